@@ -1,0 +1,49 @@
+# make report   executes the notebooks on every dataset in data/ and writes report/ and results/
+# make test     runs the tests
+# make lab      opens JupyterLab on the notebooks
+# make bench    prints the benchmarks' tables
+# Every target sets up what it needs in .venv first. Choose the Python with PYTHON=python3.12.
+
+VENV := .venv
+CANDIDATES := python3 python3.14 python3.13 python3.12 python3.11
+PYTHON ?= $(shell for p in $(CANDIDATES); do \
+	"$$p" check_python.py >/dev/null 2>&1 && echo "$$p" && exit; done; echo python3)
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+
+.PHONY: setup report test lab bench clean
+.DEFAULT_GOAL := report
+
+setup: $(READY)
+
+$(READY): requirements.txt pyproject.toml check_python.py
+	@command -v "$(PYTHON)" >/dev/null || { \
+		echo "There is no $(PYTHON): install Python 3.11 to 3.14 (see environment.md)." >&2; exit 1; }
+	@"$(PYTHON)" check_python.py
+	@"$(PYTHON)" -c 'import ensurepip, venv' 2>/dev/null || { \
+		echo "$(PYTHON) lacks venv: install it (on Debian and Ubuntu: apt install python3-venv)." >&2; \
+		exit 1; }
+	@rm -rf $(VENV)
+	"$(PYTHON)" -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes \
+		--only-binary=:all: -r requirements.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation \
+		--editable .
+	@touch $@
+
+report: $(READY)
+	@$(BIN)/python -m slamlib report
+
+test: $(READY)
+	@$(BIN)/nbstripout --verify --keep-id notebooks/*.ipynb
+	$(BIN)/python -m pytest
+
+lab: $(READY)
+	$(BIN)/jupyter lab notebooks
+
+bench: $(READY)
+	@for b in tests/benchmarks/*.py; do $(BIN)/python "$$b" || exit 1; done
+
+clean:
+	rm -rf $(VENV) report results build slamlib.egg-info .pytest_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,25 @@
+"""Fails with one sentence where the pinned gtsam wheel cannot run. Any Python can run this file."""
+
+import platform
+import sys
+
+
+def problem():
+    version = tuple(sys.version_info[:2])
+    system, machine = platform.system(), platform.machine().lower()
+    if system == "Windows":
+        return "gtsam has no wheel for Windows: run this inside WSL2 (see environment.md)."
+    if (system, machine) not in (("Linux", "x86_64"), ("Linux", "aarch64"),
+                                 ("Darwin", "x86_64"), ("Darwin", "arm64")):
+        return "gtsam has no wheel for %s on %s (see environment.md)." % (system, machine)
+    if system == "Linux" and platform.libc_ver()[0] != "glibc":
+        return "gtsam's Linux wheel needs glibc, which this Python does not use (see environment.md)."
+    if platform.python_implementation() != "CPython" or not (3, 11) <= version <= (3, 14):
+        return ("Python 3.11 to 3.14 (CPython) is needed, and %s is %s %d.%d: install one and say "
+                "`make PYTHON=python3.12 ...` (see environment.md)."
+                % (sys.executable, platform.python_implementation(), version[0], version[1]))
+    return None
+
+
+if __name__ == "__main__":
+    sys.exit(problem())

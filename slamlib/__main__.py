@@ -1,0 +1,122 @@
+"""The command line: python -m slamlib {report, solve, simulate}."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from slamlib.dataset import DatasetError, read_dataset, read_truth
+
+
+def main(arguments=None):
+    """Run one command; returns the exit code: 0, 1 for a failing notebook, 2 for bad input."""
+    options = _parser().parse_args(arguments)
+    try:
+        return options.run(options)
+    except (DatasetError, OSError) as error:
+        print(f"slamlib: {error}", file=sys.stderr)
+        return 2
+
+
+def _parser():
+    parser = argparse.ArgumentParser(prog="python -m slamlib", description=__doc__)
+    commands = parser.add_subparsers(required=True, metavar="{report,solve,simulate}")
+
+    report = commands.add_parser("report", help="execute the notebooks and build the report")
+    report.add_argument("datasets", nargs="*", metavar="DATASET",
+                        help="names of folders in data/ (all of them when none is named)")
+    report.add_argument("--data", type=Path, default=Path("data"), help="folder of the datasets")
+    report.add_argument("--notebooks", type=Path, default=Path("notebooks"))
+    report.add_argument("--report", type=Path, default=Path("report"), help="folder for the pages")
+    report.add_argument("--results", type=Path, default=Path("results"),
+                        help="folder for the .mat files")
+    report.add_argument("--jobs", type=_jobs, default=2, help="notebooks executed at a time")
+    report.set_defaults(run=_report)
+
+    solve = commands.add_parser("solve", help="solve a dataset's problems without notebooks")
+    solve.add_argument("folder", type=Path, metavar="FOLDER", help="the dataset's folder")
+    solve.add_argument("--out", type=Path, required=True, help="folder for the results")
+    solve.set_defaults(run=_solve)
+
+    simulate = commands.add_parser("simulate", help="make a dataset with its truth")
+    simulate.add_argument("folder", type=Path, metavar="FOLDER", help="a new or empty folder")
+    simulate.add_argument("--path", choices=("short", "long"), default="short")
+    simulate.add_argument("--seed", type=_count, default=0)
+    simulate.add_argument("--slip", type=_size, default=1e-3, metavar="SQRT_M",
+                          help="wheel slip: sigma after one metre, in m (default %(default)s)")
+    simulate.add_argument("--nlos", type=_share, default=0.0, metavar="SHARE",
+                          help="share of UWB ranges without line of sight, which are too long")
+    simulate.add_argument("--mislabel", type=_share, default=0.0, metavar="SHARE",
+                          help="share of marker sightings that carry another marker's id")
+    simulate.set_defaults(run=_simulate)
+    return parser
+
+
+def _report(options):
+    from slamlib.report import NotebookError, build_report
+    try:
+        pages = build_report(options.notebooks, options.data, options.report, options.results,
+                             options.datasets or None, options.jobs)
+    except NotebookError as error:
+        print(f"slamlib: {error}", file=sys.stderr)
+        return 1
+    print(f"report: {pages[0]}", file=sys.stderr)
+    return 0
+
+
+def _solve(options):
+    from slamlib.solve import solve_to_folder
+    summary = solve_to_folder(read_dataset(options.folder), read_truth(options.folder), options.out)
+    print(_table(summary))
+    return 0
+
+
+def _table(summary):
+    """The summary as a short table, one line a problem."""
+    lines = [f"{summary['dataset']}: {summary['poses']} poses",
+             f"{'problem':16} {'path':>9} {'last x, y, heading':>30} {'last sigmas':>29} {'ATE':>9}"]
+    for name, row in summary["problems"].items():
+        pose = "{:9.3f} m {:8.3f} m {:7.4f}".format(*row["last_pose"])
+        sigma = "{:8.4f} m {:8.4f} m {:7.4f}".format(*row["last_sigma"])
+        error = f"{row['ate_m']:7.4f} m" if "ate_m" in row else "no truth"
+        lines.append(f"{name:16} {row['path_length_m']:7.2f} m {pose:>30} {sigma:>29} {error:>9}")
+    return "\n".join(lines)
+
+
+def _simulate(options):
+    from slamlib.simulation import simulate, write_dataset
+    dataset, truth = simulate(options.path, options.seed, slip=options.slip,
+                              late_ranges=options.nlos, mislabelled=options.mislabel)
+    write_dataset(options.folder, dataset, truth)
+    return 0
+
+
+def _count(text):
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"expected a whole number from 0 on, found {text}")
+    return value
+
+
+def _jobs(text):
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"expected a whole number from 1 on, found {text}")
+    return value
+
+
+def _size(text):
+    value = float(text)
+    if not 0 <= value < float("inf"):
+        raise argparse.ArgumentTypeError(f"expected a number from 0 on, found {text}")
+    return value
+
+
+def _share(text):
+    value = _size(text)
+    if value > 1:
+        raise argparse.ArgumentTypeError(f"expected a share from 0 to 1, found {text}")
+    return value
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,77 @@
+"""What the notebooks share: which datasets they run on, where results go, sentences and tables."""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from IPython.display import Markdown, display
+from matplotlib_inline.backend_inline import set_matplotlib_formats
+
+from slamlib import plotting
+from slamlib.dataset import Dataset, Truth, dataset_names, read_dataset, read_truth
+
+
+@dataclass(frozen=True)
+class Log:
+    """A dataset with its name and, for figures and tables only, its truth (or None)."""
+
+    name: str
+    dataset: Dataset
+    truth: Truth | None
+
+
+def start():
+    """Set the look of the figures and read the logs.
+
+    The data folder is SLAMLIB_DATA, or else the nearest `data` in this folder or above it.
+    SLAMLIB_DATASETS selects folders in it by name, joined by os.pathsep; by default all are read.
+
+    Returns
+    -------
+    list of Log, by name but the shortest drive first.
+
+    Raises
+    ------
+    DatasetError
+        A dataset is not as it must be, or there is none.
+    """
+    plotting.use_style()
+    set_matplotlib_formats("svg", metadata={"Date": None})
+    data = _folder("SLAMLIB_DATA", "data")
+    selected = os.environ.get("SLAMLIB_DATASETS")
+    names = dataset_names(data, selected.split(os.pathsep) if selected else None)
+    logs = [Log(name, read_dataset(data / name), read_truth(data / name)) for name in names]
+    return sorted(logs, key=lambda log: len(log.dataset.ticks))
+
+
+def results_folder(log):
+    """Where this log's results go: SLAMLIB_RESULTS, or else `results` beside the data folder."""
+    results = os.environ.get("SLAMLIB_RESULTS")
+    return (Path(results) if results else _folder("SLAMLIB_DATA", "data").parent / "results") / log.name
+
+
+def with_truth(logs, lost):
+    """The logs that have truth; for the others a sentence says that `lost` cannot be shown."""
+    without = [log.name for log in logs if log.truth is None]
+    if without:
+        say(f"*No truth comes with {' and '.join(without)}, so {lost} cannot be shown there.*")
+    return [log for log in logs if log.truth is not None]
+
+
+def say(markdown):
+    """Show a sentence with computed numbers as text."""
+    display(Markdown(markdown))
+
+
+def table(header, rows, caption=None):
+    """Show a table: header is a list of str, rows are lists of str; the first column is text."""
+    lines = [header, ["---"] + ["---:"] * (len(header) - 1), *rows]
+    text = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    say(text + (f"\n\n{caption}" if caption else ""))
+
+
+def _folder(variable, name):
+    if os.environ.get(variable):
+        return Path(os.environ[variable])
+    here = Path.cwd()
+    return next((p / name for p in (here, *here.parents) if (p / name).is_dir()), here / name)

@@ -1,0 +1,152 @@
+"""Trajectories, covariance ellipses and state curves, one look for each role everywhere.
+
+Every function draws on the `ax` it is given and returns it. Ellipses state a probability: the
+region {p : (p - m)^T C^-1 (p - m) <= k^2} of a planar Gaussian holds 1 - exp(-k^2 / 2), so 95 %
+needs k = 2.4477, not 2.
+"""
+
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.collections import EllipseCollection
+from matplotlib.colors import to_rgb
+
+# Okabe and Ito's colours, told apart by the colour-blind; line style and width carry grey print.
+ROLES = {
+    "truth": dict(color="black", linestyle=(0, (4, 2)), linewidth=1.1, zorder=4),
+    "odometry": dict(color="#D55E00", linewidth=1.5, zorder=3),
+    "exact": dict(color="#0072B2", linewidth=1.5, zorder=3),
+    "sample": dict(color="#999999", linewidth=1.0, zorder=1),
+    "aruco": dict(color="#CC79A7", linewidth=1.5, zorder=3),
+    "fused": dict(color="#009E73", linewidth=1.7, zorder=3),
+    "slam": dict(color="#0072B2", linewidth=1.7, zorder=3),
+}
+
+# Where estimates are laid over a sample: dots below, a wide line, a narrow dashed one on top of it.
+COMPARED = {
+    "sample": dict(linestyle="none", marker="o", markersize=3.5, zorder=5, color="#555555"),
+    "odometry": dict(linewidth=3.2, alpha=0.75),
+    "exact": dict(linestyle=(0, (4, 2)), linewidth=1.5, zorder=4),
+}
+
+
+def use_style():
+    """The look of all figures, from now on in this process."""
+    plt.style.use(Path(__file__).with_name("slamlib.mplstyle"))
+
+
+def panels(count, rows=1, height=3.4, width=3.7, columns=2):
+    """A figure with `count` panels side by side, `columns` to a line, each of `rows` axes.
+
+    Returns the figure and an array of axes (count, rows).
+    """
+    columns = min(columns, count)
+    lines = -(-count // columns)
+    fig, axes = plt.subplots(lines * rows, columns, squeeze=False,
+                             figsize=(max(width * columns, 5.0), height * lines))
+    axes = axes.reshape(lines, rows, columns).swapaxes(1, 2).reshape(-1, rows)
+    for ax in axes[count:].ravel():
+        ax.set_visible(False)
+    return fig, axes[:count]
+
+
+def trajectory(ax, poses, role, label=None, **look):
+    """The path of poses (n, 3 or 2) in metres, axes equal, with a dot where it starts."""
+    look = {**ROLES[role], **look}
+    line, = ax.plot(poses[:, 0], poses[:, 1], label=label or role, **look)
+    ax.plot(*poses[np.isfinite(poses[:, 0])][:1, :2].T, "o", color=line.get_color(), markersize=4)
+    ax.set_aspect("equal", adjustable="datalim")
+    ax.set(xlabel="x (m)", ylabel="y (m)")
+    return ax
+
+
+def ellipses(ax, positions, covariances, color, probability=0.95, label=None, fill=0.12):
+    """Ellipses of the given probability around positions (m, >= 2), covariances (m, >= 2, >= 2)."""
+    k = np.sqrt(-2 * np.log(1 - probability))
+    variances, axes = np.linalg.eigh(np.asarray(covariances)[:, :2, :2])
+    widths = 2 * k * np.sqrt(np.maximum(variances, 0))
+    angles = np.degrees(np.arctan2(axes[:, 1, 1], axes[:, 0, 1]))
+    rgb = np.array(to_rgb(color))
+    face, edge = (*rgb, fill), tuple(0.6 * rgb)           # darker than the path they stand on
+    patches = EllipseCollection(
+        widths[:, 1], widths[:, 0], angles, units="xy", offsets=np.asarray(positions)[:, :2],
+        offset_transform=ax.transData, facecolors=face, edgecolors=edge, linewidths=1.1, zorder=3.5)
+    ax.add_collection(patches)
+    reach = k * np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)[:, :2])
+    centre = np.asarray(positions)[:, :2]
+    ax.update_datalim(np.concatenate([centre - reach, centre + reach]))
+    if label:
+        ax.plot([], [], "o", markersize=9, markerfacecolor=face, markeredgecolor=edge, label=label)
+    ax.autoscale_view()
+    return ax
+
+
+def spread(poses, count=14):
+    """Indices of about `count` poses, equally far apart along the path: few enough to read."""
+    travelled = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
+    wanted = np.linspace(0, travelled[-1], count + 1)[1:]
+    return np.unique(np.minimum(np.searchsorted(travelled, wanted), len(poses) - 1))
+
+
+def name_rows(axes, names):
+    """Names of the vertical axes of one panel, top to bottom; pose numbers only below the last."""
+    for ax, name in zip(axes, names):
+        ax.set(ylabel=name, xlabel=None)
+    axes[-1].set(xlabel="pose number")
+
+
+def farthest(poses):
+    """Index of the pose farthest from the first one."""
+    return int(np.argmax(np.hypot(*(poses[:, :2] - poses[0, :2]).T)))
+
+
+def legend_below(fig):
+    """One legend for all axes of a figure, below them: each label once."""
+    entries = {}
+    for ax in fig.axes:
+        entries |= {label: handle for handle, label in zip(*ax.get_legend_handles_labels())
+                    if label not in entries}
+    fig.legend(entries.values(), entries.keys(), loc="outside lower center",
+               ncols=min(4, len(entries)))
+
+
+def states(axes, poses, covariances, role, label=None):
+    """x, y and heading over the pose number on three axes, with a band of +-2 sigma around them."""
+    return _curves(axes, poses, poses, covariances, role, label,
+                   ("x (m)", "y (m)", "heading δ (rad)"))
+
+
+def errors(axes, poses, covariances, truth, role, label=None):
+    """Error against the truth (n, 3) over the pose number, with the band of +-2 sigma around 0."""
+    return _curves(axes, poses - truth, np.zeros_like(poses), covariances, role, label,
+                   ("error of x (m)", "error of y (m)", "error of δ (rad)"))
+
+
+def curve(ax, values, role, at=None, label=None, **look):
+    """One value (n,) over the pose number; `at` are the indices from 0 of the poses it belongs to."""
+    at = np.arange(len(values)) if at is None else at
+    ax.plot(at + 1, values, label=label or role, **{**ROLES[role], **look})
+    ax.set(xlabel="pose number")
+    return ax
+
+
+def cloud(ax, samples, mean, estimates, probability=0.95):
+    """Samples (d, 2) with the ellipses of estimates {role: (covariance (2, 2), label)} around mean."""
+    ax.plot(samples[:, 0], samples[:, 1], ".", color="#777777", markersize=2.5, label="Monte Carlo")
+    for role, (covariance, label) in estimates.items():
+        ellipses(ax, mean[None], covariance[None], ROLES[role]["color"], probability, label)
+    return ax
+
+
+def _curves(axes, values, middle, covariances, role, label, names):
+    number = np.arange(1, len(values) + 1)
+    two_sigma = 2 * np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    low, high = middle - two_sigma, middle + two_sigma
+    few = np.unique(np.linspace(0, len(values) - 1, 800).astype(int))      # bands are smooth
+    for i, ax in enumerate(axes):
+        ax.plot(number, values[:, i], label=label or role, **ROLES[role])
+        ax.fill_between(number[few], low[few, i], high[few, i], color=ROLES[role]["color"],
+                        alpha=0.18, linewidth=0, label="±2σ")
+    name_rows(axes, names)
+    return axes

@@ -1,0 +1,60 @@
+"""The deliverables: MATLAB files with struct arrays, as the assignment names their fields."""
+
+import os
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+from scipy.io import loadmat, savemat
+
+_HEADER = b"MATLAB 5.0 MAT-file, written by slamlib".ljust(116)
+
+
+def write_vehicle_poses(folder, poses, covariances):
+    """Write folder/vehiclePose.mat: vehiclePose(k).pose, .covari for pose k of the encoder file.
+
+    Parameters
+    ----------
+    folder : path, made if it does not exist.
+    poses : (n, 3) [x, y, heading] in world axes, m and rad; NaN where there is no estimate.
+    covariances : (n, 3, 3) of [x, y, heading] in world axes.
+    """
+    _write(Path(folder) / "vehiclePose.mat", pose=poses, covari=covariances)
+
+
+def read_vehicle_poses(folder):
+    """Poses (n, 3) and covariances (n, 3, 3) of a vehiclePose.mat."""
+    content = _read(Path(folder) / "vehiclePose.mat")
+    return content["pose"], content["covari"]
+
+
+def write_atomically(path, content):
+    """Write bytes to path so that it is the old file or the whole new one, never a part."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        beside.write_bytes(content)
+        os.replace(beside, path)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def _write(path, **fields):
+    """One (1, n) struct array, named like the file; equal input gives equal bytes."""
+    length = len(next(iter(fields.values())))
+    structs = np.empty((1, length), dtype=[(name, object) for name in fields])
+    for name, values in fields.items():
+        rows = np.asarray(values, dtype=float)
+        rows = rows[:, None, :] if rows.ndim == 2 else rows       # vectors are 1 x d in MATLAB
+        structs[name][0, :] = list(rows)
+    buffer = BytesIO()
+    savemat(buffer, {path.stem: structs})
+    content = buffer.getvalue()
+    write_atomically(path, _HEADER + content[len(_HEADER):])      # scipy's header has the date
+
+
+def _read(path):
+    structs = loadmat(path)[path.stem]
+    return {name: np.stack([np.squeeze(row, 0) if row.shape[0] == 1 else row
+                            for row in structs[name].ravel()])
+            for name in structs.dtype.names}

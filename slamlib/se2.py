@@ -1,0 +1,109 @@
+"""Planar rigid motions, batched: poses are arrays (..., 3) of [x, y, heading].
+
+A pose is read as the frame change T_ab that takes coordinates in b to coordinates in a,
+
+    p_a = R(heading) p_b + [x, y],        R(h) = [[cos h, -sin h], [sin h, cos h]],
+
+so that frames cancel when read: compose(T_ab, T_bc) = T_ac and between(T_wa, T_wb) = T_ab.
+Every function broadcasts over the leading dimensions. Jacobians are the partial derivatives of
+the three coordinates [x, y, heading], not of a tangent vector: they carry covariances of
+[x, y, heading] as this package stores them. Headings are added and subtracted but never wrapped;
+call `wrap` where an angle must lie in (-pi, pi].
+"""
+
+import numpy as np
+
+
+def wrap(angle):
+    """Angle in radians, any shape, brought to (-pi, pi]."""
+    return np.pi - np.mod(np.pi - np.asarray(angle, dtype=float), 2 * np.pi)
+
+
+def rotation(heading):
+    """Rotation matrices R(heading), shape heading.shape + (2, 2)."""
+    c, s = np.cos(heading), np.sin(heading)
+    return np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
+
+
+def compose(T_ab, T_bc):
+    """T_ac = T_ab T_bc, shape (..., 3), metres and radians."""
+    T_ab, T_bc = np.asarray(T_ab, dtype=float), np.asarray(T_bc, dtype=float)
+    c, s = np.cos(T_ab[..., 2]), np.sin(T_ab[..., 2])
+    x, y = T_bc[..., 0], T_bc[..., 1]
+    return np.stack([T_ab[..., 0] + c * x - s * y,
+                     T_ab[..., 1] + s * x + c * y,
+                     T_ab[..., 2] + T_bc[..., 2]], -1)
+
+
+def inverse(T_ab):
+    """T_ba, shape (..., 3)."""
+    T_ab = np.asarray(T_ab, dtype=float)
+    c, s = np.cos(T_ab[..., 2]), np.sin(T_ab[..., 2])
+    x, y = T_ab[..., 0], T_ab[..., 1]
+    return np.stack([-c * x - s * y, s * x - c * y, -T_ab[..., 2]], -1)
+
+
+def between(T_wa, T_wb):
+    """T_ab = inverse(T_wa) T_wb, the pose of b seen from a, shape (..., 3)."""
+    T_wa, T_wb = np.asarray(T_wa, dtype=float), np.asarray(T_wb, dtype=float)
+    c, s = np.cos(T_wa[..., 2]), np.sin(T_wa[..., 2])
+    dx, dy = T_wb[..., 0] - T_wa[..., 0], T_wb[..., 1] - T_wa[..., 1]
+    return np.stack([c * dx + s * dy, -s * dx + c * dy, T_wb[..., 2] - T_wa[..., 2]], -1)
+
+
+def compose_jacobians(T_ab, T_bc):
+    """Partial derivatives of compose: (d T_ac / d T_ab, d T_ac / d T_bc), each (..., 3, 3)."""
+    shape = np.broadcast_shapes(np.shape(T_ab), np.shape(T_bc))
+    T_ab, T_ac = np.broadcast_to(T_ab, shape), compose(T_ab, T_bc)
+    lever = T_ac[..., :2] - T_ab[..., :2]                # position of c from b, in axes of a
+    by_first = _identity(shape)
+    by_first[..., 0, 2] = -lever[..., 1]
+    by_first[..., 1, 2] = lever[..., 0]
+    by_second = _identity(shape)
+    by_second[..., :2, :2] = rotation(T_ab[..., 2])
+    return by_first, by_second
+
+
+def inverse_jacobian(T_ab):
+    """Partial derivatives of inverse, d T_ba / d T_ab, shape (..., 3, 3)."""
+    T_ab = np.asarray(T_ab, dtype=float)
+    T_ba = inverse(T_ab)
+    jacobian = -_identity(T_ab.shape)
+    jacobian[..., :2, :2] = -rotation(T_ba[..., 2])
+    jacobian[..., 0, 2] = T_ba[..., 1]
+    jacobian[..., 1, 2] = -T_ba[..., 0]
+    return jacobian
+
+
+def between_jacobians(T_wa, T_wb):
+    """Partial derivatives of between: (d T_ab / d T_wa, d T_ab / d T_wb), each (..., 3, 3)."""
+    shape = np.broadcast_shapes(np.shape(T_wa), np.shape(T_wb))
+    T_ab = between(T_wa, T_wb)
+    world_in_a = rotation(-np.broadcast_to(T_wa, shape)[..., 2])
+    by_second = _identity(shape)
+    by_second[..., :2, :2] = world_in_a
+    by_first = -by_second
+    by_first[..., 0, 2] = T_ab[..., 1]
+    by_first[..., 1, 2] = -T_ab[..., 0]
+    return by_first, by_second
+
+
+def rotate_covariance(covariance, heading):
+    """Covariance of [x, y, heading] expressed in axes turned by `heading`: B C B^T.
+
+    Parameters
+    ----------
+    covariance : (..., 3, 3) covariance of [x, y, heading] in the axes of frame b.
+    heading : (...) rad, heading of b in a.
+
+    Returns
+    -------
+    (..., 3, 3) covariance of the same quantity with x and y along the axes of a.
+    """
+    B = _identity(np.shape(heading) + (3,))
+    B[..., :2, :2] = rotation(heading)
+    return B @ covariance @ np.swapaxes(B, -1, -2)
+
+
+def _identity(shape):
+    return np.broadcast_to(np.eye(3), shape[:-1] + (3, 3)).copy()

@@ -1,0 +1,98 @@
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slamlib.__main__ import main
+from slamlib.dataset import read_dataset
+from slamlib.odometry import equation2
+from slamlib.results import read_vehicle_poses
+
+ROOT = Path(__file__).parents[1]
+
+
+def run(*arguments, cwd=ROOT, python=sys.executable):
+    return subprocess.run([python, "-m", "slamlib", *map(str, arguments)], cwd=cwd, text=True,
+                          capture_output=True, timeout=300)
+
+
+def test_simulate_then_solve(tmp_path):
+    made = run("simulate", "drive", "--path", "short", "--seed", 21, "--nlos", 0.15, cwd=tmp_path)
+    assert (made.returncode, made.stdout, made.stderr) == (0, "", "")
+    solved = run("solve", "drive", "--out", "out", cwd=tmp_path)
+    assert solved.returncode == 0 and solved.stderr == ""
+    lines = solved.stdout.splitlines()
+    assert lines[0] == "drive: 2000 poses" and lines[2].startswith("problem1 ")
+    assert max(map(len, lines)) <= 100
+    dataset = read_dataset(tmp_path / "drive")
+    for got, expected in zip(read_vehicle_poses(tmp_path / "out" / "problem1"),
+                             equation2(dataset.ticks, dataset.vehicle)):
+        np.testing.assert_array_equal(got, expected)
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["dataset"] == "drive" and 0 < summary["problems"]["problem1"]["ate_m"] < 1
+
+
+def test_solve_without_truth_and_with_a_single_pose(tmp_path, capsys):
+    (tmp_path / "encoderReading.txt").write_text("1 0 0\n")
+    assert main(["solve", str(tmp_path), "--out", str(tmp_path / "out")]) == 0
+    assert "no truth" in capsys.readouterr().out
+    assert len(read_vehicle_poses(tmp_path / "out" / "problem1")[0]) == 1
+
+
+def test_bad_data_is_one_sentence_and_exit_code_2_and_writes_nothing(tmp_path):
+    (tmp_path / "drive").mkdir()
+    (tmp_path / "drive" / "encoderReading.txt").write_text("1 0 0\n2 ten 9\n")
+    failed = run("solve", "drive", "--out", "out", cwd=tmp_path)
+    assert failed.returncode == 2 and failed.stdout == ""
+    assert failed.stderr.startswith("slamlib: drive/encoderReading.txt, line 2: expected ")
+    assert failed.stderr.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("arguments, word", [
+    (["solve", "nowhere", "--out", "out"], "nowhere"),
+    (["simulate", "drive", "--nlos", "1.5"], "share"),
+    (["simulate", "drive", "--slip", "-1"], "number from 0"),
+    (["simulate", "drive", "--slip", "nan"], "number from 0"),
+    (["simulate", "drive", "--seed", "x"], "seed"),
+    (["simulate", ".", "--seed", "1"], "new or empty folder"),
+    (["report", "--notebooks", ROOT / "notebooks", "--data", "nowhere"], "nowhere"),
+    (["report", "--jobs", "0"], "jobs"),
+    ([], "required"),
+])
+def test_bad_arguments_give_exit_code_2_and_no_traceback(tmp_path, arguments, word):
+    (tmp_path / "file").write_text("")
+    failed = run(*arguments, cwd=tmp_path)
+    assert failed.returncode == 2 and word in failed.stderr and "Traceback" not in failed.stderr
+    assert sorted(f.name for f in tmp_path.iterdir()) == ["file"]
+
+
+def test_an_output_that_cannot_be_written_is_one_sentence(tmp_path):
+    (tmp_path / "file").write_text("")
+    failed = run("solve", ROOT / "data" / "short", "--out", tmp_path / "file")
+    assert failed.returncode == 2 and failed.stderr.count("\n") == 1 and "file" in failed.stderr
+
+
+def test_wrong_python_or_platform_is_one_sentence():
+    check = """
+import platform, sys
+sys.path.insert(0, {root!r})
+import check_python
+{change}
+print(check_python.problem())
+"""
+    cases = {"pass": "None",
+             "sys.version_info = (3, 10, 9)": "Python 3.11 to 3.14",
+             "sys.version_info = (3, 15, 0)": "Python 3.11 to 3.14",
+             "platform.system = lambda: 'Windows'": "WSL2",
+             "platform.machine = lambda: 'riscv64'": "riscv64",
+             "platform.system = lambda: 'Linux'; platform.libc_ver = lambda: ('', '')": "glibc"}
+    for change, word in cases.items():
+        code = check.format(root=str(ROOT), change=change)
+        said = subprocess.run([sys.executable, "-c", code], text=True, capture_output=True,
+                              check=True, env={**os.environ}).stdout
+        assert word in said and said.count("\n") == 1, change

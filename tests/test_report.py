@@ -1,0 +1,247 @@
+"""The report: pages that need no script and no network, and nothing changed when a cell fails."""
+
+import json
+import os
+import re
+import sys
+from html.parser import HTMLParser
+
+import nbformat
+import pytest
+from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
+
+from slamlib.dataset import DatasetError
+from slamlib.report import NotebookError, build_report
+
+TEXT = r"""# Problem 1: *odometry*
+
+Counts become a pose $x_k$ and a covariance $\mathbf{C}_{X_k}$, as [equation 1](#eq-1) says.
+
+## The estimate $\hat\theta$
+
+$$ \begin{aligned} x_{k+1} &= x_k + \pi\,\frac{n_R R_R}{n_0}\cos\delta_k \\
+y_{k+1} &= y_k \end{aligned} \tag{1} $$
+
+| symbol | meaning |
+| :-- | --: |
+| $a < b$ | $\lVert r \rVert^2$ |
+
+\begin{equation} I_k = \underbrace{\sum_{j=1}^{k-1} J_j S_j}_{\text{drift}} \tag{3b} \end{equation}
+
+See [the other chapter](2_other.ipynb#Sums), [a paper](https://example.org/paper) and `$code$`.
+"""
+TEXT_FORMULAS = 7
+OUTPUT = r"""from IPython.display import Markdown, Math, display
+import matplotlib.pyplot as plt
+display(Markdown(r'''
+| $\sigma_x$ | 2 |
+| -- | -- |
+| **mean** | $$ \bar e = \frac1n \sum_i e_i \tag{7} $$ |
+'''))
+Math(r"\sqrt{2}")"""
+OUTPUT_FORMULAS = 3
+FIGURE = """%config InlineBackend.figure_formats = ['{}']
+plt.plot([0, 1], [0, 1]);"""
+ENVIRONMENT = """import os, sys
+print("stderr is shown", file=sys.stderr)
+for name in "DATA", "RESULTS", "DATASETS":
+    print(os.environ["SLAMLIB_" + name])
+folder = os.path.join(os.environ["SLAMLIB_RESULTS"], "short")
+os.makedirs(folder, exist_ok=True)
+open(os.path.join(folder, "vehiclePose.mat"), "w").close()
+sys.executable"""
+
+
+class Page(HTMLParser):
+    """Counts the elements of a page, and keeps what it loads, names and links to."""
+
+    def __init__(self, path):
+        super().__init__()
+        self.text = path.read_text(encoding="utf-8")
+        self.count, self.loads, self.links, self.alts, self.ids = {}, [], [], [], []
+        self.feed(self.text)
+
+    def handle_starttag(self, tag, attributes):
+        attributes = dict(attributes)
+        self.count[tag] = self.count.get(tag, 0) + 1
+        self.loads += [attributes[name] for name in ("src", "srcset", "data") if name in attributes]
+        self.links += [attributes["href"]] if tag == "a" else []
+        self.alts += [attributes.get("alt")] if tag == "img" else []
+        self.ids += [attributes["id"]] if "id" in attributes else []
+
+
+def write(folder, name, *cells):
+    """A notebook of Markdown cells (str) and code cells (1-tuples of str)."""
+    made = [new_markdown_cell(cell, id=f"m{number}") if isinstance(cell, str)
+            else new_code_cell(cell[0], id=f"c{number}") for number, cell in enumerate(cells)]
+    folder.mkdir(exist_ok=True)
+    nbformat.write(new_notebook(cells=made), folder / f"{name}.ipynb")
+
+
+def make_data(folder):
+    for name in ("short", "long"):
+        (folder / "data" / name).mkdir(parents=True)
+        (folder / "data" / name / "encoderReading.txt").write_text("1 0 0\n2 10 9\n")
+    (folder / "data" / "notes").mkdir()
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """One build of two notebooks, shared by all tests that only look at its pages."""
+    root = tmp_path_factory.mktemp("built")
+    make_data(root)
+    write(root / "notebooks", "1_odometry", TEXT, (OUTPUT,), (FIGURE.format("svg"),),
+          "**Figure 1.** A line.", (FIGURE.format("png"),))
+    write(root / "notebooks", "2_other", "# Second\n\n## Sums\n\nNo formula.", (ENVIRONMENT,),
+          ("",))
+    spec = root / "kernels" / "python3" / "kernel.json"  # a kernel of the user that cannot run
+    spec.parent.mkdir(parents=True)
+    spec.write_text(json.dumps({"argv": ["false"], "display_name": "", "language": "python"}))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("JUPYTER_PATH", str(root))
+        patch.setenv("MPLBACKEND", "agg")
+        return root, build(root, datasets=["short"])
+
+
+def build(root, **options):
+    return build_report(root / "notebooks", root / "data", root / "report", root / "results",
+                        **options)
+
+
+def test_pages_are_index_and_chapters_in_order(built):
+    root, pages = built
+    assert [page.name for page in pages] == ["index.html", "1_odometry.html", "2_other.html"]
+    assert sorted((root / "report").iterdir()) == sorted(pages)
+
+
+def test_every_formula_arrives_once(built):
+    text = built[1][1].read_text(encoding="utf-8")
+    main = text[text.index("<main>"):text.index("</main>")]
+    assert main.count("<math") == main.count("</math>") == TEXT_FORMULAS + OUTPUT_FORMULAS
+    assert "\ue000" not in text
+    assert "<code>$code$</code>" in main
+    # Outside of MathML, whose annotations keep the TeX, and of code no TeX is left.
+    left = re.sub(r"(?s)<math.*?</math>|<pre.*?</pre>|<code>.*?</code>", "", main)
+    assert "$" not in left and "\\" not in left
+
+
+def test_equation_numbers_stand_beside_their_formula(built):
+    page = Page(built[1][1])
+    assert re.findall(r'<span class="number">\((\w+)\)</span>', page.text) == ["1", "3b", "7"]
+    assert {"eq-1", "eq-3b", "eq-7"} <= set(page.ids)
+    assert len(page.ids) == len(set(page.ids))
+
+
+def test_formulas_are_mended(built):
+    text = built[1][1].read_text(encoding="utf-8")
+    assert "\U0001d402" in text and "\U0001d46a" not in text  # bold C, not bold italic C
+    assert 'class="brace"' in text and "\u23df" not in text
+    assert "<munderover>" in text and 'class="of"' in text
+
+
+def test_pages_load_nothing(built):
+    for path in built[1]:
+        page = Page(path)
+        assert not {"script", "link", "iframe", "object", "embed"} & set(page.count)
+        assert all(source.startswith("data:image/") for source in page.loads)
+        assert "url(" not in page.text and "@import" not in page.text
+    assert "https://example.org/paper" in Page(built[1][1]).links
+
+
+def test_figures_are_embedded_and_described(built):
+    page = Page(built[1][1])
+    assert [source.split(";")[0] for source in page.loads] == ["data:image/svg+xml",
+                                                               "data:image/png"]
+    assert all(page.alts)
+    assert '<p class="caption"><strong>Figure 1.</strong> A line.</p>' in page.text
+
+
+def test_contents_titles_and_links(built):
+    index, first, second = (Page(path) for path in built[1])
+    assert "<title>Problem 1: odometry</title>" in first.text
+    assert {"index.html", "2_other.html", "2_other.html#Sums", "#The-estimate"} <= set(first.links)
+    assert {"The-estimate"} <= set(first.ids) and {"Sums"} <= set(second.ids)
+    assert {"1_odometry.html", "2_other.html", "1_odometry.html#eq-1",
+            "../results/short/vehiclePose.mat"} <= set(index.links)
+    assert index.count["math"] == 2  # of the first paragraph
+    assert "<li>short</li>" in index.text and "<li>long</li>" not in index.text
+
+
+def test_kernels_see_the_folders_and_run_this_interpreter(built):
+    root, pages = built
+    text = pages[2].read_text(encoding="utf-8")
+    for value in (root / "data", root / "results", sys.executable):
+        assert str(value) in text
+    assert '<pre class="output stderr">stderr is shown' in text
+    assert re.search(r"\nshort\n?</pre>", text)
+    assert "SLAMLIB_DATA" not in os.environ
+
+
+def test_a_second_build_gives_the_same_bytes(built):
+    root, pages = built
+    before = [page.read_bytes() for page in pages]
+    assert [page.read_bytes() for page in build(root, datasets=["short"])] == before
+
+
+def test_a_failing_cell_is_named_and_leaves_the_old_report(tmp_path):
+    make_data(tmp_path)
+    write(tmp_path / "notebooks", "1_good", "# Good", ("import time\ntime.sleep(60)",))
+    write(tmp_path / "notebooks", "2_bad", "# Bad", ("x = 0",), ("y = 1\nz = y / x",))
+    (tmp_path / "report").mkdir()
+    (tmp_path / "report" / "1_good.html").write_text("old")
+    with pytest.raises(NotebookError) as caught:
+        build(tmp_path)
+    assert str(caught.value) == ("2_bad.ipynb, cell 2, line 2:\n    z = y / x\n"
+                                 "ZeroDivisionError: division by zero")
+    assert [path.name for path in (tmp_path / "report").iterdir()] == ["1_good.html"]
+    assert (tmp_path / "report" / "1_good.html").read_text() == "old"
+
+
+@pytest.mark.parametrize("text, reason", [
+    (r"Before $\nonsense{x}$ after", r"\nonsense"),
+    (r"$$ a \tag{1} \tag{2} $$", r"\tag{2}"),
+    (r"$\begin{array}{c|c} a & b \end{array}$", "would be lost"),
+    ("![](https://example.org/picture.png)", "would load something"),
+    ("<script>alert(1)</script>", "would load something"),
+])
+def test_what_cannot_be_set_is_refused_before_a_kernel_starts(tmp_path, text, reason):
+    make_data(tmp_path)
+    write(tmp_path / "notebooks", "1_text", text, ("raise SystemExit",))
+    with pytest.raises(NotebookError, match=re.escape(reason)) as caught:
+        build(tmp_path)
+    assert str(caught.value).startswith("1_text.ipynb: ")
+    assert not (tmp_path / "report").exists() and not (tmp_path / "results").exists()
+
+
+def test_missing_folders_and_names_are_told_in_one_sentence(tmp_path):
+    with pytest.raises(DatasetError, match="no notebooks"):
+        build(tmp_path)
+    write(tmp_path / "notebooks", "1_text", "# Text")
+    with pytest.raises(DatasetError, match="encoderReading.txt"):
+        build(tmp_path)
+    make_data(tmp_path)
+    with pytest.raises(DatasetError, match="expected one of long, short, found 'medium'"):
+        build(tmp_path, datasets=["medium", "short"])
+
+
+def test_bad_data_and_bad_notebooks_are_told_before_a_kernel_starts(tmp_path):
+    make_data(tmp_path)
+    write(tmp_path / "notebooks", "1_text", "# Text", ("raise SystemExit('never reached')",))
+    (tmp_path / "data" / "long" / "encoderReading.txt").write_text("1 0 0\n2 1\n")
+    with pytest.raises(DatasetError, match="encoderReading.txt, line 2: expected 3 columns"):
+        build(tmp_path)
+    (tmp_path / "notebooks" / "2_broken.ipynb").write_text("not json")
+    with pytest.raises(NotebookError, match="2_broken.ipynb is not a notebook"):
+        build(tmp_path, datasets=["short"])
+    assert not (tmp_path / "report").exists()
+
+
+def test_index_lists_results_of_the_selected_datasets_only(tmp_path):
+    make_data(tmp_path)
+    write(tmp_path / "notebooks", "1_text", "# Text", ("1",))
+    for name in ("short", "long", "gone"):
+        (tmp_path / "results" / name).mkdir(parents=True)
+        (tmp_path / "results" / name / "vehiclePose.mat").touch()
+    index = build(tmp_path, datasets=["short"])[0].read_text()
+    assert "short/vehiclePose.mat" in index
+    assert "long/vehiclePose.mat" not in index and "gone/vehiclePose.mat" not in index

@@ -1,0 +1,68 @@
+import os
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+from scipy.io import loadmat
+
+from slamlib import results
+
+
+def example(n=5):
+    rng = np.random.default_rng(0)
+    A = rng.standard_normal((n, 3, 3))
+    return rng.standard_normal((n, 3)), A @ np.swapaxes(A, 1, 2)
+
+
+def test_round_trip_through_scipy(tmp_path):
+    poses, covariances = example()
+    poses[2], covariances[2] = np.nan, np.nan                                  # no estimate
+    results.write_vehicle_poses(tmp_path / "new" / "problem1", poses, covariances)
+    structs = loadmat(tmp_path / "new" / "problem1" / "vehiclePose.mat")["vehiclePose"]
+    assert structs.shape == (1, 5) and structs.dtype.names == ("pose", "covari")
+    assert structs[0, 0]["pose"].shape == (1, 3) and structs[0, 0]["covari"].shape == (3, 3)
+    np.testing.assert_array_equal(structs[0, 3]["pose"][0], poses[3])
+    again = results.read_vehicle_poses(tmp_path / "new" / "problem1")
+    np.testing.assert_array_equal(again[0], poses)
+    np.testing.assert_array_equal(again[1], covariances)
+
+
+def test_round_trip_through_octave(tmp_path):
+    octave = shutil.which("octave-cli")
+    if octave is None:
+        assert not os.environ.get("CI"), "CI must have octave-cli"
+        pytest.skip("octave-cli is not installed")
+    poses, covariances = example(400)
+    results.write_vehicle_poses(tmp_path, poses, covariances)
+    script = ("load('vehiclePose.mat'); p = vertcat(vehiclePose.pose); c = vehiclePose(7).covari;"
+              "s = size(vehiclePose); save('-v7', 'again.mat', 'p', 'c', 's');")
+    subprocess.run([octave, "--quiet", "--no-init-file", "--eval", script], cwd=tmp_path, check=True,
+                   timeout=120)
+    again = loadmat(tmp_path / "again.mat")
+    np.testing.assert_array_equal(again["s"], [[1, 400]])
+    np.testing.assert_array_equal(again["p"], poses)
+    np.testing.assert_array_equal(again["c"], covariances[6])
+
+
+def test_a_single_pose_and_equal_bytes(tmp_path):
+    poses, covariances = example(1)
+    for name in ("a", "b"):
+        results.write_vehicle_poses(tmp_path / name, poses, covariances)
+    first, second = ((tmp_path / name / "vehiclePose.mat").read_bytes() for name in ("a", "b"))
+    assert first == second
+    np.testing.assert_array_equal(results.read_vehicle_poses(tmp_path / "a")[1], covariances)
+
+
+def test_a_failing_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
+    results.write_vehicle_poses(tmp_path, *example())
+    before = (tmp_path / "vehiclePose.mat").read_bytes()
+
+    def fail(*_):
+        raise OSError("disk full")
+
+    monkeypatch.setattr(os, "replace", fail)
+    with pytest.raises(OSError, match="disk full"):
+        results.write_vehicle_poses(tmp_path, *example(9))
+    assert [f.name for f in tmp_path.iterdir()] == ["vehiclePose.mat"]
+    assert (tmp_path / "vehiclePose.mat").read_bytes() == before

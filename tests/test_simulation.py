@@ -1,0 +1,139 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from slamlib import odometry, se2
+from slamlib.dataset import DatasetError, Vehicle, read_dataset, read_truth
+from slamlib.simulation import simulate, write_dataset
+
+DATA = Path(__file__).parents[1] / "data"
+RECIPES = {"short": dict(path="short", seed=1),
+           "long": dict(path="long", seed=2, late_ranges=0.05, mislabelled=0.005)}
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_committed_stand_ins_are_regenerated_to_the_byte(name, tmp_path):
+    if not (DATA / name / "truth").exists():
+        pytest.skip(f"data/{name} has no truth: it has been replaced by a real log")
+    write_dataset(tmp_path / name, *simulate(**RECIPES[name]))
+    made = {f.relative_to(tmp_path): f.read_bytes() for f in tmp_path.rglob("*") if f.is_file()}
+    committed = {f.relative_to(DATA): f.read_bytes()
+                 for f in (DATA / name).rglob("*") if f.is_file()}
+    assert made.keys() == committed.keys()
+    assert [f for f in made if made[f] != committed[f]] == []
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_stand_ins_are_what_the_readme_says(name):
+    dataset, truth = simulate(**RECIPES[name])
+    length = np.hypot(*np.diff(truth.poses[:, :2], axis=0).T).sum()
+    gap = np.diff(np.unique(dataset.aruco.pose)).max()
+    if name == "short":
+        assert len(dataset.ticks) == 2000 and 19 < length < 22
+        assert gap == 10
+    else:
+        assert len(dataset.ticks) >= 20000 and length > 200
+        assert gap > 400                                          # the stretch without markers
+    assert len(np.unique(dataset.aruco.pose)) < 0.2 * len(dataset.ticks)
+    np.testing.assert_allclose(truth.poses[-1, :2], 0, atol=1e-3)                    # closed
+
+
+def test_perfect_data_agrees_with_its_truth():
+    dataset, truth = simulate("short", seed=4, noise=False)
+    poses = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")
+    np.testing.assert_allclose(poses, truth.poses, atol=1e-10)
+    a, u = dataset.aruco, dataset.uwb
+    marker = truth.marker_in_world[np.searchsorted(truth.marker, a.marker)]
+    expected = se2.between(truth.poses[a.pose], marker)
+    np.testing.assert_allclose(a.marker_in_vehicle[:, :2], expected[:, :2], atol=1e-10)
+    np.testing.assert_allclose(se2.wrap(a.marker_in_vehicle[:, 2] - expected[:, 2]), 0, atol=1e-10)
+    antenna = truth.antenna_in_world[np.searchsorted(truth.antenna, u.antenna)]
+    np.testing.assert_allclose(
+        u.range, np.linalg.norm(truth.poses[u.pose, :2] - antenna, axis=1), atol=1e-10)
+    np.testing.assert_array_equal(dataset.antenna_guess.position, truth.antenna_in_world)
+
+
+def test_noise_has_the_covariances_that_the_files_state():
+    """Mean squared Mahalanobis length of m whitened d-vectors: d +- 4 sqrt(2 d / m)."""
+    dataset, truth = simulate("long", seed=6)
+    a, u = dataset.aruco, dataset.uwb
+    marker = truth.marker_in_world[np.searchsorted(truth.marker, a.marker)]
+    error = a.marker_in_vehicle - se2.between(truth.poses[a.pose], marker)
+    error[:, 2] = se2.wrap(error[:, 2])
+    chi2 = np.einsum("ni,ni->n", error, np.linalg.solve(a.covariance, error[..., None])[..., 0])
+    assert abs(chi2.mean() - 3) < 4 * np.sqrt(6 / len(chi2))
+    distance = np.linalg.norm(a.marker_in_vehicle[:, :2], axis=1)
+    sigma = np.sqrt(np.trace(a.covariance, axis1=1, axis2=2))
+    assert np.corrcoef(distance, sigma)[0, 1] > 0.99 and np.all(a.covariance[:, 0, 2] != 0)
+    antenna = truth.antenna_in_world[np.searchsorted(truth.antenna, u.antenna)]
+    z = (u.range - np.linalg.norm(truth.poses[u.pose, :2] - antenna, axis=1)) / u.sigma
+    assert abs(np.mean(z**2) - 1) < 4 * np.sqrt(2 / len(z)) and abs(z.mean()) < 4 / np.sqrt(len(z))
+    off = np.linalg.norm(dataset.antenna_guess.position - truth.antenna_in_world, axis=1)
+    assert 0.2 < np.sqrt(np.mean(off**2)) < 0.8
+
+
+@pytest.mark.parametrize("slip", [0.0, 1e-3, 5e-3])
+def test_encoder_error_is_rounding_and_a_random_walk(slip):
+    """With the true wheels the travelled distance errs by at most a count, plus slip^2 a metre."""
+    dataset, truth = simulate("long", seed=7, slip=slip)
+    ds, dtheta, _, _ = odometry.steps(dataset.ticks, truth.vehicle)
+    step = se2.between(truth.poses[:-1], truth.poses[1:])
+    true_ds = np.hypot(step[:, 0], step[:, 1]) / np.sinc(step[:, 2] / (2 * np.pi))
+    half_base = truth.vehicle.wheelbase / 2
+    error = np.cumsum(np.stack([ds + half_base * dtheta, ds - half_base * dtheta])
+                      - np.stack([true_ds + half_base * step[:, 2],
+                                  true_ds - half_base * step[:, 2]]), axis=1)
+    one_count = 2 * np.pi * 0.1 / 8000
+    if slip == 0:
+        assert np.abs(error).max() < 1.01 * one_count
+    else:
+        per_metre = np.diff(error[:, ::100], axis=1)              # about one metre each
+        metres = np.add.reduceat(true_ds, np.arange(0, len(true_ds) // 100 * 100, 100))
+        ratio = np.mean(per_metre**2) / (slip**2 * metres.mean())
+        assert abs(ratio - 1) < 4 * np.sqrt(2 / per_metre.size)
+
+
+def test_wheel_parameters_are_drawn_from_table_2():
+    draws = np.array([[v.right_radius, v.left_radius, v.wheelbase]
+                      for v in (simulate("short", seed)[1].vehicle for seed in range(60))])
+    z = (draws - [0.1, 0.1, 0.4]) / 1e-4
+    assert np.abs(z.mean(0)).max() < 4 / np.sqrt(60)
+    assert np.abs(np.mean(z**2, 0) - 1).max() < 4 * np.sqrt(2 / 60)
+
+
+def test_outliers_come_at_the_asked_rates_and_late_ranges_are_too_long():
+    clean, truth = simulate("long", seed=8)
+    dirty, same_truth = simulate("long", seed=8, late_ranges=0.15, mislabelled=0.03)
+    np.testing.assert_array_equal(truth.poses, same_truth.poses)
+    np.testing.assert_array_equal(clean.ticks, dirty.ticks)
+    wrong = dirty.aruco.marker != clean.aruco.marker
+    late = dirty.uwb.range - clean.uwb.range
+    assert abs(wrong.mean() - 0.03) < 0.01 and abs(np.mean(late > 0) - 0.15) < 0.025
+    assert (late >= 0).all() and 0.6 < late[late > 0].mean() < 1.0
+    assert np.isin(dirty.aruco.marker, truth.marker).all()
+
+
+def test_files_round_trip_through_the_reader(tmp_path):
+    vehicle = replace(Vehicle(), right_radius=0.12, ticks_per_revolution=4096.0)
+    dataset, truth = simulate("short", seed=9, vehicle=vehicle)
+    write_dataset(tmp_path / "drive", dataset, truth)
+    again, true_again = read_dataset(tmp_path / "drive"), read_truth(tmp_path / "drive")
+    assert again.vehicle == vehicle and true_again.vehicle == truth.vehicle
+    np.testing.assert_array_equal(again.ticks, dataset.ticks)
+    np.testing.assert_array_equal(again.aruco.marker, dataset.aruco.marker)
+    np.testing.assert_allclose(again.aruco.marker_in_vehicle, dataset.aruco.marker_in_vehicle,
+                               atol=6e-6)
+    np.testing.assert_allclose(again.aruco.covariance, dataset.aruco.covariance, rtol=1e-4)
+    np.testing.assert_allclose(again.uwb.range, dataset.uwb.range, atol=6e-5)
+    np.testing.assert_allclose(true_again.poses, truth.poses, atol=6e-7)
+    np.testing.assert_allclose(true_again.marker_in_world, truth.marker_in_world, atol=6e-7)
+
+
+def test_writing_never_overwrites(tmp_path):
+    (tmp_path / "drive").mkdir()
+    (tmp_path / "drive" / "notes.txt").write_text("mine")
+    with pytest.raises(DatasetError, match="new or empty folder"):
+        write_dataset(tmp_path / "drive", *simulate("short"))
+    assert [f.name for f in tmp_path.rglob("*")] == ["drive", "notes.txt"]
