@@ -1,6 +1,7 @@
 # make report   executes the notebooks on every dataset in data/ and writes report/ and results/
 # make test     runs the tests
 # make lab      opens JupyterLab on the notebooks
+# make strip    removes the outputs from saved notebooks, as they are committed
 # make bench    prints the benchmarks' tables
 # Every target sets up what it needs in .venv first. Choose the Python with PYTHON=python3.12.
 
@@ -9,9 +10,14 @@ CANDIDATES := python3 python3.14 python3.13 python3.12 python3.11
 PYTHON ?= $(shell for p in $(CANDIDATES); do \
 	"$$p" check_python.py >/dev/null 2>&1 && echo "$$p" && exit; done; echo python3)
 BIN := $(VENV)/bin
-READY := $(VENV)/.ready
+# An environment holds the folder's path and the Python it was made by: moved, or without that
+# Python, it is made anew.
+READY := $(VENV)/.ready-$(shell printf %s "$(CURDIR)" | cksum | cut -d' ' -f1)
+ifneq ($(shell $(BIN)/python -c 'print("runs")' 2>/dev/null),runs)
+$(shell rm -f $(READY))
+endif
 
-.PHONY: setup report test lab bench clean
+.PHONY: setup report test lab strip bench clean
 .DEFAULT_GOAL := report
 
 setup: $(READY)
@@ -35,11 +41,15 @@ report: $(READY)
 	@$(BIN)/python -m slamlib report
 
 test: $(READY)
-	@$(BIN)/nbstripout --verify --keep-id notebooks/*.ipynb
+	@$(BIN)/python -m nbstripout --verify --keep-id notebooks/*.ipynb >/dev/null || { \
+		echo "There are outputs in the notebooks: remove them with 'make strip'." >&2; exit 1; }
 	$(BIN)/python -m pytest
 
 lab: $(READY)
-	$(BIN)/jupyter lab notebooks
+	$(BIN)/python -m jupyter lab notebooks
+
+strip: $(READY)
+	@$(BIN)/python -m nbstripout --keep-id notebooks/*.ipynb
 
 bench: $(READY)
 	@for b in tests/benchmarks/*.py; do $(BIN)/python "$$b" || exit 1; done

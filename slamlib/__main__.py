@@ -8,13 +8,17 @@ from slamlib.dataset import DatasetError, read_dataset, read_truth
 
 
 def main(arguments=None):
-    """Run one command; returns the exit code: 0, 1 for a failing notebook, 2 for bad input."""
+    """Run one command; returns the exit code: 0, 1 for a failing notebook, 2 for bad input, 130 for
+    an interruption."""
     options = _parser().parse_args(arguments)
     try:
         return options.run(options)
     except (DatasetError, OSError) as error:
         print(f"slamlib: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print("slamlib: interrupted", file=sys.stderr)
+        return 130
 
 
 def _parser():
@@ -41,7 +45,7 @@ def _parser():
     simulate.add_argument("folder", type=Path, metavar="FOLDER", help="a new or empty folder")
     simulate.add_argument("--path", choices=("short", "long"), default="short")
     simulate.add_argument("--seed", type=_count, default=0)
-    simulate.add_argument("--slip", type=_size, default=1e-3, metavar="SQRT_M",
+    simulate.add_argument("--slip", type=_share, default=1e-3, metavar="SQRT_M",
                           help="wheel slip: sigma after one metre, in m (default %(default)s)")
     simulate.add_argument("--nlos", type=_share, default=0.0, metavar="SHARE",
                           help="share of UWB ranges without line of sight, which are too long")
@@ -55,12 +59,19 @@ def _report(options):
     from slamlib.report import NotebookError, build_report
     try:
         pages = build_report(options.notebooks, options.data, options.report, options.results,
-                             options.datasets or None, options.jobs)
+                             [_name(dataset, options.data) for dataset in options.datasets] or None,
+                             options.jobs)
     except NotebookError as error:
         print(f"slamlib: {error}", file=sys.stderr)
         return 1
     print(f"report: {pages[0]}", file=sys.stderr)
     return 0
+
+
+def _name(dataset, data):
+    """A dataset's name, which may also be given as the path of its folder in the data folder."""
+    path = Path(dataset)
+    return path.name if path.resolve().parent == data.resolve() else dataset
 
 
 def _solve(options):
@@ -73,12 +84,12 @@ def _solve(options):
 def _table(summary):
     """The summary as a short table, one line a problem."""
     lines = [f"{summary['dataset']}: {summary['poses']} poses",
-             f"{'problem':16} {'path':>9} {'last x, y, heading':>30} {'last sigmas':>29} {'ATE':>9}"]
+             f"{'problem':15}{'estimates':>10}{'last x, y, heading':>29}{'their sigmas':>27}{'ATE':>11}"]
     for name, row in summary["problems"].items():
-        pose = "{:9.3f} m {:8.3f} m {:7.4f}".format(*row["last_pose"])
-        sigma = "{:8.4f} m {:8.4f} m {:7.4f}".format(*row["last_sigma"])
-        error = f"{row['ate_m']:7.4f} m" if "ate_m" in row else "no truth"
-        lines.append(f"{name:16} {row['path_length_m']:7.2f} m {pose:>30} {sigma:>29} {error:>9}")
+        pose = "{:8.3f} m {:8.3f} m {:7.4f}".format(*row["last_pose"])
+        sigma = "{:7.4f} m {:7.4f} m {:6.4f}".format(*row["last_sigma"])
+        error = f"{row['ate_m']:9.4f} m" if "ate_m" in row else "no truth"
+        lines.append(f"{name:15}{row['estimated_poses']:10}{pose:>29}{sigma:>27}{error:>11}")
     return "\n".join(lines)
 
 
@@ -104,17 +115,10 @@ def _jobs(text):
     return value
 
 
-def _size(text):
-    value = float(text)
-    if not 0 <= value < float("inf"):
-        raise argparse.ArgumentTypeError(f"expected a number from 0 on, found {text}")
-    return value
-
-
 def _share(text):
-    value = _size(text)
-    if value > 1:
-        raise argparse.ArgumentTypeError(f"expected a share from 0 to 1, found {text}")
+    value = float(text)
+    if not 0 <= value <= 1:
+        raise argparse.ArgumentTypeError(f"expected a number from 0 to 1, found {text}")
     return value
 
 

@@ -12,6 +12,7 @@ Whatever else does not fit the format raises `DatasetError`, which says where an
 import re
 import tomllib
 from dataclasses import dataclass, fields, replace
+from difflib import get_close_matches
 from itertools import islice
 from os.path import abspath
 from pathlib import Path
@@ -21,7 +22,9 @@ import numpy as np
 ABSURD = 1e15  # no number of ours is this large, and below it float64 holds every integer
 SMALLEST_SIGMA = 1e-9  # a standard deviation (or wheel parameter) below this counts as zero
 SMALLEST_EIGENVALUE = 1e-12  # of a correlation matrix; below this it is singular
-MOST_REVOLUTIONS = 100  # of a wheel, in one step
+MOST_REVOLUTIONS = 10  # of a wheel, in one step
+FILES = ("encoderReading.txt", "ArucoReading.txt", "UwbReading.txt", "UwbAntennaGuess.txt",
+         "vehicle.toml", "truth")
 
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 CONTROL_BYTE = re.compile(rb"[\x00-\x08\x0e-\x1f]")
@@ -98,7 +101,7 @@ class Truth:
 
 
 def dataset_names(data, names=None):
-    """Names of the datasets in a folder: its sub-folders with an encoder file, or a selection.
+    """Names of the datasets in a folder: its sub-folders with any of FILES, or a selection.
 
     Parameters
     ----------
@@ -112,14 +115,16 @@ def dataset_names(data, names=None):
         There is no dataset, or none of a wanted name.
     """
     data = Path(data)
-    found = sorted(path.name for path in data.glob("*")
-                   if path.is_dir() and not path.name.startswith(".")
-                   and _find(path, "encoderReading.txt") is not None)
+    known = {name.lower() for name in FILES}
+    found = sorted(path.name for path in data.glob("[!.]*")
+                   if path.is_dir() and any(file.name.lower() in known for file in path.iterdir()))
     if not found:
         raise DatasetError(f"{data}: expected a sub-folder with an encoderReading.txt, found none")
     for name in names or []:
-        if name not in found:
+        if name not in found and not (data / name).is_dir():
             raise DatasetError(f"{data}: expected one of {', '.join(found)}, found {_quote(name)}")
+    for name in found if names is None else names:
+        _find(data / name, "encoderReading.txt", required=True)
     return found if names is None else list(names)
 
 
@@ -224,7 +229,8 @@ def _read_ticks(folder, vehicle):
     _require((ticks == np.rint(ticks)).all(axis=1), path, "whole numbers of ticks")
     _require(~ticks[:1].any(axis=1), path, "'1 0 0' as the first row (nothing leads to pose 1)")
     most = MOST_REVOLUTIONS * vehicle.ticks_per_revolution
-    expected = f"at most {MOST_REVOLUTIONS} wheel revolutions ({most:g} ticks) in one step"
+    expected = (f"at most {MOST_REVOLUTIONS} wheel revolutions ({most:g} ticks) in one step (counts "
+                "since the pose before, not since the start)")
     _require((abs(ticks) <= most).all(axis=1), path, expected)
     return ticks.astype(np.int64)
 
@@ -237,6 +243,7 @@ def _read_aruco(folder, pose_count):
         return None
     pose = _pose_rows(table[:, 0], pose_count, path)
     marker = _ids(table[:, 1], path)
+    _require(abs(table[:, 4]) < 2 * np.pi + 1e-3, path, "an angle theta in radians (below 2 pi)")
     covariance = table[:, [[5, 6, 7], [6, 8, 9], [7, 9, 10]]]
     variance = table[:, [5, 8, 10]]
     is_positive = variance >= SMALLEST_SIGMA**2
@@ -309,14 +316,21 @@ def _pose_rows(values, pose_count, path):
 
 
 def _find(folder, name, required=False):
-    """Path of a file in the folder, whatever the case of its name; None if there is none."""
+    """Path of a file in the folder, whatever the case of its name; None if there is none.
+
+    A name that is almost right is an error: the file would be silently left out.
+    """
     try:
-        paths = [path for path in Path(folder).iterdir() if path.name.lower() == name.lower()]
+        there = {path: path.name.lower() for path in Path(folder).iterdir()}
     except (OSError, ValueError):  # ValueError: a NUL character in the folder's name
         raise _error(folder, "expected a folder that can be read") from None
+    paths = [path for path, lower in there.items() if lower == name.lower()]
     if len(paths) > 1:
         names = " and ".join(sorted(path.name for path in paths))
         raise _error(Path(folder) / name, f"expected one file of this name, found {names}")
+    if not paths and (almost := get_close_matches(name.lower(), there.values(), 1, cutoff=0.9)):
+        wrong = next(path for path, lower in there.items() if lower == almost[0])
+        raise _error(wrong, f"expected the name {name}")
     if required and not paths:
         raise _error(Path(folder) / name, "expected this file, found none")
     return paths[0] if paths else None

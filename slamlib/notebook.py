@@ -19,12 +19,19 @@ class Log:
     dataset: Dataset
     truth: Truth | None
 
+    @property
+    def origin(self):
+        """What is known of where the data come from: true wheel radii are known in simulations only."""
+        if self.truth is None:
+            return "recorded"
+        return "recorded, truth known" if self.truth.vehicle == self.dataset.vehicle else "simulated"
+
 
 def start():
     """Set the look of the figures and read the logs.
 
     The data folder is SLAMLIB_DATA, or else the nearest `data` in this folder or above it.
-    SLAMLIB_DATASETS selects folders in it by name, joined by os.pathsep; by default all are read.
+    SLAMLIB_DATASETS selects folders in it by name, one a line; by default all are read.
 
     Returns
     -------
@@ -39,7 +46,7 @@ def start():
     set_matplotlib_formats("svg", metadata={"Date": None})
     data = _folder("SLAMLIB_DATA", "data")
     selected = os.environ.get("SLAMLIB_DATASETS")
-    names = dataset_names(data, selected.split(os.pathsep) if selected else None)
+    names = dataset_names(data, selected.split("\n") if selected else None)
     logs = [Log(name, read_dataset(data / name), read_truth(data / name)) for name in names]
     return sorted(logs, key=lambda log: len(log.dataset.ticks))
 
@@ -54,8 +61,13 @@ def with_truth(logs, lost):
     """The logs that have truth; for the others a sentence says that `lost` cannot be shown."""
     without = [log.name for log in logs if log.truth is None]
     if without:
-        say(f"*No truth comes with {' and '.join(without)}, so {lost} cannot be shown there.*")
+        say(f"*No truth comes with {listed(without)}, so {lost} cannot be shown there.*")
     return [log for log in logs if log.truth is not None]
+
+
+def listed(names):
+    """a, b and c."""
+    return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
 
 
 def say(markdown):

@@ -197,6 +197,50 @@ def increments(ticks, vehicle, start, end, model="euler"):
             by_start @ by_w[start] + by_end @ by_w[end])
 
 
+def increment_noise(ticks, vehicle, start, end, slip):
+    """Covariances of increments from what differs in every step: rounding of counts, and slip.
+
+    A wheel that travels s metres errs by slip with variance slip^2 |s|; the rounding of cumulative
+    counts at both ends of an increment adds one sixth of a count squared, spread over its steps.
+    Wheel errors e_R, e_L in the step at p along the unit vector u lengthen it by (e_R + e_L) / 2
+    and turn what follows by (e_R - e_L) / b, which moves its end p_e by that times S (p_e - p),
+    S = [[0, -1], [1, 0]]. What a step contributes is linear in p_e, so it is summed up once.
+
+    Parameters
+    ----------
+    ticks : (n, 2) counts of the right and left wheel.
+    vehicle : Vehicle
+    start, end : (m,) indices from 0 of the poses, start < end.
+    slip : sqrt(m), standard deviation of the slip of one wheel after one metre.
+
+    Returns
+    -------
+    (m, 3, 3) covariance of [x, y, heading] of pose `end` in the frame of pose `start`.
+    """
+    poses = dead_reckoning(ticks, vehicle, model="arc")
+    ds, dtheta, _, _ = steps(ticks, vehicle)
+    u = np.stack([np.cos(poses[:-1, 2] + dtheta / 2), np.sin(poses[:-1, 2] + dtheta / 2)], -1)
+    p = (poses[:-1, :2] + poses[1:, :2]) / 2
+    sides = vehicle.wheelbase / 2 * np.array([1, -1])
+    turn = 1 / (2 * sides)                                             # by e_R, by e_L
+    by_wheel = np.empty((len(ds), 3, 2))                               # of (end - S p_e turn, turn)
+    by_wheel[:, 0] = u[:, :1] / 2 + p[:, 1:] * turn
+    by_wheel[:, 1] = u[:, 1:] / 2 - p[:, :1] * turn
+    by_wheel[:, 2] = turn
+    outer = by_wheel[:, :, None, :] * by_wheel[:, None, :, :]          # (n-1, 3, 3, wheel)
+    from_slip = outer @ (slip**2 * np.abs(ds[:, None] + sides * dtheta[:, None])[:, None, :, None])
+    radii = np.array([vehicle.right_radius, vehicle.left_radius])
+    from_rounding = outer @ ((2 * np.pi * radii / vehicle.ticks_per_revolution)**2 / 6)
+    start, end = np.asarray(start), np.asarray(end)
+    total = [_accumulate(part) for part in (from_slip[..., 0], from_rounding)]
+    summed = total[0][end] - total[0][start] \
+        + (total[1][end] - total[1][start]) / (end - start)[:, None, None]
+    to_end = np.broadcast_to(np.eye(3), summed.shape).copy()
+    to_end[:, 0, 2], to_end[:, 1, 2] = -poses[end, 1], poses[end, 0]
+    in_world = to_end @ summed @ np.swapaxes(to_end, 1, 2)
+    return se2.rotate_covariance(in_world, -poses[start, 2])
+
+
 def monte_carlo(ticks, vehicle, at, rng, draws=400, model="euler"):
     """Poses of vehicles whose wheel parameters and initial heading are drawn from their sigmas.
 

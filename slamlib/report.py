@@ -52,7 +52,7 @@ def build_report(notebooks, data, report, results, datasets=None, jobs=2):
     """Execute the notebooks of a folder; write a page for each, and `index.html`.
 
     Kernels find the absolute paths of data and results, and the selection, in the environment
-    variables SLAMLIB_DATA, SLAMLIB_RESULTS and SLAMLIB_DATASETS (joined by `os.pathsep`).
+    variables SLAMLIB_DATA, SLAMLIB_RESULTS and SLAMLIB_DATASETS (names, one a line).
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ def _environment(settings, data, results, datasets, jobs):
                     "IPYTHONDIR": str(settings), "MATPLOTLIBRC": str(settings / "matplotlibrc"),
                     "MPLBACKEND": "module://matplotlib_inline.backend_inline"}
     environment.pop("SLAMLIB_DATASETS", None)
-    return environment | ({"SLAMLIB_DATASETS": os.pathsep.join(datasets)} if datasets else {})
+    return environment | ({"SLAMLIB_DATASETS": "\n".join(datasets)} if datasets else {})
 
 
 async def _execute_all(books, environment, jobs):

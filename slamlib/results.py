@@ -22,6 +22,25 @@ def write_vehicle_poses(folder, poses, covariances):
     _write(Path(folder) / "vehiclePose.mat", pose=poses, covari=covariances)
 
 
+def write_aruco_map(folder, ids, poses, covariances):
+    """Write folder/ArucoMap.mat: ArucoMap(k).pose, .covari and .id, in ascending id.
+
+    Parameters
+    ----------
+    folder : path, made if it does not exist.
+    ids : (k,) marker ids, ascending.
+    poses : (k, 3) [x, y, heading] in world axes, headings in (-pi, pi].
+    covariances : (k, 3, 3) of [x, y, heading] in world axes.
+    """
+    _write(Path(folder) / "ArucoMap.mat", pose=poses, covari=covariances, id=ids)
+
+
+def read_aruco_map(folder):
+    """Ids (k,), poses (k, 3) and covariances (k, 3, 3) of an ArucoMap.mat."""
+    content = _read(Path(folder) / "ArucoMap.mat")
+    return content["id"][:, 0].astype(int), content["pose"], content["covari"]
+
+
 def read_vehicle_poses(folder):
     """Poses (n, 3) and covariances (n, 3, 3) of a vehiclePose.mat."""
     content = _read(Path(folder) / "vehiclePose.mat")
@@ -45,7 +64,8 @@ def _write(path, **fields):
     structs = np.empty((1, length), dtype=[(name, object) for name in fields])
     for name, values in fields.items():
         rows = np.asarray(values, dtype=float)
-        rows = rows[:, None, :] if rows.ndim == 2 else rows       # vectors are 1 x d in MATLAB
+        if rows.ndim < 3:                                         # vectors are 1 x d in MATLAB
+            rows = rows.reshape(length, 1, -1)
         structs[name][0, :] = list(rows)
     buffer = BytesIO()
     savemat(buffer, {path.stem: structs})

@@ -16,7 +16,8 @@ import numpy as np
 
 def wrap(angle):
     """Angle in radians, any shape, brought to (-pi, pi]."""
-    return np.pi - np.mod(np.pi - np.asarray(angle, dtype=float), 2 * np.pi)
+    wrapped = np.pi - np.mod(np.pi - np.asarray(angle, dtype=float), 2 * np.pi)
+    return np.where(wrapped <= -np.pi, np.pi, wrapped)         # a remainder rounded up to 2 pi
 
 
 def rotation(heading):

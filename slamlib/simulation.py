@@ -60,7 +60,7 @@ def simulate(path="short", seed=0, *, slip=1e-3, late_ranges=0.0, mislabelled=0.
     """
     layout = PATHS[path]
     rng = np.random.default_rng(seed)
-    draws = rng.standard_normal(3) if noise else np.zeros(3)
+    draws = noise * rng.standard_normal(3)
     true_vehicle = replace(
         vehicle,
         right_radius=vehicle.right_radius + vehicle.sigma_right_radius * draws[0],
@@ -77,6 +77,28 @@ def simulate(path="short", seed=0, *, slip=1e-3, late_ranges=0.0, mislabelled=0.
     guess = AntennaGuess(antenna, antenna_in_world + noise * offset)
     return (Dataset(path, vehicle, ticks, aruco, uwb, guess),
             Truth(poses, marker, marker_in_world, antenna, antenna_in_world, true_vehicle))
+
+
+def manoeuvre(legs, vehicle=Vehicle(), step=0.01):
+    """Counts of a drive in arcs, without noise: to show or test what a certain drive does.
+
+    Parameters
+    ----------
+    legs : list of (metres, radians) driven and turned in each leg; negative metres are backwards.
+    vehicle : Vehicle
+    step : m, the longest step.
+
+    Returns
+    -------
+    (n, 2) counts of the right and left wheel, with fractions; row 0 is zero.
+    """
+    half, counts = vehicle.wheelbase / 2, [np.zeros((1, 2))]
+    for length, turn in legs:
+        steps = int(np.ceil(max(abs(length), abs(turn) * half) / step))
+        travel = np.array([length + half * turn, length - half * turn]) / steps
+        radii = np.array([vehicle.right_radius, vehicle.left_radius])
+        counts.append(np.tile(travel * vehicle.ticks_per_revolution / (2 * np.pi * radii), (steps, 1)))
+    return np.concatenate(counts)
 
 
 def write_dataset(folder, dataset, truth=None):

@@ -2,39 +2,75 @@
 
 import json
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from slamlib import evaluation, odometry, results
+from slamlib import evaluation, fusion, localization, odometry, results, se2
 
 
 @dataclass(frozen=True)
 class Solution:
-    """What one problem yields: poses (n, 3), covariances (n, 3, 3), and what it is called."""
+    """What one problem yields, for every pose of the encoder file."""
 
-    problem: str
+    problem: str                   # folder of the results
     title: str
-    poses: np.ndarray
-    covariances: np.ndarray
+    poses: np.ndarray              # (n, 3) in the world frame; NaN where there is no estimate
+    covariances: np.ndarray        # (n, 3, 3) of [x, y, heading] in world axes
+    world: int = 0                 # index from 0 of the pose whose frame is the world frame
+    aruco_map: tuple | None = None         # marker ids (k,), poses (k, 3), covariances (k, 3, 3)
+    facts: dict = field(default_factory=dict)       # plain numbers for the summary
 
 
 def problem1(dataset):
     """Odometry: equation 1 and the covariance of equation 2."""
-    poses, covariances = odometry.equation2(dataset.ticks, dataset.vehicle)
-    return Solution("problem1", "odometry", poses, covariances)
+    return Solution("problem1", "odometry", *odometry.equation2(dataset.ticks, dataset.vehicle))
+
+
+def problem2(dataset):
+    """Incremental localization from the markers alone; the world is the first measured pose."""
+    found = localization.localize(dataset.aruco)
+    poses = np.full((len(dataset.ticks), 3), np.nan)
+    covariances = np.full((len(dataset.ticks), 3, 3), np.nan)
+    poses[found.frame], covariances[found.frame] = found.poses, found.covariances
+    known = np.isfinite(found.poses[:, 0])
+    poses[found.frame[known], 2] = np.unwrap(found.poses[known, 2])
+    return Solution("problem2", "ArUco", poses, covariances, int(found.frame[0]),
+                    (found.marker, found.marker_in_world, found.marker_covariance),
+                    {"measured_poses": len(found.frame), "localized_poses": int(known.sum()),
+                     "sightings": len(dataset.aruco.pose), "outliers": int(found.outlier.sum())})
+
+
+def problem2_fused(dataset):
+    """Odometry and markers fused incrementally, with the errors that they share."""
+    fused = fusion.fuse(dataset)
+    return Solution("problem2_fused", "odometry + ArUco", fused.poses, fused.covariances, facts={
+        "slip_sqrt_m": fused.slip, "outliers": fused.outliers, "wheel_parameters_m": fused.wheel.tolist(),
+        "wheel_parameter_sigmas_m": np.sqrt(np.diag(fused.wheel_covariance)).tolist()})
 
 
 def solve(dataset):
     """Yield the Solution of every problem that the dataset's sensors allow, in order."""
     yield problem1(dataset)
+    if dataset.aruco is not None:
+        yield problem2(dataset)
+        yield problem2_fused(dataset)
+
+
+def truth_in_world_of(solution, truth):
+    """The true poses (n, 3) in the solution's world frame."""
+    if solution.world == 0:
+        return truth.poses
+    return se2.between(truth.poses[solution.world], truth.poses)
 
 
 def write(folder, solution):
     """Write a solution's .mat files into folder/<problem>/ and return that folder."""
     folder = Path(folder) / solution.problem
     results.write_vehicle_poses(folder, solution.poses, solution.covariances)
+    if solution.aruco_map is not None:
+        results.write_aruco_map(folder, *solution.aruco_map)
     return folder
 
 
@@ -58,18 +94,24 @@ def solve_to_folder(dataset, truth, out):
         solutions.append(solution)
         summary["problems"][solution.problem] = {"title": solution.title,
                                                  **summarize(solution, truth), "seconds": seconds}
+    text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     for solution in solutions:
         write(out, solution)
-    text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     results.write_atomically(Path(out) / "summary.json", text.encode())
     return summary
 
 
 def summarize(solution, truth):
-    """Last pose with its sigmas and, where there is truth, errors: a dict of plain numbers."""
-    sigma = np.sqrt(np.diagonal(solution.covariances[-1]))
+    """Last estimate with its sigmas and, where there is truth, errors: a dict of plain numbers."""
+    known = np.flatnonzero(np.isfinite(solution.poses[:, 0]))
+    last = known[-1]
     summary = {"path_length_m": evaluation.path_length(solution.poses),
-               "last_pose": solution.poses[-1].tolist(), "last_sigma": sigma.tolist()}
+               "estimated_poses": len(known), "world_is_pose": solution.world + 1,
+               "last_pose_number": int(last) + 1, "last_pose": solution.poses[last].tolist(),
+               "last_sigma": evaluation.sigmas(solution.covariances[last]).tolist(),
+               **solution.facts}
     if truth is not None:
-        summary["ate_m"] = evaluation.ate(solution.poses, truth.poses)
+        true_poses = truth_in_world_of(solution, truth)
+        summary["ate_m"] = evaluation.ate(solution.poses, true_poses)
+        summary["ate_aligned_m"] = evaluation.ate(solution.poses, true_poses, aligned=True)
     return summary

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slamlib.dataset import DatasetError, Vehicle, read_dataset, read_truth
+from slamlib.dataset import DatasetError, Vehicle, dataset_names, read_dataset, read_truth
 
 FILES = {
-    "encoderReading.txt": "1 0 0\n2 10 12\n3 -5 7\n4 0 800000\n",
+    "encoderReading.txt": "1 0 0\n2 10 12\n3 -5 7\n4 0 80000\n",
     # Out of order in pose, and marker 40 seen twice at pose 3.
     "ArucoReading.txt": (
         "3 40 1.5 -2 0.5 4e-4 1e-4 0 9e-4 0 1e-4\n"
@@ -83,7 +83,7 @@ def test_measurements_are_exactly_those_written(folder):
     assert data.name == "drive"
     assert data.vehicle == VEHICLE
     assert isinstance(data.vehicle.ticks_per_revolution, float)
-    assert_ints(data.ticks, [[0, 0], [10, 12], [-5, 7], [0, 800000]])
+    assert_ints(data.ticks, [[0, 0], [10, 12], [-5, 7], [0, 80000]])
     assert_ints(data.aruco.pose, [1, 2, 2])
     assert_ints(data.aruco.marker, [-7, 40, 40])
     np.testing.assert_array_equal(
@@ -205,7 +205,7 @@ def test_names_in_another_case_are_found(folder, change):
 
 def test_numbers_in_other_spellings(folder):
     clean = read_dataset(folder)
-    write(folder / "encoderReading.txt", "1.0 -0 0e5\n+2 1E1 12.\n3e0 -.5e1 7\n004 0 8e+5\n")
+    write(folder / "encoderReading.txt", "1.0 -0 0e5\n+2 1E1 12.\n3e0 -.5e1 7\n004 0 8e+4\n")
     assert_same(read_dataset(folder), clean)
 
 
@@ -274,8 +274,8 @@ ERRORS = [
     ("encoderReading.txt", third_row("3 5 1e15"), 5, "1e+15"),
     ("encoderReading.txt", third_row("3 -1e15 5"), 5, "1e+15"),
     ("encoderReading.txt", third_row("3 5.5 6"), 5, "whole number"),
-    ("encoderReading.txt", third_row("3 5 800001"), 5, "100 wheel revolutions"),
-    ("encoderReading.txt", third_row("3 -800001 5"), 5, "100 wheel revolutions"),
+    ("encoderReading.txt", third_row("3 5 80001"), 5, "10 wheel revolutions"),
+    ("encoderReading.txt", third_row("3 -80001 5"), 5, "10 wheel revolutions"),
     ("encoderReading.txt", third_row("4 5 6"), 5, "in order"),
     ("encoderReading.txt", third_row("2 5 6"), 5, "in order"),
     ("encoderReading.txt", third_row("2.5 5 6"), 5, "in order"),
@@ -294,6 +294,7 @@ ERRORS = [
     ("ArucoReading.txt", third_row("1.5 40 0 0 0 1 0 0 1 0 1"), 5, "whole number"),
     ("ArucoReading.txt", third_row("1 4.5 0 0 0 1 0 0 1 0 1"), 5, "whole number"),
     ("ArucoReading.txt", third_row("1 40 0 nan 0 1 0 0 1 0 1"), 5, "finite number"),
+    ("ArucoReading.txt", third_row("1 40 0 0 90 1 0 0 1 0 1"), 5, "in radians"),
     ("ArucoReading.txt", third_row(ARUCO_ROW + "0 0 0 1 0 1"), 5, "positive variance"),
     ("ArucoReading.txt", third_row(ARUCO_ROW + "1 0 0 -1 0 1"), 5, "positive variance"),
     ("ArucoReading.txt", third_row(ARUCO_ROW + "1 0 0 1 0 9e-19"), 5, "positive variance"),
@@ -475,3 +476,30 @@ def test_corrupted_files_never_end_in_a_traceback(folder, name):
             assert ": expected " in message
             outcomes.add("refused")
     assert outcomes == {"read", "refused"}
+
+
+@pytest.mark.parametrize("wrong, right", [
+    ("ArucoReadings.txt", "ArucoReading.txt"), ("uwbreadng.txt", "UwbReading.txt"),
+    ("vehicles.toml", "vehicle.toml"), ("UwbAntenaGuess.txt", "UwbAntennaGuess.txt")])
+def test_a_name_that_is_almost_right_is_not_left_out_silently(folder, wrong, right):
+    for path in folder.glob(right):
+        path.unlink()
+    write(folder / wrong, "")
+    with pytest.raises(DatasetError, match=f"{wrong}: expected the name {right}$"):
+        read_dataset(folder)
+
+
+def test_dataset_names_are_those_of_folders_with_any_file_of_a_dataset(tmp_path):
+    for name, file in (("b", "encoderReading.txt"), ("a", "ENCODERREADING.TXT"),
+                       (".hidden", "encoderReading.txt"), ("notes", "notes.txt")):
+        (tmp_path / name).mkdir()
+        write(tmp_path / name / file, "1 0 0\n")
+    assert dataset_names(tmp_path) == ["a", "b"] and dataset_names(tmp_path, ["b"]) == ["b"]
+    with pytest.raises(DatasetError, match="expected one of a, b, found 'c'"):
+        dataset_names(tmp_path, ["c"])
+    with pytest.raises(DatasetError, match="notes.encoderReading.txt: expected this file, found none"):
+        dataset_names(tmp_path, ["notes"])
+    (tmp_path / "half").mkdir()
+    write(tmp_path / "half" / "UwbReading.txt", "")
+    with pytest.raises(DatasetError, match="half.encoderReading.txt: expected this file, found none"):
+        dataset_names(tmp_path)

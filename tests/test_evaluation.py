@@ -1,6 +1,6 @@
 import numpy as np
 
-from slamlib import evaluation
+from slamlib import evaluation, se2
 
 
 def test_ate_and_path_length_by_hand():
@@ -17,3 +17,72 @@ def test_nees_by_hand_and_across_the_cut_of_the_heading():
     before = poses.copy()
     np.testing.assert_allclose(evaluation.nees(poses, C, truth), [3, 1, np.nan], rtol=1e-9)
     np.testing.assert_array_equal(poses, before)
+
+
+def drive(n=200, seed=0):
+    rng = np.random.default_rng(seed)
+    truth = np.cumsum(rng.normal([0.1, 0.02, 0.03], 0.02, (n, 3)), axis=0)
+    return truth + rng.normal(0, 0.05, (n, 3)), truth
+
+
+def as_evo(poses):
+    from evo.core.trajectory import PosePath3D
+    matrices = np.tile(np.eye(4), (len(poses), 1, 1))
+    matrices[:, :2, :2], matrices[:, :2, 3] = se2.rotation(poses[:, 2]), poses[:, :2]
+    return PosePath3D(poses_se3=list(matrices))
+
+
+def test_ate_and_rpe_agree_with_evo():
+    from evo.core import metrics
+    poses, truth = drive()
+    shifted = se2.compose([3.0, -2.0, 2.5], poses)
+    for aligned in (False, True):
+        reference, estimate = as_evo(truth), as_evo(shifted)
+        if aligned:
+            estimate.align(reference)
+        ape = metrics.APE(metrics.PoseRelation.translation_part)
+        ape.process_data((reference, estimate))
+        expected = ape.get_statistic(metrics.StatisticsType.rmse)
+        assert np.isclose(evaluation.ate(shifted, truth, aligned), expected, rtol=1e-9)
+    for step in (1, 7):
+        for relation, got in zip((metrics.PoseRelation.translation_part,
+                                  metrics.PoseRelation.rotation_angle_rad),
+                                 evaluation.rpe(shifted, truth, step)):
+            rpe = metrics.RPE(relation, delta=step, delta_unit=metrics.Unit.frames, all_pairs=True)
+            rpe.process_data((as_evo(truth), as_evo(shifted)))
+            assert np.isclose(got, rpe.get_statistic(metrics.StatisticsType.rmse), rtol=1e-9)
+
+
+def test_alignment_finds_the_motion_and_unknown_poses_are_left_out():
+    _, truth = drive()
+    motion = np.array([1.0, 2.0, -2.8])
+    moved = se2.compose(se2.inverse(motion), truth)
+    np.testing.assert_allclose(evaluation.align(moved, truth), motion, atol=1e-12)
+    moved[[3, 50]] = np.nan
+    assert evaluation.ate(moved, truth, aligned=True) < 1e-12
+    assert max(evaluation.rpe(moved, truth, 5)) < 1e-12
+    moved[:] = np.nan
+    assert np.isnan(evaluation.ate(moved, truth)) and np.isnan(evaluation.rpe(moved, truth, 5)).all()
+
+
+def test_nees_band_is_that_of_the_tables():
+    """Chi-squared, 3 degrees of freedom: 0.216 and 9.348; 150 degrees: 117.985 and 185.800."""
+    np.testing.assert_allclose(evaluation.nees_band(1), [0.2158, 9.3484], atol=1e-4)
+    np.testing.assert_allclose(evaluation.nees_band(50), np.array([117.985, 185.800]) / 50, atol=1e-4)
+
+
+def test_differences_of_covariances():
+    reference = np.array([np.diag([0, 0, 1e-8]), np.diag([4.0, 1.0, 1.0]), np.diag([9.0, 1.0, 1.0])])
+    other = reference.copy()
+    other[1, 0, 0], other[1, 0, 2], other[1, 2, 0] = 1.0, 0.5, 0.5
+    assert np.isclose(evaluation.sigma_difference(other, reference), 1 / 3)
+    assert np.isclose(evaluation.correlation_difference(other, reference), np.sqrt(0.25 / 4))
+    still = np.array([np.diag([0, 0, 1e-8])])
+    assert np.isnan(evaluation.sigma_difference(still, still))
+    assert np.isnan(evaluation.correlation_difference(still, still))
+
+
+def test_indices_along_a_path():
+    np.testing.assert_array_equal(evaluation.along(1), [0])
+    np.testing.assert_array_equal(evaluation.along(2), [1])
+    np.testing.assert_array_equal(evaluation.along(101, 3), [1, 50, 100])

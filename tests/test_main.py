@@ -55,9 +55,10 @@ def test_bad_data_is_one_sentence_and_exit_code_2_and_writes_nothing(tmp_path):
 
 @pytest.mark.parametrize("arguments, word", [
     (["solve", "nowhere", "--out", "out"], "nowhere"),
-    (["simulate", "drive", "--nlos", "1.5"], "share"),
-    (["simulate", "drive", "--slip", "-1"], "number from 0"),
-    (["simulate", "drive", "--slip", "nan"], "number from 0"),
+    (["simulate", "drive", "--nlos", "1.5"], "from 0 to 1"),
+    (["simulate", "drive", "--slip", "-1"], "from 0 to 1"),
+    (["simulate", "drive", "--slip", "nan"], "from 0 to 1"),
+    (["simulate", "drive", "--slip", "1e300"], "from 0 to 1"),
     (["simulate", "drive", "--seed", "x"], "seed"),
     (["simulate", ".", "--seed", "1"], "new or empty folder"),
     (["report", "--notebooks", ROOT / "notebooks", "--data", "nowhere"], "nowhere"),

@@ -12,21 +12,29 @@ from slamlib.dataset import read_dataset
 from slamlib.odometry import equation2
 from slamlib.report import build_report
 from slamlib.results import read_vehicle_poses
-from slamlib.simulation import simulate, write_dataset
+from slamlib.simulation import manoeuvre, simulate, write_dataset
 
 ROOT = Path(__file__).parents[1]
 
 
+BROUGHT = ("new seed", "no_truth", "wheels_only", "waits", "one_pose", "backs_up")
+
+
 @pytest.fixture(scope="module")
 def built(tmp_path_factory):
-    """The report on the committed data, and on a new drive, one without truth and one bare."""
+    """The report on what is in data/, whatever that is, and on what else a user may bring."""
     folder = tmp_path_factory.mktemp("built")
     data = folder / "data"
     shutil.copytree(ROOT / "data", data)
     write_dataset(data / "new seed", *simulate("short", seed=77, late_ranges=0.15))
     shutil.copytree(data / "new seed", data / "no_truth", ignore=lambda *_: ["truth"])
-    (data / "wheels_only").mkdir()
-    shutil.copy(data / "new seed" / "encoderReading.txt", data / "wheels_only")
+    waiting = np.concatenate([np.zeros((100, 2), int), simulate("short", seed=78)[0].ticks[:200]])
+    for name, ticks in (("wheels_only", simulate("short", seed=77)[0].ticks), ("waits", waiting),
+                        ("one_pose", [[0, 0]]),
+                        ("backs_up", np.rint(manoeuvre([(2, 1.0), (-2, 0.5)])))):
+        (data / name).mkdir()
+        np.savetxt(data / name / "encoderReading.txt",
+                   np.column_stack([np.arange(1, len(ticks) + 1), ticks]), fmt="%d")
     pages = build_report(ROOT / "notebooks", data, folder / "report", folder / "results")
     return folder, {page.stem: page.read_text(encoding="utf-8") for page in pages}
 
@@ -51,10 +59,11 @@ def test_results_are_those_of_the_library(built):
 def test_pages_name_every_dataset_and_say_what_is_left_out(built):
     _, pages = built
     text = html.unescape(re.sub(r"<[^>]+>", "", pages["1_odometry"]))
-    for name in ("short", "long", "new seed", "no_truth", "wheels_only"):
+    sentence = re.search(r"No truth comes with ([^.]*?), so the error of the odometry cannot be shown",
+                         text)
+    for name in BROUGHT:
         assert name in text and name in pages["index"]
-    assert re.search(r"No truth comes with no_truth and wheels_only, so the error of the odometry "
-                     r"cannot be shown there", text)
+        assert (name in re.split(", | and ", sentence[1])) == (name != "new seed")
 
 
 def test_no_cell_wrote_to_stderr(built):

@@ -54,6 +54,8 @@ def test_batches_broadcast_and_leave_their_arguments_alone():
 def test_wrap_keeps_the_upper_end_only():
     np.testing.assert_array_equal(se2.wrap([np.pi, -np.pi, 0.0]), [np.pi, np.pi, 0.0])
     angles = np.linspace(-50, 50, 1001)
+    ends = [np.nextafter(sign * k * np.pi, to) for sign in (-1, 1) for k in (1, 3, 7) for to in (-99, 99)]
+    angles = np.concatenate([angles, ends])
     wrapped = se2.wrap(angles)
     assert (wrapped > -np.pi).all() and (wrapped <= np.pi).all()
     np.testing.assert_allclose(np.exp(1j * wrapped), np.exp(1j * angles), atol=1e-12)

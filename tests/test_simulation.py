@@ -6,7 +6,7 @@ import pytest
 
 from slamlib import odometry, se2
 from slamlib.dataset import DatasetError, Vehicle, read_dataset, read_truth
-from slamlib.simulation import simulate, write_dataset
+from slamlib.simulation import manoeuvre, simulate, write_dataset
 
 DATA = Path(__file__).parents[1] / "data"
 RECIPES = {"short": dict(path="short", seed=1),
@@ -137,3 +137,11 @@ def test_writing_never_overwrites(tmp_path):
     with pytest.raises(DatasetError, match="new or empty folder"):
         write_dataset(tmp_path / "drive", *simulate("short"))
     assert [f.name for f in tmp_path.rglob("*")] == ["drive", "notes.txt"]
+
+
+def test_manoeuvres_drive_their_legs():
+    ticks = manoeuvre([(1.0, np.pi / 2), (0.0, np.pi / 2), (-2 / np.pi, 0.0)])
+    poses = odometry.dead_reckoning(ticks, Vehicle(), model="arc")
+    np.testing.assert_allclose(poses[-1], [4 / np.pi, 2 / np.pi, np.pi], atol=1e-12)
+    ds, _, _, _ = odometry.steps(ticks, Vehicle())
+    assert np.abs(ds).max() <= 0.01 + 1e-15

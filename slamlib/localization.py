@@ -1,0 +1,142 @@
+"""Problem 2: incremental localization from the markers alone, no encoders.
+
+Two poses that see the same markers are tied to each other. With Z_j the marker j seen from the
+earlier pose, Z'_j from the later one, and Delta the later pose in the earlier pose's frame,
+
+    r_j = Z_j - Delta Z'_j,      W_j = C_j + J' C'_j J'^T,      J' = d(Delta Z'_j) / d Z'_j,
+
+and Delta minimizes the sum of r_j^T W_j^-1 r_j (`slamlib/ties.py`). Increments are composed into
+poses.
+
+Consecutive increments share the sightings Z' of the pose between them with opposite signs: an error
+seen in one is taken back by the next. So with each pose goes the cross-covariance of its error with
+the errors of the sightings made there, H_j = Cov(pose error, error of Z'_j):
+
+    C_X' = A C_X A^T + B C_Delta B^T + S + S^T,    S = A sum_j H_j (B D_j)^T,
+    H'_j = B D'_j C'_j,
+
+with A, B the derivatives of X' = X Delta by X and Delta, and D_j, D'_j those of Delta by Z_j, Z'_j.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slamlib import se2
+from slamlib.ties import GATE, common_sightings, estimate_ties, merge_repeated, plausible_ties
+
+
+@dataclass(frozen=True)
+class Localization:
+    """Measured poses, as far as markers tie them to the first one, and the markers they map."""
+
+    frame: np.ndarray               # (f,) index from 0 of every measured pose
+    poses: np.ndarray               # (f, 3) in the frame of the first one; NaN where nothing ties
+    covariances: np.ndarray         # (f, 3, 3)
+    parent: np.ndarray              # (f,) row of the frame it was localized against, -1 for none
+    outlier: np.ndarray             # (m,) bool, sightings of the dataset that were left out
+    marker: np.ndarray              # (k,) ids of the mapped markers, ascending
+    marker_in_world: np.ndarray     # (k, 3)
+    marker_covariance: np.ndarray   # (k, 3, 3) of [x, y, heading] in world axes
+
+
+def localize(aruco, shared_errors=True):
+    """Incremental localization from the sightings of markers at successive measured poses.
+
+    A measured pose is localized against the one before it where they share a marker, else against
+    the localized pose that shares most markers with it: markers whose place is known. Where there
+    is none it stays unknown until a known marker returns. The world frame is that of the first
+    measured pose. Outliers are left out as `ties.plausible_ties` says; a marker known from earlier
+    counts only in sightings that the measured pose before or after confirms.
+
+    Parameters
+    ----------
+    aruco : ArucoReadings
+    shared_errors : False drops the correlation between a pose and the sightings made there, to
+        show what it is worth.
+
+    Returns
+    -------
+    Localization
+    """
+    index, z, C = merge_repeated(aruco)
+    marker, (frame, row) = aruco.marker[index], np.unique(aruco.pose[index], return_inverse=True)
+    count = len(frame)
+    link, first, second = common_sightings(row, marker, np.arange(count - 1), np.arange(1, count))
+    ties = plausible_ties(z, C, link, first, second, np.diff(frame))
+    confirmed = np.zeros(len(row), bool)
+    confirmed[first[ties.kept]] = confirmed[second[ties.kept]] = True
+    sure = np.where(confirmed, marker, -1 - np.arange(len(marker)))          # others match nothing
+
+    poses, covariances = np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan)
+    poses[0], covariances[0] = 0.0, 0.0
+    parent = np.full(count, -1)
+    cross = np.zeros((len(row), 3, 3))                                       # H_j
+    sightings_of = np.split(np.arange(len(row)), np.searchsorted(row, np.arange(1, count)))
+    pairs_of = np.split(np.arange(len(link)), np.searchsorted(link, np.arange(1, max(1, count - 1))))
+    last_seen = {}                           # marker: last localized frame with a sure sighting
+
+    for f in range(count):
+        own = sightings_of[f]
+        if f > 0:
+            if ties.usable[f - 1] and np.isfinite(poses[f - 1, 0]):
+                parent[f], tie, pairs, l = f - 1, ties, pairs_of[f - 1], f - 1
+                a, b = first[pairs], second[pairs]
+            else:
+                known = _most_common([last_seen.get(m) for m in sure[own].tolist()])
+                if known is None:
+                    continue
+                seen = np.concatenate([sightings_of[known], own])
+                pairs, l = slice(None), 0
+                same, a, b = common_sightings(row[seen], sure[seen], [known], [f])
+                a, b = seen[a], seen[b]
+                tie = estimate_ties(z, C, same, a, b, 1)
+                if not tie.usable[0]:
+                    continue
+                parent[f] = known
+            p = parent[f]
+            poses[f] = se2.compose(poses[p], tie.increment[l])
+            A, B = se2.compose_jacobians(poses[p], tie.increment[l])
+            covariances[f] = A @ covariances[p] @ A.T + B @ tie.covariance[l] @ B.T
+            if shared_errors:
+                S = A @ np.sum(cross[a] @ np.swapaxes(B @ tie.by_first[pairs], 1, 2), axis=0)
+                covariances[f] += S + S.T
+                cross[b] = B @ tie.by_second[pairs] @ C[b]
+        last_seen.update((m, f) for m in sure[own].tolist())
+
+    outlier = np.ones(len(aruco.pose), bool)
+    outlier[index[confirmed]] = False
+    used = np.flatnonzero(confirmed & np.isfinite(poses[row, 0]))
+    return Localization(frame, poses, covariances, parent, outlier, *_map_markers(
+        marker[used], poses[row[used]], covariances[row[used]], z[used], C[used], cross[used]))
+
+
+def _most_common(frames):
+    """The frame named most often, of those the latest; None where all are None."""
+    frames = [f for f in frames if f is not None]
+    return max(set(frames), key=lambda f: (frames.count(f), f), default=None)
+
+
+def _map_markers(marker, poses, covariances, z, C, cross):
+    """Each marker where its most certain sighting puts it: ids, poses and covariances.
+
+    The sightings of one marker err together, through the poses they are made from, so they cannot
+    be averaged as if they were independent: the one with the least determinant is taken, out of
+    those that most sightings of the marker agree with.
+    """
+    A, B = se2.compose_jacobians(poses, z)
+    S = A @ cross @ np.swapaxes(B, 1, 2)
+    covariance = (A @ covariances @ np.swapaxes(A, 1, 2) + B @ C @ np.swapaxes(B, 1, 2)
+                  + S + np.swapaxes(S, 1, 2))
+    in_world = se2.compose(poses, z)
+    in_world[:, 2] = se2.wrap(in_world[:, 2])
+    size = np.linalg.slogdet(covariance)[1]
+    ids, best = np.unique(marker), []
+    for same in (np.flatnonzero(marker == i) for i in ids):
+        apart = in_world[same, None] - in_world[same]
+        apart[..., 2] = se2.wrap(apart[..., 2])
+        spread = covariance[same, None] + covariance[same]
+        squared = np.einsum("abi,abi->ab", apart, np.linalg.solve(spread, apart[..., None])[..., 0])
+        votes = np.count_nonzero(squared < GATE, axis=1)
+        best.append(min(same[votes >= votes.max() / 2], key=size.__getitem__))
+    return ids, in_world[best], covariance[best]

@@ -1,0 +1,117 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from joblib import Parallel, delayed
+
+from slamlib import se2
+from slamlib.dataset import ArucoReadings
+from slamlib.evaluation import ate, nees, nees_band
+from slamlib.localization import localize
+from slamlib.simulation import simulate
+
+SEEDS = range(100, 140)
+
+
+def only(aruco, keep):
+    return ArucoReadings(aruco.pose[keep], aruco.marker[keep], aruco.marker_in_vehicle[keep],
+                         aruco.covariance[keep])
+
+
+def test_perfect_sightings_give_the_exact_poses_and_map():
+    dataset, truth = simulate("short", seed=1, noise=False)
+    found = localize(dataset.aruco)
+    error = found.poses - truth.poses[found.frame]
+    np.testing.assert_allclose(error[:, :2], 0, atol=1e-9)
+    np.testing.assert_allclose(se2.wrap(error[:, 2]), 0, atol=1e-9)
+    true_map = truth.marker_in_world[np.searchsorted(truth.marker, found.marker)]
+    np.testing.assert_allclose(found.marker_in_world, true_map, atol=1e-9)
+    np.testing.assert_array_equal(found.parent, np.arange(len(found.frame)) - 1)
+
+
+def test_two_increments_by_hand():
+    """One marker ahead at distance 1, three poses on a line, headings known: sigmas add like lengths.
+
+    With C = s^2 I for position and almost no heading error, the increment between two poses has the
+    covariance 2 s^2, and so has the third pose, which depends on the first and the last sighting
+    only: without the shared error it would have 4 s^2. The marker's own error is that of the first
+    sighting, s^2.
+    """
+    s = 0.01
+    z = np.array([[1.0, 0, 0], [0.9, 0, 0], [0.8, 0, 0]])
+    readings = ArucoReadings(np.array([0, 10, 20]), np.full(3, 4), z,
+                             np.tile(np.diag([s**2, s**2, 1e-16]), (3, 1, 1)))
+    found, naive = localize(readings), localize(readings, shared_errors=False)
+    np.testing.assert_allclose(found.poses[:, 0], [0, 0.1, 0.2], atol=1e-12)
+    np.testing.assert_allclose(found.covariances[:, 0, 0] / s**2, [0, 2, 2], atol=1e-9)
+    np.testing.assert_allclose(naive.covariances[:, 0, 0] / s**2, [0, 2, 4], atol=1e-9)
+    np.testing.assert_allclose(found.marker_covariance[0, 0, 0] / s**2, 1, atol=1e-9)
+
+
+def test_world_frame_is_the_first_measured_pose():
+    dataset, truth = simulate("short", seed=1, noise=False)
+    late = only(dataset.aruco, dataset.aruco.pose >= 300)
+    found = localize(late)
+    assert found.frame[0] == 300
+    expected = se2.between(truth.poses[300], truth.poses[found.frame])
+    np.testing.assert_allclose(found.poses[:, :2], expected[:, :2], atol=1e-9)
+
+
+def test_nothing_known_until_a_known_marker_returns():
+    """Two halves of the path share no marker; then the first half's markers come back."""
+    dataset, truth = simulate("short", seed=1, noise=False)
+    a = dataset.aruco
+    early = np.unique(a.marker[a.pose < 400])
+    keep = (a.pose < 400) | (a.pose > 1500) | ~np.isin(a.marker, early)
+    keep &= (a.pose < 400) | (a.pose > 500)
+    found = localize(only(a, keep))
+    known = np.isfinite(found.poses[:, 0])
+    back = found.frame[np.flatnonzero(~known)[-1] + 1]
+    seen_again = np.unique(a.pose[keep & (a.pose > 1500) & np.isin(a.marker, early)])
+    assert back in seen_again[:2]                   # the second, if the first is not confirmed yet
+    assert (found.frame[~known] > 400).all() and (~known).sum() > 20
+    assert known[found.frame >= back].all()
+    assert found.parent[found.frame == back][0] < np.flatnonzero(~known)[0]
+    np.testing.assert_allclose(found.poses[known, :2], truth.poses[found.frame[known], :2], atol=1e-9)
+    assert np.isnan(found.covariances[~known]).all()
+
+
+def trial(seed, **options):
+    """NEES of the measured poses and of the map with and without shared errors, and the ATE."""
+    dataset, truth = simulate("short", seed=seed, **options)
+    found, naive = (localize(dataset.aruco, shared) for shared in (True, False))
+    true_poses = truth.poses[found.frame]
+    true_map = truth.marker_in_world[np.searchsorted(truth.marker, found.marker)]
+    pose_nees = nees(found.poses, found.covariances, true_poses)
+    return (np.nanmean(pose_nees), pose_nees[-1],
+            nees(found.marker_in_world, found.marker_covariance, true_map).mean(),
+            np.nanmean(nees(naive.poses, naive.covariances, true_poses)),
+            ate(found.poses, true_poses))
+
+
+@pytest.mark.parametrize("mislabelled", [0.0, 0.03])
+def test_monte_carlo_is_consistent(mislabelled):
+    """40 seeds; the band is that of 40 independent NEES, which a mean over poses can only narrow."""
+    runs = np.array(Parallel(n_jobs=2)(
+        delayed(trial)(seed, mislabelled=mislabelled) for seed in SEEDS))
+    low, high = nees_band(len(SEEDS))
+    along, last, marker, naive, error = runs.mean(0)
+    assert low < along < high
+    assert low < last < high
+    assert low < marker < high
+    assert naive < 0.5                    # the covariance without the shared errors is far too large
+    assert error < 0.1 and runs[:, 4].max() < 0.4                               # metres, on 20 m
+
+
+def test_a_single_frame_and_markers_without_orientation():
+    dataset, truth = simulate("short", seed=2)
+    first = localize(only(dataset.aruco, dataset.aruco.pose == 0))
+    np.testing.assert_array_equal(first.poses, [[0, 0, 0]])
+    assert len(first.marker) == 0                      # nothing confirms a marker that is seen once
+    a, rng = dataset.aruco, np.random.default_rng(0)
+    z, covariance = a.marker_in_vehicle.copy(), a.covariance.copy()
+    z[:, 2] = rng.uniform(-np.pi, np.pi, len(z))
+    covariance[:, 2], covariance[:, :, 2], covariance[:, 2, 2] = 0, 0, 1e4
+    found = localize(replace(a, marker_in_vehicle=z, covariance=covariance))
+    assert np.isfinite(found.poses).all()
+    assert ate(found.poses, truth.poses[found.frame]) < 0.5
