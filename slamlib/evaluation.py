@@ -72,6 +72,16 @@ def rpe(poses, truth, step):
     return float(np.sqrt(squared[0] + squared[1])), float(np.sqrt(squared[2]))
 
 
+def judge(poses, covariances, truth, step):
+    """ATE, aligned ATE, RPE over `step` rows and mean NEES of one trajectory: a dict of numbers."""
+    translation, rotation = rpe(poses, truth, step)
+    values = nees(poses, covariances, truth)
+    values = values[np.isfinite(values)]
+    return {"ate": ate(poses, truth), "aligned": ate(poses, truth, aligned=True),
+            "rpe": translation, "rpe_heading": rotation,
+            "nees": float(values.mean()) if len(values) else np.nan}
+
+
 def nees_band(count, dof=3, probability=0.95):
     """Two-sided band in which the mean of `count` independent NEES lies with this probability.
 

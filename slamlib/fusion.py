@@ -23,7 +23,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from slamlib import odometry, se2
-from slamlib.ties import GATE, common_sightings, merge_repeated, plausible_ties
+from slamlib.ties import GATE, gather, tie_consecutive
 
 SLIPS = (1e-5, 3e-2)         # sqrt(m), the bounds within which slip is looked for
 
@@ -61,14 +61,10 @@ def fuse_increments(dataset, propagation=odometry.equation2):
     -------
     Fusion
     """
-    ticks, vehicle, aruco = dataset.ticks, dataset.vehicle, dataset.aruco
-    index, z, C = merge_repeated(aruco)
-    measured, row = np.unique(aruco.pose[index], return_inverse=True)
-    row += measured[0] > 0                                    # pose 1 is a frame, seen or not
-    frame = np.unique(np.r_[0, measured])
-    link, first, second = common_sightings(row, aruco.marker[index], np.arange(len(frame) - 1),
-                                           np.arange(1, len(frame)))
-    ties = plausible_ties(z, C, link, first, second, np.diff(frame))
+    ticks, vehicle = dataset.ticks, dataset.vehicle
+    sightings = gather(dataset.aruco, also=[0])
+    frame = sightings.frame
+    ties, _, first, second = tie_consecutive(sightings)
     poses, covariances = [np.zeros((1, 3))], [np.diag([0, 0, vehicle.sigma_heading])[None]**2]
     for k, (start, end) in enumerate(zip(frame, np.r_[frame[1:], len(ticks) - 1])):
         driven = ticks[start:end + 1]
@@ -87,7 +83,7 @@ def fuse_increments(dataset, propagation=odometry.equation2):
         covariances.append(path_covariance[1:])
     kept = np.unique(np.r_[first[ties.kept], second[ties.kept]])
     return Fusion(np.concatenate(poses), np.concatenate(covariances), frame,
-                  len(aruco.pose) - len(kept))
+                  len(dataset.aruco.pose) - len(kept))
 
 
 def fuse(dataset, slip=None, model="arc"):
@@ -129,16 +125,15 @@ class _Problem:
 
 
 def _prepare(dataset, model):
-    ticks, vehicle, aruco = dataset.ticks, dataset.vehicle, dataset.aruco
-    index, z, C = merge_repeated(aruco)
-    frame = np.unique(np.r_[0, aruco.pose[index]])
-    split = np.searchsorted(aruco.pose[index], frame[1:])
-    markers = list(zip(np.split(aruco.marker[index], split), np.split(z, split), np.split(C, split)))
-    start, end = frame[:-1], frame[1:]
+    ticks, vehicle, sightings = dataset.ticks, dataset.vehicle, gather(dataset.aruco, also=[0])
+    start, end = sightings.frame[:-1], sightings.frame[1:]
+    split = np.searchsorted(sightings.row, np.arange(1, len(sightings.frame)))
+    markers = list(zip(*(np.split(values, split)
+                         for values in (sightings.marker, sightings.z, sightings.C))))
     rounding = odometry.increment_noise(ticks, vehicle, start, end, 0.0)
     slipping = odometry.increment_noise(ticks, vehicle, start, end, 1.0) - rounding
-    return _Problem(dataset, model, frame, *odometry.increments(ticks, vehicle, start, end, model),
-                    rounding, slipping, markers, len(aruco.pose) - len(index))
+    return _Problem(dataset, model, sightings.frame, *odometry.increments(ticks, vehicle, start, end, model),
+                    rounding, slipping, markers, len(dataset.aruco.pose) - len(sightings.row))
 
 
 def _filter(problem, slip):

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slamlib import se2
-from slamlib.ties import GATE, common_sightings, estimate_ties, merge_repeated, plausible_ties
+from slamlib.ties import GATE, common_sightings, estimate_ties, gather, tie_consecutive
 
 
 @dataclass(frozen=True)
@@ -59,11 +59,10 @@ def localize(aruco, shared_errors=True):
     -------
     Localization
     """
-    index, z, C = merge_repeated(aruco)
-    marker, (frame, row) = aruco.marker[index], np.unique(aruco.pose[index], return_inverse=True)
-    count = len(frame)
-    link, first, second = common_sightings(row, marker, np.arange(count - 1), np.arange(1, count))
-    ties = plausible_ties(z, C, link, first, second, np.diff(frame))
+    sightings = gather(aruco)
+    row, marker, z, C = sightings.row, sightings.marker, sightings.z, sightings.C
+    ties, link, first, second = tie_consecutive(sightings)
+    count = len(sightings.frame)
     confirmed = np.zeros(len(row), bool)
     confirmed[first[ties.kept]] = confirmed[second[ties.kept]] = True
     sure = np.where(confirmed, marker, -1 - np.arange(len(marker)))          # others match nothing
@@ -105,9 +104,9 @@ def localize(aruco, shared_errors=True):
         last_seen.update((m, f) for m in sure[own].tolist())
 
     outlier = np.ones(len(aruco.pose), bool)
-    outlier[index[confirmed]] = False
+    outlier[sightings.index[confirmed]] = False
     used = np.flatnonzero(confirmed & np.isfinite(poses[row, 0]))
-    return Localization(frame, poses, covariances, parent, outlier, *_map_markers(
+    return Localization(sightings.frame, poses, covariances, parent, outlier, *_map_markers(
         marker[used], poses[row[used]], covariances[row[used]], z[used], C[used], cross[used]))
 
 

@@ -9,6 +9,7 @@ from matplotlib_inline.backend_inline import set_matplotlib_formats
 
 from slamlib import plotting
 from slamlib.dataset import Dataset, Truth, dataset_names, read_dataset, read_truth
+from slamlib.simulation import simulate
 
 
 @dataclass(frozen=True)
@@ -18,6 +19,7 @@ class Log:
     name: str
     dataset: Dataset
     truth: Truth | None
+    made_up: bool = False          # a simulated drive to read a chapter by, no dataset of the user's
 
     @property
     def origin(self):
@@ -63,6 +65,26 @@ def with_truth(logs, lost):
     if without:
         say(f"*No truth comes with {listed(without)}, so {lost} cannot be shown there.*")
     return [log for log in logs if log.truth is not None]
+
+
+def with_sensor(logs, sensor, name):
+    """The logs whose dataset has this sensor; a sentence names the others.
+
+    Where there is none, a simulated short drive takes their place, so that the chapter can be read.
+    """
+    without = [log.name for log in logs if getattr(log.dataset, sensor) is None]
+    if len(without) == len(logs):
+        say(f"*No dataset has {name}. This chapter runs on a simulated drive instead, and writes no "
+            "results.*")
+        return [Log("simulated", *simulate("short", seed=1), made_up=True)]
+    if without:
+        say(f"*There are no {name} in {listed(without)}: this chapter leaves them out.*")
+    return [log for log in logs if log.name not in without]
+
+
+def interactive():
+    """True in JupyterLab, False where the report is built."""
+    return "SLAMLIB_RESULTS" not in os.environ
 
 
 def listed(names):

@@ -12,6 +12,8 @@ import numpy as np
 from matplotlib.collections import EllipseCollection
 from matplotlib.colors import to_rgb
 
+from slamlib import se2
+
 # Okabe and Ito's colours, told apart by the colour-blind; line style and width carry grey print.
 ROLES = {
     "truth": dict(color="black", linestyle=(0, (4, 2)), linewidth=1.1, zorder=4),
@@ -20,6 +22,8 @@ ROLES = {
     "sample": dict(color="#999999", linewidth=1.0, zorder=1),
     "aruco": dict(color="#CC79A7", linewidth=1.5, zorder=3),
     "fused": dict(color="#009E73", linewidth=1.7, zorder=3),
+    "hint": dict(color="#E69F00", linestyle=(0, (5, 1, 1, 1)), linewidth=1.5, zorder=3),
+    "marker": dict(color="#333333", linestyle="none", marker="s", markersize=3, zorder=3),
     "slam": dict(color="#0072B2", linewidth=1.7, zorder=3),
 }
 
@@ -61,9 +65,12 @@ def trajectory(ax, poses, role, label=None, **look):
     return ax
 
 
-def ellipses(ax, positions, covariances, color, probability=0.95, label=None, fill=0.12):
-    """Ellipses of the given probability around positions (m, >= 2), covariances (m, >= 2, >= 2)."""
-    k = np.sqrt(-2 * np.log(1 - probability))
+def ellipses(ax, positions, covariances, color, probability=0.95, label=None, fill=0.12, enlarged=1):
+    """Ellipses of the given probability around positions (m, >= 2), covariances (m, >= 2, >= 2).
+
+    `enlarged` scales them; say so in the figure.
+    """
+    k = enlarged * np.sqrt(-2 * np.log(1 - probability))
     variances, axes = np.linalg.eigh(np.asarray(covariances)[:, :2, :2])
     widths = 2 * k * np.sqrt(np.maximum(variances, 0))
     angles = np.degrees(np.arctan2(axes[:, 1, 1], axes[:, 0, 1]))
@@ -82,11 +89,33 @@ def ellipses(ax, positions, covariances, color, probability=0.95, label=None, fi
     return ax
 
 
+def markers(ax, in_world, covariances, role="marker", label="markers"):
+    """Markers (k, >= 2) as squares with their 95 % ellipses."""
+    ellipses(ax, in_world, covariances, "#bbbbbb", fill=0.35)
+    ax.plot(in_world[:, 0], in_world[:, 1], label=label, **ROLES[role])
+    return ax
+
+
+def enlargement(poses, covariances):
+    """1, 2, 5, 10, ...: how much to enlarge ellipses so that the largest is a tenth of the path.
+
+    The path's extent is that of the known poses (n, >= 2); covariances are (n, >= 2, >= 2).
+    """
+    known = np.isfinite(poses[:, 0])
+    extent = np.ptp(poses[known, :2], axis=0).max()
+    largest = 2.45 * np.sqrt(np.linalg.eigvalsh(covariances[known, :2, :2])[:, 1].max())
+    wanted = 0.05 * extent / largest if largest > 0 else 1
+    steps = np.outer(10.0 ** np.arange(4), [1, 2, 5]).ravel()
+    return int(steps[max(0, np.searchsorted(steps, wanted, side="right") - 1)])
+
+
 def spread(poses, count=14):
-    """Indices of about `count` poses, equally far apart along the path: few enough to read."""
-    travelled = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
+    """Indices of about `count` known poses, equally far apart along the path: few enough to read."""
+    known = np.flatnonzero(np.isfinite(poses[:, 0]))
+    steps = np.hypot(*np.diff(poses[known, :2], axis=0).T)
+    travelled = np.concatenate([[0], np.cumsum(steps)])
     wanted = np.linspace(0, travelled[-1], count + 1)[1:]
-    return np.unique(np.minimum(np.searchsorted(travelled, wanted), len(poses) - 1))
+    return known[np.unique(np.minimum(np.searchsorted(travelled, wanted), len(known) - 1))]
 
 
 def name_rows(axes, names):
@@ -108,18 +137,24 @@ def legend_below(fig):
         entries |= {label: handle for handle, label in zip(*ax.get_legend_handles_labels())
                     if label not in entries}
     fig.legend(entries.values(), entries.keys(), loc="outside lower center",
-               ncols=min(4, len(entries)))
+               ncols=min(3 if len(entries) in (5, 6) else 4, len(entries)))
 
 
 def states(axes, poses, covariances, role, label=None):
     """x, y and heading over the pose number on three axes, with a band of +-2 sigma around them."""
-    return _curves(axes, poses, poses, covariances, role, label,
+    return _curves(axes, poses, poses, covariances, role, label, np.arange(len(poses)),
                    ("x (m)", "y (m)", "heading δ (rad)"))
 
 
-def errors(axes, poses, covariances, truth, role, label=None):
-    """Error against the truth (n, 3) over the pose number, with the band of +-2 sigma around 0."""
-    return _curves(axes, poses - truth, np.zeros_like(poses), covariances, role, label,
+def errors(axes, poses, covariances, truth, role, label=None, at=None):
+    """Error against the truth (n, 3) over the pose number, with the band of +-2 sigma around 0.
+
+    `at` are the indices from 0 of the poses the rows belong to; by default they are all poses.
+    """
+    error = poses - truth
+    error[:, 2] = se2.wrap(error[:, 2])
+    at = np.arange(len(poses)) if at is None else at
+    return _curves(axes, error, np.zeros_like(error), covariances, role, label, at,
                    ("error of x (m)", "error of y (m)", "error of δ (rad)"))
 
 
@@ -139,14 +174,14 @@ def cloud(ax, samples, mean, estimates, probability=0.95):
     return ax
 
 
-def _curves(axes, values, middle, covariances, role, label, names):
-    number = np.arange(1, len(values) + 1)
+def _curves(axes, values, middle, covariances, role, label, at, names):
     two_sigma = 2 * np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
     low, high = middle - two_sigma, middle + two_sigma
     few = np.unique(np.linspace(0, len(values) - 1, 800).astype(int))      # bands are smooth
+    label = label or role
     for i, ax in enumerate(axes):
-        ax.plot(number, values[:, i], label=label or role, **ROLES[role])
-        ax.fill_between(number[few], low[few, i], high[few, i], color=ROLES[role]["color"],
-                        alpha=0.18, linewidth=0, label="±2σ")
+        ax.plot(at + 1, values[:, i], label=label, **ROLES[role])
+        ax.fill_between(at[few] + 1, low[few, i], high[few, i], color=ROLES[role]["color"],
+                        alpha=0.18, linewidth=0, label=f"{label}: ±2σ")
     name_rows(axes, names)
     return axes

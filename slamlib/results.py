@@ -38,13 +38,16 @@ def write_aruco_map(folder, ids, poses, covariances):
 def read_aruco_map(folder):
     """Ids (k,), poses (k, 3) and covariances (k, 3, 3) of an ArucoMap.mat."""
     content = _read(Path(folder) / "ArucoMap.mat")
-    return content["id"][:, 0].astype(int), content["pose"], content["covari"]
+    return content["id"].astype(int).ravel(), *_poses_and_covariances(content)
 
 
 def read_vehicle_poses(folder):
     """Poses (n, 3) and covariances (n, 3, 3) of a vehiclePose.mat."""
-    content = _read(Path(folder) / "vehiclePose.mat")
-    return content["pose"], content["covari"]
+    return _poses_and_covariances(_read(Path(folder) / "vehiclePose.mat"))
+
+
+def _poses_and_covariances(content):
+    return content["pose"].reshape(-1, 3), content["covari"].reshape(-1, 3, 3)
 
 
 def write_atomically(path, content):
@@ -64,8 +67,8 @@ def _write(path, **fields):
     structs = np.empty((1, length), dtype=[(name, object) for name in fields])
     for name, values in fields.items():
         rows = np.asarray(values, dtype=float)
-        if rows.ndim < 3:                                         # vectors are 1 x d in MATLAB
-            rows = rows.reshape(length, 1, -1)
+        while rows.ndim < 3:                                      # vectors are 1 x d in MATLAB
+            rows = rows[:, None]
         structs[name][0, :] = list(rows)
     buffer = BytesIO()
     savemat(buffer, {path.stem: structs})
@@ -74,7 +77,7 @@ def _write(path, **fields):
 
 
 def _read(path):
+    """Fields of a struct array, stacked: {name: (length, 1, d) or (length, d, d)}."""
     structs = loadmat(path)[path.stem]
-    return {name: np.stack([np.squeeze(row, 0) if row.shape[0] == 1 else row
-                            for row in structs[name].ravel()])
+    return {name: np.stack([*structs[name].ravel()]) if structs.size else np.zeros((0, 1, 0))
             for name in structs.dtype.names}

@@ -28,9 +28,12 @@ def problem1(dataset):
     return Solution("problem1", "odometry", *odometry.equation2(dataset.ticks, dataset.vehicle))
 
 
-def problem2(dataset):
-    """Incremental localization from the markers alone; the world is the first measured pose."""
-    found = localization.localize(dataset.aruco)
+def problem2(dataset, found=None):
+    """Incremental localization from the markers alone; the world is the first measured pose.
+
+    `found` is the Localization, where it has been computed already.
+    """
+    found = localization.localize(dataset.aruco) if found is None else found
     poses = np.full((len(dataset.ticks), 3), np.nan)
     covariances = np.full((len(dataset.ticks), 3, 3), np.nan)
     poses[found.frame], covariances[found.frame] = found.poses, found.covariances
@@ -42,11 +45,15 @@ def problem2(dataset):
                      "sightings": len(dataset.aruco.pose), "outliers": int(found.outlier.sum())})
 
 
-def problem2_fused(dataset):
-    """Odometry and markers fused incrementally, with the errors that they share."""
-    fused = fusion.fuse(dataset)
+def problem2_fused(dataset, fused=None):
+    """Odometry and markers fused incrementally, with the errors that they share.
+
+    `fused` is the Fusion, where it has been computed already.
+    """
+    fused = fusion.fuse(dataset) if fused is None else fused
     return Solution("problem2_fused", "odometry + ArUco", fused.poses, fused.covariances, facts={
-        "slip_sqrt_m": fused.slip, "outliers": fused.outliers, "wheel_parameters_m": fused.wheel.tolist(),
+        "slip_sqrt_m": fused.slip, "outliers": fused.outliers,
+        "wheel_parameters_m": fused.wheel.tolist(),
         "wheel_parameter_sigmas_m": np.sqrt(np.diag(fused.wheel_covariance)).tolist()})
 
 

@@ -17,6 +17,18 @@ LOST_HEADING = 0.5           # rad, sigma: what knows less of the turn cannot ti
 
 
 @dataclass(frozen=True)
+class Sightings:
+    """Sightings of markers, at most one of a marker in each frame, sorted by frame and marker."""
+
+    index: np.ndarray        # (s,) row of the dataset's sightings
+    row: np.ndarray          # (s,) row of `frame`
+    marker: np.ndarray       # (s,) marker id
+    z: np.ndarray            # (s, 3) marker in vehicle
+    C: np.ndarray            # (s, 3, 3)
+    frame: np.ndarray        # (f,) index from 0 of every measured pose
+
+
+@dataclass(frozen=True)
 class Ties:
     """Increments of l ties from p common sightings."""
 
@@ -26,6 +38,26 @@ class Ties:
     kept: np.ndarray         # (p,) bool, common sightings that agree with the increment
     by_first: np.ndarray     # (p, 3, 3) d increment / d sighting from the earlier frame
     by_second: np.ndarray    # (p, 3, 3) d increment / d sighting from the later frame
+
+
+def gather(aruco, also=()):
+    """The Sightings of an ArucoReadings; `also` are poses that are frames, seen markers or not."""
+    index, z, C = merge_repeated(aruco)
+    frame = np.union1d(aruco.pose[index], also).astype(int)
+    return Sightings(index, np.searchsorted(frame, aruco.pose[index]), aruco.marker[index], z, C, frame)
+
+
+def tie_consecutive(sightings):
+    """Ties of every frame with the next one.
+
+    Returns
+    -------
+    ties : Ties, f - 1 of them.
+    link, first, second : (p,) as from `common_sightings`.
+    """
+    earlier = np.arange(len(sightings.frame) - 1)
+    pairs = common_sightings(sightings.row, sightings.marker, earlier, earlier + 1)
+    return plausible_ties(sightings.z, sightings.C, *pairs, np.diff(sightings.frame)), *pairs
 
 
 def merge_repeated(aruco):

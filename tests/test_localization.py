@@ -2,15 +2,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from joblib import Parallel, delayed
 
-from slamlib import se2
+from slamlib import montecarlo, se2
 from slamlib.dataset import ArucoReadings
-from slamlib.evaluation import ate, nees, nees_band
+from slamlib.evaluation import ate, nees_band
 from slamlib.localization import localize
 from slamlib.simulation import simulate
 
-SEEDS = range(100, 140)
+SEEDS = range(200, 240)
 
 
 def only(aruco, keep):
@@ -76,31 +75,35 @@ def test_nothing_known_until_a_known_marker_returns():
     assert np.isnan(found.covariances[~known]).all()
 
 
-def trial(seed, **options):
-    """NEES of the measured poses and of the map with and without shared errors, and the ATE."""
-    dataset, truth = simulate("short", seed=seed, **options)
-    found, naive = (localize(dataset.aruco, shared) for shared in (True, False))
-    true_poses = truth.poses[found.frame]
-    true_map = truth.marker_in_world[np.searchsorted(truth.marker, found.marker)]
-    pose_nees = nees(found.poses, found.covariances, true_poses)
-    return (np.nanmean(pose_nees), pose_nees[-1],
-            nees(found.marker_in_world, found.marker_covariance, true_map).mean(),
-            np.nanmean(nees(naive.poses, naive.covariances, true_poses)),
-            ate(found.poses, true_poses))
+@pytest.mark.parametrize("options", [dict(), dict(mislabelled=0.03), dict(slip=3e-3)])
+def test_monte_carlo_is_consistent(options):
+    """40 seeds; the band is that of 40 independent NEES, which a mean over poses can only narrow.
+
+    Six means under three options are in their bands together with 95 % probability, so each has a
+    band of 1 - 0.05 / 18 (Bonferroni). `tests/benchmarks/localization.py` has the narrow band of
+    hundreds of seeds. Markers alone and fused: NEES along the path, at its end, of the map and of the wheel parameters
+    in the band; the fused ATE below 0.6 of odometry's; the learned slip near the true one. Without
+    the shared errors the covariance is far too large, and the hint, restarted at every measured
+    pose, neither improves on odometry nor is consistent: notebook 2 explains both.
+    """
+    runs = montecarlo.run(montecarlo.problem2, SEEDS, **options)
+    low, high = nees_band(len(SEEDS), probability=1 - 0.05 / 18)
+    for name in ("ArUco nees", "ArUco last nees", "map nees", "fused nees", "fused last nees",
+                 "wheel nees"):
+        assert low < runs[name].mean() < high, name
+    for method in ("ArUco", "fused"):
+        ratio = runs[f"{method} ate"] / runs["odometry ate"]
+        assert np.median(ratio) < 0.6 and rms(runs[f"{method} ate"]) < 0.6 * rms(runs["odometry ate"])
+    assert rms(runs["fused ate"]) < rms(runs["ArUco ate"]) < 0.1                    # metres, on 20 m
+    assert 0.8 < np.exp(np.mean(np.log(runs["slip"]))) / options.get("slip", 1e-3) < 1.25
+    assert runs["naive nees"].mean() < 0.5
+    for hint in ("hint", "exact hint"):
+        assert runs[f"{hint} nees"].mean() > 20
+        assert rms(runs[f"{hint} ate"]) > 0.9 * rms(runs["odometry ate"])
 
 
-@pytest.mark.parametrize("mislabelled", [0.0, 0.03])
-def test_monte_carlo_is_consistent(mislabelled):
-    """40 seeds; the band is that of 40 independent NEES, which a mean over poses can only narrow."""
-    runs = np.array(Parallel(n_jobs=2)(
-        delayed(trial)(seed, mislabelled=mislabelled) for seed in SEEDS))
-    low, high = nees_band(len(SEEDS))
-    along, last, marker, naive, error = runs.mean(0)
-    assert low < along < high
-    assert low < last < high
-    assert low < marker < high
-    assert naive < 0.5                    # the covariance without the shared errors is far too large
-    assert error < 0.1 and runs[:, 4].max() < 0.4                               # metres, on 20 m
+def rms(values):
+    return np.sqrt(np.mean(values**2))
 
 
 def test_a_single_frame_and_markers_without_orientation():

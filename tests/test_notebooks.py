@@ -11,7 +11,7 @@ import pytest
 from slamlib.dataset import read_dataset
 from slamlib.odometry import equation2
 from slamlib.report import build_report
-from slamlib.results import read_vehicle_poses
+from slamlib.results import read_aruco_map, read_vehicle_poses
 from slamlib.simulation import manoeuvre, simulate, write_dataset
 
 ROOT = Path(__file__).parents[1]
@@ -56,6 +56,25 @@ def test_results_are_those_of_the_library(built):
                 np.testing.assert_array_equal(got, wanted)
 
 
+def test_results_of_problem_2_are_where_there_are_markers(built):
+    folder, pages = built
+    for data in (folder / "data").iterdir():
+        if data.is_dir():
+            dataset, results = read_dataset(data), folder / "results" / data.name
+            assert (results / "problem2").exists() == (dataset.aruco is not None)
+            assert (results / "problem2_fused").exists() == (dataset.aruco is not None)
+            if dataset.aruco is not None:
+                alone, covariances = read_vehicle_poses(results / "problem2")
+                fused, _ = read_vehicle_poses(results / "problem2_fused")
+                assert len(alone) == len(fused) == len(dataset.ticks)
+                known = np.isfinite(alone[:, 0])
+                assert np.isin(np.flatnonzero(known), dataset.aruco.pose).all() and known.any()
+                assert (np.isfinite(covariances[:, 0, 0]) == known).all() and np.isfinite(fused).all()
+                ids, markers, _ = read_aruco_map(results / "problem2")
+                assert np.isin(ids, dataset.aruco.marker).all() and np.isfinite(markers).all()
+                assert f"{data.name}/problem2/ArucoMap.mat" in html.unescape(pages["index"])
+
+
 def test_pages_name_every_dataset_and_say_what_is_left_out(built):
     _, pages = built
     text = html.unescape(re.sub(r"<[^>]+>", "", pages["1_odometry"]))
@@ -63,6 +82,10 @@ def test_pages_name_every_dataset_and_say_what_is_left_out(built):
                          text)
     for name in BROUGHT:
         assert name in text and name in pages["index"]
+    markers = html.unescape(re.sub(r"<[^>]+>", "", pages["2_aruco_localization"]))
+    left_out = re.search(r"There are no markers in ([^:]*): this chapter leaves them out", markers)
+    assert set(re.split(", | and ", left_out[1])) >= {"wheels_only", "waits", "one_pose", "backs_up"}
+    for name in BROUGHT:
         assert (name in re.split(", | and ", sentence[1])) == (name != "new seed")
 
 
@@ -71,3 +94,20 @@ def test_no_cell_wrote_to_stderr(built):
     _, pages = built
     for name, page in pages.items():
         assert "stderr" not in re.sub(r"<style>.*?</style>", "", page, flags=re.DOTALL), name
+
+
+def test_without_any_markers_chapter_2_can_still_be_read(tmp_path):
+    (tmp_path / "data" / "wheels").mkdir(parents=True)
+    (tmp_path / "data" / "wheels" / "encoderReading.txt").write_text("1 0 0\n2 100 90\n3 90 100\n")
+    (tmp_path / "notebooks").mkdir()
+    shutil.copy(ROOT / "notebooks" / "2_aruco_localization.ipynb", tmp_path / "notebooks")
+    pages = build_report(tmp_path / "notebooks", tmp_path / "data", tmp_path / "report",
+                         tmp_path / "results")
+    assert "runs on a simulated drive instead" in pages[1].read_text(encoding="utf-8")
+    assert list((tmp_path / "results").iterdir()) == []
+
+
+def test_no_page_shows_an_object_s_address(built):
+    _, pages = built
+    for name, page in pages.items():
+        assert not re.search(r" at 0x[0-9a-f]{6}", page), name

@@ -15,6 +15,14 @@ def example(n=5):
     return rng.standard_normal((n, 3)), A @ np.swapaxes(A, 1, 2)
 
 
+def octave_or_skip():
+    octave = shutil.which("octave-cli")
+    if octave is None:
+        assert not os.environ.get("CI"), "CI must have octave-cli"
+        pytest.skip("octave-cli is not installed")
+    return octave
+
+
 def test_round_trip_through_scipy(tmp_path):
     poses, covariances = example()
     poses[2], covariances[2] = np.nan, np.nan                                  # no estimate
@@ -29,10 +37,7 @@ def test_round_trip_through_scipy(tmp_path):
 
 
 def test_round_trip_through_octave(tmp_path):
-    octave = shutil.which("octave-cli")
-    if octave is None:
-        assert not os.environ.get("CI"), "CI must have octave-cli"
-        pytest.skip("octave-cli is not installed")
+    octave = octave_or_skip()
     poses, covariances = example(400)
     results.write_vehicle_poses(tmp_path, poses, covariances)
     script = ("load('vehiclePose.mat'); p = vertcat(vehiclePose.pose); c = vehiclePose(7).covari;"
@@ -43,6 +48,30 @@ def test_round_trip_through_octave(tmp_path):
     np.testing.assert_array_equal(again["s"], [[1, 400]])
     np.testing.assert_array_equal(again["p"], poses)
     np.testing.assert_array_equal(again["c"], covariances[6])
+
+
+def test_aruco_map_through_scipy_and_octave(tmp_path):
+    poses, covariances = example(3)
+    ids = np.array([4, 17, 10**12])
+    results.write_aruco_map(tmp_path, ids, poses, covariances)
+    structs = loadmat(tmp_path / "ArucoMap.mat")["ArucoMap"]
+    assert structs.shape == (1, 3) and structs.dtype.names == ("pose", "covari", "id")
+    assert structs[0, 1]["pose"].shape == (1, 3) and structs[0, 1]["id"] == [[17]]
+    for got, expected in zip(results.read_aruco_map(tmp_path), (ids, poses, covariances)):
+        np.testing.assert_array_equal(got, expected)
+    octave = octave_or_skip()
+    script = "load('ArucoMap.mat'); i = [ArucoMap.id]; save('-v7', 'again.mat', 'i');"
+    subprocess.run([octave, "--quiet", "--no-init-file", "--eval", script], cwd=tmp_path, check=True,
+                   timeout=120)
+    np.testing.assert_array_equal(loadmat(tmp_path / "again.mat")["i"], [ids])
+
+
+def test_an_empty_map(tmp_path):
+    poses, covariances = example(1)
+    results.write_aruco_map(tmp_path, np.zeros(0, int), poses[:0], covariances[:0])
+    assert loadmat(tmp_path / "ArucoMap.mat")["ArucoMap"].size == 0
+    ids, poses, covariances = results.read_aruco_map(tmp_path)
+    assert (ids.shape, poses.shape, covariances.shape) == ((0,), (0, 3), (0, 3, 3))
 
 
 def test_a_single_pose_and_equal_bytes(tmp_path):

@@ -1,0 +1,36 @@
+"""Problem 2's methods on 100 simulated drives: consistency and accuracy, against their bands."""
+
+import numpy as np
+
+from slamlib import montecarlo
+from slamlib.evaluation import nees_band
+
+SEEDS = range(1000, 1100)
+METHODS = {"ArUco": "markers alone", "naive": "  without shared errors", "hint": "hint, equation 2",
+           "exact hint": "hint, first order", "fused": "fused, shared errors"}
+
+
+def rms(values):
+    return np.sqrt(np.mean(values**2))
+
+
+def main():
+    low, high = nees_band(len(SEEDS))
+    print(f"Problem 2: {len(SEEDS)} drives of the short path; "
+          f"NEES of a consistent method: {low:.2f} to {high:.2f}")
+    print(f"{'method':26}{'slip':>8}{'NEES':>9}{'at end':>9}{'ATE (m)':>10}{'of odometry':>13}")
+    for slip in (0.0, 1e-3, 3e-3):
+        runs = montecarlo.run(montecarlo.problem2, SEEDS, slip=slip)
+        drift = rms(runs["odometry ate"])
+        for method, name in METHODS.items():
+            print(f"{name:26}{slip:8g}{runs[f'{method} nees'].mean():9.2f}"
+                  f"{runs[f'{method} last nees'].mean():9.2f}{rms(runs[f'{method} ate']):10.4f}"
+                  f"{rms(runs[f'{method} ate']) / drift:13.2f}")
+        learned = np.percentile(runs["slip"], [10, 50, 90])
+        print(f"{'map':26}{slip:8g}{runs['map nees'].mean():9.2f}\n"
+              f"{'wheel parameters':26}{slip:8g}{runs['wheel nees'].mean():9.2f}   learned slip "
+              f"(10, 50, 90 %): {learned[0]:.1e}, {learned[1]:.1e}, {learned[2]:.1e}")
+
+
+if __name__ == "__main__":
+    main()
