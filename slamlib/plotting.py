@@ -65,10 +65,11 @@ def trajectory(ax, poses, role, label=None, **look):
     return ax
 
 
-def ellipses(ax, positions, covariances, color, probability=0.95, label=None, fill=0.12, enlarged=1):
+def ellipses(ax, positions, covariances, color, probability=0.95, label=None, fill=0.12, enlarged=1,
+             fit=True):
     """Ellipses of the given probability around positions (m, >= 2), covariances (m, >= 2, >= 2).
 
-    `enlarged` scales them; say so in the figure.
+    `enlarged` scales them; say so in the figure. fit=False does not widen the axes to hold them.
     """
     k = enlarged * np.sqrt(-2 * np.log(1 - probability))
     variances, axes = np.linalg.eigh(np.asarray(covariances)[:, :2, :2])
@@ -82,7 +83,8 @@ def ellipses(ax, positions, covariances, color, probability=0.95, label=None, fi
     ax.add_collection(patches)
     reach = k * np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)[:, :2])
     centre = np.asarray(positions)[:, :2]
-    ax.update_datalim(np.concatenate([centre - reach, centre + reach]))
+    if fit:
+        ax.update_datalim(np.concatenate([centre - reach, centre + reach]))
     if label:
         ax.plot([], [], "o", markersize=9, markerfacecolor=face, markeredgecolor=edge, label=label)
     ax.autoscale_view()

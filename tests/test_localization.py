@@ -80,11 +80,11 @@ def test_monte_carlo_is_consistent(options):
     """40 seeds; the band is that of 40 independent NEES, which a mean over poses can only narrow.
 
     Six means under three options are in their bands together with 95 % probability, so each has a
-    band of 1 - 0.05 / 18 (Bonferroni). `tests/benchmarks/localization.py` has the narrow band of
-    hundreds of seeds. Markers alone and fused: NEES along the path, at its end, of the map and of the wheel parameters
-    in the band; the fused ATE below 0.6 of odometry's; the learned slip near the true one. Without
-    the shared errors the covariance is far too large, and the hint, restarted at every measured
-    pose, neither improves on odometry nor is consistent: notebook 2 explains both.
+    band of 1 - 0.05 / 18 (Bonferroni); tests/benchmarks/localization.py has a narrower band, of
+    more seeds. Markers alone and fused: NEES along the path, at its end, of the map and of the
+    wheel parameters in the band; ATE below 0.6 of odometry's; the learned slip near the true one.
+    Without the shared errors the covariance is far too large, and the hint, restarted at every
+    measured pose, neither improves on odometry nor is consistent: notebook 2 explains both.
     """
     runs = montecarlo.run(montecarlo.problem2, SEEDS, **options)
     low, high = nees_band(len(SEEDS), probability=1 - 0.05 / 18)
