@@ -120,8 +120,7 @@ def _map_markers(marker, poses, covariances, z, C, cross):
     """Each marker where its most certain sighting puts it: ids, poses and covariances.
 
     The sightings of one marker err together, through the poses they are made from, so they cannot
-    be averaged as if they were independent: the one with the least determinant is taken, out of
-    those that most sightings of the marker agree with.
+    be averaged as if they were independent.
     """
     A, B = se2.compose_jacobians(poses, z)
     S = A @ cross @ np.swapaxes(B, 1, 2)
@@ -129,13 +128,28 @@ def _map_markers(marker, poses, covariances, z, C, cross):
                   + S + np.swapaxes(S, 1, 2))
     in_world = se2.compose(poses, z)
     in_world[:, 2] = se2.wrap(in_world[:, 2])
-    size = np.linalg.slogdet(covariance)[1]
-    ids, best = np.unique(marker), []
-    for same in (np.flatnonzero(marker == i) for i in ids):
+    best = most_certain(marker, in_world, covariance)
+    return marker[best], in_world[best], covariance[best]
+
+
+def most_certain(marker, in_world, covariance):
+    """For every marker, its most certain sighting of those that most of its sightings agree with.
+
+    Parameters
+    ----------
+    marker : (s,) ids.
+    in_world, covariance : (s, 3), (s, 3, 3) where each sighting puts its marker.
+
+    Returns
+    -------
+    (k,) rows, in ascending order of marker id; most certain is of least determinant.
+    """
+    size, best = np.linalg.slogdet(covariance)[1], []
+    for same in (np.flatnonzero(marker == i) for i in np.unique(marker)):
         apart = in_world[same, None] - in_world[same]
         apart[..., 2] = se2.wrap(apart[..., 2])
         spread = covariance[same, None] + covariance[same]
         squared = np.einsum("abi,abi->ab", apart, np.linalg.solve(spread, apart[..., None])[..., 0])
         votes = np.count_nonzero(squared < GATE, axis=1)
         best.append(min(same[votes >= votes.max() / 2], key=size.__getitem__))
-    return ids, in_world[best], covariance[best]
+    return np.array(best, int)

@@ -89,6 +89,38 @@ def between_jacobians(T_wa, T_wb):
     return by_first, by_second
 
 
+def log(T):
+    """Logarithm of a motion, the constant velocity that reaches it in unit time, (..., 3).
+
+    With a = (h / 2) cot(h / 2) of the heading h, wrapped: [a x + h y / 2, -h x / 2 + a y, h]. It is
+    the error of GTSAM's between factors (`Pose2::Logmap`).
+    """
+    T = np.asarray(T, dtype=float)
+    h, x, y = wrap(T[..., 2]), T[..., 0], T[..., 1]
+    a, _ = _half_cotangent(h)
+    return np.stack([a * x + h * y / 2, -h * x / 2 + a * y, h], -1)
+
+
+def log_jacobian(T):
+    """Partial derivatives of log by [x, y, heading], (..., 3, 3)."""
+    T = np.asarray(T, dtype=float)
+    h, x, y = wrap(T[..., 2]), T[..., 0], T[..., 1]
+    a, slope = _half_cotangent(h)
+    jacobian = _identity(T.shape)
+    jacobian[..., 0, 0], jacobian[..., 0, 1], jacobian[..., 0, 2] = a, h / 2, slope * x + y / 2
+    jacobian[..., 1, 0], jacobian[..., 1, 1], jacobian[..., 1, 2] = -h / 2, a, slope * y - x / 2
+    return jacobian
+
+
+def _half_cotangent(h):
+    """(h / 2) cot(h / 2) and its derivative by h, with their series near zero."""
+    small = np.abs(h) < 1e-3
+    half = np.where(small, 1.0, h / 2)
+    a = np.where(small, 1 - h**2 / 12, half / np.tan(half))
+    slope = np.where(small, -h / 6, (1 / np.tan(half) - half / np.sin(half)**2) / 2)
+    return a, slope
+
+
 def rotate_covariance(covariance, heading):
     """Covariance of [x, y, heading] expressed in axes turned by `heading`: B C B^T.
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slamlib import evaluation, fusion, localization, odometry, results, se2
+from slamlib import evaluation, fusion, localization, odometry, results, se2, slam
 
 
 @dataclass(frozen=True)
@@ -57,12 +57,24 @@ def problem2_fused(dataset, fused=None):
         "wheel_parameter_sigmas_m": np.sqrt(np.diag(fused.wheel_covariance)).tolist()})
 
 
+def problem3(dataset, found=None):
+    """SLAM with GTSAM on odometry and markers. `found` is the Slam, where it has been computed."""
+    found = slam.solve(dataset) if found is None else found
+    return Solution("problem3", "SLAM: odometry + ArUco", found.poses, found.covariances, 0,
+                    (found.marker, found.marker_in_world, found.marker_covariance), {
+        "slip_sqrt_m": found.slip, "increments": found.model, "outliers": int(found.outlier.sum()),
+        "chi2_per_dof": found.chi2_per_dof, "log_evidence": found.log_evidence,
+        "wheel_parameters_m": found.wheel.tolist(),
+        "wheel_parameter_sigmas_m": np.sqrt(np.diag(found.wheel_covariance)).tolist()})
+
+
 def solve(dataset):
     """Yield the Solution of every problem that the dataset's sensors allow, in order."""
     yield problem1(dataset)
     if dataset.aruco is not None:
         yield problem2(dataset)
         yield problem2_fused(dataset)
+        yield problem3(dataset)
 
 
 def truth_in_world_of(solution, truth):

@@ -1,3 +1,4 @@
+import gtsam
 import numpy as np
 import pytest
 
@@ -34,6 +35,18 @@ def test_jacobians_against_central_differences(a):
                 by_second, central_differences(lambda p: function(a, p), b), atol=1e-8)
     np.testing.assert_allclose(se2.inverse_jacobian(a), central_differences(se2.inverse, a),
                                atol=1e-8)
+    if abs(abs(se2.wrap(a[2])) - np.pi) > 1e-3:                # where the heading wraps it jumps
+        np.testing.assert_allclose(se2.log_jacobian(a), central_differences(se2.log, a), atol=1e-7)
+
+
+@pytest.mark.parametrize("a", POSES)
+def test_log_is_gtsams(a):
+    a = np.append(a[:2], se2.wrap(a[2]))                       # at -pi there are two logarithms
+    np.testing.assert_allclose(se2.log(a), gtsam.Pose2.Logmap(gtsam.Pose2(*a)), atol=1e-6)
+    for heading in (9e-4, 1.1e-3):                             # on both sides of the series' end
+        pose = np.array([1.5, -2.5, heading])
+        np.testing.assert_allclose(se2.log(pose), gtsam.Pose2.Logmap(gtsam.Pose2(*pose)), atol=1e-12)
+        np.testing.assert_allclose(se2.log_jacobian(pose), central_differences(se2.log, pose), atol=1e-8)
 
 
 def test_batches_broadcast_and_leave_their_arguments_alone():

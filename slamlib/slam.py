@@ -1,0 +1,348 @@
+"""Problem 3: SLAM with GTSAM on odometry and markers, self-calibrating.
+
+A factor graph over the graph poses X_i (pose 1, every measured pose, the last pose), the markers
+L_j and the wheel parameters w = [R_R, R_L, b], as deviations from their nominal values in units of
+their sigmas:
+
+* a prior on pose 1, which fixes the world frame, and the prior of table 2 on w;
+* a between factor for every sighting, Z_ij = X_i^-1 L_j; a Cauchy kernel, narrowed round by round,
+  finds the wrong labels, and the last rounds do without them and without a kernel;
+* an odometry factor between consecutive graph poses, which depends on w too:
+
+      e = log(Delta_i(w)^-1 X_i^-1 X_{i+1}),    Delta_i(w) = Delta_i(0) + dDelta_i/dw w,
+
+  with the noise of rounding and slip (`odometry.increment_noise`). The errors of w repeat in every
+  increment; as a variable of the graph they do, as noise of independent factors they could not.
+
+Frames. GTSAM perturbs a pose on the right, X <- X exp(xi): its covariances are those of the
+pose's error in the pose's own axes. A between factor's noise lives in the axes of the measured pose
+Z, so a covariance given in the axes of the vehicle is turned by R(delta)^T, and a marginal is turned
+by R(delta) before it leaves this module.
+
+The odometry factors are linearised in numpy, all at once, and added to GTSAM's linearisation of the
+others: a custom factor in Python would copy all values at every call.
+"""
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import L, W, X
+from scipy.optimize import minimize_scalar
+
+from slamlib import odometry, se2
+from slamlib.localization import most_certain
+from slamlib.ties import GATE, gather
+
+GAUGE = 1e-6                 # m, sigma of the position of pose 1, which is zero by definition
+CAUCHY = (100.0, 30.0, 10.0, 3.0)   # scale of the kernel in sigmas, round after round
+SLIPS = (1e-5, 3e-2)         # sqrt(m), the bounds within which slip is looked for
+FIRST_SLIP = 1e-3            # sqrt(m), until it is learned
+LOOSE = gtsam.noiseModel.Isotropic.Sigma(3, 1e5)
+LEAST = 1e-9                 # relative decrease of the error at which iterations end
+
+
+@dataclass(frozen=True)
+class Odometry:
+    """Odometry factors between consecutive graph poses, for all values of slip."""
+
+    increment: np.ndarray    # (f-1, 3) with nominal wheels
+    by_w: np.ndarray         # (f-1, 3, 3) by w, in units of sigma
+    rounding: np.ndarray     # (f-1, 3, 3) noise without slip, in the axes of the increment's end
+    slipping: np.ndarray     # (f-1, 3, 3) noise of slip 1
+
+    def whitening(self, slip):
+        """U with U^T U = noise^-1, and the log determinants of the noise."""
+        noise = self.rounding + slip**2 * self.slipping
+        U = np.swapaxes(np.linalg.cholesky(np.linalg.inv(noise)), 1, 2)
+        return U, np.linalg.slogdet(noise)[1]
+
+
+def odometry_factors(ticks, vehicle, frame, model="arc"):
+    """Odometry between the graph poses `frame` (f,), indices from 0."""
+    start, end = frame[:-1], frame[1:]
+    increment, by_w = odometry.increments(ticks, vehicle, start, end, model)
+    rounding = odometry.increment_noise(ticks, vehicle, start, end, 0.0)
+    slipping = odometry.increment_noise(ticks, vehicle, start, end, 1.0) - rounding
+    rounding[:, [0, 1], [0, 1]] += _least_noise(vehicle)
+    turn = -increment[:, 2]
+    sigma_w = [vehicle.sigma_right_radius, vehicle.sigma_left_radius, vehicle.sigma_wheelbase]
+    return Odometry(increment, by_w * sigma_w, se2.rotate_covariance(rounding, turn),
+                    se2.rotate_covariance(slipping, turn))
+
+
+def linearize(factors, poses, w):
+    """Errors of the odometry factors and their derivatives in GTSAM's tangent spaces.
+
+    Parameters
+    ----------
+    factors : Odometry
+    poses : (f, 3) graph poses.
+    w : (3,) wheel parameters in units of sigma.
+
+    Returns
+    -------
+    e : (f-1, 3) errors.
+    by_first, by_second, by_w : (f-1, 3, 3) derivatives by X_i, X_{i+1} and w.
+    """
+    Z = factors.increment + factors.by_w @ w
+    h = se2.between(poses[:-1], poses[1:])
+    miss = se2.between(Z, h)
+    log_by_miss, origin = se2.log_jacobian(miss), np.zeros(3)
+    _, by_second = se2.compose_jacobians(miss, origin)               # miss xi for X_{i+1} xi
+    h_by_first, _ = se2.compose_jacobians(origin, h)                 # xi^-1 h for X_i xi
+    miss_by_Z, miss_by_h = se2.between_jacobians(Z, h)
+    return (se2.log(miss), -log_by_miss @ miss_by_h @ h_by_first, log_by_miss @ by_second,
+            log_by_miss @ miss_by_Z @ factors.by_w)
+
+
+@dataclass(frozen=True)
+class Slam:
+    """What the graph says of every encoder pose, of the markers and of the wheels."""
+
+    poses: np.ndarray               # (n, 3) world frame
+    covariances: np.ndarray         # (n, 3, 3)
+    marker: np.ndarray              # (k,) ids, ascending, of markers that most sightings agree on
+    marker_in_world: np.ndarray     # (k, 3)
+    marker_covariance: np.ndarray   # (k, 3, 3) of [x, y, heading] in world axes
+    wheel: np.ndarray               # (3,) R_R, R_L, b
+    wheel_covariance: np.ndarray    # (3, 3)
+    slip: float                     # sqrt(m), as given or learned
+    model: str                      # "arc" or "euler", as given or chosen
+    log_evidence: float             # Laplace, up to a constant of the dataset
+    chi2_per_dof: float             # twice the error over the degrees of freedom
+    outlier: np.ndarray             # (s,) bool, gathered sightings beyond the 99.9 % quantile
+
+
+class _Graph:
+    """The graph of one dataset and one model of the increments."""
+
+    def __init__(self, dataset, model, also=()):
+        self.dataset, self.model = dataset, model
+        self.sightings = gather(dataset.aruco, also=[0, len(dataset.ticks) - 1, *also])
+        self.frame = self.sightings.frame
+        self.factors = odometry_factors(dataset.ticks, dataset.vehicle, self.frame, model)
+        self.marker, self.label = np.unique(self.sightings.marker, return_inverse=True)
+        s = self.sightings
+        noise = se2.rotate_covariance(s.C, -s.z[:, 2])
+        self.measured = [(X(int(i)), L(int(j)), gtsam.Pose2(*z), gtsam.noiseModel.Gaussian.Covariance(c))
+                         for i, j, z, c in zip(s.row, self.label, s.z, noise)]
+
+    def native(self, cauchy=None, kept=None):
+        """GTSAM's part: priors, and the kept sightings (all if None), with a Cauchy kernel if any."""
+        graph = gtsam.NonlinearFactorGraph()
+        sigma = [GAUGE, GAUGE, self.dataset.vehicle.sigma_heading]
+        graph.add(gtsam.PriorFactorPose2(X(0), gtsam.Pose2(), gtsam.noiseModel.Diagonal.Sigmas(sigma)))
+        graph.add(gtsam.PriorFactorVector(W(0), np.zeros(3), gtsam.noiseModel.Unit.Create(3)))
+        kernel = gtsam.noiseModel.mEstimator.Cauchy.Create(cauchy) if cauchy else None
+        for k, (i, j, z, noise) in enumerate(self.measured):
+            if kept is None or kept[k]:
+                model = gtsam.noiseModel.Robust.Create(kernel, noise) if cauchy else noise
+                graph.add(gtsam.BetweenFactorPose2(i, j, z, model))
+        if kept is not None:                     # what no sighting holds must not be singular
+            for j in np.setdiff1d(self.label, self.label[kept]):
+                graph.add(gtsam.PriorFactorPose2(L(int(j)), gtsam.Pose2(), LOOSE))
+        return graph
+
+    def initial(self):
+        """Odometry's poses, and each marker by consensus of where its sightings put it."""
+        d, s = self.dataset, self.sightings
+        poses, covariances = odometry.first_order(d.ticks, d.vehicle, model=self.model)
+        seen_from = self.frame[s.row]
+        A, B = se2.compose_jacobians(poses[seen_from], s.z)
+        spread = A @ covariances[seen_from] @ np.swapaxes(A, 1, 2) + B @ s.C @ np.swapaxes(B, 1, 2)
+        in_world = se2.compose(poses[seen_from], s.z)
+        return self.values(poses[self.frame], in_world[most_certain(s.marker, in_world, spread)],
+                           np.zeros(3))
+
+    def values(self, poses, markers, w):
+        values = gtsam.Values()
+        for i, pose in enumerate(poses):
+            values.insert(X(i), gtsam.Pose2(*pose))
+        for j, pose in enumerate(markers):
+            values.insert(L(j), gtsam.Pose2(*pose))
+        values.insert(W(0), w)
+        return values
+
+    def poses(self, values):
+        """Graph poses (f, 3), headings continuous, and markers (k, 3)."""
+        def rows(key, count):
+            each = (values.atPose2(key(i)) for i in range(count))
+            return np.array([[p.x(), p.y(), p.theta()] for p in each]).reshape(-1, 3)
+        poses = rows(X, len(self.frame))
+        poses[:, 2] = np.unwrap(poses[:, 2])
+        return poses, rows(L, len(self.marker))
+
+    def error(self, values, native, U):
+        e, *_ = linearize(self.factors, self.poses(values)[0], values.atVector(W(0)))
+        return native.error(values) + np.sum((U @ e[..., None])**2) / 2
+
+    def linear(self, values, native, U):
+        """The linearised graph, GTSAM's factors and ours."""
+        e, *jacobians = linearize(self.factors, self.poses(values)[0], values.atVector(W(0)))
+        first, second, by_w = (U @ J for J in jacobians)
+        b = -(U @ e[..., None])[..., 0]
+        graph = native.linearize(values)
+        for i in range(len(e)):
+            graph.add(X(i), first[i], X(i + 1), second[i], W(0), by_w[i], b[i])
+        return graph
+
+    def optimize(self, values, native, U, most=40):
+        """Gauss-Newton with step halving; returns values and their error."""
+        error = self.error(values, native, U)
+        for _ in range(most):
+            step = self.linear(values, native, U).eliminateMultifrontal().optimize()
+            for _ in range(8):
+                candidate = values.retract(step)
+                new_error = self.error(candidate, native, U)
+                if new_error <= error:
+                    break
+                step = _halved(step, values.keys())
+            else:
+                break
+            values, error, decrease = candidate, new_error, error - new_error
+            if decrease <= LEAST * (1 + error):
+                break
+        return values, error
+
+    def agrees(self, values):
+        """(s,) True for the sightings within GATE of the values."""
+        poses, markers = self.poses(values)
+        s = self.sightings
+        r = s.z - se2.between(poses[s.row], markers[self.label])
+        r[:, 2] = se2.wrap(r[:, 2])
+        return np.einsum("ni,ni->n", r, np.linalg.solve(s.C, r[..., None])[..., 0]) < GATE
+
+
+def _halved(step, keys):
+    half = gtsam.VectorValues()
+    for key in keys:
+        half.insert(key, step.at(key) / 2)
+    return half
+
+
+def solve(dataset, slip=None, model=None):
+    """SLAM on odometry and markers.
+
+    Parameters
+    ----------
+    dataset : Dataset with markers.
+    slip : sqrt(m), standard deviation of a wheel's slip after one metre; None learns it by maximizing
+        the Laplace evidence.
+    model : "arc" or "euler"; None takes the one of greater evidence.
+
+    Returns
+    -------
+    Slam
+    """
+    found = [_solve(_Graph(dataset, candidate), slip)
+             for candidate in (odometry.MODELS if model is None else (model,))]
+    return _result(*max(found, key=lambda solution: solution[-1]))
+
+
+def _solve(graph, slip):
+    """(graph, values, kept, slip, log evidence) at the given slip, or that of greatest evidence."""
+    values = graph.initial()
+    U, _ = graph.factors.whitening(slip or FIRST_SLIP)
+    for cauchy in CAUCHY:
+        values, _ = graph.optimize(values, graph.native(cauchy), U)
+    kept = graph.agrees(values)
+    native = graph.native(kept=kept)
+
+    def log_evidence(log_slip):
+        nonlocal values
+        U, log_det = graph.factors.whitening(np.exp(log_slip))
+        values, error = graph.optimize(values, native, U)
+        tree = graph.linear(values, native, U).eliminateMultifrontal()
+        return -error - np.sum(log_det) / 2 - tree.logDeterminant()
+
+    if slip is None:
+        slip = float(np.exp(minimize_scalar(lambda s: -log_evidence(s), bounds=np.log(SLIPS),
+                                            method="bounded", options={"xatol": 0.05}).x))
+    evidence = log_evidence(np.log(max(slip, SLIPS[0])))
+    return graph, values, kept, max(slip, SLIPS[0]), evidence
+
+
+def _result(graph, values, kept, slip, evidence):
+    """Every encoder pose, the markers and the wheels, with covariances in world axes."""
+    vehicle = graph.dataset.vehicle
+    U, _ = graph.factors.whitening(slip)
+    native = graph.native(kept=kept)
+    tree = graph.linear(values, native, U).eliminateMultifrontal()
+    poses, markers = graph.poses(values)
+    w, count = values.atVector(W(0)), len(poses)
+    if count > 1:
+        joint = np.array([tree.jointMarginalCovariance([X(i), X(i + 1), W(0)]).fullMatrix()
+                          for i in range(count - 1)])
+        every = _between_frames(graph, poses, joint, w, slip)
+    else:
+        every = poses, tree.marginalCovariance(X(0))[None]
+    agreeing, others = (np.bincount(graph.label[which], minlength=len(graph.marker))
+                        for which in (kept, ~kept))
+    held = np.flatnonzero(agreeing > others)      # the rest: nobody knows which sighting is right
+    spread = np.array([tree.marginalCovariance(L(int(j))) for j in held]).reshape(-1, 3, 3)
+    markers = markers[held]
+    markers[:, 2] = se2.wrap(markers[:, 2])
+    sigma_w = np.array([vehicle.sigma_right_radius, vehicle.sigma_left_radius, vehicle.sigma_wheelbase])
+    wheel = np.array([vehicle.right_radius, vehicle.left_radius, vehicle.wheelbase]) + sigma_w * w
+    freedom = 3 * (np.count_nonzero(kept) - np.count_nonzero(agreeing))   # odometry, priors: none
+    return Slam(*every, graph.marker[held], markers, se2.rotate_covariance(spread, markers[:, 2]),
+                wheel, sigma_w[:, None] * tree.marginalCovariance(W(0)) * sigma_w, slip, graph.model,
+                float(evidence), 2 * graph.error(values, native, U) / max(1, freedom), ~kept)
+
+
+def _between_frames(graph, poses, joint, w, slip):
+    """Poses (n, 3) and covariances (n, 3, 3) of every encoder pose, given the graph's.
+
+    Between two graph poses a and b a pose depends on nothing but them and w: X_a Delta_ak(w) and
+    X_b Delta_kb(w)^-1 are two estimates of it with the independent noise of the encoder steps before
+    and after, and their average by information is exact to first order.
+
+    `joint` (f-1, 9, 9) are the covariances of [X_i, X_{i+1}, w] in GTSAM's axes.
+    """
+    ticks, vehicle = graph.dataset.ticks, graph.dataset.vehicle
+    turned = np.zeros_like(joint)
+    turned[:, range(9), range(9)] = 1
+    turned[:, :2, :2], turned[:, 3:5, 3:5] = (se2.rotation(poses[rows, 2])
+                                              for rows in (slice(-1), slice(1, None)))
+    joint = turned @ joint @ np.swapaxes(turned, 1, 2)
+
+    last = np.searchsorted(graph.frame, np.arange(len(ticks)), side="right") - 1
+    all_poses = poses[last].copy()
+    covariances = np.concatenate([joint[:, :3, :3], joint[-1:, 3:6, 3:6]])[last]
+    between = np.flatnonzero(~np.isin(np.arange(len(ticks)), graph.frame))
+    if not len(between):
+        return all_poses, covariances
+    a, b = last[between], last[between] + 1
+    sigma_w = np.array([vehicle.sigma_right_radius, vehicle.sigma_left_radius, vehicle.sigma_wheelbase])
+
+    def increment(start, end):
+        delta, by_w = odometry.increments(ticks, vehicle, start, end, graph.model)
+        noise = odometry.increment_noise(ticks, vehicle, start, end, slip)
+        noise[:, [0, 1], [0, 1]] += _least_noise(vehicle)
+        return delta + by_w @ (sigma_w * w), by_w * sigma_w, noise
+
+    forward, forward_by_w, noise = increment(graph.frame[a], between)
+    A, B = se2.compose_jacobians(poses[a], forward)
+    N_a = B @ noise @ np.swapaxes(B, 1, 2)
+    ahead, ahead_by_w, noise = increment(between, graph.frame[b])
+    back = se2.inverse(ahead)
+    A_b, B_b = se2.compose_jacobians(poses[b], back)
+    B_b = B_b @ se2.inverse_jacobian(ahead)
+    N_b = B_b @ noise @ np.swapaxes(B_b, 1, 2)
+
+    gain = N_a @ np.linalg.inv(N_a + N_b)
+    rest = np.eye(3) - gain
+    estimate, other = se2.compose(poses[a], forward), se2.compose(poses[b], back)
+    difference = other - estimate
+    difference[:, 2] = se2.wrap(difference[:, 2])
+    F = np.concatenate([rest @ A, gain @ A_b,
+                        rest @ B @ forward_by_w + gain @ B_b @ ahead_by_w], axis=2)
+    all_poses[between] = estimate + np.einsum("nij,nj->ni", gain, difference)
+    covariances[between] = F @ joint[a] @ np.swapaxes(F, 1, 2) + rest @ N_a
+    return all_poses, (covariances + np.swapaxes(covariances, 1, 2)) / 2
+
+
+def _least_noise(vehicle):
+    """m^2, sideways noise of an increment: that of rounding, where a single step has none else."""
+    return (2 * np.pi * vehicle.right_radius / vehicle.ticks_per_revolution)**2 / 6

@@ -1,0 +1,168 @@
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from gtsam.symbol_shorthand import L, X
+from joblib import Parallel, delayed
+
+from numeric import central_differences
+from slamlib import se2, slam
+from slamlib.dataset import ArucoReadings, Dataset, Vehicle
+from slamlib.evaluation import ate, nees, nees_band
+from slamlib.simulation import simulate
+
+SEEDS = range(300, 350)
+
+
+def as_rows(poses):
+    return np.array([[p.x(), p.y(), p.theta()] for p in poses])
+
+
+def example(seed=0):
+    """Odometry factors of a drive, with graph poses and wheels off the nominal ones."""
+    rng = np.random.default_rng(seed)
+    dataset, truth = simulate("short", seed=3)
+    frame = np.arange(0, 2000, 40)
+    factors = slam.odometry_factors(dataset.ticks, dataset.vehicle, frame)
+    poses = truth.poses[frame] + rng.normal(0, 0.05, (len(frame), 3))
+    return factors, poses, rng.normal(0, 1, 3)
+
+
+def test_odometry_derivatives_against_central_differences():
+    factors, poses, w = example()
+    e, by_first, by_second, by_w = slam.linearize(factors, poses, w)
+
+    def error(xi, moved):
+        """Errors when every second pose, the even or the odd ones, is retracted by xi."""
+        changed = poses.copy()
+        changed[moved::2] = as_rows(gtsam.Pose2(*p).retract(xi) for p in poses[moved::2])
+        return slam.linearize(factors, changed, w)[0]
+
+    for moved, (even, odd) in ((0, (by_first, by_second)), (1, (by_second, by_first))):
+        numeric = central_differences(lambda xi: error(xi, moved), np.zeros(3))
+        np.testing.assert_allclose(even[::2], numeric[::2], atol=1e-7)
+        np.testing.assert_allclose(odd[1::2], numeric[1::2], atol=1e-7)
+    numeric = central_differences(lambda v: slam.linearize(factors, poses, v)[0], w)
+    np.testing.assert_allclose(by_w, numeric, atol=1e-8)
+
+
+def test_odometry_factor_is_gtsams_between_factor_when_the_wheels_are_known():
+    """Equal derivatives and right-hand side, far from the optimum too, and equal error."""
+    factors, poses, _ = example()
+    U, _ = factors.whitening(1e-3)
+    e, by_first, by_second, _ = slam.linearize(factors, poses, np.zeros(3))
+    assert np.abs(e).max() > 0.05
+    for i in range(len(e)):
+        # Unit noise on both sides: GTSAM may whiten by another root of the same information.
+        native = gtsam.BetweenFactorPose2(0, 1, gtsam.Pose2(*factors.increment[i]),
+                                          gtsam.noiseModel.Unit.Create(3))
+        values = gtsam.Values()
+        for k in range(2):
+            values.insert(k, gtsam.Pose2(*poses[i + k]))
+        A, b = native.linearize(values).jacobian()
+        np.testing.assert_allclose(A, np.concatenate([by_first[i], by_second[i]], axis=1), atol=1e-9)
+        np.testing.assert_allclose(b, -e[i], atol=1e-12)
+        noise = factors.rounding[i] + 1e-6 * factors.slipping[i]
+        native = gtsam.BetweenFactorPose2(0, 1, gtsam.Pose2(*factors.increment[i]),
+                                          gtsam.noiseModel.Gaussian.Covariance(noise))
+        assert np.isclose(native.error(values), np.sum((U[i] @ e[i])**2) / 2, rtol=1e-6)
+
+
+def test_one_sigma_costs_one_half():
+    """A sighting off by d^2 = e^T C^-1 e, in the vehicle's axes as the file has it, costs d^2 / 2."""
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        root = rng.normal(0, 0.01, (3, 3))
+        C, z = root @ root.T + 1e-6 * np.eye(3), np.array([1.0, -0.5, rng.uniform(-3, 3)])
+        direction = np.linalg.cholesky(C) @ (lambda u: u / np.linalg.norm(u))(rng.normal(size=3))
+        direction[2] = 0                                      # without a turn the axes stay the same
+        expected = direction @ np.linalg.solve(C, direction) / 2
+        readings = ArucoReadings(np.array([0]), np.array([4]), z[None], C[None])
+        dataset = Dataset("one", Vehicle(), np.zeros((1, 2), int), readings, None, None)
+        graph = slam._Graph(dataset, "arc")
+        values = graph.values(np.zeros((1, 3)), [z + direction], np.zeros(3))
+        assert np.isclose(graph.native().error(values), expected, rtol=1e-9)
+
+
+def test_two_poses_and_one_marker_by_hand():
+    """On a line with headings known: odometry says 1 m with variance q, the marker is seen from both.
+
+    With pose 1 fixed, unknowns (x_2, m): information [[1/q + 1/r, -1/r], [-1/r, 1/r + 1/r]] with the
+    variance r of a sighting, hence var x_2 = 2 r q / (2 r + q), var m = r (r + q) / (2 r + q), and with
+    odometry's x_2 = o and sightings s_1, s_2: x_2 = (2 r o + q (s_1 - s_2)) / (2 r + q).
+    The wheels are known too well to matter, and q is the noise of rounding and slip.
+    """
+    r, slip, s_1, s_2 = 4e-4, 2e-2, 2.02, 0.99
+    tiny = 1e-7
+    vehicle = Vehicle(sigma_right_radius=tiny, sigma_left_radius=tiny, sigma_wheelbase=tiny,
+                      sigma_heading=tiny)
+    ticks = np.zeros((101, 2), int)
+    ticks[1:] = 127
+    o = 100 * 127 * 2 * np.pi * 0.1 / 8000
+    C = np.diag([r, 1e-10, 1e-12])
+    readings = ArucoReadings(np.array([0, 100]), np.array([9, 9]),
+                             np.array([[s_1, 0, 0], [s_2, 0, 0]]), np.array([C, C]))
+    found = slam.solve(Dataset("line", vehicle, ticks, readings, None, None), slip, "arc")
+    q = slip**2 * o / 2
+    expected = (2 * r * o + q * (s_1 - s_2)) / (2 * r + q)
+    np.testing.assert_allclose(found.poses[100, 0], expected, atol=1e-5)
+    np.testing.assert_allclose(found.covariances[100, 0, 0], 2 * r * q / (2 * r + q), rtol=1e-3)
+    np.testing.assert_allclose(found.marker_covariance[0, 0, 0], r * (r + q) / (2 * r + q), rtol=1e-3)
+
+
+def test_perfect_data_gives_the_exact_answer():
+    dataset, truth = simulate("short", seed=1, noise=False)
+    found = slam.solve(dataset, 1e-3, "arc")
+    np.testing.assert_allclose(found.poses, truth.poses, atol=1e-9)
+    seen = np.searchsorted(truth.marker, found.marker)
+    np.testing.assert_allclose(found.marker_in_world, truth.marker_in_world[seen], atol=1e-9)
+    np.testing.assert_allclose(found.wheel, [0.1, 0.1, 0.4], atol=1e-10)
+    assert found.chi2_per_dof < 1e-9 and not found.outlier.any()
+
+
+def test_poses_between_graph_poses_are_those_of_a_graph_with_all_poses():
+    dataset, _ = simulate("short", seed=2)
+    fine = replace(dataset.vehicle, ticks_per_revolution=8e5)       # rounding would be counted anew
+    dataset = replace(dataset, vehicle=fine, ticks=100 * dataset.ticks)         # at every graph pose
+    keep = dataset.aruco.pose <= 100
+    names = ("pose", "marker", "marker_in_vehicle", "covariance")
+    dataset = replace(dataset, ticks=dataset.ticks[:106], aruco=replace(
+        dataset.aruco, **{name: getattr(dataset.aruco, name)[keep] for name in names}))
+    sparse = slam.solve(dataset, 3e-3, "arc")
+    dense = slam._result(*slam._solve(slam._Graph(dataset, "arc", also=range(106)), 3e-3))
+    np.testing.assert_allclose(sparse.poses, dense.poses, atol=2e-5)
+    sigma, expected = (np.sqrt(np.diagonal(c, axis1=1, axis2=2))[1:]
+                       for c in (sparse.covariances, dense.covariances))
+    np.testing.assert_allclose(sigma, expected, rtol=0.02, atol=2e-5)
+
+
+def trial(seed, **options):
+    dataset, truth = simulate("short", seed=seed, **options)
+    found = slam.solve(dataset)
+    seen = np.searchsorted(truth.marker, found.marker)
+    values = nees(found.poses, found.covariances, truth.poses)
+    frames = np.isin(np.arange(len(values)), dataset.aruco.pose)
+    wheel = found.wheel - [truth.vehicle.right_radius, truth.vehicle.left_radius, truth.vehicle.wheelbase]
+    return (np.nanmean(values[frames]), np.nanmean(values[~frames]), nees(
+        found.marker_in_world, found.marker_covariance, truth.marker_in_world[seen]).mean(),
+        wheel @ np.linalg.solve(found.wheel_covariance, wheel), ate(found.poses, truth.poses), found.slip,
+        found.chi2_per_dof, found.model == "arc",
+        np.abs(found.marker_in_world - truth.marker_in_world[seen])[:, :2].max())
+
+
+@pytest.mark.parametrize("options", [dict(), dict(mislabelled=0.03)])
+def test_monte_carlo_is_consistent(options):
+    """50 seeds: NEES of graph poses, of those between, of markers and wheels in their bands.
+
+    Four means under two options are in their bands together with 95 % (Bonferroni).
+    """
+    runs = np.array(Parallel(n_jobs=2)(delayed(trial)(seed, **options) for seed in SEEDS))
+    low, high = nees_band(len(SEEDS), probability=1 - 0.05 / 8)
+    for name, mean in zip(("poses", "poses between", "markers", "wheels"), runs.mean(0)):
+        assert low < mean < high, name
+    assert np.sqrt(np.mean(runs[:, 4]**2)) < 0.015 and runs[:, 4].max() < 0.05        # m, ATE
+    assert 0.8 < np.exp(np.mean(np.log(runs[:, 5]))) / 1e-3 < 1.25
+    assert 0.9 < runs[:, 6].mean() < 1.05
+    assert runs[:, 7].mean() > 0.9                                      # the arc is recognized
+    assert runs[:, 8].max() < 0.2                                       # no marker is stranded
