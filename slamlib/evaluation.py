@@ -73,13 +73,20 @@ def rpe(poses, truth, step):
 
 
 def judge(poses, covariances, truth, step):
-    """ATE, aligned ATE, RPE over `step` rows and mean NEES of one trajectory: a dict of numbers."""
+    """ATE, aligned ATE, RPE over `step` rows and mean NEES of one trajectory: a dict of numbers.
+
+    Rows of poses that are NaN stay where they are: no increment leads across a gap.
+    """
     translation, rotation = rpe(poses, truth, step)
+    return {"ate": ate(poses, truth), "aligned": ate(poses, truth, aligned=True),
+            "rpe": translation, "rpe_heading": rotation, "nees": anees(poses, covariances, truth)}
+
+
+def anees(poses, covariances, truth):
+    """Average NEES over the poses that have one; NaN if none has."""
     values = nees(poses, covariances, truth)
     values = values[np.isfinite(values)]
-    return {"ate": ate(poses, truth), "aligned": ate(poses, truth, aligned=True),
-            "rpe": translation, "rpe_heading": rotation,
-            "nees": float(values.mean()) if len(values) else np.nan}
+    return float(values.mean()) if len(values) else np.nan
 
 
 def nees_band(count, dof=3, probability=0.95):

@@ -17,7 +17,7 @@ propagation of odometry. With worthless odometry and one marker in view it is th
 `localization.py`; with several it is better, because it remembers how they stand to each other.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -26,6 +26,9 @@ from slamlib import odometry, se2
 from slamlib.ties import GATE, gather, tie_consecutive
 
 SLIPS = (1e-5, 3e-2)         # sqrt(m), the bounds within which slip is looked for
+TYPICAL_SLIP = 1e-3          # sqrt(m), and the factor within which it mostly lies: a prior that
+SLIP_FACTOR = 3.0            # decides where the data say nothing
+LEARNING = 500               # measured poses, the first ones, from which slip is learned
 
 
 @dataclass(frozen=True)
@@ -93,7 +96,7 @@ def fuse(dataset, slip=None, model="arc"):
     ----------
     dataset : Dataset with markers.
     slip : sqrt(m), standard deviation of a wheel's slip after one metre; None learns it by
-        maximizing the likelihood of the innovations.
+        maximizing the likelihood of the innovations times a wide prior.
     model : "arc" or "euler", the increments' model.
 
     Returns
@@ -102,11 +105,19 @@ def fuse(dataset, slip=None, model="arc"):
     """
     problem = _prepare(dataset, model)
     if slip is None:
-        best = minimize_scalar(lambda log_slip: -_filter(problem, np.exp(log_slip))[0],
-                               bounds=np.log(SLIPS), method="bounded", options={"xatol": 0.1})
+        best = minimize_scalar(
+            lambda s: -_filter(problem, np.exp(s), LEARNING)[0] - log_slip_prior(s),
+            bounds=np.log(SLIPS), method="bounded", options={"xatol": 0.1})
         slip = float(np.exp(best.x))
+    _, joint, _, _ = _filter(problem, slip)
+    problem = _prepare(dataset, model, problem.wheel + joint[-1, 3:])   # about what was learned
     _, joint, joint_covariance, outliers = _filter(problem, slip)
     return _between_frames(problem, joint, joint_covariance, slip, outliers)
+
+
+def log_slip_prior(log_slip):
+    """Logarithm of a lognormal density of the slip, about TYPICAL_SLIP, up to a constant."""
+    return -((log_slip - np.log(TYPICAL_SLIP)) / np.log(SLIP_FACTOR))**2 / 2
 
 
 @dataclass(frozen=True)
@@ -115,8 +126,10 @@ class _Problem:
 
     dataset: object
     model: str
+    vehicle: object              # with the wheel parameters about which increments are linear
+    wheel: np.ndarray            # (3,) these
     frame: np.ndarray            # (f,) pose 1 and the measured poses
-    increment: np.ndarray        # (f-1, 3) with table 2's wheels
+    increment: np.ndarray        # (f-1, 3)
     by_w: np.ndarray             # (f-1, 3, 3)
     rounding: np.ndarray         # (f-1, 3, 3) noise without slip
     slipping: np.ndarray         # (f-1, 3, 3) noise of slip 1
@@ -124,34 +137,38 @@ class _Problem:
     repeated: int                # sightings left out before the filter
 
 
-def _prepare(dataset, model):
+def _prepare(dataset, model, wheel=None):
     ticks, vehicle, sightings = dataset.ticks, dataset.vehicle, gather(dataset.aruco, also=[0])
+    if wheel is None:
+        wheel = np.array([vehicle.right_radius, vehicle.left_radius, vehicle.wheelbase])
+    vehicle = replace(vehicle, right_radius=wheel[0], left_radius=wheel[1], wheelbase=wheel[2])
     start, end = sightings.frame[:-1], sightings.frame[1:]
     split = np.searchsorted(sightings.row, np.arange(1, len(sightings.frame)))
     markers = list(zip(*(np.split(values, split)
                          for values in (sightings.marker, sightings.z, sightings.C))))
     rounding = odometry.increment_noise(ticks, vehicle, start, end, 0.0)
     slipping = odometry.increment_noise(ticks, vehicle, start, end, 1.0) - rounding
-    return _Problem(dataset, model, sightings.frame, *odometry.increments(ticks, vehicle, start, end, model),
+    return _Problem(dataset, model, vehicle, wheel, sightings.frame, *odometry.increments(ticks, vehicle, start, end, model),
                     rounding, slipping, markers, len(dataset.aruco.pose) - len(sightings.row))
 
 
-def _filter(problem, slip):
-    """Log likelihood of the innovations, and [X, w] with covariance at every frame.
+def _filter(problem, slip, most=None):
+    """Log likelihood of the innovations, and [X, w] with covariance at every frame, or the first.
 
-    w is kept as its deviation from table 2. Returns the log likelihood, (f, 6), (f, 6, 6) and the
+    w is kept as its deviation from what the increments are linear about. Returns the log likelihood, (f, 6), (f, 6, 6) and the
     number of sightings beyond the gate.
     """
     vehicle = problem.dataset.vehicle
     sigma_w = [vehicle.sigma_right_radius, vehicle.sigma_left_radius, vehicle.sigma_wheelbase]
-    state = np.zeros(6)
+    nominal = np.array([vehicle.right_radius, vehicle.left_radius, vehicle.wheelbase])
+    state = np.r_[0.0, 0.0, 0.0, nominal - problem.wheel]
     P = np.diag([0.0, 0.0, vehicle.sigma_heading, *sigma_w])**2
     ids, seen, seen_covariance = problem.markers[0]
     M, P = seen, _add_markers(P, seen_covariance)
     joint, joint_covariance = [state], [P[:6, :6]]
     noise = problem.rounding + slip**2 * problem.slipping
     log_likelihood, outliers = 0.0, 0
-    for k, (next_ids, seen, seen_covariance) in enumerate(problem.markers[1:]):
+    for k, (next_ids, seen, seen_covariance) in enumerate(problem.markers[1:most]):
         state, M, P = _predict(state, M, P, problem.increment[k], problem.by_w[k], noise[k])
         _, old, new = np.intersect1d(ids, next_ids, assume_unique=True, return_indices=True)
         innovation = seen[new] - M[old]
@@ -221,7 +238,7 @@ def _add_markers(P, covariance):
 
 def _between_frames(problem, joint, joint_covariance, slip, outliers):
     """Every pose of the encoder file from the last measured one before it, by odometry."""
-    ticks, vehicle = problem.dataset.ticks, problem.dataset.vehicle
+    ticks, vehicle = problem.dataset.ticks, problem.vehicle
     pose = np.arange(len(ticks))
     last = np.searchsorted(problem.frame, pose, side="right") - 1
     start = problem.frame[last]
@@ -233,6 +250,5 @@ def _between_frames(problem, joint, joint_covariance, slip, outliers):
     A, B = se2.compose_jacobians(joint[last, :3], delta)
     F = np.concatenate([A, B @ by_w], axis=2)
     covariances = F @ joint_covariance[last] @ np.swapaxes(F, 1, 2) + B @ noise @ np.swapaxes(B, 1, 2)
-    wheel = np.array([vehicle.right_radius, vehicle.left_radius, vehicle.wheelbase])
     return Fusion(se2.compose(joint[last, :3], delta), covariances, problem.frame,
-                  outliers + problem.repeated, slip, wheel + joint[-1, 3:], joint_covariance[-1, 3:, 3:])
+                  outliers + problem.repeated, slip, problem.wheel + joint[-1, 3:], joint_covariance[-1, 3:, 3:])

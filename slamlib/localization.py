@@ -18,12 +18,15 @@ the errors of the sightings made there, H_j = Cov(pose error, error of Z'_j):
 with A, B the derivatives of X' = X Delta by X and Delta, and D_j, D'_j those of Delta by Z_j, Z'_j.
 """
 
+from collections import Counter, defaultdict
 from dataclasses import dataclass
 
 import numpy as np
 
 from slamlib import se2
-from slamlib.ties import GATE, common_sightings, estimate_ties, gather, tie_consecutive
+from slamlib.ties import GATE, estimate_ties, gather, tie_consecutive
+
+RETURNS = 3                  # known frames to try for a frame that is not tied to the one before
 
 
 @dataclass(frozen=True)
@@ -34,7 +37,8 @@ class Localization:
     poses: np.ndarray               # (f, 3) in the frame of the first one; NaN where nothing ties
     covariances: np.ndarray         # (f, 3, 3)
     parent: np.ndarray              # (f,) row of the frame it was localized against, -1 for none
-    outlier: np.ndarray             # (m,) bool, sightings of the dataset that were left out
+    outlier: np.ndarray             # (m,) bool, sightings of the dataset that others contradict
+    unused: np.ndarray              # (m,) bool, sightings of markers that no neighbouring frame sees
     marker: np.ndarray              # (k,) ids of the mapped markers, ascending
     marker_in_world: np.ndarray     # (k, 3)
     marker_covariance: np.ndarray   # (k, 3, 3) of [x, y, heading] in world axes
@@ -44,10 +48,11 @@ def localize(aruco, shared_errors=True):
     """Incremental localization from the sightings of markers at successive measured poses.
 
     A measured pose is localized against the one before it where they share a marker, else against
-    the localized pose that shares most markers with it: markers whose place is known. Where there
-    is none it stays unknown until a known marker returns. The world frame is that of the first
-    measured pose. Outliers are left out as `ties.plausible_ties` says; a marker known from earlier
-    counts only in sightings that the measured pose before or after confirms.
+    the localized pose that shares most markers with it: markers whose place is known. Such a return
+    counts if two markers agree on it, or one that the measured poses beside both frames confirm.
+    Where there is none the pose stays unknown until a known marker returns. The world frame is that
+    of the first measured pose that is tied to the next. Outliers are left out as
+    `ties.plausible_ties` says.
 
     Parameters
     ----------
@@ -65,34 +70,26 @@ def localize(aruco, shared_errors=True):
     count = len(sightings.frame)
     confirmed = np.zeros(len(row), bool)
     confirmed[first[ties.kept]] = confirmed[second[ties.kept]] = True
-    sure = np.where(confirmed, marker, -1 - np.arange(len(marker)))          # others match nothing
-
     poses, covariances = np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan)
-    poses[0], covariances[0] = 0.0, 0.0
+    root = int(np.argmax(ties.usable)) if ties.usable.any() else 0
+    poses[root], covariances[root] = 0.0, 0.0
     parent = np.full(count, -1)
     cross = np.zeros((len(row), 3, 3))                                       # H_j
     sightings_of = np.split(np.arange(len(row)), np.searchsorted(row, np.arange(1, count)))
     pairs_of = np.split(np.arange(len(link)), np.searchsorted(link, np.arange(1, max(1, count - 1))))
-    last_seen = {}                           # marker: last localized frame with a sure sighting
+    seen_in = defaultdict(list)                         # marker: localized frames that saw it
 
-    for f in range(count):
+    for f in range(root, count):
         own = sightings_of[f]
-        if f > 0:
+        if f > root:
             if ties.usable[f - 1] and np.isfinite(poses[f - 1, 0]):
                 parent[f], tie, pairs, l = f - 1, ties, pairs_of[f - 1], f - 1
                 a, b = first[pairs], second[pairs]
             else:
-                known = _most_common([last_seen.get(m) for m in sure[own].tolist()])
-                if known is None:
+                found = _return_to_known(z, C, marker, confirmed, sightings_of, own, seen_in)
+                if found is None:
                     continue
-                seen = np.concatenate([sightings_of[known], own])
-                pairs, l = slice(None), 0
-                same, a, b = common_sightings(row[seen], sure[seen], [known], [f])
-                a, b = seen[a], seen[b]
-                tie = estimate_ties(z, C, same, a, b, 1)
-                if not tie.usable[0]:
-                    continue
-                parent[f] = known
+                (parent[f], tie, a, b), pairs, l = found, slice(None), 0
             p = parent[f]
             poses[f] = se2.compose(poses[p], tie.increment[l])
             A, B = se2.compose_jacobians(poses[p], tie.increment[l])
@@ -101,19 +98,35 @@ def localize(aruco, shared_errors=True):
                 S = A @ np.sum(cross[a] @ np.swapaxes(B @ tie.by_first[pairs], 1, 2), axis=0)
                 covariances[f] += S + S.T
                 cross[b] = B @ tie.by_second[pairs] @ C[b]
-        last_seen.update((m, f) for m in sure[own].tolist())
+        for m in marker[own].tolist():
+            seen_in[m].append(f)
 
-    outlier = np.ones(len(aruco.pose), bool)
-    outlier[sightings.index[confirmed]] = False
+    paired = np.zeros(len(row), bool)
+    paired[first] = paired[second] = True
+    outlier, unused = np.ones(len(aruco.pose), bool), np.zeros(len(aruco.pose), bool)
+    outlier[sightings.index] = paired & ~confirmed
+    unused[sightings.index] = ~paired
     used = np.flatnonzero(confirmed & np.isfinite(poses[row, 0]))
-    return Localization(sightings.frame, poses, covariances, parent, outlier, *_map_markers(
+    return Localization(sightings.frame, poses, covariances, parent, outlier, unused, *_map_markers(
         marker[used], poses[row[used]], covariances[row[used]], z[used], C[used], cross[used]))
 
 
-def _most_common(frames):
-    """The frame named most often, of those the latest; None where all are None."""
-    frames = [f for f in frames if f is not None]
-    return max(set(frames), key=lambda f: (frames.count(f), f), default=None)
+def _return_to_known(z, C, marker, confirmed, sightings_of, own, seen_in):
+    """The localized frame that shares most markers with the sightings `own`, of those the latest.
+
+    Returns the frame, the tie, and the common sightings in it and of `own`; None if there is none
+    whose tie can be trusted.
+    """
+    shared = Counter(f for m in marker[own].tolist() for f in seen_in[m])
+    for f in sorted(shared, key=lambda f: (shared[f], f), reverse=True)[:RETURNS]:
+        there = sightings_of[f]
+        _, a, b = np.intersect1d(marker[there], marker[own], return_indices=True)
+        a, b = there[a], own[b]
+        tie = estimate_ties(z, C, np.zeros(len(a), int), a, b, 1)
+        sure = tie.kept & confirmed[a] & confirmed[b]
+        if tie.usable[0] and (tie.kept.sum() > 1 or sure.any()):
+            return f, tie, a, b
+    return None
 
 
 def _map_markers(marker, poses, covariances, z, C, cross):

@@ -31,69 +31,15 @@ from gtsam.symbol_shorthand import L, W, X
 from scipy.optimize import minimize_scalar
 
 from slamlib import odometry, se2
-from slamlib.localization import most_certain
+from slamlib.factors import least_noise, linearize, odometry_factors, wheel_sigmas
+from slamlib.fusion import SLIPS, TYPICAL_SLIP, log_slip_prior
+from slamlib.localization import localize, most_certain
 from slamlib.ties import GATE, gather
 
 GAUGE = 1e-6                 # m, sigma of the position of pose 1, which is zero by definition
 CAUCHY = (100.0, 30.0, 10.0, 3.0)   # scale of the kernel in sigmas, round after round
-SLIPS = (1e-5, 3e-2)         # sqrt(m), the bounds within which slip is looked for
-FIRST_SLIP = 1e-3            # sqrt(m), until it is learned
 LOOSE = gtsam.noiseModel.Isotropic.Sigma(3, 1e5)
 LEAST = 1e-9                 # relative decrease of the error at which iterations end
-
-
-@dataclass(frozen=True)
-class Odometry:
-    """Odometry factors between consecutive graph poses, for all values of slip."""
-
-    increment: np.ndarray    # (f-1, 3) with nominal wheels
-    by_w: np.ndarray         # (f-1, 3, 3) by w, in units of sigma
-    rounding: np.ndarray     # (f-1, 3, 3) noise without slip, in the axes of the increment's end
-    slipping: np.ndarray     # (f-1, 3, 3) noise of slip 1
-
-    def whitening(self, slip):
-        """U with U^T U = noise^-1, and the log determinants of the noise."""
-        noise = self.rounding + slip**2 * self.slipping
-        U = np.swapaxes(np.linalg.cholesky(np.linalg.inv(noise)), 1, 2)
-        return U, np.linalg.slogdet(noise)[1]
-
-
-def odometry_factors(ticks, vehicle, frame, model="arc"):
-    """Odometry between the graph poses `frame` (f,), indices from 0."""
-    start, end = frame[:-1], frame[1:]
-    increment, by_w = odometry.increments(ticks, vehicle, start, end, model)
-    rounding = odometry.increment_noise(ticks, vehicle, start, end, 0.0)
-    slipping = odometry.increment_noise(ticks, vehicle, start, end, 1.0) - rounding
-    rounding[:, [0, 1], [0, 1]] += _least_noise(vehicle)
-    turn = -increment[:, 2]
-    sigma_w = [vehicle.sigma_right_radius, vehicle.sigma_left_radius, vehicle.sigma_wheelbase]
-    return Odometry(increment, by_w * sigma_w, se2.rotate_covariance(rounding, turn),
-                    se2.rotate_covariance(slipping, turn))
-
-
-def linearize(factors, poses, w):
-    """Errors of the odometry factors and their derivatives in GTSAM's tangent spaces.
-
-    Parameters
-    ----------
-    factors : Odometry
-    poses : (f, 3) graph poses.
-    w : (3,) wheel parameters in units of sigma.
-
-    Returns
-    -------
-    e : (f-1, 3) errors.
-    by_first, by_second, by_w : (f-1, 3, 3) derivatives by X_i, X_{i+1} and w.
-    """
-    Z = factors.increment + factors.by_w @ w
-    h = se2.between(poses[:-1], poses[1:])
-    miss = se2.between(Z, h)
-    log_by_miss, origin = se2.log_jacobian(miss), np.zeros(3)
-    _, by_second = se2.compose_jacobians(miss, origin)               # miss xi for X_{i+1} xi
-    h_by_first, _ = se2.compose_jacobians(origin, h)                 # xi^-1 h for X_i xi
-    miss_by_Z, miss_by_h = se2.between_jacobians(Z, h)
-    return (se2.log(miss), -log_by_miss @ miss_by_h @ h_by_first, log_by_miss @ by_second,
-            log_by_miss @ miss_by_Z @ factors.by_w)
 
 
 @dataclass(frozen=True)
@@ -112,16 +58,17 @@ class Slam:
     log_evidence: float             # Laplace, up to a constant of the dataset
     chi2_per_dof: float             # twice the error over the degrees of freedom
     outlier: np.ndarray             # (s,) bool, gathered sightings beyond the 99.9 % quantile
+    residual: np.ndarray            # (s, 3) whitened residuals of the sightings
 
 
-class _Graph:
+class Graph:
     """The graph of one dataset and one model of the increments."""
 
-    def __init__(self, dataset, model, also=()):
+    def __init__(self, dataset, model, also=(), independent=False):
         self.dataset, self.model = dataset, model
         self.sightings = gather(dataset.aruco, also=[0, len(dataset.ticks) - 1, *also])
         self.frame = self.sightings.frame
-        self.factors = odometry_factors(dataset.ticks, dataset.vehicle, self.frame, model)
+        self.factors = odometry_factors(dataset.ticks, dataset.vehicle, self.frame, model, independent)
         self.marker, self.label = np.unique(self.sightings.marker, return_inverse=True)
         s = self.sightings
         noise = se2.rotate_covariance(s.C, -s.z[:, 2])
@@ -144,16 +91,15 @@ class _Graph:
                 graph.add(gtsam.PriorFactorPose2(L(int(j)), gtsam.Pose2(), LOOSE))
         return graph
 
-    def initial(self):
-        """Odometry's poses, and each marker by consensus of where its sightings put it."""
+    def initial(self, landmarks="consensus"):
+        """Odometry's poses, and the markers where `landmarks` (one of LANDMARKS) puts them."""
         d, s = self.dataset, self.sightings
         poses, covariances = odometry.first_order(d.ticks, d.vehicle, model=self.model)
         seen_from = self.frame[s.row]
         A, B = se2.compose_jacobians(poses[seen_from], s.z)
         spread = A @ covariances[seen_from] @ np.swapaxes(A, 1, 2) + B @ s.C @ np.swapaxes(B, 1, 2)
         in_world = se2.compose(poses[seen_from], s.z)
-        return self.values(poses[self.frame], in_world[most_certain(s.marker, in_world, spread)],
-                           np.zeros(3))
+        return self.values(poses[self.frame], LANDMARKS[landmarks](self, in_world, spread), np.zeros(3))
 
     def values(self, poses, markers, w):
         values = gtsam.Values()
@@ -188,9 +134,9 @@ class _Graph:
         return graph
 
     def optimize(self, values, native, U, most=40):
-        """Gauss-Newton with step halving; returns values and their error."""
-        error = self.error(values, native, U)
-        for _ in range(most):
+        """Gauss-Newton with step halving; returns values, their error and the number of steps."""
+        error, steps = self.error(values, native, U), 0
+        for steps in range(1, most + 1):
             step = self.linear(values, native, U).eliminateMultifrontal().optimize()
             for _ in range(8):
                 candidate = values.retract(step)
@@ -203,15 +149,65 @@ class _Graph:
             values, error, decrease = candidate, new_error, error - new_error
             if decrease <= LEAST * (1 + error):
                 break
-        return values, error
+        return values, error, steps
 
-    def agrees(self, values):
-        """(s,) True for the sightings within GATE of the values."""
+    def residuals(self, values):
+        """(s, 3) whitened differences of the sightings from the values: of unit variance."""
         poses, markers = self.poses(values)
         s = self.sightings
         r = s.z - se2.between(poses[s.row], markers[self.label])
         r[:, 2] = se2.wrap(r[:, 2])
-        return np.einsum("ni,ni->n", r, np.linalg.solve(s.C, r[..., None])[..., 0]) < GATE
+        return np.linalg.solve(np.linalg.cholesky(s.C), r[..., None])[..., 0]
+
+    def log_evidence(self, values, native, slip):
+        """Values at the optimum for this slip and their Laplace evidence, up to a constant.
+
+        -e - sum log|Q| / 2 - log|R|, with the graph's error e, the noise Q of the odometry factors
+        and the square root information R of all variables.
+        """
+        U, log_det = self.factors.whitening(slip)
+        values, error, _ = self.optimize(values, native, U)
+        tree = self.linear(values, native, U).eliminateMultifrontal()
+        return values, -error - np.sum(log_det) / 2 - tree.logDeterminant()
+
+
+def _first(graph, in_world, spread):
+    return in_world[np.unique(graph.label, return_index=True)[1]]
+
+
+def _most_certain(graph, in_world, spread):
+    order = np.lexsort((np.linalg.slogdet(spread)[1], graph.label))
+    return in_world[order[np.unique(graph.label[order], return_index=True)[1]]]
+
+
+def _mean(graph, in_world, spread):
+    """Average by information, of angles about the most certain sighting's."""
+    middle = _most_certain(graph, in_world, spread)[graph.label]
+    apart = in_world - middle
+    apart[:, 2] = se2.wrap(apart[:, 2])
+    information = np.linalg.inv(spread)
+    total, moment = np.zeros((len(graph.marker), 3, 3)), np.zeros((len(graph.marker), 3))
+    np.add.at(total, graph.label, information)
+    np.add.at(moment, graph.label, (information @ apart[..., None])[..., 0])
+    return _first(graph, middle, None) + np.linalg.solve(total, moment[..., None])[..., 0]
+
+
+def _consensus(graph, in_world, spread):
+    return in_world[most_certain(graph.label, in_world, spread)]
+
+
+def _from_problem2(graph, in_world, spread):
+    """Problem 2's map, and the consensus for markers that it does not have."""
+    markers = _consensus(graph, in_world, spread)
+    found = localize(graph.dataset.aruco)
+    if found.frame[0] == 0:
+        has = np.isin(graph.marker, found.marker)
+        markers[has] = found.marker_in_world[np.searchsorted(found.marker, graph.marker[has])]
+    return markers
+
+
+LANDMARKS = {"first sighting": _first, "most certain sighting": _most_certain,
+             "mean by information": _mean, "consensus": _consensus, "problem 2's map": _from_problem2}
 
 
 def _halved(step, keys):
@@ -235,35 +231,38 @@ def solve(dataset, slip=None, model=None):
     -------
     Slam
     """
-    found = [_solve(_Graph(dataset, candidate), slip)
+    found = [solve_graph(Graph(dataset, candidate), slip)
              for candidate in (odometry.MODELS if model is None else (model,))]
-    return _result(*max(found, key=lambda solution: solution[-1]))
+    return result(*max(found, key=lambda solution: solution[-1]))
 
 
-def _solve(graph, slip):
-    """(graph, values, kept, slip, log evidence) at the given slip, or that of greatest evidence."""
-    values = graph.initial()
-    U, _ = graph.factors.whitening(slip or FIRST_SLIP)
+def solve_graph(graph, slip=None, landmarks="consensus"):
+    """Optimum of a Graph: (graph, values, kept, slip, log evidence), as `result` takes them.
+
+    Rounds with an ever narrower Cauchy kernel find the sightings that agree; on them, without a
+    kernel, the slip of greatest evidence times prior is looked for (unless given).
+    """
+    values = graph.initial(landmarks)
+    U, _ = graph.factors.whitening(max(slip or TYPICAL_SLIP, SLIPS[0]))
     for cauchy in CAUCHY:
-        values, _ = graph.optimize(values, graph.native(cauchy), U)
-    kept = graph.agrees(values)
+        values, _, _ = graph.optimize(values, graph.native(cauchy), U)
+    kept = np.sum(graph.residuals(values)**2, axis=1) < GATE
     native = graph.native(kept=kept)
 
-    def log_evidence(log_slip):
+    def cost(log_slip):
         nonlocal values
-        U, log_det = graph.factors.whitening(np.exp(log_slip))
-        values, error = graph.optimize(values, native, U)
-        tree = graph.linear(values, native, U).eliminateMultifrontal()
-        return -error - np.sum(log_det) / 2 - tree.logDeterminant()
+        values, evidence = graph.log_evidence(values, native, np.exp(log_slip))
+        return -evidence - log_slip_prior(log_slip)
 
     if slip is None:
-        slip = float(np.exp(minimize_scalar(lambda s: -log_evidence(s), bounds=np.log(SLIPS),
-                                            method="bounded", options={"xatol": 0.05}).x))
-    evidence = log_evidence(np.log(max(slip, SLIPS[0])))
-    return graph, values, kept, max(slip, SLIPS[0]), evidence
+        slip = np.exp(minimize_scalar(cost, bounds=np.log(SLIPS), method="bounded",
+                                      options={"xatol": 0.05}).x)
+    slip = float(max(slip, SLIPS[0]))
+    values, evidence = graph.log_evidence(values, native, slip)
+    return graph, values, kept, slip, evidence
 
 
-def _result(graph, values, kept, slip, evidence):
+def result(graph, values, kept, slip, evidence):
     """Every encoder pose, the markers and the wheels, with covariances in world axes."""
     vehicle = graph.dataset.vehicle
     U, _ = graph.factors.whitening(slip)
@@ -283,12 +282,13 @@ def _result(graph, values, kept, slip, evidence):
     spread = np.array([tree.marginalCovariance(L(int(j))) for j in held]).reshape(-1, 3, 3)
     markers = markers[held]
     markers[:, 2] = se2.wrap(markers[:, 2])
-    sigma_w = np.array([vehicle.sigma_right_radius, vehicle.sigma_left_radius, vehicle.sigma_wheelbase])
+    sigma_w = wheel_sigmas(vehicle)
     wheel = np.array([vehicle.right_radius, vehicle.left_radius, vehicle.wheelbase]) + sigma_w * w
     freedom = 3 * (np.count_nonzero(kept) - np.count_nonzero(agreeing))   # odometry, priors: none
     return Slam(*every, graph.marker[held], markers, se2.rotate_covariance(spread, markers[:, 2]),
                 wheel, sigma_w[:, None] * tree.marginalCovariance(W(0)) * sigma_w, slip, graph.model,
-                float(evidence), 2 * graph.error(values, native, U) / max(1, freedom), ~kept)
+                float(evidence), 2 * graph.error(values, native, U) / max(1, freedom), ~kept,
+                graph.residuals(values))
 
 
 def _between_frames(graph, poses, joint, w, slip):
@@ -314,12 +314,12 @@ def _between_frames(graph, poses, joint, w, slip):
     if not len(between):
         return all_poses, covariances
     a, b = last[between], last[between] + 1
-    sigma_w = np.array([vehicle.sigma_right_radius, vehicle.sigma_left_radius, vehicle.sigma_wheelbase])
+    sigma_w = wheel_sigmas(vehicle)
 
     def increment(start, end):
         delta, by_w = odometry.increments(ticks, vehicle, start, end, graph.model)
         noise = odometry.increment_noise(ticks, vehicle, start, end, slip)
-        noise[:, [0, 1], [0, 1]] += _least_noise(vehicle)
+        noise[:, [0, 1], [0, 1]] += least_noise(vehicle)
         return delta + by_w @ (sigma_w * w), by_w * sigma_w, noise
 
     forward, forward_by_w, noise = increment(graph.frame[a], between)
@@ -341,8 +341,3 @@ def _between_frames(graph, poses, joint, w, slip):
     all_poses[between] = estimate + np.einsum("nij,nj->ni", gain, difference)
     covariances[between] = F @ joint[a] @ np.swapaxes(F, 1, 2) + rest @ N_a
     return all_poses, (covariances + np.swapaxes(covariances, 1, 2)) / 2
-
-
-def _least_noise(vehicle):
-    """m^2, sideways noise of an increment: that of rounding, where a single step has none else."""
-    return (2 * np.pi * vehicle.right_radius / vehicle.ticks_per_revolution)**2 / 6

@@ -118,10 +118,11 @@ def common_sightings(row, marker, earlier, later):
 def plausible_ties(z, C, link, first, second, steps):
     """Ties of consecutive frames, of which none may imply a sudden motion.
 
-    Where two or more markers agree on an increment, it is a motion of the vehicle; the 99th
-    percentile of their speeds (per encoder step) times SUDDEN bounds all others. An increment
-    beyond the bound, which comes from wrongly labelled markers, is estimated again from what lies
-    within it.
+    Where two or more markers agree on an increment, it is a motion of the vehicle. Sudden is what is
+    SUDDEN times as fast (per encoder step, plus three sigma) as the 99th percentile of those and as
+    nine tenths of all increments, and unlike the increment before and the one after. Wrong labels
+    are like that: they lead away and back. A sudden increment is estimated again from the common
+    sightings that are not, and there is no tie if none is left.
 
     Parameters
     ----------
@@ -138,8 +139,12 @@ def plausible_ties(z, C, link, first, second, steps):
     if not agreed.any():
         return ties
     speed = np.abs(_polar(ties.increment)) / steps[:, None]
-    bound = SUDDEN * np.percentile(speed[agreed], 99, axis=0)
+    bound = SUDDEN * np.maximum(np.percentile(speed[agreed], 99, axis=0),
+                                np.percentile(speed[ties.usable], 90, axis=0, method="lower"))
     sudden = ties.usable & _is_sudden(ties.increment, ties.covariance, steps, bound)
+    velocity = ties.increment / steps[:, None]
+    alike = np.r_[False, _are_alike(velocity[:-1], velocity[1:]), False]
+    sudden &= ~(alike[:-1] | alike[1:])
     single, single_covariance = _single_increments(z, C, first, second)
     allowed = ~(sudden[link] & _is_sudden(single, single_covariance, steps[link], bound))
     if allowed.all():
@@ -149,7 +154,7 @@ def plausible_ties(z, C, link, first, second, steps):
     by_first, by_second = np.zeros((2, len(link), 3, 3))
     kept[allowed], by_first[allowed], by_second[allowed] = \
         again.kept, again.by_first, again.by_second
-    usable = again.usable & ~_is_sudden(again.increment, again.covariance, steps, bound)
+    usable = again.usable & ~(sudden & _is_sudden(again.increment, again.covariance, steps, bound))
     return Ties(again.increment, again.covariance, usable, kept & usable[link], by_first, by_second)
 
 
@@ -243,6 +248,14 @@ def _is_sudden(increment, covariance, steps, bound):
         allowance = 3 * np.sqrt(np.stack([covariance[:, 0, 0] + covariance[:, 1, 1],
                                           covariance[:, 2, 2]], -1))
         return np.any(np.abs(_polar(increment)) > bound * steps[:, None] + allowance, axis=1)
+
+
+def _are_alike(a, b):
+    """True where two velocities (n, 3) differ by less than half of the greater, in place and turn."""
+    with np.errstate(invalid="ignore"):
+        place, turn = np.hypot(*(a - b)[:, :2].T), np.abs(a[:, 2] - b[:, 2])
+        most = np.maximum(np.abs(_polar(a)), np.abs(_polar(b)))
+        return (place < most[:, 0] / 2) & (turn < most[:, 1] / 2 + 1e-3)
 
 
 def _squared(r, information):

@@ -86,3 +86,14 @@ def test_indices_along_a_path():
     np.testing.assert_array_equal(evaluation.along(1), [0])
     np.testing.assert_array_equal(evaluation.along(2), [1])
     np.testing.assert_array_equal(evaluation.along(101, 3), [1, 50, 100])
+
+
+def test_judging_leads_no_increment_across_a_gap():
+    poses, truth = drive(40)
+    covariances = np.tile(0.05**2 * np.eye(3), (40, 1, 1))
+    poses[15:25] = np.nan
+    poses[25:] += [100, 0, 0]                                # what a gap may hide
+    whole = evaluation.judge(poses, covariances, truth, 3)
+    assert whole["rpe"] < 0.5 and whole["ate"] > 10 and whole["nees"] > 1e4
+    nothing = evaluation.judge(np.full((4, 3), np.nan), covariances[:4], truth[:4], 3)
+    assert all(np.isnan(list(nothing.values())))

@@ -1,10 +1,11 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from slamlib import odometry, se2
 from slamlib.dataset import Vehicle
-from slamlib.evaluation import ate, nees, nees_band
+from slamlib.evaluation import anees, ate, nees, nees_band
 from slamlib.fusion import fuse, fuse_increments
 from slamlib.localization import localize
 from slamlib.simulation import simulate
@@ -127,9 +128,40 @@ def test_sparse_and_late_markers_leave_odometry_between():
     dataset = only(dataset, dataset.aruco.pose >= 800)
     expected = odometry.first_order(dataset.ticks, dataset.vehicle, model="arc")[0]
     fused, hint = fuse(dataset, slip=1e-3), fuse_increments(dataset)
-    np.testing.assert_allclose(fused.poses[:801], expected[:801], atol=1e-12)
+    np.testing.assert_allclose(fused.poses[:801], expected[:801], atol=2e-4)     # linear elsewhere
     np.testing.assert_allclose(
         hint.poses[:801], odometry.dead_reckoning(dataset.ticks, dataset.vehicle)[:801], atol=1e-12)
     for result in (fused, hint):
         assert len(result.poses) == len(dataset.ticks) and np.isfinite(result.covariances).all()
         assert ate(result.poses, truth.poses) < 1.0
+
+
+@pytest.mark.parametrize("keep", [
+    lambda a: a.pose % 300 == 0, lambda a: a.pose % 200 == 0, lambda a: np.arange(len(a.pose)) == 0])
+def test_where_nothing_is_said_of_the_slip_a_typical_one_is_taken(keep):
+    """Few frames, or a single sighting: 20 seeds, squared error of the last heading over its variance.
+
+    Of the heading, since position and heading together lie in a needle that bends (notebook 1).
+    """
+    last = []
+    for seed in range(20):
+        dataset, truth = simulate("short", seed=seed)
+        fused = fuse(only(dataset, keep(dataset.aruco)))
+        assert 1e-4 < fused.slip < 1e-2
+        last.append((fused.poses[-1, 2] - truth.poses[-1, 2])**2 / fused.covariances[-1, 2, 2])
+    low, high = nees_band(len(last), dof=1, probability=0.999)
+    assert low < np.mean(last) < high
+
+
+def test_wheels_far_from_nominal_are_learned():
+    """Radii 3 % off, and known to 5 %: the increments are linearised again about what is learned."""
+    ratios = []
+    for seed in range(6):
+        dataset, truth = simulate("short", seed=seed)
+        vehicle = replace(dataset.vehicle, right_radius=0.103, left_radius=0.097,
+                          sigma_right_radius=5e-3, sigma_left_radius=5e-3)
+        fused = fuse(replace(dataset, vehicle=vehicle))
+        ratios.append(anees(fused.poses, fused.covariances, truth.poses))
+        assert abs(fused.wheel[0] - truth.vehicle.right_radius) < 5e-4
+        assert ate(fused.poses, truth.poses) < 0.08
+    assert np.mean(ratios) < 6

@@ -148,3 +148,21 @@ def test_repeated_sightings_are_averaged_or_dropped():
     np.testing.assert_allclose(z, [[0, 2, 0], [1.02, 1, np.pi]], atol=1e-12)
     np.testing.assert_allclose(covariance[1], np.diag([5e-3, 5e-3, 7.5e-3]))
     np.testing.assert_array_equal(readings.marker_in_vehicle, before)
+
+
+def test_starting_off_is_no_sudden_motion():
+    """200 frames at rest with two markers in view, then 15 in motion, each pair with one in common."""
+    poses = [np.zeros(3)] * 200
+    for _ in range(15):
+        poses.append(se2.compose(poses[-1], DELTA))
+    row = np.concatenate([np.repeat(np.arange(200), 2), np.repeat(np.arange(200, 215), 2)])
+    marker = np.concatenate([np.tile([5, 9], 200), np.repeat(np.arange(9, 24), 2) + np.tile([0, 1], 15)])
+    rng = np.random.default_rng(2)
+    rng_map = {m: np.append(rng.uniform(-1, 1, 2), rng.uniform(-3, 3)) for m in np.unique(marker)}
+    z = se2.between(np.array(poses)[row], np.array([rng_map[m] for m in marker]))
+    z += rng.normal(0, 1e-3, z.shape)
+    order = np.lexsort((marker, row))
+    args = common_sightings(row[order], marker[order], np.arange(214), np.arange(1, 215))
+    ties = plausible_ties(z[order], np.tile(1e-6 * np.eye(3), (len(z), 1, 1)), *args, np.full(214, 10))
+    common = np.bincount(args[0], minlength=214)
+    assert (common[199:] == 1).all() and ties.usable.all() and ties.kept.all()

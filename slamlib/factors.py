@@ -1,0 +1,86 @@
+"""Odometry factors of the SLAM graph: all increments between graph poses at once, in numpy.
+
+With Delta(w) = Delta(0) + dDelta/dw w, w the wheel parameters in units of their sigmas, the error
+of the factor between graph poses X and X' is
+
+    e = log(Delta(w)^-1 X^-1 X'),
+
+GTSAM's between factor with a measurement that depends on w. Its noise, rounding and slip, lives in
+the axes of the increment's end, its derivatives in the tangent spaces X exp(xi), X' exp(xi').
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slamlib import odometry, se2
+
+
+@dataclass(frozen=True)
+class Odometry:
+    """Odometry factors between consecutive graph poses, for all values of slip."""
+
+    increment: np.ndarray    # (f-1, 3) with nominal wheels
+    by_w: np.ndarray         # (f-1, 3, 3) by w, in units of sigma
+    rounding: np.ndarray     # (f-1, 3, 3) noise without slip, in the axes of the increment's end
+    slipping: np.ndarray     # (f-1, 3, 3) noise of slip 1
+
+    def whitening(self, slip):
+        """U with U^T U = noise^-1, and the log determinants of the noise."""
+        noise = self.rounding + slip**2 * self.slipping
+        U = np.swapaxes(np.linalg.cholesky(np.linalg.inv(noise)), 1, 2)
+        return U, np.linalg.slogdet(noise)[1]
+
+
+def odometry_factors(ticks, vehicle, frame, model="arc", independent=False):
+    """Odometry between the graph poses `frame` (f,), indices from 0.
+
+    independent=True gives every factor wheel errors of its own, as noise, instead of the common w: a
+    chain of independent between factors, for comparison.
+    """
+    start, end = frame[:-1], frame[1:]
+    increment, by_w = odometry.increments(ticks, vehicle, start, end, model)
+    rounding = odometry.increment_noise(ticks, vehicle, start, end, 0.0)
+    slipping = odometry.increment_noise(ticks, vehicle, start, end, 1.0) - rounding
+    rounding[:, [0, 1], [0, 1]] += least_noise(vehicle)
+    by_w = by_w * wheel_sigmas(vehicle)
+    if independent:
+        rounding, by_w = rounding + by_w @ np.swapaxes(by_w, 1, 2), np.zeros_like(by_w)
+    turn = -increment[:, 2]
+    return Odometry(increment, by_w, se2.rotate_covariance(rounding, turn),
+                    se2.rotate_covariance(slipping, turn))
+
+
+def linearize(factors, poses, w):
+    """Errors of the odometry factors and their derivatives in GTSAM's tangent spaces.
+
+    Parameters
+    ----------
+    factors : Odometry
+    poses : (f, 3) graph poses.
+    w : (3,) wheel parameters in units of sigma.
+
+    Returns
+    -------
+    e : (f-1, 3) errors.
+    by_first, by_second, by_w : (f-1, 3, 3) derivatives by X_i, X_{i+1} and w.
+    """
+    Z = factors.increment + factors.by_w @ w
+    h = se2.between(poses[:-1], poses[1:])
+    miss = se2.between(Z, h)
+    log_by_miss, origin = se2.log_jacobian(miss), np.zeros(3)
+    _, by_second = se2.compose_jacobians(miss, origin)               # miss xi for X_{i+1} xi
+    h_by_first, _ = se2.compose_jacobians(origin, h)                 # xi^-1 h for X_i xi
+    miss_by_Z, miss_by_h = se2.between_jacobians(Z, h)
+    return (se2.log(miss), -log_by_miss @ miss_by_h @ h_by_first, log_by_miss @ by_second,
+            log_by_miss @ miss_by_Z @ factors.by_w)
+
+
+def wheel_sigmas(vehicle):
+    """(3,) m, standard deviations of R_R, R_L and b."""
+    return np.array([vehicle.sigma_right_radius, vehicle.sigma_left_radius, vehicle.sigma_wheelbase])
+
+
+def least_noise(vehicle):
+    """m^2, sideways noise of an increment: that of rounding, where a single step has none else."""
+    return (2 * np.pi * vehicle.right_radius / vehicle.ticks_per_revolution)**2 / 6
