@@ -17,7 +17,8 @@ from slamlib.simulation import manoeuvre, simulate, write_dataset
 ROOT = Path(__file__).parents[1]
 
 
-BROUGHT = ("new seed", "no_truth", "wheels_only", "waits", "one_pose", "backs_up")
+BROUGHT = ("new seed", "no_truth", "wheels_only", "waits", "one_pose", "backs_up", "one_sighting",
+           "sparse")
 
 
 @pytest.fixture(scope="module")
@@ -35,6 +36,10 @@ def built(tmp_path_factory):
         (data / name).mkdir()
         np.savetxt(data / name / "encoderReading.txt",
                    np.column_stack([np.arange(1, len(ticks) + 1), ticks]), fmt="%d")
+    seen = np.loadtxt(data / "new seed" / "ArucoReading.txt")
+    for name, kept in (("one_sighting", seen[:1]), ("sparse", seen[seen[:, 0] % 500 == 1])):
+        shutil.copytree(data / "new seed", data / name)
+        np.savetxt(data / name / "ArucoReading.txt", kept, fmt="%d %d" + 9 * " %.6g")
     pages = build_report(ROOT / "notebooks", data, folder / "report", folder / "results")
     return folder, {page.stem: page.read_text(encoding="utf-8") for page in pages}
 
@@ -86,7 +91,8 @@ def test_pages_name_every_dataset_and_say_what_is_left_out(built):
     left_out = re.search(r"There are no markers in ([^:]*): this chapter leaves them out", markers)
     assert set(re.split(", | and ", left_out[1])) >= {"wheels_only", "waits", "one_pose", "backs_up"}
     for name in BROUGHT:
-        assert (name in re.split(", | and ", sentence[1])) == (name != "new seed")
+        assert (name in re.split(", | and ", sentence[1])) == (
+            name not in ("new seed", "one_sighting", "sparse"))
 
 
 def test_no_cell_wrote_to_stderr(built):
@@ -105,6 +111,12 @@ def test_without_any_markers_chapter_2_can_still_be_read(tmp_path):
                          tmp_path / "results")
     assert "runs on a simulated drive instead" in pages[1].read_text(encoding="utf-8")
     assert list((tmp_path / "results").iterdir()) == []
+
+
+def test_no_page_says_nan(built):
+    _, pages = built
+    for name, page in pages.items():
+        assert not re.search(r"\bnan\b", re.sub(r"<pre.*?</pre>", "", page, flags=re.DOTALL)), name
 
 
 def test_no_page_shows_an_object_s_address(built):
