@@ -32,11 +32,11 @@ class Odometry:
         return U, np.linalg.slogdet(noise)[1]
 
 
-def odometry_factors(ticks, vehicle, frame, model="arc", independent=False):
+def odometry_factors(ticks, vehicle, frame, model="arc", wheels="variable"):
     """Odometry between the graph poses `frame` (f,), indices from 0.
 
-    independent=True gives every factor wheel errors of its own, as noise, instead of the common w: a
-    chain of independent between factors, for comparison.
+    wheels : "variable", the common w; for comparison "independent", where every factor has wheel
+        errors of its own as noise, or "fixed", without any wheel error.
     """
     start, end = frame[:-1], frame[1:]
     increment, by_w = odometry.increments(ticks, vehicle, start, end, model)
@@ -44,8 +44,10 @@ def odometry_factors(ticks, vehicle, frame, model="arc", independent=False):
     slipping = odometry.increment_noise(ticks, vehicle, start, end, 1.0) - rounding
     rounding[:, [0, 1], [0, 1]] += least_noise(vehicle)
     by_w = by_w * wheel_sigmas(vehicle)
-    if independent:
-        rounding, by_w = rounding + by_w @ np.swapaxes(by_w, 1, 2), np.zeros_like(by_w)
+    if wheels == "independent":
+        rounding = rounding + by_w @ np.swapaxes(by_w, 1, 2)
+    if wheels != "variable":
+        by_w = np.zeros_like(by_w)
     turn = -increment[:, 2]
     return Odometry(increment, by_w, se2.rotate_covariance(rounding, turn),
                     se2.rotate_covariance(slipping, turn))

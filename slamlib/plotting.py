@@ -98,6 +98,35 @@ def markers(ax, in_world, covariances, role="marker", label="markers"):
     return ax
 
 
+def factor_graph(ax, poses, markers, sightings, names):
+    """A factor graph: vehicle poses (f, >= 2), markers (k, >= 2) and w, with a dot for every factor.
+
+    `sightings` are pairs (row of poses, row of markers); `names` the markers' labels.
+    """
+    wheel = np.array([poses[:, 0].mean(), poses[:, 1].min() - 0.45 * np.ptp(markers[:, 1])])
+
+    def edge(ends, color):
+        middle = np.mean(ends, axis=0)
+        for end in ends:
+            ax.plot(*np.stack([end, middle]).T, color=color, linewidth=0.9, zorder=1)
+        ax.plot(*middle, "s", color=color, markersize=4, zorder=2)
+
+    for i, j in sightings:
+        edge([poses[i, :2], markers[j, :2]], ROLES["aruco"]["color"])
+    for i in range(len(poses) - 1):
+        edge([poses[i, :2], poses[i + 1, :2], wheel], ROLES["odometry"]["color"])
+    nodes = [(p, f"$X_{i + 1}$", "white") for i, p in enumerate(poses[:, :2])]
+    nodes += [(m, f"$L_{{{name}}}$", "#dddddd") for m, name in zip(markers[:, :2], names)]
+    for place, name, color in [*nodes, (wheel, "$w$", "#ffe0b0")]:
+        ax.text(*place, name, ha="center", va="center", fontsize=8, zorder=4,
+                bbox=dict(boxstyle="circle,pad=0.25", facecolor=color, edgecolor="black"))
+    for prior in (poses[0, :2], wheel):
+        edge([prior, prior + [-0.12 * np.ptp(markers[:, 0]), 0]], "black")
+    ax.set_aspect("equal", adjustable="datalim")
+    ax.axis("off")
+    return ax
+
+
 def enlargement(poses, covariances):
     """1, 2, 5, 10, ...: how much to enlarge ellipses so that the largest is a tenth of the path.
 

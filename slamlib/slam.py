@@ -64,11 +64,11 @@ class Slam:
 class Graph:
     """The graph of one dataset and one model of the increments."""
 
-    def __init__(self, dataset, model, also=(), independent=False):
+    def __init__(self, dataset, model, also=(), wheels="variable"):
         self.dataset, self.model = dataset, model
         self.sightings = gather(dataset.aruco, also=[0, len(dataset.ticks) - 1, *also])
         self.frame = self.sightings.frame
-        self.factors = odometry_factors(dataset.ticks, dataset.vehicle, self.frame, model, independent)
+        self.factors = odometry_factors(dataset.ticks, dataset.vehicle, self.frame, model, wheels)
         self.marker, self.label = np.unique(self.sightings.marker, return_inverse=True)
         s = self.sightings
         noise = se2.rotate_covariance(s.C, -s.z[:, 2])
@@ -234,6 +234,16 @@ def solve(dataset, slip=None, model=None):
     found = [solve_graph(Graph(dataset, candidate), slip)
              for candidate in (odometry.MODELS if model is None else (model,))]
     return result(*max(found, key=lambda solution: solution[-1]))
+
+
+def evidence_curve(dataset, slips, model="arc"):
+    """Log evidence (len(slips),) of values of the slip, each at its own optimum."""
+    graph, values, kept, _, _ = solve_graph(Graph(dataset, model), slips[0])
+    native, curve = graph.native(kept=kept), []
+    for slip in slips:
+        values, evidence = graph.log_evidence(values, native, slip)
+        curve.append(evidence)
+    return np.array(curve)
 
 
 def solve_graph(graph, slip=None, landmarks="consensus"):

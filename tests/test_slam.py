@@ -151,8 +151,17 @@ def test_monte_carlo_is_consistent(options):
     assert 0.9 < runs["chi2"].mean() < 1.05
     assert runs["arc"].mean() > 0.9                                     # the arc is recognized
     assert runs["map worst"].max() < 0.2                                # no marker is stranded
-    # An independent chain of factors forgets that the wheels' errors repeat.
-    assert np.sqrt(np.mean(runs["chain ate"]**2)) > 1.2 * np.sqrt(np.mean(runs["ate"]**2))
+
+
+def test_the_wheels_belong_into_the_graph():
+    """Without slip only the wheels' errors are left, which repeat: 10 seeds, given the true slip."""
+    runs = montecarlo.run(montecarlo.graphs, range(400, 410), slip=0.0)
+    rms = {wheels: np.sqrt(np.mean(runs[f"{wheels} arc ate"]**2)) for wheels in montecarlo.WHEELS}
+    assert 2 * rms["variable"] < rms["independent"] < rms["fixed"]
+    assert runs["variable arc nees"].mean() < 4 and runs["fixed arc nees"].mean() > 50
+    others = [runs[f"{wheels} {model} evidence"] for wheels in montecarlo.WHEELS
+              for model in ("arc", "euler") if (wheels, model) != ("variable", "arc")]
+    assert (runs["variable arc evidence"] > np.array(others)).all()
 
 
 @pytest.mark.parametrize("options", [dict(mislabelled=0.05), dict(mislabelled=0.01, drift=5.0)])
