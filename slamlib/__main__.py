@@ -1,10 +1,14 @@
 """The command line: python -m slamlib {report, solve, simulate}."""
 
 import argparse
+import os
 import sys
 from pathlib import Path
 
-from slamlib.dataset import DatasetError, read_dataset, read_truth
+# The matrices are small: more threads only wait for each other. To be set before numpy is imported.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+from slamlib.dataset import DatasetError, read_dataset, read_truth  # noqa: E402
 
 
 def main(arguments=None):

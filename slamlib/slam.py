@@ -34,11 +34,12 @@ from slamlib import odometry, se2
 from slamlib.factors import least_noise, linearize, odometry_factors, wheel_sigmas
 from slamlib.fusion import SLIPS, TYPICAL_SLIP, log_slip_prior
 from slamlib.localization import localize, most_certain
+from slamlib.marginals import marginals, sighting_jacobians
 from slamlib.ties import GATE, gather
 
 GAUGE = 1e-6                 # m, sigma of the position of pose 1, which is zero by definition
 CAUCHY = (100.0, 30.0, 10.0, 3.0)   # scale of the kernel in sigmas, round after round
-LOOSE = gtsam.noiseModel.Isotropic.Sigma(3, 1e5)
+LOOSE = 1e5                  # m and rad, sigma of a marker that no sighting holds
 LEAST = 1e-9                 # relative decrease of the error at which iterations end
 
 
@@ -88,7 +89,8 @@ class Graph:
                 graph.add(gtsam.BetweenFactorPose2(i, j, z, model))
         if kept is not None:                     # what no sighting holds must not be singular
             for j in np.setdiff1d(self.label, self.label[kept]):
-                graph.add(gtsam.PriorFactorPose2(L(int(j)), gtsam.Pose2(), LOOSE))
+                graph.add(gtsam.PriorFactorPose2(
+                    L(int(j)), gtsam.Pose2(), gtsam.noiseModel.Isotropic.Sigma(3, LOOSE)))
         return graph
 
     def initial(self, landmarks="consensus"):
@@ -150,6 +152,20 @@ class Graph:
             if decrease <= LEAST * (1 + error):
                 break
         return values, error, steps
+
+    def marginals(self, values, U, kept):
+        """Covariances of consecutive poses with w, (f-1, 9, 9), and of markers and w, at the optimum."""
+        poses, markers = self.poses(values)
+        _, *jacobians = linearize(self.factors, poses, values.atVector(W(0)))
+        s, label = self.sightings, self.label[kept]
+        row, z = s.row[kept], s.z[kept]
+        root = np.linalg.cholesky(np.linalg.inv(se2.rotate_covariance(s.C[kept], -z[:, 2])))
+        whitened = (np.swapaxes(root, 1, 2) @ J
+                    for J in sighting_jacobians(z, poses[row], markers[label]))
+        loose = np.bincount(label, minlength=len(markers)) == 0
+        prior = (np.diag(np.array([GAUGE, GAUGE, self.dataset.vehicle.sigma_heading])**-2.0), np.eye(3),
+                 loose[:, None, None] / LOOSE**2 * np.eye(3))
+        return marginals([U @ J for J in jacobians], (row, label, *whitened), prior)
 
     def residuals(self, values):
         """(s, 3) whitened differences of the sightings from the values: of unit variance."""
@@ -225,15 +241,18 @@ def solve(dataset, slip=None, model=None):
     dataset : Dataset with markers.
     slip : sqrt(m), standard deviation of a wheel's slip after one metre; None learns it by maximizing
         the Laplace evidence.
-    model : "arc" or "euler"; None takes the one of greater evidence.
+    model : "arc" or "euler"; None takes the one of greater evidence (at the arc's slip).
 
     Returns
     -------
     Slam
     """
-    found = [solve_graph(Graph(dataset, candidate), slip)
-             for candidate in (odometry.MODELS if model is None else (model,))]
-    return result(*max(found, key=lambda solution: solution[-1]))
+    found = solve_graph(Graph(dataset, model or "arc"), slip)
+    if model is None:
+        other = solve_graph(Graph(dataset, "euler"), found[3], start=found[1])
+        if other[-1] > found[-1]:
+            found = other if slip is not None else solve_graph(Graph(dataset, "euler"), None, start=other[1])
+    return result(*found)
 
 
 def evidence_curve(dataset, slips, model="arc"):
@@ -246,15 +265,16 @@ def evidence_curve(dataset, slips, model="arc"):
     return np.array(curve)
 
 
-def solve_graph(graph, slip=None, landmarks="consensus"):
+def solve_graph(graph, slip=None, landmarks="consensus", start=None):
     """Optimum of a Graph: (graph, values, kept, slip, log evidence), as `result` takes them.
 
     Rounds with an ever narrower Cauchy kernel find the sightings that agree; on them, without a
-    kernel, the slip of greatest evidence times prior is looked for (unless given).
+    kernel, the slip of greatest evidence times prior is looked for (unless given). `start` are values
+    near the optimum, instead of odometry and `landmarks`: one round with the last kernel is enough.
     """
-    values = graph.initial(landmarks)
+    values = graph.initial(landmarks) if start is None else start
     U, _ = graph.factors.whitening(max(slip or TYPICAL_SLIP, SLIPS[0]))
-    for cauchy in CAUCHY:
+    for cauchy in CAUCHY if start is None else CAUCHY[-1:]:
         values, _, _ = graph.optimize(values, graph.native(cauchy), U)
     kept = np.sum(graph.residuals(values)**2, axis=1) < GATE
     native = graph.native(kept=kept)
@@ -266,7 +286,7 @@ def solve_graph(graph, slip=None, landmarks="consensus"):
 
     if slip is None:
         slip = np.exp(minimize_scalar(cost, bounds=np.log(SLIPS), method="bounded",
-                                      options={"xatol": 0.05}).x)
+                                      options={"xatol": 0.1}).x)
     slip = float(max(slip, SLIPS[0]))
     values, evidence = graph.log_evidence(values, native, slip)
     return graph, values, kept, slip, evidence
@@ -277,26 +297,22 @@ def result(graph, values, kept, slip, evidence):
     vehicle = graph.dataset.vehicle
     U, _ = graph.factors.whitening(slip)
     native = graph.native(kept=kept)
-    tree = graph.linear(values, native, U).eliminateMultifrontal()
     poses, markers = graph.poses(values)
-    w, count = values.atVector(W(0)), len(poses)
-    if count > 1:
-        joint = np.array([tree.jointMarginalCovariance([X(i), X(i + 1), W(0)]).fullMatrix()
-                          for i in range(count - 1)])
-        every = _between_frames(graph, poses, joint, w, slip)
-    else:
-        every = poses, tree.marginalCovariance(X(0))[None]
+    w = values.atVector(W(0))
+    joint, border = graph.marginals(values, U, kept)
+    every = _between_frames(graph, poses, joint, w, slip)
     agreeing, others = (np.bincount(graph.label[which], minlength=len(graph.marker))
                         for which in (kept, ~kept))
     held = np.flatnonzero(agreeing > others)      # the rest: nobody knows which sighting is right
-    spread = np.array([tree.marginalCovariance(L(int(j))) for j in held]).reshape(-1, 3, 3)
+    blocks = border.reshape(len(markers) + 1, 3, -1, 3)
+    spread, of_w = blocks[held, :, held], blocks[-1, :, -1]
     markers = markers[held]
     markers[:, 2] = se2.wrap(markers[:, 2])
     sigma_w = wheel_sigmas(vehicle)
     wheel = np.array([vehicle.right_radius, vehicle.left_radius, vehicle.wheelbase]) + sigma_w * w
     freedom = 3 * (np.count_nonzero(kept) - np.count_nonzero(agreeing))   # odometry, priors: none
     return Slam(*every, graph.marker[held], markers, se2.rotate_covariance(spread, markers[:, 2]),
-                wheel, sigma_w[:, None] * tree.marginalCovariance(W(0)) * sigma_w, slip, graph.model,
+                wheel, sigma_w[:, None] * of_w * sigma_w, slip, graph.model,
                 float(evidence), 2 * graph.error(values, native, U) / max(1, freedom), ~kept,
                 graph.residuals(values))
 

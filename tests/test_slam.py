@@ -3,6 +3,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
+from gtsam.symbol_shorthand import L, W, X
 
 from numeric import central_differences
 from slamlib import factors as factors_of
@@ -66,6 +67,24 @@ def test_odometry_factor_is_gtsams_between_factor_when_the_wheels_are_known():
         native = gtsam.BetweenFactorPose2(0, 1, gtsam.Pose2(*factors.increment[i]),
                                           gtsam.noiseModel.Gaussian.Covariance(noise))
         assert np.isclose(native.error(values), np.sum((U[i] @ e[i])**2) / 2, rtol=1e-6)
+
+
+def test_marginals_are_gtsams():
+    dataset, _ = simulate("short", seed=3, mislabelled=0.02)
+    graph, values, kept, slip, _ = slam.solve_graph(slam.Graph(dataset, "arc"), 1e-3)
+    U, _ = graph.factors.whitening(slip)
+    tree = graph.linear(values, graph.native(kept=kept), U).eliminateMultifrontal()
+    joint, border = graph.marginals(values, U, kept)
+    for i in range(0, len(joint), 13):
+        expected = tree.jointMarginalCovariance([X(i), X(i + 1), W(0)]).fullMatrix()
+        sigma = np.sqrt(np.diag(expected))
+        np.testing.assert_allclose(joint[i] / np.outer(sigma, sigma), expected / np.outer(sigma, sigma),
+                                   atol=1e-6)
+    for j in range(len(graph.marker)):
+        block = border[3 * j:3 * j + 3, 3 * j:3 * j + 3]
+        np.testing.assert_allclose(block, tree.marginalCovariance(L(j)), rtol=1e-5,
+                                   atol=1e-6 * block.max())
+    np.testing.assert_allclose(border[-3:, -3:], tree.marginalCovariance(W(0)), rtol=1e-5, atol=1e-7)
 
 
 def test_one_sigma_costs_one_half():

@@ -1,0 +1,67 @@
+"""What a plain GTSAM script makes of problem 3, to compare with: time, memory and error.
+
+A between factor for every encoder row with the noise that table 2 gives a single step (and a floor,
+since that is singular), a between factor with a Huber kernel for every sighting, markers where their
+first sighting puts them, one Levenberg-Marquardt solve, a marginal for every pose.
+
+    python tests/benchmarks/plain_gtsam.py [FOLDER]
+"""
+
+import sys
+import time
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import L, X
+
+from slamlib import evaluation, odometry, se2
+from slamlib.dataset import read_dataset, read_truth
+
+FLOOR = np.array([1e-4, 1e-4, 1e-3])          # m, m, rad in one step
+
+
+def plain(dataset, marginals=True):
+    """Poses (n, 3) and covariances (n, 3, 3) in GTSAM's axes, or None."""
+    ticks, vehicle, aruco = dataset.ticks, dataset.vehicle, dataset.aruco
+    poses = odometry.dead_reckoning(ticks, vehicle)
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    graph.add(gtsam.PriorFactorPose2(X(0), gtsam.Pose2(), gtsam.noiseModel.Diagonal.Sigmas(
+        [1e-6, 1e-6, vehicle.sigma_heading])))
+    ds, dtheta, ds_by_w, dtheta_by_w = odometry.steps(ticks, vehicle)
+    sigma_w = np.array([vehicle.sigma_right_radius, vehicle.sigma_left_radius,
+                        vehicle.sigma_wheelbase])
+    sigmas = FLOOR + np.stack([np.linalg.norm(ds_by_w * sigma_w, axis=1), 0 * ds,
+                               np.linalg.norm(dtheta_by_w * sigma_w, axis=1)], -1)
+    for k in range(len(ds)):
+        graph.add(gtsam.BetweenFactorPose2(X(k), X(k + 1), gtsam.Pose2(ds[k], 0.0, dtheta[k]),
+                                           gtsam.noiseModel.Diagonal.Sigmas(sigmas[k])))
+    for k, pose in enumerate(poses):
+        values.insert(X(k), gtsam.Pose2(*pose))
+    huber = gtsam.noiseModel.mEstimator.Huber.Create(1.345)
+    for i, j, z, C in zip(aruco.pose.tolist(), aruco.marker.tolist(), aruco.marker_in_vehicle,
+                          aruco.covariance):
+        graph.add(gtsam.BetweenFactorPose2(X(i), L(j), gtsam.Pose2(*z), gtsam.noiseModel.Robust.Create(
+            huber, gtsam.noiseModel.Gaussian.Covariance(C))))
+        if not values.exists(L(j)):
+            values.insert(L(j), gtsam.Pose2(*se2.compose(poses[i], z)))
+    values = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    each = [values.atPose2(X(k)) for k in range(len(poses))]
+    found = np.array([[p.x(), p.y(), p.theta()] for p in each])
+    if not marginals:
+        return found, None
+    of = gtsam.Marginals(graph, values)
+    return found, np.array([of.marginalCovariance(X(k)) for k in range(len(poses))])
+
+
+def main(folder):
+    dataset, truth = read_dataset(folder), read_truth(folder)
+    start = time.perf_counter()
+    poses, _ = plain(dataset)
+    seconds = time.perf_counter() - start
+    error = "" if truth is None else (f", ATE {evaluation.ate(poses, truth.poses):.4f} m, aligned "
+                                      f"{evaluation.ate(poses, truth.poses, aligned=True):.4f} m")
+    print(f"plain GTSAM script, problem 3 on {dataset.name}: {seconds:.1f} s{error}")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1] if len(sys.argv) > 1 else "data/long")
