@@ -26,8 +26,8 @@ from slamlib import odometry, se2
 from slamlib.ties import GATE, gather, tie_consecutive
 
 SLIPS = (1e-5, 3e-2)         # sqrt(m), the bounds within which slip is looked for
-TYPICAL_SLIP = 1e-3          # sqrt(m), and the factor within which it mostly lies: a prior that
-SLIP_FACTOR = 3.0            # decides where the data say nothing
+TYPICAL_SLIP = 1e-3          # sqrt(m), and the factor within which it mostly lies: a wide prior that
+SLIP_FACTOR = 10.0           # decides where the data say nothing
 LEARNING = 500               # measured poses, the first ones, from which slip is learned
 
 

@@ -40,7 +40,7 @@ from slamlib.ties import GATE, gather
 GAUGE = 1e-6                 # m, sigma of the position of pose 1, which is zero by definition
 CAUCHY = (100.0, 30.0, 10.0, 3.0)   # scale of the kernel in sigmas, round after round
 LOOSE = 1e5                  # m and rad, sigma of a marker that no sighting holds
-LEAST = 1e-9                 # relative decrease of the error at which iterations end
+LEAST = 1e-6                 # relative decrease of the error at which iterations end
 
 
 @dataclass(frozen=True)
