@@ -9,7 +9,7 @@ GTSAM's between factor with a measurement that depends on w. Its noise, rounding
 the axes of the increment's end, its derivatives in the tangent spaces X exp(xi), X' exp(xi').
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from slamlib import odometry, se2
 class Odometry:
     """Odometry factors between consecutive graph poses, for all values of slip."""
 
-    increment: np.ndarray    # (f-1, 3) with nominal wheels
+    increment: np.ndarray    # (f-1, 3) continued linearly to the nominal wheels
     by_w: np.ndarray         # (f-1, 3, 3) by w, in units of sigma
     rounding: np.ndarray     # (f-1, 3, 3) noise without slip, in the axes of the increment's end
     slipping: np.ndarray     # (f-1, 3, 3) noise of slip 1
@@ -32,12 +32,15 @@ class Odometry:
         return U, np.linalg.slogdet(noise)[1]
 
 
-def odometry_factors(ticks, vehicle, frame, model="arc", wheels="variable"):
+def odometry_factors(ticks, vehicle, frame, model="arc", wheels="variable", about=None):
     """Odometry between the graph poses `frame` (f,), indices from 0.
 
     wheels : "variable", the common w; for comparison "independent", where every factor has wheel
         errors of its own as noise, or "fixed", without any wheel error.
+    about : (3,) w about which the increments are linear; by default 0, the nominal wheels.
     """
+    about = np.zeros(3) if about is None else about
+    vehicle = vehicle_with(vehicle, about)
     start, end = frame[:-1], frame[1:]
     increment, by_w = odometry.increments(ticks, vehicle, start, end, model)
     rounding = odometry.increment_noise(ticks, vehicle, start, end, 0.0)
@@ -49,6 +52,7 @@ def odometry_factors(ticks, vehicle, frame, model="arc", wheels="variable"):
     if wheels != "variable":
         by_w = np.zeros_like(by_w)
     turn = -increment[:, 2]
+    increment = increment - by_w @ about
     return Odometry(increment, by_w, se2.rotate_covariance(rounding, turn),
                     se2.rotate_covariance(slipping, turn))
 
@@ -76,6 +80,13 @@ def linearize(factors, poses, w):
     miss_by_Z, miss_by_h = se2.between_jacobians(Z, h)
     return (se2.log(miss), -log_by_miss @ miss_by_h @ h_by_first, log_by_miss @ by_second,
             log_by_miss @ miss_by_Z @ factors.by_w)
+
+
+def vehicle_with(vehicle, w):
+    """The vehicle with the wheel parameters w, in units of their sigmas beyond the nominal ones."""
+    right, left, base = wheel_sigmas(vehicle) * w
+    return replace(vehicle, right_radius=vehicle.right_radius + right,
+                   left_radius=vehicle.left_radius + left, wheelbase=vehicle.wheelbase + base)
 
 
 def wheel_sigmas(vehicle):

@@ -89,7 +89,7 @@ def problem3(seed, **options):
             "wheel nees": wheel @ np.linalg.solve(found.wheel_covariance, wheel),
             "ate": ate(found.poses, truth.poses),
             "aligned": ate(found.poses, truth.poses, aligned=True),
-            "slip": found.slip, "chi2": found.chi2_per_dof, "arc": float(found.model == "arc"),
+            "left out": np.count_nonzero(found.outlier), "slip": found.slip, "chi2": found.chi2_per_dof, "arc": float(found.model == "arc"),
             "map worst": np.abs(found.marker_in_world - true_map)[:, :2].max()}
 
 

@@ -31,7 +31,8 @@ from gtsam.symbol_shorthand import L, W, X
 from scipy.optimize import minimize_scalar
 
 from slamlib import odometry, se2
-from slamlib.factors import least_noise, linearize, odometry_factors, wheel_sigmas
+from slamlib.factors import (least_noise, linearize, odometry_factors, vehicle_with,
+                             wheel_sigmas)
 from slamlib.fusion import SLIPS, TYPICAL_SLIP, log_slip_prior
 from slamlib.localization import localize, most_certain
 from slamlib.marginals import marginals, sighting_jacobians
@@ -40,6 +41,7 @@ from slamlib.ties import GATE, gather
 GAUGE = 1e-6                 # m, sigma of the position of pose 1, which is zero by definition
 CAUCHY = (100.0, 30.0, 10.0, 3.0)   # scale of the kernel in sigmas, round after round
 LOOSE = 1e5                  # m and rad, sigma of a marker that no sighting holds
+REPEATS = 4                  # at most, of learning the slip and judging the sightings anew
 LEAST = 1e-6                 # relative decrease of the error at which iterations end
 
 
@@ -66,7 +68,7 @@ class Graph:
     """The graph of one dataset and one model of the increments."""
 
     def __init__(self, dataset, model, also=(), wheels="variable"):
-        self.dataset, self.model = dataset, model
+        self.dataset, self.model, self.wheels = dataset, model, wheels
         self.sightings = gather(dataset.aruco, also=[0, len(dataset.ticks) - 1, *also])
         self.frame = self.sightings.frame
         self.factors = odometry_factors(dataset.ticks, dataset.vehicle, self.frame, model, wheels)
@@ -75,6 +77,11 @@ class Graph:
         noise = se2.rotate_covariance(s.C, -s.z[:, 2])
         self.measured = [(X(int(i)), L(int(j)), gtsam.Pose2(*z), gtsam.noiseModel.Gaussian.Covariance(c))
                          for i, j, z, c in zip(s.row, self.label, s.z, noise)]
+
+    def relinearize(self, values):
+        """Make the increments linear about the wheels that the values have."""
+        self.factors = odometry_factors(self.dataset.ticks, self.dataset.vehicle, self.frame, self.model,
+                                        self.wheels, values.atVector(W(0)))
 
     def native(self, cauchy=None, kept=None):
         """GTSAM's part: priors, and the kept sightings (all if None), with a Cauchy kernel if any."""
@@ -175,16 +182,20 @@ class Graph:
         r[:, 2] = se2.wrap(r[:, 2])
         return np.linalg.solve(np.linalg.cholesky(s.C), r[..., None])[..., 0]
 
-    def log_evidence(self, values, native, slip):
+    def log_evidence(self, values, native, slip, kept):
         """Values at the optimum for this slip and their Laplace evidence, up to a constant.
 
         -e - sum log|Q| / 2 - log|R|, with the graph's error e, the noise Q of the odometry factors
-        and the square root information R of all variables.
+        and the square root information R of all variables. A sighting left out costs what one at the
+        gate would, and a marker that none holds adds nothing, so that graphs which leave out other
+        sightings can be compared.
         """
         U, log_det = self.factors.whitening(slip)
         values, error, _ = self.optimize(values, native, U)
         tree = self.linear(values, native, U).eliminateMultifrontal()
-        return values, -error - np.sum(log_det) / 2 - tree.logDeterminant()
+        orphans = len(np.setdiff1d(self.label, self.label[kept]))
+        return values, (-error - np.sum(log_det) / 2 - tree.logDeterminant()
+                        - np.count_nonzero(~kept) * GATE / 2 - 3 * orphans * np.log(LOOSE))
 
 
 def _first(graph, in_world, spread):
@@ -260,7 +271,7 @@ def evidence_curve(dataset, slips, model="arc"):
     graph, values, kept, _, _ = solve_graph(Graph(dataset, model), slips[0])
     native, curve = graph.native(kept=kept), []
     for slip in slips:
-        values, evidence = graph.log_evidence(values, native, slip)
+        values, evidence = graph.log_evidence(values, native, slip, kept)
         curve.append(evidence)
     return np.array(curve)
 
@@ -273,23 +284,32 @@ def solve_graph(graph, slip=None, landmarks="consensus", start=None):
     near the optimum, instead of odometry and `landmarks`: one round with the last kernel is enough.
     """
     values = graph.initial(landmarks) if start is None else start
-    U, _ = graph.factors.whitening(max(slip or TYPICAL_SLIP, SLIPS[0]))
+    U, _ = graph.factors.whitening(max(TYPICAL_SLIP if slip is None else slip, SLIPS[0]))
     for cauchy in CAUCHY if start is None else CAUCHY[-1:]:
         values, _, _ = graph.optimize(values, graph.native(cauchy), U)
-    kept = np.sum(graph.residuals(values)**2, axis=1) < GATE
-    native = graph.native(kept=kept)
+
+    def agreeing():
+        return np.sum(graph.residuals(values)**2, axis=1) < GATE
 
     def cost(log_slip):
         nonlocal values
-        values, evidence = graph.log_evidence(values, native, np.exp(log_slip))
+        values, evidence = graph.log_evidence(values, native, np.exp(log_slip), kept)
         return -evidence - log_slip_prior(log_slip)
 
-    if slip is None:
-        slip = np.exp(minimize_scalar(cost, bounds=np.log(SLIPS), method="bounded",
-                                      options={"xatol": 0.1}).x)
-    slip = float(max(slip, SLIPS[0]))
-    values, evidence = graph.log_evidence(values, native, slip)
-    return graph, values, kept, slip, evidence
+    kept, learned = agreeing(), slip
+    for _ in range(REPEATS):                   # wheels, slip and the sightings that agree, in turn
+        graph.relinearize(values)
+        native = graph.native(kept=kept)
+        if slip is None:
+            learned = np.exp(minimize_scalar(cost, bounds=np.log(SLIPS), method="bounded",
+                                             options={"xatol": 0.1}).x)
+        learned = float(max(learned, SLIPS[0]))
+        values, evidence = graph.log_evidence(values, native, learned, kept)
+        before, kept = kept, agreeing()
+        if (kept == before).all():
+            break
+    kept = before
+    return graph, values, kept, learned, evidence
 
 
 def result(graph, values, kept, slip, evidence):
@@ -326,7 +346,7 @@ def _between_frames(graph, poses, joint, w, slip):
 
     `joint` (f-1, 9, 9) are the covariances of [X_i, X_{i+1}, w] in GTSAM's axes.
     """
-    ticks, vehicle = graph.dataset.ticks, graph.dataset.vehicle
+    ticks, vehicle = graph.dataset.ticks, vehicle_with(graph.dataset.vehicle, w)
     turned = np.zeros_like(joint)
     turned[:, range(9), range(9)] = 1
     turned[:, :2, :2], turned[:, 3:5, 3:5] = (se2.rotation(poses[rows, 2])
@@ -344,9 +364,10 @@ def _between_frames(graph, poses, joint, w, slip):
 
     def increment(start, end):
         delta, by_w = odometry.increments(ticks, vehicle, start, end, graph.model)
+        by_w = by_w * sigma_w * (graph.wheels == "variable")
         noise = odometry.increment_noise(ticks, vehicle, start, end, slip)
         noise[:, [0, 1], [0, 1]] += least_noise(vehicle)
-        return delta + by_w @ (sigma_w * w), by_w * sigma_w, noise
+        return delta, by_w, noise
 
     forward, forward_by_w, noise = increment(graph.frame[a], between)
     A, B = se2.compose_jacobians(poses[a], forward)

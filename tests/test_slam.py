@@ -9,7 +9,7 @@ from numeric import central_differences
 from slamlib import factors as factors_of
 from slamlib import montecarlo, se2, slam
 from slamlib.dataset import ArucoReadings, Dataset, Vehicle
-from slamlib.evaluation import nees_band
+from slamlib.evaluation import anees, nees_band
 from slamlib.simulation import simulate
 
 SEEDS = range(300, 350)
@@ -67,6 +67,36 @@ def test_odometry_factor_is_gtsams_between_factor_when_the_wheels_are_known():
         native = gtsam.BetweenFactorPose2(0, 1, gtsam.Pose2(*factors.increment[i]),
                                           gtsam.noiseModel.Gaussian.Covariance(noise))
         assert np.isclose(native.error(values), np.sum((U[i] @ e[i])**2) / 2, rtol=1e-6)
+
+
+@pytest.mark.parametrize("slip", [3e-3, 1e-2])
+def test_more_slip_than_typical_costs_no_good_sighting(slip):
+    """Clean drives: hardly a sighting is left out, and the slip is learned whatever it was first."""
+    runs = montecarlo.run(montecarlo.problem3, range(500, 508), slip=slip)
+    assert runs["left out"].mean() < 6                       # one in a thousand of about 900 sightings
+    assert 0.85 < np.exp(np.mean(np.log(runs["slip"]))) / slip < 1.15
+    low, high = nees_band(8, probability=0.999)
+    assert low < runs["nees"].mean() < high and runs["arc"].mean() > 0.8
+
+
+def test_wheels_far_from_nominal_are_learned_honestly():
+    """Radii 3 % off in opposite directions, known to 5 %, markers only from pose 300 on."""
+    ratios = []
+    for seed in range(6):
+        vehicle = Vehicle(sigma_right_radius=5e-3, sigma_left_radius=5e-3)
+        dataset, truth = simulate("short", seed=seed)
+        names = ("pose", "marker", "marker_in_vehicle", "covariance")
+        late = dataset.aruco.pose >= 300
+        dataset = replace(dataset, vehicle=replace(vehicle, right_radius=0.103, left_radius=0.097),
+                          aruco=replace(dataset.aruco, **{
+                              name: getattr(dataset.aruco, name)[late] for name in names}))
+        found = slam.solve(dataset, 1e-3, "arc")
+        error = found.wheel - [truth.vehicle.right_radius, truth.vehicle.left_radius,
+                               truth.vehicle.wheelbase]
+        ratios.append((anees(found.poses, found.covariances, truth.poses),
+                       error @ np.linalg.solve(found.wheel_covariance, error)))
+    low, high = nees_band(len(ratios), probability=0.999)
+    assert (np.mean(ratios, axis=0) < high).all(), (low, high, np.mean(ratios, axis=0))
 
 
 def test_marginals_are_gtsams():
