@@ -227,7 +227,7 @@ def _from_problem2(graph, in_world, spread):
     """Problem 2's map, and the consensus for markers that it does not have."""
     markers = _consensus(graph, in_world, spread)
     found = localize(graph.dataset.aruco)
-    if found.frame[0] == 0:
+    if found.frame[0] == 0 and np.isfinite(found.poses[0, 0]):          # the same world
         has = np.isin(graph.marker, found.marker)
         markers[has] = found.marker_in_world[np.searchsorted(found.marker, graph.marker[has])]
     return markers

@@ -7,7 +7,7 @@ from gtsam.symbol_shorthand import L, W, X
 
 from numeric import central_differences
 from slamlib import factors as factors_of
-from slamlib import montecarlo, se2, slam
+from slamlib import montecarlo, slam
 from slamlib.dataset import ArucoReadings, Dataset, Vehicle
 from slamlib.evaluation import anees, nees_band
 from slamlib.simulation import simulate
