@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slamlib import odometry, se2
+from slamlib.odometry import wheel_sigmas
 
 
 @dataclass(frozen=True)
@@ -72,14 +73,23 @@ def linearize(factors, poses, w):
     by_first, by_second, by_w : (f-1, 3, 3) derivatives by X_i, X_{i+1} and w.
     """
     Z = factors.increment + factors.by_w @ w
-    h = se2.between(poses[:-1], poses[1:])
+    e, by_first, by_second, by_Z = between_error(Z, poses[:-1], poses[1:])
+    return e, by_first, by_second, by_Z @ factors.by_w
+
+
+def between_error(Z, first, second):
+    """log(Z^-1 X^-1 X') and its derivatives by X and X' in GTSAM's tangent spaces, and by Z.
+
+    Z, first and second are (m, 3); the derivatives are (m, 3, 3), that by Z of its coordinates.
+    """
+    h = se2.between(first, second)
     miss = se2.between(Z, h)
     log_by_miss, origin = se2.log_jacobian(miss), np.zeros(3)
-    _, by_second = se2.compose_jacobians(miss, origin)               # miss xi for X_{i+1} xi
-    h_by_first, _ = se2.compose_jacobians(origin, h)                 # xi^-1 h for X_i xi
+    _, by_second = se2.compose_jacobians(miss, origin)               # miss xi for X' xi
+    h_by_first, _ = se2.compose_jacobians(origin, h)                 # xi^-1 h for X xi
     miss_by_Z, miss_by_h = se2.between_jacobians(Z, h)
     return (se2.log(miss), -log_by_miss @ miss_by_h @ h_by_first, log_by_miss @ by_second,
-            log_by_miss @ miss_by_Z @ factors.by_w)
+            log_by_miss @ miss_by_Z)
 
 
 def vehicle_with(vehicle, w):
@@ -87,11 +97,6 @@ def vehicle_with(vehicle, w):
     right, left, base = wheel_sigmas(vehicle) * w
     return replace(vehicle, right_radius=vehicle.right_radius + right,
                    left_radius=vehicle.left_radius + left, wheelbase=vehicle.wheelbase + base)
-
-
-def wheel_sigmas(vehicle):
-    """(3,) m, standard deviations of R_R, R_L and b."""
-    return np.array([vehicle.sigma_right_radius, vehicle.sigma_left_radius, vehicle.sigma_wheelbase])
 
 
 def least_noise(vehicle):

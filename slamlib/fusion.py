@@ -159,10 +159,9 @@ def _filter(problem, slip, most=None):
     number of sightings beyond the gate.
     """
     vehicle = problem.dataset.vehicle
-    sigma_w = [vehicle.sigma_right_radius, vehicle.sigma_left_radius, vehicle.sigma_wheelbase]
     nominal = np.array([vehicle.right_radius, vehicle.left_radius, vehicle.wheelbase])
     state = np.r_[0.0, 0.0, 0.0, nominal - problem.wheel]
-    P = np.diag([0.0, 0.0, vehicle.sigma_heading, *sigma_w])**2
+    P = np.diag([0.0, 0.0, vehicle.sigma_heading, *odometry.wheel_sigmas(vehicle)])**2
     ids, seen, seen_covariance = problem.markers[0]
     M, P = seen, _add_markers(P, seen_covariance)
     joint, joint_covariance = [state], [P[:6, :6]]

@@ -13,19 +13,6 @@ them. GTSAM's marginals are the same numbers, one query at a time; a test compar
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
-from slamlib import se2
-
-
-def sighting_jacobians(z, poses, markers):
-    """Derivatives (s, 3, 3) of log(Z^-1 X^-1 L) by X and L, in GTSAM's tangent spaces."""
-    h = se2.between(poses, markers)
-    miss = se2.between(z, h)
-    _, by_marker = se2.compose_jacobians(miss, np.zeros(3))
-    h_by_pose, _ = se2.compose_jacobians(np.zeros(3), h)
-    _, miss_by_h = se2.between_jacobians(z, h)
-    log_by_miss = se2.log_jacobian(miss)
-    return -log_by_miss @ miss_by_h @ h_by_pose, log_by_miss @ by_marker
-
 
 def marginals(odometry, sightings, prior):
     """Covariances of consecutive poses with w, and of the markers.

@@ -31,11 +31,12 @@ from gtsam.symbol_shorthand import L, W, X
 from scipy.optimize import minimize_scalar
 
 from slamlib import odometry, se2
-from slamlib.factors import (least_noise, linearize, odometry_factors, vehicle_with,
-                             wheel_sigmas)
+from slamlib.factors import (between_error, least_noise, linearize, odometry_factors,
+                             vehicle_with)
 from slamlib.fusion import SLIPS, TYPICAL_SLIP, log_slip_prior
 from slamlib.localization import localize, most_certain
-from slamlib.marginals import marginals, sighting_jacobians
+from slamlib.marginals import marginals
+from slamlib.odometry import wheel_sigmas
 from slamlib.ties import GATE, gather
 
 GAUGE = 1e-6                 # m, sigma of the position of pose 1, which is zero by definition
@@ -167,8 +168,8 @@ class Graph:
         s, label = self.sightings, self.label[kept]
         row, z = s.row[kept], s.z[kept]
         root = np.linalg.cholesky(np.linalg.inv(se2.rotate_covariance(s.C[kept], -z[:, 2])))
-        whitened = (np.swapaxes(root, 1, 2) @ J
-                    for J in sighting_jacobians(z, poses[row], markers[label]))
+        _, by_pose, by_marker, _ = between_error(z, poses[row], markers[label])
+        whitened = (np.swapaxes(root, 1, 2) @ J for J in (by_pose, by_marker))
         loose = np.bincount(label, minlength=len(markers)) == 0
         prior = (np.diag(np.array([GAUGE, GAUGE, self.dataset.vehicle.sigma_heading])**-2.0), np.eye(3),
                  loose[:, None, None] / LOOSE**2 * np.eye(3))
