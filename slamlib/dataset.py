@@ -47,6 +47,21 @@ class Vehicle:
     sigma_wheelbase: float = 1e-4  # m
     sigma_heading: float = 1e-4  # rad, of the heading at pose 1
 
+    @property
+    def wheel(self):
+        """(3,) m, the wheel parameters R_R, R_L and b."""
+        return np.array([self.right_radius, self.left_radius, self.wheelbase])
+
+    @property
+    def sigma_wheel(self):
+        """(3,) m, their standard deviations."""
+        return np.array([self.sigma_right_radius, self.sigma_left_radius, self.sigma_wheelbase])
+
+    def with_wheel(self, wheel):
+        """The vehicle with other wheel parameters (3,) in m, and the same standard deviations."""
+        right, left, base = map(float, wheel)
+        return replace(self, right_radius=right, left_radius=left, wheelbase=base)
+
 
 @dataclass(frozen=True)
 class ArucoReadings:
@@ -86,6 +101,10 @@ class Dataset:
     aruco: ArucoReadings | None
     uwb: UwbReadings | None
     antenna_guess: AntennaGuess | None
+
+    def without(self, sensor):
+        """The dataset without a sensor, "aruco" or "uwb"."""
+        return replace(self, **{sensor: None})
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,6 @@
-"""Odometry factors of the SLAM graph: all increments between graph poses at once, in numpy.
+"""Factors of the SLAM graph in numpy: errors and derivatives, all of one kind at once.
+
+Odometry factors are all increments between graph poses.
 
 With Delta(w) = Delta(0) + dDelta/dw w, w the wheel parameters in units of their sigmas, the error
 of the factor between graph poses X and X' is
@@ -9,12 +11,11 @@ GTSAM's between factor with a measurement that depends on w. Its noise, rounding
 the axes of the increment's end, its derivatives in the tangent spaces X exp(xi), X' exp(xi').
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from slamlib import odometry, se2
-from slamlib.odometry import wheel_sigmas
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ def odometry_factors(ticks, vehicle, frame, model="arc", wheels="variable", abou
     rounding = odometry.increment_noise(ticks, vehicle, start, end, 0.0)
     slipping = odometry.increment_noise(ticks, vehicle, start, end, 1.0) - rounding
     rounding[:, [0, 1], [0, 1]] += least_noise(vehicle)
-    by_w = by_w * wheel_sigmas(vehicle)
+    by_w = by_w * vehicle.sigma_wheel
     if wheels == "independent":
         rounding = rounding + by_w @ np.swapaxes(by_w, 1, 2)
     if wheels != "variable":
@@ -92,11 +93,40 @@ def between_error(Z, first, second):
             log_by_miss @ miss_by_Z)
 
 
+def point_error(z, pose, point):
+    """R^T (point - t) - z of points z (m, 2) seen from poses X = (t, R), (m, 3).
+
+    Returns
+    -------
+    e : (m, 2)
+    by_pose, by_point : (m, 2, 3), (m, 2, 2) derivatives, by the pose in GTSAM's tangent space.
+    """
+    back = se2.rotation(-pose[:, 2])
+    seen = (back @ (point - pose[:, :2])[..., None])[..., 0]
+    by_pose = np.zeros((len(z), 2, 3))
+    by_pose[:, 0, 0] = by_pose[:, 1, 1] = -1
+    by_pose[:, 0, 2], by_pose[:, 1, 2] = seen[:, 1], -seen[:, 0]
+    return seen - z, by_pose, back
+
+
+def range_error(r, pose, antenna):
+    """|antenna - t| - r of ranges r (m,) from poses (m, 3) to antennas (m, 2).
+
+    Returns
+    -------
+    e : (m,)
+    by_pose, by_antenna : (m, 1, 3), (m, 1, 2) derivatives, by the pose in GTSAM's tangent space.
+    """
+    apart = antenna - pose[:, :2]
+    distance = np.hypot(*apart.T)
+    along = apart[:, None, :] / np.maximum(distance, 1e-9)[:, None, None]
+    by_pose = np.concatenate([-along @ se2.rotation(pose[:, 2]), np.zeros((len(r), 1, 1))], axis=2)
+    return distance - r, by_pose, along
+
+
 def vehicle_with(vehicle, w):
     """The vehicle with the wheel parameters w, in units of their sigmas beyond the nominal ones."""
-    right, left, base = wheel_sigmas(vehicle) * w
-    return replace(vehicle, right_radius=vehicle.right_radius + right,
-                   left_radius=vehicle.left_radius + left, wheelbase=vehicle.wheelbase + base)
+    return vehicle.with_wheel(vehicle.wheel + vehicle.sigma_wheel * w)
 
 
 def least_noise(vehicle):

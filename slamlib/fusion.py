@@ -17,7 +17,7 @@ propagation of odometry. With worthless odometry and one marker in view it is th
 `localization.py`; with several it is better, because it remembers how they stand to each other.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -140,8 +140,8 @@ class _Problem:
 def _prepare(dataset, model, wheel=None):
     ticks, vehicle, sightings = dataset.ticks, dataset.vehicle, gather(dataset.aruco, also=[0])
     if wheel is None:
-        wheel = np.array([vehicle.right_radius, vehicle.left_radius, vehicle.wheelbase])
-    vehicle = replace(vehicle, right_radius=wheel[0], left_radius=wheel[1], wheelbase=wheel[2])
+        wheel = vehicle.wheel
+    vehicle = vehicle.with_wheel(wheel)
     start, end = sightings.frame[:-1], sightings.frame[1:]
     split = np.searchsorted(sightings.row, np.arange(1, len(sightings.frame)))
     markers = list(zip(*(np.split(values, split)
@@ -159,9 +159,8 @@ def _filter(problem, slip, most=None):
     number of sightings beyond the gate.
     """
     vehicle = problem.dataset.vehicle
-    nominal = np.array([vehicle.right_radius, vehicle.left_radius, vehicle.wheelbase])
-    state = np.r_[0.0, 0.0, 0.0, nominal - problem.wheel]
-    P = np.diag([0.0, 0.0, vehicle.sigma_heading, *odometry.wheel_sigmas(vehicle)])**2
+    state = np.r_[0.0, 0.0, 0.0, vehicle.wheel - problem.wheel]
+    P = np.diag([0.0, 0.0, vehicle.sigma_heading, *vehicle.sigma_wheel])**2
     ids, seen, seen_covariance = problem.markers[0]
     M, P = seen, _add_markers(P, seen_covariance)
     joint, joint_covariance = [state], [P[:6, :6]]

@@ -1,7 +1,7 @@
-"""Covariances of the SLAM graph: of every two consecutive poses with w, and of the markers.
+"""Covariances of the SLAM graph: of every two consecutive poses with w, and of the landmarks.
 
 The information matrix of the graph has an arrow's shape: the poses form a chain (3 x 3 blocks on and
-beside the diagonal, T), and markers and w a border (B, D) that touches all of it,
+beside the diagonal, T), and landmarks and w a border (B, D) that touches all of it,
 
     [[T, B], [B^T, D]]^-1:    border     S = (D - B^T Y)^-1,   Y = T^-1 B,
                               poses      T^-1 + Y S Y^T,       poses and border  -Y S.
@@ -14,42 +14,40 @@ import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
 
-def marginals(odometry, sightings, prior):
-    """Covariances of consecutive poses with w, and of the markers.
+def marginals(odometry, measured, prior):
+    """Covariances of consecutive poses with w, and of the border: all landmarks, then w.
 
     Parameters
     ----------
     odometry : (first, second, by_w), each (f-1, 3, 3), whitened derivatives of the odometry factors.
-    sightings : (row, label, by_pose, by_marker), whitened; (s,), (s,), (s, 3, 3), (s, 3, 3).
-    prior : information of pose 1 (3, 3), of w (3, 3), and of each marker (k, 3, 3).
+    measured : list of (row, columns, by_pose, by_landmark), one for each kind of measurement, with
+        the pose (m,), the landmark's columns of the border (m, d), and whitened derivatives
+        (m, e, 3), (m, e, d).
+    prior : information of pose 1 (3, 3), and of the border, its diagonal (c,).
 
     Returns
     -------
     joint : (f-1, 9, 9) covariance of [X_i, X_{i+1}, w] in GTSAM's axes.
-    border : (3 k + 3, 3 k + 3) covariance of the markers, then w.
+    border : (c, c) covariance of the landmarks, then w.
     """
     first, second, by_w = odometry
-    row, label, by_pose, by_marker = sightings
-    pose_prior, w_prior, marker_prior = prior
-    count, k = len(first) + 1, len(marker_prior)
+    of_first, of_border = prior
+    count, width = len(first) + 1, len(of_border)
     diagonal, beside = np.zeros((count, 3, 3)), _t(first) @ second
     diagonal[:-1] += _t(first) @ first
     diagonal[1:] += _t(second) @ second
-    np.add.at(diagonal, row, _t(by_pose) @ by_pose)
-    diagonal[0] += pose_prior
+    diagonal[0] += of_first
+    B, D = np.zeros((count, 3, width)), np.diag(of_border)
+    for row, columns, by_pose, by_landmark in measured:
+        np.add.at(diagonal, row, _t(by_pose) @ by_pose)
+        np.add.at(B, (row[:, None, None], np.arange(3)[:, None], columns[:, None, :]),
+                  _t(by_pose) @ by_landmark)
+        np.add.at(D, (columns[:, :, None], columns[:, None, :]), _t(by_landmark) @ by_landmark)
+    B[:-1, :, -3:] += _t(first) @ by_w
+    B[1:, :, -3:] += _t(second) @ by_w
+    D[-3:, -3:] += np.sum(_t(by_w) @ by_w, axis=0)
 
-    B = np.zeros((count, k + 1, 3, 3))                          # pose, border block
-    np.add.at(B, (row, label), _t(by_pose) @ by_marker)
-    B[:-1, k] += _t(first) @ by_w
-    B[1:, k] += _t(second) @ by_w
-    B = B.transpose(0, 2, 1, 3).reshape(3 * count, 3 * k + 3)
-    D = np.zeros((k + 1, 3, k + 1, 3))
-    own = marker_prior.copy()
-    np.add.at(own, label, _t(by_marker) @ by_marker)
-    D[range(k), :, range(k)] = own
-    D[k, :, k] = w_prior + np.sum(_t(by_w) @ by_w, axis=0)
-    D = D.reshape(3 * k + 3, 3 * k + 3)
-
+    B = B.reshape(3 * count, width)
     Y = cho_solve_banded((cholesky_banded(_banded(diagonal, beside), lower=True), True), B)
     border = np.linalg.inv(D - B.T @ Y)
     border = (border + border.T) / 2

@@ -1,13 +1,16 @@
 """Monte Carlo: one problem's methods on many simulated drives, judged against the truth."""
 
+import time
 from dataclasses import replace
 
+import gtsam
 import numpy as np
 from joblib import Parallel, delayed
 from tqdm import tqdm
 
-from slamlib import fusion, localization, odometry, slam
-from slamlib.dataset import Vehicle
+from slamlib import fusion, initial, localization, odometry, slam
+from slamlib.dataset import AntennaGuess, Vehicle
+from slamlib.graph import State
 from slamlib.evaluation import anees, ate, nees
 from slamlib.simulation import simulate
 
@@ -44,7 +47,6 @@ def problem2(seed, **options):
     its ATE in metres; `odometry ate`; NEES of the marker map and of the wheel parameters; the slip.
     """
     dataset, truth = simulate("short", seed, **options)
-    wheel = np.array([truth.vehicle.right_radius, truth.vehicle.left_radius, truth.vehicle.wheelbase])
     alone = localization.localize(dataset.aruco)
     naive = localization.localize(dataset.aruco, shared_errors=False)
     hint = fusion.fuse_increments(dataset)
@@ -62,39 +64,103 @@ def problem2(seed, **options):
         numbers |= {f"{name} nees": anees(poses, covariances, truth.poses[at]), f"{name} last nees": values[-1],
                     f"{name} ate": ate(poses, truth.poses[at])}
     true_map = truth.marker_in_world[np.searchsorted(truth.marker, alone.marker)]
-    error = fused.wheel - wheel
+    error = fused.wheel - truth.vehicle.wheel
     return numbers | {
         "map nees": nees(alone.marker_in_world, alone.marker_covariance, true_map).mean(),
         "wheel nees": error @ np.linalg.solve(fused.wheel_covariance, error), "slip": fused.slip}
 
 
 def problem3(seed, **options):
-    """SLAM on one drive of the short path, with everything learned.
+    """SLAM on odometry and markers of one drive of the short path, with everything learned.
 
     Returns
     -------
-    dict of numbers: NEES of the graph poses, the poses between them, the map and the wheel
-    parameters; ATE, aligned too; slip, chi-squared per degree of freedom, 1 for the model "arc"; the
-    largest error of a marker in metres.
+    dict of numbers, those of `_judged`.
     """
     dataset, truth = simulate("short", seed, **options)
-    found = slam.solve(dataset)
-    frames = np.isin(np.arange(len(truth.poses)), dataset.aruco.pose)
-    wheel = found.wheel - [truth.vehicle.right_radius, truth.vehicle.left_radius,
-                           truth.vehicle.wheelbase]
-    true_map = truth.marker_in_world[np.searchsorted(truth.marker, found.marker)]
+    return _judged(slam.solve(dataset.without("uwb")), dataset.without("uwb"), truth)
+
+
+def problem4(seed, path="short", markers=True, **options):
+    """SLAM on odometry, ranges and (unless False) markers, with everything learned, as `problem3`."""
+    dataset, truth = simulate(path, seed, **options)
+    dataset = dataset if markers else dataset.without("aruco")
+    before = slam.solve(dataset.without("uwb")) if markers else None
+    return _judged(slam.solve(dataset, after=before), dataset, truth)
+
+
+def _judged(found, dataset, truth):
+    """NEES of the graph poses, of those between, of the last pose, map, antennas and wheels; ATE,
+    aligned too; slip, chi-squared per degree of freedom, 1 for the model "arc"; sightings left out;
+    the largest error of a marker, and the rms error of the antennas, in metres; the smallest root of
+    NEES over the pose's heading alone.
+    """
+    measured = [sensor.pose for sensor in (dataset.aruco, dataset.uwb) if sensor is not None]
+    frames = np.isin(np.arange(len(truth.poses)), np.concatenate(measured))
+    wheel = found.wheel - truth.vehicle.wheel
     values = nees(found.poses, found.covariances, truth.poses)
-    return {"nees": np.nanmean(values[frames]), "nees between": np.nanmean(values[~frames]),
-            "map nees": nees(found.marker_in_world, found.marker_covariance, true_map).mean(),
-            "wheel nees": wheel @ np.linalg.solve(found.wheel_covariance, wheel),
-            "ate": ate(found.poses, truth.poses),
-            "aligned": ate(found.poses, truth.poses, aligned=True),
-            "left out": np.count_nonzero(found.outlier), "slip": found.slip, "chi2": found.chi2_per_dof, "arc": float(found.model == "arc"),
-            "map worst": np.abs(found.marker_in_world - true_map)[:, :2].max()}
+    numbers = {"nees": np.nanmean(values[frames]), "nees between": np.nanmean(values[~frames]),
+               "last nees": values[-1], "wheel nees": wheel @ np.linalg.solve(found.wheel_covariance, wheel),
+               "ate": ate(found.poses, truth.poses),
+               "aligned": ate(found.poses, truth.poses, aligned=True),
+               "left out": np.count_nonzero(found.outlier), "slip": found.slip,
+               "chi2": found.chi2_per_dof, "arc": float(found.model == "arc")}
+    if len(found.marker):
+        true_map = truth.marker_in_world[np.searchsorted(truth.marker, found.marker)]
+        numbers |= {"map nees": nees(found.marker_in_world, found.marker_covariance, true_map).mean(),
+                    "map worst": np.abs(found.marker_in_world - true_map)[:, :2].max()}
+    if len(found.antenna):
+        error = found.antenna_in_world - truth.antenna_in_world[np.searchsorted(truth.antenna, found.antenna)]
+        numbers |= {"antenna nees": np.mean(np.einsum(
+            "ni,nij,nj->n", error, np.linalg.inv(found.antenna_covariance), error)),
+            "antenna error": np.sqrt(np.mean(np.sum(error**2, axis=1))),
+            "doubts": len(found.doubts)}
+    return numbers
 
 
-WHEELS = {"variable": "wheels as a variable", "independent": "independent chain",
-          "fixed": "wheels fixed"}
+def kernels(seed, markers=True, **options):
+    """Every way of `slam.RANGES` to treat late ranges, on one drive of the short path.
+
+    The slip and the increments' model are given. Returns a dict of numbers for each way: ATE and rms
+    error of the antennas in metres, NEES of poses and of antennas, seconds of processor time.
+    """
+    dataset, truth = simulate("short", seed, **options)
+    dataset, numbers = dataset if markers else dataset.without("aruco"), {}
+    for name in slam.RANGES:
+        start = time.process_time()
+        found = slam.result(slam.solve_graph(slam.Graph(dataset, "arc"), 1e-3, ranges=name))
+        seconds = time.process_time() - start
+        judged = _judged(found, dataset, truth)
+        numbers |= {f"{name} {key}": judged[key] for key in ("ate", "nees", "antenna error", "antenna nees")}
+        numbers[f"{name} seconds"] = seconds
+    return numbers
+
+
+def guesses(seed, error, markers=True, **options):
+    """Antenna guesses that are wrong by `error` metres, each in a random direction, on a short drive.
+
+    Returns
+    -------
+    dict of numbers: shares of the antennas that end "right" (within five of their sigmas and half a
+    metre of the truth), that do so "from the guess" alone, without looking for other places, that are
+    "in doubt", and that are "silently wrong".
+    """
+    dataset, truth = simulate("short", seed, **options)
+    rng = np.random.default_rng(seed)
+    angle = rng.uniform(-np.pi, np.pi, len(truth.antenna))
+    off = error * np.stack([np.cos(angle), np.sin(angle)], -1)
+    dataset = replace(dataset if markers else dataset.without("aruco"),
+                      antenna_guess=AntennaGuess(truth.antenna, truth.antenna_in_world + off))
+
+    def is_right(found):
+        miss = found.antenna_in_world - truth.antenna_in_world[np.searchsorted(truth.antenna, found.antenna)]
+        return np.hypot(*miss.T) < 0.5
+
+    found = slam.result(slam.solve_graph(slam.Graph(dataset, "arc"), 1e-3))
+    naive = slam.result(slam.solve_graph(slam.Graph(dataset, "arc"), 1e-3, antennas="guess"))
+    doubt = np.isin(found.antenna, list(found.doubts))
+    return {"right": is_right(found).mean(), "from the guess": is_right(naive).mean(),
+            "in doubt": doubt.mean(), "silently wrong": np.mean(~is_right(found) & ~doubt)}
 
 
 def graphs(seed, **options):
@@ -102,58 +168,73 @@ def graphs(seed, **options):
 
     Returns
     -------
-    dict of numbers: for each of WHEELS and each model of the increments the log evidence, chi-squared
+    dict of numbers: for each of slam.WHEELS and each model of the increments the log evidence (all on the
+    sightings that the graph with variable wheels and arcs keeps) and, each on its own, chi-squared
     per degree of freedom, ATE, aligned ATE and NEES.
     """
     dataset, truth = simulate("short", seed, **options)
     numbers = {}
-    for wheels in WHEELS:
-        for model in odometry.MODELS:
-            found = slam.result(*slam.solve_graph(slam.Graph(dataset, model, wheels=wheels),
-                                                  options.get("slip", 1e-3)))
-            name = f"{wheels} {model}"
-            numbers |= {f"{name} evidence": found.log_evidence, f"{name} chi2": found.chi2_per_dof,
-                        f"{name} ate": ate(found.poses, truth.poses),
-                        f"{name} aligned": ate(found.poses, truth.poses, aligned=True),
-                        f"{name} nees": anees(found.poses, found.covariances, truth.poses)}
+    for wheels, model, found, evidence in slam.kinds(dataset.without("uwb"), options.get("slip", 1e-3)):
+        name = f"{wheels} {model}"
+        numbers |= {f"{name} evidence": evidence, f"{name} chi2": found.chi2_per_dof,
+                    f"{name} ate": ate(found.poses, truth.poses),
+                    f"{name} aligned": ate(found.poses, truth.poses, aligned=True),
+                    f"{name} nees": anees(found.poses, found.covariances, truth.poses)}
     return numbers
 
 
-def landmarks(seed, path="short", drift=1.0, kernel="graduated", **options):
+def wrong_labels(seed, **options):
+    """Every way of `slam.SIGHTINGS` to treat wrong labels, on one drive of the short path.
+
+    The slip and the increments' model are given. Returns a dict of numbers for each way: ATE, and the
+    largest error of a marker, in metres, NEES of the poses and of the map.
+    """
+    dataset, truth = simulate("short", seed, **options)
+    dataset, numbers = dataset.without("uwb"), {}
+    for name in slam.SIGHTINGS:
+        found = slam.result(slam.solve_graph(slam.Graph(dataset, "arc"), 1e-3, sightings=name))
+        judged = _judged(found, dataset, truth)
+        numbers |= {f"{name} {key}": judged[key] for key in ("ate", "nees", "map nees", "map worst")}
+    return numbers
+
+
+def landmarks(seed, path="short", drift=1.0, known=True, kernel="graduated", **options):
     """Every way to initialise the markers, on one simulated drive with the true slip.
 
     Parameters
     ----------
-    drift : factor on table 2's sigmas, in the drive and in the estimate.
+    drift : factor on table 2's sigmas in the drive, and in the estimate if `known`.
     kernel : "graduated", the rounds of `slam.CAUCHY`, or "last", only its last one.
 
     Returns
     -------
-    dict of numbers, for each way of `slam.LANDMARKS`: `... initial error`, the rms distance of the
+    dict of numbers, for each way of `initial.LANDMARKS`: `... initial error`, the rms distance of the
     markers to the truth in metres; `... initial cost`, `... cost`, the graph's error before and after;
-    `... steps`; `... right`, 1 where the cost is that reached from the true map and poses.
+    `... steps`; `... right`, 1 where the cost is that reached from the true map and poses, to within 1,
+    the cost of a residual of less than one and a half sigmas.
     """
     vehicle = Vehicle()
-    vehicle = replace(vehicle, sigma_right_radius=drift * vehicle.sigma_right_radius,
-                      sigma_left_radius=drift * vehicle.sigma_left_radius,
-                      sigma_wheelbase=drift * vehicle.sigma_wheelbase)
-    dataset, truth = simulate(path, seed, vehicle=vehicle, **options)
+    drifting = replace(vehicle, sigma_right_radius=drift * vehicle.sigma_right_radius,
+                       sigma_left_radius=drift * vehicle.sigma_left_radius,
+                       sigma_wheelbase=drift * vehicle.sigma_wheelbase)
+    dataset, truth = simulate(path, seed, vehicle=drifting, **options)
+    dataset = replace(dataset, uwb=None, vehicle=drifting if known else vehicle)
     graph = slam.Graph(dataset, "arc")
     U, _ = graph.factors.whitening(options.get("slip", 1e-3))
-    rounds = [graph.native(scale) for scale in (
+    rounds = [graph.native(gtsam.noiseModel.mEstimator.Cauchy.Create(scale)) for scale in (
         slam.CAUCHY if kernel == "graduated" else slam.CAUCHY[-1:])]
     true_map = truth.marker_in_world[np.searchsorted(truth.marker, graph.marker)]
-    _, best, _ = graph.optimize(graph.values(truth.poses[graph.frame], true_map, np.zeros(3)),
-                                rounds[-1], U)
+    _, best, _ = graph.optimize(graph.values(State(truth.poses[graph.frame], true_map, np.zeros((0, 2)),
+                                                   np.zeros(3))), rounds[-1], U)
     numbers = {}
-    for name in slam.LANDMARKS:
-        values, steps = graph.initial(name), 0
-        error = graph.poses(values)[1][:, :2] - true_map[:, :2]
+    for name in initial.LANDMARKS:
+        values, steps = initial.from_odometry(graph, name), 0
+        error = graph.state(values).markers[:, :2] - true_map[:, :2]
         initial_cost = graph.error(values, rounds[-1], U)
         for native in rounds:
             values, cost, more = graph.optimize(values, native, U)
             steps += more
         numbers |= {f"{name} initial error": np.sqrt(np.mean(np.sum(error**2, axis=1))),
                     f"{name} initial cost": initial_cost, f"{name} cost": cost,
-                    f"{name} steps": steps, f"{name} right": float(cost < best + 0.01 * abs(best))}
+                    f"{name} steps": steps, f"{name} right": float(cost < best + 1)}
     return numbers

@@ -14,7 +14,6 @@ Two covariances are computed. `equation2` is the assignment's, from De Cecco, Ba
 propagation of the same four uncertain quantities, w = [R_R, R_L, b] and the initial pose.
 """
 
-from dataclasses import replace
 
 import numpy as np
 
@@ -100,7 +99,7 @@ def equation2(ticks, vehicle, initial_pose=(0.0, 0.0, 0.0), initial_covariance=N
     poses = dead_reckoning(ticks, vehicle, initial_pose)
     J = step_jacobian(ticks, vehicle, poses[:-1, 2])
     integral = np.zeros((len(poses), 3, 4))                                 # I_k of equation 3
-    integral[1:, :, :3] = np.cumsum(J[:, :, :3] * wheel_sigmas(vehicle), axis=0)
+    integral[1:, :, :3] = np.cumsum(J[:, :, :3] * vehicle.sigma_wheel, axis=0)
     sigma_heading = np.sqrt(initial_covariance[2, 2] + np.sum(integral[:-1, 2, :3]**2, axis=-1))
     integral[1:, :, 3] = np.cumsum(J[:, :, 3] * sigma_heading[:, None], axis=0)
     return poses, initial_covariance + integral @ np.swapaxes(integral, -1, -2)
@@ -169,7 +168,7 @@ def first_order(ticks, vehicle, initial_pose=(0.0, 0.0, 0.0), initial_covariance
     if initial_covariance is None:
         initial_covariance = np.diag([0.0, 0.0, vehicle.sigma_heading**2])
     poses = dead_reckoning(ticks, vehicle, initial_pose, model)
-    G = wheel_jacobian(ticks, vehicle, initial_pose[2], model) * wheel_sigmas(vehicle)
+    G = wheel_jacobian(ticks, vehicle, initial_pose[2], model) * vehicle.sigma_wheel
     A, _ = se2.compose_jacobians(poses[0], se2.between(poses[0], poses))
     A_t, G_t = np.swapaxes(A, -1, -2), np.swapaxes(G, -1, -2)
     return poses, A @ initial_covariance @ A_t + G @ G_t
@@ -229,7 +228,7 @@ def increment_noise(ticks, vehicle, start, end, slip):
     by_wheel[:, 2] = turn
     outer = by_wheel[:, :, None, :] * by_wheel[:, None, :, :]          # (n-1, 3, 3, wheel)
     from_slip = outer @ (slip**2 * np.abs(ds[:, None] + sides * dtheta[:, None])[:, None, :, None])
-    radii = np.array([vehicle.right_radius, vehicle.left_radius])
+    radii = vehicle.wheel[:2]
     from_rounding = outer @ ((2 * np.pi * radii / vehicle.ticks_per_revolution)**2 / 6)
     start, end = np.asarray(start), np.asarray(end)
     total = [_accumulate(part) for part in (from_slip[..., 0], from_rounding)]
@@ -256,19 +255,11 @@ def monte_carlo(ticks, vehicle, at, rng, draws=400, model="euler"):
     -------
     (draws, m, 3) poses [x, y, heading].
     """
-    deviations = rng.standard_normal((draws, 4)) * [*wheel_sigmas(vehicle), vehicle.sigma_heading]
+    deviations = rng.standard_normal((draws, 4)) * [*vehicle.sigma_wheel, vehicle.sigma_heading]
     return np.stack([
-        dead_reckoning(ticks, replace(vehicle, right_radius=vehicle.right_radius + right,
-                                      left_radius=vehicle.left_radius + left,
-                                      wheelbase=vehicle.wheelbase + base),
-                       (0.0, 0.0, heading), model)[at]
-        for right, left, base, heading in deviations])
-
-
-def wheel_sigmas(vehicle):
-    """(3,) m, standard deviations of R_R, R_L and b."""
-    return np.array([vehicle.sigma_right_radius, vehicle.sigma_left_radius,
-                     vehicle.sigma_wheelbase])
+        dead_reckoning(ticks, vehicle.with_wheel(vehicle.wheel + deviation[:3]),
+                       (0.0, 0.0, deviation[3]), model)[at]
+        for deviation in deviations])
 
 
 def _chord(dtheta, model):

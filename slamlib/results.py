@@ -35,6 +35,26 @@ def write_aruco_map(folder, ids, poses, covariances):
     _write(Path(folder) / "ArucoMap.mat", pose=poses, covari=covariances, id=ids)
 
 
+def write_uwb_map(folder, ids, positions, covariances):
+    """Write folder/UwbMap.mat: UwbMap(k).position, .covariance and .id, in ascending id.
+
+    Parameters
+    ----------
+    folder : path, made if it does not exist.
+    ids : (a,) antenna ids, ascending.
+    positions : (a, 2) [x, y] in world axes, m.
+    covariances : (a, 2, 2) of [x, y].
+    """
+    _write(Path(folder) / "UwbMap.mat", position=positions, covariance=covariances, id=ids)
+
+
+def read_uwb_map(folder):
+    """Ids (a,), positions (a, 2) and covariances (a, 2, 2) of a UwbMap.mat."""
+    content = _read(Path(folder) / "UwbMap.mat")
+    return (content["id"].astype(int).ravel(), content["position"].reshape(-1, 2),
+            content["covariance"].reshape(-1, 2, 2))
+
+
 def read_aruco_map(folder):
     """Ids (k,), poses (k, 3) and covariances (k, 3, 3) of an ArucoMap.mat."""
     content = _read(Path(folder) / "ArucoMap.mat")

@@ -10,7 +10,7 @@ at a lower rate; the UWB tag ranges to the antennas within reach, at its own rat
 import os
 import shutil
 import tempfile
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -61,11 +61,7 @@ def simulate(path="short", seed=0, *, slip=1e-3, late_ranges=0.0, mislabelled=0.
     layout = PATHS[path]
     rng = np.random.default_rng(seed)
     draws = noise * rng.standard_normal(3)
-    true_vehicle = replace(
-        vehicle,
-        right_radius=vehicle.right_radius + vehicle.sigma_right_radius * draws[0],
-        left_radius=vehicle.left_radius + vehicle.sigma_left_radius * draws[1],
-        wheelbase=vehicle.wheelbase + vehicle.sigma_wheelbase * draws[2])
+    true_vehicle = vehicle.with_wheel(vehicle.wheel + vehicle.sigma_wheel * draws)
     ds, dtheta = _drive(layout, rounds)
     poses = _arcs(ds, dtheta)
     ticks = _encoder(ds, dtheta, true_vehicle, slip, noise, rng)
@@ -96,7 +92,7 @@ def manoeuvre(legs, vehicle=Vehicle(), step=0.01):
     for length, turn in legs:
         steps = int(np.ceil(max(abs(length), abs(turn) * half) / step))
         travel = np.array([length + half * turn, length - half * turn]) / steps
-        radii = np.array([vehicle.right_radius, vehicle.left_radius])
+        radii = vehicle.wheel[:2]
         counts.append(np.tile(travel * vehicle.ticks_per_revolution / (2 * np.pi * radii), (steps, 1)))
     return np.concatenate(counts)
 
@@ -153,7 +149,7 @@ def _encoder(ds, dtheta, vehicle, slip, noise, rng):
     travel = np.stack([ds + vehicle.wheelbase * dtheta / 2, ds - vehicle.wheelbase * dtheta / 2], -1)
     slipped = travel + slip * np.sqrt(np.abs(travel)) * rng.standard_normal(travel.shape)
     phase = rng.uniform(size=2)
-    metres_per_count = 2 * np.pi * np.array([vehicle.right_radius, vehicle.left_radius]) \
+    metres_per_count = 2 * np.pi * vehicle.wheel[:2] \
         / vehicle.ticks_per_revolution
     if not noise:
         return np.concatenate([np.zeros((1, 2)), travel / metres_per_count])

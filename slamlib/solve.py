@@ -20,6 +20,7 @@ class Solution:
     covariances: np.ndarray        # (n, 3, 3) of [x, y, heading] in world axes
     world: int = 0                 # index from 0 of the pose whose frame is the world frame
     aruco_map: tuple | None = None         # marker ids (k,), poses (k, 3), covariances (k, 3, 3)
+    uwb_map: tuple | None = None           # antenna ids (a,), positions (a, 2), covariances (a, 2, 2)
     facts: dict = field(default_factory=dict)       # plain numbers for the summary
 
 
@@ -69,23 +70,48 @@ def problem2_fused(dataset, fused=None):
 
 def problem3(dataset, found=None):
     """SLAM with GTSAM on odometry and markers. `found` is the Slam, where it has been computed."""
-    found = slam.solve(dataset) if found is None else found
+    found = slam.solve(dataset.without("uwb")) if found is None else found
     return Solution("problem3", "SLAM: odometry + ArUco", found.poses, found.covariances, 0,
-                    (found.marker, found.marker_in_world, found.marker_covariance), {
-        "slip_sqrt_m": found.slip, "increments": found.model, "outliers": int(found.outlier.sum()),
-        "chi2_per_dof": found.chi2_per_dof, "log_evidence": found.log_evidence,
-        "wheel_parameters_m": found.wheel.tolist(),
-        "wheel_parameter_sigmas_m": np.sqrt(np.diag(found.wheel_covariance)).tolist()})
+                    (found.marker, found.marker_in_world, found.marker_covariance), facts=_facts(found))
+
+
+def problem4(dataset, found=None):
+    """SLAM with GTSAM on odometry, ranges, and markers if there are any.
+
+    `found` is the Slam, where it has been computed.
+    """
+    found = slam.solve(dataset) if found is None else found
+    has_markers = dataset.aruco is not None
+    title = "SLAM: odometry + ArUco + UWB" if has_markers else "SLAM: odometry + UWB"
+    weak = {antenna: int(np.sum(found.range_weight[dataset.uwb.antenna == antenna] < 0.5))
+            for antenna in found.antenna.tolist()}
+    return Solution(
+        "problem4", title, found.poses, found.covariances, 0,
+        (found.marker, found.marker_in_world, found.marker_covariance) if has_markers else None,
+        (found.antenna, found.antenna_in_world, found.antenna_covariance),
+        _facts(found) | {"ranges": len(dataset.uwb.pose), "ranges_down_weighted_by_antenna": weak,
+                         "antennas_in_doubt": found.doubts})
+
+
+def _facts(found):
+    return {"slip_sqrt_m": found.slip, "increments": found.model, "outliers": int(found.outlier.sum()),
+            "chi2_per_dof": found.chi2_per_dof, "log_evidence": found.log_evidence,
+            "wheel_parameters_m": found.wheel.tolist(),
+            "wheel_parameter_sigmas_m": np.sqrt(np.diag(found.wheel_covariance)).tolist()}
 
 
 def solve(dataset):
     """Yield the Solution of every problem that the dataset's sensors allow, in order."""
     yield problem1(dataset)
+    found = None
     if dataset.aruco is not None:
         yield problem2(dataset)
         yield problem2_hint(dataset)
         yield problem2_fused(dataset)
-        yield problem3(dataset)
+        found = slam.solve(dataset.without("uwb"))
+        yield problem3(dataset, found)
+    if dataset.uwb is not None:
+        yield problem4(dataset, slam.solve(dataset, after=found))
 
 
 def truth_in_world_of(solution, truth):
@@ -101,6 +127,8 @@ def write(folder, solution):
     results.write_vehicle_poses(folder, solution.poses, solution.covariances)
     if solution.aruco_map is not None:
         results.write_aruco_map(folder, *solution.aruco_map)
+    if solution.uwb_map is not None:
+        results.write_uwb_map(folder, *solution.uwb_map)
     return folder
 
 

@@ -12,6 +12,7 @@ from scipy.stats import chi2
 from slamlib import se2
 
 GATE = chi2.ppf(0.999, 3)    # squared Mahalanobis length from which a sighting is an outlier
+GATE_OF_POINTS = chi2.ppf(0.999, 2)     # the same for a sighting without orientation
 SUDDEN = 3.0                 # times the 99th percentile of the agreed speeds: not a motion
 LOST_HEADING = 0.5           # rad, sigma: what knows less of the turn cannot tie two poses
 
@@ -41,7 +42,10 @@ class Ties:
 
 
 def gather(aruco, also=()):
-    """The Sightings of an ArucoReadings; `also` are poses that are frames, seen markers or not."""
+    """The Sightings of an ArucoReadings or None; `also` are frames too, seen markers or not."""
+    if aruco is None:
+        none = np.zeros(0, int)
+        return Sightings(none, none, none, np.zeros((0, 3)), np.zeros((0, 3, 3)), np.unique(also).astype(int))
     index, z, C = merge_repeated(aruco)
     frame = np.union1d(aruco.pose[index], also).astype(int)
     return Sightings(index, np.searchsorted(frame, aruco.pose[index]), aruco.marker[index], z, C, frame)

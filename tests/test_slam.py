@@ -3,13 +3,14 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from gtsam.symbol_shorthand import L, W, X
+from gtsam.symbol_shorthand import A, L, W, X
 
 from numeric import central_differences
 from slamlib import factors as factors_of
 from slamlib import montecarlo, slam
 from slamlib.dataset import ArucoReadings, Dataset, Vehicle
 from slamlib.evaluation import anees, nees_band
+from slamlib.graph import State
 from slamlib.simulation import simulate
 
 SEEDS = range(300, 350)
@@ -90,9 +91,8 @@ def test_wheels_far_from_nominal_are_learned_honestly():
         dataset = replace(dataset, vehicle=replace(vehicle, right_radius=0.103, left_radius=0.097),
                           aruco=replace(dataset.aruco, **{
                               name: getattr(dataset.aruco, name)[late] for name in names}))
-        found = slam.solve(dataset, 1e-3, "arc")
-        error = found.wheel - [truth.vehicle.right_radius, truth.vehicle.left_radius,
-                               truth.vehicle.wheelbase]
+        found = slam.solve(dataset.without("uwb"), 1e-3, "arc")
+        error = found.wheel - truth.vehicle.wheel
         ratios.append((anees(found.poses, found.covariances, truth.poses),
                        error @ np.linalg.solve(found.wheel_covariance, error)))
     low, high = nees_band(len(ratios), probability=0.999)
@@ -100,21 +100,25 @@ def test_wheels_far_from_nominal_are_learned_honestly():
 
 
 def test_marginals_are_gtsams():
-    dataset, _ = simulate("short", seed=3, mislabelled=0.02)
-    graph, values, kept, slip, _ = slam.solve_graph(slam.Graph(dataset, "arc"), 1e-3)
-    U, _ = graph.factors.whitening(slip)
-    tree = graph.linear(values, graph.native(kept=kept), U).eliminateMultifrontal()
-    joint, border = graph.marginals(values, U, kept)
+    dataset, _ = simulate("short", seed=3, mislabelled=0.02, late_ranges=0.2)
+    found = slam.solve_graph(slam.Graph(dataset, "arc"), 1e-3)
+    graph, values, late = found.graph, found.values, found.late
+    U, _ = graph.factors.whitening(found.slip)
+    native = graph.native(late=late, weight=found.weight)
+    tree = graph.linear(values, native, U).eliminateMultifrontal()
+    joint, blocks = graph.marginals(graph.state(values), U, native)
     for i in range(0, len(joint), 13):
         expected = tree.jointMarginalCovariance([X(i), X(i + 1), W(0)]).fullMatrix()
         sigma = np.sqrt(np.diag(expected))
         np.testing.assert_allclose(joint[i] / np.outer(sigma, sigma), expected / np.outer(sigma, sigma),
                                    atol=1e-6)
     for j in range(len(graph.marker)):
-        block = border[3 * j:3 * j + 3, 3 * j:3 * j + 3]
-        np.testing.assert_allclose(block, tree.marginalCovariance(L(j)), rtol=1e-5,
-                                   atol=1e-6 * block.max())
-    np.testing.assert_allclose(border[-3:, -3:], tree.marginalCovariance(W(0)), rtol=1e-5, atol=1e-7)
+        np.testing.assert_allclose(blocks[j], tree.marginalCovariance(L(j)), rtol=1e-5,
+                                   atol=1e-6 * blocks[j].max())
+    for k in range(len(graph.antenna)):
+        np.testing.assert_allclose(blocks[len(graph.marker) + k], tree.marginalCovariance(A(k)), rtol=1e-5,
+                                   atol=1e-9)
+    np.testing.assert_allclose(blocks[-1], tree.marginalCovariance(W(0)), rtol=1e-5, atol=1e-7)
 
 
 def test_one_sigma_costs_one_half():
@@ -129,8 +133,8 @@ def test_one_sigma_costs_one_half():
         readings = ArucoReadings(np.array([0]), np.array([4]), z[None], C[None])
         dataset = Dataset("one", Vehicle(), np.zeros((1, 2), int), readings, None, None)
         graph = slam.Graph(dataset, "arc")
-        values = graph.values(np.zeros((1, 3)), [z + direction], np.zeros(3))
-        assert np.isclose(graph.native().error(values), expected, rtol=1e-9)
+        values = graph.values(State(np.zeros((1, 3)), [z + direction], np.zeros((0, 2)), np.zeros(3)))
+        assert np.isclose(graph.native().graph.error(values), expected, rtol=1e-9)
 
 
 def test_two_poses_and_one_marker_by_hand():
@@ -161,7 +165,7 @@ def test_two_poses_and_one_marker_by_hand():
 
 def test_perfect_data_gives_the_exact_answer():
     dataset, truth = simulate("short", seed=1, noise=False)
-    found = slam.solve(dataset, 1e-3, "arc")
+    found = slam.solve(dataset.without("uwb"), 1e-3, "arc")
     np.testing.assert_allclose(found.poses, truth.poses, atol=1e-9)
     seen = np.searchsorted(truth.marker, found.marker)
     np.testing.assert_allclose(found.marker_in_world, truth.marker_in_world[seen], atol=1e-9)
@@ -175,13 +179,13 @@ def test_poses_between_graph_poses_are_those_of_a_graph_with_all_poses(every, si
     dataset, _ = simulate("short", seed=2)
     fine = replace(dataset.vehicle, ticks_per_revolution=8e5,       # rounding would be counted anew
                    sigma_right_radius=sigma, sigma_left_radius=sigma)           # at every graph pose
-    dataset = replace(dataset, vehicle=fine, ticks=100 * dataset.ticks[:106])
+    dataset = replace(dataset, uwb=None, vehicle=fine, ticks=100 * dataset.ticks[:106])
     keep = (dataset.aruco.pose <= 100) & (dataset.aruco.pose % every == 0)
     names = ("pose", "marker", "marker_in_vehicle", "covariance")
     dataset = replace(dataset, aruco=replace(
         dataset.aruco, **{name: getattr(dataset.aruco, name)[keep] for name in names}))
     sparse = slam.solve(dataset, 3e-3, "arc")
-    dense = slam.result(*slam.solve_graph(slam.Graph(dataset, "arc", also=range(106)), 3e-3))
+    dense = slam.result(slam.solve_graph(slam.Graph(dataset, "arc", also=range(106)), 3e-3))
     sigma, expected = (np.sqrt(np.diagonal(c, axis1=1, axis2=2))
                        for c in (sparse.covariances, dense.covariances))
     assert (np.abs(sparse.poses - dense.poses) < 0.01 * expected + 2e-5).all()      # second order
@@ -208,10 +212,10 @@ def test_monte_carlo_is_consistent(options):
 def test_the_wheels_belong_into_the_graph():
     """Without slip only the wheels' errors are left, which repeat: 10 seeds, given the true slip."""
     runs = montecarlo.run(montecarlo.graphs, range(400, 410), slip=0.0)
-    rms = {wheels: np.sqrt(np.mean(runs[f"{wheels} arc ate"]**2)) for wheels in montecarlo.WHEELS}
+    rms = {wheels: np.sqrt(np.mean(runs[f"{wheels} arc ate"]**2)) for wheels in slam.WHEELS}
     assert 2 * rms["variable"] < rms["independent"] < rms["fixed"]
     assert runs["variable arc nees"].mean() < 4 and runs["fixed arc nees"].mean() > 50
-    others = [runs[f"{wheels} {model} evidence"] for wheels in montecarlo.WHEELS
+    others = [runs[f"{wheels} {model} evidence"] for wheels in slam.WHEELS
               for model in ("arc", "euler") if (wheels, model) != ("variable", "arc")]
     assert (runs["variable arc evidence"] > np.array(others)).all()
 

@@ -28,8 +28,7 @@ def plain(dataset, marginals=True):
     graph.add(gtsam.PriorFactorPose2(X(0), gtsam.Pose2(), gtsam.noiseModel.Diagonal.Sigmas(
         [1e-6, 1e-6, vehicle.sigma_heading])))
     ds, dtheta, ds_by_w, dtheta_by_w = odometry.steps(ticks, vehicle)
-    sigma_w = np.array([vehicle.sigma_right_radius, vehicle.sigma_left_radius,
-                        vehicle.sigma_wheelbase])
+    sigma_w = vehicle.sigma_wheel
     sigmas = FLOOR + np.stack([np.linalg.norm(ds_by_w * sigma_w, axis=1), 0 * ds,
                                np.linalg.norm(dtheta_by_w * sigma_w, axis=1)], -1)
     for k in range(len(ds)):
