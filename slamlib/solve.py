@@ -42,9 +42,9 @@ def problem2(dataset, found=None):
     poses[found.frame[known], 2] = np.unwrap(found.poses[known, 2])
     return Solution("problem2", "ArUco", poses, covariances, int(found.frame[np.isfinite(found.poses[:, 0])][0]),
                     (found.marker, found.marker_in_world, found.marker_covariance),
-                    {"measured_poses": len(found.frame), "localized_poses": int(known.sum()),
-                     "sightings": len(dataset.aruco.pose), "outliers": int(found.outlier.sum()),
-                     "unused_sightings": int(found.unused.sum())})
+                    facts={"measured_poses": len(found.frame), "localized_poses": int(known.sum()),
+                           "sightings": len(dataset.aruco.pose), "outliers": int(found.outlier.sum()),
+                           "unused_sightings": int(found.unused.sum())})
 
 
 def problem2_hint(dataset, fused=None):
