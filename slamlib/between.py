@@ -4,6 +4,7 @@ import numpy as np
 
 from slamlib import odometry, se2
 from slamlib.factors import least_noise, vehicle_with
+from slamlib.graph import GAUGE
 
 
 def between_frames(graph, state, joint, slip):
@@ -16,6 +17,8 @@ def between_frames(graph, state, joint, slip):
     `joint` (f-1, 9, 9) are the covariances of [X_i, X_{i+1}, w] in GTSAM's axes.
     """
     poses, ticks, vehicle = state.poses, graph.dataset.ticks, vehicle_with(graph.dataset.vehicle, state.w)
+    if not len(joint):                                       # pose 1 alone, which is the world's origin
+        return poses, np.diag([GAUGE, GAUGE, vehicle.sigma_heading])[None]**2
     turned = np.zeros_like(joint)
     turned[:, range(9), range(9)] = 1
     turned[:, :2, :2], turned[:, 3:5, 3:5] = (se2.rotation(poses[rows, 2])

@@ -20,6 +20,7 @@ CAUCHY = (100.0, 30.0, 10.0, 3.0)   # scale of the kernel in sigmas, round after
 REPEATS = 4                  # at most, of learning the slip and judging the measurements anew
 WHEELS = {"variable": "wheels as a variable", "independent": "independent chain",
           "fixed": "wheels fixed"}
+DECISIVE = 3.0               # log evidence by which Euler's steps must explain more than arcs to be taken
 FEWEST = 5                   # ranges below which an antenna's place is not to be relied on
 
 _kernel, _one_sided = gtsam.noiseModel.mEstimator, gtsam.noiseModel.mEstimator.Base.ReweightScheme.Scalar
@@ -91,7 +92,7 @@ def solve(dataset, slip=None, model=None, after=None):
     dataset : Dataset with markers, ranges or both.
     slip : sqrt(m), standard deviation of a wheel's slip after one metre; None learns it by maximizing
         the Laplace evidence.
-    model : "arc" or "euler"; None takes the one of greater evidence.
+    model : "arc" or "euler"; None takes the arc unless the evidence of Euler's step is DECISIVE.
     after : Slam of the same drive with fewer sensors, whose poses, model and slip to start from.
 
     Returns
@@ -105,7 +106,8 @@ def solve(dataset, slip=None, model=None, after=None):
         return result(solve_graph(graph, slip, start=start))
     best = solve_graph(Graph(dataset, model or "arc"), slip)
     if model is None:
-        best = max(best, compared(best, "euler", "variable", slip), key=lambda found: found.log_evidence)
+        other = compared(best, "euler", "variable", slip)
+        best = other if other.log_evidence > best.log_evidence + DECISIVE else best
     return result(best)
 
 
@@ -171,7 +173,7 @@ def solve_graph(graph, slip=None, landmarks="consensus", start=None, weight=None
         native = graph.native(kernel, late, weight)
         if slip is None:
             values, _, _ = graph.optimize(values, native, graph.factors.whitening(learned)[0], most=2)
-            learned = _likeliest_slip(graph, values, native)
+            learned = _learned_slip(graph, values, native)
         U, _ = graph.factors.whitening(learned)
         values, _, _ = graph.optimize(values, native, U)
         before, weight = weight, weight if fixed else judged()
@@ -203,13 +205,23 @@ def _of_round(sightings, ranges, scale):
             RANGES[ranges][0] if ranges in convex else cauchy)
 
 
-def _likeliest_slip(graph, values, native):
-    """The slip of greatest evidence times prior."""
+def _learned_slip(graph, values, native):
+    """Root mean square of the slip under its posterior, evidence times prior.
+
+    About the mode, which a search finds, the posterior is summed over values of the logarithm half a
+    unit apart. Where the data say much, this is the mode; where they say little, the slips that are
+    possible beyond it count too, as variances do.
+    """
     linearized = native.graph.linearize(values)
-    best = minimize_scalar(
-        lambda s: -graph.log_evidence(values, native, np.exp(s), linearized) - log_slip_prior(s),
-        bounds=np.log(SLIPS), method="bounded", options={"xatol": 0.05})
-    return float(np.exp(best.x))
+
+    def log_posterior(log_slip):
+        return graph.log_evidence(values, native, np.exp(log_slip), linearized) + log_slip_prior(log_slip)
+
+    mode = minimize_scalar(lambda s: -log_posterior(s), bounds=np.log(SLIPS), method="bounded",
+                           options={"xatol": 0.05})
+    around = mode.x + np.arange(-4, 5) / 2
+    density = np.exp([min(0.0, log_posterior(s) + mode.fun) if s != mode.x else 0.0 for s in around])
+    return float(np.sqrt(np.sum(density * np.exp(2 * around)) / np.sum(density)))
 
 
 def agreeing(graph, values, early, late):
@@ -263,21 +275,20 @@ def result(optimum):
     used = np.bincount(graph.label[kept], np.where(graph.as_pose[kept], 3, 2), known)
     freedom = np.sum(np.maximum(used - np.where(graph.oriented, 3, 2), 0)) \
         + np.sum(of_ranges) - 2 * len(graph.antenna)   # odometry, priors: none
-    scale = vehicle.sigma_wheel
+    scale, calm = vehicle.sigma_wheel, graph.native(weight=np.r_[kept, of_ranges])    # no kernels
     return Slam(*every, graph.marker[held], markers,
                 se2.rotate_covariance(spread[held], markers[:, 2] * graph.oriented[held]),
                 graph.antenna, state.antennas, of_antennas,
-                _doubts(graph, state, joint, of_antennas, of_ranges),
+                _doubts(graph, state, every[1][graph.frame], of_antennas, of_ranges),
                 vehicle.wheel + scale * state.w, scale[:, None] * blocks[-1] * scale, optimum.slip,
                 graph.model, float(optimum.log_evidence),
-                2 * graph.error(values, native, U) / max(1, freedom), ~kept, residual, of_ranges,
+                2 * graph.error(values, calm, U) / max(1, freedom), ~kept, residual, of_ranges,
                 range_residual)
 
 
-def _doubts(graph, state, joint, covariances, weight):
+def _doubts(graph, state, of_poses, covariances, weight):
     """Sentences on antennas whose place the ranges do not settle: {id: sentence}."""
-    position = np.concatenate([joint[:, :2, :2], joint[-1:, 3:5, 3:5]])
-    sigma, doubts = np.sqrt(np.trace(position, axis1=1, axis2=2) / 2), {}
+    sigma, doubts = np.sqrt(np.trace(of_poses[:, :2, :2], axis1=1, axis2=2) / 2), {}
     for k, (antenna, ranges) in enumerate(zip(graph.antenna.tolist(), initial.ranges_of(graph, state.poses, sigma))):
         count = np.count_nonzero(weight[graph.tag == k] > 0.5)
         place, cost = initial.places(*ranges, graph.guess[k])

@@ -66,6 +66,21 @@ def test_aruco_map_through_scipy_and_octave(tmp_path):
     np.testing.assert_array_equal(loadmat(tmp_path / "again.mat")["i"], [ids])
 
 
+def test_uwb_map_through_scipy_and_octave(tmp_path):
+    positions, covariances = example(3)[0][:, :2], example(3)[1][:, :2, :2]
+    ids = np.array([4, 17, 51])
+    results.write_uwb_map(tmp_path, ids, positions, covariances)
+    structs = loadmat(tmp_path / "UwbMap.mat")["UwbMap"]
+    assert structs.shape == (1, 3) and structs.dtype.names == ("position", "covariance", "id")
+    assert structs[0, 1]["position"].shape == (1, 2) and structs[0, 1]["covariance"].shape == (2, 2)
+    for got, expected in zip(results.read_uwb_map(tmp_path), (ids, positions, covariances)):
+        np.testing.assert_array_equal(got, expected)
+    script = "load('UwbMap.mat'); p = vertcat(UwbMap.position); save('-v7', 'again.mat', 'p');"
+    subprocess.run([octave_or_skip(), "--quiet", "--no-init-file", "--eval", script], cwd=tmp_path,
+                   check=True, timeout=120)
+    np.testing.assert_array_equal(loadmat(tmp_path / "again.mat")["p"], positions)
+
+
 def test_an_empty_map(tmp_path):
     poses, covariances = example(1)
     results.write_aruco_map(tmp_path, np.zeros(0, int), poses[:0], covariances[:0])

@@ -7,9 +7,9 @@ from gtsam.symbol_shorthand import A, L, W, X
 
 from numeric import central_differences
 from slamlib import factors as factors_of
-from slamlib import montecarlo, slam
+from slamlib import initial, montecarlo, slam
 from slamlib.dataset import ArucoReadings, Dataset, Vehicle
-from slamlib.evaluation import anees, nees_band
+from slamlib.evaluation import anees, ate, nees_band
 from slamlib.graph import State
 from slamlib.simulation import simulate
 
@@ -228,3 +228,36 @@ def test_consensus_is_the_initialisation_that_survives_wrong_labels(options):
     assert runs["consensus initial error"].mean() < 0.5 * runs["first sighting initial error"].mean()
     graduated = montecarlo.run(montecarlo.landmarks, range(3), **options)
     assert graduated["consensus right"].all()
+
+
+def test_a_drive_of_many_rounds_is_grown_part_by_part():
+    """Odometry has lost the heading long before the end: from there no start would find home."""
+    dataset, truth = simulate("long", seed=3, rounds=3)
+    dataset = dataset.without("uwb")
+    assert len(initial.parts(dataset)) > 2 and initial.parts(dataset)[-1] == len(dataset.ticks)
+    found = slam.solve(dataset, 1e-3, "arc")
+    assert found.outlier.mean() < 0.005 and ate(found.poses, truth.poses) < 0.1
+
+
+def test_markers_without_orientation_are_points():
+    """Headings of the sightings are noise, and their variances say so."""
+    dataset, truth = simulate("short", seed=4)
+    rng, seen = np.random.default_rng(0), dataset.aruco
+    z, C = seen.marker_in_vehicle.copy(), seen.covariance.copy()
+    z[:, 2] = rng.uniform(-np.pi, np.pi, len(z))
+    C[:, 2, :2] = C[:, :2, 2] = 0
+    C[:, 2, 2] = 1e4
+    dataset = replace(dataset, uwb=None, aruco=replace(seen, marker_in_vehicle=z, covariance=C))
+    found = slam.solve(dataset)
+    assert ate(found.poses, truth.poses) < 0.03 and found.outlier.mean() < 0.01
+    assert anees(found.poses, found.covariances, truth.poses) < nees_band(1, probability=0.999)[1]
+    np.testing.assert_allclose(found.marker_covariance[:, 2, 2], 1e4)
+    true_map = truth.marker_in_world[np.searchsorted(truth.marker, found.marker)]
+    assert np.abs(found.marker_in_world - true_map)[:, :2].max() < 0.05
+    assert (found.marker_covariance[:, [0, 1], [0, 1]] < 0.05**2).all()
+
+
+def test_wrong_labels_are_best_left_out():
+    runs = montecarlo.run(montecarlo.wrong_labels, range(8), mislabelled=0.03)
+    error = {way: runs[f"{way} ate"].mean() for way in slam.SIGHTINGS}
+    assert error["gate"] < 1.02 * min(error.values()) and 1.5 * error["gate"] < error["Huber"]
