@@ -89,7 +89,7 @@ def wheels(log, right, left, base, sigma_radii, sigma_base, probability, count):
     k = np.sqrt(-2 * np.log(1 - probability / 100))
     longest = k * np.sqrt(np.linalg.eigvalsh(covariances[:, :2, :2])[:, 1])
     right.fill_between(np.arange(len(poses)) + 1, longest, color=color, alpha=0.18, linewidth=0,
-                       label="length of its half-axis")
+                       label="its longer half-axis")
     plotting.curve(right, np.hypot(*(other - poses)[:, :2].T), "exact", label="wheels of the sliders")
     right.set(ylabel="distance from nominal (m)", ylim=(0, None))
     if log.truth is not None:
@@ -139,7 +139,7 @@ def cameras(seed, every, reach, claimed):
         nees = evaluation.anees(fused.poses[frames], fused.covariances[frames], truth.poses[frames])
         left.set_title(f"{len(aruco.pose)} sightings (ellipses × {k})")
         if np.isfinite(nees):
-            right.set_title(f"fused: NEES {nees:.1f}")
+            right.set_title(f"fused: {fused.outliers} left out, NEES {nees:.1f}")
     right.set_ylim(LEAST_ERROR, 2 * right.dataLim.y1)
     plotting.legend_below(fig)
     return fig
@@ -177,11 +177,11 @@ def graphs(seed, slip, assumed, wrong, kernel, start):
     low, high = truth.marker_in_world[:, :2].min(0) - 0.5, truth.marker_in_world[:, :2].max(0) + 0.5
     left.set_aspect("equal", adjustable="box")               # and what is far off is cut off
     left.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-    left.set_title(f"{np.count_nonzero(solved.outlier)} sightings left out")
+    left.set_title(f"{len(solved.outlier)} sightings")
     _error(right, poses, truth.poses[graph.frame], "hint", "single kernel", at=graph.frame)
     _error(right, solved.poses, truth.poses, "slam", "rounds of kernels")
     nees = evaluation.anees(solved.poses, solved.covariances, truth.poses)
-    right.set_title(f"rounds: NEES {nees:.1f}")
+    right.set_title(f"rounds: {np.count_nonzero(solved.outlier)} left out, NEES {nees:.1f}")
     right.set_ylim(LEAST_ERROR, 2 * right.dataLim.y1)
     plotting.legend_below(fig)
     return fig
@@ -192,3 +192,4 @@ def _error(ax, poses, truth, role, label=None, **look):
     apart = np.hypot(*(poses - truth)[:, :2].T)
     plotting.curve(ax, 1e3 * apart, role, label=label, **look)
     ax.set(yscale="log", ylabel="error of position (mm)")
+    ax.yaxis.set_major_formatter("{x:g}")
