@@ -47,7 +47,7 @@ def show(draw, **controls):
     for control in controls.values():
         control.continuous_update = False              # draw when it is let go, and not on the way
         control.style.description_width = "11em"
-        control.layout.width = "27em"
+        control.layout.width = "30em"
     display(VBox([Box(list(controls.values()), layout=ROW), interactive_output(draw, controls)]))
 
 
@@ -81,21 +81,21 @@ def wheels(log, right, left, base, sigma_radii, sigma_base, probability, count):
     at, color = plotting.spread(poses, count), plotting.ROLES["odometry"]["color"]
     name = f"{probability} % by equation 2"
     fig, axes = plotting.panels(2, height=4.0)
-    (left,), (right,) = axes
-    plotting.trajectory(left, poses, "odometry", "nominal wheels")
-    plotting.ellipses(left, poses[at], covariances[at], color, probability / 100, name)
-    plotting.trajectory(left, other, "exact", "wheels of the sliders")
-    left.set_title(log.name)
+    (plan,), (side,) = axes
+    plotting.trajectory(plan, poses, "odometry", "nominal wheels")
+    plotting.ellipses(plan, poses[at], covariances[at], color, probability / 100, name)
+    plotting.trajectory(plan, other, "exact", "wheels of the sliders")
+    plan.set_title(log.name)
     k = np.sqrt(-2 * np.log(1 - probability / 100))
     longest = k * np.sqrt(np.linalg.eigvalsh(covariances[:, :2, :2])[:, 1])
-    right.fill_between(np.arange(len(poses)) + 1, longest, color=color, alpha=0.18, linewidth=0,
+    side.fill_between(np.arange(len(poses)) + 1, longest, color=color, alpha=0.18, linewidth=0,
                        label="its longer half-axis")
-    plotting.curve(right, np.hypot(*(other - poses)[:, :2].T), "exact", label="wheels of the sliders")
-    right.set(ylabel="distance from nominal (m)", ylim=(0, None))
+    plotting.curve(side, np.hypot(*(other - poses)[:, :2].T), "exact", label="wheels of the sliders")
     if log.truth is not None:
-        plotting.trajectory(left, log.truth.poses, "truth")
-        plotting.curve(right, np.hypot(*(log.truth.poses - poses)[:, :2].T), "truth")
-        left.set_title(f"{log.name}: {evaluation.ate(other, log.truth.poses):.3f} m off the truth")
+        plotting.trajectory(plan, log.truth.poses, "truth")
+        plotting.curve(side, np.hypot(*(log.truth.poses - poses)[:, :2].T), "truth")
+        plan.set_title(f"{log.name}: {evaluation.ate(other, log.truth.poses):.3f} m off the truth")
+    side.set(ylabel="distance from nominal (m)", ylim=(0, None))
     plotting.legend_below(fig)
     return fig
 
@@ -118,29 +118,29 @@ def cameras(seed, every, reach, claimed):
                     marker_in_vehicle=a.marker_in_vehicle[kept],
                     covariance=a.covariance[kept] * claimed**2)
     fig, axes = plotting.panels(2, height=4.0)
-    (left,), (right,) = axes
+    (plan,), (side,) = axes
     path = odometry.dead_reckoning(dataset.ticks, dataset.vehicle)
-    plotting.trajectory(left, truth.poses, "truth")
-    plotting.trajectory(left, path, "odometry")
-    _error(right, path, truth.poses, "odometry")
+    plotting.trajectory(plan, truth.poses, "truth")
+    plotting.trajectory(plan, path, "odometry")
+    _error(side, path, truth.poses, "odometry")
     if len(frames := np.unique(aruco.pose)):
         fused = fusion.fuse(replace(dataset, aruco=aruco), slip=SLIP)
         alone = localization.localize(aruco)
         known = np.isfinite(alone.poses[:, 0])
         poses = se2.compose(truth.poses[frames[known][0]], alone.poses)
-        plotting.trajectory(left, poses, "aruco", "markers alone")
-        plotting.trajectory(left, fused.poses, "fused")
+        plotting.trajectory(plan, poses, "aruco", "markers alone")
+        plotting.trajectory(plan, fused.poses, "fused")
         k = plotting.enlargement(fused.poses, fused.covariances)
         at = plotting.spread(fused.poses, 10)
-        plotting.ellipses(left, fused.poses[at], fused.covariances[at],
+        plotting.ellipses(plan, fused.poses[at], fused.covariances[at],
                           plotting.ROLES["fused"]["color"], enlarged=k)
-        _error(right, poses, truth.poses[frames], "aruco", "markers alone", at=frames)
-        _error(right, fused.poses, truth.poses, "fused")
+        _error(side, poses, truth.poses[frames], "aruco", "markers alone", at=frames)
+        _error(side, fused.poses, truth.poses, "fused")
         nees = evaluation.anees(fused.poses[frames], fused.covariances[frames], truth.poses[frames])
-        left.set_title(f"{len(aruco.pose)} sightings (ellipses × {k})")
+        plan.set_title(f"{len(aruco.pose)} sightings (ellipses × {k})")
         if np.isfinite(nees):
-            right.set_title(f"fused: {fused.outliers} left out, NEES {nees:.1f}")
-    right.set_ylim(LEAST_ERROR, 2 * right.dataLim.y1)
+            side.set_title(f"fused: {fused.outliers} left out, NEES {nees:.1f}")
+    side.set_ylim(LEAST_ERROR, 2 * side.dataLim.y1)
     plotting.legend_below(fig)
     return fig
 
@@ -164,25 +164,25 @@ def graphs(seed, slip, assumed, wrong, kernel, start):
     poses, markers = graph.poses(values)
     solved = slam.result(*slam.solve_graph(graph, assumed))
     fig, axes = plotting.panels(2, height=4.0)
-    (left,), (right,) = axes
-    plotting.trajectory(left, truth.poses, "truth")
-    plotting.trajectory(left, poses, "hint", "single kernel")
-    plotting.trajectory(left, solved.poses, "slam", "rounds of kernels")
+    (plan,), (side,) = axes
+    plotting.trajectory(plan, truth.poses, "truth")
+    plotting.trajectory(plan, poses, "hint", "single kernel")
+    plotting.trajectory(plan, solved.poses, "slam", "rounds of kernels")
     for marker, in_world, role in ((graph.marker, markers, "hint"),
                                    (solved.marker, solved.marker_in_world, "slam")):
         true = truth.marker_in_world[np.searchsorted(truth.marker, marker)]
         ends = np.stack([true[:, :2], in_world[:, :2]])
-        left.plot(*ends.T.swapaxes(1, 2), color=plotting.ROLES[role]["color"], linewidth=1.2)
-    left.plot(*truth.marker_in_world[:, :2].T, label="true markers", **plotting.ROLES["marker"])
+        plan.plot(*ends.T.swapaxes(1, 2), color=plotting.ROLES[role]["color"], linewidth=1.2)
+    plan.plot(*truth.marker_in_world[:, :2].T, label="true markers", **plotting.ROLES["marker"])
     low, high = truth.marker_in_world[:, :2].min(0) - 0.5, truth.marker_in_world[:, :2].max(0) + 0.5
-    left.set_aspect("equal", adjustable="box")               # and what is far off is cut off
-    left.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-    left.set_title(f"{len(solved.outlier)} sightings")
-    _error(right, poses, truth.poses[graph.frame], "hint", "single kernel", at=graph.frame)
-    _error(right, solved.poses, truth.poses, "slam", "rounds of kernels")
+    plan.set_aspect("equal", adjustable="box")               # and what is far off is cut off
+    plan.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    plan.set_title(f"{len(solved.outlier)} sightings")
+    _error(side, poses, truth.poses[graph.frame], "hint", "single kernel", at=graph.frame)
+    _error(side, solved.poses, truth.poses, "slam", "rounds of kernels")
     nees = evaluation.anees(solved.poses, solved.covariances, truth.poses)
-    right.set_title(f"rounds: {np.count_nonzero(solved.outlier)} left out, NEES {nees:.1f}")
-    right.set_ylim(LEAST_ERROR, 2 * right.dataLim.y1)
+    side.set_title(f"rounds: {np.count_nonzero(solved.outlier)} left out, NEES {nees:.1f}")
+    side.set_ylim(LEAST_ERROR, 2 * side.dataLim.y1)
     plotting.legend_below(fig)
     return fig
 
