@@ -46,8 +46,8 @@ def show(draw, **controls):
         return
     for control in controls.values():
         control.continuous_update = False              # draw when it is let go, and not on the way
-        control.style.description_width = "11em"
-        control.layout.width = "30em"
+        control.style.description_width = "12em"
+        control.layout.width = "31em"
     display(VBox([Box(list(controls.values()), layout=ROW), interactive_output(draw, controls)]))
 
 
