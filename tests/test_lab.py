@@ -62,7 +62,8 @@ def test_moving_a_slider_changes_the_picture(chromium, lab):
     asked = []
     page.on("request", lambda request: asked.append(request.url))
     page.goto(f"{lab['url']}lab/tree/1_odometry.ipynb?token={lab['token']}")
-    page.locator(".jp-Notebook-ExecutionIndicator[data-status=idle]").first.wait_for()  # the kernel is up
+    # Before the kernel is the notebook's own, JupyterLab asks which one shall run the cells.
+    page.get_by_text("Python 3 (ipykernel) | Idle", exact=True).wait_for()
     page.get_by_role("menuitem", name="Run", exact=True).click()
     page.get_by_text("Run All Cells", exact=True).click()
 
