@@ -6,11 +6,12 @@ Where the report is built it draws the picture once, at the values that the cont
 
 from dataclasses import replace
 
+import gtsam
 import numpy as np
 from IPython.display import display
 from ipywidgets import Box, Dropdown, FloatSlider, IntSlider, Layout, VBox, interactive_output
 
-from slamlib import evaluation, fusion, localization, odometry, plotting, se2, slam
+from slamlib import evaluation, fusion, initial, localization, odometry, plotting, se2, slam
 from slamlib.notebook import Log, interactive
 from slamlib.simulation import simulate
 
@@ -70,10 +71,7 @@ def wheels(log, right, left, base, sigma_radii, sigma_base, probability, count):
     probability, count : of the ellipses, in percent, and their number.
     """
     ticks, v = log.dataset.ticks, log.dataset.vehicle
-    errors = odometry.wheel_sigmas(v) * (right, left, base)
-    other = odometry.dead_reckoning(ticks, replace(
-        v, right_radius=v.right_radius + errors[0], left_radius=v.left_radius + errors[1],
-        wheelbase=v.wheelbase + errors[2]))
+    other = odometry.dead_reckoning(ticks, v.with_wheel(v.wheel + v.sigma_wheel * (right, left, base)))
     poses, covariances = odometry.equation2(ticks, replace(
         v, sigma_right_radius=v.sigma_right_radius * sigma_radii,
         sigma_left_radius=v.sigma_left_radius * sigma_radii,
@@ -154,15 +152,17 @@ def graphs(seed, slip, assumed, wrong, kernel, start):
     slip, assumed : mm after one metre, of the drive and of the graph.
     wrong : percent of the sightings that carry another marker's label.
     kernel : one of KERNELS, the Cauchy kernel's scale in sigmas.
-    start : one of slam.LANDMARKS, where the markers start in the single kernel's graph.
+    start : one of initial.LANDMARKS, where the markers start in the single kernel's graph.
     """
     dataset, truth = simulate("short", seed, slip=1e-3 * slip, mislabelled=wrong / 100)
-    graph, assumed = slam.Graph(dataset, "arc"), max(1e-3 * assumed, slam.SLIPS[0])
+    graph = slam.Graph(replace(dataset, uwb=None), "arc")
+    assumed = max(1e-3 * assumed, fusion.SLIPS[0])
     U, _ = graph.factors.whitening(assumed)
-    native = graph.native(KERNELS[kernel])
-    values, _, _ = graph.optimize(graph.initial(start), native, U)
-    poses, markers = graph.poses(values)
-    solved = slam.result(*slam.solve_graph(graph, assumed))
+    scale = KERNELS[kernel]
+    native = graph.native(gtsam.noiseModel.mEstimator.Cauchy.Create(scale) if scale else None)
+    values, _, _ = graph.optimize(initial.from_odometry(graph, start), native, U)
+    poses, markers = graph.state(values).poses, graph.state(values).markers
+    solved = slam.result(slam.solve_graph(graph, assumed))
     fig, axes = plotting.panels(2, height=4.0)
     (plan,), (side,) = axes
     plotting.trajectory(plan, truth.poses, "truth")

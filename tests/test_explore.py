@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from nbclient import NotebookClient
 
-from slamlib import explore, odometry, plotting, slam
+from slamlib import explore, initial, plotting
 from slamlib.notebook import Log
 from slamlib.simulation import manoeuvre, simulate
 
@@ -86,9 +86,7 @@ WHEELS = dict(right=0.0, left=0.0, base=0.0, sigma_radii=1.0, sigma_base=1.0, pr
 def test_wheels_of_the_true_vehicle_come_nearer_to_the_truth():
     log = Log("short", *simulate("short", seed=3, slip=0.0))
     v, t = log.dataset.vehicle, log.truth.vehicle
-    sigma = odometry.wheel_sigmas(v)
-    right, left, base = np.subtract([t.right_radius, t.left_radius, t.wheelbase],
-                                    [v.right_radius, v.left_radius, v.wheelbase]) / sigma
+    right, left, base = (t.wheel - v.wheel) / v.sigma_wheel
 
     def off(**values):
         title = explore.wheels(log, **WHEELS | values).axes[0].get_title(loc="left")
@@ -143,7 +141,7 @@ def test_the_ends_of_the_slip_sliders_can_be_drawn(slip, assumed):
 
 
 def test_every_choice_of_where_markers_start_can_be_drawn():
-    for start in slam.LANDMARKS:
+    for start in initial.LANDMARKS:
         explore.graphs(2, 1.0, 1.0, 5, "1 σ", start)
 
 
