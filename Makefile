@@ -46,7 +46,8 @@ test: $(READY)
 	$(BIN)/python -m pytest
 
 lab: $(READY)
-	$(BIN)/python -m jupyter lab notebooks
+	$(BIN)/python -m jupyter lab --LabApp.check_for_updates_class=jupyterlab.NeverCheckForUpdate \
+		notebooks
 
 strip: $(READY)
 	@$(BIN)/python -m nbstripout --keep-id notebooks/*.ipynb

@@ -278,7 +278,8 @@ def _inverse_where_regular(H):
     """Inverses of (l, 3, 3), NaN where there is none."""
     scale = np.sqrt(np.maximum(np.diagonal(H, axis1=1, axis2=2), 1e-300))
     scaled = H / (scale[:, :, None] * scale[:, None, :])
-    regular = np.linalg.eigvalsh(scaled)[:, 0] > 1e-12
+    finite = np.isfinite(H).all(axis=(1, 2))          # not where a tie has lost all its sightings
+    regular = finite & (np.linalg.eigvalsh(np.where(finite[:, None, None], scaled, 0))[:, 0] > 1e-12)
     inverse = np.full_like(H, np.nan)
     inverse[regular] = np.linalg.inv(H[regular])
     return inverse

@@ -102,6 +102,15 @@ def test_no_cell_wrote_to_stderr(built):
         assert "stderr" not in re.sub(r"<style>.*?</style>", "", page, flags=re.DOTALL), name
 
 
+def test_every_chapter_ends_with_one_picture_to_explore_and_no_widget(built):
+    _, pages = built
+    for name in pages.keys() - {"index"}:
+        _, section = pages[name].split('<h2 id="Explore">')
+        assert section.count("<figure>") == 1 == section.count('src="data:image/svg+xml;base64,'), name
+        assert "<script" not in pages[name] and "widget" not in section, name
+        assert not re.search(r"(VBox|Output|interactive)\(", section), name
+
+
 def test_without_any_markers_chapter_2_can_still_be_read(tmp_path):
     (tmp_path / "data" / "wheels").mkdir(parents=True)
     (tmp_path / "data" / "wheels" / "encoderReading.txt").write_text("1 0 0\n2 100 90\n3 90 100\n")

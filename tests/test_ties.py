@@ -166,3 +166,11 @@ def test_starting_off_is_no_sudden_motion():
     ties = plausible_ties(z[order], np.tile(1e-6 * np.eye(3), (len(z), 1, 1)), *args, np.full(214, 10))
     common = np.bincount(args[0], minlength=214)
     assert (common[199:] == 1).all() and ties.usable.all() and ties.kept.all()
+
+
+def test_two_sightings_too_far_apart_to_agree_and_too_near_for_one_to_win_make_no_tie():
+    """Seven sigmas apart each is beyond the gate of their mean: none is left, and nothing is raised."""
+    z = np.array([[1.0, 0, 0], [-1.0, 0, 0], [1.07, 0, 0], [-1.07, 0, 0]])
+    args = z, np.broadcast_to(1e-4 * np.eye(3), (4, 3, 3)), np.zeros(2, int), np.arange(2), np.arange(2, 4)
+    ties = estimate_ties(*args, 1)
+    assert not ties.usable.any() and not ties.kept.any() and np.isnan(ties.increment).all()
