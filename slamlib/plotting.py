@@ -11,6 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.collections import EllipseCollection
 from matplotlib.colors import to_rgb
+from matplotlib.patches import Annulus
 
 from slamlib import se2
 
@@ -25,6 +26,11 @@ ROLES = {
     "hint": dict(color="#E69F00", linestyle=(0, (5, 1, 1, 1)), linewidth=1.5, zorder=3),
     "marker": dict(color="#333333", linestyle="none", marker="s", markersize=3, zorder=3),
     "slam": dict(color="#0072B2", linewidth=1.7, zorder=3),
+    "uwb": dict(color="#56B4E9", linestyle=(0, (6, 1.5)), linewidth=2.2, zorder=3.2),
+    "antenna": dict(color="#222222", linestyle="none", marker="^", markersize=6, zorder=5),
+    "guess": dict(color="#222222", linestyle="none", marker="^", markersize=7, zorder=4,
+                  markerfacecolor="none"),
+    "true antenna": dict(color="black", linestyle="none", marker="+", markersize=9, zorder=6),
 }
 
 # Where estimates are laid over a sample: dots below, a wide line, a narrow dashed one on top of it.
@@ -95,6 +101,43 @@ def markers(ax, in_world, covariances, role="marker", label="markers"):
     """Markers (k, >= 2) as squares with their 95 % ellipses."""
     ellipses(ax, in_world, covariances, "#bbbbbb", fill=0.35)
     ax.plot(in_world[:, 0], in_world[:, 1], label=label, **ROLES[role])
+    return ax
+
+
+def antennas(ax, positions, covariances, guess=None, truth=None, enlarged=1):
+    """Antennas (a, 2) with their 95 % ellipses, the guessed places and the true ones."""
+    ellipses(ax, positions, covariances, "#999999", fill=0.35, enlarged=enlarged)
+    if guess is not None:
+        ax.plot(*np.stack([guess, positions]).T.swapaxes(0, 1), color="#999999", linewidth=0.8, zorder=2)
+        ax.plot(*guess.T, label="antennas: guess", **ROLES["guess"])
+    ax.plot(*positions.T, label="antennas: estimate", **ROLES["antenna"])
+    if truth is not None:
+        ax.plot(*truth.T, label="antennas: truth", **ROLES["true antenna"])
+    return ax
+
+
+def rings(ax, centres, radii, sigma, color="#56B4E9"):
+    """The places that ranges allow: rings of +-2 sigma around centres (m, 2), radii and sigma (m,)."""
+    for centre, radius, s in zip(centres, radii, sigma):
+        ax.add_patch(Annulus(centre, radius + 2 * s, 4 * s, facecolor=color, alpha=0.35, linewidth=0))
+    ax.set_aspect("equal", adjustable="datalim")
+    ax.set(xlabel="x (m)", ylabel="y (m)")
+    return ax
+
+
+def likelihood(ax, positions, ranges, sigma, window):
+    """Where an antenna may be that has these ranges (m,) of the same sigma from positions (m, 2).
+
+    `window` are the ends of x and y in metres. Shades are the density relative to its greatest.
+    """
+    x, y = (np.linspace(low, high, 161) for low, high in window)
+    grid = np.stack(np.meshgrid(x, y), -1)
+    off = (np.linalg.norm(grid[:, :, None] - positions, axis=-1) - ranges) / sigma
+    cost = np.sum(off**2, axis=-1) / 2
+    ax.contourf(x, y, np.exp(cost.min() - cost), levels=[1e-6, 1e-3, 0.05, 0.3, 1.01],
+                colors=["#e3f1fa", "#b5dbf3", "#7cbfe8", "#0072B2"])
+    ax.set_aspect("equal", adjustable="box")
+    ax.set(xlabel="x (m)", ylabel="y (m)")
     return ax
 
 
