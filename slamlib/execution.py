@@ -1,7 +1,9 @@
 """Executes notebooks headless, each in a kernel of its own, at most so many at a time."""
 
 import asyncio
+import os
 import re
+import shutil
 import sys
 import time
 
@@ -36,26 +38,70 @@ class _Loop(asyncio.SelectorEventLoop):
         raise RuntimeError("signals are not for single notebooks")
 
 
-def kernel_environment(settings, data, results, datasets, jobs):
+def kernel_environment(settings, data, datasets, jobs):
     """What kernels see: our variables, and no settings of the user that would change a page."""
     (settings / "matplotlibrc").write_text("svg.hashsalt: slamlib\n")
     threads = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS") if jobs > 1 else ()
     environment = {"SOURCE_DATE_EPOCH": "0", "PYTHONHASHSEED": "0"} | dict.fromkeys(threads, "1")
     environment |= os.environ
-    environment |= {"SLAMLIB_DATA": str(data), "SLAMLIB_RESULTS": str(results),
-                    "IPYTHONDIR": str(settings), "MATPLOTLIBRC": str(settings / "matplotlibrc"),
+    environment |= {"SLAMLIB_DATA": str(data), "IPYTHONDIR": str(settings),
+                    "MATPLOTLIBRC": str(settings / "matplotlibrc"),
                     "MPLBACKEND": "module://matplotlib_inline.backend_inline"}
     environment.pop("SLAMLIB_DATASETS", None)
     return environment | ({"SLAMLIB_DATASETS": "\n".join(datasets)} if datasets else {})
 
 
-async def _execute_all(books, environment, jobs):
-    """Execute books in place, at most `jobs` at a time; the first failure stops the others."""
+def execute(books, environment, results, jobs, done):
+    """Execute books in place, at most `jobs` at a time; the first failure stops the others.
+
+    Each writes its results to a folder of its own inside `results`, from where they are moved to
+    their places when it has ended well.
+
+    Parameters
+    ----------
+    books : dict from Path to NotebookNode
+    environment : dict of the kernels' variables; SLAMLIB_RESULTS is added.
+    results : Path
+    jobs : number of notebooks at a time.
+    done : called with source, book and the names of its results for each notebook that ended well.
+
+    Raises
+    ------
+    NotebookError : a cell failed.
+    """
+    try:
+        with asyncio.Runner(loop_factory=_Loop) as runner:
+            runner.run(_execute_all(books, environment, results, jobs, done))
+    except ExceptionGroup as group:
+        raise group.exceptions[0] from None
+
+
+async def _execute_all(books, environment, results, jobs, done):
     slots = asyncio.Semaphore(jobs)
+
+    async def run(source, book, bar):
+        stage = results / f".{source.stem}"
+        shutil.rmtree(stage, ignore_errors=True)  # of a build that was killed
+        stage.mkdir(parents=True)
+        try:
+            await _execute(source, book, environment | {"SLAMLIB_RESULTS": str(stage)}, slots, bar)
+            done(source, book, _publish(stage, results))
+        finally:
+            shutil.rmtree(stage, ignore_errors=True)
+
     with tqdm(total=0, unit="cell", leave=False, disable=not sys.stderr.isatty()) as bar:
         async with asyncio.TaskGroup() as group:
             for source, book in books.items():
-                group.create_task(_execute(source, book, environment, slots, bar))
+                group.create_task(run(source, book, bar))
+
+
+def _publish(stage, results):
+    """Move all files of a folder to their places in another; return their names there."""
+    names = [file.relative_to(stage) for file in sorted(stage.rglob("*")) if file.is_file()]
+    for name in names:
+        (results / name).parent.mkdir(parents=True, exist_ok=True)
+        os.replace(stage / name, results / name)
+    return [name.as_posix() for name in names]
 
 
 async def _execute(source, book, environment, slots, bar):

@@ -33,7 +33,7 @@ LOADED = re.compile(r"<(?:script|link|iframe|object|embed|base)\b[^>]*"
 
 
 def chapter_of(source, book):
-    """File, title and first paragraph of a book, the last in Markdown."""
+    """A dict for contents and links: file, title and first paragraph of a book, the last in Markdown."""
     text = "\n\n".join(cell.source for cell in book.cells if cell.cell_type == "markdown")
     title = re.search(r"^#\s+(.+)", text, re.MULTILINE)
     lead = re.search(r"^(?!\s|[#|<>`]|\$\$|[-*+]\s).+(?:\n.+)*", text, re.MULTILINE)
@@ -41,10 +41,17 @@ def chapter_of(source, book):
     return {"file": quote(f"{source.stem}.html"), "title": title, "lead": lead[0] if lead else ""}
 
 
-def html_page(source, book, chapters, **index):
-    """The HTML page of one book, or of the index."""
+def html_page(source, book, chapters, code=True):
+    """The HTML page of one executed book, or of the index, as text.
+
+    Parameters
+    ----------
+    source, book : Path and NotebookNode.
+    chapters : list of dicts by `chapter_of`, for the contents.
+    code : False leaves out code cells and printed text.
+    """
     page = {"formulas": [], "headings": [], "anchors": {}, "figures": [], "chapters": chapters,
-            "index": index, "file": quote(f"{source.stem}.html"), "style": STYLE}
+            "code": code, "file": quote(f"{source.stem}.html"), "style": STYLE}
     exporter = HTMLExporter(template_name="basic", raw_template=PAGE,
                             filters={"markdown2html": _markdown_to_html})
     text, resources = exporter.from_notebook_node(

@@ -35,12 +35,13 @@ REWRITTEN = [(re.compile(pattern), becomes) for pattern, becomes in (  # pandoc 
     (r"\\lvert(?![a-zA-Z])", r"\\left\\lvert"), (r"\\rvert(?![a-zA-Z])", r"\\right\\rvert"))]
 
 
-def typeset(chapters, code=True, **cover):
+def typeset(chapters, opening=None, code=True, **cover):
     """The PDF of chapters, with title page and contents, as bytes; equal input gives equal bytes.
 
     Parameters
     ----------
     chapters : list of (Path, NotebookNode), executed; links name chapters by their file names.
+    opening : NotebookNode, what stands before them without numbers, if anything.
     code : False leaves out code cells and printed text.
     cover : title, author, student_number, course: str; what the title page says.
 
@@ -49,7 +50,10 @@ def typeset(chapters, code=True, **cover):
     NotebookError : a formula is lost or cannot be set, or Typst refuses the document.
     """
     book = _Book(code)
-    text = "\n#pagebreak(weak: true)\n".join(book.chapter(*chapter) for chapter in chapters)
+    parts = [book.chapter(*chapter) for chapter in chapters]
+    if opening is not None:
+        parts.insert(0, f"#unnumbered[\n{book.chapter(Path('index'), opening)}\n]")
+    text = "\n#pagebreak(weak: true)\n".join(parts)
     formulas = book.set_formulas()
     if lost := set(range(len(formulas))) - {int(mark[1]) for mark in MARK.finditer(text)}:
         raise NotebookError(f"the PDF would lose a formula, {book.place(min(lost))}")
@@ -126,7 +130,8 @@ class _Book:
                                          ["--wrap=none", f"--extract-media={media}"])
             self.files |= {file.name: file.read_bytes() for file in Path(media).iterdir()}
         text = text.replace(f'"{media}/', '"')
-        return re.sub(r"align: \([a-z,]*\)", lambda align: align[0].replace("auto", "left"), text)
+        text = re.sub(r"align: \([a-z,]*\)", lambda align: align[0].replace("auto", "left"), text)
+        return re.sub(r"^= (\d+)\.", r"#counter(heading).update(\1 - 1)\n\g<0>", text, count=1)
 
     def markdown(self, text, attachments=()):
         renderer = _Renderer(escape=False, embed_images=True, path=str(self.page["path"]),

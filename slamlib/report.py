@@ -1,56 +1,57 @@
-"""The report: runs the notebooks headless and writes pages that need no script and no network.
+"""The report: executes the notebooks and writes pages, and a PDF, that need no network.
 
-Notebooks are executed, each in a kernel of its own; each becomes one HTML page through nbconvert,
-`report_page.html` and `report_style.css`, its formulas set from TeX to MathML by pandoc.
+Each notebook becomes one HTML page and one chapter of the PDF; both open with the same summary.
 """
 
-import asyncio
-import html
-import json
 import os
-import re
+import resource
 import sys
 import tempfile
 import time
-import xml.etree.ElementTree as ElementTree
+from dataclasses import asdict
 from pathlib import Path
 from urllib.parse import quote
 
 import nbformat
-import pypandoc
-from jinja2 import pass_context
-from jupyter_client import AsyncKernelManager
-from jupyter_client.kernelspec import KernelSpecManager
-from nbclient import NotebookClient
-from nbclient.exceptions import CellExecutionError
-from nbconvert import HTMLExporter
-from nbconvert.filters import strip_ansi
-from nbconvert.filters.markdown_mistune import IPythonRenderer, MarkdownWithMath
-from tqdm import tqdm
 
+from slamlib import cache, overview
+from slamlib.cover import Cover
 from slamlib.dataset import DatasetError, dataset_names, read_dataset, read_truth
+from slamlib.execution import NotebookError, execute, kernel_environment, read_notebook
+from slamlib.pages import chapter_of, html_page
+from slamlib.pdf import typeset
 
-def build_report(notebooks, data, report, results, datasets=None, jobs=2):
-    """Execute the notebooks of a folder; write a page for each, and `index.html`.
+__all__ = ["NotebookError", "build_report"]
+
+
+def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=Cover(), code=True,
+                 kept=None, fresh=False):
+    """Execute the notebooks of a folder; write a page for each, `index.html` and `report.pdf`.
 
     Kernels find the absolute paths of data and results, and the selection, in the environment
-    variables SLAMLIB_DATA, SLAMLIB_RESULTS and SLAMLIB_DATASETS (names, one a line).
+    variables SLAMLIB_DATA, SLAMLIB_RESULTS and SLAMLIB_DATASETS (names, one a line). Their results
+    are moved from there into `results` when the notebook has ended well.
 
     Parameters
     ----------
     notebooks, data : folder of the `*.ipynb` files, and of the datasets, a sub-folder each.
     report, results : folder of the pages, and of what notebooks write; made if they do not exist.
     datasets, jobs : names, or None for all; number of notebooks executed at a time.
+    cover : Cover, the title page of the PDF.
+    code : False leaves out code cells and printed text, on the pages and in the PDF.
+    kept : folder of executed notebooks, which are executed again only if something changed that
+        they depend on, or None; `fresh` executes all of them, and keeps them.
 
     Returns
     -------
-    list of Path, the pages, the index first.
+    list of Path: the pages, the index first, and the PDF.
 
     Raises
     ------
     DatasetError : no notebook, no dataset of a selected name, or one that is not as it must be.
     NotebookError : a cell failed, or a page cannot be set; an earlier report stays as it was.
     """
+    start = time.monotonic()
     notebooks, data, report, results = (
         Path(folder).resolve() for folder in (notebooks, data, report, results))
     sources = sorted(notebooks.glob("*.ipynb"))
@@ -59,29 +60,69 @@ def build_report(notebooks, data, report, results, datasets=None, jobs=2):
     selected = dataset_names(data, datasets)
     for name in selected:  # bad data is to be told as such, and not as a failing notebook
         read_dataset(data / name), read_truth(data / name)
-    books = {source: _read(source) for source in sources}
-    chapters = [_chapter(source, book) for source, book in books.items()]
-    for source, book in books.items():  # a formula that fails shall fail before the long part
-        text = [cell for cell in book.cells if cell.cell_type == "markdown"]
-        _page(source, nbformat.v4.new_notebook(cells=text), chapters)
+    books = {source: read_notebook(source) for source in sources}
+    chapters = [chapter_of(source, book) for source, book in books.items()]
+    _set({source: nbformat.v4.new_notebook(
+        cells=[cell for cell in book.cells if cell.cell_type == "markdown"])
+        for source, book in books.items()}, chapters, cover, code)  # fails before the long part
 
     results.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory() as settings:
-        environment = _environment(Path(settings), data, results, datasets, jobs)
-        try:
-            with asyncio.Runner(loop_factory=_Loop) as runner:
-                runner.run(_execute_all(books, environment, max(1, jobs)))
-        except ExceptionGroup as group:
-            raise group.exceptions[0] from None
-    files = [(quote(os.path.relpath(file, report)), file.relative_to(results).as_posix())
-             for name in selected for file in sorted((results / name).rglob("*.mat"))]
-    index = nbformat.v4.new_notebook()
-    pages = {"index.html": _page(Path("index"), index, chapters, datasets=selected, files=files)}
-    pages |= {f"{source.stem}.html": _page(source, books[source], chapters) for source in sources}
+    books, written = _executed(books, data, results, datasets, selected, jobs, kept, fresh)
+    drives = overview.read_drives(data, results, selected, written)
+    links = [(quote(os.path.relpath(results / name, report)), name) for name in sorted(written)
+             if name.split("/")[0] in selected and name.endswith(".mat")]
+    index = overview.index(overview.summary(cover.title, drives), chapters, links)
+    opening = overview.summary("Overview", drives)
+    files = _set({Path("index"): index, **books}, chapters, cover, code, opening)
+
     report.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".", dir=report) as beside:
-        for name, text in pages.items():
-            Path(beside, name).write_text(text, encoding="utf-8")
-        for name in pages:
+        for name, content in files.items():
+            Path(beside, name).write_bytes(content)
+        for name in files:
             os.replace(Path(beside, name), report / name)
-    return [report / name for name in pages]
+    print(_spent(time.monotonic() - start), file=sys.stderr)
+    return [report / name for name in files]
+
+
+def _executed(books, data, results, datasets, selected, jobs, kept, fresh):
+    """The books, executed or as they are kept, and the names of all files that they wrote."""
+    done, written = {}, []
+    with tempfile.TemporaryDirectory() as settings:
+        environment = kernel_environment(Path(settings), data, datasets, jobs)
+        common = cache.fingerprint([data / name for name in selected], next(iter(books)).parent,
+                                   {**environment, "SLAMLIB_RESULTS": str(results)})
+        keys = {source: cache.key_of(source, book, common) for source, book in books.items()}
+
+        def finish(source, book, names):
+            done[source] = book
+            written.extend(names)
+            if kept is not None:
+                cache.keep(kept, source, keys[source], book, results, names)
+
+        for source, key in keys.items():
+            if kept is not None and not fresh and (found := cache.recall(kept, source, key, results)):
+                done[source], names = found
+                written.extend(names)
+                print(f"{source.stem}: nothing changed, not executed again", file=sys.stderr)
+        execute({source: book for source, book in books.items() if source not in done}, environment,
+                results, max(1, jobs), finish)
+    return {source: done[source] for source in books}, sorted(set(written))
+
+
+def _set(books, chapters, cover, code, opening=None):
+    """Names and contents of the report's files: a page for each book, and the PDF."""
+    files = {f"{source.stem}.html": html_page(source, book, chapters, code).encode()
+             for source, book in books.items()}
+    parts = [(source, book) for source, book in books.items() if source.suffix]
+    files["report.pdf"] = typeset(parts, opening, code, **asdict(cover))
+    return files
+
+
+def _spent(seconds):
+    """What the build took: a sentence. Memory is the most that a process ever had."""
+    unit = 1 if sys.platform == "darwin" else 1024
+    most = {who: resource.getrusage(which).ru_maxrss * unit / 1e6 for who, which in (
+        ("the largest process that it started", resource.RUSAGE_CHILDREN), ("its own", resource.RUSAGE_SELF))}
+    return f"built in {seconds:.1f} s; memory: " + ", ".join(
+        f"{who} {size:.0f} MB" for who, size in most.items())
