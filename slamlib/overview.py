@@ -17,6 +17,7 @@ from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_outp
 
 from slamlib import evaluation, odometry, plotting, se2
 from slamlib.dataset import Dataset, Truth, read_dataset, read_truth
+from slamlib.execution import NotebookError
 from slamlib.notebook import listed
 from slamlib.results import read_vehicle_poses
 from slamlib.solve import Solution, truth_in_world_of
@@ -50,6 +51,10 @@ def read_drives(data, results, selected, written):
     data, results : Path
     selected : list of str, names of datasets.
     written : names of files below `results`, as `short/problem1/vehiclePose.mat`.
+
+    Raises
+    ------
+    NotebookError : poses that are not what a vehiclePose.mat holds.
     """
     drives = []
     for name in selected:
@@ -57,13 +62,21 @@ def read_drives(data, results, selected, written):
             f"{re.escape(name)}/[^/]+/vehiclePose.mat", file))
         order = {problem: place for place, problem in enumerate(TITLES)}
         problems.sort(key=lambda problem: order.get(problem, len(order)))
-        drives.append(Drive(name, read_dataset(data / name), read_truth(data / name),
-                            tuple(_read(results / name / problem) for problem in problems)))
+        dataset = read_dataset(data / name)
+        drives.append(Drive(name, dataset, read_truth(data / name), tuple(
+            _read(results / name / problem, len(dataset.ticks)) for problem in problems)))
     return drives
 
 
-def _read(folder):
-    poses, covariances = read_vehicle_poses(folder)
+def _read(folder, count):
+    place = f"{folder.parent.name}/{folder.name}/vehiclePose.mat, which a notebook wrote"
+    try:
+        poses, covariances = read_vehicle_poses(folder)
+    except Exception as error:  # of scipy or numpy, of whatever kind
+        raise NotebookError(f"{place}, cannot be read: {error}") from None
+    if poses.shape != (count, 3) or covariances.shape != (count, 3, 3):
+        raise NotebookError(f"{place}, must hold [x, y, heading] and a covariance for each of the "
+                            f"{count} encoder poses; it holds {poses.shape}, {covariances.shape}")
     known = np.flatnonzero(np.isfinite(poses[:, 0]))  # the first of them is the world frame
     return Solution(folder.name, TITLES.get(folder.name, folder.name), poses, covariances,
                     int(known[0]) if len(known) else 0)
@@ -166,7 +179,8 @@ def _row(drive, problem, solution):
 
 def _si(value, unit):
     """Three digits, in thousandths of the unit where it is small."""
-    return f"{value:.2f} {unit}" if value >= 1 else f"{1e3 * value:.3g} m{unit}"
+    value, unit = (value, unit) if value >= 1 else (1e3 * value, f"m{unit}")
+    return f"{value:.{max(0, 2 - len(str(int(value))) + 1)}f} {unit}"
 
 
 def _table(header, rows):

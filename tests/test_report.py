@@ -108,9 +108,10 @@ def build(root, **options):
                         **options)
 
 
-def test_pages_are_index_and_chapters_in_order(built):
+def test_files_are_index_chapters_in_order_and_the_pdf(built):
     root, pages = built
-    assert [page.name for page in pages] == ["index.html", "1_odometry.html", "2_other.html"]
+    assert [page.name for page in pages] == ["index.html", "1_odometry.html", "2_other.html",
+                                             "report.pdf"]
     assert sorted((root / "report").iterdir()) == sorted(pages)
 
 
@@ -140,7 +141,7 @@ def test_formulas_are_mended(built):
 
 
 def test_pages_load_nothing(built):
-    for path in built[1]:
+    for path in built[1][:-1]:
         page = Page(path)
         assert not {"script", "link", "iframe", "object", "embed"} & set(page.count)
         assert all(source.startswith("data:image/") for source in page.loads)
@@ -157,14 +158,14 @@ def test_figures_are_embedded_and_described(built):
 
 
 def test_contents_titles_and_links(built):
-    index, first, second = (Page(path) for path in built[1])
+    index, first, second = (Page(path) for path in built[1][:-1])
     assert "<title>Problem 1: odometry</title>" in first.text
     assert {"index.html", "2_other.html", "2_other.html#Sums", "#The-estimate"} <= set(first.links)
     assert {"The-estimate"} <= set(first.ids) and {"Sums"} <= set(second.ids)
     assert {"1_odometry.html", "2_other.html", "1_odometry.html#eq-1",
-            "../results/short/vehiclePose.mat"} <= set(index.links)
+            "../results/short/vehiclePose.mat", "report.pdf"} <= set(index.links)
     assert index.count["math"] == 2  # of the first paragraph
-    assert "<li>short</li>" in index.text and "<li>long</li>" not in index.text
+    assert ">short</td>" in index.text and ">long</td>" not in index.text
 
 
 def test_kernels_see_the_folders_and_run_this_interpreter(built):
@@ -236,12 +237,13 @@ def test_bad_data_and_bad_notebooks_are_told_before_a_kernel_starts(tmp_path):
     assert not (tmp_path / "report").exists()
 
 
-def test_index_lists_results_of_the_selected_datasets_only(tmp_path):
+def test_index_lists_results_of_this_build_and_the_selected_datasets_only(tmp_path):
     make_data(tmp_path)
-    write(tmp_path / "notebooks", "1_text", "# Text", ("1",))
-    for name in ("short", "long", "gone"):
+    write(tmp_path / "notebooks", "1_text", "# Text", (ENVIRONMENT.replace('"short"', '"long"'),),
+          (ENVIRONMENT,))
+    for name in ("short", "gone"):
         (tmp_path / "results" / name).mkdir(parents=True)
-        (tmp_path / "results" / name / "vehiclePose.mat").touch()
+        (tmp_path / "results" / name / "old.mat").touch()
     index = build(tmp_path, datasets=["short"])[0].read_text()
-    assert "short/vehiclePose.mat" in index
-    assert "long/vehiclePose.mat" not in index and "gone/vehiclePose.mat" not in index
+    assert "short/vehiclePose.mat" in index and (tmp_path / "results/long/vehiclePose.mat").exists()
+    assert "long/vehiclePose.mat" not in index and "old.mat" not in index
