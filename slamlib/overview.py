@@ -44,13 +44,13 @@ class Drive:
 
 
 def read_drives(data, results, selected, written):
-    """The drives of the selected datasets, with the poses among the `written` results.
+    """The drives of the selected datasets, the shortest first, with their poses in `written`.
 
     Parameters
     ----------
     data, results : Path
     selected : list of str, names of datasets.
-    written : names of files below `results`, as `short/problem1/vehiclePose.mat`.
+    written : names of this build's files below `results`, as `short/problem1/vehiclePose.mat`.
 
     Raises
     ------
@@ -65,7 +65,7 @@ def read_drives(data, results, selected, written):
         dataset = read_dataset(data / name)
         drives.append(Drive(name, dataset, read_truth(data / name), tuple(
             _read(results / name / problem, len(dataset.ticks)) for problem in problems)))
-    return drives
+    return sorted(drives, key=lambda drive: len(drive.dataset.ticks))
 
 
 def _read(folder, count):
@@ -180,7 +180,7 @@ def _row(drive, problem, solution):
 def _si(value, unit):
     """Three digits, in thousandths of the unit where it is small."""
     value, unit = (value, unit) if value >= 1 else (1e3 * value, f"m{unit}")
-    return f"{value:.{max(0, 2 - len(str(int(value))) + 1)}f} {unit}"
+    return f"{value:.{max(0, 2 - len(str(int(value))) + 1)}f}\u00a0{unit}"
 
 
 def _table(header, rows):
@@ -199,7 +199,7 @@ def _picture(drive):
     """The trajectories of a drive over each other, in the world frame of pose 1, as SVG text."""
     style = Path(plotting.__file__).with_name("slamlib.mplstyle")
     with plt.style.context(style, after_reset=True), matplotlib.rc_context({"svg.hashsalt": "slamlib"}):
-        fig = Figure(figsize=(7.2, 5.0))
+        fig = Figure(figsize=(7.2, 3.8))
         ax = fig.add_subplot()
         if drive.truth is not None:
             plotting.trajectory(ax, drive.truth.poses, "truth")

@@ -181,7 +181,8 @@ class _Book:
 
     def _line(self, number, formula):
         tex, display = self.page["formulas"][number]
-        formula = SCALED.sub(r"lr(size: #\1%, \2)", " ".join(formula.split()))
+        formula = SCALED.sub(lambda big: f"stretch({big[2]}, size: #{int(big[1]) / 100}em)",
+                             " ".join(formula.split()))
         formula = f"{formula}<{self.labels[number]}>"
         if "\\dfrac" in tex:
             formula = f"#show math.frac: math.display\n{formula}".replace("\n", "; ")
