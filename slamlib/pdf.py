@@ -49,6 +49,15 @@ def typeset(chapters, opening=None, code=True, **cover):
     ------
     NotebookError : a formula is lost or cannot be set, or Typst refuses the document.
     """
+    files, book = typst_files(chapters, opening, code, **cover)
+    with tempfile.TemporaryDirectory() as folder:
+        for name, content in files.items():
+            Path(folder, name).write_bytes(content)
+        return _compile(Path(folder), book)
+
+
+def typst_files(chapters, opening=None, code=True, **cover):
+    """What Typst makes the PDF from, as `typeset`: {file name: bytes}; and the book it is of."""
     book = _Book(code)
     parts = [book.chapter(*chapter) for chapter in chapters]
     if opening is not None:
@@ -65,12 +74,9 @@ def typeset(chapters, opening=None, code=True, **cover):
     cover = ", ".join(f"{name}: {_quoted(value)}" for name, value in cover.items())
     text = (f'#import "{TEMPLATE.name}": *\n#import "formulas.typ": *\n'
             f"#show: report.with({cover})\n{text}\n")
-    files = {TEMPLATE.name: TEMPLATE.read_bytes(), "main.typ": text.encode(),
-             "formulas.typ": "\n".join([f'#import "{TEMPLATE.name}": display', *formulas]).encode(), **book.files}
-    with tempfile.TemporaryDirectory() as folder:
-        for name, content in files.items():
-            Path(folder, name).write_bytes(content)
-        return _compile(Path(folder), book)
+    formulas = [f'#import "{TEMPLATE.name}": display', *formulas]  # the others have a line each
+    return {TEMPLATE.name: TEMPLATE.read_bytes(), "main.typ": text.encode(),
+            "formulas.typ": "\n".join(formulas).encode(), **book.files}, book
 
 
 def _compile(folder, book):
@@ -79,7 +85,7 @@ def _compile(folder, book):
         content = compiler.compile(format="pdf", timestamp=0)
         found = set(json.loads(compiler.query("math.equation", field="label")))
     except typst.TypstError as error:
-        line = re.search(r"formulas\.typ:(\d+):", error.diagnostic)  # a line for each formula
+        line = re.search(r"formulas\.typ:(\d+):", error.diagnostic)
         place = book.place(int(line[1]) - 2) if line else error.diagnostic.strip()
         raise NotebookError(f"Typst cannot set the PDF: {error.message}: {place}") from None
     for number, label in enumerate(book.labels):
@@ -98,7 +104,11 @@ def _label(file, anchor=""):
 
 
 class _Book:
-    """Chapters on their way to Typst, and what is gathered from them."""
+    """Chapters on their way to Typst, and what is gathered from them.
+
+    `files` are of pictures; `pictures` their names and descriptions, quoted; `page` is what the
+    renderer fills: formulas (TeX, display), and by their number the file, label and tag of each.
+    """
 
     def __init__(self, code):
         self.code, self.files, self.pictures = code, {}, []
@@ -106,9 +116,11 @@ class _Book:
 
     @property
     def labels(self):
+        """The label of each formula in Typst: its anchor's, where it is numbered."""
         return [self.page["labels"].get(n, f"formula-{n}") for n in range(len(self.page["formulas"]))]
 
     def place(self, number):
+        """The file and the TeX of a formula."""
         return f"{self.page['sources'][number]}:\n    {self.page['formulas'][number][0]}"
 
     def chapter(self, source, book):
@@ -134,6 +146,7 @@ class _Book:
         return re.sub(r"^= (\d+)\.", r"#counter(heading).update(\1 - 1)\n\g<0>", text, count=1)
 
     def markdown(self, text, attachments=()):
+        """Markdown to HTML with marks."""
         renderer = _Renderer(escape=False, embed_images=True, path=str(self.page["path"]),
                              attachments=dict(attachments))
         renderer.page = self.page
@@ -180,6 +193,7 @@ class _Book:
         return [self._line(*numbered) for numbered in enumerate(formulas)]
 
     def _line(self, number, formula):
+        """A definition on one line, mended."""
         tex, display = self.page["formulas"][number]
         formula = SCALED.sub(lambda big: f"stretch({big[2]}, size: #{int(big[1]) / 100}em)",
                              " ".join(formula.split()))
