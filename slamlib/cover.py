@@ -26,9 +26,12 @@ def read_cover(path):
     path = Path(path)
     if not path.exists():
         return Cover()
-    entries = read_toml(path, 'author = "Ada Lovelace"', [field.name for field in fields(Cover)])
+    known = [field.name for field in fields(Cover)]
+    entries = read_toml(path, 'author = "Ada Lovelace"', known, encoding="utf-8")
     for key, (value, line) in entries.items():
+        place = f"{path}, line {line}" if line else str(path)
         if type(value) not in (str, int) or not str(value).isprintable():
-            place = f"{path}, line {line}" if line else str(path)
             raise DatasetError(f"{place}: expected a line of text in quotes for {key}")
+        if "\ufffd" in str(value):
+            raise DatasetError(f"{place}: expected UTF-8 text for {key}")
     return replace(Cover(), **{key: str(value) for key, (value, _) in entries.items()})

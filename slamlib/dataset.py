@@ -213,7 +213,7 @@ def read_truth(folder):
 # One function for each file.
 
 
-def read_toml(path, example, known):
+def read_toml(path, example, known, encoding="ascii"):
     """The entries of a TOML file without tables.
 
     Parameters
@@ -221,6 +221,7 @@ def read_toml(path, example, known):
     path : Path
     example : str, an entry as it must be, for the message.
     known : list of str, the keys there may be.
+    encoding : bytes of another one become '\\ufffd'.
 
     Returns
     -------
@@ -230,7 +231,7 @@ def read_toml(path, example, known):
     ------
     DatasetError : not TOML, or another key.
     """
-    text = _read_text(path)
+    text = _read_text(path, encoding)
     try:
         entries = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
@@ -377,8 +378,8 @@ def _find(folder, name, required=False):
     return paths[0] if paths else None
 
 
-def _read_text(path):
-    """Text with line ends '\\n', and '\\ufffd' for every byte that is not ASCII."""
+def _read_text(path, encoding="ascii"):
+    """Text with line ends '\\n', and '\\ufffd' for every byte that is not of this encoding."""
     try:
         if not path.is_file():  # a folder, or a pipe that would wait for ever
             raise OSError
@@ -389,7 +390,7 @@ def _read_text(path):
     if control := CONTROL_BYTE.search(data):
         line = data.count(b"\n", 0, control.start()) + 1
         raise _error(path, f"expected plain text, found the byte 0x{control[0].hex()}", line)
-    return data.decode("ascii", errors="replace")
+    return data.decode(encoding, errors="replace")
 
 
 def _read_table(path, columns):
