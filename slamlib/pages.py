@@ -33,12 +33,14 @@ LOADED = re.compile(r"<(?:script|link|iframe|object|embed|base)\b[^>]*"
 
 
 def chapter_of(source, book):
-    """A dict for contents and links: file, title and first paragraph of a book, the last in Markdown."""
+    """A dict for contents and links: file, title, its number, and first paragraph in Markdown."""
     text = "\n\n".join(cell.source for cell in book.cells if cell.cell_type == "markdown")
     title = re.search(r"^#\s+(.+)", text, re.MULTILINE)
     lead = re.search(r"^(?!\s|[#|<>`]|\$\$|[-*+]\s).+(?:\n.+)*", text, re.MULTILINE)
     title = re.sub("[*_`]", "", title[1]).strip() if title else source.stem
-    return {"file": quote(f"{source.stem}.html"), "title": title, "lead": lead[0] if lead else ""}
+    number = re.match(r"(\d+)\.", title)
+    return {"file": quote(f"{source.stem}.html"), "title": title, "lead": lead[0] if lead else "",
+            "number": number[1] if number else None}
 
 
 def html_page(source, book, chapters, code=True):

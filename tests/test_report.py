@@ -10,6 +10,7 @@ import nbformat
 import pytest
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 
+from slamlib.__main__ import main
 from slamlib.dataset import DatasetError
 from slamlib.report import NotebookError, build_report
 
@@ -92,7 +93,7 @@ def built(tmp_path_factory):
     make_data(root)
     write(root / "notebooks", "1_odometry", TEXT, (OUTPUT,), (FIGURE.format("svg"),),
           "**Figure 1.** A line.", (FIGURE.format("png"),))
-    write(root / "notebooks", "2_other", "# Second\n\n## Sums\n\nNo formula.", (ENVIRONMENT,),
+    write(root / "notebooks", "2_other", "# 2. Second\n\n## Sums\n\nNo formula.", (ENVIRONMENT,),
           ("",))
     spec = root / "kernels" / "python3" / "kernel.json"  # a kernel of the user that cannot run
     spec.parent.mkdir(parents=True)
@@ -166,6 +167,12 @@ def test_contents_titles_and_links(built):
             "../results/short/vehiclePose.mat", "report.pdf"} <= set(index.links)
     assert index.count["math"] == 2  # of the first paragraph
     assert ">short</td>" in index.text and ">long</td>" not in index.text
+
+
+def test_sections_of_a_numbered_chapter_are_numbered(built):
+    first, second = (path.read_text(encoding="utf-8") for path in built[1][1:3])
+    assert '<body class="numbered" style="--chapter: \'2.\'">' in second
+    assert "<body>" in first  # whose title has no number
 
 
 def test_kernels_see_the_folders_and_run_this_interpreter(built):
@@ -247,3 +254,25 @@ def test_index_lists_results_of_this_build_and_the_selected_datasets_only(tmp_pa
     index = build(tmp_path, datasets=["short"])[0].read_text()
     assert "short/vehiclePose.mat" in index and (tmp_path / "results/long/vehiclePose.mat").exists()
     assert "long/vehiclePose.mat" not in index and "old.mat" not in index
+
+
+def test_the_command_line_sets_the_title_page_and_leaves_out_code(tmp_path, monkeypatch, capsys):
+    make_data(tmp_path)
+    write(tmp_path / "notebooks", "1_text", "# Text\n\nProse.", ("print('pri' + 'nted')\n'la' + 'st'",),
+          (FIGURE.format("svg").replace("\n", "\nimport matplotlib.pyplot as plt\n"),))
+    (tmp_path / "report.toml").write_text('author = "Of the file"\nstudent_number = 4711\n')
+    monkeypatch.chdir(tmp_path)
+    assert main(["report", "short", "--author", "Given", "--no-code"]) == 0
+    page = Page(tmp_path / "report" / "1_text.html")
+    assert "<p>Prose.</p>" in page.text and page.count["img"] == 1
+    main_part = page.text[page.text.index("<main>"):]
+    assert "print" not in main_part and "last" not in main_part and "<pre" not in main_part
+    content = (tmp_path / "report" / "report.pdf").read_bytes()
+    assert b"Given" in content and b"Of the file" not in content
+    assert (tmp_path / "build" / "executed" / "1_text.executed").exists()
+    assert "report/index.html and report/report.pdf" in capsys.readouterr().err.replace(
+        str(tmp_path.resolve()) + os.sep, "")
+    assert main(["report", "short"]) == 0
+    page = Page(tmp_path / "report" / "1_text.html")
+    assert "printed" in page.text and "nothing changed" in capsys.readouterr().err
+    assert b"Of the file" in (tmp_path / "report" / "report.pdf").read_bytes()
