@@ -167,3 +167,13 @@ def test_a_long_table_breaks_and_a_wide_formula_shrinks(tmp_path):
     assert all(re.search(rf"\b{row}\s+{row**2}\b", text) for row in range(200))
     line = next(line for line in text.splitlines() if line.endswith("(1)"))
     assert line.count("+") == 35
+
+
+def test_a_tall_figure_leaves_room_for_its_caption(tmp_path):
+    tall = SVG.replace('height="9"', 'height="4000"').replace('width="20"', 'width="800"')
+    book = new_notebook(cells=[
+        new_markdown_cell("Before. " * 200), new_code_cell(outputs=[shown(("image/svg+xml", tall))]),
+        new_markdown_cell("Figure 1. Tall.")])
+    pages = text_of(pdf.typeset([(Path("1.ipynb"), book)]), tmp_path).split("\f")
+    before = next(number for number, page in enumerate(pages) if "Before." in page)
+    assert "Figure 1. Tall." not in pages[before] and "Figure 1. Tall." in pages[before + 1]
