@@ -9,7 +9,6 @@ from io import StringIO
 from pathlib import Path
 from urllib.parse import quote
 
-import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
@@ -25,12 +24,12 @@ from slamlib.solve import Solution, truth_in_world_of
 TITLES = {"problem1": "odometry", "problem2": "ArUco", "problem2_hint": "odometry + ArUco, hint",
           "problem2_fused": "odometry + ArUco", "problem3": "SLAM: odometry + ArUco",
           "problem4": "SLAM: odometry + ArUco + UWB"}
-NEEDS = {"aruco": ("markers", "problem2", "problem2_hint", "problem2_fused", "problem3", "problem4"),
-         "uwb": ("UWB ranges", "problem4")}
+NEEDS = {"aruco": ("markers", [problem for problem in TITLES if problem != "problem1"]),
+         "uwb": ("UWB ranges", ["problem4"])}
 ROLES = {"problem1": "odometry", "problem2": "aruco", "problem2_fused": "fused", "problem3": "slam"}
-WHAT = ("Wheel encoders, markers on the ceiling and radio ranges: where the vehicle was, and what it "
-        "saw. Each chapter derives the estimator of one problem, runs it on every dataset, and judges "
-        "it by the truth where that is known.")
+WHAT = ("Wheel encoders, markers on the ceiling and radio ranges: where the vehicle was, and what "
+        "it saw. Each chapter derives the estimator of one problem, runs it on every dataset, and "
+        "judges it by the truth where that is known.")
 
 
 @dataclass(frozen=True)
@@ -83,7 +82,7 @@ def _read(folder, count):
 
 
 def summary(title, drives):
-    """A notebook, as if executed, that opens the report under this title."""
+    """A notebook, as if executed, that opens the report under this title (in Markdown)."""
     cells = [new_markdown_cell(f"# {title}\n\n{WHAT}", id="what"),
              new_markdown_cell("## The datasets\n\n" + _datasets(drives), id="datasets")]
     if any(drive.solutions for drive in drives):
@@ -110,8 +109,8 @@ def index(opening, chapters, files):
     if files:
         names = "\n".join(f"- [{plain(name)}]({address})" for address, name in files)
         cells.append(new_markdown_cell(
-            "## Files to hand in\n\nMATLAB files with struct arrays, as the notebooks wrote them.\n\n"
-            + names, id="files"))
+            "## Files to hand in\n\nMATLAB files with struct arrays, as the notebooks wrote them."
+            f"\n\n{names}", id="files"))
     return new_notebook(cells=cells)
 
 
@@ -127,8 +126,9 @@ def _datasets(drives):
         path = evaluation.path_length(odometry.dead_reckoning(d.ticks, d.vehicle))
         rows.append([plain(drive.name), f"{len(d.ticks):,}", f"{path:.1f} m", _count(d.aruco),
                      _count(d.uwb), "known" if drive.truth else "not known"])
-    return _table(["dataset", "poses", "path", "sightings of markers", "UWB ranges", "truth"], rows) + (
-        "\n\nTable 1. What was measured on each drive; the path is the encoders'.")
+    header = ["dataset", "poses", "path", "sightings of markers", "UWB ranges", "truth"]
+    return (_table(header, rows)
+            + "\n\nTable 1. What was measured on each drive; the path is the encoders'.")
 
 
 def _count(readings):
@@ -144,23 +144,23 @@ def _headline(drives):
         rows += [_row(drive, problem, solved.get(problem)) for problem in problems]
     text = _table(["dataset", "problem", "poses", "σ of position", "σ of heading", "ATE",
                    "ATE, aligned"], rows)
-    text += ("\n\nTable 2. Every problem on every dataset: how many poses have an estimate; at the last "
-             "of them the larger standard deviation of $x$ and $y$, and that of the heading; and the "
-             "root mean square error of all positions, as they stand and moved as a whole nearest to "
-             "the truth.")
+    text += ("\n\nTable 2. Every problem on every dataset: how many poses have an estimate; at the "
+             "last of them the larger standard deviation of $x$ and $y$, and that of the heading; and "
+             "the root mean square error of all positions (ATE), as they stand and moved as a whole "
+             "nearest to the truth.")
     if without := [plain(drive.name) for drive in drives if drive.truth is None]:
         text += f"\n\nNo truth comes with {listed(without)}, so errors are not known there."
-    for sensor, (name, *_) in NEEDS.items():
+    for sensor, (name, _) in NEEDS.items():
         if without := [plain(d.name) for d in drives if getattr(d.dataset, sensor) is None]:
-            text += (f"\n\nThere are no {name} in {listed(without)}: the problems that need them are "
-                     "left out there.")
+            text += (f"\n\nThere are no {name} in {listed(without)}: the problems that need them "
+                     "are left out there.")
     return text
 
 
 def _row(drive, problem, solution):
     row = [plain(drive.name), plain(TITLES.get(problem, problem))]
     if solution is None:
-        lacking = [name for sensor, (name, *needed) in NEEDS.items()
+        lacking = [name for sensor, (name, needed) in NEEDS.items()
                    if problem in needed and getattr(drive.dataset, sensor) is None]
         return [*row, f"left out: no {' and no '.join(lacking)}" if lacking else "no result",
                 *["–"] * 4]
@@ -198,7 +198,7 @@ def _overlaid(drive):
 def _picture(drive):
     """The trajectories of a drive over each other, in the world frame of pose 1, as SVG text."""
     style = Path(plotting.__file__).with_name("slamlib.mplstyle")
-    with plt.style.context(style, after_reset=True), matplotlib.rc_context({"svg.hashsalt": "slamlib"}):
+    with plt.style.context(style, after_reset=True):
         fig = Figure(figsize=(7.2, 3.8))
         ax = fig.add_subplot()
         if drive.truth is not None:

@@ -122,7 +122,8 @@ def _set_formulas(name, formulas):
         kind = {"t": "DisplayMath" if display else "InlineMath"}
         blocks += [{"t": "Plain", "c": [{"t": "Math", "c": [kind, tex]}]},
                    {"t": "RawBlock", "c": ["html", "\ue000"]}]
-    document = json.dumps({"pandoc-api-version": pandoc_api_version(), "meta": {}, "blocks": blocks})
+    document = json.dumps({"pandoc-api-version": pandoc_api_version(), "meta": {},
+                           "blocks": blocks})
     try:
         text = pypandoc.convert_text(document, "html", "json",
                                      ["--mathml", "--wrap=none", "--fail-if-warnings"])

@@ -26,8 +26,9 @@ PICTURES = {"image/svg+xml": "svg", "image/png": "png", "image/jpeg": "jpg"}
 TEXTS = ("text/markdown", "text/latex", "text/html", "text/plain")
 PICTURE = re.compile("\ue002(\\d+)\ue003")
 TABLE = re.compile("#figure\\(\n(?:(?!#figure\\().)*?, kind: table\n  \\)(?=\\s*\ue004)", re.DOTALL)
-APART = re.compile("(\ue002\\d+\ue003)((?:(?![\ue002\ue004]|\n=).)+?)(\ue004\\W*(?:strong|emph)?\\W*Figure[^\ue005]*\ue005)",
-                   re.DOTALL)  # a figure, printed lines, and only then the caption
+APART = re.compile(  # a figure, then lines that were printed, and only then its caption
+    "(\ue002\\d+\ue003)((?:(?![\ue002\ue004]|\n=).)+?)"
+    "(\ue004\\W*(?:strong|emph)?\\W*Figure[^\ue005]*\ue005)", re.DOTALL)
 SCALED = re.compile(r"#scale\(x: (\d+)%, y: \d+%\)\[(\\?[^\\]|\\\])\]")  # pandoc's \big, \Big, ...
 REWRITTEN = [(re.compile(pattern), becomes) for pattern, becomes in (  # pandoc would set it wrongly
     (r"\\!", ""), (r"\\;", r"\\:"),
@@ -117,7 +118,8 @@ class _Book:
     @property
     def labels(self):
         """The label of each formula in Typst: its anchor's, where it is numbered."""
-        return [self.page["labels"].get(n, f"formula-{n}") for n in range(len(self.page["formulas"]))]
+        return [self.page["labels"].get(number, f"formula-{number}")
+                for number in range(len(self.page["formulas"]))]
 
     def place(self, number):
         """The file and the TeX of a formula."""
@@ -132,7 +134,7 @@ class _Book:
                 parts.append(self.markdown(cell.source, cell.get("attachments", {})))
             elif cell.cell_type == "code":
                 if self.code and cell.source.strip():
-                    parts.append(f'<pre class="python"><code>{html.escape(cell.source)}</code></pre>')
+                    parts.append(f'<pre class="python">{html.escape(cell.source)}</pre>')
                 alt = cell.metadata.get("alt")
                 parts += [self.output(output, alt, pictures) for output in cell.outputs]
         self.page["sources"] += [source.name] * (
@@ -175,7 +177,7 @@ class _Book:
         blocks = []
         for number, (tex, display) in enumerate(self.page["formulas"]):
             if lost := LOST.search(tex):
-                raise NotebookError(f"{lost[0]} would be lost in this formula, {self.place(number)}")
+                raise NotebookError(f"{lost[0]} would be lost in a formula, {self.place(number)}")
             for pattern, becomes in REWRITTEN:
                 tex = pattern.sub(becomes, tex)
             kind = {"t": "DisplayMath" if display else "InlineMath"}

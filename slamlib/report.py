@@ -71,7 +71,7 @@ def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=
     drives = overview.read_drives(data, results, selected, written)
     links = [(quote(os.path.relpath(results / name, report)), name) for name in sorted(written)
              if name.split("/")[0] in selected and name.endswith(".mat")]
-    index = overview.index(overview.summary(cover.title, drives), chapters, links)
+    index = overview.index(overview.summary(overview.plain(cover.title), drives), chapters, links)
     opening = overview.summary("Overview", drives)
     files = _set({Path("index"): index, **books}, chapters, cover, code, opening)
 
@@ -90,18 +90,22 @@ def _executed(books, data, results, datasets, selected, jobs, kept, fresh):
     done, written = {}, []
     with tempfile.TemporaryDirectory() as settings:
         environment = kernel_environment(Path(settings), data, datasets, jobs)
-        common = cache.fingerprint([data / name for name in selected], next(iter(books)).parent,
-                                   {**environment, "SLAMLIB_RESULTS": str(results)})
+
+        def depends_on():
+            return cache.fingerprint([data / name for name in selected], next(iter(books)).parent,
+                                     {**environment, "SLAMLIB_RESULTS": str(results)})
+
+        common = depends_on()
         keys = {source: cache.key_of(source, book, common) for source, book in books.items()}
 
         def finish(source, book, names):
             done[source] = book
             written.extend(names)
-            if kept is not None:
+            if kept is not None and depends_on() == common:  # and not edited in the meantime
                 cache.keep(kept, source, keys[source], book, results, names)
 
-        for source, key in keys.items():
-            if kept is not None and not fresh and (found := cache.recall(kept, source, key, results)):
+        for source, key in keys.items() if kept is not None and not fresh else ():
+            if found := cache.recall(kept, source, key, results):
                 done[source], names = found
                 written.extend(names)
                 print(f"{source.stem}: nothing changed, not executed again", file=sys.stderr)
@@ -122,7 +126,7 @@ def _set(books, chapters, cover, code, opening=None):
 def _spent(seconds):
     """What the build took: a sentence. Memory is the most that a process ever had."""
     unit = 1 if sys.platform == "darwin" else 1024
-    most = {who: resource.getrusage(which).ru_maxrss * unit / 1e6 for who, which in (
-        ("the largest process that it started", resource.RUSAGE_CHILDREN), ("its own", resource.RUSAGE_SELF))}
-    return f"built in {seconds:.1f} s; memory: " + ", ".join(
-        f"{who} {size:.0f} MB" for who, size in most.items())
+    own, largest = (resource.getrusage(who).ru_maxrss * unit / 1e6
+                    for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return (f"built in {seconds:.1f} s; memory: {own:.0f} MB, and {largest:.0f} MB in the largest of "
+            "the notebooks and other processes")

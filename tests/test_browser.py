@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from urllib.parse import unquote, urlparse
 
 import nbformat
 import pytest
@@ -68,7 +69,8 @@ def test_every_formula_of_a_notebook_is_on_its_page_and_takes_room(visited):
 
 def test_every_figure_is_drawn_and_can_be_made_out(visited):
     for path, page in visited:
-        sizes = page.eval_on_selector_all("figure img", "all => all.map(i => [i.naturalWidth, i.width])")
+        sizes = page.eval_on_selector_all(
+            "figure img", "all => all.map(image => [image.naturalWidth, image.width])")
         assert sizes and all(natural > 0 and shown >= 450 for natural, shown in sizes), path.name
 
 
@@ -76,3 +78,18 @@ def test_nothing_sticks_out_of_the_column(visited):
     for path, page in visited:
         assert page.evaluate(STICKING_OUT) == [], path.name
         assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth"), path.name
+
+
+def test_links_inside_the_report_lead_somewhere(visited):
+    ids = {path.name: set(page.eval_on_selector_all("[id]", "all => all.map(e => e.id)"))
+           for path, page in visited}
+    for path, page in visited:
+        links = page.eval_on_selector_all("a[href]", "all => all.map(a => a.href)")
+        for link in links:
+            address = urlparse(link)
+            if address.scheme != "file":
+                continue
+            target = Path(unquote(address.path))
+            assert target.exists(), f"{path.name}: {link}"
+            if address.fragment:
+                assert unquote(address.fragment) in ids[target.name], f"{path.name}: {link}"

@@ -75,6 +75,16 @@ def test_pages_name_every_dataset_and_say_what_is_left_out(built):
             name not in ("new seed", "one_sighting", "sparse"))
 
 
+def test_the_first_page_says_what_is_left_out(built):
+    _, pages = built
+    text = html.unescape(re.sub(r"<[^>]+>", " ", pages["index"]))
+    for sensor, name in (("markers", "wheels_only"), ("UWB ranges", "waits"), ("truth", "no_truth")):
+        start = "No truth comes with" if sensor == "truth" else f"There are no {sensor} in"
+        assert name in re.search(rf"{start}([^:]*?)(?::|, so errors)", text)[1]
+    assert len(re.findall(r"wheels_only\s+odometry \+ ArUco\s+left out: no markers", text)) == 1
+    assert re.search(r"no_truth\s+SLAM: odometry \+ ArUco\s+2,000\s[^–]*?no truth\s+no truth", text)
+
+
 def test_no_cell_wrote_to_stderr(built):
     """A warning in a page is a defect of the notebook."""
     _, pages = built
