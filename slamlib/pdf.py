@@ -195,13 +195,17 @@ class _Book:
         return [self._line(*numbered) for numbered in enumerate(formulas)]
 
     def _line(self, number, formula):
-        """A definition on one line, mended."""
+        """A formula's definition, mended, on one line."""
         tex, display = self.page["formulas"][number]
         formula = SCALED.sub(lambda big: f"stretch({big[2]}, size: #{int(big[1]) / 100}em)",
                              " ".join(formula.split()))
+        if "\\parallel" not in tex:  # but \| or \Vert, which are no relations
+            formula = formula.replace("parallel", "bar.v.double")
         formula = f"{formula}<{self.labels[number]}>"
         if "\\dfrac" in tex:
-            formula = f"#show math.frac: math.display\n{formula}".replace("\n", "; ")
+            formula = f"#show math.frac: math.display; {formula}"
+        elif "\\tfrac" in tex and "\\frac" not in tex:
+            formula = f"#show math.frac: math.inline; {formula}"
         if display:
             formula = f"#display({_quoted(self.page['tags'].get(number, ''))})[{formula}]"
         return f"#let formula-{number} = [{formula}]"

@@ -128,5 +128,5 @@ def _spent(seconds):
     unit = 1 if sys.platform == "darwin" else 1024
     own, largest = (resource.getrusage(who).ru_maxrss * unit / 1e6
                     for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    return (f"built in {seconds:.1f} s; memory: {own:.0f} MB, and {largest:.0f} MB in the largest of "
-            "the notebooks and other processes")
+    return (f"built in {seconds:.1f} s; memory: {own:.0f} MB, and {largest:.0f} MB in the largest "
+            "of the notebooks and other processes")

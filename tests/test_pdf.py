@@ -112,6 +112,10 @@ def test_equal_input_gives_equal_bytes():
     (r"\ln \lvert Q \rvert", "lr(|Q|)", r"\|"),
     (r"\Big( a \Big)^2", r"stretch(\(, size: #1.8em) a stretch(\), size: #1.8em)^2", "scale"),
     (r"a\;b", "a med b", "0em"),
+    (r"\|x\|_2", "bar.v.double x bar.v.double_2", "parallel"),
+    (r"a \parallel b", "a parallel b", "bar"),
+    (r"\dfrac{a}{b}", "#show math.frac: math.display; $a / b$", "inline"),
+    (r"\tfrac{a}{b}", "#show math.frac: math.inline; $a / b$", "display"),
 ])
 def test_what_pandoc_sets_wrongly_is_mended(tex, expected, lost):
     book = new_notebook(cells=[new_markdown_cell(f"${tex}$")])
