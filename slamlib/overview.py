@@ -24,9 +24,10 @@ from slamlib.solve import Solution, truth_in_world_of
 TITLES = {"problem1": "odometry", "problem2": "ArUco", "problem2_hint": "odometry + ArUco, hint",
           "problem2_fused": "odometry + ArUco", "problem3": "SLAM: odometry + ArUco",
           "problem4": "SLAM: odometry + ArUco + UWB"}
-NEEDS = {"aruco": ("markers", [problem for problem in TITLES if problem != "problem1"]),
+NEEDS = {"aruco": ("markers", ["problem2", "problem2_hint", "problem2_fused", "problem3"]),
          "uwb": ("UWB ranges", ["problem4"])}
-ROLES = {"problem1": "odometry", "problem2": "aruco", "problem2_fused": "fused", "problem3": "slam"}
+ROLES = {"problem1": "odometry", "problem2": "aruco", "problem2_fused": "fused", "problem3": "slam",
+         "problem4": "slam_uwb"}
 WHAT = ("Wheel encoders, markers on the ceiling and radio ranges: where the vehicle was, and what "
         "it saw. Each chapter derives the estimator of one problem, runs it on every dataset, and "
         "judges it by the truth where that is known.")
@@ -63,11 +64,18 @@ def read_drives(data, results, selected, written):
         problems.sort(key=lambda problem: order.get(problem, len(order)))
         dataset = read_dataset(data / name)
         drives.append(Drive(name, dataset, read_truth(data / name), tuple(
-            _read(results / name / problem, len(dataset.ticks)) for problem in problems)))
+            _read(results / name / problem, dataset) for problem in problems)))
     return sorted(drives, key=lambda drive: len(drive.dataset.ticks))
 
 
-def _read(folder, count):
+def title_of(problem, dataset):
+    """What a problem is called on a dataset; one that is not known, by its folder."""
+    title = TITLES.get(problem, problem)
+    return title if dataset.aruco is not None else title.replace(" + ArUco + UWB", " + UWB")
+
+
+def _read(folder, dataset):
+    count = len(dataset.ticks)
     place = f"{folder.parent.name}/{folder.name}/vehiclePose.mat, which a notebook wrote"
     try:
         poses, covariances = read_vehicle_poses(folder)
@@ -77,7 +85,7 @@ def _read(folder, count):
         raise NotebookError(f"{place}, must hold [x, y, heading] and a covariance for each of the "
                             f"{count} encoder poses; it holds {poses.shape}, {covariances.shape}")
     known = np.flatnonzero(np.isfinite(poses[:, 0]))  # the first of them is the world frame
-    return Solution(folder.name, TITLES.get(folder.name, folder.name), poses, covariances,
+    return Solution(folder.name, title_of(folder.name, dataset), poses, covariances,
                     int(known[0]) if len(known) else 0)
 
 
@@ -158,7 +166,7 @@ def _headline(drives):
 
 
 def _row(drive, problem, solution):
-    row = [plain(drive.name), plain(TITLES.get(problem, problem))]
+    row = [plain(drive.name), plain(title_of(problem, drive.dataset))]
     if solution is None:
         lacking = [name for sensor, (name, needed) in NEEDS.items()
                    if problem in needed and getattr(drive.dataset, sensor) is None]

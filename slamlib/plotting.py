@@ -25,6 +25,7 @@ ROLES = {
     "hint": dict(color="#E69F00", linestyle=(0, (5, 1, 1, 1)), linewidth=1.5, zorder=3),
     "marker": dict(color="#333333", linestyle="none", marker="s", markersize=3, zorder=3),
     "slam": dict(color="#0072B2", linewidth=1.7, zorder=3),
+    "slam_uwb": dict(color="#56B4E9", linestyle=(0, (6, 1.5)), linewidth=1.7, zorder=3),
 }
 
 # Where estimates are laid over a sample: dots below, a wide line, a narrow dashed one on top of it.
