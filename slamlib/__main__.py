@@ -3,6 +3,7 @@
 import argparse
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 # The matrices are small: more threads only wait for each other. To be set before numpy is imported.
@@ -38,6 +39,12 @@ def _parser():
     report.add_argument("--results", type=Path, default=Path("results"),
                         help="folder for the .mat files")
     report.add_argument("--jobs", type=_jobs, default=2, help="notebooks executed at a time")
+    report.add_argument("--no-code", dest="code", action="store_false",
+                        help="leave out code cells and printed text")
+    report.add_argument("--author", help="on the PDF's title page, instead of report.toml's")
+    report.add_argument("--student-number", help="the same")
+    report.add_argument("--fresh", action="store_true",
+                        help="execute all notebooks, also where nothing changed")
     report.set_defaults(run=_report)
 
     solve = commands.add_parser("solve", help="solve a dataset's problems without notebooks")
@@ -60,15 +67,22 @@ def _parser():
 
 
 def _report(options):
+    from slamlib.cover import read_cover
     from slamlib.report import NotebookError, build_report
+    cover = read_cover("report.toml")
+    given = {"author": options.author, "student_number": options.student_number}
+    cover = replace(cover, **{key: value for key, value in given.items() if value is not None})
     try:
-        pages = build_report(options.notebooks, options.data, options.report, options.results,
+        files = build_report(options.notebooks, options.data, options.report, options.results,
                              [_name(dataset, options.data) for dataset in options.datasets] or None,
-                             options.jobs)
+                             options.jobs, cover, options.code, Path("build", "executed"),
+                             options.fresh)
     except NotebookError as error:
         print(f"slamlib: {error}", file=sys.stderr)
         return 1
-    print(f"report: {pages[0]}", file=sys.stderr)
+    if not cover.author:
+        print("report.toml names no author: the PDF's title page has none", file=sys.stderr)
+    print(f"report: {files[0]} and {files[-1]}", file=sys.stderr)
     return 0
 
 

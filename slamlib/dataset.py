@@ -213,11 +213,25 @@ def read_truth(folder):
 # One function for each file.
 
 
-def _read_vehicle(folder, default):
-    path = _find(folder, "vehicle.toml")
-    if path is None:
-        return default
-    text = _read_text(path)
+def read_toml(path, example, known, encoding="ascii"):
+    """The entries of a TOML file without tables.
+
+    Parameters
+    ----------
+    path : Path
+    example : str, an entry as it must be, for the message.
+    known : list of str, the keys there may be.
+    encoding : bytes of another one become '\\ufffd'.
+
+    Returns
+    -------
+    dict from key to (value, line number or None).
+
+    Raises
+    ------
+    DatasetError : not TOML, or another key.
+    """
+    text = _read_text(path, encoding)
     try:
         entries = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
@@ -226,16 +240,25 @@ def _read_vehicle(folder, default):
             line = int(at_line[1])
         else:
             line = text.rstrip("\n").count("\n") + 1 if place == "end of document)" else None
-        raise _error(path, f"expected TOML such as 'wheelbase = 0.4' ({reason})", line) from None
-    known = [field.name for field in fields(Vehicle)]
+        raise _error(path, f"expected TOML such as '{example}' ({reason})", line) from None
     for key, value in entries.items():
         at_key = re.search(rf"""^[\s\["']*{re.escape(key)}(?![\w-])""", text, re.MULTILINE)
         line = text.count("\n", 0, at_key.end()) + 1 if at_key else None
         if key not in known:
             raise _error(path, f"expected keys among {', '.join(known)}, found {_quote(key)}", line)
+        entries[key] = value, line
+    return entries
+
+
+def _read_vehicle(folder, default):
+    path = _find(folder, "vehicle.toml")
+    if path is None:
+        return default
+    entries = read_toml(path, "wheelbase = 0.4", [field.name for field in fields(Vehicle)])
+    for key, (value, line) in entries.items():
         if type(value) not in (int, float) or not SMALLEST_SIGMA <= value < ABSURD:
             raise _error(path, f"expected a positive number for {key}", line)
-    return replace(default, **{key: float(value) for key, value in entries.items()})
+    return replace(default, **{key: float(value) for key, (value, _) in entries.items()})
 
 
 def _read_ticks(folder, vehicle):
@@ -355,8 +378,8 @@ def _find(folder, name, required=False):
     return paths[0] if paths else None
 
 
-def _read_text(path):
-    """Text with line ends '\\n', and '\\ufffd' for every byte that is not ASCII."""
+def _read_text(path, encoding="ascii"):
+    """Text with line ends '\\n', and '\\ufffd' for every byte that is not of this encoding."""
     try:
         if not path.is_file():  # a folder, or a pipe that would wait for ever
             raise OSError
@@ -367,7 +390,7 @@ def _read_text(path):
     if control := CONTROL_BYTE.search(data):
         line = data.count(b"\n", 0, control.start()) + 1
         raise _error(path, f"expected plain text, found the byte 0x{control[0].hex()}", line)
-    return data.decode("ascii", errors="replace")
+    return data.decode(encoding, errors="replace")
 
 
 def _read_table(path, columns):

@@ -26,7 +26,7 @@ ROLES = {
     "hint": dict(color="#E69F00", linestyle=(0, (5, 1, 1, 1)), linewidth=1.5, zorder=3),
     "marker": dict(color="#333333", linestyle="none", marker="s", markersize=3, zorder=3),
     "slam": dict(color="#0072B2", linewidth=1.7, zorder=3),
-    "uwb": dict(color="#56B4E9", linestyle=(0, (6, 1.5)), linewidth=2.2, zorder=3.2),
+    "slam_uwb": dict(color="#56B4E9", linestyle=(0, (6, 1.5)), linewidth=2.2, zorder=3.2),
     "antenna": dict(color="#222222", linestyle="none", marker="^", markersize=6, zorder=5),
     "guess": dict(color="#222222", linestyle="none", marker="^", markersize=7, zorder=4,
                   markerfacecolor="none"),

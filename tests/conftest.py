@@ -2,11 +2,13 @@
 
 import os
 import shutil
+from pathlib import Path
 
 import pytest
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+ROOT = Path(__file__).parents[1]
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 
@@ -26,3 +28,34 @@ def chromium():
             "--no-sandbox", "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"])
         yield browser
         browser.close()
+
+
+BROUGHT = ("new seed", "no_truth", "wheels_only", "waits", "one_pose", "backs_up", "one_sighting",
+           "sparse")
+
+
+@pytest.fixture(scope="session")
+def report_on_all(tmp_path_factory):
+    """A folder with data, report and results: all of data/, and what else a user may bring."""
+    import numpy as np
+
+    from slamlib.report import build_report
+    from slamlib.simulation import manoeuvre, simulate, write_dataset
+    folder = tmp_path_factory.mktemp("built")
+    data = folder / "data"
+    shutil.copytree(ROOT / "data", data)
+    write_dataset(data / "new seed", *simulate("short", seed=77, late_ranges=0.15))
+    shutil.copytree(data / "new seed", data / "no_truth", ignore=lambda *_: ["truth"])
+    waiting = np.concatenate([np.zeros((100, 2), int), simulate("short", seed=78)[0].ticks[:200]])
+    for name, ticks in (("wheels_only", simulate("short", seed=77)[0].ticks), ("waits", waiting),
+                        ("one_pose", [[0, 0]]),
+                        ("backs_up", np.rint(manoeuvre([(2, 1.0), (-2, 0.5)])))):
+        (data / name).mkdir()
+        np.savetxt(data / name / "encoderReading.txt",
+                   np.column_stack([np.arange(1, len(ticks) + 1), ticks]), fmt="%d")
+    seen = np.loadtxt(data / "new seed" / "ArucoReading.txt")
+    for name, kept in (("one_sighting", seen[:1]), ("sparse", seen[seen[:, 0] % 500 == 1])):
+        shutil.copytree(data / "new seed", data / name)
+        np.savetxt(data / name / "ArucoReading.txt", kept, fmt="%d %d" + 9 * " %.6g")
+    build_report(ROOT / "notebooks", data, folder / "report", folder / "results")
+    return folder

@@ -7,41 +7,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import BROUGHT
 
 from slamlib.dataset import read_dataset
 from slamlib.odometry import equation2
 from slamlib.report import build_report
 from slamlib.results import read_aruco_map, read_vehicle_poses
-from slamlib.simulation import manoeuvre, simulate, write_dataset
 
 ROOT = Path(__file__).parents[1]
 
 
-BROUGHT = ("new seed", "no_truth", "wheels_only", "waits", "one_pose", "backs_up", "one_sighting",
-           "sparse")
-
-
 @pytest.fixture(scope="module")
-def built(tmp_path_factory):
-    """The report on what is in data/, whatever that is, and on what else a user may bring."""
-    folder = tmp_path_factory.mktemp("built")
-    data = folder / "data"
-    shutil.copytree(ROOT / "data", data)
-    write_dataset(data / "new seed", *simulate("short", seed=77, late_ranges=0.15))
-    shutil.copytree(data / "new seed", data / "no_truth", ignore=lambda *_: ["truth"])
-    waiting = np.concatenate([np.zeros((100, 2), int), simulate("short", seed=78)[0].ticks[:200]])
-    for name, ticks in (("wheels_only", simulate("short", seed=77)[0].ticks), ("waits", waiting),
-                        ("one_pose", [[0, 0]]),
-                        ("backs_up", np.rint(manoeuvre([(2, 1.0), (-2, 0.5)])))):
-        (data / name).mkdir()
-        np.savetxt(data / name / "encoderReading.txt",
-                   np.column_stack([np.arange(1, len(ticks) + 1), ticks]), fmt="%d")
-    seen = np.loadtxt(data / "new seed" / "ArucoReading.txt")
-    for name, kept in (("one_sighting", seen[:1]), ("sparse", seen[seen[:, 0] % 500 == 1])):
-        shutil.copytree(data / "new seed", data / name)
-        np.savetxt(data / name / "ArucoReading.txt", kept, fmt="%d %d" + 9 * " %.6g")
-    pages = build_report(ROOT / "notebooks", data, folder / "report", folder / "results")
-    return folder, {page.stem: page.read_text(encoding="utf-8") for page in pages}
+def built(report_on_all):
+    """The folder of the shared report, and the text of its pages by name."""
+    return report_on_all, {page.stem: page.read_text(encoding="utf-8")
+                           for page in (report_on_all / "report").glob("*.html")}
 
 
 def test_every_notebook_becomes_a_page(built):
@@ -93,6 +73,16 @@ def test_pages_name_every_dataset_and_say_what_is_left_out(built):
     for name in BROUGHT:
         assert (name in re.split(", | and ", sentence[1])) == (
             name not in ("new seed", "one_sighting", "sparse"))
+
+
+def test_the_first_page_says_what_is_left_out(built):
+    _, pages = built
+    text = html.unescape(re.sub(r"<[^>]+>", " ", pages["index"]))
+    for sensor, name in (("markers", "wheels_only"), ("UWB ranges", "waits"), ("truth", "no_truth")):
+        start = "No truth comes with" if sensor == "truth" else f"There are no {sensor} in"
+        assert name in re.search(rf"{start}([^:]*?)(?::|, so errors)", text)[1]
+    assert len(re.findall(r"wheels_only\s+odometry \+ ArUco\s+left out: no markers", text)) == 1
+    assert re.search(r"no_truth\s+SLAM: odometry \+ ArUco\s+2,000\s[^–]*?no truth\s+no truth", text)
 
 
 def test_no_cell_wrote_to_stderr(built):

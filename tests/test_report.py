@@ -10,6 +10,7 @@ import nbformat
 import pytest
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 
+from slamlib.__main__ import main
 from slamlib.dataset import DatasetError
 from slamlib.report import NotebookError, build_report
 
@@ -92,7 +93,7 @@ def built(tmp_path_factory):
     make_data(root)
     write(root / "notebooks", "1_odometry", TEXT, (OUTPUT,), (FIGURE.format("svg"),),
           "**Figure 1.** A line.", (FIGURE.format("png"),))
-    write(root / "notebooks", "2_other", "# Second\n\n## Sums\n\nNo formula.", (ENVIRONMENT,),
+    write(root / "notebooks", "2_other", "# 2. Second\n\n## Sums\n\nNo formula.", (ENVIRONMENT,),
           ("",))
     spec = root / "kernels" / "python3" / "kernel.json"  # a kernel of the user that cannot run
     spec.parent.mkdir(parents=True)
@@ -108,9 +109,10 @@ def build(root, **options):
                         **options)
 
 
-def test_pages_are_index_and_chapters_in_order(built):
+def test_files_are_index_chapters_in_order_and_the_pdf(built):
     root, pages = built
-    assert [page.name for page in pages] == ["index.html", "1_odometry.html", "2_other.html"]
+    assert [page.name for page in pages] == ["index.html", "1_odometry.html", "2_other.html",
+                                             "report.pdf"]
     assert sorted((root / "report").iterdir()) == sorted(pages)
 
 
@@ -140,7 +142,7 @@ def test_formulas_are_mended(built):
 
 
 def test_pages_load_nothing(built):
-    for path in built[1]:
+    for path in built[1][:-1]:
         page = Page(path)
         assert not {"script", "link", "iframe", "object", "embed"} & set(page.count)
         assert all(source.startswith("data:image/") for source in page.loads)
@@ -157,14 +159,20 @@ def test_figures_are_embedded_and_described(built):
 
 
 def test_contents_titles_and_links(built):
-    index, first, second = (Page(path) for path in built[1])
+    index, first, second = (Page(path) for path in built[1][:-1])
     assert "<title>Problem 1: odometry</title>" in first.text
     assert {"index.html", "2_other.html", "2_other.html#Sums", "#The-estimate"} <= set(first.links)
     assert {"The-estimate"} <= set(first.ids) and {"Sums"} <= set(second.ids)
     assert {"1_odometry.html", "2_other.html", "1_odometry.html#eq-1",
-            "../results/short/vehiclePose.mat"} <= set(index.links)
+            "../results/short/vehiclePose.mat", "report.pdf"} <= set(index.links)
     assert index.count["math"] == 2  # of the first paragraph
-    assert "<li>short</li>" in index.text and "<li>long</li>" not in index.text
+    assert ">short</td>" in index.text and ">long</td>" not in index.text
+
+
+def test_sections_of_a_numbered_chapter_are_numbered(built):
+    first, second = (path.read_text(encoding="utf-8") for path in built[1][1:3])
+    assert '<body class="numbered" style="--chapter: \'2.\'">' in second
+    assert "<body>" in first  # whose title has no number
 
 
 def test_kernels_see_the_folders_and_run_this_interpreter(built):
@@ -236,12 +244,35 @@ def test_bad_data_and_bad_notebooks_are_told_before_a_kernel_starts(tmp_path):
     assert not (tmp_path / "report").exists()
 
 
-def test_index_lists_results_of_the_selected_datasets_only(tmp_path):
+def test_index_lists_results_of_this_build_and_the_selected_datasets_only(tmp_path):
     make_data(tmp_path)
-    write(tmp_path / "notebooks", "1_text", "# Text", ("1",))
-    for name in ("short", "long", "gone"):
+    write(tmp_path / "notebooks", "1_text", "# Text", (ENVIRONMENT.replace('"short"', '"long"'),),
+          (ENVIRONMENT,))
+    for name in ("short", "gone"):
         (tmp_path / "results" / name).mkdir(parents=True)
-        (tmp_path / "results" / name / "vehiclePose.mat").touch()
+        (tmp_path / "results" / name / "old.mat").touch()
     index = build(tmp_path, datasets=["short"])[0].read_text()
-    assert "short/vehiclePose.mat" in index
-    assert "long/vehiclePose.mat" not in index and "gone/vehiclePose.mat" not in index
+    assert "short/vehiclePose.mat" in index and (tmp_path / "results/long/vehiclePose.mat").exists()
+    assert "long/vehiclePose.mat" not in index and "old.mat" not in index
+
+
+def test_the_command_line_sets_the_title_page_and_leaves_out_code(tmp_path, monkeypatch, capsys):
+    make_data(tmp_path)
+    write(tmp_path / "notebooks", "1_text", "# Text\n\nProse.", ("print('pri' + 'nted')\n'la' + 'st'",),
+          (FIGURE.format("svg").replace("\n", "\nimport matplotlib.pyplot as plt\n"),))
+    (tmp_path / "report.toml").write_text('author = "Of the file"\nstudent_number = 4711\n')
+    monkeypatch.chdir(tmp_path)
+    assert main(["report", "short", "--author", "Given", "--no-code"]) == 0
+    page = Page(tmp_path / "report" / "1_text.html")
+    assert "<p>Prose.</p>" in page.text and page.count["img"] == 1
+    main_part = page.text[page.text.index("<main>"):]
+    assert "print" not in main_part and "last" not in main_part and "<pre" not in main_part
+    content = (tmp_path / "report" / "report.pdf").read_bytes()
+    assert b"Given" in content and b"Of the file" not in content
+    assert (tmp_path / "build" / "executed" / "1_text.executed").exists()
+    assert "report/index.html and report/report.pdf" in capsys.readouterr().err.replace(
+        str(tmp_path.resolve()) + os.sep, "")
+    assert main(["report", "short"]) == 0
+    page = Page(tmp_path / "report" / "1_text.html")
+    assert "printed" in page.text and "nothing changed" in capsys.readouterr().err
+    assert b"Of the file" in (tmp_path / "report" / "report.pdf").read_bytes()

@@ -1,0 +1,83 @@
+"""Executed notebooks, kept until something changes that they depend on.
+
+A notebook is executed again when its cells, slamlib's code, a package, a file of the selected
+datasets, a file beside the notebook or a variable of its environment is another than it was, and
+when a result that it wrote is no longer as it wrote it.
+"""
+
+import hashlib
+import json
+import platform
+from copy import deepcopy
+from importlib.metadata import distributions
+from pathlib import Path
+
+import nbformat
+
+from slamlib.results import write_atomically
+
+VARIABLES = ("SLAMLIB_", "PYTHON", "MPL", "OMP_", "OPENBLAS_", "MKL_", "LANG", "LC_", "TZ",
+             "SOURCE_DATE_EPOCH")  # how the names of those begin that may change what a cell says
+
+
+def fingerprint(datasets, beside, environment):
+    """A digest of all that notebooks depend on besides their own cells.
+
+    Parameters
+    ----------
+    datasets : list of Path, the folders of the selected datasets.
+    beside : Path, the folder of the notebooks; other files in it may be read by them.
+    environment : dict of the kernels' environment variables.
+    """
+    code = sorted(file for file in Path(__file__).parent.iterdir()
+                  if file.suffix in (".py", ".mplstyle"))
+    files = [*code, *(file for folder in datasets for file in sorted(folder.rglob("*"))),
+             *(file for file in sorted(beside.iterdir()) if file.suffix != ".ipynb")]
+    return _digest(json.dumps([
+        platform.python_implementation(), platform.python_version(), platform.platform(),
+        sorted(f"{package.name} {package.version}" for package in distributions()),
+        [(str(file), _digest(file.read_bytes())) for file in files if file.is_file()],
+        sorted((name, value) for name, value in environment.items()
+               if name.startswith(VARIABLES) and name != "MPLBACKEND")]).encode())
+
+
+def key_of(source, book, common):
+    """The digest of a notebook that is not yet executed, and of the `common` fingerprint."""
+    book = deepcopy(book)
+    for cell in book.cells:
+        if cell.cell_type == "code":
+            cell.outputs, cell.execution_count = [], None
+    return _digest(json.dumps([source.name, nbformat.writes(book), common]).encode())
+
+
+def recall(folder, source, key, results):
+    """The executed notebook and the names of its results, or None if it must be executed again."""
+    try:
+        digest, _, content = _place(folder, source).read_bytes().partition(b"\n")
+        if digest.decode("ascii", "replace") != _digest(content):
+            return None
+        kept = json.loads(content)
+        if kept["key"] != key:
+            return None
+        for name, expected in kept["results"].items():
+            if _digest((results / name).read_bytes()) != expected:
+                return None
+    except OSError:
+        return None
+    return nbformat.reads(kept["book"], as_version=4), list(kept["results"])
+
+
+def keep(folder, source, key, book, results, names):
+    """Keep an executed notebook, with the digests of the results (by name) that it wrote."""
+    content = json.dumps({
+        "key": key, "book": nbformat.writes(book),
+        "results": {name: _digest((results / name).read_bytes()) for name in names}}).encode()
+    write_atomically(_place(folder, source), _digest(content).encode() + b"\n" + content)
+
+
+def _place(folder, source):
+    return Path(folder) / f"{source.stem}.executed"
+
+
+def _digest(content):
+    return hashlib.sha256(content).hexdigest()

@@ -1,0 +1,125 @@
+"""Only what something changed for is executed again."""
+
+import nbformat
+import pytest
+from test_report import make_data, write
+
+from slamlib import cache
+from slamlib.report import build_report
+
+COUNTING = """import os
+with open({!r}, "a") as counter:
+    counter.write("x")
+folder = os.path.join(os.environ["SLAMLIB_RESULTS"], "short")
+os.makedirs(folder, exist_ok=True)
+open(os.path.join(folder, "{}.mat"), "w").close()"""
+
+
+@pytest.fixture
+def project(tmp_path):
+    """A folder with two notebooks, each of which counts how often it was executed."""
+    make_data(tmp_path)
+    for name in "ab":
+        write(tmp_path / "notebooks", name, f"# {name}",
+              (COUNTING.format(str(tmp_path / f"count_{name}"), name),))
+    return tmp_path
+
+
+def build(folder, **options):
+    """Build the report; returns how often each notebook has been executed so far."""
+    build_report(folder / "notebooks", folder / "data", folder / "report", folder / "results",
+                 kept=folder / "kept", **options)
+    return tuple(len((folder / f"count_{name}").read_text()) for name in "ab")
+
+
+def test_a_changed_notebook_is_executed_again_and_only_that_one(project, capsys):
+    assert build(project) == (1, 1)
+    pages = [file.read_bytes() for file in sorted((project / "report").iterdir())]
+    capsys.readouterr()
+    assert build(project) == (1, 1)
+    told = capsys.readouterr().err
+    assert told.count("nothing changed, not executed again") == 2
+    assert "built in" in told and "MB" in told
+    assert [file.read_bytes() for file in sorted((project / "report").iterdir())] == pages
+    write(project / "notebooks", "b", "# b, changed",
+          (COUNTING.format(str(project / "count_b"), "b"),))
+    assert build(project) == (1, 2)
+    (project / "results" / "short" / "a.mat").write_text("changed")
+    assert build(project) == (2, 2)
+    (project / "results" / "short" / "b.mat").unlink()
+    assert build(project) == (2, 3)
+    assert (project / "results" / "short" / "b.mat").read_text() == ""
+
+
+def test_a_changed_dataset_executes_all_and_fresh_does_so_without_a_change(project):
+    assert build(project, datasets=["short"]) == (1, 1)
+    (project / "data" / "long" / "encoderReading.txt").write_text("1 0 0\n2 3 3\n")
+    assert build(project, datasets=["short"]) == (1, 1)  # not selected
+    (project / "data" / "short" / "encoderReading.txt").write_text("1 0 0\n2 3 3\n")
+    assert build(project, datasets=["short"]) == (2, 2)
+    assert build(project, datasets=["short"], fresh=True) == (3, 3)
+    assert build(project, datasets=["short"]) == (3, 3)
+
+
+@pytest.fixture
+def kept(tmp_path):
+    """A notebook that is kept with one result; returns a function that recalls it."""
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "ticks.txt").write_text("1 0 0")
+    write(tmp_path, "a", "# a", ("1 + 1",))
+    source, book = tmp_path / "a.ipynb", nbformat.read(tmp_path / "a.ipynb", as_version=4)
+    (tmp_path / "a.mat").write_text("result")
+
+    def key(variables):
+        return cache.key_of(source, book, cache.fingerprint([tmp_path / "data"], tmp_path, variables))
+
+    cache.keep(tmp_path / "kept", source, key({}), book, tmp_path, ["a.mat"])
+    return lambda **variables: cache.recall(tmp_path / "kept", source, key(variables), tmp_path)
+
+
+def test_what_is_kept_is_recalled_with_its_results(kept):
+    book, names = kept()
+    assert book.cells[1].source == "1 + 1" and names == ["a.mat"]
+    assert kept(HOME="/elsewhere") is not None  # of no matter to a notebook
+
+
+@pytest.mark.parametrize("variable", ["SLAMLIB_DATASETS", "PYTHONPATH", "OMP_NUM_THREADS", "TZ"])
+def test_variables_that_matter_are_seen(kept, variable):
+    assert kept(**{variable: "x"}) is None
+
+
+@pytest.mark.parametrize("change", [
+    lambda folder: (folder / "kept" / "a.executed").unlink(),
+    lambda folder: (folder / "kept" / "a.executed").write_bytes(b"\xff\x00 not this"),
+    lambda folder: (folder / "kept" / "a.executed").write_bytes(
+        (folder / "kept" / "a.executed").read_bytes()[:-9]),
+    lambda folder: (folder / "kept" / "a.executed").write_bytes(
+        (folder / "kept" / "a.executed").read_bytes().replace(b"1 + 1", b"1 + 2")),
+    lambda folder: (folder / "a.mat").write_text("another"),
+    lambda folder: (folder / "data" / "new.txt").write_text("new"),
+    lambda folder: (folder / "helper.py").write_text("read by a notebook"),
+])
+def test_a_change_or_a_damaged_file_is_as_if_nothing_were_kept(kept, tmp_path, change):
+    assert kept() is not None
+    change(tmp_path)
+    assert kept() is None
+
+
+def test_slamlib_and_the_packages_are_among_what_matters(monkeypatch, tmp_path):
+    before = cache.fingerprint([], tmp_path, {})
+    monkeypatch.setattr(cache, "distributions", lambda: [])
+    without_packages = cache.fingerprint([], tmp_path, {})
+    monkeypatch.setattr(cache, "__file__", str(tmp_path / "cache.py"))
+    assert len({before, without_packages, cache.fingerprint([], tmp_path, {})}) == 3
+
+
+def test_saved_outputs_do_not_matter(tmp_path):
+    write(tmp_path, "a", "# a", ("1 + 1",))
+    book = nbformat.read(tmp_path / "a.ipynb", as_version=4)
+    key = cache.key_of(tmp_path / "a.ipynb", book, "")
+    book.cells[1].execution_count = 3
+    book.cells[1].outputs = [nbformat.v4.new_output("stream", text="2")]
+    assert cache.key_of(tmp_path / "a.ipynb", book, "") == key
+    assert book.cells[1].outputs  # and it is left as it is
+    book.cells[1].source = "1 + 2"
+    assert cache.key_of(tmp_path / "a.ipynb", book, "") != key

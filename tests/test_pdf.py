@@ -1,0 +1,183 @@
+"""The PDF: every formula arrives, captions stay with figures, and equal input gives equal bytes."""
+
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+import typst
+from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_output
+from test_report import TEXT, TEXT_FORMULAS
+
+from slamlib import pdf
+from slamlib.execution import NotebookError
+
+SVG = '<svg xmlns="http://www.w3.org/2000/svg" width="20" height="9"><path d="M0 0L9 9"/></svg>'
+TABLE = "| $\\sigma_x$ | b |\n| --- | ---: |\n| one | $$ \\sqrt{2} \\tag{7} $$ |\n\nTable 1. Roots."
+OTHER = ("# 2. Second\n\n## Sums\n\n[Back](1_first.ipynb#eq-1), [back too](1_first.ipynb), "
+         "[nowhere](1_first.ipynb#eq-99) and [a file](data.txt).")
+
+
+def shown(*kinds):
+    """An output with these kinds of data, given as pairs."""
+    return new_output("display_data", dict(kinds))
+
+
+def first():
+    return Path("1_first.ipynb"), new_notebook(cells=[
+        new_markdown_cell(TEXT.replace("# Problem 1", "# 1. Problem", 1)
+                          .replace("2_other.ipynb", "2_second.ipynb")),
+        new_code_cell("print('shown')", outputs=[new_output("stream", name="stdout", text="shown\n")]),
+        new_code_cell("plot()", outputs=[
+            shown(("text/plain", "<Figure>"), ("image/svg+xml", SVG)),
+            shown(("text/markdown", "A sentence between."))]),
+        new_markdown_cell("**Figure 1.** What is seen, $x^2$."),
+        new_code_cell("table()", outputs=[shown(("text/markdown", TABLE), ("text/plain", "<M>"))])])
+
+
+def second():
+    return Path("2_second.ipynb"), new_notebook(cells=[new_markdown_cell(OTHER)])
+
+
+def text_of(content, tmp_path):
+    """What a reader of the PDF finds in it, by poppler."""
+    if shutil.which("pdftotext") is None:
+        pytest.skip("no pdftotext here (poppler-utils)")
+    (tmp_path / "report.pdf").write_bytes(content)
+    return subprocess.run(["pdftotext", "-layout", tmp_path / "report.pdf", "-"], check=True,
+                          capture_output=True, text=True).stdout
+
+
+def query(files, folder, selector):
+    """The elements of this kind in the document that Typst makes."""
+    for name, content in files.items():
+        (folder / name).write_bytes(content)
+    return json.loads(typst.query(folder / "main.typ", selector, root=folder,
+                                  ignore_system_fonts=True))
+
+
+def test_every_formula_is_in_the_document_once(tmp_path):
+    files, book = pdf.typst_files([first(), second()])
+    formulas = book.page["formulas"]
+    assert len(formulas) == TEXT_FORMULAS + 3
+    # A set, since a heading's formula is in the contents, too.
+    labels = {element["label"] for element in query(files, tmp_path, "math.equation")}
+    assert labels == {f"<{label}>" for label in book.labels} and len(labels) == len(formulas)
+
+
+def test_equation_numbers_norms_and_references_can_be_read(tmp_path):
+    text = text_of(pdf.typeset([first(), second()], title="The title", author="A. Author",
+                               student_number="4711", course="Perception"), tmp_path)
+    for number in ("(1)", "(3b)", "(7)"):
+        assert re.search(rf"\s{re.escape(number)}\s*\n", text), number
+    for line in ("The title", "A. Author", "4711", "Perception", "Contents", "1. Problem: odometry",
+                 "1.1 The estimate", "2. Second", "2.1 Sums", "Figure 1. What is seen, 𝑥2",
+                 "Table 1. Roots."):
+        assert re.search(re.escape(line).replace(r"\ ", r"\s+"), text), line
+    assert "$" not in text.replace("$code$", "") and "\\" not in text
+    assert text.index("Figure 1.") < text.index("A sentence between.")
+
+
+def test_links_lead_to_places_in_the_document(tmp_path):
+    files, book = pdf.typst_files([first(), second()])
+    targets = [element["dest"] for element in query(files, tmp_path, "link")]
+    numbered = {book.page["tags"][n]: f"<{label}>" for n, label in book.page["labels"].items()}
+    assert targets.count(numbered["(1)"]) == 2  # from either chapter
+    headings = {element.get("label") for element in query(files, tmp_path, "heading")}
+    assert len(headings & set(targets)) == 2  # the first chapter, and a section of the second
+    assert "https://example.org/paper" in targets
+    assert not any("txt" in str(target) or "ipynb" in str(target) for target in targets)
+
+
+def test_without_code_there_are_prose_formulas_figures_and_tables_only(tmp_path):
+    files, book = pdf.typst_files([first()], code=False)
+    text = files["main.typ"].decode()
+    assert "print" not in text and "shown" not in text and "plot()" not in text
+    assert len(book.page["formulas"]) == TEXT_FORMULAS + 3
+    assert "#picture(" in text and "#kept[#figure(" in text and text.count("#caption[") == 2
+    assert "print" in pdf.typst_files([first()])[0]["main.typ"].decode()
+
+
+def test_equal_input_gives_equal_bytes():
+    once, again = (pdf.typeset([first(), second()], title="T", author="A") for _ in range(2))
+    assert once == again and once.startswith(b"%PDF")
+
+
+@pytest.mark.parametrize("tex, expected, lost", [
+    (r"\left\lVert r \right\rVert^2", "lr(bar.v.double r bar.v.double)^2", "∥"),
+    (r"\bigl\lVert r \bigr\rVert", "lr(bar.v.double r bar.v.double)", "parallel"),
+    (r"a\!b", "a b", "h("),
+    (r"\ln \lvert Q \rvert", "lr(|Q|)", r"\|"),
+    (r"\Big( a \Big)^2", r"stretch(\(, size: #1.8em) a stretch(\), size: #1.8em)^2", "scale"),
+    (r"a\;b", "a med b", "0em"),
+    (r"\|x\|_2", "bar.v.double x bar.v.double_2", "parallel"),
+    (r"a \parallel b", "a parallel b", "bar"),
+    (r"\dfrac{a}{b}", "#show math.frac: math.display; $a / b$", "inline"),
+    (r"\tfrac{a}{b}", "#show math.frac: math.inline; $a / b$", "display"),
+])
+def test_what_pandoc_sets_wrongly_is_mended(tex, expected, lost):
+    book = new_notebook(cells=[new_markdown_cell(f"${tex}$")])
+    formula = pdf.typst_files([(Path("1.ipynb"), book)])[0]["formulas.typ"].decode().split("\n")[1]
+    assert expected in formula and lost not in formula
+    pdf.typeset([(Path("1.ipynb"), book)])
+
+
+@pytest.mark.parametrize("tex, reason", [
+    (r"\nonsense{x}", r"\nonsense"),
+    (r"\begin{vmatrix} a & b \end{vmatrix}", r"\begin{vmatrix}"),
+    (r"\begin{array}{c|c} a & b \end{array}", "would be lost"),
+])
+def test_a_formula_that_cannot_be_set_is_named(tex, reason):
+    book = new_notebook(cells=[new_markdown_cell(f"Fine: $x$.\n\n$$ {tex} $$\n\nFine: $y$.")])
+    with pytest.raises(NotebookError, match=re.escape(reason)):
+        pdf.typeset([(Path("7_bad.ipynb"), book)])
+
+
+def test_a_formula_that_gets_lost_on_the_way_is_named(monkeypatch, tmp_path):
+    book = Path("7_bad.ipynb"), new_notebook(cells=[new_markdown_cell("$x$ and $$ y = 2 $$")])
+    template = tmp_path / pdf.TEMPLATE.name
+    template.write_text(pdf.TEMPLATE.read_text().replace("\n  body\n})", "\n})"))
+    with monkeypatch.context() as patch:
+        patch.setattr(pdf, "TEMPLATE", template)
+        with pytest.raises(NotebookError, match=r"lost a formula, 7_bad.ipynb:\s+y = 2"):
+            pdf.typeset([book])
+    convert = pdf.pypandoc.convert_text
+    monkeypatch.setattr(pdf.pypandoc, "convert_text", lambda text, to, kind, options: convert(
+        text.replace("\ue0000\ue001", ""), to, kind, options))
+    with pytest.raises(NotebookError, match=r"would lose a formula, 7_bad.ipynb:\s+x"):
+        pdf.typeset([book])
+
+
+@pytest.mark.parametrize("data, expected", [
+    ({"image/png": "iVBORw0KGgo=", "image/svg+xml": SVG, "text/plain": "no"}, "picture-0.svg"),
+    ({"application/vnd.jupyter.widget-view+json": {}, "text/plain": "a slider"}, "a slider"),
+    ({"text/html": "<table><tr><td>cell</td></tr></table>", "text/plain": "no"}, "cell"),
+    ({"application/json": {}}, "#show: report.with()\n\n"),
+])
+def test_outputs_are_shown_by_the_best_kind_there_is(data, expected):
+    book = new_notebook(cells=[new_code_cell(outputs=[new_output("display_data", data)])])
+    text = pdf.typst_files([(Path("1.ipynb"), book)])[0]["main.typ"].decode()
+    assert expected in text and "no" not in text.split("report.with()")[1].replace("#not", "")
+
+
+def test_a_long_table_breaks_and_a_wide_formula_shrinks(tmp_path):
+    rows = "\n".join(f"| {row} | {row**2} |" for row in range(200))
+    wide = " + ".join(f"x_{{{number}}}" for number in range(36))
+    book = new_notebook(cells=[new_markdown_cell(
+        f"| a | b |\n| --- | --- |\n{rows}\n\nTable 1. Squares.\n\n$$ {wide} \\tag{{1}} $$")])
+    text = text_of(pdf.typeset([(Path("1.ipynb"), book)]), tmp_path)
+    assert all(re.search(rf"\b{row}\s+{row**2}\b", text) for row in range(200))
+    line = next(line for line in text.splitlines() if line.endswith("(1)"))
+    assert line.count("+") == 35
+
+
+def test_a_tall_figure_leaves_room_for_its_caption(tmp_path):
+    tall = SVG.replace('height="9"', 'height="4000"').replace('width="20"', 'width="800"')
+    book = new_notebook(cells=[
+        new_markdown_cell("Before. " * 200), new_code_cell(outputs=[shown(("image/svg+xml", tall))]),
+        new_markdown_cell("Figure 1. Tall.")])
+    pages = text_of(pdf.typeset([(Path("1.ipynb"), book)]), tmp_path).split("\f")
+    before = next(number for number, page in enumerate(pages) if "Before." in page)
+    assert "Figure 1. Tall." not in pages[before] and "Figure 1. Tall." in pages[before + 1]
