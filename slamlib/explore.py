@@ -187,6 +187,45 @@ def graphs(seed, slip, assumed, wrong, kernel, start):
     return fig
 
 
+def ranges(seed, late, off, poses, way):
+    """Chapter 4: ranges and wheels alone, by one kernel from the guess, and by the solver.
+
+    Parameters
+    ----------
+    seed : of a simulated drive of the short path.
+    late : percent of the ranges that are too long.
+    off : m, error of the antenna guess, in a direction of its own for each antenna.
+    poses : of the drive, the first ones.
+    way : one of slam.RANGES.
+    """
+    dataset, truth = simulate("short", seed, slip=SLIP, late_ranges=late / 100)
+    angle = np.random.default_rng(seed).uniform(-np.pi, np.pi, len(truth.antenna))
+    guess = truth.antenna_in_world + off * np.stack([np.cos(angle), np.sin(angle)], -1)
+    dataset = initial.prefix(replace(dataset, aruco=None, antenna_guess=replace(
+        dataset.antenna_guess, position=guess)), poses)
+    true_poses = truth.poses[:poses]
+    chosen, solved = (slam.result(slam.solve_graph(slam.Graph(dataset, "arc"), SLIP, **options))
+                      for options in (dict(ranges=way, antennas="guess"), {}))
+    fig, axes = plotting.panels(2, height=4.0)
+    (plan,), (side,) = axes
+    plotting.trajectory(plan, true_poses, "truth")
+    for found, role, label in ((chosen, "hint", "kernel of the sliders"), (solved, "slam", "solver")):
+        plotting.trajectory(plan, found.poses, role, label)
+        ends = np.stack([guess[np.searchsorted(truth.antenna, found.antenna)], found.antenna_in_world])
+        plan.plot(ends[..., 0], ends[..., 1], color=plotting.ROLES[role]["color"], linewidth=1.2)
+        _error(side, found.poses, true_poses, role, label)
+    plan.plot(*guess.T, label="antennas: guess", **plotting.ROLES["guess"])
+    plan.plot(*truth.antenna_in_world.T, label="antennas: truth", **plotting.ROLES["true antenna"])
+    miss = np.hypot(*(solved.antenna_in_world - truth.antenna_in_world[
+        np.searchsorted(truth.antenna, solved.antenna)]).T)
+    plan.set_title(f"antennas within {miss.max():.2f} m")
+    nees = evaluation.anees(solved.poses, solved.covariances, true_poses)
+    side.set_title(f"NEES {nees:.1f}, {len(solved.doubts)} in doubt")
+    side.set_ylim(LEAST_ERROR, 2 * side.dataLim.y1)
+    plotting.legend_below(fig)
+    return fig
+
+
 def _error(ax, poses, truth, role, label=None, **look):
     """Distance (mm) from the truth over the pose number, on a logarithmic axis."""
     apart = np.hypot(*(poses - truth)[:, :2].T)

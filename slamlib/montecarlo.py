@@ -13,6 +13,7 @@ from slamlib.dataset import AntennaGuess, Vehicle
 from slamlib.graph import State
 from slamlib.evaluation import anees, ate, nees
 from slamlib.simulation import simulate
+from slamlib.ties import GATE_OF_POINTS
 
 
 def run(trial, seeds, jobs=2, progress=False, **options):
@@ -136,14 +137,15 @@ def kernels(seed, markers=True, **options):
     return numbers
 
 
-def guesses(seed, error, markers=True, **options):
-    """Antenna guesses that are wrong by `error` metres, each in a random direction, on a short drive.
+def guesses(seed, error, poses=None, markers=True, **options):
+    """Antenna guesses that are wrong by `error` metres, each in a random direction, on a short drive
+    or its first `poses`.
 
     Returns
     -------
-    dict of numbers: shares of the antennas that end "right" (within five of their sigmas and half a
-    metre of the truth), that do so "from the guess" alone, without looking for other places, that are
-    "in doubt", and that are "silently wrong".
+    dict of numbers: shares of the antennas that end "right", within half a metre of the truth, that do
+    so "from the guess" alone, without looking for other places, that are "in doubt", and that are
+    "silently wrong": not right, outside of their 99.9 % ellipse, and not in doubt.
     """
     dataset, truth = simulate("short", seed, **options)
     rng = np.random.default_rng(seed)
@@ -151,16 +153,18 @@ def guesses(seed, error, markers=True, **options):
     off = error * np.stack([np.cos(angle), np.sin(angle)], -1)
     dataset = replace(dataset if markers else dataset.without("aruco"),
                       antenna_guess=AntennaGuess(truth.antenna, truth.antenna_in_world + off))
+    dataset = dataset if poses is None else initial.prefix(dataset, poses)
 
-    def is_right(found):
-        miss = found.antenna_in_world - truth.antenna_in_world[np.searchsorted(truth.antenna, found.antenna)]
-        return np.hypot(*miss.T) < 0.5
+    def miss(found):
+        return found.antenna_in_world - truth.antenna_in_world[np.searchsorted(truth.antenna, found.antenna)]
 
     found = slam.result(slam.solve_graph(slam.Graph(dataset, "arc"), 1e-3))
     naive = slam.result(slam.solve_graph(slam.Graph(dataset, "arc"), 1e-3, antennas="guess"))
-    doubt = np.isin(found.antenna, list(found.doubts))
-    return {"right": is_right(found).mean(), "from the guess": is_right(naive).mean(),
-            "in doubt": doubt.mean(), "silently wrong": np.mean(~is_right(found) & ~doubt)}
+    right, doubt = np.hypot(*miss(found).T) < 0.5, np.isin(found.antenna, list(found.doubts))
+    outside = np.einsum("ni,nij,nj->n", miss(found), np.linalg.inv(found.antenna_covariance),
+                        miss(found)) > GATE_OF_POINTS
+    return {"right": right.mean(), "from the guess": np.mean(np.hypot(*miss(naive).T) < 0.5),
+            "in doubt": doubt.mean(), "silently wrong": np.mean(~right & outside & ~doubt)}
 
 
 def graphs(seed, **options):

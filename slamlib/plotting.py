@@ -108,7 +108,8 @@ def antennas(ax, positions, covariances, guess=None, truth=None, enlarged=1):
     """Antennas (a, 2) with their 95 % ellipses, the guessed places and the true ones."""
     ellipses(ax, positions, covariances, "#999999", fill=0.35, enlarged=enlarged)
     if guess is not None:
-        ax.plot(*np.stack([guess, positions]).T.swapaxes(0, 1), color="#999999", linewidth=0.8, zorder=2)
+        ends = np.stack([guess, positions])
+        ax.plot(ends[..., 0], ends[..., 1], color="#999999", linewidth=0.8, zorder=2)
         ax.plot(*guess.T, label="antennas: guess", **ROLES["guess"])
     ax.plot(*positions.T, label="antennas: estimate", **ROLES["antenna"])
     if truth is not None:
@@ -120,7 +121,7 @@ def rings(ax, centres, radii, sigma, color="#56B4E9"):
     """The places that ranges allow: rings of +-2 sigma around centres (m, 2), radii and sigma (m,)."""
     for centre, radius, s in zip(centres, radii, sigma):
         ax.add_patch(Annulus(centre, radius + 2 * s, 4 * s, facecolor=color, alpha=0.35, linewidth=0))
-    ax.set_aspect("equal", adjustable="datalim")
+    ax.set_aspect("equal", adjustable="box")
     ax.set(xlabel="x (m)", ylabel="y (m)")
     return ax
 
