@@ -108,6 +108,8 @@ def _table(summary):
         sigma = "{:7.4f} m {:7.4f} m {:6.4f}".format(*row["last_sigma"])
         error = f"{row['ate_m']:9.4f} m" if "ate_m" in row else "no truth"
         lines.append(f"{name:15}{row['estimated_poses']:10}{pose:>29}{sigma:>27}{error:>11}")
+        lines += [f"  antenna {antenna} is in doubt: {reason}"
+                  for antenna, reason in row.get("antennas_in_doubt", {}).items()]
     return "\n".join(lines)
 
 

@@ -148,15 +148,16 @@ def _prepare(dataset, model, wheel=None):
                          for values in (sightings.marker, sightings.z, sightings.C))))
     rounding = odometry.increment_noise(ticks, vehicle, start, end, 0.0)
     slipping = odometry.increment_noise(ticks, vehicle, start, end, 1.0) - rounding
-    return _Problem(dataset, model, vehicle, wheel, sightings.frame, *odometry.increments(ticks, vehicle, start, end, model),
-                    rounding, slipping, markers, len(dataset.aruco.pose) - len(sightings.row))
+    return _Problem(dataset, model, vehicle, wheel, sightings.frame,
+                    *odometry.increments(ticks, vehicle, start, end, model), rounding, slipping,
+                    markers, len(dataset.aruco.pose) - len(sightings.row))
 
 
 def _filter(problem, slip, most=None):
     """Log likelihood of the innovations, and [X, w] with covariance at every frame, or the first.
 
-    w is kept as its deviation from what the increments are linear about. Returns the log likelihood, (f, 6), (f, 6, 6) and the
-    number of sightings beyond the gate.
+    w is kept as its deviation from what the increments are linear about. Returns the log
+    likelihood, (f, 6), (f, 6, 6) and the number of sightings beyond the gate.
     """
     vehicle = problem.dataset.vehicle
     state = np.r_[0.0, 0.0, 0.0, vehicle.wheel - problem.wheel]
@@ -249,4 +250,5 @@ def _between_frames(problem, joint, joint_covariance, slip, outliers):
     F = np.concatenate([A, B @ by_w], axis=2)
     covariances = F @ joint_covariance[last] @ np.swapaxes(F, 1, 2) + B @ noise @ np.swapaxes(B, 1, 2)
     return Fusion(se2.compose(joint[last, :3], delta), covariances, problem.frame,
-                  outliers + problem.repeated, slip, problem.wheel + joint[-1, 3:], joint_covariance[-1, 3:, 3:])
+                  outliers + problem.repeated, slip, problem.wheel + joint[-1, 3:],
+                  joint_covariance[-1, 3:, 3:])

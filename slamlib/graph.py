@@ -30,13 +30,14 @@ import numpy as np
 from gtsam.symbol_shorthand import A, L, P, W, X
 
 from slamlib import se2
+from slamlib.dataset import DatasetError
 from slamlib.factors import (between_error, linearize, odometry_factors, point_error, range_error)
 from slamlib.marginals import marginals
 from slamlib.ties import GATE, GATE_OF_POINTS, LOST_HEADING, gather
 
-GAUGE = 1e-6                 # m, sigma of the position of pose 1, which is zero by definition
+GAUGE = 1e-5                 # m, sigma of the position of pose 1, which is zero by definition
 LOOSE = 1e5                  # m and rad, sigma of a marker that no sighting holds
-NO_GUESS = 100.0             # m, sigma of an antenna's guess: keeps the graph regular, says nothing
+GUESS = 5.0                  # m, sigma of an antenna's guess: decides where the ranges do not
 LEAST = 1e-6                 # relative decrease of the error at which iterations end
 
 
@@ -136,7 +137,7 @@ class Graph:
                                           _robust(late, noise)))
         for k, position in enumerate(self.guess):
             graph.add(gtsam.PriorFactorPoint2(
-                A(k), position, gtsam.noiseModel.Isotropic.Sigma(2, NO_GUESS)))
+                A(k), position, gtsam.noiseModel.Isotropic.Sigma(2, GUESS)))
         return Native(graph, kernel, late, weight)
 
     def everything(self):
@@ -187,7 +188,12 @@ class Graph:
         """Bayes tree of a linear graph, w last: it touches all poses."""
         if self.ordering is None:
             self.ordering = gtsam.Ordering.ColamdConstrainedLastGaussianFactorGraph(linear, [W(0)])
-        return linear.eliminateMultifrontal(self.ordering)
+        try:
+            return linear.eliminateMultifrontal(self.ordering)
+        except RuntimeError as error:                 # GTSAM's, with the variable and much advice
+            reason = str(error).strip().partition("\n")[0]
+            raise DatasetError(f"{self.dataset.name}: expected measurements that determine every pose and "
+                               f"landmark; the graph of these cannot be solved ({reason})") from None
 
     def optimize(self, values, native, U, most=40):
         """Gauss-Newton with step halving; returns values, their error and the number of steps."""
@@ -244,7 +250,7 @@ class Graph:
         prior = np.zeros(begin[-1] + 3)
         for j in np.flatnonzero(self._orphans(native.weight)):
             prior[begin[j]:begin[j] + size[j]] = LOOSE**-2
-        prior[begin[len(self.marker)]:begin[-1]] = NO_GUESS**-2
+        prior[begin[len(self.marker)]:begin[-1]] = GUESS**-2
         prior[begin[-1]:] = 1
         of_first = np.array([GAUGE, GAUGE, self.dataset.vehicle.sigma_heading])**-2.0
         joint, border = marginals([U @ J for J in jacobians], measured, (np.diag(of_first), prior))
@@ -257,7 +263,8 @@ class Graph:
         of = np.flatnonzero((weight > 0) & self.as_pose)
         noise = se2.rotate_covariance(s.C[of], -s.z[of, 2]) / weight[of, None, None]
         root = np.swapaxes(np.linalg.cholesky(np.linalg.inv(noise)), 1, 2)
-        e, by_pose, by_marker, _ = between_error(s.z[of], state.poses[s.row[of]], state.markers[self.label[of]])
+        e, by_pose, by_marker, _ = between_error(s.z[of], state.poses[s.row[of]],
+                                                 state.markers[self.label[of]])
         if native.kernel is not None:
             size = np.linalg.norm(root @ e[..., None], axis=(1, 2))
             root *= np.sqrt([native.kernel.weight(d) for d in size])[:, None, None]

@@ -11,13 +11,12 @@ from scipy.optimize import least_squares
 
 from slamlib import odometry, se2
 from slamlib.factors import range_error, vehicle_with
-from slamlib.graph import State
+from slamlib.graph import GUESS, State
 from slamlib.localization import localize, most_certain
 
 TRUSTED = 0.5        # rad, sigma of odometry's heading at which the first part of a drive ends
 VOTES = 60           # sightings of a marker that are asked where it is, at most
 ASKED = 150          # ranges to an antenna that are asked where it is, at most
-GUESS = 5.0          # m, sigma of an antenna's guess where several places explain its ranges
 UNDECIDED = np.log(1000)     # difference of costs below which two places are both possible
 ONE_PLACE = 0.2      # of the mean range: places this near to each other are one
 ROBUST = 2.0         # sigmas, scale of the Cauchy loss of ranges
@@ -177,3 +176,23 @@ def places(positions, ranges, sigma, guess):
         if all(np.hypot(*(end.x - other.x)) > ONE_PLACE * radius for other in apart):
             apart.append(end)
     return np.array([end.x for end in apart]), np.array([end.cost - apart[0].cost for end in apart])
+
+
+def second_moment(positions, ranges, sigma, guess, about):
+    """Second moment (2, 2) in m^2 of an antenna's place about the estimate `about` (2,).
+
+    For an antenna that its ranges do not settle, whose places are no ellipse: the posterior, Cauchy
+    likelihood of the ranges times the guess, is summed over a polar grid around the path. Other
+    parameters as of `places`.
+    """
+    middle, reach = positions.mean(0), 1.5 * ranges.max() + np.ptp(positions, axis=0).max()
+    radius, angle = np.meshgrid(np.linspace(0, reach, 200)[1:], np.linspace(-np.pi, np.pi, 361)[1:])
+    place = middle + radius[..., None] * np.stack([np.cos(angle), np.sin(angle)], -1)
+    few = np.unique(np.linspace(0, len(ranges) - 1, ASKED).astype(int))
+    off = np.linalg.norm(place[..., None, :] - positions[few], axis=-1) - ranges[few]
+    coarse = np.hypot(sigma[few], reach / 400)                     # a cell is not sharper than its size
+    cost = np.sum(ROBUST**2 * np.log1p((off / coarse / ROBUST)**2), axis=-1) / 2 \
+        + np.sum((place - guess)**2, axis=-1) / GUESS**2 / 2
+    density = radius * np.exp(cost.min() - cost)
+    apart = place - about
+    return np.einsum("abi,abj,ab->ij", apart, apart, density) / density.sum()

@@ -62,7 +62,8 @@ def problem2(seed, **options):
             ("exact hint", exact_hint.poses[at], exact_hint.covariances[at]),
             ("fused", fused.poses[at], fused.covariances[at])):
         values = nees(poses, covariances, truth.poses[at])
-        numbers |= {f"{name} nees": anees(poses, covariances, truth.poses[at]), f"{name} last nees": values[-1],
+        numbers |= {f"{name} nees": anees(poses, covariances, truth.poses[at]),
+                    f"{name} last nees": values[-1],
                     f"{name} ate": ate(poses, truth.poses[at])}
     true_map = truth.marker_in_world[np.searchsorted(truth.marker, alone.marker)]
     error = fused.wheel - truth.vehicle.wheel
@@ -101,7 +102,8 @@ def _judged(found, dataset, truth):
     wheel = found.wheel - truth.vehicle.wheel
     values = nees(found.poses, found.covariances, truth.poses)
     numbers = {"nees": np.nanmean(values[frames]), "nees between": np.nanmean(values[~frames]),
-               "last nees": values[-1], "wheel nees": wheel @ np.linalg.solve(found.wheel_covariance, wheel),
+               "last nees": values[-1],
+               "wheel nees": wheel @ np.linalg.solve(found.wheel_covariance, wheel),
                "ate": ate(found.poses, truth.poses),
                "aligned": ate(found.poses, truth.poses, aligned=True),
                "left out": np.count_nonzero(found.outlier), "slip": found.slip,
@@ -111,12 +113,16 @@ def _judged(found, dataset, truth):
         numbers |= {"map nees": nees(found.marker_in_world, found.marker_covariance, true_map).mean(),
                     "map worst": np.abs(found.marker_in_world - true_map)[:, :2].max()}
     if len(found.antenna):
-        error = found.antenna_in_world - truth.antenna_in_world[np.searchsorted(truth.antenna, found.antenna)]
+        error = _antenna_error(found, truth)
         numbers |= {"antenna nees": np.mean(np.einsum(
             "ni,nij,nj->n", error, np.linalg.inv(found.antenna_covariance), error)),
             "antenna error": np.sqrt(np.mean(np.sum(error**2, axis=1))),
             "doubts": len(found.doubts)}
     return numbers
+
+
+def _antenna_error(found, truth):
+    return found.antenna_in_world - truth.antenna_in_world[np.searchsorted(truth.antenna, found.antenna)]
 
 
 def kernels(seed, markers=True, **options):
@@ -132,7 +138,8 @@ def kernels(seed, markers=True, **options):
         found = slam.result(slam.solve_graph(slam.Graph(dataset, "arc"), 1e-3, ranges=name))
         seconds = time.process_time() - start
         judged = _judged(found, dataset, truth)
-        numbers |= {f"{name} {key}": judged[key] for key in ("ate", "nees", "antenna error", "antenna nees")}
+        numbers |= {f"{name} {key}": judged[key]
+                    for key in ("ate", "nees", "antenna error", "antenna nees")}
         numbers[f"{name} seconds"] = seconds
     return numbers
 
@@ -155,15 +162,12 @@ def guesses(seed, error, poses=None, markers=True, **options):
                       antenna_guess=AntennaGuess(truth.antenna, truth.antenna_in_world + off))
     dataset = dataset if poses is None else initial.prefix(dataset, poses)
 
-    def miss(found):
-        return found.antenna_in_world - truth.antenna_in_world[np.searchsorted(truth.antenna, found.antenna)]
-
     found = slam.result(slam.solve_graph(slam.Graph(dataset, "arc"), 1e-3))
     naive = slam.result(slam.solve_graph(slam.Graph(dataset, "arc"), 1e-3, antennas="guess"))
-    right, doubt = np.hypot(*miss(found).T) < 0.5, np.isin(found.antenna, list(found.doubts))
-    outside = np.einsum("ni,nij,nj->n", miss(found), np.linalg.inv(found.antenna_covariance),
-                        miss(found)) > GATE_OF_POINTS
-    return {"right": right.mean(), "from the guess": np.mean(np.hypot(*miss(naive).T) < 0.5),
+    miss, naive_miss = _antenna_error(found, truth), _antenna_error(naive, truth)
+    right, doubt = np.hypot(*miss.T) < 0.5, np.isin(found.antenna, list(found.doubts))
+    outside = np.einsum("ni,nij,nj->n", miss, np.linalg.inv(found.antenna_covariance), miss) > GATE_OF_POINTS
+    return {"right": right.mean(), "from the guess": np.mean(np.hypot(*naive_miss.T) < 0.5),
             "in doubt": doubt.mean(), "silently wrong": np.mean(~right & outside & ~doubt)}
 
 

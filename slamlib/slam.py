@@ -21,6 +21,7 @@ REPEATS = 4                  # at most, of learning the slip and judging the mea
 WHEELS = {"variable": "wheels as a variable", "independent": "independent chain",
           "fixed": "wheels fixed"}
 DECISIVE = 3.0               # log evidence by which Euler's steps must explain more than arcs to be taken
+UNSURE = 0.025               # largest sigma of an antenna, in distances to it, that is not in doubt
 FEWEST = 5                   # ranges below which an antenna's place is not to be relied on
 
 _kernel, _one_sided = gtsam.noiseModel.mEstimator, gtsam.noiseModel.mEstimator.Base.ReweightScheme.Scalar
@@ -131,13 +132,17 @@ def kinds(dataset, slip=None):
             yield wheels, model, result(own), compared(first, model, wheels, slip).log_evidence
 
 
-def evidence_curve(dataset, slips, model="arc"):
-    """Log evidence (len(slips),) of values of the slip, each at its own optimum."""
-    found = solve_graph(Graph(dataset, model), slips[0])
-    native, values, curve = found.graph.native(found.kernel, found.late, found.weight), found.values, []
+def evidence_curve(optimum, slips, model):
+    """Log evidence (len(slips),) of values of the slip, each at its own optimum.
+
+    `optimum` is the Optimum whose measurements are to be explained, whatever the model.
+    """
+    graph, values, curve = Graph(optimum.graph.dataset, model), optimum.values, []
+    graph.about(graph.state(values).w)
+    native = graph.native(optimum.kernel, optimum.late, optimum.weight)
     for slip in slips:
-        values, _, _ = found.graph.optimize(values, native, found.graph.factors.whitening(slip)[0])
-        curve.append(found.graph.log_evidence(values, native, slip))
+        values, _, _ = graph.optimize(values, native, graph.factors.whitening(slip)[0])
+        curve.append(graph.log_evidence(values, native, slip))
     return np.array(curve)
 
 
@@ -179,7 +184,8 @@ def solve_graph(graph, slip=None, landmarks="consensus", start=None, weight=None
         before, weight = weight, weight if fixed else judged()
         if (weight == before).all():
             break
-    return Optimum(graph, values, before, float(learned), graph.log_evidence(values, native, learned), kernel, late)
+    return Optimum(graph, values, before, float(learned), graph.log_evidence(values, native, learned),
+                   kernel, late)
 
 
 def _begun(graph, landmarks, sightings, ranges, antennas):
@@ -187,7 +193,8 @@ def _begun(graph, landmarks, sightings, ranges, antennas):
     earlier = None
     for count in initial.parts(graph.dataset):
         whole = count == len(graph.dataset.ticks)
-        part = graph if whole else Graph(initial.prefix(graph.dataset, count), graph.model, wheels=graph.wheels)
+        part = graph if whole else Graph(initial.prefix(graph.dataset, count), graph.model,
+                                         wheels=graph.wheels)
         values = (initial.from_odometry(part, landmarks, antennas) if earlier is None
                   else initial.grown(part, *earlier))
         if not whole:
@@ -221,7 +228,7 @@ def _learned_slip(graph, values, native):
                            options={"xatol": 0.05})
     around = mode.x + np.arange(-4, 5) / 2
     density = np.exp([min(0.0, log_posterior(s) + mode.fun) if s != mode.x else 0.0 for s in around])
-    return float(np.sqrt(np.sum(density * np.exp(2 * around)) / np.sum(density)))
+    return float(np.clip(np.sqrt(np.sum(density * np.exp(2 * around)) / np.sum(density)), *SLIPS))
 
 
 def agreeing(graph, values, early, late):
@@ -240,7 +247,8 @@ def graduated(graph, values, U, step=1.4):
     weight, cut, of_ranges = agreeing(graph, values, *gate), gate[0]**2, slice(len(graph.label), None)
     weight[of_ranges], control = 1, None
     while control is None or ((weight > 0) & (weight < 1)).any():
-        values, _, _ = graph.optimize(values, graph.native(weight=weight), U, most=40 if control is None else 1)
+        values, _, _ = graph.optimize(values, graph.native(weight=weight), U,
+                                      most=40 if control is None else 1)
         squared = graph.residuals(graph.state(values))[1]**2
         control = step * control if control else cut / max(2 * squared.max() - cut, cut)
         root = np.sqrt(cut * control * (control + 1) / np.maximum(squared, 1e-12)) - control
@@ -275,11 +283,11 @@ def result(optimum):
     used = np.bincount(graph.label[kept], np.where(graph.as_pose[kept], 3, 2), known)
     freedom = np.sum(np.maximum(used - np.where(graph.oriented, 3, 2), 0)) \
         + np.sum(of_ranges) - 2 * len(graph.antenna)   # odometry, priors: none
+    doubts, of_antennas = _doubts(graph, state, every[1][graph.frame], of_antennas, of_ranges)
     scale, calm = vehicle.sigma_wheel, graph.native(weight=np.r_[kept, of_ranges])    # no kernels
     return Slam(*every, graph.marker[held], markers,
                 se2.rotate_covariance(spread[held], markers[:, 2] * graph.oriented[held]),
-                graph.antenna, state.antennas, of_antennas,
-                _doubts(graph, state, every[1][graph.frame], of_antennas, of_ranges),
+                graph.antenna, state.antennas, of_antennas, doubts,
                 vehicle.wheel + scale * state.w, scale[:, None] * blocks[-1] * scale, optimum.slip,
                 graph.model, float(optimum.log_evidence),
                 2 * graph.error(values, calm, U) / max(1, freedom), ~kept, residual, of_ranges,
@@ -287,12 +295,20 @@ def result(optimum):
 
 
 def _doubts(graph, state, of_poses, covariances, weight):
-    """Sentences on antennas whose place the ranges do not settle: {id: sentence}."""
+    """Antennas whose place the ranges do not settle.
+
+    Returns
+    -------
+    doubts : {id: sentence}.
+    covariances : (a, 2, 2), for those in doubt of all places that are possible.
+    """
     sigma, doubts = np.sqrt(np.trace(of_poses[:, :2, :2], axis1=1, axis2=2) / 2), {}
-    for k, (antenna, ranges) in enumerate(zip(graph.antenna.tolist(), initial.ranges_of(graph, state.poses, sigma))):
-        count = np.count_nonzero(weight[graph.tag == k] > 0.5)
+    covariances = covariances.copy()
+    each = zip(graph.antenna.tolist(), initial.ranges_of(graph, state.poses, sigma))
+    for k, (antenna, ranges) in enumerate(each):
+        count, distance = np.count_nonzero(weight[graph.tag == k] > 0.5), np.median(ranges[1])
         place, cost = initial.places(*ranges, graph.guess[k])
-        other = np.hypot(*(place - state.antennas[k]).T) > initial.ONE_PLACE * np.median(ranges[1])
+        other = np.hypot(*(place - state.antennas[k]).T) > initial.ONE_PLACE * distance
         possible = place[other & (cost < initial.UNDECIDED)]
         if count < FEWEST:
             doubts[antenna] = f"only {count} of its ranges agree"
@@ -301,6 +317,9 @@ def _doubts(graph, state, of_poses, covariances, weight):
                 "({:.1f}, {:.1f})".format(*p) for p in possible))
         elif count < len(ranges[1]) / 2:
             doubts[antenna] = f"{len(ranges[1]) - count} of its {len(ranges[1])} ranges disagree"
-        elif np.sqrt(np.linalg.eigvalsh(covariances[k])[-1]) > 0.1 * np.median(ranges[1]):
-            doubts[antenna] = "its ranges come from too few directions"
-    return doubts
+        elif np.sqrt(np.linalg.eigvalsh(covariances[k])[-1]) > UNSURE * distance:
+            doubts[antenna] = "its ranges are too few or come from too few directions"
+        if antenna in doubts:
+            wide = initial.second_moment(*ranges, graph.guess[k], state.antennas[k])
+            covariances[k] = max(covariances[k], wide, key=np.trace)
+    return doubts, covariances

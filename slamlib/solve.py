@@ -40,7 +40,7 @@ def problem2(dataset, found=None):
     poses[found.frame], covariances[found.frame] = found.poses, found.covariances
     known = np.isfinite(found.poses[:, 0])
     poses[found.frame[known], 2] = np.unwrap(found.poses[known, 2])
-    return Solution("problem2", "ArUco", poses, covariances, int(found.frame[np.isfinite(found.poses[:, 0])][0]),
+    return Solution("problem2", "ArUco", poses, covariances, int(found.frame[known][0]),
                     (found.marker, found.marker_in_world, found.marker_covariance),
                     facts={"measured_poses": len(found.frame), "localized_poses": int(known.sum()),
                            "sightings": len(dataset.aruco.pose), "outliers": int(found.outlier.sum()),

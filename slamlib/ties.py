@@ -45,7 +45,8 @@ def gather(aruco, also=()):
     """The Sightings of an ArucoReadings or None; `also` are frames too, seen markers or not."""
     if aruco is None:
         none = np.zeros(0, int)
-        return Sightings(none, none, none, np.zeros((0, 3)), np.zeros((0, 3, 3)), np.unique(also).astype(int))
+        return Sightings(none, none, none, np.zeros((0, 3)), np.zeros((0, 3, 3)),
+                         np.unique(also).astype(int))
     index, z, C = merge_repeated(aruco)
     frame = np.union1d(aruco.pose[index], also).astype(int)
     return Sightings(index, np.searchsorted(frame, aruco.pose[index]), aruco.marker[index], z, C, frame)

@@ -1,12 +1,17 @@
-"""Problem 3 against a plain GTSAM script: error on many drives, time and memory as drives grow.
+"""Problems 3 and 4 against a plain GTSAM script: errors on many drives, time and memory as drives grow.
 
     python tests/benchmarks/slam.py [ROWS]      longer drives, up to about so many encoder rows
 """
 
+import json
+import multiprocessing
 import os
 import resource
+import subprocess
 import sys
+import tempfile
 import time
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -18,13 +23,13 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from plain_gtsam import plain  # noqa: E402
 
-from slamlib import slam  # noqa: E402
+from slamlib import montecarlo, slam  # noqa: E402
 from slamlib.dataset import read_dataset  # noqa: E402
 from slamlib.evaluation import anees, ate, nees_band  # noqa: E402
 from slamlib.simulation import simulate  # noqa: E402
 
 SEEDS = range(20)
-DATA = Path(__file__).parents[2] / "data"
+LONG = Path(__file__).parents[2] / "data" / "long"
 
 
 def trial(seed, slip):
@@ -36,19 +41,31 @@ def trial(seed, slip):
             anees(found.poses, found.covariances, truth.poses))
 
 
-def parts(dataset):
-    """Seconds of the parts of problem 3: graphs, solutions with learned slip, marginals."""
-    times = [time.perf_counter()]
-    graphs = [slam.Graph(dataset, model) for model in ("euler", "arc")]
-    times.append(time.perf_counter())
-    solved = [slam.solve_graph(graph) for graph in graphs]
-    times.append(time.perf_counter())
-    slam.result(*max(solved, key=lambda s: s[-1]))
-    times.append(time.perf_counter())
-    return np.diff(times)
+def drive(rounds):
+    """data/long as it is (0), or a simulated long path driven so many times."""
+    return read_dataset(LONG) if rounds == 0 else simulate("long", 3, rounds=rounds)[0]
 
 
-def main(largest=30_000):
+def measure(rounds, problem, who):
+    """Seconds, and MB in use at most beyond the data, of one way to solve one problem."""
+    dataset = drive(rounds) if problem == 4 else drive(rounds).without("uwb")
+    before = slam.solve(dataset.without("uwb")) if (problem, who) == (4, "slamlib") else None
+    begun, start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.perf_counter()
+    if who == "plain":
+        plain(dataset)
+    else:
+        slam.solve(dataset, after=before)
+    seconds = time.perf_counter() - start
+    return seconds, (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - begun) / 1024, len(dataset.ticks)
+
+
+def alone(*arguments):
+    """measure(*arguments) in a process of its own."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(measure, *arguments).result()
+
+
+def errors():
     low, high = nees_band(len(SEEDS))
     print(f"Problem 3: rms of the aligned ATE over {len(SEEDS)} drives of the short path, all learned "
           f"(NEES of consistent estimates: {low:.2f} to {high:.2f})")
@@ -59,23 +76,57 @@ def main(largest=30_000):
         print(f"{slip:8g}{1e3 * rms[0]:10.2f}{rms[0] / rms[1]:16.2f}{rms[0] / rms[2]:10.2f}"
               f"{runs[:, 3].mean():8.2f}")
 
-    print("\nProblem 3 against the plain script, one process, in seconds")
-    print(f"{'drive':>12}{'rows':>11}{'graphs':>9}{'solve':>9}{'marginals':>11}{'all':>9}"
-          f"{'plain':>9}{'ratio':>8}{'peak MB':>10}")
-    drives = {"data/long": read_dataset(DATA / "long")} if (DATA / "long").exists() else {}
-    for rows in (10_000, 100_000, 1_000_000):
-        if rows <= largest:
-            rounds = max(1, rows // 23_000)
-            dataset = simulate("long", 3, rounds=rounds)[0]
-            drives[f"{rounds} rounds"] = dataset
-    for name, dataset in drives.items():
-        each = parts(dataset)
+
+def kernels():
+    print("\nProblem 4 without markers: ways to treat late ranges, 12 drives of the short path")
+    for late in (0.0, 0.05, 0.15, 0.30):
+        runs = montecarlo.run(montecarlo.kernels, range(12), markers=False, late_ranges=late)
+        print(f"{100 * late:.0f} % late{'':12}{'ATE (mm)':>10}{'NEES':>8}{'antennas (mm)':>15}{'NEES':>8}"
+              f"{'seconds':>9}")
+        for way in slam.RANGES:
+            of = {key: runs[f"{way} {key}"] for key in ("ate", "nees", "antenna error", "antenna nees", "seconds")}
+            print(f"  {way:18}{1e3 * np.sqrt(np.mean(of['ate']**2)):10.1f}{of['nees'].mean():8.2f}"
+                  f"{1e3 * np.sqrt(np.mean(of['antenna error']**2)):15.1f}{of['antenna nees'].mean():8.2f}"
+                  f"{of['seconds'].mean():9.2f}")
+
+
+def growth(largest):
+    print("\nProblems 3 and 4 (after 3), each in a process of its own: seconds and MB beyond the data")
+    print(f"{'rows':>11}{'problem':>9}{'slamlib':>10}{'MB':>7}{'plain':>9}{'MB':>7}{'ratio':>8}{'ms a row':>10}")
+    for rounds in [0] * LONG.exists() + [r for r in (1, 4, 43) if 23_000 * r <= largest]:
+        for problem in (3, 4):
+            ours, memory, rows = alone(rounds, problem, "slamlib")
+            theirs, their_memory, _ = alone(rounds, problem, "plain")
+            print(f"{rows:11,}{problem:9}{ours:10.1f}{memory:7.0f}{theirs:9.1f}{their_memory:7.0f}"
+                  f"{ours / theirs:8.2f}{1e3 * ours / rows:10.3f}", flush=True)
+
+
+def whole():
+    """All problems by the command line, against the plain script's problem 4 alone."""
+    with tempfile.TemporaryDirectory() as out:
         start = time.perf_counter()
-        plain(dataset)
-        seconds = time.perf_counter() - start
-        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        print(f"{name:>12}{len(dataset.ticks):11,}{each[0]:9.1f}{each[1]:9.1f}{each[2]:11.1f}"
-              f"{each.sum():9.1f}{seconds:9.1f}{each.sum() / seconds:8.2f}{memory:10.0f}", flush=True)
+        subprocess.run([sys.executable, "-m", "slamlib", "solve", LONG, "--out", out], check=True,
+                       stdout=subprocess.DEVNULL)
+        ours = time.perf_counter() - start
+        problems = json.loads(Path(out, "summary.json").read_text())["problems"]
+    start = time.perf_counter()
+    subprocess.run([sys.executable, "-c", "import sys; sys.path.insert(0, sys.argv[1]); "
+                    "from plain_gtsam import plain; from slamlib.dataset import read_dataset; "
+                    "plain(read_dataset(sys.argv[2]))", str(Path(__file__).parent), LONG], check=True)
+    theirs = time.perf_counter() - start
+    print(f"\nsolve {LONG.name}, whole process: {ours:.1f} s; plain script, problem 4, whole process: "
+          f"{theirs:.1f} s; ratio {ours / theirs:.2f}")
+    parts = {name: row["seconds"] for name, row in problems.items()}
+    parts["start, reading, writing"] = ours - sum(parts.values())
+    print("\n".join(f"  {name:25}{seconds:6.1f} s" for name, seconds in parts.items()))
+
+
+def main(largest=100_000):
+    errors()
+    kernels()
+    if LONG.exists():
+        whole()
+    growth(largest)
 
 
 if __name__ == "__main__":
