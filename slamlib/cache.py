@@ -1,8 +1,8 @@
 """Executed notebooks, kept until something changes that they depend on.
 
-A notebook is executed again when its cells, slamlib's code, a package, a file of the selected
-datasets, a file beside the notebook or a variable of its environment is another than it was, and
-when a result that it wrote is no longer as it wrote it.
+A notebook is executed again when its cells, slamlib's code (but for what only makes the pages), a
+package, a file of the selected datasets, a file beside the notebook or a variable of its environment is
+another than it was, and when a result that it wrote is no longer as it wrote it.
 """
 
 import hashlib
@@ -19,6 +19,9 @@ from slamlib.results import write_atomically
 VARIABLES = ("SLAMLIB_", "PYTHON", "MPL", "OMP_", "OPENBLAS_", "MKL_", "LANG", "LC_", "TZ",
              "SOURCE_DATE_EPOCH")  # how the names of those begin that may change what a cell says
 
+# Modules that make pages of what notebooks have shown, and are not imported by them.
+PRESENTATION = ("cache", "cover", "execution", "overview", "pages", "pdf", "report", "__main__")
+
 
 def fingerprint(datasets, beside, environment):
     """A digest of all that notebooks depend on besides their own cells.
@@ -30,7 +33,7 @@ def fingerprint(datasets, beside, environment):
     environment : dict of the kernels' environment variables.
     """
     code = sorted(file for file in Path(__file__).parent.iterdir()
-                  if file.suffix in (".py", ".mplstyle"))
+                  if file.suffix in (".py", ".mplstyle") and file.stem not in PRESENTATION)
     files = [*code, *(file for folder in datasets for file in sorted(folder.rglob("*"))),
              *(file for file in sorted(beside.iterdir()) if file.suffix != ".ipynb")]
     return _digest(json.dumps([
