@@ -107,7 +107,8 @@ class Graph:
         poses, points = gtsam.utilities.extractPose2(values), gtsam.utilities.extractPoint2(values)
         seen, known = np.count_nonzero(self.oriented), len(self.antenna)
         markers = np.zeros((len(self.marker), 3))
-        markers[self.oriented], markers[~self.oriented, :2] = poses[:seen], points[known:]
+        markers[self.oriented] = poses[:seen]
+        markers[~self.oriented, :2] = points[known:len(self.marker) - seen + known]     # then comes w
         poses = poses[seen:]
         poses[:, 2] = np.unwrap(poses[:, 2])
         return State(poses, markers, points[:known], values.atVector(W(0)))
