@@ -13,7 +13,7 @@ from ipywidgets import Box, Dropdown, FloatSlider, IntSlider, Layout, VBox, inte
 
 from slamlib import evaluation, fusion, initial, localization, odometry, plotting, se2, slam
 from slamlib.notebook import Log, interactive
-from slamlib.simulation import simulate
+from slamlib.simulation import misguess, simulate
 
 LEAST_PATH = 1.0             # m, what drives less shows nothing
 SLIP = 1e-3                  # sqrt(m), of simulated drives where no slider sets it
@@ -199,10 +199,8 @@ def ranges(seed, late, off, poses, way):
     way : one of slam.RANGES.
     """
     dataset, truth = simulate("short", seed, slip=SLIP, late_ranges=late / 100)
-    angle = np.random.default_rng(seed).uniform(-np.pi, np.pi, len(truth.antenna))
-    guess = truth.antenna_in_world + off * np.stack([np.cos(angle), np.sin(angle)], -1)
-    dataset = initial.prefix(replace(dataset, aruco=None, antenna_guess=replace(
-        dataset.antenna_guess, position=guess)), poses)
+    dataset = initial.prefix(misguess(dataset.without("aruco"), truth, off, seed), poses)
+    guess = dataset.antenna_guess.position
     true_poses = truth.poses[:poses]
     chosen, solved = (slam.result(slam.solve_graph(slam.Graph(dataset, "arc"), SLIP, **options))
                       for options in (dict(ranges=way, antennas="guess"), {}))

@@ -24,7 +24,6 @@ ROBUST = 2.0         # sigmas, scale of the Cauchy loss of ranges
 
 def parts(dataset):
     """Numbers of encoder poses of the parts of a drive, each at most double the one before."""
-    ds, dtheta, _, _ = odometry.steps(dataset.ticks, dataset.vehicle)
     _, covariances = odometry.first_order(dataset.ticks, dataset.vehicle)
     lost = np.flatnonzero(covariances[:, 2, 2] > TRUSTED**2)
     ends = [len(dataset.ticks)]
@@ -71,8 +70,7 @@ def at(graph, poses, covariances, w=np.zeros(3), landmarks="consensus", antennas
     A, B = se2.compose_jacobians(poses[s.row], s.z)
     spread = A @ covariances[s.row] @ np.swapaxes(A, 1, 2) + B @ s.C @ np.swapaxes(B, 1, 2)
     markers = LANDMARKS[landmarks](graph, se2.compose(poses[s.row], s.z), spread)
-    sigma = np.sqrt(np.trace(covariances[:, :2, :2], axis1=1, axis2=2) / 2)
-    return graph.values(State(poses, markers, ANTENNAS[antennas](graph, poses, sigma), w))
+    return graph.values(State(poses, markers, ANTENNAS[antennas](graph, poses, covariances), w))
 
 
 def _first(graph, in_world, spread):
@@ -115,12 +113,12 @@ LANDMARKS = {"first sighting": _first, "most certain sighting": _most_certain,
              "mean by information": _mean, "consensus": _consensus, "problem 2's map": _from_problem2}
 
 
-def _trilaterated(graph, poses, sigma):
-    each = zip(ranges_of(graph, poses, sigma), graph.guess)
+def _trilaterated(graph, poses, covariances):
+    each = zip(ranges_of(graph, poses, covariances), graph.guess)
     return np.reshape([places(*ranges, guess)[0][0] for ranges, guess in each], (-1, 2))
 
 
-ANTENNAS = {"guess": lambda graph, poses, sigma: graph.guess, "trilateration": _trilaterated}
+ANTENNAS = {"guess": lambda graph, poses, covariances: graph.guess, "trilateration": _trilaterated}
 
 
 def _few_of_each(label, most):
@@ -133,15 +131,22 @@ def _few_of_each(label, most):
     return np.sort(order[(number * few) // count != ((number - 1) * few) // count])
 
 
-def ranges_of(graph, poses, sigma):
+def ranges_of(graph, poses, covariances):
     """For every antenna: positions (m, 2) it was ranged from, ranges (m,), their sigmas (m,).
 
-    `poses` are those of the graph, `sigma` (f,) in m those of their positions, which add to the ranges'.
+    `poses` (f, 3) and `covariances` (f, 3, 3) are those of the graph; the positions' sigmas add to the
+    ranges'.
     """
+    sigma = np.sqrt(np.trace(covariances[:, :2, :2], axis1=1, axis2=2) / 2)
     for k in range(len(graph.antenna)):
         of = np.flatnonzero(graph.tag == k)
         row = graph.tag_row[of]
         yield poses[row, :2], graph.range[of], np.hypot(graph.sigma[of], sigma[row])
+
+
+def _asked(ranges):
+    """Rows of at most ASKED of them, evenly chosen."""
+    return np.unique(np.linspace(0, len(ranges) - 1, ASKED).astype(int))
 
 
 def places(positions, ranges, sigma, guess):
@@ -157,7 +162,7 @@ def places(positions, ranges, sigma, guess):
     place : (p, 2) local minima of the Cauchy cost that are apart from each other, the best first.
     cost : (p,) relative to the best, in units of log odds.
     """
-    few = np.unique(np.linspace(0, len(ranges) - 1, ASKED).astype(int))
+    few = _asked(ranges)
     pose = np.column_stack([positions[few], np.zeros(len(few))])
     measured, root = ranges[few], 1 / sigma[few]
 
@@ -188,7 +193,7 @@ def second_moment(positions, ranges, sigma, guess, about):
     middle, reach = positions.mean(0), 1.5 * ranges.max() + np.ptp(positions, axis=0).max()
     radius, angle = np.meshgrid(np.linspace(0, reach, 200)[1:], np.linspace(-np.pi, np.pi, 361)[1:])
     place = middle + radius[..., None] * np.stack([np.cos(angle), np.sin(angle)], -1)
-    few = np.unique(np.linspace(0, len(ranges) - 1, ASKED).astype(int))
+    few = _asked(ranges)
     off = np.linalg.norm(place[..., None, :] - positions[few], axis=-1) - ranges[few]
     coarse = np.hypot(sigma[few], reach / 400)                     # a cell is not sharper than its size
     cost = np.sum(ROBUST**2 * np.log1p((off / coarse / ROBUST)**2), axis=-1) / 2 \

@@ -99,9 +99,14 @@ def say(markdown):
 
 def table(header, rows, caption=None):
     """Show a table: header is a list of str, rows are lists of str; the first column is text."""
-    lines = [header, ["---"] + ["---:"] * (len(header) - 1), *rows]
-    text = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    text = table_text(header, rows)
     say(text + (f"\n\n{caption}" if caption else ""))
+
+
+def table_text(header, rows, texts=1):
+    """A table in Markdown, of which the first `texts` columns are text and the others numbers."""
+    lines = [header, ["---"] * texts + ["---:"] * (len(header) - texts), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def _folder(variable, name):

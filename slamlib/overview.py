@@ -17,7 +17,7 @@ from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_outp
 from slamlib import evaluation, odometry, plotting, se2
 from slamlib.dataset import Dataset, Truth, read_dataset, read_truth
 from slamlib.execution import NotebookError
-from slamlib.notebook import listed
+from slamlib.notebook import listed, table_text
 from slamlib.results import read_vehicle_poses
 from slamlib.solve import Solution, truth_in_world_of
 
@@ -135,7 +135,7 @@ def _datasets(drives):
         rows.append([plain(drive.name), f"{len(d.ticks):,}", f"{path:.1f} m", _count(d.aruco),
                      _count(d.uwb), "known" if drive.truth else "not known"])
     header = ["dataset", "poses", "path", "sightings of markers", "UWB ranges", "truth"]
-    return (_table(header, rows)
+    return (table_text(header, rows, texts=2)
             + "\n\nTable 1. What was measured on each drive; the path is the encoders'.")
 
 
@@ -150,8 +150,8 @@ def _headline(drives):
     for drive in drives:
         solved = {solution.problem: solution for solution in drive.solutions}
         rows += [_row(drive, problem, solved.get(problem)) for problem in problems]
-    text = _table(["dataset", "problem", "poses", "σ of position", "σ of heading", "ATE",
-                   "ATE, aligned"], rows)
+    text = table_text(["dataset", "problem", "poses", "σ of position", "σ of heading", "ATE",
+                       "ATE, aligned"], rows, texts=2)
     text += ("\n\nTable 2. Every problem on every dataset: how many poses have an estimate; at the "
              "last of them the larger standard deviation of $x$ and $y$, and that of the heading; and "
              "the root mean square error of all positions (ATE), as they stand and moved as a whole "
@@ -189,11 +189,6 @@ def _si(value, unit):
     """Three digits, in thousandths of the unit where it is small."""
     value, unit = (value, unit) if value >= 1 else (1e3 * value, f"m{unit}")
     return f"{value:.{max(0, 2 - len(str(int(value))) + 1)}f}\u00a0{unit}"
-
-
-def _table(header, rows):
-    lines = [header, ["---"] * 2 + ["---:"] * (len(header) - 2), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def _overlaid(drive):

@@ -10,7 +10,7 @@ at a lower rate; the UWB tag ranges to the antennas within reach, at its own rat
 import os
 import shutil
 import tempfile
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -73,6 +73,13 @@ def simulate(path="short", seed=0, *, slip=1e-3, late_ranges=0.0, mislabelled=0.
     guess = AntennaGuess(antenna, antenna_in_world + noise * offset)
     return (Dataset(path, vehicle, ticks, aruco, uwb, guess),
             Truth(poses, marker, marker_in_world, antenna, antenna_in_world, true_vehicle))
+
+
+def misguess(dataset, truth, error, seed):
+    """The dataset with antenna guesses that are wrong by `error` metres, each in a direction of its own."""
+    angle = np.random.default_rng(seed).uniform(-np.pi, np.pi, len(truth.antenna))
+    off = error * np.stack([np.cos(angle), np.sin(angle)], -1)
+    return replace(dataset, antenna_guess=AntennaGuess(truth.antenna, truth.antenna_in_world + off))
 
 
 def manoeuvre(legs, vehicle=Vehicle(), step=0.01):

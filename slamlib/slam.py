@@ -161,14 +161,15 @@ def solve_graph(graph, slip=None, landmarks="consensus", start=None, weight=None
     (kernel, gated), (late, *gate) = SIGHTINGS[sightings], RANGES[ranges]
     U, _ = graph.factors.whitening(max(TYPICAL_SLIP if slip is None else slip, SLIPS[0]))
     values = _begun(graph, landmarks, sightings, ranges, antennas) if start is None else start
-    for scale in () if weight is not None else CAUCHY if start is None else CAUCHY[-1:]:
-        values, _, _ = graph.optimize(values, graph.native(*_of_round(sightings, ranges, scale)), U)
+    if weight is None:
+        values = _rounds(graph, values, U, sightings, ranges, CAUCHY if start is None else CAUCHY[-1:])
 
     def judged():
         if ranges == "GNC":
             return graduated(graph, values, U)
         agree = agreeing(graph, values, *gate)
-        agree[:len(graph.label)] += (not gated) * (1 - agree[:len(graph.label)])
+        if not gated:
+            agree[:len(graph.label)] = 1
         return agree
 
     fixed, weight = weight is not None, judged() if weight is None else weight
@@ -199,17 +200,20 @@ def _begun(graph, landmarks, sightings, ranges, antennas):
                   else initial.grown(part, *earlier))
         if not whole:
             U, _ = part.factors.whitening(TYPICAL_SLIP)
-            for scale in CAUCHY:
-                values, _, _ = part.optimize(values, part.native(*_of_round(sightings, ranges, scale)), U)
+            values = _rounds(part, values, U, sightings, ranges, CAUCHY)
         earlier = part, values
     return values
 
 
-def _of_round(sightings, ranges, scale):
-    """The kernels of sightings and of ranges while outliers are looked for: convex ones stay."""
-    cauchy, convex = _kernel.Cauchy.Create(scale), ("quadratic", "Huber", "GNC")
-    return (SIGHTINGS[sightings][0] if sightings in convex else cauchy,
-            RANGES[ranges][0] if ranges in convex else cauchy)
+def _rounds(graph, values, U, sightings, ranges, scales):
+    """Values after a round with each scale of the Cauchy kernel, in place of all but convex ones."""
+    convex = ("quadratic", "Huber", "GNC")
+    for scale in scales:
+        cauchy = _kernel.Cauchy.Create(scale)
+        native = graph.native(SIGHTINGS[sightings][0] if sightings in convex else cauchy,
+                              RANGES[ranges][0] if ranges in convex else cauchy)
+        values, _, _ = graph.optimize(values, native, U)
+    return values
 
 
 def _learned_slip(graph, values, native):
@@ -302,9 +306,8 @@ def _doubts(graph, state, of_poses, covariances, weight):
     doubts : {id: sentence}.
     covariances : (a, 2, 2), for those in doubt of all places that are possible.
     """
-    sigma, doubts = np.sqrt(np.trace(of_poses[:, :2, :2], axis1=1, axis2=2) / 2), {}
-    covariances = covariances.copy()
-    each = zip(graph.antenna.tolist(), initial.ranges_of(graph, state.poses, sigma))
+    doubts, covariances = {}, covariances.copy()
+    each = zip(graph.antenna.tolist(), initial.ranges_of(graph, state.poses, of_poses))
     for k, (antenna, ranges) in enumerate(each):
         count, distance = np.count_nonzero(weight[graph.tag == k] > 0.5), np.median(ranges[1])
         place, cost = initial.places(*ranges, graph.guess[k])
