@@ -4,6 +4,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 from IPython.display import Markdown, display
 from matplotlib_inline.backend_inline import set_matplotlib_formats
 
@@ -97,9 +98,16 @@ def say(markdown):
     display(Markdown(markdown))
 
 
-def table(header, rows, caption=None):
-    """Show a table: header is a list of str, rows are lists of str; the first column is text."""
-    text = table_text(header, rows)
+def captioned(fig, caption):
+    """Show a figure, and directly below it its caption, which may hold computed numbers."""
+    display(fig)
+    plt.close(fig)                      # or it would be shown again at the end of the cell
+    say(caption)
+
+
+def table(header, rows, caption=None, texts=1):
+    """Show a table: header is a list of str, rows are lists of str; the first `texts` columns are text."""
+    text = table_text(header, rows, texts)
     say(text + (f"\n\n{caption}" if caption else ""))
 
 

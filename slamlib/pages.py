@@ -5,26 +5,25 @@ TeX to MathML.
 """
 
 import html
-import json
 import re
+import sys
 import xml.etree.ElementTree as ElementTree
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
-from urllib.parse import quote
+from urllib.parse import quote, unquote
 
-import pypandoc
 from jinja2 import pass_context
 from nbconvert import HTMLExporter
 from nbconvert.filters.markdown_mistune import IPythonRenderer, MarkdownWithMath
 
 from slamlib.execution import NotebookError
+from slamlib.formulas import set_formulas
+from slamlib.numbering import CAPTION, TAG
 
 PAGE = Path(__file__).with_name("report_page.html").read_text(encoding="utf-8")
 STYLE = Path(__file__).with_name("report_style.css").read_text(encoding="utf-8")
 MARK = re.compile("\ue000(\\d+)\ue001([.,;:!?)]*)")  # a formula, until pandoc has set it
-TAG = re.compile(r"\\tag\*?\s*\{([^{}]*)\}")
-LOST = re.compile(r"\\(hline|cline|boxed|cancel|color|textcolor)\b|\{array\}\s*\{[^}]*\|")
-CAPTION = re.compile(r"\W*(Figure|Table)\s+\d+\W")
+INSIDE = re.compile(r"([^:/#]+\.ipynb)?(?:#(.+))?")  # a link from one notebook to another, or to a place
 ACCENTS = {"\u0302": "^", "\u0303": "~", "\u0307": "\u02d9", "\u0308": "\u00a8"}
 UPRIGHT = {bold: bold - 104 for bold in range(0x1D468, 0x1D49C)}  # bold italic letters to bold
 LOADED = re.compile(r"<(?:script|link|iframe|object|embed|base)\b[^>]*"
@@ -43,8 +42,31 @@ def chapter_of(source, book):
             "number": number[1] if number else None}
 
 
+def html_pages(books, chapters, code=True):
+    """The HTML pages of executed books and the index, as text, in a dict by their file names.
+
+    Raises NotebookError for what a page would lose, load or link to in vain; parameters as `html_page`.
+    """
+    anchors, links, pages = {}, [], {}
+    for source, book in books.items():
+        pages[f"{source.stem}.html"], page = html_page(source, book, chapters, code)
+        anchors[f"{source.stem}.ipynb"] = {"", *page["anchors"]}
+        links += [(source.name, *link) for link in page["links"]]
+    for name, text, target, anchor in links:
+        if target not in anchors:
+            _tell_once(f"{name}: there is no {target}: '{text}' is no link")
+        elif anchor not in anchors[target]:
+            raise NotebookError(f"{name}: there is no #{anchor} in {target}, where '{text}' leads")
+    return pages
+
+
+@cache
+def _tell_once(sentence):
+    print(sentence, file=sys.stderr)
+
+
 def html_page(source, book, chapters, code=True):
-    """The HTML page of one executed book, or of the index, as text.
+    """The HTML page of one executed book, or of the index, as text; and what was found on the way.
 
     Parameters
     ----------
@@ -52,18 +74,28 @@ def html_page(source, book, chapters, code=True):
     chapters : list of dicts by `chapter_of`, for the contents.
     code : False leaves out code cells and printed text.
     """
-    page = {"formulas": [], "headings": [], "anchors": {}, "figures": [], "chapters": chapters,
-            "code": code, "file": quote(f"{source.stem}.html"), "style": STYLE}
+    page = {"formulas": [], "sections": [], "section": "", "headings": [], "anchors": {}, "links": [], "figures": [], "chapters": chapters,
+            "code": code, "file": quote(f"{source.stem}.html"), "style": STYLE, "name": f"{source.stem}.ipynb",
+            "names": {f"{source.stem}.ipynb", *(unquote(c["file"]).replace(".html", ".ipynb") for c in chapters)}}
     exporter = HTMLExporter(template_name="basic", raw_template=PAGE,
                             filters={"markdown2html": _markdown_to_html})
     text, resources = exporter.from_notebook_node(
         book, {"metadata": {"path": str(source.parent)}, "page": page})
-    formulas = _set_formulas(source.name, resources["page"]["formulas"])
+    page = resources["page"]
+    formulas = [_mend(tex, mathml) for (tex, _), mathml in zip(page["formulas"], set_formulas(
+        page["formulas"], "html", ["--mathml"], partial(refusal, source.name, page)))]
     keep = '<span class="keep">{}{}</span>'.format
     text = MARK.sub(lambda mark: keep(formulas[int(mark[1])], mark[2]), text)
     if loaded := LOADED.search(text):
         raise NotebookError(f"{source.name}: the page would load something: {loaded[0][:100]}")
-    return text
+    return text, page
+
+
+def refusal(name, page, number, reason):
+    """The error for a formula that was gathered in `page`: notebook, section, reason and TeX."""
+    section = page["sections"][number]
+    return NotebookError(name + (f", section '{section}'" if section else "")
+                         + f": {reason}:\n    {page['formulas'][number][0]}")
 
 
 @pass_context
@@ -81,6 +113,7 @@ class Renderer(IPythonRenderer):
 
     def inline_math(self, body, display=False):
         self.page["formulas"].append((body.strip(), display))
+        self.page["sections"].append(self.page["section"])
         return f"\ue000{len(self.page['formulas']) - 1}\ue001"
 
     def block_math(self, body):
@@ -95,49 +128,33 @@ class Renderer(IPythonRenderer):
         return self.block_math(f"\\begin{{{name}}}{body}\\end{{{name}}}")
 
     def heading(self, text, level, **_):
-        plain = html.unescape(re.sub("<[^>]*>", "", MARK.sub("", text))).strip()
-        anchor = html.escape(self.anchor(plain.replace(" ", "-")))  # as Jupyter names it
+        anchor = html.escape(self.named(text))
         if level in (2, 3):
             self.page["headings"].append((level, anchor, re.sub("</?a[^>]*>", "", text)))
         return f'<h{level} id="{anchor}">{text}</h{level}>\n'
+
+    def named(self, text):
+        """The anchor of a heading, as Jupyter names it; what follows is in this section."""
+        self.page["section"] = html.unescape(re.sub("<[^>]*>", "", MARK.sub("", text))).strip()
+        return self.anchor(self.page["section"].replace(" ", "-"))
 
     def anchor(self, name):
         count = self.page["anchors"][name] = self.page["anchors"].get(name, 0) + 1
         return name if count == 1 else f"{name}-{count}"
 
     def paragraph(self, text):
-        caption = ' class="caption"' if CAPTION.match(re.sub("<[^>]*>", "", text)) else ""
-        return f"<p{caption}>{text}</p>\n"
+        if not (caption := CAPTION.match(re.sub("<[^>]*>", "", text))):
+            return f"<p>{text}</p>\n"
+        anchor = self.anchor(f"{caption[1].lower()}-{caption[2]}")
+        return f'<p class="caption" id="{anchor}">{text}</p>\n'
 
     def link(self, text, url, title=None):
+        if inside := INSIDE.fullmatch(url):
+            target = unquote(inside[1] or self.page["name"])
+            self.page["links"].append((text, target, unquote(inside[2] or "")))
+            if target not in self.page["names"]:
+                return text
         return super().link(text, re.sub(r"^([^:/]+)\.ipynb(?=#|$)", r"\1.html", url), title)
-
-
-def _set_formulas(name, formulas):
-    """MathML of (TeX, display) pairs: all in one call of pandoc, which takes 0.1 s or more."""
-    blocks = []
-    for tex, display in formulas:
-        if lost := LOST.search(tex):
-            raise NotebookError(f"{name}: {lost[0]} would be lost in this formula:\n    {tex}")
-        kind = {"t": "DisplayMath" if display else "InlineMath"}
-        blocks += [{"t": "Plain", "c": [{"t": "Math", "c": [kind, tex]}]},
-                   {"t": "RawBlock", "c": ["html", "\ue000"]}]
-    document = json.dumps({"pandoc-api-version": pandoc_api_version(), "meta": {},
-                           "blocks": blocks})
-    try:
-        text = pypandoc.convert_text(document, "html", "json",
-                                     ["--mathml", "--wrap=none", "--fail-if-warnings"])
-    except RuntimeError as error:
-        raise NotebookError(f"{name}: pandoc cannot set a formula:\n{str(error).strip()}") from None
-    if text.count("<math") != len(formulas):
-        raise NotebookError(f"{name}: of {len(formulas)} formulas pandoc lost some")
-    return [_mend(tex, mathml) for (tex, _), mathml in zip(formulas, text.split("\ue000"))]
-
-
-@cache
-def pandoc_api_version():
-    """The version that pandoc wants in a document in JSON."""
-    return json.loads(pypandoc.convert_text("", "json", "markdown"))["pandoc-api-version"]
 
 
 def _mend(tex, mathml):

@@ -11,6 +11,7 @@ import html
 import json
 import re
 import tempfile
+import textwrap
 from pathlib import Path
 
 import pypandoc
@@ -19,16 +20,18 @@ from nbconvert.filters import strip_ansi
 from nbconvert.filters.markdown_mistune import MarkdownWithMath
 
 from slamlib.execution import NotebookError
-from slamlib.pages import CAPTION, LOST, MARK, TAG, Renderer, pandoc_api_version
+from slamlib.formulas import set_formulas
+from slamlib.numbering import CAPTION, TAG
+from slamlib.pages import MARK, Renderer, refusal
 
 TEMPLATE = Path(__file__).with_name("report_pdf.typ")
 PICTURES = {"image/svg+xml": "svg", "image/png": "png", "image/jpeg": "jpg"}
 TEXTS = ("text/markdown", "text/latex", "text/html", "text/plain")
+COLUMNS = 96                                          # of code, that the page is wide
 PICTURE = re.compile("\ue002(\\d+)\ue003")
 TABLE = re.compile("#figure\\(\n(?:(?!#figure\\().)*?, kind: table\n  \\)(?=\\s*\ue004)", re.DOTALL)
-APART = re.compile(  # a figure, then lines that were printed, and only then its caption
-    "(\ue002\\d+\ue003)((?:(?![\ue002\ue004]|\n=).)+?)"
-    "(\ue004\\W*(?:strong|emph)?\\W*Figure[^\ue005]*\ue005)", re.DOTALL)
+CAPTIONED = re.compile("\ue002(\\d+)\ue003\\s*\ue004(.*?)\ue006(.*?)\ue005", re.DOTALL)  # with its picture
+CAPTIONS = re.compile("\ue004(.*?)\ue006(.*?)\ue005", re.DOTALL)
 SCALED = re.compile(r"#scale\(x: (\d+)%, y: \d+%\)\[(\\?[^\\]|\\\])\]")  # pandoc's \big, \Big, ...
 REWRITTEN = [(re.compile(pattern), becomes) for pattern, becomes in (  # pandoc would set it wrongly
     (r"\\!", ""), (r"\\;", r"\\:"),
@@ -51,6 +54,11 @@ def typeset(chapters, opening=None, code=True, **cover):
     NotebookError : a formula is lost or cannot be set, or Typst refuses the document.
     """
     files, book = typst_files(chapters, opening, code, **cover)
+    text = files["main.typ"].decode()
+    if missing := without_glyph(text):
+        around = re.search(f".{{0,30}}{re.escape(missing[0])}.{{0,30}}", text)[0]
+        raise NotebookError(f"the PDF's fonts have no glyph for {missing[0]} (U+{ord(missing[0]):04X}): "
+                            f"... {around} ...")
     with tempfile.TemporaryDirectory() as folder:
         for name, content in files.items():
             Path(folder, name).write_bytes(content)
@@ -63,15 +71,16 @@ def typst_files(chapters, opening=None, code=True, **cover):
     parts = [book.chapter(*chapter) for chapter in chapters]
     if opening is not None:
         parts.insert(0, f"#unnumbered[\n{book.chapter(Path('index'), opening)}\n]")
-    text = "\n#pagebreak(weak: true)\n".join(parts)
+    text = "\n#chapter-ends()\n".join(parts)
     formulas = book.set_formulas()
     if lost := set(range(len(formulas))) - {int(mark[1]) for mark in MARK.finditer(text)}:
-        raise NotebookError(f"the PDF would lose a formula, {book.place(min(lost))}")
-    text = APART.sub(r"\1\n\n\3\n\n\2", text)
+        raise book.refusal(min(lost), "the PDF would lose this formula")
     text = TABLE.sub(lambda table: f"#kept[{table[0]}]", text)
     text = MARK.sub(r"#formula-\1;\2", text)
+    text = CAPTIONED.sub("#floating[\ue002\\1\ue003 \ue004\\2\ue006\\3\ue005]", text)
     text = PICTURE.sub(lambda mark: "#picture({}, {});".format(*book.pictures[int(mark[1])]), text)
-    text = text.replace("\ue004", "#caption[").replace("\ue005", "]")
+    text = CAPTIONS.sub(r"#caption[\2] <\1>", text)
+    text = text.replace("\ue007", "#announcing[").replace("\ue008", "]")
     cover = ", ".join(f"{name}: {_quoted(value)}" for name, value in cover.items())
     text = (f'#import "{TEMPLATE.name}": *\n#import "formulas.typ": *\n'
             f"#show: report.with({cover})\n{text}\n")
@@ -87,12 +96,39 @@ def _compile(folder, book):
         found = set(json.loads(compiler.query("math.equation", field="label")))
     except typst.TypstError as error:
         line = re.search(r"formulas\.typ:(\d+):", error.diagnostic)
-        place = book.place(int(line[1]) - 2) if line else error.diagnostic.strip()
-        raise NotebookError(f"Typst cannot set the PDF: {error.message}: {place}") from None
+        if line:
+            raise book.refusal(int(line[1]) - 2, f"Typst cannot set this formula, {error.message}") from None
+        raise NotebookError(f"Typst cannot set the PDF: {error.message}: {error.diagnostic.strip()}") from None
     for number, label in enumerate(book.labels):
         if f"<{label}>" not in found:
-            raise NotebookError(f"the PDF lost a formula, {book.place(number)}")
+            raise book.refusal(number, "the PDF lost this formula")
     return content
+
+
+def without_glyph(text):
+    """The characters of a text that no font of the PDF has: Typst would set an empty box for them."""
+    def any_boxes(characters):  # drawn like U+10FFFD, which is no character
+        source = "\n".join(f'#box({_quoted(c)})' for c in ["\U0010fffd", *characters])
+        pages = typst.compile(source.encode(), format="svg", ignore_system_fonts=True)
+        box, *glyphs = re.findall(r'<use [^>]*href="#(\w+)"', b"".join(
+            [pages] if isinstance(pages, bytes) else pages).decode())
+        return box in glyphs
+
+    characters = sorted({c for c in text if not c.isascii()})
+    return [c for c in characters if any_boxes([c])] if any_boxes(characters) else []
+
+
+def _rewritten(tex):
+    for pattern, becomes in REWRITTEN:
+        tex = pattern.sub(becomes, tex)
+    return tex
+
+
+def _folded(text):
+    """Text of which lines that are wider than the page go on in the next line."""
+    fold = textwrap.TextWrapper(COLUMNS, drop_whitespace=False, replace_whitespace=False, expand_tabs=False,
+                                break_on_hyphens=False)
+    return "\n".join("\n↪ ".join(fold.wrap(line)) for line in text.split("\n"))
 
 
 def _quoted(text):
@@ -113,7 +149,8 @@ class _Book:
 
     def __init__(self, code):
         self.code, self.files, self.pictures = code, {}, []
-        self.page = {"formulas": [], "labels": {}, "tags": {}, "headings": [], "sources": []}
+        self.page = {"formulas": [], "labels": {}, "tags": {}, "headings": [], "links": [], "sources": [],
+                     "sections": []}
 
     @property
     def labels(self):
@@ -121,20 +158,21 @@ class _Book:
         return [self.page["labels"].get(number, f"formula-{number}")
                 for number in range(len(self.page["formulas"]))]
 
-    def place(self, number):
-        """The file and the TeX of a formula."""
-        return f"{self.page['sources'][number]}:\n    {self.page['formulas'][number][0]}"
+    def refusal(self, number, reason):
+        """The error for a formula."""
+        return refusal(self.page["sources"][number], self.page, number, reason)
 
     def chapter(self, source, book):
         """A chapter in Typst, with marks."""
-        self.page |= {"file": source.stem, "anchors": {}, "path": source.parent, "titled": False}
+        self.page |= {"file": source.stem, "anchors": {}, "path": source.parent, "section": "",
+                      "titled": False}
         parts, pictures = [], len(self.pictures)
         for cell in book.cells:
             if cell.cell_type == "markdown":
                 parts.append(self.markdown(cell.source, cell.get("attachments", {})))
             elif cell.cell_type == "code":
                 if self.code and cell.source.strip():
-                    parts.append(f'<pre class="python">{html.escape(cell.source)}</pre>')
+                    parts.append(f'<pre class="python">{html.escape(_folded(cell.source))}</pre>')
                 alt = cell.metadata.get("alt")
                 parts += [self.output(output, alt, pictures) for output in cell.outputs]
         self.page["sources"] += [source.name] * (
@@ -170,29 +208,13 @@ class _Book:
             return self.markdown(data[kind])
         if kind == "text/html":
             return data[kind]
-        return f"<pre>{html.escape(strip_ansi(data[kind]))}</pre>" if kind and self.code else ""
+        return f"<pre>{html.escape(_folded(strip_ansi(data[kind])))}</pre>" if kind and self.code else ""
 
     def set_formulas(self):
         """A line of Typst for each formula, which defines it: all in one call of pandoc."""
-        blocks = []
-        for number, (tex, display) in enumerate(self.page["formulas"]):
-            if lost := LOST.search(tex):
-                raise NotebookError(f"{lost[0]} would be lost in a formula, {self.place(number)}")
-            for pattern, becomes in REWRITTEN:
-                tex = pattern.sub(becomes, tex)
-            kind = {"t": "DisplayMath" if display else "InlineMath"}
-            blocks += [{"t": "Plain", "c": [{"t": "Math", "c": [kind, tex]}]},
-                       {"t": "RawBlock", "c": ["typst", "\ue000"]}]
-        document = {"pandoc-api-version": pandoc_api_version(), "meta": {}, "blocks": blocks}
-        try:
-            text = pypandoc.convert_text(json.dumps(document), "typst", "json",
-                                         ["--wrap=none", "--fail-if-warnings"])
-        except RuntimeError as error:
-            raise NotebookError(f"pandoc cannot set a formula:\n{str(error).strip()}") from None
-        formulas = text.split("\ue000")[:-1]
-        if len(formulas) != len(self.page["formulas"]):
-            raise NotebookError("pandoc lost formulas of the PDF")
-        return [self._line(*numbered) for numbered in enumerate(formulas)]
+        formulas = [(_rewritten(tex), display) for tex, display in self.page["formulas"]]
+        return [self._line(*numbered)
+                for numbered in enumerate(set_formulas(formulas, "typst", [], self.refusal))]
 
     def _line(self, number, formula):
         """A formula's definition, mended, on one line."""
@@ -212,7 +234,8 @@ class _Book:
 
 
 class _Renderer(Renderer):
-    """Markdown to HTML for pandoc, with marks for formulas and captions, and with our labels."""
+    """Markdown to HTML for pandoc, with our labels, and with marks for formulas, for captions and for
+    paragraphs that end with a colon."""
 
     def block_math(self, body):
         mark = self.inline_math(TAG.sub("", body, count=1), display=True)
@@ -223,15 +246,17 @@ class _Renderer(Renderer):
         return mark
 
     def heading(self, text, level, **_):
-        plain = html.unescape(re.sub("<[^>]*>", "", MARK.sub("", text))).strip()
-        anchor = self.anchor(plain.replace(" ", "-"))
+        anchor = self.named(text)
         if level == 1 and not self.page["titled"]:
             self.page["titled"], anchor = True, ""
         return f'<h{level} id="{_label(self.page["file"], anchor)}">{text}</h{level}>\n'
 
     def paragraph(self, text):
-        if CAPTION.match(re.sub("<[^>]*>", "", text)):
-            return f"<p>\ue004{text}\ue005</p>\n"
+        if caption := CAPTION.match(re.sub("<[^>]*>", "", text)):
+            label = _label(self.page["file"], self.anchor(f"{caption[1].lower()}-{caption[2]}"))
+            return f"<p>\ue004{label}\ue006{text}\ue005</p>\n"
+        if text.rstrip().endswith(":"):
+            return f"<p>\ue007{text}\ue008</p>\n"
         return super().paragraph(text)
 
     def link(self, text, url, title=None):

@@ -18,8 +18,9 @@ from slamlib import cache, overview
 from slamlib.cover import Cover
 from slamlib.dataset import DatasetError, dataset_names, read_dataset, read_truth
 from slamlib.execution import NotebookError, execute, kernel_environment, read_notebook
-from slamlib.pages import chapter_of, html_page
-from slamlib.pdf import typeset
+from slamlib.numbering import numbered
+from slamlib.pages import chapter_of, html_pages
+from slamlib.pdf import typeset, without_glyph
 
 __all__ = ["NotebookError", "build_report"]
 
@@ -54,6 +55,10 @@ def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=
     start = time.monotonic()
     notebooks, data, report, results = (
         Path(folder).resolve() for folder in (notebooks, data, report, results))
+    for line, text in asdict(cover).items():
+        if missing := without_glyph(text):
+            raise DatasetError(f"title page: the PDF's fonts have no glyph for {missing[0]} in {line} "
+                               f"'{text}': write it in Latin, Greek or Cyrillic letters")
     sources = sorted(notebooks.glob("*.ipynb"))
     if not sources:
         raise DatasetError(f"{notebooks}: there are no notebooks (*.ipynb) in this folder")
@@ -66,16 +71,17 @@ def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=
         cells=[cell for cell in book.cells if cell.cell_type == "markdown"])
         for source, book in books.items()}, chapters, cover, code)  # fails before the long part
 
-    results.mkdir(parents=True, exist_ok=True)
+    for folder in (results, report):
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()  # fails before the long part, too
     books, written = _executed(books, data, results, datasets, selected, jobs, kept, fresh)
     drives = overview.read_drives(data, results, selected, written)
-    links = [(quote(os.path.relpath(results / name, report)), name) for name in sorted(written)
-             if name.split("/")[0] in selected and name.endswith(".mat")]
+    links = [(quote(os.path.relpath(results / name, report)), name) for drive in drives
+             for name in sorted(written) if name.startswith(f"{drive.name}/") and name.endswith(".mat")]
     index = overview.index(overview.summary(overview.plain(cover.title), drives), chapters, links)
     opening = overview.summary("Overview", drives)
-    files = _set({Path("index"): index, **books}, chapters, cover, code, opening)
+    files = _set({Path("index"): index, **numbered(books)}, chapters, cover, code, opening)
 
-    report.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".", dir=report) as beside:
         for name, content in files.items():
             Path(beside, name).write_bytes(content)
@@ -116,8 +122,7 @@ def _executed(books, data, results, datasets, selected, jobs, kept, fresh):
 
 def _set(books, chapters, cover, code, opening=None):
     """Names and contents of the report's files: a page for each book, and the PDF."""
-    files = {f"{source.stem}.html": html_page(source, book, chapters, code).encode()
-             for source, book in books.items()}
+    files = {name: page.encode() for name, page in html_pages(books, chapters, code).items()}
     parts = [(source, book) for source, book in books.items() if source.suffix]
     files["report.pdf"] = typeset(parts, opening, code, **asdict(cover))
     return files

@@ -41,3 +41,12 @@ def test_a_mistake_is_told_with_its_line_and_nothing_is_written(tmp_path, monkey
     told = capsys.readouterr().err
     assert f"report.toml{place}: " in told and expected in told and told.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["report.toml"]
+
+
+def test_a_name_that_the_fonts_cannot_write_is_told(tmp_path, monkeypatch, capsys):
+    (tmp_path / "notebooks").mkdir()
+    (tmp_path / "notebooks" / "1.ipynb").write_text("never read")
+    monkeypatch.chdir(tmp_path)
+    assert main(["report", "--author", "陳大文"]) == 2
+    told = capsys.readouterr().err
+    assert "no glyph for 大 in author '陳大文'" in told and told.count("\n") == 1

@@ -49,15 +49,17 @@ def test_the_section_runs_after_the_first_code_cell_alone_and_gives_a_page_one_p
 
 
 @pytest.mark.parametrize("source", NOTEBOOKS, ids=lambda path: path.stem)
-def test_explore_is_the_last_section_and_its_figure_has_the_next_number(source):
+def test_explore_is_the_last_section_and_figures_and_tables_are_numbered_in_order(source):
     cells = nbformat.read(source, as_version=4).cells
     headings = [heading for cell in cells if cell.cell_type == "markdown"
                 for heading in re.findall(r"^## (.+)$", cell.source, re.MULTILINE)]
     assert headings[-1] == "Explore"
-    numbers = [int(n) for cell in cells for n in re.findall(r"^Figure (\d+)\.", re.sub(
-        r'^\s*say\("', "", cell.source, flags=re.MULTILINE), re.MULTILINE)]
-    assert numbers == list(range(1, len(numbers) + 1))
-    assert cells[-1].cell_type == "markdown" and cells[-1].source.startswith(f"Figure {numbers[-1]}.")
+    for kind in ("Figure", "Table"):
+        numbers = re.findall(rf'^(?:.*")?{kind} (\d+\.\d+)\. ', "\n".join(cell.source for cell in cells),
+                             re.MULTILINE)
+        assert numbers == [f"{source.name[0]}.{n}" for n in range(1, len(numbers) + 1)] and len(numbers) > 3
+        if kind == "Figure":
+            assert cells[-1].source.startswith(f"Figure {numbers[-1]}.")
 
 
 def test_a_moved_slider_draws_anew_with_all_values(monkeypatch):

@@ -155,7 +155,7 @@ def test_figures_are_embedded_and_described(built):
     assert [source.split(";")[0] for source in page.loads] == ["data:image/svg+xml",
                                                                "data:image/png"]
     assert all(page.alts)
-    assert '<p class="caption"><strong>Figure 1.</strong> A line.</p>' in page.text
+    assert '<p class="caption" id="figure-1"><strong>Figure 1.</strong> A line.</p>' in page.text
 
 
 def test_contents_titles_and_links(built):
@@ -209,6 +209,7 @@ def test_a_failing_cell_is_named_and_leaves_the_old_report(tmp_path):
     (r"Before $\nonsense{x}$ after", r"\nonsense"),
     (r"$$ a \tag{1} \tag{2} $$", r"\tag{2}"),
     (r"$\begin{array}{c|c} a & b \end{array}$", "would be lost"),
+    ("[text](#Nowhere)", "there is no #Nowhere in 1_text.ipynb, where 'text' leads"),
     ("![](https://example.org/picture.png)", "would load something"),
     ("<script>alert(1)</script>", "would load something"),
 ])
@@ -217,8 +218,24 @@ def test_what_cannot_be_set_is_refused_before_a_kernel_starts(tmp_path, text, re
     write(tmp_path / "notebooks", "1_text", text, ("raise SystemExit",))
     with pytest.raises(NotebookError, match=re.escape(reason)) as caught:
         build(tmp_path)
-    assert str(caught.value).startswith("1_text.ipynb: ")
+    assert str(caught.value).startswith("1_text.ipynb")
     assert not (tmp_path / "report").exists() and not (tmp_path / "results").exists()
+
+
+def test_what_is_shown_must_fit_together_in_the_executed_notebooks(tmp_path):
+    make_data(tmp_path)
+    write(tmp_path / "notebooks", "1_text", "# 1. Text\n\nIn figure 1.4 is it; so says [the next](2_b.ipynb).",
+          ("import matplotlib.pyplot as plt\nfrom slamlib.notebook import captioned\n"
+           "%config InlineBackend.figure_formats = ['svg']\n"
+           "captioned(plt.plot(1)[0].figure, 'Figure 1.4. Nothing.')",))
+    page = Page(build(tmp_path)[1])
+    assert re.search(r'</figure>\s*<div class="output"><p class="caption" id="figure-1.1">Figure 1.1. No', page.text)
+    assert page.links.count("#figure-1.1") == 1 and page.count["img"] == 1
+    assert "2_b" not in page.text and "so says the next." in page.text  # which is not there to link to
+    write(tmp_path / "notebooks", "1_text", "# 1. Text\n\nIn figure 1.5 is nothing.")
+    with pytest.raises(NotebookError, match="1_text.ipynb: the text names figure 1.5, which is not there"):
+        build(tmp_path)
+    assert "Figure 1.1." in Page(tmp_path / "report" / "1_text.html").text  # the old report is left
 
 
 def test_missing_folders_and_names_are_told_in_one_sentence(tmp_path):

@@ -1,0 +1,78 @@
+"""Figures, tables and equations: numbers without gaps, links to what is named, and no caption astray."""
+
+from pathlib import Path
+
+import pytest
+from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_output
+
+from slamlib.execution import NotebookError
+from slamlib.numbering import numbered
+
+FIRST, SECOND = Path("1_first.ipynb"), Path("2_second.ipynb")
+TABLE = "| a | b |\n| --- | --- |\n| 1 | 2 |\n\n"
+
+
+def figure(*captions):
+    """A cell that shows a picture, and then these texts."""
+    return new_code_cell("draw()", outputs=[
+        new_output("display_data", {"image/svg+xml": "<svg/>", "text/plain": "<Figure>"}),
+        *(new_output("display_data", {"text/markdown": text, "text/plain": "<M>"}) for text in captions)])
+
+
+def texts(book):
+    """All Markdown of a book, in order."""
+    return [text for cell in book.cells for text in (
+        [cell.source] if cell.cell_type == "markdown" else
+        [o.data["text/markdown"] for o in cell.outputs if "text/markdown" in o.data])]
+
+
+def after(*cells):
+    """The texts of the first chapter with these cells, numbered."""
+    return texts(numbered({FIRST: new_notebook(cells=list(cells))})[FIRST])
+
+
+def test_gaps_are_closed_and_references_follow():
+    assert after(figure(), new_markdown_cell("Figure 1.2. One; compare figure 1.5.\n\nSee figures 1.2 and 1.5."),
+                 figure("Figure 1.5. Two."), new_markdown_cell(TABLE + "Table 1.4. A table.\n\nIn table 1.4 is it.")
+                 ) == ["Figure 1.1. One; compare figure [1.2](#figure-1.2).\n\n"
+                       "See figures [1.1](#figure-1.1) and [1.2](#figure-1.2).",
+                       "Figure 1.2. Two.", TABLE + "Table 1.1. A table.\n\nIn table [1.1](#table-1.1) is it."]
+
+
+def test_numbers_that_swap_their_meaning_are_not_replaced_twice():
+    assert after(figure("Figure 1.2. A."), figure("Figure 1.1. B, not figure 1.2.")) == [
+        "Figure 1.1. A.", "Figure 1.2. B, not figure [1.1](#figure-1.1)."]
+
+
+def test_another_chapter_is_linked_by_its_file():
+    books = {FIRST: new_notebook(cells=[figure("**Figure 1.3.** A."), new_markdown_cell("$$ x \\tag{2} $$")]),
+             SECOND: new_notebook(cells=[new_markdown_cell(
+                 "$$ y \\tag{2.1} $$\n\nBy figure 1.3, equation 2.1 and equation 2. Equation 2's, equation 4.")])}
+    done = numbered(books)
+    assert texts(done[SECOND])[0].endswith(
+        "By figure [1.1](1_first.ipynb#figure-1.1), equation [2.1](#eq-2.1) and equation "
+        "[2](1_first.ipynb#eq-2). Equation [2](1_first.ipynb#eq-2)'s, equation 4.")
+    assert texts(done[FIRST])[0] == "**Figure 1.1.** A."
+    assert texts(books[FIRST])[0] == "**Figure 1.3.** A."  # the books themselves are left as they are
+
+
+@pytest.mark.parametrize("text", [
+    "`figure 1.9`, $figure 1.9$ and\n\n```\nfigure 1.9\n\nFigure 1.8. No caption.\n```", "Figure 1. By hand, figure 7.",
+    "the assignment's table 2, 2.5 m, a [table](x.html#table 1.9)", "$$ figure 1.9 $$"])
+def test_what_is_no_reference_is_left_alone(text):
+    assert after(new_markdown_cell(text)) == [text]
+
+
+@pytest.mark.parametrize("cells, reason", [
+    ([new_markdown_cell("See figure 1.2.")], "the text names figure 1.2, which is not there"),
+    ([new_markdown_cell("By equation 1.2.")], "the text names equation 1.2, which is not there"),
+    ([figure("Figure 1.1. A."), figure("Figure 1.1. B.")], "figure 1.1 is there twice"),
+    ([new_markdown_cell("$$ a \\tag{3} $$ and $$ b \\tag{3} $$")], "equation 3 is there twice"),
+    ([figure(), new_markdown_cell("Text.\n\nFigure 1.1. Late.")], "the caption of figure 1.1 does not stand"),
+    ([figure(), new_code_cell("x"), new_markdown_cell("Figure 1.1. Late.")], "the caption of figure 1.1 does not"),
+    ([figure("Figure 1.1. A.", "Figure 1.2. Another of the same.")], "the caption of figure 1.2 does not"),
+    ([figure("Table 1.1. No table.")], "the caption of table 1.1 does not stand directly below a table"),
+])
+def test_what_does_not_fit_together_is_refused(cells, reason):
+    with pytest.raises(NotebookError, match=rf"1_first.ipynb: {reason}"):
+        after(*cells)
