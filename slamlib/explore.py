@@ -82,13 +82,14 @@ def wheels(log, right, left, base, sigma_radii, sigma_base, probability, count):
     (plan,), (side,) = axes
     plotting.trajectory(plan, poses, "odometry", "nominal wheels")
     plotting.ellipses(plan, poses[at], covariances[at], color, probability / 100, name)
-    plotting.trajectory(plan, other, "exact", "wheels of the sliders")
+    plotting.trajectory(plan, other, "alternative", "wheels of the sliders")
     plan.set_title(log.name)
     k = np.sqrt(-2 * np.log(1 - probability / 100))
     longest = k * np.sqrt(np.linalg.eigvalsh(covariances[:, :2, :2])[:, 1])
     side.fill_between(np.arange(len(poses)) + 1, longest, color=color, alpha=0.18, linewidth=0,
                        label="its longer half-axis")
-    plotting.curve(side, np.hypot(*(other - poses)[:, :2].T), "exact", label="wheels of the sliders")
+    plotting.curve(side, np.hypot(*(other - poses)[:, :2].T), "alternative",
+                   label="wheels of the sliders")
     if log.truth is not None:
         plotting.trajectory(plan, log.truth.poses, "truth")
         plotting.curve(side, np.hypot(*(log.truth.poses - poses)[:, :2].T), "truth")
@@ -166,9 +167,9 @@ def graphs(seed, slip, assumed, wrong, kernel, start):
     fig, axes = plotting.panels(2, height=4.0)
     (plan,), (side,) = axes
     plotting.trajectory(plan, truth.poses, "truth")
-    plotting.trajectory(plan, poses, "hint", "single kernel")
+    plotting.trajectory(plan, poses, "alternative", "single kernel")
     plotting.trajectory(plan, solved.poses, "slam", "rounds of kernels")
-    for marker, in_world, role in ((graph.marker, markers, "hint"),
+    for marker, in_world, role in ((graph.marker, markers, "alternative"),
                                    (solved.marker, solved.marker_in_world, "slam")):
         true = truth.marker_in_world[np.searchsorted(truth.marker, marker)]
         ends = np.stack([true[:, :2], in_world[:, :2]])
@@ -178,7 +179,7 @@ def graphs(seed, slip, assumed, wrong, kernel, start):
     plan.set_aspect("equal", adjustable="box")               # and what is far off is cut off
     plan.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     plan.set_title(f"{len(solved.outlier)} sightings")
-    _error(side, poses, truth.poses[graph.frame], "hint", "single kernel", at=graph.frame)
+    _error(side, poses, truth.poses[graph.frame], "alternative", "single kernel", at=graph.frame)
     _error(side, solved.poses, truth.poses, "slam", "rounds of kernels")
     nees = evaluation.anees(solved.poses, solved.covariances, truth.poses)
     side.set_title(f"rounds: {np.count_nonzero(solved.outlier)} left out, NEES {nees:.1f}")
@@ -207,7 +208,8 @@ def ranges(seed, late, off, poses, way):
     fig, axes = plotting.panels(2, height=4.0)
     (plan,), (side,) = axes
     plotting.trajectory(plan, true_poses, "truth")
-    for found, role, label in ((chosen, "hint", "kernel of the sliders"), (solved, "slam", "solver")):
+    for found, role, label in ((chosen, "alternative", "kernel of the sliders"),
+                               (solved, "slam", "solver")):
         plotting.trajectory(plan, found.poses, role, label)
         ends = np.stack([guess[np.searchsorted(truth.antenna, found.antenna)], found.antenna_in_world])
         plan.plot(ends[..., 0], ends[..., 1], color=plotting.ROLES[role]["color"], linewidth=1.2)

@@ -5,7 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib.pyplot as plt
+from IPython.core.interactiveshell import InteractiveShell
 from IPython.display import Markdown, display
+from matplotlib.figure import Figure
 from matplotlib_inline.backend_inline import set_matplotlib_formats
 
 from slamlib import plotting
@@ -46,12 +48,22 @@ def start():
         A dataset is not as it must be, or there is none.
     """
     plotting.use_style()
-    set_matplotlib_formats("svg", metadata={"Date": None})
+    _show_figures()
     data = _folder("SLAMLIB_DATA", "data")
     selected = os.environ.get("SLAMLIB_DATASETS")
     names = dataset_names(data, selected.split("\n") if selected else None)
     logs = [Log(name, read_dataset(data / name), read_truth(data / name)) for name in names]
     return sorted(logs, key=lambda log: len(log.dataset.ticks))
+
+
+def _show_figures():
+    """As SVG in JupyterLab; where the report is built, wide and narrow, for its pages to choose from."""
+    if interactive():
+        set_matplotlib_formats("svg", metadata={"Date": None})
+    else:
+        set_matplotlib_formats()
+        InteractiveShell.instance().display_formatter.mimebundle_formatter.for_type(
+            Figure, lambda fig, **_: plotting.pictures(fig))
 
 
 def results_folder(log):

@@ -5,7 +5,6 @@ All numbers come from the files to hand in, and from the truth where there is tr
 
 import re
 from dataclasses import dataclass
-from io import StringIO
 from pathlib import Path
 from urllib.parse import quote
 
@@ -97,7 +96,7 @@ def summary(title, drives):
         cells.append(new_markdown_cell("## The results\n\n" + _headline(drives), id="results"))
         longest = max((drive for drive in drives if drive.solutions),
                       key=lambda drive: len(drive.dataset.ticks))
-        picture = new_output("display_data", {"image/svg+xml": _picture(longest)})
+        picture = new_output("display_data", _pictures(longest))
         cells += [new_code_cell(outputs=[picture], id="picture", metadata={
                       "alt": f"The trajectories of {longest.name}, laid over each other"}),
                   new_markdown_cell(f"Figure 1. The trajectories of {plain(longest.name)}, "
@@ -132,7 +131,7 @@ def _datasets(drives):
     for drive in drives:
         d = drive.dataset
         path = evaluation.path_length(odometry.dead_reckoning(d.ticks, d.vehicle))
-        rows.append([plain(drive.name), f"{len(d.ticks):,}", f"{path:.1f} m", _count(d.aruco),
+        rows.append([plain(drive.name), f"{len(d.ticks):,}", f"{path:.1f}\u00a0m", _count(d.aruco),
                      _count(d.uwb), "known" if drive.truth else "not known"])
     header = ["dataset", "poses", "path", "sightings of markers", "UWB ranges", "truth"]
     return (table_text(header, rows, texts=2)
@@ -150,12 +149,12 @@ def _headline(drives):
     for drive in drives:
         solved = {solution.problem: solution for solution in drive.solutions}
         rows += [_row(drive, problem, solved.get(problem)) for problem in problems]
-    text = table_text(["dataset", "problem", "poses", "σ of position", "σ of heading", "ATE",
-                       "ATE, aligned"], rows, texts=2)
-    text += ("\n\nTable 2. Every problem on every dataset: how many poses have an estimate; at the "
-             "last of them the larger standard deviation of $x$ and $y$, and that of the heading; and "
-             "the root mean square error of all positions (ATE), as they stand and moved as a whole "
-             "nearest to the truth.")
+    text = table_text(["dataset", "problem", "ATE", "ATE, aligned", "σ of position", "σ of heading",
+                       "poses"], rows, texts=2)
+    text += ("\n\nTable 2. Every problem on every dataset: the root mean square error of all positions "
+             "(ATE), as they stand and moved as a whole nearest to the truth; at the last pose that has "
+             "an estimate the larger standard deviation of $x$ and $y$, and that of the heading; and how "
+             "many poses have one.")
     if without := [plain(drive.name) for drive in drives if drive.truth is None]:
         text += f"\n\nNo truth comes with {listed(without)}, so errors are not known there."
     for sensor, (name, _) in NEEDS.items():
@@ -173,16 +172,14 @@ def _row(drive, problem, solution):
         return [*row, f"left out: no {' and no '.join(lacking)}" if lacking else "no result",
                 *["–"] * 4]
     known = np.flatnonzero(np.isfinite(solution.poses[:, 0]))
-    row.append(f"{len(known):,}")
     if not len(known):
-        return [*row, *["–"] * 4]
+        return [*row, *["–"] * 4, "0"]
+    errors = ["no truth"] * 2
+    if drive.truth is not None:
+        truth = truth_in_world_of(solution, drive.truth)
+        errors = [_si(evaluation.ate(solution.poses, truth, aligned), "m") for aligned in (False, True)]
     sigma = evaluation.sigmas(solution.covariances[known[-1]])
-    row += [_si(max(sigma[:2]), "m"), _si(sigma[2], "rad")]
-    if drive.truth is None:
-        return [*row, "no truth", "no truth"]
-    truth = truth_in_world_of(solution, drive.truth)
-    return row + [_si(evaluation.ate(solution.poses, truth, aligned), "m")
-                  for aligned in (False, True)]
+    return [*row, *errors, _si(max(sigma[:2]), "m"), _si(sigma[2], "rad"), f"{len(known):,}"]
 
 
 def _si(value, unit):
@@ -198,8 +195,8 @@ def _overlaid(drive):
             "differ by is in table 2.")
 
 
-def _picture(drive):
-    """The trajectories of a drive over each other, in the world frame of pose 1, as SVG text."""
+def _pictures(drive):
+    """The trajectories of a drive over each other, in the world frame of pose 1, as SVG texts."""
     style = Path(plotting.__file__).with_name("slamlib.mplstyle")
     with plt.style.context(style, after_reset=True):
         fig = Figure(figsize=(7.2, 3.8))
@@ -212,8 +209,7 @@ def _picture(drive):
                 poses = solution.poses
                 if solution.world and np.isfinite(last[solution.world, 0]):
                     poses = se2.compose(last[solution.world], poses)
-                plotting.trajectory(ax, poses, ROLES.get(solution.problem, "exact"), solution.title)
+                plotting.trajectory(ax, poses, ROLES.get(solution.problem, "alternative"),
+                                    solution.title)
         plotting.legend_below(fig)
-        text = StringIO()
-        fig.savefig(text, format="svg", metadata={"Date": None})
-    return text.getvalue()
+        return plotting.pictures(fig)

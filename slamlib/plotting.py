@@ -9,24 +9,28 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
+from IPython.core.pylabtools import print_figure
 from matplotlib.collections import EllipseCollection
 from matplotlib.colors import to_rgb
 from matplotlib.patches import Annulus
 
 from slamlib import se2
 
-# Okabe and Ito's colours, told apart by the colour-blind; line style and width carry grey print.
+# Okabe and Ito's colours and Tol's, told apart by the colour-blind; line style and width carry grey print.
 ROLES = {
     "truth": dict(color="black", linestyle=(0, (4, 2)), linewidth=1.1, zorder=4),
     "odometry": dict(color="#D55E00", linewidth=1.5, zorder=3),
-    "exact": dict(color="#0072B2", linewidth=1.5, zorder=3),
+    "exact": dict(color="#332288", linewidth=1.5, zorder=3),
     "sample": dict(color="#999999", linewidth=1.0, zorder=1),
-    "aruco": dict(color="#CC79A7", linewidth=1.5, zorder=3),
-    "fused": dict(color="#009E73", linewidth=1.7, zorder=3),
+    "aruco": dict(color="#CC79A7", linestyle=(0, (1.2, 0.8)), linewidth=1.7, zorder=3),
+    "fused": dict(color="#009E73", linestyle=(0, (4.5, 1.2)), linewidth=1.8, zorder=3),
     "hint": dict(color="#E69F00", linestyle=(0, (5, 1, 1, 1)), linewidth=1.5, zorder=3),
     "marker": dict(color="#333333", linestyle="none", marker="s", markersize=3, zorder=3),
-    "slam": dict(color="#0072B2", linewidth=1.7, zorder=3),
+    "slam": dict(color="#0072B2", linewidth=2.0, zorder=3),
     "slam_uwb": dict(color="#56B4E9", linestyle=(0, (6, 1.5)), linewidth=2.2, zorder=3.2),
+    "arc": dict(color="#333333", linewidth=1.7, zorder=3),
+    "euler": dict(color="#888888", linestyle=(0, (3, 1.5)), linewidth=1.7, zorder=3),
+    "alternative": dict(color="#882255", linestyle=(0, (5, 1, 1, 1)), linewidth=1.5, zorder=3),
     "antenna": dict(color="#222222", linestyle="none", marker="^", markersize=6, zorder=5),
     "guess": dict(color="#222222", linestyle="none", marker="^", markersize=7, zorder=4,
                   markerfacecolor="none"),
@@ -39,6 +43,9 @@ COMPARED = {
     "odometry": dict(linewidth=3.2, alpha=0.75),
     "exact": dict(linestyle=(0, (4, 2)), linewidth=1.5, zorder=4),
 }
+
+WIDE, NARROW = "image/svg+xml", "image/svg+xml;layout=narrow"    # what `pictures` makes
+NARROW_WIDTH = 3.9                                               # inches, of a phone's column
 
 
 def use_style():
@@ -53,12 +60,41 @@ def panels(count, rows=1, height=3.4, width=3.7, columns=2):
     """
     columns = min(columns, count)
     lines = -(-count // columns)
-    fig, axes = plt.subplots(lines * rows, columns, squeeze=False,
-                             figsize=(max(width * columns, 5.0), height * lines))
-    axes = axes.reshape(lines, rows, columns).swapaxes(1, 2).reshape(-1, rows)
-    for ax in axes[count:].ravel():
-        ax.set_visible(False)
-    return fig, axes[:count]
+    fig = plt.figure(figsize=(max(width * columns, 5.0), height * lines))
+    grid = fig.add_gridspec(lines * rows, columns)
+    return fig, np.array([[fig.add_subplot(grid[panel // columns * rows + row, panel % columns])
+                           for row in range(rows)] for panel in range(count)])
+
+
+def narrow(fig, width=NARROW_WIDTH):
+    """Put a figure's axes below each other, panel by panel, for a phone: in place.
+
+    Panels keep their height in inches, but what is much wider than `width` becomes less high.
+    """
+    axes = [ax for ax in fig.axes if ax.get_visible() and ax.get_subplotspec()]
+    if not axes:
+        return
+    rows, columns = axes[0].get_gridspec().get_geometry()
+    wide, high = fig.get_size_inches()
+    height = high / rows * min(1, np.sqrt(width * columns / wide))
+    grid = fig.add_gridspec(len(axes), 1)
+    for ax, place in zip(axes, grid):
+        ax.set_subplotspec(place)
+    fig.set_size_inches(width, height * len(axes))
+    if fig.legends:
+        fig.legends[0].remove()
+        legend = legend_below(fig)
+        fig.set_size_inches(width, height * len(axes) + legend.get_window_extent().height / fig.dpi)
+
+
+def pictures(fig):
+    """A figure as SVG text by MIME type: as it is, and `narrow`, as which it is left."""
+    texts = {}
+    for kind in (WIDE, NARROW):
+        if kind == NARROW:
+            narrow(fig)
+        texts[kind] = print_figure(fig, "svg", metadata={"Date": None})
+    return texts
 
 
 def trajectory(ax, poses, role, label=None, **look):
@@ -206,13 +242,18 @@ def farthest(poses):
 
 
 def legend_below(fig):
-    """One legend for all axes of a figure, below them: each label once."""
+    """One legend for all axes of a figure, below them: each label once, in as few lines as fit."""
     entries = {}
     for ax in fig.axes:
         entries |= {label: handle for handle, label in zip(*ax.get_legend_handles_labels())
                     if label not in entries}
-    fig.legend(entries.values(), entries.keys(), loc="outside lower center",
-               ncols=min(3 if len(entries) in (5, 6) else 4, len(entries)))
+    for most in range(4, 0, -1):
+        lines = -(-len(entries) // most)
+        legend = fig.legend(entries.values(), entries.keys(), loc="outside lower center",
+                            ncols=-(-len(entries) // lines))
+        if most == 1 or legend.get_window_extent().width <= fig.bbox.width:
+            return legend
+        legend.remove()
 
 
 def states(axes, poses, covariances, role, label=None):

@@ -45,7 +45,7 @@ def test_the_section_runs_after_the_first_code_cell_alone_and_gives_a_page_one_p
     _, *section = nbformat.read(tmp_path / "book.ipynb", as_version=4).cells
     shown = [set(output.get("data", {output.output_type: ""})) - {"text/plain"}
              for cell in section for output in cell.outputs]
-    assert shown == [{"image/svg+xml"}]
+    assert shown == [{plotting.WIDE, plotting.NARROW}]
 
 
 @pytest.mark.parametrize("source", NOTEBOOKS, ids=lambda path: path.stem)
@@ -124,7 +124,8 @@ def test_the_single_kernel_misplaces_markers_that_start_at_a_wrong_label():
         left, _ = explore.graphs(1, 1.0, 1.0, 5, kernel, start).axes
         lines = [line for line in left.lines if len(line.get_xydata()) == 2]      # marker by marker
         return [max(np.hypot(*np.diff(line.get_xydata(), axis=0)[0]) for line in lines
-                    if line.get_color() == plotting.ROLES[role]["color"]) for role in ("hint", "slam")]
+                    if line.get_color() == plotting.ROLES[role]["color"])
+                for role in ("alternative", "slam")]
 
     single, rounds = worst("first sighting", "3 σ")
     assert single > 1.0 and rounds < 0.1
