@@ -1,8 +1,9 @@
-"""Executed notebooks, kept until something changes that they depend on.
+"""Executed notebooks, kept until something changes that they depend on, a few versions of each.
 
 A notebook is executed again when its cells, slamlib's code (but for what only makes the pages), a
 package, a file of the selected datasets, a file beside the notebook or a variable of its environment is
-another than it was, and when a result that it wrote is no longer as it wrote it.
+another than it was, and when a result that it wrote is no longer as it wrote it. What it was before is
+still kept, so that another selection of datasets and then the first one again cost one execution.
 """
 
 import hashlib
@@ -21,6 +22,8 @@ VARIABLES = ("SLAMLIB_", "PYTHON", "MPL", "OMP_", "OPENBLAS_", "MKL_", "LANG", "
 
 # Modules that make pages of what notebooks have shown, and are not imported by them.
 PRESENTATION = ("cache", "cover", "execution", "overview", "pages", "pdf", "report", "__main__")
+
+VERSIONS = 4  # of a notebook, those that were used last
 
 
 def fingerprint(datasets, beside, environment):
@@ -55,16 +58,16 @@ def key_of(source, book, common):
 
 def recall(folder, source, key, results):
     """The executed notebook and the names of its results, or None if it must be executed again."""
+    place = _place(folder, source, key)
     try:
-        digest, _, content = _place(folder, source).read_bytes().partition(b"\n")
+        digest, _, content = place.read_bytes().partition(b"\n")
         if digest.decode("ascii", "replace") != _digest(content):
             return None
         kept = json.loads(content)
-        if kept["key"] != key:
-            return None
         for name, expected in kept["results"].items():
             if _digest((results / name).read_bytes()) != expected:
                 return None
+        place.touch()
     except OSError:
         return None
     return nbformat.reads(kept["book"], as_version=4), list(kept["results"])
@@ -73,13 +76,17 @@ def recall(folder, source, key, results):
 def keep(folder, source, key, book, results, names):
     """Keep an executed notebook, with the digests of the results (by name) that it wrote."""
     content = json.dumps({
-        "key": key, "book": nbformat.writes(book),
+        "book": nbformat.writes(book),
         "results": {name: _digest((results / name).read_bytes()) for name in names}}).encode()
-    write_atomically(_place(folder, source), _digest(content).encode() + b"\n" + content)
+    write_atomically(_place(folder, source, key), _digest(content).encode() + b"\n" + content)
+    versions = [file for file in Path(folder).glob("*.executed")
+                if file.name.rsplit(".", 2)[0] == source.stem]
+    for old in sorted(versions, key=lambda file: file.stat().st_mtime_ns)[:-VERSIONS]:
+        old.unlink()
 
 
-def _place(folder, source):
-    return Path(folder) / f"{source.stem}.executed"
+def _place(folder, source, key):
+    return Path(folder) / f"{source.stem}.{key}.executed"
 
 
 def _digest(content):
