@@ -4,7 +4,7 @@ import nbformat
 import pytest
 from test_report import make_data, write
 
-from slamlib import cache
+from slamlib import cache, studies
 from slamlib.report import build_report
 
 COUNTING = """import os
@@ -139,7 +139,7 @@ def test_slamlib_and_the_packages_are_among_what_matters(monkeypatch, tmp_path):
     before = cache.fingerprint([], tmp_path, {})
     monkeypatch.setattr(cache, "distributions", lambda: [])
     without_packages = cache.fingerprint([], tmp_path, {})
-    monkeypatch.setattr(cache, "__file__", str(tmp_path / "cache.py"))
+    monkeypatch.setattr(studies, "__file__", str(tmp_path / "studies.py"))
     assert len({before, without_packages, cache.fingerprint([], tmp_path, {})}) == 3
 
 
