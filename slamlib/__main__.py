@@ -44,7 +44,7 @@ def _parser():
     report.add_argument("--author", help="on the PDF's title page, instead of report.toml's")
     report.add_argument("--student-number", help="the same")
     report.add_argument("--fresh", action="store_true",
-                        help="execute all notebooks, also where nothing changed")
+                        help="execute all notebooks and studies, also where nothing changed")
     report.set_defaults(run=_report)
 
     solve = commands.add_parser("solve", help="solve a dataset's problems without notebooks")

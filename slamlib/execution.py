@@ -47,7 +47,8 @@ def kernel_environment(settings, data, datasets, jobs):
     environment |= {"SLAMLIB_DATA": str(data), "IPYTHONDIR": str(settings),
                     "MATPLOTLIBRC": str(settings / "matplotlibrc"),
                     "MPLBACKEND": "module://matplotlib_inline.backend_inline"}
-    environment.pop("SLAMLIB_DATASETS", None)
+    for name in ("SLAMLIB_DATASETS", "SLAMLIB_STUDIES"):
+        environment.pop(name, None)
     return environment | ({"SLAMLIB_DATASETS": "\n".join(datasets)} if datasets else {})
 
 
@@ -127,6 +128,7 @@ async def _execute(source, book, environment, slots, bar):
         tqdm.write(f"{source.stem}: {count} cells", file=sys.stderr)
         try:
             await client.async_execute(env=environment, cleanup_kc=True)
+            _join_printed(book)
         except (CellExecutionError, TimeoutError, RuntimeError) as error:
             if asyncio.current_task().cancelling():  # which nbclient takes for a dead kernel
                 raise asyncio.CancelledError from None
@@ -135,6 +137,19 @@ async def _execute(source, book, environment, slots, bar):
             if manager.has_kernel:
                 await manager.shutdown_kernel(now=True)
         tqdm.write(f"{source.stem}: done in {time.monotonic() - start:.1f} s", file=sys.stderr)
+
+
+def _join_printed(book):
+    """Make one output of what a cell printed in a row, which arrives in parts if it takes its time."""
+    for cell in book.cells:
+        joined = []
+        for output in cell.get("outputs", []):
+            if joined and "stream" == output.output_type and output.get("name") == joined[-1].get("name"):
+                joined[-1].text += output.text
+            else:
+                joined.append(output)
+        if "outputs" in cell:
+            cell.outputs = joined
 
 
 def _failure(source, started, error):

@@ -8,7 +8,7 @@ import numpy as np
 from joblib import Parallel, delayed
 from tqdm import tqdm
 
-from slamlib import fusion, initial, localization, odometry, slam
+from slamlib import fusion, initial, localization, odometry, slam, studies
 from slamlib.dataset import Vehicle
 from slamlib.evaluation import anees, ate, nees
 from slamlib.graph import State
@@ -17,16 +17,21 @@ from slamlib.ties import GATE_OF_POINTS
 
 
 def run(trial, seeds, jobs=2, progress=False, **options):
-    """Run trial(seed, **options) for all seeds, in `jobs` processes.
+    """Run trial(seed, **options) for all seeds, in `jobs` processes, or recall what it gave (`studies`).
 
     Returns
     -------
     dict of (s,) arrays, one for each number that the trial returns.
     """
     seeds = list(seeds)
+    place = studies.place(trial, seeds, options)
+    if (kept := studies.recall(place)) is not None:
+        return kept
     rows = list(tqdm(Parallel(n_jobs=jobs, return_as="generator")(
         delayed(trial)(seed, **options) for seed in seeds), total=len(seeds), disable=not progress))
-    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    numbers = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    studies.keep(place, numbers)
+    return numbers
 
 
 def markers_alone(seed, **options):

@@ -14,7 +14,7 @@ from urllib.parse import quote
 
 import nbformat
 
-from slamlib import cache, overview
+from slamlib import cache, overview, studies
 from slamlib.cover import Cover
 from slamlib.dataset import DatasetError, dataset_names, read_dataset, read_truth
 from slamlib.execution import NotebookError, execute, kernel_environment, read_notebook
@@ -40,8 +40,8 @@ def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=
     datasets, jobs : names, or None for all; number of notebooks executed at a time.
     cover : Cover, the title page of the PDF.
     code : False leaves out code cells and printed text, on the pages and in the PDF.
-    kept : folder of executed notebooks, which are executed again only if something changed that
-        they depend on, or None; `fresh` executes all of them, and keeps them.
+    kept : folder of executed notebooks, and of their Monte Carlo studies, which are executed again
+        only if something changed that they depend on, or None; `fresh` executes all, and keeps them.
 
     Returns
     -------
@@ -115,7 +115,11 @@ def _executed(books, data, results, datasets, selected, jobs, kept, fresh):
                 done[source], names = found
                 written.extend(names)
                 print(f"{source.stem}: nothing changed, not executed again", file=sys.stderr)
-        execute({source: book for source, book in books.items() if source not in done}, environment,
+        folder = None if kept is None else Path(kept, "studies").resolve()
+        if folder and fresh:
+            studies.forget(folder)
+        execute({source: book for source, book in books.items() if source not in done},
+                environment | ({"SLAMLIB_STUDIES": str(folder)} if folder else {}),
                 results, max(1, jobs), finish)
     return {source: done[source] for source in books}, sorted(set(written))
 

@@ -1,4 +1,7 @@
-"""Before numpy is imported: matrices are small, and more threads only wait for each other."""
+"""Before numpy is imported: matrices are small, and more threads only wait for each other.
+
+No study is recalled that was kept before the tests.
+"""
 
 import os
 import shutil
@@ -7,6 +10,7 @@ from pathlib import Path
 import pytest
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.pop("SLAMLIB_STUDIES", None)
 
 ROOT = Path(__file__).parents[1]
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")

@@ -4,7 +4,7 @@ import nbformat
 import pytest
 from test_report import make_data, write
 
-from slamlib import cache
+from slamlib import cache, studies
 from slamlib.report import build_report
 
 COUNTING = """import os
@@ -61,6 +61,31 @@ def test_a_changed_dataset_executes_all_and_fresh_does_so_without_a_change(proje
     assert build(project, datasets=["short"]) == (3, 3)
 
 
+def test_another_selection_and_back_executes_each_notebook_once_for_each(project):
+    assert build(project, datasets=["short"]) == (1, 1)
+    first = [file.read_bytes() for file in sorted((project / "report").iterdir())]
+    assert build(project) == (2, 2)
+    assert build(project, datasets=["short"]) == build(project) == (2, 2)
+    build(project, datasets=["short"])
+    assert [file.read_bytes() for file in sorted((project / "report").iterdir())] == first
+    (project / "results" / "short" / "a.mat").write_text("changed")       # is neither's any more
+    assert build(project, datasets=["short"]) == (3, 2)
+    assert build(project) == (3, 2)
+
+
+def test_the_versions_used_last_are_kept_and_other_notebooks_are_left_alone(tmp_path):
+    kept, book = tmp_path / "kept", nbformat.v4.new_notebook()
+    sources = [tmp_path / name for name in ("a.ipynb", "a.b.ipynb", "[a].ipynb")]
+    for source in sources:
+        cache.keep(kept, source, "0", book, tmp_path, [])
+    for key in "1234":
+        assert cache.recall(kept, sources[0], "0", tmp_path)              # is used, and therefore stays
+        cache.keep(kept, sources[0], key, book, tmp_path, [])
+    assert [key for key in "01234" if cache.recall(kept, sources[0], key, tmp_path)] == list("0234")
+    assert all(cache.recall(kept, source, "0", tmp_path) for source in sources[1:])
+    assert len(list(kept.iterdir())) == cache.VERSIONS + 2
+
+
 @pytest.fixture
 def kept(tmp_path):
     """A notebook that is kept with one result; returns a function that recalls it."""
@@ -88,13 +113,18 @@ def test_variables_that_matter_are_seen(kept, variable):
     assert kept(**{variable: "x"}) is None
 
 
+def executed(folder):
+    """The only executed notebook that is kept in this folder."""
+    file, = (folder / "kept").glob("*.executed")
+    return file
+
+
 @pytest.mark.parametrize("change", [
-    lambda folder: (folder / "kept" / "a.executed").unlink(),
-    lambda folder: (folder / "kept" / "a.executed").write_bytes(b"\xff\x00 not this"),
-    lambda folder: (folder / "kept" / "a.executed").write_bytes(
-        (folder / "kept" / "a.executed").read_bytes()[:-9]),
-    lambda folder: (folder / "kept" / "a.executed").write_bytes(
-        (folder / "kept" / "a.executed").read_bytes().replace(b"1 + 1", b"1 + 2")),
+    lambda folder: executed(folder).unlink(),
+    lambda folder: executed(folder).write_bytes(b"\xff\x00 not this"),
+    lambda folder: executed(folder).write_bytes(executed(folder).read_bytes()[:-9]),
+    lambda folder: executed(folder).write_bytes(
+        executed(folder).read_bytes().replace(b"1 + 1", b"1 + 2")),
     lambda folder: (folder / "a.mat").write_text("another"),
     lambda folder: (folder / "data" / "new.txt").write_text("new"),
     lambda folder: (folder / "helper.py").write_text("read by a notebook"),
@@ -109,7 +139,7 @@ def test_slamlib_and_the_packages_are_among_what_matters(monkeypatch, tmp_path):
     before = cache.fingerprint([], tmp_path, {})
     monkeypatch.setattr(cache, "distributions", lambda: [])
     without_packages = cache.fingerprint([], tmp_path, {})
-    monkeypatch.setattr(cache, "__file__", str(tmp_path / "cache.py"))
+    monkeypatch.setattr(studies, "__file__", str(tmp_path / "studies.py"))
     assert len({before, without_packages, cache.fingerprint([], tmp_path, {})}) == 3
 
 

@@ -52,6 +52,14 @@ os.makedirs(folder, exist_ok=True)
 open(os.path.join(folder, "vehiclePose.mat"), "w").close()
 sys.executable"""
 
+PRINTING = """import time
+for word in "one", "two":
+    print(word)
+    time.sleep(0.5)
+print("three", file=sys.stderr)
+display("a picture", "and another")
+print("four")"""
+
 
 class Page(HTMLParser):
     """Counts the elements of a page, and keeps what it loads, names and links to."""
@@ -94,7 +102,7 @@ def built(tmp_path_factory):
     write(root / "notebooks", "1_odometry", TEXT, (OUTPUT,), (FIGURE.format("svg"),),
           "**Figure 1.** A line.", (FIGURE.format("png"),))
     write(root / "notebooks", "2_other", "# 2. Second\n\n## Sums\n\nNo formula.", (ENVIRONMENT,),
-          ("",))
+          ("",), (PRINTING,))
     spec = root / "kernels" / "python3" / "kernel.json"  # a kernel of the user that cannot run
     spec.parent.mkdir(parents=True)
     spec.write_text(json.dumps({"argv": ["false"], "display_name": "", "language": "python"}))
@@ -183,6 +191,14 @@ def test_kernels_see_the_folders_and_run_this_interpreter(built):
     assert '<pre class="output stderr">stderr is shown' in text
     assert re.search(r"\nshort\n?</pre>", text)
     assert "SLAMLIB_DATA" not in os.environ
+
+
+def test_what_is_printed_in_a_row_is_one_output_however_long_it_takes(built):
+    text = built[1][2].read_text(encoding="utf-8")
+    assert '<pre class="output">one\ntwo\n</pre>' in text
+    outputs = re.findall(r'<pre class="output[^>]*>(.*?)\s*</pre>', text, re.DOTALL)
+    assert [part.strip("'") for part in outputs[-5:]] == ["one\ntwo", "three", "a picture", "and another",
+                                                         "four"]
 
 
 def test_a_second_build_gives_the_same_bytes(built):
@@ -286,7 +302,7 @@ def test_the_command_line_sets_the_title_page_and_leaves_out_code(tmp_path, monk
     assert "print" not in main_part and "last" not in main_part and "<pre" not in main_part
     content = (tmp_path / "report" / "report.pdf").read_bytes()
     assert b"Given" in content and b"Of the file" not in content
-    assert (tmp_path / "build" / "executed" / "1_text.executed").exists()
+    assert [file.suffix for file in (tmp_path / "build" / "executed").glob("1_text.*")] == [".executed"]
     assert "report/index.html and report/report.pdf" in capsys.readouterr().err.replace(
         str(tmp_path.resolve()) + os.sep, "")
     assert main(["report", "short"]) == 0
