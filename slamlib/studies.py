@@ -19,7 +19,8 @@ import numpy as np
 from slamlib.results import write_atomically
 
 # Modules that make pages of what notebooks have shown, and are not imported by them.
-PRESENTATION = ("cache", "cover", "execution", "overview", "pages", "pdf", "report", "__main__")
+PRESENTATION = ("cache", "cover", "execution", "formulas", "numbering", "overview", "pages", "pdf", "report",
+                "__main__")
 
 # What notebooks show studies by, but do not compute them by.
 SHOWING = ("explore", "notebook", "plotting")
