@@ -23,7 +23,7 @@ ROLES = {
     "exact": dict(color="#332288", linewidth=1.5, zorder=3),
     "sample": dict(color="#999999", linewidth=1.0, zorder=1),
     "aruco": dict(color="#CC79A7", linestyle=(0, (1.2, 0.8)), linewidth=1.7, zorder=3),
-    "fused": dict(color="#009E73", linestyle=(0, (4.5, 1.2)), linewidth=1.8, zorder=3),
+    "fused": dict(color="#009E73", linestyle=(0, (4.5, 1.6)), linewidth=1.8, zorder=3),
     "hint": dict(color="#E69F00", linestyle=(0, (5, 1, 1, 1)), linewidth=1.5, zorder=3),
     "marker": dict(color="#333333", linestyle="none", marker="s", markersize=3, zorder=3),
     "slam": dict(color="#0072B2", linewidth=2.0, zorder=3),
@@ -67,24 +67,18 @@ def panels(count, rows=1, height=3.4, width=3.7, columns=2):
 
 
 def narrow(fig, width=NARROW_WIDTH):
-    """Put a figure's axes below each other, panel by panel, for a phone: in place.
-
-    Panels keep their height in inches, but what is much wider than `width` becomes less high.
-    """
+    """Put a figure's axes below each other, panel by panel and as high as they were: in place."""
     axes = [ax for ax in fig.axes if ax.get_visible() and ax.get_subplotspec()]
     if not axes:
         return
-    rows, columns = axes[0].get_gridspec().get_geometry()
-    wide, high = fig.get_size_inches()
-    height = high / rows * min(1, np.sqrt(width * columns / wide))
-    grid = fig.add_gridspec(len(axes), 1)
-    for ax, place in zip(axes, grid):
+    rows, _ = axes[0].get_gridspec().get_geometry()
+    height = fig.get_figheight() / rows * len(axes)
+    for ax, place in zip(axes, fig.add_gridspec(len(axes), 1)):
         ax.set_subplotspec(place)
-    fig.set_size_inches(width, height * len(axes))
+    fig.set_size_inches(width, height)
     if fig.legends:
-        fig.legends[0].remove()
-        legend = legend_below(fig)
-        fig.set_size_inches(width, height * len(axes) + legend.get_window_extent().height / fig.dpi)
+        legend_below(fig)
+        fig.set_size_inches(width, height + fig.legends[0].get_window_extent().height / fig.dpi)
 
 
 def pictures(fig):
@@ -248,12 +242,13 @@ def legend_below(fig):
         entries |= {label: handle for handle, label in zip(*ax.get_legend_handles_labels())
                     if label not in entries}
     for most in range(4, 0, -1):
+        for legend in fig.legends:
+            legend.remove()
         lines = -(-len(entries) // most)
         legend = fig.legend(entries.values(), entries.keys(), loc="outside lower center",
                             ncols=-(-len(entries) // lines))
-        if most == 1 or legend.get_window_extent().width <= fig.bbox.width:
-            return legend
-        legend.remove()
+        if legend.get_window_extent().width <= fig.bbox.width:
+            break
 
 
 def states(axes, poses, covariances, role, label=None):

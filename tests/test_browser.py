@@ -67,11 +67,33 @@ def test_every_formula_of_a_notebook_is_on_its_page_and_takes_room(visited):
         assert all(width > 1 for width in wide)
 
 
-def test_every_figure_is_drawn_and_can_be_made_out(visited):
+def test_every_figure_is_drawn_and_a_phone_gets_the_narrow_one(visited):
     for path, page in visited:
-        sizes = page.eval_on_selector_all(
-            "figure img", "all => all.map(image => [image.naturalWidth, image.width])")
-        assert sizes and all(natural > 0 and shown >= 450 for natural, shown in sizes), path.name
+        phone = page.viewport_size["width"] < 640
+        figures = page.eval_on_selector_all("figure img", """all => all.map(
+            image => [image.naturalWidth, image.width, image.currentSrc != image.src])""")
+        assert figures and all(
+            natural > 0 and shown >= (300 if phone else 450) and narrow == phone
+            for natural, shown, narrow in figures), (path.name, figures)
+
+
+def test_numbers_of_equations_and_names_of_rows_stay_in_view(visited):
+    for path, page in visited:
+        assert page.eval_on_selector_all(".equation > .number", """all => all.filter(
+            number => number.getBoundingClientRect().right > innerWidth).map(n => n.textContent)""") == []
+        moved = page.eval_on_selector_all("table", """all => all.map(table => {
+            table.scrollLeft = 1e4;
+            const first = table.querySelector("tbody :is(th, td)").getBoundingClientRect();
+            return table.getBoundingClientRect().left - first.left;})""")
+        if page.viewport_size["width"] < 640:
+            assert all(abs(off) < 2 for off in moved), path.name
+
+
+def test_errors_of_all_problems_are_in_view(visited):
+    page = next(page for path, page in visited if path.stem == "index")
+    ends = page.eval_on_selector_all("th", """all => all.filter(th => th.textContent.startsWith("ATE"))
+        .map(th => [th.getBoundingClientRect().right, th.closest("table").getBoundingClientRect().right])""")
+    assert len(ends) == 2 and all(end <= edge + 1 for end, edge in ends)
 
 
 def test_nothing_sticks_out_of_the_column(visited):

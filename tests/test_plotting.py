@@ -1,0 +1,87 @@
+"""Figures, wide and narrow: what is in them, and that nothing leaves them."""
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+from slamlib import plotting
+
+
+@pytest.fixture(autouse=True)
+def look():
+    """The look of the notebooks' figures; they are closed, and the look is undone."""
+    with plt.rc_context():
+        plotting.use_style()
+        yield
+        plt.close("all")
+
+
+def drawn(count, rows, columns=2, labels=("truth", "odometry and markers", "SLAM", "hint", "fused")):
+    fig, axes = plotting.panels(count, rows=rows, columns=columns, height=4.0)
+    for panel, column in enumerate(axes):
+        for row, ax in enumerate(column):
+            ax.set_title(f"{panel} {row}")
+            for i, label in enumerate(labels):
+                plotting.curve(ax, np.arange(9.0) + i, "slam", label=label)
+    plotting.legend_below(fig)
+    return fig, axes
+
+
+def boxes(fig):
+    """The extents of axes with all that belongs to them, in inches, and that of the legend."""
+    fig.draw_without_rendering()
+    return [thing.get_tightbbox().transformed(fig.dpi_scale_trans.inverted())
+            for thing in (*fig.axes, fig.legends[0])]
+
+
+@pytest.mark.parametrize("count, rows, columns", [(1, 1, 2), (2, 1, 2), (2, 3, 2), (3, 2, 2), (3, 3, 3)])
+def test_panels_are_side_by_side_and_in_the_narrow_figure_below_each_other(count, rows, columns):
+    fig, axes = drawn(count, rows, columns)
+    assert axes.shape == (count, rows) and fig.axes == list(axes.ravel())
+    *wide, _ = boxes(fig)
+    high = wide[0].height
+    if count > 1:
+        assert wide[rows].x0 > wide[0].x1
+    plotting.narrow(fig)
+    *narrow, legend = boxes(fig)
+    assert fig.axes == list(axes.ravel())
+    for upper, lower in zip(narrow, [*narrow[1:], legend]):
+        assert upper.y0 > lower.y1 - 0.01
+    for box in (*narrow, legend):
+        assert -0.01 <= box.x0 and box.x1 <= plotting.NARROW_WIDTH + 0.01
+        assert -0.01 <= box.y0 and box.y1 <= fig.get_figheight() + 0.01
+    assert all(box.height > 0.85 * high for box in narrow)
+
+
+@pytest.mark.parametrize("labels, lines", [("abcd", 1), (["odometry and markers", *"bcd"], 2), (
+    ["odometry and markers", "markers, counted twice", "c", "d"], 2), (["d" * 40, *"bc"], 3)])
+def test_a_legend_has_each_label_once_and_as_few_lines_as_fit(labels, lines):
+    one_line = boxes(drawn(1, 1, labels=["d"])[0])[-1].height
+    fig, _ = drawn(2, 2, labels=labels)
+    plotting.narrow(fig)
+    assert len(fig.legends) == 1
+    assert [text.get_text() for text in fig.legends[0].get_texts()] == list(labels)
+    assert boxes(fig)[-1].height / one_line == pytest.approx(lines, rel=0.2)
+
+
+def test_pictures_are_the_same_every_time():
+    with plt.rc_context({"svg.hashsalt": "slamlib"}):
+        first, second = (plotting.pictures(drawn(2, 1)[0]) for _ in range(2))
+    assert first == second
+    width, narrower = (float(first[kind].split('width="')[1].split("pt")[0])
+                       for kind in (plotting.WIDE, plotting.NARROW))
+    assert narrower < 0.6 * width
+
+
+def test_a_figure_without_axes_or_legend_stays_as_it_is():
+    fig = plt.figure()
+    plotting.narrow(fig)
+    ax = fig.add_axes((0.1, 0.1, 0.8, 0.8))
+    before = ax.get_position().bounds
+    plotting.narrow(fig)
+    assert ax.get_position().bounds == before
+
+
+def test_every_curve_has_a_colour_of_its_own():
+    lines = [look["color"] for look in plotting.ROLES.values() if look.get("linestyle") != "none"]
+    assert len(set(lines)) == len(lines)
