@@ -29,6 +29,7 @@ $(READY): requirements.txt pyproject.toml check_python.py
 	@"$(PYTHON)" -c 'import ensurepip, venv' 2>/dev/null || { \
 		echo "$(PYTHON) lacks venv: install it (on Debian and Ubuntu: apt install python3-venv)." >&2; \
 		exit 1; }
+	@echo "Setting up $(VENV) with what requirements.txt lists: once, 1.2 GB, about a minute." >&2
 	@rm -rf $(VENV)
 	"$(PYTHON)" -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes \

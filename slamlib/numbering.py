@@ -106,6 +106,8 @@ def _linked(text, source, places):
         return named[0].removesuffix(labels) + re.sub(r"\d+(\.\d+)?", link, labels)
 
     def block(text):
+        if text.startswith("#"):                            # a heading holds no links
+            return text
         caption = CAPTION.match(text)
         if not caption or "." not in caption[2]:
             return NAMED.sub(links, text)

@@ -28,6 +28,7 @@ TEMPLATE = Path(__file__).with_name("report_pdf.typ")
 PICTURES = {"image/svg+xml": "svg", "image/png": "png", "image/jpeg": "jpg"}
 TEXTS = ("text/markdown", "text/latex", "text/html", "text/plain")
 COLUMNS = 96                                          # of code, that the page is wide
+LONG = 36                                             # lines of a table that may be broken
 PICTURE = re.compile("\ue002(\\d+)\ue003")
 TABLE = re.compile("#figure\\(\n(?:(?!#figure\\().)*?, kind: table\n  \\)(?=\\s*\ue004)", re.DOTALL)
 CAPTIONED = re.compile("\ue002(\\d+)\ue003\\s*\ue004(.*?)\ue006(.*?)\ue005", re.DOTALL)  # with its picture
@@ -75,7 +76,7 @@ def typst_files(chapters, opening=None, code=True, **cover):
     formulas = book.set_formulas()
     if lost := set(range(len(formulas))) - {int(mark[1]) for mark in MARK.finditer(text)}:
         raise book.refusal(min(lost), "the PDF would lose this formula")
-    text = TABLE.sub(lambda table: f"#kept[{table[0]}]", text)
+    text = TABLE.sub(lambda table: f"#kept[{table[0]}]" if table[0].count("\n") < LONG else table[0], text)
     text = MARK.sub(r"#formula-\1;\2", text)
     text = CAPTIONED.sub("#floating[\ue002\\1\ue003 \ue004\\2\ue006\\3\ue005]", text)
     text = PICTURE.sub(lambda mark: "#picture({}, {});".format(*book.pictures[int(mark[1])]), text)

@@ -58,7 +58,8 @@ def test_another_chapter_is_linked_by_its_file():
 
 @pytest.mark.parametrize("text", [
     "`figure 1.9`, $figure 1.9$ and\n\n```\nfigure 1.9\n\nFigure 1.8. No caption.\n```", "Figure 1. By hand, figure 7.",
-    "the assignment's table 2, 2.5 m, a [table](x.html#table 1.9)", "$$ figure 1.9 $$"])
+    "the assignment's table 2, 2.5 m, a [table](x.html#table 1.9)", "$$ figure 1.9 $$",
+    "## What figure 1.9 says"])
 def test_what_is_no_reference_is_left_alone(text):
     assert after(new_markdown_cell(text)) == [text]
 
