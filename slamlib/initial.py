@@ -10,7 +10,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from slamlib import odometry, se2
-from slamlib.factors import range_error, vehicle_with
+from slamlib.factors import vehicle_with
 from slamlib.graph import GUESS, State
 from slamlib.localization import localize, most_certain
 
@@ -163,18 +163,21 @@ def places(positions, ranges, sigma, guess):
     cost : (p,) relative to the best, in units of log odds.
     """
     few = _asked(ranges)
-    pose = np.column_stack([positions[few], np.zeros(len(few))])
-    measured, root = ranges[few], 1 / sigma[few]
+    origin, measured, root = positions[few], ranges[few], 1 / sigma[few]
 
     def residuals(place):
-        e, _, J = range_error(measured, pose, np.broadcast_to(place, (len(few), 2)))
-        return np.r_[root * e, (place - guess) / GUESS], np.r_[root[:, None] * J[:, 0], np.eye(2) / GUESS]
+        distance = np.hypot(*(place - origin).T)
+        return np.concatenate([root * (distance - measured), (place - guess) / GUESS])
+
+    def jacobian(place):
+        apart = place - origin
+        along = apart / np.maximum(np.hypot(*apart.T), 1e-9)[:, None]
+        return np.concatenate([root[:, None] * along, np.eye(2) / GUESS])
 
     middle, radius = positions.mean(0), np.median(ranges)
     angle = np.arange(8) * np.pi / 4
     starts = [guess, 2 * middle - guess, *middle + radius * np.stack([np.cos(angle), np.sin(angle)], -1)]
-    ends = [least_squares(lambda a: residuals(a)[0], start, lambda a: residuals(a)[1], loss="cauchy",
-                          f_scale=ROBUST) for start in starts]
+    ends = [least_squares(residuals, start, jacobian, loss="cauchy", f_scale=ROBUST) for start in starts]
     ends = sorted(ends, key=lambda end: end.cost)
     apart = []
     for end in ends:

@@ -23,7 +23,10 @@ def wrap(angle):
 def rotation(heading):
     """Rotation matrices R(heading), shape heading.shape + (2, 2)."""
     c, s = np.cos(heading), np.sin(heading)
-    return np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
+    R = np.empty(np.shape(heading) + (2, 2))
+    R[..., 0, 0] = R[..., 1, 1] = c
+    R[..., 0, 1], R[..., 1, 0] = -s, s
+    return R
 
 
 def compose(T_ab, T_bc):
@@ -31,9 +34,9 @@ def compose(T_ab, T_bc):
     T_ab, T_bc = np.asarray(T_ab, dtype=float), np.asarray(T_bc, dtype=float)
     c, s = np.cos(T_ab[..., 2]), np.sin(T_ab[..., 2])
     x, y = T_bc[..., 0], T_bc[..., 1]
-    return np.stack([T_ab[..., 0] + c * x - s * y,
-                     T_ab[..., 1] + s * x + c * y,
-                     T_ab[..., 2] + T_bc[..., 2]], -1)
+    return _poses(T_ab[..., 0] + c * x - s * y,
+                  T_ab[..., 1] + s * x + c * y,
+                  T_ab[..., 2] + T_bc[..., 2])
 
 
 def inverse(T_ab):
@@ -41,7 +44,7 @@ def inverse(T_ab):
     T_ab = np.asarray(T_ab, dtype=float)
     c, s = np.cos(T_ab[..., 2]), np.sin(T_ab[..., 2])
     x, y = T_ab[..., 0], T_ab[..., 1]
-    return np.stack([-c * x - s * y, s * x - c * y, -T_ab[..., 2]], -1)
+    return _poses(-c * x - s * y, s * x - c * y, -T_ab[..., 2])
 
 
 def between(T_wa, T_wb):
@@ -49,7 +52,7 @@ def between(T_wa, T_wb):
     T_wa, T_wb = np.asarray(T_wa, dtype=float), np.asarray(T_wb, dtype=float)
     c, s = np.cos(T_wa[..., 2]), np.sin(T_wa[..., 2])
     dx, dy = T_wb[..., 0] - T_wa[..., 0], T_wb[..., 1] - T_wa[..., 1]
-    return np.stack([c * dx + s * dy, -s * dx + c * dy, T_wb[..., 2] - T_wa[..., 2]], -1)
+    return _poses(c * dx + s * dy, -s * dx + c * dy, T_wb[..., 2] - T_wa[..., 2])
 
 
 def compose_jacobians(T_ab, T_bc):
@@ -138,5 +141,15 @@ def rotate_covariance(covariance, heading):
     return B @ covariance @ np.swapaxes(B, -1, -2)
 
 
+# Arrays are filled in place: np.stack takes several times as long on the many small ones.
+def _poses(x, y, heading):
+    T = np.empty(np.shape(x) + (3,))
+    T[..., 0], T[..., 1], T[..., 2] = x, y, heading
+    return T
+
+
 def _identity(shape):
-    return np.broadcast_to(np.eye(3), shape[:-1] + (3, 3)).copy()
+    matrices = np.zeros(shape[:-1] + (3, 3))
+    for i in range(3):
+        matrices[..., i, i] = 1
+    return matrices

@@ -1,9 +1,6 @@
 """The Explore sections: what they draw, and that a page gets a picture and JupyterLab the sliders."""
 
-import os
 import re
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +10,7 @@ import numpy as np
 import pytest
 
 from slamlib import explore, initial, plotting
+from slamlib.execution import execute, kernel_environment
 from slamlib.notebook import Log
 from slamlib.simulation import manoeuvre, simulate
 
@@ -29,22 +27,25 @@ def look():
         plt.close("all")
 
 
+@pytest.fixture(scope="module")
+def sections(tmp_path_factory):
+    """The sections' code cells, executed as for the report, each after the first code cell alone."""
+    folder = tmp_path_factory.mktemp("explore")
+    books = {folder / source.name: nbformat.read(source, as_version=4) for source in NOTEBOOKS}
+    for book in books.values():
+        begin = next(i for i, cell in enumerate(book.cells) if cell.source.startswith("## Explore"))
+        first = next(cell for cell in book.cells if cell.cell_type == "code")
+        book.cells = [first] + [cell for cell in book.cells[begin:] if cell.cell_type == "code"]
+    execute(books, kernel_environment(folder, ROOT / "data", ["short"], 2), folder / "results", 2,
+            lambda *_: None)
+    return {source.stem: book.cells[1:] for source, book in books.items()}
+
+
 @pytest.mark.parametrize("source", NOTEBOOKS, ids=lambda path: path.stem)
-def test_the_section_runs_after_the_first_code_cell_alone_and_gives_a_page_one_picture(source, tmp_path):
-    """In a process of its own, as for the report; JupyterLab is tried in a browser (test_lab)."""
-    book = nbformat.read(source, as_version=4)
-    begin = next(i for i, cell in enumerate(book.cells) if cell.source.startswith("## Explore"))
-    first = next(cell for cell in book.cells if cell.cell_type == "code")
-    book.cells = [first] + [cell for cell in book.cells[begin:] if cell.cell_type == "code"]
-    nbformat.write(book, tmp_path / "book.ipynb")
-    environment = os.environ | {
-        "SLAMLIB_DATA": str(ROOT / "data"), "SLAMLIB_DATASETS": "short", "SLAMLIB_RESULTS": str(tmp_path),
-        "MPLBACKEND": "module://matplotlib_inline.backend_inline"}
-    subprocess.run([sys.executable, "-m", "nbconvert", "--to", "notebook", "--execute", "--inplace",
-                    "book.ipynb"], cwd=tmp_path, env=environment, check=True, timeout=120)
-    _, *section = nbformat.read(tmp_path / "book.ipynb", as_version=4).cells
+def test_the_section_runs_after_the_first_code_cell_alone_and_gives_a_page_one_picture(source, sections):
+    """In a kernel of its own, as for the report; JupyterLab is tried in a browser (test_lab)."""
     shown = [set(output.get("data", {output.output_type: ""})) - {"text/plain"}
-             for cell in section for output in cell.outputs]
+             for cell in sections[source.stem] for output in cell.outputs]
     assert shown == [{plotting.WIDE, plotting.NARROW}]
 
 
