@@ -5,6 +5,7 @@ region {p : (p - m)^T C^-1 (p - m) <= k^2} of a planar Gaussian holds 1 - exp(-k
 needs k = 2.4477, not 2.
 """
 
+from functools import partial
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -82,13 +83,12 @@ def narrow(fig, width=NARROW_WIDTH):
 
 
 def pictures(fig):
-    """A figure as SVG text by MIME type: as it is, and `narrow`, as which it is left."""
-    texts = {}
-    for kind in (WIDE, NARROW):
-        if kind == NARROW:
-            narrow(fig)
-        texts[kind] = print_figure(fig, "svg", metadata={"Date": None})
-    return texts
+    """A figure as SVG text by MIME type: as it is, and `narrow`, as which it is left; {} if empty."""
+    draw = partial(print_figure, fig, "svg", metadata={"Date": None})
+    texts = {WIDE: draw()}
+    narrow(fig)
+    texts[NARROW] = draw()
+    return texts if fig.axes else {}
 
 
 def trajectory(ax, poses, role, label=None, **look):
@@ -242,8 +242,8 @@ def legend_below(fig):
         entries |= {label: handle for handle, label in zip(*ax.get_legend_handles_labels())
                     if label not in entries}
     for most in range(4, 0, -1):
-        for legend in fig.legends:
-            legend.remove()
+        while fig.legends:
+            fig.legends[0].remove()
         lines = -(-len(entries) // most)
         legend = fig.legend(entries.values(), entries.keys(), loc="outside lower center",
                             ncols=-(-len(entries) // lines))

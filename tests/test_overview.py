@@ -1,5 +1,6 @@
 """The summary that opens the report: its numbers are those of the files, and gaps are told."""
 
+import base64
 import re
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 from slamlib import evaluation, overview, plotting, se2
 from slamlib.dataset import read_dataset, read_truth
 from slamlib.execution import NotebookError
+from slamlib.pages import html_page
 from slamlib.results import write_vehicle_poses
 from slamlib.simulation import simulate, write_dataset
 from slamlib.solve import Solution, solve, summarize, write
@@ -112,6 +114,19 @@ def test_the_picture_is_the_same_every_time_and_needs_no_display(project):
     for text in pictures.values():
         assert text.count("<path") > 10
         assert not re.search(r"<dc:date|/tmp/|http://(?!www.w3.org|purl.org|creativecommons)", text)
+
+
+def test_the_page_has_the_picture_wide_and_for_phones_narrow(project):
+    folder, written = project
+    book = overview.summary("T", rows_of(folder, written)[2])
+    page = html_page(Path("index"), book, [])
+    pictures = next(cell for cell in book.cells if cell.cell_type == "code").outputs[0].data
+    wide, narrow = (base64.b64encode(pictures[kind].encode()).decode()
+                    for kind in (plotting.WIDE, plotting.NARROW))
+    picture = re.search("<picture>(.*)</picture>", page)[1]
+    assert picture.count(f' src="data:image/svg+xml;base64,{wide}"') == 1
+    assert picture.count(f' srcset="data:image/svg+xml;base64,{narrow}"') == 1
+    assert picture.count('media="screen and (max-width: 40rem)"') == 1
 
 
 @pytest.mark.parametrize("content, reason", [(b"", "cannot be read"), (None, "must hold")])
