@@ -61,5 +61,5 @@ def report_on_all(tmp_path_factory):
     for name, kept in (("one_sighting", seen[:1]), ("sparse", seen[seen[:, 0] % 500 == 1])):
         shutil.copytree(data / "new seed", data / name)
         np.savetxt(data / name / "ArucoReading.txt", kept, fmt="%d %d" + 9 * " %.6g")
-    build_report(ROOT / "notebooks", data, folder / "report", folder / "results")
+    build_report(ROOT / "notebooks", data, folder / "report", folder / "results", kept=folder / "kept")
     return folder

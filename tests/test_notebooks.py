@@ -112,6 +112,24 @@ def test_without_any_markers_chapter_2_can_still_be_read(tmp_path):
     assert list((tmp_path / "results").iterdir()) == []
 
 
+def captions(page):
+    return re.findall(r'<p class="caption" id="(figure|table)-(\d+)\.(\d+)">', page)
+
+
+def test_without_truth_nothing_is_missing_from_the_numbers_or_named_in_vain(built, tmp_path):
+    folder, with_truth = built
+    alone = build_report(ROOT / "notebooks", folder / "data", tmp_path / "report", tmp_path / "results",
+                         ["no_truth"], kept=folder / "kept")
+    pages = {page.stem: page.read_text(encoding="utf-8") for page in alone if page.suffix == ".html"}
+    for name in pages.keys() - {"index"}:
+        for page in (pages[name], with_truth[name]):
+            for kind in ("figure", "table"):
+                found = [(int(chapter), int(n)) for which, chapter, n in captions(page) if which == kind]
+                assert found == [(int(name[0]), n) for n in range(1, len(found) + 1)] and found, name
+        assert len(captions(pages[name])) < len(captions(with_truth[name])), name  # errors are left out
+        assert "No truth comes with no_truth" in pages[name], name
+
+
 def test_no_page_says_nan(built):
     _, pages = built
     for name, page in pages.items():
