@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):  # as notebooks have it
+    os.environ.setdefault(name, "1")
 os.environ.pop("SLAMLIB_STUDIES", None)
 
 ROOT = Path(__file__).parents[1]
@@ -39,7 +40,19 @@ BROUGHT = ("new seed", "no_truth", "wheels_only", "waits", "one_pose", "backs_up
 
 
 @pytest.fixture(scope="session")
-def report_on_all(tmp_path_factory):
+def kept(tmp_path_factory):
+    """The folder of what is kept of notebooks and studies from one build of these tests to the next."""
+    return tmp_path_factory.mktemp("kept")
+
+
+@pytest.fixture
+def as_in_a_notebook(kept, monkeypatch):
+    """A study that a notebook has run in these tests, with the same seeds, is not run once more."""
+    monkeypatch.setenv("SLAMLIB_STUDIES", str(kept / "studies"))
+
+
+@pytest.fixture(scope="session")
+def report_on_all(tmp_path_factory, kept):
     """A folder with data, report and results: all of data/, and what else a user may bring."""
     import numpy as np
 
@@ -58,8 +71,8 @@ def report_on_all(tmp_path_factory):
         np.savetxt(data / name / "encoderReading.txt",
                    np.column_stack([np.arange(1, len(ticks) + 1), ticks]), fmt="%d")
     seen = np.loadtxt(data / "new seed" / "ArucoReading.txt")
-    for name, kept in (("one_sighting", seen[:1]), ("sparse", seen[seen[:, 0] % 500 == 1])):
+    for name, rows in (("one_sighting", seen[:1]), ("sparse", seen[seen[:, 0] % 500 == 1])):
         shutil.copytree(data / "new seed", data / name)
-        np.savetxt(data / name / "ArucoReading.txt", kept, fmt="%d %d" + 9 * " %.6g")
-    build_report(ROOT / "notebooks", data, folder / "report", folder / "results", kept=folder / "kept")
+        np.savetxt(data / name / "ArucoReading.txt", rows, fmt="%d %d" + 9 * " %.6g")
+    build_report(ROOT / "notebooks", data, folder / "report", folder / "results", kept=kept)
     return folder

@@ -101,13 +101,13 @@ def test_every_chapter_ends_with_one_picture_to_explore_and_no_widget(built):
         assert not re.search(r"(VBox|Output|interactive)\(", section), name
 
 
-def test_without_any_markers_chapter_2_can_still_be_read(tmp_path):
+def test_without_any_markers_chapter_2_can_still_be_read(tmp_path, kept):
     (tmp_path / "data" / "wheels").mkdir(parents=True)
     (tmp_path / "data" / "wheels" / "encoderReading.txt").write_text("1 0 0\n2 100 90\n3 90 100\n")
     (tmp_path / "notebooks").mkdir()
     shutil.copy(ROOT / "notebooks" / "2_aruco_localization.ipynb", tmp_path / "notebooks")
     pages = build_report(tmp_path / "notebooks", tmp_path / "data", tmp_path / "report",
-                         tmp_path / "results")
+                         tmp_path / "results", kept=kept)
     assert "runs on a simulated drive instead" in pages[1].read_text(encoding="utf-8")
     assert list((tmp_path / "results").iterdir()) == []
 
@@ -116,10 +116,10 @@ def captions(page):
     return re.findall(r'<p class="caption" id="(figure|table)-(\d+)\.(\d+)">', page)
 
 
-def test_without_truth_nothing_is_missing_from_the_numbers_or_named_in_vain(built, tmp_path):
+def test_without_truth_nothing_is_missing_from_the_numbers_or_named_in_vain(built, kept, tmp_path):
     folder, with_truth = built
     alone = build_report(ROOT / "notebooks", folder / "data", tmp_path / "report", tmp_path / "results",
-                         ["no_truth"], kept=folder / "kept")
+                         ["no_truth"], kept=kept)
     pages = {page.stem: page.read_text(encoding="utf-8") for page in alone if page.suffix == ".html"}
     for name in pages.keys() - {"index"}:
         for page in (pages[name], with_truth[name]):

@@ -257,7 +257,7 @@ def test_markers_without_orientation_are_points():
     assert (found.marker_covariance[:, [0, 1], [0, 1]] < 0.05**2).all()
 
 
-def test_wrong_labels_are_best_left_out():
+def test_wrong_labels_are_best_left_out(as_in_a_notebook):
     runs = montecarlo.run(montecarlo.wrong_labels, range(8), mislabelled=0.03)
     error = {way: runs[f"{way} ate"].mean() for way in slam.SIGHTINGS}
     assert error["gate"] < 1.02 * min(error.values()) and 1.5 * error["gate"] < error["Huber"]
