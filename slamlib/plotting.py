@@ -76,6 +76,7 @@ def narrow(fig, width=NARROW_WIDTH):
     height = fig.get_figheight() / rows * len(axes)
     for ax, place in zip(axes, fig.add_gridspec(len(axes), 1)):
         ax.set_subplotspec(place)
+        ax.autoscale_view()          # an equal aspect has stretched the limits to the wide axes
     fig.set_size_inches(width, height)
     if fig.legends:
         legend_below(fig)

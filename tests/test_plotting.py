@@ -73,6 +73,13 @@ def test_pictures_are_the_same_every_time():
     assert narrower < 0.6 * width
 
 
+def test_a_path_fills_the_narrow_axes_too():
+    fig, axes = plotting.panels(1, height=3.0, width=7.2)
+    plotting.trajectory(axes[0, 0], np.array([[0.0, 0, 0], [1, 1, 0]]), "truth")
+    plotting.pictures(fig)
+    assert min(np.ptp(axes[0, 0].get_xlim()), np.ptp(axes[0, 0].get_ylim())) < 1.2
+
+
 def test_a_figure_without_axes_or_legend_stays_as_it_is():
     fig = plt.figure()
     assert plotting.pictures(fig) == {}
