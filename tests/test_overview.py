@@ -119,7 +119,7 @@ def test_the_picture_is_the_same_every_time_and_needs_no_display(project):
 def test_the_page_has_the_picture_wide_and_for_phones_narrow(project):
     folder, written = project
     book = overview.summary("T", rows_of(folder, written)[2])
-    page = html_page(Path("index"), book, [])
+    page, _ = html_page(Path("index"), book, [])
     pictures = next(cell for cell in book.cells if cell.cell_type == "code").outputs[0].data
     wide, narrow = (base64.b64encode(pictures[kind].encode()).decode()
                     for kind in (plotting.WIDE, plotting.NARROW))
