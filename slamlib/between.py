@@ -3,7 +3,7 @@
 import numpy as np
 
 from slamlib import odometry, se2
-from slamlib.factors import least_noise, vehicle_with
+from slamlib.factors import odometry_noise, vehicle_with
 from slamlib.graph import GAUGE
 
 
@@ -36,9 +36,8 @@ def between_frames(graph, state, joint, slip):
     def increment(start, end):
         delta, by_w = odometry.increments(ticks, vehicle, start, end, graph.model)
         by_w = by_w * vehicle.sigma_wheel * (graph.wheels == "variable")
-        noise = odometry.increment_noise(ticks, vehicle, start, end, slip)
-        noise[:, [0, 1], [0, 1]] += least_noise(vehicle)
-        return delta, by_w, noise
+        rounding, slipping = odometry_noise(ticks, vehicle, start, end)
+        return delta, by_w, rounding + slip**2 * slipping
 
     forward, forward_by_w, noise = increment(graph.frame[a], between)
     A, B = se2.compose_jacobians(poses[a], forward)

@@ -17,6 +17,8 @@ import numpy as np
 
 from slamlib import odometry, se2
 
+LEAST = 1e-5                 # m, sigma of the place of any increment's end, at least
+
 
 @dataclass(frozen=True)
 class Odometry:
@@ -45,9 +47,7 @@ def odometry_factors(ticks, vehicle, frame, model="arc", wheels="variable", abou
     vehicle = vehicle_with(vehicle, about)
     start, end = frame[:-1], frame[1:]
     increment, by_w = odometry.increments(ticks, vehicle, start, end, model)
-    rounding = odometry.increment_noise(ticks, vehicle, start, end, 0.0)
-    slipping = odometry.increment_noise(ticks, vehicle, start, end, 1.0) - rounding
-    rounding[:, [0, 1], [0, 1]] += least_noise(vehicle)
+    rounding, slipping = odometry_noise(ticks, vehicle, start, end)
     by_w = by_w * vehicle.sigma_wheel
     if wheels == "independent":
         rounding = rounding + by_w @ np.swapaxes(by_w, 1, 2)
@@ -57,6 +57,28 @@ def odometry_factors(ticks, vehicle, frame, model="arc", wheels="variable", abou
     increment = increment - by_w @ about
     return Odometry(increment, by_w, se2.rotate_covariance(rounding, turn),
                     se2.rotate_covariance(slipping, turn))
+
+
+def odometry_noise(ticks, vehicle, start, end):
+    """Noise of increments of one drive, in the axes of their starts: of rounding, and of slip 1.
+
+    The counts of an increment are the difference of what the encoders show at its end and at its start, so
+    the rounding at a pose enters the increment before it and, with the opposite sign, the one after: over
+    any number of consecutive increments only the first and the last remain. Independent noise cannot say
+    that of every pair of poses; with a share by its steps in each increment it says so of the whole drive.
+    What this neglects is the rounding at a single pose, at most half a count; noise of a whole difference
+    in each increment would be a random walk instead, which is what slip is. A single step has no noise
+    sideways; LEAST keeps the information of the graph within what sums of its squares can hold.
+
+    Returns
+    -------
+    rounding, slipping : (m, 3, 3)
+    """
+    rounding = odometry.increment_noise(ticks, vehicle, start, end, 0.0)
+    slipping = odometry.increment_noise(ticks, vehicle, start, end, 1.0) - rounding
+    rounding *= ((end - start) / (len(ticks) - 1))[:, None, None]
+    rounding[:, [0, 1], [0, 1]] += LEAST**2
+    return rounding, slipping
 
 
 def linearize(factors, poses, w):
@@ -127,8 +149,3 @@ def range_error(r, pose, antenna):
 def vehicle_with(vehicle, w):
     """The vehicle with the wheel parameters w, in units of their sigmas beyond the nominal ones."""
     return vehicle.with_wheel(vehicle.wheel + vehicle.sigma_wheel * w)
-
-
-def least_noise(vehicle):
-    """m^2, sideways noise of an increment: that of rounding, where a single step has none else."""
-    return (2 * np.pi * vehicle.right_radius / vehicle.ticks_per_revolution)**2 / 6

@@ -11,7 +11,7 @@ w = [R_R, R_L, b], as deviations from their nominal values in units of their sig
 
       e = log(Delta_i(w)^-1 X_i^-1 X_{i+1}),    Delta_i(w) = Delta_i(0) + dDelta_i/dw w,
 
-  with the noise of rounding and slip (`odometry.increment_noise`). The errors of w repeat in every
+  with the noise of rounding and slip (`factors.odometry_noise`). The errors of w repeat in every
   increment; as a variable of the graph they do, as noise of independent factors they could not.
 
 Frames. GTSAM perturbs a pose on the right, X <- X exp(xi): its covariances are those of the

@@ -88,6 +88,24 @@ def problem3(seed, **options):
     return _judged(slam.solve(dataset.without("uwb")), dataset.without("uwb"), truth)
 
 
+def learned_slips(seed, slip):
+    """Problem 3 on one drive of the short path with this slip: the slip learned, and known.
+
+    Returns
+    -------
+    dict of numbers: the "slip" learned; with it the "nees" of the poses and the "aligned" ATE in metres,
+    and "known nees" and "known aligned", those of the graph that is given the slip and the arcs.
+    """
+    dataset, truth = simulate("short", seed, slip=slip)
+    dataset = dataset.without("uwb")
+    learned, known = slam.solve(dataset), slam.solve(dataset, slip, "arc")
+    numbers = {"slip": learned.slip}
+    for name, found in (("", learned), ("known ", known)):
+        numbers |= {f"{name}nees": anees(found.poses, found.covariances, truth.poses),
+                    f"{name}aligned": ate(found.poses, truth.poses, aligned=True)}
+    return numbers
+
+
 def problem4(seed, path="short", markers=True, **options):
     """SLAM on odometry, ranges and (unless False) markers, with everything learned, as `problem3`."""
     dataset, truth = simulate(path, seed, **options)

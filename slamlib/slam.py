@@ -2,7 +2,7 @@
 
 `graph.py` has the factors, `initial.py` the values to start from; here they are solved: rounds with
 an ever narrower Cauchy kernel find the measurements that agree; on these, without a kernel, the
-slip of greatest evidence times prior is looked for, and with it everything is judged anew.
+slip of greatest evidence is looked for, and with it everything is judged anew.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,8 @@ CAUCHY = (100.0, 30.0, 10.0, 3.0)   # scale of the kernel in sigmas, round after
 REPEATS = 4                  # at most, of learning the slip and judging the measurements anew
 WHEELS = {"variable": "wheels as a variable", "independent": "independent chain",
           "fixed": "wheels fixed"}
-DECISIVE = 3.0               # log evidence by which Euler's steps must explain more than arcs to be taken
+DECISIVE = 3.0               # log evidence by which the data must prefer a slip to TYPICAL_SLIP, or Euler's
+                             # steps to arcs, to be believed
 UNSURE = 0.025               # largest sigma of an antenna, in distances to it, that is not in doubt
 FEWEST = 5                   # ranges below which an antenna's place is not to be relied on
 
@@ -92,7 +93,7 @@ def solve(dataset, slip=None, model=None, after=None):
     ----------
     dataset : Dataset with markers, ranges or both.
     slip : sqrt(m), standard deviation of a wheel's slip after one metre; None learns it by maximizing
-        the Laplace evidence.
+        the Laplace evidence, with a wide prior where the data say little.
     model : "arc" or "euler"; None takes the arc unless the evidence of Euler's step is DECISIVE.
     after : Slam of the same drive with fewer sensors, whose poses, model and slip to start from.
 
@@ -217,22 +218,38 @@ def _rounds(graph, values, U, sightings, ranges, scales):
 
 
 def _learned_slip(graph, values, native):
-    """Root mean square of the slip under its posterior, evidence times prior.
+    """The slip of greatest evidence, where that decides against TYPICAL_SLIP.
 
-    About the mode, which a search finds, the posterior is summed over values of the logarithm half a
-    unit apart. Where the data say much, this is the mode; where they say little, the slips that are
-    possible beyond it count too, as variances do.
+    Otherwise the data say little, or confirm it, and it is the root mean square under the posterior,
+    evidence times prior, which is summed about its mode over values of the logarithm half a unit apart:
+    slips that are possible beyond the mode count too, as variances do.
     """
     linearized = native.graph.linearize(values)
 
-    def log_posterior(log_slip):
-        return graph.log_evidence(values, native, np.exp(log_slip), linearized) + log_slip_prior(log_slip)
+    def log_evidence(log_slip):
+        return graph.log_evidence(values, native, np.exp(log_slip), linearized)
 
-    mode = minimize_scalar(lambda s: -log_posterior(s), bounds=np.log(SLIPS), method="bounded",
-                           options={"xatol": 0.05})
-    around = mode.x + np.arange(-4, 5) / 2
-    density = np.exp([min(0.0, log_posterior(s) + mode.fun) if s != mode.x else 0.0 for s in around])
+    def log_posterior(log_slip):
+        return log_evidence(log_slip) + log_slip_prior(log_slip)
+
+    best, most = _highest(log_evidence)
+    if most - log_evidence(np.log(TYPICAL_SLIP)) > DECISIVE:
+        return float(np.exp(best))
+    mode, most = _highest(log_posterior)
+    around = mode + np.arange(-4, 5) / 2
+    density = np.exp([min(0.0, log_posterior(s) - most) if s != mode else 0.0 for s in around])
     return float(np.clip(np.sqrt(np.sum(density * np.exp(2 * around)) / np.sum(density)), *SLIPS))
+
+
+def _highest(function):
+    """Where a function of the logarithm of the slip is greatest within SLIPS, and how great.
+
+    The search comes near its bounds but never to them, and without slip the lower one is the answer.
+    """
+    found, least = minimize_scalar(lambda s: -function(s), bounds=np.log(SLIPS), method="bounded",
+                                   options={"xatol": 0.05}), np.log(SLIPS[0])
+    at_least = function(least)
+    return (least, at_least) if at_least > -found.fun else (found.x, -found.fun)
 
 
 def agreeing(graph, values, early, late):

@@ -70,6 +70,33 @@ def test_odometry_factor_is_gtsams_between_factor_when_the_wheels_are_known():
         assert np.isclose(native.error(values), np.sum((U[i] @ e[i])**2) / 2, rtol=1e-6)
 
 
+def test_rounding_telescopes():
+    """However many factors a drive is cut into, it is that of one difference of counts."""
+    vehicle, ticks = Vehicle(), np.full((2001, 2), 127)
+    count = 2 * np.pi * vehicle.right_radius / vehicle.ticks_per_revolution
+    along, turned = count**2 / 6 * np.array([1 / 2, 2 / vehicle.wheelbase**2])
+    for every in (1, 10, 500, 2000):
+        noise = factors_of.odometry_factors(ticks, vehicle, np.arange(0, 2001, every)).rounding.sum(axis=0)
+        floor = 2000 / every * factors_of.LEAST**2
+        np.testing.assert_allclose([noise[0, 0] - floor, noise[2, 2]], [along, turned], rtol=1e-6)
+
+
+def test_without_slip_none_is_learned():
+    """20 seeds: covariances as honest as poses are accurate, compared with the slip known."""
+    runs = montecarlo.run(montecarlo.learned_slips, range(3000, 3020), slip=0.0)
+    low, high = nees_band(20)
+    assert low < runs["nees"].mean() < high
+    assert np.mean(runs["aligned"]**2) < 1.1**2 * np.mean(runs["known aligned"]**2)
+    assert np.median(runs["slip"]) < 3e-5                    # m: by far less than rounding
+
+
+def test_much_slip_is_learned_as_if_it_were_known():
+    runs = montecarlo.run(montecarlo.learned_slips, range(3000, 3004), slip=3e-3)
+    np.testing.assert_allclose(runs["slip"], 3e-3, rtol=0.3)
+    np.testing.assert_allclose(runs["nees"], runs["known nees"], rtol=0.3)
+    np.testing.assert_allclose(runs["aligned"], runs["known aligned"], rtol=0.05)
+
+
 @pytest.mark.parametrize("slip", [3e-3, 1e-2])
 def test_more_slip_than_typical_costs_no_good_sighting(slip):
     """Clean drives: hardly a sighting is left out, and the slip is learned whatever it was first."""
@@ -100,7 +127,7 @@ def test_wheels_far_from_nominal_are_learned_honestly():
 
 
 def test_marginals_are_gtsams():
-    dataset, _ = simulate("short", seed=3, mislabelled=0.02, late_ranges=0.2)
+    dataset, _ = simulate("short", seed=4, mislabelled=0.02, late_ranges=0.2)
     found = slam.solve_graph(slam.Graph(dataset, "arc"), 1e-3)
     graph, values, late = found.graph, found.values, found.late
     U, _ = graph.factors.whitening(found.slip)
@@ -177,9 +204,8 @@ def test_perfect_data_gives_the_exact_answer():
 def test_poses_between_graph_poses_are_those_of_a_graph_with_all_poses(every, sigma):
     """Frames close together, and frames a metre apart with wheels that matter in between."""
     dataset, _ = simulate("short", seed=2)
-    fine = replace(dataset.vehicle, ticks_per_revolution=8e5,       # rounding would be counted anew
-                   sigma_right_radius=sigma, sigma_left_radius=sigma)           # at every graph pose
-    dataset = replace(dataset, uwb=None, vehicle=fine, ticks=100 * dataset.ticks[:106])
+    vehicle = replace(dataset.vehicle, sigma_right_radius=sigma, sigma_left_radius=sigma)
+    dataset = replace(dataset, uwb=None, vehicle=vehicle, ticks=dataset.ticks[:106])
     keep = (dataset.aruco.pose <= 100) & (dataset.aruco.pose % every == 0)
     names = ("pose", "marker", "marker_in_vehicle", "covariance")
     dataset = replace(dataset, aruco=replace(
