@@ -82,7 +82,7 @@ def test_the_first_page_says_what_is_left_out(built):
         start = "No truth comes with" if sensor == "truth" else f"There are no {sensor} in"
         assert name in re.search(rf"{start}([^:]*?)(?::|, so errors)", text)[1]
     assert len(re.findall(r"wheels_only\s+odometry \+ ArUco\s+left out: no markers", text)) == 1
-    assert re.search(r"no_truth\s+SLAM: odometry \+ ArUco\s+2,000\s[^–]*?no truth\s+no truth", text)
+    assert re.search(r"no_truth\s+SLAM: odometry \+ ArUco\s+no truth\s+no truth\s[^–]*?rad\s+2,000\s", text)
 
 
 def test_no_cell_wrote_to_stderr(built):
