@@ -11,7 +11,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -29,6 +28,7 @@ from slamlib.evaluation import anees, ate, nees_band  # noqa: E402
 from slamlib.simulation import simulate  # noqa: E402
 
 SEEDS = range(20)
+PATIENCE = 1800              # s, for one way to solve one problem
 LONG = Path(__file__).parents[2] / "data" / "long"
 
 
@@ -60,9 +60,21 @@ def measure(rounds, problem, who):
 
 
 def alone(*arguments):
-    """measure(*arguments) in a process of its own."""
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-        return pool.submit(measure, *arguments).result()
+    """measure(*arguments) in a process of its own, or None if that takes longer than PATIENCE."""
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe()
+    process = context.Process(target=_send, args=(theirs, *arguments))
+    process.start()
+    done = ours.poll(PATIENCE)
+    if not done:
+        process.kill()
+    result = ours.recv() if done else None
+    process.join()
+    return result
+
+
+def _send(pipe, *arguments):
+    pipe.send(measure(*arguments))
 
 
 def errors():
@@ -96,9 +108,11 @@ def growth(largest):
     for rounds in [0] * LONG.exists() + [r for r in (1, 4, 43) if 23_000 * r <= largest]:
         for problem in (3, 4):
             ours, memory, rows = alone(rounds, problem, "slamlib")
-            theirs, their_memory, _ = alone(rounds, problem, "plain")
-            print(f"{rows:11,}{problem:9}{ours:10.1f}{memory:7.0f}{theirs:9.1f}{their_memory:7.0f}"
-                  f"{ours / theirs:8.2f}{1e3 * ours / rows:10.3f}", flush=True)
+            plain_alone = alone(rounds, problem, "plain")
+            theirs, their_memory, _ = plain_alone or (PATIENCE, np.nan, rows)
+            print(f"{rows:11,}{problem:9}{ours:10.1f}{memory:7.0f}{'' if plain_alone else '>':>2}{theirs:7.1f}"
+                  f"{their_memory:7.0f}{'' if plain_alone else '<':>2}{ours / theirs:6.2f}"
+                  f"{1e3 * ours / rows:10.3f}", flush=True)
 
 
 def whole():
