@@ -38,8 +38,8 @@ def chapter_of(source, book):
     lead = re.search(r"^(?!\s|[#|<>`]|\$\$|[-*+]\s).+(?:\n.+)*", text, re.MULTILINE)
     title = re.sub("[*_`]", "", title[1]).strip() if title else source.stem
     number = re.match(r"(\d+)\.", title)
-    return {"file": quote(f"{source.stem}.html"), "title": title, "lead": lead[0] if lead else "",
-            "number": number[1] if number else None}
+    return {"file": quote(f"{source.stem}.html"), "notebook": source.name, "title": title,
+            "lead": lead[0] if lead else "", "number": number[1] if number else None}
 
 
 def html_pages(books, chapters, code=True):
@@ -50,7 +50,7 @@ def html_pages(books, chapters, code=True):
     anchors, links, pages = {}, [], {}
     for source, book in books.items():
         pages[f"{source.stem}.html"], page = html_page(source, book, chapters, code)
-        anchors[f"{source.stem}.ipynb"] = {"", *page["anchors"]}
+        anchors[source.name] = {"", *page["anchors"]}
         links += [(source.name, *link) for link in page["links"]]
     for name, text, target, anchor in links:
         if target not in anchors:
@@ -74,9 +74,9 @@ def html_page(source, book, chapters, code=True):
     chapters : list of dicts by `chapter_of`, for the contents.
     code : False leaves out code cells and printed text.
     """
-    page = {"formulas": [], "sections": [], "section": "", "headings": [], "anchors": {}, "links": [], "figures": [], "chapters": chapters,
-            "code": code, "file": quote(f"{source.stem}.html"), "style": STYLE, "name": f"{source.stem}.ipynb",
-            "names": {f"{source.stem}.ipynb", *(unquote(c["file"]).replace(".html", ".ipynb") for c in chapters)}}
+    page = {"formulas": [], "sections": [], "section": "", "headings": [], "anchors": {}, "links": [],
+            "figures": [], "chapters": chapters, "code": code, "file": quote(f"{source.stem}.html"),
+            "notebook": source.name, "style": STYLE}
     exporter = HTMLExporter(template_name="basic", raw_template=PAGE,
                             filters={"markdown2html": _markdown_to_html})
     text, resources = exporter.from_notebook_node(
@@ -150,9 +150,10 @@ class Renderer(IPythonRenderer):
 
     def link(self, text, url, title=None):
         if inside := INSIDE.fullmatch(url):
-            target = unquote(inside[1] or self.page["name"])
+            own = self.page["notebook"]
+            target = unquote(inside[1] or own)
             self.page["links"].append((text, target, unquote(inside[2] or "")))
-            if target not in self.page["names"]:
+            if target not in (own, *(chapter["notebook"] for chapter in self.page["chapters"])):
                 return text
         return super().link(text, re.sub(r"^([^:/]+)\.ipynb(?=#|$)", r"\1.html", url), title)
 

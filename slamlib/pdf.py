@@ -55,11 +55,11 @@ def typeset(chapters, opening=None, code=True, **cover):
     NotebookError : a formula is lost or cannot be set, or Typst refuses the document.
     """
     files, book = typst_files(chapters, opening, code, **cover)
-    text = files["main.typ"].decode()
-    if missing := without_glyph(text):
-        around = re.search(f".{{0,30}}{re.escape(missing[0])}.{{0,30}}", text)[0]
-        raise NotebookError(f"the PDF's fonts have no glyph for {missing[0]} (U+{ord(missing[0]):04X}): "
-                            f"... {around} ...")
+    for name, text in book.texts:
+        if missing := without_glyph(text):
+            raise NotebookError(f"{name}: the PDF's fonts have no glyph for {missing[0]} "
+                                f"(U+{ord(missing[0]):04X}): ..." + re.search(
+                                    f".{{0,30}}{missing[0]}.{{0,30}}", text)[0] + "...")
     with tempfile.TemporaryDirectory() as folder:
         for name, content in files.items():
             Path(folder, name).write_bytes(content)
@@ -144,12 +144,13 @@ def _label(file, anchor=""):
 class _Book:
     """Chapters on their way to Typst, and what is gathered from them.
 
-    `files` are of pictures; `pictures` their names and descriptions, quoted; `page` is what the
-    renderer fills: formulas (TeX, display), and by their number the file, label and tag of each.
+    `files` are of pictures; `pictures` their names and descriptions, quoted; `texts` are the chapters by
+    file name, without marks; `page` is what the renderer fills: formulas (TeX, display), and by their
+    number the file, section, label and tag of each.
     """
 
     def __init__(self, code):
-        self.code, self.files, self.pictures = code, {}, []
+        self.code, self.files, self.pictures, self.texts = code, {}, [], []
         self.page = {"formulas": [], "labels": {}, "tags": {}, "headings": [], "links": [], "sources": [],
                      "sections": []}
 
@@ -183,6 +184,7 @@ class _Book:
                                          ["--wrap=none", f"--extract-media={media}"])
             self.files |= {file.name: file.read_bytes() for file in Path(media).iterdir()}
         text = text.replace(f'"{media}/', '"')
+        self.texts.append((source.name, re.sub("[\ue000-\ue008]", "", text)))
         text = re.sub(r"align: \([a-z,]*\)", lambda align: align[0].replace("auto", "left"), text)
         return re.sub(r"^= (\d+)\.", r"#counter(heading).update(\1 - 1)\n\g<0>", text, count=1)
 

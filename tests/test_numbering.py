@@ -32,11 +32,12 @@ def after(*cells):
 
 
 def test_gaps_are_closed_and_references_follow():
-    assert after(figure(), new_markdown_cell("Figure 1.2. One; compare figure 1.5.\n\nSee figures 1.2 and 1.5."),
-                 figure("Figure 1.5. Two."), new_markdown_cell(TABLE + "Table 1.4. A table.\n\nIn table 1.4 is it.")
-                 ) == ["Figure 1.1. One; compare figure [1.2](#figure-1.2).\n\n"
-                       "See figures [1.1](#figure-1.1) and [1.2](#figure-1.2).",
-                       "Figure 1.2. Two.", TABLE + "Table 1.1. A table.\n\nIn table [1.1](#table-1.1) is it."]
+    first = new_markdown_cell("Figure 1.2. One; compare figure 1.5.\n\nSee figures 1.2 and 1.5.")
+    last = new_markdown_cell(TABLE + "Table 1.4. A table.\n\nIn table 1.4 is it.")
+    assert after(figure(), first, figure("Figure 1.5. Two."), last) == [
+        "Figure 1.1. One; compare figure [1.2](#figure-1.2).\n\n"
+        "See figures [1.1](#figure-1.1) and [1.2](#figure-1.2).",
+        "Figure 1.2. Two.", TABLE + "Table 1.1. A table.\n\nIn table [1.1](#table-1.1) is it."]
 
 
 def test_numbers_that_swap_their_meaning_are_not_replaced_twice():
@@ -45,7 +46,8 @@ def test_numbers_that_swap_their_meaning_are_not_replaced_twice():
 
 
 def test_another_chapter_is_linked_by_its_file():
-    books = {FIRST: new_notebook(cells=[figure("**Figure 1.3.** A."), new_markdown_cell("$$ x \\tag{2} $$")]),
+    books = {FIRST: new_notebook(cells=[figure("**Figure 1.3.** A."),
+                                        new_markdown_cell("$$ x \\tag{2} $$")]),
              SECOND: new_notebook(cells=[new_markdown_cell(
                  "$$ y \\tag{2.1} $$\n\nBy figure 1.3, equation 2.1 and equation 2. Equation 2's, equation 4.")])}
     done = numbered(books)
@@ -57,7 +59,8 @@ def test_another_chapter_is_linked_by_its_file():
 
 
 @pytest.mark.parametrize("text", [
-    "`figure 1.9`, $figure 1.9$ and\n\n```\nfigure 1.9\n\nFigure 1.8. No caption.\n```", "Figure 1. By hand, figure 7.",
+    "`figure 1.9`, $figure 1.9$ and\n\n```\nfigure 1.9\n\nFigure 1.8. No caption.\n```",
+    "Figure 1. By hand, figure 7.",
     "the assignment's table 2, 2.5 m, a [table](x.html#table 1.9)", "$$ figure 1.9 $$",
     "## What figure 1.9 says"])
 def test_what_is_no_reference_is_left_alone(text):
@@ -70,7 +73,8 @@ def test_what_is_no_reference_is_left_alone(text):
     ([figure("Figure 1.1. A."), figure("Figure 1.1. B.")], "figure 1.1 is there twice"),
     ([new_markdown_cell("$$ a \\tag{3} $$ and $$ b \\tag{3} $$")], "equation 3 is there twice"),
     ([figure(), new_markdown_cell("Text.\n\nFigure 1.1. Late.")], "the caption of figure 1.1 does not stand"),
-    ([figure(), new_code_cell("x"), new_markdown_cell("Figure 1.1. Late.")], "the caption of figure 1.1 does not"),
+    ([figure(), new_code_cell("x"), new_markdown_cell("Figure 1.1. Late.")],
+     "the caption of figure 1.1 does not"),
     ([figure("Figure 1.1. A.", "Figure 1.2. Another of the same.")], "the caption of figure 1.2 does not"),
     ([figure("Table 1.1. No table.")], "the caption of table 1.1 does not stand directly below a table"),
 ])

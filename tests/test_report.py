@@ -245,7 +245,8 @@ def test_what_is_shown_must_fit_together_in_the_executed_notebooks(tmp_path):
            "%config InlineBackend.figure_formats = ['svg']\n"
            "captioned(plt.plot(1)[0].figure, 'Figure 1.4. Nothing.')",))
     page = Page(build(tmp_path)[1])
-    assert re.search(r'</figure>\s*<div class="output"><p class="caption" id="figure-1.1">Figure 1.1. No', page.text)
+    assert re.search(r'</figure>\s*<div class="output"><p class="caption" id="figure-1.1">Figure 1.1. No',
+                     page.text)
     assert page.links.count("#figure-1.1") == 1 and page.count["img"] == 1
     assert "2_b" not in page.text and "so says the next." in page.text  # which is not there to link to
     write(tmp_path / "notebooks", "1_text", "# 1. Text\n\nIn figure 1.5 is nothing.")
