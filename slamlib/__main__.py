@@ -18,8 +18,12 @@ def main(arguments=None):
     options = _parser().parse_args(arguments)
     try:
         return options.run(options)
-    except (DatasetError, OSError) as error:
+    except DatasetError as error:
         print(f"slamlib: {error}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        reason = f"{error.filename}: {error.strerror}" if error.filename else error
+        print(f"slamlib: cannot be read or written: {reason}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("slamlib: interrupted", file=sys.stderr)

@@ -78,7 +78,7 @@ def wheels(log, right, left, base, sigma_radii, sigma_base, probability, count):
         sigma_wheelbase=v.sigma_wheelbase * sigma_base))
     at, color = plotting.spread(poses, count), plotting.ROLES["odometry"]["color"]
     name = f"{probability} % by equation 2"
-    fig, axes = plotting.panels(2, height=4.0)
+    fig, axes = plotting.panels(2, height=3.6)
     (plan,), (side,) = axes
     plotting.trajectory(plan, poses, "odometry", "nominal wheels")
     plotting.ellipses(plan, poses[at], covariances[at], color, probability / 100, name)
@@ -116,7 +116,7 @@ def cameras(seed, every, reach, claimed):
     aruco = replace(a, pose=a.pose[kept], marker=a.marker[kept],
                     marker_in_vehicle=a.marker_in_vehicle[kept],
                     covariance=a.covariance[kept] * claimed**2)
-    fig, axes = plotting.panels(2, height=4.0)
+    fig, axes = plotting.panels(2, height=3.6)
     (plan,), (side,) = axes
     path = odometry.dead_reckoning(dataset.ticks, dataset.vehicle)
     plotting.trajectory(plan, truth.poses, "truth")
@@ -164,7 +164,7 @@ def graphs(seed, slip, assumed, wrong, kernel, start):
     values, _, _ = graph.optimize(initial.from_odometry(graph, start), native, U)
     poses, markers = graph.state(values).poses, graph.state(values).markers
     solved = slam.result(slam.solve_graph(graph, assumed))
-    fig, axes = plotting.panels(2, height=4.0)
+    fig, axes = plotting.panels(2, height=3.6)
     (plan,), (side,) = axes
     plotting.trajectory(plan, truth.poses, "truth")
     plotting.trajectory(plan, poses, "alternative", "single kernel")
@@ -205,7 +205,7 @@ def ranges(seed, late, off, poses, way):
     true_poses = truth.poses[:poses]
     chosen, solved = (slam.result(slam.solve_graph(slam.Graph(dataset, "arc"), SLIP, **options))
                       for options in (dict(ranges=way, antennas="guess"), {}))
-    fig, axes = plotting.panels(2, height=4.0)
+    fig, axes = plotting.panels(2, height=3.6)
     (plan,), (side,) = axes
     plotting.trajectory(plan, true_poses, "truth")
     for found, role, label in ((chosen, "alternative", "kernel of the sliders"),

@@ -12,8 +12,9 @@ from slamlib.execution import NotebookError
 
 CAPTION = re.compile(r"\W*(Figure|Table)\s+(\d+(?:\.\d+)?)\.(?!\d)")
 TAG = re.compile(r"\\tag\*?\s*\{([^{}]*)\}")
-NAMED = re.compile(r"\b([Ff]igure|[Tt]able|[Ee]quation)s? (\d+\.\d+(?:(?:, | and | to | or )\d+\.\d+)*)"
-                   r"|\b([Ee]quation) (\d+)(?![.\d]*\d)")
+DOTTED, WHOLE, AND = r"\d+\.\d+", r"\d+(?![.\d]*\d)", r"(?:,?\s+(?:and|to|or)\s+|,\s+|–)"
+NAMED = re.compile(rf"\b(figure|table|equation)s?\s+({DOTTED}(?:{AND}{DOTTED})*|{WHOLE}(?:{AND}{WHOLE})*)",
+                   re.IGNORECASE)
 LITERAL = re.compile(r"(```.*?```|`[^`\n]*`|\$\$.*?\$\$|\$[^$\n]*\$|\]\([^)\n]*\))", re.DOTALL)
 
 
@@ -92,16 +93,18 @@ def _captions(book):
 
 def _linked(text, source, places):
     """Text with its own numbers in captions, and links where it names figures, tables and equations."""
+    chapters = {label.partition(".")[0] for _, label in places if "." in label}
+
     def links(named):
-        kind, labels = (named[1] or named[3]).lower(), named[2] or named[4]
+        kind, labels = named[1].lower(), named[2]
 
         def link(label):
             if (kind, label[0]) in places:
                 where, number, anchor = places[kind, label[0]]
                 return f"[{number}]({'' if where == source else where.name}#{anchor})"
-            if "." in label[0]:
+            if label[1] and label[0].partition(".")[0] in chapters:
                 raise NotebookError(f"{source.name}: the text names {kind} {label[0]}, which is not there")
-            return label[0]                                 # of another text
+            return label[0]                                 # of a chapter that is not here, or another text
 
         return named[0].removesuffix(labels) + re.sub(r"\d+(\.\d+)?", link, labels)
 

@@ -173,12 +173,15 @@ def likelihood(ax, positions, ranges, sigma, window):
     return ax
 
 
-def factor_graph(ax, poses, markers, sightings, names):
-    """A factor graph: vehicle poses (f, >= 2), markers (k, >= 2) and w, with a dot for every factor.
+def factor_graph(ax, count, sightings, names):
+    """A factor graph drawn as a scheme: vehicle poses in a row, markers above them, w below, factors as dots.
 
-    `sightings` are pairs (row of poses, row of markers); `names` the markers' labels.
+    `count` is that of the poses; `sightings` are pairs (pose, marker), numbers from 0; `names` the markers'
+    labels, from left to right.
     """
-    wheel = np.array([poses[:, 0].mean(), poses[:, 1].min() - 0.45 * np.ptp(markers[:, 1])])
+    poses = np.column_stack([np.arange(count), np.zeros(count)])
+    markers = np.column_stack([np.linspace(-0.5, count - 0.5, len(names) + 2)[1:-1], np.full(len(names), 1.5)])
+    wheel = np.array([poses[:, 0].mean(), -0.8])
 
     def edge(ends, color):
         middle = np.mean(ends, axis=0)
@@ -187,16 +190,16 @@ def factor_graph(ax, poses, markers, sightings, names):
         ax.plot(*middle, "s", color=color, markersize=4, zorder=2)
 
     for i, j in sightings:
-        edge([poses[i, :2], markers[j, :2]], ROLES["aruco"]["color"])
-    for i in range(len(poses) - 1):
-        edge([poses[i, :2], poses[i + 1, :2], wheel], ROLES["odometry"]["color"])
-    nodes = [(p, f"$X_{i + 1}$", "white") for i, p in enumerate(poses[:, :2])]
-    nodes += [(m, f"$L_{{{name}}}$", "#dddddd") for m, name in zip(markers[:, :2], names)]
+        edge([poses[i], markers[j]], ROLES["aruco"]["color"])
+    for i in range(count - 1):
+        edge([poses[i], poses[i + 1], wheel], ROLES["odometry"]["color"])
+    nodes = [(p, f"$X_{i + 1}$", "white") for i, p in enumerate(poses)]
+    nodes += [(m, f"$L_{{{name}}}$", "#dddddd") for m, name in zip(markers, names)]
     for place, name, color in [*nodes, (wheel, "$w$", "#ffe0b0")]:
         ax.text(*place, name, ha="center", va="center", fontsize=8, zorder=4,
                 bbox=dict(boxstyle="circle,pad=0.25", facecolor=color, edgecolor="black"))
-    for prior in (poses[0, :2], wheel):
-        edge([prior, prior + [-0.12 * np.ptp(markers[:, 0]), 0]], "black")
+    for prior in (poses[0], wheel):
+        edge([prior, prior - [0.4, 0]], "black")
     ax.set_aspect("equal", adjustable="datalim")
     ax.axis("off")
     return ax

@@ -45,6 +45,21 @@ def test_numbers_that_swap_their_meaning_are_not_replaced_twice():
         "Figure 1.1. A.", "Figure 1.2. B, not figure [1.1](#figure-1.1)."]
 
 
+@pytest.mark.parametrize("text, becomes", [
+    ("figures 1.2–1.3", "figures [1.1](#figure-1.1)–[1.2](#figure-1.2)"),
+    ("Figures 1.2, and 1.3.", "Figures [1.1](#figure-1.1), and [1.2](#figure-1.2)."),
+    ("in figure\n1.3", "in figure\n[1.2](#figure-1.2)"),
+    ("figure\u00a01.3", "figure\u00a0[1.2](#figure-1.2)"),
+    ("equations 1, 2 and 3", "equations 1, [2](#eq-2) and [3](#eq-3)"),
+    ("figure 7.1 of a chapter that is not here", "figure 7.1 of a chapter that is not here"),
+])
+def test_references_in_every_spelling(text, becomes):
+    equations = "$$ a \\tag{2} $$ $$ b \\tag{3} $$"
+    *_, last = after(figure("Figure 1.2. A."), figure("Figure 1.3. B."), new_markdown_cell(equations),
+                     new_markdown_cell(text))
+    assert last == becomes
+
+
 def test_another_chapter_is_linked_by_its_file():
     books = {FIRST: new_notebook(cells=[figure("**Figure 1.3.** A."),
                                         new_markdown_cell("$$ x \\tag{2} $$")]),
@@ -68,8 +83,10 @@ def test_what_is_no_reference_is_left_alone(text):
 
 
 @pytest.mark.parametrize("cells, reason", [
-    ([new_markdown_cell("See figure 1.2.")], "the text names figure 1.2, which is not there"),
-    ([new_markdown_cell("By equation 1.2.")], "the text names equation 1.2, which is not there"),
+    ([figure("Figure 1.1. A."), new_markdown_cell("See figure 1.2.")],
+     "the text names figure 1.2, which is not there"),
+    ([figure("Figure 1.1. A."), new_markdown_cell("By equation 1.2.")],
+     "the text names equation 1.2, which is not there"),
     ([figure("Figure 1.1. A."), figure("Figure 1.1. B.")], "figure 1.1 is there twice"),
     ([new_markdown_cell("$$ a \\tag{3} $$ and $$ b \\tag{3} $$")], "equation 3 is there twice"),
     ([figure(), new_markdown_cell("Text.\n\nFigure 1.1. Late.")], "the caption of figure 1.1 does not stand"),

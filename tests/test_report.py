@@ -249,7 +249,7 @@ def test_what_is_shown_must_fit_together_in_the_executed_notebooks(tmp_path):
                      page.text)
     assert page.links.count("#figure-1.1") == 1 and page.count["img"] == 1
     assert "2_b" not in page.text and "so says the next." in page.text  # which is not there to link to
-    write(tmp_path / "notebooks", "1_text", "# 1. Text\n\nIn figure 1.5 is nothing.")
+    write(tmp_path / "notebooks", "1_text", "# 1. Text\n\n$$ x \\tag{1.1} $$\n\nIn figure 1.5 is nothing.")
     with pytest.raises(NotebookError, match="1_text.ipynb: the text names figure 1.5, which is not there"):
         build(tmp_path)
     assert "Figure 1.1." in Page(tmp_path / "report" / "1_text.html").text  # the old report is left
