@@ -28,7 +28,7 @@ from slamlib.evaluation import anees, ate, nees_band  # noqa: E402
 from slamlib.simulation import simulate  # noqa: E402
 
 SEEDS = range(20)
-PATIENCE = 1800              # s, for one way to solve one problem
+PATIENCE = 900               # s, for one way to solve one problem
 LONG = Path(__file__).parents[2] / "data" / "long"
 
 
