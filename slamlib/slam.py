@@ -107,10 +107,29 @@ def solve(dataset, slip=None, model=None, after=None):
         start = initial.at(graph, after.poses[graph.frame], after.covariances[graph.frame], graph.w)
         return result(solve_graph(graph, slip, start=start))
     best = solve_graph(Graph(dataset, model or "arc"), slip)
-    if model is None:
+    decisive = best.log_evidence + DECISIVE
+    if model is None and _ceiling(best, "euler", slip) > decisive - 1:    # or the search can be spared
         other = compared(best, "euler", "variable", slip)
-        best = other if other.log_evidence > best.log_evidence + DECISIVE else best
+        best = other if other.log_evidence > decisive else best
     return result(best)
+
+
+def _ceiling(optimum, model, slip):
+    """About the greatest log evidence of another model of increments, on the same measurements.
+
+    For None as slip it is that of the slip that suits the model best, on the linearised graph.
+    """
+    graph = Graph(optimum.graph.dataset, model)
+    graph.about(graph.state(optimum.values).w)
+    native = graph.native(optimum.kernel, optimum.late, optimum.weight)
+    U, _ = graph.factors.whitening(optimum.slip)
+    values, _, _ = graph.optimize(optimum.values, native, U, most=2)
+    linearized = native.graph.linearize(values)
+
+    def log_evidence(log_slip):
+        return graph.log_evidence(values, native, np.exp(log_slip), linearized)
+
+    return log_evidence(np.log(optimum.slip)) if slip is not None else _highest(log_evidence)[1]
 
 
 def compared(optimum, model, wheels, slip=None):
