@@ -119,17 +119,26 @@ def _ceiling(optimum, model, slip):
 
     For None as slip it is that of the slip that suits the model best, on the linearised graph.
     """
-    graph = Graph(optimum.graph.dataset, model)
-    graph.about(graph.state(optimum.values).w)
-    native = graph.native(optimum.kernel, optimum.late, optimum.weight)
+    graph, native = _explaining(optimum, model)
     U, _ = graph.factors.whitening(optimum.slip)
     values, _, _ = graph.optimize(optimum.values, native, U, most=2)
-    linearized = native.graph.linearize(values)
-
-    def log_evidence(log_slip):
-        return graph.log_evidence(values, native, np.exp(log_slip), linearized)
-
+    log_evidence = _of_slip(graph, values, native)
     return log_evidence(np.log(optimum.slip)) if slip is not None else _highest(log_evidence)[1]
+
+
+def _explaining(optimum, model):
+    """Graph of another model of increments, about the optimum's wheels, and its Native on the same
+    measurements.
+    """
+    graph = Graph(optimum.graph.dataset, model)
+    graph.about(graph.state(optimum.values).w)
+    return graph, graph.native(optimum.kernel, optimum.late, optimum.weight)
+
+
+def _of_slip(graph, values, native):
+    """The log evidence as a function of the logarithm of the slip, on the graph linearised at `values`."""
+    linearized = native.graph.linearize(values)
+    return lambda log_slip: graph.log_evidence(values, native, np.exp(log_slip), linearized)
 
 
 def compared(optimum, model, wheels, slip=None):
@@ -157,9 +166,7 @@ def evidence_curve(optimum, slips, model):
 
     `optimum` is the Optimum whose measurements are to be explained, whatever the model.
     """
-    graph, values, curve = Graph(optimum.graph.dataset, model), optimum.values, []
-    graph.about(graph.state(values).w)
-    native = graph.native(optimum.kernel, optimum.late, optimum.weight)
+    (graph, native), values, curve = _explaining(optimum, model), optimum.values, []
     for slip in slips:
         values, _, _ = graph.optimize(values, native, graph.factors.whitening(slip)[0])
         curve.append(graph.log_evidence(values, native, slip))
@@ -243,10 +250,7 @@ def _learned_slip(graph, values, native):
     evidence times prior, which is summed about its mode over values of the logarithm half a unit apart:
     slips that are possible beyond the mode count too, as variances do.
     """
-    linearized = native.graph.linearize(values)
-
-    def log_evidence(log_slip):
-        return graph.log_evidence(values, native, np.exp(log_slip), linearized)
+    log_evidence = _of_slip(graph, values, native)
 
     def log_posterior(log_slip):
         return log_evidence(log_slip) + log_slip_prior(log_slip)

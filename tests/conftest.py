@@ -35,6 +35,18 @@ def chromium():
         browser.close()
 
 
+@pytest.fixture
+def look():
+    """The look of the notebooks' figures; they are closed, and the look is undone."""
+    import matplotlib.pyplot as plt
+
+    from slamlib import plotting
+    with plt.rc_context():
+        plotting.use_style()
+        yield
+        plt.close("all")
+
+
 BROUGHT = ("new seed", "no_truth", "wheels_only", "waits", "one_pose", "backs_up", "one_sighting",
            "sparse")
 

@@ -4,7 +4,6 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-import matplotlib.pyplot as plt
 import nbformat
 import numpy as np
 import pytest
@@ -15,16 +14,8 @@ from slamlib.notebook import Log
 from slamlib.simulation import manoeuvre, simulate
 
 ROOT = Path(__file__).parents[1]
+pytestmark = pytest.mark.usefixtures("look")
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
-
-
-@pytest.fixture(autouse=True)
-def look():
-    """The look of the notebooks' figures; they are closed, and the look is undone."""
-    with plt.rc_context():
-        plotting.use_style()
-        yield
-        plt.close("all")
 
 
 @pytest.fixture(scope="module")

@@ -6,14 +6,7 @@ import pytest
 
 from slamlib import plotting
 
-
-@pytest.fixture(autouse=True)
-def look():
-    """The look of the notebooks' figures; they are closed, and the look is undone."""
-    with plt.rc_context():
-        plotting.use_style()
-        yield
-        plt.close("all")
+pytestmark = pytest.mark.usefixtures("look")
 
 
 def drawn(count, rows, columns=2, labels=("truth", "odometry and markers", "SLAM", "hint", "fused")):

@@ -24,7 +24,7 @@ from plain_gtsam import plain  # noqa: E402
 
 from slamlib import montecarlo, slam  # noqa: E402
 from slamlib.dataset import read_dataset  # noqa: E402
-from slamlib.evaluation import anees, ate, nees_band  # noqa: E402
+from slamlib.evaluation import ate, nees_band  # noqa: E402
 from slamlib.simulation import simulate  # noqa: E402
 
 SEEDS = range(20)
@@ -33,12 +33,10 @@ LONG = Path(__file__).parents[2] / "data" / "long"
 
 
 def trial(seed, slip):
-    dataset, truth = simulate("short", seed, slip=slip)
-    dataset = dataset.without("uwb")
-    found, known = slam.solve(dataset), slam.solve(dataset, slip, "arc")
-    return (*(ate(p, truth.poses, aligned=True)
-              for p in (found.poses, known.poses, plain(dataset, marginals=False)[0])),
-            anees(found.poses, found.covariances, truth.poses))
+    numbers, (dataset, truth) = montecarlo.learned_slips(seed, slip), simulate("short", seed, slip=slip)
+    poses, _ = plain(dataset.without("uwb"), marginals=False)
+    return (numbers["aligned"], numbers["known aligned"], ate(poses, truth.poses, aligned=True),
+            numbers["nees"])
 
 
 def drive(rounds):
