@@ -1,5 +1,6 @@
 # make report   executes the notebooks on every dataset in data/ and writes report/ and results/
-# make test     runs the tests
+# make test     checks the style, and runs all tests
+# make quick    runs the tests that take less than a minute in all
 # make lab      opens JupyterLab on the notebooks
 # make strip    removes the outputs from saved notebooks, as they are committed
 # make bench    prints the benchmarks' tables
@@ -10,6 +11,8 @@ CANDIDATES := python3 python3.14 python3.13 python3.12 python3.11
 PYTHON ?= $(shell for p in $(CANDIDATES); do \
 	"$$p" check_python.py >/dev/null 2>&1 && echo "$$p" && exit; done; echo python3)
 BIN := $(VENV)/bin
+# Two processes, each of which takes file after file.
+PARALLEL := --numprocesses 2 --dist loadfile --no-loadscope-reorder
 # An environment holds the folder's path and the Python it was made by: moved, or without that
 # Python, it is made anew.
 READY := $(VENV)/.ready-$(shell printf %s "$(CURDIR)" | cksum | cut -d' ' -f1)
@@ -17,7 +20,7 @@ ifneq ($(shell $(BIN)/python -c 'print("runs")' 2>/dev/null),runs)
 $(shell rm -f $(READY))
 endif
 
-.PHONY: setup report test lab strip bench clean
+.PHONY: setup report test quick lab strip bench clean
 .DEFAULT_GOAL := report
 
 setup: $(READY)
@@ -44,7 +47,11 @@ report: $(READY)
 test: $(READY)
 	@$(BIN)/python -m nbstripout --verify --keep-id notebooks/*.ipynb >/dev/null || { \
 		echo "There are outputs in the notebooks: remove them with 'make strip'." >&2; exit 1; }
-	$(BIN)/python -m pytest
+	@$(BIN)/python -m ruff check .
+	$(BIN)/python -m pytest $(PARALLEL)
+
+quick: $(READY)
+	$(BIN)/python -m pytest $(PARALLEL) -m "not slow"
 
 lab: $(READY)
 	$(BIN)/python -m jupyter lab --LabApp.check_for_updates_class=jupyterlab.NeverCheckForUpdate \

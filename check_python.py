@@ -5,6 +5,7 @@ import sys
 
 
 def problem():
+    """A sentence that says why gtsam cannot run here, or None."""
     version = tuple(sys.version_info[:2])
     system, machine = platform.system(), platform.machine().lower()
     if system == "Windows":
@@ -13,7 +14,8 @@ def problem():
                                  ("Darwin", "x86_64"), ("Darwin", "arm64")):
         return "gtsam has no wheel for %s on %s (see environment.md)." % (system, machine)
     if system == "Linux" and platform.libc_ver()[0] != "glibc":
-        return "gtsam's Linux wheel needs glibc, which this Python does not use (see environment.md)."
+        return ("gtsam's Linux wheel needs glibc, which this Python does not use "
+                "(see environment.md).")
     if platform.python_implementation() != "CPython" or not (3, 11) <= version <= (3, 14):
         return ("Python 3.11 to 3.14 (CPython) is needed, and %s is %s %d.%d: install one and say "
                 "`make PYTHON=python3.12 ...` (see environment.md)."

@@ -6,15 +6,17 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-# The matrices are small: more threads only wait for each other. To be set before numpy is imported.
+# Set before numpy is imported: the matrices are so small that more threads are slower.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from slamlib.dataset import DatasetError, read_dataset, read_truth  # noqa: E402
 
 
 def main(arguments=None):
-    """Run one command; returns the exit code: 0, 1 for a failing notebook, 2 for bad input, 130 for
-    an interruption."""
+    """Run one command of `arguments` (list of str, or None for the command line's).
+
+    Returns the exit code: 0, 1 if a notebook failed, 2 for invalid input, 130 if interrupted.
+    """
     options = _parser().parse_args(arguments)
     try:
         return options.run(options)
@@ -71,16 +73,17 @@ def _parser():
 
 
 def _report(options):
-    from slamlib.cover import read_cover
     from slamlib.report import NotebookError, build_report
+    from slamlib.report.cover import read_cover
     cover = read_cover("report.toml")
     given = {"author": options.author, "student_number": options.student_number}
     cover = replace(cover, **{key: value for key, value in given.items() if value is not None})
     try:
-        files = build_report(options.notebooks, options.data, options.report, options.results,
-                             [_name(dataset, options.data) for dataset in options.datasets] or None,
-                             options.jobs, cover, options.code, Path("build", "executed"),
-                             options.fresh)
+        files = build_report(
+            options.notebooks, options.data, options.report, options.results,
+            datasets=[_name(dataset, options.data) for dataset in options.datasets] or None,
+            jobs=options.jobs, cover=cover, code=options.code, kept=Path("build", "executed"),
+            fresh=options.fresh)
     except NotebookError as error:
         print(f"slamlib: {error}", file=sys.stderr)
         return 1
@@ -91,22 +94,23 @@ def _report(options):
 
 
 def _name(dataset, data):
-    """A dataset's name, which may also be given as the path of its folder in the data folder."""
+    """Return the name of a dataset, given by its name or by the path of its folder in `data`."""
     path = Path(dataset)
     return path.name if path.resolve().parent == data.resolve() else dataset
 
 
 def _solve(options):
-    from slamlib.solve import solve_to_folder
+    from slamlib.summary import solve_to_folder
     summary = solve_to_folder(read_dataset(options.folder), read_truth(options.folder), options.out)
     print(_table(summary))
     return 0
 
 
 def _table(summary):
-    """The summary as a short table, one line a problem."""
+    """Return the summary as a table, one line for each problem."""
     lines = [f"{summary['dataset']}: {summary['poses']} poses",
-             f"{'problem':15}{'estimates':>10}{'last x, y, heading':>29}{'their sigmas':>27}{'ATE':>11}"]
+             f"{'problem':15}{'estimates':>10}{'last x, y, heading':>29}"
+             f"{'their sigmas':>27}{'ATE':>11}"]
     for name, row in summary["problems"].items():
         pose = "{:8.3f} m {:8.3f} m {:7.4f}".format(*row["last_pose"])
         sigma = "{:7.4f} m {:7.4f} m {:6.4f}".format(*row["last_sigma"])

@@ -1,4 +1,11 @@
-"""How good an estimate is, against the truth where there is truth."""
+"""Measures of the quality of an estimate, most of them against the truth.
+
+Poses are (n, 3) [x, y, heading] in m and rad, covariances (n, 3, 3) of the same in world axes.
+Estimate and truth hold the same pose in the same row. Poses without an estimate are NaN. ATE and
+RPE follow Sturm et al., *A benchmark for the evaluation of RGB-D SLAM systems* (IROS 2012); NEES
+follows Bar-Shalom, Li and Kirubarajan, *Estimation with Applications to Tracking and Navigation*
+(2001), section 5.4.
+"""
 
 import numpy as np
 from scipy.stats import chi2
@@ -7,24 +14,16 @@ from slamlib import se2
 
 
 def path_length(poses):
-    """Sum of the straight lines between consecutive known poses (n, >= 2), in metres."""
+    """Sum in m of the distances between consecutive known poses (n, >= 2)."""
     known = poses[np.isfinite(poses[:, 0]), :2]
     return float(np.hypot(*np.diff(known, axis=0).T).sum())
 
 
 def align(poses, truth):
-    """The motion T of SE(2) that brings poses nearest to the truth: least squares of positions.
+    """Motion T (3,) of SE(2) for which compose(T, poses) is closest to the truth.
 
-    Horn's problem in the plane: the turn follows from the cross and dot products of the positions
-    about their means.
-
-    Parameters
-    ----------
-    poses, truth : (n, >= 2) [x, y, ...], the same pose in the same row, finite.
-
-    Returns
-    -------
-    (3,) T, such that compose(T, poses) is aligned.
+    Least squares of the positions, Horn's problem in the plane: the cross and dot products of the
+    positions about their means determine the rotation. Both arguments are (n, >= 2) and finite.
     """
     mean, true_mean = poses[:, :2].mean(0), truth[:, :2].mean(0)
     p, q = poses[:, :2] - mean, truth[:, :2] - true_mean
@@ -33,16 +32,13 @@ def align(poses, truth):
 
 
 def ate(poses, truth, aligned=False):
-    """Absolute trajectory error: root mean square of the position errors, in metres.
+    """Absolute trajectory error: root mean square in m of the position errors.
 
-    Parameters
-    ----------
-    poses, truth : (n, 3) [x, y, heading], the same pose in the same row; rows of poses that are
-        NaN are left out. NaN if all are.
-    aligned : True moves the poses as a whole nearest to the truth first (Sturm et al., *A benchmark
-        for the evaluation of RGB-D SLAM systems*, IROS 2012).
+    Poses that are NaN are left out; the result is NaN if all are. With `aligned` the poses are
+    first aligned with the truth by one motion of SE(2).
     """
-    poses, truth = _finite(poses, truth)
+    known = np.isfinite(poses).all(axis=1)
+    poses, truth = poses[known], truth[known]
     if not len(poses):
         return np.nan
     if aligned:
@@ -51,16 +47,10 @@ def ate(poses, truth, aligned=False):
 
 
 def rpe(poses, truth, step):
-    """Relative pose error: of the increments over `step` rows, all of them (Sturm et al., 2012).
+    """Relative pose error: root mean square of the errors of all increments over `step` rows.
 
-    Parameters
-    ----------
-    poses, truth : (n, 3) [x, y, heading]; increments from or to a pose that is NaN are left out.
-    step : rows from the beginning to the end of an increment.
-
-    Returns
-    -------
-    translation, rotation : root mean squares in metres and radians; NaN if there is no increment.
+    Returns translation in m and rotation in rad. Increments from or to a pose that is NaN are left
+    out; both results are NaN without an increment.
     """
     estimated = se2.between(poses[:-step], poses[step:])
     error = se2.between(se2.between(truth[:-step], truth[step:]), estimated)
@@ -72,14 +62,22 @@ def rpe(poses, truth, step):
     return float(np.sqrt(squared[0] + squared[1])), float(np.sqrt(squared[2]))
 
 
-def judge(poses, covariances, truth, step):
-    """ATE, aligned ATE, RPE over `step` rows and mean NEES of one trajectory: a dict of numbers.
+def nees(poses, covariances, truth):
+    """Normalized estimation error squared e^T C^-1 e of every pose, (n,).
 
-    Rows of poses that are NaN stay where they are: no increment leads across a gap.
+    It is chi-squared with 3 degrees of freedom, so 3 on average, if the errors are Gaussian with
+    covariance C. It is NaN where C is singular, as for a known pose, and without an estimate.
     """
-    translation, rotation = rpe(poses, truth, step)
-    return {"ate": ate(poses, truth), "aligned": ate(poses, truth, aligned=True),
-            "rpe": translation, "rpe_heading": rotation, "nees": anees(poses, covariances, truth)}
+    error = poses - truth
+    error[:, 2] = se2.wrap(error[:, 2])
+    rho = correlations(covariances)
+    regular = np.isfinite(rho).all(axis=(1, 2))
+    regular[regular] = np.linalg.eigvalsh(rho[regular])[:, 0] > 1e-12      # else singular
+    scaled = error[regular] / sigmas(covariances[regular])
+    result = np.full(len(error), np.nan)
+    result[regular] = np.einsum("ni,ni->n", scaled,
+                                np.linalg.solve(rho[regular], scaled[..., None])[..., 0])
+    return result
 
 
 def anees(poses, covariances, truth):
@@ -90,48 +88,28 @@ def anees(poses, covariances, truth):
 
 
 def nees_band(count, dof=3, probability=0.95):
-    """Two-sided band in which the mean of `count` independent NEES lies with this probability.
+    """Two-sided band (low, high) that contains the mean of `count` independent NEES.
 
-    count times the mean is chi-squared with count * dof degrees of freedom (Bar-Shalom, Li and
-    Kirubarajan, *Estimation with Applications to Tracking and Navigation*, 2001, section 5.4).
+    The sum of the NEES is chi-squared with count * dof degrees of freedom; the mean lies in the
+    band with the given probability.
     """
     tail = (1 - probability) / 2
     return tuple(chi2.ppf([tail, 1 - tail], dof * count) / count)
 
 
-def _finite(poses, truth):
-    known = np.isfinite(poses).all(axis=1)
-    return poses[known], truth[known]
+def judge(poses, covariances, truth, step):
+    """ATE, aligned ATE, RPE over `step` rows and average NEES of a trajectory: a dict of numbers.
+
+    The keys are ate, aligned, rpe (all in m), rpe_heading (rad) and nees.
+    """
+    translation, rotation = rpe(poses, truth, step)
+    return {"ate": ate(poses, truth), "aligned": ate(poses, truth, aligned=True),
+            "rpe": translation, "rpe_heading": rotation, "nees": anees(poses, covariances, truth)}
 
 
 def sigmas(covariances):
     """Standard deviations (n, d) of covariances (n, d, d)."""
     return np.sqrt(np.diagonal(covariances, axis1=-2, axis2=-1))
-
-
-def along(n, count=41):
-    """Up to `count` indices from 1 to n - 1, evenly spread; 0 if there is nothing else."""
-    return np.unique(np.linspace(min(1, n - 1), n - 1, count).astype(int))
-
-
-def sigma_difference(covariances, reference):
-    """Largest difference of the position's standard deviations from those of a reference.
-
-    Both are (n, 3, 3); the result is a share of the largest standard deviation of the reference,
-    since a ratio says nothing where both are next to zero. NaN if the reference has no extent.
-    """
-    sigma, expected = sigmas(covariances)[:, :2], sigmas(reference)[:, :2]
-    return float(np.abs(sigma - expected).max() / expected.max()) if expected.max() > 0 else np.nan
-
-
-def correlation_difference(covariances, reference):
-    """Root mean square difference of the correlations of x and y with the heading.
-
-    Both are (n, 3, 3); poses where a correlation is not defined are left out. NaN if all are.
-    """
-    difference = correlations(covariances)[:, :2, 2] - correlations(reference)[:, :2, 2]
-    difference = difference[np.isfinite(difference)]
-    return float(np.sqrt(np.mean(difference**2))) if len(difference) else np.nan
 
 
 def correlations(covariances):
@@ -141,26 +119,26 @@ def correlations(covariances):
     return np.divide(covariances, scale, out=np.full_like(scale, np.nan), where=scale > 0)
 
 
-def nees(poses, covariances, truth):
-    """Normalized estimation error squared e^T C^-1 e of every pose; 3 on average is consistent.
+def sigma_difference(covariances, reference):
+    """Largest difference between the position sigmas of two sets of covariances (n, 3, 3).
 
-    Parameters
-    ----------
-    poses, truth : (n, 3) [x, y, heading].
-    covariances : (n, 3, 3) of [x, y, heading]. Singular ones, as of a pose that is known, and those
-        of poses without an estimate give NaN.
-
-    Returns
-    -------
-    (n,) NEES, chi-squared with 3 degrees of freedom for an honest Gaussian covariance.
+    The result is relative to the largest position sigma of the reference, because the ratio of two
+    sigmas means nothing where both are almost zero. It is NaN if all sigmas of the reference are 0.
     """
-    error = poses - truth
-    error[:, 2] = se2.wrap(error[:, 2])
-    rho = correlations(covariances)
-    regular = np.isfinite(rho).all(axis=(1, 2))
-    regular[regular] = np.linalg.eigvalsh(rho[regular])[:, 0] > 1e-12
-    scaled = error[regular] / sigmas(covariances[regular])
-    result = np.full(len(error), np.nan)
-    result[regular] = np.einsum("ni,ni->n", scaled,
-                                np.linalg.solve(rho[regular], scaled[..., None])[..., 0])
-    return result
+    sigma, expected = sigmas(covariances)[:, :2], sigmas(reference)[:, :2]
+    return float(np.abs(sigma - expected).max() / expected.max()) if expected.max() > 0 else np.nan
+
+
+def correlation_difference(covariances, reference):
+    """Root mean square difference between the correlations of x and y with the heading.
+
+    Both arguments are (n, 3, 3). Undefined correlations are left out; NaN if all are undefined.
+    """
+    difference = correlations(covariances)[:, :2, 2] - correlations(reference)[:, :2, 2]
+    difference = difference[np.isfinite(difference)]
+    return float(np.sqrt(np.mean(difference**2))) if len(difference) else np.nan
+
+
+def along(n, count=41):
+    """Up to `count` evenly spaced indices from 1 to n - 1; [0] if n is 1."""
+    return np.unique(np.linspace(min(1, n - 1), n - 1, count).astype(int))

@@ -1,4 +1,8 @@
-"""The deliverables: MATLAB files with struct arrays, as the assignment names their fields."""
+"""The files to hand in: MATLAB struct arrays with the assignment's field names.
+
+Poses are [x, y, heading] and positions [x, y] in world axes, in m and rad. Covariances belong to
+the same coordinates. The folder of a file is made if it does not exist.
+"""
 
 import os
 from io import BytesIO
@@ -7,17 +11,13 @@ from pathlib import Path
 import numpy as np
 from scipy.io import loadmat, savemat
 
-_HEADER = b"MATLAB 5.0 MAT-file, written by slamlib".ljust(116)
+_HEADER = b"MATLAB 5.0 MAT-file, written by slamlib".ljust(116)  # scipy's contains the date
 
 
 def write_vehicle_poses(folder, poses, covariances):
     """Write folder/vehiclePose.mat: vehiclePose(k).pose, .covari for pose k of the encoder file.
 
-    Parameters
-    ----------
-    folder : path, made if it does not exist.
-    poses : (n, 3) [x, y, heading] in world axes, m and rad; NaN where there is no estimate.
-    covariances : (n, 3, 3) of [x, y, heading] in world axes.
+    `poses` (n, 3) and `covariances` (n, 3, 3) are NaN where there is no estimate.
     """
     _write(Path(folder) / "vehiclePose.mat", pose=poses, covari=covariances)
 
@@ -25,12 +25,8 @@ def write_vehicle_poses(folder, poses, covariances):
 def write_aruco_map(folder, ids, poses, covariances):
     """Write folder/ArucoMap.mat: ArucoMap(k).pose, .covari and .id, in ascending id.
 
-    Parameters
-    ----------
-    folder : path, made if it does not exist.
-    ids : (k,) marker ids, ascending.
-    poses : (k, 3) [x, y, heading] in world axes, headings in (-pi, pi].
-    covariances : (k, 3, 3) of [x, y, heading] in world axes.
+    The marker `ids` (k,) ascend; `poses` are (k, 3) with headings in (-pi, pi], and `covariances`
+    (k, 3, 3).
     """
     _write(Path(folder) / "ArucoMap.mat", pose=poses, covari=covariances, id=ids)
 
@@ -38,66 +34,54 @@ def write_aruco_map(folder, ids, poses, covariances):
 def write_uwb_map(folder, ids, positions, covariances):
     """Write folder/UwbMap.mat: UwbMap(k).position, .covariance and .id, in ascending id.
 
-    Parameters
-    ----------
-    folder : path, made if it does not exist.
-    ids : (a,) antenna ids, ascending.
-    positions : (a, 2) [x, y] in world axes, m.
-    covariances : (a, 2, 2) of [x, y].
+    The antenna `ids` (a,) ascend; `positions` are (a, 2) and `covariances` (a, 2, 2).
     """
     _write(Path(folder) / "UwbMap.mat", position=positions, covariance=covariances, id=ids)
 
 
-def read_uwb_map(folder):
-    """Ids (a,), positions (a, 2) and covariances (a, 2, 2) of a UwbMap.mat."""
-    content = _read(Path(folder) / "UwbMap.mat")
-    return (content["id"].astype(int).ravel(), content["position"].reshape(-1, 2),
-            content["covariance"].reshape(-1, 2, 2))
+def read_vehicle_poses(folder):
+    """Poses (n, 3) and covariances (n, 3, 3) of folder/vehiclePose.mat."""
+    return _read(Path(folder) / "vehiclePose.mat", pose=(3,), covari=(3, 3))
 
 
 def read_aruco_map(folder):
-    """Ids (k,), poses (k, 3) and covariances (k, 3, 3) of an ArucoMap.mat."""
-    content = _read(Path(folder) / "ArucoMap.mat")
-    return content["id"].astype(int).ravel(), *_poses_and_covariances(content)
+    """Ids (k,), poses (k, 3) and covariances (k, 3, 3) of folder/ArucoMap.mat."""
+    ids, *rest = _read(Path(folder) / "ArucoMap.mat", id=(), pose=(3,), covari=(3, 3))
+    return ids.astype(int), *rest
 
 
-def read_vehicle_poses(folder):
-    """Poses (n, 3) and covariances (n, 3, 3) of a vehiclePose.mat."""
-    return _poses_and_covariances(_read(Path(folder) / "vehiclePose.mat"))
-
-
-def _poses_and_covariances(content):
-    return content["pose"].reshape(-1, 3), content["covari"].reshape(-1, 3, 3)
+def read_uwb_map(folder):
+    """Ids (a,), positions (a, 2) and covariances (a, 2, 2) of folder/UwbMap.mat."""
+    ids, *rest = _read(Path(folder) / "UwbMap.mat", id=(), position=(2,), covariance=(2, 2))
+    return ids.astype(int), *rest
 
 
 def write_atomically(path, content):
-    """Write bytes to path so that it is the old file or the whole new one, never a part."""
+    """Write bytes to a Path; a reader finds the old file or the whole new one, never a part."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        beside.write_bytes(content)
-        os.replace(beside, path)
+        temporary.write_bytes(content)
+        os.replace(temporary, path)
     finally:
-        beside.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
 
 
 def _write(path, **fields):
-    """One (1, n) struct array, named like the file; equal input gives equal bytes."""
-    length = len(next(iter(fields.values())))
-    structs = np.empty((1, length), dtype=[(name, object) for name in fields])
+    """Write one (1, n) struct array, named like the file; equal input gives equal bytes."""
+    structs = np.empty((1, len(next(iter(fields.values())))), dtype=[(f, object) for f in fields])
     for name, values in fields.items():
         rows = np.asarray(values, dtype=float)
-        while rows.ndim < 3:                                      # vectors are 1 x d in MATLAB
+        while rows.ndim < 3:  # vectors are 1 x d in MATLAB
             rows = rows[:, None]
         structs[name][0, :] = list(rows)
     buffer = BytesIO()
     savemat(buffer, {path.stem: structs})
-    content = buffer.getvalue()
-    write_atomically(path, _HEADER + content[len(_HEADER):])      # scipy's header has the date
+    write_atomically(path, _HEADER + buffer.getvalue()[len(_HEADER):])
 
 
-def _read(path):
-    """Fields of a struct array, stacked: {name: (length, 1, d) or (length, d, d)}."""
+def _read(path, **shapes):
+    """Fields of a struct array with n elements: a tuple of arrays (n, *shape)."""
     structs = loadmat(path)[path.stem]
-    return {name: np.stack([*structs[name].ravel()]) if structs.size else np.zeros((0, 1, 0))
-            for name in structs.dtype.names}
+    return tuple(np.reshape([*structs[name].ravel()], (-1, *shape))
+                 for name, shape in shapes.items())

@@ -1,27 +1,27 @@
 """Planar rigid motions, batched: poses are arrays (..., 3) of [x, y, heading].
 
-A pose is read as the frame change T_ab that takes coordinates in b to coordinates in a,
+Lengths are in metres, angles in radians. The pose T_ab of frame b in frame a maps coordinates in b
+to coordinates in a,
 
     p_a = R(heading) p_b + [x, y],        R(h) = [[cos h, -sin h], [sin h, cos h]],
 
-so that frames cancel when read: compose(T_ab, T_bc) = T_ac and between(T_wa, T_wb) = T_ab.
-Every function broadcasts over the leading dimensions. Jacobians are the partial derivatives of
-the three coordinates [x, y, heading], not of a tangent vector: they carry covariances of
-[x, y, heading] as this package stores them. Headings are added and subtracted but never wrapped;
-call `wrap` where an angle must lie in (-pi, pi].
+so that frames cancel: compose(T_ab, T_bc) = T_ac and between(T_wa, T_wb) = T_ab. Every function
+broadcasts over the leading dimensions. Jacobians are partial derivatives by the coordinates
+[x, y, heading], not by a tangent vector, as the covariances of this package are of [x, y, heading].
+Headings are added and subtracted but not wrapped; call `wrap` where an angle must lie in (-pi, pi].
 """
 
 import numpy as np
 
 
 def wrap(angle):
-    """Angle in radians, any shape, brought to (-pi, pi]."""
+    """Angles in (-pi, pi] that are equivalent to `angle`, rad, of any shape."""
     wrapped = np.pi - np.mod(np.pi - np.asarray(angle, dtype=float), 2 * np.pi)
-    return np.where(wrapped <= -np.pi, np.pi, wrapped)         # a remainder rounded up to 2 pi
+    return np.where(wrapped <= -np.pi, np.pi, wrapped)         # np.mod can round up to 2 pi
 
 
 def rotation(heading):
-    """Rotation matrices R(heading), shape heading.shape + (2, 2)."""
+    """Rotation matrices R(heading), (..., 2, 2), of headings (...)."""
     c, s = np.cos(heading), np.sin(heading)
     R = np.empty(np.shape(heading) + (2, 2))
     R[..., 0, 0] = R[..., 1, 1] = c
@@ -30,7 +30,7 @@ def rotation(heading):
 
 
 def compose(T_ab, T_bc):
-    """T_ac = T_ab T_bc, shape (..., 3), metres and radians."""
+    """T_ac = T_ab T_bc, (..., 3)."""
     T_ab, T_bc = np.asarray(T_ab, dtype=float), np.asarray(T_bc, dtype=float)
     c, s = np.cos(T_ab[..., 2]), np.sin(T_ab[..., 2])
     x, y = T_bc[..., 0], T_bc[..., 1]
@@ -40,7 +40,7 @@ def compose(T_ab, T_bc):
 
 
 def inverse(T_ab):
-    """T_ba, shape (..., 3)."""
+    """T_ba, (..., 3), the inverse of T_ab."""
     T_ab = np.asarray(T_ab, dtype=float)
     c, s = np.cos(T_ab[..., 2]), np.sin(T_ab[..., 2])
     x, y = T_ab[..., 0], T_ab[..., 1]
@@ -48,7 +48,7 @@ def inverse(T_ab):
 
 
 def between(T_wa, T_wb):
-    """T_ab = inverse(T_wa) T_wb, the pose of b seen from a, shape (..., 3)."""
+    """T_ab = inverse(T_wa) T_wb, (..., 3), the pose of b in a."""
     T_wa, T_wb = np.asarray(T_wa, dtype=float), np.asarray(T_wb, dtype=float)
     c, s = np.cos(T_wa[..., 2]), np.sin(T_wa[..., 2])
     dx, dy = T_wb[..., 0] - T_wa[..., 0], T_wb[..., 1] - T_wa[..., 1]
@@ -56,7 +56,7 @@ def between(T_wa, T_wb):
 
 
 def compose_jacobians(T_ab, T_bc):
-    """Partial derivatives of compose: (d T_ac / d T_ab, d T_ac / d T_bc), each (..., 3, 3)."""
+    """Derivatives of compose, d T_ac / d T_ab and d T_ac / d T_bc, each (..., 3, 3)."""
     shape = np.broadcast_shapes(np.shape(T_ab), np.shape(T_bc))
     T_ab, T_ac = np.broadcast_to(T_ab, shape), compose(T_ab, T_bc)
     lever = T_ac[..., :2] - T_ab[..., :2]                # position of c from b, in axes of a
@@ -69,7 +69,7 @@ def compose_jacobians(T_ab, T_bc):
 
 
 def inverse_jacobian(T_ab):
-    """Partial derivatives of inverse, d T_ba / d T_ab, shape (..., 3, 3)."""
+    """Derivative of inverse, d T_ba / d T_ab, (..., 3, 3)."""
     T_ab = np.asarray(T_ab, dtype=float)
     T_ba = inverse(T_ab)
     jacobian = -_identity(T_ab.shape)
@@ -80,7 +80,7 @@ def inverse_jacobian(T_ab):
 
 
 def between_jacobians(T_wa, T_wb):
-    """Partial derivatives of between: (d T_ab / d T_wa, d T_ab / d T_wb), each (..., 3, 3)."""
+    """Derivatives of between, d T_ab / d T_wa and d T_ab / d T_wb, each (..., 3, 3)."""
     shape = np.broadcast_shapes(np.shape(T_wa), np.shape(T_wb))
     T_ab = between(T_wa, T_wb)
     world_in_a = rotation(-np.broadcast_to(T_wa, shape)[..., 2])
@@ -93,10 +93,10 @@ def between_jacobians(T_wa, T_wb):
 
 
 def log(T):
-    """Logarithm of a motion, the constant velocity that reaches it in unit time, (..., 3).
+    """Logarithm (..., 3) of motions T, the constant velocity that reaches T in unit time.
 
-    With a = (h / 2) cot(h / 2) of the heading h, wrapped: [a x + h y / 2, -h x / 2 + a y, h]. It is
-    the error of GTSAM's between factors (`Pose2::Logmap`).
+    It is [a x + h y / 2, -h x / 2 + a y, h] with the wrapped heading h and a = (h / 2) cot(h / 2).
+    GTSAM computes the error of its between factors with it (`Pose2::Logmap`).
     """
     T = np.asarray(T, dtype=float)
     h, x, y = wrap(T[..., 2]), T[..., 0], T[..., 1]
@@ -105,7 +105,7 @@ def log(T):
 
 
 def log_jacobian(T):
-    """Partial derivatives of log by [x, y, heading], (..., 3, 3)."""
+    """Derivative of log by [x, y, heading], (..., 3, 3)."""
     T = np.asarray(T, dtype=float)
     h, x, y = wrap(T[..., 2]), T[..., 0], T[..., 1]
     a, slope = _half_cotangent(h)
@@ -125,30 +125,24 @@ def _half_cotangent(h):
 
 
 def rotate_covariance(covariance, heading):
-    """Covariance of [x, y, heading] expressed in axes turned by `heading`: B C B^T.
+    """B C B^T, the covariance C (..., 3, 3) of [x, y, heading] turned from axes of b to those of a.
 
-    Parameters
-    ----------
-    covariance : (..., 3, 3) covariance of [x, y, heading] in the axes of frame b.
-    heading : (...) rad, heading of b in a.
-
-    Returns
-    -------
-    (..., 3, 3) covariance of the same quantity with x and y along the axes of a.
+    `heading` (...) is that of b in a, in rad.
     """
     B = _identity(np.shape(heading) + (3,))
     B[..., :2, :2] = rotation(heading)
     return B @ covariance @ np.swapaxes(B, -1, -2)
 
 
-# Arrays are filled in place: np.stack takes several times as long on the many small ones.
 def _poses(x, y, heading):
+    """Poses (..., 3), filled in place because np.stack is several times slower on small arrays."""
     T = np.empty(np.shape(x) + (3,))
     T[..., 0], T[..., 1], T[..., 2] = x, y, heading
     return T
 
 
 def _identity(shape):
+    """An identity matrix for each pose of an array of this shape, (..., 3, 3)."""
     matrices = np.zeros(shape[:-1] + (3, 3))
     for i in range(3):
         matrices[..., i, i] = 1

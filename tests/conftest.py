@@ -14,15 +14,21 @@ for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):  # a
 os.environ.pop("SLAMLIB_STUDIES", None)
 
 ROOT = Path(__file__).parents[1]
+STUDY_SEEDS = "2"            # in pages that tests build: their claims are tested on more drives
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+
+
+def pytest_collection_modifyitems(items):
+    """The file that takes longest comes first, while the other process runs the others."""
+    items.sort(key=lambda item: item.path.stem != "test_pages")
 
 
 @pytest.fixture(scope="module")
 def chromium():
     """A headless Chromium that finds no host but this one (a playwright Browser).
 
-    While it runs asyncio counts as running in this thread, and no report can be built: a module at a
-    time, and after the pages that it looks at.
+    While it runs, asyncio counts as running in this thread, and no report can be built. So it runs
+    for a module at a time, after the pages that it looks at were built.
     """
     program = next(filter(None, map(shutil.which, BROWSERS)), None)
     if program is None:
@@ -40,7 +46,7 @@ def look():
     """The look of the notebooks' figures; they are closed, and the look is undone."""
     import matplotlib.pyplot as plt
 
-    from slamlib import plotting
+    from slamlib.notebook import plotting
     with plt.rc_context():
         plotting.use_style()
         yield
@@ -53,14 +59,14 @@ BROUGHT = ("new seed", "no_truth", "wheels_only", "waits", "one_pose", "backs_up
 
 @pytest.fixture(scope="session")
 def kept(tmp_path_factory):
-    """The folder of what is kept of notebooks and studies from one build of these tests to the next."""
+    """The folder of executed notebooks and studies that the builds of these tests keep."""
     return tmp_path_factory.mktemp("kept")
 
 
 @pytest.fixture
-def as_in_a_notebook(kept, monkeypatch):
-    """A study that a notebook has run in these tests, with the same seeds, is not run once more."""
-    monkeypatch.setenv("SLAMLIB_STUDIES", str(kept / "studies"))
+def few_seeds(monkeypatch):
+    """Studies in the pages that a test builds run on few seeds."""
+    monkeypatch.setenv("SLAMLIB_SEEDS", STUDY_SEEDS)
 
 
 @pytest.fixture(scope="session")
@@ -86,5 +92,7 @@ def report_on_all(tmp_path_factory, kept):
     for name, rows in (("one_sighting", seen[:1]), ("sparse", seen[seen[:, 0] % 500 == 1])):
         shutil.copytree(data / "new seed", data / name)
         np.savetxt(data / name / "ArucoReading.txt", rows, fmt="%d %d" + 9 * " %.6g")
-    build_report(ROOT / "notebooks", data, folder / "report", folder / "results", kept=kept)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SLAMLIB_SEEDS", STUDY_SEEDS)
+        build_report(ROOT / "notebooks", data, folder / "report", folder / "results", kept=kept)
     return folder

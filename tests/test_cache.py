@@ -1,76 +1,87 @@
-"""Only what something changed for is executed again."""
+"""A notebook is executed again when something changed that it depends on, and only then."""
+
+from importlib.metadata import distributions
 
 import nbformat
 import pytest
 from test_report import make_data, write
 
-from slamlib import cache, studies
-from slamlib.report import build_report
+from slamlib.report import build, build_report, cache
+from slamlib.studies import memory
 
-COUNTING = """import os
-with open({!r}, "a") as counter:
-    counter.write("x")
-folder = os.path.join(os.environ["SLAMLIB_RESULTS"], "short")
-os.makedirs(folder, exist_ok=True)
-open(os.path.join(folder, "{}.mat"), "w").close()"""
+
+def execute_without_kernel(books, environment, results, jobs, finish):
+    """Count an execution of each notebook and write its output and its result, as kernels would."""
+    for source, book in books.items():
+        with open(source.parents[1] / f"count_{source.stem}", "a") as count:
+            count.write("x")
+        (results / "short").mkdir(parents=True, exist_ok=True)
+        (results / "short" / f"{source.stem}.mat").write_text("")
+        book.cells[1].outputs = [nbformat.v4.new_output("stream", text="executed")]
+        finish(source, book, [f"short/{source.stem}.mat"])
+
+
+@pytest.fixture(autouse=True)
+def no_packages(monkeypatch):
+    """Reading what is installed takes 0.1 s; one test does so."""
+    monkeypatch.setattr(cache, "distributions", lambda: [])
 
 
 @pytest.fixture
-def project(tmp_path):
-    """A folder with two notebooks, each of which counts how often it was executed."""
+def project(tmp_path, monkeypatch):
+    """A folder with two notebooks a and b, whose executions are counted."""
+    monkeypatch.setattr(build, "execute", execute_without_kernel)
     make_data(tmp_path)
     for name in "ab":
-        write(tmp_path / "notebooks", name, f"# {name}",
-              (COUNTING.format(str(tmp_path / f"count_{name}"), name),))
+        write(tmp_path / "notebooks", name, f"# {name}", ("1 + 1",))
     return tmp_path
 
 
-def build(folder, **options):
-    """Build the report; returns how often each notebook has been executed so far."""
+def executions(folder, **options):
+    """Build the report; return how often each notebook has been executed so far."""
     build_report(folder / "notebooks", folder / "data", folder / "report", folder / "results",
                  kept=folder / "kept", **options)
     return tuple(len((folder / f"count_{name}").read_text()) for name in "ab")
 
 
 def test_a_changed_notebook_is_executed_again_and_only_that_one(project, capsys):
-    assert build(project) == (1, 1)
+    assert executions(project) == (1, 1)
     pages = [file.read_bytes() for file in sorted((project / "report").iterdir())]
     capsys.readouterr()
-    assert build(project) == (1, 1)
+    assert executions(project) == (1, 1)
     told = capsys.readouterr().err
     assert told.count("nothing changed, not executed again") == 2
     assert "built in" in told and "MB" in told
     assert [file.read_bytes() for file in sorted((project / "report").iterdir())] == pages
-    write(project / "notebooks", "b", "# b, changed",
-          (COUNTING.format(str(project / "count_b"), "b"),))
-    assert build(project) == (1, 2)
+    write(project / "notebooks", "b", "# b, changed", ("1 + 1",))
+    assert executions(project) == (1, 2)
     (project / "results" / "short" / "a.mat").write_text("changed")
-    assert build(project) == (2, 2)
+    assert executions(project) == (2, 2)
     (project / "results" / "short" / "b.mat").unlink()
-    assert build(project) == (2, 3)
+    assert executions(project) == (2, 3)
     assert (project / "results" / "short" / "b.mat").read_text() == ""
 
 
 def test_a_changed_dataset_executes_all_and_fresh_does_so_without_a_change(project):
-    assert build(project, datasets=["short"]) == (1, 1)
+    assert executions(project, datasets=["short"]) == (1, 1)
     (project / "data" / "long" / "encoderReading.txt").write_text("1 0 0\n2 3 3\n")
-    assert build(project, datasets=["short"]) == (1, 1)  # not selected
+    assert executions(project, datasets=["short"]) == (1, 1)  # not selected
     (project / "data" / "short" / "encoderReading.txt").write_text("1 0 0\n2 3 3\n")
-    assert build(project, datasets=["short"]) == (2, 2)
-    assert build(project, datasets=["short"], fresh=True) == (3, 3)
-    assert build(project, datasets=["short"]) == (3, 3)
+    assert executions(project, datasets=["short"]) == (2, 2)
+    assert executions(project, datasets=["short"], fresh=True) == (3, 3)
+    assert executions(project, datasets=["short"]) == (3, 3)
 
 
 def test_another_selection_and_back_executes_each_notebook_once_for_each(project):
-    assert build(project, datasets=["short"]) == (1, 1)
+    assert executions(project, datasets=["short"]) == (1, 1)
     first = [file.read_bytes() for file in sorted((project / "report").iterdir())]
-    assert build(project) == (2, 2)
-    assert build(project, datasets=["short"]) == build(project) == (2, 2)
-    build(project, datasets=["short"])
+    assert executions(project) == (2, 2)
+    assert executions(project, datasets=["short"]) == executions(project) == (2, 2)
+    executions(project, datasets=["short"])
     assert [file.read_bytes() for file in sorted((project / "report").iterdir())] == first
-    (project / "results" / "short" / "a.mat").write_text("changed")       # is neither's any more
-    assert build(project, datasets=["short"]) == (3, 2)
-    assert build(project) == (3, 2)
+    (project / "results" / "short" / "a.mat").write_text("changed")  # of neither selection now
+    assert executions(project, datasets=["short"]) == (3, 2)
+    assert executions(project) == (3, 2)
 
 
 def test_the_versions_used_last_are_kept_and_other_notebooks_are_left_alone(tmp_path):
@@ -79,7 +90,7 @@ def test_the_versions_used_last_are_kept_and_other_notebooks_are_left_alone(tmp_
     for source in sources:
         cache.keep(kept, source, "0", book, tmp_path, [])
     for key in "1234":
-        assert cache.recall(kept, sources[0], "0", tmp_path)              # is used, and therefore stays
+        assert cache.recall(kept, sources[0], "0", tmp_path)  # used, so it stays
         cache.keep(kept, sources[0], key, book, tmp_path, [])
     assert [key for key in "01234" if cache.recall(kept, sources[0], key, tmp_path)] == list("0234")
     assert all(cache.recall(kept, source, "0", tmp_path) for source in sources[1:])
@@ -96,7 +107,8 @@ def kept(tmp_path):
     (tmp_path / "a.mat").write_text("result")
 
     def key(variables):
-        return cache.key_of(source, book, cache.fingerprint([tmp_path / "data"], tmp_path, variables))
+        common = cache.fingerprint([tmp_path / "data"], tmp_path, variables)
+        return cache.key_of(source, book, common)
 
     cache.keep(tmp_path / "kept", source, key({}), book, tmp_path, ["a.mat"])
     return lambda **variables: cache.recall(tmp_path / "kept", source, key(variables), tmp_path)
@@ -136,10 +148,10 @@ def test_a_change_or_a_damaged_file_is_as_if_nothing_were_kept(kept, tmp_path, c
 
 
 def test_slamlib_and_the_packages_are_among_what_matters(monkeypatch, tmp_path):
-    before = cache.fingerprint([], tmp_path, {})
-    monkeypatch.setattr(cache, "distributions", lambda: [])
     without_packages = cache.fingerprint([], tmp_path, {})
-    monkeypatch.setattr(studies, "__file__", str(tmp_path / "studies.py"))
+    monkeypatch.setattr(cache, "distributions", distributions)
+    before = cache.fingerprint([], tmp_path, {})
+    monkeypatch.setattr(memory, "SLAMLIB", tmp_path)
     assert len({before, without_packages, cache.fingerprint([], tmp_path, {})}) == 3
 
 

@@ -3,8 +3,8 @@
 import pytest
 
 from slamlib.__main__ import main
-from slamlib.cover import Cover, read_cover
 from slamlib.dataset import DatasetError
+from slamlib.report.cover import Cover, read_cover
 
 
 def test_without_a_file_there_are_defaults(tmp_path):

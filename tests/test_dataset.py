@@ -163,7 +163,35 @@ def test_one_pose_is_a_dataset(tmp_path):
     assert_ints(read_dataset(tmp_path).ticks, [[0, 0]])
 
 
-# Oddities that are accepted without a word.
+def test_readings_are_selected_by_mask_and_by_index(folder):
+    data = read_dataset(folder)
+    for readings in (data.aruco, data.uwb):
+        mask = readings.pose != 1
+        kept = readings.select(mask)
+        assert_same(kept, readings.select(np.flatnonzero(mask)))
+        assert_same(kept, type(readings)(*(v[mask] for v in vars(readings).values())))
+        assert len(kept.pose) == np.count_nonzero(mask) > 0
+    assert_ints(data.aruco.select([2, 0]).marker, [40, -7])
+
+
+def test_the_first_poses_have_the_readings_until_then(folder):
+    data = read_dataset(folder)
+    first = data.first(3)
+    assert_ints(first.ticks, data.ticks[:3])
+    assert_same(first.aruco, data.aruco)
+    assert_ints(first.uwb.pose, [0])
+    assert_same(dataclasses.replace(first, ticks=data.ticks, aruco=data.aruco, uwb=data.uwb), data)
+    assert data.first(1).aruco is None and data.without("uwb").first(4).uwb is None
+    assert_same(data.first(4), data)
+
+
+def test_a_vehicle_by_its_deviation():
+    vehicle = Vehicle(sigma_left_radius=2e-4).with_deviation(np.array([1.0, -2.0, 3.0]))
+    np.testing.assert_allclose(vehicle.wheel, [0.1001, 0.0996, 0.4003], rtol=1e-15)
+    np.testing.assert_array_equal(vehicle.sigma_wheel, [1e-4, 2e-4, 1e-4])
+
+
+# Valid variants of the format.
 
 
 def with_comments(text):
@@ -497,9 +525,10 @@ def test_dataset_names_are_those_of_folders_with_any_file_of_a_dataset(tmp_path)
     assert dataset_names(tmp_path) == ["a", "b"] and dataset_names(tmp_path, ["b"]) == ["b"]
     with pytest.raises(DatasetError, match="expected one of a, b, found 'c'"):
         dataset_names(tmp_path, ["c"])
-    with pytest.raises(DatasetError, match="notes.encoderReading.txt: expected this file, found none"):
+    absent = "encoderReading.txt: expected this file, found none"
+    with pytest.raises(DatasetError, match=f"notes.{absent}"):
         dataset_names(tmp_path, ["notes"])
     (tmp_path / "half").mkdir()
     write(tmp_path / "half" / "UwbReading.txt", "")
-    with pytest.raises(DatasetError, match="half.encoderReading.txt: expected this file, found none"):
+    with pytest.raises(DatasetError, match=f"half.{absent}"):
         dataset_names(tmp_path)

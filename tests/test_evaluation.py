@@ -47,7 +47,7 @@ def test_ate_and_rpe_agree_with_evo():
     for step in (1, 7):
         for relation, got in zip((metrics.PoseRelation.translation_part,
                                   metrics.PoseRelation.rotation_angle_rad),
-                                 evaluation.rpe(shifted, truth, step)):
+                                 evaluation.rpe(shifted, truth, step), strict=True):
             rpe = metrics.RPE(relation, delta=step, delta_unit=metrics.Unit.frames, all_pairs=True)
             rpe.process_data((as_evo(truth), as_evo(shifted)))
             assert np.isclose(got, rpe.get_statistic(metrics.StatisticsType.rmse), rtol=1e-9)
@@ -62,17 +62,17 @@ def test_alignment_finds_the_motion_and_unknown_poses_are_left_out():
     assert evaluation.ate(moved, truth, aligned=True) < 1e-12
     assert max(evaluation.rpe(moved, truth, 5)) < 1e-12
     moved[:] = np.nan
-    assert np.isnan(evaluation.ate(moved, truth)) and np.isnan(evaluation.rpe(moved, truth, 5)).all()
+    assert np.isnan([evaluation.ate(moved, truth), *evaluation.rpe(moved, truth, 5)]).all()
 
 
 def test_nees_band_is_that_of_the_tables():
     """Chi-squared, 3 degrees of freedom: 0.216 and 9.348; 150 degrees: 117.985 and 185.800."""
     np.testing.assert_allclose(evaluation.nees_band(1), [0.2158, 9.3484], atol=1e-4)
-    np.testing.assert_allclose(evaluation.nees_band(50), np.array([117.985, 185.800]) / 50, atol=1e-4)
+    np.testing.assert_allclose(evaluation.nees_band(50), [117.985 / 50, 185.800 / 50], atol=1e-4)
 
 
 def test_differences_of_covariances():
-    reference = np.array([np.diag([0, 0, 1e-8]), np.diag([4.0, 1.0, 1.0]), np.diag([9.0, 1.0, 1.0])])
+    reference = np.array([np.diag(variances) for variances in ([0, 0, 1e-8], [4, 1, 1], [9, 1, 1])])
     other = reference.copy()
     other[1, 0, 0], other[1, 0, 2], other[1, 2, 0] = 1.0, 0.5, 0.5
     assert np.isclose(evaluation.sigma_difference(other, reference), 1 / 3)
@@ -92,7 +92,7 @@ def test_judging_leads_no_increment_across_a_gap():
     poses, truth = drive(40)
     covariances = np.tile(0.05**2 * np.eye(3), (40, 1, 1))
     poses[15:25] = np.nan
-    poses[25:] += [100, 0, 0]                                # what a gap may hide
+    poses[25:] += [100, 0, 0]                                # an error across the gap
     whole = evaluation.judge(poses, covariances, truth, 3)
     assert whole["rpe"] < 0.5 and whole["ate"] > 10 and whole["nees"] > 1e4
     nothing = evaluation.judge(np.full((4, 3), np.nan), covariances[:4], truth[:4], 3)

@@ -12,6 +12,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 SECONDS = 120
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")

@@ -3,13 +3,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slamlib import montecarlo, se2
+from slamlib import se2, studies
 from slamlib.dataset import ArucoReadings
 from slamlib.evaluation import ate, nees_band
 from slamlib.localization import localize
 from slamlib.simulation import simulate
-
-SEEDS = range(200, 240)
+from slamlib.studies import montecarlo
 
 
 def only(aruco, keep):
@@ -29,12 +28,11 @@ def test_perfect_sightings_give_the_exact_poses_and_map():
 
 
 def test_two_increments_by_hand():
-    """One marker ahead at distance 1, three poses on a line, headings known: sigmas add like lengths.
+    """One marker 1 m ahead, three poses on a line, headings known.
 
-    With C = s^2 I for position and almost no heading error, the increment between two poses has the
-    covariance 2 s^2, and so has the third pose, which depends on the first and the last sighting
-    only: without the shared error it would have 4 s^2. The marker's own error is that of the first
-    sighting, s^2.
+    With C = s^2 I for the position and almost no heading error, the increment between two poses has
+    the variance 2 s^2. So has the third pose, because it depends on the first and the last sighting
+    only; without the shared error it has 4 s^2. The map has the error of the first sighting, s^2.
     """
     s = 0.01
     z = np.array([[1.0, 0, 0], [0.9, 0, 0], [0.8, 0, 0]])
@@ -57,7 +55,7 @@ def test_world_frame_is_the_first_measured_pose():
 
 
 def test_nothing_known_until_a_known_marker_returns():
-    """Two halves of the path share no marker; then the first half's markers come back."""
+    """Two parts of the path have no common marker; then the markers of the first part return."""
     dataset, truth = simulate("short", seed=1, noise=False)
     a = dataset.aruco
     early = np.unique(a.marker[a.pose < 400])
@@ -71,51 +69,68 @@ def test_nothing_known_until_a_known_marker_returns():
     assert (found.frame[~known] > 400).all() and (~known).sum() > 20
     assert known[found.frame >= back].all()
     assert found.parent[found.frame == back][0] < np.flatnonzero(~known)[0]
-    np.testing.assert_allclose(found.poses[known, :2], truth.poses[found.frame[known], :2], atol=1e-9)
+    expected = truth.poses[found.frame[known], :2]
+    np.testing.assert_allclose(found.poses[known, :2], expected, atol=1e-9)
     assert np.isnan(found.covariances[~known]).all()
 
 
-@pytest.mark.parametrize("options", [dict(mislabelled=0.03), dict(slip=3e-3)])
-def test_monte_carlo_is_consistent(options):
-    """40 seeds; the band is that of 40 independent NEES, which a mean over poses can only narrow.
+OPTIONS = [{"mislabelled": 0.03}, {"slip": 3e-3}]
 
-    Six means under two options are in their bands together with 95 % probability, so each has a
-    band of 1 - 0.05 / 12 (Bonferroni); tests/benchmarks/localization.py has a narrower band, of
-    more seeds. Markers alone and fused: NEES along the path, at its end, of the map and of the
-    wheel parameters in the band; ATE below 0.6 of odometry's; the learned slip near the true one.
-    Without the shared errors the covariance is far too large, and the hint, restarted at every
-    measured pose, neither improves on odometry nor is consistent: notebook 2 explains both.
+
+@pytest.mark.slow
+@pytest.mark.parametrize("options", OPTIONS)
+def test_monte_carlo_is_consistent(options):
+    """Means over 24 drives lie in the band of the mean of 24 independent NEES.
+
+    A mean over the poses of a drive varies less than a single NEES. Six means under two options
+    are in their bands together with 95 % probability if each is with 1 - 0.05 / 12 (Bonferroni).
+    `test_markers_alone_on_many_drives` and tests/benchmarks/localization.py have narrower bands of
+    more drives. The ATE is below 0.6 of that of odometry, and the learned slip is near the truth.
     """
-    runs = montecarlo.run(montecarlo.problem2, SEEDS, **options)
-    low, high = nees_band(len(SEEDS), probability=1 - 0.05 / 12)
+    seeds, methods = range(200, 224), ("odometry", "ArUco", "fused")
+    runs = studies.run(montecarlo.problem2, seeds, methods=methods, **options)
+    low, high = nees_band(len(seeds), probability=1 - 0.05 / 12)
     for name in ("ArUco nees", "ArUco last nees", "map nees", "fused nees", "fused last nees",
                  "wheel nees"):
         assert low < runs[name].mean() < high, name
+    odometry_ate = runs["odometry ate"]
     for method in ("ArUco", "fused"):
-        ratio = runs[f"{method} ate"] / runs["odometry ate"]
-        assert np.median(ratio) < 0.6 and rms(runs[f"{method} ate"]) < 0.6 * rms(runs["odometry ate"])
-    assert rms(runs["fused ate"]) < rms(runs["ArUco ate"]) < 0.1                    # metres, on 20 m
+        assert np.median(runs[f"{method} ate"] / odometry_ate) < 0.6
+        assert rms(runs[f"{method} ate"]) < 0.6 * rms(odometry_ate)
+    assert rms(runs["fused ate"]) < rms(runs["ArUco ate"]) < 0.1                # m, on 20 m
     assert 0.8 < np.exp(np.mean(np.log(runs["slip"]))) / options.get("slip", 1e-3) < 1.25
-    assert runs["naive nees"].mean() < 0.5
-    for hint in ("hint", "exact hint"):
-        assert runs[f"{hint} nees"].mean() > 20
-        assert rms(runs[f"{hint} ate"]) > 0.9 * rms(runs["odometry ate"])
 
 
 def rms(values):
     return np.sqrt(np.mean(values**2))
 
 
+@pytest.mark.parametrize("options", OPTIONS)
+def test_methods_that_do_not_count_shared_errors_are_inconsistent(options):
+    """Without shared errors markers alone are conservative, and the hint is overconfident.
+
+    The hint does not improve on odometry, with either propagation (notebook 2 explains why). Four
+    drives suffice: the mean NEES, 3 if consistent, are wrong by factors of more than 6.
+    """
+    methods = ("odometry", "naive", "hint", "exact hint")
+    runs = studies.run(montecarlo.problem2, range(200, 204), jobs=1, methods=methods, **options)
+    assert runs["naive nees"].mean() < 0.5
+    for hint in ("hint", "exact hint"):
+        assert runs[f"{hint} nees"].mean() > 20
+        assert rms(runs[f"{hint} ate"]) > 0.9 * rms(runs["odometry ate"])
+
+
+@pytest.mark.slow
 def test_markers_alone_on_many_drives():
-    """200 seeds, cheap without the rivals: three means together in their bands with 95 %."""
-    low, high = nees_band(200, probability=1 - 0.05 / 3)
-    runs = montecarlo.run(montecarlo.markers_alone, range(2000, 2200))
+    """Three means over 100 drives are in their bands together with 95 % probability."""
+    low, high = nees_band(100, probability=1 - 0.05 / 3)
+    runs = studies.run(montecarlo.markers_alone, range(2000, 2100))
     for name in ("nees", "last nees", "map nees"):
         assert low < runs[name].mean() < high, name
 
 
-def test_a_wrong_first_sighting_does_not_lose_the_drive():
-    """Pose 1 sees one marker only, under a wrong id: the world is that of the next measured pose."""
+def test_a_wrong_first_sighting_moves_the_world_frame():
+    """Pose 1 sees one marker with a wrong label: the world frame is that of the next frame."""
     dataset, truth = simulate("short", seed=4, noise=False)
     a = dataset.aruco
     first = np.flatnonzero(a.pose == 0)
@@ -127,11 +142,11 @@ def test_a_wrong_first_sighting_does_not_lose_the_drive():
     np.testing.assert_array_equal(found.poses[1], 0)
     expected = se2.between(truth.poses[found.frame[1]], truth.poses[found.frame[1:]])
     np.testing.assert_allclose(found.poses[1:, :2], expected[:, :2], atol=1e-9)
-    assert found.unused[first[0]] and not found.outlier.any()
+    assert found.unused[first[0]] and not found.rejected.any()
 
 
-def test_a_return_is_recognized_by_two_markers_without_confirmation():
-    """Frames 4 m apart: neighbours share nothing, but the last one sees what the first two saw."""
+def test_two_common_markers_relocalize_without_confirmation():
+    """Adjacent frames, 4 m apart, have no common marker; the last sees the markers of the first."""
     dataset, truth = simulate("short", seed=1, noise=False)
     frames = np.array([0, 10, 400, 800, 1200, 1600, 1990])
     found = localize(only(dataset.aruco, np.isin(dataset.aruco.pose, frames)))
@@ -140,7 +155,7 @@ def test_a_return_is_recognized_by_two_markers_without_confirmation():
     assert found.parent[back][0] in (0, 1) and np.isnan(found.poses[2:-1]).all()
 
 
-def test_a_single_frame_and_markers_without_orientation():
+def test_a_single_frame_and_markers_without_heading():
     dataset, truth = simulate("short", seed=2)
     first = localize(only(dataset.aruco, dataset.aruco.pose == 0))
     np.testing.assert_array_equal(first.poses, [[0, 0, 0]])

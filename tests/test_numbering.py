@@ -1,12 +1,12 @@
-"""Figures, tables and equations: numbers without gaps, links to what is named, and no caption astray."""
+"""Figures, tables and equations have numbers without gaps and links; wrong captions are refused."""
 
 from pathlib import Path
 
 import pytest
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_output
 
-from slamlib.execution import NotebookError
-from slamlib.numbering import numbered
+from slamlib.report.execution import NotebookError
+from slamlib.report.numbering import numbered
 
 FIRST, SECOND = Path("1_first.ipynb"), Path("2_second.ipynb")
 TABLE = "| a | b |\n| --- | --- |\n| 1 | 2 |\n\n"
@@ -16,7 +16,8 @@ def figure(*captions):
     """A cell that shows a picture, and then these texts."""
     return new_code_cell("draw()", outputs=[
         new_output("display_data", {"image/svg+xml": "<svg/>", "text/plain": "<Figure>"}),
-        *(new_output("display_data", {"text/markdown": text, "text/plain": "<M>"}) for text in captions)])
+        *(new_output("display_data", {"text/markdown": text, "text/plain": "<M>"})
+          for text in captions)])
 
 
 def texts(book):
@@ -51,12 +52,16 @@ def test_numbers_that_swap_their_meaning_are_not_replaced_twice():
     ("in figure\n1.3", "in figure\n[1.2](#figure-1.2)"),
     ("figure\u00a01.3", "figure\u00a0[1.2](#figure-1.2)"),
     ("equations 1, 2 and 3", "equations 1, [2](#eq-2) and [3](#eq-3)"),
+    ("FIGURE 1.2 AND 1.3", "FIGURE [1.1](#figure-1.1) AND [1.2](#figure-1.2)"),
+    ("`x` figure 1.2\n\n# A figure 1.2\n\n## Figure 1.3 on\ntwo lines\n \nfigure 1.3, equation 2",
+     "`x` figure [1.1](#figure-1.1)\n\n# A figure 1.2\n\n## Figure 1.3 on\ntwo lines\n \n"
+     "figure [1.2](#figure-1.2), equation [2](#eq-2)"),
     ("figure 7.1 of a chapter that is not here", "figure 7.1 of a chapter that is not here"),
 ])
 def test_references_in_every_spelling(text, becomes):
     equations = "$$ a \\tag{2} $$ $$ b \\tag{3} $$"
-    *_, last = after(figure("Figure 1.2. A."), figure("Figure 1.3. B."), new_markdown_cell(equations),
-                     new_markdown_cell(text))
+    *_, last = after(figure("Figure 1.2. A."), figure("Figure 1.3. B."),
+                     new_markdown_cell(equations), new_markdown_cell(text))
     assert last == becomes
 
 
@@ -64,13 +69,14 @@ def test_another_chapter_is_linked_by_its_file():
     books = {FIRST: new_notebook(cells=[figure("**Figure 1.3.** A."),
                                         new_markdown_cell("$$ x \\tag{2} $$")]),
              SECOND: new_notebook(cells=[new_markdown_cell(
-                 "$$ y \\tag{2.1} $$\n\nBy figure 1.3, equation 2.1 and equation 2. Equation 2's, equation 4.")])}
+                 "$$ y \\tag{2.1} $$\n\n"
+                 "By figure 1.3, equation 2.1 and equation 2. Equation 2's, equation 4.")])}
     done = numbered(books)
     assert texts(done[SECOND])[0].endswith(
         "By figure [1.1](1_first.ipynb#figure-1.1), equation [2.1](#eq-2.1) and equation "
         "[2](1_first.ipynb#eq-2). Equation [2](1_first.ipynb#eq-2)'s, equation 4.")
     assert texts(done[FIRST])[0] == "**Figure 1.1.** A."
-    assert texts(books[FIRST])[0] == "**Figure 1.3.** A."  # the books themselves are left as they are
+    assert texts(books[FIRST])[0] == "**Figure 1.3.** A."  # the books are unchanged
 
 
 @pytest.mark.parametrize("text", [
@@ -84,16 +90,18 @@ def test_what_is_no_reference_is_left_alone(text):
 
 @pytest.mark.parametrize("cells, reason", [
     ([figure("Figure 1.1. A."), new_markdown_cell("See figure 1.2.")],
-     "the text names figure 1.2, which is not there"),
+     "the text refers to figure 1.2, which does not exist"),
     ([figure("Figure 1.1. A."), new_markdown_cell("By equation 1.2.")],
-     "the text names equation 1.2, which is not there"),
-    ([figure("Figure 1.1. A."), figure("Figure 1.1. B.")], "figure 1.1 is there twice"),
-    ([new_markdown_cell("$$ a \\tag{3} $$ and $$ b \\tag{3} $$")], "equation 3 is there twice"),
-    ([figure(), new_markdown_cell("Text.\n\nFigure 1.1. Late.")], "the caption of figure 1.1 does not stand"),
+     "the text refers to equation 1.2, which does not exist"),
+    ([figure("Figure 1.1. A."), figure("Figure 1.1. B.")], "figure 1.1 occurs twice"),
+    ([new_markdown_cell("$$ a \\tag{3} $$ and $$ b \\tag{3} $$")], "equation 3 occurs twice"),
+    ([figure(), new_markdown_cell("Text.\n\nFigure 1.1. Late.")],
+     "the caption of figure 1.1 is not directly below a figure"),
     ([figure(), new_code_cell("x"), new_markdown_cell("Figure 1.1. Late.")],
-     "the caption of figure 1.1 does not"),
-    ([figure("Figure 1.1. A.", "Figure 1.2. Another of the same.")], "the caption of figure 1.2 does not"),
-    ([figure("Table 1.1. No table.")], "the caption of table 1.1 does not stand directly below a table"),
+     "the caption of figure 1.1 is not"),
+    ([figure("Figure 1.1. A.", "Figure 1.2. Another of the same.")],
+     "the caption of figure 1.2 is not"),
+    ([figure("Table 1.1. No table.")], "the caption of table 1.1 is not directly below a table"),
 ])
 def test_what_does_not_fit_together_is_refused(cells, reason):
     with pytest.raises(NotebookError, match=rf"1_first.ipynb: {reason}"):

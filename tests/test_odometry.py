@@ -2,19 +2,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
 from numeric import central_differences
-from slamlib import odometry, se2
+
+from slamlib import odometry
 from slamlib.dataset import Vehicle
 from slamlib.simulation import manoeuvre, simulate
+from slamlib.studies import montecarlo
 
 VEHICLE = Vehicle()
-W = np.array([VEHICLE.right_radius, VEHICLE.left_radius, VEHICLE.wheelbase])
 BOTH = pytest.mark.parametrize("model", odometry.MODELS)
-
-
-def with_w(w):
-    return replace(VEHICLE, right_radius=w[0], left_radius=w[1], wheelbase=w[2])
 
 
 def curvy_ticks(n=300, seed=3):
@@ -30,7 +26,7 @@ def curvy_ticks(n=300, seed=3):
 
 
 def literal_recursion(ticks, vehicle, initial_pose, initial_covariance):
-    """Equations 1, 2 and 3 word by word, as the assignment prints them."""
+    """Equations 1, 2 and 3 as the assignment prints them."""
     RR, RL, b, n0 = (vehicle.right_radius, vehicle.left_radius, vehicle.wheelbase,
                      vehicle.ticks_per_revolution)
     X, C, I = np.array(initial_pose, float), np.array(initial_covariance, float), np.zeros((3, 4))
@@ -55,10 +51,10 @@ def literal_recursion(ticks, vehicle, initial_pose, initial_covariance):
 
 
 def relative_difference(a, b):
-    """Largest difference of covariances, each element on the scale of its two sigmas so far.
+    """Largest difference of covariances, each element relative to its two largest sigmas so far.
 
-    So far: a sum that has been large and shrinks again, as the covariance does when the path
-    closes, keeps the rounding of the large numbers, in the recursion more than anywhere.
+    When the path closes, the covariance shrinks, but the sums keep the rounding errors of the large
+    numbers before, in the recursion most of all.
     """
     sigma = np.maximum.accumulate(np.sqrt(np.diagonal(b, axis1=1, axis2=2)), axis=0)
     scale = sigma[:, :, None] * sigma[:, None, :]
@@ -111,12 +107,12 @@ def test_step_jacobian_against_central_differences():
     heading = odometry.dead_reckoning(ticks, VEHICLE)[:-1, 2]
     J = odometry.step_jacobian(ticks, VEHICLE, heading)
 
-    def step(w, k):
-        pose = odometry.dead_reckoning(ticks[[0, k + 1]], with_w(w), (0, 0, w[3]))
-        return pose[1] - pose[0]
-
     for k in (0, 45, 85, 155, 205, 298):
-        numeric = central_differences(lambda w: step(w, k), [*W, heading[k]])
+        def step(w, counts=ticks[[0, k + 1]]):
+            pose = odometry.dead_reckoning(counts, VEHICLE.with_wheel(w[:3]), (0, 0, w[3]))
+            return pose[1] - pose[0]
+
+        numeric = central_differences(step, [*VEHICLE.wheel, heading[k]])
         np.testing.assert_allclose(J[k], numeric, atol=1e-9)
 
 
@@ -124,7 +120,8 @@ def test_step_jacobian_against_central_differences():
 def test_wheel_jacobian_against_central_differences(model):
     ticks = curvy_ticks()
     numeric = central_differences(
-        lambda w: odometry.dead_reckoning(ticks, with_w(w), (0, 0, 0.4), model), W, step=1e-7)
+        lambda w: odometry.dead_reckoning(ticks, VEHICLE.with_wheel(w), (0, 0, 0.4), model),
+        VEHICLE.wheel, step=1e-7)
     analytic = odometry.wheel_jacobian(ticks, VEHICLE, 0.4, model)
     np.testing.assert_allclose(analytic, numeric, atol=1e-6 * np.abs(numeric).max())
 
@@ -132,28 +129,13 @@ def test_wheel_jacobian_against_central_differences(model):
 @BOTH
 @pytest.mark.parametrize("difference", [0, 1, 3, 40])
 def test_wheel_jacobian_of_nearly_straight_steps(model, difference):
-    """Around the switch to the series of the chord's derivative."""
+    """On both sides of the switch to the series of the chord's derivative."""
     ticks = np.array([[0, 0], [100 + difference, 100], [100, 100 + difference]])
     numeric = central_differences(
-        lambda w: odometry.dead_reckoning(ticks, with_w(w), model=model), W, step=1e-6)
+        lambda w: odometry.dead_reckoning(ticks, VEHICLE.with_wheel(w), model=model),
+        VEHICLE.wheel, step=1e-6)
     np.testing.assert_allclose(odometry.wheel_jacobian(ticks, VEHICLE, model=model), numeric,
                                atol=1e-9)
-
-
-@BOTH
-def test_increments_between_any_two_poses(model):
-    ticks = curvy_ticks()
-    start, end = np.array([0, 10, 35, 299, 120, 7]), np.array([299, 11, 190, 0, 120, 90])
-    increment, by_w = odometry.increments(ticks, VEHICLE, start, end, model)
-    poses = odometry.dead_reckoning(ticks, VEHICLE, (2.0, 1.0, -0.7), model)
-    np.testing.assert_allclose(se2.compose(poses[start], increment), poses[end], atol=1e-12)
-    numeric = central_differences(
-        lambda w: odometry.increments(ticks, with_w(w), start, end, model)[0], W, step=1e-7)
-    np.testing.assert_allclose(by_w, numeric, atol=1e-6 * np.abs(numeric).max())
-    # An increment depends on its own counts only.
-    alone, alone_by_w = odometry.increments(ticks[9:12], VEHICLE, [1], [2], model)
-    np.testing.assert_allclose(increment[1], alone[0], atol=1e-13)
-    np.testing.assert_allclose(by_w[1], alone_by_w[0], atol=1e-11)
 
 
 def test_unknown_model_is_refused():
@@ -171,12 +153,12 @@ def test_both_covariances_against_monte_carlo(legs, equation2_holds):
     """With 4,000 draws a sigma is known to 1.1 %, a correlation to 0.016.
 
     The first-order propagation must agree in all six elements. Equation 2 must agree in the heading
-    and, while its error builds up in one direction, in the position's sigmas; where the vehicle backs
-    up it must not; and its correlation of heading and position is next to zero: the findings that
-    notebook 1 explains.
+    and, as long as the heading error grows in one direction, in the position's sigmas. It must
+    disagree where the vehicle backs up, and its correlation of heading and position must be almost
+    zero. Notebook 1 explains these findings.
     """
     ticks = manoeuvre(legs)
-    samples = odometry.monte_carlo(ticks, VEHICLE, [-1], np.random.default_rng(11), draws=4000)
+    samples = montecarlo.odometry_draws(ticks, VEHICLE, [-1], np.random.default_rng(11), draws=4000)
     errors = samples[:, 0] - odometry.dead_reckoning(ticks, VEHICLE)[-1]
     sampled = errors.T @ errors / len(errors)
     sigma = np.sqrt(np.diag(sampled))
@@ -202,7 +184,8 @@ def correlation(covariance):
 def test_first_order_is_exact_for_the_initial_pose(model):
     """Only the initial pose uncertain: C_k = A C_1 A^T with A by central differences."""
     ticks, start = curvy_ticks(), np.array([1.0, -2.0, 0.5])
-    sure = replace(VEHICLE, sigma_right_radius=1e-30, sigma_left_radius=1e-30, sigma_wheelbase=1e-30)
+    sure = replace(VEHICLE, sigma_right_radius=1e-30, sigma_left_radius=1e-30,
+                   sigma_wheelbase=1e-30)
     C1 = np.array([[4e-4, 1e-4, 2e-4], [1e-4, 9e-4, -1e-4], [2e-4, -1e-4, 1e-3]])
     poses, covariances = odometry.first_order(ticks, sure, start, C1, model)
     A = central_differences(lambda p: odometry.dead_reckoning(ticks, VEHICLE, p, model)[-1], start)
@@ -218,11 +201,12 @@ def test_a_single_pose_has_the_initial_covariance():
 
 
 def test_monte_carlo_draws_from_the_vehicle_sigmas():
-    """Straight on for 10 m: sigma of the length is 10 m sigma_R / R / sqrt(2), of the heading
-    10 m sqrt(2) sigma_R / (R b) and sigma_heading together."""
+    """Sigmas after 10 m straight ahead: of the length 10 m sigma_R / R / sqrt(2), of the heading
+    10 m sqrt(2) sigma_R / (R b) and sigma_heading together.
+    """
     ticks = np.full((1001, 2), 10 / 1000 / (2 * np.pi * 0.1) * 8000)
-    samples = odometry.monte_carlo(ticks, replace(VEHICLE, sigma_heading=0.03), [0, -1],
-                                   np.random.default_rng(2), draws=2000)
+    samples = montecarlo.odometry_draws(ticks, replace(VEHICLE, sigma_heading=0.03), [0, -1],
+                                        np.random.default_rng(2), draws=2000)
     np.testing.assert_allclose(samples[:, 0, :2], 0)
     np.testing.assert_allclose(samples[:, 0, 2].std(), 0.03, rtol=0.07)
     np.testing.assert_allclose(samples[:, 1, 2].std(), np.hypot(0.03, 0.01 * np.sqrt(2) / 0.4),

@@ -1,4 +1,4 @@
-"""The summary that opens the report: its numbers are those of the files, and gaps are told."""
+"""The summary that opens the report: its numbers are those of the files, and it names every gap."""
 
 import base64
 import re
@@ -7,20 +7,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slamlib import evaluation, overview, plotting, se2
+from slamlib import evaluation, se2
 from slamlib.dataset import read_dataset, read_truth
-from slamlib.execution import NotebookError
-from slamlib.pages import html_page
+from slamlib.notebook import plotting
+from slamlib.report import overview
+from slamlib.report.execution import NotebookError
+from slamlib.report.pages import html_page
 from slamlib.results import write_vehicle_poses
 from slamlib.simulation import simulate, write_dataset
-from slamlib.solve import Solution, solve, summarize, write
+from slamlib.solve import Solution, problem1, solutions, title, write
+from slamlib.summary import summarize
 
-ROOT = Path(__file__).parents[1]
+NAMES = ("all", "no_truth", "wheels_only")
 
 
 @pytest.fixture(scope="module")
 def project(tmp_path_factory):
-    """Three drives, two of which lack something, with the results of problems 1 to 3."""
+    """Three drives, two of which lack something, with results; the solutions of the first drive."""
     folder = tmp_path_factory.mktemp("overview")
     dataset, truth = simulate("short", seed=5)
     write_dataset(folder / "data" / "all", dataset, truth)
@@ -30,21 +33,34 @@ def project(tmp_path_factory):
         for file in (folder / "data" / "all").iterdir():
             if file.name not in lacking and file.is_file():
                 (folder / "data" / name / file.name).write_bytes(file.read_bytes())
+    solved = tuple(solutions(read_dataset(folder / "data" / "all")))
     written = []
-    for name in ("all", "no_truth", "wheels_only"):
-        for solution in solve(read_dataset(folder / "data" / name)):
+    for name in NAMES:
+        for solution in solved[:1] if name == "wheels_only" else solved:
             write(folder / "results" / name, solution)
             written.append(f"{name}/{solution.problem}/vehiclePose.mat")
-    return folder, written
+    return folder, written, solved
 
 
-def rows_of(folder, written, names=("all", "no_truth", "wheels_only")):
-    """The rows of the table of results: {(dataset, title): cells}; and the whole text."""
-    drives = overview.read_drives(folder / "data", folder / "results", names, written)
-    text = "\n\n".join(cell.source for cell in overview.summary("Title", drives).cells)
+@pytest.fixture(scope="module")
+def summary(project):
+    """The summary of the three drives."""
+    folder, written, _ = project
+    return overview.summary(
+        overview.read_drives(folder / "data", folder / "results", NAMES, written))
+
+
+def result_rows(summary):
+    """The rows of the table of results, {(dataset, title): cells}, and the whole text."""
+    text = "\n\n".join(cell.source for cell in summary.cells)
     table = text[text.index("| dataset | problem"):].split("\n\n")[0]
-    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.split("\n")[2:]]
-    return {tuple(row[:2]): row[2:] for row in cells}, text, drives
+    cells = [[cell.strip() for cell in line.strip("|").split("|")]
+             for line in table.split("\n")[2:]]
+    return {tuple(row[:2]): row[2:] for row in cells}, text
+
+
+def pictures_of(summary):
+    return next(cell for cell in summary.cells if cell.cell_type == "code").outputs[0].data
 
 
 def metres(text):
@@ -52,20 +68,21 @@ def metres(text):
     return float(value) * {"m": 1, "mm": 1e-3, "rad": 1, "mrad": 1e-3}[unit]
 
 
-def test_titles_are_those_of_the_solutions():
-    short = read_dataset(ROOT / "data" / "short")
-    for dataset in (short, short.without("aruco")):
-        for solution in solve(dataset):
-            assert solution.problem in overview.TITLES and overview.ROLES.keys() <= overview.TITLES.keys()
-            assert overview.title_of(solution.problem, dataset) == solution.title
+def test_titles_are_those_of_the_solutions(project):
+    folder, _, solved = project
+    dataset = read_dataset(folder / "data" / "all")
+    for solution in solved:
+        assert title(solution.problem, dataset) == solution.title
+    without_markers = dataset.without("aruco")
+    for solution in solutions(without_markers):
+        assert title(solution.problem, without_markers) == solution.title
 
 
-def test_numbers_are_those_of_the_solver(project):
-    folder, written = project
-    rows, _, _ = rows_of(folder, written)
-    data = folder / "data" / "all"
-    for solution in solve(read_dataset(data)):
-        expected = summarize(solution, read_truth(data))
+def test_numbers_are_those_of_the_solver(project, summary):
+    folder, _, solved = project
+    rows, _ = result_rows(summary)
+    for solution in solved:
+        expected = summarize(solution, read_truth(folder / "data" / "all"))
         ate, aligned, position, heading, poses = rows["all", solution.title]
         assert int(poses.replace(",", "")) == expected["estimated_poses"]
         for shown, wanted in ((position, max(expected["last_sigma"][:2])), (ate, expected["ate_m"]),
@@ -74,25 +91,34 @@ def test_numbers_are_those_of_the_solver(project):
             assert metres(shown) == pytest.approx(wanted, rel=5e-3)
 
 
-def test_what_is_left_out_is_told_with_its_reason(project):
-    folder, written = project
-    rows, text, _ = rows_of(folder, written)
+def test_what_is_left_out_is_told_with_its_reason(summary):
+    rows, text = result_rows(summary)
     assert rows["no_truth", "odometry"][:2] == ["no truth", "no truth"]
     assert "No truth comes with no_truth and wheels_only" in text
     assert rows["wheels_only", "ArUco"] == ["left out: no markers", *["–"] * 4]
+    assert rows["wheels_only", "SLAM: odometry + UWB"] == ["left out: no UWB ranges", *["–"] * 4]
     assert rows["wheels_only", "odometry"][-1] == "2,000"
     assert "There are no markers in wheels_only" in text
     assert "There are no UWB ranges in wheels_only" in text
 
 
-def test_a_problem_that_is_not_known_appears_by_its_folder(project, tmp_path):
-    folder, written = project
-    poses = np.zeros((2000, 3))
-    write_vehicle_poses(folder / "results" / "all" / "problem9", poses, np.zeros((2000, 3, 3)))
-    rows, _, drives = rows_of(folder, [*written, "all/problem9/vehiclePose.mat"], ["all", "no_truth"])
-    assert rows["all", "problem9"][2:] == ["0.00\u00a0mm", "0.00\u00a0mrad", "2,000"]
-    assert rows["no_truth", "problem9"][0] == "no result"
-    assert [s.problem for s in drives[0].solutions][-1] == "problem9"
+def test_a_problem_that_is_not_known_appears_by_its_folder(tmp_path):
+    written = []
+    for name in ("other", "plain"):
+        (tmp_path / "data" / name).mkdir(parents=True)
+        (tmp_path / "data" / name / "encoderReading.txt").write_text("1 0 0\n2 10 9\n")
+        write(tmp_path / "results" / name, problem1(read_dataset(tmp_path / "data" / name)))
+        written.append(f"{name}/problem1/vehiclePose.mat")
+    write_vehicle_poses(tmp_path / "results" / "other" / "a", np.zeros((2, 3)), np.zeros((2, 3, 3)))
+    drives = overview.read_drives(tmp_path / "data", tmp_path / "results", ["other", "plain"],
+                                  ["other/a/vehiclePose.mat", *written])
+    summary = overview.summary(drives)
+    rows, _ = result_rows(summary)
+    assert rows["other", "a"][2:] == ["0.00\u00a0mm", "0.00\u00a0mrad", "2"]
+    assert rows["plain", "a"][0] == "no result"
+    assert [solution.problem for solution in drives[0].solutions] == ["problem1", "a"]
+    color = plotting.ROLES["alternative"]["color"].lower()
+    assert color in pictures_of(summary)[plotting.WIDE]
 
 
 def test_the_world_is_the_first_pose_with_an_estimate():
@@ -101,26 +127,27 @@ def test_the_world_is_the_first_pose_with_an_estimate():
     poses = np.full_like(truth.poses, np.nan)
     poses[40:] = se2.between(truth.poses[40], truth.poses[40:])
     solution = Solution("problem2", "ArUco", poses, np.zeros((len(poses), 3, 3)), 40)
-    row = overview._row(overview.Drive("x", *drive, (solution,)), "problem2", solution)
+    row = overview._result_row(overview.SolvedDrive("x", *drive, (solution,)), "problem2", solution)
     assert metres(row[2]) == pytest.approx(0, abs=1e-9)
     assert evaluation.ate(poses, truth.poses) > 0.1  # in the wrong frame
 
 
-def test_the_picture_is_the_same_every_time_and_needs_no_display(project):
-    folder, written = project
-    pictures, again = (next(cell for cell in overview.summary("T", rows_of(folder, written)[2]).cells
-                            if cell.cell_type == "code").outputs[0].data for _ in range(2))
-    assert pictures == again and set(pictures) == {plotting.WIDE, plotting.NARROW}
+def test_the_picture_is_the_same_every_time_and_needs_no_display(project, summary):
+    folder, written, solved = project
+    drives = overview.read_drives(folder / "data", folder / "results", NAMES, written)
+    pictures = pictures_of(summary)
+    assert pictures == pictures_of(overview.summary(drives))
+    assert set(pictures) == {plotting.WIDE, plotting.NARROW}
     for text in pictures.values():
         assert text.count("<path") > 10
         assert not re.search(r"<dc:date|/tmp/|http://(?!www.w3.org|purl.org|creativecommons)", text)
+    for role, drawn in (("slam_uwb", True), ("fused", True), ("hint", False)):
+        assert (plotting.ROLES[role]["color"].lower() in pictures[plotting.WIDE]) == drawn
 
 
-def test_the_page_has_the_picture_wide_and_for_phones_narrow(project):
-    folder, written = project
-    book = overview.summary("T", rows_of(folder, written)[2])
-    page, _ = html_page(Path("index"), book, [])
-    pictures = next(cell for cell in book.cells if cell.cell_type == "code").outputs[0].data
+def test_the_page_has_the_picture_wide_and_for_phones_narrow(summary):
+    page, _ = html_page(Path("index"), summary, [])
+    pictures = pictures_of(summary)
     wide, narrow = (base64.b64encode(pictures[kind].encode()).decode()
                     for kind in (plotting.WIDE, plotting.NARROW))
     picture = re.search("<picture>(.*)</picture>", page)[1]
@@ -131,13 +158,14 @@ def test_the_page_has_the_picture_wide_and_for_phones_narrow(project):
 
 @pytest.mark.parametrize("content, reason", [(b"", "cannot be read"), (None, "must hold")])
 def test_poses_that_are_none_are_told_in_one_sentence(project, content, reason):
-    folder, _ = project
-    place = folder / "results" / "all" / "broken"
-    write_vehicle_poses(place, np.zeros((7, 3)), np.zeros((7, 3, 3)))
+    folder, _, _ = project
+    broken = folder / "results" / "all" / "broken"
+    write_vehicle_poses(broken, np.zeros((7, 3)), np.zeros((7, 3, 3)))
     if content is not None:
-        (place / "vehiclePose.mat").write_bytes(content)
+        (broken / "vehiclePose.mat").write_bytes(content)
     with pytest.raises(NotebookError, match=f"all/broken/vehiclePose.mat, .*{reason}"):
-        rows_of(folder, ["all/broken/vehiclePose.mat"], ["all"])
+        overview.read_drives(folder / "data", folder / "results", ["all"],
+                             ["all/broken/vehiclePose.mat"])
 
 
 def test_names_are_shown_as_they_are():

@@ -11,8 +11,8 @@ import typst
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_output
 from test_report import TEXT, TEXT_FORMULAS
 
-from slamlib import pdf
-from slamlib.execution import NotebookError
+from slamlib.report import pdf
+from slamlib.report.execution import NotebookError
 
 SVG = '<svg xmlns="http://www.w3.org/2000/svg" width="20" height="9"><path d="M0 0L9 9"/></svg>'
 TABLE = "| $\\sigma_x$ | b |\n| --- | ---: |\n| one | $$ \\sqrt{2} \\tag{7} $$ |\n\nTable 1. Roots."
@@ -29,8 +29,10 @@ def first():
     return Path("1_first.ipynb"), new_notebook(cells=[
         new_markdown_cell(TEXT.replace("# Problem 1", "# 1. Problem", 1)
                           .replace("2_other.ipynb", "2_second.ipynb")),
-        new_code_cell("print('shown')", outputs=[new_output("stream", name="stdout", text="shown\n")]),
-        new_code_cell("plot()", outputs=[shown(("text/plain", "<Figure>"), ("image/svg+xml", SVG))]),
+        new_code_cell("print('shown')",
+                      outputs=[new_output("stream", name="stdout", text="shown\n")]),
+        new_code_cell("plot()",
+                      outputs=[shown(("text/plain", "<Figure>"), ("image/svg+xml", SVG))]),
         new_markdown_cell("**Figure 1.** What is seen, $x^2$."),
         new_code_cell("table()", outputs=[shown(("text/markdown", TABLE), ("text/plain", "<M>"))])])
 
@@ -93,7 +95,7 @@ def test_without_code_there_are_prose_formulas_figures_and_tables_only(tmp_path)
     text = files["main.typ"].decode()
     assert "print" not in text and "shown" not in text and "plot()" not in text
     assert len(book.page["formulas"]) == TEXT_FORMULAS + 3
-    assert "#picture(" in text and "#kept[#figure(" in text and text.count("#caption[") == 2
+    assert "#picture(" in text and "#unbroken[#figure(" in text and text.count("#caption[") == 2
     assert "print" in pdf.typst_files([first()])[0]["main.typ"].decode()
 
 
@@ -122,13 +124,14 @@ def test_what_pandoc_sets_wrongly_is_mended(tex, expected, lost):
 
 
 @pytest.mark.parametrize("tex, reason", [
-    (r"\nonsense{x}", "7_bad.ipynb, section 'Place': pandoc cannot set this formula, unexpected control sequence "
-     "\\nonsense:\n    \\nonsense{x}"),
+    (r"\nonsense{x}", "7_bad.ipynb, section 'Place': pandoc cannot set this formula, "
+     "unexpected control sequence \\nonsense:\n    \\nonsense{x}"),
     (r"\begin{vmatrix} a & b \end{vmatrix}", r"\begin{vmatrix}"),
-    (r"\begin{array}{c|c} a & b \end{array}", "would be lost"),
+    (r"\begin{array}{c|c} a & b \end{array}", "pandoc would lose"),
 ])
 def test_a_formula_that_cannot_be_set_is_named(tex, reason):
-    book = new_notebook(cells=[new_markdown_cell(f"## Place\n\nFine: $x$.\n\n$$ {tex} $$\n\nFine: $y$.")])
+    book = new_notebook(cells=[
+        new_markdown_cell(f"## Place\n\nFine: $x$.\n\n$$ {tex} $$\n\nFine: $y$.")])
     with pytest.raises(NotebookError, match=re.escape(reason)):
         pdf.typeset([(Path("7_bad.ipynb"), book)])
 
@@ -174,7 +177,8 @@ def test_a_long_table_breaks_and_a_wide_formula_shrinks(tmp_path):
 def test_a_tall_figure_leaves_room_for_its_caption(tmp_path):
     tall = SVG.replace('height="9"', 'height="4000"').replace('width="20"', 'width="800"')
     book = new_notebook(cells=[
-        new_markdown_cell("Before. " * 200), new_code_cell(outputs=[shown(("image/svg+xml", tall))]),
+        new_markdown_cell("Before. " * 200),
+        new_code_cell(outputs=[shown(("image/svg+xml", tall))]),
         new_markdown_cell("Figure 1. Tall.")])
     pages = text_of(pdf.typeset([(Path("1.ipynb"), book)]), tmp_path).split("\f")
     before = next(number for number, page in enumerate(pages) if "Before." in page)
@@ -203,7 +207,9 @@ def test_wide_lines_are_folded_and_nothing_of_them_is_lost(tmp_path):
 
 
 def test_a_character_that_no_font_has_is_named():
-    assert pdf.without_glyph("Ångström, Σ σ² ≤ ½ → “Ω” Жук") == []
-    assert pdf.without_glyph("a 陳 b 😀") == ["陳", "😀"]
-    with pytest.raises(NotebookError, match=r"^1.ipynb: .* no glyph for 陳 \(U\+9673\): .*the name 陳 of"):
-        pdf.typeset([(Path("1.ipynb"), new_notebook(cells=[new_markdown_cell("So the name 陳 of.")]))])
+    assert pdf.missing_glyphs("Ångström, Σ σ² ≤ ½ → “Ω” Жук") == []
+    assert pdf.missing_glyphs("a 陳 b 😀") == ["陳", "😀"]
+    book = new_notebook(cells=[new_markdown_cell("So the name 陳 of.")])
+    with pytest.raises(NotebookError,
+                       match=r"^1.ipynb: .* no glyph for 陳 \(U\+9673\): .*the name 陳 of"):
+        pdf.typeset([(Path("1.ipynb"), book)])

@@ -1,15 +1,20 @@
-"""Figures, wide and narrow: what is in them, and that nothing leaves them."""
+"""Figures, wide and narrow: what is in them, and that nothing exceeds them."""
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from matplotlib.transforms import Affine2D
 
-from slamlib import plotting
+from slamlib.notebook import plotting
+from slamlib.se2 import rotation
 
 pytestmark = pytest.mark.usefixtures("look")
 
 
-def drawn(count, rows, columns=2, labels=("truth", "odometry and markers", "SLAM", "hint", "fused")):
+LABELS = ("truth", "odometry and markers", "SLAM", "hint", "fused")
+
+
+def drawn(count, rows, columns=2, labels=LABELS):
     fig, axes = plotting.panels(count, rows=rows, columns=columns, height=4.0)
     for panel, column in enumerate(axes):
         for row, ax in enumerate(column):
@@ -27,7 +32,8 @@ def boxes(fig):
             for thing in (*fig.axes, fig.legends[0])]
 
 
-@pytest.mark.parametrize("count, rows, columns", [(1, 1, 2), (2, 1, 2), (2, 3, 2), (3, 2, 2), (3, 3, 3)])
+@pytest.mark.parametrize("count, rows, columns", [
+    (1, 1, 2), (2, 1, 2), (2, 3, 2), (3, 2, 2), (3, 3, 3)])
 def test_panels_are_side_by_side_and_in_the_narrow_figure_below_each_other(count, rows, columns):
     fig, axes = drawn(count, rows, columns)
     assert axes.shape == (count, rows) and fig.axes == list(axes.ravel())
@@ -38,7 +44,7 @@ def test_panels_are_side_by_side_and_in_the_narrow_figure_below_each_other(count
     plotting.narrow(fig)
     *narrow, legend = boxes(fig)
     assert fig.axes == list(axes.ravel())
-    for upper, lower in zip(narrow, [*narrow[1:], legend]):
+    for upper, lower in zip(narrow, [*narrow[1:], legend], strict=True):
         assert upper.y0 > lower.y1 - 0.01
     for box in (*narrow, legend):
         assert -0.01 <= box.x0 and box.x1 <= plotting.NARROW_WIDTH + 0.01
@@ -85,3 +91,34 @@ def test_a_figure_without_axes_or_legend_stays_as_it_is():
 def test_every_curve_has_a_colour_of_its_own():
     lines = [look["color"] for look in plotting.ROLES.values() if look.get("linestyle") != "none"]
     assert len(set(lines)) == len(lines)
+
+
+def boundaries(ax):
+    """Points in data coordinates on the boundary of each ellipse, as it is drawn."""
+    patches, = ax.collections
+    ax.figure.draw_without_rendering()                                    # sets the transforms
+    path, = patches.get_paths()
+    centres = patches.get_offset_transform().transform(patches.get_offsets())
+    for matrix, centre in zip(patches.get_transforms(), centres, strict=True):
+        to_pixels = Affine2D(matrix) + patches.get_transform() + Affine2D().translate(*centre)
+        polygon, = path.transformed(to_pixels).to_polygons()
+        yield ax.transData.inverted().transform(polygon)
+
+
+@pytest.mark.parametrize("enlarged", [1, 3])
+def test_ellipses_are_lines_of_equal_mahalanobis_distance(enlarged):
+    """(p - m)^T C^-1 (p - m) = k^2 holds on the boundary, with k^2 = -2 ln(1 - 0.95)."""
+    R = rotation(np.array([0.4, -1.2, 1.9, 2.6]))                    # an ellipse in each quadrant
+    means, covariances = np.arange(12.0).reshape(4, 3), np.zeros((4, 3, 3))
+    covariances[:, :2, :2] = R @ np.diag([2.0**2, 0.5**2]) @ np.swapaxes(R, 1, 2)
+    _, ((ax,),) = plotting.panels(1)                                 # scales of x and y differ
+    plotting.ellipses(ax, means, covariances, "#0072B2", probability=0.95, enlarged=enlarged)
+    half = 2.4477 * enlarged * np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)[:, :2])
+    for points, m, C, reach in zip(boundaries(ax), means, covariances, half, strict=True):
+        offset = points - m[:2]
+        squared = np.sum(offset * np.linalg.solve(C[:2, :2], offset.T).T, axis=1)
+        np.testing.assert_allclose(squared, -2 * np.log(0.05) * enlarged**2, rtol=0.01)
+        np.testing.assert_allclose([offset.min(0), offset.max(0)], [-reach, reach], rtol=0.01)
+    (x_low, x_high), (y_low, y_high) = ax.get_xlim(), ax.get_ylim()
+    corners = np.array([(means[:, :2] - half).min(0), (means[:, :2] + half).max(0)])
+    assert ([x_low, y_low] < corners[0]).all() and (corners[1] < [x_high, y_high]).all()

@@ -15,12 +15,14 @@ def example(n=5):
     return rng.standard_normal((n, 3)), A @ np.swapaxes(A, 1, 2)
 
 
-def octave_or_skip():
+def run_octave(script, folder):
+    """Run a script in this folder, or skip the test where there is no Octave."""
     octave = shutil.which("octave-cli")
     if octave is None:
         assert not os.environ.get("CI"), "CI must have octave-cli"
         pytest.skip("octave-cli is not installed")
-    return octave
+    subprocess.run([octave, "--quiet", "--no-init-file", "--eval", script], cwd=folder, check=True,
+                   timeout=120)
 
 
 def test_round_trip_through_scipy(tmp_path):
@@ -37,13 +39,11 @@ def test_round_trip_through_scipy(tmp_path):
 
 
 def test_round_trip_through_octave(tmp_path):
-    octave = octave_or_skip()
     poses, covariances = example(400)
     results.write_vehicle_poses(tmp_path, poses, covariances)
     script = ("load('vehiclePose.mat'); p = vertcat(vehiclePose.pose); c = vehiclePose(7).covari;"
               "s = size(vehiclePose); save('-v7', 'again.mat', 'p', 'c', 's');")
-    subprocess.run([octave, "--quiet", "--no-init-file", "--eval", script], cwd=tmp_path, check=True,
-                   timeout=120)
+    run_octave(script, tmp_path)
     again = loadmat(tmp_path / "again.mat")
     np.testing.assert_array_equal(again["s"], [[1, 400]])
     np.testing.assert_array_equal(again["p"], poses)
@@ -57,12 +57,10 @@ def test_aruco_map_through_scipy_and_octave(tmp_path):
     structs = loadmat(tmp_path / "ArucoMap.mat")["ArucoMap"]
     assert structs.shape == (1, 3) and structs.dtype.names == ("pose", "covari", "id")
     assert structs[0, 1]["pose"].shape == (1, 3) and structs[0, 1]["id"] == [[17]]
-    for got, expected in zip(results.read_aruco_map(tmp_path), (ids, poses, covariances)):
+    again = results.read_aruco_map(tmp_path)
+    for got, expected in zip(again, (ids, poses, covariances), strict=True):
         np.testing.assert_array_equal(got, expected)
-    octave = octave_or_skip()
-    script = "load('ArucoMap.mat'); i = [ArucoMap.id]; save('-v7', 'again.mat', 'i');"
-    subprocess.run([octave, "--quiet", "--no-init-file", "--eval", script], cwd=tmp_path, check=True,
-                   timeout=120)
+    run_octave("load('ArucoMap.mat'); i = [ArucoMap.id]; save('-v7', 'again.mat', 'i');", tmp_path)
     np.testing.assert_array_equal(loadmat(tmp_path / "again.mat")["i"], [ids])
 
 
@@ -72,12 +70,13 @@ def test_uwb_map_through_scipy_and_octave(tmp_path):
     results.write_uwb_map(tmp_path, ids, positions, covariances)
     structs = loadmat(tmp_path / "UwbMap.mat")["UwbMap"]
     assert structs.shape == (1, 3) and structs.dtype.names == ("position", "covariance", "id")
-    assert structs[0, 1]["position"].shape == (1, 2) and structs[0, 1]["covariance"].shape == (2, 2)
-    for got, expected in zip(results.read_uwb_map(tmp_path), (ids, positions, covariances)):
+    assert structs[0, 1]["position"].shape == (1, 2)
+    assert structs[0, 1]["covariance"].shape == (2, 2)
+    again = results.read_uwb_map(tmp_path)
+    for got, expected in zip(again, (ids, positions, covariances), strict=True):
         np.testing.assert_array_equal(got, expected)
-    script = "load('UwbMap.mat'); p = vertcat(UwbMap.position); save('-v7', 'again.mat', 'p');"
-    subprocess.run([octave_or_skip(), "--quiet", "--no-init-file", "--eval", script], cwd=tmp_path,
-                   check=True, timeout=120)
+    run_octave("load('UwbMap.mat'); p = vertcat(UwbMap.position); save('-v7', 'again.mat', 'p');",
+               tmp_path)
     np.testing.assert_array_equal(loadmat(tmp_path / "again.mat")["p"], positions)
 
 

@@ -1,6 +1,6 @@
-"""Equation 2 in closed form against its recursion, and the growth of both with the path.
+"""Time of equation 2 in closed form and by recursion, for drives of different length.
 
-The recursion is the one that the tests compare with. Ratios are taken within one run.
+The recursion is that of test_odometry.py.
 """
 
 import sys

@@ -1,9 +1,9 @@
-"""What a plain GTSAM script makes of problems 3 and 4, to compare with: time and error.
+"""A plain GTSAM script for problems 3 and 4, as the baseline of time and error.
 
-A between factor for every encoder row with the noise that table 2 gives a single step (and a floor,
-since that is singular), a between factor with a Huber kernel for every sighting and a range factor with
-one for every range, markers where their first sighting puts them and antennas at their guess, one
-Levenberg-Marquardt solve, a marginal for every pose.
+A between factor for every encoder row, with the noise that table 2 gives a single step and a floor,
+since that noise is singular. A between factor for every sighting and a range factor for every
+range, both with a Huber kernel. Markers start at their first sighting, antennas at their guess. One
+Levenberg-Marquardt optimisation, and the marginal covariance of every pose.
 
     python tests/benchmarks/plain_gtsam.py [FOLDER]
 """
@@ -22,7 +22,7 @@ FLOOR = np.array([1e-4, 1e-4, 1e-3])          # m, m, rad in one step
 
 
 def plain(dataset, marginals=True):
-    """Poses (n, 3) and covariances (n, 3, 3) in GTSAM's axes, or None."""
+    """Poses (n, 3), and covariances (n, 3, 3) in GTSAM's axes or, without marginals, None."""
     ticks, vehicle, aruco = dataset.ticks, dataset.vehicle, dataset.aruco
     uwb, guess = dataset.uwb, dataset.antenna_guess
     poses = odometry.dead_reckoning(ticks, vehicle)
@@ -39,7 +39,8 @@ def plain(dataset, marginals=True):
     for k, pose in enumerate(poses):
         values.insert(X(k), gtsam.Pose2(*pose))
     huber = gtsam.noiseModel.mEstimator.Huber.Create(1.345)
-    for i, k, r, sigma in [] if uwb is None else zip(uwb.pose.tolist(), uwb.antenna.tolist(), uwb.range, uwb.sigma):
+    for i, k, r, sigma in [] if uwb is None else zip(
+            uwb.pose.tolist(), uwb.antenna.tolist(), uwb.range, uwb.sigma):
         graph.add(gtsam.RangeFactor2D(X(i), A(k), r, gtsam.noiseModel.Robust.Create(
             huber, gtsam.noiseModel.Isotropic.Sigma(1, sigma))))
     for k, place in [] if uwb is None else zip(guess.antenna.tolist(), guess.position):
@@ -47,8 +48,8 @@ def plain(dataset, marginals=True):
             values.insert(A(k), gtsam.Point2(*place))
     for i, j, z, C in zip(aruco.pose.tolist(), aruco.marker.tolist(), aruco.marker_in_vehicle,
                           aruco.covariance):
-        graph.add(gtsam.BetweenFactorPose2(X(i), L(j), gtsam.Pose2(*z), gtsam.noiseModel.Robust.Create(
-            huber, gtsam.noiseModel.Gaussian.Covariance(C))))
+        noise = gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Gaussian.Covariance(C))
+        graph.add(gtsam.BetweenFactorPose2(X(i), L(j), gtsam.Pose2(*z), noise))
         if not values.exists(L(j)):
             values.insert(L(j), gtsam.Pose2(*se2.compose(poses[i], z)))
     values = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
@@ -66,8 +67,9 @@ def main(folder):
         start = time.perf_counter()
         poses, _ = plain(data)
         seconds = time.perf_counter() - start
-        error = "" if truth is None else (f", ATE {evaluation.ate(poses, truth.poses):.4f} m, aligned "
-                                          f"{evaluation.ate(poses, truth.poses, aligned=True):.4f} m")
+        error = "" if truth is None else (
+            f", ATE {evaluation.ate(poses, truth.poses):.4f} m, aligned "
+            f"{evaluation.ate(poses, truth.poses, aligned=True):.4f} m")
         print(f"plain GTSAM script, problem {problem} on {dataset.name}: {seconds:.1f} s{error}")
 
 

@@ -1,0 +1,67 @@
+"""Increments between any two poses by odometry, their noise, and the prior of the wheel slip.
+
+Two errors are independent from step to step: a wheel that travels s metres slips with variance
+slip^2 |s|, and each encoder rounds its cumulative count. An increment is the pose `end` in the
+frame of the pose `start`; both are arrays (m,) of indices from 0. The `ticks` (n, 2), `vehicle` and
+`model` are those of module `odometry`.
+"""
+
+import numpy as np
+
+from slamlib import odometry, se2
+
+SLIP_BOUNDS = (1e-5, 3e-2)  # sqrt(m), interval in which the slip is searched
+TYPICAL_SLIP = 1e-3         # sqrt(m), median of the prior
+SLIP_FACTOR = 10.0          # no unit, one standard deviation of the prior of log slip is its log
+
+
+def between_poses(ticks, vehicle, start, end, model="euler"):
+    """Increments (m, 3) by odometry, m and rad, and derivatives (m, 3, 3) by [R_R, R_L, b]."""
+    poses = odometry.dead_reckoning(ticks, vehicle, model=model)
+    by_w = odometry.wheel_jacobian(ticks, vehicle, model=model)
+    by_start, by_end = se2.between_jacobians(poses[start], poses[end])
+    return (se2.between(poses[start], poses[end]),
+            by_start @ by_w[start] + by_end @ by_w[end])
+
+
+def noise(ticks, vehicle, start, end, slip):
+    """Covariances (m, 3, 3) of increments, of [x, y, heading] in the axes of pose `start`.
+
+    `slip` in sqrt(m) is the standard deviation of the slip of one wheel after one metre. Rounding
+    at both ends of an increment has a variance of one sixth of a squared count, spread over its
+    steps. Wheel errors e_R, e_L in the step at p along the unit vector u lengthen the step by
+    (e_R + e_L) / 2. They turn the later path by (e_R - e_L) / b, which moves its end p_e by this
+    angle times S (p_e - p), S = [[0, -1], [1, 0]]. The effect of a step is linear in p_e, so one
+    cumulative sum over the steps serves all increments. No `end` may be before its `start`; the
+    covariance of an increment without steps is zero.
+    """
+    poses = odometry.dead_reckoning(ticks, vehicle, model="arc")
+    ds, dtheta, _, _ = odometry.steps(ticks, vehicle)
+    u = np.stack([np.cos(poses[:-1, 2] + dtheta / 2), np.sin(poses[:-1, 2] + dtheta / 2)], -1)
+    p = (poses[:-1, :2] + poses[1:, :2]) / 2
+    sides = vehicle.wheelbase / 2 * np.array([1, -1])
+    turn = 1 / (2 * sides)                                             # by e_R, by e_L
+    by_wheel = np.empty((len(ds), 3, 2))                               # of (end - S p_e turn, turn)
+    by_wheel[:, 0] = u[:, :1] / 2 + p[:, 1:] * turn
+    by_wheel[:, 1] = u[:, 1:] / 2 - p[:, :1] * turn
+    by_wheel[:, 2] = turn
+    outer = by_wheel[:, :, None, :] * by_wheel[:, None, :, :]          # (n-1, 3, 3, wheel)
+    from_slip = outer @ (slip**2 * np.abs(ds[:, None] + sides * dtheta[:, None])[:, None, :, None])
+    metres_per_count = 2 * np.pi * vehicle.wheel[:2] / vehicle.ticks_per_revolution
+    from_rounding = outer @ (metres_per_count**2 / 6)
+    start, end = np.asarray(start), np.asarray(end)
+    slipping, rounding = (total[end] - total[start] for total in map(
+        odometry.cumulative, (from_slip[..., 0], from_rounding)))
+    summed = slipping + rounding / np.maximum(end - start, 1)[:, None, None]
+    to_end, _ = se2.compose_jacobians(np.zeros(3), poses[end])         # I + [0, 0, S p_e]
+    in_world = to_end @ summed @ np.swapaxes(to_end, 1, 2)
+    return se2.rotate_covariance(in_world, -poses[start, 2])
+
+
+def log_slip_prior(log_slip):
+    """Log density, up to a constant, of log slip, which is normal about log TYPICAL_SLIP.
+
+    The standard deviation log SLIP_FACTOR makes the prior wide: it decides only where the
+    measurements do not determine the slip. `log_slip` is the natural logarithm of slip in sqrt(m).
+    """
+    return -((log_slip - np.log(TYPICAL_SLIP)) / np.log(SLIP_FACTOR))**2 / 2

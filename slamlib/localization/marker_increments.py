@@ -1,0 +1,195 @@
+"""Increments of the vehicle between two frames (a pair), from the markers that both frames see.
+
+With Z_j and Z'_j the sightings of marker j from the earlier and the later frame, and C_j and C'_j
+their covariances, the increment Delta, the later frame in the earlier one, minimises the sum of
+r_j^T W_j^-1 r_j over the accepted sightings, with
+
+    r_j = Z_j - Delta Z'_j,    W_j = C_j + J'_j C'_j J'_j^T,    J'_j = d(Delta Z'_j) / d Z'_j.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from slamlib import se2
+from slamlib.sightings import GATE, MAX_HEADING_SIGMA
+
+ITERATIONS = 8, 6         # numbers of Gauss-Newton iterations: Cauchy weights, then the gate
+SPEED_RATIO = 3.0         # dimensionless, largest plausible speed in units of the usual speed
+SLOW_TURN = 1e-3          # rad per encoder step; smaller differences of turn rates are ignored
+
+
+@dataclass(frozen=True)
+class MarkerIncrements:
+    """Increments of l pairs of frames from p common sightings, which are sorted by pair."""
+
+    pair: np.ndarray         # (p,) pair of frames of each common sighting
+    first: np.ndarray        # (p,) row of the sighting from the earlier frame
+    second: np.ndarray       # (p,) row of the sighting from the later frame
+    accepted: np.ndarray     # (p,) bool, within the gate of a usable increment
+    by_first: np.ndarray     # (p, 3, 3) derivative of the increment by the earlier sighting
+    by_second: np.ndarray    # (p, 3, 3) derivative of the increment by the later sighting
+    increment: np.ndarray    # (l, 3) later in earlier frame, m and rad; NaN if undetermined
+    covariance: np.ndarray   # (l, 3, 3)
+    usable: np.ndarray       # (l,) bool, the increment is determined and plausible
+
+
+def consecutive_increments(sightings):
+    """MarkerIncrements from every frame of Sightings to the next, usable if plausibly slow.
+
+    Where only one marker is common there is no redundancy to reject a wrong label. The usual speed
+    is the larger of the 99th percentile over increments on which two or more markers agree and the
+    90th percentile over all. An increment is implausible if its speed, less three standard
+    deviations, exceeds SPEED_RATIO times the usual one and its velocity is not similar to that
+    before or after. It is estimated again from those of its sightings that, taken alone, imply a
+    plausible speed. Speeds are in m and rad per encoder step, the difference of `sightings.frame`.
+    """
+    z, C, steps = sightings.z, sightings.C, np.diff(sightings.frame)
+    pair, first, second = common_sightings(sightings.row, sightings.marker)
+    found = robust_increments(z, C, pair, first, second, len(steps))
+    agreed = found.usable & (np.bincount(pair[found.accepted], minlength=len(steps)) > 1)
+    if not agreed.any():
+        return found
+    speed = np.abs(_distance_and_turn(found.increment)) / steps[:, None]
+    bound = SPEED_RATIO * np.maximum(
+        np.percentile(speed[agreed], 99, axis=0),
+        np.percentile(speed[found.usable], 90, axis=0, method="lower"))
+    velocity = found.increment / steps[:, None]
+    similar = np.r_[False, _similar(velocity[:-1], velocity[1:]), False]
+    fast = _too_fast(found.increment, found.covariance, steps, bound)
+    fast &= found.usable & ~(similar[:-1] | similar[1:])
+    single = _single_increments(z[first], C[first], z[second], C[second])
+    allowed = ~(fast[pair] & _too_fast(*single, steps[pair], bound))
+    if allowed.all():
+        return found
+    again = robust_increments(z, C, pair[allowed], first[allowed], second[allowed], len(steps))
+    usable = again.usable & ~(fast & _too_fast(again.increment, again.covariance, steps, bound))
+    accepted, (by_first, by_second) = np.zeros(len(pair), bool), np.zeros((2, len(pair), 3, 3))
+    accepted[allowed] = again.accepted
+    by_first[allowed], by_second[allowed] = again.by_first, again.by_second
+    return replace(again, pair=pair, first=first, second=second, usable=usable,
+                   accepted=accepted & usable[pair], by_first=by_first, by_second=by_second)
+
+
+def common_sightings(row, marker):
+    """pair, first and second of `MarkerIncrements`, for pairs of consecutive frames.
+
+    `row` and `marker` (s,) are frame and marker id of every sighting, sorted by both.
+    """
+    markers, label = np.unique(marker, return_inverse=True)
+    key, later_key = row * len(markers) + label, (row + 1) * len(markers) + label
+    _, first, second = np.intersect1d(later_key, key, assume_unique=True, return_indices=True)
+    return row[first], first, second
+
+
+def robust_increments(z, C, pair, first, second, count):
+    """MarkerIncrements of `count` pairs of frames, robust against wrong labels.
+
+    The best of several hypotheses (`_best_hypothesis`) is refined by Gauss-Newton with Cauchy
+    weights, then by Gauss-Newton on the sightings within GATE: with J_j = d(Delta Z'_j) / d Delta,
+
+        Delta <- Delta + C_Delta sum_j J_j^T W_j^-1 r_j,    C_Delta = (sum_j J_j^T W_j^-1 J_j)^-1.
+
+    The derivatives by the sightings are D_j = C_Delta J_j^T W_j^-1 by Z_j and D'_j = -D_j J'_j by
+    Z'_j. An increment is usable if the standard deviation of its heading is below
+    MAX_HEADING_SIGMA. `z` (s, 3), m and rad, and `C` (s, 3, 3) are sightings and their covariances,
+    `pair`, `first` and `second` (p,) those of MarkerIncrements, sorted by pair.
+    """
+    z1, C1, z2, C2 = z[first], C[first], z[second], C[second]
+    increment = _best_hypothesis(z1, C1, z2, C2, pair, count)
+    for iteration in range(sum(ITERATIONS)):
+        J_delta, J_second = se2.compose_jacobians(increment[pair], z2)
+        r, information, squared = _residuals(increment[pair], J_second, z1, C1, z2, C2)
+        weight = 1 / (1 + squared / GATE) if iteration < ITERATIONS[0] else squared < GATE
+        gain = np.swapaxes(J_delta, 1, 2) @ information * weight[:, None, None]
+        H, gradient = np.zeros((count, 3, 3)), np.zeros((count, 3))
+        np.add.at(H, pair, gain @ J_delta)
+        np.add.at(gradient, pair, np.einsum("nij,nj->ni", gain, r))
+        covariance = _inverse_where_regular(H)
+        increment = increment + np.einsum("nij,nj->ni", covariance, gradient)
+    increment[:, 2] = se2.wrap(increment[:, 2])
+    usable = covariance[:, 2, 2] < MAX_HEADING_SIGMA**2
+    D = covariance[pair] @ gain
+    return MarkerIncrements(
+        pair=pair, first=first, second=second, accepted=(weight > 0) & usable[pair],
+        by_first=D, by_second=-D @ J_second, usable=usable, covariance=covariance,
+        increment=np.where(usable[:, None], increment, np.nan))
+
+
+def _residuals(increment, J_second, z1, C1, z2, C2):
+    """r, W^-1 and r^T W^-1 r of each common sighting, with J' = J_second."""
+    r = z1 - se2.compose(increment, z2)
+    r[:, 2] = se2.wrap(r[:, 2])
+    information = np.linalg.inv(C1 + J_second @ C2 @ np.swapaxes(J_second, 1, 2))
+    return r, information, np.einsum("ni,nij,nj->n", r, information, r)
+
+
+def _best_hypothesis(z1, C1, z2, C2, pair, count):
+    """The hypothesis with the smallest Cauchy cost for every pair, (count, 3).
+
+    Hypotheses are no motion, the increment from each marker with a heading, and, in pairs without
+    such a marker, the increment from every two positions.
+    """
+    begins, ends = (np.searchsorted(pair, np.arange(count), side) for side in ("left", "right"))
+    oriented = (C1[:, 2, 2] + C2[:, 2, 2]) < MAX_HEADING_SIGMA**2
+    two_of_each = [np.add(np.triu_indices(ends[k] - begins[k], 1), begins[k])
+                   for k in np.setdiff1d(pair, pair[oriented])]
+    i, j = np.concatenate([np.zeros((2, 0), int), *two_of_each], axis=1)
+    hypothesis = np.concatenate([
+        np.zeros((count, 3)),
+        se2.compose(z1[oriented], se2.inverse(z2[oriented])),
+        _increment_of_two_points(z1[i, :2], z1[j, :2], z2[i, :2], z2[j, :2])])
+    pair_of = np.concatenate([np.arange(count), pair[oriented], pair[i]])
+    which = np.repeat(np.arange(len(pair_of)), (ends - begins)[pair_of])            # hypothesis
+    k = np.array([k for p in pair_of for k in range(begins[p], ends[p])], int)      # its sightings
+    J_second = se2.compose_jacobians(hypothesis[which], z2[k])[1]
+    squared = _residuals(hypothesis[which], J_second, z1[k], C1[k], z2[k], C2[k])[2]
+    cost = np.bincount(which, np.log1p(squared / GATE), len(pair_of))
+    order = np.lexsort((cost, pair_of))
+    return hypothesis[order[np.searchsorted(pair_of[order], np.arange(count))]]
+
+
+def _increment_of_two_points(p1, q1, p2, q2):
+    """Delta from the positions (n, 2) of two markers: direction p to q and midpoint coincide."""
+    d1, d2 = q1 - p1, q2 - p2
+    turn = se2.wrap(np.arctan2(d1[:, 1], d1[:, 0]) - np.arctan2(d2[:, 1], d2[:, 0]))
+    shift = (p1 + q1) / 2 - np.einsum("nij,nj->ni", se2.rotation(turn), (p2 + q2) / 2)
+    return np.column_stack([shift, turn])
+
+
+def _single_increments(z1, C1, z2, C2):
+    """Increment (p, 3) from each common sighting alone, Z Z'^-1, and its covariance (p, 3, 3)."""
+    by_first, by_inverse = se2.compose_jacobians(z1, se2.inverse(z2))
+    by_second = by_inverse @ se2.inverse_jacobian(z2)
+    return se2.compose(z1, se2.inverse(z2)), (by_first @ C1 @ np.swapaxes(by_first, 1, 2)
+                                              + by_second @ C2 @ np.swapaxes(by_second, 1, 2))
+
+
+def _distance_and_turn(increment):
+    """Distance in m and turn in rad, (n, 2), of increments (n, 3)."""
+    return np.stack([np.hypot(increment[:, 0], increment[:, 1]), se2.wrap(increment[:, 2])], -1)
+
+
+def _too_fast(increment, covariance, steps, bound):
+    """True where distance or turn exceeds bound * steps by more than three standard deviations."""
+    variance = np.stack([covariance[:, 0, 0] + covariance[:, 1, 1], covariance[:, 2, 2]], -1)
+    limit = bound * steps[:, None] + 3 * np.sqrt(variance)
+    return np.any(np.abs(_distance_and_turn(increment)) > limit, axis=1)
+
+
+def _similar(a, b):
+    """True where velocities (n, 3) differ by less than half the larger one, in speed and turn."""
+    speed, turn = np.hypot(*(a - b)[:, :2].T), np.abs(a[:, 2] - b[:, 2])
+    largest = np.maximum(np.abs(_distance_and_turn(a)), np.abs(_distance_and_turn(b)))
+    return (speed < largest[:, 0] / 2) & (turn < largest[:, 1] / 2 + SLOW_TURN)
+
+
+def _inverse_where_regular(H):
+    """Inverses of (l, 3, 3), NaN where H is singular or, without accepted sightings, not finite."""
+    scale = np.sqrt(np.maximum(np.diagonal(H, axis1=1, axis2=2), 1e-300))
+    finite = np.isfinite(H).all(axis=(1, 2))
+    scaled = np.where(finite[:, None, None], H / (scale[:, :, None] * scale[:, None, :]), 0)
+    regular = finite & (np.linalg.eigvalsh(scaled)[:, 0] > 1e-12)
+    inverse = np.full_like(H, np.nan)
+    inverse[regular] = np.linalg.inv(H[regular])
+    return inverse

@@ -1,0 +1,142 @@
+"""Problem 2: incremental localization from the markers alone, without encoders.
+
+The increment Delta between two frames is estimated from the sightings Z_j and Z'_j of their common
+markers j (`marker_increments`), with covariances C_j and C'_j. Poses follow by composition,
+X' = X Delta, with A = dX'/dX and B = dX'/dDelta. Consecutive increments share the sightings of the
+frame between them with opposite sign: the second increment cancels their error in the first.
+Therefore each pose X carries the cross-covariances H_j = Cov(error of X, error of Z_j) with the
+sightings of its frame,
+
+    C_X' = A C_X A^T + B C_Delta B^T + S + S^T,    S = A sum_j H_j (B D_j)^T,
+    H'_j = B D'_j C'_j,    D_j = dDelta/dZ_j,    D'_j = dDelta/dZ'_j.
+
+A marker seen as Z from X is at M = X Z. With E = dM/dX, F = dM/dZ and T = E H F^T its covariance is
+C_M = E C_X E^T + F C F^T + T + T^T. This is the correlated state of Smith, Self and Cheeseman,
+Estimating Uncertain Spatial Relationships in Robotics, 1990, without what no increment needs again.
+"""
+
+from collections import Counter, defaultdict
+from dataclasses import dataclass
+
+import numpy as np
+
+from slamlib import se2
+from slamlib.localization.marker_increments import consecutive_increments, robust_increments
+from slamlib.sightings import consensus, sightings_by_frame
+
+CANDIDATES = 3     # number of earlier frames that are tried as parent of a frame
+
+
+@dataclass(frozen=True)
+class Localization:
+    """Poses of the frames, as far as markers determine them, and the map of the markers."""
+
+    frame: np.ndarray               # (f,) pose index from 0 of every frame
+    poses: np.ndarray               # (f, 3) in the first localized frame, m and rad; or NaN
+    covariances: np.ndarray         # (f, 3, 3)
+    parent: np.ndarray              # (f,) row of the frame it was localized against, -1 for none
+    rejected: np.ndarray            # (m,) bool, rejected, or a repetition (`merge_repeated`)
+    unused: np.ndarray              # (m,) bool, sightings of markers that no adjacent frame sees
+    marker: np.ndarray              # (k,) ids of the mapped markers, ascending
+    marker_in_world: np.ndarray     # (k, 3) m and rad
+    marker_covariance: np.ndarray   # (k, 3, 3) of [x, y, heading] in world axes
+
+
+def localize(aruco, shared_errors=True):
+    """Localization from ArucoReadings, the sightings of markers at successive frames.
+
+    A frame is localized against its parent: the previous frame if the increment from it is usable,
+    else an earlier frame (`_relocalize`). Without a parent its pose is unknown. The world frame is
+    that of the first frame with a usable increment to the next. Without `shared_errors` H_j = 0:
+    increments then count as independent; this is conservative.
+    """
+    sightings = sightings_by_frame(aruco)
+    increments = consecutive_increments(sightings)
+    paired, confirmed = np.zeros((2, len(sightings.row)), bool)
+    for rows in (increments.first, increments.second):
+        paired[rows], confirmed[rows[increments.accepted]] = True, True
+    root = int(np.argmax(increments.usable)) if increments.usable.any() else 0
+    links = _links(sightings, increments, confirmed, root)
+    poses, covariances, H = _compose(sightings, links, root, shared_errors)
+    used = np.flatnonzero(confirmed & np.isfinite(poses[sightings.row, 0]))
+    marker, in_world, marker_covariance = _map_markers(sightings, used, poses, covariances, H)
+    rejected, unused = np.ones(len(aruco.pose), bool), np.zeros(len(aruco.pose), bool)
+    rejected[sightings.index], unused[sightings.index] = paired & ~confirmed, ~paired
+    return Localization(
+        frame=sightings.frame, poses=poses, covariances=covariances,
+        parent=np.array([links[f][0] if f in links else -1 for f in range(len(poses))]),
+        rejected=rejected, unused=unused, marker=marker, marker_in_world=in_world,
+        marker_covariance=marker_covariance)
+
+
+def _links(sightings, increments, confirmed, root):
+    """A dict, in ascending order, from localized frames to (parent, MarkerIncrements, pair)."""
+    count = len(sightings.frame)
+    rows_of = np.split(np.arange(len(sightings.row)),
+                       np.searchsorted(sightings.row, np.arange(1, count)))
+    links, seen_in = {}, defaultdict(list)              # marker id: localized frames that saw it
+    for f in range(root, count):
+        if f > root:
+            previous = f - 1 == root or f - 1 in links
+            link = (f - 1, increments, f - 1) if previous and increments.usable[f - 1] \
+                else _relocalize(sightings, confirmed, rows_of, f, seen_in)
+            if link is None:
+                continue
+            links[f] = link
+        for m in sightings.marker[rows_of[f]].tolist():
+            seen_in[m].append(f)
+    return links
+
+
+def _relocalize(sightings, confirmed, rows_of, frame, seen_in):
+    """The link (parent, MarkerIncrements, 0) of a frame to an earlier localized one, or None.
+
+    Candidates are the localized frames with the most common markers, the latest first. A link
+    requires two accepted markers, or one whose two sightings adjacent frames confirm.
+    """
+    marker, rows = sightings.marker, rows_of[frame]
+    shared = Counter(f for m in marker[rows].tolist() for f in seen_in[m])
+    for f in sorted(shared, key=lambda f: (shared[f], f), reverse=True)[:CANDIDATES]:
+        _, first, second = np.intersect1d(marker[rows_of[f]], marker[rows], return_indices=True)
+        first, second = rows_of[f][first], rows[second]
+        found = robust_increments(sightings.z, sightings.C, np.zeros_like(first), first, second, 1)
+        sure = found.accepted & confirmed[first] & confirmed[second]
+        if found.usable[0] and (found.accepted.sum() > 1 or sure.any()):
+            return f, found, 0
+    return None
+
+
+def _compose(sightings, links, root, shared_errors):
+    """Poses (f, 3) and covariances (f, 3, 3), NaN where unknown, and H (s, 3, 3) of sightings."""
+    count = len(sightings.frame)
+    poses, covariances = np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan)
+    poses[root], covariances[root] = 0.0, 0.0
+    H = np.zeros((len(sightings.row), 3, 3))
+    for f, (p, found, pair) in links.items():
+        poses[f] = se2.compose(poses[p], found.increment[pair])
+        A, B = se2.compose_jacobians(poses[p], found.increment[pair])
+        covariances[f] = A @ covariances[p] @ A.T + B @ found.covariance[pair] @ B.T
+        if shared_errors:
+            rows = slice(*np.searchsorted(found.pair, (pair, pair + 1)))
+            first, second = found.first[rows], found.second[rows]
+            S = A @ np.sum(H[first] @ np.swapaxes(B @ found.by_first[rows], 1, 2), axis=0)
+            covariances[f] += S + S.T
+            H[second] = B @ found.by_second[rows] @ sightings.C[second]
+    return poses, covariances, H
+
+
+def _map_markers(sightings, used, poses, covariances, H):
+    """Ids (k,), poses (k, 3) and covariances (k, 3, 3) of markers, each from one used sighting.
+
+    Sightings of a marker are correlated through the poses, so an average would be overconfident.
+    """
+    row, marker, z, C = (values[used] for values in (
+        sightings.row, sightings.marker, sightings.z, sightings.C))
+    E, F = se2.compose_jacobians(poses[row], z)
+    T = E @ H[used] @ np.swapaxes(F, 1, 2)
+    covariance = (E @ covariances[row] @ np.swapaxes(E, 1, 2) + F @ C @ np.swapaxes(F, 1, 2)
+                  + T + np.swapaxes(T, 1, 2))
+    in_world = se2.compose(poses[row], z)
+    in_world[:, 2] = se2.wrap(in_world[:, 2])
+    best = consensus(marker, in_world, covariance)
+    return marker[best], in_world[best], covariance[best]

@@ -1,0 +1,299 @@
+"""Trajectories, covariance ellipses and state curves, with one style for each role everywhere.
+
+Functions with an argument `ax` or `axes` draw on these matplotlib axes and return them. Poses are
+(n, 3) [x, y, heading] in m and rad, NaN without an estimate; covariances are (n, 3, 3) of the same.
+`role` is a key of ROLES, which gives the style; further arguments **look change it. `label` is the
+text in the legend. Ellipses state a probability: {p : (p - m)^T C^-1 (p - m) <= k^2} contains a
+planar Gaussian with probability 1 - exp(-k^2 / 2), so that 95 % needs k = 2.4477.
+"""
+
+from functools import partial
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+from IPython.core.pylabtools import print_figure
+from matplotlib.collections import EllipseCollection
+from matplotlib.colors import to_rgb
+from matplotlib.patches import Annulus
+
+from slamlib import se2
+from slamlib.odometry import cumulative
+
+# Colours of Okabe and Ito and of Tol, distinct for the colour-blind; line styles differ in grey.
+ROLES = {
+    "truth": dict(color="black", linestyle=(0, (4, 2)), linewidth=1.1, zorder=4),
+    "odometry": dict(color="#D55E00", linewidth=1.5, zorder=3),
+    "exact": dict(color="#332288", linewidth=1.5, zorder=3),
+    "sample": dict(color="#999999", linewidth=1.0, zorder=1),
+    "aruco": dict(color="#CC79A7", linestyle=(0, (1.2, 0.8)), linewidth=1.7, zorder=3),
+    "fused": dict(color="#009E73", linestyle=(0, (4.5, 1.6)), linewidth=1.8, zorder=3),
+    "hint": dict(color="#E69F00", linestyle=(0, (5, 1, 1, 1)), linewidth=1.5, zorder=3),
+    "marker": dict(color="#333333", linestyle="none", marker="s", markersize=3, zorder=3),
+    "slam": dict(color="#0072B2", linewidth=2.0, zorder=3),
+    "slam_uwb": dict(color="#56B4E9", linestyle=(0, (6, 1.5)), linewidth=2.2, zorder=3.2),
+    "arc": dict(color="#333333", linewidth=1.7, zorder=3),
+    "euler": dict(color="#888888", linestyle=(0, (3, 1.5)), linewidth=1.7, zorder=3),
+    "alternative": dict(color="#882255", linestyle=(0, (5, 1, 1, 1)), linewidth=1.5, zorder=3),
+    "antenna": dict(color="#222222", linestyle="none", marker="^", markersize=6, zorder=5),
+    "guess": dict(color="#222222", linestyle="none", marker="^", markersize=7, zorder=4,
+                  markerfacecolor="none"),
+    "true antenna": dict(color="black", linestyle="none", marker="+", markersize=9, zorder=6),
+}
+
+# Changes of ROLES where two estimates are drawn over a sample: a narrow dashed line on a wide one.
+COMPARED = {
+    "sample": dict(linestyle="none", marker="o", markersize=3.5, zorder=5, color="#555555"),
+    "odometry": dict(linewidth=3.2, alpha=0.75),
+    "exact": dict(linestyle=(0, (4, 2)), linewidth=1.5, zorder=4),
+}
+
+WIDE, NARROW = "image/svg+xml", "image/svg+xml;layout=narrow"    # MIME types, keys of `pictures`
+NARROW_WIDTH = 3.9                                               # inches, a column on a phone
+
+
+def use_style():
+    """Set the style of all later figures of this process."""
+    plt.style.use(Path(__file__).with_name("slamlib.mplstyle"))
+
+
+def panels(count, rows=1, height=3.4, width=3.7, columns=2):
+    """A figure and its axes (count, rows): `columns` panels side by side, sizes in inches each."""
+    columns = min(columns, count)
+    lines = -(-count // columns)
+    fig = plt.figure(figsize=(max(width * columns, 5.0), height * lines))
+    grid = fig.add_gridspec(lines * rows, columns)
+    return fig, np.array([[fig.add_subplot(grid[panel // columns * rows + row, panel % columns])
+                           for row in range(rows)] for panel in range(count)])
+
+
+def narrow(fig, width=NARROW_WIDTH):
+    """Change a figure to `width` inches: all axes below each other, panel by panel, same height."""
+    axes = [ax for ax in fig.axes if ax.get_visible() and ax.get_subplotspec()]
+    if not axes:
+        return
+    rows, _ = axes[0].get_gridspec().get_geometry()
+    height = fig.get_figheight() / rows * len(axes)
+    for ax, place in zip(axes, fig.add_gridspec(len(axes), 1), strict=True):
+        ax.set_subplotspec(place)
+        ax.autoscale_view()          # the equal aspect had extended the limits to the wide axes
+    fig.set_size_inches(width, height)
+    if fig.legends:
+        legend_below(fig)
+        fig.set_size_inches(width, height + fig.legends[0].get_window_extent().height / fig.dpi)
+
+
+def pictures(fig):
+    """A figure as SVG by MIME type, first WIDE, then NARROW; {} if empty. It stays narrow."""
+    draw = partial(print_figure, fig, "svg", metadata={"Date": None})
+    texts = {WIDE: draw()}
+    narrow(fig)
+    texts[NARROW] = draw()
+    return texts if fig.axes else {}
+
+
+def trajectory(ax, poses, role, label=None, **look):
+    """Draw the path of poses (n, >= 2) with a dot at its start and equal axes."""
+    look = {**ROLES[role], **look}
+    line, = ax.plot(poses[:, 0], poses[:, 1], label=label or role, **look)
+    ax.plot(*poses[np.isfinite(poses[:, 0])][:1, :2].T, "o", color=line.get_color(), markersize=4)
+    ax.set_aspect("equal", adjustable="datalim")
+    ax.set(xlabel="x (m)", ylabel="y (m)")
+    return ax
+
+
+def ellipses(ax, positions, covariances, color, probability=0.95, label=None, fill=0.12, enlarged=1,
+             fit=True):
+    """Draw ellipses of a probability at positions (m, >= 2) with covariances (m, >= 2, >= 2).
+
+    `fill` is the opacity. `enlarged` scales the ellipses, which the figure must state. The axes are
+    extended to contain the ellipses unless `fit` is False.
+    """
+    k, centre = enlarged * np.sqrt(-2 * np.log(1 - probability)), np.asarray(positions)[:, :2]
+    variances, axes = np.linalg.eigh(np.asarray(covariances)[:, :2, :2])
+    widths = 2 * k * np.sqrt(np.maximum(variances, 0))
+    angles = np.degrees(np.arctan2(axes[:, 1, 1], axes[:, 0, 1]))
+    rgb = np.array(to_rgb(color))
+    face, edge = (*rgb, fill), tuple(0.6 * rgb)           # darker than the path below them
+    patches = EllipseCollection(
+        widths[:, 1], widths[:, 0], angles, units="xy", offsets=centre,
+        offset_transform=ax.transData, facecolors=face, edgecolors=edge, linewidths=1.1, zorder=3.5)
+    ax.add_collection(patches)
+    if fit:
+        reach = k * np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)[:, :2])
+        ax.update_datalim(np.concatenate([centre - reach, centre + reach]))
+    if label:
+        ax.plot([], [], "o", markersize=9, markerfacecolor=face, markeredgecolor=edge, label=label)
+    ax.autoscale_view()
+    return ax
+
+
+def markers(ax, in_world, covariances, role="marker", label="markers"):
+    """Draw markers in_world (k, >= 2) as squares with their 95 % ellipses."""
+    ellipses(ax, in_world, covariances, "#bbbbbb", fill=0.35)
+    ax.plot(in_world[:, 0], in_world[:, 1], label=label, **ROLES[role])
+    return ax
+
+
+def antennas(ax, positions, covariances, guess=None, truth=None, enlarged=1):
+    """Draw antennas (a, 2) with 95 % ellipses, and their guessed and true positions (a, 2)."""
+    ellipses(ax, positions, covariances, "#999999", fill=0.35, enlarged=enlarged)
+    if guess is not None:
+        ends = np.stack([guess, positions])
+        ax.plot(ends[..., 0], ends[..., 1], color="#999999", linewidth=0.8, zorder=2)
+        ax.plot(*guess.T, label="antennas: guess", **ROLES["guess"])
+    ax.plot(*positions.T, label="antennas: estimate", **ROLES["antenna"])
+    if truth is not None:
+        ax.plot(*truth.T, label="antennas: truth", **ROLES["true antenna"])
+    return ax
+
+
+def rings(ax, centres, radii, sigma, color="#56B4E9"):
+    """Draw rings of radii +- 2 sigma, both (m,), around centres (m, 2), all in m."""
+    look = dict(facecolor=color, alpha=0.35, linewidth=0)
+    for centre, radius, s in zip(centres, radii, sigma, strict=True):
+        ax.add_patch(Annulus(centre, radius + 2 * s, 4 * s, **look))
+    ax.set_aspect("equal", adjustable="box")
+    ax.set(xlabel="x (m)", ylabel="y (m)")
+    return ax
+
+
+def likelihood(ax, positions, ranges, sigma, window):
+    """Shade the likelihood of an antenna's position relative to its maximum, all in m.
+
+    Ranges (m,) from positions (m, 2) have the same standard deviation `sigma`. `window` is
+    ((x_low, x_high), (y_low, y_high)).
+    """
+    x, y = (np.linspace(low, high, 161) for low, high in window)
+    grid = np.stack(np.meshgrid(x, y), -1)
+    off = (np.linalg.norm(grid[:, :, None] - positions, axis=-1) - ranges) / sigma
+    cost = np.sum(off**2, axis=-1) / 2
+    ax.contourf(x, y, np.exp(cost.min() - cost), levels=[1e-6, 1e-3, 0.05, 0.3, 1.01],
+                colors=["#e3f1fa", "#b5dbf3", "#7cbfe8", "#0072B2"])
+    ax.set_aspect("equal", adjustable="box")
+    ax.set(xlabel="x (m)", ylabel="y (m)")
+    return ax
+
+
+def factor_graph(ax, count, sightings, names):
+    """Draw a scheme of a factor graph: `count` vehicle poses in a row, markers above, w below.
+
+    `sightings` is a list of (pose, marker), indices from 0; `names` (k,) are the markers' labels.
+    """
+    poses = np.array([(i, 0.0) for i in range(count)])
+    markers = np.array([(x, 1.5) for x in np.linspace(-0.5, count - 0.5, len(names) + 2)[1:-1]])
+    wheel = np.array([poses[:, 0].mean(), -0.8])
+
+    def edge(ends, color):
+        middle = np.mean(ends, axis=0)
+        for end in ends:
+            ax.plot(*np.stack([end, middle]).T, color=color, linewidth=0.9, zorder=1)
+        ax.plot(*middle, "s", color=color, markersize=4, zorder=2)
+
+    for i, j in sightings:
+        edge([poses[i], markers[j]], ROLES["aruco"]["color"])
+    for i in range(count - 1):
+        edge([poses[i], poses[i + 1], wheel], ROLES["odometry"]["color"])
+    nodes = [(p, f"$X_{i + 1}$", "white") for i, p in enumerate(poses)]
+    nodes += [(m, f"$L_{{{name}}}$", "#dddddd") for m, name in zip(markers, names, strict=True)]
+    for place, name, color in [*nodes, (wheel, "$w$", "#ffe0b0")]:
+        ax.text(*place, name, ha="center", va="center", fontsize=8, zorder=4,
+                bbox=dict(boxstyle="circle,pad=0.25", facecolor=color, edgecolor="black"))
+    for prior in (poses[0], wheel):
+        edge([prior, prior - [0.4, 0]], "black")
+    ax.set_aspect("equal", adjustable="datalim")
+    ax.axis("off")
+    return ax
+
+
+def enlargement(poses, covariances):
+    """Factor 1, 2, 5, 10, ... that makes the largest 95 % ellipse about a tenth of the path."""
+    known = np.isfinite(poses[:, 0])
+    extent = np.ptp(poses[known, :2], axis=0).max()
+    largest = 2.45 * np.sqrt(np.linalg.eigvalsh(covariances[known, :2, :2])[:, 1].max())
+    wanted = 0.05 * extent / largest if largest > 0 else 1
+    steps = np.outer(10.0 ** np.arange(4), [1, 2, 5]).ravel()
+    return int(steps[max(0, np.searchsorted(steps, wanted, side="right") - 1)])
+
+
+def spread(poses, count=14):
+    """Indices of about `count` known poses at equal distances along the path."""
+    known = np.flatnonzero(np.isfinite(poses[:, 0]))
+    travelled = cumulative(np.hypot(*np.diff(poses[known, :2], axis=0).T))
+    wanted = np.linspace(0, travelled[-1], count + 1)[1:]
+    return known[np.unique(np.minimum(np.searchsorted(travelled, wanted), len(known) - 1))]
+
+
+def name_rows(axes, names):
+    """Set the labels of the vertical axes of one panel; the last axes show the pose number."""
+    for ax, name in zip(axes, names, strict=True):
+        ax.set(ylabel=name, xlabel=None)
+    axes[-1].set(xlabel="pose number")
+
+
+def farthest(poses):
+    """Index of the pose with the largest distance from the first one."""
+    return int(np.argmax(np.hypot(*(poses[:, :2] - poses[0, :2]).T)))
+
+
+def legend_below(fig):
+    """Draw one legend below all axes of a figure: each label once, in as few lines as fit."""
+    entries = {}
+    for ax in fig.axes:
+        handles, labels = ax.get_legend_handles_labels()
+        entries |= {label: handle for handle, label in zip(handles, labels, strict=True)
+                    if label not in entries}
+    for most in range(4, 0, -1):
+        while fig.legends:
+            fig.legends[0].remove()
+        lines = -(-len(entries) // most)
+        legend = fig.legend(entries.values(), entries.keys(), loc="outside lower center",
+                            ncols=-(-len(entries) // lines))
+        if legend.get_window_extent().width <= fig.bbox.width:
+            break
+
+
+def states(axes, poses, covariances, role, label=None):
+    """Draw x, y and heading with bands of +-2 sigma over the pose number on three axes."""
+    return _curves(axes, poses, poses, covariances, role, label or role, np.arange(len(poses)),
+                   ("x (m)", "y (m)", "heading δ (rad)"))
+
+
+def errors(axes, poses, covariances, truth, role, label=None, at=None):
+    """Draw the errors of x, y and heading with bands of +-2 sigma around 0 on three axes.
+
+    `truth` is (n, 3). `at` (n,) are the indices from 0 of the poses, by default all poses.
+    """
+    error = poses - truth
+    error[:, 2] = se2.wrap(error[:, 2])
+    at = np.arange(len(poses)) if at is None else at
+    return _curves(axes, error, np.zeros_like(error), covariances, role, label or role, at,
+                   ("error of x (m)", "error of y (m)", "error of δ (rad)"))
+
+
+def curve(ax, values, role, at=None, label=None, **look):
+    """Draw values (n,) over the pose number; `at` (n,) are the indices from 0 of their poses."""
+    at = np.arange(len(values)) if at is None else at
+    ax.plot(at + 1, values, label=label or role, **{**ROLES[role], **look})
+    ax.set(xlabel="pose number")
+    return ax
+
+
+def cloud(ax, samples, mean, estimates, probability=0.95):
+    """Draw samples (d, 2), and ellipses of estimates {role: (covariance (2, 2), label)} at mean."""
+    ax.plot(samples[:, 0], samples[:, 1], ".", color="#777777", markersize=2.5, label="Monte Carlo")
+    for role, (covariance, label) in estimates.items():
+        ellipses(ax, mean[None], covariance[None], ROLES[role]["color"], probability, label)
+    return ax
+
+
+def _curves(axes, values, middle, covariances, role, label, at, names):
+    two_sigma = 2 * np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    low, high = middle - two_sigma, middle + two_sigma
+    few = np.unique(np.linspace(0, len(values) - 1, 800).astype(int))      # bands are smooth
+    for i, ax in enumerate(axes):
+        ax.plot(at + 1, values[:, i], label=label, **ROLES[role])
+        ax.fill_between(at[few] + 1, low[few, i], high[few, i], color=ROLES[role]["color"],
+                        alpha=0.18, linewidth=0, label=f"{label}: ±2σ")
+    name_rows(axes, names)
+    return axes

@@ -1,0 +1,155 @@
+"""Executes notebooks without a display, each in its own kernel, a limited number at a time."""
+
+import asyncio
+import os
+import re
+import shutil
+import sys
+import time
+
+import nbformat
+from jupyter_client import AsyncKernelManager
+from jupyter_client.kernelspec import KernelSpecManager
+from nbclient import NotebookClient
+from nbclient.exceptions import CellExecutionError
+from nbconvert.filters import strip_ansi
+from nbconvert.preprocessors import CoalesceStreamsPreprocessor
+from tqdm import tqdm
+
+CELL_TIMEOUT = 1800  # s
+
+
+class NotebookError(RuntimeError):
+    """A notebook failed; the message names the notebook, the position in it and the reason."""
+
+
+class _Loop(asyncio.SelectorEventLoop):
+    """Refuses nbclient's signal handlers, so that Ctrl-C stops all kernels through asyncio."""
+
+    def add_signal_handler(self, *_):
+        raise RuntimeError("notebooks install no signal handlers")
+
+
+def read_notebook(source):
+    """Return the NotebookNode in a file (Path); NotebookError if the file is not a notebook."""
+    try:
+        return nbformat.read(source, as_version=4)
+    except (nbformat.reader.NotJSONError, nbformat.ValidationError) as error:
+        reason = str(error).partition("\n")[0]
+        raise NotebookError(f"{source.name} is not a notebook: {reason}") from None
+
+
+def kernel_environment(settings, data, datasets, jobs):
+    """Return the kernels' environment variables (dict of str) without settings that change pages.
+
+    `settings` is an empty folder for the kernels' own settings, `data` that of the datasets (Path),
+    `datasets` the selected names (list of str) or None, `jobs` as in `execute`.
+    """
+    (settings / "matplotlibrc").write_text("svg.hashsalt: slamlib\n")
+    threads = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS") if jobs > 1 else ()
+    environment = {"SOURCE_DATE_EPOCH": "0", "PYTHONHASHSEED": "0"} | dict.fromkeys(threads, "1")
+    environment |= os.environ
+    environment |= {"SLAMLIB_DATA": str(data), "IPYTHONDIR": str(settings),
+                    "MATPLOTLIBRC": str(settings / "matplotlibrc"),
+                    "MPLBACKEND": "module://matplotlib_inline.backend_inline"}
+    for name in ("SLAMLIB_DATASETS", "SLAMLIB_STUDIES"):
+        environment.pop(name, None)
+    return environment | ({"SLAMLIB_DATASETS": "\n".join(datasets)} if datasets else {})
+
+
+def execute(books, environment, results, jobs, finish):
+    """Execute notebooks in place, at most `jobs` at a time; the first failure stops the others.
+
+    Each notebook writes to its own folder inside `results`, SLAMLIB_RESULTS. When it ended without
+    error, its files are moved to `results`. NotebookError if a cell failed.
+
+    Parameters
+    ----------
+    books, environment : dict from Path to NotebookNode; dict of str, the kernels' variables.
+    results, jobs : Path and int.
+    finish : function of Path, NotebookNode and the names (list of str) of the result files, called
+        after each notebook.
+    """
+    try:
+        with asyncio.Runner(loop_factory=_Loop) as runner:
+            runner.run(_execute_all(books, environment, results, jobs, finish))
+    except ExceptionGroup as group:
+        raise group.exceptions[0] from None
+
+
+async def _execute_all(books, environment, results, jobs, finish):
+    slots = asyncio.Semaphore(jobs)
+
+    async def run(source, book):
+        stage = results / f".{source.stem}"
+        shutil.rmtree(stage, ignore_errors=True)  # left by a build that was killed
+        stage.mkdir(parents=True)
+        try:
+            async with slots:
+                await _execute(source, book, environment | {"SLAMLIB_RESULTS": str(stage)}, bar)
+            finish(source, book, _publish(stage, results))
+        finally:
+            shutil.rmtree(stage, ignore_errors=True)
+
+    total = sum(map(_count_code_cells, books.values()))
+    with tqdm(total=total, unit="cell", leave=False, disable=not sys.stderr.isatty()) as bar:
+        async with asyncio.TaskGroup() as group:
+            for source, book in books.items():
+                group.create_task(run(source, book))
+
+
+def _count_code_cells(book):
+    return sum(cell.cell_type == "code" and cell.source.strip() != "" for cell in book.cells)
+
+
+def _publish(stage, results):
+    """Move all files of a folder to another, and return their names relative to it."""
+    names = [file.relative_to(stage) for file in sorted(stage.rglob("*")) if file.is_file()]
+    for name in names:
+        (results / name).parent.mkdir(parents=True, exist_ok=True)
+        os.replace(stage / name, results / name)
+    return [name.as_posix() for name in names]
+
+
+async def _execute(source, book, environment, bar):
+    """Execute one notebook in place with the interpreter that runs this module."""
+    count, started, start = _count_code_cells(book), [], time.monotonic()
+
+    def begin(cell, cell_index):
+        started.append(cell)
+        bar.set_description(f"{source.stem}: cell {len(started)} of {count}")
+
+    manager = AsyncKernelManager(  # no folders to search: kernels of the user are not found
+        kernel_name="python3", kernel_spec_manager=KernelSpecManager(kernel_dirs=[]))
+    client = NotebookClient(
+        book, km=manager, resources={"metadata": {"path": str(source.parent)}},
+        timeout=CELL_TIMEOUT, iopub_timeout=60, raise_on_iopub_timeout=True,
+        record_timing=False, store_widget_state=False, shutdown_kernel="immediate",
+        extra_arguments=["--IPKernelApp.log_level=ERROR"],
+        on_cell_execute=begin, on_cell_executed=lambda **_: bar.update())
+    tqdm.write(f"{source.stem}: {count} cells", file=sys.stderr)
+    try:
+        await client.async_execute(env=environment, cleanup_kc=True)
+        CoalesceStreamsPreprocessor().preprocess(book, {})  # kernels divide them by time
+    except (CellExecutionError, TimeoutError, RuntimeError) as error:
+        if asyncio.current_task().cancelling():  # nbclient reports a cancellation as a dead kernel
+            raise asyncio.CancelledError from None
+        raise NotebookError(_failure(source, started, error)) from None
+    finally:
+        if manager.has_kernel:
+            await manager.shutdown_kernel(now=True)
+    tqdm.write(f"{source.stem}: done in {time.monotonic() - start:.1f} s", file=sys.stderr)
+
+
+def _failure(source, started, error):
+    """Return the notebook, cell, line and reason of a failure, without colours."""
+    reason = f"{type(error).__name__}: {error}".splitlines()[0]
+    position = source.name + (f", cell {len(started)}" if started else "")
+    lines = started[-1].source.splitlines() if started else []
+    if isinstance(error, CellExecutionError):
+        reason = f"{error.ename}: {error.evalue}"
+        frame = re.search(r"Cell In\s?\[\d+\], line (\d+)", strip_ansi(error.traceback))
+        if frame and int(frame[1]) <= len(lines):
+            position = f"{position}, line {frame[1]}"
+            lines = [lines[int(frame[1]) - 1].strip()]
+    return strip_ansi("\n    ".join([f"{position}:", *lines[:5]]) + f"\n{reason}")

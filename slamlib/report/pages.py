@@ -1,0 +1,193 @@
+"""Makes HTML pages of executed notebooks, which need no script and no network.
+
+nbconvert makes a page by `page.html` and `page.css`; pandoc converts its formulas to MathML.
+"""
+
+import html
+import re
+import sys
+import xml.etree.ElementTree as ElementTree
+from functools import cache, partial
+from pathlib import Path
+from urllib.parse import quote, unquote
+
+from jinja2 import pass_context
+from nbconvert import HTMLExporter
+from nbconvert.filters.markdown_mistune import IPythonRenderer, MarkdownWithMath
+
+from slamlib.report.execution import NotebookError
+from slamlib.report.formulas import set_formulas
+from slamlib.report.numbering import CAPTION, TAG
+
+PAGE = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
+STYLE = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
+MARK = re.compile("\ue000(\\d+)\ue001([.,;:!?)]*)")  # stands for a formula until pandoc converts it
+INTERNAL = re.compile(r"([^:/#]+\.ipynb)?(?:#(.+))?")  # a link to a notebook or an anchor
+ACCENTS = {"\u0302": "^", "\u0303": "~", "\u0307": "\u02d9", "\u0308": "\u00a8"}
+UPRIGHT = {letter: letter - 104 for letter in range(0x1D468, 0x1D49C)}  # bold italic to bold
+LOADED = re.compile(r"<(?:script|link|iframe|object|embed|base)\b[^>]*"
+                    r"|<[^>]*\s(?:src|srcset|poster|data)\s*=(?![\"']?data:)[^>]*"
+                    r"|@import\b.*|url\((?![\"']?(?:data:|#)).*", re.IGNORECASE)
+
+
+def chapter_of(source, book):
+    """Return file, notebook, title, number (or None) and lead of a chapter (Path, NotebookNode).
+
+    These are the keys of a dict of str; the lead is the chapter's first paragraph in Markdown.
+    """
+    text = "\n\n".join(cell.source for cell in book.cells if cell.cell_type == "markdown")
+    title = re.search(r"^#\s+(.+)", text, re.MULTILINE)
+    lead = re.search(r"^(?!\s|[#|<>`]|\$\$|[-*+]\s).+(?:\n.+)*", text, re.MULTILINE)
+    title = re.sub("[*_`]", "", title[1]).strip() if title else source.stem
+    number = re.match(r"(\d+)\.", title)
+    return {"file": quote(f"{source.stem}.html"), "notebook": source.name, "title": title,
+            "lead": lead[0] if lead else "", "number": number[1] if number else None}
+
+
+def html_pages(books, chapters, code=True):
+    """Return the HTML pages of books (dict from Path to NotebookNode) as {file name: str}.
+
+    The other parameters are those of `html_page`. NotebookError if a page would lose a formula or
+    load something, or if a link has no target.
+    """
+    anchors, links, pages = {}, [], {}
+    for source, book in books.items():
+        pages[f"{source.stem}.html"], page = html_page(source, book, chapters, code)
+        anchors[source.name] = {"", *page["anchors"]}
+        links += [(source.name, *link) for link in page["links"]]
+    for name, text, target, anchor in links:
+        if target not in anchors:
+            _print_once(f"{name}: there is no {target}, so '{text}' is not a link")
+        elif anchor not in anchors[target]:
+            raise NotebookError(f"{name}: the link '{text}' leads to #{anchor}, "
+                                f"which does not exist in {target}")
+    return pages
+
+
+@cache
+def _print_once(sentence):
+    print(sentence, file=sys.stderr)
+
+
+def html_page(source, book, chapters, code=True):
+    """Return the HTML page (str) of an executed book, and a dict of what the renderer collected.
+
+    NotebookError if a formula cannot be converted or the page would load something.
+
+    Parameters
+    ----------
+    source, book : Path and NotebookNode.
+    chapters : list of dict by `chapter_of`, for the contents.
+    code : bool; False leaves out code cells and printed text.
+    """
+    page = {"formulas": [], "sections": [], "section": "", "headings": [], "anchors": {},
+            "links": [], "figures": [], "chapters": chapters, "code": code, "style": STYLE,
+            "file": quote(f"{source.stem}.html"), "notebook": source.name}
+    text, resources = EXPORTER.from_notebook_node(
+        book, {"metadata": {"path": str(source.parent)}, "page": page})
+    page = resources["page"]
+    converted = set_formulas(page["formulas"], "html", ["--mathml"],
+                             partial(formula_error, page))
+    formulas = [_corrected(tex, mathml)
+                for (tex, _), mathml in zip(page["formulas"], converted, strict=True)]
+    unbroken = '<span class="keep">{}{}</span>'.format  # no line break before punctuation
+    text = MARK.sub(lambda mark: unbroken(formulas[int(mark[1])], mark[2]), text)
+    if loaded := LOADED.search(text):
+        raise NotebookError(f"{source.name}: the page would load a resource: {loaded[0][:100]}")
+    return text, page
+
+
+def formula_error(page, number, reason):
+    """Return the NotebookError for the formula of this index in `page`, the dict by `html_page`."""
+    name, section = page["sections"][number]
+    return NotebookError(name + (f", section '{section}'" if section else "")
+                         + f": {reason}:\n    {page['formulas'][number][0]}")
+
+
+class Renderer(IPythonRenderer):
+    """Converts Markdown to HTML (str) with marks for formulas; collects what it finds in `page`."""
+
+    def inline_math(self, body, display=False):
+        """Return the mark for a formula (TeX, str)."""
+        self.page["formulas"].append((body.strip(), display))
+        self.page["sections"].append((self.page["notebook"], self.page["section"]))
+        return f"\ue000{len(self.page['formulas']) - 1}\ue001"
+
+    def block_math(self, body):
+        """Return a display formula, with its number beside it if it has a tag."""
+        formula = self.inline_math(TAG.sub("", body, count=1), display=True)
+        if not (tag := TAG.search(body)):
+            return f'<span class="equation">{formula}</span>'
+        tag = html.escape(tag[1].strip())
+        return (f'<span class="equation" id="{self.anchor("eq-" + tag)}">{formula}'
+                f'<span class="number">({tag})</span></span>')
+
+    def latex_environment(self, name, body):
+        """Return a LaTeX environment as a display formula."""
+        return self.block_math(f"\\begin{{{name}}}{body}\\end{{{name}}}")
+
+    def heading(self, text, level, **_):
+        """Return a heading with its anchor; levels 2 and 3 are listed in the contents."""
+        anchor = html.escape(self.begin_section(text))
+        if level in (2, 3):
+            self.page["headings"].append((level, anchor, re.sub("</?a[^>]*>", "", text)))
+        return f'<h{level} id="{anchor}">{text}</h{level}>\n'
+
+    def begin_section(self, text):
+        """Return a heading's anchor, as Jupyter names it, and begin its section."""
+        self.page["section"] = html.unescape(re.sub("<[^>]*>", "", MARK.sub("", text))).strip()
+        return self.anchor(self.page["section"].replace(" ", "-"))
+
+    def anchor(self, name):
+        """Return the anchor for a name (str), numbered if the page has it already."""
+        count = self.page["anchors"][name] = self.page["anchors"].get(name, 0) + 1
+        return name if count == 1 else f"{name}-{count}"
+
+    def paragraph(self, text):
+        """Return a paragraph; a caption has an anchor."""
+        if not (caption := CAPTION.match(re.sub("<[^>]*>", "", text))):
+            return f"<p>{text}</p>\n"
+        anchor = self.anchor(f"{caption[1].lower()}-{caption[2]}")
+        return f'<p class="caption" id="{anchor}">{text}</p>\n'
+
+    def link(self, text, url, title=None):
+        """Return a link; a notebook's name becomes its page's, or plain text if there is none."""
+        if inside := INTERNAL.fullmatch(url):
+            own = self.page["notebook"]
+            target = unquote(inside[1] or own)
+            self.page["links"].append((text, target, unquote(inside[2] or "")))
+            if target not in (own, *(chapter["notebook"] for chapter in self.page["chapters"])):
+                return text
+        return super().link(text, re.sub(r"^([^:/]+)\.ipynb(?=#|$)", r"\1.html", url), title)
+
+
+def _corrected(tex, mathml):
+    """Return pandoc's MathML, corrected where it differs from TeX or browsers misplace it."""
+    math = ElementTree.fromstring(re.sub(r'\sxmlns="[^"]*"', "", mathml).strip())
+    for element in list(math.iter()):
+        last = element[-1] if len(element) else element
+        if element.tag == "mo" and element.text == "\u2061":  # function application: cos, log
+            element.set("class", "of")
+        elif element.get("mathvariant") == "bold-italic" and "\\mathbf" in tex:
+            element.text = element.text.translate(UPRIGHT)
+        elif element.tag == "mover" and last.text in ACCENTS:
+            last.text = ACCENTS[last.text]
+            last.set("stretchy", "false" if element[0].tag == "mi" else "true")
+        elif element.tag == "munder" and last.text == "\u23df":  # \underbrace, drawn by the style
+            element.remove(last)
+            element.tag, element.attrib = "mrow", {"class": "brace"}
+    return ElementTree.tostring(math, encoding="unicode", short_empty_elements=False)
+
+
+@pass_context
+def _markdown_to_html(context, source):
+    """Convert Markdown with our Renderer; the template's filter `markdown2html`."""
+    renderer = Renderer(escape=False, embed_images=True,
+                        path=context["resources"]["metadata"]["path"],
+                        attachments=context.get("cell", {}).get("attachments", {}))
+    renderer.page = context["resources"]["page"]
+    return MarkdownWithMath(renderer=renderer).render(source)
+
+
+EXPORTER = HTMLExporter(template_name="basic", raw_template=PAGE,
+                        filters={"markdown2html": _markdown_to_html})

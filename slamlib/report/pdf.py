@@ -1,0 +1,267 @@
+"""Makes the report's PDF: pandoc writes Typst, the typst wheel sets it; neither needs a network.
+
+The pages' renderer converts cells and outputs to HTML, with marks (private characters) for
+formulas, pictures, captions and paragraphs that end with a colon. pandoc converts the HTML to
+Typst, where calls of `report.typ` replace the marks. A query checks that no formula is lost.
+"""
+
+import base64
+import hashlib
+import html
+import json
+import re
+import tempfile
+import textwrap
+from functools import partial
+from pathlib import Path
+
+import pypandoc
+import typst
+from nbconvert.filters import strip_ansi
+from nbconvert.filters.markdown_mistune import MarkdownWithMath
+
+from slamlib.report.execution import NotebookError
+from slamlib.report.formulas import set_formulas
+from slamlib.report.numbering import CAPTION, TAG
+from slamlib.report.pages import MARK, Renderer, formula_error
+
+TEMPLATE = Path(__file__).with_name("report.typ")
+PICTURES = {"image/svg+xml": "svg", "image/png": "png", "image/jpeg": "jpg"}
+KINDS = (*PICTURES, "text/markdown", "text/latex", "text/html", "text/plain")  # best first
+COLUMNS = 96  # width of the page in characters of code
+LONG = 36  # lines of Typst from which a table may break between pages
+TABLE = re.compile(
+    "#figure\\(\n(?:(?!#figure\\().)*?, kind: table\n  \\)(?=\\s*\ue004)", re.DOTALL)
+PICTURE = re.compile("\ue002(\\d+)\ue003")
+CAPTIONED = re.compile("\ue002(\\d+)\ue003\\s*\ue004(.*?)\ue006(.*?)\ue005", re.DOTALL)
+CAPTIONS = re.compile("\ue004(.*?)\ue006(.*?)\ue005", re.DOTALL)
+SCALED = re.compile(r"#scale\(x: (\d+)%, y: \d+%\)\[(\\?[^\\]|\\\])\]")  # pandoc's \big, \Big, ...
+REPLACED = [(re.compile(pattern), replacement) for pattern, replacement in (
+    # TeX that pandoc sets wrongly
+    (r"\\!", ""), (r"\\;", r"\\:"),
+    (r"\\([bB]igg?[lrm]?|left|right)\s*(?=\\[lr]?[vV]ert(?![a-zA-Z])|\\\|)", ""),
+    (r"\\lvert(?![a-zA-Z])", r"\\left\\lvert"), (r"\\rvert(?![a-zA-Z])", r"\\right\\rvert"))]
+_quoted = partial(json.dumps, ensure_ascii=False)
+
+
+def typeset(chapters, opening=None, code=True, **cover):
+    """Return the PDF of chapters, title page and contents as bytes; equal input gives equal bytes.
+
+    NotebookError if a formula is lost or cannot be set, or if the fonts lack a character.
+
+    Parameters
+    ----------
+    chapters : list of (Path, NotebookNode), executed; links name chapters by their file names.
+    opening : NotebookNode, an unnumbered chapter before them, or None.
+    code : bool; False leaves out code cells and printed text.
+    cover : title, author, student_number, course (str), the lines of the title page.
+    """
+    files, book = typst_files(chapters, opening, code, **cover)
+    for name, text in book.texts:
+        if missing := missing_glyphs(text):
+            context = re.search(f".{{0,30}}{missing[0]}.{{0,30}}", text)[0]
+            raise NotebookError(f"{name}: the PDF's fonts have no glyph for {missing[0]} "
+                                f"(U+{ord(missing[0]):04X}): ...{context}...")
+    with tempfile.TemporaryDirectory() as folder:
+        for name, content in files.items():
+            Path(folder, name).write_bytes(content)
+        return _compile(Path(folder), book)
+
+
+def typst_files(chapters, opening=None, code=True, **cover):
+    """Return the files for Typst as {name: bytes}, and their _Book; parameters as `typeset`."""
+    book = _Book(code)
+    parts = [book.chapter(*chapter) for chapter in chapters]
+    if opening is not None:
+        parts.insert(0, f"#unnumbered[\n{book.chapter(Path('index'), opening)}\n]")
+    text = "\n#chapter-ends()\n".join(parts)
+    formulas = book.formula_definitions()
+    if lost := set(range(len(formulas))) - {int(mark[1]) for mark in MARK.finditer(text)}:
+        raise book.error(min(lost), "the PDF would lose this formula")
+    text = TABLE.sub(lambda table: f"#unbroken[{table[0]}]" if table[0].count("\n") < LONG
+                     else table[0], text)
+    text = MARK.sub(r"#formula-\1;\2", text)
+    text = CAPTIONED.sub("#floating[\ue002\\1\ue003 \ue004\\2\ue006\\3\ue005]", text)
+    text = PICTURE.sub(lambda mark: "#picture({}, {});".format(*book.pictures[int(mark[1])]), text)
+    text = CAPTIONS.sub(r"#caption[\2] <\1>", text)
+    text = text.replace("\ue007", "#announcing[").replace("\ue008", "]")
+    lines = ", ".join(f"{name}: {_quoted(value)}" for name, value in cover.items())
+    text = (f'#import "{TEMPLATE.name}": *\n#import "formulas.typ": *\n'
+            f"#show: report.with({lines})\n{text}\n")
+    definitions = "\n".join([f'#import "{TEMPLATE.name}": display', *formulas])
+    return {TEMPLATE.name: TEMPLATE.read_bytes(), "main.typ": text.encode(),
+            "formulas.typ": definitions.encode(), **book.files}, book
+
+
+def _compile(folder, book):
+    compiler = typst.Compiler(folder / "main.typ", root=folder, ignore_system_fonts=True)
+    try:
+        content = compiler.compile(format="pdf", timestamp=0)
+        found = set(json.loads(compiler.query("math.equation", field="label")))
+    except typst.TypstError as error:
+        if line := re.search(r"formulas\.typ:(\d+):", error.diagnostic):  # formula 0 is on line 2
+            raise book.error(int(line[1]) - 2,
+                             f"Typst cannot set this formula, {error.message}") from None
+        raise NotebookError("Typst cannot set the PDF: "
+                            f"{error.message}: {error.diagnostic.strip()}") from None
+    for number, label in enumerate(book.labels):
+        if f"<{label}>" not in found:
+            raise book.error(number, "the PDF lost this formula")
+    return content
+
+
+def missing_glyphs(text):
+    """Return the characters (list of str) of a text (str) that no font of the PDF has."""
+    def any_missing(characters):  # drawn like U+10FFFD, which is not a character
+        source = "\n".join(f'#box({_quoted(c)})' for c in ["\U0010fffd", *characters])
+        pages = typst.compile(source.encode(), format="svg", ignore_system_fonts=True)
+        missing, *glyphs = re.findall(r'<use [^>]*href="#(\w+)"', b"".join(
+            [pages] if isinstance(pages, bytes) else pages).decode())
+        return missing in glyphs
+
+    characters = sorted({c for c in text if not c.isascii()})
+    return [c for c in characters if any_missing([c])] if any_missing(characters) else []
+
+
+def _folded(text):
+    """Return text whose lines are folded at the width of the page."""
+    fold = textwrap.TextWrapper(COLUMNS, drop_whitespace=False, replace_whitespace=False,
+                                expand_tabs=False, break_on_hyphens=False)
+    return "\n".join("\n↪ ".join(fold.wrap(line)) for line in text.split("\n"))
+
+
+def _label(file, anchor=""):
+    """Return a Typst label for an anchor, which may have characters that labels must not have."""
+    return "at-" + hashlib.sha1(f"{file}#{anchor}".encode()).hexdigest()[:12]
+
+
+class _Book:
+    """Chapters in Typst, and what they refer to.
+
+    `files` are the pictures as {name: bytes}; `pictures` their quoted names and descriptions;
+    `texts` the chapters by file name, without marks. The renderer collects in `page` the formulas
+    (TeX, display), and the notebook, section, label and tag of each.
+    """
+
+    def __init__(self, code):
+        self.code, self.files, self.pictures, self.texts = code, {}, [], []
+        self.page = {"formulas": [], "sections": [], "labels": {}, "tags": {}}
+        self.error = partial(formula_error, self.page)
+
+    @property
+    def labels(self):
+        """The Typst label of each formula: that of its anchor if it has a number."""
+        return [self.page["labels"].get(number, f"formula-{number}")
+                for number in range(len(self.page["formulas"]))]
+
+    def chapter(self, source, book):
+        """Return a chapter (Path, NotebookNode) in Typst, with marks."""
+        self.page |= {"notebook": source.name, "file": source.stem, "path": source.parent,
+                      "anchors": {}, "section": "", "titled": False}
+        parts, first = [], len(self.pictures)
+        for cell in book.cells:
+            if cell.cell_type == "markdown":
+                parts.append(self.markdown(cell.source, cell.get("attachments", {})))
+            elif cell.cell_type == "code":
+                if self.code and cell.source.strip():
+                    parts.append(f'<pre class="python">{html.escape(_folded(cell.source))}</pre>')
+                alt = cell.metadata.get("alt")
+                parts += [self.output(output, alt, first) for output in cell.outputs]
+        with tempfile.TemporaryDirectory() as media:  # images inside Markdown
+            text = pypandoc.convert_text("\n".join(parts), "typst", "html",
+                                         ["--wrap=none", f"--extract-media={media}"])
+            self.files |= {file.name: file.read_bytes() for file in Path(media).iterdir()}
+        text = text.replace(f'"{media}/', '"')
+        self.texts.append((source.name, re.sub("[\ue000-\ue008]", "", text)))
+        text = re.sub(r"align: \([a-z,]*\)", lambda align: align[0].replace("auto", "left"), text)
+        return re.sub(r"^= (\d+)\.", r"#counter(heading).update(\1 - 1)\n\g<0>", text, count=1)
+
+    def markdown(self, text, attachments=()):
+        """Return Markdown (str) as HTML with marks."""
+        renderer = _Renderer(escape=False, embed_images=True, path=str(self.page["path"]),
+                             attachments=dict(attachments))
+        renderer.page = self.page
+        return MarkdownWithMath(renderer=renderer).render(text)
+
+    def output(self, output, alt, first):
+        """Return an output in HTML by the best of KINDS that it has.
+
+        `alt` describes a picture (str or None); `first` is the index of the chapter's first one.
+        """
+        data = output.get("data", {"text/plain": output.get("text", "")})
+        kind = next((kind for kind in KINDS if kind in data), None)
+        if kind in PICTURES:
+            number = len(self.pictures)
+            name = f"picture-{number}.{PICTURES[kind]}"
+            alt = alt or f"Figure {number - first + 1} of this chapter"
+            self.files[name] = (data[kind].encode() if "svg" in kind
+                                else base64.b64decode(data[kind]))
+            self.pictures.append((_quoted(name), _quoted(alt)))
+            return f"<p>\ue002{number}\ue003</p>"
+        if kind in ("text/markdown", "text/latex"):
+            return self.markdown(data[kind])
+        if kind == "text/plain":
+            text = html.escape(_folded(strip_ansi(data[kind])))
+            return f"<pre>{text}</pre>" if self.code else ""
+        return data.get(kind, "")
+
+    def formula_definitions(self):
+        """Return for each formula a line of Typst (str) that defines it."""
+        formulas = []
+        for tex, display in self.page["formulas"]:
+            for pattern, replacement in REPLACED:
+                tex = pattern.sub(replacement, tex)
+            formulas.append((tex, display))
+        return [self._definition(*numbered)
+                for numbered in enumerate(set_formulas(formulas, "typst", [], self.error))]
+
+    def _definition(self, number, formula):
+        """Return a formula's definition on one line, with what pandoc sets unlike TeX corrected."""
+        tex, display = self.page["formulas"][number]
+        formula = SCALED.sub(lambda big: f"stretch({big[2]}, size: #{int(big[1]) / 100}em)",
+                             " ".join(formula.split()))
+        if "\\parallel" not in tex:  # pandoc sets \| and \Vert as this relation, too
+            formula = formula.replace("parallel", "bar.v.double")
+        formula = f"{formula}<{self.labels[number]}>"
+        if "\\dfrac" in tex:
+            formula = f"#show math.frac: math.display; {formula}"
+        elif "\\tfrac" in tex and "\\frac" not in tex:
+            formula = f"#show math.frac: math.inline; {formula}"
+        if display:
+            formula = f"#display({_quoted(self.page['tags'].get(number, ''))})[{formula}]"
+        return f"#let formula-{number} = [{formula}]"
+
+
+class _Renderer(Renderer):
+    """Converts Markdown to HTML for pandoc, with Typst labels and with all marks of this module."""
+
+    def block_math(self, body):
+        mark = self.inline_math(TAG.sub("", body, count=1), display=True)
+        if tag := TAG.search(body):
+            number, tag = len(self.page["formulas"]) - 1, tag[1].strip()
+            self.page["tags"][number] = f"({tag})"
+            self.page["labels"][number] = _label(self.page["file"], self.anchor(f"eq-{tag}"))
+        return mark
+
+    def heading(self, text, level, **_):
+        anchor = self.begin_section(text)
+        if level == 1 and not self.page["titled"]:
+            self.page["titled"], anchor = True, ""
+        return f'<h{level} id="{_label(self.page["file"], anchor)}">{text}</h{level}>\n'
+
+    def paragraph(self, text):
+        if caption := CAPTION.match(re.sub("<[^>]*>", "", text)):
+            label = _label(self.page["file"], self.anchor(f"{caption[1].lower()}-{caption[2]}"))
+            return f"<p>\ue004{label}\ue006{text}\ue005</p>\n"
+        if text.rstrip().endswith(":"):
+            return f"<p>\ue007{text}\ue008</p>\n"
+        return super().paragraph(text)
+
+    def link(self, text, url, title=None):
+        if re.match(r"(https?|mailto):", url):
+            return super().link(text, url, title)
+        internal = re.fullmatch(r"(?:([^:/#]+)\.ipynb)?(?:#(.+))?", url)
+        if not internal:  # a file that does not come with the PDF
+            return text
+        label = _label(internal[1] or self.page["file"], internal[2] or "")
+        return f'<a href="#{label}">{text}</a>'

@@ -1,0 +1,88 @@
+"""Sightings of markers, merged and sorted by frame, and the gates, for problems 2 to 4.
+
+A frame is a pose of the vehicle with a measurement. A sighting is the pose z of a marker in the
+vehicle frame with the covariance C of [x, y, heading]. A gate is the 99.9 % quantile of the squared
+Mahalanobis distance r^T W^-1 r of a residual r with covariance W; beyond it r is rejected.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from slamlib import se2
+
+GATE = chi2.ppf(0.999, 3)          # dimensionless, for residuals of [x, y, heading]
+POINT_GATE = chi2.ppf(0.999, 2)    # dimensionless, for residuals of [x, y]
+MAX_HEADING_SIGMA = 0.5            # rad; a larger standard deviation says nothing of the heading
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """At most one sighting per frame and marker, sorted by frame, then by marker id."""
+
+    index: np.ndarray        # (s,) row in ArucoReadings
+    row: np.ndarray          # (s,) row in `frame`
+    marker: np.ndarray       # (s,) marker id
+    z: np.ndarray            # (s, 3) marker in vehicle, m and rad
+    C: np.ndarray            # (s, 3, 3) covariance of z
+    frame: np.ndarray        # (f,) pose index from 0 of every frame, ascending
+
+
+def sightings_by_frame(aruco, extra_frames=()):
+    """Sightings of ArucoReadings, or of None if there are no markers, merged by `merge_repeated`.
+
+    `extra_frames` are pose indices from 0 that are frames even if no marker is seen there.
+    """
+    if aruco is None:
+        none = np.zeros(0, int)
+        return Sightings(index=none, row=none, marker=none, z=np.zeros((0, 3)),
+                         C=np.zeros((0, 3, 3)), frame=np.unique(extra_frames).astype(int))
+    index, z, C = merge_repeated(aruco)
+    frame = np.union1d(aruco.pose[index], extra_frames).astype(int)
+    return Sightings(index=index, row=np.searchsorted(frame, aruco.pose[index]),
+                     marker=aruco.marker[index], z=z, C=C, frame=frame)
+
+
+def merge_repeated(aruco):
+    """index, z and C of `Sightings`, from ArucoReadings, with one row per pose and marker.
+
+    Repeated sightings of a marker at one pose are averaged, weighted by their information matrices,
+    if all of them lie within GATE of the mean. Otherwise all of them are rejected.
+    """
+    order = np.lexsort((aruco.marker, aruco.pose))
+    key = np.stack([aruco.pose[order], aruco.marker[order]], -1)
+    _, begins, count = np.unique(key, axis=0, return_index=True, return_counts=True)
+    z, C = aruco.marker_in_vehicle[order], aruco.covariance[order]
+    agrees = np.ones(len(begins), bool)
+    for i in np.flatnonzero(count > 1):
+        same = slice(begins[i], begins[i] + count[i])
+        information = np.linalg.inv(C[same])
+        r = z[same] - z[begins[i]]
+        r[:, 2] = se2.wrap(r[:, 2])
+        mean_covariance = np.linalg.inv(information.sum(0))
+        mean = mean_covariance @ np.einsum("nij,nj->i", information, r)
+        agrees[i] = np.all(np.einsum("ni,nij,nj->n", r - mean, information, r - mean) < GATE)
+        z[begins[i]] += mean
+        C[begins[i]] = mean_covariance
+    begins = begins[agrees]
+    return order[begins], z[begins], C[begins]
+
+
+def consensus(marker, in_world, covariance):
+    """Rows (k,) of the most certain well supported sighting of each marker, in ascending id.
+
+    The support of a sighting is the number of sightings of its marker within GATE of it. Of those
+    with at least half the maximum support, the most certain one has the smallest determinant of its
+    covariance. `marker` (s,) are ids, `in_world` (s, 3), m and rad, and `covariance` (s, 3, 3) the
+    poses of these markers in world axes as each sighting gives them.
+    """
+    log_determinant, best = np.linalg.slogdet(covariance)[1], []
+    for same in (np.flatnonzero(marker == i) for i in np.unique(marker)):
+        r = in_world[same, None] - in_world[same]
+        r[..., 2] = se2.wrap(r[..., 2])
+        W = covariance[same, None] + covariance[same]
+        squared = np.einsum("abi,abi->ab", r, np.linalg.solve(W, r[..., None])[..., 0])
+        support = np.count_nonzero(squared < GATE, axis=1)
+        best.append(min(same[support >= support.max() / 2], key=log_determinant.__getitem__))
+    return np.array(best, int)

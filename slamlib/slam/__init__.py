@@ -1,0 +1,27 @@
+"""Problems 3 and 4: SLAM with GTSAM on odometry, markers and ranges, as a pipeline.
+
+Each stage makes the record of the next. The modules, in the order in which they can be read:
+
+    1  measurements         Dataset -> Measurements: arrays, numbered once
+    2  errors               errors of the factors and their derivatives, in numpy
+       odometry_factors     odometry between frames, which depends on the wheels
+       measurement_factors  sightings, ranges and priors, by GTSAM
+    3  state                values of all variables: State
+       problem              Measurements, factors and noise -> Problem, the factor graph
+       optimizer            Problem, State -> Optimum by Gauss-Newton; the evidence
+    4  robust               Problem, State -> State past outliers; the accepted measurements
+    5  trilateration        places of an antenna from its ranges
+       initialization       Measurements -> State: the start values
+    6  slip                 Problem, State -> the slip of the wheels
+       fit                  Problem, State -> Fit: wheels, slip, accepted measurements, in turn
+       model_choice         Fit -> Fit: arcs or Euler's steps
+    7  covariances, interpolation, doubts, result      Fit -> SlamResult in world axes
+
+`estimate` is all of it. With the result of a problem with fewer sensors at hand, it starts there
+and skips stage 5 and the choice of the model.
+"""
+
+from slamlib.slam.estimate import estimate
+from slamlib.slam.result import SlamResult
+
+__all__ = ["SlamResult", "estimate"]

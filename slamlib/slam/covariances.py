@@ -1,0 +1,158 @@
+"""Stage 7: covariances at the solution: jointly of consecutive frames and w, and of each landmark.
+
+The information matrix of the graph has an arrow's shape. The poses form a chain T, with 3 x 3
+blocks on and beside the diagonal. Landmarks and w form a border (B, D) that touches all of it:
+
+    [[T, B], [B^T, D]]^-1:    border     S = (D - B^T Y)^-1,   Y = T^-1 B,
+                              poses      T^-1 + Y S Y^T,       poses and border  -Y S.
+
+Only the blocks of T^-1 on and beside the diagonal are needed. One forward and one backward sweep
+give them. GTSAM's marginals are the same numbers, one query at a time; a test compares them.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_solve_banded, cholesky_banded
+
+from slamlib import se2
+from slamlib.slam.errors import between_error, range_error
+from slamlib.slam.measurement_factors import GUESS_SIGMA, WEAK_SIGMA, point_factors
+
+
+@dataclass(frozen=True)
+class Covariances:
+    """Marginal covariances in GTSAM's axes, those of each pose itself."""
+
+    pairs: np.ndarray        # (f-1, 9, 9) of [X_i, X_{i+1}, w]
+    markers: list            # k of (3, 3), or (2, 2) for a point
+    antennas: np.ndarray     # (a, 2, 2)
+    w: np.ndarray            # (3, 3)
+
+
+def covariances(problem, state):
+    """The Covariances of a Problem at the State that solves it."""
+    m = problem.measurements
+    size = np.r_[np.where(m.oriented, 3, 2), np.full(len(m.antenna), 2), 3]
+    begin = np.cumsum(size) - size                     # columns of the border
+    measured = [(row, begin[landmark, None] + np.arange(by_landmark.shape[2]), by_pose, by_landmark)
+                for row, landmark, by_pose, by_landmark in _whitened(problem.measured, state)]
+    prior = np.zeros(begin[-1] + 3)
+    for j in problem.measured.unsupported:
+        prior[begin[j]:begin[j] + size[j]] = WEAK_SIGMA**-2
+    prior[begin[len(m.marker)]:begin[-1]] = GUESS_SIGMA**-2
+    prior[begin[-1]:] = 1
+    pose_prior = np.diag(m.origin_sigma**-2.0)
+    _, odometry = problem.odometry_jacobians(state)
+    pairs, border = arrow_inverse(odometry, measured, pose_prior, prior)
+    blocks = [border[b:b + n, b:b + n] for b, n in zip(begin, size)]
+    return Covariances(pairs, blocks[:len(m.marker)],
+                       np.reshape(blocks[len(m.marker):-1], (-1, 2, 2)), blocks[-1])
+
+
+def arrow_inverse(odometry, measured, pose_prior, border_prior):
+    """Covariances (f-1, 9, 9) of [X_i, X_{i+1}, w], and (c, c) of the landmarks, then w.
+
+    Parameters
+    ----------
+    odometry : whitened derivatives by X_i, X_{i+1} and w, each (f-1, 3, 3).
+    measured : for each kind of measurement the frame (m,), the landmark's columns of the border
+        (m, d), and whitened derivatives by pose (m, e, 3) and by landmark (m, e, d).
+    pose_prior, border_prior : information of pose 1 (3, 3), and of the border, a diagonal (c,).
+    """
+    first, second, by_w = odometry
+    count, width = len(first) + 1, len(border_prior)
+    diagonal, beside = np.zeros((count, 3, 3)), _t(first) @ second
+    diagonal[:-1] += _t(first) @ first
+    diagonal[1:] += _t(second) @ second
+    diagonal[0] += pose_prior
+    B, D = np.zeros((count, 3, width)), np.diag(border_prior)
+    for row, columns, by_pose, by_landmark in measured:
+        np.add.at(diagonal, row, _t(by_pose) @ by_pose)
+        np.add.at(B, (row[:, None, None], np.arange(3)[:, None], columns[:, None, :]),
+                  _t(by_pose) @ by_landmark)
+        np.add.at(D, (columns[:, :, None], columns[:, None, :]), _t(by_landmark) @ by_landmark)
+    B[:-1, :, -3:] += _t(first) @ by_w
+    B[1:, :, -3:] += _t(second) @ by_w
+    D[-3:, -3:] += np.sum(_t(by_w) @ by_w, axis=0)
+
+    B = B.reshape(3 * count, width)
+    Y = cho_solve_banded((cholesky_banded(_banded(diagonal, beside), lower=True), True), B)
+    border = np.linalg.inv(D - B.T @ Y)
+    border = (border + border.T) / 2
+    on, off = _inverse_blocks(diagonal, beside)
+    Y = Y.reshape(count, 3, -1)
+    YS = Y @ border
+    on += YS @ _t(Y)
+    off += YS[:-1] @ _t(Y[1:])
+    return _pairs(on, off, -YS[:, :, -3:], border[-3:, -3:]), border
+
+
+def _pairs(on, off, with_w, w):
+    """(f-1, 9, 9) of the blocks of poses, of consecutive poses, of poses with w, and of w."""
+    pairs = np.empty((len(off), 9, 9))
+    pairs[:, :3, :3], pairs[:, 3:6, 3:6], pairs[:, 6:, 6:] = on[:-1], on[1:], w
+    pairs[:, :3, 3:6], pairs[:, 3:6, :3] = off, _t(off)
+    pairs[:, :3, 6:], pairs[:, 6:, :3] = with_w[:-1], _t(with_w[:-1])
+    pairs[:, 3:6, 6:], pairs[:, 6:, 3:6] = with_w[1:], _t(with_w[1:])
+    return pairs
+
+
+def _banded(diagonal, beside):
+    """Lower bands (6, 3 n) of the block tridiagonal matrix, as LAPACK wants them."""
+    n = len(diagonal)
+    bands = np.zeros((6, 3 * n))
+    for i in range(3):
+        for j in range(i + 1):
+            bands[i - j, j::3] = diagonal[:, i, j]
+        for j in range(3):
+            bands[3 + i - j, j:3 * (n - 1):3] = beside[:, j, i]
+    return bands
+
+
+def _inverse_blocks(diagonal, beside):
+    """Blocks on (n, 3, 3) and beside (n-1, 3, 3) the diagonal of the inverse."""
+    n = len(diagonal)
+    pivot = np.empty_like(diagonal)                             # inverse of what elimination leaves
+    pivot[0] = np.linalg.inv(diagonal[0])
+    for i in range(1, n):
+        pivot[i] = np.linalg.inv(diagonal[i] - beside[i - 1].T @ pivot[i - 1] @ beside[i - 1])
+    gain = pivot[:-1] @ beside
+    on, off = pivot.copy(), np.empty_like(beside)
+    for i in range(n - 2, -1, -1):
+        off[i] = -gain[i] @ on[i + 1]
+        on[i] -= off[i] @ gain[i].T
+    return on, off
+
+
+def _whitened(factors, state):
+    """Yield (frame, landmark, by_pose, by_landmark) of sightings of poses, of points, of ranges.
+
+    Landmarks are numbered, (m,): first the markers, then the antennas. Derivatives (m, e, 3) and
+    (m, e, d) are whitened.
+    """
+    m, weight, range_weight = factors.measurements, factors.sighting_weight, factors.range_weight
+    s, r = m.sightings, m.ranges
+    rows = np.flatnonzero((weight > 0) & m.as_pose)
+    noise = se2.rotate_covariance(s.C[rows], -s.z[rows, 2]) / weight[rows, None, None]
+    root = np.swapaxes(np.linalg.cholesky(np.linalg.inv(noise)), 1, 2)
+    e, by_pose, by_marker, _ = between_error(s.z[rows], state.poses[s.row[rows]],
+                                             state.markers[m.label[rows]])
+    if factors.sighting_kernel is not None:
+        size = np.linalg.norm(root @ e[..., None], axis=(1, 2))
+        root *= np.sqrt([factors.sighting_kernel.weight(d) for d in size])[:, None, None]
+    yield s.row[rows], m.label[rows], root @ by_pose, root @ by_marker
+
+    p = point_factors(factors, state)
+    yield p.row, p.label, p.by_pose, p.by_point
+
+    rows = np.flatnonzero(range_weight)
+    e, *J = range_error(r.distance[rows], state.poses[r.row[rows]], state.antennas[r.antenna[rows]])
+    root = np.sqrt(range_weight[rows]) / r.sigma[rows]
+    if factors.range_kernel is not None:
+        root *= np.sqrt([factors.range_kernel.weight(d) for d in -root * e])  # measured - expected
+    yield r.row[rows], len(m.marker) + r.antenna[rows], *(root[:, None, None] * j for j in J)
+
+
+def _t(matrices):
+    return np.swapaxes(matrices, -1, -2)

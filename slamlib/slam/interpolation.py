@@ -1,0 +1,67 @@
+"""Stage 7: every encoder pose between the frames, conditioned on its two neighbours."""
+
+import numpy as np
+
+from slamlib import increments, se2
+from slamlib.slam.odometry_factors import odometry_noise
+
+
+def interpolate(problem, state, pairs):
+    """Every encoder pose (n, 3) and its covariance (n, 3, 3) in world axes, given the frames.
+
+    Between the frames a and b a pose k depends on nothing but them and w. X_a Delta_ak(w) and
+    X_b Delta_kb(w)^-1 are two estimates of it, with the independent noise of the encoder steps
+    before and after it. Their average by information is exact to first order.
+
+    `pairs` (f-1, 9, 9) are those of `Covariances` at the State that solves the Problem.
+    """
+    poses, frame, d = state.poses, problem.measurements.frame, problem.measurements.dataset
+    if not len(pairs):                                       # pose 1 alone: the world's origin
+        return poses, np.diag(problem.measurements.origin_sigma)[None]**2
+    joint = _in_world_axes(pairs, poses)
+    pose = np.arange(len(d.ticks))
+    last = np.searchsorted(frame, pose, side="right") - 1
+    all_poses = poses[last].copy()
+    covariances = np.concatenate([joint[:, :3, :3], joint[-1:, 3:6, 3:6]])[last]
+    between = np.flatnonzero(~np.isin(pose, frame))
+    if not len(between):
+        return all_poses, covariances
+    a, b = last[between], last[between] + 1
+
+    forward, forward_by_w, noise = _increments(problem, state.w, frame[a], between)
+    A, B = se2.compose_jacobians(poses[a], forward)
+    N_a = B @ noise @ np.swapaxes(B, 1, 2)
+    ahead, ahead_by_w, noise = _increments(problem, state.w, between, frame[b])
+    back = se2.inverse(ahead)
+    A_b, B_b = se2.compose_jacobians(poses[b], back)
+    B_b = B_b @ se2.inverse_jacobian(ahead)
+    N_b = B_b @ noise @ np.swapaxes(B_b, 1, 2)
+
+    gain = N_a @ np.linalg.inv(N_a + N_b)
+    rest = np.eye(3) - gain
+    estimate, other = se2.compose(poses[a], forward), se2.compose(poses[b], back)
+    difference = other - estimate
+    difference[:, 2] = se2.wrap(difference[:, 2])
+    F = np.concatenate([rest @ A, gain @ A_b,
+                        rest @ B @ forward_by_w + gain @ B_b @ ahead_by_w], axis=2)
+    all_poses[between] = estimate + np.einsum("nij,nj->ni", gain, difference)
+    covariances[between] = F @ joint[a] @ np.swapaxes(F, 1, 2) + rest @ N_a
+    return all_poses, (covariances + np.swapaxes(covariances, 1, 2)) / 2
+
+
+def _in_world_axes(pairs, poses):
+    """(f-1, 9, 9) covariances of [X_i, X_{i+1}, w], those of the poses in world axes."""
+    turned = np.zeros_like(pairs)
+    turned[:, range(9), range(9)] = 1
+    turned[:, :2, :2], turned[:, 3:5, 3:5] = (se2.rotation(poses[rows, 2])
+                                              for rows in (slice(-1), slice(1, None)))
+    return turned @ pairs @ np.swapaxes(turned, 1, 2)
+
+
+def _increments(problem, w, start, end):
+    """Increments (m, 3) at the wheels w, their derivatives by w, and noise (axes of the start)."""
+    d = problem.measurements.dataset
+    vehicle = d.vehicle.with_deviation(w)
+    delta, by_w = increments.between_poses(d.ticks, vehicle, start, end, problem.odometry.model)
+    rounding, slipping = odometry_noise(d.ticks, vehicle, start, end)
+    return delta, by_w * vehicle.sigma_wheel, rounding + problem.slip**2 * slipping

@@ -1,0 +1,111 @@
+"""Stage 1: all measurements of a dataset as arrays, numbered once.
+
+Frames are the encoder poses that are variables X_i of the graph: the first, the last, and each one
+with a sighting or a range. Measurements are numbered: first the s sightings, then the r ranges.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import A, L, P, W, X
+
+from slamlib import se2
+from slamlib.dataset import Dataset, UwbReadings
+from slamlib.sightings import GATE, MAX_HEADING_SIGMA, POINT_GATE, Sightings, sightings_by_frame
+
+ORIGIN_SIGMA = 1e-5          # m, of the position of pose 1, which is zero by definition
+
+
+@dataclass(frozen=True)
+class Ranges:
+    """Ranges from frames to antennas."""
+
+    row: np.ndarray          # (r,) row of `Measurements.frame`
+    antenna: np.ndarray      # (r,) row of `Measurements.antenna`
+    distance: np.ndarray     # (r,) m
+    sigma: np.ndarray        # (r,) m
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """What was measured, with rows of frames, markers and antennas in place of their ids."""
+
+    dataset: Dataset
+    frame: np.ndarray        # (f,) encoder pose of every frame, from 0
+    sightings: Sightings     # s of them
+    label: np.ndarray        # (s,) row of `marker`
+    marker: np.ndarray       # (k,) ids, ascending
+    oriented: np.ndarray     # (k,) bool; a marker without any sighted heading is a point
+    ranges: Ranges           # r of them
+    antenna: np.ndarray      # (a,) ids, ascending, of antennas with ranges
+    guess: np.ndarray        # (a, 2) m, their guessed positions
+
+    @property
+    def origin_sigma(self):
+        """(3,) standard deviations of pose 1: m, m, rad."""
+        return np.array([ORIGIN_SIGMA, ORIGIN_SIGMA, self.dataset.vehicle.sigma_heading])
+
+    @property
+    def as_pose(self):
+        """(s,) bool, sightings of markers with a heading."""
+        return self.oriented[self.label]
+
+    @property
+    def gate(self):
+        """(s,) squared Mahalanobis distance from which a sighting is rejected."""
+        return np.where(self.as_pose, GATE, POINT_GATE)
+
+    @property
+    def unit_weights(self):
+        """(s + r,) weight 1 for every measurement."""
+        return np.ones(len(self.label) + len(self.ranges.row))
+
+    @cached_property
+    def between_arguments(self):
+        """Of every sighting the keys, the measured Pose2 and its covariance in the marker's axes.
+
+        `ArucoReading.txt` gives the covariance C in the axes of the vehicle. The noise of GTSAM's
+        between factor lives in the axes of the measured pose z: R(heading)^T C R(heading).
+        """
+        s = self.sightings
+        noise = se2.rotate_covariance(s.C, -s.z[:, 2])
+        return [(X(i), L(j), gtsam.Pose2(*z), C)
+                for i, j, z, C in zip(s.row.tolist(), self.label.tolist(), s.z, noise)]
+
+    @cached_property
+    def ordering(self):
+        """Elimination ordering (COLAMD) of all variables, w last because it touches all poses."""
+        graph, s, r = gtsam.SymbolicFactorGraph(), self.sightings, self.ranges
+        graph.push_factor(X(0))
+        graph.push_factor(W(0))
+        for i, j in zip(s.row.tolist(), self.label.tolist()):
+            graph.push_factor(X(i), (L if self.oriented[j] else P)(j))
+        for i, k in zip(r.row.tolist(), r.antenna.tolist()):
+            graph.push_factor(X(i), A(k))
+        for k in range(len(self.antenna)):
+            graph.push_factor(A(k))
+        for i in range(len(self.frame) - 1):
+            graph.push_factor(X(i), X(i + 1), W(0))
+        return gtsam.Ordering.ColamdConstrainedLastSymbolicFactorGraph(graph, [W(0)])
+
+
+def measure(dataset, extra_poses=()):
+    """The Measurements of a Dataset; `extra_poses`, encoder poses from 0, are frames too.
+
+    Tests use these to compare poses between the frames with those of a graph of all poses.
+    """
+    uwb = dataset.uwb or UwbReadings(*np.zeros((2, 0), int), *np.zeros((2, 0)))
+    sightings = sightings_by_frame(dataset.aruco, np.r_[
+        0, len(dataset.ticks) - 1, np.array(extra_poses, int), uwb.pose])
+    marker, label = np.unique(sightings.marker, return_inverse=True)
+    has_heading = sightings.C[:, 2, 2] < MAX_HEADING_SIGMA**2
+    antenna, guess = np.unique(uwb.antenna), dataset.antenna_guess
+    ranges = Ranges(np.searchsorted(sightings.frame, uwb.pose),
+                    np.searchsorted(antenna, uwb.antenna), uwb.range, uwb.sigma)
+    return Measurements(
+        dataset=dataset, frame=sightings.frame, sightings=sightings, label=label, marker=marker,
+        oriented=np.bincount(label, has_heading, len(marker)) > 0, ranges=ranges, antenna=antenna,
+        guess=guess.position[np.searchsorted(guess.antenna, antenna)] if len(antenna)
+        else np.zeros((0, 2)))

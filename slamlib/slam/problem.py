@@ -1,0 +1,64 @@
+"""Stage 3: the factor graph: measurements, odometry and noise, evaluated at a state.
+
+Factors are those of the measurements (`measurement_factors.py`) and the odometry
+(`odometry_factors.py`). The same w acts in every increment. One shared variable says so;
+independent noise in each factor would not.
+
+The odometry is linearised in numpy. As a custom factor in Python it would be slow, because GTSAM
+copies all values for every call.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from slamlib.slam.measurement_factors import MeasurementFactors, point_factors
+from slamlib.slam.measurements import Measurements
+from slamlib.slam.odometry_factors import OdometryFactors, odometry_error, odometry_factors
+
+
+@dataclass(frozen=True)
+class Problem:
+    """The factor graph."""
+
+    measurements: Measurements
+    odometry: OdometryFactors
+    measured: MeasurementFactors
+    slip: float                              # sqrt(m), sigma of a wheel's slip after one metre
+
+    @cached_property
+    def whitening(self):
+        """U (f-1, 3, 3), square root information of the odometry noise: U^T U = noise^-1."""
+        noise = self.odometry.noise(self.slip)
+        return np.swapaxes(np.linalg.cholesky(np.linalg.inv(noise)), 1, 2)
+
+    @property
+    def log_determinant(self):
+        """Sum of the log determinants of the odometry noise."""
+        return np.sum(np.linalg.slogdet(self.odometry.noise(self.slip))[1])
+
+    def odometry_jacobians(self, state):
+        """Whitened errors (f-1, 3) of the odometry, and a list of their whitened derivatives.
+
+        The derivatives (f-1, 3, 3) are by X_i, X_{i+1} and w.
+        """
+        U = self.whitening
+        e, *jacobians = odometry_error(self.odometry, state.poses, state.w)
+        return (U @ e[..., None])[..., 0], [U @ J for J in jacobians]
+
+    def error(self, state):
+        """Half the sum of squared whitened errors, kernels applied."""
+        e, _ = self.odometry_jacobians(state)
+        return self.measured.graph.error(state.values) + np.sum(e**2) / 2 \
+            + point_factors(self.measured, state).error
+
+
+def build(measurements, model, slip, relinearize_at=np.zeros(3), factors=odometry_factors):
+    """The Problem of all Measurements at weight 1, without kernels.
+
+    The odometry is linear about w = `relinearize_at` (3,), its steps are of the model "arc" or
+    "euler", the slip is in sqrt(m). `factors` makes the OdometryFactors; studies give others.
+    """
+    return Problem(measurements, factors(measurements, model, relinearize_at),
+                   MeasurementFactors(measurements, measurements.unit_weights), slip)

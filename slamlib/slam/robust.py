@@ -1,0 +1,50 @@
+"""Stage 4: which measurements agree. Robust kernels find them, and gates reject the others.
+
+Solving with ever narrower Cauchy kernels keeps wrong labels and late ranges from trapping the
+solution. A late range is too long, because it lacks the line of sight. At the solution each
+measurement is accepted or rejected by a gate. Accepted sightings count in full. Accepted ranges
+keep a one-sided kernel, which reduces the weight of late ranges only.
+"""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+
+from slamlib.slam.measurement_factors import MeasurementFactors, residuals
+from slamlib.slam.optimizer import optimize
+
+CAUCHY_SCALES = (100.0, 30.0, 10.0, 3.0)     # sigmas, scale of the kernel in each round
+EARLY_GATE = 3.3             # sigmas; a range that is shorter than expected by more is rejected
+
+_kernel = gtsam.noiseModel.mEstimator
+# A kernel knows the sign of the error only if it weighs components (Scalar).
+LATE_KERNEL = _kernel.AsymmetricTukey.Create(4.685, _kernel.Base.ReweightScheme.Scalar)
+
+
+def narrow_kernels(problem, state, scales=CAUCHY_SCALES):
+    """The State after one solution for each scale of the Cauchy kernel, with all measurements."""
+    m = problem.measurements
+    for scale in scales:
+        cauchy = _kernel.Cauchy.Create(scale)
+        measured = MeasurementFactors(m, m.unit_weights, cauchy, cauchy)
+        state = optimize(replace(problem, measured=measured), state).state
+    return state
+
+
+def accepted(problem, state):
+    """MeasurementFactors of what the gates accept at a State; ranges have LATE_KERNEL."""
+    m = problem.measurements
+    weight = within_gates(m, state, EARLY_GATE, np.inf)
+    return MeasurementFactors(m, weight, range_kernel=LATE_KERNEL)
+
+
+def within_gates(measurements, state, early, late):
+    """Weights (s + r,): 1 within the gates, else 0.
+
+    The gate of a sighting is the 99.9 % quantile of chi-squared with 3 degrees of freedom, 2 for a
+    point. A range may be too short by `early` and too long by `late` sigmas.
+    """
+    sightings, ranges = residuals(measurements, state)
+    return np.r_[np.sum(sightings**2, axis=1) < measurements.gate,
+                 (ranges > -early) & (ranges < late)].astype(float)

@@ -1,0 +1,52 @@
+"""Stage 3: a state gives every variable of the graph a value, as arrays and for GTSAM.
+
+Variables are the frames' poses X_i, the markers L_j (points P_j where no sighting has a heading),
+the antennas A_k, and w, the errors of the wheel parameters in units of their standard deviations.
+"""
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import A, L, P, W, X
+
+
+@dataclass(frozen=True)
+class State:
+    """Values of all variables."""
+
+    poses: np.ndarray        # (f, 3) m, m, rad; headings continuous
+    markers: np.ndarray      # (k, 3), heading 0 where a marker is a point
+    antennas: np.ndarray     # (a, 2) m
+    w: np.ndarray            # (3,) in units of sigma
+    values: gtsam.Values     # the same, for GTSAM
+
+
+def state_from_arrays(measurements, poses, markers, antennas, w):
+    """The State of poses (f, 3), markers (k, 3), antennas (a, 2) and w (3,)."""
+    values = gtsam.Values()
+    for i, pose in enumerate(poses):
+        values.insert(X(i), gtsam.Pose2(*pose))
+    for j, (marker, oriented) in enumerate(zip(markers, measurements.oriented)):
+        if oriented:
+            values.insert(L(j), gtsam.Pose2(*marker))
+        else:
+            values.insert(P(j), gtsam.Point2(*marker[:2]))
+    for k, antenna in enumerate(antennas):
+        values.insert(A(k), gtsam.Point2(*antenna))
+    values.insert(W(0), np.asarray(w, dtype=float))
+    return state_from_values(measurements, values)
+
+
+def state_from_values(measurements, values):
+    """The State of gtsam.Values, which come in the order of their keys, by letter and number."""
+    poses, points = gtsam.utilities.extractPose2(values), gtsam.utilities.extractPoint2(values)
+    oriented, antennas = measurements.oriented, len(measurements.antenna)
+    with_heading, without = np.count_nonzero(oriented), np.count_nonzero(~oriented)
+    markers = np.zeros((len(oriented), 3))
+    markers[oriented] = poses[:with_heading]                               # L before X
+    markers[~oriented, :2] = points[antennas:antennas + without]           # A, P, then a row of w
+    poses = poses[with_heading:]
+    poses[:, 2] = np.unwrap(poses[:, 2])
+    return State(poses=poses, markers=markers, antennas=points[:antennas],
+                 w=values.atVector(W(0)), values=values)

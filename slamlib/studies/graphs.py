@@ -1,0 +1,103 @@
+"""Kinds of graphs compared: how wheel errors and odometry steps enter the SLAM graph."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from slamlib import odometry, se2
+from slamlib.evaluation import anees, ate
+from slamlib.simulation import simulate
+from slamlib.slam.estimate import fit_from_odometry
+from slamlib.slam.fit import refine
+from slamlib.slam.measurements import measure
+from slamlib.slam.odometry_factors import odometry_factors
+from slamlib.slam.optimizer import log_evidence, optimize
+from slamlib.slam.result import SlamResult, result
+
+
+def fixed_wheels(measurements, model, relinearize_at=None):
+    """OdometryFactors of wheels without errors; parameters as of `factors.odometry_factors`."""
+    factors = odometry_factors(measurements, model)
+    return replace(factors, by_w=np.zeros_like(factors.by_w))
+
+
+def independent_chain(measurements, model, relinearize_at=None):
+    """OdometryFactors with wheel errors as independent noise of each; parameters as above."""
+    factors = odometry_factors(measurements, model)
+    noise = se2.rotate_covariance(factors.by_w @ np.swapaxes(factors.by_w, 1, 2),
+                                  -factors.increment[:, 2])
+    return replace(factors, by_w=np.zeros_like(factors.by_w), rounding=factors.rounding + noise)
+
+
+WHEELS = {"wheels as a variable": odometry_factors, "independent chain": independent_chain,
+          "wheels fixed": fixed_wheels}
+
+
+@dataclass(frozen=True)
+class GraphKind:
+    """One kind of graph, solved on its own."""
+
+    wheels: str              # of WHEELS
+    model: str               # "arc" or "euler"
+    result: SlamResult
+    log_evidence: float      # on the measurements that variable wheels and arcs accept
+
+
+def graph_kinds(dataset, slip=None):
+    """Yield the GraphKind of every kind; `slip` in sqrt(m), or None to learn it for each.
+
+    Evidence compares explanations of the same data, so it is that on common measurements.
+    """
+    measurements = measure(dataset)
+    first = fit_from_odometry(measurements, slip)
+    for wheels, factors in WHEELS.items():
+        for model in odometry.MODELS:
+            own = first if (factors, model) == (odometry_factors, "arc") else fit_from_odometry(
+                measurements, slip, model, factors)
+            if factors is not odometry_factors:
+                own = replace(own, problem=_without_wheel_errors(own.problem))
+            common = replace(first.problem, odometry=factors(measurements, model))
+            common = refine(common, first.state, slip, accept=None, factors=factors)
+            yield GraphKind(wheels, model, result(own), common.log_evidence)
+
+
+def _without_wheel_errors(problem):
+    """The Problem of which poses between the frames have no wheel errors either."""
+    m = problem.measurements
+    known = replace(m.dataset.vehicle, sigma_right_radius=0.0, sigma_left_radius=0.0,
+                    sigma_wheelbase=0.0)
+    m = replace(m, dataset=replace(m.dataset, vehicle=known))
+    return replace(problem, measurements=m, measured=replace(problem.measured, measurements=m))
+
+
+def evidence_curve(fit, slips, model):
+    """Log evidence (len(slips),) of slips in sqrt(m), each at its own optimum.
+
+    The measurements are those that the Fit accepts, whatever the model of the odometry steps.
+    """
+    problem, state, curve = replace(fit.problem, odometry=odometry_factors(
+        fit.problem.measurements, model, fit.state.w)), fit.state, []
+    for slip in slips:
+        problem = replace(problem, slip=slip)
+        state = optimize(problem, state).state
+        curve.append(log_evidence(problem, state))
+    return np.array(curve)
+
+
+def compare_graphs(seed, **options):
+    """All kinds of graph on one drive of the short path, given the true slip.
+
+    Returns
+    -------
+    dict of numbers for each of WHEELS and each model: "evidence", "chi2" per degree of freedom,
+    "ate" and "aligned" in m, "nees".
+    """
+    dataset, truth = simulate("short", seed, **options)
+    numbers = {}
+    for kind in graph_kinds(dataset.without("uwb"), options.get("slip", 1e-3)):
+        name, found = f"{kind.wheels} {kind.model}", kind.result
+        numbers |= {f"{name} evidence": kind.log_evidence, f"{name} chi2": found.chi2_per_dof,
+                    f"{name} ate": ate(found.poses, truth.poses),
+                    f"{name} aligned": ate(found.poses, truth.poses, aligned=True),
+                    f"{name} nees": anees(found.poses, found.covariances, truth.poses)}
+    return numbers

@@ -1,0 +1,137 @@
+"""Kernels and gates compared: ways to treat wrong labels and late ranges in the SLAM graph."""
+
+import time
+from dataclasses import replace
+from functools import partial
+
+import gtsam
+import numpy as np
+
+from slamlib.increments import TYPICAL_SLIP
+from slamlib.simulation import simulate
+from slamlib.slam.fit import refine
+from slamlib.slam.initialization import odometry_state, trilaterated_antennas
+from slamlib.slam.measurement_factors import MeasurementFactors, residuals
+from slamlib.slam.measurements import measure
+from slamlib.slam.optimizer import optimize
+from slamlib.slam.problem import build
+from slamlib.slam.result import result
+from slamlib.slam.robust import CAUCHY_SCALES, EARLY_GATE, LATE_KERNEL, within_gates
+from slamlib.studies.montecarlo import judge
+
+_kernel = gtsam.noiseModel.mEstimator
+_scalar = _kernel.Base.ReweightScheme.Scalar
+# Ways to treat ranges: GTSAM's kernel, and by how many sigmas an accepted range may be too short
+# and too long.
+RANGES = {
+    "quadratic": (None, np.inf, np.inf),
+    "Huber": (_kernel.Huber.Create(1.345), np.inf, np.inf),
+    "Cauchy": (_kernel.Cauchy.Create(2.385), np.inf, np.inf),
+    "asymmetric Cauchy": (_kernel.AsymmetricCauchy.Create(2.385, _scalar), EARLY_GATE, np.inf),
+    "asymmetric Tukey": (LATE_KERNEL, EARLY_GATE, np.inf),
+    "GNC": (None, EARLY_GATE, EARLY_GATE),
+    "gate": (None, EARLY_GATE, EARLY_GATE),
+    "asymmetric gate": (None, EARLY_GATE, 2.0)}
+# Ways to treat sightings: GTSAM's kernel, and whether those beyond the gate are rejected.
+SIGHTINGS = {
+    "quadratic": (None, False),
+    "Huber": (_kernel.Huber.Create(1.345), False),
+    "Cauchy": (_kernel.Cauchy.Create(2.385), False),
+    "Geman-McClure": (_kernel.GemanMcClure.Create(3.0), False),
+    "Tukey": (_kernel.Tukey.Create(4.685), False),
+    "gate": (None, True)}
+CONVEX = ("quadratic", "Huber", "GNC")     # these need no rounds of narrowing kernels
+GNC_STEP = 1.4                             # factor on the control parameter in each round
+
+
+def solve_with(measurements, slip, sightings="gate", ranges="asymmetric Tukey",
+               antennas=trilaterated_antennas):
+    """The Fit of arcs with other kernels, from odometry.
+
+    Parameters
+    ----------
+    measurements : Measurements; slip : sqrt(m), or None to learn it.
+    sightings, ranges : names in SIGHTINGS and RANGES; the defaults are those of `slam.estimate`.
+    antennas : as of `initialization.state_from_poses`.
+    """
+    problem = build(measurements, "arc", TYPICAL_SLIP if slip is None else slip)
+    state = odometry_state(measurements, "arc", antennas=antennas)
+    for scale in CAUCHY_SCALES:
+        cauchy = _kernel.Cauchy.Create(scale)
+        measured = MeasurementFactors(
+            measurements, measurements.unit_weights,
+            sighting_kernel=SIGHTINGS[sightings][0] if sightings in CONVEX else cauchy,
+            range_kernel=RANGES[ranges][0] if ranges in CONVEX else cauchy)
+        state = optimize(replace(problem, measured=measured), state).state
+    return refine(problem, state, slip, partial(_accepted, sightings=sightings, ranges=ranges))
+
+
+def _accepted(problem, state, sightings, ranges):
+    """The MeasurementFactors that remain by these ways."""
+    m, (kernel, gated), (range_kernel, *gate) = (
+        problem.measurements, SIGHTINGS[sightings], RANGES[ranges])
+    weight = graduated(problem, state) if ranges == "GNC" else within_gates(m, state, *gate)
+    if not gated:
+        weight[:len(m.label)] = 1
+    return MeasurementFactors(m, weight, kernel, range_kernel)
+
+
+def graduated(problem, state):
+    """Weights (s + r,) by graduated non-convexity with truncated least squares of the ranges.
+
+    From quadratic to truncated costs, one Gauss-Newton step for each value of the control parameter
+    (Yang, Antonante, Tzoumas and Carlone, IEEE RA-L 5(2), 2020).
+    """
+    m, gate = problem.measurements, EARLY_GATE**2
+    weight, ranges = within_gates(m, state, EARLY_GATE, EARLY_GATE), slice(len(m.label), None)
+    weight[ranges], control = 1, None
+    while control is None or ((weight > 0) & (weight < 1)).any():
+        trial = replace(problem, measured=MeasurementFactors(m, weight.copy()))
+        state = optimize(trial, state, **{} if control is None else {"max_steps": 1}).state
+        squared = residuals(m, state)[1]**2
+        control = GNC_STEP * control if control else gate / max(2 * squared.max() - gate, gate)
+        root = np.sqrt(gate * control * (control + 1) / np.maximum(squared, 1e-12)) - control
+        weight[ranges] = np.clip(root, 0, 1)**2
+    return weight
+
+
+def late_ranges(seed, markers=True, ways=tuple(RANGES), **options):
+    """Ways of RANGES on one drive of the short path, the slip and the arcs given.
+
+    Parameters
+    ----------
+    seed, options : of `simulation.simulate`.
+    markers : False leaves the markers out.
+    ways : names in RANGES.
+
+    Returns
+    -------
+    dict of numbers for each way: "ate" and rms "antenna error" in m, "nees", "antenna nees",
+    "seconds" of processor time.
+    """
+    dataset, truth = simulate("short", seed, **options)
+    dataset, numbers = dataset if markers else dataset.without("aruco"), {}
+    for way in ways:
+        start = time.process_time()
+        found = result(solve_with(measure(dataset), TYPICAL_SLIP, ranges=way))
+        seconds = time.process_time() - start
+        judged = judge(found, dataset, truth)
+        numbers |= {f"{way} {key}": judged[key]
+                    for key in ("ate", "nees", "antenna error", "antenna nees")}
+        numbers[f"{way} seconds"] = seconds
+    return numbers
+
+
+def wrong_labels(seed, ways=tuple(SIGHTINGS), **options):
+    """Ways of SIGHTINGS on one drive of the short path, the slip and the arcs given.
+
+    Returns a dict of numbers for each way: "ate" and largest error of a marker, "map worst", in m,
+    "nees" and "map nees". Parameters as of `late_ranges`.
+    """
+    dataset, truth = simulate("short", seed, **options)
+    dataset, numbers = dataset.without("uwb"), {}
+    for way in ways:
+        found = result(solve_with(measure(dataset), TYPICAL_SLIP, sightings=way))
+        judged = judge(found, dataset, truth)
+        numbers |= {f"{way} {key}": judged[key] for key in ("ate", "nees", "map nees", "map worst")}
+    return numbers

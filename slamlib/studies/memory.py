@@ -1,0 +1,89 @@
+"""Studies run over seeds in parallel, and kept from one build of the report to the next.
+
+A study depends on the code of the numerics, on the packages that compute it, and on its trial,
+seeds and options; it does not depend on a user's datasets. While a report is built,
+SLAMLIB_STUDIES names the folder of the studies that are kept. Without it each is computed. Times
+that a trial measures are kept as well and are not for a page. SLAMLIB_SEEDS, a number, cuts every
+study to its first seeds: for tests of pages whose numbers nobody reads.
+"""
+
+import hashlib
+import os
+import platform
+import shutil
+import warnings
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+from joblib import Memory, Parallel, delayed
+from tqdm import tqdm
+
+SLAMLIB = Path(__file__).parents[1]
+SHOWING = ("notebook", "report")           # folders that show studies and do not compute them
+PACKAGES = ("numpy", "scipy", "gtsam")
+THREADS = ("OMP_", "OPENBLAS_", "MKL_")    # how the names of variables begin
+
+
+def run(trial, seeds, jobs=2, progress=False, **options):
+    """Numbers of trial(seed, **options) for all seeds: a dict of (s,) arrays.
+
+    Parameters
+    ----------
+    trial : function of a module in slamlib.studies that returns a dict of numbers.
+    seeds : iterable of int.
+    jobs : number of processes.
+    progress : True shows a bar.
+    """
+    name = f"{trial.__module__}.{trial.__name__}"
+    seeds = list(seeds)[:int(os.environ.get("SLAMLIB_SEEDS", len(seeds)))]
+    arguments = trial, name, seeds, options, _threads(), jobs, progress
+    folder = os.environ.get("SLAMLIB_STUDIES")
+    if not folder or not name.startswith(f"{__package__}.") or code() != CODE:
+        return _compute(*arguments)                       # not ours to keep, or edited meanwhile
+    forget(folder, but=CODE)
+    memory = Memory(Path(folder) / CODE, verbose=0, compress=True)     # zlib finds damaged files
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Exception while loading results")    # computed again
+        return memory.cache(_compute, ignore=["trial", "jobs", "progress"])(*arguments)
+
+
+def _compute(trial, name, seeds, options, threads, jobs, progress):
+    rows = list(tqdm(Parallel(n_jobs=jobs, return_as="generator")(
+        delayed(trial)(seed, **options) for seed in seeds), total=len(seeds), disable=not progress))
+    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+
+
+def _threads():
+    return sorted(item for item in os.environ.items() if item[0].startswith(THREADS))
+
+
+def forget(folder, but=None):
+    """Remove the studies of a folder, all of them or those of other code than `but`."""
+    for kept in Path(folder).glob("[0-9a-f]" * 64):
+        if kept.name != but:
+            shutil.rmtree(kept, ignore_errors=True)
+
+
+def code():
+    """A digest of what every study depends on: slamlib, Python and packages, as they are now."""
+    return digest(repr([
+        platform.python_implementation(), platform.python_version(), platform.platform(),
+        [version(package) for package in PACKAGES],
+        [(str(file.relative_to(SLAMLIB)), digest(file.read_bytes()))
+         for file in modules(*SHOWING)]]).encode())
+
+
+def modules(*without):
+    """Paths of slamlib's modules and styles, except the command line and the folders named."""
+    return sorted(file for file in SLAMLIB.rglob("*")
+                  if file.suffix in (".py", ".mplstyle") and file.name != "__main__.py"
+                  and file.relative_to(SLAMLIB).parts[0] not in without)
+
+
+def digest(content):
+    """The SHA-256 of bytes, in hexadecimal digits."""
+    return hashlib.sha256(content).hexdigest()
+
+
+CODE = code()                              # of this process, which files edited later do not change

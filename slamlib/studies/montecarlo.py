@@ -1,0 +1,158 @@
+"""Trials: the methods of each problem on one simulated drive, judged against its truth.
+
+`memory.run` runs a trial over many seeds.
+"""
+
+import numpy as np
+
+from slamlib import localization, odometry, slam
+from slamlib.evaluation import anees, ate, nees
+from slamlib.sightings import sightings_by_frame
+from slamlib.simulation import simulate
+
+METHODS = {                                     # of problem 2
+    "odometry": lambda dataset: odometry.dead_reckoning(dataset.ticks, dataset.vehicle),
+    "ArUco": lambda dataset: localization.localize(dataset.aruco),
+    "naive": lambda dataset: localization.localize(dataset.aruco, shared_errors=False),
+    "hint": localization.fuse_increments,
+    "exact hint": lambda dataset: localization.fuse_increments(dataset, odometry.first_order),
+    "fused": localization.fuse}
+
+
+def odometry_draws(ticks, vehicle, kept, rng, draws=400, model="euler"):
+    """Dead-reckoned poses for random wheel parameters and initial headings.
+
+    Parameters
+    ----------
+    ticks : (n, 2) counts of the right and left wheel, the same for every draw.
+    vehicle : Vehicle, with means and standard deviations of the normal distributions.
+    kept : (m,) indices from 0 of the poses to return.
+    rng : numpy random generator.
+    draws : number of draws.
+    model : "euler" or "arc".
+
+    Returns
+    -------
+    (draws, m, 3) poses [x, y, heading].
+    """
+    return np.stack([
+        odometry.dead_reckoning(ticks, vehicle.with_deviation(z[:3]),
+                       (0.0, 0.0, z[3] * vehicle.sigma_heading), model)[kept]
+        for z in rng.standard_normal((draws, 4))])
+
+
+def markers_alone(seed, **options):
+    """Localization from markers on one drive of the short path: "nees", "last nees", "map nees"."""
+    dataset, truth = simulate("short", seed, **options)
+    found = localization.localize(dataset.aruco)
+    values = nees(found.poses, found.covariances, truth.poses[found.frame])
+    return {"nees": np.nanmean(values), "last nees": values[-1],
+            "map nees": _map_nees(found, truth).mean()}
+
+
+def problem2(seed, methods=tuple(METHODS), **options):
+    """Methods of problem 2 on one drive of the short path, simulated with these options.
+
+    Returns
+    -------
+    dict of numbers for each of `methods`: "nees", the mean over the measured poses, "last nees" and
+    "ate" in m (of odometry the ATE only); for "ArUco" the "map nees" too, for "fused" the "wheel
+    nees" and the "slip" in sqrt(m).
+    """
+    dataset, truth = simulate("short", seed, **options)
+    frame, numbers = sightings_by_frame(dataset.aruco).frame, {}
+    for method in methods:
+        found = METHODS[method](dataset)
+        if method == "odometry":
+            numbers["odometry ate"] = ate(found[frame], truth.poses[frame])
+            continue
+        own = slice(None) if len(found.poses) == len(frame) else frame
+        poses, covariances = found.poses[own], found.covariances[own]
+        numbers |= {f"{method} nees": anees(poses, covariances, truth.poses[frame]),
+                    f"{method} last nees": nees(poses, covariances, truth.poses[frame])[-1],
+                    f"{method} ate": ate(poses, truth.poses[frame])}
+        if method == "ArUco":
+            numbers["map nees"] = _map_nees(found, truth).mean()
+        if method == "fused":
+            numbers |= {"wheel nees": _wheel_nees(found, truth), "slip": found.slip}
+    return numbers
+
+
+def problem3(seed, **options):
+    """SLAM on odometry and markers of one drive of the short path: the numbers of `judge`."""
+    dataset, truth = simulate("short", seed, **options)
+    return judge(slam.estimate(dataset.without("uwb")), dataset.without("uwb"), truth)
+
+
+def problem4(seed, path="short", markers=True, **options):
+    """SLAM on odometry, ranges and (unless False) markers, as `problem3`."""
+    dataset, truth = simulate(path, seed, **options)
+    dataset = dataset if markers else dataset.without("aruco")
+    previous = slam.estimate(dataset.without("uwb")) if markers else None
+    return judge(slam.estimate(dataset, previous=previous), dataset, truth)
+
+
+def learned_slips(seed, slip):
+    """Problem 3 on one drive of the short path with this slip in sqrt(m), learned and known.
+
+    Returns
+    -------
+    dict of numbers: the "slip" learned; "nees" of the poses and "aligned" ATE in m with it;
+    "known nees" and "known aligned", those of the graph that is given the slip and the arcs.
+    """
+    dataset, truth = simulate("short", seed, slip=slip)
+    dataset = dataset.without("uwb")
+    learned, known = slam.estimate(dataset), slam.estimate(dataset, slip, "arc")
+    numbers = {"slip": learned.slip}
+    for name, found in (("", learned), ("known ", known)):
+        numbers |= {f"{name}nees": anees(found.poses, found.covariances, truth.poses),
+                    f"{name}aligned": ate(found.poses, truth.poses, aligned=True)}
+    return numbers
+
+
+def judge(found, dataset, truth):
+    """A SlamResult against the truth, as a dict of numbers.
+
+    "nees" of the measured poses, "nees between" of the others, "last nees", "wheel nees"; "ate" and
+    "aligned" in m; "rejected" sightings; "slip" in sqrt(m); "chi2" per degree of freedom; "arc", 1
+    where arcs were chosen; with markers "map nees" and "map worst" error in m; with antennas
+    "antenna nees", their rms "antenna error" in m, and the number in "doubts".
+    """
+    measured = [sensor.pose for sensor in (dataset.aruco, dataset.uwb) if sensor is not None]
+    frames = np.isin(np.arange(len(truth.poses)), np.concatenate(measured))
+    values = nees(found.poses, found.covariances, truth.poses)
+    numbers = {"nees": np.nanmean(values[frames]), "nees between": np.nanmean(values[~frames]),
+               "last nees": values[-1], "wheel nees": _wheel_nees(found, truth),
+               "ate": ate(found.poses, truth.poses),
+               "aligned": ate(found.poses, truth.poses, aligned=True),
+               "rejected": np.count_nonzero(found.rejected), "slip": found.slip,
+               "chi2": found.chi2_per_dof, "arc": float(found.model == "arc")}
+    if len(found.marker):
+        true_map = truth.marker_in_world[np.searchsorted(truth.marker, found.marker)]
+        numbers |= {"map nees": _map_nees(found, truth).mean(),
+                    "map worst": np.abs(found.marker_in_world - true_map)[:, :2].max()}
+    if len(found.antenna):
+        error, squared = antenna_error(found, truth)
+        numbers |= {"antenna nees": np.mean(squared), "antenna error": np.sqrt(np.mean(error**2)),
+                    "doubts": len(found.doubts)}
+    return numbers
+
+
+def antenna_error(found, truth):
+    """Distances (a,) in m of a SlamResult's antennas from the truth, and their NEES (a,)."""
+    error = found.antenna_in_world - truth.antenna_in_world[
+        np.searchsorted(truth.antenna, found.antenna)]
+    return np.hypot(*error.T), np.einsum(
+        "ni,nij,nj->n", error, np.linalg.inv(found.antenna_covariance), error)
+
+
+def _map_nees(found, truth):
+    """NEES (k,) of the markers of a SlamResult or a Localization."""
+    true_map = truth.marker_in_world[np.searchsorted(truth.marker, found.marker)]
+    return nees(found.marker_in_world, found.marker_covariance, true_map)
+
+
+def _wheel_nees(found, truth):
+    """Squared error of the wheel parameters over their covariance."""
+    error = found.wheel - truth.vehicle.wheel
+    return error @ np.linalg.solve(found.wheel_covariance, error)

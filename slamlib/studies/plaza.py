@@ -1,0 +1,88 @@
+"""Plaza 2 in the assignment's format: a mower with radio ranges to four beacons on a lawn.
+
+GTSAM contains Joseph Djugash's range-only SLAM logs (`Plaza1_.mat`, `Plaza2_.mat`): increments of
+distance and heading, ranges to four beacons, the surveyed beacons, and the path by differential
+GPS. Four differences from the assignment are resolved as follows:
+
+* Increments become counts of two wheels. Rounding to a count is negligible, and the wheel
+  parameters are known to a few percent only.
+* A range is assigned to the pose nearest in time.
+* Radio ranges are too long by a constant factor. The factor and the sigma of a range are calibrated
+  on the truth of Plaza 1; the truth of Plaza 2 is not used.
+* The true heading of Plaza 2 points backwards along the path, so pi is added.
+"""
+
+import gtsam
+import numpy as np
+from scipy.io import loadmat
+from scipy.stats import median_abs_deviation
+
+from slamlib import se2
+from slamlib.dataset import AntennaGuess, Dataset, Truth, UwbReadings, Vehicle
+
+COUNT = 1e-4                # m, travel of a wheel in one count
+RADIUS, BASE = 0.2, 0.8     # m, nominal wheel radius and wheelbase
+WHEEL_SIGMA = 0.03          # standard deviation of the wheel parameters, relative to their value
+GUESS_SIGMA = 2.0           # m, standard deviation of the guessed beacons on each axis
+
+
+def read_plaza2(seed=0):
+    """Plaza 2 as a Dataset with ranges and without markers, and its Truth.
+
+    Parameters
+    ----------
+    seed : of the errors of the antenna guess, which is not part of the log.
+
+    Returns
+    -------
+    dataset : Dataset
+    truth : Truth, in the frame of pose 1.
+    """
+    scale, sigma = _calibrate(*_load(1))
+    path, increments, ranges, beacons = _load(2)
+    travel, turn = increments[:, 1], increments[:, 2]
+    wheels = np.stack([travel + BASE / 2 * turn, travel - BASE / 2 * turn], -1)
+    total = np.cumsum(np.concatenate([np.zeros((1, 2)), wheels]), axis=0)
+    total = np.rint(total / COUNT).astype(int)
+    ticks = np.diff(total, axis=0, prepend=np.zeros((1, 2), int))
+    vehicle = Vehicle(RADIUS, RADIUS, BASE, 2 * np.pi * RADIUS / COUNT,
+                      WHEEL_SIGMA * RADIUS, WHEEL_SIGMA * RADIUS, WHEEL_SIGMA * BASE)
+
+    pose = _nearest(path[:, 0], ranges[:, 0])
+    order = np.argsort(pose, kind="stable")
+    uwb = UwbReadings(pose[order], ranges[order, 2].astype(int), ranges[order, 3] / scale,
+                      np.full(len(ranges), sigma))
+    poses = path[:, 1:4] + [0, 0, np.pi]
+    start = poses[0]
+    beacons = beacons[np.argsort(beacons[:, 0])]
+    antenna, place = beacons[:, 0].astype(int), beacons[:, 1:3]
+    place = se2.between(start, np.column_stack([place, np.zeros(len(place))]))[:, :2]
+    guess = place + GUESS_SIGMA * np.random.default_rng(seed).standard_normal(place.shape)
+    poses = se2.between(start, poses)
+    poses[:, 2] = np.unwrap(poses[:, 2])
+    return (Dataset("Plaza 2", vehicle, ticks, None, uwb, AntennaGuess(antenna, guess)),
+            Truth(poses, np.zeros(0, int), np.zeros((0, 3)), antenna, place, vehicle))
+
+
+def _load(number):
+    """The arrays of a log, with a row for each reading; lengths in m, angles in rad, times in s.
+
+    Path [t, x, y, heading], increments [t, travel, turn], ranges [t, -, beacon, range] and beacons
+    [id, x, y].
+    """
+    content = loadmat(gtsam.findExampleDataFile(f"Plaza{number}_.mat"))
+    return content["GT"], content["DR"], content["TD"], content["TL"]
+
+
+def _calibrate(path, _, ranges, beacons):
+    """Factor of measured over true ranges, and the standard deviation in m, both by medians."""
+    place = np.array([beacons[beacons[:, 0] == beacon, 1:3][0] for beacon in ranges[:, 2]])
+    distance = np.hypot(*(path[_nearest(path[:, 0], ranges[:, 0]), 1:3] - place).T)
+    scale = np.median(ranges[:, 3] / distance)
+    return scale, median_abs_deviation(ranges[:, 3] / scale - distance, scale="normal")
+
+
+def _nearest(times, wanted):
+    """Indices (m,) of the ascending times (n,) nearest to the wanted ones (m,)."""
+    after = np.clip(np.searchsorted(times, wanted), 1, len(times) - 1)
+    return after - (wanted - times[after - 1] < times[after] - wanted)

@@ -1,0 +1,148 @@
+"""Start values compared: where the markers and the antennas of the SLAM graph start."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+
+from slamlib import se2
+from slamlib.dataset import Vehicle
+from slamlib.increments import TYPICAL_SLIP
+from slamlib.localization import localize
+from slamlib.sightings import POINT_GATE
+from slamlib.simulation import misguess, simulate
+from slamlib.slam.initialization import consensus_markers, odometry_state
+from slamlib.slam.measurement_factors import MeasurementFactors
+from slamlib.slam.measurements import measure
+from slamlib.slam.optimizer import optimize
+from slamlib.slam.problem import build
+from slamlib.slam.result import result
+from slamlib.slam.robust import CAUCHY_SCALES
+from slamlib.slam.state import state_from_arrays
+from slamlib.studies.kernels import solve_with
+from slamlib.studies.montecarlo import antenna_error
+
+RIGHT_ANTENNA = 0.5          # m, error below which an antenna is right
+SAME_COST = 1.0              # of the right optimum: a residual below one and a half sigmas
+
+
+def first_sighting(measurements, in_world, covariances):
+    """(k, 3) markers at their first sightings; parameters as of `consensus_markers`."""
+    return in_world[np.unique(measurements.label, return_index=True)[1]]
+
+
+def most_certain_sighting(measurements, in_world, covariances):
+    """(k, 3) markers at the sighting of least covariance determinant; parameters as above."""
+    label = measurements.label
+    order = np.lexsort((np.linalg.slogdet(covariances)[1], label))
+    return in_world[order[np.unique(label[order], return_index=True)[1]]]
+
+
+def mean_by_information(measurements, in_world, covariances):
+    """(k, 3) markers at the mean of their sightings, weighted by information; parameters as above.
+
+    Angles are averaged about the most certain sighting's.
+    """
+    m = measurements
+    middle = most_certain_sighting(m, in_world, covariances)
+    apart = in_world - middle[m.label]
+    apart[:, 2] = se2.wrap(apart[:, 2])
+    information = np.linalg.inv(covariances)
+    total, moment = np.zeros((len(m.marker), 3, 3)), np.zeros((len(m.marker), 3))
+    np.add.at(total, m.label, information)
+    np.add.at(moment, m.label, (information @ apart[..., None])[..., 0])
+    return middle + np.linalg.solve(total, moment[..., None])[..., 0]
+
+
+def map_of_problem_2(measurements, in_world, covariances):
+    """(k, 3) markers of problem 2's map, by consensus where it has none; parameters as above."""
+    markers = consensus_markers(measurements, in_world, covariances)
+    found = localize(measurements.dataset.aruco)
+    if found.frame[0] == 0 and np.isfinite(found.poses[0, 0]):          # the same world
+        mapped = np.isin(measurements.marker, found.marker)
+        markers[mapped] = found.marker_in_world[
+            np.searchsorted(found.marker, measurements.marker[mapped])]
+    return markers
+
+
+LANDMARKS = {"first sighting": first_sighting, "most certain sighting": most_certain_sighting,
+             "mean by information": mean_by_information, "consensus": consensus_markers,
+             "problem 2's map": map_of_problem_2}
+
+
+def guessed_antennas(measurements, poses, covariances):
+    """(a, 2) antennas at their guesses; parameters as of `initialization.trilaterated_antennas`."""
+    return measurements.guess
+
+
+def landmarks(seed, path="short", drift=1.0, known=True, kernel="graduated",
+              starts=tuple(LANDMARKS), **options):
+    """Ways to initialise the markers, on one simulated drive with the true slip.
+
+    Parameters
+    ----------
+    drift : factor on table 2's sigmas in the drive, and in the estimate if `known`.
+    kernel : "graduated", all scales of the Cauchy kernel, or "last", only the last one.
+    starts : names in LANDMARKS.
+
+    Returns
+    -------
+    dict of numbers for each start: "initial error", rms distance of the markers to the truth in m;
+    "initial cost" and "cost", the graph's error before and after; "steps"; "right", 1 where the
+    cost is that reached from the true map and poses, to within SAME_COST.
+    """
+    vehicle = Vehicle()
+    drifting = replace(vehicle, sigma_right_radius=drift * vehicle.sigma_right_radius,
+                       sigma_left_radius=drift * vehicle.sigma_left_radius,
+                       sigma_wheelbase=drift * vehicle.sigma_wheelbase)
+    dataset, truth = simulate(path, seed, vehicle=drifting, **options)
+    m = measure(replace(dataset, uwb=None, vehicle=drifting if known else vehicle))
+    problem = build(m, "arc", options.get("slip", TYPICAL_SLIP))
+    cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create
+    rounds = [replace(problem, measured=MeasurementFactors(m, m.unit_weights, cauchy(scale)))
+              for scale in (CAUCHY_SCALES if kernel == "graduated" else CAUCHY_SCALES[-1:])]
+    true_map = truth.marker_in_world[np.searchsorted(truth.marker, m.marker)]
+    best = optimize(rounds[-1], state_from_arrays(
+        m, truth.poses[m.frame], true_map, np.zeros((0, 2)), np.zeros(3))).error
+    numbers = {}
+    for name in starts:
+        state, steps = odometry_state(m, "arc", markers=LANDMARKS[name]), 0
+        error = state.markers[:, :2] - true_map[:, :2]
+        initial_cost = rounds[-1].error(state)
+        for trial in rounds:
+            optimum = optimize(trial, state)
+            state, steps = optimum.state, steps + optimum.steps
+        numbers |= {f"{name} initial error": np.sqrt(np.mean(np.sum(error**2, axis=1))),
+                    f"{name} initial cost": initial_cost, f"{name} cost": optimum.error,
+                    f"{name} steps": steps,
+                    f"{name} right": float(optimum.error < best + SAME_COST)}
+    return numbers
+
+
+def guesses(seed, error, poses=None, markers=True, compared=True, **options):
+    """Antenna guesses that are wrong by `error` m in random directions, on a short drive.
+
+    Parameters
+    ----------
+    poses : number of the drive's first poses to use, or None for all.
+    markers : False leaves the markers out.
+    compared : False leaves "from the guess" out.
+
+    Returns
+    -------
+    dict of shares of the antennas: "right", within RIGHT_ANTENNA of the truth; right "from the
+    guess" without trilateration; "in doubt"; and "silently wrong": not right, not in doubt, and
+    outside their 99.9 % ellipse.
+    """
+    dataset, truth = simulate("short", seed, **options)
+    dataset = misguess(dataset if markers else dataset.without("aruco"), truth, error, seed)
+    measurements = measure(dataset if poses is None else dataset.first(poses))
+    found = result(solve_with(measurements, TYPICAL_SLIP))
+    miss, squared = antenna_error(found, truth)
+    right, doubt = miss < RIGHT_ANTENNA, np.isin(found.antenna, list(found.doubts))
+    numbers = {"right": right.mean(), "in doubt": doubt.mean(),
+               "silently wrong": np.mean(~right & (squared > POINT_GATE) & ~doubt)}
+    if compared:
+        naive = result(solve_with(measurements, TYPICAL_SLIP, antennas=guessed_antennas))
+        numbers["from the guess"] = np.mean(antenna_error(naive, truth)[0] < RIGHT_ANTENNA)
+    return numbers

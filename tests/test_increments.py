@@ -1,0 +1,79 @@
+"""Increments by odometry and their noise."""
+
+import numpy as np
+from numeric import central_differences
+from test_odometry import BOTH, curvy_ticks
+
+from slamlib import increments, odometry, se2
+from slamlib.dataset import Vehicle
+from slamlib.evaluation import nees, nees_band
+from slamlib.simulation import simulate
+
+VEHICLE = Vehicle()
+
+@BOTH
+def test_increments_between_any_two_poses(model):
+    ticks = curvy_ticks()
+    start, end = np.array([0, 10, 35, 299, 120, 7]), np.array([299, 11, 190, 0, 120, 90])
+    increment, by_w = increments.between_poses(ticks, VEHICLE, start, end, model)
+    poses = odometry.dead_reckoning(ticks, VEHICLE, (2.0, 1.0, -0.7), model)
+    np.testing.assert_allclose(se2.compose(poses[start], increment), poses[end], atol=1e-12)
+    numeric = central_differences(
+        lambda w: increments.between_poses(ticks, VEHICLE.with_wheel(w), start, end, model)[0],
+        VEHICLE.wheel, step=1e-7)
+    np.testing.assert_allclose(by_w, numeric, atol=1e-6 * np.abs(numeric).max())
+    # An increment depends on its own counts only.
+    alone, alone_by_w = increments.between_poses(ticks[9:12], VEHICLE, [1], [2], model)
+    np.testing.assert_allclose(increment[1], alone[0], atol=1e-13)
+    np.testing.assert_allclose(by_w[1], alone_by_w[0], atol=1e-11)
+
+
+def literal_noise(ticks, vehicle, start, end, slip):
+    """Sum over the steps of the wheel errors' effects at the end of one increment."""
+    ds, dtheta, _, _ = odometry.steps(ticks, vehicle)
+    half = vehicle.wheelbase / 2
+    poses = odometry.dead_reckoning(ticks, vehicle, model="arc")
+    total = np.zeros((3, 3))
+    for k in range(start, end):
+        travel = np.array([ds[k] + half * dtheta[k], ds[k] - half * dtheta[k]])
+        count = 2 * np.pi * vehicle.wheel[:2] / vehicle.ticks_per_revolution
+        variance = slip**2 * np.abs(travel) + count**2 / 6 / (end - start)
+        direction = poses[k, 2] + dtheta[k] / 2
+        lever = poses[end, :2] - (poses[k, :2] + poses[k + 1, :2]) / 2
+        for sign, v in zip((1, -1), variance, strict=True):
+            turn = sign / (2 * half)
+            effect = np.array([np.cos(direction) / 2 - lever[1] * turn,
+                               np.sin(direction) / 2 + lever[0] * turn, turn])
+            total += v * np.outer(effect, effect)
+    return se2.rotate_covariance(total, -poses[start, 2])
+
+
+def test_noise_is_the_sum_over_steps():
+    ticks = simulate("short", seed=3)[0].ticks
+    start, end = np.array([0, 100, 37, 1500]), np.array([10, 400, 38, 1999])
+    expected = [literal_noise(ticks, VEHICLE, s, e, 2e-3)
+                for s, e in zip(start, end, strict=True)]
+    got = increments.noise(ticks, VEHICLE, start, end, 2e-3)
+    for a, b in zip(got, expected, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-9 * np.abs(b).max())
+
+
+def test_noise_against_simulated_slip():
+    """NEES of 38 x 20 increments of 1 m, by odometry with the true wheel parameters."""
+    errors, covariances = [], []
+    for seed in range(38):
+        dataset, truth = simulate("short", seed=seed, slip=3e-3)
+        start = np.arange(0, 1900, 95)
+        got, _ = increments.between_poses(dataset.ticks, truth.vehicle, start, start + 95, "arc")
+        errors.append(got - se2.between(truth.poses[start], truth.poses[start + 95]))
+        covariances.append(
+            increments.noise(dataset.ticks, truth.vehicle, start, start + 95, 3e-3))
+    errors, covariances = np.concatenate(errors), np.concatenate(covariances)
+    low, high = nees_band(len(errors), probability=0.999)
+    assert low < nees(errors, covariances, np.zeros_like(errors)).mean() < high
+
+
+def test_slip_prior_is_normal_in_the_logarithm():
+    typical, factor = np.log(increments.TYPICAL_SLIP), np.log(increments.SLIP_FACTOR)
+    np.testing.assert_allclose(
+        increments.log_slip_prior(typical + factor * np.array([0, 1, -1, 2])), [0, -0.5, -0.5, -2])

@@ -1,0 +1,209 @@
+from functools import partial
+
+import numpy as np
+import pytest
+from numeric import central_differences
+
+from slamlib import se2
+from slamlib.dataset import ArucoReadings
+from slamlib.evaluation import nees, nees_band
+from slamlib.localization.marker_increments import (
+    common_sightings,
+    consecutive_increments,
+    robust_increments,
+)
+from slamlib.sightings import Sightings, consensus, merge_repeated, sightings_by_frame
+
+DELTA = np.array([0.12, -0.03, 0.2])
+MARKERS = np.array([[1.2, 0.4, 0.3], [-0.7, 1.1, -2.9], [0.2, -1.3, 3.1], [-1.0, -0.8, 1.0]])
+C = np.array([[4e-4, 5e-5, 1e-5], [5e-5, 2e-4, -4e-5], [1e-5, -4e-5, 1e-4]])
+
+
+def sightings(delta=DELTA, markers=MARKERS, covariance=C, rng=None):
+    """Arguments of robust_increments for one pair: the origin and delta both see all markers."""
+    z = np.concatenate([markers, se2.between(delta, markers)])
+    covariances = np.broadcast_to(covariance, (len(z), 3, 3)).copy()
+    if rng is not None:
+        z = z + rng.multivariate_normal(np.zeros(3), covariance, len(z))
+    m = len(markers)
+    return z, covariances, np.zeros(m, int), np.arange(m), np.arange(m, 2 * m)
+
+
+def test_exact_sightings_give_the_exact_increment():
+    for delta in (DELTA, np.zeros(3), np.array([0.5, 0.4, np.pi]), np.array([-1, 2, -3.1])):
+        for count in (1, 2, 4):
+            found = robust_increments(*sightings(delta, MARKERS[:count]), 1)
+            np.testing.assert_allclose(se2.wrap(found.increment[0] - delta), 0, atol=1e-11)
+            assert found.accepted.all() and found.usable.all()
+
+
+def test_covariance_by_hand():
+    """Two markers at (+-d, 0), no motion, C = diag(s^2, s^2, t^2) everywhere, so W = 2 C.
+
+    J = d(Delta Z')/d Delta is [[1, 0, 0], [0, 1, +-d], [0, 0, 1]]: the information of x and of y is
+    2 / (2 s^2), that of the heading 2 d^2 / (2 s^2) + 2 / (2 t^2), all else cancels.
+    """
+    d, s, t = 0.8, 0.01, 0.02
+    z = np.array([[d, 0, 0.5], [-d, 0, -1.5]])
+    args = sightings(np.zeros(3), z, np.diag([s**2, s**2, t**2]))
+    expected = np.diag([s**2, s**2, 1 / (d**2 / s**2 + 1 / t**2)])
+    np.testing.assert_allclose(robust_increments(*args, 1).covariance[0], expected, atol=1e-18)
+
+
+def test_derivatives_by_the_sightings_against_central_differences():
+    rng = np.random.default_rng(4)
+    z, covariances, pair, first, second = sightings(rng=rng)
+    found = robust_increments(z, covariances, pair, first, second, 1)
+
+    def moved(k, change):
+        y = z.copy()
+        y[k] += change
+        return robust_increments(y, covariances, pair, first, second, 1).increment[0]
+
+    for p in range(len(first)):
+        for k, analytic in ((first[p], found.by_first[p]), (second[p], found.by_second[p])):
+            numeric = central_differences(partial(moved, k), np.zeros(3), 1e-5)
+            np.testing.assert_allclose(analytic, numeric, atol=0.03 * np.abs(numeric).max())
+
+
+def test_many_increments_are_consistent():
+    """NEES of 400 increments is in its band; C_Delta = sum_j D_j C_j D_j^T + D'_j C'_j D'_j^T."""
+    rng, count, m = np.random.default_rng(5), 400, len(MARKERS)
+    z, covariances = (np.concatenate(each) for each in zip(
+        *(sightings(rng=rng)[:2] for _ in range(count)), strict=True))
+    first = (2 * m * np.arange(count)[:, None] + np.arange(m)).ravel()
+    pair = np.repeat(np.arange(count), m)
+    found = robust_increments(z, covariances, pair, first, first + m, count)
+    image = sum(D @ C @ np.swapaxes(D, 1, 2) for D in (found.by_first, found.by_second))
+    np.testing.assert_allclose(image.reshape(count, m, 3, 3).sum(1), found.covariance, atol=1e-9)
+    low, high = nees_band(count)
+    errors = found.increment - DELTA
+    assert low < nees(errors, found.covariance, np.zeros_like(errors)).mean() < high
+
+
+@pytest.mark.parametrize("count, wrong, oriented", [
+    (3, 1, True), (4, 1, True), (4, 2, True), (3, 1, False), (4, 1, False)])
+def test_wrong_labels_are_rejected(count, wrong, oriented):
+    rng = np.random.default_rng(6)
+    covariance = C if oriented else np.diag([4e-4, 4e-4, 1e4])
+    for _ in range(30):
+        noise = np.diag([1e-4, 1e-4, 1e-4 if oriented else 9.0])
+        z, covariances, pair, first, second = sightings(markers=MARKERS[:count])
+        z += rng.multivariate_normal(np.zeros(3), noise, len(z))
+        covariances[:] = covariance
+        z[second[:wrong], :2] += rng.choice([-1, 1], (wrong, 2)) * rng.uniform(0.8, 2, (wrong, 2))
+        z[second[:wrong], 2] = rng.uniform(-np.pi, np.pi, wrong)
+        found = robust_increments(z, covariances, pair, first, second, 1)
+        np.testing.assert_array_equal(found.accepted, np.arange(count) >= wrong)
+        np.testing.assert_allclose(found.increment[0], DELTA, atol=0.1)
+
+
+def test_markers_without_heading_determine_an_increment_only_in_pairs():
+    covariance = np.diag([1e-4, 1e-4, 1e4])
+    two = robust_increments(*sightings(markers=MARKERS[:2], covariance=covariance), 1)
+    assert two.usable[0] and np.sqrt(two.covariance[0, 2, 2]) < 0.02
+    np.testing.assert_allclose(two.increment[0], DELTA, atol=1e-8)
+    far = robust_increments(*sightings(np.array([2.0, -1.0, 2.5]), MARKERS[:3], covariance), 1)
+    np.testing.assert_allclose(far.increment[0], [2.0, -1.0, 2.5], atol=1e-8)
+    one = robust_increments(*sightings(markers=MARKERS[:1], covariance=covariance), 1)
+    assert not one.usable[0] and np.isnan(one.increment).all() and not one.accepted.any()
+
+
+def test_without_common_markers_no_increment_is_usable():
+    z, covariances, _, _, _ = sightings()
+    none = np.zeros(0, int)
+    found = robust_increments(z, covariances, none, none, none, 2)
+    assert not found.usable.any() and np.isnan(found.increment).all()
+
+
+def consecutive(z, covariances, row, marker, steps=10):
+    """consecutive_increments of these sightings, frames being `steps` encoder steps apart."""
+    order = np.lexsort((marker, row))
+    return consecutive_increments(Sightings(
+        index=order, row=row[order], marker=marker[order], z=z[order], C=covariances[order],
+        frame=steps * np.arange(row.max() + 1)))
+
+
+def test_an_implausible_speed_makes_an_increment_unusable():
+    """Six frames at distances DELTA see two markers each; the last has one, with a wrong label."""
+    poses = [np.zeros(3)]
+    for _ in range(5):
+        poses.append(se2.compose(poses[-1], DELTA))
+    z = se2.between(np.array(poses)[:, None], MARKERS[:2]).reshape(-1, 3)
+    row, marker = np.repeat(np.arange(6), 2), np.tile([5, 9], 6)
+    z[10] = se2.between(poses[5], MARKERS[2])               # marker 5 is said to be where 2 is
+    z, row, marker = z[:11], row[:11], marker[:11]
+    covariances = np.broadcast_to(C, (11, 3, 3))
+    found = consecutive(z, covariances, row, marker)
+    np.testing.assert_array_equal(found.usable, [True, True, True, True, False])
+    np.testing.assert_array_equal(found.accepted, found.pair < 4)
+    alone = robust_increments(z, covariances, *common_sightings(row, marker), 5)
+    assert alone.usable.all()                               # the test of the speed rejected it
+
+
+def test_common_sightings_by_hand():
+    row = np.array([0, 0, 0, 1, 1, 2, 2, 3])
+    marker = np.array([3, 5, 9, 5, 8, 5, 8, 3])
+    pair, first, second = common_sightings(row, marker)
+    np.testing.assert_array_equal(pair, [0, 1, 1])
+    np.testing.assert_array_equal(first, [1, 3, 4])
+    np.testing.assert_array_equal(second, [3, 5, 6])
+
+
+def test_repeated_sightings_are_averaged_or_dropped():
+    readings = ArucoReadings(
+        pose=np.array([0, 0, 0, 4, 4]), marker=np.array([7, 2, 7, 2, 2]),
+        marker_in_vehicle=np.array([[1, 1, np.pi - 0.01], [0, 2, 0], [1.04, 1, -np.pi + 0.03],
+                                    [1, 1, 0], [3, 1, 0]]),
+        covariance=np.array([np.diag([1e-2, 1e-2, 1e-2])] * 2 + [np.diag([1e-2, 1e-2, 3e-2])]
+                            + [np.diag([1e-2, 1e-2, 1e-2])] * 2))
+    before = readings.marker_in_vehicle.copy()
+    index, z, covariance = merge_repeated(readings)
+    np.testing.assert_array_equal(index, [1, 0])                # the two of pose 4 disagree
+    np.testing.assert_allclose(z, [[0, 2, 0], [1.02, 1, np.pi]], atol=1e-12)
+    np.testing.assert_allclose(covariance[1], np.diag([5e-3, 5e-3, 7.5e-3]))
+    np.testing.assert_array_equal(readings.marker_in_vehicle, before)
+
+
+def test_sightings_are_sorted_by_frame_and_extra_frames_have_none():
+    readings = ArucoReadings(np.array([3, 3, 8]), np.array([6, 2, 6]), np.zeros((3, 3)),
+                             np.tile(np.eye(3), (3, 1, 1)))
+    found = sightings_by_frame(readings, extra_frames=[0, 8])
+    np.testing.assert_array_equal(found.frame, [0, 3, 8])
+    np.testing.assert_array_equal(found.row, [1, 1, 2])
+    np.testing.assert_array_equal(found.marker, [2, 6, 6])
+    np.testing.assert_array_equal(found.index, [1, 0, 2])
+    np.testing.assert_array_equal(sightings_by_frame(None, [4, 0]).frame, [0, 4])
+
+
+def test_consensus_takes_the_most_certain_sighting_among_the_supported():
+    """Marker 4 has three sightings that agree and a more certain one 1 m off; marker 2 has one."""
+    in_world = np.array([[0, 0, 3.1], [1, 0, 3.1], [0.01, 0, -3.13], [0, 0.01, 3.1], [5, 5, 0]])
+    variance = np.array([4, 1, 3, 2, 9]) * 1e-4
+    rows = consensus(np.array([4, 4, 4, 4, 2]), in_world, variance[:, None, None] * np.eye(3))
+    np.testing.assert_array_equal(rows, [4, 3])
+
+
+def test_a_start_from_rest_is_plausible():
+    """200 frames at rest with two common markers, then 15 in motion with one common marker each."""
+    poses = [np.zeros(3)] * 200
+    for _ in range(15):
+        poses.append(se2.compose(poses[-1], DELTA))
+    row = np.repeat(np.arange(215), 2)
+    moving = np.repeat(np.arange(9, 24), 2) + np.tile([0, 1], 15)
+    marker = np.concatenate([np.tile([5, 9], 200), moving])
+    rng = np.random.default_rng(2)
+    in_world = {m: np.append(rng.uniform(-1, 1, 2), rng.uniform(-3, 3)) for m in np.unique(marker)}
+    z = se2.between(np.array(poses)[row], np.array([in_world[m] for m in marker]))
+    z += rng.normal(0, 1e-3, z.shape)
+    found = consecutive(z, np.tile(1e-6 * np.eye(3), (len(z), 1, 1)), row, marker)
+    common = np.bincount(found.pair, minlength=214)
+    assert (common[199:] == 1).all() and found.usable.all() and found.accepted.all()
+
+
+def test_two_sightings_that_exclude_each_other_leave_no_increment():
+    """Seven sigmas apart, each is beyond the gate of their mean: both are rejected."""
+    z = np.array([[1.0, 0, 0], [-1.0, 0, 0], [1.07, 0, 0], [-1.07, 0, 0]])
+    covariances = np.broadcast_to(1e-4 * np.eye(3), (4, 3, 3))
+    found = robust_increments(z, covariances, np.zeros(2, int), np.arange(2), np.arange(2, 4), 1)
+    assert not found.usable.any() and not found.accepted.any() and np.isnan(found.increment).all()

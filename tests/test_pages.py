@@ -1,0 +1,272 @@
+"""The report on all notebooks, the stand-ins and what a user may bring; then in a real browser.
+
+One file, so that pytest-xdist builds the report in one process only.
+"""
+
+import html
+import re
+import shutil
+from pathlib import Path
+from urllib.parse import unquote, urlparse
+
+import nbformat
+import numpy as np
+import pytest
+from conftest import BROUGHT
+
+from slamlib.dataset import read_dataset
+from slamlib.odometry import equation2
+from slamlib.report import build_report
+from slamlib.results import read_aruco_map, read_vehicle_poses
+
+ROOT = Path(__file__).parents[1]
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_seeds")]
+# Elements that reach beyond the column, unless what holds them can be scrolled sideways.
+STICKING_OUT = """() => {
+    const column = document.querySelector("main").getBoundingClientRect();
+    const scrolls = e => e.tagName != "MAIN" && (
+        ["auto", "scroll"].includes(getComputedStyle(e).overflowX) || scrolls(e.parentElement));
+    return [...document.querySelectorAll("main *")].filter(e => {
+        const box = e.getBoundingClientRect();
+        return box.width > 0 && (box.right > column.right + 1 || box.left < column.left - 1)
+            && !scrolls(e.parentElement);
+    }).map(e => `${e.tagName}: ${e.textContent.slice(0, 60)}`);
+}"""
+
+
+@pytest.fixture(scope="module")
+def built(report_on_all):
+    """The folder of the shared report, and the text of its pages by name."""
+    return report_on_all, {page.stem: page.read_text(encoding="utf-8")
+                           for page in (report_on_all / "report").glob("*.html")}
+
+
+def test_every_notebook_becomes_a_page(built):
+    _, pages = built
+    notebooks = {path.stem for path in (ROOT / "notebooks").glob("*.ipynb")}
+    assert pages.keys() == notebooks | {"index"} and "1_odometry" in notebooks
+
+
+def test_results_are_those_of_the_library(built):
+    folder, _ = built
+    for data in (folder / "data").iterdir():
+        if data.is_dir():
+            dataset = read_dataset(data)
+            expected = equation2(dataset.ticks, dataset.vehicle)
+            written = read_vehicle_poses(folder / "results" / data.name / "problem1")
+            for got, wanted in zip(written, expected, strict=True):
+                np.testing.assert_array_equal(got, wanted)
+
+
+def test_results_of_problem_2_are_where_there_are_markers(built):
+    folder, pages = built
+    for data in (folder / "data").iterdir():
+        if data.is_dir():
+            dataset, results = read_dataset(data), folder / "results" / data.name
+            assert (results / "problem2").exists() == (dataset.aruco is not None)
+            assert (results / "problem2_fused").exists() == (dataset.aruco is not None)
+            if dataset.aruco is not None:
+                alone, covariances = read_vehicle_poses(results / "problem2")
+                fused, _ = read_vehicle_poses(results / "problem2_fused")
+                assert len(alone) == len(fused) == len(dataset.ticks)
+                known = np.isfinite(alone[:, 0])
+                assert np.isin(np.flatnonzero(known), dataset.aruco.pose).all() and known.any()
+                assert (np.isfinite(covariances[:, 0, 0]) == known).all()
+                assert np.isfinite(fused).all()
+                ids, markers, _ = read_aruco_map(results / "problem2")
+                assert np.isin(ids, dataset.aruco.marker).all() and np.isfinite(markers).all()
+                assert f"{data.name}/problem2/ArucoMap.mat" in html.unescape(pages["index"])
+
+
+def test_pages_name_every_dataset_and_say_what_is_left_out(built):
+    _, pages = built
+    text = html.unescape(re.sub(r"<[^>]+>", "", pages["1_odometry"]))
+    sentence = re.search(
+        r"No truth comes with ([^.]*?), so the error of the odometry cannot be shown", text)
+    for name in BROUGHT:
+        assert name in text and name in pages["index"]
+    markers = html.unescape(re.sub(r"<[^>]+>", "", pages["2_aruco_localization"]))
+    left_out = re.search(r"There are no markers in ([^:]*): this chapter leaves them out", markers)
+    without_markers = {"wheels_only", "waits", "one_pose", "backs_up"}
+    assert set(re.split(", | and ", left_out[1])) >= without_markers
+    for name in BROUGHT:
+        assert (name in re.split(", | and ", sentence[1])) == (
+            name not in ("new seed", "one_sighting", "sparse"))
+
+
+def test_the_first_page_says_what_is_left_out(built):
+    _, pages = built
+    text = html.unescape(re.sub(r"<[^>]+>", " ", pages["index"]))
+    for start, name in (("There are no markers in", "wheels_only"),
+                        ("There are no UWB ranges in", "waits"),
+                        ("No truth comes with", "no_truth")):
+        assert name in re.search(rf"{start}([^:]*?)(?::|, so errors)", text)[1]
+    assert len(re.findall(r"wheels_only\s+odometry \+ ArUco\s+left out: no markers", text)) == 1
+    assert re.search(
+        r"no_truth\s+SLAM: odometry \+ ArUco\s+no truth\s+no truth\s[^–]*?rad\s+2,000\s", text)
+
+
+def test_no_cell_wrote_to_stderr(built):
+    """A warning in a page is a defect of the notebook."""
+    _, pages = built
+    for name, page in pages.items():
+        assert "stderr" not in re.sub(r"<style>.*?</style>", "", page, flags=re.DOTALL), name
+
+
+def test_every_chapter_ends_with_one_picture_to_explore_and_no_widget(built):
+    _, pages = built
+    for name in pages.keys() - {"index"}:
+        _, section = pages[name].split('<h2 id="Explore">')
+        assert section.count("<figure>") == 1, name
+        assert section.count('src="data:image/svg+xml;base64,') == 1, name
+        assert "<script" not in pages[name] and "widget" not in section, name
+        assert not re.search(r"(VBox|Output|interactive)\(", section), name
+
+
+def test_without_any_markers_chapter_2_can_still_be_read(tmp_path, kept):
+    (tmp_path / "data" / "wheels").mkdir(parents=True)
+    (tmp_path / "data" / "wheels" / "encoderReading.txt").write_text("1 0 0\n2 100 90\n3 90 100\n")
+    (tmp_path / "notebooks").mkdir()
+    shutil.copy(ROOT / "notebooks" / "2_aruco_localization.ipynb", tmp_path / "notebooks")
+    pages = build_report(tmp_path / "notebooks", tmp_path / "data", tmp_path / "report",
+                         tmp_path / "results", kept=kept)
+    assert "runs on a simulated drive instead" in pages[1].read_text(encoding="utf-8")
+    assert list((tmp_path / "results").iterdir()) == []
+
+
+def captions(page):
+    return re.findall(r'<p class="caption" id="(figure|table)-(\d+)\.(\d+)">', page)
+
+
+def test_without_truth_nothing_is_missing_from_the_numbers_or_named_in_vain(built, kept, tmp_path):
+    folder, with_truth = built
+    alone = build_report(ROOT / "notebooks", folder / "data", tmp_path / "report",
+                         tmp_path / "results", ["no_truth"], kept=kept)
+    pages = {page.stem: page.read_text(encoding="utf-8")
+             for page in alone if page.suffix == ".html"}
+    for name in pages.keys() - {"index"}:
+        for page in (pages[name], with_truth[name]):
+            for kind in ("figure", "table"):
+                found = [(int(chapter), int(number))
+                         for which, chapter, number in captions(page) if which == kind]
+                assert found, name
+                assert found == [(int(name[0]), n) for n in range(1, len(found) + 1)], name
+        # Figures of errors are left out.
+        assert len(captions(pages[name])) < len(captions(with_truth[name])), name
+        assert "No truth comes with no_truth" in pages[name], name
+
+
+def test_no_page_says_nan(built):
+    _, pages = built
+    for name, page in pages.items():
+        assert not re.search(r"\bnan\b", re.sub(r"<pre.*?</pre>", "", page, flags=re.DOTALL)), name
+
+
+def test_no_page_shows_an_object_s_address(built):
+    _, pages = built
+    for name, page in pages.items():
+        assert not re.search(r" at 0x[0-9a-f]{6}", page), name
+
+
+# In the browser.
+
+
+@pytest.fixture(scope="module")
+def pages(report_on_all):
+    return sorted((report_on_all / "report").glob("*.html"))
+
+
+@pytest.fixture(scope="module", params=[1300, 768, 390])
+def visited(request, pages, chromium):
+    """Every page in a window of this width, with what it asked for and complained of."""
+    visits, context = [], chromium.new_context(viewport={"width": request.param, "height": 900})
+    for path in pages:
+        page = context.new_page()
+        page.asked, page.said = [], []
+        page.on("request", lambda asked, page=page: page.asked.append(asked.url))
+        page.on("console", lambda said, page=page: page.said.append(said.text))
+        page.on("pageerror", lambda error, page=page: page.said.append(str(error)))
+        page.goto(path.as_uri(), wait_until="load")
+        visits.append((path, page))
+    yield visits
+    context.close()
+
+
+def formulas(notebook):
+    """TeX formulas in a notebook's text, by their dollars."""
+    text = "\n\n".join(cell.source for cell in nbformat.read(notebook, as_version=4).cells
+                       if cell.cell_type == "markdown")
+    text = re.sub(r"(?s)```.*?```|`[^`]*`", "", text)
+    return re.findall(r"(?s)\$\$.+?\$\$|\$[^$]+\$", text)
+
+
+def test_nothing_is_loaded_and_no_error_is_told(visited):
+    for path, page in visited:
+        assert [url for url in page.asked if not url.startswith("data:")] == [path.as_uri()]
+        assert page.said == []
+
+
+def test_every_formula_of_a_notebook_is_on_its_page_and_takes_room(visited):
+    for path, page in visited:
+        if path.stem == "index":
+            continue
+        wide = page.eval_on_selector_all(
+            "main math", "all => all.filter(m => !m.closest('.output'))"
+                         ".map(m => m.getBoundingClientRect().width)")
+        assert len(wide) == len(formulas(ROOT / "notebooks" / f"{path.stem}.ipynb")) > 0
+        assert all(width > 1 for width in wide)
+
+
+def test_every_figure_is_drawn_and_a_phone_gets_the_narrow_one(visited):
+    for path, page in visited:
+        phone = page.viewport_size["width"] < 640
+        figures = page.eval_on_selector_all("figure img", """all => all.map(
+            image => [image.naturalWidth, image.width, image.currentSrc != image.src])""")
+        assert figures and all(
+            natural > 0 and shown >= (300 if phone else 450) and narrow == phone
+            for natural, shown, narrow in figures), (path.name, figures)
+
+
+def test_numbers_of_equations_and_names_of_rows_stay_in_view(visited):
+    for path, page in visited:
+        outside = page.eval_on_selector_all(".equation > .number", """all => all.filter(
+            number => number.getBoundingClientRect().right > innerWidth)
+            .map(number => number.textContent)""")
+        assert outside == []
+        moved = page.eval_on_selector_all("table", """all => all.map(table => {
+            table.scrollLeft = 1e4;
+            const first = table.querySelector("tbody :is(th, td)").getBoundingClientRect();
+            const off = table.getBoundingClientRect().left - first.left;
+            table.scrollLeft = 0;
+            return off;})""")
+        if page.viewport_size["width"] < 640:
+            assert all(abs(off) < 2 for off in moved), path.name
+
+
+def test_errors_of_all_problems_are_in_view(visited):
+    page = next(page for path, page in visited if path.stem == "index")
+    ends = page.eval_on_selector_all("th", """all => all
+        .filter(th => th.textContent.startsWith("ATE"))
+        .map(th => [th, th.closest("table")].map(e => e.getBoundingClientRect().right))""")
+    assert len(ends) == 2 and all(end <= edge + 1 for end, edge in ends)
+
+
+def test_nothing_sticks_out_of_the_column(visited):
+    for path, page in visited:
+        assert page.evaluate(STICKING_OUT) == [], path.name
+        assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth"), path.name
+
+
+def test_links_inside_the_report_lead_somewhere(visited):
+    ids = {path.name: set(page.eval_on_selector_all("[id]", "all => all.map(e => e.id)"))
+           for path, page in visited}
+    for path, page in visited:
+        links = page.eval_on_selector_all("a[href]", "all => all.map(a => a.href)")
+        for link in links:
+            address = urlparse(link)
+            if address.scheme != "file":
+                continue
+            target = Path(unquote(address.path))
+            assert target.exists(), f"{path.name}: {link}"
+            if address.fragment:
+                assert unquote(address.fragment) in ids[target.name], f"{path.name}: {link}"
