@@ -103,7 +103,10 @@ def _solve(options):
     from slamlib.summary import solve_to_folder
     summary = solve_to_folder(read_dataset(options.folder), read_truth(options.folder), options.out)
     print(_table(summary))
-    return 0
+    failed = {name: row for name, row in summary["problems"].items() if "failed" in row}
+    for name, row in failed.items():
+        print(f"slamlib: {name} could not be solved: {row['failed']}", file=sys.stderr)
+    return 3 if failed else 0
 
 
 def _table(summary):
@@ -112,6 +115,9 @@ def _table(summary):
              f"{'problem':15}{'estimates':>10}{'last x, y, heading':>29}"
              f"{'their sigmas':>27}{'ATE':>11}"]
     for name, row in summary["problems"].items():
+        if "failed" in row:
+            lines.append(f"{name:15}could not be solved")
+            continue
         pose = "{:8.3f} m {:8.3f} m {:7.4f}".format(*row["last_pose"])
         sigma = "{:7.4f} m {:7.4f} m {:6.4f}".format(*row["last_sigma"])
         error = f"{row['ate_m']:9.4f} m" if "ate_m" in row else "no truth"

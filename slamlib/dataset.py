@@ -16,6 +16,7 @@ from slamlib.textfile import BOUND, DatasetError, error, find, read_table, read_
 
 SMALLEST_SIGMA = 1e-9  # m or rad; smaller standard deviations and wheel parameters count as zero
 SMALLEST_EIGENVALUE = 1e-12  # no unit; a correlation matrix with a smaller one counts as singular
+MOST_NEGATIVE = 5.0  # sigmas, of a range at an antenna
 MOST_REVOLUTIONS = 10  # revolutions of a wheel in one step
 FILES = ("encoderReading.txt", "ArucoReading.txt", "UwbReading.txt", "UwbAntennaGuess.txt",
          "vehicle.toml", "truth")
@@ -224,8 +225,7 @@ def _read_aruco(folder, pose_count):
     correlation = covariance / (sigma[:, :, None] * sigma[:, None, :])
     smallest_eigenvalue = np.linalg.eigvalsh(correlation)[:, 0]
     require(smallest_eigenvalue > SMALLEST_EIGENVALUE, path, "a positive definite covariance")
-    readings = ArucoReadings(pose, marker, table[:, :3], covariance)
-    return readings.select(np.argsort(pose, kind="stable"))
+    return _in_order(ArucoReadings(pose, marker, table[:, :3], covariance), pose, marker, table)
 
 
 def _read_uwb(folder, pose_count, antenna_guess):
@@ -233,13 +233,20 @@ def _read_uwb(folder, pose_count, antenna_guess):
         folder, "UwbReading.txt", "pose id, antenna id, range, sigma", pose_count)
     if len(table) == 0:
         return None
-    require(table[:, 0] > 0, path, "a positive range")
     require(table[:, 1] >= SMALLEST_SIGMA, path, "a positive sigma")
+    require(table[:, 0] >= -MOST_NEGATIVE * table[:, 1], path,
+            f"a range that is not below -{MOST_NEGATIVE:g} sigma")
     if antenna_guess is None:
         raise error(path, "expected a UwbAntennaGuess.txt in the same folder, with every antenna")
     require(np.isin(antenna, antenna_guess.antenna), path, "an antenna id of UwbAntennaGuess.txt")
-    readings = UwbReadings(pose, antenna, table[:, 0], table[:, 1])
-    return readings.select(np.argsort(pose, kind="stable"))
+    return _in_order(UwbReadings(pose, antenna, table[:, 0], table[:, 1]), pose, antenna, table)
+
+
+def _in_order(readings, pose, landmark, table):
+    """The readings in ascending order of pose; rows of a file that repeat exactly count once."""
+    _, rows = np.unique(np.column_stack([pose, landmark, table]), axis=0, return_index=True)
+    rows = np.sort(rows)
+    return readings.select(rows[np.argsort(pose[rows], kind="stable")])
 
 
 def _read_all_poses(path, columns):

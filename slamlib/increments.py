@@ -34,11 +34,18 @@ def noise(ticks, vehicle, start, end, slip):
     angle times S (p_e - p), S = [[0, -1], [1, 0]]. The effect of a step is linear in p_e, so one
     cumulative sum over the steps serves all increments. No `end` may be before its `start`; the
     covariance of an increment without steps is zero.
+
+    The sum is over positions relative to the beginning of a block of steps. Relative to pose 1,
+    its differences would lose all digits on a drive of kilometres. A block is as long as the
+    longest increment, so that an increment lies in two blocks at most.
     """
     poses = odometry.dead_reckoning(ticks, vehicle, model="arc")
     ds, dtheta, _, _ = odometry.steps(ticks, vehicle)
     u = np.stack([np.cos(poses[:-1, 2] + dtheta / 2), np.sin(poses[:-1, 2] + dtheta / 2)], -1)
-    p = (poses[:-1, :2] + poses[1:, :2]) / 2
+    start, end = np.asarray(start), np.asarray(end)
+    length = np.max(end - start, initial=1)
+    origin = poses[:max(1, len(ds)):length]
+    p = (poses[:-1, :2] + poses[1:, :2]) / 2 - origin[np.arange(len(ds)) // length, :2]
     sides = vehicle.wheelbase / 2 * np.array([1, -1])
     turn = 1 / (2 * sides)                                             # by e_R, by e_L
     by_wheel = np.empty((len(ds), 3, 2))                               # of (end - S p_e turn, turn)
@@ -49,12 +56,15 @@ def noise(ticks, vehicle, start, end, slip):
     from_slip = outer @ (slip**2 * np.abs(ds[:, None] + sides * dtheta[:, None])[:, None, :, None])
     metres_per_count = 2 * np.pi * vehicle.wheel[:2] / vehicle.ticks_per_revolution
     from_rounding = outer @ (metres_per_count**2 / 6)
-    start, end = np.asarray(start), np.asarray(end)
-    slipping, rounding = (total[end] - total[start] for total in map(
-        odometry.cumulative, (from_slip[..., 0], from_rounding)))
-    summed = slipping + rounding / np.maximum(end - start, 1)[:, None, None]
-    to_end, _ = se2.compose_jacobians(np.zeros(3), poses[end])         # I + [0, 0, S p_e]
-    in_world = to_end @ summed @ np.swapaxes(to_end, 1, 2)
+    totals = [odometry.cumulative(part) for part in (from_slip[..., 0], from_rounding)]
+    in_world = np.zeros((len(start), 3, 3))
+    for block in (start // length, start // length + 1):
+        begins, ends = (np.clip(edge * length, start, end) for edge in (block, block + 1))
+        slipping, rounding = (total[ends] - total[begins] for total in totals)
+        summed = slipping + rounding / np.maximum(end - start, 1)[:, None, None]
+        lever = poses[end] - [1, 1, 0] * origin[np.minimum(block, len(origin) - 1)]
+        to_end, _ = se2.compose_jacobians(np.zeros(3), lever)          # I + [0, 0, S lever]
+        in_world += to_end @ summed @ np.swapaxes(to_end, 1, 2)
     return se2.rotate_covariance(in_world, -poses[start, 2])
 
 

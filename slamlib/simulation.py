@@ -180,7 +180,7 @@ def _place_markers(layout, poses, rng):
         centre = poses[int(fraction * len(poses)), :2]
         near &= np.hypot(*(grid - centre).T) > radius
     grid = grid[near]
-    ids = np.sort(rng.choice(np.arange(1, 250), len(grid), replace=False))
+    ids = np.sort(rng.choice(np.arange(1, max(250, len(grid) + 1)), len(grid), replace=False))
     order = rng.permutation(len(grid))
     return ids, np.column_stack([grid[order], rng.uniform(-np.pi, np.pi, len(grid))])
 

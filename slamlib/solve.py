@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from slamlib import localization, odometry, results, se2, slam
+from slamlib.dataset import DatasetError
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,15 @@ class Solution:
     aruco_map: tuple | None = None         # marker ids (k,), poses (k, 3), covariances (k, 3, 3)
     uwb_map: tuple | None = None           # antenna ids (a,), positions (a, 2), cov. (a, 2, 2)
     facts: dict = field(default_factory=dict)       # plain numbers for the summary
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A problem that could not be solved."""
+
+    problem: str
+    title: str
+    reason: str                    # a sentence
 
 
 def problem1(dataset):
@@ -129,18 +139,30 @@ def _slam_facts(found):
             "log_evidence": found.log_evidence, **_wheels(found)}
 
 
+INCREMENTAL = {"problem1": problem1, "problem2": problem2, "problem2_hint": problem2_hint,
+               "problem2_fused": problem2_fused}
+
+
 def solutions(dataset):
-    """Yield the Solution of every problem that the dataset's sensors allow, in order."""
-    yield problem1(dataset)
-    found = None
-    if dataset.aruco is not None:
-        yield problem2(dataset)
-        yield problem2_hint(dataset)
-        yield problem2_fused(dataset)
-        found = slam.estimate(dataset.without("uwb"))
-        yield problem3(dataset, found)
-    if dataset.uwb is not None:
-        yield problem4(dataset, slam.estimate(dataset, previous=found))
+    """Yield the Solution of every problem that the dataset's sensors allow, in order.
+
+    A problem that cannot be solved yields a Failure, and the others go on. Problem 4 starts from
+    problem 3 where there is one.
+    """
+    previous = None
+    for problem, task in PROBLEMS.items():
+        if any(getattr(dataset, sensor) is None for sensor in task.sensors):
+            continue
+        try:
+            if problem == "problem3":
+                previous = slam.estimate(dataset.without("uwb"))
+                yield problem3(dataset, previous)
+            elif problem == "problem4":
+                yield problem4(dataset, slam.estimate(dataset, previous=previous))
+            else:
+                yield INCREMENTAL[problem](dataset)
+        except (DatasetError, np.linalg.LinAlgError) as error:
+            yield Failure(problem, title(problem, dataset), str(error))
 
 
 def truth_in_world(solution, truth):

@@ -7,25 +7,27 @@ from pathlib import Path
 import numpy as np
 
 from slamlib import evaluation, results
-from slamlib.solve import solutions, truth_in_world, write
+from slamlib.solve import Failure, solutions, truth_in_world, write
 
 
 def solve_to_folder(dataset, truth, out):
     """The summary of all problems of a Dataset, written with their files below the folder `out`.
 
-    The Truth, or None, serves to report errors, never to estimate. The summary is the dict that is
-    written to summary.json.
+    The Truth, or None, serves to report errors, never to estimate. Each problem's files are written
+    as it ends. The summary is the dict that is written to summary.json; a problem that could not be
+    solved has the entry "failed", a sentence.
     """
     summary = {"dataset": dataset.name, "poses": len(dataset.ticks), "problems": {}}
-    solved, start = [], time.perf_counter()
+    start = time.perf_counter()
     for solution in solutions(dataset):
-        seconds, start = time.perf_counter() - start, time.perf_counter()
-        solved.append(solution)
-        summary["problems"][solution.problem] = {"title": solution.title,
-                                                 **summarize(solution, truth), "seconds": seconds}
+        seconds = time.perf_counter() - start
+        failed = isinstance(solution, Failure)
+        row = {"failed": solution.reason} if failed else summarize(solution, truth)
+        summary["problems"][solution.problem] = {"title": solution.title, **row, "seconds": seconds}
+        if not failed:
+            write(out, solution)
+        start = time.perf_counter()
     text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-    for solution in solved:
-        write(out, solution)
     results.write_atomically(Path(out) / "summary.json", text.encode())
     return summary
 

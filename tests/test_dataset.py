@@ -333,8 +333,7 @@ ERRORS = [
     ("UwbReading.txt", third_row("1 3 1"), 5, "4 columns (pose id, antenna id, range, sigma)"),
     ("UwbReading.txt", third_row("5 3 1 1"), 5, "pose id from 1 to 4"),
     ("UwbReading.txt", third_row("1 3.5 1 1"), 5, "whole number"),
-    ("UwbReading.txt", third_row("1 3 0 1"), 5, "positive range"),
-    ("UwbReading.txt", third_row("1 3 -2 1"), 5, "positive range"),
+    ("UwbReading.txt", third_row("1 3 -5.1 1"), 5, "a range that is not below -5 sigma"),
     ("UwbReading.txt", third_row("1 3 1 0"), 5, "positive sigma"),
     ("UwbReading.txt", third_row("1 3 1 9e-10"), 5, "positive sigma"),
     ("UwbReading.txt", third_row("1 4 1 1"), 5, "UwbAntennaGuess.txt"),
@@ -532,3 +531,16 @@ def test_dataset_names_are_those_of_folders_with_any_file_of_a_dataset(tmp_path)
     write(tmp_path / "half" / "UwbReading.txt", "")
     with pytest.raises(DatasetError, match=f"half.{absent}"):
         dataset_names(tmp_path)
+
+
+def test_rows_that_repeat_exactly_count_once(folder):
+    write(folder / "UwbReading.txt", "2 3 1.5 0.1\n1 3 1.4 0.1\n2 3 1.5 0.1\n2 3 1.6 0.1\n")
+    write(folder / "ArucoReading.txt", 2 * FILES["ArucoReading.txt"])
+    dataset = read_dataset(folder)
+    assert dataset.uwb.pose.tolist() == [0, 1, 1] and dataset.uwb.range.tolist() == [1.4, 1.5, 1.6]
+    assert dataset.aruco.marker.tolist() == [-7, 40, 40]
+
+
+def test_a_range_is_negative_by_its_noise_at_most(folder):
+    write(folder / "UwbReading.txt", "1 3 -0.05 0.1\n")
+    assert read_dataset(folder).uwb.range.tolist() == [-0.05]

@@ -9,10 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from slamlib import solve
 from slamlib.__main__ import main
-from slamlib.dataset import read_dataset
+from slamlib.dataset import DatasetError, read_dataset
 from slamlib.odometry import equation2
 from slamlib.results import read_vehicle_poses
+from slamlib.simulation import simulate, write_dataset
 
 ROOT = Path(__file__).parents[1]
 
@@ -108,3 +110,25 @@ print(check_python.problem())
         said = subprocess.run([sys.executable, "-c", code], text=True, capture_output=True,
                               check=True, env={**os.environ}).stdout
         assert word in said and said.count("\n") == 1, change
+
+
+def test_a_problem_that_fails_costs_the_others_nothing(tmp_path, capsys, monkeypatch):
+    """Exit code 3, a sentence in summary.json and on the terminal, and the others' results."""
+    write_dataset(tmp_path / "drive", *simulate("short", seed=3))
+    estimate = solve.slam.estimate
+
+    def failing(dataset, **options):
+        if dataset.uwb is None:
+            raise DatasetError("drive: expected measurements that determine every pose")
+        return estimate(dataset, 1e-3, "arc", **options)
+
+    monkeypatch.setattr(solve.slam, "estimate", failing)
+    assert main(["solve", str(tmp_path / "drive"), "--out", str(tmp_path / "out")]) == 3
+    problems = json.loads((tmp_path / "out" / "summary.json").read_text())["problems"]
+    assert "determine every pose" in problems["problem3"]["failed"]
+    assert "ate_m" in problems["problem4"]
+    assert not (tmp_path / "out" / "problem3").exists()
+    assert (tmp_path / "out" / "problem4" / "UwbMap.mat").exists()
+    told = capsys.readouterr()
+    assert told.err.count("problem3 could not be solved: drive: expected") == 1
+    assert "problem3       could not be solved" in told.out

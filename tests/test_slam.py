@@ -9,17 +9,17 @@ import pytest
 from gtsam.symbol_shorthand import A, L, W, X
 from numeric import central_differences, decided
 
-from slamlib import slam, studies
+from slamlib import simulation, slam, studies
 from slamlib.dataset import ArucoReadings, Dataset, Vehicle
 from slamlib.evaluation import anees, ate, nees_band
 from slamlib.simulation import simulate
-from slamlib.slam import odometry_factors
+from slamlib.slam import odometry_factors, optimizer
 from slamlib.slam.covariances import covariances
 from slamlib.slam.estimate import fit_from_odometry
 from slamlib.slam.fit import refine
 from slamlib.slam.initialization import parts
 from slamlib.slam.measurements import measure
-from slamlib.slam.optimizer import linearize
+from slamlib.slam.optimizer import linearize, log_evidence
 from slamlib.slam.problem import build
 from slamlib.slam.result import result
 from slamlib.slam.state import state_from_arrays
@@ -94,7 +94,8 @@ def test_rounding_noise_does_not_depend_on_the_number_of_factors():
         frame = np.arange(0, 2001, every)
         noise, _ = odometry_factors.odometry_noise(ticks, vehicle, frame[:-1], frame[1:])
         noise = noise.sum(axis=0)
-        floor = 2000 / every * odometry_factors.MINIMUM_INCREMENT_SIGMA**2
+        floor = (2000 / every * odometry_factors.MINIMUM_SIGMA**2
+                 + odometry_factors.MINIMUM_SLIP**2 * 2000 * 127 * count)
         np.testing.assert_allclose([noise[0, 0] - floor, noise[2, 2]], [along, turned], rtol=1e-6)
 
 
@@ -330,3 +331,80 @@ def test_refine_keeps_the_accepted_measurements_if_accept_is_none():
     assert again.problem.measured is native
     tested = refine(again.problem, fit.state, 1e-3)
     np.testing.assert_array_equal(tested.problem.measured.weight, fit.problem.measured.weight)
+
+
+OPEN_PATHS = {                                            # legs of (metres, radians)
+    "straight": [(25, 0)], "corridor": [(30, 0.05)],
+    "building": [(9, 0), (0.8, np.pi / 2), (7, 0), (0.8, -np.pi / 2), (10, 0)],
+    "spiral": [(2 + 0.8 * k, np.pi / 2) for k in range(6)]}
+
+
+def open_path(legs, seed, spacing=2.0, slip=1e-3):
+    """A drive along legs of a simulated building: Dataset with markers only, and Truth."""
+    steps = np.array([max(1, int(length / 0.01)) for length, _ in legs])
+    ds, dtheta = (np.repeat(values / steps, steps) for values in np.transpose(legs))
+    layout = replace_namespace(simulation.PATHS["short"], marker_spacing=spacing)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(simulation, "_drive", lambda layout, rounds: (ds, dtheta))
+        patch.setitem(simulation.PATHS, "open", layout)
+        dataset, truth = simulate("open", seed, slip=slip)
+    return dataset.without("uwb"), truth
+
+
+def replace_namespace(layout, **changes):
+    return type(layout)(**vars(layout) | changes)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shape", OPEN_PATHS)
+def test_open_paths_are_solved(shape):
+    """A marker every 2 m, no loop closure: three drives each, against the graph of known slip."""
+    for seed in range(3):
+        dataset, truth = open_path(OPEN_PATHS[shape], seed)
+        found, known = slam.estimate(dataset), slam.estimate(dataset, 1e-3, "arc")
+        ratio = (ate(found.poses, truth.poses, aligned=True)
+                 / ate(known.poses, truth.poses, aligned=True))
+        assert ratio < 1.1 and found.rejected.mean() < 0.01
+
+
+def test_where_cholesky_fails_qr_decides_and_has_the_same_evidence(monkeypatch):
+    dataset, _ = simulate("short", seed=4)
+    fit = fit_from_odometry(measure(dataset.without("uwb").first(400)), 1e-3)
+    expected = log_evidence(fit.problem, fit.state)
+
+    class Failing:
+        """A linearised graph whose Cholesky decomposition fails."""
+
+        def __init__(self, graph):
+            self.graph = graph
+
+        def eliminateMultifrontal(self, ordering):             # noqa: N802, GTSAM's name
+            raise RuntimeError("Indeterminate linear system")
+
+        def __getattr__(self, name):
+            return getattr(self.graph, name)
+
+    linear = optimizer.linearize
+    monkeypatch.setattr(optimizer, "linearize", lambda *arguments: Failing(linear(*arguments)))
+    assert np.isclose(log_evidence(fit.problem, fit.state), expected, atol=1e-6)
+
+
+def test_an_undetermined_variable_is_named_as_in_the_files():
+    dataset, _ = simulate("short", seed=4)
+    problem = fit_from_odometry(measure(dataset.first(200)), 1e-3).problem
+    marker, antenna = problem.measurements.marker[2], problem.measurements.antenna[1]
+    message = "Indeterminate linear system detected while working near variable\n1 (Symbol: {})."
+    for symbol, name in (("l2", f"the pose of marker {marker}"), ("w0", "the wheel parameters"),
+                         ("a1", f"the position of antenna {antenna}"), ("x0", "pose 1")):
+        assert optimizer._variable(problem.measurements, message.format(symbol)) == name
+
+
+def test_headings_are_continuous_where_frames_are_rounds_apart():
+    """Markers at both ends of three rounds only: between two frames the vehicle turns by 6 pi."""
+    dataset, truth = simulate("short", seed=5, rounds=3)
+    last = len(dataset.ticks) - 1
+    ends = (dataset.aruco.pose < 50) | (dataset.aruco.pose > last - 50)
+    found = slam.estimate(replace(dataset, uwb=None, aruco=dataset.aruco.select(ends)))
+    assert abs(truth.poses[-1, 2]) > 18
+    np.testing.assert_allclose(found.poses[:, 2], truth.poses[:, 2], atol=0.3)
+    assert np.abs(np.diff(found.poses[:, 2])).max() < 0.1

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slamlib import se2
+from slamlib.dataset import DatasetError
 from slamlib.localization.marker_increments import consecutive_increments, robust_increments
 from slamlib.sightings import consensus, sightings_by_frame
 
@@ -48,9 +49,13 @@ def localize(aruco, shared_errors=True):
     A frame is localized against its parent: the previous frame if the increment from it is usable,
     else an earlier frame (`_relocalize`). Without a parent its pose is unknown. The world frame is
     that of the first frame with a usable increment to the next. Without `shared_errors` H_j = 0:
-    increments then count as independent; this is conservative.
+    increments then count as independent; this is conservative. DatasetError if no sighting agrees
+    with the others of its marker at its pose.
     """
     sightings = sightings_by_frame(aruco)
+    if not len(sightings.frame):
+        raise DatasetError("expected sightings that agree; all contradict another one of the same "
+                           "marker at the same pose")
     increments = consecutive_increments(sightings)
     paired, confirmed = np.zeros((2, len(sightings.row)), bool)
     for rows in (increments.first, increments.second):

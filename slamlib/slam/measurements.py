@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import A, L, P, W, X
 
-from slamlib import se2
+from slamlib import odometry, se2
 from slamlib.dataset import Dataset, UwbReadings
 from slamlib.sightings import GATE, MAX_HEADING_SIGMA, POINT_GATE, Sightings, sightings_by_frame
 
@@ -34,6 +34,7 @@ class Measurements:
 
     dataset: Dataset
     frame: np.ndarray        # (f,) encoder pose of every frame, from 0
+    turn: np.ndarray         # (f-1,) rad, by odometry from each frame to the next, continuous
     sightings: Sightings     # s of them
     label: np.ndarray        # (s,) row of `marker`
     marker: np.ndarray       # (k,) ids, ascending
@@ -105,7 +106,9 @@ def measure(dataset, extra_poses=()):
     ranges = Ranges(np.searchsorted(sightings.frame, uwb.pose),
                     np.searchsorted(antenna, uwb.antenna), uwb.range, uwb.sigma)
     return Measurements(
-        dataset=dataset, frame=sightings.frame, sightings=sightings, label=label, marker=marker,
+        dataset=dataset, frame=sightings.frame,
+        turn=np.diff(odometry.dead_reckoning(dataset.ticks, dataset.vehicle)[sightings.frame, 2]),
+        sightings=sightings, label=label, marker=marker,
         oriented=np.bincount(label, has_heading, len(marker)) > 0, ranges=ranges, antenna=antenna,
         guess=guess.position[np.searchsorted(guess.antenna, antenna)] if len(antenna)
         else np.zeros((0, 2)))

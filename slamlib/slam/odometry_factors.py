@@ -13,10 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slamlib import increments, se2
+from slamlib import increments, odometry, se2
 from slamlib.slam.errors import between_error
 
-MINIMUM_INCREMENT_SIGMA = 1e-5     # m, of an increment's end: a single step has no lateral noise
+MINIMUM_SIGMA = 1e-5         # m, of an increment's end, for a vehicle that stands still
+MINIMUM_SLIP = 1e-4          # sqrt(m), of an increment's end in any direction: wheels also skid
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,9 @@ def odometry_noise(ticks, vehicle, start, end):
     a random walk. Each increment therefore has a share, by its number of steps, of the variance of
     one difference over the drive. This neglects the rounding at single poses, at most half a count.
 
+    A single step has no lateral noise, and without slip hardly any. A minimum that grows with the
+    distance, so that it does not depend on how a drive is cut, keeps the graph well conditioned.
+
     Parameters
     ----------
     ticks : (n, 2) counts; vehicle : Vehicle; start, end : (m,) poses from 0, start < end.
@@ -74,7 +78,9 @@ def odometry_noise(ticks, vehicle, start, end):
     rounding = increments.noise(ticks, vehicle, start, end, 0.0)
     slipping = increments.noise(ticks, vehicle, start, end, 1.0) - rounding
     rounding *= ((end - start) / (len(ticks) - 1))[:, None, None]
-    rounding[:, [0, 1], [0, 1]] += MINIMUM_INCREMENT_SIGMA**2
+    travelled = odometry.cumulative(np.abs(odometry.steps(ticks, vehicle)[0]))
+    minimum = MINIMUM_SIGMA**2 + MINIMUM_SLIP**2 * (travelled[end] - travelled[start])
+    rounding[:, [0, 1], [0, 1]] += minimum[:, None]
     return rounding, slipping
 
 

@@ -3,6 +3,7 @@
 GTSAM linearises its own factors and eliminates; the linearised odometry is added to its graph.
 """
 
+import re
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -35,7 +36,7 @@ def optimize(problem, state, max_steps=MAX_STEPS):
     error, steps, decrease = problem.error(state), 0, np.inf
     while steps < max_steps and decrease > CONVERGED * (1 + error):
         steps += 1
-        step = _eliminate(problem, linearize(problem, state)).optimize()
+        step, _ = _solve(problem, linearize(problem, state))
         for _ in range(MAX_HALVINGS):
             moved = state_from_values(problem.measurements, state.values.retract(step))
             new_error = problem.error(moved)
@@ -83,8 +84,8 @@ def log_evidence_of_slip(problem, state):
     def log_evidence(log_slip):
         trial = replace(problem, slip=np.exp(log_slip))
         linear = linearize(trial, state, linearized)
-        tree = _eliminate(trial, linear)
-        return -linear.error(tree.optimize()) - trial.log_determinant / 2 - tree.logDeterminant()
+        solution, log_root = _solve(trial, linear)
+        return -linear.error(solution) - trial.log_determinant / 2 - log_root
 
     return log_evidence
 
@@ -94,15 +95,36 @@ def log_evidence(problem, state):
     return log_evidence_of_slip(problem, state)(np.log(problem.slip))
 
 
-def _eliminate(problem, linear):
-    """Bayes tree of a linearised graph; DatasetError where it is singular."""
+def _solve(problem, linear):
+    """Solution (gtsam.VectorValues) of a linearised graph, and log|R|.
+
+    Cholesky decomposition of the information is fast, but fails where it is ill-conditioned. QR
+    decomposition of its root then decides whether the measurements determine every variable.
+    """
+    m = problem.measurements
     try:
-        return linear.eliminateMultifrontal(problem.measurements.ordering)
+        tree = linear.eliminateMultifrontal(m.ordering)
+        return tree.optimize(), tree.logDeterminant()
+    except RuntimeError:
+        pass
+    try:
+        net = linear.eliminateSequential(m.ordering, gtsam.EliminateQR)
+        diagonals = np.concatenate([np.diag(net.at(i).R()) for i in range(net.size())])
+        return net.optimize(), np.sum(np.log(np.abs(diagonals)))
     except RuntimeError as error:                 # GTSAM's, with the variable and much advice
-        reason = str(error).strip().partition("\n")[0]
-        raise DatasetError(
-            f"{problem.measurements.dataset.name}: expected measurements that determine every pose "
-            f"and landmark; the graph of these cannot be solved ({reason})") from None
+        raise DatasetError(f"{m.dataset.name}: expected measurements that determine every pose and "
+                           f"landmark; these do not determine {_variable(m, str(error))}") from None
+
+
+def _variable(measurements, message):
+    """What GTSAM's message about an undetermined variable names, in the words of the files."""
+    found = re.search(r"Symbol: ([alpwx])(\d+)", message)
+    kind, number = (found[1], int(found[2])) if found else ("", 0)
+    return {"x": lambda: f"pose {measurements.frame[number] + 1}",
+            "l": lambda: f"the pose of marker {measurements.marker[number]}",
+            "p": lambda: f"the position of marker {measurements.marker[number]}",
+            "a": lambda: f"the position of antenna {measurements.antenna[number]}",
+            "w": lambda: "the wheel parameters"}.get(kind, lambda: "one of them")()
 
 
 def _halved(step, keys):

@@ -10,6 +10,8 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import A, L, P, W, X
 
+from slamlib import odometry, se2
+
 
 @dataclass(frozen=True)
 class State:
@@ -47,6 +49,8 @@ def state_from_values(measurements, values):
     markers[oriented] = poses[:with_heading]                               # L before X
     markers[~oriented, :2] = points[antennas:antennas + without]           # A, P, then a row of w
     poses = poses[with_heading:]
-    poses[:, 2] = np.unwrap(poses[:, 2])
+    turn = measurements.turn                    # a frame's heading continues that of the one before
+    apart = se2.wrap(np.diff(poses[:, 2]) - turn)
+    poses[:, 2] = odometry.cumulative(turn + apart, poses[0, 2])
     return State(poses=poses, markers=markers, antennas=points[:antennas],
                  w=values.atVector(W(0)), values=values)
