@@ -139,6 +139,6 @@ def correlation_difference(covariances, reference):
     return float(np.sqrt(np.mean(difference**2))) if len(difference) else np.nan
 
 
-def along(n, count=41):
+def evenly_spaced(n, count=41):
     """Up to `count` evenly spaced indices from 1 to n - 1; [0] if n is 1."""
     return np.unique(np.linspace(min(1, n - 1), n - 1, count).astype(int))

@@ -14,7 +14,7 @@ from slamlib import se2
 
 GATE = chi2.ppf(0.999, 3)          # dimensionless, for residuals of [x, y, heading]
 POINT_GATE = chi2.ppf(0.999, 2)    # dimensionless, for residuals of [x, y]
-MAX_HEADING_SIGMA = 0.5            # rad; a larger standard deviation says nothing of the heading
+MAX_HEADING_SIGMA = 0.5            # rad; with a larger standard deviation a heading is unknown
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ PATHS = {
 CAMERA_REACH = 1.8      # m, largest distance in the plane at which a marker is in the image
 UWB_REACH = 15.0        # m, largest distance to an antenna that is measured
 LATE_RANGE_MEAN = 0.8   # m, mean of the exponential excess of late ranges
-GUESS_SIGMA = 0.35      # m per axis, standard deviation of the antenna guesses
+SIMULATED_GUESS_SIGMA = 0.35      # m per axis, standard deviation of the antenna guesses
 TABLE_2 = Vehicle()     # the assignment's nominal vehicle
 
 
@@ -69,7 +69,7 @@ def simulate(path="short", seed=0, *, slip=1e-3, late_ranges=0.0, mislabelled=0.
     antenna, antenna_in_world = _place_antennas(layout, poses, rng)
     aruco = _camera(poses, marker, marker_in_world, layout.aruco_every, mislabelled, noise, rng)
     uwb = _uwb(poses, antenna, antenna_in_world, layout.uwb_every, late_ranges, noise, rng)
-    offset = GUESS_SIGMA * rng.standard_normal(antenna_in_world.shape)
+    offset = SIMULATED_GUESS_SIGMA * rng.standard_normal(antenna_in_world.shape)
     guess = AntennaGuess(antenna, antenna_in_world + noise * offset)
     return (Dataset(name=path, vehicle=vehicle, ticks=ticks, aruco=aruco, uwb=uwb,
                     antenna_guess=guess),

@@ -57,6 +57,11 @@ class Solution:
     facts: dict = field(default_factory=dict)       # plain numbers for the summary
 
 
+def _solution(problem, dataset, poses, covariances, **others):
+    return Solution(problem=problem, title=title(problem, dataset), poses=poses,
+                    covariances=covariances, **others)
+
+
 @dataclass(frozen=True)
 class Failure:
     """A problem that could not be solved."""
@@ -69,7 +74,7 @@ class Failure:
 def problem1(dataset):
     """Solution of problem 1, odometry: equation 1 and the covariance of equation 2."""
     poses, covariances = odometry.equation2(dataset.ticks, dataset.vehicle)
-    return Solution("problem1", title("problem1", dataset), poses, covariances)
+    return _solution("problem1", dataset, poses, covariances)
 
 
 def problem2(dataset, found=None):
@@ -80,9 +85,9 @@ def problem2(dataset, found=None):
     poses[found.frame], covariances[found.frame] = found.poses, found.covariances
     known = np.isfinite(found.poses[:, 0])
     poses[found.frame[known], 2] = np.unwrap(found.poses[known, 2])
-    return Solution(
-        "problem2", title("problem2", dataset), poses, covariances,
-        world=int(found.frame[known][0]), aruco_map=_marker_map(found),
+    return _solution(
+        "problem2", dataset, poses, covariances, world=int(found.frame[known][0]),
+        aruco_map=_marker_map(found),
         facts={"measured_poses": len(found.frame), "localized_poses": int(known.sum()),
                "sightings": len(dataset.aruco.pose), "outliers": int(found.rejected.sum()),
                "unused_sightings": int(found.unused.sum())})
@@ -91,23 +96,21 @@ def problem2(dataset, found=None):
 def problem2_hint(dataset, fused=None):
     """Solution of problem 2 fused as the assignment hints: `localization.fuse_increments`."""
     fused = localization.fuse_increments(dataset) if fused is None else fused
-    return Solution("problem2_hint", title("problem2_hint", dataset), fused.poses,
-                    fused.covariances)
+    return _solution("problem2_hint", dataset, fused.poses, fused.covariances)
 
 
 def problem2_fused(dataset, fused=None):
     """Solution of problem 2 fused with odometry, with shared errors: `localization.fuse`."""
     fused = localization.fuse(dataset) if fused is None else fused
-    return Solution("problem2_fused", title("problem2_fused", dataset), fused.poses,
-                    fused.covariances, facts={
-                        "slip_sqrt_m": fused.slip, "outliers": fused.rejected, **_wheels(fused)})
+    return _solution("problem2_fused", dataset, fused.poses, fused.covariances, facts={
+        "slip_sqrt_m": fused.slip, "outliers": fused.rejected, **_wheels(fused)})
 
 
 def problem3(dataset, found=None):
     """Solution of problem 3, SLAM on odometry and markers."""
     found = slam.estimate(dataset.without("uwb")) if found is None else found
-    return Solution("problem3", title("problem3", dataset), found.poses, found.covariances,
-                    aruco_map=_marker_map(found), facts=_slam_facts(found))
+    return _solution("problem3", dataset, found.poses, found.covariances,
+                     aruco_map=_marker_map(found), facts=_slam_facts(found))
 
 
 def problem4(dataset, found=None):
@@ -115,8 +118,8 @@ def problem4(dataset, found=None):
     found = slam.estimate(dataset) if found is None else found
     weak = {antenna: int(np.sum(found.range_weight[dataset.uwb.antenna == antenna] < 0.5))
             for antenna in found.antenna.tolist()}
-    return Solution(
-        "problem4", title("problem4", dataset), found.poses, found.covariances,
+    return _solution(
+        "problem4", dataset, found.poses, found.covariances,
         aruco_map=None if dataset.aruco is None else _marker_map(found),
         uwb_map=(found.antenna, found.antenna_in_world, found.antenna_covariance),
         facts=_slam_facts(found) | {

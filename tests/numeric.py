@@ -1,6 +1,7 @@
 """Numerical derivatives and standard errors, shared by the tests."""
 
 import numpy as np
+from scipy.stats import t
 
 
 def central_differences(function, x, step=1e-6):
@@ -15,5 +16,6 @@ def central_differences(function, x, step=1e-6):
 
 
 def decided(differences):
-    """True if the mean of paired differences (s,) exceeds zero by two standard errors."""
-    return differences.mean() > 2 * differences.std(ddof=1) / np.sqrt(len(differences))
+    """True where the mean of paired differences (s,) is above zero in a t test of 2.5 %."""
+    error = differences.std(ddof=1) / np.sqrt(len(differences))
+    return differences.mean() > t.ppf(0.975, len(differences) - 1) * error

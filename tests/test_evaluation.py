@@ -83,9 +83,9 @@ def test_differences_of_covariances():
 
 
 def test_indices_along_a_path():
-    np.testing.assert_array_equal(evaluation.along(1), [0])
-    np.testing.assert_array_equal(evaluation.along(2), [1])
-    np.testing.assert_array_equal(evaluation.along(101, 3), [1, 50, 100])
+    np.testing.assert_array_equal(evaluation.evenly_spaced(1), [0])
+    np.testing.assert_array_equal(evaluation.evenly_spaced(2), [1])
+    np.testing.assert_array_equal(evaluation.evenly_spaced(101, 3), [1, 50, 100])
 
 
 def test_judging_leads_no_increment_across_a_gap():

@@ -257,12 +257,12 @@ def test_monte_carlo_is_consistent(options):
 
 @pytest.mark.slow
 def test_wheel_errors_must_be_a_variable_of_the_graph():
-    """Without slip the wheel errors dominate and are correlated: 4 drives, given the true slip."""
-    runs = studies.run(graphs.compare_graphs, range(400, 404), slip=0.0)
+    """Without slip the wheel errors dominate and are correlated: 6 drives, given the true slip."""
+    runs = studies.run(graphs.compare_graphs, range(400, 406), slip=0.0)
     variable, chain, fixed = graphs.WHEELS
-    squared = {wheels: runs[f"{wheels} arc ate"]**2 for wheels in graphs.WHEELS}
-    assert decided(squared[chain] - 4 * squared[variable])
-    assert decided(squared[fixed] - squared[chain])
+    log_error = {wheels: np.log(runs[f"{wheels} arc ate"]) for wheels in graphs.WHEELS}
+    assert decided(log_error[chain] - log_error[variable] - np.log(2))
+    assert decided(log_error[fixed] - log_error[chain])
     assert runs[f"{variable} arc nees"].mean() < 4 and runs[f"{fixed} arc nees"].mean() > 50
     for wheels in graphs.WHEELS:
         for model in ("arc", "euler"):
@@ -315,11 +315,12 @@ def test_markers_of_unknown_heading_are_mapped_as_points():
 
 @pytest.mark.slow
 def test_the_gate_has_a_smaller_error_than_hubers_kernel_with_wrong_labels():
-    """3 % wrong labels, 8 drives: the ATE differs by more than two standard errors."""
-    runs = studies.run(kernels.wrong_labels, range(8), ways=("gate", "Huber", "Tukey"),
+    """3 % wrong labels, 8 drives. Against other kernels the gate's ATE is at most 15 % larger."""
+    others = ("Cauchy", "Geman-McClure", "Tukey")
+    runs = studies.run(kernels.wrong_labels, range(8), ways=("gate", "Huber", *others),
                        mislabelled=0.03)
     assert decided(runs["Huber ate"] - runs["gate ate"])
-    assert not decided(runs["gate ate"] - runs["Tukey ate"])
+    assert all(decided(1.15 * runs[f"{way} ate"] - runs["gate ate"]) for way in others)
 
 
 def test_refine_keeps_the_accepted_measurements_if_accept_is_none():

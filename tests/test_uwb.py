@@ -175,23 +175,23 @@ def test_ranges_alone_are_consistent_although_they_hardly_determine_the_slip():
 
 @pytest.mark.slow
 def test_the_default_kernel_has_smaller_antenna_errors_than_symmetric_kernels():
-    """30 % late, with markers, 5 drives: the difference exceeds two standard errors."""
-    symmetric = ("quadratic", "Huber", "Cauchy", "gate")
-    runs = studies.run(kernels.late_ranges, range(5), late_ranges=0.3,
+    """30 % late, with markers, 10 drives; at most 10 % larger than those of the asymmetric gate."""
+    symmetric = ("quadratic", "Huber", "Cauchy", "gate", "GNC")
+    runs = studies.run(kernels.late_ranges, range(10), late_ranges=0.3,
                        ways=(*symmetric, "asymmetric Tukey", "asymmetric gate"))
     squared = {way: runs[f"{way} antenna error"]**2
                for way in (*symmetric, "asymmetric Tukey", "asymmetric gate")}
     default = squared["asymmetric Tukey"]
     assert all(decided(squared[way] - default) for way in symmetric)
-    assert not decided(default - squared["asymmetric gate"])
-    low, high = nees_band(5, 2, 0.999)
+    assert decided(1.1**2 * squared["asymmetric gate"] - default)
+    low, high = nees_band(10, 2, 0.999)
     assert low < runs["asymmetric Tukey antenna nees"].mean() < high
     assert high < runs["Huber antenna nees"].mean()
 
 
 @pytest.mark.slow
 def test_the_default_kernel_has_smaller_antenna_errors_than_convex_kernels_without_markers():
-    """15 % late, 12 drives: beyond two standard errors, and the poses are not overconfident."""
+    """15 % late, 12 drives, and the poses are not overconfident."""
     ways = ("quadratic", "Huber", "asymmetric Tukey")
     runs = studies.run(kernels.late_ranges, range(12), markers=False, late_ranges=0.15, ways=ways)
     quadratic, huber, default = (runs[f"{way} antenna error"]**2 for way in ways)

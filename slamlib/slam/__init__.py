@@ -1,6 +1,7 @@
 """Problems 3 and 4: SLAM with GTSAM on odometry, markers and ranges, as a pipeline.
 
-Each stage makes the record of the next. The modules, in the order in which they can be read:
+Each stage makes the record of the next. The modules, in the order in which they can be read
+(stage 5 runs before stage 4, and uses it for the parts of a long drive):
 
     1  measurements         Dataset -> Measurements: arrays, numbered once
     2  errors               errors of the factors and their derivatives, in numpy

@@ -7,7 +7,8 @@ blocks on and beside the diagonal. Landmarks and w form a border (B, D) that tou
                               poses      T^-1 + Y S Y^T,       poses and border  -Y S.
 
 Only the blocks of T^-1 on and beside the diagonal are needed. One forward and one backward sweep
-give them. GTSAM's marginals are the same numbers, one query at a time; a test compares them.
+give them (Kaess and Dellaert, Robotics and Autonomous Systems 57(12), 2009). GTSAM's marginals are
+the same numbers, one query at a time; a test compares them.
 """
 
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from slamlib import se2
 from slamlib.slam.errors import between_error, range_error
-from slamlib.slam.measurement_factors import GUESS_SIGMA, WEAK_SIGMA, point_factors
+from slamlib.slam.measurement_factors import GUESS_PRIOR_SIGMA, WEAK_SIGMA, point_factors
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ def covariances(problem, state):
     prior = np.zeros(begin[-1] + 3)
     for j in problem.measured.unsupported:
         prior[begin[j]:begin[j] + size[j]] = WEAK_SIGMA**-2
-    prior[begin[len(m.marker)]:begin[-1]] = GUESS_SIGMA**-2
+    prior[begin[len(m.marker)]:begin[-1]] = GUESS_PRIOR_SIGMA**-2
     prior[begin[-1]:] = 1
     pose_prior = np.diag(m.origin_sigma**-2.0)
     _, odometry = problem.odometry_jacobians(state)
@@ -99,7 +100,7 @@ def _pairs(on, off, with_w, w):
 
 
 def _banded(diagonal, beside):
-    """Lower bands (6, 3 n) of the block tridiagonal matrix, as LAPACK wants them."""
+    """Lower bands (6, 3 n) of the block tridiagonal matrix, in LAPACK's layout."""
     n = len(diagonal)
     bands = np.zeros((6, 3 * n))
     for i in range(3):

@@ -13,7 +13,7 @@ MAX_LOG_ODDS = np.log(1000)  # another place remains possible below these log od
 
 @dataclass(frozen=True)
 class AntennaDoubts:
-    """Which antennas are in doubt, and the covariances that say so."""
+    """Which antennas are in doubt, and the covariances that include it."""
 
     sentences: dict          # antenna id: why
     covariances: np.ndarray  # (a, 2, 2) m^2, in doubt at least the second moment of all places

@@ -46,6 +46,7 @@ def range_error(r, pose, antenna):
     """
     apart = antenna - pose[:, :2]
     distance = np.hypot(*apart.T)
-    along = apart[:, None, :] / np.maximum(distance, 1e-9)[:, None, None]
-    by_pose = np.concatenate([-along @ se2.rotation(pose[:, 2]), np.zeros((len(r), 1, 1))], axis=2)
-    return distance - r, by_pose, along
+    direction = apart[:, None, :] / np.maximum(distance, 1e-9)[:, None, None]
+    by_position = -direction @ se2.rotation(pose[:, 2])
+    by_pose = np.concatenate([by_position, np.zeros((len(r), 1, 1))], axis=2)
+    return distance - r, by_pose, direction

@@ -11,27 +11,28 @@ def interpolate(problem, state, pairs):
 
     Between the frames a and b a pose k depends on nothing but them and w. X_a Delta_ak(w) and
     X_b Delta_kb(w)^-1 are two estimates of it, with the independent noise of the encoder steps
-    before and after it. Their average by information is exact to first order.
+    before and after it. Their average by information is
+    the conditional mean, exact to first order.
 
     `pairs` (f-1, 9, 9) are those of `Covariances` at the State that solves the Problem.
     """
     poses, frame, d = state.poses, problem.measurements.frame, problem.measurements.dataset
     if not len(pairs):                                       # pose 1 alone: the world's origin
-        return poses, np.diag(problem.measurements.origin_sigma)[None]**2
+        return poses.copy(), np.diag(problem.measurements.origin_sigma)[None]**2
     joint = _in_world_axes(pairs, poses)
     pose = np.arange(len(d.ticks))
     last = np.searchsorted(frame, pose, side="right") - 1
     all_poses = poses[last].copy()
     covariances = np.concatenate([joint[:, :3, :3], joint[-1:, 3:6, 3:6]])[last]
-    between = np.flatnonzero(~np.isin(pose, frame))
-    if not len(between):
+    inner = np.flatnonzero(~np.isin(pose, frame))
+    if not len(inner):
         return all_poses, covariances
-    a, b = last[between], last[between] + 1
+    a, b = last[inner], last[inner] + 1
 
-    forward, forward_by_w, noise = _increments(problem, state.w, frame[a], between)
+    forward, forward_by_w, noise = _increments(problem, state.w, frame[a], inner)
     A, B = se2.compose_jacobians(poses[a], forward)
     N_a = B @ noise @ np.swapaxes(B, 1, 2)
-    ahead, ahead_by_w, noise = _increments(problem, state.w, between, frame[b])
+    ahead, ahead_by_w, noise = _increments(problem, state.w, inner, frame[b])
     back = se2.inverse(ahead)
     A_b, B_b = se2.compose_jacobians(poses[b], back)
     B_b = B_b @ se2.inverse_jacobian(ahead)
@@ -44,8 +45,8 @@ def interpolate(problem, state, pairs):
     difference[:, 2] = se2.wrap(difference[:, 2])
     F = np.concatenate([rest @ A, gain @ A_b,
                         rest @ B @ forward_by_w + gain @ B_b @ ahead_by_w], axis=2)
-    all_poses[between] = estimate + np.einsum("nij,nj->ni", gain, difference)
-    covariances[between] = F @ joint[a] @ np.swapaxes(F, 1, 2) + rest @ N_a
+    all_poses[inner] = estimate + np.einsum("nij,nj->ni", gain, difference)
+    covariances[inner] = F @ joint[a] @ np.swapaxes(F, 1, 2) + rest @ N_a
     return all_poses, (covariances + np.swapaxes(covariances, 1, 2)) / 2
 
 

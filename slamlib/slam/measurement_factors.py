@@ -17,7 +17,7 @@ from slamlib.slam.errors import point_error
 from slamlib.slam.measurements import Measurements
 
 WEAK_SIGMA = 1e5             # m and rad, prior of a marker without accepted sightings
-GUESS_SIGMA = 5.0            # m, of a guessed antenna position: decides where ranges do not
+GUESS_PRIOR_SIGMA = 5.0            # m, of a guessed antenna position: decides where ranges do not
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class MeasurementFactors:
     """The factors of the accepted measurements, with robust kernels.
 
     A weight is the share of its information that a measurement keeps: 0 if it is rejected, 1 if it
-    is accepted, and between them only in graduated non-convexity.
+    is accepted. Graduated non-convexity and chi-squared also use weights between them.
     """
 
     measurements: Measurements
@@ -73,7 +73,7 @@ class MeasurementFactors:
                 _robust(self.range_kernel, noise)))
         for k, position in enumerate(m.guess):
             graph.add(gtsam.PriorFactorPoint2(
-                A(k), position, model.Isotropic.Sigma(2, GUESS_SIGMA)))
+                A(k), position, model.Isotropic.Sigma(2, GUESS_PRIOR_SIGMA)))
         return graph
 
 

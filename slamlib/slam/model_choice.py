@@ -9,7 +9,7 @@ from slamlib.slam.odometry_factors import odometry_factors
 from slamlib.slam.optimizer import log_evidence_of_slip, optimize
 from slamlib.slam.slip import DECISIVE, maximum
 
-NEARLY = 1.0                 # log evidence
+NEARLY = 1.0                 # log evidence below DECISIVE at which the other model is solved too
 
 
 def better_model(fit, model, slip=None):

@@ -1,8 +1,8 @@
 """Stage 3: the factor graph: measurements, odometry and noise, evaluated at a state.
 
 Factors are those of the measurements (`measurement_factors.py`) and the odometry
-(`odometry_factors.py`). The same w acts in every increment. One shared variable says so;
-independent noise in each factor would not.
+(`odometry_factors.py`). The same w acts in every increment. One shared variable models this;
+independent noise in each factor does not.
 
 The odometry is linearised in numpy. As a custom factor in Python it would be slow, because GTSAM
 copies all values for every call.

@@ -1,4 +1,4 @@
-"""Stage 7: what a fit says of every encoder pose and landmark, in world axes."""
+"""Stage 7: the result of a fit, every encoder pose and landmark in world axes."""
 
 from dataclasses import dataclass, replace
 

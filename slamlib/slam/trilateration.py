@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from slamlib.slam.measurement_factors import GUESS_SIGMA
+from slamlib.slam.measurement_factors import GUESS_PRIOR_SIGMA
 
 MAX_RANGES = 150     # ranges of an antenna that are used here, evenly chosen
 SAME_PLACE = 0.2     # of the median range: places closer than this are one
@@ -56,12 +56,12 @@ def trilaterate(ranges):
 
     def residuals(place):
         distance = np.hypot(*(place - origin).T)
-        return np.concatenate([root * (distance - measured), (place - guess) / GUESS_SIGMA])
+        return np.concatenate([root * (distance - measured), (place - guess) / GUESS_PRIOR_SIGMA])
 
     def jacobian(place):
         apart = place - origin
-        along = apart / np.maximum(np.hypot(*apart.T), 1e-9)[:, None]
-        return np.concatenate([root[:, None] * along, np.eye(2) / GUESS_SIGMA])
+        direction = apart / np.maximum(np.hypot(*apart.T), 1e-9)[:, None]
+        return np.concatenate([root[:, None] * direction, np.eye(2) / GUESS_PRIOR_SIGMA])
 
     middle, radius = ranges.positions.mean(0), np.median(ranges.distance)
     angle = np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS
@@ -79,7 +79,7 @@ def trilaterate(ranges):
 def second_moment(ranges, estimate):
     """Second moment (2, 2) m^2 of an antenna's place about its estimate (2,), by AntennaRanges.
 
-    For an antenna that its ranges do not settle, so that no ellipse describes where it may be. The
+    For an antenna that its ranges do not determine, so that no ellipse describes its place. The
     posterior, the Cauchy likelihood of the ranges times the guess, is summed over a polar grid.
     """
     middle = ranges.positions.mean(0)
@@ -91,7 +91,7 @@ def second_moment(ranges, estimate):
         - ranges.distance[chosen]
     sigma = np.hypot(ranges.sigma[chosen], reach / 400)          # at least half a cell of the grid
     cost = np.sum(KERNEL_SCALE**2 * np.log1p((off / sigma / KERNEL_SCALE)**2), axis=-1) / 2 \
-        + np.sum((place - ranges.guess)**2, axis=-1) / GUESS_SIGMA**2 / 2
+        + np.sum((place - ranges.guess)**2, axis=-1) / GUESS_PRIOR_SIGMA**2 / 2
     density = radius * np.exp(cost.min() - cost)
     apart = place - estimate
     return np.einsum("abi,abj,ab->ij", apart, apart, density) / density.sum()

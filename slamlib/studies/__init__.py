@@ -1,4 +1,4 @@
-"""What argues for choices: Monte Carlo, comparisons of kernels, graphs and starts, a real log.
+"""Reasons for choices: Monte Carlo, comparisons of kernels, graphs and starts, a real log.
 
     memory       runs a trial over many seeds, and keeps its numbers between builds
     montecarlo   trials: each problem's methods against the truth of a simulated drive

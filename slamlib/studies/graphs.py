@@ -16,13 +16,13 @@ from slamlib.slam.result import SlamResult, result
 
 
 def fixed_wheels(measurements, model, relinearize_at=None):
-    """OdometryFactors of wheels without errors; parameters as of `factors.odometry_factors`."""
+    """OdometryFactors of wheels without errors; there is nothing to relinearize about."""
     factors = odometry_factors(measurements, model)
     return replace(factors, by_w=np.zeros_like(factors.by_w))
 
 
 def independent_chain(measurements, model, relinearize_at=None):
-    """OdometryFactors with wheel errors as independent noise of each; parameters as above."""
+    """OdometryFactors with wheel errors as independent noise of each, at the nominal wheels."""
     factors = odometry_factors(measurements, model)
     noise = se2.rotate_covariance(factors.by_w @ np.swapaxes(factors.by_w, 1, 2),
                                   -factors.increment[:, 2])

@@ -17,12 +17,12 @@ from slamlib.slam.optimizer import optimize
 from slamlib.slam.problem import build
 from slamlib.slam.result import result
 from slamlib.slam.robust import CAUCHY_SCALES, EARLY_GATE, LATE_KERNEL, within_gates
-from slamlib.studies.montecarlo import judge
+from slamlib.studies.montecarlo import judge_slam
 
 _kernel = gtsam.noiseModel.mEstimator
 _scalar = _kernel.Base.ReweightScheme.Scalar
-# Ways to treat ranges: GTSAM's kernel, and by how many sigmas an accepted range may be too short
-# and too long.
+# Ways to treat ranges: GTSAM's kernel with its scale in sigmas, and by how many sigmas an accepted
+# range may be too short and too long.
 RANGES = {
     "quadratic": (None, np.inf, np.inf),
     "Huber": (_kernel.Huber.Create(1.345), np.inf, np.inf),
@@ -32,7 +32,8 @@ RANGES = {
     "GNC": (None, EARLY_GATE, EARLY_GATE),
     "gate": (None, EARLY_GATE, EARLY_GATE),
     "asymmetric gate": (None, EARLY_GATE, 2.0)}
-# Ways to treat sightings: GTSAM's kernel, and whether those beyond the gate are rejected.
+# Ways to treat sightings: GTSAM's kernel with its scale in sigmas, and whether those beyond the
+# gate are rejected.
 SIGHTINGS = {
     "quadratic": (None, False),
     "Huber": (_kernel.Huber.Create(1.345), False),
@@ -115,7 +116,7 @@ def late_ranges(seed, markers=True, ways=tuple(RANGES), **options):
         start = time.process_time()
         found = result(solve_with(measure(dataset), TYPICAL_SLIP, ranges=way))
         seconds = time.process_time() - start
-        judged = judge(found, dataset, truth)
+        judged = judge_slam(found, dataset, truth)
         numbers |= {f"{way} {key}": judged[key]
                     for key in ("ate", "nees", "antenna error", "antenna nees")}
         numbers[f"{way} seconds"] = seconds
@@ -132,6 +133,6 @@ def wrong_labels(seed, ways=tuple(SIGHTINGS), **options):
     dataset, numbers = dataset.without("uwb"), {}
     for way in ways:
         found = result(solve_with(measure(dataset), TYPICAL_SLIP, sightings=way))
-        judged = judge(found, dataset, truth)
+        judged = judge_slam(found, dataset, truth)
         numbers |= {f"{way} {key}": judged[key] for key in ("ate", "nees", "map nees", "map worst")}
     return numbers

@@ -4,7 +4,7 @@ A study depends on the code of the numerics, on the packages that compute it, an
 seeds and options; it does not depend on a user's datasets. While a report is built,
 SLAMLIB_STUDIES names the folder of the studies that are kept. Without it each is computed. Times
 that a trial measures are kept as well and are not for a page. SLAMLIB_SEEDS, a number, cuts every
-study to its first seeds: for tests of pages whose numbers nobody reads.
+study to its first seeds; tests of pages use it.
 """
 
 import hashlib

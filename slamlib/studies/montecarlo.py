@@ -79,9 +79,9 @@ def problem2(seed, methods=tuple(METHODS), **options):
 
 
 def problem3(seed, **options):
-    """SLAM on odometry and markers of one drive of the short path: the numbers of `judge`."""
+    """SLAM on odometry and markers of one drive of the short path: the numbers of `judge_slam`."""
     dataset, truth = simulate("short", seed, **options)
-    return judge(slam.estimate(dataset.without("uwb")), dataset.without("uwb"), truth)
+    return judge_slam(slam.estimate(dataset.without("uwb")), dataset.without("uwb"), truth)
 
 
 def problem4(seed, path="short", markers=True, **options):
@@ -89,7 +89,7 @@ def problem4(seed, path="short", markers=True, **options):
     dataset, truth = simulate(path, seed, **options)
     dataset = dataset if markers else dataset.without("aruco")
     previous = slam.estimate(dataset.without("uwb")) if markers else None
-    return judge(slam.estimate(dataset, previous=previous), dataset, truth)
+    return judge_slam(slam.estimate(dataset, previous=previous), dataset, truth)
 
 
 def learned_slips(seed, slip):
@@ -110,7 +110,7 @@ def learned_slips(seed, slip):
     return numbers
 
 
-def judge(found, dataset, truth):
+def judge_slam(found, dataset, truth):
     """A SlamResult against the truth, as a dict of numbers.
 
     "nees" of the measured poses, "nees between" of the others, "last nees", "wheel nees"; "ate" and

@@ -23,7 +23,7 @@ from slamlib.dataset import AntennaGuess, Dataset, Truth, UwbReadings, Vehicle
 COUNT = 1e-4                # m, travel of a wheel in one count
 RADIUS, BASE = 0.2, 0.8     # m, nominal wheel radius and wheelbase
 WHEEL_SIGMA = 0.03          # standard deviation of the wheel parameters, relative to their value
-GUESS_SIGMA = 2.0           # m, standard deviation of the guessed beacons on each axis
+BEACON_GUESS_SIGMA = 2.0           # m, standard deviation of the guessed beacons on each axis
 
 
 def read_plaza2(seed=0):
@@ -45,8 +45,10 @@ def read_plaza2(seed=0):
     total = np.cumsum(np.concatenate([np.zeros((1, 2)), wheels]), axis=0)
     total = np.rint(total / COUNT).astype(int)
     ticks = np.diff(total, axis=0, prepend=np.zeros((1, 2), int))
-    vehicle = Vehicle(RADIUS, RADIUS, BASE, 2 * np.pi * RADIUS / COUNT,
-                      WHEEL_SIGMA * RADIUS, WHEEL_SIGMA * RADIUS, WHEEL_SIGMA * BASE)
+    vehicle = Vehicle(
+        right_radius=RADIUS, left_radius=RADIUS, wheelbase=BASE,
+        ticks_per_revolution=2 * np.pi * RADIUS / COUNT, sigma_right_radius=WHEEL_SIGMA * RADIUS,
+        sigma_left_radius=WHEEL_SIGMA * RADIUS, sigma_wheelbase=WHEEL_SIGMA * BASE)
 
     pose = _nearest(path[:, 0], ranges[:, 0])
     order = np.argsort(pose, kind="stable")
@@ -57,11 +59,13 @@ def read_plaza2(seed=0):
     beacons = beacons[np.argsort(beacons[:, 0])]
     antenna, place = beacons[:, 0].astype(int), beacons[:, 1:3]
     place = se2.between(start, np.column_stack([place, np.zeros(len(place))]))[:, :2]
-    guess = place + GUESS_SIGMA * np.random.default_rng(seed).standard_normal(place.shape)
+    guess = place + BEACON_GUESS_SIGMA * np.random.default_rng(seed).standard_normal(place.shape)
     poses = se2.between(start, poses)
     poses[:, 2] = np.unwrap(poses[:, 2])
-    return (Dataset("Plaza 2", vehicle, ticks, None, uwb, AntennaGuess(antenna, guess)),
-            Truth(poses, np.zeros(0, int), np.zeros((0, 3)), antenna, place, vehicle))
+    return (Dataset(name="Plaza 2", vehicle=vehicle, ticks=ticks, aruco=None, uwb=uwb,
+                    antenna_guess=AntennaGuess(antenna, guess)),
+            Truth(poses=poses, marker=np.zeros(0, int), marker_in_world=np.zeros((0, 3)),
+                  antenna=antenna, antenna_in_world=place, vehicle=vehicle))
 
 
 def _load(number):
