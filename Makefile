@@ -64,5 +64,5 @@ bench: $(READY)
 	@for b in tests/benchmarks/*.py; do $(BIN)/python "$$b" || exit 1; done
 
 clean:
-	rm -rf $(VENV) report results build slamlib.egg-info .pytest_cache
+	rm -rf $(VENV) report results build slamlib.egg-info .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
