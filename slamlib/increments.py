@@ -36,7 +36,7 @@ def noise(ticks, vehicle, start, end, slip):
     covariance of an increment without steps is zero.
 
     The sum is over positions relative to the beginning of a block of steps. Relative to pose 1,
-    its differences would lose all digits on a drive of kilometres. A block is as long as the
+    its differences would lose all digits some ten kilometres away. A block is as long as the
     longest increment, so that an increment lies in two blocks at most.
     """
     poses = odometry.dead_reckoning(ticks, vehicle, model="arc")

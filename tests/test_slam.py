@@ -327,9 +327,9 @@ def test_refine_keeps_the_accepted_measurements_if_accept_is_none():
     """Evidences can be compared only on the same measurements."""
     dataset, _ = simulate("short", seed=4, mislabelled=0.02)
     fit = fit_from_odometry(measure(dataset.without("uwb")), 1e-3)
-    native = replace(fit.problem.measured, weight=np.roll(fit.problem.measured.weight, 1))
-    again = refine(replace(fit.problem, measured=native), fit.state, 1e-3, accept=None)
-    assert again.problem.measured is native
+    measured = replace(fit.problem.measured, weight=np.roll(fit.problem.measured.weight, 1))
+    again = refine(replace(fit.problem, measured=measured), fit.state, 1e-3, accept=None)
+    assert again.problem.measured is measured
     tested = refine(again.problem, fit.state, 1e-3)
     np.testing.assert_array_equal(tested.problem.measured.weight, fit.problem.measured.weight)
 

@@ -17,7 +17,7 @@ from slamlib.slam.errors import point_error
 from slamlib.slam.measurements import Measurements
 
 WEAK_SIGMA = 1e5             # m and rad, prior of a marker without accepted sightings
-GUESS_PRIOR_SIGMA = 5.0            # m, of a guessed antenna position: decides where ranges do not
+GUESS_PRIOR_SIGMA = 5.0      # m, of a guessed antenna position: decides where ranges do not
 
 
 @dataclass(frozen=True)

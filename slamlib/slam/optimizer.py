@@ -118,13 +118,15 @@ def _solve(problem, linear):
 
 def _variable(measurements, message):
     """What GTSAM's message about an undetermined variable names, in the words of the files."""
-    found = re.search(r"Symbol: ([alpwx])(\d+)", message)
-    kind, number = (found[1], int(found[2])) if found else ("", 0)
-    return {"x": lambda: f"pose {measurements.frame[number] + 1}",
-            "l": lambda: f"the pose of marker {measurements.marker[number]}",
-            "p": lambda: f"the position of marker {measurements.marker[number]}",
-            "a": lambda: f"the position of antenna {measurements.antenna[number]}",
-            "w": lambda: "the wheel parameters"}.get(kind, lambda: "one of them")()
+    m, found = measurements, re.search(r"Symbol: ([alpwx])(\d+)", message)
+    if found is None:
+        return "one of them"
+    if found[1] == "w":
+        return "the wheel parameters"
+    name, ids = {"x": ("pose", m.frame + 1), "l": ("the pose of marker", m.marker),
+                 "p": ("the position of marker", m.marker),
+                 "a": ("the position of antenna", m.antenna)}[found[1]]
+    return f"{name} {ids[int(found[2])]}"
 
 
 def _halved(step, keys):

@@ -49,7 +49,8 @@ class Problem:
 
     def error(self, state):
         """Half the sum of squared whitened errors, kernels applied."""
-        e, _ = self.odometry_jacobians(state)
+        e, *_ = odometry_error(self.odometry, state.poses, state.w)
+        e = self.whitening @ e[..., None]
         return self.measured.graph.error(state.values) + np.sum(e**2) / 2 \
             + point_factors(self.measured, state).error
 

@@ -17,6 +17,7 @@ from slamlib.slam.optimizer import optimize
 from slamlib.slam.problem import build
 from slamlib.slam.result import result
 from slamlib.slam.robust import CAUCHY_SCALES, EARLY_GATE, LATE_KERNEL, within_gates
+from slamlib.slam.slip import assumed_slip
 from slamlib.studies.montecarlo import judge_slam
 
 _kernel = gtsam.noiseModel.mEstimator
@@ -55,7 +56,7 @@ def solve_with(measurements, slip, sightings="gate", ranges="asymmetric Tukey",
     sightings, ranges : names in SIGHTINGS and RANGES; the defaults are those of `slam.estimate`.
     antennas : as of `initialization.state_from_poses`.
     """
-    problem = build(measurements, "arc", TYPICAL_SLIP if slip is None else slip)
+    problem = build(measurements, "arc", assumed_slip(slip))
     state = odometry_state(measurements, "arc", antennas=antennas)
     for scale in CAUCHY_SCALES:
         cauchy = _kernel.Cauchy.Create(scale)
