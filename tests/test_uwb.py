@@ -1,5 +1,6 @@
 """Problem 4: range factors, kernels, start values and covariances of the antennas."""
 
+import tracemalloc
 from dataclasses import replace
 
 import gtsam
@@ -19,7 +20,13 @@ from slamlib.slam.doubts import MAX_LOG_ODDS
 from slamlib.slam.measurements import measure
 from slamlib.slam.problem import build
 from slamlib.slam.state import state_from_arrays
-from slamlib.slam.trilateration import AntennaRanges, trilaterate
+from slamlib.slam.trilateration import (
+    GUESS_PRIOR_SIGMA,
+    KERNEL_SCALE,
+    AntennaRanges,
+    second_moment,
+    trilaterate,
+)
 from slamlib.solve import problem4
 from slamlib.studies import kernels, montecarlo, plaza, starts
 
@@ -306,12 +313,45 @@ def test_covariance_is_consistent_for_an_antenna_with_few_ranges():
     assert runs["nees"].mean() < nees_band(8, 2, 0.999)[1]
 
 
+def line_of_ranges(count):
+    """Ranges without error to an antenna at (3, 4), from a straight path."""
+    path = np.column_stack([np.linspace(0, 6, count), np.zeros(count)])
+    return AntennaRanges(path, np.hypot(*(path - [3.0, 4.0]).T), np.full(count, 0.05),
+                         np.array([2.0, 3.0]))
+
+
 def test_trilateration_finds_both_mirror_places():
-    path = np.column_stack([np.linspace(0, 6, 30), np.zeros(30)])
-    r = np.hypot(*(path - [3.0, 4.0]).T)
-    places, costs = trilaterate(AntennaRanges(path, r, np.full(30, 0.05), np.array([2.0, 3.0])))
+    places, costs = trilaterate(line_of_ranges(30))
     np.testing.assert_allclose(places[:2], [[3, 4], [3, -4]], atol=1e-3)
     assert costs[0] == 0 and 0 < costs[1] < MAX_LOG_ODDS
+
+
+def test_second_moment_is_the_sum_over_the_places_of_the_grid():
+    """Every place by itself, from the definition: Cauchy likelihood, guess, area of the cell."""
+    ranges, estimate = line_of_ranges(5), np.array([2.9, 4.2])
+    reach, middle = 1.5 * ranges.distance.max() + 6.0, np.array([3.0, 0.0])
+    places, weights = [], []
+    for radius in np.arange(1, 200) * reach / 199:
+        for angle in np.arange(1, 361) * 2 * np.pi / 360:
+            place = middle + radius * np.array([np.cos(angle), np.sin(angle)])
+            off = np.hypot(*(place - ranges.positions).T) - ranges.distance
+            ratio = off / np.hypot(0.05, reach / 400) / KERNEL_SCALE
+            guess = np.sum((place - ranges.guess)**2) / GUESS_PRIOR_SIGMA**2
+            weights.append(radius * np.exp(-guess / 2)
+                           / np.prod(1 + ratio**2)**(KERNEL_SCALE**2 / 2))
+            places.append(place - estimate)
+    expected = np.einsum("ni,nj,n->ij", places, places, weights) / np.sum(weights)
+    np.testing.assert_allclose(second_moment(ranges, estimate), expected, rtol=1e-9)
+
+
+def test_second_moment_does_not_hold_the_grid_times_the_ranges():
+    """200 ranges, of which 150 are used: all at once they would take 500 MB."""
+    ranges = line_of_ranges(200)
+    tracemalloc.start()
+    second_moment(ranges, np.array([3.0, 4.0]))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 60e6
 
 
 def test_problem_4_reports_the_down_weighted_ranges():

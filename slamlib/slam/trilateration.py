@@ -80,18 +80,19 @@ def second_moment(ranges, estimate):
     """Second moment (2, 2) m^2 of an antenna's place about its estimate (2,), by AntennaRanges.
 
     For an antenna that its ranges do not determine, so that no ellipse describes its place. The
-    posterior, the Cauchy likelihood of the ranges times the guess, is summed over a polar grid.
+    posterior, the Cauchy likelihood of the ranges times the guess, is summed over a polar grid. The
+    cost is added range by range: the whole grid times all ranges would take 500 MB.
     """
     middle = ranges.positions.mean(0)
     reach = 1.5 * ranges.distance.max() + np.ptp(ranges.positions, axis=0).max()
     radius, angle = np.meshgrid(np.linspace(0, reach, 200)[1:], np.linspace(-np.pi, np.pi, 361)[1:])
     place = middle + radius[..., None] * np.stack([np.cos(angle), np.sin(angle)], -1)
     chosen = _evenly_chosen(ranges)
-    off = np.linalg.norm(place[..., None, :] - ranges.positions[chosen], axis=-1) \
-        - ranges.distance[chosen]
     sigma = np.hypot(ranges.sigma[chosen], reach / 400)          # at least half a cell of the grid
-    cost = np.sum(KERNEL_SCALE**2 * np.log1p((off / sigma / KERNEL_SCALE)**2), axis=-1) / 2 \
-        + np.sum((place - ranges.guess)**2, axis=-1) / GUESS_PRIOR_SIGMA**2 / 2
+    cost = np.sum((place - ranges.guess)**2, axis=-1) / GUESS_PRIOR_SIGMA**2 / 2
+    for origin, measured, s in zip(ranges.positions[chosen], ranges.distance[chosen], sigma):
+        off = np.hypot(place[..., 0] - origin[0], place[..., 1] - origin[1]) - measured
+        cost += KERNEL_SCALE**2 * np.log1p((off / s / KERNEL_SCALE)**2) / 2
     density = radius * np.exp(cost.min() - cost)
     apart = place - estimate
     return np.einsum("abi,abj,ab->ij", apart, apart, density) / density.sum()
