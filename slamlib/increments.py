@@ -1,9 +1,10 @@
 """Increments between any two poses by odometry, their noise, and the prior of the wheel slip.
 
-Two errors are independent from step to step: a wheel that travels s metres slips with variance
-slip^2 |s|, and each encoder rounds its cumulative count. An increment is the pose `end` in the
-frame of the pose `start`; both are arrays (m,) of indices from 0. The `ticks` (n, 2), `vehicle` and
-`model` are those of module `odometry`.
+A wheel that travels s metres slips with variance slip^2 |s|, independently from step to step. Each
+encoder rounds its cumulative count: `noise` is that of an increment by itself, `noise_in_drive`
+that of increments which are used together. An increment is the pose `end` in the frame of the pose
+`start`; both are arrays (m,) of indices from 0. The `ticks` (n, 2), `vehicle` and `model` are those
+of module `odometry`.
 """
 
 import numpy as np
@@ -11,6 +12,7 @@ import numpy as np
 from slamlib import odometry, se2
 
 SLIP_BOUNDS = (1e-5, 3e-2)  # sqrt(m), interval in which the slip is searched
+MINIMUM_SLIP = 1e-4         # sqrt(m), of an increment's end in any direction: wheels also skid
 TYPICAL_SLIP = 1e-3         # sqrt(m), median of the prior
 SLIP_FACTOR = 10.0          # no unit, one standard deviation of the prior of log slip is its log
 
@@ -66,6 +68,39 @@ def noise(ticks, vehicle, start, end, slip):
         to_end, _ = se2.compose_jacobians(np.zeros(3), lever)          # I + [0, 0, S lever]
         in_world += to_end @ summed @ np.swapaxes(to_end, 1, 2)
     return se2.rotate_covariance(in_world, -poses[start, 2])
+
+
+def noise_in_drive(ticks, vehicle, start, end):
+    """Noise of increments of one drive by encoder rounding, and by slip of 1 sqrt(m).
+
+    The counts of an increment are a difference of what the encoder shows at its end and at its
+    start. The rounding at a pose enters the increment before it and, with the opposite sign, the
+    one after it, so over consecutive increments only the first and the last rounding remain.
+    Giving each increment the variance of a whole difference, independently, would let it grow like
+    a random walk. Each increment therefore has a share, by its number of steps, of the variance of
+    one difference over the drive. This neglects the rounding at single poses, at most half a count.
+
+    A single step has no lateral noise, and without slip hardly any. The end of an increment also
+    has a skid of variance MINIMUM_SLIP^2 per metre along both axes, which no slip explains. Shares
+    and skid grow with the steps, so their sum does not depend on how a drive is cut.
+
+    Parameters
+    ----------
+    ticks : (n, 2) counts; vehicle : Vehicle; start, end : (m,) poses from 0, start <= end.
+
+    Returns
+    -------
+    rounding, slipping : (m, 3, 3) covariances in the axes of the increments' starts, the skid in
+        `rounding`. The noise for a slip in sqrt(m) is rounding + slip^2 slipping.
+    """
+    start, end = np.asarray(start), np.asarray(end)
+    rounding = noise(ticks, vehicle, start, end, 0.0)
+    slipping = noise(ticks, vehicle, start, end, 1.0) - rounding
+    rounding *= ((end - start) / max(1, len(ticks) - 1))[:, None, None]
+    travelled = odometry.cumulative(np.abs(odometry.steps(ticks, vehicle)[0]))
+    skid = MINIMUM_SLIP**2 * (travelled[end] - travelled[start])
+    rounding[:, [0, 1], [0, 1]] += skid[:, None]
+    return rounding, slipping
 
 
 def log_slip_prior(log_slip):

@@ -3,10 +3,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slamlib import odometry, se2
+from slamlib import increments, odometry, se2
+from slamlib.dataset import ArucoReadings, Dataset
 from slamlib.evaluation import anees, ate, nees_band
 from slamlib.localization import fuse, fuse_increments, localize
-from slamlib.simulation import simulate
+from slamlib.simulation import TABLE_2, simulate
 
 
 def test_perfect_data_gives_the_exact_poses():
@@ -54,6 +55,41 @@ def test_without_markers_it_is_the_first_order_propagation():
     fused = fuse(dataset, slip=0.0)
     np.testing.assert_allclose(fused.poses, poses, atol=1e-6)
     np.testing.assert_allclose(fused.covariances, covariances, atol=1e-5 * covariances[-1].max())
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_rounding_does_not_grow_with_the_number_of_frames(count):
+    """A vehicle that stands still, or travels one count in each of 2,000 steps.
+
+    Sightings are useless and everything but rounding is known. The last pose has the rounding of
+    one difference of counts (and the skid), however many frames there are. As a random walk its
+    variance would be larger by the number of frames.
+    """
+    vehicle = replace(TABLE_2, sigma_heading=1e-9, sigma_right_radius=1e-12,
+                      sigma_left_radius=1e-12, sigma_wheelbase=1e-12)
+    ticks = np.full((2001, 2), count)
+    metres = 2 * np.pi * vehicle.right_radius / vehicle.ticks_per_revolution
+    along, turned = metres**2 / 6 * np.array([1 / 2, 2 / vehicle.wheelbase**2])
+    along += increments.MINIMUM_SLIP**2 * 2000 * count * metres
+    for every in (1, 10, 2000):
+        frame = np.arange(0, 2001, every)
+        seen, useless = np.tile([1.0, 0.0, 0.0], (len(frame), 1)), 1e12 * np.eye(3)
+        aruco = ArucoReadings(frame, np.full(len(frame), 7), seen,
+                              np.tile(useless, (len(frame), 1, 1)))
+        fused = fuse(Dataset("slow", vehicle, ticks, aruco, None, None), slip=0.0)
+        variance = np.diagonal(fused.covariances, axis1=1, axis2=2)
+        np.testing.assert_allclose(variance[-1, [0, 2]], [along, turned], rtol=1e-3)
+        np.testing.assert_allclose(variance[1000, 2], turned / 2, rtol=1e-3)
+
+
+def test_slip_is_learned_although_the_encoder_is_coarse():
+    """500 counts a revolution, a frame every 10 cm: rounding is as large as slip between frames.
+
+    Rounding as a random walk would explain the slip: a quarter of it would be learned.
+    """
+    vehicle = replace(TABLE_2, ticks_per_revolution=500)
+    slips = [fuse(simulate("short", seed, slip=1e-3, vehicle=vehicle)[0]).slip for seed in range(4)]
+    assert 0.7e-3 < np.exp(np.mean(np.log(slips))) < 1.5e-3
 
 
 def test_the_hint_fuses_by_information():

@@ -73,6 +73,24 @@ def test_noise_against_simulated_slip():
     assert low < nees(errors, covariances, np.zeros_like(errors)).mean() < high
 
 
+def test_noise_in_drive_does_not_depend_on_how_the_drive_is_cut():
+    """A straight drive: the rounding of one difference of counts, the skid and the slip."""
+    ticks = np.full((2001, 2), 127)
+    whole = increments.noise(ticks, VEHICLE, [0], [2000], 0.0)[0]
+    travelled = np.sum(odometry.steps(ticks, VEHICLE)[0])
+    for every in (1, 10, 500, 2000):
+        pose = np.arange(0, 2001, every)
+        rounding, slipping = increments.noise_in_drive(ticks, VEHICLE, pose[:-1], pose[1:])
+        expected = np.diag(whole)[[0, 2]] + [increments.MINIMUM_SLIP**2 * travelled, 0.0]
+        np.testing.assert_allclose(np.diag(rounding.sum(axis=0))[[0, 2]], expected, rtol=1e-6)
+        by_slip = travelled * np.array([1 / 2, 2 / VEHICLE.wheelbase**2])
+        np.testing.assert_allclose(np.diag(slipping.sum(axis=0))[[0, 2]], by_slip, rtol=1e-6)
+    for part in increments.noise_in_drive(ticks, VEHICLE, [0, 700], [0, 700]):
+        np.testing.assert_array_equal(part, 0)
+    for part in increments.noise_in_drive(ticks[:1], VEHICLE, [0], [0]):    # a single pose
+        np.testing.assert_array_equal(part, 0)
+
+
 def test_slip_prior_is_normal_in_the_logarithm():
     typical, factor = np.log(increments.TYPICAL_SLIP), np.log(increments.SLIP_FACTOR)
     np.testing.assert_allclose(

@@ -9,7 +9,7 @@ import pytest
 from gtsam.symbol_shorthand import A, L, W, X
 from numeric import central_differences, decided
 
-from slamlib import simulation, slam, studies
+from slamlib import increments, simulation, slam, studies
 from slamlib.dataset import ArucoReadings, Dataset, Vehicle
 from slamlib.evaluation import anees, ate, nees_band
 from slamlib.simulation import simulate
@@ -95,7 +95,7 @@ def test_rounding_noise_does_not_depend_on_the_number_of_factors():
         noise, _ = odometry_factors.odometry_noise(ticks, vehicle, frame[:-1], frame[1:])
         noise = noise.sum(axis=0)
         floor = (2000 / every * odometry_factors.MINIMUM_SIGMA**2
-                 + odometry_factors.MINIMUM_SLIP**2 * 2000 * 127 * count)
+                 + increments.MINIMUM_SLIP**2 * 2000 * 127 * count)
         np.testing.assert_allclose([noise[0, 0] - floor, noise[2, 2]], [along, turned], rtol=1e-6)
 
 

@@ -7,7 +7,8 @@ Spatial Relationships in Robotics, 1990). Odometry predicts
     X' = X Delta(w),    M'_j = Delta(w)^-1 M_j,    w' = w,    P' = F P F^T + L Q L^T,
 
 with Delta(w) = Delta(w_0) + dDelta/dw (w - w_0), F and L the derivatives of the new state by the
-old one and by Delta, and Q the noise of Delta: slip and rounding of counts. The sightings Z_j of
+old one and by Delta, and Q the noise of Delta: slip, and its share of the rounding of one
+difference of counts over the drive (`increments.noise_in_drive`). The sightings Z_j of
 the new frame, with covariances C_j, measure the markers M' = H state and update
 
     state <- state + K (Z - M'),    P <- (I - K H) P',    K = P' H^T S^-1,    S = H P' H^T + C,
@@ -95,8 +96,7 @@ def _filter_input(dataset, model, vehicle):
     splits = np.searchsorted(sightings.row, np.arange(1, len(sightings.frame)))
     seen = (np.split(each, splits) for each in (sightings.marker, sightings.z, sightings.C))
     increment, by_w = increments.between_poses(ticks, vehicle, start, end, model)
-    rounding = increments.noise(ticks, vehicle, start, end, 0.0)
-    slipping = increments.noise(ticks, vehicle, start, end, 1.0) - rounding
+    rounding, slipping = increments.noise_in_drive(ticks, vehicle, start, end)
     return _FilterInput(
         dataset=dataset, model=model, vehicle=vehicle, pose=sightings.frame, increment=increment,
         by_w=by_w, rounding=rounding, slipping=slipping, frames=list(zip(*seen, strict=True)))
@@ -178,7 +178,8 @@ def _between_frames(given, slip, x, covariances, state):
     last = np.searchsorted(given.pose, pose, side="right") - 1
     start = given.pose[last]
     increment, by_w = increments.between_poses(ticks, vehicle, start, pose, given.model)
-    Q = increments.noise(ticks, vehicle, start, pose, slip)
+    rounding, slipping = increments.noise_in_drive(ticks, vehicle, start, pose)
+    Q = rounding + slip**2 * slipping
     delta = increment + np.einsum("nij,nj->ni", by_w, x[last, 3:])
     A, B = se2.compose_jacobians(x[last, :3], delta)
     F = np.concatenate([A, B @ by_w], axis=2)

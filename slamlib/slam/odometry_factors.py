@@ -13,11 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slamlib import increments, odometry, se2
+from slamlib import increments, se2
 from slamlib.slam.errors import between_error
 
 MINIMUM_SIGMA = 1e-5         # m, of an increment's end, for a vehicle that stands still
-MINIMUM_SLIP = 1e-4          # sqrt(m), of an increment's end in any direction: wheels also skid
 
 
 @dataclass(frozen=True)
@@ -55,32 +54,13 @@ def odometry_factors(measurements, model, relinearize_at=(0.0, 0.0, 0.0)):
 
 
 def odometry_noise(ticks, vehicle, start, end):
-    """Noise of increments of one drive by encoder rounding, and by slip of 1 sqrt(m).
+    """Rounding and slipping (m, 3, 3) of `increments.noise_in_drive`, with a minimum of rounding.
 
-    The counts of an increment are a difference of what the encoder shows at its end and at its
-    start. The rounding at a pose enters the increment before it and, with the opposite sign, the
-    one after it, so over consecutive increments only the first and the last rounding remain.
-    Giving each increment the variance of a whole difference, independently, would let it grow like
-    a random walk. Each increment therefore has a share, by its number of steps, of the variance of
-    one difference over the drive. This neglects the rounding at single poses, at most half a count.
-
-    A single step has no lateral noise, and without slip hardly any. A minimum that grows with the
-    distance, so that it does not depend on how a drive is cut, keeps the graph well conditioned.
-
-    Parameters
-    ----------
-    ticks : (n, 2) counts; vehicle : Vehicle; start, end : (m,) poses from 0, start < end.
-
-    Returns
-    -------
-    rounding, slipping : (m, 3, 3) covariances in the axes of the increments' starts.
+    A vehicle that stands still has no lateral noise, and a graph needs its inverse: the end of each
+    increment has at least the standard deviation MINIMUM_SIGMA along both axes.
     """
-    rounding = increments.noise(ticks, vehicle, start, end, 0.0)
-    slipping = increments.noise(ticks, vehicle, start, end, 1.0) - rounding
-    rounding *= ((end - start) / (len(ticks) - 1))[:, None, None]
-    travelled = odometry.cumulative(np.abs(odometry.steps(ticks, vehicle)[0]))
-    minimum = MINIMUM_SIGMA**2 + MINIMUM_SLIP**2 * (travelled[end] - travelled[start])
-    rounding[:, [0, 1], [0, 1]] += minimum[:, None]
+    rounding, slipping = increments.noise_in_drive(ticks, vehicle, start, end)
+    rounding[:, [0, 1], [0, 1]] += MINIMUM_SIGMA**2
     return rounding, slipping
 
 
