@@ -12,7 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
+from slamlib.doubt import Doubt
 from slamlib.textfile import BOUND, DatasetError, error, find, read_table, read_toml, require
+from slamlib.truth_frame import in_first_frame
 
 SMALLEST_SIGMA = 1e-9  # m or rad; smaller standard deviations and wheel parameters count as zero
 SMALLEST_EIGENVALUE = 1e-12  # no unit; a correlation matrix with a smaller one counts as singular
@@ -124,6 +126,7 @@ class Truth:
     antenna: np.ndarray  # (a,) int64, antenna id, ascending
     antenna_in_world: np.ndarray  # (a, 2) [x, y] in m
     vehicle: Vehicle
+    doubts: tuple[Doubt, ...] = ()
 
 
 def dataset_names(data, names=None):
@@ -165,8 +168,9 @@ def read_truth(folder):
     """Truth of one drive, from the sub-folder `truth` of its folder, or None without it.
 
     Maps without a file have length 0. Wheel parameters that `truth/vehicle.toml` does not give are
-    those of the dataset. Raises DatasetError if a file does not follow the format or has another
-    number of poses than the drive.
+    those of the dataset. Truth whose first pose is not the origin is moved there, and a doubt says
+    so. Raises DatasetError if a file does not follow the format or has another number of poses than
+    the drive.
     """
     truth_folder = find(folder, "truth")
     if truth_folder is None:
@@ -179,10 +183,11 @@ def read_truth(folder):
         raise error(path, f"expected {pose_count} poses (encoder file), found {len(poses)}")
     marker, marker_in_world = _read_map(truth_folder, "ArucoMap.txt", "marker id, x, y, theta")
     antenna, antenna_in_world = _read_map(truth_folder, "UwbMap.txt", "antenna id, x, y")
-    return Truth(poses=np.column_stack([poses[:, :2], np.unwrap(poses[:, 2])]),
-                 marker=marker, marker_in_world=marker_in_world,
-                 antenna=antenna, antenna_in_world=antenna_in_world,
-                 vehicle=_read_vehicle(truth_folder, default=vehicle))
+    truth = Truth(poses=np.column_stack([poses[:, :2], np.unwrap(poses[:, 2])]),
+                  marker=marker, marker_in_world=marker_in_world,
+                  antenna=antenna, antenna_in_world=antenna_in_world,
+                  vehicle=_read_vehicle(truth_folder, default=vehicle))
+    return in_first_frame(truth)
 
 
 def _read_vehicle(folder, default):

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from slamlib import se2
 from slamlib.dataset import DatasetError, Vehicle, dataset_names, read_dataset, read_truth
 
 FILES = {
@@ -122,6 +123,43 @@ def test_continuous_heading_is_kept_to_the_bit(folder):
     rows = [f"{i} 0 0 {h}" for i, h in enumerate(heading, start=1)]
     write(folder / "truth/vehiclePose.txt", "\n".join(rows))
     np.testing.assert_array_equal(read_truth(folder).poses[:, 2], heading)
+
+
+def test_truth_in_another_frame_is_moved_to_its_first_pose_and_said(folder):
+    """Moved out of its frame and read again, the truth is the same, and one doubt says it."""
+    clean = read_truth(folder)
+    assert clean.doubts == ()
+    first = np.array([12.5, -3.25, 2.8])
+    poses, markers = (se2.compose(first, p) for p in (clean.poses, clean.marker_in_world))
+    antennas = se2.compose(first, np.pad(clean.antenna_in_world, ((0, 0), (0, 1))))[:, :2]
+    for name, ids, rows in (
+            ("vehiclePose", np.arange(1, 5), poses), ("ArucoMap", clean.marker, markers),
+            ("UwbMap", clean.antenna, antennas)):
+        rows = np.column_stack([ids, rows]).tolist()
+        write(folder / f"truth/{name}.txt",
+              "\n".join(" ".join([f"{row[0]:.0f}", *map(repr, row[1:])]) for row in rows))
+    moved = read_truth(folder)
+    for name in ("poses", "marker_in_world", "antenna_in_world"):
+        np.testing.assert_allclose(getattr(moved, name), getattr(clean, name), atol=1e-14)
+    assert (abs(moved.marker_in_world[:, 2]) <= np.pi).all() and (abs(markers[:, 2]) > 2).any()
+    doubt, = moved.doubts
+    assert doubt.what == "truth-frame"
+    assert "(12.500 m, -3.250 m, 2.8000 rad)" in doubt.sentence
+
+
+@pytest.mark.parametrize("start, doubts", [
+    ([9e-4, -9e-4, 9e-4], 0), ([0, 0, 2 * np.pi], 0), ([0, 0, -4 * np.pi + 5e-4], 0),
+    ([2e-3, 0, 0], 1), ([0, 0, np.pi], 1), ([0, -2e-3, 2 * np.pi], 1)])
+def test_truth_that_is_rounded_or_begins_with_full_turns_is_no_doubt(folder, start, doubts):
+    path = np.add(start, [[0, 0, 0], [0.1, 0, 0], [0.2, 0, 0], [0.3, 0, 0]])
+    write(folder / "truth/vehiclePose.txt",
+          "\n".join(f"{i} {x!r} {y!r} {h!r}" for i, (x, y, h) in enumerate(path.tolist(), start=1)))
+    truth = read_truth(folder)
+    assert len(truth.doubts) == doubts
+    assert abs(truth.poses[0]).max() < (1e-12 if doubts else 1e-3)
+    expected = se2.between(path[0], path) if doubts else path - [0, 0, 2 * np.pi * round(
+        start[2] / (2 * np.pi))]
+    np.testing.assert_allclose(truth.poses, expected, atol=1e-12)
 
 
 def test_vehicle_defaults_are_table_2(folder):
