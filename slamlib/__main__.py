@@ -105,12 +105,13 @@ def _solve(options):
     print(_table(summary))
     failed = {name: row for name, row in summary["problems"].items() if "failed" in row}
     for name, row in failed.items():
-        print(f"slamlib: {name} could not be solved: {row['failed']}", file=sys.stderr)
+        print(f"slamlib: {summary['dataset']}: {name} could not be solved: {row['failed']}",
+              file=sys.stderr)
     return 3 if failed else 0
 
 
 def _table(summary):
-    """Return the summary as a table, one line for each problem."""
+    """Return the summary as a table, one line for each problem, and below it the doubts."""
     lines = [f"{summary['dataset']}: {summary['poses']} poses",
              f"{'problem':15}{'estimates':>10}{'last x, y, heading':>29}"
              f"{'their sigmas':>27}{'ATE':>11}"]
@@ -122,8 +123,7 @@ def _table(summary):
         sigma = "{:7.4f} m {:7.4f} m {:6.4f}".format(*row["last_sigma"])
         error = f"{row['ate_m']:9.4f} m" if "ate_m" in row else "no truth"
         lines.append(f"{name:15}{row['estimated_poses']:10}{pose:>29}{sigma:>27}{error:>11}")
-        lines += [f"  antenna {antenna} is in doubt: {reason}"
-                  for antenna, reason in row.get("antennas_in_doubt", {}).items()]
+    lines += [f"doubt ({doubt['what']}): {doubt['sentence']}" for doubt in summary["doubts"]]
     return "\n".join(lines)
 
 

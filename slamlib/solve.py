@@ -11,6 +11,9 @@ import numpy as np
 
 from slamlib import localization, odometry, results, se2, slam
 from slamlib.dataset import DatasetError
+from slamlib.doubt import Doubt
+
+UNSOLVABLE = (DatasetError, np.linalg.LinAlgError)  # what `find` raises where there is no solution
 
 
 @dataclass(frozen=True)
@@ -55,6 +58,7 @@ class Solution:
     aruco_map: tuple | None = None         # marker ids (k,), poses (k, 3), covariances (k, 3, 3)
     uwb_map: tuple | None = None           # antenna ids (a,), positions (a, 2), cov. (a, 2, 2)
     facts: dict = field(default_factory=dict)       # plain numbers for the summary
+    doubts: tuple[Doubt, ...] = ()
 
 
 def _solution(problem, dataset, poses, covariances, **others):
@@ -71,15 +75,43 @@ class Failure:
     reason: str                    # a sentence
 
 
-def problem1(dataset):
+def failure(problem, dataset, error):
+    """The Failure that an exception of UNSOLVABLE tells; the reason does not name the dataset."""
+    reason = str(error).removeprefix(f"{dataset.name}: ")
+    if isinstance(error, np.linalg.LinAlgError):
+        reason = f"expected matrices that can be inverted; numpy says: {reason}"
+    return Failure(problem, title(problem, dataset), reason)
+
+
+def find(problem, dataset, found=None):
+    """What the solver of a problem returns, from which `problem1` and so on make a Solution.
+
+    It is (poses, covariances), Localization, Fusion or SlamResult. `found` are such results of
+    other problems (dict by problem): problem 4 starts from problem 3 where there is one. Raises
+    UNSOLVABLE.
+    """
+    if problem == "problem1":
+        return odometry.equation2(dataset.ticks, dataset.vehicle)
+    if problem == "problem2":
+        return localization.localize(dataset.aruco)
+    if problem == "problem2_hint":
+        return localization.fuse_increments(dataset)
+    if problem == "problem2_fused":
+        return localization.fuse(dataset)
+    if problem == "problem3":
+        return slam.estimate(dataset.without("uwb"))
+    return slam.estimate(dataset, previous=(found or {}).get("problem3"))
+
+
+def problem1(dataset, found=None):
     """Solution of problem 1, odometry: equation 1 and the covariance of equation 2."""
-    poses, covariances = odometry.equation2(dataset.ticks, dataset.vehicle)
+    poses, covariances = find("problem1", dataset) if found is None else found
     return _solution("problem1", dataset, poses, covariances)
 
 
 def problem2(dataset, found=None):
     """Solution of problem 2, markers alone; the world is the frame of the first measured pose."""
-    found = localization.localize(dataset.aruco) if found is None else found
+    found = find("problem2", dataset) if found is None else found
     poses = np.full((len(dataset.ticks), 3), np.nan)
     covariances = np.full((len(dataset.ticks), 3, 3), np.nan)
     poses[found.frame], covariances[found.frame] = found.poses, found.covariances
@@ -93,29 +125,29 @@ def problem2(dataset, found=None):
                "unused_sightings": int(found.unused.sum())})
 
 
-def problem2_hint(dataset, fused=None):
+def problem2_hint(dataset, found=None):
     """Solution of problem 2 fused as the assignment hints: `localization.fuse_increments`."""
-    fused = localization.fuse_increments(dataset) if fused is None else fused
-    return _solution("problem2_hint", dataset, fused.poses, fused.covariances)
+    found = find("problem2_hint", dataset) if found is None else found
+    return _solution("problem2_hint", dataset, found.poses, found.covariances)
 
 
-def problem2_fused(dataset, fused=None):
+def problem2_fused(dataset, found=None):
     """Solution of problem 2 fused with odometry, with shared errors: `localization.fuse`."""
-    fused = localization.fuse(dataset) if fused is None else fused
-    return _solution("problem2_fused", dataset, fused.poses, fused.covariances, facts={
-        "slip_sqrt_m": fused.slip, "outliers": fused.rejected, **_wheels(fused)})
+    found = find("problem2_fused", dataset) if found is None else found
+    return _solution("problem2_fused", dataset, found.poses, found.covariances, facts={
+        "slip_sqrt_m": found.slip, "outliers": found.rejected, **_wheels(found)})
 
 
 def problem3(dataset, found=None):
     """Solution of problem 3, SLAM on odometry and markers."""
-    found = slam.estimate(dataset.without("uwb")) if found is None else found
+    found = find("problem3", dataset) if found is None else found
     return _solution("problem3", dataset, found.poses, found.covariances,
                      aruco_map=_marker_map(found), facts=_slam_facts(found))
 
 
 def problem4(dataset, found=None):
     """Solution of problem 4, SLAM on odometry, ranges, and markers if there are any."""
-    found = slam.estimate(dataset) if found is None else found
+    found = find("problem4", dataset) if found is None else found
     weak = {antenna: int(np.sum(found.range_weight[dataset.uwb.antenna == antenna] < 0.5))
             for antenna in found.antenna.tolist()}
     return _solution(
@@ -124,7 +156,14 @@ def problem4(dataset, found=None):
         uwb_map=(found.antenna, found.antenna_in_world, found.antenna_covariance),
         facts=_slam_facts(found) | {
             "ranges": len(dataset.uwb.pose), "ranges_down_weighted_by_antenna": weak,
-            "antennas_in_doubt": found.doubts})
+            "antennas_in_doubt": found.doubts},
+        doubts=tuple(_antenna_doubt(antenna, reason)
+                     for antenna, reason in found.doubts.items()))
+
+
+def _antenna_doubt(antenna, reason):
+    return Doubt("antenna", f"Antenna {antenna} is in doubt: {reason}. Its covariance includes "
+                            f"this; look at its rows in UwbReading.txt.")
 
 
 def _marker_map(found):
@@ -142,30 +181,35 @@ def _slam_facts(found):
             "log_evidence": found.log_evidence, **_wheels(found)}
 
 
-INCREMENTAL = {"problem1": problem1, "problem2": problem2, "problem2_hint": problem2_hint,
-               "problem2_fused": problem2_fused}
+SOLUTIONS = {"problem1": problem1, "problem2": problem2, "problem2_hint": problem2_hint,
+             "problem2_fused": problem2_fused, "problem3": problem3, "problem4": problem4}
 
 
-def solutions(dataset):
+def solutions(dataset, found=None):
     """Yield the Solution of every problem that the dataset's sensors allow, in order.
 
-    A problem that cannot be solved yields a Failure, and the others go on. Problem 4 starts from
-    problem 3 where there is one.
+    A problem that cannot be solved yields a Failure, and the others go on. `found` are the results
+    by `find` that are known already (dict by problem).
     """
-    previous = None
+    found = dict(found or {})
     for problem, task in PROBLEMS.items():
         if any(getattr(dataset, sensor) is None for sensor in task.sensors):
             continue
         try:
-            if problem == "problem3":
-                previous = slam.estimate(dataset.without("uwb"))
-                yield problem3(dataset, previous)
-            elif problem == "problem4":
-                yield problem4(dataset, slam.estimate(dataset, previous=previous))
-            else:
-                yield INCREMENTAL[problem](dataset)
-        except (DatasetError, np.linalg.LinAlgError) as error:
-            yield Failure(problem, title(problem, dataset), str(error))
+            if problem not in found:
+                found[problem] = find(problem, dataset, found)
+            yield SOLUTIONS[problem](dataset, found[problem])
+        except UNSOLVABLE as error:
+            yield failure(problem, dataset, error)
+
+
+def doubts_about_drive(dataset, truth):
+    """Doubts (tuple of Doubt) about a drive as a whole, before any of its problems is solved.
+
+    From its measurements, and from its Truth or None.
+    """
+    by_measurements = ()           # here is the place of localization.drive_doubts(dataset)
+    return (*by_measurements, *(() if truth is None else truth.doubts))
 
 
 def truth_in_world(solution, truth):

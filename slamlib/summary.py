@@ -2,12 +2,13 @@
 
 import json
 import time
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 
 from slamlib import evaluation, results
-from slamlib.solve import Failure, solutions, truth_in_world, write
+from slamlib.solve import Failure, doubts_about_drive, solutions, truth_in_world, write
 
 
 def solve_to_folder(dataset, truth, out):
@@ -15,9 +16,11 @@ def solve_to_folder(dataset, truth, out):
 
     The Truth, or None, serves to report errors, never to estimate. Each problem's files are written
     as it ends. The summary is the dict that is written to summary.json; a problem that could not be
-    solved has the entry "failed", a sentence.
+    solved has the entry "failed", a sentence. Its list "doubts", of "what" and "sentence", is empty
+    where the measurements agree with the files: first those about the drive, then by problem.
     """
-    summary = {"dataset": dataset.name, "poses": len(dataset.ticks), "problems": {}}
+    summary = {"dataset": dataset.name, "poses": len(dataset.ticks), "doubts": [], "problems": {}}
+    doubts = list(doubts_about_drive(dataset, truth))
     start = time.perf_counter()
     for solution in solutions(dataset):
         seconds = time.perf_counter() - start
@@ -26,7 +29,9 @@ def solve_to_folder(dataset, truth, out):
         summary["problems"][solution.problem] = {"title": solution.title, **row, "seconds": seconds}
         if not failed:
             write(out, solution)
+            doubts += solution.doubts
         start = time.perf_counter()
+    summary["doubts"] = [asdict(doubt) for doubt in dict.fromkeys(doubts)]
     text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     results.write_atomically(Path(out) / "summary.json", text.encode())
     return summary

@@ -5,6 +5,7 @@ No study is recalled that was kept before the tests.
 
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -55,6 +56,14 @@ def look():
 
 BROUGHT = ("new seed", "no_truth", "wheels_only", "waits", "one_pose", "backs_up", "one_sighting",
            "sparse")
+
+
+def contradicted(aruco):
+    """ArucoReadings with a second place for every sighting: problem 2 cannot be solved."""
+    import numpy as np
+    twice = aruco.select(np.repeat(np.arange(len(aruco.pose)), 2))
+    off = np.resize([[0.0, 0.0, 0.0], [5.0, 3.0, 1.0]], twice.marker_in_vehicle.shape)
+    return replace(twice, marker_in_vehicle=twice.marker_in_vehicle + off)
 
 
 @pytest.fixture(scope="session")

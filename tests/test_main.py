@@ -4,17 +4,21 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import contradicted
 
-from slamlib import solve
+from slamlib import se2, solve
 from slamlib.__main__ import main
 from slamlib.dataset import DatasetError, read_dataset
+from slamlib.doubt import Doubt
 from slamlib.odometry import equation2
 from slamlib.results import read_vehicle_poses
 from slamlib.simulation import simulate, write_dataset
+from slamlib.summary import solve_to_folder
 
 ROOT = Path(__file__).parents[1]
 
@@ -130,5 +134,53 @@ def test_a_problem_that_fails_costs_the_others_nothing(tmp_path, capsys, monkeyp
     assert not (tmp_path / "out" / "problem3").exists()
     assert (tmp_path / "out" / "problem4" / "UwbMap.mat").exists()
     told = capsys.readouterr()
-    assert told.err.count("problem3 could not be solved: drive: expected") == 1
+    assert told.err == ("slamlib: drive: problem3 could not be solved: expected measurements that "
+                        "determine every pose\n")
     assert "problem3       could not be solved" in told.out
+
+
+def test_doubts_are_in_the_summary_and_below_the_table(tmp_path, capsys):
+    """About the drive first, then by problem; an antenna of two ranges; truth in another frame."""
+    dataset, truth = simulate("short", seed=3)
+    dataset, poses = dataset.first(100), truth.poses[:100]
+    first = dataset.uwb.antenna[0]
+    two = np.flatnonzero(dataset.uwb.antenna == first)[:2]
+    dataset = replace(dataset, uwb=dataset.uwb.select(two))
+    truth = replace(truth, poses=se2.compose([1, 2, 0.5], poses), **{
+        name: getattr(truth, name)[:0]
+        for name in ("marker", "marker_in_world", "antenna", "antenna_in_world")})
+    write_dataset(tmp_path / "drive", dataset, truth)
+    assert main(["solve", str(tmp_path / "drive"), "--out", str(tmp_path / "out")]) == 0
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    frame, antenna = summary["doubts"]
+    assert set(frame) == set(antenna) == {"what", "sentence"}
+    assert frame["what"] == "truth-frame" and "(1.000 m, 2.000 m, 0.5000 rad)" in frame["sentence"]
+    assert antenna["what"] == "antenna"
+    assert antenna["sentence"].startswith(f"Antenna {first} is in doubt: only 2 of its ranges")
+    assert list(summary["problems"]["problem4"]["antennas_in_doubt"]) == [str(first)]
+    assert summary["problems"]["problem3"]["ate_m"] < 0.05          # in the frame of the estimate
+    told = capsys.readouterr().out.splitlines()
+    assert told[-2:] == [f"doubt ({doubt['what']}): {doubt['sentence']}" for doubt in (
+        frame, antenna)]
+
+
+def test_a_clean_drive_has_no_doubts_and_each_doubt_is_told_once(tmp_path, monkeypatch):
+    dataset, truth = simulate("short", seed=3)
+    dataset = replace(dataset.first(100), uwb=None)
+    assert solve_to_folder(dataset, None, tmp_path)["doubts"] == []
+    told = Doubt("camera-mirrored", "It is.")
+    monkeypatch.setattr("slamlib.summary.doubts_about_drive", lambda *_: (told, told))
+    monkeypatch.setattr("slamlib.summary.solutions", lambda dataset: [
+        replace(solve.problem1(dataset), doubts=(Doubt("units", "Miles."), told))])
+    assert [doubt["what"] for doubt in solve_to_folder(dataset, None, tmp_path)["doubts"]] == [
+        "camera-mirrored", "units"]
+
+
+def test_sightings_that_contradict_each_other_cost_problem_2_only(tmp_path, capsys):
+    """Every marker is seen twice at a pose, at two places, and neither is confirmed."""
+    dataset = simulate("short", seed=3)[0].first(100)
+    write_dataset(tmp_path / "drive", replace(dataset, aruco=contradicted(dataset.aruco)))
+    assert main(["solve", str(tmp_path / "drive"), "--out", str(tmp_path / "out")]) == 3
+    problems = json.loads((tmp_path / "out" / "summary.json").read_text())["problems"]
+    assert [name for name, row in problems.items() if "failed" in row] == ["problem2"]
+    assert "drive: problem2 could not be solved: expected sightings" in capsys.readouterr().err
