@@ -15,7 +15,8 @@ from slamlib.dataset import DatasetError, read_dataset, read_truth  # noqa: E402
 def main(arguments=None):
     """Run one command of `arguments` (list of str, or None for the command line's).
 
-    Returns the exit code: 0, 1 if a notebook failed, 2 for invalid input, 130 if interrupted.
+    Returns the exit code: 0, 1 if a notebook failed, 2 for invalid input, 3 if a problem could not
+    be solved, 130 if interrupted.
     """
     options = _parser().parse_args(arguments)
     try:
@@ -79,7 +80,7 @@ def _report(options):
     given = {"author": options.author, "student_number": options.student_number}
     cover = replace(cover, **{key: value for key, value in given.items() if value is not None})
     try:
-        files = build_report(
+        report = build_report(
             options.notebooks, options.data, options.report, options.results,
             datasets=[_name(dataset, options.data) for dataset in options.datasets] or None,
             jobs=options.jobs, cover=cover, code=options.code, kept=Path("build", "executed"),
@@ -89,8 +90,21 @@ def _report(options):
         return 1
     if not cover.author:
         print("report.toml names no author: the PDF's title page has none", file=sys.stderr)
-    print(f"report: {files[0]} and {files[-1]}", file=sys.stderr)
-    return 0
+    for drive in report.drives:
+        for doubt in drive.doubts:
+            print(f"{drive.name}: doubt ({doubt.what}): {doubt.sentence}", file=sys.stderr)
+    print(f"report: {report.files[0]} and {report.files[-1]}", file=sys.stderr)
+    return _exit_code((drive.name, failure.problem, failure.reason)
+                      for drive in report.drives for failure in drive.failures)
+
+
+def _exit_code(failures):
+    """Print the (dataset, problem, reason) of what could not be solved; 3 if there is any, or 0."""
+    code = 0
+    for dataset, problem, reason in failures:
+        print(f"slamlib: {dataset}: {problem} could not be solved: {reason}", file=sys.stderr)
+        code = 3
+    return code
 
 
 def _name(dataset, data):
@@ -103,11 +117,8 @@ def _solve(options):
     from slamlib.summary import solve_to_folder
     summary = solve_to_folder(read_dataset(options.folder), read_truth(options.folder), options.out)
     print(_table(summary))
-    failed = {name: row for name, row in summary["problems"].items() if "failed" in row}
-    for name, row in failed.items():
-        print(f"slamlib: {summary['dataset']}: {name} could not be solved: {row['failed']}",
-              file=sys.stderr)
-    return 3 if failed else 0
+    return _exit_code((summary["dataset"], name, row["failed"])
+                      for name, row in summary["problems"].items() if "failed" in row)
 
 
 def _table(summary):

@@ -75,6 +75,11 @@ class Failure:
     reason: str                    # a sentence
 
 
+def allows(dataset, problem):
+    """True if the dataset has the sensors that a problem needs."""
+    return all(getattr(dataset, sensor) is not None for sensor in PROBLEMS[problem].sensors)
+
+
 def failure(problem, dataset, error):
     """The Failure that an exception of UNSOLVABLE tells; the reason does not name the dataset."""
     reason = str(error).removeprefix(f"{dataset.name}: ")
@@ -192,8 +197,8 @@ def solutions(dataset, found=None):
     by `find` that are known already (dict by problem).
     """
     found = dict(found or {})
-    for problem, task in PROBLEMS.items():
-        if any(getattr(dataset, sensor) is None for sensor in task.sensors):
+    for problem in PROBLEMS:
+        if not allows(dataset, problem):
             continue
         try:
             if problem not in found:

@@ -129,7 +129,7 @@ def test_without_any_markers_chapter_2_can_still_be_read(tmp_path, kept):
     (tmp_path / "notebooks").mkdir()
     shutil.copy(ROOT / "notebooks" / "2_aruco_localization.ipynb", tmp_path / "notebooks")
     pages = build_report(tmp_path / "notebooks", tmp_path / "data", tmp_path / "report",
-                         tmp_path / "results", kept=kept)
+                         tmp_path / "results", kept=kept).files
     assert "runs on a simulated drive instead" in pages[1].read_text(encoding="utf-8")
     assert list((tmp_path / "results").iterdir()) == []
 
@@ -141,7 +141,7 @@ def captions(page):
 def test_without_truth_nothing_is_missing_from_the_numbers_or_named_in_vain(built, kept, tmp_path):
     folder, with_truth = built
     alone = build_report(ROOT / "notebooks", folder / "data", tmp_path / "report",
-                         tmp_path / "results", ["no_truth"], kept=kept)
+                         tmp_path / "results", ["no_truth"], kept=kept).files
     pages = {page.stem: page.read_text(encoding="utf-8")
              for page in alone if page.suffix == ".html"}
     for name in pages.keys() - {"index"}:

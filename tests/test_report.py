@@ -115,7 +115,7 @@ def built(tmp_path_factory):
 
 def build(root, **options):
     return build_report(root / "notebooks", root / "data", root / "report", root / "results",
-                        **options)
+                        **options).files
 
 
 def test_files_are_index_chapters_in_order_and_the_pdf(built):

@@ -150,7 +150,7 @@ def test_a_report_with_recalled_studies_equals_a_computed_one(tmp_path, capsys):
     def build(folder, **options):
         return [page.read_bytes() for page in build_report(
             tmp_path / "notebooks", tmp_path / "data", tmp_path / "report", tmp_path / "results",
-            kept=folder, **options)]
+            kept=folder, **options).files]
 
     def numbers(pages):
         return re.findall(r"nees (\[.*?\])", pages[1].decode())

@@ -5,6 +5,7 @@ from slamlib.notebook.show import (
     captioned,
     interactive,
     listed,
+    plain,
     results_folder,
     say,
     start,
@@ -13,6 +14,8 @@ from slamlib.notebook.show import (
     with_sensor,
     with_truth,
 )
+from slamlib.notebook.solving import delivered, notices, say_doubts, solved, where_possible
 
-__all__ = ["Drive", "captioned", "interactive", "listed", "results_folder", "say", "start", "table",
-           "table_text", "with_sensor", "with_truth"]
+__all__ = ["Drive", "captioned", "delivered", "interactive", "listed", "notices", "plain",
+           "results_folder", "say", "say_doubts", "solved", "start", "table", "table_text",
+           "where_possible", "with_sensor", "with_truth"]

@@ -1,6 +1,7 @@
 """Shared code of the notebooks: drives to run on, folders of results, sentences and tables."""
 
 import os
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -90,15 +91,28 @@ def with_sensor(drives, sensor, name):
     if len(without) == len(drives):
         say(f"*No dataset has {name}. This chapter runs on a simulated drive instead and writes no "
             "results.*")
-        return [Drive("simulated", *simulate("short", seed=1), made_up=True)]
+        return [simulated_drive(drives)]
     if without:
         say(f"*There are no {name} in {listed(without)}: this chapter leaves them out.*")
     return [drive for drive in drives if drive.name not in without]
 
 
+def simulated_drive(drives):
+    """A simulated short Drive that replaces all drives, with a name that none of them has."""
+    name = "simulated"
+    while any(drive.name == name for drive in drives):
+        name += " instead"
+    return Drive(name, *simulate("short", seed=1), made_up=True)
+
+
 def interactive():
     """True in JupyterLab, False while the report is built."""
     return "SLAMLIB_RESULTS" not in os.environ
+
+
+def plain(text):
+    """Text (str) with the characters escaped that Markdown would interpret."""
+    return re.sub(r"[^\w\s.,:/+-]", lambda sign: f"&#{ord(sign[0])};", text)
 
 
 def listed(names):

@@ -8,7 +8,7 @@ import resource
 import sys
 import tempfile
 import time
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from urllib.parse import quote
@@ -16,6 +16,7 @@ from urllib.parse import quote
 import nbformat
 
 from slamlib.dataset import DatasetError, dataset_names, read_dataset, read_truth
+from slamlib.notebook import notices
 from slamlib.report import cache, overview
 from slamlib.report.cover import Cover
 from slamlib.report.execution import execute, kernel_environment, read_notebook
@@ -25,9 +26,17 @@ from slamlib.report.pdf import missing_glyphs, typeset
 from slamlib.studies.memory import forget
 
 
+@dataclass(frozen=True)
+class Report:
+    """A report that was written."""
+
+    files: list  # of Path, `index.html` first
+    drives: list  # of overview.SolvedDrive, with what is doubted and what could not be solved
+
+
 def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=None, code=True,
                  kept=None, fresh=False):
-    """Execute all notebooks, write pages and PDF; return their paths (list), `index.html` first.
+    """Execute all notebooks, write pages and PDF; return the Report.
 
     Kernels read the absolute paths of data and results, and the selection, from the environment
     variables SLAMLIB_DATA, SLAMLIB_RESULTS and SLAMLIB_DATASETS (one name per line).
@@ -64,7 +73,7 @@ def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=
 
     books, written = _executed(books, {"data": data, "datasets": datasets, "jobs": jobs},
                                [data / name for name in selected], results, kept, fresh)
-    drives = overview.read_drives(data, results, selected, written)
+    drives = overview.read_drives(data, results, selected, written, notices(books.values()))
     links = [(quote(os.path.relpath(results / name, report)), name)
              for drive in drives for name in written
              if name.startswith(f"{drive.name}/") and name.endswith(".mat")]
@@ -77,7 +86,7 @@ def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=
         for name in files:
             os.replace(Path(temporary, name), report / name)
     print(_resources_used(time.monotonic() - start), file=sys.stderr)
-    return [report / name for name in files]
+    return Report([report / name for name in files], drives)
 
 
 def _checked_input(notebooks, data, datasets, cover):

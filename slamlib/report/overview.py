@@ -14,10 +14,19 @@ from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_outp
 
 from slamlib import evaluation, odometry, se2
 from slamlib.dataset import Dataset, Truth, read_dataset, read_truth
-from slamlib.notebook import listed, plotting, table_text
+from slamlib.doubt import Doubt
+from slamlib.notebook import listed, plain, plotting, table_text
 from slamlib.report.execution import NotebookError
 from slamlib.results import read_vehicle_poses
-from slamlib.solve import PROBLEMS, SENSORS, Solution, title, truth_in_world
+from slamlib.solve import (
+    PROBLEMS,
+    SENSORS,
+    Failure,
+    Solution,
+    doubts_about_drive,
+    title,
+    truth_in_world,
+)
 
 INTRODUCTION = (
     "We estimate the trajectory of a vehicle and map the landmarks from wheel encoders, markers on "
@@ -33,9 +42,11 @@ class SolvedDrive:
     dataset: Dataset
     truth: Truth | None
     solutions: tuple  # of Solution, in the order of PROBLEMS
+    doubts: tuple = ()  # of Doubt, first about the drive, then by problem
+    failures: tuple = ()  # of Failure, in the order of PROBLEMS
 
 
-def read_drives(data, results, selected, written):
+def read_drives(data, results, selected, written, notices=None):
     """Return the selected datasets with their solutions, a list of SolvedDrive, the shortest first.
 
     Parameters
@@ -44,14 +55,20 @@ def read_drives(data, results, selected, written):
     selected : list of str, names of datasets.
     written : list of str, this build's files, as `short/problem1/vehiclePose.mat` in `results`.
         NotebookError if poses cannot be read or have other shapes than the dataset's.
+    notices : dict by `notebook.notices`, the doubts and failures that this build's notebooks found.
     """
     drives = []
     for name in selected:
         problems = sorted((file.split("/")[1] for file in sorted(written) if re.fullmatch(
             f"{re.escape(name)}/[^/]+/vehiclePose.mat", file)), key=_order)
-        dataset = read_dataset(data / name)
-        drives.append(SolvedDrive(name, dataset, read_truth(data / name), tuple(
-            _read_solution(results / name / problem, dataset) for problem in problems)))
+        dataset, truth = read_dataset(data / name), read_truth(data / name)
+        solved = tuple(_read_solution(results / name / problem, dataset) for problem in problems)
+        told = (notices or {}).get(name, [])
+        doubts = [*doubts_about_drive(dataset, truth), *(x for x in told if isinstance(x, Doubt))]
+        failures = sorted((x for x in told if isinstance(x, Failure)),
+                          key=lambda failure: _order(failure.problem))
+        drives.append(SolvedDrive(name, dataset, truth, solved, tuple(dict.fromkeys(doubts)),
+                                  tuple(failures)))
     return sorted(drives, key=lambda drive: len(drive.dataset.ticks))
 
 
@@ -80,6 +97,12 @@ def summary(drives):
     """Return the opening of the report, an executed NotebookNode, for a list of SolvedDrive."""
     cells = [new_markdown_cell(f"# Overview\n\n{INTRODUCTION}", id="what"),
              new_markdown_cell("## The datasets\n\n" + _dataset_table(drives), id="datasets")]
+    if any(drive.doubts for drive in drives):
+        cells.append(new_markdown_cell("## Doubts about the data\n\n" + _doubts(drives),
+                                       id="doubts"))
+    if any(drive.failures for drive in drives):
+        cells.append(new_markdown_cell("## What could not be solved\n\n" + _failures(drives),
+                                       id="failures"))
     if solved := [drive for drive in drives if drive.solutions]:
         longest = max(solved, key=lambda drive: len(drive.dataset.ticks))
         cells += [
@@ -116,11 +139,6 @@ def index(heading, opening, chapters, files):
     return new_notebook(cells=cells)
 
 
-def plain(text):
-    """Return text (str) with the characters escaped that Markdown would interpret."""
-    return re.sub(r"[^\w\s.,:/+-]", lambda sign: f"&#{ord(sign[0])};", text)
-
-
 def _dataset_table(drives):
     rows = []
     for drive in drives:
@@ -136,9 +154,25 @@ def _dataset_table(drives):
             + "\n\nTable 1. Measurements of each drive; the path length is from odometry.")
 
 
+def _doubts(drives):
+    """Return the doubts by drive, in Markdown."""
+    return "\n\n".join(
+        f"{plain(drive.name)}:\n\n" + "\n".join(
+            f"- {plain(doubt.sentence)}" for doubt in drive.doubts)
+        for drive in drives if drive.doubts)
+
+
+def _failures(drives):
+    """Return the problems that could not be solved, with their reasons, in Markdown."""
+    return "\n".join(
+        f"- {plain(drive.name)}, {plain(failure.title)}: {plain(failure.reason)}."
+        for drive in drives for failure in drive.failures)
+
+
 def _result_table(drives):
-    problems = sorted(dict.fromkeys(solution.problem for drive in drives
-                                    for solution in drive.solutions), key=_order)
+    problems = sorted(dict.fromkeys(
+        told.problem for drive in drives for told in (*drive.solutions, *drive.failures)),
+        key=_order)
     rows = []
     for drive in drives:
         solved = {solution.problem: solution for solution in drive.solutions}
@@ -164,8 +198,9 @@ def _result_row(drive, problem, solution):
     if solution is None:
         needed = PROBLEMS[problem].sensors if problem in PROBLEMS else ()
         missing = [SENSORS[sensor] for sensor in needed if getattr(drive.dataset, sensor) is None]
-        return [*row, f"left out: no {' and no '.join(missing)}" if missing else "no result",
-                *["–"] * 4]
+        failed = any(failure.problem == problem for failure in drive.failures)
+        return [*row, f"left out: no {' and no '.join(missing)}" if missing
+                else "could not be solved" if failed else "no result", *["–"] * 4]
     known = np.flatnonzero(np.isfinite(solution.poses[:, 0]))
     if not len(known):
         return [*row, *["–"] * 4, "0"]

@@ -1,0 +1,117 @@
+"""Problems solved in a chapter. What fails or is doubted is said there, and on the first page.
+
+Each of these sentences carries its record in the metadata of the notebook's output. The report's
+first page collects the records from the executed notebooks by `notices`, so the results folders
+hold the files to hand in and nothing else, and a cached notebook keeps its records.
+"""
+
+from dataclasses import asdict
+
+from IPython.display import Markdown, display
+
+from slamlib import solve
+from slamlib.doubt import Doubt
+from slamlib.notebook.show import listed, plain, results_folder, say, simulated_drive
+
+KEY = "slamlib"  # in the metadata of outputs
+RECORDS = {"doubt": Doubt, "failure": solve.Failure}
+
+
+def solved(drives, problems, besides=()):
+    """The drives on which all `problems` can be solved, and all results.
+
+    Sentences say what could not be solved where, and why. If no drive is left, a simulated short
+    drive replaces them, so that the chapter is complete.
+
+    Parameters
+    ----------
+    drives : list of Drive
+    problems : list of str, names of `solve.PROBLEMS` that the chapter needs.
+    besides : list of str, problems that are solved first, where they can be, and not needed.
+
+    Returns
+    -------
+    drives : list of Drive
+    found : dict by problem of dicts by the name of the drive, what `solve.find` returns; also of
+        drives that the chapter leaves out.
+    """
+    found = {problem: {} for problem in (*besides, *problems)}
+    for drive in drives:
+        for problem in found:
+            _solve(drive, problem, found)
+    left = [drive for drive in drives if all(drive.name in found[p] for p in problems)]
+    if left and len(left) < len(drives):
+        without = [plain(drive.name) for drive in drives if drive not in left]
+        say(f"*This chapter leaves out {listed(without)}.*")
+    if not left:
+        say("*No drive is left, so this chapter runs on a simulated drive instead.*")
+        left, others = solved([simulated_drive(drives)], problems, besides)
+        found = {problem: found[problem] | others[problem] for problem in found}
+    return left, found
+
+
+def _solve(drive, problem, found):
+    if not solve.allows(drive.dataset, problem):
+        return
+    known = {other: by_drive[drive.name] for other, by_drive in found.items()
+             if drive.name in by_drive}
+    try:
+        found[problem][drive.name] = solve.find(problem, drive.dataset, known)
+    except solve.UNSOLVABLE as error:
+        if drive.made_up:
+            raise
+        failure = solve.failure(problem, drive.dataset, error)
+        _say(drive, f"*The problem “{failure.title}” could not be solved on {plain(drive.name)}: "
+                    f"{plain(failure.reason)}.*", failure=failure)
+
+
+def where_possible(drives, function, what):
+    """{name of the drive: function(drive)}; `what` is missing where it raises, a sentence says so.
+
+    For comparisons that a chapter shows beside the results of its problem.
+    """
+    found = {}
+    for drive in drives:
+        try:
+            found[drive.name] = function(drive)
+        except solve.UNSOLVABLE as error:
+            say(f"*{what} cannot be shown on {plain(drive.name)}: {plain(str(error))}.*")
+    return found
+
+
+def say_doubts(drive, doubts):
+    """Say each Doubt of a list about a Drive."""
+    for doubt in doubts:
+        _say(drive, f"**{plain(drive.name)}**: {plain(doubt.sentence)}", doubt=doubt)
+
+
+def _say(drive, markdown, **record):
+    (kind, value), = record.items()
+    about = {"dataset": drive.name, kind: asdict(value)}
+    display(Markdown(markdown), metadata={} if drive.made_up else {KEY: about})
+
+
+def delivered(drives, found):
+    """Write the files of all results that `solved` found, and yield what was written.
+
+    Yields (Drive, Solution, names of the files as a str); a simulated drive has no files.
+    """
+    for drive in drives:
+        for problem, by_drive in found.items():
+            if drive.name in by_drive and not drive.made_up:
+                solution = solve.SOLUTIONS[problem](drive.dataset, by_drive[drive.name])
+                folder = solve.write(results_folder(drive), solution)
+                yield drive, solution, listed(
+                    [f"`{file.name}`" for file in sorted(folder.glob("*.mat"))])
+
+
+def notices(books):
+    """What executed notebooks say of each dataset: {name: list of Doubt and Failure}, each once."""
+    found = {}
+    for book in books:
+        for cell in book.cells:
+            for output in cell.get("outputs", ()):
+                about = output.get("metadata", {}).get(KEY, {})
+                for kind in RECORDS.keys() & about.keys():
+                    found.setdefault(about["dataset"], []).append(RECORDS[kind](**about[kind]))
+    return {name: list(dict.fromkeys(records)) for name, records in found.items()}
