@@ -9,13 +9,14 @@ import pytest
 
 from slamlib import evaluation, se2
 from slamlib.dataset import read_dataset, read_truth
+from slamlib.doubt import Doubt
 from slamlib.notebook import plotting
 from slamlib.report import overview
 from slamlib.report.execution import NotebookError
 from slamlib.report.pages import html_page
 from slamlib.results import write_vehicle_poses
 from slamlib.simulation import simulate, write_dataset
-from slamlib.solve import Solution, problem1, solutions, title, write
+from slamlib.solve import Failure, Solution, problem1, solutions, title, write
 from slamlib.summary import summarize
 
 NAMES = ("all", "no_truth", "wheels_only")
@@ -100,6 +101,33 @@ def test_what_is_left_out_is_told_with_its_reason(summary):
     assert rows["wheels_only", "odometry"][-1] == "2,000"
     assert "There are no markers in wheels_only" in text
     assert "There are no UWB ranges in wheels_only" in text
+
+
+def test_doubts_and_failures_stand_on_the_first_page_only_where_there_are_any(project, summary):
+    folder, written, _ = project
+    assert not re.search("Doubts|not be solved", result_rows(summary)[1])
+    written = [name for name in written if not name.startswith("no_truth/problem3/")]
+    notices = {"no_truth": [Failure("problem3", "SLAM: odometry + ArUco", "expected | more"),
+                            Doubt("units", "Lengths are *mm*.")],
+               "all": [Doubt("antenna", "Antenna 7 is in doubt.")]}
+    drives = overview.read_drives(folder / "data", folder / "results", NAMES, written, notices)
+    told = overview.summary(drives)
+    rows, text = result_rows(told)
+    assert rows["no_truth", "SLAM: odometry + ArUco"] == ["could not be solved", *["–"] * 4]
+    doubts, failures = (next(cell.source for cell in told.cells if cell.id == name)
+                        for name in ("doubts", "failures"))
+    assert doubts.splitlines()[2:] == ["all:", "", "- Antenna 7 is in doubt.", "", "no_truth:", "",
+                                       "- Lengths are &#42;mm&#42;."]
+    assert failures.splitlines()[2:] == [
+        "- no_truth, SLAM: odometry + ArUco: expected &#124; more."]
+
+
+def test_a_problem_that_nothing_solves_is_in_the_table():
+    dataset = simulate("short", seed=5)[0]
+    failed = Failure("problem3", "SLAM: odometry + ArUco", "expected more")
+    drive = overview.SolvedDrive("x", dataset, None, (problem1(dataset),), failures=(failed,))
+    rows, _ = result_rows(overview.summary([drive]))
+    assert rows["x", "SLAM: odometry + ArUco"][0] == "could not be solved"
 
 
 def test_a_problem_that_is_not_known_appears_by_its_folder(tmp_path):

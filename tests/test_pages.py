@@ -6,18 +6,21 @@ One file, so that pytest-xdist builds the report in one process only.
 import html
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from urllib.parse import unquote, urlparse
 
 import nbformat
 import numpy as np
 import pytest
-from conftest import BROUGHT
+from conftest import BROUGHT, contradicted
 
 from slamlib.dataset import read_dataset
 from slamlib.odometry import equation2
 from slamlib.report import build_report
 from slamlib.results import read_aruco_map, read_vehicle_poses
+from slamlib.simulation import simulate, write_dataset
+from slamlib.solve import PROBLEMS
 
 ROOT = Path(__file__).parents[1]
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_seeds")]
@@ -132,6 +135,57 @@ def test_without_any_markers_chapter_2_can_still_be_read(tmp_path, kept):
                          tmp_path / "results", kept=kept).files
     assert "runs on a simulated drive instead" in pages[1].read_text(encoding="utf-8")
     assert list((tmp_path / "results").iterdir()) == []
+
+
+FAILING = """import numpy as np
+from slamlib import slam
+estimate = slam.estimate
+
+def failing(dataset, *arguments, **options):
+    if dataset.name == "bad" and dataset.uwb is None:
+        raise np.linalg.LinAlgError("Singular matrix")
+    return estimate(dataset, *arguments, **options)
+
+slam.estimate = failing"""
+
+
+def test_a_drive_that_fails_is_left_out_of_its_chapter_and_costs_the_others_nothing(tmp_path, kept):
+    """Problems 2 and 3 cannot be solved on one of two drives; problem 4 can, without problem 3."""
+    dataset, truth = simulate("short", seed=3)
+    dataset = dataset.first(300)
+    write_dataset(tmp_path / "data" / "good", dataset, replace(truth, poses=truth.poses[:300]))
+    write_dataset(tmp_path / "data" / "bad", replace(dataset, aruco=contradicted(dataset.aruco)))
+    (tmp_path / "notebooks").mkdir()
+    for source in sorted((ROOT / "notebooks").glob("[1-4]*.ipynb")):
+        book = nbformat.read(source, as_version=4)
+        book.cells.insert(1, nbformat.v4.new_code_cell(FAILING, id="failing"))
+        nbformat.write(book, tmp_path / "notebooks" / source.name)
+    report = build_report(tmp_path / "notebooks", tmp_path / "data", tmp_path / "report",
+                          tmp_path / "results", kept=kept)
+    failed = {drive.name: [failure.problem for failure in drive.failures]
+              for drive in report.drives}
+    assert failed == {"bad": ["problem2", "problem3"], "good": []}
+    written = {name: {folder.name for folder in (tmp_path / "results" / name).iterdir()}
+               for name in failed}
+    assert written["good"] - written["bad"] == {"problem2", "problem3"}
+    assert len(written["good"]) == len(PROBLEMS)
+    for page, title in ((report.files[2], "ArUco"), (report.files[3], "SLAM: odometry + ArUco")):
+        text = re.sub(r"<[^>]+>", "", html.unescape(page.read_text(encoding="utf-8")))
+        assert f"The problem “{title}” could not be solved on bad: expected" in text
+        assert "This chapter leaves out bad." in text
+    assert "leaves out bad" not in report.files[4].read_text(encoding="utf-8")
+
+
+def test_a_chapter_of_which_no_drive_can_be_solved_runs_on_a_simulated_one(tmp_path, kept):
+    dataset = simulate("short", seed=3)[0].first(100)
+    write_dataset(tmp_path / "data" / "bad", replace(dataset, aruco=contradicted(dataset.aruco)))
+    (tmp_path / "notebooks").mkdir()
+    shutil.copy(ROOT / "notebooks" / "2_aruco_localization.ipynb", tmp_path / "notebooks")
+    report = build_report(tmp_path / "notebooks", tmp_path / "data", tmp_path / "report",
+                          tmp_path / "results", kept=kept)
+    assert "runs on a simulated drive instead" in report.files[1].read_text(encoding="utf-8")
+    assert [folder.name for folder in sorted((tmp_path / "results" / "bad").iterdir())] == [
+        "problem2_fused", "problem2_hint"]
 
 
 def captions(page):

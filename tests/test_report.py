@@ -4,15 +4,19 @@ import json
 import os
 import re
 import sys
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import nbformat
 import pytest
+from conftest import contradicted
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 
 from slamlib.__main__ import main
 from slamlib.dataset import DatasetError
 from slamlib.report import NotebookError, build_report
+from slamlib.se2 import compose
+from slamlib.simulation import simulate, write_dataset
 
 TEXT = r"""# Problem 1: *odometry*
 
@@ -317,3 +321,36 @@ def test_the_command_line_sets_the_title_page_and_leaves_out_code(tmp_path, monk
     page = Page(tmp_path / "report" / "1_text.html")
     assert "printed" in page.text and "nothing changed" in capsys.readouterr().err
     assert b"Of the file" in (tmp_path / "report" / "report.pdf").read_bytes()
+
+
+def test_a_problem_that_fails_costs_one_problem_and_exit_code_3(tmp_path, monkeypatch, capsys):
+    """One of two drives contradicts itself, and its truth begins in another frame."""
+    dataset, truth = simulate("short", seed=3)
+    dataset, poses = dataset.first(50).without("uwb"), truth.poses[:50]
+    write_dataset(tmp_path / "data" / "good", dataset, replace(truth, poses=poses))
+    write_dataset(tmp_path / "data" / "bad", replace(dataset, aruco=contradicted(dataset.aruco)),
+                  replace(truth, poses=compose([7, 0, 0], poses)))
+    write(tmp_path / "notebooks", "1_solve", "# 1. Solve", ("""from slamlib.notebook import *
+drives = start()
+left, found = solved(drives, ["problem2", "problem2_hint"])
+for drive, solution, files in delivered(drives, found):
+    say(f"{drive.name}: {files}")""",))
+    monkeypatch.chdir(tmp_path)
+    reasons = []
+    for _ in range(2):                                                 # executed, then recalled
+        assert main(["report", "--jobs", "1"]) == 3
+        told = capsys.readouterr().err.splitlines()
+        reasons += [line for line in told if line.startswith("slamlib: ")]
+        assert [line for line in told if line.startswith("bad: doubt (truth-frame): In truth/")]
+    assert len(reasons) == 2 and "nothing changed" in " ".join(told)
+    assert reasons[1].startswith("slamlib: bad: problem2 could not be solved: expected sightings")
+    page, index = (Page(tmp_path / "report" / f"{name}.html").text for name in ("1_solve", "index"))
+    assert "could not be solved on bad: expected sightings" in page
+    assert "This chapter leaves out bad." in page
+    assert re.search(r"Doubts about the data.*bad:.*\(7\.000 m, 0\.000 m, 0\.0000 rad\)", index,
+                     re.DOTALL)
+    assert "bad, ArUco: expected sightings that agree" in index and "good:</p>" not in index
+    files = [file.relative_to(tmp_path / "results").as_posix()
+             for file in sorted((tmp_path / "results").rglob("*")) if file.is_file()]
+    assert files == ["bad/problem2_hint/vehiclePose.mat", "good/problem2/ArucoMap.mat",
+                     "good/problem2/vehiclePose.mat", "good/problem2_hint/vehiclePose.mat"]

@@ -112,7 +112,7 @@ def interactive():
 
 def plain(text):
     """Text (str) with the characters escaped that Markdown would interpret."""
-    return re.sub(r"[^\w\s.,:/+-]", lambda sign: f"&#{ord(sign[0])};", text)
+    return re.sub(r"[^\w\s.,:;/+-]", lambda sign: f"&#{ord(sign[0])};", text)
 
 
 def listed(names):
