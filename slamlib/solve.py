@@ -84,7 +84,7 @@ def failure(problem, dataset, error):
     """The Failure that an exception of UNSOLVABLE tells; the reason does not name the dataset."""
     reason = str(error).removeprefix(f"{dataset.name}: ")
     if isinstance(error, np.linalg.LinAlgError):
-        reason = f"expected matrices that can be inverted; numpy says: {reason}"
+        reason = f"expected matrices that numpy can compute with; it says: {reason}"
     return Failure(problem, title(problem, dataset), reason)
 
 

@@ -97,12 +97,8 @@ def summary(drives):
     """Return the opening of the report, an executed NotebookNode, for a list of SolvedDrive."""
     cells = [new_markdown_cell(f"# Overview\n\n{INTRODUCTION}", id="what"),
              new_markdown_cell("## The datasets\n\n" + _dataset_table(drives), id="datasets")]
-    if any(drive.doubts for drive in drives):
-        cells.append(new_markdown_cell("## Doubts about the data\n\n" + _doubts(drives),
-                                       id="doubts"))
-    if any(drive.failures for drive in drives):
-        cells.append(new_markdown_cell("## What could not be solved\n\n" + _failures(drives),
-                                       id="failures"))
+    if doubts := _doubts(drives):
+        cells.append(new_markdown_cell(f"## Doubts about the data\n\n{doubts}", id="doubts"))
     if solved := [drive for drive in drives if drive.solutions]:
         longest = max(solved, key=lambda drive: len(drive.dataset.ticks))
         cells += [
@@ -155,18 +151,16 @@ def _dataset_table(drives):
 
 
 def _doubts(drives):
-    """Return the doubts by drive, in Markdown."""
-    return "\n\n".join(
-        f"{plain(drive.name)}:\n\n" + "\n".join(
-            f"- {plain(doubt.sentence)}" for doubt in drive.doubts)
-        for drive in drives if drive.doubts)
-
-
-def _failures(drives):
-    """Return the problems that could not be solved, with their reasons, in Markdown."""
-    return "\n".join(
-        f"- {plain(drive.name)}, {plain(failure.title)}: {plain(failure.reason)}."
-        for drive in drives for failure in drive.failures)
+    """Return by drive what could not be solved and what is doubted, in Markdown; "" if nothing."""
+    parts = []
+    for drive in drives:
+        sentences = [f"The problem “{failure.title}” could not be solved: {failure.reason}."
+                     for failure in drive.failures]
+        sentences += [doubt.sentence for doubt in drive.doubts]
+        if sentences:
+            lines = "\n".join(f"- {plain(sentence)}" for sentence in sentences)
+            parts.append(f"{plain(drive.name)}:\n\n{lines}")
+    return "\n\n".join(parts)
 
 
 def _result_table(drives):
