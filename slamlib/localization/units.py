@@ -1,0 +1,88 @@
+"""Factors between the lengths of a drive's files: sightings, ranges, antenna guesses and wheels."""
+
+import numpy as np
+
+from slamlib import odometry, se2
+from slamlib.doubt import Doubt
+
+MIN_FACTOR = 5.0           # smaller factors are no other unit
+MIN_RANGES = 10            # ranges to an antenna that are compared with the path
+MAX_HEADING_SIGMA = 0.1    # rad, of odometry on the first part of the drive that is compared
+SMALLEST_EXTENT = 1e-3     # m, of a path that ranges are compared with
+MAX_SPREAD_FACTOR = 50.0   # by which ranges may spread less than the path
+SMALLEST_TURN = 0.05       # rad, smaller median turns are not compared
+# The standard deviation of ranges to an antenna far away is that of the path in one direction, at
+# most that of the path in the plane, and 0.7 of it if the path prefers no direction.
+RANGE_SPREAD = 0.7
+
+
+def path_and_antennas(dataset):
+    """The first part of odometry's path (p, 2) in m, and what was measured on it.
+
+    It ends where the heading's standard deviation by odometry exceeds MAX_HEADING_SIGMA. Of every
+    antenna with MIN_RANGES ranges there is a tuple: poses (m,), ranges (m,) and its guess (2,), m.
+    """
+    poses, covariances = odometry.first_order(dataset.ticks, dataset.vehicle, model="arc")
+    lost = np.flatnonzero(covariances[:, 2, 2] > MAX_HEADING_SIGMA**2)
+    path, antennas = poses[:lost[0] if len(lost) else len(poses), :2], []
+    for antenna, guess in zip(dataset.antenna_guess.antenna, dataset.antenna_guess.position):
+        ours = dataset.uwb.select(
+            (dataset.uwb.antenna == antenna) & (dataset.uwb.pose < len(path)))
+        if len(ours.pose) >= MIN_RANGES:
+            antennas.append((ours.pose, ours.range, guess))
+    return path, antennas
+
+
+def sighting_units(by_markers, by_wheels):
+    """Doubts about the units of sightings and wheels, from moving increments (n, 3) by both."""
+    lengths = [np.median(np.hypot(*each[:, :2].T)) for each in (by_markers, by_wheels)]
+    turns = [np.median(np.abs(se2.wrap(each[:, 2]))) for each in (by_markers, by_wheels)]
+    length_factor = _factor(*lengths)
+    turn_factor = _factor(*turns) if max(turns) > SMALLEST_TURN else 1.0
+    if length_factor == 1 and turn_factor == 1:
+        return []
+    if length_factor == 1:
+        look = "the unit of wheelbase in vehicle.toml (metres)"
+    elif turn_factor == 1:
+        look = ("the unit of x and y in ArucoReading.txt (metres), and of the radii and wheelbase "
+                "in vehicle.toml (metres)")
+    else:
+        look = ("the unit of the radii (metres) and ticks_per_revolution in vehicle.toml, and the "
+                "counts in encoderReading.txt")
+    return [Doubt("units", (
+        f"Between the same poses the vehicle moves by {lengths[0]:.3g} m and turns by "
+        f"{turns[0]:.3g} rad by the markers, and by {lengths[1]:.3g} m and {turns[1]:.3g} rad by "
+        f"the wheels (medians): look at {look}."))]
+
+
+def range_units(dataset):
+    """Doubts about the units of ranges and antenna guesses beside the wheels' distances."""
+    if dataset.uwb is None or dataset.antenna_guess is None:
+        return []
+    path, antennas = path_and_antennas(dataset)
+    extent = np.hypot(*path.std(axis=0))
+    if not antennas or extent < SMALLEST_EXTENT:
+        return []
+    # Between the quartiles lie 1.35 standard deviations of a normal distribution.
+    spread = np.median([np.subtract(*np.percentile(r, [75, 25])) / 1.35 for _, r, _ in antennas])
+    typical = np.median([np.median(r) for _, r, _ in antennas])
+    distance = np.median([np.median(np.hypot(*(path[pose] - guess).T))
+                          for pose, _, guess in antennas])
+    if _factor(spread, RANGE_SPREAD * extent) > 1 or spread < extent / MAX_SPREAD_FACTOR:
+        return [Doubt("units", (
+            f"The ranges to an antenna spread by {spread:.3g} m, while the vehicle is within "
+            f"{extent:.3g} m by the wheels (standard deviations; median range {typical:.3g} m): "
+            "look at the unit of UwbReading.txt (metres), and of the radii in vehicle.toml "
+            "(metres)."))]
+    if _factor(typical, distance) != 1:
+        return [Doubt("units", (
+            f"The median range is {typical:.3g} m, and the median distance from the path by the "
+            f"wheels to the guessed antennas {distance:.3g} m: look at the unit of "
+            "UwbAntennaGuess.txt (metres)."))]
+    return []
+
+
+def _factor(a, b):
+    """The ratio a / b, or 1 where it is smaller than MIN_FACTOR both ways, or b is zero."""
+    ratio = a / b if b > 0 else 1.0
+    return ratio if ratio > MIN_FACTOR or ratio < 1 / MIN_FACTOR else 1.0
