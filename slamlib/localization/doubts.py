@@ -16,6 +16,7 @@ are the same A. Ranges to antennas tell it where the antennas' guessed places ar
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.stats import chi2
 
 from slamlib import increments, se2
 from slamlib.doubt import Doubt
@@ -32,7 +33,7 @@ MIN_INCREMENTS = 10       # fewer of them decide nothing
 MOVING = 5.0              # sigmas of distance or turn, by markers or wheels, from no motion
 DECISIVE = 10.0           # log odds by which a hypothesis explains the increments better
 MOST = 0.7                # share of the increments that agree with an accepted hypothesis
-VARIANCE_FACTOR = 4.0     # by which covariances in a file may be too small without a doubt
+AGREEMENT = chi2.ppf(0.95, 3)    # squared Mahalanobis distance of increments that agree
 MIN_OFFSET = 1.0          # poses; a smaller offset is no doubt
 OFFSET_SIGMAS = 3.0       # of a decided offset
 MAX_SLIP = 5e-3           # sqrt(m), with which an offset is decided
@@ -87,6 +88,11 @@ class _Compared:
         W = self.covariance_markers + B @ self.covariance_wheels @ B.T
         return np.einsum("ni,ni->n", r, np.linalg.solve(W, r[..., None])[..., 0])
 
+    def sigma(self):
+        """Median standard deviations (2,) of distance and turn by markers, m and rad."""
+        variance = np.median(np.diagonal(self.covariance_markers, axis1=1, axis2=2), axis=0)
+        return np.sqrt([variance[0] + variance[1], variance[2]])
+
     def cost(self, squared):
         """Robust cost in units of log odds: Cauchy's, of squared Mahalanobis distances (n,)."""
         return self.weight * GATE / 2 * np.sum(np.log1p(squared / GATE))
@@ -110,7 +116,7 @@ def drive_doubts(dataset):
     compared = _compare(dataset, sightings, found)
     if len(compared.by_markers) < MIN_INCREMENTS:
         return ranges
-    units = sighting_units(compared.by_markers, compared.by_wheels)
+    units = sighting_units(compared.by_markers, compared.by_wheels, compared.sigma())
     return units + ranges if units else (
         _axes_doubts(dataset, compared, contradicting) or _odometry_doubts(compared)
         or _offset_doubts(dataset, sightings, found)) + ranges
@@ -178,7 +184,7 @@ def _axes_doubts(dataset, compared, contradicting):
     squared = [compared.squared_distances(np.array(axes.A, float)) for axes in candidates]
     costs = np.array([compared.cost(each) for each in squared])
     best = costs.argmin()
-    agreeing = np.mean(squared[best] < VARIANCE_FACTOR * GATE)
+    agreeing = np.mean(squared[best] < AGREEMENT)
     if agreeing < MOST or (not contradicting and costs[0] - costs[best] < DECISIVE):
         return [_contradiction()] if contradicting else []
     doubts = []
@@ -243,7 +249,7 @@ def _by_ranges(dataset, A):
 def _odometry_doubts(compared):
     """A Doubt if most increments by markers and by wheels disagree and no hypothesis says why."""
     squared = compared.squared_distances(np.eye(2))
-    share = np.mean(squared > VARIANCE_FACTOR * GATE)
+    share = np.mean(squared > AGREEMENT)
     if share < 0.5:
         return []
     lengths, turns = zip(*((np.median(np.hypot(*each[:, :2].T)),

@@ -24,7 +24,8 @@ from slamlib.sightings import GATE
 SLIPS = np.geomspace(1e-4, 3e-2, 6)     # sqrt(m), of which the most likely one is taken
 SIGMA_WHEEL = 0.02                      # relative, prior of the wheel parameters, not table 2's
 SIGMA_OFFSET = 100.0                    # poses, prior of the offset
-FRAMES_OF_VELOCITY = 4                  # to both sides, over which velocities are averaged
+SMOOTHING = 0.25, 1.0, 4.0              # intervals of frames, to both sides, of mean velocities
+MIN_SIGNAL = 0.5                        # share of dDelta_o/dt that is no noise of odometry
 ITERATIONS = 4                          # each at the offset, in whole poses, of the one before
 
 
@@ -32,23 +33,34 @@ def time_offset(dataset, sightings, found):
     """Poses by which the sightings are late (negative: early), its standard deviation, the slip.
 
     From a Dataset, its Sightings and the MarkerIncrements `found` between consecutive frames. The
-    slip in sqrt(m) is the most likely of SLIPS; with a large one the velocities by odometry are too
-    noisy to show an offset, and its standard deviation is no longer right.
+    slip in sqrt(m) is the most likely of SLIPS, scaled as the noise. With a large slip, velocities
+    by odometry are too noisy to show an offset, and its standard deviation is too small. Of
+    SMOOTHING, the most likely one is taken; if dDelta_o/dt is mostly noise with it, the standard
+    deviation is SIGMA_OFFSET.
     """
-    rounding, slipping = _noise(dataset, sightings.frame)
+    noise = _noise(dataset, sightings.frame)
     shared = _shared_covariances(sightings, found)
+    interval = np.median(np.diff(sightings.frame))
+    half = [max(1, int(round(each * interval))) for each in SMOOTHING]
     late, slip = 0.0, 1e-2
     for iteration in range(ITERATIONS):
         shift = -int(round(late))
-        y, A = _linear_model(dataset, sightings, found, shift)
-        C = np.where(found.usable[:, None, None], found.covariance, np.eye(3)) + rounding
-        good = found.usable & _without_outliers(y, C + slip**2 * slipping, found.usable)
-        fits = [_generalized_least_squares(y, A, C + s**2 * slipping, shared, good) for s in SLIPS]
-        _, x, sigma, slip = max((*fit, s) for fit, s in zip(fits, SLIPS))
+        y, A = _linear_model(dataset, sightings, found, shift, half)
+        C = np.where(found.usable[:, None, None], found.covariance, np.eye(3)) + noise[0]
+        good = found.usable & _without_outliers(y, C + slip**2 * noise[1], found.usable)
+        fits = [_generalized_least_squares(y, A, C + s**2 * noise[1], shared, good) for s in SLIPS]
+        (_, k, x, sigma, factor), slip = max(zip(fits, SLIPS))
         late = float(np.clip(x - shift, -SIGMA_OFFSET, SIGMA_OFFSET))
         if iteration > 0 and -int(round(late)) == shift:
             break
-    return late, sigma, slip
+    Q = (noise[0] + slip**2 * noise[1])[good]
+    of_noise = Q * min(1, 2 * half[k] / interval) / (2 * half[k]**2)
+    W = np.linalg.inv(C[good] + slip**2 * noise[1][good])
+    by_time = A[good, :, k]
+    signal = np.einsum("ni,nij,nj", by_time, W, by_time)
+    if np.einsum("nij,nji", W, of_noise) > (1 - MIN_SIGNAL) * signal:
+        sigma = SIGMA_OFFSET
+    return late, sigma, slip * np.sqrt(factor)
 
 
 def _noise(dataset, frame):
@@ -71,30 +83,37 @@ def _shared_covariances(sightings, found):
     return shared
 
 
-def _linear_model(dataset, sightings, found, shift):
-    """Differences y (l, 3) of increments and their derivatives A (l, 3, 4) by [L, w / sigma_w].
+def _linear_model(dataset, sightings, found, shift, half):
+    """Differences y (l, 3) of increments and their derivatives A (l, 3, h + 3) by [L, w / sigma_w].
 
-    Odometry is taken `shift` poses later than the frames.
+    Odometry is taken `shift` poses later than the frames. The derivatives by L are of velocities
+    that are averaged over each of h numbers of poses, `half`, to both sides.
     """
     poses = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")
     by_w = odometry.wheel_jacobian(dataset.ticks, dataset.vehicle, model="arc")
     frame, last = sightings.frame, len(poses) - 1
     t = np.clip(frame + shift, 0, last)
-    half = FRAMES_OF_VELOCITY * max(1, int(np.median(np.diff(frame))))
-    earlier, later = np.clip(t - half, 0, last), np.clip(t + half, 0, last)
-    moved = se2.between(poses[earlier], poses[later]) / np.maximum(later - earlier, 1)[:, None]
-    speed = np.copysign(np.hypot(moved[:, 0], moved[:, 1]), moved[:, 0])
-    heading = poses[t, 2]
-    velocity = np.stack([speed * np.cos(heading), speed * np.sin(heading), moved[:, 2]], -1)
     by_start, by_end = se2.between_jacobians(poses[t[:-1]], poses[t[1:]])
-    by_time = np.einsum("nij,nj->ni", by_start, velocity[:-1]) \
-        + np.einsum("nij,nj->ni", by_end, velocity[1:])
+    velocity = np.stack([_velocity(poses, t, each) for each in half], -1)
+    by_time = by_start @ velocity[:-1] + by_end @ velocity[1:]
     by_wheel = (by_start @ by_w[t[:-1]] + by_end @ by_w[t[1:]]) * (
         SIGMA_WHEEL * dataset.vehicle.wheel)
     y = np.where(found.usable[:, None], found.increment, 0) - se2.between(
         poses[t[:-1]], poses[t[1:]])
     y[:, 2] = se2.wrap(y[:, 2])
-    return y, np.concatenate([-by_time[..., None], by_wheel], axis=2)
+    return y, np.concatenate([-by_time, by_wheel], axis=2)
+
+
+def _velocity(poses, t, half):
+    """Mean velocities (f, 3) in world axes, per pose, at poses t (f,), over `half` to both sides.
+
+    The direction of motion is that of the heading.
+    """
+    earlier, later = np.clip(t - half, 0, len(poses) - 1), np.clip(t + half, 0, len(poses) - 1)
+    moved = se2.between(poses[earlier], poses[later]) / np.maximum(later - earlier, 1)[:, None]
+    speed = np.copysign(np.hypot(moved[:, 0], moved[:, 1]), moved[:, 0])
+    heading = poses[t, 2]
+    return np.stack([speed * np.cos(heading), speed * np.sin(heading), moved[:, 2]], -1)
 
 
 def _without_outliers(y, C, usable):
@@ -104,27 +123,36 @@ def _without_outliers(y, C, usable):
 
 
 def _generalized_least_squares(y, A, C, shared, good):
-    """Log likelihood, first parameter and its standard deviation, with the noise scaled to y.
+    """The most likely fit of L and w to y (l, 3), with one of the derivatives by L in A.
 
-    The noise of y (l, 3) has the covariances C (l, 3, 3), those with the next row `shared`
-    (l, 3, 3), and a common factor, which is estimated. Rows that are not `good` (l,) are left out.
-    The parameters of A (l, 3, 4) but the first have the prior N(0, 1).
+    The noise of y has the covariances C (l, 3, 3), those with the next row `shared` (l, 3, 3),
+    times a common factor, which is estimated. Rows that are not `good` (l,) are left out.
+
+    Returns
+    -------
+    log_likelihood : up to a constant.
+    k : column of A (l, 3, h + 3) that is the derivative by L.
+    x, sigma : L and its standard deviation, in poses.
+    factor : of the covariances.
     """
     pairs = good & np.append(good[1:], False)
     try:
         L = cholesky_banded(_banded(C, shared * pairs[:, None, None]), lower=True)
     except np.linalg.LinAlgError:        # shared errors larger than all errors: not this slip
-        return -np.inf, 0.0, SIGMA_OFFSET
-    columns = np.concatenate([y[..., None], A], axis=2) * good[:, None, None]
+        return -np.inf, 0, 0.0, SIGMA_OFFSET, 1.0
+    columns = np.concatenate([A, y[..., None]], axis=2) * good[:, None, None]
     white = solve_banded((5, 0), L, columns.reshape(-1, columns.shape[2]))
-    H = white[:, 1:].T @ white[:, 1:] + np.diag([SIGMA_OFFSET**-2, 1, 1, 1])
-    x = np.linalg.solve(H, white[:, 1:].T @ white[:, 0])
-    r = white[:, 0] - white[:, 1:] @ x
-    count = 3 * np.count_nonzero(good)
-    factor = max(r @ r / max(count, 1), 1e-12)
+    count = max(3 * np.count_nonzero(good), 1)
     log_determinant = np.sum(np.log(L[0].reshape(-1, 3))[good])
-    return (-count / 2 * np.log(factor) - log_determinant, x[0],
-            np.sqrt(np.linalg.inv(H)[0, 0] * max(factor, 1)))
+    fits = []
+    for k in range(A.shape[2] - 3):
+        B = white[:, [k, -4, -3, -2]]
+        H = B.T @ B + np.diag([SIGMA_OFFSET**-2, 1, 1, 1])
+        x = np.linalg.solve(H, B.T @ white[:, -1])
+        factor = max(np.sum((white[:, -1] - B @ x)**2) / count, 1e-12)
+        fits.append((-count / 2 * np.log(factor) - log_determinant, k, x[0],
+                     np.sqrt(np.linalg.inv(H)[0, 0] * max(factor, 1)), factor))
+    return max(fits)
 
 
 def _banded(diagonal, next_block):

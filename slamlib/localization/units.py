@@ -10,7 +10,7 @@ MIN_RANGES = 10            # ranges to an antenna that are compared with the pat
 MAX_HEADING_SIGMA = 0.1    # rad, of odometry on the first part of the drive that is compared
 SMALLEST_EXTENT = 1e-3     # m, of a path that ranges are compared with
 MAX_SPREAD_FACTOR = 50.0   # by which ranges may spread less than the path
-SMALLEST_TURN = 0.05       # rad, smaller median turns are not compared
+SIGNIFICANT = 5.0          # sigmas of a median distance or turn that is compared
 # The standard deviation of ranges to an antenna far away is that of the path in one direction, at
 # most that of the path in the plane, and 0.7 of it if the path prefers no direction.
 RANGE_SPREAD = 0.7
@@ -33,12 +33,17 @@ def path_and_antennas(dataset):
     return path, antennas
 
 
-def sighting_units(by_markers, by_wheels):
-    """Doubts about the units of sightings and wheels, from moving increments (n, 3) by both."""
+def sighting_units(by_markers, by_wheels, sigma):
+    """Doubts about the units of sightings and wheels, from increments (n, 3) of the moving vehicle.
+
+    `sigma` (2,) are standard deviations of distance and turn, in m and rad. Medians below
+    SIGNIFICANT of them, by markers and by wheels, are not compared.
+    """
     lengths = [np.median(np.hypot(*each[:, :2].T)) for each in (by_markers, by_wheels)]
     turns = [np.median(np.abs(se2.wrap(each[:, 2]))) for each in (by_markers, by_wheels)]
-    length_factor = _factor(*lengths)
-    turn_factor = _factor(*turns) if max(turns) > SMALLEST_TURN else 1.0
+    length_factor, turn_factor = (
+        _factor(*medians) if max(medians) > SIGNIFICANT * least else 1.0
+        for medians, least in zip((lengths, turns), sigma))
     if length_factor == 1 and turn_factor == 1:
         return []
     if length_factor == 1:
