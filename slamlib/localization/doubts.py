@@ -188,10 +188,10 @@ def _axes_doubts(dataset, compared, contradicting):
     if agreeing < MOST or (not contradicting and costs[0] - costs[best] < DECISIVE):
         return [_contradiction()] if contradicting else []
     doubts = []
-    for k in np.flatnonzero(costs < costs[best] + DECISIVE):
+    for k in np.flatnonzero(costs < costs[best] + DECISIVE):          # the drive may be straight
         nearer = np.mean(squared[k] < squared[0])
         doubts += _explanations(dataset, candidates[k], contradicting, nearer, len(squared[k]))
-    return doubts
+    return list({doubt.what: doubt for doubt in reversed(doubts)}.values())[::-1]
 
 
 def _contradiction():

@@ -1,9 +1,9 @@
 """How many poses the sightings are late against the encoder, from increments by both.
 
 If the pose ids of all sightings are too large by L poses, the increment by markers between frames
-is that of odometry between the same frames L poses earlier. With the increment Delta_o(t) by
-odometry from pose t to the next frame, its derivative by the time t and by the wheel parameters w,
-the difference of both increments is linear in L and w:
+is that of odometry between the same frames L poses earlier. A robust cost over whole poses gives a
+first value. Then the difference of both increments is linear in L and the wheel parameters w. With
+the increment Delta_o(t) by odometry from pose t to the next frame and the noise e it is
 
     Delta_m - Delta_o = -L dDelta_o/dt + dDelta_o/dw (w - w_0) + e.
 
@@ -21,6 +21,9 @@ from scipy.linalg import cholesky_banded, solve_banded
 from slamlib import increments, odometry, se2
 from slamlib.sightings import GATE
 
+SHIFTS = np.arange(-40, 41)             # poses, offsets that are looked for
+DECISIVE = 10.0                         # log odds by which one of them must be better than none
+START_SLIP = 1e-2                       # sqrt(m), slip that the robust cost assumes
 SLIPS = np.geomspace(1e-4, 3e-2, 6)     # sqrt(m), of which the most likely one is taken
 SIGMA_WHEEL = 0.02                      # relative, prior of the wheel parameters, not table 2's
 SIGMA_OFFSET = 100.0                    # poses, prior of the offset
@@ -33,34 +36,51 @@ def time_offset(dataset, sightings, found):
     """Poses by which the sightings are late (negative: early), its standard deviation, the slip.
 
     From a Dataset, its Sightings and the MarkerIncrements `found` between consecutive frames. The
-    slip in sqrt(m) is the most likely of SLIPS, scaled as the noise. With a large slip, velocities
-    by odometry are too noisy to show an offset, and its standard deviation is too small. Of
-    SMOOTHING, the most likely one is taken; if dDelta_o/dt is mostly noise with it, the standard
-    deviation is SIGMA_OFFSET.
+    standard deviation is infinite where no offset within SHIFTS can be seen. The slip in sqrt(m) is
+    the most likely of SLIPS, scaled as the noise.
     """
     noise = _noise(dataset, sightings.frame)
     shared = _shared_covariances(sightings, found)
-    interval = np.median(np.diff(sightings.frame))
-    half = [max(1, int(round(each * interval))) for each in SMOOTHING]
-    late, slip = 0.0, 1e-2
+    C = np.where(found.usable[:, None, None], found.covariance, np.eye(3)) + noise[0]
+    half = [max(1, int(round(each * np.median(np.diff(sightings.frame))))) for each in SMOOTHING]
+    slip = START_SLIP
+    late = -float(_best_shift(dataset, sightings, found, C + slip**2 * noise[1]))
     for iteration in range(ITERATIONS):
         shift = -int(round(late))
         y, A = _linear_model(dataset, sightings, found, shift, half)
-        C = np.where(found.usable[:, None, None], found.covariance, np.eye(3)) + noise[0]
         good = found.usable & _without_outliers(y, C + slip**2 * noise[1], found.usable)
-        fits = [_generalized_least_squares(y, A, C + s**2 * noise[1], shared, good) for s in SLIPS]
-        (_, k, x, sigma, factor), slip = max(zip(fits, SLIPS))
-        late = float(np.clip(x - shift, -SIGMA_OFFSET, SIGMA_OFFSET))
+        fits = [_whitened(y, A, C + s**2 * noise[1], shared, good) for s in SLIPS]
+        (_, factor, white), slip = max(zip(fits, SLIPS), key=lambda fit: fit[0][0])
+        Q = noise[0] + max(slip, increments.TYPICAL_SLIP)**2 * noise[1]
+        W = np.linalg.inv(C + slip**2 * noise[1])[good]
+        possible = [k for k in range(len(half)) if _noise_share(
+            A[good, :, k], W, Q[good], half[k], sightings) < 1 - MIN_SIGNAL]
+        if not possible:
+            return 0.0, np.inf, slip * np.sqrt(factor)
+        sigma, x = min(_offset(white, k) for k in possible)
+        late, sigma = x - shift, sigma * np.sqrt(max(factor, 1))
+        if abs(late) > SHIFTS[-1]:
+            return 0.0, np.inf, slip * np.sqrt(factor)
         if iteration > 0 and -int(round(late)) == shift:
             break
-    Q = (noise[0] + slip**2 * noise[1])[good]
-    of_noise = Q * min(1, 2 * half[k] / interval) / (2 * half[k]**2)
-    W = np.linalg.inv(C[good] + slip**2 * noise[1][good])
-    by_time = A[good, :, k]
-    signal = np.einsum("ni,nij,nj", by_time, W, by_time)
-    if np.einsum("nij,nji", W, of_noise) > (1 - MIN_SIGNAL) * signal:
-        sigma = SIGMA_OFFSET
     return late, sigma, slip * np.sqrt(factor)
+
+
+def _best_shift(dataset, sightings, found, W):
+    """By how many poses odometry must be later to fit best, 0 if not decided, by a robust cost.
+
+    It is Cauchy's, of the squared Mahalanobis distances of increments with covariances W (l, 3, 3).
+    """
+    poses = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")
+    t = np.clip(sightings.frame + SHIFTS[:, None], 0, len(poses) - 1)
+    r = found.increment - se2.between(poses[t[:, :-1]], poses[t[:, 1:]])
+    r = r[:, found.usable]
+    r[..., 2] = se2.wrap(r[..., 2])
+    root = np.linalg.cholesky(np.linalg.inv(W[found.usable]))
+    white = np.einsum("kni,nij->knj", r, root)
+    cost = GATE / 2 * np.log1p(np.sum(white**2, axis=2) / GATE).sum(axis=1)
+    best = SHIFTS[cost.argmin()]
+    return best if cost[SHIFTS == 0] - cost.min() > DECISIVE else 0
 
 
 def _noise(dataset, frame):
@@ -94,7 +114,8 @@ def _linear_model(dataset, sightings, found, shift, half):
     frame, last = sightings.frame, len(poses) - 1
     t = np.clip(frame + shift, 0, last)
     by_start, by_end = se2.between_jacobians(poses[t[:-1]], poses[t[1:]])
-    velocity = np.stack([_velocity(poses, t, each) for each in half], -1)
+    travelled = odometry.cumulative(odometry.steps(dataset.ticks, dataset.vehicle)[0])
+    velocity = np.stack([_velocity(poses[:, 2], travelled, t, each) for each in half], -1)
     by_time = by_start @ velocity[:-1] + by_end @ velocity[1:]
     by_wheel = (by_start @ by_w[t[:-1]] + by_end @ by_w[t[1:]]) * (
         SIGMA_WHEEL * dataset.vehicle.wheel)
@@ -104,16 +125,17 @@ def _linear_model(dataset, sightings, found, shift, half):
     return y, np.concatenate([-by_time, by_wheel], axis=2)
 
 
-def _velocity(poses, t, half):
-    """Mean velocities (f, 3) in world axes, per pose, at poses t (f,), over `half` to both sides.
+def _velocity(heading, travelled, t, half):
+    """Velocities (f, 3) in world axes, m and rad per pose, at the poses t (f,).
 
-    The direction of motion is that of the heading.
+    The speed and turn rate are means over `half` poses to both sides, from the headings and the
+    travelled distances (n,); the direction is that of the heading.
     """
-    earlier, later = np.clip(t - half, 0, len(poses) - 1), np.clip(t + half, 0, len(poses) - 1)
-    moved = se2.between(poses[earlier], poses[later]) / np.maximum(later - earlier, 1)[:, None]
-    speed = np.copysign(np.hypot(moved[:, 0], moved[:, 1]), moved[:, 0])
-    heading = poses[t, 2]
-    return np.stack([speed * np.cos(heading), speed * np.sin(heading), moved[:, 2]], -1)
+    earlier, later = np.clip(t - half, 0, len(heading) - 1), np.clip(t + half, 0, len(heading) - 1)
+    steps = np.maximum(later - earlier, 1)
+    speed = (travelled[later] - travelled[earlier]) / steps
+    turn_rate = (heading[later] - heading[earlier]) / steps
+    return np.stack([speed * np.cos(heading[t]), speed * np.sin(heading[t]), turn_rate], -1)
 
 
 def _without_outliers(y, C, usable):
@@ -122,37 +144,50 @@ def _without_outliers(y, C, usable):
     return squared < GATE * max(1, np.median(squared[usable]) / 2.37)   # 2.37: chi-squared, 3 dof
 
 
-def _generalized_least_squares(y, A, C, shared, good):
-    """The most likely fit of L and w to y (l, 3), with one of the derivatives by L in A.
+def _whitened(y, A, C, shared, good):
+    """Log likelihood, factor of the noise and the whitened columns [A, y], (3l, h + 4).
 
-    The noise of y has the covariances C (l, 3, 3), those with the next row `shared` (l, 3, 3),
-    times a common factor, which is estimated. Rows that are not `good` (l,) are left out.
-
-    Returns
-    -------
-    log_likelihood : up to a constant.
-    k : column of A (l, 3, h + 3) that is the derivative by L.
-    x, sigma : L and its standard deviation, in poses.
-    factor : of the covariances.
+    The noise of y (l, 3) has the covariances C (l, 3, 3), those with the next row `shared`
+    (l, 3, 3), times the factor. Rows that are not `good` (l,) are left out. The likelihood is of
+    the widest smoothing of the derivatives A (l, 3, h + 3), up to a constant.
     """
     pairs = good & np.append(good[1:], False)
+    columns = np.concatenate([A, y[..., None]], axis=2) * good[:, None, None]
+    columns = columns.reshape(-1, columns.shape[2])
     try:
         L = cholesky_banded(_banded(C, shared * pairs[:, None, None]), lower=True)
     except np.linalg.LinAlgError:        # shared errors larger than all errors: not this slip
-        return -np.inf, 0, 0.0, SIGMA_OFFSET, 1.0
-    columns = np.concatenate([A, y[..., None]], axis=2) * good[:, None, None]
-    white = solve_banded((5, 0), L, columns.reshape(-1, columns.shape[2]))
-    count = max(3 * np.count_nonzero(good), 1)
+        return -np.inf, 1.0, columns
+    white = solve_banded((5, 0), L, columns)
+    B, count = white[:, -5:-1], max(3 * np.count_nonzero(good), 1)
+    r = white[:, -1] - B @ np.linalg.solve(_information(B), B.T @ white[:, -1])
+    factor = max(r @ r / count, 1e-12)
     log_determinant = np.sum(np.log(L[0].reshape(-1, 3))[good])
-    fits = []
-    for k in range(A.shape[2] - 3):
-        B = white[:, [k, -4, -3, -2]]
-        H = B.T @ B + np.diag([SIGMA_OFFSET**-2, 1, 1, 1])
-        x = np.linalg.solve(H, B.T @ white[:, -1])
-        factor = max(np.sum((white[:, -1] - B @ x)**2) / count, 1e-12)
-        fits.append((-count / 2 * np.log(factor) - log_determinant, k, x[0],
-                     np.sqrt(np.linalg.inv(H)[0, 0] * max(factor, 1)), factor))
-    return max(fits)
+    return -count / 2 * np.log(factor) - log_determinant, factor, white
+
+
+def _information(B):
+    """Information (4, 4) of L and w / sigma_w with their prior, from whitened columns (3l, 4)."""
+    return B.T @ B + np.diag([SIGMA_OFFSET**-2, 1, 1, 1])
+
+
+def _offset(white, k):
+    """Standard deviation and value of L in poses, from whitened columns and smoothing number k."""
+    B = white[:, [k, -4, -3, -2]]
+    C = np.linalg.inv(_information(B))
+    return np.sqrt(C[0, 0]), (C @ B.T @ white[:, -1])[0]
+
+
+def _noise_share(by_time, W, Q, half, sightings):
+    """Share of the squared derivatives by_time (m, 3), weighted by W (m, 3, 3), that is noise.
+
+    The derivative is the difference of mean velocities over `half` poses to both sides of two
+    frames. Q (m, 3, 3) is the noise of odometry between the frames.
+    """
+    steps = np.median(np.diff(sightings.frame))
+    of_noise = Q * min(1, 2 * half / steps) / (2 * half**2)
+    signal = np.einsum("ni,nij,nj", by_time, W, by_time)
+    return np.einsum("nij,nji", W, of_noise) / signal if signal > 0 else 1.0
 
 
 def _banded(diagonal, next_block):
