@@ -14,7 +14,7 @@ from slamlib import odometry, se2
 SLIP_BOUNDS = (1e-5, 3e-2)  # sqrt(m), interval in which the slip is searched
 MINIMUM_SLIP = 1e-4         # sqrt(m), of an increment's end in any direction: wheels also skid
 TYPICAL_SLIP = 1e-3         # sqrt(m), median of the prior
-SLIP_FACTOR = 10.0          # no unit, one standard deviation of the prior of log slip is its log
+SLIP_FACTOR = 3.0           # no unit, one standard deviation of the prior of log slip is its log
 
 
 def between_poses(ticks, vehicle, start, end, model="euler"):
@@ -106,7 +106,7 @@ def noise_in_drive(ticks, vehicle, start, end):
 def log_slip_prior(log_slip):
     """Log density, up to a constant, of log slip, which is normal about log TYPICAL_SLIP.
 
-    The standard deviation log SLIP_FACTOR makes the prior wide: it decides only where the
-    measurements do not determine the slip. `log_slip` is the natural logarithm of slip in sqrt(m).
+    With the standard deviation log SLIP_FACTOR the prior decides only where the measurements hardly
+    determine the slip. `log_slip` is the natural logarithm of slip in sqrt(m).
     """
     return -((log_slip - np.log(TYPICAL_SLIP)) / np.log(SLIP_FACTOR))**2 / 2

@@ -147,7 +147,8 @@ def problem3(dataset, found=None):
     """Solution of problem 3, SLAM on odometry and markers."""
     found = find("problem3", dataset) if found is None else found
     return _solution("problem3", dataset, found.poses, found.covariances,
-                     aruco_map=_marker_map(found), facts=_slam_facts(found))
+                     aruco_map=_marker_map(found), facts=_slam_facts(found),
+                     doubts=found.drive_doubts)
 
 
 def problem4(dataset, found=None):
@@ -161,14 +162,7 @@ def problem4(dataset, found=None):
         uwb_map=(found.antenna, found.antenna_in_world, found.antenna_covariance),
         facts=_slam_facts(found) | {
             "ranges": len(dataset.uwb.pose), "ranges_down_weighted_by_antenna": weak,
-            "antennas_in_doubt": found.doubts},
-        doubts=tuple(_antenna_doubt(antenna, reason)
-                     for antenna, reason in found.doubts.items()))
-
-
-def _antenna_doubt(antenna, reason):
-    return Doubt("antenna", f"Antenna {antenna} is in doubt: {reason}. Its covariance includes "
-                            f"this; look at its rows in UwbReading.txt.")
+            "antennas_in_doubt": found.doubts}, doubts=found.drive_doubts)
 
 
 def _marker_map(found):
@@ -181,8 +175,15 @@ def _wheels(found):
 
 
 def _slam_facts(found):
-    return {"slip_sqrt_m": found.slip, "increments": found.model,
-            "outliers": int(found.rejected.sum()), "chi2_per_dof": found.chi2_per_dof,
+    slip, sightings, ranges = found.noise_sigma.tolist()
+    offset, scale = found.range_calibration.tolist()
+    return {"slip_sqrt_m": found.slip, "slip_relative_sigma": slip,
+            "marker_noise_factor": found.noise.sightings, "marker_noise_relative_sigma": sightings,
+            "range_noise_factor": found.noise.ranges, "range_noise_relative_sigma": ranges,
+            "range_offset_m": offset, "range_scale": scale,
+            "range_offset_and_scale_sigmas": found.range_calibration_sigma.tolist(),
+            "increments": found.model, "outliers": int(found.rejected.sum()),
+            "chi2_per_dof": found.chi2_per_dof, "chi2_per_dof_of_all": found.chi2_per_dof_of_all,
             "log_evidence": found.log_evidence, **_wheels(found)}
 
 
@@ -213,8 +214,16 @@ def doubts_about_drive(dataset, truth):
 
     From its measurements, and from its Truth or None.
     """
-    by_measurements = ()           # here is the place of localization.drive_doubts(dataset)
-    return (*by_measurements, *(() if truth is None else truth.doubts))
+    return (*localization.drive_doubts(dataset), *(() if truth is None else truth.doubts))
+
+
+def merged(doubts):
+    """List of Doubt, each once; of what problems 3 and 4 both find, the later sentence.
+
+    There may be several doubts of a kind about antennas and units.
+    """
+    return list({doubt.sentence if doubt.what in ("antenna", "units") else doubt.what: doubt
+                 for doubt in doubts}.values())
 
 
 def truth_in_world(solution, truth):

@@ -8,7 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from slamlib import evaluation, results
-from slamlib.solve import Failure, doubts_about_drive, solutions, truth_in_world, write
+from slamlib.solve import (
+    Failure,
+    doubts_about_drive,
+    merged,
+    solutions,
+    truth_in_world,
+    write,
+)
 
 
 def solve_to_folder(dataset, truth, out):
@@ -31,7 +38,7 @@ def solve_to_folder(dataset, truth, out):
             write(out, solution)
             doubts += solution.doubts
         start = time.perf_counter()
-    summary["doubts"] = [asdict(doubt) for doubt in dict.fromkeys(doubts)]
+    summary["doubts"] = [asdict(doubt) for doubt in merged(doubts)]
     text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     results.write_atomically(Path(out) / "summary.json", text.encode())
     return summary

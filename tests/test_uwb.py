@@ -17,7 +17,10 @@ from slamlib.se2 import compose
 from slamlib.simulation import manoeuvre, simulate
 from slamlib.slam import errors
 from slamlib.slam.doubts import MAX_LOG_ODDS
+from slamlib.slam.linear_factors import range_factors
+from slamlib.slam.measurement_factors import MeasurementFactors
 from slamlib.slam.measurements import measure
+from slamlib.slam.noise import Noise
 from slamlib.slam.problem import build
 from slamlib.slam.state import state_from_arrays
 from slamlib.slam.trilateration import (
@@ -105,8 +108,8 @@ def test_an_error_of_one_sigma_costs_one_half():
     state = state_from_arrays(m, poses[m.frame], np.zeros((0, 3)), np.array([[3.0, 4.0]]),
                               np.zeros(3))
     off = replace(m, ranges=replace(m.ranges, distance=m.ranges.distance + m.ranges.sigma))
-    assert build(m, "arc", 1e-3).measured.graph.error(state.values) < 1e-12
-    cost = build(off, "arc", 1e-3).measured.graph.error(state.values)
+    assert build(m, "arc", Noise()).graph.error(state.values) < 1e-12
+    cost = build(off, "arc", Noise()).graph.error(state.values)
     assert np.isclose(cost, len(off.ranges.row) / 2)
 
 
@@ -365,6 +368,45 @@ def test_problem_4_reports_the_down_weighted_ranges():
     assert problem4(dataset.without("aruco")).aruco_map is None
 
 
+def test_calibrated_ranges_have_derivatives_of_central_differences():
+    dataset, truth = simulate("short", seed=2)
+    m = replace(measure(dataset.first(200)), calibrated=True)
+    rng = np.random.default_rng(0)
+    markers, z = np.zeros((len(m.marker), 3)), rng.normal(size=2)
+    poses, antennas = truth.poses[m.frame], truth.antenna_in_world + rng.normal(size=(4, 2))
+    factors, noise = MeasurementFactors(m, m.unit_weights), Noise(ranges=1.7)
+
+    def error(poses=poses, antennas=antennas, z=z):
+        state = state_from_arrays(m, poses, markers, antennas, np.zeros(3), z)
+        return range_factors(factors, noise, state).e
+
+    state = state_from_arrays(m, poses, markers, antennas, np.zeros(3), z)
+    found = range_factors(factors, noise, state)
+    offset, scale = state.range_calibration
+    np.testing.assert_allclose([offset, scale], [0.2 * z[0], 1 + 0.05 * z[1]])
+    np.testing.assert_allclose(found.by_calibration[..., 0, :], central_differences(
+        lambda change: error(z=z + change)[:, 0], np.zeros(2)), atol=1e-6)
+    np.testing.assert_allclose(found.by_landmark[:, 0], central_differences(
+        lambda change: error(antennas=antennas + change)[:, 0], np.zeros(2)), atol=1e-5)
+    np.testing.assert_allclose(found.by_pose[:, 0], central_differences(
+        lambda xi: error(poses=compose(poses, xi))[:, 0], np.zeros(3)), atol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("offset, scale", [(0.4, 1.0), (0.0, 1.015), (-0.3, 0.97)])
+def test_ranges_calibrate_themselves(offset, scale):
+    dataset, truth = simulate("long", seed=61)
+    dataset = dataset.first(8000)
+    wrong = replace(dataset, uwb=replace(dataset.uwb, range=offset + scale * dataset.uwb.range))
+    right, found = slam.estimate(dataset), slam.estimate(wrong)
+    np.testing.assert_array_equal(right.range_calibration, [0, 1])
+    off = found.range_calibration - [offset, scale]
+    assert (np.abs(off) < 4 * found.range_calibration_sigma).all()
+    assert (found.range_calibration_sigma < [0.1, 0.01]).all()
+    error, squared = montecarlo.antenna_error(found, truth)
+    assert squared.mean() < 6 and error.max() < 0.2
+
+
 @pytest.mark.slow
 def test_plaza_2_is_solved():
     dataset, truth = plaza.read_plaza2()
@@ -372,5 +414,8 @@ def test_plaza_2_is_solved():
     motion = align(found.poses, truth.poses)
     beacons = compose(motion, np.column_stack([found.antenna_in_world, np.zeros(4)]))[:, :2]
     assert ate(found.poses, truth.poses, aligned=True) < 0.35
-    assert np.hypot(*(beacons - truth.antenna_in_world).T).max() < 0.15
+    scale, sigma = found.range_calibration[1], found.range_calibration_sigma[1]
+    assert abs(scale - plaza.calibration(2)[0]) < 2 * sigma < 0.04
+    assert [doubt.what for doubt in found.drive_doubts] == ["range-offset"]
+    assert np.hypot(*(beacons - truth.antenna_in_world).T).max() < 0.5      # 1 % of 50 m
     assert not found.doubts and dataset.ticks.shape == (4091, 2)

@@ -20,6 +20,7 @@ from slamlib.slam.estimate import fit_from_odometry
 from slamlib.slam.initialization import odometry_state, trilaterated_antennas
 from slamlib.slam.measurement_factors import MeasurementFactors
 from slamlib.slam.measurements import measure
+from slamlib.slam.noise import Noise
 from slamlib.slam.optimizer import optimize
 from slamlib.slam.problem import build
 from slamlib.slam.result import result
@@ -172,7 +173,7 @@ def graphs(seed, slip, assumed, wrong, kernel, start):
     assumed = max(1e-3 * assumed, SLIP_BOUNDS[0])
     scale = KERNELS[kernel]
     cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(scale) if scale else None
-    problem = replace(build(m, "arc", assumed),
+    problem = replace(build(m, "arc", Noise(assumed)),
                       measured=MeasurementFactors(m, m.unit_weights, cauchy))
     single = optimize(problem, odometry_state(m, "arc", markers=LANDMARKS[start])).state
     solved = result(fit_from_odometry(m, assumed))

@@ -24,6 +24,7 @@ from slamlib.solve import (
     Failure,
     Solution,
     doubts_about_drive,
+    merged,
     title,
     truth_in_world,
 )
@@ -67,7 +68,7 @@ def read_drives(data, results, selected, written, notices=None):
         doubts = [*doubts_about_drive(dataset, truth), *(x for x in told if isinstance(x, Doubt))]
         failures = sorted((x for x in told if isinstance(x, Failure)),
                           key=lambda failure: _order(failure.problem))
-        drives.append(SolvedDrive(name, dataset, truth, solved, tuple(dict.fromkeys(doubts)),
+        drives.append(SolvedDrive(name, dataset, truth, solved, tuple(merged(doubts)),
                                   tuple(failures)))
     return sorted(drives, key=lambda drive: len(drive.dataset.ticks))
 

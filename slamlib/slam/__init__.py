@@ -7,22 +7,28 @@ Each stage makes the record of the next. The modules, in the order in which they
     2  errors               errors of the factors and their derivatives, in numpy
        odometry_factors     odometry between frames, which depends on the wheels
        measurement_factors  sightings, ranges and priors, by GTSAM
+       linear_factors       the same linearised in numpy, for what GTSAM does not do
+       noise                slip, and factors on the sigmas of sightings and ranges
     3  state                values of all variables: State
        problem              Measurements, factors and noise -> Problem, the factor graph
-       optimizer            Problem, State -> Optimum by Gauss-Newton; the evidence
+       optimizer            Problem, State -> Optimum by Gauss-Newton
     4  robust               Problem, State -> State past outliers; the accepted measurements
     5  trilateration        places of an antenna from its ranges
        initialization       Measurements -> State: the start values
-    6  slip                 Problem, State -> the slip of the wheels
-       fit                  Problem, State -> Fit: wheels, slip, accepted measurements, in turn
+    6  evidence             Problem, State -> evidence of every value of the noise
+       noise_posterior      Problem, State -> the noise, and how well it is known
+       fit                  Problem, State -> Fit: wheels, noise, accepted measurements, in turn
        model_choice         Fit -> Fit: arcs or Euler's steps
-    7  covariances, interpolation, doubts, result      Fit -> SlamResult in world axes
+       range_calibration    Fit -> Fit: with an offset and a scale of the ranges, if there are any
+    7  covariances, moments, interpolation, doubts, drive_doubts, result
+                            Fit -> SlamResult in world axes
 
 `estimate` is all of it. With the result of a problem with fewer sensors at hand, it starts there
 and skips stage 5 and the choice of the model.
 """
 
+from slamlib.slam.drive_doubts import confirmation
 from slamlib.slam.estimate import estimate
 from slamlib.slam.result import SlamResult
 
-__all__ = ["SlamResult", "estimate"]
+__all__ = ["SlamResult", "confirmation", "estimate"]

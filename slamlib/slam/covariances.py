@@ -1,7 +1,7 @@
 """Stage 7: covariances at the solution: jointly of consecutive frames and w, and of each landmark.
 
 The information matrix of the graph has an arrow's shape. The poses form a chain T, with 3 x 3
-blocks on and beside the diagonal. Landmarks and w form a border (B, D) that touches all of it:
+blocks on and beside the diagonal. Landmarks, z and w form a border (B, D) that touches all of it:
 
     [[T, B], [B^T, D]]^-1:    border     S = (D - B^T Y)^-1,   Y = T^-1 B,
                               poses      T^-1 + Y S Y^T,       poses and border  -Y S.
@@ -16,9 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
-from slamlib import se2
-from slamlib.slam.errors import between_error, range_error
-from slamlib.slam.measurement_factors import GUESS_PRIOR_SIGMA, WEAK_SIGMA, point_factors
+from slamlib.slam.linear_factors import linear_factors
+from slamlib.slam.measurement_factors import GUESS_PRIOR_SIGMA, WEAK_SIGMA
 
 
 @dataclass(frozen=True)
@@ -28,31 +27,45 @@ class Covariances:
     pairs: np.ndarray        # (f-1, 9, 9) of [X_i, X_{i+1}, w]
     markers: list            # k of (3, 3), or (2, 2) for a point
     antennas: np.ndarray     # (a, 2, 2)
+    z: np.ndarray            # (2, 2) of the ranges' offset and scale, zero if they are given
     w: np.ndarray            # (3, 3)
 
 
 def covariances(problem, state):
     """The Covariances of a Problem at the State that solves it."""
     m = problem.measurements
-    size = np.r_[np.where(m.oriented, 3, 2), np.full(len(m.antenna), 2), 3]
+    size = np.r_[np.where(m.oriented, 3, 2), np.full(len(m.antenna), 2), 2 * m.calibrated, 3]
     begin = np.cumsum(size) - size                     # columns of the border
-    measured = [(row, begin[landmark, None] + np.arange(by_landmark.shape[2]), by_pose, by_landmark)
-                for row, landmark, by_pose, by_landmark in _whitened(problem.measured, state)]
-    prior = np.zeros(begin[-1] + 3)
+    prior, antennas = np.zeros(begin[-1] + 3), len(m.marker) + len(m.antenna)
     for j in problem.measured.unsupported:
         prior[begin[j]:begin[j] + size[j]] = WEAK_SIGMA**-2
-    prior[begin[len(m.marker)]:begin[-1]] = GUESS_PRIOR_SIGMA**-2
-    prior[begin[-1]:] = 1
-    pose_prior = np.diag(m.origin_sigma**-2.0)
+    prior[begin[len(m.marker)]:begin[antennas]] = GUESS_PRIOR_SIGMA**-2
+    prior[begin[antennas]:] = 1
+    measured = [_of_border(factors, begin, m.calibrated)
+                for factors in linear_factors(problem.measured, problem.noise, state)]
     _, odometry = problem.odometry_jacobians(state)
-    pairs, border = arrow_inverse(odometry, measured, pose_prior, prior)
+    pairs, border = arrow_inverse(odometry, measured, np.diag(m.origin_sigma**-2.0), prior)
     blocks = [border[b:b + n, b:b + n] for b, n in zip(begin, size)]
-    return Covariances(pairs, blocks[:len(m.marker)],
-                       np.reshape(blocks[len(m.marker):-1], (-1, 2, 2)), blocks[-1])
+    return Covariances(
+        pairs=pairs, markers=blocks[:len(m.marker)],
+        antennas=np.reshape(blocks[len(m.marker):antennas], (-1, 2, 2)),
+        z=blocks[antennas] if m.calibrated else np.zeros((2, 2)), w=blocks[-1])
+
+
+def _of_border(factors, begin, calibrated):
+    """Frames, columns of the border, and derivatives by pose and border, of LinearFactors."""
+    width = factors.by_landmark.shape[2]
+    columns = [begin[factors.landmark, None] + np.arange(width)]
+    by_border = [factors.by_landmark]
+    if calibrated and factors.by_calibration is not None:
+        columns.append(np.broadcast_to(begin[-2] + np.arange(2), (len(factors.row), 2)))
+        by_border.append(factors.by_calibration)
+    return (factors.row, np.concatenate(columns, axis=1), factors.by_pose,
+            np.concatenate(by_border, axis=2))
 
 
 def arrow_inverse(odometry, measured, pose_prior, border_prior):
-    """Covariances (f-1, 9, 9) of [X_i, X_{i+1}, w], and (c, c) of the landmarks, then w.
+    """Covariances (f-1, 9, 9) of [X_i, X_{i+1}, w], and (c, c) of landmarks, z, then w.
 
     Parameters
     ----------
@@ -124,35 +137,6 @@ def _inverse_blocks(diagonal, beside):
         off[i] = -gain[i] @ on[i + 1]
         on[i] -= off[i] @ gain[i].T
     return on, off
-
-
-def _whitened(factors, state):
-    """Yield (frame, landmark, by_pose, by_landmark) of sightings of poses, of points, of ranges.
-
-    Landmarks are numbered, (m,): first the markers, then the antennas. Derivatives (m, e, 3) and
-    (m, e, d) are whitened.
-    """
-    m, weight, range_weight = factors.measurements, factors.sighting_weight, factors.range_weight
-    s, r = m.sightings, m.ranges
-    rows = np.flatnonzero((weight > 0) & m.as_pose)
-    noise = se2.rotate_covariance(s.C[rows], -s.z[rows, 2]) / weight[rows, None, None]
-    root = np.swapaxes(np.linalg.cholesky(np.linalg.inv(noise)), 1, 2)
-    e, by_pose, by_marker, _ = between_error(s.z[rows], state.poses[s.row[rows]],
-                                             state.markers[m.label[rows]])
-    if factors.sighting_kernel is not None:
-        size = np.linalg.norm(root @ e[..., None], axis=(1, 2))
-        root *= np.sqrt([factors.sighting_kernel.weight(d) for d in size])[:, None, None]
-    yield s.row[rows], m.label[rows], root @ by_pose, root @ by_marker
-
-    p = point_factors(factors, state)
-    yield p.row, p.label, p.by_pose, p.by_point
-
-    rows = np.flatnonzero(range_weight)
-    e, *J = range_error(r.distance[rows], state.poses[r.row[rows]], state.antennas[r.antenna[rows]])
-    root = np.sqrt(range_weight[rows]) / r.sigma[rows]
-    if factors.range_kernel is not None:
-        root *= np.sqrt([factors.range_kernel.weight(d) for d in -root * e])  # measured - expected
-    yield r.row[rows], len(m.marker) + r.antenna[rows], *(root[:, None, None] * j for j in J)
 
 
 def _t(matrices):

@@ -4,11 +4,12 @@ from slamlib.slam.fit import refine
 from slamlib.slam.initialization import initial_state, state_from_poses
 from slamlib.slam.measurements import measure
 from slamlib.slam.model_choice import better_model
+from slamlib.slam.noise import known_noise
 from slamlib.slam.odometry_factors import odometry_factors
 from slamlib.slam.problem import build
+from slamlib.slam.range_calibration import calibrated
 from slamlib.slam.result import result
 from slamlib.slam.robust import CAUCHY_SCALES, narrow_kernels
-from slamlib.slam.slip import assumed_slip
 
 
 def estimate(dataset, slip=None, model=None, previous=None):
@@ -17,7 +18,8 @@ def estimate(dataset, slip=None, model=None, previous=None):
     Parameters
     ----------
     dataset : Dataset with markers, ranges or both.
-    slip : sqrt(m), standard deviation of a wheel's slip after one metre; None learns it.
+    slip : sqrt(m), standard deviation of a wheel's slip after one metre, where it is known, with
+        the covariances that the files state; None learns the slip and factors on those.
     model : "arc" or "euler", of an odometry step; None lets the evidence choose, or takes that of
         `previous`.
     previous : SlamResult of the same drive with fewer sensors, from which the solution starts.
@@ -32,18 +34,21 @@ def estimate(dataset, slip=None, model=None, previous=None):
     """
     measurements = measure(dataset)
     if previous is not None:
-        return result(fit_from_previous(measurements, previous, slip, model or previous.model))
-    fit = fit_from_odometry(measurements, slip, model or "arc")
-    return result(fit if model else better_model(fit, "euler", slip))
+        fit = fit_from_previous(measurements, previous, slip, model or previous.model)
+    else:
+        fit = fit_from_odometry(measurements, slip, model or "arc")
+        fit = fit if model else better_model(fit, "euler", slip)
+    return result(calibrated(fit, slip))
 
 
 def fit_from_odometry(measurements, slip=None, model="arc", factors=odometry_factors):
     """The Fit of Measurements from odometry on.
 
-    `slip` in sqrt(m) is learned if it is None; `model` and `factors` as of `problem.build`.
+    The noise is learned if `slip`, in sqrt(m), is None; `model` and `factors` as of
+    `problem.build`.
     """
     state = initial_state(measurements, model, factors)
-    problem = build(measurements, model, assumed_slip(slip), factors=factors)
+    problem = build(measurements, model, known_noise(slip), factors=factors)
     state = narrow_kernels(problem, state)
     return refine(problem, state, slip, factors=factors)
 
@@ -53,5 +58,5 @@ def fit_from_previous(measurements, previous, slip, model):
     vehicle, frame = measurements.dataset.vehicle, measurements.frame
     w = (previous.wheel - vehicle.wheel) / vehicle.sigma_wheel
     state = state_from_poses(measurements, previous.poses[frame], previous.covariances[frame], w)
-    problem = build(measurements, model, assumed_slip(slip), relinearize_at=w)
+    problem = build(measurements, model, known_noise(slip), relinearize_at=w)
     return refine(problem, narrow_kernels(problem, state, CAUCHY_SCALES[-1:]), slip)

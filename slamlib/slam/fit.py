@@ -1,15 +1,17 @@
-"""Stage 6: wheels, slip and accepted measurements that agree with each other."""
+"""Stage 6: wheels, noise and accepted measurements that agree with each other."""
 
 from dataclasses import dataclass, replace
 
+from slamlib.slam.evidence import log_evidence
+from slamlib.slam.noise import known_noise
+from slamlib.slam.noise_posterior import NoisePosterior, noise_posterior, starting_noise
 from slamlib.slam.odometry_factors import odometry_factors
-from slamlib.slam.optimizer import log_evidence, optimize
+from slamlib.slam.optimizer import optimize
 from slamlib.slam.problem import Problem
 from slamlib.slam.robust import accepted
-from slamlib.slam.slip import assumed_slip, learned_slip
 from slamlib.slam.state import State
 
-MAX_ROUNDS = 4               # of wheels, slip and accepted measurements
+MAX_ROUNDS = 6               # of wheels, noise and accepted measurements
 
 
 @dataclass(frozen=True)
@@ -19,26 +21,30 @@ class Fit:
     problem: Problem
     state: State
     log_evidence: float
+    posterior: NoisePosterior | None     # of the noise; None where it is given
 
 
 def refine(problem, state, slip=None, accept=accepted, factors=odometry_factors):
-    """The Fit in which wheels, slip and accepted measurements agree with each other.
+    """The Fit in which wheels, noise and accepted measurements agree with each other.
 
     They depend on each other, so each is updated in turn until the accepted measurements no longer
-    change. From a Problem and a State near its solution. The slip in sqrt(m) is learned if it is
-    None. `accept` makes MeasurementFactors from Problem and State; None keeps the problem's.
-    `factors` as of `problem.build`.
+    change. From a Problem and a State near its solution. The noise is learned if `slip` is None;
+    otherwise it is this slip in sqrt(m) and what the files state. `accept` makes MeasurementFactors
+    from Problem and State; None keeps the problem's. `factors` as of `problem.build`.
     """
-    m, model = problem.measurements, problem.odometry.model
+    m, model, posterior = problem.measurements, problem.odometry.model, None
+    if accept is not None:
+        problem = replace(problem, noise=known_noise(slip) if slip is not None
+                          else starting_noise(m, state))
     measured = problem.measured if accept is None else accept(problem, state)
-    problem = replace(problem, slip=assumed_slip(slip))
     for _ in range(MAX_ROUNDS):
         problem = replace(problem, measured=measured, odometry=factors(m, model, state.w))
         if slip is None:
             state = optimize(problem, state, max_steps=2).state
-            problem = replace(problem, slip=learned_slip(problem, state))
+            posterior = noise_posterior(problem, state)
+            problem = replace(problem, noise=posterior.noise)
         state = optimize(problem, state).state
         measured = problem.measured if accept is None else accept(problem, state)
         if (measured.weight == problem.measured.weight).all():
             break
-    return Fit(problem, state, log_evidence(problem, state))
+    return Fit(problem, state, log_evidence(problem, state), posterior)

@@ -7,9 +7,9 @@ wheels that this part calibrated predicts the next poses, up to twice as many, a
 import numpy as np
 
 from slamlib import odometry, se2
-from slamlib.increments import TYPICAL_SLIP
 from slamlib.sightings import consensus
 from slamlib.slam.measurements import measure
+from slamlib.slam.noise import Noise
 from slamlib.slam.odometry_factors import odometry_factors
 from slamlib.slam.problem import build
 from slamlib.slam.robust import narrow_kernels
@@ -29,7 +29,7 @@ def initial_state(measurements, model, factors=odometry_factors):
         state = odometry_state(part, model) if earlier is None else extended(
             part, model, earlier, state)
         if not whole:
-            state = narrow_kernels(build(part, model, TYPICAL_SLIP, factors=factors), state)
+            state = narrow_kernels(build(part, model, Noise(), factors=factors), state)
     return state
 
 

@@ -65,4 +65,4 @@ def _increments(problem, w, start, end):
     vehicle = d.vehicle.with_deviation(w)
     delta, by_w = increments.between_poses(d.ticks, vehicle, start, end, problem.odometry.model)
     rounding, slipping = odometry_noise(d.ticks, vehicle, start, end)
-    return delta, by_w * vehicle.sigma_wheel, rounding + problem.slip**2 * slipping
+    return delta, by_w * vehicle.sigma_wheel, rounding + problem.noise.slip**2 * slipping

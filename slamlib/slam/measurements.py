@@ -9,7 +9,7 @@ from functools import cached_property
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import A, L, P, W, X
+from gtsam.symbol_shorthand import A, L, P, W, X, Z
 
 from slamlib import odometry, se2
 from slamlib.dataset import Dataset, UwbReadings
@@ -42,6 +42,7 @@ class Measurements:
     ranges: Ranges           # r of them
     antenna: np.ndarray      # (a,) ids, ascending, of antennas with ranges
     guess: np.ndarray        # (a, 2) m, their guessed positions
+    calibrated: bool = False     # the ranges' offset and scale are variables
 
     @property
     def origin_sigma(self):
@@ -77,7 +78,10 @@ class Measurements:
 
     @cached_property
     def ordering(self):
-        """Elimination ordering (COLAMD) of all variables, w last because it touches all poses."""
+        """Elimination ordering (COLAMD) of all variables; w, which touches all poses, comes last.
+
+        So does z where the ranges calibrate themselves.
+        """
         graph, s, r = gtsam.SymbolicFactorGraph(), self.sightings, self.ranges
         graph.push_factor(X(0))
         graph.push_factor(W(0))
@@ -89,7 +93,10 @@ class Measurements:
             graph.push_factor(A(k))
         for i in range(len(self.frame) - 1):
             graph.push_factor(X(i), X(i + 1), W(0))
-        return gtsam.Ordering.ColamdConstrainedLastSymbolicFactorGraph(graph, [W(0)])
+        last = [W(0), Z(0)] if self.calibrated else [W(0)]
+        for key in last:
+            graph.push_factor(key)
+        return gtsam.Ordering.ColamdConstrainedLastSymbolicFactorGraph(graph, last)
 
 
 def measure(dataset, extra_poses=()):

@@ -1,17 +1,16 @@
-"""Stage 3: a problem is linearised, solved by Gauss-Newton, and its evidence computed.
+"""Stage 3: a problem is linearised and solved by Gauss-Newton.
 
 GTSAM linearises its own factors and eliminates; the linearised odometry is added to its graph.
 """
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import P, W, X
+from gtsam.symbol_shorthand import A, P, W, X, Z
 
 from slamlib.dataset import DatasetError
-from slamlib.slam.measurement_factors import point_factors
 from slamlib.slam.state import State, state_from_values
 
 CONVERGED = 1e-6             # relative decrease of the error at which iterations end
@@ -36,7 +35,7 @@ def optimize(problem, state, max_steps=MAX_STEPS):
     error, steps, decrease = problem.error(state), 0, np.inf
     while steps < max_steps and decrease > CONVERGED * (1 + error):
         steps += 1
-        step, _ = _solve(problem, linearize(problem, state))
+        step = _solve(problem, linearize(problem, state))
         for _ in range(MAX_HALVINGS):
             moved = state_from_values(problem.measurements, state.values.retract(step))
             new_error = problem.error(moved)
@@ -49,68 +48,39 @@ def optimize(problem, state, max_steps=MAX_STEPS):
     return Optimum(state, error, steps)
 
 
-def linearize(problem, state, linearized=None):
-    """The gtsam.GaussianFactorGraph of a Problem at a State.
-
-    `linearized` is that of GTSAM's factors alone, where it has been made already.
-    """
+def linearize(problem, state):
+    """The gtsam.GaussianFactorGraph of a Problem at a State."""
     e, (first, second, by_w) = problem.odometry_jacobians(state)
     graph = gtsam.GaussianFactorGraph()
-    graph.push_back(problem.measured.graph.linearize(state.values) if linearized is None
-                    else linearized)
+    graph.push_back(problem.graph.linearize(state.values))
     for i in range(len(e)):
         graph.add(X(i), first[i], X(i + 1), second[i], W(0), by_w[i], -e[i])
-    p = point_factors(problem.measured, state)
+    points, *ranges = problem.other_factors(state)
     for i, j, by_pose, by_point, error in zip(
-            p.row.tolist(), p.label.tolist(), p.by_pose, p.by_point, p.e):
+            points.row.tolist(), points.landmark.tolist(), points.by_pose, points.by_landmark,
+            points.e):
         graph.add(X(i), by_pose, P(j), by_point, -error)
+    for r in ranges:
+        for i, k, by_pose, by_antenna, by_z, error in zip(
+                r.row.tolist(), (r.landmark - len(problem.measurements.marker)).tolist(),
+                r.by_pose, r.by_landmark, r.by_calibration, r.e):
+            graph.add(X(i), by_pose, A(k), by_antenna, Z(0), by_z, -error)
     return graph
 
 
-def log_evidence_of_slip(problem, state):
-    """The function from the logarithm of the slip to the Laplace log evidence, up to a constant.
-
-    With the graph's error e at its optimum, the odometry noise Q and the square root information R
-    of all variables,
-
-        log evidence = -e - sum log|Q| / 2 - log|R|
-
-    (MacKay, Neural Computation 4(3), 1992). e is that of the graph linearised at the State, which
-    should be near the optimum. The omitted constant depends on the dataset and the weights: only
-    problems on the same accepted measurements can be compared.
-    """
-    linearized = problem.measured.graph.linearize(state.values)
-
-    def log_evidence(log_slip):
-        trial = replace(problem, slip=np.exp(log_slip))
-        linear = linearize(trial, state, linearized)
-        solution, log_root = _solve(trial, linear)
-        return -linear.error(solution) - trial.log_determinant / 2 - log_root
-
-    return log_evidence
-
-
-def log_evidence(problem, state):
-    """Laplace log evidence at the problem's own slip, as `log_evidence_of_slip`."""
-    return log_evidence_of_slip(problem, state)(np.log(problem.slip))
-
-
 def _solve(problem, linear):
-    """Solution (gtsam.VectorValues) of a linearised graph, and log|R|.
+    """Solution (gtsam.VectorValues) of a linearised graph.
 
     Cholesky decomposition of the information is fast, but fails where it is ill-conditioned. QR
     decomposition of its root then decides whether the measurements determine every variable.
     """
     m = problem.measurements
     try:
-        tree = linear.eliminateMultifrontal(m.ordering)
-        return tree.optimize(), tree.logDeterminant()
+        return linear.eliminateMultifrontal(m.ordering).optimize()
     except RuntimeError:
         pass
     try:
-        net = linear.eliminateSequential(m.ordering, gtsam.EliminateQR)
-        diagonals = np.concatenate([np.diag(net.at(i).R()) for i in range(net.size())])
-        return net.optimize(), np.sum(np.log(np.abs(diagonals)))
+        return linear.eliminateSequential(m.ordering, gtsam.EliminateQR).optimize()
     except RuntimeError as error:                 # GTSAM's, with the variable and much advice
         raise DatasetError(f"{m.dataset.name}: expected measurements that determine every pose and "
                            f"landmark; these do not determine {_variable(m, str(error))}") from None
@@ -118,11 +88,11 @@ def _solve(problem, linear):
 
 def _variable(measurements, message):
     """What GTSAM's message about an undetermined variable names, in the words of the files."""
-    m, found = measurements, re.search(r"Symbol: ([alpwx])(\d+)", message)
+    m, found = measurements, re.search(r"Symbol: ([alpwxz])(\d+)", message)
     if found is None:
         return "one of them"
-    if found[1] == "w":
-        return "the wheel parameters"
+    if found[1] in "wz":
+        return {"w": "the wheel parameters", "z": "the offset and scale of the ranges"}[found[1]]
     name, ids = {"x": ("pose", m.frame + 1), "l": ("the pose of marker", m.marker),
                  "p": ("the position of marker", m.marker),
                  "a": ("the position of antenna", m.antenna)}[found[1]]

@@ -5,10 +5,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slamlib import se2
-from slamlib.slam.covariances import covariances
 from slamlib.slam.doubts import antenna_doubts
+from slamlib.slam.drive_doubts import drive_doubts
 from slamlib.slam.interpolation import interpolate
+from slamlib.slam.linear_factors import linear_factors
 from slamlib.slam.measurement_factors import MeasurementFactors, residuals
+from slamlib.slam.moments import moments
+from slamlib.slam.noise import Noise
+from slamlib.slam.odometry_factors import odometry_error
+from slamlib.slam.state import RANGE_SIGMA
 
 
 @dataclass(frozen=True)
@@ -26,31 +31,44 @@ class SlamResult:
     doubts: dict                    # antenna id: sentence, for antennas in doubt
     wheel: np.ndarray               # (3,) R_R, R_L, b
     wheel_covariance: np.ndarray    # (3, 3)
-    slip: float                     # sqrt(m), as given or learned
+    noise: Noise                    # as given or learned
+    noise_sigma: np.ndarray         # (3,) of its logarithms, 0 where given or without measurements
+    range_calibration: np.ndarray   # (2,) offset in m and scale of the ranges, 0 and 1 if not kept
+    range_calibration_sigma: np.ndarray        # (2,) m and 1, or 0
     model: str                      # "arc" or "euler", as given or chosen
     log_evidence: float             # Laplace, up to a constant of dataset and accepted measurements
-    chi2_per_dof: float             # of the accepted measurements
+    chi2_per_dof: float             # of the accepted measurements, by the files' covariances
+    chi2_per_dof_of_all: float      # the same of all measurements
     rejected: np.ndarray            # (s,) bool, beyond the gate, rows of Measurements.sightings
     residual: np.ndarray            # (s, 3) whitened residuals of the sightings
     range_weight: np.ndarray        # (r,) share of its information that each range keeps, 0 to 1
     range_residual: np.ndarray      # (r,) whitened, positive for a range that is too long
+    drive_doubts: tuple = ()        # of Doubt: what the solution says against the files
+
+
+    @property
+    def slip(self):
+        """Standard deviation of a wheel's slip after one metre, sqrt(m), as given or learned."""
+        return self.noise.slip
 
 
 def result(fit):
     """The SlamResult of a Fit."""
-    problem, state, m = fit.problem, fit.state, fit.problem.measurements
-    measured, vehicle = problem.measured, m.dataset.vehicle
-    marginal = covariances(problem, state)
-    poses, pose_covariances = interpolate(problem, state, marginal.pairs)
-    residual, range_residual = residuals(m, state)
-    range_weight = measured.range_weight
-    if measured.range_kernel is not None:
-        range_weight = range_weight * [measured.range_kernel.weight(r) for r in range_residual]
+    problem, m = fit.problem, fit.problem.measurements
+    vehicle = m.dataset.vehicle
+    state, marginal, slip = moments(fit)
+    poses, pose_covariances = interpolate(
+        replace(problem, noise=replace(problem.noise, slip=slip)), state, marginal.pairs)
+    residual, range_residual = residuals(m, state, problem.noise)
+    kernel, range_weight = problem.measured.range_kernel, problem.measured.range_weight
+    if kernel is not None:
+        range_weight = range_weight * [kernel.weight(r) for r in range_residual]
     doubts = antenna_doubts(m, state, pose_covariances[m.frame], marginal.antennas, range_weight)
-    mapped, marker_covariance = _mapped(measured, marginal.markers)
+    mapped, marker_covariance = _mapped(problem, marginal.markers)
     markers = state.markers[mapped]
     markers[:, 2] = se2.wrap(markers[:, 2])
-    return SlamResult(
+    accepted = problem.measured.sighting_weight > 0
+    found = SlamResult(
         poses=poses, covariances=pose_covariances,
         marker=m.marker[mapped], marker_in_world=markers,
         marker_covariance=se2.rotate_covariance(
@@ -58,20 +76,25 @@ def result(fit):
         antenna=m.antenna, antenna_in_world=state.antennas, antenna_covariance=doubts.covariances,
         doubts=doubts.sentences, wheel=vehicle.wheel + vehicle.sigma_wheel * state.w,
         wheel_covariance=vehicle.sigma_wheel[:, None] * marginal.w * vehicle.sigma_wheel,
-        slip=float(problem.slip), model=problem.odometry.model,
-        log_evidence=float(fit.log_evidence),
-        chi2_per_dof=_chi2_per_dof(problem, state, range_weight),
-        rejected=measured.sighting_weight == 0, residual=residual,
+        noise=problem.noise, noise_sigma=np.zeros(3) if fit.posterior is None
+        else np.sqrt(np.diag(fit.posterior.covariance)),
+        range_calibration=state.range_calibration,
+        range_calibration_sigma=RANGE_SIGMA * np.sqrt(np.diag(marginal.z)),
+        model=problem.odometry.model, log_evidence=float(fit.log_evidence),
+        chi2_per_dof=chi2_per_dof(problem, state, np.r_[accepted, range_weight]),
+        chi2_per_dof_of_all=chi2_per_dof(problem, state, m.unit_weights),
+        rejected=~accepted, residual=residual,
         range_weight=range_weight, range_residual=range_residual)
+    return replace(found, drive_doubts=tuple(drive_doubts(m, found)))
 
 
-def _mapped(measured, blocks):
+def _mapped(problem, blocks):
     """Rows of the markers of which more sightings are accepted than rejected, and all covariances.
 
     The covariances (k, 3, 3) are in GTSAM's axes. The heading of a point has the variance of its
     best sighting.
     """
-    m, accepted = measured.measurements, measured.sighting_weight > 0
+    m, accepted = problem.measurements, problem.measured.sighting_weight > 0
     agree, differ = (np.bincount(m.label[which], minlength=len(m.marker))
                      for which in (accepted, ~accepted))
     padded = np.zeros((len(m.marker), 3, 3))
@@ -82,15 +105,19 @@ def _mapped(measured, blocks):
     return np.flatnonzero(agree > differ), padded
 
 
-def _chi2_per_dof(problem, state, range_weight):
-    """Chi-squared with the final weights, over its degrees of freedom.
+def chi2_per_dof(problem, state, weight):
+    """Chi-squared by the covariances in the files, over its degrees of freedom.
 
-    A measurement counts by its dimension (a range by its weight), and a landmark takes its own.
-    Odometry and priors have as many errors as there are poses and wheel parameters.
+    With weights (s + r,), a measurement counts by its dimension times its weight, and a landmark
+    takes its own. Odometry and priors have as many errors as there are poses and wheel parameters.
     """
-    m, accepted = problem.measurements, problem.measured.sighting_weight > 0
-    quadratic = MeasurementFactors(m, np.r_[accepted, range_weight])
-    used = np.bincount(m.label[accepted], np.where(m.as_pose[accepted], 3, 2), len(m.marker))
+    m = problem.measurements
+    sightings, ranges = np.split(weight, [len(m.label)])
+    stated = MeasurementFactors(m, weight)
+    e, *_ = odometry_error(problem.odometry, state.poses, state.w)
+    squared = np.sum((problem.whitening @ e[..., None])**2) + np.sum(state.w**2) + 2 * sum(
+        factors.error for factors in linear_factors(stated, Noise(), state))
+    used = np.bincount(m.label, sightings * np.where(m.as_pose, 3, 2), len(m.marker))
     freedom = np.sum(np.maximum(used - np.where(m.oriented, 3, 2), 0)) \
-        + np.sum(range_weight) - 2 * len(m.antenna)
-    return 2 * replace(problem, measured=quadratic).error(state) / max(1, freedom)
+        + np.sum(ranges) - 2 * len(m.antenna)
+    return float(squared / max(1, freedom))

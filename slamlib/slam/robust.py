@@ -35,17 +35,16 @@ def narrow_kernels(problem, state, scales=CAUCHY_SCALES):
 
 def accepted(problem, state):
     """MeasurementFactors of what the gates accept at a State; ranges have LATE_KERNEL."""
-    m = problem.measurements
-    weight = within_gates(m, state, EARLY_GATE, np.inf)
-    return MeasurementFactors(m, weight, range_kernel=LATE_KERNEL)
+    weight = within_gates(problem, state, EARLY_GATE, np.inf)
+    return MeasurementFactors(problem.measurements, weight, range_kernel=LATE_KERNEL)
 
 
-def within_gates(measurements, state, early, late):
+def within_gates(problem, state, early, late):
     """Weights (s + r,): 1 within the gates, else 0.
 
     The gate of a sighting is the 99.9 % quantile of chi-squared with 3 degrees of freedom, 2 for a
     point. A range may be too short by `early` and too long by `late` sigmas.
     """
-    sightings, ranges = residuals(measurements, state)
-    return np.r_[np.sum(sightings**2, axis=1) < measurements.gate,
+    sightings, ranges = residuals(problem.measurements, state, problem.noise)
+    return np.r_[np.sum(sightings**2, axis=1) < problem.measurements.gate,
                  (ranges > -early) & (ranges < late)].astype(float)

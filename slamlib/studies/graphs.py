@@ -8,10 +8,11 @@ from slamlib import odometry, se2
 from slamlib.evaluation import anees, ate
 from slamlib.simulation import simulate
 from slamlib.slam.estimate import fit_from_odometry
+from slamlib.slam.evidence import log_evidence
 from slamlib.slam.fit import refine
 from slamlib.slam.measurements import measure
 from slamlib.slam.odometry_factors import odometry_factors
-from slamlib.slam.optimizer import log_evidence, optimize
+from slamlib.slam.optimizer import optimize
 from slamlib.slam.result import SlamResult, result
 
 
@@ -78,7 +79,7 @@ def evidence_curve(fit, slips, model):
     problem, state, curve = replace(fit.problem, odometry=odometry_factors(
         fit.problem.measurements, model, fit.state.w)), fit.state, []
     for slip in slips:
-        problem = replace(problem, slip=slip)
+        problem = replace(problem, noise=replace(problem.noise, slip=slip))
         state = optimize(problem, state).state
         curve.append(log_evidence(problem, state))
     return np.array(curve)

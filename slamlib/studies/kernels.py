@@ -13,11 +13,11 @@ from slamlib.slam.fit import refine
 from slamlib.slam.initialization import odometry_state, trilaterated_antennas
 from slamlib.slam.measurement_factors import MeasurementFactors, residuals
 from slamlib.slam.measurements import measure
+from slamlib.slam.noise import known_noise
 from slamlib.slam.optimizer import optimize
 from slamlib.slam.problem import build
 from slamlib.slam.result import result
 from slamlib.slam.robust import CAUCHY_SCALES, EARLY_GATE, LATE_KERNEL, within_gates
-from slamlib.slam.slip import assumed_slip
 from slamlib.studies.montecarlo import judge_slam
 
 _kernel = gtsam.noiseModel.mEstimator
@@ -56,7 +56,7 @@ def solve_with(measurements, slip, sightings="gate", ranges="asymmetric Tukey",
     sightings, ranges : names in SIGHTINGS and RANGES; the defaults are those of `slam.estimate`.
     antennas : as of `initialization.state_from_poses`.
     """
-    problem = build(measurements, "arc", assumed_slip(slip))
+    problem = build(measurements, "arc", known_noise(slip))
     state = odometry_state(measurements, "arc", antennas=antennas)
     for scale in CAUCHY_SCALES:
         cauchy = _kernel.Cauchy.Create(scale)
@@ -72,7 +72,7 @@ def _accepted(problem, state, sightings, ranges):
     """The MeasurementFactors that remain by these ways."""
     m, (kernel, gated), (range_kernel, *gate) = (
         problem.measurements, SIGHTINGS[sightings], RANGES[ranges])
-    weight = graduated(problem, state) if ranges == "GNC" else within_gates(m, state, *gate)
+    weight = graduated(problem, state) if ranges == "GNC" else within_gates(problem, state, *gate)
     if not gated:
         weight[:len(m.label)] = 1
     return MeasurementFactors(m, weight, kernel, range_kernel)
@@ -85,12 +85,12 @@ def graduated(problem, state):
     (Yang, Antonante, Tzoumas and Carlone, IEEE RA-L 5(2), 2020).
     """
     m, gate = problem.measurements, EARLY_GATE**2
-    weight, ranges = within_gates(m, state, EARLY_GATE, EARLY_GATE), slice(len(m.label), None)
+    weight, ranges = within_gates(problem, state, EARLY_GATE, EARLY_GATE), slice(len(m.label), None)
     weight[ranges], control = 1, None
     while control is None or ((weight > 0) & (weight < 1)).any():
         trial = replace(problem, measured=MeasurementFactors(m, weight.copy()))
         state = optimize(trial, state, **{} if control is None else {"max_steps": 1}).state
-        squared = residuals(m, state)[1]**2
+        squared = residuals(m, state, problem.noise)[1]**2
         control = GNC_STEP * control if control else gate / max(2 * squared.max() - gate, gate)
         root = np.sqrt(gate * control * (control + 1) / np.maximum(squared, 1e-12)) - control
         weight[ranges] = np.clip(root, 0, 1)**2

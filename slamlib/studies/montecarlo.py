@@ -98,12 +98,15 @@ def learned_slips(seed, slip):
     Returns
     -------
     dict of numbers: the "slip" learned; "nees" of the poses and "aligned" ATE in m with it;
-    "known nees" and "known aligned", those of the graph that is given the slip and the arcs.
+    "known nees" and "known aligned", those of the graph that is given the noise and the arcs;
+    "problem 4 nees", with ranges and the noise learned.
     """
     dataset, truth = simulate("short", seed, slip=slip)
-    dataset = dataset.without("uwb")
-    learned, known = slam.estimate(dataset), slam.estimate(dataset, slip, "arc")
-    numbers = {"slip": learned.slip}
+    markers = dataset.without("uwb")
+    learned, known = slam.estimate(markers), slam.estimate(markers, slip, "arc")
+    with_ranges = slam.estimate(dataset, previous=learned)
+    numbers = {"slip": learned.slip, "problem 4 nees": anees(
+        with_ranges.poses, with_ranges.covariances, truth.poses)}
     for name, found in (("", learned), ("known ", known)):
         numbers |= {f"{name}nees": anees(found.poses, found.covariances, truth.poses),
                     f"{name}aligned": ate(found.poses, truth.poses, aligned=True)}

@@ -14,6 +14,7 @@ from slamlib.simulation import misguess, simulate
 from slamlib.slam.initialization import consensus_markers, odometry_state
 from slamlib.slam.measurement_factors import MeasurementFactors
 from slamlib.slam.measurements import measure
+from slamlib.slam.noise import Noise
 from slamlib.slam.optimizer import optimize
 from slamlib.slam.problem import build
 from slamlib.slam.result import result
@@ -97,7 +98,7 @@ def landmarks(seed, path="short", drift=1.0, known=True, kernel="graduated",
                        sigma_wheelbase=drift * vehicle.sigma_wheelbase)
     dataset, truth = simulate(path, seed, vehicle=drifting, **options)
     m = measure(replace(dataset, uwb=None, vehicle=drifting if known else vehicle))
-    problem = build(m, "arc", options.get("slip", TYPICAL_SLIP))
+    problem = build(m, "arc", Noise(options.get("slip", TYPICAL_SLIP)))
     cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create
     rounds = [replace(problem, measured=MeasurementFactors(m, m.unit_weights, cauchy(scale)))
               for scale in (CAUCHY_SCALES if kernel == "graduated" else CAUCHY_SCALES[-1:])]

@@ -1,0 +1,91 @@
+"""Stage 7: what the solution says against the files: wheels, noise, ranges and sightings."""
+
+import numpy as np
+
+from slamlib.doubt import Doubt
+
+MAX_WHEEL_SIGMAS = 4.0       # of a wheel parameter from what vehicle.toml states
+MAX_FACTOR = 1.5             # of a sigma, more or less, that is reported
+DECIDED_SIGMAS = 4.0         # of the logarithm of a factor, that it must differ from 1
+MAX_REJECTED = 0.1           # share of the sightings
+MIN_SIGHTINGS = 5            # of a marker, from which on most of them must be accepted
+WHEELS = ("right_radius", "left_radius", "wheelbase")
+
+
+def drive_doubts(measurements, found):
+    """List of Doubt about the Measurements of a drive, by their SlamResult."""
+    return [*wheel_doubts(measurements.dataset.vehicle, found), *noise_doubts(found),
+            *calibration_doubts(found), *sighting_doubts(measurements, found.rejected),
+            *(Doubt("antenna", f"Antenna {antenna} is in doubt: {reason}. Its covariance includes "
+                               "this; look at its rows in UwbReading.txt.")
+              for antenna, reason in found.doubts.items())]
+
+
+def wheel_doubts(vehicle, found):
+    """Wheel parameters that are further from the nominal ones than their sigmas allow."""
+    off = (found.wheel - vehicle.wheel) / vehicle.sigma_wheel
+    far = np.flatnonzero(np.abs(off) > MAX_WHEEL_SIGMAS)
+    if not len(far):
+        return []
+    sigma = np.sqrt(np.diag(found.wheel_covariance))
+    named = " and ".join(
+        f"{WHEELS[k]} is {1e3 * found.wheel[k]:.2f} ± {1e3 * sigma[k]:.2f} mm where "
+        f"{1e3 * vehicle.wheel[k]:.2f} ± {1e3 * vehicle.sigma_wheel[k]:.2f} mm was stated"
+        for k in far)
+    return [Doubt("wheel-parameters", (
+        f"By the other sensors {named}, up to {np.abs(off).max():.0f} standard deviations off: "
+        "measure the wheels again, or state values or larger sigmas in vehicle.toml."))]
+
+
+def noise_doubts(found):
+    """Factors on the stated sigmas that differ from 1."""
+    return [Doubt(what, (
+        f"The {name} scatter {factor:.3g} times as much as {file} states (the factor is known to "
+        f"{100 * sigma:.0f} %): problems 3 and 4 use the scatter that was found, the others the "
+        "file's. Look at how the sensor's covariances were obtained."))
+        for what, name, file, factor, sigma in (
+            ("marker-noise", "sightings", "ArucoReading.txt", found.noise.sightings,
+             found.noise_sigma[1]),
+            ("range-noise", "ranges", "UwbReading.txt", found.noise.ranges, found.noise_sigma[2]))
+        if abs(np.log(factor)) > max(np.log(MAX_FACTOR), DECIDED_SIGMAS * sigma)]
+
+
+def calibration_doubts(found):
+    """Ranges that calibrated themselves."""
+    if not found.range_calibration_sigma.any():
+        return []
+    (offset, scale), (sigma, scale_sigma) = found.range_calibration, found.range_calibration_sigma
+    return [Doubt("range-offset", (
+        f"The ranges of UwbReading.txt are {offset:.3f} ± {sigma:.3f} m plus {scale:.4f} ± "
+        f"{scale_sigma:.4f} times the distance. Problem 4 corrects this; calibrate the antennas."))]
+
+
+def sighting_doubts(measurements, rejected):
+    """Many rejected sightings, or most of a marker's; `rejected` (s,) bool."""
+    sentences = []
+    if rejected.sum() > MAX_REJECTED * len(rejected):
+        sentences.append(f"{rejected.sum()} of {len(rejected)} sightings contradict the rest and "
+                         "are left out")
+    count = np.bincount(measurements.label, minlength=len(measurements.marker))
+    wrong = np.bincount(measurements.label, rejected, len(measurements.marker))
+    most = measurements.marker[(count >= MIN_SIGHTINGS) & (wrong > count / 2)].tolist()
+    if most:
+        sentences.append("most sightings of marker " + ", ".join(map(str, most))
+                         + " contradict the rest and are left out")
+    return [Doubt("sightings-rejected", "; ".join(sentences).capitalize()
+                  + ": look at the marker ids in ArucoReading.txt, at markers that were moved or "
+                  "are there twice.")] if sentences else []
+
+
+def confirmation(found, sensor):
+    """What a SlamResult says of the stated noise of a sensor, "sightings" or "ranges": a clause.
+
+    It is confirmed where the factor on its standard deviations is within a tenth of 1 or within
+    three standard deviations of it.
+    """
+    column, file = {"sightings": (1, "ArucoReading.txt"), "ranges": (2, "UwbReading.txt")}[sensor]
+    factor, relative = getattr(found.noise, sensor), found.noise_sigma[column]
+    number = f"{factor:.2f} ± {factor * relative:.2f}"
+    if abs(np.log(factor)) < max(np.log(1.1), 3 * relative):
+        return f"the standard deviations in {file} are confirmed (factor {number})"
+    return f"the standard deviations in {file} were multiplied by {number}"

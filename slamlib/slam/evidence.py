@@ -1,0 +1,189 @@
+"""Stage 6: the evidence of the noise, from one linearisation for all values of the noise.
+
+At a state, the graph's factors are linearised and their information is summed by groups: priors,
+odometry, sightings and ranges. The noise of odometry depends on the slip, the information of the
+other two on their factors alone. Each value of the noise then costs one sparse decomposition.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import gtsam
+import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import splu
+
+from slamlib.slam.linear_factors import linear_factors
+from slamlib.slam.measurement_factors import GUESS_PRIOR_SIGMA, WEAK_SIGMA
+from slamlib.slam.odometry_factors import odometry_error
+from slamlib.slam.problem import Problem
+from slamlib.slam.state import State
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """The normal equations H delta = -g of the linearised graph, as a function of the noise."""
+
+    problem: Problem
+    state: State
+
+    def solve(self, noise):
+        """Solution delta (n,) in the order of `begin`, and the log evidence, up to a constant.
+
+        With half the squared error e at the solution, the odometry noise Q, factors l_s and l_r on
+        the sigmas of S errors of sightings and R of ranges, and the information H,
+
+            log evidence = -e - sum log|Q| / 2 - S log l_s - R log l_r - log|H| / 2
+
+        (MacKay, Neural Computation 4(3), 1992). The omitted constant depends on the dataset and the
+        weights: only problems on the same accepted measurements can be compared. The log evidence
+        is minus infinity where H is singular to rounding.
+        """
+        given, groups, Q = self.problem.noise, self._groups, self._odometry.noise(noise.slip)
+        ratios = {"prior": 1.0, "sightings": (given.sightings / noise.sightings)**2,
+                  "ranges": (given.ranges / noise.ranges)**2}
+        J, e, log_determinant = self._whitened_odometry(Q)
+        H, g, squared = J.T @ J, J.T @ e, e @ e
+        for name, ratio in ratios.items():
+            H = H + ratio * groups[name].H
+            g = g + ratio * groups[name].g
+            squared += ratio * groups[name].squared
+        try:
+            lu = splu(H.tocsc(), permc_spec="NATURAL", diag_pivot_thresh=0.0,
+                      options={"SymmetricMode": True})
+        except RuntimeError:
+            return np.full(len(g), np.nan), -np.inf
+        delta = -lu.solve(g)
+        log_root = np.sum(np.log(np.abs(lu.U.diagonal()))) / 2
+        return delta, -(squared + g @ delta) / 2 - log_determinant / 2 - log_root \
+            - groups["sightings"].count * np.log(noise.sightings) \
+            - groups["ranges"].count * np.log(noise.ranges)
+
+    @property
+    def _odometry(self):
+        return self.problem.odometry
+
+    @cached_property
+    def begin(self):
+        """(v,) first row of every variable: frames, markers, antennas, w, and z where it is one."""
+        m = self.problem.measurements
+        size = np.r_[np.full(len(m.frame), 3), np.where(m.oriented, 3, 2),
+                     np.full(len(m.antenna), 2), 3, [2] * m.calibrated].astype(int)
+        first = {"x": 0, "l": len(m.frame), "p": len(m.frame),
+                 "a": len(m.frame) + len(m.marker), "w": len(size) - 1 - m.calibrated,
+                 "z": len(size) - 1}
+        keys = (gtsam.Symbol(m.ordering.at(i)) for i in range(m.ordering.size()))
+        order = [first[chr(key.chr())] + key.index() for key in keys]
+        begin = np.empty(len(size), int)
+        begin[order] = np.cumsum(size[order]) - size[order]
+        return begin
+
+    @cached_property
+    def size(self):
+        """Number n of unknowns."""
+        m = self.problem.measurements
+        return 3 * len(m.frame) + np.sum(np.where(m.oriented, 3, 2)) + 2 * len(m.antenna) + 3 \
+            + 2 * m.calibrated
+
+    def rows(self, variables, width):
+        """Rows (m, width) of the unknowns of `variables` (m,), numbered as in `begin`."""
+        return self.begin[variables][:, None] + np.arange(width)
+
+    @cached_property
+    def _frames(self):
+        """Rows (f-1, 9) of [X_i, X_{i+1}, w], and unwhitened errors and derivatives."""
+        m, state = self.problem.measurements, self.state
+        f = len(m.frame)
+        w = np.full(f - 1, f + len(m.marker) + len(m.antenna))
+        rows = np.concatenate([self.rows(np.arange(f - 1), 3), self.rows(np.arange(1, f), 3),
+                               self.rows(w, 3)], axis=1)
+        e, *jacobians = odometry_error(self._odometry, state.poses, state.w)
+        return rows, e, np.concatenate(jacobians, axis=2)
+
+    def _whitened_odometry(self, Q):
+        """Sparse J (3 f - 3, n), whitened errors (3 f - 3,), and sum log|Q|."""
+        rows, e, J = self._frames
+        L = np.linalg.cholesky(Q)
+        J, e = np.linalg.solve(L, J), np.linalg.solve(L, e[..., None])
+        logs = np.log(np.diagonal(L, axis1=1, axis2=2))
+        return self._sparse(rows, J), e.ravel(), 2 * np.sum(logs)
+
+    def _sparse(self, columns, blocks):
+        """Sparse (m d, n) of blocks (m, d, c) at columns (m, c)."""
+        m, d, c = blocks.shape
+        return sparse.csr_matrix(
+            (blocks.ravel(), np.repeat(columns[:, None], d, axis=1).ravel(),
+             np.arange(0, m * d * c + 1, c)), shape=(m * d, self.size))
+
+    @cached_property
+    def _groups(self):
+        """The _Group of the priors, of the sightings and of the ranges."""
+        problem = self.problem
+        poses, points, ranges = linear_factors(problem.measured, problem.noise, self.state)
+        from_kernel = consistency(problem.measured.range_kernel)
+        sightings = _sum([self._group(poses), self._group(points)])
+        return {"prior": self._prior(), "sightings": sightings,
+                "ranges": self._group(ranges, from_kernel)}
+
+    def _group(self, factors, from_kernel=1.0):
+        m, width = self.problem.measurements, factors.by_landmark.shape[2]
+        rows = [self.rows(factors.row, 3), self.rows(len(m.frame) + factors.landmark, width)]
+        J = [factors.by_pose, factors.by_landmark]
+        if factors.by_calibration is not None and m.calibrated:
+            rows.append(self.rows(np.full(len(factors.row), len(self.begin) - 1), 2))
+            J.append(factors.by_calibration)
+        J = self._sparse(np.concatenate(rows, axis=1), np.concatenate(J, axis=2))
+        e = factors.e.ravel()
+        return _Group(J.T @ J / from_kernel, J.T @ e / from_kernel, e @ e / from_kernel,
+                      factors.e.shape[1] * np.sum(factors.weight))
+
+    def _prior(self):
+        problem, m, state = self.problem, self.problem.measurements, self.state
+        f, k = len(m.frame), len(m.marker)
+        parts = [(np.array([0]), state.poses[:1], m.origin_sigma),
+                 (np.array([f + k + len(m.antenna)]), state.w[None], 1.0),
+                 (f + k + np.arange(len(m.antenna)), state.antennas - m.guess, GUESS_PRIOR_SIGMA)]
+        parts += [(np.array([f + j]), state.markers[j:j + 1, :2 + m.oriented[j]], WEAK_SIGMA)
+                  for j in problem.measured.unsupported]
+        if m.calibrated:
+            parts.append((np.array([len(self.begin) - 1]), state.z[None], 1.0))
+        information, e = np.zeros(self.size), np.zeros(self.size)
+        for variables, off, sigma in parts:
+            rows = self.rows(variables, off.shape[1])
+            information[rows], e[rows] = np.broadcast_to(sigma, off.shape)**-2.0, off
+        return _Group(sparse.diags_array(information).tocsr(), information * e,
+                      np.sum(information * e**2), 0)
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Information H (n, n), gradient g (n,) and squared error of a group of `count` errors."""
+
+    H: sparse.csr_matrix
+    g: np.ndarray
+    squared: float
+    count: float
+
+
+def _sum(groups):
+    return _Group(*(sum(getattr(group, name) for group in groups)
+                    for name in ("H", "g", "squared", "count")))
+
+
+def consistency(kernel):
+    """Weighted mean of the squares of standard normal residuals under a kernel's weights.
+
+    A kernel takes part of the variance of Gaussian residuals; without this factor the learned sigma
+    would be too small (Huber and Ronchetti, Robust Statistics, 2009, chapter 5). It is 1 without
+    kernel.
+    """
+    if kernel is None:
+        return 1.0
+    r = np.linspace(-6, 6, 241)
+    density = np.exp(-r**2 / 2) * np.array([kernel.weight(x) for x in r])
+    return float(np.sum(r**2 * density) / np.sum(density))
+
+
+def log_evidence(problem, state):
+    """Laplace log evidence of a Problem at a State near its optimum, as `NormalEquations.solve`."""
+    return NormalEquations(problem, state).solve(problem.noise)[1]

@@ -1,0 +1,123 @@
+"""Stage 6: the noise of a drive, learned from its own measurements, and how well it is known.
+
+The evidence times the prior is the posterior of the logarithms of slip and factors. Newton's method
+finds its mode, differences give its covariance. Poses and landmarks are averaged over a few points
+of it (integrated nested Laplace approximation: Rue, Martino and Chopin, J. R. Stat. Soc. B 71(2),
+2009), so that every slip that is possible widens the covariance by its probability.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slamlib.slam.evidence import NormalEquations
+from slamlib.slam.measurement_factors import residuals
+from slamlib.slam.noise import BOUNDS, MEDIAN, PRIOR_SIGMA, Noise, from_logarithms, log_prior
+
+STEP = 0.2                   # of the logarithms, for differences
+MAX_STEP = 1.5               # of Newton's method
+MAX_STEPS = 12
+GAIN = 0.01                  # predicted log posterior at which Newton's method ends
+ACROSS = 1.5 * np.arange(-2, 3)      # sigmas of log slip, points at which the posterior is summed
+NARROW = 0.2                 # sigma of log slip below which one point is enough
+NEGLIGIBLE = 1e-3            # weight of a point that is left out
+FEW = 20                     # measurements, below which their scatter does not start a factor
+
+
+@dataclass(frozen=True)
+class NoisePosterior:
+    """Noise given the measurements."""
+
+    noise: Noise                 # of greatest posterior density
+    covariance: np.ndarray       # (3, 3) of its logarithms; zero for what has no measurements
+    density: float               # log posterior at `noise`, up to a constant
+    points: tuple                # of (weight, Noise), over which estimates are averaged
+
+
+def noise_posterior(problem, state):
+    """The NoisePosterior at a State near the solution of a Problem; starts from its noise."""
+    equations = NormalEquations(problem, state)
+    free = np.array([True, len(problem.measured.sighting_weight) > 0,
+                     len(problem.measured.range_weight) > 0])
+
+    def log_posterior(logarithms):
+        return equations.solve(from_logarithms(logarithms))[1] \
+            + np.sum(log_prior(logarithms)[free])
+
+    start = np.where(free, problem.noise.logarithms, np.log(MEDIAN))
+    mode, density, covariance = _mode(log_posterior, start, np.flatnonzero(free))
+    return NoisePosterior(from_logarithms(mode), covariance, density,
+                          _points(log_posterior, mode, density, covariance))
+
+
+def starting_noise(measurements, state):
+    """Noise of typical slip whose factors, at least 1, are the residuals' medians at a State.
+
+    Covariances that are far too small would otherwise have most measurements rejected before a
+    factor is learned.
+    """
+    sightings, ranges = residuals(measurements, state, Noise())
+    squared = np.sum(sightings**2, axis=1) / np.where(measurements.as_pose, 2.366, 1.386)
+    return Noise(sightings=_at_least_one(squared), ranges=_at_least_one(ranges**2 / 0.455))
+
+
+def _at_least_one(squared):
+    """Root of the median of squared residuals over that of chi-squared, if it exceeds 1."""
+    return max(1.0, float(np.sqrt(np.median(squared)))) if len(squared) >= FEW else 1.0
+
+
+def _mode(function, x, free):
+    """Argument, value and covariance (3, 3) of the maximum of a log density, by Newton's method."""
+    value = function(x)
+    for _ in range(MAX_STEPS):
+        gradient, hessian = _differences(function, x, value, free)
+        curvature, axes = np.linalg.eigh(-hessian)
+        covariance = axes / np.maximum(curvature, PRIOR_SIGMA.max()**-2) @ axes.T
+        step = covariance @ gradient
+        if gradient @ step / 2 < GAIN:
+            break
+        step *= min(1.0, MAX_STEP / np.abs(step).max())
+        while (new := function(_moved(x, free, step))) < value and np.abs(step).max() > 1e-2:
+            step = step / 2
+        if new <= value:
+            break
+        x, value = _moved(x, free, step), new
+    full = np.zeros((len(x), len(x)))
+    full[np.ix_(free, free)] = covariance
+    return x, value, full
+
+
+def _moved(x, free, step):
+    moved = x.copy()
+    moved[free] += step
+    return np.clip(moved, *BOUNDS)
+
+
+def _differences(function, x, value, free):
+    """Gradient (p,) and Hessian (p, p) by central differences over the free components."""
+    unit = STEP * np.eye(len(free))
+    up, down = (np.array([function(_moved(x, free, sign * e)) for e in unit]) for sign in (1, -1))
+    gradient, hessian = (up - down) / (2 * STEP), np.diag((up + down - 2 * value) / STEP**2)
+    for i in range(len(free)):
+        for j in range(i):
+            both = function(_moved(x, free, unit[i] + unit[j]))
+            hessian[i, j] = hessian[j, i] = (both - up[i] - up[j] + value) / STEP**2
+    return gradient, hessian
+
+
+def _points(log_posterior, mode, density, covariance):
+    """(weight, Noise) along the slip, at each the most probable factors.
+
+    What remains uncertain at a point widens its noise: a sigma is replaced by its root mean square.
+    """
+    sigma = np.sqrt(covariance[0, 0])
+    along = covariance[0] / sigma                       # of all logarithms, for one sigma of slip
+    if sigma < NARROW:
+        rest, offsets, weights = covariance, [0.0], np.ones(1)
+    else:
+        rest, offsets = covariance - np.outer(along, along), ACROSS
+        logs = np.array([log_posterior(mode + z * along) if z else density for z in offsets])
+        weights = np.exp(logs - logs.max())
+    mean_square = np.maximum(np.diag(rest), 0)
+    return tuple((float(weight), from_logarithms(mode + z * along + mean_square))
+                 for weight, z in zip(weights / weights.sum(), offsets) if weight > NEGLIGIBLE)
