@@ -214,7 +214,11 @@ def doubts_about_drive(dataset, truth):
 
     From its measurements, and from its Truth or None.
     """
-    return (*localization.drive_doubts(dataset), *(() if truth is None else truth.doubts))
+    try:
+        by_measurements = localization.drive_doubts(dataset)
+    except np.linalg.LinAlgError:              # where increments have no covariance
+        by_measurements = []
+    return (*by_measurements, *(() if truth is None else truth.doubts))
 
 
 def merged(doubts):

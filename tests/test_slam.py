@@ -407,13 +407,16 @@ def replace_namespace(layout, **changes):
 @pytest.mark.slow
 @pytest.mark.parametrize("shape", OPEN_PATHS)
 def test_open_paths_are_solved(shape):
-    """A marker every 2 m, no loop closure: three drives each, against the graph of known slip."""
+    """A marker every 2 m, no loop closure: three drives each, against the graph of known noise."""
+    values = []
     for seed in range(3):
         dataset, truth = open_path(OPEN_PATHS[shape], seed)
         found, known = slam.estimate(dataset), slam.estimate(dataset, 1e-3, "arc")
         ratio = (ate(found.poses, truth.poses, aligned=True)
                  / ate(known.poses, truth.poses, aligned=True))
         assert ratio < 1.1 and found.rejected.mean() < 0.01
+        values.append(anees(found.poses, found.covariances, truth.poses))
+    assert np.mean(values) < nees_band(3, probability=0.999)[1]
 
 
 def test_where_cholesky_fails_qr_gives_the_same_solution(monkeypatch):

@@ -1,6 +1,6 @@
 """Doubts about a whole drive, from increments by markers against increments by odometry.
 
-Files whose columns, signs, stamps or units are wrong give increments that disagree in a way that is
+Files whose columns, signs or units are wrong give increments that disagree in a way that is
 known in advance. Each such hypothesis predicts the increments by markers from those by the wheels;
 it is accepted if its robust cost is decisively lower than that of the file as it is, and if most
 increments then agree. Everything here takes the files as they are, before any graph is built.
@@ -21,7 +21,6 @@ from scipy.stats import chi2
 from slamlib import increments, se2
 from slamlib.doubt import Doubt
 from slamlib.localization.marker_increments import consecutive_increments
-from slamlib.localization.time_offset import time_offset
 from slamlib.localization.units import path_and_antennas, range_units, sighting_units
 from slamlib.sightings import GATE, MAX_HEADING_SIGMA, sightings_by_frame
 
@@ -34,9 +33,6 @@ MOVING = 5.0              # sigmas of distance or turn, by markers or wheels, fr
 DECISIVE = 10.0           # log odds by which a hypothesis explains the increments better
 MOST = 0.7                # share of the increments that agree with an accepted hypothesis
 AGREEMENT = chi2.ppf(0.95, 3)    # squared Mahalanobis distance of increments that agree
-MIN_OFFSET = 1.0          # poses; a smaller offset is no doubt
-OFFSET_SIGMAS = 3.0       # of a decided offset
-MAX_SLIP = 5e-3           # sqrt(m), with which an offset is decided
 CONTRADICTING = 4.0       # standard errors of the mean agreement of headings and positions below 0
 BETTER_FIT = 3.0          # ratio of the ranges' median residuals that decides between two paths
 
@@ -46,26 +42,30 @@ class _Axes:
     """One way to exchange axes or signs, and what in the files explains it."""
 
     A: tuple              # 2 x 2, of an increment's x and y
-    seen: str             # how the markers move beside the wheels
+    seen: str             # how the vehicle moves by the markers, beside the wheels
     sightings: str        # what mends x and y of the sightings
     wheels: str = ""      # name of the doubt about the wheels; empty if they do not explain it
     counts: str = ""      # what mends the counts of the wheels
     look: str = ""        # at what in encoderReading.txt
 
 
-AS_IT_IS = _Axes(((1, 0), (0, 1)), "move as", "")
+AS_IT_IS = _Axes(((1, 0), (0, 1)), "moves as", "")
 AXES = (
-    _Axes(((1, 0), (0, -1)), "turn the other way than", "the other sign of y",
+    _Axes(((1, 0), (0, -1)), "turns the other way than", "the other sign of y",
           "wheels-swapped", "the columns exchanged", "the order of right and left"),
-    _Axes(((-1, 0), (0, 1)), "drive backwards and turn the other way than", "the other sign of x",
+    _Axes(((-1, 0), (0, 1)), "drives and turns the other way than", "the other sign of x",
           "wheels-reversed", "both signs reversed", "the signs of the counts"),
-    _Axes(((-1, 0), (0, -1)), "drive backwards beside", "the other signs of x and y",
+    _Axes(((-1, 0), (0, -1)), "drives the other way than", "the other signs of x and y",
           "wheels-reversed", "both signs reversed and the columns exchanged",
           "the signs of the counts and the order of right and left"),
-    _Axes(((0, -1), (1, 0)), "drive to the left of", "axes turned by a right angle"),
-    _Axes(((0, 1), (-1, 0)), "drive to the right of", "axes turned by a right angle"),
-    _Axes(((0, 1), (1, 0)), "turn the other way and drive to the left of", "x and y exchanged"),
-    _Axes(((0, -1), (-1, 0)), "turn the other way and drive to the right of",
+    _Axes(((0, -1), (1, 0)), "moves to the left where it moves forwards",
+          "axes turned by a right angle"),
+    _Axes(((0, 1), (-1, 0)), "moves to the right where it moves forwards",
+          "axes turned by a right angle"),
+    _Axes(((0, 1), (1, 0)), "turns the other way, and moves to the left where it moves forwards,",
+          "x and y exchanged"),
+    _Axes(((0, -1), (-1, 0)),
+          "turns the other way, and moves to the right where it moves forwards,",
           "x and y exchanged, with the other signs"))
 
 
@@ -101,8 +101,8 @@ class _Compared:
 def drive_doubts(dataset):
     """List of Doubts about the files of a drive, a Dataset; empty if too little was seen to decide.
 
-    Kinds are units, wheels-swapped, wheels-reversed, camera-mirrored, camera-turned, time-offset
-    and odometry. At most one flaw of sightings and counts is named, with all that explains it.
+    Kinds are units, wheels-swapped, wheels-reversed, camera-mirrored, camera-turned and odometry.
+    At most one flaw of sightings and counts is named, with all that explains it.
     """
     ranges, sightings = range_units(dataset), sightings_by_frame(dataset.aruco)
     if len(sightings.frame) <= MIN_INCREMENTS:
@@ -118,8 +118,7 @@ def drive_doubts(dataset):
         return ranges
     units = sighting_units(compared.by_markers, compared.by_wheels, compared.sigma())
     return units + ranges if units else (
-        _axes_doubts(dataset, compared, contradicting) or _odometry_doubts(compared)
-        or _offset_doubts(dataset, sightings, found)) + ranges
+        _axes_doubts(dataset, compared, contradicting) or _odometry_doubts(compared)) + ranges
 
 
 def _headings_contradict(sightings, found):
@@ -212,8 +211,8 @@ def _explanations(dataset, axes, contradicting, nearer, count):
     camera = f"sightings with {mend} (look at x, y and theta in ArucoReading.txt)"
     if contradicting:
         return [Doubt(name, _contradiction().sentence + f" They agree for {camera}.")]
-    seen = (f"The markers {axes.seen} the wheels: with {{}}, increments of the vehicle by markers "
-            f"and by wheels agree better at {nearer:.0%} of {count} places.")
+    seen = (f"By the markers the vehicle {axes.seen} by the wheels: with {{}}, increments by both "
+            f"agree better at {nearer:.0%} of {count} places.")
     if not axes.wheels:
         return [Doubt(name, seen.format(camera))]
     wheels = f"{axes.counts} in encoderReading.txt (look at {axes.look})"
@@ -221,7 +220,7 @@ def _explanations(dataset, axes, contradicting, nearer, count):
     side, fit = _by_ranges(dataset, axes.A)
     if side is not None:
         return [replace(doubts[side], sentence=f"{doubts[side].sentence} {fit}")]
-    return [replace(doubt, sentence=f"{doubt.sentence} As well possible: {other}.")
+    return [replace(doubt, sentence=f"{doubt.sentence} Equally possible: {other}.")
             for doubt, other in zip(doubts, (camera, wheels))]
 
 
@@ -256,23 +255,8 @@ def _odometry_doubts(compared):
                             np.median(np.abs(se2.wrap(each[:, 2]))))
                            for each in (compared.by_markers, compared.by_wheels)))
     return [Doubt("odometry", (
-        f"The vehicle's increments by markers and by wheels disagree at {share:.0%} of "
-        f"{len(squared)} places, far beyond their noise: by markers it moves by {lengths[0]:.2g} m "
-        f"and turns by {turns[0]:.2g} rad, by wheels {lengths[1]:.2g} m and {turns[1]:.2g} rad "
+        f"Increments of the vehicle by markers and by wheels disagree beyond their noise at "
+        f"{share:.0%} of {len(squared)} places: by the markers it moves by {lengths[0]:.3g} m and "
+        f"turns by {turns[0]:.3g} rad, by the wheels {lengths[1]:.3g} m and {turns[1]:.3g} rad "
         "(medians). Look whether encoderReading.txt and ArucoReading.txt are of the same drive and "
         "count the same poses."))]
-
-
-def _offset_doubts(dataset, sightings, found):
-    """A Doubt if the sightings are late or early against the encoder."""
-    if np.count_nonzero(found.usable) < MIN_INCREMENTS:
-        return []
-    late, sigma, slip = time_offset(dataset, sightings, found)
-    if slip > MAX_SLIP or abs(late) < max(MIN_OFFSET, OFFSET_SIGMAS * sigma):
-        return []
-    side, sign = ("late", "large") if late > 0 else ("early", "small")
-    return [Doubt("time-offset", (
-        f"The sightings are {abs(late):.1f} poses {side} against the encoder, with a standard "
-        f"deviation of {sigma:.1f}, by the turns and distances of {np.count_nonzero(found.usable)} "
-        f"increments: look whether the pose ids of ArucoReading.txt are too {sign} by "
-        f"{abs(late):.0f}."))]

@@ -55,8 +55,8 @@ def sighting_units(by_markers, by_wheels, sigma):
         look = ("the unit of the radii (metres) and ticks_per_revolution in vehicle.toml, and the "
                 "counts in encoderReading.txt")
     return [Doubt("units", (
-        f"Between the same poses the vehicle moves by {lengths[0]:.3g} m and turns by "
-        f"{turns[0]:.3g} rad by the markers, and by {lengths[1]:.3g} m and {turns[1]:.3g} rad by "
+        f"Between the same poses the vehicle moves by {lengths[0]:.4g} m and turns by "
+        f"{turns[0]:.4g} rad by the markers, and by {lengths[1]:.4g} m and {turns[1]:.4g} rad by "
         f"the wheels (medians): look at {look}."))]
 
 
@@ -75,14 +75,14 @@ def range_units(dataset):
                           for pose, _, guess in antennas])
     if _factor(spread, RANGE_SPREAD * extent) > 1 or spread < extent / MAX_SPREAD_FACTOR:
         return [Doubt("units", (
-            f"The ranges to an antenna spread by {spread:.3g} m, while the vehicle is within "
-            f"{extent:.3g} m by the wheels (standard deviations; median range {typical:.3g} m): "
+            f"The ranges to an antenna spread by {spread:.4g} m, while the vehicle is within "
+            f"{extent:.4g} m by the wheels (standard deviations; median range {typical:.4g} m): "
             "look at the unit of UwbReading.txt (metres), and of the radii in vehicle.toml "
             "(metres)."))]
     if _factor(typical, distance) != 1:
         return [Doubt("units", (
-            f"The median range is {typical:.3g} m, and the median distance from the path by the "
-            f"wheels to the guessed antennas {distance:.3g} m: look at the unit of "
+            f"The median range is {typical:.4g} m, and the median distance from the path by the "
+            f"wheels to the guessed antennas {distance:.4g} m: look at the unit of "
             "UwbAntennaGuess.txt (metres)."))]
     return []
 

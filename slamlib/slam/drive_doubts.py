@@ -5,6 +5,10 @@ import numpy as np
 from slamlib.doubt import Doubt
 
 MAX_WHEEL_SIGMAS = 4.0       # of a wheel parameter from what vehicle.toml states
+SMALLEST_SIGMA = 1e-12       # m, of a wheel parameter that studies take as known
+MAX_SLIP = 0.02              # sqrt(m), of wheels that merely slip
+MIN_OFFSET = 0.5             # poses
+OFFSET_SIGMAS = 3.5          # of a decided offset
 MAX_FACTOR = 1.5             # of a sigma, more or less, that is reported
 DECIDED_SIGMAS = 4.0         # of the logarithm of a factor, that it must differ from 1
 MAX_REJECTED = 0.1           # share of the sightings
@@ -14,7 +18,8 @@ WHEELS = ("right_radius", "left_radius", "wheelbase")
 
 def drive_doubts(measurements, found):
     """List of Doubt about the Measurements of a drive, by their SlamResult."""
-    return [*wheel_doubts(measurements.dataset.vehicle, found), *noise_doubts(found),
+    return [*wheel_doubts(measurements.dataset.vehicle, found), *slip_doubts(found),
+            *time_doubts(found), *noise_doubts(found),
             *calibration_doubts(found), *sighting_doubts(measurements, found.rejected),
             *(Doubt("antenna", f"Antenna {antenna} is in doubt: {reason}. Its covariance includes "
                                "this; look at its rows in UwbReading.txt.")
@@ -23,7 +28,7 @@ def drive_doubts(measurements, found):
 
 def wheel_doubts(vehicle, found):
     """Wheel parameters that are further from the nominal ones than their sigmas allow."""
-    off = (found.wheel - vehicle.wheel) / vehicle.sigma_wheel
+    off = (found.wheel - vehicle.wheel) / np.maximum(vehicle.sigma_wheel, SMALLEST_SIGMA)
     far = np.flatnonzero(np.abs(off) > MAX_WHEEL_SIGMAS)
     if not len(far):
         return []
@@ -35,6 +40,27 @@ def wheel_doubts(vehicle, found):
     return [Doubt("wheel-parameters", (
         f"By the other sensors {named}, up to {np.abs(off).max():.0f} standard deviations off: "
         "measure the wheels again, or state values or larger sigmas in vehicle.toml."))]
+
+
+def slip_doubts(found):
+    """A slip that no wheel has."""
+    if found.slip <= MAX_SLIP or not found.noise_sigma[0]:
+        return []
+    return [Doubt("wheel-slip", (
+        f"By the other sensors each wheel slips by {1e3 * found.slip:.0f} mm (one standard "
+        "deviation) after one metre, far more than wheels do: look whether encoderReading.txt is "
+        "of the same drive as the other files, with the same pose ids."))]
+
+
+def time_doubts(found):
+    """Sightings that are late or early against the encoder."""
+    late, sigma = found.time_offset
+    if abs(late) < max(MIN_OFFSET, OFFSET_SIGMAS * sigma):
+        return []
+    side, sign = ("late", "large") if late > 0 else ("early", "small")
+    return [Doubt("time-offset", (
+        f"The sightings are {abs(late):.1f} ± {sigma:.1f} poses {side} against the encoder: look "
+        f"whether the pose ids of ArucoReading.txt are too {sign} by about {abs(late):.0f}."))]
 
 
 def noise_doubts(found):

@@ -39,19 +39,9 @@ class NormalEquations:
         weights: only problems on the same accepted measurements can be compared. The log evidence
         is minus infinity where H is singular to rounding.
         """
-        given, groups, Q = self.problem.noise, self._groups, self._odometry.noise(noise.slip)
-        ratios = {"prior": 1.0, "sightings": (given.sightings / noise.sightings)**2,
-                  "ranges": (given.ranges / noise.ranges)**2}
-        J, e, log_determinant = self._whitened_odometry(Q)
-        H, g, squared = J.T @ J, J.T @ e, e @ e
-        for name, ratio in ratios.items():
-            H = H + ratio * groups[name].H
-            g = g + ratio * groups[name].g
-            squared += ratio * groups[name].squared
-        try:
-            lu = splu(H.tocsc(), permc_spec="NATURAL", diag_pivot_thresh=0.0,
-                      options={"SymmetricMode": True})
-        except RuntimeError:
+        H, g, squared, log_determinant = self._sums(noise)
+        lu, groups = decomposition(H), self._groups
+        if lu is None:
             return np.full(len(g), np.nan), -np.inf
         delta = -lu.solve(g)
         log_root = np.sum(np.log(np.abs(lu.U.diagonal()))) / 2
@@ -59,9 +49,22 @@ class NormalEquations:
             - groups["sightings"].count * np.log(noise.sightings) \
             - groups["ranges"].count * np.log(noise.ranges)
 
-    @property
-    def _odometry(self):
-        return self.problem.odometry
+    def information(self, noise):
+        """H (n, n), sparse, and g (n,)."""
+        return self._sums(noise)[:2]
+
+    def _sums(self, noise):
+        """H, g, squared error at the state, and sum log|Q|."""
+        given, groups = self.problem.noise, self._groups
+        ratios = {"prior": 1.0, "sightings": (given.sightings / noise.sightings)**2,
+                  "ranges": (given.ranges / noise.ranges)**2}
+        J, e, log_determinant = self._whitened_odometry(self.problem.odometry.noise(noise.slip))
+        H, g, squared = J.T @ J, J.T @ e, e @ e
+        for name, ratio in ratios.items():
+            H = H + ratio * groups[name].H
+            g = g + ratio * groups[name].g
+            squared += ratio * groups[name].squared
+        return H, g, squared, log_determinant
 
     @cached_property
     def begin(self):
@@ -97,7 +100,7 @@ class NormalEquations:
         w = np.full(f - 1, f + len(m.marker) + len(m.antenna))
         rows = np.concatenate([self.rows(np.arange(f - 1), 3), self.rows(np.arange(1, f), 3),
                                self.rows(w, 3)], axis=1)
-        e, *jacobians = odometry_error(self._odometry, state.poses, state.w)
+        e, *jacobians = odometry_error(self.problem.odometry, state.poses, state.w)
         return rows, e, np.concatenate(jacobians, axis=2)
 
     def _whitened_odometry(self, Q):
@@ -126,16 +129,19 @@ class NormalEquations:
                 "ranges": self._group(ranges, from_kernel)}
 
     def _group(self, factors, from_kernel=1.0):
+        J, e = self.jacobian(factors), factors.e.ravel()
+        return _Group(J.T @ J / from_kernel, J.T @ e / from_kernel, e @ e / from_kernel,
+                      factors.e.shape[1] * np.sum(factors.weight))
+
+    def jacobian(self, factors):
+        """Sparse derivatives (m d, n) of LinearFactors."""
         m, width = self.problem.measurements, factors.by_landmark.shape[2]
         rows = [self.rows(factors.row, 3), self.rows(len(m.frame) + factors.landmark, width)]
         J = [factors.by_pose, factors.by_landmark]
         if factors.by_calibration is not None and m.calibrated:
             rows.append(self.rows(np.full(len(factors.row), len(self.begin) - 1), 2))
             J.append(factors.by_calibration)
-        J = self._sparse(np.concatenate(rows, axis=1), np.concatenate(J, axis=2))
-        e = factors.e.ravel()
-        return _Group(J.T @ J / from_kernel, J.T @ e / from_kernel, e @ e / from_kernel,
-                      factors.e.shape[1] * np.sum(factors.weight))
+        return self._sparse(np.concatenate(rows, axis=1), np.concatenate(J, axis=2))
 
     def _prior(self):
         problem, m, state = self.problem, self.problem.measurements, self.state
@@ -168,6 +174,15 @@ class _Group:
 def _sum(groups):
     return _Group(*(sum(getattr(group, name) for group in groups)
                     for name in ("H", "g", "squared", "count")))
+
+
+def decomposition(H):
+    """Sparse decomposition of H (n, n), ordered for elimination; None if H is singular."""
+    try:
+        return splu(H.tocsc(), permc_spec="NATURAL", diag_pivot_thresh=0.0,
+                    options={"SymmetricMode": True})
+    except RuntimeError:
+        return None
 
 
 def consistency(kernel):

@@ -21,6 +21,7 @@ GAIN = 0.01                  # predicted log posterior at which Newton's method 
 ACROSS = 1.5 * np.arange(-2, 3)      # sigmas of log slip, points at which the posterior is summed
 NARROW = 0.2                 # sigma of log slip below which one point is enough
 NEGLIGIBLE = 1e-3            # weight of a point that is left out
+IMPOSSIBLE = -1e12           # log evidence of noise for which the equations are singular
 FEW = 20                     # measurements, below which their scatter does not start a factor
 
 
@@ -41,10 +42,12 @@ def noise_posterior(problem, state):
                      len(problem.measured.range_weight) > 0])
 
     def log_posterior(logarithms):
-        return equations.solve(from_logarithms(logarithms))[1] \
+        return max(equations.solve(from_logarithms(logarithms))[1], IMPOSSIBLE) \
             + np.sum(log_prior(logarithms)[free])
 
     start = np.where(free, problem.noise.logarithms, np.log(MEDIAN))
+    if log_posterior(start) < IMPOSSIBLE / 2:            # singular to rounding: nothing is learned
+        return NoisePosterior(problem.noise, np.zeros((3, 3)), IMPOSSIBLE, ((1.0, problem.noise),))
     mode, density, covariance = _mode(log_posterior, start, np.flatnonzero(free))
     return NoisePosterior(from_logarithms(mode), covariance, density,
                           _points(log_posterior, mode, density, covariance))

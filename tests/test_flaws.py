@@ -1,0 +1,146 @@
+"""Drives that are not as their files say: the estimate holds, or a doubt names what is wrong."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from slamlib import localization, slam
+from slamlib.evaluation import anees, ate, nees_band
+from slamlib.simulation import simulate
+
+
+def aruco(dataset, **changes):
+    return replace(dataset, aruco=replace(dataset.aruco, **changes))
+
+
+def uwb(dataset, **changes):
+    return replace(dataset, uwb=replace(dataset.uwb, **changes))
+
+
+def late(dataset, poses):
+    """The dataset with sightings that are late."""
+    moved = dataset.aruco.pose + poses
+    kept = (moved >= 0) & (moved < len(dataset.ticks))
+    return replace(dataset, aruco=replace(dataset.aruco, pose=moved).select(kept))
+
+
+def larger_wheels(dataset):
+    vehicle = dataset.vehicle
+    return replace(dataset, vehicle=replace(vehicle, right_radius=0.101, left_radius=0.101))
+
+
+SIGN = np.array([1, -1, -1])
+WRONG_FILES = {                                # found before any graph is built
+    "wheels-swapped": lambda d: replace(d, ticks=d.ticks[:, ::-1].copy()),
+    "wheels-reversed": lambda d: replace(d, ticks=-d.ticks),
+    "camera-mirrored": lambda d: aruco(
+        d, marker_in_vehicle=d.aruco.marker_in_vehicle * SIGN,
+        covariance=d.aruco.covariance * np.outer(SIGN, SIGN)),
+    "odometry": lambda d: replace(d, ticks=np.zeros_like(d.ticks)),
+    "units": lambda d: aruco(
+        d, marker_in_vehicle=d.aruco.marker_in_vehicle * [1e3, 1e3, 1],
+        covariance=d.aruco.covariance * np.outer([1e3, 1e3, 1], [1e3, 1e3, 1]))}
+WRONG_SIZES = {                                # found by the graph, and mended but for the wheels
+    "covariances a quarter": (lambda d: aruco(d, covariance=d.aruco.covariance / 4),
+                              "marker-noise"),
+    "covariances fourfold": (lambda d: aruco(d, covariance=d.aruco.covariance * 4),
+                             "marker-noise"),
+    "sigmas of ranges halved": (lambda d: uwb(d, sigma=d.uwb.sigma / 2), "range-noise"),
+    "ranges 1.5 % too long": (lambda d: uwb(d, range=d.uwb.range * 1.015), "range-offset"),
+    "wheels 1 % too large": (larger_wheels, "wheel-parameters")}
+
+
+def names(*lists):
+    return {doubt.what for doubts in lists for doubt in doubts}
+
+
+@pytest.mark.parametrize("seed", [61, 62, 63])
+@pytest.mark.parametrize("what", WRONG_FILES)
+def test_wrong_files_are_named_before_a_graph_is_built(what, seed):
+    dataset, _ = simulate("short", seed)
+    assert what in names(localization.drive_doubts(WRONG_FILES[what](dataset)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [61, 62, 63])
+@pytest.mark.parametrize("flaw", WRONG_SIZES)
+def test_wrong_sizes_are_mended_or_named(flaw, seed):
+    """Problems 3 and 4 on short drives: as accurate as on the right files, and said."""
+    dataset, truth = simulate("short", seed)
+    spoil, what = WRONG_SIZES[flaw]
+    right, spoilt = slam.estimate(dataset.without("uwb")), spoil(dataset)
+    markers = slam.estimate(spoilt.without("uwb"))
+    both = slam.estimate(spoilt, previous=markers)
+    assert names(markers.drive_doubts, both.drive_doubts) == {what}
+    assert not localization.drive_doubts(spoilt)
+    if what != "wheel-parameters":
+        for found in (markers, both):
+            assert anees(found.poses, found.covariances, truth.poses) < 6
+            assert ate(found.poses, truth.poses, aligned=True) < 1.2 * ate(
+                right.poses, truth.poses, aligned=True)
+
+
+@pytest.mark.parametrize("poses", [-3, 3, 10])
+def test_sightings_that_are_late_are_named(poses):
+    """Three short drives: at three poses the offset is right, at ten it is nearly."""
+    for seed in (61, 62, 63):
+        dataset, _ = simulate("short", seed)
+        found = slam.estimate(late(dataset, poses).without("uwb"))
+        offset, sigma = found.time_offset
+        assert abs(offset - poses) < 3 * sigma < 3
+        assert names(found.drive_doubts) == {"time-offset"}
+
+
+@pytest.mark.slow
+def test_sightings_that_are_late_are_named_on_the_long_path():
+    for seed in (61, 62, 63):
+        dataset, _ = simulate("long", seed)
+        found = slam.estimate(late(dataset, 3).without("uwb"))
+        assert names(found.drive_doubts) == {"time-offset"}
+
+
+def test_the_offset_of_sightings_has_the_standard_deviation_that_it_states():
+    """Twelve clean drives of much and of little slip."""
+    offsets = []
+    for seed in range(6):
+        for slip in (1e-3, 1e-2):
+            dataset, _ = simulate("short", seed, slip=slip)
+            late, sigma = slam.estimate(dataset.without("uwb")).time_offset
+            offsets.append(late / sigma)
+    low, high = nees_band(12, 1, probability=0.99)
+    assert low < np.mean(np.square(offsets)) < high
+
+
+@pytest.mark.slow
+def test_ranges_that_are_all_15_cm_too_long_do_no_harm():
+    """Three short drives: not always enough to decide for an offset, and then it hardly matters."""
+    for seed in (61, 62, 63):
+        dataset, truth = simulate("short", seed)
+        found = slam.estimate(uwb(dataset, range=dataset.uwb.range + 0.15))
+        assert anees(found.poses, found.covariances, truth.poses) < 6
+        assert names(found.drive_doubts) <= {"range-offset"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("slip", [0.0, 1e-3, 1e-2])
+@pytest.mark.parametrize("path, seeds", [("short", (71, 72, 73)), ("long", (71,))])
+def test_there_is_no_doubt_about_clean_drives(path, seeds, slip):
+    for seed in seeds:
+        dataset, _ = simulate(path, seed, slip=slip)
+        found = slam.estimate(dataset.without("uwb"))
+        both = slam.estimate(dataset, previous=found)
+        assert not names(localization.drive_doubts(dataset), found.drive_doubts, both.drive_doubts)
+
+
+def test_markers_of_which_most_sightings_contradict_are_named():
+    """The sightings of one marker scatter by a metre."""
+    dataset, _ = simulate("short", 61)
+    label, count = np.unique(dataset.aruco.marker, return_counts=True)
+    moved = label[count.argmax()]
+    rows = np.flatnonzero(dataset.aruco.marker == moved)
+    z = dataset.aruco.marker_in_vehicle.copy()
+    z[rows] += np.random.default_rng(0).normal(0, 1, (len(rows), 3)) * [1, 1, 0]
+    found = slam.estimate(aruco(dataset, marker_in_vehicle=z).without("uwb"))
+    doubts = [doubt for doubt in found.drive_doubts if doubt.what == "sightings-rejected"]
+    assert len(doubts) == 1 and f"marker {moved}" in doubts[0].sentence
