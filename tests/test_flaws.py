@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slamlib import localization, slam
+from slamlib import localization, se2, slam
 from slamlib.evaluation import anees, ate, nees_band
 from slamlib.simulation import simulate
 
@@ -87,9 +87,19 @@ def test_sightings_that_are_late_are_named(poses):
     for seed in (61, 62, 63):
         dataset, _ = simulate("short", seed)
         found = slam.estimate(late(dataset, poses).without("uwb"))
-        offset, sigma = found.time_offset
+        offset, sigma = found.camera.time.estimate[0], found.camera.time.sigma[0]
         assert abs(offset - poses) < 3 * sigma < 3
         assert names(found.drive_doubts) == {"time-offset"}
+
+
+@pytest.mark.parametrize("place", [(0.1, 0.0, 0.0), (0.0, 0.1, 0.0), (0.0, 0.0, 0.05)])
+def test_a_camera_that_is_not_in_the_origin_is_named(place):
+    dataset, _ = simulate("short", 61)
+    z = se2.between(np.array(place), dataset.aruco.marker_in_vehicle)
+    C = se2.rotate_covariance(dataset.aruco.covariance, -place[2])
+    found = slam.estimate(aruco(dataset, marker_in_vehicle=z, covariance=C).without("uwb"))
+    np.testing.assert_allclose(found.camera.place.estimate, place, atol=0.03)
+    assert "camera-offset" in names(found.drive_doubts)
 
 
 @pytest.mark.slow
@@ -100,16 +110,19 @@ def test_sightings_that_are_late_are_named_on_the_long_path():
         assert names(found.drive_doubts) == {"time-offset"}
 
 
-def test_the_offset_of_sightings_has_the_standard_deviation_that_it_states():
+def test_offsets_of_the_camera_have_the_standard_deviations_that_they_state():
     """Twelve clean drives of much and of little slip."""
     offsets = []
     for seed in range(6):
         for slip in (1e-3, 1e-2):
             dataset, _ = simulate("short", seed, slip=slip)
-            late, sigma = slam.estimate(dataset.without("uwb")).time_offset
-            offsets.append(late / sigma)
+            camera = slam.estimate(dataset.without("uwb")).camera
+            offsets.append((*camera.time.estimate / camera.time.sigma, camera.place.gain))
+    time, place = np.transpose(offsets)
     low, high = nees_band(12, 1, probability=0.99)
-    assert low < np.mean(np.square(offsets)) < high
+    assert low < np.mean(time**2) < high
+    low, high = nees_band(12, 3, probability=0.99)
+    assert low < np.mean(2 * place) < high
 
 
 @pytest.mark.slow

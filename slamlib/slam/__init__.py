@@ -20,7 +20,7 @@ Each stage makes the record of the next. The modules, in the order in which they
        fit                  Problem, State -> Fit: wheels, noise, accepted measurements, in turn
        model_choice         Fit -> Fit: arcs or Euler's steps
        range_calibration    Fit -> Fit: with an offset and a scale of the ranges, if there are any
-    7  covariances, moments, interpolation, doubts, time_offset, drive_doubts, result
+    7  covariances, moments, interpolation, doubts, camera_offsets, drive_doubts, result
                             Fit -> SlamResult in world axes
 
 `estimate` is all of it. With the result of a problem with fewer sensors at hand, it starts there

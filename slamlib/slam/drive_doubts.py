@@ -1,14 +1,17 @@
 """Stage 7: what the solution says against the files: wheels, noise, ranges and sightings."""
 
 import numpy as np
+from scipy.stats import chi2
 
 from slamlib.doubt import Doubt
 
 MAX_WHEEL_SIGMAS = 4.0       # of a wheel parameter from what vehicle.toml states
 SMALLEST_SIGMA = 1e-12       # m, of a wheel parameter that studies take as known
 MAX_SLIP = 0.02              # sqrt(m), of wheels that merely slip
-MIN_OFFSET = 0.5             # poses
-OFFSET_SIGMAS = 3.5          # of a decided offset
+MIN_GAIN = chi2.isf(5e-4, [1, 3]) / 2        # log likelihood, of late sightings and of a place
+MIN_LATE = 0.5               # poses
+MIN_PLACE = (0.005, 0.005, 0.005)            # m, m, rad, of the camera
+NEARLY = 5.0                 # log likelihood by which one explanation must lead to be the only one
 MAX_FACTOR = 1.5             # of a sigma, more or less, that is reported
 DECIDED_SIGMAS = 4.0         # of the logarithm of a factor, that it must differ from 1
 MAX_REJECTED = 0.1           # share of the sightings
@@ -19,7 +22,7 @@ WHEELS = ("right_radius", "left_radius", "wheelbase")
 def drive_doubts(measurements, found):
     """List of Doubt about the Measurements of a drive, by their SlamResult."""
     return [*wheel_doubts(measurements.dataset.vehicle, found), *slip_doubts(found),
-            *time_doubts(found), *noise_doubts(found),
+            *camera_doubts(found.camera), *noise_doubts(found),
             *calibration_doubts(found), *sighting_doubts(measurements, found.rejected),
             *(Doubt("antenna", f"Antenna {antenna} is in doubt: {reason}. Its covariance includes "
                                "this; look at its rows in UwbReading.txt.")
@@ -52,15 +55,29 @@ def slip_doubts(found):
         "of the same drive as the other files, with the same pose ids."))]
 
 
-def time_doubts(found):
-    """Sightings that are late or early against the encoder."""
-    late, sigma = found.time_offset
-    if abs(late) < max(MIN_OFFSET, OFFSET_SIGMAS * sigma):
-        return []
+def camera_doubts(camera):
+    """Sightings that are late against the encoder, or a camera that is not in the origin.
+
+    Whichever explains more is named, and the other one too where it explains nearly as much.
+    """
+    time, place = camera.time, camera.place
+    late, sigma = time.estimate[0], time.sigma[0]
     side, sign = ("late", "large") if late > 0 else ("early", "small")
-    return [Doubt("time-offset", (
-        f"The sightings are {abs(late):.1f} ± {sigma:.1f} poses {side} against the encoder: look "
-        f"whether the pose ids of ArucoReading.txt are too {sign} by about {abs(late):.0f}."))]
+    (x, y, turn), sigmas = place.estimate, place.sigma
+    found = {}
+    if time.gain > MIN_GAIN[0] and abs(late) > MIN_LATE:
+        found[time.gain] = Doubt("time-offset", (
+            f"The sightings agree best if they are {abs(late):.1f} ± {sigma:.1f} poses {side} "
+            f"against the encoder: look whether the pose ids of ArucoReading.txt are too {sign} by "
+            f"about {abs(late):.0f}."))
+    if place.gain > MIN_GAIN[1] and (np.abs(place.estimate) > MIN_PLACE).any():
+        found[place.gain] = Doubt("camera-offset", (
+            "The sightings agree best from a camera that is not in the vehicle's origin, midway "
+            f"between the wheels, but at x = {x:.3f} ± {sigmas[0]:.3f} m, y = {y:.3f} ± "
+            f"{sigmas[1]:.3f} m and turned by {turn:.3f} ± {sigmas[2]:.3f} rad: look whether "
+            "ArucoReading.txt gives the markers in the axes of the vehicle."))
+    return [doubt for gain, doubt in sorted(found.items(), reverse=True)
+            if gain > max(found) - NEARLY]
 
 
 def noise_doubts(found):

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slamlib import se2
+from slamlib.slam.camera_offsets import CameraOffsets, camera_offsets
 from slamlib.slam.doubts import antenna_doubts
 from slamlib.slam.drive_doubts import drive_doubts
 from slamlib.slam.interpolation import interpolate
@@ -14,7 +15,6 @@ from slamlib.slam.moments import moments
 from slamlib.slam.noise import Noise
 from slamlib.slam.odometry_factors import odometry_error
 from slamlib.slam.state import RANGE_SIGMA
-from slamlib.slam.time_offset import time_offset
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class SlamResult:
     noise_sigma: np.ndarray         # (3,) of its logarithms, 0 where given or without measurements
     range_calibration: np.ndarray   # (2,) offset in m and scale of the ranges, 0 and 1 if not kept
     range_calibration_sigma: np.ndarray        # (2,) m and 1, or 0
-    time_offset: tuple              # poses by which the sightings are late, and its sigma
+    camera: CameraOffsets           # errors that all sightings may share, which are not modelled
     model: str                      # "arc" or "euler", as given or chosen
     log_evidence: float             # Laplace, up to a constant of dataset and accepted measurements
     chi2_per_dof: float             # of the accepted measurements, by the files' covariances
@@ -82,7 +82,7 @@ def result(fit):
         else np.sqrt(np.diag(fit.posterior.covariance)),
         range_calibration=state.range_calibration,
         range_calibration_sigma=RANGE_SIGMA * np.sqrt(np.diag(marginal.z)),
-        time_offset=time_offset(problem, fit.state),
+        camera=camera_offsets(problem, fit.state),
         model=problem.odometry.model, log_evidence=float(fit.log_evidence),
         chi2_per_dof=chi2_per_dof(problem, state, np.r_[accepted, range_weight]),
         chi2_per_dof_of_all=chi2_per_dof(problem, state, m.unit_weights),
