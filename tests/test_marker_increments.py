@@ -1,3 +1,4 @@
+import tracemalloc
 from functools import partial
 
 import numpy as np
@@ -207,3 +208,24 @@ def test_two_sightings_that_exclude_each_other_leave_no_increment():
     covariances = np.broadcast_to(1e-4 * np.eye(3), (4, 3, 3))
     found = robust_increments(z, covariances, np.zeros(2, int), np.arange(2), np.arange(2, 4), 1)
     assert not found.usable.any() and not found.accepted.any() and np.isnan(found.increment).all()
+
+
+def test_many_points_take_little_memory():
+    """Forty points at each of fifty frames: 780 pairs of points for every pair of frames."""
+    rng = np.random.default_rng(0)
+    frames, points = 50, 40
+    place = rng.uniform(-5, 5, (points, 2))
+    along = np.linspace(0, 1, frames)
+    poses = np.column_stack([along, np.zeros(frames), along])
+    z = np.concatenate([se2.between(pose, np.column_stack([place, np.zeros(points)]))
+                        for pose in poses])
+    z[:, :2] += rng.normal(0, 1e-3, (len(z), 2))
+    C = np.tile(np.diag([1e-6, 1e-6, 1e4]), (len(z), 1, 1))
+    row, marker = np.repeat(np.arange(frames), points), np.tile(np.arange(points), frames)
+    pair, first, second = common_sightings(row, marker)
+    tracemalloc.start()
+    found = robust_increments(z, C, pair, first, second, frames - 1)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 60e6
+    np.testing.assert_allclose(found.increment, se2.between(poses[:-1], poses[1:]), atol=2e-3)

@@ -418,4 +418,4 @@ def test_plaza_2_is_solved():
     assert abs(scale - plaza.calibration(2)[0]) < 2 * sigma < 0.04
     assert [doubt.what for doubt in found.drive_doubts] == ["range-offset"]
     assert np.hypot(*(beacons - truth.antenna_in_world).T).max() < 0.5      # 1 % of 50 m
-    assert not found.doubts and dataset.ticks.shape == (4091, 2)
+    assert not found.doubts and dataset.ticks.shape == (3881, 2)

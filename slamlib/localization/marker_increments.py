@@ -16,6 +16,8 @@ from slamlib.sightings import GATE, MAX_HEADING_SIGMA
 
 ITERATIONS = 8, 6         # numbers of Gauss-Newton iterations: Cauchy weights, then the gate
 SPEED_RATIO = 3.0         # dimensionless, largest plausible speed in units of the usual speed
+POINT_PAIRS = 60          # pairs of points that give hypotheses, of every pair of frames
+AT_ONCE = 20_000          # sightings whose residuals are computed together
 SLOW_TURN = 1e-3          # rad per encoder step; smaller differences of turn rates are ignored
 
 
@@ -128,11 +130,11 @@ def _best_hypothesis(z1, C1, z2, C2, pair, count):
     """The hypothesis with the smallest Cauchy cost for every pair, (count, 3).
 
     Hypotheses are no motion, the increment from each marker with a heading, and, in pairs without
-    such a marker, the increment from every two positions.
+    such a marker, the increment from two positions, of which at most POINT_PAIRS are tried.
     """
     begins, ends = (np.searchsorted(pair, np.arange(count), side) for side in ("left", "right"))
     oriented = (C1[:, 2, 2] + C2[:, 2, 2]) < MAX_HEADING_SIGMA**2
-    two_of_each = [np.add(np.triu_indices(ends[k] - begins[k], 1), begins[k])
+    two_of_each = [_some(np.add(np.triu_indices(ends[k] - begins[k], 1), begins[k]))
                    for k in np.setdiff1d(pair, pair[oriented])]
     i, j = np.concatenate([np.zeros((2, 0), int), *two_of_each], axis=1)
     hypothesis = np.concatenate([
@@ -140,13 +142,25 @@ def _best_hypothesis(z1, C1, z2, C2, pair, count):
         se2.compose(z1[oriented], se2.inverse(z2[oriented])),
         _increment_of_two_points(z1[i, :2], z1[j, :2], z2[i, :2], z2[j, :2])])
     pair_of = np.concatenate([np.arange(count), pair[oriented], pair[i]])
-    which = np.repeat(np.arange(len(pair_of)), (ends - begins)[pair_of])            # hypothesis
-    k = np.array([k for p in pair_of for k in range(begins[p], ends[p])], int)      # its sightings
-    J_second = se2.compose_jacobians(hypothesis[which], z2[k])[1]
-    squared = _residuals(hypothesis[which], J_second, z1[k], C1[k], z2[k], C2[k])[2]
-    cost = np.bincount(which, np.log1p(squared / GATE), len(pair_of))
+    own = (ends - begins)[pair_of]                      # number of the hypothesis's sightings
+    blocks = np.split(np.arange(len(own)), np.flatnonzero(np.diff(np.cumsum(own) // AT_ONCE)) + 1)
+    cost = np.empty(len(own))
+    for block in blocks:                                # all at once would take gigabytes
+        n = own[block]
+        which = np.repeat(np.arange(len(block)), n)
+        k = np.arange(len(which)) - np.repeat(np.cumsum(n) - n - begins[pair_of[block]], n)
+        supposed = hypothesis[block][which]
+        J_second = se2.compose_jacobians(supposed, z2[k])[1]
+        squared = _residuals(supposed, J_second, z1[k], C1[k], z2[k], C2[k])[2]
+        cost[block] = np.bincount(which, np.log1p(squared / GATE), len(block))
     order = np.lexsort((cost, pair_of))
     return hypothesis[order[np.searchsorted(pair_of[order], np.arange(count))]]
+
+
+def _some(pairs):
+    """At most POINT_PAIRS columns of pairs (2, m), evenly chosen."""
+    m = pairs.shape[1]
+    return pairs[:, np.linspace(0, m - 1, POINT_PAIRS).astype(int)] if m > POINT_PAIRS else pairs
 
 
 def _increment_of_two_points(p1, q1, p2, q2):

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from slamlib.slam.measurement_factors import GUESS_PRIOR_SIGMA
 from slamlib.slam.trilateration import SAME_PLACE, ranges_by_antenna, second_moment, trilaterate
 
 MIN_RANGES = 5               # accepted ranges of an antenna that is not in doubt
@@ -28,8 +29,8 @@ def antenna_doubts(measurements, state, frame_covariances, covariances, range_we
     sentences, covariances = {}, covariances.copy()
     each = ranges_by_antenna(measurements, state.poses, frame_covariances)
     for k, (antenna, ranges) in enumerate(zip(measurements.antenna.tolist(), each)):
-        count = np.count_nonzero(range_weight[measurements.ranges.antenna == k] > 0.5)
-        sentence = _doubt(ranges, state.antennas[k], covariances[k], count)
+        weight = range_weight[measurements.ranges.antenna == k]
+        sentence = _doubt(ranges, state.antennas[k], weight)
         if sentence is not None:
             sentences[antenna] = sentence
             covariances[k] = max(covariances[k], second_moment(ranges, state.antennas[k]),
@@ -37,9 +38,9 @@ def antenna_doubts(measurements, state, frame_covariances, covariances, range_we
     return AntennaDoubts(sentences, covariances)
 
 
-def _doubt(ranges, estimate, covariance, count):
-    """Why an antenna of which `count` ranges are accepted is in doubt, or None."""
-    distance = np.median(ranges.distance)
+def _doubt(ranges, estimate, weight):
+    """Why an antenna whose ranges have the weights (m,) is in doubt, or None."""
+    distance, count = np.median(ranges.distance), np.count_nonzero(weight > 0.5)
     places, costs = trilaterate(ranges)
     other = np.hypot(*(places - estimate).T) > SAME_PLACE * distance
     possible = places[other & (costs < MAX_LOG_ODDS)]
@@ -50,6 +51,18 @@ def _doubt(ranges, estimate, covariance, count):
             "({:.1f}, {:.1f})".format(*place) for place in possible)
     if count < len(ranges.distance) / 2:
         return f"{len(ranges.distance) - count} of its {len(ranges.distance)} ranges disagree"
-    if np.sqrt(np.linalg.eigvalsh(covariance)[-1]) > MAX_RELATIVE_SIGMA * distance:
+    if _own_sigma(ranges, estimate, weight) > MAX_RELATIVE_SIGMA * distance:
         return "its ranges are too few or come from too few directions"
     return None
+
+
+def _own_sigma(ranges, estimate, weight):
+    """Largest standard deviation in m of an antenna by its ranges alone, in any direction.
+
+    Its covariance in the world has the uncertain heading of pose 1 as well, which turns the whole
+    map and says nothing about the antenna.
+    """
+    apart = estimate - ranges.positions
+    direction = apart / np.maximum(np.hypot(*apart.T), 1e-9)[:, None]
+    information = direction.T @ (direction * (weight / ranges.sigma**2)[:, None])
+    return 1 / np.sqrt(max(np.linalg.eigvalsh(information)[0], GUESS_PRIOR_SIGMA**-2))

@@ -21,28 +21,63 @@ WHEELS = ("right_radius", "left_radius", "wheelbase")
 
 def drive_doubts(measurements, found):
     """List of Doubt about the Measurements of a drive, by their SlamResult."""
-    return [*wheel_doubts(measurements.dataset.vehicle, found), *slip_doubts(found),
-            *camera_doubts(found.camera), *noise_doubts(found),
-            *calibration_doubts(found), *sighting_doubts(measurements, found.rejected),
+    return [*geometry_doubts(measurements.dataset.vehicle, found), *slip_doubts(found),
+            *noise_doubts(found), *calibration_doubts(found),
+            *sighting_doubts(measurements, found.rejected),
             *(Doubt("antenna", f"Antenna {antenna} is in doubt: {reason}. Its covariance includes "
                                "this; look at its rows in UwbReading.txt.")
               for antenna, reason in found.doubts.items())]
 
 
-def wheel_doubts(vehicle, found):
-    """Wheel parameters that are further from the nominal ones than their sigmas allow."""
+def geometry_doubts(vehicle, found):
+    """Wheels, late sightings or a place of the camera: what explains most, and what nearly as much.
+
+    Each strains the others, so that two would often be named for one reason.
+    """
+    explained = {gain: doubt for gain, doubt in (
+        _wheels(vehicle, found), _late(found.camera.time), _place(found.camera.place)) if doubt}
+    return [doubt for gain, doubt in sorted(explained.items(), reverse=True)
+            if gain > max(explained) - NEARLY]
+
+
+def _wheels(vehicle, found):
+    """Log likelihood that the wheels' prior costs, and the Doubt if one of them is far from it."""
     off = (found.wheel - vehicle.wheel) / np.maximum(vehicle.sigma_wheel, SMALLEST_SIGMA)
     far = np.flatnonzero(np.abs(off) > MAX_WHEEL_SIGMAS)
     if not len(far):
-        return []
+        return 0.0, None
     sigma = np.sqrt(np.diag(found.wheel_covariance))
     named = " and ".join(
         f"{WHEELS[k]} is {1e3 * found.wheel[k]:.2f} ± {1e3 * sigma[k]:.2f} mm where "
         f"{1e3 * vehicle.wheel[k]:.2f} ± {1e3 * vehicle.sigma_wheel[k]:.2f} mm was stated"
         for k in far)
-    return [Doubt("wheel-parameters", (
+    return off @ off / 2, Doubt("wheel-parameters", (
         f"By the other sensors {named}, up to {np.abs(off).max():.0f} standard deviations off: "
-        "measure the wheels again, or state values or larger sigmas in vehicle.toml."))]
+        "measure the wheels again, or state values or larger sigmas in vehicle.toml."))
+
+
+def _late(time):
+    """Gain in log likelihood, and the Doubt if sightings are late or early against the encoder."""
+    late, sigma = time.estimate[0], time.sigma[0]
+    if time.gain < MIN_GAIN[0] or abs(late) < MIN_LATE:
+        return time.gain, None
+    side, sign = ("late", "large") if late > 0 else ("early", "small")
+    return time.gain, Doubt("time-offset", (
+        f"The sightings agree best if they are {abs(late):.1f} ± {sigma:.1f} poses {side} against "
+        f"the encoder: look whether the pose ids of ArucoReading.txt are too {sign} by about "
+        f"{abs(late):.0f}."))
+
+
+def _place(place):
+    """Gain in log likelihood, and the Doubt if the camera is not in the vehicle's origin."""
+    if place.gain < MIN_GAIN[1] or (np.abs(place.estimate) < MIN_PLACE).all():
+        return place.gain, None
+    (x, y, turn), sigma = place.estimate, place.sigma
+    return place.gain, Doubt("camera-offset", (
+        "The sightings agree best from a camera that is not in the vehicle's origin, midway "
+        f"between the wheels, but at x = {x:.3f} ± {sigma[0]:.3f} m, y = {y:.3f} ± "
+        f"{sigma[1]:.3f} m and turned by {turn:.3f} ± {sigma[2]:.3f} rad: look whether "
+        "ArucoReading.txt gives the markers in the axes of the vehicle."))
 
 
 def slip_doubts(found):
@@ -53,31 +88,6 @@ def slip_doubts(found):
         f"By the other sensors each wheel slips by {1e3 * found.slip:.0f} mm (one standard "
         "deviation) after one metre, far more than wheels do: look whether encoderReading.txt is "
         "of the same drive as the other files, with the same pose ids."))]
-
-
-def camera_doubts(camera):
-    """Sightings that are late against the encoder, or a camera that is not in the origin.
-
-    Whichever explains more is named, and the other one too where it explains nearly as much.
-    """
-    time, place = camera.time, camera.place
-    late, sigma = time.estimate[0], time.sigma[0]
-    side, sign = ("late", "large") if late > 0 else ("early", "small")
-    (x, y, turn), sigmas = place.estimate, place.sigma
-    found = {}
-    if time.gain > MIN_GAIN[0] and abs(late) > MIN_LATE:
-        found[time.gain] = Doubt("time-offset", (
-            f"The sightings agree best if they are {abs(late):.1f} ± {sigma:.1f} poses {side} "
-            f"against the encoder: look whether the pose ids of ArucoReading.txt are too {sign} by "
-            f"about {abs(late):.0f}."))
-    if place.gain > MIN_GAIN[1] and (np.abs(place.estimate) > MIN_PLACE).any():
-        found[place.gain] = Doubt("camera-offset", (
-            "The sightings agree best from a camera that is not in the vehicle's origin, midway "
-            f"between the wheels, but at x = {x:.3f} ± {sigmas[0]:.3f} m, y = {y:.3f} ± "
-            f"{sigmas[1]:.3f} m and turned by {turn:.3f} ± {sigmas[2]:.3f} rad: look whether "
-            "ArucoReading.txt gives the markers in the axes of the vehicle."))
-    return [doubt for gain, doubt in sorted(found.items(), reverse=True)
-            if gain > max(found) - NEARLY]
 
 
 def noise_doubts(found):

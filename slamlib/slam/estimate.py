@@ -49,7 +49,7 @@ def fit_from_odometry(measurements, slip=None, model="arc", factors=odometry_fac
     """
     state = initial_state(measurements, model, factors)
     problem = build(measurements, model, known_noise(slip), factors=factors)
-    state = narrow_kernels(problem, state)
+    state = narrow_kernels(problem, state, learn=slip is None)
     return refine(problem, state, slip, factors=factors)
 
 
@@ -59,4 +59,4 @@ def fit_from_previous(measurements, previous, slip, model):
     w = (previous.wheel - vehicle.wheel) / vehicle.sigma_wheel
     state = state_from_poses(measurements, previous.poses[frame], previous.covariances[frame], w)
     problem = build(measurements, model, known_noise(slip), relinearize_at=w)
-    return refine(problem, narrow_kernels(problem, state, CAUCHY_SCALES[-1:]), slip)
+    return refine(problem, narrow_kernels(problem, state, CAUCHY_SCALES[-1:], slip is None), slip)

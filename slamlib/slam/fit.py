@@ -4,11 +4,11 @@ from dataclasses import dataclass, replace
 
 from slamlib.slam.evidence import log_evidence
 from slamlib.slam.noise import known_noise
-from slamlib.slam.noise_posterior import NoisePosterior, noise_posterior, starting_noise
+from slamlib.slam.noise_posterior import NoisePosterior, noise_posterior
 from slamlib.slam.odometry_factors import odometry_factors
 from slamlib.slam.optimizer import optimize
 from slamlib.slam.problem import Problem
-from slamlib.slam.robust import accepted
+from slamlib.slam.robust import accepted, noise_of_scatter
 from slamlib.slam.state import State
 
 MAX_ROUNDS = 6               # of wheels, noise and accepted measurements
@@ -35,7 +35,7 @@ def refine(problem, state, slip=None, accept=accepted, factors=odometry_factors)
     m, model, posterior = problem.measurements, problem.odometry.model, None
     if accept is not None:
         problem = replace(problem, noise=known_noise(slip) if slip is not None
-                          else starting_noise(m, state))
+                          else noise_of_scatter(m, state))
     measured = problem.measured if accept is None else accept(problem, state)
     for _ in range(MAX_ROUNDS):
         problem = replace(problem, measured=measured, odometry=factors(m, model, state.w))

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from slamlib.slam.evidence import NormalEquations
-from slamlib.slam.measurement_factors import residuals
 from slamlib.slam.noise import BOUNDS, MEDIAN, PRIOR_SIGMA, Noise, from_logarithms, log_prior
 
 STEP = 0.2                   # of the logarithms, for differences
@@ -22,7 +21,6 @@ ACROSS = 1.5 * np.arange(-2, 3)      # sigmas of log slip, points at which the p
 NARROW = 0.2                 # sigma of log slip below which one point is enough
 NEGLIGIBLE = 1e-3            # weight of a point that is left out
 IMPOSSIBLE = -1e12           # log evidence of noise for which the equations are singular
-FEW = 20                     # measurements, below which their scatter does not start a factor
 
 
 @dataclass(frozen=True)
@@ -51,22 +49,6 @@ def noise_posterior(problem, state):
     mode, density, covariance = _mode(log_posterior, start, np.flatnonzero(free))
     return NoisePosterior(from_logarithms(mode), covariance, density,
                           _points(log_posterior, mode, density, covariance))
-
-
-def starting_noise(measurements, state):
-    """Noise of typical slip whose factors, at least 1, are the residuals' medians at a State.
-
-    Covariances that are far too small would otherwise have most measurements rejected before a
-    factor is learned.
-    """
-    sightings, ranges = residuals(measurements, state, Noise())
-    squared = np.sum(sightings**2, axis=1) / np.where(measurements.as_pose, 2.366, 1.386)
-    return Noise(sightings=_at_least_one(squared), ranges=_at_least_one(ranges**2 / 0.455))
-
-
-def _at_least_one(squared):
-    """Root of the median of squared residuals over that of chi-squared, if it exceeds 1."""
-    return max(1.0, float(np.sqrt(np.median(squared)))) if len(squared) >= FEW else 1.0
 
 
 def _mode(function, x, free):

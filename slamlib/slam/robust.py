@@ -12,9 +12,11 @@ import gtsam
 import numpy as np
 
 from slamlib.slam.measurement_factors import MeasurementFactors, residuals
+from slamlib.slam.noise import Noise
 from slamlib.slam.optimizer import optimize
 
 CAUCHY_SCALES = (100.0, 30.0, 10.0, 3.0)     # sigmas, scale of the kernel in each round
+FEW = 20                     # measurements, below which their scatter gives no factor
 EARLY_GATE = 3.3             # sigmas; a range that is shorter than expected by more is rejected
 
 _kernel = gtsam.noiseModel.mEstimator
@@ -23,14 +25,36 @@ _kernel = gtsam.noiseModel.mEstimator
 LATE_KERNEL = _kernel.AsymmetricTukey.Create(4.685, _kernel.Base.ReweightScheme.Scalar)
 
 
-def narrow_kernels(problem, state, scales=CAUCHY_SCALES):
-    """The State after one solution for each scale of the Cauchy kernel, with all measurements."""
+def narrow_kernels(problem, state, scales=CAUCHY_SCALES, learn=True):
+    """The State after one solution for each scale of the Cauchy kernel, with all measurements.
+
+    The scales are in sigmas of the problem's noise. Unless `learn` is False, this is what the
+    scatter of the residuals shows after each solution.
+    """
     m = problem.measurements
     for scale in scales:
         cauchy = _kernel.Cauchy.Create(scale)
         measured = MeasurementFactors(m, m.unit_weights, cauchy, cauchy)
         state = optimize(replace(problem, measured=measured), state).state
+        if learn:
+            problem = replace(problem, noise=noise_of_scatter(m, state))
     return state
+
+
+def noise_of_scatter(measurements, state):
+    """Noise of typical slip whose factors, at least 1, are the residuals' medians at a State.
+
+    Covariances that are far too small would otherwise have most measurements rejected before a
+    factor is learned.
+    """
+    sightings, ranges = residuals(measurements, state, Noise())
+    squared = np.sum(sightings**2, axis=1) / np.where(measurements.as_pose, 2.366, 1.386)
+    return Noise(sightings=_at_least_one(squared), ranges=_at_least_one(ranges**2 / 0.455))
+
+
+def _at_least_one(squared):
+    """Root of the median of squared residuals over that of chi-squared, if it exceeds 1."""
+    return max(1.0, float(np.sqrt(np.median(squared)))) if len(squared) >= FEW else 1.0
 
 
 def accepted(problem, state):

@@ -2,11 +2,12 @@
 
 GTSAM contains Joseph Djugash's range-only SLAM logs (`Plaza1_.mat`, `Plaza2_.mat`): increments of
 distance and heading, ranges to four beacons, the surveyed beacons, and the path by differential
-GPS. Four differences from the assignment are resolved as follows:
+GPS. Some differences from the assignment are resolved as follows:
 
 * Increments become counts of two wheels. Rounding to a count is negligible. The wheel parameters
   are taken as known to two percent: on Plaza 1, odometry's distances agree with GPS within one.
-* A range is assigned to the pose nearest in time.
+* A range is assigned to the pose nearest in time. The mower stands at first, while the gyroscope
+  that gave its turns drifts; the drive begins where it moves.
 * Radio ranges are too long by a constant factor, which the solver has to find. Their sigma is that
   of Plaza 1 about this factor, from its truth; the truth of Plaza 2 is not used.
 * The true heading of Plaza 2 points backwards along the path, so pi is added.
@@ -23,6 +24,7 @@ from slamlib.dataset import AntennaGuess, Dataset, Truth, UwbReadings, Vehicle
 COUNT = 1e-4                # m, travel of a wheel in one count
 RADIUS, BASE = 0.2, 0.8     # m, nominal wheel radius and wheelbase
 WHEEL_SIGMA = 0.02          # standard deviation of the wheel parameters, relative to their value
+STANDING = 0.2              # m, what odometry travels while the mower stands
 BEACON_GUESS_SIGMA = 2.0           # m, standard deviation of the guessed beacons on each axis
 
 
@@ -40,6 +42,9 @@ def read_plaza2(seed=0):
     """
     _, sigma = calibration(1)
     path, increments, ranges, beacons = _load(2)
+    begin = np.argmax(np.cumsum(np.abs(increments[:, 1])) > STANDING)
+    path, increments = path[begin:], increments[begin:]
+    ranges = ranges[ranges[:, 0] >= path[0, 0]]
     travel, turn = increments[:, 1], increments[:, 2]
     wheels = np.stack([travel + BASE / 2 * turn, travel - BASE / 2 * turn], -1)
     total = np.cumsum(np.concatenate([np.zeros((1, 2)), wheels]), axis=0)
