@@ -31,11 +31,19 @@ def noise(ticks, vehicle, start, end, slip):
 
     `slip` in sqrt(m) is the standard deviation of the slip of one wheel after one metre. Rounding
     at both ends of an increment has a variance of one sixth of a squared count, spread over its
-    steps. Wheel errors e_R, e_L in the step at p along the unit vector u lengthen the step by
+    steps. No `end` may be before its `start`; the covariance of an increment without steps is zero.
+    """
+    rounding, slipping = rounding_and_slipping(ticks, vehicle, start, end)
+    return rounding + slip**2 * slipping
+
+
+def rounding_and_slipping(ticks, vehicle, start, end):
+    """The parts of `noise`, each (m, 3, 3): by rounding, and by a slip of 1 sqrt(m).
+
+    Wheel errors e_R, e_L in the step at p along the unit vector u lengthen the step by
     (e_R + e_L) / 2. They turn the later path by (e_R - e_L) / b, which moves its end p_e by this
     angle times S (p_e - p), S = [[0, -1], [1, 0]]. The effect of a step is linear in p_e, so one
-    cumulative sum over the steps serves all increments. No `end` may be before its `start`; the
-    covariance of an increment without steps is zero.
+    cumulative sum over the steps serves all increments.
 
     The sum is over positions relative to the beginning of a block of steps. Relative to pose 1,
     its differences would lose all digits some ten kilometres away. A block is as long as the
@@ -55,19 +63,19 @@ def noise(ticks, vehicle, start, end, slip):
     by_wheel[:, 1] = u[:, 1:] / 2 - p[:, :1] * turn
     by_wheel[:, 2] = turn
     outer = by_wheel[:, :, None, :] * by_wheel[:, None, :, :]          # (n-1, 3, 3, wheel)
-    from_slip = outer @ (slip**2 * np.abs(ds[:, None] + sides * dtheta[:, None])[:, None, :, None])
+    from_slip = outer @ np.abs(ds[:, None] + sides * dtheta[:, None])[:, None, :, None]
     metres_per_count = 2 * np.pi * vehicle.wheel[:2] / vehicle.ticks_per_revolution
     from_rounding = outer @ (metres_per_count**2 / 6)
     totals = [odometry.cumulative(part) for part in (from_slip[..., 0], from_rounding)]
-    in_world = np.zeros((len(start), 3, 3))
+    in_world = np.zeros((2, len(start), 3, 3))
     for block in (start // length, start // length + 1):
         begins, ends = (np.clip(edge * length, start, end) for edge in (block, block + 1))
         slipping, rounding = (total[ends] - total[begins] for total in totals)
-        summed = slipping + rounding / np.maximum(end - start, 1)[:, None, None]
+        rounding = rounding / np.maximum(end - start, 1)[:, None, None]
         lever = poses[end] - [1, 1, 0] * origin[np.minimum(block, len(origin) - 1)]
         to_end, _ = se2.compose_jacobians(np.zeros(3), lever)          # I + [0, 0, S lever]
-        in_world += to_end @ summed @ np.swapaxes(to_end, 1, 2)
-    return se2.rotate_covariance(in_world, -poses[start, 2])
+        in_world += to_end @ np.stack([rounding, slipping]) @ np.swapaxes(to_end, 1, 2)
+    return tuple(se2.rotate_covariance(part, -poses[start, 2]) for part in in_world)
 
 
 def noise_in_drive(ticks, vehicle, start, end):
@@ -94,8 +102,7 @@ def noise_in_drive(ticks, vehicle, start, end):
         `rounding`. The noise for a slip in sqrt(m) is rounding + slip^2 slipping.
     """
     start, end = np.asarray(start), np.asarray(end)
-    rounding = noise(ticks, vehicle, start, end, 0.0)
-    slipping = noise(ticks, vehicle, start, end, 1.0) - rounding
+    rounding, slipping = rounding_and_slipping(ticks, vehicle, start, end)
     rounding *= ((end - start) / max(1, len(ticks) - 1))[:, None, None]
     travelled = odometry.cumulative(np.abs(odometry.steps(ticks, vehicle)[0]))
     skid = MINIMUM_SLIP**2 * (travelled[end] - travelled[start])

@@ -456,7 +456,7 @@ def test_the_normal_equations_are_those_of_gtsams_linear_graph():
     solution, m = tree.optimize(), problem.measurements
     for i in (0, 7, len(m.frame) - 1):
         np.testing.assert_allclose(delta[equations.rows(np.array([i]), 3)[0]], solution.at(X(i)),
-                                   rtol=1e-6, atol=1e-9)
+                                   rtol=1e-5, atol=1e-8)      # both square the condition number
     S = 3 * np.count_nonzero(measured.sighting_weight)
     expected = -linear.error(solution) - tree.logDeterminant() \
         - np.sum(np.linalg.slogdet(problem.odometry.noise(2e-3))[1]) / 2 \

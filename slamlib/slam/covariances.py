@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.sparse import csr_matrix
 
 from slamlib.slam.linear_factors import linear_factors
 from slamlib.slam.measurement_factors import GUESS_PRIOR_SIGMA, WEAK_SIGMA
@@ -92,11 +93,10 @@ def arrow_inverse(odometry, measured, pose_prior, border_prior):
 
     B = B.reshape(3 * count, width)
     Y = cho_solve_banded((cholesky_banded(_banded(diagonal, beside), lower=True), True), B)
-    border = np.linalg.inv(D - B.T @ Y)
+    border = np.linalg.inv(D - csr_matrix(B).T @ Y)
     border = (border + border.T) / 2
     on, off = _inverse_blocks(diagonal, beside)
-    Y = Y.reshape(count, 3, -1)
-    YS = Y @ border
+    Y, YS = Y.reshape(count, 3, width), (Y @ border).reshape(count, 3, width)
     on += YS @ _t(Y)
     off += YS[:-1] @ _t(Y[1:])
     return _pairs(on, off, -YS[:, :, -3:], border[-3:, -3:]), border
