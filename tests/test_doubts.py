@@ -153,8 +153,7 @@ def test_noise_hides_no_flaw(spoil, keywords):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("flaw", ["columns of counts", "signs of counts", "y", "sightings late",
-                                  "ranges in mm"])
+@pytest.mark.parametrize("flaw", ["columns of counts", "signs of counts", "y", "ranges in mm"])
 def test_a_flaw_is_named_on_a_long_drive(flaw):
     for seed in SEEDS:
         assert whats(FLAWS[flaw][0](simulated("long", seed)[0])) == [FLAWS[flaw][1]]
