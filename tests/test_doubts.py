@@ -39,14 +39,6 @@ def covariances(factor):
         dataset.aruco, covariance=factor * dataset.aruco.covariance))
 
 
-def late(poses):
-    def spoil(dataset):
-        pose = dataset.aruco.pose + poses
-        kept = (0 <= pose) & (pose < len(dataset.ticks))
-        return replace(dataset, aruco=replace(dataset.aruco, pose=pose).select(kept))
-    return spoil
-
-
 def ranges(factor):
     return lambda dataset: replace(dataset, uwb=replace(
         dataset.uwb, range=factor * dataset.uwb.range, sigma=factor * dataset.uwb.sigma))
