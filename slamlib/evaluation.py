@@ -8,7 +8,7 @@ follows Bar-Shalom, Li and Kirubarajan, *Estimation with Applications to Trackin
 """
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from slamlib import se2
 
@@ -94,7 +94,7 @@ def nees_band(count, dof=3, probability=0.95):
     band with the given probability.
     """
     tail = (1 - probability) / 2
-    return tuple(chi2.ppf([tail, 1 - tail], dof * count) / count)
+    return tuple(chdtri(dof * count, [1 - tail, tail]) / count)
 
 
 def judge(poses, covariances, truth, step):

@@ -5,6 +5,7 @@ the same coordinates. The folder of a file is made if it does not exist.
 """
 
 import os
+import struct
 from io import BytesIO
 from pathlib import Path
 
@@ -12,6 +13,8 @@ import numpy as np
 from scipy.io import loadmat, savemat
 
 _HEADER = b"MATLAB 5.0 MAT-file, written by slamlib".ljust(116)  # scipy's contains the date
+SIZE_AT, COUNT_AT = 132, 164  # bytes, of the array's size and of its number of columns
+FEW = 100  # structs that scipy writes itself
 
 
 def write_vehicle_poses(folder, poses, covariances):
@@ -69,15 +72,55 @@ def write_atomically(path, content):
 
 def _write(path, **fields):
     """Write one (1, n) struct array, named like the file; equal input gives equal bytes."""
-    structs = np.empty((1, len(next(iter(fields.values())))), dtype=[(f, object) for f in fields])
-    for name, values in fields.items():
-        rows = np.asarray(values, dtype=float)
-        while rows.ndim < 3:  # vectors are 1 x d in MATLAB
-            rows = rows[:, None]
-        structs[name][0, :] = list(rows)
+    rows = {name: _matrices(values) for name, values in fields.items()}
+    count = len(next(iter(rows.values())))
+    content = _tiled(path.stem, rows) if count > FEW else _saved(path.stem, rows)
+    write_atomically(path, _HEADER + content[len(_HEADER):])
+
+
+def _matrices(values):
+    """Scalars (n,), vectors (n, d) or matrices (n, c, d) as (n, c, d); vectors are 1 x d."""
+    rows = np.asarray(values, dtype=float)
+    while rows.ndim < 3:
+        rows = rows[:, None]
+    return rows
+
+
+def _saved(name, rows):
+    """The bytes that scipy writes for a struct array."""
+    count = len(next(iter(rows.values())))
+    structs = np.empty((1, count), dtype=[(field, object) for field in rows])
+    for field, values in rows.items():
+        structs[field][0, :] = list(values)
     buffer = BytesIO()
-    savemat(buffer, {path.stem: structs})
-    write_atomically(path, _HEADER + buffer.getvalue()[len(_HEADER):])
+    savemat(buffer, {name: structs})
+    return buffer.getvalue()
+
+
+def _tiled(name, rows):
+    """The same bytes as `_saved`, for many structs: scipy needs a tenth of a millisecond for each.
+
+    All elements of the array have the same layout. scipy writes one and two of them, which shows
+    how long an element is; each number's place in it is where scipy puts a number that is known.
+    The count stands in the array's dimensions, and in its size (MAT-File Format, version 5).
+    """
+    count = len(next(iter(rows.values())))
+    known = iter(np.pi * np.arange(1, 1000))
+    one = {field: np.reshape([next(known) for _ in values[0].flat], (1, *values.shape[1:]))
+           for field, values in rows.items()}
+    first, second = _saved(name, one), _saved(
+        name, {field: np.repeat(values, 2, axis=0) for field, values in one.items()})
+    length = len(second) - len(first)
+    head, element = bytearray(first[:-length]), first[-length:]
+    size, = struct.unpack_from("=I", head, SIZE_AT)
+    struct.pack_into("=I", head, SIZE_AT, size + (count - 1) * length)
+    struct.pack_into("=i", head, COUNT_AT, count)
+    elements = np.tile(np.frombuffer(element, np.uint8), (count, 1))
+    for field, values in rows.items():
+        for number, column in zip(one[field].flat, values.reshape(count, -1).T):
+            at = element.index(struct.pack("=d", number))
+            elements[:, at:at + 8] = np.ascontiguousarray(column)[:, None].view(np.uint8)
+    return bytes(head) + elements.tobytes()
 
 
 def _read(path, **shapes):

@@ -8,12 +8,12 @@ Mahalanobis distance r^T W^-1 r of a residual r with covariance W; beyond it r i
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from slamlib import se2
 
-GATE = chi2.ppf(0.999, 3)          # dimensionless, for residuals of [x, y, heading]
-POINT_GATE = chi2.ppf(0.999, 2)    # dimensionless, for residuals of [x, y]
+GATE = chdtri(3, 0.001)          # dimensionless, for residuals of [x, y, heading]
+POINT_GATE = chdtri(2, 0.001)    # dimensionless, for residuals of [x, y]
 MAX_HEADING_SIGMA = 0.5            # rad; with a larger standard deviation a heading is unknown
 
 

@@ -16,7 +16,7 @@ are the same A. Ranges to antennas tell it where the antennas' guessed places ar
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from slamlib import increments, se2
 from slamlib.doubt import Doubt
@@ -32,7 +32,7 @@ MIN_INCREMENTS = 10       # fewer of them decide nothing
 MOVING = 5.0              # sigmas of distance or turn, by markers or wheels, from no motion
 DECISIVE = 10.0           # log odds by which a hypothesis explains the increments better
 MOST = 0.7                # share of the increments that agree with an accepted hypothesis
-AGREEMENT = chi2.ppf(0.95, 3)    # squared Mahalanobis distance of increments that agree
+AGREEMENT = chdtri(3, 0.05)    # squared Mahalanobis distance of increments that agree
 CONTRADICTING = 4.0       # standard errors of the mean agreement of headings and positions below 0
 BETTER_FIT = 3.0          # ratio of the ranges' median residuals that decides between two paths
 

@@ -1,14 +1,14 @@
 """Stage 7: what the solution says against the files: wheels, noise, ranges and sightings."""
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from slamlib.doubt import Doubt
 
 MAX_WHEEL_SIGMAS = 4.0       # of a wheel parameter from what vehicle.toml states
 SMALLEST_SIGMA = 1e-12       # m, of a wheel parameter that studies take as known
 MAX_SLIP = 0.02              # sqrt(m), of wheels that merely slip
-MIN_GAIN = chi2.isf(5e-4, [1, 3]) / 2        # log likelihood, of late sightings and of a place
+MIN_GAIN = chdtri([1, 3], 5e-4) / 2        # log likelihood, of late sightings and of a place
 MIN_LATE = 0.5               # poses
 MIN_PLACE = (0.005, 0.005, 0.005)            # m, m, rad, of the camera
 NEARLY = 5.0                 # log likelihood by which one explanation must lead to be the only one
