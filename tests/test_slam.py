@@ -21,7 +21,8 @@ from slamlib.slam.fit import refine
 from slamlib.slam.initialization import parts, state_from_poses
 from slamlib.slam.measurements import measure
 from slamlib.slam.moments import moments
-from slamlib.slam.noise import Noise
+from slamlib.slam.noise import Noise, from_logarithms, log_prior
+from slamlib.slam.noise_posterior import noise_posterior
 from slamlib.slam.optimizer import linearize, optimize
 from slamlib.slam.problem import build
 from slamlib.slam.result import result
@@ -151,6 +152,26 @@ def test_wrong_covariances_of_sightings_are_scaled(scale):
     np.testing.assert_allclose(found.covariances[-1], expected.covariances[-1], rtol=0.2,
                                atol=0.1 * expected.covariances[-1].max())
     assert abs(np.log(found.chi2_per_dof * scale)) < 0.3     # odometry's errors are not scaled
+
+
+@pytest.mark.parametrize("poses, slip", [(2000, 1e-3), (300, 0.0)])
+def test_the_learned_noise_has_the_greatest_posterior(poses, slip):
+    """Many and few measurements: derivatives at the mode, by small steps, are nearly zero."""
+    dataset, _ = simulate("short", seed=6, slip=slip)
+    fit = fit_from_odometry(measure(dataset.first(poses)))
+    equations = NormalEquations(fit.problem, fit.state)
+    found = noise_posterior(fit.problem, fit.state)
+
+    def log_posterior(logarithms):
+        return equations.solve(from_logarithms(logarithms))[1] + np.sum(log_prior(logarithms))
+
+    sigma = np.sqrt(np.diag(found.covariance))
+    for direction in np.diag(sigma):
+        mode = found.noise.logarithms
+        up, down = (log_posterior(mode + 0.1 * sign * direction) for sign in (1, -1))
+        assert abs(up - down) / 0.2 < 0.2                       # for a step of one sigma
+        curvature = (up + down - 2 * log_posterior(mode)) / 0.01
+        assert -2 < curvature < -0.5                            # -1 without correlations
 
 
 def test_averages_over_the_noise_are_moments_of_a_mixture():

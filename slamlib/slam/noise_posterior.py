@@ -13,10 +13,11 @@ import numpy as np
 from slamlib.slam.evidence import NormalEquations
 from slamlib.slam.noise import BOUNDS, MEDIAN, PRIOR_SIGMA, Noise, from_logarithms, log_prior
 
-STEP = 0.2                   # of the logarithms, for differences
+MAX_DIFFERENCE = 0.2         # of the logarithms, over which derivatives are taken
+MIN_DIFFERENCE = 0.003
 MAX_STEP = 1.5               # of Newton's method
 MAX_STEPS = 12
-GAIN = 0.01                  # predicted log posterior at which Newton's method ends
+GAIN = 0.01                  # log posterior of a step at which Newton's method ends
 ACROSS = 1.5 * np.arange(-2, 3)      # sigmas of log slip, points at which the posterior is summed
 NARROW = 0.2                 # sigma of log slip below which one point is enough
 NEGLIGIBLE = 1e-3            # weight of a point that is left out
@@ -52,21 +53,27 @@ def noise_posterior(problem, state):
 
 
 def _mode(function, x, free):
-    """Argument, value and covariance (3, 3) of the maximum of a log density, by Newton's method."""
-    value = function(x)
+    """Argument, value and covariance (3, 3) of the maximum of a log density, by Newton's method.
+
+    Differences over much more than a standard deviation are wrong by the third derivative, so they
+    are taken over one, once it is known.
+    """
+    value, steps = function(x), np.full(len(free), MAX_DIFFERENCE)
     for _ in range(MAX_STEPS):
-        gradient, hessian = _differences(function, x, value, free)
+        gradient, hessian = _differences(function, x, value, free, steps)
         curvature, axes = np.linalg.eigh(-hessian)
         covariance = axes / np.maximum(curvature, PRIOR_SIGMA.max()**-2) @ axes.T
+        sigma = np.clip(np.sqrt(np.diag(covariance)), MIN_DIFFERENCE, MAX_DIFFERENCE)
+        coarse, steps = (steps > 2 * sigma).any(), sigma
         step = covariance @ gradient
-        if gradient @ step / 2 < GAIN:
-            break
         step *= min(1.0, MAX_STEP / np.abs(step).max())
-        while (new := function(_moved(x, free, step))) < value and np.abs(step).max() > 1e-2:
+        while (new := function(_moved(x, free, step))) < value and np.abs(step / sigma).max() > 0.1:
             step = step / 2
-        if new <= value:
+        gained = new - value
+        if gained > 0:
+            x, value = _moved(x, free, step), new
+        if gained < GAIN and not coarse:
             break
-        x, value = _moved(x, free, step), new
     full = np.zeros((len(x), len(x)))
     full[np.ix_(free, free)] = covariance
     return x, value, full
@@ -78,15 +85,15 @@ def _moved(x, free, step):
     return np.clip(moved, *BOUNDS)
 
 
-def _differences(function, x, value, free):
-    """Gradient (p,) and Hessian (p, p) by central differences over the free components."""
-    unit = STEP * np.eye(len(free))
+def _differences(function, x, value, free, steps):
+    """Gradient (p,) and Hessian (p, p) by central differences of the free components by `steps`."""
+    unit = np.diag(steps)
     up, down = (np.array([function(_moved(x, free, sign * e)) for e in unit]) for sign in (1, -1))
-    gradient, hessian = (up - down) / (2 * STEP), np.diag((up + down - 2 * value) / STEP**2)
+    gradient, hessian = (up - down) / (2 * steps), np.diag((up + down - 2 * value) / steps**2)
     for i in range(len(free)):
         for j in range(i):
             both = function(_moved(x, free, unit[i] + unit[j]))
-            hessian[i, j] = hessian[j, i] = (both - up[i] - up[j] + value) / STEP**2
+            hessian[i, j] = hessian[j, i] = (both - up[i] - up[j] + value) / (steps[i] * steps[j])
     return gradient, hessian
 
 
