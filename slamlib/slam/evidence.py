@@ -19,6 +19,8 @@ from slamlib.slam.odometry_factors import odometry_error
 from slamlib.slam.problem import Problem
 from slamlib.slam.state import State
 
+KEPT = 4                     # values of the slip whose sums are kept
+
 
 @dataclass(frozen=True)
 class NormalEquations:
@@ -58,12 +60,11 @@ class NormalEquations:
         given, groups = self.problem.noise, self._groups
         ratios = {"prior": 1.0, "sightings": (given.sightings / noise.sightings)**2,
                   "ranges": (given.ranges / noise.ranges)**2}
-        J, e, log_determinant = self._whitened_odometry(self.problem.odometry.noise(noise.slip))
-        H, g, squared = J.T @ J, J.T @ e, e @ e
+        H, g, squared, log_determinant = self._odometry_sums(noise.slip)
         for name, ratio in ratios.items():
             H = H + ratio * groups[name].H
             g = g + ratio * groups[name].g
-            squared += ratio * groups[name].squared
+            squared = squared + ratio * groups[name].squared
         return H, g, squared, log_determinant
 
     @cached_property
@@ -103,13 +104,23 @@ class NormalEquations:
         e, *jacobians = odometry_error(self.problem.odometry, state.poses, state.w)
         return rows, e, np.concatenate(jacobians, axis=2)
 
-    def _whitened_odometry(self, Q):
-        """Sparse J (3 f - 3, n), whitened errors (3 f - 3,), and sum log|Q|."""
-        rows, e, J = self._frames
-        L = np.linalg.cholesky(Q)
-        J, e = np.linalg.solve(L, J), np.linalg.solve(L, e[..., None])
-        logs = np.log(np.diagonal(L, axis1=1, axis2=2))
-        return self._sparse(rows, J), e.ravel(), 2 * np.sum(logs)
+    def _odometry_sums(self, slip):
+        """H, g, squared error and sum log|Q| of the odometry; those of the last slips are kept."""
+        kept = self._kept_sums
+        if slip not in kept:
+            rows, e, J = self._frames
+            L = np.linalg.cholesky(self.problem.odometry.noise(slip))
+            J = self._sparse(rows, np.linalg.solve(L, J))
+            e = np.linalg.solve(L, e[..., None]).ravel()
+            logs = np.log(np.diagonal(L, axis1=1, axis2=2))
+            kept[slip] = J.T @ J, J.T @ e, e @ e, 2 * np.sum(logs)
+            if len(kept) > KEPT:
+                del kept[next(iter(kept))]
+        return kept[slip]
+
+    @cached_property
+    def _kept_sums(self):
+        return {}
 
     def _sparse(self, columns, blocks):
         """Sparse (m d, n) of blocks (m, d, c) at columns (m, c)."""

@@ -7,7 +7,7 @@ import numpy as np
 from slamlib.slam.evidence import log_evidence
 from slamlib.slam.fit import refine
 from slamlib.slam.linear_factors import range_factors
-from slamlib.slam.noise_posterior import noise_posterior
+from slamlib.slam.noise_posterior import greatest_density
 from slamlib.slam.odometry_factors import odometry_factors
 from slamlib.slam.optimizer import optimize
 
@@ -41,5 +41,4 @@ def _with_fixed_weights(fit):
 
 def _log_density(problem, state, slip):
     """Log evidence of a given noise, or log posterior of a learned one."""
-    return log_evidence(problem, state) if slip is not None else noise_posterior(
-        problem, state).density
+    return (greatest_density if slip is None else log_evidence)(problem, state)

@@ -36,6 +36,21 @@ class NoisePosterior:
 
 def noise_posterior(problem, state):
     """The NoisePosterior at a State near the solution of a Problem; starts from its noise."""
+    log_posterior, start, free = _log_posterior(problem, state)
+    if log_posterior(start) < IMPOSSIBLE / 2:            # singular to rounding: nothing is learned
+        return NoisePosterior(problem.noise, np.zeros((3, 3)), IMPOSSIBLE, ((1.0, problem.noise),))
+    mode, density, covariance = _mode(log_posterior, start, free)
+    return NoisePosterior(from_logarithms(mode), covariance, density,
+                          _points(log_posterior, mode, density, covariance))
+
+
+def greatest_density(problem, state):
+    """The greatest log density of the noise that `noise_posterior` finds, up to a constant."""
+    return _mode(*_log_posterior(problem, state))[1]
+
+
+def _log_posterior(problem, state):
+    """The function from `Noise.logarithms` to log density, where it starts, and what is free."""
     equations = NormalEquations(problem, state)
     free = np.array([True, len(problem.measured.sighting_weight) > 0,
                      len(problem.measured.range_weight) > 0])
@@ -44,12 +59,8 @@ def noise_posterior(problem, state):
         return max(equations.solve(from_logarithms(logarithms))[1], IMPOSSIBLE) \
             + np.sum(log_prior(logarithms)[free])
 
-    start = np.where(free, problem.noise.logarithms, np.log(MEDIAN))
-    if log_posterior(start) < IMPOSSIBLE / 2:            # singular to rounding: nothing is learned
-        return NoisePosterior(problem.noise, np.zeros((3, 3)), IMPOSSIBLE, ((1.0, problem.noise),))
-    mode, density, covariance = _mode(log_posterior, start, np.flatnonzero(free))
-    return NoisePosterior(from_logarithms(mode), covariance, density,
-                          _points(log_posterior, mode, density, covariance))
+    return (log_posterior, np.where(free, problem.noise.logarithms, np.log(MEDIAN)),
+            np.flatnonzero(free))
 
 
 def _mode(function, x, free):
