@@ -27,6 +27,7 @@ class Sightings:
     z: np.ndarray            # (s, 3) marker in vehicle, m and rad
     C: np.ndarray            # (s, 3, 3) covariance of z
     frame: np.ndarray        # (f,) pose index from 0 of every frame, ascending
+    contradicting: int = 0   # number of repeated sightings that contradict each other
 
 
 def sightings_by_frame(aruco, extra_frames=()):
@@ -38,17 +39,18 @@ def sightings_by_frame(aruco, extra_frames=()):
         none = np.zeros(0, int)
         return Sightings(index=none, row=none, marker=none, z=np.zeros((0, 3)),
                          C=np.zeros((0, 3, 3)), frame=np.unique(extra_frames).astype(int))
-    index, z, C = merge_repeated(aruco)
+    index, z, C, contradicting = merge_repeated(aruco)
     frame = np.union1d(aruco.pose[index], extra_frames).astype(int)
     return Sightings(index=index, row=np.searchsorted(frame, aruco.pose[index]),
-                     marker=aruco.marker[index], z=z, C=C, frame=frame)
+                     marker=aruco.marker[index], z=z, C=C, frame=frame,
+                     contradicting=contradicting)
 
 
 def merge_repeated(aruco):
-    """index, z and C of `Sightings`, from ArucoReadings, with one row per pose and marker.
+    """index, z, C and contradicting of `Sightings`, with one row per pose and marker.
 
-    Repeated sightings of a marker at one pose are averaged, weighted by their information matrices,
-    if all of them lie within GATE of the mean. Otherwise all of them are rejected.
+    Repeated sightings in ArucoReadings of a marker at one pose are averaged, weighted by their
+    information matrices, if all of them lie within GATE of the mean. Otherwise all are rejected.
     """
     order = np.lexsort((aruco.marker, aruco.pose))
     key = np.stack([aruco.pose[order], aruco.marker[order]], -1)
@@ -65,8 +67,8 @@ def merge_repeated(aruco):
         agrees[i] = np.all(np.einsum("ni,nij,nj->n", r - mean, information, r - mean) < GATE)
         z[begins[i]] += mean
         C[begins[i]] = mean_covariance
-    begins = begins[agrees]
-    return order[begins], z[begins], C[begins]
+    begins, contradicting = begins[agrees], int(count[~agrees].sum())
+    return order[begins], z[begins], C[begins], contradicting
 
 
 def consensus(marker, in_world, covariance):

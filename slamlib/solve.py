@@ -34,6 +34,8 @@ PROBLEMS = {
     "problem3": Task("SLAM: odometry + ArUco", ("aruco",), "slam"),
     "problem4": Task("SLAM: odometry + ArUco + UWB", ("uwb",), "slam_uwb"),
 }
+WHOLE_FILES = {"units", "wheels-swapped", "wheels-reversed", "camera-mirrored", "camera-turned",
+               "odometry"}
 SENSORS = {"aruco": "markers", "uwb": "UWB ranges"}
 
 
@@ -175,13 +177,16 @@ def _wheels(found):
 
 
 def _slam_facts(found):
-    slip, sightings, ranges = found.noise_sigma.tolist()
-    offset, scale = found.range_calibration.tolist()
-    return {"slip_sqrt_m": found.slip, "slip_relative_sigma": slip,
-            "marker_noise_factor": found.noise.sightings, "marker_noise_relative_sigma": sightings,
-            "range_noise_factor": found.noise.ranges, "range_noise_relative_sigma": ranges,
-            "range_offset_m": offset, "range_scale": scale,
-            "range_offset_and_scale_sigmas": found.range_calibration_sigma.tolist(),
+    facts, sigma = {}, found.noise_sigma.tolist()
+    if len(found.rejected):
+        facts |= {"marker_noise_factor": found.noise.sightings,
+                  "marker_noise_relative_sigma": sigma[1]}
+    if len(found.antenna):
+        facts |= {"range_noise_factor": found.noise.ranges, "range_noise_relative_sigma": sigma[2]}
+    if found.range_calibration_covariance.any():
+        facts |= dict(zip(("range_offset_m", "range_scale"), found.range_calibration.tolist()))
+        facts["range_offset_and_scale_sigmas"] = found.range_calibration_sigma.tolist()
+    return {"slip_sqrt_m": found.slip, "slip_relative_sigma": sigma[0], **facts,
             "increments": found.model, "outliers": int(found.rejected.sum()),
             "chi2_per_dof": found.chi2_per_dof, "chi2_per_dof_of_all": found.chi2_per_dof_of_all,
             "log_evidence": found.log_evidence, **_wheels(found)}
@@ -224,10 +229,14 @@ def doubts_about_drive(dataset, truth):
 def merged(doubts):
     """List of Doubt, each once; of what problems 3 and 4 both find, the later sentence.
 
-    There may be several doubts of a kind about antennas and units.
+    There may be several doubts of a kind about antennas and units. A doubt about whole files
+    silences those that a solution of such files leads to.
     """
+    kinds = {doubt.what for doubt in doubts}
+    kept = [doubt for doubt in doubts if not kinds & WHOLE_FILES
+            or doubt.what in WHOLE_FILES | {"truth-frame"}]
     return list({doubt.sentence if doubt.what in ("antenna", "units") else doubt.what: doubt
-                 for doubt in doubts}.values())
+                 for doubt in kept}.values())
 
 
 def truth_in_world(solution, truth):

@@ -156,7 +156,7 @@ def test_doubts_are_in_the_summary_and_below_the_table(tmp_path, capsys):
     assert set(frame) == set(antenna) == {"what", "sentence"}
     assert frame["what"] == "truth-frame" and "(1.000 m, 2.000 m, 0.5000 rad)" in frame["sentence"]
     assert antenna["what"] == "antenna"
-    assert antenna["sentence"].startswith(f"Antenna {first} is in doubt: only 2 of its ranges")
+    assert antenna["sentence"].startswith(f"Antenna {first} is in doubt: only 2 of its 2 ranges")
     assert list(summary["problems"]["problem4"]["antennas_in_doubt"]) == [str(first)]
     assert summary["problems"]["problem3"]["ate_m"] < 0.05          # in the frame of the estimate
     told = capsys.readouterr().out.splitlines()

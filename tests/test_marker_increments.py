@@ -159,8 +159,9 @@ def test_repeated_sightings_are_averaged_or_dropped():
         covariance=np.array([np.diag([1e-2, 1e-2, 1e-2])] * 2 + [np.diag([1e-2, 1e-2, 3e-2])]
                             + [np.diag([1e-2, 1e-2, 1e-2])] * 2))
     before = readings.marker_in_vehicle.copy()
-    index, z, covariance = merge_repeated(readings)
+    index, z, covariance, contradicting = merge_repeated(readings)
     np.testing.assert_array_equal(index, [1, 0])                # the two of pose 4 disagree
+    assert contradicting == 2
     np.testing.assert_allclose(z, [[0, 2, 0], [1.02, 1, np.pi]], atol=1e-12)
     np.testing.assert_allclose(covariance[1], np.diag([5e-3, 5e-3, 7.5e-3]))
     np.testing.assert_array_equal(readings.marker_in_vehicle, before)

@@ -20,8 +20,10 @@ Each stage makes the record of the next. The modules, in the order in which they
        fit                  Problem, State -> Fit: wheels, noise, accepted measurements, in turn
        model_choice         Fit -> Fit: arcs or Euler's steps
        range_calibration    Fit -> Fit: with an offset and a scale of the ranges, if there are any
-    7  covariances, moments, interpolation, doubts, camera_offsets, drive_doubts, result
+    7  covariances, moments, interpolation, result
                             Fit -> SlamResult in world axes
+       doubts, camera_offsets, drive_doubts, wheel_check
+                            what the solution says against the files
 
 `estimate` is all of it. With the result of a problem with fewer sensors at hand, it starts there
 and skips stage 5 and the choice of the model.

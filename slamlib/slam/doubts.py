@@ -1,6 +1,6 @@
 """Stage 7: antennas whose place their ranges do not settle."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,14 +20,19 @@ class AntennaDoubts:
     covariances: np.ndarray  # (a, 2, 2) m^2, in doubt at least the second moment of all places
 
 
-def antenna_doubts(measurements, state, frame_covariances, covariances, range_weight):
-    """The AntennaDoubts about a State of Measurements.
+def antenna_doubts(problem, state, frame_covariances, covariances, range_weight):
+    """The AntennaDoubts about the State that solves a Problem.
 
     From covariances (f, 3, 3) of the frames and (a, 2, 2) of the antennas, and the share of its
     information that each range keeps, `range_weight` (r,).
     """
-    sentences, covariances = {}, covariances.copy()
-    each = ranges_by_antenna(measurements, state.poses, frame_covariances)
+    measurements, sentences, covariances = problem.measurements, {}, covariances.copy()
+    offset, scale = state.range_calibration
+    r = measurements.ranges
+    corrected = replace(r, distance=(r.distance - offset) / scale,
+                        sigma=r.sigma * problem.noise.ranges / scale)
+    each = ranges_by_antenna(replace(measurements, ranges=corrected), state.poses,
+                             frame_covariances)
     for k, (antenna, ranges) in enumerate(zip(measurements.antenna.tolist(), each)):
         weight = range_weight[measurements.ranges.antenna == k]
         sentence = _doubt(ranges, state.antennas[k], weight)
@@ -45,7 +50,7 @@ def _doubt(ranges, estimate, weight):
     other = np.hypot(*(places - estimate).T) > SAME_PLACE * distance
     possible = places[other & (costs < MAX_LOG_ODDS)]
     if count < MIN_RANGES:
-        return f"only {count} of its ranges agree"
+        return f"only {count} of its {len(ranges.distance)} ranges agree"
     if len(possible):
         return "its ranges fit as well at " + " and ".join(
             "({:.1f}, {:.1f})".format(*place) for place in possible)

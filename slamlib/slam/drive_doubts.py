@@ -4,13 +4,17 @@ import numpy as np
 from scipy.special import chdtri
 
 from slamlib.doubt import Doubt
+from slamlib.slam.noise import BOUNDS
 
 MAX_WHEEL_SIGMAS = 4.0       # of a wheel parameter from what vehicle.toml states
 SMALLEST_SIGMA = 1e-12       # m, of a wheel parameter that studies take as known
 MAX_SLIP = 0.02              # sqrt(m), of wheels that merely slip
 MIN_GAIN = chdtri([1, 3], 5e-4) / 2        # log likelihood, of late sightings and of a place
 MIN_LATE = 0.5               # poses
+MANY_POSES = 10              # from which on the estimate of late sightings is too small
 MIN_PLACE = (0.005, 0.005, 0.005)            # m, m, rad, of the camera
+MIN_GAIN_RANGES = chdtri(2, 5e-4) / 2        # the same, of the ranges' offset and scale
+MANY_LATE = 0.1              # share of the ranges with less than half of their weight
 NEARLY = 5.0                 # log likelihood by which one explanation must lead to be the only one
 MAX_FACTOR = 1.5             # of a sigma, more or less, that is reported
 DECIDED_SIGMAS = 4.0         # of the logarithm of a factor, that it must differ from 1
@@ -46,14 +50,29 @@ def _wheels(vehicle, found):
     far = np.flatnonzero(np.abs(off) > MAX_WHEEL_SIGMAS)
     if not len(far):
         return 0.0, None
-    sigma = np.sqrt(np.diag(found.wheel_covariance))
-    named = " and ".join(
-        f"{WHEELS[k]} is {1e3 * found.wheel[k]:.2f} ± {1e3 * sigma[k]:.2f} mm where "
-        f"{1e3 * vehicle.wheel[k]:.2f} ± {1e3 * vehicle.sigma_wheel[k]:.2f} mm was stated"
-        for k in far)
     return off @ off / 2, Doubt("wheel-parameters", (
-        f"By the other sensors {named}, up to {np.abs(off).max():.0f} standard deviations off: "
-        "measure the wheels again, or state values or larger sigmas in vehicle.toml."))
+        f"By the other sensors {wheels_in_words(vehicle, found.wheel)}, up to "
+        f"{np.abs(off).max():.0f} standard deviations off: measure the wheels again, or state "
+        "values or larger sigmas in vehicle.toml." + marker_size(vehicle, found.wheel)))
+
+
+def wheels_in_words(vehicle, wheel):
+    """The parameters in `wheel` (3,), m, that differ from a Vehicle's by MAX_WHEEL_SIGMAS."""
+    off = np.abs(wheel - vehicle.wheel) / np.maximum(vehicle.sigma_wheel, SMALLEST_SIGMA)
+    return " and ".join(
+        f"{WHEELS[k]} is {1e3 * wheel[k]:.1f} mm (stated: {1e3 * vehicle.wheel[k]:.1f} ± "
+        f"{1e3 * vehicle.sigma_wheel[k]:.1f} mm)" for k in np.flatnonzero(off > MAX_WHEEL_SIGMAS))
+
+
+def marker_size(vehicle, wheel):
+    """What else explains radii in `wheel` (3,) that differ from a Vehicle's by one factor."""
+    factors = wheel[:2] / vehicle.wheel[:2]
+    off = factors.mean() - 1
+    if abs(off) < 2 * np.ptp(factors):
+        return ""
+    return (f" The same is seen if all lengths in ArucoReading.txt are {abs(off):.1%} too "
+            f"{'large' if off > 0 else 'small'}, as for printed markers of another size than the "
+            "detector was told.")
 
 
 def _late(time):
@@ -62,10 +81,12 @@ def _late(time):
     if time.gain < MIN_GAIN[0] or abs(late) < MIN_LATE:
         return time.gain, None
     side, sign = ("late", "large") if late > 0 else ("early", "small")
+    number = f"{abs(late):.1f} ± {sigma:.1f} poses" if abs(late) < MANY_POSES else \
+        f"{abs(late):.0f} poses or more"
     return time.gain, Doubt("time-offset", (
-        f"The sightings agree best if they are {abs(late):.1f} ± {sigma:.1f} poses {side} against "
-        f"the encoder: look whether the pose ids of ArucoReading.txt are too {sign} by about "
-        f"{abs(late):.0f}."))
+        f"The sightings agree best if they are {number} {side} against the encoder: look whether "
+        f"the pose ids of ArucoReading.txt are too {sign}, and whether rows are missing in "
+        "encoderReading.txt."))
 
 
 def _place(place):
@@ -92,20 +113,32 @@ def slip_doubts(found):
 
 def noise_doubts(found):
     """Factors on the stated sigmas that differ from 1."""
-    return [Doubt(what, (
-        f"The {name} scatter {factor:.3g} times as much as {file} states (the factor is known to "
-        f"{100 * sigma:.0f} %): problems 3 and 4 use the scatter that was found, the others the "
-        "file's. Look at how the sensor's covariances were obtained."))
-        for what, name, file, factor, sigma in (
-            ("marker-noise", "sightings", "ArucoReading.txt", found.noise.sightings,
-             found.noise_sigma[1]),
-            ("range-noise", "ranges", "UwbReading.txt", found.noise.ranges, found.noise_sigma[2]))
-        if abs(np.log(factor)) > max(np.log(MAX_FACTOR), DECIDED_SIGMAS * sigma)]
+    late = np.mean(found.range_weight < 0.5) if len(found.range_weight) else 0.0
+    doubts = []
+    for column, what, name, file in ((1, "marker-noise", "sightings", "ArucoReading.txt"),
+                                     (2, "range-noise", "ranges", "UwbReading.txt")):
+        factor, sigma = getattr(found.noise, name), found.noise_sigma[column]
+        if abs(np.log(factor)) <= max(np.log(MAX_FACTOR), DECIDED_SIGMAS * sigma):
+            continue
+        outside = (found.noise.logarithms[column] - BOUNDS[:, column]) * [1, -1] < sigma
+        number = f"at most {factor:.2g}" if outside[0] else \
+            f"at least {factor:.3g}" if outside[1] else f"{factor:.2f} ± {factor * sigma:.2f}"
+        reason = (f"{late:.0%} of them are far too long, as without line of sight."
+                  if name == "ranges" and late > MANY_LATE else
+                  "Look at how the sensor's covariances were obtained.")
+        doubts.append(Doubt(what, (
+            f"The {name} scatter {number} times as much as {file} states: problems 3 and 4 use the "
+            f"scatter that was found, the others the file's. {reason}")))
+    return doubts
 
 
 def calibration_doubts(found):
-    """Ranges that calibrated themselves."""
-    if not found.range_calibration_sigma.any():
+    """Ranges that calibrated themselves and are not as stated."""
+    covariance = found.range_calibration_covariance
+    if not covariance.any():
+        return []
+    off = found.range_calibration - [0, 1]
+    if off @ np.linalg.solve(covariance, off) / 2 < MIN_GAIN_RANGES:
         return []
     (offset, scale), (sigma, scale_sigma) = found.range_calibration, found.range_calibration_sigma
     return [Doubt("range-offset", (
@@ -115,19 +148,24 @@ def calibration_doubts(found):
 
 def sighting_doubts(measurements, rejected):
     """Many rejected sightings, or most of a marker's; `rejected` (s,) bool."""
-    sentences = []
-    if rejected.sum() > MAX_REJECTED * len(rejected):
-        sentences.append(f"{rejected.sum()} of {len(rejected)} sightings contradict the rest and "
-                         "are left out")
-    count = np.bincount(measurements.label, minlength=len(measurements.marker))
+    sentences, repeated = [], measurements.sightings.contradicting
+    left_out, count = rejected.sum() + repeated, len(rejected) + repeated
+    if left_out > MAX_REJECTED * count:
+        sentences.append(f"{left_out} of {count} sightings contradict the rest and are left out"
+                         + (f", {repeated} of them another one of the same marker at the same pose"
+                            if repeated else ""))
+    seen = np.bincount(measurements.label, minlength=len(measurements.marker))
     wrong = np.bincount(measurements.label, rejected, len(measurements.marker))
-    most = measurements.marker[(count >= MIN_SIGHTINGS) & (wrong > count / 2)].tolist()
+    most = measurements.marker[(seen >= MIN_SIGHTINGS) & (wrong > seen / 2)].tolist()
     if most:
-        sentences.append("most sightings of marker " + ", ".join(map(str, most))
-                         + " contradict the rest and are left out")
-    return [Doubt("sightings-rejected", "; ".join(sentences).capitalize()
-                  + ": look at the marker ids in ArucoReading.txt, at markers that were moved or "
-                  "are there twice.")] if sentences else []
+        sentences.append(f"most sightings of marker{'s' * (len(most) > 1)} "
+                         + ", ".join(map(str, most)) + " contradict the rest and are left out")
+    if not sentences:
+        return []
+    text = "; ".join(sentences)
+    return [Doubt("sightings-rejected", text[0].upper() + text[1:]
+                  + ": look at the marker ids in ArucoReading.txt, and for markers that were moved "
+                  "or are there twice.")]
 
 
 def confirmation(found, sensor):

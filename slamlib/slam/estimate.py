@@ -10,6 +10,7 @@ from slamlib.slam.problem import build
 from slamlib.slam.range_calibration import calibrated
 from slamlib.slam.result import result
 from slamlib.slam.robust import CAUCHY_SCALES, narrow_kernels
+from slamlib.slam.wheel_check import with_checked_wheels
 
 
 def estimate(dataset, slip=None, model=None, previous=None):
@@ -38,7 +39,9 @@ def estimate(dataset, slip=None, model=None, previous=None):
     else:
         fit = fit_from_odometry(measurements, slip, model or "arc")
         fit = fit if model else better_model(fit, "euler", slip)
-    return result(calibrated(fit, slip))
+    fit = calibrated(fit, slip)
+    return with_checked_wheels(
+        result(fit), fit, lambda measurements, model: fit_from_odometry(measurements, model=model))
 
 
 def fit_from_odometry(measurements, slip=None, model="arc", factors=odometry_factors):

@@ -77,7 +77,7 @@ def _mode(function, x, free):
         sigma = np.clip(np.sqrt(np.diag(covariance)), MIN_DIFFERENCE, MAX_DIFFERENCE)
         coarse, steps = (steps > 2 * sigma).any(), sigma
         step = covariance @ gradient
-        step *= min(1.0, MAX_STEP / np.abs(step).max())
+        step *= MAX_STEP / max(MAX_STEP, np.abs(step).max())
         while (new := function(_moved(x, free, step))) < value and np.abs(step / sigma).max() > 0.1:
             step = step / 2
         gained = new - value

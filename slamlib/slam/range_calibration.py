@@ -1,4 +1,7 @@
-"""Stage 6: a common offset and scale of the ranges, kept where the evidence decides for them."""
+"""Stage 6: a common offset and scale of the ranges, but where the evidence decides against them.
+
+Where it does not decide, they remain variables: an offset that is possible moves the antennas.
+"""
 
 from dataclasses import replace
 
@@ -9,9 +12,10 @@ from slamlib.slam.state import state_from_arrays
 
 
 def calibrated(fit, slip=None):
-    """The Fit with offset and scale of the ranges as variables if its evidence is DECISIVE.
+    """The Fit with offset and scale of the ranges as variables.
 
-    Otherwise `fit`. Both are compared at the state and on the accepted measurements of `fit`.
+    `fit` itself where its evidence leads by DECISIVE or there are no ranges. Both are compared at
+    its state and on its accepted measurements.
     """
     problem, state = fit.problem, fit.state
     if not len(problem.measurements.ranges.row):
@@ -19,6 +23,6 @@ def calibrated(fit, slip=None):
     m = replace(problem.measurements, calibrated=True)
     other = replace(problem, measurements=m, measured=replace(problem.measured, measurements=m))
     start = state_from_arrays(m, state.poses, state.markers, state.antennas, state.w)
-    if log_evidence(other, start) < fit.log_evidence + DECISIVE:
+    if log_evidence(other, start) < fit.log_evidence - DECISIVE:
         return fit
     return refine(other, start, slip)

@@ -35,7 +35,7 @@ class SlamResult:
     noise: Noise                    # as given or learned
     noise_sigma: np.ndarray         # (3,) of its logarithms, 0 where given or without measurements
     range_calibration: np.ndarray   # (2,) offset in m and scale of the ranges, 0 and 1 if not kept
-    range_calibration_sigma: np.ndarray        # (2,) m and 1, or 0
+    range_calibration_covariance: np.ndarray   # (2, 2), or 0
     camera: CameraOffsets           # errors that all sightings may share, which are not modelled
     model: str                      # "arc" or "euler", as given or chosen
     log_evidence: float             # Laplace, up to a constant of dataset and accepted measurements
@@ -53,6 +53,11 @@ class SlamResult:
         """Standard deviation of a wheel's slip after one metre, sqrt(m), as given or learned."""
         return self.noise.slip
 
+    @property
+    def range_calibration_sigma(self):
+        """(2,) standard deviations of the ranges' offset in m and scale, or 0."""
+        return np.sqrt(np.diag(self.range_calibration_covariance))
+
 
 def result(fit):
     """The SlamResult of a Fit."""
@@ -65,7 +70,8 @@ def result(fit):
     kernel, range_weight = problem.measured.range_kernel, problem.measured.range_weight
     if kernel is not None:
         range_weight = range_weight * [kernel.weight(r) for r in range_residual]
-    doubts = antenna_doubts(m, state, pose_covariances[m.frame], marginal.antennas, range_weight)
+    doubts = antenna_doubts(problem, state, pose_covariances[m.frame], marginal.antennas,
+                            range_weight)
     mapped, marker_covariance = _mapped(problem, marginal.markers)
     markers = state.markers[mapped]
     markers[:, 2] = se2.wrap(markers[:, 2])
@@ -81,7 +87,7 @@ def result(fit):
         noise=problem.noise, noise_sigma=np.zeros(3) if fit.posterior is None
         else np.sqrt(np.diag(fit.posterior.covariance)),
         range_calibration=state.range_calibration,
-        range_calibration_sigma=RANGE_SIGMA * np.sqrt(np.diag(marginal.z)),
+        range_calibration_covariance=RANGE_SIGMA[:, None] * marginal.z * RANGE_SIGMA,
         camera=camera_offsets(problem, fit.state),
         model=problem.odometry.model, log_evidence=float(fit.log_evidence),
         chi2_per_dof=chi2_per_dof(problem, state, np.r_[accepted, range_weight]),
