@@ -428,15 +428,20 @@ def replace_namespace(layout, **changes):
 @pytest.mark.slow
 @pytest.mark.parametrize("shape", OPEN_PATHS)
 def test_open_paths_are_solved(shape):
-    """A marker every 2 m, no loop closure: three drives each, against the graph of known noise."""
-    values = []
+    """A marker every 2 m, no loop closure: three drives each, against the graph of known noise.
+
+    On a single drive a learned slip makes the error larger or smaller by chance, by up to a
+    quarter; their rms is compared.
+    """
+    values, errors = [], []
     for seed in range(3):
         dataset, truth = open_path(OPEN_PATHS[shape], seed)
         found, known = slam.estimate(dataset), slam.estimate(dataset, 1e-3, "arc")
-        ratio = (ate(found.poses, truth.poses, aligned=True)
-                 / ate(known.poses, truth.poses, aligned=True))
-        assert ratio < 1.1 and found.rejected.mean() < 0.01
+        errors.append([ate(r.poses, truth.poses, aligned=True) for r in (found, known)])
+        assert found.rejected.mean() < 0.01
         values.append(anees(found.poses, found.covariances, truth.poses))
+    learned, with_known_noise = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert learned < 1.1 * with_known_noise
     assert np.mean(values) < nees_band(3, probability=0.999)[1]
 
 

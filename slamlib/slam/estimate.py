@@ -35,13 +35,12 @@ def estimate(dataset, slip=None, model=None, previous=None):
     """
     measurements = measure(dataset)
     if previous is not None:
-        fit = fit_from_previous(measurements, previous, slip, model or previous.model)
+        fit = fit_from_previous(measurements, previous, slip, model)
     else:
         fit = fit_from_odometry(measurements, slip, model or "arc")
         fit = fit if model else better_model(fit, "euler", slip)
     fit = calibrated(fit, slip)
-    return with_checked_wheels(
-        result(fit), fit, lambda measurements, model: fit_from_odometry(measurements, model=model))
+    return with_checked_wheels(result(fit), fit, fit_from_previous)
 
 
 def fit_from_odometry(measurements, slip=None, model="arc", factors=odometry_factors):
@@ -56,10 +55,10 @@ def fit_from_odometry(measurements, slip=None, model="arc", factors=odometry_fac
     return refine(problem, state, slip, factors=factors)
 
 
-def fit_from_previous(measurements, previous, slip, model):
-    """The Fit of Measurements from the poses and wheels of a SlamResult; otherwise as above."""
+def fit_from_previous(measurements, previous, slip=None, model=None):
+    """The Fit of Measurements from poses, wheels and model of a SlamResult; otherwise as above."""
     vehicle, frame = measurements.dataset.vehicle, measurements.frame
     w = (previous.wheel - vehicle.wheel) / vehicle.sigma_wheel
     state = state_from_poses(measurements, previous.poses[frame], previous.covariances[frame], w)
-    problem = build(measurements, model, known_noise(slip), relinearize_at=w)
+    problem = build(measurements, model or previous.model, known_noise(slip), relinearize_at=w)
     return refine(problem, narrow_kernels(problem, state, CAUCHY_SCALES[-1:], slip is None), slip)

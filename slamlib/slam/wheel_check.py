@@ -17,13 +17,15 @@ from slamlib.slam.measurements import measure
 
 SUSPICIOUS_SLIP = 3e-3       # sqrt(m), from which the wheels are checked
 GENEROUS = 0.05              # relative standard deviation of radii and wheelbase
+MOST = 0.98                  # of the measurements, that the other wheels must accept as well
+LESS_SLIP = 0.7              # of the slip with the stated wheels, that may remain
 EXPLAINED = {"wheel-parameters", "wheel-slip", "camera-offset", "time-offset"}
 
 
 def with_checked_wheels(found, fit, solve):
     """The SlamResult of a Fit, with the doubt that its wheels are not as stated if they explain it.
 
-    `solve` makes a Fit from Measurements and the model of the odometry steps.
+    `solve` makes a Fit from Measurements and this SlamResult.
     """
     doubted = {doubt.what for doubt in found.drive_doubts}
     if fit.posterior is None or not (found.slip > SUSPICIOUS_SLIP or doubted & EXPLAINED):
@@ -35,13 +37,16 @@ def with_checked_wheels(found, fit, solve):
         sigma_left_radius=GENEROUS * stated.left_radius,
         sigma_wheelbase=GENEROUS * stated.wheelbase)
     try:
-        other = solve(measure(replace(dataset, vehicle=generous)), found.model)
+        other = solve(measure(replace(dataset, vehicle=generous)), found)
         own = refine(_on_measurements_of(other, fit), fit.state, accept=None)
     except (DatasetError, np.linalg.LinAlgError):
         return found
     wheel = stated.wheel + generous.sigma_wheel * other.state.w
     sigma = np.maximum(stated.sigma_wheel, 1e-12)
     lead = other.posterior.density - own.posterior.density
+    if other.problem.measured.weight.sum() < MOST * fit.problem.measured.weight.sum() \
+            or other.problem.noise.slip > LESS_SLIP * found.slip:
+        return found
     far = np.abs(wheel - stated.wheel) > MAX_WHEEL_SIGMAS * sigma
     if lead < max(NEARLY, found.camera.time.gain, found.camera.place.gain) or not far.any():
         return found
