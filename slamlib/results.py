@@ -98,7 +98,7 @@ def _saved(name, rows):
 
 
 def _tiled(name, rows):
-    """The same bytes as `_saved`, for many structs: scipy needs a tenth of a millisecond for each.
+    """The same bytes as `_saved`, for many structs, which scipy writes one by one.
 
     All elements of the array have the same layout. scipy writes one and two of them, which shows
     how long an element is; each number's place in it is where scipy puts a number that is known.

@@ -430,8 +430,8 @@ def replace_namespace(layout, **changes):
 def test_open_paths_are_solved(shape):
     """A marker every 2 m, no loop closure: three drives each, against the graph of known noise.
 
-    On a single drive a learned slip makes the error larger or smaller by chance, by up to a
-    quarter; their rms is compared.
+    On a single drive a learned slip makes the error larger or smaller by chance; their
+    rms is compared.
     """
     values, errors = [], []
     for seed in range(3):

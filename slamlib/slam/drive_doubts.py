@@ -46,9 +46,8 @@ def geometry_doubts(vehicle, found):
 
 def _wheels(vehicle, found):
     """Log likelihood that the wheels' prior costs, and the Doubt if one of them is far from it."""
-    off = (found.wheel - vehicle.wheel) / np.maximum(vehicle.sigma_wheel, SMALLEST_SIGMA)
-    far = np.flatnonzero(np.abs(off) > MAX_WHEEL_SIGMAS)
-    if not len(far):
+    off = in_sigmas(vehicle, found.wheel)
+    if not far_off(vehicle, found.wheel).any():
         return 0.0, None
     return off @ off / 2, Doubt("wheel-parameters", (
         f"By the other sensors {wheels_in_words(vehicle, found.wheel)}, up to "
@@ -56,12 +55,21 @@ def _wheels(vehicle, found):
         "values or larger sigmas in vehicle.toml." + marker_size(vehicle, found.wheel)))
 
 
+def in_sigmas(vehicle, wheel):
+    """Differences (3,) of parameters `wheel` (3,), m, from a Vehicle's, in its sigmas."""
+    return (wheel - vehicle.wheel) / np.maximum(vehicle.sigma_wheel, SMALLEST_SIGMA)
+
+
+def far_off(vehicle, wheel):
+    """(3,) bool, parameters that differ from a Vehicle's by more than MAX_WHEEL_SIGMAS."""
+    return np.abs(in_sigmas(vehicle, wheel)) > MAX_WHEEL_SIGMAS
+
+
 def wheels_in_words(vehicle, wheel):
-    """The parameters in `wheel` (3,), m, that differ from a Vehicle's by MAX_WHEEL_SIGMAS."""
-    off = np.abs(wheel - vehicle.wheel) / np.maximum(vehicle.sigma_wheel, SMALLEST_SIGMA)
+    """The parameters in `wheel` (3,), m, that are far off a Vehicle's."""
     return " and ".join(
         f"{WHEELS[k]} is {1e3 * wheel[k]:.1f} mm (stated: {1e3 * vehicle.wheel[k]:.1f} ± "
-        f"{1e3 * vehicle.sigma_wheel[k]:.1f} mm)" for k in np.flatnonzero(off > MAX_WHEEL_SIGMAS))
+        f"{1e3 * vehicle.sigma_wheel[k]:.1f} mm)" for k in np.flatnonzero(far_off(vehicle, wheel)))
 
 
 def marker_size(vehicle, wheel):

@@ -70,9 +70,7 @@ class NormalEquations:
     @cached_property
     def begin(self):
         """(v,) first row of every variable: frames, markers, antennas, w, and z where it is one."""
-        m = self.problem.measurements
-        size = np.r_[np.full(len(m.frame), 3), np.where(m.oriented, 3, 2),
-                     np.full(len(m.antenna), 2), 3, [2] * m.calibrated].astype(int)
+        m, size = self.problem.measurements, self._widths
         first = {"x": 0, "l": len(m.frame), "p": len(m.frame),
                  "a": len(m.frame) + len(m.marker), "w": len(size) - 1 - m.calibrated,
                  "z": len(size) - 1}
@@ -83,11 +81,16 @@ class NormalEquations:
         return begin
 
     @cached_property
+    def _widths(self):
+        """(v,) numbers of unknowns of the variables, numbered as in `begin`."""
+        m = self.problem.measurements
+        return np.r_[np.full(len(m.frame), 3), np.where(m.oriented, 3, 2),
+                     np.full(len(m.antenna), 2), 3, [2] * m.calibrated].astype(int)
+
+    @property
     def size(self):
         """Number n of unknowns."""
-        m = self.problem.measurements
-        return 3 * len(m.frame) + np.sum(np.where(m.oriented, 3, 2)) + 2 * len(m.antenna) + 3 \
-            + 2 * m.calibrated
+        return int(self._widths.sum())
 
     def rows(self, variables, width):
         """Rows (m, width) of the unknowns of `variables` (m,), numbered as in `begin`."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from slamlib.dataset import DatasetError
 from slamlib.doubt import Doubt
-from slamlib.slam.drive_doubts import MAX_WHEEL_SIGMAS, NEARLY, marker_size, wheels_in_words
+from slamlib.slam.drive_doubts import NEARLY, far_off, marker_size, wheels_in_words
 from slamlib.slam.fit import refine
 from slamlib.slam.measurements import measure
 
@@ -42,13 +42,12 @@ def with_checked_wheels(found, fit, solve):
     except (DatasetError, np.linalg.LinAlgError):
         return found
     wheel = stated.wheel + generous.sigma_wheel * other.state.w
-    sigma = np.maximum(stated.sigma_wheel, 1e-12)
     lead = other.posterior.density - own.posterior.density
     if other.problem.measured.weight.sum() < MOST * fit.problem.measured.weight.sum() \
             or other.problem.noise.slip > LESS_SLIP * found.slip:
         return found
-    far = np.abs(wheel - stated.wheel) > MAX_WHEEL_SIGMAS * sigma
-    if lead < max(NEARLY, found.camera.time.gain, found.camera.place.gain) or not far.any():
+    if lead < max(NEARLY, found.camera.time.gain, found.camera.place.gain) \
+            or not far_off(stated, wheel).any():
         return found
     doubt = Doubt("wheel-parameters", (
         f"The drive is explained far better if {wheels_in_words(stated, wheel)}: measure the "
