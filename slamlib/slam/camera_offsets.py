@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slamlib import se2
-from slamlib.slam.evidence import NormalEquations, decomposition
+from slamlib.slam.evidence import decomposition
 from slamlib.slam.linear_factors import point_factors, pose_factors
 
 FRAMES = 3                   # to both sides, over which a velocity is averaged
@@ -42,9 +42,9 @@ class CameraOffsets:
     place: SharedError       # (3,) m, m, rad of the camera in the vehicle
 
 
-def camera_offsets(problem, state):
-    """The CameraOffsets of a Problem at the State that solves it."""
-    equations = NormalEquations(problem, state)
+def camera_offsets(equations):
+    """The CameraOffsets by the NormalEquations at the State that solves a Problem."""
+    problem, state = equations.problem, equations.state
     H, g = equations.information(problem.noise)
     lu, velocity = decomposition(H), _velocities(problem.measurements, state)
     sightings = [kind(problem.measured, problem.noise, state)

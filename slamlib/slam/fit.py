@@ -1,8 +1,9 @@
 """Stage 6: wheels, noise and accepted measurements that agree with each other."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
-from slamlib.slam.evidence import log_evidence
+from slamlib.slam.evidence import NormalEquations, log_evidence
 from slamlib.slam.noise import known_noise
 from slamlib.slam.noise_posterior import NoisePosterior, noise_posterior
 from slamlib.slam.odometry_factors import odometry_factors
@@ -22,6 +23,11 @@ class Fit:
     state: State
     log_evidence: float
     posterior: NoisePosterior | None     # of the noise; None where it is given
+
+    @cached_property
+    def equations(self):
+        """The NormalEquations at the state."""
+        return NormalEquations(self.problem, self.state)
 
 
 def refine(problem, state, slip=None, accept=accepted, factors=odometry_factors):

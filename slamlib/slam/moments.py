@@ -13,7 +13,6 @@ import numpy as np
 
 from slamlib import se2
 from slamlib.slam.covariances import Covariances, covariances
-from slamlib.slam.evidence import NormalEquations
 from slamlib.slam.state import state_from_arrays
 
 
@@ -28,7 +27,7 @@ def moments(fit):
     each = [covariances(replace(problem, noise=noise), state) for noise in noises]
     if len(each) == 1:
         return state, each[0], slip
-    equations = NormalEquations(problem, state)
+    equations = fit.equations
     x = np.stack([equations.solve(noise)[0] for noise in noises]) \
         - equations.solve(problem.noise)[0]
     mean = weights @ x

@@ -88,7 +88,7 @@ def result(fit):
         else np.sqrt(np.diag(fit.posterior.covariance)),
         range_calibration=state.range_calibration,
         range_calibration_covariance=RANGE_SIGMA[:, None] * marginal.z * RANGE_SIGMA,
-        camera=camera_offsets(problem, fit.state),
+        camera=camera_offsets(fit.equations),
         model=problem.odometry.model, log_evidence=float(fit.log_evidence),
         chi2_per_dof=chi2_per_dof(problem, state, np.r_[accepted, range_weight]),
         chi2_per_dof_of_all=chi2_per_dof(problem, state, m.unit_weights),
