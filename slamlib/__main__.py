@@ -45,7 +45,7 @@ def _parser():
     report.add_argument("--report", type=Path, default=Path("report"), help="folder for the pages")
     report.add_argument("--results", type=Path, default=Path("results"),
                         help="folder for the .mat files")
-    report.add_argument("--jobs", type=_jobs, default=2, help="notebooks executed at a time")
+    report.add_argument("--jobs", type=_positive, default=2, help="notebooks executed at a time")
     report.add_argument("--no-code", dest="code", action="store_false",
                         help="leave out code cells and printed text")
     report.add_argument("--author", help="on the PDF's title page, instead of report.toml's")
@@ -62,6 +62,8 @@ def _parser():
     simulate = commands.add_parser("simulate", help="make a dataset with its truth")
     simulate.add_argument("folder", type=Path, metavar="FOLDER", help="a new or empty folder")
     simulate.add_argument("--path", choices=("short", "long"), default="short")
+    simulate.add_argument("--rounds", type=_positive, default=1,
+                          help="how often the path is driven; 44 long ones are a million rows")
     simulate.add_argument("--seed", type=_count, default=0)
     simulate.add_argument("--slip", type=_share, default=1e-3, metavar="SQRT_M",
                           help="wheel slip: sigma after one metre, in m (default %(default)s)")
@@ -115,7 +117,8 @@ def _name(dataset, data):
 
 def _solve(options):
     from slamlib.summary import solve_to_folder
-    summary = solve_to_folder(read_dataset(options.folder), read_truth(options.folder), options.out)
+    summary = solve_to_folder(
+        read_dataset(options.folder), read_truth(options.folder), options.out, jobs=2)
     print(_table(summary))
     return _exit_code((summary["dataset"], name, row["failed"])
                       for name, row in summary["problems"].items() if "failed" in row)
@@ -141,7 +144,8 @@ def _table(summary):
 def _simulate(options):
     from slamlib.simulation import simulate, write_dataset
     dataset, truth = simulate(options.path, options.seed, slip=options.slip,
-                              late_ranges=options.nlos, mislabelled=options.mislabel)
+                              late_ranges=options.nlos, mislabelled=options.mislabel,
+                              rounds=options.rounds)
     write_dataset(options.folder, dataset, truth)
     return 0
 
@@ -153,7 +157,7 @@ def _count(text):
     return value
 
 
-def _jobs(text):
+def _positive(text):
     value = int(text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"expected a whole number from 1 on, found {text}")

@@ -8,7 +8,6 @@ follows Bar-Shalom, Li and Kirubarajan, *Estimation with Applications to Trackin
 """
 
 import numpy as np
-from scipy.special import chdtri
 
 from slamlib import se2
 
@@ -93,6 +92,8 @@ def nees_band(count, dof=3, probability=0.95):
     The sum of the NEES is chi-squared with count * dof degrees of freedom; the mean lies in the
     band with the given probability.
     """
+    from scipy.special import chdtri  # slow to import, and nothing that is solved needs it
+
     tail = (1 - probability) / 2
     return tuple(chdtri(dof * count, [1 - tail, tail]) / count)
 

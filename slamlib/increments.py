@@ -51,34 +51,36 @@ def rounding_and_slipping(ticks, vehicle, start, end):
     """
     poses = odometry.dead_reckoning(ticks, vehicle, model="arc")
     ds, dtheta, _, _ = odometry.steps(ticks, vehicle)
-    u = np.stack([np.cos(poses[:-1, 2] + dtheta / 2), np.sin(poses[:-1, 2] + dtheta / 2)], -1)
+    direction = poses[:-1, 2] + dtheta / 2
     start, end = np.asarray(start), np.asarray(end)
     length = np.max(end - start, initial=1)
     origin = poses[:max(1, len(ds)):length]
-    p = (poses[:-1, :2] + poses[1:, :2]) / 2 - origin[np.arange(len(ds)) // length, :2]
-    sides = vehicle.wheelbase / 2 * np.array([1, -1])
+    x, y = ((poses[:-1, :2] + poses[1:, :2]) / 2 - origin[np.arange(len(ds)) // length, :2]).T
+    sides = vehicle.wheelbase / 2 * np.array([[1], [-1]])
     turn = 1 / (2 * sides)                                             # by e_R, by e_L
-    by_wheel = np.empty((len(ds), 3, 2))                               # of (end - S p_e turn, turn)
-    by_wheel[:, 0] = u[:, :1] / 2 + p[:, 1:] * turn
-    by_wheel[:, 1] = u[:, 1:] / 2 - p[:, :1] * turn
-    by_wheel[:, 2] = turn
-    outer = by_wheel[:, :, None, :] * by_wheel[:, None, :, :]          # (n-1, 3, 3, wheel)
-    from_slip = outer @ np.abs(ds[:, None] + sides * dtheta[:, None])[:, None, :, None]
-    metres_per_count = 2 * np.pi * vehicle.wheel[:2] / vehicle.ticks_per_revolution
-    from_rounding = outer @ (metres_per_count**2 / 6)
-    totals = [odometry.cumulative(part) for part in (from_slip[..., 0], from_rounding)]
+    by_wheel = np.stack([np.cos(direction) / 2 + y * turn, np.sin(direction) / 2 - x * turn,
+                         np.broadcast_to(turn, (2, len(ds)))])   # of (end - S p_e turn, turn)
+    i, j = np.triu_indices(3)
+    outer = by_wheel[i] * by_wheel[j]                                  # (6, wheel, n-1)
+    metres_per_count = 2 * np.pi * vehicle.wheel[:2, None] / vehicle.ticks_per_revolution
+    totals = np.zeros((2, 6, len(ds) + 1))
+    for total, variance in zip(totals, (np.abs(ds + sides * dtheta), metres_per_count**2 / 6)):
+        np.cumsum(np.sum(outer * variance, axis=1), axis=1, out=total[:, 1:])
+    symmetric = np.empty((3, 3), int)
+    symmetric[i, j] = symmetric[j, i] = np.arange(6)
     in_world = np.zeros((2, len(start), 3, 3))
     for block in (start // length, start // length + 1):
         begins, ends = (np.clip(edge * length, start, end) for edge in (block, block + 1))
-        slipping, rounding = (total[ends] - total[begins] for total in totals)
-        rounding = rounding / np.maximum(end - start, 1)[:, None, None]
+        slipping, rounding = totals[..., ends] - totals[..., begins]
+        rounding = rounding / np.maximum(end - start, 1)
         lever = poses[end] - [1, 1, 0] * origin[np.minimum(block, len(origin) - 1)]
         to_end, _ = se2.compose_jacobians(np.zeros(3), lever)          # I + [0, 0, S lever]
-        in_world += to_end @ np.stack([rounding, slipping]) @ np.swapaxes(to_end, 1, 2)
+        parts = np.stack([each.T[:, symmetric] for each in (rounding, slipping)])
+        in_world += to_end @ parts @ np.swapaxes(to_end, 1, 2)
     return tuple(se2.rotate_covariance(part, -poses[start, 2]) for part in in_world)
 
 
-def noise_in_drive(ticks, vehicle, start, end):
+def noise_in_drive(ticks, vehicle, start, end, steps=None):
     """Noise of increments of one drive by encoder rounding, and by slip of 1 sqrt(m).
 
     The counts of an increment are a difference of what the encoder shows at its end and at its
@@ -95,6 +97,7 @@ def noise_in_drive(ticks, vehicle, start, end):
     Parameters
     ----------
     ticks : (n, 2) counts; vehicle : Vehicle; start, end : (m,) poses from 0, start <= end.
+    steps : of the drive, where the ticks are those of a part; default n - 1.
 
     Returns
     -------
@@ -103,7 +106,7 @@ def noise_in_drive(ticks, vehicle, start, end):
     """
     start, end = np.asarray(start), np.asarray(end)
     rounding, slipping = rounding_and_slipping(ticks, vehicle, start, end)
-    rounding *= ((end - start) / max(1, len(ticks) - 1))[:, None, None]
+    rounding *= ((end - start) / max(1, steps or len(ticks) - 1))[:, None, None]
     travelled = odometry.cumulative(np.abs(odometry.steps(ticks, vehicle)[0]))
     skid = MINIMUM_SLIP**2 * (travelled[end] - travelled[start])
     rounding[:, [0, 1], [0, 1]] += skid[:, None]

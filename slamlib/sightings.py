@@ -8,13 +8,13 @@ Mahalanobis distance r^T W^-1 r of a residual r with covariance W; beyond it r i
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtri
 
 from slamlib import se2
 
-GATE = chdtri(3, 0.001)          # dimensionless, for residuals of [x, y, heading]
-POINT_GATE = chdtri(2, 0.001)    # dimensionless, for residuals of [x, y]
-MAX_HEADING_SIGMA = 0.5            # rad; with a larger standard deviation a heading is unknown
+GATE = 16.26623619623813         # dimensionless, for residuals of [x, y, heading]
+MAX_COMPARED = 200               # sightings of a marker, whose comparison costs their square
+POINT_GATE = 13.815510557964274  # dimensionless, for residuals of [x, y]
+MAX_HEADING_SIGMA = 0.5          # rad; with a larger standard deviation a heading is unknown
 
 
 @dataclass(frozen=True)
@@ -77,10 +77,14 @@ def consensus(marker, in_world, covariance):
     The support of a sighting is the number of sightings of its marker within GATE of it. Of those
     with at least half the maximum support, the most certain one has the smallest determinant of its
     covariance. `marker` (s,) are ids, `in_world` (s, 3), m and rad, and `covariance` (s, 3, 3) the
-    poses of these markers in world axes as each sighting gives them.
+    poses of these markers in world axes as each sighting gives them. Of a marker with more than
+    MAX_COMPARED sightings, so many are compared, evenly chosen.
     """
-    log_determinant, best = np.linalg.slogdet(covariance)[1], []
-    for same in (np.flatnonzero(marker == i) for i in np.unique(marker)):
+    _, label = np.unique(marker, return_inverse=True)
+    chosen, best = few_of_each(label, MAX_COMPARED), []
+    order = chosen[np.argsort(label[chosen], kind="stable")]
+    log_determinant = np.linalg.slogdet(covariance)[1]
+    for same in np.split(order, np.flatnonzero(np.diff(label[order])) + 1) if len(order) else ():
         r = in_world[same, None] - in_world[same]
         r[..., 2] = se2.wrap(r[..., 2])
         W = covariance[same, None] + covariance[same]
@@ -88,3 +92,12 @@ def consensus(marker, in_world, covariance):
         support = np.count_nonzero(squared < GATE, axis=1)
         best.append(min(same[support >= support.max() / 2], key=log_determinant.__getitem__))
     return np.array(best, int)
+
+
+def few_of_each(label, most):
+    """Rows of at most `most` entries of every label, evenly chosen. Labels count from 0."""
+    order = np.argsort(label, kind="stable")
+    count = np.bincount(label)[label[order]]
+    number = np.arange(len(order)) - np.searchsorted(label[order], label[order])
+    few = np.minimum(count, most)
+    return np.sort(order[(number * few) // count != ((number - 1) * few) // count])

@@ -1,14 +1,21 @@
 """All problems of a dataset solved into a folder, with a summary of plain numbers."""
 
 import json
+import os
+import sys
 import time
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict
+from itertools import chain
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
 
 from slamlib import evaluation, results
 from slamlib.solve import (
+    PROBLEMS,
     Failure,
     doubts_about_drive,
     merged,
@@ -17,31 +24,66 @@ from slamlib.solve import (
     write,
 )
 
+BESIDES = ("problem2", "problem2_hint", "problem2_fused")      # nothing else depends on them
 
-def solve_to_folder(dataset, truth, out):
+
+def solve_to_folder(dataset, truth, out, jobs=1):
     """The summary of all problems of a Dataset, written with their files below the folder `out`.
 
     The Truth, or None, serves to report errors, never to estimate. Each problem's files are written
     as it ends. The summary is the dict that is written to summary.json; a problem that could not be
     solved has the entry "failed", a sentence. Its list "doubts", of "what" and "sentence", is empty
     where the measurements agree with the files: first those about the drive, then by problem.
+    With two `jobs`, a second process solves problem 2 meanwhile.
     """
-    summary = {"dataset": dataset.name, "poses": len(dataset.ticks), "doubts": [], "problems": {}}
-    doubts = list(doubts_about_drive(dataset, truth))
-    start = time.perf_counter()
-    for solution in solutions(dataset):
-        seconds = time.perf_counter() - start
+    rows, doubts = {}, {}
+    for solution, seconds in _solved(dataset, jobs):
         failed = isinstance(solution, Failure)
         row = {"failed": solution.reason} if failed else summarize(solution, truth)
-        summary["problems"][solution.problem] = {"title": solution.title, **row, "seconds": seconds}
+        rows[solution.problem] = {"title": solution.title, **row, "seconds": seconds}
         if not failed:
             write(out, solution)
-            doubts += solution.doubts
-        start = time.perf_counter()
-    summary["doubts"] = [asdict(doubt) for doubt in merged(doubts)]
+            doubts[solution.problem] = solution.doubts
+    of_drive = doubts_about_drive(dataset, truth)
+    in_order = [problem for problem in PROBLEMS if problem in rows]
+    summary = {"dataset": dataset.name, "poses": len(dataset.ticks),
+               "doubts": [asdict(doubt) for doubt in merged(
+                   [*of_drive, *chain(*(doubts.get(problem, ()) for problem in in_order))])],
+               "problems": {problem: rows[problem] for problem in in_order}}
     text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     results.write_atomically(Path(out) / "summary.json", text.encode())
     return summary
+
+
+def _solved(dataset, jobs):
+    """Yield (Solution or Failure, seconds) of every problem, those of BESIDES last if it can be.
+
+    The second process is a fork: only Linux makes those safely. It returns what it found and writes
+    nothing, so that nothing is written once this process is gone.
+    """
+    if jobs < 2 or sys.platform != "linux" or len(os.sched_getaffinity(0)) < 2:
+        yield from _timed(dataset, PROBLEMS)
+        return
+    others = [problem for problem in PROBLEMS if problem not in BESIDES]
+    with ProcessPoolExecutor(1, mp_context=get_context("fork")) as pool:
+        besides = pool.submit(_listed, dataset)
+        yield from _timed(dataset, others)
+        try:
+            found = besides.result()
+        except BrokenProcessPool:                       # killed, as where memory is short
+            found = _listed(dataset)
+        yield from found
+
+
+def _listed(dataset):
+    return list(_timed(dataset, BESIDES))
+
+
+def _timed(dataset, problems):
+    start = time.perf_counter()
+    for solution in solutions(dataset, problems=problems):
+        yield solution, time.perf_counter() - start
+        start = time.perf_counter()
 
 
 def summarize(solution, truth):

@@ -1,20 +1,35 @@
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
-from slamlib import increments, odometry, se2
+from slamlib import increments, odometry, se2, slam
 from slamlib.dataset import ArucoReadings, Dataset
 from slamlib.evaluation import anees, ate, nees_band
-from slamlib.localization import fuse, fuse_increments, localize
+from slamlib.localization import fuse, fuse_increments, fused, localize
 from slamlib.simulation import TABLE_2, simulate
+from slamlib.slam import interpolation
 
 
 def test_perfect_data_gives_the_exact_poses():
     dataset, truth = simulate("short", seed=1, noise=False)
-    for fused in (fuse(dataset, slip=1e-3), fuse(dataset)):
-        np.testing.assert_allclose(fused.poses, truth.poses, atol=1e-9)
-        np.testing.assert_allclose(fused.wheel, [0.1, 0.1, 0.4], atol=1e-9)
+    for found in (fuse(dataset, slip=1e-3), fuse(dataset)):
+        np.testing.assert_allclose(found.poses, truth.poses, atol=1e-9)
+        np.testing.assert_allclose(found.wheel, [0.1, 0.1, 0.4], atol=1e-9)
+
+
+@pytest.mark.parametrize("module, solve", [
+    (fused, partial(fuse, slip=1e-3)),
+    (interpolation, lambda dataset: slam.estimate(dataset, slip=1e-3, model="arc"))])
+def test_sections_of_a_drive_have_no_seams(module, solve, monkeypatch):
+    dataset, _ = simulate("short", seed=3)
+    dataset = only(dataset.first(600), dataset.first(600).aruco.pose < 500)    # odometry at the end
+    whole = solve(dataset)
+    monkeypatch.setattr(module, "AT_ONCE", 7)
+    sections = solve(dataset)
+    np.testing.assert_allclose(sections.poses, whole.poses, atol=1e-10)
+    np.testing.assert_allclose(sections.covariances, whole.covariances, rtol=1e-7, atol=1e-14)
 
 
 def only(dataset, keep):

@@ -45,11 +45,49 @@ def test_simulate_then_solve(tmp_path):
     assert summary["dataset"] == "drive" and 0 < summary["problems"]["problem1"]["ate_m"] < 1
 
 
+def test_simulated_paths_are_driven_several_times(tmp_path):
+    assert main(["simulate", str(tmp_path / "drive"), "--rounds", "3", "--seed", "5"]) == 0
+    found, (expected, _) = read_dataset(tmp_path / "drive"), simulate("short", 5, rounds=3)
+    assert len(found.ticks) == 6000
+    np.testing.assert_array_equal(found.ticks, expected.ticks)
+
+
 def test_solve_without_truth_and_with_a_single_pose(tmp_path, capsys):
     (tmp_path / "encoderReading.txt").write_text("1 0 0\n")
     assert main(["solve", str(tmp_path), "--out", str(tmp_path / "out")]) == 0
     assert "no truth" in capsys.readouterr().out
     assert len(read_vehicle_poses(tmp_path / "out" / "problem1")[0]) == 1
+
+
+def test_two_processes_write_what_one_does(tmp_path):
+    dataset, truth = simulate("short", 8)
+    dataset = dataset.first(400)
+    truth = replace(truth, poses=truth.poses[:400])
+    one, two = (solve_to_folder(dataset, truth, tmp_path / str(jobs), jobs) for jobs in (1, 2))
+    assert list(one["problems"]) == list(two["problems"]) == list(solve.PROBLEMS)
+    for summary in (one, two):
+        assert all(row.pop("seconds") > 0 for row in summary["problems"].values())
+    assert one == two
+    for file in sorted((tmp_path / "1").rglob("*.mat")):
+        other = tmp_path / "2" / file.relative_to(tmp_path / "1")
+        assert file.read_bytes() == other.read_bytes()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux forks safely")
+def test_a_second_process_that_is_killed_costs_time_only(tmp_path, monkeypatch):
+    dataset, _ = simulate("short", 8)
+    here = os.getpid()
+
+    def killed(*arguments):
+        if os.getpid() != here:
+            os.kill(os.getpid(), 9)
+        return find(*arguments)
+
+    find = solve.find
+    monkeypatch.setattr(solve, "find", killed)
+    rows = solve_to_folder(dataset.first(300), None, tmp_path, jobs=2)["problems"]
+    assert list(rows) == list(solve.PROBLEMS)
+    assert not any("failed" in row for row in rows.values())
 
 
 def test_bad_data_is_one_sentence_and_exit_code_2_and_writes_nothing(tmp_path):
@@ -69,6 +107,7 @@ def test_bad_data_is_one_sentence_and_exit_code_2_and_writes_nothing(tmp_path):
     (["simulate", "drive", "--slip", "nan"], "from 0 to 1"),
     (["simulate", "drive", "--slip", "1e300"], "from 0 to 1"),
     (["simulate", "drive", "--seed", "x"], "seed"),
+    (["simulate", "drive", "--rounds", "0"], "from 1 on"),
     (["simulate", ".", "--seed", "1"], "new or empty folder"),
     (["report", "--notebooks", ROOT / "notebooks", "--data", "nowhere"], "nowhere"),
     (["report", "--jobs", "0"], "jobs"),
@@ -170,7 +209,7 @@ def test_a_clean_drive_has_no_doubts_and_each_doubt_is_told_once(tmp_path, monke
     assert solve_to_folder(dataset, None, tmp_path)["doubts"] == []
     told = Doubt("camera-mirrored", "It is.")
     monkeypatch.setattr("slamlib.summary.doubts_about_drive", lambda *_: (told, told))
-    monkeypatch.setattr("slamlib.summary.solutions", lambda dataset: [
+    monkeypatch.setattr("slamlib.summary.solutions", lambda dataset, problems: [
         replace(solve.problem1(dataset), doubts=(Doubt("units", "Miles."), told))])
     assert [doubt["what"] for doubt in solve_to_folder(dataset, None, tmp_path)["doubts"]] == [
         "camera-mirrored", "units"]

@@ -6,24 +6,23 @@ from functools import partial
 import gtsam
 import numpy as np
 import pytest
-from gtsam.symbol_shorthand import A, L, W, X
 from numeric import central_differences, decided
 
 from slamlib import increments, se2, simulation, slam, studies
 from slamlib.dataset import ArucoReadings, Dataset, Vehicle
 from slamlib.evaluation import anees, ate, nees_band
 from slamlib.simulation import simulate
-from slamlib.slam import odometry_factors, optimizer
+from slamlib.slam import gtsam_graph, odometry_factors
 from slamlib.slam.covariances import covariances
 from slamlib.slam.estimate import fit_from_odometry
-from slamlib.slam.evidence import NormalEquations
+from slamlib.slam.evidence import solve
 from slamlib.slam.fit import refine
-from slamlib.slam.initialization import parts, state_from_poses
+from slamlib.slam.initialization import parts
 from slamlib.slam.measurements import measure
 from slamlib.slam.moments import moments
 from slamlib.slam.noise import Noise, from_logarithms, log_prior
 from slamlib.slam.noise_posterior import noise_posterior
-from slamlib.slam.optimizer import linearize, optimize
+from slamlib.slam.normal_equations import NormalEquations
 from slamlib.slam.problem import build
 from slamlib.slam.result import result
 from slamlib.slam.state import state_from_arrays
@@ -69,7 +68,8 @@ def test_odometry_derivatives_against_central_differences():
 def test_odometry_factor_equals_gtsams_between_factor_for_known_wheels():
     """Jacobian, right-hand side and error are equal, also far from the optimum."""
     problem, poses, _ = example()
-    U, odometry = problem.whitening, problem.odometry
+    odometry = problem.odometry
+    U, _ = odometry.whitening(problem.noise.slip)
     e, by_first, by_second, _ = odometry_factors.odometry_error(odometry, poses, np.zeros(3))
     assert np.abs(e).max() > 0.05
     for i in range(len(e)):
@@ -160,10 +160,10 @@ def test_the_learned_noise_has_the_greatest_posterior(poses, slip):
     dataset, _ = simulate("short", seed=6, slip=slip)
     fit = fit_from_odometry(measure(dataset.first(poses)))
     equations = NormalEquations(fit.problem, fit.state)
-    found = noise_posterior(fit.problem, fit.state)
+    found = noise_posterior(equations)
 
     def log_posterior(logarithms):
-        return equations.solve(from_logarithms(logarithms))[1] + np.sum(log_prior(logarithms))
+        return solve(equations, from_logarithms(logarithms))[1] + np.sum(log_prior(logarithms))
 
     sigma = np.sqrt(np.diag(found.covariance))
     for direction in np.diag(sigma):
@@ -181,15 +181,14 @@ def test_averages_over_the_noise_are_moments_of_a_mixture():
     weights, noises = zip(*fit.posterior.points)
     assert len(weights) > 2 and np.isclose(sum(weights), 1, atol=1e-2)
     equations = NormalEquations(fit.problem, fit.state)
-    origin = equations.solve(fit.problem.noise)[0]
-    x = np.stack([equations.solve(noise)[0] - origin for noise in noises])
+    origin = solve(equations, fit.problem.noise)[0]
+    x = np.stack([solve(equations, noise)[0] - origin for noise in noises])
     weights = np.array(weights) / sum(weights)
     state, mixed, slip = moments(fit)
     frame = 20
-    rows = equations.rows(np.array([frame]), 3)[0]
+    rows = equations.structure.rows([frame], 3)[0]
     mean = weights @ x[:, rows]
-    each = [covariances(replace(fit.problem, noise=noise), fit.state).pairs[frame, :3, :3]
-            for noise in noises]
+    each = [covariances(equations, noise).pairs[frame, :3, :3] for noise in noises]
     expected = sum(p * (C + np.outer(d, d)) for p, C, d in zip(weights, each, x[:, rows] - mean))
     np.testing.assert_allclose(mixed.pairs[frame, :3, :3], expected, rtol=1e-9, atol=1e-15)
     np.testing.assert_allclose(state.poses[frame], se2.compose(fit.state.poses[frame], mean),
@@ -214,24 +213,6 @@ def test_wheels_far_from_nominal_are_learned_consistently():
     assert (np.mean(ratios, axis=0) < high).all(), (low, high, np.mean(ratios, axis=0))
 
 
-def test_marginal_covariances_equal_gtsams():
-    dataset, _ = simulate("short", seed=4, mislabelled=0.02, late_ranges=0.2)
-    m = measure(dataset)
-    fit = fit_from_odometry(m, 1e-3)
-    marginal = covariances(fit.problem, fit.state)
-    tree = linearize(fit.problem, fit.state).eliminateMultifrontal()
-    for i in range(0, len(marginal.pairs), 13):
-        expected = tree.jointMarginalCovariance([X(i), X(i + 1), W(0)]).fullMatrix()
-        scale = np.outer(*2 * [np.sqrt(np.diag(expected))])
-        np.testing.assert_allclose(marginal.pairs[i] / scale, expected / scale, atol=1e-6)
-    for j, found in enumerate(marginal.markers):
-        np.testing.assert_allclose(found, tree.marginalCovariance(L(j)), rtol=1e-5,
-                                   atol=1e-6 * found.max())
-    for k, found in enumerate(marginal.antennas):
-        np.testing.assert_allclose(found, tree.marginalCovariance(A(k)), rtol=1e-5, atol=1e-9)
-    np.testing.assert_allclose(marginal.w, tree.marginalCovariance(W(0)), rtol=1e-5, atol=1e-7)
-
-
 def test_an_error_of_one_sigma_costs_one_half():
     """A sighting in vehicle axes with error e and covariance C costs e^T C^-1 e / 2."""
     rng = np.random.default_rng(1)
@@ -246,7 +227,8 @@ def test_an_error_of_one_sigma_costs_one_half():
         m = measure(dataset)
         state = state_from_arrays(m, np.zeros((1, 3)), [z + direction], np.zeros((0, 2)),
                                   np.zeros(3))
-        assert np.isclose(build(m, "arc", Noise()).error(state), expected, rtol=1e-9)
+        assert np.isclose(NormalEquations(build(m, "arc", Noise()), state).error, expected,
+                          rtol=1e-9)
 
 
 def test_two_poses_and_one_marker_by_hand():
@@ -445,51 +427,6 @@ def test_open_paths_are_solved(shape):
     assert np.mean(values) < nees_band(3, probability=0.999)[1]
 
 
-def test_where_cholesky_fails_qr_gives_the_same_solution(monkeypatch):
-    dataset, _ = simulate("short", seed=4)
-    fit = fit_from_odometry(measure(dataset.without("uwb").first(400)), 1e-3)
-    poses = fit.state.poses + [0.01, 0, 0]
-    start = state_from_poses(fit.problem.measurements, poses, np.zeros((len(poses), 3, 3)))
-    expected = optimize(fit.problem, start).state
-
-    class Failing:
-        """A linearised graph whose Cholesky decomposition fails."""
-
-        def __init__(self, graph):
-            self.graph = graph
-
-        def eliminateMultifrontal(self, ordering):             # noqa: N802, GTSAM's name
-            raise RuntimeError("Indeterminate linear system")
-
-        def __getattr__(self, name):
-            return getattr(self.graph, name)
-
-    linear = optimizer.linearize
-    monkeypatch.setattr(optimizer, "linearize", lambda *arguments: Failing(linear(*arguments)))
-    np.testing.assert_allclose(optimize(fit.problem, start).state.poses, expected.poses, atol=1e-8)
-
-
-def test_the_normal_equations_are_those_of_gtsams_linear_graph():
-    """Solution and log determinant, for the noise of the problem and for another one."""
-    dataset, _ = simulate("short", seed=4, mislabelled=0.02, late_ranges=0.2)
-    fit = fit_from_odometry(measure(dataset.first(600)), 1e-3)
-    measured = replace(fit.problem.measured, range_kernel=None)
-    problem = replace(fit.problem, measured=measured, noise=Noise(2e-3, 1.5, 0.7))
-    equations = NormalEquations(replace(problem, noise=Noise(1e-3)), fit.state)
-    delta, found = equations.solve(problem.noise)
-    linear = linearize(problem, fit.state)
-    tree = linear.eliminateMultifrontal()
-    solution, m = tree.optimize(), problem.measurements
-    for i in (0, 7, len(m.frame) - 1):
-        np.testing.assert_allclose(delta[equations.rows(np.array([i]), 3)[0]], solution.at(X(i)),
-                                   rtol=1e-5, atol=1e-8)      # both square the condition number
-    S = 3 * np.count_nonzero(measured.sighting_weight)
-    expected = -linear.error(solution) - tree.logDeterminant() \
-        - np.sum(np.linalg.slogdet(problem.odometry.noise(2e-3))[1]) / 2 \
-        - S * np.log(1.5) - np.count_nonzero(measured.range_weight) * np.log(0.7)
-    assert np.isclose(found, expected, atol=1e-6)
-
-
 def test_an_undetermined_variable_is_named_as_in_the_files():
     dataset, _ = simulate("short", seed=4)
     problem = fit_from_odometry(measure(dataset.first(200)), 1e-3).problem
@@ -497,7 +434,7 @@ def test_an_undetermined_variable_is_named_as_in_the_files():
     message = "Indeterminate linear system detected while working near variable\n1 (Symbol: {})."
     for symbol, name in (("l2", f"the pose of marker {marker}"), ("w0", "the wheel parameters"),
                          ("a1", f"the position of antenna {antenna}"), ("x0", "pose 1")):
-        assert optimizer._variable(problem.measurements, message.format(symbol)) == name
+        assert gtsam_graph._variable(problem.measurements, message.format(symbol)) == name
 
 
 def test_headings_are_continuous_where_frames_are_rounds_apart():

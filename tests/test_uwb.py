@@ -21,12 +21,15 @@ from slamlib.slam.linear_factors import range_factors
 from slamlib.slam.measurement_factors import MeasurementFactors
 from slamlib.slam.measurements import measure
 from slamlib.slam.noise import Noise
+from slamlib.slam.normal_equations import NormalEquations
 from slamlib.slam.problem import build
 from slamlib.slam.state import state_from_arrays
 from slamlib.slam.trilateration import (
     GUESS_PRIOR_SIGMA,
     KERNEL_SCALE,
     AntennaRanges,
+    _cost,
+    ranges_by_antenna,
     second_moment,
     trilaterate,
 )
@@ -108,8 +111,8 @@ def test_an_error_of_one_sigma_costs_one_half():
     state = state_from_arrays(m, poses[m.frame], np.zeros((0, 3)), np.array([[3.0, 4.0]]),
                               np.zeros(3))
     off = replace(m, ranges=replace(m.ranges, distance=m.ranges.distance + m.ranges.sigma))
-    assert build(m, "arc", Noise()).graph.error(state.values) < 1e-12
-    cost = build(off, "arc", Noise()).graph.error(state.values)
+    assert NormalEquations(build(m, "arc", Noise()), state).error < 1e-12
+    cost = NormalEquations(build(off, "arc", Noise()), state).error
     assert np.isclose(cost, len(off.ranges.row) / 2)
 
 
@@ -366,6 +369,26 @@ def test_problem_4_reports_the_down_weighted_ranges():
     assert solution.title == "SLAM: odometry + ArUco + UWB"
     assert solution.uwb_map[1].shape == (4, 2)
     assert problem4(dataset.without("aruco")).aruco_map is None
+
+
+def test_places_are_minima_of_the_cost():
+    """At places from many starts the cost rises in all directions; the first is the lowest."""
+    dataset, truth = simulate("short", seed=7, late_ranges=0.2)
+    m = measure(dataset.first(500))
+    for ranges in ranges_by_antenna(m, truth.poses[m.frame], np.zeros((len(m.frame), 3, 3))):
+        places, costs = trilaterate(ranges)
+        assert costs[0] == 0 and (np.diff(costs) >= 0).all()
+        value, gradient, hessian = _cost(ranges, places)
+        np.testing.assert_allclose(gradient, 0, atol=1e-4)
+        assert (np.linalg.eigvalsh(hessian) > 0).all()
+        elsewhere = places[:1] + [0.3, -0.2]
+        _, gradient, hessian = _cost(ranges, elsewhere)
+        for found, which in ((gradient, 0), (hessian, 1)):
+            numeric = central_differences(
+                lambda place, of=ranges, which=which: _cost(of, place[None])[which][0],
+                elsewhere[0])
+            np.testing.assert_allclose(found[0], np.reshape(numeric, found[0].shape), rtol=1e-5,
+                                       atol=1e-4)
 
 
 def test_calibrated_ranges_have_derivatives_of_central_differences():

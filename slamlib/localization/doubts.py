@@ -16,7 +16,6 @@ are the same A. Ranges to antennas tell it where the antennas' guessed places ar
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import chdtri
 
 from slamlib import increments, se2
 from slamlib.doubt import Doubt
@@ -27,12 +26,14 @@ from slamlib.sightings import GATE, MAX_HEADING_SIGMA, sightings_by_frame
 GENEROUS_SLIP = 1e-2      # sqrt(m), slip of the wheels that explains a difference
 GENEROUS_WHEEL = 0.03     # relative standard deviation of the wheel parameters, likewise
 SPAN = 1.0                # m, distance over which increments are compared
+MANY_POSES = 200_000      # of a longer drive, the first ones are looked at
 MAX_FRAMES = 20           # between the poses of an increment
 MIN_INCREMENTS = 10       # fewer of them decide nothing
 MOVING = 5.0              # sigmas of distance or turn, by markers or wheels, from no motion
 DECISIVE = 10.0           # log odds by which a hypothesis explains the increments better
 MOST = 0.7                # share of the increments that agree with an accepted hypothesis
-AGREEMENT = chdtri(3, 0.05)    # squared Mahalanobis distance of increments that agree
+AGREEMENT = 7.8147             # squared Mahalanobis distance of increments that agree: the 95 %
+                               # quantile of chi-squared with 3 degrees of freedom
 CONTRADICTING = 4.0       # standard errors of the mean agreement of headings and positions below 0
 BETTER_FIT = 3.0          # ratio of the ranges' median residuals that decides between two paths
 
@@ -104,6 +105,7 @@ def drive_doubts(dataset):
     Kinds are units, wheels-swapped, wheels-reversed, camera-mirrored, camera-turned and odometry.
     At most one flaw of sightings and counts is named, with all that explains it.
     """
+    dataset = dataset.first(MANY_POSES)
     ranges, sightings = range_units(dataset), sightings_by_frame(dataset.aruco)
     if len(sightings.frame) <= MIN_INCREMENTS:
         return ranges

@@ -18,16 +18,20 @@ view are dropped, and new ones are added with covariance C_j. Without markers th
 first-order propagation of odometry; with uninformative odometry and one marker it is `localize`.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from slamlib import increments, se2
-from slamlib.increments import SLIP_BOUNDS, log_slip_prior
+from slamlib.increments import SLIP_BOUNDS, SLIP_FACTOR, TYPICAL_SLIP, log_slip_prior
+from slamlib.localization.marker_increments import common_sightings
 from slamlib.sightings import GATE, sightings_by_frame
 
 SLIP_FRAMES = 500            # number of frames, the first ones, from which the slip is learned
+WHEEL_FRAMES = 5000          # the same, of the wheels at which the odometry is linearised
+AT_ONCE = 1000               # frames between which poses are computed together: these stay in cache
+LOG_TOLERANCE = 0.05         # of the logarithm of the slip
 
 
 @dataclass(frozen=True)
@@ -55,17 +59,18 @@ class _FilterInput:
     by_w: np.ndarray             # (f-1, 3, 3) dDelta/dw
     rounding: np.ndarray         # (f-1, 3, 3) Q without slip
     slipping: np.ndarray         # (f-1, 3, 3) what a slip of 1 sqrt(m) adds to Q
-    frames: list                 # of f tuples: marker ids (m,), z (m, 3) and C (m, 3, 3)
+    frames: list                 # of f tuples: z (m, 3) and C (m, 3, 3) of a frame's sightings, and
+                                 # rows of common markers, in the frame before and in this one
 
 
-@dataclass(frozen=True)
+@dataclass
 class _State:
-    """The filter after a frame with m markers."""
+    """The filter after a frame with m sightings; rejected markers are not in the state."""
 
     x: np.ndarray                # (6,) pose X and w - w_0
-    ids: np.ndarray              # (m,) marker ids
-    M: np.ndarray                # (m, 3) markers in the frame
-    P: np.ndarray                # (6 + 3m, 6 + 3m) covariance of x and M
+    M: np.ndarray                # (k, 3) markers in the frame
+    P: np.ndarray                # (6 + 3k, 6 + 3k) covariance of x and M
+    place: np.ndarray            # (m,) row in M of each sighting's marker, -1 if rejected
     log_likelihood: float = 0.0  # of the innovations so far, up to a constant
     rejected: int = 0            # number of sightings so far beyond the gate
 
@@ -79,113 +84,171 @@ def fuse(dataset, slip=None, model="arc"):
     """
     given = _filter_input(dataset, model, dataset.vehicle)
     if slip is None:
-        first = replace(given, frames=given.frames[:SLIP_FRAMES])
-        best = minimize_scalar(
-            lambda s: -_filter(first, np.exp(s))[2].log_likelihood - log_slip_prior(s),
-            bounds=np.log(SLIP_BOUNDS), method="bounded", options={"xatol": 0.1})
-        slip = float(np.exp(best.x))
-    wheel = given.vehicle.wheel + _filter(given, slip)[0][-1, 3:]
+        slip = _likeliest_slip(replace(given, frames=given.frames[:SLIP_FRAMES]))
+    first = replace(given, frames=given.frames[:WHEEL_FRAMES])
+    wheel = given.vehicle.wheel + _filter(first, slip)[0][-1, 3:]
     given = _filter_input(dataset, model, dataset.vehicle.with_wheel(wheel))    # linearised again
     return _between_frames(given, slip, *_filter(given, slip))
+
+
+def _likeliest_slip(given):
+    """Slip in sqrt(m) of greatest posterior density, by parabolas over the logarithm of slip.
+
+    The first three points are the median of the prior and one standard deviation to both sides.
+    """
+    def density(log_slip):
+        return _filter(given, np.exp(log_slip))[2].log_likelihood + log_slip_prior(log_slip)
+
+    step = np.log(SLIP_FACTOR)
+    points = {each: density(each) for each in np.log(TYPICAL_SLIP) + step * np.arange(-1, 2)}
+    while True:
+        best = max(points, key=points.get)
+        below, above = (min((each for each in points if side * (each - best) > 0),
+                            key=lambda each: abs(each - best), default=None) for side in (-1, 1))
+        if below is None or above is None:                     # the maximum is further outside
+            vertex = np.clip(best + (step if above is None else -step), *np.log(SLIP_BOUNDS))
+        else:
+            slopes = [(points[each] - points[best]) / (each - best) for each in (below, above)]
+            vertex = (below + best) / 2 - slopes[0] * (above - below) / 2 / (slopes[1] - slopes[0])
+        if abs(vertex - best) < LOG_TOLERANCE:
+            return float(np.exp(vertex))
+        points[vertex] = density(vertex)
 
 
 def _filter_input(dataset, model, vehicle):
     """The _FilterInput with odometry linearised at the wheel parameters of this vehicle."""
     ticks, sightings = dataset.ticks, sightings_by_frame(dataset.aruco, extra_frames=[0])
     start, end = sightings.frame[:-1], sightings.frame[1:]
-    splits = np.searchsorted(sightings.row, np.arange(1, len(sightings.frame)))
-    seen = (np.split(each, splits) for each in (sightings.marker, sightings.z, sightings.C))
+    begins = np.searchsorted(sightings.row, np.arange(len(sightings.frame)))
+    pair, first, second = common_sightings(sightings.row, sightings.marker)
+    splits = np.searchsorted(pair, np.arange(len(start)))
+    seen = (np.split(each, begins[1:]) for each in (sightings.z, sightings.C))
+    common = (np.split(rows, splits) for rows in (first - begins[pair], second - begins[pair + 1]))
     increment, by_w = increments.between_poses(ticks, vehicle, start, end, model)
     rounding, slipping = increments.noise_in_drive(ticks, vehicle, start, end)
     return _FilterInput(
         dataset=dataset, model=model, vehicle=vehicle, pose=sightings.frame, increment=increment,
-        by_w=by_w, rounding=rounding, slipping=slipping, frames=list(zip(*seen, strict=True)))
+        by_w=by_w, rounding=rounding, slipping=slipping,
+        frames=list(zip(*seen, *common, strict=True)))
 
 
 def _filter(given, slip):
     """x (f, 6) and its covariances (f, 6, 6) after every frame, and the last _State."""
     vehicle = given.dataset.vehicle
     state = _State(x=np.append(np.zeros(3), vehicle.wheel - given.vehicle.wheel),
-                   ids=np.zeros(0, int), M=np.zeros((0, 3)),
+                   M=np.zeros((0, 3)), place=np.zeros(0, int),
                    P=np.diag([0.0, 0.0, vehicle.sigma_heading, *vehicle.sigma_wheel])**2)
     Q, x, covariances = given.rounding + slip**2 * given.slipping, [], []
     for k, frame in enumerate(given.frames):
         if k > 0:
-            state = _predict(state, given.increment[k - 1], given.by_w[k - 1], Q[k - 1])
-        state = _update(state, *frame)
+            _predict(state, given.increment[k - 1], given.by_w[k - 1], Q[k - 1])
+        _update(state, *frame)
         x.append(state.x)
         covariances.append(state.P[:6, :6].copy())
     return np.array(x), np.array(covariances), state
 
 
 def _predict(state, increment, by_w, Q):
-    """The _State after one odometry increment."""
+    """Move a _State by one odometry increment.
+
+    The derivatives are those of `se2.compose` and `se2.between`, in place: the arrays of one frame
+    are so small that calls take longer than arithmetic.
+    """
     delta = increment + by_w @ state.x[3:]
-    A, B = se2.compose_jacobians(state.x[:3], delta)
-    by_delta, by_marker = se2.between_jacobians(delta, state.M)
+    x, y, heading = state.x[:3].tolist()
+    turned, back = _rotation(heading), _rotation(-delta[2])
+    pose = state.x[:3] + turned @ delta
+    state.M = (state.M - delta) @ back.T
     F, L = np.eye(len(state.P)), np.zeros((len(state.P), 3))
-    F[:3, :3] = A
-    L[:3], L[6:] = B, by_delta.reshape(-1, 3)
+    F[0, 2], F[1, 2] = y - pose[1], pose[0] - x
+    L[:3] = turned
+    L[6:] = np.tile(-back, (len(state.M), 1))
+    L[6::3, 2], L[7::3, 2] = state.M[:, 1], -state.M[:, 0]
     F[:, 3:6] += L @ by_w
     rows = 6 + np.arange(3 * len(state.M)).reshape(-1, 3)
-    F[rows[:, :, None], rows[:, None, :]] = by_marker
-    return replace(state, x=np.append(se2.compose(state.x[:3], delta), state.x[3:]),
-                   M=se2.between(delta, state.M), P=F @ state.P @ F.T + L @ Q @ L.T)
+    F[rows[:, :, None], rows[:, None, :]] = back
+    state.x, state.P = np.concatenate([pose, state.x[3:]]), F @ state.P @ F.T + L @ Q @ L.T
 
 
-def _update(state, ids, z, C):
-    """The _State after the sightings of a frame: marker ids (m,), z (m, 3) and C (m, 3, 3)."""
-    _, old, new = np.intersect1d(state.ids, ids, assume_unique=True, return_indices=True)
+def _rotation(angle):
+    """The matrix (3, 3) that turns the position of [x, y, heading] by an angle in rad."""
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _update(state, z, C, before, now):
+    """Correct a _State by a frame's sightings z (m, 3) and C (m, 3, 3), as in `_FilterInput`."""
+    known = state.place[before] >= 0
+    old, new = state.place[before[known]], now[known]
     v = z[new] - state.M[old]
-    v[:, 2] = se2.wrap(v[:, 2])
+    v[:, 2] = (v[:, 2] + np.pi) % (2 * np.pi) - np.pi
     rows = 6 + 3 * old[:, None] + np.arange(3)
     S = state.P[rows[:, :, None], rows[:, None, :]] + C[new]            # of each sighting alone
-    accepted = np.einsum("ni,ni->n", v, np.linalg.solve(S, v[..., None])[..., 0]) < GATE
-    # A rejected sighting has the density at the gate, so that rejections do not favour a slip.
-    rejected = int(np.count_nonzero(~accepted))
-    penalty = rejected * GATE / 2 + np.sum(np.linalg.slogdet(S[~accepted])[1]) / 2
-    state = replace(state, log_likelihood=state.log_likelihood - penalty,
-                    rejected=state.rejected + rejected)
-    if accepted.any():
-        state = _correct(state, rows[accepted], v[accepted].ravel(), C[new[accepted]])
-    added, kept = np.setdiff1d(np.arange(len(ids)), new), old[accepted]
-    rows = np.append(np.arange(6), rows[accepted])
-    P = np.zeros(2 * [len(rows) + 3 * len(added)])
+    accepted = (v * np.linalg.solve(S, v[..., None])[..., 0]).sum(axis=1) < GATE
+    if not accepted.all():
+        # A rejected sighting has the density at the gate, so that rejections do not favour a slip.
+        rejected = int(np.count_nonzero(~accepted))
+        state.log_likelihood -= rejected * GATE / 2 \
+            + np.sum(np.linalg.slogdet(S[~accepted])[1]) / 2
+        state.rejected += rejected
+        old, rows = old[accepted], rows[accepted]
+    if len(rows):
+        _correct(state, rows.ravel(), v[accepted].ravel(), C[new[accepted]])
+    added = np.ones(len(z), bool)
+    added[new] = False
+    kept, rows = len(old), np.concatenate([np.arange(6), rows.ravel()])
+    P = np.zeros(2 * [len(rows) + 3 * np.count_nonzero(added)])
     P[:len(rows), :len(rows)] = state.P[rows[:, None], rows]
-    rows = len(rows) + np.arange(3 * len(added)).reshape(-1, 3)
+    rows = len(rows) + np.arange(len(P) - len(rows)).reshape(-1, 3)
     P[rows[:, :, None], rows[:, None, :]] = C[added]
-    return replace(state, ids=np.append(state.ids[kept], ids[added]), P=P,
-                   M=np.concatenate([state.M[kept], z[added]]))
+    state.P, state.M = P, np.concatenate([state.M[old], z[added]])
+    state.place = np.full(len(z), -1)
+    state.place[new[accepted]] = np.arange(kept)
+    state.place[added] = kept + np.arange(len(rows))
 
 
 def _correct(state, rows, v, C):
-    """The _State after the Kalman update with innovations v (3m,) of the rows (m, 3) of P."""
-    S = state.P[rows.reshape(-1, 1), rows.ravel()]
+    """The Kalman update of a _State with innovations v (3m,) of these rows (3m,) of P."""
+    S, HP = state.P[rows[:, None], rows], state.P[rows]
     block = np.arange(len(v)).reshape(-1, 3)
     S[block[:, :, None], block[:, None, :]] += C
-    HP = state.P[rows.ravel()]
-    K = np.linalg.solve(S, HP).T
-    change, P = K @ v, state.P - K @ HP
-    gained = -(v @ np.linalg.solve(S, v) + np.linalg.slogdet(S)[1]) / 2
-    return replace(state, x=state.x + change[:6], M=state.M + change[6:].reshape(-1, 3),
-                   P=(P + P.T) / 2, log_likelihood=state.log_likelihood + gained)
+    solved = np.linalg.solve(S, np.column_stack([HP, v]))
+    change, P = HP.T @ solved[:, -1], state.P - HP.T @ solved[:, :-1]
+    state.x, state.M = state.x + change[:6], state.M + change[6:].reshape(-1, 3)
+    state.P = (P + P.T) / 2
+    state.log_likelihood -= (v @ solved[:, -1] + np.linalg.slogdet(S)[1]) / 2
 
 
 def _between_frames(given, slip, x, covariances, state):
     """The Fusion: every pose of the encoder file by odometry from the last frame before it."""
-    ticks, vehicle = given.dataset.ticks, given.vehicle
-    pose = np.arange(len(ticks))
-    last = np.searchsorted(given.pose, pose, side="right") - 1
-    start = given.pose[last]
-    increment, by_w = increments.between_poses(ticks, vehicle, start, pose, given.model)
-    rounding, slipping = increments.noise_in_drive(ticks, vehicle, start, pose)
+    count, vehicle = len(given.dataset.ticks), given.vehicle
+    found = [_section(given, slip, x[rows], covariances[rows], given.pose[rows], end)
+             for rows, end in _sections(given.pose, count)]
+    poses, each = (np.concatenate(part) for part in zip(*found))
+    repeated = len(given.dataset.aruco.pose) - sum(len(z) for z, *_ in given.frames)
+    return Fusion(
+        poses=poses, covariances=each, measured=given.pose, rejected=state.rejected + repeated,
+        slip=slip, wheel=vehicle.wheel + x[-1, 3:], wheel_covariance=covariances[-1, 3:, 3:])
+
+
+def _sections(frame, count):
+    """Slices of AT_ONCE frames, and the pose at which the next one begins, of `count` poses."""
+    for first in range(0, len(frame), AT_ONCE):
+        end = first + AT_ONCE
+        yield slice(first, end), frame[end] if end < len(frame) else count
+
+
+def _section(given, slip, x, covariances, frame, end):
+    """Poses and covariances from the first of some frames to the pose before `end`."""
+    ticks = given.dataset.ticks
+    pose = np.arange(frame[0], end)
+    last = np.searchsorted(frame, pose, side="right") - 1
+    args = ticks[frame[0]:end], given.vehicle, frame[last] - frame[0], pose - frame[0]
+    increment, by_w = increments.between_poses(*args, given.model)
+    rounding, slipping = increments.noise_in_drive(*args, steps=len(ticks) - 1)
     Q = rounding + slip**2 * slipping
     delta = increment + np.einsum("nij,nj->ni", by_w, x[last, 3:])
     A, B = se2.compose_jacobians(x[last, :3], delta)
     F = np.concatenate([A, B @ by_w], axis=2)
-    repeated = len(given.dataset.aruco.pose) - sum(len(ids) for ids, _, _ in given.frames)
-    return Fusion(
-        poses=se2.compose(x[last, :3], delta),
-        covariances=F @ covariances[last] @ np.swapaxes(F, 1, 2) + B @ Q @ np.swapaxes(B, 1, 2),
-        measured=given.pose, rejected=state.rejected + repeated, slip=slip,
-        wheel=vehicle.wheel + x[-1, 3:], wheel_covariance=covariances[-1, 3:, 3:])
+    return (se2.compose(x[last, :3], delta),
+            F @ covariances[last] @ np.swapaxes(F, 1, 2) + B @ Q @ np.swapaxes(B, 1, 2))

@@ -11,35 +11,97 @@ all increments, and consecutive marker increments share sightings. `fused.py` co
 
 import numpy as np
 
-from slamlib import odometry, se2
+from slamlib import increments, odometry, se2
 from slamlib.localization.fused import Fusion
 from slamlib.localization.marker_increments import consecutive_increments
 from slamlib.sightings import sightings_by_frame
 
 
-def fuse_increments(dataset, propagation=odometry.equation2):
+def equation2_from(ticks, vehicle, start, poses, covariances):
+    """Equation 2 restarted at some poses: `odometry.equation2` of every part between them.
+
+    Parameters
+    ----------
+    ticks : (n, 2); vehicle : Vehicle; start : (f,) poses from 0, ascending, the first one is 0.
+    poses, covariances : (f, 3) and (f, 3, 3) at `start`, in world axes.
+
+    Returns
+    -------
+    (n, 3) and (n, 3, 3), each pose from the last `start` before it; pose 0 as given.
+    """
+    driven = odometry.dead_reckoning(ticks, vehicle)
+    part = np.maximum(np.searchsorted(start, np.arange(len(ticks))) - 1, 0)
+    turned = (poses[:, 2] - driven[start, 2])[part]              # from the axes of `driven`
+    J = odometry.step_jacobian(ticks, vehicle, driven[:-1, 2] + turned[1:])
+    integral = np.zeros((len(ticks), 3, 4))                      # of all parts in their sum
+    np.cumsum(J[:, :, :3] * vehicle.sigma_wheel, axis=0, out=integral[1:, :, :3])
+    by_wheels = integral[:-1, 2, :3] - integral[start[part[1:]], 2, :3]
+    sigma_heading = np.sqrt(covariances[part[1:], 2, 2] + np.sum(by_wheels**2, axis=-1))
+    np.cumsum(J[:, :, 3] * sigma_heading[:, None], axis=0, out=integral[1:, :, 3])
+    integral -= integral[start[part]]
+    return (_from_start(driven, start, part, poses),
+            covariances[part] + integral @ np.swapaxes(integral, 1, 2))
+
+
+def first_order_from(ticks, vehicle, start, poses, covariances):
+    """The same by `odometry.first_order`, which includes all correlations."""
+    part = np.maximum(np.searchsorted(start, np.arange(len(ticks))) - 1, 0)
+    delta, by_w = increments.between_poses(ticks, vehicle, start[part], np.arange(len(ticks)))
+    A, B = se2.compose_jacobians(poses[part], delta)
+    G = B @ by_w * vehicle.sigma_wheel
+    return (se2.compose(poses[part], delta),
+            A @ covariances[part] @ np.swapaxes(A, 1, 2) + G @ np.swapaxes(G, 1, 2))
+
+
+def _from_start(driven, start, part, poses):
+    """Poses (n, 3) of odometry, `driven` (n, 3), continued from `poses` (f, 3) at `start` (f,)."""
+    return se2.compose(poses[part], se2.between(driven[start[part]], driven))
+
+
+def fuse_increments(dataset, propagation=equation2_from):
     """Fusion of a Dataset by independent increments; where markers give none, odometry alone.
 
-    `propagation` is `odometry.equation2`, or `odometry.first_order` to include all correlations.
+    `propagation` is `equation2_from`, or `first_order_from` to include all correlations.
     """
     ticks, vehicle = dataset.ticks, dataset.vehicle
     sightings = sightings_by_frame(dataset.aruco, extra_frames=[0])
-    frame, increments = sightings.frame, consecutive_increments(sightings)
-    poses, covariances = [np.zeros((1, 3))], [np.diag([0, 0, vehicle.sigma_heading])[None]**2]
-    for k, (start, end) in enumerate(zip(frame, np.r_[frame[1:], len(ticks) - 1], strict=True)):
-        driven, pose, covariance = ticks[start:end + 1], poses[-1][-1], covariances[-1][-1]
-        path, path_covariance = propagation(driven, vehicle, pose, covariance)
-        if k < len(frame) - 1 and increments.usable[k]:
-            by_odometry, C_odometry = propagation(driven, vehicle, np.zeros(3), np.zeros((3, 3)))
-            difference = increments.increment[k] - by_odometry[-1]
-            difference[2] = se2.wrap(difference[2])
-            gain = C_odometry[-1] @ np.linalg.inv(C_odometry[-1] + increments.covariance[k])
-            delta, C = by_odometry[-1] + gain @ difference, gain @ increments.covariance[k]
-            A, B = se2.compose_jacobians(pose, delta)
-            path[-1] = se2.compose(pose, delta)
-            path_covariance[-1] = A @ covariance @ A.T + B @ (C + C.T) / 2 @ B.T
-        poses.append(path[1:])
-        covariances.append(path_covariance[1:])
-    used = np.union1d(*(r[increments.accepted] for r in (increments.first, increments.second)))
-    return Fusion(poses=np.concatenate(poses), covariances=np.concatenate(covariances),
-                  measured=frame, rejected=len(dataset.aruco.pose) - len(used))
+    frame, found = sightings.frame, consecutive_increments(sightings)
+    delta, C = _fused_increments(dataset, frame, found, propagation)
+    heading = odometry.cumulative(delta[:, 2])
+    turned = (se2.rotation(heading[:-1]) @ delta[:, :2, None])[..., 0]
+    poses = np.column_stack([odometry.cumulative(turned), heading])
+    A, B = se2.compose_jacobians(poses[:-1], delta)
+    noise, covariances = B @ C @ np.swapaxes(B, 1, 2), np.zeros((len(frame), 3, 3))
+    covariances[0, 2, 2] = vehicle.sigma_heading**2
+    for k, (start, end) in enumerate(zip(frame, frame[1:])):
+        if found.usable[k]:
+            covariances[k + 1] = A[k] @ covariances[k] @ A[k].T + noise[k]
+        else:
+            covariances[k + 1] = propagation(
+                ticks[start:end + 1], vehicle, np.zeros(1, int), poses[k:k + 1],
+                covariances[k:k + 1])[1][-1]
+    path, path_covariances = propagation(ticks, vehicle, frame, poses, covariances)
+    path[frame], path_covariances[frame] = poses, covariances
+    used = np.union1d(*(r[found.accepted] for r in (found.first, found.second)))
+    return Fusion(poses=path, covariances=path_covariances, measured=frame,
+                  rejected=len(dataset.aruco.pose) - len(used))
+
+
+def _fused_increments(dataset, frame, found, propagation):
+    """Increments (f-1, 3) between the frames by odometry and markers, and covariances (f-1, 3, 3).
+
+    `found` are the MarkerIncrements between them. Where they are not usable, the increments are
+    those by odometry, and the covariances NaN.
+    """
+    zero = np.zeros((len(frame), 3))
+    by_odometry, C_odometry = (each[frame[1:]] for each in propagation(
+        dataset.ticks, dataset.vehicle, frame, zero, np.zeros((len(frame), 3, 3))))
+    difference = found.increment - by_odometry
+    difference[:, 2] = se2.wrap(difference[:, 2])
+    C = np.full_like(C_odometry, np.nan)
+    use = found.usable
+    gain = C_odometry[use] @ np.linalg.inv(C_odometry[use] + found.covariance[use])
+    C[use] = gain @ found.covariance[use]
+    fused = by_odometry.copy()
+    fused[use] += (gain @ difference[use, :, None])[..., 0]
+    return fused, (C + np.swapaxes(C, 1, 2)) / 2

@@ -15,6 +15,7 @@ from slamlib import se2
 from slamlib.sightings import GATE, MAX_HEADING_SIGMA
 
 ITERATIONS = 8, 6         # numbers of Gauss-Newton iterations: Cauchy weights, then the gate
+SMALL_STEP = 1e-10        # m and rad, of the iteration that is the last one
 SPEED_RATIO = 3.0         # dimensionless, largest plausible speed in units of the usual speed
 POINT_PAIRS = 60          # pairs of points that give hypotheses, of every pair of frames
 AT_ONCE = 20_000          # sightings whose residuals are computed together
@@ -99,16 +100,20 @@ def robust_increments(z, C, pair, first, second, count):
     """
     z1, C1, z2, C2 = z[first], C[first], z[second], C[second]
     increment = _best_hypothesis(z1, C1, z2, C2, pair, count)
-    for iteration in range(sum(ITERATIONS)):
-        J_delta, J_second = se2.compose_jacobians(increment[pair], z2)
-        r, information, squared = _residuals(increment[pair], J_second, z1, C1, z2, C2)
-        weight = 1 / (1 + squared / GATE) if iteration < ITERATIONS[0] else squared < GATE
-        gain = np.swapaxes(J_delta, 1, 2) @ information * weight[:, None, None]
-        H, gradient = np.zeros((count, 3, 3)), np.zeros((count, 3))
-        np.add.at(H, pair, gain @ J_delta)
-        np.add.at(gradient, pair, np.einsum("nij,nj->ni", gain, r))
-        covariance = _inverse_where_regular(H)
-        increment = increment + np.einsum("nij,nj->ni", covariance, gradient)
+    for gated, iterations in enumerate(ITERATIONS):
+        for _ in range(iterations):
+            J_delta, J_second = se2.compose_jacobians(increment[pair], z2)
+            r, information, squared = _residuals(increment[pair], J_second, z1, C1, z2, C2)
+            weight = squared < GATE if gated else 1 / (1 + squared / GATE)
+            gain = np.swapaxes(J_delta, 1, 2) @ information * weight[:, None, None]
+            H, gradient = np.zeros((count, 3, 3)), np.zeros((count, 3))
+            np.add.at(H, pair, gain @ J_delta)
+            np.add.at(gradient, pair, np.einsum("nij,nj->ni", gain, r))
+            covariance = _inverse_where_regular(H)
+            step = np.einsum("nij,nj->ni", covariance, gradient)
+            increment = increment + step
+            if not np.nanmax(np.abs(step), initial=0) > SMALL_STEP:
+                break
     increment[:, 2] = se2.wrap(increment[:, 2])
     usable = covariance[:, 2, 2] < MAX_HEADING_SIGMA**2
     D = covariance[pair] @ gain

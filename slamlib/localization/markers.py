@@ -15,8 +15,9 @@ C_M = E C_X E^T + F C F^T + T + T^T. This is the correlated state of Smith, Self
 Estimating Uncertain Spatial Relationships in Robotics, 1990, without what no increment needs again.
 """
 
-from collections import Counter, defaultdict
+from collections import Counter, defaultdict, deque
 from dataclasses import dataclass
+from heapq import nlargest
 
 import numpy as np
 
@@ -26,6 +27,7 @@ from slamlib.localization.marker_increments import consecutive_increments, robus
 from slamlib.sightings import consensus, sightings_by_frame
 
 CANDIDATES = 3     # number of earlier frames that are tried as parent of a frame
+REMEMBERED = 200   # frames that saw a marker, the latest ones, from which candidates are taken
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,8 @@ def _links(sightings, increments, confirmed, root):
     count = len(sightings.frame)
     rows_of = np.split(np.arange(len(sightings.row)),
                        np.searchsorted(sightings.row, np.arange(1, count)))
-    links, seen_in = {}, defaultdict(list)              # marker id: localized frames that saw it
+    # By marker id, the latest localized frames that saw it.
+    links, seen_in = {}, defaultdict(lambda: deque(maxlen=REMEMBERED))
     for f in range(root, count):
         if f > root:
             previous = f - 1 == root or f - 1 in links
@@ -101,7 +104,7 @@ def _relocalize(sightings, confirmed, rows_of, frame, seen_in):
     """
     marker, rows = sightings.marker, rows_of[frame]
     shared = Counter(f for m in marker[rows].tolist() for f in seen_in[m])
-    for f in sorted(shared, key=lambda f: (shared[f], f), reverse=True)[:CANDIDATES]:
+    for f in nlargest(CANDIDATES, shared, key=lambda f: (shared[f], f)):
         _, first, second = np.intersect1d(marker[rows_of[f]], marker[rows], return_indices=True)
         first, second = rows_of[f][first], rows[second]
         found = robust_increments(sightings.z, sightings.C, np.zeros_like(first), first, second, 1)

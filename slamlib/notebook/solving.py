@@ -8,10 +8,11 @@ hold the files to hand in and nothing else, and a cached notebook keeps its reco
 from dataclasses import asdict
 
 from IPython.display import Markdown, display
+from tqdm import tqdm
 
 from slamlib import solve
 from slamlib.doubt import Doubt
-from slamlib.notebook.show import listed, plain, results_folder, say, simulated_drive
+from slamlib.notebook.show import interactive, listed, plain, results_folder, say, simulated_drive
 
 KEY = "slamlib"  # in the metadata of outputs
 RECORDS = {"doubt": Doubt, "failure": solve.Failure}
@@ -36,9 +37,9 @@ def solved(drives, problems, besides=()):
         drives that the chapter leaves out.
     """
     found = {problem: {} for problem in (*besides, *problems)}
-    for drive in drives:
-        for problem in found:
-            _solve(drive, problem, found)
+    pairs = [(drive, problem) for drive in drives for problem in found]
+    for drive, problem in tqdm(pairs, disable=not interactive(), leave=False):
+        _solve(drive, problem, found)
     left = [drive for drive in drives if all(drive.name in found[p] for p in problems)]
     if left and len(left) < len(drives):
         without = [plain(drive.name) for drive in drives if drive not in left]

@@ -5,7 +5,9 @@ import os
 import re
 import shutil
 import sys
+import tempfile
 import time
+from pathlib import Path
 
 import nbformat
 from jupyter_client import AsyncKernelManager
@@ -17,6 +19,7 @@ from nbconvert.preprocessors import CoalesceStreamsPreprocessor
 from tqdm import tqdm
 
 CELL_TIMEOUT = 1800  # s
+POLL = 1.0  # s, between looks at how far the studies are
 
 
 class NotebookError(RuntimeError):
@@ -86,16 +89,30 @@ async def _execute_all(books, environment, results, jobs, finish):
         stage.mkdir(parents=True)
         try:
             async with slots:
-                await _execute(source, book, environment | {"SLAMLIB_RESULTS": str(stage)}, bar)
+                files = {"SLAMLIB_RESULTS": str(stage), "SLAMLIB_PROGRESS": str(told / source.stem)}
+                await _execute(source, book, environment | files, bar)
             finish(source, book, _publish(stage, results))
         finally:
             shutil.rmtree(stage, ignore_errors=True)
 
     total = sum(map(_count_code_cells, books.values()))
-    with tqdm(total=total, unit="cell", leave=False, disable=not sys.stderr.isatty()) as bar:
-        async with asyncio.TaskGroup() as group:
-            for source, book in books.items():
-                group.create_task(run(source, book))
+    with tempfile.TemporaryDirectory() as folder, tqdm(
+            total=total, unit="cell", leave=False, disable=not sys.stderr.isatty()) as bar:
+        told = Path(folder)
+        watching = asyncio.create_task(_watch(told, bar))
+        try:
+            async with asyncio.TaskGroup() as group:
+                for source, book in reversed(books.items()):     # later chapters take longer
+                    group.create_task(run(source, book))
+        finally:
+            watching.cancel()
+
+
+async def _watch(told, bar):
+    """Show on the bar what the notebooks' studies tell in the files of a folder."""
+    while not bar.disable:
+        bar.set_postfix_str(", ".join(file.read_text() for file in sorted(told.iterdir())))
+        await asyncio.sleep(POLL)
 
 
 def _count_code_cells(book):

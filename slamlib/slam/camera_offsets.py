@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from slamlib import se2
-from slamlib.slam.evidence import decomposition
-from slamlib.slam.linear_factors import point_factors, pose_factors
+from slamlib.slam.evidence import consistency
+from slamlib.slam.normal_equations import decomposition
 
 FRAMES = 3                   # to both sides, over which a velocity is averaged
 SMALLEST = 1e-9              # share of its information that the other variables leave to an unknown
@@ -45,17 +45,20 @@ class CameraOffsets:
 def camera_offsets(equations):
     """The CameraOffsets by the NormalEquations at the State that solves a Problem."""
     problem, state = equations.problem, equations.state
-    H, g = equations.information(problem.noise)
-    lu, velocity = decomposition(H), _velocities(problem.measurements, state)
-    sightings = [kind(problem.measured, problem.noise, state)
-                 for kind in (pose_factors, point_factors)]
-    J = [equations.jacobian(factors) for factors in sightings]
+    H, g, *_ = equations.sums(problem.noise, consistency(problem.measured.range_kernel))
+    lu = decomposition(equations.structure.matrix(H))
+    velocity, sightings = _velocities(problem.measurements, state), equations.factors[:2]
 
     def shared(columns):
         """SharedError with columns (m, d, p) for both kinds of sightings."""
         added = [column.reshape(-1, column.shape[2]) for column in columns]
-        own, cross = (sum(t.T @ a for t, a in zip(others, added)) for others in (added, J))
-        gradient = sum(a.T @ f.e.ravel() for a, f in zip(added, sightings))
+        own, gradient = (sum(a.T @ b for a, b in zip(added, others))
+                         for others in (added, [f.e.ravel() for f in sightings]))
+        cross = np.zeros((len(g), own.shape[1]))
+        for f, column, (_, rows) in zip(sightings, columns, problem.measurements.placed[1:]):
+            if len(f.row):
+                np.add.at(cross, rows[f.index],
+                          np.swapaxes(equations.jacobian(f), 1, 2) @ column)
         rest = lu.solve(np.column_stack([cross, g]))
         return _estimate(own, own - cross.T @ rest[:, :-1], gradient - cross.T @ rest[:, -1])
 

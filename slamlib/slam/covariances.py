@@ -1,24 +1,24 @@
 """Stage 7: covariances at the solution: jointly of consecutive frames and w, and of each landmark.
 
-The information matrix of the graph has an arrow's shape. The poses form a chain T, with 3 x 3
-blocks on and beside the diagonal. Landmarks, z and w form a border (B, D) that touches all of it:
+The inverse of the information matrix is dense; only some of its blocks are computed, by nested
+dissection. Every LEAF frames there is a separator. What is connected only to unknowns between two
+separators is eliminated there, which leaves a Schur complement on its front, the unknowns around.
+Two such parts are joined at the separator between them, and so on. With C the information of what
+is eliminated, B that between it and the front, and W = C^-1 B, the way back is
 
-    [[T, B], [B^T, D]]^-1:    border     S = (D - B^T Y)^-1,   Y = T^-1 B,
-                              poses      T^-1 + Y S Y^T,       poses and border  -Y S.
+    Cov(front) = S,    Cov(eliminated, front) = -W S,    Cov(eliminated) = C^-1 + W S W^T
 
-Only the blocks of T^-1 on and beside the diagonal are needed. One forward and one backward sweep
-give them (Kaess and Dellaert, Robotics and Autonomous Systems 57(12), 2009). GTSAM's marginals are
-the same numbers, one query at a time; a test compares them.
+(Kaess and Dellaert, Robotics and Autonomous Systems 57(12), 2009). GTSAM's marginals are the same
+numbers, one query at a time; a test compares them.
 """
 
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_solve_banded, cholesky_banded
-from scipy.sparse import csr_matrix
+from scipy.sparse import csc_array
 
-from slamlib.slam.linear_factors import linear_factors
-from slamlib.slam.measurement_factors import GUESS_PRIOR_SIGMA, WEAK_SIGMA
+LEAF = 12                    # frames between separators
 
 
 @dataclass(frozen=True)
@@ -32,112 +32,145 @@ class Covariances:
     w: np.ndarray            # (3, 3)
 
 
-def covariances(problem, state):
-    """The Covariances of a Problem at the State that solves it."""
-    m = problem.measurements
-    size = np.r_[np.where(m.oriented, 3, 2), np.full(len(m.antenna), 2), 2 * m.calibrated, 3]
-    begin = np.cumsum(size) - size                     # columns of the border
-    prior, antennas = np.zeros(begin[-1] + 3), len(m.marker) + len(m.antenna)
-    for j in problem.measured.unsupported:
-        prior[begin[j]:begin[j] + size[j]] = WEAK_SIGMA**-2
-    prior[begin[len(m.marker)]:begin[antennas]] = GUESS_PRIOR_SIGMA**-2
-    prior[begin[antennas]:] = 1
-    measured = [_of_border(factors, begin, m.calibrated)
-                for factors in linear_factors(problem.measured, problem.noise, state)]
-    _, odometry = problem.odometry_jacobians(state)
-    pairs, border = arrow_inverse(odometry, measured, np.diag(m.origin_sigma**-2.0), prior)
-    blocks = [border[b:b + n, b:b + n] for b, n in zip(begin, size)]
+def covariances(equations, noise):
+    """The Covariances of a Noise by NormalEquations at the State that solves the problem."""
+    m, rows = equations.problem.measurements, equations.structure.rows
+    f, k, a = len(m.frame), len(m.marker), len(m.antenna)
+    frames, w = rows(np.arange(f), 3), rows([m.wheels], 3)
+    pairs = np.concatenate([frames[:-1], frames[1:], np.repeat(w, f - 1, axis=0)], axis=1)
+    landmarks = [rows([f + j], 2 + m.oriented[j])[0] for j in range(k)] \
+        + [*rows(f + k + np.arange(a), 2), w[0]]
+    if m.calibrated:
+        landmarks.append(rows([m.wheels + 1], 2)[0])
+    of_pairs, blocks = selected_inverse(
+        equations.structure.matrix(equations.sums(noise)[0]), frames, pairs, landmarks)
     return Covariances(
-        pairs=pairs, markers=blocks[:len(m.marker)],
-        antennas=np.reshape(blocks[len(m.marker):antennas], (-1, 2, 2)),
-        z=blocks[antennas] if m.calibrated else np.zeros((2, 2)), w=blocks[-1])
+        pairs=of_pairs, markers=blocks[:k], antennas=np.reshape(blocks[k:k + a], (-1, 2, 2)),
+        z=blocks[-1] if m.calibrated else np.zeros((2, 2)), w=blocks[k + a])
 
 
-def _of_border(factors, begin, calibrated):
-    """Frames, columns of the border, and derivatives by pose and border, of LinearFactors."""
-    width = factors.by_landmark.shape[2]
-    columns = [begin[factors.landmark, None] + np.arange(width)]
-    by_border = [factors.by_landmark]
-    if calibrated and factors.by_calibration is not None:
-        columns.append(np.broadcast_to(begin[-2] + np.arange(2), (len(factors.row), 2)))
-        by_border.append(factors.by_calibration)
-    return (factors.row, np.concatenate(columns, axis=1), factors.by_pose,
-            np.concatenate(by_border, axis=2))
-
-
-def arrow_inverse(odometry, measured, pose_prior, border_prior):
-    """Covariances (f-1, 9, 9) of [X_i, X_{i+1}, w], and (c, c) of landmarks, z, then w.
+def selected_inverse(H, frames, pairs, blocks):
+    """Some blocks of the inverse of a sparse information matrix H (n, n) in csc format.
 
     Parameters
     ----------
-    odometry : whitened derivatives by X_i, X_{i+1} and w, each (f-1, 3, 3).
-    measured : for each kind of measurement the frame (m,), the landmark's columns of the border
-        (m, d), and whitened derivatives by pose (m, e, 3) and by landmark (m, e, d).
-    pose_prior, border_prior : information of pose 1 (3, 3), and of the border, a diagonal (c,).
+    frames : (f, 3) rows of consecutive poses. H connects a pose with the next, but no other poses.
+    pairs : (f-1, p) rows of which the blocks are asked for, each connected to a pose and the next.
+    blocks : list of (d,) rows of single variables.
+
+    Returns
+    -------
+    (f-1, p, p), and a list of (d, d).
     """
-    first, second, by_w = odometry
-    count, width = len(first) + 1, len(border_prior)
-    diagonal, beside = np.zeros((count, 3, 3)), _t(first) @ second
-    diagonal[:-1] += _t(first) @ first
-    diagonal[1:] += _t(second) @ second
-    diagonal[0] += pose_prior
-    B, D = np.zeros((count, 3, width)), np.diag(border_prior)
-    for row, columns, by_pose, by_landmark in measured:
-        np.add.at(diagonal, row, _t(by_pose) @ by_pose)
-        np.add.at(B, (row[:, None, None], np.arange(3)[:, None], columns[:, None, :]),
-                  _t(by_pose) @ by_landmark)
-        np.add.at(D, (columns[:, :, None], columns[:, None, :]), _t(by_landmark) @ by_landmark)
-    B[:-1, :, -3:] += _t(first) @ by_w
-    B[1:, :, -3:] += _t(second) @ by_w
-    D[-3:, -3:] += np.sum(_t(by_w) @ by_w, axis=0)
+    graph = _dissection(H, frames)
+    of_pairs = np.empty((len(pairs),) + 2 * pairs.shape[1:])
+    of_blocks, block_at = [None] * len(blocks), np.full(H.shape[0], -1)
+    block_at[[rows[0] for rows in blocks]] = np.arange(len(blocks))
 
-    B = B.reshape(3 * count, width)
-    Y = cho_solve_banded((cholesky_banded(_banded(diagonal, beside), lower=True), True), B)
-    border = np.linalg.inv(D - csr_matrix(B).T @ Y)
-    border = (border + border.T) / 2
-    on, off = _inverse_blocks(diagonal, beside)
-    Y, YS = Y.reshape(count, 3, width), (Y @ border).reshape(count, 3, width)
-    on += YS @ _t(Y)
-    off += YS[:-1] @ _t(Y[1:])
-    return _pairs(on, off, -YS[:, :, -3:], border[-3:, -3:]), border
+    def downward(part, front_covariance):
+        """Fill in what is asked for of a _Part, from the covariance of its front."""
+        cross = -part.W @ front_covariance
+        joint = np.block([[part.inverse - cross @ part.W.T, cross], [cross.T, front_covariance]])
+        with _places(graph.local, part.rows, part.front) as local:
+            if not part.parts:
+                at = local[pairs[part.pairs]]
+                of_pairs[part.pairs] = joint[at[:, :, None], at[:, None, :]]
+            for number in block_at[part.rows][block_at[part.rows] >= 0].tolist():
+                at = local[blocks[number]]
+                of_blocks[number] = joint[at[:, None], at]
+            fronts = [local[each.front] for each in part.parts]
+        for each, at in zip(part.parts, fronts):
+            downward(each, joint[at[:, None], at])
+
+    downward(_eliminated(graph, 0, len(graph.separators) - 1), np.zeros((0, 0)))
+    return of_pairs, of_blocks
 
 
-def _pairs(on, off, with_w, w):
-    """(f-1, 9, 9) of the blocks of poses, of consecutive poses, of poses with w, and of w."""
-    pairs = np.empty((len(off), 9, 9))
-    pairs[:, :3, :3], pairs[:, 3:6, 3:6], pairs[:, 6:, 6:] = on[:-1], on[1:], w
-    pairs[:, :3, 3:6], pairs[:, 3:6, :3] = off, _t(off)
-    pairs[:, :3, 6:], pairs[:, 6:, :3] = with_w[:-1], _t(with_w[:-1])
-    pairs[:, 3:6, 6:], pairs[:, 6:, 3:6] = with_w[1:], _t(with_w[1:])
-    return pairs
+@dataclass
+class _Dissection:
+    """A matrix H (n, n) and how it falls apart."""
+
+    H: csc_array
+    frames: np.ndarray       # (f, 3)
+    separators: np.ndarray   # frames between parts, with -1 and f at the ends
+    first: np.ndarray        # (n,) first frame that a row is connected to, or the row's own
+    last: np.ndarray         # (n,)
+    done: np.ndarray         # (n,) bool, eliminated so far
+    local: np.ndarray        # (n,) scratch, see `_places`
 
 
-def _banded(diagonal, beside):
-    """Lower bands (6, 3 n) of the block tridiagonal matrix, in LAPACK's layout."""
-    n = len(diagonal)
-    bands = np.zeros((6, 3 * n))
-    for i in range(3):
-        for j in range(i + 1):
-            bands[i - j, j::3] = diagonal[:, i, j]
-        for j in range(3):
-            bands[3 + i - j, j:3 * (n - 1):3] = beside[:, j, i]
-    return bands
+def _dissection(H, frames):
+    """The _Dissection with a separator every LEAF frames."""
+    size, count = H.shape[0], len(frames)
+    frame = np.full(size, -1)
+    frame[frames] = np.arange(count)[:, None]
+    of_entries = frame[H.indices]
+    last = np.maximum.reduceat(of_entries, H.indptr[:-1])
+    first = np.minimum.reduceat(np.where(of_entries < 0, count, of_entries), H.indptr[:-1])
+    return _Dissection(
+        H, frames, np.r_[-1, np.arange(LEAF, count - 1, LEAF + 1), count],
+        np.where(frame < 0, first, frame), np.where(frame < 0, last, frame),
+        np.zeros(size, bool), np.full(size, -1))
 
 
-def _inverse_blocks(diagonal, beside):
-    """Blocks on (n, 3, 3) and beside (n-1, 3, 3) the diagonal of the inverse."""
-    n = len(diagonal)
-    pivot = np.empty_like(diagonal)                             # inverse of what elimination leaves
-    pivot[0] = np.linalg.inv(diagonal[0])
-    for i in range(1, n):
-        pivot[i] = np.linalg.inv(diagonal[i] - beside[i - 1].T @ pivot[i - 1] @ beside[i - 1])
-    gain = pivot[:-1] @ beside
-    on, off = pivot.copy(), np.empty_like(beside)
-    for i in range(n - 2, -1, -1):
-        off[i] = -gain[i] @ on[i + 1]
-        on[i] -= off[i] @ gain[i].T
-    return on, off
+@dataclass
+class _Part:
+    """What is between two separators, eliminated."""
+
+    rows: np.ndarray         # (e,) of what is eliminated
+    front: np.ndarray        # (s,) rows of what it is connected to
+    inverse: np.ndarray      # (e, e) C^-1
+    W: np.ndarray            # (e, s)
+    schur: np.ndarray        # (s, s)
+    parts: tuple             # the two _Parts that are joined here, or none
+    pairs: range             # of poses in a part that joins none
 
 
-def _t(matrices):
-    return np.swapaxes(matrices, -1, -2)
+def _eliminated(graph, begin, end):
+    """The _Part between the separators `begin` and `end` of a _Dissection."""
+    low, high, parts = graph.separators[begin], graph.separators[end], ()
+    own, whole = graph.frames[low + 1:high].ravel(), end - begin == len(graph.separators) - 1
+    if end - begin > 1:
+        middle = (begin + end) // 2
+        parts = _eliminated(graph, begin, middle), _eliminated(graph, middle, end)
+        own = graph.frames[graph.separators[middle]]
+    reached = np.unique(np.concatenate(
+        [own, _entries(graph.H, own)[1], *(part.front for part in parts)]))
+    reached = np.flatnonzero(~graph.done) if whole else reached[~graph.done[reached]]
+    inside = whole | (graph.first[reached] > low) & (graph.last[reached] < high)
+    rows, front = reached[inside], reached[~inside]
+    F, e = _information(graph, rows, front, parts), len(rows)
+    inverse = np.linalg.inv(F[:e, :e])
+    W = inverse @ F[:e, e:]
+    graph.done[rows] = True
+    return _Part(rows, front, (inverse + inverse.T) / 2, W, F[e:, e:] - F[:e, e:].T @ W, parts,
+                 range(max(low, 0), min(high, len(graph.frames) - 1)))
+
+
+def _information(graph, rows, front, parts):
+    """Information of `rows` (e,) and `front` (s,) once the `parts` are eliminated."""
+    F = np.zeros(2 * [len(rows) + len(front)])
+    with _places(graph.local, rows, front) as local:
+        row, column, value = _entries(graph.H, rows)
+        inside = local[column] >= 0
+        F[local[row[inside]], local[column[inside]]] = value[inside]
+        for part in parts:
+            at = local[part.front]
+            F[at[:, None], at] += part.schur
+            part.schur = None                                          # frees the memory
+    return F
+
+
+@contextmanager
+def _places(local, rows, front):
+    """`local` (n,) holds the place of every row in a front, otherwise -1."""
+    local[rows], local[front] = np.arange(len(rows)), len(rows) + np.arange(len(front))
+    yield local
+    local[rows] = local[front] = -1
+
+
+def _entries(H, columns):
+    """Column, row and value of all entries in some columns of H, which is symmetric."""
+    begin, count = H.indptr[columns], H.indptr[columns + 1] - H.indptr[columns]
+    at = np.repeat(begin - np.cumsum(count) + count, count) + np.arange(count.sum())
+    return np.repeat(columns, count), H.indices[at], H.data[at]

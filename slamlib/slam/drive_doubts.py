@@ -1,7 +1,6 @@
 """Stage 7: what the solution says against the files: wheels, noise, ranges and sightings."""
 
 import numpy as np
-from scipy.special import chdtri
 
 from slamlib.doubt import Doubt
 from slamlib.slam.noise import BOUNDS
@@ -9,11 +8,12 @@ from slamlib.slam.noise import BOUNDS
 MAX_WHEEL_SIGMAS = 4.0       # of a wheel parameter from what vehicle.toml states
 SMALLEST_SIGMA = 1e-12       # m, of a wheel parameter that studies take as known
 MAX_SLIP = 0.02              # sqrt(m), of wheels that merely slip
-MIN_GAIN = chdtri([1, 3], 5e-4) / 2        # log likelihood, of late sightings and of a place
+MIN_GAIN = 6.0578, 8.8650    # log likelihood, of late sightings and of a place: the 99.95 %
+                             # quantile of chi-squared with 1 and 3 degrees of freedom, halved
 MIN_LATE = 0.5               # poses
 MANY_POSES = 10              # from which on the estimate of late sightings is too small
 MIN_PLACE = (0.005, 0.005, 0.005)            # m, m, rad, of the camera
-MIN_GAIN_RANGES = chdtri(2, 5e-4) / 2        # the same, of the ranges' offset and scale
+MIN_GAIN_RANGES = 7.6009     # the same, of the ranges' offset and scale
 MANY_LATE = 0.1              # share of the ranges with less than half of their weight
 NEARLY = 5.0                 # log likelihood by which one explanation must lead to be the only one
 MAX_FACTOR = 1.5             # of a sigma, more or less, that is reported

@@ -50,3 +50,8 @@ def range_error(r, pose, antenna):
     by_position = -direction @ se2.rotation(pose[:, 2])
     by_pose = np.concatenate([by_position, np.zeros((len(r), 1, 1))], axis=2)
     return distance - r, by_pose, direction
+
+
+def square_root_information(covariance):
+    """Upper triangular U (..., d, d) with U^T U = C^-1, of covariances C, which whitens errors."""
+    return np.swapaxes(np.linalg.cholesky(np.linalg.inv(covariance)), -1, -2)

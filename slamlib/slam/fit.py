@@ -3,9 +3,12 @@
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from slamlib.slam.evidence import NormalEquations, log_evidence
+import numpy as np
+
+from slamlib.slam.evidence import solve
 from slamlib.slam.noise import known_noise
 from slamlib.slam.noise_posterior import NoisePosterior, noise_posterior
+from slamlib.slam.normal_equations import NormalEquations
 from slamlib.slam.odometry_factors import odometry_factors
 from slamlib.slam.optimizer import optimize
 from slamlib.slam.problem import Problem
@@ -13,6 +16,7 @@ from slamlib.slam.robust import accepted, noise_of_scatter
 from slamlib.slam.state import State
 
 MAX_ROUNDS = 6               # of wheels, noise and accepted measurements
+FEW = 1e-3                   # share of the measurements whose change says nothing of the noise
 
 
 @dataclass(frozen=True)
@@ -30,6 +34,11 @@ class Fit:
         return NormalEquations(self.problem, self.state)
 
 
+def solved_by_gtsam(fit):
+    """The Fit whose state GTSAM's optimisation of the same graph ends at, from that of the Fit."""
+    return replace(fit, state=optimize(fit.problem, fit.state, by_gtsam=True).state)
+
+
 def refine(problem, state, slip=None, accept=accepted, factors=odometry_factors):
     """The Fit in which wheels, noise and accepted measurements agree with each other.
 
@@ -43,14 +52,17 @@ def refine(problem, state, slip=None, accept=accepted, factors=odometry_factors)
         problem = replace(problem, noise=known_noise(slip) if slip is not None
                           else noise_of_scatter(m, state))
     measured = problem.measured if accept is None else accept(problem, state)
+    changed = np.inf
     for _ in range(MAX_ROUNDS):
         problem = replace(problem, measured=measured, odometry=factors(m, model, state.w))
-        if slip is None:
-            state = optimize(problem, state, max_steps=2).state
-            posterior = noise_posterior(problem, state)
+        if slip is None and changed > FEW * len(measured.weight):
+            near = optimize(problem, state, max_steps=2)
+            state, posterior = near.state, noise_posterior(near.equations)
             problem = replace(problem, noise=posterior.noise)
-        state = optimize(problem, state).state
+        optimum = optimize(problem, state)
+        state = optimum.state
         measured = problem.measured if accept is None else accept(problem, state)
-        if (measured.weight == problem.measured.weight).all():
+        changed = np.count_nonzero(measured.weight != problem.measured.weight)
+        if not changed:
             break
-    return Fit(problem, state, log_evidence(problem, state), posterior)
+    return Fit(problem, state, solve(optimum.equations, problem.noise)[1], posterior)

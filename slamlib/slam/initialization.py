@@ -7,7 +7,7 @@ wheels that this part calibrated predicts the next poses, up to twice as many, a
 import numpy as np
 
 from slamlib import odometry, se2
-from slamlib.sightings import consensus
+from slamlib.sightings import consensus, few_of_each
 from slamlib.slam.measurements import measure
 from slamlib.slam.noise import Noise
 from slamlib.slam.odometry_factors import odometry_factors
@@ -75,7 +75,7 @@ def consensus_markers(measurements, in_world, covariances):
 
     `in_world` (s, 3) and `covariances` (s, 3, 3) are where the sightings put their markers.
     """
-    chosen = _few_of_each(measurements.label, MAX_VOTES)
+    chosen = few_of_each(measurements.label, MAX_VOTES)
     best = consensus(measurements.label[chosen], in_world[chosen], covariances[chosen])
     return in_world[chosen[best]]
 
@@ -99,12 +99,3 @@ def state_from_poses(measurements, poses, covariances, w=np.zeros(3), markers=co
     return state_from_arrays(
         measurements, poses, markers(measurements, se2.compose(poses[s.row], s.z), spread),
         antennas(measurements, poses, covariances), w)
-
-
-def _few_of_each(label, most):
-    """Rows of at most `most` entries of every label, evenly chosen."""
-    order = np.argsort(label, kind="stable")
-    count = np.bincount(label)[label[order]]
-    number = np.arange(len(order)) - np.searchsorted(label[order], label[order])
-    few = np.minimum(count, most)
-    return np.sort(order[(number * few) // count != ((number - 1) * few) // count])

@@ -5,22 +5,34 @@ import numpy as np
 from slamlib import increments, se2
 from slamlib.slam.odometry_factors import odometry_noise
 
+AT_ONCE = 1000               # frames between which poses are computed together: these stay in cache
+
 
 def interpolate(problem, state, pairs):
     """Every encoder pose (n, 3) and its covariance (n, 3, 3) in world axes, given the frames.
 
     Between the frames a and b a pose k depends on nothing but them and w. X_a Delta_ak(w) and
     X_b Delta_kb(w)^-1 are two estimates of it, with the independent noise of the encoder steps
-    before and after it. Their average by information is
-    the conditional mean, exact to first order.
+    before and after it. Their average by information is the conditional mean, exact to first order.
 
     `pairs` (f-1, 9, 9) are those of `Covariances` at the State that solves the Problem.
     """
-    poses, frame, d = state.poses, problem.measurements.frame, problem.measurements.dataset
+    frame, count = problem.measurements.frame, len(problem.measurements.dataset.ticks)
     if not len(pairs):                                       # pose 1 alone: the world's origin
-        return poses.copy(), np.diag(problem.measurements.origin_sigma)[None]**2
+        return state.poses.copy(), np.diag(problem.measurements.origin_sigma)[None]**2
+    poses, covariances = np.empty((count, 3)), np.empty((count, 3, 3))
+    for first in range(0, len(pairs), AT_ONCE):
+        rows = slice(first, min(first + AT_ONCE, len(pairs)) + 1)          # of frames
+        of_section = slice(frame[rows][0], frame[rows][-1] + 1)
+        poses[of_section], covariances[of_section] = _section(
+            problem, state.poses[rows], state.w, frame[rows], pairs[rows.start:rows.stop - 1])
+    return poses, covariances
+
+
+def _section(problem, poses, w, frame, pairs):
+    """The same from the first to the last of some consecutive frames, at encoder poses (g,)."""
     joint = _in_world_axes(pairs, poses)
-    pose = np.arange(len(d.ticks))
+    pose = np.arange(frame[0], frame[-1] + 1)
     last = np.searchsorted(frame, pose, side="right") - 1
     all_poses = poses[last].copy()
     covariances = np.concatenate([joint[:, :3, :3], joint[-1:, 3:6, 3:6]])[last]
@@ -29,10 +41,10 @@ def interpolate(problem, state, pairs):
         return all_poses, covariances
     a, b = last[inner], last[inner] + 1
 
-    forward, forward_by_w, noise = _increments(problem, state.w, frame[a], inner)
+    forward, forward_by_w, noise = _increments(problem, w, frame, frame[a], pose[inner])
     A, B = se2.compose_jacobians(poses[a], forward)
     N_a = B @ noise @ np.swapaxes(B, 1, 2)
-    ahead, ahead_by_w, noise = _increments(problem, state.w, inner, frame[b])
+    ahead, ahead_by_w, noise = _increments(problem, w, frame, pose[inner], frame[b])
     back = se2.inverse(ahead)
     A_b, B_b = se2.compose_jacobians(poses[b], back)
     B_b = B_b @ se2.inverse_jacobian(ahead)
@@ -59,10 +71,14 @@ def _in_world_axes(pairs, poses):
     return turned @ pairs @ np.swapaxes(turned, 1, 2)
 
 
-def _increments(problem, w, start, end):
-    """Increments (m, 3) at the wheels w, their derivatives by w, and noise (axes of the start)."""
+def _increments(problem, w, frame, start, end):
+    """Increments (m, 3) between poses of a section with these frames, at the wheels w.
+
+    Also their derivatives by w, and their noise in the axes of the start.
+    """
     d = problem.measurements.dataset
-    vehicle = d.vehicle.with_deviation(w)
-    delta, by_w = increments.between_poses(d.ticks, vehicle, start, end, problem.odometry.model)
-    rounding, slipping = odometry_noise(d.ticks, vehicle, start, end)
+    vehicle, ticks = d.vehicle.with_deviation(w), d.ticks[frame[0]:frame[-1] + 1]
+    start, end = start - frame[0], end - frame[0]
+    delta, by_w = increments.between_poses(ticks, vehicle, start, end, problem.odometry.model)
+    rounding, slipping = odometry_noise(ticks, vehicle, start, end, len(d.ticks) - 1)
     return delta, by_w * vehicle.sigma_wheel, rounding + problem.noise.slip**2 * slipping

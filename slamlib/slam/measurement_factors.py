@@ -1,18 +1,9 @@
-"""Stage 2: the factors of sightings and ranges, and the priors, by GTSAM.
-
-* a prior on pose 1, which fixes the world frame, and the prior of table 2 on w;
-* a between factor for every sighting, Z_ij = X_i^-1 L_j;
-* a range factor for every range, r_ik = |A_k - (x_i, y_i)|, and the guess as a prior on A_k.
-
-Two kinds of factors are not GTSAM's but those of `linear_factors.py`: sightings of points, whose
-heading is unknown, and ranges whose offset and scale are variables.
-"""
+"""Stage 2: the factors of sightings and ranges: which are accepted, and their robust kernels."""
 
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import A, L, P, W, X, Z
 
 from slamlib import se2
 from slamlib.slam.measurements import Measurements
@@ -51,42 +42,6 @@ class MeasurementFactors:
         return np.flatnonzero(np.bincount(m.label, self.sighting_weight, len(m.marker)) == 0)
 
 
-def measurement_graph(factors, noise):
-    """The gtsam.NonlinearFactorGraph of MeasurementFactors with the factors of a Noise."""
-    m, graph, model = factors.measurements, gtsam.NonlinearFactorGraph(), gtsam.noiseModel
-    weight = factors.sighting_weight / noise.sightings**2
-    for k in np.flatnonzero(weight * m.as_pose):
-        i, j, z, covariance = m.between_arguments[k]
-        graph.add(gtsam.BetweenFactorPose2(i, j, z, _robust(
-            factors.sighting_kernel, model.Gaussian.Covariance(covariance / weight[k]))))
-    if not m.calibrated:
-        sigma = noise.ranges * m.ranges.sigma
-        for k in np.flatnonzero(factors.range_weight):
-            graph.add(gtsam.RangeFactor2D(
-                X(int(m.ranges.row[k])), A(int(m.ranges.antenna[k])), m.ranges.distance[k],
-                _robust(factors.range_kernel, model.Isotropic.Sigma(
-                    1, sigma[k] / np.sqrt(factors.range_weight[k])))))
-    _add_priors(graph, factors)
-    return graph
-
-
-def _add_priors(graph, factors):
-    m, model = factors.measurements, gtsam.noiseModel
-    graph.add(gtsam.PriorFactorPose2(
-        X(0), gtsam.Pose2(), model.Diagonal.Sigmas(m.origin_sigma)))
-    graph.add(gtsam.PriorFactorVector(W(0), np.zeros(3), model.Unit.Create(3)))
-    for j in factors.unsupported:
-        graph.add(gtsam.PriorFactorPose2(
-            L(j), gtsam.Pose2(), model.Isotropic.Sigma(3, WEAK_SIGMA)) if m.oriented[j]
-            else gtsam.PriorFactorPoint2(
-                P(j), np.zeros(2), model.Isotropic.Sigma(2, WEAK_SIGMA)))
-    for k, position in enumerate(m.guess):
-        graph.add(gtsam.PriorFactorPoint2(
-            A(k), position, model.Isotropic.Sigma(2, GUESS_PRIOR_SIGMA)))
-    if m.calibrated:
-        graph.add(gtsam.PriorFactorVector(Z(0), np.zeros(2), model.Unit.Create(2)))
-
-
 def residuals(measurements, state, noise):
     """Whitened measured minus expected values, without kernels.
 
@@ -105,7 +60,3 @@ def residuals(measurements, state, noise):
         *(state.antennas[m.ranges.antenna] - state.poses[m.ranges.row, :2]).T)
     return (np.linalg.solve(np.linalg.cholesky(C), off[..., None])[..., 0] / noise.sightings,
             (m.ranges.distance - expected) / m.ranges.sigma / noise.ranges)
-
-
-def _robust(kernel, noise):
-    return gtsam.noiseModel.Robust.Create(kernel, noise) if kernel else noise

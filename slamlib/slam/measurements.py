@@ -4,7 +4,7 @@ Frames are the encoder poses that are variables X_i of the graph: the first, the
 with a sighting or a range. Measurements are numbered: first the s sightings, then the r ranges.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import gtsam
@@ -14,6 +14,8 @@ from gtsam.symbol_shorthand import A, L, P, W, X, Z
 from slamlib import odometry, se2
 from slamlib.dataset import Dataset, UwbReadings
 from slamlib.sightings import GATE, MAX_HEADING_SIGMA, POINT_GATE, Sightings, sightings_by_frame
+from slamlib.slam.errors import square_root_information
+from slamlib.slam.structure import structure
 
 ORIGIN_SIGMA = 1e-5          # m, of the position of pose 1, which is zero by definition
 
@@ -65,38 +67,81 @@ class Measurements:
         return np.ones(len(self.label) + len(self.ranges.row))
 
     @cached_property
-    def between_arguments(self):
-        """Of every sighting the keys, the measured Pose2 and its covariance in the marker's axes.
+    def sighting_roots(self):
+        """Square root informations (s, 3, 3) of the sightings, and (s, 2, 2) of their positions.
 
-        `ArucoReading.txt` gives the covariance C in the axes of the vehicle. The noise of GTSAM's
-        between factor lives in the axes of the measured pose z: R(heading)^T C R(heading).
+        `ArucoReading.txt` gives the covariance C in the axes of the vehicle. The error of a marker
+        with a heading lives in the axes of the measured pose z: R(heading)^T C R(heading).
         """
         s = self.sightings
-        noise = se2.rotate_covariance(s.C, -s.z[:, 2])
-        return [(X(i), L(j), gtsam.Pose2(*z), C)
-                for i, j, z, C in zip(s.row.tolist(), self.label.tolist(), s.z, noise)]
+        return (square_root_information(se2.rotate_covariance(s.C, -s.z[:, 2])),
+                square_root_information(s.C[:, :2, :2]))
 
     @cached_property
-    def ordering(self):
-        """Elimination ordering (COLAMD) of all variables; w, which touches all poses, comes last.
+    def structure(self):
+        """The Structure of the information matrix."""
+        width = np.r_[np.full(len(self.frame), 3), np.where(self.oriented, 3, 2),
+                      np.full(len(self.antenna), 2), 3, [2] * self.calibrated].astype(int)
+        order = self.ordering
+        keys = (gtsam.Symbol(order.at(i)) for i in range(order.size()))
+        first = {"x": 0, "l": len(self.frame), "p": len(self.frame),
+                 "a": len(self.frame) + len(self.marker), "w": self.wheels, "z": self.wheels + 1}
+        rank = np.empty(len(width), int)
+        rank[[first[chr(key.chr())] + key.index() for key in keys]] = np.arange(len(width))
+        return structure(width, rank, self.variables)
 
-        So does z where the ranges calibrate themselves.
+    @cached_property
+    def placed(self):
+        """Of the factors of `variables` the places and rows in the matrix."""
+        return [(self.structure.places(each), self.structure.rows_of_factors(each))
+                for each in self.variables]
+
+    @property
+    def wheels(self):
+        """Number of the variable w; the next one is z."""
+        return len(self.frame) + len(self.marker) + len(self.antenna)
+
+    @property
+    def variables(self):
+        """Numbers of the variables of odometry, sightings of poses, those of points, and ranges.
+
+        (f-1, 3) of X_i, X_{i+1} and w; (m, 2) of frames and markers, twice; (r, 2) of frames and
+        antennas, or (r, 3) with z where they calibrate themselves.
         """
+        f, k, s, r = len(self.frame), len(self.marker), self.sightings, self.ranges
+        i, of_sightings = np.arange(f - 1), np.stack([s.row, f + self.label], -1)
+        of_ranges = [r.row, f + k + r.antenna, np.full(len(r.row), self.wheels + 1)]
+        return [np.stack([i, i + 1, np.full(f - 1, self.wheels)], -1),
+                of_sightings[self.as_pose], of_sightings[~self.as_pose],
+                np.stack(of_ranges[:2 + self.calibrated], -1)]
+
+    @property
+    def ordering(self):
+        """Elimination ordering of all variables. w and z, which touch many poses, come last."""
+        order = gtsam.Ordering(self.order_of_others)
+        order.push_back(W(0))
+        if self.calibrated:
+            order.push_back(Z(0))
+        return order
+
+    @cached_property
+    def order_of_others(self):
+        """The ordering (COLAMD) of poses and landmarks."""
         graph, s, r = gtsam.SymbolicFactorGraph(), self.sightings, self.ranges
         graph.push_factor(X(0))
-        graph.push_factor(W(0))
         for i, j in zip(s.row.tolist(), self.label.tolist()):
             graph.push_factor(X(i), (L if self.oriented[j] else P)(j))
         for i, k in zip(r.row.tolist(), r.antenna.tolist()):
             graph.push_factor(X(i), A(k))
-        for k in range(len(self.antenna)):
-            graph.push_factor(A(k))
         for i in range(len(self.frame) - 1):
-            graph.push_factor(X(i), X(i + 1), W(0))
-        last = [W(0), Z(0)] if self.calibrated else [W(0)]
-        for key in last:
-            graph.push_factor(key)
-        return gtsam.Ordering.ColamdConstrainedLastSymbolicFactorGraph(graph, last)
+            graph.push_factor(X(i), X(i + 1))
+        return gtsam.Ordering.ColamdSymbolicFactorGraph(graph)
+
+    def calibrating(self):
+        """The Measurements with the ranges' offset and scale as variables."""
+        other = replace(self, calibrated=True)
+        other.__dict__["order_of_others"] = self.order_of_others       # does not depend on z
+        return other
 
 
 def measure(dataset, extra_poses=()):

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from slamlib.slam.evidence import log_evidence
+from slamlib.slam.evidence import solve
 from slamlib.slam.fit import refine
 from slamlib.slam.linear_factors import range_factors
-from slamlib.slam.noise_posterior import greatest_density
+from slamlib.slam.noise_posterior import density, greatest_density
+from slamlib.slam.normal_equations import NormalEquations
 from slamlib.slam.odometry_factors import odometry_factors
-from slamlib.slam.optimizer import optimize
 
 DECISIVE = 3.0               # log evidence by which data prefer a model to the default
 
@@ -23,8 +23,9 @@ def better_model(fit, model, slip=None):
     """
     own = replace(fit.problem, measured=_with_fixed_weights(fit))
     other = replace(own, odometry=odometry_factors(own.measurements, model, fit.state.w))
-    lead = _log_density(other, optimize(other, fit.state).state, slip) \
-        - _log_density(own, fit.state, slip)
+    lead = _log_density(NormalEquations(other, fit.state), fit.posterior) \
+        - _log_density(NormalEquations(own, fit.state), fit.posterior,
+                       is_greatest=not len(own.measured.range_weight))
     if lead <= DECISIVE:
         return fit
     return refine(replace(fit.problem, odometry=other.odometry), fit.state, slip, accept=None)
@@ -39,6 +40,11 @@ def _with_fixed_weights(fit):
     return replace(measured, weight=weight, range_kernel=None)
 
 
-def _log_density(problem, state, slip):
-    """Log evidence of a given noise, or log posterior of a learned one."""
-    return (greatest_density if slip is None else log_evidence)(problem, state)
+def _log_density(equations, posterior, is_greatest=False):
+    """Log evidence of a given noise, or greatest log density of one with this NoisePosterior.
+
+    It is that of the equations' own noise if it `is_greatest` there.
+    """
+    if posterior is None:
+        return solve(equations, equations.problem.noise)[1]
+    return density(equations) if is_greatest else greatest_density(equations, posterior)

@@ -7,49 +7,30 @@ With probability p_k of point k, x_k its solution and C_k its covariance, the mo
 in the tangent space at the state that solves the problem of greatest posterior density.
 """
 
-from dataclasses import replace
-
 import numpy as np
 
-from slamlib import se2
 from slamlib.slam.covariances import Covariances, covariances
-from slamlib.slam.state import state_from_arrays
+from slamlib.slam.evidence import solve
+from slamlib.slam.state import moved
 
 
 def moments(fit):
     """Mean State, Covariances, and root mean square of the slip in sqrt(m), of a Fit."""
     problem, state = fit.problem, fit.state
     if fit.posterior is None:
-        return state, covariances(problem, state), problem.noise.slip
+        return state, covariances(fit.equations, problem.noise), problem.noise.slip
     weights, noises = zip(*fit.posterior.points)
     weights = np.array(weights) / sum(weights)
     slip = np.sqrt(weights @ np.square([noise.slip for noise in noises]))
-    each = [covariances(replace(problem, noise=noise), state) for noise in noises]
+    each = [covariances(fit.equations, noise) for noise in noises]
     if len(each) == 1:
         return state, each[0], slip
     equations = fit.equations
-    x = np.stack([equations.solve(noise)[0] for noise in noises]) \
-        - equations.solve(problem.noise)[0]
+    x = np.stack([solve(equations, noise)[0] for noise in noises]) \
+        - solve(equations, problem.noise)[0]
     mean = weights @ x
     x -= mean
-    return _moved(equations, mean), _averaged(equations, each, x, weights), slip
-
-
-def _moved(equations, delta):
-    """The State that a solution (n,) of the normal equations leads to."""
-    m, state = equations.problem.measurements, equations.state
-    frames, markers, antennas, w, z = _variables(equations)
-    moved_markers = state.markers.copy()
-    for j, variable in enumerate(markers):
-        if m.oriented[j]:
-            moved_markers[j] = se2.compose(state.markers[j], delta[equations.rows(variable, 3)[0]])
-        else:
-            moved_markers[j, :2] += delta[equations.rows(variable, 2)[0]]
-    return state_from_arrays(
-        m, se2.compose(state.poses, delta[equations.rows(frames, 3)]), moved_markers,
-        state.antennas + delta[equations.rows(antennas, 2)],
-        state.w + delta[equations.rows(w, 3)[0]],
-        state.z + delta[equations.rows(z, 2)[0]] if m.calibrated else state.z)
+    return moved(problem.measurements, state, mean), _averaged(equations, each, x, weights), slip
 
 
 def _averaged(equations, each, x, weights):
@@ -62,17 +43,18 @@ def _averaged(equations, each, x, weights):
         spread = own[..., :, None] * own[..., None, :]
         return np.einsum("p,p...->...", weights, np.stack(blocks) + spread)
 
-    w_rows = equations.rows(w, 3)
+    w_rows = equations.structure.rows(w, 3)
     pair_rows = np.concatenate([
-        equations.rows(frames[:-1], 3), equations.rows(frames[1:], 3),
+        equations.structure.rows(frames[:-1], 3), equations.structure.rows(frames[1:], 3),
         np.broadcast_to(w_rows, (len(frames) - 1, 3))], axis=1)
     return Covariances(
         pairs=mixed([c.pairs for c in each], pair_rows),
         markers=[mixed([c.markers[j] for c in each],
-                       equations.rows(variable, 3 if m.oriented[j] else 2)[0])
+                       equations.structure.rows(variable, 2 + m.oriented[j])[0])
                  for j, variable in enumerate(markers)],
-        antennas=mixed([c.antennas for c in each], equations.rows(antennas, 2)),
-        z=mixed([c.z for c in each], equations.rows(z, 2)[0]) if m.calibrated else each[0].z,
+        antennas=mixed([c.antennas for c in each], equations.structure.rows(antennas, 2)),
+        z=mixed([c.z for c in each], equations.structure.rows(z, 2)[0]) if m.calibrated
+        else each[0].z,
         w=mixed([c.w for c in each], w_rows[0]))
 
 

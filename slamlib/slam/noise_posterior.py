@@ -6,11 +6,13 @@ of it (integrated nested Laplace approximation: Rue, Martino and Chopin, J. R. S
 2009), so that every slip that is possible widens the covariance by its probability.
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
-from slamlib.slam.evidence import NormalEquations
+from slamlib.slam.evidence import solve
 from slamlib.slam.noise import BOUNDS, MEDIAN, PRIOR_SIGMA, Noise, from_logarithms, log_prior
 
 MAX_DIFFERENCE = 0.2         # of the logarithms, over which derivatives are taken
@@ -34,44 +36,63 @@ class NoisePosterior:
     points: tuple                # of (weight, Noise), over which estimates are averaged
 
 
-def noise_posterior(problem, state):
-    """The NoisePosterior at a State near the solution of a Problem; starts from its noise."""
-    log_posterior, start, free = _log_posterior(problem, state)
-    if log_posterior(start) < IMPOSSIBLE / 2:            # singular to rounding: nothing is learned
-        return NoisePosterior(problem.noise, np.zeros((3, 3)), IMPOSSIBLE, ((1.0, problem.noise),))
-    mode, density, covariance = _mode(log_posterior, start, free)
+def noise_posterior(equations):
+    """The NoisePosterior by NormalEquations near a problem's solution; starts from its noise."""
+    log_posterior, start, free = _log_posterior(equations)
+    value = log_posterior(start)
+    if value < IMPOSSIBLE / 2:                           # singular to rounding: nothing is learned
+        given = equations.problem.noise
+        return NoisePosterior(given, np.zeros((3, 3)), IMPOSSIBLE, ((1.0, given),))
+    frames = len(equations.problem.measurements.frame)
+    smallest = 1 / np.sqrt(2 * np.maximum([3 * frames, *equations.counts()], 1))
+    mode, density, covariance = _mode(log_posterior, start, value, free, smallest[free])
     return NoisePosterior(from_logarithms(mode), covariance, density,
                           _points(log_posterior, mode, density, covariance))
 
 
-def greatest_density(problem, state):
-    """The greatest log density of the noise that `noise_posterior` finds, up to a constant."""
-    return _mode(*_log_posterior(problem, state))[1]
+def density(equations):
+    """The log density of the noise that the equations' problem has, up to a constant."""
+    log_posterior, noise, _ = _log_posterior(equations)
+    return log_posterior(noise)
 
 
-def _log_posterior(problem, state):
+def greatest_density(equations, posterior):
+    """The greatest log density of the noise that `noise_posterior` finds, up to a constant.
+
+    `posterior` is the NoisePosterior of nearly the same equations.
+    """
+    log_posterior, start, free = _log_posterior(equations)
+    covariance = posterior.covariance[np.ix_(free, free)]
+    information = np.linalg.inv(covariance)
+    scale = np.sqrt(np.diag(information))
+    return _mode(log_posterior, start, log_posterior(start), free, np.sqrt(np.diag(covariance)),
+                 information / np.outer(scale, scale))[1]
+
+
+def _log_posterior(equations):
     """The function from `Noise.logarithms` to log density, where it starts, and what is free."""
-    equations = NormalEquations(problem, state)
+    problem = equations.problem
     free = np.array([True, len(problem.measured.sighting_weight) > 0,
                      len(problem.measured.range_weight) > 0])
 
     def log_posterior(logarithms):
-        return max(equations.solve(from_logarithms(logarithms))[1], IMPOSSIBLE) \
+        return max(solve(equations, from_logarithms(logarithms))[1], IMPOSSIBLE) \
             + np.sum(log_prior(logarithms)[free])
 
     return (log_posterior, np.where(free, problem.noise.logarithms, np.log(MEDIAN)),
             np.flatnonzero(free))
 
 
-def _mode(function, x, free):
+def _mode(function, x, value, free, steps, correlation=None):
     """Argument, value and covariance (3, 3) of the maximum of a log density, by Newton's method.
 
-    Differences over much more than a standard deviation are wrong by the third derivative, so they
-    are taken over one, once it is known.
+    From `x` (3,) with its `value`. Derivatives by the components `free` (p,) are differences over
+    `steps` (p,), later over standard deviations. `correlation` (p, p) is that of the second
+    derivatives where it is known, to save mixed ones.
     """
-    value, steps = function(x), np.full(len(free), MAX_DIFFERENCE)
+    steps = np.clip(steps, MIN_DIFFERENCE, MAX_DIFFERENCE)
     for _ in range(MAX_STEPS):
-        gradient, hessian = _differences(function, x, value, free, steps)
+        gradient, hessian = _differences(function, x, value, free, steps, correlation)
         curvature, axes = np.linalg.eigh(-hessian)
         covariance = axes / np.maximum(curvature, PRIOR_SIGMA.max()**-2) @ axes.T
         sigma = np.clip(np.sqrt(np.diag(covariance)), MIN_DIFFERENCE, MAX_DIFFERENCE)
@@ -96,15 +117,25 @@ def _moved(x, free, step):
     return np.clip(moved, *BOUNDS)
 
 
-def _differences(function, x, value, free, steps):
-    """Gradient (p,) and Hessian (p, p) by central differences of the free components by `steps`."""
-    unit = np.diag(steps)
-    up, down = (np.array([function(_moved(x, free, sign * e)) for e in unit]) for sign in (1, -1))
+def _differences(function, x, value, free, steps, correlation=None):
+    """Gradient (p,) and Hessian (p, p) by central differences of the free components by `steps`.
+
+    Mixed second derivatives have the `correlation` (p, p) if it is given.
+    """
+    unit, pairs = np.diag(steps), list(combinations(range(len(free)), 2))
+    offsets = [*unit, *-unit]
+    if correlation is None:
+        offsets += [unit[i] + unit[j] for i, j in pairs]
+    with ThreadPoolExecutor(2) as pool:          # the sparse decomposition lets other threads run
+        values = np.array(list(pool.map(lambda off: function(_moved(x, free, off)), offsets)))
+    up, down, both = np.split(values, [len(free), 2 * len(free)])
     gradient, hessian = (up - down) / (2 * steps), np.diag((up + down - 2 * value) / steps**2)
-    for i in range(len(free)):
-        for j in range(i):
-            both = function(_moved(x, free, unit[i] + unit[j]))
-            hessian[i, j] = hessian[j, i] = (both - up[i] - up[j] + value) / (steps[i] * steps[j])
+    if correlation is not None:
+        scale = np.sqrt(np.abs(np.diag(hessian)))
+        return gradient, np.where(np.eye(len(free)), hessian, -correlation * np.outer(scale, scale))
+    for (i, j), value_of_both in zip(pairs, both):
+        hessian[i, j] = hessian[j, i] = (value_of_both - up[i] - up[j] + value) \
+            / (steps[i] * steps[j])
     return gradient, hessian
 
 

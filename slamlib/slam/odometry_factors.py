@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slamlib import increments, se2
-from slamlib.slam.errors import between_error
+from slamlib.slam.errors import between_error, square_root_information
 
 MINIMUM_SIGMA = 1e-5         # m, of an increment's end, for a vehicle that stands still
 
@@ -32,6 +32,11 @@ class OdometryFactors:
     def noise(self, slip):
         """Covariances (f-1, 3, 3) for a slip in sqrt(m)."""
         return self.rounding + slip**2 * self.slipping
+
+    def whitening(self, slip):
+        """Square root information U (f-1, 3, 3) of the noise Q, U^T U = Q^-1, and sum log|Q|."""
+        U = square_root_information(self.noise(slip))
+        return U, -2 * float(np.sum(np.log(np.diagonal(U, axis1=1, axis2=2))))
 
 
 def odometry_factors(measurements, model, relinearize_at=(0.0, 0.0, 0.0)):
@@ -53,13 +58,13 @@ def odometry_factors(measurements, model, relinearize_at=(0.0, 0.0, 0.0)):
         slipping=se2.rotate_covariance(slipping, turn))
 
 
-def odometry_noise(ticks, vehicle, start, end):
+def odometry_noise(ticks, vehicle, start, end, steps=None):
     """Rounding and slipping (m, 3, 3) of `increments.noise_in_drive`, with a minimum of rounding.
 
     A vehicle that stands still has no lateral noise, and a graph needs its inverse: the end of each
     increment has at least the standard deviation MINIMUM_SIGMA along both axes.
     """
-    rounding, slipping = increments.noise_in_drive(ticks, vehicle, start, end)
+    rounding, slipping = increments.noise_in_drive(ticks, vehicle, start, end, steps)
     rounding[:, [0, 1], [0, 1]] += MINIMUM_SIGMA**2
     return rounding, slipping
 

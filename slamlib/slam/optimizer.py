@@ -1,19 +1,19 @@
-"""Stage 3: a problem is linearised and solved by Gauss-Newton.
+"""Stage 3: a problem is solved by Gauss-Newton with step halving.
 
-GTSAM linearises its own factors and eliminates; the linearised odometry is added to its graph.
+A step solves the normal equations in numpy and scipy, all factors of a kind at once. Or it is
+GTSAM's, which builds, linearises and eliminates the same graph factor by factor. Start values,
+kernels and noise take dozens of steps, by the normal equations. GTSAM then takes the last ones
+(`estimate`), and it decides where the normal equations are singular to rounding.
 """
 
-import re
 from dataclasses import dataclass
 
-import gtsam
-import numpy as np
-from gtsam.symbol_shorthand import A, P, W, X, Z
-
-from slamlib.dataset import DatasetError
-from slamlib.slam.state import State, state_from_values
+from slamlib.slam.gtsam_graph import gtsam_step
+from slamlib.slam.normal_equations import NormalEquations
+from slamlib.slam.state import State, moved
 
 CONVERGED = 1e-6             # relative decrease of the error at which iterations end
+ROUNDING = 1e-12             # relative increase of the error that means nothing
 MAX_STEPS = 40               # of Gauss-Newton
 MAX_HALVINGS = 8             # of one step
 
@@ -22,85 +22,38 @@ MAX_HALVINGS = 8             # of one step
 class Optimum:
     """Where Gauss-Newton ends."""
 
-    state: State
-    error: float
+    equations: NormalEquations
     steps: int
 
+    @property
+    def state(self) -> State:
+        """The State."""
+        return self.equations.state
 
-def optimize(problem, state, max_steps=MAX_STEPS):
-    """The Optimum from a State, by Gauss-Newton with step halving.
+    @property
+    def error(self):
+        """Half the sum of squared whitened errors, kernels applied."""
+        return self.equations.error
+
+
+def optimize(problem, state, max_steps=MAX_STEPS, converged=CONVERGED, by_gtsam=False):
+    """The Optimum from a State; it ends after a relative decrease of the error of `converged`.
 
     Raises DatasetError where the measurements do not determine every variable.
     """
-    error, steps, decrease = problem.error(state), 0, np.inf
-    while steps < max_steps and decrease > CONVERGED * (1 + error):
+    m, equations, steps, ended = problem.measurements, NormalEquations(problem, state), 0, False
+    while steps < max_steps and not ended:
         steps += 1
-        step = _solve(problem, linearize(problem, state))
+        step = None if by_gtsam else equations.step()
+        if step is None:
+            step = gtsam_step(problem, equations.state)
         for _ in range(MAX_HALVINGS):
-            moved = state_from_values(problem.measurements, state.values.retract(step))
-            new_error = problem.error(moved)
-            if new_error <= error:
+            tried = NormalEquations(problem, moved(m, equations.state, step))
+            if tried.error <= (1 + ROUNDING) * equations.error:
                 break
-            step = _halved(step, state.values.keys())
+            step = step / 2
         else:
             break
-        state, error, decrease = moved, new_error, error - new_error
-    return Optimum(state, error, steps)
-
-
-def linearize(problem, state):
-    """The gtsam.GaussianFactorGraph of a Problem at a State."""
-    e, (first, second, by_w) = problem.odometry_jacobians(state)
-    graph = gtsam.GaussianFactorGraph()
-    graph.push_back(problem.graph.linearize(state.values))
-    for i in range(len(e)):
-        graph.add(X(i), first[i], X(i + 1), second[i], W(0), by_w[i], -e[i])
-    points, *ranges = problem.other_factors(state)
-    for i, j, by_pose, by_point, error in zip(
-            points.row.tolist(), points.landmark.tolist(), points.by_pose, points.by_landmark,
-            points.e):
-        graph.add(X(i), by_pose, P(j), by_point, -error)
-    for r in ranges:
-        for i, k, by_pose, by_antenna, by_z, error in zip(
-                r.row.tolist(), (r.landmark - len(problem.measurements.marker)).tolist(),
-                r.by_pose, r.by_landmark, r.by_calibration, r.e):
-            graph.add(X(i), by_pose, A(k), by_antenna, Z(0), by_z, -error)
-    return graph
-
-
-def _solve(problem, linear):
-    """Solution (gtsam.VectorValues) of a linearised graph.
-
-    Cholesky decomposition of the information is fast, but fails where it is ill-conditioned. QR
-    decomposition of its root then decides whether the measurements determine every variable.
-    """
-    m = problem.measurements
-    try:
-        return linear.eliminateMultifrontal(m.ordering).optimize()
-    except RuntimeError:
-        pass
-    try:
-        return linear.eliminateSequential(m.ordering, gtsam.EliminateQR).optimize()
-    except RuntimeError as error:                 # GTSAM's, with the variable and much advice
-        raise DatasetError(f"{m.dataset.name}: expected measurements that determine every pose and "
-                           f"landmark; these do not determine {_variable(m, str(error))}") from None
-
-
-def _variable(measurements, message):
-    """What GTSAM's message about an undetermined variable names, in the words of the files."""
-    m, found = measurements, re.search(r"Symbol: ([alpwxz])(\d+)", message)
-    if found is None:
-        return "one of them"
-    if found[1] in "wz":
-        return {"w": "the wheel parameters", "z": "the offset and scale of the ranges"}[found[1]]
-    name, ids = {"x": ("pose", m.frame + 1), "l": ("the pose of marker", m.marker),
-                 "p": ("the position of marker", m.marker),
-                 "a": ("the position of antenna", m.antenna)}[found[1]]
-    return f"{name} {ids[int(found[2])]}"
-
-
-def _halved(step, keys):
-    half = gtsam.VectorValues()
-    for key in keys:
-        half.insert(key, step.at(key) / 2)
-    return half
+        ended = equations.error - tried.error <= converged * (1 + equations.error)
+        equations = tried
+    return Optimum(equations, steps)

@@ -20,7 +20,7 @@ def calibrated(fit, slip=None):
     problem, state = fit.problem, fit.state
     if not len(problem.measurements.ranges.row):
         return fit
-    m = replace(problem.measurements, calibrated=True)
+    m = problem.measurements.calibrating()
     other = replace(problem, measurements=m, measured=replace(problem.measured, measurements=m))
     start = state_from_arrays(m, state.poses, state.markers, state.antennas, state.w)
     if log_evidence(other, start) < fit.log_evidence - DECISIVE:

@@ -124,7 +124,8 @@ def chi2_per_dof(problem, state, weight):
     sightings, ranges = np.split(weight, [len(m.label)])
     stated = MeasurementFactors(m, weight)
     e, *_ = odometry_error(problem.odometry, state.poses, state.w)
-    squared = np.sum((problem.whitening @ e[..., None])**2) + np.sum(state.w**2) + 2 * sum(
+    U, _ = problem.odometry.whitening(problem.noise.slip)
+    squared = np.sum((U @ e[..., None])**2) + np.sum(state.w**2) + 2 * sum(
         factors.error for factors in linear_factors(stated, Noise(), state))
     used = np.bincount(m.label, sightings * np.where(m.as_pose, 3, 2), len(m.marker))
     freedom = np.sum(np.maximum(used - np.where(m.oriented, 3, 2), 0)) \

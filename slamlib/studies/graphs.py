@@ -11,8 +11,10 @@ from slamlib.slam.estimate import fit_from_odometry
 from slamlib.slam.evidence import log_evidence
 from slamlib.slam.fit import refine
 from slamlib.slam.measurements import measure
+from slamlib.slam.noise import known_noise
 from slamlib.slam.odometry_factors import odometry_factors
 from slamlib.slam.optimizer import optimize
+from slamlib.slam.problem import build
 from slamlib.slam.result import SlamResult, result
 
 
@@ -47,14 +49,16 @@ class GraphKind:
 def graph_kinds(dataset, slip=None):
     """Yield the GraphKind of every kind; `slip` in sqrt(m), or None to learn it for each.
 
+    All start from the solution of the first kind, variable wheels and arcs.
     Evidence compares explanations of the same data, so it is that on common measurements.
     """
     measurements = measure(dataset)
     first = fit_from_odometry(measurements, slip)
     for wheels, factors in WHEELS.items():
         for model in odometry.MODELS:
-            own = first if (factors, model) == (odometry_factors, "arc") else fit_from_odometry(
-                measurements, slip, model, factors)
+            own = first if (factors, model) == (odometry_factors, "arc") else refine(
+                build(measurements, model, known_noise(slip), factors=factors), first.state, slip,
+                factors=factors)
             if factors is not odometry_factors:
                 own = replace(own, problem=_without_wheel_errors(own.problem))
             common = replace(first.problem, odometry=factors(measurements, model))

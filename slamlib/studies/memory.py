@@ -4,7 +4,8 @@ A study depends on the code of the numerics, on the packages that compute it, an
 seeds and options; it does not depend on a user's datasets. While a report is built,
 SLAMLIB_STUDIES names the folder of the studies that are kept. Without it each is computed. Times
 that a trial measures are kept as well and are not for a page. SLAMLIB_SEEDS, a number, cuts every
-study to its first seeds; tests of pages use it.
+study to its first seeds; tests of pages use it. The file SLAMLIB_PROGRESS tells the build how far a
+study is.
 """
 
 import hashlib
@@ -49,9 +50,14 @@ def run(trial, seeds, jobs=2, progress=False, **options):
 
 
 def _compute(trial, name, seeds, options, threads, jobs, progress):
-    rows = list(tqdm(Parallel(n_jobs=jobs, return_as="generator")(
-        delayed(trial)(seed, **options) for seed in seeds), total=len(seeds), disable=not progress))
-    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    rows, told = [], os.environ.get("SLAMLIB_PROGRESS")
+    for row in tqdm(Parallel(n_jobs=jobs, return_as="generator")(
+            delayed(trial)(seed, **options) for seed in seeds), total=len(seeds),
+            disable=not progress):
+        rows.append(row)
+        if told:
+            Path(told).write_text(f"{trial.__name__} {len(rows)} of {len(seeds)}")
+    return {key: np.array([row[key] for row in rows]) for key in rows[0]}
 
 
 def _threads():

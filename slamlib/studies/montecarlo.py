@@ -7,6 +7,7 @@ import numpy as np
 
 from slamlib import localization, odometry, slam
 from slamlib.evaluation import anees, ate, nees
+from slamlib.localization.hint import first_order_from
 from slamlib.sightings import sightings_by_frame
 from slamlib.simulation import simulate
 
@@ -15,7 +16,7 @@ METHODS = {                                     # of problem 2
     "ArUco": lambda dataset: localization.localize(dataset.aruco),
     "naive": lambda dataset: localization.localize(dataset.aruco, shared_errors=False),
     "hint": localization.fuse_increments,
-    "exact hint": lambda dataset: localization.fuse_increments(dataset, odometry.first_order),
+    "exact hint": lambda dataset: localization.fuse_increments(dataset, first_order_from),
     "fused": localization.fuse}
 
 

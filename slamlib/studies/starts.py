@@ -15,6 +15,7 @@ from slamlib.slam.initialization import consensus_markers, odometry_state
 from slamlib.slam.measurement_factors import MeasurementFactors
 from slamlib.slam.measurements import measure
 from slamlib.slam.noise import Noise
+from slamlib.slam.normal_equations import NormalEquations
 from slamlib.slam.optimizer import optimize
 from slamlib.slam.problem import build
 from slamlib.slam.result import result
@@ -109,7 +110,7 @@ def landmarks(seed, path="short", drift=1.0, known=True, kernel="graduated",
     for name in starts:
         state, steps = odometry_state(m, "arc", markers=LANDMARKS[name]), 0
         error = state.markers[:, :2] - true_map[:, :2]
-        initial_cost = rounds[-1].error(state)
+        initial_cost = NormalEquations(rounds[-1], state).error
         for trial in rounds:
             optimum = optimize(trial, state)
             state, steps = optimum.state, steps + optimum.steps

@@ -1,0 +1,153 @@
+"""The linearised graph: normal equations, GTSAM's equal ones, and blocks of the inverse."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from gtsam.symbol_shorthand import A, L, W, X
+from scipy.special import chdtri
+
+from slamlib import sightings
+from slamlib.localization import doubts
+from slamlib.simulation import simulate
+from slamlib.slam import drive_doubts, gtsam_graph, normal_equations, odometry_factors
+from slamlib.slam.covariances import covariances
+from slamlib.slam.estimate import fit_from_odometry
+from slamlib.slam.evidence import solve
+from slamlib.slam.initialization import odometry_state, state_from_poses
+from slamlib.slam.measurement_factors import MeasurementFactors
+from slamlib.slam.measurements import measure
+from slamlib.slam.noise import Noise
+from slamlib.slam.normal_equations import NormalEquations
+from slamlib.slam.optimizer import optimize
+from slamlib.slam.problem import build
+from slamlib.slam.robust import LATE_KERNEL
+
+
+def test_gtsam_has_the_same_error_and_takes_the_same_step():
+    """Far from the optimum, with kernels, points, wrong labels and late ranges, without and with z.
+
+    GTSAM evaluates, linearises and eliminates its factors one by one.
+    """
+    dataset, _ = simulate("short", seed=4, mislabelled=0.02, late_ranges=0.2)
+    points = np.isin(dataset.aruco.marker, dataset.aruco.marker[:3])
+    C = dataset.aruco.covariance.copy()
+    C[points, 2] = C[points, :, 2] = [0, 0, 4.0]
+    m = measure(replace(dataset.first(700), aruco=replace(dataset.aruco, covariance=C)
+                        .select(dataset.aruco.pose < 700)))
+    assert 0 < np.count_nonzero(m.oriented) < len(m.oriented)
+    state = odometry_state(m, "arc")
+    cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(3.0)
+    measured = MeasurementFactors(m, m.unit_weights, cauchy, LATE_KERNEL)
+    problem = replace(build(m, "arc", Noise(2e-3, 1.5, 0.7)), measured=measured)
+    equations = NormalEquations(problem, state)
+    values = gtsam_graph.values(m, state)
+    others = odometry_factors.odometry_error(problem.odometry, state.poses, state.w)[0]
+    others = problem.odometry.whitening(2e-3)[0] @ others[..., None]
+    expected = gtsam_graph.nonlinear_graph(problem).error(values) + np.sum(others**2) / 2 \
+        + equations.factors[1].error
+    assert np.isclose(equations.error, expected, rtol=1e-12)
+    step = gtsam_graph.gtsam_step(problem, state)
+    np.testing.assert_allclose(equations.step(), step, rtol=1e-5, atol=1e-6 * np.abs(step).max())
+    free = replace(m, calibrated=True)
+    problem = replace(problem, measurements=free, measured=replace(measured, measurements=free))
+    step = gtsam_graph.gtsam_step(problem, state)
+    np.testing.assert_allclose(NormalEquations(problem, state).step(), step, rtol=1e-5,
+                               atol=1e-6 * np.abs(step).max())
+
+
+@pytest.mark.parametrize("poses", [1, 15, 400])
+def test_selected_blocks_are_those_of_the_dense_inverse(poses):
+    """A part of a drive without a separator, and with many."""
+    dataset, _ = simulate("short", seed=4)
+    m = replace(measure(dataset.first(poses)), calibrated=True) if poses > 1 \
+        else measure(dataset.first(1))
+    equations = NormalEquations(build(m, "arc", Noise()), odometry_state(m, "arc"))
+    found = covariances(equations, Noise(2e-3, 1.5, 0.7))
+    H = equations.structure.matrix(equations.sums(Noise(2e-3, 1.5, 0.7))[0]).toarray()
+    np.testing.assert_allclose(H, H.T, rtol=1e-9, atol=1e-6)
+    expected, rows = np.linalg.inv(H), equations.structure.rows
+    sigma = np.sqrt(np.diag(expected))
+    expected /= np.outer(sigma, sigma)
+    for i, block in enumerate(found.pairs):
+        at = np.concatenate([rows([i], 3)[0], rows([i + 1], 3)[0], rows([m.wheels], 3)[0]])
+        np.testing.assert_allclose(block / np.outer(sigma[at], sigma[at]), expected[np.ix_(at, at)],
+                                   atol=1e-6)
+    landmarks = [*found.markers, *found.antennas, found.w] + [found.z] * m.calibrated
+    for j, block in enumerate(landmarks):
+        at = rows([len(m.frame) + j], len(block))[0]
+        np.testing.assert_allclose(block / np.outer(sigma[at], sigma[at]), expected[np.ix_(at, at)],
+                                   atol=1e-6)
+
+
+def test_gates_are_quantiles_of_chi_squared():
+    """They are numbers in the code because scipy.special takes long to import."""
+    assert np.allclose([sightings.GATE, sightings.POINT_GATE], chdtri([3, 2], 1e-3), rtol=1e-12)
+    assert np.isclose(doubts.AGREEMENT, chdtri(3, 0.05), rtol=1e-5)
+    gains = [*drive_doubts.MIN_GAIN, drive_doubts.MIN_GAIN_RANGES]
+    assert np.allclose(gains, chdtri([1, 3, 2], 5e-4) / 2, rtol=1e-5)
+
+
+def test_where_cholesky_fails_qr_gives_the_same_solution(monkeypatch):
+    dataset, _ = simulate("short", seed=4)
+    fit = fit_from_odometry(measure(dataset.without("uwb").first(400)), 1e-3)
+    poses = fit.state.poses + [0.01, 0, 0]
+    start = state_from_poses(fit.problem.measurements, poses, np.zeros((len(poses), 3, 3)))
+    expected = optimize(fit.problem, start).state
+
+    class Failing:
+        """A linearised graph whose Cholesky decomposition fails."""
+
+        def __init__(self, graph):
+            self.graph = graph
+
+        def eliminateMultifrontal(self, ordering):             # noqa: N802, GTSAM's name
+            raise RuntimeError("Indeterminate linear system")
+
+        def __getattr__(self, name):
+            return getattr(self.graph, name)
+
+    linear = gtsam_graph.linearize
+    monkeypatch.setattr(gtsam_graph, "linearize", lambda *arguments: Failing(linear(*arguments)))
+    monkeypatch.setattr(normal_equations, "decomposition", lambda H: None)
+    np.testing.assert_allclose(optimize(fit.problem, start).state.poses, expected.poses, atol=1e-8)
+
+
+def test_the_normal_equations_are_those_of_gtsams_linear_graph():
+    """Solution and log determinant, for the noise of the problem and for another one."""
+    dataset, _ = simulate("short", seed=4, mislabelled=0.02, late_ranges=0.2)
+    fit = fit_from_odometry(measure(dataset.first(600)), 1e-3)
+    measured = replace(fit.problem.measured, range_kernel=None)
+    problem = replace(fit.problem, measured=measured, noise=Noise(2e-3, 1.5, 0.7))
+    equations = NormalEquations(replace(problem, noise=Noise(1e-3)), fit.state)
+    delta, found = solve(equations, problem.noise)
+    linear = gtsam_graph.linearize(problem, fit.state)
+    tree = linear.eliminateMultifrontal()
+    solution, m = tree.optimize(), problem.measurements
+    for i in (0, 7, len(m.frame) - 1):
+        np.testing.assert_allclose(delta[equations.structure.rows([i], 3)[0]], solution.at(X(i)),
+                                   rtol=1e-5, atol=1e-8)      # both square the condition number
+    S = 3 * np.count_nonzero(measured.sighting_weight)
+    expected = -linear.error(solution) - tree.logDeterminant() \
+        - np.sum(np.linalg.slogdet(problem.odometry.noise(2e-3))[1]) / 2 \
+        - S * np.log(1.5) - np.count_nonzero(measured.range_weight) * np.log(0.7)
+    assert np.isclose(found, expected, atol=1e-6)
+
+
+def test_marginal_covariances_equal_gtsams():
+    dataset, _ = simulate("short", seed=4, mislabelled=0.02, late_ranges=0.2)
+    m = measure(dataset)
+    fit = fit_from_odometry(m, 1e-3)
+    marginal = covariances(fit.equations, fit.problem.noise)
+    tree = gtsam_graph.linearize(fit.problem, fit.state).eliminateMultifrontal()
+    for i in range(0, len(marginal.pairs), 13):
+        expected = tree.jointMarginalCovariance([X(i), X(i + 1), W(0)]).fullMatrix()
+        scale = np.outer(*2 * [np.sqrt(np.diag(expected))])
+        np.testing.assert_allclose(marginal.pairs[i] / scale, expected / scale, atol=1e-6)
+    for j, found in enumerate(marginal.markers):
+        np.testing.assert_allclose(found, tree.marginalCovariance(L(j)), rtol=1e-5,
+                                   atol=1e-6 * found.max())
+    for k, found in enumerate(marginal.antennas):
+        np.testing.assert_allclose(found, tree.marginalCovariance(A(k)), rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(marginal.w, tree.marginalCovariance(W(0)), rtol=1e-5, atol=1e-7)
