@@ -6,6 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from slamlib import slam
 from slamlib.dataset import AntennaGuess, Vehicle
 from slamlib.localization import drive_doubts
 from slamlib.simulation import simulate
@@ -74,6 +75,20 @@ FLAWS = {
     "wheelbase in mm": (vehicle(wheelbase=400.0), "units", "wheelbase in vehicle.toml"),
     "no counts": (wheels([[0, 0], [0, 0]]), "odometry", "encoderReading.txt"),
 }
+
+
+def test_turns_that_only_the_wheels_have_seen_are_doubted():
+    """Markers at both ends of two rounds: the heading there is known up to whole turns only."""
+    dataset, _ = simulate("long", 3, rounds=2)
+    pose = dataset.aruco.pose
+    ends = (pose < 600) | (pose > len(dataset.ticks) - 600)
+    found = slam.estimate(replace(dataset, aruco=dataset.aruco.select(ends), uwb=None))
+    doubt, = (doubt for doubt in found.drive_doubts if doubt.what == "turns")
+    seen = dataset.aruco.pose[ends]
+    assert f"Between poses {seen[seen < 600][-1] + 1} and {seen[seen > 600][0] + 1} " \
+        in doubt.sentence
+    whole = slam.estimate(simulate("short", 3)[0].without("uwb"))
+    assert "turns" not in {doubt.what for doubt in whole.drive_doubts}
 
 
 @pytest.mark.parametrize("flaw", FLAWS)

@@ -7,7 +7,7 @@ import pytest
 from slamlib import increments, odometry, se2, slam
 from slamlib.dataset import ArucoReadings, Dataset
 from slamlib.evaluation import anees, ate, nees_band
-from slamlib.localization import fuse, fuse_increments, fused, localize
+from slamlib.localization import fuse, fuse_increments, fused, hint, localize
 from slamlib.simulation import TABLE_2, simulate
 from slamlib.slam import interpolation
 
@@ -30,6 +30,22 @@ def test_sections_of_a_drive_have_no_seams(module, solve, monkeypatch):
     sections = solve(dataset)
     np.testing.assert_allclose(sections.poses, whole.poses, atol=1e-10)
     np.testing.assert_allclose(sections.covariances, whole.covariances, rtol=1e-7, atol=1e-14)
+
+
+@pytest.mark.parametrize("restarted, whole", [
+    (hint.equation2_from, odometry.equation2), (hint.first_order_from, odometry.first_order)])
+def test_restarted_propagation_is_that_of_every_part(restarted, whole):
+    dataset, _ = simulate("short", seed=3)
+    rng = np.random.default_rng(0)
+    start = np.array([0, 1, 40, 41, 500, 1990])
+    poses, root = rng.normal(0, 2, (len(start), 3)), rng.normal(0, 0.1, (len(start), 3, 3))
+    covariances = root @ np.swapaxes(root, 1, 2)
+    found = restarted(dataset.ticks, dataset.vehicle, start, poses, covariances)
+    for k, (begin, end) in enumerate(zip(start, [*start[1:], 1999])):
+        expected = whole(dataset.ticks[begin:end + 1], dataset.vehicle, poses[k], covariances[k])
+        for got, part in zip(found, expected):
+            np.testing.assert_allclose(got[begin + 1:end + 1], part[1:], atol=1e-9)
+    np.testing.assert_allclose(found[0][0], poses[0], atol=1e-12)
 
 
 def only(dataset, keep):

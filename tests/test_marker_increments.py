@@ -13,7 +13,13 @@ from slamlib.localization.marker_increments import (
     consecutive_increments,
     robust_increments,
 )
-from slamlib.sightings import Sightings, consensus, merge_repeated, sightings_by_frame
+from slamlib.sightings import (
+    Sightings,
+    consensus,
+    few_of_each,
+    merge_repeated,
+    sightings_by_frame,
+)
 
 DELTA = np.array([0.12, -0.03, 0.2])
 MARKERS = np.array([[1.2, 0.4, 0.3], [-0.7, 1.1, -2.9], [0.2, -1.3, 3.1], [-1.0, -0.8, 1.0]])
@@ -28,6 +34,22 @@ def sightings(delta=DELTA, markers=MARKERS, covariance=C, rng=None):
         z = z + rng.multivariate_normal(np.zeros(3), covariance, len(z))
     m = len(markers)
     return z, covariances, np.zeros(m, int), np.arange(m), np.arange(m, 2 * m)
+
+
+def test_the_consensus_of_many_sightings_takes_a_few_of_each_marker():
+    """Ids may be large; a third of the sightings of each marker are somewhere else."""
+    rng = np.random.default_rng(2)
+    marker = np.sort(rng.choice([10**14, 5, 7], 3000))
+    place = np.searchsorted([5, 7, 10**14], marker)[:, None] * [1.0, 2.0, 0.1]
+    in_world = place + rng.normal(0, 0.01, (3000, 3))
+    in_world[::3] += rng.normal(0, 5, (1000, 3))
+    rows = consensus(marker, in_world, np.broadcast_to(1e-4 * np.eye(3), (3000, 3, 3)))
+    assert marker[rows].tolist() == [5, 7, 10**14]
+    assert np.abs(in_world[rows] - place[rows]).max() < 0.1
+    label = np.searchsorted([5, 7, 10**14], marker)
+    few = few_of_each(label, 100)
+    assert np.bincount(label[few]).tolist() == [100, 100, 100]
+    assert few_of_each(label, 2000).tolist() == list(range(3000))
 
 
 def test_exact_sightings_give_the_exact_increment():

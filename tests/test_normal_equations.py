@@ -15,6 +15,7 @@ from slamlib.slam import drive_doubts, gtsam_graph, normal_equations, odometry_f
 from slamlib.slam.covariances import covariances
 from slamlib.slam.estimate import fit_from_odometry
 from slamlib.slam.evidence import solve
+from slamlib.slam.first_frames import first_frames
 from slamlib.slam.initialization import odometry_state, state_from_poses
 from slamlib.slam.measurement_factors import MeasurementFactors
 from slamlib.slam.measurements import measure
@@ -79,6 +80,31 @@ def test_selected_blocks_are_those_of_the_dense_inverse(poses):
         at = rows([len(m.frame) + j], len(block))[0]
         np.testing.assert_allclose(block / np.outer(sigma[at], sigma[at]), expected[np.ix_(at, at)],
                                    atol=1e-6)
+
+
+def test_the_first_frames_are_a_drive_of_their_own():
+    """Equal to the equations of the drive cut there, but for the rounding of the whole drive."""
+    dataset, _ = simulate("short", seed=4, mislabelled=0.02, late_ranges=0.2)
+    m = measure(dataset).calibrating()
+    weight = (np.arange(len(m.unit_weights)) % 7 > 0).astype(float)
+    problem = build(m, "arc", Noise(2e-3, 1.5, 0.7))
+    problem = replace(problem, measured=MeasurementFactors(m, weight, range_kernel=LATE_KERNEL))
+    state = odometry_state(m, "arc")
+    part = first_frames(NormalEquations(problem, state), 60)
+    cut = measure(dataset.first(int(m.frame[59]) + 1))
+    np.testing.assert_array_equal(part.problem.measurements.frame, cut.frame)
+    np.testing.assert_array_equal(part.problem.measurements.frame, m.frame[:60])
+    rows, kept = m.sightings.row < 60, m.ranges.row < 60
+    np.testing.assert_array_equal(part.problem.measurements.sightings.z, m.sightings.z[rows])
+    np.testing.assert_array_equal(part.problem.measured.weight, np.r_[
+        weight[:len(m.label)][rows], weight[len(m.label):][kept]])
+    whole = NormalEquations(problem, state)
+    np.testing.assert_allclose(part.factors[0].e,
+                               whole.factors[0].e[whole.factors[0].row < 60], rtol=1e-12)
+    np.testing.assert_allclose(part.factors[2].e,
+                               whole.factors[2].e[whole.factors[2].row < 60], rtol=1e-12)
+    assert np.isfinite(part.step()).all()
+    assert first_frames(whole, len(m.frame)) is whole
 
 
 def test_gates_are_quantiles_of_chi_squared():

@@ -23,6 +23,7 @@ Each stage makes the record of the next. The modules, in the order in which they
     5  trilateration        places of an antenna from its ranges
        initialization       Measurements -> State: the start values
     6  evidence             Problem, State -> evidence of every value of the noise
+       first_frames         of a drive of a million rows, what the noise is learned from
        noise_posterior      Problem, State -> the noise, and how well it is known
        fit                  Problem, State -> Fit: wheels, noise, accepted measurements, in turn
        model_choice         Fit -> Fit: arcs or Euler's steps

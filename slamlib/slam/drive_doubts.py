@@ -7,6 +7,7 @@ from slamlib.slam.noise import BOUNDS
 
 MAX_WHEEL_SIGMAS = 4.0       # of a wheel parameter from what vehicle.toml states
 SMALLEST_SIGMA = 1e-12       # m, of a wheel parameter that studies take as known
+MAX_TURN_SIGMA = np.pi / 3   # rad, between two frames; half a turn is three sigmas
 MAX_SLIP = 0.02              # sqrt(m), of wheels that merely slip
 MIN_GAIN = 6.0578, 8.8650    # log likelihood, of late sightings and of a place: the 99.95 %
                              # quantile of chi-squared with 1 and 3 degrees of freedom, halved
@@ -31,6 +32,24 @@ def drive_doubts(measurements, found):
             *(Doubt("antenna", f"Antenna {antenna} is in doubt: {reason}. Its covariance includes "
                                "this; look at its rows in UwbReading.txt.")
               for antenna, reason in found.doubts.items())]
+
+
+def turn_doubts(problem):
+    """Doubt where a Problem's wheels leave the turn between two frames open by whole turns.
+
+    By the wheels as vehicle.toml states them: those of a solution that lost a turn explain it.
+    """
+    odometry, frame = problem.odometry, problem.measurements.frame
+    variance = np.sum(odometry.by_w[:, 2]**2, axis=1) \
+        + odometry.noise(problem.noise.slip)[:, 2, 2]
+    if not len(variance) or np.sqrt(variance.max()) < MAX_TURN_SIGMA:
+        return []
+    k = int(variance.argmax())
+    return [Doubt("turns", (
+        f"Between poses {frame[k] + 1} and {frame[k + 1] + 1} only the wheels were measured, and "
+        f"they know the turn between them to {np.sqrt(variance[k]):.1f} rad (one standard "
+        "deviation): whole turns may be missing in the solution, and with them the path between "
+        "these poses is wrong."))]
 
 
 def geometry_doubts(vehicle, found):

@@ -56,9 +56,11 @@ def refine(problem, state, slip=None, accept=accepted, factors=odometry_factors)
     for _ in range(MAX_ROUNDS):
         problem = replace(problem, measured=measured, odometry=factors(m, model, state.w))
         if slip is None and changed > FEW * len(measured.weight):
-            near = optimize(problem, state, max_steps=2)
-            state, posterior = near.state, noise_posterior(near.equations)
+            optimum = None                                 # frees the equations before
+            optimum = optimize(problem, state, max_steps=2)
+            state, posterior = optimum.state, noise_posterior(optimum.equations)
             problem = replace(problem, noise=posterior.noise)
+        optimum = None
         optimum = optimize(problem, state)
         state = optimum.state
         measured = problem.measured if accept is None else accept(problem, state)

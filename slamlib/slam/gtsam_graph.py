@@ -29,17 +29,18 @@ def gtsam_step(problem, state):
     decomposition of its root then decides whether the measurements determine every variable; it
     raises DatasetError if they do not.
     """
-    m, linear = problem.measurements, linearize(problem, state)
+    linear, ordering = linearize(problem, state), problem.measurements.ordering
     try:
-        solution = linear.eliminateMultifrontal(m.ordering).optimize()
+        solution = linear.eliminateMultifrontal(ordering).optimize()
     except RuntimeError:
         try:
-            solution = linear.eliminateSequential(m.ordering, gtsam.EliminateQR).optimize()
+            solution = linear.eliminateSequential(ordering, gtsam.EliminateQR).optimize()
         except RuntimeError as error:             # GTSAM's, with the variable and much advice
+            m = problem.measurements
             raise DatasetError(
                 f"{m.dataset.name}: expected measurements that determine every pose and landmark; "
                 f"these do not determine {_variable(m, str(error))}") from None
-    return solution.vector(gtsam.KeyVector([m.ordering.at(i) for i in range(m.ordering.size())]))
+    return solution.vector(gtsam.KeyVector([ordering.at(i) for i in range(ordering.size())]))
 
 
 def linearize(problem, state):
@@ -70,17 +71,19 @@ def nonlinear_graph(problem):
     m, graph = problem.measurements, gtsam.NonlinearFactorGraph()
     s, weight = m.sightings, factors.sighting_weight * m.as_pose
     roots = m.sighting_roots[0] * (np.sqrt(weight) / noise.sightings)[:, None, None]
-    for k in np.flatnonzero(weight):
-        graph.add(gtsam.BetweenFactorPose2(
-            X(int(s.row[k])), L(int(m.label[k])), gtsam.Pose2(*s.z[k]),
-            _robust(factors.sighting_kernel, model.Gaussian.SqrtInformation(roots[k], False))))
+    used = np.flatnonzero(weight)
+    for i, j, z, root in zip(s.row[used].tolist(), m.label[used].tolist(), s.z[used].tolist(),
+                             roots[used]):
+        graph.add(gtsam.BetweenFactorPose2(X(i), L(j), gtsam.Pose2(*z), _robust(
+            factors.sighting_kernel, model.Gaussian.SqrtInformation(root, False))))
     if not m.calibrated:
         sigma = noise.ranges * m.ranges.sigma
-        for k in np.flatnonzero(factors.range_weight):
-            graph.add(gtsam.RangeFactor2D(
-                X(int(m.ranges.row[k])), A(int(m.ranges.antenna[k])), m.ranges.distance[k],
-                _robust(factors.range_kernel, model.Isotropic.Sigma(
-                    1, sigma[k] / np.sqrt(factors.range_weight[k])))))
+        used, r = np.flatnonzero(factors.range_weight), m.ranges
+        sigma = sigma[used] / np.sqrt(factors.range_weight[used])
+        for i, k, distance, own in zip(r.row[used].tolist(), r.antenna[used].tolist(),
+                                       r.distance[used].tolist(), sigma.tolist()):
+            graph.add(gtsam.RangeFactor2D(X(i), A(k), distance, _robust(
+                factors.range_kernel, model.Isotropic.Sigma(1, own))))
     _add_priors(graph, factors)
     return graph
 
@@ -109,7 +112,7 @@ def _robust(kernel, noise):
 def values(measurements, state):
     """The gtsam.Values of a State."""
     found = gtsam.Values()
-    for i, pose in enumerate(state.poses):
+    for i, pose in enumerate(state.poses.tolist()):
         found.insert(X(i), gtsam.Pose2(*pose))
     for j, (marker, oriented) in enumerate(zip(state.markers, measurements.oriented)):
         if oriented:

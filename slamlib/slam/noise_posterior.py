@@ -13,12 +13,14 @@ from itertools import combinations
 import numpy as np
 
 from slamlib.slam.evidence import solve
+from slamlib.slam.first_frames import first_frames
 from slamlib.slam.noise import BOUNDS, MEDIAN, PRIOR_SIGMA, Noise, from_logarithms, log_prior
 
 MAX_DIFFERENCE = 0.2         # of the logarithms, over which derivatives are taken
 MIN_DIFFERENCE = 0.003
 MAX_STEP = 1.5               # of Newton's method
 MAX_STEPS = 12
+MANY_FRAMES = 20_000         # of a longer drive, the first ones teach the noise: to about 1 %
 GAIN = 0.01                  # log posterior of a step at which Newton's method ends
 ACROSS = 1.5 * np.arange(-2, 3)      # sigmas of log slip, points at which the posterior is summed
 NARROW = 0.2                 # sigma of log slip below which one point is enough
@@ -38,6 +40,7 @@ class NoisePosterior:
 
 def noise_posterior(equations):
     """The NoisePosterior by NormalEquations near a problem's solution; starts from its noise."""
+    equations = first_frames(equations, MANY_FRAMES)
     log_posterior, start, free = _log_posterior(equations)
     value = log_posterior(start)
     if value < IMPOSSIBLE / 2:                           # singular to rounding: nothing is learned
@@ -52,7 +55,7 @@ def noise_posterior(equations):
 
 def density(equations):
     """The log density of the noise that the equations' problem has, up to a constant."""
-    log_posterior, noise, _ = _log_posterior(equations)
+    log_posterior, noise, _ = _log_posterior(first_frames(equations, MANY_FRAMES))
     return log_posterior(noise)
 
 
@@ -61,7 +64,7 @@ def greatest_density(equations, posterior):
 
     `posterior` is the NoisePosterior of nearly the same equations.
     """
-    log_posterior, start, free = _log_posterior(equations)
+    log_posterior, start, free = _log_posterior(first_frames(equations, MANY_FRAMES))
     covariance = posterior.covariance[np.ix_(free, free)]
     information = np.linalg.inv(covariance)
     scale = np.sqrt(np.diag(information))

@@ -36,24 +36,26 @@ class Optimum:
         return self.equations.error
 
 
-def optimize(problem, state, max_steps=MAX_STEPS, converged=CONVERGED, by_gtsam=False):
-    """The Optimum from a State; it ends after a relative decrease of the error of `converged`.
+def optimize(problem, state, max_steps=MAX_STEPS, by_gtsam=False):
+    """The Optimum from a State.
 
     Raises DatasetError where the measurements do not determine every variable.
     """
-    m, equations, steps, ended = problem.measurements, NormalEquations(problem, state), 0, False
+    equations, steps, ended = NormalEquations(problem, state), 0, False
     while steps < max_steps and not ended:
         steps += 1
+        state, error = equations.state, equations.error
         step = None if by_gtsam else equations.step()
+        equations = None                                   # of a long drive they are large
         if step is None:
-            step = gtsam_step(problem, equations.state)
+            step = gtsam_step(problem, state)
         for _ in range(MAX_HALVINGS):
-            tried = NormalEquations(problem, moved(m, equations.state, step))
-            if tried.error <= (1 + ROUNDING) * equations.error:
+            equations = NormalEquations(problem, moved(problem.measurements, state, step))
+            if equations.error <= (1 + ROUNDING) * error:
                 break
             step = step / 2
         else:
+            equations = NormalEquations(problem, state)
             break
-        ended = equations.error - tried.error <= converged * (1 + equations.error)
-        equations = tried
+        ended = error - equations.error <= CONVERGED * (1 + error)
     return Optimum(equations, steps)

@@ -7,7 +7,7 @@ import numpy as np
 from slamlib import se2
 from slamlib.slam.camera_offsets import CameraOffsets, camera_offsets
 from slamlib.slam.doubts import antenna_doubts
-from slamlib.slam.drive_doubts import drive_doubts
+from slamlib.slam.drive_doubts import drive_doubts, turn_doubts
 from slamlib.slam.interpolation import interpolate
 from slamlib.slam.linear_factors import linear_factors
 from slamlib.slam.measurement_factors import MeasurementFactors, residuals
@@ -94,7 +94,7 @@ def result(fit):
         chi2_per_dof_of_all=chi2_per_dof(problem, state, m.unit_weights),
         rejected=~accepted, residual=residual,
         range_weight=range_weight, range_residual=range_residual)
-    return replace(found, drive_doubts=tuple(drive_doubts(m, found)))
+    return replace(found, drive_doubts=(*drive_doubts(m, found), *turn_doubts(problem)))
 
 
 def _mapped(problem, blocks):

@@ -16,7 +16,6 @@ from slamlib.slam.noise import Noise
 from slamlib.slam.optimizer import optimize
 
 CAUCHY_SCALES = (100.0, 30.0, 10.0, 3.0)     # sigmas, scale of the kernel in each round
-NEAR = 1e-3                  # relative decrease of the error at which a round ends
 FEW = 20                     # measurements, below which their scatter gives no factor
 EARLY_GATE = 3.3             # sigmas; a range that is shorter than expected by more is rejected
 
@@ -36,7 +35,7 @@ def narrow_kernels(problem, state, scales=CAUCHY_SCALES, learn=True):
     for scale in scales:
         cauchy = _kernel.Cauchy.Create(scale)
         measured = MeasurementFactors(m, m.unit_weights, cauchy, cauchy)
-        state = optimize(replace(problem, measured=measured), state, converged=NEAR).state
+        state = optimize(replace(problem, measured=measured), state).state
         if learn:
             problem = replace(problem, noise=noise_of_scatter(m, state))
     return state

@@ -1,18 +1,10 @@
-"""Problems 3 and 4 compared with a plain GTSAM script: error, time and memory.
+"""Errors of problem 3 beside a plain GTSAM script, and of the kernels for late ranges.
 
-    python tests/benchmarks/slam.py [ROWS]
-
-ROWS is the largest number of encoder rows of the longer drives.
+    python tests/benchmarks/slam.py [large]
 """
 
-import json
-import multiprocessing
 import os
-import resource
-import subprocess
 import sys
-import tempfile
-import time
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -24,15 +16,12 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from plain_gtsam import plain  # noqa: E402
 
-from slamlib import slam, studies  # noqa: E402
-from slamlib.dataset import read_dataset  # noqa: E402
+from slamlib import studies  # noqa: E402
 from slamlib.evaluation import ate, nees_band  # noqa: E402
 from slamlib.simulation import simulate  # noqa: E402
 from slamlib.studies import kernels, montecarlo  # noqa: E402
 
-SEEDS = range(20)
-TIME_LIMIT = 900             # s, for one solution of one problem
-LONG = Path(__file__).parents[2] / "data" / "long"
+SEEDS = range(8)
 
 
 def trial(seed, slip):
@@ -44,52 +33,7 @@ def trial(seed, slip):
             numbers["nees"])
 
 
-def drive(rounds):
-    """The Dataset data/long (0), or that of a simulated long path driven so many times."""
-    return read_dataset(LONG) if rounds == 0 else simulate("long", 3, rounds=rounds)[0]
-
-
-def measure(rounds, problem, script):
-    """Time in s, peak memory in MB beyond the data, and encoder rows of one solution.
-
-    Parameters
-    ----------
-    rounds : as of `drive`.
-    problem : 3 or 4.
-    script : "slamlib" or "plain".
-    """
-    dataset = drive(rounds) if problem == 4 else drive(rounds).without("uwb")
-    previous = (slam.estimate(dataset.without("uwb"))
-                if (problem, script) == (4, "slamlib") else None)
-    before, start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.perf_counter()
-    if script == "plain":
-        plain(dataset)
-    else:
-        slam.estimate(dataset, previous=previous)
-    seconds = time.perf_counter() - start
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return seconds, (peak - before) / 1024, len(dataset.ticks)
-
-
-def alone(*arguments):
-    """measure(*arguments) in a process of its own, or None after TIME_LIMIT."""
-    context = multiprocessing.get_context("spawn")
-    ours, theirs = context.Pipe()
-    process = context.Process(target=_send, args=(theirs, *arguments))
-    process.start()
-    done = ours.poll(TIME_LIMIT)
-    if not done:
-        process.kill()
-    result = ours.recv() if done else None
-    process.join()
-    return result
-
-
-def _send(pipe, *arguments):
-    pipe.send(measure(*arguments))
-
-
-def errors(seeds=SEEDS):
+def errors(seeds):
     """Print the errors of problem 3, with slamlib and plain."""
     low, high = nees_band(len(seeds))
     print(f"Problem 3: rms of the aligned ATE over {len(seeds)} drives of the short path, "
@@ -102,64 +46,26 @@ def errors(seeds=SEEDS):
               f"{runs[:, 3].mean():8.2f}")
 
 
-def compare_kernels(seeds=range(12)):
-    """Print the errors, NEES and times of the kernels for late ranges."""
+def compare_kernels(seeds):
+    """Print the errors and NEES of the kernels for late ranges."""
     print(f"\nProblem 4 without markers: late ranges, {len(seeds)} drives of the short path")
     for late in (0.0, 0.05, 0.15, 0.30):
         runs = studies.run(kernels.late_ranges, seeds, markers=False, late_ranges=late)
         print(f"{100 * late:.0f} % late{'':12}{'ATE (mm)':>10}{'NEES':>8}{'antennas (mm)':>15}"
-              f"{'NEES':>8}{'seconds':>9}")
+              f"{'NEES':>8}")
         for way in kernels.RANGES:
             of = {key: runs[f"{way} {key}"]
-                  for key in ("ate", "nees", "antenna error", "antenna nees", "seconds")}
+                  for key in ("ate", "nees", "antenna error", "antenna nees")}
             print(f"  {way:18}{1e3 * np.sqrt(np.mean(of['ate']**2)):10.1f}"
                   f"{of['nees'].mean():8.2f}"
                   f"{1e3 * np.sqrt(np.mean(of['antenna error']**2)):15.1f}"
-                  f"{of['antenna nees'].mean():8.2f}{of['seconds'].mean():9.2f}")
+                  f"{of['antenna nees'].mean():8.2f}")
 
 
-def growth(largest):
-    """Print time and memory against the length of the drive, up to `largest` encoder rows."""
-    print("\nProblems 3 and 4 (after 3), each in its own process: seconds and MB beyond the data")
-    print(f"{'rows':>11}{'problem':>9}{'slamlib':>10}{'MB':>7}{'plain':>9}{'MB':>7}{'ratio':>8}"
-          f"{'ms a row':>10}")
-    for rounds in [0] * LONG.exists() + [r for r in (1, 4, 43) if 23_000 * r <= largest]:
-        for problem in (3, 4):
-            ours, memory, rows = alone(rounds, problem, "slamlib")
-            plain_alone = alone(rounds, problem, "plain")
-            theirs, their_memory, _ = plain_alone or (TIME_LIMIT, np.nan, rows)
-            print(f"{rows:11,}{problem:9}{ours:10.1f}{memory:7.0f}{'' if plain_alone else '>':>2}"
-                  f"{theirs:7.1f}{their_memory:7.0f}{'' if plain_alone else '<':>2}"
-                  f"{ours / theirs:6.2f}{1e3 * ours / rows:10.3f}", flush=True)
-
-
-def whole():
-    """Print the time of `slamlib solve`, all problems, and of the plain script, problem 4."""
-    with tempfile.TemporaryDirectory() as out:
-        start = time.perf_counter()
-        subprocess.run([sys.executable, "-m", "slamlib", "solve", LONG, "--out", out], check=True,
-                       stdout=subprocess.DEVNULL)
-        ours = time.perf_counter() - start
-        problems = json.loads(Path(out, "summary.json").read_text())["problems"]
-    start = time.perf_counter()
-    program = ("import sys; sys.path.insert(0, sys.argv[1]); from plain_gtsam import plain; "
-               "from slamlib.dataset import read_dataset; plain(read_dataset(sys.argv[2]))")
-    subprocess.run([sys.executable, "-c", program, str(Path(__file__).parent), LONG], check=True)
-    theirs = time.perf_counter() - start
-    print(f"\nsolve {LONG.name}, whole process: {ours:.1f} s; plain script, problem 4, "
-          f"whole process: {theirs:.1f} s; ratio {ours / theirs:.2f}")
-    parts = {name: row["seconds"] for name, row in problems.items()}
-    parts["start, reading, writing"] = ours - sum(parts.values())
-    print("\n".join(f"  {name:25}{seconds:6.1f} s" for name, seconds in parts.items()))
-
-
-def main(largest=100_000):
-    errors()
-    compare_kernels()
-    if LONG.exists():
-        whole()
-    growth(largest)
+def main(seeds):
+    errors(seeds)
+    compare_kernels(seeds)
 
 
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:]))
+    main(range(20) if "large" in sys.argv[1:] else SEEDS)

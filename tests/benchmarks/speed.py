@@ -1,0 +1,133 @@
+"""Time and memory of `slamlib solve`, beside a plain script, and by length and shape of a drive.
+
+    python tests/benchmarks/speed.py [large]
+
+With `large` the plain script runs on the longer drives too, which takes a quarter of an hour.
+"""
+
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+
+from slamlib import simulation
+from slamlib.simulation import simulate, write_dataset
+from slamlib.solve import PROBLEMS
+
+HERE, LONG = Path(__file__).parent, Path(__file__).parents[2] / "data" / "long"
+PAIRS = 5                    # runs of `solve` and of the plain script, in turn
+ROUNDS = (1, 4, 44)          # of the long path: 23,000, 92,000 and 1,012,000 rows
+PLAIN = """
+import sys, time
+sys.path.insert(0, sys.argv[1])
+from plain_gtsam import plain
+from slamlib.dataset import read_dataset
+dataset = read_dataset(sys.argv[2])
+start = time.perf_counter()
+plain(dataset)
+print(time.perf_counter() - start)
+"""
+
+
+def solve(folder):
+    """Seconds of `slamlib solve` on a folder, those of each problem (dict), and peak memory, MB."""
+    with tempfile.TemporaryDirectory() as out:
+        start = time.perf_counter()
+        process = subprocess.Popen([sys.executable, "-m", "slamlib", "solve", folder, "--out", out],
+                                   stdout=subprocess.DEVNULL)
+        _, status, used = os.wait4(process.pid, 0)
+        seconds = time.perf_counter() - start
+        if status:
+            raise RuntimeError(f"solve failed on {folder}")
+        rows = json.loads(Path(out, "summary.json").read_text())["problems"]
+    return seconds, {name: row["seconds"] for name, row in rows.items()}, used.ru_maxrss / 1024
+
+
+def plain(folder):
+    """Seconds of the plain script's problem 4, without reading, and of its whole process."""
+    start = time.perf_counter()
+    printed = subprocess.run([sys.executable, "-c", PLAIN, HERE, folder], check=True,
+                             capture_output=True, text=True).stdout
+    return float(printed), time.perf_counter() - start
+
+
+def pairs(count=PAIRS):
+    """Print the times of `solve` and of the plain script on data/long, one after the other."""
+    print(f"solve {LONG.name}, all problems, whole process, beside the plain script's problem 4")
+    print(f"{'load':>6}{'solve (s)':>12}{'plain (s)':>12}{'ratio':>8}{'whole process (s)':>20}"
+          f"{'ratio':>8}")
+    ratios = []
+    for _ in range(count):
+        load = os.getloadavg()[0]
+        (ours, parts, _), (theirs, whole) = solve(LONG), plain(LONG)
+        ratios.append(ours / theirs)
+        print(f"{load:6.2f}{ours:12.2f}{theirs:12.2f}{ours / theirs:8.2f}{whole:20.2f}"
+              f"{ours / whole:8.2f}", flush=True)
+    print(f"median ratio {np.median(ratios):.2f}; of the last run: " + ", ".join(
+        f"{name} {seconds:.2f} s" for name, seconds in parts.items())
+        + " (problem 2 in a second process, where there is a second core)")
+
+
+def growth(folder, large):
+    """Print times and memory by the length of the drive."""
+    print("\nThe long path driven several times: seconds of each problem, and of all")
+    print(f"{'rows':>10}" + "".join(f"{name.removeprefix('problem'):>9}" for name in PROBLEMS)
+          + f"{'solve':>9}{'ms/1000':>10}{'MB':>7}{'plain 4':>9}")
+    for rounds in ROUNDS:
+        drive = folder / f"{rounds} rounds"
+        dataset, _ = simulate("long", 3, rounds=rounds)
+        rows = len(dataset.ticks)
+        write_dataset(drive, dataset)
+        del dataset
+        seconds, parts, memory = solve(drive)
+        beside = f"{plain(drive)[0]:9.1f}" if large or rounds < max(ROUNDS) else f"{'–':>9}"
+        print(f"{rows:10,}" + "".join(f"{parts[name]:9.2f}" for name in PROBLEMS)
+              + f"{seconds:9.1f}{1e6 * seconds / rows:10.0f}{memory:7.0f}{beside}", flush=True)
+
+
+def shapes(folder):
+    """Print times of drives that are no closed loops, beside a loop of about as many rows."""
+    print("\nDrives of other shapes, whole process")
+    print(f"{'drive':34}{'rows':>9}{'solve (s)':>11}{'ms/1000':>9}")
+    simulation.PATHS["corridor"] = replace_path(vectors=((1, 200.0, 0.0),), poses=125_664)
+    corridor = simulate("corridor", 5)[0].first(10_000)
+    ends = simulate("long", 3, rounds=2)[0]
+    outside = (ends.aruco.pose < 600) | (ends.aruco.pose > len(ends.ticks) - 600)
+    drives = {"closed loop, five rounds of 20 m": simulate("short", 3, rounds=5)[0],
+              "corridor of 100 m": corridor,
+              "closed loop of 230 m, two rounds": simulate("long", 3, rounds=2)[0],
+              "the same, markers at both ends only": replace(
+                  ends, aruco=ends.aruco.select(outside), uwb=None)}
+    for name, dataset in drives.items():
+        write_dataset(folder / name, dataset)
+        seconds, _, _ = solve(folder / name)
+        print(f"{name:34}{len(dataset.ticks):9,}{seconds:11.2f}"
+              f"{1e6 * seconds / len(dataset.ticks):9.0f}", flush=True)
+
+
+def replace_path(**changes):
+    """The long path of the simulator with changes."""
+    return SimpleNamespace(**vars(simulation.PATHS["long"]) | {"markers_missing": None} | changes)
+
+
+def main(large=False):
+    print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.2f} before")
+    if LONG.exists():
+        pairs()
+    with tempfile.TemporaryDirectory() as folder:
+        shapes(Path(folder))
+        growth(Path(folder), large)
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(f"load {os.getloadavg()[0]:.2f} after; {memory:.0f} MB for making the drives")
+
+
+if __name__ == "__main__":
+    main("large" in sys.argv[1:])
