@@ -207,9 +207,10 @@ def solutions(dataset, found=None, problems=tuple(PROBLEMS)):
         if not allows(dataset, problem):
             continue
         try:
-            if problem not in found:
-                found[problem] = find(problem, dataset, found)
-            yield SOLUTIONS[problem](dataset, found[problem])
+            result = found[problem] if problem in found else find(problem, dataset, found)
+            if problem == "problem3":                    # from which problem 4 starts
+                found[problem] = result
+            yield SOLUTIONS[problem](dataset, result)
         except UNSOLVABLE as error:
             yield failure(problem, dataset, error)
 

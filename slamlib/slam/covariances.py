@@ -67,8 +67,9 @@ def selected_inverse(H, frames, pairs, blocks):
     of_blocks, block_at = [None] * len(blocks), np.full(H.shape[0], -1)
     block_at[[rows[0] for rows in blocks]] = np.arange(len(blocks))
 
-    def downward(part, front_covariance):
-        """Fill in what is asked for of a _Part, from the covariance of its front."""
+    below = [(_eliminated(graph, 0, len(graph.separators) - 1), np.zeros((0, 0)))]
+    while below:                                        # parts, and the covariances of their fronts
+        part, front_covariance = below.pop()
         cross = -part.W @ front_covariance
         joint = np.block([[part.inverse - cross @ part.W.T, cross], [cross.T, front_covariance]])
         with _places(graph.local, part.rows, part.front) as local:
@@ -78,11 +79,9 @@ def selected_inverse(H, frames, pairs, blocks):
             for number in block_at[part.rows][block_at[part.rows] >= 0].tolist():
                 at = local[blocks[number]]
                 of_blocks[number] = joint[at[:, None], at]
-            fronts = [local[each.front] for each in part.parts]
-        for each, at in zip(part.parts, fronts):
-            downward(each, joint[at[:, None], at])
-
-    downward(_eliminated(graph, 0, len(graph.separators) - 1), np.zeros((0, 0)))
+            for each in part.parts:
+                at = local[each.front]
+                below.append((each, joint[at[:, None], at]))
     return of_pairs, of_blocks
 
 
