@@ -1,7 +1,9 @@
 """All problems of a dataset solved into a folder, with a summary of plain numbers."""
 
+import ctypes
 import json
 import os
+import signal
 import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
@@ -24,6 +26,7 @@ from slamlib.solve import (
     write,
 )
 
+PR_SET_PDEATHSIG = 1                                           # Linux, prctl(2)
 BESIDES = ("problem2", "problem2_hint", "problem2_fused")      # nothing else depends on them
 
 
@@ -65,7 +68,8 @@ def _solved(dataset, jobs):
         yield from _timed(dataset, PROBLEMS)
         return
     others = [problem for problem in PROBLEMS if problem not in BESIDES]
-    with ProcessPoolExecutor(1, mp_context=get_context("fork")) as pool:
+    with ProcessPoolExecutor(1, mp_context=get_context("fork"), initializer=_ends_with,
+                             initargs=(os.getpid(),)) as pool:
         besides = pool.submit(_listed, dataset)
         yield from _timed(dataset, others)
         try:
@@ -73,6 +77,13 @@ def _solved(dataset, jobs):
         except BrokenProcessPool:                       # killed, as where memory is short
             found = _listed(dataset)
         yield from found
+
+
+def _ends_with(parent):
+    """Let the kernel end this process when `parent` (process id) is gone, however it ended."""
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:                          # gone already
+        os._exit(1)
 
 
 def _listed(dataset):

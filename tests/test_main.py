@@ -2,8 +2,10 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -88,6 +90,32 @@ def test_a_second_process_that_is_killed_costs_time_only(tmp_path, monkeypatch):
     rows = solve_to_folder(dataset.first(300), None, tmp_path, jobs=2)["problems"]
     assert list(rows) == list(solve.PROBLEMS)
     assert not any("failed" in row for row in rows.values())
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux forks safely")
+@pytest.mark.parametrize("end", [signal.SIGTERM, signal.SIGKILL])
+def test_no_process_survives_a_solve_that_is_killed(end, tmp_path):
+    write_dataset(tmp_path / "drive", simulate("long", 3)[0])
+    process = subprocess.Popen([sys.executable, "-m", "slamlib", "solve", "drive", "--out", "out"],
+                               cwd=tmp_path)
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+    until = time.monotonic() + 60
+    while not (found := children.read_text().split()) and time.monotonic() < until:
+        time.sleep(0.02)
+    process.send_signal(end)
+    process.wait()
+    assert len(found) == 1
+    while running(found[0]) and time.monotonic() < until:
+        time.sleep(0.02)
+    assert not running(found[0])
+
+
+def running(process):
+    """True unless a process is gone, or waits to be buried."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
 
 
 def test_bad_data_is_one_sentence_and_exit_code_2_and_writes_nothing(tmp_path):

@@ -8,10 +8,17 @@ import pytest
 from gtsam.symbol_shorthand import A, L, W, X
 from scipy.special import chdtri
 
-from slamlib import sightings
+from slamlib import sightings, slam
 from slamlib.localization import doubts
 from slamlib.simulation import simulate
-from slamlib.slam import drive_doubts, gtsam_graph, normal_equations, odometry_factors
+from slamlib.slam import (
+    drive_doubts,
+    gtsam_graph,
+    noise_posterior,
+    normal_equations,
+    odometry_factors,
+)
+from slamlib.slam import first_frames as first_frames_module
 from slamlib.slam.covariances import covariances
 from slamlib.slam.estimate import fit_from_odometry
 from slamlib.slam.evidence import solve
@@ -82,7 +89,7 @@ def test_selected_blocks_are_those_of_the_dense_inverse(poses):
                                    atol=1e-6)
 
 
-def test_the_first_frames_are_a_drive_of_their_own():
+def test_the_first_frames_are_a_drive_of_their_own(monkeypatch):
     """Equal to the equations of the drive cut there, but for the rounding of the whole drive."""
     dataset, _ = simulate("short", seed=4, mislabelled=0.02, late_ranges=0.2)
     m = measure(dataset).calibrating()
@@ -90,6 +97,7 @@ def test_the_first_frames_are_a_drive_of_their_own():
     problem = build(m, "arc", Noise(2e-3, 1.5, 0.7))
     problem = replace(problem, measured=MeasurementFactors(m, weight, range_kernel=LATE_KERNEL))
     state = odometry_state(m, "arc")
+    monkeypatch.setattr(first_frames_module, "ENOUGH", 50)
     part = first_frames(NormalEquations(problem, state), 60)
     cut = measure(dataset.first(int(m.frame[59]) + 1))
     np.testing.assert_array_equal(part.problem.measurements.frame, cut.frame)
@@ -105,6 +113,20 @@ def test_the_first_frames_are_a_drive_of_their_own():
                                whole.factors[2].e[whole.factors[2].row < 60], rtol=1e-12)
     assert np.isfinite(part.step()).all()
     assert first_frames(whole, len(m.frame)) is whole
+    monkeypatch.undo()
+    assert first_frames(whole, 60) is whole                          # too few ranges there
+
+
+def test_noise_of_a_sensor_that_starts_late_is_learned(monkeypatch):
+    """Sigmas of sightings that are six times too small; the first frames have ranges only."""
+    dataset, _ = simulate("short", 2)
+    aruco = dataset.aruco.select(dataset.aruco.pose > 1000)
+    dataset = replace(dataset, aruco=replace(aruco, covariance=aruco.covariance / 36))
+    whole = slam.estimate(dataset)
+    monkeypatch.setattr(noise_posterior, "MANY_FRAMES", 40)
+    found = slam.estimate(dataset)
+    assert np.isclose(found.noise.sightings, whole.noise.sightings, rtol=1e-3)
+    assert 5 < found.noise.sightings < 7 and found.rejected.mean() < 0.02
 
 
 def test_gates_are_quantiles_of_chi_squared():

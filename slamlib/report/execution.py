@@ -111,8 +111,15 @@ async def _execute_all(books, environment, results, jobs, finish):
 async def _watch(told, bar):
     """Show on the bar what the notebooks' studies tell in the files of a folder."""
     while not bar.disable:
-        bar.set_postfix_str(", ".join(file.read_text() for file in sorted(told.iterdir())))
+        bar.set_postfix_str(", ".join(filter(None, map(_text, sorted(told.iterdir())))))
         await asyncio.sleep(POLL)
+
+
+def _text(file):
+    try:
+        return file.read_text()
+    except FileNotFoundError:  # the study has ended meanwhile
+        return ""
 
 
 def _count_code_cells(book):

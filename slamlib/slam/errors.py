@@ -1,9 +1,7 @@
 """Stage 2: errors of the factors and their derivatives in numpy, all factors of a kind at once.
 
 Derivatives are by GTSAM's tangent vectors: a pose X moves as X exp(xi), in its own axes. GTSAM has
-the same errors in BetweenFactorPose2 and RangeFactor2D; tests compare them. These here serve the
-odometry, whose measurement depends on the wheels, the points, which GTSAM lacks, and the
-covariances.
+the same errors in BetweenFactorPose2 and RangeFactor2D; tests compare them.
 """
 
 import numpy as np

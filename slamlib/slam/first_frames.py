@@ -7,16 +7,22 @@ import numpy as np
 from slamlib.slam.measurements import measure
 from slamlib.slam.normal_equations import NormalEquations
 
+ENOUGH = 5000                # measurements of a sensor that show the factor on its sigmas to 1 %
 
 def first_frames(equations, count):
-    """The NormalEquations of what was measured at the first `count` frames; all if there are fewer.
+    """The NormalEquations of what was measured at the first `count` frames.
 
     Odometry keeps its share of the rounding of the whole drive, and every measurement its weight.
+    The result is `equations` itself if there are fewer frames, or if the first ones have less than
+    ENOUGH of the sightings or ranges that the drive has.
     """
     problem, state, m = equations.problem, equations.state, equations.problem.measurements
     if len(m.frame) <= count:
         return equations
     part = measure(m.dataset.first(int(m.frame[count - 1]) + 1))
+    if len(part.label) < min(ENOUGH, len(m.label)) \
+            or len(part.ranges.row) < min(ENOUGH, len(m.ranges.row)):
+        return equations
     markers, antennas = (np.searchsorted(all_of_them, own) for all_of_them, own in (
         (m.marker, part.marker), (m.antenna, part.antenna)))
     part = replace(part, oriented=m.oriented[markers], calibrated=m.calibrated)

@@ -45,6 +45,6 @@ def _log_density(equations, posterior, is_greatest=False):
 
     It is that of the equations' own noise if it `is_greatest` there.
     """
-    if posterior is None:
+    if posterior is None or not posterior.covariance.any():          # given, or not to be learned
         return solve(equations, equations.problem.noise)[1]
     return density(equations) if is_greatest else greatest_density(equations, posterior)

@@ -57,6 +57,8 @@ def _compute(trial, name, seeds, options, threads, jobs, progress):
         rows.append(row)
         if told:
             Path(told).write_text(f"{trial.__name__} {len(rows)} of {len(seeds)}")
+    if told:
+        Path(told).unlink(missing_ok=True)
     return {key: np.array([row[key] for row in rows]) for key in rows[0]}
 
 
