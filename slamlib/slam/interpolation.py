@@ -1,7 +1,5 @@
 """Stage 7: every encoder pose between the frames, conditioned on its two neighbours."""
 
-from concurrent.futures import ThreadPoolExecutor
-
 import numpy as np
 
 from slamlib import increments, se2
@@ -23,15 +21,11 @@ def interpolate(problem, state, pairs):
     if not len(pairs):                                       # pose 1 alone: the world's origin
         return state.poses.copy(), np.diag(problem.measurements.origin_sigma)[None]**2
     poses, covariances = np.empty((count, 3)), np.empty((count, 3, 3))
-
-    def fill(first):
+    for first in range(0, len(pairs), AT_ONCE):
         rows = slice(first, min(first + AT_ONCE, len(pairs)) + 1)          # of frames
-        own = slice(frame[rows][0], frame[rows][-1] + (rows.stop > len(pairs)))   # without the next
-        poses[own], covariances[own] = (each[:own.stop - own.start] for each in _section(
-            problem, state.poses[rows], state.w, frame[rows], pairs[rows.start:rows.stop - 1]))
-
-    with ThreadPoolExecutor(2) as pool:
-        list(pool.map(fill, range(0, len(pairs), AT_ONCE)))
+        own = slice(frame[rows][0], frame[rows][-1] + 1)                   # shares its ends
+        poses[own], covariances[own] = _section(
+            problem, state.poses[rows], state.w, frame[rows], pairs[rows.start:rows.stop - 1])
     return poses, covariances
 
 

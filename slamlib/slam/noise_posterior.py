@@ -6,7 +6,6 @@ of it (integrated nested Laplace approximation: Rue, Martino and Chopin, J. R. S
 2009), so that every slip that is possible widens the covariance by its probability.
 """
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -129,8 +128,7 @@ def _differences(function, x, value, free, steps, correlation=None):
     offsets = [*unit, *-unit]
     if correlation is None:
         offsets += [unit[i] + unit[j] for i, j in pairs]
-    with ThreadPoolExecutor(2) as pool:          # the sparse decomposition lets other threads run
-        values = np.array(list(pool.map(lambda off: function(_moved(x, free, off)), offsets)))
+    values = np.array([function(_moved(x, free, off)) for off in offsets])
     up, down, both = np.split(values, [len(free), 2 * len(free)])
     gradient, hessian = (up - down) / (2 * steps), np.diag((up + down - 2 * value) / steps**2)
     if correlation is not None:

@@ -7,7 +7,6 @@ the ranges on their factors alone. Each value of the noise then costs one sparse
 
 from dataclasses import dataclass
 from functools import cached_property
-from threading import Lock
 
 import numpy as np
 from scipy.sparse.linalg import splu
@@ -99,21 +98,20 @@ class NormalEquations:
 
     def _odometry_sums(self, slip):
         """`sums` of the odometry alone; those of the last slips are kept."""
-        kept, lock = self._kept_sums
-        with lock:                                         # threads may ask for the same slip
-            if slip not in kept:
-                if len(kept) == KEPT:
-                    del kept[next(iter(kept))]
-                e, J = self._odometry
-                U, log_determinant = self.problem.odometry.whitening(slip)
-                J, e = U @ J, (U @ e[..., None])[..., 0]
-                own = _group(self.structure, *self.problem.measurements.placed[0], J, e)
-                kept[slip] = own.H, own.g, own.squared, log_determinant
-            return kept[slip]
+        kept = self._kept_sums
+        if slip not in kept:
+            if len(kept) == KEPT:
+                del kept[next(iter(kept))]
+            e, J = self._odometry
+            U, log_determinant = self.problem.odometry.whitening(slip)
+            J, e = U @ J, (U @ e[..., None])[..., 0]
+            own = _group(self.structure, *self.problem.measurements.placed[0], J, e)
+            kept[slip] = own.H, own.g, own.squared, log_determinant
+        return kept[slip]
 
     @cached_property
     def _kept_sums(self):
-        return {}, Lock()
+        return {}
 
     @cached_property
     def _priors(self):
