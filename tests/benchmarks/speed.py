@@ -7,7 +7,6 @@ With `large` the plain script runs on the longer drives too, which takes a quart
 
 import json
 import os
-import resource
 import subprocess
 import sys
 import tempfile
@@ -83,12 +82,11 @@ def growth(folder, large):
           + f"{'solve':>9}{'ms/1000':>10}{'MB':>7}{'plain 4':>9}")
     for rounds in ROUNDS:
         drive = folder / f"{rounds} rounds"
-        dataset, _ = simulate("long", 3, rounds=rounds)
-        rows = len(dataset.ticks)
-        write_dataset(drive, dataset)
-        del dataset
+        subprocess.run([sys.executable, "-m", "slamlib", "simulate", drive, "--path", "long",
+                        "--seed", "3", "--rounds", str(rounds)], check=True)
         seconds, parts, memory = solve(drive)
-        beside = f"{plain(drive)[0]:9.1f}" if large or rounds < max(ROUNDS) else f"{'–':>9}"
+        rows = rounds * simulation.PATHS["long"].poses
+        beside = f"{plain(drive)[0]:9.1f}" if large or rounds == 1 else f"{'–':>9}"
         print(f"{rows:10,}" + "".join(f"{parts[name]:9.2f}" for name in PROBLEMS)
               + f"{seconds:9.1f}{1e6 * seconds / rows:10.0f}{memory:7.0f}{beside}", flush=True)
 
@@ -96,7 +94,7 @@ def growth(folder, large):
 def shapes(folder):
     """Print times of drives that are no closed loops, beside a loop of about as many rows."""
     print("\nDrives of other shapes, whole process")
-    print(f"{'drive':34}{'rows':>9}{'solve (s)':>11}{'ms/1000':>9}")
+    print(f"{'drive':36}{'rows':>9}{'solve (s)':>11}{'ms/1000':>9}")
     simulation.PATHS["corridor"] = replace_path(vectors=((1, 200.0, 0.0),), poses=125_664)
     corridor = simulate("corridor", 5)[0].first(10_000)
     ends = simulate("long", 3, rounds=2)[0]
@@ -109,7 +107,7 @@ def shapes(folder):
     for name, dataset in drives.items():
         write_dataset(folder / name, dataset)
         seconds, _, _ = solve(folder / name)
-        print(f"{name:34}{len(dataset.ticks):9,}{seconds:11.2f}"
+        print(f"{name:36}{len(dataset.ticks):9,}{seconds:11.2f}"
               f"{1e6 * seconds / len(dataset.ticks):9.0f}", flush=True)
 
 
@@ -123,10 +121,9 @@ def main(large=False):
     if LONG.exists():
         pairs()
     with tempfile.TemporaryDirectory() as folder:
+        growth(Path(folder), large)      # first: a process begins with the memory of this one
         shapes(Path(folder))
-        growth(Path(folder), large)
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    print(f"load {os.getloadavg()[0]:.2f} after; {memory:.0f} MB for making the drives")
+    print(f"load {os.getloadavg()[0]:.2f} after")
 
 
 if __name__ == "__main__":
