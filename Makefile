@@ -3,8 +3,8 @@
 # make quick    runs the tests that take less than a minute in all
 # make lab      opens JupyterLab on the notebooks
 # make strip    removes the outputs from saved notebooks, as they are committed
-# make bench    prints the benchmarks' tables, in about five minutes
-# make bench-large   the same on more drives, and the plain script on long ones: half an hour
+# make bench    prints the benchmarks' tables
+# make bench-large   the same on more drives, and the plain script on long ones
 # Every target sets up what it needs in .venv first. Choose the Python with PYTHON=python3.12.
 
 VENV := .venv

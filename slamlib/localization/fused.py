@@ -181,7 +181,7 @@ def _update(state, z, C, before, now):
     known = state.place[before] >= 0
     old, new = state.place[before[known]], now[known]
     v = z[new] - state.M[old]
-    v[:, 2] = (v[:, 2] + np.pi) % (2 * np.pi) - np.pi
+    v[:, 2] = se2.wrap(v[:, 2])
     rows = 6 + 3 * old[:, None] + np.arange(3)
     S = state.P[rows[:, :, None], rows[:, None, :]] + C[new]            # of each sighting alone
     accepted = (v * np.linalg.solve(S, v[..., None])[..., 0]).sum(axis=1) < GATE

@@ -39,7 +39,7 @@ def equation2_from(ticks, vehicle, start, poses, covariances):
     sigma_heading = np.sqrt(covariances[part[1:], 2, 2] + np.sum(by_wheels**2, axis=-1))
     np.cumsum(J[:, :, 3] * sigma_heading[:, None], axis=0, out=integral[1:, :, 3])
     integral -= integral[start[part]]
-    return (_from_start(driven, start, part, poses),
+    return (se2.compose(poses[part], se2.between(driven[start[part]], driven)),
             covariances[part] + integral @ np.swapaxes(integral, 1, 2))
 
 
@@ -51,11 +51,6 @@ def first_order_from(ticks, vehicle, start, poses, covariances):
     G = B @ by_w * vehicle.sigma_wheel
     return (se2.compose(poses[part], delta),
             A @ covariances[part] @ np.swapaxes(A, 1, 2) + G @ np.swapaxes(G, 1, 2))
-
-
-def _from_start(driven, start, part, poses):
-    """Poses (n, 3) of odometry, `driven` (n, 3), continued from `poses` (f, 3) at `start` (f,)."""
-    return se2.compose(poses[part], se2.between(driven[start[part]], driven))
 
 
 def fuse_increments(dataset, propagation=equation2_from):

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.sparse.linalg import splu
 
 from slamlib import se2
-from slamlib.slam.linear_factors import point_factors, pose_factors, range_factors
+from slamlib.slam.linear_factors import linear_factors
 from slamlib.slam.measurement_factors import GUESS_PRIOR_SIGMA, WEAK_SIGMA
 from slamlib.slam.odometry_factors import odometry_error
 from slamlib.slam.problem import Problem
@@ -42,9 +42,7 @@ class NormalEquations:
     @cached_property
     def factors(self):
         """The LinearFactors of sightings of poses, of points, and of ranges."""
-        problem = self.problem
-        return [kind(problem.measured, problem.noise, self.state)
-                for kind in (pose_factors, point_factors, range_factors)]
+        return linear_factors(self.problem.measured, self.problem.noise, self.state)
 
     def step(self):
         """The Gauss-Newton step (n,), or None where H is singular to rounding."""

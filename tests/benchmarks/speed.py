@@ -2,7 +2,7 @@
 
     python tests/benchmarks/speed.py [large]
 
-With `large` the plain script runs on the longer drives too, which takes a quarter of an hour.
+With `large` the plain script runs on the longer drives too.
 """
 
 import json
