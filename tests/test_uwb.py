@@ -17,11 +17,14 @@ from slamlib.se2 import compose
 from slamlib.simulation import manoeuvre, simulate
 from slamlib.slam import errors
 from slamlib.slam.doubts import MAX_LOG_ODDS
+from slamlib.slam.estimate import fit_from_previous
+from slamlib.slam.initialization import odometry_state
 from slamlib.slam.linear_factors import range_factors
 from slamlib.slam.measurement_factors import MeasurementFactors
 from slamlib.slam.measurements import measure
 from slamlib.slam.noise import Noise
 from slamlib.slam.normal_equations import NormalEquations
+from slamlib.slam.optimizer import optimize
 from slamlib.slam.problem import build
 from slamlib.slam.state import state_from_arrays
 from slamlib.slam.trilateration import (
@@ -442,3 +445,24 @@ def test_plaza_2_is_solved():
     assert [doubt.what for doubt in found.drive_doubts] == ["range-offset"]
     assert np.hypot(*(beacons - truth.antenna_in_world).T).max() < 0.5      # 1 % of 50 m
     assert not found.doubts and dataset.ticks.shape == (3881, 2)
+
+
+def test_gtsam_reaches_one_optimum_from_the_guess_file_and_from_problem_3():
+    """The assignment starts at odometry and the guesses, slamlib at problem 3 and trilateration."""
+    dataset, _ = simulate("short", seed=3, late_ranges=0.1)
+    fit = fit_from_previous(measure(dataset), slam.estimate(dataset.without("uwb")))
+    first = odometry_state(fit.problem.measurements, "arc", antennas=starts.guessed_antennas)
+    assert NormalEquations(fit.problem, first).error > 1.5 * fit.equations.error
+    end = optimize(fit.problem, first, by_gtsam=True)
+    assert abs(end.error - fit.equations.error) < 1e-3
+    np.testing.assert_allclose(end.state.poses, fit.state.poses, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(end.state.antennas, fit.state.antennas, rtol=0, atol=1e-3)
+
+
+@pytest.mark.slow
+def test_ranges_hardly_move_a_drive_full_of_markers_and_bound_one_without():
+    full = studies.run(montecarlo.ranges_added, range(4))
+    assert full["moved"].max() < 0.3 and (full["sigma with"] <= full["sigma without"]).all()
+    few = studies.run(montecarlo.ranges_added, range(4), share=0.1)
+    assert few["ate with"].mean() < 0.5 * few["ate without"].mean()
+    assert (few["sigma with"] < 0.6 * few["sigma without"]).all()

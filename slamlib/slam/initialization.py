@@ -1,7 +1,8 @@
 """Stage 5: start values. Poses from odometry, markers by consensus, antennas by trilateration.
 
 On a long drive odometry loses the heading. There the first part is solved, then odometry with the
-wheels that this part calibrated predicts the next poses, up to twice as many, and so on.
+wheels that this part calibrated predicts the next poses, until there are GROWTH times as many, and
+so on.
 """
 
 import numpy as np
@@ -17,6 +18,7 @@ from slamlib.slam.state import state_from_arrays
 from slamlib.slam.trilateration import ranges_by_antenna, trilaterate
 
 MAX_ODOMETRY_SIGMA = 0.5     # rad, of odometry's heading at the end of a drive's first part
+GROWTH = 4                   # poses of a part over those of the part before, at most
 MAX_VOTES = 60               # sightings of a marker among which the consensus is sought
 
 
@@ -36,14 +38,14 @@ def initial_state(measurements, model, factors=odometry_factors):
 def parts(dataset):
     """How many encoder poses each part of a drive has; every part starts at pose 1.
 
-    Each is at most twice as long as the one before; the last one is the whole drive.
+    Each is at most GROWTH times as long as the one before; the last one is the whole drive.
     """
     _, covariances = odometry.first_order(dataset.ticks, dataset.vehicle)
     lost = np.flatnonzero(covariances[:, 2, 2] > MAX_ODOMETRY_SIGMA**2)
     ends = [len(dataset.ticks)]
     first = max(lost[0], 2) if len(lost) else ends[0]
     while ends[0] > 1.5 * first:
-        ends.insert(0, max(first, -(-ends[0] // 2)))
+        ends.insert(0, max(first, -(-ends[0] // GROWTH)))
     return ends
 
 
