@@ -2,7 +2,9 @@
 
 from dataclasses import dataclass, replace
 
+import gtsam
 import numpy as np
+from gtsam.symbol_shorthand import X
 
 from slamlib import odometry, se2
 from slamlib.evaluation import anees, ate
@@ -10,6 +12,7 @@ from slamlib.simulation import simulate
 from slamlib.slam.estimate import fit_from_odometry
 from slamlib.slam.evidence import log_evidence
 from slamlib.slam.fit import refine
+from slamlib.slam.gtsam_graph import nonlinear_graph
 from slamlib.slam.measurements import measure
 from slamlib.slam.noise import known_noise
 from slamlib.slam.odometry_factors import odometry_factors
@@ -73,6 +76,16 @@ def _without_wheel_errors(problem):
                     sigma_wheelbase=0.0)
     m = replace(m, dataset=replace(m.dataset, vehicle=known))
     return replace(problem, measurements=m, measured=replace(problem.measured, measurements=m))
+
+
+def gtsam_chain(problem):
+    """The gtsam.NonlinearFactorGraph of a Problem with an independent chain of between factors."""
+    graph = nonlinear_graph(problem)
+    chain = independent_chain(problem.measurements, problem.odometry.model)
+    for i, (step, Q) in enumerate(zip(chain.increment, chain.noise(problem.noise.slip))):
+        graph.add(gtsam.BetweenFactorPose2(X(i), X(i + 1), gtsam.Pose2(*step),
+                                           gtsam.noiseModel.Gaussian.Covariance(Q)))
+    return graph
 
 
 def evidence_curve(fit, slips, model):

@@ -12,11 +12,12 @@ from slamlib.slam.fit import refine
 from slamlib.slam.initialization import odometry_state, trilaterated_antennas
 from slamlib.slam.measurement_factors import MeasurementFactors, residuals
 from slamlib.slam.measurements import measure
-from slamlib.slam.noise import known_noise
+from slamlib.slam.noise import Noise, known_noise
 from slamlib.slam.optimizer import optimize
 from slamlib.slam.problem import build
 from slamlib.slam.result import result
 from slamlib.slam.robust import CAUCHY_SCALES, EARLY_GATE, LATE_KERNEL, within_gates
+from slamlib.slam.state import state_from_arrays
 from slamlib.studies.montecarlo import judge_slam
 
 _kernel = gtsam.noiseModel.mEstimator
@@ -43,6 +44,8 @@ SIGHTINGS = {
     "gate": (None, True)}
 CONVEX = ("quadratic", "Huber", "GNC")     # these need no rounds of narrowing kernels
 GNC_STEP = 1.4                             # factor on the control parameter in each round
+WRONG_LABEL = 50.0                         # squared Mahalanobis distance; a right label reaches it
+                                           # once in ten billion sightings
 
 
 def solve_with(measurements, slip, sightings="gate", ranges="asymmetric Tukey",
@@ -130,14 +133,41 @@ def late_ranges(seed, markers=True, ways=tuple(RANGES), **options):
 def wrong_labels(seed, ways=tuple(SIGHTINGS), **options):
     """Ways of SIGHTINGS on one drive of the short path, the slip and the arcs given.
 
-    Returns a dict of numbers for each way: "ate" and largest error of a marker, "map worst", in m,
-    "nees" and "map nees". Parameters as of `late_ranges`.
+    Parameters as of `late_ranges`.
+
+    Returns
+    -------
+    dict of numbers for each way: "ate" and largest error of a marker, "map worst", in m, "nees" and
+    "map nees"; the shares "wrong rejected" of the wrong labels (NaN without any) and "good lost" of
+    the others that keep less than half of their weight.
     """
     dataset, truth = simulate("short", seed, **options)
     dataset, numbers, starts = dataset.without("uwb"), {}, {}
     measurements = measure(dataset)
+    wrong = mislabelled(measurements, truth)
     for way in ways:
-        found = result(solve_with(measurements, TYPICAL_SLIP, sightings=way, starts=starts))
-        judged = judge_slam(found, dataset, truth)
+        fit = solve_with(measurements, TYPICAL_SLIP, sightings=way, starts=starts)
+        judged = judge_slam(result(fit), dataset, truth)
         numbers |= {f"{way} {key}": judged[key] for key in ("ate", "nees", "map nees", "map worst")}
+        lost = _sighting_weights(fit) < 0.5
+        numbers |= {f"{way} wrong rejected": lost[wrong].mean() if wrong.any() else np.nan,
+                    f"{way} good lost": lost[~wrong].mean()}
     return numbers
+
+
+def mislabelled(measurements, truth):
+    """(s,) bool, sightings of a simulated drive that have another marker's label, by its Truth."""
+    m = measurements
+    true_map = truth.marker_in_world[np.searchsorted(truth.marker, m.marker)]
+    state = state_from_arrays(m, truth.poses[m.frame], true_map,
+                              np.zeros((len(m.antenna), 2)), np.zeros(3))
+    return np.sum(residuals(m, state, Noise())[0]**2, axis=1) > WRONG_LABEL
+
+
+def _sighting_weights(fit):
+    """(s,) share of its information that each sighting keeps in a Fit."""
+    measured, noise = fit.problem.measured, fit.problem.noise
+    distance = np.linalg.norm(residuals(fit.problem.measurements, fit.state, noise)[0], axis=1)
+    kernel = measured.sighting_kernel
+    return measured.sighting_weight * (1 if kernel is None else [
+        kernel.weight(d) for d in distance])

@@ -3,10 +3,12 @@
 `memory.run` runs a trial over many seeds.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from slamlib import localization, odometry, slam
-from slamlib.evaluation import anees, ate, nees
+from slamlib.evaluation import anees, ate, nees, sigmas
 from slamlib.localization.hint import first_order_from
 from slamlib.sightings import sightings_by_frame
 from slamlib.simulation import simulate
@@ -91,6 +93,34 @@ def problem4(seed, path="short", markers=True, **options):
     dataset = dataset if markers else dataset.without("aruco")
     previous = slam.estimate(dataset.without("uwb")) if markers else None
     return judge_slam(slam.estimate(dataset, previous=previous), dataset, truth)
+
+
+def ranges_added(seed, share=1.0, **options):
+    """Problems 3 and 4 on one drive of the short path, to see what the ranges add to the markers.
+
+    Parameters
+    ----------
+    share : the markers are seen over this first share of the drive only.
+
+    Returns
+    -------
+    dict of numbers, "without" and "with" ranges: "ate without" and "aligned without", the ATE in m;
+    "sigma without", the median over the poses of the larger sigma of x and y, in m; and so on. Also
+    "moved", the median distance between the positions of both, over this sigma of each pose.
+    """
+    dataset, truth = simulate("short", seed, **options)
+    seen = dataset.first(round(share * len(dataset.ticks))).aruco
+    dataset = replace(dataset, aruco=seen)
+    without = slam.estimate(dataset.without("uwb"))
+    solved, numbers = {"without": without, "with": slam.estimate(dataset, previous=without)}, {}
+    sigma = {name: sigmas(found.covariances[1:])[:, :2].max(axis=1)
+             for name, found in solved.items()}
+    for name, found in solved.items():
+        numbers |= {f"ate {name}": ate(found.poses, truth.poses),
+                    f"aligned {name}": ate(found.poses, truth.poses, aligned=True),
+                    f"sigma {name}": np.median(sigma[name])}
+    apart = np.hypot(*(solved["with"].poses - without.poses)[1:, :2].T)
+    return numbers | {"moved": np.median(apart / sigma["without"])}
 
 
 def learned_slips(seed, slip):

@@ -11,7 +11,7 @@ from slamlib.increments import TYPICAL_SLIP
 from slamlib.localization import localize
 from slamlib.sightings import POINT_GATE
 from slamlib.simulation import misguess, simulate
-from slamlib.slam.initialization import consensus_markers, odometry_state
+from slamlib.slam.initialization import consensus_markers, odometry_state, state_from_poses
 from slamlib.slam.measurement_factors import MeasurementFactors
 from slamlib.slam.measurements import measure
 from slamlib.slam.noise import Noise
@@ -99,17 +99,40 @@ def landmarks(seed, path="short", drift=1.0, known=True, kernel="graduated",
                        sigma_wheelbase=drift * vehicle.sigma_wheelbase)
     dataset, truth = simulate(path, seed, vehicle=drifting, **options)
     m = measure(replace(dataset, uwb=None, vehicle=drifting if known else vehicle))
-    problem = build(m, "arc", Noise(options.get("slip", TYPICAL_SLIP)))
-    cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create
-    rounds = [replace(problem, measured=MeasurementFactors(m, m.unit_weights, cauchy(scale)))
-              for scale in (CAUCHY_SCALES if kernel == "graduated" else CAUCHY_SCALES[-1:])]
+    rounds = _rounds(build(m, "arc", Noise(options.get("slip", TYPICAL_SLIP))), kernel)
     true_map = truth.marker_in_world[np.searchsorted(truth.marker, m.marker)]
     best = optimize(rounds[-1], state_from_arrays(
         m, truth.poses[m.frame], true_map, np.zeros((0, 2)), np.zeros(3))).error
-    numbers = {}
+    return _from_each_start(rounds, best, true_map, starts)
+
+
+def landmarks_of_drive(dataset, found, kernel="last", starts=tuple(LANDMARKS)):
+    """Ways to initialise the markers of a Dataset, given the SlamResult `found` of problem 3.
+
+    Model and noise are those of the result. Returns the numbers of `landmarks`, with the optimum
+    that is reached from the result and its map in place of the truth.
+    """
+    m, vehicle = measure(dataset.without("uwb")), dataset.vehicle
+    rounds = _rounds(build(m, found.model, found.noise), kernel)
+    best = optimize(rounds[-1], state_from_poses(
+        m, found.poses[m.frame], found.covariances[m.frame],
+        (found.wheel - vehicle.wheel) / vehicle.sigma_wheel))
+    return _from_each_start(rounds, best.error, best.state.markers, starts)
+
+
+def _rounds(problem, kernel):
+    """Problems with the scales of the Cauchy kernel, "graduated" or the "last" one only."""
+    m, cauchy = problem.measurements, gtsam.noiseModel.mEstimator.Cauchy.Create
+    return [replace(problem, measured=MeasurementFactors(m, m.unit_weights, cauchy(scale)))
+            for scale in (CAUCHY_SCALES if kernel == "graduated" else CAUCHY_SCALES[-1:])]
+
+
+def _from_each_start(rounds, best, markers, starts):
+    """The numbers of `landmarks`, by the right optimum's error `best` and its markers (k, 3)."""
+    m, numbers = rounds[-1].measurements, {}
     for name in starts:
-        state, steps = odometry_state(m, "arc", markers=LANDMARKS[name]), 0
-        error = state.markers[:, :2] - true_map[:, :2]
+        state, steps = odometry_state(m, rounds[-1].odometry.model, markers=LANDMARKS[name]), 0
+        error = state.markers[:, :2] - markers[:, :2]
         initial_cost = NormalEquations(rounds[-1], state).error
         for trial in rounds:
             optimum = optimize(trial, state)
