@@ -37,22 +37,8 @@ def _parser():
     parser = argparse.ArgumentParser(prog="python -m slamlib", description=__doc__)
     commands = parser.add_subparsers(required=True, metavar="{report,solve,simulate}")
 
-    report = commands.add_parser("report", help="execute the notebooks and build the report")
-    report.add_argument("datasets", nargs="*", metavar="DATASET",
-                        help="names of folders in data/ (all of them when none is named)")
-    report.add_argument("--data", type=Path, default=Path("data"), help="folder of the datasets")
-    report.add_argument("--notebooks", type=Path, default=Path("notebooks"))
-    report.add_argument("--report", type=Path, default=Path("report"), help="folder for the pages")
-    report.add_argument("--results", type=Path, default=Path("results"),
-                        help="folder for the .mat files")
-    report.add_argument("--jobs", type=_positive, default=2, help="notebooks executed at a time")
-    report.add_argument("--no-code", dest="code", action="store_false",
-                        help="leave out code cells and printed text")
-    report.add_argument("--author", help="on the PDF's title page, instead of report.toml's")
-    report.add_argument("--student-number", help="the same")
-    report.add_argument("--fresh", action="store_true",
-                        help="execute all notebooks and studies, also where nothing changed")
-    report.set_defaults(run=_report)
+    _report_options(commands.add_parser(
+        "report", help="execute the notebooks and build the report"))
 
     solve = commands.add_parser("solve", help="solve a dataset's problems without notebooks")
     solve.add_argument("folder", type=Path, metavar="FOLDER", help="the dataset's folder")
@@ -75,6 +61,30 @@ def _parser():
     return parser
 
 
+def _report_options(report):
+    """Add the options of `report` to its parser."""
+    report.add_argument("datasets", nargs="*", metavar="DATASET",
+                        help="names of folders in data/ (all of them when none is named)")
+    report.add_argument("--data", type=Path, default=Path("data"), help="folder of the datasets")
+    report.add_argument("--notebooks", type=Path, default=Path("notebooks"))
+    report.add_argument("--report", type=Path, default=Path("report"), help="folder for the pages")
+    report.add_argument("--results", type=Path, default=Path("results"),
+                        help="folder for the .mat files")
+    report.add_argument("--jobs", type=_positive, default=2, help="notebooks executed at a time")
+    code = report.add_mutually_exclusive_group()
+    code.add_argument("--no-code", dest="code", action="store_const", const="none",
+                      default="method", help="leave out code cells and printed text")
+    code.add_argument("--all-code", dest="code", action="store_const", const="all",
+                      help="show the code that plots, prints and tabulates, too")
+    report.add_argument("--no-appendix", dest="appendix", action="store_false",
+                        help="leave out the notebooks whose title begins with a letter")
+    report.add_argument("--author", help="on the PDF's title page, instead of report.toml's")
+    report.add_argument("--student-number", help="the same")
+    report.add_argument("--fresh", action="store_true",
+                        help="execute all notebooks and studies, also where nothing changed")
+    report.set_defaults(run=_report)
+
+
 def _report(options):
     from slamlib.report import NotebookError, build_report
     from slamlib.report.cover import read_cover
@@ -86,7 +96,7 @@ def _report(options):
             options.notebooks, options.data, options.report, options.results,
             datasets=[_name(dataset, options.data) for dataset in options.datasets] or None,
             jobs=options.jobs, cover=cover, code=options.code, kept=Path("build", "executed"),
-            fresh=options.fresh)
+            fresh=options.fresh, appendix=options.appendix)
     except NotebookError as error:
         print(f"slamlib: {error}", file=sys.stderr)
         return 1

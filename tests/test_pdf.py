@@ -79,6 +79,76 @@ def test_equation_numbers_norms_and_references_can_be_read(tmp_path):
     assert "$" not in text.replace("$code$", "") and "\\" not in text
 
 
+def test_figures_stand_where_the_text_has_them_or_float_to_the_next_page(tmp_path):
+    """Their order is kept, what fits stays in its place, and the text fills the page before."""
+    tall = SVG.replace('height="9"', 'height="300"').replace('width="20"', 'width="500"')
+    cells = [new_markdown_cell("# 1. Many")]
+    for number in range(1, 8):
+        cells += [new_markdown_cell(f"## Section {number}\n\n" + f"Before {number}. " * 150),
+                  new_code_cell(outputs=[shown(("image/svg+xml", tall))]),
+                  new_markdown_cell(f"Figure 1.{number}. Tall."),
+                  new_markdown_cell(f"After {number}. " * 150)]
+    text = text_of(pdf.typeset([(Path("1.ipynb"), new_notebook(cells=cells))]), tmp_path)
+    assert re.findall(r"Figure 1\.(\d)\. Tall", text) == list("1234567")
+    pages = text.split("\f")[2:-1]
+    at = [next(n for n, page in enumerate(pages) if f"Figure 1.{number}." in page)
+          for number in range(1, 8)]
+    before = [max(n for n, page in enumerate(pages) if f"Before {number}." in page)
+              for number in range(1, 8)]
+    assert all(0 <= here - last <= 1 for here, last in zip(at, before, strict=True))
+    assert any(here == last for here, last in zip(at, before, strict=True))
+    assert all(page.count("\n") > 20 for page in pages[:-1])
+
+
+def test_long_code_may_break_but_leaves_no_line_alone(tmp_path):
+    code = "\n".join(f"line_{number:02} = {number}" for number in range(40))
+    for lines in range(30, 60, 3):  # at every distance from the end of the page
+        book = new_notebook(cells=[new_markdown_cell("Before.\n\n" * lines), new_code_cell(code)])
+        pages = text_of(pdf.typeset([(Path("1.ipynb"), book)]), tmp_path).split("\f")
+        counts = [page.count("line_") for page in pages if "line_" in page]
+        assert sum(counts) == 40 and min(counts) >= 5 and len(counts) <= 2
+
+
+def test_rows_of_a_group_are_divided_from_the_next_group():
+    rows = "| a | 1 |\n| | 2 |\n| b | 3 |\n| | 4 |"
+    book = new_notebook(cells=[new_markdown_cell(
+        f"| x | y |\n| --- | --- |\n{rows}\n\nTable 1.1. Groups.")])
+    text = pdf.typst_files([(Path("1.ipynb"), book)])[0]["main.typ"].decode()
+    assert text.count("table.hline(stroke: 0.3pt)") == 1
+    assert text.index("table.hline(stroke: 0.3pt)") < text.index("[b], [3]")
+    pdf.typeset([(Path("1.ipynb"), book)])
+
+
+@pytest.mark.parametrize("after, small", [("", 1), ("\n\n## More\n\nText.", 0)])
+def test_references_that_end_a_chapter_are_set_smaller(after, small):
+    book = new_notebook(cells=[new_markdown_cell(
+        f"# 1. T\n\nText.\n\n## References\n\n[1] A. Author, *Title*.\n\n[2] B.{after}")])
+    text = pdf.typst_files([(Path("1.ipynb"), book)])[0]["main.typ"].decode()
+    assert text.count("#references[") == small
+    if small:
+        assert "Author" in text.split("#references[")[1]
+    pdf.typeset([(Path("1.ipynb"), book)])
+
+
+def test_the_name_of_a_group_has_a_row_of_its_own():
+    rows = "| *first, $x$* | | |\n| a | 1 | |\n| | | 2 |\n| **second** | | |\n| b | 3 | 4 |"
+    book = new_notebook(cells=[new_markdown_cell(
+        f"| x | y | z |\n| --- | ---: | --- |\n{rows}\n\nTable 1.1. Groups.")])
+    text = pdf.typst_files([(Path("1.ipynb"), book)])[0]["main.typ"].decode()
+    assert re.findall(r"table.cell\(colspan: 3\)\[(.*)\],", text) == [
+        "#emph[first, #formula-0;]", "#strong[second]"]
+    pdf.typeset([(Path("1.ipynb"), book)])
+
+
+def test_the_box_answer_is_framed_and_other_quotes_are_not():
+    box = "> **Answer**\n>\n> **Question.** Why $x$?\n>\n> **Method.** So."
+    book = new_notebook(cells=[new_markdown_cell(box), new_markdown_cell("> A quote.")])
+    text = pdf.typst_files([(Path("1.ipynb"), book)])[0]["main.typ"].decode()
+    assert len(re.findall(r"#answer\[\s*#strong\[Answer\].*?Why.*?So\.\s*\]", text, re.DOTALL)) == 1
+    assert "#quote(block: true)[\nA quote" in text
+    pdf.typeset([(Path("1.ipynb"), book)])
+
+
 def test_links_lead_to_places_in_the_document(tmp_path):
     files, book = pdf.typst_files([first(), second()])
     targets = [element["dest"] for element in query(files, tmp_path, "link")]
@@ -91,11 +161,12 @@ def test_links_lead_to_places_in_the_document(tmp_path):
 
 
 def test_without_code_there_are_prose_formulas_figures_and_tables_only(tmp_path):
-    files, book = pdf.typst_files([first()], code=False)
+    files, book = pdf.typst_files([first()], code="none")
     text = files["main.typ"].decode()
     assert "print" not in text and "shown" not in text and "plot()" not in text
     assert len(book.page["formulas"]) == TEXT_FORMULAS + 3
-    assert "#picture(" in text and "#unbroken[#figure(" in text and text.count("#caption[") == 2
+    assert "#picture(" in text and '#placed(2, "table", _ => [#figure(' in text
+    assert text.count("#caption[") == 2
     assert "print" in pdf.typst_files([first()])[0]["main.typ"].decode()
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from matplotlib.transforms import Affine2D
 
-from slamlib.notebook import plotting
+from slamlib.notebook import plotting, schemes
 from slamlib.se2 import rotation
 
 pytestmark = pytest.mark.usefixtures("look")
@@ -52,8 +52,9 @@ def test_panels_are_side_by_side_and_in_the_narrow_figure_below_each_other(count
     assert all(box.height > 0.85 * high for box in narrow)
 
 
-@pytest.mark.parametrize("labels, lines", [("abcd", 1), (["odometry and markers", *"bcd"], 2), (
-    ["odometry and markers", "markers, counted twice", "c", "d"], 2), (["d" * 40, *"bc"], 3)])
+@pytest.mark.parametrize("labels, lines", [
+    ("abcd", 1), (["odometry and markers, without the ranges", *"bcd"], 2),
+    (["odometry and markers", "markers, counted twice", "c", "d"], 2), (["d" * 60, *"bc"], 3)])
 def test_a_legend_has_each_label_once_and_as_few_lines_as_fit(labels, lines):
     one_line = boxes(drawn(1, 1, labels=["d"])[0])[-1].height
     fig, _ = drawn(2, 2, labels=labels)
@@ -122,3 +123,12 @@ def test_ellipses_are_lines_of_equal_mahalanobis_distance(enlarged):
     (x_low, x_high), (y_low, y_high) = ax.get_xlim(), ax.get_ylim()
     corners = np.array([(means[:, :2] - half).min(0), (means[:, :2] + half).max(0)])
     assert ([x_low, y_low] < corners[0]).all() and (corners[1] < [x_high, y_high]).all()
+
+
+def test_the_scheme_of_a_graph_has_a_square_for_each_factor_and_a_name_for_each_variable():
+    _, ((ax,),) = plotting.panels(1)
+    schemes.slam_graph(ax, 3, [(0, 0), (1, 0), (2, 1)], [(0, 0), (2, 0)], [7, 8], [5])
+    squares = [line for line in ax.lines if line.get_marker() == "s"]
+    assert len(squares) == 3 + 2 + 2 + 3       # sightings, ranges, odometry, and three priors
+    assert [text.get_text() for text in ax.texts] == [
+        "$X_1$", "$X_2$", "$X_3$", "$L_{7}$", "$L_{8}$", "$A_{5}$", "$w$"]

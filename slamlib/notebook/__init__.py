@@ -1,5 +1,6 @@
 """Code for notebooks: drives and results, sentences and tables, figures, sliders."""
 
+from slamlib.notebook.answers import answer, median_sigmas, result_sentence, with_unit
 from slamlib.notebook.show import (
     Drive,
     captioned,
@@ -16,6 +17,7 @@ from slamlib.notebook.show import (
 )
 from slamlib.notebook.solving import delivered, notices, say_doubts, solved, where_possible
 
-__all__ = ["Drive", "captioned", "delivered", "interactive", "listed", "notices", "plain",
+__all__ = ["Drive", "answer", "captioned", "delivered", "interactive", "listed", "median_sigmas",
+           "notices", "plain", "result_sentence",
            "results_folder", "say", "say_doubts", "solved", "start", "table", "table_text",
-           "where_possible", "with_sensor", "with_truth"]
+           "where_possible", "with_sensor", "with_truth", "with_unit"]

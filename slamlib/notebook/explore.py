@@ -1,10 +1,12 @@
 """The Explore sections at the end of the notebooks: one figure each, with controls in JupyterLab.
 
 In JupyterLab `show` displays the controls above the figure and redraws it when a value changes. In
-the report it draws the figure once, with the initial values of the controls.
+the report it draws the figure with the initial values of the controls; in its HTML page some of
+them can be moved, among a few values for which the figure is drawn when the report is built.
 """
 
 from dataclasses import replace
+from functools import lru_cache
 
 import gtsam
 import numpy as np
@@ -14,6 +16,7 @@ from ipywidgets import Box, Dropdown, FloatSlider, IntSlider, Layout, VBox, inte
 from slamlib import evaluation, localization, odometry, se2
 from slamlib.increments import SLIP_BOUNDS, TYPICAL_SLIP
 from slamlib.notebook import plotting
+from slamlib.notebook.live import live
 from slamlib.notebook.show import Drive, interactive
 from slamlib.simulation import misguess, simulate
 from slamlib.slam.estimate import fit_from_odometry
@@ -29,6 +32,7 @@ from slamlib.studies.starts import LANDMARKS, guessed_antennas
 
 MINIMUM_PATH = 1.0           # m, path length from which a drive is worth drawing
 SMALLEST_ERROR = 1.0         # mm, lower limit of the axis of errors
+WRONG_PLACE = 0.5            # m, error of a marker that is mapped at a wrong place
 KERNELS = {f"{scale} σ": scale for scale in (1, 3, 10, 30, 100)} | {"none": None}   # Cauchy scales
 ROW = Layout(display="flex", flex_flow="row wrap")
 
@@ -45,16 +49,17 @@ def choice(label, options, start):
     return Dropdown(options=list(options), value=start, description=label)
 
 
-def show(draw, **controls):
+def show(draw, grid=None, **controls):
     """Show the figure of draw(**values), in JupyterLab with controls of the values.
 
     Parameters
     ----------
     draw : function of the controls' values, by name, that makes one figure.
+    grid : dict by name of the values (list) that some controls have in the report's HTML page.
     controls : widgets with a value, as of `slider` and `choice`.
     """
     if not interactive():
-        draw(**{name: control.value for name, control in controls.items()})
+        live(draw, controls, grid or {})
         return
     for control in controls.values():
         control.continuous_update = False              # redraw on release only
@@ -109,7 +114,24 @@ def wheels(drive, right, left, base, sigma_radii, sigma_base, probability, count
         plan.set_title(f"{drive.name}: ATE {evaluation.ate(other, drive.truth.poses):.3f} m")
     side.set(ylabel="distance from nominal (m)", ylim=(0, None))
     plotting.legend_below(fig)
+    fig.said = _said_of_wheels(v, np.array([right, left, base]), poses[-1], other[-1])
     return fig
+
+
+def _said_of_wheels(vehicle, deviation, end, other):
+    """What wrong wheels, off by deviation (3,) in sigmas, do to the last pose (3,) of the path."""
+    off = 100 * deviation * vehicle.sigma_wheel / vehicle.wheel                        # percent
+    names = (("right wheel", "large", "small"), ("left wheel", "large", "small"),
+             ("wheelbase", "long", "short"))
+    wrong = [f"{name} {abs(each):.2g} % too {more if each > 0 else less}"
+             for each, (name, more, less) in zip(off, names, strict=True) if each]
+    if not wrong:
+        return "Nominal wheels: both paths agree."
+    turned = np.degrees(abs(other[2]) - abs(end[2]))
+    told = (f"{' and '.join(wrong)}: the path turns {abs(turned):.1f}° "
+            f"{'more' if turned > 0 else 'less'}, its end moves by "
+            f"{np.hypot(*(other - end)[:2]):.2f} m.")
+    return told[0].upper() + told[1:]
 
 
 def cameras(seed, every, reach, claimed):
@@ -152,6 +174,10 @@ def cameras(seed, every, reach, claimed):
         plan.set_title(f"{len(aruco.pose)} sightings (ellipses × {k})")
         if np.isfinite(nees):
             side.set_title(f"fused: {fused.rejected} rejected, NEES {nees:.1f}")
+            low, high = evaluation.nees_band(1)
+            fig.said = (f"Markers alone locate {np.count_nonzero(known)} of {len(frames)} frames. "
+                        f"The NEES of the fusion is {nees:.1f}; on single drives consistent "
+                        f"covariances give {low:.1f} to {high:.1f} in 95 % of the cases.")
     side.set_ylim(SMALLEST_ERROR, 2 * side.dataLim.y1)
     plotting.legend_below(fig)
     return fig
@@ -168,25 +194,26 @@ def graphs(seed, slip, assumed, wrong, kernel, start):
     kernel : name in KERNELS.
     start : name in starts.LANDMARKS, for the single kernel.
     """
-    dataset, truth = simulate("short", seed, slip=1e-3 * slip, mislabelled=wrong / 100)
-    m = measure(replace(dataset, uwb=None))
-    assumed = max(1e-3 * assumed, SLIP_BOUNDS[0])
+    m, truth, solved = _rounds(seed, slip, assumed, wrong)
     scale = KERNELS[kernel]
     cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(scale) if scale else None
-    problem = replace(build(m, "arc", Noise(assumed)),
+    problem = replace(build(m, "arc", Noise(max(1e-3 * assumed, SLIP_BOUNDS[0]))),
                       measured=MeasurementFactors(m, m.unit_weights, cauchy))
     single = optimize(problem, odometry_state(m, "arc", markers=LANDMARKS[start])).state
-    solved = result(fit_from_odometry(m, assumed))
     fig, axes = plotting.panels(2, height=3.6)
     (plan,), (side,) = axes
     plotting.trajectory(plan, truth.poses, "truth")
     plotting.trajectory(plan, single.poses, "alternative", "single kernel")
     plotting.trajectory(plan, solved.poses, "slam", "rounds of kernels")
+    wide = []
     for marker, in_world, role in ((m.marker, single.markers, "alternative"),
                                    (solved.marker, solved.marker_in_world, "slam")):
         true = truth.marker_in_world[np.searchsorted(truth.marker, marker)]
         ends = np.stack([true[:, :2], in_world[:, :2]])
         plan.plot(*ends.T.swapaxes(1, 2), color=plotting.ROLES[role]["color"], linewidth=1.2)
+        wide.append(np.count_nonzero(np.hypot(*(ends[1] - ends[0]).T) > WRONG_PLACE))
+    fig.said = (f"{wrong} % wrong labels: the single kernel maps {wide[0]} of {len(m.marker)} "
+                f"markers more than {WRONG_PLACE} m from their true place, the rounds {wide[1]}.")
     plan.plot(*truth.marker_in_world[:, :2].T, label="true markers", **plotting.ROLES["marker"])
     low, high = truth.marker_in_world[:, :2].min(0) - 0.5, truth.marker_in_world[:, :2].max(0) + 0.5
     plan.set_aspect("equal", adjustable="box")          # markers far from the true map are cut off
@@ -201,6 +228,14 @@ def graphs(seed, slip, assumed, wrong, kernel, start):
     return fig
 
 
+@lru_cache(maxsize=8)
+def _rounds(seed, slip, assumed, wrong):
+    """Measurements, Truth and SlamResult by rounds of kernels of the drive of `graphs`."""
+    dataset, truth = simulate("short", seed, slip=1e-3 * slip, mislabelled=wrong / 100)
+    m = measure(replace(dataset, uwb=None))
+    return m, truth, result(fit_from_odometry(m, max(1e-3 * assumed, SLIP_BOUNDS[0])))
+
+
 def ranges(seed, late, off, poses, way):
     """Chapter 4: ranges and odometry, by one kernel from the guess, and by the default. The figure.
 
@@ -212,34 +247,47 @@ def ranges(seed, late, off, poses, way):
     poses : number of the drive's first poses that are used.
     way : name in kernels.RANGES.
     """
-    dataset, truth = simulate("short", seed, slip=TYPICAL_SLIP, late_ranges=late / 100)
-    dataset = misguess(dataset.without("aruco"), truth, off, seed).first(poses)
+    dataset, truth = _late(seed, late, off, poses)
     guess = dataset.antenna_guess.position
     true_poses = truth.poses[:poses]
-    chosen, solved = (
-        result(solve_with(measure(dataset), TYPICAL_SLIP, ranges=ranges, antennas=antennas))
-        for ranges, antennas in ((way, guessed_antennas),
-                                 ("asymmetric Tukey", trilaterated_antennas)))
+    chosen = _by_ranges(seed, late, off, poses, way, guessed_antennas)
+    solved = _by_ranges(seed, late, off, poses, "asymmetric Tukey", trilaterated_antennas)
     fig, axes = plotting.panels(2, height=3.6)
     (plan,), (side,) = axes
     plotting.trajectory(plan, true_poses, "truth")
-    for found, role, label in ((chosen, "alternative", "kernel of the sliders"),
+    for found, role, label in ((chosen, "alternative", "chosen kernel"),
                                (solved, "slam", "solver")):
         plotting.trajectory(plan, found.poses, role, label)
         first = guess[np.searchsorted(truth.antenna, found.antenna)]
         ends = np.stack([first, found.antenna_in_world])
-        plan.plot(ends[..., 0], ends[..., 1], color=plotting.ROLES[role]["color"], linewidth=1.2)
+        plan.plot(ends[..., 0], ends[..., 1], "o-", markevery=[1], markersize=4, linewidth=1.2,
+                  color=plotting.ROLES[role]["color"])
         _error(side, found.poses, true_poses, role, label)
     plan.plot(*guess.T, label="antennas: guess", **plotting.ROLES["guess"])
     plan.plot(*truth.antenna_in_world.T, label="antennas: truth", **plotting.ROLES["true antenna"])
-    miss = np.hypot(*(solved.antenna_in_world - truth.antenna_in_world[
-        np.searchsorted(truth.antenna, solved.antenna)]).T)
-    plan.set_title(f"antennas within {miss.max():.2f} m")
+    misses = [np.hypot(*(found.antenna_in_world - truth.antenna_in_world[
+        np.searchsorted(truth.antenna, found.antenna)]).T).max() for found in (chosen, solved)]
+    plan.set_title(f"antennas within {misses[1]:.2f} m")
+    fig.said = (f"{late} % late ranges: the antennas end up to {misses[0]:.2f} m from their true "
+                f"places with the kernel “{way}”, and up to {misses[1]:.2f} m with the solver.")
     nees = evaluation.anees(solved.poses, solved.covariances, true_poses)
     side.set_title(f"NEES {nees:.1f}, {len(solved.doubts)} in doubt")
     side.set_ylim(SMALLEST_ERROR, 2 * side.dataLim.y1)
     plotting.legend_below(fig)
     return fig
+
+
+def _late(seed, late, off, poses):
+    """Dataset and Truth of the drive of `ranges`."""
+    dataset, truth = simulate("short", seed, slip=TYPICAL_SLIP, late_ranges=late / 100)
+    return misguess(dataset.without("aruco"), truth, off, seed).first(poses), truth
+
+
+@lru_cache(maxsize=16)
+def _by_ranges(seed, late, off, poses, way, antennas):
+    """SlamResult of the drive of `ranges` by a way to treat ranges and a start of the antennas."""
+    dataset, _ = _late(seed, late, off, poses)
+    return result(solve_with(measure(dataset), TYPICAL_SLIP, ranges=way, antennas=antennas))
 
 
 def _error(ax, poses, truth, role, label=None, **look):

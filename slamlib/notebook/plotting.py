@@ -68,12 +68,14 @@ def panels(count, rows=1, height=3.4, width=3.7, columns=2):
 
 
 def narrow(fig, width=NARROW_WIDTH):
-    """Change a figure to `width` inches: all axes below each other, panel by panel, same height."""
+    """Change a figure to `width` inches: all axes below each other, maps in the same shape."""
     axes = [ax for ax in fig.axes if ax.get_visible() and ax.get_subplotspec()]
     if not axes:
         return
-    rows, _ = axes[0].get_gridspec().get_geometry()
-    height = fig.get_figheight() / rows * len(axes)
+    height = fig.get_figheight() / axes[0].get_gridspec().get_geometry()[0] * len(axes)
+    if all(ax.get_aspect() == 1 and ax.get_adjustable() == "box" for ax in axes):
+        height = sum((width - 0.65) * np.ptp(ax.get_ylim()) / np.ptp(ax.get_xlim()) + 0.8
+                     for ax in axes)
     for ax, place in zip(axes, fig.add_gridspec(len(axes), 1), strict=True):
         ax.set_subplotspec(place)
         ax.autoscale_view()          # the equal aspect had extended the limits to the wide axes
@@ -150,9 +152,8 @@ def antennas(ax, positions, covariances, guess=None, truth=None, enlarged=1):
 
 def rings(ax, centres, radii, sigma, color="#56B4E9"):
     """Draw rings of radii +- 2 sigma, both (m,), around centres (m, 2), all in m."""
-    look = dict(facecolor=color, alpha=0.35, linewidth=0)
     for centre, radius, s in zip(centres, radii, sigma, strict=True):
-        ax.add_patch(Annulus(centre, radius + 2 * s, 4 * s, **look))
+        ax.add_patch(Annulus(centre, radius + 2 * s, 4 * s, color=color, alpha=0.35, linewidth=0))
     ax.set_aspect("equal", adjustable="box")
     ax.set(xlabel="x (m)", ylabel="y (m)")
     return ax
@@ -206,12 +207,12 @@ def factor_graph(ax, count, sightings, names):
     return ax
 
 
-def enlargement(poses, covariances):
-    """Factor 1, 2, 5, 10, ... that makes the largest 95 % ellipse about a tenth of the path."""
+def enlargement(poses, covariances, share=0.05):
+    """Factor 1, 2, 5, 10, ... with which no 95 % semi-axis exceeds this share of the extent."""
     known = np.isfinite(poses[:, 0])
     extent = np.ptp(poses[known, :2], axis=0).max()
     largest = 2.45 * np.sqrt(np.linalg.eigvalsh(covariances[known, :2, :2])[:, 1].max())
-    wanted = 0.05 * extent / largest if largest > 0 else 1
+    wanted = share * extent / largest if largest > 0 else 1
     steps = np.outer(10.0 ** np.arange(4), [1, 2, 5]).ravel()
     return int(steps[max(0, np.searchsorted(steps, wanted, side="right") - 1)])
 

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib_inline.backend_inline import set_matplotlib_formats
 
 from slamlib.dataset import Dataset, Truth, dataset_names, read_dataset, read_truth
-from slamlib.notebook import plotting
+from slamlib.notebook import inline, plotting
 from slamlib.simulation import simulate
 
 
@@ -56,11 +56,12 @@ def start():
 def _show_figures():
     """Show figures as SVG, in the report in two widths between which its pages choose."""
     if interactive():
+        plt.rcParams["svg.fonttype"] = "path"       # pages bring the typeface
         set_matplotlib_formats("svg", metadata={"Date": None})
     else:
         set_matplotlib_formats()
         InteractiveShell.instance().display_formatter.mimebundle_formatter.for_type(
-            Figure, lambda fig, **_: plotting.pictures(fig))
+            Figure, lambda fig, **_: inline.outputs(fig, plotting.pictures(fig)))
 
 
 def results_folder(drive):
@@ -142,9 +143,13 @@ def table_text(header, rows, texts=1):
     """Table in Markdown, a str.
 
     `header` is a list of c str, `rows` a list of such lists. The first `texts` columns are aligned
-    left as text, the others right as numbers.
+    left as text, the others right as numbers. Rows that begin alike are a group: only its first row
+    shows this beginning.
     """
-    lines = [header, ["---"] * texts + ["---:"] * (len(header) - texts), *rows]
+    above = [None, *(row[0] for row in rows)]
+    grouped = [["" if row[0] == first else row[0], *row[1:]]
+               for first, row in zip(above, rows, strict=False)]
+    lines = [header, ["---"] * texts + ["---:"] * (len(header) - texts), *grouped]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 

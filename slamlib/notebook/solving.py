@@ -95,8 +95,11 @@ def _say(drive, markdown, **record):
 def delivered(drives, found):
     """Write the files of all results that `solved` found, and yield what was written.
 
-    Yields (Drive, Solution, names of the files as a str); a simulated drive has no files.
+    Yields (Drive, Solution, names of the files as a str); a simulated drive has no files, and a
+    sentence says so if there is no other.
     """
+    if all(drive.made_up for drive in drives):
+        say("A simulated drive has no files to hand in.")
     for drive in drives:
         for problem, by_drive in found.items():
             if drive.name in by_drive and not drive.made_up:

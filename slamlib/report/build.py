@@ -11,18 +11,21 @@ import time
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from urllib.parse import quote
 
 import nbformat
 
 from slamlib.dataset import DatasetError, dataset_names, read_dataset, read_truth
 from slamlib.notebook import notices
 from slamlib.report import cache, overview
+from slamlib.report.chapters import chapter_of, in_order, printed, with_data
 from slamlib.report.cover import Cover
+from slamlib.report.drives import read_drives
 from slamlib.report.execution import execute, kernel_environment, read_notebook
 from slamlib.report.numbering import numbered
-from slamlib.report.pages import chapter_of, html_pages
-from slamlib.report.pdf import missing_glyphs, typeset
+from slamlib.report.pages import html_pages
+from slamlib.report.pdf import typeset
+from slamlib.report.pictures import title_picture
+from slamlib.report.setting import missing_glyphs
 from slamlib.studies.memory import forget
 
 
@@ -31,11 +34,11 @@ class Report:
     """A report that was written."""
 
     files: list  # of Path, `index.html` first
-    drives: list  # of overview.SolvedDrive, with what is doubted and what could not be solved
+    drives: list  # of drives.SolvedDrive, with what is doubted and what could not be solved
 
 
-def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=None, code=True,
-                 kept=None, fresh=False):
+def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=None,
+                 code="method", kept=None, fresh=False, appendix=True):
     """Execute all notebooks, write pages and PDF; return the Report.
 
     Kernels read the absolute paths of data and results, and the selection, from the environment
@@ -48,9 +51,10 @@ def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=
     datasets : list of str, names of the selected datasets, or None for all.
     jobs : int, notebooks executed at a time.
     cover : Cover, the title page of the PDF, or None for the default.
-    code : bool; False leaves out code cells and printed text.
+    code : one of chapters.CODE; "none" leaves out code cells and printed text.
     kept : folder that caches executed notebooks and their Monte Carlo studies, or None.
     fresh : bool; True executes everything although it is cached.
+    appendix : bool; False leaves out the appendices.
 
     Raises
     ------
@@ -61,25 +65,20 @@ def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=
     notebooks, data, report, results = (
         Path(folder).resolve() for folder in (notebooks, data, report, results))
     cover = cover or Cover()
-    books, selected = _checked_input(notebooks, data, datasets, cover)
+    books, selected = _checked_input(notebooks, data, datasets, cover, appendix)
     chapters = [chapter_of(source, book) for source, book in books.items()]
     texts = {source: nbformat.v4.new_notebook(
         cells=[cell for cell in book.cells if cell.cell_type == "markdown"])
         for source, book in books.items()}
-    _render(texts, chapters, cover, code)  # reports early what cannot be set
+    _render(texts, texts, chapters, cover, code)  # reports early what cannot be set
     for folder in (results, report):
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()  # reports early that a folder is not writable
 
     books, written = _executed(books, {"data": data, "datasets": datasets, "jobs": jobs},
                                [data / name for name in selected], results, kept, fresh)
-    drives = overview.read_drives(data, results, selected, written, notices(books.values()))
-    links = [(quote(os.path.relpath(results / name, report)), name)
-             for drive in drives for name in written
-             if name.startswith(f"{drive.name}/") and name.endswith(".mat")]
-    opening = overview.summary(drives)
-    index = overview.index(cover.title, opening, chapters, links)
-    files = _render({Path("index"): index, **numbered(books)}, chapters, cover, code, opening)
+    drives = read_drives(data, results, selected, written, notices(books.values()))
+    files = rendered(books, drives, cover, code, os.path.relpath(results, report))
     with tempfile.TemporaryDirectory(prefix=".", dir=report) as temporary:
         for name, content in files.items():
             Path(temporary, name).write_bytes(content)
@@ -89,19 +88,22 @@ def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=
     return Report([report / name for name in files], drives)
 
 
-def _checked_input(notebooks, data, datasets, cover):
-    """Return the notebooks by their paths, and the selected names; malformed input is refused."""
+def _checked_input(notebooks, data, datasets, cover, appendix):
+    """Return the notebooks by their paths, in order, and the names of the selected datasets."""
     for line, text in asdict(cover).items():
         if missing := missing_glyphs(text):
             raise DatasetError(f"title page: the PDF's fonts have no glyph for {missing[0]} in "
                                f"{line} '{text}': write it in Latin, Greek or Cyrillic letters")
-    sources = sorted(notebooks.glob("*.ipynb"))
-    if not sources:
+    books = in_order({source: read_notebook(source) for source in notebooks.glob("*.ipynb")},
+                     appendix)
+    if not books:
         raise DatasetError(f"{notebooks}: there are no notebooks (*.ipynb) in this folder")
     selected = dataset_names(data, datasets)
-    for name in selected:
-        read_dataset(data / name), read_truth(data / name)
-    return {source: read_notebook(source) for source in sources}, selected
+    read = [(read_dataset(data / name), read_truth(data / name)) for name in selected]
+    served = with_data(books, [dataset for dataset, _ in read])
+    for source in books.keys() - served.keys():
+        print(f"{source.stem}: left out, no dataset has the measurements", file=sys.stderr)
+    return served, selected
 
 
 def _executed(books, options, datasets, results, kept, fresh):
@@ -139,11 +141,33 @@ def _executed(books, options, datasets, results, kept, fresh):
     return {source: executed[source] for source in books}, sorted(written)
 
 
-def _render(books, chapters, cover, code, opening=None):
-    """Return the report's files as {name: bytes}: a page for each book, and the PDF."""
+def rendered(books, drives, cover, code, results):
+    """Return the report's files as {name: bytes}, `index.html` first and the PDF last.
+
+    Parameters
+    ----------
+    books : dict from Path to NotebookNode, executed, in order.
+    drives : list of SolvedDrive, of which the opening tells.
+    cover, code : as of `build_report`.
+    results : str, the path of the results folder from that of the report.
+    """
+    chapters = [chapter_of(source, book) for source, book in books.items()]
+    opening = overview.summary(drives, results)
+    on_paper = numbered({source: printed(book) for source, book in books.items()}, whole=books)
+    index = {Path("index"): overview.index(cover.title, opening, chapters)}
+    solved = [drive for drive in drives if drive.solutions]
+    return _render(index | numbered(books), on_paper, chapters, cover, code, printed(opening),
+                   title_picture(solved[-1]) if solved else None)
+
+
+def _render(books, on_paper, chapters, cover, code, opening=None, picture=None):
+    """Return the report's files as {name: bytes}: a page for each of `books`, and the PDF.
+
+    `on_paper` are the chapters of the PDF, a dict as `books`.
+    """
     files = {name: page.encode() for name, page in html_pages(books, chapters, code).items()}
-    parts = [(source, book) for source, book in books.items() if source.suffix]
-    return files | {"report.pdf": typeset(parts, opening, code, **asdict(cover))}
+    return files | {"report.pdf": typeset(list(on_paper.items()), opening, code, picture,
+                                          **asdict(cover))}
 
 
 def _resources_used(seconds):

@@ -1,46 +1,67 @@
 """Numbers figures and tables without gaps, and links the text to figures, tables and equations.
 
-A caption is a paragraph that begins with "Figure 2.3." or "Table 2.3." (chapter and number)
-directly below its figure or table. Some datasets leave figures out; numbering closes these gaps.
-References such as "figure 2.3", "tables 2.3 and 2.5" or "equation 2.1" become links.
+A caption is a paragraph that begins with "Figure 2.3." or "Table A.3." (chapter or appendix, and
+number) directly below its figure or table. Some datasets leave figures out; numbering closes these
+gaps. References such as "figure 2.3", "tables A.3 and A.5", "equation 2.1" or "appendix A" become
+links.
 """
 
 import re
 from copy import deepcopy
 
+from slamlib.report.chapters import chapter_of, is_appendix
 from slamlib.report.execution import NotebookError
 
-CAPTION = re.compile(r"\W*(Figure|Table)\s+(\d+(?:\.\d+)?)\.(?!\d)")
+CAPTION = re.compile(r"\W*(Figure|Table)\s+(\d+(?:\.\d+)?|[A-Z]\.\d+)\.(?!\d)")
 TAG = re.compile(r"\\tag\*?\s*\{([^{}]*)\}")
-DOTTED, WHOLE, AND = r"\d+\.\d+", r"\d+(?![.\d]*\d)", r"(?:,?\s+(?:and|to|or)\s+|,\s+|–)"
+DOTTED, WHOLE, LETTER = r"(?:\d+|(?-i:[A-Z]))\.\d+", r"\d+(?![.\d]*\d)", r"(?-i:[A-Z])\b"
+LABEL = r"\d+(?:\.\d+)?|\b[A-Z]\.\d+|\b[A-Z]\b"  # each of those
+AND = r"(?:,?\s+(?:and|to|or)\s+|,\s+|–)"
 PARTS = re.compile(  # code, formulas and addresses; headings; captions; references
     r"```.*?```|`[^`\n]*`|\$\$.*?\$\$|\$[^$\n]*\$|\]\([^)\n]*\)"
-    r"|(?:\A|\n\s*\n)(?:#(?:(?!\n\s*\n).)*|(?P<caption>\W*(Figure|Table)\s+)(\d+\.\d+)\.(?!\d))"
+    r"|(?:\A|\n\s*\n)(?:#(?:(?!\n\s*\n).)*|(?P<caption>\W*(Figure|Table)\s+)"
+    r"(\d+\.\d+|[A-Z]\.\d+)\.(?!\d))"
     r"|\b(?i:(?P<kind>figure|table|equation)s?\s+"
-    rf"(?P<labels>{DOTTED}(?:{AND}{DOTTED})*|{WHOLE}(?:{AND}{WHOLE})*))", re.DOTALL)
+    rf"(?P<labels>{DOTTED}(?:{AND}{DOTTED})*|{WHOLE}(?:{AND}{WHOLE})*))"
+    rf"|\b(?i:appendi(?:x|ces)\s+(?P<letters>{LETTER}(?:{AND}{LETTER})*))", re.DOTALL)
 
 
-def numbered(books):
+def numbered(books, whole=None):
     """Return copies of executed books (dict from Path to NotebookNode), numbered and with links.
 
-    NotebookError if a caption is not directly below its figure or table, if a number occurs twice,
-    or if a reference to a chapter of the report has no target.
+    `whole` is the same with cells that `books` leaves out: a reference to these becomes plain text.
+
+    Raises
+    ------
+    NotebookError : a caption is not directly below its figure or table, a number occurs twice, or
+        a reference to a chapter of the report has no target.
     """
     books = {source: deepcopy(book) for source, book in books.items()}
-    targets = {}  # (kind, label) -> (source, number)
+    targets = _targets(books)
+    absent = {key: number for key, (_, number) in _targets(whole or {}).items()
+              if key not in targets}
+    for source, book in books.items():
+        for node, key in _texts(book):
+            node[key] = _linked(node[key], source, targets, absent)
+    return books
+
+
+def _targets(books):
+    """Return {(kind, label): (source, number)} of all captions, equations and appendices."""
+    targets = {}
     for source, book in books.items():
         for kind, label, number in _numbers(source, book):
             if (kind, label) in targets:
                 raise NotebookError(f"{source.name}: {kind} {label} occurs twice")
             targets[kind, label] = source, number
-    for source, book in books.items():
-        for node, key in _texts(book):
-            node[key] = _linked(node[key], source, targets)
-    return books
+    return targets
 
 
 def _numbers(source, book):
-    """Yield (kind, label, new number) for each caption and each equation."""
+    """Yield (kind, label, new number) for each caption and each equation, and for an appendix."""
+    chapter = chapter_of(source, book)
+    if is_appendix(chapter):
+        yield "appendix", chapter["number"], chapter["number"]
     count = {"figure": 0, "table": 0}
     for above, kind, label in _captions(book):
         if above != kind:
@@ -80,15 +101,17 @@ def _captions(book):
                 above = "table" if block.startswith("|") else block
 
 
-def _linked(text, source, targets):
+def _linked(text, source, targets, absent):
     """Return Markdown with the final numbers in its captions and with links for its references."""
     chapters = {label.partition(".")[0] for _, label in targets if "." in label}
 
     def link(kind, label):
         if (kind, label) in targets:
             target, number = targets[kind, label]
-            anchor = f"{'eq' if kind == 'equation' else kind}-{number}"
-            return f"[{number}]({'' if target == source else target.name}#{anchor})"
+            anchor = {"equation": f"#eq-{number}", "appendix": ""}.get(kind, f"#{kind}-{number}")
+            return f"[{number}]({'' if target == source and anchor else target.name}{anchor})"
+        if (kind, label) in absent:
+            return absent[kind, label]
         if "." in label and label.partition(".")[0] in chapters:
             raise NotebookError(
                 f"{source.name}: the text refers to {kind} {label}, which does not exist")
@@ -97,9 +120,11 @@ def _linked(text, source, targets):
     def replaced(part):
         if part["caption"]:
             return part[0].removesuffix(f"{part[3]}.") + f"{targets[part[2].lower(), part[3]][1]}."
-        if not part["labels"]:
+        labels = part["labels"] or part["letters"]
+        if not labels:
             return part[0]
-        return part[0].removesuffix(part["labels"]) + re.sub(
-            r"\d+(\.\d+)?", lambda label: link(part["kind"].lower(), label[0]), part["labels"])
+        kind = part["kind"].lower() if part["kind"] else "appendix"
+        return part[0].removesuffix(labels) + re.sub(
+            LABEL, lambda label: link(kind, label[0]), labels)
 
     return PARTS.sub(replaced, text)

@@ -1,139 +1,169 @@
-"""The summary that opens the report: the datasets, all results, and a figure of the trajectories.
+"""The summary that opens the report: an abstract, all results, the files to hand in, a figure.
 
 All numbers are computed from the result files and, where it is known, the truth.
 """
 
 import re
-from dataclasses import dataclass
-from pathlib import Path
+from pathlib import PurePath
+from urllib.parse import quote
 
-import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.figure import Figure
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_output
 
-from slamlib import evaluation, odometry, se2
-from slamlib.dataset import Dataset, Truth, read_dataset, read_truth
-from slamlib.doubt import Doubt
-from slamlib.notebook import listed, plain, plotting, table_text
-from slamlib.report.execution import NotebookError
-from slamlib.results import read_vehicle_poses
-from slamlib.solve import (
-    PROBLEMS,
-    SENSORS,
-    Failure,
-    Solution,
-    doubts_about_drive,
-    merged,
-    title,
-    truth_in_world,
-)
+from slamlib import evaluation, odometry
+from slamlib.notebook import listed, median_sigmas, plain, table_text, with_unit
+from slamlib.report.animation import moving
+from slamlib.report.chapters import HTML_ONLY
+from slamlib.report.drives import order
+from slamlib.report.pictures import trajectories
+from slamlib.solve import PROBLEMS, SENSORS, title, truth_in_world
 
-INTRODUCTION = (
-    "We estimate the trajectory of a vehicle and map the landmarks from wheel encoders, markers on "
-    "the ceiling and radio ranges. Each chapter derives the estimator of one problem, runs it on "
-    "every dataset, and compares it with the truth where that is known.")
+FILES = ("vehiclePose.mat", "ArucoMap.mat", "UwbMap.mat")
+METHODS = {  # in the order of the problems; the hint is left to chapter 2
+    "problem1": "by odometry (problem\u00a01)", "problem2": "by markers alone",
+    "problem2_fused": "with odometry fused (problem\u00a02)",
+    "problem3": "by SLAM on odometry and markers (problem\u00a03)",
+    "problem4": "by SLAM with the UWB ranges (problem\u00a04)"}
+FEW = 3  # drives, at most, that the abstract names one by one
 
 
-@dataclass(frozen=True)
-class SolvedDrive:
-    """A dataset with the solutions that this build computed for it."""
+def summary(drives, address="."):
+    """Return the opening of the report, an executed NotebookNode, for a list of SolvedDrive.
 
-    name: str
-    dataset: Dataset
-    truth: Truth | None
-    solutions: tuple  # of Solution, in the order of PROBLEMS
-    doubts: tuple = ()  # of Doubt, first about the drive, then by problem
-    failures: tuple = ()  # of Failure, in the order of PROBLEMS
-
-
-def read_drives(data, results, selected, written, notices=None):
-    """Return the selected datasets with their solutions, a list of SolvedDrive, the shortest first.
-
-    Parameters
-    ----------
-    data, results : Path, the folders of the datasets and of the result files.
-    selected : list of str, names of datasets.
-    written : list of str, this build's files, as `short/problem1/vehiclePose.mat` in `results`.
-        NotebookError if poses cannot be read or have other shapes than the dataset's.
-    notices : dict by `notebook.notices`, the doubts and failures that this build's notebooks found.
+    `address` (str) is the path of the results folder from that of the report.
     """
-    drives = []
-    for name in selected:
-        problems = sorted((file.split("/")[1] for file in sorted(written) if re.fullmatch(
-            f"{re.escape(name)}/[^/]+/vehiclePose.mat", file)), key=_order)
-        dataset, truth = read_dataset(data / name), read_truth(data / name)
-        solved = tuple(_read_solution(results / name / problem, dataset) for problem in problems)
-        told = (notices or {}).get(name, [])
-        doubts = [*doubts_about_drive(dataset, truth), *(x for x in told if isinstance(x, Doubt))]
-        failures = sorted((x for x in told if isinstance(x, Failure)),
-                          key=lambda failure: _order(failure.problem))
-        drives.append(SolvedDrive(name, dataset, truth, solved, tuple(merged(doubts)),
-                                  tuple(failures)))
-    return sorted(drives, key=lambda drive: len(drive.dataset.ticks))
-
-
-def _order(problem):
-    """Return the index of a problem in PROBLEMS; unknown problems come last."""
-    return list(PROBLEMS).index(problem) if problem in PROBLEMS else len(PROBLEMS)
-
-
-def _read_solution(folder, dataset):
-    """Return the Solution in a results folder; its world frame is the first pose estimated."""
-    count = len(dataset.ticks)
-    file = f"{folder.parent.name}/{folder.name}/vehiclePose.mat, which a notebook wrote"
-    try:
-        poses, covariances = read_vehicle_poses(folder)
-    except Exception as error:  # scipy and numpy raise many kinds
-        raise NotebookError(f"{file}, cannot be read: {error}") from None
-    if poses.shape != (count, 3) or covariances.shape != (count, 3, 3):
-        raise NotebookError(f"{file}, must hold [x, y, heading] and a covariance for each of the "
-                            f"{count} encoder poses; it holds {poses.shape}, {covariances.shape}")
-    known = np.flatnonzero(np.isfinite(poses[:, 0]))
-    return Solution(problem=folder.name, title=title(folder.name, dataset), poses=poses,
-                    covariances=covariances, world=int(known[0]) if len(known) else 0)
-
-
-def summary(drives):
-    """Return the opening of the report, an executed NotebookNode, for a list of SolvedDrive."""
-    cells = [new_markdown_cell(f"# Overview\n\n{INTRODUCTION}", id="what"),
-             new_markdown_cell("## The datasets\n\n" + _dataset_table(drives), id="datasets")]
+    cells = [new_markdown_cell("# Overview\n\n" + abstract(drives), id="what")]
+    solved = [drive for drive in drives if drive.solutions]
+    if solved:
+        cells.append(new_markdown_cell("## Results\n\n" + _result_table(drives), id="results"))
     if doubts := _doubts(drives):
         cells.append(new_markdown_cell(f"## Doubts about the data\n\n{doubts}", id="doubts"))
-    if solved := [drive for drive in drives if drive.solutions]:
+    if any(drive.files for drive in drives):
+        cells.append(new_markdown_cell(
+            "## Files to hand in\n\n" + _file_table(drives, PurePath(address)), id="files"))
+    if solved:
         longest = max(solved, key=lambda drive: len(drive.dataset.ticks))
         cells += [
-            new_markdown_cell("## The results\n\n" + _result_table(drives), id="results"),
-            new_code_cell(
-                outputs=[new_output("display_data", _trajectories(longest))], id="picture",
-                metadata={"alt": f"The trajectories of {longest.name}, laid over each other"}),
+            *moving(longest),
+            new_code_cell(outputs=[new_output("display_data", trajectories(longest))], id="picture",
+                          metadata={"alt": f"The trajectories of {longest.name}, and the standard "
+                                           "deviation of position along them"}),
             new_markdown_cell(
-                f"Figure 1. The trajectories of {plain(longest.name)}, the longest drive, as the "
-                f"problems estimate it{', and the truth (dashed)' if longest.truth else ''}. Where "
-                "curves cannot be told apart they agree; table 2 lists the differences.",
+                f"Figure 1. *{plain(longest.name)}*, the longest drive. Left: its trajectory by "
+                "odometry, by fusion and by the last problem"
+                f"{', and the truth (dashed)' if longest.truth else ''}. Right: the standard "
+                "deviation of position along the drive, for every problem, on a logarithmic axis"
+                f"{'; problem 3 is the wide line' if longest.solution('problem3') else ''}.",
                 id="caption")]
+    cells.append(new_markdown_cell("## The datasets\n\n" + _dataset_table(drives), id="datasets",
+                                   metadata={"tags": [HTML_ONLY]}))  # chapter 1 has this table
     return new_notebook(cells=cells)
 
 
-def index(heading, opening, chapters, files):
+def index(heading, opening, chapters):
     """Return the first page, a NotebookNode: the opening by `summary` with links to all the rest.
 
-    `heading` (str) is the title of the report, `chapters` are dicts by `pages.chapter_of`, and
-    `files` pairs (str, str) of address and name of the result files.
+    `heading` (str) is the title of the report, `chapters` are dicts by `chapters.chapter_of`.
     """
     links = "\n\n".join(
         f"### [{chapter['title']}]({chapter['file']})\n\n"
         + re.sub(r"\]\(#", f"]({chapter['file']}#", chapter["lead"]) for chapter in chapters)
-    cells = [new_markdown_cell(f"# {plain(heading)}\n\n{INTRODUCTION}\n\n"
-                               "[The whole report as one PDF](report.pdf)", id="what"),
-             *opening.cells[1:],
-             new_markdown_cell("## Chapters\n\n" + links, id="chapters")]
-    if files:
-        names = "\n".join(f"- [{plain(name)}]({address})" for address, name in files)
-        cells.append(new_markdown_cell(
-            "## Files to hand in\n\nMATLAB files with struct arrays, as the notebooks wrote them."
-            f"\n\n{names}", id="files"))
-    return new_notebook(cells=cells)
+    first, *others = opening.cells
+    text = first.source.removeprefix("# Overview")
+    return new_notebook(cells=[
+        new_markdown_cell(f"# {plain(heading)}{text}\n\n[The whole report as one PDF](report.pdf)",
+                          id="what"),
+        *others, new_markdown_cell("## Chapters\n\n" + links, id="chapters")])
+
+
+def abstract(drives):
+    """Return what was done and found, in Markdown: at most six sentences, then where data are from.
+
+    `drives` is a list of SolvedDrive.
+    """
+    sentences = [
+        _what_was_done({name for name in SENSORS for drive in drives
+                        if getattr(drive.dataset, name) is not None}),
+        *_sigmas(drives), *_errors(drives), *_landmarks(drives)]
+    simulated = [f"*{plain(drive.name)}*" for drive in drives if drive.simulated]
+    return " ".join(sentences) + (f"\n\n{_said_of_simulated(simulated)}" if simulated else "")
+
+
+def _what_was_done(sensors):
+    """Return the first sentence of the abstract for a set of SENSORS."""
+    data = ["wheel encoders", *["ArUco markers on the ceiling"] * ("aruco" in sensors),
+            *["UWB ranges"] * ("uwb" in sensors)]
+    ways = ["by odometry"] + ["by markers", "by a filter that fuses both"] * ("aruco" in sensors) \
+        + ["by one factor graph in GTSAM"] * bool(sensors)
+    return ("We estimate the trajectory of a differential-drive vehicle"
+            + " and map its landmarks" * bool(sensors) + f" from {listed(data)}"
+            + (f": {', '.join(ways[:-1])}, and {ways[-1]}." if len(ways) > 2
+               else f", {listed(ways)}."))
+
+
+def _said_of_simulated(names):
+    are = "s {} are simulated stand-ins" if len(names) > 1 else " {} is a simulated stand-in"
+    return (f"The dataset{are.format(listed(names))} for the course's logs, so the truth is known. "
+            "With the course's logs in their place the errors are no longer known; everything else "
+            "is computed in the same way.")
+
+
+def _estimates(solution):
+    """Return True if a Solution or None has an estimate of any pose."""
+    return solution is not None and bool(np.isfinite(solution.poses[:, 0]).any())
+
+
+def _named(drives):
+    """Return the drives that the abstract names: all, or of many the shortest and the longest."""
+    solved = [drive for drive in drives if any(map(_estimates, drive.solutions))]
+    return solved if len(solved) <= FEW else [solved[0], solved[-1]]
+
+
+def _sigmas(drives):
+    """Yield a sentence on each drive, with the median sigma of position by every problem."""
+    before = None
+    for drive in _named(drives):
+        found = {problem: with_unit(median_sigmas(drive.solution(problem))[0], "m")
+                 for problem in METHODS if _estimates(drive.solution(problem))}
+        if found.keys() == before:
+            yield f"On *{plain(drive.name)}* it is {listed(list(found.values()))}."
+        elif before := found.keys():
+            yield (f"On *{plain(drive.name)}* the median standard deviation of position is "
+                   + listed([f"{value} {METHODS[problem]}" for problem, value in found.items()])
+                   + ".")
+
+
+def _errors(drives):
+    """Yield a sentence on the errors of odometry and of SLAM, where the truth is known."""
+    falls = []
+    for drive in _named(drives):
+        ends = drive.solution("problem1"), drive.solution("problem4") or drive.solution("problem3")
+        if drive.truth is not None and all(map(_estimates, ends)):
+            first, last = (with_unit(_ate(drive, solution), "m") for solution in ends)
+            falls.append(f"from {first} to {last} on *{plain(drive.name)}*")
+    if falls:
+        yield ("SLAM in place of odometry changes the root mean square error of position "
+               f"{listed(falls)}.")
+
+
+def _landmarks(drives):
+    """Yield a sentence on the maps of the named drives, each of the last problem that has one."""
+    maps = []
+    for drive in _named(drives):
+        found = []
+        for kind, name in (("aruco_map", "marker"), ("uwb_map", "antenna")):
+            known = [getattr(solution, kind) for solution in drive.solutions
+                     if getattr(solution, kind) is not None]
+            if known and (count := len(known[-1][0])):
+                found.append(f"{count} {name}{'s' * (count > 1)}")
+        if found:
+            maps.append(f"{listed(found)} on *{plain(drive.name)}*")
+    if maps:
+        yield f"The maps hold {', '.join(maps)}."
+
+
+def _ate(drive, solution, aligned=False):
+    return evaluation.ate(solution.poses, truth_in_world(solution, drive.truth), aligned)
 
 
 def _dataset_table(drives):
@@ -144,11 +174,12 @@ def _dataset_table(drives):
         counts = ["none" if readings is None else f"{len(readings.pose):,}"
                   for readings in (dataset.aruco, dataset.uwb)]
         rows.append([plain(drive.name), f"{len(dataset.ticks):,}",
-                     f"{evaluation.path_length(path):.1f}\u00a0m", *counts,
+                     with_unit(evaluation.path_length(path), "m"), *counts,
+                     "simulated" if drive.simulated else "recorded",
                      "known" if drive.truth else "not known"])
-    header = ["dataset", "poses", "path", "sightings of markers", "UWB ranges", "truth"]
-    return (table_text(header, rows, texts=2)
-            + "\n\nTable 1. Measurements of each drive; the path length is from odometry.")
+    header = ["dataset", "poses", "path", "sightings of markers", "UWB ranges", "origin", "truth"]
+    return (table_text(header, rows, texts=1)
+            + "\n\nTable 3. Measurements of each drive; the path length is from odometry.")
 
 
 def _doubts(drives):
@@ -167,18 +198,18 @@ def _doubts(drives):
 def _result_table(drives):
     problems = sorted(dict.fromkeys(
         told.problem for drive in drives for told in (*drive.solutions, *drive.failures)),
-        key=_order)
-    rows = []
-    for drive in drives:
-        solved = {solution.problem: solution for solution in drive.solutions}
-        rows += [_result_row(drive, problem, solved.get(problem)) for problem in problems]
-    header = ["dataset", "problem", "ATE", "ATE, aligned", "σ of position", "σ of heading",
-              "poses"]
+        key=order)
+    known = any(drive.truth is not None for drive in drives)
+    rows = [result_row(drive, problem, known) for drive in drives for problem in problems]
+    errors = ["ATE", "ATE, aligned"] if known else []
+    header = ["dataset", "problem", *errors, "σ of position", "σ of heading", "poses"]
     text = table_text(header, rows, texts=2) + (
-        "\n\nTable 2. Every problem on every dataset: the root mean square error of all positions "
-        "(ATE), as they stand and moved as a whole nearest to the truth; at the last pose that has "
-        "an estimate the larger standard deviation of $x$ and $y$, and that of the heading; and "
-        "how many poses have one.")
+        "\n\nTable 1. Every problem on every dataset: "
+        + ("the root mean square error of all positions (ATE), as they stand and moved as a whole "
+           "nearest to the truth (aligned); " if known else "")
+        + "the medians over all estimated poses of the standard deviation σ of position (the "
+        "larger of $x$ and $y$) and of heading; how many poses are estimated."
+        + (" *Hint*: fused as the assignment suggests." if "problem2_hint" in problems else ""))
     if without := [plain(drive.name) for drive in drives if drive.truth is None]:
         text += f"\n\nNo truth comes with {listed(without)}, so errors are not known there."
     for sensor, name in SENSORS.items():
@@ -188,49 +219,46 @@ def _result_table(drives):
     return text
 
 
-def _result_row(drive, problem, solution):
-    row = [plain(drive.name), plain(title(problem, drive.dataset))]
+def named(problem, dataset):
+    """Return number and title of a problem on a dataset (str), as "3. SLAM: odometry + ArUco"."""
+    number = re.match(r"problem(\d+)", problem)
+    return (f"{number[1]}. " if number else "") + plain(title(problem, dataset))
+
+
+def result_row(drive, problem, known=True):
+    """Return a row of the table of results (list of str); `known`: it has columns of errors."""
+    row = [plain(drive.name), named(problem, drive.dataset)]
+    solution, errors = drive.solution(problem), 2 * known
     if solution is None:
         needed = PROBLEMS[problem].sensors if problem in PROBLEMS else ()
         missing = [SENSORS[sensor] for sensor in needed if getattr(drive.dataset, sensor) is None]
         failed = any(failure.problem == problem for failure in drive.failures)
         return [*row, f"left out: no {' and no '.join(missing)}" if missing
-                else "could not be solved" if failed else "no result", *["–"] * 4]
-    known = np.flatnonzero(np.isfinite(solution.poses[:, 0]))
-    if not len(known):
-        return [*row, *["–"] * 4, "0"]
-    errors = ["no truth"] * 2
-    if drive.truth is not None:
-        truth = truth_in_world(solution, drive.truth)
-        errors = [_with_unit(evaluation.ate(solution.poses, truth, aligned), "m")
-                  for aligned in (False, True)]
-    sigma = evaluation.sigmas(solution.covariances[known[-1]])
-    return [*row, *errors, _with_unit(max(sigma[:2]), "m"), _with_unit(sigma[2], "rad"),
-            f"{len(known):,}"]
+                else "could not be solved" if failed else "no result", *["–"] * (errors + 2)]
+    if not _estimates(solution):
+        return [*row, *["–"] * (errors + 2), "0"]
+    row += ["no truth"] * errors if drive.truth is None else [
+        with_unit(_ate(drive, solution, aligned), "m") for aligned in (False, True)[:errors]]
+    position, heading = median_sigmas(solution)
+    count = np.isfinite(solution.poses[:, 0]).sum()
+    return [*row, with_unit(position, "m"), with_unit(heading, "rad"), f"{count:,}"]
 
 
-def _with_unit(value, unit):
-    """Return a value with three digits, below 1 in thousandths of the unit."""
-    value, unit = (value, unit) if value >= 1 else (1e3 * value, f"m{unit}")
-    return f"{value:.{max(0, 3 - len(str(int(value))))}f}\u00a0{unit}"
-
-
-def _trajectories(drive):
-    """Return the figure of a drive's trajectories, in the frame of pose 1, as {MIME type: SVG}."""
-    style = Path(plotting.__file__).with_name("slamlib.mplstyle")
-    with plt.style.context(style, after_reset=True):
-        fig = Figure(figsize=(7.2, 3.8))  # inches
-        ax = fig.add_subplot()
-        if drive.truth is not None:
-            plotting.trajectory(ax, drive.truth.poses, "truth")
-        last = drive.solutions[-1].poses
-        for solution in drive.solutions:
-            if solution.problem == "problem2_hint":
-                continue
-            poses = solution.poses
-            if solution.world and np.isfinite(last[solution.world, 0]):
-                poses = se2.compose(last[solution.world], poses)
-            task = PROBLEMS.get(solution.problem)
-            plotting.trajectory(ax, poses, task.role if task else "alternative", solution.title)
-        plotting.legend_below(fig)
-        return plotting.pictures(fig)
+def _file_table(drives, address):
+    """Return the table of the files to hand in, with links, by problem and dataset."""
+    paths = [PurePath(file) for drive in drives for file in drive.files]
+    folders = sorted({path.parent for path in paths}, key=lambda path: (order(path.name), path))
+    kinds = sorted({path.name for path in paths}, key=lambda name: (
+        FILES.index(name) if name in FILES else len(FILES), name))
+    rows = []
+    for folder in folders:
+        links = [", ".join(
+            f"[{plain(drive.name)}]({quote(str(address / drive.name / folder / kind))})"
+            for drive in drives if str(folder / kind) in drive.files) or "–" for kind in kinds]
+        at = next(drive for drive in drives
+                  if folder in (PurePath(file).parent for file in drive.files))
+        rows.append([named(folder.name, at.dataset), f"`{folder}`", *links])
+    text = table_text(["problem", "folder", *[f"`{kind}`" for kind in kinds]], rows,
+                      texts=2 + len(kinds))
+    return (f"{text}\n\nTable 2. The files to hand in, MATLAB files with struct arrays, and the "
+            "datasets that have them. The path of a file is `results/dataset/folder/file`.")

@@ -1,6 +1,7 @@
-"""Makes HTML pages of executed notebooks, which need no script and no network.
+"""Makes HTML pages of executed notebooks, which need no network.
 
-nbconvert makes a page by `page.html` and `page.css`; pandoc converts its formulas to MathML.
+nbconvert makes a page by `page.html` and `page.css`; pandoc converts its formulas to MathML. A page
+with an element of class `live` has the script `page.js`, and no page has another one.
 """
 
 import html
@@ -15,12 +16,17 @@ from jinja2 import pass_context
 from nbconvert import HTMLExporter
 from nbconvert.filters.markdown_mistune import IPythonRenderer, MarkdownWithMath
 
+from slamlib.report.chapters import shows_input
 from slamlib.report.execution import NotebookError
 from slamlib.report.formulas import set_formulas
 from slamlib.report.numbering import CAPTION, TAG
+from slamlib.report.svg import DRAWN, FAMILY, compact
 
 PAGE = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
 STYLE = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
+SCRIPT = Path(__file__).with_name("page.js")  # of what moves; without it the pictures stand still
+ANSWER = re.compile(r"<p><strong>Answer</strong></p>\n?")  # begins the block quote of an answer
+LIVE = re.compile(r'<[^>]*\sclass="(?:[^">]*\s)?live[\s"]')
 MARK = re.compile("\ue000(\\d+)\ue001([.,;:!?)]*)")  # stands for a formula until pandoc converts it
 INTERNAL = re.compile(r"([^:/#]+\.ipynb)?(?:#(.+))?")  # a link to a notebook or an anchor
 ACCENTS = {"\u0302": "^", "\u0303": "~", "\u0307": "\u02d9", "\u0308": "\u00a8"}
@@ -30,21 +36,7 @@ LOADED = re.compile(r"<(?:script|link|iframe|object|embed|base)\b[^>]*"
                     r"|@import\b.*|url\((?![\"']?(?:data:|#)).*", re.IGNORECASE)
 
 
-def chapter_of(source, book):
-    """Return file, notebook, title, number (or None) and lead of a chapter (Path, NotebookNode).
-
-    These are the keys of a dict of str; the lead is the chapter's first paragraph in Markdown.
-    """
-    text = "\n\n".join(cell.source for cell in book.cells if cell.cell_type == "markdown")
-    title = re.search(r"^#\s+(.+)", text, re.MULTILINE)
-    lead = re.search(r"^(?!\s|[#|<>`]|\$\$|[-*+]\s).+(?:\n.+)*", text, re.MULTILINE)
-    title = re.sub("[*_`]", "", title[1]).strip() if title else source.stem
-    number = re.match(r"(\d+)\.", title)
-    return {"file": quote(f"{source.stem}.html"), "notebook": source.name, "title": title,
-            "lead": lead[0] if lead else "", "number": number[1] if number else None}
-
-
-def html_pages(books, chapters, code=True):
+def html_pages(books, chapters, code="method"):
     """Return the HTML pages of books (dict from Path to NotebookNode) as {file name: str}.
 
     The other parameters are those of `html_page`. NotebookError if a page would lose a formula or
@@ -69,7 +61,7 @@ def _print_once(sentence):
     print(sentence, file=sys.stderr)
 
 
-def html_page(source, book, chapters, code=True):
+def html_page(source, book, chapters, code="method"):
     """Return the HTML page (str) of an executed book, and a dict of what the renderer collected.
 
     NotebookError if a formula cannot be converted or the page would load something.
@@ -78,7 +70,7 @@ def html_page(source, book, chapters, code=True):
     ----------
     source, book : Path and NotebookNode.
     chapters : list of dict by `chapter_of`, for the contents.
-    code : bool; False leaves out code cells and printed text.
+    code : one of chapters.CODE; "none" leaves out printed text, too.
     """
     page = {"formulas": [], "sections": [], "section": "", "headings": [], "anchors": {},
             "links": [], "figures": [], "chapters": chapters, "code": code, "style": STYLE,
@@ -94,7 +86,15 @@ def html_page(source, book, chapters, code=True):
     text = MARK.sub(lambda mark: unbroken(formulas[int(mark[1])], mark[2]), text)
     if loaded := LOADED.search(text):
         raise NotebookError(f"{source.name}: the page would load a resource: {loaded[0][:100]}")
-    return text, page
+    return _with_script(text.replace(f"'{DRAWN}'", FAMILY)), page
+
+
+def _with_script(text):
+    """Return a page (str) with the build's own script if it has an element of class `live`."""
+    if not LIVE.search(text) or not SCRIPT.exists():
+        return text
+    before, end, after = text.rpartition("</body>")
+    return f"{before}<script>\n{SCRIPT.read_text(encoding='utf-8')}</script>\n{end}{after}"
 
 
 def formula_error(page, number, reason):
@@ -150,6 +150,11 @@ class Renderer(IPythonRenderer):
         anchor = self.anchor(f"{caption[1].lower()}-{caption[2]}")
         return f'<p class="caption" id="{anchor}">{text}</p>\n'
 
+    def block_quote(self, text):
+        """Return a block quote; the box *Answer* of a chapter has a class."""
+        kind = ' class="answer"' if ANSWER.match(text) else ""
+        return f"<blockquote{kind}>\n{text}</blockquote>\n"
+
     def link(self, text, url, title=None):
         """Return a link; a notebook's name becomes its page's, or plain text if there is none."""
         if inside := INTERNAL.fullmatch(url):
@@ -190,4 +195,5 @@ def _markdown_to_html(context, source):
 
 
 EXPORTER = HTMLExporter(template_name="basic", raw_template=PAGE,
-                        filters={"markdown2html": _markdown_to_html})
+                        filters={"markdown2html": _markdown_to_html, "shows_input": shows_input,
+                                 "compact": compact})

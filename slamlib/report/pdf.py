@@ -1,8 +1,8 @@
 """Makes the report's PDF: pandoc writes Typst, the typst wheel sets it; neither needs a network.
 
 The pages' renderer converts cells and outputs to HTML, with marks (private characters) for
-formulas, pictures, captions and paragraphs that end with a colon. pandoc converts the HTML to
-Typst, where calls of `report.typ` replace the marks. A query checks that no formula is lost.
+formulas, pictures, captions, answers and paragraphs that end with a colon. pandoc converts the HTML
+to Typst, where calls of `report.typ` replace the marks. A query checks that no formula is lost.
 """
 
 import base64
@@ -13,38 +13,44 @@ import re
 import tempfile
 import textwrap
 from functools import partial
+from itertools import count
 from pathlib import Path
 
 import pypandoc
-import typst
 from nbconvert.filters import strip_ansi
 from nbconvert.filters.markdown_mistune import MarkdownWithMath
 
+from slamlib.report.chapters import shows_input
 from slamlib.report.execution import NotebookError
 from slamlib.report.formulas import set_formulas
 from slamlib.report.numbering import CAPTION, TAG
-from slamlib.report.pages import MARK, Renderer, formula_error
+from slamlib.report.pages import ANSWER, MARK, Renderer, formula_error
+from slamlib.report.setting import PLACES, UNKNOWN, compiled, missing_glyphs, quoted
+from slamlib.report.svg import compact
 
 TEMPLATE = Path(__file__).with_name("report.typ")
 PICTURES = {"image/svg+xml": "svg", "image/png": "png", "image/jpeg": "jpg"}
 KINDS = (*PICTURES, "text/markdown", "text/latex", "text/html", "text/plain")  # best first
 COLUMNS = 96  # width of the page in characters of code
-LONG = 36  # lines of Typst from which a table may break between pages
-TABLE = re.compile(
-    "#figure\\(\n(?:(?!#figure\\().)*?, kind: table\n  \\)(?=\\s*\ue004)", re.DOTALL)
+TABLE = re.compile("#figure\\(\n(?:(?!#figure\\().)*?, kind: table\n  \\)"
+                   "\\s*\ue004(.*?)\ue006(.*?)\ue005", re.DOTALL)
+NAME_ONLY = re.compile(
+    r"^    \[((?:(?!\], ).)+)\](?:, (?:table\.cell\([^)]*\))?\[\])+,$", re.MULTILINE)
 PICTURE = re.compile("\ue002(\\d+)\ue003")
 CAPTIONED = re.compile("\ue002(\\d+)\ue003\\s*\ue004(.*?)\ue006(.*?)\ue005", re.DOTALL)
 CAPTIONS = re.compile("\ue004(.*?)\ue006(.*?)\ue005", re.DOTALL)
+REFERENCES = re.compile(r"^(== References\n<[\w-]+>\n)((?:(?!== ).*\n)+)\Z", re.MULTILINE)
+STAYS = re.compile(r"(?:^=+ .*\n<[\w-]+>|\ue008)\s*\n#placed\(\ue009, \"\w+\",", re.MULTILINE)
 SCALED = re.compile(r"#scale\(x: (\d+)%, y: \d+%\)\[(\\?[^\\]|\\\])\]")  # pandoc's \big, \Big, ...
 REPLACED = [(re.compile(pattern), replacement) for pattern, replacement in (
     # TeX that pandoc sets wrongly
     (r"\\!", ""), (r"\\;", r"\\:"),
     (r"\\([bB]igg?[lrm]?|left|right)\s*(?=\\[lr]?[vV]ert(?![a-zA-Z])|\\\|)", ""),
     (r"\\lvert(?![a-zA-Z])", r"\\left\\lvert"), (r"\\rvert(?![a-zA-Z])", r"\\right\\rvert"))]
-_quoted = partial(json.dumps, ensure_ascii=False)
+COMMANDS = {"\ue007": "#announcing[", "\ue008": "]", "\ue00a": "#answer[", "\ue00b": "]"}
 
 
-def typeset(chapters, opening=None, code=True, **cover):
+def typeset(chapters, opening=None, code="method", picture=None, **cover):
     """Return the PDF of chapters, title page and contents as bytes; equal input gives equal bytes.
 
     NotebookError if a formula is lost or cannot be set, or if the fonts lack a character.
@@ -53,10 +59,11 @@ def typeset(chapters, opening=None, code=True, **cover):
     ----------
     chapters : list of (Path, NotebookNode), executed; links name chapters by their file names.
     opening : NotebookNode, an unnumbered chapter before them, or None.
-    code : bool; False leaves out code cells and printed text.
+    code : one of chapters.CODE; "none" leaves out printed text, too.
+    picture : str, an SVG for the title page, or None.
     cover : title, author, student_number, course (str), the lines of the title page.
     """
-    files, book = typst_files(chapters, opening, code, **cover)
+    files, book = typst_files(chapters, opening, code, picture, **cover)
     for name, text in book.texts:
         if missing := missing_glyphs(text):
             context = re.search(f".{{0,30}}{missing[0]}.{{0,30}}", text)[0]
@@ -65,10 +72,10 @@ def typeset(chapters, opening=None, code=True, **cover):
     with tempfile.TemporaryDirectory() as folder:
         for name, content in files.items():
             Path(folder, name).write_bytes(content)
-        return _compile(Path(folder), book)
+        return compiled(Path(folder), book)
 
 
-def typst_files(chapters, opening=None, code=True, **cover):
+def typst_files(chapters, opening=None, code="method", picture=None, **cover):
     """Return the files for Typst as {name: bytes}, and their _Book; parameters as `typeset`."""
     book = _Book(code)
     parts = [book.chapter(*chapter) for chapter in chapters]
@@ -78,49 +85,45 @@ def typst_files(chapters, opening=None, code=True, **cover):
     formulas = book.formula_definitions()
     if lost := set(range(len(formulas))) - {int(mark[1]) for mark in MARK.finditer(text)}:
         raise book.error(min(lost), "the PDF would lose this formula")
-    text = TABLE.sub(lambda table: f"#unbroken[{table[0]}]" if table[0].count("\n") < LONG
-                     else table[0], text)
+    text = TABLE.sub(_table, text)
     text = MARK.sub(r"#formula-\1;\2", text)
-    text = CAPTIONED.sub("#floating[\ue002\\1\ue003 \ue004\\2\ue006\\3\ue005]", text)
+    text = CAPTIONED.sub(
+        lambda figure: "#placed(\ue009, \"figure\", size => [#picture({}, {}, shrink: size)".format(
+            *book.pictures[int(figure[1])])
+        + f" \ue004{figure[2]}\ue006{figure[3]}\ue005])", text)
+    text = STAYS.sub(r"\g<0> stays: true,", text)
+    text = re.sub("^(?=== )", "#section(\ue009)\n", text, flags=re.MULTILINE)
+    number = count()
+    text = re.sub("\ue009", lambda _: str(next(number)), text)
     text = PICTURE.sub(lambda mark: "#picture({}, {});".format(*book.pictures[int(mark[1])]), text)
     text = CAPTIONS.sub(r"#caption[\2] <\1>", text)
-    text = text.replace("\ue007", "#announcing[").replace("\ue008", "]")
-    lines = ", ".join(f"{name}: {_quoted(value)}" for name, value in cover.items())
+    for mark, command in COMMANDS.items():
+        text = text.replace(mark, command)
+    if picture:
+        book.files["title.svg"] = compact(picture).encode()
+        cover["picture"] = "title.svg"
+    lines = ", ".join(f"{name}: {quoted(value)}" for name, value in cover.items())
     text = (f'#import "{TEMPLATE.name}": *\n#import "formulas.typ": *\n'
             f"#show: report.with({lines})\n{text}\n")
     definitions = "\n".join([f'#import "{TEMPLATE.name}": display', *formulas])
     return {TEMPLATE.name: TEMPLATE.read_bytes(), "main.typ": text.encode(),
-            "formulas.typ": definitions.encode(), **book.files}, book
+            "formulas.typ": definitions.encode(), PLACES: json.dumps(UNKNOWN).encode(),
+            **book.files}, book
 
 
-def _compile(folder, book):
-    compiler = typst.Compiler(folder / "main.typ", root=folder, ignore_system_fonts=True)
-    try:
-        content = compiler.compile(format="pdf", timestamp=0)
-        found = set(json.loads(compiler.query("math.equation", field="label")))
-    except typst.TypstError as error:
-        if line := re.search(r"formulas\.typ:(\d+):", error.diagnostic):  # formula 0 is on line 2
-            raise book.error(int(line[1]) - 2,
-                             f"Typst cannot set this formula, {error.message}") from None
-        raise NotebookError("Typst cannot set the PDF: "
-                            f"{error.message}: {error.diagnostic.strip()}") from None
-    for number, label in enumerate(book.labels):
-        if f"<{label}>" not in found:
-            raise book.error(number, "the PDF lost this formula")
-    return content
+def _table(found):
+    """Return a table and its caption (Match) to be placed, with lines between its groups.
 
-
-def missing_glyphs(text):
-    """Return the characters (list of str) of a text (str) that no font of the PDF has."""
-    def any_missing(characters):  # drawn like U+10FFFD, which is not a character
-        source = "\n".join(f'#box({_quoted(c)})' for c in ["\U0010fffd", *characters])
-        pages = typst.compile(source.encode(), format="svg", ignore_system_fonts=True)
-        missing, *glyphs = re.findall(r'<use [^>]*href="#(\w+)"', b"".join(
-            [pages] if isinstance(pages, bytes) else pages).decode())
-        return missing in glyphs
-
-    characters = sorted({c for c in text if not c.isascii()})
-    return [c for c in characters if any_missing([c])] if any_missing(characters) else []
+    The rows of a group but the first begin with an empty cell, or a row with a name only precedes
+    them.
+    """
+    head, rule, rows = found[0].partition("    table.hline(),\n")
+    columns = re.search(r"columns: (\d+)", head)
+    rows = NAME_ONLY.sub(rf"    table.cell(colspan: {columns[1] if columns else 1})[\1],", rows)
+    if "\n    [], " in rows:  # a row that continues a group
+        rows = rows[:5] + re.sub(r"^    \[(?!\], )", r"    table.hline(stroke: 0.3pt),\n\g<0>",
+                                 rows[5:], flags=re.MULTILINE)
+    return f"#placed(\ue009, \"table\", _ => [{head}{rule}{rows}])"
 
 
 def _folded(text):
@@ -163,7 +166,7 @@ class _Book:
             if cell.cell_type == "markdown":
                 parts.append(self.markdown(cell.source, cell.get("attachments", {})))
             elif cell.cell_type == "code":
-                if self.code and cell.source.strip():
+                if shows_input(cell, self.code) == "open":
                     parts.append(f'<pre class="python">{html.escape(_folded(cell.source))}</pre>')
                 alt = cell.metadata.get("alt")
                 parts += [self.output(output, alt, first) for output in cell.outputs]
@@ -172,9 +175,18 @@ class _Book:
                                          ["--wrap=none", f"--extract-media={media}"])
             self.files |= {file.name: file.read_bytes() for file in Path(media).iterdir()}
         text = text.replace(f'"{media}/', '"')
-        self.texts.append((source.name, re.sub("[\ue000-\ue008]", "", text)))
+        self.texts.append((source.name, re.sub("[\ue000-\ue00b]", "", text)))
         text = re.sub(r"align: \([a-z,]*\)", lambda align: align[0].replace("auto", "left"), text)
-        return re.sub(r"^= (\d+)\.", r"#counter(heading).update(\1 - 1)\n\g<0>", text, count=1)
+        text = REFERENCES.sub(r"\1#references[\n\2\n]\n", text)
+        return re.sub(r"^= (\d+|[A-Z])\.", self._numbered, text, count=1)
+
+    @staticmethod
+    def _numbered(title):
+        """Return the beginning of a chapter's title (Match) with the number of its sections."""
+        if title[1].isdigit():
+            return f"#counter(heading).update({title[1]} - 1)\n{title[0]}"
+        return (f"#counter(heading).update({ord(title[1]) - ord('A')})\n"
+                f"#set heading(numbering: lettered)\n{title[0]}")
 
     def markdown(self, text, attachments=()):
         """Return Markdown (str) as HTML with marks."""
@@ -194,15 +206,15 @@ class _Book:
             number = len(self.pictures)
             name = f"picture-{number}.{PICTURES[kind]}"
             alt = alt or f"Figure {number - first + 1} of this chapter"
-            self.files[name] = (data[kind].encode() if "svg" in kind
+            self.files[name] = (compact(data[kind]).encode() if "svg" in kind
                                 else base64.b64decode(data[kind]))
-            self.pictures.append((_quoted(name), _quoted(alt)))
+            self.pictures.append((quoted(name), quoted(alt)))
             return f"<p>\ue002{number}\ue003</p>"
         if kind in ("text/markdown", "text/latex"):
             return self.markdown(data[kind])
         if kind == "text/plain":
             text = html.escape(_folded(strip_ansi(data[kind])))
-            return f"<pre>{text}</pre>" if self.code else ""
+            return f"<pre>{text}</pre>" if self.code != "none" else ""
         return data.get(kind, "")
 
     def formula_definitions(self):
@@ -228,7 +240,7 @@ class _Book:
         elif "\\tfrac" in tex and "\\frac" not in tex:
             formula = f"#show math.frac: math.inline; {formula}"
         if display:
-            formula = f"#display({_quoted(self.page['tags'].get(number, ''))})[{formula}]"
+            formula = f"#display({quoted(self.page['tags'].get(number, ''))})[{formula}]"
         return f"#let formula-{number} = [{formula}]"
 
 
@@ -256,6 +268,10 @@ class _Renderer(Renderer):
         if text.rstrip().endswith(":"):
             return f"<p>\ue007{text}\ue008</p>\n"
         return super().paragraph(text)
+
+    def block_quote(self, text):
+        return f"<p>\ue00a</p>\n{text}<p>\ue00b</p>\n" if ANSWER.match(text) else (
+            super().block_quote(text))
 
     def link(self, text, url, title=None):
         if re.match(r"(https?|mailto):", url):

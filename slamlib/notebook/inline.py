@@ -1,0 +1,99 @@
+"""Figures as SVG inside an HTML page: compact, with ids of their own, and points that tell.
+
+Pages show figures as pictures, in which nothing can be pointed at. A figure that has points with
+sentences (`tell`) is put into the page itself instead, as another output of the same cell.
+"""
+
+import re
+from hashlib import sha256
+from html import escape
+
+from slamlib.notebook import plotting
+
+REACH = 5.0                    # points, radius of the area around a point that tells its sentence
+LARGEST = 1.4                  # times its size, in which a figure is shown where there is room
+POINTS = "telling"             # id of these areas
+STYLE = """<style>.inline svg { display: block; width: 100%; height: auto; margin: auto;
+  background: #fff; }
+.inline circle { fill: transparent; pointer-events: all; cursor: help; }
+.inline circle:hover { stroke: #000; stroke-width: 0.7; }
+.inline .narrow { display: none; }
+@media screen and (max-width: 40rem) { .inline .wide { display: none; }
+  .inline .narrow { display: block; } }</style>"""
+
+
+def tell(ax, places, sentences, name):
+    """Let each of places (n, 2) tell a sentence (str) when it is pointed at in an HTML page.
+
+    `name` (str) is the figure's, for those who cannot see it. One call a figure.
+    """
+    ax.plot(*places.T, "o", markersize=2 * REACH, alpha=0, gid=POINTS, zorder=20)
+    ax.figure.telling = list(sentences), name
+
+
+def outputs(fig, pictures):
+    """The outputs of a figure by MIME type: its pictures, and HTML if it can be moved or tells.
+
+    The HTML of a figure that can be moved is its attribute `moving` (`live.live`). `pictures`
+    is what `plotting.pictures` returns.
+    """
+    if not pictures:
+        return pictures
+    if moving := getattr(fig, "moving", None):
+        return {**pictures, "text/html": moving}
+    if not getattr(fig, "telling", None):
+        return pictures
+    sentences, name = fig.telling
+    both = "".join(_svg(_told(compact(pictures[key]), sentences), kind, name)
+                   for key, kind in ((plotting.WIDE, "wide"), (plotting.NARROW, "narrow")))
+    return {**pictures, "text/html": f'<figure class="inline">{STYLE}{both}</figure>'}
+
+
+def compact(svg):
+    """An SVG (str) by matplotlib for an HTML page: short numbers, and no ids that others may have.
+
+    Ids that nothing refers to are left out, that of POINTS stays, and all others begin with a hash
+    of the picture.
+    """
+    svg = shortened(re.sub(r"<metadata>.*?</metadata>|<style.*?</style>|<!--.*?-->", "",
+                           svg[svg.index("<svg"):], flags=re.DOTALL).replace("xlink:href", "href"))
+    used = {name for pair in re.findall(r'href="#([^"]+)"|url\(#([^)]+)\)', svg) for name in pair}
+    own = f"i{sha256(svg.encode()).hexdigest()[:8]}-"
+    svg = re.sub(r' id="([^"]*)"', lambda found: found[0] if found[1] == POINTS else
+                 f' id="{own}{found[1]}"' if found[1] in used else "", svg)
+    return re.sub(r'(href="|url\()#', rf"\1#{own}", svg)
+
+
+def shortened(svg):
+    """An SVG (str) or a part of one with short numbers, and no space between its elements."""
+    svg = re.sub(r' transform="rotate\(-0 [^)]*\)"', "", svg)
+    svg = re.sub(r'(?<= (?:d|x|y)=")[^"]*', lambda part: _short(part[0]), svg)
+    svg = re.sub(r'(?<=translate\()[^)]*', lambda part: _short(part[0]), svg)
+    svg = re.sub(r'(?<= style=")[^"]*', lambda part: re.sub(r"([:;])\s+", r"\1", part[0]), svg)
+    return re.sub(r">\s+<", "><", svg).strip()
+
+
+def _short(numbers):
+    """A text with its numbers rounded, to two digits behind the point below 10 and one above."""
+    def rounded(number):
+        value = float(number[0])
+        return f"{round(value, 2 if abs(value) < 10 else 1):g}"
+    numbers = re.sub(r"-?\d+\.\d+", rounded, " ".join(numbers.split()))
+    return re.sub(r" ?([A-Za-z]) ?", r"\1", numbers)
+
+
+def _told(svg, sentences):
+    """An SVG with the areas of its points, each with the sentence in a title."""
+    group = re.search(rf'<g id="{POINTS}">(.*?)</g></g>', svg, re.DOTALL)
+    places = re.findall(r'<use [^>]*?x="([^"]+)" y="([^"]+)"', group[1])
+    areas = "".join(f'<circle cx="{x}" cy="{y}" r="{REACH:g}"><title>{escape(sentence)}</title>'
+                    "</circle>" for (x, y), sentence in zip(places, sentences, strict=True))
+    return svg[:group.start()] + f"<g>{areas}</g>" + svg[group.end():]
+
+
+def _svg(svg, kind, name):
+    """An SVG element of a class, with a name and its width; lines end and join as matplotlib's."""
+    box, width = re.search(r'viewBox="[^"]*"', svg)[0], re.search(r'width="([\d.]+)pt"', svg)[1]
+    return (f'<svg class="{kind}" {box} role="img" aria-label="{escape(name)}" '
+            f'style="max-width:{LARGEST * float(width):.0f}pt;stroke-linejoin:round;'
+            f'stroke-linecap:butt">{svg[svg.index(">") + 1:]}')

@@ -1,0 +1,247 @@
+"""The whole map of one drive: a figure of all landmarks with their names, and tables of them.
+
+A result is a `slam.SlamResult`; it may have no markers or no antennas. Truth enters here only: it
+is drawn, and errors are computed from it, where the drive has it.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from slamlib import evaluation, se2
+from slamlib.notebook import inline, plotting
+from slamlib.notebook.names import Names
+
+WIDTH = 7.4                    # inches, the whole width of the page
+HEIGHTS = 2.6, 4.0, 5.7        # inches: lowest axes; highest ones of few and of many landmarks
+MANY = 60                      # landmarks
+POINT = 1.0                    # rad^2, variance of the heading of a marker without orientation
+MARGIN = 0.04                  # of the map's extent around it
+TICK = 0.022                   # length of a marker's heading tick, of the map's extent
+LARGEST = 0.045                # semi-axis of the largest ellipse, of the map's extent
+NAME, ANTENNA_NAME = 6.2, 10.0                         # points, sizes of the names
+MARKER, ANTENNA = "#CC79A7", "#44AA99"                 # colours of the ellipses
+
+
+def whole_map(drive, result):
+    """The figure of a drive's map: path, markers, antennas and their names, and truth if known.
+
+    Ellipses hold 95 %; the title states how much they are enlarged. Those of antennas in doubt are
+    drawn in their true size, because they may be as large as the map.
+
+    Parameters
+    ----------
+    drive : Drive
+    result : SlamResult
+    """
+    low, high = _extent(drive, result)
+    size = (high - low).max()
+    enlarged = _enlargement(result, size)
+    fig, ((ax,),) = plotting.panels(1, width=WIDTH, height=_height(high - low, result))
+    role = "slam_uwb" if len(result.antenna) else "slam"
+    plotting.trajectory(ax, result.poses, role, "vehicle", linewidth=1.5,
+                        linestyle="-")
+    if drive.truth is not None:
+        plotting.trajectory(ax, drive.truth.poses, "truth", linewidth=0.7)
+    names = [*_markers(ax, drive, result, enlarged, TICK * size),
+             *_antennas(ax, drive, result, enlarged)]
+    ax.set_aspect("equal", adjustable="box")
+    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), title=_title(drive, result, enlarged))
+    for ellipses in ax.collections:
+        ellipses.set_linewidth(0.7)
+    ax.add_artist(Names(names, _guesses(drive, result), np.concatenate([
+        result.poses[:, :2], *_ticks(result, TICK * size), *_outlines(result, enlarged)])))
+    if names:
+        inline.tell(ax, np.array([place for _, place, _ in names]), _sentences(drive, result),
+                    f"Map of {drive.name}")
+    plotting.legend_below(fig)
+    return fig
+
+
+def _markers(ax, drive, result, enlarged, tick):
+    """Draw the markers; yield (name, place (2,), font size) of each."""
+    if not len(result.marker):
+        return
+    place = result.marker_in_world[:, :2]
+    plotting.ellipses(ax, place, result.marker_covariance, MARKER, enlarged=enlarged, fill=0.3,
+                      fit=False)
+    ax.plot(*_ticks(result, tick).transpose(2, 0, 1)[:, [0, -1]], color="#555555", linewidth=0.9,
+            zorder=4)
+    ax.plot(*place.T, "s", color="#777777", markersize=2.6, zorder=4, label="markers, headings")
+    if drive.truth is not None and len(drive.truth.marker):
+        ax.plot(*drive.truth.marker_in_world[:, :2].T, "+", color="black", markersize=4.5,
+                markeredgewidth=0.6, zorder=5, label="markers: truth")
+    for marker, at in zip(result.marker, place, strict=True):
+        yield str(marker), at, NAME
+
+
+def _ticks(result, length):
+    """Points (5, k, 2) on the heading ticks of the markers that have a heading, ends included."""
+    place, heading = np.split(result.marker_in_world[_oriented(result)], [2], axis=1)
+    way = length * np.hstack([np.cos(heading), np.sin(heading)])
+    return place + np.linspace(0, 1, 5)[:, None, None] * way
+
+
+def _antennas(ax, drive, result, enlarged):
+    """Draw the antennas; yield (name, place (2,), font size) of each."""
+    if not len(result.antenna):
+        return
+    place, doubt = result.antenna_in_world, in_doubt(result)
+    for which, factor in ((~doubt, enlarged), (doubt, 1)):
+        if which.any():
+            plotting.ellipses(ax, place[which], result.antenna_covariance[which], ANTENNA,
+                              enlarged=factor, fill=0.3, fit=False)
+    guess = _guesses(drive, result)
+    ax.plot(*np.stack([guess, place]).transpose(2, 0, 1), color="#999999", linewidth=0.8, zorder=2)
+    ax.plot(*guess.T, label="antennas: guess", **plotting.ROLES["guess"])
+    ax.plot(*place.T, label="antennas: estimate", **plotting.ROLES["antenna"],
+            markerfacecolor="#aaaaaa", markeredgewidth=0.8)
+    if drive.truth is not None and len(drive.truth.antenna):
+        ax.plot(*drive.truth.antenna_in_world.T, label="antennas: truth",
+                **plotting.ROLES["true antenna"])
+    for antenna, at, doubtful in zip(result.antenna, place, doubt, strict=True):
+        yield f"{antenna}{'?' * int(doubtful)}", at, ANTENNA_NAME
+
+
+def landmark_table(drive, result):
+    """Header (list of str) and rows (lists of str) of a table of all antennas of a result.
+
+    Each row has id, position, standard deviations, the distance from the guess and, where the
+    truth is known, that from the true position. An antenna in doubt is called so behind its id.
+    """
+    moved = _apart(result.antenna_in_world, _guesses(drive, result))
+    sigma = evaluation.sigmas(result.antenna_covariance)
+    header = ["antenna", "x (m)", "y (m)", "σ of x (mm)", "σ of y (mm)", "from the guess (mm)"]
+    rows = [[f"{antenna} (in doubt)" if doubtful else str(antenna), *map(_metres, place),
+             *map(_thousandths, s), _thousandths(distance)]
+            for antenna, doubtful, place, s, distance in zip(
+                result.antenna, in_doubt(result), result.antenna_in_world, sigma, moved,
+                strict=True)]
+    if drive.truth is None or not len(drive.truth.antenna):
+        return header, rows
+    true = _rows(drive.truth.antenna, drive.truth.antenna_in_world, result.antenna)
+    errors = _apart(result.antenna_in_world, true)
+    return [*header, "error (mm)"], [[*row, _thousandths(error)]
+                                     for row, error in zip(rows, errors, strict=True)]
+
+
+def marker_table(drive, result):
+    """Header (list of str) and rows (lists of str) of a table of all markers of a result.
+
+    Each row has id, pose, standard deviations and, where the truth is known, the distance from the
+    true position and the error of the heading. A marker without orientation has no heading.
+    """
+    header = ["marker", "x (m)", "y (m)", "δ (°)", "σ of x (mm)", "σ of y (mm)", "σ of δ (mrad)"]
+    sigma, known = evaluation.sigmas(result.marker_covariance), _oriented(result)
+    angle = [f"{np.degrees(heading):.1f}" if is_known else "–"
+             for heading, is_known in zip(result.marker_in_world[:, 2], known, strict=True)]
+    sigma[~known, 2] = np.nan
+    rows = [[str(marker), *map(_metres, pose[:2]), heading, *map(_thousandths, s)]
+            for marker, pose, heading, s in zip(result.marker, result.marker_in_world, angle, sigma,
+                                                strict=True)]
+    if drive.truth is None or not len(drive.truth.marker):
+        return header, rows
+    true = _rows(drive.truth.marker, drive.truth.marker_in_world, result.marker)
+    errors = _apart(result.marker_in_world, true)
+    turned = np.where(known, np.abs(se2.wrap(result.marker_in_world[:, 2] - true[:, 2])), np.nan)
+    return ([*header, "error (mm)", "error of δ (mrad)"],
+            [[*row, _thousandths(error), _thousandths(angle)]
+             for row, error, angle in zip(rows, errors, turned, strict=True)])
+
+
+def _sentences(drive, result):
+    """What each marker, then each antenna, tells when it is pointed at, a list of str."""
+    _, rows = marker_table(replace(drive, truth=None), result)
+    told = [f"marker {marker}: x {x} m, y {y} m, δ {angle}°; σ {s[0]} mm, {s[1]} mm, {s[2]} mrad"
+            if angle != "–" else f"marker {marker}: x {x} m, y {y} m; σ {s[0]} mm, {s[1]} mm"
+            for marker, x, y, angle, *s in rows]
+    _, rows = landmark_table(replace(drive, truth=None), result)
+    return told + [f"antenna {antenna}: x {x} m, y {y} m; σ {s[0]} mm, {s[1]} mm; "
+                   f"{moved} mm from its guess" for antenna, x, y, *s, moved in rows]
+
+
+def _oriented(result):
+    """Which markers of a result have a heading, (k,) bool; the others are points."""
+    return result.marker_covariance[:, 2, 2] < POINT
+
+
+def in_doubt(result):
+    """Which antennas of a result are in doubt, (a,) bool."""
+    return np.array([antenna in result.doubts for antenna in result.antenna.tolist()], dtype=bool)
+
+
+def _extent(drive, result):
+    """Lower left and upper right corner of the map with a margin, (2,) each."""
+    shown = np.concatenate([result.poses[:, :2], result.marker_in_world[:, :2],
+                            result.antenna_in_world, _guesses(drive, result)])
+    low, high = np.nanmin(shown, axis=0), np.nanmax(shown, axis=0)
+    margin = MARGIN * max((high - low).max(), 1.0)
+    return low - margin, high + margin
+
+
+def _guesses(drive, result):
+    """Guessed positions (a, 2) of a result's antennas."""
+    guess = drive.dataset.antenna_guess
+    return _rows(*((), np.empty((0, 2))) if guess is None else (guess.antenna, guess.position),
+                 result.antenna)
+
+
+def _outlines(result, enlarged):
+    """Points (12, k, 2) around the ellipses of the markers, as they are drawn."""
+    variances, axes = np.linalg.eigh(result.marker_covariance[:, :2, :2])
+    reach = 2.4477 * enlarged * np.sqrt(np.maximum(variances, 0))[:, None] * axes
+    turn = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    circle = np.column_stack([np.cos(turn), np.sin(turn)])
+    return result.marker_in_world[:, :2] + np.einsum("kij,mj->mki", reach, circle)
+
+
+def _height(extent, result):
+    """Height in inches of the figure for a map of extent (2,) in m: its shape, within HEIGHTS."""
+    low, few, many = HEIGHTS
+    highest = many if len(result.marker) + len(result.antenna) > MANY else few
+    return float(np.clip((WIDTH - 0.7) * extent[1] / extent[0], low, highest)) + 1.1
+
+
+def _enlargement(result, size):
+    """Factor 1, 2, 5, 10, ... on the ellipses; the largest that is not in doubt is LARGEST."""
+    covariances = np.concatenate([result.marker_covariance[:, :2, :2],
+                                  result.antenna_covariance[~in_doubt(result)]])
+    if not len(covariances):
+        return 1
+    largest = 2.4477 * np.sqrt(np.quantile(np.linalg.eigvalsh(covariances)[:, 1], 0.95))
+    steps = np.outer(10.0 ** np.arange(4), [1, 2, 5]).ravel()
+    fitting = steps[steps * largest <= LARGEST * size]
+    return int(fitting[-1]) if len(fitting) else 1
+
+
+def _title(drive, result, enlarged):
+    if not len(result.marker) + len(result.antenna):
+        return drive.name
+    if enlarged == 1:
+        return f"{drive.name} (95 % ellipses)"
+    doubtful = ", in doubt (?) × 1" if in_doubt(result).any() else ""
+    return f"{drive.name} (95 % ellipses × {enlarged}{doubtful})"
+
+
+def _rows(ids, places, wanted):
+    """Places (m, c) of the wanted ids (k,), NaN for ids that have none."""
+    found = dict(zip(np.asarray(ids).tolist(), places, strict=True))
+    none = np.full(np.shape(places)[1], np.nan)
+    return np.array([found.get(i, none) for i in np.asarray(wanted).tolist()]).reshape(
+        len(wanted), len(none))
+
+
+def _apart(places, others):
+    return np.hypot(*(places - others)[:, :2].T)
+
+
+def _metres(value):
+    return f"{value:.3f}"
+
+
+def _thousandths(value):
+    """A value in thousandths of its unit with three significant digits; "–" if it is not known."""
+    if not np.isfinite(value):
+        return "–"
+    number = 1e3 * value
+    return f"{number:,.0f}" if number >= 100 else f"{number:#.3g}".removesuffix(".")

@@ -1,0 +1,53 @@
+"""The factor graph of problem 4 as a scheme."""
+
+import numpy as np
+
+from slamlib.notebook.plotting import ROLES
+
+
+def slam_graph(ax, count, sightings, ranges, markers, antennas):
+    """Draw a scheme of the graph of problem 4 on `ax`, and return `ax`.
+
+    Vehicle poses stand in a row, the markers above, the wheel parameters w and the antennas below.
+
+    Parameters
+    ----------
+    count : int, number of vehicle poses.
+    sightings, ranges : lists of (pose, landmark), indices from 0.
+    markers, antennas : lists of the landmarks' labels.
+    """
+    poses = np.array([(i, 0.0) for i in range(count)])
+    above, below = (_row(count, len(names), y) for names, y in ((markers, 1.3), (antennas, -2.0)))
+    wheel = np.array([poses[:, 0].mean(), -0.8])
+    for i, j in sightings:
+        _factor(ax, [poses[i], above[j]], ROLES["aruco"]["color"])
+    for i, k in ranges:
+        _factor(ax, [poses[i], below[k]], ROLES["slam_uwb"]["color"], at=0.75)
+    for i in range(count - 1):
+        _factor(ax, [poses[i], poses[i + 1], wheel], ROLES["odometry"]["color"])
+    for place, side in [(poses[0], -0.3), (wheel, -0.3), *((place, 0.3) for place in below)]:
+        _factor(ax, [place, place + [side, 0.0]], "black", at=1.0)
+    for place, name, color in [
+            *((place, f"$X_{i + 1}$", "white") for i, place in enumerate(poses)),
+            *((place, f"$L_{{{name}}}$", "#dddddd") for place, name in zip(above, markers)),
+            *((place, f"$A_{{{name}}}$", "#cfe8f7") for place, name in zip(below, antennas)),
+            (wheel, "$w$", "#ffe0b0")]:
+        ax.text(*place, name, ha="center", va="center", fontsize=9, zorder=4,
+                bbox=dict(boxstyle="circle,pad=0.35", facecolor=color, edgecolor="black"))
+    ax.set(xlim=(-0.8, count - 0.2), ylim=(-2.5, 1.8))
+    ax.axis("off")
+    return ax
+
+
+def _row(count, landmarks, y):
+    """Places (landmarks, 2) at equal distances in a row above or below `count` poses."""
+    x = np.linspace(-0.7, count - 0.3, landmarks + 2)[1:-1]
+    return np.column_stack([x, np.full(landmarks, y)])
+
+
+def _factor(ax, ends, color, at=None):
+    """Draw a factor between the places `ends`; of two, at a fraction of the way to the second."""
+    middle = np.mean(ends, axis=0) if at is None else (1 - at) * ends[0] + at * ends[1]
+    for end in ends:
+        ax.plot(*np.stack([end, middle]).T, color=color, linewidth=0.9, zorder=1)
+    ax.plot(*middle, "s", color=color, markersize=4.5, zorder=2)

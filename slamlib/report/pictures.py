@@ -1,0 +1,79 @@
+"""Pictures of the longest drive: the first figure of the report, and that of the title page."""
+
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+from IPython.core.pylabtools import print_figure
+from matplotlib.figure import Figure
+
+from slamlib import evaluation, se2
+from slamlib.notebook import plotting
+from slamlib.solve import PROBLEMS
+
+POINTS = 1500  # of a curve, at most
+HIDDEN = ("problem2", "problem2_hint", "problem3")  # trajectories that would lie below others
+LOOKS = {"problem3": dict(linewidth=4.0), "problem4": dict(linestyle="-", linewidth=1.4)}
+STYLE = Path(plotting.__file__).with_name("slamlib.mplstyle")
+
+
+def trajectories(drive):
+    """Return the figure of a SolvedDrive's trajectories and sigmas, as {MIME type: SVG}."""
+    with plt.style.context(STYLE, after_reset=True):
+        fig = Figure(figsize=(7.2, 2.7))  # inches
+        left, right = fig.subplots(1, 2, width_ratios=(1, 1))
+        for solution in drive.solutions:
+            role, look = _role(solution), LOOKS.get(solution.problem, {})
+            if solution.problem not in HIDDEN or solution is drive.solutions[-1]:
+                plotting.trajectory(left, _few(_in_first_frame(drive, solution)), role,
+                                    solution.title, **look)
+            sigma = evaluation.sigmas(solution.covariances)[:, :2].max(axis=1)
+            known = _few(np.flatnonzero(np.isfinite(sigma) & (sigma > 0)))
+            plotting.curve(right, sigma[known], role, known, solution.title, **look)
+        if drive.truth is not None:
+            plotting.trajectory(left, _few(drive.truth.poses), "truth")
+        right.set(yscale="log", ylabel="σ of position (m)")
+        right.set_ylim(bottom=_shown_from(drive))
+        plotting.legend_below(fig)
+        return plotting.pictures(fig)
+
+
+def title_picture(drive):
+    """Return a SolvedDrive's last trajectory with its landmarks, without axes, as SVG (str)."""
+    with plt.style.context(STYLE, after_reset=True):
+        fig = Figure(figsize=(6.3, 4.6))  # inches
+        ax = fig.add_subplot()
+        solution = drive.solutions[-1]
+        plotting.trajectory(ax, _few(solution.poses), _role(solution), linestyle="-", linewidth=1.2)
+        if solution.aruco_map is not None:
+            plotting.markers(ax, *solution.aruco_map[1:])
+        if solution.uwb_map is not None:
+            plotting.antennas(ax, *solution.uwb_map[1:])
+        ax.axis("off")
+        return print_figure(fig, "svg", metadata={"Date": None})
+
+
+def _shown_from(drive):
+    """Return a sigma in m below which at most 2 % are for every problem, or None."""
+    sigmas = [evaluation.sigmas(solution.covariances)[:, :2].max(axis=1)
+              for solution in drive.solutions]
+    low = [np.nanquantile(sigma, 0.02) for sigma in sigmas if np.isfinite(sigma).any()]
+    return min(low) if low and min(low) > 0 else None
+
+
+def _role(solution):
+    task = PROBLEMS.get(solution.problem)
+    return task.role if task else "alternative"
+
+
+def _in_first_frame(drive, solution):
+    """Return the poses (n, 3) of a Solution in the frame of pose 1, where the last one knows it."""
+    last = drive.solutions[-1].poses
+    if solution.world and np.isfinite(last[solution.world, 0]):
+        return se2.compose(last[solution.world], solution.poses)
+    return solution.poses
+
+
+def _few(rows):
+    """Return at most POINTS of the rows (n, ...), first and last included."""
+    return rows[np.unique(np.linspace(0, len(rows) - 1, POINTS).astype(int))] if len(rows) else rows

@@ -1,0 +1,69 @@
+"""The drive that moves on the first page."""
+
+import re
+import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from slamlib import solve
+from slamlib.report.animation import animation, moving
+from slamlib.report.chapters import printed
+from slamlib.report.drives import SolvedDrive
+from slamlib.report.overview import index, summary
+from slamlib.report.pages import LOADED
+from slamlib.simulation import simulate
+
+MOST = 1_000_000               # bytes
+
+
+@pytest.fixture(scope="module")
+def drive():
+    """A SolvedDrive on a simulated short path, with odometry and problem 4."""
+    dataset, truth = simulate("short", seed=2)
+    solutions = tuple(solve.solutions(dataset, problems=("problem1", "problem4")))
+    return SolvedDrive("short", dataset, truth, solutions)
+
+
+def test_the_animation_is_small_loads_nothing_and_moves_both_paths_in_time(drive):
+    html = animation(drive)
+    assert len(html.encode()) < MOST / 5 and not LOADED.search(html)
+    svg = ElementTree.fromstring(re.search("<svg.*</svg>", html, re.DOTALL)[0])
+    names = re.findall(r"animation:(\w+)", html)
+    assert len(names) == len(set(names)) and len(names) > 20
+    assert set(names) == set(re.findall(r"@keyframes (\w+)", html))
+    assert len(list(svg.iter("circle"))) == 2 and len(list(svg.iter("ellipse"))) > 16
+    for frames in re.findall(r"@keyframes \w+(?:line|dot)\{(.*?\})\}", html):
+        times = [float(time) for time in re.findall(r"([\d.]+)%\{", frames)]
+        assert times == sorted(times) and times[0] == 0 and times[-1] == 100
+
+
+def test_it_pauses_without_script_and_stands_still_where_no_motion_is_wanted(drive):
+    html = animation(drive)
+    box = re.search(r'<input class="pause" type="checkbox" id="(\w+)">', html)[1]
+    assert f'for="{box}"' in html and "<script" not in html
+    still = re.search(r"@media \(prefers-reduced-motion: reduce\) \{(.*?)\}\s*@media", html,
+                      re.DOTALL)[1]
+    assert "animation: none" in still
+
+
+def test_what_cannot_move_has_no_animation(drive):
+    still = tuple(SimpleNamespace(problem=problem, title="x", poses=np.zeros((3, 3)),
+                                  covariances=np.zeros((3, 3, 3)))
+                  for problem in ("problem1", "problem4"))
+    for solutions in (drive.solutions[:1], still, ()):
+        assert animation(replace(drive, solutions=solutions)) == ""
+        assert moving(replace(drive, solutions=solutions)) == []
+
+
+def test_the_first_page_moves_and_the_pdf_does_not(drive):
+    opening = summary([drive])
+    assert "@keyframes" in str(index("Report", opening, []).cells)
+    assert "@keyframes" in str(opening.cells) and "@keyframes" not in str(printed(opening).cells)
+
+
+def test_a_drive_without_truth_moves_too(drive):
+    html = animation(replace(drive, truth=None))
+    assert "truth" not in re.sub("<style>.*?</style>", "", html, flags=re.DOTALL)

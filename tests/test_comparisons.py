@@ -1,0 +1,56 @@
+"""What the studies compare: wrong labels known by the truth, starts on a dataset, GTSAM's chain."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from slamlib import slam
+from slamlib.simulation import simulate
+from slamlib.slam.estimate import fit_from_odometry
+from slamlib.slam.gtsam_graph import values
+from slamlib.slam.measurements import measure
+from slamlib.slam.optimizer import optimize
+from slamlib.studies import graphs, kernels, starts
+
+
+@pytest.fixture(scope="module")
+def drive():
+    """A drive with wrong labels, its truth, and the same drive without."""
+    dataset, truth = simulate("short", seed=6, mislabelled=0.03)
+    return dataset.without("uwb"), truth, simulate("short", seed=6)[0]
+
+
+def test_wrong_labels_are_those_that_differ_from_the_same_drive_without(drive):
+    dataset, truth, clean = drive
+    differ = dataset.aruco.marker != clean.aruco.marker
+    label_is_wrong = dict(zip(map(tuple, dataset.aruco.marker_in_vehicle), differ))
+    m = measure(dataset)
+    expected = [label_is_wrong[tuple(z)] for z in m.sightings.z]
+    np.testing.assert_array_equal(kernels.mislabelled(m, truth), expected)
+    assert sum(expected) > 10
+
+
+def test_the_gate_rejects_wrong_labels_and_hardly_any_others():
+    numbers = kernels.wrong_labels(6, ways=("quadratic", "gate"), mislabelled=0.03)
+    assert numbers["gate wrong rejected"] == 1 and numbers["gate good lost"] < 0.005
+    assert numbers["quadratic wrong rejected"] == numbers["quadratic good lost"] == 0
+
+
+def test_starts_on_a_dataset_are_right_or_wrong_without_truth(drive):
+    dataset, _, _ = drive
+    numbers = starts.landmarks_of_drive(dataset, slam.estimate(dataset))
+    assert numbers["consensus right"] == 1 and numbers["first sighting right"] == 0
+    assert numbers["consensus initial error"] < 0.5 < numbers["first sighting initial error"]
+
+
+def test_gtsam_s_chain_has_the_optimum_of_the_independent_chain(drive):
+    fit = fit_from_odometry(measure(drive[0]), 1e-3)
+    problem, m = fit.problem, fit.problem.measurements
+    chain = replace(problem, odometry=graphs.independent_chain(m, problem.odometry.model))
+    expected = optimize(chain, fit.state).state
+    found = gtsam.LevenbergMarquardtOptimizer(
+        graphs.gtsam_chain(problem), values(m, fit.state)).optimize()
+    poses = [found.atPose2(gtsam.symbol("x", i)) for i in range(len(m.frame))]
+    np.testing.assert_allclose([[p.x(), p.y()] for p in poses], expected.poses[:, :2], atol=1e-4)

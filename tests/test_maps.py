@@ -1,0 +1,196 @@
+"""The whole map of a drive: its figure, names that can be read, and the tables of its landmarks."""
+
+import re
+import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
+from itertools import combinations
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+from slamlib import slam
+from slamlib.notebook import Drive, inline, maps, plotting, table_text
+from slamlib.notebook.names import Names
+from slamlib.report.pages import LOADED
+from slamlib.simulation import simulate
+
+pytestmark = pytest.mark.usefixtures("look")
+
+
+@pytest.fixture(scope="module")
+def solved():
+    """A simulated Drive and its SlamResult with markers and antennas."""
+    drive = Drive("short", *simulate("short", seed=4))
+    return drive, slam.estimate(drive.dataset)
+
+
+def parts(result, markers=True, antennas=True):
+    """A result without its markers or antennas."""
+    k, a = len(result.marker) * markers, len(result.antenna) * antennas
+    return replace(
+        result, marker=result.marker[:k], marker_in_world=result.marker_in_world[:k],
+        marker_covariance=result.marker_covariance[:k], antenna=result.antenna[:a],
+        antenna_in_world=result.antenna_in_world[:a],
+        antenna_covariance=result.antenna_covariance[:a])
+
+
+def labels(fig):
+    return {text.get_text() for text in fig.legends[0].get_texts()}
+
+
+def test_a_map_shows_path_markers_antennas_guess_truth_and_states_the_enlargement(solved):
+    drive, result = solved
+    fig = maps.whole_map(drive, result)
+    assert fig.get_figwidth() == 7.4
+    assert labels(fig) == {"vehicle", "truth", "markers, headings", "markers: truth",
+                           "antennas: guess", "antennas: estimate", "antennas: truth"}
+    title = fig.axes[0].get_title("left")
+    assert title.startswith("short (95 % ellipses × ")
+    widest = max(max(ellipses.get_widths().max(), ellipses.get_heights().max())
+                 for ellipses in fig.axes[0].collections)
+    factor = int(title.split("× ")[1].rstrip(")"))
+    covariances = np.concatenate([result.marker_covariance[:, :2, :2], result.antenna_covariance])
+    assert widest == pytest.approx(
+        2 * factor * 2.4477 * np.sqrt(np.linalg.eigvalsh(covariances).max()), rel=1e-3)
+    x, y = fig.axes[0].get_xlim(), fig.axes[0].get_ylim()
+    for points in (result.poses, result.marker_in_world, result.antenna_in_world):
+        assert x[0] < points[:, 0].min() and points[:, 0].max() < x[1]
+        assert y[0] < points[:, 1].min() and points[:, 1].max() < y[1]
+
+
+@pytest.mark.parametrize("markers, antennas", [(True, False), (False, True), (False, False)])
+def test_what_a_drive_lacks_is_absent_from_map_and_tables(solved, markers, antennas):
+    drive, result = solved
+    drive, result = replace(drive, truth=None), parts(result, markers, antennas)
+    if not antennas:
+        drive = replace(drive, dataset=drive.dataset.without("uwb"))
+    fig = maps.whole_map(drive, result)
+    expected = {"vehicle"} | ({"markers, headings"} if markers else set())
+    expected |= {"antennas: guess", "antennas: estimate"} if antennas else set()
+    assert labels(fig) == expected
+    assert set(plotting.pictures(fig)) == {plotting.WIDE, plotting.NARROW}
+    for table, shown in ((maps.landmark_table, antennas), (maps.marker_table, markers)):
+        header, rows = table(drive, result)
+        assert bool(rows) == shown and not any("error" in name for name in header)
+
+
+def test_a_dataset_without_guesses_has_an_empty_table(solved):
+    drive, result = solved
+    nothing = replace(drive, dataset=replace(drive.dataset, uwb=None, antenna_guess=None))
+    header, rows = maps.landmark_table(nothing, parts(result, antennas=False))
+    assert header[0] == "antenna" and rows == []
+
+
+@pytest.mark.parametrize("width", [maps.WIDTH, plotting.NARROW_WIDTH])
+def test_names_cover_neither_each_other_nor_what_is_around_the_axes(solved, width):
+    drive, result = solved
+    fig = maps.whole_map(drive, result)
+    if width < maps.WIDTH:
+        plotting.narrow(fig)
+    fig.draw_without_rendering()
+    names, = (artist for artist in fig.axes[0].artists if isinstance(artist, Names))
+    renderer = fig.canvas.get_renderer()
+    texts = [text for text, _ in names.placed(renderer)]
+    assert sorted(text.get_text() for text in texts) == sorted(
+        map(str, [*result.marker, *result.antenna]))
+    boxes = [text.get_window_extent(renderer).padded(-0.18 * text.get_fontsize())
+             for text in texts]
+    assert not any(a.overlaps(b) for a, b in combinations(boxes, 2))
+    frame = fig.axes[0].bbox
+    assert all(frame.x0 <= box.x0 and box.x1 <= frame.x1 for box in boxes)
+
+
+def test_the_narrow_map_keeps_its_shape(solved):
+    fig = maps.whole_map(*solved)
+    ax, = fig.axes
+    fig.draw_without_rendering()
+    wide = ax.bbox.width / ax.bbox.height
+    plotting.narrow(fig)
+    fig.draw_without_rendering()
+    assert ax.bbox.width / ax.bbox.height == pytest.approx(wide, rel=0.01)
+    assert ax.bbox.width > 0.75 * fig.bbox.width
+    plt.close(fig)
+
+
+def test_tables_hold_every_landmark_and_its_errors(solved):
+    drive, result = solved
+    header, rows = maps.landmark_table(drive, result)
+    assert [row[0] for row in rows] == [str(antenna) for antenna in result.antenna]
+    assert header[-1] == "error (mm)" and all(len(row) == len(header) for row in rows)
+    moved = np.hypot(*(result.antenna_in_world - drive.dataset.antenna_guess.position).T)
+    assert [float(row[-2].replace(",", "")) for row in rows] == pytest.approx(
+        1e3 * moved, rel=5e-3)
+    header, rows = maps.marker_table(drive, result)
+    assert [row[0] for row in rows] == [str(marker) for marker in result.marker]
+    assert len(header) == len(rows[0]) == 9
+    assert [float(row[4]) for row in rows] == pytest.approx(
+        1e3 * np.sqrt(result.marker_covariance[:, 0, 0]), rel=5e-3)
+    assert table_text(header, rows).count("\n") == len(rows) + 1
+
+
+def test_a_marker_without_orientation_has_no_heading(solved):
+    drive, result = solved
+    covariances = result.marker_covariance.copy()
+    covariances[0, 2, 2] = 1e8
+    point = replace(result, marker_covariance=covariances)
+    _, (first, second, *_) = maps.marker_table(drive, point)
+    assert [first[i] for i in (3, 6, 8)] == ["–"] * 3 and "–" not in second
+    fig = maps.whole_map(drive, point)
+    sentences, _ = fig.telling
+    assert "δ" not in sentences[0] and "δ" in sentences[1]
+
+
+def test_an_antenna_in_doubt_is_called_so_and_drawn_in_its_true_size(solved):
+    drive, result = solved
+    first = int(result.antenna[0])
+    covariances = result.antenna_covariance.copy()
+    covariances[0] = np.diag([9.0, 4.0])
+    doubted = replace(result, doubts={first: "It may be elsewhere."},
+                      antenna_covariance=covariances)
+    before, after = (maps.whole_map(drive, each).axes[0] for each in (result, doubted))
+    assert after.get_title("left") == before.get_title("left").replace(
+        ")", ", in doubt (?) × 1)")
+    widest = max(ellipses.get_widths().max() for ellipses in after.collections)
+    assert widest == pytest.approx(2 * 2.4477 * 3, rel=1e-3)
+    assert maps.landmark_table(drive, doubted)[1][0][0] == f"{first} (in doubt)"
+
+
+def test_every_landmark_tells_its_name_position_and_sigma_where_it_is_drawn(solved):
+    drive, result = solved
+    fig = maps.whole_map(drive, result)
+    texts = inline.outputs(fig, plotting.pictures(fig))
+    assert set(texts) == {plotting.WIDE, plotting.NARROW, "text/html"}
+    for svg in re.findall("<svg.*?</svg>", texts["text/html"]):
+        ElementTree.fromstring(svg)
+        told = re.findall(r'<circle cx="([\d.]+)" cy="([\d.]+)" r="5"><title>(.*?)</title>', svg)
+        assert len(told) == len(result.marker) + len(result.antenna)
+        names = [sentence.split(":")[0] for *_, sentence in told]
+        assert names == [f"marker {i}" for i in result.marker] + [
+            f"antenna {i}" for i in result.antenna]
+        places = np.concatenate([result.marker_in_world[:, :2], result.antenna_in_world])
+        pixels = np.array([(float(x), float(y)) for x, y, _ in told])
+        assert np.corrcoef(pixels[:, 0], places[:, 0])[0, 1] > 0.9999
+        assert np.corrcoef(pixels[:, 1], places[:, 1])[0, 1] < -0.9999
+    sigma = 1e3 * np.sqrt(result.marker_covariance[0, 0, 0])
+    assert f"σ {sigma:.2f} mm" in told[0][2]
+
+
+def test_ids_of_figures_in_one_page_differ(solved):
+    drive, result = solved
+    ids, pictures = [], []
+    for each in (result, parts(result, antennas=False)):
+        fig = maps.whole_map(drive, each)
+        pictures.append(inline.outputs(fig, plotting.pictures(fig))["text/html"])
+        ids += re.findall(r' id="([^"]*)"', pictures[-1])
+    assert len(ids) == len(set(ids)) > 20
+    page = "".join(pictures)
+    used = re.findall(r'href="#([^"]*)"|url\(#([^)]*)\)', page)
+    assert {name for pair in used for name in pair if name} == set(ids)
+    assert "<style>*" not in page and not LOADED.search(page)
+
+
+def test_a_figure_without_points_that_tell_stays_a_picture():
+    fig, _ = plotting.panels(1)
+    pictures = plotting.pictures(fig)
+    assert inline.outputs(fig, pictures) == pictures
