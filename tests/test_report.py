@@ -5,6 +5,7 @@ import json
 import os
 import re
 import sys
+import tempfile
 from dataclasses import replace
 from html.parser import HTMLParser
 
@@ -205,6 +206,19 @@ def test_what_is_printed_in_a_row_is_one_output_however_long_it_takes(built):
     outputs = re.findall(r'<pre class="output[^>]*>(.*?)\s*</pre>', text, re.DOTALL)
     assert [part.strip("'") for part in outputs[-5:]] == [
         "one\ntwo", "three", "a picture", "and another", "four"]
+
+
+def test_kernels_listen_at_sockets_not_at_ports(tmp_path, monkeypatch):
+    """Another program can take a port between its choice and the kernel; nobody takes a socket."""
+    long = tmp_path / ("x" * 60)  # a folder with too long a name for sockets
+    long.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(long))
+    make_data(tmp_path)
+    write(tmp_path / "notebooks", "1_kernel", "# Kernel", (
+        "from ipykernel.connect import get_connection_info\n"
+        "print(get_connection_info(unpack=True)['transport'])",))
+    page = build(tmp_path)[1].read_text(encoding="utf-8")
+    assert re.search(r'<pre class="output[^>]*>\s*ipc\s*</pre>', page)
 
 
 @pytest.mark.slow

@@ -20,6 +20,7 @@ from tqdm import tqdm
 
 CELL_TIMEOUT = 1800  # s
 POLL = 1.0  # s, between looks at how far the studies are
+LONGEST_FOLDER = 70  # characters, of one for sockets: their paths have at most 103
 
 
 class NotebookError(RuntimeError):
@@ -83,27 +84,30 @@ def execute(books, environment, results, jobs, finish):
 async def _execute_all(books, environment, results, jobs, finish):
     slots = asyncio.Semaphore(jobs)
 
-    async def run(source, book):
+    async def run(number, source, book):
         stage = results / f".{source.stem}"
         shutil.rmtree(stage, ignore_errors=True)  # left by a build that was killed
         stage.mkdir(parents=True)
         try:
             async with slots:
                 files = {"SLAMLIB_RESULTS": str(stage), "SLAMLIB_PROGRESS": str(told / source.stem)}
-                await _execute(source, book, environment | files, bar)
+                await _execute(source, book, environment | files, folder / f"{number}.json", bar)
             finish(source, book, _publish(stage, results))
         finally:
             shutil.rmtree(stage, ignore_errors=True)
 
     total = sum(map(_count_code_cells, books.values()))
-    with tempfile.TemporaryDirectory() as folder, tqdm(
+    place = "/tmp" if len(tempfile.gettempdir()) > LONGEST_FOLDER else None
+    with tempfile.TemporaryDirectory(dir=place) as folder, tqdm(
             total=total, unit="cell", leave=False, disable=not sys.stderr.isatty()) as bar:
-        told = Path(folder)
+        folder = Path(folder)
+        told = folder / "progress"
+        told.mkdir()
         watching = asyncio.create_task(_watch(told, bar))
         try:
             async with asyncio.TaskGroup() as group:
-                for source, book in reversed(books.items()):     # later chapters take longer
-                    group.create_task(run(source, book))
+                for number, (source, book) in reversed([*enumerate(books.items())]):
+                    group.create_task(run(number, source, book))    # later chapters take longer
         finally:
             watching.cancel()
 
@@ -135,8 +139,12 @@ def _publish(stage, results):
     return [name.as_posix() for name in names]
 
 
-async def _execute(source, book, environment, bar):
-    """Execute one notebook in place with the interpreter that runs this module."""
+async def _execute(source, book, environment, connection, bar):
+    """Execute one notebook in place with the interpreter that runs this module.
+
+    The kernel listens at sockets beside the file `connection` (Path): a port that was free when it
+    was chosen can be taken by another program before the kernel has it.
+    """
     count, started, start = _count_code_cells(book), [], time.monotonic()
 
     def begin(cell, cell_index):
@@ -144,7 +152,8 @@ async def _execute(source, book, environment, bar):
         bar.set_description(f"{source.stem}: cell {len(started)} of {count}")
 
     manager = AsyncKernelManager(  # no folders to search: kernels of the user are not found
-        kernel_name="python3", kernel_spec_manager=KernelSpecManager(kernel_dirs=[]))
+        kernel_name="python3", kernel_spec_manager=KernelSpecManager(kernel_dirs=[]),
+        transport="ipc", connection_file=str(connection))
     client = NotebookClient(
         book, km=manager, resources={"metadata": {"path": str(source.parent)}},
         timeout=CELL_TIMEOUT, iopub_timeout=60, raise_on_iopub_timeout=True,
