@@ -12,6 +12,8 @@ from slamlib.slam.result import result
 from slamlib.slam.robust import CAUCHY_SCALES, narrow_kernels
 from slamlib.slam.wheel_check import with_checked_wheels
 
+NEAR = 1e-3                  # relative decrease of the error at which a start from a result is near
+
 
 def estimate(dataset, slip=None, model=None, previous=None):
     """SLAM on odometry and on the markers and ranges that the dataset has.
@@ -61,4 +63,5 @@ def fit_from_previous(measurements, previous, slip=None, model=None):
     w = (previous.wheel - vehicle.wheel) / vehicle.sigma_wheel
     state = state_from_poses(measurements, previous.poses[frame], previous.covariances[frame], w)
     problem = build(measurements, model or previous.model, known_noise(slip), relinearize_at=w)
-    return refine(problem, narrow_kernels(problem, state, CAUCHY_SCALES[-1:], slip is None), slip)
+    state = narrow_kernels(problem, state, CAUCHY_SCALES[-1:], slip is None, converged=NEAR)
+    return refine(problem, state, slip)

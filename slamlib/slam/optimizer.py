@@ -36,8 +36,8 @@ class Optimum:
         return self.equations.error
 
 
-def optimize(problem, state, max_steps=MAX_STEPS, by_gtsam=False):
-    """The Optimum from a State.
+def optimize(problem, state, max_steps=MAX_STEPS, by_gtsam=False, converged=CONVERGED):
+    """The Optimum from a State, where the error decreases by less than its share `converged`.
 
     Raises DatasetError where the measurements do not determine every variable.
     """
@@ -57,5 +57,5 @@ def optimize(problem, state, max_steps=MAX_STEPS, by_gtsam=False):
         else:
             equations = NormalEquations(problem, state)
             break
-        ended = error - equations.error <= CONVERGED * (1 + error)
+        ended = error - equations.error <= converged * (1 + error)
     return Optimum(equations, steps)

@@ -13,7 +13,7 @@ import numpy as np
 
 from slamlib.slam.measurement_factors import MeasurementFactors, residuals
 from slamlib.slam.noise import Noise
-from slamlib.slam.optimizer import optimize
+from slamlib.slam.optimizer import CONVERGED, optimize
 
 CAUCHY_SCALES = (100.0, 30.0, 10.0, 3.0)     # sigmas, scale of the kernel in each round
 FEW = 20                     # measurements, below which their scatter gives no factor
@@ -25,17 +25,17 @@ _kernel = gtsam.noiseModel.mEstimator
 LATE_KERNEL = _kernel.AsymmetricTukey.Create(4.685, _kernel.Base.ReweightScheme.Scalar)
 
 
-def narrow_kernels(problem, state, scales=CAUCHY_SCALES, learn=True):
+def narrow_kernels(problem, state, scales=CAUCHY_SCALES, learn=True, converged=CONVERGED):
     """The State after one solution for each scale of the Cauchy kernel, with all measurements.
 
     The scales are in sigmas of the problem's noise. Unless `learn` is False, this is what the
-    scatter of the residuals shows after each solution.
+    scatter of the residuals shows after each solution. `converged` as of `optimize`.
     """
     m = problem.measurements
     for scale in scales:
         cauchy = _kernel.Cauchy.Create(scale)
         measured = MeasurementFactors(m, m.unit_weights, cauchy, cauchy)
-        state = optimize(replace(problem, measured=measured), state).state
+        state = optimize(replace(problem, measured=measured), state, converged=converged).state
         if learn:
             problem = replace(problem, noise=noise_of_scatter(m, state))
     return state
