@@ -11,6 +11,8 @@ import numpy as np
 
 from slamlib import se2
 
+REACH_95 = float(np.sqrt(-2 * np.log(0.05)))    # sigmas, that hold 95 % of a planar Gaussian
+
 
 def path_length(poses):
     """Sum in m of the distances between consecutive known poses (n, >= 2)."""
@@ -111,6 +113,11 @@ def judge(poses, covariances, truth, step):
 def sigmas(covariances):
     """Standard deviations (n, d) of covariances (n, d, d)."""
     return np.sqrt(np.diagonal(covariances, axis1=-2, axis2=-1))
+
+
+def position_sigmas(covariances):
+    """Standard deviations (n,) of position: the larger of those of x and y, of (n, >= 2, >= 2)."""
+    return sigmas(covariances)[:, :2].max(axis=1)
 
 
 def correlations(covariances):

@@ -127,7 +127,7 @@ def test_ellipses_are_lines_of_equal_mahalanobis_distance(enlarged):
 
 def test_the_scheme_of_a_graph_has_a_square_for_each_factor_and_a_name_for_each_variable():
     _, ((ax,),) = plotting.panels(1)
-    schemes.slam_graph(ax, 3, [(0, 0), (1, 0), (2, 1)], [(0, 0), (2, 0)], [7, 8], [5])
+    schemes.slam_graph(ax, 3, [(0, 0), (1, 0), (2, 1)], [7, 8], [(0, 0), (2, 0)], [5])
     squares = [line for line in ax.lines if line.get_marker() == "s"]
     assert len(squares) == 3 + 2 + 2 + 3       # sightings, ranges, odometry, and three priors
     assert [text.get_text() for text in ax.texts] == [

@@ -6,7 +6,8 @@ zero at the last fused frame) and the marker increment Delta_m with covariance C
     Delta = Delta_o + C_o (C_o + C_m)^-1 (Delta_m - Delta_o),    C = (C_o^-1 + C_m^-1)^-1.
 
 The result is overconfident and overweights odometry: errors of the wheel parameters are the same in
-all increments, and consecutive marker increments share sightings. `fused.py` counts both once.
+all increments, consecutive marker increments share sightings, and equation 2 has no wheel slip.
+`fused.py` counts what is shared once, and learns the slip.
 """
 
 import numpy as np

@@ -1,6 +1,7 @@
 """Code for notebooks: drives and results, sentences and tables, figures, sliders."""
 
 from slamlib.notebook.answers import answer, median_sigmas, result_sentence, with_unit
+from slamlib.notebook.means import decided, mean_and_error, number, share, verdict, with_error
 from slamlib.notebook.show import (
     Drive,
     captioned,
@@ -17,7 +18,8 @@ from slamlib.notebook.show import (
 )
 from slamlib.notebook.solving import delivered, notices, say_doubts, solved, where_possible
 
-__all__ = ["Drive", "answer", "captioned", "delivered", "interactive", "listed", "median_sigmas",
-           "notices", "plain", "result_sentence",
-           "results_folder", "say", "say_doubts", "solved", "start", "table", "table_text",
-           "where_possible", "with_sensor", "with_truth", "with_unit"]
+__all__ = ["Drive", "answer", "captioned", "decided", "delivered", "interactive", "listed",
+           "mean_and_error", "median_sigmas", "notices", "number", "plain", "result_sentence",
+           "results_folder", "say", "say_doubts", "share", "solved", "start", "table",
+           "table_text", "verdict", "where_possible", "with_error", "with_sensor", "with_truth",
+           "with_unit"]

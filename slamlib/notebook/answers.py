@@ -28,8 +28,9 @@ def median_sigmas(solution):
     The sigma of position is the larger of those of x and y.
     """
     known = np.isfinite(solution.poses[:, 0])
-    sigmas = evaluation.sigmas(solution.covariances[known])
-    return float(np.median(sigmas[:, :2].max(axis=1))), float(np.median(sigmas[:, 2]))
+    covariances = solution.covariances[known]
+    return (float(np.median(evaluation.position_sigmas(covariances))),
+            float(np.median(evaluation.sigmas(covariances)[:, 2])))
 
 
 def result_sentence(drive, solution):

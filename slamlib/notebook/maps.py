@@ -37,7 +37,8 @@ def whole_map(drive, result):
     low, high = _extent(drive, result)
     size = (high - low).max()
     enlarged = _enlargement(result, size)
-    fig, ((ax,),) = plotting.panels(1, width=WIDTH, height=_height(high - low, result))
+    height, is_tall = _height(high - low, result)
+    fig, ((ax,),) = plotting.panels(1, width=WIDTH, height=height)
     role = "slam_uwb" if len(result.antenna) else "slam"
     plotting.trajectory(ax, result.poses, role, "vehicle", linewidth=1.5,
                         linestyle="-")
@@ -45,8 +46,13 @@ def whole_map(drive, result):
         plotting.trajectory(ax, drive.truth.poses, "truth", linewidth=0.7)
     names = [*_markers(ax, drive, result, enlarged, TICK * size),
              *_antennas(ax, drive, result, enlarged)]
-    ax.set_aspect("equal", adjustable="box")
-    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), title=_title(drive, result, enlarged))
+    ax.set_title(_title(drive, result, enlarged))
+    if is_tall:                                     # axes fill the width, with room at both sides
+        ax.dataLim.set_points(np.array([low, high]))
+        ax.margins(0)
+    else:
+        ax.set_aspect("equal", adjustable="box")
+        ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     for ellipses in ax.collections:
         ellipses.set_linewidth(0.7)
     ax.add_artist(Names(names, _guesses(drive, result), np.concatenate([
@@ -189,17 +195,21 @@ def _guesses(drive, result):
 def _outlines(result, enlarged):
     """Points (12, k, 2) around the ellipses of the markers, as they are drawn."""
     variances, axes = np.linalg.eigh(result.marker_covariance[:, :2, :2])
-    reach = 2.4477 * enlarged * np.sqrt(np.maximum(variances, 0))[:, None] * axes
+    reach = evaluation.REACH_95 * enlarged * np.sqrt(np.maximum(variances, 0))[:, None] * axes
     turn = np.linspace(0, 2 * np.pi, 12, endpoint=False)
     circle = np.column_stack([np.cos(turn), np.sin(turn)])
     return result.marker_in_world[:, :2] + np.einsum("kij,mj->mki", reach, circle)
 
 
 def _height(extent, result):
-    """Height in inches of the figure for a map of extent (2,) in m: its shape, within HEIGHTS."""
+    """Height in inches of the figure for a map of extent (2,) in m, and whether the map is tall.
+
+    The axes have the map's shape within HEIGHTS. A tall map would be higher at the page's width.
+    """
     low, few, many = HEIGHTS
     highest = many if len(result.marker) + len(result.antenna) > MANY else few
-    return float(np.clip((WIDTH - 0.7) * extent[1] / extent[0], low, highest)) + 1.1
+    wanted = (WIDTH - 0.7) * extent[1] / extent[0]
+    return float(np.clip(wanted, low, highest)) + 1.1, bool(wanted > highest)
 
 
 def _enlargement(result, size):
@@ -208,7 +218,8 @@ def _enlargement(result, size):
                                   result.antenna_covariance[~in_doubt(result)]])
     if not len(covariances):
         return 1
-    largest = 2.4477 * np.sqrt(np.quantile(np.linalg.eigvalsh(covariances)[:, 1], 0.95))
+    axes = np.sqrt(np.linalg.eigvalsh(covariances)[:, 1])
+    largest = evaluation.REACH_95 * np.quantile(axes, 0.95)
     steps = np.outer(10.0 ** np.arange(4), [1, 2, 5]).ravel()
     fitting = steps[steps * largest <= LARGEST * size]
     return int(fitting[-1]) if len(fitting) else 1

@@ -18,6 +18,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.patches import Annulus
 
 from slamlib import se2
+from slamlib.evaluation import REACH_95
 from slamlib.odometry import cumulative
 
 # Colours of Okabe and Ito and of Tol, distinct for the colour-blind; line styles differ in grey.
@@ -176,42 +177,11 @@ def likelihood(ax, positions, ranges, sigma, window):
     return ax
 
 
-def factor_graph(ax, count, sightings, names):
-    """Draw a scheme of a factor graph: `count` vehicle poses in a row, markers above, w below.
-
-    `sightings` is a list of (pose, marker), indices from 0; `names` (k,) are the markers' labels.
-    """
-    poses = np.array([(i, 0.0) for i in range(count)])
-    markers = np.array([(x, 1.5) for x in np.linspace(-0.5, count - 0.5, len(names) + 2)[1:-1]])
-    wheel = np.array([poses[:, 0].mean(), -0.8])
-
-    def edge(ends, color):
-        middle = np.mean(ends, axis=0)
-        for end in ends:
-            ax.plot(*np.stack([end, middle]).T, color=color, linewidth=0.9, zorder=1)
-        ax.plot(*middle, "s", color=color, markersize=4, zorder=2)
-
-    for i, j in sightings:
-        edge([poses[i], markers[j]], ROLES["aruco"]["color"])
-    for i in range(count - 1):
-        edge([poses[i], poses[i + 1], wheel], ROLES["odometry"]["color"])
-    nodes = [(p, f"$X_{i + 1}$", "white") for i, p in enumerate(poses)]
-    nodes += [(m, f"$L_{{{name}}}$", "#dddddd") for m, name in zip(markers, names, strict=True)]
-    for place, name, color in [*nodes, (wheel, "$w$", "#ffe0b0")]:
-        ax.text(*place, name, ha="center", va="center", fontsize=8, zorder=4,
-                bbox=dict(boxstyle="circle,pad=0.25", facecolor=color, edgecolor="black"))
-    for prior in (poses[0], wheel):
-        edge([prior, prior - [0.4, 0]], "black")
-    ax.set_aspect("equal", adjustable="datalim")
-    ax.axis("off")
-    return ax
-
-
 def enlargement(poses, covariances, share=0.05):
     """Factor 1, 2, 5, 10, ... with which no 95 % semi-axis exceeds this share of the extent."""
     known = np.isfinite(poses[:, 0])
     extent = np.ptp(poses[known, :2], axis=0).max()
-    largest = 2.45 * np.sqrt(np.linalg.eigvalsh(covariances[known, :2, :2])[:, 1].max())
+    largest = REACH_95 * np.sqrt(np.linalg.eigvalsh(covariances[known, :2, :2])[:, 1].max())
     wanted = share * extent / largest if largest > 0 else 1
     steps = np.outer(10.0 ** np.arange(4), [1, 2, 5]).ravel()
     return int(steps[max(0, np.searchsorted(steps, wanted, side="right") - 1)])

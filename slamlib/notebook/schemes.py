@@ -1,12 +1,12 @@
-"""The factor graph of problem 4 as a scheme."""
+"""The factor graphs of problems 3 and 4 as schemes."""
 
 import numpy as np
 
 from slamlib.notebook.plotting import ROLES
 
 
-def slam_graph(ax, count, sightings, ranges, markers, antennas):
-    """Draw a scheme of the graph of problem 4 on `ax`, and return `ax`.
+def slam_graph(ax, count, sightings, markers, ranges=(), antennas=()):
+    """Draw a scheme of the graph of problem 3, or with ranges that of problem 4, on `ax`.
 
     Vehicle poses stand in a row, the markers above, the wheel parameters w and the antennas below.
 
@@ -15,6 +15,10 @@ def slam_graph(ax, count, sightings, ranges, markers, antennas):
     count : int, number of vehicle poses.
     sightings, ranges : lists of (pose, landmark), indices from 0.
     markers, antennas : lists of the landmarks' labels.
+
+    Returns
+    -------
+    `ax`
     """
     poses = np.array([(i, 0.0) for i in range(count)])
     above, below = (_row(count, len(names), y) for names, y in ((markers, 1.3), (antennas, -2.0)))
@@ -32,9 +36,9 @@ def slam_graph(ax, count, sightings, ranges, markers, antennas):
             *((place, f"$L_{{{name}}}$", "#dddddd") for place, name in zip(above, markers)),
             *((place, f"$A_{{{name}}}$", "#cfe8f7") for place, name in zip(below, antennas)),
             (wheel, "$w$", "#ffe0b0")]:
-        ax.text(*place, name, ha="center", va="center", fontsize=9, zorder=4,
-                bbox=dict(boxstyle="circle,pad=0.35", facecolor=color, edgecolor="black"))
-    ax.set(xlim=(-0.8, count - 0.2), ylim=(-2.5, 1.8))
+        ax.text(*place, name, ha="center", va="center", fontsize=11, zorder=4,
+                bbox=dict(boxstyle="circle,pad=0.25", facecolor=color, edgecolor="black"))
+    ax.set(xlim=(-0.8, count - 0.2), ylim=(-2.5 if len(antennas) else -1.3, 1.8))
     ax.axis("off")
     return ax
 

@@ -75,9 +75,9 @@ def results_folder(drive):
 
 
 def with_truth(drives, lost):
-    """The drives that have truth; for the others a sentence says that `lost` cannot be shown."""
+    """The drives that have truth; if some do, a sentence says for which `lost` cannot be shown."""
     without = [drive.name for drive in drives if drive.truth is None]
-    if without:
+    if 0 < len(without) < len(drives):
         say(f"*No truth comes with {listed(without)}, so {lost} cannot be shown there.*")
     return [drive for drive in drives if drive.truth is not None]
 
@@ -143,11 +143,12 @@ def table_text(header, rows, texts=1):
     """Table in Markdown, a str.
 
     `header` is a list of c str, `rows` a list of such lists. The first `texts` columns are aligned
-    left as text, the others right as numbers. Rows that begin alike are a group: only its first row
-    shows this beginning.
+    left as text, the others right as numbers, with minus signs. Rows that begin alike are a group:
+    only its first row shows this beginning.
     """
     above = [None, *(row[0] for row in rows)]
-    grouped = [["" if row[0] == first else row[0], *row[1:]]
+    grouped = [["" if row[0] == first else row[0], *row[1:texts],
+                *(re.sub(r"(?<!\S)-(?=\d)", "−", cell) for cell in row[max(1, texts):])]
                for first, row in zip(above, rows, strict=False)]
     lines = [header, ["---"] * texts + ["---:"] * (len(header) - texts), *grouped]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)

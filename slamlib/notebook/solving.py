@@ -98,15 +98,14 @@ def delivered(drives, found):
     Yields (Drive, Solution, names of the files as a str); a simulated drive has no files, and a
     sentence says so if there is no other.
     """
-    if all(drive.made_up for drive in drives):
+    pairs = [(drive, problem) for drive in drives for problem, by_drive in found.items()
+             if drive.name in by_drive and not drive.made_up]
+    if not pairs:
         say("A simulated drive has no files to hand in.")
-    for drive in drives:
-        for problem, by_drive in found.items():
-            if drive.name in by_drive and not drive.made_up:
-                solution = solve.SOLUTIONS[problem](drive.dataset, by_drive[drive.name])
-                folder = solve.write(results_folder(drive), solution)
-                yield drive, solution, listed(
-                    [f"`{file.name}`" for file in sorted(folder.glob("*.mat"))])
+    for drive, problem in pairs:
+        solution = solve.SOLUTIONS[problem](drive.dataset, found[problem][drive.name])
+        folder = solve.write(results_folder(drive), solution)
+        yield drive, solution, listed([f"`{file.name}`" for file in sorted(folder.glob("*.mat"))])
 
 
 def notices(books):

@@ -131,7 +131,7 @@ def _path(points, travelled=None):
 def _ellipses(centres, covariances, scale):
     """Yield the attributes (str) of the 95 % ellipses at centres (m, 2) on the page."""
     variances, axes = np.linalg.eigh(covariances[:, :2, :2])
-    radii = 2.4477 * scale * np.sqrt(np.maximum(variances, 0))
+    radii = evaluation.REACH_95 * scale * np.sqrt(np.maximum(variances, 0))
     angles = -np.degrees(np.arctan2(axes[:, 1, 1], axes[:, 0, 1]))
     for (x, y), (minor, major), angle in zip(centres, radii, angles, strict=True):
         yield (f'rx="{major:.1f}" ry="{minor:.1f}" '

@@ -27,7 +27,7 @@ def trajectories(drive):
             if solution.problem not in HIDDEN or solution is drive.solutions[-1]:
                 plotting.trajectory(left, _few(_in_first_frame(drive, solution)), role,
                                     solution.title, **look)
-            sigma = evaluation.sigmas(solution.covariances)[:, :2].max(axis=1)
+            sigma = evaluation.position_sigmas(solution.covariances)
             known = _few(np.flatnonzero(np.isfinite(sigma) & (sigma > 0)))
             plotting.curve(right, sigma[known], role, known, solution.title, **look)
         if drive.truth is not None:
@@ -55,7 +55,7 @@ def title_picture(drive):
 
 def _shown_from(drive):
     """Return a sigma in m below which at most 2 % are for every problem, or None."""
-    sigmas = [evaluation.sigmas(solution.covariances)[:, :2].max(axis=1)
+    sigmas = [evaluation.position_sigmas(solution.covariances)
               for solution in drive.solutions]
     low = [np.nanquantile(sigma, 0.02) for sigma in sigmas if np.isfinite(sigma).any()]
     return min(low) if low and min(low) > 0 else None

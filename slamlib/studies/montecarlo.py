@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from slamlib import localization, odometry, slam
-from slamlib.evaluation import anees, ate, nees, sigmas
+from slamlib.evaluation import anees, ate, nees, position_sigmas
 from slamlib.localization.hint import first_order_from
 from slamlib.sightings import sightings_by_frame
 from slamlib.simulation import simulate
@@ -113,7 +113,7 @@ def ranges_added(seed, share=1.0, **options):
     dataset = replace(dataset, aruco=seen)
     without = slam.estimate(dataset.without("uwb"))
     solved, numbers = {"without": without, "with": slam.estimate(dataset, previous=without)}, {}
-    sigma = {name: sigmas(found.covariances[1:])[:, :2].max(axis=1)
+    sigma = {name: position_sigmas(found.covariances[1:])
              for name, found in solved.items()}
     for name, found in solved.items():
         numbers |= {f"ate {name}": ate(found.poses, truth.poses),
