@@ -5,6 +5,7 @@ whose message names the file, the line and what was expected there.
 """
 
 import re
+import stat
 import tomllib
 from difflib import get_close_matches
 from itertools import islice
@@ -107,14 +108,26 @@ def error(path, message, line=None):
     return DatasetError(f"{path}{'' if line is None else f', line {line}'}: {message}")
 
 
+def read_regular(path):
+    """Bytes of a file; DatasetError if it is no regular file or cannot be read.
+
+    Reading a pipe waits for a writer, and some devices have no end.
+    """
+    expected = "expected a file that can be read"
+    try:
+        mode = path.stat().st_mode
+        if not stat.S_ISREG(mode):
+            kind = "a folder" if stat.S_ISDIR(mode) else "a pipe" if stat.S_ISFIFO(mode) \
+                else "a socket" if stat.S_ISSOCK(mode) else "a device"
+            raise error(path, f"{expected}, found {kind}")
+        return path.read_bytes()
+    except OSError:
+        raise error(path, expected) from None
+
+
 def _read_text(path, encoding="ascii"):
     """Text with line ends '\\n'; bytes that are invalid in this encoding become '\\ufffd'."""
-    try:
-        if not path.is_file():  # a folder, or a pipe, on which reading would block
-            raise OSError
-        data = path.read_bytes()
-    except OSError:
-        raise error(path, "expected a file that can be read") from None
+    data = read_regular(path)
     data = data.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     if control := CONTROL_BYTE.search(data):
         line = data.count(b"\n", 0, control.start()) + 1
