@@ -91,16 +91,20 @@ def read_toml(path, example, known, encoding="ascii"):
         at_key = re.search(rf"""^[\s\["']*{re.escape(key)}(?![\w-])""", text, re.MULTILINE)
         line = text.count("\n", 0, at_key.end()) + 1 if at_key else None
         if key not in known:
-            raise error(path, f"expected keys among {', '.join(known)}, found {_quoted(key)}", line)
+            raise error(path, f"expected keys among {', '.join(known)}, found {quoted(key)}", line)
         entries[key] = value, line
     return entries
 
 
-def require(ok, path, expected):
-    """Raise DatasetError for the first row of a file where ok (m,) is False."""
+def require(ok, path, expected, column=None):
+    """Raise DatasetError for the first row of a file where ok (m,) is False.
+
+    The message quotes the row, or the word in the column with this number from 0.
+    """
     if not ok.all():
         line, words = next(islice(_rows(_read_text(path)), int(np.argmin(ok)), None))
-        raise error(path, f"expected {expected}, found {_quoted(' '.join(words))}", line)
+        found = " ".join(words) if column is None else words[column]
+        raise error(path, f"expected {expected}, found {quoted(found)}", line)
 
 
 def error(path, message, line=None):
@@ -143,7 +147,7 @@ def _table_error(path, text, columns):
         for word in words:
             if not NUMBER.fullmatch(word) or abs(float(word)) >= BOUND:
                 expected = f"expected finite numbers (below {BOUND:g} in size)"
-                return error(path, f"{expected}, found {_quoted(word)}", line)
+                return error(path, f"{expected}, found {quoted(word)}", line)
     return error(path, expected)  # unreachable unless numpy and NUMBER disagree
 
 
@@ -154,5 +158,10 @@ def _rows(text):
             yield line, words
 
 
-def _quoted(text, longest=60):
+def quoted(value, longest=60):
+    """The beginning of a value as text, in quotes."""
+    try:
+        text = str(value)
+    except ValueError:                         # Python writes no integers of thousands of digits
+        return "a far longer number"
     return repr(text if len(text) <= longest else text[:longest] + "...")
