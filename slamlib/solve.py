@@ -118,7 +118,8 @@ def _require_covariances(result):
         getattr(result, name) for name in COVARIANCES if getattr(result, name, None) is not None]
     variances = np.concatenate(
         [np.diagonal(C, axis1=-2, axis2=-1).ravel() for C in each])
-    if not (variances >= 0).all() or not np.isfinite(getattr(result, "log_evidence", 0.0)):
+    if not ((0 <= variances) & (variances < np.inf)).all() \
+            or not np.isfinite(getattr(result, "log_evidence", 0.0)):
         raise np.linalg.LinAlgError("a variance is negative or not finite")
 
 

@@ -101,7 +101,7 @@ def test_problem_4_starts_from_problem_3_only_where_there_is_one(said, monkeypat
     left, found = solved(both, ["problem4"], besides=["problem3"])
     assert left == both and set(found["problem3"]) == {"other"}
     assert previous == [None, None, found["problem3"]["other"]]
-    assert "matrices lose their digits (Singular matrix)" in said[0][0]
+    assert "matrices lose their digits &#40;Singular matrix&#41;" in said[0][0]
 
 
 def test_a_simulated_drive_that_fails_is_a_defect(said, drives, monkeypatch):
