@@ -3,7 +3,8 @@
 The folder holds `encoderReading.txt` and, where the vehicle has the sensors, `ArucoReading.txt` and
 `UwbReading.txt` with `UwbAntennaGuess.txt`. Optional are `vehicle.toml`, with what differs from the
 assignment's table 2, and the folder `truth`. Lengths are in metres, angles in radians. Pose ids
-count from 1 in the files and from 0 in the arrays; marker and antenna ids stay unchanged.
+count from 1 in the files and from 0 in the arrays; marker and antenna ids stay unchanged. Numbers
+are within `limits.LIMITS`.
 """
 
 from dataclasses import asdict, dataclass, replace
