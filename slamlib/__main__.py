@@ -33,8 +33,15 @@ def main(arguments=None):
         return 130
 
 
+class _Parser(argparse.ArgumentParser):
+    def error(self, message):
+        """End with exit code 2 and one sentence, without argparse's usage."""
+        told = " ".join(message.split())
+        self.exit(2, f"slamlib: {told} ({self.prog} --help shows the usage)\n")
+
+
 def _parser():
-    parser = argparse.ArgumentParser(prog="python -m slamlib", description=__doc__)
+    parser = _Parser(prog="python -m slamlib", description=__doc__)
     commands = parser.add_subparsers(required=True, metavar="{report,solve,simulate}")
 
     _report_options(commands.add_parser(
@@ -161,23 +168,24 @@ def _simulate(options):
 
 
 def _count(text):
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"expected a whole number from 0 on, found {text}")
-    return value
+    return _number(text, int, 0, float("inf"), "a whole number from 0 on")
 
 
 def _positive(text):
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"expected a whole number from 1 on, found {text}")
-    return value
+    return _number(text, int, 1, float("inf"), "a whole number from 1 on")
 
 
 def _share(text):
-    value = float(text)
-    if not 0 <= value <= 1:
-        raise argparse.ArgumentTypeError(f"expected a number from 0 to 1, found {text}")
+    return _number(text, float, 0, 1, "a number from 0 to 1")
+
+
+def _number(text, kind, least, most, expected):
+    try:
+        value = kind(text)
+    except ValueError:
+        value = float("nan")
+    if not least <= value <= most:
+        raise argparse.ArgumentTypeError(f"expected {expected}, found {text[:60]!r}")
     return value
 
 

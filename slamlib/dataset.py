@@ -3,20 +3,21 @@
 The folder holds `encoderReading.txt` and, where the vehicle has the sensors, `ArucoReading.txt` and
 `UwbReading.txt` with `UwbAntennaGuess.txt`. Optional are `vehicle.toml`, with what differs from the
 assignment's table 2, and the folder `truth`. Lengths are in metres, angles in radians. Pose ids
-count from 1 in the files and from 0 in the arrays; marker and antenna ids stay unchanged.
+count from 1 in the files and from 0 in the arrays; marker and antenna ids stay unchanged. Numbers
+are within `limits.LIMITS`.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from os.path import abspath
 from pathlib import Path
 
 import numpy as np
 
 from slamlib.doubt import Doubt
-from slamlib.textfile import BOUND, DatasetError, error, find, read_table, read_toml, require
+from slamlib.limits import LIMITS
+from slamlib.textfile import DatasetError, error, find, quoted, read_table, read_toml, require
 from slamlib.truth_frame import in_first_frame
 
-SMALLEST_SIGMA = 1e-9  # m or rad; smaller standard deviations and wheel parameters count as zero
 SMALLEST_EIGENVALUE = 1e-12  # no unit; a correlation matrix with a smaller one counts as singular
 MOST_NEGATIVE = 5.0  # sigmas, of a range at an antenna
 MOST_REVOLUTIONS = 10  # revolutions of a wheel in one step
@@ -178,7 +179,7 @@ def read_truth(folder):
     vehicle = _read_vehicle(folder, default=Vehicle())
     pose_count = len(_read_ticks(folder, vehicle))
     path = find(truth_folder, "vehiclePose.txt", required=True)
-    poses = _read_all_poses(path, "pose id, x, y, theta")
+    poses = _read_all_poses(path, "vehiclePose.txt", "pose id, x, y, theta")
     if len(poses) != pose_count:
         raise error(path, f"expected {pose_count} poses (encoder file), found {len(poses)}")
     marker, marker_in_world = _read_map(truth_folder, "ArucoMap.txt", "marker id, x, y, theta")
@@ -194,16 +195,31 @@ def _read_vehicle(folder, default):
     path = find(folder, "vehicle.toml")
     if path is None:
         return default
-    entries = read_toml(path, "wheelbase = 0.4", [field.name for field in fields(Vehicle)])
-    for key, (value, line) in entries.items():
-        if type(value) not in (int, float) or not SMALLEST_SIGMA <= value < BOUND:
-            raise error(path, f"expected a positive number for {key}", line)
-    return replace(default, **{key: float(value) for key, (value, _) in entries.items()})
+    limits, values = LIMITS["vehicle.toml"], asdict(default)
+    entries = read_toml(path, "wheelbase = 0.4", list(values))
+    for key in sorted(entries, key=list(limits).index):    # a parameter before its sigma
+        (value, line), limit = entries[key], limits[key]
+        most = values.get(limit.most, limit.most)
+        if type(value) not in (int, float) or not limit.least <= value <= most:
+            raise error(path, f"expected {limit.expected(f'number for {key}')}, found "
+                        f"{quoted(value)}", line)
+        values[key] = float(value)
+    return Vehicle(**values)
+
+
+def _read_numbers(path, name, columns):
+    """`read_table` of the file `name`, whose numbers are within LIMITS."""
+    table, names = read_table(path, columns), columns.split(", ")
+    for column, limit in LIMITS.get(name, {}).items():
+        number = names.index(column)
+        ok = (limit.least <= table[:, number]) & (table[:, number] <= limit.most)
+        require(ok, path, limit.expected(column), number)
+    return table
 
 
 def _read_ticks(folder, vehicle):
     path = find(folder, "encoderReading.txt", required=True)
-    ticks = _read_all_poses(path, "pose id, right ticks, left ticks")
+    ticks = _read_all_poses(path, "encoderReading.txt", "pose id, right ticks, left ticks")
     if len(ticks) == 0:
         raise error(path, "expected at least the row '1 0 0', found no rows")
     require((ticks == np.rint(ticks)).all(axis=1), path, "whole numbers of ticks")
@@ -221,12 +237,9 @@ def _read_aruco(folder, pose_count):
         "s_xx, s_xy, s_xtheta, s_yy, s_ytheta, s_thetatheta", pose_count)
     if len(table) == 0:
         return None
-    require(abs(table[:, 2]) < 2 * np.pi + 1e-3, path, "an angle theta in radians (below 2 pi)")
-    covariance, variance = table[:, [[3, 4, 5], [4, 6, 7], [5, 7, 8]]], table[:, [3, 6, 8]]
-    require((variance >= SMALLEST_SIGMA**2).all(axis=1), path,
-            "positive variances s_xx, s_yy and s_thetatheta")
+    covariance = table[:, [[3, 4, 5], [4, 6, 7], [5, 7, 8]]]
     # Scaled to correlations: s_thetatheta may be 1e4 rad^2 where s_xx is 1e-4 m^2.
-    sigma = np.sqrt(variance)
+    sigma = np.sqrt(table[:, [3, 6, 8]])
     correlation = covariance / (sigma[:, :, None] * sigma[:, None, :])
     smallest_eigenvalue = np.linalg.eigvalsh(correlation)[:, 0]
     require(smallest_eigenvalue > SMALLEST_EIGENVALUE, path, "a positive definite covariance")
@@ -238,7 +251,6 @@ def _read_uwb(folder, pose_count, antenna_guess):
         folder, "UwbReading.txt", "pose id, antenna id, range, sigma", pose_count)
     if len(table) == 0:
         return None
-    require(table[:, 1] >= SMALLEST_SIGMA, path, "a positive sigma")
     require(table[:, 0] >= -MOST_NEGATIVE * table[:, 1], path,
             f"a range that is not below -{MOST_NEGATIVE:g} sigma")
     if antenna_guess is None:
@@ -254,9 +266,9 @@ def _in_order(readings, pose, landmark, table):
     return readings.select(rows[np.argsort(pose[rows], kind="stable")])
 
 
-def _read_all_poses(path, columns):
+def _read_all_poses(path, name, columns):
     """Columns (n, c - 1) beside the ids of all poses."""
-    table = read_table(path, columns)
+    table = _read_numbers(path, name, columns)
     ids = np.arange(1, len(table) + 1)
     require(table[:, 0] == ids, path, "pose ids 1, 2, 3, ... in order")
     return table[:, 1:]
@@ -265,7 +277,7 @@ def _read_all_poses(path, columns):
 def _read_readings(folder, name, columns, pose_count):
     """Path, rows of poses (m,), landmark ids (m,) and the other columns (m, c - 2)."""
     path = find(folder, name)
-    table = read_table(path, columns)
+    table = _read_numbers(path, name, columns)
     pose_id = _ids(table[:, 0], path)
     require((1 <= pose_id) & (pose_id <= pose_count), path, f"a pose id from 1 to {pose_count}")
     return path, pose_id - 1, _ids(table[:, 1], path), table[:, 2:]
@@ -274,7 +286,7 @@ def _read_readings(folder, name, columns, pose_count):
 def _read_map(folder, name, columns):
     """Landmark ids (k,), ascending, and the other columns (k, c - 1)."""
     path = find(folder, name)
-    table = read_table(path, columns)
+    table = _read_numbers(path, name, columns)
     ids, first_row = np.unique(_ids(table[:, 0], path), return_index=True)
     require(np.isin(np.arange(len(table)), first_row), path, "each id only once")
     return ids, table[first_row, 1:]

@@ -5,7 +5,7 @@ vehicle frame with the covariance C of [x, y, heading]. A gate is the 99.9 % qua
 Mahalanobis distance r^T W^-1 r of a residual r with covariance W; beyond it r is rejected.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,6 +14,8 @@ from slamlib import se2
 GATE = 16.26623619623813         # dimensionless, for residuals of [x, y, heading]
 MAX_COMPARED = 200               # sightings of a marker, whose comparison costs their square
 POINT_GATE = 13.815510557964274  # dimensionless, for residuals of [x, y]
+SMALLEST_SIGMA = 1e-6            # m or rad, of a measurement if all else is known
+SMALLEST_RATIO = 1e-6            # of the standard deviations of x and y
 MAX_HEADING_SIGMA = 0.5          # rad; with a larger standard deviation a heading is unknown
 
 
@@ -39,11 +41,29 @@ def sightings_by_frame(aruco, extra_frames=()):
         none = np.zeros(0, int)
         return Sightings(index=none, row=none, marker=none, z=np.zeros((0, 3)),
                          C=np.zeros((0, 3, 3)), frame=np.unique(extra_frames).astype(int))
-    index, z, C, contradicting = merge_repeated(aruco)
+    index, z, C, contradicting = merge_repeated(replace(
+        aruco, covariance=regular(aruco.covariance)))
     frame = np.union1d(aruco.pose[index], extra_frames).astype(int)
     return Sightings(index=index, row=np.searchsorted(frame, aruco.pose[index]),
                      marker=aruco.marker[index], z=z, C=C, frame=frame,
                      contradicting=contradicting)
+
+
+def regular(covariance):
+    """Covariances (m, 3, 3) that float64 can invert and a graph can hold beside weaker information.
+
+    Where the standard deviation of x, y or heading, given the other two, is below SMALLEST_SIGMA,
+    as between coordinates that are fully correlated, the variance is increased by its square. For
+    x and y, SMALLEST_RATIO of the larger of both standard deviations counts in the same way.
+    """
+    sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    correlation = covariance / (sigma[:, :, None] * sigma[:, None, :])
+    given_others = sigma**2 / np.diagonal(np.linalg.inv(correlation), axis1=1, axis2=2)
+    smallest = np.full_like(sigma, SMALLEST_SIGMA)
+    smallest[:, :2] = np.maximum(
+        SMALLEST_SIGMA, SMALLEST_RATIO * sigma[:, :2].max(axis=1, keepdims=True))
+    added = np.where(given_others < smallest**2, smallest**2, 0.0)
+    return covariance + added[:, :, None] * np.eye(3)
 
 
 def merge_repeated(aruco):

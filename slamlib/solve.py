@@ -36,6 +36,7 @@ PROBLEMS = {
 }
 WHOLE_FILES = {"units", "wheels-swapped", "wheels-reversed", "camera-mirrored", "camera-turned",
                "odometry"}
+COVARIANCES = ("marker_covariance", "antenna_covariance", "wheel_covariance")
 SENSORS = {"aruco": "markers", "uwb": "UWB ranges"}
 
 
@@ -86,7 +87,8 @@ def failure(problem, dataset, error):
     """The Failure that an exception of UNSOLVABLE tells; the reason does not name the dataset."""
     reason = str(error).removeprefix(f"{dataset.name}: ")
     if isinstance(error, np.linalg.LinAlgError):
-        reason = f"expected matrices that numpy can compute with; it says: {reason}"
+        reason = ("expected lengths and standard deviations that float64 can hold together; some "
+                  f"are so far from the others that matrices lose their digits ({reason})")
     return Failure(problem, title(problem, dataset), reason)
 
 
@@ -97,17 +99,28 @@ def find(problem, dataset, found=None):
     other problems (dict by problem): problem 4 starts from problem 3 where there is one. Raises
     UNSOLVABLE.
     """
-    if problem == "problem1":
-        return odometry.equation2(dataset.ticks, dataset.vehicle)
-    if problem == "problem2":
-        return localization.localize(dataset.aruco)
-    if problem == "problem2_hint":
-        return localization.fuse_increments(dataset)
-    if problem == "problem2_fused":
-        return localization.fuse(dataset)
-    if problem == "problem3":
-        return slam.estimate(dataset.without("uwb"))
-    return slam.estimate(dataset, previous=(found or {}).get("problem3"))
+    solvers = {
+        "problem1": lambda: odometry.equation2(dataset.ticks, dataset.vehicle),
+        "problem2": lambda: localization.localize(dataset.aruco),
+        "problem2_hint": lambda: localization.fuse_increments(dataset),
+        "problem2_fused": lambda: localization.fuse(dataset),
+        "problem3": lambda: slam.estimate(dataset.without("uwb")),
+        "problem4": lambda: slam.estimate(dataset, previous=(found or {}).get("problem3"))}
+    result = solvers[problem]()
+    _require_covariances(result)
+    return result
+
+
+def _require_covariances(result):
+    """Raise LinAlgError where a covariance of what `find` returns is lost by rounding."""
+    poses, covariances = result if isinstance(result, tuple) else (result.poses, result.covariances)
+    each = [covariances[np.isfinite(poses[:, 0])]] + [
+        getattr(result, name) for name in COVARIANCES if getattr(result, name, None) is not None]
+    variances = np.concatenate(
+        [np.diagonal(C, axis1=-2, axis2=-1).ravel() for C in each])
+    if not ((0 <= variances) & (variances < np.inf)).all() \
+            or not np.isfinite(getattr(result, "log_evidence", 0.0)):
+        raise np.linalg.LinAlgError("a variance is negative or not finite")
 
 
 def problem1(dataset, found=None):

@@ -5,6 +5,7 @@ whose message names the file, the line and what was expected there.
 """
 
 import re
+import stat
 import tomllib
 from difflib import get_close_matches
 from itertools import islice
@@ -90,16 +91,20 @@ def read_toml(path, example, known, encoding="ascii"):
         at_key = re.search(rf"""^[\s\["']*{re.escape(key)}(?![\w-])""", text, re.MULTILINE)
         line = text.count("\n", 0, at_key.end()) + 1 if at_key else None
         if key not in known:
-            raise error(path, f"expected keys among {', '.join(known)}, found {_quoted(key)}", line)
+            raise error(path, f"expected keys among {', '.join(known)}, found {quoted(key)}", line)
         entries[key] = value, line
     return entries
 
 
-def require(ok, path, expected):
-    """Raise DatasetError for the first row of a file where ok (m,) is False."""
+def require(ok, path, expected, column=None):
+    """Raise DatasetError for the first row of a file where ok (m,) is False.
+
+    The message quotes the row, or the word in the column with this number from 0.
+    """
     if not ok.all():
         line, words = next(islice(_rows(_read_text(path)), int(np.argmin(ok)), None))
-        raise error(path, f"expected {expected}, found {_quoted(' '.join(words))}", line)
+        found = " ".join(words) if column is None else words[column]
+        raise error(path, f"expected {expected}, found {quoted(found)}", line)
 
 
 def error(path, message, line=None):
@@ -107,14 +112,26 @@ def error(path, message, line=None):
     return DatasetError(f"{path}{'' if line is None else f', line {line}'}: {message}")
 
 
+def read_regular(path):
+    """Bytes of a file; DatasetError if it is no regular file or cannot be read.
+
+    Reading a pipe waits for a writer, and some devices have no end.
+    """
+    expected = "expected a file that can be read"
+    try:
+        mode = path.stat().st_mode
+        if not stat.S_ISREG(mode):
+            kind = "a folder" if stat.S_ISDIR(mode) else "a pipe" if stat.S_ISFIFO(mode) \
+                else "a socket" if stat.S_ISSOCK(mode) else "a device"
+            raise error(path, f"{expected}, found {kind}")
+        return path.read_bytes()
+    except OSError:
+        raise error(path, expected) from None
+
+
 def _read_text(path, encoding="ascii"):
     """Text with line ends '\\n'; bytes that are invalid in this encoding become '\\ufffd'."""
-    try:
-        if not path.is_file():  # a folder, or a pipe, on which reading would block
-            raise OSError
-        data = path.read_bytes()
-    except OSError:
-        raise error(path, "expected a file that can be read") from None
+    data = read_regular(path)
     data = data.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     if control := CONTROL_BYTE.search(data):
         line = data.count(b"\n", 0, control.start()) + 1
@@ -130,7 +147,7 @@ def _table_error(path, text, columns):
         for word in words:
             if not NUMBER.fullmatch(word) or abs(float(word)) >= BOUND:
                 expected = f"expected finite numbers (below {BOUND:g} in size)"
-                return error(path, f"{expected}, found {_quoted(word)}", line)
+                return error(path, f"{expected}, found {quoted(word)}", line)
     return error(path, expected)  # unreachable unless numpy and NUMBER disagree
 
 
@@ -141,5 +158,10 @@ def _rows(text):
             yield line, words
 
 
-def _quoted(text, longest=60):
+def quoted(value, longest=60):
+    """The beginning of a value as text, in quotes."""
+    try:
+        text = str(value)
+    except ValueError:                         # Python writes no integers of thousands of digits
+        return "a far longer number"
     return repr(text if len(text) <= longest else text[:longest] + "...")

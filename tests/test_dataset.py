@@ -11,6 +11,7 @@ import pytest
 
 from slamlib import se2
 from slamlib.dataset import DatasetError, Vehicle, dataset_names, read_dataset, read_truth
+from slamlib.limits import LIMITS
 
 FILES = {
     "encoderReading.txt": "1 0 0\n2 10 12\n3 -5 7\n4 0 80000\n",
@@ -361,9 +362,9 @@ ERRORS = [
     ("ArucoReading.txt", third_row("1 4.5 0 0 0 1 0 0 1 0 1"), 5, "whole number"),
     ("ArucoReading.txt", third_row("1 40 0 nan 0 1 0 0 1 0 1"), 5, "finite number"),
     ("ArucoReading.txt", third_row("1 40 0 0 90 1 0 0 1 0 1"), 5, "in radians"),
-    ("ArucoReading.txt", third_row(ARUCO_ROW + "0 0 0 1 0 1"), 5, "positive variance"),
-    ("ArucoReading.txt", third_row(ARUCO_ROW + "1 0 0 -1 0 1"), 5, "positive variance"),
-    ("ArucoReading.txt", third_row(ARUCO_ROW + "1 0 0 1 0 9e-19"), 5, "positive variance"),
+    ("ArucoReading.txt", third_row(ARUCO_ROW + "0 0 0 1 0 1"), 5, "positive s_xx from 1e-18"),
+    ("ArucoReading.txt", third_row(ARUCO_ROW + "1 0 0 -1 0 1"), 5, "positive s_yy"),
+    ("ArucoReading.txt", third_row(ARUCO_ROW + "1 0 0 1 0 9e-19"), 5, "positive s_thetatheta"),
     ("ArucoReading.txt", third_row(ARUCO_ROW + "1 1 0 1 0 1"), 5, "positive definite"),
     ("ArucoReading.txt", third_row(ARUCO_ROW + "1e-4 2e-4 0 1e-4 0 1e4"), 5, "positive definite"),
     ("ArucoReading.txt", third_row(ARUCO_ROW + "1 .9 -.9 1 .9 1"), 5, "positive definite"),
@@ -425,6 +426,74 @@ def test_faults_in_a_file_are_named_by_file_line_and_expectation(
     assert key_word in message
 
 
+# Limits: of every file and column the number at the limit is read, the next one beyond refused.
+
+ROWS = {
+    "ArucoReading.txt": "1 40 0 0 0 1 0 0 1 0 1", "UwbReading.txt": "1 3 1 1e4",
+    "UwbAntennaGuess.txt": "3 0 0", "vehiclePose.txt": "1 0 0 0", "ArucoMap.txt": "40 0 0 0",
+    "UwbMap.txt": "3 0 0"}
+COLUMNS = {
+    "ArucoReading.txt": ["", "", "x", "y", "theta", "s_xx", "", "", "s_yy", "", "s_thetatheta"],
+    "UwbReading.txt": ["", "", "range", "sigma"], "UwbAntennaGuess.txt": ["", "x", "y"],
+    "vehiclePose.txt": ["", "x", "y", "theta"], "ArucoMap.txt": ["", "x", "y", "theta"],
+    "UwbMap.txt": ["", "x", "y"]}
+PLACES = [(name, column) for name in ROWS for column in LIMITS[name]]
+
+
+def write_number(folder, name, column, value):
+    """Write a folder of one pose with this number in a file; path and reader of the file."""
+    words = ROWS[name].split()
+    words[COLUMNS[name].index(column)] = repr(value)
+    write(folder / "encoderReading.txt", "1 0 0\n")
+    path = folder / ("truth" if name in ("vehiclePose.txt", "ArucoMap.txt", "UwbMap.txt") else "") \
+        / name
+    if name.startswith("Uwb"):
+        write(folder / "UwbAntennaGuess.txt", "3 0 0\n")
+    if path.parent.name == "truth":
+        write(path.parent / "vehiclePose.txt", "1 0 0 0\n")
+    write(path, " ".join(words) + "\n")
+    return path, read_truth if path.parent.name == "truth" else read_dataset
+
+
+@pytest.mark.parametrize("name, column", PLACES)
+def test_numbers_at_the_limits_are_read_and_beyond_them_refused(tmp_path, name, column):
+    limit = LIMITS[name][column]
+    for most, away in ((limit.least, -np.inf), (limit.most, np.inf)):
+        path, read = write_number(tmp_path, name, column, float(most))
+        read(tmp_path)
+        beyond = float(np.nextafter(most, away))
+        write_number(tmp_path, name, column, beyond)
+        message = error_of(read, tmp_path)
+        assert message.startswith(f"{path}, line 1: expected ") and str(limit) in message
+        assert message.endswith(f"found '{beyond!r}'")
+
+
+@pytest.mark.parametrize("key", LIMITS["vehicle.toml"])
+def test_a_vehicle_at_the_limits_is_read_and_beyond_them_refused(tmp_path, key):
+    limit, parameter = LIMITS["vehicle.toml"][key], key.removeprefix("sigma_")
+    write(tmp_path / "encoderReading.txt", "1 0 0\n")
+    most = 5.0 if isinstance(limit.most, str) else limit.most
+    other = f"{parameter} = 5\n" if isinstance(limit.most, str) else ""
+    for value, away in ((limit.least, -np.inf), (most, np.inf)):
+        write(tmp_path / "vehicle.toml", f"{key} = {float(value)!r}\n{other}")
+        assert getattr(read_dataset(tmp_path).vehicle, key) == value
+        beyond = float(np.nextafter(value, away))
+        write(tmp_path / "vehicle.toml", f"{key} = {beyond!r}\n{other}")
+        message = error_of(read_dataset, tmp_path)
+        assert f"line 1: expected a positive number for {key} {limit} (" in message
+        assert message.endswith(f"found '{beyond!r}'")
+
+
+def test_the_limits_that_a_user_reads_are_those_of_the_reader():
+    text = (Path(__file__).parents[1] / "data" / "README.md").read_text()
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines()
+            if line.startswith("| `") and "| from " in line]
+    told = {(file.strip("`"), column.strip("` ")): limit for file, columns, limit in rows
+            for column in columns.split(",")}
+    assert told == {(file, column): str(limit) for file, columns in LIMITS.items()
+                    for column, limit in columns.items()}
+
+
 def test_ranges_without_a_guess_file(folder):
     (folder / "UwbAntennaGuess.txt").unlink()
     message = error_of(read_dataset, folder)
@@ -460,18 +529,33 @@ def test_the_same_name_in_two_cases(folder):
     assert "ARUCOREADING.txt and ArucoReading.txt" in message
 
 
-@pytest.mark.parametrize("name", [name for name in FILES if not name.startswith("truth/")])
+@pytest.mark.parametrize("name", FILES)
 def test_files_that_cannot_be_read(folder, name, monkeypatch):
     place = f"{folder / name}: expected a file that can be read"
+    read = read_truth if name.startswith("truth/") else read_dataset
     with monkeypatch.context() as patch:
-        patch.setattr(Path, "read_bytes", refuse_only(name))
-        assert error_of(read_dataset, folder) == place
+        patch.setattr(Path, "read_bytes", refuse_only(folder / name))
+        assert error_of(read, folder) == place
     (folder / name).unlink()
     (folder / name).symlink_to("nothing")
-    assert error_of(read_dataset, folder) == place
+    assert error_of(read, folder) == place
     (folder / name).unlink()
     (folder / name).mkdir()
-    assert error_of(read_dataset, folder) == place
+    assert error_of(read, folder) == f"{place}, found a folder"
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes on this system")
+@pytest.mark.parametrize("name", FILES)
+def test_pipes_and_devices_are_refused_and_not_waited_for(folder, name):
+    place = f"{folder / name}: expected a file that can be read"
+    read = read_truth if name.startswith("truth/") else read_dataset
+    (folder / name).unlink()
+    (folder / name).symlink_to("/dev/zero")
+    assert error_of(read, folder) == f"{place}, found a device"
+    (folder / name).unlink()
+    os.mkfifo(folder / "pipe")
+    (folder / name).symlink_to(folder / "pipe")
+    assert error_of(read, folder) == f"{place}, found a pipe"
 
 
 def refuse_only(name):
@@ -479,18 +563,11 @@ def refuse_only(name):
     read_bytes = Path.read_bytes
 
     def refusing(path):
-        if path.name == name:
+        if path == name:
             raise PermissionError(13, "Permission denied")
         return read_bytes(path)
 
     return refusing
-
-
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes on this system")
-def test_a_pipe_does_not_wait_for_ever(folder):
-    (folder / "encoderReading.txt").unlink()
-    os.mkfifo(folder / "encoderReading.txt")
-    assert "expected a file that can be read" in error_of(read_dataset, folder)
 
 
 def test_the_path_is_written_as_the_user_gave_it(folder, monkeypatch):

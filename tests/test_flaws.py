@@ -1,14 +1,18 @@
 """Drives that are not as their files say: the estimate holds, or a doubt names what is wrong."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from slamlib import localization, se2, slam
+from slamlib import localization, se2, slam, solve
+from slamlib.dataset import read_dataset, read_truth
 from slamlib.evaluation import anees, ate, nees_band
 from slamlib.simulation import simulate
 from slamlib.studies import montecarlo
+
+SHORT = Path(__file__).parents[1] / "data" / "short"
 
 
 def aruco(dataset, **changes):
@@ -50,6 +54,59 @@ WRONG_SIZES = {                                # found by the graph, and mended 
     "sigmas of ranges halved": (lambda d: uwb(d, sigma=d.uwb.sigma / 2), "range-noise"),
     "ranges 1.5 % too long": (lambda d: uwb(d, range=d.uwb.range * 1.015), "range-offset"),
     "wheels 1 % too large": (larger_wheels, "wheel-parameters")}
+
+
+def uncorrelated(*variances):
+    """A change of all sightings: other variances of x, y and heading, and no correlation."""
+    return lambda d: aruco(d, covariance=np.broadcast_to(
+        np.diag(variances), d.aruco.covariance.shape))
+
+
+def correlated(i, j, by):
+    """A change of all sightings: two coordinates, and no others, are correlated by `by`."""
+    def change(d):
+        C = d.aruco.covariance * np.eye(3)
+        C[:, i, j] = C[:, j, i] = by * np.sqrt(C[:, i, i] * C[:, j, j])
+        return aruco(d, covariance=C)
+    return change
+
+
+def one_of(sensor, change):
+    """A change of one reading only, in the middle of a drive."""
+    def of_one(d):
+        readings, changed = getattr(d, sensor), getattr(change(d), sensor)
+        half = len(readings.pose) // 2
+        return replace(d, **{sensor: replace(readings, **{
+            name: np.concatenate([values[:half], getattr(changed, name)[half:half + 1],
+                                  values[half + 1:]])
+            for name, values in vars(readings).items()})})
+    return of_one
+
+
+def vehicle(**changes):
+    return lambda d: replace(d, vehicle=replace(d.vehicle, **changes))
+
+
+def range_sigmas(sigma):
+    return lambda d: uwb(d, sigma=np.full_like(d.uwb.sigma, sigma))
+
+
+LEGAL = {                                      # within the limits, and far from what is usual
+    "an unknown heading of pose 1": vehicle(sigma_heading=10.0),
+    "an uncertain heading of pose 1": vehicle(sigma_heading=0.1),
+    "a very certain heading of pose 1": vehicle(sigma_heading=1e-9),
+    "very certain wheels": vehicle(
+        sigma_right_radius=1e-9, sigma_left_radius=1e-9, sigma_wheelbase=1e-9),
+    "unknown wheels": vehicle(sigma_right_radius=0.1, sigma_left_radius=0.1, sigma_wheelbase=0.4),
+    "a very certain range": one_of("uwb", range_sigmas(1e-7)),
+    "the most certain range": one_of("uwb", range_sigmas(1e-9)),
+    "the most uncertain ranges": range_sigmas(1e4),
+    "the most certain sighting": one_of("aruco", uncorrelated(1e-18, 1e-18, 1e-18)),
+    "the most uncertain sightings": uncorrelated(1e8, 1e8, 1e14),
+    "a sighting of a direction": one_of("aruco", uncorrelated(1e-18, 1e8, 1e-18)),
+    "sightings of a distance": uncorrelated(1e8, 1e-18, 1e14),
+    "correlations of almost 1": correlated(0, 1, 1 - 1e-11),
+    "correlations with heading of almost 1": correlated(1, 2, 1 - 1e-11)}
 
 
 def names(*lists):
@@ -198,3 +255,31 @@ def test_markers_of_which_most_sightings_contradict_are_named():
     found = slam.estimate(aruco(dataset, marker_in_vehicle=z).without("uwb"))
     doubts = [doubt for doubt in found.drive_doubts if doubt.what == "sightings-rejected"]
     assert len(doubts) == 1 and f"marker {moved}" in doubts[0].sentence
+
+
+@pytest.mark.parametrize("case", LEGAL)
+def test_every_problem_is_solved_within_the_limits(case):
+    """Finite covariances that are not negative, and of SLAM errors as those that they state."""
+    dataset, truth = read_dataset(SHORT), read_truth(SHORT)
+    dataset = LEGAL[case](dataset.first(300))
+    solve.doubts_about_drive(dataset, truth)                  # without a warning
+    for solution in solve.solutions(dataset):
+        assert isinstance(solution, solve.Solution), solution.reason
+        known = np.isfinite(solution.poses[:, 0])
+        variances = np.diagonal(solution.covariances[known], axis1=1, axis2=2)
+        assert known.any() and (variances >= 0).all()
+        if solution.problem in ("problem3", "problem4"):
+            errors = np.abs(solution.poses - truth.poses[:300])
+            assert (errors < 5 * np.sqrt(variances) + 0.02).all()
+
+
+def test_a_solution_that_rounding_spoilt_is_none(monkeypatch):
+    dataset, _ = simulate("short", 61)
+    dataset = replace(dataset.first(100), uwb=None)
+    found = slam.estimate(dataset)
+    for name, value in (("covariances", np.nan), ("wheel_covariance", -1e-30),
+                        ("marker_covariance", np.inf), ("log_evidence", -np.inf)):
+        spoilt = replace(found, **{name: np.full_like(getattr(found, name), value)})
+        monkeypatch.setattr(solve.slam, "estimate", lambda _, spoilt=spoilt: spoilt)
+        failure, = solve.solutions(dataset, problems=("problem3",))
+        assert "float64" in failure.reason and "a variance is negative" in failure.reason

@@ -4,6 +4,8 @@ import html
 import json
 import os
 import re
+import shutil
+import subprocess
 import sys
 import tempfile
 from dataclasses import replace
@@ -296,10 +298,35 @@ def test_bad_data_and_bad_notebooks_are_told_before_a_kernel_starts(tmp_path):
     (tmp_path / "data" / "long" / "encoderReading.txt").write_text("1 0 0\n2 1\n")
     with pytest.raises(DatasetError, match="encoderReading.txt, line 2: expected 3 columns"):
         build(tmp_path)
-    (tmp_path / "notebooks" / "2_broken.ipynb").write_text("not json")
-    with pytest.raises(NotebookError, match="2_broken.ipynb is not a notebook"):
+    broken = tmp_path / "notebooks" / "2_broken.ipynb"
+    for content, reason in (
+            (b"not json", "Notebook does not appear to be JSON"),
+            (b'{"nbformat": 99}', "Unsupported nbformat version 99"),
+            (b"[]", "expected JSON with cells and metadata"),
+            (b'{"nbformat": 4,\n"caf\xe9": 1}',
+             "expected UTF-8 text, found the byte 0xe9 in line 2")):
+        broken.write_bytes(content)
+        with pytest.raises(NotebookError, match=f"^2_broken.ipynb is not a notebook: {reason}"):
+            build(tmp_path, datasets=["short"])
+    broken.unlink()
+    os.mkfifo(broken)
+    with pytest.raises(DatasetError, match="2_broken.ipynb: expected a file that can be read, fo"):
         build(tmp_path, datasets=["short"])
     assert not (tmp_path / "report").exists()
+
+
+@pytest.mark.skipif(shutil.which("unshare") is None
+                    or subprocess.run(["unshare", "-rn", "true"], capture_output=True).returncode,
+                    reason="no namespace without a network can be made here")
+def test_a_loopback_that_is_down_is_not_needed(tmp_path):
+    make_data(tmp_path)
+    write(tmp_path / "notebooks", "1_text", "# Text", ("print(6 * 7)",))
+    built = subprocess.run(
+        ["unshare", "-rn", sys.executable, "-m", "slamlib", "report", "short"],
+        cwd=tmp_path, text=True, capture_output=True, timeout=300,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)})
+    assert built.returncode == 0, built.stderr
+    assert "42" in (tmp_path / "report" / "1_text.html").read_text()
 
 
 def test_index_lists_results_of_this_build_and_the_selected_datasets_only(tmp_path):

@@ -18,6 +18,8 @@ from nbconvert.filters import strip_ansi
 from nbconvert.preprocessors import CoalesceStreamsPreprocessor
 from tqdm import tqdm
 
+from slamlib.textfile import read_regular
+
 CELL_TIMEOUT = 1800  # s
 POLL = 1.0  # s, between looks at how far the studies are
 LONGEST_FOLDER = 70  # characters, of one for sockets: their paths have at most 103
@@ -35,12 +37,21 @@ class _Loop(asyncio.SelectorEventLoop):
 
 
 def read_notebook(source):
-    """Return the NotebookNode in a file (Path); NotebookError if the file is not a notebook."""
+    """Return the NotebookNode in a file (Path).
+
+    NotebookError if the file is not a notebook, DatasetError if it is no file that can be read.
+    """
+    data = read_regular(source)
     try:
-        return nbformat.read(source, as_version=4)
-    except (nbformat.reader.NotJSONError, nbformat.ValidationError) as error:
+        return nbformat.reads(data.decode("utf-8-sig"), as_version=4)
+    except UnicodeDecodeError as error:
+        byte, line = error.object[error.start], data.count(b"\n", 0, error.start) + 1
+        reason = f"expected UTF-8 text, found the byte 0x{byte:02x} in line {line}"
+    except (ValueError, nbformat.ValidationError) as error:
         reason = str(error).partition("\n")[0]
-        raise NotebookError(f"{source.name} is not a notebook: {reason}") from None
+    except Exception:  # on other JSON nbformat fails in many ways
+        reason = "expected JSON with cells and metadata"
+    raise NotebookError(f"{source.name} is not a notebook: {reason}")
 
 
 def kernel_environment(settings, data, datasets, jobs):

@@ -40,7 +40,8 @@ def parts(dataset):
 
     Each is at most GROWTH times as long as the one before; the last one is the whole drive.
     """
-    _, covariances = odometry.first_order(dataset.ticks, dataset.vehicle)
+    _, covariances = odometry.first_order(
+        dataset.ticks, dataset.vehicle, initial_covariance=np.zeros((3, 3)))
     lost = np.flatnonzero(covariances[:, 2, 2] > MAX_ODOMETRY_SIGMA**2)
     ends = [len(dataset.ticks)]
     first = max(lost[0], 2) if len(lost) else ends[0]

@@ -13,7 +13,14 @@ from gtsam.symbol_shorthand import A, L, P, W, X, Z
 
 from slamlib import odometry, se2
 from slamlib.dataset import Dataset, UwbReadings
-from slamlib.sightings import GATE, MAX_HEADING_SIGMA, POINT_GATE, Sightings, sightings_by_frame
+from slamlib.sightings import (
+    GATE,
+    MAX_HEADING_SIGMA,
+    POINT_GATE,
+    SMALLEST_SIGMA,
+    Sightings,
+    sightings_by_frame,
+)
 from slamlib.slam.errors import square_root_information
 from slamlib.slam.structure import structure
 
@@ -156,7 +163,8 @@ def measure(dataset, extra_poses=()):
     has_heading = sightings.C[:, 2, 2] < MAX_HEADING_SIGMA**2
     antenna, guess = np.unique(uwb.antenna), dataset.antenna_guess
     ranges = Ranges(np.searchsorted(sightings.frame, uwb.pose),
-                    np.searchsorted(antenna, uwb.antenna), uwb.range, uwb.sigma)
+                    np.searchsorted(antenna, uwb.antenna), uwb.range,
+                    np.maximum(uwb.sigma, SMALLEST_SIGMA))
     return Measurements(
         dataset=dataset, frame=sightings.frame,
         turn=np.diff(odometry.dead_reckoning(dataset.ticks, dataset.vehicle)[sightings.frame, 2]),
