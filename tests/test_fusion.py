@@ -123,6 +123,29 @@ def test_slip_is_learned_although_the_encoder_is_coarse():
     assert 0.7e-3 < np.exp(np.mean(np.log(slips))) < 1.5e-3
 
 
+def test_sightings_that_are_not_used_are_counted():
+    """Five sightings moved by a metre, one that repeats another, two of a marker that contradict.
+
+    The hint uses no sighting of a marker that no adjacent frame sees, on the clean drive either.
+    """
+    dataset, _ = simulate("short", seed=1, noise=False)
+    a = dataset.aruco
+    z, seen_before = a.marker_in_vehicle.copy(), [
+        row for row in range(len(a.pose))
+        if a.marker[row] in a.marker[a.pose == a.pose[row] - 10]]
+    moved = [next(row for row in seen_before if a.pose[row] == pose)
+             for pose in (200, 300, 400, 500, 600)]
+    z[moved, :2] += 1.0
+    again, other = (next(row for row in seen_before if a.pose[row] == pose) for pose in (700, 800))
+    spoilt = replace(a, marker_in_vehicle=z).select(np.r_[np.arange(len(z)), again, other])
+    spoilt.marker_in_vehicle[-1, 0] += 1.0
+    order = np.argsort(spoilt.pose, kind="stable")
+    spoilt = replace(dataset, aruco=spoilt.select(order))
+    assert fuse(dataset, slip=1e-3).rejected == 0
+    assert fuse(spoilt, slip=1e-3).rejected == 5 + 1 + 2
+    assert fuse_increments(spoilt).rejected == fuse_increments(dataset).rejected + 5 + 1 + 2
+
+
 def test_the_hint_fuses_by_information():
     """One interval: C = (C_o^-1 + C_m^-1)^-1 and Delta = C (C_o^-1 Delta_o + C_m^-1 Delta_m)."""
     dataset, _ = simulate("short", seed=6)

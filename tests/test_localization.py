@@ -155,6 +155,37 @@ def test_two_common_markers_relocalize_without_confirmation():
     assert found.parent[back][0] in (0, 1) and np.isnan(found.poses[2:-1]).all()
 
 
+def seen_in(*frames):
+    """Exact ArucoReadings of a straight drive that sees these markers (numbers) in its frames."""
+    pose, marker = np.array([(10 * f, m) for f, markers in enumerate(frames) for m in markers]).T
+    in_world = np.column_stack([marker, -0.5 * marker, 0.7 * marker])
+    vehicle = np.column_stack([0.01 * pose, np.zeros((len(pose), 2))])
+    return ArucoReadings(pose, marker, se2.between(vehicle, in_world),
+                         np.tile(1e-4 * np.eye(3), (len(pose), 1, 1)))
+
+
+@pytest.mark.parametrize("frames, known", [
+    ([[1, 2], [1, 2], [3], [1]], [True, True, False, False]),
+    ([[1, 2], [1, 2], [3], [1], [1]], 2 * [True] + [False] + 2 * [True]),
+    ([[1, 2], [2], [3], [1], [1]], 2 * [True] + 3 * [False]),
+    ([[1, 2], [2], [3], [1, 2]], 2 * [True] + [False, True])])
+def test_one_marker_relocalizes_only_if_adjacent_frames_confirm_both_sightings(frames, known):
+    found = localize(seen_in(*frames))
+    np.testing.assert_array_equal(np.isfinite(found.poses[:, 0]), known)
+    np.testing.assert_allclose(found.poses[known, 0], 0.1 * np.flatnonzero(known), atol=1e-12)
+
+
+def test_the_map_has_markers_that_are_confirmed_and_seen_from_known_poses():
+    """Marker 5 is seen once; 3 and 4 twice, but from poses that nothing connects to the world."""
+    readings = seen_in([1, 2], [1, 2, 5], [3, 4], [3, 4], [1, 2])
+    found = localize(readings)
+    np.testing.assert_array_equal(np.isfinite(found.poses[:, 0]), [True, True, False, False, True])
+    np.testing.assert_array_equal(found.marker, [1, 2])
+    np.testing.assert_allclose(found.marker_in_world[:, :2], [[1, -0.5], [2, -1]], atol=1e-12)
+    np.testing.assert_array_equal(readings.marker[found.unused], [5, 1, 2])
+    assert not found.rejected.any()
+
+
 def test_a_single_frame_and_markers_without_heading():
     dataset, truth = simulate("short", seed=2)
     first = localize(only(dataset.aruco, dataset.aruco.pose == 0))

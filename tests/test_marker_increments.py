@@ -9,6 +9,8 @@ from slamlib import se2
 from slamlib.dataset import ArucoReadings
 from slamlib.evaluation import nees, nees_band
 from slamlib.localization.marker_increments import (
+    _inverse_where_regular,
+    _single_increments,
     common_sightings,
     consecutive_increments,
     robust_increments,
@@ -87,6 +89,31 @@ def test_derivatives_by_the_sightings_against_central_differences():
         for k, analytic in ((first[p], found.by_first[p]), (second[p], found.by_second[p])):
             numeric = central_differences(partial(moved, k), np.zeros(3), 1e-5)
             np.testing.assert_allclose(analytic, numeric, atol=0.03 * np.abs(numeric).max())
+
+
+def test_the_increment_from_one_marker_has_the_covariance_of_both_its_sightings():
+    """Z Z'^-1 moves by its numerical derivatives; both covariances have correlations."""
+    z1, z2 = MARKERS[0], se2.between(DELTA, MARKERS[0])
+    C2 = 3 * C[::-1, ::-1]
+    (increment,), (covariance,) = _single_increments(z1[None], C[None], z2[None], C2[None])
+    np.testing.assert_allclose(increment, DELTA, atol=1e-12)
+    by_first = central_differences(lambda z: se2.compose(z, se2.inverse(z2)), z1)
+    by_second = central_differences(lambda z: se2.compose(z1, se2.inverse(z)), z2)
+    expected = by_first @ C @ by_first.T + by_second @ C2 @ by_second.T
+    np.testing.assert_allclose(covariance, expected, rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize("units", [[1, 1, 1], [1e6, 1e6, 1e-3], [1e-9, 1e3, 1]])
+def test_whether_an_information_is_singular_does_not_depend_on_the_units(units):
+    """In other units of x, y and heading, H becomes D H D with a diagonal D."""
+    D = np.diag(units)
+    regular = D @ np.linalg.inv(C) @ D
+    one_point = np.array([[1.0, 0, 0.4], [0, 1, 1.2]])             # the heading moves it, too
+    singular = D @ one_point.T @ one_point @ D
+    found = _inverse_where_regular(np.array([
+        regular, singular, np.full((3, 3), np.nan), np.zeros((3, 3))]))
+    np.testing.assert_allclose(D @ found[0] @ D, C, rtol=1e-9)
+    assert np.isnan(found[1:]).all()
 
 
 def test_many_increments_are_consistent():
