@@ -26,7 +26,7 @@ from slamlib.slam.first_frames import first_frames
 from slamlib.slam.initialization import odometry_state, state_from_poses
 from slamlib.slam.measurement_factors import MeasurementFactors
 from slamlib.slam.measurements import measure
-from slamlib.slam.noise import Noise
+from slamlib.slam.noise import BOUNDS, Noise
 from slamlib.slam.normal_equations import NormalEquations
 from slamlib.slam.optimizer import optimize
 from slamlib.slam.problem import build
@@ -127,6 +127,88 @@ def test_noise_of_a_sensor_that_starts_late_is_learned(monkeypatch):
     found = slam.estimate(dataset)
     assert np.isclose(found.noise.sightings, whole.noise.sightings, rtol=1e-3)
     assert 5 < found.noise.sightings < 7 and found.rejected.mean() < 0.02
+
+
+PRECISION = np.array([[40.0, 12.0, 0.0], [12.0, 90.0, -20.0], [0.0, -20.0, 60.0]])
+CENTRE = np.log([2e-3, 1.3, 0.8])
+
+
+def gaussian(x):
+    """A log density of the three logarithms, with its maximum 7 at CENTRE."""
+    return 7.0 - (x - CENTRE) @ PRECISION @ (x - CENTRE) / 2
+
+
+@pytest.mark.parametrize("free", [[0, 1, 2], [0, 2], [0]])
+def test_differences_of_a_quadratic_are_exact(free):
+    """Also where only some components are free, and where the correlation is known."""
+    free, x = np.array(free), CENTRE + [0.1, -0.2, 0.15]
+    steps = np.array([0.2, 0.1, 0.05])[free]
+    expected = -PRECISION[np.ix_(free, free)]
+    scale = np.sqrt(-np.diag(expected))
+    for correlation in (None, -expected / np.outer(scale, scale)):
+        gradient, hessian = noise_posterior._differences(
+            gaussian, x, gaussian(x), free, steps, correlation)
+        np.testing.assert_allclose(gradient, -(PRECISION @ (x - CENTRE))[free], rtol=1e-9)
+        np.testing.assert_allclose(hessian, expected, rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.parametrize("free", [[0, 1, 2], [0, 1]])
+@pytest.mark.parametrize("start", [[0.1, 0.0, 0.1], [2.5, -2.0, 1.5]])
+def test_newtons_method_finds_mode_and_covariance_of_a_gaussian(free, start):
+    """What is not free keeps its start, and its covariance is zero."""
+    free, x = np.array(free), CENTRE + start
+    given = np.setdiff1d(range(3), free)
+    mode, value, covariance = noise_posterior._mode(
+        gaussian, x, gaussian(x), free, np.full(len(free), 0.1))
+    H, cross = PRECISION[np.ix_(free, free)], PRECISION[np.ix_(free, given)]
+    expected = CENTRE[free] - np.linalg.solve(H, cross @ (x - CENTRE)[given])
+    np.testing.assert_allclose(mode[free], expected, atol=1e-6)
+    np.testing.assert_array_equal(mode[given], x[given])
+    assert np.isclose(value, gaussian(mode)) and value > gaussian(x)
+    np.testing.assert_allclose(covariance[np.ix_(free, free)], np.linalg.inv(H), rtol=1e-6)
+    assert not covariance[given].any() and not covariance[:, given].any()
+
+
+def test_newtons_method_stays_within_the_bounds_and_never_descends():
+    """A mode beyond the bound of the slip, and a density that is not concave at the start."""
+    beyond = CENTRE.copy()
+    beyond[0] = BOUNDS[1, 0] + 1.0
+    mode, *_ = noise_posterior._mode(
+        lambda x: -50 * np.sum((x - beyond)**2), CENTRE, -1e3, np.arange(3), np.full(3, 0.1))
+    np.testing.assert_allclose(mode, [BOUNDS[1, 0], *beyond[1:]], atol=1e-6)
+
+    def two_hills(x):
+        off = x[0] - CENTRE[0]
+        return float(np.logaddexp(-8 * (off - 1)**2, 1 - 8 * (off + 1)**2))
+
+    mode, value, _ = noise_posterior._mode(two_hills, CENTRE + [0.05, 0, 0],
+                                           two_hills(CENTRE + [0.05, 0, 0]), np.array([0]),
+                                           np.array([0.1]))
+    assert value >= two_hills(CENTRE + [0.05, 0, 0])
+    assert abs(abs(mode[0] - CENTRE[0]) - 1) < 0.05
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.01])
+def test_points_of_the_posterior_have_its_moments(scale):
+    """Along the slip by points, across by a wider noise: log-normal root mean squares.
+
+    A narrow posterior is one point.
+    """
+    C = scale * np.array([[0.25, 0.06, 0.0], [0.06, 0.04, 0.01], [0.0, 0.01, 0.09]])
+    information = np.linalg.inv(C)
+    points = noise_posterior._points(
+        lambda x: -(x - CENTRE) @ information @ (x - CENTRE) / 2, CENTRE, 0.0, C)
+    weights, noises = zip(*points)
+    assert len(points) == (5 if scale == 1 else 1) and np.isclose(sum(weights), 1)
+    logs = np.array([noise.logarithms for noise in noises])
+    if scale < 1:
+        np.testing.assert_allclose(logs[0], CENTRE + np.diag(C), rtol=1e-12)
+        return
+    rest = np.diag(C) - C[0]**2 / C[0, 0]                       # given the slip
+    np.testing.assert_allclose(weights @ logs, CENTRE + rest, atol=1e-6)
+    spread = logs - CENTRE - rest
+    np.testing.assert_allclose(np.einsum("p,pi,pj->ij", weights, spread, spread),
+                               np.outer(C[0], C[0]) / C[0, 0], rtol=0.02, atol=1e-12)
 
 
 def test_gates_are_quantiles_of_chi_squared():
