@@ -129,6 +129,14 @@ def test_a_camera_that_is_not_in_the_origin_is_named(place):
     assert "camera-offset" in names(found.drive_doubts)
 
 
+def test_without_sightings_nothing_is_known_of_the_camera():
+    found = slam.estimate(simulate("short", 61)[0].first(300).without("aruco"), 1e-3, "arc")
+    for error, count in ((found.camera.time, 1), (found.camera.place, 3)):
+        np.testing.assert_array_equal(error.estimate, np.zeros(count))
+        np.testing.assert_array_equal(error.sigma, np.full(count, np.inf))
+        assert error.gain == 0
+
+
 @pytest.mark.slow
 def test_sightings_that_are_late_are_named_on_the_long_path():
     for seed in (61, 62, 63):
