@@ -10,6 +10,7 @@ from slamlib.dataset import ArucoReadings
 from slamlib.evaluation import nees, nees_band
 from slamlib.localization.marker_increments import (
     _inverse_where_regular,
+    _similar,
     _single_increments,
     common_sightings,
     consecutive_increments,
@@ -189,6 +190,19 @@ def test_an_implausible_speed_makes_an_increment_unusable():
     np.testing.assert_array_equal(found.accepted, found.pair < 4)
     alone = robust_increments(z, covariances, *common_sightings(row, marker), 5)
     assert alone.usable.all()                               # the test of the speed rejected it
+
+
+@pytest.mark.parametrize("a, b, similar", [
+    ((0.06, 0.08, 0.01), (0.06, 0.02, 0.01), False), ((0.06, 0.08, 0.01), (0.06, 0.04, 0.01), True),
+    ((0.0, 0.0, 0.1), (0.0, 0.0, 0.06), True), ((0.0, 0.0, 0.1), (0.0, 0.0, 0.04), False),
+    ((0.1, 0.0, -0.1), (0.1, 0.0, 0.1), False), ((0.1, 0.0, 1.8e-3), (0.1, 0.0, 0.0), True),
+    ((0.1, 0.0, 2.2e-3), (0.1, 0.0, 0.0), False)])
+def test_velocities_are_similar_if_they_differ_by_less_than_half_the_larger(a, b, similar):
+    """In speed and in turn; turns also if they differ by less than 1 mrad more than that."""
+    a, b = 1.001 * np.array([a]), np.array([b])
+    still = np.zeros((1, 3)) + [1e-3, 0, 0]          # so that the speeds of turns on the spot agree
+    for one, other in ((a, b), (b, a)):
+        assert _similar(one + still, other + still)[0] == similar
 
 
 def test_common_sightings_by_hand():

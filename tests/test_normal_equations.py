@@ -24,7 +24,7 @@ from slamlib.slam.estimate import fit_from_odometry
 from slamlib.slam.evidence import solve
 from slamlib.slam.first_frames import first_frames
 from slamlib.slam.initialization import odometry_state, state_from_poses
-from slamlib.slam.measurement_factors import MeasurementFactors
+from slamlib.slam.measurement_factors import WEAK_SIGMA, MeasurementFactors
 from slamlib.slam.measurements import measure
 from slamlib.slam.noise import BOUNDS, Noise
 from slamlib.slam.normal_equations import NormalEquations
@@ -63,6 +63,32 @@ def test_gtsam_has_the_same_error_and_takes_the_same_step():
     step = gtsam_graph.gtsam_step(problem, state)
     np.testing.assert_allclose(NormalEquations(problem, state).step(), step, rtol=1e-5,
                                atol=1e-6 * np.abs(step).max())
+
+
+def test_markers_without_accepted_sightings_have_a_weak_prior_and_move_nothing_else():
+    """Two markers with a heading, of consecutive ids, and a point; GTSAM takes the same step."""
+    dataset, _ = simulate("short", seed=4)
+    C = dataset.aruco.covariance.copy()
+    points = dataset.aruco.marker == dataset.aruco.marker[0]
+    C[points, 2] = C[points, :, 2] = [0, 0, 4.0]
+    m = measure(replace(dataset, aruco=replace(dataset.aruco, covariance=C)).first(500))
+    point, = np.flatnonzero(~m.oriented)
+    first = next(j for j in range(len(m.marker) - 1) if m.oriented[j:j + 2].all())
+    left = [point, first, first + 1]
+    weight = np.r_[~np.isin(m.label, left), np.ones(len(m.ranges.row), bool)].astype(float)
+    problem = replace(build(m, "arc", Noise()), measured=MeasurementFactors(m, weight))
+    np.testing.assert_array_equal(problem.measured.unsupported, sorted(left))
+    state = odometry_state(m, "arc")
+    equations = NormalEquations(problem, state)
+    H, rows = equations.structure.matrix(equations.sums(Noise())[0]).toarray(), []
+    for j in left:
+        own = equations.structure.rows([len(m.frame) + j], 2 + m.oriented[j])[0]
+        np.testing.assert_allclose(H[np.ix_(own, own)], np.eye(len(own)) / WEAK_SIGMA**2)
+        assert np.count_nonzero(H[own]) == len(own)
+        rows.extend(own)
+    others = np.setdiff1d(np.arange(len(H)), rows)
+    step, expected = equations.step()[others], gtsam_graph.gtsam_step(problem, state)[others]
+    np.testing.assert_allclose(step, expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("poses", [1, 15, 400])

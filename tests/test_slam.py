@@ -105,6 +105,15 @@ def test_rounding_noise_does_not_depend_on_the_number_of_factors():
         np.testing.assert_allclose([noise[0, 0] - floor, noise[2, 2]], [along, turned], rtol=1e-6)
 
 
+def test_a_vehicle_that_stands_has_the_smallest_noise_along_both_axes():
+    frame = np.array([0, 10, 20])
+    rounding, slipping = odometry_factors.odometry_noise(
+        np.zeros((21, 2)), Vehicle(ticks_per_revolution=1e12), frame[:-1], frame[1:])
+    smallest = np.diag([odometry_factors.MINIMUM_SIGMA**2] * 2 + [0.0])
+    np.testing.assert_allclose(rounding, [smallest, smallest], rtol=1e-9, atol=1e-20)
+    np.testing.assert_array_equal(slipping, 0)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("slip", [0.0, 1e-4, 1e-3, 1e-2])
 def test_a_slip_that_is_not_known_widens_the_covariance(slip):
