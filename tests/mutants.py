@@ -25,11 +25,14 @@ import time
 from collections import Counter
 from pathlib import Path
 
-for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):       # threads do not survive a fork
-    os.environ[name] = "1"
+for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "PYTEST_DISABLE_PLUGIN_AUTOLOAD"):
+    os.environ[name] = "1"                                     # threads do not survive a fork
 import gtsam  # noqa: E402, F401, I001  imported once, before every mutant's own process
+import joblib  # noqa: E402, F401
 import pytest  # noqa: E402
+import scipy.io  # noqa: E402, F401
 import scipy.sparse.linalg  # noqa: E402, F401
+import scipy.stats  # noqa: E402, F401
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("localization", "slam")

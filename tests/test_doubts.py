@@ -308,16 +308,17 @@ def test_motion_is_what_is_above_five_sigmas(increment, moves):
 
 @pytest.mark.parametrize("wrong, doubted", [(8, False), (12, True)])
 def test_odometry_is_doubted_if_most_increments_disagree(wrong, doubted):
-    """Of twenty; an increment of 20 cm disagrees by 10 cm, ten sigmas."""
+    """Of twenty; an increment of 20 cm and 0.1 rad disagrees by half of it, ten sigmas."""
     wheels = moved_by(0.2, 0.1)
     markers = wheels.copy()
-    markers[:wrong, 0] += 0.1
+    markers[:wrong] *= 1.5
     C = np.tile(5e-5 * np.eye(3), (20, 1, 1))
     doubts = _odometry_doubts(_Compared(markers, wheels, C, C, 1.0))
     assert len(doubts) == doubted
     if doubted:
         assert "at 60% of 20 places" in doubts[0].sentence
-        assert "the wheels 0.2 m and 0.1 rad" in doubts[0].sentence
+        assert "by the markers it moves by 0.3 m and turns by 0.15 rad, by the wheels 0.2 m and " \
+            "0.1 rad (medians)" in doubts[0].sentence
 
 
 @pytest.mark.parametrize("signs, contradict", [

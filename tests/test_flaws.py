@@ -308,9 +308,9 @@ def test_of_explanations_that_exclude_each_other_the_likeliest_are_named():
 
 
 def test_wheels_that_are_far_off_are_given_in_millimetres_and_standard_deviations():
-    wheel = np.array([0.1005, 0.0997, 0.4006])                       # 5, 3 and 6 sigmas
+    wheel = np.array([0.1005, 0.0997, 0.3994])                      # 5, -3 and -6 sigmas
     doubt, = drive_doubts.geometry_doubts(Vehicle(), solved(wheel=wheel))
-    assert "right_radius is 100.5 mm (stated: 100.0 ± 0.1 mm) and wheelbase is 400.6 mm" \
+    assert "right_radius is 100.5 mm (stated: 100.0 ± 0.1 mm) and wheelbase is 399.4 mm" \
         in doubt.sentence and "left_radius" not in doubt.sentence
     assert "up to 6 standard deviations" in doubt.sentence
     assert not drive_doubts.geometry_doubts(Vehicle(), solved(wheel=Vehicle().wheel - 3e-4))

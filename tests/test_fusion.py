@@ -207,6 +207,23 @@ def test_the_hint_fuses_by_information():
     np.testing.assert_allclose(fused.covariances[10:], expected_covariances, atol=1e-15)
 
 
+@pytest.mark.parametrize("propagation, whole", [
+    (hint.equation2_from, odometry.equation2), (hint.first_order_from, odometry.first_order)])
+def test_where_markers_give_no_increment_the_hint_restarts_odometry(propagation, whole):
+    """Three frames without common markers: the covariance is restarted at every frame."""
+    dataset, _ = simulate("short", seed=7)
+    frames = [0, 400, 800, 1200]
+    dataset = only(dataset, np.isin(dataset.aruco.pose, frames))
+    found = fuse_increments(dataset, propagation)
+    np.testing.assert_array_equal(found.measured, frames)
+    pose, covariance = np.zeros(3), np.diag([0.0, 0.0, dataset.vehicle.sigma_heading**2])
+    for begin, end in zip(frames, [*frames[1:], len(dataset.ticks) - 1]):
+        poses, covariances = whole(dataset.ticks[begin:end + 1], dataset.vehicle, pose, covariance)
+        np.testing.assert_allclose(found.poses[begin:end], poses[:-1], atol=1e-9)
+        np.testing.assert_allclose(found.covariances[begin:end], covariances[:-1], atol=1e-9)
+        pose, covariance = poses[-1], covariances[-1]
+
+
 def test_sparse_and_late_markers_leave_odometry_between():
     dataset, truth = simulate("short", seed=7)
     dataset = only(dataset, dataset.aruco.pose >= 800)

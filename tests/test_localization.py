@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numeric import central_differences
 
 from slamlib import se2, studies
 from slamlib.dataset import ArucoReadings
@@ -43,6 +44,35 @@ def test_two_increments_by_hand():
     np.testing.assert_allclose(found.covariances[:, 0, 0] / s**2, [0, 2, 2], atol=1e-9)
     np.testing.assert_allclose(naive.covariances[:, 0, 0] / s**2, [0, 2, 4], atol=1e-9)
     np.testing.assert_allclose(found.marker_covariance[0, 0, 0] / s**2, 1, atol=1e-9)
+
+
+def test_covariances_are_those_of_all_sightings_through_numerical_derivatives():
+    """Four frames with three markers on a winding path: C = sum over the sightings of D C_s D^T.
+
+    D are derivatives of poses and markers by each sighting, whose covariances are not diagonal.
+    """
+    rng = np.random.default_rng(0)
+    poses = np.array([[0, 0, 0], [0.3, 0.1, 0.9], [0.4, 0.5, 2.0], [0.1, 0.6, 3.3]])
+    markers = np.array([[2.0, 1.0, 0.5], [-1.0, 2.0, -2.0], [1.0, -1.5, 3.0]])
+    frame, marker = np.repeat(np.arange(4), 3), np.tile(np.arange(3), 4)
+    root = 0.01 * rng.normal(size=(12, 3, 3))
+    readings = ArucoReadings(10 * frame, marker, se2.between(poses[frame], markers[marker]),
+                             root @ np.swapaxes(root, 1, 2) + 1e-5 * np.eye(3))
+    found = localize(readings)
+    expected_poses, expected_map = np.zeros((4, 3, 3)), np.zeros((3, 3, 3))
+    for k in range(12):
+        def moved(change, k=k):
+            z = readings.marker_in_vehicle.copy()
+            z[k] += change
+            again = localize(replace(readings, marker_in_vehicle=z))
+            return np.concatenate([again.poses, again.marker_in_world])
+        D = central_differences(moved, np.zeros(3), 1e-5)
+        C = D @ readings.covariance[k] @ np.swapaxes(D, 1, 2)
+        expected_poses += C[:4]
+        expected_map += C[4:]
+    scale = np.abs(expected_poses).max()
+    np.testing.assert_allclose(found.covariances, expected_poses, atol=1e-5 * scale)
+    np.testing.assert_allclose(found.marker_covariance, expected_map, atol=1e-5 * scale)
 
 
 def test_world_frame_is_the_first_measured_pose():

@@ -186,24 +186,47 @@ def test_the_learned_noise_has_the_greatest_posterior(poses, slip):
 
 
 def test_averages_over_the_noise_are_moments_of_a_mixture():
-    """Mean and covariance over the points, by hand for one pair of frames and one marker."""
-    dataset, _ = simulate("short", seed=5, slip=0.0)
-    fit = fit_from_odometry(measure(dataset.without("uwb").first(600)))
+    """Mean and covariance over the points, by hand, of variables of every kind.
+
+    One marker is a point, and the ranges calibrate themselves.
+    """
+    dataset = simulate("short", seed=5, slip=0.0)[0].first(600)
+    C = dataset.aruco.covariance.copy()
+    point = dataset.aruco.marker == dataset.aruco.marker[0]
+    C[point, 2] = C[point, :, 2] = [0, 0, 1e4]
+    dataset = replace(dataset, aruco=replace(dataset.aruco, covariance=C))
+    fit = fit_from_odometry(measure(dataset).calibrating())
     weights, noises = zip(*fit.posterior.points)
     assert len(weights) > 2 and np.isclose(sum(weights), 1, atol=1e-2)
-    equations = NormalEquations(fit.problem, fit.state)
+    equations, m = NormalEquations(fit.problem, fit.state), fit.problem.measurements
     origin = solve(equations, fit.problem.noise)[0]
     x = np.stack([solve(equations, noise)[0] - origin for noise in noises])
     weights = np.array(weights) / sum(weights)
     state, mixed, slip = moments(fit)
-    frame = 20
-    rows = equations.structure.rows([frame], 3)[0]
-    mean = weights @ x[:, rows]
-    each = [covariances(equations, noise).pairs[frame, :3, :3] for noise in noises]
-    expected = sum(p * (C + np.outer(d, d)) for p, C, d in zip(weights, each, x[:, rows] - mean))
-    np.testing.assert_allclose(mixed.pairs[frame, :3, :3], expected, rtol=1e-9, atol=1e-15)
-    np.testing.assert_allclose(state.poses[frame], se2.compose(fit.state.poses[frame], mean),
-                               atol=1e-12)
+    each = [covariances(equations, noise) for noise in noises]
+    point, oriented = np.flatnonzero(~m.oriented)[0], np.flatnonzero(m.oriented)[0]
+    variable = len(m.frame) + len(m.marker)
+    for number, width, block in (
+            (20, 3, lambda c: c.pairs[20][:3, :3]), (21, 3, lambda c: c.pairs[20][3:6, 3:6]),
+            (len(m.frame) + point, 2, lambda c: c.markers[point]),
+            (len(m.frame) + oriented, 3, lambda c: c.markers[oriented]),
+            (variable + 1, 2, lambda c: c.antennas[1]), (m.wheels, 3, lambda c: c.w),
+            (m.wheels, 3, lambda c: c.pairs[20][6:, 6:]), (m.wheels + 1, 2, lambda c: c.z)):
+        rows = equations.structure.rows([number], width)[0]
+        off = x[:, rows] - weights @ x[:, rows]
+        expected = sum(p * (block(c) + np.outer(d, d)) for p, c, d in zip(weights, each, off))
+        np.testing.assert_allclose(block(mixed), expected, rtol=1e-9, atol=1e-15)
+    for moved, before, number, width in (
+            (state.antennas[1], fit.state.antennas[1], variable + 1, 2),
+            (state.w, fit.state.w, m.wheels, 3), (state.z, fit.state.z, m.wheels + 1, 2),
+            (state.markers[point, :2], fit.state.markers[point, :2], len(m.frame) + point, 2)):
+        mean = weights @ x[:, equations.structure.rows([number], width)[0]]
+        np.testing.assert_allclose(moved, before + mean, atol=1e-12)
+    for moved, before, number in (
+            (state.poses[20], fit.state.poses[20], 20),
+            (state.markers[oriented], fit.state.markers[oriented], len(m.frame) + oriented)):
+        mean = weights @ x[:, equations.structure.rows([number], 3)[0]]
+        np.testing.assert_allclose(moved, se2.compose(before, mean), atol=1e-12)
     assert np.isclose(slip**2, sum(p * noise.slip**2 for p, noise in zip(weights, noises)))
 
 

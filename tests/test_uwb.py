@@ -11,10 +11,10 @@ from numeric import central_differences, decided
 from scipy.integrate import quad
 
 from slamlib import slam, studies
-from slamlib.dataset import AntennaGuess, Dataset, UwbReadings, Vehicle
+from slamlib.dataset import AntennaGuess, ArucoReadings, Dataset, UwbReadings, Vehicle
 from slamlib.evaluation import align, ate, nees_band
 from slamlib.odometry import dead_reckoning
-from slamlib.se2 import compose
+from slamlib.se2 import between, compose
 from slamlib.simulation import manoeuvre, simulate
 from slamlib.slam import doubts, errors
 from slamlib.slam.doubts import MAX_LOG_ODDS
@@ -29,6 +29,7 @@ from slamlib.slam.normal_equations import NormalEquations
 from slamlib.slam.optimizer import optimize
 from slamlib.slam.problem import build
 from slamlib.slam.range_calibration import calibrated
+from slamlib.slam.result import chi2_per_dof
 from slamlib.slam.robust import LATE_KERNEL
 from slamlib.slam.state import state_from_arrays
 from slamlib.slam.trilateration import (
@@ -121,6 +122,33 @@ def test_an_error_of_one_sigma_costs_one_half():
     assert NormalEquations(build(m, "arc", Noise()), state).error < 1e-12
     cost = NormalEquations(build(off, "arc", Noise()), state).error
     assert np.isclose(cost, len(off.ranges.row) / 2)
+
+
+def test_chi_squared_over_its_degrees_of_freedom_by_hand():
+    """Each of r ranges is off by one sigma, and the antenna takes two: r / (r - 2).
+
+    Of the weighted ones it is r/4 / (r/4 - 2). Then three markers are seen once each, which take
+    what their sightings give; one, a point, is seen twice more, off by one sigma along x.
+    """
+    place = np.array([3.0, 4.0])
+    dataset, poses = drive([(2.0, 1.0)], place, place)
+    off = replace(dataset.uwb, range=dataset.uwb.range + dataset.uwb.sigma)
+    at, r = off.pose[[0, 3, 5, 8, 9]], len(off.pose)
+    marker = np.array([1, 2, 3, 3, 3])
+    in_world = np.array([[1.0, 1, 0.5], [2, 0, 1], [1, -1, 0], [1, -1, 0], [1, -1, 0]])
+    z = between(poses[at], in_world)
+    C = np.tile(np.diag([4e-4, 1e-4, 1e-4]), (5, 1, 1))
+    C[2:, 2, 2] = 1e4
+    z[3:, 0] += 0.02
+    for aruco, chi2, freedom in ((None, 0, 0), (ArucoReadings(at, marker, z, C), 2, 2 * 2)):
+        m = measure(replace(dataset, uwb=off, aruco=aruco))
+        problem = build(m, "arc", Noise(sightings=5.0, ranges=7.0))       # which do not count
+        state = state_from_arrays(m, poses[m.frame], np.array([*in_world[:3]])[:len(m.marker)],
+                                  place[None], np.zeros(3))
+        share = np.r_[np.ones(len(m.label)), np.full(r, 0.25)]
+        for weight, ranges in ((m.unit_weights, r), (share, r / 4)):
+            assert np.isclose(chi2_per_dof(problem, state, weight),
+                              (ranges + chi2) / (ranges - 2 + freedom), rtol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["asymmetric Cauchy", "asymmetric Tukey"])
@@ -337,6 +365,18 @@ def test_trilateration_finds_both_mirror_places():
     places, costs = trilaterate(line_of_ranges(30))
     np.testing.assert_allclose(places[:2], [[3, 4], [3, -4]], atol=1e-3)
     assert costs[0] == 0 and 0 < costs[1] < MAX_LOG_ODDS
+
+
+def test_places_within_a_fifth_of_the_distance_are_one():
+    """A path of one metre and its antenna 20 m ahead, to one side; its mirror image is as far."""
+    path = np.column_stack([np.linspace(0, 1, 30), np.zeros(30)])
+    place = np.array([20.0, 1.0])
+    ranges = AntennaRanges(path, np.hypot(*(path - place).T), np.full(30, 1e-4), place)
+    places, costs = trilaterate(ranges)
+    np.testing.assert_allclose(places[0], place, atol=0.1)
+    assert (costs[1:] > 3).all()                          # the mirror image is 2 m away, the same
+    apart = np.hypot(*(places[:, None] - places).reshape(-1, 2).T)
+    assert ((apart == 0) | (apart > 0.2 * 19.5)).all()
 
 
 def test_second_moment_is_the_sum_over_the_places_of_the_grid():
