@@ -3,14 +3,25 @@
 import re
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from numeric import central_differences
+from scipy.linalg import block_diag
 
-from slamlib import slam
+from slamlib import increments, se2, slam
 from slamlib.dataset import AntennaGuess, Dataset, UwbReadings, Vehicle
 from slamlib.localization import drive_doubts, units
-from slamlib.localization.doubts import _Compared, _headings_contradict, _moves, _odometry_doubts
+from slamlib.localization.doubts import (
+    GENEROUS_SLIP,
+    GENEROUS_WHEEL,
+    _compare,
+    _Compared,
+    _headings_contradict,
+    _moves,
+    _odometry_doubts,
+)
 from slamlib.localization.marker_increments import consecutive_increments
 from slamlib.sightings import sightings_by_frame
 from slamlib.simulation import manoeuvre, simulate
@@ -295,6 +306,39 @@ def test_increments_are_compared_in_exchanged_axes_by_both_covariances():
     np.testing.assert_allclose(compared.sigma(), np.sqrt([5e-4, 1e-3]))
     assert np.isclose(compared.cost(np.array([1e-9])), 0.25 * 1e-9 / 2)     # as a quadratic loss
     assert compared.cost(np.array([1e4])) < 0.25 * 60                       # but bounded by a log
+
+
+def test_increments_are_compared_over_a_metre():
+    """Frames every 26 cm: increments over four of them.
+
+    Those by markers are composed, with their covariances; where one is not usable, no span has it.
+    """
+    ticks = np.rint(manoeuvre([(0.26 * 60, 9.0)], step=0.026))
+    drive, rng = Dataset("metre", Vehicle(), ticks, None, None, None), np.random.default_rng(0)
+    frame = np.arange(0, len(ticks), 10)
+    step = increments.between_poses(ticks, Vehicle(), frame[:-1], frame[1:], "arc")[0]
+    step += rng.normal(0, 0.01, step.shape)
+    root = 0.01 * rng.normal(size=(len(step), 3, 3))
+    C, usable = root @ np.swapaxes(root, 1, 2), np.ones(len(step), bool)
+    usable[20] = False
+    compared = _compare(drive, SimpleNamespace(frame=frame), SimpleNamespace(
+        increment=step, covariance=C, usable=usable))
+    begin = np.setdiff1d(np.arange(len(step) - 3), [17, 18, 19, 20])
+    assert compared.weight == 1 / 4 and len(compared.by_markers) == len(begin)
+    wheels, by_w = increments.between_poses(ticks, Vehicle(), frame[begin], frame[begin + 4], "arc")
+    np.testing.assert_allclose(compared.by_wheels, wheels)
+    by_w = by_w * (GENEROUS_WHEEL * Vehicle().wheel)
+    np.testing.assert_allclose(
+        compared.covariance_wheels, by_w @ np.swapaxes(by_w, 1, 2) + increments.noise(
+            ticks, Vehicle(), frame[begin], frame[begin + 4], GENEROUS_SLIP), rtol=1e-9, atol=1e-15)
+    for n in (0, 16, 17, 40):
+        def composed(change, at=begin[n]):
+            a, b, c, d = step[at:at + 4] + change.reshape(4, 3)
+            return se2.compose(se2.compose(se2.compose(a, b), c), d)
+        D = central_differences(composed, np.zeros(12))
+        expected = D @ block_diag(*C[begin[n]:begin[n] + 4]) @ D.T
+        np.testing.assert_allclose(compared.by_markers[n], composed(np.zeros(12)))
+        np.testing.assert_allclose(compared.covariance_markers[n], expected, rtol=1e-6, atol=1e-12)
 
 
 @pytest.mark.parametrize("increment, moves", [

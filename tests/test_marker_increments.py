@@ -9,6 +9,7 @@ from slamlib import se2
 from slamlib.dataset import ArucoReadings
 from slamlib.evaluation import nees, nees_band
 from slamlib.localization.marker_increments import (
+    _increment_of_two_points,
     _inverse_where_regular,
     _similar,
     _single_increments,
@@ -52,6 +53,9 @@ def test_the_consensus_of_many_sightings_takes_a_few_of_each_marker():
     label = np.searchsorted([5, 7, 10**14], marker)
     few = few_of_each(label, 100)
     assert np.bincount(label[few]).tolist() == [100, 100, 100]
+    for k in range(3):
+        rows = np.searchsorted(np.flatnonzero(label == k), few[label[few] == k])
+        assert rows[0] == 0 and np.ptp(np.diff(rows)) <= 1
     assert few_of_each(label, 2000).tolist() == list(range(3000))
 
 
@@ -90,6 +94,18 @@ def test_derivatives_by_the_sightings_against_central_differences():
         for k, analytic in ((first[p], found.by_first[p]), (second[p], found.by_second[p])):
             numeric = central_differences(partial(moved, k), np.zeros(3), 1e-5)
             np.testing.assert_allclose(analytic, numeric, atol=0.03 * np.abs(numeric).max())
+
+
+def test_the_increment_from_two_points_moves_the_one_pair_onto_the_other():
+    for delta in (DELTA, np.array([2.0, -1.0, 2.5]), np.array([-0.4, 3.0, -3.1])):
+        p1, q1 = MARKERS[:2, None, :2]
+        p2, q2 = se2.between(delta, MARKERS[:2])[:, None, :2]
+        found, = _increment_of_two_points(p1, q1, p2, q2)
+        np.testing.assert_allclose(found[:2], delta[:2], atol=1e-12)
+        np.testing.assert_allclose(se2.wrap(found[2] - delta[2]), 0, atol=1e-12)
+        # Of points whose distances differ the midpoints and directions agree.
+        found, = _increment_of_two_points(p1, q1, p2 + 0.1 * (p2 - q2), q2 - 0.1 * (p2 - q2))
+        np.testing.assert_allclose(found[:2], delta[:2], atol=1e-12)
 
 
 def test_the_increment_from_one_marker_has_the_covariance_of_both_its_sightings():
