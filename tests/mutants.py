@@ -131,6 +131,11 @@ def module_of(file, root):
     return module if module in MODULES or module.startswith(FOLDERS) else None
 
 
+def file_of(test):
+    """Name of the file of a test, "tests/test_x.py::test_y"."""
+    return test.partition("::")[0].rpartition("/")[2]
+
+
 class Watch:
     """A plugin of pytest: how long every test takes, and the functions that it enters.
 
@@ -168,7 +173,7 @@ class Watch:
     def pytest_sessionfinish(self):
         """Keep (seconds, name, functions), the fastest test first."""
         tests = sorted((self.seconds[name], name, self._functions(entered | self.by_fixtures[
-            name.partition("::")[0].rpartition("/")[2]])) for name, entered in self.entered.items())
+            file_of(name)])) for name, entered in self.entered.items())
         (Path(self.package) / "tests.pickle").write_bytes(pickle.dumps(tests))
 
 
@@ -186,7 +191,10 @@ class Only:
 
 
 def passes(package, files, seconds, plugin):
-    """True if the tests in these files pass in time, with the package in this folder."""
+    """True if the tests in these files pass in time, with the package in this folder.
+
+    In a process of its own, which has no memory of other mutants.
+    """
     pid = os.fork()
     if pid:
         return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
@@ -204,10 +212,10 @@ def passes(package, files, seconds, plugin):
 
 
 def all_places(only):
-    """Tuples of module, text, node and function of all places that `only` begins the name of.
+    """(module, text, node, function) for all places in modules whose names begin with `only`.
 
-    The function is that around the node as a tuple of its lines, where it is decorated with them;
-    it is None if others may have called it before, or if the node is outside of functions.
+    `function` is the first line of that around the node. It is None outside of functions, and in
+    those with decorators, which may be cached: then not all tests that need them enter them.
     """
     found = []
     for file in sorted((ROOT / "slamlib").rglob("*.py")):
@@ -252,13 +260,15 @@ def main():
         if not passes(package, FILES, 3600, Watch(package)):
             sys.exit("A test fails without a mutant.")
         tests = pickle.loads(Path(package, "tests.pickle").read_bytes())
+        if not passes(package, FILES, 3600, Only([name for _, name, _ in tests])):
+            sys.exit("A test fails without a mutant if the fastest tests run first.")
         for number, k in enumerate(drawn, 1):
             module, text, node, function = found[k]
             new = rng.choice(changes(node))
             names, seconds = tests_of(tests, module, function)
             file = f"slamlib/{module}.py"
             Path(package, file).write_text(mutated(text, node, new), encoding="utf-8")
-            files = {name.partition("::")[0].rpartition("/")[2] for name in names}
+            files = {*map(file_of, names)}
             if not names or passes(package, files, START + PATIENCE * seconds, Only(names)):
                 survivors[module] += 1
                 print(f"{number:4} {file}:{node.lineno}: {ast.unparse(node)}   ->   "

@@ -505,6 +505,7 @@ def test_a_longer_part_goes_on_from_the_last_solved_pose_with_its_wheels():
     kept = np.searchsorted(whole.frame, part.frame[:-1])
     np.testing.assert_allclose(found.poses[kept], solved.poses[:-1], atol=1e-12)
     np.testing.assert_array_equal(found.w, w)
+    np.testing.assert_array_equal(found.z, [0, 0])                # ranges that are not calibrated
     expected = odometry.dead_reckoning(
         dataset.ticks[499:], dataset.vehicle.with_deviation(w), solved.poses[last], "arc")
     later = whole.frame > 499
