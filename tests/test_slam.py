@@ -12,9 +12,10 @@ from slamlib import increments, odometry, se2, simulation, slam, studies
 from slamlib.dataset import AntennaGuess, ArucoReadings, Dataset, UwbReadings, Vehicle
 from slamlib.evaluation import anees, ate, nees_band
 from slamlib.simulation import simulate
-from slamlib.slam import gtsam_graph, odometry_factors
+from slamlib.slam import fit as fit_module
+from slamlib.slam import gtsam_graph, odometry_factors, robust
 from slamlib.slam.covariances import covariances
-from slamlib.slam.estimate import fit_from_odometry
+from slamlib.slam.estimate import fit_from_odometry, fit_from_previous
 from slamlib.slam.evidence import solve
 from slamlib.slam.fit import refine
 from slamlib.slam.initialization import GROWTH, extended, parts
@@ -553,6 +554,26 @@ def test_the_scatter_of_residuals_gives_factors_of_at_least_one():
     state = state_from_arrays(few, truth.poses[few.frame], truth.marker_in_world[
         np.searchsorted(truth.marker, few.marker)], truth.antenna_in_world, np.zeros(3))
     assert noise_of_scatter(few, state).ranges == 1 < noise_of_scatter(few, state).sightings
+
+
+def test_with_a_given_slip_the_covariances_are_those_of_the_files(monkeypatch):
+    """The scatter of the residuals is looked at only where the noise is learned."""
+    class LookedAtError(Exception):
+        pass
+
+    def look(*_):
+        raise LookedAtError
+
+    dataset = simulate("short", seed=4)[0].without("uwb").first(100)
+    before = slam.estimate(dataset, 1e-3, "arc")
+    for module in (robust, fit_module):
+        monkeypatch.setattr(module, "noise_of_scatter", look)
+        for solve_it in (fit_from_odometry, partial(fit_from_previous, previous=before)):
+            given = solve_it(measure(dataset), slip=2e-3)
+            assert given.problem.noise == Noise(2e-3) and given.posterior is None
+            with pytest.raises(LookedAtError):
+                solve_it(measure(dataset))
+        monkeypatch.undo()
 
 
 def test_gates_of_poses_points_and_ranges():

@@ -128,23 +128,23 @@ def test_chi_squared_over_its_degrees_of_freedom_by_hand():
     """Each of r ranges is off by one sigma, and the antenna takes two: r / (r - 2).
 
     Of the weighted ones it is r/4 / (r/4 - 2). Then three markers are seen once each, which take
-    what their sightings give; one, a point, is seen twice more, off by one sigma along x. Wheel
-    errors of one and two sigmas count, which move these poses by nanometres.
+    what their sightings give. One is seen once more, and one, a point, twice more, off by one sigma
+    along x: they add three and four degrees of freedom and a squared error of two.
+    Wheel errors of one and two sigmas add five; they move these poses by nanometres.
     """
     place = np.array([3.0, 4.0])
     dataset, poses = drive([(2.0, 1.0)], place, place)
     off = replace(dataset.uwb, range=dataset.uwb.range + dataset.uwb.sigma)
-    at, r = off.pose[[0, 3, 5, 8, 9]], len(off.pose)
-    marker = np.array([1, 2, 3, 3, 3])
-    in_world = np.array([[1.0, 1, 0.5], [2, 0, 1], [1, -1, 0], [1, -1, 0], [1, -1, 0]])
-    z = between(poses[at], in_world)
-    C = np.tile(np.diag([4e-4, 1e-4, 1e-4]), (5, 1, 1))
-    C[2:, 2, 2] = 1e4
-    z[3:, 0] += 0.02
-    for aruco, chi2, freedom in ((None, 0, 0), (ArucoReadings(at, marker, z, C), 2, 2 * 2)):
+    at, r = off.pose[[0, 3, 5, 8, 9, 10]], len(off.pose)
+    marker, in_world = np.array([0, 1, 1, 2, 2, 2]), np.array([[1, 1, 0.5], [2, 0, 1], [1, -1, 0]])
+    z = between(poses[at], in_world[marker])
+    C = np.tile(np.diag([4e-4, 1e-4, 1e-4]), (6, 1, 1))
+    C[3:, 2, 2] = 1e4
+    z[4:, 0] += 0.02
+    for aruco, chi2, freedom in ((None, 0, 0), (ArucoReadings(at, marker, z, C), 2, 3 + 2 * 2)):
         m = measure(replace(dataset, uwb=off, aruco=aruco))
         problem = build(m, "arc", Noise(sightings=5.0, ranges=7.0))       # which do not count
-        state = state_from_arrays(m, poses[m.frame], np.array([*in_world[:3]])[:len(m.marker)],
+        state = state_from_arrays(m, poses[m.frame], in_world[:len(m.marker)],
                                   place[None], np.array([1.0, -2.0, 0.0]))
         share = np.r_[np.ones(len(m.label)), np.full(r, 0.25)]
         for weight, ranges in ((m.unit_weights, r), (share, r / 4)):
