@@ -92,6 +92,22 @@ def test_odometry_factor_equals_gtsams_between_factor_for_known_wheels():
         assert np.isclose(native.error(values), np.sum((U[i] @ e[i])**2) / 2, rtol=1e-6)
 
 
+@pytest.mark.parametrize("about", [[], [np.array([3.0, -2.0, 1.0])]])
+def test_odometry_is_that_of_the_wheels_about_which_it_is_linear(about):
+    """The stated wheels, unless others are given; its derivatives are those at these wheels."""
+    measurements = example()[0].measurements
+    dataset, frame = measurements.dataset, measurements.frame
+    found = odometry_factors.odometry_factors(measurements, "arc", *about)
+    w = about[0] if about else np.zeros(3)
+
+    def by_wheels(w):
+        return increments.between_poses(
+            dataset.ticks, dataset.vehicle.with_deviation(w), frame[:-1], frame[1:], "arc")[0]
+
+    np.testing.assert_allclose(found.increment + found.by_w @ w, by_wheels(w), atol=1e-12)
+    np.testing.assert_allclose(found.by_w, central_differences(by_wheels, w, 1e-2), atol=1e-8)
+
+
 def test_rounding_noise_does_not_depend_on_the_number_of_factors():
     """Rounding errors telescope: their sum over all factors is that of one difference of counts."""
     vehicle, ticks = Vehicle(), np.full((2001, 2), 127)
