@@ -1,6 +1,7 @@
 # make report   executes the notebooks on every dataset in data/ and writes report/ and results/
 # make test     checks the style, and runs all tests
 # make quick    runs the tests that take less than a minute in all
+# make mutants   prints which small defects of the numerics no test notices; half an hour
 # make lab      opens JupyterLab on the notebooks
 # make strip    removes the outputs from saved notebooks, as they are committed
 # make bench    prints the benchmarks' tables
@@ -21,7 +22,7 @@ ifneq ($(shell $(BIN)/python -c 'print("runs")' 2>/dev/null),runs)
 $(shell rm -f $(READY))
 endif
 
-.PHONY: setup report test quick lab strip bench bench-large clean
+.PHONY: setup report test quick mutants lab strip bench bench-large clean
 .DEFAULT_GOAL := report
 
 setup: $(READY)
@@ -53,6 +54,9 @@ test: $(READY)
 
 quick: $(READY)
 	$(BIN)/python -m pytest $(PARALLEL) -m "not slow"
+
+mutants: $(READY)
+	$(BIN)/python tests/mutants.py $(ARGS)
 
 lab: $(READY)
 	$(BIN)/python -m jupyter lab --LabApp.check_for_updates_class=jupyterlab.NeverCheckForUpdate \

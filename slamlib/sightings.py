@@ -115,7 +115,10 @@ def consensus(marker, in_world, covariance):
 
 
 def few_of_each(label, most):
-    """Rows of at most `most` entries of every label, evenly chosen. Labels count from 0."""
+    """Rows of at most `most` entries of every label, from its first one on, evenly chosen.
+
+    Labels count from 0.
+    """
     order = np.argsort(label, kind="stable")
     count = np.bincount(label)[label[order]]
     number = np.arange(len(order)) - np.searchsorted(label[order], label[order])

@@ -1,15 +1,30 @@
 """Flaws of whole files are named, and nothing else is, on drives of the simulator."""
 
+import re
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from numeric import central_differences
+from scipy.linalg import block_diag
 
-from slamlib import slam
-from slamlib.dataset import AntennaGuess, Vehicle
-from slamlib.localization import drive_doubts
-from slamlib.simulation import simulate
+from slamlib import increments, se2, slam
+from slamlib.dataset import AntennaGuess, Dataset, UwbReadings, Vehicle
+from slamlib.localization import drive_doubts, units
+from slamlib.localization.doubts import (
+    GENEROUS_SLIP,
+    GENEROUS_WHEEL,
+    _compare,
+    _Compared,
+    _headings_contradict,
+    _moves,
+    _odometry_doubts,
+)
+from slamlib.localization.marker_increments import consecutive_increments
+from slamlib.sightings import sightings_by_frame
+from slamlib.simulation import manoeuvre, simulate
 
 SEEDS = (0, 1, 2)
 simulated = cache(simulate)
@@ -189,3 +204,179 @@ def test_standing_still_gives_no_doubt():
     waits = np.concatenate([still.ticks[:1000], dataset.ticks[1:1001]])
     moved = replace(dataset.aruco, pose=dataset.aruco.pose + 999).select(dataset.aruco.pose < 1001)
     assert drive_doubts(replace(dataset, ticks=waits, aruco=moved, uwb=None)) == []
+
+
+def moved_by(length, turn, count=20):
+    """Increments that turn to either side in turn, so that their mean is no turn."""
+    side = np.resize([1.0, -1.0], count)
+    return np.column_stack([np.full(count, 0.6 * length), 0.8 * length * side, turn * side])
+
+
+@pytest.mark.parametrize("markers, wheels, said", [
+    ((0.2, 0.1), (0.2, 0.1), None), ((0.2, 0.1), (0.9, 0.45), None),
+    ((0.9, 0.45), (0.2, 0.1), None),
+    ((1.1, 0.1), (0.2, 0.1), "x and y in ArucoReading.txt"),
+    ((0.2, 0.1), (1.1, 0.1), "x and y in ArucoReading.txt"),
+    ((0.2, 0.01), (0.2, 0.06), "wheelbase in vehicle.toml"),
+    ((0.2, 0.06), (0.2, 0.01), "wheelbase in vehicle.toml"),
+    ((0.02, 0.01), (0.2, 0.1), "radii (metres) and ticks_per_revolution"),
+    ((0.02, 0.1), (0.0, 0.1), None), ((0.02, 0.1), (0.005, 0.1), None),
+    ((0.2, 0.004), (0.2, 0.0005), None)])
+def test_units_are_named_from_a_factor_of_five_on_where_motion_is_significant(
+        markers, wheels, said):
+    """Standard deviations of 1 cm and 1 mrad: from five of them on, motion is compared."""
+    doubts = units.sighting_units(moved_by(*markers), moved_by(*wheels), np.array([0.01, 1e-3]))
+    assert len(doubts) == (said is not None)
+    if said:
+        assert said in doubts[0].sentence
+        assert ("moves by {:.4g} m and turns by {:.4g} rad by the markers, and by {:.4g} m and "
+                "{:.4g} rad by the wheels").format(*markers, *wheels) in doubts[0].sentence
+
+
+def ranges_on_a_circle(factor=1.0, guess=1.0, count=200):
+    """A drive on a circle of 2 m with ranges to an antenna 10 m away, times a factor."""
+    ticks = np.rint(manoeuvre([(4 * np.pi, 2 * np.pi)]))
+    path = np.column_stack([2 * np.sin(np.linspace(0, 2 * np.pi, len(ticks))),
+                            2 - 2 * np.cos(np.linspace(0, 2 * np.pi, len(ticks)))])
+    at = np.linspace(0, len(ticks) - 1, count).astype(int)
+    place = np.array([6.0, 10.0])
+    r = factor * np.hypot(*(path[at] - place).T)
+    return Dataset("circle", Vehicle(), ticks, None,
+                   UwbReadings(at, np.full(count, 3), r, np.full(count, 0.1)),
+                   AntennaGuess(np.array([3]), guess * place[None]))
+
+
+@pytest.mark.parametrize("factor, guess, named", [
+    (1.0, 1.0, ""), (3.0, 1.0, ""), (4.0, 1.0, "spread"), (0.25, 1.0, ""), (0.15, 1.0, "distance"),
+    (0.03, 1.0, "distance"), (0.015, 1.0, "spread"), (1.0, 0.01, ""), (1.0, 4.0, ""),
+    (1.0, 8.0, "distance")])
+def test_units_of_ranges_are_judged_by_their_spread_and_by_the_guesses(factor, guess, named):
+    """The quartiles of 2 m sin(t) are 2 sqrt(2) m apart, which is 2.1 m by 1.35 sigmas of a normal
+    distribution. The path has the standard deviation 2 m, of which 0.7 are expected in the ranges.
+    """
+    doubts = units.range_units(ranges_on_a_circle(factor, guess))
+    assert len(doubts) == bool(named)
+    if named:
+        numbers = [float(number) for number in re.findall(r"[\d.]+(?= m\b)", doubts[0].sentence)]
+        middle = np.array([0.0, 2.0])
+        typical = factor * np.hypot(*(middle - [6, 10]))
+        expected = {"spread": [factor * 2 * np.sqrt(2) / 1.35, 2.0, typical],
+                    "distance": [typical, np.hypot(*(middle - guess * np.array([6, 10])))]}[named]
+        np.testing.assert_allclose(numbers, expected, rtol=0.03)
+        assert ("UwbReading.txt" if named == "spread" else "UwbAntennaGuess.txt") \
+            in doubts[0].sentence
+
+
+def test_units_of_few_ranges_and_of_a_vehicle_that_stands_are_not_judged():
+    assert units.range_units(ranges_on_a_circle(1e3, count=10))
+    assert not units.range_units(ranges_on_a_circle(1e3, count=9))
+    drive = ranges_on_a_circle(1e3)
+    assert not units.range_units(replace(drive, ticks=0 * drive.ticks))
+    assert not units.range_units(drive.without("uwb"))
+
+
+def test_ranges_are_compared_only_while_odometry_knows_the_heading():
+    """A heading that is lost at once leaves the first pose; one that is known leaves the drive."""
+    drive = ranges_on_a_circle()
+    path, antennas = units.path_and_antennas(drive)
+    assert len(path) == len(drive.ticks) and len(antennas[0][0]) == 200
+    lost = replace(drive, vehicle=Vehicle(sigma_wheelbase=0.02))       # 0.1 rad after 2 rad
+    path, antennas = units.path_and_antennas(lost)
+    turned = 2 * np.pi * np.arange(len(drive.ticks)) / (len(drive.ticks) - 1)
+    assert np.isclose(len(path), np.count_nonzero(turned * 0.05 < 0.1), rtol=0.01)
+    (pose, distance, guess), = antennas
+    assert pose.max() < len(path) <= drive.uwb.pose[len(pose)]
+    np.testing.assert_array_equal(distance, drive.uwb.range[:len(pose)])
+    np.testing.assert_array_equal(guess, [6.0, 10.0])
+
+
+def test_increments_are_compared_in_exchanged_axes_by_both_covariances():
+    """One increment: by markers [x, y, turn] and by wheels, whose axes are exchanged or not."""
+    markers, wheels = np.array([[0.3, -0.2, 3.1]]), np.array([[0.25, 0.3, -3.0]])
+    C_m, C_w = np.diag([1e-4, 4e-4, 1e-3]), np.diag([2e-4, 1e-4, 2e-3])
+    C_w[0, 2] = C_w[2, 0] = 1e-4
+    compared = _Compared(markers, wheels, C_m[None], C_w[None], 0.25)
+    for A in ([[1, 0], [0, 1]], [[0, -1], [1, 0]], [[1, 0], [0, -1]]):
+        B = np.zeros((3, 3))
+        B[:2, :2], B[2, 2] = A, np.linalg.det(A)
+        r = markers[0] - B @ wheels[0]
+        r[2] = (r[2] + np.pi) % (2 * np.pi) - np.pi
+        expected = r @ np.linalg.solve(C_m + B @ C_w @ B.T, r)
+        np.testing.assert_allclose(compared.squared_distances(np.array(A, float)), [expected])
+    np.testing.assert_allclose(compared.sigma(), np.sqrt([5e-4, 1e-3]))
+    assert np.isclose(compared.cost(np.array([1e-9])), 0.25 * 1e-9 / 2)     # as a quadratic loss
+    assert compared.cost(np.array([1e4])) < 0.25 * 60                       # but bounded by a log
+
+
+def test_increments_are_compared_over_a_metre():
+    """Frames every 26 cm: increments over four of them.
+
+    Those by markers are composed, with their covariances; where one is not usable, no span has it.
+    """
+    ticks = np.rint(manoeuvre([(0.26 * 60, 9.0)], step=0.026))
+    drive, rng = Dataset("metre", Vehicle(), ticks, None, None, None), np.random.default_rng(0)
+    frame = np.arange(0, len(ticks), 10)
+    step = increments.between_poses(ticks, Vehicle(), frame[:-1], frame[1:], "arc")[0]
+    step += rng.normal(0, 0.01, step.shape)
+    root = 0.01 * rng.normal(size=(len(step), 3, 3))
+    C, usable = root @ np.swapaxes(root, 1, 2), np.ones(len(step), bool)
+    usable[20] = False
+    compared = _compare(drive, SimpleNamespace(frame=frame), SimpleNamespace(
+        increment=step, covariance=C, usable=usable))
+    begin = np.setdiff1d(np.arange(len(step) - 3), [17, 18, 19, 20])
+    assert compared.weight == 1 / 4 and len(compared.by_markers) == len(begin)
+    wheels, by_w = increments.between_poses(ticks, Vehicle(), frame[begin], frame[begin + 4], "arc")
+    np.testing.assert_allclose(compared.by_wheels, wheels)
+    by_w = by_w * (GENEROUS_WHEEL * Vehicle().wheel)
+    np.testing.assert_allclose(
+        compared.covariance_wheels, by_w @ np.swapaxes(by_w, 1, 2) + increments.noise(
+            ticks, Vehicle(), frame[begin], frame[begin + 4], GENEROUS_SLIP), rtol=1e-9, atol=1e-15)
+    for n in (0, 16, 17, 40):
+        def composed(change, at=begin[n]):
+            a, b, c, d = step[at:at + 4] + change.reshape(4, 3)
+            return se2.compose(se2.compose(se2.compose(a, b), c), d)
+        D = central_differences(composed, np.zeros(12))
+        expected = D @ block_diag(*C[begin[n]:begin[n] + 4]) @ D.T
+        np.testing.assert_allclose(compared.by_markers[n], composed(np.zeros(12)))
+        np.testing.assert_allclose(compared.covariance_markers[n], expected, rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize("increment, moves", [
+    ([0.06, 0.0, 0.0], False), ([0.05, 0.06, 0.0], True), ([0.0, 0.0, 0.011], True),
+    ([0.0, 0.0, -0.011], True), ([0.0, 0.0, 0.009], False), ([0.0, 0.0, 2 * np.pi], False)])
+def test_motion_is_what_is_above_five_sigmas(increment, moves):
+    """Of distance, sqrt(2) * 1 cm, or of turn, 2 mrad."""
+    C = np.diag([1e-4, 1e-4, 4e-6])
+    np.testing.assert_array_equal(_moves(np.array([increment]), C[None]), [moves])
+
+
+@pytest.mark.parametrize("wrong, doubted", [(8, False), (12, True)])
+def test_odometry_is_doubted_if_most_increments_disagree(wrong, doubted):
+    """Of twenty; an increment of 20 cm and 0.1 rad disagrees by half of it, ten sigmas."""
+    wheels = moved_by(0.2, 0.1)
+    markers = wheels.copy()
+    markers[:wrong] *= 1.5
+    C = np.tile(5e-5 * np.eye(3), (20, 1, 1))
+    doubts = _odometry_doubts(_Compared(markers, wheels, C, C, 1.0))
+    assert len(doubts) == doubted
+    if doubted:
+        assert "at 60% of 20 places" in doubts[0].sentence
+        assert "by the markers it moves by 0.3 m and turns by 0.15 rad, by the wheels 0.2 m and " \
+            "0.1 rad (medians)" in doubts[0].sentence
+
+
+@pytest.mark.parametrize("signs, contradict", [
+    ((1, 1, 1), False), ((-1, -1, 1), False), ((1, -1, -1), False), ((1, 1, -1), True),
+    ((1, -1, 1), True), ((-1, 1, 1), True), ((-1, -1, -1), True)])
+@pytest.mark.parametrize("mislabelled", [0.0, 0.03])
+def test_headings_contradict_positions_if_an_odd_number_of_signs_is_wrong(
+        signs, contradict, mislabelled):
+    dataset = camera(*signs)(simulated("short", 0, mislabelled=mislabelled)[0])
+    sightings = sightings_by_frame(dataset.aruco)
+    assert _headings_contradict(sightings, consecutive_increments(sightings)) == contradict
+    few = sightings_by_frame(dataset.aruco.select(dataset.aruco.pose < 40))
+    assert not _headings_contradict(few, consecutive_increments(few))
+    C = dataset.aruco.covariance.copy()
+    C[:, 2, 2] = 1.0                                             # headings that nothing is known of
+    unknown = sightings_by_frame(replace(dataset.aruco, covariance=C))
+    assert not _headings_contradict(unknown, consecutive_increments(unknown))

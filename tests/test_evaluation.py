@@ -65,6 +65,20 @@ def test_alignment_finds_the_motion_and_unknown_poses_are_left_out():
     assert np.isnan([evaluation.ate(moved, truth), *evaluation.rpe(moved, truth, 5)]).all()
 
 
+def test_whole_turns_of_the_heading_are_no_error():
+    """An estimate whose heading jumps by whole turns has the RPE and NEES of one without jumps."""
+    poses, truth = drive(40)
+    turned = poses.copy()
+    turned[10:, 2] += 2 * np.pi
+    turned[30:, 2] -= 4 * np.pi
+    C = np.tile(0.05**2 * np.eye(3), (40, 1, 1))
+    for step in (1, 7):
+        np.testing.assert_allclose(evaluation.rpe(turned, truth, step),
+                                   evaluation.rpe(poses, truth, step))
+    np.testing.assert_allclose(evaluation.nees(turned, C, truth),
+                               evaluation.nees(poses, C, truth))
+
+
 def test_nees_band_is_that_of_the_tables():
     """Chi-squared, 3 degrees of freedom: 0.216 and 9.348; 150 degrees: 117.985 and 185.800."""
     np.testing.assert_allclose(evaluation.nees_band(1), [0.2158, 9.3484], atol=1e-4)

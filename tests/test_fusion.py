@@ -8,6 +8,7 @@ from slamlib import increments, odometry, se2, slam
 from slamlib.dataset import ArucoReadings, Dataset
 from slamlib.evaluation import anees, ate, nees_band
 from slamlib.localization import fuse, fuse_increments, fused, hint, localize
+from slamlib.sightings import GATE
 from slamlib.simulation import TABLE_2, simulate
 from slamlib.slam import interpolation
 
@@ -123,6 +124,69 @@ def test_slip_is_learned_although_the_encoder_is_coarse():
     assert 0.7e-3 < np.exp(np.mean(np.log(slips))) < 1.5e-3
 
 
+def test_sightings_that_are_not_used_are_counted():
+    """Five sightings moved by a metre, one that repeats another, two of a marker that contradict.
+
+    The hint uses no sighting of a marker that no adjacent frame sees, on the clean drive either.
+    """
+    dataset, _ = simulate("short", seed=1, noise=False)
+    a = dataset.aruco
+    z, seen_before = a.marker_in_vehicle.copy(), [
+        row for row in range(len(a.pose))
+        if a.marker[row] in a.marker[a.pose == a.pose[row] - 10]]
+    moved = [next(row for row in seen_before if a.pose[row] == pose)
+             for pose in (200, 300, 400, 500, 600)]
+    z[moved, :2] += 1.0
+    again, other = (next(row for row in seen_before if a.pose[row] == pose) for pose in (700, 800))
+    spoilt = replace(a, marker_in_vehicle=z).select(np.r_[np.arange(len(z)), again, other])
+    spoilt.marker_in_vehicle[-1, 0] += 1.0
+    order = np.argsort(spoilt.pose, kind="stable")
+    spoilt = replace(dataset, aruco=spoilt.select(order))
+    assert fuse(dataset, slip=1e-3).rejected == 0
+    assert fuse(spoilt, slip=1e-3).rejected == 5 + 1 + 2
+    assert fuse_increments(spoilt).rejected == fuse_increments(dataset).rejected + 5 + 1 + 2
+
+
+def test_the_likelihood_of_the_innovations_by_hand():
+    """A vehicle that stands and sees one marker twice: v = z' - z is normal with C + C'.
+
+    Beyond the gate a sighting has the density at the gate.
+    """
+    C = np.array([[[4e-4, 1e-4, 0], [1e-4, 9e-4, 0], [0, 0, 1e-4]],
+                  [[1e-4, 0, 0], [0, 4e-4, 1e-4], [0, 1e-4, 4e-4]]])
+    S = C.sum(axis=0)
+    for off in ([0.02, -0.03, 0.01], [0.3, 0.0, 0.0], [0.0, 0.0, 2 * np.pi + 0.01]):
+        z = np.array([[1.0, 0.5, 3.0], [1.0, 0.5, 3.0]])
+        z[1] += off
+        aruco = ArucoReadings(np.array([0, 5]), np.array([7, 7]), z, C)
+        dataset = Dataset("still", TABLE_2, np.zeros((6, 2), int), aruco, None, None)
+        state = fused._filter(fused._filter_input(dataset, "arc", TABLE_2), 1e-3)[2]
+        v = np.array([*off[:2], se2.wrap(off[2])])
+        squared = min(v @ np.linalg.solve(S, v), GATE)
+        assert np.isclose(state.log_likelihood, -(squared + np.linalg.slogdet(S)[1]) / 2)
+        assert state.rejected == (squared == GATE)
+
+
+@pytest.mark.parametrize("slip", [2e-4, 5e-3])
+def test_the_slip_that_is_learned_has_the_greatest_density(slip):
+    """Likelihood times prior are less for slips that are 20 % larger or smaller."""
+    dataset, _ = simulate("short", seed=3, slip=slip)
+    given = fused._filter_input(dataset, "arc", dataset.vehicle)
+    found = fused._likeliest_slip(given)
+    log_density = [fused._filter(given, each)[2].log_likelihood
+                   + increments.log_slip_prior(np.log(each))
+                   for each in (0.8 * found, found, 1.2 * found)]
+    assert np.argmax(log_density) == 1
+
+
+def test_the_slip_stays_within_its_bounds(monkeypatch):
+    """A likelihood that always rises, or falls, with the slip."""
+    for sign, bound in ((1, increments.SLIP_BOUNDS[1]), (-1, increments.SLIP_BOUNDS[0])):
+        monkeypatch.setattr(fused, "_filter", lambda given, slip, sign=sign: (
+            None, None, fused._State(None, None, None, None, 100 * sign * np.log(slip))))
+        assert np.isclose(fused._likeliest_slip(None), bound)
+
+
 def test_the_hint_fuses_by_information():
     """One interval: C = (C_o^-1 + C_m^-1)^-1 and Delta = C (C_o^-1 Delta_o + C_m^-1 Delta_m)."""
     dataset, _ = simulate("short", seed=6)
@@ -141,6 +205,23 @@ def test_the_hint_fuses_by_information():
         dataset.ticks[10:], sure, fused.poses[10], fused.covariances[10])
     np.testing.assert_allclose(fused.poses[10:], expected, atol=1e-12)
     np.testing.assert_allclose(fused.covariances[10:], expected_covariances, atol=1e-15)
+
+
+@pytest.mark.parametrize("propagation, whole", [
+    (hint.equation2_from, odometry.equation2), (hint.first_order_from, odometry.first_order)])
+def test_where_markers_give_no_increment_the_hint_restarts_odometry(propagation, whole):
+    """Three frames without common markers: the covariance is restarted at every frame."""
+    dataset, _ = simulate("short", seed=7)
+    frames = [0, 400, 800, 1200]
+    dataset = only(dataset, np.isin(dataset.aruco.pose, frames))
+    found = fuse_increments(dataset, propagation)
+    np.testing.assert_array_equal(found.measured, frames)
+    pose, covariance = np.zeros(3), np.diag([0.0, 0.0, dataset.vehicle.sigma_heading**2])
+    for begin, end in zip(frames, [*frames[1:], len(dataset.ticks) - 1]):
+        poses, covariances = whole(dataset.ticks[begin:end + 1], dataset.vehicle, pose, covariance)
+        np.testing.assert_allclose(found.poses[begin:end], poses[:-1], atol=1e-9)
+        np.testing.assert_allclose(found.covariances[begin:end], covariances[:-1], atol=1e-9)
+        pose, covariance = poses[-1], covariances[-1]
 
 
 def test_sparse_and_late_markers_leave_odometry_between():

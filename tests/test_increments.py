@@ -83,8 +83,16 @@ def test_noise_in_drive_does_not_depend_on_how_the_drive_is_cut():
         rounding, slipping = increments.noise_in_drive(ticks, VEHICLE, pose[:-1], pose[1:])
         expected = np.diag(whole)[[0, 2]] + [increments.MINIMUM_SLIP**2 * travelled, 0.0]
         np.testing.assert_allclose(np.diag(rounding.sum(axis=0))[[0, 2]], expected, rtol=1e-6)
+        if every == 1:                                        # no lever arm: the skid alone
+            skid = expected[0] - whole[0, 0]
+            np.testing.assert_allclose(rounding[:, 1, 1].sum(), skid, rtol=1e-4)
+            np.testing.assert_allclose(rounding[:, 0, 1], 0, atol=1e-6 * rounding[0, 1, 1])
         by_slip = travelled * np.array([1 / 2, 2 / VEHICLE.wheelbase**2])
         np.testing.assert_allclose(np.diag(slipping.sum(axis=0))[[0, 2]], by_slip, rtol=1e-6)
+    one, _ = increments.noise_in_drive(ticks[:2], VEHICLE, [0], [1])             # a single step
+    difference = one[0] - increments.noise(ticks[:2], VEHICLE, [0], [1], 0.0)[0]
+    skid = increments.MINIMUM_SLIP**2 * travelled / 2000
+    np.testing.assert_allclose(difference, np.diag([skid, skid, 0.0]), rtol=1e-9, atol=1e-20)
     for part in increments.noise_in_drive(ticks, VEHICLE, [0, 700], [0, 700]):
         np.testing.assert_array_equal(part, 0)
     for part in increments.noise_in_drive(ticks[:1], VEHICLE, [0], [0]):    # a single pose

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numeric import central_differences
 
 from slamlib import se2, studies
 from slamlib.dataset import ArucoReadings
@@ -43,6 +44,35 @@ def test_two_increments_by_hand():
     np.testing.assert_allclose(found.covariances[:, 0, 0] / s**2, [0, 2, 2], atol=1e-9)
     np.testing.assert_allclose(naive.covariances[:, 0, 0] / s**2, [0, 2, 4], atol=1e-9)
     np.testing.assert_allclose(found.marker_covariance[0, 0, 0] / s**2, 1, atol=1e-9)
+
+
+def test_covariances_are_those_of_all_sightings_through_numerical_derivatives():
+    """Four frames with three markers on a winding path: C = sum over the sightings of D C_s D^T.
+
+    D are derivatives of poses and markers by each sighting, whose covariances are not diagonal.
+    """
+    rng = np.random.default_rng(0)
+    poses = np.array([[0, 0, 0], [0.3, 0.1, 0.9], [0.4, 0.5, 2.0], [0.1, 0.6, 3.3]])
+    markers = np.array([[2.0, 1.0, 0.5], [-1.0, 2.0, -2.0], [1.0, -1.5, 3.0]])
+    frame, marker = np.repeat(np.arange(4), 3), np.tile(np.arange(3), 4)
+    root = 0.01 * rng.normal(size=(12, 3, 3))
+    readings = ArucoReadings(10 * frame, marker, se2.between(poses[frame], markers[marker]),
+                             root @ np.swapaxes(root, 1, 2) + 1e-5 * np.eye(3))
+    found = localize(readings)
+    expected_poses, expected_map = np.zeros((4, 3, 3)), np.zeros((3, 3, 3))
+    for k in range(12):
+        def moved(change, k=k):
+            z = readings.marker_in_vehicle.copy()
+            z[k] += change
+            again = localize(replace(readings, marker_in_vehicle=z))
+            return np.concatenate([again.poses, again.marker_in_world])
+        D = central_differences(moved, np.zeros(3), 1e-5)
+        C = D @ readings.covariance[k] @ np.swapaxes(D, 1, 2)
+        expected_poses += C[:4]
+        expected_map += C[4:]
+    scale = np.abs(expected_poses).max()
+    np.testing.assert_allclose(found.covariances, expected_poses, atol=1e-5 * scale)
+    np.testing.assert_allclose(found.marker_covariance, expected_map, atol=1e-5 * scale)
 
 
 def test_world_frame_is_the_first_measured_pose():
@@ -153,6 +183,37 @@ def test_two_common_markers_relocalize_without_confirmation():
     back = found.frame == 1990
     np.testing.assert_allclose(found.poses[back, :2], truth.poses[[1990], :2], atol=1e-9)
     assert found.parent[back][0] in (0, 1) and np.isnan(found.poses[2:-1]).all()
+
+
+def seen_in(*frames):
+    """Exact ArucoReadings of a straight drive that sees these markers (numbers) in its frames."""
+    pose, marker = np.array([(10 * f, m) for f, markers in enumerate(frames) for m in markers]).T
+    in_world = np.column_stack([marker, -0.5 * marker, 0.7 * marker])
+    vehicle = np.column_stack([0.01 * pose, np.zeros((len(pose), 2))])
+    return ArucoReadings(pose, marker, se2.between(vehicle, in_world),
+                         np.tile(1e-4 * np.eye(3), (len(pose), 1, 1)))
+
+
+@pytest.mark.parametrize("frames, known", [
+    ([[1, 2], [1, 2], [3], [1]], [True, True, False, False]),
+    ([[1, 2], [1, 2], [3], [1], [1]], 2 * [True] + [False] + 2 * [True]),
+    ([[1, 2], [2], [3], [1], [1]], 2 * [True] + 3 * [False]),
+    ([[1, 2], [2], [3], [1, 2]], 2 * [True] + [False, True])])
+def test_one_marker_relocalizes_only_if_adjacent_frames_confirm_both_sightings(frames, known):
+    found = localize(seen_in(*frames))
+    np.testing.assert_array_equal(np.isfinite(found.poses[:, 0]), known)
+    np.testing.assert_allclose(found.poses[known, 0], 0.1 * np.flatnonzero(known), atol=1e-12)
+
+
+def test_the_map_has_markers_that_are_confirmed_and_seen_from_known_poses():
+    """Marker 5 is seen once; 3 and 4 twice, but from poses that nothing connects to the world."""
+    readings = seen_in([1, 2], [1, 2, 5], [3, 4], [3, 4], [1, 2])
+    found = localize(readings)
+    np.testing.assert_array_equal(np.isfinite(found.poses[:, 0]), [True, True, False, False, True])
+    np.testing.assert_array_equal(found.marker, [1, 2])
+    np.testing.assert_allclose(found.marker_in_world[:, :2], [[1, -0.5], [2, -1]], atol=1e-12)
+    np.testing.assert_array_equal(readings.marker[found.unused], [5, 1, 2])
+    assert not found.rejected.any()
 
 
 def test_a_single_frame_and_markers_without_heading():

@@ -9,6 +9,10 @@ from slamlib import se2
 from slamlib.dataset import ArucoReadings
 from slamlib.evaluation import nees, nees_band
 from slamlib.localization.marker_increments import (
+    _increment_of_two_points,
+    _inverse_where_regular,
+    _similar,
+    _single_increments,
     common_sightings,
     consecutive_increments,
     robust_increments,
@@ -49,6 +53,9 @@ def test_the_consensus_of_many_sightings_takes_a_few_of_each_marker():
     label = np.searchsorted([5, 7, 10**14], marker)
     few = few_of_each(label, 100)
     assert np.bincount(label[few]).tolist() == [100, 100, 100]
+    for k in range(3):
+        rows = np.searchsorted(np.flatnonzero(label == k), few[label[few] == k])
+        assert rows[0] == 0 and np.ptp(np.diff(rows)) <= 1
     assert few_of_each(label, 2000).tolist() == list(range(3000))
 
 
@@ -87,6 +94,43 @@ def test_derivatives_by_the_sightings_against_central_differences():
         for k, analytic in ((first[p], found.by_first[p]), (second[p], found.by_second[p])):
             numeric = central_differences(partial(moved, k), np.zeros(3), 1e-5)
             np.testing.assert_allclose(analytic, numeric, atol=0.03 * np.abs(numeric).max())
+
+
+def test_the_increment_from_two_points_moves_the_one_pair_onto_the_other():
+    for delta in (DELTA, np.array([2.0, -1.0, 2.5]), np.array([-0.4, 3.0, -3.1])):
+        p1, q1 = MARKERS[:2, None, :2]
+        p2, q2 = se2.between(delta, MARKERS[:2])[:, None, :2]
+        found, = _increment_of_two_points(p1, q1, p2, q2)
+        np.testing.assert_allclose(found[:2], delta[:2], atol=1e-12)
+        np.testing.assert_allclose(se2.wrap(found[2] - delta[2]), 0, atol=1e-12)
+        # Of points whose distances differ the midpoints and directions agree.
+        found, = _increment_of_two_points(p1, q1, p2 + 0.1 * (p2 - q2), q2 - 0.1 * (p2 - q2))
+        np.testing.assert_allclose(found[:2], delta[:2], atol=1e-12)
+
+
+def test_the_increment_from_one_marker_has_the_covariance_of_both_its_sightings():
+    """Z Z'^-1 moves by its numerical derivatives; both covariances have correlations."""
+    z1, z2 = MARKERS[0], se2.between(DELTA, MARKERS[0])
+    C2 = 3 * C[::-1, ::-1]
+    (increment,), (covariance,) = _single_increments(z1[None], C[None], z2[None], C2[None])
+    np.testing.assert_allclose(increment, DELTA, atol=1e-12)
+    by_first = central_differences(lambda z: se2.compose(z, se2.inverse(z2)), z1)
+    by_second = central_differences(lambda z: se2.compose(z1, se2.inverse(z)), z2)
+    expected = by_first @ C @ by_first.T + by_second @ C2 @ by_second.T
+    np.testing.assert_allclose(covariance, expected, rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize("units", [[1, 1, 1], [1e6, 1e6, 1e-3], [1e-9, 1e3, 1]])
+def test_whether_an_information_is_singular_does_not_depend_on_the_units(units):
+    """In other units of x, y and heading, H becomes D H D with a diagonal D."""
+    D = np.diag(units)
+    regular = D @ np.linalg.inv(C) @ D
+    one_point = np.array([[1.0, 0, 0.4], [0, 1, 1.2]])             # the heading moves it, too
+    singular = D @ one_point.T @ one_point @ D
+    found = _inverse_where_regular(np.array([
+        regular, singular, np.full((3, 3), np.nan), np.zeros((3, 3))]))
+    np.testing.assert_allclose(D @ found[0] @ D, C, rtol=1e-9)
+    assert np.isnan(found[1:]).all()
 
 
 def test_many_increments_are_consistent():
@@ -162,6 +206,19 @@ def test_an_implausible_speed_makes_an_increment_unusable():
     np.testing.assert_array_equal(found.accepted, found.pair < 4)
     alone = robust_increments(z, covariances, *common_sightings(row, marker), 5)
     assert alone.usable.all()                               # the test of the speed rejected it
+
+
+@pytest.mark.parametrize("a, b, similar", [
+    ((0.06, 0.08, 0.01), (0.06, 0.02, 0.01), False), ((0.06, 0.08, 0.01), (0.06, 0.04, 0.01), True),
+    ((0.0, 0.0, 0.1), (0.0, 0.0, 0.06), True), ((0.0, 0.0, 0.1), (0.0, 0.0, 0.04), False),
+    ((0.1, 0.0, -0.1), (0.1, 0.0, 0.1), False), ((0.1, 0.0, 1.8e-3), (0.1, 0.0, 0.0), True),
+    ((0.1, 0.0, 2.2e-3), (0.1, 0.0, 0.0), False)])
+def test_velocities_are_similar_if_they_differ_by_less_than_half_the_larger(a, b, similar):
+    """In speed and in turn; turns also if they differ by less than 1 mrad more than that."""
+    a, b = 1.001 * np.array([a]), np.array([b])
+    still = np.zeros((1, 3)) + [1e-3, 0, 0]          # so that the speeds of turns on the spot agree
+    for one, other in ((a, b), (b, a)):
+        assert _similar(one + still, other + still)[0] == similar
 
 
 def test_common_sightings_by_hand():

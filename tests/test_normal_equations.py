@@ -24,9 +24,9 @@ from slamlib.slam.estimate import fit_from_odometry
 from slamlib.slam.evidence import solve
 from slamlib.slam.first_frames import first_frames
 from slamlib.slam.initialization import odometry_state, state_from_poses
-from slamlib.slam.measurement_factors import MeasurementFactors
+from slamlib.slam.measurement_factors import WEAK_SIGMA, MeasurementFactors
 from slamlib.slam.measurements import measure
-from slamlib.slam.noise import Noise
+from slamlib.slam.noise import BOUNDS, Noise
 from slamlib.slam.normal_equations import NormalEquations
 from slamlib.slam.optimizer import optimize
 from slamlib.slam.problem import build
@@ -63,6 +63,32 @@ def test_gtsam_has_the_same_error_and_takes_the_same_step():
     step = gtsam_graph.gtsam_step(problem, state)
     np.testing.assert_allclose(NormalEquations(problem, state).step(), step, rtol=1e-5,
                                atol=1e-6 * np.abs(step).max())
+
+
+def test_markers_without_accepted_sightings_have_a_weak_prior_and_move_nothing_else():
+    """Two markers with a heading, of consecutive ids, and a point; GTSAM takes the same step."""
+    dataset, _ = simulate("short", seed=4)
+    C = dataset.aruco.covariance.copy()
+    points = dataset.aruco.marker == dataset.aruco.marker[0]
+    C[points, 2] = C[points, :, 2] = [0, 0, 4.0]
+    m = measure(replace(dataset, aruco=replace(dataset.aruco, covariance=C)).first(500))
+    point, = np.flatnonzero(~m.oriented)
+    first = next(j for j in range(len(m.marker) - 1) if m.oriented[j:j + 2].all())
+    left = [point, first, first + 1]
+    weight = np.r_[~np.isin(m.label, left), np.ones(len(m.ranges.row), bool)].astype(float)
+    problem = replace(build(m, "arc", Noise()), measured=MeasurementFactors(m, weight))
+    np.testing.assert_array_equal(problem.measured.unsupported, sorted(left))
+    state = odometry_state(m, "arc")
+    equations = NormalEquations(problem, state)
+    H, rows = equations.structure.matrix(equations.sums(Noise())[0]).toarray(), []
+    for j in left:
+        own = equations.structure.rows([len(m.frame) + j], 2 + m.oriented[j])[0]
+        np.testing.assert_allclose(H[np.ix_(own, own)], np.eye(len(own)) / WEAK_SIGMA**2)
+        assert np.count_nonzero(H[own]) == len(own)
+        rows.extend(own)
+    others = np.setdiff1d(np.arange(len(H)), rows)
+    step, expected = equations.step()[others], gtsam_graph.gtsam_step(problem, state)[others]
+    np.testing.assert_allclose(step, expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("poses", [1, 15, 400])
@@ -127,6 +153,88 @@ def test_noise_of_a_sensor_that_starts_late_is_learned(monkeypatch):
     found = slam.estimate(dataset)
     assert np.isclose(found.noise.sightings, whole.noise.sightings, rtol=1e-3)
     assert 5 < found.noise.sightings < 7 and found.rejected.mean() < 0.02
+
+
+PRECISION = np.array([[40.0, 12.0, 0.0], [12.0, 90.0, -20.0], [0.0, -20.0, 60.0]])
+CENTRE = np.log([2e-3, 1.3, 0.8])
+
+
+def gaussian(x):
+    """A log density of the three logarithms, with its maximum 7 at CENTRE."""
+    return 7.0 - (x - CENTRE) @ PRECISION @ (x - CENTRE) / 2
+
+
+@pytest.mark.parametrize("free", [[0, 1, 2], [0, 2], [0]])
+def test_differences_of_a_quadratic_are_exact(free):
+    """Also where only some components are free, and where the correlation is known."""
+    free, x = np.array(free), CENTRE + [0.1, -0.2, 0.15]
+    steps = np.array([0.2, 0.1, 0.05])[free]
+    expected = -PRECISION[np.ix_(free, free)]
+    scale = np.sqrt(-np.diag(expected))
+    for correlation in (None, -expected / np.outer(scale, scale)):
+        gradient, hessian = noise_posterior._differences(
+            gaussian, x, gaussian(x), free, steps, correlation)
+        np.testing.assert_allclose(gradient, -(PRECISION @ (x - CENTRE))[free], rtol=1e-9)
+        np.testing.assert_allclose(hessian, expected, rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.parametrize("free", [[0, 1, 2], [0, 1]])
+@pytest.mark.parametrize("start", [[0.1, 0.0, 0.1], [2.5, -2.0, 1.5]])
+def test_newtons_method_finds_mode_and_covariance_of_a_gaussian(free, start):
+    """What is not free keeps its start, and its covariance is zero."""
+    free, x = np.array(free), CENTRE + start
+    given = np.setdiff1d(range(3), free)
+    mode, value, covariance = noise_posterior._mode(
+        gaussian, x, gaussian(x), free, np.full(len(free), 0.1))
+    H, cross = PRECISION[np.ix_(free, free)], PRECISION[np.ix_(free, given)]
+    expected = CENTRE[free] - np.linalg.solve(H, cross @ (x - CENTRE)[given])
+    np.testing.assert_allclose(mode[free], expected, atol=1e-6)
+    np.testing.assert_array_equal(mode[given], x[given])
+    assert np.isclose(value, gaussian(mode)) and value > gaussian(x)
+    np.testing.assert_allclose(covariance[np.ix_(free, free)], np.linalg.inv(H), rtol=1e-6)
+    assert not covariance[given].any() and not covariance[:, given].any()
+
+
+def test_newtons_method_stays_within_the_bounds_and_never_descends():
+    """A mode beyond the bound of the slip, and a density that is not concave at the start."""
+    beyond = CENTRE.copy()
+    beyond[0] = BOUNDS[1, 0] + 1.0
+    mode, *_ = noise_posterior._mode(
+        lambda x: -50 * np.sum((x - beyond)**2), CENTRE, -1e3, np.arange(3), np.full(3, 0.1))
+    np.testing.assert_allclose(mode, [BOUNDS[1, 0], *beyond[1:]], atol=1e-6)
+
+    def two_hills(x):
+        off = x[0] - CENTRE[0]
+        return float(np.logaddexp(-8 * (off - 1)**2, 1 - 8 * (off + 1)**2))
+
+    mode, value, _ = noise_posterior._mode(two_hills, CENTRE + [0.05, 0, 0],
+                                           two_hills(CENTRE + [0.05, 0, 0]), np.array([0]),
+                                           np.array([0.1]))
+    assert value >= two_hills(CENTRE + [0.05, 0, 0])
+    assert abs(abs(mode[0] - CENTRE[0]) - 1) < 0.05
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.01])
+def test_points_of_the_posterior_have_its_moments(scale):
+    """Along the slip by points, across by a wider noise: log-normal root mean squares.
+
+    A narrow posterior is one point.
+    """
+    C = scale * np.array([[0.25, 0.06, 0.0], [0.06, 0.04, 0.01], [0.0, 0.01, 0.09]])
+    information = np.linalg.inv(C)
+    points = noise_posterior._points(
+        lambda x: -(x - CENTRE) @ information @ (x - CENTRE) / 2, CENTRE, 0.0, C)
+    weights, noises = zip(*points)
+    assert len(points) == (5 if scale == 1 else 1) and np.isclose(sum(weights), 1)
+    logs = np.array([noise.logarithms for noise in noises])
+    if scale < 1:
+        np.testing.assert_allclose(logs[0], CENTRE + np.diag(C), rtol=1e-12)
+        return
+    rest = np.diag(C) - C[0]**2 / C[0, 0]                       # given the slip
+    np.testing.assert_allclose(weights @ logs, CENTRE + rest, atol=1e-6)
+    spread = logs - CENTRE - rest
+    np.testing.assert_allclose(np.einsum("p,pi,pj->ij", weights, spread, spread),
+                               np.outer(C[0], C[0]) / C[0, 0], rtol=0.02, atol=1e-12)
 
 
 def test_gates_are_quantiles_of_chi_squared():

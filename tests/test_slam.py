@@ -8,23 +8,26 @@ import numpy as np
 import pytest
 from numeric import central_differences, decided
 
-from slamlib import increments, se2, simulation, slam, studies
-from slamlib.dataset import ArucoReadings, Dataset, Vehicle
+from slamlib import increments, odometry, se2, simulation, slam, studies
+from slamlib.dataset import AntennaGuess, ArucoReadings, Dataset, UwbReadings, Vehicle
 from slamlib.evaluation import anees, ate, nees_band
 from slamlib.simulation import simulate
-from slamlib.slam import gtsam_graph, odometry_factors
+from slamlib.slam import fit as fit_module
+from slamlib.slam import gtsam_graph, odometry_factors, robust
 from slamlib.slam.covariances import covariances
-from slamlib.slam.estimate import fit_from_odometry
+from slamlib.slam.estimate import fit_from_odometry, fit_from_previous
 from slamlib.slam.evidence import solve
 from slamlib.slam.fit import refine
-from slamlib.slam.initialization import GROWTH, parts
+from slamlib.slam.initialization import GROWTH, extended, parts
 from slamlib.slam.measurements import measure
+from slamlib.slam.model_choice import DECISIVE, better_model
 from slamlib.slam.moments import moments
 from slamlib.slam.noise import Noise, from_logarithms, log_prior
 from slamlib.slam.noise_posterior import noise_posterior
 from slamlib.slam.normal_equations import NormalEquations
 from slamlib.slam.problem import build
-from slamlib.slam.result import result
+from slamlib.slam.result import _mapped, result
+from slamlib.slam.robust import FEW, accepted, noise_of_scatter, within_gates
 from slamlib.slam.state import state_from_arrays
 from slamlib.studies import graphs, kernels, montecarlo, starts
 
@@ -89,6 +92,22 @@ def test_odometry_factor_equals_gtsams_between_factor_for_known_wheels():
         assert np.isclose(native.error(values), np.sum((U[i] @ e[i])**2) / 2, rtol=1e-6)
 
 
+@pytest.mark.parametrize("about", [[], [np.array([3.0, -2.0, 1.0])]])
+def test_odometry_is_that_of_the_wheels_about_which_it_is_linear(about):
+    """The stated wheels, unless others are given; its derivatives are those at these wheels."""
+    measurements = example()[0].measurements
+    dataset, frame = measurements.dataset, measurements.frame
+    found = odometry_factors.odometry_factors(measurements, "arc", *about)
+    w = about[0] if about else np.zeros(3)
+
+    def by_wheels(w):
+        return increments.between_poses(
+            dataset.ticks, dataset.vehicle.with_deviation(w), frame[:-1], frame[1:], "arc")[0]
+
+    np.testing.assert_allclose(found.increment + found.by_w @ w, by_wheels(w), atol=1e-12)
+    np.testing.assert_allclose(found.by_w, central_differences(by_wheels, w, 1e-2), atol=1e-8)
+
+
 def test_rounding_noise_does_not_depend_on_the_number_of_factors():
     """Rounding errors telescope: their sum over all factors is that of one difference of counts."""
     vehicle, ticks = Vehicle(), np.full((2001, 2), 127)
@@ -101,6 +120,15 @@ def test_rounding_noise_does_not_depend_on_the_number_of_factors():
         floor = (2000 / every * odometry_factors.MINIMUM_SIGMA**2
                  + increments.MINIMUM_SLIP**2 * 2000 * 127 * count)
         np.testing.assert_allclose([noise[0, 0] - floor, noise[2, 2]], [along, turned], rtol=1e-6)
+
+
+def test_a_vehicle_that_stands_has_the_smallest_noise_along_both_axes():
+    frame = np.array([0, 10, 20])
+    rounding, slipping = odometry_factors.odometry_noise(
+        np.zeros((21, 2)), Vehicle(ticks_per_revolution=1e12), frame[:-1], frame[1:])
+    smallest = np.diag([odometry_factors.MINIMUM_SIGMA**2] * 2 + [0.0])
+    np.testing.assert_allclose(rounding, [smallest, smallest], rtol=1e-9, atol=1e-20)
+    np.testing.assert_array_equal(slipping, 0)
 
 
 @pytest.mark.slow
@@ -175,24 +203,47 @@ def test_the_learned_noise_has_the_greatest_posterior(poses, slip):
 
 
 def test_averages_over_the_noise_are_moments_of_a_mixture():
-    """Mean and covariance over the points, by hand for one pair of frames and one marker."""
-    dataset, _ = simulate("short", seed=5, slip=0.0)
-    fit = fit_from_odometry(measure(dataset.without("uwb").first(600)))
+    """Mean and covariance over the points, by hand, of variables of every kind.
+
+    One marker is a point, and the ranges calibrate themselves.
+    """
+    dataset = simulate("short", seed=5, slip=0.0)[0].first(600)
+    C = dataset.aruco.covariance.copy()
+    point = dataset.aruco.marker == dataset.aruco.marker[0]
+    C[point, 2] = C[point, :, 2] = [0, 0, 1e4]
+    dataset = replace(dataset, aruco=replace(dataset.aruco, covariance=C))
+    fit = fit_from_odometry(measure(dataset).calibrating())
     weights, noises = zip(*fit.posterior.points)
     assert len(weights) > 2 and np.isclose(sum(weights), 1, atol=1e-2)
-    equations = NormalEquations(fit.problem, fit.state)
+    equations, m = NormalEquations(fit.problem, fit.state), fit.problem.measurements
     origin = solve(equations, fit.problem.noise)[0]
     x = np.stack([solve(equations, noise)[0] - origin for noise in noises])
     weights = np.array(weights) / sum(weights)
     state, mixed, slip = moments(fit)
-    frame = 20
-    rows = equations.structure.rows([frame], 3)[0]
-    mean = weights @ x[:, rows]
-    each = [covariances(equations, noise).pairs[frame, :3, :3] for noise in noises]
-    expected = sum(p * (C + np.outer(d, d)) for p, C, d in zip(weights, each, x[:, rows] - mean))
-    np.testing.assert_allclose(mixed.pairs[frame, :3, :3], expected, rtol=1e-9, atol=1e-15)
-    np.testing.assert_allclose(state.poses[frame], se2.compose(fit.state.poses[frame], mean),
-                               atol=1e-12)
+    each = [covariances(equations, noise) for noise in noises]
+    point, oriented = np.flatnonzero(~m.oriented)[0], np.flatnonzero(m.oriented)[0]
+    variable = len(m.frame) + len(m.marker)
+    for number, width, block in (
+            (20, 3, lambda c: c.pairs[20][:3, :3]), (21, 3, lambda c: c.pairs[20][3:6, 3:6]),
+            (len(m.frame) + point, 2, lambda c: c.markers[point]),
+            (len(m.frame) + oriented, 3, lambda c: c.markers[oriented]),
+            (variable + 1, 2, lambda c: c.antennas[1]), (m.wheels, 3, lambda c: c.w),
+            (m.wheels, 3, lambda c: c.pairs[20][6:, 6:]), (m.wheels + 1, 2, lambda c: c.z)):
+        rows = equations.structure.rows([number], width)[0]
+        off = x[:, rows] - weights @ x[:, rows]
+        expected = sum(p * (block(c) + np.outer(d, d)) for p, c, d in zip(weights, each, off))
+        np.testing.assert_allclose(block(mixed), expected, rtol=1e-9, atol=1e-15)
+    for moved, before, number, width in (
+            (state.antennas[1], fit.state.antennas[1], variable + 1, 2),
+            (state.w, fit.state.w, m.wheels, 3), (state.z, fit.state.z, m.wheels + 1, 2),
+            (state.markers[point, :2], fit.state.markers[point, :2], len(m.frame) + point, 2)):
+        mean = weights @ x[:, equations.structure.rows([number], width)[0]]
+        np.testing.assert_allclose(moved, before + mean, atol=1e-12)
+    for moved, before, number in (
+            (state.poses[20], fit.state.poses[20], 20),
+            (state.markers[oriented], fit.state.markers[oriented], len(m.frame) + oriented)):
+        mean = weights @ x[:, equations.structure.rows([number], 3)[0]]
+        np.testing.assert_allclose(moved, se2.compose(before, mean), atol=1e-12)
     assert np.isclose(slip**2, sum(p * noise.slip**2 for p, noise in zip(weights, noises)))
 
 
@@ -437,6 +488,147 @@ def test_an_undetermined_variable_is_named_as_in_the_files():
     for symbol, name in (("l2", f"the pose of marker {marker}"), ("w0", "the wheel parameters"),
                          ("a1", f"the position of antenna {antenna}"), ("x0", "pose 1")):
         assert gtsam_graph._variable(problem.measurements, message.format(symbol)) == name
+
+
+def test_parts_of_a_drive_grow_at_most_fourfold_from_where_the_heading_is_lost():
+    """A turn of one rad a metre: a wheelbase known to 5 % loses 0.5 rad after ten metres."""
+    ticks = np.tile(np.rint(simulation.manoeuvre([(1.0, 1.0)])[1:]), (300, 1))
+    vehicle = Vehicle(sigma_wheelbase=0.02)
+    drive = Dataset("turns", vehicle, np.vstack([[0, 0], ticks]), None, None, None)
+    count = len(drive.ticks)
+    ends = parts(drive)
+    variance = odometry.first_order(drive.ticks, vehicle)[1][:, 2, 2]
+    lost = np.flatnonzero(variance > 0.5**2)[0]
+    assert abs(lost - count / 30) < count / 300
+    assert ends[-1] == count and ends[0] >= lost
+    assert ends[0] <= 1.5 * lost and len(ends) == 4
+    np.testing.assert_array_equal(ends[:-1], [max(lost, -(-end // GROWTH)) for end in ends[1:]])
+    sure = Vehicle(sigma_wheelbase=1e-6, sigma_right_radius=1e-6, sigma_left_radius=1e-6)
+    assert parts(replace(drive, vehicle=sure)) == [count]
+    assert parts(drive.first(lost + 10)) == [lost + 10]           # not worth a part of its own
+    blind = replace(vehicle, sigma_heading=1.0)
+    assert parts(replace(drive, vehicle=blind))[0] <= 3           # lost at once
+
+
+def test_a_longer_part_goes_on_from_the_last_solved_pose_with_its_wheels():
+    dataset, truth = simulate("short", seed=4, noise=False)
+    dataset = dataset.without("uwb")
+    part, whole = measure(dataset.first(500)), measure(dataset)
+    w, rng = np.array([3.0, -2.0, 1.0]), np.random.default_rng(0)
+    poses = truth.poses[part.frame] + rng.normal(0, 0.01, (len(part.frame), 3))
+    solved = state_from_arrays(part, poses, np.zeros((len(part.marker), 3)), np.zeros((0, 2)), w)
+    found = extended(whole, "arc", part, solved)
+    last = len(part.frame) - 1
+    kept = np.searchsorted(whole.frame, part.frame[:-1])
+    np.testing.assert_allclose(found.poses[kept], solved.poses[:-1], atol=1e-12)
+    np.testing.assert_array_equal(found.w, w)
+    np.testing.assert_array_equal(found.z, [0, 0])                # ranges that are not calibrated
+    expected = odometry.dead_reckoning(
+        dataset.ticks[499:], dataset.vehicle.with_deviation(w), solved.poses[last], "arc")
+    later = whole.frame > 499
+    np.testing.assert_allclose(found.poses[later], expected[whole.frame[later] - 499], atol=1e-9)
+
+
+def test_a_point_has_the_heading_variance_of_its_best_sighting_and_few_markers_are_left_out():
+    """Marker 5 is a point; two of three sightings of 6 are rejected, and one of two of 7."""
+    pose, marker = np.arange(7), np.array([5, 5, 6, 6, 6, 7, 7])
+    C = np.tile(1e-4 * np.eye(3), (7, 1, 1))
+    C[:2, 2, 2] = [9.0, 4.0]
+    readings = ArucoReadings(pose, marker, np.tile([1.0, 0, 0], (7, 1)), C)
+    m = measure(Dataset("few", Vehicle(), np.zeros((7, 2), int), readings, None, None))
+    problem = build(m, "arc", Noise())
+    weight = np.array([1, 1, 1, 0, 0, 1, 0.0])
+    problem = replace(problem, measured=replace(problem.measured, weight=weight))
+    blocks = [np.diag([1.0, 2.0]), np.diag([3.0, 4.0, 5.0]), np.diag([6.0, 7.0, 8.0])]
+    mapped, covariance = _mapped(problem, blocks)
+    np.testing.assert_array_equal(m.marker[mapped], [5])
+    np.testing.assert_array_equal(np.diagonal(covariance, axis1=1, axis2=2),
+                                  [[1, 2, 4], [3, 4, 5], [6, 7, 8]])
+    weight[:] = 1
+    np.testing.assert_array_equal(_mapped(problem, blocks)[0], [0, 1, 2])
+
+
+def test_the_scatter_of_residuals_gives_factors_of_at_least_one():
+    """Medians of chi-squared with 3, 2 and 1 degrees of freedom, for poses, points and ranges."""
+    rng = np.random.default_rng(0)
+    dataset, truth = simulate("short", seed=4)
+    noisy = replace(dataset, aruco=replace(dataset.aruco, covariance=dataset.aruco.covariance / 9),
+                    uwb=replace(dataset.uwb, sigma=dataset.uwb.sigma / 4))
+    points = noisy.aruco.covariance.copy()
+    points[:, 2] = points[:, :, 2] = [0, 0, 1e4]
+    points = replace(noisy, aruco=replace(noisy.aruco, covariance=points))
+    quiet = replace(dataset, aruco=replace(dataset.aruco, covariance=9 * dataset.aruco.covariance))
+    for drive, sightings, ranges in ((noisy, 3, 4), (points, 3, 4), (quiet, 1, 1)):
+        m = measure(drive)
+        state = state_from_arrays(
+            m, truth.poses[m.frame], truth.marker_in_world[np.searchsorted(truth.marker, m.marker)],
+            truth.antenna_in_world, rng.normal(size=3))
+        found = noise_of_scatter(m, state)
+        np.testing.assert_allclose([found.sightings, found.ranges], [sightings, ranges], rtol=0.1)
+    few = measure(noisy.first(60))
+    assert 0 < len(few.ranges.row) < FEW < len(few.label)
+    state = state_from_arrays(few, truth.poses[few.frame], truth.marker_in_world[
+        np.searchsorted(truth.marker, few.marker)], truth.antenna_in_world, np.zeros(3))
+    assert noise_of_scatter(few, state).ranges == 1 < noise_of_scatter(few, state).sightings
+
+
+def test_with_a_given_slip_the_covariances_are_those_of_the_files(monkeypatch):
+    """The scatter of the residuals is looked at only where the noise is learned."""
+    class LookedAtError(Exception):
+        pass
+
+    def look(*_):
+        raise LookedAtError
+
+    dataset = simulate("short", seed=4)[0].without("uwb").first(100)
+    before = slam.estimate(dataset, 1e-3, "arc")
+    for module in (robust, fit_module):
+        monkeypatch.setattr(module, "noise_of_scatter", look)
+        for solve_it in (fit_from_odometry, partial(fit_from_previous, previous=before)):
+            given = solve_it(measure(dataset), slip=2e-3)
+            assert given.problem.noise == Noise(2e-3) and given.posterior is None
+            with pytest.raises(LookedAtError):
+                solve_it(measure(dataset))
+        monkeypatch.undo()
+
+
+def test_gates_of_poses_points_and_ranges():
+    """Residuals just below and above the gates; a range may be too long by any number of sigmas."""
+    C = np.tile(1e-4 * np.eye(3), (4, 1, 1))
+    C[2:, 2, 2] = 1e4
+    z = np.array([[1.0, 0, 0], [1, 0, 0], [1, 0, 0], [1, 0, 0]])
+    z[:, 0] += 0.01 * np.sqrt([16.2, 16.3, 13.8, 13.9])
+    readings = ArucoReadings(np.zeros(4, int), np.arange(4), z, C)
+    ranges = UwbReadings(np.zeros(3, int), np.zeros(3, int), 5 + 0.1 * np.array([-3.2, -3.4, 50]),
+                         np.full(3, 0.1))
+    m = measure(Dataset("gates", Vehicle(), np.zeros((1, 2), int), readings, ranges,
+                        AntennaGuess(np.zeros(1, int), np.array([[3.0, 4.0]]))))
+    state = state_from_arrays(m, np.zeros((1, 3)), np.tile([1.0, 0, 0], (4, 1)), [[3.0, 4.0]],
+                              np.zeros(3))
+    problem = build(m, "arc", Noise())
+    np.testing.assert_array_equal(accepted(problem, state).weight, [1, 0, 1, 0, 1, 0, 1])
+    wider = replace(problem, noise=Noise(sightings=1.1, ranges=1.1))
+    np.testing.assert_array_equal(accepted(wider, state).weight, 1)
+    np.testing.assert_array_equal(within_gates(problem, state, 3.3, 10.0), [1, 0, 1, 0, 1, 0, 0])
+
+
+@pytest.mark.parametrize("true, other", [("arc", "euler"), ("euler", "arc")])
+def test_the_evidence_chooses_the_steps_that_the_vehicle_drives(true, other):
+    """Without slip; the measurements and their weights stay those of the fit."""
+    dataset, truth = simulate("short", seed=3, noise=False)
+    a, rng = dataset.aruco, np.random.default_rng(0)
+    poses = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model=true)
+    z = se2.between(poses[a.pose],
+                    truth.marker_in_world[np.searchsorted(truth.marker, a.marker)])
+    z += (np.linalg.cholesky(a.covariance) @ rng.normal(size=(len(z), 3, 1)))[..., 0]
+    drive = replace(dataset, uwb=None, aruco=replace(a, marker_in_vehicle=z))
+    m = measure(drive.first(1000))
+    right, wrong = (fit_from_odometry(m, 1e-4, model) for model in (true, other))
+    assert better_model(right, other, 1e-4) is right
+    found = better_model(wrong, true, 1e-4)
+    assert found.problem.odometry.model == true
+    assert found.log_evidence > wrong.log_evidence + DECISIVE
+    np.testing.assert_array_equal(found.problem.measured.weight, wrong.problem.measured.weight)
 
 
 def test_headings_are_continuous_where_frames_are_rounds_apart():

@@ -8,16 +8,18 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import A, X
 from numeric import central_differences, decided
+from scipy.integrate import quad
 
 from slamlib import slam, studies
-from slamlib.dataset import AntennaGuess, Dataset, UwbReadings, Vehicle
+from slamlib.dataset import AntennaGuess, ArucoReadings, Dataset, UwbReadings, Vehicle
 from slamlib.evaluation import align, ate, nees_band
 from slamlib.odometry import dead_reckoning
-from slamlib.se2 import compose
+from slamlib.se2 import between, compose
 from slamlib.simulation import manoeuvre, simulate
-from slamlib.slam import errors
+from slamlib.slam import doubts, errors
 from slamlib.slam.doubts import MAX_LOG_ODDS
 from slamlib.slam.estimate import fit_from_previous
+from slamlib.slam.evidence import consistency
 from slamlib.slam.initialization import odometry_state
 from slamlib.slam.linear_factors import range_factors
 from slamlib.slam.measurement_factors import MeasurementFactors
@@ -26,6 +28,9 @@ from slamlib.slam.noise import Noise
 from slamlib.slam.normal_equations import NormalEquations
 from slamlib.slam.optimizer import optimize
 from slamlib.slam.problem import build
+from slamlib.slam.range_calibration import calibrated
+from slamlib.slam.result import chi2_per_dof
+from slamlib.slam.robust import LATE_KERNEL
 from slamlib.slam.state import state_from_arrays
 from slamlib.slam.trilateration import (
     GUESS_PRIOR_SIGMA,
@@ -117,6 +122,34 @@ def test_an_error_of_one_sigma_costs_one_half():
     assert NormalEquations(build(m, "arc", Noise()), state).error < 1e-12
     cost = NormalEquations(build(off, "arc", Noise()), state).error
     assert np.isclose(cost, len(off.ranges.row) / 2)
+
+
+def test_chi_squared_over_its_degrees_of_freedom_by_hand():
+    """Each of r ranges is off by one sigma, and the antenna takes two: r / (r - 2).
+
+    Of the weighted ones it is r/4 / (r/4 - 2). Then three markers are seen once each, which take
+    what their sightings give. One is seen once more, and one, a point, twice more, off by one sigma
+    along x: they add three and four degrees of freedom and a squared error of two.
+    Wheel errors of one and two sigmas add five; they move these poses by nanometres.
+    """
+    place = np.array([3.0, 4.0])
+    dataset, poses = drive([(2.0, 1.0)], place, place)
+    off = replace(dataset.uwb, range=dataset.uwb.range + dataset.uwb.sigma)
+    at, r = off.pose[[0, 3, 5, 8, 9, 10]], len(off.pose)
+    marker, in_world = np.array([0, 1, 1, 2, 2, 2]), np.array([[1, 1, 0.5], [2, 0, 1], [1, -1, 0]])
+    z = between(poses[at], in_world[marker])
+    C = np.tile(np.diag([4e-4, 1e-4, 1e-4]), (6, 1, 1))
+    C[3:, 2, 2] = 1e4
+    z[4:, 0] += 0.02
+    for aruco, chi2, freedom in ((None, 0, 0), (ArucoReadings(at, marker, z, C), 2, 3 + 2 * 2)):
+        m = measure(replace(dataset, uwb=off, aruco=aruco))
+        problem = build(m, "arc", Noise(sightings=5.0, ranges=7.0))       # which do not count
+        state = state_from_arrays(m, poses[m.frame], in_world[:len(m.marker)],
+                                  place[None], np.array([1.0, -2.0, 0.0]))
+        share = np.r_[np.ones(len(m.label)), np.full(r, 0.25)]
+        for weight, ranges in ((m.unit_weights, r), (share, r / 4)):
+            assert np.isclose(chi2_per_dof(problem, state, weight),
+                              (ranges + chi2 + 5) / (ranges - 2 + freedom), rtol=1e-4)
 
 
 @pytest.mark.parametrize("name", ["asymmetric Cauchy", "asymmetric Tukey"])
@@ -335,6 +368,18 @@ def test_trilateration_finds_both_mirror_places():
     assert costs[0] == 0 and 0 < costs[1] < MAX_LOG_ODDS
 
 
+def test_places_within_a_fifth_of_the_distance_are_one():
+    """A path of one metre and its antenna 20 m ahead, to one side; its mirror image is as far."""
+    path = np.column_stack([np.linspace(0, 1, 30), np.zeros(30)])
+    place = np.array([20.0, 1.0])
+    ranges = AntennaRanges(path, np.hypot(*(path - place).T), np.full(30, 1e-4), place)
+    places, costs = trilaterate(ranges)
+    np.testing.assert_allclose(places[0], place, atol=0.1)
+    assert (costs[1:] > 3).all()                          # the mirror image is 2 m away, the same
+    apart = np.hypot(*(places[:, None] - places).reshape(-1, 2).T)
+    assert ((apart == 0) | (apart > 0.2 * 19.5)).all()
+
+
 def test_second_moment_is_the_sum_over_the_places_of_the_grid():
     """Every place by itself, from the definition: Cauchy likelihood, guess, area of the cell."""
     ranges, estimate = line_of_ranges(5), np.array([2.9, 4.2])
@@ -372,6 +417,91 @@ def test_problem_4_reports_the_down_weighted_ranges():
     assert solution.title == "SLAM: odometry + ArUco + UWB"
     assert solution.uwb_map[1].shape == (4, 2)
     assert problem4(dataset.without("aruco")).aruco_map is None
+
+
+def test_ranges_carry_the_uncertainty_of_the_place_they_were_measured_from():
+    """sigma^2 is that of the range plus the mean variance of the vehicle's x and y."""
+    dataset, poses = drive([(2.0, 1.0)], np.array([3.0, 4.0]), (3.5, 4.0), every=50)
+    m = measure(dataset)
+    variance = 1e-4 * np.arange(len(m.frame))
+    C = np.zeros((len(m.frame), 3, 3))
+    C[:, 0, 0], C[:, 1, 1], C[:, 2, 2] = variance, 3 * variance, 9.0
+    ranges, = ranges_by_antenna(m, poses[m.frame], C)
+    np.testing.assert_allclose(ranges.sigma**2, 0.05**2 + 2 * variance[m.ranges.row])
+    np.testing.assert_allclose(ranges.positions, poses[dataset.uwb.pose, :2])
+    np.testing.assert_array_equal(ranges.distance, dataset.uwb.range)
+    np.testing.assert_array_equal(ranges.guess, [3.5, 4.0])
+
+
+def test_of_many_ranges_at_most_150_are_used_evenly_from_the_first_to_the_last():
+    for count in (1, 150):
+        ranges = line_of_ranges(count)
+        np.testing.assert_array_equal(ranges.evenly_chosen().positions, ranges.positions)
+    for count in (151, 1000):
+        ranges = line_of_ranges(count)
+        few = ranges.evenly_chosen()
+        rows = np.searchsorted(ranges.positions[:, 0], few.positions[:, 0])
+        assert len(rows) == 150 and rows[0] == 0 and rows[-1] == count - 1
+        assert np.ptp(np.diff(rows)) <= 1
+        np.testing.assert_array_equal(few.distance, ranges.distance[rows])
+        assert len(few.sigma) == 150
+
+
+def test_an_antenna_is_known_by_its_ranges_across_the_worst_direction():
+    """Four ranges of 0.1 m from two directions at right angles, one weighing a quarter.
+
+    The information is 2 / 0.01 along y and 1.25 / 0.01 along x. Without the second direction only
+    the guess is left there: 5 m.
+    """
+    positions = np.array([[0.0, 0], [0, 10], [4, 5], [-4, 5]])
+    ranges = AntennaRanges(positions, np.array([5.0, 5, 4, 4]), np.full(4, 0.1), np.zeros(2))
+    own = doubts._own_sigma(ranges, np.array([0.0, 5.0]), np.array([1, 1, 1, 0.25]))
+    assert np.isclose(own, 0.1 / np.sqrt(1.25))
+    own = doubts._own_sigma(ranges, np.array([0.0, 5.0]), np.array([1.0, 1, 0, 0]))
+    assert np.isclose(own, 5.0)
+
+
+@pytest.mark.parametrize("weight, said", [
+    (np.ones(40), None), (np.repeat([1.0, 0.4], [21, 19]), None),
+    (np.repeat([1.0, 0.4], [19, 21]), "21 of its 40 ranges disagree"),
+    (np.repeat([1.0, 0.4], [4, 36]), "only 4 of its 40 ranges agree"),
+    (np.repeat([1.0, 0.0], [5, 35]), "35 of its 40 ranges disagree")])
+def test_an_antenna_is_doubted_if_most_of_its_ranges_disagree(weight, said):
+    angle = np.linspace(0, 5, 40)
+    path = 2 * np.column_stack([np.cos(angle), np.sin(angle)])
+    place = np.array([3.0, 4.0])
+    ranges = AntennaRanges(path, np.hypot(*(path - place).T), np.full(40, 0.05), place + 0.2)
+    assert doubts._doubt(ranges, place, weight) == said
+    coarse = replace(ranges, sigma=np.full(40, 1.0))
+    if said is None:                                      # sigma 0.2 m or so: above 2.5 % of 5 m
+        assert "too few or come from too few" in doubts._doubt(coarse, place, weight)
+
+
+def test_a_kernel_takes_a_known_part_of_the_variance():
+    """The integral of r^2 w(r) phi(r) over that of w(r) phi(r); without a kernel it is 1."""
+    assert consistency(None) == 1
+    for kernel in (LATE_KERNEL, gtsam.noiseModel.mEstimator.Cauchy.Create(3.0)):
+        def weighted(r, power, of=kernel):
+            return r**power * of.weight(r) * np.exp(-r**2 / 2)
+
+        below, above = (quad(weighted, -8, 8, (power,))[0] for power in (0, 2))
+        assert 0.5 < consistency(kernel) < 1
+        assert np.isclose(consistency(kernel), above / below, rtol=1e-4)
+
+
+def test_an_offset_of_the_ranges_is_kept_unless_the_evidence_excludes_it():
+    """Five metres exclude no offset, twenty do; one of a metre is kept. Without ranges, none is."""
+    for offset, poses, kept in ((0.0, 500, True), (0.0, 2000, False), (1.0, 2000, True)):
+        dataset = simulate("short", seed=61)[0].first(poses)
+        dataset = replace(dataset, uwb=replace(dataset.uwb, range=dataset.uwb.range + offset))
+        before = slam.estimate(dataset.without("uwb"), 1e-3, "arc")
+        fit = fit_from_previous(measure(dataset), before, 1e-3)
+        found = calibrated(fit, 1e-3)
+        assert (found is not fit) == found.problem.measurements.calibrated == kept
+    assert abs(found.state.range_calibration[0] - offset) < 0.3
+    assert found.log_evidence > fit.log_evidence + 10
+    without = fit_from_previous(measure(dataset.without("uwb")), before, 1e-3)
+    assert calibrated(without, 1e-3) is without
 
 
 def test_places_are_minima_of_the_cost():

@@ -171,7 +171,7 @@ def _some(pairs):
 def _increment_of_two_points(p1, q1, p2, q2):
     """Delta from the positions (n, 2) of two markers: direction p to q and midpoint coincide."""
     d1, d2 = q1 - p1, q2 - p2
-    turn = se2.wrap(np.arctan2(d1[:, 1], d1[:, 0]) - np.arctan2(d2[:, 1], d2[:, 0]))
+    turn = np.arctan2(d1[:, 1], d1[:, 0]) - np.arctan2(d2[:, 1], d2[:, 0])
     shift = (p1 + q1) / 2 - np.einsum("nij,nj->ni", se2.rotation(turn), (p2 + q2) / 2)
     return np.column_stack([shift, turn])
 
