@@ -65,8 +65,7 @@ def range_units(dataset):
     if dataset.uwb is None or dataset.antenna_guess is None:
         return []
     path, antennas = path_and_antennas(dataset)
-    extent = np.hypot(*path.std(axis=0))
-    if not antennas or extent < SMALLEST_EXTENT:
+    if not antennas or (extent := np.hypot(*path.std(axis=0))) < SMALLEST_EXTENT:
         return []
     # Between the quartiles lie 1.35 standard deviations of a normal distribution.
     spread = np.median([np.subtract(*np.percentile(r, [75, 25])) / 1.35 for _, r, _ in antennas])

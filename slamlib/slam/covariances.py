@@ -71,7 +71,9 @@ def selected_inverse(H, frames, pairs, blocks):
     while below:                                        # parts, and the covariances of their fronts
         part, front_covariance = below.pop()
         cross = -part.W @ front_covariance
-        joint = np.block([[part.inverse - cross @ part.W.T, cross], [cross.T, front_covariance]])
+        own = part.inverse - cross @ part.W.T
+        # Rounding is relative to the largest entry: it would make pose 1's covariance asymmetric.
+        joint = np.block([[(own + own.T) / 2, cross], [cross.T, front_covariance]])
         with _places(graph.local, part.rows, part.front) as local:
             if not part.parts:
                 at = local[pairs[part.pairs]]
