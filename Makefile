@@ -71,5 +71,5 @@ bench bench-large: $(READY)
 		echo; done
 
 clean:
-	rm -rf $(VENV) report results build slamlib.egg-info .pytest_cache .ruff_cache
+	rm -rf $(VENV) report results build slamlib.egg-info .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

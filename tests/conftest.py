@@ -9,10 +9,16 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):  # as notebooks have it
     os.environ.setdefault(name, "1")
 os.environ.pop("SLAMLIB_STUDIES", None)
+
+settings.register_profile("short", derandomize=True, deadline=None, database=None, max_examples=40)
+settings.register_profile("long", deadline=None, database=None, max_examples=2000,
+                          print_blob=True)
+settings.load_profile("short")           # another one by `pytest --hypothesis-profile=NAME`
 
 ROOT = Path(__file__).parents[1]
 STUDY_SEEDS = "2"            # in pages that tests build: their claims are tested on more drives

@@ -19,9 +19,8 @@ RANGE_SPREAD = 0.7
 def path_and_antennas(dataset):
     """The first part of odometry's path (p, 2) in m, and what was measured on it.
 
-    It ends where the heading's standard deviation by odometry exceeds MAX_HEADING_SIGMA, which may
-    be at pose 1. Of every antenna with MIN_RANGES ranges there is a tuple: poses (m,), ranges (m,)
-    and its guess (2,), m.
+    It ends where the heading's standard deviation by odometry exceeds MAX_HEADING_SIGMA. Of every
+    antenna with MIN_RANGES ranges there is a tuple: poses (m,), ranges (m,) and its guess (2,), m.
     """
     poses, covariances = odometry.first_order(dataset.ticks, dataset.vehicle, model="arc")
     lost = np.flatnonzero(covariances[:, 2, 2] > MAX_HEADING_SIGMA**2)
@@ -66,8 +65,7 @@ def range_units(dataset):
     if dataset.uwb is None or dataset.antenna_guess is None:
         return []
     path, antennas = path_and_antennas(dataset)
-    extent = np.hypot(*path.std(axis=0)) if antennas else 0.0
-    if extent < SMALLEST_EXTENT:
+    if not antennas or (extent := np.hypot(*path.std(axis=0))) < SMALLEST_EXTENT:
         return []
     # Between the quartiles lie 1.35 standard deviations of a normal distribution.
     spread = np.median([np.subtract(*np.percentile(r, [75, 25])) / 1.35 for _, r, _ in antennas])

@@ -18,7 +18,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import csc_array
 
+from slamlib import se2
+from slamlib.dataset import DatasetError
+
 LEAF = 12                    # frames between separators
+MAX_ROUNDING = 0.05          # of the information about the heading at pose 1
 
 
 @dataclass(frozen=True)
@@ -33,7 +37,10 @@ class Covariances:
 
 
 def covariances(equations, noise):
-    """The Covariances of a Noise by NormalEquations at the State that solves the problem."""
+    """The Covariances of a Noise by NormalEquations at the State that solves the problem.
+
+    Raises DatasetError where rounding hides what is known of the heading at pose 1.
+    """
     m, rows = equations.problem.measurements, equations.structure.rows
     f, k, a = len(m.frame), len(m.marker), len(m.antenna)
     frames, w = rows(np.arange(f), 3), rows([m.wheels], 3)
@@ -42,11 +49,46 @@ def covariances(equations, noise):
         + [*rows(f + k + np.arange(a), 2), w[0]]
     if m.calibrated:
         landmarks.append(rows([m.wheels + 1], 2)[0])
-    of_pairs, blocks = selected_inverse(
-        equations.structure.matrix(equations.sums(noise)[0]), frames, pairs, landmarks)
+    H = equations.structure.matrix(equations.sums(noise)[0])
+    _require_digits(equations, H)
+    of_pairs, blocks = selected_inverse(H, frames, pairs, landmarks)
     return Covariances(
         pairs=of_pairs, markers=blocks[:k], antennas=np.reshape(blocks[k:k + a], (-1, 2, 2)),
         z=blocks[-1] if m.calibrated else np.zeros((2, 2)), w=blocks[k + a])
+
+
+def _require_digits(equations, H):
+    """Raise DatasetError where rounding in the information matrix H hides the prior of the heading.
+
+    If all poses and landmarks turn together about pose 1, no measurement changes: only the priors
+    have information about it. What H has beyond theirs is rounding.
+    """
+    turn = _common_turn(equations.problem.measurements, equations.state)
+    rounding = turn @ (H @ turn) - equations.of_priors @ turn**2
+    m, sigma = equations.problem.measurements, equations.problem.measurements.origin_sigma[2]
+    if abs(rounding) * sigma**2 > MAX_ROUNDING:
+        raise DatasetError(
+            f"{m.dataset.name}: expected measurements beside which sigma_heading = {sigma:g} rad "
+            "(vehicle.toml, or table 2) is not lost in rounding; their standard deviations are too "
+            "small for it")
+
+
+def _common_turn(m, state):
+    """How the unknowns (n,) change per rad by which poses and landmarks turn about the origin."""
+    f, k, rows = len(m.frame), len(m.marker), m.structure.rows
+    turn = np.empty(len(m.structure.diagonal))
+    turn[rows([m.wheels], 3)] = 0
+    if m.calibrated:
+        turn[rows([m.wheels + 1], 2)] = 0
+    for first, poses, width in (
+            (0, state.poses, np.full(f, 3)), (f, state.markers, 2 + m.oriented),
+            (f + k, np.pad(state.antennas, ((0, 0), (0, 1))), np.full(len(m.antenna), 2))):
+        moved = se2.compose_jacobians(np.zeros(3), poses)[0][..., 2]
+        moved[:, :2] = (se2.rotation(-poses[:, 2]) @ moved[:, :2, None])[..., 0]     # own axes
+        for each in (2, 3):
+            of_width = np.flatnonzero(width == each)
+            turn[rows(first + of_width, each)] = moved[of_width, :each]
+    return turn
 
 
 def selected_inverse(H, frames, pairs, blocks):
@@ -71,7 +113,9 @@ def selected_inverse(H, frames, pairs, blocks):
     while below:                                        # parts, and the covariances of their fronts
         part, front_covariance = below.pop()
         cross = -part.W @ front_covariance
-        joint = np.block([[part.inverse - cross @ part.W.T, cross], [cross.T, front_covariance]])
+        own = part.inverse - cross @ part.W.T
+        # Rounding is relative to the largest entry: it would make pose 1's covariance asymmetric.
+        joint = np.block([[(own + own.T) / 2, cross], [cross.T, front_covariance]])
         with _places(graph.local, part.rows, part.front) as local:
             if not part.parts:
                 at = local[pairs[part.pairs]]

@@ -69,6 +69,11 @@ class NormalEquations:
                 squared += ratio * group.squared
         return H, g, squared, log_determinant
 
+    @property
+    def of_priors(self):
+        """What the priors add to the diagonal (n,) of H."""
+        return self._priors.H
+
     def counts(self):
         """Numbers of accepted errors of sightings and of ranges."""
         poses, points, ranges = (f.e.shape[1] * np.sum(f.weight) for f in self.factors)

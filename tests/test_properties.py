@@ -1,0 +1,393 @@
+"""Properties of all legal input: files of any bytes, small drives of any kind, and changed drives.
+
+`pytest --hypothesis-profile=long tests/test_properties.py` tries many more, other ones every time.
+"""
+
+import json
+import sys
+import tempfile
+from collections import Counter
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_dataset import FILES, write
+
+from slamlib import localization, odometry, se2, slam
+from slamlib.dataset import DatasetError, Vehicle, read_dataset, read_truth
+from slamlib.localization.units import range_units
+from slamlib.simulation import simulate
+from slamlib.slam.covariances import covariances
+from slamlib.slam.estimate import fit_from_odometry
+from slamlib.slam.measurements import measure
+from slamlib.solve import Failure, doubts_about_drive, solutions
+from slamlib.summary import summarize
+
+COUNTS = st.one_of(st.just(0), st.sampled_from([127, -127, 1, 2000]), st.integers(-300, 300))
+LEGS = st.one_of(                                  # (steps, right and left counts of each)
+    st.tuples(st.integers(1, 30), COUNTS).map(lambda leg: (*leg, leg[1])),      # straight
+    st.tuples(st.integers(1, 30), COUNTS).map(lambda leg: (*leg, -leg[1])),     # on the spot
+    st.tuples(st.integers(1, 30), COUNTS, COUNTS))
+IDS = st.one_of(st.integers(0, 50), st.sampled_from([-7, 10**12, -10**12, 10**12 + 1]))
+VEHICLES = st.builds(
+    Vehicle, right_radius=st.sampled_from([0.1, 0.101, 0.02, 0.5]),
+    left_radius=st.sampled_from([0.1, 0.099, 0.02, 0.5]), wheelbase=st.sampled_from([0.4, 0.05, 2]),
+    sigma_right_radius=st.sampled_from([1e-4, 1e-6, 5e-3]),
+    sigma_left_radius=st.sampled_from([1e-4, 1e-6, 5e-3]),
+    sigma_wheelbase=st.sampled_from([1e-4, 1e-6, 1e-2]),
+    sigma_heading=st.sampled_from([1e-4, 1e-6, 0.1, 1.0]))
+
+
+@st.composite
+def drives(draw, vehicles=VEHICLES, sensors=None):
+    """Rows of the files of a small legal drive, as a namespace."""
+    vehicle = draw(vehicles)
+    legs = draw(st.lists(LEGS, max_size=4))
+    ticks = np.concatenate([[[0, 0]], *(np.tile(leg[1:], (leg[0], 1)) for leg in legs)])
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    path = odometry.dead_reckoning(
+        ticks, vehicle.with_deviation(rng.normal(size=3)), model="arc")
+    return SimpleNamespace(
+        vehicle=vehicle, ticks=ticks, sightings=draw(sightings(path, rng)),
+        **dict(zip(("ranges", "guesses"), draw(ranges(path, rng)))))
+
+
+def frames(draw, count):
+    """Poses from 0 with measurements: none, one, every k-th."""
+    every = draw(st.sampled_from([None, count, 1, 3, 10]))
+    return np.arange(0 if every is None else count)[draw(st.integers(0, count - 1))::every or 1]
+
+
+@st.composite
+def sightings(draw, path, rng):
+    """Rows (m, 11) of ArucoReading.txt from poses (n, 3)."""
+    seen_from = frames(draw, len(path))
+    many = draw(st.integers(0, 9)) == 9
+    ids = np.arange(300) if many else np.array(
+        draw(st.lists(IDS, min_size=1, max_size=6, unique=True)))
+    marker = np.column_stack([rng.uniform(-3, 3, (len(ids), 2)),
+                              rng.uniform(-np.pi, np.pi, len(ids))])
+    marker[:, :2] += path[rng.integers(len(path), size=len(ids)), :2]
+    share = 0.05 if many else draw(st.sampled_from([1.0, 0.5, 0.1]))
+    frame, which = np.nonzero(rng.uniform(size=(len(seen_from), len(ids))) < share)
+    pose, which = seen_from[frame], rng.permuted(which) if draw(st.booleans()) else which
+    sigma = np.array([*draw(st.sampled_from([(0.005, 0.005), (1e-4, 1e-2), (0.5, 0.5)])), 0])
+    sigma = np.tile(sigma, (len(pose), 1))
+    sigma[:, 2] = rng.choice(draw(st.sampled_from([[0.01], [1e-3], [0.4], [100], [0.01, 100]])),
+                             len(pose))
+    root = np.linalg.cholesky(np.eye(3) + draw(st.sampled_from([0, 0.9])) * (
+        np.ones((3, 3)) - np.eye(3))) * sigma[:, :, None]
+    error = (root @ rng.normal(size=(len(pose), 3, 1)))[..., 0]
+    z = se2.between(path[pose], marker[which]) + draw(st.sampled_from([1, 0, 30])) * error
+    z[:, 2] = se2.wrap(z[:, 2])
+    C = (root @ np.swapaxes(root, 1, 2))[:, *np.triu_indices(3)]
+    return [(int(i) + 1, int(j), *row) for i, j, row in zip(
+        pose, ids[which], np.column_stack([z, C]).tolist())]
+
+
+@st.composite
+def ranges(draw, path, rng):
+    """Rows (m, 4) of UwbReading.txt from poses (n, 3), and (a, 3) of UwbAntennaGuess.txt."""
+    seen_from = frames(draw, len(path))
+    ids = draw(st.lists(IDS, min_size=1, max_size=4, unique=True))
+    antenna = path[rng.integers(len(path), size=len(ids)), :2] + draw(
+        st.sampled_from([0.0, 3.0, 50.0])) * rng.normal(size=(len(ids), 2))
+    guess = antenna + draw(st.sampled_from([0.3, 0.0, 30.0])) * rng.normal(size=(len(ids), 2))
+    frame, which = np.nonzero(rng.uniform(size=(len(seen_from), len(ids))) < draw(
+        st.sampled_from([1.0, 0.3])))
+    pose, sigma = seen_from[frame], draw(st.sampled_from([0.05, 1e-3, 1.0]))
+    late = draw(st.sampled_from([0.0, 5.0])) * (rng.uniform(size=len(pose)) < 0.3)
+    distance = np.hypot(*(antenna[which] - path[pose, :2]).T) + late + sigma * rng.normal(
+        size=len(pose)).clip(-4, 4)
+    return ([(int(i) + 1, ids[k], float(r), sigma) for i, k, r in zip(pose, which, distance)],
+            [(k, *place) for k, place in zip(ids, guess.tolist())])
+
+
+def read(drive):
+    """The Dataset that is read from the files of a drive."""
+    with tempfile.TemporaryDirectory() as folder:
+        written = {"encoderReading.txt": [(i, *row) for i, row in enumerate(
+                       drive.ticks.tolist(), start=1)],
+                   "ArucoReading.txt": drive.sightings, "UwbReading.txt": drive.ranges,
+                   "UwbAntennaGuess.txt": drive.guesses}
+        for name, rows in written.items():
+            Path(folder, name).write_text("".join(
+                " ".join(map(repr, row)) + "\n" for row in rows))
+        Path(folder, "vehicle.toml").write_text("".join(
+            f"{name} = {float(value)!r}\n" for name, value in vars(drive.vehicle).items()))
+        return read_dataset(folder)
+
+
+# The reader: whatever the bytes, a dataset or one sentence.
+
+SMALLEST = 1e-9            # m and rad, sigma of what has none: position of pose 1 in problem 1
+QUICK = settings(max_examples=3 * settings.default.max_examples)
+FEW = settings(max_examples=settings.default.max_examples // 3)
+ROUNDING = 1e-4            # TODO
+CONVERGED = 2e-3
+WORDS = st.one_of(
+    st.integers(-2, 12).map(str), st.floats().map(repr), st.integers().map(str),
+    st.sampled_from(["nan", "1e999", "-0", "1_0", "0x1", "\u0661", "#", "=", "[", "'", "1e-400",
+                     "+1", ".5", "1e15", "\x1c", "\u2028", "\x85", "wheelbase", "sigma_heading"]))
+LINES = st.lists(WORDS, max_size=12).map(" ".join)
+BYTES = st.one_of(st.binary(max_size=50), st.lists(LINES, max_size=5).map(
+    lambda lines: "\n".join(lines).encode()))
+
+
+@st.composite
+def spoilt(draw, text):
+    """The bytes of a text of which a part is replaced by any others."""
+    content = text.encode()
+    begin = draw(st.integers(0, len(content)))
+    end = begin + draw(st.sampled_from([0, 1, 2, 20, len(content)]))
+    return content[:begin] + draw(BYTES) + content[end:]
+
+
+@QUICK
+@given(st.fixed_dictionaries({}, optional={
+    name: st.one_of(st.just(text.encode()), spoilt(text), BYTES) for name, text in FILES.items()}))
+def test_files_of_any_bytes_are_read_or_refused_in_one_sentence(files):
+    with tempfile.TemporaryDirectory() as folder:
+        for name, content in files.items():
+            write(Path(folder, name), content)
+        try:
+            dataset, truth = read_dataset(folder), read_truth(folder)
+        except DatasetError as error:
+            assert str(error).startswith(folder) and str(error).isprintable()
+            assert ": expected " in str(error) and len(str(error)) < 400
+            return
+    arrays = [dataset.ticks, *(array for each in (
+        dataset.aruco, dataset.uwb, dataset.antenna_guess, truth) if each
+        for array in vars(each).values() if isinstance(array, np.ndarray))]
+    assert all(np.isfinite(array).all() for array in arrays)
+    for readings in filter(None, (dataset.aruco, dataset.uwb)):
+        assert (np.diff(readings.pose) >= 0).all() and len(readings.pose)
+        assert 0 <= readings.pose[0] and readings.pose[-1] < len(dataset.ticks)
+
+
+# All problems: estimates with covariances, or a reason that is true.
+
+@given(drives())
+def test_every_small_drive_is_solved(drive):
+    """Estimates are finite with positive definite covariances; what fails, says truly why."""
+    dataset = read(drive)
+    for solution in solutions(dataset):
+        if isinstance(solution, Failure):
+            assert is_true(solution, drive), solution
+            continue
+        json.dumps(summarize(solution, None), allow_nan=False)
+        known = np.isfinite(solution.poses).all(axis=1)
+        assert known.any() and (known.all() or solution.problem == "problem2")
+        assert np.isnan(solution.covariances[~known]).all()
+        least = 0 if solution.problem in ("problem3", "problem4") else -1e-9
+        for C in (solution.covariances[known], *(
+                each[2] for each in (solution.aruco_map, solution.uwb_map) if each is not None)):
+            assert_positive(C, least, solution.problem)
+    for doubt in doubts_about_drive(dataset, None):
+        assert doubt.sentence.endswith(".") and "nan" not in doubt.sentence
+
+
+def is_true(failure, drive):
+    """True of what can be: all sightings contradict each other, or sigmas are too far apart."""
+    if "contradict" in failure.reason:
+        count = Counter(row[:2] for row in drive.sightings)
+        return failure.problem == "problem2" and all(k > 1 for k in count.values())
+    return "lost in rounding" in failure.reason and drive.vehicle.sigma_heading == 1
+
+
+def assert_positive(covariances, least, problem):
+    assert np.isfinite(covariances).all(), problem
+    sigma = np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 1e-30))
+    correlation = covariances / (sigma[:, :, None] * sigma[:, None, :])
+    np.testing.assert_allclose(correlation, np.swapaxes(correlation, 1, 2), 0, 1e-9)
+    if len(covariances):
+        assert np.linalg.eigvalsh(correlation)[:, 0].min() > least, problem
+
+
+def first_heading_unknown(**options):
+    """A drive of 400 poses whose first heading is known to 1 rad."""
+    dataset, _ = simulate("short", 61, **options)
+    return replace(dataset.first(400), vehicle=replace(dataset.vehicle, sigma_heading=1.0))
+
+
+def test_units_are_not_compared_where_the_first_heading_is_unknown():
+    """A warning: no pose was certain enough to be compared with the ranges."""
+    assert range_units(first_heading_unknown()) == []
+
+
+def test_covariances_are_symmetric():
+    """Rounding relative to the heading's variance exceeded that of pose 1's position."""
+    fit = fit_from_odometry(measure(first_heading_unknown()), slip=1e-3)
+    found = covariances(fit.equations, fit.problem.noise).pairs
+    np.testing.assert_array_equal(found, np.swapaxes(found, 1, 2))
+
+
+def test_a_heading_that_is_lost_in_rounding_is_told():
+    """Its variance was negative: sightings of 50 nm beside a first heading of 1 rad."""
+    dataset = first_heading_unknown(noise=False).without("uwb")
+    seen = dataset.aruco
+    with pytest.raises(DatasetError, match="sigma_heading = 1 rad .* lost in rounding"):
+        slam.estimate(replace(dataset, aruco=replace(seen, covariance=1e-10 * seen.covariance)))
+
+
+# Changes of a drive that change nothing but what they must.
+
+
+def solved(dataset, slip=None):
+    """By problem, a list of what was estimated: ids (m,), values (m, d), covariances (m, d, d)."""
+    pose, found = np.arange(len(dataset.ticks)), {}
+    found["problem1"] = [(pose, *odometry.equation2(dataset.ticks, dataset.vehicle))]
+    if dataset.aruco is not None:
+        with suppress(DatasetError):                        # all sightings contradict each other
+            each = localization.localize(dataset.aruco)
+            found["problem2"] = [(each.frame, each.poses, each.covariances),
+                                 (each.marker, each.marker_in_world, each.marker_covariance)]
+        for name, each in (("problem2_hint", localization.fuse_increments(dataset)),
+                           ("problem2_fused", localization.fuse(dataset, slip))):
+            found[name] = [(pose, each.poses, each.covariances)]
+    for name, sensors in (("problem3", dataset.without("uwb")), ("problem4", dataset)):
+        if sensors.aruco is not None or sensors.uwb is not None:
+            each = slam.estimate(sensors, slip)
+            found[name] = [(pose, each.poses, each.covariances),
+                           (each.marker, each.marker_in_world, each.marker_covariance),
+                           (each.antenna, each.antenna_in_world, each.antenna_covariance)]
+    return found
+
+
+def assert_same(before, after, tolerance, numbers=None, factor=(1, 1, 1)):
+    """Estimates differ by `tolerance` sigmas, covariances by as much of a product of sigmas.
+
+    After the change, what had the id `i` has the id `numbers[i]`, and values [x, y, heading] are
+    multiplied by `factor`.
+    """
+    assert before.keys() == after.keys()
+    for problem, kinds in before.items():
+        for k, ((ids, x, C), (other_ids, other, other_C)) in enumerate(
+                zip(kinds, after[problem], strict=True)):
+            expected = ids if k == 0 or numbers is None else np.array([*map(numbers.get, ids)], int)
+            order = np.argsort(expected)
+            np.testing.assert_array_equal(expected[order], other_ids)
+            by = np.array(factor[:x.shape[1]])
+            off = other / by - x[order]
+            off[:, 2:] = se2.wrap(off[:, 2:])
+            sigma = np.sqrt(np.diagonal(C[order], axis1=1, axis2=2)) + SMALLEST
+            products = sigma[:, :, None] * sigma[:, None, :]
+            for share in (off / sigma, (other_C / np.outer(by, by) - C[order]) / products):
+                np.testing.assert_allclose(share, 0 * share, 0, tolerance, err_msg=problem)
+
+
+def renumbered(drive, ids):
+    """The drive with other ids, from a dict."""
+    return SimpleNamespace(**{**vars(drive), **{
+        name: [(row[0], ids[row[1]], *row[2:]) for row in getattr(drive, name)]
+        for name in ("sightings", "ranges")},
+        "guesses": [(ids[row[0]], *row[1:]) for row in drive.guesses]})
+
+
+def reversed_rows(drive):
+    """The drive with the rows of its sensors in the opposite order."""
+    return SimpleNamespace(**{**vars(drive), **{
+        name: getattr(drive, name)[::-1] for name in ("sightings", "ranges", "guesses")}})
+
+
+def mirrored(dataset):
+    """The Dataset of the drive seen in a mirror: y and headings have the other sign."""
+    sign, v = np.array([1, -1, -1]), dataset.vehicle
+    aruco, uwb, guess = dataset.aruco, dataset.uwb, dataset.antenna_guess
+    return replace(
+        dataset, ticks=dataset.ticks[:, ::-1].copy(), vehicle=replace(
+            v, right_radius=v.left_radius, left_radius=v.right_radius,
+            sigma_right_radius=v.sigma_left_radius, sigma_left_radius=v.sigma_right_radius),
+        aruco=aruco and replace(aruco, marker_in_vehicle=aruco.marker_in_vehicle * sign,
+                                covariance=aruco.covariance * np.outer(sign, sign)),
+        uwb=uwb, antenna_guess=guess and replace(guess, position=guess.position * sign[:2]))
+
+
+LENGTHS = {"ORIGIN_SIGMA": 4, "MINIMUM_SIGMA": 4, "GUESS_PRIOR_SIGMA": 4, "MINIMUM_SLIP": 2,
+           "RANGE_SIGMA": np.array([4, 1])}         # factors on constants in m, and in sqrt(m)
+
+
+def in_quarters(dataset):
+    """The Dataset in quarters of a metre."""
+    v, aruco, uwb, guess = dataset.vehicle, dataset.aruco, dataset.uwb, dataset.antenna_guess
+    length = np.array([4, 4, 1])
+    return replace(
+        dataset, vehicle=replace(v, **{name: 4 * getattr(v, name) for name in (
+            "right_radius", "left_radius", "wheelbase", "sigma_right_radius", "sigma_left_radius",
+            "sigma_wheelbase")}),
+        aruco=aruco and replace(aruco, marker_in_vehicle=aruco.marker_in_vehicle * length,
+                                covariance=aruco.covariance * np.outer(length, length)),
+        uwb=uwb and replace(uwb, range=4 * uwb.range, sigma=4 * uwb.sigma),
+        antenna_guess=guess and replace(guess, position=4 * guess.position))
+
+
+def constants_in_quarters(patch):
+    """Constants of slamlib that are lengths, in quarters of a metre, wherever they are imported."""
+    for module in [each for name, each in sys.modules.items() if name.startswith("slamlib.")]:
+        for name, factor in LENGTHS.items():
+            if hasattr(module, name):
+                patch.setattr(module, name, getattr(module, name) * factor)
+
+
+def begun_by(leg, dataset):
+    """The Dataset of a drive that begins elsewhere: with `leg`, (steps, right and left counts)."""
+    ticks = np.concatenate([[[0, 0]], np.tile(leg[1:], (leg[0], 1))])
+    first = odometry.dead_reckoning(ticks, dataset.vehicle, model="arc")[-1]
+    aruco, uwb, guess = dataset.aruco, dataset.uwb, dataset.antenna_guess
+    return replace(
+        dataset, ticks=np.concatenate([ticks, dataset.ticks[1:]]),
+        aruco=aruco and replace(aruco, pose=aruco.pose + leg[0]),
+        uwb=uwb and replace(uwb, pose=uwb.pose + leg[0]),
+        antenna_guess=guess and replace(guess, position=se2.compose(
+            first, np.pad(guess.position, ((0, 0), (0, 1))))[:, :2]))
+
+
+@FEW
+@given(drives(), st.integers(0, 2**32 - 1))
+def test_ids_and_the_order_of_rows_are_names_only(drive, seed):
+    ids = sorted({row[1] for row in drive.sightings} | {row[0] for row in drive.guesses})
+    rng = np.random.default_rng(seed)
+    numbers = dict(zip(ids, rng.choice(3 * len(ids), len(ids), replace=False).tolist()))
+    other = read(reversed_rows(renumbered(drive, numbers)))
+    assert_same(solved(read(drive)), solved(other), ROUNDING, numbers)
+
+
+@FEW
+@given(drives())
+def test_a_drive_in_a_mirror_has_mirrored_estimates(drive):
+    dataset = read(drive)
+    assert_same(solved(dataset), solved(mirrored(dataset)), ROUNDING, factor=(1, -1, -1))
+
+
+@FEW
+@given(drives())
+def test_the_unit_of_length_is_a_convention(drive):
+    """The slip is given: what is learned of it begins at its prior, which is a length."""
+    dataset = read(drive)
+    before = solved(dataset, slip=1e-3)
+    with pytest.MonkeyPatch.context() as patch:
+        constants_in_quarters(patch)
+        after = solved(in_quarters(dataset), slip=2e-3)
+    assert_same(before, after, ROUNDING, factor=(4, 4, 1))
+
+
+@FEW
+@given(drives())
+def test_the_world_may_begin_at_another_pose(drive):
+    """Pose 1 of the drive, seen from two places from which the vehicle gets there."""
+    dataset, steps = read(drive), 10
+    own, *others = (solved(each) for each in (dataset, begun_by((steps, 127, 127), dataset),
+                                              begun_by((steps, 300, -250), dataset)))
+
+    def relative(found, problem):
+        (pose, _, C), (_, x, _) = own[problem][0], found[problem][0]
+        return [(pose, se2.between(x[steps], x[steps:]), C)]
+
+    problems = own.keys() - {"problem2", "problem2_hint"}
+    assert_same(*({each: relative(found, each) for each in problems} for found in others),
+                CONVERGED)
