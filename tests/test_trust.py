@@ -219,13 +219,14 @@ def visit(named, server, chromium, tmp_path):
         path.write_text(text.replace("PORT", str(server.server_port)), encoding="utf-8")
         page.goto(path.as_uri(), wait_until="load")
         page.wait_for_timeout(50)
+        titles = [page.title()]                 # a click may lead to a page without a title
         away = page.url != path.as_uri() or page.evaluate("document.baseURI") != page.url
         if not away:
             page.evaluate("""() => document.querySelectorAll("main :is(a, button)").forEach(e =>
                 !/^[^:]*$|html|pdf|mat$/.test(e.getAttribute("href") ?? "x:") && e.dispatchEvent(
                     new MouseEvent("click", {bubbles: true, cancelable: true})))""")
             page.wait_for_timeout(50)
-        ran = page.title() == "ran"
+        ran = "ran" in [*titles, page.title()]
         page.close()
         return ["ran"] * ran + ["away"] * away + ["asked"] * bool(server.asked)
 
