@@ -36,11 +36,13 @@ def path(tmp_path_factory):
 def page(request, path, chromium):
     scheme, width = request.param
     context = chromium.new_context(viewport={"width": width, "height": 800}, color_scheme=scheme)
-    page = context.new_page()
+    page, said = context.new_page(), []
+    page.on("console", lambda message: said.append(message.text))
     page.goto(path.as_uri())
     page.scheme = scheme
     yield page
     context.close()
+    assert said == []  # such as what the page's policy refuses
 
 
 def brightness(page, selector, name):

@@ -5,6 +5,7 @@ from slamlib.notebook.means import decided, mean_and_error, number, share, verdi
 from slamlib.notebook.show import (
     Drive,
     captioned,
+    code,
     interactive,
     listed,
     plain,
@@ -18,8 +19,7 @@ from slamlib.notebook.show import (
 )
 from slamlib.notebook.solving import delivered, notices, say_doubts, solved, where_possible
 
-__all__ = ["Drive", "answer", "captioned", "decided", "delivered", "interactive", "listed",
+__all__ = ["Drive", "answer", "captioned", "code", "decided", "delivered", "interactive", "listed",
            "mean_and_error", "median_sigmas", "notices", "number", "plain", "result_sentence",
-           "results_folder", "say", "say_doubts", "share", "solved", "start", "table",
-           "table_text", "verdict", "where_possible", "with_error", "with_sensor", "with_truth",
-           "with_unit"]
+           "results_folder", "say", "say_doubts", "share", "solved", "start", "table", "table_text",
+           "verdict", "where_possible", "with_error", "with_sensor", "with_truth", "with_unit"]

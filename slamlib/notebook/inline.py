@@ -13,13 +13,6 @@ from slamlib.notebook import plotting
 REACH = 5.0                    # points, radius of the area around a point that tells its sentence
 LARGEST = 1.4                  # times its size, in which a figure is shown where there is room
 POINTS = "telling"             # id of these areas
-STYLE = """<style>.inline svg { display: block; width: 100%; height: auto; margin: auto;
-  background: #fff; }
-.inline circle { fill: transparent; pointer-events: all; cursor: help; }
-.inline circle:hover { stroke: #000; stroke-width: 0.7; }
-.inline .narrow { display: none; }
-@media screen and (max-width: 40rem) { .inline .wide { display: none; }
-  .inline .narrow { display: block; } }</style>"""
 
 
 def tell(ax, places, sentences, name):
@@ -46,7 +39,7 @@ def outputs(fig, pictures):
     sentences, name = fig.telling
     both = "".join(_svg(_told(compact(pictures[key]), sentences), kind, name)
                    for key, kind in ((plotting.WIDE, "wide"), (plotting.NARROW, "narrow")))
-    return {**pictures, "text/html": f'<figure class="inline">{STYLE}{both}</figure>'}
+    return {**pictures, "text/html": f'<figure class="inline">{both}</figure>'}
 
 
 def compact(svg):

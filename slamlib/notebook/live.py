@@ -21,18 +21,6 @@ from slamlib.notebook.inline import shortened
 
 SVG, LINK = "{http://www.w3.org/2000/svg}", "{http://www.w3.org/1999/xlink}href"
 SIMPLIFY = 0.5                 # points, by which drawn curves may differ from the computed ones
-STYLE = """<style>.live .panels { display: flex; flex-wrap: wrap; background: #fff; }
-.live .panels svg { min-width: min(100%, 17rem); }
-.live .legend { background: #fff; }
-.live .legend svg { display: inline-block; max-width: 100%; margin: 0 0.6em; vertical-align: top; }
-.live svg { stroke-linejoin: round; stroke-linecap: butt; }
-.live form { display: grid; grid-template-columns: auto minmax(6rem, 1fr) 5em; gap: 0.3em 1em;
-  align-items: center; text-align: left; font: 0.86rem/1.5 var(--sans, sans-serif); }
-.live form[hidden] { display: none; }
-.live select { grid-column: 2 / 4; }
-.live label { max-width: 12em; }
-.live .says { margin: 0.6em 0; min-height: 2.6em; font-size: 0.92em; text-align: left; }
-@media print { .live form { display: none; } }</style>"""
 
 
 def live(draw, controls, grid):
@@ -131,10 +119,10 @@ def _html(figures, fields, first):
             f'<form hidden autocomplete="off">{fields}</form><p class="says" role="status">'
             f'{escape(said[first])}</p><div class="panels">{shown}</div>'
             f'<div class="legend" aria-hidden="true">{entries}</div>'
-            f'<template><svg>{"".join(texts)}</svg></template>')
+            f'<div class="parts" hidden><svg>{"".join(texts)}</svg></div>')
     own = f"l{sha256(html.encode()).hexdigest()[:8]}-"
     html = re.sub(r'((?: id|href)="#?|url\(#)', rf"\1{own}", html)
-    return f'<figure class="live" data-live="{data}">{STYLE}{html}</figure>'
+    return f'<figure class="live" data-live="{data}">{html}</figure>'
 
 
 def _parts(fig, definitions):

@@ -2,6 +2,7 @@
 
 import os
 import re
+import unicodedata
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -76,7 +77,7 @@ def results_folder(drive):
 
 def with_truth(drives, lost):
     """The drives that have truth; if some do, a sentence says for which `lost` cannot be shown."""
-    without = [drive.name for drive in drives if drive.truth is None]
+    without = [plain(drive.name) for drive in drives if drive.truth is None]
     if 0 < len(without) < len(drives):
         say(f"*No truth comes with {listed(without)}, so {lost} cannot be shown there.*")
     return [drive for drive in drives if drive.truth is not None]
@@ -88,14 +89,15 @@ def with_sensor(drives, sensor, name):
     If no dataset has it, a simulated short drive replaces them, so that the chapter is complete.
     `name` is what the sensor measures, for the sentence.
     """
-    without = [drive.name for drive in drives if getattr(drive.dataset, sensor) is None]
+    without = [drive for drive in drives if getattr(drive.dataset, sensor) is None]
     if len(without) == len(drives):
         say(f"*No dataset has {name}. This chapter runs on a simulated drive instead and writes no "
             "results.*")
         return [simulated_drive(drives)]
     if without:
-        say(f"*There are no {name} in {listed(without)}: this chapter leaves them out.*")
-    return [drive for drive in drives if drive.name not in without]
+        names = listed([plain(drive.name) for drive in without])
+        say(f"*There are no {name} in {names}: this chapter leaves them out.*")
+    return [drive for drive in drives if drive not in without]
 
 
 def simulated_drive(drives):
@@ -112,8 +114,23 @@ def interactive():
 
 
 def plain(text):
-    """Text (str) with the characters escaped that Markdown would interpret."""
-    return re.sub(r"[^\w\s.,:;/+-]", lambda sign: f"&#{ord(sign[0])};", text)
+    """Text (str) with the characters escaped that Markdown or HTML would interpret.
+
+    Names from folders and files pass it or `code`. A space replaces a control character.
+    """
+    return re.sub(r"[^\w\s.,:;/+-]|(?<![^\W_])_|_(?![^\W_])",
+                  lambda sign: f"&#{ord(sign[0])};", _seen(text))
+
+
+def code(text):
+    """Text (str), such as a path, as code in Markdown, whatever characters it has."""
+    text = _seen(text)
+    fence = "`" * (1 + max(map(len, re.findall("`+", text)), default=0))
+    return f"{fence} {text} {fence}" if len(fence) > 1 else f"`{text}`"
+
+
+def _seen(text):
+    return "".join(" " if unicodedata.category(sign)[0] == "C" else sign for sign in text)
 
 
 def listed(names):

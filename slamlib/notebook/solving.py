@@ -12,7 +12,15 @@ from tqdm import tqdm
 
 from slamlib import solve
 from slamlib.doubt import Doubt
-from slamlib.notebook.show import interactive, listed, plain, results_folder, say, simulated_drive
+from slamlib.notebook.show import (
+    code,
+    interactive,
+    listed,
+    plain,
+    results_folder,
+    say,
+    simulated_drive,
+)
 
 KEY = "slamlib"  # in the metadata of outputs
 RECORDS = {"doubt": Doubt, "failure": solve.Failure}
@@ -105,7 +113,7 @@ def delivered(drives, found):
     for drive, problem in pairs:
         solution = solve.SOLUTIONS[problem](drive.dataset, found[problem][drive.name])
         folder = solve.write(results_folder(drive), solution)
-        yield drive, solution, listed([f"`{file.name}`" for file in sorted(folder.glob("*.mat"))])
+        yield drive, solution, listed([code(file.name) for file in sorted(folder.glob("*.mat"))])
 
 
 def notices(books):

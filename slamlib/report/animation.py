@@ -8,6 +8,7 @@ from hashlib import sha256
 from html import escape
 
 import numpy as np
+from markupsafe import Markup
 from nbformat.v4 import new_code_cell, new_output
 
 from slamlib import evaluation
@@ -44,7 +45,7 @@ STYLE = """.drive svg { display: block; width: 100%; height: auto; }
 def moving(drive):
     """Cells for a SolvedDrive in motion, which the PDF leaves out: a list of one, or of none."""
     html = animation(drive)
-    output = new_output("display_data", {"text/html": html})
+    output = new_output("display_data", {"text/html": Markup(html)})  # a page takes it as it is
     return [new_code_cell(outputs=[output], id="motion",
                           metadata={"tags": [HTML_ONLY]})] if html else []
 

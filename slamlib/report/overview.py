@@ -11,7 +11,7 @@ import numpy as np
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_output
 
 from slamlib import evaluation, odometry
-from slamlib.notebook import listed, median_sigmas, plain, table_text, with_unit
+from slamlib.notebook import code, listed, median_sigmas, plain, table_text, with_unit
 from slamlib.report.animation import moving
 from slamlib.report.chapters import HTML_ONLY
 from slamlib.report.drives import order
@@ -257,8 +257,8 @@ def _file_table(drives, address):
             for drive in drives if str(folder / kind) in drive.files) or "–" for kind in kinds]
         at = next(drive for drive in drives
                   if folder in (PurePath(file).parent for file in drive.files))
-        rows.append([named(folder.name, at.dataset), f"`{folder}`", *links])
-    text = table_text(["problem", "folder", *[f"`{kind}`" for kind in kinds]], rows,
+        rows.append([named(folder.name, at.dataset), code(str(folder)), *links])
+    text = table_text(["problem", "folder", *map(code, kinds)], rows,
                       texts=2 + len(kinds))
     return (f"{text}\n\nTable 2. The files to hand in, MATLAB files with struct arrays, and the "
             "datasets that have them. The path of a file is `results/dataset/folder/file`.")

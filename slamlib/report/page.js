@@ -1,7 +1,7 @@
 // Figures of class "live": show the parts of the values that the controls have.
 for (const figure of document.querySelectorAll("figure.live")) {
   const { states, said } = JSON.parse(figure.dataset.live);
-  const parts = figure.querySelector("template").content.firstElementChild.children;
+  const parts = figure.querySelector(".parts > svg").children;
   const panels = figure.querySelectorAll("svg.panel");
   const form = figure.querySelector("form");
   const controls = [...form.querySelectorAll("input, select")];

@@ -1,39 +1,50 @@
 """Makes HTML pages of executed notebooks, which need no network.
 
 nbconvert makes a page by `page.html` and `page.css`; pandoc converts its formulas to MathML. A page
-with an element of class `live` has the script `page.js`, and no page has another one.
+with an element of class `live` has the script `page.js`, and no page has another one. What comes
+from cells is sanitized; besides, each page has a Content-Security-Policy, which allows this script
+and the build's own styles only.
 """
 
+import base64
 import html
 import re
-import sys
 import xml.etree.ElementTree as ElementTree
-from functools import cache, partial
+from functools import partial
+from hashlib import sha256
 from pathlib import Path
 from urllib.parse import quote, unquote
 
 from jinja2 import pass_context
+from markupsafe import Markup
 from nbconvert import HTMLExporter
+from nbconvert.filters import Highlight2HTML
 from nbconvert.filters.markdown_mistune import IPythonRenderer, MarkdownWithMath
+from traitlets.config import Config
 
 from slamlib.report.chapters import shows_input
 from slamlib.report.execution import NotebookError
 from slamlib.report.formulas import set_formulas
 from slamlib.report.numbering import CAPTION, TAG
+from slamlib.report.sanitize import cleaned, print_once, sanitized
 from slamlib.report.svg import DRAWN, FAMILY, compact
 
 PAGE = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
 STYLE = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
 SCRIPT = Path(__file__).with_name("page.js")  # of what moves; without it the pictures stand still
+SHOWN = ["text/html", "text/markdown", "image/svg+xml", "text/latex", "image/png", "image/jpeg",
+         "text/plain"]  # kinds of outputs, the first is preferred
 ANSWER = re.compile(r"<p><strong>Answer</strong></p>\n?")  # begins the block quote of an answer
 LIVE = re.compile(r'<[^>]*\sclass="(?:[^">]*\s)?live[\s"]')
 MARK = re.compile("\ue000(\\d+)\ue001([.,;:!?)]*)")  # stands for a formula until pandoc converts it
 INTERNAL = re.compile(r"([^:/#]+\.ipynb)?(?:#(.+))?")  # a link to a notebook or an anchor
+IMG = re.compile(r"<img\b", re.IGNORECASE)
 ACCENTS = {"\u0302": "^", "\u0303": "~", "\u0307": "\u02d9", "\u0308": "\u00a8"}
 UPRIGHT = {letter: letter - 104 for letter in range(0x1D468, 0x1D49C)}  # bold italic to bold
-LOADED = re.compile(r"<(?:script|link|iframe|object|embed|base)\b[^>]*"
-                    r"|<[^>]*\s(?:src|srcset|poster|data)\s*=(?![\"']?data:)[^>]*"
-                    r"|@import\b.*|url\((?![\"']?(?:data:|#)).*", re.IGNORECASE)
+OWN_STYLE = re.compile("<style>(.*?)</style>", re.DOTALL)
+CHARSET = '<meta charset="utf-8">'  # the page's first line, which the policy follows
+POLICY = ("default-src 'none'; img-src data:; script-src {}; style-src 'unsafe-inline'; "
+          "style-src-elem {}; base-uri 'none'; form-action 'none'")  # unsafe-inline: attributes
 
 
 def html_pages(books, chapters, code="method"):
@@ -49,22 +60,17 @@ def html_pages(books, chapters, code="method"):
         links += [(source.name, *link) for link in page["links"]]
     for name, text, target, anchor in links:
         if target not in anchors:
-            _print_once(f"{name}: there is no {target}, so '{text}' is not a link")
+            print_once(f"{name}: there is no {target}, so '{text}' is not a link")
         elif anchor not in anchors[target]:
             raise NotebookError(f"{name}: the link '{text}' leads to #{anchor}, "
                                 f"which does not exist in {target}")
     return pages
 
 
-@cache
-def _print_once(sentence):
-    print(sentence, file=sys.stderr)
-
-
 def html_page(source, book, chapters, code="method"):
     """Return the HTML page (str) of an executed book, and a dict of what the renderer collected.
 
-    NotebookError if a formula cannot be converted or the page would load something.
+    NotebookError if a formula cannot be converted, or if a cell holds what pages cannot show.
 
     Parameters
     ----------
@@ -73,7 +79,7 @@ def html_page(source, book, chapters, code="method"):
     code : one of chapters.CODE; "none" leaves out printed text, too.
     """
     page = {"formulas": [], "sections": [], "section": "", "headings": [], "anchors": {},
-            "links": [], "figures": [], "chapters": chapters, "code": code, "style": STYLE,
+            "links": [], "figures": [], "chapters": chapters, "code": code, "styles": [STYLE],
             "file": quote(f"{source.stem}.html"), "notebook": source.name}
     text, resources = EXPORTER.from_notebook_node(
         book, {"metadata": {"path": str(source.parent)}, "page": page})
@@ -84,17 +90,28 @@ def html_page(source, book, chapters, code="method"):
                 for (tex, _), mathml in zip(page["formulas"], converted, strict=True)]
     unbroken = '<span class="keep">{}{}</span>'.format  # no line break before punctuation
     text = MARK.sub(lambda mark: unbroken(formulas[int(mark[1])], mark[2]), text)
-    if loaded := LOADED.search(text):
-        raise NotebookError(f"{source.name}: the page would load a resource: {loaded[0][:100]}")
-    return _with_script(text.replace(f"'{DRAWN}'", FAMILY)), page
+    return _with_policy(text.replace(f"'{DRAWN}'", FAMILY), page["styles"]), page
 
 
-def _with_script(text):
-    """Return a page (str) with the build's own script if it has an element of class `live`."""
-    if not LIVE.search(text) or not SCRIPT.exists():
-        return text
-    before, end, after = text.rpartition("</body>")
-    return f"{before}<script>\n{SCRIPT.read_text(encoding='utf-8')}</script>\n{end}{after}"
+def _with_policy(text, styles):
+    """Return a page (str) with its policy, and with the own script if it has an element to move.
+
+    `styles` are the texts (list of str) of its style elements that the build made.
+    """
+    scripts = []
+    if LIVE.search(text) and SCRIPT.exists():
+        scripts = [f"\n{SCRIPT.read_text(encoding='utf-8')}"]
+        before, end, after = text.rpartition("</body>")
+        text = f"{before}<script>{scripts[0]}</script>\n{end}{after}"
+    policy = POLICY.format(*map(_sources, (scripts, styles)))
+    return text.replace(CHARSET, f'{CHARSET}\n<meta http-equiv="Content-Security-Policy" '
+                                 f'content="{policy}">', 1)
+
+
+def _sources(texts):
+    """Return the sources (str) of a policy that allow scripts or styles of these texts only."""
+    return " ".join(f"'sha256-{base64.b64encode(sha256(text.encode()).digest()).decode()}'"
+                    for text in texts) or "'none'"
 
 
 def formula_error(page, number, reason):
@@ -130,7 +147,8 @@ class Renderer(IPythonRenderer):
         """Return a heading with its anchor; levels 2 and 3 are listed in the contents."""
         anchor = html.escape(self.begin_section(text))
         if level in (2, 3):
-            self.page["headings"].append((level, anchor, re.sub("</?a[^>]*>", "", text)))
+            listed = cleaned(re.sub("</?a[^>]*>", "", text))  # a link in a link
+            self.page["headings"].append((level, anchor, listed))
         return f'<h{level} id="{anchor}">{text}</h{level}>\n'
 
     def begin_section(self, text):
@@ -149,6 +167,14 @@ class Renderer(IPythonRenderer):
             return f"<p>{text}</p>\n"
         anchor = self.anchor(f"{caption[1].lower()}-{caption[2]}")
         return f'<p class="caption" id="{anchor}">{text}</p>\n'
+
+    def block_html(self, text):
+        """Return HTML as it is; nbconvert parses it to embed pictures, and would close its tags."""
+        return super().block_html(text) if IMG.search(text) else f"{text.strip()}\n"
+
+    def inline_html(self, text):
+        """Return a tag as it is, see `block_html`."""
+        return super().inline_html(text) if IMG.search(text) else text
 
     def block_quote(self, text):
         """Return a block quote; the box *Answer* of a chapter has a class."""
@@ -184,16 +210,37 @@ def _corrected(tex, mathml):
     return ElementTree.tostring(math, encoding="unicode", short_empty_elements=False)
 
 
+class _Exporter(HTMLExporter):
+    """Makes pages as nbconvert does, but for its last step, which parses and writes them anew."""
+
+    def from_notebook_node(self, nb, resources=None, **options):
+        return super(HTMLExporter, self).from_notebook_node(nb, resources, **options)
+
+
 @pass_context
 def _markdown_to_html(context, source):
     """Convert Markdown with our Renderer; the template's filter `markdown2html`."""
+    page = context["resources"]["page"]
+    section = page["section"]
     renderer = Renderer(escape=False, embed_images=True,
                         path=context["resources"]["metadata"]["path"],
                         attachments=context.get("cell", {}).get("attachments", {}))
-    renderer.page = context["resources"]["page"]
-    return MarkdownWithMath(renderer=renderer).render(source)
+    renderer.page = page
+    return sanitized(MarkdownWithMath(renderer=renderer).render(source), page["notebook"], section)
 
 
-EXPORTER = HTMLExporter(template_name="basic", raw_template=PAGE,
-                        filters={"markdown2html": _markdown_to_html, "shows_input": shows_input,
-                                 "compact": compact})
+@pass_context
+def _sanitized(context, text):
+    """Return HTML of a cell, sanitized unless this build made it; the template's filter."""
+    page = context["resources"]["page"]
+    if isinstance(text, Markup):  # nothing in a notebook's file can be
+        page["styles"] += OWN_STYLE.findall(text)
+        return text
+    return sanitized(text, page["notebook"], page["section"])
+
+
+EXPORTER = _Exporter(
+    template_name="basic", raw_template=PAGE,
+    config=Config({"NbConvertBase": {"display_data_priority": SHOWN}}),
+    filters={"markdown2html": _markdown_to_html, "shows_input": shows_input, "compact": compact,
+             "sanitized": _sanitized, "highlight_code": Highlight2HTML(pygments_lexer="ipython3")})

@@ -25,6 +25,7 @@ from slamlib.report.execution import NotebookError
 from slamlib.report.formulas import set_formulas
 from slamlib.report.numbering import CAPTION, TAG
 from slamlib.report.pages import ANSWER, MARK, Renderer, formula_error
+from slamlib.report.sanitize import sanitized
 from slamlib.report.setting import PLACES, UNKNOWN, compiled, missing_glyphs, quoted
 from slamlib.report.svg import compact
 
@@ -192,8 +193,12 @@ class _Book:
         """Return Markdown (str) as HTML with marks."""
         renderer = _Renderer(escape=False, embed_images=True, path=str(self.page["path"]),
                              attachments=dict(attachments))
-        renderer.page = self.page
-        return MarkdownWithMath(renderer=renderer).render(text)
+        renderer.page, section = self.page, self.page["section"]
+        return self.sanitized(MarkdownWithMath(renderer=renderer).render(text), section)
+
+    def sanitized(self, text, section):
+        """Return HTML (str) of a cell as pages show it: pandoc would load what it names."""
+        return sanitized(text, self.page["notebook"], section)
 
     def output(self, output, alt, first):
         """Return an output in HTML by the best of KINDS that it has.
@@ -215,7 +220,7 @@ class _Book:
         if kind == "text/plain":
             text = html.escape(_folded(strip_ansi(data[kind])))
             return f"<pre>{text}</pre>" if self.code != "none" else ""
-        return data.get(kind, "")
+        return self.sanitized(data.get(kind, ""), self.page["section"])
 
     def formula_definitions(self):
         """Return for each formula a line of Typst (str) that defines it."""
