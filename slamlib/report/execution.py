@@ -18,6 +18,8 @@ from nbconvert.filters import strip_ansi
 from nbconvert.preprocessors import CoalesceStreamsPreprocessor
 from tqdm import tqdm
 
+from slamlib import swap
+
 CELL_TIMEOUT = 1800  # s
 POLL = 1.0  # s, between looks at how far the studies are
 LONGEST_FOLDER = 70  # characters, of one for sockets: their paths have at most 103
@@ -86,7 +88,6 @@ async def _execute_all(books, environment, results, jobs, finish):
 
     async def run(number, source, book):
         stage = results / f".{source.stem}"
-        shutil.rmtree(stage, ignore_errors=True)  # left by a build that was killed
         stage.mkdir(parents=True)
         try:
             async with slots:
@@ -132,11 +133,11 @@ def _count_code_cells(book):
 
 def _publish(stage, results):
     """Move all files of a folder to another, and return their names relative to it."""
-    names = [file.relative_to(stage) for file in sorted(stage.rglob("*")) if file.is_file()]
+    names = swap.names(stage)
     for name in names:
         (results / name).parent.mkdir(parents=True, exist_ok=True)
         os.replace(stage / name, results / name)
-    return [name.as_posix() for name in names]
+    return names
 
 
 async def _execute(source, book, environment, connection, bar):
