@@ -15,7 +15,9 @@ import glob
 import json
 import os
 import shutil
+import signal
 import sys
+import threading
 import time
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
@@ -58,7 +60,7 @@ def write(path, content):
     except OSError as error:
         if error.filename or not error.errno:
             raise
-        raise OSError(error.errno, error.strerror, str(path)) from None
+        raise _os_error(error.errno, path) from None
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -188,9 +190,30 @@ def publish(sets):
         pairs = [(each, stack.enter_context(staging(each.folder))) for each in sets]
         for folder in sorted({each.folder for each in sets}):  # in this order by all processes
             stack.enter_context(locked(folder / LOCK))
-        for step in (_prepare, _mark, _remove_old, _move_new, _finish):
-            for each, control in pairs:
-                step(each, control)
+        for each, control in pairs:
+            _prepare(each, control)
+        with _undisturbed():
+            for step in (_mark, _remove_old, _move_new, _finish):
+                for each, control in pairs:
+                    step(each, control)
+
+
+@contextmanager
+def _undisturbed():
+    """Let signals that handlers of this process turn into an end wait until the block is done."""
+    waiting, handlers = [], {}
+    if threading.current_thread() is threading.main_thread():
+        handlers = {number: handler for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+                    if callable(handler := signal.getsignal(number))}
+    for number in handlers:
+        signal.signal(number, lambda number, _: waiting.append(number))
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        for number in waiting:
+            signal.raise_signal(number)
 
 
 def _prepare(each, control):
@@ -202,10 +225,17 @@ def _prepare(each, control):
     for name, staged in each.files.items():
         target = each.folder / name
         target.parent.mkdir(parents=True, exist_ok=True)
-        number = (errno.EISDIR if target.is_dir() else errno.EXDEV
-                  if target.parent.stat().st_dev != staged.stat().st_dev else 0)
-        if number:
-            raise OSError(number, os.strerror(number), str(target))
+        if target.parent.stat().st_dev != staged.stat().st_dev:
+            raise _os_error(errno.EXDEV, target)
+        if target.is_dir():
+            raise _os_error(errno.EISDIR, target)
+    for folder in {(each.folder / name).parent for name in _old(each)}:
+        if folder.is_dir() and not os.access(folder, os.W_OK):
+            raise _os_error(errno.EACCES, folder)
+
+
+def _os_error(number, path):
+    return OSError(number, os.strerror(number), str(path))
 
 
 def _mark(each, control):
