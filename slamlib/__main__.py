@@ -2,7 +2,10 @@
 
 import argparse
 import os
+import signal
 import sys
+import threading
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,11 +19,13 @@ def main(arguments=None):
     """Run one command of `arguments` (list of str, or None for the command line's).
 
     Returns the exit code: 0, 1 if a notebook failed, 2 for invalid input, 3 if a problem could not
-    be solved, 130 if interrupted.
+    be solved, 128 + n if ended by signal n.
     """
     options = _parser().parse_args(arguments)
+    ended = [signal.SIGINT]
     try:
-        return options.run(options)
+        with _orderly_end(ended):
+            return options.run(options)
     except DatasetError as error:
         print(f"slamlib: {error}", file=sys.stderr)
         return 2
@@ -29,8 +34,32 @@ def main(arguments=None):
         print(f"slamlib: cannot be read or written: {reason}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("slamlib: interrupted", file=sys.stderr)
-        return 130
+        with suppress(OSError):  # the terminal may be gone
+            print(f"slamlib: ended by {ended[-1].name}", file=sys.stderr)
+        return 128 + ended[-1]
+
+
+@contextmanager
+def _orderly_end(ended):
+    """Let SIGTERM and SIGHUP end a run as Ctrl-C does, and add the signal to the list `ended`."""
+    def end(number, frame):
+        for each in before:
+            signal.signal(each, signal.SIG_IGN)
+        ended.append(signal.Signals(number))
+        interrupt = signal.getsignal(signal.SIGINT)  # the event loop's, while notebooks run
+        (interrupt if callable(interrupt) else signal.default_int_handler)(signal.SIGINT, frame)
+
+    before = {}
+    if threading.current_thread() is threading.main_thread():
+        before = {each: signal.getsignal(each) for each in (signal.SIGTERM, signal.SIGHUP)
+                  if signal.getsignal(each) == signal.SIG_DFL}  # nohup's stays
+    for each in before:
+        signal.signal(each, end)
+    try:
+        yield
+    finally:
+        for each, handler in before.items():
+            signal.signal(each, handler)
 
 
 class _Parser(argparse.ArgumentParser):

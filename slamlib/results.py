@@ -1,10 +1,10 @@
 """The files to hand in: MATLAB struct arrays with the assignment's field names.
 
 Poses are [x, y, heading] and positions [x, y] in world axes, in m and rad. Covariances belong to
-the same coordinates. The folder of a file is made if it does not exist.
+the same coordinates. The folder of a file is made if it does not exist. What is read raises
+`swap.UnfinishedError` where a run was ended while it wrote the folder's files, or those above it.
 """
 
-import os
 import struct
 from io import BytesIO
 from pathlib import Path
@@ -12,8 +12,11 @@ from pathlib import Path
 import numpy as np
 from scipy.io import loadmat, savemat
 
+from slamlib import swap
+
 _HEADER = b"MATLAB 5.0 MAT-file, written by slamlib".ljust(116)  # scipy's contains the date
 SIZE_AT, COUNT_AT = 132, 164  # bytes, of the array's size and of its number of columns
+FILES = ("vehiclePose.mat", "ArucoMap.mat", "UwbMap.mat")  # of a problem's folder
 FEW = 100  # structs that scipy writes itself
 
 
@@ -59,23 +62,12 @@ def read_uwb_map(folder):
     return ids.astype(int), *rest
 
 
-def write_atomically(path, content):
-    """Write bytes to a Path; a reader finds the old file or the whole new one, never a part."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        temporary.write_bytes(content)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
 def _write(path, **fields):
     """Write one (1, n) struct array, named like the file; equal input gives equal bytes."""
     rows = {name: _matrices(values) for name, values in fields.items()}
     count = len(next(iter(rows.values())))
     content = _tiled(path.stem, rows) if count > FEW else _saved(path.stem, rows)
-    write_atomically(path, _HEADER + content[len(_HEADER):])
+    swap.write(path, _HEADER + content[len(_HEADER):])
 
 
 def _matrices(values):
@@ -125,6 +117,8 @@ def _tiled(name, rows):
 
 def _read(path, **shapes):
     """Fields of a struct array with n elements: a tuple of arrays (n, *shape)."""
+    for folder in (path.parent, path.parent.parent):
+        swap.require_finished(folder)
     structs = loadmat(path)[path.stem]
     return tuple(np.reshape([*structs[name].ravel()], (-1, *shape))
                  for name, shape in shapes.items())

@@ -38,6 +38,9 @@ WHOLE_FILES = {"units", "wheels-swapped", "wheels-reversed", "camera-mirrored", 
                "odometry"}
 COVARIANCES = ("marker_covariance", "antenna_covariance", "wheel_covariance")
 SENSORS = {"aruco": "markers", "uwb": "UWB ranges"}
+SUMMARY = "summary.json"
+OURS = frozenset([  # names of what a drive's results may be
+    SUMMARY, *(f"{problem}/{file}" for problem in PROBLEMS for file in results.FILES)])
 
 
 def title(problem, dataset):
@@ -261,7 +264,11 @@ def truth_in_world(solution, truth):
 
 
 def write(folder, solution):
-    """Write a solution's .mat files into folder/<problem>/ and return that folder."""
+    """Write a solution's .mat files into folder/<problem>/ and return that folder.
+
+    A summary in `folder` is removed: it is not of these files.
+    """
+    (Path(folder) / SUMMARY).unlink(missing_ok=True)
     folder = Path(folder) / solution.problem
     results.write_vehicle_poses(folder, solution.poses, solution.covariances)
     if solution.aruco_map is not None:

@@ -10,14 +10,16 @@ from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict
 from itertools import chain
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from pathlib import Path
 
 import numpy as np
 
-from slamlib import evaluation, results
+from slamlib import evaluation, swap
 from slamlib.solve import (
+    OURS,
     PROBLEMS,
+    SUMMARY,
     Failure,
     doubts_about_drive,
     merged,
@@ -33,19 +35,31 @@ BESIDES = ("problem2", "problem2_hint", "problem2_fused")      # nothing else de
 def solve_to_folder(dataset, truth, out, jobs=1):
     """The summary of all problems of a Dataset, written with their files below the folder `out`.
 
-    The Truth, or None, serves to report errors, never to estimate. Each problem's files are written
-    as it ends. The summary is the dict that is written to summary.json; a problem that could not be
-    solved has the entry "failed", a sentence. Its list "doubts", of "what" and "sentence", is empty
-    where the measurements agree with the files: first those about the drive, then by problem.
+    The Truth, or None, serves to report errors, never to estimate. The summary is the dict that is
+    written to summary.json; a problem that could not be solved has the entry "failed", a sentence.
+    Its list "doubts", of "what" and "sentence", is empty where the measurements agree with the
+    files: first those about the drive, then by problem. Once all files are written they replace
+    those of an earlier run, by `swap.publish`.
     With two `jobs`, a second process solves problem 2 meanwhile.
     """
+    out = Path(out)
+    with swap.staging(out) as stage:
+        summary = _solve_to_stage(dataset, truth, stage, jobs)
+        swap.require_staged(stage)
+        swap.publish([swap.Set(out, {name: stage / name for name in swap.names(stage)},
+                               last=SUMMARY, ours=OURS)])
+    return summary
+
+
+def _solve_to_stage(dataset, truth, stage, jobs):
+    """Write each problem's files to an empty folder as it ends, then the summary; return it."""
     rows, doubts = {}, {}
     for solution, seconds in _solved(dataset, jobs):
         failed = isinstance(solution, Failure)
         row = {"failed": solution.reason} if failed else summarize(solution, truth)
         rows[solution.problem] = {"title": solution.title, **row, "seconds": seconds}
         if not failed:
-            write(out, solution)
+            write(stage, solution)
             doubts[solution.problem] = solution.doubts
     of_drive = doubts_about_drive(dataset, truth)
     in_order = [problem for problem in PROBLEMS if problem in rows]
@@ -54,7 +68,7 @@ def solve_to_folder(dataset, truth, out, jobs=1):
                    [*of_drive, *chain(*(doubts.get(problem, ()) for problem in in_order))])],
                "problems": {problem: rows[problem] for problem in in_order}}
     text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-    results.write_atomically(Path(out) / "summary.json", text.encode())
+    swap.write(stage / SUMMARY, text.encode())
     return summary
 
 
@@ -67,20 +81,31 @@ def _solved(dataset, jobs):
     if jobs < 2 or sys.platform != "linux" or len(os.sched_getaffinity(0)) < 2:
         yield from _timed(dataset, PROBLEMS)
         return
-    others = [problem for problem in PROBLEMS if problem not in BESIDES]
+    first = [problem for problem in PROBLEMS if problem not in BESIDES]
+    others = set(active_children())
     with ProcessPoolExecutor(1, mp_context=get_context("fork"), initializer=_ends_with,
                              initargs=(os.getpid(),)) as pool:
-        besides = pool.submit(_listed, dataset)
-        yield from _timed(dataset, others)
         try:
-            found = besides.result()
-        except BrokenProcessPool:                       # killed, as where memory is short
-            found = _listed(dataset)
-        yield from found
+            besides = pool.submit(_listed, dataset)
+            yield from _timed(dataset, first)
+            try:
+                found = besides.result()
+            except BrokenProcessPool:                   # killed, as where memory is short
+                found = _listed(dataset)
+            yield from found
+        except BaseException:                           # no one waits for what it finds
+            for process in set(active_children()) - others:
+                process.kill()
+            raise
 
 
 def _ends_with(parent):
-    """Let the kernel end this process when `parent` (process id) is gone, however it ended."""
+    """Let the kernel end this process when `parent` (process id) is gone, however it ended.
+
+    Signals that end both end this process at once: only the parent has something to put in order.
+    """
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:                          # gone already
         os._exit(1)

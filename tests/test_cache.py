@@ -1,6 +1,9 @@
 """A notebook is executed again when something changed that it depends on, and only then."""
 
+import shutil
 from importlib.metadata import distributions
+from io import BytesIO
+from zipfile import ZipFile
 
 import nbformat
 import pytest
@@ -16,7 +19,7 @@ def execute_without_kernel(books, environment, results, jobs, finish):
         with open(source.parents[1] / f"count_{source.stem}", "a") as count:
             count.write("x")
         (results / "short").mkdir(parents=True, exist_ok=True)
-        (results / "short" / f"{source.stem}.mat").write_text("")
+        (results / "short" / f"{source.stem}.mat").write_text("result")
         book.cells[1].outputs = [nbformat.v4.new_output("stream", text="executed")]
         finish(source, book, [f"short/{source.stem}.mat"])
 
@@ -55,11 +58,18 @@ def test_a_changed_notebook_is_executed_again_and_only_that_one(project, capsys)
     assert [file.read_bytes() for file in sorted((project / "report").iterdir())] == pages
     write(project / "notebooks", "b", "# b, changed", ("1 + 1",))
     assert executions(project) == (1, 2)
-    (project / "results" / "short" / "a.mat").write_text("changed")
-    assert executions(project) == (2, 2)
-    (project / "results" / "short" / "b.mat").unlink()
-    assert executions(project) == (2, 3)
-    assert (project / "results" / "short" / "b.mat").read_text() == ""
+
+
+def test_results_that_are_gone_or_changed_are_written_again_without_an_execution(project):
+    assert executions(project) == (1, 1)
+    a, b = (project / "results" / "short" / name for name in ("a.mat", "b.mat"))
+    a.write_text("changed")
+    b.unlink()
+    assert executions(project) == (1, 1)
+    assert a.read_text() == b.read_text() == "result"
+    shutil.rmtree(project / "results")
+    assert executions(project) == (1, 1)
+    assert a.read_text() == b.read_text() == "result"
 
 
 def test_a_changed_dataset_executes_all_and_fresh_does_so_without_a_change(project):
@@ -79,9 +89,7 @@ def test_another_selection_and_back_executes_each_notebook_once_for_each(project
     assert executions(project, datasets=["short"]) == executions(project) == (2, 2)
     executions(project, datasets=["short"])
     assert [file.read_bytes() for file in sorted((project / "report").iterdir())] == first
-    (project / "results" / "short" / "a.mat").write_text("changed")  # of neither selection now
-    assert executions(project, datasets=["short"]) == (3, 2)
-    assert executions(project) == (3, 2)
+    assert executions(project) == (2, 2)
 
 
 def test_the_versions_used_last_are_kept_and_other_notebooks_are_left_alone(tmp_path):
@@ -104,19 +112,24 @@ def kept(tmp_path):
     (tmp_path / "data" / "ticks.txt").write_text("1 0 0")
     write(tmp_path, "a", "# a", ("1 + 1",))
     source, book = tmp_path / "a.ipynb", nbformat.read(tmp_path / "a.ipynb", as_version=4)
-    (tmp_path / "a.mat").write_text("result")
+    results = tmp_path / "results"
+    results.mkdir()
+    (results / "a.mat").write_text("result")
 
     def key(variables):
         common = cache.fingerprint([tmp_path / "data"], tmp_path, variables)
         return cache.key_of(source, book, common)
 
-    cache.keep(tmp_path / "kept", source, key({}), book, tmp_path, ["a.mat"])
-    return lambda **variables: cache.recall(tmp_path / "kept", source, key(variables), tmp_path)
+    cache.keep(tmp_path / "kept", source, key({}), book, results, ["a.mat"])
+    return lambda **variables: cache.recall(tmp_path / "kept", source, key(variables), results)
 
 
-def test_what_is_kept_is_recalled_with_its_results(kept):
+def test_what_is_kept_is_recalled_with_its_results(kept, tmp_path):
+    result = tmp_path / "results" / "a.mat"
+    result.unlink()
     book, names = kept()
     assert book.cells[1].source == "1 + 1" and names == ["a.mat"]
+    assert result.read_text() == "result"
     assert kept(HOME="/elsewhere") is not None  # of no matter to a notebook
 
 
@@ -131,13 +144,31 @@ def executed(folder):
     return file
 
 
+def with_digest(folder, content):
+    """Content of an entry in the place of the only one, with the right digest."""
+    key = executed(folder).name.split(".")[1]
+    return cache._checksum(key, content) + b"\n" + content
+
+
+def archive_of(text):
+    """The archive of a kept notebook whose file holds this text."""
+    buffer = BytesIO()
+    with ZipFile(buffer, "w") as archive:
+        archive.writestr(cache.BOOK, text)
+    return buffer.getvalue()
+
+
 @pytest.mark.parametrize("change", [
     lambda folder: executed(folder).unlink(),
     lambda folder: executed(folder).write_bytes(b"\xff\x00 not this"),
     lambda folder: executed(folder).write_bytes(executed(folder).read_bytes()[:-9]),
     lambda folder: executed(folder).write_bytes(
-        executed(folder).read_bytes().replace(b"1 + 1", b"1 + 2")),
-    lambda folder: (folder / "a.mat").write_text("another"),
+        executed(folder).read_bytes().replace(b"executed.ipynb", b"executed.ipync")),
+    lambda folder: executed(folder).write_bytes(with_digest(folder, b"not an archive")),
+    lambda folder: executed(folder).write_bytes(with_digest(folder, archive_of("not JSON"))),
+    lambda folder: executed(folder).write_bytes(with_digest(folder, archive_of("[1]"))),
+    lambda folder: executed(folder).write_bytes(with_digest(folder, archive_of(
+        '{"nbformat": 4, "nbformat_minor": 5, "metadata": {}, "cells": [{}]}'))),
     lambda folder: (folder / "data" / "new.txt").write_text("new"),
     lambda folder: (folder / "helper.py").write_text("read by a notebook"),
 ])
@@ -145,6 +176,13 @@ def test_a_change_or_a_damaged_file_is_as_if_nothing_were_kept(kept, tmp_path, c
     assert kept() is not None
     change(tmp_path)
     assert kept() is None
+
+
+def test_an_entry_of_another_key_is_not_recalled(kept, tmp_path):
+    source, other = tmp_path / "a.ipynb", "0" * 64
+    shutil.copy(executed(tmp_path), tmp_path / "kept" / f"a.{other}.executed")
+    assert kept() is not None
+    assert cache.recall(tmp_path / "kept", source, other, tmp_path) is None
 
 
 def test_slamlib_and_the_packages_are_among_what_matters(monkeypatch, tmp_path):

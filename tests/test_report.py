@@ -16,6 +16,7 @@ import pytest
 from conftest import contradicted
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 
+from slamlib import swap
 from slamlib.__main__ import main
 from slamlib.dataset import DatasetError
 from slamlib.report import NotebookError, build_report
@@ -130,7 +131,8 @@ def test_files_are_index_chapters_in_order_and_the_pdf(built):
     root, pages = built
     assert [page.name for page in pages] == ["index.html", "1_odometry.html", "2_other.html",
                                              "report.pdf"]
-    assert sorted((root / "report").iterdir()) == sorted(pages)
+    assert sorted((root / "report").iterdir()) == sorted(
+        [*pages, root / "report" / swap.WRITTEN])
 
 
 def test_every_formula_arrives_once(built):
@@ -397,5 +399,6 @@ for drive, solution, files in delivered(drives, found):
     assert "good:</p>" not in index
     files = [file.relative_to(tmp_path / "results").as_posix()
              for file in sorted((tmp_path / "results").rglob("*")) if file.is_file()]
-    assert files == ["bad/problem2_hint/vehiclePose.mat", "good/problem2/ArucoMap.mat",
-                     "good/problem2/vehiclePose.mat", "good/problem2_hint/vehiclePose.mat"]
+    assert files == ["bad/.slamlib.json", "bad/problem2_hint/vehiclePose.mat", "good/.slamlib.json",
+                     "good/problem2/ArucoMap.mat", "good/problem2/vehiclePose.mat",
+                     "good/problem2_hint/vehiclePose.mat"]

@@ -8,12 +8,14 @@ import resource
 import sys
 import tempfile
 import time
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
 import nbformat
 
+from slamlib import swap
 from slamlib.dataset import DatasetError, dataset_names, read_dataset, read_truth
 from slamlib.notebook import notices
 from slamlib.report import cache, overview
@@ -26,7 +28,10 @@ from slamlib.report.pages import html_pages
 from slamlib.report.pdf import typeset
 from slamlib.report.pictures import title_picture
 from slamlib.report.setting import missing_glyphs
+from slamlib.solve import OURS
 from slamlib.studies.memory import forget
+
+BUILDING = ".slamlib-build.lock"  # in folders that only one build at a time changes
 
 
 @dataclass(frozen=True)
@@ -59,7 +64,9 @@ def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=
     Raises
     ------
     DatasetError : there is no notebook or dataset of a selected name, or a dataset is malformed.
-    NotebookError : a cell failed or a page cannot be set; the previous report is unchanged.
+    NotebookError : a cell failed or a page cannot be set; report and results are unchanged.
+
+    One build at a time works in a results folder or with a cache; another one waits for it.
     """
     start = time.monotonic()
     notebooks, data, report, results = (
@@ -71,19 +78,20 @@ def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=
         cells=[cell for cell in book.cells if cell.cell_type == "markdown"])
         for source, book in books.items()}
     _render(texts, texts, chapters, cover, code)  # reports early what cannot be set
-    for folder in (results, report):
-        folder.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=folder).close()  # reports early that a folder is not writable
-
-    books, written = _executed(books, {"data": data, "datasets": datasets, "jobs": jobs},
-                               [data / name for name in selected], results, kept, fresh)
-    drives = read_drives(data, results, selected, written, notices(books.values()))
-    files = rendered(books, drives, cover, code, os.path.relpath(results, report))
-    with tempfile.TemporaryDirectory(prefix=".", dir=report) as temporary:
+    with ExitStack() as stack:
+        for folder in sorted({results, Path(kept or results).resolve()}):
+            stack.enter_context(swap.locked(folder / BUILDING))
+        stage, pages = (stack.enter_context(swap.staging(folder)) for folder in (results, report))
+        books, written = _executed(books, {"data": data, "datasets": datasets, "jobs": jobs},
+                                   [data / name for name in selected], results, stage, kept, fresh)
+        drives = read_drives(data, stage, selected, written, notices(books.values()))
+        files = rendered(books, drives, cover, code, os.path.relpath(results, report))
         for name, content in files.items():
-            Path(temporary, name).write_bytes(content)
-        for name in files:
-            os.replace(Path(temporary, name), report / name)
+            swap.write(pages / name, content)
+        swap.require_staged(stage)
+        swap.publish([
+            swap.Set(report, {name: pages / name for name in files}, last=next(iter(files))),
+            *_result_sets(results, stage, selected, written)])
     print(_resources_used(time.monotonic() - start), file=sys.stderr)
     return Report([report / name for name in files], drives)
 
@@ -106,10 +114,20 @@ def _checked_input(notebooks, data, datasets, cover, appendix):
     return served, selected
 
 
-def _executed(books, options, datasets, results, kept, fresh):
+def _result_sets(results, stage, selected, written):
+    """Return a swap.Set for each of the datasets that are selected or have files in `stage`."""
+    files = {name: {} for name in selected}
+    for path in written:
+        dataset, name = path.split("/", 1) if "/" in path else ("", path)
+        files.setdefault(dataset, {})[name] = stage / path
+    return [swap.Set(results / dataset, found, ours=OURS) for dataset, found in files.items()]
+
+
+def _executed(books, options, datasets, results, stage, kept, fresh):
     """Return the executed books, cached or new, and the sorted names of the files they wrote.
 
-    `options` are those of `kernel_environment`, `datasets` the selected folders.
+    `options` are those of `kernel_environment`, `datasets` the selected folders. The files are in
+    `stage`, a folder by `swap.staging` in `results`.
     """
     executed, written = {}, set()
     with tempfile.TemporaryDirectory() as folder:
@@ -120,14 +138,15 @@ def _executed(books, options, datasets, results, kept, fresh):
         keys = {source: cache.key_of(source, book, common) for source, book in books.items()}
 
         def finish(source, book, names):
+            swap.require_staged(stage)
             executed[source] = book
             written.update(names)
             if kept is not None and fingerprint() == common:  # nothing was edited meanwhile
-                cache.keep(kept, source, keys[source], book, results, names)
+                cache.keep(kept, source, keys[source], book, stage, names)
 
         if kept is not None and not fresh:
             for source, key in keys.items():
-                if found := cache.recall(kept, source, key, results):
+                if found := cache.recall(kept, source, key, stage):
                     executed[source] = found[0]
                     written.update(found[1])
                     print(f"{source.stem}: nothing changed, not executed again", file=sys.stderr)
@@ -137,7 +156,7 @@ def _executed(books, options, datasets, results, kept, fresh):
             if fresh:
                 forget(studies)
         execute({source: book for source, book in books.items() if source not in executed},
-                environment, results, max(1, options["jobs"]), finish)
+                environment, stage, max(1, options["jobs"]), finish)
     return {source: executed[source] for source in books}, sorted(written)
 
 

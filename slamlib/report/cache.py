@@ -2,24 +2,27 @@
 
 A notebook is executed again when its cells, slamlib's code (without the package `report`), an
 installed package, a file of the selected datasets, another file beside the notebook or an
-environment variable changed, or when a result file is no longer as the notebook wrote it. Earlier
-versions stay, so returning to an earlier selection of datasets executes nothing.
+environment variable changed. The result files that it wrote are kept with it. Earlier versions
+stay, so returning to an earlier selection of datasets executes nothing.
 """
 
 import json
 import platform
 from copy import deepcopy
 from importlib.metadata import distributions
+from io import BytesIO
 from pathlib import Path
+from zipfile import ZIP_DEFLATED, ZipFile
 
 import nbformat
 
-from slamlib.results import write_atomically
+from slamlib import swap
 from slamlib.studies.memory import digest, modules
 
 VARIABLES = ("SLAMLIB_", "PYTHON", "MPL", "OMP_", "OPENBLAS_", "MKL_", "LANG", "LC_", "TZ",
              "SOURCE_DATE_EPOCH")  # prefixes of environment variables that may change an output
 VERSIONS = 4  # of each notebook, the last used
+BOOK, RESULTS = "executed.ipynb", "results/"  # in the ZIP archive of a notebook
 
 
 def fingerprint(datasets, notebooks, environment):
@@ -56,24 +59,37 @@ def key_of(source, book, common):
 def recall(folder, source, key, results):
     """Return an executed notebook and the names of its results, or None if it must be executed.
 
+    Its result files are written below `results`.
+
     Parameters
     ----------
-    folder, results : str or Path, the folder of the cache; Path, the folder of the result files.
+    folder, results : str or Path, the folder of the cache; Path, the folder for the result files.
     source, key : Path of the notebook and str by `key_of`.
     """
     path = Path(folder, f"{source.stem}.{key}.executed")
     try:
         checksum, _, content = path.read_bytes().partition(b"\n")
-        if checksum != digest(content).encode():
-            return None
-        entry = json.loads(content)
-        if any(digest((results / name).read_bytes()) != expected
-               for name, expected in entry["results"].items()):
-            return None
-        path.touch()
     except OSError:
         return None
-    return nbformat.reads(entry["book"], as_version=4), list(entry["results"])
+    if checksum != _checksum(key, content):
+        return None
+    try:
+        archive = ZipFile(BytesIO(content))
+        book = nbformat.reads(archive.read(BOOK).decode(), as_version=4)
+        nbformat.validate(book)
+        if archive.testzip():
+            return None
+    except Exception:  # zipfile, zlib, json and nbformat raise many kinds
+        return None
+    names = [name.removeprefix(RESULTS) for name in archive.namelist() if name != BOOK]
+    for name in names:
+        swap.write(results / name, archive.read(RESULTS + name))
+    path.touch()
+    return book, names
+
+
+def _checksum(key, content):
+    return digest(key.encode() + content).encode()
 
 
 def keep(folder, source, key, book, results, names):
@@ -85,11 +101,14 @@ def keep(folder, source, key, book, results, names):
     book : NotebookNode, executed.
     names : list of str, the result files that it wrote, relative to `results`.
     """
-    content = json.dumps({
-        "book": nbformat.writes(book),
-        "results": {name: digest((results / name).read_bytes()) for name in names}}).encode()
-    write_atomically(Path(folder, f"{source.stem}.{key}.executed"),
-                     digest(content).encode() + b"\n" + content)
+    content = BytesIO()
+    with ZipFile(content, "w", ZIP_DEFLATED, compresslevel=1, strict_timestamps=False) as archive:
+        archive.writestr(BOOK, nbformat.writes(book))
+        for name in names:
+            archive.write(results / name, RESULTS + name)
+    content = content.getvalue()
+    swap.write(Path(folder, f"{source.stem}.{key}.executed"),
+               _checksum(key, content) + b"\n" + content)
     versions = [file for file in Path(folder).glob("*.executed")
                 if file.name.rsplit(".", 2)[0] == source.stem]
     for old in sorted(versions, key=lambda file: file.stat().st_mtime_ns)[:-VERSIONS]:

@@ -40,7 +40,7 @@ def read_drives(data, results, selected, written, notices=None):
 
     Parameters
     ----------
-    data, results : Path, the folders of the datasets and of the result files.
+    data, results : Path, the folders of the datasets and of the result files of this build.
     selected : list of str, names of datasets.
     written : list of str, this build's files, as `short/problem1/vehiclePose.mat` in `results`.
         NotebookError if poses cannot be read or have other shapes than the dataset's.

@@ -18,6 +18,7 @@ from nbconvert.filters import strip_ansi
 from nbconvert.preprocessors import CoalesceStreamsPreprocessor
 from tqdm import tqdm
 
+from slamlib import swap
 from slamlib.textfile import read_regular
 
 CELL_TIMEOUT = 1800  # s
@@ -97,7 +98,6 @@ async def _execute_all(books, environment, results, jobs, finish):
 
     async def run(number, source, book):
         stage = results / f".{source.stem}"
-        shutil.rmtree(stage, ignore_errors=True)  # left by a build that was killed
         stage.mkdir(parents=True)
         try:
             async with slots:
@@ -143,11 +143,11 @@ def _count_code_cells(book):
 
 def _publish(stage, results):
     """Move all files of a folder to another, and return their names relative to it."""
-    names = [file.relative_to(stage) for file in sorted(stage.rglob("*")) if file.is_file()]
+    names = swap.names(stage)
     for name in names:
         (results / name).parent.mkdir(parents=True, exist_ok=True)
         os.replace(stage / name, results / name)
-    return [name.as_posix() for name in names]
+    return names
 
 
 async def _execute(source, book, environment, connection, bar):

@@ -16,9 +16,9 @@ from slamlib.report.animation import moving
 from slamlib.report.chapters import HTML_ONLY
 from slamlib.report.drives import order
 from slamlib.report.pictures import trajectories
+from slamlib.results import FILES
 from slamlib.solve import PROBLEMS, SENSORS, title, truth_in_world
 
-FILES = ("vehiclePose.mat", "ArucoMap.mat", "UwbMap.mat")
 METHODS = {  # in the order of the problems; the hint is left to chapter 2
     "problem1": "by odometry (problem\u00a01)", "problem2": "by markers alone",
     "problem2_fused": "with odometry fused (problem\u00a02)",

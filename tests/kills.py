@@ -1,0 +1,324 @@
+"""Kills solve and report at random moments and at every step, and runs several builds at once.
+
+    python tests/kills.py [solve] [steps] [report] [report-steps] [builds]
+
+prints a table of counts; without arguments it does all. It is not part of the suite, of which
+test_concurrency.py runs a part. Runs are forks of this process, so that none waits for imports. A
+folder that a run of A or B writes to is judged by the bytes that undisturbed runs wrote.
+"""
+
+import json
+import os
+import random
+import shutil
+import signal
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+
+import nbformat
+
+from slamlib import summary, swap
+from slamlib.__main__ import main
+from slamlib.dataset import read_dataset
+from slamlib.simulation import simulate, write_dataset
+
+STEPS = {"os.rename", "os.remove", "os.mkdir", "os.rmdir"}      # audit events, also of pathlib
+MINE = {"notes.txt": "of the user", "mine/data.mat": "mine", "problem1/notes.txt": "too"}
+CODE = """from slamlib import solve
+from slamlib.notebook import results_folder, start
+for drive in start():
+    for problem in {problems}:
+        if solve.allows(drive.dataset, problem):
+            solve.write(results_folder(drive), solve.SOLUTIONS[problem](drive.dataset))"""
+
+
+def started(arguments, folder, at_step=None):
+    """Process id of a fork that runs `main` in a folder, and kills itself before a step if told."""
+    process = os.fork()
+    if process:
+        return process
+    code = 9
+    try:
+        os.chdir(folder)
+        for number in (1, 2):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), number)
+        if at_step is not None:
+            _kill_at(at_step)
+        code = main(list(map(str, arguments)))
+    finally:
+        os._exit(code)
+
+
+def _kill_at(step):
+    here, count = os.getpid(), 0
+
+    def hook(event, _):
+        nonlocal count
+        if event in STEPS and os.getpid() == here:
+            count += 1
+            if count == step:
+                os.kill(here, signal.SIGKILL)
+
+    sys.addaudithook(hook)
+
+
+def ended(process):
+    """Exit code of a process, -9 if it was killed."""
+    return os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
+
+
+def run(arguments, folder):
+    """Run `main` undisturbed."""
+    code = ended(started(arguments, folder))
+    assert code == 0, f"exit code {code}"
+
+
+def contents(folder):
+    """Bytes of a run's files by name: not those of the user, nor what begins with a dot."""
+    return {name: _plain(folder / name) for name in swap.names(folder)
+            if name not in MINE and name != swap.MARKER
+            and not any(part.startswith(".") for part in Path(name).parts)}
+
+
+def _plain(file):
+    """Bytes of a file, of a summary without its times."""
+    content = file.read_bytes()
+    if file.name == "summary.json":
+        summary = json.loads(content)
+        for row in summary["problems"].values():
+            del row["seconds"]
+        content = json.dumps(summary).encode()
+    return content
+
+
+def judge(folder, references, last=None):
+    """Which reference, "A" or "B", a folder holds, finished; else "unfinished" or "MIXED: ...".
+
+    Never may files of two runs be side by side, and the file `last` is there with all others only.
+    The user's files must be as they were.
+    """
+    found = contents(folder)
+    owners = [name for name, files in references.items() if found.items() <= files.items()]
+    for name, text in MINE.items():
+        if not (folder / name).is_file() or (folder / name).read_text() != text:
+            return "MIXED: lost " + name
+    marked = (folder / swap.MARKER).exists()
+    if not owners or last in found and found.keys() != references[owners[0]].keys():
+        return "MIXED: " + " ".join(sorted(found))
+    if marked:
+        return "unfinished"
+    return owners[0] if found.keys() == references[owners[0]].keys() else "MIXED: not marked"
+
+
+def left(folder):
+    """What lies in a folder that is no run's and no user's, empty folders too."""
+    return [str(path.relative_to(folder)) for path in folder.rglob("*")
+            if path.name.startswith(".") and path.name != swap.WRITTEN or path.name == swap.MARKER
+            or path.is_dir() and not any(path.iterdir())]
+
+
+def put_mine(folder):
+    """Write the user's files."""
+    for name, text in MINE.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+
+
+def make_drives(root):
+    """Folders A (all sensors) and B (another drive, without ranges), each with data/short."""
+    for name, seed in (("A", 3), ("B", 4)):
+        dataset = simulate("short", seed)[0].first(40)
+        write_dataset(root / name / "short", dataset.without("uwb") if name == "B" else dataset)
+
+
+class Solves:
+    """The command solve between the drives A and B in one folder."""
+
+    last = "summary.json"
+
+    def __init__(self, root):
+        self.root = root
+        make_drives(root)
+        self.references, self.copies = {}, {}
+        for name in "AB":
+            self.copies[name] = root / f"copy_{name}"
+            run(["solve", root / name / "short", "--out", self.copies[name]], root)
+            self.references[name] = contents(self.copies[name])
+            put_mine(self.copies[name])
+
+    def arguments(self, name):
+        """Of the command line for one drive."""
+        return ["solve", self.root / name / "short", "--out", "out"]
+
+    def reset(self, name):
+        """Make the results of a drive, finished, those of the folder."""
+        shutil.rmtree(self.root / "out", ignore_errors=True)
+        shutil.copytree(self.copies[name], self.root / "out")
+
+    def state(self):
+        """What `judge` says."""
+        return judge(self.root / "out", self.references, self.last)
+
+    def left(self):
+        """What is there and should not be after an undisturbed run."""
+        return left(self.root / "out")
+
+
+class StoredSolves(Solves):
+    """The same, with problems that are solved once: only the files are written each time."""
+
+    def __init__(self, root):
+        super().__init__(root)
+        found = {}
+        for name in "AB":
+            dataset = read_dataset(root / name / "short")
+            found[dataset.uwb is None] = [*summary._solved(dataset, 1)]
+        summary._solved = lambda dataset, jobs: found[dataset.uwb is None]
+
+
+class Reports:
+    """The command report between the drives A and B, of two tiny notebooks."""
+
+    def __init__(self, root):
+        self.root = root
+        make_drives(root)
+        (root / "notebooks").mkdir()
+        for name, problems in (("1_one", ["problem1"]), ("2_two", ["problem2", "problem4"])):
+            nbformat.write(nbformat.v4.new_notebook(cells=[
+                nbformat.v4.new_markdown_cell(f"# {name[0]}. Chapter", id="a"),
+                nbformat.v4.new_code_cell(CODE.format(problems=problems), id="b")]),
+                root / "notebooks" / f"{name}.ipynb")
+        self.folders = {"results/short": None, "report": "index.html"}
+        self.references, self.copies = {}, {}
+        for name in "AB":
+            run(self.arguments(name), root)
+            self.references[name] = {folder: contents(root / folder) for folder in self.folders}
+            self.copies[name] = root / f"copy_{name}"
+            for folder in self.folders:
+                shutil.copytree(root / folder, self.copies[name] / folder)
+                put_mine(self.copies[name] / folder)
+        self.reset("B")
+
+    def arguments(self, name):
+        """Of the command line for one drive."""
+        return ["report", "--data", self.root / name]
+
+    def reset(self, name):
+        """Make the report of a drive, finished, that of the folder."""
+        for folder in ("results", "report"):
+            shutil.rmtree(self.root / folder, ignore_errors=True)
+            shutil.copytree(self.copies[name] / folder, self.root / folder)
+
+    def state(self):
+        """What `judge` says of all folders; where none is marked, they are of one run."""
+        states = {judge(self.root / folder, {
+            name: files[folder] for name, files in self.references.items()}, last)
+            for folder, last in self.folders.items()}
+        mixed = [state for state in states if state.startswith("MIXED")]
+        if mixed:
+            return mixed[0]
+        if "unfinished" in states:
+            return "unfinished"
+        return states.pop() if len(states) == 1 else "MIXED: results and pages"
+
+    def left(self):
+        """What is there and should not be after an undisturbed run."""
+        return [name for folder in ("results", "report", "build/executed")
+                for name in left(self.root / folder)]
+
+
+def count(counts, runs, name, result):
+    """Count the state after a kill; sometimes, and after each step, run again undisturbed."""
+    counts[result if result in ("A", "B", "unfinished") else "MIXED"] += 1
+    if result.startswith("MIXED"):
+        print(result, file=sys.stderr)
+    if name is None:
+        return
+    run(runs.arguments(name), runs.root)
+    counts["runs after"] += 1
+    if runs.state() != name:
+        counts["MIXED"] += 1
+        print("after:", runs.state(), file=sys.stderr)
+    if what := runs.left():
+        counts["LEFT"] += 1
+        print("left:", what, file=sys.stderr)
+
+
+def at_random(runs, kills, seed, options=lambda rng: []):
+    """Counts after kills at random moments of runs between two drives."""
+    counts, rng, longest = Counter(), random.Random(seed), 0.0
+    runs.reset("A")
+    for name in "AB":
+        begin = time.monotonic()
+        run([*runs.arguments(name), *options(rng)], runs.root)
+        longest = max(longest, time.monotonic() - begin)
+    while counts["killed"] < kills:
+        process = started([*runs.arguments(rng.choice("AB")), *options(rng)], runs.root)
+        time.sleep(rng.uniform(0, longest))
+        os.kill(process, signal.SIGKILL)
+        counts["killed" if ended(process) == -9 else "ended before"] += 1
+        count(counts, runs, rng.choice(["A", "B", None]), runs.state())
+    return counts
+
+
+def at_every_step(runs, begin, then):
+    """Counts after kills before each step of a run of `then`, where that of `begin` ended well."""
+    counts, step, code = Counter(), 0, -9
+    while code == -9:
+        step += 1
+        runs.reset(begin)
+        code = ended(started(runs.arguments(then), runs.root, step))
+        counts["killed"] += code == -9
+        count(counts, runs, then if code == -9 else None, runs.state())
+    assert code == 0
+    return counts
+
+
+def at_once(runs, builds, times, seed):
+    """Counts of rounds of several builds that start at random offsets, with an empty cache."""
+    counts, rng = Counter(), random.Random(seed)
+    for _ in range(times):
+        shutil.rmtree(runs.root / "build", ignore_errors=True)
+        runs.reset("B")
+        processes = []
+        for _ in range(builds):
+            processes.append(started(runs.arguments("A"), runs.root))
+            time.sleep(rng.uniform(0, 3))
+        counts["builds"] += builds
+        counts["FAILED"] += sum(ended(process) != 0 for process in processes)
+        counts["rounds of the same bytes"] += runs.state() == "A" and not runs.left()
+    return counts
+
+
+PARTS = {
+    "solve": (Solves, [("solve, random moments", at_random, (200, 1))]),
+    "steps": (StoredSolves, [("solve, every step, A then B", at_every_step, ("A", "B")),
+                       ("solve, every step, B then A", at_every_step, ("B", "A"))]),
+    "report": (Reports, [("report, random moments", at_random, (
+        40, 2, lambda rng: rng.choice([[], ["--fresh"]])))]),
+    "report-steps": (Reports, [("report, every step, A then B", at_every_step, ("A", "B"))]),
+    "builds": (Reports, [("two builds at once", at_once, (2, 20, 3)),
+                         ("four builds at once", at_once, (4, 20, 4))]),
+}
+
+
+def do(parts):
+    """Run parts by name, print a line for each, and return True if nothing was mixed or left."""
+    well = True
+    for part in parts:
+        kind, lines = PARTS[part]
+        with tempfile.TemporaryDirectory() as folder:
+            runs = kind(Path(folder).resolve())
+            for title, function, arguments in lines:
+                counts = function(runs, *arguments)
+                well &= not any(counts[bad] for bad in ("MIXED", "LEFT", "FAILED"))
+                print(f"{title:30}" + ", ".join(
+                    f"{number} {what}" for what, number in counts.items()), flush=True)
+    return well
+
+
+if __name__ == "__main__":
+    sys.exit(not do(sys.argv[1:] or PARTS))
