@@ -53,46 +53,38 @@ def solve_to_folder(dataset, truth, out, jobs=1):
 
 def _solve_to_stage(dataset, truth, stage, jobs):
     """Write each problem's files to an empty folder as it ends, then the summary; return it."""
-    rows, doubts = {}, {}
-    for solution, seconds in _solved(dataset, jobs):
-        failed = isinstance(solution, Failure)
-        row = {"failed": solution.reason} if failed else summarize(solution, truth)
-        rows[solution.problem] = {"title": solution.title, **row, "seconds": seconds}
-        if not failed:
-            write(stage, solution)
-            doubts[solution.problem] = solution.doubts
+    rows, doubts = _written_by_all(dataset, truth, stage, jobs)
     of_drive = doubts_about_drive(dataset, truth)
     in_order = [problem for problem in PROBLEMS if problem in rows]
     summary = {"dataset": dataset.name, "poses": len(dataset.ticks),
                "doubts": [asdict(doubt) for doubt in merged(
-                   [*of_drive, *chain(*(doubts.get(problem, ()) for problem in in_order))])],
+                   [*of_drive, *chain(*(doubts[problem] for problem in in_order))])],
                "problems": {problem: rows[problem] for problem in in_order}}
     text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     swap.write(stage / SUMMARY, text.encode())
     return summary
 
 
-def _solved(dataset, jobs):
-    """Yield (Solution or Failure, seconds) of every problem, those of BESIDES last if it can be.
+def _written_by_all(dataset, truth, stage, jobs):
+    """What `_written` returns, of all problems; with two `jobs` by two processes.
 
-    The second process is a fork: only Linux makes those safely. It returns what it found and writes
-    nothing, so that nothing is written once this process is gone.
+    The second process is a fork: only Linux makes those safely. It ends with this one, so that
+    nothing is written once this process is gone.
     """
     if jobs < 2 or sys.platform != "linux" or len(os.sched_getaffinity(0)) < 2:
-        yield from _timed(dataset, PROBLEMS)
-        return
+        return _written(dataset, truth, stage, PROBLEMS)
     first = [problem for problem in PROBLEMS if problem not in BESIDES]
     others = set(active_children())
     with ProcessPoolExecutor(1, mp_context=get_context("fork"), initializer=_ends_with,
                              initargs=(os.getpid(),)) as pool:
         try:
-            besides = pool.submit(_listed, dataset)
-            yield from _timed(dataset, first)
+            besides = pool.submit(_written, dataset, truth, stage, BESIDES)
+            rows, doubts = _written(dataset, truth, stage, first)
             try:
-                found = besides.result()
+                others_rows, others_doubts = besides.result()
             except BrokenProcessPool:                   # killed, as where memory is short
-                found = _listed(dataset)
-            yield from found
+                others_rows, others_doubts = _written(dataset, truth, stage, BESIDES)
+            return rows | others_rows, doubts | others_doubts
         except BaseException:                           # no one waits for what it finds
             for process in set(active_children()) - others:
                 process.kill()
@@ -111,15 +103,19 @@ def _ends_with(parent):
         os._exit(1)
 
 
-def _listed(dataset):
-    return list(_timed(dataset, BESIDES))
-
-
-def _timed(dataset, problems):
-    start = time.perf_counter()
+def _written(dataset, truth, stage, problems):
+    """Solve some problems and write their files; rows of the summary and doubts, by problem."""
+    rows, doubts, start = {}, {}, time.perf_counter()
     for solution in solutions(dataset, problems=problems):
-        yield solution, time.perf_counter() - start
+        failed = isinstance(solution, Failure)
+        seconds = time.perf_counter() - start
+        row = {"failed": solution.reason} if failed else summarize(solution, truth)
+        rows[solution.problem] = {"title": solution.title, **row, "seconds": seconds}
+        doubts[solution.problem] = () if failed else solution.doubts
+        if not failed:
+            write(stage, solution)
         start = time.perf_counter()
+    return rows, doubts
 
 
 def summarize(solution, truth):
