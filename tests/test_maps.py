@@ -101,15 +101,19 @@ def test_names_cover_neither_each_other_nor_what_is_around_the_axes(solved, widt
     assert all(frame.x0 <= box.x0 and box.x1 <= frame.x1 for box in boxes)
 
 
-def test_the_narrow_map_keeps_its_shape(solved):
-    fig = maps.whole_map(*solved)
+def test_the_wide_and_the_narrow_map_fill_their_width_at_equal_scales(solved):
+    drive, result = solved
+    fig = maps.whole_map(drive, result)
     ax, = fig.axes
-    fig.draw_without_rendering()
-    wide = ax.bbox.width / ax.bbox.height
-    plotting.narrow(fig)
-    fig.draw_without_rendering()
-    assert ax.bbox.width / ax.bbox.height == pytest.approx(wide, rel=0.01)
-    assert ax.bbox.width > 0.75 * fig.bbox.width
+    for change in (lambda fig: None, plotting.narrow):
+        change(fig)
+        fig.draw_without_rendering()
+        (across, up), = np.diff(ax.transData.transform([[0, 0], [1, 1]]), axis=0)
+        assert across == pytest.approx(up, rel=1e-6)
+        assert ax.bbox.width > 0.75 * fig.bbox.width
+        shown = ax.transData.transform(np.concatenate([
+            result.marker_in_world[:, :2], result.antenna_in_world, result.poses[:, :2]]))
+        assert all(ax.bbox.contains(*place) for place in shown)
     plt.close(fig)
 
 
