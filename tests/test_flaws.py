@@ -109,6 +109,8 @@ LEGAL = {                                      # within the limits, and far from
     "the most uncertain sightings": uncorrelated(1e8, 1e8, 1e14),
     "a sighting of a direction": one_of("aruco", uncorrelated(1e-18, 1e8, 1e-18)),
     "sightings of a distance": uncorrelated(1e8, 1e-18, 1e14),
+    "very certain sightings, and nothing else": lambda d: uncorrelated(1e-18, 1e-18, 1e-18)(
+        range_sigmas(1e4)(vehicle(sigma_heading=10.0)(d))),
     "correlations of almost 1": correlated(0, 1, 1 - 1e-11),
     "correlations with heading of almost 1": correlated(1, 2, 1 - 1e-11)}
 
