@@ -28,6 +28,11 @@ from slamlib.slam.measurements import measure
 from slamlib.solve import Failure, doubts_about_drive, solutions
 from slamlib.summary import summarize
 
+QUICK = settings(max_examples=3 * settings.default.max_examples)
+FEW = settings(max_examples=settings.default.max_examples // 3)
+
+# Drives.
+
 COUNTS = st.one_of(st.just(0), st.sampled_from([127, -127, 1, 2000]), st.integers(-300, 300))
 LEGS = st.one_of(                                  # (steps, right and left counts of each)
     st.tuples(st.integers(1, 30), COUNTS).map(lambda leg: (*leg, leg[1])),      # straight
@@ -129,18 +134,6 @@ def read(drive):
 
 # The reader: whatever the bytes, a dataset or one sentence.
 
-SMALLEST = 1e-9            # m and rad, sigma of what has none: position of pose 1 in problem 1
-QUICK = settings(max_examples=3 * settings.default.max_examples)
-FEW = settings(max_examples=settings.default.max_examples // 3)
-# Largest differences, in sigmas. Rounding is 1e-16 of the information, which reaches 1e10 / m^2
-# (MINIMUM_SIGMA of the odometry, seen sightings of 0.1 mm) beside 1 / rad^2 of the first heading.
-ROUNDING = 1e-4
-# Gauss-Newton ends at a relative decrease of the error of 1e-6. Half the squared distance from the
-# minimum in sigmas is about this decrease.
-CONVERGED = np.sqrt(2e-6)
-# The learned noise ends where it gains 0.01 in log density, 0.14 of its own sigma from the greatest
-# one. Rounding decides where; so little of the noise changes a covariance by few percent.
-LEARNED = 0.05
 WORDS = st.one_of(
     st.integers(-2, 12).map(str), st.floats().map(repr), st.integers().map(str),
     st.sampled_from(["nan", "1e999", "-0", "1_0", "0x1", "\u0661", "#", "=", "[", "'", "1e-400",
@@ -247,6 +240,17 @@ def test_a_heading_that_is_lost_in_rounding_is_told():
 
 
 # Changes of a drive that change nothing but what they must.
+
+SMALLEST = 1e-9            # m and rad, sigma of what has none: position of pose 1 in problem 1
+# Tolerances are in sigmas. Rounding is 1e-16 of the information, which reaches 1e10 / m^2 (by
+# MINIMUM_SIGMA of the odometry) beside the 1 / rad^2 of the first heading: 1e-6, here times 100.
+ROUNDING = 1e-4
+# Gauss-Newton ends where half the squared error decreases by 1e-6 of it plus 1. That is half the
+# squared distance from the minimum, in sigmas.
+CONVERGED = np.sqrt(2e-6)
+# The search of the noise ends where it gains 0.01 in log density, 0.14 of its own sigma from the
+# maximum. Rounding decides where, and so little of the noise changes a covariance by few percent.
+LEARNED = 0.05
 
 
 def solved(dataset, slip=None):
