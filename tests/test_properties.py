@@ -28,6 +28,11 @@ from slamlib.slam.measurements import measure
 from slamlib.solve import Failure, doubts_about_drive, solutions
 from slamlib.summary import summarize
 
+QUICK = settings(max_examples=3 * settings.default.max_examples)
+FEW = settings(max_examples=settings.default.max_examples // 3)
+
+# Drives.
+
 COUNTS = st.one_of(st.just(0), st.sampled_from([127, -127, 1, 2000]), st.integers(-300, 300))
 LEGS = st.one_of(                                  # (steps, right and left counts of each)
     st.tuples(st.integers(1, 30), COUNTS).map(lambda leg: (*leg, leg[1])),      # straight
@@ -44,16 +49,19 @@ VEHICLES = st.builds(
 
 
 @st.composite
-def drives(draw, vehicles=VEHICLES, sensors=None):
-    """Rows of the files of a small legal drive, as a namespace."""
-    vehicle = draw(vehicles)
+def drives(draw, sound=False):
+    """Rows of the files of a small legal drive, as a namespace.
+
+    In a sound one the wheels are those of table 2, and sightings agree.
+    """
+    vehicle = Vehicle() if sound else draw(VEHICLES)
     legs = draw(st.lists(LEGS, max_size=4))
     ticks = np.concatenate([[[0, 0]], *(np.tile(leg[1:], (leg[0], 1)) for leg in legs)])
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     path = odometry.dead_reckoning(
         ticks, vehicle.with_deviation(rng.normal(size=3)), model="arc")
     return SimpleNamespace(
-        vehicle=vehicle, ticks=ticks, sightings=draw(sightings(path, rng)),
+        vehicle=vehicle, ticks=ticks, sightings=draw(sightings(path, rng, sound)),
         **dict(zip(("ranges", "guesses"), draw(ranges(path, rng)))))
 
 
@@ -64,7 +72,7 @@ def frames(draw, count):
 
 
 @st.composite
-def sightings(draw, path, rng):
+def sightings(draw, path, rng, sound):
     """Rows (m, 11) of ArucoReading.txt from poses (n, 3)."""
     seen_from = frames(draw, len(path))
     many = draw(st.integers(0, 9)) == 9
@@ -75,7 +83,7 @@ def sightings(draw, path, rng):
     marker[:, :2] += path[rng.integers(len(path), size=len(ids)), :2]
     share = 0.05 if many else draw(st.sampled_from([1.0, 0.5, 0.1]))
     frame, which = np.nonzero(rng.uniform(size=(len(seen_from), len(ids))) < share)
-    pose, which = seen_from[frame], rng.permuted(which) if draw(st.booleans()) else which
+    pose, which = seen_from[frame], which if sound or draw(st.booleans()) else rng.permuted(which)
     sigma = np.array([*draw(st.sampled_from([(0.005, 0.005), (1e-4, 1e-2), (0.5, 0.5)])), 0])
     sigma = np.tile(sigma, (len(pose), 1))
     sigma[:, 2] = rng.choice(draw(st.sampled_from([[0.01], [1e-3], [0.4], [100], [0.01, 100]])),
@@ -83,7 +91,8 @@ def sightings(draw, path, rng):
     root = np.linalg.cholesky(np.eye(3) + draw(st.sampled_from([0, 0.9])) * (
         np.ones((3, 3)) - np.eye(3))) * sigma[:, :, None]
     error = (root @ rng.normal(size=(len(pose), 3, 1)))[..., 0]
-    z = se2.between(path[pose], marker[which]) + draw(st.sampled_from([1, 0, 30])) * error
+    z = se2.between(path[pose], marker[which]) + error * (
+        1 if sound else draw(st.sampled_from([1, 0, 30])))
     z[:, 2] = se2.wrap(z[:, 2])
     C = (root @ np.swapaxes(root, 1, 2))[:, *np.triu_indices(3)]
     return [(int(i) + 1, int(j), *row) for i, j, row in zip(
@@ -125,11 +134,6 @@ def read(drive):
 
 # The reader: whatever the bytes, a dataset or one sentence.
 
-SMALLEST = 1e-9            # m and rad, sigma of what has none: position of pose 1 in problem 1
-QUICK = settings(max_examples=3 * settings.default.max_examples)
-FEW = settings(max_examples=settings.default.max_examples // 3)
-ROUNDING = 1e-4            # TODO
-CONVERGED = 2e-3
 WORDS = st.one_of(
     st.integers(-2, 12).map(str), st.floats().map(repr), st.integers().map(str),
     st.sampled_from(["nan", "1e999", "-0", "1_0", "0x1", "\u0661", "#", "=", "[", "'", "1e-400",
@@ -237,9 +241,25 @@ def test_a_heading_that_is_lost_in_rounding_is_told():
 
 # Changes of a drive that change nothing but what they must.
 
+SMALLEST = 1e-9            # m and rad, sigma of what has none: position of pose 1 in problem 1
+# Tolerances are in sigmas. Rounding is 1e-16 of the information, which reaches 1e10 / m^2 (by
+# MINIMUM_SIGMA of the odometry) beside the 1 / rad^2 of the first heading: 1e-6, here times 100.
+ROUNDING = 1e-4
+# Gauss-Newton ends where half the squared error decreases by 1e-6 of it plus 1. That is half the
+# squared distance from the minimum, in sigmas.
+CONVERGED = np.sqrt(2e-6)
+# The search of the noise ends where it gains 0.01 in log density, 0.14 of its own sigma from the
+# maximum. Rounding decides where, and so little of the noise changes a covariance by few percent.
+LEARNED = 0.05
+
 
 def solved(dataset, slip=None):
-    """By problem, a list of what was estimated: ids (m,), values (m, d), covariances (m, d, d)."""
+    """By problem, a list of what was estimated: ids (m,), values (m, d), covariances (m, d, d).
+
+    Poses, markers and antennas. Not problem 4 with an antenna in doubt: beside the antenna, the
+    direction of a range is that of rounding, and few ranges may leave Gauss-Newton in a valley in
+    which it ends by its number of steps.
+    """
     pose, found = np.arange(len(dataset.ticks)), {}
     found["problem1"] = [(pose, *odometry.equation2(dataset.ticks, dataset.vehicle))]
     if dataset.aruco is not None:
@@ -253,6 +273,8 @@ def solved(dataset, slip=None):
     for name, sensors in (("problem3", dataset.without("uwb")), ("problem4", dataset)):
         if sensors.aruco is not None or sensors.uwb is not None:
             each = slam.estimate(sensors, slip)
+            if each.doubts:
+                continue
             found[name] = [(pose, each.poses, each.covariances),
                            (each.marker, each.marker_in_world, each.marker_covariance),
                            (each.antenna, each.antenna_in_world, each.antenna_covariance)]
@@ -308,8 +330,9 @@ def mirrored(dataset):
         uwb=uwb, antenna_guess=guess and replace(guess, position=guess.position * sign[:2]))
 
 
-LENGTHS = {"ORIGIN_SIGMA": 4, "MINIMUM_SIGMA": 4, "GUESS_PRIOR_SIGMA": 4, "MINIMUM_SLIP": 2,
-           "RANGE_SIGMA": np.array([4, 1])}         # factors on constants in m, and in sqrt(m)
+# Factors on the constants in m, in sqrt(m), and in [m, 1].
+LENGTHS = {"ORIGIN_SIGMA": 4, "MINIMUM_SIGMA": 4, "GUESS_PRIOR_SIGMA": 4, "STEP_TOLERANCE": 4,
+           "MINIMUM_SLIP": 2, "RANGE_SIGMA": np.array([4, 1])}
 
 
 def in_quarters(dataset):
@@ -348,20 +371,21 @@ def begun_by(leg, dataset):
 
 
 @FEW
-@given(drives(), st.integers(0, 2**32 - 1))
-def test_ids_and_the_order_of_rows_are_names_only(drive, seed):
+@given(drives(), st.integers(0, 2**32 - 1), st.sampled_from([1e-3, None]))
+def test_ids_and_the_order_of_rows_are_names_only(drive, seed, slip):
     ids = sorted({row[1] for row in drive.sightings} | {row[0] for row in drive.guesses})
-    rng = np.random.default_rng(seed)
-    numbers = dict(zip(ids, rng.choice(3 * len(ids), len(ids), replace=False).tolist()))
+    numbers = dict(zip(ids, np.random.default_rng(seed).permutation(ids).tolist()))
     other = read(reversed_rows(renumbered(drive, numbers)))
-    assert_same(solved(read(drive)), solved(other), ROUNDING, numbers)
+    assert_same(solved(read(drive), slip), solved(other, slip), ROUNDING if slip else LEARNED,
+                numbers)
 
 
 @FEW
 @given(drives())
 def test_a_drive_in_a_mirror_has_mirrored_estimates(drive):
     dataset = read(drive)
-    assert_same(solved(dataset), solved(mirrored(dataset)), ROUNDING, factor=(1, -1, -1))
+    assert_same(solved(dataset, slip=1e-3), solved(mirrored(dataset), slip=1e-3), ROUNDING,
+                factor=(1, -1, -1))
 
 
 @FEW
@@ -377,17 +401,20 @@ def test_the_unit_of_length_is_a_convention(drive):
 
 
 @FEW
-@given(drives())
+@given(drives(sound=True))
 def test_the_world_may_begin_at_another_pose(drive):
-    """Pose 1 of the drive, seen from two places from which the vehicle gets there."""
-    dataset, steps = read(drive), 10
-    own, *others = (solved(each) for each in (dataset, begun_by((steps, 127, 127), dataset),
-                                              begun_by((steps, 300, -250), dataset)))
+    """Pose 1 and all that follows, in a drive that begins elsewhere: problems 1 and 3.
+
+    How far the steps to this pose are known says nothing of the poses after it.
+    """
+    dataset, steps = read(drive).without("uwb"), 10
+    own, *others = (solved(each, slip=1e-3) for each in (
+        dataset, begun_by((steps, 127, 127), dataset), begun_by((steps, 300, -250), dataset)))
 
     def relative(found, problem):
         (pose, _, C), (_, x, _) = own[problem][0], found[problem][0]
         return [(pose, se2.between(x[steps], x[steps:]), C)]
 
-    problems = own.keys() - {"problem2", "problem2_hint"}
+    problems = own.keys() & {"problem1", "problem3"}
     assert_same(*({each: relative(found, each) for each in problems} for found in others),
                 CONVERGED)
