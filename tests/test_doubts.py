@@ -225,7 +225,8 @@ def moved_by(length, turn, count=20):
 def test_units_are_named_from_a_factor_of_five_on_where_motion_is_significant(
         markers, wheels, said):
     """Standard deviations of 1 cm and 1 mrad: from five of them on, motion is compared."""
-    doubts = units.sighting_units(moved_by(*markers), moved_by(*wheels), np.array([0.01, 1e-3]))
+    doubts = units.sighting_units(moved_by(*markers) + [0, 0, 2 * np.pi], moved_by(*wheels),
+                                  np.array([0.01, 1e-3]))
     assert len(doubts) == (said is not None)
     if said:
         assert said in doubts[0].sentence
@@ -356,6 +357,7 @@ def test_odometry_is_doubted_if_most_increments_disagree(wrong, doubted):
     wheels = moved_by(0.2, 0.1)
     markers = wheels.copy()
     markers[:wrong] *= 1.5
+    markers[:, 2] += 2 * np.pi                                   # whole turns say nothing
     C = np.tile(5e-5 * np.eye(3), (20, 1, 1))
     doubts = _odometry_doubts(_Compared(markers, wheels, C, C, 1.0))
     assert len(doubts) == doubted

@@ -47,20 +47,23 @@ def test_two_increments_by_hand():
 
 
 def test_covariances_are_those_of_all_sightings_through_numerical_derivatives():
-    """Four frames with three markers on a winding path: C = sum over the sightings of D C_s D^T.
+    """Four frames of a winding path with three markers, and the last two with another one.
 
-    D are derivatives of poses and markers by each sighting, whose covariances are not diagonal.
+    C = sum over the sightings of D C_s D^T: D are derivatives of poses and markers by each
+    sighting, whose covariances are not diagonal.
     """
     rng = np.random.default_rng(0)
     poses = np.array([[0, 0, 0], [0.3, 0.1, 0.9], [0.4, 0.5, 2.0], [0.1, 0.6, 3.3]])
-    markers = np.array([[2.0, 1.0, 0.5], [-1.0, 2.0, -2.0], [1.0, -1.5, 3.0]])
-    frame, marker = np.repeat(np.arange(4), 3), np.tile(np.arange(3), 4)
-    root = 0.01 * rng.normal(size=(12, 3, 3))
+    markers = np.array([[2.0, 1.0, 0.5], [-1.0, 2.0, -2.0], [1.0, -1.5, 3.0],
+                        [-1.0, -1.0, 1.0]])
+    frame = np.repeat(np.arange(4), [3, 3, 4, 4])
+    marker = np.r_[np.tile(np.arange(3), 2), np.tile(np.arange(4), 2)]
+    root = 0.01 * rng.normal(size=(14, 3, 3))
     readings = ArucoReadings(10 * frame, marker, se2.between(poses[frame], markers[marker]),
                              root @ np.swapaxes(root, 1, 2) + 1e-5 * np.eye(3))
     found = localize(readings)
-    expected_poses, expected_map = np.zeros((4, 3, 3)), np.zeros((3, 3, 3))
-    for k in range(12):
+    expected_poses, expected_map = np.zeros((2, 4, 3, 3))
+    for k in range(14):
         def moved(change, k=k):
             z = readings.marker_in_vehicle.copy()
             z[k] += change

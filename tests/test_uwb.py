@@ -16,10 +16,11 @@ from slamlib.evaluation import align, ate, nees_band
 from slamlib.odometry import dead_reckoning
 from slamlib.se2 import between, compose
 from slamlib.simulation import manoeuvre, simulate
-from slamlib.slam import doubts, errors
+from slamlib.slam import doubts, errors, gtsam_graph, optimizer
 from slamlib.slam.doubts import MAX_LOG_ODDS
-from slamlib.slam.estimate import fit_from_previous
+from slamlib.slam.estimate import fit_from_odometry, fit_from_previous
 from slamlib.slam.evidence import consistency
+from slamlib.slam.fit import solved_by_gtsam
 from slamlib.slam.initialization import odometry_state
 from slamlib.slam.linear_factors import range_factors
 from slamlib.slam.measurement_factors import MeasurementFactors
@@ -587,6 +588,22 @@ def test_gtsam_reaches_one_optimum_from_the_guess_file_and_from_problem_3():
     assert abs(end.error - fit.equations.error) < 1e-3
     np.testing.assert_allclose(end.state.poses, fit.state.poses, rtol=0, atol=1e-4)
     np.testing.assert_allclose(end.state.antennas, fit.state.antennas, rtol=0, atol=1e-3)
+
+
+def test_gtsam_takes_the_last_steps_of_a_solution(monkeypatch):
+    """Those before are by normal equations; both end at the same place."""
+    m = measure(simulate("short", seed=3)[0].first(200))
+    fit, steps = fit_from_odometry(m, 1e-3), []
+
+    def counted(problem, state):
+        steps.append(gtsam_graph.gtsam_step(problem, state))
+        return steps[-1]
+
+    monkeypatch.setattr(optimizer, "gtsam_step", counted)
+    assert optimize(fit.problem, fit.state).steps > 0 and not steps
+    found = solved_by_gtsam(fit)
+    assert steps
+    np.testing.assert_allclose(found.state.poses, fit.state.poses, atol=1e-5)
 
 
 @pytest.mark.slow
