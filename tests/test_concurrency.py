@@ -40,7 +40,7 @@ def start(folder, *arguments, **options):
                             env=os.environ | {"PYTHONPATH": str(ROOT)})
 
 
-def wait_for(found, process, seconds=120):
+def wait_for(found, process, seconds=300):
     """Wait until a function returns something true, which is returned, while a process runs."""
     until = time.monotonic() + seconds
     while not (value := found()):
@@ -70,8 +70,8 @@ def test_a_second_build_waits_and_names_the_first_and_neither_loses_results(tmp_
         second = start(tmp_path, "report", "short", stderr=told)
         wait_for(lambda: (tmp_path / "told").read_text().endswith("\n"), second)
         (tmp_path / "go").touch()
-        assert "waits for" not in first.communicate(timeout=120)[1] and first.returncode == 0
-        second.communicate(timeout=120)
+        assert "waits for" not in first.communicate(timeout=300)[1] and first.returncode == 0
+        second.communicate(timeout=300)
         assert second.returncode == 0
     line, *lines = (tmp_path / "told").read_text().splitlines()
     assert line.startswith(f"slamlib: waits for process {first.pid}, which has written to ")
