@@ -40,7 +40,7 @@ def start(folder, *arguments, **options):
                             env=os.environ | {"PYTHONPATH": str(ROOT)})
 
 
-def wait_for(found, process, seconds=120):
+def wait_for(found, process, seconds=300):
     """Wait until a function returns something true, which is returned, while a process runs."""
     until = time.monotonic() + seconds
     while not (value := found()):
@@ -60,6 +60,7 @@ def drive():
     return simulate("short", seed=3)[0].first(40)
 
 
+@pytest.mark.slow
 def test_a_second_build_waits_and_names_the_first_and_neither_loses_results(tmp_path):
     make_data(tmp_path)
     write(tmp_path / "notebooks", "1_slow", "# Slow", (RESULT,), (
@@ -70,8 +71,8 @@ def test_a_second_build_waits_and_names_the_first_and_neither_loses_results(tmp_
         second = start(tmp_path, "report", "short", stderr=told)
         wait_for(lambda: (tmp_path / "told").read_text().endswith("\n"), second)
         (tmp_path / "go").touch()
-        assert "waits for" not in first.communicate(timeout=120)[1] and first.returncode == 0
-        second.communicate(timeout=120)
+        assert "waits for" not in first.communicate(timeout=300)[1] and first.returncode == 0
+        second.communicate(timeout=300)
         assert second.returncode == 0
     line, *lines = (tmp_path / "told").read_text().splitlines()
     assert line.startswith(f"slamlib: waits for process {first.pid}, which has written to ")
@@ -161,6 +162,7 @@ def test_unfinished_results_are_not_read(tmp_path):
         results.read_vehicle_poses(tmp_path / "problem1")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux forks safely")
 def test_a_kill_before_any_step_of_solve_mixes_nothing_and_the_next_run_cleans_up():
     """Exhaustive, in both directions between two drives; kills.py does more, and by chance."""
@@ -237,6 +239,7 @@ def test_names_in_a_list_that_lead_out_of_the_folder_are_ignored(tmp_path):
     assert swap.names(tmp_path) == ["above.txt", "out/.slamlib.json"]
 
 
+@pytest.mark.slow
 def test_pages_and_results_that_a_build_no_longer_makes_are_removed(tmp_path):
     make_data(tmp_path)
     write(tmp_path / "notebooks", "1_stays", "# Stays", (RESULT,))
@@ -257,6 +260,7 @@ def test_pages_and_results_that_a_build_no_longer_makes_are_removed(tmp_path):
         "short/problem1/vehiclePose.mat"]
 
 
+@pytest.mark.slow
 def test_a_notebook_that_fails_leaves_old_results_and_what_was_executed_is_kept(tmp_path, capsys):
     make_data(tmp_path)
     write(tmp_path / "notebooks", "1_bad", "# Bad", ("1 / 0",))  # one at a time, the last first
@@ -290,6 +294,7 @@ def test_a_file_that_cannot_be_kept_is_an_error(tmp_path):
     assert not (tmp_path / "kept").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_a_build_in_order(tmp_path, number):
     make_data(tmp_path)

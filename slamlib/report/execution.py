@@ -82,7 +82,7 @@ def execute(books, environment, results, jobs, finish):
     Parameters
     ----------
     books, environment : dict from Path to NotebookNode; dict of str, the kernels' variables.
-    results, jobs : Path and int.
+    results, jobs : Path, a folder of this build alone, and int.
     finish : function of Path, NotebookNode and the names (list of str) of the result files, called
         after each notebook.
     """
