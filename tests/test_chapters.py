@@ -126,7 +126,7 @@ def test_only_a_page_with_something_live_has_the_build_s_script(tmp_path, monkey
         assert page.count("<script>\nmoved();\n</script>\n</body>") == expected
         assert page.count("<script") == expected
     book = titled("1. T", new_markdown_cell('<div class="live"><script>1</script></div>'))
-    with pytest.raises(NotebookError, match="would load a resource: <script"):
+    with pytest.raises(NotebookError, match="cannot show <script>"):
         pages.html_page(Path("1.ipynb"), book, [])
     monkeypatch.setattr(pages, "SCRIPT", tmp_path / "none.js")
     assert "<script" not in pages.html_page(Path("1.ipynb"), titled(
