@@ -15,7 +15,7 @@ for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):  # a
     os.environ.setdefault(name, "1")
 os.environ.pop("SLAMLIB_STUDIES", None)
 
-settings.register_profile("short", derandomize=True, deadline=None, database=None, max_examples=60)
+settings.register_profile("short", derandomize=True, deadline=None, database=None, max_examples=40)
 settings.register_profile("long", deadline=None, database=None, max_examples=1000,
                           print_blob=True)
 settings.load_profile("short")           # another one by `pytest --hypothesis-profile=NAME`
