@@ -99,6 +99,12 @@ def test_wheels_that_are_far_off_are_named_although_slip_explains_the_path(wrong
         assert doubt.what == "wheel-parameters" and said in doubt.sentence
 
 
+def test_wheels_are_not_doubted_for_a_slip_that_was_given():
+    dataset, _ = simulate("short", 61)
+    found = slam.estimate(dataset.without("uwb").first(300), 1e-2, "arc")
+    assert found.slip == 1e-2 and not found.drive_doubts
+
+
 def test_markers_of_another_size_are_named_with_the_wheels():
     """Lengths by markers 5 % too large: the same as wheels that are larger than stated."""
     dataset, _ = simulate("short", 61)
