@@ -1,7 +1,7 @@
 # make report   executes the notebooks on every dataset in data/ and writes report/ and results/
 # make test     checks the style, and runs all tests
 # make quick    runs the tests that take less than a minute in all
-# make mutants   prints which small defects of the numerics no test notices; half an hour
+# make mutants  prints which small defects of the numerics no test notices
 # make lab      opens JupyterLab on the notebooks
 # make strip    removes the outputs from saved notebooks, as they are committed
 # make bench    prints the benchmarks' tables

@@ -23,7 +23,7 @@ from slamlib.localization.doubts import (
     _odometry_doubts,
 )
 from slamlib.localization.marker_increments import consecutive_increments
-from slamlib.sightings import sightings_by_frame
+from slamlib.sightings import Sightings, sightings_by_frame
 from slamlib.simulation import manoeuvre, simulate
 
 SEEDS = (0, 1, 2)
@@ -179,6 +179,16 @@ def test_noise_hides_no_flaw(spoil, keywords):
 def test_a_flaw_is_named_on_a_long_drive(flaw):
     for seed in SEEDS:
         assert whats(FLAWS[flaw][0](simulated("long", seed)[0])) == [FLAWS[flaw][1]]
+
+
+def test_noise_alone_contradicts_no_headings():
+    """A vehicle that stands sees two markers at 100 frames, turned by 1 mrad of noise."""
+    for seed in range(8):
+        rng, frame = np.random.default_rng(seed), np.repeat(np.arange(100), 2)
+        z = np.tile([[2.0, 1.0, 0.3], [1.0, -2.0, -2.0]], (100, 1)) + rng.normal(0, 1e-3, (200, 3))
+        sightings = Sightings(index=np.arange(200), row=frame, marker=np.tile([4, 5], 100), z=z,
+                              C=np.tile(1e-6 * np.eye(3), (200, 1, 1)), frame=np.arange(100))
+        assert not _headings_contradict(sightings, consecutive_increments(sightings))
 
 
 def test_too_little_to_decide_gives_no_doubt():

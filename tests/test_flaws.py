@@ -157,6 +157,16 @@ def test_wheels_that_are_far_off_are_named_although_slip_explains_the_path(wrong
         assert doubt.what == "wheel-parameters" and said in doubt.sentence
 
 
+def test_a_slip_that_was_given_is_not_explained_by_other_wheels():
+    """Radii 3 % off: only a slip that was learned is a reason to try other wheels."""
+    dataset = simulate("short", 501)[0].without("uwb").first(800)
+    spoilt = replace(dataset, vehicle=replace(dataset.vehicle, right_radius=0.103,
+                                              left_radius=0.103))
+    assert "wheel-parameters" in names(slam.estimate(spoilt).drive_doubts)
+    given = slam.estimate(spoilt, 1e-2, "arc")
+    assert given.slip == 1e-2 and "wheel-parameters" not in names(given.drive_doubts)
+
+
 def test_markers_of_another_size_are_named_with_the_wheels():
     """Lengths by markers 5 % too large: the same as wheels that are larger than stated."""
     dataset, _ = simulate("short", 61)

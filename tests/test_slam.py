@@ -631,6 +631,19 @@ def test_the_evidence_chooses_the_steps_that_the_vehicle_drives(true, other):
     np.testing.assert_array_equal(found.problem.measured.weight, wrong.problem.measured.weight)
 
 
+def test_headings_of_a_state_follow_the_turns_by_odometry():
+    """Whatever whole turns are in the poses; the first heading is wrapped."""
+    dataset, truth = simulate("short", seed=5, rounds=2)
+    m, rng = measure(dataset.without("uwb")), np.random.default_rng(0)
+    poses = truth.poses[m.frame]
+    assert np.ptp(poses[:, 2]) > 12
+    turned = poses + 2 * np.pi * rng.integers(-3, 4, len(poses))[:, None] * [0, 0, 1]
+    for start in (turned, poses, poses - [0, 0, 2 * np.pi]):
+        state = state_from_arrays(m, start, np.zeros((len(m.marker), 3)), np.zeros((0, 2)),
+                                  np.zeros(3))
+        np.testing.assert_allclose(state.poses, poses, atol=1e-9)
+
+
 def test_headings_are_continuous_where_frames_are_rounds_apart():
     """Markers at both ends of three rounds only: between two frames the vehicle turns by 6 pi."""
     dataset, truth = simulate("short", seed=5, rounds=3)

@@ -152,7 +152,7 @@ def _compare(dataset, sightings, found):
     args = dataset.ticks, dataset.vehicle
     step, _ = increments.between_poses(*args, frame[:-1], frame[1:], "arc")
     typical = max(np.median(np.hypot(*step[:, :2].T)), SPAN / MAX_FRAMES)
-    span = int(np.clip(np.ceil(SPAN / typical), 1, MAX_FRAMES))
+    span = int(np.ceil(SPAN / typical))
     complete = np.convolve(found.usable, np.ones(span), "valid") == span if l >= span else []
     if np.count_nonzero(complete) < MIN_INCREMENTS * span:
         span, complete = 1, found.usable
