@@ -34,9 +34,11 @@ write_vehicle_poses(Path(os.environ["SLAMLIB_RESULTS"], "short", "problem1"), *p
 
 
 def start(folder, *arguments, **options):
+    """The command in a process of its own, which heeds SIGHUP also where these tests ignore it."""
     return subprocess.Popen([sys.executable, "-m", "slamlib", *map(str, arguments)], cwd=folder,
                             text=True, **({"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
                                           | options),
+                            preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL),
                             env=os.environ | {"PYTHONPATH": str(ROOT)})
 
 
