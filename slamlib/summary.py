@@ -29,7 +29,7 @@ from slamlib.solve import (
 )
 
 PR_SET_PDEATHSIG = 1                                           # Linux, prctl(2)
-BESIDES = ("problem2", "problem2_hint", "problem2_fused")      # nothing else depends on them
+BESIDES = ("problem1", "problem2", "problem2_hint", "problem2_fused")  # none depends on others
 
 
 def solve_to_folder(dataset, truth, out, jobs=1):
@@ -40,7 +40,7 @@ def solve_to_folder(dataset, truth, out, jobs=1):
     Its list "doubts", of "what" and "sentence", is empty where the measurements agree with the
     files: first those about the drive, then by problem. Once all files are written they replace
     those of an earlier run, by `swap.publish`.
-    With two `jobs`, a second process solves problem 2 meanwhile.
+    With two `jobs`, a second process solves problems 1 and 2 meanwhile.
     """
     out = Path(out)
     with swap.staging(out) as stage:
@@ -53,8 +53,7 @@ def solve_to_folder(dataset, truth, out, jobs=1):
 
 def _solve_to_stage(dataset, truth, stage, jobs):
     """Write each problem's files to an empty folder as it ends, then the summary; return it."""
-    rows, doubts = _written_by_all(dataset, truth, stage, jobs)
-    of_drive = doubts_about_drive(dataset, truth)
+    (rows, doubts), of_drive = _written_by_all(dataset, truth, stage, jobs)
     in_order = [problem for problem in PROBLEMS if problem in rows]
     summary = {"dataset": dataset.name, "poses": len(dataset.ticks),
                "doubts": [asdict(doubt) for doubt in merged(
@@ -66,25 +65,25 @@ def _solve_to_stage(dataset, truth, stage, jobs):
 
 
 def _written_by_all(dataset, truth, stage, jobs):
-    """What `_written` returns, of all problems; with two `jobs` by two processes.
+    """What `_written` returns, of all problems, and doubts about the drive.
 
-    The second process is a fork: only Linux makes those safely. It ends with this one, so that
-    nothing is written once this process is gone.
+    With two `jobs` there are two processes. The second one is a fork: only Linux makes those
+    safely. It ends with this one, so that nothing is written once this process is gone.
     """
     if jobs < 2 or sys.platform != "linux" or len(os.sched_getaffinity(0)) < 2:
-        return _written(dataset, truth, stage, PROBLEMS)
+        return _written(dataset, truth, stage, PROBLEMS), doubts_about_drive(dataset, truth)
     first = [problem for problem in PROBLEMS if problem not in BESIDES]
     others = set(active_children())
     with ProcessPoolExecutor(1, mp_context=get_context("fork"), initializer=_ends_with,
                              initargs=(os.getpid(),)) as pool:
         try:
-            besides = pool.submit(_written, dataset, truth, stage, BESIDES)
+            besides = pool.submit(_besides, dataset, truth, stage)
             rows, doubts = _written(dataset, truth, stage, first)
             try:
-                others_rows, others_doubts = besides.result()
+                (others_rows, others_doubts), of_drive = besides.result()
             except BrokenProcessPool:                   # killed, as where memory is short
-                others_rows, others_doubts = _written(dataset, truth, stage, BESIDES)
-            return rows | others_rows, doubts | others_doubts
+                (others_rows, others_doubts), of_drive = _besides(dataset, truth, stage)
+            return (rows | others_rows, doubts | others_doubts), of_drive
         except BaseException:                           # no one waits for what it finds
             for process in set(active_children()) - others:
                 process.kill()
@@ -101,6 +100,11 @@ def _ends_with(parent):
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:                          # gone already
         os._exit(1)
+
+
+def _besides(dataset, truth, stage):
+    """What the second process does."""
+    return _written(dataset, truth, stage, BESIDES), doubts_about_drive(dataset, truth)
 
 
 def _written(dataset, truth, stage, problems):

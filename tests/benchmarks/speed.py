@@ -72,7 +72,7 @@ def pairs(count=PAIRS):
               f"{ours / whole:8.2f}", flush=True)
     print(f"median ratio {np.median(ratios):.2f}; of the last run: " + ", ".join(
         f"{name} {seconds:.2f} s" for name, seconds in parts.items())
-        + " (problem 2 in a second process, where there is a second core)")
+        + " (problems 1 and 2 in a second process, where there is a second core)")
 
 
 def growth(folder, large):
