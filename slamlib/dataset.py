@@ -242,7 +242,8 @@ def _read_aruco(folder, pose_count):
     sigma = np.sqrt(table[:, [3, 6, 8]])
     correlation = covariance / (sigma[:, :, None] * sigma[:, None, :])
     smallest_eigenvalue = np.linalg.eigvalsh(correlation)[:, 0]
-    require(smallest_eigenvalue > SMALLEST_EIGENVALUE, path, "a positive definite covariance")
+    require(smallest_eigenvalue > SMALLEST_EIGENVALUE, path, "a positive definite covariance "
+            f"(smallest eigenvalue of its correlation matrix above {SMALLEST_EIGENVALUE:g})")
     return _in_order(ArucoReadings(pose, marker, table[:, :3], covariance), pose, marker, table)
 
 

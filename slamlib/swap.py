@@ -69,11 +69,12 @@ def _remove_temporaries(path):
     """Remove what processes that are gone left of `write` to this path."""
     for file in path.parent.glob(f".{glob.escape(path.name)}.*"):
         process = file.name.rpartition(".")[2]
-        if process.isdecimal() and not _runs(int(process)):
+        if process.isdecimal() and not runs(int(process)):
             file.unlink(missing_ok=True)
 
 
-def _runs(process):
+def runs(process):
+    """True if there is a process with this id."""
     try:
         os.kill(process, 0)
     except (ProcessLookupError, OverflowError):
@@ -190,6 +191,8 @@ def publish(sets):
         pairs = [(each, stack.enter_context(staging(each.folder))) for each in sets]
         for folder in sorted({each.folder for each in sets}):  # in this order by all processes
             stack.enter_context(locked(folder / LOCK))
+        for each in sets:
+            _check(each)
         for each, control in pairs:
             _prepare(each, control)
         with _undisturbed():
@@ -216,22 +219,30 @@ def _undisturbed():
             signal.raise_signal(number)
 
 
+def _check(each):
+    """Raise OSError where a file cannot be put in its place, or an earlier one not be removed."""
+    for name, staged in each.files.items():
+        target = each.folder / name
+        parent = next(folder for folder in target.parents if folder.exists())
+        if not parent.is_dir():
+            raise _os_error(errno.ENOTDIR, parent)
+        if parent.stat().st_dev != staged.stat().st_dev:
+            raise _os_error(errno.EXDEV, target)
+        if target.is_dir():
+            raise _os_error(errno.EISDIR, target)
+    for folder in sorted({(each.folder / name).parent for name in _old(each) | each.files.keys()}):
+        if folder.is_dir() and not os.access(folder, os.W_OK):
+            raise _os_error(errno.EACCES, folder)
+
+
 def _prepare(each, control):
     """Stage the control files, name all files that may be found from now on, and make folders."""
     write(control / MARKER, SENTENCE.encode())
     write(control / "after", json.dumps(sorted(each.files)).encode())
     write(control / WRITTEN, json.dumps(sorted(_old(each) | each.files.keys())).encode())
     os.replace(control / WRITTEN, each.folder / WRITTEN)
-    for name, staged in each.files.items():
-        target = each.folder / name
-        target.parent.mkdir(parents=True, exist_ok=True)
-        if target.parent.stat().st_dev != staged.stat().st_dev:
-            raise _os_error(errno.EXDEV, target)
-        if target.is_dir():
-            raise _os_error(errno.EISDIR, target)
-    for folder in {(each.folder / name).parent for name in _old(each)}:
-        if folder.is_dir() and not os.access(folder, os.W_OK):
-            raise _os_error(errno.EACCES, folder)
+    for name in each.files:
+        (each.folder / name).parent.mkdir(parents=True, exist_ok=True)
 
 
 def _os_error(number, path):
@@ -266,9 +277,11 @@ def _finish(each, control):
 
 def _old(each):
     """Names (set of str) of all files in a set's folder that may be a run's, also removed ones."""
+    file = each.folder / WRITTEN
     try:
-        written = json.loads((each.folder / WRITTEN).read_bytes())
-    except (FileNotFoundError, NotADirectoryError, ValueError):
-        written = []
-    return {name for name in written if ".." not in PurePosixPath(name).parts
-            and not name.startswith("/")} | each.ours
+        written = json.loads(file.read_bytes()) if file.is_file() else []
+    except (ValueError, RecursionError):
+        written = []                    # not ours: what it should name is the user's
+    return {name for name in (written if isinstance(written, list) else ())
+            if isinstance(name, str) and name and "\0" not in name
+            and ".." not in PurePosixPath(name).parts and not name.startswith("/")} | each.ours

@@ -1,5 +1,6 @@
 """A notebook is executed again when something changed that it depends on, and only then."""
 
+import json
 import shutil
 from importlib.metadata import distributions
 from io import BytesIO
@@ -7,6 +8,7 @@ from zipfile import ZipFile
 
 import nbformat
 import pytest
+from nbformat.v4 import new_markdown_cell
 from test_report import make_data, write
 
 from slamlib.report import build, build_report, cache
@@ -150,12 +152,18 @@ def with_digest(folder, content):
     return cache._checksum(key, content) + b"\n" + content
 
 
-def archive_of(text):
-    """The archive of a kept notebook whose file holds this text."""
+def archive_of(text, names=(), held=()):
+    """The archive of a kept notebook whose file holds this text, with results that it lists."""
     buffer = BytesIO()
     with ZipFile(buffer, "w") as archive:
         archive.writestr(cache.BOOK, text)
+        archive.writestr(cache.NAMES, json.dumps(names))
+        for name in held:
+            archive.writestr(name, "content")
     return buffer.getvalue()
+
+
+EMPTY = '{"nbformat": 4, "nbformat_minor": 5, "metadata": {}, "cells": []}'
 
 
 @pytest.mark.parametrize("change", [
@@ -168,7 +176,12 @@ def archive_of(text):
     lambda folder: executed(folder).write_bytes(with_digest(folder, archive_of("not JSON"))),
     lambda folder: executed(folder).write_bytes(with_digest(folder, archive_of("[1]"))),
     lambda folder: executed(folder).write_bytes(with_digest(folder, archive_of(
-        '{"nbformat": 4, "nbformat_minor": 5, "metadata": {}, "cells": [{}]}'))),
+        EMPTY.replace("[]", "[{}]")))),
+    *(lambda folder, archive=archive: executed(folder).write_bytes(with_digest(folder, archive))
+      for archive in (archive_of(EMPTY, ["a.mat"]), archive_of(EMPTY, [], ["results/a.mat"]),
+                      archive_of(EMPTY, ["a.mat"], ["other/a.mat"]), archive_of(EMPTY, [1], ["1"]),
+                      archive_of(EMPTY, ["../a.mat"], ["results/../a.mat"]),
+                      archive_of(EMPTY, 5))),
     lambda folder: (folder / "data" / "new.txt").write_text("new"),
     lambda folder: (folder / "helper.py").write_text("read by a notebook"),
 ])
@@ -176,6 +189,27 @@ def test_a_change_or_a_damaged_file_is_as_if_nothing_were_kept(kept, tmp_path, c
     assert kept() is not None
     change(tmp_path)
     assert kept() is None
+
+
+def test_an_entry_whose_list_names_its_results_is_recalled(kept, tmp_path):
+    """What the entries above differ from."""
+    executed(tmp_path).write_bytes(with_digest(
+        tmp_path, archive_of(EMPTY, ["a.mat"], ["results/a.mat"])))
+    assert kept()[1] == ["a.mat"]
+
+
+def test_an_entry_with_other_cells_is_executed_again(project, monkeypatch):
+    assert executions(project) == (1, 1)
+    recall = cache.recall
+
+    def with_another_cell(folder, source, *arguments):
+        book, names = recall(folder, source, *arguments)
+        if source.stem == "b":
+            book.cells.append(new_markdown_cell("Another."))
+        return book, names
+
+    monkeypatch.setattr(cache, "recall", with_another_cell)
+    assert executions(project) == (1, 2)
 
 
 def test_an_entry_of_another_key_is_not_recalled(kept, tmp_path):

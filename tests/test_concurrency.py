@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from pathlib import Path
@@ -18,7 +19,7 @@ from test_report import build, make_data, write
 
 from slamlib import results, swap
 from slamlib.__main__ import main
-from slamlib.report import NotebookError, cache
+from slamlib.report import NotebookError, cache, execution
 from slamlib.simulation import simulate, write_dataset
 from slamlib.solve import OURS
 from slamlib.summary import solve_to_folder
@@ -193,7 +194,7 @@ def test_a_full_disk_names_the_path_and_leaves_the_old_results(tmp_path, drive):
                           cwd=tmp_path, text=True, capture_output=True, timeout=120,
                           env=os.environ | {"PYTHONPATH": str(ROOT)})
     assert done.returncode == 2 and done.stderr.count("\n") == 1
-    assert "problem1/vehiclePose.mat: " + os.strerror(errno.EFBIG) in done.stderr
+    assert "/vehiclePose.mat: " + os.strerror(errno.EFBIG) in done.stderr
     assert {name: (out / name).read_bytes() for name in swap.names(out)} == before
 
 
@@ -311,7 +312,7 @@ time.sleep(100)""",))
     assert process.returncode == 128 + number
     assert told.splitlines()[-1] == f"slamlib: ended by {number.name}" and "Traceback" not in told
     assert swap.names(tmp_path / "results") == [] and hidden(tmp_path) == []
-    assert not swap._runs(kernel)
+    assert not swap.runs(kernel)
 
 
 def test_a_signal_while_files_are_replaced_waits_until_they_are(tmp_path, drive, monkeypatch,
@@ -334,8 +335,37 @@ def test_a_folder_that_is_protected_is_told_before_anything_changes(tmp_path, dr
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != protected)
     with pytest.raises(PermissionError, match="problem3"):
         solve_to_folder(drive.without("uwb").without("aruco"), None, tmp_path)
-    assert before == {name: before[name] if name == swap.WRITTEN else (
-        tmp_path / name).read_bytes() for name in swap.names(tmp_path)}
+    assert before == {name: (tmp_path / name).read_bytes() for name in swap.names(tmp_path)}
+
+
+@pytest.mark.parametrize("content", ["5", "null", "[1, null, [], \"a\\u0000\"]", "{\"a\": 1}",
+                                     "[" * 100_000, None])
+def test_a_list_of_files_that_is_none_names_no_file(tmp_path, content):
+    """Not those of the user; None is a pipe, on which reading would wait."""
+    (tmp_path / "mine.txt").write_text("mine")
+    if content is None:
+        os.mkfifo(tmp_path / swap.WRITTEN)
+    else:
+        (tmp_path / swap.WRITTEN).write_text(content)
+    with swap.staging(tmp_path) as stage:
+        swap.write(stage / "new.txt", b"new")
+        swap.publish([swap.Set(tmp_path, {"new.txt": stage / "new.txt"})])
+    assert swap.names(tmp_path) == [swap.WRITTEN, "mine.txt", "new.txt"]
+    assert json.loads((tmp_path / swap.WRITTEN).read_text()) == ["new.txt"]
+
+
+def test_temporary_folders_of_builds_that_are_gone_are_removed(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(execution, "LONGEST_FOLDER", len(str(tmp_path)))
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    names = [f"slamlib-{gone.pid}-x", f"slamlib-{os.getppid()}-x", "slamlib-mine", "other"]
+    for name in names:
+        (tmp_path / name).mkdir()
+    with execution.temporary_folder() as folder:
+        assert folder.parent == tmp_path and folder.name.startswith(f"slamlib-{os.getpid()}-")
+        assert {path.name for path in tmp_path.iterdir()} == {folder.name, *names[1:]}
+    assert not folder.exists()
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
@@ -352,8 +382,8 @@ def test_a_signal_that_is_ignored_stays_so_and_handlers_are_as_before(tmp_path, 
     """As under nohup; and a run from a thread installs no handlers."""
     write_dataset(tmp_path / "drive", drive.without("uwb").without("aruco"))
     seen = []
-    monkeypatch.setattr("slamlib.summary.doubts_about_drive", lambda *_: seen.append(
-        [signal.getsignal(each) for each in (signal.SIGTERM, signal.SIGHUP)]) or ())
+    monkeypatch.setattr("slamlib.summary.merged", lambda _: seen.append(
+        [signal.getsignal(each) for each in (signal.SIGTERM, signal.SIGHUP)]) or [])
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         arguments = ["solve", str(tmp_path / "drive"), "--out", str(tmp_path / "out")]

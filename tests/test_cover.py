@@ -1,6 +1,7 @@
 """report.toml, and what is said of one that is not as it must be."""
 
 import pytest
+from test_report import make_data, write
 
 from slamlib.__main__ import main
 from slamlib.dataset import DatasetError
@@ -50,3 +51,15 @@ def test_a_name_that_the_fonts_cannot_write_is_told(tmp_path, monkeypatch, capsy
     assert main(["report", "--author", "陳大文"]) == 2
     told = capsys.readouterr().err
     assert "no glyph for 大 in author '陳大文'" in told and told.count("\n") == 1
+
+
+def test_a_dataset_s_name_that_the_fonts_cannot_write_is_told_before_a_kernel_starts(
+        tmp_path, monkeypatch, capsys):
+    make_data(tmp_path)
+    (tmp_path / "data" / "short").rename(tmp_path / "data" / "日本")
+    write(tmp_path / "notebooks", "1_text", "# 1. Text", ("1 / 0",))
+    monkeypatch.chdir(tmp_path)
+    assert main(["report"]) == 2
+    told = capsys.readouterr().err
+    assert "data/日本: the PDF's fonts have no glyph for 日 in the name of this dataset" in told
+    assert told.count("\n") == 1

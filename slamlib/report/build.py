@@ -6,7 +6,6 @@ Each notebook becomes one HTML page and one chapter of the PDF; both open with t
 import os
 import resource
 import sys
-import tempfile
 import time
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
@@ -22,7 +21,12 @@ from slamlib.report import cache, overview
 from slamlib.report.chapters import chapter_of, in_order, printed, with_data
 from slamlib.report.cover import Cover
 from slamlib.report.drives import read_drives
-from slamlib.report.execution import execute, kernel_environment, read_notebook
+from slamlib.report.execution import (
+    execute,
+    kernel_environment,
+    read_notebook,
+    temporary_folder,
+)
 from slamlib.report.numbering import numbered
 from slamlib.report.pages import html_pages
 from slamlib.report.pdf import typeset
@@ -107,6 +111,10 @@ def _checked_input(notebooks, data, datasets, cover, appendix):
     if not books:
         raise DatasetError(f"{notebooks}: there are no notebooks (*.ipynb) in this folder")
     selected = dataset_names(data, datasets)
+    for name in selected:
+        if missing := missing_glyphs(name):
+            raise DatasetError(f"{data / name}: the PDF's fonts have no glyph for {missing[0]} in "
+                               "the name of this dataset: rename its folder")
     read = [(read_dataset(data / name), read_truth(data / name)) for name in selected]
     served = with_data(books, [dataset for dataset, _ in read])
     for source in books.keys() - served.keys():
@@ -130,8 +138,8 @@ def _executed(books, options, datasets, results, stage, kept, fresh):
     `stage`, a folder by `swap.staging` in `results`.
     """
     executed, written = {}, set()
-    with tempfile.TemporaryDirectory() as folder:
-        environment = kernel_environment(Path(folder), **options)
+    with temporary_folder() as folder:
+        environment = kernel_environment(folder, **options)
         fingerprint = partial(cache.fingerprint, datasets, next(iter(books)).parent,
                               environment | {"SLAMLIB_RESULTS": str(results)})
         common = fingerprint()
@@ -146,7 +154,8 @@ def _executed(books, options, datasets, results, stage, kept, fresh):
 
         if kept is not None and not fresh:
             for source, key in keys.items():
-                if found := cache.recall(kept, source, key, stage):
+                found = cache.recall(kept, source, key, stage)
+                if found and _sources(found[0]) == _sources(books[source]):
                     executed[source] = found[0]
                     written.update(found[1])
                     print(f"{source.stem}: nothing changed, not executed again", file=sys.stderr)
@@ -158,6 +167,10 @@ def _executed(books, options, datasets, results, stage, kept, fresh):
         execute({source: book for source, book in books.items() if source not in executed},
                 environment, stage, max(1, options["jobs"]), finish)
     return {source: executed[source] for source in books}, sorted(written)
+
+
+def _sources(book):
+    return [(cell.cell_type, cell.source) for cell in book.cells]
 
 
 def rendered(books, drives, cover, code, results):

@@ -22,7 +22,7 @@ from slamlib.studies.memory import digest, modules
 VARIABLES = ("SLAMLIB_", "PYTHON", "MPL", "OMP_", "OPENBLAS_", "MKL_", "LANG", "LC_", "TZ",
              "SOURCE_DATE_EPOCH")  # prefixes of environment variables that may change an output
 VERSIONS = 4  # of each notebook, the last used
-BOOK, RESULTS = "executed.ipynb", "results/"  # in the ZIP archive of a notebook
+BOOK, NAMES, RESULTS = "executed.ipynb", "results.json", "results/"  # in a notebook's ZIP archive
 
 
 def fingerprint(datasets, notebooks, environment):
@@ -77,11 +77,13 @@ def recall(folder, source, key, results):
         archive = ZipFile(BytesIO(content))
         book = nbformat.reads(archive.read(BOOK).decode(), as_version=4)
         nbformat.validate(book)
-        if archive.testzip():
-            return None
+        names = json.loads(archive.read(NAMES))
+        whole = not archive.testzip() and archive.namelist() == [
+            BOOK, NAMES, *(RESULTS + name for name in names)]
     except Exception:  # zipfile, zlib, json and nbformat raise many kinds
         return None
-    names = [name.removeprefix(RESULTS) for name in archive.namelist() if name != BOOK]
+    if not whole or any(".." in name.split("/") for name in names):
+        return None
     for name in names:
         swap.write(results / name, archive.read(RESULTS + name))
     path.touch()
@@ -104,6 +106,7 @@ def keep(folder, source, key, book, results, names):
     content = BytesIO()
     with ZipFile(content, "w", ZIP_DEFLATED, compresslevel=1, strict_timestamps=False) as archive:
         archive.writestr(BOOK, nbformat.writes(book))
+        archive.writestr(NAMES, json.dumps(names))
         for name in names:
             archive.write(results / name, RESULTS + name)
     content = content.getvalue()

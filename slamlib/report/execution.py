@@ -7,6 +7,7 @@ import shutil
 import sys
 import tempfile
 import time
+from contextlib import contextmanager
 from pathlib import Path
 
 import nbformat
@@ -23,6 +24,7 @@ from slamlib.textfile import read_regular
 
 CELL_TIMEOUT = 1800  # s
 POLL = 1.0  # s, between looks at how far the studies are
+PREFIX = "slamlib-"  # of the names of temporary folders
 LONGEST_FOLDER = 70  # characters, of one for sockets: their paths have at most 103
 
 
@@ -73,6 +75,22 @@ def kernel_environment(settings, data, datasets, jobs):
     return environment | ({"SLAMLIB_DATASETS": "\n".join(datasets)} if datasets else {})
 
 
+@contextmanager
+def temporary_folder():
+    """Yield a new folder (Path) of this process; those of builds that are gone are removed first.
+
+    Its path is short enough for sockets in it.
+    """
+    place = tempfile.gettempdir()
+    place = Path("/tmp" if len(place) > LONGEST_FOLDER else place)
+    for left in place.glob(f"{PREFIX}*-*"):
+        process = left.name.split("-")[1]
+        if process.isdecimal() and not swap.runs(int(process)):
+            shutil.rmtree(left, ignore_errors=True)
+    with tempfile.TemporaryDirectory(dir=place, prefix=f"{PREFIX}{os.getpid()}-") as folder:
+        yield Path(folder)
+
+
 def execute(books, environment, results, jobs, finish):
     """Execute notebooks in place, at most `jobs` at a time; the first failure stops the others.
 
@@ -108,10 +126,8 @@ async def _execute_all(books, environment, results, jobs, finish):
             shutil.rmtree(stage, ignore_errors=True)
 
     total = sum(map(_count_code_cells, books.values()))
-    place = "/tmp" if len(tempfile.gettempdir()) > LONGEST_FOLDER else None
-    with tempfile.TemporaryDirectory(dir=place) as folder, tqdm(
+    with temporary_folder() as folder, tqdm(
             total=total, unit="cell", leave=False, disable=not sys.stderr.isatty()) as bar:
-        folder = Path(folder)
         told = folder / "progress"
         told.mkdir()
         watching = asyncio.create_task(_watch(told, bar))
