@@ -418,3 +418,38 @@ def test_the_world_may_begin_at_another_pose(drive):
     problems = own.keys() & {"problem1", "problem3"}
     assert_same(*({each: relative(found, each) for each in problems} for found in others),
                 CONVERGED)
+
+
+@pytest.fixture(scope="module")
+def simulated():
+    """A drive without doubts, so that problem 4 is among what is compared, and its estimates."""
+    dataset, _ = simulate("short", 7, late_ranges=0.1, mislabelled=0.02)
+    before = solved(dataset, slip=1e-3)
+    assert {"problem2_fused", "problem3", "problem4"} <= before.keys()
+    return dataset, before
+
+
+def test_a_simulated_drive_in_a_mirror_has_mirrored_estimates(simulated):
+    dataset, before = simulated
+    assert_same(before, solved(mirrored(dataset), slip=1e-3), ROUNDING, factor=(1, -1, -1))
+
+
+def test_the_unit_of_length_of_a_simulated_drive_is_a_convention(simulated, monkeypatch):
+    dataset, before = simulated
+    constants_in_quarters(monkeypatch)
+    assert_same(before, solved(in_quarters(dataset), slip=2e-3), ROUNDING, factor=(4, 4, 1))
+
+
+def test_ids_of_a_simulated_drive_are_names_only(simulated):
+    dataset, before = simulated
+    aruco, uwb, guess = dataset.aruco, dataset.uwb, dataset.antenna_guess
+    ids = np.unique(np.r_[aruco.marker, guess.antenna])
+    other = np.random.default_rng(1).permutation(ids)
+    markers, antennas, guessed = (other[np.searchsorted(ids, own)] for own in (
+        aruco.marker, uwb.antenna, guess.antenna))
+    order = np.argsort(guessed)
+    changed = replace(
+        dataset, aruco=replace(aruco, marker=markers), uwb=replace(uwb, antenna=antennas),
+        antenna_guess=replace(guess, antenna=guessed[order], position=guess.position[order]))
+    assert_same(before, solved(changed, slip=1e-3), ROUNDING,
+                dict(zip(ids.tolist(), other.tolist(), strict=True)))
