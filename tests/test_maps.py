@@ -43,7 +43,8 @@ def test_a_map_shows_path_markers_antennas_guess_truth_and_states_the_enlargemen
     drive, result = solved
     fig = maps.whole_map(drive, result)
     assert fig.get_figwidth() == 7.4
-    assert labels(fig) == {"vehicle", "truth", "markers, headings", "markers: truth",
+    assert labels(fig) == {"vehicle", "its ellipses", "truth", "ellipses of markers",
+                           "markers, headings", "markers: truth",
                            "antennas: guess", "antennas: estimate", "antennas: truth"}
     title = fig.axes[0].get_title("left")
     assert title.startswith("short (95 % ellipses × ")
@@ -53,6 +54,12 @@ def test_a_map_shows_path_markers_antennas_guess_truth_and_states_the_enlargemen
     covariances = np.concatenate([result.marker_covariance[:, :2, :2], result.antenna_covariance])
     assert widest == pytest.approx(
         2 * factor * 2.4477 * np.sqrt(np.linalg.eigvalsh(covariances).max()), rel=1e-3)
+    of_vehicle = fig.axes[0].collections[0]
+    places = of_vehicle.get_offsets()
+    assert len(places) == maps.ELLIPSES and np.isin(places, result.poses[:, :2]).all()
+    own = result.covariances[np.isin(result.poses[:, 0], places[:, 0]), :2, :2]
+    assert of_vehicle.get_widths() == pytest.approx(
+        2 * factor * 2.4477 * np.sqrt(np.linalg.eigvalsh(own)[:, 1]), rel=1e-3)
     x, y = fig.axes[0].get_xlim(), fig.axes[0].get_ylim()
     for points in (result.poses, result.marker_in_world, result.antenna_in_world):
         assert x[0] < points[:, 0].min() and points[:, 0].max() < x[1]
@@ -66,7 +73,8 @@ def test_what_a_drive_lacks_is_absent_from_map_and_tables(solved, markers, anten
     if not antennas:
         drive = replace(drive, dataset=drive.dataset.without("uwb"))
     fig = maps.whole_map(drive, result)
-    expected = {"vehicle"} | ({"markers, headings"} if markers else set())
+    expected = {"vehicle", "its ellipses"}
+    expected |= {"ellipses of markers", "markers, headings"} if markers else set()
     expected |= {"antennas: guess", "antennas: estimate"} if antennas else set()
     assert labels(fig) == expected
     assert set(plotting.pictures(fig)) == {plotting.WIDE, plotting.NARROW}

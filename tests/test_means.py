@@ -41,5 +41,5 @@ def test_a_difference_is_decided_beyond_two_standard_errors():
 
 
 def test_numbers_of_a_table_have_minus_signs():
-    text = table_text(["name", "x", "y"], [["a-1", "-0.5", "+1, -2 ± 3"]])
-    assert text.splitlines()[-1] == "| a-1 | −0.5 | +1, −2 ± 3 |"
+    text = table_text(["name", "x", "y"], [["a-1", "-0.5", "+1, -2 ± 3 (-4)"]])
+    assert text.splitlines()[-1] == "| a-1 | −0.5 | +1, −2 ± 3 (−4) |"

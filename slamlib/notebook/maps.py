@@ -18,13 +18,14 @@ MANY = 60                      # landmarks
 POINT = 1.0                    # rad^2, variance of the heading of a marker without orientation
 MARGIN = 0.04                  # of the map's extent around it
 TICK = 0.022                   # length of a marker's heading tick, of the map's extent
+ELLIPSES = 16                  # of the vehicle, at equal distances along the path
 LARGEST = 0.045                # semi-axis of the largest ellipse, of the map's extent
 NAME, ANTENNA_NAME = 6.2, 10.0                         # points, sizes of the names
 MARKER, ANTENNA = "#CC79A7", "#44AA99"                 # colours of the ellipses
 
 
 def whole_map(drive, result):
-    """The figure of a drive's map: path, markers, antennas and their names, and truth if known.
+    """The figure of a drive's map: path, markers, antennas, their names, and truth if known.
 
     Ellipses hold 95 %; the title states how much they are enlarged. Those of antennas in doubt are
     drawn in their true size, because they may be as large as the map.
@@ -42,6 +43,9 @@ def whole_map(drive, result):
     role = "slam_uwb" if len(result.antenna) else "slam"
     plotting.trajectory(ax, result.poses, role, "vehicle", linewidth=1.5,
                         linestyle="-")
+    at = plotting.spread(result.poses, ELLIPSES)
+    plotting.ellipses(ax, result.poses[at], result.covariances[at], plotting.ROLES[role]["color"],
+                      enlarged=enlarged, fit=False, fill=0.35, label="its ellipses")
     if drive.truth is not None:
         plotting.trajectory(ax, drive.truth.poses, "truth", linewidth=0.7)
     names = [*_markers(ax, drive, result, enlarged, TICK * size),
@@ -70,7 +74,7 @@ def _markers(ax, drive, result, enlarged, tick):
         return
     place = result.marker_in_world[:, :2]
     plotting.ellipses(ax, place, result.marker_covariance, MARKER, enlarged=enlarged, fill=0.3,
-                      fit=False)
+                      fit=False, label="ellipses of markers")
     ax.plot(*_ticks(result, tick).transpose(2, 0, 1)[:, [0, -1]], color="#555555", linewidth=0.9,
             zorder=4)
     ax.plot(*place.T, "s", color="#777777", markersize=2.6, zorder=4, label="markers, headings")
@@ -226,8 +230,6 @@ def _enlargement(result, size):
 
 
 def _title(drive, result, enlarged):
-    if not len(result.marker) + len(result.antenna):
-        return drive.name
     if enlarged == 1:
         return f"{drive.name} (95 % ellipses)"
     doubtful = ", in doubt (?) × 1" if in_doubt(result).any() else ""

@@ -165,7 +165,7 @@ def table_text(header, rows, texts=1):
     """
     above = [None, *(row[0] for row in rows)]
     grouped = [["" if row[0] == first else row[0], *row[1:texts],
-                *(re.sub(r"(?<!\S)-(?=\d)", "−", cell) for cell in row[max(1, texts):])]
+                *(re.sub(r"(?<![\w.])-(?=\d)", "−", cell) for cell in row[max(1, texts):])]
                for first, row in zip(above, rows, strict=False)]
     lines = [header, ["---"] * texts + ["---:"] * (len(header) - texts), *grouped]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
