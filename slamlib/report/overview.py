@@ -260,8 +260,8 @@ def _file_table(drives, address):
         rows.append([named(folder.name, at.dataset), code(str(folder)), *links])
     text = table_text(["problem", "folder", *map(code, kinds)], rows,
                       texts=2 + len(kinds))
-    which = " Of problem 2, `problem2` is markers alone, `problem2_fused` the fusion with odometry, " \
-            "and `problem2_hint` the fusion by the assignment's hint, for comparison." \
-            if PurePath("problem2_hint") in folders else ""
+    which = "" if PurePath("problem2_hint") not in folders else (
+        " Of problem 2, `problem2` is markers alone, `problem2_fused` the fusion with odometry, "
+        "and `problem2_hint` the fusion by the assignment's hint, for comparison.")
     return (f"{text}\n\nTable 2. The files to hand in, MATLAB files with struct arrays, and the "
             "datasets that have them. The path of a file is `results/dataset/folder/file`." + which)
