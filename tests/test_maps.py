@@ -66,6 +66,14 @@ def test_a_map_shows_path_markers_antennas_guess_truth_and_states_the_enlargemen
         assert y[0] < points[:, 1].min() and points[:, 1].max() < y[1]
 
 
+def test_a_name_with_dollar_signs_is_no_formula(solved):
+    drive, result = solved
+    fig = maps.whole_map(replace(drive, name=r"$\foo$ of $x$"), result)
+    wide = plotting.pictures(fig)[plotting.WIDE]
+    assert r"$\foo$ of $x$ (95" in wide
+    plt.close(fig)
+
+
 @pytest.mark.parametrize("markers, antennas", [(True, False), (False, True), (False, False)])
 def test_what_a_drive_lacks_is_absent_from_map_and_tables(solved, markers, antennas):
     drive, result = solved

@@ -101,7 +101,7 @@ def wheels(drive, right, left, base, sigma_radii, sigma_base, probability, count
     plotting.trajectory(plan, poses, "odometry", "nominal wheels")
     plotting.ellipses(plan, poses[at], covariances[at], color, probability / 100, name)
     plotting.trajectory(plan, other, "alternative", "wheels of the sliders")
-    plan.set_title(drive.name)
+    plan.set_title(plotting.literal(drive.name))
     k = np.sqrt(-2 * np.log(1 - probability / 100))
     longest = k * np.sqrt(np.linalg.eigvalsh(covariances[:, :2, :2])[:, 1])
     side.fill_between(np.arange(len(poses)) + 1, longest, color=color, alpha=0.18, linewidth=0,
@@ -111,7 +111,8 @@ def wheels(drive, right, left, base, sigma_radii, sigma_base, probability, count
     if drive.truth is not None:
         plotting.trajectory(plan, drive.truth.poses, "truth")
         plotting.curve(side, np.hypot(*(drive.truth.poses - poses)[:, :2].T), "truth")
-        plan.set_title(f"{drive.name}: ATE {evaluation.ate(other, drive.truth.poses):.3f} m")
+        plan.set_title(f"{plotting.literal(drive.name)}: "
+                       f"ATE {evaluation.ate(other, drive.truth.poses):.3f} m")
     side.set(ylabel="distance from nominal (m)", ylim=(0, None))
     plotting.legend_below(fig)
     fig.said = _said_of_wheels(v, np.array([right, left, base]), poses[-1], other[-1])

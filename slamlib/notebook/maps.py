@@ -230,10 +230,11 @@ def _enlargement(result, size):
 
 
 def _title(drive, result, enlarged):
+    name = plotting.literal(drive.name)
     if enlarged == 1:
-        return f"{drive.name} (95 % ellipses)"
+        return f"{name} (95 % ellipses)"
     doubtful = ", in doubt (?) × 1" if in_doubt(result).any() else ""
-    return f"{drive.name} (95 % ellipses × {enlarged}{doubtful})"
+    return f"{name} (95 % ellipses × {enlarged}{doubtful})"
 
 
 def _rows(ids, places, wanted):

@@ -58,6 +58,11 @@ def use_style():
     plt.style.use(Path(__file__).with_name("slamlib.mplstyle"))
 
 
+def literal(text):
+    """Text (str) as a figure shows it, without formulas: names may have dollar signs."""
+    return text.replace("$", r"\$")
+
+
 def panels(count, rows=1, height=3.4, width=3.7, columns=2):
     """A figure and its axes (count, rows): `columns` panels side by side, sizes in inches each."""
     columns = min(columns, count)
