@@ -213,3 +213,15 @@ def test_monte_carlo_draws_from_the_vehicle_sigmas():
                                rtol=0.07)
     length = np.hypot(samples[:, 1, 0], samples[:, 1, 1])
     np.testing.assert_allclose(length.std(), 0.01 / np.sqrt(2), rtol=0.07)
+
+
+def test_the_chord_of_a_large_turn_is_the_same_to_both_sides():
+    """A unit arc that turns by d has the chord sin(d / 2) / (d / 2)."""
+    turn = np.array([-3.0, -1.0, -1e-5, 0.0, 1e-5, 1.0, 3.0])
+    chord, slope, share = odometry._chord(turn, "arc")
+    half = np.where(turn == 0, 1, turn) / 2
+    np.testing.assert_allclose(chord, np.where(turn == 0, 1, np.sin(half) / half))
+    h = 1e-6
+    numeric = (odometry._chord(turn + h, "arc")[0] - odometry._chord(turn - h, "arc")[0]) / (2 * h)
+    np.testing.assert_allclose(slope, numeric, atol=1e-9)
+    assert share == 0.5

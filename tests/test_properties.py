@@ -7,7 +7,7 @@ import json
 import sys
 import tempfile
 from collections import Counter
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,7 +22,7 @@ from slamlib import localization, odometry, se2, slam
 from slamlib.dataset import DatasetError, Vehicle, read_dataset, read_truth
 from slamlib.localization.units import range_units
 from slamlib.simulation import simulate
-from slamlib.slam.covariances import covariances
+from slamlib.slam.covariances import _common_turn, _require_digits, covariances
 from slamlib.slam.estimate import fit_from_odometry
 from slamlib.slam.measurements import measure
 from slamlib.solve import Failure, doubts_about_drive, solutions
@@ -237,6 +237,21 @@ def test_a_heading_that_is_lost_in_rounding_is_told():
     seen = dataset.aruco
     with pytest.raises(DatasetError, match="sigma_heading = 1 rad .* lost in rounding"):
         slam.estimate(replace(dataset, aruco=replace(seen, covariance=1e-10 * seen.covariance)))
+
+
+def test_rounding_hides_a_heading_from_a_twentieth_of_its_information_on():
+    """What the information has beyond that of the priors about a common turn, over the priors'."""
+    dataset, _ = simulate("short", 61)
+    dataset = replace(dataset.first(400), uwb=None,
+                      vehicle=replace(dataset.vehicle, sigma_heading=0.1))
+    equations = fit_from_odometry(measure(dataset), slip=1e-3).equations
+    turn = _common_turn(equations.problem.measurements, equations.state)
+    H = equations.structure.matrix(equations.sums(equations.problem.noise)[0]).toarray()
+    for share, sign in ((0.045, 1), (0.055, 1), (0.045, -1), (0.055, -1)):
+        rounding = sign * share / 0.1**2 * np.outer(turn, turn) / (turn @ turn)**2
+        with pytest.raises(DatasetError, match="lost in rounding") if share > 0.05 \
+                else nullcontext():
+            _require_digits(equations, H + rounding)
 
 
 # Changes of a drive that change nothing but what they must.
