@@ -208,24 +208,26 @@ def server():
 def visit(named, server, chromium, tmp_path):
     """A function that opens a page (str), clicks what can be clicked, and says what happened.
 
+    It waits so many ms after both.
+
     The report `named` is built before the browser starts, see `chromium`.
     """
     context = chromium.new_context()
     path = tmp_path / "page.html"
 
-    def happened(text):
+    def happened(text, wait=200):
         page = context.new_page()
         server.asked.clear()
         path.write_text(text.replace("PORT", str(server.server_port)), encoding="utf-8")
         page.goto(path.as_uri(), wait_until="load")
-        page.wait_for_timeout(50)
+        page.wait_for_timeout(wait)
         titles = [page.title()]                 # a click may lead to a page without a title
         away = page.url != path.as_uri() or page.evaluate("document.baseURI") != page.url
         if not away:
             page.evaluate("""() => document.querySelectorAll("main :is(a, button)").forEach(e =>
                 !/^[^:]*$|html|pdf|mat$/.test(e.getAttribute("href") ?? "x:") && e.dispatchEvent(
                     new MouseEvent("click", {bubbles: true, cancelable: true})))""")
-            page.wait_for_timeout(50)
+            page.wait_for_timeout(wait)
         ran = "ran" in [*titles, page.title()]
         page.close()
         return ["ran"] * ran + ["away"] * away + ["asked"] * bool(server.asked)
@@ -244,7 +246,8 @@ def put(text, page):
 def test_a_payload_does_something_in_a_page_without_policy(kind, visit):
     """Otherwise the next test could not fail."""
     expected = "ran" if kind in RUNNING else "asked" if kind in LOADING else "away"
-    assert expected in visit(put(PAYLOADS[kind], POLICY.sub("", page_of())))
+    page = put(PAYLOADS[kind], POLICY.sub("", page_of()))
+    assert any(expected in visit(page, wait) for wait in (50, 500, 5000))    # ms: a busy machine
 
 
 @pytest.mark.slow
