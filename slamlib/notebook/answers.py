@@ -3,6 +3,7 @@
 import numpy as np
 
 from slamlib import evaluation
+from slamlib.notebook.means import three_digits
 from slamlib.notebook.show import plain, say
 from slamlib.solve import truth_in_world
 
@@ -48,5 +49,4 @@ def result_sentence(drive, solution):
 def with_unit(value, unit):
     """A value with three significant digits and its unit (str), below 1 in thousandths of it."""
     value, unit = (value, unit) if abs(value) >= 1 else (1e3 * value, f"m{unit}")
-    number = f"{value:{',.0f' if abs(value) >= 100 else '#.3g'}}".removesuffix(".")
-    return f"{number}\u00a0{unit}"
+    return f"{three_digits(value)}\u00a0{unit}"

@@ -10,6 +10,7 @@ import numpy as np
 
 from slamlib import evaluation, se2
 from slamlib.notebook import inline, plotting
+from slamlib.notebook.means import three_digits
 from slamlib.notebook.names import Names
 
 WIDTH = 7.4                    # inches, the whole width of the page
@@ -257,5 +258,4 @@ def _thousandths(value):
     """A value in thousandths of its unit with three significant digits; "–" if it is not known."""
     if not np.isfinite(value):
         return "–"
-    number = 1e3 * value
-    return f"{number:,.0f}" if number >= 100 else f"{number:#.3g}".removesuffix(".")
+    return three_digits(1e3 * value)

@@ -13,6 +13,11 @@ def number(value):
     return _text(value, 0 if size >= 100 else 1 if size >= 10 else 2)
 
 
+def three_digits(value):
+    """A value with three significant digits (str), however small it is."""
+    return f"{value:{',.0f' if abs(value) >= 100 else '#.3g'}}".removesuffix(".")
+
+
 def mean_and_error(series):
     """Mean of a series (n,) over drives, and its standard error."""
     series = np.asarray(series, float)

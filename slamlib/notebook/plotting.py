@@ -1,4 +1,4 @@
-"""Trajectories, covariance ellipses and state curves, with one style for each role everywhere.
+"""Trajectories, covariance ellipses and curves over poses, with one style for each role everywhere.
 
 Functions with an argument `ax` or `axes` draw on these matplotlib axes and return them. Poses are
 (n, 3) [x, y, heading] in m and rad, NaN without an estimate; covariances are (n, 3, 3) of the same.
@@ -15,9 +15,7 @@ import numpy as np
 from IPython.core.pylabtools import print_figure
 from matplotlib.collections import EllipseCollection
 from matplotlib.colors import to_rgb
-from matplotlib.patches import Annulus
 
-from slamlib import se2
 from slamlib.evaluation import REACH_95
 from slamlib.odometry import cumulative
 
@@ -156,15 +154,6 @@ def antennas(ax, positions, covariances, guess=None, truth=None, enlarged=1):
     return ax
 
 
-def rings(ax, centres, radii, sigma, color="#56B4E9"):
-    """Draw rings of radii +- 2 sigma, both (m,), around centres (m, 2), all in m."""
-    for centre, radius, s in zip(centres, radii, sigma, strict=True):
-        ax.add_patch(Annulus(centre, radius + 2 * s, 4 * s, color=color, alpha=0.35, linewidth=0))
-    ax.set_aspect("equal", adjustable="box")
-    ax.set(xlabel="x (m)", ylabel="y (m)")
-    return ax
-
-
 def likelihood(ax, positions, ranges, sigma, window):
     """Shade the likelihood of an antenna's position relative to its maximum, all in m.
 
@@ -207,11 +196,6 @@ def name_rows(axes, names):
     axes[-1].set(xlabel="pose number")
 
 
-def farthest(poses):
-    """Index of the pose with the largest distance from the first one."""
-    return int(np.argmax(np.hypot(*(poses[:, :2] - poses[0, :2]).T)))
-
-
 def legend_below(fig):
     """Draw one legend below all axes of a figure: each label once, in as few lines as fit."""
     entries = {}
@@ -229,47 +213,9 @@ def legend_below(fig):
             break
 
 
-def states(axes, poses, covariances, role, label=None):
-    """Draw x, y and heading with bands of +-2 sigma over the pose number on three axes."""
-    return _curves(axes, poses, poses, covariances, role, label or role, np.arange(len(poses)),
-                   ("x (m)", "y (m)", "heading δ (rad)"))
-
-
-def errors(axes, poses, covariances, truth, role, label=None, at=None):
-    """Draw the errors of x, y and heading with bands of +-2 sigma around 0 on three axes.
-
-    `truth` is (n, 3). `at` (n,) are the indices from 0 of the poses, by default all poses.
-    """
-    error = poses - truth
-    error[:, 2] = se2.wrap(error[:, 2])
-    at = np.arange(len(poses)) if at is None else at
-    return _curves(axes, error, np.zeros_like(error), covariances, role, label or role, at,
-                   ("error of x (m)", "error of y (m)", "error of δ (rad)"))
-
-
 def curve(ax, values, role, at=None, label=None, **look):
     """Draw values (n,) over the pose number; `at` (n,) are the indices from 0 of their poses."""
     at = np.arange(len(values)) if at is None else at
     ax.plot(at + 1, values, label=label or role, **{**ROLES[role], **look})
     ax.set(xlabel="pose number")
     return ax
-
-
-def cloud(ax, samples, mean, estimates, probability=0.95):
-    """Draw samples (d, 2), and ellipses of estimates {role: (covariance (2, 2), label)} at mean."""
-    ax.plot(samples[:, 0], samples[:, 1], ".", color="#777777", markersize=2.5, label="Monte Carlo")
-    for role, (covariance, label) in estimates.items():
-        ellipses(ax, mean[None], covariance[None], ROLES[role]["color"], probability, label)
-    return ax
-
-
-def _curves(axes, values, middle, covariances, role, label, at, names):
-    two_sigma = 2 * np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
-    low, high = middle - two_sigma, middle + two_sigma
-    few = np.unique(np.linspace(0, len(values) - 1, 800).astype(int))      # bands are smooth
-    for i, ax in enumerate(axes):
-        ax.plot(at + 1, values[:, i], label=label, **ROLES[role])
-        ax.fill_between(at[few] + 1, low[few, i], high[few, i], color=ROLES[role]["color"],
-                        alpha=0.18, linewidth=0, label=f"{label}: ±2σ")
-    name_rows(axes, names)
-    return axes
