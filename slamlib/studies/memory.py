@@ -17,8 +17,10 @@ from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
-from joblib import Memory, Parallel, delayed
+from joblib import Memory
 from tqdm import tqdm
+
+from slamlib.studies import workers
 
 SLAMLIB = Path(__file__).parents[1]
 SHOWING = ("notebook", "report")           # folders that show studies and do not compute them
@@ -51,9 +53,8 @@ def run(trial, seeds, jobs=2, progress=False, **options):
 
 def _compute(trial, name, seeds, options, threads, jobs, progress):
     rows, told = [], os.environ.get("SLAMLIB_PROGRESS")
-    for row in tqdm(Parallel(n_jobs=jobs, return_as="generator")(
-            delayed(trial)(seed, **options) for seed in seeds), total=len(seeds),
-            disable=not progress):
+    for row in tqdm(workers.rows(trial, seeds, options, jobs), total=len(seeds),
+                    disable=not progress):
         rows.append(row)
         if told:
             Path(told).write_text(f"{trial.__name__} {len(rows)} of {len(seeds)}")

@@ -1,0 +1,82 @@
+"""Trials in processes that are joined by pipes alone, so that nothing stays however they end.
+
+Pools of processes have named semaphores, which a kernel that is killed leaves in shared memory, and
+workers that outlive it. A pipe ends with the process that holds its other end.
+"""
+
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import traceback
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, suppress
+from queue import SimpleQueue
+
+from joblib import wrap_non_picklable_objects
+
+# Matrices are small: more threads only wait for each other.
+ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+COMMAND = "from slamlib.studies.workers import _serve; _serve()"
+
+
+def rows(trial, seeds, options, jobs):
+    """Yield what trial(seed, **options) returns for each of `seeds` (list of int), in their order.
+
+    With more than one of `jobs` in processes of their own, whose numerics have one thread each. An
+    exception of the trial is raised here; RuntimeError if one of these processes is killed.
+    """
+    if jobs == 1:
+        yield from (trial(seed, **options) for seed in seeds)
+        return
+    trial = wrap_non_picklable_objects(trial, keep_wrapper=False)  # one that a notebook defines
+    with ExitStack() as stack:
+        idle = SimpleQueue()
+        for _ in range(min(jobs, len(seeds))):
+            idle.put(stack.enter_context(_worker()))
+
+        def row(seed):
+            worker = idle.get()
+            try:
+                return _answer(worker, (trial, seed, options))
+            finally:
+                idle.put(worker)
+
+        yield from stack.enter_context(ThreadPoolExecutor(jobs)).map(row, seeds)
+
+
+def _worker():
+    """Start a process that imports what this one can import."""
+    environment = ONE_THREAD | os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    return subprocess.Popen([sys.executable, "-c", COMMAND], env=environment,
+                            stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+
+
+def _answer(worker, call):
+    try:
+        pickle.dump(call, worker.stdin)
+        worker.stdin.flush()
+        answer = pickle.load(worker.stdout)
+    except (EOFError, BrokenPipeError):
+        raise RuntimeError("a process that ran a study ended, "
+                           f"with exit code {worker.wait()}") from None
+    if isinstance(answer, Exception):
+        raise answer
+    return answer
+
+
+def _serve():
+    """Answer the calls that stdin brings, on stdout, until either end of a pipe is closed."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)            # which interrupts the parent, too
+    with suppress(EOFError, OSError), os.fdopen(os.dup(1), "wb") as answers:
+        os.dup2(2, 1)                                       # what a trial prints is no answer
+        while True:
+            trial, seed, options = pickle.load(sys.stdin.buffer)
+            try:
+                answer = trial(seed, **options)
+            except Exception as error:
+                error.add_note(traceback.format_exc())
+                answer = error
+            pickle.dump(answer, answers)
+            answers.flush()
