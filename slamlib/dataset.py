@@ -4,7 +4,7 @@ The folder holds `encoderReading.txt` and, where the vehicle has the sensors, `A
 `UwbReading.txt` with `UwbAntennaGuess.txt`. Optional are `vehicle.toml`, with what differs from the
 assignment's table 2, and the folder `truth`. Lengths are in metres, angles in radians. Pose ids
 count from 1 in the files and from 0 in the arrays; marker and antenna ids stay unchanged. Numbers
-are within `limits.LIMITS`.
+are within `limits.LIMITS`. `folder` finds the files, `dialects` reads their numbers.
 """
 
 from dataclasses import asdict, dataclass, replace
@@ -13,16 +13,17 @@ from pathlib import Path
 
 import numpy as np
 
+from slamlib import counts
+from slamlib.dialects import read_table
 from slamlib.doubt import Doubt
+from slamlib.exchanged import look_exchanged
+from slamlib.folder import ENCODER, TRUTH_FILES, contents, is_dataset
 from slamlib.limits import LIMITS
-from slamlib.textfile import DatasetError, error, find, quoted, read_table, read_toml, require
+from slamlib.textfile import DatasetError, error, quoted, read_toml
 from slamlib.truth_frame import in_first_frame
 
 SMALLEST_EIGENVALUE = 1e-12  # no unit; a correlation matrix with a smaller one counts as singular
 MOST_NEGATIVE = 5.0  # sigmas, of a range at an antenna
-MOST_REVOLUTIONS = 10  # revolutions of a wheel in one step
-FILES = ("encoderReading.txt", "ArucoReading.txt", "UwbReading.txt", "UwbAntennaGuess.txt",
-         "vehicle.toml", "truth")
 
 
 @dataclass(frozen=True)
@@ -104,6 +105,7 @@ class Dataset:
     aruco: ArucoReadings | None
     uwb: UwbReadings | None
     antenna_guess: AntennaGuess | None
+    notes: tuple[str, ...] = ()  # what was mended or left out while reading, a sentence each
 
     def without(self, sensor):
         """The dataset without a sensor, "aruco" or "uwb"."""
@@ -128,41 +130,70 @@ class Truth:
     antenna_in_world: np.ndarray  # (a, 2) [x, y] in m
     vehicle: Vehicle
     doubts: tuple[Doubt, ...] = ()
+    notes: tuple[str, ...] = ()  # as those of a Dataset
 
 
 def dataset_names(data, names=None):
-    """Names of the datasets in a folder: of all sub-folders with any of FILES, or the list `names`.
+    """Names of the datasets in a folder: all sub-folders that look like one, or the list `names`.
 
     Raises DatasetError if there is no dataset, no sub-folder of a selected name, or no
     encoderReading.txt in a sub-folder.
     """
     data = Path(data)
-    known = {name.lower() for name in FILES}
-    found = sorted(path.name for path in data.glob("[!.]*")
-                   if path.is_dir() and any(file.name.lower() in known for file in path.iterdir()))
+    found = sorted(path.name for path in data.glob("[!.]*") if path.is_dir() and is_dataset(path))
     if not found:
-        raise DatasetError(f"{data}: expected a sub-folder with an encoderReading.txt, found none")
+        raise DatasetError(f"{data}: expected a sub-folder with an {ENCODER}, found none")
     selected = found if names is None else list(names)
     for name in selected:
         if not (data / name).is_dir():
             raise DatasetError(f"{data}: expected one of {', '.join(found)}, found {name!r}")
-        find(data / name, "encoderReading.txt", required=True)
+        contents(data / name).required(ENCODER)
     return selected
 
 
 def read_dataset(folder):
     """Measurements of one drive, a Dataset; sensors without a file or without rows are None.
 
-    The names of the files in `folder` may be in upper or lower case. Raises DatasetError if a file
-    does not follow the format.
+    The names of the files in `folder` may be in upper or lower case, and the files in any of the
+    `dialects`; `Dataset.notes` say what was mended or left out. Raises DatasetError if a file does
+    not follow the format.
     """
-    vehicle = _read_vehicle(folder, default=Vehicle())
-    ticks = _read_ticks(folder, vehicle)
-    aruco = _read_aruco(folder, len(ticks))
-    antenna, position = _read_map(folder, "UwbAntennaGuess.txt", "antenna id, x, y")
+    files, notes = contents(folder), []
+    notes += files.notes
+    vehicle = _read_vehicle(files, default=Vehicle())
+    table = _read_encoder(files, notes)
+    aruco = _read_aruco(files, len(table.numbers), notes)
+    ticks = _ticks(table, vehicle, aruco, notes)
+    antenna, position = _read_map(
+        files, "UwbAntennaGuess.txt", "antenna id, x, y", notes, optional="z")
     guess = AntennaGuess(antenna, position) if len(antenna) else None
+    uwb = _read_uwb(files, len(ticks), guess, notes)
     return Dataset(name=Path(abspath(folder)).name, vehicle=vehicle, ticks=ticks, aruco=aruco,
-                   uwb=_read_uwb(folder, len(ticks), guess), antenna_guess=guess)
+                   uwb=uwb, antenna_guess=guess, notes=tuple(notes))
+
+
+def found(dataset, truth):
+    """Lines (list of str) on what was read of a drive, a Dataset and its Truth or None.
+
+    There is a line on each sensor, the vehicle and the truth, then the notes of both.
+    """
+    seen, ranges, default = dataset.aruco, dataset.uwb, asdict(Vehicle())
+    changed = [f"{key} = {value:g}" for key, value in asdict(dataset.vehicle).items()
+               if value != default[key]]
+    right, left = abs(dataset.ticks).sum(axis=0)
+    lines = [
+        f"encoders: {len(dataset.ticks)} poses, {right} ticks right and {left} left",
+        "markers: none, no ArucoReading.txt with rows" if seen is None else
+        f"markers: {len(seen.pose)} sightings of {len(np.unique(seen.marker))} markers at "
+        f"{len(np.unique(seen.pose))} poses",
+        "ranges: none, no UwbReading.txt with rows" if ranges is None else
+        f"ranges: {len(ranges.pose)} ranges to {len(np.unique(ranges.antenna))} antennas at "
+        f"{len(np.unique(ranges.pose))} poses",
+        f"vehicle.toml: {', '.join(changed)}" if changed else
+        "vehicle.toml: none, or as the assignment's table 2",
+        f"truth: {'no' if truth is None else 'yes'}"]
+    notes = [f"note: {note}" for note in (*dataset.notes, *(truth.notes if truth else ()))]
+    return [f"{dataset.name}: {line}" for line in (*lines, *notes)]
 
 
 def read_truth(folder):
@@ -173,26 +204,28 @@ def read_truth(folder):
     so. Raises DatasetError if a file does not follow the format or has another number of poses than
     the drive.
     """
-    truth_folder = find(folder, "truth")
-    if truth_folder is None:
+    of_drive = contents(folder)
+    if "truth" not in of_drive.files:
         return None
-    vehicle = _read_vehicle(folder, default=Vehicle())
-    pose_count = len(_read_ticks(folder, vehicle))
-    path = find(truth_folder, "vehiclePose.txt", required=True)
-    poses = _read_all_poses(path, "vehiclePose.txt", "pose id, x, y, theta")
+    files, notes = contents(of_drive.files["truth"], TRUTH_FILES), []
+    notes += [f"In truth: {note}" for note in files.notes]
+    vehicle = _read_vehicle(of_drive, default=Vehicle())
+    pose_count = len(_read_encoder(of_drive, []).numbers)
+    table = _read_all_poses(files, "vehiclePose.txt", "pose id, x, y, theta", notes)
+    poses = table.numbers[:, 1:]
     if len(poses) != pose_count:
-        raise error(path, f"expected {pose_count} poses (encoder file), found {len(poses)}")
-    marker, marker_in_world = _read_map(truth_folder, "ArucoMap.txt", "marker id, x, y, theta")
-    antenna, antenna_in_world = _read_map(truth_folder, "UwbMap.txt", "antenna id, x, y")
+        raise error(table.source, f"expected {pose_count} poses (encoder file), found {len(poses)}")
+    marker, marker_in_world = _read_map(files, "ArucoMap.txt", "marker id, x, y, theta", notes)
+    antenna, antenna_in_world = _read_map(files, "UwbMap.txt", "antenna id, x, y", notes)
     truth = Truth(poses=np.column_stack([poses[:, :2], np.unwrap(poses[:, 2])]),
                   marker=marker, marker_in_world=marker_in_world,
                   antenna=antenna, antenna_in_world=antenna_in_world,
-                  vehicle=_read_vehicle(truth_folder, default=vehicle))
+                  vehicle=_read_vehicle(files, default=vehicle), notes=tuple(notes))
     return in_first_frame(truth)
 
 
-def _read_vehicle(folder, default):
-    path = find(folder, "vehicle.toml")
+def _read_vehicle(files, default):
+    path = files.files.get("vehicle.toml")
     if path is None:
         return default
     limits, values = LIMITS["vehicle.toml"], asdict(default)
@@ -207,92 +240,113 @@ def _read_vehicle(folder, default):
     return Vehicle(**values)
 
 
-def _read_numbers(path, name, columns):
-    """`read_table` of the file `name`, whose numbers are within LIMITS."""
-    table, names = read_table(path, columns), columns.split(", ")
+def _read_numbers(files, name, columns, notes, **options):
+    """The `read_table` of the file `name`, whose numbers are within LIMITS; adds its notes."""
+    table, names = read_table(files.files.get(name), columns, **options), columns.split(", ")
     for column, limit in LIMITS.get(name, {}).items():
-        number = names.index(column)
-        ok = (limit.least <= table[:, number]) & (table[:, number] <= limit.most)
-        require(ok, path, limit.expected(column), number)
+        values = table.numbers[:, names.index(column)]
+        table.require((limit.least <= values) & (values <= limit.most), limit.expected(column),
+                      names.index(column))
+    notes += table.notes
+    if table.source is not None and len(table.numbers) == 0:
+        notes.append(f"{table.source.name} holds no rows.")
     return table
 
 
-def _read_ticks(folder, vehicle):
-    path = find(folder, "encoderReading.txt", required=True)
-    ticks = _read_all_poses(path, "encoderReading.txt", "pose id, right ticks, left ticks")
-    if len(ticks) == 0:
-        raise error(path, "expected at least the row '1 0 0', found no rows")
-    require((ticks == np.rint(ticks)).all(axis=1), path, "whole numbers of ticks")
-    require(~ticks[:1].any(axis=1), path, "'1 0 0' as the first row (no step leads to pose 1)")
-    most = MOST_REVOLUTIONS * vehicle.ticks_per_revolution
-    require((abs(ticks) <= most).all(axis=1), path,
-            f"at most {MOST_REVOLUTIONS} wheel revolutions ({most:g} ticks) in one step (counts "
-            "since the previous pose, not since the start)")
+def _read_encoder(files, notes):
+    """The Table of the encoders, with whole numbers."""
+    table = _read_all_poses(files, ENCODER, "pose id, right ticks, left ticks", notes)
+    if len(table.numbers) == 0:
+        raise error(table.source, "expected at least the row '1 0 0', found no rows")
+    table.require((table.numbers == np.rint(table.numbers)).all(axis=1), "whole numbers of ticks")
+    return table
+
+
+def _ticks(table, vehicle, aruco, notes):
+    """Counts since the pose before (n, 2) int64 from the Table of the encoders."""
+    ticks = table.numbers[:, 1:]
+    if reason := counts.run_on(ticks, vehicle, aruco):
+        notes.append(f"{table.source.name} holds counts since the start ({reason}): the difference "
+                     "of each row from the one before was taken.")
+        return counts.differences(ticks).astype(np.int64)
+    table.require(~ticks[:1].any(axis=1), "'1 0 0' as the first row (no step leads to pose 1)")
+    most = counts.MOST_REVOLUTIONS * vehicle.ticks_per_revolution
+    table.require((abs(ticks) <= most).all(axis=1),
+                  f"at most {counts.MOST_REVOLUTIONS:g} wheel revolutions ({most:g} ticks) in one "
+                  "step (counts since the previous pose, not since the start)")
     return ticks.astype(np.int64)
 
 
-def _read_aruco(folder, pose_count):
-    path, pose, marker, table = _read_readings(
-        folder, "ArucoReading.txt", "pose id, marker id, x, y, theta, "
-        "s_xx, s_xy, s_xtheta, s_yy, s_ytheta, s_thetatheta", pose_count)
-    if len(table) == 0:
+def _read_aruco(files, pose_count, notes):
+    table, pose, marker = _read_readings(
+        files, "ArucoReading.txt", "pose id, marker id, x, y, theta, "
+        "s_xx, s_xy, s_xtheta, s_yy, s_ytheta, s_thetatheta", pose_count, notes)
+    if len(pose) == 0:
         return None
-    covariance = table[:, [[3, 4, 5], [4, 6, 7], [5, 7, 8]]]
+    values = table.numbers[:, 2:]
+    covariance = values[:, [[3, 4, 5], [4, 6, 7], [5, 7, 8]]]
     # Scaled to correlations: s_thetatheta may be 1e4 rad^2 where s_xx is 1e-4 m^2.
-    sigma = np.sqrt(table[:, [3, 6, 8]])
+    sigma = np.sqrt(values[:, [3, 6, 8]])
     correlation = covariance / (sigma[:, :, None] * sigma[:, None, :])
     smallest_eigenvalue = np.linalg.eigvalsh(correlation)[:, 0]
-    require(smallest_eigenvalue > SMALLEST_EIGENVALUE, path, "a positive definite covariance "
-            f"(smallest eigenvalue of its correlation matrix above {SMALLEST_EIGENVALUE:g})")
-    return _in_order(ArucoReadings(pose, marker, table[:, :3], covariance), pose, marker, table)
+    table.require(smallest_eigenvalue > SMALLEST_EIGENVALUE, "a positive definite covariance "
+                  f"(smallest eigenvalue of its correlation matrix above {SMALLEST_EIGENVALUE:g})")
+    return _in_order(ArucoReadings(pose, marker, values[:, :3], covariance), table)
 
 
-def _read_uwb(folder, pose_count, antenna_guess):
-    path, pose, antenna, table = _read_readings(
-        folder, "UwbReading.txt", "pose id, antenna id, range, sigma", pose_count)
-    if len(table) == 0:
+def _read_uwb(files, pose_count, antenna_guess, notes):
+    table, pose, antenna = _read_readings(
+        files, "UwbReading.txt", "pose id, antenna id, range, sigma", pose_count, notes)
+    if len(pose) == 0:
         return None
-    require(table[:, 0] >= -MOST_NEGATIVE * table[:, 1], path,
-            f"a range that is not below -{MOST_NEGATIVE:g} sigma")
+    ranges, sigma = table.numbers[:, 2:].T
+    table.require(ranges >= -MOST_NEGATIVE * sigma,
+                  f"a range that is not below -{MOST_NEGATIVE:g} sigma")
     if antenna_guess is None:
-        raise error(path, "expected a UwbAntennaGuess.txt in the same folder, with every antenna")
-    require(np.isin(antenna, antenna_guess.antenna), path, "an antenna id of UwbAntennaGuess.txt")
-    return _in_order(UwbReadings(pose, antenna, table[:, 0], table[:, 1]), pose, antenna, table)
+        raise error(table.source,
+                    "expected a UwbAntennaGuess.txt in the same folder, with every antenna")
+    table.require(np.isin(antenna, antenna_guess.antenna), "an antenna id of UwbAntennaGuess.txt")
+    return _in_order(UwbReadings(pose, antenna, ranges, sigma), table)
 
 
-def _in_order(readings, pose, landmark, table):
+def _in_order(readings, table):
     """The readings in ascending order of pose; rows of a file that repeat exactly count once."""
-    _, rows = np.unique(np.column_stack([pose, landmark, table]), axis=0, return_index=True)
+    _, rows = np.unique(table.numbers, axis=0, return_index=True)
     rows = np.sort(rows)
-    return readings.select(rows[np.argsort(pose[rows], kind="stable")])
+    return readings.select(rows[np.argsort(readings.pose[rows], kind="stable")])
 
 
-def _read_all_poses(path, name, columns):
-    """Columns (n, c - 1) beside the ids of all poses."""
-    table = _read_numbers(path, name, columns)
-    ids = np.arange(1, len(table) + 1)
-    require(table[:, 0] == ids, path, "pose ids 1, 2, 3, ... in order")
-    return table[:, 1:]
+def _read_all_poses(files, name, columns, notes):
+    """The Table of a file that has to be there, with a row for each pose."""
+    files.required(name)
+    table = _read_numbers(files, name, columns, notes)
+    ids = np.arange(1, len(table.numbers) + 1)
+    table.require(table.numbers[:, 0] == ids, "pose ids 1, 2, 3, ... in order")
+    return table
 
 
-def _read_readings(folder, name, columns, pose_count):
-    """Path, rows of poses (m,), landmark ids (m,) and the other columns (m, c - 2)."""
-    path = find(folder, name)
-    table = _read_numbers(path, name, columns)
-    pose_id = _ids(table[:, 0], path)
-    require((1 <= pose_id) & (pose_id <= pose_count), path, f"a pose id from 1 to {pose_count}")
-    return path, pose_id - 1, _ids(table[:, 1], path), table[:, 2:]
+def _read_readings(files, name, columns, pose_count, notes):
+    """The Table of a sensor, rows of poses (m,) and landmark ids (m,)."""
+    table = _read_numbers(files, name, columns, notes, gaps=True)
+    pose, landmark = table.numbers[:, :2].T
+    place = table.numbers[:, 2:4] if name.startswith("Aruco") else table.numbers[:, 2:3]
+    if look_exchanged(pose, landmark, place, pose_count):
+        raise error(table.source, f"expected the columns ({columns}), but columns 1 and 2 look "
+                    "exchanged: measurements with successive ids of column 2 are alike")
+    pose, landmark = _ids(table, 0), _ids(table, 1)
+    table.require((1 <= pose) & (pose <= pose_count), f"a pose id from 1 to {pose_count}")
+    return table, pose - 1, landmark
 
 
-def _read_map(folder, name, columns):
+def _read_map(files, name, columns, notes, **options):
     """Landmark ids (k,), ascending, and the other columns (k, c - 1)."""
-    path = find(folder, name)
-    table = _read_numbers(path, name, columns)
-    ids, first_row = np.unique(_ids(table[:, 0], path), return_index=True)
-    require(np.isin(np.arange(len(table)), first_row), path, "each id only once")
-    return ids, table[first_row, 1:]
+    table = _read_numbers(files, name, columns, notes, **options)
+    ids, first_row = np.unique(_ids(table, 0), return_index=True)
+    table.require(np.isin(np.arange(len(table.numbers)), first_row), "each id only once")
+    return ids, table.numbers[first_row, 1:]
 
 
-def _ids(values, path):
-    require(values == np.rint(values), path, "ids that are whole numbers")
+def _ids(table, column):
+    values = table.numbers[:, column]
+    table.require(values == np.rint(values), "ids that are whole numbers")
     return values.astype(np.int64)

@@ -38,8 +38,9 @@ def solve_to_folder(dataset, truth, out, jobs=1):
     The Truth, or None, serves to report errors, never to estimate. The summary is the dict that is
     written to summary.json; a problem that could not be solved has the entry "failed", a sentence.
     Its list "doubts", of "what" and "sentence", is empty where the measurements agree with the
-    files: first those about the drive, then by problem. Once all files are written they replace
-    those of an earlier run, by `swap.publish`.
+    files: first those about the drive, then by problem. Its list "notes" says what was mended or
+    left out while the files were read. Once all files are written they replace those of an earlier
+    run, by `swap.publish`.
     With two `jobs`, a second process solves problems 1 and 2 meanwhile.
     """
     out = Path(out)
@@ -58,6 +59,7 @@ def _solve_to_stage(dataset, truth, stage, jobs):
     summary = {"dataset": dataset.name, "poses": len(dataset.ticks),
                "doubts": [asdict(doubt) for doubt in merged(
                    [*of_drive, *chain(*(doubts[problem] for problem in in_order))])],
+               "notes": list(chain(dataset.notes, () if truth is None else truth.notes)),
                "problems": {problem: rows[problem] for problem in in_order}}
     text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     swap.write(stage / SUMMARY, text.encode())

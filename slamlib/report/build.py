@@ -15,7 +15,8 @@ from pathlib import Path
 import nbformat
 
 from slamlib import swap
-from slamlib.dataset import DatasetError, dataset_names, read_dataset, read_truth
+from slamlib.dataset import DatasetError, dataset_names, found, read_dataset, read_truth
+from slamlib.folder import left_in
 from slamlib.notebook import notices
 from slamlib.report import cache, overview
 from slamlib.report.chapters import chapter_of, in_order, printed, with_data
@@ -116,6 +117,10 @@ def _checked_input(notebooks, data, datasets, cover, appendix):
             raise DatasetError(f"{data / name}: the PDF's fonts have no glyph for {missing[0]} in "
                                "the name of this dataset: rename its folder")
     read = [(read_dataset(data / name), read_truth(data / name)) for name in selected]
+    for dataset, truth in read:
+        print("\n".join(found(dataset, truth)), file=sys.stderr)
+    for sentence in left_in(data):
+        print(sentence, file=sys.stderr)
     served = with_data(books, [dataset for dataset, _ in read])
     for source in books.keys() - served.keys():
         print(f"{source.stem}: left out, no dataset has the measurements", file=sys.stderr)

@@ -38,6 +38,8 @@ def summary(drives, address="."):
         cells.append(new_markdown_cell("## Results\n\n" + _result_table(drives), id="results"))
     if doubts := _doubts(drives):
         cells.append(new_markdown_cell(f"## Doubts about the data\n\n{doubts}", id="doubts"))
+    if notes := _notes(drives):
+        cells.append(new_markdown_cell(notes, id="notes"))
     if any(drive.files for drive in drives):
         cells.append(new_markdown_cell(
             "## Files to hand in\n\n" + _file_table(drives, PurePath(address)), id="files"))
@@ -193,6 +195,14 @@ def _doubts(drives):
             lines = "\n".join(f"- {plain(sentence)}" for sentence in sentences)
             parts.append(f"{plain(drive.name)}:\n\n{lines}")
     return "\n\n".join(parts)
+
+
+def _notes(drives):
+    """Return what was mended or left out when files were read, in Markdown; "" if nothing."""
+    noted = [(drive.name, (*drive.dataset.notes, *(drive.truth.notes if drive.truth else ())))
+             for drive in drives]
+    return "\n\n".join(f"Notes on the files of *{plain(name)}*: " + " ".join(map(plain, notes))
+                       for name, notes in noted if notes)
 
 
 def _result_table(drives):

@@ -1,0 +1,92 @@
+"""Encoder counts that run on since the start, where the format has those since the pose before."""
+
+import numpy as np
+
+from slamlib import se2
+
+MOST_REVOLUTIONS = 10.0  # revolutions of a wheel in one step
+SMOOTH = 0.1  # largest change from row to row of a counter, in MOST_REVOLUTIONS
+WRAP = 2**16  # values of a counter of 16 bits
+MIN_PAIRS = 10  # pairs of sightings that decide
+MANY = 20_000  # sightings; of more, the first ones decide
+MOVING = 5.0  # standard deviations by which a wheel's way is above the noise of a pair
+LESS = 5.0  # ratio of the ways by counts and by markers from which they contradict
+ALIKE = 2.0  # and up to which they agree
+
+
+def run_on(counts, vehicle, aruco):
+    """How the rows (n, 2) of an encoder file are known to be counts since the start, or "".
+
+    The result is a reason, a part of a sentence. Counts since the pose before are never taken for
+    others: a reason excludes them.
+
+    1. Bound. They would be above MOST_REVOLUTIONS, of which a step has no tenth: a wheel does not
+       speed up to ten revolutions in a step by less than one from row to row.
+    2. Overflow. Rows change by less than 1 % of 2^16, but for jumps by 2^16 less such a change: no
+       wheel falls from thousands of counts in a step to none in one row, and to the count.
+    3. Markers. Between two sightings of a marker, at which increments of the pose are known without
+       the wheels, wheels would go LESS times farther than markers say, and differences of rows
+       agree with them within the factor ALIKE (medians). Differences have one sign between most of
+       the sightings: those of counts since the pose before are noise about a constant speed.
+
+    Parameters
+    ----------
+    counts : (n, 2), right and left.
+    vehicle : Vehicle
+    aruco : ArucoReadings or None
+    """
+    steps = np.diff(counts, axis=0)
+    most = MOST_REVOLUTIONS * vehicle.ticks_per_revolution
+    if len(steps) == 0:
+        return ""
+    if abs(counts).max() > most and abs(steps).max() <= SMOOTH * most:
+        return f"one row has {abs(counts).max():g}, no two in succession differ by a tenth of that"
+    if abs(steps).max() > WRAP / 2 and abs(wrapped(steps)).max() < WRAP / 100 \
+            and np.ptp(counts) < WRAP:
+        return "they overflow at 16 bits"
+    return _by_markers(counts, vehicle, aruco)
+
+
+def differences(counts):
+    """Counts (n, 2) since the pose before, from those since the start; 0 in the first row."""
+    steps = np.diff(counts, axis=0, prepend=counts[:1])
+    overflowing = len(steps) and abs(steps).max() > WRAP / 2 and np.ptp(counts) < WRAP
+    return wrapped(steps) if overflowing else steps
+
+
+def wrapped(steps):
+    """Differences of counters of 16 bits, in [-2^15, 2^15)."""
+    return (steps + WRAP / 2) % WRAP - WRAP / 2
+
+
+def _by_markers(counts, vehicle, aruco):
+    if aruco is None:
+        return ""
+    aruco = aruco.select(slice(MANY))
+    order = np.lexsort([aruco.pose, aruco.marker])
+    pose, marker, z = (each[order] for each in (aruco.pose, aruco.marker, aruco.marker_in_vehicle))
+    variance = aruco.covariance[order][:, [0, 1], [0, 1]].sum(axis=1)
+    a = np.flatnonzero((marker[1:] == marker[:-1]) & (pose[1:] > pose[:-1]))
+    motion = se2.compose(z[a], se2.inverse(z[a + 1]))      # the later pose in the vehicle's frame
+    # Ways of both wheels together: s + t and s - t of the way s and half the base times turn t.
+    seen = np.maximum(2 * np.hypot(*motion[:, :2].T),
+                      vehicle.wheelbase * abs(se2.wrap(motion[:, 2])))
+    way = 2 * np.pi / vehicle.ticks_per_revolution * vehicle.wheel[:2]
+    steps = differences(counts)
+
+    def between(rows):
+        """Sum (p, 2) of rows after the first and until the second sighting, in m."""
+        total = np.cumsum(rows, axis=0)
+        return (total[pose[a + 1]] - total[pose[a]]) * way
+
+    by_counts, net, gross = (abs(between(rows)).sum(axis=1) for rows in (
+        counts, steps, abs(steps)))
+    moving = gross > MOVING * np.sqrt(variance[a] + variance[a + 1])
+    if np.count_nonzero(moving) < MIN_PAIRS:
+        return ""
+    by_counts, net, gross, seen = (np.median(each[moving]) for each in (
+        by_counts, net, gross, seen))
+    if by_counts > LESS * seen and seen / ALIKE < net < ALIKE * seen and net > gross / ALIKE:
+        return (f"between sightings of a marker, the wheels go {seen / 2:.3g} m by the markers, "
+                f"{net / 2:.3g} m by the differences of rows, and else {by_counts / 2:.3g} m")
+    return ""

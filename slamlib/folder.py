@@ -1,0 +1,228 @@
+"""Which file of a dataset's folder is which: every one is read, named in a note, or refused.
+
+A file whose name is unmistakably that of a missing one, as `ArucoReading.txt.txt` where Windows
+hides extensions, is read under it. A name that is near to a missing one is refused: a sensor would
+else be left out silently.
+"""
+
+import re
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+
+from slamlib.dialects import Variable, mat_variables
+from slamlib.textfile import DatasetError, error, quoted, read_regular
+
+ENCODER = "encoderReading.txt"
+TABLES = (ENCODER, "ArucoReading.txt", "UwbReading.txt", "UwbAntennaGuess.txt")
+FILES = (*TABLES, "vehicle.toml", "truth")
+TRUTH_FILES = ("vehiclePose.txt", "ArucoMap.txt", "UwbMap.txt", "vehicle.toml")
+IGNORED = re.compile(r"\..*|thumbs\.db|desktop\.ini|__macosx", re.IGNORECASE)
+ARCHIVE = re.compile(r"\.(zip|7z|rar|gz|tgz|tar)$", re.IGNORECASE)
+SPREADSHEET = re.compile(r"\.(xlsx?|ods|numbers)$", re.IGNORECASE)
+# What an editor, a browser or a file manager adds to a name: an extension, or the number of a copy.
+EXTENSION = re.compile(r"\.(txt|csv|tsv|dat)$")
+COPY = re.compile(r"^(copy of|copia di) |( ?\(\d+\)|[ _-]+(copy|copia)( ?\(\d+\)| \d+)?)$")
+# Extensions of files that may hold data.
+DATA = re.compile(r"^[^.]*$|\.(txt|csv|tsv|dat|asc|log|toml|bak|old|orig|xlsx?|ods|numbers)~?$|~$")
+# What the words of a name say, the first that fits.
+MEANINGS = {"UwbAntennaGuess.txt": "guess|antenna|anchor",
+            "ArucoReading.txt": "aruco|marker|sighting", "UwbReading.txt": "uwb|(?<![a-z])range",
+            ENCODER: "encoder|odometr|(?<![a-z])tick"}
+MOST_NAMED = 5  # files that one sentence names
+
+
+@dataclass(frozen=True)
+class Contents:
+    """The files of a dataset's folder, or of its folder `truth`."""
+
+    folder: Path  # in which they are
+    files: dict  # from a name of FILES to a Path or a Variable
+    notes: tuple[str, ...]  # on names that are not as expected and files that are not read
+    hint: str = ""  # what a message on a missing file adds
+
+    def required(self, name):
+        """The source of this name; DatasetError if there is none."""
+        if name not in self.files:
+            raise error(self.folder / name, f"expected this file, found none{self.hint}")
+        return self.files[name]
+
+
+def contents(folder, expected=FILES):
+    """The Contents of a folder, in which files of the names `expected` are looked for.
+
+    Upper and lower case are the same. If the folder holds none of these, they may be in one of its
+    sub-folders. Raises DatasetError if two files have a name, a name is almost right, or the folder
+    cannot be read.
+    """
+    folder = Path(folder)
+    paths = _listed(folder)
+    if expected is FILES and not any(_role(path, expected) for path in paths):
+        deeper = [path for path in paths if path.is_dir() and _holds_encoder(path)]
+        if len(deeper) > 1:
+            raise error(folder, "expected the files of one dataset, found those of "
+                        f"{_some([path.name for path in deeper])} in sub-folders")
+        if deeper:
+            inner = contents(deeper[0], expected)
+            notes = [f"The files were read from the sub-folder {_some([deeper[0].name])}."]
+            return Contents(inner.folder, inner.files, (*notes, *_not_read(
+                [path.name for path in paths if path != deeper[0]]), *inner.notes), inner.hint)
+    files, notes, copies = {}, [], set()
+    for name in expected:
+        found, others = _choose(folder, name, paths)
+        if found is not None:
+            files[name] = found
+        if found is not None and found.name.lower() != name.lower():
+            notes.append(f"{found.name} was read as {name}.")
+        notes += [f"{other.name} is not read: it is a copy of {found.name}." for other in others]
+        copies |= {found, *others}
+    rest = [path for path in paths if path not in copies]
+    if expected is FILES:
+        variables, more = _mat_tables([path for path in rest if path.suffix.lower() == ".mat"],
+                                      [name for name in TABLES if name not in files])
+        files |= variables
+        notes += more
+        rest = [path for path in rest if path not in {each.path for each in variables.values()}]
+    for path in rest:
+        if (name := _meant(path, expected)) and name not in files:
+            raise _misnamed(path, name)
+    archives = [path.name for path in rest if ARCHIVE.search(path.name)]
+    notes += [f"{name} is not read: unpack it here if it holds files of this dataset."
+              for name in archives]
+    others = [path.name for path in rest if path.name not in archives]
+    notes += _not_read(others)
+    return Contents(folder, files, tuple(notes),
+                    f", but {quoted(archives[0])}: unpack it" if archives else "")
+
+
+def is_dataset(folder):
+    """True if a folder, or one of its sub-folders, holds files of a dataset under any names."""
+    paths = _listed(folder)
+    return any(_role(path, FILES) or path.suffix.lower() in (".mat", ".zip") for path in paths) \
+        or any(path.is_dir() and _holds_encoder(path) for path in paths)
+
+
+def left_in(data):
+    """Sentences on archives and files of a dataset that are in the folder of all datasets."""
+    sentences = []
+    for path in _listed(data):
+        if path.is_file() and ARCHIVE.search(path.name):
+            sentences.append(f"{path} is not read: unpack it into a folder in {data}.")
+        elif path.is_file() and _role(path, TABLES):
+            sentences.append(f"{path} is not read: move it into a folder of its dataset in {data}.")
+    return sentences
+
+
+def _listed(folder):
+    """Paths in a folder, sorted, without those that systems put there."""
+    try:
+        return sorted(path for path in Path(folder).iterdir() if not IGNORED.fullmatch(path.name))
+    except (OSError, ValueError):  # ValueError: a NUL character in the folder's name
+        raise error(folder, "expected a folder that can be read") from None
+
+
+def _some(names):
+    """A list of names in words, of many the first ones."""
+    named = [name if name.isprintable() and name.isascii() and len(name) < 40 else
+             ascii(name[:40]) for name in names[:MOST_NAMED]]
+    more = len(names) - len(named)
+    return ", ".join(named) + (f" and {more} more" if more else "")
+
+
+def _not_read(names):
+    return [f"Not read: {_some(names)}."] * bool(names)
+
+
+def _choose(folder, name, paths):
+    """The path of a file of this name, or None, and copies of it that are not read.
+
+    Raises DatasetError if there are two files that differ.
+    """
+    exact = [path for path in paths if path.name.lower() == name.lower()]
+    if len(exact) > 1:
+        raise error(folder / name, "expected one file of this name, found "
+                    f"{' and '.join(path.name for path in exact)}")
+    variants = [path for path in paths if path not in exact and _is_variant(path, name)]
+    first, *others = [*exact, *variants] or [None]
+    for other in others:
+        if read_regular(other) != read_regular(first):
+            raise error(folder / name, f"expected one file of this name, found {first.name} and "
+                        f"{quoted(other.name)}, which differ: move one of them away")
+    return first, others
+
+
+def _is_variant(path, name):
+    """True if a file's name is this one with what a copy or a program has added to it."""
+    if name == "truth" or path.is_dir():
+        return False
+    return _stem(path.name) == _stem(name) and (
+        ".toml" in path.name.lower() if name.endswith(".toml") else not ARCHIVE.search(path.name))
+
+
+def _stem(name):
+    """A file's name in small letters without extensions and the number of a copy."""
+    name, before = name.lower(), None
+    while name != before:
+        before = name
+        name = COPY.sub("", EXTENSION.sub("", name)).strip()
+        if name.endswith(".toml"):
+            name = COPY.sub("", name.removesuffix(".toml"))
+    return name
+
+
+def _meant(path, expected):
+    """The name of `expected` that a file's name is near to in spelling or meaning, or None."""
+    if path.is_dir() or not DATA.search(path.name.lower()):
+        return None
+    stem = re.sub(r"\.[a-z]{3,4}~?$|~$", "", _stem(path.name))
+    stems = {_stem(name): name for name in expected if name != "truth"}
+    if close := get_close_matches(stem, stems, 1, 0.8):
+        return stems[close[0]]
+    if expected is TRUTH_FILES or get_close_matches(stem, map(_stem, TRUTH_FILES), 1, 0.8):
+        return None
+    return next((name for name, words in MEANINGS.items() if re.search(words, stem)), None)
+
+
+def _role(path, expected):
+    """The name of `expected` that a file has, in any form, or None."""
+    exact = next((name for name in expected if path.name.lower() == name.lower()), None)
+    return exact or next((name for name in expected if _is_variant(path, name)), None) \
+        or _meant(path, expected)
+
+
+def _holds_encoder(folder):
+    """True if one of the files in a folder is that of the encoders."""
+    try:
+        return any(_role(path, (ENCODER,)) for path in _listed(folder))
+    except DatasetError:
+        return False
+
+
+def _misnamed(path, name):
+    if SPREADSHEET.search(path.name):
+        return error(path, f"expected text, found a spreadsheet: save it as {Path(name).stem}.csv")
+    return error(path, f"expected the name {name}: rename it, or move it away")
+
+
+def _mat_tables(paths, names):
+    """Variables of .mat files by the names that they have of `names`, and notes."""
+    files, notes = {}, []
+    for path in paths:
+        variables = mat_variables(path)
+        known = {variable.lower(): variable for variable in variables}
+        single = len(variables) == 1 and _stem(path.stem) in {_stem(name) for name in names}
+        for name in names:
+            variable = variables[0] if single and _stem(path.stem) == _stem(name) \
+                else known.get(_stem(name))
+            if variable is None:
+                continue
+            if name in files:
+                raise error(path.parent, f"expected one table {Path(name).stem}, found it in "
+                            f"{files[name].path.name} and {path.name}")
+            files[name] = Variable(path, variable)
+            notes.append(f"Variable {variable} of {path.name} was read as {name}.")
+        used = {each.name for each in files.values() if each.path == path}
+        left = [variable for variable in variables if variable not in used]
+        if used and left:
+            notes.append(f"Not read: variables {_some(left)} of {path.name}.")
+    return files, notes
