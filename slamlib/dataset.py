@@ -28,7 +28,10 @@ MOST_NEGATIVE = 5.0  # sigmas, of a range at an antenna
 
 @dataclass(frozen=True)
 class Vehicle:
-    """Wheel parameters and their standard deviations; the defaults are the assignment's table 2."""
+    """Wheel parameters, their standard deviations, and what is known of the noise.
+
+    The defaults are the assignment's table 2, in which the noise is not known.
+    """
 
     right_radius: float = 0.1  # m
     left_radius: float = 0.1  # m
@@ -38,6 +41,9 @@ class Vehicle:
     sigma_left_radius: float = 1e-4  # m
     sigma_wheelbase: float = 1e-4  # m
     sigma_heading: float = 1e-4  # rad, of the heading at pose 1
+    slip: float | None = None  # sqrt(m), sigma of a wheel's slip after 1 m; None: learned
+    marker_noise_factor: float | None = None  # of the sigmas in ArucoReading.txt; None: learned
+    range_noise_factor: float | None = None  # of the sigmas in UwbReading.txt; None: learned
 
     @property
     def wheel(self):

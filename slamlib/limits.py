@@ -31,6 +31,7 @@ _VARIANCE = Limit(1e-18, 1e8, "m^2", "the square of a standard deviation in metr
 _GUESS = Limit(-1e6, 1e6, "m", "a place in the frame of pose 1 in metres")
 _TRUE = Limit(-1e9, 1e9, "m", "a place in metres")
 _TRUE_ANGLE = Limit(-1e9, 1e9, "rad", "an angle in radians")
+_FACTOR = Limit(0.01, 100, "", "what the stated standard deviations are multiplied by")
 
 
 def _of(parameter):
@@ -47,7 +48,10 @@ LIMITS = {
         "sigma_right_radius": _of("right_radius"), "sigma_left_radius": _of("left_radius"),
         "sigma_wheelbase": _of("wheelbase"),
         "sigma_heading": Limit(1e-9, 10, "rad", "a standard deviation in radians; from pi on the "
-                               "heading is unknown")},
+                               "heading is unknown"),
+        "slip": Limit(0, 0.1, "sqrt(m)", "the standard deviation in metres of a wheel's slip after "
+                      "one metre"),
+        "marker_noise_factor": _FACTOR, "range_noise_factor": _FACTOR},
     "ArucoReading.txt": {
         "x": _SIGHTED, "y": _SIGHTED, "theta": Limit(-6.3, 6.3, "rad", "an angle in radians"),
         "s_xx": _VARIANCE, "s_yy": _VARIANCE,

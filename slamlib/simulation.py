@@ -262,7 +262,8 @@ def _write_truth(folder, truth):
 
 
 def _write_vehicle(path, vehicle):
-    lines = [f"{name} = {float(value)!r}\n" for name, value in asdict(vehicle).items()]
+    lines = [f"{name} = {float(value)!r}\n" for name, value in asdict(vehicle).items()
+             if value is not None]
     path.write_text("".join(lines), encoding="utf-8", newline="\n")
 
 

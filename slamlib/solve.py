@@ -157,15 +157,18 @@ def problem2_hint(dataset, found=None):
 def problem2_fused(dataset, found=None):
     """Solution of problem 2 fused with odometry, with shared errors: `localization.fuse`."""
     found = find("problem2_fused", dataset) if found is None else found
+    factor = dataset.vehicle.marker_noise_factor
+    facts = {"slip_sqrt_m": found.slip, **({} if factor is None else {
+        "marker_noise_factor": factor})}
     return _solution("problem2_fused", dataset, found.poses, found.covariances, facts={
-        "slip_sqrt_m": found.slip, "outliers": found.rejected, **_wheels(found)})
+        **facts, **_given(dataset, facts), "outliers": found.rejected, **_wheels(found)})
 
 
 def problem3(dataset, found=None):
     """Solution of problem 3, SLAM on odometry and markers."""
     found = find("problem3", dataset) if found is None else found
     return _solution("problem3", dataset, found.poses, found.covariances,
-                     aruco_map=_marker_map(found), facts=_slam_facts(found),
+                     aruco_map=_marker_map(found), facts=_slam_facts(found, dataset),
                      doubts=found.drive_doubts)
 
 
@@ -178,7 +181,7 @@ def problem4(dataset, found=None):
         "problem4", dataset, found.poses, found.covariances,
         aruco_map=None if dataset.aruco is None else _marker_map(found),
         uwb_map=(found.antenna, found.antenna_in_world, found.antenna_covariance),
-        facts=_slam_facts(found) | {
+        facts=_slam_facts(found, dataset) | {
             "ranges": len(dataset.uwb.pose), "ranges_down_weighted_by_antenna": weak,
             "antennas_in_doubt": found.doubts}, doubts=found.drive_doubts)
 
@@ -192,7 +195,14 @@ def _wheels(found):
             "wheel_parameter_sigmas_m": np.sqrt(np.diag(found.wheel_covariance)).tolist()}
 
 
-def _slam_facts(found):
+def _given(dataset, facts):
+    """The names of those of the facts that the dataset's Vehicle gives, where there are any."""
+    names = [name for name in facts
+             if getattr(dataset.vehicle, name.removesuffix("_sqrt_m"), None) is not None]
+    return {"given": names} if names else {}
+
+
+def _slam_facts(found, dataset):
     facts, sigma = {}, found.noise_sigma.tolist()
     if len(found.rejected):
         facts |= {"marker_noise_factor": found.noise.sightings,
@@ -202,9 +212,10 @@ def _slam_facts(found):
     if found.range_calibration_covariance.any():
         facts |= dict(zip(("range_offset_m", "range_scale"), found.range_calibration.tolist()))
         facts["range_offset_and_scale_sigmas"] = found.range_calibration_sigma.tolist()
-    return {"slip_sqrt_m": found.slip, "slip_relative_sigma": sigma[0], **facts,
-            "increments": found.model, "outliers": int(found.rejected.sum()),
-            "chi2_per_dof": found.chi2_per_dof, "chi2_per_dof_of_all": found.chi2_per_dof_of_all,
+    facts = {"slip_sqrt_m": found.slip, "slip_relative_sigma": sigma[0], **facts}
+    return {**facts, **_given(dataset, facts), "increments": found.model,
+            "outliers": int(found.rejected.sum()), "chi2_per_dof": found.chi2_per_dof,
+            "chi2_per_dof_of_all": found.chi2_per_dof_of_all,
             "log_evidence": found.log_evidence, **_wheels(found)}
 
 

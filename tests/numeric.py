@@ -1,7 +1,9 @@
-"""Numerical derivatives and standard errors, shared by the tests."""
+"""Numerical derivatives, standard errors and known noise, shared by the tests."""
 
 import numpy as np
 from scipy.stats import t
+
+from slamlib.slam.noise import given
 
 
 def central_differences(function, x, step=1e-6):
@@ -19,3 +21,8 @@ def decided(differences):
     """True where the mean of paired differences (s,) is above zero in a t test of 2.5 %."""
     error = differences.std(ddof=1) / np.sqrt(len(differences))
     return differences.mean() > t.ppf(0.975, len(differences) - 1) * error
+
+
+def known_noise(dataset, slip):
+    """The Dataset of a drive with this slip in sqrt(m), and the noise that its files state."""
+    return given(dataset, slip, marker_noise_factor=1.0, range_noise_factor=1.0)

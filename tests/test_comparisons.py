@@ -5,6 +5,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
+from numeric import known_noise
 
 from slamlib import slam
 from slamlib.simulation import simulate
@@ -46,7 +47,7 @@ def test_starts_on_a_dataset_are_right_or_wrong_without_truth(drive):
 
 
 def test_gtsam_s_chain_has_the_optimum_of_the_independent_chain(drive):
-    fit = fit_from_odometry(measure(drive[0]), 1e-3)
+    fit = fit_from_odometry(measure(known_noise(drive[0], 1e-3)))
     problem, m = fit.problem, fit.problem.measurements
     chain = replace(problem, odometry=graphs.independent_chain(m, problem.odometry.model))
     expected = optimize(chain, fit.state).state

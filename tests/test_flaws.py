@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from numeric import known_noise
 
 from slamlib import localization, se2, slam, solve
 from slamlib.dataset import Vehicle, read_dataset, read_truth
@@ -163,7 +164,7 @@ def test_a_slip_that_was_given_is_not_explained_by_other_wheels():
     spoilt = replace(dataset, vehicle=replace(dataset.vehicle, right_radius=0.103,
                                               left_radius=0.103))
     assert "wheel-parameters" in names(slam.estimate(spoilt).drive_doubts)
-    given = slam.estimate(spoilt, 1e-2, "arc")
+    given = slam.estimate(known_noise(spoilt, 1e-2), model="arc")
     assert given.slip == 1e-2 and "wheel-parameters" not in names(given.drive_doubts)
 
 
@@ -198,7 +199,8 @@ def test_a_camera_that_is_not_in_the_origin_is_named(place):
 
 
 def test_without_sightings_nothing_is_known_of_the_camera():
-    found = slam.estimate(simulate("short", 61)[0].first(300).without("aruco"), 1e-3, "arc")
+    dataset = known_noise(simulate("short", 61)[0].first(300).without("aruco"), 1e-3)
+    found = slam.estimate(dataset, model="arc")
     for error, count in ((found.camera.time, 1), (found.camera.place, 3)):
         np.testing.assert_array_equal(error.estimate, np.zeros(count))
         np.testing.assert_array_equal(error.sigma, np.full(count, np.inf))
@@ -330,6 +332,7 @@ def solved(noise=(1e-3, 1.0, 1.0), noise_sigma=(0.1, 0.02, 0.03), late=0.0, **ch
 @pytest.mark.parametrize("factor, sigma, said", [
     (1.0, 0.02, None), (1.45, 0.02, None), (1 / 1.45, 0.02, None), (1.6, 0.13, None),
     (1.6, 0.02, "scatter 1.60 ± 0.03 times"), (0.5, 0.02, "scatter 0.50 ± 0.01 times"),
+    (1.6, 0.0, None),                                        # as given, not learned
     (100.0, 0.02, "scatter at least 100 times"), (0.01, 0.02, "scatter at most 0.01 times"),
     (2.0, 0.13, "scatter 2.00 ± 0.26 times")])
 def test_scatter_that_is_decidedly_not_as_stated_is_named(factor, sigma, said):
@@ -359,7 +362,8 @@ def test_late_ranges_are_the_reason_for_their_scatter_if_they_are_more_than_a_te
 @pytest.mark.parametrize("factor, sigma, said", [
     (1.05, 0.01, "are confirmed (factor 1.05 ± 0.01)"), (0.95, 0.01, "are confirmed"),
     (1.2, 0.1, "are confirmed"), (1.2, 0.05, "were multiplied by 1.20 ± 0.06"),
-    (0.8, 0.05, "were multiplied by 0.80 ± 0.04")])
+    (0.8, 0.05, "were multiplied by 0.80 ± 0.04"), (1.0, 0.0, "are multiplied by 1, as given"),
+    (0.75, 0.0, "are multiplied by 0.75, as given")])
 def test_stated_noise_is_confirmed_within_a_tenth_or_three_standard_deviations(
         factor, sigma, said):
     assert said in slam.confirmation(solved((1e-3, factor, 9.0), (9.0, sigma, 9.0)), "sightings")

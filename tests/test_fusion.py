@@ -268,3 +268,19 @@ def test_wheels_far_from_nominal_are_learned():
         assert abs(fused.wheel[0] - truth.vehicle.right_radius) < 5e-4
         assert ate(fused.poses, truth.poses) < 0.08
     assert np.mean(ratios) < 6
+
+
+def test_the_slip_and_the_factor_that_a_vehicle_gives_are_taken():
+    """The slip as by the option; twice the sigmas at a factor of one half change nothing."""
+    dataset = simulate("short", seed=5)[0].first(600)
+    known = replace(dataset, vehicle=replace(TABLE_2, slip=3e-3))
+    for found in (fuse(known), fuse(dataset, slip=3e-3)):
+        assert found.slip == 3e-3
+        np.testing.assert_array_equal(found.poses, fuse(known).poses)
+    assert fuse(known, slip=1e-3).slip == 1e-3
+    assert np.abs(fuse(known).poses - fuse(dataset).poses).max() > 1e-6
+    halved = replace(
+        dataset, vehicle=replace(TABLE_2, marker_noise_factor=0.5),
+        aruco=replace(dataset.aruco, covariance=4 * dataset.aruco.covariance))
+    np.testing.assert_allclose(fuse(halved).poses, fuse(dataset).poses, rtol=0, atol=1e-12)
+    assert np.abs(fuse(replace(halved, vehicle=TABLE_2)).poses - fuse(dataset).poses).max() > 1e-6

@@ -49,6 +49,28 @@ def test_simulate_then_solve(tmp_path):
     assert summary["dataset"] == "drive" and 0 < summary["problems"]["problem1"]["ate_m"] < 1
 
 
+def test_what_vehicle_toml_gives_of_the_noise_is_taken_and_the_summary_says_so(tmp_path, capsys):
+    """By each problem that has such noise; the rest is learned. Without entries nothing is said."""
+    write_dataset(tmp_path / "drive", simulate("short", seed=3)[0].first(300))
+    given = {"slip = 2e-3": ["slip_sqrt_m"], "marker_noise_factor = 1.25": ["marker_noise_factor"],
+             "range_noise_factor = 0.5": ["range_noise_factor"], "": []}
+    for entry, names in given.items():
+        (tmp_path / "drive" / "vehicle.toml").write_text(entry + "\n")
+        assert main(["solve", str(tmp_path / "drive"), "--out", str(tmp_path / "out")]) == 0
+        rows = json.loads((tmp_path / "out" / "summary.json").read_text())["problems"]
+        for problem, row in rows.items():
+            has = [name for name in names if problem == "problem4" or problem == "problem3"
+                   and "range" not in name or problem == "problem2_fused" and "range" not in name]
+            assert row.get("given", []) == has
+            for name in has:
+                assert row[name] == float(entry.split()[-1])
+                sigma = name.replace("factor", "relative_sigma").replace("sqrt_m", "relative_sigma")
+                assert row.get(sigma, 0) == 0
+        for problem in ("problem3", "problem4"):
+            assert (rows[problem]["slip_relative_sigma"] == 0) == ("slip" in entry)
+    assert "scatter" not in capsys.readouterr().out
+
+
 def test_simulated_paths_are_driven_several_times(tmp_path):
     assert main(["simulate", str(tmp_path / "drive"), "--rounds", "3", "--seed", "5"]) == 0
     found, (expected, _) = read_dataset(tmp_path / "drive"), simulate("short", 5, rounds=3)
@@ -201,7 +223,7 @@ def test_a_problem_that_fails_costs_the_others_nothing(tmp_path, capsys, monkeyp
     def failing(dataset, **options):
         if dataset.uwb is None:
             raise DatasetError("drive: expected measurements that determine every pose")
-        return estimate(dataset, 1e-3, "arc", **options)
+        return estimate(dataset, slip=1e-3, marker_noise_factor=1, model="arc", **options)
 
     monkeypatch.setattr(solve.slam, "estimate", failing)
     assert main(["solve", str(tmp_path / "drive"), "--out", str(tmp_path / "out")]) == 3

@@ -6,6 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 from gtsam.symbol_shorthand import A, L, W, X
+from numeric import known_noise
 from scipy.special import chdtri
 
 from slamlib import sightings, slam
@@ -247,7 +248,7 @@ def test_gates_are_quantiles_of_chi_squared():
 
 def test_where_cholesky_fails_qr_gives_the_same_solution(monkeypatch):
     dataset, _ = simulate("short", seed=4)
-    fit = fit_from_odometry(measure(dataset.without("uwb").first(400)), 1e-3)
+    fit = fit_from_odometry(measure(known_noise(dataset.without("uwb").first(400), 1e-3)))
     poses = fit.state.poses + [0.01, 0, 0]
     start = state_from_poses(fit.problem.measurements, poses, np.zeros((len(poses), 3, 3)))
     expected = optimize(fit.problem, start).state
@@ -273,7 +274,7 @@ def test_where_cholesky_fails_qr_gives_the_same_solution(monkeypatch):
 def test_the_normal_equations_are_those_of_gtsams_linear_graph():
     """Solution and log determinant, for the noise of the problem and for another one."""
     dataset, _ = simulate("short", seed=4, mislabelled=0.02, late_ranges=0.2)
-    fit = fit_from_odometry(measure(dataset.first(600)), 1e-3)
+    fit = fit_from_odometry(measure(known_noise(dataset.first(600), 1e-3)))
     measured = replace(fit.problem.measured, range_kernel=None)
     problem = replace(fit.problem, measured=measured, noise=Noise(2e-3, 1.5, 0.7))
     equations = NormalEquations(replace(problem, noise=Noise(1e-3)), fit.state)
@@ -293,8 +294,8 @@ def test_the_normal_equations_are_those_of_gtsams_linear_graph():
 
 def test_marginal_covariances_equal_gtsams():
     dataset, _ = simulate("short", seed=4, mislabelled=0.02, late_ranges=0.2)
-    m = measure(dataset)
-    fit = fit_from_odometry(m, 1e-3)
+    m = measure(known_noise(dataset, 1e-3))
+    fit = fit_from_odometry(m)
     marginal = covariances(fit.equations, fit.problem.noise)
     tree = gtsam_graph.linearize(fit.problem, fit.state).eliminateMultifrontal()
     for i in range(0, len(marginal.pairs), 13):

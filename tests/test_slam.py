@@ -6,23 +6,22 @@ from functools import partial
 import gtsam
 import numpy as np
 import pytest
-from numeric import central_differences, decided
+from numeric import central_differences, decided, known_noise
 
 from slamlib import increments, odometry, se2, simulation, slam, studies
 from slamlib.dataset import AntennaGuess, ArucoReadings, Dataset, UwbReadings, Vehicle
 from slamlib.evaluation import anees, ate, nees_band
 from slamlib.simulation import simulate
-from slamlib.slam import fit as fit_module
 from slamlib.slam import gtsam_graph, odometry_factors, robust
 from slamlib.slam.covariances import covariances
-from slamlib.slam.estimate import fit_from_odometry, fit_from_previous
+from slamlib.slam.estimate import fit_from_odometry
 from slamlib.slam.evidence import solve
 from slamlib.slam.fit import refine
 from slamlib.slam.initialization import GROWTH, extended, parts
 from slamlib.slam.measurements import measure
 from slamlib.slam.model_choice import DECISIVE, better_model
 from slamlib.slam.moments import moments
-from slamlib.slam.noise import Noise, from_logarithms, log_prior
+from slamlib.slam.noise import GIVEN, Noise, from_logarithms, log_prior
 from slamlib.slam.noise_posterior import noise_posterior
 from slamlib.slam.normal_equations import NormalEquations
 from slamlib.slam.problem import build
@@ -256,7 +255,7 @@ def test_wheels_far_from_nominal_are_learned_consistently():
         dataset, truth = simulate("short", seed=seed)
         dataset = replace(dataset, vehicle=replace(vehicle, right_radius=0.103, left_radius=0.097),
                           aruco=dataset.aruco.select(dataset.aruco.pose >= 300))
-        found = slam.estimate(dataset.without("uwb"), 1e-3, "arc")
+        found = slam.estimate(known_noise(dataset.without("uwb"), 1e-3), model="arc")
         error = found.wheel - truth.vehicle.wheel
         ratios.append((anees(found.poses, found.covariances, truth.poses),
                        error @ np.linalg.solve(found.wheel_covariance, error)))
@@ -303,7 +302,8 @@ def test_two_poses_and_one_marker_by_hand():
     C = np.diag([r, 1e-10, 1e-12])
     readings = ArucoReadings(np.array([0, 100]), np.array([9, 9]),
                              np.array([[s_1, 0, 0], [s_2, 0, 0]]), np.array([C, C]))
-    found = slam.estimate(Dataset("line", vehicle, ticks, readings, None, None), slip, "arc")
+    dataset = Dataset("line", vehicle, ticks, readings, None, None)
+    found = slam.estimate(known_noise(dataset, slip), model="arc")
     q = slip**2 * o / 2
     expected = (2 * r * o + q * (s_1 - s_2)) / (2 * r + q)
     np.testing.assert_allclose(found.poses[100, 0], expected, atol=1e-5)
@@ -314,7 +314,7 @@ def test_two_poses_and_one_marker_by_hand():
 
 def test_perfect_data_gives_the_exact_answer():
     dataset, truth = simulate("short", seed=1, noise=False)
-    found = slam.estimate(dataset.without("uwb"), 1e-3, "arc")
+    found = slam.estimate(known_noise(dataset.without("uwb"), 1e-3), model="arc")
     np.testing.assert_allclose(found.poses, truth.poses, atol=1e-9)
     seen = np.searchsorted(truth.marker, found.marker)
     np.testing.assert_allclose(found.marker_in_world, truth.marker_in_world[seen], atol=1e-9)
@@ -330,8 +330,8 @@ def test_interpolated_poses_equal_those_of_a_graph_with_all_poses(every, sigma):
     dataset = replace(dataset, uwb=None, vehicle=vehicle, ticks=dataset.ticks[:106])
     keep = (dataset.aruco.pose <= 100) & (dataset.aruco.pose % every == 0)
     dataset = replace(dataset, aruco=dataset.aruco.select(keep))
-    sparse = slam.estimate(dataset, 3e-3, "arc")
-    dense = result(fit_from_odometry(measure(dataset, range(106)), 3e-3))
+    sparse = slam.estimate(known_noise(dataset, 3e-3), model="arc")
+    dense = result(fit_from_odometry(measure(known_noise(dataset, 3e-3), range(106))))
     sigma, expected = (np.sqrt(np.diagonal(c, axis1=1, axis2=2))
                        for c in (sparse.covariances, dense.covariances))
     # The difference is of second order.
@@ -395,7 +395,7 @@ def test_a_long_drive_is_solved_in_growing_parts():
     ends = np.array(parts(dataset))
     assert len(ends) > 1 and ends[-1] == len(dataset.ticks)
     assert (ends[1:] <= GROWTH * ends[:-1]).all()
-    found = slam.estimate(dataset, 1e-3, "arc")
+    found = slam.estimate(known_noise(dataset, 1e-3), model="arc")
     assert found.rejected.mean() < 0.005 and ate(found.poses, truth.poses) < 0.1
 
 
@@ -430,11 +430,11 @@ def test_the_gate_has_a_smaller_error_than_hubers_kernel_with_wrong_labels():
 def test_refine_keeps_the_accepted_measurements_if_accept_is_none():
     """Evidences can be compared only on the same measurements."""
     dataset, _ = simulate("short", seed=4, mislabelled=0.02)
-    fit = fit_from_odometry(measure(dataset.without("uwb")), 1e-3)
+    fit = fit_from_odometry(measure(known_noise(dataset.without("uwb"), 1e-3)))
     measured = replace(fit.problem.measured, weight=np.roll(fit.problem.measured.weight, 1))
-    again = refine(replace(fit.problem, measured=measured), fit.state, 1e-3, accept=None)
+    again = refine(replace(fit.problem, measured=measured), fit.state, accept=None)
     assert again.problem.measured is measured
-    tested = refine(again.problem, fit.state, 1e-3)
+    tested = refine(again.problem, fit.state)
     np.testing.assert_array_equal(tested.problem.measured.weight, fit.problem.measured.weight)
 
 
@@ -471,7 +471,8 @@ def test_open_paths_are_solved(shape):
     values, errors = [], []
     for seed in range(3):
         dataset, truth = open_path(OPEN_PATHS[shape], seed)
-        found, known = slam.estimate(dataset), slam.estimate(dataset, 1e-3, "arc")
+        found = slam.estimate(dataset)
+        known = slam.estimate(known_noise(dataset, 1e-3), model="arc")
         errors.append([ate(r.poses, truth.poses, aligned=True) for r in (found, known)])
         assert found.rejected.mean() < 0.01
         values.append(anees(found.poses, found.covariances, truth.poses))
@@ -482,7 +483,7 @@ def test_open_paths_are_solved(shape):
 
 def test_an_undetermined_variable_is_named_as_in_the_files():
     dataset, _ = simulate("short", seed=4)
-    problem = fit_from_odometry(measure(dataset.first(200)), 1e-3).problem
+    problem = fit_from_odometry(measure(known_noise(dataset.first(200), 1e-3))).problem
     marker, antenna = problem.measurements.marker[2], problem.measurements.antenna[1]
     message = "Indeterminate linear system detected while working near variable\n1 (Symbol: {})."
     for symbol, name in (("l2", f"the pose of marker {marker}"), ("w0", "the wheel parameters"),
@@ -572,24 +573,65 @@ def test_the_scatter_of_residuals_gives_factors_of_at_least_one():
     assert noise_of_scatter(few, state).ranges == 1 < noise_of_scatter(few, state).sightings
 
 
-def test_with_a_given_slip_the_covariances_are_those_of_the_files(monkeypatch):
-    """The scatter of the residuals is looked at only where the noise is learned."""
-    class LookedAtError(Exception):
-        pass
+@pytest.mark.parametrize("known", [
+    {"slip": 2e-3}, {"marker_noise_factor": 1.3}, {"range_noise_factor": 0.8},
+    {"slip": 2e-3, "marker_noise_factor": 1.3, "range_noise_factor": 0.8}])
+def test_noise_that_is_known_is_not_learned_and_the_rest_is(known):
+    """By an option and by the vehicle alike, from odometry and from a result; sigmas say which."""
+    dataset = simulate("short", seed=4)[0].first(400)
+    before = slam.estimate(dataset.without("uwb"))
+    found = slam.estimate(dataset, **known)
+    by_vehicle = slam.estimate(replace(dataset, vehicle=replace(dataset.vehicle, **known)))
+    again = slam.estimate(dataset, previous=before, **known)
+    np.testing.assert_array_equal(found.poses, by_vehicle.poses)
+    for each in (found, again):
+        given = np.array([name in known for name in GIVEN])
+        np.testing.assert_array_equal(each.noise_sigma == 0, given)
+        values = np.array([each.noise.slip, each.noise.sightings, each.noise.ranges])
+        np.testing.assert_allclose(values[given], list(known.values()), rtol=1e-12)
+        assert (values[~given] != np.array([1e-3, 1, 1])[~given]).all()
+        np.testing.assert_allclose(values[1:][~given[1:]], 1, atol=0.2)
+    assert np.abs(found.poses[-1] - slam.estimate(dataset).poses[-1]).max() > 1e-6
 
-    def look(*_):
-        raise LookedAtError
 
-    dataset = simulate("short", seed=4)[0].without("uwb").first(100)
-    before = slam.estimate(dataset, 1e-3, "arc")
-    for module in (robust, fit_module):
-        monkeypatch.setattr(module, "noise_of_scatter", look)
-        for solve_it in (fit_from_odometry, partial(fit_from_previous, previous=before)):
-            given = solve_it(measure(dataset), slip=2e-3)
-            assert given.problem.noise == Noise(2e-3) and given.posterior is None
-            with pytest.raises(LookedAtError):
-                solve_it(measure(dataset))
-        monkeypatch.undo()
+def test_the_noise_that_is_known_scales_covariances_and_posterior_alike():
+    """Twice the sigmas in the files at a factor of one half are the same measurements."""
+    dataset = simulate("short", seed=4)[0].first(400).without("uwb")
+    aruco = replace(dataset.aruco, covariance=4 * dataset.aruco.covariance)
+    one = slam.estimate(dataset, slip=1e-3, marker_noise_factor=1.0, model="arc")
+    other = slam.estimate(replace(dataset, aruco=aruco), slip=1e-3, marker_noise_factor=0.5,
+                          model="arc")
+    np.testing.assert_allclose(other.poses, one.poses, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(other.covariances, one.covariances, rtol=1e-6, atol=1e-15)
+
+
+@pytest.mark.parametrize("options, told", [
+    ({"kernel": "huber"}, "kernel must be one of quadratic, Huber, Cauchy, .*, not 'huber'"),
+    ({"model": "line"}, "model must be one of euler, arc, or None, not 'line'"),
+    ({"slip": -1e-3}, r"expected slip from 0 to 0.1 sqrt\(m\).*, not -0.001"),
+    ({"slip": np.nan}, "expected slip .* not nan"),
+    ({"marker_noise_factor": 0.0}, "expected a positive marker_noise_factor from 0.01 to 100"),
+    ({"range_noise_factor": 1e3}, "range_noise_factor .* not 1000.0")])
+def test_an_option_with_a_wrong_name_or_value_is_told_with_what_there_is(options, told):
+    with pytest.raises(ValueError, match=told):
+        slam.estimate(simulate("short", seed=4)[0].first(50), **options)
+
+
+@pytest.mark.parametrize("kernel", robust.KERNELS)
+def test_every_kernel_solves_a_drive_with_wrong_labels_and_late_ranges(kernel):
+    """With and without gates; only quadratic errors without gates follow the wrong labels.
+
+    Kernels take part of the variance of good measurements, too, which the learned factors contain.
+    """
+    dataset, truth = simulate("short", seed=4, mislabelled=0.01, late_ranges=0.05)
+    dataset, truth = dataset.first(800), truth.poses[:800]
+    gated, open_ = (slam.estimate(dataset, kernel=kernel, model="arc", gate=gate)
+                    for gate in (True, False))
+    assert gated.rejected.any() and not open_.rejected.any()
+    assert ate(gated.poses, truth) < 0.02
+    np.testing.assert_allclose(gated.noise.sightings, 1, atol=0.15)
+    assert (ate(open_.poses, truth) < 0.03) == (kernel not in ("quadratic", *robust.ONE_SIDED))
+    assert (gated.range_weight < 1).any()
 
 
 def test_gates_of_poses_points_and_ranges():
@@ -622,10 +664,10 @@ def test_the_evidence_chooses_the_steps_that_the_vehicle_drives(true, other):
                     truth.marker_in_world[np.searchsorted(truth.marker, a.marker)])
     z += (np.linalg.cholesky(a.covariance) @ rng.normal(size=(len(z), 3, 1)))[..., 0]
     drive = replace(dataset, uwb=None, aruco=replace(a, marker_in_vehicle=z))
-    m = measure(drive.first(1000))
-    right, wrong = (fit_from_odometry(m, 1e-4, model) for model in (true, other))
-    assert better_model(right, other, 1e-4) is right
-    found = better_model(wrong, true, 1e-4)
+    m = measure(known_noise(drive.first(1000), 1e-4))
+    right, wrong = (fit_from_odometry(m, model) for model in (true, other))
+    assert better_model(right, other) is right
+    found = better_model(wrong, true)
     assert found.problem.odometry.model == true
     assert found.log_evidence > wrong.log_evidence + DECISIVE
     np.testing.assert_array_equal(found.problem.measured.weight, wrong.problem.measured.weight)

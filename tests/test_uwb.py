@@ -7,7 +7,7 @@ import gtsam
 import numpy as np
 import pytest
 from gtsam.symbol_shorthand import A, X
-from numeric import central_differences, decided
+from numeric import central_differences, decided, known_noise
 from scipy.integrate import quad
 
 from slamlib import slam, studies
@@ -31,7 +31,7 @@ from slamlib.slam.optimizer import optimize
 from slamlib.slam.problem import build
 from slamlib.slam.range_calibration import calibrated
 from slamlib.slam.result import chi2_per_dof
-from slamlib.slam.robust import LATE_KERNEL
+from slamlib.slam.robust import KERNELS, LATE_KERNEL
 from slamlib.slam.state import state_from_arrays
 from slamlib.slam.trilateration import (
     GUESS_PRIOR_SIGMA,
@@ -156,7 +156,7 @@ def test_chi_squared_over_its_degrees_of_freedom_by_hand():
 @pytest.mark.parametrize("name", ["asymmetric Cauchy", "asymmetric Tukey"])
 def test_one_sided_kernels_down_weight_late_ranges_only(name):
     """GTSAM's sign is that of measured minus expected if components are weighted."""
-    kernel = kernels.RANGES[name][0]
+    kernel = KERNELS[name]
     values = gtsam.Values()
     values.insert(X(0), gtsam.Pose2(0, 0, 0))
     values.insert(A(0), gtsam.Point2(8, 0))
@@ -171,7 +171,7 @@ def test_antenna_from_known_poses_by_hand():
     """The information is the sum of u u^T / sigma^2 over unit directions u, plus the guess's."""
     place = np.array([2.0, 5.0])
     dataset, poses = drive([(4.0, 2.0), (3.0, -1.0)], place, (2.5, 4.0))
-    found = slam.estimate(dataset, 1e-5, "arc")
+    found = slam.estimate(known_noise(dataset, 1e-5), model="arc")
     u = place - poses[dataset.uwb.pose, :2]
     u /= np.hypot(*u.T)[:, None]
     expected = np.linalg.inv(u.T @ u / 0.05**2 + np.eye(2) / 5.0**2)
@@ -185,7 +185,7 @@ def test_antenna_from_known_poses_by_hand():
 def test_perfect_data_gives_the_exact_answer(markers):
     dataset, truth = simulate("short", seed=1, noise=False)
     dataset = dataset if markers else dataset.without("aruco")
-    found = slam.estimate(dataset, 1e-3, "arc")
+    found = slam.estimate(known_noise(dataset, 1e-3), model="arc")
     np.testing.assert_allclose(found.poses, truth.poses, atol=1e-9)
     np.testing.assert_allclose(found.antenna_in_world, truth.antenna_in_world, atol=1e-9)
 
@@ -256,7 +256,7 @@ def test_graduated_non_convexity_rejects_late_ranges():
     """Weight 0 for ranges late by more than 10 sigmas, and 1 for nearly all accurate ones."""
     dataset, truth = simulate("short", seed=9, late_ranges=0.15)
     off = range_errors(dataset, truth)
-    fit = kernels.solve_with(measure(dataset), 1e-3, ranges="GNC")
+    fit = kernels.solve_with(measure(known_noise(dataset, 1e-3)), ranges="GNC")
     weight = fit.problem.measured.range_weight
     assert (weight[off > 10] == 0).all() and (off > 10).sum() > 10
     assert np.mean(weight[np.abs(off) < 2] == 1) > 0.98
@@ -278,7 +278,7 @@ def test_antennas_are_right_or_in_doubt_despite_bad_guesses():
 def test_a_guess_mirrored_at_a_curved_path_is_corrected():
     place = np.array([3.0, 4.0])
     dataset, _ = drive([(3.0, 0.0), (2.0, 1.0), (3.0, 0.0)], place, (3.0, -4.0))
-    found = slam.estimate(dataset, 1e-5, "arc")
+    found = slam.estimate(known_noise(dataset, 1e-5), model="arc")
     np.testing.assert_allclose(found.antenna_in_world[0], place, atol=1e-3)
     assert not found.doubts
 
@@ -287,7 +287,7 @@ def test_the_mirror_place_is_reported_for_a_straight_path():
     place = np.array([3.0, 4.0])
     for guess in (1.0, -1.0):
         dataset, _ = drive([(6.0, 0.0)], place, (2.5, 3.0 * guess))
-        found = slam.estimate(dataset, 1e-5, "arc")
+        found = slam.estimate(known_noise(dataset, 1e-5), model="arc")
         np.testing.assert_allclose(found.antenna_in_world[0], [3.0, guess * 4.0], atol=1e-2)
         assert "as well at" in found.doubts[7] and f"{-guess * 4.0:.1f}" in found.doubts[7]
 
@@ -297,7 +297,7 @@ def test_few_ranges_give_a_large_covariance_and_a_doubt(count, reason):
     dataset, _ = drive([(4.0, 2.0), (3.0, -1.0)], np.array([2.0, 5.0]), (2.5, 4.5))
     few = np.linspace(0, len(dataset.uwb.pose) - 1, count).astype(int)
     dataset = replace(dataset, uwb=dataset.uwb.select(few))
-    found = slam.estimate(dataset, 1e-5, "arc")
+    found = slam.estimate(known_noise(dataset, 1e-5), model="arc")
     assert reason in found.doubts[7]
     largest = np.sqrt(np.linalg.eigvalsh(found.antenna_covariance[0])[-1])
     assert largest > (2 if count == 1 else 0.15)
@@ -310,7 +310,7 @@ def test_ranges_from_a_single_place_give_a_doubt():
     uwb = UwbReadings(np.zeros(50, int), np.full(50, 7), np.full(50, 5.0), np.full(50, 0.05))
     dataset = Dataset("still", EXACT, np.zeros((1, 2), int), None, uwb,
                       AntennaGuess(np.array([7]), np.array([[3.0, 4.0]])))
-    found = slam.estimate(dataset, 1e-5, "arc")
+    found = slam.estimate(known_noise(dataset, 1e-5), model="arc")
     assert 7 in found.doubts and np.linalg.eigvalsh(found.antenna_covariance[0])[-1] > 4
 
 
@@ -346,7 +346,8 @@ def test_covariance_is_consistent_for_an_antenna_with_few_ranges():
         dataset, truth = simulate("short", seed, late_ranges=0.15)
         uwb, last = dataset.uwb, truth.antenna[-1]
         keep = (uwb.antenna != last) | (np.cumsum(uwb.antenna == last) <= 5)
-        found = slam.estimate(replace(dataset, uwb=uwb.select(keep)), 1e-3, "arc")
+        few = known_noise(replace(dataset, uwb=uwb.select(keep)), 1e-3)
+        found = slam.estimate(few, model="arc")
         error = found.antenna_in_world[-1] - truth.antenna_in_world[-1]
         return {"nees": error @ np.linalg.solve(found.antenna_covariance[-1], error),
                 "in doubt": int(last) in found.doubts}
@@ -495,14 +496,14 @@ def test_an_offset_of_the_ranges_is_kept_unless_the_evidence_excludes_it():
     for offset, poses, kept in ((0.0, 500, True), (0.0, 2000, False), (1.0, 2000, True)):
         dataset = simulate("short", seed=61)[0].first(poses)
         dataset = replace(dataset, uwb=replace(dataset.uwb, range=dataset.uwb.range + offset))
-        before = slam.estimate(dataset.without("uwb"), 1e-3, "arc")
-        fit = fit_from_previous(measure(dataset), before, 1e-3)
-        found = calibrated(fit, 1e-3)
+        before = slam.estimate(known_noise(dataset.without("uwb"), 1e-3), model="arc")
+        fit = fit_from_previous(measure(known_noise(dataset, 1e-3)), before)
+        found = calibrated(fit)
         assert (found is not fit) == found.problem.measurements.calibrated == kept
     assert abs(found.state.range_calibration[0] - offset) < 0.3
     assert found.log_evidence > fit.log_evidence + 10
-    without = fit_from_previous(measure(dataset.without("uwb")), before, 1e-3)
-    assert calibrated(without, 1e-3) is without
+    without = fit_from_previous(measure(known_noise(dataset.without("uwb"), 1e-3)), before)
+    assert calibrated(without) is without
 
 
 def test_places_are_minima_of_the_cost():
@@ -592,8 +593,8 @@ def test_gtsam_reaches_one_optimum_from_the_guess_file_and_from_problem_3():
 
 def test_gtsam_takes_the_last_steps_of_a_solution(monkeypatch):
     """Those before are by normal equations; both end at the same place."""
-    m = measure(simulate("short", seed=3)[0].first(200))
-    fit, steps = fit_from_odometry(m, 1e-3), []
+    m = measure(known_noise(simulate("short", seed=3)[0].first(200), 1e-3))
+    fit, steps = fit_from_odometry(m), []
 
     def counted(problem, state):
         steps.append(gtsam_graph.gtsam_step(problem, state))

@@ -78,10 +78,13 @@ class _State:
 def fuse(dataset, slip=None, model="arc"):
     """Fusion of a Dataset's odometry and markers; its covariances count shared errors once.
 
-    `slip` in sqrt(m) is the standard deviation of the slip of one wheel after 1 m; None maximises
-    the likelihood of the innovations times `log_slip_prior`. `model` is that of the increments,
-    "arc" or "euler"; another one raises ValueError.
+    `slip` in sqrt(m) is the standard deviation of the slip of one wheel after 1 m; None takes that
+    of the dataset's Vehicle, and if there is none, the one that maximises the likelihood of the
+    innovations times `log_slip_prior`. A marker_noise_factor of the Vehicle multiplies the standard
+    deviations of the sightings. `model` is that of the increments, "arc" or "euler"; another one
+    raises ValueError.
     """
+    slip = dataset.vehicle.slip if slip is None else slip
     given = _filter_input(dataset, model, dataset.vehicle)
     if slip is None:
         slip = _likeliest_slip(replace(given, frames=given.frames[:SLIP_FRAMES]))
@@ -122,7 +125,8 @@ def _filter_input(dataset, model, vehicle):
     begins = np.searchsorted(sightings.row, np.arange(len(sightings.frame)))
     pair, first, second = common_sightings(sightings.row, sightings.marker)
     splits = np.searchsorted(pair, np.arange(len(start)))
-    seen = (np.split(each, begins[1:]) for each in (sightings.z, sightings.C))
+    C = (vehicle.marker_noise_factor or 1.0)**2 * sightings.C
+    seen = (np.split(each, begins[1:]) for each in (sightings.z, C))
     common = (np.split(rows, splits) for rows in (first - begins[pair], second - begins[pair + 1]))
     increment, by_w = increments.between_poses(ticks, vehicle, start, end, model)
     rounding, slipping = increments.noise_in_drive(ticks, vehicle, start, end)

@@ -1,6 +1,12 @@
 """Code for notebooks: drives and results, sentences and tables, figures, sliders."""
 
-from slamlib.notebook.answers import answer, median_sigmas, result_sentence, with_unit
+from slamlib.notebook.answers import (
+    answer,
+    median_sigmas,
+    result_sentence,
+    slip_in_words,
+    with_unit,
+)
 from slamlib.notebook.means import decided, mean_and_error, number, share, verdict, with_error
 from slamlib.notebook.show import (
     Drive,
@@ -21,5 +27,6 @@ from slamlib.notebook.solving import delivered, notices, say_doubts, solved, whe
 
 __all__ = ["Drive", "answer", "captioned", "code", "decided", "delivered", "interactive", "listed",
            "mean_and_error", "median_sigmas", "notices", "number", "plain", "result_sentence",
-           "results_folder", "say", "say_doubts", "share", "solved", "start", "table", "table_text",
-           "verdict", "where_possible", "with_error", "with_sensor", "with_truth", "with_unit"]
+           "results_folder", "say", "say_doubts", "share", "slip_in_words", "solved", "start",
+           "table", "table_text", "verdict", "where_possible", "with_error", "with_sensor",
+           "with_truth", "with_unit"]

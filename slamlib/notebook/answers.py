@@ -46,6 +46,13 @@ def result_sentence(drive, solution):
     return sentence + f"; ATE {with_unit(ate, 'm')}, {with_unit(aligned, 'm')} aligned."
 
 
+def slip_in_words(found):
+    """Slip after one metre in a SlamResult (str), and how well it is known or that it is given."""
+    number = f"{1e3 * found.slip:.2f} mm"
+    return f"{number} ± {100 * found.noise_sigma[0]:.0f}\u00a0%" if found.noise_sigma[0] \
+        else f"{number}, as given"
+
+
 def with_unit(value, unit):
     """A value with three significant digits and its unit (str), below 1 in thousandths of it."""
     value, unit = (value, unit) if abs(value) >= 1 else (1e3 * value, f"m{unit}")

@@ -14,7 +14,7 @@ from IPython.display import display
 from ipywidgets import Box, Dropdown, FloatSlider, IntSlider, Layout, VBox, interactive_output
 
 from slamlib import evaluation, localization, odometry, se2
-from slamlib.increments import SLIP_BOUNDS, TYPICAL_SLIP
+from slamlib.increments import TYPICAL_SLIP
 from slamlib.notebook import plotting
 from slamlib.notebook.live import live
 from slamlib.notebook.show import Drive, interactive
@@ -23,7 +23,7 @@ from slamlib.slam.estimate import fit_from_odometry
 from slamlib.slam.initialization import odometry_state, trilaterated_antennas
 from slamlib.slam.measurement_factors import MeasurementFactors
 from slamlib.slam.measurements import measure
-from slamlib.slam.noise import Noise
+from slamlib.slam.noise import Noise, given, with_known
 from slamlib.slam.optimizer import optimize
 from slamlib.slam.problem import build
 from slamlib.slam.result import result
@@ -198,7 +198,7 @@ def graphs(seed, slip, assumed, wrong, kernel, start):
     m, truth, solved = _rounds(seed, slip, assumed, wrong)
     scale = KERNELS[kernel]
     cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(scale) if scale else None
-    problem = replace(build(m, "arc", Noise(max(1e-3 * assumed, SLIP_BOUNDS[0]))),
+    problem = replace(build(m, "arc", with_known(Noise(), m.dataset.vehicle)),
                       measured=MeasurementFactors(m, m.unit_weights, cauchy))
     single = optimize(problem, odometry_state(m, "arc", markers=LANDMARKS[start])).state
     fig, axes = plotting.panels(2, height=3.6)
@@ -233,8 +233,8 @@ def graphs(seed, slip, assumed, wrong, kernel, start):
 def _rounds(seed, slip, assumed, wrong):
     """Measurements, Truth and SlamResult by rounds of kernels of the drive of `graphs`."""
     dataset, truth = simulate("short", seed, slip=1e-3 * slip, mislabelled=wrong / 100)
-    m = measure(replace(dataset, uwb=None))
-    return m, truth, result(fit_from_odometry(m, max(1e-3 * assumed, SLIP_BOUNDS[0])))
+    m = measure(given(dataset.without("uwb"), 1e-3 * assumed, 1.0, 1.0))
+    return m, truth, result(fit_from_odometry(m))
 
 
 def ranges(seed, late, off, poses, way):
@@ -288,7 +288,8 @@ def _late(seed, late, off, poses):
 def _by_ranges(seed, late, off, poses, way, antennas):
     """SlamResult of the drive of `ranges` by a way to treat ranges and a start of the antennas."""
     dataset, _ = _late(seed, late, off, poses)
-    return result(solve_with(measure(dataset), TYPICAL_SLIP, ranges=way, antennas=antennas))
+    known = given(dataset, TYPICAL_SLIP, 1.0, 1.0)
+    return result(solve_with(measure(known), ranges=way, antennas=antennas))
 
 
 def _error(ax, poses, truth, role, label=None, **look):

@@ -45,7 +45,8 @@ class CameraOffsets:
 def camera_offsets(equations):
     """The CameraOffsets by the NormalEquations at the State that solves a Problem."""
     problem, state = equations.problem, equations.state
-    H, g, *_ = equations.sums(problem.noise, consistency(problem.measured.range_kernel))
+    H, g, *_ = equations.sums(
+        problem.noise, (1.0, 1.0, consistency(problem.measured.range_kernel)))
     lu = decomposition(equations.structure.matrix(H))
     velocity, sightings = _velocities(problem.measurements, state), equations.factors[:2]
 

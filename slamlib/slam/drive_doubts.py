@@ -139,13 +139,13 @@ def slip_doubts(found):
 
 
 def noise_doubts(found):
-    """Factors on the stated sigmas that differ from 1."""
+    """Factors on the stated sigmas that were learned and differ from 1."""
     late = np.mean(found.range_weight < 0.5) if len(found.range_weight) else 0.0
     doubts = []
     for column, what, name, file in ((1, "marker-noise", "sightings", "ArucoReading.txt"),
                                      (2, "range-noise", "ranges", "UwbReading.txt")):
         factor, sigma = getattr(found.noise, name), found.noise_sigma[column]
-        if abs(np.log(factor)) <= max(np.log(MAX_FACTOR), DECIDED_SIGMAS * sigma):
+        if not sigma or abs(np.log(factor)) <= max(np.log(MAX_FACTOR), DECIDED_SIGMAS * sigma):
             continue
         outside = (found.noise.logarithms[column] - BOUNDS[:, column]) * [1, -1] < sigma
         number = f"at most {factor:.2g}" if outside[0] else \
@@ -199,10 +199,12 @@ def confirmation(found, sensor):
     """What a SlamResult says of the stated noise of a sensor, "sightings" or "ranges": a clause.
 
     It is confirmed where the factor on its standard deviations is within a tenth of 1 or within
-    three standard deviations of it.
+    three standard deviations of it; a factor that was given says nothing.
     """
     column, file = {"sightings": (1, "ArucoReading.txt"), "ranges": (2, "UwbReading.txt")}[sensor]
     factor, relative = getattr(found.noise, sensor), found.noise_sigma[column]
+    if not relative:
+        return f"the standard deviations in {file} are multiplied by {factor:.3g}, as given"
     number = f"{factor:.2f} ± {factor * relative:.2f}"
     if abs(np.log(factor)) < max(np.log(1.1), 3 * relative):
         return f"the standard deviations in {file} are confirmed (factor {number})"

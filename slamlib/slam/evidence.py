@@ -20,7 +20,7 @@ def solve(equations, noise):
     minus infinity where H is singular to rounding.
     """
     H, g, squared, log_determinant = equations.sums(
-        noise, consistency(equations.problem.measured.range_kernel))
+        noise, consistencies(equations.problem.measured))
     lu = decomposition(equations.structure.matrix(H))
     pivots = np.zeros(1) if lu is None else lu.U.diagonal()
     if (pivots <= 0).any():                              # those of a positive definite H are not
@@ -31,9 +31,18 @@ def solve(equations, noise):
         - sightings * np.log(noise.sightings) - ranges * np.log(noise.ranges)
 
 
+def consistencies(measured):
+    """`consistency` (3,) of the sightings of poses, of points, and of ranges, as by `factors`."""
+    return (consistency(measured.sighting_kernel, 3), consistency(measured.sighting_kernel, 2),
+            consistency(measured.range_kernel))
+
+
 @lru_cache(maxsize=8)
-def consistency(kernel):
+def consistency(kernel, size=1):
     """Weighted mean of the squares of standard normal residuals under a kernel's weights.
+
+    A residual has `size` components, and the kernel weighs its length, or its sign too if it is one
+    number.
 
     A kernel takes part of the variance of Gaussian residuals; without this factor the learned sigma
     would be too small (Huber and Ronchetti, Robust Statistics, 2009, chapter 5). It is 1 without
@@ -41,9 +50,9 @@ def consistency(kernel):
     """
     if kernel is None:
         return 1.0
-    r = np.linspace(-6, 6, 241)
-    density = np.exp(-r**2 / 2) * np.array([kernel.weight(x) for x in r])
-    return float(np.sum(r**2 * density) / np.sum(density))
+    r = np.linspace(-6 if size == 1 else 0, 6, 241)
+    density = r**(size - 1) * np.exp(-r**2 / 2) * np.array([kernel.weight(x) for x in r])
+    return float(np.sum(r**2 * density) / np.sum(density)) / size
 
 
 def log_evidence(problem, state):

@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 
 from slamlib.slam.evidence import solve
-from slamlib.slam.noise import known_noise
+from slamlib.slam.noise import with_known
 from slamlib.slam.noise_posterior import NoisePosterior, noise_posterior
 from slamlib.slam.normal_equations import NormalEquations
 from slamlib.slam.odometry_factors import odometry_factors
@@ -26,7 +26,7 @@ class Fit:
     problem: Problem
     state: State
     log_evidence: float
-    posterior: NoisePosterior | None     # of the noise; None where it is given
+    posterior: NoisePosterior | None     # of the noise; None where all of it is known
 
     @cached_property
     def equations(self):
@@ -39,27 +39,25 @@ def solved_by_gtsam(fit):
     return replace(fit, state=optimize(fit.problem, fit.state, by_gtsam=True).state)
 
 
-def refine(problem, state, slip=None, accept=accepted, factors=odometry_factors):
+def refine(problem, state, accept=accepted, factors=odometry_factors):
     """The Fit in which wheels, noise and accepted measurements agree with each other.
 
     They depend on each other, so each is updated in turn until the accepted measurements no longer
-    change. From a Problem and a State near its solution. The noise is learned if `slip` is None;
-    otherwise it is this slip in sqrt(m) and what the files state. `accept` makes MeasurementFactors
-    from Problem and State; None keeps the problem's. `factors` as of `problem.build`.
+    change. From a Problem and a State near its solution. `accept` makes MeasurementFactors from
+    Problem and State; None keeps the problem's. `factors` as of `problem.build`.
     """
     m, model, posterior = problem.measurements, problem.odometry.model, None
     if accept is not None:
-        problem = replace(problem, noise=known_noise(slip) if slip is not None
-                          else noise_of_scatter(m, state))
+        problem = replace(problem, noise=noise_of_scatter(m, state))
     measured = problem.measured if accept is None else accept(problem, state)
     changed = np.inf
     for _ in range(MAX_ROUNDS):
         problem = replace(problem, measured=measured, odometry=factors(m, model, state.w))
-        if slip is None and changed > FEW * len(measured.weight):
+        if m.learned.any() and changed > FEW * len(measured.weight):
             optimum = None                                 # frees the equations before
             optimum = optimize(problem, state, max_steps=2)
             state, posterior = optimum.state, noise_posterior(optimum.equations)
-            problem = replace(problem, noise=posterior.noise)
+            problem = replace(problem, noise=with_known(posterior.noise, m.dataset.vehicle))
         optimum = None
         optimum = optimize(problem, state)
         state = optimum.state

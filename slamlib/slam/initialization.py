@@ -10,7 +10,7 @@ import numpy as np
 from slamlib import odometry, se2
 from slamlib.sightings import consensus, few_of_each
 from slamlib.slam.measurements import measure
-from slamlib.slam.noise import Noise
+from slamlib.slam.noise import Noise, with_known
 from slamlib.slam.odometry_factors import odometry_factors
 from slamlib.slam.problem import build
 from slamlib.slam.robust import narrow_kernels
@@ -31,7 +31,8 @@ def initial_state(measurements, model, factors=odometry_factors):
         state = odometry_state(part, model) if earlier is None else extended(
             part, model, earlier, state)
         if not whole:
-            state = narrow_kernels(build(part, model, Noise(), factors=factors), state)
+            noise = with_known(Noise(), dataset.vehicle)
+            state = narrow_kernels(build(part, model, noise, factors=factors), state)
     return state
 
 

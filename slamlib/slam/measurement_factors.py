@@ -42,6 +42,18 @@ class MeasurementFactors:
         return np.flatnonzero(np.bincount(m.label, self.sighting_weight, len(m.marker)) == 0)
 
 
+def kept_weights(factors, sightings, ranges):
+    """Shares of its information, (s,) and (r,), that each measurement keeps, by gates and kernels.
+
+    From MeasurementFactors and the `residuals` of sightings (s, 3) and of ranges (r,).
+    """
+    sizes = np.linalg.norm(sightings, axis=1), ranges
+    return tuple(weight * ([kernel.weight(size) for size in each] if kernel else 1.0)
+                 for weight, kernel, each in zip(
+                     (factors.sighting_weight, factors.range_weight),
+                     (factors.sighting_kernel, factors.range_kernel), sizes))
+
+
 def residuals(measurements, state, noise):
     """Whitened measured minus expected values, without kernels.
 

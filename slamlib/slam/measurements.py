@@ -22,6 +22,7 @@ from slamlib.sightings import (
     sightings_by_frame,
 )
 from slamlib.slam.errors import square_root_information
+from slamlib.slam.noise import is_known
 from slamlib.slam.structure import structure
 
 ORIGIN_SIGMA = 1e-5          # m, of the position of pose 1, which is zero by definition
@@ -57,6 +58,12 @@ class Measurements:
     def origin_sigma(self):
         """(3,) standard deviations of pose 1: m, m, rad."""
         return np.array([ORIGIN_SIGMA, ORIGIN_SIGMA, self.dataset.vehicle.sigma_heading])
+
+    @property
+    def learned(self):
+        """(3,) bool, noise parameters that are learned: not known, and of these measurements."""
+        return ~is_known(self.dataset.vehicle) & [
+            True, len(self.label) > 0, len(self.ranges.row) > 0]
 
     @property
     def as_pose(self):

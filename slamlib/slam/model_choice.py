@@ -14,12 +14,11 @@ from slamlib.slam.odometry_factors import odometry_factors
 DECISIVE = 3.0               # log evidence by which data prefer a model to the default
 
 
-def better_model(fit, model, slip=None):
+def better_model(fit, model):
     """The Fit of another model of the odometry steps if its evidence is DECISIVE, else `fit`.
 
     The evidences are those of the same measurements with the same weights, so the weights that the
-    kernel of the ranges gives at `fit` are kept. The noise is learned for each model if `slip`, in
-    sqrt(m), is None.
+    kernel of the ranges gives at `fit` are kept. The noise is learned for each model.
     """
     own = replace(fit.problem, measured=_with_fixed_weights(fit))
     other = replace(own, odometry=odometry_factors(own.measurements, model, fit.state.w))
@@ -28,7 +27,7 @@ def better_model(fit, model, slip=None):
                        is_greatest=not len(own.measured.range_weight))
     if lead <= DECISIVE:
         return fit
-    return refine(replace(fit.problem, odometry=other.odometry), fit.state, slip, accept=None)
+    return refine(replace(fit.problem, odometry=other.odometry), fit.state, accept=None)
 
 
 def _with_fixed_weights(fit):

@@ -2,10 +2,11 @@
 
 Slip is the standard deviation of a wheel's slip after one metre. Two factors multiply the standard
 deviations that the files state for sightings and for ranges. The logarithms of all three are
-normal a priori: a slip of 1 mm and factors of 1, within a factor of 3 and of 2.
+normal a priori: a slip of 1 mm and factors of 1, within a factor of 3 and of 2. What a dataset's
+Vehicle gives of the three is known; the others are learned from the drive.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from slamlib.increments import SLIP_BOUNDS, SLIP_FACTOR, TYPICAL_SLIP
 
 MEDIAN = np.array([TYPICAL_SLIP, 1.0, 1.0])
 PRIOR_SIGMA = np.log([SLIP_FACTOR, 2.0, 2.0])      # of the logarithms
+GIVEN = ("slip", "marker_noise_factor", "range_noise_factor")      # of a Vehicle, as in Noise
 BOUNDS = np.log(MEDIAN) + np.log(100) * np.array([[-1], [1]])      # (2, 3) of the logarithms
 
 
@@ -35,9 +37,24 @@ def from_logarithms(logarithms):
     return Noise(*np.exp(logarithms).tolist())
 
 
-def known_noise(slip):
-    """The Noise to start from: with the slip in sqrt(m) that is given, or typical if it is None."""
-    return Noise() if slip is None else Noise(max(slip, SLIP_BOUNDS[0]))
+def given(dataset, slip=None, marker_noise_factor=None, range_noise_factor=None):
+    """The Dataset whose Vehicle has these noise parameters; None leaves what it has."""
+    known = dict(zip(GIVEN, (slip, marker_noise_factor, range_noise_factor)))
+    return replace(dataset, vehicle=replace(dataset.vehicle, **{
+        name: value for name, value in known.items() if value is not None}))
+
+
+def is_known(vehicle):
+    """(3,) bool, which noise parameters a Vehicle gives."""
+    return np.array([getattr(vehicle, name) is not None for name in GIVEN])
+
+
+def with_known(noise, vehicle):
+    """The Noise with what a Vehicle gives in place of its own; a slip is at least 1e-5 sqrt(m)."""
+    slip, sightings, ranges = (
+        own if (known := getattr(vehicle, name)) is None else known
+        for name, own in zip(GIVEN, (noise.slip, noise.sightings, noise.ranges)))
+    return Noise(max(slip, SLIP_BOUNDS[0]), sightings, ranges)
 
 
 def log_prior(logarithms):

@@ -13,7 +13,15 @@ import numpy as np
 
 from slamlib.slam.evidence import solve
 from slamlib.slam.first_frames import first_frames
-from slamlib.slam.noise import BOUNDS, MEDIAN, PRIOR_SIGMA, Noise, from_logarithms, log_prior
+from slamlib.slam.noise import (
+    BOUNDS,
+    MEDIAN,
+    PRIOR_SIGMA,
+    Noise,
+    from_logarithms,
+    is_known,
+    log_prior,
+)
 
 MAX_DIFFERENCE = 0.2         # of the logarithms, over which derivatives are taken
 MIN_DIFFERENCE = 0.003
@@ -32,7 +40,7 @@ class NoisePosterior:
     """Noise given the measurements."""
 
     noise: Noise                 # of greatest posterior density
-    covariance: np.ndarray       # (3, 3) of its logarithms; zero for what has no measurements
+    covariance: np.ndarray       # (3, 3) of its logarithms; zero for what is not learned
     density: float               # log posterior at `noise`, up to a constant
     points: tuple                # of (weight, Noise), over which estimates are averaged
 
@@ -74,15 +82,15 @@ def greatest_density(equations, posterior):
 def _log_posterior(equations):
     """The function from `Noise.logarithms` to log density, where it starts, and what is free."""
     problem = equations.problem
-    free = np.array([True, len(problem.measured.sighting_weight) > 0,
-                     len(problem.measured.range_weight) > 0])
+    free = problem.measurements.learned
 
     def log_posterior(logarithms):
         return max(solve(equations, from_logarithms(logarithms))[1], IMPOSSIBLE) \
             + np.sum(log_prior(logarithms)[free])
 
-    return (log_posterior, np.where(free, problem.noise.logarithms, np.log(MEDIAN)),
-            np.flatnonzero(free))
+    start = np.where(free | is_known(problem.measurements.dataset.vehicle),
+                     problem.noise.logarithms, np.log(MEDIAN))
+    return log_posterior, start, np.flatnonzero(free)
 
 
 def _mode(function, x, value, free, steps, correlation=None):
@@ -146,7 +154,7 @@ def _points(log_posterior, mode, density, covariance):
     What remains uncertain at a point widens its noise: a sigma is replaced by its root mean square.
     """
     sigma = np.sqrt(covariance[0, 0])
-    along = covariance[0] / sigma                       # of all logarithms, for one sigma of slip
+    along = covariance[0] / (sigma or 1)     # of all logarithms, for one sigma of slip; 0 if known
     if sigma < NARROW:
         rest, offsets, weights = covariance, [0.0], np.ones(1)
     else:

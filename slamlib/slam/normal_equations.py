@@ -51,19 +51,21 @@ class NormalEquations:
         step = None if lu is None else -lu.solve(g)
         return step if step is not None and g @ step <= 0 else None        # else not a descent
 
-    def sums(self, noise, from_kernel=1.0):
+    def sums(self, noise, from_kernels=(1.0, 1.0, 1.0)):
         """Data of H, g, squared error at the state, and sum log|Q| of the odometry noise Q.
 
-        `from_kernel` divides what the ranges contribute (`evidence.consistency`).
+        `from_kernels` (3,) divide what the factors contribute (`evidence.consistencies`).
         """
         given, priors = self.problem.noise, self._priors
         H, g, squared, log_determinant = self._odometry_sums(noise.slip)
         H, g, squared = H.copy(), g + priors.g, squared + priors.squared
         H[self.structure.diagonal] += priors.H
         of_sightings = (given.sightings / noise.sightings)**2
-        of_ranges = (given.ranges / noise.ranges)**2 / from_kernel
-        for group, ratio in zip(self._measured, (of_sightings, of_sightings, of_ranges)):
+        of_ranges = (given.ranges / noise.ranges)**2
+        for group, ratio, from_kernel in zip(
+                self._measured, (of_sightings, of_sightings, of_ranges), from_kernels):
             if group is not None:
+                ratio = ratio / from_kernel
                 H += group.H if ratio == 1 else ratio * group.H
                 g += ratio * group.g
                 squared += ratio * group.squared

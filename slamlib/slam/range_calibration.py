@@ -8,14 +8,15 @@ from dataclasses import replace
 from slamlib.slam.evidence import log_evidence
 from slamlib.slam.fit import refine
 from slamlib.slam.model_choice import DECISIVE
+from slamlib.slam.robust import accepted
 from slamlib.slam.state import state_from_arrays
 
 
-def calibrated(fit, slip=None):
+def calibrated(fit, accept=accepted):
     """The Fit with offset and scale of the ranges as variables.
 
     `fit` itself where its evidence leads by DECISIVE or there are no ranges. Both are compared at
-    its state and on its accepted measurements.
+    its state and on its accepted measurements. `accept` as of `fit.refine`.
     """
     problem, state = fit.problem, fit.state
     if not len(problem.measurements.ranges.row):
@@ -25,4 +26,4 @@ def calibrated(fit, slip=None):
     start = state_from_arrays(m, state.poses, state.markers, state.antennas, state.w)
     if log_evidence(other, start) < fit.log_evidence - DECISIVE:
         return fit
-    return refine(other, start, slip)
+    return refine(other, start, accept)

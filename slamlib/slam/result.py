@@ -10,7 +10,7 @@ from slamlib.slam.doubts import antenna_doubts
 from slamlib.slam.drive_doubts import drive_doubts, turn_doubts
 from slamlib.slam.interpolation import interpolate
 from slamlib.slam.linear_factors import linear_factors
-from slamlib.slam.measurement_factors import MeasurementFactors, residuals
+from slamlib.slam.measurement_factors import MeasurementFactors, kept_weights, residuals
 from slamlib.slam.moments import moments
 from slamlib.slam.noise import Noise
 from slamlib.slam.odometry_factors import odometry_error
@@ -33,7 +33,7 @@ class SlamResult:
     wheel: np.ndarray               # (3,) R_R, R_L, b
     wheel_covariance: np.ndarray    # (3, 3)
     noise: Noise                    # as given or learned
-    noise_sigma: np.ndarray         # (3,) of its logarithms, 0 where given or without measurements
+    noise_sigma: np.ndarray         # (3,) of its logarithms, 0 where not learned
     range_calibration: np.ndarray   # (2,) offset in m and scale of the ranges, 0 and 1 if not kept
     range_calibration_covariance: np.ndarray   # (2, 2), or 0
     camera: CameraOffsets           # errors that all sightings may share, which are not modelled
@@ -67,15 +67,12 @@ def result(fit):
     poses, pose_covariances = interpolate(
         replace(problem, noise=replace(problem.noise, slip=slip)), state, marginal.pairs)
     residual, range_residual = residuals(m, state, problem.noise)
-    kernel, range_weight = problem.measured.range_kernel, problem.measured.range_weight
-    if kernel is not None:
-        range_weight = range_weight * [kernel.weight(r) for r in range_residual]
+    sighting_weight, range_weight = kept_weights(problem.measured, residual, range_residual)
     doubts = antenna_doubts(problem, state, pose_covariances[m.frame], marginal.antennas,
                             range_weight)
     mapped, marker_covariance = _mapped(problem, marginal.markers)
     markers = state.markers[mapped]
     markers[:, 2] = se2.wrap(markers[:, 2])
-    accepted = problem.measured.sighting_weight > 0
     found = SlamResult(
         poses=poses, covariances=pose_covariances,
         marker=m.marker[mapped], marker_in_world=markers,
@@ -90,9 +87,9 @@ def result(fit):
         range_calibration_covariance=RANGE_SIGMA[:, None] * marginal.z * RANGE_SIGMA,
         camera=camera_offsets(fit.equations),
         model=problem.odometry.model, log_evidence=float(fit.log_evidence),
-        chi2_per_dof=chi2_per_dof(problem, state, np.r_[accepted, range_weight]),
+        chi2_per_dof=chi2_per_dof(problem, state, np.r_[sighting_weight, range_weight]),
         chi2_per_dof_of_all=chi2_per_dof(problem, state, m.unit_weights),
-        rejected=~accepted, residual=residual,
+        rejected=problem.measured.sighting_weight == 0, residual=residual,
         range_weight=range_weight, range_residual=range_residual)
     return replace(found, drive_doubts=(*drive_doubts(m, found), *turn_doubts(problem)))
 

@@ -3,16 +3,17 @@
 Solving with ever narrower Cauchy kernels keeps wrong labels and late ranges from trapping the
 solution. A late range is too long, because it lacks the line of sight. At the solution each
 measurement is accepted or rejected by a gate. Accepted sightings count in full. Accepted ranges
-keep a one-sided kernel, which reduces the weight of late ranges only.
+keep a one-sided kernel, which reduces the weight of late ranges only. `acceptance` gives other
+kernels.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 
 from slamlib.slam.measurement_factors import MeasurementFactors, residuals
-from slamlib.slam.noise import Noise
+from slamlib.slam.noise import Noise, with_known
 from slamlib.slam.optimizer import CONVERGED, optimize
 
 CAUCHY_SCALES = (100.0, 30.0, 10.0, 3.0)     # sigmas, scale of the kernel in each round
@@ -20,24 +21,60 @@ FEW = 20                     # measurements, below which their scatter gives no 
 EARLY_GATE = 3.3             # sigmas; a range that is shorter than expected by more is rejected
 
 _kernel = gtsam.noiseModel.mEstimator
-# Tukey's scale, 4.685 sigmas, has 95 % efficiency on Gaussian noise (Zhang, Image and Vision
-# Computing 15(1), 1997). GTSAM gives a kernel the sign of the error only if it weighs components.
-LATE_KERNEL = _kernel.AsymmetricTukey.Create(4.685, _kernel.Base.ReweightScheme.Scalar)
+# By name, scales in sigmas. Those of Huber, Cauchy and Tukey have 95 % efficiency on Gaussian noise
+# (Zhang, Image and Vision Computing 15(1), 1997). GTSAM gives a kernel the sign of the error only
+# if it weighs components.
+_scalar = _kernel.Base.ReweightScheme.Scalar
+KERNELS = {
+    "quadratic": None,
+    "Huber": _kernel.Huber.Create(1.345),
+    "Cauchy": _kernel.Cauchy.Create(2.385),
+    "Geman-McClure": _kernel.GemanMcClure.Create(3.0),
+    "Tukey": _kernel.Tukey.Create(4.685),
+    "asymmetric Cauchy": _kernel.AsymmetricCauchy.Create(2.385, _scalar),
+    "asymmetric Tukey": _kernel.AsymmetricTukey.Create(4.685, _scalar)}
+ONE_SIDED = ("asymmetric Cauchy", "asymmetric Tukey")
+LATE_KERNEL = KERNELS["asymmetric Tukey"]
 
 
-def narrow_kernels(problem, state, scales=CAUCHY_SCALES, learn=True, converged=CONVERGED):
+@dataclass(frozen=True)
+class Acceptance:
+    """Which measurements are accepted, and with which of KERNELS' values."""
+
+    sighting_kernel: gtsam.noiseModel.mEstimator.Base | None = None
+    gated: bool = True           # sightings beyond their gate are rejected
+    range_kernel: gtsam.noiseModel.mEstimator.Base | None = LATE_KERNEL
+    early: float = EARLY_GATE    # sigmas; a range that is too short by more is rejected
+    late: float = np.inf         # sigmas; the same, too long
+
+
+def acceptance(kernel="asymmetric Tukey", gate=True):
+    """The Acceptance by a name in KERNELS, of sightings and ranges.
+
+    A one-sided kernel is that of the ranges only, and takes the place of their gate for late ones.
+    Without `gate` nothing is rejected. Raises ValueError for another name.
+    """
+    if kernel not in KERNELS:
+        raise ValueError(f"kernel must be one of {', '.join(KERNELS)}, not {kernel!r}")
+    one_sided = kernel in ONE_SIDED
+    return Acceptance(
+        None if one_sided else KERNELS[kernel], gate, KERNELS[kernel],
+        early=EARLY_GATE if gate else np.inf,
+        late=EARLY_GATE if gate and not one_sided else np.inf)
+
+
+def narrow_kernels(problem, state, scales=CAUCHY_SCALES, converged=CONVERGED):
     """The State after one solution for each scale of the Cauchy kernel, with all measurements.
 
-    The scales are in sigmas of the problem's noise. Unless `learn` is False, this is what the
-    scatter of the residuals shows after each solution. `converged` as of `optimize`.
+    The scales are in sigmas of the problem's noise, which is what the scatter of the residuals
+    shows after each solution. `converged` as of `optimize`.
     """
     m = problem.measurements
     for scale in scales:
         cauchy = _kernel.Cauchy.Create(scale)
         measured = MeasurementFactors(m, m.unit_weights, cauchy, cauchy)
         state = optimize(replace(problem, measured=measured), state, converged=converged).state
-        if learn:
-            problem = replace(problem, noise=noise_of_scatter(m, state))
+        problem = replace(problem, noise=noise_of_scatter(m, state))
     return state
 
 
@@ -45,12 +82,14 @@ def noise_of_scatter(measurements, state):
     """Noise of typical slip whose factors, at least 1, are the residuals' medians at a State.
 
     Covariances that are far too small would otherwise have most measurements rejected before a
-    factor is learned.
+    factor is learned. What is known of the noise stays.
     """
     sightings, ranges = residuals(measurements, state, Noise())
     # 2.366, 1.386 and 0.455 are the medians of chi-squared with 3, 2 and 1 degrees of freedom.
     squared = np.sum(sightings**2, axis=1) / np.where(measurements.as_pose, 2.366, 1.386)
-    return Noise(sightings=_at_least_one(squared), ranges=_at_least_one(ranges**2 / 0.455))
+    return with_known(
+        Noise(sightings=_at_least_one(squared), ranges=_at_least_one(ranges**2 / 0.455)),
+        measurements.dataset.vehicle)
 
 
 def _at_least_one(squared):
@@ -58,10 +97,12 @@ def _at_least_one(squared):
     return max(1.0, float(np.sqrt(np.median(squared)))) if len(squared) >= FEW else 1.0
 
 
-def accepted(problem, state):
-    """MeasurementFactors of what the gates accept at a State; ranges have LATE_KERNEL."""
-    weight = within_gates(problem, state, EARLY_GATE, np.inf)
-    return MeasurementFactors(problem.measurements, weight, range_kernel=LATE_KERNEL)
+def accepted(problem, state, way=Acceptance()):
+    """MeasurementFactors of what an Acceptance accepts at a State."""
+    weight = within_gates(problem, state, way.early, way.late)
+    if not way.gated:
+        weight[:len(problem.measurements.label)] = 1
+    return MeasurementFactors(problem.measurements, weight, way.sighting_kernel, way.range_kernel)
 
 
 def within_gates(problem, state, early, late):

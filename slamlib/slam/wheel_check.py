@@ -1,8 +1,8 @@
 """Stage 7: whether wheels far from the stated ones explain a drive that the stated ones do not.
 
-Slip explains any path, so a wheel that is far from its stated value appears as slip and strains
-everything else, while its estimate hardly moves. Such a drive is solved again with wheels that are
-known to a few percent only, and the evidence of both is compared.
+Slip that is learned explains any path, so a wheel that is far from its stated value appears as
+slip and strains everything else, while its estimate hardly moves. Such a drive is solved again with
+wheels that are known to a few percent only, and the evidence of both is compared.
 """
 
 from dataclasses import replace
@@ -28,7 +28,8 @@ def with_checked_wheels(found, fit, solve):
     `solve` makes a Fit from Measurements and this SlamResult.
     """
     doubted = {doubt.what for doubt in found.drive_doubts}
-    if fit.posterior is None or not (found.slip > SUSPICIOUS_SLIP or doubted & EXPLAINED):
+    if not fit.problem.measurements.learned[0] or not (
+            found.slip > SUSPICIOUS_SLIP or doubted & EXPLAINED):
         return found
     dataset = fit.problem.measurements.dataset
     stated = dataset.vehicle

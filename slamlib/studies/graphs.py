@@ -14,7 +14,7 @@ from slamlib.slam.evidence import log_evidence
 from slamlib.slam.fit import refine
 from slamlib.slam.gtsam_graph import nonlinear_graph
 from slamlib.slam.measurements import measure
-from slamlib.slam.noise import known_noise
+from slamlib.slam.noise import Noise, given, with_known
 from slamlib.slam.odometry_factors import odometry_factors
 from slamlib.slam.optimizer import optimize
 from slamlib.slam.problem import build
@@ -49,23 +49,22 @@ class GraphKind:
     log_evidence: float      # on the measurements that variable wheels and arcs accept
 
 
-def graph_kinds(dataset, slip=None):
-    """Yield the GraphKind of every kind; `slip` in sqrt(m), or None to learn it for each.
+def graph_kinds(dataset):
+    """Yield the GraphKind of every kind; noise that is not known is learned for each.
 
     All start from the solution of the first kind, variable wheels and arcs.
     Evidence compares explanations of the same data, so it is that on common measurements.
     """
     measurements = measure(dataset)
-    first = fit_from_odometry(measurements, slip)
+    first, noise = fit_from_odometry(measurements), with_known(Noise(), dataset.vehicle)
     for wheels, factors in WHEELS.items():
         for model in odometry.MODELS:
             own = first if (factors, model) == (odometry_factors, "arc") else refine(
-                build(measurements, model, known_noise(slip), factors=factors), first.state, slip,
-                factors=factors)
+                build(measurements, model, noise, factors=factors), first.state, factors=factors)
             if factors is not odometry_factors:
                 own = replace(own, problem=_without_wheel_errors(own.problem))
             common = replace(first.problem, odometry=factors(measurements, model))
-            common = refine(common, first.state, slip, accept=None, factors=factors)
+            common = refine(common, first.state, accept=None, factors=factors)
             yield GraphKind(wheels, model, result(own), common.log_evidence)
 
 
@@ -112,7 +111,7 @@ def compare_graphs(seed, **options):
     """
     dataset, truth = simulate("short", seed, **options)
     numbers = {}
-    for kind in graph_kinds(dataset.without("uwb"), options.get("slip", 1e-3)):
+    for kind in graph_kinds(given(dataset.without("uwb"), options.get("slip", 1e-3), 1.0, 1.0)):
         name, found = f"{kind.wheels} {kind.model}", kind.result
         numbers |= {f"{name} evidence": kind.log_evidence, f"{name} chi2": found.chi2_per_dof,
                     f"{name} ate": ate(found.poses, truth.poses),

@@ -10,85 +10,81 @@ from slamlib.increments import TYPICAL_SLIP
 from slamlib.simulation import simulate
 from slamlib.slam.fit import refine
 from slamlib.slam.initialization import odometry_state, trilaterated_antennas
-from slamlib.slam.measurement_factors import MeasurementFactors, residuals
+from slamlib.slam.measurement_factors import MeasurementFactors, kept_weights, residuals
 from slamlib.slam.measurements import measure
-from slamlib.slam.noise import Noise, known_noise
+from slamlib.slam.noise import Noise, given, with_known
 from slamlib.slam.optimizer import optimize
 from slamlib.slam.problem import build
 from slamlib.slam.result import result
-from slamlib.slam.robust import CAUCHY_SCALES, EARLY_GATE, LATE_KERNEL, within_gates
+from slamlib.slam.robust import CAUCHY_SCALES, EARLY_GATE, acceptance, accepted, within_gates
 from slamlib.slam.state import state_from_arrays
 from slamlib.studies.montecarlo import judge_slam
 
-_kernel = gtsam.noiseModel.mEstimator
-_scalar = _kernel.Base.ReweightScheme.Scalar
-# Ways to treat ranges: GTSAM's kernel with its scale in sigmas, and by how many sigmas an accepted
-# range may be too short and too long.
+# Ways to treat ranges, and ways to treat sightings: `robust.Acceptance`.
 RANGES = {
-    "quadratic": (None, np.inf, np.inf),
-    "Huber": (_kernel.Huber.Create(1.345), np.inf, np.inf),
-    "Cauchy": (_kernel.Cauchy.Create(2.385), np.inf, np.inf),
-    "asymmetric Cauchy": (_kernel.AsymmetricCauchy.Create(2.385, _scalar), EARLY_GATE, np.inf),
-    "asymmetric Tukey": (LATE_KERNEL, EARLY_GATE, np.inf),
-    "GNC": (None, EARLY_GATE, EARLY_GATE),
-    "gate": (None, EARLY_GATE, EARLY_GATE),
-    "asymmetric gate": (None, EARLY_GATE, 2.0)}
-# Ways to treat sightings: GTSAM's kernel with its scale in sigmas, and whether those beyond the
-# gate are rejected.
+    **{name: acceptance(name, gate=False) for name in ("quadratic", "Huber", "Cauchy")},
+    "asymmetric Cauchy": acceptance("asymmetric Cauchy"),
+    "asymmetric Tukey": acceptance(),
+    "GNC": acceptance("quadratic"),
+    "gate": acceptance("quadratic"),
+    "asymmetric gate": replace(acceptance("quadratic"), late=2.0)}
 SIGHTINGS = {
-    "quadratic": (None, False),
-    "Huber": (_kernel.Huber.Create(1.345), False),
-    "Cauchy": (_kernel.Cauchy.Create(2.385), False),
-    "Geman-McClure": (_kernel.GemanMcClure.Create(3.0), False),
-    "Tukey": (_kernel.Tukey.Create(4.685), False),
-    "gate": (None, True)}
+    **{name: acceptance(name, gate=False)
+       for name in ("quadratic", "Huber", "Cauchy", "Geman-McClure", "Tukey")},
+    "gate": acceptance()}
 CONVEX = ("quadratic", "Huber", "GNC")     # these need no rounds of narrowing kernels
 GNC_STEP = 1.4                             # factor on the control parameter in each round
 WRONG_LABEL = 50.0                         # squared Mahalanobis distance; a right label reaches it
                                            # once in ten billion sightings
 
 
-def solve_with(measurements, slip, sightings="gate", ranges="asymmetric Tukey",
+def solve_with(measurements, sightings="gate", ranges="asymmetric Tukey",
                antennas=trilaterated_antennas, starts=None):
     """The Fit of arcs with other kernels, from odometry.
 
     Parameters
     ----------
-    measurements : Measurements; slip : sqrt(m), or None to learn it.
+    measurements : Measurements of a dataset whose noise is known.
     sightings, ranges : names in SIGHTINGS and RANGES; the defaults are those of `slam.estimate`.
     antennas : as of `initialization.state_from_poses`.
     starts : dict, or None, of what other ways on the same measurements have found so far: all that
         are not CONVEX start from the same rounds of narrowing kernels.
     """
-    problem = build(measurements, "arc", known_noise(slip))
+    problem = build(measurements, "arc", with_known(Noise(), measurements.dataset.vehicle))
     starts = {} if starts is None else starts
     kernels = [way if way in CONVEX else "narrowing" for way in (sightings, ranges)]
     if tuple(kernels) not in starts:
         state = odometry_state(measurements, "arc", antennas=antennas)
         for scale in CAUCHY_SCALES:
-            cauchy = _kernel.Cauchy.Create(scale)
+            cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(scale)
             measured = MeasurementFactors(
                 measurements, measurements.unit_weights,
-                sighting_kernel=SIGHTINGS[sightings][0] if sightings in CONVEX else cauchy,
-                range_kernel=RANGES[ranges][0] if ranges in CONVEX else cauchy)
+                sighting_kernel=_way(sightings, ranges).sighting_kernel
+                if sightings in CONVEX else cauchy,
+                range_kernel=_way(sightings, ranges).range_kernel if ranges in CONVEX else cauchy)
             state = optimize(replace(problem, measured=measured), state).state
         starts[tuple(kernels)] = state
-    return refine(problem, starts[tuple(kernels)], slip,
+    return refine(problem, starts[tuple(kernels)],
                   partial(_accepted, sightings=sightings, ranges=ranges))
+
+
+def _way(sightings, ranges):
+    """The Acceptance by these ways."""
+    of_sightings = SIGHTINGS[sightings]
+    return replace(RANGES[ranges], sighting_kernel=of_sightings.sighting_kernel,
+                   gated=of_sightings.gated)
 
 
 def _accepted(problem, state, sightings, ranges):
     """The MeasurementFactors that remain by these ways."""
-    m, (kernel, gated), (range_kernel, *gate) = (
-        problem.measurements, SIGHTINGS[sightings], RANGES[ranges])
-    weight = graduated(problem, state) if ranges == "GNC" else within_gates(problem, state, *gate)
-    if not gated:
-        weight[:len(m.label)] = 1
-    return MeasurementFactors(m, weight, kernel, range_kernel)
+    found = accepted(problem, state, _way(sightings, ranges))
+    if ranges == "GNC":
+        found.weight[len(problem.measurements.label):] = graduated(problem, state)
+    return found
 
 
 def graduated(problem, state):
-    """Weights (s + r,) by graduated non-convexity with truncated least squares of the ranges.
+    """Weights (r,) by graduated non-convexity with truncated least squares of the ranges.
 
     From quadratic to truncated costs, one Gauss-Newton step for each value of the control parameter
     (Yang, Antonante, Tzoumas and Carlone, IEEE RA-L 5(2), 2020).
@@ -103,7 +99,7 @@ def graduated(problem, state):
         control = GNC_STEP * control if control else gate / max(2 * squared.max() - gate, gate)
         root = np.sqrt(gate * control * (control + 1) / np.maximum(squared, 1e-12)) - control
         weight[ranges] = np.clip(root, 0, 1)**2
-    return weight
+    return weight[ranges]
 
 
 def late_ranges(seed, markers=True, ways=tuple(RANGES), **options):
@@ -121,9 +117,9 @@ def late_ranges(seed, markers=True, ways=tuple(RANGES), **options):
     """
     dataset, truth = simulate("short", seed, **options)
     dataset, numbers = dataset if markers else dataset.without("aruco"), {}
-    measurements, starts = measure(dataset), {}
+    measurements, starts = measure(given(dataset, TYPICAL_SLIP, 1.0, 1.0)), {}
     for way in ways:
-        found = result(solve_with(measurements, TYPICAL_SLIP, ranges=way, starts=starts))
+        found = result(solve_with(measurements, ranges=way, starts=starts))
         judged = judge_slam(found, dataset, truth)
         numbers |= {f"{way} {key}": judged[key]
                     for key in ("ate", "nees", "antenna error", "antenna nees")}
@@ -143,13 +139,14 @@ def wrong_labels(seed, ways=tuple(SIGHTINGS), **options):
     """
     dataset, truth = simulate("short", seed, **options)
     dataset, numbers, starts = dataset.without("uwb"), {}, {}
-    measurements = measure(dataset)
+    measurements = measure(given(dataset, TYPICAL_SLIP, 1.0, 1.0))
     wrong = mislabelled(measurements, truth)
     for way in ways:
-        fit = solve_with(measurements, TYPICAL_SLIP, sightings=way, starts=starts)
+        fit = solve_with(measurements, sightings=way, starts=starts)
         judged = judge_slam(result(fit), dataset, truth)
         numbers |= {f"{way} {key}": judged[key] for key in ("ate", "nees", "map nees", "map worst")}
-        lost = _sighting_weights(fit) < 0.5
+        each = residuals(measurements, fit.state, fit.problem.noise)
+        lost = kept_weights(fit.problem.measured, *each)[0] < 0.5
         numbers |= {f"{way} wrong rejected": lost[wrong].mean() if wrong.any() else np.nan,
                     f"{way} good lost": lost[~wrong].mean()}
     return numbers
@@ -162,12 +159,3 @@ def mislabelled(measurements, truth):
     state = state_from_arrays(m, truth.poses[m.frame], true_map,
                               np.zeros((len(m.antenna), 2)), np.zeros(3))
     return np.sum(residuals(m, state, Noise())[0]**2, axis=1) > WRONG_LABEL
-
-
-def _sighting_weights(fit):
-    """(s,) share of its information that each sighting keeps in a Fit."""
-    measured, noise = fit.problem.measured, fit.problem.noise
-    distance = np.linalg.norm(residuals(fit.problem.measurements, fit.state, noise)[0], axis=1)
-    kernel = measured.sighting_kernel
-    return measured.sighting_weight * (1 if kernel is None else [
-        kernel.weight(d) for d in distance])

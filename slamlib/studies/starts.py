@@ -14,7 +14,7 @@ from slamlib.simulation import misguess, simulate
 from slamlib.slam.initialization import consensus_markers, odometry_state, state_from_poses
 from slamlib.slam.measurement_factors import MeasurementFactors
 from slamlib.slam.measurements import measure
-from slamlib.slam.noise import Noise
+from slamlib.slam.noise import Noise, given
 from slamlib.slam.normal_equations import NormalEquations
 from slamlib.slam.optimizer import optimize
 from slamlib.slam.problem import build
@@ -161,13 +161,14 @@ def guesses(seed, error, poses=None, markers=True, compared=True, **options):
     """
     dataset, truth = simulate("short", seed, **options)
     dataset = misguess(dataset if markers else dataset.without("aruco"), truth, error, seed)
-    measurements = measure(dataset if poses is None else dataset.first(poses))
-    found = result(solve_with(measurements, TYPICAL_SLIP))
+    dataset = given(dataset if poses is None else dataset.first(poses), TYPICAL_SLIP, 1.0, 1.0)
+    measurements = measure(dataset)
+    found = result(solve_with(measurements))
     miss, squared = antenna_error(found, truth)
     right, doubt = miss < RIGHT_ANTENNA, np.isin(found.antenna, list(found.doubts))
     numbers = {"right": right.mean(), "in doubt": doubt.mean(),
                "silently wrong": np.mean(~right & (squared > POINT_GATE) & ~doubt)}
     if compared:
-        naive = result(solve_with(measurements, TYPICAL_SLIP, antennas=guessed_antennas))
+        naive = result(solve_with(measurements, antennas=guessed_antennas))
         numbers["from the guess"] = np.mean(antenna_error(naive, truth)[0] < RIGHT_ANTENNA)
     return numbers
