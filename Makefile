@@ -2,8 +2,8 @@
 # make test     checks the style, and runs all tests
 # make quick    runs the tests that take less than a minute in all
 # make mutants  prints which small defects of the numerics no test notices
-# make lab      opens JupyterLab on the notebooks
-# make strip    removes the outputs from saved notebooks, as they are committed
+# make lab      opens JupyterLab on the notebooks, with ARGS="--no-browser --port 9999" or others
+# make strip    restores saved notebooks to the form in which they are committed
 # make bench    prints the benchmarks' tables
 # make bench-large   the same on more drives, and the plain script on long ones
 # Every target sets up what it needs in .venv first. Choose the Python with PYTHON=python3.12.
@@ -25,7 +25,13 @@ endif
 .PHONY: setup report test quick mutants lab strip bench bench-large clean
 .DEFAULT_GOAL := report
 
+# In a git checkout, also configures the filter that .gitattributes names: git stores notebooks as
+# `make strip` leaves them.
+STRIP := .venv/bin/python
 setup: $(READY)
+	@! git ls-files --error-unmatch .gitattributes >/dev/null 2>&1 || git config --local \
+		filter.slamlib-notebooks.clean "cd \"./$$(git rev-parse --show-prefix)\" && if \
+	[ -x $(STRIP) ]; then $(STRIP) strip_notebooks.py; else cat; fi"
 
 $(READY): requirements.txt pyproject.toml check_python.py
 	@command -v "$(PYTHON)" >/dev/null || { \
@@ -58,12 +64,11 @@ quick: $(READY)
 mutants: $(READY)
 	$(BIN)/python tests/mutants.py $(ARGS)
 
-lab: $(READY)
-	$(BIN)/python -m jupyter lab --LabApp.check_for_updates_class=jupyterlab.NeverCheckForUpdate \
-		notebooks
+lab: setup
+	$(BIN)/python -m slamlib lab $(ARGS)
 
 strip: $(READY)
-	@$(BIN)/python -m nbstripout --keep-id notebooks/*.ipynb
+	@$(BIN)/python strip_notebooks.py notebooks/*.ipynb
 
 bench bench-large: $(READY)
 	@for b in speed odometry localization slam; do \

@@ -1,4 +1,4 @@
-"""The command line: python -m slamlib {report, solve, simulate}."""
+"""The command line: python -m slamlib {report, solve, simulate, lab}."""
 
 import argparse
 import os
@@ -14,6 +14,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from slamlib.dataset import DatasetError, found, read_dataset, read_truth  # noqa: E402
 
+DATA, NOTEBOOKS, KEPT = Path("data"), Path("notebooks"), Path("build", "executed")
+
 
 def main(arguments=None):
     """Run one command of `arguments` (list of str, or None for the command line's).
@@ -21,7 +23,11 @@ def main(arguments=None):
     Returns the exit code: 0, 1 if a notebook failed, 2 for invalid input, 3 if a problem could not
     be solved, 128 + n if ended by signal n.
     """
-    options = _parser().parse_args(arguments)
+    parser = _parser()
+    options, others = parser.parse_known_args(arguments)
+    if others and options.run is not _lab:
+        parser.error(f"unrecognized arguments: {' '.join(others)}")
+    options.others = others
     ended = [signal.SIGINT]
     try:
         with _orderly_end(ended):
@@ -71,7 +77,7 @@ class _Parser(argparse.ArgumentParser):
 
 def _parser():
     parser = _Parser(prog="python -m slamlib", description=__doc__)
-    commands = parser.add_subparsers(required=True, metavar="{report,solve,simulate}")
+    commands = parser.add_subparsers(required=True, metavar="{report,solve,simulate,lab}")
 
     _report_options(commands.add_parser(
         "report", help="execute the notebooks and build the report"))
@@ -94,6 +100,12 @@ def _parser():
     simulate.add_argument("--mislabel", type=_share, default=0.0, metavar="SHARE",
                           help="share of marker sightings that carry another marker's id")
     simulate.set_defaults(run=_simulate)
+
+    lab = commands.add_parser("lab", help="open JupyterLab on the notebooks; it is given all other "
+                                          "arguments, as --no-browser", allow_abbrev=False)
+    lab.add_argument("--data", type=Path, default=DATA, help="folder of the datasets")
+    lab.add_argument("--notebooks", type=Path, default=NOTEBOOKS)
+    lab.set_defaults(run=_lab)
     return parser
 
 
@@ -101,8 +113,8 @@ def _report_options(report):
     """Add the options of `report` to its parser."""
     report.add_argument("datasets", nargs="*", metavar="DATASET",
                         help="names of folders in data/ (all of them when none is named)")
-    report.add_argument("--data", type=Path, default=Path("data"), help="folder of the datasets")
-    report.add_argument("--notebooks", type=Path, default=Path("notebooks"))
+    report.add_argument("--data", type=Path, default=DATA, help="folder of the datasets")
+    report.add_argument("--notebooks", type=Path, default=NOTEBOOKS)
     report.add_argument("--report", type=Path, default=Path("report"), help="folder for the pages")
     report.add_argument("--results", type=Path, default=Path("results"),
                         help="folder for the .mat files")
@@ -131,7 +143,7 @@ def _report(options):
         report = build_report(
             options.notebooks, options.data, options.report, options.results,
             datasets=[_name(dataset, options.data) for dataset in options.datasets] or None,
-            jobs=options.jobs, cover=cover, code=options.code, kept=Path("build", "executed"),
+            jobs=options.jobs, cover=cover, code=options.code, kept=KEPT,
             fresh=options.fresh, appendix=options.appendix)
     except NotebookError as error:
         print(f"slamlib: {error}", file=sys.stderr)
@@ -162,30 +174,12 @@ def _name(dataset, data):
 
 
 def _solve(options):
-    from slamlib.summary import solve_to_folder
+    from slamlib.summary import solve_to_folder, table
     dataset, truth = read_dataset(options.folder), read_truth(options.folder)
     print("\n".join(found(dataset, truth)), file=sys.stderr)
-    summary = solve_to_folder(dataset, truth, options.out, jobs=2)
-    print(_table(summary))
+    print(table(summary := solve_to_folder(dataset, truth, options.out, jobs=2)))
     return _exit_code((summary["dataset"], name, row["failed"])
                       for name, row in summary["problems"].items() if "failed" in row)
-
-
-def _table(summary):
-    """Return the summary as a table, one line for each problem, and below it the doubts."""
-    lines = [f"{summary['dataset']}: {summary['poses']} poses",
-             f"{'problem':15}{'estimates':>10}{'last x, y, heading':>29}"
-             f"{'their sigmas':>27}{'ATE':>11}"]
-    for name, row in summary["problems"].items():
-        if "failed" in row:
-            lines.append(f"{name:15}could not be solved")
-            continue
-        pose = "{:8.3f} m {:8.3f} m {:7.4f}".format(*row["last_pose"])
-        sigma = "{:7.4f} m {:7.4f} m {:6.4f}".format(*row["last_sigma"])
-        error = f"{row['ate_m']:9.4f} m" if "ate_m" in row else "no truth"
-        lines.append(f"{name:15}{row['estimated_poses']:10}{pose:>29}{sigma:>27}{error:>11}")
-    lines += [f"doubt ({doubt['what']}): {doubt['sentence']}" for doubt in summary["doubts"]]
-    return "\n".join(lines)
 
 
 def _simulate(options):
@@ -195,6 +189,11 @@ def _simulate(options):
                               rounds=options.rounds)
     write_dataset(options.folder, dataset, truth)
     return 0
+
+
+def _lab(options):
+    from slamlib.report.lab import start_lab
+    start_lab(options.notebooks, options.data, KEPT, options.others)
 
 
 def _count(text):

@@ -5,9 +5,11 @@ import json
 import os
 import signal
 import sys
+import threading
 import time
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import asdict
 from itertools import chain
 from multiprocessing import active_children, get_context
@@ -16,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from slamlib import evaluation, swap
+from slamlib.dataset import read_dataset, read_truth
 from slamlib.solve import (
     OURS,
     PROBLEMS,
@@ -45,25 +48,85 @@ def solve_to_folder(dataset, truth, out, jobs=1):
     """
     out = Path(out)
     with swap.staging(out) as stage:
-        summary = _solve_to_stage(dataset, truth, stage, jobs)
+        summary = _summary(dataset, truth, stage, jobs)
+        text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+        swap.write(stage / SUMMARY, text.encode())
         swap.require_staged(stage)
         swap.publish([swap.Set(out, {name: stage / name for name in swap.names(stage)},
                                last=SUMMARY, ours=OURS)])
     return summary
 
 
-def _solve_to_stage(dataset, truth, stage, jobs):
-    """Write each problem's files to an empty folder as it ends, then the summary; return it."""
+def _summary(dataset, truth, stage, jobs):
+    """The summary; each problem's files are written to an empty folder as it ends, or none."""
     (rows, doubts), of_drive = _written_by_all(dataset, truth, stage, jobs)
     in_order = [problem for problem in PROBLEMS if problem in rows]
-    summary = {"dataset": dataset.name, "poses": len(dataset.ticks),
-               "doubts": [asdict(doubt) for doubt in merged(
-                   [*of_drive, *chain(*(doubts[problem] for problem in in_order))])],
-               "notes": list(chain(dataset.notes, () if truth is None else truth.notes)),
-               "problems": {problem: rows[problem] for problem in in_order}}
-    text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-    swap.write(stage / SUMMARY, text.encode())
-    return summary
+    return {"dataset": dataset.name, "poses": len(dataset.ticks),
+            "doubts": [asdict(doubt) for doubt in merged(
+                [*of_drive, *chain(*(doubts[problem] for problem in in_order))])],
+            "notes": [*dataset.notes, *(() if truth is None else truth.notes)],
+            "problems": {problem: rows[problem] for problem in in_order}}
+
+
+@contextmanager
+def tables(folders, tell):
+    """Let another process solve the datasets in `folders` (list of Path) while a block runs.
+
+    The function `tell` of a str is called in a thread with each dataset's `table` as it comes, the
+    shortest drive's first, and nothing is written. The block is given a function that waits for the
+    tables at most a number of seconds; at its end the process is gone.
+    """
+    context = get_context("fork" if sys.platform == "linux" else "spawn")
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=_send_tables, args=(folders, sender, os.getpid()), daemon=True)
+    process.start()
+    sender.close()
+    listening = threading.Thread(target=_tell_all, args=(receiver, tell), daemon=True)
+    listening.start()
+    try:
+        yield listening.join
+    finally:
+        process.kill()
+        process.join()
+        listening.join()
+
+
+def _send_tables(folders, sender, parent):
+    if sys.platform == "linux":
+        _ends_with(parent)
+    drives = [(read_dataset(folder), read_truth(folder)) for folder in folders]
+    for dataset, truth in sorted(drives, key=lambda drive: len(drive[0].ticks)):
+        try:
+            text = table(_summary(dataset, truth, None, 1))
+        except Exception as error:          # the notebooks tell more, where they fail as well
+            text = f"{dataset.name}: not solved before the notebooks: {error!r}"
+        sender.send(text)
+
+
+def _tell_all(receiver, tell):
+    with receiver:
+        while True:
+            try:
+                tell(receiver.recv())
+            except EOFError:                # the process has ended
+                return
+
+
+def table(summary):
+    """The summary as a table (str), one line for each problem, and below it the doubts."""
+    lines = [f"{summary['dataset']}: {summary['poses']} poses",
+             f"{'problem':15}{'estimates':>10}{'last x, y, heading':>29}"
+             f"{'their sigmas':>27}{'ATE':>11}"]
+    for name, row in summary["problems"].items():
+        if "failed" in row:
+            lines.append(f"{name:15}could not be solved")
+            continue
+        pose = "{:8.3f} m {:8.3f} m {:7.4f}".format(*row["last_pose"])
+        sigma = "{:7.4f} m {:7.4f} m {:6.4f}".format(*row["last_sigma"])
+        error = f"{row['ate_m']:9.4f} m" if "ate_m" in row else "no truth"
+        lines.append(f"{name:15}{row['estimated_poses']:10}{pose:>29}{sigma:>27}{error:>11}")
+    lines += [f"doubt ({doubt['what']}): {doubt['sentence']}" for doubt in summary["doubts"]]
+    return "\n".join(lines)
 
 
 def _written_by_all(dataset, truth, stage, jobs):
@@ -118,7 +181,7 @@ def _written(dataset, truth, stage, problems):
         row = {"failed": solution.reason} if failed else summarize(solution, truth)
         rows[solution.problem] = {"title": solution.title, **row, "seconds": seconds}
         doubts[solution.problem] = () if failed else solution.doubts
-        if not failed:
+        if not failed and stage is not None:
             write(stage, solution)
         start = time.perf_counter()
     return rows, doubts

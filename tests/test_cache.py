@@ -8,21 +8,23 @@ from zipfile import ZipFile
 
 import nbformat
 import pytest
-from nbformat.v4 import new_markdown_cell
+from nbformat.v4 import new_code_cell
 from test_report import make_data, write
+from test_strip import save_as_lab
 
 from slamlib.report import build, build_report, cache
 from slamlib.studies import memory
 
 
-def execute_without_kernel(books, environment, results, jobs, finish):
+def execute_without_kernel(books, environment, results, jobs, finish, seconds):
     """Count an execution of each notebook and write its output and its result, as kernels would."""
     for source, book in books.items():
         with open(source.parents[1] / f"count_{source.stem}", "a") as count:
             count.write("x")
         (results / "short").mkdir(parents=True, exist_ok=True)
         (results / "short" / f"{source.stem}.mat").write_text("result")
-        book.cells[1].outputs = [nbformat.v4.new_output("stream", text="executed")]
+        cell, = (cell for cell in book.cells if cell.cell_type == "code")
+        cell.outputs = [nbformat.v4.new_output("stream", text="executed")]
         finish(source, book, [f"short/{source.stem}.mat"])
 
 
@@ -58,7 +60,7 @@ def test_a_changed_notebook_is_executed_again_and_only_that_one(project, capsys)
     assert told.count("nothing changed, not executed again") == 2
     assert "built in" in told and "MB" in told
     assert [file.read_bytes() for file in sorted((project / "report").iterdir())] == pages
-    write(project / "notebooks", "b", "# b, changed", ("1 + 1",))
+    write(project / "notebooks", "b", "# b", ("1 + 2",))
     assert executions(project) == (1, 2)
 
 
@@ -99,17 +101,21 @@ def test_the_versions_used_last_are_kept_and_other_notebooks_are_left_alone(tmp_
     sources = [tmp_path / name for name in ("a.ipynb", "a.b.ipynb", "[a].ipynb")]
     for source in sources:
         cache.keep(kept, source, "0", book, tmp_path, [])
+
+    def is_kept(source, key):
+        return cache.recall(kept, source, key, book, tmp_path) is not None
+
     for key in "1234":
-        assert cache.recall(kept, sources[0], "0", tmp_path)  # used, so it stays
+        assert is_kept(sources[0], "0")  # used, so it stays
         cache.keep(kept, sources[0], key, book, tmp_path, [])
-    assert [key for key in "01234" if cache.recall(kept, sources[0], key, tmp_path)] == list("0234")
-    assert all(cache.recall(kept, source, "0", tmp_path) for source in sources[1:])
+    assert [key for key in "01234" if is_kept(sources[0], key)] == list("0234")
+    assert all(is_kept(source, "0") for source in sources[1:])
     assert len(list(kept.iterdir())) == cache.VERSIONS + 2
 
 
 @pytest.fixture
 def kept(tmp_path):
-    """A notebook that is kept with one result; returns a function that recalls it."""
+    """A notebook that is kept with one result; returns a function that recalls it, or None."""
     (tmp_path / "data").mkdir()
     (tmp_path / "data" / "ticks.txt").write_text("1 0 0")
     write(tmp_path, "a", "# a", ("1 + 1",))
@@ -122,15 +128,21 @@ def kept(tmp_path):
         common = cache.fingerprint([tmp_path / "data"], tmp_path, variables)
         return cache.key_of(source, book, common)
 
+    def recall(**variables):
+        now = nbformat.read(source, as_version=4)
+        names = cache.recall(tmp_path / "kept", source, key(variables), now, results)
+        return names if names is None else (now, names)
+
+    book.cells[1].outputs = [nbformat.v4.new_output("stream", text="2")]
     cache.keep(tmp_path / "kept", source, key({}), book, results, ["a.mat"])
-    return lambda **variables: cache.recall(tmp_path / "kept", source, key(variables), results)
+    return recall
 
 
 def test_what_is_kept_is_recalled_with_its_results(kept, tmp_path):
     result = tmp_path / "results" / "a.mat"
     result.unlink()
     book, names = kept()
-    assert book.cells[1].source == "1 + 1" and names == ["a.mat"]
+    assert book.cells[1].outputs[0].text == "2" and names == ["a.mat"]
     assert result.read_text() == "result"
     assert kept(HOME="/elsewhere") is not None  # of no matter to a notebook
 
@@ -163,7 +175,7 @@ def archive_of(text, names=(), held=()):
     return buffer.getvalue()
 
 
-EMPTY = '{"nbformat": 4, "nbformat_minor": 5, "metadata": {}, "cells": []}'
+BOOK = nbformat.writes(nbformat.v4.new_notebook(cells=[new_code_cell("1 + 1", id="c")]))
 
 
 @pytest.mark.parametrize("change", [
@@ -176,12 +188,13 @@ EMPTY = '{"nbformat": 4, "nbformat_minor": 5, "metadata": {}, "cells": []}'
     lambda folder: executed(folder).write_bytes(with_digest(folder, archive_of("not JSON"))),
     lambda folder: executed(folder).write_bytes(with_digest(folder, archive_of("[1]"))),
     lambda folder: executed(folder).write_bytes(with_digest(folder, archive_of(
-        EMPTY.replace("[]", "[{}]")))),
+        BOOK.replace('"cells": [', '"cells": [{},')))),
     *(lambda folder, archive=archive: executed(folder).write_bytes(with_digest(folder, archive))
-      for archive in (archive_of(EMPTY, ["a.mat"]), archive_of(EMPTY, [], ["results/a.mat"]),
-                      archive_of(EMPTY, ["a.mat"], ["other/a.mat"]), archive_of(EMPTY, [1], ["1"]),
-                      archive_of(EMPTY, ["../a.mat"], ["results/../a.mat"]),
-                      archive_of(EMPTY, 5))),
+      for archive in (archive_of(BOOK, ["a.mat"]), archive_of(BOOK, [], ["results/a.mat"]),
+                      archive_of(BOOK, ["a.mat"], ["other/a.mat"]), archive_of(BOOK, [1], ["1"]),
+                      archive_of(BOOK, ["../a.mat"], ["results/../a.mat"]),
+                      archive_of(BOOK, 5), archive_of(BOOK.replace("1 + 1", "1 + 2")),
+                      archive_of(nbformat.writes(nbformat.v4.new_notebook())))),
     lambda folder: (folder / "data" / "new.txt").write_text("new"),
     lambda folder: (folder / "helper.py").write_text("read by a notebook"),
 ])
@@ -194,29 +207,16 @@ def test_a_change_or_a_damaged_file_is_as_if_nothing_were_kept(kept, tmp_path, c
 def test_an_entry_whose_list_names_its_results_is_recalled(kept, tmp_path):
     """What the entries above differ from."""
     executed(tmp_path).write_bytes(with_digest(
-        tmp_path, archive_of(EMPTY, ["a.mat"], ["results/a.mat"])))
+        tmp_path, archive_of(BOOK, ["a.mat"], ["results/a.mat"])))
     assert kept()[1] == ["a.mat"]
-
-
-def test_an_entry_with_other_cells_is_executed_again(project, monkeypatch):
-    assert executions(project) == (1, 1)
-    recall = cache.recall
-
-    def with_another_cell(folder, source, *arguments):
-        book, names = recall(folder, source, *arguments)
-        if source.stem == "b":
-            book.cells.append(new_markdown_cell("Another."))
-        return book, names
-
-    monkeypatch.setattr(cache, "recall", with_another_cell)
-    assert executions(project) == (1, 2)
 
 
 def test_an_entry_of_another_key_is_not_recalled(kept, tmp_path):
     source, other = tmp_path / "a.ipynb", "0" * 64
     shutil.copy(executed(tmp_path), tmp_path / "kept" / f"a.{other}.executed")
     assert kept() is not None
-    assert cache.recall(tmp_path / "kept", source, other, tmp_path) is None
+    book = nbformat.read(source, as_version=4)
+    assert cache.recall(tmp_path / "kept", source, other, book, tmp_path) is None
 
 
 def test_slamlib_and_the_packages_are_among_what_matters(monkeypatch, tmp_path):
@@ -227,13 +227,56 @@ def test_slamlib_and_the_packages_are_among_what_matters(monkeypatch, tmp_path):
     assert len({before, without_packages, cache.fingerprint([], tmp_path, {})}) == 3
 
 
-def test_saved_outputs_do_not_matter(tmp_path):
-    write(tmp_path, "a", "# a", ("1 + 1",))
-    book = nbformat.read(tmp_path / "a.ipynb", as_version=4)
-    key = cache.key_of(tmp_path / "a.ipynb", book, "")
-    book.cells[1].execution_count = 3
-    book.cells[1].outputs = [nbformat.v4.new_output("stream", text="2")]
-    assert cache.key_of(tmp_path / "a.ipynb", book, "") == key
-    assert book.cells[1].outputs  # and it is left as it is
-    book.cells[1].source = "1 + 2"
-    assert cache.key_of(tmp_path / "a.ipynb", book, "") != key
+@pytest.fixture
+def read(tmp_path):
+    """A notebook with two code cells, and a function that returns its key."""
+    book = nbformat.v4.new_notebook(cells=[
+        nbformat.v4.new_markdown_cell("# a"), new_code_cell("1 + 1"), new_code_cell("2 + 2")])
+    return book, lambda: cache.key_of(tmp_path / "a.ipynb", book, "")
+
+
+def test_prose_metadata_and_saved_outputs_do_not_matter(read):
+    book, key = read
+    before = key()
+    book.cells[0].source = "# Another title"
+    book.cells[0].attachments = {"a.png": {"image/png": "AA=="}}
+    book.cells.insert(1, nbformat.v4.new_markdown_cell("Another cell."))
+    book.cells[2].execution_count = 3
+    book.cells[2].outputs = [nbformat.v4.new_output("stream", text="2")]
+    book.cells[2].metadata.update({
+        "trusted": True, "collapsed": False, "tags": ["hide-input"],
+        "execution": {"iopub.status.busy": "2026-01-01T00:00:00Z"}})
+    book.cells[2].id = "another"
+    book.metadata.update({"language_info": {"version": "3.99"}, "widgets": {"state": {}}})
+    assert key() == before
+
+
+@pytest.mark.parametrize("change", [
+    lambda cells: cells[1].update(source="1 + 2"), lambda cells: cells.append(cells[1]),
+    lambda cells: cells.pop(), lambda cells: cells.insert(0, cells.pop()),
+    lambda cells: cells[2].metadata.update(tags=["skip-execution"]),
+    lambda cells: cells[2].metadata.update(tags=["raises-exception"])])
+def test_code_cells_their_order_and_the_tags_that_nbclient_heeds_matter(read, change):
+    book, key = read
+    before = key()
+    change(book.cells)
+    assert key() != before
+
+
+def test_a_notebook_saved_in_jupyterlab_is_not_executed_and_gives_the_same_pages(project, capsys):
+    executions(project)
+    pages = [file.read_bytes() for file in sorted((project / "report").iterdir())]
+    for name in "ab":
+        save_as_lab(project / "notebooks" / f"{name}.ipynb")
+    assert executions(project) == (1, 1)
+    assert capsys.readouterr().err.count("nothing changed, not executed again") == 2
+    assert [file.read_bytes() for file in sorted((project / "report").iterdir())] == pages
+
+
+def test_changed_prose_and_new_cells_of_text_cost_a_page_and_no_execution(project):
+    executions(project)
+    write(project / "notebooks", "a", "New prose.", "# a, changed", "More.", ("1 + 1",), "An end.")
+    assert executions(project) == (1, 1)
+    page = (project / "report" / "a.html").read_text()
+    order = [page.index(f"{text}<") for text in ("New prose.", "More.", "executed", "An end.")]
+    assert order == sorted(order)

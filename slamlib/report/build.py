@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 
 import nbformat
+from tqdm import tqdm
 
 from slamlib import swap
 from slamlib.dataset import DatasetError, dataset_names, found, read_dataset, read_truth
@@ -35,7 +36,10 @@ from slamlib.report.pictures import title_picture
 from slamlib.report.setting import missing_glyphs
 from slamlib.solve import OURS
 from slamlib.studies.memory import forget
+from slamlib.summary import tables
 
+STUDIES, SECONDS = "studies", "seconds.json"  # in the cache, besides executed notebooks
+FIRST = 10.0  # s, for which the notebooks wait for the first numbers
 BUILDING = ".slamlib-build.lock"  # in folders that only one build at a time changes
 
 
@@ -62,7 +66,8 @@ def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=
     jobs : int, notebooks executed at a time.
     cover : Cover, the title page of the PDF, or None for the default.
     code : one of chapters.CODE; "none" leaves out code cells and printed text.
-    kept : folder that caches executed notebooks and their Monte Carlo studies, or None.
+    kept : folder that caches executed notebooks and their Monte Carlo studies, or None. Where it
+        has none of these notebooks, each dataset is solved first, and its `summary.table` printed.
     fresh : bool; True executes everything although it is cached.
     appendix : bool; False leaves out the appendices.
 
@@ -74,6 +79,7 @@ def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=
     One build at a time works in a results folder or with a cache; another one waits for it.
     """
     start = time.monotonic()
+    kept = kept and Path(kept).resolve()
     notebooks, data, report, results = (
         Path(folder).resolve() for folder in (notebooks, data, report, results))
     cover = cover or Cover()
@@ -82,13 +88,24 @@ def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=
     texts = {source: nbformat.v4.new_notebook(
         cells=[cell for cell in book.cells if cell.cell_type == "markdown"])
         for source, book in books.items()}
-    _render(texts, texts, chapters, cover, code)  # reports early what cannot be set
+    folders = [data / name for name in selected]
     with ExitStack() as stack:
-        for folder in sorted({results, Path(kept or results).resolve()}):
+        settings = stack.enter_context(temporary_folder())
+        environment = kernel_environment(settings, data, datasets, kept and kept / STUDIES)
+        keys = partial(_keys, books, folders, environment | {"SLAMLIB_RESULTS": str(results)})
+        if fresh or kept is None or not any(
+                cache.entry(kept, source, key).exists() for source, key in keys().items()):
+            wait = stack.enter_context(tables(folders, partial(tqdm.write, file=sys.stderr)))
+        else:
+            wait = None
+        _render(texts, texts, chapters, cover, code)  # reports early what cannot be set
+        if wait:
+            wait(max(0.0, start + FIRST - time.monotonic()))
+        for folder in sorted({results, kept or results}):
             stack.enter_context(swap.locked(folder / BUILDING))
         stage, pages = (stack.enter_context(swap.staging(folder)) for folder in (results, report))
-        books, written = _executed(books, {"data": data, "datasets": datasets, "jobs": jobs},
-                                   [data / name for name in selected], results, stage, kept, fresh)
+        books, written = _executed(books, keys, environment, max(1, jobs), stage, kept, fresh)
+        print("setting the pages and the PDF", file=sys.stderr)
         drives = read_drives(data, stage, selected, written, notices(books.values()))
         files = rendered(books, drives, cover, code, os.path.relpath(results, report))
         for name, content in files.items():
@@ -136,46 +153,39 @@ def _result_sets(results, stage, selected, written):
     return [swap.Set(results / dataset, found, ours=OURS) for dataset, found in files.items()]
 
 
-def _executed(books, options, datasets, results, stage, kept, fresh):
+def _keys(books, datasets, environment):
+    """Return {source: key} with the books' keys in the cache, as files and variables are now."""
+    common = cache.fingerprint(datasets, next(iter(books)).parent, environment)
+    return {source: cache.key_of(source, book, common) for source, book in books.items()}
+
+
+def _executed(books, keys, environment, jobs, stage, kept, fresh):
     """Return the executed books, cached or new, and the sorted names of the files they wrote.
 
-    `options` are those of `kernel_environment`, `datasets` the selected folders. The files are in
-    `stage`, a folder by `swap.staging` in `results`.
+    `keys` is a function without arguments that returns what `_keys` does, `environment` that of the
+    kernels, `stage` the folder of the files, by `swap.staging`.
     """
-    executed, written = {}, set()
-    with temporary_folder() as folder:
-        environment = kernel_environment(folder, **options)
-        fingerprint = partial(cache.fingerprint, datasets, next(iter(books)).parent,
-                              environment | {"SLAMLIB_RESULTS": str(results)})
-        common = fingerprint()
-        keys = {source: cache.key_of(source, book, common) for source, book in books.items()}
+    executed, written, begun = {}, set(), keys()
 
-        def finish(source, book, names):
-            swap.require_staged(stage)
-            executed[source] = book
-            written.update(names)
-            if kept is not None and fingerprint() == common:  # nothing was edited meanwhile
-                cache.keep(kept, source, keys[source], book, stage, names)
+    def finish(source, book, names):
+        swap.require_staged(stage)
+        executed[source] = book
+        written.update(names)
+        if kept is not None and keys() == begun:  # nothing was edited meanwhile
+            cache.keep(kept, source, begun[source], book, stage, names)
 
-        if kept is not None and not fresh:
-            for source, key in keys.items():
-                found = cache.recall(kept, source, key, stage)
-                if found and _sources(found[0]) == _sources(books[source]):
-                    executed[source] = found[0]
-                    written.update(found[1])
-                    print(f"{source.stem}: nothing changed, not executed again", file=sys.stderr)
-        if kept is not None:
-            studies = Path(kept, "studies").resolve()
-            environment["SLAMLIB_STUDIES"] = str(studies)
-            if fresh:
-                forget(studies)
-        execute({source: book for source, book in books.items() if source not in executed},
-                environment, stage, max(1, options["jobs"]), finish)
+    if kept is not None and not fresh:
+        for source, book in books.items():
+            names = cache.recall(kept, source, begun[source], book, stage)
+            if names is not None:
+                executed[source] = book
+                written.update(names)
+                print(f"{source.stem}: nothing changed, not executed again", file=sys.stderr)
+    if kept is not None and fresh:
+        forget(kept / STUDIES)
+    execute({source: book for source, book in books.items() if source not in executed},
+            environment, stage, jobs, finish, kept and kept / SECONDS)
     return {source: executed[source] for source in books}, sorted(written)
-
-
-def _sources(book):
-    return [(cell.cell_type, cell.source) for cell in book.cells]
 
 
 def rendered(books, drives, cover, code, results):

@@ -1,14 +1,15 @@
 """A cache of executed notebooks, a few versions of each.
 
-A notebook is executed again when its cells, slamlib's code (without the package `report`), an
+A notebook is executed again when its code cells, slamlib's code (without the package `report`), an
 installed package, a file of the selected datasets, another file beside the notebook or an
-environment variable changed. The result files that it wrote are kept with it. Earlier versions
-stay, so returning to an earlier selection of datasets executes nothing.
+environment variable changed. Its text, its metadata and outputs that an editor saved in it do not
+matter: the kept outputs are put into the notebook as it is now. The result files that it wrote are
+kept with it. Earlier versions stay, so returning to an earlier selection of datasets executes
+nothing.
 """
 
 import json
 import platform
-from copy import deepcopy
 from importlib.metadata import distributions
 from io import BytesIO
 from pathlib import Path
@@ -21,6 +22,8 @@ from slamlib.studies.memory import digest, modules
 
 VARIABLES = ("SLAMLIB_", "PYTHON", "MPL", "OMP_", "OPENBLAS_", "MKL_", "LANG", "LC_", "TZ",
              "SOURCE_DATE_EPOCH")  # prefixes of environment variables that may change an output
+IGNORED = ("MPLBACKEND", "SLAMLIB_STUDIES")
+HEEDED = {"raises-exception", "skip-execution"}  # the tags of cells that nbclient heeds
 VERSIONS = 4  # of each notebook, the last used
 BOOK, NAMES, RESULTS = "executed.ipynb", "results.json", "results/"  # in a notebook's ZIP archive
 
@@ -41,32 +44,39 @@ def fingerprint(datasets, notebooks, environment):
         sorted(f"{package.name} {package.version}" for package in distributions()),
         [(str(file), digest(file.read_bytes())) for file in files if file.is_file()],
         sorted((name, value) for name, value in environment.items()
-               if name.startswith(VARIABLES) and name != "MPLBACKEND")]).encode())
+               if name.startswith(VARIABLES) and name not in IGNORED)]).encode())
 
 
 def key_of(source, book, common):
     """Return the cache key (str) of a notebook, given as Path and NotebookNode.
 
-    It is a digest of its name, its cells without outputs, and the fingerprint `common` (str).
+    It is a digest of its name, its code cells in order, and the fingerprint `common` (str).
     """
-    book = deepcopy(book)
-    for cell in book.cells:
-        if cell.cell_type == "code":
-            cell.outputs, cell.execution_count = [], None
-    return digest(json.dumps([source.name, nbformat.writes(book), common]).encode())
+    cells = [(cell.source, sorted(HEEDED.intersection(cell.metadata.get("tags", ()))))
+             for cell in _code_cells(book)]
+    return digest(json.dumps([source.name, cells, common]).encode())
 
 
-def recall(folder, source, key, results):
-    """Return an executed notebook and the names of its results, or None if it must be executed.
+def _code_cells(book):
+    return [cell for cell in book.cells if cell.cell_type == "code"]
 
-    Its result files are written below `results`.
+
+def entry(folder, source, key):
+    """Return the Path of the file in the cache `folder` for a notebook (Path) with this key."""
+    return Path(folder, f"{source.stem}.{key}.executed")
+
+
+def recall(folder, source, key, book, results):
+    """Return the names of a notebook's results, or None if it must be executed.
+
+    Its result files are written below `results`, and its outputs into `book`.
 
     Parameters
     ----------
     folder, results : str or Path, the folder of the cache; Path, the folder for the result files.
-    source, key : Path of the notebook and str by `key_of`.
+    source, key, book : Path of the notebook, str by `key_of`, and NotebookNode as it is now.
     """
-    path = Path(folder, f"{source.stem}.{key}.executed")
+    path = entry(folder, source, key)
     try:
         checksum, _, content = path.read_bytes().partition(b"\n")
     except OSError:
@@ -75,19 +85,23 @@ def recall(folder, source, key, results):
         return None
     try:
         archive = ZipFile(BytesIO(content))
-        book = nbformat.reads(archive.read(BOOK).decode(), as_version=4)
-        nbformat.validate(book)
+        executed = nbformat.reads(archive.read(BOOK).decode(), as_version=4)
+        nbformat.validate(executed)
         names = json.loads(archive.read(NAMES))
         whole = not archive.testzip() and archive.namelist() == [
             BOOK, NAMES, *(RESULTS + name for name in names)]
     except Exception:  # zipfile, zlib, json and nbformat raise many kinds
         return None
+    cells, kept = _code_cells(book), _code_cells(executed)
+    whole = whole and [cell.source for cell in cells] == [cell.source for cell in kept]
     if not whole or any(".." in name.split("/") for name in names):
         return None
+    for cell, other in zip(cells, kept):
+        cell.outputs, cell.execution_count = other.outputs, other.execution_count
     for name in names:
         swap.write(results / name, archive.read(RESULTS + name))
     path.touch()
-    return book, names
+    return names
 
 
 def _checksum(key, content):
@@ -99,8 +113,7 @@ def keep(folder, source, key, book, results, names):
 
     Parameters
     ----------
-    folder, source, key, results : as in `recall`.
-    book : NotebookNode, executed.
+    folder, source, key, book, results : as in `recall`, `book` executed.
     names : list of str, the result files that it wrote, relative to `results`.
     """
     content = BytesIO()
@@ -110,8 +123,7 @@ def keep(folder, source, key, book, results, names):
         for name in names:
             archive.write(results / name, RESULTS + name)
     content = content.getvalue()
-    swap.write(Path(folder, f"{source.stem}.{key}.executed"),
-               _checksum(key, content) + b"\n" + content)
+    swap.write(entry(folder, source, key), _checksum(key, content) + b"\n" + content)
     versions = [file for file in Path(folder).glob("*.executed")
                 if file.name.rsplit(".", 2)[0] == source.stem]
     for old in sorted(versions, key=lambda file: file.stat().st_mtime_ns)[:-VERSIONS]:

@@ -20,9 +20,11 @@ from nbconvert.preprocessors import CoalesceStreamsPreprocessor
 from tqdm import tqdm
 
 from slamlib import swap
+from slamlib.report.progress import Progress
 from slamlib.textfile import read_regular
 
 CELL_TIMEOUT = 1800  # s
+THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")  # one each, if not set
 POLL = 1.0  # s, between looks at how far the studies are
 PREFIX = "slamlib-"  # of the names of temporary folders
 LONGEST_FOLDER = 70  # characters, of one for sockets: their paths have at most 103
@@ -40,13 +42,17 @@ class _Loop(asyncio.SelectorEventLoop):
 
 
 def read_notebook(source):
-    """Return the NotebookNode in a file (Path).
+    """Return the NotebookNode in a file (Path), without outputs that an editor saved.
 
     NotebookError if the file is not a notebook, DatasetError if it is no file that can be read.
     """
     data = read_regular(source)
     try:
-        return nbformat.reads(data.decode("utf-8-sig"), as_version=4)
+        book = nbformat.reads(data.decode("utf-8-sig"), as_version=4)
+        for cell in book.cells:
+            if cell.cell_type == "code":
+                cell.outputs, cell.execution_count = [], None
+        return book
     except UnicodeDecodeError as error:
         byte, line = error.object[error.start], data.count(b"\n", 0, error.start) + 1
         reason = f"expected UTF-8 text, found the byte 0x{byte:02x} in line {line}"
@@ -57,22 +63,25 @@ def read_notebook(source):
     raise NotebookError(f"{source.name} is not a notebook: {reason}")
 
 
-def kernel_environment(settings, data, datasets, jobs):
+def kernel_environment(settings, data, datasets, studies=None):
     """Return the kernels' environment variables (dict of str) without settings that change pages.
 
-    `settings` is an empty folder for the kernels' own settings, `data` that of the datasets (Path),
-    `datasets` the selected names (list of str) or None, `jobs` as in `execute`.
+    `settings` is a folder for the kernels' own settings, `data` that of the datasets (Path),
+    `datasets` the selected names (list of str) or None, `studies` the folder (Path) of the studies
+    that are kept, or None.
     """
     (settings / "matplotlibrc").write_text("svg.hashsalt: slamlib\n")
-    threads = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS") if jobs > 1 else ()
-    environment = {"SOURCE_DATE_EPOCH": "0", "PYTHONHASHSEED": "0"} | dict.fromkeys(threads, "1")
+    environment = {"SOURCE_DATE_EPOCH": "0", "PYTHONHASHSEED": "0"} | dict.fromkeys(THREADS, "1")
     environment |= os.environ
     environment |= {"SLAMLIB_DATA": str(data), "IPYTHONDIR": str(settings),
                     "MATPLOTLIBRC": str(settings / "matplotlibrc"),
                     "MPLBACKEND": "module://matplotlib_inline.backend_inline"}
-    for name in ("SLAMLIB_DATASETS", "SLAMLIB_STUDIES"):
+    chosen = {"SLAMLIB_DATASETS": datasets and "\n".join(datasets),
+              "SLAMLIB_STUDIES": studies and str(studies.resolve())}
+    for name, value in chosen.items():
         environment.pop(name, None)
-    return environment | ({"SLAMLIB_DATASETS": "\n".join(datasets)} if datasets else {})
+        environment |= {name: value} if value else {}
+    return environment
 
 
 @contextmanager
@@ -91,7 +100,7 @@ def temporary_folder():
         yield Path(folder)
 
 
-def execute(books, environment, results, jobs, finish):
+def execute(books, environment, results, jobs, finish, seconds=None):
     """Execute notebooks in place, at most `jobs` at a time; the first failure stops the others.
 
     Each notebook writes to its own folder inside `results`, SLAMLIB_RESULTS. When it ended without
@@ -103,15 +112,16 @@ def execute(books, environment, results, jobs, finish):
     results, jobs : Path, a folder of this build alone, and int.
     finish : function of Path, NotebookNode and the names (list of str) of the result files, called
         after each notebook.
+    seconds : Path of a file that keeps how long cells took, for the time left, or None.
     """
     try:
         with asyncio.Runner(loop_factory=_Loop) as runner:
-            runner.run(_execute_all(books, environment, results, jobs, finish))
+            runner.run(_execute_all(books, environment, results, jobs, finish, seconds))
     except ExceptionGroup as group:
         raise group.exceptions[0] from None
 
 
-async def _execute_all(books, environment, results, jobs, finish):
+async def _execute_all(books, environment, results, jobs, finish, seconds):
     slots = asyncio.Semaphore(jobs)
 
     async def run(number, source, book):
@@ -120,41 +130,31 @@ async def _execute_all(books, environment, results, jobs, finish):
         try:
             async with slots:
                 files = {"SLAMLIB_RESULTS": str(stage), "SLAMLIB_PROGRESS": str(told / source.stem)}
-                await _execute(source, book, environment | files, folder / f"{number}.json", bar)
+                await _execute(source, book, environment | files, folder / f"{number}.json",
+                               progress)
+            progress.keep(source.stem)
             finish(source, book, _publish(stage, results))
         finally:
             shutil.rmtree(stage, ignore_errors=True)
 
-    total = sum(map(_count_code_cells, books.values()))
-    with temporary_folder() as folder, tqdm(
-            total=total, unit="cell", leave=False, disable=not sys.stderr.isatty()) as bar:
+    with temporary_folder() as folder:
         told = folder / "progress"
         told.mkdir()
-        watching = asyncio.create_task(_watch(told, bar))
+        progress = Progress(books, jobs, told, seconds)
+        watching = asyncio.create_task(_watch(progress))
         try:
             async with asyncio.TaskGroup() as group:
                 for number, (source, book) in reversed([*enumerate(books.items())]):
                     group.create_task(run(number, source, book))    # later chapters take longer
         finally:
             watching.cancel()
+            progress.bar.close()
 
 
-async def _watch(told, bar):
-    """Show on the bar what the notebooks' studies tell in the files of a folder."""
-    while not bar.disable:
-        bar.set_postfix_str(", ".join(filter(None, map(_text, sorted(told.iterdir())))))
+async def _watch(progress):
+    while True:
+        progress.show()
         await asyncio.sleep(POLL)
-
-
-def _text(file):
-    try:
-        return file.read_text()
-    except FileNotFoundError:  # the study has ended meanwhile
-        return ""
-
-
-def _count_code_cells(book):
-    return sum(cell.cell_type == "code" and cell.source.strip() != "" for cell in book.cells)
 
 
 def _publish(stage, results):
@@ -166,17 +166,17 @@ def _publish(stage, results):
     return names
 
 
-async def _execute(source, book, environment, connection, bar):
+async def _execute(source, book, environment, connection, progress):
     """Execute one notebook in place with the interpreter that runs this module.
 
     The kernel listens at sockets beside the file `connection` (Path): a port that was free when it
     was chosen can be taken by another program before the kernel has it.
     """
-    count, started, start = _count_code_cells(book), [], time.monotonic()
+    name, started, start = source.stem, [], time.monotonic()
 
     def begin(cell, cell_index):
         started.append(cell)
-        bar.set_description(f"{source.stem}: cell {len(started)} of {count}")
+        progress.begin(name)
 
     manager = AsyncKernelManager(  # no folders to search: kernels of the user are not found
         kernel_name="python3", kernel_spec_manager=KernelSpecManager(kernel_dirs=[]),
@@ -186,8 +186,8 @@ async def _execute(source, book, environment, connection, bar):
         timeout=CELL_TIMEOUT, iopub_timeout=60, raise_on_iopub_timeout=True,
         record_timing=False, store_widget_state=False, shutdown_kernel="immediate",
         extra_arguments=["--IPKernelApp.log_level=ERROR"],
-        on_cell_execute=begin, on_cell_executed=lambda **_: bar.update())
-    tqdm.write(f"{source.stem}: {count} cells", file=sys.stderr)
+        on_cell_execute=begin, on_cell_executed=lambda **_: progress.end(name))
+    tqdm.write(f"{name}: {len(progress.cells[name])} cells", file=sys.stderr)
     try:
         await client.async_execute(env=environment, cleanup_kc=True)
         CoalesceStreamsPreprocessor().preprocess(book, {})  # kernels divide them by time
@@ -198,7 +198,7 @@ async def _execute(source, book, environment, connection, bar):
     finally:
         if manager.has_kernel:
             await manager.shutdown_kernel(now=True)
-    tqdm.write(f"{source.stem}: done in {time.monotonic() - start:.1f} s", file=sys.stderr)
+    tqdm.write(f"{name}: done in {time.monotonic() - start:.1f} s", file=sys.stderr)
 
 
 def _failure(source, started, error):

@@ -1,0 +1,61 @@
+"""Restores notebooks to the form in which they are committed, to the byte.
+
+    python strip_notebooks.py FILE...     restores these files
+    python strip_notebooks.py < FILE      prints what is restored; so git's filter does
+
+Outputs go, and what editors write into the metadata. It needs no package, so that git is fast.
+"""
+
+import json
+import sys
+
+CELL = ("tags", "alt")  # of a cell's metadata, what the report reads
+BOOK = ("slamlib",)     # of a notebook's
+KERNEL = {
+    "kernelspec": {"display_name": "Python 3 (ipykernel)", "language": "python", "name": "python3"},
+    "language_info": {"name": "python"}}
+
+
+def restored(content):
+    """Return a notebook (bytes) in its committed form; ValueError if it is none."""
+    try:
+        book = json.loads(content)
+        book["metadata"] = KERNEL | _only(BOOK, book["metadata"])
+        for cell in book["cells"]:
+            cell["metadata"] = _only(CELL, cell["metadata"])
+            cell["source"] = "".join(cell["source"]).splitlines(keepends=True)
+            if cell["cell_type"] == "code":
+                cell |= {"execution_count": None, "outputs": []}
+            elif not cell.get("attachments"):
+                cell.pop("attachments", None)
+    except (KeyError, TypeError, AttributeError):
+        raise ValueError("expected a notebook with cells and metadata") from None
+    return json.dumps(book, indent=1, sort_keys=True, ensure_ascii=False).encode() + b"\n"
+
+
+def _only(keys, metadata):
+    return {key: metadata[key] for key in keys if metadata.get(key)}
+
+
+def main(names):
+    """Restore the files with these names, or standard input; return 0, or a sentence (str)."""
+    try:
+        for name in names:
+            with open(name, "rb+") as file:
+                content = file.read()
+                if (new := restored(content)) != content:
+                    file.seek(0)
+                    file.truncate()
+                    file.write(new)
+        if not names:
+            name = "standard input"
+            sys.stdout.buffer.write(restored(sys.stdin.buffer.read()))
+    except ValueError as error:
+        return f"{name} is not a notebook: {error}"
+    except OSError as error:
+        return f"{error.filename}: {error.strerror}"
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
