@@ -77,14 +77,32 @@ def simulate(path="short", seed=0, *, slip=1e-3, late_ranges=0.0, mislabelled=0.
                   antenna_in_world=antenna_in_world, vehicle=true_vehicle))
 
 
-def misguess(dataset, truth, error, seed):
-    """The dataset with antenna guesses `error` m from the truth, each in a random direction.
+def misguess(dataset, position, error, seed):
+    """The dataset with antenna guesses `error` m from `position` (a, 2), in random directions.
 
-    `seed` is that of the random generator.
+    The rows of `position` are the antennas of the dataset's guesses. `seed` is that of the random
+    generator.
     """
-    angle = np.random.default_rng(seed).uniform(-np.pi, np.pi, len(truth.antenna))
+    angle = np.random.default_rng(seed).uniform(-np.pi, np.pi, len(position))
     off = error * np.stack([np.cos(angle), np.sin(angle)], -1)
-    return replace(dataset, antenna_guess=AntennaGuess(truth.antenna, truth.antenna_in_world + off))
+    return replace(dataset, antenna_guess=replace(dataset.antenna_guess, position=position + off))
+
+
+def mislabel(dataset, fraction, seed):
+    """The dataset with another marker's id at a fraction of its sightings; `seed` as above."""
+    rng = np.random.default_rng(seed)
+    ids, label = np.unique(dataset.aruco.marker, return_inverse=True)
+    wrong = rng.uniform(size=len(label)) < fraction
+    other = (label + rng.integers(1, max(2, len(ids)), len(label))) % len(ids)
+    marker = ids[np.where(wrong, other, label)]
+    return replace(dataset, aruco=replace(dataset.aruco, marker=marker))
+
+
+def delay(dataset, fraction, seed):
+    """The dataset with a fraction of its ranges too long, as by `simulate`; `seed` as above."""
+    rng, count = np.random.default_rng(seed), len(dataset.uwb.range)
+    excess = rng.exponential(LATE_RANGE_MEAN, count) * (rng.uniform(size=count) < fraction)
+    return replace(dataset, uwb=replace(dataset.uwb, range=dataset.uwb.range + excess))
 
 
 def manoeuvre(legs, vehicle=TABLE_2, step=0.01):

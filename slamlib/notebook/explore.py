@@ -1,8 +1,8 @@
-"""The Explore sections at the end of the notebooks: one figure each, with controls in JupyterLab.
+"""The figures of the Explore sections at the end of the notebooks; `controls` moves them.
 
-In JupyterLab `show` displays the controls above the figure and redraws it when a value changes. In
-the report it draws the figure with the initial values of the controls; in its HTML page some of
-them can be moved, among a few values for which the figure is drawn when the report is built.
+A figure's attribute `said` (str) says what is to be seen in it. Chapters 2 to 4 draw a simulated
+drive, or the first part of a dataset. Errors that the controls make are added to those of its
+files. Without truth a dataset is compared with the chapter's solution of the whole drive.
 """
 
 from dataclasses import replace
@@ -10,15 +10,21 @@ from functools import lru_cache
 
 import gtsam
 import numpy as np
-from IPython.display import display
-from ipywidgets import Box, Dropdown, FloatSlider, IntSlider, Layout, VBox, interactive_output
 
 from slamlib import evaluation, localization, odometry, se2
 from slamlib.increments import TYPICAL_SLIP
 from slamlib.notebook import plotting
-from slamlib.notebook.live import live
-from slamlib.notebook.show import Drive, interactive
-from slamlib.simulation import misguess, simulate
+from slamlib.notebook.controls import SIMULATED, choice, drive_choice, show, slider
+from slamlib.notebook.parts import (
+    about,
+    compared_with,
+    farthest,
+    first_part,
+    known_places,
+    moving_drive,
+    simulated,
+)
+from slamlib.simulation import delay, misguess, mislabel
 from slamlib.slam.estimate import fit_from_odometry
 from slamlib.slam.initialization import odometry_state, trilaterated_antennas
 from slamlib.slam.measurement_factors import MeasurementFactors
@@ -30,51 +36,12 @@ from slamlib.slam.result import result
 from slamlib.studies.kernels import solve_with
 from slamlib.studies.starts import LANDMARKS, guessed_antennas
 
-MINIMUM_PATH = 1.0           # m, path length from which a drive is worth drawing
+__all__ = ["KERNELS", "SIMULATED", "cameras", "choice", "drive_choice", "farthest", "graphs",
+           "moving_drive", "ranges", "show", "slider", "wheels"]
+
 SMALLEST_ERROR = 1.0         # mm, lower limit of the axis of errors
 WRONG_PLACE = 0.5            # m, error of a marker that is mapped at a wrong place
 KERNELS = {f"{scale} σ": scale for scale in (1, 3, 10, 30, 100)} | {"none": None}   # Cauchy scales
-ROW = Layout(display="flex", flex_flow="row wrap")
-
-
-def slider(label, start, low, high, step=1):
-    """A slider from `low` to `high`, of integers if all its numbers are, else of floats."""
-    whole = all(isinstance(number, int) for number in (start, low, high, step))
-    return (IntSlider if whole else FloatSlider)(start, min=low, max=high, step=step,
-                                                 description=label)
-
-
-def choice(label, options, start):
-    """A drop-down list of names; its value is the name chosen, `start` at first."""
-    return Dropdown(options=list(options), value=start, description=label)
-
-
-def show(draw, grid=None, **controls):
-    """Show the figure of draw(**values), in JupyterLab with controls of the values.
-
-    Parameters
-    ----------
-    draw : function of the controls' values, by name, that makes one figure.
-    grid : dict by name of the values (list) that some controls have in the report's HTML page.
-    controls : widgets with a value, as of `slider` and `choice`.
-    """
-    if not interactive():
-        live(draw, controls, grid or {})
-        return
-    for control in controls.values():
-        control.continuous_update = False              # redraw on release only
-        control.style.description_width = "12em"
-        control.layout.width = "31em"
-    display(VBox([Box(list(controls.values()), layout=ROW), interactive_output(draw, controls)]))
-
-
-def moving_drive(drives):
-    """The first Drive with a path of at least MINIMUM_PATH, or else a simulated one."""
-    for drive in drives:
-        d = drive.dataset
-        if evaluation.path_length(odometry.dead_reckoning(d.ticks, d.vehicle)) >= MINIMUM_PATH:
-            return drive
-    return Drive("simulated", *simulate("short", seed=1), made_up=True)
 
 
 def wheels(drive, right, left, base, sigma_radii, sigma_base, probability, count):
@@ -88,7 +55,8 @@ def wheels(drive, right, left, base, sigma_radii, sigma_base, probability, count
     probability : percent, of the ellipses.
     count : number of ellipses.
     """
-    ticks, v = drive.dataset.ticks, drive.dataset.vehicle
+    part = first_part(drive.dataset)
+    ticks, v = part.ticks, part.vehicle
     other = odometry.dead_reckoning(ticks, v.with_deviation(np.array([right, left, base])))
     poses, covariances = odometry.equation2(ticks, replace(
         v, sigma_right_radius=v.sigma_right_radius * sigma_radii,
@@ -109,13 +77,14 @@ def wheels(drive, right, left, base, sigma_radii, sigma_base, probability, count
     plotting.curve(side, np.hypot(*(other - poses)[:, :2].T), "alternative",
                    label="wheels of the sliders")
     if drive.truth is not None:
-        plotting.trajectory(plan, drive.truth.poses, "truth")
-        plotting.curve(side, np.hypot(*(drive.truth.poses - poses)[:, :2].T), "truth")
-        plan.set_title(f"{plotting.literal(drive.name)}: "
-                       f"ATE {evaluation.ate(other, drive.truth.poses):.3f} m")
+        true = drive.truth.poses[:len(ticks)]
+        plotting.trajectory(plan, true, "truth")
+        plotting.curve(side, np.hypot(*(true - poses)[:, :2].T), "truth")
+        plan.set_title(f"{plotting.literal(drive.name)}: ATE {evaluation.ate(other, true):.3f} m")
     side.set(ylabel="distance from nominal (m)", ylim=(0, None))
     plotting.legend_below(fig)
     fig.said = _said_of_wheels(v, np.array([right, left, base]), poses[-1], other[-1])
+    fig.said += about(drive, part)
     return fig
 
 
@@ -135,166 +104,214 @@ def _said_of_wheels(vehicle, deviation, end, other):
     return told[0].upper() + told[1:]
 
 
-def cameras(seed, every, reach, claimed):
+def cameras(full, drive, seed, every, reach, claimed):
     """Chapter 2: localization from fewer sightings, by markers alone and fused. The figure.
 
     Parameters
     ----------
+    full : dict by the drives' names of Fusion, of all measurements.
+    drive : Drive, or SIMULATED.
     seed : of a simulated drive of the short path.
     every : one frame of the camera in so many is used.
     reach : m, largest distance of a marker that is seen.
     claimed : factor on the reported standard deviations of the sightings, not on their errors.
     """
-    dataset, truth = simulate("short", seed, slip=TYPICAL_SLIP)
-    aruco = dataset.aruco
+    slip = TYPICAL_SLIP if drive.made_up else full[drive.name].slip
+    if drive.made_up:
+        drive = simulated(seed, slip=slip)
+    dataset = first_part(drive.dataset, "aruco")
+    compared, role, label = compared_with(drive, full, "this chapter's fusion")
+    true, aruco = compared.poses[:len(dataset.ticks)], dataset.aruco
     used = np.isin(aruco.pose, np.unique(aruco.pose)[::every])
     aruco = aruco.select(used & (np.hypot(*aruco.marker_in_vehicle[:, :2].T) <= reach))
     aruco = replace(aruco, covariance=aruco.covariance * claimed**2)
     fig, axes = plotting.panels(2, height=3.6)
     (plan,), (side,) = axes
     path = odometry.dead_reckoning(dataset.ticks, dataset.vehicle)
-    plotting.trajectory(plan, truth.poses, "truth")
+    _reference(plan, true, role, label)
     plotting.trajectory(plan, path, "odometry")
-    _error(side, path, truth.poses, "odometry")
-    frames = np.unique(aruco.pose)
-    if len(frames):
-        fused = localization.fuse(replace(dataset, aruco=aruco), slip=TYPICAL_SLIP)
+    _error(side, path, true, "odometry")
+    fig.said = "Without a sighting only the odometry is left."
+    if len(aruco.pose):
+        fused = localization.fuse(replace(dataset, aruco=aruco), slip=slip)
         alone = localization.localize(aruco)
         known = np.isfinite(alone.poses[:, 0])
-        poses = se2.compose(truth.poses[frames[known][0]], alone.poses)
+        poses = se2.compose(true[alone.frame[known][0]], alone.poses)
         plotting.trajectory(plan, poses, "aruco", "markers alone")
         plotting.trajectory(plan, fused.poses, "fused")
         k = plotting.enlargement(fused.poses, fused.covariances)
         at = plotting.spread(fused.poses, 10)
         plotting.ellipses(plan, fused.poses[at], fused.covariances[at],
                           plotting.ROLES["fused"]["color"], enlarged=k)
-        _error(side, poses, truth.poses[frames], "aruco", "markers alone", at=frames)
-        _error(side, fused.poses, truth.poses, "fused")
-        nees = evaluation.anees(fused.poses[frames], fused.covariances[frames],
-                                truth.poses[frames])
+        _error(side, poses, true[alone.frame], "aruco", "markers alone", at=alone.frame)
+        _error(side, fused.poses, true, "fused")
         plan.set_title(f"{len(aruco.pose)} sightings (ellipses × {k})")
+        fig.said = f"Markers alone locate {np.count_nonzero(known)} of {len(known)} frames."
+        nees = evaluation.anees(fused.poses[alone.frame], fused.covariances[alone.frame],
+                                true[alone.frame]) if role == "truth" else np.nan
+        side.set_title(f"fused: {fused.rejected} rejected"
+                       + (f", NEES {nees:.1f}" if np.isfinite(nees) else ""))
         if np.isfinite(nees):
-            side.set_title(f"fused: {fused.rejected} rejected, NEES {nees:.1f}")
             low, high = evaluation.nees_band(1)
-            fig.said = (f"Markers alone locate {np.count_nonzero(known)} of {len(frames)} frames. "
-                        f"The NEES of the fusion is {nees:.1f}; on single drives consistent "
-                        f"covariances give {low:.1f} to {high:.1f} in 95 % of the cases.")
-    side.set_ylim(SMALLEST_ERROR, 2 * side.dataLim.y1)
-    plotting.legend_below(fig)
-    return fig
+            fig.said += (f" The NEES of the fusion is {nees:.1f}; on single drives consistent "
+                         f"covariances give {low:.1f} to {high:.1f} in 95 % of the cases.")
+    fig.said += about(drive, dataset, label)
+    return _finished(fig, label)
 
 
-def graphs(seed, slip, assumed, wrong, kernel, start):
+def graphs(full, drive, seed, slip, assumed, wrong, kernel, start):
     """Chapter 3: the graph solved with one Cauchy kernel, and with kernels that narrow. The figure.
 
     Parameters
     ----------
-    seed : of a simulated drive of the short path.
-    slip, assumed : mm after 1 m, of the drive and of the graph.
+    full : dict by the drives' names of SlamResult, of all measurements.
+    drive : Drive, or SIMULATED, a simulated drive of the short path.
+    seed : of the simulated drive, or of the wrong labels that are added to a dataset.
+    slip, assumed : mm after 1 m, of the simulated drive and of the graph.
     wrong : percent of the sightings with a wrong label.
     kernel : name in KERNELS.
     start : name in starts.LANDMARKS, for the single kernel.
     """
-    m, truth, solved = _rounds(seed, slip, assumed, wrong)
+    model = "arc" if drive.made_up else full[drive.name].model
+    drive, m, solved = _rounds(drive, model, seed, slip, assumed, wrong)
+    compared, role, label = compared_with(drive, full, "problem 3's solution")
+    true = compared.poses[:len(m.dataset.ticks)]
     scale = KERNELS[kernel]
     cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(scale) if scale else None
-    problem = replace(build(m, "arc", with_known(Noise(), m.dataset.vehicle)),
+    problem = replace(build(m, model, with_known(Noise(), m.dataset.vehicle)),
                       measured=MeasurementFactors(m, m.unit_weights, cauchy))
-    single = optimize(problem, odometry_state(m, "arc", markers=LANDMARKS[start])).state
+    single = optimize(problem, odometry_state(m, model, markers=LANDMARKS[start])).state
     fig, axes = plotting.panels(2, height=3.6)
     (plan,), (side,) = axes
-    plotting.trajectory(plan, truth.poses, "truth")
+    _reference(plan, true, role, label)
     plotting.trajectory(plan, single.poses, "alternative", "single kernel")
     plotting.trajectory(plan, solved.poses, "slam", "rounds of kernels")
-    wide = []
-    for marker, in_world, role in ((m.marker, single.markers, "alternative"),
+    places, wide = known_places(m.marker, compared.marker, compared.marker_in_world), []
+    for marker, in_world, look in ((m.marker, single.markers, "alternative"),
                                    (solved.marker, solved.marker_in_world, "slam")):
-        true = truth.marker_in_world[np.searchsorted(truth.marker, marker)]
-        ends = np.stack([true[:, :2], in_world[:, :2]])
-        plan.plot(*ends.T.swapaxes(1, 2), color=plotting.ROLES[role]["color"], linewidth=1.2)
+        ends = np.stack([places[np.isin(m.marker, marker)], in_world[:, :2]])
+        plan.plot(*ends.T.swapaxes(1, 2), color=plotting.ROLES[look]["color"], linewidth=1.2)
         wide.append(np.count_nonzero(np.hypot(*(ends[1] - ends[0]).T) > WRONG_PLACE))
-    fig.said = (f"{wrong} % wrong labels: the single kernel maps {wide[0]} of {len(m.marker)} "
-                f"markers more than {WRONG_PLACE} m from their true place, the rounds {wide[1]}.")
-    plan.plot(*truth.marker_in_world[:, :2].T, label="true markers", **plotting.ROLES["marker"])
-    low, high = truth.marker_in_world[:, :2].min(0) - 0.5, truth.marker_in_world[:, :2].max(0) + 0.5
-    plan.set_aspect("equal", adjustable="box")          # markers far from the true map are cut off
+    places = places[np.isfinite(places[:, 0])]
+    fig.said = f"{wrong} % wrong labels{'' if drive.made_up else ' added'}."
+    if len(places):
+        their = "their true place" if role == "truth" else f"where {label} has them"
+        fig.said = (f"{fig.said[:-1]}: the single kernel maps {wide[0]} of {len(places)} markers "
+                    f"more than {WRONG_PLACE} m from {their}, the rounds {wide[1]}.")
+        plan.plot(*places.T, **plotting.ROLES["marker"],
+                  label="true markers" if role == "truth" else f"markers: {label}")
+    fig.said += about(drive, m.dataset, label)
+    around = np.concatenate([places, true[:, :2]])
+    low, high = around.min(0) - 0.5, around.max(0) + 0.5
+    plan.set_aspect("equal", adjustable="box")          # markers far from the map are cut off
     plan.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     plan.set_title(f"{len(solved.rejected)} sightings")
-    _error(side, single.poses, truth.poses[m.frame], "alternative", "single kernel", at=m.frame)
-    _error(side, solved.poses, truth.poses, "slam", "rounds of kernels")
-    nees = evaluation.anees(solved.poses, solved.covariances, truth.poses)
-    side.set_title(f"rounds: {np.count_nonzero(solved.rejected)} rejected, NEES {nees:.1f}")
-    side.set_ylim(SMALLEST_ERROR, 2 * side.dataLim.y1)
-    plotting.legend_below(fig)
-    return fig
+    _error(side, single.poses, true[m.frame], "alternative", "single kernel", at=m.frame)
+    _error(side, solved.poses, true, "slam", "rounds of kernels")
+    side.set_title(f"rounds: {np.count_nonzero(solved.rejected)} rejected"
+                   + _nees(solved, true, role))
+    return _finished(fig, label)
 
 
 @lru_cache(maxsize=8)
-def _rounds(seed, slip, assumed, wrong):
-    """Measurements, Truth and SlamResult by rounds of kernels of the drive of `graphs`."""
-    dataset, truth = simulate("short", seed, slip=1e-3 * slip, mislabelled=wrong / 100)
+def _rounds(drive, model, seed, slip, assumed, wrong):
+    """Drive, Measurements, and SlamResult by rounds of kernels, of the values of `graphs`."""
+    if drive.made_up:
+        drive = simulated(seed, slip=1e-3 * slip, mislabelled=wrong / 100)
+        dataset = drive.dataset
+    else:
+        dataset = mislabel(first_part(drive.dataset, "aruco"), wrong / 100, seed)
     m = measure(given(dataset.without("uwb"), 1e-3 * assumed, 1.0, 1.0))
-    return m, truth, result(fit_from_odometry(m))
+    return drive, m, result(fit_from_odometry(m, model))
 
 
-def ranges(seed, late, off, poses, way):
+def ranges(full, drive, seed, late, off, part, way):
     """Chapter 4: ranges and odometry, by one kernel from the guess, and by the default. The figure.
 
     Parameters
     ----------
-    seed : of a simulated drive of the short path.
+    full : dict by the drives' names of SlamResult, of all measurements.
+    drive : Drive, or SIMULATED, a simulated drive of the short path.
+    seed : of the simulated drive, or of the errors that are added to a dataset.
     late : percent of the ranges that are too long.
     off : m, error of the antenna guesses, each in a random direction.
-    poses : number of the drive's first poses that are used.
+    part : percent of the poses, the first ones, that are used.
     way : name in kernels.RANGES.
     """
-    dataset, truth = _late(seed, late, off, poses)
-    guess = dataset.antenna_guess.position
-    true_poses = truth.poses[:poses]
-    chosen = _by_ranges(seed, late, off, poses, way, guessed_antennas)
-    solved = _by_ranges(seed, late, off, poses, "asymmetric Tukey", trilaterated_antennas)
+    known = (TYPICAL_SLIP, "arc") if drive.made_up else \
+        (full[drive.name].slip, full[drive.name].model)
+    drive, m, chosen = _by_ranges(drive, *known, seed, late, off, part, way, guessed_antennas)
+    *_, solved = _by_ranges(drive, *known, seed, late, off, part, "asymmetric Tukey",
+                            trilaterated_antennas)
+    compared, role, label = compared_with(drive, full, "problem 4's solution")
+    true = compared.poses[:len(m.dataset.ticks)]
+    places = known_places(m.antenna, compared.antenna, compared.antenna_in_world)
     fig, axes = plotting.panels(2, height=3.6)
     (plan,), (side,) = axes
-    plotting.trajectory(plan, true_poses, "truth")
-    for found, role, label in ((chosen, "alternative", "chosen kernel"),
-                               (solved, "slam", "solver")):
-        plotting.trajectory(plan, found.poses, role, label)
-        first = guess[np.searchsorted(truth.antenna, found.antenna)]
-        ends = np.stack([first, found.antenna_in_world])
+    _reference(plan, true, role, label)
+    for found, look, name in ((chosen, "alternative", "chosen kernel"),
+                              (solved, "slam", "solver")):
+        plotting.trajectory(plan, found.poses, look, name)
+        ends = np.stack([m.guess, found.antenna_in_world])
         plan.plot(ends[..., 0], ends[..., 1], "o-", markevery=[1], markersize=4, linewidth=1.2,
-                  color=plotting.ROLES[role]["color"])
-        _error(side, found.poses, true_poses, role, label)
-    plan.plot(*guess.T, label="antennas: guess", **plotting.ROLES["guess"])
-    plan.plot(*truth.antenna_in_world.T, label="antennas: truth", **plotting.ROLES["true antenna"])
-    misses = [np.hypot(*(found.antenna_in_world - truth.antenna_in_world[
-        np.searchsorted(truth.antenna, found.antenna)]).T).max() for found in (chosen, solved)]
-    plan.set_title(f"antennas within {misses[1]:.2f} m")
-    fig.said = (f"{late} % late ranges: the antennas end up to {misses[0]:.2f} m from their true "
-                f"places with the kernel “{way}”, and up to {misses[1]:.2f} m with the solver.")
-    nees = evaluation.anees(solved.poses, solved.covariances, true_poses)
-    side.set_title(f"NEES {nees:.1f}, {len(solved.doubts)} in doubt")
-    side.set_ylim(SMALLEST_ERROR, 2 * side.dataLim.y1)
-    plotting.legend_below(fig)
-    return fig
-
-
-def _late(seed, late, off, poses):
-    """Dataset and Truth of the drive of `ranges`."""
-    dataset, truth = simulate("short", seed, slip=TYPICAL_SLIP, late_ranges=late / 100)
-    return misguess(dataset.without("aruco"), truth, off, seed).first(poses), truth
+                  color=plotting.ROLES[look]["color"])
+        _error(side, found.poses, true, look, name)
+    plan.plot(*m.dataset.antenna_guess.position.T, label="antennas: guess",
+              **plotting.ROLES["guess"])
+    fig.said = f"{late} % late ranges{'' if drive.made_up else ' added'}."
+    if np.isfinite(places).any():
+        plan.plot(*places.T, label=f"antennas: {label}",
+                  **plotting.ROLES["true antenna" if role == "truth" else "antenna"])
+        misses = [np.nanmax(np.hypot(*(found.antenna_in_world - places).T))
+                  for found in (chosen, solved)]
+        plan.set_title(f"antennas within {misses[1]:.2f} m")
+        their = "their true places" if role == "truth" else f"where {label} has them"
+        fig.said = (f"{fig.said[:-1]}: the antennas end up to {misses[0]:.2f} m from {their} with "
+                    f"the kernel “{way}”, and up to {misses[1]:.2f} m with the solver.")
+    fig.said += about(drive, m.dataset, label)
+    side.set_title(f"{len(solved.doubts)} in doubt" + _nees(solved, true, role))
+    return _finished(fig, label)
 
 
 @lru_cache(maxsize=16)
-def _by_ranges(seed, late, off, poses, way, antennas):
-    """SlamResult of the drive of `ranges` by a way to treat ranges and a start of the antennas."""
-    dataset, _ = _late(seed, late, off, poses)
-    known = given(dataset, TYPICAL_SLIP, 1.0, 1.0)
-    return result(solve_with(measure(known), ranges=way, antennas=antennas))
+def _by_ranges(drive, slip, model, seed, late, off, part, way, antennas):
+    """Drive, Measurements and SlamResult of the values of `ranges` and a start of the antennas."""
+    if drive.made_up:
+        drive = simulated(seed, slip=slip, late_ranges=late / 100)
+        dataset, position = drive.dataset, drive.truth.antenna_in_world
+    else:
+        dataset = delay(first_part(drive.dataset, "uwb"), late / 100, seed)
+        position = dataset.antenna_guess.position
+    dataset = misguess(dataset.without("aruco"), position, off, seed)
+    dataset = first_part(dataset.first(-(-len(dataset.ticks) * part // 100)), "uwb")
+    m = measure(given(dataset, slip, 1.0, 1.0))
+    return drive, m, result(solve_with(m, ranges=way, antennas=antennas, model=model))
 
 
-def _error(ax, poses, truth, role, label=None, **look):
-    """Draw the position error in mm of poses (n, 3) over the pose number, on a logarithmic axis."""
-    apart = np.hypot(*(poses - truth)[:, :2].T)
+def _reference(ax, true, role, label):
+    """Draw the path that others are compared with; without truth it is wide, below the others."""
+    plotting.trajectory(ax, true, role, label, **{} if role == "truth" else {"linewidth": 4.0})
+
+
+def _nees(found, true, role):
+    """Text (str) with the average NEES of a SlamResult where its role says that truth is known."""
+    if role != "truth":
+        return ""
+    return f", NEES {evaluation.anees(found.poses, found.covariances, true):.1f}"
+
+
+def _error(ax, poses, true, role, label=None, **look):
+    """Draw the distance in mm of poses (n, 3) from others over the pose number."""
+    apart = np.hypot(*(poses - true)[:, :2].T)
     plotting.curve(ax, 1e3 * apart, role, label=label, **look)
-    ax.set(yscale="log", ylabel="position error (mm)")
-    ax.yaxis.set_major_formatter("{x:g}")
+
+
+def _finished(fig, label):
+    """The figure with a logarithmic axis of errors, the second one, and a legend."""
+    side = fig.axes[1]
+    side.set(yscale="log", ylabel="position error (mm)" if label == "truth"
+             else f"distance from {label} (mm)")
+    side.yaxis.set_major_formatter("{x:g}")
+    side.set_ylim(SMALLEST_ERROR, max(2 * side.dataLim.y1, 10 * SMALLEST_ERROR))
+    plotting.legend_below(fig)
+    return fig

@@ -116,7 +116,8 @@ def _html(figures, fields, first):
                              separators=(",", ":")))
     html = (f'<svg width="0" height="0" style="position:absolute" aria-hidden="true"><defs>'
             f'{"".join(definitions.values())}<g id="legend">{"".join(legend)}</g></defs></svg>'
-            f'<form hidden autocomplete="off">{fields}</form><p class="says" role="status">'
+            f'<form hidden autocomplete="off">{fields}<input type="reset" value="Reset"></form>'
+            f'<p class="says" role="status">'
             f'{escape(said[first])}</p><div class="panels">{shown}</div>'
             f'<div class="legend" aria-hidden="true">{entries}</div>'
             f'<div class="parts" hidden><svg>{"".join(texts)}</svg></div>')

@@ -17,7 +17,7 @@ from slamlib.notebook import inline, plotting
 from slamlib.simulation import simulate
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)          # a drive is itself alone: arrays have no hash
 class Drive:
     """A dataset with, for figures and tables only, its truth."""
 

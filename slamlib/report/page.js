@@ -4,10 +4,10 @@ for (const figure of document.querySelectorAll("figure.live")) {
   const parts = figure.querySelector(".parts > svg").children;
   const panels = figure.querySelectorAll("svg.panel");
   const form = figure.querySelector("form");
-  const controls = [...form.querySelectorAll("input, select")];
+  const controls = [...form.querySelectorAll("[data-count]")];
   form.hidden = false;
   form.addEventListener("submit", (event) => event.preventDefault());
-  form.addEventListener("input", () => {
+  const show = () => {
     let state = 0;
     for (const control of controls) {
       state = state * control.dataset.count + Number(control.value);
@@ -19,5 +19,7 @@ for (const figure of document.querySelectorAll("figure.live")) {
     panels.forEach((panel, number) => panel.replaceChildren(
       ...states[state][number].map((part) => parts[part].cloneNode(true))));
     figure.querySelector(".says").textContent = said[state];
-  });
+  };
+  form.addEventListener("input", show);
+  form.addEventListener("reset", () => setTimeout(show));  // the controls have their first values then
 }

@@ -39,8 +39,8 @@ WRONG_LABEL = 50.0                         # squared Mahalanobis distance; a rig
 
 
 def solve_with(measurements, sightings="gate", ranges="asymmetric Tukey",
-               antennas=trilaterated_antennas, starts=None):
-    """The Fit of arcs with other kernels, from odometry.
+               antennas=trilaterated_antennas, starts=None, model="arc"):
+    """The Fit with other kernels, from odometry.
 
     Parameters
     ----------
@@ -49,12 +49,13 @@ def solve_with(measurements, sightings="gate", ranges="asymmetric Tukey",
     antennas : as of `initialization.state_from_poses`.
     starts : dict, or None, of what other ways on the same measurements have found so far: all that
         are not CONVEX start from the same rounds of narrowing kernels.
+    model : "arc" or "euler", of an odometry step.
     """
-    problem = build(measurements, "arc", with_known(Noise(), measurements.dataset.vehicle))
+    problem = build(measurements, model, with_known(Noise(), measurements.dataset.vehicle))
     starts = {} if starts is None else starts
     kernels = [way if way in CONVEX else "narrowing" for way in (sightings, ranges)]
     if tuple(kernels) not in starts:
-        state = odometry_state(measurements, "arc", antennas=antennas)
+        state = odometry_state(measurements, model, antennas=antennas)
         for scale in CAUCHY_SCALES:
             cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(scale)
             measured = MeasurementFactors(

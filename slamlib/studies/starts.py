@@ -160,7 +160,8 @@ def guesses(seed, error, poses=None, markers=True, compared=True, **options):
     outside their 99.9 % ellipse.
     """
     dataset, truth = simulate("short", seed, **options)
-    dataset = misguess(dataset if markers else dataset.without("aruco"), truth, error, seed)
+    dataset = misguess(dataset if markers else dataset.without("aruco"), truth.antenna_in_world,
+                       error, seed)
     dataset = given(dataset if poses is None else dataset.first(poses), TYPICAL_SLIP, 1.0, 1.0)
     measurements = measure(dataset)
     found = result(solve_with(measurements))
