@@ -62,8 +62,8 @@ def panel(draw, controls, only_simulated=()):
     """A widget: the controls and a button Reset, the sentence and the figure; as of `show`.
 
     A slider redraws the figure while it is dragged if the last drawing that it or a list caused
-    took less than FAST; else when it is released. The first drawing, which also loads typefaces, and
-    those of Reset, whose values are known already, say nothing of that.
+    took less than FAST; else when it is released. The first drawing, which also loads typefaces,
+    and those of Reset, whose values are known already, say nothing of that.
     """
     first = {name: control.value for name, control in controls.items()}
     sliders = [control for control in controls.values() if hasattr(control, "continuous_update")]
