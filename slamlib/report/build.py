@@ -20,7 +20,7 @@ from slamlib.dataset import DatasetError, dataset_names, found, read_dataset, re
 from slamlib.folder import left_in
 from slamlib.notebook import notices
 from slamlib.report import cache, overview
-from slamlib.report.chapters import chapter_of, in_order, printed, with_data
+from slamlib.report.chapters import available, chapter_of, in_order, printed, with_data
 from slamlib.report.cover import Cover
 from slamlib.report.drives import read_drives
 from slamlib.report.execution import (
@@ -33,6 +33,7 @@ from slamlib.report.numbering import numbered
 from slamlib.report.pages import html_pages
 from slamlib.report.pdf import typeset
 from slamlib.report.pictures import title_picture
+from slamlib.report.sections import shown, to_execute
 from slamlib.report.setting import missing_glyphs
 from slamlib.solve import OURS
 from slamlib.studies.memory import forget
@@ -52,7 +53,7 @@ class Report:
 
 
 def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=None,
-                 code="method", kept=None, fresh=False, appendix=True):
+                 code="method", kept=None, fresh=False, appendix=True, leave_out=None):
     """Execute all notebooks, write pages and PDF; return the Report.
 
     Kernels read the absolute paths of data and results, and the selection, from the environment
@@ -70,10 +71,13 @@ def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=
         has none of these notebooks, each dataset is solved first, and its `summary.table` printed.
     fresh : bool; True executes everything although it is cached.
     appendix : bool; False leaves out the appendices.
+    leave_out : dict as of `sections.to_execute`, what else is not shown, or None for nothing.
+        An appendix that is left out is not executed; a chapter is, as it writes the results.
 
     Raises
     ------
-    DatasetError : there is no notebook or dataset of a selected name, or a dataset is malformed.
+    DatasetError : there is no notebook or dataset of a selected name, or a dataset is malformed, or
+        what is to be left out is unknown.
     NotebookError : a cell failed or a page cannot be set; report and results are unchanged.
 
     One build at a time works in a results folder or with a cache; another one waits for it.
@@ -83,7 +87,8 @@ def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=
     notebooks, data, report, results = (
         Path(folder).resolve() for folder in (notebooks, data, report, results))
     cover = cover or Cover()
-    books, selected = _checked_input(notebooks, data, datasets, cover, appendix)
+    books, selected, has = _checked_input(notebooks, data, datasets, cover, appendix,
+                                          leave_out or {})
     chapters = [chapter_of(source, book) for source, book in books.items()]
     texts = {source: nbformat.v4.new_notebook(
         cells=[cell for cell in book.cells if cell.cell_type == "markdown"])
@@ -107,7 +112,8 @@ def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=
         books, written = _executed(books, keys, environment, max(1, jobs), stage, kept, fresh)
         print("setting the pages and the PDF", file=sys.stderr)
         drives = read_drives(data, stage, selected, written, notices(books.values()))
-        files = rendered(books, drives, cover, code, os.path.relpath(results, report))
+        files = rendered(books, drives, cover, code, os.path.relpath(results, report),
+                         partial(shown, has=has, leave_out=leave_out or {}))
         for name, content in files.items():
             swap.write(pages / name, content)
         swap.require_staged(stage)
@@ -118,16 +124,18 @@ def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=
     return Report([report / name for name in files], drives)
 
 
-def _checked_input(notebooks, data, datasets, cover, appendix):
-    """Return the notebooks by their paths, in order, and the names of the selected datasets."""
+def _checked_input(notebooks, data, datasets, cover, appendix, leave_out):
+    """Return the notebooks by their paths, in order, the datasets' names and what they have."""
     for line, text in asdict(cover).items():
         if missing := missing_glyphs(text):
             raise DatasetError(f"title page: the PDF's fonts have no glyph for {missing[0]} in "
                                f"{line} '{text}': write it in Latin, Greek or Cyrillic letters")
-    books = in_order({source: read_notebook(source) for source in notebooks.glob("*.ipynb")},
-                     appendix)
+    books = {source: read_notebook(source) for source in sorted(notebooks.glob("*.ipynb"))}
     if not books:
         raise DatasetError(f"{notebooks}: there are no notebooks (*.ipynb) in this folder")
+    books = in_order(to_execute(books, leave_out), appendix)
+    if not books:
+        raise DatasetError(f"{notebooks}: expected a notebook that is not left out")
     selected = dataset_names(data, datasets)
     for name in selected:
         if missing := missing_glyphs(name):
@@ -138,10 +146,11 @@ def _checked_input(notebooks, data, datasets, cover, appendix):
         print("\n".join(found(dataset, truth)), file=sys.stderr)
     for sentence in left_in(data):
         print(sentence, file=sys.stderr)
-    served = with_data(books, [dataset for dataset, _ in read])
+    has = available(read)
+    served = with_data(books, has)
     for source in books.keys() - served.keys():
         print(f"{source.stem}: left out, no dataset has the measurements", file=sys.stderr)
-    return served, selected
+    return served, selected, has
 
 
 def _result_sets(results, stage, selected, written):
@@ -188,7 +197,7 @@ def _executed(books, keys, environment, jobs, stage, kept, fresh):
     return {source: executed[source] for source in books}, sorted(written)
 
 
-def rendered(books, drives, cover, code, results):
+def rendered(books, drives, cover, code, results, shown=lambda books: books):
     """Return the report's files as {name: bytes}, `index.html` first and the PDF last.
 
     Parameters
@@ -197,22 +206,27 @@ def rendered(books, drives, cover, code, results):
     drives : list of SolvedDrive, of which the opening tells.
     cover, code : as of `build_report`.
     results : str, the path of the results folder from that of the report.
+    shown : function of the books that returns them without the sections that are left out.
     """
-    chapters = [chapter_of(source, book) for source, book in books.items()]
+    whole, books = books, shown(books)
+    on_paper = numbered({source: printed(book) for source, book in books.items()}, whole)
+    on_pages = numbered(books, whole)
+    chapters = [chapter_of(source, book) for source, book in on_pages.items()]
     opening = overview.summary(drives, results)
-    on_paper = numbered({source: printed(book) for source, book in books.items()}, whole=books)
     index = {Path("index"): overview.index(cover.title, opening, chapters)}
     solved = [drive for drive in drives if drive.solutions]
-    return _render(index | numbered(books), on_paper, chapters, cover, code, printed(opening),
-                   title_picture(solved[-1]) if solved else None)
+    shortened = {source: book for source, book in whole.items() if books.get(source) is not book}
+    return _render(index | on_pages, on_paper, chapters, cover, code, printed(opening),
+                   title_picture(solved[-1]) if solved else None, shortened)
 
 
-def _render(books, on_paper, chapters, cover, code, opening=None, picture=None):
+def _render(books, on_paper, chapters, cover, code, opening=None, picture=None, whole=None):
     """Return the report's files as {name: bytes}: a page for each of `books`, and the PDF.
 
-    `on_paper` are the chapters of the PDF, a dict as `books`.
+    `on_paper` are the chapters of the PDF, a dict as `books`; `whole` as of `html_pages`.
     """
-    files = {name: page.encode() for name, page in html_pages(books, chapters, code).items()}
+    files = {name: page.encode()
+             for name, page in html_pages(books, chapters, code, whole).items()}
     return files | {"report.pdf": typeset(list(on_paper.items()), opening, code, picture,
                                           **asdict(cover))}
 

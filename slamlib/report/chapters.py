@@ -10,7 +10,12 @@ from urllib.parse import quote
 
 from nbformat import NotebookNode
 
+from slamlib.report.execution import NotebookError
+from slamlib.solve import SENSORS
+from slamlib.textfile import quoted
+
 HIDDEN, HTML_ONLY = "hide-input", "html-only"
+NEEDS = (*SENSORS, "truth")  # what a notebook or a section may need
 CODE = ("none", "method", "all")  # what code is shown: none, all that is not hidden, or all
 
 
@@ -49,17 +54,43 @@ def in_order(books, appendix=True):
             if appendix or not keys[source][0]}
 
 
-def with_data(books, datasets):
-    """Return the books (dict from Path to NotebookNode) for which one of the Datasets has the data.
+def available(drives):
+    """Return what the drives (list of (Dataset, Truth or None)) have, a set among NEEDS."""
+    return {name for name in SENSORS
+            if any(getattr(dataset, name) is not None for dataset, _ in drives)} | {
+        "truth" for _, truth in drives if truth is not None}
 
-    The metadata of a notebook may name the sensor that it needs, as {"slamlib": {"needs": "uwb"}},
-    an attribute of Dataset. All books are returned if no dataset serves any.
+
+def needs(source, node):
+    """Return what a notebook or a cell (NotebookNode) says that it needs, or None.
+
+    The metadata say so, as {"slamlib": {"needs": "uwb"}}. NotebookError, which names the file
+    `source` (Path), if it is not among NEEDS.
     """
-    def served(book):
-        sensor = book.metadata.get("slamlib", {}).get("needs")
-        return sensor is None or any(getattr(each, sensor, None) is not None for each in datasets)
+    need = node.metadata.get("slamlib", {}).get("needs")
+    if need is not None and need not in NEEDS:
+        raise NotebookError(f"{source.name}: expected needs among {', '.join(NEEDS)} in the "
+                            f"metadata, found {quoted(need)}")
+    return need
 
-    return {source: book for source, book in books.items() if served(book)} or books
+
+def with_data(books, has):
+    """Return the books (dict from Path to NotebookNode) that need nothing but what is in `has`.
+
+    All books are returned if no dataset serves any.
+    """
+    return {source: book for source, book in books.items()
+            if needs(source, book) in {None, *has}} or books
+
+
+def texts(cells):
+    """Yield (dict, key) for each text in Markdown, in cells (list of NotebookNode) and outputs."""
+    for cell in cells:
+        if cell.cell_type == "markdown":
+            yield cell, "source"
+        for output in cell.get("outputs", ()):
+            if "text/markdown" in output.get("data", {}):
+                yield output.data, "text/markdown"
 
 
 def has_tag(cell, tag):

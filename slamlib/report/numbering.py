@@ -9,7 +9,7 @@ links.
 import re
 from copy import deepcopy
 
-from slamlib.report.chapters import chapter_of, is_appendix
+from slamlib.report.chapters import chapter_of, is_appendix, texts
 from slamlib.report.execution import NotebookError
 
 CAPTION = re.compile(r"\W*(Figure|Table)\s+(\d+(?:\.\d+)?|[A-Z]\.\d+)\.(?!\d)")
@@ -29,7 +29,8 @@ PARTS = re.compile(  # code, formulas and addresses; headings; captions; referen
 def numbered(books, whole=None):
     """Return copies of executed books (dict from Path to NotebookNode), numbered and with links.
 
-    `whole` is the same with cells that `books` leaves out: a reference to these becomes plain text.
+    `whole` is the same with what `books` leaves out: a reference to this becomes plain text, which
+    says "left out" where the number is now another's.
 
     Raises
     ------
@@ -38,10 +39,12 @@ def numbered(books, whole=None):
     """
     books = {source: deepcopy(book) for source, book in books.items()}
     targets = _targets(books)
-    absent = {key: number for key, (_, number) in _targets(whole or {}).items()
-              if key not in targets}
+    taken = {(kind, number) for (kind, _), (_, number) in targets.items()}
+    absent = {(kind, label): f"{number} (left out)" if (kind, number) in taken else number
+              for (kind, label), (_, number) in _targets(whole or {}).items()
+              if (kind, label) not in targets}
     for source, book in books.items():
-        for node, key in _texts(book):
+        for node, key in texts(book.cells):
             node[key] = _linked(node[key], source, targets, absent)
     return books
 
@@ -69,18 +72,8 @@ def _numbers(source, book):
                                 f"directly below a {kind}")
         count[kind] += 1
         yield kind, label, f"{label.partition('.')[0]}.{count[kind]}"
-    for tag in (tag.strip() for node, key in _texts(book) for tag in TAG.findall(node[key])):
+    for tag in (tag.strip() for node, key in texts(book.cells) for tag in TAG.findall(node[key])):
         yield "equation", tag, tag
-
-
-def _texts(book):
-    """Yield (dict, key) for each text in Markdown, in cells and outputs."""
-    for cell in book.cells:
-        if cell.cell_type == "markdown":
-            yield cell, "source"
-        for output in cell.get("outputs", ()):
-            if "text/markdown" in output.get("data", {}):
-                yield output.data, "text/markdown"
 
 
 def _captions(book):

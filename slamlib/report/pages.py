@@ -22,7 +22,7 @@ from nbconvert.filters import Highlight2HTML
 from nbconvert.filters.markdown_mistune import IPythonRenderer, MarkdownWithMath
 from traitlets.config import Config
 
-from slamlib.report.chapters import shows_input
+from slamlib.report.chapters import shows_input, texts
 from slamlib.report.execution import NotebookError
 from slamlib.report.formulas import set_formulas
 from slamlib.report.numbering import CAPTION, TAG
@@ -47,15 +47,19 @@ POLICY = ("default-src 'none'; img-src data:; script-src {}; style-src 'unsafe-i
           "style-src-elem {}; base-uri 'none'; form-action 'none'")  # unsafe-inline: attributes
 
 
-def html_pages(books, chapters, code="method"):
+def html_pages(books, chapters, code="method", whole=None):
     """Return the HTML pages of books (dict from Path to NotebookNode) as {file name: str}.
 
-    The other parameters are those of `html_page`. NotebookError if a page would lose a formula or
-    load something, or if a link has no target.
+    `whole` is the same with the sections that `books` leaves out: a link to one is plain text. The
+    other parameters are those of `html_page`. NotebookError if a page would lose a formula or load
+    something, or if a link has no target.
     """
+    absent = {(source.name, anchor) for source, book in (whole or {}).items()
+              if source in books for anchor in _anchors(source, book) - _anchors(
+                  source, books[source])}
     anchors, links, pages = {}, [], {}
     for source, book in books.items():
-        pages[f"{source.stem}.html"], page = html_page(source, book, chapters, code)
+        pages[f"{source.stem}.html"], page = html_page(source, book, chapters, code, absent)
         anchors[source.name] = {"", *page["anchors"]}
         links += [(source.name, *link) for link in page["links"]]
     for name, text, target, anchor in links:
@@ -67,7 +71,7 @@ def html_pages(books, chapters, code="method"):
     return pages
 
 
-def html_page(source, book, chapters, code="method"):
+def html_page(source, book, chapters, code="method", absent=()):
     """Return the HTML page (str) of an executed book, and a dict of what the renderer collected.
 
     NotebookError if a formula cannot be converted, or if a cell holds what pages cannot show.
@@ -77,10 +81,9 @@ def html_page(source, book, chapters, code="method"):
     source, book : Path and NotebookNode.
     chapters : list of dict by `chapter_of`, for the contents.
     code : one of chapters.CODE; "none" leaves out printed text, too.
+    absent : set of (notebook's name, anchor), to which no link is made.
     """
-    page = {"formulas": [], "sections": [], "section": "", "headings": [], "anchors": {},
-            "links": [], "figures": [], "chapters": chapters, "code": code, "styles": [STYLE],
-            "file": quote(f"{source.stem}.html"), "notebook": source.name}
+    page = _new_page(source, chapters) | {"code": code, "absent": absent}
     text, resources = EXPORTER.from_notebook_node(
         book, {"metadata": {"path": str(source.parent)}, "page": page})
     page = resources["page"]
@@ -91,6 +94,22 @@ def html_page(source, book, chapters, code="method"):
     unbroken = '<span class="keep">{}{}</span>'.format  # no line break before punctuation
     text = MARK.sub(lambda mark: unbroken(formulas[int(mark[1])], mark[2]), text)
     return _with_policy(text.replace(f"'{DRAWN}'", FAMILY), page["styles"]), page
+
+
+def _new_page(source, chapters):
+    """Return the dict in which the renderer collects what it finds."""
+    return {"formulas": [], "sections": [], "section": "", "headings": [], "anchors": {},
+            "links": [], "figures": [], "chapters": chapters, "absent": (), "styles": [STYLE],
+            "file": quote(f"{source.stem}.html"), "notebook": source.name}
+
+
+def _anchors(source, book):
+    """Return the anchors (set of str) of a book's headings, captions and equations."""
+    renderer = Renderer(escape=False)
+    renderer.page = _new_page(source, [])
+    for node, key in texts(book.cells):
+        MarkdownWithMath(renderer=renderer).render(node[key])
+    return {*renderer.page["anchors"]}
 
 
 def _with_policy(text, styles):
@@ -186,7 +205,9 @@ class Renderer(IPythonRenderer):
         if inside := INTERNAL.fullmatch(url):
             own = self.page["notebook"]
             target = unquote(inside[1] or own)
-            self.page["links"].append((text, target, unquote(inside[2] or "")))
+            if (target, anchor := unquote(inside[2] or "")) in self.page["absent"]:
+                return text
+            self.page["links"].append((text, target, anchor))
             if target not in (own, *(chapter["notebook"] for chapter in self.page["chapters"])):
                 return text
         return super().link(text, re.sub(r"^([^:/]+)\.ipynb(?=#|$)", r"\1.html", url), title)

@@ -1,0 +1,188 @@
+"""Sections of the chapters, and which of them a report shows.
+
+A section begins with a heading of level 2 or 3 and ends before the next one of the same or a higher
+level. A Markdown cell that begins with a heading may say in its metadata what its section needs, as
+`"slamlib": {"needs": "truth"}`. A section that is left out was executed like all others.
+"""
+
+import re
+from copy import deepcopy
+from dataclasses import dataclass
+from itertools import count
+
+from nbformat import NotebookNode
+from nbformat.v4 import new_markdown_cell
+
+from slamlib.dataset import DatasetError
+from slamlib.report.chapters import chapter_of, is_appendix, needs, texts
+from slamlib.report.execution import NotebookError
+from slamlib.report.sanitize import print_once
+from slamlib.textfile import quoted
+
+HEADING = re.compile(r"^(?P<fence>```|~~~).*?^(?P=fence)"
+                     r"|^(?P<level>#{1,3})[ \t]+(?P<title>[^\n]+)", re.MULTILINE | re.DOTALL)
+IN_CODE = re.compile(r"[\"'](#{2,3} [^\"'\\\n]+)")  # a heading that a cell will show
+
+
+@dataclass(frozen=True)
+class Section:
+    """A heading: its level (1 is a title), number such as "3.5" (or None), title and need."""
+
+    level: int
+    number: str | None
+    title: str
+    needs: str | None = None
+
+
+def sections(source, book):
+    """Return the headings (list of Section) of a notebook (Path, NotebookNode), in order.
+
+    NotebookError if the metadata of a cell has a need that is unknown or not a section's.
+    """
+    chapter, counts, found = chapter_of(source, book)["number"], [0, 0], []
+    for cell in book.cells:
+        need = needs(source, cell)
+        if need and not (cell.cell_type == "markdown" and re.match("###? ", cell.source)):
+            raise NotebookError(f"{source.name}: expected a Markdown cell that begins with a "
+                                f"heading ## or ### where the metadata says that it needs {need}, "
+                                f"found {quoted(cell.source)}")
+        for node, key in texts([cell]):
+            for begin, level, title in _headings(node[key]):
+                if level > 1:
+                    counts = [counts[0] + 1, 0] if level == 2 else [counts[0], counts[1] + 1]
+                number = ".".join(map(str, [chapter, *counts[:level - 1]])) if chapter else None
+                found.append(Section(level, number, title, None if begin else need))
+    return found
+
+
+def shown(books, has, leave_out=()):
+    """Return the books (dict from Path to NotebookNode) without what a report leaves out.
+
+    These are sections that need what the datasets do not have, `has` (a set by
+    `chapters.available`), and what `leave_out` names, as in `to_execute`.
+    """
+    left_out, result = {_key(entry) for entry in leave_out}, {}
+    for source, book in books.items():
+        if _is_left_out(source, book, left_out):
+            print_once(f"{source.stem}: left out")
+            continue
+        for reason, unwanted in (
+                ("no dataset has {}", lambda each: each.needs and each.needs not in has),
+                ("as asked for", lambda each: each.level > 1 and left_out & {
+                    _key(each.number), _key(each.title)})):
+            dropped = set()
+            for at, each in enumerate(sections(source, book)):
+                if unwanted(each):
+                    dropped.add(at)
+                    print_once(f"{source.stem}: section '{each.title}' is left out, "
+                               + reason.format(each.needs))
+            book = _without(book, dropped)
+        result[source] = book
+    return result
+
+
+def to_execute(books, leave_out):
+    """Return the books without those appendices that are left out: only chapters write results.
+
+    Parameters
+    ----------
+    books : dict from Path to NotebookNode, all that there are.
+    leave_out : dict from what is left out to where this is asked for (str), such as
+        "report.toml, line 3". It is a chapter by its number ("2" or "B"), or a section by its
+        number ("3.5") or title. Sections are numbered as where nothing is left out by this dict.
+
+    Raises
+    ------
+    DatasetError : nothing has this number or title. Headings that a cell will show count where its
+        code names them.
+    """
+    for entry, place in leave_out.items():
+        _require_known(books, entry, place)
+    left_out = {_key(entry) for entry in leave_out}
+    return {source: book for source, book in books.items()
+            if not (is_appendix(chapter_of(source, book))
+                    and _is_left_out(source, book, left_out))}
+
+
+def _require_known(books, entry, place):
+    """Raise DatasetError, which begins with `place`, if no chapter or section is called `entry`."""
+    chapters, listed, names = [], [], set()
+    for source, book in books.items():
+        number = chapter_of(source, book)["number"]
+        chapters += [number] if number else []
+        names.add(_key(number))
+        for each in sections(source, _announced(book)):
+            if each.level > 1:
+                names |= {_key(each.number), _key(each.title)}
+                listed.append(f"{each.number} {each.title}" if number else each.title)
+    if _key(entry) not in names - {_key(None)}:
+        within = entry.strip().partition(".")[0]
+        near = [each for each in listed if within in chapters and each.startswith(f"{within}.")]
+        raise DatasetError(f"{place}: expected to leave out a chapter ({', '.join(chapters)}) or a "
+                           f"section ({', '.join(near or listed)}), found {quoted(entry)}")
+
+
+def _is_left_out(source, book, left_out):
+    number = chapter_of(source, book)["number"]
+    return number is not None and _key(number) in left_out
+
+
+def _key(name):
+    """Return a number or a title (str or None) as it is compared."""
+    return _plain(name or "").removesuffix(".").casefold()
+
+
+def _plain(title):
+    return re.sub("[*_`]", "", title).strip(" #")
+
+
+def _headings(text):
+    """Yield (index, level, title) of each heading of levels 1 to 3 in Markdown."""
+    for found in HEADING.finditer(text):
+        if found["level"]:
+            yield found.start(), len(found["level"]), _plain(found["title"])
+
+
+def _announced(book):
+    """Return a book that is not yet executed, with headings in place of the code that names any."""
+    return NotebookNode(book | {"cells": [
+        new_markdown_cell("\n\n".join(IN_CODE.findall(cell.source)))
+        if cell.cell_type == "code" else cell for cell in book.cells]})
+
+
+def _without(book, dropped):
+    """Return a book without the sections at these indexes (set of int) of those by `sections`."""
+    if not dropped:
+        return book
+    number, left, cells = count(), 0, []  # left: the level of the section that is left out, or 0
+
+    def kept(text):
+        nonlocal left
+        begins = [*_headings(text)]
+        ends = [*(begin for begin, *_ in begins), len(text)]
+        parts = [] if left else [text[:ends[0]]]
+        for (begin, level, _), end in zip(begins, ends[1:]):
+            at = next(number)
+            if not left or level <= left:
+                left = level if at in dropped else 0
+            if not left:
+                parts.append(text[begin:end])
+        return "".join(parts)
+
+    def keeps(output):
+        data = output.get("data", {})
+        if "text/markdown" not in data:
+            return not left
+        data["text/markdown"] = kept(data["text/markdown"])
+        return data["text/markdown"].strip()
+
+    for cell in map(deepcopy, book.cells):
+        if cell.cell_type == "markdown":
+            cell.source = kept(cell.source)
+        elif left:
+            cell.source = ""
+        if "outputs" in cell:
+            cell.outputs = [output for output in cell.outputs if keeps(output)]
+        if cell.source.strip() or cell.get("outputs"):
+            cells.append(cell)
+    return NotebookNode(book | {"cells": cells})
