@@ -49,9 +49,10 @@ def _orderly_end(ended):
         interrupt = signal.getsignal(signal.SIGINT)  # the event loop's, while notebooks run
         (interrupt if callable(interrupt) else signal.default_int_handler)(signal.SIGINT, frame)
 
+    from slamlib.swap import ENDS
     before = {}
     if threading.current_thread() is threading.main_thread():
-        before = {each: signal.getsignal(each) for each in (signal.SIGTERM, signal.SIGHUP)
+        before = {each: signal.getsignal(each) for each in ENDS
                   if signal.getsignal(each) == signal.SIG_DFL}  # nohup's stays
     for each in before:
         signal.signal(each, end)
@@ -219,4 +220,5 @@ def _number(text, kind, least, most, expected):
 
 
 if __name__ == "__main__":
+    sys.stdout.reconfigure(errors="backslashreplace")  # as stderr, for names in other letters
     sys.exit(main())

@@ -17,7 +17,7 @@ import pytest
 from nbformat.v4 import new_notebook
 from test_report import build, make_data, write
 
-from slamlib import results, swap
+from slamlib import locks, results, swap
 from slamlib.__main__ import main
 from slamlib.report import NotebookError, cache, execution
 from slamlib.simulation import simulate, write_dataset
@@ -87,17 +87,17 @@ def test_a_second_build_waits_and_names_the_first_and_neither_loses_results(tmp_
 def test_the_lock_of_a_process_that_is_killed_is_free(tmp_path):
     holder = subprocess.Popen([sys.executable, "-c", f"""
 from pathlib import Path
-from slamlib.swap import locked
+from slamlib.locks import locked
 with locked(Path({str(tmp_path / "lock")!r})):
     print("held", flush=True)
     input()"""], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
         env=os.environ | {"PYTHONPATH": str(ROOT)})
     assert holder.stdout.readline() == "held\n"
     with open(tmp_path / "lock", "a+") as file:
-        assert not swap._take(file)
+        assert not locks.take(file)
     holder.kill()
     holder.communicate()
-    with swap.locked(tmp_path / "lock"):
+    with locks.locked(tmp_path / "lock"):
         assert str(os.getpid()) in (tmp_path / "lock").read_text()
     assert not (tmp_path / "lock").exists()
 
@@ -107,7 +107,7 @@ def test_a_lock_has_one_holder_at_a_time_although_its_file_is_removed(tmp_path):
 
     def work():
         for _ in range(50):
-            with swap.locked(tmp_path / "lock"):
+            with locks.locked(tmp_path / "lock"):
                 held.append(1)
                 most.append(len(held))
                 time.sleep(0)
@@ -312,7 +312,7 @@ time.sleep(100)""",))
     assert process.returncode == 128 + number
     assert told.splitlines()[-1] == f"slamlib: ended by {number.name}" and "Traceback" not in told
     assert swap.names(tmp_path / "results") == [] and hidden(tmp_path) == []
-    assert not swap.runs(kernel)
+    assert not locks.runs(kernel)
 
 
 def test_a_signal_while_files_are_replaced_waits_until_they_are(tmp_path, drive, monkeypatch,

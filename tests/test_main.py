@@ -175,13 +175,16 @@ def test_wrong_python_or_platform_is_one_sentence():
 import platform, sys
 sys.path.insert(0, {root!r})
 import check_python
+check_python.installed = lambda: None
 {change}
 print(check_python.problem())
 """
-    cases = {"pass": "None",
+    conda = "platform.system = lambda: 'Windows'; check_python.installed = lambda: ['4', '{}']"
+    cases = {"pass": "None", conda.format(3): "None", conda.format(2): "WSL2",
+             conda.format(3) + "; sys.version_info = (3, 10, 9)": "WSL2",
              "sys.version_info = (3, 10, 9)": "Python 3.11 to 3.14",
              "sys.version_info = (3, 15, 0)": "Python 3.11 to 3.14",
-             "platform.system = lambda: 'Windows'": "WSL2",
+             "platform.system = lambda: 'Windows'": "environment.yml",
              "platform.machine = lambda: 'riscv64'": "riscv64",
              "platform.system = lambda: 'Linux'; platform.libc_ver = lambda: ('', '')": "glibc"}
     for change, word in cases.items():

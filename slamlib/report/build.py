@@ -4,7 +4,6 @@ Each notebook becomes one HTML page and one chapter of the PDF; both open with t
 """
 
 import os
-import resource
 import sys
 import time
 from contextlib import ExitStack
@@ -14,7 +13,12 @@ from pathlib import Path
 
 import nbformat
 
-from slamlib import swap
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None
+
+from slamlib import locks, swap
 from slamlib.dataset import DatasetError, dataset_names, read_dataset, read_truth
 from slamlib.notebook import notices
 from slamlib.report import cache, overview
@@ -75,6 +79,7 @@ def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=
     start = time.monotonic()
     notebooks, data, report, results = (
         Path(folder).resolve() for folder in (notebooks, data, report, results))
+    address = _address(results, report)
     cover = cover or Cover()
     books, selected = _checked_input(notebooks, data, datasets, cover, appendix)
     chapters = [chapter_of(source, book) for source, book in books.items()]
@@ -84,12 +89,12 @@ def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=
     _render(texts, texts, chapters, cover, code)  # reports early what cannot be set
     with ExitStack() as stack:
         for folder in sorted({results, Path(kept or results).resolve()}):
-            stack.enter_context(swap.locked(folder / BUILDING))
+            stack.enter_context(locks.locked(folder / BUILDING))
         stage, pages = (stack.enter_context(swap.staging(folder)) for folder in (results, report))
         books, written = _executed(books, {"data": data, "datasets": datasets, "jobs": jobs},
                                    [data / name for name in selected], results, stage, kept, fresh)
         drives = read_drives(data, stage, selected, written, notices(books.values()))
-        files = rendered(books, drives, cover, code, os.path.relpath(results, report))
+        files = rendered(books, drives, cover, code, address)
         for name, content in files.items():
             swap.write(pages / name, content)
         swap.require_staged(stage)
@@ -98,6 +103,14 @@ def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=
             *_result_sets(results, stage, selected, written)])
     print(_resources_used(time.monotonic() - start), file=sys.stderr)
     return Report([report / name for name in files], drives)
+
+
+def _address(results, report):
+    """Return the path (str) of the results from the report, as in a link."""
+    try:
+        return Path(os.path.relpath(results, report)).as_posix()
+    except ValueError:  # Windows
+        raise DatasetError(f"{results}: expected a folder on the drive of {report}") from None
 
 
 def _checked_input(notebooks, data, datasets, cover, appendix):
@@ -203,7 +216,9 @@ def _render(books, on_paper, chapters, cover, code, opening=None, picture=None):
 
 
 def _resources_used(seconds):
-    """Return a sentence with the duration and the peak memory of the build."""
+    """Return a sentence with the duration and, where the system tells it, the peak memory."""
+    if resource is None:
+        return f"built in {seconds:.1f} s"
     unit = 1 if sys.platform == "darwin" else 1024  # bytes in a unit of ru_maxrss
     own, largest = (resource.getrusage(who).ru_maxrss * unit / 1e6
                     for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))

@@ -4,6 +4,7 @@ import asyncio
 import os
 import re
 import shutil
+import socket
 import sys
 import tempfile
 import time
@@ -19,12 +20,14 @@ from nbconvert.filters import strip_ansi
 from nbconvert.preprocessors import CoalesceStreamsPreprocessor
 from tqdm import tqdm
 
-from slamlib import swap
+from slamlib import locks, swap
+from slamlib.studies.workers import ONE_THREAD
 from slamlib.textfile import read_regular
 
 CELL_TIMEOUT = 1800  # s
 POLL = 1.0  # s, between looks at how far the studies are
 PREFIX = "slamlib-"  # of the names of temporary folders
+TRANSPORT = "ipc" if hasattr(socket, "AF_UNIX") else "tcp"  # Windows lacks the former
 LONGEST_FOLDER = 70  # characters, of one for sockets: their paths have at most 103
 
 
@@ -64,9 +67,8 @@ def kernel_environment(settings, data, datasets, jobs):
     `datasets` the selected names (list of str) or None, `jobs` as in `execute`.
     """
     (settings / "matplotlibrc").write_text("svg.hashsalt: slamlib\n")
-    threads = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS") if jobs > 1 else ()
-    environment = {"SOURCE_DATE_EPOCH": "0", "PYTHONHASHSEED": "0"} | dict.fromkeys(threads, "1")
-    environment |= os.environ
+    environment = {"SOURCE_DATE_EPOCH": "0", "PYTHONHASHSEED": "0"}
+    environment |= (ONE_THREAD if jobs > 1 else {}) | os.environ
     environment |= {"SLAMLIB_DATA": str(data), "IPYTHONDIR": str(settings),
                     "MATPLOTLIBRC": str(settings / "matplotlibrc"),
                     "MPLBACKEND": "module://matplotlib_inline.backend_inline"}
@@ -82,12 +84,13 @@ def temporary_folder():
     Its path is short enough for sockets in it.
     """
     place = tempfile.gettempdir()
-    place = Path("/tmp" if len(place) > LONGEST_FOLDER else place)
+    place = Path("/tmp" if TRANSPORT == "ipc" and len(place) > LONGEST_FOLDER else place)
     for left in place.glob(f"{PREFIX}*-*"):
         process = left.name.split("-")[1]
-        if process.isdecimal() and not swap.runs(int(process)):
+        if process.isdecimal() and not locks.runs(int(process)):
             shutil.rmtree(left, ignore_errors=True)
-    with tempfile.TemporaryDirectory(dir=place, prefix=f"{PREFIX}{os.getpid()}-") as folder:
+    with tempfile.TemporaryDirectory(dir=place, prefix=f"{PREFIX}{os.getpid()}-",
+                                     ignore_cleanup_errors=True) as folder:
         yield Path(folder)
 
 
@@ -142,15 +145,9 @@ async def _execute_all(books, environment, results, jobs, finish):
 async def _watch(told, bar):
     """Show on the bar what the notebooks' studies tell in the files of a folder."""
     while not bar.disable:
-        bar.set_postfix_str(", ".join(filter(None, map(_text, sorted(told.iterdir())))))
+        texts = (file.read_text() for file in sorted(told.iterdir()))
+        bar.set_postfix_str(", ".join(filter(None, texts)))  # of a study that has ended: ""
         await asyncio.sleep(POLL)
-
-
-def _text(file):
-    try:
-        return file.read_text()
-    except FileNotFoundError:  # the study has ended meanwhile
-        return ""
 
 
 def _count_code_cells(book):
@@ -169,8 +166,8 @@ def _publish(stage, results):
 async def _execute(source, book, environment, connection, bar):
     """Execute one notebook in place with the interpreter that runs this module.
 
-    The kernel listens at sockets beside the file `connection` (Path): a port that was free when it
-    was chosen can be taken by another program before the kernel has it.
+    The kernel listens at sockets beside the file `connection` (Path), where the system has them: a
+    port that was free when it was chosen can be taken by another program before the kernel has it.
     """
     count, started, start = _count_code_cells(book), [], time.monotonic()
 
@@ -180,7 +177,7 @@ async def _execute(source, book, environment, connection, bar):
 
     manager = AsyncKernelManager(  # no folders to search: kernels of the user are not found
         kernel_name="python3", kernel_spec_manager=KernelSpecManager(kernel_dirs=[]),
-        transport="ipc", connection_file=str(connection))
+        transport=TRANSPORT, connection_file=str(connection))
     client = NotebookClient(
         book, km=manager, resources={"metadata": {"path": str(source.parent)}},
         timeout=CELL_TIMEOUT, iopub_timeout=60, raise_on_iopub_timeout=True,
