@@ -19,8 +19,8 @@ def without_wheel():
     version = tuple(sys.version_info[:2])
     system, machine = platform.system(), platform.machine().lower()
     if system == "Windows":
-        return ("gtsam has no wheel for Windows: run this inside WSL2, or in conda's environment of "
-                "environment.yml, which was not tried on Windows (see environment.md).")
+        return ("gtsam has no wheel for Windows: run this inside WSL2, or in conda's environment "
+                "of environment.yml, which was not tried on Windows (see environment.md).")
     if (system, machine) not in (("Linux", "x86_64"), ("Linux", "aarch64"),
                                  ("Darwin", "x86_64"), ("Darwin", "arm64")):
         return "gtsam has no wheel for %s on %s (see environment.md)." % (system, machine)

@@ -298,7 +298,7 @@ def test_a_file_that_cannot_be_kept_is_an_error(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", swap.ENDS)
 def test_a_signal_ends_a_build_in_order(tmp_path, number):
     make_data(tmp_path)
     write(tmp_path / "notebooks", "1_slow", "# Slow", (RESULT + """
@@ -368,7 +368,7 @@ def test_temporary_folders_of_builds_that_are_gone_are_removed(tmp_path, monkeyp
     assert not folder.exists()
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", swap.ENDS)
 def test_a_signal_ends_a_solve_in_order(tmp_path, number):
     write_dataset(tmp_path / "drive", simulate("long", 3)[0])
     process = start(tmp_path, "solve", "drive", "--out", "out")
@@ -383,7 +383,7 @@ def test_a_signal_that_is_ignored_stays_so_and_handlers_are_as_before(tmp_path, 
     write_dataset(tmp_path / "drive", drive.without("uwb").without("aruco"))
     seen = []
     monkeypatch.setattr("slamlib.summary.merged", lambda _: seen.append(
-        [signal.getsignal(each) for each in (signal.SIGTERM, signal.SIGHUP)]) or [])
+        [signal.getsignal(each) for each in swap.ENDS]) or [])
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         arguments = ["solve", str(tmp_path / "drive"), "--out", str(tmp_path / "out")]

@@ -167,9 +167,9 @@ def test_a_study_whose_process_is_killed_leaves_nothing():
 
 @pytest.mark.slow
 @on_linux
-@pytest.mark.parametrize("killed, number", [
-    ("build", signal.SIGKILL), ("kernel", signal.SIGKILL), ("build", signal.SIGINT)])
-def test_a_report_that_is_killed_leaves_no_process_and_no_shared_memory(killed, number, tmp_path):
+@pytest.mark.parametrize("killed, name", [
+    ("build", "SIGKILL"), ("kernel", "SIGKILL"), ("build", "SIGINT")])
+def test_a_report_that_is_killed_leaves_no_process_and_no_shared_memory(killed, name, tmp_path):
     make_data(tmp_path)
     write(tmp_path / "notebooks", "1_slow", "# Slow", (SLOW_STUDY,))
     build = subprocess.Popen(
@@ -177,13 +177,14 @@ def test_a_report_that_is_killed_leaves_no_process_and_no_shared_memory(killed, 
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=os.environ | {"PYTHONPATH": str(ROOT)})
     below = processes_with(build, 2)
     kernel, = (each for each in below if "ipykernel_launcher" in each.cmdline())
+    number = getattr(signal, name)
     os.kill(build.pid if killed == "build" else kernel.pid, number)
     told = build.communicate(timeout=60)[1]
     require_gone(below)
     if killed == "kernel":
         assert build.returncode == 1 and "1_slow.ipynb, cell 1:" in told
     else:
-        assert build.returncode == (-number if number == signal.SIGKILL else 128 + number)
+        assert build.returncode == (-number if name == "SIGKILL" else 128 + number)
 
 
 def test_a_study_of_several_processes_equals_that_of_one():
@@ -214,3 +215,54 @@ def test_a_process_of_a_trial_that_is_killed_is_told():
         for _ in range(2):
             with pytest.raises(RuntimeError, match="with exit code 3"):
                 workers._answer(worker, (sys.exit, 3, {}))
+
+
+def required(lines):
+    """Requirements as {name: the rest of its line}, of lines as `numpy` or `gtsam==4.3.0`."""
+    found = (re.fullmatch(r"([\w-]+)(.*)", line) for line in lines)
+    return {each[1].lower().replace("_", "-"): each[2].strip() for each in found}
+
+
+def test_the_environment_of_conda_has_what_the_lock_is_made_from():
+    """What pip installs there has the lock's versions, and gtsam the first two numbers of its."""
+    *conda, by_pip = yaml.safe_load((ROOT / "environment.yml").read_text())["dependencies"]
+    conda, by_pip = required(conda), required(by_pip["pip"])
+    asked = required(line for line in (ROOT / "requirements.in").read_text().splitlines()
+                     if not line.startswith("#"))
+    assert conda.keys() | by_pip.keys() == asked.keys() | {"python", "pip"}
+    assert not conda.keys() & by_pip.keys()
+    assert {name: asked[name] for name in by_pip} == by_pip
+    assert asked["gtsam"].startswith(f"=={conda['gtsam'].removesuffix('*')}")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert required(project["dependencies"]).keys() <= asked.keys()
+    assert conda["python"] in [f"3.{minor}.*" for minor in range(11, 15)]
+
+
+def test_the_version_that_check_python_asks_for_is_the_one_that_is_pinned(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT))
+    import check_python
+    assert check_python.installed() == check_python.GTSAM
+    asked = (ROOT / "requirements.in").read_text()
+    assert f"gtsam=={'.'.join(check_python.GTSAM)}." in asked
+
+
+def targets_in(text):
+    """Targets of make (set of str) in lines of a shell."""
+    return set(re.findall(r"\bmake ([\w-]+)", text))
+
+
+def test_container_and_ci_call_targets_that_there_are():
+    rules = re.findall(r"^([a-z][\w -]*):(?!=)", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    targets = {target for rule in rules for target in rule.split()}
+    container = json.loads((ROOT / ".devcontainer" / "devcontainer.json").read_text())
+    assert targets_in(container["postCreateCommand"]) == {"setup"} <= targets
+    jobs = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text())["jobs"]
+    called = {name: targets_in(" ".join(step.get("run", "") for step in job["steps"]))
+              for name, job in jobs.items()}
+    assert called == {"test-and-report": {"report"}, "macos": {"quick", "report"}, "windows": set()}
+    assert set.union(*called.values()) <= targets
+    assert {name for name, job in jobs.items() if job.get("continue-on-error")} == {
+        "macos", "windows"}
+    used, = (step["with"]["environment-file"] for step in jobs["windows"]["steps"]
+             if "environment-file" in step.get("with", {}))
+    assert (ROOT / used).is_file()
