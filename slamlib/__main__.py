@@ -13,6 +13,7 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from slamlib.dataset import DatasetError, read_dataset, read_truth  # noqa: E402
+from slamlib.swap import ENDS  # noqa: E402
 
 
 def main(arguments=None):
@@ -49,7 +50,6 @@ def _orderly_end(ended):
         interrupt = signal.getsignal(signal.SIGINT)  # the event loop's, while notebooks run
         (interrupt if callable(interrupt) else signal.default_int_handler)(signal.SIGINT, frame)
 
-    from slamlib.swap import ENDS
     before = {}
     if threading.current_thread() is threading.main_thread():
         before = {each: signal.getsignal(each) for each in ENDS
