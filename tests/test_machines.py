@@ -17,9 +17,10 @@ from pathlib import Path
 import psutil
 import pytest
 import yaml
-from test_report import make_data, write
+from test_report import build, make_data, write
 
-from slamlib import studies, swap
+from slamlib import locks, studies, swap
+from slamlib.dataset import DatasetError
 from slamlib.results import read_vehicle_poses
 from slamlib.simulation import simulate, write_dataset
 from slamlib.studies import workers
@@ -116,6 +117,35 @@ sys.exit(main())"""
     assert told.count("\n") == 1 and ".mat: is open in another program" in told
     assert (tmp_path / "out" / "summary.json").exists()
     assert not (tmp_path / "out" / swap.MARKER).exists()
+
+
+def test_folders_on_two_drives_of_windows_are_told_before_anything_runs(tmp_path, monkeypatch):
+    def relpath(path, start):
+        raise ValueError("path is on mount 'D:', start on mount 'C:'")
+    monkeypatch.setattr(os.path, "relpath", relpath)
+    make_data(tmp_path)
+    with pytest.raises(DatasetError, match="results: expected a folder on the drive of .*report"):
+        build(tmp_path)
+
+
+def test_a_process_runs_or_not():
+    """Numbers come from names of files, which may have any."""
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    assert [locks.runs(number) for number in (os.getpid(), ended.pid, 10**30)] == [
+        True, False, False]
+
+
+def test_a_study_tells_how_far_it_is_and_nothing_when_it_has_ended(tmp_path, monkeypatch):
+    """The file stays: Windows removes none that the build reads."""
+    monkeypatch.setenv("SLAMLIB_PROGRESS", str(tmp_path / "told"))
+    told = []
+
+    def trial(seed):
+        told.append((tmp_path / "told").read_text() if seed else "")
+        return {"seed": seed}
+    studies.run(trial, range(3), jobs=1)
+    assert [*told, (tmp_path / "told").read_text()] == ["", "trial 1 of 3", "trial 2 of 3", ""]
 
 
 SLOW_STUDY = """import time
