@@ -1,15 +1,26 @@
-"""Fails with one sentence where the pinned gtsam wheel cannot run. Any Python can run this file."""
+"""Fails with one sentence where gtsam cannot run. Any Python can run this file."""
 
 import platform
 import sys
 
+GTSAM = ["4", "3"]                      # of its version; pyproject.toml pins the wheel's
+
 
 def problem():
     """A sentence that says why gtsam cannot run here, or None."""
+    reason = without_wheel()
+    if reason and sys.version_info >= (3, 11) and installed() == GTSAM:
+        return None                     # from conda, say
+    return reason
+
+
+def without_wheel():
+    """A sentence that says why there is no wheel of gtsam for this Python, or None."""
     version = tuple(sys.version_info[:2])
     system, machine = platform.system(), platform.machine().lower()
     if system == "Windows":
-        return "gtsam has no wheel for Windows: run this inside WSL2 (see environment.md)."
+        return ("gtsam has no wheel for Windows: run this inside WSL2, or in conda's environment "
+                "of environment.yml, which was not tried on Windows (see environment.md).")
     if (system, machine) not in (("Linux", "x86_64"), ("Linux", "aarch64"),
                                  ("Darwin", "x86_64"), ("Darwin", "arm64")):
         return "gtsam has no wheel for %s on %s (see environment.md)." % (system, machine)
@@ -21,6 +32,17 @@ def problem():
                 "`make PYTHON=python3.12 ...` (see environment.md)."
                 % (sys.executable, platform.python_implementation(), version[0], version[1]))
     return None
+
+
+def installed():
+    """The first two numbers of gtsam's version, or None where it cannot be imported."""
+    try:
+        from importlib.metadata import version
+
+        import gtsam  # noqa: F401
+        return version("gtsam").split(".")[:2]
+    except Exception:                   # a library for another system raises many kinds
+        return None
 
 
 if __name__ == "__main__":

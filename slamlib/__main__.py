@@ -13,6 +13,7 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from slamlib.dataset import DatasetError, found, read_dataset, read_truth  # noqa: E402
+from slamlib.swap import ENDS  # noqa: E402
 
 DATA, NOTEBOOKS, KEPT = Path("data"), Path("notebooks"), Path("build", "executed")
 
@@ -57,7 +58,7 @@ def _orderly_end(ended):
 
     before = {}
     if threading.current_thread() is threading.main_thread():
-        before = {each: signal.getsignal(each) for each in (signal.SIGTERM, signal.SIGHUP)
+        before = {each: signal.getsignal(each) for each in ENDS
                   if signal.getsignal(each) == signal.SIG_DFL}  # nohup's stays
     for each in before:
         signal.signal(each, end)
@@ -219,4 +220,5 @@ def _number(text, kind, least, most, expected):
 
 
 if __name__ == "__main__":
+    sys.stdout.reconfigure(errors="backslashreplace")  # as stderr, for names in other letters
     sys.exit(main())

@@ -6,23 +6,22 @@ killed. UNFINISHED.txt is there from before the first of these steps until after
 file that sums up the set, as summary.json, goes first and comes last, so it is only there with all.
 
 `.slamlib.json` in a folder names the files of its set; whatever else is there is the user's and
-stays. Locks are those of flock, which the kernel releases however a process ends.
+stays. Windows neither removes nor replaces a file that is open.
 """
 
 import errno
-import fcntl
 import glob
 import json
 import os
 import shutil
 import signal
-import sys
 import threading
-import time
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from itertools import count
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePath, PurePosixPath
+
+from slamlib.locks import REMOVABLE, locked, runs, take
 
 MARKER = "UNFINISHED.txt"
 SENTENCE = ("A run writes the files of this folder, or was ended while it did so: "
@@ -30,6 +29,7 @@ SENTENCE = ("A run writes the files of this folder, or was ended while it did so
 WRITTEN = ".slamlib.json"  # the names of a set's files
 LOCK = ".slamlib.lock"
 STAGE = ".slamlib-stage-"  # and a number
+ENDS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
 
 
 class UnfinishedError(RuntimeError):
@@ -73,59 +73,6 @@ def _remove_temporaries(path):
             file.unlink(missing_ok=True)
 
 
-def runs(process):
-    """True if there is a process with this id."""
-    try:
-        os.kill(process, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:  # another user's
-        pass
-    return True
-
-
-@contextmanager
-def locked(path):
-    """Hold a lock file (Path) that is removed at the end; a process that waits says for which."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    file = _acquired(path)
-    try:
-        began = time.strftime("%Y-%m-%d %H:%M:%S")
-        file.truncate(0)
-        with suppress(OSError):  # a full disk is told by whoever writes more
-            os.write(file.fileno(), f"process {os.getpid()}, which has written to {path.parent} "
-                                    f"since {began}".encode())
-        yield
-    finally:
-        path.unlink(missing_ok=True)
-        fcntl.flock(file, fcntl.LOCK_UN)  # closing is not enough where a child has it open
-        file.close()
-
-
-def _acquired(path):
-    """Return the open file at this path once its lock is ours."""
-    while True:
-        with ExitStack() as stack:
-            file = stack.enter_context(open(path, "a+"))
-            if not _take(file):
-                file.seek(0)
-                print(f"slamlib: waits for {file.read() or 'another process'}", file=sys.stderr)
-                fcntl.flock(file, fcntl.LOCK_EX)
-            with suppress(FileNotFoundError):  # the holder removes the file before others have it
-                if os.path.samestat(os.fstat(file.fileno()), path.stat()):
-                    stack.pop_all()
-                    return file
-
-
-def _take(file):
-    """Take the lock of an open file if it is free; return whether it was."""
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
-
-
 @contextmanager
 def staging(folder):
     """Yield a new empty folder (Path) of this process in `folder`, and remove it at the end.
@@ -141,19 +88,22 @@ def staging(folder):
         stage = next(path for n in count(1) if not (path := folder / f"{STAGE}{n}").exists())
         (stage / "files").mkdir(parents=True)
         file = open(stage / LOCK, "w")
-        _take(file)
+        take(file)
     try:
         yield stage / "files"
     finally:
-        shutil.rmtree(stage, ignore_errors=True)
-        file.close()
+        with nullcontext() if REMOVABLE else locked(folder / LOCK):  # nobody else takes its number
+            if not REMOVABLE:
+                file.close()
+            shutil.rmtree(stage, ignore_errors=True)
+            file.close()
 
 
 def _held(stage):
     """True if the process that made a folder by `staging` is still there."""
     try:
         with open(stage / LOCK, "r+") as file:
-            return not _take(file)
+            return not take(file)
     except OSError:
         return False
 
@@ -206,7 +156,7 @@ def _undisturbed():
     """Let signals that handlers of this process turn into an end wait until the block is done."""
     waiting, handlers = [], {}
     if threading.current_thread() is threading.main_thread():
-        handlers = {number: handler for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+        handlers = {number: handler for number in (signal.SIGINT, *ENDS)
                     if callable(handler := signal.getsignal(number))}
     for number in handlers:
         signal.signal(number, lambda number, _: waiting.append(number))
@@ -230,6 +180,9 @@ def _check(each):
             raise _os_error(errno.EXDEV, target)
         if target.is_dir():
             raise _os_error(errno.EISDIR, target)
+    for name in () if REMOVABLE else sorted(_old(each)):  # one that a program shows stays as it is
+        with suppress(FileNotFoundError):
+            open(each.folder / name, "r+b").close()
     for folder in sorted({(each.folder / name).parent for name in _old(each) | each.files.keys()}):
         if folder.is_dir() and not os.access(folder, os.W_OK):
             raise _os_error(errno.EACCES, folder)
@@ -284,4 +237,4 @@ def _old(each):
         written = []                    # not ours: what it should name is the user's
     return {name for name in (written if isinstance(written, list) else ())
             if isinstance(name, str) and name and "\0" not in name
-            and ".." not in PurePosixPath(name).parts and not name.startswith("/")} | each.ours
+            and ".." not in PurePath(name).parts and not PurePath(name).anchor} | each.ours

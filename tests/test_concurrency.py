@@ -17,7 +17,7 @@ import pytest
 from nbformat.v4 import new_notebook
 from test_report import build, make_data, write
 
-from slamlib import results, swap
+from slamlib import locks, results, swap
 from slamlib.__main__ import main
 from slamlib.report import NotebookError, cache, execution
 from slamlib.simulation import simulate, write_dataset
@@ -87,17 +87,17 @@ def test_a_second_build_waits_and_names_the_first_and_neither_loses_results(tmp_
 def test_the_lock_of_a_process_that_is_killed_is_free(tmp_path):
     holder = subprocess.Popen([sys.executable, "-c", f"""
 from pathlib import Path
-from slamlib.swap import locked
+from slamlib.locks import locked
 with locked(Path({str(tmp_path / "lock")!r})):
     print("held", flush=True)
     input()"""], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
         env=os.environ | {"PYTHONPATH": str(ROOT)})
     assert holder.stdout.readline() == "held\n"
     with open(tmp_path / "lock", "a+") as file:
-        assert not swap._take(file)
+        assert not locks.take(file)
     holder.kill()
     holder.communicate()
-    with swap.locked(tmp_path / "lock"):
+    with locks.locked(tmp_path / "lock"):
         assert str(os.getpid()) in (tmp_path / "lock").read_text()
     assert not (tmp_path / "lock").exists()
 
@@ -107,7 +107,7 @@ def test_a_lock_has_one_holder_at_a_time_although_its_file_is_removed(tmp_path):
 
     def work():
         for _ in range(50):
-            with swap.locked(tmp_path / "lock"):
+            with locks.locked(tmp_path / "lock"):
                 held.append(1)
                 most.append(len(held))
                 time.sleep(0)
@@ -298,7 +298,7 @@ def test_a_file_that_cannot_be_kept_is_an_error(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", swap.ENDS)
 def test_a_signal_ends_a_build_in_order(tmp_path, number):
     make_data(tmp_path)
     write(tmp_path / "notebooks", "1_slow", "# Slow", (RESULT + """
@@ -312,7 +312,7 @@ time.sleep(100)""",))
     assert process.returncode == 128 + number
     assert told.splitlines()[-1] == f"slamlib: ended by {number.name}" and "Traceback" not in told
     assert swap.names(tmp_path / "results") == [] and hidden(tmp_path) == []
-    assert not swap.runs(kernel)
+    assert not locks.runs(kernel)
 
 
 def test_a_signal_while_files_are_replaced_waits_until_they_are(tmp_path, drive, monkeypatch,
@@ -368,7 +368,7 @@ def test_temporary_folders_of_builds_that_are_gone_are_removed(tmp_path, monkeyp
     assert not folder.exists()
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("number", swap.ENDS)
 def test_a_signal_ends_a_solve_in_order(tmp_path, number):
     write_dataset(tmp_path / "drive", simulate("long", 3)[0])
     process = start(tmp_path, "solve", "drive", "--out", "out")
@@ -383,7 +383,7 @@ def test_a_signal_that_is_ignored_stays_so_and_handlers_are_as_before(tmp_path, 
     write_dataset(tmp_path / "drive", drive.without("uwb").without("aruco"))
     seen = []
     monkeypatch.setattr("slamlib.summary.merged", lambda _: seen.append(
-        [signal.getsignal(each) for each in (signal.SIGTERM, signal.SIGHUP)]) or [])
+        [signal.getsignal(each) for each in swap.ENDS]) or [])
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         arguments = ["solve", str(tmp_path / "drive"), "--out", str(tmp_path / "out")]

@@ -117,7 +117,7 @@ def test_a_second_process_that_is_killed_costs_time_only(tmp_path, monkeypatch):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux forks safely")
-@pytest.mark.parametrize("end", [signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("end", ["SIGTERM", "SIGKILL"])
 def test_no_process_survives_a_solve_that_is_killed(end, tmp_path):
     write_dataset(tmp_path / "drive", simulate("long", 3)[0])
     process = subprocess.Popen([sys.executable, "-m", "slamlib", "solve", "drive", "--out", "out"],
@@ -126,7 +126,7 @@ def test_no_process_survives_a_solve_that_is_killed(end, tmp_path):
     until = time.monotonic() + 60
     while not (found := children.read_text().split()) and time.monotonic() < until:
         time.sleep(0.02)
-    process.send_signal(end)
+    process.send_signal(getattr(signal, end))
     process.wait()
     assert len(found) == 1
     while running(found[0]) and time.monotonic() < until:
@@ -199,13 +199,16 @@ def test_wrong_python_or_platform_is_one_sentence():
 import platform, sys
 sys.path.insert(0, {root!r})
 import check_python
+check_python.installed = lambda: None
 {change}
 print(check_python.problem())
 """
-    cases = {"pass": "None",
+    conda = "platform.system = lambda: 'Windows'; check_python.installed = lambda: ['4', '{}']"
+    cases = {"pass": "None", conda.format(3): "None", conda.format(2): "WSL2",
+             conda.format(3) + "; sys.version_info = (3, 10, 9)": "WSL2",
              "sys.version_info = (3, 10, 9)": "Python 3.11 to 3.14",
              "sys.version_info = (3, 15, 0)": "Python 3.11 to 3.14",
-             "platform.system = lambda: 'Windows'": "WSL2",
+             "platform.system = lambda: 'Windows'": "environment.yml",
              "platform.machine = lambda: 'riscv64'": "riscv64",
              "platform.system = lambda: 'Linux'; platform.libc_ver = lambda: ('', '')": "glibc"}
     for change, word in cases.items():

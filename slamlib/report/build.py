@@ -4,7 +4,6 @@ Each notebook becomes one HTML page and one chapter of the PDF; both open with t
 """
 
 import os
-import resource
 import sys
 import time
 from contextlib import ExitStack
@@ -15,7 +14,12 @@ from pathlib import Path
 import nbformat
 from tqdm import tqdm
 
-from slamlib import swap
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None
+
+from slamlib import locks, swap
 from slamlib.dataset import DatasetError, dataset_names, found, read_dataset, read_truth
 from slamlib.folder import left_in
 from slamlib.notebook import notices
@@ -86,6 +90,7 @@ def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=
     kept = kept and Path(kept).resolve()
     notebooks, data, report, results = (
         Path(folder).resolve() for folder in (notebooks, data, report, results))
+    address = _address(results, report)
     cover = cover or Cover()
     books, selected, has = _checked_input(notebooks, data, datasets, cover, appendix,
                                           leave_out or {})
@@ -107,12 +112,12 @@ def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=
         if wait:
             wait(max(0.0, start + FIRST - time.monotonic()))
         for folder in sorted({results, kept or results}):
-            stack.enter_context(swap.locked(folder / BUILDING))
+            stack.enter_context(locks.locked(folder / BUILDING))
         stage, pages = (stack.enter_context(swap.staging(folder)) for folder in (results, report))
         books, written = _executed(books, keys, environment, max(1, jobs), stage, kept, fresh)
         print("setting the pages and the PDF", file=sys.stderr)
         drives = read_drives(data, stage, selected, written, notices(books.values()))
-        files = rendered(books, drives, cover, code, os.path.relpath(results, report),
+        files = rendered(books, drives, cover, code, address,
                          partial(shown, has=has, leave_out=leave_out or {}))
         for name, content in files.items():
             swap.write(pages / name, content)
@@ -122,6 +127,14 @@ def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=
             *_result_sets(results, stage, selected, written)])
     print(_resources_used(time.monotonic() - start), file=sys.stderr)
     return Report([report / name for name in files], drives)
+
+
+def _address(results, report):
+    """Return the path (str) of the results from the report, as in a link."""
+    try:
+        return Path(os.path.relpath(results, report)).as_posix()
+    except ValueError:  # Windows
+        raise DatasetError(f"{results}: expected a folder on the drive of {report}") from None
 
 
 def _checked_input(notebooks, data, datasets, cover, appendix, leave_out):
@@ -232,7 +245,9 @@ def _render(books, on_paper, chapters, cover, code, opening=None, picture=None, 
 
 
 def _resources_used(seconds):
-    """Return a sentence with the duration and the peak memory of the build."""
+    """Return a sentence with the duration and, where the system tells it, the peak memory."""
+    if resource is None:
+        return f"built in {seconds:.1f} s"
     unit = 1 if sys.platform == "darwin" else 1024  # bytes in a unit of ru_maxrss
     own, largest = (resource.getrusage(who).ru_maxrss * unit / 1e6
                     for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))

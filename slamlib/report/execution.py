@@ -4,6 +4,7 @@ import asyncio
 import os
 import re
 import shutil
+import socket
 import sys
 import tempfile
 import time
@@ -19,14 +20,15 @@ from nbconvert.filters import strip_ansi
 from nbconvert.preprocessors import CoalesceStreamsPreprocessor
 from tqdm import tqdm
 
-from slamlib import swap
+from slamlib import locks, swap
 from slamlib.report.progress import Progress
+from slamlib.studies.workers import ONE_THREAD
 from slamlib.textfile import read_regular
 
 CELL_TIMEOUT = 1800  # s
-THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")  # one each, if not set
 POLL = 1.0  # s, between looks at how far the studies are
 PREFIX = "slamlib-"  # of the names of temporary folders
+TRANSPORT = "ipc" if hasattr(socket, "AF_UNIX") else "tcp"  # Windows lacks the former
 LONGEST_FOLDER = 70  # characters, of one for sockets: their paths have at most 103
 
 
@@ -71,8 +73,7 @@ def kernel_environment(settings, data, datasets, studies=None):
     that are kept, or None.
     """
     (settings / "matplotlibrc").write_text("svg.hashsalt: slamlib\n")
-    environment = {"SOURCE_DATE_EPOCH": "0", "PYTHONHASHSEED": "0"} | dict.fromkeys(THREADS, "1")
-    environment |= os.environ
+    environment = {"SOURCE_DATE_EPOCH": "0", "PYTHONHASHSEED": "0"} | ONE_THREAD | os.environ
     environment |= {"SLAMLIB_DATA": str(data), "IPYTHONDIR": str(settings),
                     "MATPLOTLIBRC": str(settings / "matplotlibrc"),
                     "MPLBACKEND": "module://matplotlib_inline.backend_inline"}
@@ -91,12 +92,13 @@ def temporary_folder():
     Its path is short enough for sockets in it.
     """
     place = tempfile.gettempdir()
-    place = Path("/tmp" if len(place) > LONGEST_FOLDER else place)
+    place = Path("/tmp" if TRANSPORT == "ipc" and len(place) > LONGEST_FOLDER else place)
     for left in place.glob(f"{PREFIX}*-*"):
         process = left.name.split("-")[1]
-        if process.isdecimal() and not swap.runs(int(process)):
+        if process.isdecimal() and not locks.runs(int(process)):
             shutil.rmtree(left, ignore_errors=True)
-    with tempfile.TemporaryDirectory(dir=place, prefix=f"{PREFIX}{os.getpid()}-") as folder:
+    with tempfile.TemporaryDirectory(dir=place, prefix=f"{PREFIX}{os.getpid()}-",
+                                     ignore_cleanup_errors=True) as folder:
         yield Path(folder)
 
 
@@ -169,8 +171,8 @@ def _publish(stage, results):
 async def _execute(source, book, environment, connection, progress):
     """Execute one notebook in place with the interpreter that runs this module.
 
-    The kernel listens at sockets beside the file `connection` (Path): a port that was free when it
-    was chosen can be taken by another program before the kernel has it.
+    The kernel listens at sockets beside the file `connection` (Path), where the system has them: a
+    port that was free when it was chosen can be taken by another program before the kernel has it.
     """
     name, started, start = source.stem, [], time.monotonic()
 
@@ -180,7 +182,7 @@ async def _execute(source, book, environment, connection, progress):
 
     manager = AsyncKernelManager(  # no folders to search: kernels of the user are not found
         kernel_name="python3", kernel_spec_manager=KernelSpecManager(kernel_dirs=[]),
-        transport="ipc", connection_file=str(connection))
+        transport=TRANSPORT, connection_file=str(connection))
     client = NotebookClient(
         book, km=manager, resources={"metadata": {"path": str(source.parent)}},
         timeout=CELL_TIMEOUT, iopub_timeout=60, raise_on_iopub_timeout=True,

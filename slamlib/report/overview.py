@@ -4,7 +4,7 @@ All numbers are computed from the result files and, where it is known, the truth
 """
 
 import re
-from pathlib import PurePath
+from pathlib import PurePosixPath
 from urllib.parse import quote
 
 import numpy as np
@@ -42,7 +42,7 @@ def summary(drives, address="."):
         cells.append(new_markdown_cell(notes, id="notes"))
     if any(drive.files for drive in drives):
         cells.append(new_markdown_cell(
-            "## Files to hand in\n\n" + _file_table(drives, PurePath(address)), id="files"))
+            "## Files to hand in\n\n" + _file_table(drives, PurePosixPath(address)), id="files"))
     if solved:
         longest = max(solved, key=lambda drive: len(drive.dataset.ticks))
         cells += [
@@ -256,7 +256,7 @@ def result_row(drive, problem, known=True):
 
 def _file_table(drives, address):
     """Return the table of the files to hand in, with links, by problem and dataset."""
-    paths = [PurePath(file) for drive in drives for file in drive.files]
+    paths = [PurePosixPath(file) for drive in drives for file in drive.files]
     folders = sorted({path.parent for path in paths}, key=lambda path: (order(path.name), path))
     kinds = sorted({path.name for path in paths}, key=lambda name: (
         FILES.index(name) if name in FILES else len(FILES), name))
@@ -266,11 +266,11 @@ def _file_table(drives, address):
             f"[{plain(drive.name)}]({quote(str(address / drive.name / folder / kind))})"
             for drive in drives if str(folder / kind) in drive.files) or "–" for kind in kinds]
         at = next(drive for drive in drives
-                  if folder in (PurePath(file).parent for file in drive.files))
+                  if folder in (PurePosixPath(file).parent for file in drive.files))
         rows.append([named(folder.name, at.dataset), code(str(folder)), *links])
     text = table_text(["problem", "folder", *map(code, kinds)], rows,
                       texts=2 + len(kinds))
-    which = "" if PurePath("problem2_hint") not in folders else (
+    which = "" if PurePosixPath("problem2_hint") not in folders else (
         " Of problem 2, `problem2` is markers alone, `problem2_fused` the fusion with odometry, "
         "and `problem2_hint` the fusion by the assignment's hint, for comparison.")
     return (f"{text}\n\nTable 2. The files to hand in, MATLAB files with struct arrays, and the "

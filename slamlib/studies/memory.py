@@ -59,7 +59,7 @@ def _compute(trial, name, seeds, options, threads, jobs, progress):
         if told:
             Path(told).write_text(f"{trial.__name__} {len(rows)} of {len(seeds)}")
     if told:
-        Path(told).unlink(missing_ok=True)
+        Path(told).write_text("")
     return {key: np.array([row[key] for row in rows]) for key in rows[0]}
 
 

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import traceback
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from queue import SimpleQueue
 
 from joblib import wrap_non_picklable_objects
@@ -46,11 +46,19 @@ def rows(trial, seeds, options, jobs):
         yield from stack.enter_context(ThreadPoolExecutor(jobs)).map(row, seeds)
 
 
+@contextmanager
 def _worker():
-    """Start a process that imports what this one can import."""
+    """Yield a process (Popen) that imports what this one can import, and ends at the end."""
     environment = ONE_THREAD | os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    return subprocess.Popen([sys.executable, "-c", COMMAND], env=environment,
-                            stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    worker = subprocess.Popen([sys.executable, "-c", COMMAND], env=environment,
+                              stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    try:
+        yield worker
+    finally:
+        with suppress(OSError):                             # what it did not read, if it was killed
+            worker.stdin.close()
+        worker.stdout.close()
+        worker.wait()
 
 
 def _answer(worker, call):
@@ -58,7 +66,7 @@ def _answer(worker, call):
         pickle.dump(call, worker.stdin)
         worker.stdin.flush()
         answer = pickle.load(worker.stdout)
-    except (EOFError, BrokenPipeError):
+    except (EOFError, OSError, pickle.UnpicklingError):
         raise RuntimeError("a process that ran a study ended, "
                            f"with exit code {worker.wait()}") from None
     if isinstance(answer, Exception):

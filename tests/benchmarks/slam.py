@@ -10,7 +10,6 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np  # noqa: E402
-from joblib import Parallel, delayed  # noqa: E402
 
 sys.path.insert(0, str(Path(__file__).parent))
 
@@ -19,7 +18,7 @@ from plain_gtsam import plain  # noqa: E402
 from slamlib import studies  # noqa: E402
 from slamlib.evaluation import ate, nees_band  # noqa: E402
 from slamlib.simulation import simulate  # noqa: E402
-from slamlib.studies import kernels, montecarlo  # noqa: E402
+from slamlib.studies import kernels, montecarlo, workers  # noqa: E402
 
 SEEDS = range(8)
 
@@ -40,7 +39,7 @@ def errors(seeds):
           f"noise learned (NEES of consistent estimates: {low:.2f} to {high:.2f})")
     print(f"{'slip':>8}{'ATE (mm)':>10}{'of known noise':>16}{'of plain':>10}{'NEES':>8}")
     for slip in (0.0, 1e-3, 3e-3):
-        runs = np.array(Parallel(n_jobs=2)(delayed(trial)(seed, slip) for seed in seeds))
+        runs = np.array([*workers.rows(trial, seeds, {"slip": slip}, 2)])
         rms = np.sqrt(np.mean(runs[:, :3]**2, axis=0))
         print(f"{slip:8g}{1e3 * rms[0]:10.2f}{rms[0] / rms[1]:16.2f}{rms[0] / rms[2]:10.2f}"
               f"{runs[:, 3].mean():8.2f}")

@@ -1,0 +1,298 @@
+"""Other machines: what Windows and macOS lack, and the files that set up an environment there.
+
+No test here runs on these systems. `tests/unlike/sitecustomize.py` takes from slamlib what they
+lack.
+"""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+import tomllib
+from pathlib import Path
+
+import psutil
+import pytest
+import yaml
+from test_report import build, make_data, write
+
+from slamlib import locks, studies, swap
+from slamlib.dataset import DatasetError
+from slamlib.results import read_vehicle_poses
+from slamlib.simulation import simulate, write_dataset
+from slamlib.studies import workers
+
+ROOT = Path(__file__).parents[1]
+on_linux = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc and /dev/shm of Linux")
+NOTEBOOK = """from pathlib import Path
+import os
+import numpy as np
+from ipykernel.connect import get_connection_info
+from slamlib import studies
+from slamlib.results import write_vehicle_poses
+from slamlib.studies import montecarlo
+folder = Path(os.environ["SLAMLIB_RESULTS"], os.environ["SLAMLIB_DATASETS"], "problem1")
+write_vehicle_poses(folder, np.zeros((2, 3)), np.zeros((2, 3, 3)))
+print(sorted(studies.run(montecarlo.markers_alone, range(2))))
+print("transport:", get_connection_info(unpack=True)["transport"])"""
+
+
+def unlike(system, folder, *arguments, **options):
+    """The command of a process (Popen) in a folder, where slamlib finds this system."""
+    return subprocess.Popen(
+        [sys.executable, *map(str, arguments)], cwd=folder, text=True, stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, encoding="cp1252", **options, env=os.environ | {
+            "PYTHONPATH": os.pathsep.join([str(ROOT / "tests" / "unlike"), str(ROOT)]),
+            "UNLIKE": system, "UNLIKE_IN": str(folder.resolve()), "PYTHONIOENCODING": "cp1252"})
+
+
+@on_linux
+@pytest.mark.parametrize("system", ["win32", "darwin"])
+def test_solve_writes_the_same_on_systems_that_lack_what_linux_has(system, tmp_path):
+    """Twice, so that files are replaced; the console cannot show the drive's name."""
+    write_dataset(tmp_path / "\u03c3", simulate("short", seed=3)[0].first(60))
+    for _ in range(2):
+        process = unlike(system, tmp_path, "-m", "slamlib", "solve", "\u03c3", "--out", "out")
+        told = process.communicate(timeout=120)
+        assert process.returncode == 0 and told[1] == "", told
+        assert told[0].startswith("\\u03c3: 60 poses")
+        assert [path.name for path in tmp_path.rglob(".*")] == [swap.WRITTEN]
+    poses = read_vehicle_poses(tmp_path / "out" / "problem4")[0]
+    subprocess.run([sys.executable, "-m", "slamlib", "solve", "\u03c3", "--out", "here"],
+                   cwd=tmp_path, check=True, capture_output=True,
+                   env=os.environ | {"PYTHONPATH": str(ROOT)})
+    assert (poses == read_vehicle_poses(tmp_path / "here" / "problem4")[0]).all()
+
+
+@pytest.mark.slow
+@on_linux
+def test_a_report_is_built_where_windows_lacks_what_unix_has(tmp_path):
+    make_data(tmp_path)
+    write(tmp_path / "notebooks", "1_first", "# First", (NOTEBOOK,))
+    process = unlike("win32", tmp_path, "-m", "slamlib", "report", "short")
+    told = process.communicate(timeout=300)[1]
+    assert process.returncode == 0, told
+    assert re.search(r"^built in [\d.]+ s$", told, re.MULTILINE)
+    assert "transport: tcp" in (tmp_path / "report" / "1_first.html").read_text(encoding="utf-8")
+    assert "href=\"../results/short/problem1/vehiclePose.mat\"" in (
+        tmp_path / "report" / "index.html").read_text(encoding="utf-8")
+    assert {path.name for path in tmp_path.rglob(".slamlib*")} == {swap.WRITTEN}
+
+
+@on_linux
+def test_locks_of_windows_exclude_and_end_with_their_process(tmp_path):
+    hold = ("from pathlib import Path\nfrom slamlib.locks import locked\n"
+            "with locked(Path('lock')): print('held', flush=True); input()")
+    first = unlike("win32", tmp_path, "-c", hold, stdin=subprocess.PIPE)
+    assert first.stdout.readline() == "held\n"
+    second = unlike("win32", tmp_path, "-c", hold, stdin=subprocess.PIPE)
+    line = second.stderr.readline()
+    assert line.startswith(f"slamlib: waits for process {first.pid}, which has written to ")
+    first.kill()
+    first.communicate()
+    assert second.stdout.readline() == "held\n"
+    assert second.communicate("\n", timeout=60) == ("", "") and second.returncode == 0
+    assert not (tmp_path / "lock").exists()
+
+
+@on_linux
+def test_a_result_that_a_program_of_windows_shows_is_told_before_anything_changes(tmp_path):
+    code = """import sys
+from slamlib import swap
+from slamlib.__main__ import main
+def refused(path, mode="r"):
+    if path.suffix == ".mat":
+        raise PermissionError(13, "is open in another program", str(path))
+    return open(path, mode)
+swap.open = refused
+sys.exit(main())"""
+    write_dataset(tmp_path / "drive", simulate("short", seed=3)[0].first(20).without("uwb"))
+    for arguments, expected in ((("-m", "slamlib"), 0), (("-c", code), 2)):
+        process = unlike("win32", tmp_path, *arguments, "solve", "drive", "--out", "out")
+        told = process.communicate(timeout=120)[1]
+        assert process.returncode == expected, told
+    assert told.count("\n") == 1 and ".mat: is open in another program" in told
+    assert (tmp_path / "out" / "summary.json").exists()
+    assert not (tmp_path / "out" / swap.MARKER).exists()
+
+
+def test_folders_on_two_drives_of_windows_are_told_before_anything_runs(tmp_path, monkeypatch):
+    def relpath(path, start):
+        raise ValueError("path is on mount 'D:', start on mount 'C:'")
+    monkeypatch.setattr(os.path, "relpath", relpath)
+    make_data(tmp_path)
+    with pytest.raises(DatasetError, match="results: expected a folder on the drive of .*report"):
+        build(tmp_path)
+
+
+def test_a_process_runs_or_not():
+    """Numbers come from names of files, which may have any."""
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    assert [locks.runs(number) for number in (os.getpid(), ended.pid, 10**30)] == [
+        True, False, False]
+
+
+def test_a_study_tells_how_far_it_is_and_nothing_when_it_has_ended(tmp_path, monkeypatch):
+    """The file stays: Windows removes none that the build reads."""
+    monkeypatch.setenv("SLAMLIB_PROGRESS", str(tmp_path / "told"))
+    told = []
+
+    def trial(seed):
+        told.append((tmp_path / "told").read_text() if seed else "")
+        return {"seed": seed}
+    studies.run(trial, range(3), jobs=1)
+    assert [*told, (tmp_path / "told").read_text()] == ["", "trial 1 of 3", "trial 2 of 3", ""]
+
+
+SLOW_STUDY = """import time
+from slamlib import studies
+def trial(seed):
+    time.sleep(1)
+    return {"seed": seed}
+studies.run(trial, range(1000))"""
+
+
+def processes_with(parent, count):
+    """All processes below a Popen, once it has so many that run trials."""
+    until = time.monotonic() + 120
+    while parent.poll() is None and time.monotonic() < until:
+        below = psutil.Process(parent.pid).children(recursive=True)
+        if sum(workers.COMMAND in each.cmdline() for each in below if is_running(each)) == count:
+            return below
+        time.sleep(0.05)
+    raise AssertionError(parent.communicate())
+
+
+def is_running(process):
+    """True unless a psutil.Process is gone, or waits to be buried."""
+    try:
+        return process.status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
+
+
+def require_gone(processes):
+    """No process is left, and nothing of any in shared memory, where names have its number."""
+    until = time.monotonic() + 60
+    while left := [*filter(is_running, processes)]:
+        assert time.monotonic() < until, left
+        time.sleep(0.05)
+    numbers = {str(process.pid) for process in processes}
+    assert not [file for file in os.listdir("/dev/shm") if numbers & {*re.split(r"[-_]", file)}]
+
+
+@on_linux
+def test_a_study_whose_process_is_killed_leaves_nothing():
+    process = subprocess.Popen([sys.executable, "-c", SLOW_STUDY],
+                               env=os.environ | {"PYTHONPATH": str(ROOT)})
+    below = processes_with(process, 2)
+    process.kill()
+    process.wait()
+    require_gone(below)
+
+
+@pytest.mark.slow
+@on_linux
+@pytest.mark.parametrize("killed, name", [
+    ("build", "SIGKILL"), ("kernel", "SIGKILL"), ("build", "SIGINT")])
+def test_a_report_that_is_killed_leaves_no_process_and_no_shared_memory(killed, name, tmp_path):
+    make_data(tmp_path)
+    write(tmp_path / "notebooks", "1_slow", "# Slow", (SLOW_STUDY,))
+    build = subprocess.Popen(
+        [sys.executable, "-m", "slamlib", "report", "short"], cwd=tmp_path, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=os.environ | {"PYTHONPATH": str(ROOT)})
+    below = processes_with(build, 2)
+    kernel, = (each for each in below if "ipykernel_launcher" in each.cmdline())
+    number = getattr(signal, name)
+    os.kill(build.pid if killed == "build" else kernel.pid, number)
+    told = build.communicate(timeout=60)[1]
+    require_gone(below)
+    if killed == "kernel":
+        assert build.returncode == 1 and "1_slow.ipynb, cell 1:" in told
+    else:
+        assert build.returncode == (-number if name == "SIGKILL" else 128 + number)
+
+
+def test_a_study_of_several_processes_equals_that_of_one():
+    """In the order of the seeds, with a trial that no module has."""
+    def trial(seed, factor):
+        """Later seeds are ready first."""
+        time.sleep(0.2 / seed)
+        return {"seed": factor * seed}
+    found = [studies.run(trial, [1, 2, 3], jobs, factor=7)["seed"].tolist() for jobs in (1, 2)]
+    assert found == [[7, 14, 21]] * 2
+
+
+def test_what_fails_in_a_trial_is_raised_with_its_place():
+    def trial(seed):
+        return {"seed": 1 / seed}
+    with pytest.raises(ZeroDivisionError) as failed:
+        studies.run(trial, [1, 0, 1])
+    assert "return {\"seed\": 1 / seed}" in failed.value.__notes__[0]
+
+
+def test_a_process_of_a_trial_that_is_killed_is_told():
+    """Also to the next trial, whose call it does not read any more."""
+    def trial(seed):
+        sys.exit(3)
+    with pytest.raises(RuntimeError, match="a process that ran a study ended, with exit code 3"):
+        studies.run(trial, [1, 2])
+    with workers._worker() as worker:
+        for _ in range(2):
+            with pytest.raises(RuntimeError, match="with exit code 3"):
+                workers._answer(worker, (sys.exit, 3, {}))
+
+
+def required(lines):
+    """Requirements as {name: the rest of its line}, of lines as `numpy` or `gtsam==4.3.0`."""
+    found = (re.fullmatch(r"([\w-]+)(.*)", line) for line in lines)
+    return {each[1].lower().replace("_", "-"): each[2].strip() for each in found}
+
+
+def test_the_environment_of_conda_has_what_the_lock_is_made_from():
+    """What pip installs there has the lock's versions, and gtsam the first two numbers of its."""
+    *conda, by_pip = yaml.safe_load((ROOT / "environment.yml").read_text())["dependencies"]
+    conda, by_pip = required(conda), required(by_pip["pip"])
+    asked = required(line for line in (ROOT / "requirements.in").read_text().splitlines()
+                     if not line.startswith("#"))
+    assert conda.keys() | by_pip.keys() == asked.keys() | {"python", "pip"}
+    assert not conda.keys() & by_pip.keys()
+    assert {name: asked[name] for name in by_pip} == by_pip
+    assert asked["gtsam"].startswith(f"=={conda['gtsam'].removesuffix('*')}")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert required(project["dependencies"]).keys() <= asked.keys()
+    assert conda["python"] in [f"3.{minor}.*" for minor in range(11, 15)]
+
+
+def test_the_version_that_check_python_asks_for_is_the_one_that_is_pinned(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT))
+    import check_python
+    assert check_python.installed() == check_python.GTSAM
+    asked = (ROOT / "requirements.in").read_text()
+    assert f"gtsam=={'.'.join(check_python.GTSAM)}." in asked
+
+
+def targets_in(text):
+    """Targets of make (set of str) in lines of a shell."""
+    return set(re.findall(r"\bmake ([\w-]+)", text))
+
+
+def test_container_and_ci_call_targets_that_there_are():
+    rules = re.findall(r"^([a-z][\w -]*):(?!=)", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    targets = {target for rule in rules for target in rule.split()}
+    container = json.loads((ROOT / ".devcontainer" / "devcontainer.json").read_text())
+    assert targets_in(container["postCreateCommand"]) == {"setup"} <= targets
+    jobs = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text())["jobs"]
+    called = {name: targets_in(" ".join(step.get("run", "") for step in job["steps"]))
+              for name, job in jobs.items()}
+    assert called == {"test-and-report": {"report"}, "macos": {"quick", "report"}, "windows": set()}
+    assert set.union(*called.values()) <= targets
+    assert {name for name, job in jobs.items() if job.get("continue-on-error")} == {
+        "macos", "windows"}
+    used, = (step["with"]["environment-file"] for step in jobs["windows"]["steps"]
+             if "environment-file" in step.get("with", {}))
+    assert (ROOT / used).is_file()
