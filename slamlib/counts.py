@@ -11,6 +11,8 @@ MIN_PAIRS = 10  # pairs of sightings that decide
 MANY = 20_000  # sightings; of more, the first ones decide
 MOVING = 5.0  # standard deviations by which a wheel's way is above the noise of a pair
 LESS = 5.0  # ratio of the ways by counts and by markers from which they contradict
+MIN_ROWS = 4  # rows after the first that may be judged at all
+EVEN = 0.25  # share of the last row's size by which even growth may be missed
 ALIKE = 2.0  # and up to which they agree
 
 
@@ -45,6 +47,19 @@ def run_on(counts, vehicle, aruco):
             and np.ptp(counts) < WRAP:
         return "they overflow at 16 bits"
     return _by_markers(counts, vehicle, aruco)
+
+
+def may_run_on(counts):
+    """True if rows (n, 2) grow in proportion to their number, within EVEN of the last one.
+
+    So do counts since the start at constant speed, and increments of a vehicle that speeds up until
+    the end.
+    """
+    size = abs(counts[1:]).sum(axis=1)
+    if len(size) < MIN_ROWS:
+        return False
+    expected = size[-1] * np.arange(1, len(size) + 1) / len(size)
+    return bool(abs(size - expected).max() < EVEN * size[-1])
 
 
 def differences(counts):

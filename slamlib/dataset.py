@@ -275,7 +275,8 @@ def _ticks(table, vehicle, aruco, notes):
         notes.append(f"{table.source.name} holds counts since the start ({reason}): the difference "
                      "of each row from the one before was taken.")
         return counts.differences(ticks).astype(np.int64)
-    table.require(~ticks[:1].any(axis=1), "'1 0 0' as the first row (no step leads to pose 1)")
+    table.require(~ticks[:1].any(axis=1), "'1 0 0' as the first row (no step leads to "
+                  "pose 1; counts are since the previous pose, not since the start)")
     most = counts.MOST_REVOLUTIONS * vehicle.ticks_per_revolution
     table.require((abs(ticks) <= most).all(axis=1),
                   f"at most {counts.MOST_REVOLUTIONS:g} wheel revolutions ({most:g} ticks) in one "

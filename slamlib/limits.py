@@ -25,7 +25,7 @@ class Limit:
         return f"{'a positive ' if self.least > 0 else ''}{name} {self} ({self.what})"
 
 
-_RADIUS = Limit(1e-3, 10, "m", "the radius of a wheel in metres")
+_RADIUS = Limit(1e-3, 2.5, "m", "the radius of a wheel in metres")
 _SIGHTED = Limit(-1e4, 1e4, "m", "a place in the vehicle's frame in metres")
 _VARIANCE = Limit(1e-18, 1e8, "m^2", "the square of a standard deviation in metres")
 _GUESS = Limit(-1e6, 1e6, "m", "a place in the frame of pose 1 in metres")
@@ -43,7 +43,7 @@ def _of(parameter):
 LIMITS = {
     "vehicle.toml": {
         "right_radius": _RADIUS, "left_radius": _RADIUS,
-        "wheelbase": Limit(1e-3, 100, "m", "the distance between the wheels in metres"),
+        "wheelbase": Limit(1e-3, 20, "m", "the distance between the wheels in metres"),
         "ticks_per_revolution": Limit(1, 1e10, "", "counts of an encoder in one revolution"),
         "sigma_right_radius": _of("right_radius"), "sigma_left_radius": _of("left_radius"),
         "sigma_wheelbase": _of("wheelbase"),

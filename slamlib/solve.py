@@ -35,7 +35,7 @@ PROBLEMS = {
     "problem4": Task("SLAM: odometry + ArUco + UWB", ("uwb",), "slam_uwb"),
 }
 WHOLE_FILES = {"units", "wheels-swapped", "wheels-reversed", "camera-mirrored", "camera-turned",
-               "odometry"}
+               "odometry", "counts-since-start"}
 COVARIANCES = ("marker_covariance", "antenna_covariance", "wheel_covariance")
 SENSORS = {"aruco": "markers", "uwb": "UWB ranges"}
 SUMMARY = "summary.json"

@@ -17,10 +17,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slamlib import increments, se2
+from slamlib import counts, increments, se2
 from slamlib.doubt import Doubt
 from slamlib.localization.marker_increments import consecutive_increments
-from slamlib.localization.units import path_and_antennas, range_units, sighting_units
+from slamlib.localization.units import path_and_antennas, range_units, sighting_units, sigma_units
 from slamlib.sightings import GATE, MAX_HEADING_SIGMA, sightings_by_frame
 
 GENEROUS_SLIP = 1e-2      # sqrt(m), slip of the wheels that explains a difference
@@ -102,13 +102,15 @@ class _Compared:
 def drive_doubts(dataset):
     """List of Doubts about the files of a drive, a Dataset; empty if too little was seen to decide.
 
-    Kinds are units, wheels-swapped, wheels-reversed, camera-mirrored, camera-turned and odometry.
-    At most one flaw of sightings and counts is named, with all that explains it.
+    Kinds are units, wheels-swapped, wheels-reversed, camera-mirrored, camera-turned, odometry and
+    counts-since-start. At most one flaw of sightings and counts is named, with all that explains
+    it.
     """
     dataset = dataset.first(MANY_POSES)
-    ranges, sightings = range_units(dataset), sightings_by_frame(dataset.aruco)
+    others, sightings = range_units(dataset) + sigma_units(dataset), sightings_by_frame(
+        dataset.aruco)
     if len(sightings.frame) <= MIN_INCREMENTS:
-        return ranges
+        return _counts_doubts(dataset) + others
     found = consecutive_increments(sightings)
     contradicting = _headings_contradict(sightings, found)
     if contradicting:
@@ -117,10 +119,21 @@ def drive_doubts(dataset):
         found = consecutive_increments(sightings)
     compared = _compare(dataset, sightings, found)
     if len(compared.by_markers) < MIN_INCREMENTS:
-        return ranges
+        return _counts_doubts(dataset) + others
     units = sighting_units(compared.by_markers, compared.by_wheels, compared.sigma())
-    return units + ranges if units else (
-        _axes_doubts(dataset, compared, contradicting) or _odometry_doubts(compared)) + ranges
+    return units + others if units else (
+        _axes_doubts(dataset, compared, contradicting) or _odometry_doubts(compared)) + others
+
+
+def _counts_doubts(dataset):
+    """A Doubt if counts may be those since the start; markers decide where there are enough."""
+    if not counts.may_run_on(dataset.ticks):
+        return []
+    most = abs(dataset.ticks).max()
+    return [Doubt("counts-since-start", (
+        f"The counts in encoderReading.txt grow evenly from row to row, up to {most} in one row: "
+        "either the vehicle speeds up until the end, or they are counts since the start, where "
+        "those since the previous pose are expected. Look at encoderReading.txt."))]
 
 
 def _headings_contradict(sightings, found):

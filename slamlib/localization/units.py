@@ -1,4 +1,7 @@
-"""Factors between the lengths of a drive's files: sightings, ranges, antenna guesses and wheels."""
+"""Factors between the lengths of a drive's files: sightings, ranges, antenna guesses and wheels.
+
+And between the standard deviations that are stated and how much measurements scatter.
+"""
 
 import numpy as np
 
@@ -7,6 +10,8 @@ from slamlib.doubt import Doubt
 
 MIN_FACTOR = 5.0           # smaller factors are no other unit
 MIN_RANGES = 10            # ranges to an antenna that are compared with the path
+FEW_RANGES = 4             # of antennas with as few there must be MIN_RANGES together
+MAX_NOISE = 2.0            # sigmas by which noise spreads few ranges
 MAX_HEADING_SIGMA = 0.1    # rad, of odometry on the first part of the drive that is compared
 SMALLEST_EXTENT = 1e-3     # m, of a path that ranges are compared with
 MAX_SPREAD_FACTOR = 50.0   # by which ranges may spread less than the path
@@ -14,13 +19,17 @@ SIGNIFICANT = 5.0          # sigmas of a median distance or turn that is compare
 # The standard deviation of ranges to an antenna far away is that of the path in one direction, at
 # most that of the path in the plane, and 0.7 of it if the path prefers no direction.
 RANGE_SPREAD = 0.7
+# Second differences of independent errors of standard deviation 1 have the median size 0.6745 of
+# their standard deviation sqrt(1 + 4 + 1).
+SECOND_DIFFERENCE = 0.6745 * 6**0.5
+LARGER = 15.0              # ratio of a stated standard deviation to the scatter: degrees are 57
 
 
-def path_and_antennas(dataset):
+def path_and_antennas(dataset, least=MIN_RANGES):
     """The first part of odometry's path (p, 2) in m, and what was measured on it.
 
     It ends where the heading's standard deviation by odometry exceeds MAX_HEADING_SIGMA. Of every
-    antenna with MIN_RANGES ranges there is a tuple: poses (m,), ranges (m,) and its guess (2,), m.
+    antenna with `least` ranges there is a tuple: poses (m,), ranges (m,) and its guess (2,), m.
     """
     poses, covariances = odometry.first_order(dataset.ticks, dataset.vehicle, model="arc")
     lost = np.flatnonzero(covariances[:, 2, 2] > MAX_HEADING_SIGMA**2)
@@ -28,7 +37,7 @@ def path_and_antennas(dataset):
     for antenna, guess in zip(dataset.antenna_guess.antenna, dataset.antenna_guess.position):
         ours = dataset.uwb.select(
             (dataset.uwb.antenna == antenna) & (dataset.uwb.pose < len(path)))
-        if len(ours.pose) >= MIN_RANGES:
+        if len(ours.pose) >= least:
             antennas.append((ours.pose, ours.range, guess))
     return path, antennas
 
@@ -65,25 +74,79 @@ def range_units(dataset):
     if dataset.uwb is None or dataset.antenna_guess is None:
         return []
     path, antennas = path_and_antennas(dataset)
-    if not antennas or (extent := np.hypot(*path.std(axis=0))) < SMALLEST_EXTENT:
+    extent = np.hypot(*path.std(axis=0))
+    few = not antennas
+    if few:
+        _, antennas = path_and_antennas(dataset, FEW_RANGES)
+    if sum(len(r) for _, r, _ in antennas) < MIN_RANGES or extent < SMALLEST_EXTENT:
         return []
     # Between the quartiles lie 1.35 standard deviations of a normal distribution.
     spread = np.median([np.subtract(*np.percentile(r, [75, 25])) / 1.35 for _, r, _ in antennas])
     typical = np.median([np.median(r) for _, r, _ in antennas])
     distance = np.median([np.median(np.hypot(*(path[pose] - guess).T))
                           for pose, _, guess in antennas])
-    if _factor(spread, RANGE_SPREAD * extent) > 1 or spread < extent / MAX_SPREAD_FACTOR:
+    if few:                        # of a short path, which noise may exceed
+        wrong = spread > MIN_FACTOR * extent + MAX_NOISE * np.median(dataset.uwb.sigma)
+    else:
+        wrong = _factor(spread, RANGE_SPREAD * extent) > 1 or spread < extent / MAX_SPREAD_FACTOR
+    if wrong:
         return [Doubt("units", (
             f"The ranges to an antenna spread by {spread:.4g} m, while the vehicle is within "
             f"{extent:.4g} m by the wheels (standard deviations; median range {typical:.4g} m): "
-            "look at the unit of UwbReading.txt (metres), and of the radii in vehicle.toml "
-            "(metres)."))]
+            "look at the unit of UwbReading.txt (metres) and the order of its columns, and at the "
+            "unit of the radii in vehicle.toml (metres)."))]
     if _factor(typical, distance) != 1:
         return [Doubt("units", (
             f"The median range is {typical:.4g} m, and the median distance from the path by the "
             f"wheels to the guessed antennas {distance:.4g} m: look at the unit of "
-            "UwbAntennaGuess.txt (metres)."))]
+            "UwbAntennaGuess.txt (metres), and at the unit and the order of columns of "
+            "UwbReading.txt."))]
     return []
+
+
+def sigma_units(dataset):
+    """Doubts about the units of standard deviations that are far above the scatter.
+
+    The scatter is that of second differences of successive measurements of a landmark. The motion
+    of the vehicle can only add to it.
+    """
+    doubts = []
+    if (seen := dataset.aruco) is not None:
+        variance = np.diagonal(seen.covariance, axis1=1, axis2=2)
+        z = seen.marker_in_vehicle
+        doubts += _larger("sightings of a marker", "m", [
+            _scatter(seen.pose, seen.marker, z[:, k]) for k in (0, 1)],
+            np.sqrt(variance[:, :2].mean(axis=1)),
+            "s_xx, s_xy and s_yy in ArucoReading.txt (square metres, not standard deviations)")
+        doubts += _larger("headings of a marker", "rad", [
+            _scatter(seen.pose, seen.marker, z[:, 2], se2.wrap)], np.sqrt(variance[:, 2]),
+            "s_thetatheta in ArucoReading.txt (square radians)")
+    if (ranges := dataset.uwb) is not None:
+        doubts += _larger("ranges to an antenna", "m", [
+            _scatter(ranges.pose, ranges.antenna, ranges.range)], ranges.sigma,
+            "sigma in UwbReading.txt (metres)")
+    return doubts
+
+
+def _scatter(pose, landmark, values, wrap=lambda x: x):
+    """Sizes of second differences of successive values (m,) of each landmark, as sigmas."""
+    order = np.lexsort([pose, landmark])
+    values, landmark = values[order], landmark[order]
+    second = wrap(np.diff(wrap(np.diff(values))))
+    return np.abs(second[landmark[2:] == landmark[:-2]]) / SECOND_DIFFERENCE
+
+
+def _larger(what, unit, scatters, sigma, look):
+    """A Doubt if the stated standard deviations (m,) are LARGER times the scatter."""
+    sizes = np.concatenate(scatters)
+    if len(sizes) < MIN_RANGES:
+        return []
+    scatter, stated = np.median(sizes), np.median(sigma)
+    if not 0 < LARGER * scatter < stated:
+        return []
+    return [Doubt("units", (
+        f"Successive {what} scatter by {scatter:.3g} {unit} at most, while their stated standard "
+        f"deviation is {stated:.3g} {unit} (medians): look at the unit of {look}."))]
 
 
 def _factor(a, b):
