@@ -143,6 +143,9 @@ def dataset_names(data, names=None):
     encoderReading.txt in a sub-folder.
     """
     data = Path(data)
+    if not data.is_dir():
+        raise DatasetError(f"{data}: expected this folder, with a sub-folder for each dataset, "
+                           "found none")
     known = {name.lower() for name in FILES}
     found = sorted(path.name for path in data.glob("[!.]*")
                    if path.is_dir() and any(file.name.lower() in known for file in path.iterdir()))
