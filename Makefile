@@ -3,6 +3,7 @@
 # make quick    runs the tests that take less than a minute in all
 # make mutants  prints which small defects of the numerics no test notices
 # make lab      opens JupyterLab on the notebooks
+# make docs     writes pages of slamlib's functions to build/api
 # make strip    removes the outputs from saved notebooks, as they are committed
 # make bench    prints the benchmarks' tables
 # make bench-large   the same on more drives, and the plain script on long ones
@@ -22,7 +23,7 @@ ifneq ($(shell $(BIN)/python -c 'print("runs")' 2>/dev/null),runs)
 $(shell rm -f $(READY))
 endif
 
-.PHONY: setup report test quick mutants lab strip bench bench-large clean
+.PHONY: setup report test quick mutants lab docs strip bench bench-large clean
 .DEFAULT_GOAL := report
 
 setup: $(READY)
@@ -61,6 +62,9 @@ mutants: $(READY)
 lab: $(READY)
 	$(BIN)/python -m jupyter lab --LabApp.check_for_updates_class=jupyterlab.NeverCheckForUpdate \
 		notebooks
+
+docs: $(READY)
+	@$(BIN)/python api_pages.py build/api
 
 strip: $(READY)
 	@$(BIN)/python -m nbstripout --keep-id notebooks/*.ipynb

@@ -164,6 +164,12 @@ def read_dataset(folder):
 
     The names of the files in `folder` may be in upper or lower case. Raises DatasetError if a file
     does not follow the format.
+
+    >>> from slamlib.simulation import simulate, write_dataset
+    >>> write_dataset("drive", *simulate("short", seed=1))
+    >>> dataset = read_dataset("drive")
+    >>> len(dataset.ticks), len(dataset.aruco.pose), dataset.antenna_guess.antenna.tolist()
+    (2000, 894, [5, 13, 36, 46])
     """
     vehicle = _read_vehicle(folder, default=Vehicle())
     ticks = _read_ticks(folder, vehicle)
