@@ -3,6 +3,7 @@
 # make quick    runs the tests that take less than a minute in all
 # make mutants  prints which small defects of the numerics no test notices
 # make lab      opens JupyterLab on the notebooks, with ARGS="--no-browser --port 9999" or others
+# make docs     writes pages of slamlib's functions to build/api
 # make strip    restores saved notebooks to the form in which they are committed
 # make bench    prints the benchmarks' tables
 # make bench-large   the same on more drives, and the plain script on long ones
@@ -22,7 +23,7 @@ ifneq ($(shell $(BIN)/python -c 'print("runs")' 2>/dev/null),runs)
 $(shell rm -f $(READY))
 endif
 
-.PHONY: setup report test quick mutants lab strip bench bench-large clean
+.PHONY: setup report test quick mutants lab docs strip bench bench-large clean
 .DEFAULT_GOAL := report
 
 # In a git checkout, also configures the filter that .gitattributes names: git stores notebooks as
@@ -66,6 +67,9 @@ mutants: $(READY)
 
 lab: setup
 	$(BIN)/python -m slamlib lab $(ARGS)
+
+docs: $(READY)
+	@$(BIN)/python api_pages.py build/api
 
 strip: $(READY)
 	@$(BIN)/python strip_notebooks.py notebooks/*.ipynb

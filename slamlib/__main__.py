@@ -1,4 +1,4 @@
-"""The command line: python -m slamlib {report, solve, simulate, lab}."""
+"""The command line: slamlib {report, solve, simulate, export, lab}, or python -m slamlib."""
 
 import argparse
 import os
@@ -12,10 +12,16 @@ from pathlib import Path
 # Set before numpy is imported: the matrices are so small that more threads are slower.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from slamlib.dataset import DatasetError, found, read_dataset, read_truth  # noqa: E402
+from slamlib.dataset import (  # noqa: E402
+    DatasetError,
+    dataset_names,
+    found,
+    read_dataset,
+    read_truth,
+)
 from slamlib.swap import ENDS  # noqa: E402
 
-DATA, NOTEBOOKS, KEPT = Path("data"), Path("notebooks"), Path("build", "executed")
+DATA, KEPT = Path("data"), Path("build", "executed")
 
 
 def main(arguments=None):
@@ -77,8 +83,9 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _parser():
-    parser = _Parser(prog="python -m slamlib", description=__doc__)
-    commands = parser.add_subparsers(required=True, metavar="{report,solve,simulate,lab}")
+    prog = Path(sys.argv[0]).name
+    parser = _Parser(prog=prog if prog == "slamlib" else "python -m slamlib", description=__doc__)
+    commands = parser.add_subparsers(required=True, metavar="{report,solve,simulate,export,lab}")
 
     _report_options(commands.add_parser(
         "report", help="execute the notebooks and build the report"))
@@ -102,10 +109,18 @@ def _parser():
                           help="share of marker sightings that carry another marker's id")
     simulate.set_defaults(run=_simulate)
 
+    export = commands.add_parser("export", help="write trajectories as TUM files or CSV")
+    export.add_argument("results", type=Path, metavar="RESULTS", help="a folder of results, of one "
+                        "problem's results, or the folder truth of a dataset")
+    export.add_argument("--format", choices=("tum", "csv"), default="tum",
+                        help="tum has pose numbers as time stamps; csv has covariances, too")
+    export.add_argument("--out", type=Path, required=True, help="folder for the files")
+    export.set_defaults(run=_export)
+
     lab = commands.add_parser("lab", help="open JupyterLab on the notebooks; it is given all other "
                                           "arguments, as --no-browser", allow_abbrev=False)
     lab.add_argument("--data", type=Path, default=DATA, help="folder of the datasets")
-    lab.add_argument("--notebooks", type=Path, default=NOTEBOOKS)
+    lab.add_argument("--notebooks", type=Path)
     lab.set_defaults(run=_lab)
     return parser
 
@@ -115,7 +130,11 @@ def _report_options(report):
     report.add_argument("datasets", nargs="*", metavar="DATASET",
                         help="names of folders in data/ (all of them when none is named)")
     report.add_argument("--data", type=Path, default=DATA, help="folder of the datasets")
-    report.add_argument("--notebooks", type=Path, default=NOTEBOOKS)
+    report.add_argument("--notebooks", type=Path, help="folder of the notebooks (default: the "
+                        "folder notebooks where there is one, else those of the installation)")
+    report.add_argument("--notebooks-to", type=Path, metavar="FOLDER",
+                        help="copy the notebooks to this new or empty folder first, to edit them "
+                        "there, and build the report from it")
     report.add_argument("--report", type=Path, default=Path("report"), help="folder for the pages")
     report.add_argument("--results", type=Path, default=Path("results"),
                         help="folder for the .mat files")
@@ -137,15 +156,20 @@ def _report_options(report):
 def _report(options):
     from slamlib.report import NotebookError, build_report
     from slamlib.report.cover import read_cover
+    from slamlib.report.sources import copy_notebooks, notebooks_folder
     cover = read_cover("report.toml")
     given = {"author": options.author, "student_number": options.student_number}
     cover = replace(cover, **{key: value for key, value in given.items() if value is not None})
+    names = [_name(dataset, options.data) for dataset in options.datasets] or None
+    dataset_names(options.data, names)                     # before notebooks are copied
+    notebooks = options.notebooks or notebooks_folder()
+    if options.notebooks_to:
+        notebooks = copy_notebooks(notebooks, options.notebooks_to)
     try:
         report = build_report(
-            options.notebooks, options.data, options.report, options.results,
-            datasets=[_name(dataset, options.data) for dataset in options.datasets] or None,
-            jobs=options.jobs, cover=cover, code=options.code, kept=KEPT,
-            fresh=options.fresh, appendix=options.appendix)
+            notebooks, options.data, options.report, options.results,
+            datasets=names, jobs=options.jobs, cover=cover, code=options.code,
+            kept=KEPT, fresh=options.fresh, appendix=options.appendix)
     except NotebookError as error:
         print(f"slamlib: {error}", file=sys.stderr)
         return 1
@@ -194,7 +218,15 @@ def _simulate(options):
 
 def _lab(options):
     from slamlib.report.lab import start_lab
-    start_lab(options.notebooks, options.data, KEPT, options.others)
+    from slamlib.report.sources import notebooks_folder
+    start_lab(options.notebooks or notebooks_folder(), options.data, KEPT, options.others)
+
+
+def _export(options):
+    from slamlib.export import export
+    for path in export(options.results, options.format, options.out):
+        print(path)
+    return 0
 
 
 def _count(text):

@@ -146,6 +146,9 @@ def dataset_names(data, names=None):
     encoderReading.txt in a sub-folder.
     """
     data = Path(data)
+    if not data.is_dir():
+        raise DatasetError(f"{data}: expected this folder, with a sub-folder for each dataset, "
+                           "found none")
     found = sorted(path.name for path in data.glob("[!.]*") if path.is_dir() and is_dataset(path))
     if not found:
         raise DatasetError(f"{data}: expected a sub-folder with an {ENCODER}, found none")
@@ -163,6 +166,12 @@ def read_dataset(folder):
     The names of the files in `folder` may be in upper or lower case, and the files in any of the
     `dialects`; `Dataset.notes` say what was mended or left out. Raises DatasetError if a file does
     not follow the format.
+
+    >>> from slamlib.simulation import simulate, write_dataset
+    >>> write_dataset("drive", *simulate("short", seed=1))
+    >>> dataset = read_dataset("drive")
+    >>> len(dataset.ticks), len(dataset.aruco.pose), dataset.antenna_guess.antenna.tolist()
+    (2000, 894, [5, 13, 36, 46])
     """
     files, notes = contents(folder), []
     notes += files.notes

@@ -37,6 +37,10 @@ def ate(poses, truth, aligned=False):
 
     Poses that are NaN are left out; the result is NaN if all are. With `aligned` the poses are
     first aligned with the truth by one motion of SE(2).
+
+    >>> poses, truth = np.array([[0, 0, 0], [3, 4, 0]]), np.zeros((2, 3))
+    >>> round(ate(poses, truth), 3)
+    3.536
     """
     known = np.isfinite(poses).all(axis=1)
     poses, truth = poses[known], truth[known]
@@ -93,6 +97,9 @@ def nees_band(count, dof=3, probability=0.95):
 
     The sum of the NEES is chi-squared with count * dof degrees of freedom; the mean lies in the
     band with the given probability.
+
+    >>> np.round(nees_band(8), 2)
+    array([1.55, 4.92])
     """
     from scipy.special import chdtri  # slow to import, and nothing that is solved needs it
 

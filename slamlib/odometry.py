@@ -42,7 +42,15 @@ def steps(ticks, vehicle):
 
 
 def dead_reckoning(ticks, vehicle, initial_pose=(0.0, 0.0, 0.0), model="euler"):
-    """Poses (n, 3) from `initial_pose` (3,), by equation 1 or, with model "arc", by exact arcs."""
+    """Poses (n, 3) from `initial_pose` (3,), by equation 1 or, with model "arc", by exact arcs.
+
+    One revolution of both wheels, whose radii are 0.1 m:
+
+    >>> from slamlib.dataset import Vehicle
+    >>> dead_reckoning([[0, 0], [8000, 8000]], Vehicle()).round(3)
+    array([[0.   , 0.   , 0.   ],
+           [0.628, 0.   , 0.   ]])
+    """
     ds, dtheta, _, _ = steps(ticks, vehicle)
     heading = cumulative(dtheta, initial_pose[2])
     chord, _, bend = _chord(dtheta, model)
@@ -64,6 +72,11 @@ def equation2(ticks, vehicle, initial_pose=(0.0, 0.0, 0.0), initial_covariance=N
     column, so the first three columns of I_k determine every sigma_theta_j. Two cumulative sums
     replace the recursion. `initial_pose` (3,) is pose 1 and `initial_covariance` (3, 3) is C_X1, by
     default diag(0, 0, sigma_heading^2).
+
+    >>> from slamlib.dataset import Vehicle
+    >>> poses, covariances = equation2([[0, 0], [8000, 8000]], Vehicle())
+    >>> (1e3 * np.sqrt(np.diagonal(covariances[-1]))).round(3)         # mm, mm, mrad
+    array([0.444, 0.063, 2.224])
     """
     if initial_covariance is None:
         initial_covariance = np.diag([0.0, 0.0, vehicle.sigma_heading**2])

@@ -46,7 +46,13 @@ def write_uwb_map(folder, ids, positions, covariances):
 
 
 def read_vehicle_poses(folder):
-    """Poses (n, 3) and covariances (n, 3, 3) of folder/vehiclePose.mat."""
+    """Poses (n, 3) and covariances (n, 3, 3) of folder/vehiclePose.mat.
+
+    >>> write_vehicle_poses("problem1", np.zeros((2, 3)), np.zeros((2, 3, 3)))
+    >>> poses, covariances = read_vehicle_poses("problem1")
+    >>> poses.shape, covariances.shape
+    ((2, 3), (2, 3, 3))
+    """
     return _read(Path(folder) / "vehiclePose.mat", pose=(3,), covari=(3, 3))
 
 

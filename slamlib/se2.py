@@ -15,7 +15,11 @@ import numpy as np
 
 
 def wrap(angle):
-    """Angles in (-pi, pi] that are equivalent to `angle`, rad, of any shape."""
+    """Angles in (-pi, pi] that are equivalent to `angle`, rad, of any shape.
+
+    >>> wrap([1.5 * np.pi, 2.0]).round(3)
+    array([-1.571,  2.   ])
+    """
     wrapped = np.pi - np.mod(np.pi - np.asarray(angle, dtype=float), 2 * np.pi)
     return np.where(wrapped <= -np.pi, np.pi, wrapped)         # np.mod can round up to 2 pi
 
@@ -30,7 +34,11 @@ def rotation(heading):
 
 
 def compose(T_ab, T_bc):
-    """T_ac = T_ab T_bc, (..., 3)."""
+    """T_ac = T_ab T_bc, (..., 3).
+
+    >>> compose([1, 0, np.pi / 2], [2, 0, 0]).round(3)
+    array([1.   , 2.   , 1.571])
+    """
     T_ab, T_bc = np.asarray(T_ab, dtype=float), np.asarray(T_bc, dtype=float)
     c, s = np.cos(T_ab[..., 2]), np.sin(T_ab[..., 2])
     x, y = T_bc[..., 0], T_bc[..., 1]
@@ -48,7 +56,11 @@ def inverse(T_ab):
 
 
 def between(T_wa, T_wb):
-    """T_ab = inverse(T_wa) T_wb, (..., 3), the pose of b in a."""
+    """T_ab = inverse(T_wa) T_wb, (..., 3), the pose of b in a.
+
+    >>> between([1, 0, np.pi / 2], [1, 2, np.pi / 2]).round(3)
+    array([2., 0., 0.])
+    """
     T_wa, T_wb = np.asarray(T_wa, dtype=float), np.asarray(T_wb, dtype=float)
     c, s = np.cos(T_wa[..., 2]), np.sin(T_wa[..., 2])
     dx, dy = T_wb[..., 0] - T_wa[..., 0], T_wb[..., 1] - T_wa[..., 1]

@@ -59,7 +59,17 @@ def simulate(path="short", seed=0, *, slip=1e-3, late_ranges=0.0, mislabelled=0.
     -------
     dataset : Dataset
     truth : Truth
+
+    Raises
+    ------
+    ValueError : there is no such path.
+
+    >>> dataset, truth = simulate("short", seed=1, late_ranges=0.1)
+    >>> dataset.ticks.shape, truth.poses.shape
+    ((2000, 2), (2000, 3))
     """
+    if path not in PATHS:
+        raise ValueError(f"path must be one of {', '.join(PATHS)}, not {path!r}")
     layout = PATHS[path]
     rng = np.random.default_rng(seed)
     true_vehicle = vehicle.with_deviation(noise * rng.standard_normal(3))

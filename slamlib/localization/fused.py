@@ -83,6 +83,11 @@ def fuse(dataset, slip=None, model="arc"):
     innovations times `log_slip_prior`. A marker_noise_factor of the Vehicle multiplies the standard
     deviations of the sightings. `model` is that of the increments, "arc" or "euler"; another one
     raises ValueError.
+
+    >>> from slamlib.simulation import simulate
+    >>> dataset, truth = simulate("short", seed=1)
+    >>> fuse(dataset, slip=1e-3).poses.shape
+    (2000, 3)
     """
     slip = dataset.vehicle.slip if slip is None else slip
     given = _filter_input(dataset, model, dataset.vehicle)

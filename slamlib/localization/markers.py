@@ -53,6 +53,12 @@ def localize(aruco, shared_errors=True):
     that of the first frame with a usable increment to the next. Without `shared_errors` H_j = 0:
     increments then count as independent; this is conservative. DatasetError if no sighting agrees
     with the others of its marker at its pose.
+
+    >>> from slamlib.simulation import simulate
+    >>> dataset, truth = simulate("short", seed=1)
+    >>> found = localize(dataset.aruco)
+    >>> found.frame[:3].tolist(), found.poses.shape
+    ([0, 10, 20], (200, 3))
     """
     sightings = sightings_by_frame(aruco)
     if not len(sightings.frame):

@@ -45,6 +45,16 @@ def estimate(dataset, slip=None, model=None, previous=None, *, marker_noise_fact
     ------
     DatasetError : the measurements do not determine every pose and landmark.
     ValueError : an option has no such name, or is not within the limits of vehicle.toml.
+
+    >>> from slamlib.simulation import simulate
+    >>> dataset, truth = simulate("short", seed=1)
+    >>> found = estimate(dataset.first(200), slip=1e-3, kernel="Huber")
+    >>> found.poses.shape, found.antenna.tolist(), found.noise.slip
+    ((200, 3), [5, 13, 36, 46], 0.001)
+    >>> estimate(dataset, kernel="L2")
+    Traceback (most recent call last):
+    ValueError: kernel must be one of quadratic, Huber, Cauchy, Geman-McClure, Tukey, \
+asymmetric Cauchy, asymmetric Tukey, not 'L2'
     """
     if model not in (None, *MODELS):
         raise ValueError(f"model must be one of {', '.join(MODELS)}, or None, not {model!r}")

@@ -1,0 +1,86 @@
+"""Examples in docstrings and in the README run, and the pages of the functions load nothing."""
+
+import doctest
+import re
+import subprocess
+import sys
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parents[1]
+MODULES = sorted(".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+                 for path in (ROOT / "slamlib").rglob("*.py") if path.stem != "__main__")
+WITH_EXAMPLES = {f"slamlib.{name}" for name in (
+    "se2", "odometry", "evaluation", "dataset", "results", "export", "simulation", "slam.estimate",
+    "localization.markers", "localization.fused")} | {"slamlib"}
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_examples_in_docstrings_are_true(module, tmp_path, monkeypatch):
+    if ">>> " not in find_spec(module).loader.get_source(module):
+        assert module not in WITH_EXAMPLES
+        return
+    monkeypatch.chdir(tmp_path)                                         # some write files
+    failed, tried = doctest.testmod(import_module(module))
+    assert failed == 0 < tried
+
+
+def test_the_example_of_the_readme_runs(tmp_path, monkeypatch, capsys):
+    """On data/short, in the folder of the README; what it writes is what it says."""
+    text = (ROOT / "README.md").read_text()
+    section, = re.findall(r"^## As a library\n(.*?)(?=^## )", text, re.DOTALL | re.MULTILINE)
+    example, = re.findall(r"(?:^    .*\n|^\n(?=    ))+", section[section.index("    from "):],
+                          re.MULTILINE)[:1]
+    lines = [line.removeprefix("    ") for line in example.splitlines()]
+    assert 8 <= len(lines) <= 16
+    (tmp_path / "data").symlink_to(ROOT / "data")
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    exec("\n".join(lines), names)  # noqa: S102
+    assert names["found"].poses.shape == (2000, 3) and len(capsys.readouterr().out) > 20
+    rows = np.loadtxt(tmp_path / "build" / "short.tum")
+    np.testing.assert_array_equal(rows[:, 1:3], names["found"].poses[:, :2])
+    assert (tmp_path / "build" / "short.svg").read_text().count("<path") > 3
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory):
+    """A folder with what `make docs` writes."""
+    folder = tmp_path_factory.mktemp("docs") / "api"
+    made = subprocess.run([sys.executable, ROOT / "api_pages.py", folder], text=True, cwd=ROOT,
+                          capture_output=True, timeout=600, env={
+                              "PATH": "/usr/bin:/bin", "PYTHONPATH": str(ROOT),
+                              "OPENBLAS_NUM_THREADS": "1", "HOME": str(folder.parent)})
+    assert (made.returncode, made.stderr) == (0, "")
+    return folder
+
+
+@pytest.mark.slow
+def test_every_module_has_a_page_with_its_functions(pages):
+    for module in MODULES:
+        text = (pages / f"{module.replace('.', '/')}.html").read_text()
+        assert 'class="docstring"' in text
+    text = (pages / "slamlib" / "slam" / "estimate.html").read_text()
+    assert re.search(r"<li><code>marker_noise_factor, range_noise_factor</code>: what the", text)
+    assert "----" not in text.split("pdoc-code codehilite")[0]
+    text = (pages / "slamlib" / "slam.html").read_text()
+    assert all(f'href="slam/{name}.html"' in text for name in ("estimate", "robust", "result"))
+
+
+@pytest.mark.slow
+def test_the_pages_load_nothing(pages, chromium):
+    """But each other: no request leaves the folder, and the first page leads to the others."""
+    page, requests = chromium.new_page(), []
+    page.on("request", lambda request: requests.append(request.url))
+    for name in ("index.html", "slamlib/slam/estimate.html", "slamlib/odometry.html"):
+        page.goto((pages / name).as_uri())
+    page.goto((pages / "index.html").as_uri())
+    page.wait_for_url(f"{(pages / 'slamlib.html').as_uri()}*")
+    page.get_by_role("link", name="odometry", exact=True).first.click()
+    page.wait_for_url("**/odometry.html")
+    page.close()
+    assert all(url.startswith((pages.as_uri(), "data:")) for url in requests)

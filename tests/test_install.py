@@ -1,0 +1,95 @@
+"""What `pip install` gives: a wheel with the command `slamlib` and the notebooks."""
+
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+from pathlib import Path
+
+import pytest
+
+from slamlib.__main__ import main
+from slamlib.report import sources
+
+ROOT = Path(__file__).parents[1]
+NOTEBOOKS = sorted(file.name for file in (ROOT / "notebooks").glob("*.ipynb"))
+
+
+def run(*command, cwd, code=0):
+    """What a program writes, as (stdout, stderr); slamlib is only where it is installed."""
+    environment = {name: value for name, value in os.environ.items()
+                   if name not in ("PYTHONPATH", "SLAMLIB_STUDIES")}
+    templates = Path(sysconfig.get_path("data"), "share", "jupyter")          # nbconvert's
+    environment |= {"SLAMLIB_SEEDS": "2", "JUPYTER_PATH": str(templates)}
+    ended = subprocess.run([*map(str, command)], cwd=cwd, text=True, capture_output=True,
+                           timeout=900, env=environment)
+    assert ended.returncode == code, ended.stderr
+    return ended.stdout, ended.stderr
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory):
+    """The `bin` of an environment with slamlib's wheel, which finds all else in that of the tests.
+
+    The wheel is built from a copy, because building leaves files beside the sources.
+    """
+    folder = tmp_path_factory.mktemp("installed")
+    tree, environment = folder / "tree", folder / "environment"
+    tree.mkdir()
+    for name in ("slamlib", "notebooks"):
+        shutil.copytree(ROOT / name, tree / name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "README.md"):
+        shutil.copy(ROOT / name, tree)
+    run(sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-build-isolation", "--no-index",
+        "--quiet", "--wheel-dir", folder, tree, cwd=folder)
+    run(sys.executable, "-m", "venv", "--without-pip", environment, cwd=folder)
+    place, = environment.glob("lib/python*/site-packages")
+    (place / "locked.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    wheel, = folder.glob("*.whl")
+    run(sys.executable, "-m", "pip", "--python", environment / "bin" / "python", "install",
+        "--no-deps", "--no-index", "--quiet", wheel, cwd=folder)
+    return environment / "bin"
+
+
+@pytest.mark.slow
+def test_an_installed_slamlib_makes_a_drive_solves_it_and_reports_on_it(installed, tmp_path):
+    """In a folder with nothing but `data`; the notebooks are copies of the installed ones."""
+    slamlib = installed / "slamlib"
+    told, _ = run(slamlib, "--help", cwd=tmp_path)
+    assert told.startswith("usage: slamlib ") and "export" in told
+    place, _ = run(installed / "python", "-c",
+                   "from slamlib.report.sources import *; print(notebooks_folder())", cwd=tmp_path)
+    assert Path(place.strip()) == (installed.parent / "share" / "slamlib" / "notebooks").resolve()
+    _, told = run(slamlib, "report", cwd=tmp_path, code=2)
+    assert told.startswith("slamlib: data: expected this folder") and told.count("\n") == 1
+    assert not any(tmp_path.iterdir())
+    run(slamlib, "simulate", "data/drive", cwd=tmp_path)
+    told, _ = run(slamlib, "solve", "data/drive", "--out", "out", cwd=tmp_path)
+    assert told.startswith("drive: 2000 poses") and "problem4" in told
+    run(slamlib, "report", "--no-appendix", "--notebooks-to", "notebooks", cwd=tmp_path)
+    assert sorted(file.name for file in (tmp_path / "notebooks").iterdir()) == NOTEBOOKS
+    assert (tmp_path / "report" / "report.pdf").stat().st_size > 1e5
+    assert (tmp_path / "results" / "drive" / "problem4" / "UwbMap.mat").is_file()
+    _, told = run(slamlib, "report", "--no-appendix", cwd=tmp_path)
+    assert told.count("nothing changed") == 4
+
+
+def test_notebooks_are_those_of_the_folder_else_those_beside_the_sources(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert sources.notebooks_folder() == ROOT / "notebooks"
+    (tmp_path / "notebooks").mkdir()
+    assert sources.notebooks_folder() == Path("notebooks")
+
+
+@pytest.mark.parametrize("taken", ["folder/file", "folder"])
+def test_notebooks_are_not_copied_over_what_is_there(tmp_path, monkeypatch, capsys, taken):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "data" / "drive").mkdir(parents=True)
+    (tmp_path / "data" / "drive" / "encoderReading.txt").write_text("1 0 0\n")
+    Path(taken).parent.mkdir(exist_ok=True)
+    Path(taken).write_text("mine")
+    assert main(["report", "--notebooks-to", "folder"]) == 2
+    assert capsys.readouterr().err == (
+        "slamlib: folder: expected a new or empty folder to copy the notebooks to\n")
+    assert Path(taken).read_text() == "mine"
