@@ -28,7 +28,7 @@ def sections(tmp_path_factory):
         begin = next(i for i, cell in enumerate(book.cells) if cell.source.startswith("## Explore"))
         first = next(cell for cell in book.cells if cell.cell_type == "code")
         book.cells = [first] + [cell for cell in book.cells[begin:] if cell.cell_type == "code"]
-    execute(books, kernel_environment(folder, ROOT / "data", ["short"], 2), folder / "results", 2,
+    execute(books, kernel_environment(folder, ROOT / "data", ["short"]), folder / "results", 2,
             lambda *_: None)
     return {source.stem: book.cells[1:] for source, book in books.items()}
 
