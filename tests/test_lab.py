@@ -9,10 +9,16 @@ import time
 from pathlib import Path
 
 import pytest
+from test_report import build, make_data, write
+from test_studies import CELL, kept
+
+from slamlib.__main__ import main
+from slamlib.report import lab as starting
+from slamlib.report.execution import kernel_environment
 
 ROOT = Path(__file__).parents[1]
 SECONDS = 120
-pytestmark = pytest.mark.slow
+NEWS = "Would you like to get notified about official Jupyter news?"
 
 
 @pytest.fixture(scope="module")
@@ -29,9 +35,8 @@ def lab(tmp_path_factory):
         "JUPYTERLAB_SETTINGS_DIR", "JUPYTERLAB_WORKSPACES_DIR")}
     with open(folder / "log", "w") as log:
         server = subprocess.Popen(
-            [sys.executable, "-m", "jupyter", "lab", "--no-browser", "--allow-root",
-             "--ServerApp.ip=127.0.0.1", "--ServerApp.port=0",
-             "--LabApp.check_for_updates_class=jupyterlab.NeverCheckForUpdate", "notebooks"],
+            [sys.executable, "-m", "slamlib", "lab", "--no-browser", "--ip", "127.0.0.1",
+             "--port", "0"],
             cwd=folder, env=environment, stdout=log, stderr=subprocess.STDOUT)
     try:
         yield _started(server, folder)
@@ -55,6 +60,50 @@ def _started(server, folder):
     pytest.fail("JupyterLab did not start:\n" + (folder / "log").read_text()[-2000:])
 
 
+def test_jupyterlab_replaces_the_command_and_is_given_its_arguments(tmp_path, monkeypatch):
+    started = []
+    monkeypatch.setattr(os, "execve", lambda *arguments: started.append(arguments))
+    monkeypatch.chdir(tmp_path)
+    for user in (0, 1000):
+        monkeypatch.setattr(os, "geteuid", lambda user=user: user)
+        main(["lab", "--no-browser", "--port", "9999"])
+    (program, as_root, environment), (_, command, _) = started
+    assert program == sys.executable and command[1:3] == ["-m", "jupyterlab"]
+    assert command[-4:] == ["--no-browser", "--port", "9999", "notebooks"]
+    assert [each for each in as_root if each not in command] == ["--allow-root"]
+    assert environment["SLAMLIB_STUDIES"] == str(tmp_path / "build" / "executed" / "studies")
+
+
+def test_kernels_have_the_environment_of_the_build(tmp_path, monkeypatch):
+    """But for SLAMLIB_RESULTS and SLAMLIB_PROGRESS, by which a cell knows that it is in a build."""
+    monkeypatch.setenv("SLAMLIB_DATASETS", "short")
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    found = starting.environment(tmp_path, tmp_path / "data", tmp_path / "kept")
+    assert found == kernel_environment(tmp_path, tmp_path / "data", ["short"],
+                                       tmp_path / "kept" / "studies")
+    assert found["OMP_NUM_THREADS"] == found["OPENBLAS_NUM_THREADS"] == "1"
+    assert not {"SLAMLIB_RESULTS", "SLAMLIB_PROGRESS"} & found.keys()
+
+
+@pytest.mark.slow
+def test_studies_of_the_build_are_recalled_in_jupyterlab_and_numbers_are_the_same(tmp_path):
+    make_data(tmp_path)
+    write(tmp_path / "notebooks", "a", "# a", (CELL,))
+    page = build(tmp_path, kept=tmp_path / "kept")[1].read_text()
+    environment = starting.environment(tmp_path, tmp_path / "data", tmp_path / "kept")
+
+    def printed():
+        return subprocess.run([sys.executable, "-c", CELL], env=environment, text=True, check=True,
+                              capture_output=True).stdout
+
+    numbers = printed()
+    assert numbers in page and len(set(numbers.splitlines())) == 2
+    one, other = kept(tmp_path / "kept" / "studies")
+    one.write_bytes(other.read_bytes())                # shows that it is recalled
+    assert len(set(printed().splitlines())) == 1
+
+
+@pytest.mark.slow
 def test_moving_a_slider_changes_the_picture(chromium, lab):
     from playwright.sync_api import expect
     page = chromium.new_page(viewport={"width": 1300, "height": 1000})
@@ -83,5 +132,6 @@ def test_moving_a_slider_changes_the_picture(chromium, lab):
     assert second != first
 
     expect(page.locator("[data-mime-type*=stderr], [data-mime-type*=error]")).to_have_count(0)
+    expect(page.get_by_text(NEWS)).to_have_count(0)
     away = [url for url in asked if not url.startswith((lab["url"], "data:", "blob:"))]
     assert asked and not away

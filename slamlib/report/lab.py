@@ -1,13 +1,15 @@
 """JupyterLab with the settings and the kept studies that the build's kernels have."""
 
+import json
 import os
 import sys
 
 from slamlib.report.build import STUDIES
 from slamlib.report.execution import kernel_environment
 
-NO_NEWS = ("--LabApp.news_url=None",  # asks no question about news when it opens
-           "--LabApp.check_for_updates_class=jupyterlab.NeverCheckForUpdate")
+SETTINGS = "settings"  # in the cache: of kernels, and JupyterLab's where the user has no others
+OVERRIDES = {"@jupyterlab/apputils-extension:notification": {
+    "fetchNews": "false", "checkForUpdates": False}}  # without a question when it opens
 
 
 def start_lab(notebooks, data, kept, arguments):
@@ -18,26 +20,24 @@ def start_lab(notebooks, data, kept, arguments):
     notebooks, data, kept : Path, folders as of `build_report`.
     arguments : list of str, JupyterLab's.
     """
-    os.execve(sys.executable, command(notebooks, arguments), environment(data, kept))
+    settings = kept.resolve() / SETTINGS
+    settings.mkdir(parents=True, exist_ok=True)
+    (settings / "overrides.json").write_text(json.dumps(OVERRIDES))
+    options = [f"--LabApp.app_settings_dir={settings}",
+               "--LabApp.check_for_updates_class=jupyterlab.NeverCheckForUpdate"]
+    if os.geteuid() == 0:  # as in containers; it listens to this machine alone
+        options.append("--allow-root")
+    os.execve(sys.executable,
+              [sys.executable, "-m", "jupyterlab", *options, *arguments, str(notebooks)],
+              environment(settings, data, kept))
 
 
-def command(notebooks, arguments):
-    """Return the command (list of str) that opens JupyterLab on a folder, with its `arguments`.
-
-    The administrator, as whom containers run, is let in: JupyterLab listens to this machine alone.
-    """
-    root = ["--allow-root"] if os.geteuid() == 0 else []
-    return [sys.executable, "-m", "jupyter", "lab", *NO_NEWS, *root, *arguments, str(notebooks)]
-
-
-def environment(data, kept):
+def environment(settings, data, kept):
     """Return the environment (dict of str) of JupyterLab, whose kernels inherit it.
 
     A cell computes there what it does in the build, with the studies that the build keeps. Its
     selection of datasets is that of SLAMLIB_DATASETS, if it is set.
     """
-    settings = kept.resolve() / "settings"
-    settings.mkdir(parents=True, exist_ok=True)
     chosen = os.environ.get("SLAMLIB_DATASETS")
     return kernel_environment(settings, data.resolve(), chosen and chosen.split("\n"),
                               kept / STUDIES)
