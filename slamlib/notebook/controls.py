@@ -61,9 +61,9 @@ def show(draw, grid=None, only_simulated=(), **controls):
 def panel(draw, controls, only_simulated=()):
     """A widget: the controls and a button Reset, the sentence and the figure; as of `show`.
 
-    A slider redraws the figure while it is dragged if the last drawing that it or a list caused took
-    less than FAST; else when it is released. The first drawing, which also loads typefaces, and
-    those of Reset, whose values are known already, say nothing of that.
+    A slider redraws the figure while it is dragged if the last drawing that it or a list caused
+    took less than FAST; else when it is released. The first drawing, which also loads typefaces,
+    and those of Reset, which may be remembered, do not count.
     """
     first = {name: control.value for name, control in controls.items()}
     sliders = [control for control in controls.values() if hasattr(control, "continuous_update")]
@@ -91,9 +91,8 @@ def panel(draw, controls, only_simulated=()):
                 each.continuous_update = fast
 
     def restart(_):
-        for control in controls.values():
-            control.unobserve(redraw, "value")
         for name, control in controls.items():
+            control.unobserve(redraw, "value")
             control.value = first[name]
             control.observe(redraw, "value")
         redraw(None)
@@ -101,6 +100,7 @@ def panel(draw, controls, only_simulated=()):
     for control in controls.values():
         control.style.description_width = "12em"
         control.layout.width = "31em"
+        control.observe(redraw, "value")
     reset.on_click(restart)
-    restart(reset)
+    redraw(None)
     return VBox([Box([*controls.values(), reset], layout=ROW), said, picture])
