@@ -93,20 +93,19 @@ def drawing(drawn, raises=None):
 
 
 def parts_of(panel):
-    """The sliders and lists, the button Reset and the sentence of a panel."""
-    row, said, _ = panel.children
-    return row.children[:-1], row.children[-1], said
+    """The sliders and lists of a panel as they are now, the button Reset, and the sentence."""
+    row, reset, said, _ = panel.children
+    return row.children, reset, said
 
 
 def test_a_moved_slider_redraws_the_figure_with_all_values(monkeypatch):
     monkeypatch.delenv("SLAMLIB_RESULTS", raising=False)
     shown, drawn = [], []
-    monkeypatch.setattr(controls, "display", lambda each: shown.append(each))
-    a, b = explore.slider("a", 1, 0, 9), explore.slider("b", 0.5, 0.0, 1.0, 0.25)
-    explore.show(drawing(drawn), a=a, b=b)
-    panel = next(each for each in shown if hasattr(each, "children"))
-    each, _, said = parts_of(panel)
-    assert each == (a, b)
+    monkeypatch.setattr(controls, "display", shown.append)
+    explore.show(drawing(drawn), a=explore.slider("a", 1, 0, 9),
+                 b=explore.slider("b", 0.5, 0.0, 1.0, 0.25))
+    (a, b), _, said = parts_of(shown[-1])
+    assert (a.min, a.max, b.step, b.description) == (0, 9, 0.25, "b")
     a.value = 4
     assert drawn == [{"a": 1, "b": 0.5}, {"a": 4, "b": 0.5}]
     assert isinstance(a.value, int) and said.value == "a is 4 &lt; 10." and not plt.get_fignums()
@@ -114,67 +113,70 @@ def test_a_moved_slider_redraws_the_figure_with_all_values(monkeypatch):
 
 def test_reset_brings_all_first_values_back_and_draws_once():
     drawn = []
-    a, name = explore.slider("a", 1, 0, 9), explore.choice("name", ["one", "two"], "two")
-    _, reset, said = parts_of(controls.panel(drawing(drawn), {"a": a, "name": name}))
+    panel = controls.panel(drawing(drawn), {"a": explore.slider("a", 1, 0, 9),
+                                            "name": explore.choice("name", ["one", "two"], "two")})
+    (a, name), reset, said = parts_of(panel)
     a.value, name.value = 5, "one"
     del drawn[:]
     reset.click()
     assert drawn == [{"a": 1, "name": "two"}] and said.value == "a is 1 &lt; 10."
-    a.value = 2
+    (new, name), _, _ = parts_of(panel)
+    assert (new.value, name.value, a.comm) == (1, "two", None)  # the old one hears nothing
+    new.value = 2
     assert drawn[1:] == [{"a": 2, "name": "two"}]
+    reset.click()
+    assert drawn[2:] == [{"a": 1, "name": "two"}]
 
 
 def test_a_slider_follows_the_mouse_while_its_drawings_take_less_than_0_3_s(seconds):
-    a, b, name = (explore.slider("a", 1, 0, 9), explore.slider("b", 1, 0, 9),
-                  explore.choice("name", ["one", "two"], "one"))
-    takes = {"s": 5.0}
+    takes = [5.0]
 
     def draw(**values):
-        seconds.append(takes["s"])
+        seconds.append(takes[-1])
         return plt.figure()
 
-    _, reset, _ = parts_of(controls.panel(draw, {"a": a, "b": b, "name": name}))
+    panel = controls.panel(draw, {"a": explore.slider("a", 1, 0, 9),
+                                  "b": explore.slider("b", 1, 0, 9),
+                                  "name": explore.choice("name", ["one", "two"], "one")})
+    (a, b, name), reset, _ = parts_of(panel)
     assert a.continuous_update and b.continuous_update     # the first drawing does not count
-    takes["s"] = 0.31
-    a.value = 2
-    assert not a.continuous_update and b.continuous_update
-    takes["s"] = 0.29
-    a.value = 3
-    assert a.continuous_update
-    takes["s"] = 0.31
-    name.value = "two"
-    assert not a.continuous_update and not b.continuous_update
-    takes["s"] = 0.0
+    for value, time, follows in ((2, 0.31, False), (3, 0.29, True), (4, 0.31, False)):
+        takes.append(time)
+        a.value = value
+        assert a.continuous_update == follows and b.continuous_update
+    for value, time, follows in (("two", 0.29, True), ("one", 0.31, False)):
+        takes.append(time)
+        name.value = value
+        assert a.continuous_update == b.continuous_update == follows
+    takes.append(5.0)
     reset.click()
-    assert not a.continuous_update                          # nor does Reset
-    b.value = 5
-    assert b.continuous_update
+    assert all(slider.continuous_update for slider in parts_of(panel)[0][:2])
 
 
 def test_values_without_a_solution_leave_a_sentence_and_no_picture():
-    drawn = []
-    a = explore.slider("a", 1, 0, 9)
-    _, reset, said = parts_of(controls.panel(
-        drawing(drawn, raises={4: DatasetError("x: expected < 3"),
-                               5: np.linalg.LinAlgError("Singular matrix")}), {"a": a}))
+    panel = controls.panel(drawing([], {4: DatasetError("x: expected < 3"),
+                                        5: np.linalg.LinAlgError("Singular matrix")}),
+                           {"a": explore.slider("a", 1, 0, 9)})
+    (a,), _, said = parts_of(panel)
     for value, reason in ((4, "x: expected &lt; 3"), (5, "Singular matrix")):
         a.value = value
         assert said.value == f"There is no solution with these values: {reason}."
-    reset.click()
-    assert said.value == "a is 1 &lt; 10."
+    a.value = 6
+    assert said.value == "a is 6 &lt; 10."
 
 
 def test_a_control_of_the_simulation_is_disabled_while_a_dataset_is_drawn():
     drives = [Drive("one", None, None), Drive("one", None, None, made_up=True),
               Drive("simulated", None, None)]
-    drive, a = explore.drive_choice(drives), explore.slider("a", 1, 0, 9)
+    panel = controls.panel(drawing([]), {"drive": explore.drive_choice(drives),
+                                         "a": explore.slider("a", 1, 0, 9)}, ["a"])
+    (drive, a), reset, _ = parts_of(panel)
     assert [name for name, _ in drive.options] == ["simulated", "one", "simulated"]
-    assert drive.value is explore.SIMULATED and drive.value.made_up
-    _, reset, _ = parts_of(controls.panel(drawing([]), {"drive": drive, "a": a}, ["a"]))
-    assert not a.disabled
+    assert drive.value is explore.SIMULATED and not a.disabled
     drive.value = drives[2]
     assert a.disabled
     reset.click()
+    (drive, a), _, _ = parts_of(panel)
     assert not a.disabled and drive.value is explore.SIMULATED
 
 
