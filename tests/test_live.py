@@ -87,6 +87,30 @@ def test_a_moved_slider_changes_the_picture_without_a_network(offline):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("options", [{}, {"color_scheme": "dark"},
+                                     {"viewport": {"width": 390, "height": 800}}], ids=str)
+def test_reset_is_reached_by_keys_and_brings_the_first_figure_back(offline, options):
+    page = offline("1_chapter.html", **options)
+    figure = page.locator("figure.live")
+    sliders, reset = figure.get_by_role("slider"), figure.get_by_role("button", name="Reset")
+    seen = [panel.inner_html() for panel in figure.locator("svg.panel").all()]
+    said, value = figure.locator(".says").inner_text(), figure.locator("output").first.inner_text()
+    for slider in sliders.all():
+        slider.press("ArrowLeft")
+    assert figure.locator(".says").inner_text() != said
+    assert figure.locator("output").first.inner_text() != value
+    page.keyboard.press("Tab")
+    assert reset.evaluate("button => button === document.activeElement")
+    page.keyboard.press("Enter")
+    page.wait_for_function("said => document.querySelector('.says').textContent === said",
+                           arg=said)
+    assert [panel.inner_html() for panel in figure.locator("svg.panel").all()] == seen
+    assert figure.locator("output").first.inner_text() == value
+    box = reset.bounding_box()
+    assert box["x"] >= 0 and box["x"] + box["width"] <= page.viewport_size["width"]
+
+
+@pytest.mark.slow
 def test_without_script_the_still_picture_stands_and_no_control_does_nothing(offline):
     page = offline("1_chapter.html", java_script_enabled=False)
     panel = page.locator("figure.live svg.panel").first

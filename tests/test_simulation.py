@@ -6,7 +6,15 @@ import pytest
 
 from slamlib import odometry, se2
 from slamlib.dataset import DatasetError, Vehicle, read_dataset, read_truth
-from slamlib.simulation import manoeuvre, simulate, write_dataset
+from slamlib.simulation import (
+    LATE_RANGE_MEAN,
+    delay,
+    manoeuvre,
+    misguess,
+    mislabel,
+    simulate,
+    write_dataset,
+)
 
 DATA = Path(__file__).parents[1] / "data"
 RECIPES = {"short": dict(path="short", seed=1),
@@ -145,3 +153,33 @@ def test_manoeuvres_drive_their_legs():
     np.testing.assert_allclose(poses[-1], [4 / np.pi, 2 / np.pi, np.pi], atol=1e-12)
     ds, _, _, _ = odometry.steps(ticks, Vehicle())
     assert np.abs(ds).max() <= 0.01 + 1e-15
+
+
+def test_errors_are_added_to_a_dataset_by_their_seed():
+    dataset, _ = simulate("short", seed=5)
+    wrong, late = mislabel(dataset, 0.2, 1), delay(dataset, 0.2, 1)
+    changed = wrong.aruco.marker != dataset.aruco.marker
+    assert 0.1 < changed.mean() < 0.3
+    assert set(wrong.aruco.marker) <= set(dataset.aruco.marker)
+    np.testing.assert_array_equal(wrong.aruco.marker_in_vehicle, dataset.aruco.marker_in_vehicle)
+    excess = late.uwb.range - dataset.uwb.range
+    assert (excess >= 0).all() and 0.1 < np.mean(excess > 0) < 0.3
+    assert 0.7 * LATE_RANGE_MEAN < excess[excess > 0].mean() < 1.4 * LATE_RANGE_MEAN
+    other = mislabel(dataset, 0.2, 2).aruco.marker
+    assert (other != wrong.aruco.marker).any() and (mislabel(dataset, 0, 1).aruco.marker
+                                                    == dataset.aruco.marker).all()
+    np.testing.assert_array_equal(delay(dataset, 0, 1).uwb.range, dataset.uwb.range)
+
+
+def test_a_single_marker_keeps_its_label():
+    dataset, _ = simulate("short", seed=5)
+    single = dataset.aruco.select(dataset.aruco.marker == dataset.aruco.marker[0])
+    one = mislabel(replace(dataset, aruco=single), 1.0, 1)
+    np.testing.assert_array_equal(one.aruco.marker, single.marker)
+
+
+def test_guesses_are_as_wrong_as_is_asked_for():
+    dataset, truth = simulate("short", seed=5)
+    guess = misguess(dataset, truth.antenna_in_world, 2.0, 1).antenna_guess
+    np.testing.assert_array_equal(guess.antenna, truth.antenna)
+    np.testing.assert_allclose(np.hypot(*(guess.position - truth.antenna_in_world).T), 2.0)

@@ -63,20 +63,20 @@ def panel(draw, controls, only_simulated=()):
 
     A slider redraws the figure while it is dragged if the last drawing that it or a list caused
     took less than FAST; else when it is released. The first drawing, which also loads typefaces,
-    and those of Reset, whose values are known already, say nothing of that.
+    and those of Reset, which may be remembered, do not count. Reset replaces the widgets: values of
+    the old ones that the browser still holds back are lost with these.
     """
-    first = {name: control.value for name, control in controls.items()}
-    sliders = [control for control in controls.values() if hasattr(control, "continuous_update")]
-    reset = Button(description="Reset", tooltip="All controls as they were at first")
+    row, reset = Box(layout=ROW), Button(description="Reset", tooltip="Return to the first values")
     said, picture = HTML(layout=SENTENCE), Output()
+    first, shown = {name: control.value for name, control in controls.items()}, {}
 
     def redraw(change):
         begin = perf_counter()
         for name in only_simulated:
-            controls[name].disabled = controls["drive"].value is not SIMULATED
+            shown[name].disabled = shown["drive"].value is not SIMULATED
         with picture:
             try:
-                fig = draw(**{name: control.value for name, control in controls.items()})
+                fig = draw(**{name: control.value for name, control in shown.items()})
             except UNSOLVABLE as error:
                 clear_output()
                 said.value = escape(f"There is no solution with these values: {error}.")
@@ -87,20 +87,27 @@ def panel(draw, controls, only_simulated=()):
                 plt.close(fig)
         if change is not None:
             fast = perf_counter() - begin < FAST
+            sliders = [each for each in shown.values() if each.has_trait("continuous_update")]
             for each in [change.owner] if change.owner in sliders else sliders:
                 each.continuous_update = fast
 
     def restart(_):
-        for control in controls.values():
-            control.unobserve(redraw, "value")
-        for name, control in controls.items():
-            control.value = first[name]
-            control.observe(redraw, "value")
+        for name, control in list(shown.items()) or controls.items():
+            shown[name] = _copy(control, first[name])
+            shown[name].observe(redraw, "value")
+            control.close()                     # with values that the browser has not sent yet
+        row.children = list(shown.values())
         redraw(None)
 
-    for control in controls.values():
-        control.style.description_width = "12em"
-        control.layout.width = "31em"
+    restart(None)
     reset.on_click(restart)
-    restart(reset)
-    return VBox([Box([*controls.values(), reset], layout=ROW), said, picture])
+    return VBox([row, reset, said, picture])
+
+
+def _copy(control, value):
+    """A new widget like a slider or list, with a value."""
+    traits = ("min", "max", "step", "options", "description")
+    new = type(control)(value=value, **{name: getattr(control, name) for name in traits
+                                        if control.has_trait(name)})
+    new.style.description_width, new.layout.width = "12em", "31em"
+    return new
