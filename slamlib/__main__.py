@@ -1,4 +1,4 @@
-"""The command line: python -m slamlib {report, solve, simulate}."""
+"""The command line: python -m slamlib {report, hand-in, solve, simulate}."""
 
 import argparse
 import os
@@ -71,10 +71,19 @@ class _Parser(argparse.ArgumentParser):
 
 def _parser():
     parser = _Parser(prog="python -m slamlib", description=__doc__)
-    commands = parser.add_subparsers(required=True, metavar="{report,solve,simulate}")
+    commands = parser.add_subparsers(required=True, metavar="{report,hand-in,solve,simulate}")
 
-    _report_options(commands.add_parser(
-        "report", help="execute the notebooks and build the report"))
+    report = commands.add_parser("report", help="execute the notebooks and build the report")
+    report.add_argument("--report", type=Path, default=Path("report"), help="folder for the pages")
+    _build_options(report)
+    report.set_defaults(run=_report)
+
+    hand_in = commands.add_parser(
+        "hand-in", help="build the report and put it into a zip, with the result files")
+    hand_in.add_argument("--out", type=Path, default=Path("hand-in.zip"),
+                         help="the file to write (default %(default)s)")
+    _build_options(hand_in)
+    hand_in.set_defaults(run=_hand_in)
 
     solve = commands.add_parser("solve", help="solve a dataset's problems without notebooks")
     solve.add_argument("folder", type=Path, metavar="FOLDER", help="the dataset's folder")
@@ -97,53 +106,90 @@ def _parser():
     return parser
 
 
-def _report_options(report):
-    """Add the options of `report` to its parser."""
-    report.add_argument("datasets", nargs="*", metavar="DATASET",
+def _build_options(parser):
+    """Add the options of `report` and `hand-in` to a parser."""
+    parser.add_argument("datasets", nargs="*", metavar="DATASET",
                         help="names of folders in data/ (all of them when none is named)")
-    report.add_argument("--data", type=Path, default=Path("data"), help="folder of the datasets")
-    report.add_argument("--notebooks", type=Path, default=Path("notebooks"))
-    report.add_argument("--report", type=Path, default=Path("report"), help="folder for the pages")
-    report.add_argument("--results", type=Path, default=Path("results"),
+    parser.add_argument("--data", type=Path, default=Path("data"), help="folder of the datasets")
+    parser.add_argument("--notebooks", type=Path, default=Path("notebooks"))
+    parser.add_argument("--results", type=Path, default=Path("results"),
                         help="folder for the .mat files")
-    report.add_argument("--jobs", type=_positive, default=2, help="notebooks executed at a time")
-    code = report.add_mutually_exclusive_group()
+    parser.add_argument("--jobs", type=_positive, default=2, help="notebooks executed at a time")
+    code = parser.add_mutually_exclusive_group()
     code.add_argument("--no-code", dest="code", action="store_const", const="none",
-                      default="method", help="leave out code cells and printed text")
+                      help="leave out code cells and printed text")
     code.add_argument("--all-code", dest="code", action="store_const", const="all",
                       help="show the code that plots, prints and tabulates, too")
-    report.add_argument("--no-appendix", dest="appendix", action="store_false",
-                        help="leave out the notebooks whose title begins with a letter")
-    report.add_argument("--author", help="on the PDF's title page, instead of report.toml's")
-    report.add_argument("--student-number", help="the same")
-    report.add_argument("--fresh", action="store_true",
+    parser.add_argument("--appendix", action=argparse.BooleanOptionalAction,
+                        help="show the notebooks whose title begins with a letter, or leave them "
+                             "out (the report has them, the hand-in has not)")
+    parser.add_argument("--author", help="on the PDF's title page, instead of report.toml's")
+    parser.add_argument("--student-number", help="the same")
+    parser.add_argument("--fresh", action="store_true",
                         help="execute all notebooks and studies, also where nothing changed")
-    report.set_defaults(run=_report)
 
 
-def _report(options):
+def _report(arguments):
+    options = _options(arguments)
+    report = _built(arguments, options, arguments.report, _names(arguments),
+                    appendix=options.appendix is not False, leave_out=options.leave_out)
+    if report is None:
+        return 1
+    print(f"report: {report.files[0]} and {report.files[-1]}", file=sys.stderr)
+    return _exit_code(_failures(report))
+
+
+def _hand_in(arguments):
+    from slamlib.report import handin
+    if arguments.out.is_dir():
+        raise DatasetError(f"{arguments.out}: expected the name of a file to write, found a folder")
+    options = _options(arguments)
+    datasets, omitted = handin.selection(arguments.data, _names(arguments))
+    report = _built(arguments, options, Path("build", "hand-in"), datasets,
+                    appendix=bool(options.appendix), leave_out=handin.leave_out(options),
+                    files=False)
+    if report is None:
+        return 1
+    handin.write(arguments.out, report, arguments.results, options, omitted)
+    print(f"hand-in: {arguments.out.resolve()}", file=sys.stderr)
+    return _exit_code(_failures(report))
+
+
+def _options(arguments):
+    """Return the Options of report.toml with what the command line says instead."""
+    from slamlib.report.options import read_options
+    options = read_options("report.toml")
+    cover = {key: getattr(arguments, key) for key in ("author", "student_number")}
+    others = {key: getattr(arguments, key) for key in ("code", "appendix")}
+    return replace(options, cover=replace(options.cover, **_given(cover)), **_given(others))
+
+
+def _given(values):
+    return {key: value for key, value in values.items() if value is not None}
+
+
+def _built(arguments, options, folder, datasets, **shown):
+    """Return the Report that is built into a folder, or None if a notebook failed; tell doubts."""
     from slamlib.report import NotebookError, build_report
-    from slamlib.report.cover import read_cover
-    cover = read_cover("report.toml")
-    given = {"author": options.author, "student_number": options.student_number}
-    cover = replace(cover, **{key: value for key, value in given.items() if value is not None})
     try:
         report = build_report(
-            options.notebooks, options.data, options.report, options.results,
-            datasets=[_name(dataset, options.data) for dataset in options.datasets] or None,
-            jobs=options.jobs, cover=cover, code=options.code, kept=Path("build", "executed"),
-            fresh=options.fresh, appendix=options.appendix)
+            arguments.notebooks, arguments.data, folder, arguments.results, datasets=datasets,
+            jobs=arguments.jobs, cover=options.cover, code=options.code,
+            kept=Path("build", "executed"), fresh=arguments.fresh, **shown)
     except NotebookError as error:
         print(f"slamlib: {error}", file=sys.stderr)
-        return 1
-    if not cover.author:
+        return None
+    if not options.cover.author:
         print("report.toml names no author: the PDF's title page has none", file=sys.stderr)
     for drive in report.drives:
         for doubt in drive.doubts:
             print(f"{drive.name}: doubt ({doubt.what}): {doubt.sentence}", file=sys.stderr)
-    print(f"report: {report.files[0]} and {report.files[-1]}", file=sys.stderr)
-    return _exit_code((drive.name, failure.problem, failure.reason)
-                      for drive in report.drives for failure in drive.failures)
+    return report
+
+
+def _failures(report):
+    return ((drive.name, failure.problem, failure.reason)
+            for drive in report.drives for failure in drive.failures)
 
 
 def _exit_code(failures):
@@ -155,10 +201,11 @@ def _exit_code(failures):
     return code
 
 
-def _name(dataset, data):
-    """Return the name of a dataset, given by its name or by the path of its folder in `data`."""
-    path = Path(dataset)
-    return path.name if path.resolve().parent == data.resolve() else dataset
+def _names(arguments):
+    """Return the names of the datasets, given by names or paths of folders in data/, or None."""
+    paths = {dataset: Path(dataset) for dataset in arguments.datasets}
+    return [path.name if path.resolve().parent == arguments.data.resolve() else dataset
+            for dataset, path in paths.items()] or None
 
 
 def _solve(options):
