@@ -1,4 +1,5 @@
 # make report   executes the notebooks on every dataset in data/ and writes report/ and results/
+# make hand-in  builds the report and writes hand-in.zip: the PDF and the .mat files to hand in
 # make test     checks the style, and runs all tests
 # make quick    runs the tests that take less than a minute in all
 # make mutants  prints which small defects of the numerics no test notices
@@ -23,7 +24,7 @@ ifneq ($(shell $(BIN)/python -c 'print("runs")' 2>/dev/null),runs)
 $(shell rm -f $(READY))
 endif
 
-.PHONY: setup report test quick mutants lab docs strip bench bench-large clean
+.PHONY: setup report hand-in test quick mutants lab docs strip bench bench-large clean
 .DEFAULT_GOAL := report
 
 # In a git checkout, also configures the filter that .gitattributes names: git stores notebooks as
@@ -52,6 +53,9 @@ $(READY): requirements.txt pyproject.toml check_python.py
 
 report: $(READY)
 	@$(BIN)/python -m slamlib report
+
+hand-in: $(READY)
+	@$(BIN)/python -m slamlib hand-in $(ARGS)
 
 test: $(READY)
 	@$(BIN)/python -m nbstripout --verify --keep-id notebooks/*.ipynb >/dev/null || { \

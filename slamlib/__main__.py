@@ -1,6 +1,5 @@
-"""The command line: slamlib {report, solve, simulate, export, lab}, or python -m slamlib."""
+"""The command line: `slamlib` or `python -m slamlib`."""
 
-import argparse
 import os
 import signal
 import sys
@@ -12,6 +11,7 @@ from pathlib import Path
 # Set before numpy is imported: the matrices are so small that more threads are slower.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+from slamlib.arguments import parser  # noqa: E402
 from slamlib.dataset import (  # noqa: E402
     DatasetError,
     dataset_names,
@@ -21,7 +21,7 @@ from slamlib.dataset import (  # noqa: E402
 )
 from slamlib.swap import ENDS  # noqa: E402
 
-DATA, KEPT = Path("data"), Path("build", "executed")
+KEPT = Path("build", "executed")
 
 
 def main(arguments=None):
@@ -30,15 +30,17 @@ def main(arguments=None):
     Returns the exit code: 0, 1 if a notebook failed, 2 for invalid input, 3 if a problem could not
     be solved, 128 + n if ended by signal n.
     """
-    parser = _parser()
-    options, others = parser.parse_known_args(arguments)
-    if others and options.run is not _lab:
-        parser.error(f"unrecognized arguments: {' '.join(others)}")
+    if arguments is None:
+        sys.stdout.reconfigure(errors="backslashreplace")  # as stderr, for names in other letters
+    known = parser()
+    options, others = known.parse_known_args(arguments)
+    if others and options.command != "lab":
+        known.error(f"unrecognized arguments: {' '.join(others)}")
     options.others = others
     ended = [signal.SIGINT]
     try:
         with _orderly_end(ended):
-            return options.run(options)
+            return RUN[options.command](options)
     except DatasetError as error:
         print(f"slamlib: {error}", file=sys.stderr)
         return 2
@@ -75,112 +77,72 @@ def _orderly_end(ended):
             signal.signal(each, handler)
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message):
-        """End with exit code 2 and one sentence, without argparse's usage."""
-        told = " ".join(message.split())
-        self.exit(2, f"slamlib: {told} ({self.prog} --help shows the usage)\n")
+def _report(arguments):
+    options = _options(arguments)
+    report = _built(arguments, options, arguments.report, _names(arguments),
+                    appendix=options.appendix is not False, leave_out=options.leave_out)
+    if report is None:
+        return 1
+    print(f"report: {report.files[0]} and {report.files[-1]}", file=sys.stderr)
+    return _exit_code(_failures(report))
 
 
-def _parser():
-    prog = Path(sys.argv[0]).name
-    parser = _Parser(prog=prog if prog == "slamlib" else "python -m slamlib", description=__doc__)
-    commands = parser.add_subparsers(required=True, metavar="{report,solve,simulate,export,lab}")
-
-    _report_options(commands.add_parser(
-        "report", help="execute the notebooks and build the report"))
-
-    solve = commands.add_parser("solve", help="solve a dataset's problems without notebooks")
-    solve.add_argument("folder", type=Path, metavar="FOLDER", help="the dataset's folder")
-    solve.add_argument("--out", type=Path, required=True, help="folder for the results")
-    solve.set_defaults(run=_solve)
-
-    simulate = commands.add_parser("simulate", help="make a dataset with its truth")
-    simulate.add_argument("folder", type=Path, metavar="FOLDER", help="a new or empty folder")
-    simulate.add_argument("--path", choices=("short", "long"), default="short")
-    simulate.add_argument("--rounds", type=_positive, default=1,
-                          help="how often the path is driven; 44 long ones are a million rows")
-    simulate.add_argument("--seed", type=_count, default=0)
-    simulate.add_argument("--slip", type=_share, default=1e-3, metavar="SQRT_M",
-                          help="wheel slip: sigma after one metre, in m (default %(default)s)")
-    simulate.add_argument("--nlos", type=_share, default=0.0, metavar="SHARE",
-                          help="share of UWB ranges without line of sight, which are too long")
-    simulate.add_argument("--mislabel", type=_share, default=0.0, metavar="SHARE",
-                          help="share of marker sightings that carry another marker's id")
-    simulate.set_defaults(run=_simulate)
-
-    export = commands.add_parser("export", help="write trajectories as TUM files or CSV")
-    export.add_argument("results", type=Path, metavar="RESULTS", help="a folder of results, of one "
-                        "problem's results, or the folder truth of a dataset")
-    export.add_argument("--format", choices=("tum", "csv"), default="tum",
-                        help="tum has pose numbers as time stamps; csv has covariances, too")
-    export.add_argument("--out", type=Path, required=True, help="folder for the files")
-    export.set_defaults(run=_export)
-
-    lab = commands.add_parser("lab", help="open JupyterLab on the notebooks; it is given all other "
-                                          "arguments, as --no-browser", allow_abbrev=False)
-    lab.add_argument("--data", type=Path, default=DATA, help="folder of the datasets")
-    lab.add_argument("--notebooks", type=Path)
-    lab.set_defaults(run=_lab)
-    return parser
+def _hand_in(arguments):
+    from slamlib.report import handin
+    if arguments.out.is_dir():
+        raise DatasetError(f"{arguments.out}: expected the name of a file to write, found a folder")
+    options = _options(arguments)
+    datasets, omitted = handin.selection(arguments.data, _names(arguments))
+    report = _built(arguments, options, Path("build", "hand-in"), datasets,
+                    appendix=bool(options.appendix), leave_out=handin.leave_out(options),
+                    files=False)
+    if report is None:
+        return 1
+    handin.write(arguments.out, report, arguments.results, options, omitted)
+    print(f"hand-in: {arguments.out.resolve()}", file=sys.stderr)
+    return _exit_code(_failures(report))
 
 
-def _report_options(report):
-    """Add the options of `report` to its parser."""
-    report.add_argument("datasets", nargs="*", metavar="DATASET",
-                        help="names of folders in data/ (all of them when none is named)")
-    report.add_argument("--data", type=Path, default=DATA, help="folder of the datasets")
-    report.add_argument("--notebooks", type=Path, help="folder of the notebooks (default: the "
-                        "folder notebooks where there is one, else those of the installation)")
-    report.add_argument("--notebooks-to", type=Path, metavar="FOLDER",
-                        help="copy the notebooks to this new or empty folder first, to edit them "
-                        "there, and build the report from it")
-    report.add_argument("--report", type=Path, default=Path("report"), help="folder for the pages")
-    report.add_argument("--results", type=Path, default=Path("results"),
-                        help="folder for the .mat files")
-    report.add_argument("--jobs", type=_positive, default=2, help="notebooks executed at a time")
-    code = report.add_mutually_exclusive_group()
-    code.add_argument("--no-code", dest="code", action="store_const", const="none",
-                      default="method", help="leave out code cells and printed text")
-    code.add_argument("--all-code", dest="code", action="store_const", const="all",
-                      help="show the code that plots, prints and tabulates, too")
-    report.add_argument("--no-appendix", dest="appendix", action="store_false",
-                        help="leave out the notebooks whose title begins with a letter")
-    report.add_argument("--author", help="on the PDF's title page, instead of report.toml's")
-    report.add_argument("--student-number", help="the same")
-    report.add_argument("--fresh", action="store_true",
-                        help="execute all notebooks and studies, also where nothing changed")
-    report.set_defaults(run=_report)
+def _options(arguments):
+    """Return the Options of report.toml with what the command line says instead."""
+    from slamlib.report.options import read_options
+    options = read_options("report.toml")
+    cover = {key: getattr(arguments, key) for key in ("author", "student_number")}
+    others = {key: getattr(arguments, key) for key in ("code", "appendix")}
+    return replace(options, cover=replace(options.cover, **_given(cover)), **_given(others))
 
 
-def _report(options):
+def _given(values):
+    return {key: value for key, value in values.items() if value is not None}
+
+
+def _built(arguments, options, folder, datasets, **shown):
+    """Return the Report that is built into a folder, or None if a notebook failed; tell doubts."""
     from slamlib.report import NotebookError, build_report
-    from slamlib.report.cover import read_cover
     from slamlib.report.sources import copy_notebooks, notebooks_folder
-    cover = read_cover("report.toml")
-    given = {"author": options.author, "student_number": options.student_number}
-    cover = replace(cover, **{key: value for key, value in given.items() if value is not None})
-    names = [_name(dataset, options.data) for dataset in options.datasets] or None
-    dataset_names(options.data, names)                     # before notebooks are copied
-    notebooks = options.notebooks or notebooks_folder()
-    if options.notebooks_to:
-        notebooks = copy_notebooks(notebooks, options.notebooks_to)
+    dataset_names(arguments.data, datasets)                # before notebooks are copied
+    notebooks = arguments.notebooks or notebooks_folder()
+    if arguments.notebooks_to:
+        notebooks = copy_notebooks(notebooks, arguments.notebooks_to)
     try:
         report = build_report(
-            notebooks, options.data, options.report, options.results,
-            datasets=names, jobs=options.jobs, cover=cover, code=options.code,
-            kept=KEPT, fresh=options.fresh, appendix=options.appendix)
+            notebooks, arguments.data, folder, arguments.results, datasets=datasets,
+            jobs=arguments.jobs, cover=options.cover, code=options.code, kept=KEPT,
+            fresh=arguments.fresh, **shown)
     except NotebookError as error:
         print(f"slamlib: {error}", file=sys.stderr)
-        return 1
-    if not cover.author:
+        return None
+    if not options.cover.author:
         print("report.toml names no author: the PDF's title page has none", file=sys.stderr)
     for drive in report.drives:
         for doubt in drive.doubts:
             print(f"{drive.name}: doubt ({doubt.what}): {doubt.sentence}", file=sys.stderr)
-    print(f"report: {report.files[0]} and {report.files[-1]}", file=sys.stderr)
-    return _exit_code((drive.name, failure.problem, failure.reason)
-                      for drive in report.drives for failure in drive.failures)
+    return report
+
+
+def _failures(report):
+    return ((drive.name, failure.problem, failure.reason)
+            for drive in report.drives for failure in drive.failures)
 
 
 def _exit_code(failures):
@@ -192,10 +154,11 @@ def _exit_code(failures):
     return code
 
 
-def _name(dataset, data):
-    """Return the name of a dataset, given by its name or by the path of its folder in `data`."""
-    path = Path(dataset)
-    return path.name if path.resolve().parent == data.resolve() else dataset
+def _names(arguments):
+    """Return the names of the datasets, given by names or paths of folders in data/, or None."""
+    paths = {dataset: Path(dataset) for dataset in arguments.datasets}
+    return [path.name if path.resolve().parent == arguments.data.resolve() else dataset
+            for dataset, path in paths.items()] or None
 
 
 def _solve(options):
@@ -229,28 +192,9 @@ def _export(options):
     return 0
 
 
-def _count(text):
-    return _number(text, int, 0, float("inf"), "a whole number from 0 on")
-
-
-def _positive(text):
-    return _number(text, int, 1, float("inf"), "a whole number from 1 on")
-
-
-def _share(text):
-    return _number(text, float, 0, 1, "a number from 0 to 1")
-
-
-def _number(text, kind, least, most, expected):
-    try:
-        value = kind(text)
-    except ValueError:
-        value = float("nan")
-    if not least <= value <= most:
-        raise argparse.ArgumentTypeError(f"expected {expected}, found {text[:60]!r}")
-    return value
+RUN = {"report": _report, "hand-in": _hand_in, "solve": _solve, "simulate": _simulate,
+       "export": _export, "lab": _lab}
 
 
 if __name__ == "__main__":
-    sys.stdout.reconfigure(errors="backslashreplace")  # as stderr, for names in other letters
     sys.exit(main())

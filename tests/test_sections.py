@@ -55,19 +55,19 @@ def test_sections_have_the_numbers_of_the_pages():
 
 def test_nothing_is_changed_where_nothing_is_left_out():
     books = {ONE: book()}
-    assert shown(books, ALL)[ONE] is books[ONE]
+    assert shown(books, ALL, {})[ONE] is books[ONE]
 
 
 def test_a_section_ends_at_the_next_heading_of_its_level_wherever_this_is(capsys):
     path, whole = Path("1_told_once.ipynb"), book()
     before = deepcopy(whole)
-    left = content(shown({path: whole}, ALL - {"truth"})[path])
+    left = content(shown({path: whole}, ALL - {"truth"}, {})[path])
     assert not re.search("Errors|truth|Deep|more|errors|printed|said|Before", left)
     for kept in ("The lead.", "## no heading", "first()", "## Said\n\nIt.", "below", "End."):
         assert kept in left
     assert whole == before
     told = capsys.readouterr().err
-    assert told == "1_told_once: section 'Errors' is left out, no dataset has truth\n"
+    assert told == "1_told_once: section 'Errors' left out (no dataset has truth)\n"
 
 
 @pytest.mark.parametrize("entry, gone, kept", [
@@ -76,7 +76,7 @@ def test_a_section_ends_at_the_next_heading_of_its_level_wherever_this_is(capsys
     ("errors", "Errors|Deep|errors|Before", "Said"), ("1.3", "Said|It|below", "Before|said|Last"),
     ("really last", "End", "Last"), ("1.4", "## Last", "Really last"), ("1", "", "")])
 def test_what_is_named_is_left_out(entry, gone, kept):
-    books = shown({ONE: book(), TWO: titled("2. Two")}, ALL, [entry])
+    books = shown({ONE: book(), TWO: titled("2. Two")}, ALL, {entry: "here"})
     assert TWO in books and (ONE in books) == (entry != "1")
     left = content(books[ONE]) if ONE in books else ""
     assert not (gone and re.search(gone, left)) and all(
@@ -84,7 +84,7 @@ def test_what_is_named_is_left_out(entry, gone, kept):
 
 
 def test_numbers_are_those_without_what_no_dataset_allows():
-    left = content(shown({ONE: book()}, {"uwb"}, ["1.2"])[ONE])
+    left = content(shown({ONE: book()}, {"uwb"}, {"1.2": "here"})[ONE])
     assert "Said" not in left and "Errors" not in left and "Last" in left
 
 
@@ -106,7 +106,8 @@ def test_a_notebook_may_need_truth():
 @pytest.mark.parametrize("entry", ["3", "A.3", "Explore", ""])
 def test_what_is_unknown_is_told_with_what_there_is(entry):
     books = {ONE: book(), MORE: titled("A. More", new_code_cell("say('## Computed\\n\\nText')"))}
-    assert to_execute(books, {"A.1": "", "Computed": "", "1": "", "1.2.2": ""}) == books
+    assert to_execute(books, dict.fromkeys(["A.1", "Computed", "1", "1.2.2"], "here")) == books
+    assert to_execute(books, {"unknown": ""}) == books
     with pytest.raises(DatasetError) as told:
         to_execute(books, {entry: "report.toml, line 3"})
     said = str(told.value)
@@ -117,7 +118,7 @@ def test_what_is_unknown_is_told_with_what_there_is(entry):
 
 def test_an_appendix_that_is_left_out_is_not_executed_and_a_chapter_is():
     books = {ONE: titled("1. One"), MORE: titled("A. More")}
-    assert [*to_execute(books, {"A": "", "1": ""})] == [ONE]
+    assert [*to_execute(books, {"A": "here", "1": "here"})] == [ONE]
 
 
 def test_references_to_what_is_left_out_are_plain_text():
@@ -127,11 +128,11 @@ def test_references_to_what_is_left_out_are_plain_text():
         figure("Figure 1.1. A."),
         new_markdown_cell(f"## Gone\n\n{TABLE}Table 1.1. T.\n\n$$ x \\tag{{1.1}} $$"),
         figure("Figure 1.2. B."), new_markdown_cell("## Last"), figure("Figure 1.3. C."))}
-    left = shown(books, ALL, ["Errors"])
+    left = shown(books, ALL, {"Errors": "here"})
     assert texts(numbered(left, books)[ONE])[1] == (
         "See figures 1.1 (left out), [1.1](#figure-1.1) and [1.2](#figure-1.2), table "
         "[1.1](#table-1.1) and equation [1.1](#eq-1.1).\n\n")
-    left = shown(books, ALL, ["Gone"])
+    left = shown(books, ALL, {"Gone": "here"})
     assert texts(numbered(left, books)[ONE])[1].startswith(
         "See figures [1.1](#figure-1.1), 1.2 (left out) and [1.2](#figure-1.2), table 1.1 and "
         "equation 1.1.")

@@ -15,7 +15,7 @@ from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_outp
 
 from slamlib.notebook import code, inline, plain, plotting
 from slamlib.report import NotebookError, build_report
-from slamlib.report.cover import Cover
+from slamlib.report.options import Cover
 from slamlib.report.pages import html_page
 from slamlib.report.pdf import typst_files
 from slamlib.report.sanitize import cleaned, sanitized

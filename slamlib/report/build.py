@@ -25,7 +25,6 @@ from slamlib.folder import left_in
 from slamlib.notebook import notices
 from slamlib.report import cache, overview
 from slamlib.report.chapters import available, chapter_of, in_order, printed, with_data
-from slamlib.report.cover import Cover
 from slamlib.report.drives import read_drives
 from slamlib.report.execution import (
     execute,
@@ -34,6 +33,7 @@ from slamlib.report.execution import (
     temporary_folder,
 )
 from slamlib.report.numbering import numbered
+from slamlib.report.options import Cover
 from slamlib.report.pages import html_pages
 from slamlib.report.pdf import typeset
 from slamlib.report.pictures import title_picture
@@ -57,7 +57,8 @@ class Report:
 
 
 def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=None,
-                 code="method", kept=None, fresh=False, appendix=True, leave_out=None):
+                 code="method", kept=None, fresh=False, appendix=True, leave_out=None,
+                 files=True):
     """Execute all notebooks, write pages and PDF; return the Report.
 
     Kernels read the absolute paths of data and results, and the selection, from the environment
@@ -77,6 +78,7 @@ def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=
     appendix : bool; False leaves out the appendices.
     leave_out : dict as of `sections.to_execute`, what else is not shown, or None for nothing.
         An appendix that is left out is not executed; a chapter is, as it writes the results.
+    files : bool; False leaves the table of the result files out of the opening.
 
     Raises
     ------
@@ -90,7 +92,7 @@ def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=
     kept = kept and Path(kept).resolve()
     notebooks, data, report, results = (
         Path(folder).resolve() for folder in (notebooks, data, report, results))
-    address = _address(results, report)
+    address = _address(results, report) if files else None
     cover = cover or Cover()
     books, selected, has = _checked_input(notebooks, data, datasets, cover, appendix,
                                           leave_out or {})
@@ -117,16 +119,17 @@ def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=
         books, written = _executed(books, keys, environment, max(1, jobs), stage, kept, fresh)
         print("setting the pages and the PDF", file=sys.stderr)
         drives = read_drives(data, stage, selected, written, notices(books.values()))
-        files = rendered(books, drives, cover, code, address,
-                         partial(shown, has=has, leave_out=leave_out or {}))
-        for name, content in files.items():
+        made = rendered(books, drives, cover, code,
+                        address,
+                        partial(shown, has=has, leave_out=leave_out or {}))
+        for name, content in made.items():
             swap.write(pages / name, content)
         swap.require_staged(stage)
         swap.publish([
-            swap.Set(report, {name: pages / name for name in files}, last=next(iter(files))),
+            swap.Set(report, {name: pages / name for name in made}, last=next(iter(made))),
             *_result_sets(results, stage, selected, written)])
     print(_resources_used(time.monotonic() - start), file=sys.stderr)
-    return Report([report / name for name in files], drives)
+    return Report([report / name for name in made], drives)
 
 
 def _address(results, report):
@@ -218,7 +221,8 @@ def rendered(books, drives, cover, code, results, shown=lambda books: books):
     books : dict from Path to NotebookNode, executed, in order.
     drives : list of SolvedDrive, of which the opening tells.
     cover, code : as of `build_report`.
-    results : str, the path of the results folder from that of the report.
+    results : str, the path of the results folder from that of the report, or None as of
+        `overview.summary`.
     shown : function of the books that returns them without the sections that are left out.
     """
     whole, books = books, shown(books)

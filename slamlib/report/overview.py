@@ -30,7 +30,8 @@ FEW = 3  # drives, at most, that the abstract names one by one
 def summary(drives, address="."):
     """Return the opening of the report, an executed NotebookNode, for a list of SolvedDrive.
 
-    `address` (str) is the path of the results folder from that of the report.
+    `address` (str) is the path of the results folder from that of the report; with None the table
+    of the files to hand in is left out.
     """
     cells = [new_markdown_cell("# Overview\n\n" + abstract(drives), id="what")]
     solved = [drive for drive in drives if drive.solutions]
@@ -40,7 +41,7 @@ def summary(drives, address="."):
         cells.append(new_markdown_cell(f"## Doubts about the data\n\n{doubts}", id="doubts"))
     if notes := _notes(drives):
         cells.append(new_markdown_cell(notes, id="notes"))
-    if any(drive.files for drive in drives):
+    if address is not None and any(drive.files for drive in drives):
         cells.append(new_markdown_cell(
             "## Files to hand in\n\n" + _file_table(drives, PurePosixPath(address)), id="files"))
     if solved:

@@ -55,28 +55,33 @@ def sections(source, book):
     return found
 
 
-def shown(books, has, leave_out=()):
+def shown(books, has, leave_out):
     """Return the books (dict from Path to NotebookNode) without what a report leaves out.
 
     These are sections that need what the datasets do not have, `has` (a set by
     `chapters.available`), and what `leave_out` names, as in `to_execute`.
     """
-    left_out, result = {_key(entry) for entry in leave_out}, {}
+    left_out, result = {_key(entry): place for entry, place in leave_out.items()}, {}
+
+    def lacks(each):
+        return f"no dataset has {each.needs}" if each.needs not in {None, *has} else None
+
+    def asked(each):
+        return next((left_out[key] for key in (_key(each.number), _key(each.title))
+                     if each.level > 1 and key in left_out), None)
+
     for source, book in books.items():
         if _is_left_out(source, book, left_out):
             print_once(f"{source.stem}: left out")
             continue
-        for reason, unwanted in (
-                ("no dataset has {}", lambda each: each.needs and each.needs not in has),
-                ("as asked for", lambda each: each.level > 1 and left_out & {
-                    _key(each.number), _key(each.title)})):
-            dropped = set()
-            for at, each in enumerate(sections(source, book)):
-                if unwanted(each):
-                    dropped.add(at)
-                    print_once(f"{source.stem}: section '{each.title}' is left out, "
-                               + reason.format(each.needs))
-            book = _without(book, dropped)
+        for why in (lacks, asked):
+            found = sections(source, book)
+            reasons = {at: reason for at, each in enumerate(found)
+                       if (reason := why(each)) is not None}
+            for at, reason in reasons.items():
+                if reason:
+                    print_once(f"{source.stem}: section '{found[at].title}' left out ({reason})")
+            book = _without(book, reasons.keys())
         result[source] = book
     return result
 
@@ -88,8 +93,9 @@ def to_execute(books, leave_out):
     ----------
     books : dict from Path to NotebookNode, all that there are.
     leave_out : dict from what is left out to where this is asked for (str), such as
-        "report.toml, line 3". It is a chapter by its number ("2" or "B"), or a section by its
-        number ("3.5") or title. Sections are numbered as where nothing is left out by this dict.
+        "report.toml, line 3", or "" where it need not exist. It is a chapter by its number ("2" or
+        "B"), or a section by its number ("3.5") or title. Sections are numbered as where nothing is
+        left out by this dict.
 
     Raises
     ------
@@ -97,7 +103,8 @@ def to_execute(books, leave_out):
         code names them.
     """
     for entry, place in leave_out.items():
-        _require_known(books, entry, place)
+        if place:
+            _require_known(books, entry, place)
     left_out = {_key(entry) for entry in leave_out}
     return {source: book for source, book in books.items()
             if not (is_appendix(chapter_of(source, book))
@@ -151,7 +158,7 @@ def _announced(book):
 
 
 def _without(book, dropped):
-    """Return a book without the sections at these indexes (set of int) of those by `sections`."""
+    """Return a book without the sections at these indexes of those by `sections`."""
     if not dropped:
         return book
     number, left, cells = count(), 0, []  # left: the level of the section that is left out, or 0

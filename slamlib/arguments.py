@@ -1,0 +1,111 @@
+"""The options of the command line."""
+
+import argparse
+import sys
+from pathlib import Path
+
+DATA = Path("data")
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message):
+        """End with exit code 2 and one sentence, without argparse's usage."""
+        told = " ".join(message.split())
+        self.exit(2, f"slamlib: {told} ({self.prog} --help shows the usage)\n")
+
+
+def parser():
+    """The parser of the command line; what it returns has the name `command`."""
+    prog = Path(sys.argv[0]).name
+    whole = _Parser(prog=prog if prog == "slamlib" else "python -m slamlib",
+                    description="Vehicle SLAM from wheel encoders, markers and UWB ranges.")
+    commands = whole.add_subparsers(dest="command", required=True)
+
+    report = commands.add_parser("report", help="execute the notebooks and build the report")
+    report.add_argument("--report", type=Path, default=Path("report"), help="folder for the pages")
+    _build_options(report)
+
+    hand_in = commands.add_parser(
+        "hand-in", help="build the report and put it into a zip, with the result files")
+    hand_in.add_argument("--out", type=Path, default=Path("hand-in.zip"),
+                         help="the file to write (default %(default)s)")
+    _build_options(hand_in)
+
+    solve = commands.add_parser("solve", help="solve a dataset's problems without notebooks")
+    solve.add_argument("folder", type=Path, metavar="FOLDER", help="the dataset's folder")
+    solve.add_argument("--out", type=Path, required=True, help="folder for the results")
+
+    simulate = commands.add_parser("simulate", help="make a dataset with its truth")
+    simulate.add_argument("folder", type=Path, metavar="FOLDER", help="a new or empty folder")
+    simulate.add_argument("--path", choices=("short", "long"), default="short")
+    simulate.add_argument("--rounds", type=_positive, default=1,
+                          help="how often the path is driven; 44 long ones are a million rows")
+    simulate.add_argument("--seed", type=_count, default=0)
+    simulate.add_argument("--slip", type=_share, default=1e-3, metavar="SQRT_M",
+                          help="wheel slip: sigma after one metre, in m (default %(default)s)")
+    simulate.add_argument("--nlos", type=_share, default=0.0, metavar="SHARE",
+                          help="share of UWB ranges without line of sight, which are too long")
+    simulate.add_argument("--mislabel", type=_share, default=0.0, metavar="SHARE",
+                          help="share of marker sightings that carry another marker's id")
+
+    export = commands.add_parser("export", help="write trajectories as TUM files or CSV")
+    export.add_argument("results", type=Path, metavar="RESULTS", help="a folder of results, of one "
+                        "problem's results, or the folder truth of a dataset")
+    export.add_argument("--format", choices=("tum", "csv"), default="tum",
+                        help="tum has pose numbers as time stamps; csv has covariances, too")
+    export.add_argument("--out", type=Path, required=True, help="folder for the files")
+
+    lab = commands.add_parser("lab", help="open JupyterLab on the notebooks; it is given all other "
+                                          "arguments, as --no-browser", allow_abbrev=False)
+    lab.add_argument("--data", type=Path, default=DATA, help="folder of the datasets")
+    lab.add_argument("--notebooks", type=Path)
+    return whole
+
+
+def _build_options(parser):
+    """Add the options of `report` and `hand-in` to a parser."""
+    parser.add_argument("datasets", nargs="*", metavar="DATASET",
+                        help="names of folders in data/ (all of them when none is named)")
+    parser.add_argument("--data", type=Path, default=DATA, help="folder of the datasets")
+    parser.add_argument("--notebooks", type=Path, help="folder of the notebooks (default: the "
+                        "folder notebooks where there is one, else those of the installation)")
+    parser.add_argument("--notebooks-to", type=Path, metavar="FOLDER",
+                        help="copy the notebooks to this new or empty folder first, to edit them "
+                        "there, and build the report from it")
+    parser.add_argument("--results", type=Path, default=Path("results"),
+                        help="folder for the .mat files")
+    parser.add_argument("--jobs", type=_positive, default=2, help="notebooks executed at a time")
+    code = parser.add_mutually_exclusive_group()
+    code.add_argument("--no-code", dest="code", action="store_const", const="none",
+                      help="leave out code cells and printed text")
+    code.add_argument("--all-code", dest="code", action="store_const", const="all",
+                      help="show the code that plots, prints and tabulates, too")
+    parser.add_argument("--appendix", action=argparse.BooleanOptionalAction,
+                        help="show the notebooks whose title begins with a letter, or leave them "
+                             "out (the report has them, the hand-in has not)")
+    parser.add_argument("--author", help="on the PDF's title page, instead of report.toml's")
+    parser.add_argument("--student-number", help="the same")
+    parser.add_argument("--fresh", action="store_true",
+                        help="execute all notebooks and studies, also where nothing changed")
+
+
+def _count(text):
+    return _number(text, int, 0, float("inf"), "a whole number from 0 on")
+
+
+def _positive(text):
+    return _number(text, int, 1, float("inf"), "a whole number from 1 on")
+
+
+def _share(text):
+    return _number(text, float, 0, 1, "a number from 0 to 1")
+
+
+def _number(text, kind, least, most, expected):
+    try:
+        value = kind(text)
+    except ValueError:
+        value = float("nan")
+    if not least <= value <= most:
+        raise argparse.ArgumentTypeError(f"expected {expected}, found {text[:60]!r}")
+    return value

@@ -1,0 +1,71 @@
+"""The file report.toml: the title page, and what the report and the hand-in show."""
+
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+
+from slamlib.report.chapters import CODE
+from slamlib.textfile import DatasetError, quoted, read_toml
+
+ESTIMATES = {"aruco": "problem2", "fused": "problem2_fused", "hint": "problem2_hint"}
+
+
+@dataclass(frozen=True)
+class Cover:
+    """The lines of the title page; an empty line is left out."""
+
+    title: str = "Localization and mapping of a differential-drive vehicle"
+    author: str = ""
+    student_number: str = ""
+    course: str = ""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What report.toml says."""
+
+    cover: Cover = Cover()
+    leave_out: dict = field(default_factory=dict)  # as of `sections.to_execute`
+    appendix: bool | None = None  # None: the report has it, the hand-in has not
+    code: str = "method"  # one of chapters.CODE
+    problem2: str = "aruco"  # the estimate that is handed in, one of ESTIMATES: the assignment
+    #                          requires markers alone, and calls the fusion facultative
+
+
+def read_options(path):
+    """Return the Options that the file `path` (str or Path) describes; without it, the defaults.
+
+    DatasetError if the file is not TOML, has an unknown key, or a value is not as it must be.
+    """
+    path = Path(path)
+    if not path.exists():
+        return Options()
+    lines = [each.name for each in fields(Cover)]
+    others = [each.name for each in fields(Options) if each.name != "cover"]
+    entries = read_toml(path, 'author = "Ada Lovelace"', [*lines, *others], encoding="utf-8")
+    values = {key: _checked(key, value, f"{path}, line {line}" if line else str(path))
+              for key, (value, line) in entries.items()}
+    return Options(Cover(**{key: values[key] for key in lines if key in values}),
+                   **{key: values[key] for key in others if key in values})
+
+
+def _checked(key, value, place):
+    """Return the value of a key as Options have it; DatasetError, which begins with `place`."""
+    def require(ok, expected):
+        if not ok:
+            raise DatasetError(f"{place}: expected {expected} for {key}, found {quoted(value)}")
+
+    choices = {"code": CODE, "problem2": ESTIMATES}.get(key)
+    if choices:
+        require(type(value) is str and value in choices,
+                f"one of {', '.join(map(repr, choices))}")
+    elif key == "appendix":
+        require(type(value) is bool, "true or false")
+    elif key == "leave_out":
+        require(type(value) is list and all(type(entry) is str for entry in value),
+                'a list of numbers and titles in quotes, such as ["B", "3.5", "Explore"],')
+        return dict.fromkeys(value, place)
+    else:
+        require(type(value) in (str, int) and str(value).isprintable(), "a line of text in quotes")
+        require("\ufffd" not in str(value), "UTF-8 text")
+        return str(value)
+    return value

@@ -1,0 +1,196 @@
+"""The zip to hand in: the assignment's files and names, and a README.txt that is true of them."""
+
+import re
+from dataclasses import replace
+from zipfile import ZipFile
+
+import nbformat
+import numpy as np
+import pytest
+from conftest import contradicted
+from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
+from test_pdf import text_of
+from test_report import write
+
+from slamlib.__main__ import main
+from slamlib.doubt import Doubt
+from slamlib.report import handin
+from slamlib.report.drives import SolvedDrive
+from slamlib.report.options import Cover, Options
+from slamlib.simulation import simulate, write_dataset
+from slamlib.solve import Failure, Solution
+
+SOLVE = """from slamlib.notebook import *
+from slamlib.solve import allows
+drives = start()
+for problem in {problems}:
+    left, found = solved([drive for drive in drives if allows(drive.dataset, problem)], [problem])
+    for drive, solution, files in delivered(left, found):
+        say(f"{{drive.name}}: {{solution.problem}}")"""
+SIX = ["problem1", "problem2", "problem2_hint", "problem2_fused", "problem3", "problem4"]
+
+
+def drive_of(name="mine", first=40, **without):
+    """The first poses of a simulated drive, whose first sighting is at a later pose, no truth."""
+    dataset, _ = simulate("short", seed=3)
+    dataset = dataset.first(first)
+    later = dataset.aruco.select(dataset.aruco.pose >= 10)
+    return replace(dataset, name=name, aruco=later, **without)
+
+
+def project(folder, problems=SIX, **datasets):
+    """A folder with datasets and notebooks: a chapter for all problems, and an appendix."""
+    for name, dataset in datasets.items():
+        write_dataset(folder / "data" / name, *dataset)
+    write(folder / "notebooks", "A_more", "# A. More\n\nOnly if asked for.")
+    cells = [new_markdown_cell("# 1. All"), new_code_cell(SOLVE.format(problems=problems)),
+             new_markdown_cell("## Middle\n\nRead this."),
+             new_markdown_cell("## Files\n\nOf another folder."),
+             new_markdown_cell("## Explore\n\nMove the slider.")]
+    nbformat.write(new_notebook(cells=cells), folder / "notebooks" / "1_all.ipynb")
+
+
+@pytest.fixture(scope="module")
+def handed(tmp_path_factory):
+    """A hand-in of a recorded dataset beside a simulated one, and what the run said."""
+    folder = tmp_path_factory.mktemp("hand in")
+    simulated, truth = simulate("short", seed=4)
+    project(folder, mine=(drive_of(), None),
+            stand_in=(simulated.first(30), replace(truth, poses=truth.poses[:30])))
+    (folder / "report.toml").write_text('author = "Ada"\nproblem2 = "fused"\n')
+    (folder / "report").mkdir()
+    (folder / "report" / "index.html").write_text("the pages of the usual build")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        assert main(["hand-in", "--jobs", "1"]) == 0
+    return folder, ZipFile(folder / "hand-in.zip")
+
+
+def test_the_names_are_the_assignment_s_and_the_files_are_the_results(handed):
+    folder, archive = handed
+    files = {"problem1/vehiclePose.mat": "problem1/vehiclePose.mat",
+             "problem2/ArucoMap.mat": "problem2/ArucoMap.mat",
+             "problem2/vehiclePose.mat": "problem2_fused/vehiclePose.mat",
+             **{f"problem{n}/{name}.mat": f"problem{n}/{name}.mat"
+                for n in (3, 4) for name in ("ArucoMap", "vehiclePose")},
+             "problem4/UwbMap.mat": "problem4/UwbMap.mat"}
+    assert archive.namelist() == sorted(
+        ["README.txt", "report.pdf", *(f"mine/{name}" for name in files)])
+    for name, result in files.items():
+        assert archive.read(f"mine/{name}") == (folder / "results/mine" / result).read_bytes()
+
+
+def test_the_pdf_is_without_what_is_for_screens_and_the_usual_pages_stay(handed):
+    folder, archive = handed
+    text = re.sub(r"\s+", " ", text_of(archive.read("report.pdf"), folder))
+    assert "1.1 Middle" in text and "Read this." in text and "Ada" in text
+    assert not re.search("Explore|slider|another folder|Files to hand in|asked for|stand_in", text)
+    assert [file.name for file in (folder / "report").iterdir()] == ["index.html"]
+
+
+def test_the_readme_is_true_of_the_files(handed):
+    text = handed[1].read("README.txt").decode()
+    one_line = re.sub(r"\s+", " ", text)
+    for part in ("Ada", "mine/problem2: vehiclePose.mat and ArucoMap.mat odometry + ArUco; 40 of "
+                 "40 poses have an estimate", "mine/problem4: vehiclePose.mat, ArucoMap.mat and "
+                 "UwbMap.mat SLAM: odometry + ArUco + UWB; 40 of 40", "fused with odometry",
+                 "mine/problem2/ArucoMap.mat is the map by the ArUco measurements alone, because "
+                 "the fusion has no map of its own. Its world frame is the frame of pose 11.",
+                 "The simulated dataset stand_in is left out.", "gtsam 4.3", "are NaN",
+                 "calls the folder of this estimate problem2_fused"):
+        assert part in one_line
+    assert max(map(len, text.split("\n"))) <= handin.COLUMNS and text.endswith("\n")
+
+
+def test_equal_input_gives_equal_bytes_and_the_date_is_fixed(handed, monkeypatch, capsys):
+    folder, archive = handed
+    before = (folder / "hand-in.zip").read_bytes()
+    monkeypatch.chdir(folder)
+    assert main(["hand-in", "--out", "new/second.zip"]) == 0
+    assert (folder / "new" / "second.zip").read_bytes() == before
+    assert {entry.date_time for entry in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
+    told = capsys.readouterr().err
+    assert "1_all: nothing changed, not executed again" in told
+    assert "hand-in: without stand_in, which are simulated" in told
+    assert f"hand-in: {(folder / 'new' / 'second.zip').resolve()}\n" in told
+    assert [file.name for file in (folder / "new").iterdir()] == ["second.zip"]
+
+
+def test_what_cannot_be_solved_is_said_and_the_rest_is_handed_in(tmp_path, monkeypatch, capsys):
+    """Every sighting contradicts itself; the appendix is asked for, and nobody is named."""
+    dataset = drive_of(uwb=None)
+    project(tmp_path, SIX[:4], bad=(replace(dataset, aruco=contradicted(dataset.aruco)), None))
+    monkeypatch.chdir(tmp_path)
+    assert main(["hand-in", "bad", "--appendix"]) == 3
+    told = capsys.readouterr().err
+    assert "bad: problem2 could not be solved: " in told and "names no author" in told
+    archive = ZipFile(tmp_path / "hand-in.zip")
+    assert archive.namelist() == ["README.txt", "bad/problem1/vehiclePose.mat", "report.pdf"]
+    text = re.sub(r"\s+", " ", archive.read("README.txt").decode())
+    assert "bad/problem2 (ArUco): could not be solved: expected sightings" in text
+    assert "bad/problem3 (SLAM: odometry + ArUco): the report has no result of it." in text
+    assert "/problem4 (SLAM: odometry + ArUco + UWB): there are no UWB ranges in this da" in text
+    assert "Only if asked for." in text_of(archive.read("report.pdf"), tmp_path)
+
+
+def test_a_folder_in_the_place_of_the_zip_is_told_before_anything_is_built(
+        tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "out").mkdir()
+    assert main(["hand-in", "--out", "out"]) == 2
+    assert capsys.readouterr().err == (
+        "slamlib: out: expected the name of a file to write, found a folder\n")
+    assert [file.name for file in tmp_path.iterdir()] == ["out"]
+
+
+def test_simulated_datasets_are_left_out_where_there_are_recorded_ones_only(tmp_path):
+    simulated, truth = simulate("short", seed=4)
+    write_dataset(tmp_path / "short", simulated, truth)
+    assert handin.selection(tmp_path) == (None, [])  # as of a report on all: nothing is executed
+    write_dataset(tmp_path / "mine", simulated, None)
+    assert handin.selection(tmp_path) == (["mine"], ["short"])
+    assert handin.selection(tmp_path, ["short"]) == (["short"], [])
+    write_dataset(tmp_path / "short" / "never", simulated, None)
+    assert handin.selection(tmp_path) == (["mine"], ["short"])
+
+
+def solved_drive(*problems, **others):
+    """A SolvedDrive of two poses, the first of which has no estimate by markers alone."""
+    dataset = drive_of("d", 2)
+    poses = np.zeros((2, 3))
+    solutions = [Solution(problem, problem, poses, np.zeros((2, 3, 3)),
+                          world=int(problem == "problem2")) for problem in problems]
+    return SolvedDrive("d", dataset, None, tuple(solutions), **others)
+
+
+@pytest.mark.parametrize("problem2, folder, aruco_map", [
+    ("aruco", "problem2", "problem2"), ("fused", "problem2_fused", "problem2"),
+    ("hint", "problem2_hint", "problem2_hint")])
+def test_the_map_of_problem_2_is_that_of_its_estimate_if_it_has_one(problem2, folder, aruco_map):
+    files = ("notes.mat", "problem1/other.mat", "problem2/ArucoMap.mat", "problem2/vehiclePose.mat",
+             "problem2_fused/vehiclePose.mat", "problem2_hint/ArucoMap.mat",
+             "problem2_hint/vehiclePose.mat")
+    drive = solved_drive("problem2", "problem2_fused", "problem2_hint", files=files)
+    assert handin.handed_in(drive, problem2) == {
+        "problem2/vehiclePose.mat": f"{folder}/vehiclePose.mat",
+        "problem2/ArucoMap.mat": f"{aruco_map}/ArucoMap.mat"}
+    text = handin.readme([drive], Options(problem2=problem2))
+    assert ("no map of its own" in text) == (problem2 == "fused")
+    assert ("In d/problem2 it is the frame of the vehicle at pose 2" in text) == (
+        problem2 == "aruco")
+    files = files[:3]  # no poses of the chosen estimate: the map alone is not handed in
+    if problem2 != "aruco":
+        assert handin.handed_in(replace(drive, files=files), problem2) == {}
+
+
+def test_doubts_and_failures_are_in_the_readme_and_empty_headings_are_not():
+    drive = solved_drive("problem1", files=("problem1/vehiclePose.mat",), doubts=(
+        Doubt("units", "Lengths may be in millimetres."),), failures=(
+        Failure("problem3", "SLAM", "no landmark"), Failure("problem2_hint", "hint", "not told")))
+    text = handin.readme([drive], Options(Cover(author="A", course="C")), ["x", "y"])
+    assert "d: Lengths may be in millimetres." in text
+    assert "could not be solved: no landmark." in text and "not told" not in text
+    assert "The simulated datasets x and y are left out." in text
+    assert text.startswith(f"{Cover().title}\nA\nC\n")
+    text = handin.readme([replace(drive, doubts=())], Options())
+    assert "Doubts" not in text and "Notes" not in text
