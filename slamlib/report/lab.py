@@ -25,7 +25,8 @@ def start_lab(notebooks, data, kept, arguments):
     (settings / "overrides.json").write_text(json.dumps(OVERRIDES))
     options = [f"--LabApp.app_settings_dir={settings}",
                "--LabApp.check_for_updates_class=jupyterlab.NeverCheckForUpdate"]
-    if hasattr(os, "geteuid") and os.geteuid() == 0:  # as in containers; it listens to this machine alone
+    # As in containers; JupyterLab listens to this machine alone. Windows has no such numbers.
+    if hasattr(os, "geteuid") and os.geteuid() == 0:
         options.append("--allow-root")
     os.execve(sys.executable,
               [sys.executable, "-m", "jupyterlab", *options, *arguments, str(notebooks)],
