@@ -10,7 +10,7 @@ from test_dataset import error_of, write
 from slamlib import counts
 from slamlib.dataset import Vehicle, read_dataset
 from slamlib.localization import drive_doubts
-from slamlib.simulation import manoeuvre, simulate, write_dataset
+from slamlib.simulation import simulate, write_dataset
 
 simulated = cache(simulate)
 
