@@ -12,7 +12,7 @@ from pathlib import Path
 # Set before numpy is imported: the matrices are so small that more threads are slower.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from slamlib.dataset import DatasetError, found, read_dataset, read_truth  # noqa: E402
+from slamlib.dataset import DatasetError, read_dataset, read_truth  # noqa: E402
 
 
 def main(arguments=None):
@@ -162,6 +162,7 @@ def _name(dataset, data):
 
 
 def _solve(options):
+    from slamlib.inventory import found
     from slamlib.summary import solve_to_folder
     dataset, truth = read_dataset(options.folder), read_truth(options.folder)
     print("\n".join(found(dataset, truth)), file=sys.stderr)

@@ -228,6 +228,10 @@ def test_faults_in_a_mat_file_are_named_by_variable_and_row(folder, value, said)
     (b"", "that can be read"), (b"nonsense", "that can be read"),
     (b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + b"\0" * 99, "of version 7 or older")])
 def test_a_mat_file_that_cannot_be_read(folder, content, said):  # noqa: F811
-    (folder / "UwbReading.txt").unlink()
     write(folder / "logs.mat", content)
-    assert f"logs.mat: expected a .mat file {said}" in error_of(read_dataset, folder)
+    assert read_dataset(folder).notes == ("Not read: logs.mat.",)
+    (folder / "UwbReading.txt").unlink()
+    note, = read_dataset(folder).notes
+    assert note.startswith(f"logs.mat is not read: expected a .mat file {said}")
+    (folder / "logs.mat").rename(folder / "UwbReading.mat")
+    assert f"UwbReading.mat: expected a .mat file {said}" in error_of(read_dataset, folder)
