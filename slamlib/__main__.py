@@ -12,13 +12,7 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from slamlib.arguments import parser  # noqa: E402
-from slamlib.dataset import (  # noqa: E402
-    DatasetError,
-    dataset_names,
-    found,
-    read_dataset,
-    read_truth,
-)
+from slamlib.dataset import DatasetError, dataset_names, read_dataset, read_truth  # noqa: E402
 from slamlib.swap import ENDS  # noqa: E402
 
 KEPT = Path("build", "executed")
@@ -162,10 +156,12 @@ def _names(arguments):
 
 
 def _solve(options):
+    from slamlib.inventory import found
     from slamlib.summary import solve_to_folder, table
     dataset, truth = read_dataset(options.folder), read_truth(options.folder)
     print("\n".join(found(dataset, truth)), file=sys.stderr)
-    print(table(summary := solve_to_folder(dataset, truth, options.out, jobs=2)))
+    summary = solve_to_folder(dataset, truth, options.out, jobs=2)
+    print(table(summary))
     return _exit_code((summary["dataset"], name, row["failed"])
                       for name, row in summary["problems"].items() if "failed" in row)
 

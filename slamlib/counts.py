@@ -12,8 +12,35 @@ MANY = 20_000  # sightings; of more, the first ones decide
 MOVING = 5.0  # standard deviations by which a wheel's way is above the noise of a pair
 LESS = 5.0  # ratio of the ways by counts and by markers from which they contradict
 MIN_ROWS = 4  # rows after the first that may be judged at all
-EVEN = 0.25  # share of the last row's size by which even growth may be missed
+FALLING = 0.02  # share of the rows that are smaller than the one before
+LEAP = 0.5  # share of the last row's size by which two rows in succession differ
+GROWING = 1.15  # ratio of the mean sizes of the last and the middle third
 ALIKE = 2.0  # and up to which they agree
+
+
+def since_previous(table, vehicle, aruco):
+    """Counts since the pose before (n, 2) int64, and notes (list of str) if they had to be made.
+
+    Raises DatasetError if the first row is not 0, or a step is above MOST_REVOLUTIONS.
+
+    Parameters
+    ----------
+    table : dialects.Table of the encoders, with whole numbers.
+    vehicle : Vehicle
+    aruco : ArucoReadings or None
+    """
+    ticks = table.numbers[:, 1:]
+    if reason := run_on(ticks, vehicle, aruco):
+        return differences(ticks).astype(np.int64), [
+            f"{table.source.name} holds counts since the start ({reason}): the difference of each "
+            "row from the one before was taken."]
+    table.require(~ticks[:1].any(axis=1), "'1 0 0' as the first row (no step leads to pose 1; "
+                  "counts are since the previous pose, not since the start)")
+    most = MOST_REVOLUTIONS * vehicle.ticks_per_revolution
+    table.require((abs(ticks) <= most).all(axis=1),
+                  f"at most {MOST_REVOLUTIONS:g} wheel revolutions ({most:g} ticks) in one "
+                  "step (counts since the previous pose, not since the start)")
+    return ticks.astype(np.int64), []
 
 
 def run_on(counts, vehicle, aruco):
@@ -50,16 +77,17 @@ def run_on(counts, vehicle, aruco):
 
 
 def may_run_on(counts):
-    """True if rows (n, 2) grow in proportion to their number, within EVEN of the last one.
+    """True if the size of rows (n, 2) grows until the end, hardly ever falls and never leaps.
 
-    So do counts since the start at constant speed, and increments of a vehicle that speeds up until
-    the end.
+    So do counts since the start, and increments of a vehicle that speeds up until the end.
     """
     size = abs(counts[1:]).sum(axis=1)
     if len(size) < MIN_ROWS:
         return False
-    expected = size[-1] * np.arange(1, len(size) + 1) / len(size)
-    return bool(abs(size - expected).max() < EVEN * size[-1])
+    steps = np.diff(size)
+    _, middle, end = (part.mean() for part in np.array_split(size, 3))
+    return bool(np.mean(steps < 0) < FALLING and abs(steps).max() < LEAP * size[-1]
+                and end > GROWING * middle)
 
 
 def differences(counts):

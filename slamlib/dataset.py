@@ -178,37 +178,14 @@ def read_dataset(folder):
     vehicle = _read_vehicle(files, default=Vehicle())
     table = _read_encoder(files, notes)
     aruco = _read_aruco(files, len(table.numbers), notes)
-    ticks = _ticks(table, vehicle, aruco, notes)
+    ticks, more = counts.since_previous(table, vehicle, aruco)
+    notes += more
     antenna, position = _read_map(
         files, "UwbAntennaGuess.txt", "antenna id, x, y", notes, optional="z")
     guess = AntennaGuess(antenna, position) if len(antenna) else None
     uwb = _read_uwb(files, len(ticks), guess, notes)
     return Dataset(name=Path(abspath(folder)).name, vehicle=vehicle, ticks=ticks, aruco=aruco,
                    uwb=uwb, antenna_guess=guess, notes=tuple(notes))
-
-
-def found(dataset, truth):
-    """Lines (list of str) on what was read of a drive, a Dataset and its Truth or None.
-
-    There is a line on each sensor, the vehicle and the truth, then the notes of both.
-    """
-    seen, ranges, default = dataset.aruco, dataset.uwb, asdict(Vehicle())
-    changed = [f"{key} = {value:g}" for key, value in asdict(dataset.vehicle).items()
-               if value != default[key]]
-    right, left = abs(dataset.ticks).sum(axis=0)
-    lines = [
-        f"encoders: {len(dataset.ticks)} poses, {right} ticks right and {left} left",
-        "markers: none, no ArucoReading.txt with rows" if seen is None else
-        f"markers: {len(seen.pose)} sightings of {len(np.unique(seen.marker))} markers at "
-        f"{len(np.unique(seen.pose))} poses",
-        "ranges: none, no UwbReading.txt with rows" if ranges is None else
-        f"ranges: {len(ranges.pose)} ranges to {len(np.unique(ranges.antenna))} antennas at "
-        f"{len(np.unique(ranges.pose))} poses",
-        f"vehicle.toml: {', '.join(changed)}" if changed else
-        "vehicle.toml: none, or as the assignment's table 2",
-        f"truth: {'no' if truth is None else 'yes'}"]
-    notes = [f"note: {note}" for note in (*dataset.notes, *(truth.notes if truth else ()))]
-    return [f"{dataset.name}: {line}" for line in (*lines, *notes)]
 
 
 def read_truth(folder):
@@ -275,22 +252,6 @@ def _read_encoder(files, notes):
         raise error(table.source, "expected at least the row '1 0 0', found no rows")
     table.require((table.numbers == np.rint(table.numbers)).all(axis=1), "whole numbers of ticks")
     return table
-
-
-def _ticks(table, vehicle, aruco, notes):
-    """Counts since the pose before (n, 2) int64 from the Table of the encoders."""
-    ticks = table.numbers[:, 1:]
-    if reason := counts.run_on(ticks, vehicle, aruco):
-        notes.append(f"{table.source.name} holds counts since the start ({reason}): the difference "
-                     "of each row from the one before was taken.")
-        return counts.differences(ticks).astype(np.int64)
-    table.require(~ticks[:1].any(axis=1), "'1 0 0' as the first row (no step leads to "
-                  "pose 1; counts are since the previous pose, not since the start)")
-    most = counts.MOST_REVOLUTIONS * vehicle.ticks_per_revolution
-    table.require((abs(ticks) <= most).all(axis=1),
-                  f"at most {counts.MOST_REVOLUTIONS:g} wheel revolutions ({most:g} ticks) in one "
-                  "step (counts since the previous pose, not since the start)")
-    return ticks.astype(np.int64)
 
 
 def _read_aruco(files, pose_count, notes):

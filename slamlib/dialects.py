@@ -149,11 +149,11 @@ def _in_plain_dialect(source, text, columns, gaps, optional):
         return "", columns, notes
     header = lines[filled[0]]
     if _is_header(header, columns, more=len(filled) > 1):
+        _require_order(source, header, filled[0] + 1, columns)
         lines[filled.pop(0)] = ""
-        _require_order(source, header, filled, columns, text)
         notes.append(f"{name}: the header {ascii(header[:60])} was left out.")
     for end in ",;":                                # an empty last cell in every row
-        if filled and all(lines[k].endswith(end) for k in filled):
+        if filled and all(lines[k].endswith(end) and lines[k] != end for k in filled):
             lines = [line.removesuffix(end).rstrip() for line in lines]
     for wanted in [columns] + ([[*columns, optional]] if optional else []):
         body = "\n".join(lines)
@@ -194,9 +194,12 @@ def _translated(body, dialect):
 
 
 def _is_header(line, columns, more):
-    """True if a line has words and no number; without `more` rows it must name two columns."""
+    """True if a line has words of which none begins as a number does.
+
+    Without `more` rows it must name two columns.
+    """
     words = [word for word in re.split(r"[\s,;]+", line) if word]
-    numbers = any(NUMBER.fullmatch(word) or NAN.fullmatch(word) or "inf" in word.lower()
+    numbers = any(re.match(r"\W*\d", word) or NAN.fullmatch(word) or "inf" in word.lower()
                   for word in words)
     return bool(re.search("[A-Za-z]", line)) and not numbers and (
         more or len(_named(line, columns)) > 1)
@@ -209,11 +212,10 @@ def _named(header, columns):
             if column in WORDS and re.fullmatch(WORDS[column], word)]
 
 
-def _require_order(source, header, filled, columns, text):
+def _require_order(source, header, line, columns):
     """Raise DatasetError if the header names columns in another order."""
     named = _named(header, columns)
     if named != sorted(named):
-        line = next(k for k, each in enumerate(text.split("\n"), start=1) if header in each)
         raise error(source, f"expected the columns in the order ({', '.join(columns)}), found the "
                     f"header {quoted(header)}", line)
 

@@ -78,11 +78,13 @@ def contents(folder, expected=FILES):
         copies |= {found, *others}
     rest = [path for path in paths if path not in copies]
     if expected is FILES:
-        variables, more = _mat_tables([path for path in rest if path.suffix.lower() == ".mat"],
-                                      [name for name in TABLES if name not in files])
+        variables, more, unread = _mat_tables(
+            [path for path in rest if path.suffix.lower() == ".mat"],
+            [name for name in TABLES if name not in files])
         files |= variables
         notes += more
-        rest = [path for path in rest if path not in {each.path for each in variables.values()}]
+        told = {*unread, *(each.path for each in variables.values())}
+        rest = [path for path in rest if path not in told]
     for path in rest:
         if (name := _meant(path, expected)) and name not in files:
             raise _misnamed(path, name)
@@ -98,8 +100,10 @@ def contents(folder, expected=FILES):
 def is_dataset(folder):
     """True if a folder, or one of its sub-folders, holds files of a dataset under any names."""
     paths = _listed(folder)
-    return any(_role(path, FILES) or path.suffix.lower() in (".mat", ".zip") for path in paths) \
-        or any(path.is_dir() and _holds_encoder(path) for path in paths)
+    mats = [path for path in paths if path.suffix.lower() == ".mat"]
+    return any(_role(path, FILES) or ARCHIVE.search(path.name) for path in paths) \
+        or any(path.is_dir() and _holds_encoder(path) for path in paths) \
+        or bool(_mat_tables(mats, TABLES)[0])
 
 
 def left_in(data):
@@ -205,10 +209,20 @@ def _misnamed(path, name):
 
 
 def _mat_tables(paths, names):
-    """Variables of .mat files by the names that they have of `names`, and notes."""
-    files, notes = {}, []
-    for path in paths:
-        variables = mat_variables(path)
+    """Variables of .mat files by the names that they have of `names`, notes, and unreadable files.
+
+    A file that cannot be read is refused if its own name is one of them.
+    """
+    files, notes, unread = {}, [], []
+    for path in paths if names else ():
+        try:
+            variables = mat_variables(path)
+        except DatasetError as failure:
+            if any(_stem(path.stem) == _stem(name) for name in names):
+                raise
+            notes.append(f"{path.name} is not read{str(failure).removeprefix(str(path))}.")
+            unread.append(path)
+            continue
         known = {variable.lower(): variable for variable in variables}
         single = len(variables) == 1 and _stem(path.stem) in {_stem(name) for name in names}
         for name in names:
@@ -225,4 +239,4 @@ def _mat_tables(paths, names):
         left = [variable for variable in variables if variable not in used]
         if used and left:
             notes.append(f"Not read: variables {_some(left)} of {path.name}.")
-    return files, notes
+    return files, notes, unread

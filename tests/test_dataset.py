@@ -473,8 +473,8 @@ def test_numbers_at_the_limits_are_read_and_beyond_them_refused(tmp_path, name, 
 def test_a_vehicle_at_the_limits_is_read_and_beyond_them_refused(tmp_path, key):
     limit, parameter = LIMITS["vehicle.toml"][key], key.removeprefix("sigma_")
     write(tmp_path / "encoderReading.txt", "1 0 0\n")
-    most = 5.0 if isinstance(limit.most, str) else limit.most
-    other = f"{parameter} = 5\n" if isinstance(limit.most, str) else ""
+    most = 2.0 if isinstance(limit.most, str) else limit.most
+    other = f"{parameter} = 2\n" if isinstance(limit.most, str) else ""
     for value, away in ((limit.least, -np.inf), (most, np.inf)):
         write(tmp_path / "vehicle.toml", f"{key} = {float(value)!r}\n{other}")
         assert getattr(read_dataset(tmp_path).vehicle, key) == value

@@ -106,9 +106,12 @@ REFUSED = [
     ("encoderReading.txt", "pose, left ticks, right ticks\n1, 0, 0", 1, "expected the columns in "
      "the order (pose id, right ticks, left ticks), found the header 'pose, left ticks, right "),
     ("ArucoReading.txt", "# c\nmarker pose x y theta\n" + ROW, 2, "expected the columns in"),
+    ("UwbReading.txt", '"pose","antenna","sigma","range"\n1,3,1,1', 1, "expected the columns in"),
     ("ArucoReading.txt", "pose x y marker theta\n" + ROW, 1, "expected the columns in the order"),
     ("ArucoReading.txt", "p m x y theta s_yy s_xy\n" + ROW, 1, "expected the columns in the order"),
     ("UwbReading.txt", "hello", 1, "expected 4 columns"),
+    ("UwbReading.txt", "1a 3b 1.5c 0,1d\n1 3 1.5 0.1", 1, "expected finite numbers"),
+    ("UwbReading.txt", "; \n;", 1, "expected 4 columns"),
     ("UwbReading.txt", "hello you there now", 1, "expected finite numbers"),
     ("UwbAntennaGuess.txt", "3 1 2 0.5\n900 1 2", 1, "expected 3 columns"),
 ]
@@ -225,6 +228,10 @@ def test_faults_in_a_mat_file_are_named_by_variable_and_row(folder, value, said)
     (b"", "that can be read"), (b"nonsense", "that can be read"),
     (b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + b"\0" * 99, "of version 7 or older")])
 def test_a_mat_file_that_cannot_be_read(folder, content, said):  # noqa: F811
-    (folder / "UwbReading.txt").unlink()
     write(folder / "logs.mat", content)
-    assert f"logs.mat: expected a .mat file {said}" in error_of(read_dataset, folder)
+    assert read_dataset(folder).notes == ("Not read: logs.mat.",)
+    (folder / "UwbReading.txt").unlink()
+    note, = read_dataset(folder).notes
+    assert note.startswith(f"logs.mat is not read: expected a .mat file {said}")
+    (folder / "logs.mat").rename(folder / "UwbReading.mat")
+    assert f"UwbReading.mat: expected a .mat file {said}" in error_of(read_dataset, folder)

@@ -11,7 +11,14 @@ from numeric import central_differences
 from scipy.linalg import block_diag
 
 from slamlib import increments, se2, slam
-from slamlib.dataset import AntennaGuess, Dataset, UwbReadings, Vehicle
+from slamlib.dataset import (
+    AntennaGuess,
+    Dataset,
+    DatasetError,
+    UwbReadings,
+    Vehicle,
+    read_dataset,
+)
 from slamlib.localization import drive_doubts, units
 from slamlib.localization.doubts import (
     GENEROUS_SLIP,
@@ -24,7 +31,7 @@ from slamlib.localization.doubts import (
 )
 from slamlib.localization.marker_increments import consecutive_increments
 from slamlib.sightings import Sightings, sightings_by_frame
-from slamlib.simulation import manoeuvre, simulate
+from slamlib.simulation import manoeuvre, simulate, write_dataset
 
 SEEDS = (0, 1, 2)
 simulated = cache(simulate)
@@ -392,3 +399,91 @@ def test_headings_contradict_positions_if_an_odd_number_of_signs_is_wrong(
     C[:, 2, 2] = 1.0                                             # headings that nothing is known of
     unknown = sightings_by_frame(replace(dataset.aruco, covariance=C))
     assert not _headings_contradict(unknown, consecutive_increments(unknown))
+
+
+# Units of lengths: (what is multiplied, by what); every one ends in a doubt or a refusal.
+
+def in_unit(dataset, what, factor):
+    """The dataset with some of its lengths in another unit, and the vehicle's parameters."""
+    a, u, v, g = dataset.aruco, dataset.uwb, dataset.vehicle, dataset.antenna_guess
+    place, size = np.array([factor, factor, 1.0]), {}
+    if "xy" in what:
+        a = replace(a, marker_in_vehicle=a.marker_in_vehicle * place)
+    if "covariance" in what:
+        a = replace(a, covariance=a.covariance * np.outer(place, place))
+    if "range" in what:
+        u = replace(u, range=u.range * factor)
+    if "sigma" in what:
+        u = replace(u, sigma=u.sigma * factor)
+    if "guess" in what:
+        g = replace(g, position=g.position * factor)
+    for name, value in vars(v).items():
+        if "radius" in name and "radii" in what or "wheelbase" in name and "base" in what:
+            size[name] = value * factor
+    return replace(dataset, aruco=None if "no markers" in what else a, antenna_guess=g,
+                   uwb=None if "no ranges" in what else u, vehicle=replace(v, **size))
+
+
+LENGTHS = [
+    "xy", "xy covariance", "covariance", "xy no ranges", "xy covariance no ranges", "range",
+    "range sigma", "sigma", "guess", "range guess", "range sigma guess", "range no markers",
+    "range sigma no markers", "guess no markers", "range sigma guess no markers",
+    "xy range sigma guess", "xy covariance range sigma", "xy covariance range sigma guess", "radii",
+    "base", "radii base", "radii no markers", "base no markers", "radii base no markers",
+    "radii base no ranges", "radii base no markers no ranges", "range sigma radii base",
+    "xy covariance range sigma guess radii base"]
+
+
+@pytest.mark.parametrize("count", [150, 2000])
+@pytest.mark.parametrize("factor", [100.0, 1000.0])
+@pytest.mark.parametrize("what", LENGTHS)
+def test_lengths_in_another_unit_are_doubted_or_refused(what, factor, count, tmp_path):
+    """Of short drives of 1.5 m and 20 m; in the data they come with a vehicle of table 2."""
+    spoilt = in_unit(simulated("short", 0)[0].first(count), what, factor)
+    write_dataset(tmp_path / "drive", spoilt)
+    if "radii" in what or "base" in what:
+        with pytest.raises(DatasetError, match="vehicle.toml, line .: expected a positive number "):
+            read_dataset(tmp_path / "drive")
+    else:
+        doubts = drive_doubts(read_dataset(tmp_path / "drive"))
+        assert {doubt.what for doubt in doubts} == {"units"}
+
+
+@pytest.mark.parametrize("what, said", [
+    ("covariance", "s_xx, s_xy and s_yy in ArucoReading.txt"), ("sigma", "sigma in UwbReading")])
+def test_standard_deviations_in_another_unit_are_named(what, said):
+    for seed in SEEDS:
+        doubt, = drive_doubts(in_unit(simulated("short", seed)[0], what, 100.0))
+        assert doubt.what == "units" and f"look at the unit of {said}" in doubt.sentence
+
+
+def test_variances_of_headings_in_square_degrees_are_named():
+    scale = np.array([1.0, 1.0, np.degrees(1)])
+    for seed in SEEDS:
+        dataset = simulated("short", seed)[0]
+        a = dataset.aruco
+        doubt, = drive_doubts(replace(dataset, aruco=replace(
+            a, covariance=a.covariance * np.outer(scale, scale))))
+        assert doubt.what == "units" and "s_thetatheta" in doubt.sentence
+
+
+@pytest.mark.parametrize("larger, doubted", [(14.0, False), (16.0, True)])
+def test_scatter_is_that_of_the_noise_where_the_vehicle_stands(larger, doubted):
+    """Ranges of 5 m with a noise of 0.1 m to two antennas, in any order."""
+    rng, count = np.random.default_rng(0), 20_000
+    pose = rng.permutation(count)
+    ranges = UwbReadings(pose, pose % 2, 5 + 3 * (pose % 2) + rng.normal(0, 0.1, count),
+                         np.full(count, 0.1 * larger))
+    doubts = units.sigma_units(replace(simulated("short", 0)[0], aruco=None, uwb=ranges))
+    assert len(doubts) == doubted
+    if doubted:
+        assert "scatter by 0.101 m at most" in doubts[0].sentence
+
+
+def test_ranges_exchanged_with_their_sigmas_are_doubted():
+    for count in (150, 2000):
+        dataset = simulated("short", 0)[0].first(count)
+        u = dataset.uwb
+        doubts = drive_doubts(replace(dataset, uwb=replace(u, range=u.sigma, sigma=u.range)))
+        assert {doubt.what for doubt in doubts} == {"units"}
+        assert all("UwbReading.txt" in doubt.sentence for doubt in doubts)

@@ -7,8 +7,9 @@ import pytest
 from test_dataset import FILES, assert_same, error_of, folder, write  # noqa: F401
 from test_dialects import assert_same_but_notes
 
-from slamlib.dataset import DatasetError, dataset_names, found, read_dataset, read_truth
+from slamlib.dataset import DatasetError, dataset_names, read_dataset, read_truth
 from slamlib.folder import left_in
+from slamlib.inventory import found
 
 
 @pytest.mark.parametrize("variant", [
@@ -143,8 +144,8 @@ def test_files_one_folder_deeper(folder):  # noqa: F811
 
 
 @pytest.mark.parametrize("name, listed", [
-    ("encoder.txt", True), ("uwb.txt", True), ("vehicle.toml.txt", True), ("drive.mat", True),
-    ("notes.txt", False), ("README.md", False), ("photo.jpg", False)])
+    ("encoder.txt", True), ("uwb.txt", True), ("vehicle.toml.txt", True), ("UwbReading.mat", True),
+    ("notes.txt", False), ("vehiclePose.mat", False), ("README.md", False), ("photo.jpg", False)])
 def test_a_folder_that_looks_like_a_dataset_is_not_left_out(folder, name, listed):  # noqa: F811
     write(folder.parent / "other" / name, b"\0")
     if listed:

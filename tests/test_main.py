@@ -288,3 +288,28 @@ def test_sightings_that_contradict_each_other_cost_problem_2_only(tmp_path, caps
     problems = json.loads((tmp_path / "out" / "summary.json").read_text())["problems"]
     assert [name for name, row in problems.items() if "failed" in row] == ["problem2"]
     assert "drive: problem2 could not be solved: expected sightings" in capsys.readouterr().err
+
+
+def test_what_was_found_and_mended_is_said_first_and_kept_in_the_summary(tmp_path, capsys):
+    drive = tmp_path / "drive"
+    write_dataset(drive, *simulate("short", 3))
+    (drive / "ArucoReading.txt").rename(drive / "ArucoReading.txt.txt")
+    (drive / "UwbReading.txt").unlink()
+    (drive / "truth" / "ArucoMap.txt").rename(drive / "truth" / "ArucoMap.csv")
+    assert main(["solve", str(drive), "--out", str(tmp_path / "out")]) == 0
+    *found, first, second = capsys.readouterr().err.splitlines()
+    assert found[1].startswith("drive: markers: ") and "sightings of 33 markers" in found[1]
+    assert found[2] == "drive: ranges: none, no UwbReading.txt with rows"
+    notes = ["ArucoReading.txt.txt was read as ArucoReading.txt.",
+             "In truth: ArucoMap.csv was read as ArucoMap.txt."]
+    assert [first, second] == [f"drive: note: {note}" for note in notes]
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["notes"] == notes
+
+
+def test_files_that_are_refused_end_in_one_sentence(tmp_path, capsys):
+    (tmp_path / "encoderReading.txt").write_text("1 0 0\n")
+    (tmp_path / "ArucoMeasurements.txt").write_text("")
+    assert main(["solve", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
+    assert capsys.readouterr().err == (
+        f"slamlib: {tmp_path / 'ArucoMeasurements.txt'}: expected the name ArucoReading.txt: "
+        "rename it, or move it away\n")

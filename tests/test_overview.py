@@ -2,6 +2,7 @@
 
 import base64
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -271,3 +272,13 @@ def test_poses_that_are_none_are_told_in_one_sentence(project, content, reason):
 
 def test_names_are_shown_as_they_are():
     assert overview.plain("a_b*c|<d> $e$") == "a_b&#42;c&#124;&#60;d&#62; &#36;e&#36;"
+
+
+def test_notes_on_files_stand_on_the_first_page_only_where_there_are_any(project, summary):
+    dataset = read_dataset(project[0] / "data" / "wheels_only")
+    assert not [cell for cell in summary.cells if cell.id == "notes"]
+    drives = [solved_drives.SolvedDrive(name, replace(dataset, notes=notes), None, ())
+              for name, notes in (("a", ()), ("b_*", ("X*.txt is not read.", "Y holds no rows.")))]
+    notes = next(cell.source for cell in overview.summary(drives).cells if cell.id == "notes")
+    assert notes == ("Notes on the files of *b&#95;&#42;*: X&#42;.txt is not read. "
+                     "Y holds no rows.")

@@ -131,8 +131,8 @@ def _counts_doubts(dataset):
         return []
     most = abs(dataset.ticks).max()
     return [Doubt("counts-since-start", (
-        f"The counts in encoderReading.txt grow evenly from row to row, up to {most} in one row: "
-        "either the vehicle speeds up until the end, or they are counts since the start, where "
+        f"The counts in encoderReading.txt grow from row to row until the end, up to {most} in one "
+        "row: either the vehicle speeds up until then, or they are counts since the start, where "
         "those since the previous pose are expected. Look at encoderReading.txt."))]
 
 

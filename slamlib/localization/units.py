@@ -74,11 +74,11 @@ def range_units(dataset):
     if dataset.uwb is None or dataset.antenna_guess is None:
         return []
     path, antennas = path_and_antennas(dataset)
-    extent = np.hypot(*path.std(axis=0))
     few = not antennas
     if few:
         _, antennas = path_and_antennas(dataset, FEW_RANGES)
-    if sum(len(r) for _, r, _ in antennas) < MIN_RANGES or extent < SMALLEST_EXTENT:
+    if sum(len(r) for _, r, _ in antennas) < MIN_RANGES \
+            or (extent := np.hypot(*path.std(axis=0))) < SMALLEST_EXTENT:
         return []
     # Between the quartiles lie 1.35 standard deviations of a normal distribution.
     spread = np.median([np.subtract(*np.percentile(r, [75, 25])) / 1.35 for _, r, _ in antennas])

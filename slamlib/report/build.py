@@ -20,8 +20,9 @@ except ImportError:  # Windows
     resource = None
 
 from slamlib import locks, swap
-from slamlib.dataset import DatasetError, dataset_names, found, read_dataset, read_truth
+from slamlib.dataset import DatasetError, dataset_names, read_dataset, read_truth
 from slamlib.folder import left_in
+from slamlib.inventory import found
 from slamlib.notebook import notices
 from slamlib.report import cache, overview
 from slamlib.report.chapters import available, chapter_of, in_order, printed, with_data
