@@ -76,7 +76,7 @@ def _folders(source):
     is_truth = source.is_dir() and source.resolve().name.lower() == "truth"
     if is_truth or (source / POSES).is_file():
         return [source]
-    folders = sorted(path.parent for path in source.glob(f"*/{POSES}"))
+    folders = sorted(path.parent for path in source.glob(f"[!.]*/{POSES}"))
     if not folders:
         raise DatasetError(f"{source}: expected a folder with {POSES}, with sub-folders that have "
                            "one, or the folder truth of a dataset; found none of them")

@@ -211,6 +211,30 @@ def test_a_chapter_of_which_no_drive_can_be_solved_runs_on_a_simulated_one(tmp_p
         "problem2_fused", "problem2_hint"]
 
 
+def test_chapters_say_which_noise_was_given(tmp_path, kept):
+    """And not that it was learned, of the one drive whose vehicle.toml gives it."""
+    dataset = simulate("short", seed=3)[0].first(600)
+    write_dataset(tmp_path / "data" / "own", dataset)
+    given = replace(dataset.vehicle, slip=2e-3, marker_noise_factor=1.25, range_noise_factor=0.75)
+    write_dataset(tmp_path / "data" / "told", replace(dataset, vehicle=given))
+    (tmp_path / "notebooks").mkdir()
+    for source in (ROOT / "notebooks").glob("[1-4]*.ipynb"):
+        shutil.copy(source, tmp_path / "notebooks")
+    report = build_report(tmp_path / "notebooks", tmp_path / "data", tmp_path / "report",
+                          tmp_path / "results", kept=kept)
+    first, second, third, fourth = (
+        " ".join(re.sub(r"<[^>]+>", "", html.unescape(page.read_text(encoding="utf-8"))).split())
+        for page in report.files[1:5])
+    assert first.count("Known of the noise: slip = 0.002, marker_noise_factor = 1.25 and "
+                       "range_noise_factor = 0.75.") == 1
+    assert re.findall(r"(\d\S+) \(given\)", second) == ["2.00"]
+    assert "On told the slip after one metre is 2.00 mm, as given" in third
+    assert re.search(r"On own the slip after one metre is \d\.\d\d mm ± \d+ %", third)
+    for text, file, factor in ((third, "Aruco", "1.25"), (fourth, "Uwb", "0.75")):
+        assert text.count(f"in {file}Reading.txt are multiplied by {factor}, as given") == 1
+        assert text.count(f"in {file}Reading.txt are confirmed (factor ") == 1
+
+
 def captions(page):
     return re.findall(r'<p class="caption" id="(figure|table)-(\d+|[A-Z])\.(\d+)">', page)
 

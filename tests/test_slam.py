@@ -629,7 +629,7 @@ def test_every_kernel_solves_a_drive_with_wrong_labels_and_late_ranges(kernel):
                     for gate in (True, False))
     assert gated.rejected.any() and not open_.rejected.any()
     assert ate(gated.poses, truth) < 0.02
-    np.testing.assert_allclose(gated.noise.sightings, 1, atol=0.15)
+    np.testing.assert_allclose(gated.noise.sightings, 1, atol=0.05)
     assert (ate(open_.poses, truth) < 0.03) == (kernel not in ("quadratic", *robust.ONE_SIDED))
     assert (gated.range_weight < 1).any()
 
