@@ -196,7 +196,6 @@ with summary.tables([Path({str(folders[0])!r})], print) as wait:
                                env=os.environ | {"PYTHONPATH": str(ROOT)})
     child = process.stdout.readline().strip()
     assert running(child)
-    time.sleep(0.5)                                # until it has told the system whom it ends with
     process.send_signal(number)
     process.communicate()
     until = time.monotonic() + 60
