@@ -18,6 +18,7 @@ from slamlib import summary
 from slamlib.report import build as building
 from slamlib.report import progress
 from slamlib.report.progress import Progress
+from slamlib.studies import memory
 
 CELLS = [new_markdown_cell("# 1. One\n\nText."), new_code_cell("1"), new_code_cell(" "),
          new_markdown_cell("Text.\n\n## Two"), new_code_cell("2"), new_code_cell("3")]
@@ -149,8 +150,16 @@ def test_the_first_numbers_come_before_the_notebooks_the_shortest_drive_first(
     assert "poses" not in capsys.readouterr().err
     build(tmp_path, kept=tmp_path / "kept", fresh=True)
     assert "short: 2 poses" in capsys.readouterr().err
-    cells = json.loads((tmp_path / "kept" / "seconds.json").read_text())["1_one"]
+    cells = json.loads((tmp_path / "kept" / "seconds_computed.json").read_text())["1_one"]
     assert len(cells) == 1 and next(iter(cells.values())) > 0
+
+
+def test_builds_that_compute_studies_and_those_that_recall_them_have_their_own_times(tmp_path):
+    assert building._seconds(tmp_path).name == "seconds_computed.json"
+    (tmp_path / "studies" / ("0" * 64)).mkdir(parents=True)               # of other code
+    assert building._seconds(tmp_path).name == "seconds_computed.json"
+    (tmp_path / "studies" / memory.CODE).mkdir()
+    assert building._seconds(tmp_path).name == "seconds_recalled.json"
 
 
 @pytest.fixture
@@ -196,7 +205,6 @@ with summary.tables([Path({str(folders[0])!r})], print) as wait:
                                env=os.environ | {"PYTHONPATH": str(ROOT)})
     child = process.stdout.readline().strip()
     assert running(child)
-    time.sleep(0.5)                                # until it has told the system whom it ends with
     process.send_signal(number)
     process.communicate()
     until = time.monotonic() + 60

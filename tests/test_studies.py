@@ -134,6 +134,20 @@ def test_only_studies_of_other_code_are_removed(folder, computed):
     assert len(kept(folder)) == 3
 
 
+@pytest.mark.parametrize("kernel, told, shown", [
+    (True, False, True), (True, True, False), (False, False, False)])
+def test_a_study_shows_a_bar_in_a_kernel_of_jupyterlab_and_not_in_the_build(
+        monkeypatch, tmp_path, capsys, computed, kernel, told, shown):
+    monkeypatch.setattr(memory, "BAR_AFTER", 0.0)
+    monkeypatch.delitem(sys.modules, "ipykernel", raising=False)
+    if kernel:
+        monkeypatch.setitem(sys.modules, "ipykernel", studies)
+    if told:
+        monkeypatch.setenv("SLAMLIB_PROGRESS", str(tmp_path / "told"))
+    study()
+    assert ("markers_alone" in capsys.readouterr().err) == shown
+
+
 CELL = """from slamlib import studies
 from slamlib.studies import montecarlo
 for share in (0.0, 0.05):

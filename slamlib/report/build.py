@@ -41,10 +41,10 @@ from slamlib.report.pictures import title_picture
 from slamlib.report.sections import shown, to_execute
 from slamlib.report.setting import missing_glyphs
 from slamlib.solve import OURS
-from slamlib.studies.memory import forget
+from slamlib.studies.memory import CODE, forget
 from slamlib.summary import tables
 
-STUDIES, SECONDS = "studies", "seconds.json"  # in the cache, besides executed notebooks
+STUDIES = "studies"  # in the cache, besides executed notebooks
 FIRST = 10.0  # s, for which the notebooks wait for the first numbers
 BUILDING = ".slamlib-build.lock"  # in folders that only one build at a time changes
 
@@ -210,8 +210,13 @@ def _executed(books, keys, environment, jobs, stage, kept, fresh):
     if kept is not None and fresh:
         forget(kept / STUDIES)
     execute({source: book for source, book in books.items() if source not in executed},
-            environment, stage, jobs, finish, kept and kept / SECONDS)
+            environment, stage, jobs, finish, kept and _seconds(kept))
     return {source: executed[source] for source in books}, sorted(written)
+
+
+def _seconds(kept):
+    """Return the Path of the seconds that cells take, which are more where studies are computed."""
+    return kept / f"seconds_{'recalled' if (kept / STUDIES / CODE).is_dir() else 'computed'}.json"
 
 
 def rendered(books, drives, cover, code, results, shown=lambda books: books):

@@ -5,20 +5,21 @@ seeds and options; it does not depend on a user's datasets. While a report is bu
 SLAMLIB_STUDIES names the folder of the studies that are kept. Without it each is computed. Times
 that a trial measures are kept as well and are not for a page. SLAMLIB_SEEDS, a number, cuts every
 study to its first seeds; tests of pages use it. The file SLAMLIB_PROGRESS tells the build how far a
-study is.
+study is; in JupyterLab, where there is none, a study that takes longer shows a bar.
 """
 
 import hashlib
 import os
 import platform
 import shutil
+import sys
 import warnings
 from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 from joblib import Memory
-from tqdm import tqdm
+from tqdm.auto import tqdm
 
 from slamlib.studies import workers
 
@@ -26,9 +27,10 @@ SLAMLIB = Path(__file__).parents[1]
 SHOWING = ("notebook", "report")           # folders that show studies and do not compute them
 PACKAGES = ("numpy", "scipy", "gtsam")
 THREADS = ("OMP_", "OPENBLAS_", "MKL_")    # how the names of variables begin
+BAR_AFTER = 5.0                            # s
 
 
-def run(trial, seeds, jobs=2, progress=False, **options):
+def run(trial, seeds, jobs=2, **options):
     """Numbers of trial(seed, **options) for all seeds: a dict of (s,) arrays.
 
     Parameters
@@ -36,11 +38,10 @@ def run(trial, seeds, jobs=2, progress=False, **options):
     trial : function of a module in slamlib.studies that returns a dict of numbers.
     seeds : iterable of int.
     jobs : number of processes.
-    progress : True shows a bar.
     """
     name = f"{trial.__module__}.{trial.__name__}"
     seeds = list(seeds)[:int(os.environ.get("SLAMLIB_SEEDS", len(seeds)))]
-    arguments = trial, name, seeds, options, _threads(), jobs, progress
+    arguments = trial, name, seeds, options, _threads(), jobs
     folder = os.environ.get("SLAMLIB_STUDIES")
     if not folder or not name.startswith(f"{__package__}.") or code() != CODE:
         return _compute(*arguments)                       # not ours to keep, or edited meanwhile
@@ -48,13 +49,14 @@ def run(trial, seeds, jobs=2, progress=False, **options):
     memory = Memory(Path(folder) / CODE, verbose=0, compress=True)     # zlib finds damaged files
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Exception while loading results")    # computed again
-        return memory.cache(_compute, ignore=["trial", "jobs", "progress"])(*arguments)
+        return memory.cache(_compute, ignore=["trial", "jobs"])(*arguments)
 
 
-def _compute(trial, name, seeds, options, threads, jobs, progress):
+def _compute(trial, name, seeds, options, threads, jobs):
     rows, told = [], os.environ.get("SLAMLIB_PROGRESS")
     for row in tqdm(workers.rows(trial, seeds, options, jobs), total=len(seeds),
-                    disable=not progress):
+                    desc=trial.__name__, leave=False, delay=BAR_AFTER,
+                    disable=bool(told) or "ipykernel" not in sys.modules):
         rows.append(row)
         if told:
             Path(told).write_text(f"{trial.__name__} {len(rows)} of {len(seeds)}")
