@@ -1,6 +1,7 @@
 """The Explore sections: a picture on the page, sliders in JupyterLab, and the numbers they draw."""
 
 import re
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -125,7 +126,32 @@ def test_reset_brings_all_first_values_back_and_draws_once():
     new.value = 2
     assert drawn[1:] == [{"a": 2, "name": "two"}]
     reset.click()
+    reset.click()                                              # there is nothing to return from
     assert drawn[2:] == [{"a": 1, "name": "two"}]
+
+
+def test_widgets_that_the_kernel_serves_at_once_draw_one_after_the_other():
+    """JupyterLab gives every widget a thread of the kernel: a second one moves while one draws."""
+    drawing_now, never, drawn = threading.Lock(), threading.Event(), []
+
+    def draw(**values):
+        assert drawing_now.acquire(blocking=False)
+        drawn.append(values)
+        if values["a"] == 2:
+            threads[1].start()
+            never.wait(0.2)                                     # the other one waits for the lock
+        drawing_now.release()
+        return plt.figure()
+
+    panel = controls.panel(draw, {name: explore.slider(name, 1, 0, 9) for name in "ab"})
+    (a, b), reset, _ = parts_of(panel)
+    threads = [threading.Thread(target=setattr, args=(a, "value", 2)),
+               threading.Thread(target=reset.click)]
+    threads[0].start()
+    threads[0].join()
+    threads[1].join()
+    a.value = b.value = 5                    # widgets that Reset replaced change nothing any more
+    assert drawn == [{"a": 1, "b": 1}, {"a": 2, "b": 1}, {"a": 1, "b": 1}]
 
 
 def test_a_slider_follows_the_mouse_while_its_drawings_take_less_than_0_3_s(seconds):

@@ -1,14 +1,17 @@
-"""JupyterLab as a user sees it: a notebook is opened and run, and a slider of Explore is moved."""
+"""JupyterLab as a user sees it: a notebook is opened and run, and sliders of Explore are moved."""
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+import nbformat
 import pytest
+from nbformat.v4 import new_code_cell, new_notebook
 from test_report import build, make_data, write
 from test_studies import CELL, kept
 
@@ -19,6 +22,20 @@ from slamlib.report.execution import kernel_environment
 ROOT = Path(__file__).parents[1]
 SECONDS = 120
 NEWS = "Would you like to get notified about official Jupyter news?"
+COUNTED = """import time
+from itertools import count
+import matplotlib.pyplot as plt
+from slamlib.notebook import explore, start
+start()
+number = count(1)
+def draw(a, seconds):
+    time.sleep(seconds)
+    fig = plt.figure(figsize=(2, 2))
+    fig.said = f"a is {a}, drawing {next(number)}"
+    return fig
+explore.show(draw, a=explore.slider("a", 10, 0, 100),
+             seconds=explore.slider("seconds", 0.1, 0.0, 2.0, 0.1))"""
+KERNEL = {"kernelspec": {"name": "python3", "display_name": "Python 3 (ipykernel)"}}
 
 
 @pytest.fixture(scope="module")
@@ -27,6 +44,8 @@ def lab(tmp_path_factory):
     folder = tmp_path_factory.mktemp("lab")
     (folder / "notebooks").mkdir()
     shutil.copy(ROOT / "notebooks" / "1_odometry.ipynb", folder / "notebooks")
+    nbformat.write(new_notebook(cells=[new_code_cell(COUNTED)], metadata=KERNEL),
+                   folder / "notebooks" / "counted.ipynb")
     shutil.copytree(ROOT / "data" / "short", folder / "data" / "short")
     environment = {name: value for name, value in os.environ.items()
                    if not name.startswith(("SLAMLIB_", "JUPYTER"))}
@@ -103,21 +122,35 @@ def test_studies_of_the_build_are_recalled_in_jupyterlab_and_numbers_are_the_sam
     assert len(set(printed().splitlines())) == 1
 
 
-@pytest.mark.slow
-def test_moving_a_slider_changes_the_picture(chromium, lab):
+@pytest.fixture
+def run(chromium, lab):
+    """A function that opens a notebook and runs it: its page, and the cell with sliders."""
     from playwright.sync_api import expect
-    page = chromium.new_page(viewport={"width": 1300, "height": 1000})
-    page.set_default_timeout(1000 * SECONDS)
     expect.set_options(timeout=1000 * SECONDS)
-    asked = []
-    page.on("request", lambda request: asked.append(request.url))
-    page.goto(f"{lab['url']}lab/tree/1_odometry.ipynb?token={lab['token']}")
-    # Before the kernel is the notebook's own, JupyterLab asks which one shall run the cells.
-    page.get_by_text("Python 3 (ipykernel) | Idle", exact=True).wait_for()
-    page.get_by_role("menuitem", name="Run", exact=True).click()
-    page.get_by_text("Run All Cells", exact=True).click()
+    pages = []
 
-    cell = page.locator(".jp-CodeCell").filter(has=page.get_by_role("slider"))
+    def opened(name, listen=lambda request: None):
+        page = chromium.new_page(viewport={"width": 1300, "height": 1000})
+        pages.append(page)
+        page.set_default_timeout(1000 * SECONDS)
+        page.on("request", listen)
+        page.goto(f"{lab['url']}lab/tree/{name}?token={lab['token']}&reset")
+        # Before the kernel is the notebook's own, JupyterLab asks which one shall run the cells.
+        page.get_by_text("Python 3 (ipykernel) | Idle", exact=True).wait_for()
+        page.get_by_role("menuitem", name="Run", exact=True).click()
+        page.get_by_text("Run All Cells", exact=True).click()
+        return page, page.locator(".jp-CodeCell").filter(has=page.get_by_role("slider"))
+
+    yield opened
+    for page in pages:
+        page.close()
+
+
+@pytest.mark.slow
+def test_moving_a_slider_changes_the_picture(run, lab):
+    from playwright.sync_api import expect
+    asked = []
+    page, cell = run("1_odometry.ipynb", lambda request: asked.append(request.url))
     picture, slider = cell.locator("img"), cell.get_by_role("slider").first
     expect(picture).to_have_count(1)
     first, value = picture.get_attribute("src"), slider.get_attribute("aria-valuenow")
@@ -135,3 +168,38 @@ def test_moving_a_slider_changes_the_picture(chromium, lab):
     expect(page.get_by_text(NEWS)).to_have_count(0)
     away = [url for url in asked if not url.startswith((lab["url"], "data:", "blob:"))]
     assert asked and not away
+
+
+@pytest.mark.slow
+def test_a_dragged_slider_leaves_no_old_pictures_to_draw_and_reset_holds(run):
+    from playwright.sync_api import expect
+    page, cell = run("counted.ipynb")
+    said, sliders = cell.locator(".widget-html-content"), cell.get_by_role("slider")
+    expect(said).to_have_text("a is 10, drawing 1")
+
+    def drawings():
+        return int(said.inner_text().split()[-1])
+
+    handle = sliders.first.bounding_box()
+    x, y = handle["x"] + handle["width"] / 2, handle["y"] + handle["height"] / 2
+    page.mouse.move(x, y)
+    page.mouse.down()
+    for step in range(20):
+        page.mouse.move(x + 3 * step, y)
+    dragged = drawings()
+    page.mouse.up()
+    last = sliders.first.get_attribute("aria-valuenow").removesuffix(".0")
+    assert last != "10"
+    expect(said).to_have_text(re.compile(f"a is {last}, "))
+    sliders.last.press("End")                       # every drawing takes two seconds from here on
+    page.wait_for_timeout(3000)
+    assert drawings() - dragged <= 4                # at release one under way, a last one; End
+
+    for _ in range(3):
+        sliders.first.press("ArrowRight")           # the browser holds back the last values
+    cell.get_by_role("button", name="Reset").click()
+    expect(said).to_have_text(re.compile("a is 10, "))
+    page.wait_for_timeout(3000)
+    expect(said).to_have_text(re.compile("a is 10, "))
+    expect(sliders.first).to_have_attribute("aria-valuenow", re.compile(r"10(\.0)?"))
+    expect(page.locator("[data-mime-type*=stderr], [data-mime-type*=error]")).to_have_count(0)

@@ -1,10 +1,12 @@
 """Controls of the Explore sections: widgets in JupyterLab, and fields of the report's HTML pages.
 
-In JupyterLab every change draws the figure once, before the kernel takes the next message. The
-browser holds a slider's values back until then and sends only the latest, so old ones never wait.
+In JupyterLab the browser holds a widget's values back while the kernel draws for one of them, and
+then sends the latest only, so old ones never wait. The kernel may serve several widgets at once, in
+threads of their own; a lock lets one of them draw at a time.
 """
 
 from html import escape
+from threading import RLock
 from time import perf_counter
 
 import matplotlib.pyplot as plt
@@ -69,39 +71,53 @@ def panel(draw, controls, only_simulated=()):
     row, reset = Box(layout=ROW), Button(description="Reset", tooltip="Return to the first values")
     said, picture = HTML(layout=SENTENCE), Output()
     first, shown = {name: control.value for name, control in controls.items()}, {}
+    lock, drawn = RLock(), {}
 
     def redraw(change):
-        begin = perf_counter()
-        for name in only_simulated:
-            shown[name].disabled = shown["drive"].value is not SIMULATED
-        with picture:
-            try:
-                fig = draw(**{name: control.value for name, control in shown.items()})
-            except UNSOLVABLE as error:
-                clear_output()
-                said.value = escape(f"There is no solution with these values: {error}.")
-            else:
-                said.value = escape(getattr(fig, "said", ""))
-                clear_output(wait=True)
-                display(fig)
-                plt.close(fig)
-        if change is not None:
-            fast = perf_counter() - begin < FAST
-            sliders = [each for each in shown.values() if each.has_trait("continuous_update")]
-            for each in [change.owner] if change.owner in sliders else sliders:
-                each.continuous_update = fast
+        with lock:
+            values = {name: control.value for name, control in shown.items()}
+            if values == drawn:                  # by another widget's drawing, meanwhile
+                return
+            drawn.update(values)
+            begin = perf_counter()
+            for name in only_simulated:
+                shown[name].disabled = values["drive"] is not SIMULATED
+            said.value = _drawn(draw, values, picture)
+            if change is not None:
+                fast = perf_counter() - begin < FAST
+                sliders = [each for each in shown.values() if each.has_trait("continuous_update")]
+                for each in [change.owner] if change.owner in sliders else sliders:
+                    each.continuous_update = fast
 
     def restart(_):
-        for name, control in list(shown.items()) or controls.items():
-            shown[name] = _copy(control, first[name])
-            shown[name].observe(redraw, "value")
-            control.close()                     # with values that the browser has not sent yet
-        row.children = list(shown.values())
-        redraw(None)
+        with lock:
+            for name, control in list(shown.items()) or controls.items():
+                shown[name] = _copy(control, first[name])
+                shown[name].observe(redraw, "value")
+                control.close()                  # with values that the browser has not sent yet
+            row.children = list(shown.values())
+            redraw(None)
 
     restart(None)
     reset.on_click(restart)
     return VBox([row, reset, said, picture])
+
+
+def _drawn(draw, values, picture):
+    """What the figure of draw(**values), shown in an Output, says as HTML; or why there is none."""
+    said = ""
+    with picture:                                # which also shows other exceptions
+        try:
+            fig = draw(**values)
+        except UNSOLVABLE as error:
+            clear_output()
+            said = escape(f"There is no solution with these values: {error}.")
+        else:
+            clear_output(wait=True)
+            display(fig)
+            plt.close(fig)
+            said = escape(getattr(fig, "said", ""))
+    return said
 
 
 def _copy(control, value):
