@@ -106,3 +106,16 @@ def test_what_is_no_reference_is_left_alone(text):
 def test_what_does_not_fit_together_is_refused(cells, reason):
     with pytest.raises(NotebookError, match=rf"1_first.ipynb: {reason}"):
         after(*cells)
+
+
+@pytest.mark.parametrize("source, label", [(SECOND, "2.9"), (FIRST, "2.1"), (SECOND, "1.9")])
+def test_what_does_not_exist_is_refused_in_a_chapter_without_captions_too(source, label):
+    said = {FIRST: "Figure 3.1.", SECOND: "Table 7.1."}  # of chapters that are not here
+    books = {path: new_notebook(cells=[figure("Figure 1.1. A.")] * (path == FIRST) + [
+        new_markdown_cell(f"# {path.stem[0]}. Title\n\nBy {text}")])
+        for path, text in said.items()}
+    assert texts(numbered(books)[SECOND]) == ["# 2. Title\n\nBy Table 7.1."]
+    books[source].cells[-1].source += f" See figure {label}."
+    for part in (books, {source: books[source]}):  # the other chapter is left out
+        with pytest.raises(NotebookError, match=f"^{source.name}: .* figure {label}, which does"):
+            numbered(part, books)

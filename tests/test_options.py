@@ -99,15 +99,15 @@ def test_the_committed_file_has_the_defaults_also_where_its_examples_are_read(tm
 
 def test_the_command_line_comes_before_the_file(tmp_path, monkeypatch):
     make_data(tmp_path)
-    write(tmp_path / "notebooks", "1_text", "# 1. Text\n\n## First\n\n## Second",
-          ("print('told' * 2)",))
+    write(tmp_path / "notebooks", "1_text", "# 1. Text\n\n## First",
+          ("print('told' * 2)",), "## Second")
     write(tmp_path / "notebooks", "A_more", "# A. More")
     (tmp_path / "report.toml").write_text(
         'code = "none"\nappendix = false\nleave_out = ["second"]\n')
     monkeypatch.chdir(tmp_path)
     assert main(["report", "short", "--jobs", "1"]) == 0
     page = (tmp_path / "report" / "1_text.html").read_text()
-    assert ">First<" in page and "Second" not in page and "told" not in page
+    assert ">First<" in page and "Second" not in page and "toldtold" not in page
     assert not (tmp_path / "report" / "A_more.html").exists()
     assert main(["report", "short", "--all-code", "--appendix"]) == 0
     assert "toldtold" in (tmp_path / "report" / "1_text.html").read_text()

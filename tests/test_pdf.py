@@ -284,3 +284,25 @@ def test_a_character_that_no_font_has_is_named():
     with pytest.raises(NotebookError,
                        match=r"^1.ipynb: .* no glyph for 陳 \(U\+9673\): .*the name 陳 of"):
         pdf.typeset([(Path("1.ipynb"), book)])
+
+
+@pytest.mark.parametrize("text, said", [
+    (r"A $x$, $\text{the 陳} \cdot \dfrac{1}{2}$.",
+     "no glyph for 陳 (U+9673) in this formula:\n    \\text{the 陳} \\cdot \\dfrac{1}{2}"),
+    ("$$ 陳_k \\tag{1.1} $$", "no glyph for 陳 (U+9673) in this formula:\n    陳_k"),
+    ("By $x_k$ the #陳_ of *it*.",
+     "no glyph for 陳 (U+9673): ...By $x_k$ the #陳_ of *it*....")])
+def test_a_character_that_no_font_has_is_quoted_as_the_notebook_has_it(text, said):
+    book = new_notebook(cells=[new_markdown_cell("# 1. T\n\n## A\n\n$y$"),
+                               new_markdown_cell(f"## The *section*\n\n{text}")])
+    with pytest.raises(NotebookError) as told:
+        pdf.typeset([(Path("1.ipynb"), book)])
+    name, _, message = str(told.value).partition("': the PDF's fonts have ")
+    assert name.replace("*", "") == "1.ipynb, section 'The section" and message == said
+
+
+def test_a_character_of_an_output_is_quoted_from_it():
+    book = new_notebook(cells=[new_markdown_cell("## Told"), new_code_cell(
+        "x", outputs=[new_output("stream", name="stdout", text="one\nin #陳_ it\n")])])
+    with pytest.raises(NotebookError, match=r"^1.ipynb, section 'Told': .*: \.{3}in #陳_ it\.{3}$"):
+        pdf.typeset([(Path("1.ipynb"), book)])

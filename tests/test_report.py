@@ -285,6 +285,27 @@ def test_what_is_shown_must_fit_together_in_the_executed_notebooks(tmp_path):
     assert "Figure 1.1." in Page(tmp_path / "report" / "1_text.html").text  # the old report is left
 
 
+def test_a_page_of_a_notebook_that_is_gone_goes_and_the_user_s_stay(tmp_path):
+    """Also those of builds that kept no list of their files."""
+    make_data(tmp_path)
+    for name in ("1_text", "2_gone", "3_now gone"):
+        write(tmp_path / "notebooks", name, f"# {name[0]}. Text")
+    build(tmp_path)
+    report = tmp_path / "report"
+    shutil.copy(report / "2_gone.html", report / "my copy.html")
+    (report / "notes.html").write_text('<a href="notes.html">mine</a>')
+    (report / "latin.html").write_bytes(b"\xff")
+    (report / "here.html").symlink_to("2_gone.html")
+    (report / "folder.html").mkdir()
+    for name in ("2_gone", "3_now gone"):
+        (tmp_path / "notebooks" / f"{name}.ipynb").unlink()
+    (report / swap.WRITTEN).unlink()
+    build(tmp_path)
+    assert sorted(file.name for file in report.iterdir()) == sorted([
+        swap.WRITTEN, "1_text.html", "folder.html", "here.html", "index.html", "latin.html",
+        "my copy.html", "notes.html", "report.pdf"])
+
+
 def test_missing_folders_and_names_are_told_in_one_sentence(tmp_path):
     with pytest.raises(DatasetError, match="no notebooks"):
         build(tmp_path)

@@ -35,7 +35,7 @@ from slamlib.report.execution import (
 )
 from slamlib.report.numbering import numbered
 from slamlib.report.options import Cover
-from slamlib.report.pages import html_pages
+from slamlib.report.pages import html_pages, own_pages
 from slamlib.report.pdf import typeset
 from slamlib.report.pictures import title_picture
 from slamlib.report.sections import shown, to_execute
@@ -127,7 +127,8 @@ def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=
             swap.write(pages / name, content)
         swap.require_staged(stage)
         swap.publish([
-            swap.Set(report, {name: pages / name for name in made}, last=next(iter(made))),
+            swap.Set(report, {name: pages / name for name in made}, last=next(iter(made)),
+                     ours=frozenset(own_pages(report))),  # also of notebooks that are gone
             *_result_sets(results, stage, selected, written)])
     print(_resources_used(time.monotonic() - start), file=sys.stderr)
     return Report([report / name for name in made], drives)

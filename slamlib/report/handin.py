@@ -9,7 +9,7 @@ from pathlib import Path
 from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 
 from slamlib import swap
-from slamlib.dataset import dataset_names, read_dataset, read_truth
+from slamlib.dataset import DatasetError, dataset_names, read_dataset, read_truth
 from slamlib.notebook import Drive, listed
 from slamlib.report.build import BUILDING
 from slamlib.report.options import ESTIMATES
@@ -74,12 +74,19 @@ def write(path, report, results, options, omitted=()):
     results : Path, the folder of the result files of this report.
     options : Options, of which `problem2` says which estimate is handed in as problem 2.
     omitted : list of str, names of simulated datasets that are left out.
+
+    Raises
+    ------
+    DatasetError : another run began to replace the result files, and did not end well.
     """
     contents = {"report.pdf": report.files[-1].read_bytes(),
                 "README.txt": readme(report.drives, options, omitted).encode()}
     with swap.locked(results.resolve() / BUILDING):
         for drive in report.drives:
-            swap.require_finished(results / drive.name)
+            try:
+                swap.require_finished(results / drive.name)
+            except swap.UnfinishedError as error:
+                raise DatasetError(str(error)) from None
             contents |= {f"{drive.name}/{name}": Path(results, drive.name, file).read_bytes()
                          for name, file in handed_in(drive, options.problem2).items()}
     archive = BytesIO()

@@ -43,9 +43,11 @@ def numbered(books, whole=None):
     absent = {(kind, label): f"{number} (left out)" if (kind, number) in taken else number
               for (kind, label), (_, number) in _targets(whole or {}).items()
               if (kind, label) not in targets}
+    chapters = {label.partition(".")[0] for _, label in targets if "." in label} | {
+        chapter_of(source, book)["number"] for source, book in (whole or books).items()}
     for source, book in books.items():
         for node, key in texts(book.cells):
-            node[key] = _linked(node[key], source, targets, absent)
+            node[key] = _linked(node[key], source, targets, absent, chapters)
     return books
 
 
@@ -94,10 +96,11 @@ def _captions(book):
                 above = "table" if block.startswith("|") else block
 
 
-def _linked(text, source, targets, absent):
-    """Return Markdown with the final numbers in its captions and with links for its references."""
-    chapters = {label.partition(".")[0] for _, label in targets if "." in label}
+def _linked(text, source, targets, absent, chapters):
+    """Return Markdown with the final numbers in its captions and with links for its references.
 
+    `chapters` are the numbers of those that are executed: what is not there is refused.
+    """
     def link(kind, label):
         if (kind, label) in targets:
             target, number = targets[kind, label]

@@ -96,6 +96,18 @@ def html_page(source, book, chapters, code="method", absent=()):
     return _with_policy(text.replace(f"'{DRAWN}'", FAMILY), page["styles"]), page
 
 
+def own_pages(folder):
+    """Return the names (set of str) of all pages in a folder (Path) that a build wrote there.
+
+    Each page lists itself, by the name of its file, as the one that is shown; a copy by another
+    name does not.
+    """
+    return {file.name for file in folder.glob("*.html") if file.is_file() and not file.is_symlink()
+            and re.search(rf'<nav class="contents" .*<li class="here"><a href="'
+                          rf'{re.escape(quote(file.name, errors="replace"))}">',
+                          file.read_text(encoding="utf-8", errors="replace"), re.DOTALL)}
+
+
 def _new_page(source, chapters):
     """Return the dict in which the renderer collects what it finds."""
     return {"formulas": [], "sections": [], "section": "", "headings": [], "anchors": {},

@@ -65,15 +65,46 @@ def typeset(chapters, opening=None, code="method", picture=None, **cover):
     cover : title, author, student_number, course (str), the lines of the title page.
     """
     files, book = typst_files(chapters, opening, code, picture, **cover)
-    for name, text in book.texts:
+    for name, text, notebook in book.texts:
         if missing := missing_glyphs(text):
-            context = re.search(f".{{0,30}}{missing[0]}.{{0,30}}", text)[0]
-            raise NotebookError(f"{name}: the PDF's fonts have no glyph for {missing[0]} "
-                                f"(U+{ord(missing[0]):04X}): ...{context}...")
+            section, context = _where(missing[0], notebook, text)
+            raise NotebookError(name + (f", section '{section}'" if section else "")
+                                + f": {_no_glyph(missing[0])}: ...{context}...")
+    formulas = files["formulas.typ"].decode().split("\n")[1:]  # below an import, one a line
+    if missing := missing_glyphs("".join(formulas)):
+        number = next(n for n, formula in enumerate(formulas) if missing[0] in formula)
+        raise book.error(number, f"{_no_glyph(missing[0])} in this formula")
     with tempfile.TemporaryDirectory() as folder:
         for name, content in files.items():
             Path(folder, name).write_bytes(content)
         return compiled(Path(folder), book)
+
+
+def _no_glyph(character):
+    return f"the PDF's fonts have no glyph for {character} (U+{ord(character):04X})"
+
+
+def _where(character, notebook, text):
+    """Return the section (str) of a character, and the words around it as the notebook has them.
+
+    What cannot be found in the cells of `notebook` (NotebookNode) is quoted from `text`, the Typst.
+    """
+    section = ""
+    for cell in notebook.cells:
+        data = [output.get("data", {"text/plain": output.get("text", "")})
+                for output in cell.get("outputs", ())]
+        outputs = [each[kind] for each in data for kind in KINDS if kind in each]
+        for shown in (cell.source, *outputs):
+            for line in shown.split("\n"):
+                heading = cell.cell_type == "markdown" and re.match(r"##+\s+(.*)", line)
+                section = heading[1] if heading else section
+                if character in line:
+                    return section, _around(character, line)
+    return "", _around(character, text)
+
+
+def _around(character, text):
+    return re.search(f".{{0,30}}{re.escape(character)}.{{0,30}}", text)[0]
 
 
 def typst_files(chapters, opening=None, code="method", picture=None, **cover):
@@ -143,8 +174,8 @@ class _Book:
     """Chapters in Typst, and what they refer to.
 
     `files` are the pictures as {name: bytes}; `pictures` their quoted names and descriptions;
-    `texts` the chapters by file name, without marks. The renderer collects in `page` the formulas
-    (TeX, display), and the notebook, section, label and tag of each.
+    `texts` the chapters: file name, text without marks and NotebookNode. The renderer collects in
+    `page` the formulas (TeX, display), and the notebook, section, label and tag of each.
     """
 
     def __init__(self, code):
@@ -176,7 +207,7 @@ class _Book:
                                          ["--wrap=none", f"--extract-media={media}"])
             self.files |= {file.name: file.read_bytes() for file in Path(media).iterdir()}
         text = text.replace(f'"{media}/', '"')
-        self.texts.append((source.name, re.sub("[\ue000-\ue00b]", "", text)))
+        self.texts.append((source.name, re.sub("[\ue000-\ue00b]", "", text), book))
         text = re.sub(r"align: \([a-z,]*\)", lambda align: align[0].replace("auto", "left"), text)
         text = REFERENCES.sub(r"\1#references[\n\2\n]\n", text)
         return re.sub(r"^= (\d+|[A-Z])\.", self._numbered, text, count=1)
