@@ -16,6 +16,7 @@ from slamlib.slam.estimate import fit_from_odometry
 from slamlib.slam.evidence import consistency
 from slamlib.slam.measurements import measure
 from slamlib.slam.normal_equations import decomposition
+from slamlib.slam.range_calibration import calibrated
 from slamlib.slam.result import result
 
 MIN_SIGHTINGS = 3            # accepted ones of a marker that is compared; fewer may be wrong labels
@@ -105,7 +106,7 @@ def map_of(dataset):
 
     Raises DatasetError where the measurements do not determine a solution.
     """
-    fit = fit_from_odometry(measure(dataset))
+    fit = calibrated(fit_from_odometry(measure(dataset)))
     m, found, rows = fit.problem.measurements, result(fit), fit.problem.measurements.structure.rows
     agree = np.bincount(m.label, fit.problem.measured.sighting_weight, len(m.marker))
     marker = np.flatnonzero(np.isin(m.marker, found.marker) & m.oriented & (agree >= MIN_SIGHTINGS))

@@ -4,6 +4,7 @@ from slamlib.notebook.answers import answer, median_sigmas, result_sentence, wit
 from slamlib.notebook.means import decided, mean_and_error, number, share, verdict, with_error
 from slamlib.notebook.show import (
     Drive,
+    about_dashes,
     captioned,
     code,
     interactive,
@@ -19,7 +20,8 @@ from slamlib.notebook.show import (
 )
 from slamlib.notebook.solving import delivered, notices, say_doubts, solved, where_possible
 
-__all__ = ["Drive", "answer", "captioned", "code", "decided", "delivered", "interactive", "listed",
-           "mean_and_error", "median_sigmas", "notices", "number", "plain", "result_sentence",
-           "results_folder", "say", "say_doubts", "share", "solved", "start", "table", "table_text",
-           "verdict", "where_possible", "with_error", "with_sensor", "with_truth", "with_unit"]
+__all__ = ["Drive", "about_dashes", "answer", "captioned", "code", "decided", "delivered",
+           "interactive", "listed", "mean_and_error", "median_sigmas", "notices", "number",
+           "plain", "result_sentence", "results_folder", "say", "say_doubts", "share", "solved",
+           "start", "table", "table_text", "verdict", "where_possible", "with_error",
+           "with_sensor", "with_truth", "with_unit"]
