@@ -154,10 +154,10 @@ def _returns(drives):
         found = consistency.returns(drive.dataset)
         if len(found.start) and all(map(_estimates, ends)):
             first, last = (with_unit(_apart(found, solution.poses), "m") for solution in ends)
-            falls.append(f"{first} by odometry and {last} by SLAM on *{plain(drive.name)}*")
+            falls.append(f"{first} (odometry) and {last} (SLAM) on *{plain(drive.name)}*")
     if falls:
-        yield ("Where the vehicle returns, the markers contradict the motion since then by "
-               f"{listed(falls)} (root mean square).")
+        yield ("Where the vehicle returns, its motion since then differs from that by the markers, "
+               f"in root mean square, by {listed(falls)}.")
 
 
 def _apart(found, poses):
