@@ -12,7 +12,7 @@ from test_pdf import text_of
 from slamlib import evaluation, se2
 from slamlib.dataset import read_dataset, read_truth
 from slamlib.doubt import Doubt
-from slamlib.notebook import median_sigmas, plotting, table_text, with_unit
+from slamlib.notebook import about_dashes, median_sigmas, plotting, table_text, with_unit
 from slamlib.report import drives as solved_drives
 from slamlib.report import overview, pdf
 from slamlib.report.chapters import printed
@@ -105,8 +105,8 @@ def test_numbers_are_those_of_the_solver(project, summary):
 
 def test_what_is_left_out_is_told_with_its_reason(summary):
     rows, text = result_rows(summary)
-    assert rows["no_truth", "odometry"][:2] == ["no truth", "no truth"]
-    assert "No truth comes with no_truth and wheels_only" in text
+    assert rows["no_truth", "odometry"][:2] == ["–", "–"]
+    assert "A dash stands where no truth is known." in text
     assert rows["wheels_only", "ArUco"] == ["left out: no markers", *["–"] * 4]
     assert rows["wheels_only", "SLAM: odometry + UWB"] == ["left out: no UWB ranges", *["–"] * 4]
     assert rows["wheels_only", "odometry"][-1] == "2,000"
@@ -208,6 +208,15 @@ def test_the_abstract_says_what_was_found_with_the_numbers_of_the_table(project,
     assert note.startswith("The dataset *all* is a simulated stand-in for the course's logs")
 
 
+def test_dashes_are_explained_only_where_some_truth_is_unknown(project):
+    folder, written, _ = project
+    drives = solved_drives.read_drives(folder / "data", folder / "results", NAMES, written)
+    known = [drive for drive in drives if drive.truth is not None]
+    assert len(known) < len(drives) and "dash" in about_dashes(drives)
+    assert about_dashes(known) == ""
+    assert "dash" not in overview.summary(known).cells[1].source
+
+
 def test_of_many_drives_the_abstract_names_the_shortest_and_the_longest(project, summary):
     folder, written, _ = project
     drives = solved_drives.read_drives(folder / "data", folder / "results", NAMES, written)
@@ -215,7 +224,10 @@ def test_of_many_drives_the_abstract_names_the_shortest_and_the_longest(project,
     assert [name for name in NAMES if f"n *{name}* " in text] == [drives[0].name, drives[2].name]
     recorded = overview.summary([drive for drive in drives if drive.truth is None])
     rows, text = result_rows(recorded)
-    assert "simulated" not in text.split("## The datasets")[0] and "ATE" not in text
+    assert not re.search("simulated|ATE|(?<!_)truth", text.split("## The datasets")[0])
+    assert re.search(r"differs from that by the markers, in root mean square, by "
+                     r"[\d.]+\u00a0m?m \(odometry\) and [\d.]+\u00a0mm \(SLAM\) on \*no_truth\*",
+                     text)
     assert all(len(row) == 3 for row in rows.values())
 
 

@@ -163,7 +163,6 @@ def test_characters_that_are_not_seen_are_spaces():
 NOTEBOOK = """from slamlib.notebook import *
 from slamlib.slam import *
 drives = start()
-with_truth(drives, "nothing")
 with_sensor(drives, "uwb", "ranges")
 drives, found = solved(drives, ["problem1"])
 for drive, solution, files in delivered(drives, found):

@@ -10,6 +10,7 @@ from slamlib.notebook.answers import (
 from slamlib.notebook.means import decided, mean_and_error, number, share, verdict, with_error
 from slamlib.notebook.show import (
     Drive,
+    about_dashes,
     captioned,
     code,
     interactive,
@@ -25,8 +26,8 @@ from slamlib.notebook.show import (
 )
 from slamlib.notebook.solving import delivered, notices, say_doubts, solved, where_possible
 
-__all__ = ["Drive", "answer", "captioned", "code", "decided", "delivered", "interactive", "listed",
-           "mean_and_error", "median_sigmas", "notices", "number", "plain", "result_sentence",
-           "results_folder", "say", "say_doubts", "share", "slip_in_words", "solved", "start",
-           "table", "table_text", "verdict", "where_possible", "with_error", "with_sensor",
-           "with_truth", "with_unit"]
+__all__ = ["Drive", "about_dashes", "answer", "captioned", "code", "decided", "delivered",
+           "interactive", "listed", "mean_and_error", "median_sigmas", "notices", "number", "plain",
+           "result_sentence", "results_folder", "say", "say_doubts", "share", "slip_in_words",
+           "solved", "start", "table", "table_text", "verdict", "where_possible", "with_error",
+           "with_sensor", "with_truth", "with_unit"]

@@ -75,12 +75,14 @@ def results_folder(drive):
     return folder / drive.name
 
 
-def with_truth(drives, lost):
-    """The drives that have truth; if some do, a sentence says for which `lost` cannot be shown."""
-    without = [plain(drive.name) for drive in drives if drive.truth is None]
-    if 0 < len(without) < len(drives):
-        say(f"*No truth comes with {listed(without)}, so {lost} cannot be shown there.*")
+def with_truth(drives):
+    """The drives whose truth is known: errors are shown of these only."""
     return [drive for drive in drives if drive.truth is not None]
+
+
+def about_dashes(drives):
+    """Sentence (str) for the caption of a table of errors; empty if all drives have truth."""
+    return " A dash stands where no truth is known." if with_truth(drives) != drives else ""
 
 
 def with_sensor(drives, sensor, name):

@@ -26,9 +26,14 @@ class SolvedDrive:
     files: tuple = ()  # of str, its files to hand in, as `problem1/vehiclePose.mat`
 
     @property
+    def origin(self):
+        """Origin of the data, a str as of `notebook.Drive`."""
+        return Drive(self.name, self.dataset, self.truth).origin
+
+    @property
     def simulated(self):
         """True if the data are simulated, False if they were recorded."""
-        return Drive(self.name, self.dataset, self.truth).origin == "simulated"
+        return self.origin == "simulated"
 
     def solution(self, problem):
         """Return the Solution of a problem (str), or None."""

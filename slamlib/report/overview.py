@@ -10,8 +10,8 @@ from urllib.parse import quote
 import numpy as np
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_output
 
-from slamlib import evaluation, odometry
-from slamlib.notebook import code, listed, median_sigmas, plain, table_text, with_unit
+from slamlib import consistency, evaluation, odometry
+from slamlib.notebook import about_dashes, code, listed, median_sigmas, plain, table_text, with_unit
 from slamlib.report.animation import moving
 from slamlib.report.chapters import HTML_ONLY
 from slamlib.report.drives import order
@@ -87,7 +87,7 @@ def abstract(drives):
     sentences = [
         _what_was_done({name for name in SENSORS for drive in drives
                         if getattr(drive.dataset, name) is not None}),
-        *_sigmas(drives), *_errors(drives), *_landmarks(drives)]
+        *_sigmas(drives), *(list(_errors(drives)) or _returns(drives)), *_landmarks(drives)]
     simulated = [f"*{plain(drive.name)}*" for drive in drives if drive.simulated]
     return " ".join(sentences) + (f"\n\n{_said_of_simulated(simulated)}" if simulated else "")
 
@@ -149,6 +149,25 @@ def _errors(drives):
                f"{listed(falls)}.")
 
 
+def _returns(drives):
+    """Yield a sentence on odometry and SLAM at returns, which need no truth."""
+    falls = []
+    for drive in _named(drives):
+        ends = drive.solution("problem1"), drive.solution("problem4") or drive.solution("problem3")
+        found = consistency.returns(drive.dataset)
+        if len(found.start) and all(map(_estimates, ends)):
+            first, last = (with_unit(_apart(found, solution.poses), "m") for solution in ends)
+            falls.append(f"{first} (odometry) and {last} (SLAM) on *{plain(drive.name)}*")
+    if falls:
+        yield ("Where the vehicle returns, its motion since then differs from that by the markers, "
+               f"in root mean square, by {listed(falls)}.")
+
+
+def _apart(found, poses):
+    off = consistency.discrepancies(found, poses)[:, :2]
+    return np.sqrt(np.mean(np.sum(off**2, axis=1)))
+
+
 def _landmarks(drives):
     """Yield a sentence on the maps of the named drives, each of the last problem that has one."""
     maps = []
@@ -178,9 +197,8 @@ def _dataset_table(drives):
                   for readings in (dataset.aruco, dataset.uwb)]
         rows.append([plain(drive.name), f"{len(dataset.ticks):,}",
                      with_unit(evaluation.path_length(path), "m"), *counts,
-                     "simulated" if drive.simulated else "recorded",
-                     "known" if drive.truth else "not known"])
-    header = ["dataset", "poses", "path", "sightings of markers", "UWB ranges", "origin", "truth"]
+                     drive.origin])
+    header = ["dataset", "poses", "path", "sightings of markers", "UWB ranges", "origin"]
     return (table_text(header, rows, texts=1)
             + "\n\nTable 3. Measurements of each drive; the path length is from odometry.")
 
@@ -220,9 +238,8 @@ def _result_table(drives):
            "nearest to the truth (aligned); " if known else "")
         + "the medians over all estimated poses of the standard deviation σ of position (the "
         "larger of $x$ and $y$) and of heading; how many poses are estimated."
+        + (about_dashes(drives) if known else "")
         + (" *Hint*: fused as the assignment suggests." if "problem2_hint" in problems else ""))
-    if without := [plain(drive.name) for drive in drives if drive.truth is None]:
-        text += f"\n\nNo truth comes with {listed(without)}, so errors are not known there."
     for sensor, name in SENSORS.items():
         if without := [plain(d.name) for d in drives if getattr(d.dataset, sensor) is None]:
             text += (f"\n\nThere are no {name} in {listed(without)}: the problems that need them "
@@ -248,7 +265,7 @@ def result_row(drive, problem, known=True):
                 else "could not be solved" if failed else "no result", *["–"] * (errors + 2)]
     if not _estimates(solution):
         return [*row, *["–"] * (errors + 2), "0"]
-    row += ["no truth"] * errors if drive.truth is None else [
+    row += ["–"] * errors if drive.truth is None else [
         with_unit(_ate(drive, solution, aligned), "m") for aligned in (False, True)[:errors]]
     position, heading = median_sigmas(solution)
     count = np.isfinite(solution.poses[:, 0]).sum()

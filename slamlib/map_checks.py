@@ -1,0 +1,180 @@
+"""Checks of a map that need no truth: residuals by landmark, and both halves of a drive.
+
+`residuals_by_landmark` compares the residuals of every landmark with what is expected of them.
+`halves` of a drive are solved independently, each in the frame of its own first pose.
+`compared` moves their maps onto each other; the distances that are left have known covariances.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from slamlib import evaluation, se2
+from slamlib.slam.covariances import covariances
+from slamlib.slam.estimate import fit_from_odometry
+from slamlib.slam.evidence import consistency
+from slamlib.slam.measurements import measure
+from slamlib.slam.normal_equations import decomposition
+from slamlib.slam.range_calibration import calibrated
+from slamlib.slam.result import result
+
+MIN_SIGHTINGS = 3            # accepted ones of a marker that is compared; fewer may be wrong labels
+ITERATIONS = 10              # of Gauss-Newton, for the motion between two maps
+
+
+@dataclass(frozen=True)
+class LandmarkResiduals:
+    """Squared whitened residuals of every landmark of a kind, by the learned noise."""
+
+    count: np.ndarray        # (k,) of accepted measurements, those of little weight counting less
+    chi2: np.ndarray         # (k,) sum of the squares
+    dof: np.ndarray          # (k,) what is expected of it
+
+
+def residuals_by_landmark(fit):
+    """LandmarkResiduals of the markers and of the antennas of a `slam.fit.Fit`.
+
+    With the derivatives J of n whitened errors e by unknowns of covariance C, the solution takes
+    the degrees of freedom tr(J C J^T): E[e^T e] = n - tr(J C J^T). A range counts by its weight.
+    """
+    m, equations = fit.problem.measurements, fit.equations
+    own = np.arange(len(m.frame), len(m.structure.width))               # all variables but poses
+    own = np.concatenate([m.structure.rows([j], m.structure.width[j])[0] for j in own])
+    column = np.full(len(m.structure.diagonal), -1)
+    column[own] = np.arange(len(own))
+    with_own = _covariance_with(fit, own)
+    pairs = covariances(equations, fit.problem.noise).pairs
+    of_poses = np.concatenate([pairs[:, :3, :3], pairs[-1:, 3:6, 3:6]])
+    totals = np.zeros((3, len(m.marker) + len(m.antenna)))
+    of_kernel = consistency(fit.problem.measured.range_kernel)
+    for f, (_, rows), expected in zip(equations.factors, m.placed[1:], (1, 1, of_kernel)):
+        if not len(f.row):                                              # of no width
+            continue
+        rows, J = rows[f.index], equations.jacobian(f)
+        C = with_own[rows[:, :, None], column[rows][:, None]]           # wrong in columns of poses
+        C[:, :3, :3], C[:, 3:, :3] = of_poses[f.row], np.swapaxes(C[:, :3, 3:], 1, 2)
+        taken = np.einsum("mdi,mij,mdj->m", J, C, J)
+        for total, values in zip(totals, (f.weight, np.sum(f.e**2, axis=1),
+                                          expected * f.weight * f.e.shape[1] - taken)):
+            np.add.at(total, f.landmark, values)
+    markers, antennas = np.split(totals, [len(m.marker)], axis=1)
+    return LandmarkResiduals(*markers), LandmarkResiduals(*antennas)
+
+
+def _covariance_with(fit, rows):
+    """Columns `rows` (r,) of the covariance (n, n) of all unknowns of a Fit, (n, r)."""
+    H = fit.equations.structure.matrix(fit.equations.sums(fit.problem.noise)[0])
+    unit = np.zeros((H.shape[0], len(rows)))
+    unit[rows, np.arange(len(rows))] = 1
+    return decomposition(H).solve(unit)
+
+
+@dataclass(frozen=True)
+class Map:
+    """Landmarks of a drive in the frame of its first pose: k markers, then a antennas."""
+
+    marker: np.ndarray       # (k,) ids, ascending, of markers with a heading
+    antenna: np.ndarray      # (a,) ids, ascending
+    place: np.ndarray        # (k + a, 3) in m and rad; the heading of an antenna is 0
+    covariance: np.ndarray   # (3k + 3a, 3k + 3a) of all places jointly, in world axes
+
+
+def halves(dataset, poses):
+    """Both halves of a Dataset, each a Dataset in the frame of its own first pose.
+
+    `poses` (n, 3), of any solution, move the guesses of the antennas into the second half's frame.
+    Sensors without readings are None.
+    """
+    middle = len(dataset.ticks) // 2
+
+    def later(readings):
+        late = readings and readings.select(readings.pose >= middle)
+        return replace(late, pose=late.pose - middle) if late and len(late.pose) else None
+
+    ticks, guess = dataset.ticks[middle:].copy(), dataset.antenna_guess
+    ticks[0] = 0
+    if guess is not None:
+        there = se2.between(poses[middle], np.pad(guess.position, ((0, 0), (0, 1))))
+        guess = replace(guess, position=there[:, :2])
+    return dataset.first(middle), replace(dataset, ticks=ticks, aruco=later(dataset.aruco),
+                                          uwb=later(dataset.uwb), antenna_guess=guess)
+
+
+def map_of(dataset):
+    """The Map of a Dataset by a solution of its own, without landmarks that are in doubt there.
+
+    Raises DatasetError where the measurements do not determine a solution.
+    """
+    fit = calibrated(fit_from_odometry(measure(dataset)))
+    m, found, rows = fit.problem.measurements, result(fit), fit.problem.measurements.structure.rows
+    agree = np.bincount(m.label, fit.problem.measured.sighting_weight, len(m.marker))
+    marker = np.flatnonzero(np.isin(m.marker, found.marker) & m.oriented & (agree >= MIN_SIGHTINGS))
+    antenna = np.flatnonzero(~np.isin(m.antenna, list(found.doubts)))
+    f, k = len(m.frame), len(m.marker)
+    own = np.concatenate([rows(f + marker, 3).ravel(), rows(f + k + antenna, 2).ravel()])
+    place = np.concatenate([fit.state.markers[marker],
+                            np.pad(fit.state.antennas[antenna], ((0, 0), (0, 1)))])
+    used, C = _coordinates(marker, antenna), np.zeros(2 * [place.size])
+    C[np.ix_(used, used)] = _covariance_with(fit, own)[own]
+    to_world = se2.compose_jacobians(place, np.zeros(3))[1]            # from each landmark's axes
+    turn = block_diag(np.zeros((0, 0)), *to_world)                     # (0, 0) also without any
+    return Map(m.marker[marker], m.antenna[antenna], place, turn @ C @ turn.T)
+
+
+def _coordinates(marker, antenna):
+    """(3k + 3a,) bool, the coordinates that landmarks have: antennas have no heading."""
+    return np.concatenate([np.ones(3 * len(marker), bool), np.tile([True, True, False],
+                                                                  len(antenna))])
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The common landmarks of two maps, after the motion that brings them closest."""
+
+    marker: np.ndarray       # (k,) ids
+    antenna: np.ndarray      # (a,) ids
+    apart: np.ndarray        # (k + a,) m, distances of the positions
+    squared: np.ndarray      # (k + a,) chi-squared of each landmark against all others
+    dofs: np.ndarray         # (k + a,) its degrees of freedom, 3 of a marker and 2 of an antenna
+    chi2: float              # of all of them together
+    dof: int                 # its degrees of freedom, without the 3 of the motion
+
+
+def compared(one, other):
+    """The Comparison of two independent Maps, None if they have fewer than two landmarks in common.
+
+    The motion T minimises r^T W r for r = one - T other and W = (C_one + J C_other J^T)^-1. With
+    A = dr/dT and P = W - W A (A^T W A)^-1 A^T W, the vector u = P r has the covariance P. Landmark
+    j adds u_j^T P_jj^-1 u_j to the chi-squared of the others (Baarda, A Testing Procedure for Use
+    in Geodetic Networks, 1968).
+    """
+    marker, antenna = (np.intersect1d(getattr(one, kind), getattr(other, kind))
+                       for kind in ("marker", "antenna"))
+    if len(marker) + len(antenna) < 2:
+        return None
+    (p, C), (q, D) = (_selected(each, marker, antenna) for each in (one, other))
+    used = _coordinates(marker, antenna)
+    T = evaluation.align(q, p)
+    for _ in range(ITERATIONS):
+        by_T, by_q = se2.compose_jacobians(T, q)
+        r = p - se2.compose(T, q)
+        r[:, 2] = se2.wrap(r[:, 2])
+        J, A, e = block_diag(*by_q), by_T.reshape(-1, 3)[used], r.ravel()[used]
+        W = np.linalg.inv((C + J @ D @ J.T)[np.ix_(used, used)])
+        gain = np.linalg.solve(A.T @ W @ A, A.T @ W)
+        T = T + gain @ e
+    P = W - W @ A @ gain
+    u, dofs = P @ e, used.reshape(-1, 3).sum(axis=1)
+    rows = np.split(np.arange(len(u)), np.cumsum(dofs)[:-1])
+    return Comparison(
+        marker, antenna, apart=np.hypot(*r[:, :2].T), chi2=float(e @ u), dof=len(u) - 3, dofs=dofs,
+        squared=np.array([u[j] @ np.linalg.solve(P[np.ix_(j, j)], u[j]) for j in rows]))
+
+
+def _selected(one, marker, antenna):
+    """Places (k + a, 3) and their covariance of some landmarks of a Map."""
+    rows = np.concatenate([np.searchsorted(one.marker, marker),
+                           len(one.marker) + np.searchsorted(one.antenna, antenna)])
+    of_each = (3 * rows[:, None] + np.arange(3)).ravel()
+    return one.place[rows], one.covariance[np.ix_(of_each, of_each)]
