@@ -139,7 +139,8 @@ def read(drive):
 WORDS = st.one_of(
     st.integers(-2, 12).map(str), st.floats().map(repr), st.integers().map(str),
     st.sampled_from(["nan", "1e999", "-0", "1_0", "0x1", "\u0661", "#", "=", "[", "'", "1e-400",
-                     "+1", ".5", "1e15", "\x1c", "\u2028", "\x85", "wheelbase", "sigma_heading"]))
+                     "+1", ".5", "1e15", "1,5", "1;2,5;3", ";", ",", "//", "%", "pose", "\x1c",
+                     "\u2028", "\x85", "wheelbase", "sigma_heading"]))
 LINES = st.lists(WORDS, max_size=12).map(" ".join)
 BYTES = st.one_of(st.binary(max_size=50), st.lists(LINES, max_size=5).map(
     lambda lines: "\n".join(lines).encode()))
