@@ -29,11 +29,10 @@ endif
 
 # In a git checkout, also configures the filter that .gitattributes names: git stores notebooks as
 # `make strip` leaves them.
-STRIP := .venv/bin/python
 setup: $(READY)
 	@! git ls-files --error-unmatch .gitattributes >/dev/null 2>&1 || git config --local \
 		filter.slamlib-notebooks.clean "cd \"./$$(git rev-parse --show-prefix)\" && if \
-	[ -x $(STRIP) ]; then $(STRIP) strip_notebooks.py; else cat; fi"
+	[ -x $(BIN)/python ]; then $(BIN)/python strip_notebooks.py; else cat; fi"
 
 $(READY): requirements.txt pyproject.toml check_python.py
 	@command -v "$(PYTHON)" >/dev/null || { \
