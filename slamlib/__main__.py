@@ -147,9 +147,9 @@ def _report(options):
     given = {"author": options.author, "student_number": options.student_number}
     cover = replace(cover, **{key: value for key, value in given.items() if value is not None})
     names = [_name(dataset, options.data) for dataset in options.datasets] or None
-    dataset_names(options.data, names)                     # before notebooks are copied
     notebooks = options.notebooks or notebooks_folder()
     if options.notebooks_to:
+        dataset_names(options.data, names)                 # nothing is copied if there are none
         notebooks = copy_notebooks(notebooks, options.notebooks_to)
     try:
         report = build_report(

@@ -144,8 +144,8 @@ def dataset_names(data, names=None):
     """
     data = Path(data)
     if not data.is_dir():
-        raise DatasetError(f"{data}: expected this folder, with a sub-folder for each dataset, "
-                           "found none")
+        raise DatasetError(f"{data}: expected this folder, with a sub-folder with an "
+                           "encoderReading.txt for each dataset, found none")
     known = {name.lower() for name in FILES}
     found = sorted(path.name for path in data.glob("[!.]*")
                    if path.is_dir() and any(file.name.lower() in known for file in path.iterdir()))
