@@ -114,9 +114,9 @@ def _built(arguments, options, folder, datasets, **shown):
     """Return the Report that is built into a folder, or None if a notebook failed; tell doubts."""
     from slamlib.report import NotebookError, build_report
     from slamlib.report.sources import copy_notebooks, notebooks_folder
-    dataset_names(arguments.data, datasets)                # before notebooks are copied
     notebooks = arguments.notebooks or notebooks_folder()
     if arguments.notebooks_to:
+        dataset_names(arguments.data, datasets)            # nothing is copied if there are none
         notebooks = copy_notebooks(notebooks, arguments.notebooks_to)
     try:
         report = build_report(

@@ -147,8 +147,8 @@ def dataset_names(data, names=None):
     """
     data = Path(data)
     if not data.is_dir():
-        raise DatasetError(f"{data}: expected this folder, with a sub-folder for each dataset, "
-                           "found none")
+        raise DatasetError(f"{data}: expected this folder, with a sub-folder with an {ENCODER} for each "
+                           "dataset, found none")
     found = sorted(path.name for path in data.glob("[!.]*") if path.is_dir() and is_dataset(path))
     if not found:
         raise DatasetError(f"{data}: expected a sub-folder with an {ENCODER}, found none")
