@@ -35,18 +35,7 @@ def parser():
     solve.add_argument("folder", type=Path, metavar="FOLDER", help="the dataset's folder")
     solve.add_argument("--out", type=Path, required=True, help="folder for the results")
 
-    simulate = commands.add_parser("simulate", help="make a dataset with its truth")
-    simulate.add_argument("folder", type=Path, metavar="FOLDER", help="a new or empty folder")
-    simulate.add_argument("--path", choices=("short", "long"), default="short")
-    simulate.add_argument("--rounds", type=_positive, default=1,
-                          help="how often the path is driven; 44 long ones are a million rows")
-    simulate.add_argument("--seed", type=_count, default=0)
-    simulate.add_argument("--slip", type=_share, default=1e-3, metavar="SQRT_M",
-                          help="wheel slip: sigma after one metre, in m (default %(default)s)")
-    simulate.add_argument("--nlos", type=_share, default=0.0, metavar="SHARE",
-                          help="share of UWB ranges without line of sight, which are too long")
-    simulate.add_argument("--mislabel", type=_share, default=0.0, metavar="SHARE",
-                          help="share of marker sightings that carry another marker's id")
+    _simulate_options(commands.add_parser("simulate", help="make a dataset with its truth"))
 
     export = commands.add_parser("export", help="write trajectories as TUM files or CSV")
     export.add_argument("results", type=Path, metavar="RESULTS", help="a folder of results, of one "
@@ -60,6 +49,21 @@ def parser():
     lab.add_argument("--data", type=Path, default=DATA, help="folder of the datasets")
     lab.add_argument("--notebooks", type=Path)
     return whole
+
+
+def _simulate_options(parser):
+    """Add the options of `simulate` to its parser."""
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="a new or empty folder")
+    parser.add_argument("--path", choices=("short", "long"), default="short")
+    parser.add_argument("--rounds", type=_positive, default=1,
+                        help="how often the path is driven; 44 long ones are a million rows")
+    parser.add_argument("--seed", type=_count, default=0)
+    parser.add_argument("--slip", type=_share, default=1e-3, metavar="SQRT_M",
+                        help="wheel slip: sigma after one metre, in m (default %(default)s)")
+    parser.add_argument("--nlos", type=_share, default=0.0, metavar="SHARE",
+                        help="share of UWB ranges without line of sight, which are too long")
+    parser.add_argument("--mislabel", type=_share, default=0.0, metavar="SHARE",
+                        help="share of marker sightings that carry another marker's id")
 
 
 def _build_options(parser):

@@ -7,7 +7,7 @@ count from 1 in the files and from 0 in the arrays; marker and antenna ids stay 
 are within `limits.LIMITS`. `folder` finds the files, `dialects` reads their numbers.
 """
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from os.path import abspath
 from pathlib import Path
 
@@ -19,50 +19,12 @@ from slamlib.doubt import Doubt
 from slamlib.exchanged import look_exchanged
 from slamlib.folder import ENCODER, TRUTH_FILES, contents, is_dataset
 from slamlib.limits import LIMITS
-from slamlib.textfile import DatasetError, error, quoted, read_toml
+from slamlib.textfile import DatasetError, error
 from slamlib.truth_frame import in_first_frame
+from slamlib.vehicle import Vehicle, read_vehicle
 
 SMALLEST_EIGENVALUE = 1e-12  # no unit; a correlation matrix with a smaller one counts as singular
 MOST_NEGATIVE = 5.0  # sigmas, of a range at an antenna
-
-
-@dataclass(frozen=True)
-class Vehicle:
-    """Wheel parameters, their standard deviations, and what is known of the noise.
-
-    The defaults are the assignment's table 2, in which the noise is not known.
-    """
-
-    right_radius: float = 0.1  # m
-    left_radius: float = 0.1  # m
-    wheelbase: float = 0.4  # m
-    ticks_per_revolution: float = 8000.0
-    sigma_right_radius: float = 1e-4  # m
-    sigma_left_radius: float = 1e-4  # m
-    sigma_wheelbase: float = 1e-4  # m
-    sigma_heading: float = 1e-4  # rad, of the heading at pose 1
-    slip: float | None = None  # sqrt(m), sigma of a wheel's slip after 1 m; None: learned
-    marker_noise_factor: float | None = None  # of the sigmas in ArucoReading.txt; None: learned
-    range_noise_factor: float | None = None  # of the sigmas in UwbReading.txt; None: learned
-
-    @property
-    def wheel(self):
-        """Wheel parameters [R_R, R_L, b], (3,) in m."""
-        return np.array([self.right_radius, self.left_radius, self.wheelbase])
-
-    @property
-    def sigma_wheel(self):
-        """Standard deviations of the wheel parameters, (3,) in m."""
-        return np.array([self.sigma_right_radius, self.sigma_left_radius, self.sigma_wheelbase])
-
-    def with_wheel(self, wheel):
-        """The vehicle with other wheel parameters (3,) in m and the same standard deviations."""
-        right, left, base = map(float, wheel)
-        return replace(self, right_radius=right, left_radius=left, wheelbase=base)
-
-    def with_deviation(self, w):
-        """The vehicle with wheel parameters wheel + sigma_wheel * w, w (3,) without unit."""
-        return self.with_wheel(self.wheel + self.sigma_wheel * w)
 
 
 class _Readings:
@@ -147,8 +109,8 @@ def dataset_names(data, names=None):
     """
     data = Path(data)
     if not data.is_dir():
-        raise DatasetError(f"{data}: expected this folder, with a sub-folder with an {ENCODER} for each "
-                           "dataset, found none")
+        raise DatasetError(f"{data}: expected this folder, with a sub-folder with an {ENCODER} for "
+                           "each dataset, found none")
     found = sorted(path.name for path in data.glob("[!.]*") if path.is_dir() and is_dataset(path))
     if not found:
         raise DatasetError(f"{data}: expected a sub-folder with an {ENCODER}, found none")
@@ -175,7 +137,7 @@ def read_dataset(folder):
     """
     files, notes = contents(folder), []
     notes += files.notes
-    vehicle = _read_vehicle(files, default=Vehicle())
+    vehicle = read_vehicle(files, default=Vehicle())
     table = _read_encoder(files, notes)
     aruco = _read_aruco(files, len(table.numbers), notes)
     ticks, more = counts.since_previous(table, vehicle, aruco)
@@ -201,7 +163,7 @@ def read_truth(folder):
         return None
     files, notes = contents(of_drive.files["truth"], TRUTH_FILES), []
     notes += [f"In truth: {note}" for note in files.notes]
-    vehicle = _read_vehicle(of_drive, default=Vehicle())
+    vehicle = read_vehicle(of_drive, default=Vehicle())
     pose_count = len(_read_encoder(of_drive, []).numbers)
     table = _read_all_poses(files, "vehiclePose.txt", "pose id, x, y, theta", notes)
     poses = table.numbers[:, 1:]
@@ -212,24 +174,8 @@ def read_truth(folder):
     truth = Truth(poses=np.column_stack([poses[:, :2], np.unwrap(poses[:, 2])]),
                   marker=marker, marker_in_world=marker_in_world,
                   antenna=antenna, antenna_in_world=antenna_in_world,
-                  vehicle=_read_vehicle(files, default=vehicle), notes=tuple(notes))
+                  vehicle=read_vehicle(files, default=vehicle), notes=tuple(notes))
     return in_first_frame(truth)
-
-
-def _read_vehicle(files, default):
-    path = files.files.get("vehicle.toml")
-    if path is None:
-        return default
-    limits, values = LIMITS["vehicle.toml"], asdict(default)
-    entries = read_toml(path, "wheelbase = 0.4", list(values))
-    for key in sorted(entries, key=list(limits).index):    # a parameter before its sigma
-        (value, line), limit = entries[key], limits[key]
-        most = values.get(limit.most, limit.most)
-        if type(value) not in (int, float) or not limit.least <= value <= most:
-            raise error(path, f"expected {limit.expected(f'number for {key}')}, found "
-                        f"{quoted(value)}", line)
-        values[key] = float(value)
-    return Vehicle(**values)
 
 
 def _read_numbers(files, name, columns, notes, **options):

@@ -18,10 +18,14 @@ from slamlib.notebook.controls import SIMULATED, choice, drive_choice, show, sli
 from slamlib.notebook.parts import (
     about,
     compared_with,
+    error_curve,
     farthest,
+    finished,
     first_part,
     known_places,
     moving_drive,
+    nees_text,
+    reference,
     simulated,
 )
 from slamlib.simulation import delay, misguess, mislabel
@@ -39,7 +43,6 @@ from slamlib.studies.starts import LANDMARKS, guessed_antennas
 __all__ = ["KERNELS", "SIMULATED", "cameras", "choice", "drive_choice", "farthest", "graphs",
            "moving_drive", "ranges", "show", "slider", "wheels"]
 
-SMALLEST_ERROR = 1.0         # mm, lower limit of the axis of errors
 WRONG_PLACE = 0.5            # m, error of a marker that is mapped at a wrong place
 KERNELS = {f"{scale} σ": scale for scale in (1, 3, 10, 30, 100)} | {"none": None}   # Cauchy scales
 
@@ -128,9 +131,9 @@ def cameras(full, drive, seed, every, reach, claimed):
     fig, axes = plotting.panels(2, height=3.6)
     (plan,), (side,) = axes
     path = odometry.dead_reckoning(dataset.ticks, dataset.vehicle)
-    _reference(plan, true, role, label)
+    reference(plan, true, role, label)
     plotting.trajectory(plan, path, "odometry")
-    _error(side, path, true, "odometry")
+    error_curve(side, path, true, "odometry")
     fig.said = "Without a sighting only the odometry is left."
     if len(aruco.pose):
         fused = localization.fuse(replace(dataset, aruco=aruco), slip=slip)
@@ -140,11 +143,10 @@ def cameras(full, drive, seed, every, reach, claimed):
         plotting.trajectory(plan, poses, "aruco", "markers alone")
         plotting.trajectory(plan, fused.poses, "fused")
         k = plotting.enlargement(fused.poses, fused.covariances)
-        at = plotting.spread(fused.poses, 10)
-        plotting.ellipses(plan, fused.poses[at], fused.covariances[at],
-                          plotting.ROLES["fused"]["color"], enlarged=k)
-        _error(side, poses, true[alone.frame], "aruco", "markers alone", at=alone.frame)
-        _error(side, fused.poses, true, "fused")
+        at, color = plotting.spread(fused.poses, 10), plotting.ROLES["fused"]["color"]
+        plotting.ellipses(plan, fused.poses[at], fused.covariances[at], color, enlarged=k)
+        error_curve(side, poses, true[alone.frame], "aruco", "markers alone", at=alone.frame)
+        error_curve(side, fused.poses, true, "fused")
         plan.set_title(f"{len(aruco.pose)} sightings (ellipses × {k})")
         fig.said = f"Markers alone locate {np.count_nonzero(known)} of {len(known)} frames."
         nees = evaluation.anees(fused.poses[alone.frame], fused.covariances[alone.frame],
@@ -156,7 +158,7 @@ def cameras(full, drive, seed, every, reach, claimed):
             fig.said += (f" The NEES of the fusion is {nees:.1f}; on single drives consistent "
                          f"covariances give {low:.1f} to {high:.1f} in 95 % of the cases.")
     fig.said += about(drive, dataset, label)
-    return _finished(fig, label)
+    return finished(fig, label)
 
 
 def graphs(full, drive, seed, slip, assumed, wrong, kernel, start):
@@ -183,7 +185,7 @@ def graphs(full, drive, seed, slip, assumed, wrong, kernel, start):
     single = optimize(problem, odometry_state(m, model, markers=LANDMARKS[start])).state
     fig, axes = plotting.panels(2, height=3.6)
     (plan,), (side,) = axes
-    _reference(plan, true, role, label)
+    reference(plan, true, role, label)
     plotting.trajectory(plan, single.poses, "alternative", "single kernel")
     plotting.trajectory(plan, solved.poses, "slam", "rounds of kernels")
     places, wide = known_places(m.marker, compared.marker, compared.marker_in_world), []
@@ -206,11 +208,11 @@ def graphs(full, drive, seed, slip, assumed, wrong, kernel, start):
     plan.set_aspect("equal", adjustable="box")          # markers far from the map are cut off
     plan.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     plan.set_title(f"{len(solved.rejected)} sightings")
-    _error(side, single.poses, true[m.frame], "alternative", "single kernel", at=m.frame)
-    _error(side, solved.poses, true, "slam", "rounds of kernels")
+    error_curve(side, single.poses, true[m.frame], "alternative", "single kernel", at=m.frame)
+    error_curve(side, solved.poses, true, "slam", "rounds of kernels")
     side.set_title(f"rounds: {np.count_nonzero(solved.rejected)} rejected"
-                   + _nees(solved, true, role))
-    return _finished(fig, label)
+                   + nees_text(solved, true, role))
+    return finished(fig, label)
 
 
 @lru_cache(maxsize=8)
@@ -248,14 +250,14 @@ def ranges(full, drive, seed, late, off, part, way):
     places = known_places(m.antenna, compared.antenna, compared.antenna_in_world)
     fig, axes = plotting.panels(2, height=3.6)
     (plan,), (side,) = axes
-    _reference(plan, true, role, label)
+    reference(plan, true, role, label)
     for found, look, name in ((chosen, "alternative", "chosen kernel"),
                               (solved, "slam", "solver")):
         plotting.trajectory(plan, found.poses, look, name)
         ends = np.stack([m.guess, found.antenna_in_world])
         plan.plot(ends[..., 0], ends[..., 1], "o-", markevery=[1], markersize=4, linewidth=1.2,
                   color=plotting.ROLES[look]["color"])
-        _error(side, found.poses, true, look, name)
+        error_curve(side, found.poses, true, look, name)
     plan.plot(*m.dataset.antenna_guess.position.T, label="antennas: guess",
               **plotting.ROLES["guess"])
     fig.said = f"{late} % late ranges{'' if drive.made_up else ' added'}."
@@ -269,8 +271,8 @@ def ranges(full, drive, seed, late, off, part, way):
         fig.said = (f"{fig.said[:-1]}: the antennas end up to {misses[0]:.2f} m from {their} with "
                     f"the kernel “{way}”, and up to {misses[1]:.2f} m with the solver.")
     fig.said += about(drive, m.dataset, label)
-    side.set_title(f"{len(solved.doubts)} in doubt" + _nees(solved, true, role))
-    return _finished(fig, label)
+    side.set_title(f"{len(solved.doubts)} in doubt" + nees_text(solved, true, role))
+    return finished(fig, label)
 
 
 @lru_cache(maxsize=16)
@@ -286,32 +288,3 @@ def _by_ranges(drive, slip, model, seed, late, off, part, way, antennas):
     dataset = first_part(dataset.first(-(-len(dataset.ticks) * part // 100)), "uwb")
     m = measure(given(dataset, slip, 1.0, 1.0))
     return drive, m, result(solve_with(m, ranges=way, antennas=antennas, model=model))
-
-
-def _reference(ax, true, role, label):
-    """Draw the path that others are compared with; without truth it is wide, below the others."""
-    plotting.trajectory(ax, true, role, label, **{} if role == "truth" else {"linewidth": 4.0})
-
-
-def _nees(found, true, role):
-    """Text (str) with the average NEES of a SlamResult where its role says that truth is known."""
-    if role != "truth":
-        return ""
-    return f", NEES {evaluation.anees(found.poses, found.covariances, true):.1f}"
-
-
-def _error(ax, poses, true, role, label=None, **look):
-    """Draw the distance in mm of poses (n, 3) from others over the pose number."""
-    apart = np.hypot(*(poses - true)[:, :2].T)
-    plotting.curve(ax, 1e3 * apart, role, label=label, **look)
-
-
-def _finished(fig, label):
-    """The figure with a logarithmic axis of errors, the second one, and a legend."""
-    side = fig.axes[1]
-    side.set(yscale="log", ylabel="position error (mm)" if label == "truth"
-             else f"distance from {label} (mm)")
-    side.yaxis.set_major_formatter("{x:g}")
-    side.set_ylim(SMALLEST_ERROR, max(2 * side.dataLim.y1, 10 * SMALLEST_ERROR))
-    plotting.legend_below(fig)
-    return fig

@@ -4,10 +4,12 @@ import numpy as np
 
 from slamlib import evaluation, odometry
 from slamlib.dataset import DatasetError
+from slamlib.notebook import plotting
 from slamlib.notebook.show import Drive
 from slamlib.simulation import CAMERA_REACH, simulate
 
 MINIMUM_PATH = 1.0           # m, path length from which a drive is worth drawing
+SMALLEST_ERROR = 1.0         # mm, lower limit of the axis of errors
 MOST_POSES = 20_000          # poses of a dataset's first part, at most, and
 MOST_FRAMES = 200            # of them with measurements: as many as a simulated drive has
 
@@ -77,3 +79,32 @@ def known_places(ids, known, places):
     found, there = np.full((len(ids), 2), np.nan), np.isin(ids, known)
     found[there] = places[np.searchsorted(known, ids[there]), :2]
     return found
+
+
+def reference(ax, true, role, label):
+    """Draw the path that others are compared with; without truth it is wide, below the others."""
+    plotting.trajectory(ax, true, role, label, **{} if role == "truth" else {"linewidth": 4.0})
+
+
+def nees_text(found, true, role):
+    """Text (str) with the average NEES of a SlamResult where its role says that truth is known."""
+    if role != "truth":
+        return ""
+    return f", NEES {evaluation.anees(found.poses, found.covariances, true):.1f}"
+
+
+def error_curve(ax, poses, true, role, label=None, **look):
+    """Draw the distance in mm of poses (n, 3) from others over the pose number."""
+    apart = np.hypot(*(poses - true)[:, :2].T)
+    plotting.curve(ax, 1e3 * apart, role, label=label, **look)
+
+
+def finished(fig, label):
+    """The figure with a logarithmic axis of errors, the second one, and a legend."""
+    side = fig.axes[1]
+    side.set(yscale="log", ylabel="position error (mm)" if label == "truth"
+             else f"distance from {label} (mm)")
+    side.yaxis.set_major_formatter("{x:g}")
+    side.set_ylim(SMALLEST_ERROR, max(2 * side.dataLim.y1, 10 * SMALLEST_ERROR))
+    plotting.legend_below(fig)
+    return fig

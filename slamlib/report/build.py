@@ -6,7 +6,7 @@ Each notebook becomes one HTML page and one chapter of the PDF; both open with t
 import os
 import sys
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -89,40 +89,33 @@ def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=
 
     One build at a time works in a results folder or with a cache; another one waits for it.
     """
-    start = time.monotonic()
+    start, leave_out = time.monotonic(), leave_out or {}
     kept = kept and Path(kept).resolve()
     notebooks, data, report, results = (
         Path(folder).resolve() for folder in (notebooks, data, report, results))
     address = _address(results, report) if files else None
     cover = cover or Cover()
-    books, selected, has = _checked_input(notebooks, data, datasets, cover, appendix,
-                                          leave_out or {})
-    chapters = [chapter_of(source, book) for source, book in books.items()]
-    texts = {source: nbformat.v4.new_notebook(
-        cells=[cell for cell in book.cells if cell.cell_type == "markdown"])
-        for source, book in books.items()}
+    books, selected, has = _checked_input(notebooks, data, datasets, cover, appendix, leave_out)
     folders = [data / name for name in selected]
     with ExitStack() as stack:
         settings = stack.enter_context(temporary_folder())
         environment = kernel_environment(settings, data, datasets, kept and kept / STUDIES)
         keys = partial(_keys, books, folders, environment | {"SLAMLIB_RESULTS": str(results)})
-        if fresh or kept is None or not any(
-                cache.entry(kept, source, key).exists() for source, key in keys().items()):
-            wait = stack.enter_context(tables(folders, partial(tqdm.write, file=sys.stderr)))
-        else:
-            wait = None
-        _render(texts, texts, chapters, cover, code)  # reports early what cannot be set
-        if wait:
-            wait(max(0.0, start + FIRST - time.monotonic()))
-        for folder in sorted({results, kept or results}):
-            stack.enter_context(locks.locked(folder / BUILDING))
-        stage, pages = (stack.enter_context(swap.staging(folder)) for folder in (results, report))
-        books, written = _executed(books, keys, environment, max(1, jobs), stage, kept, fresh)
-        print("setting the pages and the PDF", file=sys.stderr)
+        recalled = kept is not None and not fresh and any(
+            cache.entry(kept, source, key).exists() for source, key in keys().items())
+        with nullcontext() if recalled else tables(folders, _tell) as wait:
+            _require_pages(books, cover, code)
+            if wait:
+                wait(max(0.0, start + FIRST - time.monotonic()))
+            for folder in sorted({results, kept or results}):
+                stack.enter_context(locks.locked(folder / BUILDING))
+            stage, pages = (
+                stack.enter_context(swap.staging(folder)) for folder in (results, report))
+            books, written = _executed(books, keys, environment, max(1, jobs), stage, kept, fresh)
+        _tell("setting the pages and the PDF")
         drives = read_drives(data, stage, selected, written, notices(books.values()))
-        made = rendered(books, drives, cover, code,
-                        address,
-                        partial(shown, has=has, leave_out=leave_out or {}))
+        made = rendered(books, drives, cover, code, address,
+                        partial(shown, has=has, leave_out=leave_out))
         for name, content in made.items():
             swap.write(pages / name, content)
         swap.require_staged(stage)
@@ -130,8 +123,22 @@ def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=
             swap.Set(report, {name: pages / name for name in made}, last=next(iter(made)),
                      ours=frozenset(own_pages(report))),  # also of notebooks that are gone
             *_result_sets(results, stage, selected, written)])
-    print(_resources_used(time.monotonic() - start), file=sys.stderr)
+    _tell(_resources_used(time.monotonic() - start))
     return Report([report / name for name in made], drives)
+
+
+def _tell(line):
+    """Print a line on stderr, above the bar where one is shown."""
+    tqdm.write(line, file=sys.stderr)
+
+
+def _require_pages(books, cover, code):
+    """Set the Markdown of the notebooks, which tells early what cannot be set."""
+    texts = {source: nbformat.v4.new_notebook(
+        cells=[cell for cell in book.cells if cell.cell_type == "markdown"])
+        for source, book in books.items()}
+    chapters = [chapter_of(source, book) for source, book in books.items()]
+    _render(texts, texts, chapters, cover, code)
 
 
 def _address(results, report):

@@ -21,12 +21,12 @@ from nbconvert.filters import strip_ansi
 from nbconvert.filters.markdown_mistune import MarkdownWithMath
 
 from slamlib.report.chapters import shows_input
-from slamlib.report.execution import NotebookError
 from slamlib.report.formulas import set_formulas
+from slamlib.report.glyphs import require_glyphs
 from slamlib.report.numbering import CAPTION, TAG
 from slamlib.report.pages import ANSWER, MARK, Renderer, formula_error
 from slamlib.report.sanitize import sanitized
-from slamlib.report.setting import PLACES, UNKNOWN, compiled, missing_glyphs, quoted
+from slamlib.report.setting import PLACES, UNKNOWN, compiled, quoted
 from slamlib.report.svg import compact
 
 TEMPLATE = Path(__file__).with_name("report.typ")
@@ -65,46 +65,11 @@ def typeset(chapters, opening=None, code="method", picture=None, **cover):
     cover : title, author, student_number, course (str), the lines of the title page.
     """
     files, book = typst_files(chapters, opening, code, picture, **cover)
-    for name, text, notebook in book.texts:
-        if missing := missing_glyphs(text):
-            section, context = _where(missing[0], notebook, text)
-            raise NotebookError(name + (f", section '{section}'" if section else "")
-                                + f": {_no_glyph(missing[0])}: ...{context}...")
-    formulas = files["formulas.typ"].decode().split("\n")[1:]  # below an import, one a line
-    if missing := missing_glyphs("".join(formulas)):
-        number = next(n for n, formula in enumerate(formulas) if missing[0] in formula)
-        raise book.error(number, f"{_no_glyph(missing[0])} in this formula")
+    require_glyphs(book, KINDS, files["formulas.typ"].decode().split("\n")[1:])  # below an import
     with tempfile.TemporaryDirectory() as folder:
         for name, content in files.items():
             Path(folder, name).write_bytes(content)
         return compiled(Path(folder), book)
-
-
-def _no_glyph(character):
-    return f"the PDF's fonts have no glyph for {character} (U+{ord(character):04X})"
-
-
-def _where(character, notebook, text):
-    """Return the section (str) of a character, and the words around it as the notebook has them.
-
-    What cannot be found in the cells of `notebook` (NotebookNode) is quoted from `text`, the Typst.
-    """
-    section = ""
-    for cell in notebook.cells:
-        data = [output.get("data", {"text/plain": output.get("text", "")})
-                for output in cell.get("outputs", ())]
-        outputs = [each[kind] for each in data for kind in KINDS if kind in each]
-        for shown in (cell.source, *outputs):
-            for line in shown.split("\n"):
-                heading = cell.cell_type == "markdown" and re.match(r"##+\s+(.*)", line)
-                section = heading[1] if heading else section
-                if character in line:
-                    return section, _around(character, line)
-    return "", _around(character, text)
-
-
-def _around(character, text):
-    return re.search(f".{{0,30}}{re.escape(character)}.{{0,30}}", text)[0]
 
 
 def typst_files(chapters, opening=None, code="method", picture=None, **cover):
