@@ -249,8 +249,9 @@ def test_without_truth_nothing_is_missing_from_the_numbers_or_named_in_vain(buil
                 assert found == [(name[0], n) for n in range(1, len(found) + 1)], name
         if name[0].isdigit():  # a chapter, of which figures of errors are left out
             assert len(captions(pages[name])) < len(captions(with_truth[name])), name
+    for name in [name for name in pages if name == "index" or name[0].isdigit()]:
         text = html.unescape(re.sub(r"<(style|script|pre).*?</\1>|<[^>]+>", " ", pages[name],
-                                    flags=re.DOTALL)).partition(" Explore ")[0]
+                                    flags=re.DOTALL))
         assert not re.search("no truth (is|comes)|not known|is unknown", text, re.I), name
 
 
