@@ -2,7 +2,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from slamlib import consistency, evaluation, increments, localization, odometry, se2
+from slamlib import evaluation, increments, localization, odometry, se2
+from slamlib.checks import consistency
 from slamlib.simulation import simulate
 
 

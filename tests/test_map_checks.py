@@ -2,7 +2,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from slamlib import evaluation, map_checks, se2
+from slamlib import evaluation, se2
+from slamlib.checks import map_checks
 from slamlib.simulation import simulate
 from slamlib.slam.estimate import fit_from_odometry
 from slamlib.slam.measurements import measure

@@ -52,8 +52,9 @@ def test_arrows_run_downwards(module):
     """Numerics import no studies, notebooks or pages; studies import no notebooks or pages."""
     allowed = {
         "": {""}, "localization": {"", "localization"}, "slam": {"", "slam"},
+        "checks": {"", *NUMERICS, "checks"},
         "studies": {"", *NUMERICS, "studies"}, "notebook": {"", *NUMERICS, "studies", "notebook"},
-        "report": {"", *NUMERICS, "studies", "notebook", "report"}}[package(module)]
+        "report": {"", *NUMERICS, "checks", "studies", "notebook", "report"}}[package(module)]
     if module in ("slamlib.solve", "slamlib.summary"):
         allowed = {"", *NUMERICS}
     if module != "slamlib.__main__":

@@ -10,7 +10,8 @@ from urllib.parse import quote
 import numpy as np
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_output
 
-from slamlib import consistency, evaluation, odometry
+from slamlib import evaluation, odometry
+from slamlib.checks import consistency
 from slamlib.notebook import about_dashes, code, listed, median_sigmas, plain, table_text, with_unit
 from slamlib.report.animation import moving
 from slamlib.report.chapters import HTML_ONLY

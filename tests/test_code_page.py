@@ -1,0 +1,22 @@
+"""docs/code.md lists every module of slamlib, and nothing else."""
+
+import re
+from pathlib import Path
+
+import slamlib
+
+ROOT = Path(slamlib.__file__).parent
+
+
+def test_the_table_of_modules_is_complete():
+    text = (ROOT.parent / "docs" / "code.md").read_text(encoding="utf-8")
+    rows = [line.split("|")[1] for line in text.splitlines() if line.startswith("| `")]
+    listed = sorted(name for row in rows for name in re.findall(r"`([\w/]+\.py)`", row))
+    modules = [file.relative_to(ROOT).as_posix() for file in ROOT.rglob("*.py")]
+    assert listed == sorted(name for name in modules if not name.endswith("__init__.py"))
+
+
+def test_the_table_of_packages_is_complete():
+    text = (ROOT.parent / "docs" / "code.md").read_text(encoding="utf-8")
+    listed = set(re.findall(r"^\| `slamlib/(\w+)/` \|", text, re.MULTILINE))
+    assert listed == {file.parent.name for file in ROOT.glob("*/__init__.py")}
