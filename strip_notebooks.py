@@ -7,9 +7,10 @@ Outputs go, and what editors write into the metadata. It needs no package, so th
 """
 
 import json
+import os
 import sys
 
-CELL = ("tags", "alt")  # of a cell's metadata, what the report reads
+CELL = ("tags", "alt", "slamlib")  # of a cell's metadata, what the report reads
 BOOK = ("slamlib",)     # of a notebook's
 KERNEL = {
     "kernelspec": {"display_name": "Python 3 (ipykernel)", "language": "python", "name": "python3"},
@@ -41,12 +42,12 @@ def main(names):
     """Restore the files with these names, or standard input; return 0, or a sentence (str)."""
     try:
         for name in names:
-            with open(name, "rb+") as file:
+            with open(name, "rb") as file:
                 content = file.read()
-                if (new := restored(content)) != content:
-                    file.seek(0)
-                    file.truncate()
+            if (new := restored(content)) != content:
+                with open(f"{name}.new", "wb") as file:
                     file.write(new)
+                os.replace(f"{name}.new", name)
         if not names:
             name = "standard input"
             sys.stdout.buffer.write(restored(sys.stdin.buffer.read()))
