@@ -82,6 +82,7 @@ def _started(server, folder):
 def test_jupyterlab_replaces_the_command_and_is_given_its_arguments(tmp_path, monkeypatch):
     started = []
     monkeypatch.setattr(os, "execve", lambda *arguments: started.append(arguments))
+    (tmp_path / "notebooks").mkdir()
     monkeypatch.chdir(tmp_path)
     for user in (0, 1000):
         monkeypatch.setattr(os, "geteuid", lambda user=user: user)

@@ -13,6 +13,7 @@ from test_report import TEXT, TEXT_FORMULAS
 
 from slamlib.report import pdf
 from slamlib.report.execution import NotebookError
+from slamlib.report.setting import missing_glyphs
 
 SVG = '<svg xmlns="http://www.w3.org/2000/svg" width="20" height="9"><path d="M0 0L9 9"/></svg>'
 TABLE = "| $\\sigma_x$ | b |\n| --- | ---: |\n| one | $$ \\sqrt{2} \\tag{7} $$ |\n\nTable 1. Roots."
@@ -278,8 +279,8 @@ def test_wide_lines_are_folded_and_nothing_of_them_is_lost(tmp_path):
 
 
 def test_a_character_that_no_font_has_is_named():
-    assert pdf.missing_glyphs("Ångström, Σ σ² ≤ ½ → “Ω” Жук") == []
-    assert pdf.missing_glyphs("a 陳 b 😀") == ["陳", "😀"]
+    assert missing_glyphs("Ångström, Σ σ² ≤ ½ → “Ω” Жук") == []
+    assert missing_glyphs("a 陳 b 😀") == ["陳", "😀"]
     book = new_notebook(cells=[new_markdown_cell("So the name 陳 of.")])
     with pytest.raises(NotebookError,
                        match=r"^1.ipynb: .* no glyph for 陳 \(U\+9673\): .*the name 陳 of"):
