@@ -254,6 +254,17 @@ def test_a_process_of_a_trial_that_is_killed_is_told():
                 workers._answer(worker, (sys.exit, 3, {}))
 
 
+def test_processes_of_trials_wait_for_the_next_study_unless_they_ended():
+    def trial(seed):
+        return {"process": os.getpid()}
+    first, second = ({*studies.run(trial, range(4))["process"]} for _ in range(2))
+    assert second <= first and os.getpid() not in first
+    for process in first:
+        os.kill(process, signal.SIGKILL)
+        psutil.wait_procs([psutil.Process(process)], timeout=60)
+    assert not first & {*studies.run(trial, range(4))["process"]}
+
+
 def required(lines):
     """Requirements as {name: the rest of its line}, of lines as `numpy` or `gtsam==4.3.0`."""
     found = (re.fullmatch(r"([\w-]+)(.*)", line) for line in lines)

@@ -4,6 +4,7 @@ Pools of processes have named semaphores, which a kernel that is killed leaves i
 workers that outlive it. A pipe ends with the process that holds its other end.
 """
 
+import atexit
 import os
 import pickle
 import signal
@@ -19,6 +20,7 @@ from joblib import wrap_non_picklable_objects
 # Matrices are small: more threads only wait for each other.
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 COMMAND = "from slamlib.studies.workers import _serve; _serve()"
+WAITING = {}  # processes (Popen) that wait for a study, with the environments of their starts
 
 
 def rows(trial, seeds, options, jobs):
@@ -48,24 +50,48 @@ def rows(trial, seeds, options, jobs):
 
 @contextmanager
 def _worker():
-    """Yield a process (Popen) that imports what this one can import, and ends at the end."""
+    """Yield a process (Popen) that imports what this one can import.
+
+    It waits for the next study, which saves its imports. It ends with this process, or at the end
+    if it owes an answer.
+    """
     environment = ONE_THREAD | os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    worker = subprocess.Popen([sys.executable, "-c", COMMAND], env=environment,
-                              stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    worker = next((each for each, its in WAITING.items()
+                   if its == environment and each.poll() is None), None)
+    if worker is None:
+        worker = subprocess.Popen([sys.executable, "-c", COMMAND], env=environment,
+                                  stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        worker.owes = False
+    WAITING.pop(worker, None)
     try:
         yield worker
     finally:
-        with suppress(OSError):                             # what it did not read, if it was killed
-            worker.stdin.close()
-        worker.stdout.close()
-        worker.wait()
+        if worker.owes or worker.poll() is not None:
+            _end(worker)
+        else:
+            WAITING[worker] = environment
+
+
+def _end(worker):
+    with suppress(OSError):                                 # what it did not read, if it was killed
+        worker.stdin.close()
+    worker.stdout.close()
+    worker.wait()
+
+
+@atexit.register
+def _end_all():
+    for worker in WAITING:
+        _end(worker)
 
 
 def _answer(worker, call):
+    worker.owes = True
     try:
         pickle.dump(call, worker.stdin)
         worker.stdin.flush()
         answer = pickle.load(worker.stdout)
+        worker.owes = False
     except (EOFError, OSError, pickle.UnpicklingError):
         raise RuntimeError("a process that ran a study ended, "
                            f"with exit code {worker.wait()}") from None
