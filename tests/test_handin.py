@@ -192,5 +192,7 @@ def test_doubts_and_failures_are_in_the_readme_and_empty_headings_are_not():
     assert "could not be solved: no landmark." in text and "not told" not in text
     assert "The simulated datasets x and y are left out." in text
     assert text.startswith(f"{Cover().title}\nA\nC\n")
+    noted = replace(drive, dataset=replace(drive.dataset, notes=("A header was left out.",)))
+    assert "d: A header was left out." in handin.readme([noted], Options())
     text = handin.readme([replace(drive, doubts=())], Options())
     assert "Doubts" not in text and "Notes" not in text

@@ -31,6 +31,11 @@ class SolvedDrive:
         return Drive(self.name, self.dataset, self.truth).origin
 
     @property
+    def notes(self):
+        """What was mended or left out when the files were read, a tuple of str."""
+        return (*self.dataset.notes, *(self.truth.notes if self.truth else ()))
+
+    @property
     def simulated(self):
         """True if the data are simulated, False if they were recorded."""
         return self.origin == "simulated"

@@ -8,7 +8,7 @@ from io import BytesIO
 from pathlib import Path
 from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 
-from slamlib import swap
+from slamlib import locks, swap
 from slamlib.dataset import DatasetError, dataset_names, read_dataset, read_truth
 from slamlib.notebook import Drive, listed
 from slamlib.report.build import BUILDING
@@ -81,7 +81,7 @@ def write(path, report, results, options, omitted=()):
     """
     contents = {"report.pdf": report.files[-1].read_bytes(),
                 "README.txt": readme(report.drives, options, omitted).encode()}
-    with swap.locked(results.resolve() / BUILDING):
+    with locks.locked(results.resolve() / BUILDING):
         for drive in report.drives:
             try:
                 swap.require_finished(results / drive.name)
@@ -140,7 +140,9 @@ def readme(drives, options, omitted=()):
             ("What is not here", [sentence for drive in drives
                                   for sentence in _missing(drive, options.problem2)]),
             ("Doubts about the data", [f"{drive.name}: {doubt.sentence}"
-                                       for drive in drives for doubt in drive.doubts])):
+                                       for drive in drives for doubt in drive.doubts]),
+            ("Notes on the files", [f"{drive.name}: {note}"
+                                    for drive in drives for note in drive.notes])):
         if sentences:
             parts += [_heading(heading), *sentences]
     if omitted:

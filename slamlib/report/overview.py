@@ -219,10 +219,9 @@ def _doubts(drives):
 
 def _notes(drives):
     """Return what was mended or left out when files were read, in Markdown; "" if nothing."""
-    noted = [(drive.name, (*drive.dataset.notes, *(drive.truth.notes if drive.truth else ())))
-             for drive in drives]
-    return "\n\n".join(f"Notes on the files of *{plain(name)}*: " + " ".join(map(plain, notes))
-                       for name, notes in noted if notes)
+    return "\n\n".join(
+        f"Notes on the files of *{plain(drive.name)}*: " + " ".join(map(plain, drive.notes))
+        for drive in drives if drive.notes)
 
 
 def _result_table(drives):
