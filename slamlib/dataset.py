@@ -255,7 +255,8 @@ def _read_readings(files, name, columns, pose_count, notes):
     place = table.numbers[:, 2:4] if name.startswith("Aruco") else table.numbers[:, 2:3]
     if look_exchanged(pose, landmark, place, pose_count):
         raise error(table.source, f"expected the columns ({columns}), but columns 1 and 2 look "
-                    "exchanged: measurements with successive ids of column 2 are alike")
+                    "exchanged: successive measurements of one landmark agree only if column 2 has "
+                    "the pose ids")
     pose, landmark = _ids(table, 0), _ids(table, 1)
     table.require((1 <= pose) & (pose <= pose_count), f"a pose id from 1 to {pose_count}")
     return table, pose - 1, landmark

@@ -94,10 +94,10 @@ def test_the_readme_is_true_of_the_files(handed):
     for part in ("Ada", "mine/problem2: vehiclePose.mat and ArucoMap.mat odometry + ArUco; 40 of "
                  "40 poses have an estimate", "mine/problem4: vehiclePose.mat, ArucoMap.mat and "
                  "UwbMap.mat SLAM: odometry + ArUco + UWB; 40 of 40", "fused with odometry",
-                 "mine/problem2/ArucoMap.mat is the map by the ArUco measurements alone, because "
-                 "the fusion has no map of its own. Its world frame is the frame of pose 11.",
+                 "problem2/ArucoMap.mat is the map by the ArUco measurements alone, because "
+                 "the fusion has no map of its own. Its world frame is the frame of pose 11 in mine.",
                  "The simulated dataset stand_in is left out.", "gtsam 4.3", "are NaN",
-                 "calls the folder of this estimate problem2_fused"):
+                 "problem2_fused of the report is problem2 here"):
         assert part in one_line
     assert max(map(len, text.split("\n"))) <= handin.COLUMNS and text.endswith("\n")
 

@@ -108,6 +108,29 @@ def test_cells_that_are_new_make_the_time_left_a_bound(started, now, capsys):
     assert capsys.readouterr().err == "0 of 6 cells, at least 24 s left\n"
 
 
+def test_what_cells_took_with_other_studies_is_a_bound(started, now, tmp_path, capsys):
+    first = started()
+    for name in "ab":
+        do(first, name, now, 1.0, 20.0, 3.0)
+        first.keep(name)
+    books = {tmp_path / f"{name}.ipynb": new_notebook(cells=CELLS) for name in "ab"}
+    told = Progress(books, 1, tmp_path, tmp_path / "new.json", tmp_path / "seconds.json")
+
+    def line():
+        now[0] += progress.EVERY
+        told.show()
+        return capsys.readouterr().err
+
+    assert line() == "0 of 6 cells, at most 48 s left\n"
+    do(told, "a", now, 1.0, 2.0, 1.0)
+    told.keep("a")
+    assert line() == "3 of 6 cells, at most 24 s left\n"
+    do(told, "b", now, 1.0, 2.0, 1.0)
+    told.keep("b")
+    told = Progress(books, 1, tmp_path, tmp_path / "new.json", tmp_path / "seconds.json")
+    assert line() == "0 of 6 cells, about 8 s left\n"
+
+
 @pytest.mark.parametrize("content", [None, b"not JSON", b"[1]", b'{"a": 5}', b'{"a": {"b": "c"}}',
                                      b"\xff", b'{"a": {"b": null}}'])
 def test_without_a_memory_there_is_the_count_alone(started, now, tmp_path, capsys, content):
@@ -155,11 +178,11 @@ def test_the_first_numbers_come_before_the_notebooks_the_shortest_drive_first(
 
 
 def test_builds_that_compute_studies_and_those_that_recall_them_have_their_own_times(tmp_path):
-    assert building._seconds(tmp_path).name == "seconds_computed.json"
+    assert building._seconds(tmp_path)[0].name == "seconds_computed.json"
     (tmp_path / "studies" / ("0" * 64)).mkdir(parents=True)               # of other code
-    assert building._seconds(tmp_path).name == "seconds_computed.json"
+    assert building._seconds(tmp_path)[0].name == "seconds_computed.json"
     (tmp_path / "studies" / memory.CODE).mkdir()
-    assert building._seconds(tmp_path).name == "seconds_recalled.json"
+    assert building._seconds(tmp_path)[0].name == "seconds_recalled.json"
 
 
 @pytest.fixture

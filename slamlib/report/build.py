@@ -218,13 +218,19 @@ def _executed(books, keys, environment, jobs, stage, kept, fresh):
     if kept is not None and fresh:
         forget(kept / STUDIES)
     execute({source: book for source, book in books.items() if source not in executed},
-            environment, stage, jobs, finish, kept and _seconds(kept))
+            environment, stage, jobs, finish, _seconds(kept) if kept else ())
     return {source: executed[source] for source in books}, sorted(written)
 
 
 def _seconds(kept):
-    """Return the Path of the seconds that cells take, which are more where studies are computed."""
-    return kept / f"seconds_{'recalled' if (kept / STUDIES / CODE).is_dir() else 'computed'}.json"
+    """Return the file of the seconds that cells take, another one, and what its seconds are.
+
+    They are more where studies are computed than where these are recalled.
+    """
+    computed, recalled = kept / "seconds_computed.json", kept / "seconds_recalled.json"
+    if (kept / STUDIES / CODE).is_dir():
+        return recalled, computed, "at most"
+    return computed, recalled, "at least"
 
 
 def rendered(books, drives, cover, code, results, shown=lambda books: books):

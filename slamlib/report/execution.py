@@ -102,7 +102,7 @@ def temporary_folder():
         yield Path(folder)
 
 
-def execute(books, environment, results, jobs, finish, seconds=None):
+def execute(books, environment, results, jobs, finish, seconds=()):
     """Execute notebooks in place, at most `jobs` at a time; the first failure stops the others.
 
     Each notebook writes to its own folder inside `results`, SLAMLIB_RESULTS. When it ended without
@@ -114,7 +114,8 @@ def execute(books, environment, results, jobs, finish, seconds=None):
     results, jobs : Path, a folder of this build alone, and int.
     finish : function of Path, NotebookNode and the names (list of str) of the result files, called
         after each notebook.
-    seconds : Path of a file that keeps how long cells took, for the time left, or None.
+    seconds : files that keep how long cells took, for the time left, as of `Progress`: the last
+        three of its parameters, or none.
     """
     try:
         with asyncio.Runner(loop_factory=_Loop) as runner:
@@ -142,7 +143,7 @@ async def _execute_all(books, environment, results, jobs, finish, seconds):
     with temporary_folder() as folder:
         told = folder / "progress"
         told.mkdir()
-        progress = Progress(books, jobs, told, seconds)
+        progress = Progress(books, jobs, told, *seconds)
         watching = asyncio.create_task(_watch(progress))
         try:
             async with asyncio.TaskGroup() as group:

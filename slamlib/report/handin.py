@@ -122,16 +122,16 @@ def readme(drives, options, omitted=()):
              "report.pdf is the report. Each dataset has a folder, with a folder for each problem:",
              "\n".join(line for drive in drives for line in _file_lines(drive, options.problem2)),
              *FORMAT, "Where the report names a folder such as results/DATASET/problem1, it is the "
-             "folder DATASET/problem1 here.", _heading("Problem 2"), WHICH[options.problem2]]
-    if options.problem2 != "aruco":
-        parts.append(f"The report calls the folder of this estimate {ESTIMATES[options.problem2]}, "
-                     "and calls the one by the ArUco measurements alone problem2.")
-    for drive in drives:
-        if handed_in(drive, options.problem2).get("problem2/ArucoMap.mat") not in (
-                None, f"{ESTIMATES[options.problem2]}/ArucoMap.mat"):
-            parts.append(f"{drive.name}/problem2/ArucoMap.mat is the map by the ArUco measurements "
-                         "alone, because the fusion has no map of its own. Its world frame is the "
-                         f"frame of pose {drive.solution('problem2').world + 1}.")
+             f"folder DATASET/problem1 here. {ESTIMATES[options.problem2]} of the report is "
+             "problem2 here, and its other folders of problem 2 are not handed in.",
+             _heading("Problem 2"), WHICH[options.problem2]]
+    worlds = {drive.name: drive.solution("problem2").world + 1 for drive in drives
+              if handed_in(drive, options.problem2).get("problem2/ArucoMap.mat") not in (
+                  None, f"{ESTIMATES[options.problem2]}/ArucoMap.mat")}
+    if worlds:
+        frames = listed([f"of pose {pose} in {name}" for name, pose in worlds.items()])
+        parts.append("problem2/ArucoMap.mat is the map by the ArUco measurements alone, because "
+                     f"the fusion has no map of its own. Its world frame is the frame {frames}.")
     parts += [_heading("World frame"), "The world frame is the frame of the vehicle at pose 1."]
     parts += [f"In {drive.name}/problem2 it is the frame of the vehicle at pose {pose}, the first "
               "that is estimated." for drive in drives

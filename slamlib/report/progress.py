@@ -28,13 +28,17 @@ class Progress:
     jobs : int, notebooks executed at a time.
     told : Path, a folder in which studies say how far they are, in a file named as the notebook.
     file : Path of the seconds that cells took, or None.
+    other : Path of what they took where studies were kept otherwise, or None. It is asked for
+        notebooks of which `file` knows nothing.
+    bound : "at most" or "at least", what the seconds of `other` are.
     """
 
-    def __init__(self, books, jobs, told, file):
+    def __init__(self, books, jobs, told, file=None, other=None, bound="at most"):
         self.cells = {source.stem: _cells(book) for source, book in books.items()}
         self.seconds = {name: [] for name in self.cells}  # of the cells that are done
         self.began = {}  # by notebook: when its present cell began
         self.jobs, self.told, self.file, self.known = jobs, told, file, _read(file)
+        self.others, self.bound = _read(other), bound
         self.next_line = time.monotonic() + EVERY
         self.bar = tqdm(total=sum(map(len, self.cells.values())), leave=False, bar_format=BAR,
                         disable=not sys.stderr.isatty())
@@ -79,9 +83,12 @@ class Progress:
 
     def _left(self):
         """Return the time until the last notebook ends (str), "" if no cell is known."""
-        each, complete = [], True
+        each, complete, word = [], True, "about"
         for name, cells in self.cells.items():
-            known = self.known.get(name, {})
+            known = self.known.get(name)
+            if known is None:
+                known = self.others.get(name, {})
+                word = self.bound if len(self.seconds[name]) < len(cells) else word
             ahead = [known.get(key) for key, _ in cells[len(self.seconds[name]):]]
             complete &= None not in ahead
             ahead = [seconds or 0.0 for seconds in ahead]
@@ -92,7 +99,7 @@ class Progress:
         if not seconds:
             return ""
         text = f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
-        return f"{'about' if complete else 'at least'} {text} left"
+        return f"{word if complete else 'at least'} {text} left"
 
 
 def _cells(book):

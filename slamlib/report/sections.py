@@ -63,10 +63,11 @@ def shown(books, has, leave_out):
     """
     left_out, result = {_key(entry): place for entry, place in leave_out.items()}, {}
 
-    def lacks(each):
-        return f"no dataset has {each.needs}" if each.needs not in {None, *has} else None
+    def reason(each):
+        """Why a section is left out (str), "" if no reason is told, or None if it is shown."""
+        if each.needs not in {None, *has}:
+            return f"no dataset has {each.needs}"
 
-    def asked(each):
         return next((left_out[key] for key in (_key(each.number), _key(each.title))
                      if each.level > 1 and key in left_out), None)
 
@@ -74,15 +75,12 @@ def shown(books, has, leave_out):
         if _is_left_out(source, book, left_out):
             print_once(f"{source.stem}: left out")
             continue
-        for why in (lacks, asked):
-            found = sections(source, book)
-            reasons = {at: reason for at, each in enumerate(found)
-                       if (reason := why(each)) is not None}
-            for at, reason in reasons.items():
-                if reason:
-                    print_once(f"{source.stem}: section '{found[at].title}' left out ({reason})")
-            book = _without(book, reasons.keys())
-        result[source] = book
+        found = sections(source, book)
+        reasons = {at: why for at, each in enumerate(found) if (why := reason(each)) is not None}
+        for at, why in reasons.items():
+            if why:
+                print_once(f"{source.stem}: section '{found[at].title}' left out ({why})")
+        result[source] = _without(book, reasons.keys())
     return result
 
 
@@ -95,7 +93,7 @@ def to_execute(books, leave_out):
     leave_out : dict from what is left out to where this is asked for (str), such as
         "report.toml, line 3", or "" where it need not exist. It is a chapter by its number ("2" or
         "B"), or a section by its number ("3.5") or title. Sections are numbered as where nothing is
-        left out by this dict.
+        left out, neither by this dict nor for lack of data.
 
     Raises
     ------
