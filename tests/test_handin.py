@@ -95,7 +95,8 @@ def test_the_readme_is_true_of_the_files(handed):
                  "40 poses have an estimate", "mine/problem4: vehiclePose.mat, ArucoMap.mat and "
                  "UwbMap.mat SLAM: odometry + ArUco + UWB; 40 of 40", "fused with odometry",
                  "problem2/ArucoMap.mat is the map by the ArUco measurements alone, because "
-                 "the fusion has no map of its own. Its world frame is the frame of pose 11 in mine.",
+                 "the fusion has no map of its own. Its world frame is the frame of pose 11 in "
+                 "mine.",
                  "The simulated dataset stand_in is left out.", "gtsam 4.3", "are NaN",
                  "problem2_fused of the report is problem2 here"):
         assert part in one_line
