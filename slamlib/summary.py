@@ -120,7 +120,7 @@ def table(summary):
     judged = any("ate_m" in row for row in summary["problems"].values())
     lines = [f"{summary['dataset']}: {summary['poses']} poses",
              f"{'problem':15}{'estimates':>10}{'last x, y, heading':>29}"
-             f"{'their sigmas':>27}" + judged * f"{'ATE':>11}"]
+             f"{'their sigmas':>28}" + judged * f"{'ATE':>11}"]
     for name, row in summary["problems"].items():
         if "failed" in row:
             lines.append(f"{name:15}could not be solved")
@@ -128,7 +128,7 @@ def table(summary):
         pose = "{:8.3f} m {:8.3f} m {:7.4f}".format(*row["last_pose"])
         sigma = "{:7.4f} m {:7.4f} m {:6.4f}".format(*row["last_sigma"])
         error = f"{row['ate_m']:9.4f} m" if judged else ""
-        lines.append(f"{name:15}{row['estimated_poses']:10}{pose:>29}{sigma:>27}{error}")
+        lines.append(f"{name:15}{row['estimated_poses']:10}{pose:>29} {sigma:>27}{error}")
     lines += [f"doubt ({doubt['what']}): {doubt['sentence']}" for doubt in summary["doubts"]]
     return "\n".join(lines)
 

@@ -13,8 +13,10 @@ from test_pdf import text_of
 from test_report import write
 
 from slamlib.__main__ import main
+from slamlib.dataset import DatasetError
 from slamlib.doubt import Doubt
 from slamlib.report import handin
+from slamlib.report.build import Report
 from slamlib.report.drives import SolvedDrive
 from slamlib.report.options import Cover, Options
 from slamlib.simulation import simulate, write_dataset
@@ -197,3 +199,12 @@ def test_doubts_and_failures_are_in_the_readme_and_empty_headings_are_not():
     assert "d: A header was left out." in handin.readme([noted], Options())
     text = handin.readme([replace(drive, doubts=())], Options())
     assert "Doubts" not in text and "Notes" not in text
+
+
+def test_a_dataset_called_like_a_file_of_the_zip_is_refused(tmp_path):
+    report = Report([tmp_path / "index.html", tmp_path / "report.pdf"], [
+        replace(solved_drive("problem1"), name="readme.TXT")])
+    report.files[-1].write_bytes(b"")
+    with pytest.raises(DatasetError, match="readme.TXT: the zip has a file of the name"):
+        handin.write(tmp_path / "hand-in.zip", report, tmp_path, Options())
+    assert not (tmp_path / "hand-in.zip").exists()

@@ -610,6 +610,10 @@ def test_the_noise_that_is_known_scales_covariances_and_posterior_alike():
     ({"model": "line"}, "model must be one of euler, arc, or None, not 'line'"),
     ({"slip": -1e-3}, r"expected slip from 0 to 0.1 sqrt\(m\).*, not -0.001"),
     ({"slip": np.nan}, "expected slip .* not nan"),
+    ({"slip": "0.001"}, "expected slip .* not '0.001'"),
+    ({"kernel": ["Huber"]}, "kernel must be one of quadratic"),
+    ({"gate": "no"}, "gate must be True or False, not 'no'"),
+    ({"range_noise_factor": True}, "range_noise_factor .* not True"),
     ({"marker_noise_factor": 0.0}, "expected a positive marker_noise_factor from 0.01 to 100"),
     ({"range_noise_factor": 1e3}, "range_noise_factor .* not 1000.0")])
 def test_an_option_with_a_wrong_name_or_value_is_told_with_what_there_is(options, told):

@@ -81,6 +81,10 @@ def write(path, report, results, options, omitted=()):
     """
     contents = {"report.pdf": report.files[-1].read_bytes(),
                 "README.txt": readme(report.drives, options, omitted).encode()}
+    for drive in report.drives:
+        if drive.name.casefold() in {name.casefold() for name in contents}:
+            raise DatasetError(f"{drive.name}: the zip has a file of the name of this dataset: "
+                               "rename its folder")
     with locks.locked(results.resolve() / BUILDING):
         for drive in report.drives:
             try:

@@ -1,6 +1,7 @@
 """The whole pipeline: from a dataset to the result of problem 3 or 4."""
 
 from functools import partial
+from numbers import Real
 
 from slamlib.limits import LIMITS
 from slamlib.odometry import MODELS
@@ -60,7 +61,8 @@ asymmetric Cauchy, asymmetric Tukey, not 'L2'
         raise ValueError(f"model must be one of {', '.join(MODELS)}, or None, not {model!r}")
     for name, value in zip(GIVEN, (slip, marker_noise_factor, range_noise_factor)):
         limit = LIMITS["vehicle.toml"][name]
-        if value is not None and not limit.least <= value <= limit.most:
+        number = isinstance(value, Real) and not isinstance(value, bool)
+        if value is not None and not (number and limit.least <= value <= limit.most):
             raise ValueError(f"expected {limit.expected(name)}, not {value!r}")
     accept = partial(accepted, way=acceptance(kernel, gate))
     measurements = measure(given(dataset, slip, marker_noise_factor, range_noise_factor))

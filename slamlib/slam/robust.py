@@ -54,7 +54,9 @@ def acceptance(kernel="asymmetric Tukey", gate=True):
     A one-sided kernel is that of the ranges only, and takes the place of their gate for late ones.
     Without `gate` nothing is rejected. Raises ValueError for another name.
     """
-    if kernel not in KERNELS:
+    if gate not in (True, False):
+        raise ValueError(f"gate must be True or False, not {gate!r}")
+    if kernel not in [*KERNELS]:
         raise ValueError(f"kernel must be one of {', '.join(KERNELS)}, not {kernel!r}")
     one_sided = kernel in ONE_SIDED
     return Acceptance(
