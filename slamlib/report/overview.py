@@ -56,7 +56,8 @@ def summary(drives, address="."):
                 f"Figure 1. *{plain(longest.name)}*, the longest drive. Left: its trajectory by "
                 "odometry, by fusion and by the last problem"
                 f"{', and the truth (dashed)' if longest.truth else ''}. Right: the standard "
-                "deviation of position along the drive, for every problem, on a logarithmic axis"
+                "deviation of position along the drive, for every problem, on a logarithmic axis "
+                "(near zero at the start)"
                 f"{'; problem 3 is the wide line' if longest.solution('problem3') else ''}.",
                 id="caption")]
     cells.append(new_markdown_cell("## The datasets\n\n" + _dataset_table(drives), id="datasets",
@@ -81,7 +82,7 @@ def index(heading, opening, chapters):
 
 
 def abstract(drives):
-    """Return what was done and found, in Markdown: at most eight sentences, then where data are from.
+    """Return what was done and found, in Markdown: at most eight sentences, then the origin of data.
 
     `drives` is a list of SolvedDrive.
     """
