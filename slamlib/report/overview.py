@@ -82,7 +82,7 @@ def index(heading, opening, chapters):
 
 
 def abstract(drives):
-    """Return what was done and found, in Markdown: at most eight sentences, then the origin of data.
+    """Return what was done and found, in Markdown: at most eight sentences, then data's origin.
 
     `drives` is a list of SolvedDrive.
     """

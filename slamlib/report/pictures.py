@@ -54,11 +54,11 @@ def title_picture(drive):
 
 
 def _shown_from(drive):
-    """Return the smallest sigma in m after the first 2 % of the poses, or None."""
+    """Return two thirds of the smallest sigma in m after the first 2 % of the poses, or None."""
     sigmas = np.concatenate([
         evaluation.position_sigmas(solution.covariances)[len(solution.covariances) // 50:]
         for solution in drive.solutions])
-    return min(sigmas[sigmas > 0], default=None)
+    return sigmas[sigmas > 0].min() / 1.5 if (sigmas > 0).any() else None
 
 
 def _role(solution):
