@@ -67,14 +67,14 @@ def test_tags_say_how_a_cell_is_shown(code, tags, shown):
 def test_labels_with_letters_are_numbered_and_linked():
     first, appendix = Path("1_first.ipynb"), Path("A_more.ipynb")
     books = {first: titled("1. First", new_markdown_cell(
-        "Tables A.2 and A.4, figure A.3, equation A.1, appendix A, appendices A and C, "
+        "See tables A.2 and A.4, figure A.3, equation A.1, appendix A, appendices A and C, "
         "table C.1.")),
         appendix: titled("A. More", figure("Figure A.3. F."), new_markdown_cell(
             f"{TABLE}Table A.2. One.\n\n{TABLE}Table A.4. Two.\n\n$$ x \\tag{{A.1}} $$"))}
     done = numbered(books)
     name = appendix.name
     assert texts(done[first])[1] == (
-        f"Tables [A.1]({name}#table-A.1) and [A.2]({name}#table-A.2), figure "
+        f"See tables [A.1]({name}#table-A.1) and [A.2]({name}#table-A.2), figure "
         f"[A.1]({name}#figure-A.1), equation [A.1]({name}#eq-A.1), appendix [A]({name}), "
         f"appendices [A]({name}) and C, table C.1.")
     assert "Figure A.1. F." in texts(done[appendix])

@@ -1,5 +1,6 @@
 """Figures, tables and equations have numbers without gaps and links; wrong captions are refused."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -79,7 +80,24 @@ def test_another_chapter_is_linked_by_its_file():
     assert texts(books[FIRST])[0] == "**Figure 1.3.** A."  # the books are unchanged
 
 
+@pytest.mark.parametrize("text, without", [
+    ("Wheels matter (table A.1).", "Wheels matter."),
+    ("One. Table A.1 has 1.5 m\nof it. Two.", "One. Two."),
+    ("Appendix A compares ways, and table A.1\ntests them. Two.\n\nThree.", "Two.\n\nThree."),
+    ("One (appendix A).\n\nTable A.1 compares.", "One.\n\n"),
+])
+def test_what_only_points_to_an_appendix_goes_with_it(text, without):
+    chapter = new_notebook(cells=[new_markdown_cell(f"# 1. One\n\n{text}")])
+    appendix = new_notebook(cells=[new_markdown_cell("# A. Studies"),
+                                   new_markdown_cell(TABLE + "Table A.1. Ways.")])
+    for whole in (None, {FIRST: chapter, Path("A.ipynb"): appendix}):
+        assert texts(numbered({FIRST: chapter}, whole)[FIRST]) == [f"# 1. One\n\n{without}"]
+    linked, = texts(numbered({FIRST: chapter, Path("A.ipynb"): appendix})[FIRST])
+    assert re.sub(r"\[(.*?)\]\(A.ipynb.*?\)", r"\1", linked) == f"# 1. One\n\n{text}" != linked
+
+
 @pytest.mark.parametrize("text", [
+    "See (figure 7.1). Figure 7.1 is of a chapter. Appendix C of [3] has it. By table A.1.",
     "`figure 1.9`, $figure 1.9$ and\n\n```\nfigure 1.9\n\nFigure 1.8. No caption.\n```",
     "Figure 1. By hand, figure 7.",
     "the assignment's table 2, 2.5 m, a [table](x.html#table 1.9)", "$$ figure 1.9 $$",

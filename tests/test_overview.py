@@ -225,9 +225,10 @@ def test_of_many_drives_the_abstract_names_the_shortest_and_the_longest(project,
     recorded = overview.summary([drive for drive in drives if drive.truth is None])
     rows, text = result_rows(recorded)
     assert not re.search("simulated|ATE|(?<!_)truth", text.split("## The datasets")[0])
-    assert re.search(r"differs from that by the markers, in root mean square, by "
-                     r"[\d.]+\u00a0m?m \(odometry\) and [\d.]+\u00a0mm \(SLAM\) on \*no_truth\*",
+    assert re.search(r"Odometry differs from this by [\d.]+\u00a0m?m on \*no_truth\* .*SLAM, which "
+                     r"uses these sightings, agrees with them to [\d.]+\u00a0mm on \*no_truth\*\.",
                      text)
+    assert "σ is what each method claims. *Hint*" in text
     assert all(len(row) == 3 for row in rows.values())
 
 

@@ -74,7 +74,7 @@ def animation(drive):
             f'Pause</label><svg viewBox="0 0 {WIDTH} {height}" role="img" '
             f'aria-label="{escape(_described(drive, best))}">{"".join(parts)}{_bar(scale, height)}'
             f"</svg>{_legend(layers, drive.truth is not None)}"
-            f"<figcaption>{escape(_said(drive, solved['problem1'], best))}</figcaption></figure>")
+            f"<figcaption>{_said(drive, solved['problem1'], best)}</figcaption></figure>")
 
 
 def _layer(name, count, solution, color, enlarged, on_page, scale):
@@ -148,14 +148,15 @@ def _bar(scale, height):
 
 
 def _said(drive, first, best):
-    """What the motion shows, a str: the largest errors of odometry and of the best estimate."""
-    begin = f"The drive {drive.name} in {SECONDS} seconds: odometry is up to"
+    """What the motion shows, in HTML: the largest errors of odometry and of the best estimate."""
+    begin = f"The drive <em>{escape(drive.name)}</em> in {SECONDS} seconds: odometry is up to"
+    estimate = f"the estimate “{escape(best.title)}”"
     if drive.truth is None:
         apart = with_unit(_farthest(first.poses, best.poses), "m")
-        return f"{begin} {apart} from the estimate “{best.title}”."
+        return f"{begin} {apart} from {estimate}."
     off = [with_unit(_farthest(solution.poses, drive.truth.poses), "m")
            for solution in (first, best)]
-    return f"{begin} {off[0]} from the truth, the estimate “{best.title}” up to {off[1]}."
+    return f"{begin} {off[0]} from the truth, {estimate} up to {off[1]}."
 
 
 def _farthest(poses, others):

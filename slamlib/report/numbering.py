@@ -3,7 +3,8 @@
 A caption is a paragraph that begins with "Figure 2.3." or "Table A.3." (chapter or appendix, and
 number) directly below its figure or table. Some datasets leave figures out; numbering closes these
 gaps. References such as "figure 2.3", "tables A.3 and A.5", "equation 2.1" or "appendix A" become
-links.
+links. Of an appendix that is left out, "(table A.3)" goes, and a sentence that begins with
+"Table A.3" or "Appendix A".
 """
 
 import re
@@ -26,6 +27,15 @@ PARTS = re.compile(  # code, formulas and addresses; headings; captions; referen
     rf"|\b(?i:appendi(?:x|ces)\s+(?P<letters>{LETTER}(?:{AND}{LETTER})*))", re.DOTALL)
 
 
+def _to_absent(letters):
+    """Return a Pattern of what only points to an appendix whose letter is not in `letters`."""
+    absent = f"(?![{letters} ])[A-Z]"
+    label = rf"(?:(?i:figure|table)s?\s+{absent}\.\d+|(?i:appendix)\s+{absent}\b(?!\s+of\b))"
+    sentence = rf"(?=[A-Z]){label}(?:(?!\n\n).)*?[.?!]"
+    return re.compile(rf"\s*\({label}\)|(?:\A|(?<=\n\n)){sentence}(?:[^\S\n]+|(?=\n|\Z))"
+                      rf"|(?<=[.?!])(?:[^\S\n]+|\n(?=\S)){sentence}(?=\s|\Z)", re.DOTALL)
+
+
 def numbered(books, whole=None):
     """Return copies of executed books (dict from Path to NotebookNode), numbered and with links.
 
@@ -45,9 +55,11 @@ def numbered(books, whole=None):
               if (kind, label) not in targets}
     chapters = {label.partition(".")[0] for _, label in targets if "." in label} | {
         chapter_of(source, book)["number"] for source, book in (whole or books).items()}
+    to_absent = _to_absent("".join(label for kind, label in targets if kind == "appendix"))
     for source, book in books.items():
         for node, key in texts(book.cells):
-            node[key] = _linked(node[key], source, targets, absent, chapters)
+            text = to_absent.sub("", node[key])
+            node[key] = _linked(text, source, targets, absent, chapters)
     return books
 
 

@@ -56,7 +56,8 @@ def summary(drives, address="."):
                 f"Figure 1. *{plain(longest.name)}*, the longest drive. Left: its trajectory by "
                 "odometry, by fusion and by the last problem"
                 f"{', and the truth (dashed)' if longest.truth else ''}. Right: the standard "
-                "deviation of position along the drive, for every problem, on a logarithmic axis"
+                "deviation of position along the drive, for every problem, on a logarithmic axis "
+                "(near zero at the start)"
                 f"{'; problem 3 is the wide line' if longest.solution('problem3') else ''}.",
                 id="caption")]
     cells.append(new_markdown_cell("## The datasets\n\n" + _dataset_table(drives), id="datasets",
@@ -81,7 +82,7 @@ def index(heading, opening, chapters):
 
 
 def abstract(drives):
-    """Return what was done and found, in Markdown: at most six sentences, then where data are from.
+    """Return what was done and found, in Markdown: at most eight sentences, then data's origin.
 
     `drives` is a list of SolvedDrive.
     """
@@ -151,17 +152,19 @@ def _errors(drives):
 
 
 def _returns(drives):
-    """Yield a sentence on odometry and SLAM at returns, which need no truth."""
-    falls = []
+    """Yield sentences on odometry and SLAM at returns, which need no truth."""
+    by_odometry, by_slam = [], []
     for drive in _named(drives):
         ends = drive.solution("problem1"), drive.solution("problem4") or drive.solution("problem3")
         found = consistency.returns(drive.dataset)
         if len(found.start) and all(map(_estimates, ends)):
-            first, last = (with_unit(_apart(found, solution.poses), "m") for solution in ends)
-            falls.append(f"{first} (odometry) and {last} (SLAM) on *{plain(drive.name)}*")
-    if falls:
-        yield ("Where the vehicle returns, its motion since then differs from that by the markers, "
-               f"in root mean square, by {listed(falls)}.")
+            for said, solution in zip((by_odometry, by_slam), ends):
+                apart = with_unit(_apart(found, solution.poses), "m")
+                said.append(f"{apart} on *{plain(drive.name)}*")
+    if by_odometry:
+        yield ("Where the camera sees the same markers again, they measure how far the vehicle has "
+               f"moved in between. Odometry differs from this by {listed(by_odometry)} (root mean "
+               f"square). SLAM, which uses these sightings, agrees with them to {listed(by_slam)}.")
 
 
 def _apart(found, poses):
@@ -239,7 +242,9 @@ def _result_table(drives):
         + "the medians over all estimated poses of the standard deviation σ of position (the "
         "larger of $x$ and $y$) and of heading; how many poses are estimated."
         + (about_dashes(drives) if known else "")
-        + (" *Hint*: fused as the assignment suggests." if "problem2_hint" in problems else ""))
+        + " σ is what each method claims" + ", to be compared with the ATE" * known + "."
+        + (" *Hint*: fused as the assignment suggests; it is overconfident (chapter 2)."
+           if "problem2_hint" in problems else ""))
     for sensor, name in SENSORS.items():
         if without := [plain(d.name) for d in drives if getattr(d.dataset, sensor) is None]:
             text += (f"\n\nThere are no {name} in {listed(without)}: the problems that need them "
