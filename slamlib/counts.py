@@ -16,12 +16,19 @@ FALLING = 0.02  # share of the rows that are smaller than the one before
 LEAP = 0.5  # share of the last row's size by which two rows in succession differ
 GROWING = 1.15  # ratio of the mean sizes of the last and the middle third
 ALIKE = 2.0  # and up to which they agree
+FAST = 0.5  # revolutions in one step, from which counts that change gradually are doubted
+RUN = 10  # rows over which they change one way
+JUMP = 4.0  # ratio of a jump of the counter to steps nearby and to a large step of the drive
+FALL = 2.0  # the same, of one against the direction of the step before and of the one after
+NEARBY = 5  # rows before and after
+LARGE = 0.9  # quantile of the steps of wheels that turn
 
 
 def since_previous(table, vehicle, aruco):
     """Counts since the pose before (n, 2) int64, and notes (list of str) if they had to be made.
 
-    Raises DatasetError if the first row is not 0, or a step is above MOST_REVOLUTIONS.
+    Raises DatasetError if the first row is not 0, a step is above MOST_REVOLUTIONS, or counts since
+    the start jump.
 
     Parameters
     ----------
@@ -30,13 +37,20 @@ def since_previous(table, vehicle, aruco):
     aruco : ArucoReadings or None
     """
     ticks = table.numbers[:, 1:]
+    most = MOST_REVOLUTIONS * vehicle.ticks_per_revolution
     if reason := run_on(ticks, vehicle, aruco):
-        return differences(ticks).astype(np.int64), [
+        steps = differences(ticks)
+        jump = jumps(steps) | (abs(steps) > most)
+        row, wheel = np.unravel_index(np.argmax(jump), jump.shape)
+        table.require(~jump.any(axis=1), "counts since the start that run on, but from the row "
+                      f"before, the count jumps from {ticks[row - 1, wheel]:.0f} to "
+                      f"{ticks[row, wheel]:.0f}: the counter restarted or overflowed, or rows are "
+                      "missing")
+        return steps.astype(np.int64), [
             f"{table.source.name} holds counts since the start ({reason}): the difference of each "
             "row from the one before was taken."]
     table.require(~ticks[:1].any(axis=1), "'1 0 0' as the first row (no step leads to pose 1; "
                   "counts are since the previous pose, not since the start)")
-    most = MOST_REVOLUTIONS * vehicle.ticks_per_revolution
     table.require((abs(ticks) <= most).all(axis=1),
                   f"at most {MOST_REVOLUTIONS:g} wheel revolutions ({most:g} ticks) in one "
                   "step (counts since the previous pose, not since the start)")
@@ -76,18 +90,53 @@ def run_on(counts, vehicle, aruco):
     return _by_markers(counts, vehicle, aruco)
 
 
-def may_run_on(counts):
-    """True if the size of rows (n, 2) grows until the end, hardly ever falls and never leaps.
+def may_run_on(counts, vehicle):
+    """True if rows (n, 2) may be counts since the start.
 
-    So do counts since the start, and increments of a vehicle that speeds up until the end.
+    1. Their size grows until the end, hardly ever falls and never leaps. So do increments of a
+       vehicle that speeds up until the end.
+    2. Or they reach FAST from 0 gradually and, but for jumps, stay gradual: rows in succession
+       differ by at most SMOOTH of the largest, mostly with one sign over RUN rows. A vehicle may
+       then stand or drive back. Increments at constant speed differ by noise about zero.
     """
-    size = abs(counts[1:]).sum(axis=1)
+    return _grow(abs(counts[1:]).sum(axis=1)) or _gradual(counts, vehicle)
+
+
+def _grow(size):
     if len(size) < MIN_ROWS:
         return False
     steps = np.diff(size)
     _, middle, end = (part.mean() for part in np.array_split(size, 3))
     return bool(np.mean(steps < 0) < FALLING and abs(steps).max() < LEAP * size[-1]
                 and end > GROWING * middle)
+
+
+def _gradual(counts, vehicle):
+    most = abs(counts).max()
+    if len(counts) <= RUN or most < FAST * vehicle.ticks_per_revolution:
+        return False
+    steps = differences(counts)
+    jump = jumps(steps)
+    jump[1] = False                     # a vehicle that drives at once
+    gradual = abs(np.where(jump, 0, steps)).max() <= SMOOTH * most
+    over_run = abs(counts[RUN:] - counts[:-RUN]).sum() / RUN
+    return bool(gradual and over_run > abs(steps).sum() / ALIKE)
+
+
+def jumps(steps):
+    """Where (n, 2) steps of a counter are above JUMP or FALL times those nearby and a large one.
+
+    So are those of a counter that restarts or overflows. A wheel changes its speed gradually.
+    """
+    size = abs(steps)
+    nearby = np.zeros_like(size)
+    for k in range(1, NEARBY + 1):
+        np.maximum(nearby[k:], size[:-k], out=nearby[k:])
+        np.maximum(nearby[:-k], size[k:], out=nearby[:-k])
+    large = np.quantile(size[size > 0], LARGE) if size.any() else 0
+    against = np.zeros(size.shape, bool)
+    against[1:-1] = (steps[1:-1] * steps[:-2] < 0) & (steps[1:-1] * steps[2:] < 0)
+    return size > np.where(against, FALL, JUMP) * np.maximum(nearby, large)
 
 
 def differences(counts):
@@ -116,6 +165,7 @@ def _by_markers(counts, vehicle, aruco):
                       vehicle.wheelbase * abs(se2.wrap(motion[:, 2])))
     way = 2 * np.pi / vehicle.ticks_per_revolution * vehicle.wheel[:2]
     steps = differences(counts)
+    steps = np.where(jumps(steps), 0, steps)
 
     def between(rows):
         """Sum (p, 2) of rows after the first and until the second sighting, in m."""

@@ -10,7 +10,7 @@ from test_dataset import error_of, write
 from slamlib import counts
 from slamlib.dataset import Vehicle, read_dataset
 from slamlib.localization import drive_doubts
-from slamlib.simulation import simulate, write_dataset
+from slamlib.simulation import manoeuvre, simulate, write_dataset
 
 simulated = cache(simulate)
 
@@ -33,7 +33,7 @@ def test_real_increments_are_never_taken_for_counts_since_the_start():
         for part in (drive, *(cut(drive, rng.integers(2000 - n), n) for n in lengths)):
             for ticks in (part.ticks, -part.ticks):
                 assert counts.run_on(ticks, part.vehicle, part.aruco) == ""
-                assert not counts.may_run_on(ticks)
+                assert not counts.may_run_on(ticks, part.vehicle)
 
 
 DRIVES = {
@@ -122,6 +122,95 @@ def test_undecided_counts_are_doubted(change):
     doubt, = drive_doubts(drive)
     assert doubt.what == "counts-since-start"
     assert f"up to {abs(drive.ticks).max()} in one row" in doubt.sentence
+
+
+def restarted(counter, row):
+    return np.r_[counter[:row], counter[row:] - counter[row]]
+
+
+def without(counter, begin, end):
+    return np.r_[counter[:begin], counter[end:]]
+
+
+JUMPS = {        # what happens to a counter, and the first line that jumps, where it is known
+    "restart after 5 rows": (lambda c: restarted(c, 5), 6),
+    "restart after 300 rows": (lambda c: restarted(c, 300), 301),
+    "restart after 1000 rows": (lambda c: restarted(c, 1000), 1001),
+    "two restarts": (lambda c: restarted(restarted(c, 1000), 300), 301),
+    "lost rows": (lambda c: without(c, 150, 200), 151),
+    "a count at the start": (lambda c: np.r_[c[:1], c[1:] + 30_000], 2),
+    **{f"modulo {m}": (lambda c, m=m: c % m, None) for m in (8000, 2**13, 2**14, 2**15, 2**17)},
+    "15 bits with a sign": (lambda c: (c + 2**14) % 2**15 - 2**14, None)}
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("case", JUMPS)
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_counter_that_jumps_is_refused(case, seed, sign, tmp_path):
+    """The reader gives no step of thousands of counts to a wheel that makes hundreds."""
+    change, line = JUMPS[case]
+    drive = simulated("short", seed)[0]
+    counter = change(sign * drive.ticks.cumsum(axis=0))
+    step = np.diff(counter, axis=0)
+    row = 1 + np.flatnonzero((abs(step) > 2 * abs(drive.ticks).max()).any(axis=1))[0]
+    assert line in (None, row + 1)
+    wheel = np.argmax(abs(step[row - 1]) > 2 * abs(drive.ticks).max())
+    seen = drive.aruco.select(drive.aruco.pose < len(counter))
+    write_dataset(tmp_path / "drive", replace(drive, ticks=counter, aruco=seen, uwb=None))
+    assert (f"encoderReading.txt, line {row + 1}: expected counts since the start that run on, but "
+            f"from the row before, the count jumps from {counter[row - 1, wheel]} to "
+            f"{counter[row, wheel]}: the counter restarted or overflowed, or rows are missing, "
+            f"found '{row + 1} ") in error_of(read_dataset, tmp_path / "drive")
+
+
+def forth(rows=300):
+    """Counts since the pose before of a drive with rounding and a slip of the wheels."""
+    slip = np.random.default_rng(0).normal(0, 2, (rows, 2)).cumsum(axis=0) / 10
+    return np.r_[[[0, 0]], np.rint(132 + slip)].astype(int)
+
+
+@pytest.mark.parametrize("ticks", [
+    np.r_[forth(), np.zeros((300, 2), int)], np.r_[forth(), -forth()],
+    np.r_[forth(), np.zeros((1000, 2), int), forth(100)], [1, -1] * forth(), [1, 0] * forth(),
+    -np.r_[forth(50), np.zeros((50, 2), int)]],
+    ids=["stands at the end", "to and fro", "stops", "on the spot", "one wheel", "backward"])
+@pytest.mark.parametrize("change", [
+    lambda c: c, lambda c: restarted(c, 250 if len(c) > 250 else 90),
+    lambda c: (c + 2**13) % 2**14 - 2**13],
+    ids=["as it is", "restarted", "overflows"])
+def test_undecided_counts_of_a_vehicle_that_stops_or_turns_back_are_doubted(
+        ticks, change, tmp_path):
+    """Without markers, and without a row of more than 10 revolutions."""
+    counter = change(ticks.cumsum(axis=0))
+    write(tmp_path / "encoderReading.txt", "\n".join(
+        f"{i} {right} {left}" for i, (right, left) in enumerate(counter, start=1)))
+    dataset = read_dataset(tmp_path)
+    np.testing.assert_array_equal(dataset.ticks, counter)
+    doubt, = drive_doubts(dataset)
+    assert doubt.what == "counts-since-start"
+    assert f"change gradually from row to row, up to {abs(counter).max()} in" in doubt.sentence
+
+
+def test_manoeuvres_are_never_taken_for_counts_since_the_start():
+    """Two hundred open paths with rests and turns back, at 1 cm to 1 m in a step, with noise."""
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        legs = [(rng.uniform(-5, 10), rng.uniform(-3, 3)) for _ in range(rng.integers(1, 6))]
+        total = manoeuvre(legs, step=rng.choice([0.01, 0.1, 1.0])).cumsum(axis=0)
+        ticks = np.diff(np.rint(total), axis=0, prepend=0).astype(int)
+        rest = np.zeros((rng.integers(100), 2), int)
+        ticks = np.insert(ticks, [rng.integers(1, len(ticks) + 1)] * len(rest), rest, axis=0)
+        assert counts.run_on(ticks, Vehicle(), None) == ""
+        assert not counts.may_run_on(ticks, Vehicle())
+
+
+def test_fast_increments_are_not_doubted_at_a_speed_that_varies():
+    """From rest to 2.5 revolutions in a step, which then vary by 1 %."""
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        speed = np.minimum(np.arange(400), 40)[:, None] * [500, 490]
+        ticks = np.rint(speed * (1 + rng.normal(0, 0.01, (400, 2)))).astype(int)
+        assert not counts.may_run_on(ticks, Vehicle())
 
 
 def test_counts_that_end_above_the_bound_by_a_leap_are_refused(tmp_path):

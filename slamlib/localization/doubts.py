@@ -127,13 +127,13 @@ def drive_doubts(dataset):
 
 def _counts_doubts(dataset):
     """A Doubt if counts may be those since the start; markers decide where there are enough."""
-    if not counts.may_run_on(dataset.ticks):
+    if not counts.may_run_on(dataset.ticks, dataset.vehicle):
         return []
     most = abs(dataset.ticks).max()
     return [Doubt("counts-since-start", (
-        f"The counts in encoderReading.txt grow from row to row until the end, up to {most} in one "
-        "row: either the vehicle speeds up until then, or they are counts since the start, where "
-        "those since the previous pose are expected. Look at encoderReading.txt."))]
+        f"The counts in encoderReading.txt change gradually from row to row, up to {most} in one "
+        "row: either the vehicle speeds up gradually to that, or they are counts since the start, "
+        "where those since the previous pose are expected. Look at encoderReading.txt."))]
 
 
 def _headings_contradict(sightings, found):
