@@ -25,13 +25,15 @@ THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(,\d{3})+")  # what a decimal comma ma
 DIALECTS = {"blanks": (None, "."), "commas": (",", "."), "semicolons": (";", "."),
             "semicolons, with decimal commas": (";", ","),
             "blanks or tabs, with decimal commas": (None, ",")}
+ID = "(id|number|num|nr|no|n|index|idx)?"
+COUNTS = "(n|d|c|e|t|w|delta|ticks?|counts?|enc|encoder|wheel|ruota|pulses?|impulsi)*"
 # Words of a header, in small letters, by the column that they name.
 WORDS = {
-    "pose id": "pose(id|number|nr|no|index)?|idpose|step",
-    "marker id": "(marker|tag)(id)?|idmarker",
-    "antenna id": "(antenna|anchor)(id)?|idantenna|idanchor",
-    "right ticks": "(ticks)?(right|destra)(ticks)?",
-    "left ticks": "(ticks)?(left|sinistra)(ticks)?",
+    "pose id": f"{ID}(pose|posa|step){ID}",
+    "marker id": f"{ID}(marker|aruco|tag|landmark)+{ID}",
+    "antenna id": f"{ID}(uwb)?(antenna|anchor|beacon|landmark){ID}",
+    "right ticks": f"{COUNTS}(right|destr[ao]|dx|r){COUNTS}",
+    "left ticks": f"{COUNTS}(left|sinistr[ao]|sx|l){COUNTS}",
     "x": "x", "y": "y", "theta": "theta|delta|heading|yaw", "range": "range|distance",
     "sigma": "sigma|std|stddev",
     **{f"s_{a}{b}": f"(s|sigma|cov|c|var){a[0]}({a[1:]})?{b[0]}({b[1:]})?" for a, b in (
@@ -98,19 +100,19 @@ def read_table(source, columns, gaps=False, optional=None):
     if numbers is None:
         text, columns, more = _in_plain_dialect(source, text, columns, gaps, optional)
         notes += more
-        numbers = _parsed(text, len(columns), nan=gaps)
+        numbers = _parsed(text, len(columns), _gaps(columns, gaps, optional))
         if numbers is None:
             raise _table_error(source, text, columns, gaps)
+        if columns[-1] == optional:
+            numbers = numbers[:, :-1]
+            notes.append(f"{name}: the last of {len(columns)} columns was taken as {optional} and "
+                         "left out; positions and ranges are taken in the plane.")
         lacking = np.isnan(numbers).any(axis=1)
         if lacking.any():
             text, first = _without(text, lacking)
             numbers = numbers[~lacking]
             notes.append(f"{name}: {np.count_nonzero(lacking)} of {len(lacking)} rows hold NaN and "
                          f"were left out, the first in {_place(source, first)}.")
-        if columns[-1] == optional:
-            numbers = numbers[:, :-1]
-            notes.append(f"{name}: the last of {len(columns)} columns was taken as {optional} and "
-                         "left out; positions and ranges are taken in the plane.")
     return Table(source, numbers, text, tuple(notes))
 
 
@@ -127,7 +129,7 @@ def _place(source, line):
 def _parsed(text, count, nan=False):
     """Numbers (m, count) of text in the plain dialect, or None where it is not that.
 
-    With `nan`, rows may hold NaN.
+    `nan`, a bool or one for each column, tells where rows may hold NaN.
     """
     if not re.search(r"^[ \t\v\f]*[^#\s]", text, re.MULTILINE):
         return np.empty((0, count))
@@ -137,6 +139,11 @@ def _parsed(text, count, nan=False):
         return None
     ok = abs(table) < BOUND
     return table if table.shape[1] == count and (ok | np.isnan(table) & nan).all() else None
+
+
+def _gaps(columns, gaps, optional):
+    """Which columns may hold NaN (c,): with `gaps` all, else the optional one."""
+    return np.array([gaps or column == optional for column in columns])
 
 
 def _in_plain_dialect(source, text, columns, gaps, optional):
@@ -158,7 +165,8 @@ def _in_plain_dialect(source, text, columns, gaps, optional):
     for wanted in [columns] + ([[*columns, optional]] if optional else []):
         body = "\n".join(lines)
         fitting = [dialect for dialect in DIALECTS if _fits(body, dialect)
-                   and _parsed(_translated(body, dialect), len(wanted), gaps) is not None]
+                   and _parsed(_translated(body, dialect), len(wanted),
+                               _gaps(wanted, gaps, optional)) is not None]
         if fitting:
             _require_decimals(source, lines, fitting[0])
             notes += [f"{name} was read with columns separated by {fitting[0]}."] * (

@@ -109,6 +109,14 @@ REFUSED = [
     ("UwbReading.txt", '"pose","antenna","sigma","range"\n1,3,1,1', 1, "expected the columns in"),
     ("ArucoReading.txt", "pose x y marker theta\n" + ROW, 1, "expected the columns in the order"),
     ("ArucoReading.txt", "p m x y theta s_yy s_xy\n" + ROW, 1, "expected the columns in the order"),
+    *[("encoderReading.txt", f"{header}\n1;0;0", 1, "expected the columns in the order")
+      for header in ("pose;tick_sx;tick_dx", "pose,nL,nR", "id L R", "k left_wheel right_wheel",
+                     "k,encoder_l,encoder_r", "n conteggi sinistra destra", "Left Right pose",
+                     "ticksLeft;ticksRight", "right left pose")],
+    *[("ArucoReading.txt", f"{header}\n" + ROW, 1, "expected the columns in the order")
+      for header in ("id_aruco,id_pose,x,y,d", "tag pose", "LandmarkId;PoseId", "aruco_id,pose_id",
+                     "ArucoMarkerID PoseNumber x")],
+    ("UwbReading.txt", "id_beacon id_pose\n1 3 1 1", 1, "expected the columns in the order"),
     ("UwbReading.txt", "hello", 1, "expected 4 columns"),
     ("UwbReading.txt", "1a 3b 1.5c 0,1d\n1 3 1.5 0.1", 1, "expected finite numbers"),
     ("UwbReading.txt", "; \n;", 1, "expected 4 columns"),
@@ -133,7 +141,8 @@ def test_a_header_alone_is_a_table_without_rows(folder):  # noqa: F811
 
 @pytest.mark.parametrize("header", [
     "pose_id,marker_id,x,y,theta,s_xx,s_xy,s_xtheta,s_yy,s_ytheta,s_thetatheta",
-    "Pose Marker x y heading cov_xx cov_xy cov_xt cov_yy cov_yt cov_tt", "id tag", "k j dx dy"])
+    "Pose Marker x y heading cov_xx cov_xy cov_xt cov_yy cov_yt cov_tt", "id tag", "k j dx dy",
+    "id_pose;id_aruco;dx;dy", "pose_id marker_id pose_x pose_y", "n landmark l r"])
 def test_headers_in_the_order_of_the_format_are_left_out(folder, header):  # noqa: F811
     clean = read_dataset(folder)
     write(folder / "ArucoReading.txt", header + "\n" + FILES["ArucoReading.txt"])
@@ -178,6 +187,19 @@ def test_guesses_with_a_height(folder, separator, decimal):  # noqa: F811
     assert_same_but_notes(found, clean)
     assert found.notes[-1] == ("UwbAntennaGuess.txt: the last of 4 columns was taken as z and left "
                                "out; positions and ranges are taken in the plane.")
+
+
+@pytest.mark.parametrize("height", ["nan", "NaN", "-nan(ind)", "1.5"])
+def test_a_height_may_be_nan_and_nothing_else(folder, height):  # noqa: F811
+    clean = read_dataset(folder)
+    for separator in (" ", ";"):
+        text = rows(separator)(f"900 1.0 2 {height}\n3 -4 5.5 nan")
+        write(folder / "UwbAntennaGuess.txt", text)
+        found = read_dataset(folder)
+        assert_same_but_notes(found, clean)
+        assert found.notes[-1].startswith("UwbAntennaGuess.txt: the last of 4 columns was taken as")
+    write(folder / "UwbAntennaGuess.txt", "900 1 2 1\n3 nan 5.5 1\n")
+    assert "expected 3 columns" in error_of(read_dataset, folder)
 
 
 def matrix(name):
