@@ -277,16 +277,33 @@ def _rows(text, separator=None):
 
 
 def mat_variables(path):
-    """Names of the variables in a .mat file, a list of str.
+    """Numbers of elements by the names of variables and of fields, as `logs.UwbReading`, a dict.
 
-    Raises DatasetError if it cannot be read, or is of another version than MATLAB's 5 to 7.
+    A struct counts as many elements. Raises DatasetError if a .mat file cannot be read, or is of
+    another version than MATLAB's 5 to 7.
     """
-    return [name for name, _, _ in _of_mat(whosmat, path)]
+    sizes = {}
+    for name, shape, kind in _of_mat(whosmat, path):
+        sizes[name] = np.inf if kind == "struct" else np.prod(shape)
+        value = _mat_value(path, name) if kind == "struct" else None
+        if isinstance(value, np.ndarray) and value.shape == (1, 1):
+            sizes |= {f"{name}.{field}": np.size(value[field][0, 0])
+                      for field in value.dtype.names or ()}
+    return sizes
+
+
+def _mat_value(path, name):
+    """A variable of a .mat file, or a field of one."""
+    name, *fields = name.split(".")
+    value = _of_mat(loadmat, path, variable_names=[name]).get(name)
+    for field in fields:
+        value = value[field][0, 0]
+    return value
 
 
 def _variable_text(source):
     """The rows of a table in a .mat file as text, one a line."""
-    value = _of_mat(loadmat, source.path, variable_names=[source.name]).get(source.name)
+    value = _mat_value(source.path, source.name)
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "iuf" or value.ndim != 2:
         kind = "a struct" if getattr(value, "dtype", None) is not None and value.dtype.names \
             else "a cell array" if getattr(value, "dtype", None) == object else "something else"
@@ -297,6 +314,9 @@ def _variable_text(source):
 def _of_mat(read, path, **keywords):
     """What a function of scipy.io reads from a .mat file."""
     data = read_regular(path)
+    if data.startswith((b"# Created by Octave", b"# name:")):
+        raise error(path, "expected a .mat file of version 7 or older, found Octave's text: save "
+                    "it with the option '-v7'")
     try:
         return read(BytesIO(data), **keywords)
     except NotImplementedError:

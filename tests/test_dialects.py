@@ -257,3 +257,67 @@ def test_a_mat_file_that_cannot_be_read(folder, content, said):  # noqa: F811
     assert note.startswith(f"logs.mat is not read: expected a .mat file {said}")
     (folder / "logs.mat").rename(folder / "UwbReading.mat")
     assert f"UwbReading.mat: expected a .mat file {said}" in error_of(read_dataset, folder)
+
+
+def test_tables_in_one_struct(folder):  # noqa: F811
+    clean = read_dataset(folder)
+    for name in TABLES:
+        (folder / name).unlink()
+    savemat(folder / "drive.mat", {"logs": {
+        "t": 1.0, **{name.removesuffix(".txt"): matrix(name) for name in TABLES}}})
+    found = read_dataset(folder)
+    assert_same_but_notes(found, clean)
+    assert "Variable logs.UwbReading of drive.mat was read as UwbReading.txt." in found.notes
+    assert "Not read: variables logs.t of drive.mat." in found.notes
+    savemat(folder / "drive.mat", {
+        name: {"encoderReading": matrix("encoderReading.txt")} for name in "ab"})
+    assert error_of(read_dataset, folder).endswith(
+        "drive.mat: expected one table encoderReading, found it in a.encoderReading and "
+        "b.encoderReading")
+
+
+@pytest.mark.parametrize("name, variables, listed", [
+    ("ArucoReading.mat", ("a", "b"), "a, b"), ("aruco.mat", ("aruco",), "aruco"),
+    ("logs.mat", ("ArucoReadings",), "ArucoReadings"), ("logs.mat", ("x", "markers"), "x, markers"),
+    ("markers.mat", (), "none")])
+def test_a_mat_file_without_the_table_that_its_names_are_near_to(
+        folder, name, variables, listed):  # noqa: F811
+    savemat(folder / name, {variable: matrix("ArucoReading.txt") for variable in variables})
+    assert read_dataset(folder).notes == (f"Not read: {name}.",)
+    (folder / "ArucoReading.txt").unlink()
+    assert error_of(read_dataset, folder) == (
+        f"{folder / name}: expected a matrix named ArucoReading, found the variables {listed}: "
+        "rename one of them")
+
+
+def test_a_struct_that_is_no_table(folder):  # noqa: F811
+    (folder / "ArucoReading.txt").unlink()
+    savemat(folder / "logs.mat", {"aruco": {"id": 1}})
+    assert error_of(read_dataset, folder).endswith(
+        "logs.mat: expected a matrix named ArucoReading, found the variables aruco, aruco.id: "
+        "rename one of them")
+
+
+def test_other_mat_files_are_named_with_their_variables(folder):  # noqa: F811
+    (folder / "ArucoReading.txt").unlink()
+    savemat(folder / "logs.mat", {"x": np.eye(3), "aruco_sigma": 0.1})
+    note, = read_dataset(folder).notes
+    assert note == "logs.mat is not read: it has the variables x, aruco_sigma."
+    (folder / "encoderReading.txt").unlink()
+    assert error_of(read_dataset, folder).endswith(
+        "encoderReading.txt: expected this file, found none, but logs.mat, which has the variables "
+        "x, aruco_sigma: name the matrix encoderReading")
+
+
+@pytest.mark.parametrize("begin", ["# Created by Octave 8.4.0", "# name: x"])
+def test_octaves_text_is_to_be_saved_as_matlabs_format(folder, begin):  # noqa: F811
+    write(folder / "logs.mat", begin + "\n# type: scalar\n1\n")
+    (folder / "UwbReading.txt").unlink()
+    said = ("logs.mat is not read: expected a .mat file of version 7 or older, found Octave's "
+            "text: save it with the option '-v7'")
+    assert read_dataset(folder).notes == (said + ".",)
+    (folder / "encoderReading.txt").unlink()
+    assert error_of(read_dataset, folder).endswith("found none, but " + said)
+    (folder / "logs.mat").rename(folder / "UwbReading.mat")
+    assert error_of(read_dataset, folder) == f"{folder}/{said.replace('logs', 'UwbReading')}" \
+        .replace(" is not read", "")
