@@ -25,13 +25,15 @@ THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(,\d{3})+")  # what a decimal comma ma
 DIALECTS = {"blanks": (None, "."), "commas": (",", "."), "semicolons": (";", "."),
             "semicolons, with decimal commas": (";", ","),
             "blanks or tabs, with decimal commas": (None, ",")}
+ID = "(id|number|num|nr|no|n|index|idx)?"
+COUNTS = "(n|d|c|e|t|w|delta|ticks?|counts?|enc|encoder|wheel|ruota|pulses?|impulsi)*"
 # Words of a header, in small letters, by the column that they name.
 WORDS = {
-    "pose id": "pose(id|number|nr|no|index)?|idpose|step",
-    "marker id": "(marker|tag)(id)?|idmarker",
-    "antenna id": "(antenna|anchor)(id)?|idantenna|idanchor",
-    "right ticks": "(ticks)?(right|destra)(ticks)?",
-    "left ticks": "(ticks)?(left|sinistra)(ticks)?",
+    "pose id": f"{ID}(pose|posa|step){ID}",
+    "marker id": f"{ID}(marker|aruco|tag|landmark)+{ID}",
+    "antenna id": f"{ID}(uwb)?(antenna|anchor|beacon|landmark){ID}",
+    "right ticks": f"{COUNTS}(right|destr[ao]|dx|r){COUNTS}",
+    "left ticks": f"{COUNTS}(left|sinistr[ao]|sx|l){COUNTS}",
     "x": "x", "y": "y", "theta": "theta|delta|heading|yaw", "range": "range|distance",
     "sigma": "sigma|std|stddev",
     **{f"s_{a}{b}": f"(s|sigma|cov|c|var){a[0]}({a[1:]})?{b[0]}({b[1:]})?" for a, b in (
@@ -98,19 +100,19 @@ def read_table(source, columns, gaps=False, optional=None):
     if numbers is None:
         text, columns, more = _in_plain_dialect(source, text, columns, gaps, optional)
         notes += more
-        numbers = _parsed(text, len(columns), nan=gaps)
+        numbers = _parsed(text, len(columns), _gaps(columns, gaps, optional))
         if numbers is None:
             raise _table_error(source, text, columns, gaps)
+        if columns[-1] == optional:
+            numbers = numbers[:, :-1]
+            notes.append(f"{name}: the last of {len(columns)} columns was taken as {optional} and "
+                         "left out; positions and ranges are taken in the plane.")
         lacking = np.isnan(numbers).any(axis=1)
         if lacking.any():
             text, first = _without(text, lacking)
             numbers = numbers[~lacking]
             notes.append(f"{name}: {np.count_nonzero(lacking)} of {len(lacking)} rows hold NaN and "
                          f"were left out, the first in {_place(source, first)}.")
-        if columns[-1] == optional:
-            numbers = numbers[:, :-1]
-            notes.append(f"{name}: the last of {len(columns)} columns was taken as {optional} and "
-                         "left out; positions and ranges are taken in the plane.")
     return Table(source, numbers, text, tuple(notes))
 
 
@@ -127,7 +129,7 @@ def _place(source, line):
 def _parsed(text, count, nan=False):
     """Numbers (m, count) of text in the plain dialect, or None where it is not that.
 
-    With `nan`, rows may hold NaN.
+    `nan`, a bool or one for each column, tells where rows may hold NaN.
     """
     if not re.search(r"^[ \t\v\f]*[^#\s]", text, re.MULTILINE):
         return np.empty((0, count))
@@ -137,6 +139,11 @@ def _parsed(text, count, nan=False):
         return None
     ok = abs(table) < BOUND
     return table if table.shape[1] == count and (ok | np.isnan(table) & nan).all() else None
+
+
+def _gaps(columns, gaps, optional):
+    """Which columns may hold NaN (c,): with `gaps` all, else the optional one."""
+    return np.array([gaps or column == optional for column in columns])
 
 
 def _in_plain_dialect(source, text, columns, gaps, optional):
@@ -158,7 +165,8 @@ def _in_plain_dialect(source, text, columns, gaps, optional):
     for wanted in [columns] + ([[*columns, optional]] if optional else []):
         body = "\n".join(lines)
         fitting = [dialect for dialect in DIALECTS if _fits(body, dialect)
-                   and _parsed(_translated(body, dialect), len(wanted), gaps) is not None]
+                   and _parsed(_translated(body, dialect), len(wanted),
+                               _gaps(wanted, gaps, optional)) is not None]
         if fitting:
             _require_decimals(source, lines, fitting[0])
             notes += [f"{name} was read with columns separated by {fitting[0]}."] * (
@@ -269,16 +277,33 @@ def _rows(text, separator=None):
 
 
 def mat_variables(path):
-    """Names of the variables in a .mat file, a list of str.
+    """Numbers of elements by the names of variables and of fields, as `logs.UwbReading`, a dict.
 
-    Raises DatasetError if it cannot be read, or is of another version than MATLAB's 5 to 7.
+    A struct counts as many elements. Raises DatasetError if a .mat file cannot be read, or is of
+    another version than MATLAB's 5 to 7.
     """
-    return [name for name, _, _ in _of_mat(whosmat, path)]
+    sizes = {}
+    for name, shape, kind in _of_mat(whosmat, path):
+        sizes[name] = np.inf if kind == "struct" else np.prod(shape)
+        value = _mat_value(path, name) if kind == "struct" else None
+        if isinstance(value, np.ndarray) and value.shape == (1, 1):
+            sizes |= {f"{name}.{field}": np.size(value[field][0, 0])
+                      for field in value.dtype.names or ()}
+    return sizes
+
+
+def _mat_value(path, name):
+    """A variable of a .mat file, or a field of one."""
+    name, *fields = name.split(".")
+    value = _of_mat(loadmat, path, variable_names=[name]).get(name)
+    for field in fields:
+        value = value[field][0, 0]
+    return value
 
 
 def _variable_text(source):
     """The rows of a table in a .mat file as text, one a line."""
-    value = _of_mat(loadmat, source.path, variable_names=[source.name]).get(source.name)
+    value = _mat_value(source.path, source.name)
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "iuf" or value.ndim != 2:
         kind = "a struct" if getattr(value, "dtype", None) is not None and value.dtype.names \
             else "a cell array" if getattr(value, "dtype", None) == object else "something else"
@@ -289,6 +314,9 @@ def _variable_text(source):
 def _of_mat(read, path, **keywords):
     """What a function of scipy.io reads from a .mat file."""
     data = read_regular(path)
+    if data.startswith((b"# Created by Octave", b"# name:")):
+        raise error(path, "expected a .mat file of version 7 or older, found Octave's text: save "
+                    "it with the option '-v7'")
     try:
         return read(BytesIO(data), **keywords)
     except NotImplementedError:

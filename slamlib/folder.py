@@ -19,12 +19,24 @@ FILES = (*TABLES, "vehicle.toml", "truth")
 TRUTH_FILES = ("vehiclePose.txt", "ArucoMap.txt", "UwbMap.txt", "vehicle.toml")
 IGNORED = re.compile(r"\..*|thumbs\.db|desktop\.ini|__macosx", re.IGNORECASE)
 ARCHIVE = re.compile(r"\.(zip|7z|rar|gz|tgz|tar)$", re.IGNORECASE)
-SPREADSHEET = re.compile(r"\.(xlsx?|ods|numbers)$", re.IGNORECASE)
+PICTURE = re.compile(r"\.(jpe?g|png|gif|svg|heic|webp|tiff?|bmp|eps|fig|mp4|mov|avi)$")
+# Extensions of files that hold no text, what that is, and what is to be done.
+KINDS = (
+    (re.compile(r"\.(xlsx?|ods|numbers)$"), "a spreadsheet", "save it as {stem}.csv"),
+    (re.compile(r"\.(docx?|odt|rtf|pdf|pages|html?)$"), "a document", "save it as text in {name}"),
+    (re.compile(r"\.mat$"), "a .mat file", "save it as text in {name}"),
+    (re.compile(r"\.np[yz]$"), "arrays of numpy", "save them as text in {name}"),
+    (ARCHIVE, "an archive", "unpack it here as {name}"),
+    (re.compile(r"\.(crdownload|download|part|partial|opdownload)$"), "an unfinished download",
+     "download {name} again"),
+    (re.compile(r"\.(url|lnk|webloc)$"), "a link", "copy {name} itself here"),
+    (re.compile(r"^\."), "a hidden file", "download or copy {name} itself here"))
 # What an editor, a browser or a file manager adds to a name: an extension, or the number of a copy.
 EXTENSION = re.compile(r"\.(txt|csv|tsv|dat)$")
 COPY = re.compile(r"^(copy of|copia di) |( ?\(\d+\)|[ _-]+(copy|copia)( ?\(\d+\)| \d+)?)$")
 # Extensions of files that may hold data.
-DATA = re.compile(r"^[^.]*$|\.(txt|csv|tsv|dat|asc|log|toml|bak|old|orig|xlsx?|ods|numbers)~?$|~$")
+DATA = re.compile(r"^[^.]*$|\.(txt|csv|tsv|dat|asc|log|text|prn|out|toml|tml|bak|old|orig|"
+                  r"xlsx?|ods|numbers)~?$|~$")
 # What the words of a name say, the first that fits.
 MEANINGS = {"UwbAntennaGuess.txt": "guess|antenna|anchor",
             "ArucoReading.txt": "aruco|marker|sighting", "UwbReading.txt": "uwb|(?<![a-z])range",
@@ -67,7 +79,7 @@ def contents(folder, expected=FILES):
             notes = [f"The files were read from the sub-folder {_some([deeper[0].name])}."]
             return Contents(inner.folder, inner.files, (*notes, *_not_read(
                 [path.name for path in paths if path != deeper[0]]), *inner.notes), inner.hint)
-    files, notes, copies = {}, [], set()
+    files, notes, copies, hint = {}, [], set(), ""
     for name in expected:
         found, others = _choose(folder, name, paths)
         if found is not None:
@@ -78,7 +90,7 @@ def contents(folder, expected=FILES):
         copies |= {found, *others}
     rest = [path for path in paths if path not in copies]
     if expected is FILES:
-        variables, more, unread = _mat_tables(
+        variables, more, unread, hint = _mat_tables(
             [path for path in rest if path.suffix.lower() == ".mat"],
             [name for name in TABLES if name not in files])
         files |= variables
@@ -88,13 +100,18 @@ def contents(folder, expected=FILES):
     for path in rest:
         if (name := _meant(path, expected)) and name not in files:
             raise _misnamed(path, name)
+    for path in _hidden(folder):
+        if (name := _placeholder(path, expected)) and name not in files:
+            raise _misnamed(path, name)
+    if expected is FILES:
+        _require_here(folder, files, [path for path in rest if path.is_dir()])
     archives = [path.name for path in rest if ARCHIVE.search(path.name)]
     notes += [f"{name} is not read: unpack it here if it holds files of this dataset."
               for name in archives]
     others = [path.name for path in rest if path.name not in archives]
     notes += _not_read(others)
     return Contents(folder, files, tuple(notes),
-                    f", but {quoted(archives[0])}: unpack it" if archives else "")
+                    f", but {quoted(archives[0])}: unpack it" if archives else hint)
 
 
 def is_dataset(folder):
@@ -103,6 +120,7 @@ def is_dataset(folder):
     mats = [path for path in paths if path.suffix.lower() == ".mat"]
     return any(_role(path, FILES) or ARCHIVE.search(path.name) for path in paths) \
         or any(path.is_dir() and _holds_encoder(path) for path in paths) \
+        or any(_placeholder(path, FILES) for path in _hidden(folder)) \
         or bool(_mat_tables(mats, TABLES)[0])
 
 
@@ -123,6 +141,37 @@ def _listed(folder):
         return sorted(path for path in Path(folder).iterdir() if not IGNORED.fullmatch(path.name))
     except (OSError, ValueError):  # ValueError: a NUL character in the folder's name
         raise error(folder, "expected a folder that can be read") from None
+
+
+def _hidden(folder):
+    """Paths of the files in a folder whose names begin with a dot, sorted."""
+    return sorted(path for path in Path(folder).glob(".*") if path.is_file())
+
+
+def _placeholder(path, expected):
+    """The name of `expected` that a hidden file's name contains, or None.
+
+    Clouds leave `.ArucoReading.txt.icloud` for a file that is not here, macOS
+    `._ArucoReading.txt` beside one.
+    """
+    return next((name for name in expected
+                 if name != "truth" and name.removesuffix(".txt").lower() in path.name.lower()),
+                None)
+
+
+def _require_here(folder, files, others):
+    """Raise DatasetError if a table that is not among `files` is in one of the folders `others`.
+
+    A folder with encoders of its own is another dataset.
+    """
+    for deeper in others:
+        held = {_role(path, TABLES): path for path in _listed_if_readable(deeper)
+                if any(path.name.lower() == name.lower() or _is_variant(path, name)
+                       for name in TABLES)}
+        for name, path in held.items():
+            if name not in files and (ENCODER not in files or ENCODER not in held):
+                raise error(folder / name, "expected this file, found it as "
+                            f"{_some([f'{deeper.name}/{path.name}'])}: move it up, or away")
 
 
 def _some(names):
@@ -175,10 +224,22 @@ def _stem(name):
 
 
 def _meant(path, expected):
-    """The name of `expected` that a file's name is near to in spelling or meaning, or None."""
-    if path.is_dir() or not DATA.search(path.name.lower()):
+    """The name of `expected` that a file's name is near to in spelling or meaning, or None.
+
+    A text file's name without extension is enough, unless the file is a picture.
+    """
+    if path.is_dir() or PICTURE.search(path.name.lower()):
         return None
-    stem = re.sub(r"\.[a-z]{3,4}~?$|~$", "", _stem(path.name))
+    bare = _stem(path.name.partition(".")[0])
+    same = next((name for name in expected if name == f"{Path(name).stem}.txt"
+                 and bare == _stem(name)), None)
+    if same or not DATA.search(path.name.lower()):
+        return same
+    return _sense(re.sub(r"\.[a-z]{3,4}~?$|~$", "", _stem(path.name)), expected)
+
+
+def _sense(stem, expected):
+    """The name of `expected` that a name without extension is near to, or None."""
     stems = {_stem(name): name for name in expected if name != "truth"}
     if close := get_close_matches(stem, stems, 1, 0.8):
         return stems[close[0]]
@@ -195,25 +256,33 @@ def _role(path, expected):
 
 
 def _holds_encoder(folder):
-    """True if one of the files in a folder is that of the encoders."""
+    """True if one of the files in a folder is that of the encoders, or near to a table."""
+    return any(_role(path, (ENCODER,)) for path in _listed_if_readable(folder))
+
+
+def _listed_if_readable(folder):
     try:
-        return any(_role(path, (ENCODER,)) for path in _listed(folder))
+        return _listed(folder)
     except DatasetError:
-        return False
+        return []
 
 
 def _misnamed(path, name):
-    if SPREADSHEET.search(path.name):
-        return error(path, f"expected text, found a spreadsheet: save it as {Path(name).stem}.csv")
+    for extension, kind, advice in KINDS:
+        if extension.search(path.name.lower()):
+            advice = advice.format(name=name, stem=Path(name).stem)
+            return error(path, f"expected text, found {kind}: {advice}")
     return error(path, f"expected the name {name}: rename it, or move it away")
 
 
 def _mat_tables(paths, names):
-    """Variables of .mat files by the names that they have of `names`, notes, and unreadable files.
+    """Variables of .mat files by the names that they have of `names`, notes, files that are not
+    read, and what a message on missing encoders adds.
 
-    A file that cannot be read is refused if its own name is one of them.
+    A file is refused if it cannot be read and its own name is one of them, or if its name or that
+    of a variable is near to a missing one.
     """
-    files, notes, unread = {}, [], []
+    files, notes, unread, hint, left = {}, [], [], "", {}
     for path in paths if names else ():
         try:
             variables = mat_variables(path)
@@ -221,22 +290,36 @@ def _mat_tables(paths, names):
             if any(_stem(path.stem) == _stem(name) for name in names):
                 raise
             notes.append(f"{path.name} is not read{str(failure).removeprefix(str(path))}.")
+            hint = f", but {notes[-1][:-1]}"
             unread.append(path)
             continue
-        known = {variable.lower(): variable for variable in variables}
-        single = len(variables) == 1 and _stem(path.stem) in {_stem(name) for name in names}
         for name in names:
-            variable = variables[0] if single and _stem(path.stem) == _stem(name) \
-                else known.get(_stem(name))
-            if variable is None:
-                continue
-            if name in files:
-                raise error(path.parent, f"expected one table {Path(name).stem}, found it in "
-                            f"{files[name].path.name} and {path.name}")
-            files[name] = Variable(path, variable)
-            notes.append(f"Variable {variable} of {path.name} was read as {name}.")
+            found = [each for each in variables if each.rpartition(".")[2].lower() == _stem(name)]
+            if len(variables) == 1 and _stem(path.stem) == _stem(name):
+                found = list(variables)
+            if len(found) > 1 or found and name in files:
+                places = found[:2] if len(found) > 1 else [files[name].path.name, path.name]
+                raise error(path.parent if len(found) == 1 else path, "expected one table "
+                            f"{Path(name).stem}, found it in {' and '.join(places)}")
+            if found:
+                files[name] = Variable(path, found[0])
+                notes.append(f"Variable {found[0]} of {path.name} was read as {name}.")
         used = {each.name for each in files.values() if each.path == path}
-        left = [variable for variable in variables if variable not in used]
-        if used and left:
-            notes.append(f"Not read: variables {_some(left)} of {path.name}.")
-    return files, notes, unread
+        left[path] = {each: size for each, size in variables.items()
+                      if not any(f"{name}.".startswith(f"{each}.") for name in used)}
+        if used and left[path]:
+            notes.append(f"Not read: variables {_some(list(left[path]))} of {path.name}.")
+    for path, variables in left.items():
+        used = any(each.path == path for each in files.values())
+        has = f"has the variables {_some(list(variables)) or 'none'}"
+        near = [each.rpartition(".")[2] for each, size in variables.items() if size > 1]
+        for name in names:
+            if name not in files and name in {
+                    _sense(word.lower(), TABLES) for word in near + [path.stem] * (not used)}:
+                raise error(path, f"expected a matrix named {Path(name).stem}, found the variables "
+                            f"{_some(list(variables)) or 'none'}: rename one of them")
+        if not used:
+            notes.append(f"{path.name} is not read: it {has}.")
+            hint = f", but {path.name}, which {has}: name the matrix {Path(ENCODER).stem}"
+            unread.append(path)
+    return files, notes, unread, hint

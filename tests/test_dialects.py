@@ -109,6 +109,14 @@ REFUSED = [
     ("UwbReading.txt", '"pose","antenna","sigma","range"\n1,3,1,1', 1, "expected the columns in"),
     ("ArucoReading.txt", "pose x y marker theta\n" + ROW, 1, "expected the columns in the order"),
     ("ArucoReading.txt", "p m x y theta s_yy s_xy\n" + ROW, 1, "expected the columns in the order"),
+    *[("encoderReading.txt", f"{header}\n1;0;0", 1, "expected the columns in the order")
+      for header in ("pose;tick_sx;tick_dx", "pose,nL,nR", "id L R", "k left_wheel right_wheel",
+                     "k,encoder_l,encoder_r", "n conteggi sinistra destra", "Left Right pose",
+                     "ticksLeft;ticksRight", "right left pose")],
+    *[("ArucoReading.txt", f"{header}\n" + ROW, 1, "expected the columns in the order")
+      for header in ("id_aruco,id_pose,x,y,d", "tag pose", "LandmarkId;PoseId", "aruco_id,pose_id",
+                     "ArucoMarkerID PoseNumber x")],
+    ("UwbReading.txt", "id_beacon id_pose\n1 3 1 1", 1, "expected the columns in the order"),
     ("UwbReading.txt", "hello", 1, "expected 4 columns"),
     ("UwbReading.txt", "1a 3b 1.5c 0,1d\n1 3 1.5 0.1", 1, "expected finite numbers"),
     ("UwbReading.txt", "; \n;", 1, "expected 4 columns"),
@@ -133,7 +141,8 @@ def test_a_header_alone_is_a_table_without_rows(folder):  # noqa: F811
 
 @pytest.mark.parametrize("header", [
     "pose_id,marker_id,x,y,theta,s_xx,s_xy,s_xtheta,s_yy,s_ytheta,s_thetatheta",
-    "Pose Marker x y heading cov_xx cov_xy cov_xt cov_yy cov_yt cov_tt", "id tag", "k j dx dy"])
+    "Pose Marker x y heading cov_xx cov_xy cov_xt cov_yy cov_yt cov_tt", "id tag", "k j dx dy",
+    "id_pose;id_aruco;dx;dy", "pose_id marker_id pose_x pose_y", "n landmark l r"])
 def test_headers_in_the_order_of_the_format_are_left_out(folder, header):  # noqa: F811
     clean = read_dataset(folder)
     write(folder / "ArucoReading.txt", header + "\n" + FILES["ArucoReading.txt"])
@@ -178,6 +187,19 @@ def test_guesses_with_a_height(folder, separator, decimal):  # noqa: F811
     assert_same_but_notes(found, clean)
     assert found.notes[-1] == ("UwbAntennaGuess.txt: the last of 4 columns was taken as z and left "
                                "out; positions and ranges are taken in the plane.")
+
+
+@pytest.mark.parametrize("height", ["nan", "NaN", "-nan(ind)", "1.5"])
+def test_a_height_may_be_nan_and_nothing_else(folder, height):  # noqa: F811
+    clean = read_dataset(folder)
+    for separator in (" ", ";"):
+        text = rows(separator)(f"900 1.0 2 {height}\n3 -4 5.5 nan")
+        write(folder / "UwbAntennaGuess.txt", text)
+        found = read_dataset(folder)
+        assert_same_but_notes(found, clean)
+        assert found.notes[-1].startswith("UwbAntennaGuess.txt: the last of 4 columns was taken as")
+    write(folder / "UwbAntennaGuess.txt", "900 1 2 1\n3 nan 5.5 1\n")
+    assert "expected 3 columns" in error_of(read_dataset, folder)
 
 
 def matrix(name):
@@ -235,3 +257,67 @@ def test_a_mat_file_that_cannot_be_read(folder, content, said):  # noqa: F811
     assert note.startswith(f"logs.mat is not read: expected a .mat file {said}")
     (folder / "logs.mat").rename(folder / "UwbReading.mat")
     assert f"UwbReading.mat: expected a .mat file {said}" in error_of(read_dataset, folder)
+
+
+def test_tables_in_one_struct(folder):  # noqa: F811
+    clean = read_dataset(folder)
+    for name in TABLES:
+        (folder / name).unlink()
+    savemat(folder / "drive.mat", {"logs": {
+        "t": 1.0, **{name.removesuffix(".txt"): matrix(name) for name in TABLES}}})
+    found = read_dataset(folder)
+    assert_same_but_notes(found, clean)
+    assert "Variable logs.UwbReading of drive.mat was read as UwbReading.txt." in found.notes
+    assert "Not read: variables logs.t of drive.mat." in found.notes
+    savemat(folder / "drive.mat", {
+        name: {"encoderReading": matrix("encoderReading.txt")} for name in "ab"})
+    assert error_of(read_dataset, folder).endswith(
+        "drive.mat: expected one table encoderReading, found it in a.encoderReading and "
+        "b.encoderReading")
+
+
+@pytest.mark.parametrize("name, variables, listed", [
+    ("ArucoReading.mat", ("a", "b"), "a, b"), ("aruco.mat", ("aruco",), "aruco"),
+    ("logs.mat", ("ArucoReadings",), "ArucoReadings"), ("logs.mat", ("x", "markers"), "x, markers"),
+    ("markers.mat", (), "none")])
+def test_a_mat_file_without_the_table_that_its_names_are_near_to(
+        folder, name, variables, listed):  # noqa: F811
+    savemat(folder / name, {variable: matrix("ArucoReading.txt") for variable in variables})
+    assert read_dataset(folder).notes == (f"Not read: {name}.",)
+    (folder / "ArucoReading.txt").unlink()
+    assert error_of(read_dataset, folder) == (
+        f"{folder / name}: expected a matrix named ArucoReading, found the variables {listed}: "
+        "rename one of them")
+
+
+def test_a_struct_that_is_no_table(folder):  # noqa: F811
+    (folder / "ArucoReading.txt").unlink()
+    savemat(folder / "logs.mat", {"aruco": {"id": 1}})
+    assert error_of(read_dataset, folder).endswith(
+        "logs.mat: expected a matrix named ArucoReading, found the variables aruco, aruco.id: "
+        "rename one of them")
+
+
+def test_other_mat_files_are_named_with_their_variables(folder):  # noqa: F811
+    (folder / "ArucoReading.txt").unlink()
+    savemat(folder / "logs.mat", {"x": np.eye(3), "aruco_sigma": 0.1})
+    note, = read_dataset(folder).notes
+    assert note == "logs.mat is not read: it has the variables x, aruco_sigma."
+    (folder / "encoderReading.txt").unlink()
+    assert error_of(read_dataset, folder).endswith(
+        "encoderReading.txt: expected this file, found none, but logs.mat, which has the variables "
+        "x, aruco_sigma: name the matrix encoderReading")
+
+
+@pytest.mark.parametrize("begin", ["# Created by Octave 8.4.0", "# name: x"])
+def test_octaves_text_is_to_be_saved_as_matlabs_format(folder, begin):  # noqa: F811
+    write(folder / "logs.mat", begin + "\n# type: scalar\n1\n")
+    (folder / "UwbReading.txt").unlink()
+    said = ("logs.mat is not read: expected a .mat file of version 7 or older, found Octave's "
+            "text: save it with the option '-v7'")
+    assert read_dataset(folder).notes == (said + ".",)
+    (folder / "encoderReading.txt").unlink()
+    assert error_of(read_dataset, folder).endswith("found none, but " + said)
+    (folder / "logs.mat").rename(folder / "UwbReading.mat")
+    assert error_of(read_dataset, folder) == f"{folder}/{said.replace('logs', 'UwbReading')}" \
+        .replace(" is not read", "")

@@ -77,7 +77,10 @@ def test_a_copy_is_not_read_and_another_version_is_refused(folder):  # noqa: F81
     ("odometry.log", "encoderReading.txt"), ("uwb.txt", "UwbReading.txt"),
     ("ranges.txt", "UwbReading.txt"), ("AntennaGuess.txt", "UwbAntennaGuess.txt"),
     ("anchors.csv", "UwbAntennaGuess.txt"), ("UwbGuess.txt", "UwbAntennaGuess.txt"),
-    ("vehicle.txt", "vehicle.toml")])
+    *[(f"ArucoReading{end}", "ArucoReading.txt") for end in (
+        ".text", ".prn", ".out", ".json", ".md", ".xml", ".m", ".txt_", ".TXT_", " (1).json")],
+    ("encoderReading.text", "encoderReading.txt"), ("markers.prn", "ArucoReading.txt"),
+    ("vehicle.tml", "vehicle.toml"), ("vehicle.txt", "vehicle.toml")])
 def test_a_name_near_to_a_missing_one_is_refused(folder, wrong, right):  # noqa: F811
     (folder / right).rename(folder / wrong)
     message = error_of(read_dataset, folder)
@@ -90,6 +93,85 @@ def test_a_spreadsheet_is_to_be_saved_as_text(folder):  # noqa: F811
     (folder / "UwbReading.txt").rename(folder / "UwbReading.xlsx")
     assert error_of(read_dataset, folder).endswith(
         "UwbReading.xlsx: expected text, found a spreadsheet: save it as UwbReading.csv")
+
+
+@pytest.mark.parametrize("extension, said", [
+    *[(end, "a document: save it as text in UwbReading.txt")
+      for end in (".docx", ".odt", ".pdf", ".rtf", ".html", ".txt.pdf", " (1).PDF")],
+    (".npy", "arrays of numpy: save them as text in UwbReading.txt"),
+    (".txt.download", "an unfinished download: download UwbReading.txt again"),
+    (".txt.crdownload", "an unfinished download: download UwbReading.txt again"),
+    (".txt.url", "a link: copy UwbReading.txt itself here"),
+    (".txt.lnk", "a link: copy UwbReading.txt itself here"),
+    (".zip", "an archive: unpack it here as UwbReading.txt"),
+    (".txt.gz", "an archive: unpack it here as UwbReading.txt")])
+def test_a_file_of_a_sensor_that_is_no_text_is_refused(folder, extension, said):  # noqa: F811
+    path = folder / f"UwbReading{extension}"
+    shutil.copy(folder / "UwbReading.txt", path)
+    assert len(read_dataset(folder).notes) == 1
+    (folder / "UwbReading.txt").unlink()
+    assert error_of(read_dataset, folder) == f"{path}: expected text, found {said}"
+
+
+def test_maps_of_the_truth_that_are_no_text_are_refused(folder):  # noqa: F811
+    (folder / "truth/UwbMap.txt").rename(folder / "truth/UwbMap.mat")
+    assert error_of(read_truth, folder).endswith(
+        "UwbMap.mat: expected text, found a .mat file: save it as text in UwbMap.txt")
+
+
+@pytest.mark.parametrize("name", [
+    ".UwbReading.txt.icloud", "._UwbReading.txt", ".uwbreading.csv.icloud"])
+def test_a_hidden_file_stands_for_one_that_is_not_here(folder, name):  # noqa: F811
+    write(folder / name, b"\0")
+    write(folder / ".other.icloud", b"\0")
+    assert read_dataset(folder).notes == ()
+    (folder / "UwbReading.txt").unlink()
+    assert error_of(read_dataset, folder) == (
+        f"{folder / name}: expected text, found a hidden file: download or copy UwbReading.txt "
+        "itself here")
+
+
+def test_a_dataset_of_which_all_files_are_in_a_cloud_is_not_left_out(folder):  # noqa: F811
+    write(folder.parent / "other" / ".encoderReading.txt.icloud", b"\0")
+    with pytest.raises(DatasetError, match="other.*download or copy encoderReading.txt itself"):
+        dataset_names(folder.parent)
+
+
+@pytest.mark.parametrize("name", ["vehicle.jpg", "vehicle.pdf", "ArucoReading.png", "uwb.docx",
+                                  "aruco.md", "markers.pdf", "range.html"])
+def test_pictures_and_documents_are_no_sensors(folder, name):  # noqa: F811
+    for missing in ("ArucoReading.txt", "UwbReading.txt", "vehicle.toml"):
+        (folder / missing).unlink()
+    write(folder / name, b"\0")
+    assert read_dataset(folder).notes == (f"Not read: {name}.",)
+
+
+def test_a_table_in_a_sub_folder_is_to_be_moved_up(folder):  # noqa: F811
+    (folder / "sens").mkdir()
+    (folder / "ArucoReading.txt").rename(folder / "sens/ArucoReading.txt.txt")
+    assert error_of(read_dataset, folder) == (
+        f"{folder / 'ArucoReading.txt'}: expected this file, found it as "
+        "sens/ArucoReading.txt.txt: move it up, or away")
+    shutil.copy(folder / "encoderReading.txt", folder / "sens")     # a dataset of its own
+    assert read_dataset(folder).notes == ("Not read: sens.",)
+    (folder / "encoderReading.txt").unlink()
+    (folder / "sens/ArucoReading.txt.txt").rename(folder / "ArucoReading.txt")
+    assert error_of(read_dataset, folder).endswith(
+        "encoderReading.txt: expected this file, found it as sens/encoderReading.txt: move it up, "
+        "or away")
+
+
+def test_tables_in_folders_beside_each_other_are_to_be_moved(folder):  # noqa: F811
+    for name, inner in (("encoderReading.txt", "wheels"), ("UwbReading.txt", "radio")):
+        (folder / inner).mkdir()
+        (folder / name).rename(folder / inner / name)
+    for name in ("ArucoReading.txt", "UwbAntennaGuess.txt", "vehicle.toml"):
+        (folder / name).unlink()
+    assert error_of(read_dataset, folder).endswith(
+        "UwbReading.txt: expected this file, found it as radio/UwbReading.txt: move it up, or away")
+    shutil.rmtree(folder / "truth")
+    assert error_of(read_dataset, folder).endswith(
+        "expected the files of one dataset, found those of radio, wheels in sub-folders")
 
 
 def test_other_files_are_named_and_those_of_systems_are_not(folder):  # noqa: F811
