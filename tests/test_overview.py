@@ -228,7 +228,8 @@ def test_of_many_drives_the_abstract_names_the_shortest_and_the_longest(project,
     assert re.search(r"Odometry differs from this by [\d.]+\u00a0m?m on \*no_truth\* .*SLAM, which "
                      r"uses these sightings, agrees with them to [\d.]+\u00a0mm on \*no_truth\*\.",
                      text)
-    assert "σ is what each method claims. *Hint*" in text
+    assert "standard deviation σ that a method claims" in text
+    assert "overconfident (chapter 2)" in text
     assert all(len(row) == 3 for row in rows.values())
 
 

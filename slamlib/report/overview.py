@@ -56,8 +56,7 @@ def summary(drives, address="."):
                 f"Figure 1. *{plain(longest.name)}*, the longest drive. Left: its trajectory by "
                 "odometry, by fusion and by the last problem"
                 f"{', and the truth (dashed)' if longest.truth else ''}. Right: the standard "
-                "deviation of position along the drive, for every problem, on a logarithmic axis "
-                "(near zero at the start)"
+                "deviation of position along the drive, for every problem, on a logarithmic axis"
                 f"{'; problem 3 is the wide line' if longest.solution('problem3') else ''}.",
                 id="caption")]
     cells.append(new_markdown_cell("## The datasets\n\n" + _dataset_table(drives), id="datasets",
@@ -239,11 +238,10 @@ def _result_table(drives):
         "\n\nTable 1. Every problem on every dataset: "
         + ("the root mean square error of all positions (ATE), as they stand and moved as a whole "
            "nearest to the truth (aligned); " if known else "")
-        + "the medians over all estimated poses of the standard deviation σ of position (the "
-        "larger of $x$ and $y$) and of heading; how many poses are estimated."
+        + "the medians over all estimated poses of the standard deviation σ that a method claims, "
+        "of position (the larger of $x$ and $y$) and of heading; how many poses are estimated."
         + (about_dashes(drives) if known else "")
-        + " σ is what each method claims" + ", to be compared with the ATE" * known + "."
-        + (" *Hint*: fused as the assignment suggests; it is overconfident (chapter 2)."
+        + (" *Hint*: as the assignment suggests, overconfident (chapter 2)."
            if "problem2_hint" in problems else ""))
     for sensor, name in SENSORS.items():
         if without := [plain(d.name) for d in drives if getattr(d.dataset, sensor) is None]:
