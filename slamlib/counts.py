@@ -19,7 +19,7 @@ ALIKE = 2.0  # and up to which they agree
 FAST = 0.5  # revolutions in one step, from which counts that change gradually are doubted
 RUN = 10  # rows over which they change one way
 JUMP = 4.0  # ratio of a jump of the counter to steps nearby and to a large step of the drive
-FALL = 2.0  # the same, of one against the direction of the step before and of the one after
+FALL = 3.0  # the same, of one against the direction of the step before and of the one after
 NEARBY = 5  # rows before and after
 LARGE = 0.9  # quantile of the steps of wheels that turn
 

@@ -34,6 +34,7 @@ def test_real_increments_are_never_taken_for_counts_since_the_start():
             for ticks in (part.ticks, -part.ticks):
                 assert counts.run_on(ticks, part.vehicle, part.aruco) == ""
                 assert not counts.may_run_on(ticks, part.vehicle)
+                assert not counts.jumps(ticks).any()
 
 
 DRIVES = {
@@ -202,6 +203,7 @@ def test_manoeuvres_are_never_taken_for_counts_since_the_start():
         ticks = np.insert(ticks, [rng.integers(1, len(ticks) + 1)] * len(rest), rest, axis=0)
         assert counts.run_on(ticks, Vehicle(), None) == ""
         assert not counts.may_run_on(ticks, Vehicle())
+        assert not counts.jumps(ticks).any()
 
 
 def test_fast_increments_are_not_doubted_at_a_speed_that_varies():
