@@ -76,7 +76,7 @@ def test_the_pages_load_nothing(pages, chromium):
     """But each other: no request leaves the folder, and the first page leads to the others."""
     page, requests = chromium.new_page(), []
     page.on("request", lambda request: requests.append(request.url))
-    for name in ("slamlib/slam/estimate.html", "slamlib/odometry.html"):     # the first page goes on
+    for name in ("slamlib/slam/estimate.html", "slamlib/odometry.html"):
         page.goto((pages / name).as_uri())
     page.goto((pages / "index.html").as_uri())
     page.wait_for_url(f"{(pages / 'slamlib.html').as_uri()}*")
