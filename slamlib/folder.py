@@ -279,15 +279,17 @@ def _mat_tables(paths, names):
     """Variables of .mat files by the names that they have of `names`, notes, files that are not
     read, and what a message on missing encoders adds.
 
-    A file is refused if it cannot be read and its own name is one of them, or if its name or that
-    of a variable is near to a missing one.
+    A file that cannot be read is refused if one of them is its own name or in its bytes; another
+    one if its name or that of a variable is near to a missing one.
     """
     files, notes, unread, hint, left = {}, [], [], "", {}
     for path in paths if names else ():
         try:
             variables = mat_variables(path)
         except DatasetError as failure:
-            if any(_stem(path.stem) == _stem(name) for name in names):
+            content = read_regular(path).lower() if path.is_file() else b""
+            if any(_stem(path.stem) == _stem(name) or _stem(name).encode() in content
+                   for name in names):
                 raise
             notes.append(f"{path.name} is not read{str(failure).removeprefix(str(path))}.")
             hint = f", but {notes[-1][:-1]}"
