@@ -17,7 +17,8 @@ from slamlib import counts
 from slamlib.dialects import read_table
 from slamlib.doubt import Doubt
 from slamlib.exchanged import look_exchanged
-from slamlib.folder import ENCODER, TRUTH_FILES, contents, is_dataset
+from slamlib.filenames import ENCODER, TRUTH_FILES
+from slamlib.folder import contents, is_dataset
 from slamlib.limits import LIMITS
 from slamlib.textfile import DatasetError, error
 from slamlib.truth_frame import in_first_frame

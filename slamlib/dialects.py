@@ -7,14 +7,13 @@ note says so; what can be read in two ways is refused. Every message names the f
 
 import re
 from dataclasses import dataclass
-from io import BytesIO
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
-from scipy.io import loadmat, whosmat
 
-from slamlib.textfile import error, quoted, read_regular, read_text
+from slamlib.matfile import Variable, variable_text
+from slamlib.textfile import error, quoted, read_text
 
 BOUND = 1e15  # every number is smaller in size, so that float64 represents every integer exactly
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
@@ -38,17 +37,6 @@ WORDS = {
     "sigma": "sigma|std|stddev",
     **{f"s_{a}{b}": f"(s|sigma|cov|c|var){a[0]}({a[1:]})?{b[0]}({b[1:]})?" for a, b in (
         ("x", "x"), ("x", "y"), ("x", "theta"), ("y", "y"), ("y", "theta"), ("theta", "theta"))}}
-
-
-@dataclass(frozen=True)
-class Variable:
-    """A table in a .mat file."""
-
-    path: Path
-    name: str
-
-    def __str__(self):
-        return f"{self.path}, variable {self.name}"
 
 
 @dataclass(frozen=True)
@@ -92,7 +80,7 @@ def read_table(source, columns, gaps=False, optional=None):
         return Table(None, np.empty((0, len(columns))))
     notes, name = [], _name(source)
     if isinstance(source, Variable):
-        text = _variable_text(source)
+        text = variable_text(source)
     else:
         text, encoding = read_text(source)
         notes += [f"{name} was read as {encoding} text."] * bool(encoding)
@@ -271,56 +259,3 @@ def _rows(text, separator=None):
     for line, content in enumerate(text.split("\n"), start=1):
         if words := content.partition("#")[0].strip():
             yield line, [word.strip() for word in words.split(separator)]
-
-
-# Tables in .mat files.
-
-
-def mat_variables(path):
-    """Numbers of elements by the names of variables and of fields, as `logs.UwbReading`, a dict.
-
-    A struct counts as many elements. Raises DatasetError if a .mat file cannot be read, or is of
-    another version than MATLAB's 5 to 7.
-    """
-    sizes = {}
-    for name, shape, kind in _of_mat(whosmat, path):
-        sizes[name] = np.inf if kind == "struct" else np.prod(shape)
-        value = _mat_value(path, name) if kind == "struct" else None
-        if isinstance(value, np.ndarray) and value.shape == (1, 1):
-            sizes |= {f"{name}.{field}": np.size(value[field][0, 0])
-                      for field in value.dtype.names or ()}
-    return sizes
-
-
-def _mat_value(path, name):
-    """A variable of a .mat file, or a field of one."""
-    name, *fields = name.split(".")
-    value = _of_mat(loadmat, path, variable_names=[name]).get(name)
-    for field in fields:
-        value = value[field][0, 0]
-    return value
-
-
-def _variable_text(source):
-    """The rows of a table in a .mat file as text, one a line."""
-    value = _mat_value(source.path, source.name)
-    if not isinstance(value, np.ndarray) or value.dtype.kind not in "iuf" or value.ndim != 2:
-        kind = "a struct" if getattr(value, "dtype", None) is not None and value.dtype.names \
-            else "a cell array" if getattr(value, "dtype", None) == object else "something else"
-        raise error(source, f"expected a matrix of real numbers, found {kind}")
-    return "\n".join(" ".join(map(repr, row)) for row in value.tolist())
-
-
-def _of_mat(read, path, **keywords):
-    """What a function of scipy.io reads from a .mat file."""
-    data = read_regular(path)
-    if data.startswith((b"# Created by Octave", b"# name:")):
-        raise error(path, "expected a .mat file of version 7 or older, found Octave's text: save "
-                    "it with the option '-v7'")
-    try:
-        return read(BytesIO(data), **keywords)
-    except NotImplementedError:
-        raise error(path, "expected a .mat file of version 7 or older, found 7.3: save it with the "
-                    "option '-v7'") from None
-    except Exception:                   # scipy raises many kinds about bytes that are no .mat file
-        raise error(path, "expected a .mat file that can be read") from None

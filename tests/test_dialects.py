@@ -318,6 +318,8 @@ def test_octaves_text_is_to_be_saved_as_matlabs_format(folder, begin):  # noqa: 
     assert read_dataset(folder).notes == (said + ".",)
     (folder / "encoderReading.txt").unlink()
     assert error_of(read_dataset, folder).endswith("found none, but " + said)
+    write(folder / "logs.mat", begin + "\n# type: scalar\n1\n# name: UwbReading\n")
+    assert error_of(read_dataset, folder) == f"{folder}/{said.replace(' is not read', '')}"
     (folder / "logs.mat").rename(folder / "UwbReading.mat")
     assert error_of(read_dataset, folder) == f"{folder}/{said.replace('logs', 'UwbReading')}" \
         .replace(" is not read", "")
