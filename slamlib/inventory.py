@@ -7,6 +7,12 @@ import numpy as np
 from slamlib.dataset import Vehicle
 
 
+def all_notes(dataset, truth):
+    """What was mended or left out when a drive was read (tuple of str), its Truth or None included.
+    """
+    return (*dataset.notes, *(() if truth is None else truth.notes))
+
+
 def found(dataset, truth):
     """Lines (list of str) on what was read of a drive, a Dataset and its Truth or None.
 
@@ -27,5 +33,5 @@ def found(dataset, truth):
         f"vehicle.toml: {', '.join(changed)}" if changed else
         "vehicle.toml: none, or as the assignment's table 2",
         f"truth: {'no' if truth is None else 'yes'}"]
-    notes = [f"note: {note}" for note in (*dataset.notes, *(truth.notes if truth else ()))]
+    notes = [f"note: {note}" for note in all_notes(dataset, truth)]
     return [f"{dataset.name}: {line}" for line in (*lines, *notes)]

@@ -19,6 +19,7 @@ import numpy as np
 
 from slamlib import evaluation, swap
 from slamlib.dataset import read_dataset, read_truth
+from slamlib.inventory import all_notes
 from slamlib.solve import (
     OURS,
     PROBLEMS,
@@ -64,7 +65,7 @@ def _summary(dataset, truth, stage, jobs):
     return {"dataset": dataset.name, "poses": len(dataset.ticks),
             "doubts": [asdict(doubt) for doubt in merged(
                 [*of_drive, *chain(*(doubts[problem] for problem in in_order))])],
-            "notes": [*dataset.notes, *(() if truth is None else truth.notes)],
+            "notes": list(all_notes(dataset, truth)),
             "problems": {problem: rows[problem] for problem in in_order}}
 
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from slamlib.dataset import Dataset, Truth, read_dataset, read_truth
 from slamlib.doubt import Doubt
+from slamlib.inventory import all_notes
 from slamlib.notebook import Drive
 from slamlib.report.execution import NotebookError
 from slamlib.results import read_aruco_map, read_uwb_map, read_vehicle_poses
@@ -33,7 +34,7 @@ class SolvedDrive:
     @property
     def notes(self):
         """What was mended or left out when the files were read, a tuple of str."""
-        return (*self.dataset.notes, *(self.truth.notes if self.truth else ()))
+        return all_notes(self.dataset, self.truth)
 
     @property
     def simulated(self):

@@ -67,7 +67,6 @@ def shown(books, has, leave_out):
         """Why a section is left out (str), "" if no reason is told, or None if it is shown."""
         if each.needs not in {None, *has}:
             return f"no dataset has {each.needs}"
-
         return next((left_out[key] for key in (_key(each.number), _key(each.title))
                      if each.level > 1 and key in left_out), None)
 
