@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.stats import t
 
-from slamlib.slam.noise import given
+from slamlib.slam.noise import with_noise
 
 
 def central_differences(function, x, step=1e-6):
@@ -25,4 +25,4 @@ def decided(differences):
 
 def known_noise(dataset, slip):
     """The Dataset of a drive with this slip in sqrt(m), and the noise that its files state."""
-    return given(dataset, slip, marker_noise_factor=1.0, range_noise_factor=1.0)
+    return with_noise(dataset, slip, marker_noise_factor=1.0, range_noise_factor=1.0)

@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[1]
 MODULES = sorted(".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
                  for path in (ROOT / "slamlib").rglob("*.py") if path.stem != "__main__")
 WITH_EXAMPLES = {f"slamlib.{name}" for name in (
-    "se2", "odometry", "evaluation", "dataset", "results", "export", "simulation", "slam.estimate",
+    "se2", "odometry", "evaluation", "dataset", "results", "export", "simulation", "slam.pipeline",
     "localization.markers", "localization.fused")} | {"slamlib"}
 
 
@@ -76,7 +76,7 @@ def test_the_pages_load_nothing(pages, chromium):
     """But each other: no request leaves the folder, and the first page leads to the others."""
     page, requests = chromium.new_page(), []
     page.on("request", lambda request: requests.append(request.url))
-    for name in ("slamlib/slam/estimate.html", "slamlib/odometry.html"):
+    for name in ("slamlib/slam/pipeline.html", "slamlib/odometry.html"):
         page.goto((pages / name).as_uri())
     page.goto((pages / "index.html").as_uri())
     page.wait_for_url(f"{(pages / 'slamlib.html').as_uri()}*")

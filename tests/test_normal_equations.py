@@ -20,17 +20,17 @@ from slamlib.slam import (
     odometry_factors,
 )
 from slamlib.slam import first_frames as first_frames_module
-from slamlib.slam.covariances import covariances
-from slamlib.slam.estimate import fit_from_odometry
-from slamlib.slam.evidence import solve
-from slamlib.slam.first_frames import first_frames
+from slamlib.slam.covariances import marginal_covariances
+from slamlib.slam.evidence import laplace_approximation
+from slamlib.slam.first_frames import equations_of_first_frames
 from slamlib.slam.initialization import odometry_state, state_from_poses
 from slamlib.slam.measurement_factors import WEAK_SIGMA, MeasurementFactors
 from slamlib.slam.measurements import measure
 from slamlib.slam.noise import BOUNDS, Noise
 from slamlib.slam.normal_equations import NormalEquations
 from slamlib.slam.optimizer import optimize
-from slamlib.slam.problem import build
+from slamlib.slam.pipeline import fit_from_odometry
+from slamlib.slam.problem import build_problem
 from slamlib.slam.robust import LATE_KERNEL
 
 
@@ -49,7 +49,7 @@ def test_gtsam_has_the_same_error_and_takes_the_same_step():
     state = odometry_state(m, "arc")
     cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(3.0)
     measured = MeasurementFactors(m, m.unit_weights, cauchy, LATE_KERNEL)
-    problem = replace(build(m, "arc", Noise(2e-3, 1.5, 0.7)), measured=measured)
+    problem = replace(build_problem(m, "arc", Noise(2e-3, 1.5, 0.7)), measured=measured)
     equations = NormalEquations(problem, state)
     values = gtsam_graph.values(m, state)
     others = odometry_factors.odometry_error(problem.odometry, state.poses, state.w)[0]
@@ -77,7 +77,7 @@ def test_markers_without_accepted_sightings_have_a_weak_prior_and_move_nothing_e
     first = next(j for j in range(len(m.marker) - 1) if m.oriented[j:j + 2].all())
     left = [point, first, first + 1]
     weight = np.r_[~np.isin(m.label, left), np.ones(len(m.ranges.row), bool)].astype(float)
-    problem = replace(build(m, "arc", Noise()), measured=MeasurementFactors(m, weight))
+    problem = replace(build_problem(m, "arc", Noise()), measured=MeasurementFactors(m, weight))
     np.testing.assert_array_equal(problem.measured.unsupported, sorted(left))
     state = odometry_state(m, "arc")
     equations = NormalEquations(problem, state)
@@ -98,18 +98,18 @@ def test_selected_blocks_are_those_of_the_dense_inverse(poses):
     dataset, _ = simulate("short", seed=4)
     m = replace(measure(dataset.first(poses)), calibrated=True) if poses > 1 \
         else measure(dataset.first(1))
-    equations = NormalEquations(build(m, "arc", Noise()), odometry_state(m, "arc"))
-    found = covariances(equations, Noise(2e-3, 1.5, 0.7))
+    equations = NormalEquations(build_problem(m, "arc", Noise()), odometry_state(m, "arc"))
+    found = marginal_covariances(equations, Noise(2e-3, 1.5, 0.7))
     H = equations.structure.matrix(equations.sums(Noise(2e-3, 1.5, 0.7))[0]).toarray()
     np.testing.assert_allclose(H, H.T, rtol=1e-9, atol=1e-6)
     expected, rows = np.linalg.inv(H), equations.structure.rows
     sigma = np.sqrt(np.diag(expected))
     expected /= np.outer(sigma, sigma)
     for i, block in enumerate(found.pairs):
-        at = np.concatenate([rows([i], 3)[0], rows([i + 1], 3)[0], rows([m.wheels], 3)[0]])
+        at = np.concatenate([rows([i], 3)[0], rows([i + 1], 3)[0], rows(m.variables.w, 3)[0]])
         np.testing.assert_allclose(block / np.outer(sigma[at], sigma[at]), expected[np.ix_(at, at)],
                                    atol=1e-6)
-    landmarks = [*found.markers, *found.antennas, found.w] + [found.z] * m.calibrated
+    landmarks = [*found.markers, *found.antennas, found.w] + [found.c] * m.calibrated
     for j, block in enumerate(landmarks):
         at = rows([len(m.frame) + j], len(block))[0]
         np.testing.assert_allclose(block / np.outer(sigma[at], sigma[at]), expected[np.ix_(at, at)],
@@ -119,13 +119,13 @@ def test_selected_blocks_are_those_of_the_dense_inverse(poses):
 def test_the_first_frames_are_a_drive_of_their_own(monkeypatch):
     """Equal to the equations of the drive cut there, but for the rounding of the whole drive."""
     dataset, _ = simulate("short", seed=4, mislabelled=0.02, late_ranges=0.2)
-    m = measure(dataset).calibrating()
+    m = replace(measure(dataset), calibrated=True)
     weight = (np.arange(len(m.unit_weights)) % 7 > 0).astype(float)
-    problem = build(m, "arc", Noise(2e-3, 1.5, 0.7))
+    problem = build_problem(m, "arc", Noise(2e-3, 1.5, 0.7))
     problem = replace(problem, measured=MeasurementFactors(m, weight, range_kernel=LATE_KERNEL))
     state = odometry_state(m, "arc")
-    monkeypatch.setattr(first_frames_module, "ENOUGH", 50)
-    part = first_frames(NormalEquations(problem, state), 60)
+    monkeypatch.setattr(first_frames_module, "MIN_MEASUREMENTS", 50)
+    part = equations_of_first_frames(NormalEquations(problem, state), 60)
     cut = measure(dataset.first(int(m.frame[59]) + 1))
     np.testing.assert_array_equal(part.problem.measurements.frame, cut.frame)
     np.testing.assert_array_equal(part.problem.measurements.frame, m.frame[:60])
@@ -139,9 +139,9 @@ def test_the_first_frames_are_a_drive_of_their_own(monkeypatch):
     np.testing.assert_allclose(part.factors[2].e,
                                whole.factors[2].e[whole.factors[2].row < 60], rtol=1e-12)
     assert np.isfinite(part.step()).all()
-    assert first_frames(whole, len(m.frame)) is whole
+    assert equations_of_first_frames(whole, len(m.frame)) is whole
     monkeypatch.undo()
-    assert first_frames(whole, 60) is whole                          # too few ranges there
+    assert equations_of_first_frames(whole, 60) is whole      # too few ranges there
 
 
 def test_noise_of_a_sensor_that_starts_late_is_learned(monkeypatch):
@@ -150,7 +150,7 @@ def test_noise_of_a_sensor_that_starts_late_is_learned(monkeypatch):
     aruco = dataset.aruco.select(dataset.aruco.pose > 1000)
     dataset = replace(dataset, aruco=replace(aruco, covariance=aruco.covariance / 36))
     whole = slam.estimate(dataset)
-    monkeypatch.setattr(noise_posterior, "MANY_FRAMES", 40)
+    monkeypatch.setattr(noise_posterior, "MAX_FRAMES", 40)
     found = slam.estimate(dataset)
     assert np.isclose(found.noise.sightings, whole.noise.sightings, rtol=1e-3)
     assert 5 < found.noise.sightings < 7 and found.rejected.mean() < 0.02
@@ -242,7 +242,7 @@ def test_gates_are_quantiles_of_chi_squared():
     """They are numbers in the code because scipy.special takes long to import."""
     assert np.allclose([sightings.GATE, sightings.POINT_GATE], chdtri([3, 2], 1e-3), rtol=1e-12)
     assert np.isclose(doubts.AGREEMENT, chdtri(3, 0.05), rtol=1e-5)
-    gains = [*drive_doubts.MIN_GAIN, drive_doubts.MIN_GAIN_RANGES]
+    gains = [drive_doubts.MIN_TIME_GAIN, drive_doubts.MIN_PLACE_GAIN, drive_doubts.MIN_RANGE_GAIN]
     assert np.allclose(gains, chdtri([1, 3, 2], 5e-4) / 2, rtol=1e-5)
 
 
@@ -278,7 +278,7 @@ def test_the_normal_equations_are_those_of_gtsams_linear_graph():
     measured = replace(fit.problem.measured, range_kernel=None)
     problem = replace(fit.problem, measured=measured, noise=Noise(2e-3, 1.5, 0.7))
     equations = NormalEquations(replace(problem, noise=Noise(1e-3)), fit.state)
-    delta, found = solve(equations, problem.noise)
+    delta, found = laplace_approximation(equations, problem.noise)
     linear = gtsam_graph.linearize(problem, fit.state)
     tree = linear.eliminateMultifrontal()
     solution, m = tree.optimize(), problem.measurements
@@ -296,7 +296,7 @@ def test_marginal_covariances_equal_gtsams():
     dataset, _ = simulate("short", seed=4, mislabelled=0.02, late_ranges=0.2)
     m = measure(known_noise(dataset, 1e-3))
     fit = fit_from_odometry(m)
-    marginal = covariances(fit.equations, fit.problem.noise)
+    marginal = marginal_covariances(fit.equations, fit.problem.noise)
     tree = gtsam_graph.linearize(fit.problem, fit.state).eliminateMultifrontal()
     for i in range(0, len(marginal.pairs), 13):
         expected = tree.jointMarginalCovariance([X(i), X(i + 1), W(0)]).fullMatrix()

@@ -23,9 +23,9 @@ from slamlib import localization, odometry, se2, slam
 from slamlib.dataset import DatasetError, Vehicle, read_dataset, read_truth
 from slamlib.localization.units import range_units
 from slamlib.simulation import simulate
-from slamlib.slam.covariances import _common_turn, _require_digits, covariances
-from slamlib.slam.estimate import fit_from_odometry
+from slamlib.slam.covariances import _common_turn, _require_digits, marginal_covariances
 from slamlib.slam.measurements import measure
+from slamlib.slam.pipeline import fit_from_odometry
 from slamlib.solve import Failure, doubts_about_drive, solutions
 from slamlib.summary import summarize
 
@@ -230,7 +230,7 @@ def test_units_are_not_compared_where_the_first_heading_is_unknown():
 def test_covariances_are_symmetric():
     """Rounding relative to the heading's variance exceeded that of pose 1's position."""
     fit = fit_from_odometry(measure(known_noise(first_heading_unknown(), 1e-3)))
-    found = covariances(fit.equations, fit.problem.noise).pairs
+    found = marginal_covariances(fit.equations, fit.problem.noise).pairs
     np.testing.assert_array_equal(found, np.swapaxes(found, 1, 2))
 
 
@@ -248,7 +248,7 @@ def test_rounding_hides_a_heading_from_a_twentieth_of_its_information_on():
     dataset = replace(dataset.first(400), uwb=None,
                       vehicle=replace(dataset.vehicle, sigma_heading=0.1))
     equations = fit_from_odometry(measure(known_noise(dataset, 1e-3))).equations
-    turn = _common_turn(equations.problem.measurements, equations.state)
+    turn = _common_turn(equations)
     H = equations.structure.matrix(equations.sums(equations.problem.noise)[0]).toarray()
     for share, sign in ((0.045, 1), (0.055, 1), (0.045, -1), (0.055, -1)):
         rounding = sign * share / 0.1**2 * np.outer(turn, turn) / (turn @ turn)**2

@@ -13,20 +13,20 @@ from slamlib.dataset import AntennaGuess, ArucoReadings, Dataset, UwbReadings, V
 from slamlib.evaluation import anees, ate, nees_band
 from slamlib.simulation import simulate
 from slamlib.slam import gtsam_graph, odometry_factors, robust
-from slamlib.slam.covariances import covariances
-from slamlib.slam.estimate import fit_from_odometry
-from slamlib.slam.evidence import solve
+from slamlib.slam.covariances import marginal_covariances
+from slamlib.slam.evidence import laplace_approximation
 from slamlib.slam.fit import refine
-from slamlib.slam.initialization import GROWTH, extended, parts
+from slamlib.slam.initialization import GROWTH, extended, part_lengths
 from slamlib.slam.measurements import measure
-from slamlib.slam.model_choice import DECISIVE, better_model
-from slamlib.slam.moments import moments
-from slamlib.slam.noise import GIVEN, Noise, from_logarithms, log_prior
-from slamlib.slam.noise_posterior import noise_posterior
+from slamlib.slam.model_choice import DECISIVE_LEAD, better_model
+from slamlib.slam.moments import posterior_moments
+from slamlib.slam.noise import NOISE_KEYS, Noise, from_logarithms, log_prior
+from slamlib.slam.noise_posterior import learn_noise
 from slamlib.slam.normal_equations import NormalEquations
-from slamlib.slam.problem import build
-from slamlib.slam.result import _mapped, result
-from slamlib.slam.robust import FEW, accepted, noise_of_scatter, within_gates
+from slamlib.slam.pipeline import fit_from_odometry
+from slamlib.slam.problem import build_problem
+from slamlib.slam.result import _mapped, slam_result
+from slamlib.slam.robust import MIN_RESIDUALS, accepted, noise_of_scatter, within_gates
 from slamlib.slam.state import state_from_arrays
 from slamlib.studies import graphs, kernels, montecarlo, starts
 
@@ -45,12 +45,13 @@ def example(seed=0):
     ticks = Dataset("ticks", dataset.vehicle, dataset.ticks, None, None, None)
     measurements = measure(ticks, frame)
     poses = truth.poses[measurements.frame] + rng.normal(0, 0.05, (len(measurements.frame), 3))
-    return build(measurements, "arc", Noise()), poses, rng.normal(0, 1, 3)
+    return build_problem(measurements, "arc", Noise()), poses, rng.normal(0, 1, 3)
 
 
 def test_odometry_derivatives_against_central_differences():
     problem, poses, w = example()
-    e, by_first, by_second, by_w = odometry_factors.odometry_error(problem.odometry, poses, w)
+    _, J = odometry_factors.odometry_error(problem.odometry, poses, w)
+    by_first, by_second, by_w = np.split(J, 3, axis=2)
 
     def error(xi, moved):
         """Errors with every second pose, the even (0) or the odd ones (1), retracted by xi."""
@@ -72,7 +73,8 @@ def test_odometry_factor_equals_gtsams_between_factor_for_known_wheels():
     problem, poses, _ = example()
     odometry = problem.odometry
     U, _ = odometry.whitening(problem.noise.slip)
-    e, by_first, by_second, _ = odometry_factors.odometry_error(odometry, poses, np.zeros(3))
+    e, J = odometry_factors.odometry_error(odometry, poses, np.zeros(3))
+    by_first, by_second, _ = np.split(J, 3, axis=2)
     assert np.abs(e).max() > 0.05
     for i in range(len(e)):
         # Unit noise: GTSAM may whiten with another square root of the same information.
@@ -96,7 +98,7 @@ def test_odometry_is_that_of_the_wheels_about_which_it_is_linear(about):
     """The stated wheels, unless others are given; its derivatives are those at these wheels."""
     measurements = example()[0].measurements
     dataset, frame = measurements.dataset, measurements.frame
-    found = odometry_factors.odometry_factors(measurements, "arc", *about)
+    found = odometry_factors.preintegrate_odometry(measurements, "arc", *about)
     w = about[0] if about else np.zeros(3)
 
     def by_wheels(w):
@@ -187,10 +189,11 @@ def test_the_learned_noise_has_the_greatest_posterior(poses, slip):
     dataset, _ = simulate("short", seed=6, slip=slip)
     fit = fit_from_odometry(measure(dataset.first(poses)))
     equations = NormalEquations(fit.problem, fit.state)
-    found = noise_posterior(equations)
+    found = learn_noise(equations)
 
     def log_posterior(logarithms):
-        return solve(equations, from_logarithms(logarithms))[1] + np.sum(log_prior(logarithms))
+        return laplace_approximation(equations, from_logarithms(logarithms))[1] \
+            + np.sum(log_prior(logarithms))
 
     sigma = np.sqrt(np.diag(found.covariance))
     for direction in np.diag(sigma):
@@ -211,30 +214,30 @@ def test_averages_over_the_noise_are_moments_of_a_mixture():
     point = dataset.aruco.marker == dataset.aruco.marker[0]
     C[point, 2] = C[point, :, 2] = [0, 0, 1e4]
     dataset = replace(dataset, aruco=replace(dataset.aruco, covariance=C))
-    fit = fit_from_odometry(measure(dataset).calibrating())
+    fit = fit_from_odometry(replace(measure(dataset), calibrated=True))
     weights, noises = zip(*fit.posterior.points)
     assert len(weights) > 2 and np.isclose(sum(weights), 1, atol=1e-2)
     equations, m = NormalEquations(fit.problem, fit.state), fit.problem.measurements
-    origin = solve(equations, fit.problem.noise)[0]
-    x = np.stack([solve(equations, noise)[0] - origin for noise in noises])
+    origin = laplace_approximation(equations, fit.problem.noise)[0]
+    x = np.stack([laplace_approximation(equations, noise)[0] - origin for noise in noises])
     weights = np.array(weights) / sum(weights)
-    state, mixed, slip = moments(fit)
-    each = [covariances(equations, noise) for noise in noises]
+    state, mixed, slip = posterior_moments(fit)
+    each = [marginal_covariances(equations, noise) for noise in noises]
     point, oriented = np.flatnonzero(~m.oriented)[0], np.flatnonzero(m.oriented)[0]
-    variable = len(m.frame) + len(m.marker)
+    variable, w, c = (len(m.frame) + len(m.marker), *m.variables.w, *m.variables.c)
     for number, width, block in (
             (20, 3, lambda c: c.pairs[20][:3, :3]), (21, 3, lambda c: c.pairs[20][3:6, 3:6]),
             (len(m.frame) + point, 2, lambda c: c.markers[point]),
             (len(m.frame) + oriented, 3, lambda c: c.markers[oriented]),
-            (variable + 1, 2, lambda c: c.antennas[1]), (m.wheels, 3, lambda c: c.w),
-            (m.wheels, 3, lambda c: c.pairs[20][6:, 6:]), (m.wheels + 1, 2, lambda c: c.z)):
+            (variable + 1, 2, lambda c: c.antennas[1]), (w, 3, lambda c: c.w),
+            (w, 3, lambda c: c.pairs[20][6:, 6:]), (c, 2, lambda c: c.c)):
         rows = equations.structure.rows([number], width)[0]
         off = x[:, rows] - weights @ x[:, rows]
         expected = sum(p * (block(c) + np.outer(d, d)) for p, c, d in zip(weights, each, off))
         np.testing.assert_allclose(block(mixed), expected, rtol=1e-9, atol=1e-15)
     for moved, before, number, width in (
             (state.antennas[1], fit.state.antennas[1], variable + 1, 2),
-            (state.w, fit.state.w, m.wheels, 3), (state.z, fit.state.z, m.wheels + 1, 2),
+            (state.w, fit.state.w, w, 3), (state.c, fit.state.c, c, 2),
             (state.markers[point, :2], fit.state.markers[point, :2], len(m.frame) + point, 2)):
         mean = weights @ x[:, equations.structure.rows([number], width)[0]]
         np.testing.assert_allclose(moved, before + mean, atol=1e-12)
@@ -277,7 +280,7 @@ def test_an_error_of_one_sigma_costs_one_half():
         m = measure(dataset)
         state = state_from_arrays(m, np.zeros((1, 3)), [z + direction], np.zeros((0, 2)),
                                   np.zeros(3))
-        assert np.isclose(NormalEquations(build(m, "arc", Noise()), state).error, expected,
+        assert np.isclose(NormalEquations(build_problem(m, "arc", Noise()), state).error, expected,
                           rtol=1e-9)
 
 
@@ -331,7 +334,7 @@ def test_interpolated_poses_equal_those_of_a_graph_with_all_poses(every, sigma):
     keep = (dataset.aruco.pose <= 100) & (dataset.aruco.pose % every == 0)
     dataset = replace(dataset, aruco=dataset.aruco.select(keep))
     sparse = slam.estimate(known_noise(dataset, 3e-3), model="arc")
-    dense = result(fit_from_odometry(measure(known_noise(dataset, 3e-3), range(106))))
+    dense = slam_result(fit_from_odometry(measure(known_noise(dataset, 3e-3), range(106))))
     sigma, expected = (np.sqrt(np.diagonal(c, axis1=1, axis2=2))
                        for c in (sparse.covariances, dense.covariances))
     # The difference is of second order.
@@ -392,7 +395,7 @@ def test_a_long_drive_is_solved_in_growing_parts():
     """The σ of odometry's heading exceeds its limit long before the end of three rounds."""
     dataset, truth = simulate("long", seed=3, rounds=3)
     dataset = dataset.without("uwb")
-    ends = np.array(parts(dataset))
+    ends = np.array(part_lengths(dataset))
     assert len(ends) > 1 and ends[-1] == len(dataset.ticks)
     assert (ends[1:] <= GROWTH * ends[:-1]).all()
     found = slam.estimate(known_noise(dataset, 1e-3), model="arc")
@@ -497,7 +500,7 @@ def test_parts_of_a_drive_grow_at_most_fourfold_from_where_the_heading_is_lost()
     vehicle = Vehicle(sigma_wheelbase=0.02)
     drive = Dataset("turns", vehicle, np.vstack([[0, 0], ticks]), None, None, None)
     count = len(drive.ticks)
-    ends = parts(drive)
+    ends = part_lengths(drive)
     variance = odometry.first_order(drive.ticks, vehicle)[1][:, 2, 2]
     lost = np.flatnonzero(variance > 0.5**2)[0]
     assert abs(lost - count / 30) < count / 300
@@ -505,10 +508,10 @@ def test_parts_of_a_drive_grow_at_most_fourfold_from_where_the_heading_is_lost()
     assert ends[0] <= 1.5 * lost and len(ends) == 4
     np.testing.assert_array_equal(ends[:-1], [max(lost, -(-end // GROWTH)) for end in ends[1:]])
     sure = Vehicle(sigma_wheelbase=1e-6, sigma_right_radius=1e-6, sigma_left_radius=1e-6)
-    assert parts(replace(drive, vehicle=sure)) == [count]
-    assert parts(drive.first(lost + 10)) == [lost + 10]           # not worth a part of its own
+    assert part_lengths(replace(drive, vehicle=sure)) == [count]
+    assert part_lengths(drive.first(lost + 10)) == [lost + 10]      # not worth a part of its own
     blind = replace(vehicle, sigma_heading=1.0)       # the same error at all poses loses no turn
-    assert parts(replace(drive, vehicle=blind)) == ends
+    assert part_lengths(replace(drive, vehicle=blind)) == ends
 
 
 def test_a_longer_part_goes_on_from_the_last_solved_pose_with_its_wheels():
@@ -523,7 +526,7 @@ def test_a_longer_part_goes_on_from_the_last_solved_pose_with_its_wheels():
     kept = np.searchsorted(whole.frame, part.frame[:-1])
     np.testing.assert_allclose(found.poses[kept], solved.poses[:-1], atol=1e-12)
     np.testing.assert_array_equal(found.w, w)
-    np.testing.assert_array_equal(found.z, [0, 0])                # ranges that are not calibrated
+    np.testing.assert_array_equal(found.c, [0, 0])                # ranges that are not calibrated
     expected = odometry.dead_reckoning(
         dataset.ticks[499:], dataset.vehicle.with_deviation(w), solved.poses[last], "arc")
     later = whole.frame > 499
@@ -537,7 +540,7 @@ def test_a_point_has_the_heading_variance_of_its_best_sighting_and_few_markers_a
     C[:2, 2, 2] = [9.0, 4.0]
     readings = ArucoReadings(pose, marker, np.tile([1.0, 0, 0], (7, 1)), C)
     m = measure(Dataset("few", Vehicle(), np.zeros((7, 2), int), readings, None, None))
-    problem = build(m, "arc", Noise())
+    problem = build_problem(m, "arc", Noise())
     weight = np.array([1, 1, 1, 0, 0, 1, 0.0])
     problem = replace(problem, measured=replace(problem.measured, weight=weight))
     blocks = [np.diag([1.0, 2.0]), np.diag([3.0, 4.0, 5.0]), np.diag([6.0, 7.0, 8.0])]
@@ -567,7 +570,7 @@ def test_the_scatter_of_residuals_gives_factors_of_at_least_one():
         found = noise_of_scatter(m, state)
         np.testing.assert_allclose([found.sightings, found.ranges], [sightings, ranges], rtol=0.1)
     few = measure(noisy.first(60))
-    assert 0 < len(few.ranges.row) < FEW < len(few.label)
+    assert 0 < len(few.ranges.row) < MIN_RESIDUALS < len(few.label)
     state = state_from_arrays(few, truth.poses[few.frame], truth.marker_in_world[
         np.searchsorted(truth.marker, few.marker)], truth.antenna_in_world, np.zeros(3))
     assert noise_of_scatter(few, state).ranges == 1 < noise_of_scatter(few, state).sightings
@@ -585,7 +588,7 @@ def test_noise_that_is_known_is_not_learned_and_the_rest_is(known):
     again = slam.estimate(dataset, previous=before, **known)
     np.testing.assert_array_equal(found.poses, by_vehicle.poses)
     for each in (found, again):
-        given = np.array([name in known for name in GIVEN])
+        given = np.array([name in known for name in NOISE_KEYS])
         np.testing.assert_array_equal(each.noise_sigma == 0, given)
         values = np.array([each.noise.slip, each.noise.sightings, each.noise.ranges])
         np.testing.assert_allclose(values[given], list(known.values()), rtol=1e-12)
@@ -651,7 +654,7 @@ def test_gates_of_poses_points_and_ranges():
                         AntennaGuess(np.zeros(1, int), np.array([[3.0, 4.0]]))))
     state = state_from_arrays(m, np.zeros((1, 3)), np.tile([1.0, 0, 0], (4, 1)), [[3.0, 4.0]],
                               np.zeros(3))
-    problem = build(m, "arc", Noise())
+    problem = build_problem(m, "arc", Noise())
     np.testing.assert_array_equal(accepted(problem, state).weight, [1, 0, 1, 0, 1, 0, 1])
     wider = replace(problem, noise=Noise(sightings=1.1, ranges=1.1))
     np.testing.assert_array_equal(accepted(wider, state).weight, 1)
@@ -673,7 +676,7 @@ def test_the_evidence_chooses_the_steps_that_the_vehicle_drives(true, other):
     assert better_model(right, other) is right
     found = better_model(wrong, true)
     assert found.problem.odometry.model == true
-    assert found.log_evidence > wrong.log_evidence + DECISIVE
+    assert found.log_evidence > wrong.log_evidence + DECISIVE_LEAD
     np.testing.assert_array_equal(found.problem.measured.weight, wrong.problem.measured.weight)
 
 

@@ -18,8 +18,7 @@ from slamlib.se2 import between, compose
 from slamlib.simulation import manoeuvre, simulate
 from slamlib.slam import doubts, errors, gtsam_graph, optimizer
 from slamlib.slam.doubts import MAX_LOG_ODDS
-from slamlib.slam.estimate import fit_from_odometry, fit_from_previous
-from slamlib.slam.evidence import consistency
+from slamlib.slam.evidence import consistency_factor
 from slamlib.slam.fit import solved_by_gtsam
 from slamlib.slam.initialization import odometry_state
 from slamlib.slam.linear_factors import range_factors
@@ -28,7 +27,8 @@ from slamlib.slam.measurements import measure
 from slamlib.slam.noise import Noise
 from slamlib.slam.normal_equations import NormalEquations
 from slamlib.slam.optimizer import optimize
-from slamlib.slam.problem import build
+from slamlib.slam.pipeline import fit_from_odometry, fit_from_previous
+from slamlib.slam.problem import build_problem
 from slamlib.slam.range_calibration import calibrated
 from slamlib.slam.result import chi2_per_dof
 from slamlib.slam.robust import KERNELS, LATE_KERNEL
@@ -120,8 +120,8 @@ def test_an_error_of_one_sigma_costs_one_half():
     state = state_from_arrays(m, poses[m.frame], np.zeros((0, 3)), np.array([[3.0, 4.0]]),
                               np.zeros(3))
     off = replace(m, ranges=replace(m.ranges, distance=m.ranges.distance + m.ranges.sigma))
-    assert NormalEquations(build(m, "arc", Noise()), state).error < 1e-12
-    cost = NormalEquations(build(off, "arc", Noise()), state).error
+    assert NormalEquations(build_problem(m, "arc", Noise()), state).error < 1e-12
+    cost = NormalEquations(build_problem(off, "arc", Noise()), state).error
     assert np.isclose(cost, len(off.ranges.row) / 2)
 
 
@@ -144,7 +144,7 @@ def test_chi_squared_over_its_degrees_of_freedom_by_hand():
     z[4:, 0] += 0.02
     for aruco, chi2, freedom in ((None, 0, 0), (ArucoReadings(at, marker, z, C), 2, 3 + 2 * 2)):
         m = measure(replace(dataset, uwb=off, aruco=aruco))
-        problem = build(m, "arc", Noise(sightings=5.0, ranges=7.0))       # which do not count
+        problem = build_problem(m, "arc", Noise(sightings=5.0, ranges=7.0))     # which do not count
         state = state_from_arrays(m, poses[m.frame], in_world[:len(m.marker)],
                                   place[None], np.array([1.0, -2.0, 0.0]))
         share = np.r_[np.ones(len(m.label)), np.full(r, 0.25)]
@@ -457,9 +457,9 @@ def test_an_antenna_is_known_by_its_ranges_across_the_worst_direction():
     """
     positions = np.array([[0.0, 0], [0, 10], [4, 5], [-4, 5]])
     ranges = AntennaRanges(positions, np.array([5.0, 5, 4, 4]), np.full(4, 0.1), np.zeros(2))
-    own = doubts._own_sigma(ranges, np.array([0.0, 5.0]), np.array([1, 1, 1, 0.25]))
+    own = doubts._sigma_by_ranges(ranges, np.array([0.0, 5.0]), np.array([1, 1, 1, 0.25]))
     assert np.isclose(own, 0.1 / np.sqrt(1.25))
-    own = doubts._own_sigma(ranges, np.array([0.0, 5.0]), np.array([1.0, 1, 0, 0]))
+    own = doubts._sigma_by_ranges(ranges, np.array([0.0, 5.0]), np.array([1.0, 1, 0, 0]))
     assert np.isclose(own, 5.0)
 
 
@@ -481,14 +481,14 @@ def test_an_antenna_is_doubted_if_most_of_its_ranges_disagree(weight, said):
 
 def test_a_kernel_takes_a_known_part_of_the_variance():
     """The integral of r^2 w(r) phi(r) over that of w(r) phi(r); without a kernel it is 1."""
-    assert consistency(None) == 1
+    assert consistency_factor(None) == 1
     for kernel in (LATE_KERNEL, gtsam.noiseModel.mEstimator.Cauchy.Create(3.0)):
         def weighted(r, power, of=kernel):
             return r**power * of.weight(r) * np.exp(-r**2 / 2)
 
         below, above = (quad(weighted, -8, 8, (power,))[0] for power in (0, 2))
-        assert 0.5 < consistency(kernel) < 1
-        assert np.isclose(consistency(kernel), above / below, rtol=1e-4)
+        assert 0.5 < consistency_factor(kernel) < 1
+        assert np.isclose(consistency_factor(kernel), above / below, rtol=1e-4)
 
 
 def test_an_offset_of_the_ranges_is_kept_unless_the_evidence_excludes_it():
@@ -530,23 +530,23 @@ def test_calibrated_ranges_have_derivatives_of_central_differences():
     dataset, truth = simulate("short", seed=2)
     m = replace(measure(dataset.first(200)), calibrated=True)
     rng = np.random.default_rng(0)
-    markers, z = np.zeros((len(m.marker), 3)), rng.normal(size=2)
+    markers, c = np.zeros((len(m.marker), 3)), rng.normal(size=2)
     poses, antennas = truth.poses[m.frame], truth.antenna_in_world + rng.normal(size=(4, 2))
     factors, noise = MeasurementFactors(m, m.unit_weights), Noise(ranges=1.7)
 
-    def error(poses=poses, antennas=antennas, z=z):
-        state = state_from_arrays(m, poses, markers, antennas, np.zeros(3), z)
+    def error(poses=poses, antennas=antennas, c=c):
+        state = state_from_arrays(m, poses, markers, antennas, np.zeros(3), c)
         return range_factors(factors, noise, state).e
 
-    state = state_from_arrays(m, poses, markers, antennas, np.zeros(3), z)
+    state = state_from_arrays(m, poses, markers, antennas, np.zeros(3), c)
     found = range_factors(factors, noise, state)
     offset, scale = state.range_calibration
-    np.testing.assert_allclose([offset, scale], [0.2 * z[0], 1 + 0.05 * z[1]])
-    np.testing.assert_allclose(found.by_calibration[..., 0, :], central_differences(
-        lambda change: error(z=z + change)[:, 0], np.zeros(2)), atol=1e-6)
-    np.testing.assert_allclose(found.by_landmark[:, 0], central_differences(
+    np.testing.assert_allclose([offset, scale], [0.2 * c[0], 1 + 0.05 * c[1]])
+    np.testing.assert_allclose(found.J[:, 0, 5:], central_differences(
+        lambda change: error(c=c + change)[:, 0], np.zeros(2)), atol=1e-6)
+    np.testing.assert_allclose(found.J[:, 0, 3:5], central_differences(
         lambda change: error(antennas=antennas + change)[:, 0], np.zeros(2)), atol=1e-5)
-    np.testing.assert_allclose(found.by_pose[:, 0], central_differences(
+    np.testing.assert_allclose(found.J[:, 0, :3], central_differences(
         lambda xi: error(poses=compose(poses, xi))[:, 0], np.zeros(3)), atol=1e-5)
 
 

@@ -11,13 +11,13 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from slamlib import evaluation, se2
-from slamlib.slam.covariances import covariances
-from slamlib.slam.estimate import fit_from_odometry
-from slamlib.slam.evidence import consistency
+from slamlib.slam.covariances import marginal_covariances
+from slamlib.slam.evidence import consistency_factor
 from slamlib.slam.measurements import measure
 from slamlib.slam.normal_equations import decomposition
+from slamlib.slam.pipeline import fit_from_odometry
 from slamlib.slam.range_calibration import calibrated
-from slamlib.slam.result import result
+from slamlib.slam.result import slam_result
 
 MIN_SIGHTINGS = 3            # accepted ones of a marker that is compared; fewer may be wrong labels
 ITERATIONS = 10              # of Gauss-Newton, for the motion between two maps
@@ -44,14 +44,14 @@ def residuals_by_landmark(fit):
     column = np.full(len(m.structure.diagonal), -1)
     column[own] = np.arange(len(own))
     with_own = _covariance_with(fit, own)
-    pairs = covariances(equations, fit.problem.noise).pairs
+    pairs = marginal_covariances(equations, fit.problem.noise).pairs
     of_poses = np.concatenate([pairs[:, :3, :3], pairs[-1:, 3:6, 3:6]])
     totals = np.zeros((3, len(m.marker) + len(m.antenna)))
-    of_kernel = consistency(fit.problem.measured.range_kernel)
-    for f, (_, rows), expected in zip(equations.factors, m.placed[1:], (1, 1, of_kernel)):
+    of_kernel = consistency_factor(fit.problem.measured.range_kernel)
+    for f, (_, rows), expected in zip(equations.factors, m.factor_places[1:], (1, 1, of_kernel)):
         if not len(f.row):                                              # of no width
             continue
-        rows, J = rows[f.index], equations.jacobian(f)
+        rows, J = rows[f.index], f.J
         C = with_own[rows[:, :, None], column[rows][:, None]]           # wrong in columns of poses
         C[:, :3, :3], C[:, 3:, :3] = of_poses[f.row], np.swapaxes(C[:, :3, 3:], 1, 2)
         taken = np.einsum("mdi,mij,mdj->m", J, C, J)
@@ -107,7 +107,8 @@ def map_of(dataset):
     Raises DatasetError where the measurements do not determine a solution.
     """
     fit = calibrated(fit_from_odometry(measure(dataset)))
-    m, found, rows = fit.problem.measurements, result(fit), fit.problem.measurements.structure.rows
+    m, found = fit.problem.measurements, slam_result(fit)
+    rows = m.structure.rows
     agree = np.bincount(m.label, fit.problem.measured.sighting_weight, len(m.marker))
     marker = np.flatnonzero(np.isin(m.marker, found.marker) & m.oriented & (agree >= MIN_SIGHTINGS))
     antenna = np.flatnonzero(~np.isin(m.antenna, list(found.doubts)))

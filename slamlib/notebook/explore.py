@@ -29,14 +29,14 @@ from slamlib.notebook.parts import (
     simulated,
 )
 from slamlib.simulation import delay, misguess, mislabel
-from slamlib.slam.estimate import fit_from_odometry
 from slamlib.slam.initialization import odometry_state, trilaterated_antennas
 from slamlib.slam.measurement_factors import MeasurementFactors
 from slamlib.slam.measurements import measure
-from slamlib.slam.noise import Noise, given, with_known
+from slamlib.slam.noise import Noise, with_known, with_noise
 from slamlib.slam.optimizer import optimize
-from slamlib.slam.problem import build
-from slamlib.slam.result import result
+from slamlib.slam.pipeline import fit_from_odometry
+from slamlib.slam.problem import build_problem
+from slamlib.slam.result import slam_result
 from slamlib.studies.kernels import solve_with
 from slamlib.studies.starts import LANDMARKS, guessed_antennas
 
@@ -180,7 +180,7 @@ def graphs(full, drive, seed, slip, assumed, wrong, kernel, start):
     true = compared.poses[:len(m.dataset.ticks)]
     scale = KERNELS[kernel]
     cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(scale) if scale else None
-    problem = replace(build(m, model, with_known(Noise(), m.dataset.vehicle)),
+    problem = replace(build_problem(m, model, with_known(Noise(), m.dataset.vehicle)),
                       measured=MeasurementFactors(m, m.unit_weights, cauchy))
     single = optimize(problem, odometry_state(m, model, markers=LANDMARKS[start])).state
     fig, axes = plotting.panels(2, height=3.6)
@@ -223,8 +223,8 @@ def _rounds(drive, model, seed, slip, assumed, wrong):
         dataset = drive.dataset
     else:
         dataset = mislabel(first_part(drive.dataset, "aruco"), wrong / 100, seed)
-    m = measure(given(dataset.without("uwb"), 1e-3 * assumed, 1.0, 1.0))
-    return drive, m, result(fit_from_odometry(m, model))
+    m = measure(with_noise(dataset.without("uwb"), 1e-3 * assumed, 1.0, 1.0))
+    return drive, m, slam_result(fit_from_odometry(m, model))
 
 
 def ranges(full, drive, seed, late, off, part, way):
@@ -286,5 +286,5 @@ def _by_ranges(drive, slip, model, seed, late, off, part, way, antennas):
         position = dataset.antenna_guess.position
     dataset = misguess(dataset.without("aruco"), position, off, seed)
     dataset = first_part(dataset.first(-(-len(dataset.ticks) * part // 100)), "uwb")
-    m = measure(given(dataset, slip, 1.0, 1.0))
-    return drive, m, result(solve_with(m, ranges=way, antennas=antennas, model=model))
+    m = measure(with_noise(dataset, slip, 1.0, 1.0))
+    return drive, m, slam_result(solve_with(m, ranges=way, antennas=antennas, model=model))

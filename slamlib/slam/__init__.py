@@ -1,17 +1,17 @@
 """Problems 3 and 4: SLAM with GTSAM on odometry, markers and ranges, as a pipeline.
 
 GTSAM keeps the robust kernels, orders the elimination, takes the last steps of every solution, and
-says what the measurements do not determine. The steps before, and the evidence of the noise, solve
-the same graph by normal equations in numpy, all factors of a kind at once.
+detects variables that the measurements do not determine. The steps before, and the evidence of the
+noise, solve the same graph by normal equations in numpy, all factors of a kind at once.
 
-Each stage makes the record of the next. The modules, in the order in which they can be read
-(stage 5 runs before stage 4, and uses it for the parts of a long drive):
+`pipeline` holds `estimate`, the whole way from a dataset to the result. Each stage makes the record
+of the next; the modules in the order of the stages (stage 4 uses stage 5 on long drives):
 
-    1  structure            which unknowns a factor touches, and where in the sparse matrix
+    1  structure            sparsity structure of the information matrix
        measurements         Dataset -> Measurements: arrays, numbered once
     2  errors               errors of the factors and their derivatives, in numpy
-       odometry_factors     odometry between frames, which depends on the wheels
-       measurement_factors  which sightings and ranges are accepted, and their kernels
+       odometry_factors     odometry between frames, which depends on the wheel errors w
+       measurement_factors  weights and kernels of sightings and ranges
        linear_factors       sightings and ranges linearised in numpy
        noise                slip, and factors on the sigmas of sightings and ranges
     3  state                values of all variables: State
@@ -19,26 +19,45 @@ Each stage makes the record of the next. The modules, in the order in which they
        normal_equations     Problem, State -> the linearised graph, for all values of the noise
        gtsam_graph          the same graph in GTSAM
        optimizer            Problem, State -> Optimum by Gauss-Newton
-    4  robust               Problem, State -> State past outliers; the accepted measurements
-    5  trilateration        places of an antenna from its ranges
+    4  trilateration        possible positions of an antenna from its ranges
        initialization       Measurements -> State: the start values
+    5  robust               Problem, State -> State by robust kernels; the accepted measurements
     6  evidence             Problem, State -> evidence of every value of the noise
-       first_frames         of a drive of a million rows, what the noise is learned from
-       noise_posterior      Problem, State -> the noise, and how well it is known
+       first_frames         the part of a very long drive from which the noise is learned
+       noise_posterior      Problem, State -> posterior of the noise
        fit                  Problem, State -> Fit: wheels, noise, accepted measurements, in turn
        model_choice         Fit -> Fit: arcs or Euler's steps
-       range_calibration    Fit -> Fit: with an offset and a scale of the ranges, if there are any
-    7  covariances, moments, interpolation, result
-                            Fit -> SlamResult in world axes
-       doubts, camera_offsets, drive_doubts, wheel_check
-                            what the solution says against the files
+       range_calibration    Fit -> Fit: with offset and scale of the ranges, if there are any
+    7  covariances          marginal covariances for one value of the noise
+       moments              Fit -> State and Covariances, averaged over the posterior of the noise
+       interpolation        encoder poses between the frames
+       camera_offsets, doubts, drive_doubts
+                            where the solution contradicts the files
+       result               Fit -> SlamResult in world axes
+       wheel_check          SlamResult -> SlamResult: whether other wheels explain the drive better
 
-`estimate` is all of it. With the result of a problem with fewer sensors at hand, it starts there
-and skips stage 5 and the choice of the model.
+With the result of a problem with fewer sensors, `estimate` starts from it, without stage 4 and the
+choice of the model.
+
+Symbols in code and docstrings; sizes are f frames, k markers, a antennas, s sightings, r ranges and
+n unknowns, and (m, d) are m measurements of a kind with d errors each:
+
+    X_i      pose of frame i: m, m, rad
+    L_j P_j  pose of marker j (m, m, rad), or position (m) if its heading is unknown
+    A_k      position of antenna k, m
+    w        (3,) errors of R_R, R_L, b, in units of their standard deviations
+    c        (2,) errors of offset and scale of the ranges, in units of RANGE_SIGMA
+    z, C     measured pose of a marker in the vehicle (m, m, rad), and its covariance
+    e        errors, expected minus measured; whitened errors are U e, without unit
+    U        square root information, upper triangular: U^T U = C^-1 or Q^-1
+    Q        covariance of the odometry noise: m^2, m rad, rad^2
+    J        derivatives of whitened errors by the unknowns
+    H, g     information matrix (n, n), sum J^T J, and gradient (n,), sum J^T e
+    delta    (n,) step of the unknowns, H delta = -g
 """
 
 from slamlib.slam.drive_doubts import confirmation
-from slamlib.slam.estimate import estimate
+from slamlib.slam.pipeline import estimate
 from slamlib.slam.result import SlamResult
 
 __all__ = ["SlamResult", "confirmation", "estimate"]

@@ -1,18 +1,18 @@
-"""Stage 7: covariances at the solution: jointly of consecutive frames and w, and of each landmark.
+"""Stage 7: marginal covariances at the solution, of consecutive frames with w and of each landmark.
 
-The inverse of the information matrix is dense; only some of its blocks are computed, by nested
-dissection. Every LEAF frames there is a separator. What is connected only to unknowns between two
-separators is eliminated there, which leaves a Schur complement on its front, the unknowns around.
-Two such parts are joined at the separator between them, and so on. With C the information of what
-is eliminated, B that between it and the front, and W = C^-1 B, the way back is
+The inverse of the information matrix H is dense; only some of its blocks are computed, by nested
+dissection. Every LEAF frames there is a separator. The unknowns that are connected only to unknowns
+between two separators are eliminated there, which leaves a Schur complement on the front, the
+unknowns around them. Two such parts are joined at the separator between them, and so on. With the
+blocks H_ee of the eliminated unknowns and H_ef between them and the front, and K = H_ee^-1 H_ef,
+the covariances follow from the front inwards:
 
-    Cov(front) = S,    Cov(eliminated, front) = -W S,    Cov(eliminated) = C^-1 + W S W^T
+    Cov(front) = S,    Cov(eliminated, front) = -K S,    Cov(eliminated) = H_ee^-1 + K S K^T
 
 (Kaess and Dellaert, Robotics and Autonomous Systems 57(12), 2009). GTSAM's marginals are the same
 numbers, one query at a time; a test compares them.
 """
 
-from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,8 +21,8 @@ from scipy.sparse import csc_array
 from slamlib import se2
 from slamlib.dataset import DatasetError
 
-LEAF = 12                    # frames between separators
-MAX_ROUNDING = 0.05          # of the information about the heading at pose 1
+LEAF = 12                    # number of frames between separators
+MAX_ROUNDING = 0.05          # share of the information about the heading at pose 1
 
 
 @dataclass(frozen=True)
@@ -32,40 +32,35 @@ class Covariances:
     pairs: np.ndarray        # (f-1, 9, 9) of [X_i, X_{i+1}, w]
     markers: list            # k of (3, 3), or (2, 2) for a point
     antennas: np.ndarray     # (a, 2, 2)
-    z: np.ndarray            # (2, 2) of the ranges' offset and scale, zero if they are given
     w: np.ndarray            # (3, 3)
+    c: np.ndarray            # (2, 2), 0 if the ranges are not calibrated
 
 
-def covariances(equations, noise):
-    """The Covariances of a Noise by NormalEquations at the State that solves the problem.
+def marginal_covariances(equations, noise):
+    """The Covariances for a Noise by NormalEquations at the State that solves the problem.
 
-    Raises DatasetError where rounding hides what is known of the heading at pose 1.
+    Raises DatasetError if rounding hides the information about the heading at pose 1.
     """
-    m, rows = equations.problem.measurements, equations.structure.rows
-    f, k, a = len(m.frame), len(m.marker), len(m.antenna)
-    frames, w = rows(np.arange(f), 3), rows([m.wheels], 3)
-    pairs = np.concatenate([frames[:-1], frames[1:], np.repeat(w, f - 1, axis=0)], axis=1)
-    landmarks = [rows([f + j], 2 + m.oriented[j])[0] for j in range(k)] \
-        + [*rows(f + k + np.arange(a), 2), w[0]]
-    if m.calibrated:
-        landmarks.append(rows([m.wheels + 1], 2)[0])
+    m, v = equations.problem.measurements, equations.problem.measurements.variables
+    k, a = len(v.markers), len(v.antennas)
+    landmarks = equations.structure.rows_of_each(np.r_[v.markers, v.antennas, v.w, v.c])
+    _, pairs = m.factor_places[0]                          # rows of X_i, X_{i+1} and w
     H = equations.structure.matrix(equations.sums(noise)[0])
     _require_digits(equations, H)
-    of_pairs, blocks = selected_inverse(H, frames, pairs, landmarks)
+    of_pairs, blocks = selected_inverse(H, equations.structure.rows(v.frames, 3), pairs, landmarks)
     return Covariances(
         pairs=of_pairs, markers=blocks[:k], antennas=np.reshape(blocks[k:k + a], (-1, 2, 2)),
-        z=blocks[-1] if m.calibrated else np.zeros((2, 2)), w=blocks[k + a])
+        w=blocks[k + a], c=blocks[-1] if m.calibrated else np.zeros((2, 2)))
 
 
 def _require_digits(equations, H):
-    """Raise DatasetError where rounding in the information matrix H hides the prior of the heading.
+    """Raise DatasetError if rounding in the information matrix H hides the prior of the heading.
 
-    If all poses and landmarks turn together about pose 1, no measurement changes: only the priors
-    have information about it. What H has beyond theirs is rounding.
+    A common rotation of all poses and landmarks about pose 1 changes no measurement: only the
+    priors have information about it. Any more information in H is rounding.
     """
-    turn = _common_turn(equations.problem.measurements, equations.state)
-    rounding = turn @ (H @ turn) - equations.of_priors @ turn**2
-    m, sigma = equations.problem.measurements, equations.problem.measurements.origin_sigma[2]
+    m, turn = equations.problem.measurements, _common_turn(equations)
+    rounding, sigma = turn @ (H @ turn) - equations.priors.H @ turn**2, m.origin_sigma[2]
     if abs(rounding) * sigma**2 > MAX_ROUNDING:
         raise DatasetError(
             f"{m.dataset.name}: expected measurements beside which sigma_heading = {sigma:g} rad "
@@ -73,21 +68,22 @@ def _require_digits(equations, H):
             "small for it")
 
 
-def _common_turn(m, state):
-    """How the unknowns (n,) change per rad by which poses and landmarks turn about the origin."""
-    f, k, rows = len(m.frame), len(m.marker), m.structure.rows
-    turn = np.empty(len(m.structure.diagonal))
-    turn[rows([m.wheels], 3)] = 0
-    if m.calibrated:
-        turn[rows([m.wheels + 1], 2)] = 0
-    for first, poses, width in (
-            (0, state.poses, np.full(f, 3)), (f, state.markers, 2 + m.oriented),
-            (f + k, np.pad(state.antennas, ((0, 0), (0, 1))), np.full(len(m.antenna), 2))):
+def _common_turn(equations):
+    """Change (n,) of all unknowns per rad of a rotation of poses and landmarks about the origin."""
+    m, state, structure = equations.problem.measurements, equations.state, equations.structure
+    turn, v = np.zeros(len(structure.diagonal)), m.variables
+
+    def in_own_axes(poses):
+        """Change (m, 3) of poses (m, 3) per rad, in their own axes."""
         moved = se2.compose_jacobians(np.zeros(3), poses)[0][..., 2]
-        moved[:, :2] = (se2.rotation(-poses[:, 2]) @ moved[:, :2, None])[..., 0]     # own axes
-        for each in (2, 3):
-            of_width = np.flatnonzero(width == each)
-            turn[rows(first + of_width, each)] = moved[of_width, :each]
+        moved[:, :2] = (se2.rotation(-poses[:, 2]) @ moved[:, :2, None])[..., 0]
+        return moved
+
+    antennas = np.pad(state.antennas, ((0, 0), (0, 1)))
+    turn[structure.rows(v.frames, 3)] = in_own_axes(state.poses)
+    turn[structure.rows(v.antennas, 2)] = in_own_axes(antennas)[:, :2]
+    for rows, change in zip(structure.rows_of_each(v.markers), in_own_axes(state.markers)):
+        turn[rows] = change[:len(rows)]
     return turn
 
 
@@ -97,123 +93,133 @@ def selected_inverse(H, frames, pairs, blocks):
     Parameters
     ----------
     frames : (f, 3) rows of consecutive poses. H connects a pose with the next, but no other poses.
-    pairs : (f-1, p) rows of which the blocks are asked for, each connected to a pose and the next.
+    pairs : (f-1, p) rows of the first blocks, each connected to a pose and the next.
     blocks : list of (d,) rows of single variables.
 
     Returns
     -------
     (f-1, p, p), and a list of (d, d).
     """
-    graph = _dissection(H, frames)
+    tree = _dissection(H, frames)
     of_pairs = np.empty((len(pairs),) + 2 * pairs.shape[1:])
-    of_blocks, block_at = [None] * len(blocks), np.full(H.shape[0], -1)
-    block_at[[rows[0] for rows in blocks]] = np.arange(len(blocks))
+    of_blocks, block_of_row = [None] * len(blocks), np.full(H.shape[0], -1)
+    block_of_row[[rows[0] for rows in blocks]] = np.arange(len(blocks))
 
-    below = [(_eliminated(graph, 0, len(graph.separators) - 1), np.zeros((0, 0)))]
-    while below:                                        # parts, and the covariances of their fronts
-        part, front_covariance = below.pop()
-        cross = -part.W @ front_covariance
-        own = part.inverse - cross @ part.W.T
+    root, _ = _eliminated(tree, 0, len(tree.separators) - 1)
+    stack = [(root, np.zeros((0, 0)))]                  # parts, and the covariances of their fronts
+    while stack:
+        part, S = stack.pop()
+        cross = -part.K @ S
+        own = part.inverse - cross @ part.K.T
         # Rounding is relative to the largest entry: it would make pose 1's covariance asymmetric.
-        joint = np.block([[(own + own.T) / 2, cross], [cross.T, front_covariance]])
-        with _places(graph.local, part.rows, part.front) as local:
-            if not part.parts:
-                at = local[pairs[part.pairs]]
-                of_pairs[part.pairs] = joint[at[:, :, None], at[:, None, :]]
-            for number in block_at[part.rows][block_at[part.rows] >= 0].tolist():
-                at = local[blocks[number]]
-                of_blocks[number] = joint[at[:, None], at]
-            for each in part.parts:
-                at = local[each.front]
-                below.append((each, joint[at[:, None], at]))
+        joint = np.block([[(own + own.T) / 2, cross], [cross.T, S]])
+        position = _positions(part.rows, part.front)
+        if not part.parts:
+            i = position(pairs[part.pairs])
+            of_pairs[part.pairs] = joint[i[:, :, None], i[:, None, :]]
+        for number in block_of_row[part.rows][block_of_row[part.rows] >= 0].tolist():
+            i = position(blocks[number])
+            of_blocks[number] = joint[i[:, None], i]
+        for inner in part.parts:
+            i = position(inner.front)
+            stack.append((inner, joint[i[:, None], i]))
     return of_pairs, of_blocks
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Dissection:
-    """A matrix H (n, n) and how it falls apart."""
+    """A matrix H (n, n) and its separators."""
 
     H: csc_array
     frames: np.ndarray       # (f, 3)
     separators: np.ndarray   # frames between parts, with -1 and f at the ends
-    first: np.ndarray        # (n,) first frame that a row is connected to, or the row's own
-    last: np.ndarray         # (n,)
-    done: np.ndarray         # (n,) bool, eliminated so far
-    local: np.ndarray        # (n,) scratch, see `_places`
+    first: np.ndarray        # (n,) first frame that a row is connected to, or that of the row
+    last: np.ndarray         # (n,) last one
+
+    def inside(self, rows, begin, end):
+        """(m,) bool, `rows` (m,) connected only to frames between the separators begin and end."""
+        low, high = self.separators[begin], self.separators[end]
+        return (self.first[rows] > low) & (self.last[rows] < high)
 
 
 def _dissection(H, frames):
     """The _Dissection with a separator every LEAF frames."""
-    size, count = H.shape[0], len(frames)
-    frame = np.full(size, -1)
+    count = len(frames)
+    frame = np.full(H.shape[0], -1)
     frame[frames] = np.arange(count)[:, None]
     of_entries = frame[H.indices]
     last = np.maximum.reduceat(of_entries, H.indptr[:-1])
     first = np.minimum.reduceat(np.where(of_entries < 0, count, of_entries), H.indptr[:-1])
+    alone = last < 0                                       # eliminated last, with w
+    first, last = np.where(alone, 0, first), np.where(alone, count - 1, last)
     return _Dissection(
-        H, frames, np.r_[-1, np.arange(LEAF, count - 1, LEAF + 1), count],
-        np.where(frame < 0, first, frame), np.where(frame < 0, last, frame),
-        np.zeros(size, bool), np.full(size, -1))
+        H=H, frames=frames, separators=np.r_[-1, np.arange(LEAF, count - 1, LEAF + 1), count],
+        first=np.where(frame < 0, first, frame), last=np.where(frame < 0, last, frame))
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Part:
-    """What is between two separators, eliminated."""
+    """The elimination of the unknowns between two separators."""
 
     rows: np.ndarray         # (e,) of what is eliminated
     front: np.ndarray        # (s,) rows of what it is connected to
-    inverse: np.ndarray      # (e, e) C^-1
-    W: np.ndarray            # (e, s)
-    schur: np.ndarray        # (s, s)
+    inverse: np.ndarray      # (e, e) H_ee^-1
+    K: np.ndarray            # (e, s)
     parts: tuple             # the two _Parts that are joined here, or none
     pairs: range             # of poses in a part that joins none
 
 
-def _eliminated(graph, begin, end):
-    """The _Part between the separators `begin` and `end` of a _Dissection."""
-    low, high, parts = graph.separators[begin], graph.separators[end], ()
-    own, whole = graph.frames[low + 1:high].ravel(), end - begin == len(graph.separators) - 1
+def _eliminated(tree, begin, end):
+    """The _Part between the separators `begin` and `end`, and its Schur complement (s, s)."""
+    low, high, joined = tree.separators[begin], tree.separators[end], ()
+    own, middle = tree.frames[low + 1:high].ravel(), (begin + end) // 2
     if end - begin > 1:
-        middle = (begin + end) // 2
-        parts = _eliminated(graph, begin, middle), _eliminated(graph, middle, end)
-        own = graph.frames[graph.separators[middle]]
+        joined = _eliminated(tree, begin, middle), _eliminated(tree, middle, end)
+        own = tree.frames[tree.separators[middle]]
     reached = np.unique(np.concatenate(
-        [own, _entries(graph.H, own)[1], *(part.front for part in parts)]))
-    reached = np.flatnonzero(~graph.done) if whole else reached[~graph.done[reached]]
-    inside = whole | (graph.first[reached] > low) & (graph.last[reached] < high)
+        [own, _entries(tree.H, own)[1], *(part.front for part, _ in joined)]))
+    if end - begin == len(tree.separators) - 1:            # all that is left
+        reached = np.arange(tree.H.shape[0])
+    if joined:
+        reached = reached[~tree.inside(reached, begin, middle) & ~tree.inside(reached, middle, end)]
+    inside = tree.inside(reached, begin, end)
     rows, front = reached[inside], reached[~inside]
-    F, e = _information(graph, rows, front, parts), len(rows)
+    F, e = _information(tree.H, rows, front, joined), len(rows)
     inverse = np.linalg.inv(F[:e, :e])
-    W = inverse @ F[:e, e:]
-    graph.done[rows] = True
-    return _Part(rows, front, (inverse + inverse.T) / 2, W, F[e:, e:] - F[:e, e:].T @ W, parts,
-                 range(max(low, 0), min(high, len(graph.frames) - 1)))
+    K = inverse @ F[:e, e:]
+    part = _Part(rows=rows, front=front, inverse=(inverse + inverse.T) / 2, K=K,
+                 parts=tuple(part for part, _ in joined),
+                 pairs=range(max(low, 0), min(high, len(tree.frames) - 1)))
+    return part, F[e:, e:] - F[:e, e:].T @ K
 
 
-def _information(graph, rows, front, parts):
-    """Information of `rows` (e,) and `front` (s,) once the `parts` are eliminated."""
-    F = np.zeros(2 * [len(rows) + len(front)])
-    with _places(graph.local, rows, front) as local:
-        row, column, value = _entries(graph.H, rows)
-        inside = local[column] >= 0
-        F[local[row[inside]], local[column[inside]]] = value[inside]
-        for part in parts:
-            at = local[part.front]
-            F[at[:, None], at] += part.schur
-            part.schur = None                                          # frees the memory
+def _information(H, rows, front, joined):
+    """Information of `rows` (e,) and `front` (s,) once the parts of `joined` are eliminated."""
+    position, F = _positions(rows, front), np.zeros(2 * [len(rows) + len(front)])
+    row, column, value = _entries(H, rows)
+    i, j = position(row), position(column)
+    inside = j >= 0
+    F[i[inside], j[inside]] = value[inside]
+    for part, schur in joined:
+        i = position(part.front)
+        F[i[:, None], i] += schur
     return F
 
 
-@contextmanager
-def _places(local, rows, front):
-    """`local` (n,) holds the place of every row in a front, otherwise -1."""
-    local[rows], local[front] = np.arange(len(rows)), len(rows) + np.arange(len(front))
-    yield local
-    local[rows] = local[front] = -1
+def _positions(rows, front):
+    """Function from rows to their positions in `rows` (e,), then `front` (s,); -1 if not there."""
+    both = np.concatenate([rows, front])
+    order = np.argsort(both)
+
+    def position(wanted):
+        found = order[np.minimum(np.searchsorted(both, wanted, sorter=order), len(both) - 1)]
+        return np.where(both[found] == wanted, found, -1)
+
+    return position
 
 
 def _entries(H, columns):
     """Column, row and value of all entries in some columns of H, which is symmetric."""
     begin, count = H.indptr[columns], H.indptr[columns + 1] - H.indptr[columns]
-    at = np.repeat(begin - np.cumsum(count) + count, count) + np.arange(count.sum())
-    return np.repeat(columns, count), H.indices[at], H.data[at]
+    index = np.repeat(begin - np.cumsum(count) + count, count) + np.arange(count.sum())
+    return np.repeat(columns, count), H.indices[index], H.data[index]

@@ -1,31 +1,32 @@
-"""Stage 7: what the solution says against the files: wheels, noise, ranges and sightings."""
+"""Stage 7: doubts where the solution contradicts the files: wheels, noise, ranges, sightings."""
 
 import numpy as np
 
 from slamlib.doubt import Doubt
 from slamlib.slam.noise import BOUNDS
 
-MAX_WHEEL_SIGMAS = 4.0       # of a wheel parameter from what vehicle.toml states
-SMALLEST_SIGMA = 1e-12       # m, of a wheel parameter that studies take as known
+MAX_WHEEL_SIGMAS = 4.0       # sigmas, of a wheel parameter from that in vehicle.toml
+MIN_WHEEL_SIGMA = 1e-12      # m, of a wheel parameter that studies take as known
 MAX_TURN_SIGMA = np.pi / 3   # rad, between two frames; half a turn is three sigmas
-MAX_SLIP = 0.02              # sqrt(m), of wheels that merely slip
-MIN_GAIN = 6.0578, 8.8650    # log likelihood, of late sightings and of a place: the 99.95 %
-                             # quantile of chi-squared with 1 and 3 degrees of freedom, halved
-MIN_LATE = 0.5               # poses
-MANY_POSES = 10              # from which on the estimate of late sightings is too small
-MIN_PLACE = (0.005, 0.005, 0.005)            # m, m, rad, of the camera
-MIN_GAIN_RANGES = 7.6009     # the same, of the ranges' offset and scale
-MANY_LATE = 0.1              # share of the ranges with less than half of their weight
-NEARLY = 5.0                 # log likelihood by which one explanation must lead to be the only one
-MAX_FACTOR = 1.5             # of a sigma, more or less, that is reported
-DECIDED_SIGMAS = 4.0         # of the logarithm of a factor, that it must differ from 1
-MAX_REJECTED = 0.1           # share of the sightings
-MIN_SIGHTINGS = 5            # of a marker, from which on most of them must be accepted
-WHEELS = ("right_radius", "left_radius", "wheelbase")
+MAX_SLIP = 0.02              # sqrt(m), of wheels on the ground
+# Log likelihoods: the 99.95 % quantiles of chi-squared with 1, 3 and 2 degrees of freedom, halved.
+MIN_TIME_GAIN = 6.0578       # of late sightings
+MIN_PLACE_GAIN = 8.8650      # of a camera that is not in the origin
+MIN_RANGE_GAIN = 7.6009      # of offset and scale of the ranges
+MIN_DELAY = 0.5              # poses, of late sightings that are reported
+MAX_DELAY = 10               # poses, above which the estimate of the delay is too small
+MIN_PLACE = (0.005, 0.005, 0.005)    # m, m, rad, of a camera whose place is reported
+MAX_LATE_SHARE = 0.1         # share of the ranges that keep less than half of their weight
+MIN_LEAD = 5.0               # log likelihood by which the only explanation leads the others
+MAX_NOISE_FACTOR = 1.5       # on a sigma, or its inverse; beyond it the factor is reported
+MIN_FACTOR_SIGMAS = 4.0      # sigmas of the logarithm of a factor that is reported
+MAX_REJECTED = 0.1           # share of the sightings that are rejected
+MIN_SIGHTINGS_PER_MARKER = 5         # number of sightings, of which the majority must be accepted
+WHEEL_NAMES = ("right_radius", "left_radius", "wheelbase")
 
 
-def drive_doubts(measurements, found):
-    """List of Doubt about the Measurements of a drive, by their SlamResult."""
+def solution_doubts(measurements, found):
+    """List of Doubt about the Measurements of a drive, from their SlamResult."""
     return [*geometry_doubts(measurements.dataset.vehicle, found), *slip_doubts(found),
             *noise_doubts(found), *calibration_doubts(found),
             *sighting_doubts(measurements, found.rejected),
@@ -35,9 +36,9 @@ def drive_doubts(measurements, found):
 
 
 def turn_doubts(problem):
-    """Doubt where a Problem's wheels leave the turn between two frames open by whole turns.
+    """List of a Doubt if odometry does not determine the number of turns between two frames.
 
-    By the wheels as vehicle.toml states them: those of a solution that lost a turn explain it.
+    By the wheels of vehicle.toml: those of a solution with a wrong number of turns fit to it.
     """
     odometry, frame = problem.odometry, problem.measurements.frame
     variance = np.sum(odometry.by_w[:, 2]**2, axis=1) \
@@ -53,30 +54,31 @@ def turn_doubts(problem):
 
 
 def geometry_doubts(vehicle, found):
-    """Wheels, late sightings or a place of the camera: what explains most, and what nearly as much.
+    """List of Doubt: wheels, late sightings or place of the camera, those that explain most.
 
-    Each strains the others, so that two would often be named for one reason.
+    One cause changes the estimates of all three; those that explain less by MIN_LEAD are left out.
     """
     explained = {gain: doubt for gain, doubt in (
-        _wheels(vehicle, found), _late(found.camera.time), _place(found.camera.place)) if doubt}
+        _wheel_doubt(vehicle, found), _time_doubt(found.camera.time),
+        _place_doubt(found.camera.place)) if doubt}
     return [doubt for gain, doubt in sorted(explained.items(), reverse=True)
-            if gain > max(explained) - NEARLY]
+            if gain > max(explained) - MIN_LEAD]
 
 
-def _wheels(vehicle, found):
-    """Log likelihood that the wheels' prior costs, and the Doubt if one of them is far from it."""
-    off = in_sigmas(vehicle, found.wheel)
+def _wheel_doubt(vehicle, found):
+    """Cost of the wheels' prior in log likelihood, and the Doubt if one of them is far off."""
+    deviation = in_sigmas(vehicle, found.wheel)
     if not far_off(vehicle, found.wheel).any():
         return 0.0, None
-    return off @ off / 2, Doubt("wheel-parameters", (
+    return deviation @ deviation / 2, Doubt("wheel-parameters", (
         f"By the other sensors {wheels_in_words(vehicle, found.wheel)}, up to "
-        f"{np.abs(off).max():.0f} standard deviations off: measure the wheels again, or state "
-        "values or larger sigmas in vehicle.toml." + marker_size(vehicle, found.wheel)))
+        f"{np.abs(deviation).max():.0f} standard deviations off: measure the wheels again, or "
+        "state values or larger sigmas in vehicle.toml." + marker_size(vehicle, found.wheel)))
 
 
 def in_sigmas(vehicle, wheel):
     """Differences (3,) of parameters `wheel` (3,), m, from a Vehicle's, in its sigmas."""
-    return (wheel - vehicle.wheel) / np.maximum(vehicle.sigma_wheel, SMALLEST_SIGMA)
+    return (wheel - vehicle.wheel) / np.maximum(vehicle.sigma_wheel, MIN_WHEEL_SIGMA)
 
 
 def far_off(vehicle, wheel):
@@ -85,40 +87,40 @@ def far_off(vehicle, wheel):
 
 
 def wheels_in_words(vehicle, wheel):
-    """The parameters in `wheel` (3,), m, that are far off a Vehicle's."""
+    """Text of the parameters in `wheel` (3,), m, that are far off a Vehicle's."""
     return " and ".join(
-        f"{WHEELS[k]} is {1e3 * wheel[k]:.1f} mm (stated: {1e3 * vehicle.wheel[k]:.1f} ± "
+        f"{WHEEL_NAMES[k]} is {1e3 * wheel[k]:.1f} mm (stated: {1e3 * vehicle.wheel[k]:.1f} ± "
         f"{1e3 * vehicle.sigma_wheel[k]:.1f} mm)" for k in np.flatnonzero(far_off(vehicle, wheel)))
 
 
 def marker_size(vehicle, wheel):
-    """What else explains radii in `wheel` (3,) that differ from a Vehicle's by one factor."""
+    """A sentence if both radii in `wheel` (3,) differ from a Vehicle's by one factor, else ""."""
     factors = wheel[:2] / vehicle.wheel[:2]
-    off = factors.mean() - 1
-    if abs(off) < 2 * np.ptp(factors):
+    excess = factors.mean() - 1
+    if abs(excess) < 2 * np.ptp(factors):
         return ""
-    return (f" The same is seen if all lengths in ArucoReading.txt are {abs(off):.1%} too "
-            f"{'large' if off > 0 else 'small'}, as for printed markers of another size than the "
-            "detector was told.")
+    return (f" The same is seen if all lengths in ArucoReading.txt are {abs(excess):.1%} too "
+            f"{'large' if excess > 0 else 'small'}, as for printed markers of another size than "
+            "the detector was told.")
 
 
-def _late(time):
+def _time_doubt(time):
     """Gain in log likelihood, and the Doubt if sightings are late or early against the encoder."""
-    late, sigma = time.estimate[0], time.sigma[0]
-    if time.gain < MIN_GAIN[0] or abs(late) < MIN_LATE:
+    delay, sigma = time.estimate[0], time.sigma[0]
+    if time.gain < MIN_TIME_GAIN or abs(delay) < MIN_DELAY:
         return time.gain, None
-    side, sign = ("late", "large") if late > 0 else ("early", "small")
-    number = f"{abs(late):.1f} ± {sigma:.1f} poses" if abs(late) < MANY_POSES else \
-        f"{abs(late):.0f} poses or more"
+    side, sign = ("late", "large") if delay > 0 else ("early", "small")
+    number = f"{abs(delay):.1f} ± {sigma:.1f} poses" if abs(delay) < MAX_DELAY else \
+        f"{abs(delay):.0f} poses or more"
     return time.gain, Doubt("time-offset", (
         f"The sightings agree best if they are {number} {side} against the encoder: look whether "
         f"the pose ids of ArucoReading.txt are too {sign}, and whether rows are missing in "
         "encoderReading.txt."))
 
 
-def _place(place):
+def _place_doubt(place):
     """Gain in log likelihood, and the Doubt if the camera is not in the vehicle's origin."""
-    if place.gain < MIN_GAIN[1] or (np.abs(place.estimate) < MIN_PLACE).all():
+    if place.gain < MIN_PLACE_GAIN or (np.abs(place.estimate) < MIN_PLACE).all():
         return place.gain, None
     (x, y, turn), sigma = place.estimate, place.sigma
     return place.gain, Doubt("camera-offset", (
@@ -129,7 +131,7 @@ def _place(place):
 
 
 def slip_doubts(found):
-    """A slip that no wheel has."""
+    """List of a Doubt if the slip is larger than that of any wheel."""
     if found.slip <= MAX_SLIP or not found.noise_sigma[0]:
         return []
     return [Doubt("wheel-slip", (
@@ -139,19 +141,20 @@ def slip_doubts(found):
 
 
 def noise_doubts(found):
-    """Factors on the stated sigmas that were learned and differ from 1."""
-    late = np.mean(found.range_weight < 0.5) if len(found.range_weight) else 0.0
+    """List of Doubt for learned factors on the stated sigmas that differ from 1."""
+    late_share = np.mean(found.range_weight < 0.5) if len(found.range_weight) else 0.0
     doubts = []
     for column, what, name, file in ((1, "marker-noise", "sightings", "ArucoReading.txt"),
                                      (2, "range-noise", "ranges", "UwbReading.txt")):
         factor, sigma = getattr(found.noise, name), found.noise_sigma[column]
-        if not sigma or abs(np.log(factor)) <= max(np.log(MAX_FACTOR), DECIDED_SIGMAS * sigma):
+        if not sigma or abs(np.log(factor)) <= max(
+                np.log(MAX_NOISE_FACTOR), MIN_FACTOR_SIGMAS * sigma):
             continue
         outside = (found.noise.logarithms[column] - BOUNDS[:, column]) * [1, -1] < sigma
         number = f"at most {factor:.2g}" if outside[0] else \
             f"at least {factor:.3g}" if outside[1] else f"{factor:.2f} ± {factor * sigma:.2f}"
-        reason = (f"{late:.0%} of them are far too long, as without line of sight."
-                  if name == "ranges" and late > MANY_LATE else
+        reason = (f"{late_share:.0%} of them are far too long, as without line of sight."
+                  if name == "ranges" and late_share > MAX_LATE_SHARE else
                   "Look at how the sensor's covariances were obtained.")
         doubts.append(Doubt(what, (
             f"The {name} scatter {number} times as much as {file} states: problems 3 and 4 use the "
@@ -160,12 +163,12 @@ def noise_doubts(found):
 
 
 def calibration_doubts(found):
-    """Ranges that calibrated themselves and are not as stated."""
+    """List of a Doubt if the offset or scale of the ranges is not 0 or 1."""
     covariance = found.range_calibration_covariance
     if not covariance.any():
         return []
-    off = found.range_calibration - [0, 1]
-    if off @ np.linalg.solve(covariance, off) / 2 < MIN_GAIN_RANGES:
+    difference = found.range_calibration - [0, 1]
+    if difference @ np.linalg.solve(covariance, difference) / 2 < MIN_RANGE_GAIN:
         return []
     (offset, scale), (sigma, scale_sigma) = found.range_calibration, found.range_calibration_sigma
     return [Doubt("range-offset", (
@@ -174,7 +177,7 @@ def calibration_doubts(found):
 
 
 def sighting_doubts(measurements, rejected):
-    """Many rejected sightings, or most of a marker's; `rejected` (s,) bool."""
+    """List of a Doubt if `rejected` (s,), bool, has many sightings, or the majority of a marker."""
     sentences, repeated = [], measurements.sightings.contradicting
     left_out, count = rejected.sum() + repeated, len(rejected) + repeated
     if left_out > MAX_REJECTED * count:
@@ -183,10 +186,11 @@ def sighting_doubts(measurements, rejected):
                             if repeated else ""))
     seen = np.bincount(measurements.label, minlength=len(measurements.marker))
     wrong = np.bincount(measurements.label, rejected, len(measurements.marker))
-    most = measurements.marker[(seen >= MIN_SIGHTINGS) & (wrong > seen / 2)].tolist()
-    if most:
-        sentences.append(f"most sightings of marker{'s' * (len(most) > 1)} "
-                         + ", ".join(map(str, most)) + " contradict the rest and are left out")
+    markers = measurements.marker[
+        (seen >= MIN_SIGHTINGS_PER_MARKER) & (wrong > seen / 2)].tolist()
+    if markers:
+        sentences.append(f"most sightings of marker{'s' * (len(markers) > 1)} "
+                         + ", ".join(map(str, markers)) + " contradict the rest and are left out")
     if not sentences:
         return []
     text = "; ".join(sentences)
@@ -196,10 +200,10 @@ def sighting_doubts(measurements, rejected):
 
 
 def confirmation(found, sensor):
-    """What a SlamResult says of the stated noise of a sensor, "sightings" or "ranges": a clause.
+    """A clause on the stated noise of a sensor, "sightings" or "ranges", from a SlamResult.
 
-    It is confirmed where the factor on its standard deviations is within a tenth of 1 or within
-    three standard deviations of it; a factor that was given says nothing.
+    The noise is confirmed if the learned factor on its standard deviations is within a tenth of 1,
+    or within three of its own standard deviations.
     """
     column, file = {"sightings": (1, "ArucoReading.txt"), "ranges": (2, "UwbReading.txt")}[sensor]
     factor, relative = getattr(found.noise, sensor), found.noise_sigma[column]

@@ -1,22 +1,22 @@
-"""Stage 6: wheels, noise and accepted measurements that agree with each other."""
+"""Stage 6: wheels, noise and accepted measurements, estimated in turn until they agree."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from slamlib.slam.evidence import solve
+from slamlib.slam.evidence import laplace_approximation
 from slamlib.slam.noise import with_known
-from slamlib.slam.noise_posterior import NoisePosterior, noise_posterior
+from slamlib.slam.noise_posterior import NoisePosterior, learn_noise
 from slamlib.slam.normal_equations import NormalEquations
-from slamlib.slam.odometry_factors import odometry_factors
+from slamlib.slam.odometry_factors import preintegrate_odometry
 from slamlib.slam.optimizer import optimize
 from slamlib.slam.problem import Problem
 from slamlib.slam.robust import accepted, noise_of_scatter
 from slamlib.slam.state import State
 
-MAX_ROUNDS = 6               # of wheels, noise and accepted measurements
-FEW = 1e-3                   # share of the measurements whose change says nothing of the noise
+MAX_ROUNDS = 6               # number of rounds of wheels, noise and accepted measurements
+NEGLIGIBLE_CHANGE = 1e-3     # share of the measurements whose weight may change at the same noise
 
 
 @dataclass(frozen=True)
@@ -25,8 +25,8 @@ class Fit:
 
     problem: Problem
     state: State
-    log_evidence: float
-    posterior: NoisePosterior | None     # of the noise; None where all of it is known
+    log_evidence: float                  # Laplace, up to a constant
+    posterior: NoisePosterior | None     # None if all noise parameters are known
 
     @cached_property
     def equations(self):
@@ -35,16 +35,16 @@ class Fit:
 
 
 def solved_by_gtsam(fit):
-    """The Fit whose state GTSAM's optimisation of the same graph ends at, from that of the Fit."""
+    """The Fit at the end of GTSAM's optimisation of the same graph, from the state of `fit`."""
     return replace(fit, state=optimize(fit.problem, fit.state, by_gtsam=True).state)
 
 
-def refine(problem, state, accept=accepted, factors=odometry_factors):
+def refine(problem, state, accept=accepted, preintegrate=preintegrate_odometry):
     """The Fit in which wheels, noise and accepted measurements agree with each other.
 
     They depend on each other, so each is updated in turn until the accepted measurements no longer
     change. From a Problem and a State near its solution. `accept` makes MeasurementFactors from
-    Problem and State; None keeps the problem's. `factors` as of `problem.build`.
+    Problem and State; None keeps those of the problem. `preintegrate` as in `build_problem`.
     """
     m, model, posterior = problem.measurements, problem.odometry.model, None
     if accept is not None:
@@ -52,11 +52,11 @@ def refine(problem, state, accept=accepted, factors=odometry_factors):
     measured = problem.measured if accept is None else accept(problem, state)
     changed = np.inf
     for _ in range(MAX_ROUNDS):
-        problem = replace(problem, measured=measured, odometry=factors(m, model, state.w))
-        if m.learned.any() and changed > FEW * len(measured.weight):
-            optimum = None                                 # frees the equations before
+        problem = replace(problem, measured=measured, odometry=preintegrate(m, model, state.w))
+        if m.learned.any() and changed > NEGLIGIBLE_CHANGE * len(measured.weight):
+            optimum = None                                 # frees the equations of the last round
             optimum = optimize(problem, state, max_steps=2)
-            state, posterior = optimum.state, noise_posterior(optimum.equations)
+            state, posterior = optimum.state, learn_noise(optimum.equations)
             problem = replace(problem, noise=with_known(posterior.noise, m.dataset.vehicle))
         optimum = None
         optimum = optimize(problem, state)
@@ -65,4 +65,5 @@ def refine(problem, state, accept=accepted, factors=odometry_factors):
         changed = np.count_nonzero(measured.weight != problem.measured.weight)
         if not changed:
             break
-    return Fit(problem, state, solve(optimum.equations, problem.noise)[1], posterior)
+    _, log_evidence = laplace_approximation(optimum.equations, problem.noise)
+    return Fit(problem, state, log_evidence, posterior)

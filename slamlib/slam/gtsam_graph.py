@@ -7,14 +7,14 @@
   custom factor in Python it would be slow, because GTSAM copies all values for every call.
 
 Two more kinds of factors are linearised in numpy, by `linear_factors.py`: sightings of points,
-whose heading is unknown, and ranges whose offset and scale are variables.
+whose heading is unknown, and ranges whose offset and scale c are variables.
 """
 
 import re
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import A, L, P, W, X, Z
+from gtsam.symbol_shorthand import A, C, L, P, W, X
 
 from slamlib.dataset import DatasetError
 from slamlib.slam.linear_factors import point_factors, range_factors
@@ -23,11 +23,11 @@ from slamlib.slam.odometry_factors import odometry_error
 
 
 def gtsam_step(problem, state):
-    """The Gauss-Newton step (n,) of a Problem at a State, in the order of elimination, by GTSAM.
+    """The Gauss-Newton step delta (n,) by GTSAM of a Problem at a State, in elimination ordering.
 
-    Cholesky decomposition of the information is fast, but fails where it is ill-conditioned. QR
-    decomposition of its root then decides whether the measurements determine every variable; it
-    raises DatasetError if they do not.
+    Cholesky decomposition of H is fast, but fails if H is ill-conditioned. QR decomposition of its
+    root then decides whether the measurements determine every variable. Raises DatasetError if they
+    do not.
     """
     linear, ordering = linearize(problem, state), problem.measurements.ordering
     try:
@@ -47,21 +47,18 @@ def linearize(problem, state):
     """The gtsam.GaussianFactorGraph of a Problem at a State."""
     graph = gtsam.GaussianFactorGraph()
     graph.push_back(nonlinear_graph(problem).linearize(values(problem.measurements, state)))
-    e, *jacobians = odometry_error(problem.odometry, state.poses, state.w)
+    errors, jacobians = odometry_error(problem.odometry, state.poses, state.w)
     U, _ = problem.odometry.whitening(problem.noise.slip)
-    e, (first, second, by_w) = (U @ e[..., None])[..., 0], [U @ J for J in jacobians]
-    for i in range(len(e)):
-        graph.add(X(i), first[i], X(i + 1), second[i], W(0), by_w[i], -e[i])
+    for i, (e, J) in enumerate(zip((U @ errors[..., None])[..., 0], U @ jacobians)):
+        graph.add(X(i), J[:, :3], X(i + 1), J[:, 3:6], W(0), J[:, 6:], -e)
     f = point_factors(problem.measured, problem.noise, state)
-    for i, j, by_pose, by_point, error in zip(
-            f.row.tolist(), f.landmark.tolist(), f.by_pose, f.by_landmark, f.e):
-        graph.add(X(i), by_pose, P(j), by_point, -error)
+    for i, j, e, J in zip(f.row.tolist(), f.landmark.tolist(), f.e, f.J):
+        graph.add(X(i), J[:, :3], P(j), J[:, 3:], -e)
     if problem.measurements.calibrated:
         f = range_factors(problem.measured, problem.noise, state)
-        for i, k, by_pose, by_antenna, by_z, error in zip(
-                f.row.tolist(), (f.landmark - len(problem.measurements.marker)).tolist(),
-                f.by_pose, f.by_landmark, f.by_calibration, f.e):
-            graph.add(X(i), by_pose, A(k), by_antenna, Z(0), by_z, -error)
+        antennas = f.landmark - len(problem.measurements.marker)
+        for i, k, e, J in zip(f.row.tolist(), antennas.tolist(), f.e, f.J):
+            graph.add(X(i), J[:, :3], A(k), J[:, 3:5], C(0), J[:, 5:], -e)
     return graph
 
 
@@ -77,13 +74,12 @@ def nonlinear_graph(problem):
         graph.add(gtsam.BetweenFactorPose2(X(i), L(j), gtsam.Pose2(*z), _robust(
             factors.sighting_kernel, model.Gaussian.SqrtInformation(root, False))))
     if not m.calibrated:
-        sigma = noise.ranges * m.ranges.sigma
-        used, r = np.flatnonzero(factors.range_weight), m.ranges
-        sigma = sigma[used] / np.sqrt(factors.range_weight[used])
-        for i, k, distance, own in zip(r.row[used].tolist(), r.antenna[used].tolist(),
-                                       r.distance[used].tolist(), sigma.tolist()):
+        r, used = m.ranges, np.flatnonzero(factors.range_weight)
+        sigmas = noise.ranges * r.sigma[used] / np.sqrt(factors.range_weight[used])
+        for i, k, distance, sigma in zip(r.row[used].tolist(), r.antenna[used].tolist(),
+                                         r.distance[used].tolist(), sigmas.tolist()):
             graph.add(gtsam.RangeFactor2D(X(i), A(k), distance, _robust(
-                factors.range_kernel, model.Isotropic.Sigma(1, own))))
+                factors.range_kernel, model.Isotropic.Sigma(1, sigma))))
     _add_priors(graph, factors)
     return graph
 
@@ -102,7 +98,7 @@ def _add_priors(graph, factors):
         graph.add(gtsam.PriorFactorPoint2(
             A(k), position, model.Isotropic.Sigma(2, GUESS_PRIOR_SIGMA)))
     if m.calibrated:
-        graph.add(gtsam.PriorFactorVector(Z(0), np.zeros(2), model.Unit.Create(2)))
+        graph.add(gtsam.PriorFactorVector(C(0), np.zeros(2), model.Unit.Create(2)))
 
 
 def _robust(kernel, noise):
@@ -123,17 +119,17 @@ def values(measurements, state):
         found.insert(A(k), gtsam.Point2(*antenna))
     found.insert(W(0), state.w)
     if measurements.calibrated:
-        found.insert(Z(0), state.z)
+        found.insert(C(0), state.c)
     return found
 
 
 def _variable(measurements, message):
-    """What GTSAM's message about an undetermined variable names, in the words of the files."""
-    m, found = measurements, re.search(r"Symbol: ([alpwxz])(\d+)", message)
+    """The undetermined variable that GTSAM's message names, in the words of the files."""
+    m, found = measurements, re.search(r"Symbol: ([aclpwx])(\d+)", message)
     if found is None:
         return "one of them"
-    if found[1] in "wz":
-        return {"w": "the wheel parameters", "z": "the offset and scale of the ranges"}[found[1]]
+    if found[1] in "wc":
+        return {"w": "the wheel parameters", "c": "the offset and scale of the ranges"}[found[1]]
     name, ids = {"x": ("pose", m.frame + 1), "l": ("the pose of marker", m.marker),
                  "p": ("the position of marker", m.marker),
                  "a": ("the position of antenna", m.antenna)}[found[1]]

@@ -1,36 +1,36 @@
-"""Stage 7: every encoder pose between the frames, conditioned on its two neighbours."""
+"""Stage 7: the encoder poses between the frames, conditioned on both neighbouring frames."""
 
 import numpy as np
 
 from slamlib import increments, se2
 from slamlib.slam.odometry_factors import odometry_noise
 
-AT_ONCE = 1000               # frames between which poses are computed together: these stay in cache
+FRAMES_AT_ONCE = 1000        # number of frames of a section, whose arrays stay in cache
 
 
 def interpolate(problem, state, pairs):
     """Every encoder pose (n, 3) and its covariance (n, 3, 3) in world axes, given the frames.
 
-    Between the frames a and b a pose k depends on nothing but them and w. X_a Delta_ak(w) and
-    X_b Delta_kb(w)^-1 are two estimates of it, with the independent noise of the encoder steps
-    before and after it. Their average by information is the conditional mean, exact to first order.
+    A pose k between the frames a and b depends only on them and on w. X_a Delta_ak(w) and
+    X_b Delta_kb(w)^-1 are two estimates of it, with independent noise of the encoder steps before
+    and after it. Their average by information is the conditional mean, exact to first order.
 
-    `pairs` (f-1, 9, 9) are those of `Covariances` at the State that solves the Problem.
+    `pairs` (f-1, 9, 9) as in `Covariances`, at the State that solves the Problem.
     """
     frame, count = problem.measurements.frame, len(problem.measurements.dataset.ticks)
     if not len(pairs):                                       # pose 1 alone: the world's origin
         return state.poses.copy(), np.diag(problem.measurements.origin_sigma)[None]**2
     poses, covariances = np.empty((count, 3)), np.empty((count, 3, 3))
-    for first in range(0, len(pairs), AT_ONCE):
-        rows = slice(first, min(first + AT_ONCE, len(pairs)) + 1)          # of frames
-        own = slice(frame[rows][0], frame[rows][-1] + 1)                   # shares its ends
-        poses[own], covariances[own] = _section(
+    for first in range(0, len(pairs), FRAMES_AT_ONCE):
+        rows = slice(first, min(first + FRAMES_AT_ONCE, len(pairs)) + 1)          # of frames
+        section = slice(frame[rows][0], frame[rows][-1] + 1)               # shares its ends
+        poses[section], covariances[section] = _interpolate_section(
             problem, state.poses[rows], state.w, frame[rows], pairs[rows.start:rows.stop - 1])
     return poses, covariances
 
 
-def _section(problem, poses, w, frame, pairs):
-    """The same from the first to the last of some consecutive frames, at encoder poses (g,)."""
+def _interpolate_section(problem, poses, w, frame, pairs):
+    """The same for the encoder poses from the first to the last of consecutive frames (g,)."""
     joint = _in_world_axes(pairs, poses)
     pose = np.arange(frame[0], frame[-1] + 1)
     last = np.searchsorted(frame, pose, side="right") - 1
@@ -41,29 +41,29 @@ def _section(problem, poses, w, frame, pairs):
         return all_poses, covariances
     a, b = last[inner], last[inner] + 1
 
-    forward, forward_by_w, noise = _increments(problem, w, frame, frame[a], pose[inner])
-    A, B = se2.compose_jacobians(poses[a], forward)
-    N_a = B @ noise @ np.swapaxes(B, 1, 2)
-    ahead, ahead_by_w, noise = _increments(problem, w, frame, pose[inner], frame[b])
-    back = se2.inverse(ahead)
+    delta_a, delta_a_by_w, Q_a = _increments(problem, w, frame, frame[a], pose[inner])
+    A_a, B_a = se2.compose_jacobians(poses[a], delta_a)
+    N_a = B_a @ Q_a @ np.swapaxes(B_a, 1, 2)
+    delta_b, delta_b_by_w, Q_b = _increments(problem, w, frame, pose[inner], frame[b])
+    back = se2.inverse(delta_b)
     A_b, B_b = se2.compose_jacobians(poses[b], back)
-    B_b = B_b @ se2.inverse_jacobian(ahead)
-    N_b = B_b @ noise @ np.swapaxes(B_b, 1, 2)
+    B_b = B_b @ se2.inverse_jacobian(delta_b)
+    N_b = B_b @ Q_b @ np.swapaxes(B_b, 1, 2)
 
-    gain = N_a @ np.linalg.inv(N_a + N_b)
-    rest = np.eye(3) - gain
-    estimate, other = se2.compose(poses[a], forward), se2.compose(poses[b], back)
-    difference = other - estimate
+    gain_b = N_a @ np.linalg.inv(N_a + N_b)
+    gain_a = np.eye(3) - gain_b
+    from_a, from_b = se2.compose(poses[a], delta_a), se2.compose(poses[b], back)
+    difference = from_b - from_a
     difference[:, 2] = se2.wrap(difference[:, 2])
-    F = np.concatenate([rest @ A, gain @ A_b,
-                        rest @ B @ forward_by_w + gain @ B_b @ ahead_by_w], axis=2)
-    all_poses[inner] = estimate + np.einsum("nij,nj->ni", gain, difference)
-    covariances[inner] = F @ joint[a] @ np.swapaxes(F, 1, 2) + rest @ N_a
+    F = np.concatenate([gain_a @ A_a, gain_b @ A_b,
+                        gain_a @ B_a @ delta_a_by_w + gain_b @ B_b @ delta_b_by_w], axis=2)
+    all_poses[inner] = from_a + np.einsum("nij,nj->ni", gain_b, difference)
+    covariances[inner] = F @ joint[a] @ np.swapaxes(F, 1, 2) + gain_a @ N_a
     return all_poses, (covariances + np.swapaxes(covariances, 1, 2)) / 2
 
 
 def _in_world_axes(pairs, poses):
-    """(f-1, 9, 9) covariances of [X_i, X_{i+1}, w], those of the poses in world axes."""
+    """Covariances (g-1, 9, 9) of [X_i, X_{i+1}, w] with the poses in world axes."""
     turned = np.zeros_like(pairs)
     turned[:, range(9), range(9)] = 1
     turned[:, :2, :2], turned[:, 3:5, 3:5] = (se2.rotation(poses[rows, 2])
@@ -72,9 +72,9 @@ def _in_world_axes(pairs, poses):
 
 
 def _increments(problem, w, frame, start, end):
-    """Increments (m, 3) between poses of a section with these frames, at the wheels w.
+    """Increments (m, 3) between poses of the section of these frames, at the wheel errors w.
 
-    Also their derivatives by w, and their noise in the axes of the start.
+    Also their derivatives (m, 3, 3) by w, and their noise Q (m, 3, 3) in the axes of the start.
     """
     d = problem.measurements.dataset
     vehicle, ticks = d.vehicle.with_deviation(w), d.ticks[frame[0]:frame[-1] + 1]

@@ -1,7 +1,7 @@
-"""Stage 2: the factors of sightings and ranges, linearised in numpy, whitened, with their kernels.
+"""Stage 2: sightings and ranges linearised in numpy, whitened and weighted by their kernels.
 
-GTSAM linearises the same factors, one by one, but for two kinds: sightings of points, and ranges
-with an offset and a scale.
+GTSAM linearises the same factors one by one, except for sightings of points and for ranges whose
+offset and scale are variables.
 """
 
 from dataclasses import dataclass
@@ -14,21 +14,22 @@ from slamlib.slam.state import RANGE_SIGMA
 
 @dataclass(frozen=True)
 class LinearFactors:
-    """The accepted measurements of one kind at a state: m of them, with d errors each."""
+    """The m accepted measurements of one kind, linearised at a state, with d errors each."""
 
-    index: np.ndarray                # (m,) which of all measurements of the kind
-    row: np.ndarray                  # (m,) frame
-    landmark: np.ndarray             # (m,) first the markers, then the antennas
-    e: np.ndarray                    # (m, d) expected minus measured, whitened
-    by_pose: np.ndarray              # (m, d, 3)
-    by_landmark: np.ndarray          # (m, d, 3), or (m, d, 2) of positions
-    weight: np.ndarray               # (m,) share of its information that a measurement keeps
-    error: float                     # half the sum of squares, or the kernel's loss
-    by_calibration: np.ndarray | None = None       # (m, 1, 2) of ranges by offset and scale
+    index: np.ndarray        # (m,) row among all measurements of the kind
+    row: np.ndarray          # (m,) frame
+    landmark: np.ndarray     # (m,) row of the marker, or k plus row of the antenna
+    e: np.ndarray            # (m, d) whitened errors
+    J: np.ndarray            # (m, d, p) whitened derivatives by the unknowns of pose, landmark, c
+    weight: np.ndarray       # (m,) share of its information that a measurement keeps
+    error: float             # half the sum of squared errors, or the loss of the kernel
 
 
-def linear_factors(factors, noise, state):
-    """The LinearFactors of sightings of poses, of points, and of ranges."""
+def linearize_measurements(factors, noise, state):
+    """The LinearFactors of sightings of poses, of points, and of ranges.
+
+    From MeasurementFactors, a Noise and a State.
+    """
     return (pose_factors(factors, noise, state), point_factors(factors, noise, state),
             range_factors(factors, noise, state))
 
@@ -38,56 +39,55 @@ def pose_factors(factors, noise, state):
     m, s = factors.measurements, factors.measurements.sightings
     index = np.flatnonzero(factors.sighting_weight[m.as_pose])
     rows = np.flatnonzero(m.as_pose)[index]
-    e, by_pose, by_marker, _ = between_error(s.z[rows], state.poses[s.row[rows]],
-                                             state.markers[m.label[rows]])
-    return _whitened(index, s.row[rows], m.label[rows], (e, by_pose, by_marker),
-                     m.sighting_roots[0][rows], factors.sighting_weight[rows], noise.sightings,
-                     factors.sighting_kernel)
+    e, *jacobians, _ = between_error(s.z[rows], state.poses[s.row[rows]],
+                                     state.markers[m.label[rows]])
+    return _whitened(index, s.row[rows], m.label[rows], e, jacobians, m.sighting_roots[0][rows],
+                     factors.sighting_weight[rows], noise.sightings, factors.sighting_kernel)
 
 
 def point_factors(factors, noise, state):
-    """The LinearFactors of the sightings of markers without one."""
+    """The LinearFactors of the sightings of markers that are points."""
     m, s = factors.measurements, factors.measurements.sightings
     index = np.flatnonzero(factors.sighting_weight[~m.as_pose])
     rows = np.flatnonzero(~m.as_pose)[index]
-    linear = point_error(s.z[rows, :2], state.poses[s.row[rows]], state.markers[m.label[rows], :2])
-    return _whitened(index, s.row[rows], m.label[rows], linear, m.sighting_roots[1][rows],
+    e, *jacobians = point_error(s.z[rows, :2], state.poses[s.row[rows]],
+                                state.markers[m.label[rows], :2])
+    return _whitened(index, s.row[rows], m.label[rows], e, jacobians, m.sighting_roots[1][rows],
                      factors.sighting_weight[rows], noise.sightings, factors.sighting_kernel)
 
 
 def range_factors(factors, noise, state):
-    """The LinearFactors of the ranges, offset + scale * distance."""
+    """The LinearFactors of the ranges; expected is offset + scale * distance."""
     m, r = factors.measurements, factors.measurements.ranges
     rows = np.flatnonzero(factors.range_weight)
     offset, scale = state.range_calibration
-    distance, by_pose, by_antenna = range_error(
+    distance, *jacobians = range_error(
         np.zeros(len(rows)), state.poses[r.row[rows]], state.antennas[r.antenna[rows]])
-    linear = ((offset + scale * distance - r.distance[rows])[:, None], scale * by_pose,
-              scale * by_antenna)
-    by_calibration = RANGE_SIGMA * np.stack([np.ones_like(distance), distance], -1)[:, None]
-    return _whitened(
-        rows, r.row[rows], len(m.marker) + r.antenna[rows], linear, 1 / r.sigma[rows, None, None],
-        factors.range_weight[rows], noise.ranges, factors.range_kernel, by_calibration)
+    e = (offset + scale * distance - r.distance[rows])[:, None]
+    jacobians = [scale * jacobian for jacobian in jacobians]
+    if m.calibrated:
+        jacobians.append(RANGE_SIGMA * np.stack([np.ones_like(distance), distance], -1)[:, None])
+    return _whitened(rows, r.row[rows], len(m.marker) + r.antenna[rows], e, jacobians,
+                     1 / r.sigma[rows, None, None], factors.range_weight[rows], noise.ranges,
+                     factors.range_kernel)
 
 
-def _whitened(index, row, landmark, linear, root, weight, factor, kernel, by_calibration=None):
-    """The LinearFactors of errors and derivatives.
+def _whitened(index, row, landmark, e, jacobians, U, weight, factor, kernel):
+    """The LinearFactors of errors e (m, d) with a list of derivatives (m, d, p) each.
 
-    From square root informations (m, d, d) and weights (m,). `factor` multiplies the standard
-    deviations. A kernel weighs a measurement by the size of its
-    whitened error. That of a range has the sign of measured minus expected.
+    From square root informations U (m, d, d) and weights (m,). `factor` multiplies the standard
+    deviations. A kernel weighs a measurement by the norm of its whitened error; that of a range
+    has the sign of measured minus expected.
     """
-    root = root * (np.sqrt(weight) / factor)[:, None, None]
-    e = (root @ linear[0][..., None])[..., 0]
+    U = U * (np.sqrt(weight) / factor)[:, None, None]
+    e = (U @ e[..., None])[..., 0]
     size, error = -e[:, 0] if e.shape[1] == 1 else np.linalg.norm(e, axis=1), np.sum(e**2) / 2
     if kernel is not None:
         size = size.tolist()
         by_kernel, error = np.array([*map(kernel.weight, size)]), sum(map(kernel.loss, size))
         weight = weight * by_kernel
-        root = root * np.sqrt(by_kernel)[:, None, None]
+        U = U * np.sqrt(by_kernel)[:, None, None]
         e = e * np.sqrt(by_kernel)[:, None]
-    return LinearFactors(
-        index=index, row=row, landmark=landmark, e=e, by_pose=root @ linear[1],
-        by_landmark=root @ linear[2],
-        weight=weight, error=float(error),
-        by_calibration=None if by_calibration is None else root @ by_calibration)
+    return LinearFactors(index=index, row=row, landmark=landmark, e=e,
+                         J=U @ np.concatenate(jacobians, axis=2), weight=weight,
+                         error=float(error))

@@ -1,15 +1,15 @@
-"""Stage 1: all measurements of a dataset as arrays, numbered once.
+"""Stage 1: all measurements of a dataset as arrays.
 
 Frames are the encoder poses that are variables X_i of the graph: the first, the last, and each one
 with a sighting or a range. Measurements are numbered: first the s sightings, then the r ranges.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import A, L, P, W, X, Z
+from gtsam.symbol_shorthand import A, C, L, P, W, X
 
 from slamlib import odometry, se2
 from slamlib.dataset import Dataset, UwbReadings
@@ -23,7 +23,7 @@ from slamlib.sightings import (
 )
 from slamlib.slam.errors import square_root_information
 from slamlib.slam.noise import is_known
-from slamlib.slam.structure import structure
+from slamlib.slam.structure import block_structure, numbered_variables
 
 ORIGIN_SIGMA = 1e-5          # m, of the position of pose 1, which is zero by definition
 
@@ -40,11 +40,11 @@ class Ranges:
 
 @dataclass(frozen=True)
 class Measurements:
-    """What was measured, with rows of frames, markers and antennas in place of their ids."""
+    """The measurements, with rows of frames, markers and antennas in place of their ids."""
 
     dataset: Dataset
     frame: np.ndarray        # (f,) encoder pose of every frame, from 0
-    turn: np.ndarray         # (f-1,) rad, by odometry from each frame to the next, continuous
+    turn: np.ndarray         # (f-1,) rad, change of heading to the next frame by odometry
     sightings: Sightings     # s of them
     label: np.ndarray        # (s,) row of `marker`
     marker: np.ndarray       # (k,) ids, ascending
@@ -52,7 +52,7 @@ class Measurements:
     ranges: Ranges           # r of them
     antenna: np.ndarray      # (a,) ids, ascending, of antennas with ranges
     guess: np.ndarray        # (a, 2) m, their guessed positions
-    calibrated: bool = False     # the ranges' offset and scale are variables
+    calibrated: bool = False     # whether offset and scale of the ranges are a variable, c
 
     @property
     def origin_sigma(self):
@@ -61,7 +61,7 @@ class Measurements:
 
     @property
     def learned(self):
-        """(3,) bool, noise parameters that are learned: not known, and of these measurements."""
+        """(3,) bool, noise parameters that are learned: unknown ones with measurements."""
         return ~is_known(self.dataset.vehicle) & [
             True, len(self.label) > 0, len(self.ranges.row) > 0]
 
@@ -92,55 +92,30 @@ class Measurements:
                 square_root_information(s.C[:, :2, :2]))
 
     @cached_property
-    def structure(self):
-        """The Structure of the information matrix."""
-        width = np.r_[np.full(len(self.frame), 3), np.where(self.oriented, 3, 2),
-                      np.full(len(self.antenna), 2), 3, [2] * self.calibrated].astype(int)
-        order = self.ordering
-        keys = (gtsam.Symbol(order.at(i)) for i in range(order.size()))
-        first = {"x": 0, "l": len(self.frame), "p": len(self.frame),
-                 "a": len(self.frame) + len(self.marker), "w": self.wheels, "z": self.wheels + 1}
-        rank = np.empty(len(width), int)
-        rank[[first[chr(key.chr())] + key.index() for key in keys]] = np.arange(len(width))
-        return structure(width, rank, self.variables)
-
-    @cached_property
-    def placed(self):
-        """Of the factors of `variables` the places and rows in the matrix."""
-        return [(self.structure.places(each), self.structure.rows_of_factors(each))
-                for each in self.variables]
-
-    @property
-    def wheels(self):
-        """Number of the variable w; the next one is z."""
-        return len(self.frame) + len(self.marker) + len(self.antenna)
-
-    @property
     def variables(self):
+        """The Variables, numbered."""
+        return numbered_variables(
+            len(self.frame), len(self.marker), len(self.antenna), self.calibrated)
+
+    @property
+    def factor_variables(self):
         """Numbers of the variables of odometry, sightings of poses, those of points, and ranges.
 
         (f-1, 3) of X_i, X_{i+1} and w; (m, 2) of frames and markers, twice; (r, 2) of frames and
-        antennas, or (r, 3) with z where they calibrate themselves.
+        antennas, or (r, 3) with c if the ranges are calibrated.
         """
-        f, k, s, r = len(self.frame), len(self.marker), self.sightings, self.ranges
-        i, of_sightings = np.arange(f - 1), np.stack([s.row, f + self.label], -1)
-        of_ranges = [r.row, f + k + r.antenna, np.full(len(r.row), self.wheels + 1)]
-        return [np.stack([i, i + 1, np.full(f - 1, self.wheels)], -1),
-                of_sightings[self.as_pose], of_sightings[~self.as_pose],
-                np.stack(of_ranges[:2 + self.calibrated], -1)]
-
-    @property
-    def ordering(self):
-        """Elimination ordering of all variables. w and z, which touch many poses, come last."""
-        order = gtsam.Ordering(self.order_of_others)
-        order.push_back(W(0))
+        v, s, r = self.variables, self.sightings, self.ranges
+        odometry = [v.frames[:-1], v.frames[1:], np.repeat(v.w, len(v.frames) - 1)]
+        sightings = np.stack([s.row, v.markers[self.label]], -1)
+        ranges = [r.row, v.antennas[r.antenna]]
         if self.calibrated:
-            order.push_back(Z(0))
-        return order
+            ranges.append(np.repeat(v.c, len(r.row)))
+        return [np.stack(odometry, -1), sightings[self.as_pose], sightings[~self.as_pose],
+                np.stack(ranges, -1)]
 
     @cached_property
-    def order_of_others(self):
-        """The ordering (COLAMD) of poses and landmarks."""
+    def ordering(self):
+        """Elimination ordering (COLAMD) of all variables; w and c, which touch many poses, last."""
         graph, s, r = gtsam.SymbolicFactorGraph(), self.sightings, self.ranges
         graph.push_factor(X(0))
         for i, j in zip(s.row.tolist(), self.label.tolist()):
@@ -149,19 +124,36 @@ class Measurements:
             graph.push_factor(X(i), A(k))
         for i in range(len(self.frame) - 1):
             graph.push_factor(X(i), X(i + 1))
-        return gtsam.Ordering.ColamdSymbolicFactorGraph(graph)
+        ordering = gtsam.Ordering.ColamdSymbolicFactorGraph(graph)
+        ordering.push_back(W(0))
+        if self.calibrated:
+            ordering.push_back(C(0))
+        return ordering
 
-    def calibrating(self):
-        """The Measurements with the ranges' offset and scale as variables."""
-        other = replace(self, calibrated=True)
-        other.__dict__["order_of_others"] = self.order_of_others       # does not depend on z
-        return other
+    @cached_property
+    def structure(self):
+        """The Structure of the information matrix."""
+        v, order = self.variables, self.ordering
+        numbers = {"x": v.frames, "l": v.markers, "p": v.markers, "a": v.antennas, "w": v.w,
+                   "c": v.c}
+        keys = (gtsam.Symbol(order.at(i)) for i in range(order.size()))
+        rank = np.argsort([numbers[chr(key.chr())][key.index()] for key in keys])
+        width = np.full(len(rank), 2)
+        width[np.r_[v.frames, v.markers[self.oriented], v.w]] = 3
+        return block_structure(width, rank, self.factor_variables)
+
+    @cached_property
+    def factor_places(self):
+        """(places, rows) in the matrix of each kind of factors, in the order `factor_variables`."""
+        return [(self.structure.places(variables), self.structure.rows_of_factors(variables))
+                for variables in self.factor_variables]
 
 
 def measure(dataset, extra_poses=()):
-    """The Measurements of a Dataset; `extra_poses`, encoder poses from 0, are frames too.
+    """The Measurements of a Dataset.
 
-    Tests use these to compare poses between the frames with those of a graph of all poses.
+    `extra_poses`, encoder poses from 0, are frames without a measurement: tests compare a graph of
+    all poses with poses interpolated between the frames.
     """
     uwb = dataset.uwb or UwbReadings(*np.zeros((2, 0), int), *np.zeros((2, 0)))
     sightings = sightings_by_frame(dataset.aruco, np.r_[

@@ -1,37 +1,38 @@
-"""Stage 6: whether the wheels drive in arcs or in Euler's steps, decided by the evidence."""
+"""Stage 6: the model of the odometry steps, arcs or Euler's, chosen by the evidence."""
 
 from dataclasses import replace
 
 import numpy as np
 
-from slamlib.slam.evidence import solve
+from slamlib.slam.evidence import laplace_approximation
 from slamlib.slam.fit import refine
 from slamlib.slam.linear_factors import range_factors
 from slamlib.slam.noise_posterior import density, greatest_density
 from slamlib.slam.normal_equations import NormalEquations
-from slamlib.slam.odometry_factors import odometry_factors
+from slamlib.slam.odometry_factors import preintegrate_odometry
 
-DECISIVE = 3.0               # log evidence by which data prefer a model to the default
+DECISIVE_LEAD = 3.0          # difference of log evidence from which a model replaces the default
 
 
 def better_model(fit, model):
-    """The Fit of another model of the odometry steps if its evidence is DECISIVE, else `fit`.
+    """The Fit of another model of odometry if its evidence leads by DECISIVE_LEAD, else `fit`.
 
-    The evidences are those of the same measurements with the same weights, so the weights that the
+    Both evidences are on the same measurements with the same weights, so the weights that the
     kernel of the ranges gives at `fit` are kept. The noise is learned for each model.
     """
-    own = replace(fit.problem, measured=_with_fixed_weights(fit))
-    other = replace(own, odometry=odometry_factors(own.measurements, model, fit.state.w))
-    lead = _log_density(NormalEquations(other, fit.state), fit.posterior) \
-        - _log_density(NormalEquations(own, fit.state), fit.posterior,
-                       is_greatest=not len(own.measured.range_weight))
-    if lead <= DECISIVE:
+    current = replace(fit.problem, measured=_with_fixed_weights(fit))
+    odometry = preintegrate_odometry(current.measurements, model, fit.state.w)
+    alternative = replace(current, odometry=odometry)
+    lead = _log_density(NormalEquations(alternative, fit.state), fit.posterior) \
+        - _log_density(NormalEquations(current, fit.state), fit.posterior,
+                       is_greatest=not len(current.measured.range_weight))
+    if lead <= DECISIVE_LEAD:
         return fit
-    return refine(replace(fit.problem, odometry=other.odometry), fit.state, accept=None)
+    return refine(replace(fit.problem, odometry=odometry), fit.state, accept=None)
 
 
 def _with_fixed_weights(fit):
-    """MeasurementFactors without a kernel of the ranges, whose weights are those it gives."""
+    """MeasurementFactors in which weights replace the kernel of the ranges."""
     measured = fit.problem.measured
     weight = measured.weight.astype(float)
     ranges = np.flatnonzero(measured.range_weight) + len(measured.sighting_weight)
@@ -40,10 +41,10 @@ def _with_fixed_weights(fit):
 
 
 def _log_density(equations, posterior, is_greatest=False):
-    """Log evidence of a given noise, or greatest log density of one with this NoisePosterior.
+    """Log evidence of known noise, or greatest log posterior density of learned noise.
 
-    It is that of the equations' own noise if it `is_greatest` there.
+    `is_greatest` says that the noise of the equations' problem is the mode already.
     """
-    if posterior is None or not posterior.covariance.any():          # given, or not to be learned
-        return solve(equations, equations.problem.noise)[1]
+    if posterior is None or not posterior.covariance.any():          # nothing was learned
+        return laplace_approximation(equations, equations.problem.noise)[1]
     return density(equations) if is_greatest else greatest_density(equations, posterior)

@@ -1,4 +1,4 @@
-"""Stage 7: mean and covariance of all variables, averaged over the points of the noise posterior.
+"""Stage 7: mean and covariances of all variables, averaged over the points of the noise posterior.
 
 With probability p_k of point k, x_k its solution and C_k its covariance, the moments are
 
@@ -9,59 +9,49 @@ in the tangent space at the state that solves the problem of greatest posterior 
 
 import numpy as np
 
-from slamlib.slam.covariances import Covariances, covariances
-from slamlib.slam.evidence import solve
+from slamlib.slam.covariances import Covariances, marginal_covariances
+from slamlib.slam.evidence import laplace_approximation
 from slamlib.slam.state import moved
 
 
-def moments(fit):
-    """Mean State, Covariances, and root mean square of the slip in sqrt(m), of a Fit."""
-    problem, state = fit.problem, fit.state
+def posterior_moments(fit):
+    """Mean State, Covariances, and root mean square of the slip in sqrt(m), of a Fit.
+
+    Raises DatasetError as `marginal_covariances`.
+    """
+    noise, equations = fit.problem.noise, fit.equations
     if fit.posterior is None:
-        return state, covariances(fit.equations, problem.noise), problem.noise.slip
+        return fit.state, marginal_covariances(equations, noise), noise.slip
     weights, noises = zip(*fit.posterior.points)
     weights = np.array(weights) / sum(weights)
-    slip = np.sqrt(weights @ np.square([noise.slip for noise in noises]))
-    each = [covariances(fit.equations, noise) for noise in noises]
-    if len(each) == 1:
-        return state, each[0], slip
-    equations = fit.equations
-    x = np.stack([solve(equations, noise)[0] for noise in noises]) \
-        - solve(equations, problem.noise)[0]
+    slip = np.sqrt(weights @ np.square([point.slip for point in noises]))
+    conditional = [marginal_covariances(equations, point) for point in noises]
+    if len(noises) == 1:
+        return fit.state, conditional[0], slip
+    x = np.stack([laplace_approximation(equations, point)[0] for point in noises]) \
+        - laplace_approximation(equations, noise)[0]
     mean = weights @ x
-    x -= mean
-    return moved(problem.measurements, state, mean), _averaged(equations, each, x, weights), slip
+    return (moved(fit.problem.measurements, fit.state, mean),
+            _averaged(equations, conditional, x - mean, weights), slip)
 
 
-def _averaged(equations, each, x, weights):
-    """The Covariances averaged over points with solutions x (p, n) about the mean."""
-    m = equations.problem.measurements
-    frames, markers, antennas, w, z = _variables(equations)
+def _averaged(equations, conditional, x, weights):
+    """The Covariances averaged over points, with solutions x (p, n) about the mean."""
+    m, v, structure = (equations.problem.measurements, equations.problem.measurements.variables,
+                       equations.structure)
+    _, pairs = m.factor_places[0]
 
-    def mixed(blocks, rows):
-        own = x[:, rows]                                               # (p, ..., d)
-        spread = own[..., :, None] * own[..., None, :]
-        return np.einsum("p,p...->...", weights, np.stack(blocks) + spread)
+    def averaged(blocks, rows):
+        """sum p_k (C_k + x_k x_k^T) of blocks p of (..., d, d) with rows (..., d)."""
+        x_k = x[:, rows]
+        return np.einsum("p,p...->...", weights,
+                         np.stack(blocks) + x_k[..., :, None] * x_k[..., None, :])
 
-    w_rows = equations.structure.rows(w, 3)
-    pair_rows = np.concatenate([
-        equations.structure.rows(frames[:-1], 3), equations.structure.rows(frames[1:], 3),
-        np.broadcast_to(w_rows, (len(frames) - 1, 3))], axis=1)
     return Covariances(
-        pairs=mixed([c.pairs for c in each], pair_rows),
-        markers=[mixed([c.markers[j] for c in each],
-                       equations.structure.rows(variable, 2 + m.oriented[j])[0])
-                 for j, variable in enumerate(markers)],
-        antennas=mixed([c.antennas for c in each], equations.structure.rows(antennas, 2)),
-        z=mixed([c.z for c in each], equations.structure.rows(z, 2)[0]) if m.calibrated
-        else each[0].z,
-        w=mixed([c.w for c in each], w_rows[0]))
-
-
-def _variables(equations):
-    """Numbers of the frames (f,), markers (k, 1), antennas (a,), w (1,) and z (1,)."""
-    m = equations.problem.measurements
-    f, k, a = len(m.frame), len(m.marker), len(m.antenna)
-    numbers = np.arange(f + k + a + 2)
-    return (numbers[:f], numbers[f:f + k, None], numbers[f + k:f + k + a],
-            numbers[f + k + a:][:1], numbers[f + k + a + 1:])
+        pairs=averaged([C.pairs for C in conditional], pairs),
+        markers=[averaged([C.markers[j] for C in conditional], rows)
+                 for j, rows in enumerate(structure.rows_of_each(v.markers))],
+        antennas=averaged([C.antennas for C in conditional], structure.rows(v.antennas, 2)),
+        w=averaged([C.w for C in conditional], structure.rows(v.w, 3)[0]),
+        c=averaged([C.c for C in conditional], structure.rows(v.c, 2)[0]) if m.calibrated
+        else conditional[0].c)

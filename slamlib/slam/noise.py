@@ -1,9 +1,9 @@
-"""Stage 2: the noise parameters, which scale the noise of the factors, and their prior.
+"""Stage 2: the three noise parameters and their prior.
 
 Slip is the standard deviation of a wheel's slip after one metre. Two factors multiply the standard
-deviations that the files state for sightings and for ranges. The logarithms of all three are
-normal a priori: a slip of 1 mm and factors of 1, within a factor of 3 and of 2. What a dataset's
-Vehicle gives of the three is known; the others are learned from the drive.
+deviations that the files state for sightings and for ranges. All three are log-normal a priori,
+with medians of 1 mm after one metre and of 1, and standard deviations of a factor of 3 and of 2.
+Those that a dataset's Vehicle gives are known; the others are learned from the drive.
 """
 
 from dataclasses import dataclass, replace
@@ -12,9 +12,9 @@ import numpy as np
 
 from slamlib.increments import SLIP_BOUNDS, SLIP_FACTOR, TYPICAL_SLIP
 
-MEDIAN = np.array([TYPICAL_SLIP, 1.0, 1.0])
-PRIOR_SIGMA = np.log([SLIP_FACTOR, 2.0, 2.0])      # of the logarithms
-GIVEN = ("slip", "marker_noise_factor", "range_noise_factor")      # of a Vehicle, as in Noise
+MEDIAN = np.array([TYPICAL_SLIP, 1.0, 1.0])        # sqrt(m), 1, 1: of the prior
+PRIOR_SIGMA = np.log([SLIP_FACTOR, 2.0, 2.0])      # (3,) standard deviations of the logarithms
+NOISE_KEYS = ("slip", "marker_noise_factor", "range_noise_factor")      # of a Vehicle, as in Noise
 BOUNDS = np.log(MEDIAN) + np.log(100) * np.array([[-1], [1]])      # (2, 3) of the logarithms
 
 
@@ -23,8 +23,8 @@ class Noise:
     """The three noise parameters."""
 
     slip: float = TYPICAL_SLIP     # sqrt(m), sigma of a wheel's slip after one metre
-    sightings: float = 1.0         # of the sigmas in ArucoReading.txt
-    ranges: float = 1.0            # of the sigmas in UwbReading.txt
+    sightings: float = 1.0         # factor on the sigmas in ArucoReading.txt
+    ranges: float = 1.0            # factor on the sigmas in UwbReading.txt
 
     @property
     def logarithms(self):
@@ -37,26 +37,27 @@ def from_logarithms(logarithms):
     return Noise(*np.exp(logarithms).tolist())
 
 
-def given(dataset, slip=None, marker_noise_factor=None, range_noise_factor=None):
-    """The Dataset whose Vehicle has these noise parameters; None leaves what it has."""
-    known = dict(zip(GIVEN, (slip, marker_noise_factor, range_noise_factor)))
+def with_noise(dataset, slip=None, marker_noise_factor=None, range_noise_factor=None):
+    """The Dataset whose Vehicle has these noise parameters; None leaves that of the Vehicle."""
+    values = zip(NOISE_KEYS, (slip, marker_noise_factor, range_noise_factor))
     return replace(dataset, vehicle=replace(dataset.vehicle, **{
-        name: value for name, value in known.items() if value is not None}))
+        key: value for key, value in values if value is not None}))
 
 
 def is_known(vehicle):
     """(3,) bool, which noise parameters a Vehicle gives."""
-    return np.array([getattr(vehicle, name) is not None for name in GIVEN])
+    return np.array([getattr(vehicle, key) is not None for key in NOISE_KEYS])
 
 
 def with_known(noise, vehicle):
-    """The Noise with what a Vehicle gives in place of its own; a slip is at least 1e-5 sqrt(m)."""
+    """The Noise with the parameters that a Vehicle gives; the slip is at least 1e-5 sqrt(m)."""
+    known = (getattr(vehicle, key) for key in NOISE_KEYS)
     slip, sightings, ranges = (
-        own if (known := getattr(vehicle, name)) is None else known
-        for name, own in zip(GIVEN, (noise.slip, noise.sightings, noise.ranges)))
+        value if given is None else given
+        for given, value in zip(known, (noise.slip, noise.sightings, noise.ranges)))
     return Noise(max(slip, SLIP_BOUNDS[0]), sightings, ranges)
 
 
 def log_prior(logarithms):
-    """Log density (3,), up to a constant, of each of `Noise.logarithms`."""
+    """Log prior density (3,), up to a constant, of each of `Noise.logarithms` (3,)."""
     return -((logarithms - np.log(MEDIAN)) / PRIOR_SIGMA)**2 / 2

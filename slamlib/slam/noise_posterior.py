@@ -1,9 +1,9 @@
-"""Stage 6: the noise of a drive, learned from its own measurements, and how well it is known.
+"""Stage 6: the posterior of the noise parameters, learned from the drive's own measurements.
 
 The evidence times the prior is the posterior of the logarithms of slip and factors. Newton's method
 finds its mode, differences give its covariance. Poses and landmarks are averaged over a few points
 of it (integrated nested Laplace approximation: Rue, Martino and Chopin, J. R. Stat. Soc. B 71(2),
-2009), so that every slip that is possible widens the covariance by its probability.
+2009), so that the covariances include that the slip is uncertain.
 """
 
 from dataclasses import dataclass
@@ -11,8 +11,8 @@ from itertools import combinations
 
 import numpy as np
 
-from slamlib.slam.evidence import solve
-from slamlib.slam.first_frames import first_frames
+from slamlib.slam.evidence import laplace_approximation
+from slamlib.slam.first_frames import equations_of_first_frames
 from slamlib.slam.noise import (
     BOUNDS,
     MEDIAN,
@@ -23,36 +23,36 @@ from slamlib.slam.noise import (
     log_prior,
 )
 
-MAX_DIFFERENCE = 0.2         # of the logarithms, over which derivatives are taken
-MIN_DIFFERENCE = 0.003
-MAX_STEP = 1.5               # of Newton's method
-MAX_STEPS = 12
-MANY_FRAMES = 20_000         # of a longer drive, from the first of which the noise is learned
-GAIN = 0.01                  # log posterior of a step at which Newton's method ends
-ACROSS = 1.5 * np.arange(-2, 3)      # sigmas of log slip, points at which the posterior is summed
-NARROW = 0.2                 # sigma of log slip below which one point is enough
-NEGLIGIBLE = 1e-3            # weight of a point that is left out
-IMPOSSIBLE = -1e12           # log evidence of noise for which the equations are singular
+MAX_DIFFERENCE = 0.2         # of a logarithm, largest one of a difference quotient
+MIN_DIFFERENCE = 0.003       # of a logarithm, smallest one of a difference quotient
+MAX_STEP = 1.5               # of a logarithm, longest step of Newton's method
+MAX_NEWTON_STEPS = 12        # number of steps of Newton's method
+MAX_FRAMES = 20_000          # number of frames from which the noise of a longer drive is learned
+CONVERGED_GAIN = 0.01        # log posterior gained by the last step of Newton's method
+POINT_OFFSETS = 1.5 * np.arange(-2, 3)       # sigmas of log slip, points of the average
+SINGLE_POINT_SIGMA = 0.2     # of log slip, below which the mode alone is enough
+MIN_POINT_WEIGHT = 1e-3      # probability of a point; less probable ones are left out
+SINGULAR = -1e12             # log evidence of noise for which the equations are singular
 
 
 @dataclass(frozen=True)
 class NoisePosterior:
-    """Noise given the measurements."""
+    """Posterior of the noise given the measurements."""
 
-    noise: Noise                 # of greatest posterior density
-    covariance: np.ndarray       # (3, 3) of its logarithms; zero for what is not learned
-    density: float               # log posterior at `noise`, up to a constant
-    points: tuple                # of (weight, Noise), over which estimates are averaged
+    noise: Noise                 # the mode
+    covariance: np.ndarray       # (3, 3) of its logarithms, 0 for parameters that are not learned
+    density: float               # log posterior at the mode, up to a constant
+    points: tuple                # of (probability, Noise), over which estimates are averaged
 
 
-def noise_posterior(equations):
-    """The NoisePosterior by NormalEquations near a problem's solution; starts from its noise."""
-    equations = first_frames(equations, MANY_FRAMES)
+def learn_noise(equations):
+    """The NoisePosterior by NormalEquations near the solution, from the noise of their problem."""
+    equations = equations_of_first_frames(equations, MAX_FRAMES)
     log_posterior, start, free = _log_posterior(equations)
     value = log_posterior(start)
-    if value < IMPOSSIBLE / 2:                           # singular to rounding: nothing is learned
-        given = equations.problem.noise
-        return NoisePosterior(given, np.zeros((3, 3)), IMPOSSIBLE, ((1.0, given),))
+    if value < SINGULAR / 2:                             # nothing can be learned
+        noise = equations.problem.noise
+        return NoisePosterior(noise, np.zeros((3, 3)), SINGULAR, ((1.0, noise),))
     frames = len(equations.problem.measurements.frame)
     smallest = 1 / np.sqrt(2 * np.maximum([3 * frames, *equations.counts()], 1))
     mode, density, covariance = _mode(log_posterior, start, value, free, smallest[free])
@@ -61,17 +61,17 @@ def noise_posterior(equations):
 
 
 def density(equations):
-    """The log density of the noise that the equations' problem has, up to a constant."""
-    log_posterior, noise, _ = _log_posterior(first_frames(equations, MANY_FRAMES))
+    """Log posterior density of the noise of the equations' problem, up to a constant."""
+    log_posterior, noise, _ = _log_posterior(equations_of_first_frames(equations, MAX_FRAMES))
     return log_posterior(noise)
 
 
 def greatest_density(equations, posterior):
-    """The greatest log density of the noise that `noise_posterior` finds, up to a constant.
+    """Log posterior density at the mode that `learn_noise` finds, up to a constant.
 
-    `posterior` is the NoisePosterior of nearly the same equations.
+    `posterior`, the NoisePosterior of nearly the same equations, gives step sizes and correlations.
     """
-    log_posterior, start, free = _log_posterior(first_frames(equations, MANY_FRAMES))
+    log_posterior, start, free = _log_posterior(equations_of_first_frames(equations, MAX_FRAMES))
     covariance = posterior.covariance[np.ix_(free, free)]
     information = np.linalg.inv(covariance)
     scale = np.sqrt(np.diag(information))
@@ -80,12 +80,12 @@ def greatest_density(equations, posterior):
 
 
 def _log_posterior(equations):
-    """The function from `Noise.logarithms` to log density, where it starts, and what is free."""
+    """Log posterior, a function of `Noise.logarithms`, start (3,), and indices of learned ones."""
     problem = equations.problem
     free = problem.measurements.learned
 
     def log_posterior(logarithms):
-        return max(solve(equations, from_logarithms(logarithms))[1], IMPOSSIBLE) \
+        return max(laplace_approximation(equations, from_logarithms(logarithms))[1], SINGULAR) \
             + np.sum(log_prior(logarithms)[free])
 
     start = np.where(free | is_known(problem.measurements.dataset.vehicle),
@@ -97,11 +97,11 @@ def _mode(function, x, value, free, steps, correlation=None):
     """Argument, value and covariance (3, 3) of the maximum of a log density, by Newton's method.
 
     From `x` (3,) with its `value`. Derivatives by the components `free` (p,) are differences over
-    `steps` (p,), later over standard deviations. `correlation` (p, p) is that of the second
-    derivatives where it is known, to save mixed ones.
+    `steps` (p,), later over standard deviations. A known `correlation` (p, p) of the second
+    derivatives replaces the mixed ones.
     """
     steps = np.clip(steps, MIN_DIFFERENCE, MAX_DIFFERENCE)
-    for _ in range(MAX_STEPS):
+    for _ in range(MAX_NEWTON_STEPS):
         gradient, hessian = _differences(function, x, value, free, steps, correlation)
         curvature, axes = np.linalg.eigh(-hessian)
         covariance = axes / np.maximum(curvature, PRIOR_SIGMA.max()**-2) @ axes.T
@@ -111,10 +111,10 @@ def _mode(function, x, value, free, steps, correlation=None):
         step *= MAX_STEP / max(MAX_STEP, np.abs(step).max())
         while (new := function(_moved(x, free, step))) < value and np.abs(step / sigma).max() > 0.1:
             step = step / 2
-        gained = new - value
-        if gained > 0:
+        gain = new - value
+        if gain > 0:
             x, value = _moved(x, free, step), new
-        if gained < GAIN and not coarse:
+        if gain < CONVERGED_GAIN and not coarse:
             break
     full = np.zeros((len(x), len(x)))
     full[np.ix_(free, free)] = covariance
@@ -122,15 +122,16 @@ def _mode(function, x, value, free, steps, correlation=None):
 
 
 def _moved(x, free, step):
+    """x (3,) with `step` (p,) added to the components `free` (p,), within BOUNDS."""
     moved = x.copy()
     moved[free] += step
     return np.clip(moved, *BOUNDS)
 
 
 def _differences(function, x, value, free, steps, correlation=None):
-    """Gradient (p,) and Hessian (p, p) by central differences of the free components by `steps`.
+    """Gradient (p,) and Hessian (p, p) by differences over `steps` (p,) of the components `free`.
 
-    Mixed second derivatives have the `correlation` (p, p) if it is given.
+    Mixed second derivatives are those of the `correlation` (p, p) if it is not None.
     """
     unit, pairs = np.diag(steps), list(combinations(range(len(free)), 2))
     offsets = [*unit, *-unit]
@@ -142,25 +143,26 @@ def _differences(function, x, value, free, steps, correlation=None):
     if correlation is not None:
         scale = np.sqrt(np.abs(np.diag(hessian)))
         return gradient, np.where(np.eye(len(free)), hessian, -correlation * np.outer(scale, scale))
-    for (i, j), value_of_both in zip(pairs, both):
-        hessian[i, j] = hessian[j, i] = (value_of_both - up[i] - up[j] + value) \
-            / (steps[i] * steps[j])
+    for (i, j), value_ij in zip(pairs, both):
+        hessian[i, j] = hessian[j, i] = (value_ij - up[i] - up[j] + value) / (steps[i] * steps[j])
     return gradient, hessian
 
 
 def _points(log_posterior, mode, density, covariance):
-    """(weight, Noise) along the slip, at each the most probable factors.
+    """Tuple of (probability, Noise) along the slip, each with the most probable factors.
 
-    What remains uncertain at a point widens its noise: a sigma is replaced by its root mean square.
+    The remaining variance at a point is included in its Noise: sigmas are root mean squares.
     """
     sigma = np.sqrt(covariance[0, 0])
-    along = covariance[0] / (sigma or 1)     # of all logarithms, for one sigma of slip; 0 if known
-    if sigma < NARROW:
-        rest, offsets, weights = covariance, [0.0], np.ones(1)
+    direction = covariance[0] / (sigma or 1)     # (3,) for one sigma of log slip; 0 if it is known
+    if sigma < SINGLE_POINT_SIGMA:
+        remaining, offsets, weights = covariance, [0.0], np.ones(1)
     else:
-        rest, offsets = covariance - np.outer(along, along), ACROSS
-        logs = np.array([log_posterior(mode + z * along) if z else density for z in offsets])
+        remaining, offsets = covariance - np.outer(direction, direction), POINT_OFFSETS
+        logs = np.array([log_posterior(mode + offset * direction) if offset else density
+                         for offset in offsets])
         weights = np.exp(logs - logs.max())
-    mean_square = np.maximum(np.diag(rest), 0)
-    return tuple((float(weight), from_logarithms(mode + z * along + mean_square))
-                 for weight, z in zip(weights / weights.sum(), offsets) if weight > NEGLIGIBLE)
+    variance = np.maximum(np.diag(remaining), 0)
+    return tuple((float(weight), from_logarithms(mode + offset * direction + variance))
+                 for weight, offset in zip(weights / weights.sum(), offsets)
+                 if weight > MIN_POINT_WEIGHT)

@@ -1,24 +1,34 @@
-"""Stage 3: the normal equations of a problem at a state, for all values of the noise.
+"""Stage 3: the normal equations H delta = -g of a problem at a state, for all values of the noise.
 
-The factors are linearised once, and their information is summed by groups: priors, odometry,
-sightings and ranges. The information of odometry depends on the slip, that of the sightings and of
-the ranges on their factors alone. Each value of the noise then costs one sparse decomposition.
+With whitened errors e and derivatives J of all factors, H = sum J^T J and g = sum J^T e. The
+factors are linearised once, and H and g are summed by groups: priors, odometry, sightings and
+ranges. The group of odometry depends on the slip, those of sightings and ranges only on their noise
+factors. Each value of the noise then costs one sparse decomposition.
 """
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy.sparse.linalg import splu
 
 from slamlib import se2
-from slamlib.slam.linear_factors import linear_factors
+from slamlib.slam.linear_factors import linearize_measurements
 from slamlib.slam.measurement_factors import GUESS_PRIOR_SIGMA, WEAK_SIGMA
 from slamlib.slam.odometry_factors import odometry_error
 from slamlib.slam.problem import Problem
 from slamlib.slam.state import State
 
-KEPT = 3                     # values of the slip whose sums are kept
+MAX_CACHED_SLIPS = 3         # values of the slip whose sums are kept in memory
+
+
+@dataclass(frozen=True)
+class Group:
+    """Sums over a group of factors."""
+
+    H: np.ndarray            # data of `Structure.matrix`; of the priors the diagonal (n,)
+    g: np.ndarray            # (n,)
+    squared: float           # sum of squared whitened errors
 
 
 @dataclass(frozen=True)
@@ -36,119 +46,93 @@ class NormalEquations:
     @cached_property
     def error(self):
         """Half the sum of squared whitened errors, kernels applied."""
-        squared = self._odometry_sums(self.problem.noise.slip)[2] + self._priors.squared
-        return float(squared) / 2 + sum(factors.error for factors in self.factors)
+        odometry, _ = self._odometry(self.problem.noise.slip)
+        return float(odometry.squared + self.priors.squared) / 2 \
+            + sum(factors.error for factors in self.factors)
 
     @cached_property
     def factors(self):
         """The LinearFactors of sightings of poses, of points, and of ranges."""
-        return linear_factors(self.problem.measured, self.problem.noise, self.state)
+        return linearize_measurements(self.problem.measured, self.problem.noise, self.state)
 
     def step(self):
-        """The Gauss-Newton step (n,), or None where H is singular to rounding."""
+        """The Gauss-Newton step delta (n,), or None where H is singular to rounding."""
         H, g, *_ = self.sums(self.problem.noise)
         lu = decomposition(self.structure.matrix(H))
-        step = None if lu is None else -lu.solve(g)
-        return step if step is not None and g @ step <= 0 else None        # else not a descent
+        delta = None if lu is None else -lu.solve(g)
+        return delta if delta is not None and g @ delta <= 0 else None     # else not a descent
 
-    def sums(self, noise, from_kernels=(1.0, 1.0, 1.0)):
-        """Data of H, g, squared error at the state, and sum log|Q| of the odometry noise Q.
+    def sums(self, noise, consistency=(1.0, 1.0, 1.0)):
+        """Data of H, g (n,), squared error at the state, and sum log|Q| of the odometry noise Q.
 
-        `from_kernels` (3,) divide what the factors contribute (`evidence.consistencies`).
+        `consistency` (3,) divides the information of each kind of `factors`
+        (`evidence.consistency_factors`).
         """
-        given, priors = self.problem.noise, self._priors
-        H, g, squared, log_determinant = self._odometry_sums(noise.slip)
-        H, g, squared = H.copy(), g + priors.g, squared + priors.squared
-        H[self.structure.diagonal] += priors.H
-        of_sightings = (given.sightings / noise.sightings)**2
-        of_ranges = (given.ranges / noise.ranges)**2
-        for group, ratio, from_kernel in zip(
-                self._measured, (of_sightings, of_sightings, of_ranges), from_kernels):
+        odometry, log_determinant = self._odometry(noise.slip)
+        H, g, squared = odometry.H.copy(), odometry.g.copy(), odometry.squared
+        H[self.structure.diagonal] += self.priors.H
+        g += self.priors.g
+        squared += self.priors.squared
+        sightings = (self.problem.noise.sightings / noise.sightings)**2
+        ranges = (self.problem.noise.ranges / noise.ranges)**2
+        for group, ratio, divisor in zip(
+                self._measured, (sightings, sightings, ranges), consistency):
             if group is not None:
-                ratio = ratio / from_kernel
+                ratio = ratio / divisor
                 H += group.H if ratio == 1 else ratio * group.H
                 g += ratio * group.g
                 squared += ratio * group.squared
         return H, g, squared, log_determinant
-
-    @property
-    def of_priors(self):
-        """What the priors add to the diagonal (n,) of H."""
-        return self._priors.H
 
     def counts(self):
         """Numbers of accepted errors of sightings and of ranges."""
         poses, points, ranges = (f.e.shape[1] * np.sum(f.weight) for f in self.factors)
         return poses + points, ranges
 
-    def jacobian(self, factors):
-        """Derivatives (m, d, c) of LinearFactors by the unknowns of their variables."""
-        J = [factors.by_pose, factors.by_landmark]
-        if self.problem.measurements.calibrated and factors.by_calibration is not None:
-            J.append(factors.by_calibration)
-        return np.concatenate(J, axis=2)
+    @cached_property
+    def priors(self):
+        """The Group of the priors, whose H is diagonal: (n,)."""
+        m, v, state = self.problem.measurements, self.problem.measurements.variables, self.state
+        parts = [(v.frames[:1], se2.log(state.poses[:1]), m.origin_sigma),
+                 (v.antennas, state.antennas - m.guess, GUESS_PRIOR_SIGMA),
+                 (v.w, state.w[None], 1.0)]
+        parts += [(v.markers[[j]], state.markers[[j], :2 + m.oriented[j]], WEAK_SIGMA)
+                  for j in self.problem.measured.unsupported]
+        if m.calibrated:
+            parts.append((v.c, state.c[None], 1.0))
+        H, e = np.zeros((2, len(self.structure.diagonal)))
+        for variables, difference, sigma in parts:
+            rows = self.structure.rows(variables, difference.shape[1])
+            H[rows], e[rows] = np.broadcast_to(sigma, difference.shape)**-2.0, difference
+        return Group(H, H * e, float(np.sum(H * e**2)))
 
     @cached_property
     def _measured(self):
-        """The _Groups of `factors`, None where there are no such measurements."""
-        return [_group(self.structure, places[f.index], rows[f.index], self.jacobian(f), f.e)
+        """The Group of each kind of `factors`, None if there are no such measurements."""
+        return [_group(self.structure, places[f.index], rows[f.index], f.J, f.e)
                 if len(f.row) else None
-                for f, (places, rows) in zip(self.factors, self.problem.measurements.placed[1:])]
+                for f, (places, rows) in zip(
+                    self.factors, self.problem.measurements.factor_places[1:])]
 
     @cached_property
     def _odometry(self):
-        """Unwhitened errors (f-1, 3) and derivatives (f-1, 3, 9) of the odometry."""
-        e, *jacobians = odometry_error(self.problem.odometry, self.state.poses, self.state.w)
-        return e, np.concatenate(jacobians, axis=2)
+        """Function from a slip to the Group of the odometry and sum log|Q|."""
+        structure, factors = self.structure, self.problem.odometry
+        places = self.problem.measurements.factor_places[0]
+        e, J = odometry_error(factors, self.state.poses, self.state.w)
 
-    def _odometry_sums(self, slip):
-        """`sums` of the odometry alone; those of the last slips are kept."""
-        kept = self._kept_sums
-        if slip not in kept:
-            if len(kept) == KEPT:
-                del kept[next(iter(kept))]
-            e, J = self._odometry
-            U, log_determinant = self.problem.odometry.whitening(slip)
-            J, e = U @ J, (U @ e[..., None])[..., 0]
-            own = _group(self.structure, *self.problem.measurements.placed[0], J, e)
-            kept[slip] = own.H, own.g, own.squared, log_determinant
-        return kept[slip]
+        @lru_cache(maxsize=MAX_CACHED_SLIPS)
+        def odometry(slip):
+            U, log_determinant = factors.whitening(slip)
+            return _group(structure, *places, U @ J, (U @ e[..., None])[..., 0]), log_determinant
 
-    @cached_property
-    def _kept_sums(self):
-        return {}
-
-    @cached_property
-    def _priors(self):
-        """The _Group of the priors, whose H is the diagonal (n,)."""
-        problem, m, state = self.problem, self.problem.measurements, self.state
-        f, k = len(m.frame), len(m.marker)
-        parts = [([0], se2.log(state.poses[:1]), m.origin_sigma), ([m.wheels], state.w[None], 1.0),
-                 (f + k + np.arange(len(m.antenna)), state.antennas - m.guess, GUESS_PRIOR_SIGMA)]
-        parts += [([f + j], state.markers[j:j + 1, :2 + m.oriented[j]], WEAK_SIGMA)
-                  for j in problem.measured.unsupported]
-        if m.calibrated:
-            parts.append(([m.wheels + 1], state.z[None], 1.0))
-        information, e = np.zeros((2, len(self.structure.diagonal)))
-        for variables, off, sigma in parts:
-            rows = self.structure.rows(np.asarray(variables), off.shape[1])
-            information[rows], e[rows] = np.broadcast_to(sigma, off.shape)**-2.0, off
-        return _Group(information, information * e, float(np.sum(information * e**2)))
-
-
-@dataclass(frozen=True)
-class _Group:
-    """What factors add to H (data of `Structure.matrix`), to g (n,) and to the squared error."""
-
-    H: np.ndarray
-    g: np.ndarray
-    squared: float
+        return odometry
 
 
 def _group(structure, places, rows, J, e):
-    """The _Group of whitened errors e (m, d) and derivatives J (m, d, c) at `rows` (m, c)."""
+    """The Group of whitened errors e (m, d) and derivatives J (m, d, p) at `rows` (m, p)."""
     J_t = np.swapaxes(J, 1, 2)
-    return _Group(
+    return Group(
         _summed(places, J_t @ J, len(structure.indices)),
         _summed(rows, J_t @ e[..., None], len(structure.diagonal)), float(np.sum(e**2)))
 

@@ -1,12 +1,11 @@
-"""Stage 2: the odometry factors between consecutive frames, which depend on the wheel parameters.
+"""Stage 2: the odometry factors between consecutive frames, which depend on the wheel errors w.
 
-Let w be the errors of [R_R, R_L, b] in units of their standard deviations, and
-Delta(w) = Delta(0) + dDelta/dw w the increment between the frames X and X'. The factor's error is
+With the increment Delta(w) = Delta(0) + dDelta/dw w between the frames X and X' the error is
 
     e = log(Delta(w)^-1 X^-1 X'),
 
-that of GTSAM's between factor, except that the measurement depends on w. The noise of Delta is
-encoder rounding and wheel slip, in the axes of the increment's end.
+that of GTSAM's between factor, except that the measurement depends on w. The noise of Delta, with
+covariance Q, is encoder rounding and wheel slip, in the axes of the increment's end.
 """
 
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ import numpy as np
 from slamlib import increments, se2
 from slamlib.slam.errors import between_error, square_root_information
 
-MINIMUM_SIGMA = 1e-5         # m, of an increment's end, for a vehicle that stands still
+MINIMUM_SIGMA = 1e-5         # m, standard deviation of an increment's end along x and y
 
 
 @dataclass(frozen=True)
@@ -30,24 +29,23 @@ class OdometryFactors:
     slipping: np.ndarray     # (f-1, 3, 3) noise of slip 1 sqrt(m)
 
     def noise(self, slip):
-        """Covariances (f-1, 3, 3) for a slip in sqrt(m)."""
+        """Covariances Q (f-1, 3, 3) for a slip in sqrt(m)."""
         return self.rounding + slip**2 * self.slipping
 
     def whitening(self, slip):
-        """Square root information U (f-1, 3, 3) of the noise Q, U^T U = Q^-1, and sum log|Q|."""
+        """Square root information U (f-1, 3, 3), U^T U = Q^-1, and sum log|Q|, for a slip."""
         U = square_root_information(self.noise(slip))
         return U, -2 * float(np.sum(np.log(np.diagonal(U, axis1=1, axis2=2))))
 
 
-def odometry_factors(measurements, model, relinearize_at=(0.0, 0.0, 0.0)):
-    """The OdometryFactors between the frames, linear in w about `relinearize_at` (3,).
+def preintegrate_odometry(measurements, model, relinearize_at=(0.0, 0.0, 0.0)):
+    """The OdometryFactors of Measurements, linearised at w = `relinearize_at` (3,).
 
     `model` is "arc" or "euler". dDelta/dw accumulates over the encoder steps between two frames
     (preintegration with calibration parameters: Forster et al., IEEE T-RO 33(1), 2017).
     """
-    relinearize_at, dataset = np.asarray(relinearize_at), measurements.dataset
-    vehicle = dataset.vehicle.with_deviation(relinearize_at)
-    start, end = measurements.frame[:-1], measurements.frame[1:]
+    dataset, start, end = measurements.dataset, measurements.frame[:-1], measurements.frame[1:]
+    vehicle = dataset.vehicle.with_deviation(np.asarray(relinearize_at))
     increment, by_w = increments.between_poses(dataset.ticks, vehicle, start, end, model)
     rounding, slipping = odometry_noise(dataset.ticks, vehicle, start, end)
     by_w = by_w * vehicle.sigma_wheel
@@ -59,10 +57,9 @@ def odometry_factors(measurements, model, relinearize_at=(0.0, 0.0, 0.0)):
 
 
 def odometry_noise(ticks, vehicle, start, end, steps=None):
-    """Rounding and slipping (m, 3, 3) of `increments.noise_in_drive`, with a minimum of rounding.
+    """Rounding and slipping (m, 3, 3) of `increments.noise_in_drive`, regular by MINIMUM_SIGMA.
 
-    A vehicle that stands still has no lateral noise, and a graph needs its inverse: the end of each
-    increment has at least the standard deviation MINIMUM_SIGMA along both axes.
+    A vehicle that stands still has no lateral noise, but the graph needs the inverse of Q.
     """
     rounding, slipping = increments.noise_in_drive(ticks, vehicle, start, end, steps)
     rounding[:, [0, 1], [0, 1]] += MINIMUM_SIGMA**2
@@ -70,11 +67,10 @@ def odometry_noise(ticks, vehicle, start, end, steps=None):
 
 
 def odometry_error(factors, poses, w):
-    """Errors of the odometry factors and their derivatives.
+    """Errors (f-1, 3) of OdometryFactors, and their derivatives (f-1, 3, 9) by X_i, X_{i+1} and w.
 
-    From OdometryFactors, poses (f, 3) of the frames and w (3,): errors (f-1, 3), and derivatives
-    (f-1, 3, 3) by X_i, X_{i+1} and w.
+    At poses (f, 3) of the frames and w (3,). The errors are not whitened.
     """
-    Z = factors.increment + factors.by_w @ w
-    e, by_first, by_second, by_Z = between_error(Z, poses[:-1], poses[1:])
-    return e, by_first, by_second, by_Z @ factors.by_w
+    increment = factors.increment + factors.by_w @ w
+    e, by_first, by_second, by_increment = between_error(increment, poses[:-1], poses[1:])
+    return e, np.concatenate([by_first, by_second, by_increment @ factors.by_w], axis=2)

@@ -1,9 +1,9 @@
-"""Stage 3: a problem is solved by Gauss-Newton with step halving.
+"""Stage 3: Gauss-Newton with step halving.
 
-A step solves the normal equations in numpy and scipy, all factors of a kind at once. Or it is
-GTSAM's, which builds, linearises and eliminates the same graph factor by factor. Start values,
-kernels and noise take dozens of steps, by the normal equations. GTSAM then takes the last ones
-(`estimate`), and it decides where the normal equations are singular to rounding.
+A step solves the normal equations in numpy and scipy, all factors of a kind at once, or is GTSAM's,
+which builds, linearises and eliminates the same graph factor by factor. Start values, kernels and
+noise take dozens of steps, by the normal equations. GTSAM takes the last steps of every solution,
+and all steps where the normal equations are singular to rounding.
 """
 
 from dataclasses import dataclass
@@ -13,21 +13,21 @@ from slamlib.slam.normal_equations import NormalEquations
 from slamlib.slam.state import State, moved
 
 CONVERGED = 1e-6             # relative decrease of the error at which iterations end
-ROUNDING = 1e-12             # relative increase of the error that means nothing
-MAX_STEPS = 40               # of Gauss-Newton
-MAX_HALVINGS = 8             # of one step
+ROUNDING = 1e-12             # relative increase of the error that is rounding
+MAX_GAUSS_NEWTON_STEPS = 40  # number of steps
+MAX_HALVINGS = 8             # number of halvings of one step
 
 
 @dataclass(frozen=True)
 class Optimum:
-    """Where Gauss-Newton ends."""
+    """The end of Gauss-Newton."""
 
     equations: NormalEquations
-    steps: int
+    steps: int                         # number of steps taken
 
     @property
     def state(self) -> State:
-        """The State."""
+        """The State where the error is smallest."""
         return self.equations.state
 
     @property
@@ -36,10 +36,12 @@ class Optimum:
         return self.equations.error
 
 
-def optimize(problem, state, max_steps=MAX_STEPS, by_gtsam=False, converged=CONVERGED):
-    """The Optimum from a State, where the error decreases by less than its share `converged`.
+def optimize(problem, state, max_steps=MAX_GAUSS_NEWTON_STEPS, by_gtsam=False,
+             converged=CONVERGED):
+    """The Optimum of a Problem from a State.
 
-    Raises DatasetError where the measurements do not determine every variable.
+    It ends where the error decreases by less than its share `converged`. Raises DatasetError if the
+    measurements do not determine every variable.
     """
     equations, steps, ended = NormalEquations(problem, state), 0, False
     while steps < max_steps and not ended:

@@ -1,8 +1,7 @@
 """Stage 3: the factor graph: measurements, odometry and noise.
 
-Factors are those of the measurements (`measurement_factors.py`) and the odometry
-(`odometry_factors.py`). The same w acts in every increment. One shared variable models this;
-independent noise in each factor does not.
+All odometry factors share the variable w, because the same wheel errors act in every increment.
+Independent noise in each factor would not model this.
 """
 
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ import numpy as np
 from slamlib.slam.measurement_factors import MeasurementFactors
 from slamlib.slam.measurements import Measurements
 from slamlib.slam.noise import Noise
-from slamlib.slam.odometry_factors import OdometryFactors, odometry_factors
+from slamlib.slam.odometry_factors import OdometryFactors, preintegrate_odometry
 
 
 @dataclass(frozen=True)
@@ -25,12 +24,12 @@ class Problem:
     noise: Noise
 
 
-def build(measurements, model, noise, relinearize_at=np.zeros(3), factors=odometry_factors):
-    """The Problem of all Measurements at weight 1, without kernels.
+def build_problem(measurements, model, noise, relinearize_at=np.zeros(3),
+                  preintegrate=preintegrate_odometry):
+    """The Problem of all Measurements with weight 1, without kernels, and of a Noise.
 
-    The odometry is linear about w = `relinearize_at` (3,), its steps are of the model "arc" or
-    "euler", its noise and that of the measurements is by a Noise. `factors` makes the
-    OdometryFactors; studies give others.
+    `preintegrate` makes the OdometryFactors of steps of the `model`, "arc" or "euler", linearised
+    at w = `relinearize_at` (3,); studies pass other functions.
     """
-    return Problem(measurements, factors(measurements, model, relinearize_at),
+    return Problem(measurements, preintegrate(measurements, model, relinearize_at),
                    MeasurementFactors(measurements, measurements.unit_weights), noise)

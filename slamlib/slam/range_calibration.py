@@ -1,29 +1,27 @@
-"""Stage 6: a common offset and scale of the ranges, but where the evidence decides against them.
+"""Stage 6: a common offset and scale of the ranges, unless the evidence decides against them.
 
-Where it does not decide, they remain variables: an offset that is possible moves the antennas.
+If it does not decide, they remain variables: a possible offset makes the antennas less certain.
 """
 
 from dataclasses import replace
 
 from slamlib.slam.evidence import log_evidence
 from slamlib.slam.fit import refine
-from slamlib.slam.model_choice import DECISIVE
+from slamlib.slam.model_choice import DECISIVE_LEAD
 from slamlib.slam.robust import accepted
-from slamlib.slam.state import state_from_arrays
 
 
 def calibrated(fit, accept=accepted):
     """The Fit with offset and scale of the ranges as variables.
 
-    `fit` itself where its evidence leads by DECISIVE or there are no ranges. Both are compared at
-    its state and on its accepted measurements. `accept` as of `fit.refine`.
+    `fit` itself if its evidence leads by DECISIVE_LEAD or if there are no ranges. Both are compared
+    at its state and on its accepted measurements. `accept` as in `refine`.
     """
-    problem, state = fit.problem, fit.state
-    if not len(problem.measurements.ranges.row):
+    if not len(fit.problem.measurements.ranges.row):
         return fit
-    m = problem.measurements.calibrating()
-    other = replace(problem, measurements=m, measured=replace(problem.measured, measurements=m))
-    start = state_from_arrays(m, state.poses, state.markers, state.antennas, state.w)
-    if log_evidence(other, start) < fit.log_evidence - DECISIVE:
+    m = replace(fit.problem.measurements, calibrated=True)
+    problem = replace(fit.problem, measurements=m,
+                      measured=replace(fit.problem.measured, measurements=m))
+    if log_evidence(problem, fit.state) < fit.log_evidence - DECISIVE_LEAD:
         return fit
-    return refine(other, start, accept)
+    return refine(problem, fit.state, accept)

@@ -1,17 +1,17 @@
-"""Stage 7: the result of a fit, every encoder pose and landmark in world axes."""
+"""Stage 7: the result of a fit: every encoder pose and landmark, with covariances, and doubts."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from slamlib import se2
-from slamlib.slam.camera_offsets import CameraOffsets, camera_offsets
+from slamlib.slam.camera_offsets import CameraOffsets, estimate_camera_offsets
 from slamlib.slam.doubts import antenna_doubts
-from slamlib.slam.drive_doubts import drive_doubts, turn_doubts
+from slamlib.slam.drive_doubts import solution_doubts, turn_doubts
 from slamlib.slam.interpolation import interpolate
-from slamlib.slam.linear_factors import linear_factors
+from slamlib.slam.linear_factors import linearize_measurements
 from slamlib.slam.measurement_factors import MeasurementFactors, kept_weights, residuals
-from slamlib.slam.moments import moments
+from slamlib.slam.moments import posterior_moments
 from slamlib.slam.noise import Noise
 from slamlib.slam.odometry_factors import odometry_error
 from slamlib.slam.state import RANGE_SIGMA
@@ -23,20 +23,20 @@ class SlamResult:
 
     poses: np.ndarray               # (n, 3), headings continuous
     covariances: np.ndarray         # (n, 3, 3)
-    marker: np.ndarray              # (k,) ids, ascending; most sightings are accepted
+    marker: np.ndarray              # (k,) ids, ascending, of markers whose sightings are accepted
     marker_in_world: np.ndarray     # (k, 3)
     marker_covariance: np.ndarray   # (k, 3, 3)
     antenna: np.ndarray             # (a,) ids, ascending, of antennas with ranges
     antenna_in_world: np.ndarray    # (a, 2)
     antenna_covariance: np.ndarray  # (a, 2, 2)
-    doubts: dict                    # antenna id: sentence, for antennas in doubt
+    doubts: dict                    # antenna id: reason, for antennas in doubt
     wheel: np.ndarray               # (3,) R_R, R_L, b
     wheel_covariance: np.ndarray    # (3, 3)
     noise: Noise                    # as given or learned
     noise_sigma: np.ndarray         # (3,) of its logarithms, 0 where not learned
-    range_calibration: np.ndarray   # (2,) offset in m and scale of the ranges, 0 and 1 if not kept
+    range_calibration: np.ndarray   # (2,) offset in m and scale of the ranges, 0 and 1 if stated
     range_calibration_covariance: np.ndarray   # (2, 2), or 0
-    camera: CameraOffsets           # errors that all sightings may share, which are not modelled
+    camera: CameraOffsets           # errors shared by all sightings, which are not modelled
     model: str                      # "arc" or "euler", as given or chosen
     log_evidence: float             # Laplace, up to a constant of dataset and accepted measurements
     chi2_per_dof: float             # of the accepted measurements, by the files' covariances
@@ -45,8 +45,7 @@ class SlamResult:
     residual: np.ndarray            # (s, 3) whitened residuals of the sightings
     range_weight: np.ndarray        # (r,) share of its information that each range keeps, 0 to 1
     range_residual: np.ndarray      # (r,) whitened, positive for a range that is too long
-    drive_doubts: tuple = ()        # of Doubt: what the solution says against the files
-
+    drive_doubts: tuple = ()        # of Doubt: where the solution contradicts the files
 
     @property
     def slip(self):
@@ -59,71 +58,74 @@ class SlamResult:
         return np.sqrt(np.diag(self.range_calibration_covariance))
 
 
-def result(fit):
-    """The SlamResult of a Fit."""
+def slam_result(fit):
+    """The SlamResult of a Fit.
+
+    Raises DatasetError as `marginal_covariances`.
+    """
     problem, m = fit.problem, fit.problem.measurements
     vehicle = m.dataset.vehicle
-    state, marginal, slip = moments(fit)
+    state, marginal, slip = posterior_moments(fit)
     poses, pose_covariances = interpolate(
         replace(problem, noise=replace(problem.noise, slip=slip)), state, marginal.pairs)
     residual, range_residual = residuals(m, state, problem.noise)
     sighting_weight, range_weight = kept_weights(problem.measured, residual, range_residual)
-    doubts = antenna_doubts(problem, state, pose_covariances[m.frame], marginal.antennas,
-                            range_weight)
     mapped, marker_covariance = _mapped(problem, marginal.markers)
     markers = state.markers[mapped]
     markers[:, 2] = se2.wrap(markers[:, 2])
+    antennas = antenna_doubts(problem, state, pose_covariances[m.frame], marginal.antennas,
+                              range_weight)
     found = SlamResult(
         poses=poses, covariances=pose_covariances,
         marker=m.marker[mapped], marker_in_world=markers,
         marker_covariance=se2.rotate_covariance(
             marker_covariance[mapped], markers[:, 2] * m.oriented[mapped]),
-        antenna=m.antenna, antenna_in_world=state.antennas, antenna_covariance=doubts.covariances,
-        doubts=doubts.sentences, wheel=vehicle.wheel + vehicle.sigma_wheel * state.w,
+        antenna=m.antenna, antenna_in_world=state.antennas,
+        antenna_covariance=antennas.covariances, doubts=antennas.sentences,
+        wheel=vehicle.wheel + vehicle.sigma_wheel * state.w,
         wheel_covariance=vehicle.sigma_wheel[:, None] * marginal.w * vehicle.sigma_wheel,
         noise=problem.noise, noise_sigma=np.zeros(3) if fit.posterior is None
         else np.sqrt(np.diag(fit.posterior.covariance)),
         range_calibration=state.range_calibration,
-        range_calibration_covariance=RANGE_SIGMA[:, None] * marginal.z * RANGE_SIGMA,
-        camera=camera_offsets(fit.equations),
+        range_calibration_covariance=RANGE_SIGMA[:, None] * marginal.c * RANGE_SIGMA,
+        camera=estimate_camera_offsets(fit.equations),
         model=problem.odometry.model, log_evidence=float(fit.log_evidence),
         chi2_per_dof=chi2_per_dof(problem, state, np.r_[sighting_weight, range_weight]),
         chi2_per_dof_of_all=chi2_per_dof(problem, state, m.unit_weights),
         rejected=problem.measured.sighting_weight == 0, residual=residual,
         range_weight=range_weight, range_residual=range_residual)
-    return replace(found, drive_doubts=(*drive_doubts(m, found), *turn_doubts(problem)))
+    return replace(found, drive_doubts=(*solution_doubts(m, found), *turn_doubts(problem)))
 
 
 def _mapped(problem, blocks):
-    """Rows of the markers of which more sightings are accepted than rejected, and all covariances.
+    """Rows of the markers with more accepted than rejected sightings, and covariances of all.
 
     The covariances (k, 3, 3) are in GTSAM's axes. The heading of a point has the variance of its
     best sighting.
     """
     m, accepted = problem.measurements, problem.measured.sighting_weight > 0
-    agree, differ = (np.bincount(m.label[which], minlength=len(m.marker))
-                     for which in (accepted, ~accepted))
-    padded = np.zeros((len(m.marker), 3, 3))
-    for j, (block, oriented) in enumerate(zip(blocks, m.oriented)):
-        padded[j, :len(block), :len(block)] = block
-        if not oriented:
-            padded[j, 2, 2] = m.sightings.C[m.label == j, 2, 2].min()
-    return np.flatnonzero(agree > differ), padded
+    balance = np.bincount(m.label, np.where(accepted, 1, -1), len(m.marker))
+    covariances = np.zeros((len(m.marker), 3, 3))
+    for j, block in enumerate(blocks):
+        covariances[j, :len(block), :len(block)] = block
+        if not m.oriented[j]:
+            covariances[j, 2, 2] = m.sightings.C[m.label == j, 2, 2].min()
+    return np.flatnonzero(balance > 0), covariances
 
 
 def chi2_per_dof(problem, state, weight):
     """Chi-squared by the covariances in the files, over its degrees of freedom.
 
     With weights (s + r,), a measurement counts by its dimension times its weight, and a landmark
-    takes its own. Odometry and priors have as many errors as there are poses and wheel parameters.
+    subtracts its dimension. Odometry and priors have as many errors as poses and w have unknowns.
     """
     m = problem.measurements
     sightings, ranges = np.split(weight, [len(m.label)])
     stated = MeasurementFactors(m, weight)
-    e, *_ = odometry_error(problem.odometry, state.poses, state.w)
+    e, _ = odometry_error(problem.odometry, state.poses, state.w)
     U, _ = problem.odometry.whitening(problem.noise.slip)
     squared = np.sum((U @ e[..., None])**2) + np.sum(state.w**2) + 2 * sum(
-        factors.error for factors in linear_factors(stated, Noise(), state))
+        factors.error for factors in linearize_measurements(stated, Noise(), state))
     used = np.bincount(m.label, sightings * np.where(m.as_pose, 3, 2), len(m.marker))
     freedom = np.sum(np.maximum(used - np.where(m.oriented, 3, 2), 0)) \
         + np.sum(ranges) - 2 * len(m.antenna)

@@ -1,10 +1,9 @@
-"""Stage 4: which measurements agree. Robust kernels find them, and gates reject the others.
+"""Stage 5: robust rounds, and gates that accept or reject each measurement.
 
-Solving with ever narrower Cauchy kernels keeps wrong labels and late ranges from trapping the
-solution. A late range is too long, because it lacks the line of sight. At the solution each
-measurement is accepted or rejected by a gate. Accepted sightings count in full. Accepted ranges
-keep a one-sided kernel, which reduces the weight of late ranges only. `acceptance` gives other
-kernels.
+Solving with ever narrower Cauchy kernels keeps the solution out of the wrong minima to which wrong
+labels and late ranges lead. A late range is too long, because it lacks the line of sight. At the
+solution each measurement is accepted or rejected by a gate. Accepted sightings count in full.
+Accepted ranges keep a one-sided kernel, which reduces the weight of late ranges only.
 """
 
 from dataclasses import dataclass, replace
@@ -17,7 +16,7 @@ from slamlib.slam.noise import Noise, with_known
 from slamlib.slam.optimizer import CONVERGED, optimize
 
 CAUCHY_SCALES = (100.0, 30.0, 10.0, 3.0)     # sigmas, scale of the kernel in each round
-FEW = 20                     # measurements, below which their scatter gives no factor
+MIN_RESIDUALS = 20           # number of measurements from which their scatter gives a factor
 EARLY_GATE = 3.3             # sigmas; a range that is shorter than expected by more is rejected
 
 _kernel = gtsam.noiseModel.mEstimator
@@ -39,37 +38,37 @@ LATE_KERNEL = KERNELS["asymmetric Tukey"]
 
 @dataclass(frozen=True)
 class Acceptance:
-    """Which measurements are accepted, and with which of KERNELS' values."""
+    """How measurements are accepted, and with which kernels."""
 
     sighting_kernel: gtsam.noiseModel.mEstimator.Base | None = None
-    gated: bool = True           # sightings beyond their gate are rejected
+    gated: bool = True           # whether sightings beyond their gate are rejected
     range_kernel: gtsam.noiseModel.mEstimator.Base | None = LATE_KERNEL
     early: float = EARLY_GATE    # sigmas; a range that is too short by more is rejected
     late: float = np.inf         # sigmas; the same, too long
 
 
 def acceptance(kernel="asymmetric Tukey", gate=True):
-    """The Acceptance by a name in KERNELS, of sightings and ranges.
+    """The Acceptance with the kernel of this name in KERNELS, for sightings and ranges.
 
-    A one-sided kernel is that of the ranges only, and takes the place of their gate for late ones.
-    Without `gate` nothing is rejected. Raises ValueError for another name.
+    A one-sided kernel is that of the ranges only, and replaces their gate for late ones. Without
+    `gate` nothing is rejected. Raises ValueError if KERNELS has no such name.
     """
     if gate not in (True, False):
         raise ValueError(f"gate must be True or False, not {gate!r}")
-    if kernel not in [*KERNELS]:
+    if kernel not in [*KERNELS]:                              # of any type, also not hashable
         raise ValueError(f"kernel must be one of {', '.join(KERNELS)}, not {kernel!r}")
     one_sided = kernel in ONE_SIDED
     return Acceptance(
-        None if one_sided else KERNELS[kernel], gate, KERNELS[kernel],
-        early=EARLY_GATE if gate else np.inf,
+        sighting_kernel=None if one_sided else KERNELS[kernel], gated=gate,
+        range_kernel=KERNELS[kernel], early=EARLY_GATE if gate else np.inf,
         late=EARLY_GATE if gate and not one_sided else np.inf)
 
 
 def narrow_kernels(problem, state, scales=CAUCHY_SCALES, converged=CONVERGED):
     """The State after one solution for each scale of the Cauchy kernel, with all measurements.
 
-    The scales are in sigmas of the problem's noise, which is what the scatter of the residuals
-    shows after each solution. `converged` as of `optimize`.
+    The scales are in sigmas. After each solution the scatter of the residuals gives the noise of
+    the problem. `converged` as in `optimize`.
     """
     m = problem.measurements
     for scale in scales:
@@ -81,10 +80,10 @@ def narrow_kernels(problem, state, scales=CAUCHY_SCALES, converged=CONVERGED):
 
 
 def noise_of_scatter(measurements, state):
-    """Noise of typical slip whose factors, at least 1, are the residuals' medians at a State.
+    """The Noise with typical slip and factors, at least 1, from the medians of the residuals.
 
-    Covariances that are far too small would otherwise have most measurements rejected before a
-    factor is learned. What is known of the noise stays.
+    Without these factors, covariances that are far too small would have most measurements rejected
+    before a factor is learned. Known noise parameters are kept.
     """
     sightings, ranges = residuals(measurements, state, Noise())
     # 2.366, 1.386 and 0.455 are the medians of chi-squared with 3, 2 and 1 degrees of freedom.
@@ -96,22 +95,22 @@ def noise_of_scatter(measurements, state):
 
 def _at_least_one(squared):
     """Root of the median of squared residuals over that of chi-squared, if it exceeds 1."""
-    return max(1.0, float(np.sqrt(np.median(squared)))) if len(squared) >= FEW else 1.0
+    return max(1.0, float(np.sqrt(np.median(squared)))) if len(squared) >= MIN_RESIDUALS else 1.0
 
 
-def accepted(problem, state, way=Acceptance()):
-    """MeasurementFactors of what an Acceptance accepts at a State."""
-    weight = within_gates(problem, state, way.early, way.late)
-    if not way.gated:
+def accepted(problem, state, rule=Acceptance()):
+    """The MeasurementFactors that an Acceptance accepts at a State, with its kernels."""
+    weight = within_gates(problem, state, rule.early, rule.late)
+    if not rule.gated:
         weight[:len(problem.measurements.label)] = 1
-    return MeasurementFactors(problem.measurements, weight, way.sighting_kernel, way.range_kernel)
+    return MeasurementFactors(problem.measurements, weight, rule.sighting_kernel, rule.range_kernel)
 
 
 def within_gates(problem, state, early, late):
     """Weights (s + r,): 1 within the gates, else 0.
 
-    The gate of a sighting is the 99.9 % quantile of chi-squared with 3 degrees of freedom, 2 for a
-    point. A range may be too short by `early` and too long by `late` sigmas.
+    The gate of a sighting is the 99.9 % quantile of chi-squared with 3 degrees of freedom, or 2 for
+    a point. A range may be too short by `early` and too long by `late` sigmas.
     """
     sightings, ranges = residuals(problem.measurements, state, problem.noise)
     return np.r_[np.sum(sightings**2, axis=1) < problem.measurements.gate,

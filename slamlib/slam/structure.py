@@ -1,8 +1,8 @@
-"""Stage 1: which unknowns every factor touches, and their places in the information matrix.
+"""Stage 1: the sparsity structure of the information matrix H.
 
-Variables are numbered: the frames' poses, the markers, the antennas, w, and z where the ranges
-calibrate themselves. Their unknowns lie in the order in which they are eliminated. All this depends
-on the Measurements alone, so it is found once for all states, kernels and values of the noise.
+Variables are numbered: the frames' poses, the markers, the antennas, w, and c if the ranges are
+calibrated. Their unknowns are in the order in which they are eliminated. The structure depends on
+the Measurements alone and is computed once for all states, kernels and values of the noise.
 """
 
 from copy import copy
@@ -14,12 +14,30 @@ from scipy import sparse
 
 
 @dataclass(frozen=True)
+class Variables:
+    """Numbers of the variables."""
+
+    frames: np.ndarray       # (f,) of X_i
+    markers: np.ndarray      # (k,) of L_j or P_j
+    antennas: np.ndarray     # (a,) of A_k
+    w: np.ndarray            # (1,)
+    c: np.ndarray            # (1,), or (0,) if the ranges are not calibrated
+
+
+def numbered_variables(frames, markers, antennas, calibrated):
+    """The Variables of so many frames, markers and antennas; `calibrated` (bool) adds c."""
+    counts = [frames, markers, antennas, 1, int(calibrated)]
+    numbers = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
+    return Variables(**dict(zip(("frames", "markers", "antennas", "w", "c"), numbers)))
+
+
+@dataclass(frozen=True)
 class Structure:
     """Rows of v variables with n unknowns, and places of their blocks in a matrix (n, n)."""
 
     width: np.ndarray        # (v,) number of unknowns of every variable
-    rank: np.ndarray         # (v,) its place in the order of elimination
-    begin: np.ndarray        # (v,) its first row
+    rank: np.ndarray         # (v,) position in the elimination ordering
+    begin: np.ndarray        # (v,) first row
     block: np.ndarray        # (b,) every block: rank of its column times v, plus rank of its row
     place: np.ndarray        # (b,) of a block's first entry in the data of the matrix
     height: np.ndarray       # (v,) number of entries in every column of a variable
@@ -30,24 +48,28 @@ class Structure:
         """Rows (m, width) of the unknowns of `variables` (m,)."""
         return self.begin[variables][:, None] + np.arange(width, dtype=np.int32)
 
+    def rows_of_each(self, variables):
+        """List of the rows (d,) of each of `variables` (m,), which may have different widths."""
+        return [self.rows([number], self.width[number])[0] for number in variables]
+
     def rows_of_factors(self, variables):
-        """Rows (m, c) of the unknowns of factors on `variables` (m, p), all of the same widths."""
-        return np.concatenate([self.rows(own, width) for own, width in
+        """Rows (m, p) of the unknowns of factors on `variables` (m, q), all of the same widths."""
+        return np.concatenate([self.rows(numbers, width) for numbers, width in
                                zip(variables.T, self._widths(variables))], axis=1)
 
     def places(self, variables):
-        """Places (m, c, c) of what factors as of `rows_of_factors` add to the matrix."""
-        pairs = [(own, np.arange(width, dtype=np.int32)) for own, width in
-                 zip(variables.T, self._widths(variables))]
+        """Places (m, p, p), in the data of the matrix, of the information J^T J of such factors."""
+        blocks = [(numbers, np.arange(width, dtype=np.int32)) for numbers, width in
+                  zip(variables.T, self._widths(variables))]
 
-        def of_block(row, column, offset, into):
+        def places_of_block(row, column, rows, columns):
             found = np.searchsorted(self.block, self.rank[column] * len(self.rank) + self.rank[row])
-            return (self.place[found][:, None, None] + offset
-                    + self.height[column][:, None, None] * into[:, None])
+            return (self.place[found][:, None, None] + rows
+                    + self.height[column][:, None, None] * columns[:, None])
 
         return np.concatenate([np.concatenate([
-            of_block(row, column, offset, into) for row, offset in pairs], axis=2)
-            for column, into in pairs], axis=1)
+            places_of_block(row, column, rows, columns) for row, rows in blocks], axis=2)
+            for column, columns in blocks], axis=1)
 
     @cached_property
     def diagonal(self):
@@ -71,8 +93,11 @@ class Structure:
                                 shape=(size, size))
 
 
-def structure(width, rank, factors):
-    """The Structure of variables (v,) and of `factors`, a list of (m, p) variables of factors."""
+def block_structure(width, rank, factors):
+    """The Structure of variables with these widths (v,) and ranks (v,).
+
+    `factors` lists, for each kind of factor, the numbers (m, q) of the variables of its m factors.
+    """
     count = len(width)
     begin = np.empty(count, np.int32)             # half the memory of int: there are many places
     order = np.argsort(rank)

@@ -9,33 +9,33 @@ from gtsam.symbol_shorthand import X
 from slamlib import odometry, se2
 from slamlib.evaluation import anees, ate
 from slamlib.simulation import simulate
-from slamlib.slam.estimate import fit_from_odometry
 from slamlib.slam.evidence import log_evidence
 from slamlib.slam.fit import refine
 from slamlib.slam.gtsam_graph import nonlinear_graph
 from slamlib.slam.measurements import measure
-from slamlib.slam.noise import Noise, given, with_known
-from slamlib.slam.odometry_factors import odometry_factors
+from slamlib.slam.noise import Noise, with_known, with_noise
+from slamlib.slam.odometry_factors import preintegrate_odometry
 from slamlib.slam.optimizer import optimize
-from slamlib.slam.problem import build
-from slamlib.slam.result import SlamResult, result
+from slamlib.slam.pipeline import fit_from_odometry
+from slamlib.slam.problem import build_problem
+from slamlib.slam.result import SlamResult, slam_result
 
 
 def fixed_wheels(measurements, model, relinearize_at=None):
     """OdometryFactors of wheels without errors; there is nothing to relinearize about."""
-    factors = odometry_factors(measurements, model)
+    factors = preintegrate_odometry(measurements, model)
     return replace(factors, by_w=np.zeros_like(factors.by_w))
 
 
 def independent_chain(measurements, model, relinearize_at=None):
     """OdometryFactors with wheel errors as independent noise of each, at the nominal wheels."""
-    factors = odometry_factors(measurements, model)
+    factors = preintegrate_odometry(measurements, model)
     noise = se2.rotate_covariance(factors.by_w @ np.swapaxes(factors.by_w, 1, 2),
                                   -factors.increment[:, 2])
     return replace(factors, by_w=np.zeros_like(factors.by_w), rounding=factors.rounding + noise)
 
 
-WHEELS = {"wheels as a variable": odometry_factors, "independent chain": independent_chain,
+WHEELS = {"wheels as a variable": preintegrate_odometry, "independent chain": independent_chain,
           "wheels fixed": fixed_wheels}
 
 
@@ -57,15 +57,16 @@ def graph_kinds(dataset):
     """
     measurements = measure(dataset)
     first, noise = fit_from_odometry(measurements), with_known(Noise(), dataset.vehicle)
-    for wheels, factors in WHEELS.items():
+    for wheels, preintegrate in WHEELS.items():
         for model in odometry.MODELS:
-            own = first if (factors, model) == (odometry_factors, "arc") else refine(
-                build(measurements, model, noise, factors=factors), first.state, factors=factors)
-            if factors is not odometry_factors:
+            problem = build_problem(measurements, model, noise, preintegrate=preintegrate)
+            own = first if (preintegrate, model) == (preintegrate_odometry, "arc") else refine(
+                problem, first.state, preintegrate=preintegrate)
+            if preintegrate is not preintegrate_odometry:
                 own = replace(own, problem=_without_wheel_errors(own.problem))
-            common = replace(first.problem, odometry=factors(measurements, model))
-            common = refine(common, first.state, accept=None, factors=factors)
-            yield GraphKind(wheels, model, result(own), common.log_evidence)
+            common = replace(first.problem, odometry=preintegrate(measurements, model))
+            common = refine(common, first.state, accept=None, preintegrate=preintegrate)
+            yield GraphKind(wheels, model, slam_result(own), common.log_evidence)
 
 
 def _without_wheel_errors(problem):
@@ -92,7 +93,7 @@ def evidence_curve(fit, slips, model):
 
     The measurements are those that the Fit accepts, whatever the model of the odometry steps.
     """
-    problem, state, curve = replace(fit.problem, odometry=odometry_factors(
+    problem, state, curve = replace(fit.problem, odometry=preintegrate_odometry(
         fit.problem.measurements, model, fit.state.w)), fit.state, []
     for slip in slips:
         problem = replace(problem, noise=replace(problem.noise, slip=slip))
@@ -111,7 +112,8 @@ def compare_graphs(seed, **options):
     """
     dataset, truth = simulate("short", seed, **options)
     numbers = {}
-    for kind in graph_kinds(given(dataset.without("uwb"), options.get("slip", 1e-3), 1.0, 1.0)):
+    markers = with_noise(dataset.without("uwb"), options.get("slip", 1e-3), 1.0, 1.0)
+    for kind in graph_kinds(markers):
         name, found = f"{kind.wheels} {kind.model}", kind.result
         numbers |= {f"{name} evidence": kind.log_evidence, f"{name} chi2": found.chi2_per_dof,
                     f"{name} ate": ate(found.poses, truth.poses),

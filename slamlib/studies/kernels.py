@@ -12,10 +12,10 @@ from slamlib.slam.fit import refine
 from slamlib.slam.initialization import odometry_state, trilaterated_antennas
 from slamlib.slam.measurement_factors import MeasurementFactors, kept_weights, residuals
 from slamlib.slam.measurements import measure
-from slamlib.slam.noise import Noise, given, with_known
+from slamlib.slam.noise import Noise, with_known, with_noise
 from slamlib.slam.optimizer import optimize
-from slamlib.slam.problem import build
-from slamlib.slam.result import result
+from slamlib.slam.problem import build_problem
+from slamlib.slam.result import slam_result
 from slamlib.slam.robust import CAUCHY_SCALES, EARLY_GATE, acceptance, accepted, within_gates
 from slamlib.slam.state import state_from_arrays
 from slamlib.studies.montecarlo import judge_slam
@@ -51,7 +51,7 @@ def solve_with(measurements, sightings="gate", ranges="asymmetric Tukey",
         are not CONVEX start from the same rounds of narrowing kernels.
     model : "arc" or "euler", of an odometry step.
     """
-    problem = build(measurements, model, with_known(Noise(), measurements.dataset.vehicle))
+    problem = build_problem(measurements, model, with_known(Noise(), measurements.dataset.vehicle))
     starts = {} if starts is None else starts
     kernels = [way if way in CONVEX else "narrowing" for way in (sightings, ranges)]
     if tuple(kernels) not in starts:
@@ -118,9 +118,9 @@ def late_ranges(seed, markers=True, ways=tuple(RANGES), **options):
     """
     dataset, truth = simulate("short", seed, **options)
     dataset, numbers = dataset if markers else dataset.without("aruco"), {}
-    measurements, starts = measure(given(dataset, TYPICAL_SLIP, 1.0, 1.0)), {}
+    measurements, starts = measure(with_noise(dataset, TYPICAL_SLIP, 1.0, 1.0)), {}
     for way in ways:
-        found = result(solve_with(measurements, ranges=way, starts=starts))
+        found = slam_result(solve_with(measurements, ranges=way, starts=starts))
         judged = judge_slam(found, dataset, truth)
         numbers |= {f"{way} {key}": judged[key]
                     for key in ("ate", "nees", "antenna error", "antenna nees")}
@@ -140,11 +140,11 @@ def wrong_labels(seed, ways=tuple(SIGHTINGS), **options):
     """
     dataset, truth = simulate("short", seed, **options)
     dataset, numbers, starts = dataset.without("uwb"), {}, {}
-    measurements = measure(given(dataset, TYPICAL_SLIP, 1.0, 1.0))
+    measurements = measure(with_noise(dataset, TYPICAL_SLIP, 1.0, 1.0))
     wrong = mislabelled(measurements, truth)
     for way in ways:
         fit = solve_with(measurements, sightings=way, starts=starts)
-        judged = judge_slam(result(fit), dataset, truth)
+        judged = judge_slam(slam_result(fit), dataset, truth)
         numbers |= {f"{way} {key}": judged[key] for key in ("ate", "nees", "map nees", "map worst")}
         each = residuals(measurements, fit.state, fit.problem.noise)
         lost = kept_weights(fit.problem.measured, *each)[0] < 0.5

@@ -14,11 +14,11 @@ from slamlib.simulation import misguess, simulate
 from slamlib.slam.initialization import consensus_markers, odometry_state, state_from_poses
 from slamlib.slam.measurement_factors import MeasurementFactors
 from slamlib.slam.measurements import measure
-from slamlib.slam.noise import Noise, given
+from slamlib.slam.noise import Noise, with_noise
 from slamlib.slam.normal_equations import NormalEquations
 from slamlib.slam.optimizer import optimize
-from slamlib.slam.problem import build
-from slamlib.slam.result import result
+from slamlib.slam.problem import build_problem
+from slamlib.slam.result import slam_result
 from slamlib.slam.robust import CAUCHY_SCALES
 from slamlib.slam.state import state_from_arrays
 from slamlib.studies.kernels import solve_with
@@ -99,7 +99,7 @@ def landmarks(seed, path="short", drift=1.0, known=True, kernel="graduated",
                        sigma_wheelbase=drift * vehicle.sigma_wheelbase)
     dataset, truth = simulate(path, seed, vehicle=drifting, **options)
     m = measure(replace(dataset, uwb=None, vehicle=drifting if known else vehicle))
-    rounds = _rounds(build(m, "arc", Noise(options.get("slip", TYPICAL_SLIP))), kernel)
+    rounds = _rounds(build_problem(m, "arc", Noise(options.get("slip", TYPICAL_SLIP))), kernel)
     true_map = truth.marker_in_world[np.searchsorted(truth.marker, m.marker)]
     best = optimize(rounds[-1], state_from_arrays(
         m, truth.poses[m.frame], true_map, np.zeros((0, 2)), np.zeros(3))).error
@@ -113,7 +113,7 @@ def landmarks_of_drive(dataset, found, kernel="last", starts=tuple(LANDMARKS)):
     that is reached from the result and its map in place of the truth.
     """
     m, vehicle = measure(dataset.without("uwb")), dataset.vehicle
-    rounds = _rounds(build(m, found.model, found.noise), kernel)
+    rounds = _rounds(build_problem(m, found.model, found.noise), kernel)
     best = optimize(rounds[-1], state_from_poses(
         m, found.poses[m.frame], found.covariances[m.frame],
         (found.wheel - vehicle.wheel) / vehicle.sigma_wheel))
@@ -162,14 +162,14 @@ def guesses(seed, error, poses=None, markers=True, compared=True, **options):
     dataset, truth = simulate("short", seed, **options)
     dataset = misguess(dataset if markers else dataset.without("aruco"), truth.antenna_in_world,
                        error, seed)
-    dataset = given(dataset if poses is None else dataset.first(poses), TYPICAL_SLIP, 1.0, 1.0)
+    dataset = with_noise(dataset if poses is None else dataset.first(poses), TYPICAL_SLIP, 1.0, 1.0)
     measurements = measure(dataset)
-    found = result(solve_with(measurements))
+    found = slam_result(solve_with(measurements))
     miss, squared = antenna_error(found, truth)
     right, doubt = miss < RIGHT_ANTENNA, np.isin(found.antenna, list(found.doubts))
     numbers = {"right": right.mean(), "in doubt": doubt.mean(),
                "silently wrong": np.mean(~right & (squared > POINT_GATE) & ~doubt)}
     if compared:
-        naive = result(solve_with(measurements, antennas=guessed_antennas))
+        naive = slam_result(solve_with(measurements, antennas=guessed_antennas))
         numbers["from the guess"] = np.mean(antenna_error(naive, truth)[0] < RIGHT_ANTENNA)
     return numbers

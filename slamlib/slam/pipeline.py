@@ -1,0 +1,129 @@
+"""The pipeline of problems 3 and 4, from a Dataset to a SlamResult.
+
+Each stage is a function from one frozen record to the next; stages have the numbers of the list in
+`slamlib.slam`:
+
+    1   measure           Dataset -> Measurements
+    2   build_problem     Measurements -> the factors of odometry, sightings and ranges,
+    3                     and with the noise -> Problem, the factor graph
+    4   initial_state     Measurements -> State, the start values
+    5   narrow_kernels    Problem, State -> State, by robust kernels
+    6   refine            Problem, State -> Fit: wheels, noise and accepted measurements in turn
+        better_model      Fit -> Fit: arcs or Euler's steps
+        calibrated        Fit -> Fit: with offset and scale of the ranges
+        solved_by_gtsam   Fit -> Fit: the last steps by GTSAM
+    7   slam_result       Fit -> SlamResult: mean and covariances over the possible noise, poses
+                          between the frames, doubts
+"""
+
+from functools import partial
+from numbers import Real
+
+from slamlib.limits import LIMITS
+from slamlib.odometry import MODELS
+from slamlib.slam.fit import refine, solved_by_gtsam
+from slamlib.slam.initialization import initial_state, state_from_poses
+from slamlib.slam.measurements import measure
+from slamlib.slam.model_choice import better_model
+from slamlib.slam.noise import NOISE_KEYS, Noise, with_known, with_noise
+from slamlib.slam.odometry_factors import preintegrate_odometry
+from slamlib.slam.problem import build_problem
+from slamlib.slam.range_calibration import calibrated
+from slamlib.slam.result import slam_result
+from slamlib.slam.robust import CAUCHY_SCALES, acceptance, accepted, narrow_kernels
+from slamlib.slam.wheel_check import with_checked_wheels
+
+WARM_START_CONVERGED = 1e-3  # relative decrease of the error at which the start from a result ends
+
+
+def estimate(dataset, slip=None, model=None, previous=None, *, marker_noise_factor=None,
+             range_noise_factor=None, kernel="asymmetric Tukey", gate=True):
+    """SLAM on odometry and on the markers and ranges that the dataset has.
+
+    Parameters
+    ----------
+    dataset : Dataset with markers, ranges or both.
+    slip : sqrt(m), known standard deviation of a wheel's slip after one metre; None takes that of
+        the dataset's Vehicle, or learns it if the Vehicle has none.
+    model : "arc" or "euler", of an odometry step; None lets the evidence choose, or takes that of
+        `previous`.
+    previous : SlamResult of the same drive with fewer sensors, from which the solution starts.
+    marker_noise_factor, range_noise_factor : known factors on the standard deviations in the files;
+        None as for `slip`.
+    kernel : name in `robust.KERNELS`, the robust kernel of sightings and ranges; that of the
+        ranges only if its name begins with "asymmetric".
+    gate : bool, whether measurements that contradict the solution are rejected.
+
+    Returns
+    -------
+    SlamResult
+
+    Raises
+    ------
+    DatasetError : the measurements do not determine every pose and landmark.
+    ValueError : an option has no such name, or is not within the limits of vehicle.toml.
+
+    >>> from slamlib.simulation import simulate
+    >>> dataset, truth = simulate("short", seed=1)
+    >>> found = estimate(dataset.first(200), slip=1e-3, kernel="Huber")
+    >>> found.poses.shape, found.antenna.tolist(), found.noise.slip
+    ((200, 3), [5, 13, 36, 46], 0.001)
+    >>> estimate(dataset, kernel="L2")
+    Traceback (most recent call last):
+    ValueError: kernel must be one of quadratic, Huber, Cauchy, Geman-McClure, Tukey, \
+asymmetric Cauchy, asymmetric Tukey, not 'L2'
+    """
+    _check_options(model, slip, marker_noise_factor, range_noise_factor)
+    dataset = with_noise(dataset, slip, marker_noise_factor, range_noise_factor)
+    accept = partial(accepted, rule=acceptance(kernel, gate))
+
+    measurements = measure(dataset)                                                   # 1
+    if previous is not None:
+        fit = fit_from_previous(measurements, previous, model, accept)
+    else:
+        fit = fit_from_odometry(measurements, model or "arc", accept=accept)          # 2 to 6
+        fit = fit if model else better_model(fit, "euler")
+    fit = solved_by_gtsam(calibrated(fit, accept))
+    return with_checked_wheels(slam_result(fit), fit,                                 # 7
+                               partial(fit_from_previous, accept=accept))
+
+
+def fit_from_odometry(measurements, model="arc", preintegrate=preintegrate_odometry,
+                      accept=accepted):
+    """The Fit of Measurements with start values by odometry.
+
+    `model` and `preintegrate` as in `build_problem`, `accept` as in `refine`. Raises DatasetError
+    as `estimate`.
+    """
+    problem = build_problem(measurements, model, _initial_noise(measurements),        # 2 and 3
+                            preintegrate=preintegrate)
+    state = initial_state(measurements, model, preintegrate)                          # 4
+    state = narrow_kernels(problem, state)                                            # 5
+    return refine(problem, state, accept, preintegrate)                               # 6
+
+
+def fit_from_previous(measurements, previous, model=None, accept=accepted):
+    """The Fit of Measurements from poses, wheels and model of a SlamResult; otherwise as above."""
+    vehicle, frame = measurements.dataset.vehicle, measurements.frame
+    w = (previous.wheel - vehicle.wheel) / vehicle.sigma_wheel
+    problem = build_problem(measurements, model or previous.model, _initial_noise(measurements),
+                            relinearize_at=w)
+    state = state_from_poses(measurements, previous.poses[frame], previous.covariances[frame], w)
+    state = narrow_kernels(problem, state, CAUCHY_SCALES[-1:], converged=WARM_START_CONVERGED)
+    return refine(problem, state, accept)
+
+
+def _initial_noise(measurements):
+    """The Noise to start from: typical values for the parameters that are not known."""
+    return with_known(Noise(), measurements.dataset.vehicle)
+
+
+def _check_options(model, *noise):
+    """Raise ValueError for an unknown model, or for `noise` (NOISE_KEYS) beyond its limits."""
+    if model not in (None, *MODELS):
+        raise ValueError(f"model must be one of {', '.join(MODELS)}, or None, not {model!r}")
+    for name, value in zip(NOISE_KEYS, noise):
+        limit = LIMITS["vehicle.toml"][name]
+        number = isinstance(value, Real) and not isinstance(value, bool)
+        if value is not None and not (number and limit.least <= value <= limit.most):
+            raise ValueError(f"expected {limit.expected(name)}, not {value!r}")
