@@ -14,12 +14,12 @@ from slamlib.localization import doubts
 from slamlib.simulation import simulate
 from slamlib.slam import (
     drive_doubts,
+    first_frames,
     gtsam_graph,
     noise_posterior,
     normal_equations,
     odometry_factors,
 )
-from slamlib.slam import first_frames as first_frames_module
 from slamlib.slam.covariances import marginal_covariances
 from slamlib.slam.evidence import laplace_approximation
 from slamlib.slam.first_frames import equations_of_first_frames
@@ -60,7 +60,7 @@ def test_gtsam_has_the_same_error_and_takes_the_same_step():
     step = gtsam_graph.gtsam_step(problem, state)
     np.testing.assert_allclose(equations.step(), step, rtol=1e-5, atol=1e-6 * np.abs(step).max())
     free = replace(m, calibrated=True)
-    problem = replace(problem, measurements=free, measured=replace(measured, measurements=free))
+    problem = replace(problem, measured=replace(measured, measurements=free))
     step = gtsam_graph.gtsam_step(problem, state)
     np.testing.assert_allclose(NormalEquations(problem, state).step(), step, rtol=1e-5,
                                atol=1e-6 * np.abs(step).max())
@@ -124,8 +124,9 @@ def test_the_first_frames_are_a_drive_of_their_own(monkeypatch):
     problem = build_problem(m, "arc", Noise(2e-3, 1.5, 0.7))
     problem = replace(problem, measured=MeasurementFactors(m, weight, range_kernel=LATE_KERNEL))
     state = odometry_state(m, "arc")
-    monkeypatch.setattr(first_frames_module, "MIN_MEASUREMENTS", 50)
-    part = equations_of_first_frames(NormalEquations(problem, state), 60)
+    monkeypatch.setattr(first_frames, "MIN_MEASUREMENTS", 50)
+    monkeypatch.setattr(first_frames, "LEARNING_FRAMES", 60)
+    part = equations_of_first_frames(NormalEquations(problem, state))
     cut = measure(dataset.first(int(m.frame[59]) + 1))
     np.testing.assert_array_equal(part.problem.measurements.frame, cut.frame)
     np.testing.assert_array_equal(part.problem.measurements.frame, m.frame[:60])
@@ -139,9 +140,11 @@ def test_the_first_frames_are_a_drive_of_their_own(monkeypatch):
     np.testing.assert_allclose(part.factors[2].e,
                                whole.factors[2].e[whole.factors[2].row < 60], rtol=1e-12)
     assert np.isfinite(part.step()).all()
-    assert equations_of_first_frames(whole, len(m.frame)) is whole
+    monkeypatch.setattr(first_frames, "LEARNING_FRAMES", len(m.frame))
+    assert equations_of_first_frames(whole) is whole
     monkeypatch.undo()
-    assert equations_of_first_frames(whole, 60) is whole      # too few ranges there
+    monkeypatch.setattr(first_frames, "LEARNING_FRAMES", 60)
+    assert equations_of_first_frames(whole) is whole                  # too few ranges there
 
 
 def test_noise_of_a_sensor_that_starts_late_is_learned(monkeypatch):
@@ -150,7 +153,7 @@ def test_noise_of_a_sensor_that_starts_late_is_learned(monkeypatch):
     aruco = dataset.aruco.select(dataset.aruco.pose > 1000)
     dataset = replace(dataset, aruco=replace(aruco, covariance=aruco.covariance / 36))
     whole = slam.estimate(dataset)
-    monkeypatch.setattr(noise_posterior, "MAX_FRAMES", 40)
+    monkeypatch.setattr(first_frames, "LEARNING_FRAMES", 40)
     found = slam.estimate(dataset)
     assert np.isclose(found.noise.sightings, whole.noise.sightings, rtol=1e-3)
     assert 5 < found.noise.sightings < 7 and found.rejected.mean() < 0.02

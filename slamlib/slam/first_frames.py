@@ -7,17 +7,19 @@ import numpy as np
 from slamlib.slam.measurements import measure
 from slamlib.slam.normal_equations import NormalEquations
 
+LEARNING_FRAMES = 20_000     # number of frames from which the noise of a longer drive is learned
 MIN_MEASUREMENTS = 5000      # of a sensor: they determine the factor on its sigmas to 1 %
 
 
-def equations_of_first_frames(equations, count):
-    """The NormalEquations of the measurements at the first `count` frames.
+def equations_of_first_frames(equations):
+    """The NormalEquations of the measurements at the first LEARNING_FRAMES.
 
     The odometry keeps its noise of the whole drive, and every measurement its weight. Returns
     `equations` itself if there are no more frames, or if the first ones have fewer than
     MIN_MEASUREMENTS of the sightings or ranges of the drive.
     """
     problem, state, m = equations.problem, equations.state, equations.problem.measurements
+    count = LEARNING_FRAMES
     if len(m.frame) <= count:
         return equations
     part = measure(m.dataset.first(int(m.frame[count - 1]) + 1))
@@ -34,6 +36,6 @@ def equations_of_first_frames(equations, count):
         name: getattr(problem.odometry, name)[:count - 1]
         for name in ("increment", "by_w", "rounding", "slipping")})
     return NormalEquations(
-        replace(problem, measurements=part, odometry=odometry, measured=measured),
+        replace(problem, odometry=odometry, measured=measured),
         replace(state, poses=state.poses[:count], markers=state.markers[markers],
                 antennas=state.antennas[antennas]))

@@ -17,7 +17,7 @@ import numpy as np
 from gtsam.symbol_shorthand import A, C, L, P, W, X
 
 from slamlib.dataset import DatasetError
-from slamlib.slam.linear_factors import point_factors, range_factors
+from slamlib.slam.linear_factors import range_factors, sighting_factors
 from slamlib.slam.measurement_factors import GUESS_PRIOR_SIGMA, WEAK_SIGMA
 from slamlib.slam.odometry_factors import odometry_error
 
@@ -51,7 +51,7 @@ def linearize(problem, state):
     U, _ = problem.odometry.whitening(problem.noise.slip)
     for i, (e, J) in enumerate(zip((U @ errors[..., None])[..., 0], U @ jacobians)):
         graph.add(X(i), J[:, :3], X(i + 1), J[:, 3:6], W(0), J[:, 6:], -e)
-    f = point_factors(problem.measured, problem.noise, state)
+    f = sighting_factors(problem.measured, problem.noise, state, as_pose=False)
     for i, j, e, J in zip(f.row.tolist(), f.landmark.tolist(), f.e, f.J):
         graph.add(X(i), J[:, :3], P(j), J[:, 3:], -e)
     if problem.measurements.calibrated:

@@ -30,29 +30,22 @@ def linearize_measurements(factors, noise, state):
 
     From MeasurementFactors, a Noise and a State.
     """
-    return (pose_factors(factors, noise, state), point_factors(factors, noise, state),
+    return (sighting_factors(factors, noise, state, as_pose=True),
+            sighting_factors(factors, noise, state, as_pose=False),
             range_factors(factors, noise, state))
 
 
-def pose_factors(factors, noise, state):
-    """The LinearFactors of the sightings of markers with a heading."""
+def sighting_factors(factors, noise, state, as_pose):
+    """The LinearFactors of the sightings of markers with a heading (`as_pose`), or of points."""
     m, s = factors.measurements, factors.measurements.sightings
-    index = np.flatnonzero(factors.sighting_weight[m.as_pose])
-    rows = np.flatnonzero(m.as_pose)[index]
-    e, *jacobians, _ = between_error(s.z[rows], state.poses[s.row[rows]],
-                                     state.markers[m.label[rows]])
-    return _whitened(index, s.row[rows], m.label[rows], e, jacobians, m.sighting_roots[0][rows],
-                     factors.sighting_weight[rows], noise.sightings, factors.sighting_kernel)
-
-
-def point_factors(factors, noise, state):
-    """The LinearFactors of the sightings of markers that are points."""
-    m, s = factors.measurements, factors.measurements.sightings
-    index = np.flatnonzero(factors.sighting_weight[~m.as_pose])
-    rows = np.flatnonzero(~m.as_pose)[index]
-    e, *jacobians = point_error(s.z[rows, :2], state.poses[s.row[rows]],
-                                state.markers[m.label[rows], :2])
-    return _whitened(index, s.row[rows], m.label[rows], e, jacobians, m.sighting_roots[1][rows],
+    kind = np.flatnonzero(m.as_pose == as_pose)
+    index = np.flatnonzero(factors.sighting_weight[kind])
+    rows = kind[index]
+    pose, marker = state.poses[s.row[rows]], state.markers[m.label[rows]]
+    e, by_pose, by_marker, *_ = between_error(s.z[rows], pose, marker) if as_pose \
+        else point_error(s.z[rows, :2], pose, marker[:, :2])
+    U = m.sighting_roots[0 if as_pose else 1][rows]
+    return _whitened(index, s.row[rows], m.label[rows], e, [by_pose, by_marker], U,
                      factors.sighting_weight[rows], noise.sightings, factors.sighting_kernel)
 
 

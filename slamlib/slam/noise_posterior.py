@@ -27,7 +27,6 @@ MAX_DIFFERENCE = 0.2         # of a logarithm, largest one of a difference quoti
 MIN_DIFFERENCE = 0.003       # of a logarithm, smallest one of a difference quotient
 MAX_STEP = 1.5               # of a logarithm, longest step of Newton's method
 MAX_NEWTON_STEPS = 12        # number of steps of Newton's method
-MAX_FRAMES = 20_000          # number of frames from which the noise of a longer drive is learned
 CONVERGED_GAIN = 0.01        # log posterior gained by the last step of Newton's method
 POINT_OFFSETS = 1.5 * np.arange(-2, 3)       # sigmas of log slip, points of the average
 SINGLE_POINT_SIGMA = 0.2     # of log slip, below which the mode alone is enough
@@ -47,7 +46,7 @@ class NoisePosterior:
 
 def learn_noise(equations):
     """The NoisePosterior by NormalEquations near the solution, from the noise of their problem."""
-    equations = equations_of_first_frames(equations, MAX_FRAMES)
+    equations = equations_of_first_frames(equations)
     log_posterior, start, free = _log_posterior(equations)
     value = log_posterior(start)
     if value < SINGULAR / 2:                             # nothing can be learned
@@ -62,7 +61,7 @@ def learn_noise(equations):
 
 def density(equations):
     """Log posterior density of the noise of the equations' problem, up to a constant."""
-    log_posterior, noise, _ = _log_posterior(equations_of_first_frames(equations, MAX_FRAMES))
+    log_posterior, noise, _ = _log_posterior(equations_of_first_frames(equations))
     return log_posterior(noise)
 
 
@@ -71,7 +70,7 @@ def greatest_density(equations, posterior):
 
     `posterior`, the NoisePosterior of nearly the same equations, gives step sizes and correlations.
     """
-    log_posterior, start, free = _log_posterior(equations_of_first_frames(equations, MAX_FRAMES))
+    log_posterior, start, free = _log_posterior(equations_of_first_frames(equations))
     covariance = posterior.covariance[np.ix_(free, free)]
     information = np.linalg.inv(covariance)
     scale = np.sqrt(np.diag(information))

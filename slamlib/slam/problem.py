@@ -18,10 +18,14 @@ from slamlib.slam.odometry_factors import OdometryFactors, preintegrate_odometry
 class Problem:
     """The factor graph."""
 
-    measurements: Measurements
     odometry: OdometryFactors
     measured: MeasurementFactors
     noise: Noise
+
+    @property
+    def measurements(self) -> Measurements:
+        """The Measurements."""
+        return self.measured.measurements
 
 
 def build_problem(measurements, model, noise, relinearize_at=np.zeros(3),
@@ -31,5 +35,5 @@ def build_problem(measurements, model, noise, relinearize_at=np.zeros(3),
     `preintegrate` makes the OdometryFactors of steps of the `model`, "arc" or "euler", linearised
     at w = `relinearize_at` (3,); studies pass other functions.
     """
-    return Problem(measurements, preintegrate(measurements, model, relinearize_at),
+    return Problem(preintegrate(measurements, model, relinearize_at),
                    MeasurementFactors(measurements, measurements.unit_weights), noise)

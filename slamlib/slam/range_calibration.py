@@ -20,8 +20,7 @@ def calibrated(fit, accept=accepted):
     if not len(fit.problem.measurements.ranges.row):
         return fit
     m = replace(fit.problem.measurements, calibrated=True)
-    problem = replace(fit.problem, measurements=m,
-                      measured=replace(fit.problem.measured, measurements=m))
+    problem = replace(fit.problem, measured=replace(fit.problem.measured, measurements=m))
     if log_evidence(problem, fit.state) < fit.log_evidence - DECISIVE_LEAD:
         return fit
     return refine(problem, fit.state, accept)

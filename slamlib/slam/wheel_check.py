@@ -39,16 +39,16 @@ def with_checked_wheels(found, fit, solve):
         sigma_wheelbase=WEAK_WHEEL_SIGMA * stated.wheelbase)
     try:
         alternative = solve(measure(replace(dataset, vehicle=uncertain)), found)
-        compared = refine(_with_weights_of(alternative, fit), fit.state, accept=None)
+        measured = replace(alternative.problem.measured, measurements=fit.problem.measurements)
+        compared = refine(replace(fit.problem, measured=measured), fit.state, accept=None)
     except (DatasetError, np.linalg.LinAlgError):
         return found
     wheel = stated.wheel + uncertain.sigma_wheel * alternative.state.w
     lead = alternative.posterior.density - compared.posterior.density
     if alternative.problem.measured.weight.sum() \
             < MIN_ACCEPTED * fit.problem.measured.weight.sum() \
-            or alternative.problem.noise.slip > MAX_SLIP_RATIO * found.slip:
-        return found
-    if lead < max(MIN_LEAD, found.camera.time.gain, found.camera.place.gain) \
+            or alternative.problem.noise.slip > MAX_SLIP_RATIO * found.slip \
+            or lead < max(MIN_LEAD, found.camera.time.gain, found.camera.place.gain) \
             or not far_off(stated, wheel).any():
         return found
     doubt = Doubt("wheel-parameters", (
@@ -57,9 +57,3 @@ def with_checked_wheels(found, fit, solve):
         + marker_size(stated, wheel)))
     remaining = (doubt for doubt in found.drive_doubts if doubt.what not in EXPLAINED)
     return replace(found, drive_doubts=(doubt, *remaining))
-
-
-def _with_weights_of(alternative, fit):
-    """The Problem of a Fit with the weights of an alternative Fit of the same drive."""
-    measured = replace(alternative.problem.measured, measurements=fit.problem.measurements)
-    return replace(fit.problem, measured=measured)

@@ -75,7 +75,7 @@ def _without_wheel_errors(problem):
     known = replace(m.dataset.vehicle, sigma_right_radius=0.0, sigma_left_radius=0.0,
                     sigma_wheelbase=0.0)
     m = replace(m, dataset=replace(m.dataset, vehicle=known))
-    return replace(problem, measurements=m, measured=replace(problem.measured, measurements=m))
+    return replace(problem, measured=replace(problem.measured, measurements=m))
 
 
 def gtsam_chain(problem):
