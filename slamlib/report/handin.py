@@ -4,6 +4,7 @@ import platform
 import re
 import sys
 import textwrap
+from dataclasses import replace
 from importlib.metadata import version
 from io import BytesIO
 from pathlib import Path
@@ -43,9 +44,10 @@ def selection(data, names=None):
     return [name for name in origins if name not in simulated], simulated
 
 
-def leave_out(options):
-    """Return what the report of the hand-in leaves out: a dict as of `sections.to_execute`."""
-    return dict.fromkeys(LEFT_OUT, "") | options.leave_out
+def shown(options):
+    """Return Options by which the hand-in leaves out the appendices, unless they are asked for."""
+    return replace(options, appendix=bool(options.appendix),
+                   leave_out=dict.fromkeys(LEFT_OUT, "") | options.leave_out)
 
 
 def write(path, report, results, options, omitted=()):
