@@ -37,7 +37,8 @@ def started(tmp_path, now):
     """A function that begins a build of notebooks a and b, of which each is executed alone."""
     def start(jobs=1):
         books = {tmp_path / f"{name}.ipynb": new_notebook(cells=CELLS) for name in "ab"}
-        return Progress(books, jobs, tmp_path, tmp_path / "seconds.json")
+        return Progress(books, jobs, tmp_path, tmp_path / "seconds.json", tmp_path / "none.json",
+                        "at least")
     return start
 
 
@@ -114,7 +115,7 @@ def test_what_cells_took_with_other_studies_is_a_bound(started, now, tmp_path, c
         do(first, name, now, 1.0, 20.0, 3.0)
         first.keep(name)
     books = {tmp_path / f"{name}.ipynb": new_notebook(cells=CELLS) for name in "ab"}
-    told = Progress(books, 1, tmp_path, tmp_path / "new.json", tmp_path / "seconds.json")
+    told = Progress(books, 1, tmp_path, tmp_path / "new.json", tmp_path / "seconds.json", "at most")
 
     def line():
         now[0] += progress.EVERY
@@ -127,7 +128,7 @@ def test_what_cells_took_with_other_studies_is_a_bound(started, now, tmp_path, c
     assert line() == "3 of 6 cells, at most 24 s left\n"
     do(told, "b", now, 1.0, 2.0, 1.0)
     told.keep("b")
-    told = Progress(books, 1, tmp_path, tmp_path / "new.json", tmp_path / "seconds.json")
+    told = Progress(books, 1, tmp_path, tmp_path / "new.json", tmp_path / "seconds.json", "at most")
     assert line() == "0 of 6 cells, about 8 s left\n"
 
 

@@ -27,12 +27,7 @@ from slamlib.notebook import notices
 from slamlib.report import cache, overview
 from slamlib.report.chapters import available, chapter_of, in_order, printed, with_data
 from slamlib.report.drives import read_drives
-from slamlib.report.execution import (
-    execute,
-    kernel_environment,
-    read_notebook,
-    temporary_folder,
-)
+from slamlib.report.execution import execute, kernel_environment, read_notebook, temporary_folder
 from slamlib.report.numbering import numbered
 from slamlib.report.options import Options
 from slamlib.report.pages import html_pages, own_pages

@@ -39,13 +39,13 @@ def read_options(path):
     path = Path(path)
     if not path.exists():
         return Options()
-    lines = [each.name for each in fields(Cover)]
-    others = [each.name for each in fields(Options) if each.name != "cover"]
-    entries = read_toml(path, 'author = "Ada Lovelace"', [*lines, *others], encoding="utf-8")
+    lines = [line.name for line in fields(Cover)]
+    keys = [*lines, *(option.name for option in fields(Options) if option.name != "cover")]
+    entries = read_toml(path, 'author = "Ada Lovelace"', keys, encoding="utf-8")
     values = {key: _checked(key, value, f"{path}, line {line}" if line else str(path))
               for key, (value, line) in entries.items()}
-    return Options(Cover(**{key: values[key] for key in lines if key in values}),
-                   **{key: values[key] for key in others if key in values})
+    cover = {key: values.pop(key) for key in lines if key in values}
+    return Options(cover=Cover(**cover), **values)
 
 
 def _checked(key, value, place):
