@@ -84,12 +84,12 @@ def _hand_in(arguments):
     from slamlib.report import handin
     if arguments.out.is_dir():
         raise DatasetError(f"{arguments.out}: expected the name of a file to write, found a folder")
-    options = handin.shown(_options(arguments))
+    options = handin.hand_in_options(_options(arguments))
     datasets, omitted = handin.selection(arguments.data, _names(arguments))
     report = _built(arguments, options, Path("build", "hand-in"), datasets, files=False)
     if report is None:
         return 1
-    handin.write(arguments.out, report, arguments.results, options, omitted)
+    handin.write_zip(arguments.out, report, arguments.results, options, omitted)
     print(f"hand-in: {arguments.out.resolve()}", file=sys.stderr)
     return _exit_code(_failures(report))
 

@@ -40,8 +40,8 @@ from slamlib.studies.memory import CODE, forget
 from slamlib.summary import tables
 
 STUDIES = "studies"  # in the cache, besides executed notebooks
-FIRST = 10.0  # s, for which the notebooks wait for the first numbers
-BUILDING = ".slamlib-build.lock"  # in folders that only one build at a time changes
+TABLES_WAIT = 10.0  # s, for which the notebooks wait for the first numbers
+BUILD_LOCK = ".slamlib-build.lock"  # in folders that only one build at a time changes
 
 
 @dataclass(frozen=True)
@@ -97,9 +97,9 @@ def build_report(notebooks, data, report, results, datasets=None, options=Option
         with nullcontext() if recalled else tables(folders, _tell) as wait:
             _require_pages(books, options)
             if wait:
-                wait(max(0.0, start + FIRST - time.monotonic()))
+                wait(max(0.0, start + TABLES_WAIT - time.monotonic()))
             for folder in sorted({results, kept}):
-                stack.enter_context(locks.locked(folder / BUILDING))
+                stack.enter_context(locks.locked(folder / BUILD_LOCK))
             stage, pages = (
                 stack.enter_context(swap.staging(folder)) for folder in (results, report))
             written = _executed(books, keys, environment, jobs, stage, kept, fresh)

@@ -23,8 +23,8 @@ from slamlib.studies.memory import digest, modules
 
 VARIABLES = ("SLAMLIB_", "PYTHON", "MPL", "OMP_", "OPENBLAS_", "MKL_", "LANG", "LC_", "TZ",
              "SOURCE_DATE_EPOCH")  # prefixes of environment variables that may change an output
-IGNORED = ("MPLBACKEND", "SLAMLIB_STUDIES")
-HEEDED = {"raises-exception", "skip-execution"}  # the tags of cells that nbclient heeds
+IGNORED_VARIABLES = ("MPLBACKEND", "SLAMLIB_STUDIES")  # they change no output
+HEEDED_TAGS = {"raises-exception", "skip-execution"}  # the tags of cells that nbclient heeds
 VERSIONS = 4  # of each notebook, the last used
 
 
@@ -44,7 +44,7 @@ def fingerprint(datasets, notebooks, environment):
         sorted(f"{package.name} {package.version}" for package in distributions()),
         [(str(file), digest(file.read_bytes())) for file in files if file.is_file()],
         sorted((name, value) for name, value in environment.items()
-               if name.startswith(VARIABLES) and name not in IGNORED)]).encode())
+               if name.startswith(VARIABLES) and name not in IGNORED_VARIABLES)]).encode())
 
 
 def key_of(source, book, common):
@@ -52,7 +52,7 @@ def key_of(source, book, common):
 
     It is a digest of its name, its code cells in order, and the fingerprint `common` (str).
     """
-    cells = [(cell.source, sorted(HEEDED.intersection(cell.metadata.get("tags", ()))))
+    cells = [(cell.source, sorted(HEEDED_TAGS.intersection(cell.metadata.get("tags", ()))))
              for cell in _code_cells(book)]
     return digest(json.dumps([source.name, cells, common]).encode())
 

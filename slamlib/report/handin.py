@@ -15,15 +15,15 @@ from jinja2 import Template
 from slamlib import locks, swap
 from slamlib.dataset import DatasetError, dataset_names, read_dataset, read_truth
 from slamlib.notebook import Drive, listed
-from slamlib.report.build import BUILDING
-from slamlib.report.options import ESTIMATES
+from slamlib.report.build import BUILD_LOCK
+from slamlib.report.options import PROBLEM2_FOLDERS
 from slamlib.results import FILES
 from slamlib.solve import PROBLEMS, SENSORS, title
 
-COLUMNS = 88  # characters in a line of README.txt
+LINE_WIDTH = 88  # characters in a line of README.txt
 README = Path(__file__).with_name("readme.txt")  # a template of Jinja
 LEFT_OUT = ("Explore", "Files")  # titles of sections that are for screens, or on other folders
-PACKAGES = ("slamlib", "numpy", "scipy", "gtsam")  # README.txt tells their versions
+PACKAGES_TOLD = ("slamlib", "numpy", "scipy", "gtsam")  # README.txt tells their versions
 
 
 def selection(data, names=None):
@@ -44,13 +44,13 @@ def selection(data, names=None):
     return [name for name in origins if name not in simulated], simulated
 
 
-def shown(options):
+def hand_in_options(options):
     """Return Options by which the hand-in leaves out the appendices, unless they are asked for."""
     return replace(options, appendix=bool(options.appendix),
                    leave_out=dict.fromkeys(LEFT_OUT, "") | options.leave_out)
 
 
-def write(path, report, results, options, omitted=()):
+def write_zip(path, report, results, options, omitted=()):
     """Write the zip of a Report to `path` (Path); equal input gives equal bytes.
 
     Parameters
@@ -70,7 +70,7 @@ def write(path, report, results, options, omitted=()):
         if drive.name.casefold() in {name.casefold() for name in contents}:
             raise DatasetError(f"{drive.name}: the zip has a file of the name of this dataset: "
                                "rename its folder")
-    with locks.locked(results.resolve() / BUILDING):
+    with locks.locked(results.resolve() / BUILD_LOCK):
         for drive in report.drives:
             try:
                 swap.require_finished(results / drive.name)
@@ -90,10 +90,10 @@ def write(path, report, results, options, omitted=()):
 def handed_in(drive, problem2):
     """Return the files of a SolvedDrive, a dict from names in the hand-in to names in its results.
 
-    Those of `problem2`, one of ESTIMATES, are in the folder problem2. An estimate without a map of
-    the markers has that of the markers alone.
+    Those of `problem2`, a key of PROBLEM2_FOLDERS, are in the folder problem2. An estimate without
+    a map of the markers has that of the markers alone.
     """
-    estimate = ESTIMATES[problem2]
+    estimate = PROBLEM2_FOLDERS[problem2]
     files = {f"{problem[:8]}/{name}": f"{problem}/{name}"
              for problem in ("problem1", estimate, "problem3", "problem4") for name in FILES
              if f"{problem}/{name}" in drive.files}
@@ -104,8 +104,8 @@ def handed_in(drive, problem2):
 
 
 def readme(drives, options, omitted=()):
-    """Return README.txt (str); parameters as of `write`, with a list of SolvedDrive."""
-    cover, estimate = options.cover, ESTIMATES[options.problem2]
+    """Return README.txt (str); parameters as of `write_zip`, with a list of SolvedDrive."""
+    cover, estimate = options.cover, PROBLEM2_FOLDERS[options.problem2]
     named = " ".join(filter(None, [cover.author, cover.student_number]))
     frames = [f"of pose {_world(drive, 'problem2')} in {drive.name}" for drive in drives
               if handed_in(drive, options.problem2).get("problem2/ArucoMap.mat") not in (
@@ -126,15 +126,15 @@ def readme(drives, options, omitted=()):
         frames=frames and listed(frames), sections=sections,
         worlds={drive.name: _world(drive, estimate) for drive in drives},
         versions=", ".join([f"Python {platform.python_version()}",
-                            *(f"{name} {version(name)}" for name in PACKAGES)]))
+                            *(f"{name} {version(name)}" for name in PACKAGES_TOLD)]))
     lines, *paragraphs = re.split("\n{2,}", text.strip())
     return "\n\n".join([lines, *map(_wrapped, paragraphs)]) + "\n"
 
 
 def _wrapped(paragraph):
-    """Return a paragraph in lines of at most COLUMNS characters; headings and lists stay."""
+    """Return a paragraph in lines of at most LINE_WIDTH characters; headings and lists stay."""
     return paragraph if paragraph.startswith(" ") or paragraph.endswith("--") else textwrap.fill(
-        paragraph, COLUMNS, break_long_words=False, break_on_hyphens=False)
+        paragraph, LINE_WIDTH, break_long_words=False, break_on_hyphens=False)
 
 
 def _file_lines(drive, problem2):
@@ -158,7 +158,7 @@ def _world(drive, problem):
 def _missing(drive, problem2):
     """Yield a sentence on each problem that has no files."""
     files = handed_in(drive, problem2)
-    for problem in ("problem1", ESTIMATES[problem2], "problem3", "problem4"):
+    for problem in ("problem1", PROBLEM2_FOLDERS[problem2], "problem3", "problem4"):
         if f"{problem[:8]}/vehiclePose.mat" not in files:
             lacks = [SENSORS[sensor] for sensor in PROBLEMS[problem].sensors
                      if getattr(drive.dataset, sensor) is None]

@@ -3,10 +3,11 @@
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 
-from slamlib.report.chapters import CODE
+from slamlib.report.chapters import CODE_SHOWN
 from slamlib.textfile import DatasetError, quoted, read_toml
 
-ESTIMATES = {"aruco": "problem2", "fused": "problem2_fused", "hint": "problem2_hint"}
+# Folder of the results of each estimate that may be handed in as problem 2.
+PROBLEM2_FOLDERS = {"aruco": "problem2", "fused": "problem2_fused", "hint": "problem2_hint"}
 
 
 @dataclass(frozen=True)
@@ -26,9 +27,9 @@ class Options:
     cover: Cover = Cover()
     leave_out: dict = field(default_factory=dict)  # as of `sections.to_execute`
     appendix: bool | None = None  # None: the report has it, the hand-in has not
-    code: str = "method"  # one of chapters.CODE
-    problem2: str = "aruco"  # the estimate that is handed in, one of ESTIMATES: the assignment
-    #                          requires markers alone, and calls the fusion facultative
+    code: str = "method"  # one of chapters.CODE_SHOWN
+    problem2: str = "aruco"  # the estimate that is handed in, a key of PROBLEM2_FOLDERS: the
+    #                          assignment requires markers alone, and calls the fusion facultative
 
 
 def read_options(path):
@@ -54,7 +55,7 @@ def _checked(key, value, place):
         if not ok:
             raise DatasetError(f"{place}: expected {expected} for {key}, found {quoted(value)}")
 
-    choices = {"code": CODE, "problem2": ESTIMATES}.get(key)
+    choices = {"code": CODE_SHOWN, "problem2": PROBLEM2_FOLDERS}.get(key)
     if choices:
         require(type(value) is str and value in choices,
                 f"one of {', '.join(map(repr, choices))}")

@@ -14,7 +14,7 @@ from tqdm import tqdm
 from slamlib import swap
 from slamlib.studies.memory import digest
 
-EVERY = 15.0  # s, between lines where there is no terminal
+LINE_INTERVAL = 15.0  # s, between lines where there is no terminal
 # What the bar on a terminal shows, for tqdm.
 BAR = "{desc} {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} [{elapsed}{postfix}]"
 SECTION = re.compile(r"^#+\s+(.+)", re.MULTILINE)  # a heading of any level in Markdown
@@ -40,7 +40,7 @@ class Progress:
         self.began = {}  # by notebook: when its present cell began
         self.jobs, self.folder, self.file, self.bound = jobs, folder, file, bound
         self.known, self.bounds = _read(file), _read(bounds_file)
-        self.next_line = time.monotonic() + EVERY
+        self.next_line = time.monotonic() + LINE_INTERVAL
         self.bar = tqdm(total=sum(map(len, self.cells.values())), leave=False, bar_format=BAR,
                         disable=not sys.stderr.isatty())
 
@@ -60,14 +60,14 @@ class Progress:
         swap.write(self.file, json.dumps(self.known, indent=1).encode())
 
     def show(self):
-        """Bring the bar up to date; without one print a line if the last is EVERY seconds old."""
+        """Bring the bar up to date; without one print a line, if LINE_INTERVAL has passed."""
         positions = [self._position(name) for name in self.cells if name in self.began]
         left = self._left()
         if not self.bar.disable:
             self.bar.set_description_str(positions[0] if positions else "")
             self.bar.set_postfix_str(left)
         elif time.monotonic() >= self.next_line:
-            self.next_line = time.monotonic() + EVERY
+            self.next_line = time.monotonic() + LINE_INTERVAL
             count = f"{sum(map(len, self.seconds.values()))} of {self.bar.total} cells"
             print("; ".join([f"{count}, {left}" if left else count, *positions]), file=sys.stderr)
 
