@@ -25,11 +25,11 @@ from slamlib.report.progress import Progress
 from slamlib.studies.workers import ONE_THREAD
 from slamlib.textfile import read_regular
 
-CELL_TIMEOUT = 1800  # s
-POLL = 1.0  # s, between looks at how far the studies are
-PREFIX = "slamlib-"  # of the names of temporary folders
-TRANSPORT = "ipc" if hasattr(socket, "AF_UNIX") else "tcp"  # Windows lacks the former
-LONGEST_FOLDER = 70  # characters, of one for sockets: their paths have at most 103
+CELL_TIMEOUT = 1800  # s, in which a cell must end
+POLL = 1.0  # s, between updates of the progress shown
+PREFIX = "slamlib-"  # begins the names of temporary folders, before the process id
+TRANSPORT = "ipc" if hasattr(socket, "AF_UNIX") else "tcp"  # Windows has no Unix sockets
+LONGEST_FOLDER = 70  # characters; paths of sockets in it have at most 103
 
 
 class NotebookError(RuntimeError):
@@ -79,7 +79,7 @@ def kernel_environment(settings, data, datasets, studies):
 
 @contextmanager
 def temporary_folder():
-    """Yield a new folder (Path) of this process; those of builds that are gone are removed first.
+    """Yield a new folder (Path) of this process, and remove those of builds that are gone.
 
     Its path is short enough for sockets in it.
     """

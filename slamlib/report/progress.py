@@ -1,4 +1,4 @@
-"""How far the notebooks are: a bar on a terminal, elsewhere a line at times.
+"""Shows the progress of the notebooks: a bar on a terminal, elsewhere a line every 15 s.
 
 The time left comes from the seconds that each code cell took when it was executed last. They are
 kept in a JSON file, by the notebook's name and a digest of the cell's source.
