@@ -73,8 +73,7 @@ def _orderly_end(ended):
 
 def _report(arguments):
     options = _options(arguments)
-    report = _built(arguments, options, arguments.report, _names(arguments),
-                    appendix=options.appendix is not False, leave_out=options.leave_out)
+    report = _built(arguments, options, arguments.report, _names(arguments))
     if report is None:
         return 1
     print(f"report: {report.files[0]} and {report.files[-1]}", file=sys.stderr)
@@ -85,14 +84,12 @@ def _hand_in(arguments):
     from slamlib.report import handin
     if arguments.out.is_dir():
         raise DatasetError(f"{arguments.out}: expected the name of a file to write, found a folder")
-    options = _options(arguments)
+    options = handin.hand_in_options(_options(arguments))
     datasets, omitted = handin.selection(arguments.data, _names(arguments))
-    report = _built(arguments, options, Path("build", "hand-in"), datasets,
-                    appendix=bool(options.appendix), leave_out=handin.leave_out(options),
-                    files=False)
+    report = _built(arguments, options, Path("build", "hand-in"), datasets, files=False)
     if report is None:
         return 1
-    handin.write(arguments.out, report, arguments.results, options, omitted)
+    handin.write_zip(arguments.out, report, arguments.results, options, omitted)
     print(f"hand-in: {arguments.out.resolve()}", file=sys.stderr)
     return _exit_code(_failures(report))
 
@@ -110,7 +107,7 @@ def _given(values):
     return {key: value for key, value in values.items() if value is not None}
 
 
-def _built(arguments, options, folder, datasets, **shown):
+def _built(arguments, options, folder, datasets, files=True):
     """Return the Report that is built into a folder, or None if a notebook failed; tell doubts."""
     from slamlib.report import NotebookError, build_report
     from slamlib.report.sources import copy_notebooks, notebooks_folder
@@ -121,8 +118,7 @@ def _built(arguments, options, folder, datasets, **shown):
     try:
         report = build_report(
             notebooks, arguments.data, folder, arguments.results, datasets=datasets,
-            jobs=arguments.jobs, cover=options.cover, code=options.code, kept=KEPT,
-            fresh=arguments.fresh, **shown)
+            options=options, jobs=arguments.jobs, kept=KEPT, fresh=arguments.fresh, files=files)
     except NotebookError as error:
         print(f"slamlib: {error}", file=sys.stderr)
         return None

@@ -32,8 +32,9 @@ def sections(tmp_path_factory):
         begin = next(i for i, cell in enumerate(book.cells) if cell.source.startswith("## Explore"))
         first = next(cell for cell in book.cells if cell.cell_type == "code")
         book.cells = [first] + [cell for cell in book.cells[begin:] if cell.cell_type == "code"]
-    execute(books, kernel_environment(folder, ROOT / "data", ["short"]), folder / "results", 2,
-            lambda *_: None)
+    environment = kernel_environment(folder, ROOT / "data", ["short"], folder / "studies")
+    execute(books, environment, folder / "results", 2, lambda *_: None,
+            (folder / "seconds.json", folder / "others.json", "at least"))
     return {source.stem: book.cells[1:] for source, book in books.items()}
 
 

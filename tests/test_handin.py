@@ -102,7 +102,7 @@ def test_the_readme_is_true_of_the_files(handed):
                  "The simulated dataset stand_in is left out.", "gtsam 4.3", "are NaN",
                  "problem2_fused of the report is problem2 here"):
         assert part in one_line
-    assert max(map(len, text.split("\n"))) <= handin.COLUMNS and text.endswith("\n")
+    assert max(map(len, text.split("\n"))) <= handin.LINE_WIDTH and text.endswith("\n")
 
 
 def test_equal_input_gives_equal_bytes_and_the_date_is_fixed(handed, monkeypatch, capsys):
@@ -206,5 +206,5 @@ def test_a_dataset_called_like_a_file_of_the_zip_is_refused(tmp_path):
         replace(solved_drive("problem1"), name="readme.TXT")])
     report.files[-1].write_bytes(b"")
     with pytest.raises(DatasetError, match="readme.TXT: the zip has a file of the name"):
-        handin.write(tmp_path / "hand-in.zip", report, tmp_path, Options())
+        handin.write_zip(tmp_path / "hand-in.zip", report, tmp_path, Options())
     assert not (tmp_path / "hand-in.zip").exists()

@@ -37,7 +37,8 @@ def started(tmp_path, now):
     """A function that begins a build of notebooks a and b, of which each is executed alone."""
     def start(jobs=1):
         books = {tmp_path / f"{name}.ipynb": new_notebook(cells=CELLS) for name in "ab"}
-        return Progress(books, jobs, tmp_path, tmp_path / "seconds.json")
+        return Progress(books, jobs, tmp_path, tmp_path / "seconds.json", tmp_path / "none.json",
+                        "at least")
     return start
 
 
@@ -57,14 +58,14 @@ def test_without_a_terminal_a_line_says_at_times_how_far_each_notebook_is(
     told.begin("a")
     told.show()
     assert capsys.readouterr().err == ""
-    now[0] = progress.EVERY
+    now[0] = progress.LINE_INTERVAL
     (tmp_path / "a").write_text("late_ranges 3 of 8")
     told.show()
-    now[0] += progress.EVERY / 2
+    now[0] += progress.LINE_INTERVAL / 2
     told.show()
     assert capsys.readouterr().err == "1 of 6 cells; a: cell 2 of 3, Two, late_ranges 3 of 8\n"
     told.begin("b")
-    now[0] += progress.EVERY / 2
+    now[0] += progress.LINE_INTERVAL / 2
     (tmp_path / "a").unlink()
     told.show()
     assert capsys.readouterr().err == (
@@ -79,7 +80,7 @@ def test_the_time_left_is_what_cells_took_before(started, now, capsys):
     first.keep("b")
 
     def left(told):
-        now[0] += progress.EVERY
+        now[0] += progress.LINE_INTERVAL
         told.show()
         return capsys.readouterr().err.partition(";")[0].strip()
 
@@ -103,7 +104,7 @@ def test_cells_that_are_new_make_the_time_left_a_bound(started, now, capsys):
     do(first, "a", now, 1.0, 20.0, 3.0)
     first.keep("a")
     told = started()
-    now[0] += progress.EVERY
+    now[0] += progress.LINE_INTERVAL
     told.show()
     assert capsys.readouterr().err == "0 of 6 cells, at least 24 s left\n"
 
@@ -114,10 +115,10 @@ def test_what_cells_took_with_other_studies_is_a_bound(started, now, tmp_path, c
         do(first, name, now, 1.0, 20.0, 3.0)
         first.keep(name)
     books = {tmp_path / f"{name}.ipynb": new_notebook(cells=CELLS) for name in "ab"}
-    told = Progress(books, 1, tmp_path, tmp_path / "new.json", tmp_path / "seconds.json")
+    told = Progress(books, 1, tmp_path, tmp_path / "new.json", tmp_path / "seconds.json", "at most")
 
     def line():
-        now[0] += progress.EVERY
+        now[0] += progress.LINE_INTERVAL
         told.show()
         return capsys.readouterr().err
 
@@ -127,7 +128,7 @@ def test_what_cells_took_with_other_studies_is_a_bound(started, now, tmp_path, c
     assert line() == "3 of 6 cells, at most 24 s left\n"
     do(told, "b", now, 1.0, 2.0, 1.0)
     told.keep("b")
-    told = Progress(books, 1, tmp_path, tmp_path / "new.json", tmp_path / "seconds.json")
+    told = Progress(books, 1, tmp_path, tmp_path / "new.json", tmp_path / "seconds.json", "at most")
     assert line() == "0 of 6 cells, about 8 s left\n"
 
 
@@ -137,7 +138,7 @@ def test_without_a_memory_there_is_the_count_alone(started, now, tmp_path, capsy
     if content is not None:
         (tmp_path / "seconds.json").write_bytes(content)
     told = started()
-    now[0] = progress.EVERY
+    now[0] = progress.LINE_INTERVAL
     told.show()
     assert capsys.readouterr().err == "0 of 6 cells\n"
 
@@ -163,7 +164,7 @@ def test_the_first_numbers_come_before_the_notebooks_the_shortest_drive_first(
     make_data(tmp_path)
     (tmp_path / "data" / "long" / "encoderReading.txt").write_text("1 0 0\n2 9 9\n3 9 9\n")
     write(tmp_path / "notebooks", "1_one", "# One", ("1 + 1",))
-    monkeypatch.setattr(building, "FIRST", 300.0)
+    monkeypatch.setattr(building, "TABLES_WAIT", 300.0)
     build(tmp_path, kept=tmp_path / "kept")
     told = capsys.readouterr().err
     found = re.findall("^(short|long|problem1|1_one):? +([0-9]+)", told, re.MULTILINE)

@@ -16,6 +16,7 @@ from slamlib.dataset import DatasetError
 from slamlib.report.chapters import with_data
 from slamlib.report.execution import NotebookError
 from slamlib.report.numbering import numbered
+from slamlib.report.options import Options
 from slamlib.report.sections import Section, sections, shown, to_execute
 
 ONE, TWO, MORE = Path("1_one.ipynb"), Path("2_two.ipynb"), Path("A_more.ipynb")
@@ -161,7 +162,7 @@ def built(tmp_path_factory):
                    new_code_cell(writes.format("more"))]}.items():
         number, name = path.stem.split("_")
         nbformat.write(titled(f"{number}. {name.title()}", *cells), root / "notebooks" / path)
-    build(root, datasets=["short"], leave_out={"1.3": "here", "2": "here"})
+    build(root, datasets=["short"], options=Options(leave_out={"1.3": "here", "2": "here"}))
     return root
 
 

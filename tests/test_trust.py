@@ -15,7 +15,7 @@ from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_outp
 
 from slamlib.notebook import code, inline, plain, plotting
 from slamlib.report import NotebookError, build_report
-from slamlib.report.options import Cover
+from slamlib.report.options import Cover, Options
 from slamlib.report.pages import html_page
 from slamlib.report.pdf import typst_files
 from slamlib.report.sanitize import cleaned, sanitized
@@ -182,7 +182,8 @@ def named(tmp_path_factory):
     nbformat.write(new_notebook(cells=[new_markdown_cell("# 1. Names"), new_code_cell(NOTEBOOK)]),
                    folder / "notebooks" / "1_names.ipynb")
     return build_report(folder / "notebooks", folder / "data", folder / "report",
-                        folder / "results", cover=Cover(title=NAMES[1], author=NAMES[0])).files
+                        folder / "results",
+                        options=Options(Cover(title=NAMES[1], author=NAMES[0]))).files
 
 
 @pytest.fixture(scope="module")

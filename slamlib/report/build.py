@@ -27,14 +27,9 @@ from slamlib.notebook import notices
 from slamlib.report import cache, overview
 from slamlib.report.chapters import available, chapter_of, in_order, printed, with_data
 from slamlib.report.drives import read_drives
-from slamlib.report.execution import (
-    execute,
-    kernel_environment,
-    read_notebook,
-    temporary_folder,
-)
+from slamlib.report.execution import execute, kernel_environment, read_notebook, temporary_folder
 from slamlib.report.numbering import numbered
-from slamlib.report.options import Cover
+from slamlib.report.options import Options
 from slamlib.report.pages import html_pages, own_pages
 from slamlib.report.pdf import typeset
 from slamlib.report.pictures import title_picture
@@ -45,8 +40,8 @@ from slamlib.studies.memory import CODE, forget
 from slamlib.summary import tables
 
 STUDIES = "studies"  # in the cache, besides executed notebooks
-FIRST = 10.0  # s, for which the notebooks wait for the first numbers
-BUILDING = ".slamlib-build.lock"  # in folders that only one build at a time changes
+TABLES_WAIT = 10.0  # s, for which the notebooks wait for the first numbers
+BUILD_LOCK = ".slamlib-build.lock"  # in folders that only one build at a time changes
 
 
 @dataclass(frozen=True)
@@ -57,9 +52,8 @@ class Report:
     drives: list  # of drives.SolvedDrive, with what is doubted and what could not be solved
 
 
-def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=None,
-                 code="method", kept=None, fresh=False, appendix=True, leave_out=None,
-                 files=True):
+def build_report(notebooks, data, report, results, datasets=None, options=Options(), jobs=2,
+                 kept=None, fresh=False, files=True):
     """Execute all notebooks, write pages and PDF; return the Report.
 
     Kernels read the absolute paths of data and results, and the selection, from the environment
@@ -70,15 +64,13 @@ def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=
     notebooks, data : folders of the `*.ipynb` files and of the datasets, one sub-folder each.
     report, results : folders of the pages and of the result files; created if absent.
     datasets : list of str, names of the selected datasets, or None for all.
+    options : Options, the title page and what is shown. An appendix that is left out is not
+        executed; a chapter is, as it writes the results.
     jobs : int, notebooks executed at a time.
-    cover : Cover, the title page of the PDF, or None for the default.
-    code : one of chapters.CODE; "none" leaves out code cells and printed text.
-    kept : folder that caches executed notebooks and their Monte Carlo studies, or None. Where it
-        has none of these notebooks, each dataset is solved first, and its `summary.table` printed.
+    kept : folder that caches executed notebooks and their Monte Carlo studies, or None for one
+        that is removed at the end. Where it has none of these notebooks, each dataset is solved
+        first, and its `summary.table` printed.
     fresh : bool; True executes everything although it is cached.
-    appendix : bool; False leaves out the appendices.
-    leave_out : dict as of `sections.to_execute`, what else is not shown, or None for nothing.
-        An appendix that is left out is not executed; a chapter is, as it writes the results.
     files : bool; False leaves the table of the result files out of the opening.
 
     Raises
@@ -89,33 +81,31 @@ def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=
 
     One build at a time works in a results folder or with a cache; another one waits for it.
     """
-    start, leave_out = time.monotonic(), leave_out or {}
-    kept = kept and Path(kept).resolve()
+    start = time.monotonic()
     notebooks, data, report, results = (
         Path(folder).resolve() for folder in (notebooks, data, report, results))
     address = _address(results, report) if files else None
-    cover = cover or Cover()
-    books, selected, has = _checked_input(notebooks, data, datasets, cover, appendix, leave_out)
+    books, selected, has = _checked_input(notebooks, data, datasets, options)
     folders = [data / name for name in selected]
     with ExitStack() as stack:
-        settings = stack.enter_context(temporary_folder())
-        environment = kernel_environment(settings, data, datasets, kept and kept / STUDIES)
+        temporary = stack.enter_context(temporary_folder())
+        kept = Path(kept or temporary / "kept").resolve()
+        environment = kernel_environment(temporary, data, datasets, kept / STUDIES)
         keys = partial(_keys, books, folders, environment | {"SLAMLIB_RESULTS": str(results)})
-        recalled = kept is not None and not fresh and any(
+        recalled = not fresh and any(
             cache.entry(kept, source, key).exists() for source, key in keys().items())
         with nullcontext() if recalled else tables(folders, _tell) as wait:
-            _require_pages(books, cover, code)
+            _require_pages(books, options)
             if wait:
-                wait(max(0.0, start + FIRST - time.monotonic()))
-            for folder in sorted({results, kept or results}):
-                stack.enter_context(locks.locked(folder / BUILDING))
+                wait(max(0.0, start + TABLES_WAIT - time.monotonic()))
+            for folder in sorted({results, kept}):
+                stack.enter_context(locks.locked(folder / BUILD_LOCK))
             stage, pages = (
                 stack.enter_context(swap.staging(folder)) for folder in (results, report))
-            books, written = _executed(books, keys, environment, max(1, jobs), stage, kept, fresh)
+            written = _executed(books, keys, environment, jobs, stage, kept, fresh)
         _tell("setting the pages and the PDF")
         drives = read_drives(data, stage, selected, written, notices(books.values()))
-        made = rendered(books, drives, cover, code, address,
-                        partial(shown, has=has, leave_out=leave_out))
+        made = rendered(books, drives, options, address, has)
         for name, content in made.items():
             swap.write(pages / name, content)
         swap.require_staged(stage)
@@ -132,13 +122,13 @@ def _tell(line):
     tqdm.write(line, file=sys.stderr)
 
 
-def _require_pages(books, cover, code):
+def _require_pages(books, options):
     """Set the Markdown of the notebooks, which tells early what cannot be set."""
     texts = {source: nbformat.v4.new_notebook(
         cells=[cell for cell in book.cells if cell.cell_type == "markdown"])
         for source, book in books.items()}
-    chapters = [chapter_of(source, book) for source, book in books.items()]
-    _render(texts, texts, chapters, cover, code)
+    html_pages(texts, [chapter_of(*each) for each in books.items()], options.code)
+    typeset([*texts.items()], code=options.code, **asdict(options.cover))
 
 
 def _address(results, report):
@@ -149,16 +139,16 @@ def _address(results, report):
         raise DatasetError(f"{results}: expected a folder on the drive of {report}") from None
 
 
-def _checked_input(notebooks, data, datasets, cover, appendix, leave_out):
+def _checked_input(notebooks, data, datasets, options):
     """Return the notebooks by their paths, in order, the datasets' names and what they have."""
-    for line, text in asdict(cover).items():
+    for line, text in asdict(options.cover).items():
         if missing := missing_glyphs(text):
             raise DatasetError(f"title page: the PDF's fonts have no glyph for {missing[0]} in "
                                f"{line} '{text}': write it in Latin, Greek or Cyrillic letters")
     books = {source: read_notebook(source) for source in sorted(notebooks.glob("*.ipynb"))}
     if not books:
         raise DatasetError(f"{notebooks}: there are no notebooks (*.ipynb) in this folder")
-    books = in_order(to_execute(books, leave_out), appendix)
+    books = in_order(to_execute(books, options.leave_out), options.appendix is not False)
     if not books:
         raise DatasetError(f"{notebooks}: expected a notebook that is not left out")
     selected = dataset_names(data, datasets)
@@ -194,32 +184,29 @@ def _keys(books, datasets, environment):
 
 
 def _executed(books, keys, environment, jobs, stage, kept, fresh):
-    """Return the executed books, cached or new, and the sorted names of the files they wrote.
+    """Execute books in place, or recall their outputs; return the sorted names of their files.
 
     `keys` is a function without arguments that returns what `_keys` does, `environment` that of the
     kernels, `stage` the folder of the files, by `swap.staging`.
     """
-    executed, written, begun = {}, set(), keys()
+    written, begun, left = set(), keys(), dict(books)
 
     def finish(source, book, names):
         swap.require_staged(stage)
-        executed[source] = book
         written.update(names)
-        if kept is not None and keys() == begun:  # nothing was edited meanwhile
+        if keys() == begun:  # nothing was edited meanwhile
             cache.keep(kept, source, begun[source], book, stage, names)
 
-    if kept is not None and not fresh:
-        for source, book in books.items():
-            names = cache.recall(kept, source, begun[source], book, stage)
-            if names is not None:
-                executed[source] = book
-                written.update(names)
-                print(f"{source.stem}: nothing changed, not executed again", file=sys.stderr)
-    if kept is not None and fresh:
+    if fresh:
         forget(kept / STUDIES)
-    execute({source: book for source, book in books.items() if source not in executed},
-            environment, stage, jobs, finish, _seconds(kept) if kept else ())
-    return {source: executed[source] for source in books}, sorted(written)
+    else:
+        for source, book in books.items():
+            if (names := cache.recall(kept, source, begun[source], book, stage)) is not None:
+                written.update(names)
+                del left[source]
+                print(f"{source.stem}: nothing changed, not executed again", file=sys.stderr)
+    execute(left, environment, stage, max(1, jobs), finish, _seconds(kept))
+    return sorted(written)
 
 
 def _seconds(kept):
@@ -233,39 +220,30 @@ def _seconds(kept):
     return computed, recalled, "at least"
 
 
-def rendered(books, drives, cover, code, results, shown=lambda books: books):
+def rendered(books, drives, options, address, has):
     """Return the report's files as {name: bytes}, `index.html` first and the PDF last.
 
     Parameters
     ----------
     books : dict from Path to NotebookNode, executed, in order.
     drives : list of SolvedDrive, of which the opening tells.
-    cover, code : as of `build_report`.
-    results : str, the path of the results folder from that of the report, or None as of
+    options : Options as of `build_report`.
+    address : str, the path of the results folder from that of the report, or None as of
         `overview.summary`.
-    shown : function of the books that returns them without the sections that are left out.
+    has : set of str by `chapters.available`; sections that need other data are left out.
     """
-    whole, books = books, shown(books)
+    whole, books = books, shown(books, has, options.leave_out)
     on_paper = numbered({source: printed(book) for source, book in books.items()}, whole)
     on_pages = numbered(books, whole)
-    chapters = [chapter_of(source, book) for source, book in on_pages.items()]
-    opening = overview.summary(drives, results)
-    index = {Path("index"): overview.index(cover.title, opening, chapters)}
+    chapters = [chapter_of(*each) for each in on_pages.items()]
+    opening = overview.summary(drives, address)
+    index = {Path("index"): overview.index(options.cover.title, opening, chapters)}
     solved = [drive for drive in drives if drive.solutions]
     shortened = {source: book for source, book in whole.items() if books.get(source) is not book}
-    return _render(index | on_pages, on_paper, chapters, cover, code, printed(opening),
-                   title_picture(solved[-1]) if solved else None, shortened)
-
-
-def _render(books, on_paper, chapters, cover, code, opening=None, picture=None, whole=None):
-    """Return the report's files as {name: bytes}: a page for each of `books`, and the PDF.
-
-    `on_paper` are the chapters of the PDF, a dict as `books`; `whole` as of `html_pages`.
-    """
-    files = {name: page.encode()
-             for name, page in html_pages(books, chapters, code, whole).items()}
-    return files | {"report.pdf": typeset(list(on_paper.items()), opening, code, picture,
-                                          **asdict(cover))}
+    pages = html_pages(index | on_pages, chapters, options.code, shortened)
+    return {name: page.encode() for name, page in pages.items()} | {"report.pdf": typeset(
+        [*on_paper.items()], printed(opening), options.code,
+        title_picture(solved[-1]) if solved else None, **asdict(options.cover))}
 
 
 def _resources_used(seconds):

@@ -8,12 +8,13 @@ kept with it. Earlier versions stay, so returning to an earlier selection of dat
 nothing.
 """
 
+import gzip
 import json
 import platform
+import zlib
+from base64 import b64decode, b64encode
 from importlib.metadata import distributions
-from io import BytesIO
 from pathlib import Path
-from zipfile import ZIP_DEFLATED, ZipFile
 
 import nbformat
 
@@ -22,10 +23,9 @@ from slamlib.studies.memory import digest, modules
 
 VARIABLES = ("SLAMLIB_", "PYTHON", "MPL", "OMP_", "OPENBLAS_", "MKL_", "LANG", "LC_", "TZ",
              "SOURCE_DATE_EPOCH")  # prefixes of environment variables that may change an output
-IGNORED = ("MPLBACKEND", "SLAMLIB_STUDIES")
-HEEDED = {"raises-exception", "skip-execution"}  # the tags of cells that nbclient heeds
+IGNORED_VARIABLES = ("MPLBACKEND", "SLAMLIB_STUDIES")  # they change no output
+HEEDED_TAGS = {"raises-exception", "skip-execution"}  # the tags of cells that nbclient heeds
 VERSIONS = 4  # of each notebook, the last used
-BOOK, NAMES, RESULTS = "executed.ipynb", "results.json", "results/"  # in a notebook's ZIP archive
 
 
 def fingerprint(datasets, notebooks, environment):
@@ -36,7 +36,7 @@ def fingerprint(datasets, notebooks, environment):
     datasets, notebooks : list of Path, the folders of the selected datasets; Path, the notebooks'.
     environment : dict of str, the environment variables of the kernels.
     """
-    files = [*modules("report"),
+    files = [*modules("report"), Path(__file__),  # this one for the format of the cache
              *(file for folder in datasets for file in sorted(folder.rglob("*"))),
              *(file for file in sorted(notebooks.iterdir()) if file.suffix != ".ipynb")]
     return digest(json.dumps([
@@ -44,7 +44,7 @@ def fingerprint(datasets, notebooks, environment):
         sorted(f"{package.name} {package.version}" for package in distributions()),
         [(str(file), digest(file.read_bytes())) for file in files if file.is_file()],
         sorted((name, value) for name, value in environment.items()
-               if name.startswith(VARIABLES) and name not in IGNORED)]).encode())
+               if name.startswith(VARIABLES) and name not in IGNORED_VARIABLES)]).encode())
 
 
 def key_of(source, book, common):
@@ -52,7 +52,7 @@ def key_of(source, book, common):
 
     It is a digest of its name, its code cells in order, and the fingerprint `common` (str).
     """
-    cells = [(cell.source, sorted(HEEDED.intersection(cell.metadata.get("tags", ()))))
+    cells = [(cell.source, sorted(HEEDED_TAGS.intersection(cell.metadata.get("tags", ()))))
              for cell in _code_cells(book)]
     return digest(json.dumps([source.name, cells, common]).encode())
 
@@ -78,34 +78,18 @@ def recall(folder, source, key, book, results):
     """
     path = entry(folder, source, key)
     try:
-        checksum, _, content = path.read_bytes().partition(b"\n")
-    except OSError:
+        found, executed, files = json.loads(gzip.decompress(path.read_bytes()))
+    except (OSError, EOFError, ValueError, zlib.error):  # it is absent, damaged or empty
         return None
-    if checksum != _checksum(key, content):
+    if found != key:
         return None
-    try:
-        archive = ZipFile(BytesIO(content))
-        executed = nbformat.reads(archive.read(BOOK).decode(), as_version=4)
-        nbformat.validate(executed)
-        names = json.loads(archive.read(NAMES))
-        whole = not archive.testzip() and archive.namelist() == [
-            BOOK, NAMES, *(RESULTS + name for name in names)]
-    except Exception:  # zipfile, zlib, json and nbformat raise many kinds
-        return None
-    cells, kept = _code_cells(book), _code_cells(executed)
-    whole = whole and [cell.source for cell in cells] == [cell.source for cell in kept]
-    if not whole or any(".." in name.split("/") for name in names):
-        return None
-    for cell, other in zip(cells, kept):
+    kept = _code_cells(nbformat.from_dict(executed))
+    for cell, other in zip(_code_cells(book), kept, strict=True):
         cell.outputs, cell.execution_count = other.outputs, other.execution_count
-    for name in names:
-        swap.write(results / name, archive.read(RESULTS + name))
+    for name, content in files.items():
+        swap.write(results / name, b64decode(content))
     path.touch()
-    return names
-
-
-def _checksum(key, content):
-    return digest(key.encode() + content).encode()
+    return [*files]
 
 
 def keep(folder, source, key, book, results, names):
@@ -116,14 +100,9 @@ def keep(folder, source, key, book, results, names):
     folder, source, key, book, results : as in `recall`, `book` executed.
     names : list of str, the result files that it wrote, relative to `results`.
     """
-    content = BytesIO()
-    with ZipFile(content, "w", ZIP_DEFLATED, compresslevel=1, strict_timestamps=False) as archive:
-        archive.writestr(BOOK, nbformat.writes(book))
-        archive.writestr(NAMES, json.dumps(names))
-        for name in names:
-            archive.write(results / name, RESULTS + name)
-    content = content.getvalue()
-    swap.write(entry(folder, source, key), _checksum(key, content) + b"\n" + content)
+    files = {name: b64encode((results / name).read_bytes()).decode() for name in names}
+    content = json.dumps([key, book, files]).encode()
+    swap.write(entry(folder, source, key), gzip.compress(content, compresslevel=1))
     versions = [file for file in Path(folder).glob("*.executed")
                 if file.name.rsplit(".", 2)[0] == source.stem]
     for old in sorted(versions, key=lambda file: file.stat().st_mtime_ns)[:-VERSIONS]:

@@ -16,7 +16,7 @@ from slamlib.textfile import quoted
 
 HIDDEN, HTML_ONLY = "hide-input", "html-only"
 NEEDS = (*SENSORS, "truth")  # what a notebook or a section may need
-CODE = ("none", "method", "all")  # what code is shown: none, all that is not hidden, or all
+CODE_SHOWN = ("none", "method", "all")  # what code is shown: none, all that is not hidden, or all
 
 
 def chapter_of(source, book):
@@ -101,7 +101,7 @@ def has_tag(cell, tag):
 def shows_input(cell, code):
     """Return "open", "folded" or "" (not at all): how a page shows the input of a code cell.
 
-    `code` is one of CODE. The PDF shows what is "open".
+    `code` is one of CODE_SHOWN. The PDF shows what is "open".
     """
     if code == "none" or not cell.source.strip():
         return ""

@@ -17,7 +17,7 @@ from jupyter_client.kernelspec import KernelSpecManager
 from nbclient import NotebookClient
 from nbclient.exceptions import CellExecutionError
 from nbconvert.filters import strip_ansi
-from nbconvert.preprocessors import CoalesceStreamsPreprocessor
+from nbconvert.preprocessors import ClearOutputPreprocessor, CoalesceStreamsPreprocessor
 from tqdm import tqdm
 
 from slamlib import locks, swap
@@ -25,11 +25,11 @@ from slamlib.report.progress import Progress
 from slamlib.studies.workers import ONE_THREAD
 from slamlib.textfile import read_regular
 
-CELL_TIMEOUT = 1800  # s
-POLL = 1.0  # s, between looks at how far the studies are
-PREFIX = "slamlib-"  # of the names of temporary folders
-TRANSPORT = "ipc" if hasattr(socket, "AF_UNIX") else "tcp"  # Windows lacks the former
-LONGEST_FOLDER = 70  # characters, of one for sockets: their paths have at most 103
+CELL_TIMEOUT = 1800  # s, in which a cell must end
+POLL = 1.0  # s, between updates of the progress shown
+PREFIX = "slamlib-"  # begins the names of temporary folders, before the process id
+TRANSPORT = "ipc" if hasattr(socket, "AF_UNIX") else "tcp"  # Windows has no Unix sockets
+LONGEST_FOLDER = 70  # characters; paths of sockets in it have at most 103
 
 
 class NotebookError(RuntimeError):
@@ -51,10 +51,7 @@ def read_notebook(source):
     data = read_regular(source)
     try:
         book = nbformat.reads(data.decode("utf-8-sig"), as_version=4)
-        for cell in book.cells:
-            if cell.cell_type == "code":
-                cell.outputs, cell.execution_count = [], None
-        return book
+        return ClearOutputPreprocessor().preprocess(book, {})[0]
     except UnicodeDecodeError as error:
         byte, line = error.object[error.start], data.count(b"\n", 0, error.start) + 1
         reason = f"expected UTF-8 text, found the byte 0x{byte:02x} in line {line}"
@@ -65,44 +62,39 @@ def read_notebook(source):
     raise NotebookError(f"{source.name} is not a notebook: {reason}")
 
 
-def kernel_environment(settings, data, datasets, studies=None):
+def kernel_environment(settings, data, datasets, studies):
     """Return the kernels' environment variables (dict of str) without settings that change pages.
 
     `settings` is a folder for the kernels' own settings, `data` that of the datasets (Path),
-    `datasets` the selected names (list of str) or None, `studies` the folder (Path) of the studies
-    that are kept, or None.
+    `datasets` the selected names (list of str) or None for all, `studies` the folder (Path) of the
+    studies that are kept.
     """
     (settings / "matplotlibrc").write_text("svg.hashsalt: slamlib\n")
-    environment = {"SOURCE_DATE_EPOCH": "0", "PYTHONHASHSEED": "0"} | ONE_THREAD | os.environ
-    environment |= {"SLAMLIB_DATA": str(data), "IPYTHONDIR": str(settings),
-                    "MATPLOTLIBRC": str(settings / "matplotlibrc"),
-                    "MPLBACKEND": "module://matplotlib_inline.backend_inline"}
-    chosen = {"SLAMLIB_DATASETS": datasets and "\n".join(datasets),
-              "SLAMLIB_STUDIES": studies and str(studies.resolve())}
-    for name, value in chosen.items():
-        environment.pop(name, None)
-        environment |= {name: value} if value else {}
-    return environment
+    return {"SOURCE_DATE_EPOCH": "0", "PYTHONHASHSEED": "0"} | ONE_THREAD | os.environ | {
+        "SLAMLIB_DATA": str(data), "SLAMLIB_DATASETS": "\n".join(datasets or []),
+        "SLAMLIB_STUDIES": str(studies.resolve()), "IPYTHONDIR": str(settings),
+        "MATPLOTLIBRC": str(settings / "matplotlibrc"),
+        "MPLBACKEND": "module://matplotlib_inline.backend_inline"}
 
 
 @contextmanager
 def temporary_folder():
-    """Yield a new folder (Path) of this process; those of builds that are gone are removed first.
+    """Yield a new folder (Path) of this process, and remove those of builds that are gone.
 
     Its path is short enough for sockets in it.
     """
-    place = tempfile.gettempdir()
-    place = Path("/tmp" if TRANSPORT == "ipc" and len(place) > LONGEST_FOLDER else place)
-    for left in place.glob(f"{PREFIX}*-*"):
-        process = left.name.split("-")[1]
+    parent = tempfile.gettempdir()
+    parent = Path("/tmp" if TRANSPORT == "ipc" and len(parent) > LONGEST_FOLDER else parent)
+    for old in parent.glob(f"{PREFIX}*-*"):
+        process = old.name.split("-")[1]
         if process.isdecimal() and not locks.runs(int(process)):
-            shutil.rmtree(left, ignore_errors=True)
-    with tempfile.TemporaryDirectory(dir=place, prefix=f"{PREFIX}{os.getpid()}-",
+            shutil.rmtree(old, ignore_errors=True)
+    with tempfile.TemporaryDirectory(dir=parent, prefix=f"{PREFIX}{os.getpid()}-",
                                      ignore_cleanup_errors=True) as folder:
         yield Path(folder)
 
 
-def execute(books, environment, results, jobs, finish, seconds=()):
+def execute(books, environment, results, jobs, finish, seconds):
     """Execute notebooks in place, at most `jobs` at a time; the first failure stops the others.
 
     Each notebook writes to its own folder inside `results`, SLAMLIB_RESULTS. When it ended without
@@ -114,8 +106,7 @@ def execute(books, environment, results, jobs, finish, seconds=()):
     results, jobs : Path, a folder of this build alone, and int.
     finish : function of Path, NotebookNode and the names (list of str) of the result files, called
         after each notebook.
-    seconds : files that keep how long cells took, for the time left, as of `Progress`: the last
-        three of its parameters, or none.
+    seconds : the last three parameters of `Progress`, by which it tells the time left.
     """
     try:
         with asyncio.Runner(loop_factory=_Loop) as runner:

@@ -39,6 +39,5 @@ def environment(settings, data, kept):
     A cell computes there what it does in the build, with the studies that the build keeps. Its
     selection of datasets is that of SLAMLIB_DATASETS, if it is set.
     """
-    chosen = os.environ.get("SLAMLIB_DATASETS")
-    return kernel_environment(settings, data.resolve(), chosen and chosen.split("\n"),
-                              kept / STUDIES)
+    selected = os.environ.get("SLAMLIB_DATASETS", "").split("\n")
+    return kernel_environment(settings, data.resolve(), selected, kept / STUDIES)

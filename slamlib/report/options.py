@@ -3,10 +3,11 @@
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 
-from slamlib.report.chapters import CODE
+from slamlib.report.chapters import CODE_SHOWN
 from slamlib.textfile import DatasetError, quoted, read_toml
 
-ESTIMATES = {"aruco": "problem2", "fused": "problem2_fused", "hint": "problem2_hint"}
+# Folder of the results of each estimate that may be handed in as problem 2.
+PROBLEM2_FOLDERS = {"aruco": "problem2", "fused": "problem2_fused", "hint": "problem2_hint"}
 
 
 @dataclass(frozen=True)
@@ -26,9 +27,9 @@ class Options:
     cover: Cover = Cover()
     leave_out: dict = field(default_factory=dict)  # as of `sections.to_execute`
     appendix: bool | None = None  # None: the report has it, the hand-in has not
-    code: str = "method"  # one of chapters.CODE
-    problem2: str = "aruco"  # the estimate that is handed in, one of ESTIMATES: the assignment
-    #                          requires markers alone, and calls the fusion facultative
+    code: str = "method"  # one of chapters.CODE_SHOWN
+    problem2: str = "aruco"  # the estimate that is handed in, a key of PROBLEM2_FOLDERS: the
+    #                          assignment requires markers alone, and calls the fusion facultative
 
 
 def read_options(path):
@@ -39,13 +40,13 @@ def read_options(path):
     path = Path(path)
     if not path.exists():
         return Options()
-    lines = [each.name for each in fields(Cover)]
-    others = [each.name for each in fields(Options) if each.name != "cover"]
-    entries = read_toml(path, 'author = "Ada Lovelace"', [*lines, *others], encoding="utf-8")
+    lines = [line.name for line in fields(Cover)]
+    keys = [*lines, *(option.name for option in fields(Options) if option.name != "cover")]
+    entries = read_toml(path, 'author = "Ada Lovelace"', keys, encoding="utf-8")
     values = {key: _checked(key, value, f"{path}, line {line}" if line else str(path))
               for key, (value, line) in entries.items()}
-    return Options(Cover(**{key: values[key] for key in lines if key in values}),
-                   **{key: values[key] for key in others if key in values})
+    cover = {key: values.pop(key) for key in lines if key in values}
+    return Options(cover=Cover(**cover), **values)
 
 
 def _checked(key, value, place):
@@ -54,7 +55,7 @@ def _checked(key, value, place):
         if not ok:
             raise DatasetError(f"{place}: expected {expected} for {key}, found {quoted(value)}")
 
-    choices = {"code": CODE, "problem2": ESTIMATES}.get(key)
+    choices = {"code": CODE_SHOWN, "problem2": PROBLEM2_FOLDERS}.get(key)
     if choices:
         require(type(value) is str and value in choices,
                 f"one of {', '.join(map(repr, choices))}")

@@ -80,7 +80,7 @@ def html_page(source, book, chapters, code="method", absent=()):
     ----------
     source, book : Path and NotebookNode.
     chapters : list of dict by `chapter_of`, for the contents.
-    code : one of chapters.CODE; "none" leaves out printed text, too.
+    code : one of chapters.CODE_SHOWN; "none" leaves out printed text, too.
     absent : set of (notebook's name, anchor), to which no link is made.
     """
     page = _new_page(source, chapters) | {"code": code, "absent": absent}

@@ -60,7 +60,7 @@ def typeset(chapters, opening=None, code="method", picture=None, **cover):
     ----------
     chapters : list of (Path, NotebookNode), executed; links name chapters by their file names.
     opening : NotebookNode, an unnumbered chapter before them, or None.
-    code : one of chapters.CODE; "none" leaves out printed text, too.
+    code : one of chapters.CODE_SHOWN; "none" leaves out printed text, too.
     picture : str, an SVG for the title page, or None.
     cover : title, author, student_number, course (str), the lines of the title page.
     """

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from slamlib.dataset import DatasetError
 
-NAME = "notebooks"
+FOLDER = "notebooks"  # name of the notebooks' folder
 
 
 def notebooks_folder():
@@ -15,16 +15,16 @@ def notebooks_folder():
     Raises DatasetError where neither is there.
     """
     root = Path(__file__).parents[2]
-    if Path(NAME).is_dir():
-        return Path(NAME)
+    if Path(FOLDER).is_dir():
+        return Path(FOLDER)
     if (root / "pyproject.toml").is_file():                # slamlib runs from its repository
-        return root / NAME
+        return root / FOLDER
     try:
         installed = [file.locate() for file in files("slamlib") or () if file.suffix == ".ipynb"]
     except PackageNotFoundError:
         installed = []
     if not installed:
-        raise DatasetError(f"{NAME}: expected this folder, because slamlib was installed without "
+        raise DatasetError(f"{FOLDER}: expected this folder, because slamlib was installed without "
                            "its notebooks; found none")
     return Path(installed[0]).resolve().parent
 
