@@ -61,7 +61,7 @@ def query(files, folder, selector):
 
 def test_every_formula_is_in_the_document_once(tmp_path):
     files, book = pdf.typst_files([first(), second()])
-    formulas = book.page["formulas"]
+    formulas = book.formulas
     assert len(formulas) == TEXT_FORMULAS + 3
     # A set, since a heading's formula is in the contents, too.
     labels = {element["label"] for element in query(files, tmp_path, "math.equation")}
@@ -153,8 +153,9 @@ def test_the_box_answer_is_framed_and_other_quotes_are_not():
 def test_links_lead_to_places_in_the_document(tmp_path):
     files, book = pdf.typst_files([first(), second()])
     targets = [element["dest"] for element in query(files, tmp_path, "link")]
-    numbered = {book.page["tags"][n]: f"<{label}>" for n, label in book.page["labels"].items()}
-    assert targets.count(numbered["(1)"]) == 2  # from either chapter
+    numbered = {formula.number: f"<{label}>"
+                for formula, label in zip(book.formulas, book.labels, strict=True)}
+    assert targets.count(numbered["1"]) == 2  # from either chapter
     headings = {element.get("label") for element in query(files, tmp_path, "heading")}
     assert len(headings & set(targets)) == 2  # the first chapter, and a section of the second
     assert "https://example.org/paper" in targets
@@ -165,7 +166,7 @@ def test_without_code_there_are_prose_formulas_figures_and_tables_only(tmp_path)
     files, book = pdf.typst_files([first()], code="none")
     text = files["main.typ"].decode()
     assert "print" not in text and "shown" not in text and "plot()" not in text
-    assert len(book.page["formulas"]) == TEXT_FORMULAS + 3
+    assert len(book.formulas) == TEXT_FORMULAS + 3
     assert "#picture(" in text and '#placed(2, "table", _ => [#figure(' in text
     assert text.count("#caption[") == 2
     assert "print" in pdf.typst_files([first()])[0]["main.typ"].decode()

@@ -18,7 +18,7 @@ quoted = partial(json.dumps, ensure_ascii=False)  # a string of Typst
 def compiled(folder, book):
     """Return the PDF as bytes. Typst is called again until figures and tables stay in place.
 
-    `folder` (Path) has the files of a document with `main.typ`, and `book` (pdf._Book) the formulas
+    `folder` (Path) has the files of a document with `main.typ`, and `book` (pdf.Book) the formulas
     that must be in it. NotebookError if one is not, or if Typst refuses the document.
     """
     places = UNKNOWN
@@ -36,16 +36,17 @@ def compiled(folder, book):
         sizes = {str(each["number"]): each["size"] for each in placed
                  if isinstance(each, dict)}
         places = {"final": sizes == places["sizes"] or attempt + 2 == ATTEMPTS, "sizes": sizes}
-    for number, label in enumerate(book.labels):
+    for formula, label in zip(book.formulas, book.labels, strict=True):
         if f"<{label}>" not in found:
-            raise book.error(number, "the PDF lost this formula")
+            raise formula.error("the PDF lost this formula")
     return content
 
 
 def _refused(error, book):
     """Return the NotebookError for what Typst says of a document."""
     if line := re.search(r"formulas\.typ:(\d+):", error.diagnostic):  # formula 0 is on line 2
-        return book.error(int(line[1]) - 2, f"Typst cannot set this formula, {error.message}")
+        return book.formulas[int(line[1]) - 2].error(
+            f"Typst cannot set this formula, {error.message}")
     return NotebookError("Typst cannot set the PDF: "
                          f"{error.message}: {error.diagnostic.strip()}")
 
