@@ -13,6 +13,7 @@ from slamlib.report.animation import animation, moving
 from slamlib.report.chapters import printed
 from slamlib.report.drives import SolvedDrive
 from slamlib.report.overview import index, summary
+from slamlib.report.pages import STYLE
 from slamlib.simulation import simulate
 
 MOST = 1_000_000               # bytes
@@ -44,9 +45,9 @@ def test_it_pauses_without_script_and_stands_still_where_no_motion_is_wanted(dri
     html = animation(drive)
     box = re.search(r'<input class="pause" type="checkbox" id="(\w+)">', html)[1]
     assert f'for="{box}"' in html and "<script" not in html
-    still = re.search(r"@media \(prefers-reduced-motion: reduce\) \{(.*?)\}\s*@media", html,
+    still = re.search(r"@media \(prefers-reduced-motion: reduce\) \{(.*?)\}\s*@media", STYLE,
                       re.DOTALL)[1]
-    assert "animation: none" in still
+    assert ".drive svg * { animation: none" in still
 
 
 def test_what_cannot_move_has_no_animation(drive):

@@ -23,23 +23,6 @@ POINTS, STOPS = 500, 40        # of a path, and where its time is exact
 ELLIPSES = 8, 16               # of odometry, and of the estimate beside it
 SEEN = 0.08                    # of the path's extent: longest semi-axis of the latter, enlarged
 ESTIMATES = ("problem4", "problem3", "problem2_fused")   # beside odometry, the best first
-STYLE = """.drive svg { display: block; width: 100%; height: auto; }
-.drive path { fill: none; }
-.drive ellipse { fill-opacity: 0.08; stroke-opacity: 0.55; }
-.drive .true { stroke: currentColor; stroke-width: 1; stroke-dasharray: 5 4; opacity: 0.6; }
-.drive .bar { stroke: currentColor; stroke-width: 1.5; }
-.drive text { fill: currentColor; font: 18px sans-serif; }
-.drive .key, .drive label { margin: 0.3em; font: 0.86rem/1.5 var(--sans, sans-serif); }
-.drive .key span { display: inline-block; margin: 0 0.8em; }
-.drive .key i { display: inline-block; width: 1.6em; margin-right: 0.5em;
-  vertical-align: middle; border-top: 3px solid; }
-.drive figcaption { margin-top: 0.6em; font-size: 0.92em; line-height: 1.45; text-align: left; }
-.drive input:checked ~ svg * { animation-play-state: paused !important; }
-@media (prefers-reduced-motion: reduce) {
-  .drive svg * { animation: none !important; } .drive .pause { display: none; } }
-@media screen and (prefers-color-scheme: dark) { .drive svg { filter: brightness(1.4); } }
-@media print { .drive svg * { animation: none !important; } .drive .pause { display: none; } }
-"""
 
 
 def moving(drive):
@@ -69,7 +52,7 @@ def animation(drive):
         drawn, styled = _layer(own + name, count, *layer, on_page, scale)
         parts.append(drawn)
         rules.append(styled)
-    return (f'<figure class="drive"><style>{STYLE}{"".join(rules)}</style>'
+    return (f'<figure class="drive"><style>{"".join(rules)}</style>'
             f'<input class="pause" type="checkbox" id="{own}"><label class="pause" for="{own}">'
             f'Pause</label><svg viewBox="0 0 {WIDTH} {height}" role="img" '
             f'aria-label="{escape(_described(drive, best))}">{"".join(parts)}{_bar(scale, height)}'
