@@ -19,7 +19,7 @@ from slamlib.report.chapters import printed
 from slamlib.report.execution import NotebookError
 from slamlib.report.pages import html_page
 from slamlib.report.pictures import title_picture
-from slamlib.report.svg import compact
+from slamlib.report.svg import compressed
 from slamlib.results import write_vehicle_poses
 from slamlib.simulation import simulate, write_dataset
 from slamlib.solve import Failure, Solution, problem1, solutions, title, write
@@ -187,7 +187,7 @@ def test_the_picture_is_the_same_every_time_and_needs_no_display(project, summar
 def test_the_page_has_the_picture_wide_and_for_phones_narrow(summary):
     page, _ = html_page(Path("index"), summary, [])
     pictures = pictures_of(summary)
-    wide, narrow = (base64.b64encode(compact(pictures[kind]).encode()).decode()
+    wide, narrow = (base64.b64encode(compressed(pictures[kind]).encode()).decode()
                     for kind in (plotting.WIDE, plotting.NARROW))
     picture = re.search("<picture>(.*)</picture>", page)[1]
     assert picture.count(f' src="data:image/svg+xml;base64,{wide}"') == 1

@@ -276,7 +276,7 @@ def test_wide_lines_are_folded_and_nothing_of_them_is_lost(tmp_path):
     text = text_of(pdf.typeset([(Path("1.ipynb"), book)]), tmp_path)
     assert re.sub(r"[\s↪]", "", text).count(wide) == 2
     lines = [line.strip() for line in text.splitlines() if "<" in line]
-    assert max(map(len, lines)) <= pdf.COLUMNS + 2 and len(lines) >= 8
+    assert max(map(len, lines)) <= pdf.CODE_COLUMNS + 2 and len(lines) >= 8
 
 
 def test_a_character_that_no_font_has_is_named():

@@ -8,6 +8,7 @@ from functools import cache
 import pypandoc
 
 from slamlib.report.execution import NotebookError
+from slamlib.report.sanitize import place_of
 
 LOST = re.compile(r"\\(hline|cline|boxed|cancel|color|textcolor)\b|\{array\}\s*\{[^}]*\|")
 WARNING = re.compile(
@@ -27,8 +28,7 @@ class Formula:
 
     def error(self, reason):
         """Return the NotebookError that names this formula, for a reason (str)."""
-        section = f", section '{self.section}'" if self.section else ""
-        return NotebookError(f"{self.notebook}{section}: {reason}:\n    {self.tex}")
+        return NotebookError(f"{place_of(self.notebook, self.section)}: {reason}:\n    {self.tex}")
 
 
 def set_formulas(formulas, target, *options):
@@ -55,7 +55,7 @@ def set_formulas(formulas, target, *options):
         text = pypandoc.convert_text(json.dumps(document), target, "json",
                                      ["--wrap=none", "--fail-if-warnings", *options])
     except RuntimeError as refused:
-        raise _refused(str(refused), formulas) from None
+        raise _pandoc_error(str(refused), formulas) from None
     converted = text.split("\ue000")[:-1]
     if len(converted) != len(formulas):
         raise NotebookError(f"pandoc lost some of {len(formulas)} formulas")
@@ -68,7 +68,7 @@ def _api_version():
     return json.loads(pypandoc.convert_text("", "json", "markdown"))["pandoc-api-version"]
 
 
-def _refused(message, formulas):
+def _pandoc_error(message, formulas):
     """Return the NotebookError for pandoc's message; it names the formula if the message does."""
     found = WARNING.search(message)
     formula = next((each for each in formulas if found and each.tex == found[1]), None)

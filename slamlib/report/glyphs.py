@@ -3,6 +3,7 @@
 import re
 
 from slamlib.report.execution import NotebookError
+from slamlib.report.sanitize import place_of
 from slamlib.report.setting import missing_glyphs
 
 
@@ -17,8 +18,8 @@ def require_glyphs(book, definitions):
     for name, text, notebook in book.texts:
         if missing := missing_glyphs(text):
             section, context = _where(missing[0], notebook, text)
-            raise NotebookError(name + (f", section '{section}'" if section else "")
-                                + f": {_no_glyph(missing[0])}: ...{context}...")
+            raise NotebookError(
+                f"{place_of(name, section)}: {_no_glyph(missing[0])}: ...{context}...")
     if missing := missing_glyphs("".join(definitions)):
         formula = next(formula for formula, definition in zip(book.formulas, definitions)
                        if missing[0] in definition)

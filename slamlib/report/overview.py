@@ -21,7 +21,7 @@ from slamlib.report.pictures import trajectories
 from slamlib.results import FILES
 from slamlib.solve import PROBLEMS, SENSORS, title, truth_in_world
 
-METHODS = {  # in the order of the problems; the hint is left to chapter 2
+METHOD_PHRASES = {  # in the order of the problems; the hint is left to chapter 2
     "problem1": "by odometry (problem\u00a01)", "problem2": "by markers alone",
     "problem2_fused": "with odometry fused (problem\u00a02)",
     "problem3": "by SLAM on odometry and markers (problem\u00a03)",
@@ -56,9 +56,9 @@ def _first_figure(drive):
                       metadata={"alt": f"The trajectories of {drive.name}, and the standard "
                                        "deviation of position along them"}),
         new_markdown_cell(
-            f"Figure 1. {_name(drive)}, the longest drive. Left: its trajectory by odometry, by "
-            f"fusion and by the last problem{', and the truth (dashed)' if drive.truth else ''}. "
-            "Right: the standard deviation of position along the drive, for every problem, on a "
+            f"Figure 1. {_emphasized(drive)}, the longest drive. Left: its trajectory by odometry, "
+            f"by fusion and by the last problem{', and the truth (dashed)' if drive.truth else ''}."
+            " Right: the standard deviation of position along the drive, for every problem, on a "
             "logarithmic axis"
             f"{'; problem 3 is the wide line' if drive.solution('problem3') else ''}.",
             id="caption")]
@@ -89,11 +89,11 @@ def abstract(drives):
         _what_was_done({name for name in SENSORS for drive in drives
                         if getattr(drive.dataset, name) is not None}),
         *_sigmas(drives), *(_errors(drives) or _returns(drives)), *_landmarks(drives)]
-    simulated = [_name(drive) for drive in drives if drive.simulated]
+    simulated = [_emphasized(drive) for drive in drives if drive.simulated]
     return " ".join(sentences) + (f"\n\n{_said_of_simulated(simulated)}" if simulated else "")
 
 
-def _name(drive):
+def _emphasized(drive):
     return f"*{plain(drive.name)}*"
 
 
@@ -121,7 +121,7 @@ def _has_estimates(solution):
     return solution is not None and bool(np.isfinite(solution.poses[:, 0]).any())
 
 
-def _named(drives):
+def _in_abstract(drives):
     """Return the drives that the abstract names: all, or of many the shortest and the longest."""
     solved = [drive for drive in drives if any(map(_has_estimates, drive.solutions))]
     return solved if len(solved) <= MAX_NAMED else [solved[0], solved[-1]]
@@ -130,28 +130,29 @@ def _named(drives):
 def _sigmas(drives):
     """Yield a sentence on each drive, with the median sigma of position by every problem."""
     listed_problems = None
-    for drive in _named(drives):
+    for drive in _in_abstract(drives):
         found = {problem: with_unit(median_sigmas(drive.solution(problem))[0], "m")
-                 for problem in METHODS if _has_estimates(drive.solution(problem))}
+                 for problem in METHOD_PHRASES if _has_estimates(drive.solution(problem))}
         if found.keys() == listed_problems:
-            yield f"On {_name(drive)} it is {listed(list(found.values()))}."
+            yield f"On {_emphasized(drive)} it is {listed(list(found.values()))}."
         elif listed_problems := found.keys():
-            values = [f"{value} {METHODS[problem]}" for problem, value in found.items()]
-            yield (f"On {_name(drive)} the median standard deviation of position is "
+            values = [f"{value} {METHOD_PHRASES[problem]}" for problem, value in found.items()]
+            yield (f"On {_emphasized(drive)} the median standard deviation of position is "
                    f"{listed(values)}.")
 
 
 def _compared(drives):
     """Return the named drives that both odometry and SLAM estimate, with these two Solutions."""
     found = [(drive, drive.solution("problem1"),
-              drive.solution("problem4") or drive.solution("problem3")) for drive in _named(drives)]
+              drive.solution("problem4") or drive.solution("problem3"))
+             for drive in _in_abstract(drives)]
     return [each for each in found if all(map(_has_estimates, each[1:]))]
 
 
 def _errors(drives):
     """Return a list of a sentence on the errors of odometry and SLAM, or of none without truth."""
     changes = [
-        f"from {_ate(drive, by_odometry)} to {_ate(drive, by_slam)} on {_name(drive)}"
+        f"from {_ate(drive, by_odometry)} to {_ate(drive, by_slam)} on {_emphasized(drive)}"
         for drive, by_odometry, by_slam in _compared(drives) if drive.truth is not None]
     return ["SLAM in place of odometry changes the root mean square error of position "
             f"{listed(changes)}."] if changes else []
@@ -163,7 +164,7 @@ def _returns(drives):
     for drive, *solutions in _compared(drives):
         found = consistency.returns(drive.dataset)
         if len(found.start):
-            texts.append([f"{_rms_discrepancy(found, solution.poses)} on {_name(drive)}"
+            texts.append([f"{_rms_discrepancy(found, solution.poses)} on {_emphasized(drive)}"
                           for solution in solutions])
     if not texts:
         return []
@@ -181,7 +182,7 @@ def _rms_discrepancy(found, poses):
 def _landmarks(drives):
     """Yield a sentence on the maps of the named drives, each of the last problem that has one."""
     maps = []
-    for drive in _named(drives):
+    for drive in _in_abstract(drives):
         counts = []
         for kind, name in (("aruco_map", "marker"), ("uwb_map", "antenna")):
             known = [landmarks for solution in drive.solutions
@@ -189,7 +190,7 @@ def _landmarks(drives):
             if known and (count := len(known[-1][0])):
                 counts.append(f"{count} {name}{'s' * (count > 1)}")
         if counts:
-            maps.append(f"{listed(counts)} on {_name(drive)}")
+            maps.append(f"{listed(counts)} on {_emphasized(drive)}")
     if maps:
         yield f"The maps hold {', '.join(maps)}."
 
@@ -230,7 +231,7 @@ def _doubts(drives):
 def _notes(drives):
     """Return what was mended or left out when files were read, in Markdown; "" if nothing."""
     return "\n\n".join(
-        f"Notes on the files of {_name(drive)}: " + " ".join(map(plain, drive.notes))
+        f"Notes on the files of {_emphasized(drive)}: " + " ".join(map(plain, drive.notes))
         for drive in drives if drive.notes)
 
 

@@ -26,7 +26,7 @@ from slamlib.report.execution import NotebookError
 from slamlib.report.formulas import Formula, set_formulas
 from slamlib.report.numbering import CAPTION, TAG
 from slamlib.report.sanitize import cleaned, print_once, sanitized
-from slamlib.report.svg import DRAWN, FAMILY, compact
+from slamlib.report.svg import DRAWN, FAMILY, compressed
 
 PAGE = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
 STYLE = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
@@ -144,8 +144,8 @@ def _with_policy(text, styles):
     scripts = []
     if LIVE.search(text) and SCRIPT.exists():
         scripts = [f"\n{SCRIPT.read_text(encoding='utf-8')}"]
-        before, end, after = text.rpartition("</body>")
-        text = f"{before}<script>{scripts[0]}</script>\n{end}{after}"
+        body, end, rest = text.rpartition("</body>")
+        text = f"{body}<script>{scripts[0]}</script>\n{end}{rest}"
     policy = POLICY.format(*map(_sources, (scripts, styles)))
     return text.replace(CHARSET, f'{CHARSET}\n<meta http-equiv="Content-Security-Policy" '
                                  f'content="{policy}">', 1)
@@ -289,5 +289,6 @@ def _sanitized(context, text):
 EXPORTER = _Exporter(
     template_name="basic", raw_template=PAGE,
     config=Config({"NbConvertBase": {"display_data_priority": SHOWN}}),
-    filters={"markdown2html": _markdown_to_html, "shows_input": shows_input, "compact": compact,
-             "sanitized": _sanitized, "highlight_code": Highlight2HTML(pygments_lexer="ipython3")})
+    filters={"markdown2html": _markdown_to_html, "sanitized": _sanitized, "compressed": compressed,
+             "shows_input": shows_input,
+             "highlight_code": Highlight2HTML(pygments_lexer="ipython3")})

@@ -26,13 +26,13 @@ from slamlib.report.formulas import set_formulas
 from slamlib.report.glyphs import require_glyphs
 from slamlib.report.pages import ANSWER, INTERNAL, MARK, Renderer, markdown_html, new_page
 from slamlib.report.sanitize import sanitized
-from slamlib.report.setting import PLACES, UNKNOWN, compiled, quoted
-from slamlib.report.svg import compact
+from slamlib.report.setting import PLACES, UNKNOWN, compiled, typst_string
+from slamlib.report.svg import compressed
 
 TEMPLATE = Path(__file__).with_name("report.typ")
 PICTURES = {"image/svg+xml": "svg", "image/png": "png", "image/jpeg": "jpg"}
-KINDS = (*PICTURES, "text/markdown", "text/latex", "text/html", "text/plain")  # best first
-COLUMNS = 96  # width of the page in characters of code
+OUTPUT_KINDS = (*PICTURES, "text/markdown", "text/latex", "text/html", "text/plain")  # best first
+CODE_COLUMNS = 96  # width of the page in characters of code
 COMMAND = re.compile("\ue002(\\d+)\ue003")  # stands for Typst until pandoc has converted the rest
 CAPTIONED = r"\s*#caption\[.*?\] <at-\w+>"  # below a figure or a table
 FIGURE = re.compile(rf'#picture\(("[\w.-]+", "(?:[^"\\]|\\.)*")\);({CAPTIONED})', re.DOTALL)
@@ -41,8 +41,8 @@ TABLE = re.compile(
 NAME_ONLY = re.compile(
     r"^    \[((?:(?!\], ).)+)\](?:, (?:table\.cell\([^)]*\))?\[\])+,$", re.MULTILINE)
 REFERENCES = re.compile(r"^(== References\n<[\w-]+>\n)((?:(?!== ).*\n)+)\Z", re.MULTILINE)
-NUMBER = "\ue004"  # stands for the next number of a figure, a table or a section
-STAYS = re.compile(rf"(?:^=+ .*\n<[\w-]+>\n|#announcing\[.*\n(?:.+\n)*)\s*#placed\({NUMBER}, ",
+NEXT_NUMBER = "\ue004"  # stands for the next number of a figure, a table or a section
+STAYS = re.compile(rf"(?:^=+ .*\n<[\w-]+>\n|#announcing\[.*\n(?:.+\n)*)\s*#placed\({NEXT_NUMBER}, ",
                    re.MULTILINE)
 SCALED = re.compile(r"#scale\(x: (\d+)%, y: \d+%\)\[(\\?[^\\]|\\\])\]")  # pandoc's \big, \Big, ...
 REPLACED = [(re.compile(pattern), replacement) for pattern, replacement in (
@@ -87,15 +87,15 @@ def typst_files(chapters, opening=None, code="method", picture=None, **cover):
     text = MARK.sub(r"#formula-\1;\2", text)
     text = TABLE.sub(_table, text)
     text = FIGURE.sub(
-        rf'#placed({NUMBER}, "figure", size => [#picture(\1, shrink: size)\2])', text)
+        rf'#placed({NEXT_NUMBER}, "figure", size => [#picture(\1, shrink: size)\2])', text)
     text = STAYS.sub(r"\g<0>stays: true, ", text)
-    text = re.sub("^(?=== )", f"#section({NUMBER})\n", text, flags=re.MULTILINE)
+    text = re.sub("^(?=== )", f"#section({NEXT_NUMBER})\n", text, flags=re.MULTILINE)
     number = count()
-    text = re.sub(NUMBER, lambda _: str(next(number)), text)
+    text = re.sub(NEXT_NUMBER, lambda _: str(next(number)), text)
     if picture:
-        book.files["title.svg"] = compact(picture).encode()
+        book.files["title.svg"] = compressed(picture).encode()
         cover["picture"] = "title.svg"
-    lines = ", ".join(f"{name}: {quoted(value)}" for name, value in cover.items())
+    lines = ", ".join(f"{name}: {typst_string(value)}" for name, value in cover.items())
     text = (f'#import "{TEMPLATE.name}": *\n#import "formulas.typ": *\n'
             f"#show: report.with({lines})\n{text}\n")
     definitions = "\n".join([f'#import "{TEMPLATE.name}": display', *_definitions(book)])
@@ -116,12 +116,12 @@ def _table(found):
     if "\n    [], " in rows:  # a row that continues a group
         rows = rows[:5] + re.sub(r"^    \[(?!\], )", r"    table.hline(stroke: 0.3pt),\n\g<0>",
                                  rows[5:], flags=re.MULTILINE)
-    return f'#placed({NUMBER}, "table", _ => [{head}{rule}{rows}])'
+    return f'#placed({NEXT_NUMBER}, "table", _ => [{head}{rule}{rows}])'
 
 
 def _folded(text):
     """Return text whose lines are folded at the width of the page."""
-    fold = textwrap.TextWrapper(COLUMNS, drop_whitespace=False, replace_whitespace=False,
+    fold = textwrap.TextWrapper(CODE_COLUMNS, drop_whitespace=False, replace_whitespace=False,
                                 expand_tabs=False, break_on_hyphens=False)
     return "\n".join("\n↪ ".join(fold.wrap(line)) for line in text.split("\n"))
 
@@ -154,7 +154,7 @@ def _corrected(formula, typst, label):
     elif "\\tfrac" in formula.tex and "\\frac" not in formula.tex:
         typst = f"#show math.frac: math.inline; {typst}"
     if formula.display:
-        typst = f"#display({quoted(formula.number and f'({formula.number})')})[{typst}]"
+        typst = f"#display({typst_string(formula.number and f'({formula.number})')})[{typst}]"
     return typst
 
 
@@ -200,38 +200,31 @@ class Book:
         self.texts.append((source.name, re.sub("[\ue000-\ue003]", "", text), book))
         text = re.sub(r"align: \([a-z,]*\)", lambda align: align[0].replace("auto", "left"), text)
         text = REFERENCES.sub(r"\1#references[\n\2\n]\n", text)
-        return re.sub(r"^= (\d+|[A-Z])\.", _numbered, text, count=1)
+        return re.sub(r"^= (\d+|[A-Z])\.", r'#show: chapter.with("\1")\n\g<0>', text, count=1)
 
     def markdown(self, text, attachments=()):
         """Return Markdown (str) as HTML with marks."""
         return markdown_html(text, self.page, attachments, _Renderer)
 
     def output(self, output, alt):
-        """Return an output in HTML by the best of KINDS that it has; `alt` describes a picture."""
+        """Return an output in HTML, by the best kind that it has; `alt` describes a picture."""
         data = output.get("data", {"text/plain": output.get("text", "")})
-        kind = next((kind for kind in KINDS if kind in data), None)
+        kind = next((kind for kind in OUTPUT_KINDS if kind in data), None)
         if kind in PICTURES:
             figures = self.page["figures"]
             figures.append(kind)
             name = f"picture-{len(self.commands)}.{PICTURES[kind]}"
             alt = alt or f"Figure {len(figures)} of this chapter"
-            self.files[name] = (compact(data[kind]).encode() if "svg" in kind
+            self.files[name] = (compressed(data[kind]).encode() if "svg" in kind
                                 else base64.b64decode(data[kind]))
-            return f"<p>{_mark(self.page, f'#picture({quoted(name)}, {quoted(alt)});')}</p>"
+            command = f"#picture({typst_string(name)}, {typst_string(alt)});"
+            return f"<p>{_mark(self.page, command)}</p>"
         if kind in ("text/markdown", "text/latex"):
             return self.markdown(data[kind])
         if kind == "text/plain":
             text = html.escape(_folded(strip_ansi(data[kind])))
             return f"<pre>{text}</pre>" if self.code != "none" else ""
         return sanitized(data.get(kind, ""), self.page["notebook"], self.page["section"])
-
-
-def _numbered(title):
-    """Return the beginning of a chapter's title (Match) with the number of its sections."""
-    if title[1].isdigit():
-        return f"#counter(heading).update({title[1]} - 1)\n{title[0]}"
-    return (f"#counter(heading).update({ord(title[1]) - ord('A')})\n"
-            f"#set heading(numbering: lettered)\n{title[0]}")
 
 
 def _mark(page, command):

@@ -19,7 +19,7 @@ from slamlib.report.execution import NotebookError
 from slamlib.report.sanitize import print_once
 from slamlib.textfile import quoted
 
-HEADING = re.compile(r"^(?P<fence>```|~~~).*?^(?P=fence)"
+HEADING_OR_CODE = re.compile(r"^(?P<fence>```|~~~).*?^(?P=fence)"
                      r"|^(?P<level>#{1,3})[ \t]+(?P<title>[^\n]+)", re.MULTILINE | re.DOTALL)
 IN_CODE = re.compile(r"[\"'](#{2,3} [^\"'\\\n]+)")  # a heading that a cell will show
 
@@ -79,7 +79,7 @@ def shown(books, has, leave_out):
         for at, why in reasons.items():
             if why:
                 print_once(f"{source.stem}: section '{found[at].title}' left out ({why})")
-        result[source] = _without(book, reasons.keys())
+        result[source] = _with_dropped(book, reasons.keys())
     return result
 
 
@@ -142,7 +142,7 @@ def _plain(title):
 
 def _headings(text):
     """Yield (index, level, title) of each heading of levels 1 to 3 in Markdown."""
-    for found in HEADING.finditer(text):
+    for found in HEADING_OR_CODE.finditer(text):
         if found["level"]:
             yield found.start(), len(found["level"]), _plain(found["title"])
 
@@ -154,7 +154,7 @@ def _announced(book):
         if cell.cell_type == "code" else cell for cell in book.cells]})
 
 
-def _without(book, dropped):
+def _with_dropped(book, dropped):
     """Return a book without the sections at these indexes of those by `sections`."""
     if not dropped:
         return book

@@ -12,7 +12,7 @@ from slamlib.report.execution import NotebookError
 ATTEMPTS = 6  # of setting the document, until all figures stay where they are
 PLACES = "places.json"  # what the attempts came to
 UNKNOWN = {"final": False, "sizes": {}}  # of each figure and table, by its number
-quoted = partial(json.dumps, ensure_ascii=False)  # a string of Typst
+typst_string = partial(json.dumps, ensure_ascii=False)  # a string of Typst
 
 
 def compiled(folder, book):
@@ -30,7 +30,7 @@ def compiled(folder, book):
             found = set(json.loads(compiler.query("math.equation", field="label")))
             placed = json.loads(compiler.query("metadata", field="value"))
         except typst.TypstError as error:
-            raise _refused(error, book) from None
+            raise _typst_error(error, book) from None
         if not any("did not converge" in warning.message for warning in warnings):
             break
         sizes = {str(each["number"]): each["size"] for each in placed
@@ -42,7 +42,7 @@ def compiled(folder, book):
     return content
 
 
-def _refused(error, book):
+def _typst_error(error, book):
     """Return the NotebookError for what Typst says of a document."""
     if line := re.search(r"formulas\.typ:(\d+):", error.diagnostic):  # formula 0 is on line 2
         return book.formulas[int(line[1]) - 2].error(
@@ -54,7 +54,7 @@ def _refused(error, book):
 def missing_glyphs(text):
     """Return the characters (list of str) of a text (str) that no font of the PDF has."""
     def any_missing(characters):  # drawn like U+10FFFD, which is not a character
-        source = "\n".join(f'#box({quoted(c)})' for c in ["\U0010fffd", *characters])
+        source = "\n".join(f'#box({typst_string(c)})' for c in ["\U0010fffd", *characters])
         pages = typst.compile(source.encode(), format="svg", ignore_system_fonts=True)
         missing, *glyphs = re.findall(r'<use [^>]*href="#(\w+)"', b"".join(
             [pages] if isinstance(pages, bytes) else pages).decode())

@@ -22,11 +22,11 @@ FAMILY = ("'Libertinus Serif', Charter, 'Bitstream Charter', 'Iowan Old Style', 
           "Cambria, 'Liberation Serif', Georgia, STIXGeneral, serif")
 UNSEEN = re.compile(r"<\?xml.*?\?>|<!DOCTYPE[^>]*>|<metadata>.*?</metadata>|<!--.*?-->", re.DOTALL)
 MARKS = re.compile(r"(?:<use [^>]*/>){2,}")
-STYLE = re.compile(r' style="[^"]*"')
+STYLE_ATTRIBUTE = re.compile(r' style="[^"]*"')
 
 
 @lru_cache(maxsize=256)  # a page and the PDF show the same figures
-def compact(text):
+def compressed(text):
     """Return an SVG (str) that looks the same and is smaller."""
     text = re.sub(r">\s+<", "><", UNSEEN.sub("", text)).strip()
     text = LINES.sub(_relative_path, text)
@@ -41,10 +41,10 @@ def _rounded(coordinates):
 
 def _grouped_marks(marks):
     """Return marks in a row (Match) in a group with their style, if all have the same one."""
-    styles = STYLE.findall(marks[0])
+    styles = STYLE_ATTRIBUTE.findall(marks[0])
     if len(set(styles)) != 1 or marks[0].count("<use ") != len(styles):
         return marks[0]
-    return f"<g{styles[0]}>{STYLE.sub('', marks[0])}</g>"
+    return f"<g{styles[0]}>{STYLE_ATTRIBUTE.sub('', marks[0])}</g>"
 
 
 def _relative_path(lines):
