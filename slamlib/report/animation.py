@@ -28,13 +28,13 @@ BESIDE_ODOMETRY = ("problem4", "problem3", "problem2_fused")  # estimates, the b
 
 def moving(drive):
     """Return a list of the cell with a SolvedDrive's animation, for pages only; [] without one."""
-    html = animation(drive)
+    html = animated(drive)
     output = new_output("display_data", {"text/html": Markup(html)})  # a page takes it as it is
     return [new_code_cell(outputs=[output], id="motion",
                           metadata={"tags": [HTML_ONLY]})] if html else []
 
 
-def animation(drive):
+def animated(drive):
     """Return the animation of a SolvedDrive in HTML; "" without odometry and another estimate."""
     solved = {solution.problem: solution for solution in drive.solutions}
     best = next((solved[problem] for problem in BESIDE_ODOMETRY if problem in solved), None)
@@ -62,7 +62,7 @@ def animation(drive):
 
 
 def _layer(name, count, solution, color, enlarged, on_page, scale):
-    """Return path, ellipses and vehicle of a Solution in SVG (str), and the CSS (str) to move them."""
+    """Return a Solution's path, ellipses and vehicle in SVG (str), and the CSS that moves them."""
     known = np.flatnonzero(np.isfinite(solution.poses[:, 0]))
     poses = solution.poses[known]
     indices = plotting.spread(poses, count)

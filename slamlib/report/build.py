@@ -242,14 +242,14 @@ def rendered(books, drives, cover, code, results, shown=lambda books: books):
     drives : list of SolvedDrive, of which the opening tells.
     cover, code : as of `build_report`.
     results : str, the path of the results folder from that of the report, or None as of
-        `overview.summary`.
+        `overview.opening`.
     shown : function of the books that returns them without the sections that are left out.
     """
     whole, books = books, shown(books)
     on_paper = numbered({source: printed(book) for source, book in books.items()}, whole)
     on_pages = numbered(books, whole)
     chapters = [chapter_of(source, book) for source, book in on_pages.items()]
-    opening = overview.summary(drives, results)
+    opening = overview.opening(drives, results)
     index = {Path("index"): overview.index(cover.title, opening, chapters)}
     solved = [drive for drive in drives if drive.solutions]
     shortened = {source: book for source, book in whole.items() if books.get(source) is not book}

@@ -70,8 +70,9 @@ def read_drives(data, results, selected, written, notices=None):
         doubts = [*doubts_about_drive(dataset, truth), *(x for x in told if isinstance(x, Doubt))]
         failures = sorted((x for x in told if isinstance(x, Failure)),
                           key=lambda failure: order(failure.problem))
-        drives.append(SolvedDrive(name, dataset, truth, solved, tuple(merged(doubts)),
-                                  tuple(failures), files))
+        drives.append(SolvedDrive(
+            name=name, dataset=dataset, truth=truth, solutions=solved,
+            doubts=tuple(merged(doubts)), failures=tuple(failures), files=files))
     return sorted(drives, key=lambda drive: len(drive.dataset.ticks))
 
 

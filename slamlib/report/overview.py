@@ -29,7 +29,7 @@ METHOD_PHRASES = {  # in the order of the problems; the hint is left to chapter 
 MAX_NAMED = 3  # drives that the abstract names one by one
 
 
-def summary(drives, address="."):
+def opening(drives, address="."):
     """Return the opening of the report, an executed NotebookNode, for a list of SolvedDrive.
 
     `address` (str) is the path of the results folder from that of the report; with None the table
@@ -64,15 +64,15 @@ def _first_figure(drive):
             id="caption")]
 
 
-def index(heading, opening, chapters):
-    """Return the first page, a NotebookNode: the opening by `summary` with links to all the rest.
+def index(heading, first_page, chapters):
+    """Return the first page, a NotebookNode: `first_page` by `opening` with links to all the rest.
 
     `heading` (str) is the title of the report, `chapters` are dicts by `chapters.chapter_of`.
     """
     links = "\n\n".join(
         f"### [{chapter['title']}]({chapter['file']})\n\n"
         + re.sub(r"\]\(#", f"]({chapter['file']}#", chapter["lead"]) for chapter in chapters)
-    first, *others = opening.cells
+    first, *others = first_page.cells
     text = first.source.removeprefix("# Overview")
     return new_notebook(cells=[
         new_markdown_cell(f"# {plain(heading)}{text}\n\n[The whole report as one PDF](report.pdf)",

@@ -233,7 +233,7 @@ class Renderer(IPythonRenderer):
 
 def _with_number(formula, mathml, punctuation):
     """Return a Formula in HTML (str), with its number beside it and the punctuation behind it."""
-    mathml = _corrected(formula.tex, mathml)
+    mathml = _mended_mathml(formula.tex, mathml)
     if not formula.display:  # no line break before punctuation
         return f'<span class="keep">{mathml}{punctuation}</span>'
     anchor, number = "", ""
@@ -244,7 +244,7 @@ def _with_number(formula, mathml, punctuation):
             f"{punctuation}")
 
 
-def _corrected(tex, mathml):
+def _mended_mathml(tex, mathml):
     """Return pandoc's MathML, corrected where it differs from TeX or browsers misplace it."""
     math = ElementTree.fromstring(re.sub(r'\sxmlns="[^"]*"', "", mathml).strip())
     for element in list(math.iter()):

@@ -33,7 +33,7 @@ TEMPLATE = Path(__file__).with_name("report.typ")
 PICTURES = {"image/svg+xml": "svg", "image/png": "png", "image/jpeg": "jpg"}
 OUTPUT_KINDS = (*PICTURES, "text/markdown", "text/latex", "text/html", "text/plain")  # best first
 CODE_COLUMNS = 96  # width of the page in characters of code
-COMMAND = re.compile("\ue002(\\d+)\ue003")  # stands for Typst until pandoc has converted the rest
+COMMAND_MARK = re.compile("\ue002(\\d+)\ue003")  # stands for Typst until pandoc has converted the rest
 CAPTIONED = r"\s*#caption\[.*?\] <at-\w+>"  # below a figure or a table
 FIGURE = re.compile(rf'#picture\(("[\w.-]+", "(?:[^"\\]|\\.)*")\);({CAPTIONED})', re.DOTALL)
 TABLE = re.compile(
@@ -83,7 +83,7 @@ def typst_files(chapters, opening=None, code="method", picture=None, **cover):
     for number, formula in enumerate(book.formulas):
         if f"\ue000{number}\ue001" not in text:
             raise formula.error("the PDF would lose this formula")
-    text = COMMAND.sub(lambda mark: book.commands[int(mark[1])], text)
+    text = COMMAND_MARK.sub(lambda mark: book.commands[int(mark[1])], text)
     text = MARK.sub(r"#formula-\1;\2", text)
     text = TABLE.sub(_table, text)
     text = FIGURE.sub(
@@ -134,12 +134,12 @@ def _definitions(book):
         for pattern, replacement in REPLACED:
             tex = pattern.sub(replacement, tex)
         changed.append(replace(formula, tex=tex))
-    return [f"#let formula-{number} = [{_corrected(formula, typst, label)}]"
+    return [f"#let formula-{number} = [{_mended_typst(formula, typst, label)}]"
             for number, (formula, typst, label) in enumerate(zip(
                 book.formulas, set_formulas(changed, "typst"), book.labels, strict=True))]
 
 
-def _corrected(formula, typst, label):
+def _mended_typst(formula, typst, label):
     """Return a Formula with its label in Typst, on one line; what pandoc sets unlike TeX is mended.
 
     `typst` (str) is the formula by pandoc.
@@ -218,7 +218,7 @@ class Book:
             self.files[name] = (compressed(data[kind]).encode() if "svg" in kind
                                 else base64.b64decode(data[kind]))
             command = f"#picture({typst_string(name)}, {typst_string(alt)});"
-            return f"<p>{_mark(self.page, command)}</p>"
+            return f"<p>{_command_mark(self.page, command)}</p>"
         if kind in ("text/markdown", "text/latex"):
             return self.markdown(data[kind])
         if kind == "text/plain":
@@ -227,7 +227,7 @@ class Book:
         return sanitized(data.get(kind, ""), self.page["notebook"], self.page["section"])
 
 
-def _mark(page, command):
+def _command_mark(page, command):
     """Return the mark for a command of Typst (str), which is added to those of `page` (dict)."""
     page["commands"].append(command)
     return f"\ue002{len(page['commands']) - 1}\ue003"
@@ -244,7 +244,7 @@ class _Renderer(Renderer):
         return f'<h{level} id="{label}">{text}</h{level}>\n'
 
     def paragraph(self, text):
-        command = partial(_mark, self.page)
+        command = partial(_command_mark, self.page)
         if anchor := self.caption_anchor(text):
             label = _label(self.page["notebook"], anchor)
             return f"<p>{command('#caption[')}{text}{command(f'] <{label}>')}</p>\n"
@@ -255,7 +255,7 @@ class _Renderer(Renderer):
     def block_quote(self, text):
         if not ANSWER.match(text):
             return super().block_quote(text)
-        return f"<p>{_mark(self.page, '#answer[')}</p>\n{text}<p>{_mark(self.page, ']')}</p>\n"
+        return f"<p>{_command_mark(self.page, '#answer[')}</p>\n{text}<p>{_command_mark(self.page, ']')}</p>\n"
 
     def link(self, text, url, title=None):
         if re.match(r"(https?|mailto):", url):

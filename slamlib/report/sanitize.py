@@ -15,6 +15,7 @@ import nh3
 
 from slamlib.report.execution import NotebookError
 
+# What is allowed: names of elements and of attributes.
 ELEMENTS = nh3.ALLOWED_TAGS | set(
     "tfoot section figure figcaption form fieldset legend label input select option output "
     "progress meter svg g defs symbol use path rect circle ellipse line polyline polygon text "

@@ -55,12 +55,12 @@ def _relative_path(lines):
         points = np.rint(100 * _simplified(points)).astype(int)
         steps = np.diff(points, axis=0, prepend=position[None])
         closing = "z" if "z" in part else ""
-        written.append(_written("m", steps[:1]) + _written("l", steps[1:]) + closing)
+        written.append(_path_steps("m", steps[:1]) + _path_steps("l", steps[1:]) + closing)
         position = points[0] if closing else points[-1]
     return "".join(written)
 
 
-def _written(command, steps):
+def _path_steps(command, steps):
     """Return steps (n, 2) in hundredths of a point as data of a path, "" if there are none."""
     numbers = " ".join(f"{value / 100:.10g}" for value in steps.ravel().tolist())
     return command * bool(numbers) + re.sub(r"\b0\.", ".", numbers).replace(" -", "-")
