@@ -13,7 +13,6 @@ import re
 import tempfile
 import textwrap
 from dataclasses import replace
-from functools import partial
 from itertools import count
 from pathlib import Path
 from urllib.parse import unquote
@@ -33,7 +32,7 @@ TEMPLATE = Path(__file__).with_name("report.typ")
 PICTURES = {"image/svg+xml": "svg", "image/png": "png", "image/jpeg": "jpg"}
 OUTPUT_KINDS = (*PICTURES, "text/markdown", "text/latex", "text/html", "text/plain")  # best first
 CODE_COLUMNS = 96  # width of the page in characters of code
-COMMAND_MARK = re.compile("\ue002(\\d+)\ue003")  # stands for Typst until pandoc has converted the rest
+COMMAND_MARK = re.compile("\ue002(\\d+)\ue003")  # stands for a command until pandoc is done
 CAPTIONED = r"\s*#caption\[.*?\] <at-\w+>"  # below a figure or a table
 FIGURE = re.compile(rf'#picture\(("[\w.-]+", "(?:[^"\\]|\\.)*")\);({CAPTIONED})', re.DOTALL)
 TABLE = re.compile(
@@ -244,18 +243,21 @@ class _Renderer(Renderer):
         return f'<h{level} id="{label}">{text}</h{level}>\n'
 
     def paragraph(self, text):
-        command = partial(_command_mark, self.page)
         if anchor := self.caption_anchor(text):
             label = _label(self.page["notebook"], anchor)
-            return f"<p>{command('#caption[')}{text}{command(f'] <{label}>')}</p>\n"
+            return f"<p>{self.command('#caption[')}{text}{self.command(f'] <{label}>')}</p>\n"
         if text.rstrip().endswith(":"):
-            return f"<p>{command('#announcing[')}{text}{command(']')}</p>\n"
+            return f"<p>{self.command('#announcing[')}{text}{self.command(']')}</p>\n"
         return super().paragraph(text)
+
+    def command(self, command):
+        """Return the mark for a command of Typst (str)."""
+        return _command_mark(self.page, command)
 
     def block_quote(self, text):
         if not ANSWER.match(text):
             return super().block_quote(text)
-        return f"<p>{_command_mark(self.page, '#answer[')}</p>\n{text}<p>{_command_mark(self.page, ']')}</p>\n"
+        return f"<p>{self.command('#answer[')}</p>\n{text}<p>{self.command(']')}</p>\n"
 
     def link(self, text, url, title=None):
         if re.match(r"(https?|mailto):", url):

@@ -157,7 +157,7 @@ def _announced(book):
 
 
 def _without_sections(book, dropped):
-    """Return a book without the sections at the indexes `dropped` (set) of those by `sections_of`."""
+    """Return a book without the sections at the indexes `dropped` (set) in `sections_of`."""
     if not dropped:
         return book
     indexes, hidden, cells = count(), 0, []  # hidden: the level of the section left out here, or 0
