@@ -162,6 +162,25 @@ def test_links_lead_to_places_in_the_document(tmp_path):
     assert not any("txt" in str(target) or "ipynb" in str(target) for target in targets)
 
 
+def test_a_link_to_a_notebook_whose_name_has_a_space_leads_there():
+    first, last = (new_notebook(cells=[new_markdown_cell(text)])
+                   for text in ("# 1. T\n\n[There](2%20x.ipynb)", "# 2. X"))
+    files, _ = pdf.typst_files([(Path("1.ipynb"), first), (Path("2 x.ipynb"), last)])
+    text = files["main.typ"].decode()
+    label = re.search(r"#link\(<([\w-]+)>\)\[There\]", text)[1]
+    assert f"= 2. X\n<{label}>" in text
+
+
+def test_what_describes_a_figure_may_have_any_characters():
+    alt = 'a "b"); #c[\\] <at-d>'
+    book = new_notebook(cells=[
+        new_code_cell(outputs=[shown(("image/svg+xml", SVG))], metadata={"alt": alt}),
+        new_markdown_cell("Figure 1. Seen.")])
+    text = pdf.typst_files([(Path("1.ipynb"), book)])[0]["main.typ"].decode()
+    assert f"[#picture(\"picture-0.svg\", {json.dumps(alt)}, shrink: size)" in text
+    pdf.typeset([(Path("1.ipynb"), book)])
+
+
 def test_without_code_there_are_prose_formulas_figures_and_tables_only(tmp_path):
     files, book = pdf.typst_files([first()], code="none")
     text = files["main.typ"].decode()

@@ -58,6 +58,12 @@ def test_curves_are_rounded_only():
     assert ' d="M 0 1.23 C 2 3.14 4 5 6 7 z"' in small
 
 
+@pytest.mark.parametrize("data", ["M 0 0 1 1.25 2 0", "M 0 0 H 5.25", "M 0 0 L 1 1 z L 2 0"])
+def test_paths_that_are_written_otherwise_stay(data):
+    """Such as by other programs: a bare pair continues a line, a line may begin at the start."""
+    assert f' d="{data}"' in svg.compressed(f'<svg><path d="{data}"/></svg>')
+
+
 def test_marks_in_a_row_share_their_style():
     use = '<use xlink:href="#m" x="{}.123456" y="2" style="stroke: #000"/>\n'
     small = svg.compressed("<svg>" + use.format(1) + use.format(2) + "</svg>")
