@@ -29,18 +29,20 @@ from slamlib.report.setting import PLACES, UNKNOWN, compiled, typst_string
 from slamlib.report.svg import compressed
 
 TEMPLATE = Path(__file__).with_name("report.typ")
-PICTURES = {"image/svg+xml": "svg", "image/png": "png", "image/jpeg": "jpg"}
+PICTURES = {"image/svg+xml": "svg", "image/png": "png", "image/jpeg": "jpg"}  # endings of files
 OUTPUT_KINDS = (*PICTURES, "text/markdown", "text/latex", "text/html", "text/plain")  # best first
 CODE_COLUMNS = 96  # width of the page in characters of code
 COMMAND_MARK = re.compile("\ue002(\\d+)\ue003")  # stands for a command until pandoc is done
-CAPTIONED = r"\s*#caption\[.*?\] <at-\w+>"  # below a figure or a table
+# What pandoc and the commands write: figures and tables with their captions, table rows that hold
+# a group's name only, references that end a chapter, what is placed below a heading or announced.
+CAPTIONED = r"\s*#caption\[.*?\] <at-\w+>"
 FIGURE = re.compile(rf'#picture\(("[\w.-]+", "(?:[^"\\]|\\.)*")\);({CAPTIONED})', re.DOTALL)
 TABLE = re.compile(
     rf"#figure\(\n(?:(?!#figure\().)*?, kind: table\n  \){CAPTIONED}", re.DOTALL)
 NAME_ONLY = re.compile(
     r"^    \[((?:(?!\], ).)+)\](?:, (?:table\.cell\([^)]*\))?\[\])+,$", re.MULTILINE)
 REFERENCES = re.compile(r"^(== References\n<[\w-]+>\n)((?:(?!== ).*\n)+)\Z", re.MULTILINE)
-NEXT_NUMBER = "\ue004"  # stands for the next number of a figure, a table or a section
+NEXT_NUMBER = "\ue004"  # stands for the number of a figure, a table or a section, by their order
 STAYS = re.compile(rf"(?:^=+ .*\n<[\w-]+>\n|#announcing\[.*\n(?:.+\n)*)\s*#placed\({NEXT_NUMBER}, ",
                    re.MULTILINE)
 SCALED = re.compile(r"#scale\(x: (\d+)%, y: \d+%\)\[(\\?[^\\]|\\\])\]")  # pandoc's \big, \Big, ...
