@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from slamlib import solve
-from slamlib.report.animation import animation, moving
+from slamlib.report.animation import animated, moving
 from slamlib.report.chapters import printed
 from slamlib.report.drives import SolvedDrive
-from slamlib.report.overview import index, summary
+from slamlib.report.overview import index, opening
+from slamlib.report.pages import STYLE
 from slamlib.simulation import simulate
 
 MOST = 1_000_000               # bytes
@@ -27,7 +28,7 @@ def drive():
 
 
 def test_the_animation_is_small_loads_nothing_and_moves_both_paths_in_time(drive):
-    html = animation(drive)
+    html = animated(drive)
     assert len(html.encode()) < MOST / 5
     assert not re.search(r"<script|\s(?:src|href)=|url\(|@import", html)
     svg = ElementTree.fromstring(re.search("<svg.*</svg>", html, re.DOTALL)[0])
@@ -41,12 +42,12 @@ def test_the_animation_is_small_loads_nothing_and_moves_both_paths_in_time(drive
 
 
 def test_it_pauses_without_script_and_stands_still_where_no_motion_is_wanted(drive):
-    html = animation(drive)
+    html = animated(drive)
     box = re.search(r'<input class="pause" type="checkbox" id="(\w+)">', html)[1]
     assert f'for="{box}"' in html and "<script" not in html
-    still = re.search(r"@media \(prefers-reduced-motion: reduce\) \{(.*?)\}\s*@media", html,
+    still = re.search(r"@media \(prefers-reduced-motion: reduce\) \{(.*?)\}\s*@media", STYLE,
                       re.DOTALL)[1]
-    assert "animation: none" in still
+    assert ".drive svg * { animation: none" in still
 
 
 def test_what_cannot_move_has_no_animation(drive):
@@ -54,16 +55,16 @@ def test_what_cannot_move_has_no_animation(drive):
                                   covariances=np.zeros((3, 3, 3)))
                   for problem in ("problem1", "problem4"))
     for solutions in (drive.solutions[:1], still, ()):
-        assert animation(replace(drive, solutions=solutions)) == ""
+        assert animated(replace(drive, solutions=solutions)) == ""
         assert moving(replace(drive, solutions=solutions)) == []
 
 
 def test_the_first_page_moves_and_the_pdf_does_not(drive):
-    opening = summary([drive])
-    assert "@keyframes" in str(index("Report", opening, []).cells)
-    assert "@keyframes" in str(opening.cells) and "@keyframes" not in str(printed(opening).cells)
+    book = opening([drive])
+    assert "@keyframes" in str(index("Report", book, []).cells)
+    assert "@keyframes" in str(book.cells) and "@keyframes" not in str(printed(book).cells)
 
 
 def test_a_drive_without_truth_moves_too(drive):
-    html = animation(replace(drive, truth=None))
+    html = animated(replace(drive, truth=None))
     assert "truth" not in re.sub("<style>.*?</style>", "", html, flags=re.DOTALL)

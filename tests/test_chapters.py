@@ -115,6 +115,14 @@ def test_code_is_folded_on_the_page_and_left_out_of_the_pdf(code, folded, shown)
     assert content.count("told") == (0 if code == "none" else 2)
 
 
+def test_punctuation_stands_behind_a_display_formula_and_beside_one_in_the_line():
+    page, _ = pages.html_page(Path("1.ipynb"), titled("1. T", new_markdown_cell(
+        "So $a$, and $$ b \\tag{1.1} $$.")), [])
+    assert re.search(r'<span class="keep"><math.*?</math>,</span> and', page, re.DOTALL)
+    assert re.search(r'<span class="equation" id="eq-1.1"><span class="keep"><math.*?</math></span>'
+                     r'<span class="number">\(1.1\)</span></span>\.', page, re.DOTALL)
+
+
 def test_only_a_page_with_something_live_has_the_build_s_script(tmp_path, monkeypatch):
     (tmp_path / "page.js").write_text("moved();\n")
     monkeypatch.setattr(pages, "SCRIPT", tmp_path / "page.js")

@@ -19,7 +19,7 @@ from slamlib.report.chapters import printed
 from slamlib.report.execution import NotebookError
 from slamlib.report.pages import html_page
 from slamlib.report.pictures import title_picture
-from slamlib.report.svg import compact
+from slamlib.report.svg import compressed
 from slamlib.results import write_vehicle_poses
 from slamlib.simulation import simulate, write_dataset
 from slamlib.solve import Failure, Solution, problem1, solutions, title, write
@@ -53,7 +53,7 @@ def project(tmp_path_factory):
 def summary(project):
     """The summary of the three drives."""
     folder, written, _ = project
-    return overview.summary(
+    return overview.opening(
         solved_drives.read_drives(folder / "data", folder / "results", NAMES, written))
 
 
@@ -122,7 +122,7 @@ def test_doubts_and_failures_stand_on_the_first_page_only_where_there_are_any(pr
                             Doubt("units", "Lengths are *mm*.")],
                "all": [Doubt("antenna", "Antenna 7 is in doubt.")]}
     drives = solved_drives.read_drives(folder / "data", folder / "results", NAMES, written, notices)
-    told = overview.summary(drives)
+    told = overview.opening(drives)
     rows, text = result_rows(told)
     assert rows["no_truth", "SLAM: odometry + ArUco"] == ["could not be solved", *["–"] * 4]
     doubts = next(cell.source for cell in told.cells if cell.id == "doubts")
@@ -137,7 +137,7 @@ def test_a_problem_that_nothing_solves_is_in_the_table():
     dataset = simulate("short", seed=5)[0]
     failed = Failure("problem3", "SLAM: odometry + ArUco", "expected more")
     drive = solved_drives.SolvedDrive("x", dataset, None, (problem1(dataset),), failures=(failed,))
-    rows, _ = result_rows(overview.summary([drive]))
+    rows, _ = result_rows(overview.opening([drive]))
     assert rows["x", "SLAM: odometry + ArUco"][0] == "could not be solved"
 
 
@@ -151,7 +151,7 @@ def test_a_problem_that_is_not_known_appears_by_its_folder(tmp_path):
     write_vehicle_poses(tmp_path / "results" / "other" / "a", np.zeros((2, 3)), np.zeros((2, 3, 3)))
     drives = solved_drives.read_drives(tmp_path / "data", tmp_path / "results", ["other", "plain"],
                                   ["other/a/vehiclePose.mat", *written])
-    summary = overview.summary(drives)
+    summary = overview.opening(drives)
     rows, _ = result_rows(summary)
     assert rows["other", "a"] == ["0.00\u00a0mm", "0.00\u00a0mrad", "2"]
     assert rows["plain", "a"][0] == "no result"
@@ -175,7 +175,7 @@ def test_the_picture_is_the_same_every_time_and_needs_no_display(project, summar
     folder, written, solved = project
     drives = solved_drives.read_drives(folder / "data", folder / "results", NAMES, written)
     pictures = pictures_of(summary)
-    assert pictures == pictures_of(overview.summary(drives))
+    assert pictures == pictures_of(overview.opening(drives))
     assert set(pictures) == {plotting.WIDE, plotting.NARROW}
     for text in pictures.values():
         assert text.count("<path") > 10
@@ -187,7 +187,7 @@ def test_the_picture_is_the_same_every_time_and_needs_no_display(project, summar
 def test_the_page_has_the_picture_wide_and_for_phones_narrow(summary):
     page, _ = html_page(Path("index"), summary, [])
     pictures = pictures_of(summary)
-    wide, narrow = (base64.b64encode(compact(pictures[kind]).encode()).decode()
+    wide, narrow = (base64.b64encode(compressed(pictures[kind]).encode()).decode()
                     for kind in (plotting.WIDE, plotting.NARROW))
     picture = re.search("<picture>(.*)</picture>", page)[1]
     assert picture.count(f' src="data:image/svg+xml;base64,{wide}"') == 1
@@ -214,7 +214,7 @@ def test_dashes_are_explained_only_where_some_truth_is_unknown(project):
     known = [drive for drive in drives if drive.truth is not None]
     assert len(known) < len(drives) and "dash" in about_dashes(drives)
     assert about_dashes(known) == ""
-    assert "dash" not in overview.summary(known).cells[1].source
+    assert "dash" not in overview.opening(known).cells[1].source
 
 
 def test_of_many_drives_the_abstract_names_the_shortest_and_the_longest(project, summary):
@@ -222,7 +222,7 @@ def test_of_many_drives_the_abstract_names_the_shortest_and_the_longest(project,
     drives = solved_drives.read_drives(folder / "data", folder / "results", NAMES, written)
     text = overview.abstract([drives[0], *4 * [drives[1]], drives[2]])
     assert [name for name in NAMES if f"n *{name}* " in text] == [drives[0].name, drives[2].name]
-    recorded = overview.summary([drive for drive in drives if drive.truth is None])
+    recorded = overview.opening([drive for drive in drives if drive.truth is None])
     rows, text = result_rows(recorded)
     assert not re.search("simulated|ATE|(?<!_)truth", text.split("## The datasets")[0])
     assert re.search(r"Odometry differs from this by [\d.]+\u00a0m?m on \*no_truth\* .*SLAM, which "
@@ -237,7 +237,7 @@ def test_files_to_hand_in_stand_by_problem_and_dataset(project):
     folder, written, _ = project
     written = [*written, "other/problem4/UwbMap.mat", "all/notes.txt"]
     drives = solved_drives.read_drives(folder / "data", folder / "results", NAMES, written)
-    text = overview.summary(drives, "../the results").cells[2].source
+    text = overview.opening(drives, "../the results").cells[2].source
     assert text.startswith("## Files to hand in")
     last = next(line for line in text.splitlines() if line.startswith("| 4. SLAM"))
     name, at, poses, _, ranges = [cell.strip() for cell in last.strip("|").split("|")]
@@ -251,7 +251,7 @@ def test_files_to_hand_in_stand_by_problem_and_dataset(project):
 def test_the_opening_of_any_one_drive_fits_on_a_page(project, tmp_path, name):
     folder, written, _ = project
     drives = solved_drives.read_drives(folder / "data", folder / "results", [name], written)
-    text = text_of(pdf.typeset([], printed(overview.summary(drives)), "method",
+    text = text_of(pdf.typeset([], printed(overview.opening(drives)), "method",
                                title_picture(drives[0]), title="T"), tmp_path)
     cover, contents, *pages = text.rstrip("\f\n").split("\f")
     assert len(pages) == 1 and "Figure 1." in pages[0] and "The datasets" not in text
@@ -293,6 +293,6 @@ def test_notes_on_files_stand_on_the_first_page_only_where_there_are_any(project
     assert not [cell for cell in summary.cells if cell.id == "notes"]
     drives = [solved_drives.SolvedDrive(name, replace(dataset, notes=notes), None, ())
               for name, notes in (("a", ()), ("b_*", ("X*.txt is not read.", "Y holds no rows.")))]
-    notes = next(cell.source for cell in overview.summary(drives).cells if cell.id == "notes")
+    notes = next(cell.source for cell in overview.opening(drives).cells if cell.id == "notes")
     assert notes == ("Notes on the files of *b&#95;&#42;*: X&#42;.txt is not read. "
                      "Y holds no rows.")

@@ -61,7 +61,7 @@ def query(files, folder, selector):
 
 def test_every_formula_is_in_the_document_once(tmp_path):
     files, book = pdf.typst_files([first(), second()])
-    formulas = book.page["formulas"]
+    formulas = book.formulas
     assert len(formulas) == TEXT_FORMULAS + 3
     # A set, since a heading's formula is in the contents, too.
     labels = {element["label"] for element in query(files, tmp_path, "math.equation")}
@@ -153,19 +153,39 @@ def test_the_box_answer_is_framed_and_other_quotes_are_not():
 def test_links_lead_to_places_in_the_document(tmp_path):
     files, book = pdf.typst_files([first(), second()])
     targets = [element["dest"] for element in query(files, tmp_path, "link")]
-    numbered = {book.page["tags"][n]: f"<{label}>" for n, label in book.page["labels"].items()}
-    assert targets.count(numbered["(1)"]) == 2  # from either chapter
+    numbered = {formula.number: f"<{label}>"
+                for formula, label in zip(book.formulas, book.labels, strict=True)}
+    assert targets.count(numbered["1"]) == 2  # from either chapter
     headings = {element.get("label") for element in query(files, tmp_path, "heading")}
     assert len(headings & set(targets)) == 2  # the first chapter, and a section of the second
     assert "https://example.org/paper" in targets
     assert not any("txt" in str(target) or "ipynb" in str(target) for target in targets)
 
 
+def test_a_link_to_a_notebook_whose_name_has_a_space_leads_there():
+    first, last = (new_notebook(cells=[new_markdown_cell(text)])
+                   for text in ("# 1. T\n\n[There](2%20x.ipynb)", "# 2. X"))
+    files, _ = pdf.typst_files([(Path("1.ipynb"), first), (Path("2 x.ipynb"), last)])
+    text = files["main.typ"].decode()
+    label = re.search(r"#link\(<([\w-]+)>\)\[There\]", text)[1]
+    assert f"= 2. X\n<{label}>" in text
+
+
+def test_what_describes_a_figure_may_have_any_characters():
+    alt = 'a "b"); #c[\\] <at-d>'
+    book = new_notebook(cells=[
+        new_code_cell(outputs=[shown(("image/svg+xml", SVG))], metadata={"alt": alt}),
+        new_markdown_cell("Figure 1. Seen.")])
+    text = pdf.typst_files([(Path("1.ipynb"), book)])[0]["main.typ"].decode()
+    assert f"[#picture(\"picture-0.svg\", {json.dumps(alt)}, shrink: size)" in text
+    pdf.typeset([(Path("1.ipynb"), book)])
+
+
 def test_without_code_there_are_prose_formulas_figures_and_tables_only(tmp_path):
     files, book = pdf.typst_files([first()], code="none")
     text = files["main.typ"].decode()
     assert "print" not in text and "shown" not in text and "plot()" not in text
-    assert len(book.page["formulas"]) == TEXT_FORMULAS + 3
+    assert len(book.formulas) == TEXT_FORMULAS + 3
     assert "#picture(" in text and '#placed(2, "table", _ => [#figure(' in text
     assert text.count("#caption[") == 2
     assert "print" in pdf.typst_files([first()])[0]["main.typ"].decode()
@@ -275,7 +295,7 @@ def test_wide_lines_are_folded_and_nothing_of_them_is_lost(tmp_path):
     text = text_of(pdf.typeset([(Path("1.ipynb"), book)]), tmp_path)
     assert re.sub(r"[\s↪]", "", text).count(wide) == 2
     lines = [line.strip() for line in text.splitlines() if "<" in line]
-    assert max(map(len, lines)) <= pdf.COLUMNS + 2 and len(lines) >= 8
+    assert max(map(len, lines)) <= pdf.CODE_COLUMNS + 2 and len(lines) >= 8
 
 
 def test_a_character_that_no_font_has_is_named():

@@ -17,7 +17,7 @@ from slamlib.report.chapters import with_data
 from slamlib.report.execution import NotebookError
 from slamlib.report.numbering import numbered
 from slamlib.report.options import Options
-from slamlib.report.sections import Section, sections, shown, to_execute
+from slamlib.report.sections import Section, sections_of, shown, to_execute
 
 ONE, TWO, MORE = Path("1_one.ipynb"), Path("2_two.ipynb"), Path("A_more.ipynb")
 TRUTH = {"slamlib": {"needs": "truth"}}
@@ -46,12 +46,13 @@ def content(book):
 
 
 def test_sections_have_the_numbers_of_the_pages():
-    assert sections(ONE, book()) == [
+    assert sections_of(ONE, book()) == [
         Section(1, "1", "1. One"), Section(2, "1.1", "First"),
         Section(2, "1.2", "Errors", "truth"), Section(3, "1.2.1", "Deep"),
         Section(3, "1.2.2", "Deeper"), Section(2, "1.3", "Said"), Section(2, "1.4", "Last"),
         Section(2, "1.5", "Really last")]
-    assert sections(ONE, titled("Untitled", new_markdown_cell("## A")))[1] == Section(2, None, "A")
+    untitled = titled("Untitled", new_markdown_cell("## A"))
+    assert sections_of(ONE, untitled)[1] == Section(2, None, "A")
 
 
 def test_nothing_is_changed_where_nothing_is_left_out():
@@ -97,7 +98,7 @@ def test_a_number_names_the_same_section_whatever_the_datasets_have():
      "expected needs among aruco, uwb, truth in the metadata, found 'lidar'")])
 def test_needs_that_would_be_ignored_are_refused(cell, found):
     with pytest.raises(NotebookError, match=f"^1_one.ipynb: .*{found}"):
-        sections(ONE, titled("1. One", cell))
+        sections_of(ONE, titled("1. One", cell))
 
 
 def test_a_notebook_may_need_truth():

@@ -1,7 +1,7 @@
-"""The drive that moves on the first page: odometry beside SLAM, each with its ellipses.
+"""The animated drive on the first page: odometry beside SLAM, each with its ellipses.
 
-It is an SVG whose paths are drawn by CSS alone: a check box pauses it, and where the reader wants
-no motion, and on paper, it stands still at its end. It loads nothing.
+It is an SVG that CSS alone animates (with the rules for `.drive` in page.css): a check box pauses
+it, and it stands still at its end on paper and where the reader wants no motion. It loads nothing.
 """
 
 from hashlib import sha256
@@ -16,60 +16,44 @@ from slamlib.notebook import plotting, with_unit
 from slamlib.odometry import cumulative
 from slamlib.report.chapters import HTML_ONLY
 
-SECONDS, MOVING = 24, 0.88     # of one round, and the share of it in which the vehicle moves
-WIDTH, HEIGHTS = 720, (280, 460)                 # units of the drawing, about pixels
-MARGIN = 24
-POINTS, STOPS = 500, 40        # of a path, and where its time is exact
-ELLIPSES = 8, 16               # of odometry, and of the estimate beside it
-SEEN = 0.08                    # of the path's extent: longest semi-axis of the latter, enlarged
-ESTIMATES = ("problem4", "problem3", "problem2_fused")   # beside odometry, the best first
-STYLE = """.drive svg { display: block; width: 100%; height: auto; }
-.drive path { fill: none; }
-.drive ellipse { fill-opacity: 0.08; stroke-opacity: 0.55; }
-.drive .true { stroke: currentColor; stroke-width: 1; stroke-dasharray: 5 4; opacity: 0.6; }
-.drive .bar { stroke: currentColor; stroke-width: 1.5; }
-.drive text { fill: currentColor; font: 18px sans-serif; }
-.drive .key, .drive label { margin: 0.3em; font: 0.86rem/1.5 var(--sans, sans-serif); }
-.drive .key span { display: inline-block; margin: 0 0.8em; }
-.drive .key i { display: inline-block; width: 1.6em; margin-right: 0.5em;
-  vertical-align: middle; border-top: 3px solid; }
-.drive figcaption { margin-top: 0.6em; font-size: 0.92em; line-height: 1.45; text-align: left; }
-.drive input:checked ~ svg * { animation-play-state: paused !important; }
-@media (prefers-reduced-motion: reduce) {
-  .drive svg * { animation: none !important; } .drive .pause { display: none; } }
-@media screen and (prefers-color-scheme: dark) { .drive svg { filter: brightness(1.4); } }
-@media print { .drive svg * { animation: none !important; } .drive .pause { display: none; } }
-"""
+SECONDS, MOVING_SHARE = 24, 0.88  # of one round, and the share of it in which the vehicle moves
+WIDTH, HEIGHTS = 720, (280, 460)  # units of the drawing, about pixels: width, least and most height
+DRAWING_MARGIN = 24  # units of the drawing
+PATH_POINTS, STOPS = 500, 40  # numbers of points of a path, and of those where its time is exact
+ELLIPSE_COUNTS = 8, 16  # of odometry, and of the estimate beside it
+MAX_SEMI_AXIS = 0.08  # of the path's extent: the estimate's ellipses are enlarged up to it
+BESIDE_ODOMETRY = ("problem4", "problem3", "problem2_fused")  # estimates, the best first
+
 
 
 def moving(drive):
-    """Cells for a SolvedDrive in motion, which the PDF leaves out: a list of one, or of none."""
-    html = animation(drive)
+    """Return a list of the cell with a SolvedDrive's animation, for pages only; [] without one."""
+    html = animated(drive)
     output = new_output("display_data", {"text/html": Markup(html)})  # a page takes it as it is
     return [new_code_cell(outputs=[output], id="motion",
                           metadata={"tags": [HTML_ONLY]})] if html else []
 
 
-def animation(drive):
-    """HTML (str) in which a SolvedDrive is driven; "" without odometry or an estimate beside it."""
+def animated(drive):
+    """Return the animation of a SolvedDrive in HTML; "" without odometry and another estimate."""
     solved = {solution.problem: solution for solution in drive.solutions}
-    best = next((solved[problem] for problem in ESTIMATES if problem in solved), None)
+    best = next((solved[problem] for problem in BESIDE_ODOMETRY if problem in solved), None)
     if best is None or "problem1" not in solved or evaluation.path_length(best.poses) <= 0:
         return ""
     shown = [solved["problem1"].poses, best.poses]
     shown += [drive.truth.poses] if drive.truth else []
     on_page, height, scale = _projection(shown)
     layers = [(solved["problem1"], "#D55E00", 1),
-              (best, "#0072B2", plotting.enlargement(best.poses, best.covariances, SEEN))]
+              (best, "#0072B2", plotting.enlargement(best.poses, best.covariances, MAX_SEMI_AXIS))]
     parts, rules = [], []
     own = f"d{sha256(np.concatenate(shown).tobytes()).hexdigest()[:6]}"
     if drive.truth is not None:
-        parts.append(f'<path class="true" d="{_path(on_page(drive.truth.poses))}"/>')
-    for name, count, layer in zip("ab", ELLIPSES, layers, strict=True):
+        parts.append(f'<path class="true" d="{_path_data(on_page(drive.truth.poses))}"/>')
+    for name, count, layer in zip("ab", ELLIPSE_COUNTS, layers, strict=True):
         drawn, styled = _layer(own + name, count, *layer, on_page, scale)
         parts.append(drawn)
         rules.append(styled)
-    return (f'<figure class="drive"><style>{STYLE}{"".join(rules)}</style>'
+    return (f'<figure class="drive"><style>{"".join(rules)}</style>'
             f'<input class="pause" type="checkbox" id="{own}"><label class="pause" for="{own}">'
             f'Pause</label><svg viewBox="0 0 {WIDTH} {height}" role="img" '
             f'aria-label="{escape(_described(drive, best))}">{"".join(parts)}{_bar(scale, height)}'
@@ -78,14 +62,15 @@ def animation(drive):
 
 
 def _layer(name, count, solution, color, enlarged, on_page, scale):
-    """SVG (str) of a path, its ellipses and the vehicle, and the rules (str) by which they move."""
+    """Return a Solution's path, ellipses and vehicle in SVG (str), and the CSS that moves them."""
     known = np.flatnonzero(np.isfinite(solution.poses[:, 0]))
     poses = solution.poses[known]
-    at = plotting.spread(poses, count)
+    indices = plotting.spread(poses, count)
     drawn, rules = [], []
-    for number, (i, ellipse) in enumerate(zip(at, _ellipses(
-            on_page(poses[at]), solution.covariances[known[at]], enlarged * scale), strict=True)):
-        when = 100 * MOVING * i / (len(poses) - 1)
+    for number, (i, ellipse) in enumerate(zip(indices, _ellipses(
+            on_page(poses[indices]), solution.covariances[known[indices]], enlarged * scale),
+            strict=True)):
+        when = 100 * MOVING_SHARE * i / (len(poses) - 1)
         rules.append(f"@keyframes {name}{number}{{0%,{when:.1f}%{{opacity:0}}"
                      f"{when + 0.5:.1f}%,100%{{opacity:1}}}}")
         drawn.append(f'<ellipse {ellipse} stroke="{color}" fill="{color}" '
@@ -94,13 +79,13 @@ def _layer(name, count, solution, color, enlarged, on_page, scale):
     travelled = cumulative(np.hypot(*np.diff(path, axis=0).T))
     stops = np.unique(np.linspace(0, len(poses) - 1, STOPS).astype(int))
     done = travelled[stops] / max(travelled[-1], 1e-9)
-    times = 100 * MOVING * stops / stops[-1]
+    times = 100 * MOVING_SHARE * stops / stops[-1]
     for kind, rule in (("line", "stroke-dashoffset:{:.4f}"), ("dot", "offset-distance:{:.2f}%")):
         values = 1 - done if kind == "line" else 100 * done
         frames = "".join(f"{time:.1f}%{{{rule.format(value)}}}"
                          for time, value in zip(times, values, strict=True))
         rules.append(f"@keyframes {name}{kind}{{{frames}100%{{{rule.format(values[-1])}}}}}")
-    d = _path(path, travelled)
+    d = _path_data(path)
     drawn.append(
         f'<path d="{d}" pathLength="1" stroke="{color}" stroke-width="2.2" style="stroke-dasharray:'
         f'1;stroke-dashoffset:0;animation:{name}line {SECONDS}s linear infinite"/>'
@@ -110,22 +95,22 @@ def _layer(name, count, solution, color, enlarged, on_page, scale):
 
 
 def _projection(shown):
-    """A function from positions (n, >= 2) in m to the page, the page's height, and units per m."""
+    """Return a function from positions (n, >= 2) in m to the page, its height, and units per m."""
     every = np.concatenate([poses[np.isfinite(poses[:, 0]), :2] for poses in shown])
     low, high = every.min(0), every.max(0)
-    room = np.array([WIDTH, HEIGHTS[1]]) - 2 * MARGIN
+    room = np.array([WIDTH, HEIGHTS[1]]) - 2 * DRAWING_MARGIN
     scale = (room / np.maximum(high - low, 1e-6)).min()
-    height = round(max(HEIGHTS[0], scale * (high - low)[1] + 2 * MARGIN))
+    height = round(max(HEIGHTS[0], scale * (high - low)[1] + 2 * DRAWING_MARGIN))
     middle = (low + high) / 2
     flip = np.array([scale, -scale])
     return lambda poses: (poses[:, :2] - middle) * flip + [WIDTH / 2, height / 2], height, scale
 
 
-def _path(points, travelled=None):
-    """The d of an SVG path along points (n, 2), of which POINTS at equal distances are kept."""
+def _path_data(points):
+    """Return the data of an SVG path along points (n, 2), thinned out at equal distances."""
     points = points[np.isfinite(points[:, 0])]
-    travelled = cumulative(np.hypot(*np.diff(points, axis=0).T)) if travelled is None else travelled
-    kept = np.unique(np.searchsorted(travelled, np.linspace(0, travelled[-1], POINTS)))
+    travelled = cumulative(np.hypot(*np.diff(points, axis=0).T))
+    kept = np.unique(np.searchsorted(travelled, np.linspace(0, travelled[-1], PATH_POINTS)))
     return "M" + " ".join(f"{x:.1f} {y:.1f}" for x, y in points[np.minimum(kept, len(points) - 1)])
 
 
@@ -140,15 +125,15 @@ def _ellipses(centres, covariances, scale):
 
 
 def _bar(scale, height):
-    """A scale bar (SVG, str) of 1, 2 or 5 times a power of ten metres in the lower left corner."""
+    """Return a scale bar (SVG, str) of 1, 2 or 5 times a power of ten metres."""
     lengths = np.outer(10.0 ** np.arange(-3, 5), [1, 2, 5]).ravel()
     length = lengths[np.searchsorted(lengths, WIDTH / 6 / scale)]
-    return (f'<path class="bar" d="M{MARGIN} {height - 12}h{length * scale:.1f}"/>'
-            f'<text x="{MARGIN}" y="{height - 18}">{length:g} m</text>')
+    return (f'<path class="bar" d="M{DRAWING_MARGIN} {height - 12}h{length * scale:.1f}"/>'
+            f'<text x="{DRAWING_MARGIN}" y="{height - 18}">{length:g} m</text>')
 
 
 def _said(drive, first, best):
-    """What the motion shows, in HTML: the largest errors of odometry and of the best estimate."""
+    """Return the caption in HTML: the largest errors of odometry and of the best estimate."""
     begin = f"The drive <em>{escape(drive.name)}</em> in {SECONDS} seconds: odometry is up to"
     estimate = f"the estimate “{escape(best.title)}”"
     if drive.truth is None:
@@ -164,7 +149,7 @@ def _farthest(poses, others):
 
 
 def _legend(layers, truth):
-    """The names of the layers (solution, colour, enlargement of its ellipses), and of the truth."""
+    """Return the legend in HTML of layers (solution, colour, enlargement) and of the truth."""
     lines = [f'<span><i style="border-color:{color}"></i>{escape(solution.title)}, 95 % ellipses'
              f'{f" × {enlarged}" if enlarged > 1 else ""}</span>'
              for solution, color, enlarged in layers]

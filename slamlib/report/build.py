@@ -229,14 +229,14 @@ def rendered(books, drives, options, address, has):
     drives : list of SolvedDrive, of which the opening tells.
     options : Options as of `build_report`.
     address : str, the path of the results folder from that of the report, or None as of
-        `overview.summary`.
+        `overview.opening`.
     has : set of str by `chapters.available`; sections that need other data are left out.
     """
     whole, books = books, shown(books, has, options.leave_out)
     on_paper = numbered({source: printed(book) for source, book in books.items()}, whole)
     on_pages = numbered(books, whole)
-    chapters = [chapter_of(*each) for each in on_pages.items()]
-    opening = overview.summary(drives, address)
+    chapters = [chapter_of(source, book) for source, book in on_pages.items()]
+    opening = overview.opening(drives, address)
     index = {Path("index"): overview.index(options.cover.title, opening, chapters)}
     solved = [drive for drive in drives if drive.solutions]
     shortened = {source: book for source, book in whole.items() if books.get(source) is not book}

@@ -70,8 +70,9 @@ def read_drives(data, results, selected, written, notices=None):
         doubts = [*doubts_about_drive(dataset, truth), *(x for x in told if isinstance(x, Doubt))]
         failures = sorted((x for x in told if isinstance(x, Failure)),
                           key=lambda failure: order(failure.problem))
-        drives.append(SolvedDrive(name, dataset, truth, solved, tuple(merged(doubts)),
-                                  tuple(failures), files))
+        drives.append(SolvedDrive(
+            name=name, dataset=dataset, truth=truth, solutions=solved,
+            doubts=tuple(merged(doubts)), failures=tuple(failures), files=files))
     return sorted(drives, key=lambda drive: len(drive.dataset.ticks))
 
 
@@ -83,25 +84,26 @@ def order(problem):
 def _read_solution(folder, dataset, files):
     """Return the Solution in a results folder; its world frame is the first pose estimated."""
     count = len(dataset.ticks)
-    poses, covariances = _read(read_vehicle_poses, folder, "vehiclePose.mat")
+    poses, covariances = _read_result(read_vehicle_poses, folder, "vehiclePose.mat")
     if poses.shape != (count, 3) or covariances.shape != (count, 3, 3):
         raise NotebookError(
-            f"{_name(folder, 'vehiclePose.mat')}, must hold [x, y, heading] and a covariance for "
-            f"each of the {count} encoder poses; it holds {poses.shape}, {covariances.shape}")
+            f"{_written_file(folder, 'vehiclePose.mat')}, must hold [x, y, heading] and a "
+            f"covariance for each of the {count} encoder poses; it holds {poses.shape}, "
+            f"{covariances.shape}")
     known = np.flatnonzero(np.isfinite(poses[:, 0]))
-    maps = {field: _read(function, folder, file) for field, function, file in (
+    maps = {field: _read_result(function, folder, file) for field, function, file in (
         ("aruco_map", read_aruco_map, "ArucoMap.mat"), ("uwb_map", read_uwb_map, "UwbMap.mat"))
         if f"{folder.name}/{file}" in files}
     return Solution(problem=folder.name, title=title(folder.name, dataset), poses=poses,
                     covariances=covariances, world=int(known[0]) if len(known) else 0, **maps)
 
 
-def _read(function, folder, file):
+def _read_result(function, folder, file):
     try:
         return function(folder)
     except Exception as error:  # scipy and numpy raise many kinds
-        raise NotebookError(f"{_name(folder, file)}, cannot be read: {error}") from None
+        raise NotebookError(f"{_written_file(folder, file)}, cannot be read: {error}") from None
 
 
-def _name(folder, file):
+def _written_file(folder, file):
     return f"{folder.parent.name}/{folder.name}/{file}, which a notebook wrote"

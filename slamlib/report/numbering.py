@@ -18,7 +18,7 @@ TAG = re.compile(r"\\tag\*?\s*\{([^{}]*)\}")
 DOTTED, WHOLE, LETTER = r"(?:\d+|(?-i:[A-Z]))\.\d+", r"\d+(?![.\d]*\d)", r"(?-i:[A-Z])\b"
 LABEL = r"\d+(?:\.\d+)?|\b[A-Z]\.\d+|\b[A-Z]\b"  # each of those
 AND = r"(?:,?\s+(?:and|to|or)\s+|,\s+|–)"
-PARTS = re.compile(  # code, formulas and addresses; headings; captions; references
+TEXT_PARTS = re.compile(  # code, formulas and addresses; headings; captions; references
     r"```.*?```|`[^`\n]*`|\$\$.*?\$\$|\$[^$\n]*\$|\]\([^)\n]*\)"
     r"|(?:\A|\n\s*\n)(?:#(?:(?!\n\s*\n).)*|(?P<caption>\W*(Figure|Table)\s+)"
     r"(\d+\.\d+|[A-Z]\.\d+)\.(?!\d))"
@@ -135,4 +135,4 @@ def _linked(text, source, targets, absent, chapters):
         return part[0].removesuffix(labels) + re.sub(
             LABEL, lambda label: link(kind, label[0]), labels)
 
-    return PARTS.sub(replaced, text)
+    return TEXT_PARTS.sub(replaced, text)

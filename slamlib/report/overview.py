@@ -4,6 +4,7 @@ All numbers are computed from the result files and, where it is known, the truth
 """
 
 import re
+from collections import defaultdict
 from pathlib import PurePosixPath
 from urllib.parse import quote
 
@@ -20,59 +21,58 @@ from slamlib.report.pictures import trajectories
 from slamlib.results import FILES
 from slamlib.solve import PROBLEMS, SENSORS, title, truth_in_world
 
-METHODS = {  # in the order of the problems; the hint is left to chapter 2
+METHOD_PHRASES = {  # in the order of the problems; the hint is left to chapter 2
     "problem1": "by odometry (problem\u00a01)", "problem2": "by markers alone",
     "problem2_fused": "with odometry fused (problem\u00a02)",
     "problem3": "by SLAM on odometry and markers (problem\u00a03)",
     "problem4": "by SLAM with the UWB ranges (problem\u00a04)"}
-FEW = 3  # drives, at most, that the abstract names one by one
+MAX_NAMED = 3  # drives that the abstract names one by one
 
 
-def summary(drives, address="."):
+def opening(drives, address="."):
     """Return the opening of the report, an executed NotebookNode, for a list of SolvedDrive.
 
     `address` (str) is the path of the results folder from that of the report; with None the table
     of the files to hand in is left out.
     """
-    cells = [new_markdown_cell("# Overview\n\n" + abstract(drives), id="what")]
     solved = [drive for drive in drives if drive.solutions]
-    if solved:
-        cells.append(new_markdown_cell("## Results\n\n" + _result_table(drives), id="results"))
-    if doubts := _doubts(drives):
-        cells.append(new_markdown_cell(f"## Doubts about the data\n\n{doubts}", id="doubts"))
-    if notes := _notes(drives):
-        cells.append(new_markdown_cell(notes, id="notes"))
-    if address is not None and any(drive.files for drive in drives):
-        cells.append(new_markdown_cell(
-            "## Files to hand in\n\n" + _file_table(drives, PurePosixPath(address)), id="files"))
+    texts = {"what": f"# Overview\n\n{abstract(drives)}",
+             "results": _result_table(drives) if solved else "",
+             "doubts": _doubts(drives), "notes": _notes(drives),
+             "files": "" if address is None else _file_table(drives, PurePosixPath(address))}
+    cells = [new_markdown_cell(text, id=name) for name, text in texts.items() if text]
     if solved:
         longest = max(solved, key=lambda drive: len(drive.dataset.ticks))
-        cells += [
-            *moving(longest),
-            new_code_cell(outputs=[new_output("display_data", trajectories(longest))], id="picture",
-                          metadata={"alt": f"The trajectories of {longest.name}, and the standard "
-                                           "deviation of position along them"}),
-            new_markdown_cell(
-                f"Figure 1. *{plain(longest.name)}*, the longest drive. Left: its trajectory by "
-                "odometry, by fusion and by the last problem"
-                f"{', and the truth (dashed)' if longest.truth else ''}. Right: the standard "
-                "deviation of position along the drive, for every problem, on a logarithmic axis"
-                f"{'; problem 3 is the wide line' if longest.solution('problem3') else ''}.",
-                id="caption")]
-    cells.append(new_markdown_cell("## The datasets\n\n" + _dataset_table(drives), id="datasets",
+        cells += [*moving(longest), *_first_figure(longest)]
+    cells.append(new_markdown_cell(_dataset_table(drives), id="datasets",
                                    metadata={"tags": [HTML_ONLY]}))  # chapter 1 has this table
     return new_notebook(cells=cells)
 
 
-def index(heading, opening, chapters):
-    """Return the first page, a NotebookNode: the opening by `summary` with links to all the rest.
+def _first_figure(drive):
+    """Return the cells of the figure of a SolvedDrive and of its caption."""
+    return [
+        new_code_cell(outputs=[new_output("display_data", trajectories(drive))], id="picture",
+                      metadata={"alt": f"The trajectories of {drive.name}, and the standard "
+                                       "deviation of position along them"}),
+        new_markdown_cell(
+            f"Figure 1. {_emphasized(drive)}, the longest drive. Left: its trajectory by odometry, "
+            f"by fusion and by the last problem{', and the truth (dashed)' if drive.truth else ''}."
+            " Right: the standard deviation of position along the drive, for every problem, on a "
+            "logarithmic axis"
+            f"{'; problem 3 is the wide line' if drive.solution('problem3') else ''}.",
+            id="caption")]
+
+
+def index(heading, first_page, chapters):
+    """Return the first page, a NotebookNode: `first_page` by `opening` with links to all the rest.
 
     `heading` (str) is the title of the report, `chapters` are dicts by `chapters.chapter_of`.
     """
     links = "\n\n".join(
         f"### [{chapter['title']}]({chapter['file']})\n\n"
         + re.sub(r"\]\(#", f"]({chapter['file']}#", chapter["lead"]) for chapter in chapters)
-    first, *others = opening.cells
+    first, *others = first_page.cells
     text = first.source.removeprefix("# Overview")
     return new_notebook(cells=[
         new_markdown_cell(f"# {plain(heading)}{text}\n\n[The whole report as one PDF](report.pdf)",
@@ -88,9 +88,13 @@ def abstract(drives):
     sentences = [
         _what_was_done({name for name in SENSORS for drive in drives
                         if getattr(drive.dataset, name) is not None}),
-        *_sigmas(drives), *(list(_errors(drives)) or _returns(drives)), *_landmarks(drives)]
-    simulated = [f"*{plain(drive.name)}*" for drive in drives if drive.simulated]
+        *_sigmas(drives), *(_errors(drives) or _returns(drives)), *_landmarks(drives)]
+    simulated = [_emphasized(drive) for drive in drives if drive.simulated]
     return " ".join(sentences) + (f"\n\n{_said_of_simulated(simulated)}" if simulated else "")
+
+
+def _emphasized(drive):
+    return f"*{plain(drive.name)}*"
 
 
 def _what_was_done(sensors):
@@ -112,83 +116,88 @@ def _said_of_simulated(names):
             "is computed in the same way.")
 
 
-def _estimates(solution):
+def _has_estimates(solution):
     """Return True if a Solution or None has an estimate of any pose."""
     return solution is not None and bool(np.isfinite(solution.poses[:, 0]).any())
 
 
-def _named(drives):
+def _in_abstract(drives):
     """Return the drives that the abstract names: all, or of many the shortest and the longest."""
-    solved = [drive for drive in drives if any(map(_estimates, drive.solutions))]
-    return solved if len(solved) <= FEW else [solved[0], solved[-1]]
+    solved = [drive for drive in drives if any(map(_has_estimates, drive.solutions))]
+    return solved if len(solved) <= MAX_NAMED else [solved[0], solved[-1]]
 
 
 def _sigmas(drives):
     """Yield a sentence on each drive, with the median sigma of position by every problem."""
-    before = None
-    for drive in _named(drives):
+    listed_problems = None
+    for drive in _in_abstract(drives):
         found = {problem: with_unit(median_sigmas(drive.solution(problem))[0], "m")
-                 for problem in METHODS if _estimates(drive.solution(problem))}
-        if found.keys() == before:
-            yield f"On *{plain(drive.name)}* it is {listed(list(found.values()))}."
-        elif before := found.keys():
-            yield (f"On *{plain(drive.name)}* the median standard deviation of position is "
-                   + listed([f"{value} {METHODS[problem]}" for problem, value in found.items()])
-                   + ".")
+                 for problem in METHOD_PHRASES if _has_estimates(drive.solution(problem))}
+        if found.keys() == listed_problems:
+            yield f"On {_emphasized(drive)} it is {listed(list(found.values()))}."
+        elif listed_problems := found.keys():
+            values = [f"{value} {METHOD_PHRASES[problem]}" for problem, value in found.items()]
+            yield (f"On {_emphasized(drive)} the median standard deviation of position is "
+                   f"{listed(values)}.")
+
+
+def _compared(drives):
+    """Return the named drives that both odometry and SLAM estimate, with these two Solutions."""
+    found = [(drive, drive.solution("problem1"),
+              drive.solution("problem4") or drive.solution("problem3"))
+             for drive in _in_abstract(drives)]
+    return [each for each in found if all(map(_has_estimates, each[1:]))]
 
 
 def _errors(drives):
-    """Yield a sentence on the errors of odometry and of SLAM, where the truth is known."""
-    falls = []
-    for drive in _named(drives):
-        ends = drive.solution("problem1"), drive.solution("problem4") or drive.solution("problem3")
-        if drive.truth is not None and all(map(_estimates, ends)):
-            first, last = (with_unit(_ate(drive, solution), "m") for solution in ends)
-            falls.append(f"from {first} to {last} on *{plain(drive.name)}*")
-    if falls:
-        yield ("SLAM in place of odometry changes the root mean square error of position "
-               f"{listed(falls)}.")
+    """Return a list of a sentence on the errors of odometry and SLAM, or of none without truth."""
+    changes = [
+        f"from {_ate(drive, by_odometry)} to {_ate(drive, by_slam)} on {_emphasized(drive)}"
+        for drive, by_odometry, by_slam in _compared(drives) if drive.truth is not None]
+    return ["SLAM in place of odometry changes the root mean square error of position "
+            f"{listed(changes)}."] if changes else []
 
 
 def _returns(drives):
-    """Yield sentences on odometry and SLAM at returns, which need no truth."""
-    by_odometry, by_slam = [], []
-    for drive in _named(drives):
-        ends = drive.solution("problem1"), drive.solution("problem4") or drive.solution("problem3")
+    """Return a list of sentences on odometry and SLAM at returns, which need no truth."""
+    texts = []
+    for drive, *solutions in _compared(drives):
         found = consistency.returns(drive.dataset)
-        if len(found.start) and all(map(_estimates, ends)):
-            for said, solution in zip((by_odometry, by_slam), ends):
-                apart = with_unit(_apart(found, solution.poses), "m")
-                said.append(f"{apart} on *{plain(drive.name)}*")
-    if by_odometry:
-        yield ("Where the camera sees the same markers again, they measure how far the vehicle has "
-               f"moved in between. Odometry differs from this by {listed(by_odometry)} (root mean "
-               f"square). SLAM, which uses these sightings, agrees with them to {listed(by_slam)}.")
+        if len(found.start):
+            texts.append([f"{_rms_discrepancy(found, solution.poses)} on {_emphasized(drive)}"
+                          for solution in solutions])
+    if not texts:
+        return []
+    by_odometry, by_slam = (listed([*each]) for each in zip(*texts, strict=True))
+    return ["Where the camera sees the same markers again, they measure how far the vehicle has "
+            f"moved in between. Odometry differs from this by {by_odometry} (root mean square). "
+            f"SLAM, which uses these sightings, agrees with them to {by_slam}."]
 
 
-def _apart(found, poses):
+def _rms_discrepancy(found, poses):
     off = consistency.discrepancies(found, poses)[:, :2]
-    return np.sqrt(np.mean(np.sum(off**2, axis=1)))
+    return with_unit(np.sqrt(np.mean(np.sum(off**2, axis=1))), "m")
 
 
 def _landmarks(drives):
     """Yield a sentence on the maps of the named drives, each of the last problem that has one."""
     maps = []
-    for drive in _named(drives):
-        found = []
+    for drive in _in_abstract(drives):
+        counts = []
         for kind, name in (("aruco_map", "marker"), ("uwb_map", "antenna")):
-            known = [getattr(solution, kind) for solution in drive.solutions
-                     if getattr(solution, kind) is not None]
+            known = [landmarks for solution in drive.solutions
+                     if (landmarks := getattr(solution, kind)) is not None]
             if known and (count := len(known[-1][0])):
-                found.append(f"{count} {name}{'s' * (count > 1)}")
-        if found:
-            maps.append(f"{listed(found)} on *{plain(drive.name)}*")
+                counts.append(f"{count} {name}{'s' * (count > 1)}")
+        if counts:
+            maps.append(f"{listed(counts)} on {_emphasized(drive)}")
     if maps:
         yield f"The maps hold {', '.join(maps)}."
 
 
 def _ate(drive, solution, aligned=False):
-    return evaluation.ate(solution.poses, truth_in_world(solution, drive.truth), aligned)
+    truth = truth_in_world(solution, drive.truth)
+    return with_unit(evaluation.ate(solution.poses, truth, aligned), "m")
 
 
 def _dataset_table(drives):
@@ -202,8 +211,8 @@ def _dataset_table(drives):
                      with_unit(evaluation.path_length(path), "m"), *counts,
                      drive.origin])
     header = ["dataset", "poses", "path", "sightings of markers", "UWB ranges", "origin"]
-    return (table_text(header, rows, texts=1)
-            + "\n\nTable 3. Measurements of each drive; the path length is from odometry.")
+    return (f"## The datasets\n\n{table_text(header, rows, texts=1)}\n\n"
+            "Table 3. Measurements of each drive; the path length is from odometry.")
 
 
 def _doubts(drives):
@@ -216,13 +225,13 @@ def _doubts(drives):
         if sentences:
             lines = "\n".join(f"- {plain(sentence)}" for sentence in sentences)
             parts.append(f"{plain(drive.name)}:\n\n{lines}")
-    return "\n\n".join(parts)
+    return "\n\n".join(["## Doubts about the data", *parts]) if parts else ""
 
 
 def _notes(drives):
     """Return what was mended or left out when files were read, in Markdown; "" if nothing."""
     return "\n\n".join(
-        f"Notes on the files of *{plain(drive.name)}*: " + " ".join(map(plain, drive.notes))
+        f"Notes on the files of {_emphasized(drive)}: " + " ".join(map(plain, drive.notes))
         for drive in drives if drive.notes)
 
 
@@ -234,7 +243,7 @@ def _result_table(drives):
     rows = [result_row(drive, problem, known) for drive in drives for problem in problems]
     errors = ["ATE", "ATE, aligned"] if known else []
     header = ["dataset", "problem", *errors, "σ of position", "σ of heading", "poses"]
-    text = table_text(header, rows, texts=2) + (
+    text = f"## Results\n\n{table_text(header, rows, texts=2)}" + (
         "\n\nTable 1. Every problem on every dataset: "
         + ("the root mean square error of all positions (ATE), as they stand and moved as a whole "
            "nearest to the truth (aligned); " if known else "")
@@ -259,40 +268,41 @@ def named(problem, dataset):
 def result_row(drive, problem, known=True):
     """Return a row of the table of results (list of str); `known`: it has columns of errors."""
     row = [plain(drive.name), named(problem, drive.dataset)]
-    solution, errors = drive.solution(problem), 2 * known
+    solution, errors = drive.solution(problem), ["–", "–"] * known
     if solution is None:
         needed = PROBLEMS[problem].sensors if problem in PROBLEMS else ()
         missing = [SENSORS[sensor] for sensor in needed if getattr(drive.dataset, sensor) is None]
         failed = any(failure.problem == problem for failure in drive.failures)
         return [*row, f"left out: no {' and no '.join(missing)}" if missing
-                else "could not be solved" if failed else "no result", *["–"] * (errors + 2)]
-    if not _estimates(solution):
-        return [*row, *["–"] * (errors + 2), "0"]
-    row += ["–"] * errors if drive.truth is None else [
-        with_unit(_ate(drive, solution, aligned), "m") for aligned in (False, True)[:errors]]
+                else "could not be solved" if failed else "no result", *errors, "–", "–"]
+    if not _has_estimates(solution):
+        return [*row, *errors, "–", "–", "0"]
+    if known and drive.truth is not None:
+        errors = [_ate(drive, solution), _ate(drive, solution, aligned=True)]
     position, heading = median_sigmas(solution)
     count = np.isfinite(solution.poses[:, 0]).sum()
-    return [*row, with_unit(position, "m"), with_unit(heading, "rad"), f"{count:,}"]
+    return [*row, *errors, with_unit(position, "m"), with_unit(heading, "rad"), f"{count:,}"]
 
 
 def _file_table(drives, address):
-    """Return the table of the files to hand in, with links, by problem and dataset."""
-    paths = [PurePosixPath(file) for drive in drives for file in drive.files]
-    folders = sorted({path.parent for path in paths}, key=lambda path: (order(path.name), path))
-    kinds = sorted({path.name for path in paths}, key=lambda name: (
-        FILES.index(name) if name in FILES else len(FILES), name))
-    rows = []
-    for folder in folders:
-        links = [", ".join(
-            f"[{plain(drive.name)}]({quote(str(address / drive.name / folder / kind))})"
-            for drive in drives if str(folder / kind) in drive.files) or "–" for kind in kinds]
-        at = next(drive for drive in drives
-                  if folder in (PurePosixPath(file).parent for file in drive.files))
-        rows.append([named(folder.name, at.dataset), code(str(folder)), *links])
-    text = table_text(["problem", "folder", *map(code, kinds)], rows,
-                      texts=2 + len(kinds))
-    which = "" if PurePosixPath("problem2_hint") not in folders else (
+    """Return the table of the files to hand in, by problem, with links; "" if there are none."""
+    links, titles = defaultdict(list), {}
+    for drive in drives:
+        for path in map(PurePosixPath, drive.files):
+            titles.setdefault(path.parent, named(path.parent.name, drive.dataset))
+            links[path.parent, path.name].append(
+                f"[{plain(drive.name)}]({quote(str(address / drive.name / path))})")
+    if not links:
+        return ""
+    names = {name for _, name in links}
+    names = [name for name in FILES if name in names] + sorted(names - {*FILES})
+    rows = [[titles[folder], code(str(folder)),
+             *(", ".join(links[folder, name]) or "–" for name in names)]
+            for folder in sorted(titles, key=lambda path: (order(path.name), path))]
+    text = table_text(["problem", "folder", *map(code, names)], rows, texts=2 + len(names))
+    which = "" if PurePosixPath("problem2_hint") not in titles else (
         " Of problem 2, `problem2` is markers alone, `problem2_fused` the fusion with odometry, "
         "and `problem2_hint` the fusion by the assignment's hint, for comparison.")
-    return (f"{text}\n\nTable 2. The files to hand in, MATLAB files with struct arrays, and the "
-            "datasets that have them. The path of a file is `results/dataset/folder/file`." + which)
+    return (f"## Files to hand in\n\n{text}\n\nTable 2. The files to hand in, MATLAB files with "
+            "struct arrays, and the datasets that have them. The path of a file is "
+            f"`results/dataset/folder/file`.{which}")

@@ -10,7 +10,6 @@ import base64
 import html
 import re
 import xml.etree.ElementTree as ElementTree
-from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from urllib.parse import quote, unquote
@@ -24,10 +23,10 @@ from traitlets.config import Config
 
 from slamlib.report.chapters import shows_input, texts
 from slamlib.report.execution import NotebookError
-from slamlib.report.formulas import set_formulas
+from slamlib.report.formulas import Formula, set_formulas
 from slamlib.report.numbering import CAPTION, TAG
 from slamlib.report.sanitize import cleaned, print_once, sanitized
-from slamlib.report.svg import DRAWN, FAMILY, compact
+from slamlib.report.svg import DRAWN, FAMILY, compressed
 
 PAGE = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
 STYLE = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
@@ -83,17 +82,29 @@ def html_page(source, book, chapters, code="method", absent=()):
     code : one of chapters.CODE_SHOWN; "none" leaves out printed text, too.
     absent : set of (notebook's name, anchor), to which no link is made.
     """
-    page = _new_page(source, chapters) | {"code": code, "absent": absent}
-    text, resources = EXPORTER.from_notebook_node(
-        book, {"metadata": {"path": str(source.parent)}, "page": page})
+    page = new_page(source, chapters) | {"code": code, "absent": absent}
+    text, resources = EXPORTER.from_notebook_node(book, {"page": page})
     page = resources["page"]
-    converted = set_formulas(page["formulas"], "html", ["--mathml"],
-                             partial(formula_error, page))
-    formulas = [_corrected(tex, mathml)
-                for (tex, _), mathml in zip(page["formulas"], converted, strict=True)]
-    unbroken = '<span class="keep">{}{}</span>'.format  # no line break before punctuation
-    text = MARK.sub(lambda mark: unbroken(formulas[int(mark[1])], mark[2]), text)
+    converted = [*zip(page["formulas"], set_formulas(page["formulas"], "html", "--mathml"),
+                      strict=True)]
+    text = MARK.sub(lambda mark: _with_number(*converted[int(mark[1])], mark[2]), text)
     return _with_policy(text.replace(f"'{DRAWN}'", FAMILY), page["styles"]), page
+
+
+def markdown_html(text, page, attachments=(), renderer=None):
+    """Return Markdown (str) as sanitized HTML with marks.
+
+    Parameters
+    ----------
+    page : dict in which the renderer collects what it finds, as by `new_page`.
+    attachments : dict of a cell.
+    renderer : subclass of Renderer, or None for that of pages.
+    """
+    section = page["section"]
+    converter = (renderer or Renderer)(escape=False, embed_images=True, path=page["path"],
+                                       attachments=dict(attachments))
+    converter.page = page
+    return sanitized(MarkdownWithMath(renderer=converter).render(text), page["notebook"], section)
 
 
 def own_pages(folder):
@@ -108,17 +119,18 @@ def own_pages(folder):
                           file.read_text(encoding="utf-8", errors="replace"), re.DOTALL)}
 
 
-def _new_page(source, chapters):
-    """Return the dict in which the renderer collects what it finds."""
-    return {"formulas": [], "sections": [], "section": "", "headings": [], "anchors": {},
-            "links": [], "figures": [], "chapters": chapters, "absent": (), "styles": [STYLE],
-            "file": quote(f"{source.stem}.html"), "notebook": source.name}
+def new_page(source, chapters=()):
+    """Return the dict in which the renderer collects what it finds in a notebook (Path)."""
+    return {"formulas": [], "section": "", "headings": [], "anchors": {}, "links": [],
+            "figures": [], "chapters": chapters, "absent": (), "styles": [STYLE],
+            "path": str(source.parent), "file": quote(f"{source.stem}.html"),
+            "notebook": source.name}
 
 
 def _anchors(source, book):
     """Return the anchors (set of str) of a book's headings, captions and equations."""
     renderer = Renderer(escape=False)
-    renderer.page = _new_page(source, [])
+    renderer.page = new_page(source)
     for node, key in texts(book.cells):
         MarkdownWithMath(renderer=renderer).render(node[key])
     return {*renderer.page["anchors"]}
@@ -132,8 +144,8 @@ def _with_policy(text, styles):
     scripts = []
     if LIVE.search(text) and SCRIPT.exists():
         scripts = [f"\n{SCRIPT.read_text(encoding='utf-8')}"]
-        before, end, after = text.rpartition("</body>")
-        text = f"{before}<script>{scripts[0]}</script>\n{end}{after}"
+        body, end, rest = text.rpartition("</body>")
+        text = f"{body}<script>{scripts[0]}</script>\n{end}{rest}"
     policy = POLICY.format(*map(_sources, (scripts, styles)))
     return text.replace(CHARSET, f'{CHARSET}\n<meta http-equiv="Content-Security-Policy" '
                                  f'content="{policy}">', 1)
@@ -145,30 +157,21 @@ def _sources(texts):
                     for text in texts) or "'none'"
 
 
-def formula_error(page, number, reason):
-    """Return the NotebookError for the formula of this index in `page`, the dict by `html_page`."""
-    name, section = page["sections"][number]
-    return NotebookError(name + (f", section '{section}'" if section else "")
-                         + f": {reason}:\n    {page['formulas'][number][0]}")
-
-
 class Renderer(IPythonRenderer):
     """Converts Markdown to HTML (str) with marks for formulas; collects what it finds in `page`."""
 
-    def inline_math(self, body, display=False):
-        """Return the mark for a formula (TeX, str)."""
-        self.page["formulas"].append((body.strip(), display))
-        self.page["sections"].append((self.page["notebook"], self.page["section"]))
+    def inline_math(self, body, display=False, number=""):
+        """Return the mark for a formula (TeX, str); `number` is that of a display formula."""
+        self.page["formulas"].append(Formula(
+            tex=body.strip(), display=display, number=number,
+            anchor=self.anchor(f"eq-{number}") if number else "",
+            notebook=self.page["notebook"], section=self.page["section"]))
         return f"\ue000{len(self.page['formulas']) - 1}\ue001"
 
     def block_math(self, body):
-        """Return a display formula, with its number beside it if it has a tag."""
-        formula = self.inline_math(TAG.sub("", body, count=1), display=True)
-        if not (tag := TAG.search(body)):
-            return f'<span class="equation">{formula}</span>'
-        tag = html.escape(tag[1].strip())
-        return (f'<span class="equation" id="{self.anchor("eq-" + tag)}">{formula}'
-                f'<span class="number">({tag})</span></span>')
+        """Return the mark for a display formula, whose tag has its number."""
+        tag = TAG.search(body)
+        return self.inline_math(TAG.sub("", body, count=1), True, tag[1].strip() if tag else "")
 
     def latex_environment(self, name, body):
         """Return a LaTeX environment as a display formula."""
@@ -194,10 +197,13 @@ class Renderer(IPythonRenderer):
 
     def paragraph(self, text):
         """Return a paragraph; a caption has an anchor."""
-        if not (caption := CAPTION.match(re.sub("<[^>]*>", "", text))):
-            return f"<p>{text}</p>\n"
-        anchor = self.anchor(f"{caption[1].lower()}-{caption[2]}")
-        return f'<p class="caption" id="{anchor}">{text}</p>\n'
+        anchor = self.caption_anchor(text)
+        return f'<p class="caption" id="{anchor}">{text}</p>\n' if anchor else f"<p>{text}</p>\n"
+
+    def caption_anchor(self, text):
+        """Return the anchor of a paragraph (HTML) that is a caption, or None."""
+        caption = CAPTION.match(re.sub("<[^>]*>", "", text))
+        return caption and self.anchor(f"{caption[1].lower()}-{caption[2]}")
 
     def block_html(self, text):
         """Return HTML as it is; nbconvert parses it to embed pictures, and would close its tags."""
@@ -225,7 +231,20 @@ class Renderer(IPythonRenderer):
         return super().link(text, re.sub(r"^([^:/]+)\.ipynb(?=#|$)", r"\1.html", url), title)
 
 
-def _corrected(tex, mathml):
+def _with_number(formula, mathml, punctuation):
+    """Return a Formula in HTML (str), with its number beside it and the punctuation behind it."""
+    mathml = _mended_mathml(formula.tex, mathml)
+    if not formula.display:  # no line break before punctuation
+        return f'<span class="keep">{mathml}{punctuation}</span>'
+    anchor, number = "", ""
+    if formula.number:
+        anchor = f' id="{html.escape(formula.anchor)}"'
+        number = f'<span class="number">({html.escape(formula.number)})</span>'
+    return (f'<span class="equation"{anchor}><span class="keep">{mathml}</span>{number}</span>'
+            f"{punctuation}")
+
+
+def _mended_mathml(tex, mathml):
     """Return pandoc's MathML, corrected where it differs from TeX or browsers misplace it."""
     math = ElementTree.fromstring(re.sub(r'\sxmlns="[^"]*"', "", mathml).strip())
     for element in list(math.iter()):
@@ -251,15 +270,10 @@ class _Exporter(HTMLExporter):
 
 
 @pass_context
-def _markdown_to_html(context, source):
+def _markdown_to_html(context, text):
     """Convert Markdown with our Renderer; the template's filter `markdown2html`."""
-    page = context["resources"]["page"]
-    section = page["section"]
-    renderer = Renderer(escape=False, embed_images=True,
-                        path=context["resources"]["metadata"]["path"],
-                        attachments=context.get("cell", {}).get("attachments", {}))
-    renderer.page = page
-    return sanitized(MarkdownWithMath(renderer=renderer).render(source), page["notebook"], section)
+    return markdown_html(text, context["resources"]["page"],
+                         context.get("cell", {}).get("attachments", {}))
 
 
 @pass_context
@@ -275,5 +289,6 @@ def _sanitized(context, text):
 EXPORTER = _Exporter(
     template_name="basic", raw_template=PAGE,
     config=Config({"NbConvertBase": {"display_data_priority": SHOWN}}),
-    filters={"markdown2html": _markdown_to_html, "shows_input": shows_input, "compact": compact,
-             "sanitized": _sanitized, "highlight_code": Highlight2HTML(pygments_lexer="ipython3")})
+    filters={"markdown2html": _markdown_to_html, "sanitized": _sanitized, "compressed": compressed,
+             "shows_input": shows_input,
+             "highlight_code": Highlight2HTML(pygments_lexer="ipython3")})

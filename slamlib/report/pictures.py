@@ -11,15 +11,15 @@ from slamlib import evaluation, se2
 from slamlib.notebook import plotting
 from slamlib.solve import PROBLEMS
 
-POINTS = 1500  # of a curve, at most
+CURVE_POINTS = 1500  # of a curve, at most
 HIDDEN = ("problem2", "problem2_hint", "problem3")  # trajectories that would lie below others
 LOOKS = {"problem3": dict(linewidth=4.0), "problem4": dict(linestyle="-", linewidth=1.4)}
-STYLE = Path(plotting.__file__).with_name("slamlib.mplstyle")
+FIGURE_STYLE = Path(plotting.__file__).with_name("slamlib.mplstyle")
 
 
 def trajectories(drive):
     """Return the figure of a SolvedDrive's trajectories and sigmas, as {MIME type: SVG}."""
-    with plt.style.context(STYLE, after_reset=True):
+    with plt.style.context(FIGURE_STYLE, after_reset=True):
         fig = Figure(figsize=(7.2, 2.7))  # inches
         left, right = fig.subplots(1, 2, width_ratios=(1, 1))
         for solution in drive.solutions:
@@ -40,7 +40,7 @@ def trajectories(drive):
 
 def title_picture(drive):
     """Return a SolvedDrive's last trajectory with its landmarks, without axes, as SVG (str)."""
-    with plt.style.context(STYLE, after_reset=True):
+    with plt.style.context(FIGURE_STYLE, after_reset=True):
         fig = Figure(figsize=(6.3, 4.6))  # inches
         ax = fig.add_subplot()
         solution = drive.solutions[-1]
@@ -75,5 +75,7 @@ def _in_first_frame(drive, solution):
 
 
 def _few(rows):
-    """Return at most POINTS of the rows (n, ...), first and last included."""
-    return rows[np.unique(np.linspace(0, len(rows) - 1, POINTS).astype(int))] if len(rows) else rows
+    """Return at most CURVE_POINTS of the rows (n, ...), first and last included."""
+    if not len(rows):
+        return rows
+    return rows[np.unique(np.linspace(0, len(rows) - 1, CURVE_POINTS).astype(int))]

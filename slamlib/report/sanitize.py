@@ -15,6 +15,7 @@ import nh3
 
 from slamlib.report.execution import NotebookError
 
+# What is allowed: names of elements and of attributes.
 ELEMENTS = nh3.ALLOWED_TAGS | set(
     "tfoot section figure figcaption form fieldset legend label input select option output "
     "progress meter svg g defs symbol use path rect circle ellipse line polyline polygon text "
@@ -35,7 +36,7 @@ ATTRIBUTES = set(
     "text-anchor dominant-baseline".split())
 ADDRESSES = {"href", "xlink:href", "src"}
 LINK = re.compile(r"(?:https?|mailto):|[^:]*(?:[/?#]|\Z)", re.IGNORECASE)  # or a relative address
-PICTURE = re.compile(r"data:image/[\w.+-]+[;,]", re.IGNORECASE)
+PICTURE_DATA = re.compile(r"data:image/[\w.+-]+[;,]", re.IGNORECASE)
 STYLED = {"style", "color", "fill", "stroke", "stop-color", "clip-path", "mask", "marker-start",
           "marker-mid", "marker-end"}  # hold CSS, in which a function could load something
 CALLED = re.compile(r"([\w-]*)\(\s*[\"']?(#?)")
@@ -43,7 +44,7 @@ HARMLESS = {"", "rgb", "rgba", "hsl", "hsla", "calc", "min", "max", "var", "matr
             "scale", "rotate", "path", "linear-gradient", "radial-gradient"}
 ACTIVE = ADDRESSES | STYLED | {"action", "background", "data", "formaction", "http-equiv", "ping",
                                "poster", "srcdoc", "srcset"}  # never left out without an error
-LONGEST = 60  # characters of a value in a message
+MAX_VALUE = 60  # characters of an attribute's value in a message
 
 
 def sanitized(text, notebook, section=""):
@@ -52,14 +53,17 @@ def sanitized(text, notebook, section=""):
     `notebook` and `section` (str) are the file's name and the heading above, for the messages.
     """
     clean = cleaned(text)
-    before, after = _tags(text), _tags(clean)
-    for (element, attribute), values in before.items():
-        left = after.get((element, attribute), [])
-        if len(left) >= len(values):
+    kept = _tags(clean)
+    for (element, attribute), values in _tags(text).items():
+        kept_values = kept.get((element, attribute), [])
+        if len(kept_values) >= len(values):
             continue
-        value = next((value for value in values if value not in left), values[-1])
-        what = f'<{element} {attribute}="{value[:LONGEST]}">' if attribute else f"<{element}>"
-        place = _place(text[:text.lower().find(f"<{element}")], notebook, section)
+        value = next((value for value in values if value not in kept_values), values[-1])
+        what = f'<{element} {attribute}="{value[:MAX_VALUE]}">' if attribute else f"<{element}>"
+        headings = re.findall(r"<h\d[^>]*>(.*?)</h\d>",
+                              text[:text.lower().find(f"<{element}")], re.DOTALL)
+        place = place_of(notebook, re.sub("<[^>]*>|[\ue000-\uf8ff]", "", headings[-1])
+                         if headings else section)
         if element != "style" and (
                 not attribute or attribute in ACTIVE or attribute.startswith("on")):
             raise NotebookError(f"{place}: the report cannot show {what}: it holds text, tables, "
@@ -76,6 +80,11 @@ def cleaned(text):
                      generic_attribute_prefixes={"aria-", "data-"})
 
 
+def place_of(notebook, section):
+    """Return how a message names a section (str or "") of a notebook (str, name of the file)."""
+    return notebook + (f", section '{section}'" if section else "")
+
+
 @cache
 def print_once(sentence):
     """Print a sentence (str) to stderr, unless this process has printed it before."""
@@ -85,10 +94,11 @@ def print_once(sentence):
 def _allowed(element, attribute, value):
     """Return the value of an attribute, or None if it could run or load something."""
     if attribute in ADDRESSES and element == "img":
-        allowed = PICTURE.match(value)
+        allowed = PICTURE_DATA.match(value)
     elif attribute in ADDRESSES:
         allowed = value.startswith("#") or (
-            element == "a" and LINK.match(value) or element == "image" and PICTURE.match(value))
+            element == "a" and LINK.match(value)
+            or element == "image" and PICTURE_DATA.match(value))
     elif attribute in STYLED:
         allowed = "\\" not in value and all(
             inside if name.lower() == "url" else name.lower() in HARMLESS
@@ -114,10 +124,3 @@ def _tags(text):
     parser.feed(text)
     parser.close()
     return found
-
-
-def _place(above, notebook, section):
-    """Return the place (str) below HTML (str) in a section of a notebook."""
-    headings = re.findall(r"<h\d[^>]*>(.*?)</h\d>", above, re.DOTALL)
-    section = re.sub("<[^>]*>|[\ue000-\uf8ff]", "", headings[-1]) if headings else section
-    return notebook + (f", section '{section}'" if section else "")

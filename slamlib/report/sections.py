@@ -19,7 +19,7 @@ from slamlib.report.execution import NotebookError
 from slamlib.report.sanitize import print_once
 from slamlib.textfile import quoted
 
-HEADING = re.compile(r"^(?P<fence>```|~~~).*?^(?P=fence)"
+HEADING_OR_CODE = re.compile(r"^(?P<fence>```|~~~).*?^(?P=fence)"
                      r"|^(?P<level>#{1,3})[ \t]+(?P<title>[^\n]+)", re.MULTILINE | re.DOTALL)
 IN_CODE = re.compile(r"[\"'](#{2,3} [^\"'\\\n]+)")  # a heading that a cell will show
 
@@ -34,7 +34,7 @@ class Section:
     needs: str | None = None
 
 
-def sections(source, book):
+def sections_of(source, book):
     """Return the headings (list of Section) of a notebook (Path, NotebookNode), in order.
 
     NotebookError if the metadata of a cell has a need that is unknown or not a section's.
@@ -63,23 +63,24 @@ def shown(books, has, leave_out):
     """
     left_out, result = {_key(entry): place for entry, place in leave_out.items()}, {}
 
-    def reason(each):
-        """Why a section is left out (str), "" if no reason is told, or None if it is shown."""
-        if each.needs not in {None, *has}:
-            return f"no dataset has {each.needs}"
-        return next((left_out[key] for key in (_key(each.number), _key(each.title))
-                     if each.level > 1 and key in left_out), None)
+    def reason(section):
+        """Return why a section is left out (str), "" if untold, or None if it is shown."""
+        if section.needs not in {None, *has}:
+            return f"no dataset has {section.needs}"
+        return next((left_out[key] for key in (_key(section.number), _key(section.title))
+                     if section.level > 1 and key in left_out), None)
 
     for source, book in books.items():
         if _is_left_out(source, book, left_out):
             print_once(f"{source.stem}: left out")
             continue
-        found = sections(source, book)
-        reasons = {at: why for at, each in enumerate(found) if (why := reason(each)) is not None}
-        for at, why in reasons.items():
+        dropped = set()
+        for index, section in enumerate(sections_of(source, book)):
+            if (why := reason(section)) is not None:
+                dropped.add(index)
             if why:
-                print_once(f"{source.stem}: section '{found[at].title}' left out ({why})")
-        result[source] = _without(book, reasons.keys())
+                print_once(f"{source.stem}: section '{section.title}' left out ({why})")
+        result[source] = _without_sections(book, dropped)
     return result
 
 
@@ -115,15 +116,16 @@ def _require_known(books, entry, place):
         number = chapter_of(source, book)["number"]
         chapters += [number] if number else []
         names.add(_key(number))
-        for each in sections(source, _announced(book)):
-            if each.level > 1:
-                names |= {_key(each.number), _key(each.title)}
-                listed.append(f"{each.number} {each.title}" if number else each.title)
+        for section in sections_of(source, _announced(book)):
+            if section.level > 1:
+                names |= {_key(section.number), _key(section.title)}
+                listed.append(f"{section.number} {section.title}" if number else section.title)
     if _key(entry) not in names - {_key(None)}:
-        within = entry.strip().partition(".")[0]
-        near = [each for each in listed if within in chapters and each.startswith(f"{within}.")]
+        chapter = entry.strip().partition(".")[0]
+        similar = [name for name in listed
+                   if chapter in chapters and name.startswith(f"{chapter}.")]
         raise DatasetError(f"{place}: expected to leave out a chapter ({', '.join(chapters)}) or a "
-                           f"section ({', '.join(near or listed)}), found {quoted(entry)}")
+                           f"section ({', '.join(similar or listed)}), found {quoted(entry)}")
 
 
 def _is_left_out(source, book, left_out):
@@ -142,7 +144,7 @@ def _plain(title):
 
 def _headings(text):
     """Yield (index, level, title) of each heading of levels 1 to 3 in Markdown."""
-    for found in HEADING.finditer(text):
+    for found in HEADING_OR_CODE.finditer(text):
         if found["level"]:
             yield found.start(), len(found["level"]), _plain(found["title"])
 
@@ -154,36 +156,36 @@ def _announced(book):
         if cell.cell_type == "code" else cell for cell in book.cells]})
 
 
-def _without(book, dropped):
-    """Return a book without the sections at these indexes of those by `sections`."""
+def _without_sections(book, dropped):
+    """Return a book without the sections at the indexes `dropped` (set) in `sections_of`."""
     if not dropped:
         return book
-    number, left, cells = count(), 0, []  # left: the level of the section that is left out, or 0
+    indexes, hidden, cells = count(), 0, []  # hidden: the level of the section left out here, or 0
 
     def kept(text):
-        nonlocal left
-        begins = [*_headings(text)]
-        ends = [*(begin for begin, *_ in begins), len(text)]
-        parts = [] if left else [text[:ends[0]]]
-        for (begin, level, _), end in zip(begins, ends[1:]):
-            at = next(number)
-            if not left or level <= left:
-                left = level if at in dropped else 0
-            if not left:
+        nonlocal hidden
+        headings = [*_headings(text)]
+        ends = [*(begin for begin, *_ in headings), len(text)]
+        parts = [] if hidden else [text[:ends[0]]]
+        for (begin, level, _), end in zip(headings, ends[1:]):
+            index = next(indexes)
+            if not hidden or level <= hidden:
+                hidden = level if index in dropped else 0
+            if not hidden:
                 parts.append(text[begin:end])
         return "".join(parts)
 
     def keeps(output):
         data = output.get("data", {})
         if "text/markdown" not in data:
-            return not left
+            return not hidden
         data["text/markdown"] = kept(data["text/markdown"])
         return data["text/markdown"].strip()
 
     for cell in map(deepcopy, book.cells):
         if cell.cell_type == "markdown":
             cell.source = kept(cell.source)
-        elif left:
+        elif hidden:
             cell.source = ""
         if "outputs" in cell:
             cell.outputs = [output for output in cell.outputs if keeps(output)]

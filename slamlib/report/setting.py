@@ -12,13 +12,13 @@ from slamlib.report.execution import NotebookError
 ATTEMPTS = 6  # of setting the document, until all figures stay where they are
 PLACES = "places.json"  # what the attempts came to
 UNKNOWN = {"final": False, "sizes": {}}  # of each figure and table, by its number
-quoted = partial(json.dumps, ensure_ascii=False)  # a string of Typst
+typst_string = partial(json.dumps, ensure_ascii=False)  # a string of Typst
 
 
 def compiled(folder, book):
     """Return the PDF as bytes. Typst is called again until figures and tables stay in place.
 
-    `folder` (Path) has the files of a document with `main.typ`, and `book` (pdf._Book) the formulas
+    `folder` (Path) has the files of a document with `main.typ`, and `book` (pdf.Book) the formulas
     that must be in it. NotebookError if one is not, or if Typst refuses the document.
     """
     places = UNKNOWN
@@ -30,22 +30,23 @@ def compiled(folder, book):
             found = set(json.loads(compiler.query("math.equation", field="label")))
             placed = json.loads(compiler.query("metadata", field="value"))
         except typst.TypstError as error:
-            raise _refused(error, book) from None
+            raise _typst_error(error, book) from None
         if not any("did not converge" in warning.message for warning in warnings):
             break
         sizes = {str(each["number"]): each["size"] for each in placed
                  if isinstance(each, dict)}
         places = {"final": sizes == places["sizes"] or attempt + 2 == ATTEMPTS, "sizes": sizes}
-    for number, label in enumerate(book.labels):
+    for formula, label in zip(book.formulas, book.labels, strict=True):
         if f"<{label}>" not in found:
-            raise book.error(number, "the PDF lost this formula")
+            raise formula.error("the PDF lost this formula")
     return content
 
 
-def _refused(error, book):
+def _typst_error(error, book):
     """Return the NotebookError for what Typst says of a document."""
     if line := re.search(r"formulas\.typ:(\d+):", error.diagnostic):  # formula 0 is on line 2
-        return book.error(int(line[1]) - 2, f"Typst cannot set this formula, {error.message}")
+        return book.formulas[int(line[1]) - 2].error(
+            f"Typst cannot set this formula, {error.message}")
     return NotebookError("Typst cannot set the PDF: "
                          f"{error.message}: {error.diagnostic.strip()}")
 
@@ -53,7 +54,7 @@ def _refused(error, book):
 def missing_glyphs(text):
     """Return the characters (list of str) of a text (str) that no font of the PDF has."""
     def any_missing(characters):  # drawn like U+10FFFD, which is not a character
-        source = "\n".join(f'#box({quoted(c)})' for c in ["\U0010fffd", *characters])
+        source = "\n".join(f'#box({typst_string(c)})' for c in ["\U0010fffd", *characters])
         pages = typst.compile(source.encode(), format="svg", ignore_system_fonts=True)
         missing, *glyphs = re.findall(r'<use [^>]*href="#(\w+)"', b"".join(
             [pages] if isinstance(pages, bytes) else pages).decode())
