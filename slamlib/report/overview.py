@@ -9,7 +9,7 @@ from pathlib import PurePosixPath
 from urllib.parse import quote
 
 import numpy as np
-from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_output
+from nbformat.v4 import new_markdown_cell, new_notebook
 
 from slamlib import evaluation, odometry
 from slamlib.checks import consistency
@@ -17,7 +17,7 @@ from slamlib.notebook import about_dashes, code, listed, median_sigmas, plain, t
 from slamlib.report.animation import moving
 from slamlib.report.chapters import HTML_ONLY
 from slamlib.report.drives import order
-from slamlib.report.pictures import trajectories
+from slamlib.report.pictures import first_figure
 from slamlib.results import FILES
 from slamlib.solve import PROBLEMS, SENSORS, title, truth_in_world
 
@@ -43,25 +43,10 @@ def opening(drives, address="."):
     cells = [new_markdown_cell(text, id=name) for name, text in texts.items() if text]
     if solved:
         longest = max(solved, key=lambda drive: len(drive.dataset.ticks))
-        cells += [*moving(longest), *_first_figure(longest)]
+        cells += [*moving(longest), *first_figure(longest)]
     cells.append(new_markdown_cell(_dataset_table(drives), id="datasets",
                                    metadata={"tags": [HTML_ONLY]}))  # chapter 1 has this table
     return new_notebook(cells=cells)
-
-
-def _first_figure(drive):
-    """Return the cells of the figure of a SolvedDrive and of its caption."""
-    return [
-        new_code_cell(outputs=[new_output("display_data", trajectories(drive))], id="picture",
-                      metadata={"alt": f"The trajectories of {drive.name}, and the standard "
-                                       "deviation of position along them"}),
-        new_markdown_cell(
-            f"Figure 1. {_emphasized(drive)}, the longest drive. Left: its trajectory by odometry, "
-            f"by fusion and by the last problem{', and the truth (dashed)' if drive.truth else ''}."
-            " Right: the standard deviation of position along the drive, for every problem, on a "
-            "logarithmic axis"
-            f"{'; problem 3 is the wide line' if drive.solution('problem3') else ''}.",
-            id="caption")]
 
 
 def index(heading, first_page, chapters):

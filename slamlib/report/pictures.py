@@ -6,15 +6,31 @@ import matplotlib.pyplot as plt
 import numpy as np
 from IPython.core.pylabtools import print_figure
 from matplotlib.figure import Figure
+from nbformat.v4 import new_code_cell, new_markdown_cell, new_output
 
 from slamlib import evaluation, se2
-from slamlib.notebook import plotting
+from slamlib.notebook import plain, plotting
 from slamlib.solve import PROBLEMS
 
 CURVE_POINTS = 1500  # of a curve, at most
 HIDDEN = ("problem2", "problem2_hint", "problem3")  # trajectories that would lie below others
 LOOKS = {"problem3": dict(linewidth=4.0), "problem4": dict(linestyle="-", linewidth=1.4)}
 FIGURE_STYLE = Path(plotting.__file__).with_name("slamlib.mplstyle")
+
+
+def first_figure(drive):
+    """Return the cells (list of NotebookNode) of a SolvedDrive's figure and of its caption."""
+    return [
+        new_code_cell(outputs=[new_output("display_data", trajectories(drive))], id="picture",
+                      metadata={"alt": f"The trajectories of {drive.name}, and the standard "
+                                       "deviation of position along them"}),
+        new_markdown_cell(
+            f"Figure 1. *{plain(drive.name)}*, the longest drive. Left: its trajectory by "
+            "odometry, by fusion and by the last problem"
+            f"{', and the truth (dashed)' if drive.truth else ''}. Right: the standard deviation "
+            "of position along the drive, for every problem, on a logarithmic axis"
+            f"{'; problem 3 is the wide line' if drive.solution('problem3') else ''}.",
+            id="caption")]
 
 
 def trajectories(drive):
