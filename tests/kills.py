@@ -33,7 +33,7 @@ from slamlib.notebook import results_folder, start
 for drive in start():
     for problem in {problems}:
         if solve.allows(drive.dataset, problem):
-            solve.write(results_folder(drive), solve.SOLUTIONS[problem](drive.dataset))"""
+            solve.write_solution(results_folder(drive), solve.problem_solution(problem, drive.dataset))"""
 
 
 def started(arguments, folder, at_step=None):

@@ -158,7 +158,7 @@ def test_large_slip_is_learned_as_accurately_as_if_known():
 @pytest.mark.parametrize("slip", [3e-3, 1e-2])
 def test_large_slip_does_not_cause_rejected_sightings(slip):
     """Correct labels: few sightings are rejected, and the slip is learned from the typical one."""
-    runs = studies.run(montecarlo.problem3, range(500, 508), slip=slip)
+    runs = studies.run(montecarlo.problem3_trial, range(500, 508), slip=slip)
     assert runs["rejected"].mean() < 6                       # gate: 0.1 % of about 900
     assert 0.85 < np.exp(np.mean(np.log(runs["slip"]))) / slip < 1.15
     low, high = nees_band(8, probability=0.999)
@@ -346,7 +346,7 @@ def test_monte_carlo_is_consistent(options):
 
     All four means of both options are in their bands with probability 95 % (Bonferroni).
     """
-    runs = studies.run(montecarlo.problem3, SEEDS, **options)
+    runs = studies.run(montecarlo.problem3_trial, SEEDS, **options)
     low, high = nees_band(len(SEEDS), probability=1 - 0.05 / 8)
     for name in ("nees", "nees between", "map nees", "wheel nees"):
         assert low < runs[name].mean() < high, name
@@ -361,12 +361,12 @@ def test_monte_carlo_is_consistent(options):
 def test_wheel_errors_must_be_a_variable_of_the_graph():
     """Without slip the wheel errors dominate and are correlated: 6 drives, given the true slip."""
     runs = studies.run(graphs.compare_graphs, range(400, 406), slip=0.0)
-    variable, chain, fixed = graphs.WHEELS
-    log_error = {wheels: np.log(runs[f"{wheels} arc ate"]) for wheels in graphs.WHEELS}
+    variable, chain, fixed = graphs.WHEEL_MODELS
+    log_error = {wheels: np.log(runs[f"{wheels} arc ate"]) for wheels in graphs.WHEEL_MODELS}
     assert decided(log_error[chain] - log_error[variable] - np.log(2))
     assert decided(log_error[fixed] - log_error[chain])
     assert runs[f"{variable} arc nees"].mean() < 4 and runs[f"{fixed} arc nees"].mean() > 50
-    for wheels in graphs.WHEELS:
+    for wheels in graphs.WHEEL_MODELS:
         for model in ("arc", "euler"):
             if (wheels, model) != (variable, "arc"):
                 other = runs[f"{wheels} {model} evidence"]

@@ -92,15 +92,15 @@ def test_the_digest_of_the_code_changes_with_every_module_that_computes(tmp_path
     shutil.copytree(memory.SLAMLIB, tmp_path / "slamlib",
                     ignore=shutil.ignore_patterns("__pycache__"))
     monkeypatch.setattr(memory, "SLAMLIB", tmp_path / "slamlib")
-    assert memory.code() == memory.CODE
+    assert memory.code_digest() == memory.CODE_DIGEST
     for module in sorted((tmp_path / "slamlib").rglob("*.py")):
         before = module.read_bytes()
         module.write_bytes(before + b"\n")
         shows = module.parent.name in ("notebook", "report") or module.name == "__main__.py"
-        assert (memory.code() == memory.CODE) == shows, module.name
+        assert (memory.code_digest() == memory.CODE_DIGEST) == shows, module.name
         module.write_bytes(before)
     (tmp_path / "slamlib" / "slam" / "new.py").touch()
-    assert memory.code() != memory.CODE
+    assert memory.code_digest() != memory.CODE_DIGEST
 
 
 @pytest.mark.parametrize("package", ["numpy", "scipy", "gtsam"])
@@ -108,7 +108,7 @@ def test_the_digest_of_the_code_changes_with_the_packages_that_compute(monkeypat
     installed = memory.version
     monkeypatch.setattr(memory, "version",
                         lambda name: "0" if name == package else installed(name))
-    assert memory.code() != memory.CODE
+    assert memory.code_digest() != memory.CODE_DIGEST
 
 
 def test_montecarlo_imports_no_module_that_the_digest_leaves_out():
@@ -130,7 +130,7 @@ def test_only_studies_of_other_code_are_removed(folder, computed):
     folder.joinpath("0" * 64).mkdir()
     folder.joinpath("mine.txt").touch()
     study(slip=0.2)
-    assert sorted(path.name for path in folder.iterdir()) == sorted([memory.CODE, "mine.txt"])
+    assert sorted(path.name for path in folder.iterdir()) == sorted([memory.CODE_DIGEST, "mine.txt"])
     assert len(kept(folder)) == 3
 
 

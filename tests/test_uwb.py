@@ -42,7 +42,7 @@ from slamlib.slam.trilateration import (
     second_moment,
     trilaterate,
 )
-from slamlib.solve import problem4
+from slamlib.solve import problem_solution
 from slamlib.studies import kernels, montecarlo, plaza, starts
 
 # A vehicle of exact odometry, so that only the geometry of the ranges matters.
@@ -210,7 +210,7 @@ def consistent(runs, names, count):
 @pytest.mark.parametrize("options", [dict(), dict(late_ranges=0.15)])
 def test_monte_carlo_is_consistent(options):
     """12 drives: NEES of poses, interpolated poses, map, antennas and wheels in their bands."""
-    runs = studies.run(montecarlo.problem4, range(700, 712), **options)
+    runs = studies.run(montecarlo.problem4_trial, range(700, 712), **options)
     consistent(runs, ("nees", "nees between", "map nees", "antenna nees", "wheel nees"), 12)
     assert runs["ate"].max() < 0.05 and runs["antenna error"].max() < 0.15
     assert runs["doubts"].sum() == 0
@@ -218,7 +218,7 @@ def test_monte_carlo_is_consistent(options):
 
 @pytest.mark.slow
 def test_ranges_alone_are_consistent_although_they_hardly_determine_the_slip():
-    runs = studies.run(montecarlo.problem4, range(800, 812), markers=False, late_ranges=0.15)
+    runs = studies.run(montecarlo.problem4_trial, range(800, 812), markers=False, late_ranges=0.15)
     consistent(runs, ("nees", "last nees", "antenna nees", "wheel nees"), 12)
     assert np.sqrt(np.mean(runs["ate"]**2)) < 0.06
 
@@ -412,13 +412,13 @@ def test_second_moment_does_not_hold_the_grid_times_the_ranges():
 
 def test_problem_4_reports_the_down_weighted_ranges():
     dataset, _ = simulate("short", seed=9, late_ranges=0.15)
-    solution = problem4(dataset)
+    solution = problem_solution("problem4", dataset)
     weak = solution.facts["ranges_down_weighted_by_antenna"]
     assert weak.keys() == set(dataset.antenna_guess.antenna.tolist())
     assert 0.08 < sum(weak.values()) / solution.facts["ranges"] < 0.2
     assert solution.title == "SLAM: odometry + ArUco + UWB"
     assert solution.uwb_map[1].shape == (4, 2)
-    assert problem4(dataset.without("aruco")).aruco_map is None
+    assert problem_solution("problem4", dataset.without("aruco")).aruco_map is None
 
 
 def test_ranges_carry_the_uncertainty_of_the_place_they_were_measured_from():

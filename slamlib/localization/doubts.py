@@ -26,16 +26,16 @@ from slamlib.sightings import GATE, MAX_HEADING_SIGMA, sightings_by_frame
 GENEROUS_SLIP = 1e-2      # sqrt(m), slip of the wheels that explains a difference
 GENEROUS_WHEEL = 0.03     # relative standard deviation of the wheel parameters, likewise
 SPAN = 1.0                # m, distance over which increments are compared
-MANY_POSES = 200_000      # of a longer drive, the first ones are looked at
+MAX_POSES = 200_000      # of a longer drive, the first ones are looked at
 MAX_FRAMES = 20           # between the poses of an increment
 MIN_INCREMENTS = 10       # fewer of them decide nothing
-MOVING = 5.0              # sigmas of distance or turn, by markers or wheels, from no motion
-DECISIVE = 10.0           # log odds by which a hypothesis explains the increments better
-MOST = 0.7                # share of the increments that agree with an accepted hypothesis
-AGREEMENT = 7.8147             # squared Mahalanobis distance of increments that agree: the 95 %
+MIN_MOTION_SIGMAS = 5.0              # sigmas of distance or turn, by markers or wheels, from no motion
+MIN_LOG_ODDS = 10.0           # log odds by which a hypothesis explains the increments better
+MIN_AGREEING_SHARE = 0.7                # share of the increments that agree with an accepted hypothesis
+AGREEMENT_GATE = 7.8147             # squared Mahalanobis distance of increments that agree: the 95 %
                                # quantile of chi-squared with 3 degrees of freedom
-CONTRADICTING = 4.0       # standard errors of the mean agreement of headings and positions below 0
-BETTER_FIT = 3.0          # ratio of the ranges' median residuals that decides between two paths
+MIN_CONTRADICTION = 4.0       # standard errors of the mean agreement of headings and positions below 0
+MIN_FIT_RATIO = 3.0          # ratio of the ranges' median residuals that decides between two paths
 
 
 @dataclass(frozen=True)
@@ -99,14 +99,14 @@ class _Compared:
         return self.weight * GATE / 2 * np.sum(np.log1p(squared / GATE))
 
 
-def drive_doubts(dataset):
+def doubts_before_solving(dataset):
     """List of Doubts about the files of a drive, a Dataset; empty if too little was seen to decide.
 
     Kinds are units, wheels-swapped, wheels-reversed, camera-mirrored, camera-turned, odometry and
     counts-since-start. At most one flaw of sightings and counts is named, with all that explains
     it.
     """
-    dataset = dataset.first(MANY_POSES)
+    dataset = dataset.first(MAX_POSES)
     others, sightings = range_units(dataset) + sigma_units(dataset), sightings_by_frame(
         dataset.aruco)
     if len(sightings.frame) <= MIN_INCREMENTS:
@@ -153,7 +153,7 @@ def _headings_contradict(sightings, found):
     smaller = np.minimum(smaller, np.median(smaller) if len(same) else 0)    # wrong labels
     agreement = np.sign(turn * seen_turn) * smaller
     error = np.sqrt(np.sum(agreement**2))
-    return bool(len(same) >= MIN_INCREMENTS and agreement.sum() < -CONTRADICTING * error)
+    return bool(len(same) >= MIN_INCREMENTS and agreement.sum() < -MIN_CONTRADICTION * error)
 
 
 def _compare(dataset, sightings, found):
@@ -179,17 +179,17 @@ def _compare(dataset, sightings, found):
     start, end = frame[begin], frame[begin + span]
     by_wheels, by_w = increments.between_poses(*args, start, end, "arc")
     by_w = by_w * (GENEROUS_WHEEL * dataset.vehicle.wheel)
-    generous = increments.noise(*args, start, end, GENEROUS_SLIP) + by_w @ np.swapaxes(by_w, 1, 2)
+    generous = increments.noise_covariances(*args, start, end, GENEROUS_SLIP) + by_w @ np.swapaxes(by_w, 1, 2)
     moving = _moves(by_markers, covariance) | _moves(by_wheels, generous)
     return _Compared(by_markers[moving], by_wheels[moving], covariance[moving], generous[moving],
                      1 / span)
 
 
 def _moves(increment, covariance):
-    """Mask (n,) of increments (n, 3) whose distance or turn is above MOVING sigmas."""
+    """Mask (n,) of increments (n, 3) whose distance or turn is above MIN_MOTION_SIGMAS sigmas."""
     variance = np.diagonal(covariance, axis1=1, axis2=2)
-    far = np.sum(increment[:, :2]**2, axis=1) > MOVING**2 * variance[:, :2].sum(axis=1)
-    return far | (np.abs(se2.wrap(increment[:, 2])) > MOVING * np.sqrt(variance[:, 2]))
+    far = np.sum(increment[:, :2]**2, axis=1) > MIN_MOTION_SIGMAS**2 * variance[:, :2].sum(axis=1)
+    return far | (np.abs(se2.wrap(increment[:, 2])) > MIN_MOTION_SIGMAS * np.sqrt(variance[:, 2]))
 
 
 def _axes_doubts(dataset, compared, contradicting):
@@ -198,11 +198,11 @@ def _axes_doubts(dataset, compared, contradicting):
     squared = [compared.squared_distances(np.array(axes.A, float)) for axes in candidates]
     costs = np.array([compared.cost(each) for each in squared])
     best = costs.argmin()
-    agreeing = np.mean(squared[best] < AGREEMENT)
-    if agreeing < MOST or (not contradicting and costs[0] - costs[best] < DECISIVE):
+    agreeing = np.mean(squared[best] < AGREEMENT_GATE)
+    if agreeing < MIN_AGREEING_SHARE or (not contradicting and costs[0] - costs[best] < MIN_LOG_ODDS):
         return [_contradiction()] if contradicting else []
     doubts = []
-    for k in np.flatnonzero(costs < costs[best] + DECISIVE):          # the drive may be straight
+    for k in np.flatnonzero(costs < costs[best] + MIN_LOG_ODDS):          # the drive may be straight
         nearer = np.mean(squared[k] < squared[0])
         doubts += _explanations(dataset, candidates[k], contradicting, nearer, len(squared[k]))
     return list({doubt.what: doubt for doubt in reversed(doubts)}.values())[::-1]
@@ -232,14 +232,14 @@ def _explanations(dataset, axes, contradicting, nearer, count):
         return [Doubt(name, seen.format(camera))]
     wheels = f"{axes.counts} in encoderReading.txt (look at {axes.look})"
     doubts = [Doubt(axes.wheels, seen.format(wheels)), Doubt(name, seen.format(camera))]
-    side, fit = _by_ranges(dataset, axes.A)
+    side, fit = _side_by_ranges(dataset, axes.A)
     if side is not None:
         return [replace(doubts[side], sentence=f"{doubts[side].sentence} {fit}")]
     return [replace(doubt, sentence=f"{doubt.sentence} Equally possible: {other}.")
             for doubt, other in zip(doubts, (camera, wheels))]
 
 
-def _by_ranges(dataset, A):
+def _side_by_ranges(dataset, A):
     """0 if the path by the wheels is wrong by ranges to the guessed antennas, 1 if it is right.
 
     None if ranges do not decide between odometry's path and the path transformed by A. The second
@@ -254,7 +254,7 @@ def _by_ranges(dataset, A):
                        for pose, r, guess in antennas])
             for each in (path @ np.transpose(A), path)]
     side = int(np.argmin(fits))
-    if fits[1 - side] < BETTER_FIT * fits[side]:
+    if fits[1 - side] < MIN_FIT_RATIO * fits[side]:
         return None, ""
     return side, (f"The ranges to the guessed antennas differ from this path by {fits[side]:.2g} m "
                   f"(median), from the other explanation's by {fits[1 - side]:.2g} m.")
@@ -263,7 +263,7 @@ def _by_ranges(dataset, A):
 def _odometry_doubts(compared):
     """A Doubt if most increments by markers and by wheels disagree and no hypothesis says why."""
     squared = compared.squared_distances(np.eye(2))
-    share = np.mean(squared > AGREEMENT)
+    share = np.mean(squared > AGREEMENT_GATE)
     if share < 0.5:
         return []
     lengths, turns = zip(*((np.median(np.hypot(*each[:, :2].T)),

@@ -30,8 +30,8 @@ from slamlib.sightings import GATE, sightings_by_frame
 
 SLIP_FRAMES = 500            # number of frames, the first ones, from which the slip is learned
 WHEEL_FRAMES = 5000          # the same, of the wheels at which the odometry is linearised
-AT_ONCE = 1000               # frames between which poses are computed together: these stay in cache
-LOG_TOLERANCE = 0.05         # of the logarithm of the slip
+FRAMES_PER_BLOCK = 1000               # frames between which poses are computed together: these stay in cache
+LOG_SLIP_TOLERANCE = 0.05         # of the logarithm of the slip
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ def _likeliest_slip(given):
         else:
             slopes = [(points[each] - points[best]) / (each - best) for each in (below, above)]
             vertex = (below + best) / 2 - slopes[0] * (above - below) / 2 / (slopes[1] - slopes[0])
-        if abs(vertex - best) < LOG_TOLERANCE:
+        if abs(vertex - best) < LOG_SLIP_TOLERANCE:
             return float(np.exp(vertex))
         points[vertex] = density(vertex)
 
@@ -231,8 +231,8 @@ def _correct(state, rows, v, C):
 def _between_frames(given, slip, x, covariances, state):
     """The Fusion: every pose of the encoder file by odometry from the last frame before it."""
     count, vehicle = len(given.dataset.ticks), given.vehicle
-    found = [_section(given, slip, x[rows], covariances[rows], given.pose[rows], end)
-             for rows, end in _sections(given.pose, count)]
+    found = [_section_of_poses(given, slip, x[rows], covariances[rows], given.pose[rows], end)
+             for rows, end in _sections_of_poses(given.pose, count)]
     poses, each = (np.concatenate(part) for part in zip(*found))
     repeated = len(given.dataset.aruco.pose) - sum(len(z) for z, *_ in given.frames)
     return Fusion(
@@ -240,14 +240,14 @@ def _between_frames(given, slip, x, covariances, state):
         slip=slip, wheel=vehicle.wheel + x[-1, 3:], wheel_covariance=covariances[-1, 3:, 3:])
 
 
-def _sections(frame, count):
-    """Slices of AT_ONCE frames, and the pose at which the next one begins, of `count` poses."""
-    for first in range(0, len(frame), AT_ONCE):
-        end = first + AT_ONCE
+def _sections_of_poses(frame, count):
+    """Slices of FRAMES_PER_BLOCK frames, and the pose at which the next one begins, of `count` poses."""
+    for first in range(0, len(frame), FRAMES_PER_BLOCK):
+        end = first + FRAMES_PER_BLOCK
         yield slice(first, end), frame[end] if end < len(frame) else count
 
 
-def _section(given, slip, x, covariances, frame, end):
+def _section_of_poses(given, slip, x, covariances, frame, end):
     """Poses and covariances from the first of some frames to the pose before `end`."""
     ticks = given.dataset.ticks
     pose = np.arange(frame[0], end)

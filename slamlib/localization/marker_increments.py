@@ -14,12 +14,12 @@ import numpy as np
 from slamlib import se2
 from slamlib.sightings import GATE, MAX_HEADING_SIGMA
 
-ITERATIONS = 8, 6         # numbers of Gauss-Newton iterations: Cauchy weights, then the gate
-SMALL_STEP = 1e-10        # m and rad, of the iteration that is the last one
+INCREMENT_ITERATIONS = 8, 6         # numbers of Gauss-Newton iterations: Cauchy weights, then the gate
+STEP_TOLERANCE = 1e-10        # m and rad, of the iteration that is the last one
 SPEED_RATIO = 3.0         # dimensionless, largest plausible speed in units of the usual speed
 POINT_PAIRS = 60          # pairs of points that give hypotheses, of every pair of frames
-AT_ONCE = 20_000          # sightings whose residuals are computed together
-SLOW_TURN = 1e-3          # rad per encoder step; smaller differences of turn rates are ignored
+SIGHTINGS_PER_BLOCK = 20_000          # sightings whose residuals are computed together
+MIN_TURN_RATE = 1e-3          # rad per encoder step; smaller differences of turn rates are ignored
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ def robust_increments(z, C, pair, first, second, count):
     """
     z1, C1, z2, C2 = z[first], C[first], z[second], C[second]
     increment = _best_hypothesis(z1, C1, z2, C2, pair, count)
-    for gated, iterations in enumerate(ITERATIONS):
+    for gated, iterations in enumerate(INCREMENT_ITERATIONS):
         for _ in range(iterations):
             J_delta, J_second = se2.compose_jacobians(increment[pair], z2)
             r, information, squared = _residuals(increment[pair], J_second, z1, C1, z2, C2)
@@ -112,7 +112,7 @@ def robust_increments(z, C, pair, first, second, count):
             covariance = _inverse_where_regular(H)
             step = np.einsum("nij,nj->ni", covariance, gradient)
             increment = increment + step
-            if not np.nanmax(np.abs(step), initial=0) > SMALL_STEP:
+            if not np.nanmax(np.abs(step), initial=0) > STEP_TOLERANCE:
                 break
     increment[:, 2] = se2.wrap(increment[:, 2])
     usable = covariance[:, 2, 2] < MAX_HEADING_SIGMA**2
@@ -148,7 +148,7 @@ def _best_hypothesis(z1, C1, z2, C2, pair, count):
         _increment_of_two_points(z1[i, :2], z1[j, :2], z2[i, :2], z2[j, :2])])
     pair_of = np.concatenate([np.arange(count), pair[oriented], pair[i]])
     own = (ends - begins)[pair_of]                      # number of the hypothesis's sightings
-    blocks = np.split(np.arange(len(own)), np.flatnonzero(np.diff(np.cumsum(own) // AT_ONCE)) + 1)
+    blocks = np.split(np.arange(len(own)), np.flatnonzero(np.diff(np.cumsum(own) // SIGHTINGS_PER_BLOCK)) + 1)
     cost = np.empty(len(own))
     for block in blocks:                                # all at once would take gigabytes
         n = own[block]
@@ -200,7 +200,7 @@ def _similar(a, b):
     """True where velocities (n, 3) differ by less than half the larger one, in speed and turn."""
     speed, turn = np.hypot(*(a - b)[:, :2].T), np.abs(a[:, 2] - b[:, 2])
     largest = np.maximum(np.abs(_distance_and_turn(a)), np.abs(_distance_and_turn(b)))
-    return (speed < largest[:, 0] / 2) & (turn < largest[:, 1] / 2 + SLOW_TURN)
+    return (speed < largest[:, 0] / 2) & (turn < largest[:, 1] / 2 + MIN_TURN_RATE)
 
 
 def _inverse_where_regular(H):

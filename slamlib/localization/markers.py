@@ -26,8 +26,8 @@ from slamlib.dataset import DatasetError
 from slamlib.localization.marker_increments import consecutive_increments, robust_increments
 from slamlib.sightings import consensus, sightings_by_frame
 
-CANDIDATES = 3     # number of earlier frames that are tried as parent of a frame
-REMEMBERED = 200   # frames that saw a marker, the latest ones, from which candidates are taken
+MAX_CANDIDATES = 3     # number of earlier frames that are tried as parent of a frame
+MAX_FRAMES_PER_MARKER = 200   # frames that saw a marker, the latest ones, from which candidates are taken
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def localize(aruco, shared_errors=True):
         paired[rows], confirmed[rows[increments.accepted]] = True, True
     root = int(np.argmax(increments.usable)) if increments.usable.any() else 0
     links = _links(sightings, increments, confirmed, root)
-    poses, covariances, H = _compose(sightings, links, root, shared_errors)
+    poses, covariances, H = _compose_increments(sightings, links, root, shared_errors)
     used = np.flatnonzero(confirmed & np.isfinite(poses[sightings.row, 0]))
     marker, in_world, marker_covariance = _map_markers(sightings, used, poses, covariances, H)
     rejected, unused = np.ones(len(aruco.pose), bool), np.zeros(len(aruco.pose), bool)
@@ -88,7 +88,7 @@ def _links(sightings, increments, confirmed, root):
     rows_of = np.split(np.arange(len(sightings.row)),
                        np.searchsorted(sightings.row, np.arange(1, count)))
     # By marker id, the latest localized frames that saw it.
-    links, seen_in = {}, defaultdict(lambda: deque(maxlen=REMEMBERED))
+    links, seen_in = {}, defaultdict(lambda: deque(maxlen=MAX_FRAMES_PER_MARKER))
     for f in range(root, count):
         if f > root:
             previous = f - 1 == root or f - 1 in links
@@ -110,7 +110,7 @@ def _relocalize(sightings, confirmed, rows_of, frame, seen_in):
     """
     marker, rows = sightings.marker, rows_of[frame]
     shared = Counter(f for m in marker[rows].tolist() for f in seen_in[m])
-    for f in nlargest(CANDIDATES, shared, key=lambda f: (shared[f], f)):
+    for f in nlargest(MAX_CANDIDATES, shared, key=lambda f: (shared[f], f)):
         _, first, second = np.intersect1d(marker[rows_of[f]], marker[rows], return_indices=True)
         first, second = rows_of[f][first], rows[second]
         found = robust_increments(sightings.z, sightings.C, np.zeros_like(first), first, second, 1)
@@ -120,7 +120,7 @@ def _relocalize(sightings, confirmed, rows_of, frame, seen_in):
     return None
 
 
-def _compose(sightings, links, root, shared_errors):
+def _compose_increments(sightings, links, root, shared_errors):
     """Poses (f, 3) and covariances (f, 3, 3), NaN where unknown, and H (s, 3, 3) of sightings."""
     count = len(sightings.frame)
     poses, covariances = np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan)

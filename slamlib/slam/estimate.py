@@ -62,7 +62,7 @@ asymmetric Cauchy, asymmetric Tukey, not 'L2'
     for name, value in zip(GIVEN, (slip, marker_noise_factor, range_noise_factor)):
         limit = LIMITS["vehicle.toml"][name]
         number = isinstance(value, Real) and not isinstance(value, bool)
-        if value is not None and not (number and limit.least <= value <= limit.most):
+        if value is not None and not (number and limit.minimum <= value <= limit.maximum):
             raise ValueError(f"expected {limit.expected(name)}, not {value!r}")
     accept = partial(accepted, way=acceptance(kernel, gate))
     measurements = measure(given(dataset, slip, marker_noise_factor, range_noise_factor))

@@ -35,7 +35,7 @@ def independent_chain(measurements, model, relinearize_at=None):
     return replace(factors, by_w=np.zeros_like(factors.by_w), rounding=factors.rounding + noise)
 
 
-WHEELS = {"wheels as a variable": odometry_factors, "independent chain": independent_chain,
+WHEEL_MODELS = {"wheels as a variable": odometry_factors, "independent chain": independent_chain,
           "wheels fixed": fixed_wheels}
 
 
@@ -43,7 +43,7 @@ WHEELS = {"wheels as a variable": odometry_factors, "independent chain": indepen
 class GraphKind:
     """One kind of graph, solved on its own."""
 
-    wheels: str              # of WHEELS
+    wheels: str              # of WHEEL_MODELS
     model: str               # "arc" or "euler"
     result: SlamResult
     log_evidence: float      # on the measurements that variable wheels and arcs accept
@@ -57,7 +57,7 @@ def graph_kinds(dataset):
     """
     measurements = measure(dataset)
     first, noise = fit_from_odometry(measurements), with_known(Noise(), dataset.vehicle)
-    for wheels, factors in WHEELS.items():
+    for wheels, factors in WHEEL_MODELS.items():
         for model in odometry.MODELS:
             own = first if (factors, model) == (odometry_factors, "arc") else refine(
                 build(measurements, model, noise, factors=factors), first.state, factors=factors)
@@ -106,7 +106,7 @@ def compare_graphs(seed, **options):
 
     Returns
     -------
-    dict of numbers for each of WHEELS and each model: "evidence", "chi2" per degree of freedom,
+    dict of numbers for each of WHEEL_MODELS and each model: "evidence", "chi2" per degree of freedom,
     "ate" and "aligned" in m, "nees".
     """
     dataset, truth = simulate("short", seed, **options)

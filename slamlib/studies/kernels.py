@@ -21,20 +21,20 @@ from slamlib.slam.state import state_from_arrays
 from slamlib.studies.montecarlo import judge_slam
 
 # Ways to treat ranges, and ways to treat sightings: `robust.Acceptance`.
-RANGES = {
+RANGE_METHODS = {
     **{name: acceptance(name, gate=False) for name in ("quadratic", "Huber", "Cauchy")},
     "asymmetric Cauchy": acceptance("asymmetric Cauchy"),
     "asymmetric Tukey": acceptance(),
     "GNC": acceptance("quadratic"),
     "gate": acceptance("quadratic"),
     "asymmetric gate": replace(acceptance("quadratic"), late=2.0)}
-SIGHTINGS = {
+SIGHTING_METHODS = {
     **{name: acceptance(name, gate=False)
        for name in ("quadratic", "Huber", "Cauchy", "Geman-McClure", "Tukey")},
     "gate": acceptance()}
 CONVEX = ("quadratic", "Huber", "GNC")     # these need no rounds of narrowing kernels
 GNC_STEP = 1.4                             # factor on the control parameter in each round
-WRONG_LABEL = 50.0                         # squared Mahalanobis distance; a right label reaches it
+MIN_MISLABELLED_SQUARED = 50.0                         # squared Mahalanobis distance; a right label reaches it
                                            # once in ten billion sightings
 
 
@@ -45,7 +45,7 @@ def solve_with(measurements, sightings="gate", ranges="asymmetric Tukey",
     Parameters
     ----------
     measurements : Measurements of a dataset whose noise is known.
-    sightings, ranges : names in SIGHTINGS and RANGES; the defaults are those of `slam.estimate`.
+    sightings, ranges : names in SIGHTING_METHODS and RANGE_METHODS; the defaults are those of `slam.estimate`.
     antennas : as of `initialization.state_from_poses`.
     starts : dict, or None, of what other ways on the same measurements have found so far: all that
         are not CONVEX start from the same rounds of narrowing kernels.
@@ -71,8 +71,8 @@ def solve_with(measurements, sightings="gate", ranges="asymmetric Tukey",
 
 def _way(sightings, ranges):
     """The Acceptance by these ways."""
-    of_sightings = SIGHTINGS[sightings]
-    return replace(RANGES[ranges], sighting_kernel=of_sightings.sighting_kernel,
+    of_sightings = SIGHTING_METHODS[sightings]
+    return replace(RANGE_METHODS[ranges], sighting_kernel=of_sightings.sighting_kernel,
                    gated=of_sightings.gated)
 
 
@@ -103,14 +103,14 @@ def graduated(problem, state):
     return weight[ranges]
 
 
-def late_ranges(seed, markers=True, ways=tuple(RANGES), **options):
-    """Ways of RANGES on one drive of the short path, the slip and the arcs given.
+def late_ranges(seed, markers=True, ways=tuple(RANGE_METHODS), **options):
+    """Ways of RANGE_METHODS on one drive of the short path, the slip and the arcs given.
 
     Parameters
     ----------
     seed, options : of `simulation.simulate`.
     markers : False leaves the markers out.
-    ways : names in RANGES.
+    ways : names in RANGE_METHODS.
 
     Returns
     -------
@@ -127,8 +127,8 @@ def late_ranges(seed, markers=True, ways=tuple(RANGES), **options):
     return numbers
 
 
-def wrong_labels(seed, ways=tuple(SIGHTINGS), **options):
-    """Ways of SIGHTINGS on one drive of the short path, the slip and the arcs given.
+def wrong_labels(seed, ways=tuple(SIGHTING_METHODS), **options):
+    """Ways of SIGHTING_METHODS on one drive of the short path, the slip and the arcs given.
 
     Parameters as of `late_ranges`.
 
@@ -159,4 +159,4 @@ def mislabelled(measurements, truth):
     true_map = truth.marker_in_world[np.searchsorted(truth.marker, m.marker)]
     state = state_from_arrays(m, truth.poses[m.frame], true_map,
                               np.zeros((len(m.antenna), 2)), np.zeros(3))
-    return np.sum(residuals(m, state, Noise())[0]**2, axis=1) > WRONG_LABEL
+    return np.sum(residuals(m, state, Noise())[0]**2, axis=1) > MIN_MISLABELLED_SQUARED

@@ -25,7 +25,7 @@ from slamlib.studies import workers
 
 SLAMLIB = Path(__file__).parents[1]
 SHOWING = ("notebook", "report")           # folders that show studies and do not compute them
-PACKAGES = ("numpy", "scipy", "gtsam")
+NUMERIC_PACKAGES = ("numpy", "scipy", "gtsam")
 THREADS = ("OMP_", "OPENBLAS_", "MKL_")    # how the names of variables begin
 BAR_AFTER = 5.0                            # s
 
@@ -43,10 +43,10 @@ def run(trial, seeds, jobs=2, **options):
     seeds = list(seeds)[:int(os.environ.get("SLAMLIB_SEEDS", len(seeds)))]
     arguments = trial, name, seeds, options, _threads(), jobs
     folder = os.environ.get("SLAMLIB_STUDIES")
-    if not folder or not name.startswith(f"{__package__}.") or code() != CODE:
+    if not folder or not name.startswith(f"{__package__}.") or code_digest() != CODE_DIGEST:
         return _compute(*arguments)                       # not ours to keep, or edited meanwhile
-    forget(folder, but=CODE)
-    memory = Memory(Path(folder) / CODE, verbose=0, compress=True)     # zlib finds damaged files
+    forget(folder, but=CODE_DIGEST)
+    memory = Memory(Path(folder) / CODE_DIGEST, verbose=0, compress=True)     # zlib finds damaged files
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Exception while loading results")    # computed again
         return memory.cache(_compute, ignore=["trial", "jobs"])(*arguments)
@@ -76,11 +76,11 @@ def forget(folder, but=None):
             shutil.rmtree(kept, ignore_errors=True)
 
 
-def code():
+def code_digest():
     """A digest of what every study depends on: slamlib, Python and packages, as they are now."""
     return digest(repr([
         platform.python_implementation(), platform.python_version(), platform.platform(),
-        [version(package) for package in PACKAGES],
+        [version(package) for package in NUMERIC_PACKAGES],
         [(str(file.relative_to(SLAMLIB)), digest(file.read_bytes()))
          for file in modules(*SHOWING)]]).encode())
 
@@ -97,4 +97,4 @@ def digest(content):
     return hashlib.sha256(content).hexdigest()
 
 
-CODE = code()                              # of this process, which files edited later do not change
+CODE_DIGEST = code_digest()                              # of this process, which files edited later do not change

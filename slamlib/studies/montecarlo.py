@@ -13,7 +13,7 @@ from slamlib.localization.hint import first_order_from
 from slamlib.sightings import sightings_by_frame
 from slamlib.simulation import simulate
 
-METHODS = {                                     # of problem 2
+PROBLEM2_METHODS = {                                     # of problem 2
     "odometry": lambda dataset: odometry.dead_reckoning(dataset.ticks, dataset.vehicle),
     "ArUco": lambda dataset: localization.localize(dataset.aruco),
     "naive": lambda dataset: localization.localize(dataset.aruco, shared_errors=False),
@@ -53,7 +53,7 @@ def markers_alone(seed, **options):
             "map nees": _map_nees(found, truth).mean()}
 
 
-def problem2(seed, methods=tuple(METHODS), **options):
+def problem2_trial(seed, methods=tuple(PROBLEM2_METHODS), **options):
     """Methods of problem 2 on one drive of the short path, simulated with these options.
 
     Returns
@@ -65,7 +65,7 @@ def problem2(seed, methods=tuple(METHODS), **options):
     dataset, truth = simulate("short", seed, **options)
     frame, numbers = sightings_by_frame(dataset.aruco).frame, {}
     for method in methods:
-        found = METHODS[method](dataset)
+        found = PROBLEM2_METHODS[method](dataset)
         if method == "odometry":
             numbers["odometry ate"] = ate(found[frame], truth.poses[frame])
             continue
@@ -81,14 +81,14 @@ def problem2(seed, methods=tuple(METHODS), **options):
     return numbers
 
 
-def problem3(seed, **options):
+def problem3_trial(seed, **options):
     """SLAM on odometry and markers of one drive of the short path: the numbers of `judge_slam`."""
     dataset, truth = simulate("short", seed, **options)
     return judge_slam(slam.estimate(dataset.without("uwb")), dataset.without("uwb"), truth)
 
 
-def problem4(seed, path="short", markers=True, **options):
-    """SLAM on odometry, ranges and (unless False) markers, as `problem3`."""
+def problem4_trial(seed, path="short", markers=True, **options):
+    """SLAM on odometry, ranges and (unless False) markers, as `problem3_trial`."""
     dataset, truth = simulate(path, seed, **options)
     dataset = dataset if markers else dataset.without("aruco")
     previous = slam.estimate(dataset.without("uwb")) if markers else None

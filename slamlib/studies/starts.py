@@ -24,8 +24,8 @@ from slamlib.slam.state import state_from_arrays
 from slamlib.studies.kernels import solve_with
 from slamlib.studies.montecarlo import antenna_error
 
-RIGHT_ANTENNA = 0.5          # m, error below which an antenna is right
-SAME_COST = 1.0              # of the right optimum: a residual below one and a half sigmas
+MAX_ANTENNA_ERROR = 0.5          # m, error below which an antenna is right
+COST_TOLERANCE = 1.0              # of the right optimum: a residual below one and a half sigmas
 
 
 def first_sighting(measurements, in_world, covariances):
@@ -91,7 +91,7 @@ def landmarks(seed, path="short", drift=1.0, known=True, kernel="graduated",
     -------
     dict of numbers for each start: "initial error", rms distance of the markers to the truth in m;
     "initial cost" and "cost", the graph's error before and after; "steps"; "right", 1 where the
-    cost is that reached from the true map and poses, to within SAME_COST.
+    cost is that reached from the true map and poses, to within COST_TOLERANCE.
     """
     vehicle = Vehicle()
     drifting = replace(vehicle, sigma_right_radius=drift * vehicle.sigma_right_radius,
@@ -99,7 +99,7 @@ def landmarks(seed, path="short", drift=1.0, known=True, kernel="graduated",
                        sigma_wheelbase=drift * vehicle.sigma_wheelbase)
     dataset, truth = simulate(path, seed, vehicle=drifting, **options)
     m = measure(replace(dataset, uwb=None, vehicle=drifting if known else vehicle))
-    rounds = _rounds(build(m, "arc", Noise(options.get("slip", TYPICAL_SLIP))), kernel)
+    rounds = _kernel_rounds(build(m, "arc", Noise(options.get("slip", TYPICAL_SLIP))), kernel)
     true_map = truth.marker_in_world[np.searchsorted(truth.marker, m.marker)]
     best = optimize(rounds[-1], state_from_arrays(
         m, truth.poses[m.frame], true_map, np.zeros((0, 2)), np.zeros(3))).error
@@ -113,14 +113,14 @@ def landmarks_of_drive(dataset, found, kernel="last", starts=tuple(LANDMARKS)):
     that is reached from the result and its map in place of the truth.
     """
     m, vehicle = measure(dataset.without("uwb")), dataset.vehicle
-    rounds = _rounds(build(m, found.model, found.noise), kernel)
+    rounds = _kernel_rounds(build(m, found.model, found.noise), kernel)
     best = optimize(rounds[-1], state_from_poses(
         m, found.poses[m.frame], found.covariances[m.frame],
         (found.wheel - vehicle.wheel) / vehicle.sigma_wheel))
     return _from_each_start(rounds, best.error, best.state.markers, starts)
 
 
-def _rounds(problem, kernel):
+def _kernel_rounds(problem, kernel):
     """Problems with the scales of the Cauchy kernel, "graduated" or the "last" one only."""
     m, cauchy = problem.measurements, gtsam.noiseModel.mEstimator.Cauchy.Create
     return [replace(problem, measured=MeasurementFactors(m, m.unit_weights, cauchy(scale)))
@@ -140,7 +140,7 @@ def _from_each_start(rounds, best, markers, starts):
         numbers |= {f"{name} initial error": np.sqrt(np.mean(np.sum(error**2, axis=1))),
                     f"{name} initial cost": initial_cost, f"{name} cost": optimum.error,
                     f"{name} steps": steps,
-                    f"{name} right": float(optimum.error < best + SAME_COST)}
+                    f"{name} right": float(optimum.error < best + COST_TOLERANCE)}
     return numbers
 
 
@@ -155,7 +155,7 @@ def guesses(seed, error, poses=None, markers=True, compared=True, **options):
 
     Returns
     -------
-    dict of shares of the antennas: "right", within RIGHT_ANTENNA of the truth; right "from the
+    dict of shares of the antennas: "right", within MAX_ANTENNA_ERROR of the truth; right "from the
     guess" without trilateration; "in doubt"; and "silently wrong": not right, not in doubt, and
     outside their 99.9 % ellipse.
     """
@@ -166,10 +166,10 @@ def guesses(seed, error, poses=None, markers=True, compared=True, **options):
     measurements = measure(dataset)
     found = result(solve_with(measurements))
     miss, squared = antenna_error(found, truth)
-    right, doubt = miss < RIGHT_ANTENNA, np.isin(found.antenna, list(found.doubts))
+    right, doubt = miss < MAX_ANTENNA_ERROR, np.isin(found.antenna, list(found.doubts))
     numbers = {"right": right.mean(), "in doubt": doubt.mean(),
                "silently wrong": np.mean(~right & (squared > POINT_GATE) & ~doubt)}
     if compared:
         naive = result(solve_with(measurements, antennas=guessed_antennas))
-        numbers["from the guess"] = np.mean(antenna_error(naive, truth)[0] < RIGHT_ANTENNA)
+        numbers["from the guess"] = np.mean(antenna_error(naive, truth)[0] < MAX_ANTENNA_ERROR)
     return numbers
