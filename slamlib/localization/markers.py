@@ -10,9 +10,9 @@ sightings of its frame,
     C_X' = A C_X A^T + B C_Delta B^T + S + S^T,    S = A sum_j H_j (B D_j)^T,
     H'_j = B D'_j C'_j,    D_j = dDelta/dZ_j,    D'_j = dDelta/dZ'_j.
 
-A marker seen as Z from X is at M = X Z. With E = dM/dX, F = dM/dZ and T = E H F^T its covariance is
-C_M = E C_X E^T + F C F^T + T + T^T. This is the correlated state of Smith, Self and Cheeseman,
-Estimating Uncertain Spatial Relationships in Robotics, 1990, without what no increment needs again.
+A marker sighted as Z from X is at M = X Z. With E = dM/dX, F = dM/dZ and T = E H F^T its covariance
+is C_M = E C_X E^T + F C F^T + T + T^T. This is the correlated state of Smith, Self and Cheeseman,
+Estimating Uncertain Spatial Relationships in Robotics, 1990, without the states of earlier frames.
 """
 
 from collections import Counter, defaultdict, deque
@@ -26,18 +26,18 @@ from slamlib.dataset import DatasetError
 from slamlib.localization.marker_increments import consecutive_increments, robust_increments
 from slamlib.sightings import consensus, sightings_by_frame
 
-MAX_CANDIDATES = 3     # number of earlier frames that are tried as parent of a frame
-MAX_FRAMES_PER_MARKER = 200   # frames that saw a marker, the latest ones, from which candidates are taken
+MAX_CANDIDATES = 3            # number of earlier frames that are tried as parent of a frame
+MAX_FRAMES_PER_MARKER = 200   # number of frames, the latest that saw a marker, to choose them from
 
 
 @dataclass(frozen=True)
 class Localization:
-    """Poses of the frames, as far as markers determine them, and the map of the markers."""
+    """Poses of the frames, where markers determine them, and the map of the markers."""
 
     frame: np.ndarray               # (f,) pose index from 0 of every frame
     poses: np.ndarray               # (f, 3) in the first localized frame, m and rad; or NaN
     covariances: np.ndarray         # (f, 3, 3)
-    parent: np.ndarray              # (f,) row of the frame it was localized against, -1 for none
+    parent: np.ndarray              # (f,) row of the frame its increment starts at, -1 for none
     rejected: np.ndarray            # (m,) bool, rejected, or a repetition (`merge_repeated`)
     unused: np.ndarray              # (m,) bool, sightings of markers that no adjacent frame sees
     marker: np.ndarray              # (k,) ids of the mapped markers, ascending
@@ -46,12 +46,12 @@ class Localization:
 
 
 def localize(aruco, shared_errors=True):
-    """Localization from ArucoReadings, the sightings of markers at successive frames.
+    """Localization for problem 2: incremental, from the ArucoReadings alone.
 
     A frame is localized against its parent: the previous frame if the increment from it is usable,
     else an earlier frame (`_relocalize`). Without a parent its pose is unknown. The world frame is
-    that of the first frame with a usable increment to the next. Without `shared_errors` H_j = 0:
-    increments then count as independent; this is conservative. DatasetError if no sighting agrees
+    that of the first frame with a usable increment to the next. Without `shared_errors` H_j = 0,
+    as for independent increments; this is conservative. Raises DatasetError if no sighting agrees
     with the others of its marker at its pose.
 
     >>> from slamlib.simulation import simulate
