@@ -1,7 +1,7 @@
 """The assignment's problems: which of them a dataset allows, their solutions and files.
 
-`find` runs the solver of a problem and `problem_solution` makes a Solution of its result, with what the
-files and figures of every problem need.
+`find` runs the solver of a problem; `problem_solution` makes a Solution of its result, with what
+the files and figures of every problem need.
 """
 
 from dataclasses import dataclass, field

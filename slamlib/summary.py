@@ -41,11 +41,11 @@ def solve_to_folder(dataset, truth, out, jobs=1):
     """Solve all problems of a Dataset and write their files below the folder `out`.
 
     Returns the summary, the dict that is written to summary.json. A problem that could not be
-    solved has the entry "failed", a sentence. The list "doubts", of "what" and "sentence", has those
-    about the drive first, then by problem. The list "notes" states what was mended or left out
-    while the files were read. The Truth, or None, serves to report errors, never to estimate. When
-    all files are written they replace those of an earlier run, by `swap.publish`. With two `jobs`,
-    a second process solves problems 1 and 2.
+    solved has the entry "failed", a sentence. The list "doubts", of "what" and "sentence", has
+    those about the drive first, then by problem. "notes" lists what was mended or left out while
+    the files were read. The Truth, or None, serves to report errors, never to estimate. When all
+    files are written they replace those of an earlier run, by `swap.publish`. With two `jobs`, a
+    second process solves problems 1 and 2.
     """
     out = Path(out)
     with swap.staging(out) as stage:

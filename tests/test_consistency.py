@@ -76,7 +76,8 @@ def test_excess_by_hand():
     C = np.array([np.diag([10.0, 2, 1]), np.diag([2.0, 2, 0.05]), np.diag([10.0, 0.5, 1]),
                   np.diag([2.0, 2, 2])])
     before = C.copy()
-    np.testing.assert_allclose(consistency.hausman_statistic(poses, C, best, C_best), [1, 1, np.nan, np.nan])
+    np.testing.assert_allclose(consistency.hausman_statistic(poses, C, best, C_best),
+                               [1, 1, np.nan, np.nan])
     np.testing.assert_array_equal(C, before)
 
 

@@ -484,6 +484,7 @@ def test_ranges_exchanged_with_their_sigmas_are_doubted():
     for count in (150, 2000):
         dataset = simulated("short", 0)[0].first(count)
         u = dataset.uwb
-        doubts = doubts_before_solving(replace(dataset, uwb=replace(u, range=u.sigma, sigma=u.range)))
+        exchanged = replace(u, range=u.sigma, sigma=u.range)
+        doubts = doubts_before_solving(replace(dataset, uwb=exchanged))
         assert {doubt.what for doubt in doubts} == {"units"}
         assert all("UwbReading.txt" in doubt.sentence for doubt in doubts)

@@ -267,7 +267,8 @@ def test_there_is_no_doubt_about_clean_drives(path, seeds, slip):
         dataset, _ = simulate(path, seed, slip=slip)
         found = slam.estimate(dataset.without("uwb"))
         both = slam.estimate(dataset, previous=found)
-        assert not names(localization.doubts_before_solving(dataset), found.drive_doubts, both.drive_doubts)
+        assert not names(localization.doubts_before_solving(dataset), found.drive_doubts,
+                         both.drive_doubts)
 
 
 def test_markers_of_which_most_sightings_contradict_are_named():

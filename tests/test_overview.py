@@ -136,7 +136,8 @@ def test_doubts_and_failures_stand_on_the_first_page_only_where_there_are_any(pr
 def test_a_problem_that_nothing_solves_is_in_the_table():
     dataset = simulate("short", seed=5)[0]
     failed = Failure("problem3", "SLAM: odometry + ArUco", "expected more")
-    drive = solved_drives.SolvedDrive("x", dataset, None, (problem_solution("problem1", dataset),), failures=(failed,))
+    solved = problem_solution("problem1", dataset)
+    drive = solved_drives.SolvedDrive("x", dataset, None, (solved,), failures=(failed,))
     rows, _ = result_rows(overview.summary([drive]))
     assert rows["x", "SLAM: odometry + ArUco"][0] == "could not be solved"
 

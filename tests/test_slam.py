@@ -6,7 +6,7 @@ from functools import partial
 import gtsam
 import numpy as np
 import pytest
-from numeric import central_differences, decided, known_noise
+from numeric import central_differences, decided, known_noise, slam_trial
 
 from slamlib import increments, odometry, se2, simulation, slam, studies
 from slamlib.dataset import AntennaGuess, ArucoReadings, Dataset, UwbReadings, Vehicle
@@ -158,7 +158,7 @@ def test_large_slip_is_learned_as_accurately_as_if_known():
 @pytest.mark.parametrize("slip", [3e-3, 1e-2])
 def test_large_slip_does_not_cause_rejected_sightings(slip):
     """Correct labels: few sightings are rejected, and the slip is learned from the typical one."""
-    runs = studies.run(montecarlo.problem3_trial, range(500, 508), slip=slip)
+    runs = studies.run(slam_trial, range(500, 508), ranges=False, slip=slip)
     assert runs["rejected"].mean() < 6                       # gate: 0.1 % of about 900
     assert 0.85 < np.exp(np.mean(np.log(runs["slip"]))) / slip < 1.15
     low, high = nees_band(8, probability=0.999)
@@ -346,7 +346,7 @@ def test_monte_carlo_is_consistent(options):
 
     All four means of both options are in their bands with probability 95 % (Bonferroni).
     """
-    runs = studies.run(montecarlo.problem3_trial, SEEDS, **options)
+    runs = studies.run(slam_trial, SEEDS, ranges=False, **options)
     low, high = nees_band(len(SEEDS), probability=1 - 0.05 / 8)
     for name in ("nees", "nees between", "map nees", "wheel nees"):
         assert low < runs[name].mean() < high, name
@@ -421,7 +421,7 @@ def test_markers_of_unknown_heading_are_mapped_as_points():
 def test_the_gate_has_a_smaller_error_than_hubers_kernel_with_wrong_labels():
     """3 % wrong labels, 8 drives. Against other kernels the gate's ATE is at most 15 % larger."""
     others = ("Cauchy", "Geman-McClure", "Tukey")
-    runs = studies.run(kernels.wrong_labels, range(8), ways=("gate", "Huber", *others),
+    runs = studies.run(kernels.wrong_labels, range(8), methods=("gate", "Huber", *others),
                        mislabelled=0.03)
     assert decided(runs["Huber ate"] - runs["gate ate"])
     assert all(decided(1.15 * runs[f"{way} ate"] - runs["gate ate"]) for way in others)

@@ -108,8 +108,9 @@ def estimated_map(dataset):
     """
     fit = calibrated(fit_from_odometry(measure(dataset)))
     m, found, rows = fit.problem.measurements, result(fit), fit.problem.measurements.structure.rows
-    agree = np.bincount(m.label, fit.problem.measured.sighting_weight, len(m.marker))
-    marker = np.flatnonzero(np.isin(m.marker, found.marker) & m.oriented & (agree >= MIN_SIGHTINGS_PER_MARKER))
+    accepted = np.bincount(m.label, fit.problem.measured.sighting_weight, len(m.marker))
+    marker = np.flatnonzero(np.isin(m.marker, found.marker) & m.oriented
+                            & (accepted >= MIN_SIGHTINGS_PER_MARKER))
     antenna = np.flatnonzero(~np.isin(m.antenna, list(found.doubts)))
     f, k = len(m.frame), len(m.marker)
     unknowns = np.concatenate([rows(f + marker, 3).ravel(), rows(f + k + antenna, 2).ravel()])

@@ -13,7 +13,7 @@ from slamlib.dataset import DatasetError, dataset_names, read_dataset, read_trut
 from slamlib.notebook import Drive, listed
 from slamlib.report.build import BUILDING
 from slamlib.report.options import ESTIMATES
-from slamlib.results import FILES
+from slamlib.results import RESULT_FILES
 from slamlib.solve import PROBLEMS, SENSORS, title
 
 BEGINNING = (1980, 1, 1, 0, 0, 0)  # of time in a zip: equal input gives equal bytes
@@ -110,7 +110,7 @@ def handed_in(drive, problem2):
     """
     estimate = ESTIMATES[problem2]
     files = {f"{problem[:8]}/{name}": f"{problem}/{name}"
-             for problem in ("problem1", estimate, "problem3", "problem4") for name in FILES
+             for problem in ("problem1", estimate, "problem3", "problem4") for name in RESULT_FILES
              if f"{problem}/{name}" in drive.files}
     alone = "problem2/ArucoMap.mat"
     if "problem2/vehiclePose.mat" in files and alone in drive.files:

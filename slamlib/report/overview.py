@@ -17,7 +17,7 @@ from slamlib.report.animation import moving
 from slamlib.report.chapters import HTML_ONLY
 from slamlib.report.drives import order
 from slamlib.report.pictures import trajectories
-from slamlib.results import FILES
+from slamlib.results import RESULT_FILES
 from slamlib.solve import PROBLEMS, SENSORS, title, truth_in_world
 
 METHODS = {  # in the order of the problems; the hint is left to chapter 2
@@ -280,7 +280,7 @@ def _file_table(drives, address):
     paths = [PurePosixPath(file) for drive in drives for file in drive.files]
     folders = sorted({path.parent for path in paths}, key=lambda path: (order(path.name), path))
     kinds = sorted({path.name for path in paths}, key=lambda name: (
-        FILES.index(name) if name in FILES else len(FILES), name))
+        RESULT_FILES.index(name) if name in RESULT_FILES else len(RESULT_FILES), name))
     rows = []
     for folder in folders:
         links = [", ".join(

@@ -1,4 +1,4 @@
-"""Start values compared: where the markers and the antennas of the SLAM graph start."""
+"""Comparison of start values of the markers and the antennas in the SLAM graph."""
 
 from dataclasses import replace
 
@@ -24,8 +24,8 @@ from slamlib.slam.state import state_from_arrays
 from slamlib.studies.kernels import solve_with
 from slamlib.studies.montecarlo import antenna_error
 
-MAX_ANTENNA_ERROR = 0.5          # m, error below which an antenna is right
-COST_TOLERANCE = 1.0              # of the right optimum: a residual below one and a half sigmas
+MAX_ANTENNA_ERROR = 0.5      # m, error below which an antenna is right
+COST_TOLERANCE = 1.0         # cost above that of the right optimum: a residual of 1.4 sigmas
 
 
 def first_sighting(measurements, in_world, covariances):
@@ -47,12 +47,12 @@ def mean_by_information(measurements, in_world, covariances):
     """
     m = measurements
     middle = most_certain_sighting(m, in_world, covariances)
-    apart = in_world - middle[m.label]
-    apart[:, 2] = se2.wrap(apart[:, 2])
+    difference = in_world - middle[m.label]
+    difference[:, 2] = se2.wrap(difference[:, 2])
     information = np.linalg.inv(covariances)
     total, moment = np.zeros((len(m.marker), 3, 3)), np.zeros((len(m.marker), 3))
     np.add.at(total, m.label, information)
-    np.add.at(moment, m.label, (information @ apart[..., None])[..., 0])
+    np.add.at(moment, m.label, (information @ difference[..., None])[..., 0])
     return middle + np.linalg.solve(total, moment[..., None])[..., 0]
 
 
@@ -79,7 +79,7 @@ def guessed_antennas(measurements, poses, covariances):
 
 def landmarks(seed, path="short", drift=1.0, known=True, kernel="graduated",
               starts=tuple(LANDMARKS), **options):
-    """Ways to initialise the markers, on one simulated drive with the true slip.
+    """LANDMARKS, starts of the markers, on one simulated drive with the true slip.
 
     Parameters
     ----------
@@ -107,10 +107,10 @@ def landmarks(seed, path="short", drift=1.0, known=True, kernel="graduated",
 
 
 def landmarks_of_drive(dataset, found, kernel="last", starts=tuple(LANDMARKS)):
-    """Ways to initialise the markers of a Dataset, given the SlamResult `found` of problem 3.
+    """LANDMARKS, starts of the markers of a Dataset, given the SlamResult `found` of problem 3.
 
-    Model and noise are those of the result. Returns the numbers of `landmarks`, with the optimum
-    that is reached from the result and its map in place of the truth.
+    Model and noise are those of the result. Returns the numbers of `landmarks`; the optimum reached
+    from the result, and its map, replace the truth.
     """
     m, vehicle = measure(dataset.without("uwb")), dataset.vehicle
     rounds = _kernel_rounds(build(m, found.model, found.noise), kernel)
@@ -144,14 +144,14 @@ def _from_each_start(rounds, best, markers, starts):
     return numbers
 
 
-def guesses(seed, error, poses=None, markers=True, compared=True, **options):
+def guesses(seed, error, poses=None, markers=True, from_guess=True, **options):
     """Antenna guesses that are wrong by `error` m in random directions, on a short drive.
 
     Parameters
     ----------
     poses : number of the drive's first poses to use, or None for all.
     markers : False leaves the markers out.
-    compared : False leaves "from the guess" out.
+    from_guess : False leaves "from the guess" out.
 
     Returns
     -------
@@ -169,7 +169,8 @@ def guesses(seed, error, poses=None, markers=True, compared=True, **options):
     right, doubt = miss < MAX_ANTENNA_ERROR, np.isin(found.antenna, list(found.doubts))
     numbers = {"right": right.mean(), "in doubt": doubt.mean(),
                "silently wrong": np.mean(~right & (squared > POINT_GATE) & ~doubt)}
-    if compared:
-        naive = result(solve_with(measurements, antennas=guessed_antennas))
-        numbers["from the guess"] = np.mean(antenna_error(naive, truth)[0] < MAX_ANTENNA_ERROR)
+    if from_guess:
+        untrilaterated = result(solve_with(measurements, antennas=guessed_antennas))
+        error, _ = antenna_error(untrilaterated, truth)
+        numbers["from the guess"] = np.mean(error < MAX_ANTENNA_ERROR)
     return numbers
