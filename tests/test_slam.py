@@ -450,7 +450,7 @@ def open_path(legs, seed, spacing=2.0, slip=1e-3):
     ds, dtheta = (np.repeat(values / steps, steps) for values in np.transpose(legs))
     layout = replace_namespace(simulation.PATHS["short"], marker_spacing=spacing)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(simulation, "_drive", lambda layout, rounds: (ds, dtheta))
+        patch.setattr(simulation, "_driven_arcs", lambda layout, rounds: (ds, dtheta))
         patch.setitem(simulation.PATHS, "open", layout)
         dataset, truth = simulate("open", seed, slip=slip)
     return dataset.without("uwb"), truth

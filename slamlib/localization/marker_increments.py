@@ -15,7 +15,7 @@ from slamlib import se2
 from slamlib.sightings import GATE, MAX_HEADING_SIGMA
 
 INCREMENT_ITERATIONS = 8, 6   # numbers of Gauss-Newton iterations: Cauchy weights, then the gate
-STEP_TOLERANCE = 1e-10        # m and rad; iterations end after a smaller step
+INCREMENT_STEP_TOLERANCE = 1e-10  # m and rad; iterations end after a smaller step
 SPEED_RATIO = 3.0             # ratio of the largest plausible speed to the usual speed
 POINT_PAIRS = 60              # pairs of points that give hypotheses, of every pair of frames
 SIGHTINGS_PER_BLOCK = 20_000  # sightings whose residuals are computed together
@@ -112,7 +112,7 @@ def robust_increments(z, C, pair, first, second, count):
             covariance = _inverse_where_regular(H)
             step = np.einsum("nij,nj->ni", covariance, gradient)
             increment = increment + step
-            if not np.nanmax(np.abs(step), initial=0) > STEP_TOLERANCE:
+            if not np.nanmax(np.abs(step), initial=0) > INCREMENT_STEP_TOLERANCE:
                 break
     increment[:, 2] = se2.wrap(increment[:, 2])
     usable = covariance[:, 2, 2] < MAX_HEADING_SIGMA**2
