@@ -153,11 +153,11 @@ def _names(arguments):
 
 def _solve(options):
     from slamlib.inventory import found
-    from slamlib.summary import solve_to_folder, table
+    from slamlib.summary import solve_to_folder, summary_table
     dataset, truth = read_dataset(options.folder), read_truth(options.folder)
     print("\n".join(found(dataset, truth)), file=sys.stderr)
     summary = solve_to_folder(dataset, truth, options.out, jobs=2)
-    print(table(summary))
+    print(summary_table(summary))
     return _exit_code((summary["dataset"], name, row["failed"])
                       for name, row in summary["problems"].items() if "failed" in row)
 
@@ -178,8 +178,8 @@ def _lab(options):
 
 
 def _export(options):
-    from slamlib.export import export
-    for path in export(options.results, options.format, options.out):
+    from slamlib.export import export_trajectories
+    for path in export_trajectories(options.results, options.format, options.out):
         print(path)
     return 0
 

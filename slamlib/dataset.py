@@ -1,4 +1,4 @@
-"""Datasets of one drive each, read from a folder of text files.
+"""Datasets: the measurements of one drive, read from a folder of text files.
 
 The folder holds `encoderReading.txt` and, where the vehicle has the sensors, `ArucoReading.txt` and
 `UwbReading.txt` with `UwbAntennaGuess.txt`. Optional are `vehicle.toml`, with what differs from the
@@ -16,6 +16,7 @@ import numpy as np
 from slamlib import counts
 from slamlib.dialects import read_table
 from slamlib.doubt import Doubt
+from slamlib.evaluation import correlations
 from slamlib.exchanged import look_exchanged
 from slamlib.filenames import ENCODER, TRUTH_FILES
 from slamlib.folder import contents, is_dataset
@@ -24,8 +25,8 @@ from slamlib.textfile import DatasetError, error
 from slamlib.truth_frame import in_first_frame
 from slamlib.vehicle import Vehicle, read_vehicle
 
-SMALLEST_EIGENVALUE = 1e-12  # no unit; a correlation matrix with a smaller one counts as singular
-MOST_NEGATIVE = 5.0  # sigmas, of a range at an antenna
+MIN_EIGENVALUE = 1e-12  # of a correlation matrix; with a smaller one it counts as singular
+MAX_NEGATIVE_SIGMAS = 5.0  # sigmas, by which noise may make a range negative
 
 
 class _Readings:
@@ -77,11 +78,11 @@ class Dataset:
     notes: tuple[str, ...] = ()  # what was mended or left out while reading, a sentence each
 
     def without(self, sensor):
-        """The dataset without a sensor, "aruco" or "uwb"."""
+        """The Dataset without a sensor, "aruco" or "uwb"."""
         return replace(self, **{sensor: None})
 
     def first(self, count):
-        """The dataset until encoder pose number `count`; sensors without readings are None."""
+        """The Dataset of the first `count` poses; sensors without readings are None."""
         def until(readings):
             early = readings and readings.select(readings.pose < count)
             return early if early and len(early.pose) else None
@@ -90,7 +91,7 @@ class Dataset:
 
 @dataclass(frozen=True)
 class Truth:
-    """What the measurements would be without errors; known for simulated or surveyed drives."""
+    """True poses, maps and wheel parameters of a simulated or surveyed drive."""
 
     poses: np.ndarray  # (n, 3) [x, y, heading] in m, m, rad; headings are continuous
     marker: np.ndarray  # (k,) int64, marker id, ascending
@@ -127,8 +128,8 @@ def read_dataset(folder):
     """Measurements of one drive, a Dataset; sensors without a file or without rows are None.
 
     The names of the files in `folder` may be in upper or lower case, and the files in any of the
-    `dialects`; `Dataset.notes` say what was mended or left out. Raises DatasetError if a file does
-    not follow the format.
+    `dialects`; `Dataset.notes` state what was mended or left out. Raises DatasetError if a file
+    does not have the format.
 
     >>> from slamlib.simulation import simulate, write_dataset
     >>> write_dataset("drive", *simulate("short", seed=1))
@@ -136,8 +137,8 @@ def read_dataset(folder):
     >>> len(dataset.ticks), len(dataset.aruco.pose), dataset.antenna_guess.antenna.tolist()
     (2000, 894, [5, 13, 36, 46])
     """
-    files, notes = contents(folder), []
-    notes += files.notes
+    files = contents(folder)
+    notes = list(files.notes)
     vehicle = read_vehicle(files, default=Vehicle())
     table = _read_encoder(files, notes)
     aruco = _read_aruco(files, len(table.numbers), notes)
@@ -156,16 +157,16 @@ def read_truth(folder):
 
     Maps without a file have length 0. Wheel parameters that `truth/vehicle.toml` does not give are
     those of the dataset. Truth whose first pose is not the origin is moved there, and a doubt says
-    so. Raises DatasetError if a file does not follow the format or has another number of poses than
+    so. Raises DatasetError if a file does not have the format or the number of poses is not that of
     the drive.
     """
-    of_drive = contents(folder)
-    if "truth" not in of_drive.files:
+    drive = contents(folder)
+    if "truth" not in drive.files:
         return None
-    files, notes = contents(of_drive.files["truth"], TRUTH_FILES), []
-    notes += [f"In truth: {note}" for note in files.notes]
-    vehicle = read_vehicle(of_drive, default=Vehicle())
-    pose_count = len(_read_encoder(of_drive, []).numbers)
+    files = contents(drive.files["truth"], TRUTH_FILES)
+    notes = [f"In truth: {note}" for note in files.notes]
+    vehicle = read_vehicle(drive, default=Vehicle())
+    pose_count = len(_read_encoder(drive, []).numbers)
     table = _read_all_poses(files, "vehiclePose.txt", "pose id, x, y, theta", notes)
     poses = table.numbers[:, 1:]
     if len(poses) != pose_count:
@@ -180,11 +181,11 @@ def read_truth(folder):
 
 
 def _read_numbers(files, name, columns, notes, **options):
-    """The `read_table` of the file `name`, whose numbers are within LIMITS; adds its notes."""
+    """The Table of the file `name`, with numbers within LIMITS; its notes are added to `notes`."""
     table, names = read_table(files.files.get(name), columns, **options), columns.split(", ")
     for column, limit in LIMITS.get(name, {}).items():
         values = table.numbers[:, names.index(column)]
-        table.require((limit.least <= values) & (values <= limit.most), limit.expected(column),
+        table.require((limit.minimum <= values) & (values <= limit.maximum), limit.expected(column),
                       names.index(column))
     notes += table.notes
     if table.source is not None and len(table.numbers) == 0:
@@ -202,6 +203,7 @@ def _read_encoder(files, notes):
 
 
 def _read_aruco(files, pose_count, notes):
+    """The ArucoReadings, or None without rows."""
     table, pose, marker = _read_readings(
         files, "ArucoReading.txt", "pose id, marker id, x, y, theta, "
         "s_xx, s_xy, s_xtheta, s_yy, s_ytheta, s_thetatheta", pose_count, notes)
@@ -210,22 +212,21 @@ def _read_aruco(files, pose_count, notes):
     values = table.numbers[:, 2:]
     covariance = values[:, [[3, 4, 5], [4, 6, 7], [5, 7, 8]]]
     # Scaled to correlations: s_thetatheta may be 1e4 rad^2 where s_xx is 1e-4 m^2.
-    sigma = np.sqrt(values[:, [3, 6, 8]])
-    correlation = covariance / (sigma[:, :, None] * sigma[:, None, :])
-    smallest_eigenvalue = np.linalg.eigvalsh(correlation)[:, 0]
-    table.require(smallest_eigenvalue > SMALLEST_EIGENVALUE, "a positive definite covariance "
-                  f"(smallest eigenvalue of its correlation matrix above {SMALLEST_EIGENVALUE:g})")
+    smallest_eigenvalue = np.linalg.eigvalsh(correlations(covariance))[:, 0]
+    table.require(smallest_eigenvalue > MIN_EIGENVALUE, "a positive definite covariance "
+                  f"(smallest eigenvalue of its correlation matrix above {MIN_EIGENVALUE:g})")
     return _in_order(ArucoReadings(pose, marker, values[:, :3], covariance), table)
 
 
 def _read_uwb(files, pose_count, antenna_guess, notes):
+    """The UwbReadings of antennas with a guess, or None without rows."""
     table, pose, antenna = _read_readings(
         files, "UwbReading.txt", "pose id, antenna id, range, sigma", pose_count, notes)
     if len(pose) == 0:
         return None
     ranges, sigma = table.numbers[:, 2:].T
-    table.require(ranges >= -MOST_NEGATIVE * sigma,
-                  f"a range that is not below -{MOST_NEGATIVE:g} sigma")
+    table.require(ranges >= -MAX_NEGATIVE_SIGMAS * sigma,
+                  f"a range that is not below -{MAX_NEGATIVE_SIGMAS:g} sigma")
     if antenna_guess is None:
         raise error(table.source,
                     "expected a UwbAntennaGuess.txt in the same folder, with every antenna")
@@ -241,7 +242,7 @@ def _in_order(readings, table):
 
 
 def _read_all_poses(files, name, columns, notes):
-    """The Table of a file that has to be there, with a row for each pose."""
+    """The Table of a required file, with a row for each pose."""
     files.required(name)
     table = _read_numbers(files, name, columns, notes)
     ids = np.arange(1, len(table.numbers) + 1)
@@ -250,7 +251,7 @@ def _read_all_poses(files, name, columns, notes):
 
 
 def _read_readings(files, name, columns, pose_count, notes):
-    """The Table of a sensor, rows of poses (m,) and landmark ids (m,)."""
+    """The Table of a sensor, pose indices (m,) from 0 and landmark ids (m,)."""
     table = _read_numbers(files, name, columns, notes, gaps=True)
     pose, landmark = table.numbers[:, :2].T
     place = table.numbers[:, 2:4] if name.startswith("Aruco") else table.numbers[:, 2:3]
@@ -264,7 +265,7 @@ def _read_readings(files, name, columns, pose_count, notes):
 
 
 def _read_map(files, name, columns, notes, **options):
-    """Landmark ids (k,), ascending, and the other columns (k, c - 1)."""
+    """Landmark ids (k,), ascending, and the further columns (k, c - 1)."""
     table = _read_numbers(files, name, columns, notes, **options)
     ids, first_row = np.unique(_ids(table, 0), return_index=True)
     table.require(np.isin(np.arange(len(table.numbers)), first_row), "each id only once")
@@ -272,6 +273,7 @@ def _read_map(files, name, columns, notes, **options):
 
 
 def _ids(table, column):
+    """Ids (m,) in a column, whole numbers, as int64."""
     values = table.numbers[:, column]
     table.require(values == np.rint(values), "ids that are whole numbers")
     return values.astype(np.int64)

@@ -1,14 +1,14 @@
-"""Doubts: what a drive's own measurements say against its files, each in one sentence."""
+"""The record of a doubt: a contradiction between the measurements and the files of a drive."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class Doubt:
-    """Something about a drive that its user should look at.
+    """A possible error in the files of a drive, for the user to check.
 
-    `what` is a short name in kebab case ("wheels-swapped"), for programs. `sentence` says what was
-    seen, how decided it is, and what to look at in which file.
+    `what` is its kind in kebab case ("wheels-swapped"), for programs. `sentence` states the
+    evidence and what to check in which file.
     """
 
     what: str

@@ -1,4 +1,4 @@
-"""Measures of the quality of an estimate, most of them against the truth.
+"""Measures of the error of an estimate against the truth, and sizes of covariances.
 
 Poses are (n, 3) [x, y, heading] in m and rad, covariances (n, 3, 3) of the same in world axes.
 Estimate and truth hold the same pose in the same row. Poses without an estimate are NaN. ATE and
@@ -11,7 +11,7 @@ import numpy as np
 
 from slamlib import se2
 
-REACH_95 = float(np.sqrt(-2 * np.log(0.05)))    # sigmas, that hold 95 % of a planar Gaussian
+REACH_95 = float(np.sqrt(-2 * np.log(0.05)))    # sigmas, of the 95 % ellipse of a planar Gaussian
 
 
 def path_length(poses):
@@ -23,8 +23,8 @@ def path_length(poses):
 def align(poses, truth):
     """Motion T (3,) of SE(2) for which compose(T, poses) is closest to the truth.
 
-    Least squares of the positions, Horn's problem in the plane: the cross and dot products of the
-    positions about their means determine the rotation. Both arguments are (n, >= 2) and finite.
+    Least squares of the positions, Horn's problem in the plane (J. Opt. Soc. Am. A 4(4), 1987): the
+    cross and dot products of the centred positions give the rotation. Both are (n, >= 2), finite.
     """
     mean, true_mean = poses[:, :2].mean(0), truth[:, :2].mean(0)
     p, q = poses[:, :2] - mean, truth[:, :2] - true_mean
@@ -101,7 +101,7 @@ def nees_band(count, dof=3, probability=0.95):
     >>> np.round(nees_band(8), 2)
     array([1.55, 4.92])
     """
-    from scipy.special import chdtri  # slow to import, and nothing that is solved needs it
+    from scipy.special import chdtri  # imported here: it is slow and no solver needs it
 
     tail = (1 - probability) / 2
     return tuple(chdtri(dof * count, [1 - tail, tail]) / count)
@@ -123,7 +123,7 @@ def sigmas(covariances):
 
 
 def position_sigmas(covariances):
-    """Standard deviations (n,) of position: the larger of those of x and y, of (n, >= 2, >= 2)."""
+    """The larger standard deviation of x and y (n,), of covariances (n, >= 2, >= 2)."""
     return sigmas(covariances)[:, :2].max(axis=1)
 
 
@@ -135,10 +135,10 @@ def correlations(covariances):
 
 
 def sigma_difference(covariances, reference):
-    """Largest difference between the position sigmas of two sets of covariances (n, 3, 3).
+    """Largest relative difference between the position sigmas of covariances (n, 3, 3) of two sets.
 
-    The result is relative to the largest position sigma of the reference, because the ratio of two
-    sigmas means nothing where both are almost zero. It is NaN if all sigmas of the reference are 0.
+    It is relative to the largest position sigma of the reference, because ratios are meaningless
+    where both sigmas are almost zero. It is NaN if all sigmas of the reference are 0.
     """
     sigma, expected = sigmas(covariances)[:, :2], sigmas(reference)[:, :2]
     return float(np.abs(sigma - expected).max() / expected.max()) if expected.max() > 0 else np.nan

@@ -1,4 +1,4 @@
-"""Trajectories as text, for other programs: TUM files and comma-separated values.
+"""Trajectories as text files: TUM format and comma-separated values.
 
 A line of a TUM file is `timestamp x y z qx qy qz qw`, the format of the TUM RGB-D benchmark that
 evo and others read. The measurements have no times, so the time stamps are pose numbers, from 1.
@@ -16,9 +16,8 @@ from slamlib.results import read_vehicle_poses
 from slamlib.textfile import DatasetError
 
 POSES = "vehiclePose.mat"
-ROWS, COLUMNS = np.triu_indices(3)
-HEADER = "pose,x,y,theta"
-COVARIANCES = ",s_xx,s_xy,s_xtheta,s_yy,s_ytheta,s_thetatheta"
+POSE_HEADER = "pose,x,y,theta"
+COVARIANCE_HEADER = ",s_xx,s_xy,s_xtheta,s_yy,s_ytheta,s_thetatheta"
 
 
 def write_tum(path, poses):
@@ -31,21 +30,26 @@ def write_tum(path, poses):
     """
     known = np.flatnonzero(np.isfinite(poses[:, 0]))
     x, y, heading = poses[known].T
-    none = np.zeros(len(known))
-    _write(path, [known + 1, x, y, none, none, none, np.sin(heading / 2), np.cos(heading / 2)], " ")
+    zero = np.zeros(len(known))
+    _write_lines(path, [known + 1, x, y, zero, zero, zero, np.sin(heading / 2),
+                        np.cos(heading / 2)], " ")
 
 
 def write_csv(path, poses, covariances=None):
-    """Write poses (n, 3), and their covariances (n, 3, 3) in world axes if given, with a header."""
+    """Write poses (n, 3), NaN without an estimate, as comma-separated values with a header.
+
+    Their covariances (n, 3, 3) in world axes, if given, are further columns.
+    """
     known = np.flatnonzero(np.isfinite(poses[:, 0]))
-    columns, header = [known + 1, *poses[known].T], HEADER
+    columns, header = [known + 1, *poses[known].T], POSE_HEADER
     if covariances is not None:
-        columns, header = [*columns, *covariances[known][:, ROWS, COLUMNS].T], header + COVARIANCES
-    _write(path, columns, ",", header)
+        columns += [*covariances[known][:, *np.triu_indices(3)].T]
+        header += COVARIANCE_HEADER
+    _write_lines(path, columns, ",", header)
 
 
-def export(source, kind, out):
-    """Write the trajectories in the folder `source` to the folder `out`; list of the Paths.
+def export_trajectories(source, kind, out):
+    """Write the trajectories in the folder `source` to the folder `out`; returns their Paths.
 
     Parameters
     ----------
@@ -60,7 +64,7 @@ def export(source, kind, out):
     for folder in _folders(source):
         path = Path(out) / f"{folder.resolve().name}.{kind}"
         if (folder / POSES).is_file():
-            poses, covariances = _read(folder)
+            poses, covariances = _read_poses(folder)
         else:
             poses, covariances = read_truth(folder.resolve().parent).poses, None
         if kind == "tum":
@@ -83,7 +87,7 @@ def _folders(source):
     return folders
 
 
-def _read(folder):
+def _read_poses(folder):
     """Poses and covariances in a problem's folder."""
     try:
         return read_vehicle_poses(folder)
@@ -94,7 +98,7 @@ def _read(folder):
                            "them, found something else") from None
 
 
-def _write(path, columns, delimiter, header=""):
+def _write_lines(path, columns, delimiter, header=""):
     """Write numbers with all their digits, the pose numbers first."""
     text = BytesIO()
     np.savetxt(text, np.column_stack(columns), header=header, comments="", delimiter=delimiter,

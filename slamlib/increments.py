@@ -1,10 +1,10 @@
 """Increments between any two poses by odometry, their noise, and the prior of the wheel slip.
 
 A wheel that travels s metres slips with variance slip^2 |s|, independently from step to step. Each
-encoder rounds its cumulative count: `noise` is that of an increment by itself, `noise_in_drive`
-that of increments which are used together. An increment is the pose `end` in the frame of the pose
-`start`; both are arrays (m,) of indices from 0. The `ticks` (n, 2), `vehicle` and `model` are those
-of module `odometry`.
+encoder rounds its cumulative count. `noise_covariances` is for a single increment, `noise_in_drive`
+for increments of one drive that are used together. An increment is the pose `end` in the frame of
+the pose `start`; both are arrays (m,) of indices from 0. The `ticks` (n, 2), `vehicle` and `model`
+are those of module `odometry`.
 """
 
 import numpy as np
@@ -12,13 +12,16 @@ import numpy as np
 from slamlib import odometry, se2
 
 SLIP_BOUNDS = (1e-5, 3e-2)  # sqrt(m), interval in which the slip is searched
-MINIMUM_SLIP = 1e-4         # sqrt(m), of an increment's end in any direction: wheels also skid
+MINIMUM_SLIP = 1e-4         # sqrt(m), skid of an increment's end along either axis
 TYPICAL_SLIP = 1e-3         # sqrt(m), median of the prior
-SLIP_FACTOR = 3.0           # no unit, one standard deviation of the prior of log slip is its log
+SLIP_FACTOR = 3.0           # its logarithm is the standard deviation of the prior of log slip
 
 
 def between_poses(ticks, vehicle, start, end, model="euler"):
-    """Increments (m, 3) by odometry, m and rad, and derivatives (m, 3, 3) by [R_R, R_L, b]."""
+    """Increments (m, 3) by odometry, m and rad, and derivatives (m, 3, 3) by [R_R, R_L, b].
+
+    Raises ValueError if `model` is not in `odometry.MODELS`.
+    """
     poses = odometry.dead_reckoning(ticks, vehicle, model=model)
     by_w = odometry.wheel_jacobian(ticks, vehicle, model=model)
     by_start, by_end = se2.between_jacobians(poses[start], poses[end])
@@ -26,7 +29,7 @@ def between_poses(ticks, vehicle, start, end, model="euler"):
             by_start @ by_w[start] + by_end @ by_w[end])
 
 
-def noise(ticks, vehicle, start, end, slip):
+def noise_covariances(ticks, vehicle, start, end, slip):
     """Covariances (m, 3, 3) of increments, of [x, y, heading] in the axes of pose `start`.
 
     `slip` in sqrt(m) is the standard deviation of the slip of one wheel after one metre. Rounding
@@ -38,7 +41,7 @@ def noise(ticks, vehicle, start, end, slip):
 
 
 def rounding_and_slipping(ticks, vehicle, start, end):
-    """The parts of `noise`, each (m, 3, 3): by rounding, and by a slip of 1 sqrt(m).
+    """Parts of `noise_covariances`, each (m, 3, 3): rounding, and a slip of 1 sqrt(m).
 
     Wheel errors e_R, e_L in the step at p along the unit vector u lengthen the step by
     (e_R + e_L) / 2. They turn the later path by (e_R - e_L) / b, which moves its end p_e by this
@@ -81,23 +84,22 @@ def rounding_and_slipping(ticks, vehicle, start, end):
 
 
 def noise_in_drive(ticks, vehicle, start, end, steps=None):
-    """Noise of increments of one drive by encoder rounding, and by slip of 1 sqrt(m).
+    """Noise of increments of one drive by encoder rounding, and by a slip of 1 sqrt(m).
 
-    The counts of an increment are a difference of what the encoder shows at its end and at its
-    start. The rounding at a pose enters the increment before it and, with the opposite sign, the
-    one after it, so over consecutive increments only the first and the last rounding remain.
-    Giving each increment the variance of a whole difference, independently, would let it grow like
-    a random walk. Each increment therefore has a share, by its number of steps, of the variance of
-    one difference over the drive. This neglects the rounding at single poses, at most half a count.
+    The rounding at a pose enters the increment before it and, with the opposite sign, the one after
+    it. Over consecutive increments only the first and the last rounding remain; independent
+    variances of whole differences would grow like a random walk. Each increment therefore has a
+    share, by its number of steps, of the variance of one difference of counts over the drive. This
+    neglects the rounding at single poses, at most half a count.
 
-    A single step has no lateral noise, and without slip hardly any. The end of an increment also
-    has a skid of variance MINIMUM_SLIP^2 per metre along both axes, which no slip explains. Shares
-    and skid grow with the steps, so their sum does not depend on how a drive is cut.
+    A single step has hardly any lateral noise. The end of an increment therefore also has a skid of
+    variance MINIMUM_SLIP^2 per metre along both axes. Shares and skid are proportional to the
+    steps, so their sum does not depend on the choice of the poses.
 
     Parameters
     ----------
     ticks : (n, 2) counts; vehicle : Vehicle; start, end : (m,) poses from 0, start <= end.
-    steps : of the drive, where the ticks are those of a part; default n - 1.
+    steps : number of steps of the drive if the ticks are those of a part; default n - 1.
 
     Returns
     -------
@@ -116,7 +118,7 @@ def noise_in_drive(ticks, vehicle, start, end, steps=None):
 def log_slip_prior(log_slip):
     """Log density, up to a constant, of log slip, which is normal about log TYPICAL_SLIP.
 
-    With the standard deviation log SLIP_FACTOR the prior decides only where the measurements hardly
-    determine the slip. `log_slip` is the natural logarithm of slip in sqrt(m).
+    Its standard deviation is log SLIP_FACTOR, so that it matters only where the measurements hardly
+    determine the slip. `log_slip` is the natural logarithm of the slip in sqrt(m).
     """
     return -((log_slip - np.log(TYPICAL_SLIP)) / np.log(SLIP_FACTOR))**2 / 2

@@ -1,7 +1,7 @@
-"""The numbers that a dataset may hold: one table, which the reader checks and data/README.md shows.
+"""Limits of the numbers in a dataset, which the reader checks and data/README.md lists.
 
-The limits are far wider than vehicles, cameras and antennas need. A number outside of them is in
-another unit, or so large or small beside the others that float64 cannot hold both.
+The limits are far wider than vehicles, cameras and antennas need. A number beyond them has another
+unit, or a magnitude so far from the others that float64 loses digits.
 """
 
 from dataclasses import dataclass
@@ -11,18 +11,18 @@ from dataclasses import dataclass
 class Limit:
     """The closed interval in which a number lies."""
 
-    least: float
-    most: float | str        # a str names the entry of the same file that is the largest value
+    minimum: float
+    maximum: float | str     # a str names the entry of the same file that is the maximum
     unit: str
-    what: str                # what the number is
+    meaning: str             # of the number, with its unit
 
     def __str__(self):
-        most = self.most if isinstance(self.most, str) else f"{self.most:g}"
-        return f"from {self.least:g} to {most} {self.unit}".rstrip()
+        maximum = self.maximum if isinstance(self.maximum, str) else f"{self.maximum:g}"
+        return f"from {self.minimum:g} to {maximum} {self.unit}".rstrip()
 
     def expected(self, name):
-        """What a message says that is expected of the number `name`."""
-        return f"{'a positive ' if self.least > 0 else ''}{name} {self} ({self.what})"
+        """The part of an error message (str) that says what is expected of the number `name`."""
+        return f"{'a positive ' if self.minimum > 0 else ''}{name} {self} ({self.meaning})"
 
 
 _RADIUS = Limit(1e-3, 2.5, "m", "the radius of a wheel in metres")
@@ -34,19 +34,21 @@ _TRUE_ANGLE = Limit(-1e9, 1e9, "rad", "an angle in radians")
 _FACTOR = Limit(0.01, 100, "", "what the stated standard deviations are multiplied by")
 
 
-def _of(parameter):
+def _sigma_limit(parameter):
+    """The Limit of the standard deviation of a length, at most the length itself."""
     return Limit(1e-9, parameter, "m",
                  f"a standard deviation in metres, not larger than {parameter} itself")
 
 
-# By the name of a file, and by column or entry.
+# Limits by the name of a file, and by its column or entry.
 LIMITS = {
     "vehicle.toml": {
         "right_radius": _RADIUS, "left_radius": _RADIUS,
         "wheelbase": Limit(1e-3, 20, "m", "the distance between the wheels in metres"),
         "ticks_per_revolution": Limit(1, 1e10, "", "counts of an encoder in one revolution"),
-        "sigma_right_radius": _of("right_radius"), "sigma_left_radius": _of("left_radius"),
-        "sigma_wheelbase": _of("wheelbase"),
+        "sigma_right_radius": _sigma_limit("right_radius"),
+        "sigma_left_radius": _sigma_limit("left_radius"),
+        "sigma_wheelbase": _sigma_limit("wheelbase"),
         "sigma_heading": Limit(1e-9, 10, "rad", "a standard deviation in radians; from pi on the "
                                "heading is unknown"),
         "slip": Limit(0, 0.1, "sqrt(m)", "the standard deviation in metres of a wheel's slip after "

@@ -9,9 +9,9 @@ The assignment's equation 1 is a forward Euler step: ds along the heading at the
 `model="arc"` is exact for wheels at constant speed, which describe a circular arc: its chord is
 ds sin(dtheta/2) / (dtheta/2) long, along the heading at the middle of the step.
 
-`equation2` computes the assignment's covariance, from De Cecco, Baglivo and Angrilli (IEEE T.
-Instrum. Meas. 56(3), 2007), in closed form. `first_order` computes the exact first-order covariance
-for the same uncertain quantities: the wheel parameters w = [R_R, R_L, b] and the initial pose.
+`equation2` computes the assignment's covariance in closed form, from De Cecco, Baglivo and Angrilli
+(IEEE T. Instrum. Meas. 56(3), 2007). `first_order` computes the exact first-order covariance for
+the same uncertain quantities: the wheel parameters w = [R_R, R_L, b] and the initial pose.
 
 All functions take the `ticks` (n, 2), counts of the right and left wheel in the step to each of n
 poses (row 0 is not used), and a `vehicle`, a Vehicle. Poses are [x, y, heading] in the world frame,
@@ -27,10 +27,10 @@ MODELS = ("euler", "arc")
 
 
 def steps(ticks, vehicle):
-    """Length ds and turn dtheta of every step, (n-1,) in m and rad, with their derivatives.
+    """Length ds and turn dtheta of every step in equation 1, with their derivatives.
 
-    Returns ds, dtheta, ds_by_w and dtheta_by_w. The last two are the derivatives by the wheel
-    parameters [R_R, R_L, b], (n-1, 3) without unit and in rad/m.
+    Returns ds (n-1,) in m, dtheta (n-1,) in rad, and ds_by_w and dtheta_by_w (n-1, 3), the
+    derivatives by the wheel parameters [R_R, R_L, b], without unit and in rad/m.
     """
     counts = np.asarray(ticks, dtype=float)[1:]
     ds_by_w = np.pi / vehicle.ticks_per_revolution * np.insert(counts, 2, 0.0, axis=1)  # b: zero
@@ -42,7 +42,9 @@ def steps(ticks, vehicle):
 
 
 def dead_reckoning(ticks, vehicle, initial_pose=(0.0, 0.0, 0.0), model="euler"):
-    """Poses (n, 3) from `initial_pose` (3,), by equation 1 or, with model "arc", by exact arcs.
+    """Poses (n, 3) from `initial_pose` (3,) by equation 1 or, with model "arc", by exact arcs.
+
+    Raises ValueError if `model` is not in MODELS.
 
     One revolution of both wheels, whose radii are 0.1 m:
 
@@ -61,7 +63,7 @@ def dead_reckoning(ticks, vehicle, initial_pose=(0.0, 0.0, 0.0), model="euler"):
 
 
 def equation2(ticks, vehicle, initial_pose=(0.0, 0.0, 0.0), initial_covariance=None):
-    """Poses (n, 3) by equation 1 and covariances (n, 3, 3) by equations 2 and 3, in closed form.
+    """Poses (n, 3) by equation 1 and covariances (n, 3, 3) by equation 2 and equation 3.
 
     Equation 2 adds J C_w J^T + J S I^T + I S J^T = (I + J S)(I + J S)^T - I I^T at every step, and
     I + J S is the next I by equation 3. The sum telescopes:
@@ -90,9 +92,10 @@ def equation2(ticks, vehicle, initial_pose=(0.0, 0.0, 0.0), initial_covariance=N
 
 
 def step_jacobian(ticks, vehicle, heading):
-    """J_k of equation 2, d(X_{k+1} - X_k) / d w_k with w_k = [R_R, R_L, b, heading_k], (n-1, 3, 4).
+    """Jacobians J_k of equation 2 and equation 3, (n-1, 3, 4).
 
-    `heading` (n-1,) is that at the start of each Euler step, in rad.
+    J_k = d(X_{k+1} - X_k) / d w_k with w_k = [R_R, R_L, b, heading_k]. `heading` (n-1,) is that at
+    the start of each Euler step, in rad.
     """
     ds, _, ds_by_w, dtheta_by_w = steps(ticks, vehicle)
     c, s = np.cos(heading), np.sin(heading)
@@ -106,10 +109,11 @@ def step_jacobian(ticks, vehicle, heading):
 
 
 def wheel_jacobian(ticks, vehicle, initial_heading=0.0, model="euler"):
-    """Derivatives (n, 3, 3) of every dead-reckoned pose by [R_R, R_L, b], with pose 1 fixed.
+    """Derivatives (n, 3, 3) of the poses of `dead_reckoning` by [R_R, R_L, b], with pose 1 fixed.
 
     A wheel-parameter error is constant. It acts in every step and, through the heading, on all
-    later steps: the derivatives accumulate, not the variances. `initial_heading` is in rad.
+    later steps: the derivatives accumulate, not the variances. `initial_heading` is in rad. Raises
+    ValueError if `model` is not in MODELS.
     """
     ds, dtheta, ds_by_w, dtheta_by_w = steps(ticks, vehicle)
     heading = cumulative(dtheta, initial_heading)
@@ -134,6 +138,7 @@ def first_order(ticks, vehicle, initial_pose=(0.0, 0.0, 0.0), initial_covariance
 
     Unlike equation 2 it contains the correlation of position and heading, because A_k and G_k
     propagate a heading error to all later positions. Shapes and defaults are those of `equation2`.
+    Raises ValueError if `model` is not in MODELS.
     """
     if initial_covariance is None:
         initial_covariance = np.diag([0.0, 0.0, vehicle.sigma_heading**2])

@@ -1,8 +1,8 @@
 """The files to hand in: MATLAB struct arrays with the assignment's field names.
 
 Poses are [x, y, heading] and positions [x, y] in world axes, in m and rad. Covariances belong to
-the same coordinates. The folder of a file is made if it does not exist. What is read raises
-`swap.UnfinishedError` where a run was ended while it wrote the folder's files, or those above it.
+the same coordinates. Writing makes the folder of a file. Reading raises `swap.UnfinishedError` if a
+run ended while it wrote the files of the folder or of its parent.
 """
 
 import struct
@@ -15,9 +15,9 @@ from scipy.io import loadmat, savemat
 from slamlib import swap
 
 _HEADER = b"MATLAB 5.0 MAT-file, written by slamlib".ljust(116)  # scipy's contains the date
-SIZE_AT, COUNT_AT = 132, 164  # bytes, of the array's size and of its number of columns
-FILES = ("vehiclePose.mat", "ArucoMap.mat", "UwbMap.mat")  # of a problem's folder
-FEW = 100  # structs that scipy writes itself
+SIZE_OFFSET, COUNT_OFFSET = 132, 164  # bytes, to the array's size and its number of columns
+RESULT_FILES = ("vehiclePose.mat", "ArucoMap.mat", "UwbMap.mat")  # of a problem's folder
+MAX_STRUCTS_BY_SCIPY = 100  # number of structs above which `_tiled` writes them
 
 
 def write_vehicle_poses(folder, poses, covariances):
@@ -25,7 +25,7 @@ def write_vehicle_poses(folder, poses, covariances):
 
     `poses` (n, 3) and `covariances` (n, 3, 3) are NaN where there is no estimate.
     """
-    _write(Path(folder) / "vehiclePose.mat", pose=poses, covari=covariances)
+    _write_structs(Path(folder) / "vehiclePose.mat", pose=poses, covari=covariances)
 
 
 def write_aruco_map(folder, ids, poses, covariances):
@@ -34,7 +34,7 @@ def write_aruco_map(folder, ids, poses, covariances):
     The marker `ids` (k,) ascend; `poses` are (k, 3) with headings in (-pi, pi], and `covariances`
     (k, 3, 3).
     """
-    _write(Path(folder) / "ArucoMap.mat", pose=poses, covari=covariances, id=ids)
+    _write_structs(Path(folder) / "ArucoMap.mat", pose=poses, covari=covariances, id=ids)
 
 
 def write_uwb_map(folder, ids, positions, covariances):
@@ -42,7 +42,7 @@ def write_uwb_map(folder, ids, positions, covariances):
 
     The antenna `ids` (a,) ascend; `positions` are (a, 2) and `covariances` (a, 2, 2).
     """
-    _write(Path(folder) / "UwbMap.mat", position=positions, covariance=covariances, id=ids)
+    _write_structs(Path(folder) / "UwbMap.mat", position=positions, covariance=covariances, id=ids)
 
 
 def read_vehicle_poses(folder):
@@ -53,26 +53,26 @@ def read_vehicle_poses(folder):
     >>> poses.shape, covariances.shape
     ((2, 3), (2, 3, 3))
     """
-    return _read(Path(folder) / "vehiclePose.mat", pose=(3,), covari=(3, 3))
+    return _read_structs(Path(folder) / "vehiclePose.mat", pose=(3,), covari=(3, 3))
 
 
 def read_aruco_map(folder):
     """Ids (k,), poses (k, 3) and covariances (k, 3, 3) of folder/ArucoMap.mat."""
-    ids, *rest = _read(Path(folder) / "ArucoMap.mat", id=(), pose=(3,), covari=(3, 3))
+    ids, *rest = _read_structs(Path(folder) / "ArucoMap.mat", id=(), pose=(3,), covari=(3, 3))
     return ids.astype(int), *rest
 
 
 def read_uwb_map(folder):
     """Ids (a,), positions (a, 2) and covariances (a, 2, 2) of folder/UwbMap.mat."""
-    ids, *rest = _read(Path(folder) / "UwbMap.mat", id=(), position=(2,), covariance=(2, 2))
+    ids, *rest = _read_structs(Path(folder) / "UwbMap.mat", id=(), position=(2,), covariance=(2, 2))
     return ids.astype(int), *rest
 
 
-def _write(path, **fields):
+def _write_structs(path, **fields):
     """Write one (1, n) struct array, named like the file; equal input gives equal bytes."""
     rows = {name: _matrices(values) for name, values in fields.items()}
     count = len(next(iter(rows.values())))
-    content = _tiled(path.stem, rows) if count > FEW else _saved(path.stem, rows)
+    content = _tiled(path.stem, rows) if count > MAX_STRUCTS_BY_SCIPY else _saved(path.stem, rows)
     swap.write(path, _HEADER + content[len(_HEADER):])
 
 
@@ -96,11 +96,11 @@ def _saved(name, rows):
 
 
 def _tiled(name, rows):
-    """The same bytes as `_saved`, for many structs, which scipy writes one by one.
+    """The bytes of `_saved` for many structs; scipy writes these slowly, one by one.
 
-    All elements of the array have the same layout. scipy writes one and two of them, which shows
-    how long an element is; each number's place in it is where scipy puts a number that is known.
-    The count stands in the array's dimensions, and in its size (MAT-File Format, version 5).
+    All elements of the array have the same layout. Files by scipy with one and two of them give the
+    length of an element, and known numbers in them the offset of each number. The array's
+    dimensions and size contain the count (MAT-File Format, version 5).
     """
     count = len(next(iter(rows.values())))
     known = iter(np.pi * np.arange(1, 1000))
@@ -110,18 +110,18 @@ def _tiled(name, rows):
         name, {field: np.repeat(values, 2, axis=0) for field, values in one.items()})
     length = len(second) - len(first)
     head, element = bytearray(first[:-length]), first[-length:]
-    size, = struct.unpack_from("=I", head, SIZE_AT)
-    struct.pack_into("=I", head, SIZE_AT, size + (count - 1) * length)
-    struct.pack_into("=i", head, COUNT_AT, count)
+    size, = struct.unpack_from("=I", head, SIZE_OFFSET)
+    struct.pack_into("=I", head, SIZE_OFFSET, size + (count - 1) * length)
+    struct.pack_into("=i", head, COUNT_OFFSET, count)
     elements = np.tile(np.frombuffer(element, np.uint8), (count, 1))
     for field, values in rows.items():
         for number, column in zip(one[field].flat, values.reshape(count, -1).T):
-            at = element.index(struct.pack("=d", number))
-            elements[:, at:at + 8] = np.ascontiguousarray(column)[:, None].view(np.uint8)
+            offset = element.index(struct.pack("=d", number))
+            elements[:, offset:offset + 8] = np.ascontiguousarray(column)[:, None].view(np.uint8)
     return bytes(head) + elements.tobytes()
 
 
-def _read(path, **shapes):
+def _read_structs(path, **shapes):
     """Fields of a struct array with n elements: a tuple of arrays (n, *shape)."""
     for folder in (path.parent, path.parent.parent):
         swap.require_finished(folder)

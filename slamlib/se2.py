@@ -3,9 +3,9 @@
 Lengths are in metres, angles in radians. The pose T_ab of frame b in frame a maps coordinates in b
 to coordinates in a,
 
-    p_a = R(heading) p_b + [x, y],        R(h) = [[cos h, -sin h], [sin h, cos h]],
+    p_a = R(heading) p_b + [x, y],        R(h) = [[cos h, -sin h], [sin h, cos h]].
 
-so that frames cancel: compose(T_ab, T_bc) = T_ac and between(T_wa, T_wb) = T_ab. Every function
+Adjacent frames cancel: compose(T_ab, T_bc) = T_ac and between(T_wa, T_wb) = T_ab. Every function
 broadcasts over the leading dimensions. Jacobians are partial derivatives by the coordinates
 [x, y, heading], not by a tangent vector, as the covariances of this package are of [x, y, heading].
 Headings are added and subtracted but not wrapped; call `wrap` where an angle must lie in (-pi, pi].
@@ -49,10 +49,7 @@ def compose(T_ab, T_bc):
 
 def inverse(T_ab):
     """T_ba, (..., 3), the inverse of T_ab."""
-    T_ab = np.asarray(T_ab, dtype=float)
-    c, s = np.cos(T_ab[..., 2]), np.sin(T_ab[..., 2])
-    x, y = T_ab[..., 0], T_ab[..., 1]
-    return _poses(-c * x - s * y, s * x - c * y, -T_ab[..., 2])
+    return between(T_ab, np.zeros(3))
 
 
 def between(T_wa, T_wb):
@@ -82,13 +79,7 @@ def compose_jacobians(T_ab, T_bc):
 
 def inverse_jacobian(T_ab):
     """Derivative of inverse, d T_ba / d T_ab, (..., 3, 3)."""
-    T_ab = np.asarray(T_ab, dtype=float)
-    T_ba = inverse(T_ab)
-    jacobian = -_identity(T_ab.shape)
-    jacobian[..., :2, :2] = -rotation(T_ba[..., 2])
-    jacobian[..., 0, 2] = T_ba[..., 1]
-    jacobian[..., 1, 2] = -T_ba[..., 0]
-    return jacobian
+    return between_jacobians(T_ab, np.zeros(3))[0]
 
 
 def between_jacobians(T_wa, T_wb):
@@ -105,7 +96,7 @@ def between_jacobians(T_wa, T_wb):
 
 
 def log(T):
-    """Logarithm (..., 3) of motions T, the constant velocity that reaches T in unit time.
+    """Logarithm (..., 3) of motions T (..., 3), the constant velocity that yields T in unit time.
 
     It is [a x + h y / 2, -h x / 2 + a y, h] with the wrapped heading h and a = (h / 2) cot(h / 2).
     GTSAM computes the error of its between factors with it (`Pose2::Logmap`).
@@ -117,7 +108,7 @@ def log(T):
 
 
 def log_jacobian(T):
-    """Derivative of log by [x, y, heading], (..., 3, 3)."""
+    """Derivative of `log` at motions T (..., 3) by [x, y, heading], (..., 3, 3)."""
     T = np.asarray(T, dtype=float)
     h, x, y = wrap(T[..., 2]), T[..., 0], T[..., 1]
     a, slope = _half_cotangent(h)
@@ -137,9 +128,9 @@ def _half_cotangent(h):
 
 
 def rotate_covariance(covariance, heading):
-    """B C B^T, the covariance C (..., 3, 3) of [x, y, heading] turned from axes of b to those of a.
+    """B C B^T, covariances C (..., 3, 3) of [x, y, heading] rotated from axes of b to those of a.
 
-    `heading` (...) is that of b in a, in rad.
+    B rotates x and y by `heading` (...), that of b in a, in rad.
     """
     B = _identity(np.shape(heading) + (3,))
     B[..., :2, :2] = rotation(heading)
@@ -154,8 +145,5 @@ def _poses(x, y, heading):
 
 
 def _identity(shape):
-    """An identity matrix for each pose of an array of this shape, (..., 3, 3)."""
-    matrices = np.zeros(shape[:-1] + (3, 3))
-    for i in range(3):
-        matrices[..., i, i] = 1
-    return matrices
+    """Identity matrices (..., 3, 3), one for each pose of an array of this shape, (..., 3)."""
+    return np.broadcast_to(np.eye(3), shape + (3,)).copy()

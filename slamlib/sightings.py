@@ -1,4 +1,4 @@
-"""Sightings of markers, merged and sorted by frame, and the gates, for problems 2 to 4.
+"""Sightings of markers, merged and sorted by frame, and the gates of problems 2 to 4.
 
 A frame is a pose of the vehicle with a measurement. A sighting is the pose z of a marker in the
 vehicle frame with the covariance C of [x, y, heading]. A gate is the 99.9 % quantile of the squared
@@ -10,12 +10,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slamlib import se2
+from slamlib.evaluation import correlations, sigmas
 
 GATE = 16.26623619623813         # dimensionless, for residuals of [x, y, heading]
-MAX_COMPARED = 200               # sightings of a marker, whose comparison costs their square
+MAX_SIGHTINGS_COMPARED = 200     # of a marker; the cost of comparison is quadratic
 POINT_GATE = 13.815510557964274  # dimensionless, for residuals of [x, y]
-SMALLEST_SIGMA = 1e-6            # m or rad, of a measurement if all else is known
-SMALLEST_RATIO = 1e-6            # of the standard deviations of x and y
+MIN_MEASUREMENT_SIGMA = 1e-6     # m or rad, of one coordinate given the others
+MIN_SIGMA_RATIO = 1e-6           # of the standard deviations of x and y
 MAX_HEADING_SIGMA = 0.5          # rad; with a larger standard deviation a heading is unknown
 
 
@@ -50,19 +51,18 @@ def sightings_by_frame(aruco, extra_frames=()):
 
 
 def regular(covariance):
-    """Covariances (m, 3, 3) that float64 can invert and a graph can hold beside weaker information.
+    """Covariances (m, 3, 3), increased where float64 could not invert or add their information.
 
-    Where the standard deviation of x, y or heading, given the other two, is below SMALLEST_SIGMA,
-    as between coordinates that are fully correlated, the variance is increased by its square. For
-    x and y, SMALLEST_RATIO of the larger of both standard deviations counts in the same way.
+    Where the standard deviation of x, y or heading, given the other two, is below
+    MIN_MEASUREMENT_SIGMA, as of fully correlated coordinates, the variance is increased by its
+    square. For x and y the bound is at least MIN_SIGMA_RATIO of the larger standard deviation.
     """
-    sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-    correlation = covariance / (sigma[:, :, None] * sigma[:, None, :])
-    given_others = sigma**2 / np.diagonal(np.linalg.inv(correlation), axis1=1, axis2=2)
-    smallest = np.full_like(sigma, SMALLEST_SIGMA)
-    smallest[:, :2] = np.maximum(
-        SMALLEST_SIGMA, SMALLEST_RATIO * sigma[:, :2].max(axis=1, keepdims=True))
-    added = np.where(given_others < smallest**2, smallest**2, 0.0)
+    sigma, information = sigmas(covariance), np.linalg.inv(correlations(covariance))
+    conditional = sigma**2 / np.diagonal(information, axis1=1, axis2=2)
+    bound = np.full_like(sigma, MIN_MEASUREMENT_SIGMA)
+    bound[:, :2] = np.maximum(
+        MIN_MEASUREMENT_SIGMA, MIN_SIGMA_RATIO * sigma[:, :2].max(axis=1, keepdims=True))
+    added = np.where(conditional < bound**2, bound**2, 0.0)
     return covariance + added[:, :, None] * np.eye(3)
 
 
@@ -92,16 +92,16 @@ def merge_repeated(aruco):
 
 
 def consensus(marker, in_world, covariance):
-    """Rows (k,) of the most certain well supported sighting of each marker, in ascending id.
+    """Rows (k,) of one sighting of each marker, well supported and certain, in ascending id.
 
     The support of a sighting is the number of sightings of its marker within GATE of it. Of those
     with at least half the maximum support, the most certain one has the smallest determinant of its
     covariance. `marker` (s,) are ids, `in_world` (s, 3), m and rad, and `covariance` (s, 3, 3) the
-    poses of these markers in world axes as each sighting gives them. Of a marker with more than
-    MAX_COMPARED sightings, so many are compared, evenly chosen.
+    poses of these markers in world axes by each sighting. Of a marker with more than
+    MAX_SIGHTINGS_COMPARED sightings, so many evenly chosen ones are compared.
     """
     _, label = np.unique(marker, return_inverse=True)
-    chosen, best = few_of_each(label, MAX_COMPARED), []
+    chosen, best = evenly_chosen(label, MAX_SIGHTINGS_COMPARED), []
     order = chosen[np.argsort(label[chosen], kind="stable")]
     log_determinant = np.linalg.slogdet(covariance)[1]
     for same in np.split(order, np.flatnonzero(np.diff(label[order])) + 1) if len(order) else ():
@@ -114,13 +114,13 @@ def consensus(marker, in_world, covariance):
     return np.array(best, int)
 
 
-def few_of_each(label, most):
-    """Rows of at most `most` entries of every label, from its first one on, evenly chosen.
+def evenly_chosen(label, maximum):
+    """Rows, ascending, of at most `maximum` evenly spaced entries of every label, with its first.
 
-    Labels count from 0.
+    `label` (s,) are integers from 0.
     """
     order = np.argsort(label, kind="stable")
     count = np.bincount(label)[label[order]]
     number = np.arange(len(order)) - np.searchsorted(label[order], label[order])
-    few = np.minimum(count, most)
+    few = np.minimum(count, maximum)
     return np.sort(order[(number * few) // count != ((number - 1) * few) // count])

@@ -21,8 +21,8 @@ from slamlib.dataset import AntennaGuess, ArucoReadings, Dataset, Truth, UwbRead
 from slamlib.odometry import cumulative
 from slamlib.textfile import DatasetError
 
-# A path is a sum of rotating vectors (turns per round, radius in m, phase in rad). Markers, spaced
-# in m, are missing in a disc: its centre as a fraction of the path, and its radius in m.
+# A path is a sum of rotating vectors (turns per round, radius in m, phase in rad). `marker_spacing`
+# is in m; no markers are in a disc with its centre at a fraction of the path and its radius in m.
 PATHS = {
     "short": SimpleNamespace(
         vectors=((1, 2.9, 0.0), (-1, 0.9, 0.3), (2, 0.7, 2.0), (3, 0.2, 1.0)), poses=2000,
@@ -34,7 +34,7 @@ PATHS = {
 CAMERA_REACH = 1.8      # m, largest distance in the plane at which a marker is in the image
 UWB_REACH = 15.0        # m, largest distance to an antenna that is measured
 LATE_RANGE_MEAN = 0.8   # m, mean of the exponential excess of late ranges
-SIMULATED_GUESS_SIGMA = 0.35      # m per axis, standard deviation of the antenna guesses
+SIMULATED_GUESS_SIGMA = 0.35   # m per axis, standard deviation of the antenna guesses
 TABLE_2 = Vehicle()     # the assignment's nominal vehicle
 
 
@@ -73,8 +73,8 @@ def simulate(path="short", seed=0, *, slip=1e-3, late_ranges=0.0, mislabelled=0.
     layout = PATHS[path]
     rng = np.random.default_rng(seed)
     true_vehicle = vehicle.with_deviation(noise * rng.standard_normal(3))
-    arcs = _drive(layout, rounds)
-    poses, ticks = _compose(*arcs), _encoder(*arcs, true_vehicle, slip, noise, rng)
+    arcs = _driven_arcs(layout, rounds)
+    poses, ticks = _arc_poses(*arcs), _encoder(*arcs, true_vehicle, slip, noise, rng)
     marker, marker_in_world = _place_markers(layout, poses, rng)
     antenna, antenna_in_world = _place_antennas(layout, poses, rng)
     aruco = _camera(poses, marker, marker_in_world, layout.aruco_every, mislabelled, noise, rng)
@@ -88,10 +88,9 @@ def simulate(path="short", seed=0, *, slip=1e-3, late_ranges=0.0, mislabelled=0.
 
 
 def misguess(dataset, position, error, seed):
-    """The dataset with antenna guesses `error` m from `position` (a, 2), in random directions.
+    """The Dataset with antenna guesses `error` m from `position` (a, 2), in random directions.
 
-    The rows of `position` are the antennas of the dataset's guesses. `seed` is that of the random
-    generator.
+    `position` has the antennas of the guesses in the same order. `seed` is of the random generator.
     """
     angle = np.random.default_rng(seed).uniform(-np.pi, np.pi, len(position))
     off = error * np.stack([np.cos(angle), np.sin(angle)], -1)
@@ -99,7 +98,7 @@ def misguess(dataset, position, error, seed):
 
 
 def mislabel(dataset, fraction, seed):
-    """The dataset with another marker's id at a fraction of its sightings; `seed` as above."""
+    """The Dataset with another marker's id at a fraction of its sightings; `seed` as above."""
     rng = np.random.default_rng(seed)
     ids, label = np.unique(dataset.aruco.marker, return_inverse=True)
     wrong = rng.uniform(size=len(label)) < fraction
@@ -109,7 +108,7 @@ def mislabel(dataset, fraction, seed):
 
 
 def delay(dataset, fraction, seed):
-    """The dataset with a fraction of its ranges too long, as by `simulate`; `seed` as above."""
+    """The Dataset with a fraction of its ranges too long, as by `simulate`; `seed` as above."""
     rng, count = np.random.default_rng(seed), len(dataset.uwb.range)
     excess = rng.exponential(LATE_RANGE_MEAN, count) * (rng.uniform(size=count) < fraction)
     return replace(dataset, uwb=replace(dataset.uwb, range=dataset.uwb.range + excess))
@@ -157,7 +156,7 @@ def write_dataset(folder, dataset, truth=None):
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def _drive(layout, rounds):
+def _driven_arcs(layout, rounds):
     """Lengths (n-1,) in m and turns (n-1,) in rad of the arcs of the path, at varying speed."""
     turns, radius, phase = np.array(layout.vectors).T[:, :, None]
 
@@ -175,7 +174,7 @@ def _drive(layout, rounds):
     return np.diff(travelled), np.diff(np.unwrap(np.arctan2(direction[1], direction[0])))
 
 
-def _compose(ds, dtheta):
+def _arc_poses(ds, dtheta):
     """Poses (n, 3) along arcs of length ds and turn dtheta, from [0, 0, 0]."""
     heading = cumulative(dtheta)
     chord, direction = ds * np.sinc(dtheta / (2 * np.pi)), heading[:-1] + dtheta / 2
@@ -202,12 +201,12 @@ def _place_markers(layout, poses, rng):
     x, y = (np.arange(low[i], high[i], layout.marker_spacing) for i in range(2))
     grid = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
     grid += layout.marker_spacing * rng.uniform(-0.35, 0.35, grid.shape)
-    near = np.array([np.hypot(*(poses[::10, :2] - p).T).min() < CAMERA_REACH for p in grid])
+    visible = np.array([np.hypot(*(poses[::10, :2] - p).T).min() < CAMERA_REACH for p in grid])
     if layout.markers_missing is not None:
         fraction, radius = layout.markers_missing
         centre = poses[int(fraction * len(poses)), :2]
-        near &= np.hypot(*(grid - centre).T) > radius
-    grid = grid[near]
+        visible &= np.hypot(*(grid - centre).T) > radius
+    grid = grid[visible]
     ids = np.sort(rng.choice(np.arange(1, max(250, len(grid) + 1)), len(grid), replace=False))
     order = rng.permutation(len(grid))
     return ids, np.column_stack([grid[order], rng.uniform(-np.pi, np.pi, len(grid))])

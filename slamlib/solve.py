@@ -1,7 +1,7 @@
 """The assignment's problems: which of them a dataset allows, their solutions and files.
 
-This module is the one home of the problems' titles, sensors and roles in figures. The function of a
-problem takes what a caller has computed already: a Localization, Fusion or SlamResult.
+`find` runs the solver of a problem; `problem_solution` makes a Solution of its result, with what
+the files and figures of every problem need.
 """
 
 from dataclasses import dataclass, field
@@ -18,11 +18,11 @@ UNSOLVABLE = (DatasetError, np.linalg.LinAlgError)  # what `find` raises where t
 
 @dataclass(frozen=True)
 class Task:
-    """What is known of a problem before it is solved."""
+    """Title, required sensors and role in figures of a problem."""
 
     title: str
     sensors: tuple                 # attributes of Dataset that it needs besides the ticks
-    role: str                      # its look in figures (`notebook.plotting.ROLES`)
+    role: str                      # key of its colour and line, `notebook.plotting.ROLES`
 
 
 # Every problem in the order of solution, by the name of its results folder.
@@ -34,19 +34,20 @@ PROBLEMS = {
     "problem3": Task("SLAM: odometry + ArUco", ("aruco",), "slam"),
     "problem4": Task("SLAM: odometry + ArUco + UWB", ("uwb",), "slam_uwb"),
 }
-WHOLE_FILES = {"units", "wheels-swapped", "wheels-reversed", "camera-mirrored", "camera-turned",
+# Kinds of doubts about whole files.
+FILE_DOUBTS = {"units", "wheels-swapped", "wheels-reversed", "camera-mirrored", "camera-turned",
                "odometry", "counts-since-start"}
-COVARIANCES = ("marker_covariance", "antenna_covariance", "wheel_covariance")
+COVARIANCE_FIELDS = ("marker_covariance", "antenna_covariance", "wheel_covariance")
 SENSORS = {"aruco": "markers", "uwb": "UWB ranges"}
 SUMMARY = "summary.json"
-OURS = frozenset([  # names of what a drive's results may be
-    SUMMARY, *(f"{problem}/{file}" for problem in PROBLEMS for file in results.FILES)])
+RESULT_NAMES = frozenset([  # relative paths of all files that a drive's results may have
+    SUMMARY, *(f"{problem}/{file}" for problem in PROBLEMS for file in results.RESULT_FILES)])
 
 
 def title(problem, dataset):
-    """Title of a problem on this dataset; one that is not in PROBLEMS is called by its folder.
+    """Title of a problem for a Dataset; one that is not in PROBLEMS has the name of its folder.
 
-    Problem 4 is solved without markers, too, and its title says so.
+    The title of problem 4 tells whether markers take part.
     """
     name = PROBLEMS[problem].title if problem in PROBLEMS else problem
     return name if dataset.aruco is not None else name.replace(" + ArUco + UWB", " + UWB")
@@ -54,7 +55,7 @@ def title(problem, dataset):
 
 @dataclass(frozen=True)
 class Solution:
-    """What one problem yields, for every pose of the encoder file."""
+    """Poses, maps and facts of one problem; it has every pose of the encoder file."""
 
     problem: str                   # folder of the results
     title: str
@@ -65,11 +66,6 @@ class Solution:
     uwb_map: tuple | None = None           # antenna ids (a,), positions (a, 2), cov. (a, 2, 2)
     facts: dict = field(default_factory=dict)       # plain numbers for the summary
     doubts: tuple[Doubt, ...] = ()
-
-
-def _solution(problem, dataset, poses, covariances, **others):
-    return Solution(problem=problem, title=title(problem, dataset), poses=poses,
-                    covariances=covariances, **others)
 
 
 @dataclass(frozen=True)
@@ -87,7 +83,7 @@ def allows(dataset, problem):
 
 
 def failure(problem, dataset, error):
-    """The Failure that an exception of UNSOLVABLE tells; the reason does not name the dataset."""
+    """The Failure by an exception of UNSOLVABLE; its reason does not name the dataset."""
     reason = str(error).removeprefix(f"{dataset.name}: ")
     if isinstance(error, np.linalg.LinAlgError):
         reason = ("expected lengths and standard deviations that float64 can hold together; some "
@@ -96,11 +92,10 @@ def failure(problem, dataset, error):
 
 
 def find(problem, dataset, found=None):
-    """What the solver of a problem returns, from which `problem1` and so on make a Solution.
+    """The result of a problem's solver: (poses, covariances), Localization, Fusion or SlamResult.
 
-    It is (poses, covariances), Localization, Fusion or SlamResult. `found` are such results of
-    other problems (dict by problem): problem 4 starts from problem 3 where there is one. Raises
-    UNSOLVABLE.
+    `found` are such results of other problems (dict by problem): problem 4 starts from problem 3
+    where there is one. Raises UNSOLVABLE where the measurements determine no solution.
     """
     solvers = {
         "problem1": lambda: odometry.equation2(dataset.ticks, dataset.vehicle),
@@ -114,95 +109,100 @@ def find(problem, dataset, found=None):
     return result
 
 
+def _poses_and_covariances(result):
+    """Poses and covariances of what `find` returns."""
+    return result if isinstance(result, tuple) else (result.poses, result.covariances)
+
+
 def _require_covariances(result):
     """Raise LinAlgError where a covariance of what `find` returns is lost by rounding."""
-    poses, covariances = result if isinstance(result, tuple) else (result.poses, result.covariances)
-    each = [covariances[np.isfinite(poses[:, 0])]] + [
-        getattr(result, name) for name in COVARIANCES if getattr(result, name, None) is not None]
-    variances = np.concatenate(
-        [np.diagonal(C, axis1=-2, axis2=-1).ravel() for C in each])
+    poses, covariances = _poses_and_covariances(result)
+    maps = (getattr(result, name, None) for name in COVARIANCE_FIELDS)
+    variances = np.concatenate([
+        np.diagonal(C, axis1=-2, axis2=-1).ravel()
+        for C in (covariances[np.isfinite(poses[:, 0])], *maps) if C is not None])
     if not ((0 <= variances) & (variances < np.inf)).all() \
             or not np.isfinite(getattr(result, "log_evidence", 0.0)):
         raise np.linalg.LinAlgError("a variance is negative or not finite")
 
 
-def problem1(dataset, found=None):
-    """Solution of problem 1, odometry: equation 1 and the covariance of equation 2."""
-    poses, covariances = find("problem1", dataset) if found is None else found
-    return _solution("problem1", dataset, poses, covariances)
+def problem_solution(problem, dataset, found=None):
+    """The Solution of a problem, from what `find` returned for it or, with None, solved here.
+
+    Problem 1 is odometry, equation 1 with the covariance of equation 2. Problem 2 is incremental
+    localization: "problem2" from the markers alone, "problem2_hint" fused as the assignment
+    suggests, "problem2_fused" fused with all shared errors. Problem 3 is SLAM with odometry and
+    markers, problem 4 with ranges, too. Raises UNSOLVABLE if `found` is None.
+    """
+    found = find(problem, dataset) if found is None else found
+    poses, covariances = _poses_and_covariances(found)
+    more = {"problem2": _marker_fields, "problem2_fused": _fusion_fields,
+            "problem3": _slam_fields, "problem4": _slam_and_antenna_fields}.get(problem)
+    fields = {"poses": poses, "covariances": covariances} | (more(dataset, found) if more else {})
+    return Solution(problem=problem, title=title(problem, dataset), **fields)
 
 
-def problem2(dataset, found=None):
-    """Solution of problem 2, markers alone; the world is the frame of the first measured pose."""
-    found = find("problem2", dataset) if found is None else found
+def _marker_fields(dataset, found):
+    """Fields of problem 2's Solution by a Localization; the first localized pose is the world."""
     poses = np.full((len(dataset.ticks), 3), np.nan)
     covariances = np.full((len(dataset.ticks), 3, 3), np.nan)
     poses[found.frame], covariances[found.frame] = found.poses, found.covariances
     known = np.isfinite(found.poses[:, 0])
     poses[found.frame[known], 2] = np.unwrap(found.poses[known, 2])
-    return _solution(
-        "problem2", dataset, poses, covariances, world=int(found.frame[known][0]),
-        aruco_map=_marker_map(found),
-        facts={"measured_poses": len(found.frame), "localized_poses": int(known.sum()),
-               "sightings": len(dataset.aruco.pose), "outliers": int(found.rejected.sum()),
-               "unused_sightings": int(found.unused.sum())})
+    facts = {"measured_poses": len(found.frame), "localized_poses": int(known.sum()),
+             "sightings": len(dataset.aruco.pose), "outliers": int(found.rejected.sum()),
+             "unused_sightings": int(found.unused.sum())}
+    return {"poses": poses, "covariances": covariances, "world": int(found.frame[known][0]),
+            "aruco_map": _marker_map(found), "facts": facts}
 
 
-def problem2_hint(dataset, found=None):
-    """Solution of problem 2 fused as the assignment hints: `localization.fuse_increments`."""
-    found = find("problem2_hint", dataset) if found is None else found
-    return _solution("problem2_hint", dataset, found.poses, found.covariances)
-
-
-def problem2_fused(dataset, found=None):
-    """Solution of problem 2 fused with odometry, with shared errors: `localization.fuse`."""
-    found = find("problem2_fused", dataset) if found is None else found
+def _fusion_fields(dataset, found):
+    """Fields of the Solution of problem 2 by a Fusion with shared errors."""
     factor = dataset.vehicle.marker_noise_factor
-    facts = {"slip_sqrt_m": found.slip, **({} if factor is None else {
-        "marker_noise_factor": factor})}
-    return _solution("problem2_fused", dataset, found.poses, found.covariances, facts={
-        **facts, **_given(dataset, facts), "outliers": found.rejected, **_wheels(found)})
+    facts = {"slip_sqrt_m": found.slip}
+    if factor is not None:
+        facts["marker_noise_factor"] = factor
+    return {"facts": {**facts, **_given_facts(dataset, facts), "outliers": found.rejected,
+                      **_wheel_facts(found)}}
 
 
-def problem3(dataset, found=None):
-    """Solution of problem 3, SLAM on odometry and markers."""
-    found = find("problem3", dataset) if found is None else found
-    return _solution("problem3", dataset, found.poses, found.covariances,
-                     aruco_map=_marker_map(found), facts=_slam_facts(found, dataset),
-                     doubts=found.drive_doubts)
+def _slam_fields(dataset, found):
+    """Fields of the Solution of problem 3 by a SlamResult."""
+    return {"aruco_map": None if dataset.aruco is None else _marker_map(found),
+            "facts": _slam_facts(found, dataset), "doubts": found.drive_doubts}
 
 
-def problem4(dataset, found=None):
-    """Solution of problem 4, SLAM on odometry, ranges, and markers if there are any."""
-    found = find("problem4", dataset) if found is None else found
-    weak = {antenna: int(np.sum(found.range_weight[dataset.uwb.antenna == antenna] < 0.5))
-            for antenna in found.antenna.tolist()}
-    return _solution(
-        "problem4", dataset, found.poses, found.covariances,
-        aruco_map=None if dataset.aruco is None else _marker_map(found),
-        uwb_map=(found.antenna, found.antenna_in_world, found.antenna_covariance),
-        facts=_slam_facts(found, dataset) | {
-            "ranges": len(dataset.uwb.pose), "ranges_down_weighted_by_antenna": weak,
-            "antennas_in_doubt": found.doubts}, doubts=found.drive_doubts)
+def _slam_and_antenna_fields(dataset, found):
+    """Fields of the Solution of problem 4 by a SlamResult."""
+    down_weighted = {antenna: int(np.sum(found.range_weight[dataset.uwb.antenna == antenna] < 0.5))
+                     for antenna in found.antenna.tolist()}
+    fields = _slam_fields(dataset, found)
+    fields["facts"] |= {"ranges": len(dataset.uwb.pose),
+                        "ranges_down_weighted_by_antenna": down_weighted,
+                        "antennas_in_doubt": found.doubts}
+    return fields | {"uwb_map": (found.antenna, found.antenna_in_world, found.antenna_covariance)}
 
 
 def _marker_map(found):
+    """Ids, poses and covariances of the markers."""
     return found.marker, found.marker_in_world, found.marker_covariance
 
 
-def _wheels(found):
+def _wheel_facts(found):
+    """Wheel parameters and their sigmas."""
     return {"wheel_parameters_m": found.wheel.tolist(),
             "wheel_parameter_sigmas_m": np.sqrt(np.diag(found.wheel_covariance)).tolist()}
 
 
-def _given(dataset, facts):
-    """The names of those of the facts that the dataset's Vehicle gives, where there are any."""
+def _given_facts(dataset, facts):
+    """The entry "given" with the names of facts that the dataset's Vehicle states, if any."""
     names = [name for name in facts
              if getattr(dataset.vehicle, name.removesuffix("_sqrt_m"), None) is not None]
     return {"given": names} if names else {}
 
 
 def _slam_facts(found, dataset):
+    """Noise, evidence and wheel parameters of a SlamResult."""
     facts, sigma = {}, found.noise_sigma.tolist()
     if len(found.rejected):
         facts |= {"marker_noise_factor": found.noise.sightings,
@@ -213,21 +213,17 @@ def _slam_facts(found, dataset):
         facts |= dict(zip(("range_offset_m", "range_scale"), found.range_calibration.tolist()))
         facts["range_offset_and_scale_sigmas"] = found.range_calibration_sigma.tolist()
     facts = {"slip_sqrt_m": found.slip, "slip_relative_sigma": sigma[0], **facts}
-    return {**facts, **_given(dataset, facts), "increments": found.model,
+    return {**facts, **_given_facts(dataset, facts), "increments": found.model,
             "outliers": int(found.rejected.sum()), "chi2_per_dof": found.chi2_per_dof,
             "chi2_per_dof_of_all": found.chi2_per_dof_of_all,
-            "log_evidence": found.log_evidence, **_wheels(found)}
-
-
-SOLUTIONS = {"problem1": problem1, "problem2": problem2, "problem2_hint": problem2_hint,
-             "problem2_fused": problem2_fused, "problem3": problem3, "problem4": problem4}
+            "log_evidence": found.log_evidence, **_wheel_facts(found)}
 
 
 def solutions(dataset, found=None, problems=tuple(PROBLEMS)):
     """Yield the Solution of each of `problems` that the dataset's sensors allow, in order.
 
-    A problem that cannot be solved yields a Failure, and the others go on. `found` are the results
-    by `find` that are known already (dict by problem).
+    A problem that cannot be solved yields a Failure. `found` are results of `find` that are known
+    already (dict by problem).
     """
     found = dict(found or {})
     for problem in problems:
@@ -237,47 +233,43 @@ def solutions(dataset, found=None, problems=tuple(PROBLEMS)):
             result = found[problem] if problem in found else find(problem, dataset, found)
             if problem == "problem3":                    # from which problem 4 starts
                 found[problem] = result
-            yield SOLUTIONS[problem](dataset, result)
+            yield problem_solution(problem, dataset, result)
         except UNSOLVABLE as error:
             yield failure(problem, dataset, error)
 
 
 def doubts_about_drive(dataset, truth):
-    """Doubts (tuple of Doubt) about a drive as a whole, before any of its problems is solved.
-
-    From its measurements, and from its Truth or None.
-    """
+    """Doubts (tuple of Doubt) from the measurements of a Dataset and from its Truth or None."""
     try:
-        by_measurements = localization.drive_doubts(dataset)
+        by_measurements = localization.doubts_before_solving(dataset)
     except np.linalg.LinAlgError:              # where increments have no covariance
         by_measurements = []
     return (*by_measurements, *(() if truth is None else truth.doubts))
 
 
 def merged(doubts):
-    """List of Doubt, each once; of what problems 3 and 4 both find, the later sentence.
+    """List of Doubt, each kind once with its last sentence; of antennas and units, each sentence.
 
-    There may be several doubts of a kind about antennas and units. A doubt about whole files
-    silences those that a solution of such files leads to.
+    A doubt about whole files removes those that follow from solving such files.
     """
     kinds = {doubt.what for doubt in doubts}
-    kept = [doubt for doubt in doubts if not kinds & WHOLE_FILES
-            or doubt.what in WHOLE_FILES | {"truth-frame"}]
+    kept = [doubt for doubt in doubts if not kinds & FILE_DOUBTS
+            or doubt.what in FILE_DOUBTS | {"truth-frame"}]
     return list({doubt.sentence if doubt.what in ("antenna", "units") else doubt.what: doubt
                  for doubt in kept}.values())
 
 
 def truth_in_world(solution, truth):
-    """The true poses (n, 3) in the solution's world frame."""
+    """The true poses (n, 3) in the world frame of a Solution."""
     if solution.world == 0:
         return truth.poses
     return se2.between(truth.poses[solution.world], truth.poses)
 
 
-def write(folder, solution):
-    """Write a solution's .mat files into folder/<problem>/ and return that folder.
+def write_solution(folder, solution):
+    """Write the .mat files of a Solution into folder/<problem>/; returns the Path of that folder.
 
-    A summary in `folder` is removed: it is not of these files.
+    A summary in `folder` is removed, because it belongs to other files.
     """
     (Path(folder) / SUMMARY).unlink(missing_ok=True)
     folder = Path(folder) / solution.problem

@@ -1,4 +1,4 @@
-"""All problems of a dataset solved into a folder, with a summary of plain numbers."""
+"""Solving all problems of a dataset into a folder, with a summary of plain numbers."""
 
 import ctypes
 import json
@@ -21,31 +21,31 @@ from slamlib import evaluation, swap
 from slamlib.dataset import read_dataset, read_truth
 from slamlib.inventory import all_notes
 from slamlib.solve import (
-    OURS,
     PROBLEMS,
+    RESULT_NAMES,
     SUMMARY,
     Failure,
     doubts_about_drive,
     merged,
     solutions,
     truth_in_world,
-    write,
+    write_solution,
 )
 
 PR_SET_PDEATHSIG = 1                                           # Linux, prctl(2)
-BESIDES = ("problem1", "problem2", "problem2_hint", "problem2_fused")  # none depends on others
+# Problems of the second process: no other problem needs their results.
+PARALLEL_PROBLEMS = ("problem1", "problem2", "problem2_hint", "problem2_fused")
 
 
 def solve_to_folder(dataset, truth, out, jobs=1):
-    """The summary of all problems of a Dataset, written with their files below the folder `out`.
+    """Solve all problems of a Dataset and write their files below the folder `out`.
 
-    The Truth, or None, serves to report errors, never to estimate. The summary is the dict that is
-    written to summary.json; a problem that could not be solved has the entry "failed", a sentence.
-    Its list "doubts", of "what" and "sentence", is empty where the measurements agree with the
-    files: first those about the drive, then by problem. Its list "notes" says what was mended or
-    left out while the files were read. Once all files are written they replace those of an earlier
-    run, by `swap.publish`.
-    With two `jobs`, a second process solves problems 1 and 2 meanwhile.
+    Returns the summary, the dict that is written to summary.json. A problem that could not be
+    solved has the entry "failed", a sentence. The list "doubts", of "what" and "sentence", has
+    those about the drive first, then by problem. "notes" lists what was mended or left out while
+    the files were read. The Truth, or None, serves to report errors, never to estimate. When all
+    files are written they replace those of an earlier run, by `swap.publish`. With two `jobs`, a
+    second process solves problems 1 and 2.
     """
     out = Path(out)
     with swap.staging(out) as stage:
@@ -54,28 +54,28 @@ def solve_to_folder(dataset, truth, out, jobs=1):
         swap.write(stage / SUMMARY, text.encode())
         swap.require_staged(stage)
         swap.publish([swap.Set(out, {name: stage / name for name in swap.names(stage)},
-                               last=SUMMARY, ours=OURS)])
+                               last=SUMMARY, ours=RESULT_NAMES)])
     return summary
 
 
 def _summary(dataset, truth, stage, jobs):
-    """The summary; each problem's files are written to an empty folder as it ends, or none."""
-    (rows, doubts), of_drive = _written_by_all(dataset, truth, stage, jobs)
+    """The summary; files are written to the empty folder `stage`, or none if it is None."""
+    (rows, doubts), about_drive = _written_by_all(dataset, truth, stage, jobs)
     in_order = [problem for problem in PROBLEMS if problem in rows]
     return {"dataset": dataset.name, "poses": len(dataset.ticks),
             "doubts": [asdict(doubt) for doubt in merged(
-                [*of_drive, *chain(*(doubts[problem] for problem in in_order))])],
+                [*about_drive, *chain(*(doubts[problem] for problem in in_order))])],
             "notes": list(all_notes(dataset, truth)),
             "problems": {problem: rows[problem] for problem in in_order}}
 
 
 @contextmanager
 def tables(folders, tell):
-    """Let another process solve the datasets in `folders` (list of Path) while a block runs.
+    """Context in which another process solves the datasets in `folders` (list of Path).
 
-    The function `tell` of a str is called in a thread with each dataset's `table` as it comes, the
-    shortest drive's first, and nothing is written. The block is given a function that waits for the
-    tables at most a number of seconds; at its end the process is gone.
+    A thread calls the function `tell` with each dataset's `summary_table` (str), the shortest
+    drive's first; nothing is written. The context's value is a function that waits for the tables
+    for at most a number of seconds. The process ends with the context.
     """
     context = get_context("fork" if sys.platform == "linux" else "spawn")
     receiver, sender = context.Pipe(duplex=False)
@@ -93,18 +93,20 @@ def tables(folders, tell):
 
 
 def _send_tables(folders, sender, parent):
+    """Send the summary tables of the datasets in `folders`; `parent` is a process id."""
     if sys.platform == "linux":
         _ends_with(parent)
     drives = [(read_dataset(folder), read_truth(folder)) for folder in folders]
     for dataset, truth in sorted(drives, key=lambda drive: len(drive[0].ticks)):
         try:
-            text = table(_summary(dataset, truth, None, 1))
-        except Exception as error:          # the notebooks tell more, where they fail as well
+            text = summary_table(_summary(dataset, truth, None, 1))
+        except Exception as error:          # the notebooks report it in full
             text = f"{dataset.name}: not solved before the notebooks: {error!r}"
         sender.send(text)
 
 
 def _tell_all(receiver, tell):
+    """Call `tell` with every object that is received until the other end is closed."""
     with receiver:
         while True:
             try:
@@ -113,10 +115,10 @@ def _tell_all(receiver, tell):
                 return
 
 
-def table(summary):
-    """The summary as a table (str), one line for each problem, and below it the doubts.
+def summary_table(summary):
+    """The summary as a table (str), one line for each problem, with the doubts below it.
 
-    It has a column for the ATE where there is truth.
+    It has a column for the ATE if there is truth.
     """
     judged = any("ate_m" in row for row in summary["problems"].values())
     lines = [f"{summary['dataset']}: {summary['poses']} poses",
@@ -135,26 +137,26 @@ def table(summary):
 
 
 def _written_by_all(dataset, truth, stage, jobs):
-    """What `_written` returns, of all problems, and doubts about the drive.
+    """The result of `_written` for all problems, and doubts about the drive.
 
-    With two `jobs` there are two processes. The second one is a fork: only Linux makes those
-    safely. It ends with this one, so that nothing is written once this process is gone.
+    With two `jobs` there are two processes. The second one is a fork, which is safe only on Linux.
+    It ends with this process, so that nothing is written later.
     """
     if jobs < 2 or sys.platform != "linux" or len(os.sched_getaffinity(0)) < 2:
         return _written(dataset, truth, stage, PROBLEMS), doubts_about_drive(dataset, truth)
-    first = [problem for problem in PROBLEMS if problem not in BESIDES]
+    first = [problem for problem in PROBLEMS if problem not in PARALLEL_PROBLEMS]
     others = set(active_children())
     with ProcessPoolExecutor(1, mp_context=get_context("fork"), initializer=_ends_with,
                              initargs=(os.getpid(),)) as pool:
         try:
-            besides = pool.submit(_besides, dataset, truth, stage)
+            second = pool.submit(_solve_in_parallel, dataset, truth, stage)
             rows, doubts = _written(dataset, truth, stage, first)
             try:
-                (others_rows, others_doubts), of_drive = besides.result()
+                (more_rows, more_doubts), about_drive = second.result()
             except BrokenProcessPool:                   # killed, as where memory is short
-                (others_rows, others_doubts), of_drive = _besides(dataset, truth, stage)
-            return (rows | others_rows, doubts | others_doubts), of_drive
-        except BaseException:                           # no one waits for what it finds
+                (more_rows, more_doubts), about_drive = _solve_in_parallel(dataset, truth, stage)
+            return (rows | more_rows, doubts | more_doubts), about_drive
+        except BaseException:                           # nobody needs its results
             for process in set(active_children()) - others:
                 process.kill()
             raise
@@ -172,9 +174,9 @@ def _ends_with(parent):
         os._exit(1)
 
 
-def _besides(dataset, truth, stage):
-    """What the second process does."""
-    return _written(dataset, truth, stage, BESIDES), doubts_about_drive(dataset, truth)
+def _solve_in_parallel(dataset, truth, stage):
+    """The results of the second process: `_written` for its problems, doubts about the drive."""
+    return _written(dataset, truth, stage, PARALLEL_PROBLEMS), doubts_about_drive(dataset, truth)
 
 
 def _written(dataset, truth, stage, problems):
@@ -187,7 +189,7 @@ def _written(dataset, truth, stage, problems):
         rows[solution.problem] = {"title": solution.title, **row, "seconds": seconds}
         doubts[solution.problem] = () if failed else solution.doubts
         if not failed and stage is not None:
-            write(stage, solution)
+            write_solution(stage, solution)
         start = time.perf_counter()
     return rows, doubts
 

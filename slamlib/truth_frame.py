@@ -7,19 +7,19 @@ import numpy as np
 from slamlib import se2
 from slamlib.doubt import Doubt
 
-SAME_FRAME = 1e-3  # m and rad: a first true pose that is no farther from the origin is at it
+ORIGIN_TOLERANCE = 1e-3  # m and rad; a first true pose within it is taken as the origin
 
 
 def in_first_frame(truth):
     """The Truth in the frame of its first pose T_w1; a Doubt says so if it had to be moved.
 
-    Poses T_wv become T_1v = inverse(T_w1) T_wv, and markers and antennas are moved alike. Where the
-    first pose is the origin within SAME_FRAME, only full turns are taken from the headings.
+    Poses T_wv become T_1v = inverse(T_w1) T_wv; markers and antennas are transformed alike. Where
+    the first pose is the origin within ORIGIN_TOLERANCE, only full turns of the headings change.
     """
     turns = 2 * np.pi * np.rint(truth.poses[0, 2] / (2 * np.pi))
     truth = replace(truth, poses=truth.poses - [0, 0, turns])
     first = truth.poses[0]
-    if (abs(first) <= SAME_FRAME).all():
+    if (abs(first) <= ORIGIN_TOLERANCE).all():
         return truth
     marker = se2.between(first, truth.marker_in_world)
     antenna = np.column_stack([truth.antenna_in_world, np.zeros(len(truth.antenna))])

@@ -1,4 +1,4 @@
-"""The vehicle: wheel parameters, and what is known of the noise."""
+"""The vehicle: its wheel parameters and, where known, the noise of its sensors."""
 
 from dataclasses import asdict, dataclass, replace
 
@@ -10,9 +10,9 @@ from slamlib.textfile import error, quoted, read_toml
 
 @dataclass(frozen=True)
 class Vehicle:
-    """Wheel parameters, their standard deviations, and what is known of the noise.
+    """Wheel parameters with their standard deviations, and noise parameters or None.
 
-    The defaults are the assignment's table 2, in which the noise is not known.
+    The defaults are the assignment's table 2, which gives no noise.
     """
 
     right_radius: float = 0.1  # m
@@ -38,19 +38,19 @@ class Vehicle:
         return np.array([self.sigma_right_radius, self.sigma_left_radius, self.sigma_wheelbase])
 
     def with_wheel(self, wheel):
-        """The vehicle with other wheel parameters (3,) in m and the same standard deviations."""
+        """The Vehicle with the wheel parameters `wheel` (3,) in m and unchanged sigmas."""
         right, left, base = map(float, wheel)
         return replace(self, right_radius=right, left_radius=left, wheelbase=base)
 
     def with_deviation(self, w):
-        """The vehicle with wheel parameters wheel + sigma_wheel * w, w (3,) without unit."""
+        """The Vehicle with wheel parameters wheel + sigma_wheel * w; w (3,) has no unit."""
         return self.with_wheel(self.wheel + self.sigma_wheel * w)
 
 
 def read_vehicle(files, default):
     """The Vehicle of a folder's `vehicle.toml`, whose entries replace those of a default Vehicle.
 
-    `files` are the `folder.contents`. Raises DatasetError if the file does not follow the format.
+    `files` are the `folder.contents`. Raises DatasetError if the file does not have the format.
     """
     path = files.files.get("vehicle.toml")
     if path is None:
@@ -59,8 +59,8 @@ def read_vehicle(files, default):
     entries = read_toml(path, "wheelbase = 0.4", list(values))
     for key in sorted(entries, key=list(limits).index):    # a parameter before its sigma
         (value, line), limit = entries[key], limits[key]
-        most = values.get(limit.most, limit.most)
-        if type(value) not in (int, float) or not limit.least <= value <= most:
+        maximum = values.get(limit.maximum, limit.maximum)
+        if type(value) not in (int, float) or not limit.minimum <= value <= maximum:
             raise error(path, f"expected {limit.expected(f'number for {key}')}, found "
                         f"{quoted(value)}", line)
         values[key] = float(value)

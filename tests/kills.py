@@ -33,7 +33,8 @@ from slamlib.notebook import results_folder, start
 for drive in start():
     for problem in {problems}:
         if solve.allows(drive.dataset, problem):
-            solve.write(results_folder(drive), solve.SOLUTIONS[problem](drive.dataset))"""
+            solution = solve.problem_solution(problem, drive.dataset)
+            solve.write_solution(results_folder(drive), solution)"""
 
 
 def started(arguments, folder, at_step=None):

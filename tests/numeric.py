@@ -1,9 +1,12 @@
-"""Numerical derivatives, standard errors and known noise, shared by the tests."""
+"""Numerical derivatives, standard errors, known noise and trials, shared by the tests."""
 
 import numpy as np
 from scipy.stats import t
 
+from slamlib import slam
+from slamlib.simulation import simulate
 from slamlib.slam.noise import with_noise
+from slamlib.studies.montecarlo import judge_slam
 
 
 def central_differences(function, x, step=1e-6):
@@ -26,3 +29,13 @@ def decided(differences):
 def known_noise(dataset, slip):
     """The Dataset of a drive with this slip in sqrt(m), and the noise that its files state."""
     return with_noise(dataset, slip, marker_noise_factor=1.0, range_noise_factor=1.0)
+
+
+def slam_trial(seed, ranges=True, markers=True, **options):
+    """`judge_slam` of SLAM on one simulated drive of the short path, with these sensors."""
+    dataset, truth = simulate("short", seed, **options)
+    found = slam.estimate(dataset.without("uwb")) if markers else None
+    if not ranges:
+        return judge_slam(found, dataset.without("uwb"), truth)
+    dataset = dataset if markers else dataset.without("aruco")
+    return judge_slam(slam.estimate(dataset, previous=found), dataset, truth)

@@ -21,7 +21,7 @@ from slamlib import locks, results, swap
 from slamlib.__main__ import main
 from slamlib.report import NotebookError, cache, execution
 from slamlib.simulation import simulate, write_dataset
-from slamlib.solve import OURS
+from slamlib.solve import RESULT_NAMES
 from slamlib.summary import solve_to_folder
 
 ROOT = Path(__file__).parents[1]
@@ -152,10 +152,9 @@ def test_a_dataset_with_fewer_sensors_leaves_no_problem_of_another(tmp_path, dri
 
 
 def test_a_problem_written_by_itself_removes_the_summary_of_other_files(tmp_path, drive):
-    from slamlib.solve import problem1
-    from slamlib.solve import write as write_solution
+    from slamlib.solve import problem_solution, write_solution
     solve_to_folder(drive, None, tmp_path)
-    write_solution(tmp_path, problem1(drive.first(9)))
+    write_solution(tmp_path, problem_solution("problem1", drive.first(9)))
     assert not (tmp_path / "summary.json").exists()
 
 
@@ -240,7 +239,7 @@ def test_names_in_a_list_that_lead_out_of_the_folder_are_ignored(tmp_path):
     swap.publish([swap.Set(tmp_path / "out", {})])
     assert swap.names(tmp_path) == ["above.txt", "out/.slamlib.json"]
     (tmp_path / "out" / swap.WRITTEN).write_text("not JSON")
-    swap.publish([swap.Set(tmp_path / "out", {}, ours=OURS)])
+    swap.publish([swap.Set(tmp_path / "out", {}, ours=RESULT_NAMES)])
     assert swap.names(tmp_path) == ["above.txt", "out/.slamlib.json"]
 
 

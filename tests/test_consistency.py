@@ -22,7 +22,7 @@ def test_returns_measure_the_true_motion():
         assert len(off) > 5
         np.testing.assert_allclose(np.hypot(*off[:, :2].T), 0, atol=1e-8)
         np.testing.assert_allclose(se2.wrap(off[:, 2]), 0, atol=1e-8)
-        assert (found.driven >= consistency.GAP).all() and (np.diff(found.end) > 0).all()
+        assert (found.driven >= consistency.MIN_GAP).all() and (np.diff(found.end) > 0).all()
         np.testing.assert_allclose(consistency.discrepancies(found, truth.poses), 0, atol=1e-8)
 
 
@@ -52,7 +52,7 @@ def odometry_at_returns(dataset):
         dataset.ticks, dataset.vehicle, model="arc")), dataset.vehicle
     _, by_w = increments.between_poses(dataset.ticks, v, found.start, found.end)
     wheels = by_w * v.sigma_wheel
-    C = wheels @ np.swapaxes(wheels, 1, 2) + found.covariance + increments.noise(
+    C = wheels @ np.swapaxes(wheels, 1, 2) + found.covariance + increments.noise_covariances(
         dataset.ticks, v, found.start, found.end, 1e-3)
     return evaluation.nees(d, C, np.zeros_like(d))[-1]
 
@@ -76,7 +76,8 @@ def test_excess_by_hand():
     C = np.array([np.diag([10.0, 2, 1]), np.diag([2.0, 2, 0.05]), np.diag([10.0, 0.5, 1]),
                   np.diag([2.0, 2, 2])])
     before = C.copy()
-    np.testing.assert_allclose(consistency.excess(poses, C, best, C_best), [1, 1, np.nan, np.nan])
+    np.testing.assert_allclose(consistency.hausman_statistic(poses, C, best, C_best),
+                               [1, 1, np.nan, np.nan])
     np.testing.assert_array_equal(C, before)
 
 
@@ -89,7 +90,7 @@ def test_excess_is_chi_squared_for_an_estimate_from_part_of_the_data():
     best = np.einsum("nij,nj->ni", best_C, np.einsum("nij,nj->ni", np.linalg.inv(A), a)
                      + np.einsum("nij,nj->ni", np.linalg.inv(B), b))
     low, high = evaluation.nees_band(count)
-    assert low < np.nanmean(consistency.excess(a, A, best, best_C)) < high
+    assert low < np.nanmean(consistency.hausman_statistic(a, A, best, best_C)) < high
 
 
 def test_excess_shows_marker_covariances_that_are_too_small():
@@ -97,7 +98,7 @@ def test_excess_shows_marker_covariances_that_are_too_small():
     def last(dataset):
         alone, fused = localization.localize(dataset.aruco), localization.fuse(dataset)
         at = alone.frame
-        return consistency.excess(alone.poses, alone.covariances, fused.poses[at],
+        return consistency.hausman_statistic(alone.poses, alone.covariances, fused.poses[at],
                                   fused.covariances[at])[-1]
 
     right, wrong = [], []

@@ -9,7 +9,7 @@ from test_dataset import error_of, write
 
 from slamlib import counts
 from slamlib.dataset import Vehicle, read_dataset
-from slamlib.localization import drive_doubts
+from slamlib.localization import doubts_before_solving
 from slamlib.simulation import manoeuvre, simulate, write_dataset
 
 simulated = cache(simulate)
@@ -54,7 +54,7 @@ def test_increments_of_any_drive_are_taken_as_such(drive, tmp_path):
         f"{i} {right} {left}" for i, (right, left) in enumerate(ticks, start=1)))
     dataset = read_dataset(tmp_path)
     np.testing.assert_array_equal(dataset.ticks, ticks)
-    assert dataset.notes == () and drive_doubts(dataset) == []
+    assert dataset.notes == () and doubts_before_solving(dataset) == []
 
 
 def slow(dataset, factor=20):
@@ -95,7 +95,7 @@ def test_counts_since_the_start_are_differenced_with_a_note(case, seed, tmp_path
     np.testing.assert_array_equal(found.ticks, dataset.ticks)
     note, = found.notes
     assert note.startswith(f"encoderReading.txt holds counts since the start ({reason}")
-    assert drive_doubts(found) == drive_doubts(dataset)
+    assert doubts_before_solving(found) == doubts_before_solving(dataset)
 
 
 @pytest.mark.parametrize("begin, low", [(60_000, 0), (30_000, -2**15), (3000, 0)])
@@ -120,7 +120,7 @@ def test_undecided_counts_are_doubted(change):
     drive = change(simulated("short", 0)[0])
     drive = replace(drive, aruco=None, ticks=drive.ticks.cumsum(axis=0))
     assert counts.run_on(drive.ticks, drive.vehicle, None) == ""
-    doubt, = drive_doubts(drive)
+    doubt, = doubts_before_solving(drive)
     assert doubt.what == "counts-since-start"
     assert f"up to {abs(drive.ticks).max()} in one row" in doubt.sentence
 
@@ -187,7 +187,7 @@ def test_undecided_counts_of_a_vehicle_that_stops_or_turns_back_are_doubted(
         f"{i} {right} {left}" for i, (right, left) in enumerate(counter, start=1)))
     dataset = read_dataset(tmp_path)
     np.testing.assert_array_equal(dataset.ticks, counter)
-    doubt, = drive_doubts(dataset)
+    doubt, = doubts_before_solving(dataset)
     assert doubt.what == "counts-since-start"
     assert f"change gradually from row to row, up to {abs(counter).max()} in" in doubt.sentence
 

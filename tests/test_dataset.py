@@ -459,7 +459,7 @@ def write_number(folder, name, column, value):
 @pytest.mark.parametrize("name, column", PLACES)
 def test_numbers_at_the_limits_are_read_and_beyond_them_refused(tmp_path, name, column):
     limit = LIMITS[name][column]
-    for most, away in ((limit.least, -np.inf), (limit.most, np.inf)):
+    for most, away in ((limit.minimum, -np.inf), (limit.maximum, np.inf)):
         path, read = write_number(tmp_path, name, column, float(most))
         read(tmp_path)
         beyond = float(np.nextafter(most, away))
@@ -473,9 +473,9 @@ def test_numbers_at_the_limits_are_read_and_beyond_them_refused(tmp_path, name, 
 def test_a_vehicle_at_the_limits_is_read_and_beyond_them_refused(tmp_path, key):
     limit, parameter = LIMITS["vehicle.toml"][key], key.removeprefix("sigma_")
     write(tmp_path / "encoderReading.txt", "1 0 0\n")
-    most = 2.0 if isinstance(limit.most, str) else limit.most
-    other = f"{parameter} = 2\n" if isinstance(limit.most, str) else ""
-    for value, away in ((limit.least, -np.inf), (most, np.inf)):
+    most = 2.0 if isinstance(limit.maximum, str) else limit.maximum
+    other = f"{parameter} = 2\n" if isinstance(limit.maximum, str) else ""
+    for value, away in ((limit.minimum, -np.inf), (most, np.inf)):
         write(tmp_path / "vehicle.toml", f"{key} = {float(value)!r}\n{other}")
         assert getattr(read_dataset(tmp_path).vehicle, key) == value
         beyond = float(np.nextafter(value, away))

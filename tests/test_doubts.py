@@ -19,7 +19,7 @@ from slamlib.dataset import (
     Vehicle,
     read_dataset,
 )
-from slamlib.localization import drive_doubts, units
+from slamlib.localization import doubts_before_solving, units
 from slamlib.localization.doubts import (
     GENEROUS_SLIP,
     GENEROUS_WHEEL,
@@ -38,7 +38,7 @@ simulated = cache(simulate)
 
 
 def whats(dataset):
-    return [doubt.what for doubt in drive_doubts(dataset)]
+    return [doubt.what for doubt in doubts_before_solving(dataset)]
 
 
 def wheels(matrix):
@@ -117,7 +117,7 @@ def test_turns_that_only_the_wheels_have_seen_are_doubted():
 def test_a_flaw_is_named(flaw):
     spoil, what, said = FLAWS[flaw]
     for seed in SEEDS:
-        doubt, = drive_doubts(spoil(simulated("short", seed)[0]))
+        doubt, = doubts_before_solving(spoil(simulated("short", seed)[0]))
         assert doubt.what == what
         assert said in doubt.sentence
 
@@ -131,7 +131,7 @@ def test_files_of_two_drives_are_named():
 def test_a_vehicle_in_millimetres_is_named_by_sightings_and_by_ranges():
     """The markers' distances are a thousandth of the wheels', and so are the changes of ranges."""
     spoil = vehicle(right_radius=100.0, left_radius=100.0, wheelbase=400.0)
-    doubts = drive_doubts(spoil(simulated("short", 0)[0]))
+    doubts = doubts_before_solving(spoil(simulated("short", 0)[0]))
     assert [doubt.what for doubt in doubts] == ["units", "units"]
     assert all("vehicle.toml" in doubt.sentence for doubt in doubts)
 
@@ -144,7 +144,7 @@ def test_a_vehicle_in_millimetres_is_named_by_sightings_and_by_ranges():
 def test_without_ranges_both_explanations_are_named(spoil, expected):
     """A path and its mirror image cannot be told apart by increments; ranges do so in FLAWS."""
     for seed in SEEDS:
-        doubts = drive_doubts(spoil(simulated("short", seed)[0]).without("uwb"))
+        doubts = doubts_before_solving(spoil(simulated("short", seed)[0]).without("uwb"))
         assert [doubt.what for doubt in doubts] == expected
         assert "Equally possible: sightings with" in doubts[0].sentence
         assert "Equally possible: " in doubts[1].sentence
@@ -158,9 +158,9 @@ def test_without_ranges_both_explanations_are_named(spoil, expected):
 def test_a_clean_drive_gives_no_doubt(path, seeds, keywords):
     for seed in seeds:
         dataset = simulated(path, seed, **keywords)[0]
-        assert drive_doubts(dataset) == []
-        assert drive_doubts(covariances(4.0)(dataset)) == []
-        assert drive_doubts(covariances(0.25)(dataset)) == []
+        assert doubts_before_solving(dataset) == []
+        assert doubts_before_solving(covariances(4.0)(dataset)) == []
+        assert doubts_before_solving(covariances(0.25)(dataset)) == []
 
 
 @pytest.mark.parametrize("wrong", [
@@ -169,7 +169,7 @@ def test_a_clean_drive_gives_no_doubt(path, seeds, keywords):
 def test_a_wheel_one_percent_off_gives_no_doubt_here(wrong):
     for seed in SEEDS:
         dataset = simulated("short", seed, vehicle=Vehicle(**wrong))[0]
-        assert drive_doubts(replace(dataset, vehicle=Vehicle())) == []
+        assert doubts_before_solving(replace(dataset, vehicle=Vehicle())) == []
 
 
 @pytest.mark.parametrize("keywords", [{"slip": 0.0}, {"mislabelled": 0.01}])
@@ -204,8 +204,8 @@ def test_too_little_to_decide_gives_no_doubt():
                    dataset.without("aruco").without("uwb"),
                    replace(dataset, aruco=dataset.aruco.select([5])),
                    replace(dataset, aruco=dataset.aruco.select(dataset.aruco.pose % 500 == 0))):
-        assert drive_doubts(little) == []
-        assert drive_doubts(wheels(SWAPPED)(little)) == []
+        assert doubts_before_solving(little) == []
+        assert doubts_before_solving(wheels(SWAPPED)(little)) == []
 
 
 def test_standing_still_gives_no_doubt():
@@ -217,10 +217,10 @@ def test_standing_still_gives_no_doubt():
     noise = np.linalg.cholesky(seen.covariance) @ rng.standard_normal((len(rows), 3, 1))
     seen = replace(seen, marker_in_vehicle=seen.marker_in_vehicle + noise[..., 0])
     still = replace(dataset, ticks=0 * dataset.ticks, aruco=seen)
-    assert drive_doubts(still.without("uwb")) == []
+    assert doubts_before_solving(still.without("uwb")) == []
     waits = np.concatenate([still.ticks[:1000], dataset.ticks[1:1001]])
     moved = replace(dataset.aruco, pose=dataset.aruco.pose + 999).select(dataset.aruco.pose < 1001)
-    assert drive_doubts(replace(dataset, ticks=waits, aruco=moved, uwb=None)) == []
+    assert doubts_before_solving(replace(dataset, ticks=waits, aruco=moved, uwb=None)) == []
 
 
 def moved_by(length, turn, count=20):
@@ -347,7 +347,7 @@ def test_increments_are_compared_over_a_metre():
     np.testing.assert_allclose(compared.by_wheels, wheels)
     by_w = by_w * (GENEROUS_WHEEL * Vehicle().wheel)
     np.testing.assert_allclose(
-        compared.covariance_wheels, by_w @ np.swapaxes(by_w, 1, 2) + increments.noise(
+        compared.covariance_wheels, by_w @ np.swapaxes(by_w, 1, 2) + increments.noise_covariances(
             ticks, Vehicle(), frame[begin], frame[begin + 4], GENEROUS_SLIP), rtol=1e-9, atol=1e-15)
     for n in (0, 16, 17, 40):
         def composed(change, at=begin[n]):
@@ -445,7 +445,7 @@ def test_lengths_in_another_unit_are_doubted_or_refused(what, factor, count, tmp
         with pytest.raises(DatasetError, match="vehicle.toml, line .: expected a positive number "):
             read_dataset(tmp_path / "drive")
     else:
-        doubts = drive_doubts(read_dataset(tmp_path / "drive"))
+        doubts = doubts_before_solving(read_dataset(tmp_path / "drive"))
         assert {doubt.what for doubt in doubts} == {"units"}
 
 
@@ -453,7 +453,7 @@ def test_lengths_in_another_unit_are_doubted_or_refused(what, factor, count, tmp
     ("covariance", "s_xx, s_xy and s_yy in ArucoReading.txt"), ("sigma", "sigma in UwbReading")])
 def test_standard_deviations_in_another_unit_are_named(what, said):
     for seed in SEEDS:
-        doubt, = drive_doubts(in_unit(simulated("short", seed)[0], what, 100.0))
+        doubt, = doubts_before_solving(in_unit(simulated("short", seed)[0], what, 100.0))
         assert doubt.what == "units" and f"look at the unit of {said}" in doubt.sentence
 
 
@@ -462,7 +462,7 @@ def test_variances_of_headings_in_square_degrees_are_named():
     for seed in SEEDS:
         dataset = simulated("short", seed)[0]
         a = dataset.aruco
-        doubt, = drive_doubts(replace(dataset, aruco=replace(
+        doubt, = doubts_before_solving(replace(dataset, aruco=replace(
             a, covariance=a.covariance * np.outer(scale, scale))))
         assert doubt.what == "units" and "s_thetatheta" in doubt.sentence
 
@@ -484,6 +484,7 @@ def test_ranges_exchanged_with_their_sigmas_are_doubted():
     for count in (150, 2000):
         dataset = simulated("short", 0)[0].first(count)
         u = dataset.uwb
-        doubts = drive_doubts(replace(dataset, uwb=replace(u, range=u.sigma, sigma=u.range)))
+        exchanged = replace(u, range=u.sigma, sigma=u.range)
+        doubts = doubts_before_solving(replace(dataset, uwb=exchanged))
         assert {doubt.what for doubt in doubts} == {"units"}
         assert all("UwbReading.txt" in doubt.sentence for doubt in doubts)

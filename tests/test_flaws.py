@@ -124,7 +124,7 @@ def names(*lists):
 @pytest.mark.parametrize("what", WRONG_FILES)
 def test_wrong_files_are_named_before_a_graph_is_built(what, seed):
     dataset, _ = simulate("short", seed)
-    assert what in names(localization.drive_doubts(WRONG_FILES[what](dataset)))
+    assert what in names(localization.doubts_before_solving(WRONG_FILES[what](dataset)))
 
 
 @pytest.mark.slow
@@ -138,7 +138,7 @@ def test_wrong_sizes_are_mended_or_named(flaw, seed):
     markers = slam.estimate(spoilt.without("uwb"))
     both = slam.estimate(spoilt, previous=markers)
     assert names(markers.drive_doubts, both.drive_doubts) == {what}
-    assert not localization.drive_doubts(spoilt)
+    assert not localization.doubts_before_solving(spoilt)
     if what != "wheel-parameters":
         for found in (markers, both):
             assert anees(found.poses, found.covariances, truth.poses) < 6
@@ -267,7 +267,8 @@ def test_there_is_no_doubt_about_clean_drives(path, seeds, slip):
         dataset, _ = simulate(path, seed, slip=slip)
         found = slam.estimate(dataset.without("uwb"))
         both = slam.estimate(dataset, previous=found)
-        assert not names(localization.drive_doubts(dataset), found.drive_doubts, both.drive_doubts)
+        assert not names(localization.doubts_before_solving(dataset), found.drive_doubts,
+                         both.drive_doubts)
 
 
 def test_markers_of_which_most_sightings_contradict_are_named():

@@ -20,15 +20,15 @@ def test_perfect_data_gives_the_exact_poses():
         np.testing.assert_allclose(found.wheel, [0.1, 0.1, 0.4], atol=1e-9)
 
 
-@pytest.mark.parametrize("module, size, solve", [
-    (fused, "AT_ONCE", partial(fuse, slip=1e-3)),
+@pytest.mark.parametrize("module, block, solve", [
+    (fused, "FRAMES_PER_BLOCK", partial(fuse, slip=1e-3)),
     (interpolation, "FRAMES_AT_ONCE",
      lambda dataset: slam.estimate(dataset, slip=1e-3, model="arc"))])
-def test_sections_of_a_drive_have_no_seams(module, size, solve, monkeypatch):
+def test_sections_of_a_drive_have_no_seams(module, block, solve, monkeypatch):
     dataset, _ = simulate("short", seed=3)
     dataset = only(dataset.first(600), dataset.first(600).aruco.pose < 500)    # odometry at the end
     whole = solve(dataset)
-    monkeypatch.setattr(module, size, 7)
+    monkeypatch.setattr(module, block, 7)
     sections = solve(dataset)
     np.testing.assert_allclose(sections.poses, whole.poses, atol=1e-10)
     np.testing.assert_allclose(sections.covariances, whole.covariances, rtol=1e-7, atol=1e-14)

@@ -53,7 +53,7 @@ def test_noise_is_the_sum_over_steps():
     start, end = np.array([0, 100, 37, 1500]), np.array([10, 400, 38, 1999])
     expected = [literal_noise(ticks, VEHICLE, s, e, 2e-3)
                 for s, e in zip(start, end, strict=True)]
-    got = increments.noise(ticks, VEHICLE, start, end, 2e-3)
+    got = increments.noise_covariances(ticks, VEHICLE, start, end, 2e-3)
     for a, b in zip(got, expected, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-9 * np.abs(b).max())
 
@@ -67,7 +67,7 @@ def test_noise_against_simulated_slip():
         got, _ = increments.between_poses(dataset.ticks, truth.vehicle, start, start + 95, "arc")
         errors.append(got - se2.between(truth.poses[start], truth.poses[start + 95]))
         covariances.append(
-            increments.noise(dataset.ticks, truth.vehicle, start, start + 95, 3e-3))
+            increments.noise_covariances(dataset.ticks, truth.vehicle, start, start + 95, 3e-3))
     errors, covariances = np.concatenate(errors), np.concatenate(covariances)
     low, high = nees_band(len(errors), probability=0.999)
     assert low < nees(errors, covariances, np.zeros_like(errors)).mean() < high
@@ -76,7 +76,7 @@ def test_noise_against_simulated_slip():
 def test_noise_in_drive_does_not_depend_on_how_the_drive_is_cut():
     """A straight drive: the rounding of one difference of counts, the skid and the slip."""
     ticks = np.full((2001, 2), 127)
-    whole = increments.noise(ticks, VEHICLE, [0], [2000], 0.0)[0]
+    whole = increments.noise_covariances(ticks, VEHICLE, [0], [2000], 0.0)[0]
     travelled = np.sum(odometry.steps(ticks, VEHICLE)[0])
     for every in (1, 10, 500, 2000):
         pose = np.arange(0, 2001, every)
@@ -90,7 +90,7 @@ def test_noise_in_drive_does_not_depend_on_how_the_drive_is_cut():
         by_slip = travelled * np.array([1 / 2, 2 / VEHICLE.wheelbase**2])
         np.testing.assert_allclose(np.diag(slipping.sum(axis=0))[[0, 2]], by_slip, rtol=1e-6)
     one, _ = increments.noise_in_drive(ticks[:2], VEHICLE, [0], [1])             # a single step
-    difference = one[0] - increments.noise(ticks[:2], VEHICLE, [0], [1], 0.0)[0]
+    difference = one[0] - increments.noise_covariances(ticks[:2], VEHICLE, [0], [1], 0.0)[0]
     skid = increments.MINIMUM_SLIP**2 * travelled / 2000
     np.testing.assert_allclose(difference, np.diag([skid, skid, 0.0]), rtol=1e-9, atol=1e-20)
     for part in increments.noise_in_drive(ticks, VEHICLE, [0, 700], [0, 700]):
@@ -112,10 +112,10 @@ def test_noise_does_not_depend_on_where_the_increment_lies():
     count = len(curvy_ticks()) - 1
     start = np.array([0, 10, 35, 200])
     end = np.array([10, 35, 190, count])
-    near = increments.noise(ticks, VEHICLE, start, end, 1e-3)
+    near = increments.noise_covariances(ticks, VEHICLE, start, end, 1e-3)
     shift = count + len(far)
-    for got in (increments.noise(ticks, VEHICLE, start + shift, end + shift, 1e-3),
-                np.concatenate([increments.noise(ticks, VEHICLE, [s], [e], 1e-3)
+    for got in (increments.noise_covariances(ticks, VEHICLE, start + shift, end + shift, 1e-3),
+                np.concatenate([increments.noise_covariances(ticks, VEHICLE, [s], [e], 1e-3)
                                 for s, e in zip(start + shift, end + shift, strict=True)])):
         scale = np.sqrt(np.einsum("nii,njj->nij", near, near))
         np.testing.assert_allclose(got / scale, near / scale, atol=1e-5)

@@ -36,7 +36,7 @@ from slamlib.results import write_vehicle_poses
 from slamlib.studies import montecarlo
 folder = Path(os.environ["SLAMLIB_RESULTS"], os.environ["SLAMLIB_DATASETS"], "problem1")
 write_vehicle_poses(folder, np.zeros((2, 3)), np.zeros((2, 3, 3)))
-print(sorted(studies.run(montecarlo.markers_alone, range(2))))
+print(sorted(studies.run(montecarlo.problem2_trial, range(2))))
 print("transport:", get_connection_info(unpack=True)["transport"])"""
 
 

@@ -275,7 +275,8 @@ def test_a_clean_drive_has_no_doubts_and_each_doubt_is_told_once(tmp_path, monke
     told = Doubt("camera-mirrored", "It is.")
     monkeypatch.setattr("slamlib.summary.doubts_about_drive", lambda *_: (told, told))
     monkeypatch.setattr("slamlib.summary.solutions", lambda dataset, problems: [
-        replace(solve.problem1(dataset), doubts=(Doubt("units", "Miles."), told))])
+        replace(solve.problem_solution("problem1", dataset),
+                doubts=(Doubt("units", "Miles."), told))])
     assert [doubt["what"] for doubt in solve_to_folder(dataset, None, tmp_path)["doubts"]] == [
         "camera-mirrored", "units"]
 

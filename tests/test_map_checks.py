@@ -60,7 +60,7 @@ def test_a_marker_with_larger_errors_than_stated_stands_out():
 
 
 def maps_of(dataset, truth):
-    return [map_checks.map_of(each) for each in map_checks.halves(dataset, truth.poses)]
+    return [map_checks.estimated_map(each) for each in map_checks.halves(dataset, truth.poses)]
 
 
 def test_halves_are_the_drive_in_two_frames():
@@ -80,9 +80,9 @@ def test_halves_are_the_drive_in_two_frames():
 
 def test_maps_of_both_halves_coincide_without_noise():
     one, other = maps_of(*simulate("short", 1, noise=False))
-    found = map_checks.compared(one, other)
+    found = map_checks.compare_maps(one, other)
     assert len(found.marker) > 3 and len(found.antenna) == 4
-    np.testing.assert_allclose(found.apart, 0, atol=1e-5)
+    np.testing.assert_allclose(found.distance, 0, atol=1e-5)
     assert found.chi2 < 1e-3
 
 
@@ -92,22 +92,22 @@ def test_two_antennas_compare_by_their_distance():
     C = np.diag(2 * [s**2, s**2, 0])
     one = map_checks.Map(np.zeros(0, int), np.array([4, 7]), np.array([[0.0, 0, 0], [3, 4, 0]]), C)
     other = replace(one, place=np.array([[1.0, 1, 0], [6.3, 1, 0]]))
-    found = map_checks.compared(one, other)
+    found = map_checks.compare_maps(one, other)
     assert found.dof == 1
     np.testing.assert_allclose(found.chi2, 0.3**2 / (4 * s**2))
-    np.testing.assert_allclose(found.apart, 0.15)
-    assert map_checks.compared(one, replace(other, antenna=np.array([4, 8]))) is None
+    np.testing.assert_allclose(found.distance, 0.15)
+    assert map_checks.compare_maps(one, replace(other, antenna=np.array([4, 8]))) is None
 
 
 def test_chi_squared_of_a_landmark_is_what_it_adds_to_that_of_the_others():
     one, other = maps_of(*simulate("short", 5))
-    found = map_checks.compared(one, other)
+    found = map_checks.compare_maps(one, other)
     assert found.dof == 3 * len(found.marker) + 2 * len(found.antenna) - 3 == found.dofs.sum() - 3
     for kind, ids, each in (("marker", found.marker, found.squared),
                             ("antenna", found.antenna, found.squared[len(found.marker):])):
         other_ids = getattr(other, kind).copy()
         other_ids[np.searchsorted(other_ids, ids[-1]):] += 1000             # as if not common
-        kept = map_checks.compared(one, replace(other, **{kind: other_ids}))
+        kept = map_checks.compare_maps(one, replace(other, **{kind: other_ids}))
         lost = [j for j in ids if j not in getattr(kept, kind)]
         assert lost == [ids[-1]]
         np.testing.assert_allclose(found.chi2 - kept.chi2, each[len(ids) - 1], rtol=0.05)
@@ -116,7 +116,7 @@ def test_chi_squared_of_a_landmark_is_what_it_adds_to_that_of_the_others():
 def test_differences_of_both_halves_are_chi_squared():
     chi2, dof = 0.0, 0
     for seed in SEEDS:
-        found = map_checks.compared(*maps_of(*simulate("short", seed, slip=2e-3)))
+        found = map_checks.compare_maps(*maps_of(*simulate("short", seed, slip=2e-3)))
         chi2, dof = chi2 + found.chi2, dof + found.dof
     low, high = evaluation.nees_band(1, dof, 0.99)
     assert low < chi2 < high
@@ -125,12 +125,12 @@ def test_differences_of_both_halves_are_chi_squared():
 def test_a_marker_that_was_moved_between_the_halves_stands_out():
     dataset, truth = simulate("short", 5)
     aruco = dataset.aruco
-    marker = map_checks.compared(*maps_of(dataset, truth)).marker[0]
+    marker = map_checks.compare_maps(*maps_of(dataset, truth)).marker[0]
     late = (aruco.marker == marker) & (aruco.pose >= 1000)
     z = aruco.marker_in_vehicle.copy()
     z[late, :2] += (se2.rotation(-truth.poses[aruco.pose[late], 2]) @ [0.05, 0])
     moved = replace(dataset, aruco=replace(aruco, marker_in_vehicle=z))
-    found = map_checks.compared(*maps_of(moved, truth))
+    found = map_checks.compare_maps(*maps_of(moved, truth))
     assert found.marker[found.squared.argmax()] == marker
     assert found.chi2 > 2 * evaluation.nees_band(1, found.dof, 0.9999)[1]
 
@@ -138,14 +138,14 @@ def test_a_marker_that_was_moved_between_the_halves_stands_out():
 def test_a_wrong_label_alone_makes_no_landmark():
     """A marker that a half sees only under wrong labels is not compared."""
     dataset, truth = simulate("short", 7, mislabelled=0.02)
-    found = map_checks.compared(*maps_of(dataset, truth))
-    assert found.apart[:len(found.marker)].max() < 0.3
+    found = map_checks.compare_maps(*maps_of(dataset, truth))
+    assert found.distance[:len(found.marker)].max() < 0.3
     few = replace(dataset, aruco=dataset.aruco.select(np.arange(2)), uwb=None)
-    assert len(map_checks.map_of(few).marker) == 0
+    assert len(map_checks.estimated_map(few).marker) == 0
 
 
 def test_a_drive_without_landmarks_has_an_empty_map():
     dataset, truth = simulate("short", 1)
     one, other = maps_of(replace(dataset, aruco=None, uwb=None), truth)
     assert one.place.shape == (0, 3) and one.covariance.shape == (0, 0)
-    assert map_checks.compared(one, other) is None
+    assert map_checks.compare_maps(one, other) is None

@@ -20,7 +20,7 @@ from slamlib.localization.marker_increments import (
 from slamlib.sightings import (
     Sightings,
     consensus,
-    few_of_each,
+    evenly_chosen,
     merge_repeated,
     sightings_by_frame,
 )
@@ -51,12 +51,12 @@ def test_the_consensus_of_many_sightings_takes_a_few_of_each_marker():
     assert marker[rows].tolist() == [5, 7, 10**14]
     assert np.abs(in_world[rows] - place[rows]).max() < 0.1
     label = np.searchsorted([5, 7, 10**14], marker)
-    few = few_of_each(label, 100)
+    few = evenly_chosen(label, 100)
     assert np.bincount(label[few]).tolist() == [100, 100, 100]
     for k in range(3):
         rows = np.searchsorted(np.flatnonzero(label == k), few[label[few] == k])
         assert rows[0] == 0 and np.ptp(np.diff(rows)) <= 1
-    assert few_of_each(label, 2000).tolist() == list(range(3000))
+    assert evenly_chosen(label, 2000).tolist() == list(range(3000))
 
 
 def test_exact_sightings_give_the_exact_increment():

@@ -22,7 +22,7 @@ from slamlib.report.pictures import title_picture
 from slamlib.report.svg import compressed
 from slamlib.results import write_vehicle_poses
 from slamlib.simulation import simulate, write_dataset
-from slamlib.solve import Failure, Solution, problem1, solutions, title, write
+from slamlib.solve import Failure, Solution, problem_solution, solutions, title, write_solution
 from slamlib.summary import summarize
 
 NAMES = ("all", "no_truth", "wheels_only")
@@ -44,7 +44,7 @@ def project(tmp_path_factory):
     written = []
     for name in NAMES:
         for solution in solved[:1] if name == "wheels_only" else solved:
-            at = write(folder / "results" / name, solution)
+            at = write_solution(folder / "results" / name, solution)
             written += [f"{name}/{solution.problem}/{file.name}" for file in at.glob("*.mat")]
     return folder, written, solved
 
@@ -136,7 +136,8 @@ def test_doubts_and_failures_stand_on_the_first_page_only_where_there_are_any(pr
 def test_a_problem_that_nothing_solves_is_in_the_table():
     dataset = simulate("short", seed=5)[0]
     failed = Failure("problem3", "SLAM: odometry + ArUco", "expected more")
-    drive = solved_drives.SolvedDrive("x", dataset, None, (problem1(dataset),), failures=(failed,))
+    solved = problem_solution("problem1", dataset)
+    drive = solved_drives.SolvedDrive("x", dataset, None, (solved,), failures=(failed,))
     rows, _ = result_rows(overview.opening([drive]))
     assert rows["x", "SLAM: odometry + ArUco"][0] == "could not be solved"
 
@@ -146,7 +147,8 @@ def test_a_problem_that_is_not_known_appears_by_its_folder(tmp_path):
     for name in ("other", "plain"):
         (tmp_path / "data" / name).mkdir(parents=True)
         (tmp_path / "data" / name / "encoderReading.txt").write_text("1 0 0\n2 10 9\n")
-        write(tmp_path / "results" / name, problem1(read_dataset(tmp_path / "data" / name)))
+        dataset = read_dataset(tmp_path / "data" / name)
+        write_solution(tmp_path / "results" / name, problem_solution("problem1", dataset))
         written.append(f"{name}/problem1/vehiclePose.mat")
     write_vehicle_poses(tmp_path / "results" / "other" / "a", np.zeros((2, 3)), np.zeros((2, 3, 3)))
     drives = solved_drives.read_drives(tmp_path / "data", tmp_path / "results", ["other", "plain"],

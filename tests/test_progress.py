@@ -182,7 +182,7 @@ def test_builds_that_compute_studies_and_those_that_recall_them_have_their_own_t
     assert building._seconds(tmp_path)[0].name == "seconds_computed.json"
     (tmp_path / "studies" / ("0" * 64)).mkdir(parents=True)               # of other code
     assert building._seconds(tmp_path)[0].name == "seconds_computed.json"
-    (tmp_path / "studies" / memory.CODE).mkdir()
+    (tmp_path / "studies" / memory.CODE_DIGEST).mkdir()
     assert building._seconds(tmp_path)[0].name == "seconds_recalled.json"
 
 

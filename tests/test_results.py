@@ -114,7 +114,7 @@ def test_a_failing_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypa
 def test_many_structs_have_the_bytes_that_scipy_writes():
     """Any numbers, NaN and infinity among them, for vectors, matrices and scalars."""
     rng = np.random.default_rng(0)
-    n = results.FEW + 7
+    n = results.MAX_STRUCTS_BY_SCIPY + 7
     rows = {"pose": rng.normal(size=(n, 1, 3)), "covari": rng.normal(size=(n, 3, 3)),
             "id": np.arange(n, dtype=float)[:, None, None]}
     rows["pose"][3], rows["covari"][5, 1, 2] = np.nan, np.inf

@@ -6,7 +6,7 @@ from functools import partial
 import gtsam
 import numpy as np
 import pytest
-from numeric import central_differences, decided, known_noise
+from numeric import central_differences, decided, known_noise, slam_trial
 
 from slamlib import increments, odometry, se2, simulation, slam, studies
 from slamlib.dataset import AntennaGuess, ArucoReadings, Dataset, UwbReadings, Vehicle
@@ -160,7 +160,7 @@ def test_large_slip_is_learned_as_accurately_as_if_known():
 @pytest.mark.parametrize("slip", [3e-3, 1e-2])
 def test_large_slip_does_not_cause_rejected_sightings(slip):
     """Correct labels: few sightings are rejected, and the slip is learned from the typical one."""
-    runs = studies.run(montecarlo.problem3, range(500, 508), slip=slip)
+    runs = studies.run(slam_trial, range(500, 508), ranges=False, slip=slip)
     assert runs["rejected"].mean() < 6                       # gate: 0.1 % of about 900
     assert 0.85 < np.exp(np.mean(np.log(runs["slip"]))) / slip < 1.15
     low, high = nees_band(8, probability=0.999)
@@ -349,7 +349,7 @@ def test_monte_carlo_is_consistent(options):
 
     All four means of both options are in their bands with probability 95 % (Bonferroni).
     """
-    runs = studies.run(montecarlo.problem3, SEEDS, **options)
+    runs = studies.run(slam_trial, SEEDS, ranges=False, **options)
     low, high = nees_band(len(SEEDS), probability=1 - 0.05 / 8)
     for name in ("nees", "nees between", "map nees", "wheel nees"):
         assert low < runs[name].mean() < high, name
@@ -364,12 +364,12 @@ def test_monte_carlo_is_consistent(options):
 def test_wheel_errors_must_be_a_variable_of_the_graph():
     """Without slip the wheel errors dominate and are correlated: 6 drives, given the true slip."""
     runs = studies.run(graphs.compare_graphs, range(400, 406), slip=0.0)
-    variable, chain, fixed = graphs.WHEELS
-    log_error = {wheels: np.log(runs[f"{wheels} arc ate"]) for wheels in graphs.WHEELS}
+    variable, chain, fixed = graphs.WHEEL_MODELS
+    log_error = {wheels: np.log(runs[f"{wheels} arc ate"]) for wheels in graphs.WHEEL_MODELS}
     assert decided(log_error[chain] - log_error[variable] - np.log(2))
     assert decided(log_error[fixed] - log_error[chain])
     assert runs[f"{variable} arc nees"].mean() < 4 and runs[f"{fixed} arc nees"].mean() > 50
-    for wheels in graphs.WHEELS:
+    for wheels in graphs.WHEEL_MODELS:
         for model in ("arc", "euler"):
             if (wheels, model) != (variable, "arc"):
                 other = runs[f"{wheels} {model} evidence"]
@@ -424,7 +424,7 @@ def test_markers_of_unknown_heading_are_mapped_as_points():
 def test_the_gate_has_a_smaller_error_than_hubers_kernel_with_wrong_labels():
     """3 % wrong labels, 8 drives. Against other kernels the gate's ATE is at most 15 % larger."""
     others = ("Cauchy", "Geman-McClure", "Tukey")
-    runs = studies.run(kernels.wrong_labels, range(8), ways=("gate", "Huber", *others),
+    runs = studies.run(kernels.wrong_labels, range(8), methods=("gate", "Huber", *others),
                        mislabelled=0.03)
     assert decided(runs["Huber ate"] - runs["gate ate"])
     assert all(decided(1.15 * runs[f"{way} ate"] - runs["gate ate"]) for way in others)
@@ -453,7 +453,7 @@ def open_path(legs, seed, spacing=2.0, slip=1e-3):
     ds, dtheta = (np.repeat(values / steps, steps) for values in np.transpose(legs))
     layout = replace_namespace(simulation.PATHS["short"], marker_spacing=spacing)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(simulation, "_drive", lambda layout, rounds: (ds, dtheta))
+        patch.setattr(simulation, "_driven_arcs", lambda layout, rounds: (ds, dtheta))
         patch.setitem(simulation.PATHS, "open", layout)
         dataset, truth = simulate("open", seed, slip=slip)
     return dataset.without("uwb"), truth

@@ -15,7 +15,7 @@ from slamlib.studies import memory, montecarlo
 
 
 def study(seeds=range(2), **options):
-    return studies.run(montecarlo.markers_alone, seeds, jobs=1, **options)
+    return studies.run(montecarlo.problem2_trial, seeds, jobs=1, **options)
 
 
 @pytest.fixture
@@ -31,7 +31,7 @@ def kept(folder):
 
 @pytest.fixture
 def computed(monkeypatch):
-    """The list of seeds that are computed, not recalled, by a trial that replaces markers_alone."""
+    """The list of seeds that are computed, not recalled, by a trial in place of problem2_trial."""
     seeds = []
 
     def trial(seed, **options):
@@ -39,8 +39,8 @@ def computed(monkeypatch):
         return {"of options": sum(options.values()), "not known": np.nan, "whole": seed,
                 "nees": seed / 3}
 
-    trial.__module__, trial.__name__ = montecarlo.__name__, "markers_alone"
-    monkeypatch.setattr(montecarlo, "markers_alone", trial)
+    trial.__module__, trial.__name__ = montecarlo.__name__, "problem2_trial"
+    monkeypatch.setattr(montecarlo, "problem2_trial", trial)
     return seeds
 
 
@@ -64,7 +64,7 @@ def test_studies_differ_by_trial_seeds_options_and_threads(folder, computed, mon
     study(), study([1, 0]), study([0]), study(slip=0.0), study(slip=0.1), study(mislabelled=0.1)
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     study()
-    montecarlo.markers_alone.__name__ = "another"
+    montecarlo.problem2_trial.__name__ = "another"
     study()
     assert len(computed) == 15 and len(kept(folder)) == 8
 
@@ -92,15 +92,15 @@ def test_the_digest_of_the_code_changes_with_every_module_that_computes(tmp_path
     shutil.copytree(memory.SLAMLIB, tmp_path / "slamlib",
                     ignore=shutil.ignore_patterns("__pycache__"))
     monkeypatch.setattr(memory, "SLAMLIB", tmp_path / "slamlib")
-    assert memory.code() == memory.CODE
+    assert memory.code_digest() == memory.CODE_DIGEST
     for module in sorted((tmp_path / "slamlib").rglob("*.py")):
         before = module.read_bytes()
         module.write_bytes(before + b"\n")
         shows = module.parent.name in ("notebook", "report") or module.name == "__main__.py"
-        assert (memory.code() == memory.CODE) == shows, module.name
+        assert (memory.code_digest() == memory.CODE_DIGEST) == shows, module.name
         module.write_bytes(before)
     (tmp_path / "slamlib" / "slam" / "new.py").touch()
-    assert memory.code() != memory.CODE
+    assert memory.code_digest() != memory.CODE_DIGEST
 
 
 @pytest.mark.parametrize("package", ["numpy", "scipy", "gtsam"])
@@ -108,7 +108,7 @@ def test_the_digest_of_the_code_changes_with_the_packages_that_compute(monkeypat
     installed = memory.version
     monkeypatch.setattr(memory, "version",
                         lambda name: "0" if name == package else installed(name))
-    assert memory.code() != memory.CODE
+    assert memory.code_digest() != memory.CODE_DIGEST
 
 
 def test_montecarlo_imports_no_module_that_the_digest_leaves_out():
@@ -120,7 +120,7 @@ def test_montecarlo_imports_no_module_that_the_digest_leaves_out():
 
 
 def test_no_study_is_kept_if_the_code_was_edited_meanwhile(folder, computed, monkeypatch):
-    monkeypatch.setattr(memory, "code", lambda: "edited")
+    monkeypatch.setattr(memory, "code_digest", lambda: "edited")
     study()
     assert computed == [0, 1] and not folder.exists()
 
@@ -130,7 +130,7 @@ def test_only_studies_of_other_code_are_removed(folder, computed):
     folder.joinpath("0" * 64).mkdir()
     folder.joinpath("mine.txt").touch()
     study(slip=0.2)
-    assert sorted(path.name for path in folder.iterdir()) == sorted([memory.CODE, "mine.txt"])
+    assert {path.name for path in folder.iterdir()} == {memory.CODE_DIGEST, "mine.txt"}
     assert len(kept(folder)) == 3
 
 
@@ -145,14 +145,14 @@ def test_a_study_shows_a_bar_in_a_kernel_of_jupyterlab_and_not_in_the_build(
     if told:
         monkeypatch.setenv("SLAMLIB_PROGRESS", str(tmp_path / "told"))
     study()
-    assert ("markers_alone" in capsys.readouterr().err) == shown
+    assert ("problem2_trial" in capsys.readouterr().err) == shown
 
 
 CELL = """from slamlib import studies
 from slamlib.studies import montecarlo
 for share in (0.0, 0.05):
-    runs = studies.run(montecarlo.markers_alone, range(2), mislabelled=share)
-    print("nees", runs["nees"].tolist())"""
+    runs = studies.run(montecarlo.problem2_trial, range(2), methods=("ArUco",), mislabelled=share)
+    print("nees", runs["ArUco nees"].tolist())"""
 
 
 @pytest.mark.slow

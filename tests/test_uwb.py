@@ -7,7 +7,7 @@ import gtsam
 import numpy as np
 import pytest
 from gtsam.symbol_shorthand import A, X
-from numeric import central_differences, decided, known_noise
+from numeric import central_differences, decided, known_noise, slam_trial
 from scipy.integrate import quad
 
 from slamlib import slam, studies
@@ -42,7 +42,7 @@ from slamlib.slam.trilateration import (
     second_moment,
     trilaterate,
 )
-from slamlib.solve import problem4
+from slamlib.solve import problem_solution
 from slamlib.studies import kernels, montecarlo, plaza, starts
 
 # A vehicle of exact odometry, so that only the geometry of the ranges matters.
@@ -210,7 +210,7 @@ def consistent(runs, names, count):
 @pytest.mark.parametrize("options", [dict(), dict(late_ranges=0.15)])
 def test_monte_carlo_is_consistent(options):
     """12 drives: NEES of poses, interpolated poses, map, antennas and wheels in their bands."""
-    runs = studies.run(montecarlo.problem4, range(700, 712), **options)
+    runs = studies.run(slam_trial, range(700, 712), **options)
     consistent(runs, ("nees", "nees between", "map nees", "antenna nees", "wheel nees"), 12)
     assert runs["ate"].max() < 0.05 and runs["antenna error"].max() < 0.15
     assert runs["doubts"].sum() == 0
@@ -218,7 +218,7 @@ def test_monte_carlo_is_consistent(options):
 
 @pytest.mark.slow
 def test_ranges_alone_are_consistent_although_they_hardly_determine_the_slip():
-    runs = studies.run(montecarlo.problem4, range(800, 812), markers=False, late_ranges=0.15)
+    runs = studies.run(slam_trial, range(800, 812), markers=False, late_ranges=0.15)
     consistent(runs, ("nees", "last nees", "antenna nees", "wheel nees"), 12)
     assert np.sqrt(np.mean(runs["ate"]**2)) < 0.06
 
@@ -228,7 +228,7 @@ def test_the_default_kernel_has_smaller_antenna_errors_than_symmetric_kernels():
     """30 % late, with markers, 10 drives; at most 10 % larger than those of the asymmetric gate."""
     symmetric = ("quadratic", "Huber", "Cauchy", "gate", "GNC")
     runs = studies.run(kernels.late_ranges, range(10), late_ranges=0.3,
-                       ways=(*symmetric, "asymmetric Tukey", "asymmetric gate"))
+                       methods=(*symmetric, "asymmetric Tukey", "asymmetric gate"))
     squared = {way: runs[f"{way} antenna error"]**2
                for way in (*symmetric, "asymmetric Tukey", "asymmetric gate")}
     default = squared["asymmetric Tukey"]
@@ -243,7 +243,8 @@ def test_the_default_kernel_has_smaller_antenna_errors_than_symmetric_kernels():
 def test_the_default_kernel_has_smaller_antenna_errors_than_convex_kernels_without_markers():
     """15 % late, 12 drives, and the poses are not overconfident."""
     ways = ("quadratic", "Huber", "asymmetric Tukey")
-    runs = studies.run(kernels.late_ranges, range(12), markers=False, late_ranges=0.15, ways=ways)
+    runs = studies.run(
+        kernels.late_ranges, range(12), markers=False, late_ranges=0.15, methods=ways)
     quadratic, huber, default = (runs[f"{way} antenna error"]**2 for way in ways)
     assert decided(huber - default) and decided(quadratic - 9 * default)
     assert runs["asymmetric Tukey nees"].mean() < 6 < runs["quadratic nees"].mean()
@@ -271,7 +272,7 @@ def test_late_ranges_are_down_weighted_and_accurate_ones_are_not():
 
 @pytest.mark.slow
 def test_antennas_are_right_or_in_doubt_despite_bad_guesses():
-    runs = studies.run(starts.guesses, range(8), error=10.0, compared=False)
+    runs = studies.run(starts.guesses, range(8), error=10.0, from_guess=False)
     assert runs["right"].mean() > 0.95 and runs["silently wrong"].sum() == 0
 
 
@@ -334,7 +335,7 @@ def test_a_standing_vehicle_learns_only_the_distances_of_its_antennas():
                                      dict(late_ranges=0.3, error=5.0, poses=800)])
 def test_every_wrong_antenna_of_a_short_drive_is_in_doubt_or_inside_its_ellipse(options):
     """Late ranges and bad guesses; the ellipse is that of 99.9 %."""
-    runs = studies.run(starts.guesses, range(3000, 3010), compared=False, **options)
+    runs = studies.run(starts.guesses, range(3000, 3010), from_guess=False, **options)
     assert runs["silently wrong"].sum() == 0
 
 
@@ -412,13 +413,13 @@ def test_second_moment_does_not_hold_the_grid_times_the_ranges():
 
 def test_problem_4_reports_the_down_weighted_ranges():
     dataset, _ = simulate("short", seed=9, late_ranges=0.15)
-    solution = problem4(dataset)
+    solution = problem_solution("problem4", dataset)
     weak = solution.facts["ranges_down_weighted_by_antenna"]
     assert weak.keys() == set(dataset.antenna_guess.antenna.tolist())
     assert 0.08 < sum(weak.values()) / solution.facts["ranges"] < 0.2
     assert solution.title == "SLAM: odometry + ArUco + UWB"
     assert solution.uwb_map[1].shape == (4, 2)
-    assert problem4(dataset.without("aruco")).aruco_map is None
+    assert problem_solution("problem4", dataset.without("aruco")).aruco_map is None
 
 
 def test_ranges_carry_the_uncertainty_of_the_place_they_were_measured_from():

@@ -1,5 +1,5 @@
-"""Checks that need no truth: what the measurements of a drive say against each other.
+"""Checks that need no truth: they compare the measurements of a drive with each other.
 
-    consistency  poses: returns to the same place, and distances from a better method
-    map_checks   maps: residuals by landmark, and both halves of the drive against each other
+    consistency  poses: loop closures, and differences from a more informed method
+    map_checks   maps: residuals by landmark, and the maps of both halves of a drive
 """

@@ -1,11 +1,11 @@
-"""Checks of poses that need no truth: what the measurements of one drive say against each other.
+"""Checks of poses without truth: loop closures, and the Hausman statistic.
 
-Where the camera sees markers again that it saw before, they measure the motion since then, and with
-it the error of every method that does not recognize places: `returns` and `discrepancies`.
+Markers that the camera sees again measure the motion since then, and with it the error of every
+method without loop closures: `returns` and `discrepancies`.
 
-A method that uses the data less well than another one differs from it by `excess`. The error of the
-best estimate is uncorrelated with what others differ from it by, so the covariance of the
-difference is the difference of both covariances (Hausman, Econometrica 46(6), 1978).
+`hausman_statistic` compares a method with an efficient one. The error of the efficient estimate is
+uncorrelated with its difference from any other, so the covariance of the difference is the
+difference of both covariances (Hausman, Econometrica 46(6), 1978).
 
 Poses are [x, y, heading] in m and rad.
 """
@@ -18,14 +18,14 @@ from slamlib import evaluation, odometry, se2
 from slamlib.localization.marker_increments import robust_increments
 from slamlib.sightings import sightings_by_frame
 
-GAP = 5.0                    # m, driven between two sightings of the markers of a return
-MOST_FRAMES = 400            # at equal distances along the path, among which returns are sought
-MIN_COMMON = 2               # markers that both frames of a return see, and that agree
+MIN_GAP = 5.0                # m, driven between two sightings of the markers of a return
+MAX_RETURN_FRAMES = 400      # frames, evenly spaced along the path, among which returns are sought
+MIN_COMMON_MARKERS = 2       # markers that both frames of a return see, and that agree
 
 
 @dataclass(frozen=True)
 class Returns:
-    """Pairs of frames that see the same markers, and the motion between them by these alone."""
+    """Pairs of frames that see the same markers, and the motion between them by these markers."""
 
     start: np.ndarray        # (m,) pose index from 0 of the earlier frame
     end: np.ndarray          # (m,) pose index of the later frame, ascending
@@ -34,11 +34,11 @@ class Returns:
     covariance: np.ndarray   # (m, 3, 3) of the motion, by the covariances of the sightings
 
 
-def returns(dataset, gap=GAP):
-    """The Returns of a Dataset after at least `gap` m; without markers there are none.
+def returns(dataset, gap=MIN_GAP):
+    """The Returns of a Dataset after at least `gap` m of driving; none without markers.
 
-    A frame returns to the earlier frame with which it has most markers in common. Returns share
-    errors, those of odometry over the same section and those of the same sightings.
+    A frame returns to the earlier frame with which it has most markers in common. Errors of returns
+    are correlated: they share sections of odometry, and sightings.
     """
     s = sightings_by_frame(dataset.aruco)
     travelled = odometry.cumulative(np.abs(odometry.steps(dataset.ticks, dataset.vehicle)[0]))
@@ -46,47 +46,48 @@ def returns(dataset, gap=GAP):
     label = np.unique(s.marker, return_inverse=True)[1]
     sighting = np.full((len(s.frame), label.max(initial=-1) + 1), -1)          # row, or -1
     sighting[s.row, label] = np.arange(len(s.row))
-    sighting, at = sighting[frame], travelled[s.frame[frame]]
+    sighting, distance = sighting[frame], travelled[s.frame[frame]]
     seen = (sighting >= 0).astype(int)
-    common = (seen @ seen.T) * (at[:, None] - at >= gap)            # of later with earlier frames
-    later = np.flatnonzero(common.max(axis=1, initial=0) >= MIN_COMMON)
+    common = (seen @ seen.T) * (distance[:, None] - distance >= gap)     # later with earlier frames
+    later = np.flatnonzero(common.max(axis=1, initial=0) >= MIN_COMMON_MARKERS)
     earlier = common[later].argmax(axis=1) if len(later) else later
     pair, which = np.nonzero(seen[earlier] & seen[later])
     found = robust_increments(s.z, s.C, pair, sighting[earlier[pair], which],
                               sighting[later[pair], which], len(later))
-    ok = found.usable & (np.bincount(pair, found.accepted, len(later)) >= MIN_COMMON)
+    ok = found.usable & (np.bincount(pair, found.accepted, len(later)) >= MIN_COMMON_MARKERS)
     start, end = s.frame[frame[earlier[ok]]], s.frame[frame[later[ok]]]
     return Returns(start=start, end=end, driven=travelled[end] - travelled[start],
                    motion=found.increment[ok], covariance=found.covariance[ok])
 
 
 def _spread(travelled):
-    """Rows of at most MOST_FRAMES distances (f,), ascending, that are nearly evenly spaced."""
+    """Rows of at most MAX_RETURN_FRAMES nearly evenly spaced distances (f,), which ascend."""
     if not len(travelled):
         return np.zeros(0, int)
-    wanted = np.linspace(travelled[0], travelled[-1], MOST_FRAMES)
+    wanted = np.linspace(travelled[0], travelled[-1], MAX_RETURN_FRAMES)
     return np.unique(np.searchsorted(travelled, wanted))
 
 
 def discrepancies(found, poses):
-    """Motions (m, 3) of Returns by the poses (n, 3) minus those by the markers, in their starts.
+    """Motions (m, 3) of Returns by the poses (n, 3) minus those by the markers.
 
-    The heading is wrapped. NaN where a pose is NaN.
+    They are in the frames of `found.start`, in m and rad with wrapped headings; NaN where a pose is
+    NaN.
     """
     off = se2.between(poses[found.start], poses[found.end]) - found.motion
     off[:, 2] = se2.wrap(off[:, 2])
     return off
 
 
-def excess(poses, covariances, best, best_covariances):
-    """Squared distance (n,) of poses (n, 3) from better ones, normalized by C - C_best, (n, 3, 3).
+def hausman_statistic(poses, covariances, efficient, efficient_covariances):
+    """Squared differences (n,) of poses (n, 3) from efficient ones, normalized by C - C_efficient.
 
-    It is chi-squared with 3 degrees of freedom if both covariances are right and the better method
-    is optimal for data that include those of the other. NaN where C - C_best is not positive
-    definite: there the other method claims to be more certain than the better one in some
-    direction. NaN without a pose.
+    It is chi-squared with 3 degrees of freedom if both covariances (n, 3, 3) are right and the
+    efficient method is optimal for data that include those of the first one. NaN where
+    C - C_efficient is not positive definite: there the first method claims to be more certain than
+    the efficient one in some direction. NaN without a pose.
     """
-    difference = covariances - best_covariances
-    claims = ~(np.diagonal(difference, axis1=1, axis2=2) > 0).all(axis=1)
-    difference[claims] = 0
-    return evaluation.nees(poses, difference, best)
+    difference = covariances - efficient_covariances
+    indefinite = ~(np.diagonal(difference, axis1=1, axis2=2) > 0).all(axis=1)
+    difference[indefinite] = 0
+    return evaluation.nees(poses, difference, efficient)

@@ -1,8 +1,8 @@
-"""Checks of a map that need no truth: residuals by landmark, and both halves of a drive.
+"""Checks of a map without truth: residuals by landmark, and the maps of both halves of a drive.
 
-`residuals_by_landmark` compares the residuals of every landmark with what is expected of them.
-`halves` of a drive are solved independently, each in the frame of its own first pose.
-`compared` moves their maps onto each other; the distances that are left have known covariances.
+`residuals_by_landmark` compares the residuals of every landmark with their expected sum of squares.
+`halves` splits a drive, and `estimated_map` solves each half in the frame of its own first pose.
+`compare_maps` aligns both maps; the remaining distances have known covariances.
 """
 
 from dataclasses import dataclass, replace
@@ -19,17 +19,17 @@ from slamlib.slam.pipeline import fit_from_odometry
 from slamlib.slam.range_calibration import calibrated
 from slamlib.slam.result import slam_result
 
-MIN_SIGHTINGS = 3            # accepted ones of a marker that is compared; fewer may be wrong labels
-ITERATIONS = 10              # of Gauss-Newton, for the motion between two maps
+MIN_SIGHTINGS_PER_MARKER = 3  # accepted sightings; fewer may all have wrong labels
+ALIGNMENT_ITERATIONS = 10     # Gauss-Newton iterations for the motion between two maps
 
 
 @dataclass(frozen=True)
 class LandmarkResiduals:
-    """Squared whitened residuals of every landmark of a kind, by the learned noise."""
+    """Squared whitened residuals of every landmark of a kind, with the learned noise."""
 
-    count: np.ndarray        # (k,) of accepted measurements, those of little weight counting less
+    count: np.ndarray        # (k,) sum of the weights of the accepted measurements
     chi2: np.ndarray         # (k,) sum of the squares
-    dof: np.ndarray          # (k,) what is expected of it
+    dof: np.ndarray          # (k,) its expectation
 
 
 def residuals_by_landmark(fit):
@@ -39,11 +39,11 @@ def residuals_by_landmark(fit):
     the degrees of freedom tr(J C J^T): E[e^T e] = n - tr(J C J^T). A range counts by its weight.
     """
     m, equations = fit.problem.measurements, fit.equations
-    own = np.arange(len(m.frame), len(m.structure.width))               # all variables but poses
-    own = np.concatenate([m.structure.rows([j], m.structure.width[j])[0] for j in own])
+    variables = range(len(m.frame), len(m.structure.width))             # all but the poses
+    unknowns = np.concatenate([m.structure.rows([j], m.structure.width[j])[0] for j in variables])
     column = np.full(len(m.structure.diagonal), -1)
-    column[own] = np.arange(len(own))
-    with_own = _covariance_with(fit, own)
+    column[unknowns] = np.arange(len(unknowns))
+    columns = _covariance_columns(fit, unknowns)
     pairs = marginal_covariances(equations, fit.problem.noise).pairs
     of_poses = np.concatenate([pairs[:, :3, :3], pairs[-1:, 3:6, 3:6]])
     totals = np.zeros((3, len(m.marker) + len(m.antenna)))
@@ -52,7 +52,7 @@ def residuals_by_landmark(fit):
         if not len(f.row):                                              # of no width
             continue
         rows, J = rows[f.index], f.J
-        C = with_own[rows[:, :, None], column[rows][:, None]]           # wrong in columns of poses
+        C = columns[rows[:, :, None], column[rows][:, None]]            # wrong in columns of poses
         C[:, :3, :3], C[:, 3:, :3] = of_poses[f.row], np.swapaxes(C[:, :3, 3:], 1, 2)
         taken = np.einsum("mdi,mij,mdj->m", J, C, J)
         for total, values in zip(totals, (f.weight, np.sum(f.e**2, axis=1),
@@ -62,7 +62,7 @@ def residuals_by_landmark(fit):
     return LandmarkResiduals(*markers), LandmarkResiduals(*antennas)
 
 
-def _covariance_with(fit, rows):
+def _covariance_columns(fit, rows):
     """Columns `rows` (r,) of the covariance (n, n) of all unknowns of a Fit, (n, r)."""
     H = fit.equations.structure.matrix(fit.equations.sums(fit.problem.noise)[0])
     unit = np.zeros((H.shape[0], len(rows)))
@@ -101,63 +101,65 @@ def halves(dataset, poses):
                                           uwb=later(dataset.uwb), antenna_guess=guess)
 
 
-def map_of(dataset):
-    """The Map of a Dataset by a solution of its own, without landmarks that are in doubt there.
+def estimated_map(dataset):
+    """The Map of a Dataset by SLAM, without landmarks that are in doubt.
 
-    Raises DatasetError where the measurements do not determine a solution.
+    Raises DatasetError where the measurements determine no solution.
     """
     fit = calibrated(fit_from_odometry(measure(dataset)))
     m, found = fit.problem.measurements, slam_result(fit)
     rows = m.structure.rows
-    agree = np.bincount(m.label, fit.problem.measured.sighting_weight, len(m.marker))
-    marker = np.flatnonzero(np.isin(m.marker, found.marker) & m.oriented & (agree >= MIN_SIGHTINGS))
+    accepted = np.bincount(m.label, fit.problem.measured.sighting_weight, len(m.marker))
+    marker = np.flatnonzero(np.isin(m.marker, found.marker) & m.oriented
+                            & (accepted >= MIN_SIGHTINGS_PER_MARKER))
     antenna = np.flatnonzero(~np.isin(m.antenna, list(found.doubts)))
     f, k = len(m.frame), len(m.marker)
-    own = np.concatenate([rows(f + marker, 3).ravel(), rows(f + k + antenna, 2).ravel()])
+    unknowns = np.concatenate([rows(f + marker, 3).ravel(), rows(f + k + antenna, 2).ravel()])
     place = np.concatenate([fit.state.markers[marker],
                             np.pad(fit.state.antennas[antenna], ((0, 0), (0, 1)))])
     used, C = _coordinates(marker, antenna), np.zeros(2 * [place.size])
-    C[np.ix_(used, used)] = _covariance_with(fit, own)[own]
+    C[np.ix_(used, used)] = _covariance_columns(fit, unknowns)[unknowns]
     to_world = se2.compose_jacobians(place, np.zeros(3))[1]            # from each landmark's axes
     turn = block_diag(np.zeros((0, 0)), *to_world)                     # (0, 0) also without any
     return Map(m.marker[marker], m.antenna[antenna], place, turn @ C @ turn.T)
 
 
 def _coordinates(marker, antenna):
-    """(3k + 3a,) bool, the coordinates that landmarks have: antennas have no heading."""
-    return np.concatenate([np.ones(3 * len(marker), bool), np.tile([True, True, False],
-                                                                  len(antenna))])
+    """Mask (3k + 3a,) of the coordinates that landmarks have: antennas have no heading."""
+    return np.concatenate([np.ones(3 * len(marker), bool),
+                           np.tile([True, True, False], len(antenna))])
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """The common landmarks of two maps, after the motion that brings them closest."""
+    """The common landmarks of two maps after their alignment."""
 
     marker: np.ndarray       # (k,) ids
     antenna: np.ndarray      # (a,) ids
-    apart: np.ndarray        # (k + a,) m, distances of the positions
-    squared: np.ndarray      # (k + a,) chi-squared of each landmark against all others
+    distance: np.ndarray     # (k + a,) m, between both positions
+    squared: np.ndarray      # (k + a,) chi-squared of each landmark given all others
     dofs: np.ndarray         # (k + a,) its degrees of freedom, 3 of a marker and 2 of an antenna
     chi2: float              # of all of them together
     dof: int                 # its degrees of freedom, without the 3 of the motion
 
 
-def compared(one, other):
+def compare_maps(first, second):
     """The Comparison of two independent Maps, None if they have fewer than two landmarks in common.
 
-    The motion T minimises r^T W r for r = one - T other and W = (C_one + J C_other J^T)^-1. With
+    The motion T minimises r^T W r for r = p - T q, with the places p of the first map and q of the
+    second one, of covariances C and D, and W = (C + J D J^T)^-1, J = d(T q) / dq. With
     A = dr/dT and P = W - W A (A^T W A)^-1 A^T W, the vector u = P r has the covariance P. Landmark
     j adds u_j^T P_jj^-1 u_j to the chi-squared of the others (Baarda, A Testing Procedure for Use
     in Geodetic Networks, 1968).
     """
-    marker, antenna = (np.intersect1d(getattr(one, kind), getattr(other, kind))
+    marker, antenna = (np.intersect1d(getattr(first, kind), getattr(second, kind))
                        for kind in ("marker", "antenna"))
     if len(marker) + len(antenna) < 2:
         return None
-    (p, C), (q, D) = (_selected(each, marker, antenna) for each in (one, other))
+    (p, C), (q, D) = (_common(half, marker, antenna) for half in (first, second))
     used = _coordinates(marker, antenna)
     T = evaluation.align(q, p)
-    for _ in range(ITERATIONS):
+    for _ in range(ALIGNMENT_ITERATIONS):
         by_T, by_q = se2.compose_jacobians(T, q)
         r = p - se2.compose(T, q)
         r[:, 2] = se2.wrap(r[:, 2])
@@ -169,13 +171,14 @@ def compared(one, other):
     u, dofs = P @ e, used.reshape(-1, 3).sum(axis=1)
     rows = np.split(np.arange(len(u)), np.cumsum(dofs)[:-1])
     return Comparison(
-        marker, antenna, apart=np.hypot(*r[:, :2].T), chi2=float(e @ u), dof=len(u) - 3, dofs=dofs,
+        marker=marker, antenna=antenna, distance=np.hypot(*r[:, :2].T), dofs=dofs,
+        chi2=float(e @ u), dof=len(u) - 3,
         squared=np.array([u[j] @ np.linalg.solve(P[np.ix_(j, j)], u[j]) for j in rows]))
 
 
-def _selected(one, marker, antenna):
-    """Places (k + a, 3) and their covariance of some landmarks of a Map."""
-    rows = np.concatenate([np.searchsorted(one.marker, marker),
-                           len(one.marker) + np.searchsorted(one.antenna, antenna)])
-    of_each = (3 * rows[:, None] + np.arange(3)).ravel()
-    return one.place[rows], one.covariance[np.ix_(of_each, of_each)]
+def _common(half, marker, antenna):
+    """Places (k + a, 3) of some landmarks of a Map, and their covariance."""
+    rows = np.concatenate([np.searchsorted(half.marker, marker),
+                           len(half.marker) + np.searchsorted(half.antenna, antenna)])
+    coordinates = (3 * rows[:, None] + np.arange(3)).ravel()
+    return half.place[rows], half.covariance[np.ix_(coordinates, coordinates)]

@@ -1,4 +1,4 @@
-"""Problem 2, odometry and markers fused by a Kalman filter whose state holds the shared errors.
+"""Problem 2, odometry and markers fused by a Kalman filter whose state contains the shared errors.
 
 The state contains the pose X, the wheel parameters w = [R_R, R_L, b] and the markers M_j of the
 last frame, in that frame, with covariance P (Smith, Self and Cheeseman, Estimating Uncertain
@@ -7,19 +7,19 @@ Spatial Relationships in Robotics, 1990). Odometry predicts
     X' = X Delta(w),    M'_j = Delta(w)^-1 M_j,    w' = w,    P' = F P F^T + L Q L^T,
 
 with Delta(w) = Delta(w_0) + dDelta/dw (w - w_0), F and L the derivatives of the new state by the
-old one and by Delta, and Q the noise of Delta: slip, and its share of the rounding of one
-difference of counts over the drive (`increments.noise_in_drive`). The sightings Z_j of
+old one and by Delta, and Q the noise of Delta (`increments.noise_in_drive`). The sightings Z_j of
 the new frame, with covariances C_j, measure the markers M' = H state and update
 
     state <- state + K (Z - M'),    P <- (I - K H) P',    K = P' H^T S^-1,    S = H P' H^T + C,
 
-with C block-diagonal. Sightings beyond GATE are rejected. Then rejected markers and those out of
-view are dropped, and new ones are added with covariance C_j. Without markers the result is the
+with C block-diagonal. Sightings beyond GATE are rejected. Then the filter removes rejected markers
+and those out of view, and adds new ones with covariance C_j. Without markers the result is the
 first-order propagation of odometry; with uninformative odometry and one marker it is `localize`.
 """
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,19 +29,19 @@ from slamlib.localization.marker_increments import common_sightings
 from slamlib.sightings import GATE, sightings_by_frame
 
 SLIP_FRAMES = 500            # number of frames, the first ones, from which the slip is learned
-WHEEL_FRAMES = 5000          # the same, of the wheels at which the odometry is linearised
-AT_ONCE = 1000               # frames between which poses are computed together: these stay in cache
-LOG_TOLERANCE = 0.05         # of the logarithm of the slip
+WHEEL_FRAMES = 5000          # number of frames, the first ones, that give the wheel parameters w_0
+FRAMES_PER_BLOCK = 1000      # frames whose poses are computed together, so that they stay in cache
+LOG_SLIP_TOLERANCE = 0.05    # of the natural logarithm of the slip
 
 
 @dataclass(frozen=True)
 class Fusion:
-    """Poses and covariances at every pose of the encoder file."""
+    """Poses and covariances by fusion, for every pose of the encoder file."""
 
     poses: np.ndarray            # (n, 3) in the world frame, m and rad
     covariances: np.ndarray      # (n, 3, 3) of [x, y, heading] in world axes
     measured: np.ndarray         # (f,) pose indices from 0 of the frames
-    rejected: int                # number of sightings not used; of repeated ones one is used
+    rejected: int                # number of sightings not used; repeated ones are used once
     slip: float | None = None    # sqrt(m), given or learned
     wheel: np.ndarray | None = None             # (3,) m, R_R, R_L, b estimated at the last frame
     wheel_covariance: np.ndarray | None = None  # (3, 3) m^2
@@ -49,7 +49,7 @@ class Fusion:
 
 @dataclass(frozen=True)
 class _FilterInput:
-    """The data of the filter, computed once for all values of slip."""
+    """The data of the filter, the same for all values of slip."""
 
     dataset: object
     model: str
@@ -60,11 +60,10 @@ class _FilterInput:
     rounding: np.ndarray         # (f-1, 3, 3) Q without slip
     slipping: np.ndarray         # (f-1, 3, 3) what a slip of 1 sqrt(m) adds to Q
     frames: list                 # of f tuples: z (m, 3) and C (m, 3, 3) of a frame's sightings, and
-                                 # rows of common markers, in the frame before and in this one
+                                 # rows of common markers in the previous and in this frame
 
 
-@dataclass
-class _State:
+class _State(NamedTuple):        # three are made at a frame: faster than frozen dataclasses
     """The filter after a frame with m sightings; rejected markers are not in the state."""
 
     x: np.ndarray                # (6,) pose X and w - w_0
@@ -76,11 +75,11 @@ class _State:
 
 
 def fuse(dataset, slip=None, model="arc"):
-    """Fusion of a Dataset's odometry and markers; its covariances count shared errors once.
+    """Fusion of a Dataset's odometry and markers for problem 2, with correct shared errors.
 
     `slip` in sqrt(m) is the standard deviation of the slip of one wheel after 1 m; None takes that
-    of the dataset's Vehicle, and if there is none, the one that maximises the likelihood of the
-    innovations times `log_slip_prior`. A marker_noise_factor of the Vehicle multiplies the standard
+    of the dataset's Vehicle or, if it has none, the maximum of the posterior density by the
+    innovations and `log_slip_prior`. A marker_noise_factor of the Vehicle multiplies the standard
     deviations of the sightings. `model` is that of the increments, "arc" or "euler"; another one
     raises ValueError.
 
@@ -96,11 +95,20 @@ def fuse(dataset, slip=None, model="arc"):
     first = replace(given, frames=given.frames[:WHEEL_FRAMES])
     wheel = given.vehicle.wheel + _filter(first, slip)[0][-1, 3:]
     given = _filter_input(dataset, model, dataset.vehicle.with_wheel(wheel))    # linearised again
-    return _between_frames(given, slip, *_filter(given, slip))
+    x, covariances, state = _filter(given, slip)
+    blocks = [*given.pose[::FRAMES_PER_BLOCK], len(dataset.ticks)]
+    poses, pose_covariances = (np.concatenate(parts) for parts in zip(*(
+        _poses_from_frames(given, slip, x, covariances, np.arange(begin, end))
+        for begin, end in zip(blocks, blocks[1:]))))
+    repeated = len(dataset.aruco.pose) - sum(len(z) for z, *_ in given.frames)
+    return Fusion(
+        poses=poses, covariances=pose_covariances, measured=given.pose, slip=slip,
+        rejected=state.rejected + repeated, wheel=given.vehicle.wheel + x[-1, 3:],
+        wheel_covariance=covariances[-1, 3:, 3:])
 
 
 def _likeliest_slip(given):
-    """Slip in sqrt(m) of greatest posterior density, by parabolas over the logarithm of slip.
+    """Slip in sqrt(m) of maximum posterior density, by parabolas over the logarithm of slip.
 
     The first three points are the median of the prior and one standard deviation to both sides.
     """
@@ -108,30 +116,30 @@ def _likeliest_slip(given):
         return _filter(given, np.exp(log_slip))[2].log_likelihood + log_slip_prior(log_slip)
 
     step = np.log(SLIP_FACTOR)
-    points = {each: density(each) for each in np.log(TYPICAL_SLIP) + step * np.arange(-1, 2)}
+    points = {point: density(point) for point in np.log(TYPICAL_SLIP) + step * np.arange(-1, 2)}
     while True:
         best = max(points, key=points.get)
-        below, above = (min((each for each in points if side * (each - best) > 0),
-                            key=lambda each: abs(each - best), default=None) for side in (-1, 1))
+        below = max((point for point in points if point < best), default=None)
+        above = min((point for point in points if point > best), default=None)
         if below is None or above is None:                     # the maximum is further outside
             vertex = np.clip(best + (step if above is None else -step), *np.log(SLIP_BOUNDS))
         else:
-            slopes = [(points[each] - points[best]) / (each - best) for each in (below, above)]
+            slopes = [(points[point] - points[best]) / (point - best) for point in (below, above)]
             vertex = (below + best) / 2 - slopes[0] * (above - below) / 2 / (slopes[1] - slopes[0])
-        if abs(vertex - best) < LOG_TOLERANCE:
+        if abs(vertex - best) < LOG_SLIP_TOLERANCE:
             return float(np.exp(vertex))
         points[vertex] = density(vertex)
 
 
 def _filter_input(dataset, model, vehicle):
-    """The _FilterInput with odometry linearised at the wheel parameters of this vehicle."""
+    """The _FilterInput with odometry linearised at the wheel parameters of `vehicle`."""
     ticks, sightings = dataset.ticks, sightings_by_frame(dataset.aruco, extra_frames=[0])
     start, end = sightings.frame[:-1], sightings.frame[1:]
     begins = np.searchsorted(sightings.row, np.arange(len(sightings.frame)))
     pair, first, second = common_sightings(sightings.row, sightings.marker)
     splits = np.searchsorted(pair, np.arange(len(start)))
     C = (vehicle.marker_noise_factor or 1.0)**2 * sightings.C
-    seen = (np.split(each, begins[1:]) for each in (sightings.z, C))
+    seen = (np.split(values, begins[1:]) for values in (sightings.z, C))
     common = (np.split(rows, splits) for rows in (first - begins[pair], second - begins[pair + 1]))
     increment, by_w = increments.between_poses(ticks, vehicle, start, end, model)
     rounding, slipping = increments.noise_in_drive(ticks, vehicle, start, end)
@@ -150,33 +158,33 @@ def _filter(given, slip):
     Q, x, covariances = given.rounding + slip**2 * given.slipping, [], []
     for k, frame in enumerate(given.frames):
         if k > 0:
-            _predict(state, given.increment[k - 1], given.by_w[k - 1], Q[k - 1])
-        _update(state, *frame)
+            state = _predicted(state, given.increment[k - 1], given.by_w[k - 1], Q[k - 1])
+        state = _updated(state, *frame)
         x.append(state.x)
         covariances.append(state.P[:6, :6].copy())
     return np.array(x), np.array(covariances), state
 
 
-def _predict(state, increment, by_w, Q):
-    """Move a _State by one odometry increment.
+def _predicted(state, increment, by_w, Q):
+    """The _State after one odometry increment.
 
-    The derivatives are those of `se2.compose` and `se2.between`, in place: the arrays of one frame
-    are so small that calls take longer than arithmetic.
+    The derivatives are those of `se2.compose` and `se2.between`, written out: the arrays of one
+    frame are so small that calls take longer than arithmetic.
     """
     delta = increment + by_w @ state.x[3:]
     x, y, heading = state.x[:3].tolist()
     turned, back = _rotation(heading), _rotation(-delta[2])
-    pose = state.x[:3] + turned @ delta
-    state.M = (state.M - delta) @ back.T
+    pose, M = state.x[:3] + turned @ delta, (state.M - delta) @ back.T
     F, L = np.eye(len(state.P)), np.zeros((len(state.P), 3))
     F[0, 2], F[1, 2] = y - pose[1], pose[0] - x
     L[:3] = turned
-    L[6:] = np.tile(-back, (len(state.M), 1))
-    L[6::3, 2], L[7::3, 2] = state.M[:, 1], -state.M[:, 0]
+    L[6:] = np.tile(-back, (len(M), 1))
+    L[6::3, 2], L[7::3, 2] = M[:, 1], -M[:, 0]
     F[:, 3:6] += L @ by_w
-    rows = 6 + np.arange(3 * len(state.M)).reshape(-1, 3)
+    rows = 6 + np.arange(3 * len(M)).reshape(-1, 3)
     F[rows[:, :, None], rows[:, None, :]] = back
-    state.x, state.P = np.concatenate([pose, state.x[3:]]), F @ state.P @ F.T + L @ Q @ L.T
+    return state._replace(x=np.concatenate([pose, state.x[3:]]), M=M,
+                          P=F @ state.P @ F.T + L @ Q @ L.T)
 
 
 def _rotation(angle):
@@ -185,10 +193,10 @@ def _rotation(angle):
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def _update(state, z, C, before, now):
-    """Correct a _State by a frame's sightings z (m, 3) and C (m, 3, 3), as in `_FilterInput`."""
-    known = state.place[before] >= 0
-    old, new = state.place[before[known]], now[known]
+def _updated(state, z, C, earlier, later):
+    """The _State after a frame's sightings z (m, 3) and C (m, 3, 3), as in `_FilterInput`."""
+    known = state.place[earlier] >= 0
+    old, new = state.place[earlier[known]], later[known]
     v = z[new] - state.M[old]
     v[:, 2] = se2.wrap(v[:, 2])
     rows = 6 + 3 * old[:, None] + np.arange(3)
@@ -197,12 +205,12 @@ def _update(state, z, C, before, now):
     if not accepted.all():
         # A rejected sighting has the density at the gate, so that rejections do not favour a slip.
         rejected = int(np.count_nonzero(~accepted))
-        state.log_likelihood -= rejected * GATE / 2 \
-            + np.sum(np.linalg.slogdet(S[~accepted])[1]) / 2
-        state.rejected += rejected
+        density = rejected * GATE / 2 + np.sum(np.linalg.slogdet(S[~accepted])[1]) / 2
+        state = state._replace(log_likelihood=state.log_likelihood - density,
+                               rejected=state.rejected + rejected)
         old, rows = old[accepted], rows[accepted]
     if len(rows):
-        _correct(state, rows.ravel(), v[accepted].ravel(), C[new[accepted]])
+        state = _corrected(state, rows.ravel(), v[accepted].ravel(), C[new[accepted]])
     added = np.ones(len(z), bool)
     added[new] = False
     kept, rows = len(old), np.concatenate([np.arange(6), rows.ravel()])
@@ -210,51 +218,35 @@ def _update(state, z, C, before, now):
     P[:len(rows), :len(rows)] = state.P[rows[:, None], rows]
     rows = len(rows) + np.arange(len(P) - len(rows)).reshape(-1, 3)
     P[rows[:, :, None], rows[:, None, :]] = C[added]
-    state.P, state.M = P, np.concatenate([state.M[old], z[added]])
-    state.place = np.full(len(z), -1)
-    state.place[new[accepted]] = np.arange(kept)
-    state.place[added] = kept + np.arange(len(rows))
+    place = np.full(len(z), -1)
+    place[new[accepted]] = np.arange(kept)
+    place[added] = kept + np.arange(len(rows))
+    return state._replace(P=P, M=np.concatenate([state.M[old], z[added]]), place=place)
 
 
-def _correct(state, rows, v, C):
-    """The Kalman update of a _State with innovations v (3m,) of these rows (3m,) of P."""
+def _corrected(state, rows, v, C):
+    """The _State after the Kalman update by innovations v (3m,) of these rows (3m,) of P."""
     S, HP = state.P[rows[:, None], rows], state.P[rows]
     block = np.arange(len(v)).reshape(-1, 3)
     S[block[:, :, None], block[:, None, :]] += C
     solved = np.linalg.solve(S, np.column_stack([HP, v]))
     change, P = HP.T @ solved[:, -1], state.P - HP.T @ solved[:, :-1]
-    state.x, state.M = state.x + change[:6], state.M + change[6:].reshape(-1, 3)
-    state.P = (P + P.T) / 2
-    state.log_likelihood -= (v @ solved[:, -1] + np.linalg.slogdet(S)[1]) / 2
+    density = (v @ solved[:, -1] + np.linalg.slogdet(S)[1]) / 2
+    return state._replace(x=state.x + change[:6], M=state.M + change[6:].reshape(-1, 3),
+                          P=(P + P.T) / 2, log_likelihood=state.log_likelihood - density)
 
 
-def _between_frames(given, slip, x, covariances, state):
-    """The Fusion: every pose of the encoder file by odometry from the last frame before it."""
-    count, vehicle = len(given.dataset.ticks), given.vehicle
-    found = [_section(given, slip, x[rows], covariances[rows], given.pose[rows], end)
-             for rows, end in _sections(given.pose, count)]
-    poses, each = (np.concatenate(part) for part in zip(*found))
-    repeated = len(given.dataset.aruco.pose) - sum(len(z) for z, *_ in given.frames)
-    return Fusion(
-        poses=poses, covariances=each, measured=given.pose, rejected=state.rejected + repeated,
-        slip=slip, wheel=vehicle.wheel + x[-1, 3:], wheel_covariance=covariances[-1, 3:, 3:])
+def _poses_from_frames(given, slip, x, covariances, pose):
+    """Successive poses and their covariances, by odometry from the last frame before each.
 
-
-def _sections(frame, count):
-    """Slices of AT_ONCE frames, and the pose at which the next one begins, of `count` poses."""
-    for first in range(0, len(frame), AT_ONCE):
-        end = first + AT_ONCE
-        yield slice(first, end), frame[end] if end < len(frame) else count
-
-
-def _section(given, slip, x, covariances, frame, end):
-    """Poses and covariances from the first of some frames to the pose before `end`."""
-    ticks = given.dataset.ticks
-    pose = np.arange(frame[0], end)
-    last = np.searchsorted(frame, pose, side="right") - 1
-    args = ticks[frame[0]:end], given.vehicle, frame[last] - frame[0], pose - frame[0]
-    increment, by_w = increments.between_poses(*args, given.model)
-    rounding, slipping = increments.noise_in_drive(*args, steps=len(ticks) - 1)
+    `pose` (n,) are indices from 0, the first one that of a frame; x and covariances are those of
+    `_filter`.
+    """
+    begin, ticks = pose[0], given.dataset.ticks
+    last = np.searchsorted(given.pose, pose, side="right") - 1
+    steps = ticks[begin:pose[-1] + 1], given.vehicle, given.pose[last] - begin, pose - begin
+    increment, by_w = increments.between_poses(*steps, given.model)
+    rounding, slipping = increments.noise_in_drive(*steps, steps=len(ticks) - 1)
     Q = rounding + slip**2 * slipping
     delta = increment + np.einsum("nij,nj->ni", by_w, x[last, 3:])
     A, B = se2.compose_jacobians(x[last, :3], delta)

@@ -7,7 +7,7 @@ zero at the last fused frame) and the marker increment Delta_m with covariance C
 
 The result is overconfident and overweights odometry: errors of the wheel parameters are the same in
 all increments, consecutive marker increments share sightings, and equation 2 has no wheel slip.
-`fused.py` counts what is shared once, and learns the slip.
+`fused.py` counts shared errors once and learns the slip.
 """
 
 import numpy as np
@@ -19,7 +19,7 @@ from slamlib.sightings import sightings_by_frame
 
 
 def equation2_from(ticks, vehicle, start, poses, covariances):
-    """Equation 2 restarted at some poses: `odometry.equation2` of every part between them.
+    """Equation 1 and equation 2 restarted at some poses: `odometry.equation2` of every part.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def equation2_from(ticks, vehicle, start, poses, covariances):
 
 
 def first_order_from(ticks, vehicle, start, poses, covariances):
-    """The same by `odometry.first_order`, which includes all correlations."""
+    """The same by `odometry.first_order`, with all correlations of a part."""
     part = np.maximum(np.searchsorted(start, np.arange(len(ticks))) - 1, 0)
     delta, by_w = increments.between_poses(ticks, vehicle, start[part], np.arange(len(ticks)))
     A, B = se2.compose_jacobians(poses[part], delta)
@@ -55,9 +55,10 @@ def first_order_from(ticks, vehicle, start, poses, covariances):
 
 
 def fuse_increments(dataset, propagation=equation2_from):
-    """Fusion of a Dataset by independent increments; where markers give none, odometry alone.
+    """Fusion for problem 2 as the assignment suggests: equation 2 restarts at every fused frame.
 
-    `propagation` is `equation2_from`, or `first_order_from` to include all correlations.
+    Where markers give no increment, odometry alone is used. `propagation` is `equation2_from`, or
+    `first_order_from` with all correlations.
     """
     ticks, vehicle = dataset.ticks, dataset.vehicle
     sightings = sightings_by_frame(dataset.aruco, extra_frames=[0])

@@ -1,4 +1,4 @@
-"""Increments of the vehicle between two frames (a pair), from the markers that both frames see.
+"""Problem 2, increments of the vehicle between a pair of frames, from their common markers.
 
 With Z_j and Z'_j the sightings of marker j from the earlier and the later frame, and C_j and C'_j
 their covariances, the increment Delta, the later frame in the earlier one, minimises the sum of
@@ -14,12 +14,12 @@ import numpy as np
 from slamlib import se2
 from slamlib.sightings import GATE, MAX_HEADING_SIGMA
 
-ITERATIONS = 8, 6         # numbers of Gauss-Newton iterations: Cauchy weights, then the gate
-SMALL_STEP = 1e-10        # m and rad, of the iteration that is the last one
-SPEED_RATIO = 3.0         # dimensionless, largest plausible speed in units of the usual speed
-POINT_PAIRS = 60          # pairs of points that give hypotheses, of every pair of frames
-AT_ONCE = 20_000          # sightings whose residuals are computed together
-SLOW_TURN = 1e-3          # rad per encoder step; smaller differences of turn rates are ignored
+INCREMENT_ITERATIONS = 8, 6   # numbers of Gauss-Newton iterations: Cauchy weights, then the gate
+INCREMENT_STEP_TOLERANCE = 1e-10  # m and rad; iterations end after a smaller step
+SPEED_RATIO = 3.0             # ratio of the largest plausible speed to the usual speed
+POINT_PAIRS = 60              # pairs of points that give hypotheses, of every pair of frames
+SIGHTINGS_PER_BLOCK = 20_000  # sightings whose residuals are computed together
+MIN_TURN_RATE = 1e-3          # rad per encoder step; smaller differences of turn rates are ignored
 
 
 @dataclass(frozen=True)
@@ -40,12 +40,12 @@ class MarkerIncrements:
 def consecutive_increments(sightings):
     """MarkerIncrements from every frame of Sightings to the next, usable if plausibly slow.
 
-    Where only one marker is common there is no redundancy to reject a wrong label. The usual speed
-    is the larger of the 99th percentile over increments on which two or more markers agree and the
+    With a single common marker there is no redundancy to reject a wrong label. The usual speed is
+    the larger of the 99th percentile over increments on which two or more markers agree and the
     90th percentile over all. An increment is implausible if its speed, less three standard
-    deviations, exceeds SPEED_RATIO times the usual one and its velocity is not similar to that
-    before or after. It is estimated again from those of its sightings that, taken alone, imply a
-    plausible speed. Speeds are in m and rad per encoder step, the difference of `sightings.frame`.
+    deviations, exceeds SPEED_RATIO times the usual one and its velocity differs from the previous
+    and the next one. It is estimated again from those of its sightings that alone imply a plausible
+    speed. Speeds are in m and rad per encoder step, the difference of `sightings.frame`.
     """
     z, C, steps = sightings.z, sightings.C, np.diff(sightings.frame)
     pair, first, second = common_sightings(sightings.row, sightings.marker)
@@ -100,7 +100,7 @@ def robust_increments(z, C, pair, first, second, count):
     """
     z1, C1, z2, C2 = z[first], C[first], z[second], C[second]
     increment = _best_hypothesis(z1, C1, z2, C2, pair, count)
-    for gated, iterations in enumerate(ITERATIONS):
+    for gated, iterations in enumerate(INCREMENT_ITERATIONS):
         for _ in range(iterations):
             J_delta, J_second = se2.compose_jacobians(increment[pair], z2)
             r, information, squared = _residuals(increment[pair], J_second, z1, C1, z2, C2)
@@ -112,7 +112,7 @@ def robust_increments(z, C, pair, first, second, count):
             covariance = _inverse_where_regular(H)
             step = np.einsum("nij,nj->ni", covariance, gradient)
             increment = increment + step
-            if not np.nanmax(np.abs(step), initial=0) > SMALL_STEP:
+            if not np.nanmax(np.abs(step), initial=0) > INCREMENT_STEP_TOLERANCE:
                 break
     increment[:, 2] = se2.wrap(increment[:, 2])
     usable = covariance[:, 2, 2] < MAX_HEADING_SIGMA**2
@@ -139,19 +139,20 @@ def _best_hypothesis(z1, C1, z2, C2, pair, count):
     """
     begins, ends = (np.searchsorted(pair, np.arange(count), side) for side in ("left", "right"))
     oriented = (C1[:, 2, 2] + C2[:, 2, 2]) < MAX_HEADING_SIGMA**2
-    two_of_each = [_some(np.add(np.triu_indices(ends[k] - begins[k], 1), begins[k]))
-                   for k in np.setdiff1d(pair, pair[oriented])]
+    two_of_each = [
+        _evenly_chosen_pairs(np.add(np.triu_indices(ends[k] - begins[k], 1), begins[k]))
+        for k in np.setdiff1d(pair, pair[oriented])]
     i, j = np.concatenate([np.zeros((2, 0), int), *two_of_each], axis=1)
     hypothesis = np.concatenate([
         np.zeros((count, 3)),
         se2.compose(z1[oriented], se2.inverse(z2[oriented])),
         _increment_of_two_points(z1[i, :2], z1[j, :2], z2[i, :2], z2[j, :2])])
     pair_of = np.concatenate([np.arange(count), pair[oriented], pair[i]])
-    own = (ends - begins)[pair_of]                      # number of the hypothesis's sightings
-    blocks = np.split(np.arange(len(own)), np.flatnonzero(np.diff(np.cumsum(own) // AT_ONCE)) + 1)
-    cost = np.empty(len(own))
-    for block in blocks:                                # all at once would take gigabytes
-        n = own[block]
+    number = (ends - begins)[pair_of]                   # of common sightings of each hypothesis
+    block_of = np.cumsum(number) // SIGHTINGS_PER_BLOCK         # together they need gigabytes
+    cost = np.empty(len(number))
+    for block in np.split(np.arange(len(number)), np.flatnonzero(np.diff(block_of)) + 1):
+        n = number[block]
         which = np.repeat(np.arange(len(block)), n)
         k = np.arange(len(which)) - np.repeat(np.cumsum(n) - n - begins[pair_of[block]], n)
         supposed = hypothesis[block][which]
@@ -162,7 +163,7 @@ def _best_hypothesis(z1, C1, z2, C2, pair, count):
     return hypothesis[order[np.searchsorted(pair_of[order], np.arange(count))]]
 
 
-def _some(pairs):
+def _evenly_chosen_pairs(pairs):
     """At most POINT_PAIRS columns of pairs (2, m), evenly chosen."""
     m = pairs.shape[1]
     return pairs[:, np.linspace(0, m - 1, POINT_PAIRS).astype(int)] if m > POINT_PAIRS else pairs
@@ -200,7 +201,7 @@ def _similar(a, b):
     """True where velocities (n, 3) differ by less than half the larger one, in speed and turn."""
     speed, turn = np.hypot(*(a - b)[:, :2].T), np.abs(a[:, 2] - b[:, 2])
     largest = np.maximum(np.abs(_distance_and_turn(a)), np.abs(_distance_and_turn(b)))
-    return (speed < largest[:, 0] / 2) & (turn < largest[:, 1] / 2 + SLOW_TURN)
+    return (speed < largest[:, 0] / 2) & (turn < largest[:, 1] / 2 + MIN_TURN_RATE)
 
 
 def _inverse_where_regular(H):

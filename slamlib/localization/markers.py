@@ -10,9 +10,9 @@ sightings of its frame,
     C_X' = A C_X A^T + B C_Delta B^T + S + S^T,    S = A sum_j H_j (B D_j)^T,
     H'_j = B D'_j C'_j,    D_j = dDelta/dZ_j,    D'_j = dDelta/dZ'_j.
 
-A marker seen as Z from X is at M = X Z. With E = dM/dX, F = dM/dZ and T = E H F^T its covariance is
-C_M = E C_X E^T + F C F^T + T + T^T. This is the correlated state of Smith, Self and Cheeseman,
-Estimating Uncertain Spatial Relationships in Robotics, 1990, without what no increment needs again.
+A marker sighted as Z from X is at M = X Z. With E = dM/dX, F = dM/dZ and T = E H F^T its covariance
+is C_M = E C_X E^T + F C F^T + T + T^T. This is the correlated state of Smith, Self and Cheeseman,
+Estimating Uncertain Spatial Relationships in Robotics, 1990, without the states of earlier frames.
 """
 
 from collections import Counter, defaultdict, deque
@@ -26,18 +26,18 @@ from slamlib.dataset import DatasetError
 from slamlib.localization.marker_increments import consecutive_increments, robust_increments
 from slamlib.sightings import consensus, sightings_by_frame
 
-CANDIDATES = 3     # number of earlier frames that are tried as parent of a frame
-REMEMBERED = 200   # frames that saw a marker, the latest ones, from which candidates are taken
+MAX_CANDIDATES = 3            # number of earlier frames that are tried as parent of a frame
+MAX_FRAMES_PER_MARKER = 200   # number of frames, the latest that saw a marker, to choose them from
 
 
 @dataclass(frozen=True)
 class Localization:
-    """Poses of the frames, as far as markers determine them, and the map of the markers."""
+    """Poses of the frames, where markers determine them, and the map of the markers."""
 
     frame: np.ndarray               # (f,) pose index from 0 of every frame
     poses: np.ndarray               # (f, 3) in the first localized frame, m and rad; or NaN
     covariances: np.ndarray         # (f, 3, 3)
-    parent: np.ndarray              # (f,) row of the frame it was localized against, -1 for none
+    parent: np.ndarray              # (f,) row of the frame its increment starts at, -1 for none
     rejected: np.ndarray            # (m,) bool, rejected, or a repetition (`merge_repeated`)
     unused: np.ndarray              # (m,) bool, sightings of markers that no adjacent frame sees
     marker: np.ndarray              # (k,) ids of the mapped markers, ascending
@@ -46,12 +46,12 @@ class Localization:
 
 
 def localize(aruco, shared_errors=True):
-    """Localization from ArucoReadings, the sightings of markers at successive frames.
+    """Localization for problem 2: incremental, from the ArucoReadings alone.
 
     A frame is localized against its parent: the previous frame if the increment from it is usable,
     else an earlier frame (`_relocalize`). Without a parent its pose is unknown. The world frame is
-    that of the first frame with a usable increment to the next. Without `shared_errors` H_j = 0:
-    increments then count as independent; this is conservative. DatasetError if no sighting agrees
+    that of the first frame with a usable increment to the next. Without `shared_errors` H_j = 0,
+    as for independent increments; this is conservative. Raises DatasetError if no sighting agrees
     with the others of its marker at its pose.
 
     >>> from slamlib.simulation import simulate
@@ -70,7 +70,7 @@ def localize(aruco, shared_errors=True):
         paired[rows], confirmed[rows[increments.accepted]] = True, True
     root = int(np.argmax(increments.usable)) if increments.usable.any() else 0
     links = _links(sightings, increments, confirmed, root)
-    poses, covariances, H = _compose(sightings, links, root, shared_errors)
+    poses, covariances, H = _compose_increments(sightings, links, root, shared_errors)
     used = np.flatnonzero(confirmed & np.isfinite(poses[sightings.row, 0]))
     marker, in_world, marker_covariance = _map_markers(sightings, used, poses, covariances, H)
     rejected, unused = np.ones(len(aruco.pose), bool), np.zeros(len(aruco.pose), bool)
@@ -88,7 +88,7 @@ def _links(sightings, increments, confirmed, root):
     rows_of = np.split(np.arange(len(sightings.row)),
                        np.searchsorted(sightings.row, np.arange(1, count)))
     # By marker id, the latest localized frames that saw it.
-    links, seen_in = {}, defaultdict(lambda: deque(maxlen=REMEMBERED))
+    links, seen_in = {}, defaultdict(lambda: deque(maxlen=MAX_FRAMES_PER_MARKER))
     for f in range(root, count):
         if f > root:
             previous = f - 1 == root or f - 1 in links
@@ -110,7 +110,7 @@ def _relocalize(sightings, confirmed, rows_of, frame, seen_in):
     """
     marker, rows = sightings.marker, rows_of[frame]
     shared = Counter(f for m in marker[rows].tolist() for f in seen_in[m])
-    for f in nlargest(CANDIDATES, shared, key=lambda f: (shared[f], f)):
+    for f in nlargest(MAX_CANDIDATES, shared, key=lambda f: (shared[f], f)):
         _, first, second = np.intersect1d(marker[rows_of[f]], marker[rows], return_indices=True)
         first, second = rows_of[f][first], rows[second]
         found = robust_increments(sightings.z, sightings.C, np.zeros_like(first), first, second, 1)
@@ -120,7 +120,7 @@ def _relocalize(sightings, confirmed, rows_of, frame, seen_in):
     return None
 
 
-def _compose(sightings, links, root, shared_errors):
+def _compose_increments(sightings, links, root, shared_errors):
     """Poses (f, 3) and covariances (f, 3, 3), NaN where unknown, and H (s, 3, 3) of sightings."""
     count = len(sightings.frame)
     poses, covariances = np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan)

@@ -238,7 +238,7 @@ def ranges(full, drive, seed, late, off, part, way):
     late : percent of the ranges that are too long.
     off : m, error of the antenna guesses, each in a random direction.
     part : percent of the poses, the first ones, that are used.
-    way : name in kernels.RANGES.
+    way : name in kernels.RANGE_METHODS.
     """
     known = (TYPICAL_SLIP, "arc") if drive.made_up else \
         (full[drive.name].slip, full[drive.name].model)

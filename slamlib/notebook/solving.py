@@ -111,8 +111,8 @@ def delivered(drives, found):
     if not pairs:
         say("A simulated drive has no files to hand in.")
     for drive, problem in pairs:
-        solution = solve.SOLUTIONS[problem](drive.dataset, found[problem][drive.name])
-        folder = solve.write(results_folder(drive), solution)
+        solution = solve.problem_solution(problem, drive.dataset, found[problem][drive.name])
+        folder = solve.write_solution(results_folder(drive), solution)
         yield drive, solution, listed([code(file.name) for file in sorted(folder.glob("*.mat"))])
 
 

@@ -35,8 +35,8 @@ from slamlib.report.pdf import typeset
 from slamlib.report.pictures import title_picture
 from slamlib.report.sections import shown, to_execute
 from slamlib.report.setting import missing_glyphs
-from slamlib.solve import OURS
-from slamlib.studies.memory import CODE, forget
+from slamlib.solve import RESULT_NAMES
+from slamlib.studies.memory import CODE_DIGEST, forget
 from slamlib.summary import tables
 
 STUDIES = "studies"  # in the cache, besides executed notebooks
@@ -69,7 +69,7 @@ def build_report(notebooks, data, report, results, datasets=None, options=Option
     jobs : int, notebooks executed at a time.
     kept : folder that caches executed notebooks and their Monte Carlo studies, or None for one
         that is removed at the end. Where it has none of these notebooks, each dataset is solved
-        first, and its `summary.table` printed.
+        first, and its `summary_table` printed.
     fresh : bool; True executes everything although it is cached.
     files : bool; False leaves the table of the result files out of the opening.
 
@@ -174,7 +174,8 @@ def _result_sets(results, stage, selected, written):
     for path in written:
         dataset, name = path.split("/", 1) if "/" in path else ("", path)
         files.setdefault(dataset, {})[name] = stage / path
-    return [swap.Set(results / dataset, found, ours=OURS) for dataset, found in files.items()]
+    return [swap.Set(results / dataset, found, ours=RESULT_NAMES)
+            for dataset, found in files.items()]
 
 
 def _keys(books, datasets, environment):
@@ -215,7 +216,7 @@ def _seconds(kept):
     They are more where studies are computed than where these are recalled.
     """
     computed, recalled = kept / "seconds_computed.json", kept / "seconds_recalled.json"
-    if (kept / STUDIES / CODE).is_dir():
+    if (kept / STUDIES / CODE_DIGEST).is_dir():
         return recalled, computed, "at most"
     return computed, recalled, "at least"
 

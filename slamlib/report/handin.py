@@ -17,7 +17,7 @@ from slamlib.dataset import DatasetError, dataset_names, read_dataset, read_trut
 from slamlib.notebook import Drive, listed
 from slamlib.report.build import BUILD_LOCK
 from slamlib.report.options import PROBLEM2_FOLDERS
-from slamlib.results import FILES
+from slamlib.results import RESULT_FILES
 from slamlib.solve import PROBLEMS, SENSORS, title
 
 LINE_WIDTH = 88  # characters in a line of README.txt
@@ -95,7 +95,7 @@ def handed_in(drive, problem2):
     """
     estimate = PROBLEM2_FOLDERS[problem2]
     files = {f"{problem[:8]}/{name}": f"{problem}/{name}"
-             for problem in ("problem1", estimate, "problem3", "problem4") for name in FILES
+             for problem in ("problem1", estimate, "problem3", "problem4") for name in RESULT_FILES
              if f"{problem}/{name}" in drive.files}
     alone = "problem2/ArucoMap.mat"
     if "problem2/vehiclePose.mat" in files and alone in drive.files:

@@ -18,7 +18,7 @@ from slamlib.report.animation import moving
 from slamlib.report.chapters import HTML_ONLY
 from slamlib.report.drives import order
 from slamlib.report.pictures import first_figure
-from slamlib.results import FILES
+from slamlib.results import RESULT_FILES
 from slamlib.solve import PROBLEMS, SENSORS, title, truth_in_world
 
 METHOD_PHRASES = {  # in the order of the problems; the hint is left to chapter 2
@@ -280,7 +280,7 @@ def _file_table(drives, address):
     if not links:
         return ""
     names = {name for _, name in links}
-    names = [name for name in FILES if name in names] + sorted(names - {*FILES})
+    names = [name for name in RESULT_FILES if name in names] + sorted(names - {*RESULT_FILES})
     rows = [[titles[folder], code(str(folder)),
              *(", ".join(links[folder, name]) or "–" for name in names)]
             for folder in sorted(titles, key=lambda path: (order(path.name), path))]

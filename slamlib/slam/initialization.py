@@ -8,7 +8,7 @@ part, and so on.
 import numpy as np
 
 from slamlib import odometry, se2
-from slamlib.sightings import consensus, few_of_each
+from slamlib.sightings import consensus, evenly_chosen
 from slamlib.slam.measurements import measure
 from slamlib.slam.noise import Noise, with_known
 from slamlib.slam.odometry_factors import preintegrate_odometry
@@ -80,7 +80,7 @@ def consensus_markers(measurements, in_world, covariances):
 
     `in_world` (s, 3) and `covariances` (s, 3, 3) are the marker poses by each sighting.
     """
-    chosen = few_of_each(measurements.label, MAX_VOTES)
+    chosen = evenly_chosen(measurements.label, MAX_VOTES)
     best = consensus(measurements.label[chosen], in_world[chosen], covariances[chosen])
     return in_world[chosen[best]]
 

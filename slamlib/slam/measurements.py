@@ -16,8 +16,8 @@ from slamlib.dataset import Dataset, UwbReadings
 from slamlib.sightings import (
     GATE,
     MAX_HEADING_SIGMA,
+    MIN_MEASUREMENT_SIGMA,
     POINT_GATE,
-    SMALLEST_SIGMA,
     Sightings,
     sightings_by_frame,
 )
@@ -163,7 +163,7 @@ def measure(dataset, extra_poses=()):
     antenna, guess = np.unique(uwb.antenna), dataset.antenna_guess
     ranges = Ranges(np.searchsorted(sightings.frame, uwb.pose),
                     np.searchsorted(antenna, uwb.antenna), uwb.range,
-                    np.maximum(uwb.sigma, SMALLEST_SIGMA))
+                    np.maximum(uwb.sigma, MIN_MEASUREMENT_SIGMA))
     return Measurements(
         dataset=dataset, frame=sightings.frame,
         turn=np.diff(odometry.dead_reckoning(dataset.ticks, dataset.vehicle)[sightings.frame, 2]),

@@ -125,5 +125,5 @@ def _check_options(model, *noise):
     for name, value in zip(NOISE_KEYS, noise):
         limit = LIMITS["vehicle.toml"][name]
         number = isinstance(value, Real) and not isinstance(value, bool)
-        if value is not None and not (number and limit.least <= value <= limit.most):
+        if value is not None and not (number and limit.minimum <= value <= limit.maximum):
             raise ValueError(f"expected {limit.expected(name)}, not {value!r}")

@@ -1,9 +1,9 @@
-"""Reasons for choices: Monte Carlo, comparisons of kernels, graphs and starts, a real log.
+"""Studies that justify choices: Monte Carlo trials, kernels, graphs, starts, a real log.
 
     memory       runs a trial over many seeds, and keeps its numbers between builds
     workers      the processes in which trials run
     montecarlo   trials: each problem's methods against the truth of a simulated drive
-    kernels      ways to treat wrong labels and late ranges, among them GNC
+    kernels      kernels and gates against wrong labels and late ranges, among them GNC
     graphs       kinds of graphs, and the evidence over the slip
     starts       where markers and antennas start
     plaza        the log Plaza 2 in the assignment's format

@@ -1,4 +1,4 @@
-"""Kinds of graphs compared: how wheel errors and odometry steps enter the SLAM graph."""
+"""Comparison of graphs: models of the wheel errors and of the odometry steps in SLAM."""
 
 from dataclasses import dataclass, replace
 
@@ -22,55 +22,55 @@ from slamlib.slam.result import SlamResult, slam_result
 
 
 def fixed_wheels(measurements, model, relinearize_at=None):
-    """OdometryFactors of wheels without errors; there is nothing to relinearize about."""
+    """OdometryFactors of wheels without errors; they do not depend on `relinearize_at`."""
     factors = preintegrate_odometry(measurements, model)
     return replace(factors, by_w=np.zeros_like(factors.by_w))
 
 
 def independent_chain(measurements, model, relinearize_at=None):
-    """OdometryFactors with wheel errors as independent noise of each, at the nominal wheels."""
+    """OdometryFactors with wheel errors as independent noise, linearised at the nominal wheels."""
     factors = preintegrate_odometry(measurements, model)
     noise = se2.rotate_covariance(factors.by_w @ np.swapaxes(factors.by_w, 1, 2),
                                   -factors.increment[:, 2])
     return replace(factors, by_w=np.zeros_like(factors.by_w), rounding=factors.rounding + noise)
 
 
-WHEELS = {"wheels as a variable": preintegrate_odometry, "independent chain": independent_chain,
-          "wheels fixed": fixed_wheels}
+WHEEL_MODELS = {"wheels as a variable": preintegrate_odometry,
+                "independent chain": independent_chain, "wheels fixed": fixed_wheels}
 
 
 @dataclass(frozen=True)
 class GraphKind:
-    """One kind of graph, solved on its own."""
+    """One kind of graph and its solution."""
 
-    wheels: str              # of WHEELS
+    wheels: str              # of WHEEL_MODELS
     model: str               # "arc" or "euler"
     result: SlamResult
     log_evidence: float      # on the measurements that variable wheels and arcs accept
 
 
 def graph_kinds(dataset):
-    """Yield the GraphKind of every kind; noise that is not known is learned for each.
+    """Yield the GraphKind of every kind for a Dataset; unknown noise is learned for each.
 
-    All start from the solution of the first kind, variable wheels and arcs.
-    Evidence compares explanations of the same data, so it is that on common measurements.
+    All start from the solution of the first kind, variable wheels and arcs. The evidence is that on
+    common accepted measurements, because only then it can be compared.
     """
     measurements = measure(dataset)
     first, noise = fit_from_odometry(measurements), with_known(Noise(), dataset.vehicle)
-    for wheels, preintegrate in WHEELS.items():
+    for wheels, preintegrate in WHEEL_MODELS.items():
         for model in odometry.MODELS:
             problem = build_problem(measurements, model, noise, preintegrate=preintegrate)
-            own = first if (preintegrate, model) == (preintegrate_odometry, "arc") else refine(
+            fit = first if (preintegrate, model) == (preintegrate_odometry, "arc") else refine(
                 problem, first.state, preintegrate=preintegrate)
             if preintegrate is not preintegrate_odometry:
-                own = replace(own, problem=_without_wheel_errors(own.problem))
+                fit = replace(fit, problem=_without_wheel_errors(fit.problem))
             common = replace(first.problem, odometry=preintegrate(measurements, model))
             common = refine(common, first.state, accept=None, preintegrate=preintegrate)
-            yield GraphKind(wheels, model, slam_result(own), common.log_evidence)
+            yield GraphKind(wheels, model, slam_result(fit), common.log_evidence)
 
 
 def _without_wheel_errors(problem):
-    """The Problem of which poses between the frames have no wheel errors either."""
+    """The Problem in which the poses between the frames have no wheel errors either."""
     m = problem.measurements
     known = replace(m.dataset.vehicle, sigma_right_radius=0.0, sigma_left_radius=0.0,
                     sigma_wheelbase=0.0)
@@ -93,8 +93,8 @@ def evidence_curve(fit, slips, model):
 
     The measurements are those that the Fit accepts, whatever the model of the odometry steps.
     """
-    problem, state, curve = replace(fit.problem, odometry=preintegrate_odometry(
-        fit.problem.measurements, model, fit.state.w)), fit.state, []
+    factors = preintegrate_odometry(fit.problem.measurements, model, fit.state.w)
+    problem, state, curve = replace(fit.problem, odometry=factors), fit.state, []
     for slip in slips:
         problem = replace(problem, noise=replace(problem.noise, slip=slip))
         state = optimize(problem, state).state
@@ -107,8 +107,8 @@ def compare_graphs(seed, **options):
 
     Returns
     -------
-    dict of numbers for each of WHEELS and each model: "evidence", "chi2" per degree of freedom,
-    "ate" and "aligned" in m, "nees".
+    dict of numbers for each of WHEEL_MODELS and each model: "evidence", "chi2" per degree of
+    freedom, "ate" and "aligned" in m, "nees".
     """
     dataset, truth = simulate("short", seed, **options)
     numbers = {}

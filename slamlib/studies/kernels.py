@@ -1,4 +1,4 @@
-"""Kernels and gates compared: ways to treat wrong labels and late ranges in the SLAM graph."""
+"""Comparison of kernels and gates against wrong labels and late ranges in the SLAM graph."""
 
 from dataclasses import replace
 from functools import partial
@@ -20,65 +20,66 @@ from slamlib.slam.robust import CAUCHY_SCALES, EARLY_GATE, acceptance, accepted,
 from slamlib.slam.state import state_from_arrays
 from slamlib.studies.montecarlo import judge_slam
 
-# Ways to treat ranges, and ways to treat sightings: `robust.Acceptance`.
-RANGES = {
+# The `robust.Acceptance` of every method against late ranges, and against wrong labels.
+RANGE_METHODS = {
     **{name: acceptance(name, gate=False) for name in ("quadratic", "Huber", "Cauchy")},
     "asymmetric Cauchy": acceptance("asymmetric Cauchy"),
     "asymmetric Tukey": acceptance(),
     "GNC": acceptance("quadratic"),
     "gate": acceptance("quadratic"),
     "asymmetric gate": replace(acceptance("quadratic"), late=2.0)}
-SIGHTINGS = {
+SIGHTING_METHODS = {
     **{name: acceptance(name, gate=False)
        for name in ("quadratic", "Huber", "Cauchy", "Geman-McClure", "Tukey")},
     "gate": acceptance()}
-CONVEX = ("quadratic", "Huber", "GNC")     # these need no rounds of narrowing kernels
+CONVEX = ("quadratic", "Huber", "GNC")     # methods without rounds of narrowing kernels
 GNC_STEP = 1.4                             # factor on the control parameter in each round
-WRONG_LABEL = 50.0                         # squared Mahalanobis distance; a right label reaches it
-                                           # once in ten billion sightings
+MIN_MISLABELLED_SQUARED = 50.0             # squared Mahalanobis distance of a wrong label; a right
+                                           # one reaches it once in ten billion sightings
 
 
 def solve_with(measurements, sightings="gate", ranges="asymmetric Tukey",
                antennas=trilaterated_antennas, starts=None, model="arc"):
-    """The Fit with other kernels, from odometry.
+    """The Fit by these methods, from odometry.
 
     Parameters
     ----------
     measurements : Measurements of a dataset whose noise is known.
-    sightings, ranges : names in SIGHTINGS and RANGES; the defaults are those of `slam.estimate`.
+    sightings, ranges : names in SIGHTING_METHODS and RANGE_METHODS; the defaults are those of
+        `slam.estimate`.
     antennas : as of `initialization.state_from_poses`.
-    starts : dict, or None, of what other ways on the same measurements have found so far: all that
-        are not CONVEX start from the same rounds of narrowing kernels.
+    starts : dict, or None, of start values for the same measurements, to which those of this call
+        are added: methods that are not CONVEX share the rounds of narrowing kernels.
     model : "arc" or "euler", of an odometry step.
     """
     problem = build_problem(measurements, model, with_known(Noise(), measurements.dataset.vehicle))
     starts = {} if starts is None else starts
-    kernels = [way if way in CONVEX else "narrowing" for way in (sightings, ranges)]
-    if tuple(kernels) not in starts:
+    methods = tuple(name if name in CONVEX else "narrowing" for name in (sightings, ranges))
+    convex = _acceptance_by(sightings, ranges)
+    if methods not in starts:
         state = odometry_state(measurements, model, antennas=antennas)
         for scale in CAUCHY_SCALES:
             cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(scale)
             measured = MeasurementFactors(
                 measurements, measurements.unit_weights,
-                sighting_kernel=_way(sightings, ranges).sighting_kernel
-                if sightings in CONVEX else cauchy,
-                range_kernel=_way(sightings, ranges).range_kernel if ranges in CONVEX else cauchy)
+                sighting_kernel=convex.sighting_kernel if sightings in CONVEX else cauchy,
+                range_kernel=convex.range_kernel if ranges in CONVEX else cauchy)
             state = optimize(replace(problem, measured=measured), state).state
-        starts[tuple(kernels)] = state
-    return refine(problem, starts[tuple(kernels)],
+        starts[methods] = state
+    return refine(problem, starts[methods],
                   partial(_accepted, sightings=sightings, ranges=ranges))
 
 
-def _way(sightings, ranges):
-    """The Acceptance by these ways."""
-    of_sightings = SIGHTINGS[sightings]
-    return replace(RANGES[ranges], sighting_kernel=of_sightings.sighting_kernel,
-                   gated=of_sightings.gated)
+def _acceptance_by(sightings, ranges):
+    """The Acceptance by these methods."""
+    chosen = SIGHTING_METHODS[sightings]
+    return replace(RANGE_METHODS[ranges], sighting_kernel=chosen.sighting_kernel,
+                   gated=chosen.gated)
 
 
 def _accepted(problem, state, sightings, ranges):
-    """The MeasurementFactors that remain by these ways."""
-    found = accepted(problem, state, _way(sightings, ranges))
+    """The MeasurementFactors that these methods accept."""
+    found = accepted(problem, state, _acceptance_by(sightings, ranges))
     if ranges == "GNC":
         found.weight[len(problem.measurements.label):] = graduated(problem, state)
     return found
@@ -103,53 +104,54 @@ def graduated(problem, state):
     return weight[ranges]
 
 
-def late_ranges(seed, markers=True, ways=tuple(RANGES), **options):
-    """Ways of RANGES on one drive of the short path, the slip and the arcs given.
+def late_ranges(seed, markers=True, methods=tuple(RANGE_METHODS), **options):
+    """RANGE_METHODS on one drive of the short path, the slip and the arcs given.
 
     Parameters
     ----------
     seed, options : of `simulation.simulate`.
     markers : False leaves the markers out.
-    ways : names in RANGES.
+    methods : names in RANGE_METHODS.
 
     Returns
     -------
-    dict of numbers for each way: "ate" and rms "antenna error" in m, "nees", "antenna nees".
+    dict of numbers for each method: "ate" and rms "antenna error" in m, "nees", "antenna nees".
     """
     dataset, truth = simulate("short", seed, **options)
     dataset, numbers = dataset if markers else dataset.without("aruco"), {}
     measurements, starts = measure(with_noise(dataset, TYPICAL_SLIP, 1.0, 1.0)), {}
-    for way in ways:
-        found = slam_result(solve_with(measurements, ranges=way, starts=starts))
+    for method in methods:
+        found = slam_result(solve_with(measurements, ranges=method, starts=starts))
         judged = judge_slam(found, dataset, truth)
-        numbers |= {f"{way} {key}": judged[key]
+        numbers |= {f"{method} {key}": judged[key]
                     for key in ("ate", "nees", "antenna error", "antenna nees")}
     return numbers
 
 
-def wrong_labels(seed, ways=tuple(SIGHTINGS), **options):
-    """Ways of SIGHTINGS on one drive of the short path, the slip and the arcs given.
+def wrong_labels(seed, methods=tuple(SIGHTING_METHODS), **options):
+    """SIGHTING_METHODS on one drive of the short path, the slip and the arcs given.
 
     Parameters as of `late_ranges`.
 
     Returns
     -------
-    dict of numbers for each way: "ate" and largest error of a marker, "map worst", in m, "nees" and
-    "map nees"; the shares "wrong rejected" of the wrong labels (NaN without any) and "good lost" of
-    the others that keep less than half of their weight.
+    dict of numbers for each method: "ate" and largest error of a marker, "map worst", in m, "nees"
+    and "map nees"; the shares "wrong rejected" of the wrong labels (NaN without any) and "good
+    lost" of the others that keep less than half of their weight.
     """
     dataset, truth = simulate("short", seed, **options)
     dataset, numbers, starts = dataset.without("uwb"), {}, {}
     measurements = measure(with_noise(dataset, TYPICAL_SLIP, 1.0, 1.0))
     wrong = mislabelled(measurements, truth)
-    for way in ways:
-        fit = solve_with(measurements, sightings=way, starts=starts)
+    for method in methods:
+        fit = solve_with(measurements, sightings=method, starts=starts)
         judged = judge_slam(slam_result(fit), dataset, truth)
-        numbers |= {f"{way} {key}": judged[key] for key in ("ate", "nees", "map nees", "map worst")}
+        numbers |= {f"{method} {key}": judged[key]
+                    for key in ("ate", "nees", "map nees", "map worst")}
         each = residuals(measurements, fit.state, fit.problem.noise)
         lost = kept_weights(fit.problem.measured, *each)[0] < 0.5
-        numbers |= {f"{way} wrong rejected": lost[wrong].mean() if wrong.any() else np.nan,
-                    f"{way} good lost": lost[~wrong].mean()}
+        numbers |= {f"{method} wrong rejected": lost[wrong].mean() if wrong.any() else np.nan,
+                    f"{method} good lost": lost[~wrong].mean()}
     return numbers
 
 
@@ -159,4 +161,4 @@ def mislabelled(measurements, truth):
     true_map = truth.marker_in_world[np.searchsorted(truth.marker, m.marker)]
     state = state_from_arrays(m, truth.poses[m.frame], true_map,
                               np.zeros((len(m.antenna), 2)), np.zeros(3))
-    return np.sum(residuals(m, state, Noise())[0]**2, axis=1) > WRONG_LABEL
+    return np.sum(residuals(m, state, Noise())[0]**2, axis=1) > MIN_MISLABELLED_SQUARED

@@ -1,11 +1,11 @@
-"""Studies run over seeds in parallel, and kept from one build of the report to the next.
+"""Studies run over seeds in parallel, and kept between builds of the report.
 
 A study depends on the code of the numerics, on the packages that compute it, and on its trial,
 seeds and options; it does not depend on a user's datasets. While a report is built,
-SLAMLIB_STUDIES names the folder of the studies that are kept. Without it each is computed. Times
-that a trial measures are kept as well and are not for a page. SLAMLIB_SEEDS, a number, cuts every
-study to its first seeds; tests of pages use it. The file SLAMLIB_PROGRESS tells the build how far a
-study is; in JupyterLab, where there is none, a study that takes longer shows a bar.
+SLAMLIB_STUDIES names the folder of the studies that are kept. Without it each is computed. No page
+may print times that a trial measures, because they are kept, too. SLAMLIB_SEEDS, a number, cuts
+every study to its first seeds; tests of pages use it. The build reads the progress of a study in
+the file SLAMLIB_PROGRESS; in JupyterLab, without this file, a long study shows a bar.
 """
 
 import hashlib
@@ -24,10 +24,10 @@ from tqdm.auto import tqdm
 from slamlib.studies import workers
 
 SLAMLIB = Path(__file__).parents[1]
-SHOWING = ("notebook", "report")           # folders that show studies and do not compute them
-PACKAGES = ("numpy", "scipy", "gtsam")
-THREADS = ("OMP_", "OPENBLAS_", "MKL_")    # how the names of variables begin
-BAR_AFTER = 5.0                            # s
+SHOWING = ("notebook", "report")           # folders of code on which no study depends
+NUMERIC_PACKAGES = ("numpy", "scipy", "gtsam")
+THREADS = ("OMP_", "OPENBLAS_", "MKL_")    # prefixes of variables that set numbers of threads
+BAR_AFTER = 5.0                            # s, duration of a study from which on it shows a bar
 
 
 def run(trial, seeds, jobs=2, **options):
@@ -43,16 +43,18 @@ def run(trial, seeds, jobs=2, **options):
     seeds = list(seeds)[:int(os.environ.get("SLAMLIB_SEEDS", len(seeds)))]
     arguments = trial, name, seeds, options, _threads(), jobs
     folder = os.environ.get("SLAMLIB_STUDIES")
-    if not folder or not name.startswith(f"{__package__}.") or code() != CODE:
-        return _compute(*arguments)                       # not ours to keep, or edited meanwhile
-    forget(folder, but=CODE)
-    memory = Memory(Path(folder) / CODE, verbose=0, compress=True)     # zlib finds damaged files
+    ours = name.startswith(f"{__package__}.")
+    if not folder or not ours or code_digest() != CODE_DIGEST:          # or edited meanwhile
+        return _compute(*arguments)
+    forget(folder, keep=CODE_DIGEST)
+    memory = Memory(Path(folder) / CODE_DIGEST, verbose=0, compress=True)  # finds damaged files
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Exception while loading results")    # computed again
         return memory.cache(_compute, ignore=["trial", "jobs"])(*arguments)
 
 
 def _compute(trial, name, seeds, options, threads, jobs):
+    """The numbers of `run`; joblib distinguishes studies by all arguments but trial and jobs."""
     rows, told = [], os.environ.get("SLAMLIB_PROGRESS")
     for row in tqdm(workers.rows(trial, seeds, options, jobs), total=len(seeds),
                     desc=trial.__name__, leave=False, delay=BAR_AFTER,
@@ -66,21 +68,22 @@ def _compute(trial, name, seeds, options, threads, jobs):
 
 
 def _threads():
+    """The environment's variables that set numbers of threads, sorted pairs of name and value."""
     return sorted(item for item in os.environ.items() if item[0].startswith(THREADS))
 
 
-def forget(folder, but=None):
-    """Remove the studies of a folder, all of them or those of other code than `but`."""
+def forget(folder, keep=None):
+    """Remove the studies in a folder, except those of the code with the digest `keep`."""
     for kept in Path(folder).glob("[0-9a-f]" * 64):
-        if kept.name != but:
+        if kept.name != keep:
             shutil.rmtree(kept, ignore_errors=True)
 
 
-def code():
-    """A digest of what every study depends on: slamlib, Python and packages, as they are now."""
+def code_digest():
+    """Digest (str) of what all studies depend on: the current slamlib, Python and packages."""
     return digest(repr([
         platform.python_implementation(), platform.python_version(), platform.platform(),
-        [version(package) for package in PACKAGES],
+        [version(package) for package in NUMERIC_PACKAGES],
         [(str(file.relative_to(SLAMLIB)), digest(file.read_bytes()))
          for file in modules(*SHOWING)]]).encode())
 
@@ -97,4 +100,4 @@ def digest(content):
     return hashlib.sha256(content).hexdigest()
 
 
-CODE = code()                              # of this process, which files edited later do not change
+CODE_DIGEST = code_digest()                # of the code that this process imported

@@ -1,4 +1,4 @@
-"""Trials: the methods of each problem on one simulated drive, judged against its truth.
+"""Trials of the methods of problems 2 to 4: one simulated drive, judged against its truth.
 
 `memory.run` runs a trial over many seeds.
 """
@@ -13,7 +13,7 @@ from slamlib.localization.hint import first_order_from
 from slamlib.sightings import sightings_by_frame
 from slamlib.simulation import simulate
 
-METHODS = {                                     # of problem 2
+PROBLEM2_METHODS = {
     "odometry": lambda dataset: odometry.dead_reckoning(dataset.ticks, dataset.vehicle),
     "ArUco": lambda dataset: localization.localize(dataset.aruco),
     "naive": lambda dataset: localization.localize(dataset.aruco, shared_errors=False),
@@ -44,33 +44,24 @@ def odometry_draws(ticks, vehicle, kept, rng, draws=400, model="euler"):
         for z in rng.standard_normal((draws, 4))])
 
 
-def markers_alone(seed, **options):
-    """Localization from markers on one drive of the short path: "nees", "last nees", "map nees"."""
-    dataset, truth = simulate("short", seed, **options)
-    found = localization.localize(dataset.aruco)
-    values = nees(found.poses, found.covariances, truth.poses[found.frame])
-    return {"nees": np.nanmean(values), "last nees": values[-1],
-            "map nees": _map_nees(found, truth).mean()}
-
-
-def problem2(seed, methods=tuple(METHODS), **options):
+def problem2_trial(seed, methods=tuple(PROBLEM2_METHODS), **options):
     """Methods of problem 2 on one drive of the short path, simulated with these options.
 
     Returns
     -------
     dict of numbers for each of `methods`: "nees", the mean over the measured poses, "last nees" and
-    "ate" in m (of odometry the ATE only); for "ArUco" the "map nees" too, for "fused" the "wheel
-    nees" and the "slip" in sqrt(m).
+    "ate" in m (of odometry the ATE only). With "ArUco" there is "map nees", with "fused" there are
+    "wheel nees" and "slip" in sqrt(m).
     """
     dataset, truth = simulate("short", seed, **options)
     frame, numbers = sightings_by_frame(dataset.aruco).frame, {}
     for method in methods:
-        found = METHODS[method](dataset)
+        found = PROBLEM2_METHODS[method](dataset)
         if method == "odometry":
             numbers["odometry ate"] = ate(found[frame], truth.poses[frame])
             continue
-        own = slice(None) if len(found.poses) == len(frame) else frame
-        poses, covariances = found.poses[own], found.covariances[own]
+        measured = slice(None) if len(found.poses) == len(frame) else frame
+        poses, covariances = found.poses[measured], found.covariances[measured]
         numbers |= {f"{method} nees": anees(poses, covariances, truth.poses[frame]),
                     f"{method} last nees": nees(poses, covariances, truth.poses[frame])[-1],
                     f"{method} ate": ate(poses, truth.poses[frame])}
@@ -81,22 +72,8 @@ def problem2(seed, methods=tuple(METHODS), **options):
     return numbers
 
 
-def problem3(seed, **options):
-    """SLAM on odometry and markers of one drive of the short path: the numbers of `judge_slam`."""
-    dataset, truth = simulate("short", seed, **options)
-    return judge_slam(slam.estimate(dataset.without("uwb")), dataset.without("uwb"), truth)
-
-
-def problem4(seed, path="short", markers=True, **options):
-    """SLAM on odometry, ranges and (unless False) markers, as `problem3`."""
-    dataset, truth = simulate(path, seed, **options)
-    dataset = dataset if markers else dataset.without("aruco")
-    previous = slam.estimate(dataset.without("uwb")) if markers else None
-    return judge_slam(slam.estimate(dataset, previous=previous), dataset, truth)
-
-
 def ranges_added(seed, share=1.0, **options):
-    """Problems 3 and 4 on one drive of the short path, to see what the ranges add to the markers.
+    """Problems 3 and 4 on one drive of the short path, for the information that ranges add.
 
     Parameters
     ----------
@@ -109,18 +86,15 @@ def ranges_added(seed, share=1.0, **options):
     "moved", the median distance between the positions of both, over this sigma of each pose.
     """
     dataset, truth = simulate("short", seed, **options)
-    seen = dataset.first(round(share * len(dataset.ticks))).aruco
-    dataset = replace(dataset, aruco=seen)
+    dataset = replace(dataset, aruco=dataset.first(round(share * len(dataset.ticks))).aruco)
     without = slam.estimate(dataset.without("uwb"))
     solved, numbers = {"without": without, "with": slam.estimate(dataset, previous=without)}, {}
-    sigma = {name: position_sigmas(found.covariances[1:])
-             for name, found in solved.items()}
     for name, found in solved.items():
         numbers |= {f"ate {name}": ate(found.poses, truth.poses),
                     f"aligned {name}": ate(found.poses, truth.poses, aligned=True),
-                    f"sigma {name}": np.median(sigma[name])}
-    apart = np.hypot(*(solved["with"].poses - without.poses)[1:, :2].T)
-    return numbers | {"moved": np.median(apart / sigma["without"])}
+                    f"sigma {name}": np.median(position_sigmas(found.covariances[1:]))}
+    distance = np.hypot(*(solved["with"].poses - without.poses)[1:, :2].T)
+    return numbers | {"moved": np.median(distance / position_sigmas(without.covariances[1:]))}
 
 
 def learned_slips(seed, slip):

@@ -1,4 +1,4 @@
-"""Plaza 2 in the assignment's format: a mower with radio ranges to four beacons on a lawn.
+"""The real log Plaza 2 in the assignment's format: a mower with radio ranges to four beacons.
 
 GTSAM contains Joseph Djugash's range-only SLAM logs (`Plaza1_.mat`, `Plaza2_.mat`): increments of
 distance and heading, ranges to four beacons, the surveyed beacons, and the path by differential
@@ -24,7 +24,7 @@ COUNT = 1e-4                # m, travel of a wheel in one count
 RADIUS, BASE = 0.2, 0.8     # m, nominal wheel radius and wheelbase
 WHEEL_SIGMA = 0.02          # standard deviation of the wheel parameters, relative to their value
 STANDING = 0.2              # m, what odometry travels while the mower stands
-BEACON_GUESS_SIGMA = 2.0           # m, standard deviation of the guessed beacons on each axis
+BEACON_GUESS_SIGMA = 2.0    # m, standard deviation of the guessed beacons on each axis
 
 
 def read_plaza2(seed=0):
@@ -97,5 +97,5 @@ def _load(number):
 
 def _nearest(times, wanted):
     """Indices (m,) of the ascending times (n,) nearest to the wanted ones (m,)."""
-    after = np.clip(np.searchsorted(times, wanted), 1, len(times) - 1)
-    return after - (wanted - times[after - 1] < times[after] - wanted)
+    later = np.clip(np.searchsorted(times, wanted), 1, len(times) - 1)
+    return later - (wanted - times[later - 1] < times[later] - wanted)

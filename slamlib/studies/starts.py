@@ -1,4 +1,4 @@
-"""Start values compared: where the markers and the antennas of the SLAM graph start."""
+"""Comparison of start values of the markers and the antennas in the SLAM graph."""
 
 from dataclasses import replace
 
@@ -24,8 +24,8 @@ from slamlib.slam.state import state_from_arrays
 from slamlib.studies.kernels import solve_with
 from slamlib.studies.montecarlo import antenna_error
 
-RIGHT_ANTENNA = 0.5          # m, error below which an antenna is right
-SAME_COST = 1.0              # of the right optimum: a residual below one and a half sigmas
+MAX_ANTENNA_ERROR = 0.5      # m, error below which an antenna is right
+COST_TOLERANCE = 1.0         # cost above that of the right optimum: a residual of 1.4 sigmas
 
 
 def first_sighting(measurements, in_world, covariances):
@@ -47,12 +47,12 @@ def mean_by_information(measurements, in_world, covariances):
     """
     m = measurements
     middle = most_certain_sighting(m, in_world, covariances)
-    apart = in_world - middle[m.label]
-    apart[:, 2] = se2.wrap(apart[:, 2])
+    difference = in_world - middle[m.label]
+    difference[:, 2] = se2.wrap(difference[:, 2])
     information = np.linalg.inv(covariances)
     total, moment = np.zeros((len(m.marker), 3, 3)), np.zeros((len(m.marker), 3))
     np.add.at(total, m.label, information)
-    np.add.at(moment, m.label, (information @ apart[..., None])[..., 0])
+    np.add.at(moment, m.label, (information @ difference[..., None])[..., 0])
     return middle + np.linalg.solve(total, moment[..., None])[..., 0]
 
 
@@ -79,7 +79,7 @@ def guessed_antennas(measurements, poses, covariances):
 
 def landmarks(seed, path="short", drift=1.0, known=True, kernel="graduated",
               starts=tuple(LANDMARKS), **options):
-    """Ways to initialise the markers, on one simulated drive with the true slip.
+    """LANDMARKS, starts of the markers, on one simulated drive with the true slip.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def landmarks(seed, path="short", drift=1.0, known=True, kernel="graduated",
     -------
     dict of numbers for each start: "initial error", rms distance of the markers to the truth in m;
     "initial cost" and "cost", the graph's error before and after; "steps"; "right", 1 where the
-    cost is that reached from the true map and poses, to within SAME_COST.
+    cost is that reached from the true map and poses, to within COST_TOLERANCE.
     """
     vehicle = Vehicle()
     drifting = replace(vehicle, sigma_right_radius=drift * vehicle.sigma_right_radius,
@@ -99,7 +99,8 @@ def landmarks(seed, path="short", drift=1.0, known=True, kernel="graduated",
                        sigma_wheelbase=drift * vehicle.sigma_wheelbase)
     dataset, truth = simulate(path, seed, vehicle=drifting, **options)
     m = measure(replace(dataset, uwb=None, vehicle=drifting if known else vehicle))
-    rounds = _rounds(build_problem(m, "arc", Noise(options.get("slip", TYPICAL_SLIP))), kernel)
+    noise = Noise(options.get("slip", TYPICAL_SLIP))
+    rounds = _kernel_rounds(build_problem(m, "arc", noise), kernel)
     true_map = truth.marker_in_world[np.searchsorted(truth.marker, m.marker)]
     best = optimize(rounds[-1], state_from_arrays(
         m, truth.poses[m.frame], true_map, np.zeros((0, 2)), np.zeros(3))).error
@@ -107,20 +108,20 @@ def landmarks(seed, path="short", drift=1.0, known=True, kernel="graduated",
 
 
 def landmarks_of_drive(dataset, found, kernel="last", starts=tuple(LANDMARKS)):
-    """Ways to initialise the markers of a Dataset, given the SlamResult `found` of problem 3.
+    """LANDMARKS, starts of the markers of a Dataset, given the SlamResult `found` of problem 3.
 
-    Model and noise are those of the result. Returns the numbers of `landmarks`, with the optimum
-    that is reached from the result and its map in place of the truth.
+    Model and noise are those of the result. Returns the numbers of `landmarks`; the optimum reached
+    from the result, and its map, replace the truth.
     """
     m, vehicle = measure(dataset.without("uwb")), dataset.vehicle
-    rounds = _rounds(build_problem(m, found.model, found.noise), kernel)
+    rounds = _kernel_rounds(build_problem(m, found.model, found.noise), kernel)
     best = optimize(rounds[-1], state_from_poses(
         m, found.poses[m.frame], found.covariances[m.frame],
         (found.wheel - vehicle.wheel) / vehicle.sigma_wheel))
     return _from_each_start(rounds, best.error, best.state.markers, starts)
 
 
-def _rounds(problem, kernel):
+def _kernel_rounds(problem, kernel):
     """Problems with the scales of the Cauchy kernel, "graduated" or the "last" one only."""
     m, cauchy = problem.measurements, gtsam.noiseModel.mEstimator.Cauchy.Create
     return [replace(problem, measured=MeasurementFactors(m, m.unit_weights, cauchy(scale)))
@@ -140,22 +141,22 @@ def _from_each_start(rounds, best, markers, starts):
         numbers |= {f"{name} initial error": np.sqrt(np.mean(np.sum(error**2, axis=1))),
                     f"{name} initial cost": initial_cost, f"{name} cost": optimum.error,
                     f"{name} steps": steps,
-                    f"{name} right": float(optimum.error < best + SAME_COST)}
+                    f"{name} right": float(optimum.error < best + COST_TOLERANCE)}
     return numbers
 
 
-def guesses(seed, error, poses=None, markers=True, compared=True, **options):
+def guesses(seed, error, poses=None, markers=True, from_guess=True, **options):
     """Antenna guesses that are wrong by `error` m in random directions, on a short drive.
 
     Parameters
     ----------
     poses : number of the drive's first poses to use, or None for all.
     markers : False leaves the markers out.
-    compared : False leaves "from the guess" out.
+    from_guess : False leaves "from the guess" out.
 
     Returns
     -------
-    dict of shares of the antennas: "right", within RIGHT_ANTENNA of the truth; right "from the
+    dict of shares of the antennas: "right", within MAX_ANTENNA_ERROR of the truth; right "from the
     guess" without trilateration; "in doubt"; and "silently wrong": not right, not in doubt, and
     outside their 99.9 % ellipse.
     """
@@ -166,10 +167,11 @@ def guesses(seed, error, poses=None, markers=True, compared=True, **options):
     measurements = measure(dataset)
     found = slam_result(solve_with(measurements))
     miss, squared = antenna_error(found, truth)
-    right, doubt = miss < RIGHT_ANTENNA, np.isin(found.antenna, list(found.doubts))
+    right, doubt = miss < MAX_ANTENNA_ERROR, np.isin(found.antenna, list(found.doubts))
     numbers = {"right": right.mean(), "in doubt": doubt.mean(),
                "silently wrong": np.mean(~right & (squared > POINT_GATE) & ~doubt)}
-    if compared:
-        naive = slam_result(solve_with(measurements, antennas=guessed_antennas))
-        numbers["from the guess"] = np.mean(antenna_error(naive, truth)[0] < RIGHT_ANTENNA)
+    if from_guess:
+        untrilaterated = slam_result(solve_with(measurements, antennas=guessed_antennas))
+        error, _ = antenna_error(untrilaterated, truth)
+        numbers["from the guess"] = np.mean(error < MAX_ANTENNA_ERROR)
     return numbers

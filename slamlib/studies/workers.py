@@ -1,7 +1,7 @@
-"""Trials in processes that are joined by pipes alone, so that nothing stays however they end.
+"""Processes for trials, connected by pipes only, so that nothing remains however they end.
 
-Pools of processes have named semaphores, which a kernel that is killed leaves in shared memory, and
-workers that outlive it. A pipe ends with the process that holds its other end.
+Process pools have named semaphores, which stay in shared memory if a kernel is killed, and workers
+that outlive it. A pipe is closed when the process at its other end ends.
 """
 
 import atexit
@@ -17,17 +17,17 @@ from queue import SimpleQueue
 
 from joblib import wrap_non_picklable_objects
 
-# Matrices are small: more threads only wait for each other.
+# The matrices are small: more threads cost time.
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 COMMAND = "from slamlib.studies.workers import _serve; _serve()"
-WAITING = {}  # processes (Popen) that wait for a study, with the environments of their starts
+WAITING = {}  # by process (Popen) that waits for a study, the environment of its start
 
 
 def rows(trial, seeds, options, jobs):
     """Yield what trial(seed, **options) returns for each of `seeds` (list of int), in their order.
 
-    With more than one of `jobs` in processes of their own, whose numerics have one thread each. An
-    exception of the trial is raised here; RuntimeError if one of these processes is killed.
+    With more than one of `jobs` the trials run in further processes with one thread each. Raises
+    the exception of a trial, and RuntimeError if one of these processes is killed.
     """
     if jobs == 1:
         yield from (trial(seed, **options) for seed in seeds)
@@ -50,14 +50,14 @@ def rows(trial, seeds, options, jobs):
 
 @contextmanager
 def _worker():
-    """Yield a process (Popen) that imports what this one can import.
+    """Context of a process (Popen) with the import path of this one.
 
-    It waits for the next study, which saves its imports. It ends with this process, or at the end
-    if it owes an answer.
+    Later it waits for the next study, which saves the imports, until this process ends. If it owes
+    an answer it ends at once.
     """
     environment = ONE_THREAD | os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    worker = next((each for each, its in WAITING.items()
-                   if its == environment and each.poll() is None), None)
+    worker = next((process for process, started_in in WAITING.items()
+                   if started_in == environment and process.poll() is None), None)
     if worker is None:
         worker = subprocess.Popen([sys.executable, "-c", COMMAND], env=environment,
                                   stdin=subprocess.PIPE, stdout=subprocess.PIPE)
@@ -86,6 +86,7 @@ def _end_all():
 
 
 def _answer(worker, call):
+    """What a worker returns for a call, a tuple (trial, seed, options)."""
     worker.owes = True
     try:
         pickle.dump(call, worker.stdin)
