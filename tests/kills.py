@@ -79,8 +79,8 @@ def run(arguments, folder):
 
 def contents(folder):
     """Bytes of a run's files by name: not those of the user, nor what begins with a dot."""
-    return {name: _plain(folder / name) for name in swap.names(folder)
-            if name not in MINE and name != swap.MARKER
+    return {name: _plain(folder / name) for name in swap.file_names(folder)
+            if name not in MINE and name != swap.UNFINISHED
             and not any(part.startswith(".") for part in Path(name).parts)}
 
 
@@ -106,7 +106,7 @@ def judge(folder, references, last=None):
     for name, text in MINE.items():
         if not (folder / name).is_file() or (folder / name).read_text() != text:
             return "MIXED: lost " + name
-    marked = (folder / swap.MARKER).exists()
+    marked = (folder / swap.UNFINISHED).exists()
     if not owners or last in found and found.keys() != references[owners[0]].keys():
         return "MIXED: " + " ".join(sorted(found))
     if marked:
@@ -117,7 +117,8 @@ def judge(folder, references, last=None):
 def left(folder):
     """What lies in a folder that is no run's and no user's, empty folders too."""
     return [str(path.relative_to(folder)) for path in folder.rglob("*")
-            if path.name.startswith(".") and path.name != swap.WRITTEN or path.name == swap.MARKER
+            if path.name.startswith(".") and path.name != swap.FILE_LIST
+            or path.name == swap.UNFINISHED
             or path.is_dir() and not any(path.iterdir())]
 
 

@@ -127,7 +127,7 @@ def drive_doubts(dataset):
 
 def _counts_doubts(dataset):
     """A Doubt if counts may be those since the start; markers decide where there are enough."""
-    if not counts.may_run_on(dataset.ticks, dataset.vehicle):
+    if not counts.may_be_cumulative(dataset.ticks, dataset.vehicle):
         return []
     most = abs(dataset.ticks).max()
     return [Doubt("counts-since-start", (

@@ -22,7 +22,7 @@ except ImportError:  # Windows
 from slamlib import locks, swap
 from slamlib.dataset import DatasetError, dataset_names, read_dataset, read_truth
 from slamlib.folder import left_in
-from slamlib.inventory import found
+from slamlib.inventory import inventory_lines
 from slamlib.notebook import notices
 from slamlib.report import cache, overview
 from slamlib.report.chapters import available, chapter_of, in_order, printed, with_data
@@ -117,10 +117,10 @@ def build_report(notebooks, data, report, results, datasets=None, jobs=2, cover=
         made = rendered(books, drives, cover, code, address,
                         partial(shown, has=has, leave_out=leave_out))
         for name, content in made.items():
-            swap.write(pages / name, content)
+            swap.write_atomically(pages / name, content)
         swap.require_staged(stage)
         swap.publish([
-            swap.Set(report, {name: pages / name for name in made}, last=next(iter(made)),
+            swap.FileSet(report, {name: pages / name for name in made}, last=next(iter(made)),
                      ours=frozenset(own_pages(report))),  # also of notebooks that are gone
             *_result_sets(results, stage, selected, written)])
     _tell(_resources_used(time.monotonic() - start))
@@ -168,7 +168,7 @@ def _checked_input(notebooks, data, datasets, cover, appendix, leave_out):
                                "the name of this dataset: rename its folder")
     read = [(read_dataset(data / name), read_truth(data / name)) for name in selected]
     for dataset, truth in read:
-        print("\n".join(found(dataset, truth)), file=sys.stderr)
+        print("\n".join(inventory_lines(dataset, truth)), file=sys.stderr)
     for sentence in left_in(data):
         print(sentence, file=sys.stderr)
     has = available(read)
@@ -179,12 +179,12 @@ def _checked_input(notebooks, data, datasets, cover, appendix, leave_out):
 
 
 def _result_sets(results, stage, selected, written):
-    """Return a swap.Set for each of the datasets that are selected or have files in `stage`."""
+    """Return a swap.FileSet for each of the datasets that are selected or have files in `stage`."""
     files = {name: {} for name in selected}
     for path in written:
         dataset, name = path.split("/", 1) if "/" in path else ("", path)
         files.setdefault(dataset, {})[name] = stage / path
-    return [swap.Set(results / dataset, found, ours=OURS) for dataset, found in files.items()]
+    return [swap.FileSet(results / dataset, found, ours=OURS) for dataset, found in files.items()]
 
 
 def _keys(books, datasets, environment):

@@ -99,7 +99,7 @@ def recall(folder, source, key, book, results):
     for cell, other in zip(cells, kept):
         cell.outputs, cell.execution_count = other.outputs, other.execution_count
     for name in names:
-        swap.write(results / name, archive.read(RESULTS + name))
+        swap.write_atomically(results / name, archive.read(RESULTS + name))
     path.touch()
     return names
 
@@ -123,7 +123,7 @@ def keep(folder, source, key, book, results, names):
         for name in names:
             archive.write(results / name, RESULTS + name)
     content = content.getvalue()
-    swap.write(entry(folder, source, key), _checksum(key, content) + b"\n" + content)
+    swap.write_atomically(entry(folder, source, key), _checksum(key, content) + b"\n" + content)
     versions = [file for file in Path(folder).glob("*.executed")
                 if file.name.rsplit(".", 2)[0] == source.stem]
     for old in sorted(versions, key=lambda file: file.stat().st_mtime_ns)[:-VERSIONS]:

@@ -95,7 +95,7 @@ def temporary_folder():
     place = Path("/tmp" if TRANSPORT == "ipc" and len(place) > LONGEST_FOLDER else place)
     for left in place.glob(f"{PREFIX}*-*"):
         process = left.name.split("-")[1]
-        if process.isdecimal() and not locks.runs(int(process)):
+        if process.isdecimal() and not locks.process_exists(int(process)):
             shutil.rmtree(left, ignore_errors=True)
     with tempfile.TemporaryDirectory(dir=place, prefix=f"{PREFIX}{os.getpid()}-",
                                      ignore_cleanup_errors=True) as folder:
@@ -162,7 +162,7 @@ async def _watch(progress):
 
 def _publish(stage, results):
     """Move all files of a folder to another, and return their names relative to it."""
-    names = swap.names(stage)
+    names = swap.file_names(stage)
     for name in names:
         (results / name).parent.mkdir(parents=True, exist_ok=True)
         os.replace(stage / name, results / name)

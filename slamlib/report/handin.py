@@ -99,7 +99,7 @@ def write(path, report, results, options, omitted=()):
             entry = ZipInfo(name, BEGINNING)
             entry.compress_type, entry.external_attr = ZIP_DEFLATED, 0o644 << 16
             file.writestr(entry, content)
-    swap.write(path, archive.getvalue())
+    swap.write_atomically(path, archive.getvalue())
 
 
 def handed_in(drive, problem2):
