@@ -311,7 +311,7 @@ def at_once(runs, builds, times, seed):
     return counts
 
 
-PARTS = {
+ANSWER_PARTS = {
     "solve": (Solves, [("solve, random moments", at_random, (200, 1))]),
     "steps": (StoredSolves, [("solve, every step, A then B", at_every_step, ("A", "B")),
                        ("solve, every step, B then A", at_every_step, ("B", "A"))]),
@@ -329,7 +329,7 @@ def do(parts):
     """Run parts by name, print a line for each, and return True if nothing was mixed or left."""
     well = True
     for part in parts:
-        kind, lines = PARTS[part]
+        kind, lines = ANSWER_PARTS[part]
         with tempfile.TemporaryDirectory() as folder:
             runs = kind(Path(folder).resolve())
             for title, function, arguments in lines:
@@ -341,4 +341,4 @@ def do(parts):
 
 
 if __name__ == "__main__":
-    sys.exit(not do(sys.argv[1:] or PARTS))
+    sys.exit(not do(sys.argv[1:] or ANSWER_PARTS))

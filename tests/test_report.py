@@ -400,7 +400,7 @@ def test_a_problem_that_fails_costs_one_problem_and_exit_code_3(tmp_path, monkey
     write(tmp_path / "notebooks", "1_solve", "# 1. Solve", ("""from slamlib.notebook import *
 drives = start()
 left, found = solved(drives, ["problem2", "problem2_hint"])
-for drive, solution, files in delivered(drives, found):
+for drive, solution, files in write_results(drives, found):
     say(f"{drive.name}: {files}")""",))
     monkeypatch.chdir(tmp_path)
     reasons = []

@@ -1,4 +1,4 @@
-"""Shared code of the notebooks: drives to run on, folders of results, sentences and tables."""
+"""Gives notebooks their drives and folders of results, and shows sentences and tables."""
 
 import os
 import re
@@ -17,9 +17,9 @@ from slamlib.notebook import inline, plotting
 from slamlib.simulation import simulate
 
 
-@dataclass(frozen=True, eq=False)          # a drive is itself alone: arrays have no hash
+@dataclass(frozen=True, eq=False)          # compared by identity, because arrays have no hash
 class Drive:
-    """A dataset with, for figures and tables only, its truth."""
+    """A dataset and its truth, which serves figures and tables only."""
 
     name: str
     dataset: Dataset
@@ -55,14 +55,14 @@ def start():
 
 
 def _show_figures():
-    """Show figures as SVG, in the report in two widths between which its pages choose."""
+    """Show figures as SVG, in the report in two widths, of which its pages choose one."""
     if interactive():
         plt.rcParams["svg.fonttype"] = "path"       # pages bring the typeface
         set_matplotlib_formats("svg", metadata={"Date": None})
     else:
         set_matplotlib_formats()
         InteractiveShell.instance().display_formatter.mimebundle_formatter.for_type(
-            Figure, lambda fig, **_: inline.outputs(fig, plotting.pictures(fig)))
+            Figure, lambda fig, **_: inline.outputs(fig, plotting.svg_pictures(fig)))
 
 
 def results_folder(drive):
@@ -76,11 +76,11 @@ def results_folder(drive):
 
 
 def with_truth(drives):
-    """The drives whose truth is known: errors are shown of these only."""
+    """The drives with truth; errors are shown of these only."""
     return [drive for drive in drives if drive.truth is not None]
 
 
-def about_dashes(drives):
+def dash_note(drives):
     """Sentence (str) for the caption of a table of errors; empty if all drives have truth."""
     return " A dash stands where no truth is known." if with_truth(drives) != drives else ""
 

@@ -81,7 +81,7 @@ def _layer(name, count, solution, color, enlarged, on_page, scale):
     """SVG (str) of a path, its ellipses and the vehicle, and the rules (str) by which they move."""
     known = np.flatnonzero(np.isfinite(solution.poses[:, 0]))
     poses = solution.poses[known]
-    at = plotting.spread(poses, count)
+    at = plotting.equidistant(poses, count)
     drawn, rules = [], []
     for number, (i, ellipse) in enumerate(zip(at, _ellipses(
             on_page(poses[at]), solution.covariances[known[at]], enlarged * scale), strict=True)):
