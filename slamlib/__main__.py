@@ -34,7 +34,7 @@ def main(arguments=None):
     ended = [signal.SIGINT]
     try:
         with _orderly_end(ended):
-            return COMMANDS[options.command](options)
+            return HANDLERS[options.command](options)
     except DatasetError as error:
         print(f"slamlib: {error}", file=sys.stderr)
         return 2
@@ -187,7 +187,7 @@ def _export(options):
     return 0
 
 
-COMMANDS = {"report": _report, "hand-in": _hand_in, "solve": _solve, "simulate": _simulate,
+HANDLERS = {"report": _report, "hand-in": _hand_in, "solve": _solve, "simulate": _simulate,
             "export": _export, "lab": _lab}
 
 

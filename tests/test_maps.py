@@ -86,7 +86,7 @@ def test_what_a_drive_lacks_is_absent_from_map_and_tables(solved, markers, anten
     expected |= {"antennas: guess", "antennas: estimate"} if antennas else set()
     assert labels(fig) == expected
     assert set(plotting.svg_pictures(fig)) == {plotting.WIDE, plotting.NARROW}
-    for table, shown in ((maps.landmark_table, antennas), (maps.marker_table, markers)):
+    for table, shown in ((maps.antenna_table, antennas), (maps.marker_table, markers)):
         header, rows = table(drive, result)
         assert bool(rows) == shown and not any("error" in name for name in header)
 
@@ -94,7 +94,7 @@ def test_what_a_drive_lacks_is_absent_from_map_and_tables(solved, markers, anten
 def test_a_dataset_without_guesses_has_an_empty_table(solved):
     drive, result = solved
     nothing = replace(drive, dataset=replace(drive.dataset, uwb=None, antenna_guess=None))
-    header, rows = maps.landmark_table(nothing, parts(result, antennas=False))
+    header, rows = maps.antenna_table(nothing, parts(result, antennas=False))
     assert header[0] == "antenna" and rows == []
 
 
@@ -135,7 +135,7 @@ def test_the_wide_and_the_narrow_map_fill_their_width_at_equal_scales(solved):
 
 def test_tables_hold_every_landmark_and_its_errors(solved):
     drive, result = solved
-    header, rows = maps.landmark_table(drive, result)
+    header, rows = maps.antenna_table(drive, result)
     assert [row[0] for row in rows] == [str(antenna) for antenna in result.antenna]
     assert header[-1] == "error (mm)" and all(len(row) == len(header) for row in rows)
     moved = np.hypot(*(result.antenna_in_world - drive.dataset.antenna_guess.position).T)
@@ -173,7 +173,7 @@ def test_an_antenna_in_doubt_is_called_so_and_drawn_in_its_true_size(solved):
         ")", ", in doubt (?) × 1)")
     widest = max(ellipses.get_widths().max() for ellipses in after.collections)
     assert widest == pytest.approx(2 * 2.4477 * 3, rel=1e-3)
-    assert maps.landmark_table(drive, doubted)[1][0][0] == f"{first} (in doubt)"
+    assert maps.antenna_table(drive, doubted)[1][0][0] == f"{first} (in doubt)"
 
 
 def test_every_landmark_tells_its_name_position_and_sigma_where_it_is_drawn(solved):

@@ -39,13 +39,13 @@ from slamlib.slam.result import result
 from slamlib.studies.kernels import solve_with
 from slamlib.studies.starts import LANDMARKS, guessed_antennas
 
-__all__ = ["CAUCHY_SCALES", "SIMULATED", "camera_reach", "choice", "draw_cameras", "draw_graphs",
+__all__ = ["KERNEL_SCALES", "SIMULATED", "camera_reach", "choice", "draw_cameras", "draw_graphs",
            "draw_ranges", "draw_wheels", "drive_choice", "moving_drive", "show_with_controls",
            "slider"]
 
 MIN_WRONG_DISTANCE = 0.5     # m, error of a marker that is mapped at a wrong place
 # Scales of the Cauchy kernel in standard deviations, by name.
-CAUCHY_SCALES = {f"{scale} σ": scale for scale in (1, 3, 10, 30, 100)} | {"none": None}
+KERNEL_SCALES = {f"{scale} σ": scale for scale in (1, 3, 10, 30, 100)} | {"none": None}
 
 
 def draw_wheels(drive, right, left, base, sigma_radii, sigma_base, probability, count):
@@ -168,14 +168,14 @@ def draw_graphs(full, drive, seed, slip, assumed, wrong, kernel, start):
     seed : of the simulated drive, or of the wrong labels that are added to a dataset.
     slip, assumed : mm after 1 m, of the simulated drive and of the graph.
     wrong : percent of the sightings with a wrong label.
-    kernel : name in CAUCHY_SCALES.
+    kernel : name in KERNEL_SCALES.
     start : name in starts.LANDMARKS, for the single kernel.
     """
     model = "arc" if drive.made_up else full[drive.name].model
     drive, m, solved = _solved_with_markers(drive, model, seed, slip, assumed, wrong)
     reference = reference_of(drive, full, "problem 3's solution", len(m.dataset.ticks))
     label, compared = reference.label, reference.solution
-    scale = CAUCHY_SCALES[kernel]
+    scale = KERNEL_SCALES[kernel]
     cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(scale) if scale else None
     problem = replace(build(m, model, with_known(Noise(), m.dataset.vehicle)),
                       measured=MeasurementFactors(m, m.unit_weights, cauchy))

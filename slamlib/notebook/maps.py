@@ -4,8 +4,6 @@ A result is a `slam.SlamResult`; it may have no markers or no antennas. Truth en
 is drawn, and errors are computed from it, where the drive has it.
 """
 
-from dataclasses import replace
-
 import numpy as np
 
 from slamlib import evaluation, se2
@@ -110,26 +108,30 @@ def _antennas(ax, drive, result, enlarged):
         yield f"{antenna}{'?' * int(doubtful)}", position, ANTENNA_NAME
 
 
-def landmark_table(drive, result):
+def antenna_table(drive, result):
     """Header (list of str) and rows (lists of str) of a table of all antennas of a result.
 
     Each row has id, position, standard deviations, the distance from the guess and, where the
-    truth is known, that from the true position. An antenna in doubt is called so behind its id.
+    truth is known, that from the true position. Antennas in doubt are marked behind the id.
     """
-    moved = _distances(result.antenna_in_world, _guesses(drive, result))
-    sigma = evaluation.sigmas(result.antenna_covariance)
     header = ["antenna", "x (m)", "y (m)", "σ of x (mm)", "σ of y (mm)", "from the guess (mm)"]
-    rows = [[f"{antenna} (in doubt)" if doubtful else str(antenna), *map(_metres, place),
-             *map(_thousandths, s), _thousandths(distance)]
-            for antenna, doubtful, place, s, distance in zip(
-                result.antenna, in_doubt(result), result.antenna_in_world, sigma, moved,
-                strict=True)]
+    rows = _antenna_rows(drive, result)
     if drive.truth is None or not len(drive.truth.antenna):
         return header, rows
     true = plotting.places_by_id(drive.truth.antenna, drive.truth.antenna_in_world, result.antenna)
     errors = _distances(result.antenna_in_world, true)
     return [*header, "error (mm)"], [[*row, _thousandths(error)]
                                      for row, error in zip(rows, errors, strict=True)]
+
+
+def _antenna_rows(drive, result):
+    moved = _distances(result.antenna_in_world, _guesses(drive, result))
+    sigma = evaluation.sigmas(result.antenna_covariance)
+    return [[f"{antenna} (in doubt)" if doubtful else str(antenna), *map(_metres, place),
+             *map(_thousandths, [*s, distance])]
+            for antenna, doubtful, place, s, distance in zip(
+                result.antenna, in_doubt(result), result.antenna_in_world, sigma, moved,
+                strict=True)]
 
 
 def marker_table(drive, result):
@@ -139,32 +141,34 @@ def marker_table(drive, result):
     true position and the error of the heading. A marker without orientation has no heading.
     """
     header = ["marker", "x (m)", "y (m)", "δ (°)", "σ of x (mm)", "σ of y (mm)", "σ of δ (mrad)"]
-    sigma, known = evaluation.sigmas(result.marker_covariance), _oriented(result)
-    angle = [f"{np.degrees(heading):.1f}" if is_known else "–"
-             for heading, is_known in zip(result.marker_in_world[:, 2], known, strict=True)]
-    sigma[~known, 2] = np.nan
-    rows = [[str(marker), *map(_metres, pose[:2]), heading, *map(_thousandths, s)]
-            for marker, pose, heading, s in zip(result.marker, result.marker_in_world, angle, sigma,
-                                                strict=True)]
+    rows = _marker_rows(result)
     if drive.truth is None or not len(drive.truth.marker):
         return header, rows
     true = plotting.places_by_id(drive.truth.marker, drive.truth.marker_in_world, result.marker)
     errors = _distances(result.marker_in_world, true)
-    turned = np.where(known, np.abs(se2.wrap(result.marker_in_world[:, 2] - true[:, 2])), np.nan)
+    turned = np.abs(se2.wrap(result.marker_in_world[:, 2] - true[:, 2]))
+    turned[~_oriented(result)] = np.nan
     return ([*header, "error (mm)", "error of δ (mrad)"],
             [[*row, _thousandths(error), _thousandths(angle)]
              for row, error, angle in zip(rows, errors, turned, strict=True)])
 
 
+def _marker_rows(result):
+    pose, sigma = result.marker_in_world.copy(), evaluation.sigmas(result.marker_covariance)
+    pose[~_oriented(result), 2] = sigma[~_oriented(result), 2] = np.nan
+    return [[str(marker), _metres(x), _metres(y),
+             "–" if np.isnan(heading) else f"{np.degrees(heading):.1f}", *map(_thousandths, s)]
+            for marker, (x, y, heading), s in zip(result.marker, pose, sigma, strict=True)]
+
+
 def _sentences(drive, result):
-    """What each marker, then each antenna, tells when it is pointed at, a list of str."""
-    _, rows = marker_table(replace(drive, truth=None), result)
+    """Sentences (list of str) on each marker, then on each antenna, for the pointer."""
     told = [f"marker {marker}: x {x} m, y {y} m, δ {angle}°; σ {s[0]} mm, {s[1]} mm, {s[2]} mrad"
             if angle != "–" else f"marker {marker}: x {x} m, y {y} m; σ {s[0]} mm, {s[1]} mm"
-            for marker, x, y, angle, *s in rows]
-    _, rows = landmark_table(replace(drive, truth=None), result)
+            for marker, x, y, angle, *s in _marker_rows(result)]
     return told + [f"antenna {antenna}: x {x} m, y {y} m; σ {s[0]} mm, {s[1]} mm; "
-                   f"{moved} mm from its guess" for antenna, x, y, *s, moved in rows]
+                   f"{moved} mm from its guess"
+                   for antenna, x, y, *s, moved in _antenna_rows(drive, result)]
 
 
 def _oriented(result):
