@@ -43,3 +43,8 @@ def test_a_difference_is_decided_beyond_two_standard_errors():
 def test_numbers_of_a_table_have_minus_signs():
     text = table_text(["name", "x", "y"], [["a-1", "-0.5", "+1, -2 ± 3 (-4)"]])
     assert text.splitlines()[-1] == "| a-1 | −0.5 | +1, −2 ± 3 (−4) |"
+
+
+def test_a_row_of_one_cell_is_a_heading():
+    lines = table_text(["name", "x", "y"], [["*short*"], ["a", "1", "2"]]).split("\n")
+    assert lines[2:] == ["| *short* |  |  |", "| a | 1 | 2 |"]

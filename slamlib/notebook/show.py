@@ -161,10 +161,11 @@ def table(header, rows, caption=None, texts=1):
 def table_text(header, rows, texts=1):
     """Table in Markdown, a str.
 
-    `header` is a list of c str, `rows` a list of such lists. The first `texts` columns are aligned
-    left as text, the others right as numbers, with minus signs. Rows that begin alike are a group:
-    only its first row shows this beginning.
+    `header` is a list of c str, `rows` a list of such lists, or of one str as a heading of the rows
+    below it. The first `texts` columns are aligned left as text, the others right as numbers, with
+    minus signs. Of consecutive rows with the same first cell only the first row shows it.
     """
+    rows = [row if len(row) > 1 else [*row, *[""] * (len(header) - 1)] for row in rows]
     above = [None, *(row[0] for row in rows)]
     grouped = [["" if row[0] == first else row[0], *row[1:texts],
                 *(re.sub(r"(?<![\w.])-(?=\d)", "−", cell) for cell in row[max(1, texts):])]
