@@ -13,7 +13,9 @@ import pdoc
 
 import slamlib
 
+# A section of a docstring: its heading and its lines.
 SECTION = re.compile(r"^(Parameters|Returns|Raises)\n-+\n((?:.+\n?|\n(?! *\w+\n-))*)", re.MULTILINE)
+# Packages whose `__all__` hides their modules.
 PACKAGES = ("slamlib.slam", "slamlib.localization", "slamlib.studies", "slamlib.notebook",
             "slamlib.report")
 

@@ -10,20 +10,21 @@ import json
 import os
 import sys
 
-CELL = ("tags", "alt", "slamlib")  # of a cell's metadata, what the report reads
-BOOK = ("slamlib",)     # of a notebook's
+# Keys of the metadata of cells and notebooks that the report reads, and the other metadata.
+CELL_KEYS = ("tags", "alt", "slamlib")
+NOTEBOOK_KEYS = ("slamlib",)
 KERNEL = {
     "kernelspec": {"display_name": "Python 3 (ipykernel)", "language": "python", "name": "python3"},
     "language_info": {"name": "python"}}
 
 
 def restored(content):
-    """Return a notebook (bytes) in its committed form; ValueError if it is none."""
+    """Return a notebook (bytes) in its committed form; ValueError if it is not a notebook."""
     try:
         book = json.loads(content)
-        book["metadata"] = KERNEL | _only(BOOK, book["metadata"])
+        book["metadata"] = KERNEL | _only(NOTEBOOK_KEYS, book["metadata"])
         for cell in book["cells"]:
-            cell["metadata"] = _only(CELL, cell["metadata"])
+            cell["metadata"] = _only(CELL_KEYS, cell["metadata"])
             cell["source"] = "".join(cell["source"]).splitlines(keepends=True)
             if cell["cell_type"] == "code":
                 cell |= {"execution_count": None, "outputs": []}

@@ -1,4 +1,4 @@
-"""The command line: `slamlib` or `python -m slamlib`."""
+"""Runs the commands of the command line, `slamlib` or `python -m slamlib`."""
 
 import os
 import signal
@@ -11,11 +11,11 @@ from pathlib import Path
 # Set before numpy is imported: the matrices are so small that more threads are slower.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from slamlib.arguments import parser  # noqa: E402
+from slamlib.arguments import command_line_parser  # noqa: E402
 from slamlib.dataset import DatasetError, dataset_names, read_dataset, read_truth  # noqa: E402
-from slamlib.swap import ENDS  # noqa: E402
+from slamlib.swap import END_SIGNALS  # noqa: E402
 
-KEPT = Path("build", "executed")
+EXECUTED_NOTEBOOKS = Path("build", "executed")  # folder in which executed notebooks are kept
 
 
 def main(arguments=None):
@@ -26,15 +26,15 @@ def main(arguments=None):
     """
     if arguments is None:
         sys.stdout.reconfigure(errors="backslashreplace")  # as stderr, for names in other letters
-    known = parser()
-    options, others = known.parse_known_args(arguments)
+    parser = command_line_parser()
+    options, others = parser.parse_known_args(arguments)
     if others and options.command != "lab":
-        known.error(f"unrecognized arguments: {' '.join(others)}")
+        parser.error(f"unrecognized arguments: {' '.join(others)}")
     options.others = others
     ended = [signal.SIGINT]
     try:
         with _orderly_end(ended):
-            return RUN[options.command](options)
+            return HANDLERS[options.command](options)
     except DatasetError as error:
         print(f"slamlib: {error}", file=sys.stderr)
         return 2
@@ -50,34 +50,34 @@ def main(arguments=None):
 
 @contextmanager
 def _orderly_end(ended):
-    """Let SIGTERM and SIGHUP end a run as Ctrl-C does, and add the signal to the list `ended`."""
+    """Let END_SIGNALS end a run as Ctrl-C does; the list `ended` gets the signal that came."""
     def end(number, frame):
-        for each in before:
+        for each in defaults:
             signal.signal(each, signal.SIG_IGN)
         ended.append(signal.Signals(number))
         interrupt = signal.getsignal(signal.SIGINT)  # the event loop's, while notebooks run
         (interrupt if callable(interrupt) else signal.default_int_handler)(signal.SIGINT, frame)
 
-    before = {}
+    defaults = ()
     if threading.current_thread() is threading.main_thread():
-        before = {each: signal.getsignal(each) for each in ENDS
-                  if signal.getsignal(each) == signal.SIG_DFL}  # nohup's stays
-    for each in before:
+        defaults = [each for each in END_SIGNALS
+                    if signal.getsignal(each) == signal.SIG_DFL]  # nohup's handler stays
+    for each in defaults:
         signal.signal(each, end)
     try:
         yield
     finally:
-        for each, handler in before.items():
-            signal.signal(each, handler)
+        for each in defaults:
+            signal.signal(each, signal.SIG_DFL)
 
 
 def _report(arguments):
     options = _options(arguments)
-    report = _built(arguments, options, arguments.report, _names(arguments))
+    report = _built(arguments, options, arguments.report, _selected_datasets(arguments))
     if report is None:
         return 1
     print(f"report: {report.files[0]} and {report.files[-1]}", file=sys.stderr)
-    return _exit_code(_failures(report))
+    return _report_exit_code(report)
 
 
 def _hand_in(arguments):
@@ -85,30 +85,30 @@ def _hand_in(arguments):
     if arguments.out.is_dir():
         raise DatasetError(f"{arguments.out}: expected the name of a file to write, found a folder")
     options = handin.hand_in_options(_options(arguments))
-    datasets, omitted = handin.selection(arguments.data, _names(arguments))
+    datasets, omitted = handin.selection(arguments.data, _selected_datasets(arguments))
     report = _built(arguments, options, Path("build", "hand-in"), datasets, files=False)
     if report is None:
         return 1
     handin.write_zip(arguments.out, report, arguments.results, options, omitted)
     print(f"hand-in: {arguments.out.resolve()}", file=sys.stderr)
-    return _exit_code(_failures(report))
+    return _report_exit_code(report)
 
 
 def _options(arguments):
-    """Return the Options of report.toml with what the command line says instead."""
+    """The Options of report.toml; those of the command line replace them."""
     from slamlib.report.options import read_options
     options = read_options("report.toml")
     cover = {key: getattr(arguments, key) for key in ("author", "student_number")}
     others = {key: getattr(arguments, key) for key in ("code", "appendix")}
-    return replace(options, cover=replace(options.cover, **_given(cover)), **_given(others))
+    return replace(options, cover=replace(options.cover, **_stated(cover)), **_stated(others))
 
 
-def _given(values):
+def _stated(values):
     return {key: value for key, value in values.items() if value is not None}
 
 
 def _built(arguments, options, folder, datasets, files=True):
-    """Return the Report that is built into a folder, or None if a notebook failed; tell doubts."""
+    """The Report that is built into a folder, or None if a notebook failed; prints doubts."""
     from slamlib.report import NotebookError, build_report
     from slamlib.report.sources import copy_notebooks, notebooks_folder
     notebooks = arguments.notebooks or notebooks_folder()
@@ -118,7 +118,8 @@ def _built(arguments, options, folder, datasets, files=True):
     try:
         report = build_report(
             notebooks, arguments.data, folder, arguments.results, datasets=datasets,
-            options=options, jobs=arguments.jobs, kept=KEPT, fresh=arguments.fresh, files=files)
+            options=options, jobs=arguments.jobs, kept=EXECUTED_NOTEBOOKS,
+            fresh=arguments.fresh, files=files)
     except NotebookError as error:
         print(f"slamlib: {error}", file=sys.stderr)
         return None
@@ -130,36 +131,33 @@ def _built(arguments, options, folder, datasets, files=True):
     return report
 
 
-def _failures(report):
-    return ((drive.name, failure.problem, failure.reason)
-            for drive in report.drives for failure in drive.failures)
+def _report_exit_code(report):
+    return _exit_code([(drive.name, failure.problem, failure.reason)
+                       for drive in report.drives for failure in drive.failures])
 
 
 def _exit_code(failures):
-    """Print the (dataset, problem, reason) of what could not be solved; 3 if there is any, or 0."""
-    code = 0
+    """Prints the list of (dataset, problem, reason) of unsolved problems; 3 if there are any, or 0."""
     for dataset, problem, reason in failures:
         print(f"slamlib: {dataset}: {problem} could not be solved: {reason}", file=sys.stderr)
-        code = 3
-    return code
+    return 3 if failures else 0
 
 
-def _names(arguments):
-    """Return the names of the datasets, given by names or paths of folders in data/, or None."""
-    paths = {dataset: Path(dataset) for dataset in arguments.datasets}
-    return [path.name if path.resolve().parent == arguments.data.resolve() else dataset
-            for dataset, path in paths.items()] or None
+def _selected_datasets(arguments):
+    """Names (list of str) of the datasets, given by names or paths of folders in data/, or None."""
+    return [Path(dataset).name if Path(dataset).resolve().parent == arguments.data.resolve()
+            else dataset for dataset in arguments.datasets] or None
 
 
 def _solve(options):
-    from slamlib.inventory import found
+    from slamlib.inventory import inventory_lines
     from slamlib.summary import solve_to_folder, summary_table
     dataset, truth = read_dataset(options.folder), read_truth(options.folder)
-    print("\n".join(found(dataset, truth)), file=sys.stderr)
+    print("\n".join(inventory_lines(dataset, truth)), file=sys.stderr)
     summary = solve_to_folder(dataset, truth, options.out, jobs=2)
     print(summary_table(summary))
-    return _exit_code((summary["dataset"], name, row["failed"])
-                      for name, row in summary["problems"].items() if "failed" in row)
+    return _exit_code([(summary["dataset"], name, row["failed"])
+                       for name, row in summary["problems"].items() if "failed" in row])
 
 
 def _simulate(options):
@@ -174,7 +172,8 @@ def _simulate(options):
 def _lab(options):
     from slamlib.report.lab import start_lab
     from slamlib.report.sources import notebooks_folder
-    start_lab(options.notebooks or notebooks_folder(), options.data, KEPT, options.others)
+    start_lab(options.notebooks or notebooks_folder(), options.data, EXECUTED_NOTEBOOKS,
+              options.others)
 
 
 def _export(options):
@@ -184,8 +183,8 @@ def _export(options):
     return 0
 
 
-RUN = {"report": _report, "hand-in": _hand_in, "solve": _solve, "simulate": _simulate,
-       "export": _export, "lab": _lab}
+HANDLERS = {"report": _report, "hand-in": _hand_in, "solve": _solve, "simulate": _simulate,
+            "export": _export, "lab": _lab}
 
 
 if __name__ == "__main__":

@@ -1,21 +1,38 @@
-"""The options of the command line."""
+"""Defines the options of the command line."""
 
 import argparse
 import sys
 from pathlib import Path
 
-DATA = Path("data")
+DATA_FOLDER = Path("data")  # default folder of the datasets
+
+
+def _number(kind, low, high, expected):
+    """A function that converts text to an int or float in [low, high], for `add_argument`."""
+    def converted(text):
+        try:
+            value = kind(text)
+        except ValueError:
+            value = float("nan")
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(f"expected {expected}, found {text[:60]!r}")
+        return value
+    return converted
+
+
+_count = _number(int, 0, float("inf"), "a whole number from 0 on")
+_positive = _number(int, 1, float("inf"), "a whole number from 1 on")
+_share = _number(float, 0, 1, "a number from 0 to 1")
 
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message):
         """End with exit code 2 and one sentence, without argparse's usage."""
-        told = " ".join(message.split())
-        self.exit(2, f"slamlib: {told} ({self.prog} --help shows the usage)\n")
+        self.exit(2, f"slamlib: {' '.join(message.split())} ({self.prog} --help shows the usage)\n")
 
 
-def parser():
-    """The parser of the command line; what it returns has the name `command`."""
+def command_line_parser():
+    """The ArgumentParser of the command line; `command` of what it parses is the command's name."""
     prog = Path(sys.argv[0]).name
     whole = _Parser(prog=prog if prog == "slamlib" else "python -m slamlib",
                     description="Vehicle SLAM from wheel encoders, markers and UWB ranges.")
@@ -46,7 +63,7 @@ def parser():
 
     lab = commands.add_parser("lab", help="open JupyterLab on the notebooks; it is given all other "
                                           "arguments, as --no-browser", allow_abbrev=False)
-    lab.add_argument("--data", type=Path, default=DATA, help="folder of the datasets")
+    lab.add_argument("--data", type=Path, default=DATA_FOLDER, help="folder of the datasets")
     lab.add_argument("--notebooks", type=Path)
     return whole
 
@@ -70,7 +87,7 @@ def _build_options(parser):
     """Add the options of `report` and `hand-in` to a parser."""
     parser.add_argument("datasets", nargs="*", metavar="DATASET",
                         help="names of folders in data/ (all of them when none is named)")
-    parser.add_argument("--data", type=Path, default=DATA, help="folder of the datasets")
+    parser.add_argument("--data", type=Path, default=DATA_FOLDER, help="folder of the datasets")
     parser.add_argument("--notebooks", type=Path, help="folder of the notebooks (default: the "
                         "folder notebooks where there is one, else those of the installation)")
     parser.add_argument("--notebooks-to", type=Path, metavar="FOLDER",
@@ -91,25 +108,3 @@ def _build_options(parser):
     parser.add_argument("--student-number", help="the same")
     parser.add_argument("--fresh", action="store_true",
                         help="execute all notebooks and studies, also where nothing changed")
-
-
-def _count(text):
-    return _number(text, int, 0, float("inf"), "a whole number from 0 on")
-
-
-def _positive(text):
-    return _number(text, int, 1, float("inf"), "a whole number from 1 on")
-
-
-def _share(text):
-    return _number(text, float, 0, 1, "a number from 0 to 1")
-
-
-def _number(text, kind, least, most, expected):
-    try:
-        value = kind(text)
-    except ValueError:
-        value = float("nan")
-    if not least <= value <= most:
-        raise argparse.ArgumentTypeError(f"expected {expected}, found {text[:60]!r}")
-    return value

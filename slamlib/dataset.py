@@ -142,7 +142,7 @@ def read_dataset(folder):
     vehicle = read_vehicle(files, default=Vehicle())
     table = _read_encoder(files, notes)
     aruco = _read_aruco(files, len(table.numbers), notes)
-    ticks, more = counts.since_previous(table, vehicle, aruco)
+    ticks, more = counts.incremental_counts(table, vehicle, aruco)
     notes += more
     antenna, position = _read_map(
         files, "UwbAntennaGuess.txt", "antenna id, x, y", notes, optional="z")

@@ -1,8 +1,8 @@
-"""Tables of numbers, from text in the dialects of spreadsheets and MATLAB, and from .mat files.
+"""Reads tables of numbers from .mat files, and from text as spreadsheets and MATLAB write it.
 
-The plain dialect has blanks or tabs between columns, decimal points, blank lines and comments from
-`#`, `%` or `//` on. Text in another dialect is translated into the plain one, line by line, and a
-note says so; what can be read in two ways is refused. Every message names the file and the line.
+The plain dialect has blanks or tabs between columns, decimal points, blank lines, and comments that
+begin with `#`, `%` or `//`. Text in another dialect is translated into the plain one, line by line,
+with a note; ambiguous text is refused. Every message names the file and the line.
 """
 
 import re
@@ -15,24 +15,25 @@ import numpy as np
 from slamlib.matfile import Variable, variable_text
 from slamlib.textfile import error, quoted, read_text
 
-BOUND = 1e15  # every number is smaller in size, so that float64 represents every integer exactly
-NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+MAX_SIZE = 1e15  # bound on the size of numbers; float64 represents integers below it exactly
+# Words that are numbers or NaN; comments; numbers whose commas may also separate thousands.
+DECIMAL_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 NAN = re.compile(r"[+-]?nan(\([a-z]*\))?", re.IGNORECASE)
 COMMENT = re.compile(r"(#|%|//).*")
-THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(,\d{3})+")  # what a decimal comma may be instead
-# By name: separator of columns (None for blanks), decimal sign.
+THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(,\d{3})+")
+# Separator of columns (None for blanks) and decimal sign, by name.
 DIALECTS = {"blanks": (None, "."), "commas": (",", "."), "semicolons": (";", "."),
             "semicolons, with decimal commas": (";", ","),
             "blanks or tabs, with decimal commas": (None, ",")}
-ID = "(id|number|num|nr|no|n|index|idx)?"
-COUNTS = "(n|d|c|e|t|w|delta|ticks?|counts?|enc|encoder|wheel|ruota|pulses?|impulsi)*"
-# Words of a header, in small letters, by the column that they name.
-WORDS = {
-    "pose id": f"{ID}(pose|posa|step){ID}",
-    "marker id": f"{ID}(marker|aruco|tag|landmark)+{ID}",
-    "antenna id": f"{ID}(uwb)?(antenna|anchor|beacon|landmark){ID}",
-    "right ticks": f"{COUNTS}(right|destr[ao]|dx|r){COUNTS}",
-    "left ticks": f"{COUNTS}(left|sinistr[ao]|sx|l){COUNTS}",
+# Parts of the words in headers, and the words that name a column, as patterns in small letters.
+ID_WORDS = "(id|number|num|nr|no|n|index|idx)?"
+TICK_WORDS = "(n|d|c|e|t|w|delta|ticks?|counts?|enc|encoder|wheel|ruota|pulses?|impulsi)*"
+COLUMN_WORDS = {
+    "pose id": f"{ID_WORDS}(pose|posa|step){ID_WORDS}",
+    "marker id": f"{ID_WORDS}(marker|aruco|tag|landmark)+{ID_WORDS}",
+    "antenna id": f"{ID_WORDS}(uwb)?(antenna|anchor|beacon|landmark){ID_WORDS}",
+    "right ticks": f"{TICK_WORDS}(right|destr[ao]|dx|r){TICK_WORDS}",
+    "left ticks": f"{TICK_WORDS}(left|sinistr[ao]|sx|l){TICK_WORDS}",
     "x": "x", "y": "y", "theta": "theta|delta|heading|yaw", "range": "range|distance",
     "sigma": "sigma|std|stddev",
     **{f"s_{a}{b}": f"(s|sigma|cov|c|var){a[0]}({a[1:]})?{b[0]}({b[1:]})?" for a, b in (
@@ -41,12 +42,12 @@ WORDS = {
 
 @dataclass(frozen=True)
 class Table:
-    """Numbers of a file, and what messages about them need."""
+    """The numbers of a table, with its text for messages."""
 
-    source: Path | Variable | None  # None for no file, whose table has no rows
+    source: Path | Variable | None  # None if there is no file
     numbers: np.ndarray  # (m, c)
-    text: str = ""  # the rows in the plain dialect, on the lines that they have in the file
-    notes: tuple[str, ...] = ()  # what was mended or left out, a sentence each
+    text: str = ""  # in the plain dialect, with the lines of the file
+    notes: tuple[str, ...] = ()  # sentences on what was mended or left out
 
     def require(self, ok, expected, column=None):
         """Raise DatasetError for the first row where ok (m,) is False.
@@ -54,10 +55,10 @@ class Table:
         The message quotes the row, or the word in the column with this number from 0.
         """
         if not ok.all():
-            line, words = next(islice(_rows(self.text), int(np.argmin(ok)), None))
+            line, words = next(islice(_filled_lines(self.text), int(np.argmin(ok)), None))
             found = " ".join(words) if column is None else words[column]
             raise error(self.source, f"expected {expected}, found {quoted(found)}",
-                        _place(self.source, line))
+                        _row_name(self.source, line))
 
 
 def read_table(source, columns, gaps=False, optional=None):
@@ -72,13 +73,13 @@ def read_table(source, columns, gaps=False, optional=None):
 
     Raises
     ------
-    DatasetError : a row has another number of columns or a word that is not a number below BOUND, a
-        header names the columns in another order, or the text can be read in two ways.
+    DatasetError : a row has another number of columns or a word that is not a number below
+        MAX_SIZE, a header names the columns in another order, or the text is ambiguous.
     """
     columns = columns.split(", ")
     if source is None:
         return Table(None, np.empty((0, len(columns))))
-    notes, name = [], _name(source)
+    notes, name = [], _source_name(source)
     if isinstance(source, Variable):
         text = variable_text(source)
     else:
@@ -88,7 +89,7 @@ def read_table(source, columns, gaps=False, optional=None):
     if numbers is None:
         text, columns, more = _in_plain_dialect(source, text, columns, gaps, optional)
         notes += more
-        numbers = _parsed(text, len(columns), _gaps(columns, gaps, optional))
+        numbers = _parsed(text, len(columns), _may_be_nan(columns, gaps, optional))
         if numbers is None:
             raise _table_error(source, text, columns, gaps)
         if columns[-1] == optional:
@@ -97,27 +98,27 @@ def read_table(source, columns, gaps=False, optional=None):
                          "left out; positions and ranges are taken in the plane.")
         lacking = np.isnan(numbers).any(axis=1)
         if lacking.any():
-            text, first = _without(text, lacking)
+            text, first = _without_rows(text, lacking)
             numbers = numbers[~lacking]
             notes.append(f"{name}: {np.count_nonzero(lacking)} of {len(lacking)} rows hold NaN and "
-                         f"were left out, the first in {_place(source, first)}.")
+                         f"were left out, the first in {_row_name(source, first)}.")
     return Table(source, numbers, text, tuple(notes))
 
 
-def _name(source):
-    """How notes name a source: without the folder, as the report shows them."""
+def _source_name(source):
+    """Name (str) of a source in notes, without the folder."""
     return f"{source.path.name}, variable {source.name}" if isinstance(source, Variable) \
         else source.name
 
 
-def _place(source, line):
+def _row_name(source, line):
     return f"row {line}" if isinstance(source, Variable) else f"line {line}"
 
 
 def _parsed(text, count, nan=False):
-    """Numbers (m, count) of text in the plain dialect, or None where it is not that.
+    """Numbers (m, count) of text in the plain dialect, or None for other text.
 
-    `nan`, a bool or one for each column, tells where rows may hold NaN.
+    `nan`, a bool or (count,) bool, is True for columns that may hold NaN.
     """
     if not re.search(r"^[ \t\v\f]*[^#\s]", text, re.MULTILINE):
         return np.empty((0, count))
@@ -125,18 +126,18 @@ def _parsed(text, count, nan=False):
         table = np.loadtxt(text.split("\n"), comments="#", ndmin=2)
     except ValueError:
         return None
-    ok = abs(table) < BOUND
+    ok = abs(table) < MAX_SIZE
     return table if table.shape[1] == count and (ok | np.isnan(table) & nan).all() else None
 
 
-def _gaps(columns, gaps, optional):
-    """Which columns may hold NaN (c,): with `gaps` all, else the optional one."""
+def _may_be_nan(columns, gaps, optional):
+    """Mask (c,) of columns that may hold NaN: all with `gaps`, else the optional one."""
     return np.array([gaps or column == optional for column in columns])
 
 
 def _in_plain_dialect(source, text, columns, gaps, optional):
     """The text in the plain dialect, its columns (list of str) and notes (list of str)."""
-    name, notes = _name(source), []
+    name, notes = _source_name(source), []
     lines = [COMMENT.sub("", line).strip() for line in text.split("\n")]
     lines = [re.sub(r'"([^"]*)"', r"\1", line) for line in lines]
     filled = [k for k, line in enumerate(lines) if line]
@@ -154,7 +155,7 @@ def _in_plain_dialect(source, text, columns, gaps, optional):
         body = "\n".join(lines)
         fitting = [dialect for dialect in DIALECTS if _fits(body, dialect)
                    and _parsed(_translated(body, dialect), len(wanted),
-                               _gaps(wanted, gaps, optional)) is not None]
+                               _may_be_nan(wanted, gaps, optional)) is not None]
         if fitting:
             _require_decimals(source, lines, fitting[0])
             notes += [f"{name} was read with columns separated by {fitting[0]}."] * (
@@ -163,8 +164,8 @@ def _in_plain_dialect(source, text, columns, gaps, optional):
     first = lines[filled[0]]
     commas = "commas" if "," in first.split()[0][:-1] else "blanks"
     likely = "semicolons" if ";" in first else commas
-    dialect = next((each for each in DIALECTS if _fits(first, each) and _parsed(
-        _translated(first, each), len(columns), gaps) is not None), likely)
+    dialect = next((name for name in DIALECTS if _fits(first, name) and _parsed(
+        _translated(first, name), len(columns), gaps) is not None), likely)
     raise _table_error(source, "\n".join(lines), columns, gaps, *DIALECTS[dialect])
 
 
@@ -190,7 +191,7 @@ def _translated(body, dialect):
 
 
 def _is_header(line, columns, more):
-    """True if a line has words of which none begins as a number does.
+    """True if a line has words, none of which begins like a number.
 
     Without `more` rows it must name two columns.
     """
@@ -198,19 +199,19 @@ def _is_header(line, columns, more):
     numbers = any(re.match(r"\W*\d", word) or NAN.fullmatch(word) or "inf" in word.lower()
                   for word in words)
     return bool(re.search("[A-Za-z]", line)) and not numbers and (
-        more or len(_named(line, columns)) > 1)
+        more or len(_named_columns(line, columns)) > 1)
 
 
-def _named(header, columns):
-    """Numbers of the columns that the words of a header name, in their order there."""
+def _named_columns(header, columns):
+    """Indices (list) of the columns that the words of a header name, in their order there."""
     words = [re.sub("[^a-z]", "", word) for word in re.split(r"[\s,;]+", header.lower())]
     return [k for word in words for k, column in enumerate(columns)
-            if column in WORDS and re.fullmatch(WORDS[column], word)]
+            if column in COLUMN_WORDS and re.fullmatch(COLUMN_WORDS[column], word)]
 
 
 def _require_order(source, header, line, columns):
     """Raise DatasetError if the header names columns in another order."""
-    named = _named(header, columns)
+    named = _named_columns(header, columns)
     if named != sorted(named):
         raise error(source, f"expected the columns in the order ({', '.join(columns)}), found the "
                     f"header {quoted(header)}", line)
@@ -227,11 +228,11 @@ def _require_decimals(source, lines, dialect):
                         f"{cell.replace(',', '.')} or {cell.replace(',', '')}", line)
 
 
-def _without(text, lacking):
+def _without_rows(text, lacking):
     """The text without the rows where lacking (m,) is True, and the number of the first one's line.
     """
     lines = text.split("\n")
-    numbers = [line for line, _ in _rows(text)]
+    numbers = [line for line, _ in _filled_lines(text)]
     left_out = [numbers[k] for k in np.flatnonzero(lacking)]
     for line in left_out:
         lines[line - 1] = ""
@@ -241,20 +242,20 @@ def _without(text, lacking):
 def _table_error(source, text, columns, gaps, separator=None, decimal="."):
     """The DatasetError about the first row that does not follow a dialect."""
     expected = f"expected {len(columns)} columns ({', '.join(columns)})"
-    for line, words in _rows(text, separator):
-        place = _place(source, line)
+    for line, words in _filled_lines(text, separator):
+        place = _row_name(source, line)
         if len(words) != len(columns):
             return error(source, f"{expected}, found {len(words)}", place)
         for word in words:
             plain = word if decimal == "." else word.replace(".", "?").replace(",", ".")
-            number = NUMBER.fullmatch(plain) and abs(float(plain)) < BOUND
+            number = DECIMAL_NUMBER.fullmatch(plain) and abs(float(plain)) < MAX_SIZE
             if not number and not (gaps and (not word or NAN.fullmatch(word))):
-                expected = f"expected finite numbers (below {BOUND:g} in size)"
+                expected = f"expected finite numbers (below {MAX_SIZE:g} in size)"
                 return error(source, f"{expected}, found {quoted(word)}", place)
-    return error(source, expected)  # unreachable unless numpy and NUMBER disagree
+    return error(source, expected)  # unreachable unless numpy and DECIMAL_NUMBER disagree
 
 
-def _rows(text, separator=None):
+def _filled_lines(text, separator=None):
     """Yield line number and words of every line that has more than a comment."""
     for line, content in enumerate(text.split("\n"), start=1):
         if words := content.partition("#")[0].strip():

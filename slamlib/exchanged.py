@@ -1,45 +1,46 @@
-"""Columns that look exchanged: the pose's id and the landmark's in a file of measurements."""
+"""Detects exchanged columns: the pose's id and the landmark's in a file of measurements."""
 
 import numpy as np
 
-MIN_PAIRS = 10  # pairs of readings that decide
-MANY = 20_000  # readings; of more, the first in the file are looked at
-SEEN = 3  # readings of a landmark on average, of which ids alone decide
-FARTHER = 3.0  # ratio of their median distances by which the columns look exchanged
+MIN_READING_PAIRS = 10  # pairs of readings, for a decision
+MAX_READINGS = 20_000  # readings; of more, the first ones decide
+MIN_READINGS_PER_LANDMARK = 3  # mean of readings of a landmark, where only ids decide
+MIN_DISTANCE_RATIO = 3.0  # ratio of median distances from which columns look exchanged
 
 
-def look_exchanged(pose, landmark, place, pose_count):
-    """True if the ids of poses (m,) and landmarks (m,), as a file has them, look exchanged.
+def look_exchanged(pose, landmark, measured, pose_count):
+    """True if the ids of poses (m,) and landmarks (m,) in a file look exchanged.
 
-    A landmark is measured from poses that follow each other at almost the same place (m, d) of the
-    vehicle's frame, or at almost the same range; several landmarks measured at one pose are at
-    different ones. So the columns look exchanged if measurements of one "landmark" from successive
-    "poses" are FARTHER from each other than those of one "pose" of successive "landmarks". Where a
-    pose has one landmark, the ids decide.
+    Consecutive poses measure a landmark at almost the same place of the vehicle's frame, or almost
+    the same range, and one pose measures several landmarks at different ones: `measured` (m, d). So
+    columns look exchanged if the median distance between consecutive measurements of one "landmark"
+    exceeds that between those of one "pose" MIN_DISTANCE_RATIO times. With one landmark a pose, the
+    ids decide.
     """
-    pose, landmark, place = pose[:MANY], landmark[:MANY], place[:MANY]
+    pose, landmark, measured = (each[:MAX_READINGS] for each in (pose, landmark, measured))
     whole = (landmark == np.rint(landmark)) & (pose == np.rint(pose))
     if not (whole & (1 <= landmark) & (landmark <= pose_count)).all():
         return False
-    if len(landmark) - len(np.unique(landmark)) < MIN_PAIRS:
+    if len(landmark) - len(np.unique(landmark)) < MIN_READING_PAIRS:
         return _ids_look_exchanged(pose, landmark, pose_count)
     medians = []
     for first, second in ((landmark, pose), (pose, landmark)):
         order = np.lexsort([second, first])
         same = np.diff(first[order]) == 0
-        apart = np.linalg.norm(np.diff(place[order], axis=0), axis=1)[same]
-        if len(apart) < MIN_PAIRS:
+        distance = np.linalg.norm(np.diff(measured[order], axis=0), axis=1)[same]
+        if len(distance) < MIN_READING_PAIRS:
             return False
-        medians.append(np.median(apart))
-    return medians[0] > FARTHER * medians[1]
+        medians.append(np.median(distance))
+    return medians[0] > MIN_DISTANCE_RATIO * medians[1]
 
 
 def _ids_look_exchanged(pose, landmark, pose_count):
-    """True if "landmarks" that hardly repeat are in the order of a drive, and "poses" are not.
+    """True if "landmarks" that hardly repeat ascend as the poses of a drive do.
 
-    The "landmarks" ascend over more than half of the drive's poses. The "poses" do not ascend, are
-    few, and lie in less than half of the drive.
+    They ascend over more than half of the drive's poses. The "poses" do not ascend, are few, and
+    cover less than half of the drive.
     """
-    few = SEEN * len(np.unique(pose)) <= len(np.unique(landmark)) >= MIN_PAIRS
+    poses, landmarks = len(np.unique(pose)), len(np.unique(landmark))
+    few = landmarks >= max(MIN_READING_PAIRS, MIN_READINGS_PER_LANDMARK * poses)
     ascend = (np.diff(landmark) >= 0).all() and not (np.diff(pose) >= 0).all()
     return bool(few and ascend and np.ptp(landmark) > pose_count / 2 > np.ptp(pose))

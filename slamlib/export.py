@@ -103,4 +103,4 @@ def _write_lines(path, columns, delimiter, header=""):
     text = BytesIO()
     np.savetxt(text, np.column_stack(columns), header=header, comments="", delimiter=delimiter,
                fmt=["%d"] + ["%.17g"] * (len(columns) - 1))
-    swap.write(Path(path), text.getvalue())
+    swap.write_atomically(Path(path), text.getvalue())

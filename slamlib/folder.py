@@ -1,8 +1,8 @@
-"""Which file of a dataset's folder is which: every one is read, named in a note, or refused.
+"""Finds the files of a dataset in its folder: each file is read, named in a note, or refused.
 
-A file whose name is unmistakably that of a missing one, as `ArucoReading.txt.txt` where Windows
-hides extensions, is read under it. A name that is near to a missing one is refused: a sensor would
-else be left out silently.
+A file whose name is certainly that of a missing one, as `ArucoReading.txt.txt` where Windows hides
+extensions, is read as that. A name that only resembles a missing one is refused, because a sensor
+would be left out silently.
 """
 
 import re
@@ -11,57 +11,57 @@ from pathlib import Path
 
 from slamlib.filenames import (
     ARCHIVE,
+    DATASET_FILES,
     ENCODER,
-    FILES,
     TABLES,
     is_variant,
-    meant,
-    misnamed,
-    placeholder,
-    role,
-    sense,
-    some,
+    listed_names,
+    misnamed_error,
+    name_in_placeholder,
+    name_of_file,
+    resembled_name,
+    similar_name,
     stem_of,
 )
 from slamlib.matfile import Variable, mat_variables
 from slamlib.textfile import DatasetError, error, quoted, read_regular
 
-IGNORED = re.compile(r"\..*|thumbs\.db|desktop\.ini|__macosx", re.IGNORECASE)
+# Names of files that systems put into folders.
+SYSTEM_FILES = re.compile(r"\..*|thumbs\.db|desktop\.ini|__macosx", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
 class Contents:
     """The files of a dataset's folder, or of its folder `truth`."""
 
-    folder: Path  # in which they are
-    files: dict  # from a name of FILES to a Path or a Variable
-    notes: tuple[str, ...]  # on names that are not as expected and files that are not read
-    hint: str = ""  # what a message on a missing file adds
+    folder: Path  # of the files
+    files: dict  # Path or Variable by name in DATASET_FILES
+    notes: tuple[str, ...]  # on unexpected names and on files that are not read
+    hint: str = ""  # end of a message on a missing file
 
     def required(self, name):
-        """The source of this name; DatasetError if there is none."""
+        """The source (Path or Variable) of this name; raises DatasetError if there is none."""
         if name not in self.files:
             raise error(self.folder / name, f"expected this file, found none{self.hint}")
         return self.files[name]
 
 
-def contents(folder, expected=FILES):
-    """The Contents of a folder, in which files of the names `expected` are looked for.
+def contents(folder, expected=DATASET_FILES):
+    """The Contents of a folder (Path) with files of the names `expected`, in any case of letters.
 
-    Upper and lower case are the same. If the folder holds none of these, they may be in one of its
-    sub-folders. Raises DatasetError if two files have a name, a name is almost right, or the folder
-    cannot be read.
+    If the folder holds none of these, they may be in one of its sub-folders. Raises DatasetError if
+    two files have a name, a name is almost right, or the folder cannot be read.
     """
     folder = Path(folder)
     paths = _listed(folder)
-    if expected is FILES and not any(role(path, expected) for path in paths):
+    if expected is DATASET_FILES and not any(name_of_file(path, expected) for path in paths):
         deeper = [path for path in paths if path.is_dir() and _holds_encoder(path)]
         if len(deeper) > 1:
             raise error(folder, "expected the files of one dataset, found those of "
-                        f"{some([path.name for path in deeper])} in sub-folders")
+                        f"{listed_names([path.name for path in deeper])} in sub-folders")
         if deeper:
             inner = contents(deeper[0], expected)
-            notes = [f"The files were read from the sub-folder {some([deeper[0].name])}."]
+            notes = [f"The files were read from the sub-folder {listed_names([deeper[0].name])}."]
             return Contents(inner.folder, inner.files, (*notes, *_not_read(
                 [path.name for path in paths if path != deeper[0]]), *inner.notes), inner.hint)
     files, notes, copies, hint = {}, [], set(), ""
@@ -74,7 +74,7 @@ def contents(folder, expected=FILES):
         notes += [f"{other.name} is not read: it is a copy of {found.name}." for other in others]
         copies |= {found, *others}
     rest = [path for path in paths if path not in copies]
-    if expected is FILES:
+    if expected is DATASET_FILES:
         variables, more, unread, hint = _mat_tables(
             [path for path in rest if path.suffix.lower() == ".mat"],
             [name for name in TABLES if name not in files])
@@ -93,30 +93,31 @@ def contents(folder, expected=FILES):
 
 
 def is_dataset(folder):
-    """True if a folder, or one of its sub-folders, holds files of a dataset under any names."""
+    """True if a folder (Path) or one of its sub-folders holds files of a dataset, in any form."""
     paths = _listed(folder)
     mats = [path for path in paths if path.suffix.lower() == ".mat"]
-    return any(role(path, FILES) or ARCHIVE.search(path.name) for path in paths) \
+    return any(name_of_file(path, DATASET_FILES) or ARCHIVE.search(path.name) for path in paths) \
         or any(path.is_dir() and _holds_encoder(path) for path in paths) \
-        or any(placeholder(path, FILES) for path in _hidden(folder)) \
+        or any(name_in_placeholder(path, DATASET_FILES) for path in _hidden(folder)) \
         or bool(_mat_tables(mats, TABLES)[0])
 
 
 def left_in(data):
-    """Sentences on archives and files of a dataset that are in the folder of all datasets."""
+    """Sentences (list of str) on archives and tables in the folder of all datasets (Path)."""
     sentences = []
     for path in _listed(data):
         if path.is_file() and ARCHIVE.search(path.name):
             sentences.append(f"{path} is not read: unpack it into a folder in {data}.")
-        elif path.is_file() and role(path, TABLES):
+        elif path.is_file() and name_of_file(path, TABLES):
             sentences.append(f"{path} is not read: move it into a folder of its dataset in {data}.")
     return sentences
 
 
 def _listed(folder):
-    """Paths in a folder, sorted, without those that systems put there."""
+    """Sorted paths in a folder without SYSTEM_FILES."""
     try:
-        return sorted(path for path in Path(folder).iterdir() if not IGNORED.fullmatch(path.name))
+        return sorted(path for path in Path(folder).iterdir()
+                      if not SYSTEM_FILES.fullmatch(path.name))
     except (OSError, ValueError):  # ValueError: a NUL character in the folder's name
         raise error(folder, "expected a folder that can be read") from None
 
@@ -127,38 +128,37 @@ def _hidden(folder):
 
 
 def _refuse_misnamed(folder, expected, files, rest):
-    """Raise DatasetError if one of the paths `rest` stands for a name that is not among `files`."""
-    for path in rest:
-        if (name := meant(path, expected)) and name not in files:
-            raise misnamed(path, name)
-    for path in _hidden(folder):
-        if (name := placeholder(path, expected)) and name not in files:
-            raise misnamed(path, name)
-    if expected is FILES:
+    """Raise DatasetError if one of the paths `rest` replaces a name that is not in `files`."""
+    names = [*((path, resembled_name(path, expected)) for path in rest),
+             *((path, name_in_placeholder(path, expected)) for path in _hidden(folder))]
+    for path, name in names:
+        if name and name not in files:
+            raise misnamed_error(path, name)
+    if expected is DATASET_FILES:
         _require_here(folder, files, [path for path in rest if path.is_dir()])
 
 
 def _require_here(folder, files, others):
-    """Raise DatasetError if a table that is not among `files` is in one of the folders `others`.
+    """Raise DatasetError if a table that is not in `files` is in one of the folders `others`.
 
-    A folder with encoders of its own is another dataset.
+    A folder with its own encoder file is another dataset.
     """
     for deeper in others:
-        held = {role(path, TABLES): path for path in _listed_if_readable(deeper)
+        held = {name_of_file(path, TABLES): path for path in _listed_if_readable(deeper)
                 if any(path.name.lower() == name.lower() or is_variant(path, name)
                        for name in TABLES)}
         for name, path in held.items():
             if name not in files and (ENCODER not in files or ENCODER not in held):
                 raise error(folder / name, "expected this file, found it as "
-                            f"{some([f'{deeper.name}/{path.name}'])}: move it up, or away")
+                            f"{listed_names([f'{deeper.name}/{path.name}'])}: move it up, or away")
 
 
 def _not_read(names):
-    return [f"Not read: {some(names)}."] * bool(names)
+    return [f"Not read: {listed_names(names)}."] * bool(names)
 
 
 def _choose(folder, name, paths):
-    """The path of a file of this name, or None, and copies of it that are not read.
+    """The path of the file of this name, or None, and copies of it that are not read.
 
     Raises DatasetError if there are two files that differ.
     """
@@ -176,8 +176,8 @@ def _choose(folder, name, paths):
 
 
 def _holds_encoder(folder):
-    """True if one of the files in a folder is that of the encoders, or near to a table."""
-    return any(role(path, (ENCODER,)) for path in _listed_if_readable(folder))
+    """True if a folder holds the encoder file, in any form."""
+    return any(name_of_file(path, (ENCODER,)) for path in _listed_if_readable(folder))
 
 
 def _listed_if_readable(folder):
@@ -188,11 +188,10 @@ def _listed_if_readable(folder):
 
 
 def _mat_tables(paths, names):
-    """Variables of .mat files by the names that they have of `names`, notes, files that are not
-    read, and what a message on missing encoders adds.
+    """Variables of .mat files by name in `names`, notes, unread files, and the hint of Contents.
 
-    A file that cannot be read is refused if one of them is its own name or in its bytes; another
-    one if its name or that of a variable is near to a missing one.
+    A file that cannot be read is refused if its name is one of `names`, or its bytes hold one;
+    another file is refused if its name or that of a variable resembles a missing one.
     """
     files, notes, unread, hint, left = {}, [], [], "", {}
     for path in paths if names else ():
@@ -222,11 +221,11 @@ def _mat_tables(paths, names):
         left[path] = {each: size for each, size in variables.items()
                       if not any(f"{name}.".startswith(f"{each}.") for name in used)}
         if used and left[path]:
-            notes.append(f"Not read: variables {some(list(left[path]))} of {path.name}.")
+            notes.append(f"Not read: variables {listed_names(list(left[path]))} of {path.name}.")
     for path, variables in left.items():
         used = any(each.path == path for each in files.values())
-        has = f"the variables {some(list(variables)) or 'none'}"
-        _refuse_near(path, variables, [name for name in names if name not in files], used, has)
+        has = f"the variables {listed_names(list(variables)) or 'none'}"
+        _refuse_similar(path, variables, [name for name in names if name not in files], used, has)
         if not used:
             notes.append(f"{path.name} is not read: it has {has}.")
             hint = f", but {path.name}, which has {has}: name the matrix {Path(ENCODER).stem}"
@@ -234,13 +233,13 @@ def _mat_tables(paths, names):
     return files, notes, unread, hint
 
 
-def _refuse_near(path, variables, missing, used, has):
-    """Raise DatasetError if a .mat file's variables or, unless it is used, its name are near to
-    one of the names `missing`.
+def _refuse_similar(path, variables, missing, used, has):
+    """Raise DatasetError if a .mat file's variables or, unless it is used, its name resemble one of
+    the names `missing`.
     """
     words = [each.rpartition(".")[2] for each, size in variables.items() if size > 1]
-    near = {sense(word.lower(), TABLES) for word in words + [path.stem] * (not used)}
+    resembled = {similar_name(word.lower(), TABLES) for word in words + [path.stem] * (not used)}
     for name in missing:
-        if name in near:
+        if name in resembled:
             raise error(path, f"expected a matrix named {Path(name).stem}, found {has}: rename one "
                         "of them")

@@ -1,4 +1,4 @@
-"""Tables in .mat files of MATLAB's versions 5 to 7."""
+"""Reads tables from .mat files of MATLAB's versions 5 to 7."""
 
 from dataclasses import dataclass
 from io import BytesIO
@@ -22,9 +22,9 @@ class Variable:
 
 
 def mat_variables(path):
-    """Numbers of elements by the names of variables and of fields, as `logs.UwbReading`, a dict.
+    """Numbers of elements (dict) by the names of variables and fields, as `logs.UwbReading`.
 
-    A struct counts as many elements. Raises DatasetError if a .mat file cannot be read, or is of
+    The number of a struct is infinite. Raises DatasetError if a .mat file cannot be read, or is of
     another version than MATLAB's 5 to 7.
     """
     sizes = {}
@@ -47,9 +47,9 @@ def _mat_value(path, name):
 
 
 def variable_text(source):
-    """The rows of a table, a Variable, as text, one a line.
+    """The rows of a Variable as text (str), one a line.
 
-    Raises DatasetError if it is no matrix of real numbers.
+    Raises DatasetError if it is not a matrix of real numbers.
     """
     value = _mat_value(source.path, source.name)
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "iuf" or value.ndim != 2:
@@ -60,7 +60,7 @@ def variable_text(source):
 
 
 def _of_mat(read, path, **keywords):
-    """What a function of scipy.io reads from a .mat file."""
+    """The result of a function of scipy.io on a .mat file, with DatasetErrors."""
     data = read_regular(path)
     if data.startswith((b"# Created by Octave", b"# name:")):
         raise error(path, "expected a .mat file of version 7 or older, found Octave's text: save "

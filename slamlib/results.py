@@ -73,7 +73,7 @@ def _write_structs(path, **fields):
     rows = {name: _matrices(values) for name, values in fields.items()}
     count = len(next(iter(rows.values())))
     content = _tiled(path.stem, rows) if count > MAX_STRUCTS_BY_SCIPY else _saved(path.stem, rows)
-    swap.write(path, _HEADER + content[len(_HEADER):])
+    swap.write_atomically(path, _HEADER + content[len(_HEADER):])
 
 
 def _matrices(values):

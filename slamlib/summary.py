@@ -51,9 +51,9 @@ def solve_to_folder(dataset, truth, out, jobs=1):
     with swap.staging(out) as stage:
         summary = _summary(dataset, truth, stage, jobs)
         text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-        swap.write(stage / SUMMARY, text.encode())
+        swap.write_atomically(stage / SUMMARY, text.encode())
         swap.require_staged(stage)
-        swap.publish([swap.Set(out, {name: stage / name for name in swap.names(stage)},
+        swap.publish([swap.FileSet(out, {name: stage / name for name in swap.file_names(stage)},
                                last=SUMMARY, ours=RESULT_NAMES)])
     return summary
 

@@ -1,12 +1,12 @@
-"""Files that runs leave: staged in a folder of the run's own, then swapped in as one set.
+"""Stages the files of a run in a folder of its own, then swaps them in as one set.
 
 No system renames the files of several folders at once, so `publish` removes the old set before it
-moves in the new one: files of two runs are never side by side, at whichever step the process is
-killed. UNFINISHED.txt is there from before the first of these steps until after the last, and the
-file that sums up the set, as summary.json, goes first and comes last, so it is only there with all.
+moves in the new one: files of two runs are never side by side, whenever the process is killed.
+UNFINISHED.txt exists from before the first of these steps until after the last. The file that sums
+up the set, such as summary.json, is removed first and moved in last, so it exists only with all.
 
-`.slamlib.json` in a folder names the files of its set; whatever else is there is the user's and
-stays. Windows neither removes nor replaces a file that is open.
+`.slamlib.json` in a folder names the files of its set; all others are the user's and stay.
+Windows neither removes nor replaces a file that is open.
 """
 
 import errno
@@ -21,15 +21,17 @@ from dataclasses import dataclass
 from itertools import count
 from pathlib import Path, PurePath, PurePosixPath
 
-from slamlib.locks import REMOVABLE, locked, runs, take
+from slamlib.locks import CAN_REMOVE_OPEN_FILES, locked, process_exists, try_lock
 
-MARKER = "UNFINISHED.txt"
-SENTENCE = ("A run writes the files of this folder, or was ended while it did so: "
+UNFINISHED = "UNFINISHED.txt"  # exists while the files of a folder are not complete
+UNFINISHED_TEXT = ("A run writes the files of this folder, or was ended while it did so: "
             "they are not complete. Run it again.\n")
-WRITTEN = ".slamlib.json"  # the names of a set's files
-LOCK = ".slamlib.lock"
+FILE_LIST = ".slamlib.json"  # holds the names of a set's files
+LOCK = ".slamlib.lock"  # in a folder that is written to, and in the stage of a process
 STAGE = ".slamlib-stage-"  # and a number
-ENDS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
+# Signals that end a process; Windows has no SIGHUP.
+END_SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP")
+                    if hasattr(signal, name))
 
 
 class UnfinishedError(RuntimeError):
@@ -37,19 +39,19 @@ class UnfinishedError(RuntimeError):
 
 
 @dataclass(frozen=True)
-class Set:
-    """What one run writes to one folder."""
+class FileSet:
+    """The files that one run writes to one folder."""
 
     folder: Path
-    files: dict  # from name, as `problem1/vehiclePose.mat`, to the Path of the staged file
+    files: dict  # Path of the staged file by name, as `problem1/vehiclePose.mat`
     last: str | None = None  # name of the file that sums up the others
-    ours: frozenset = frozenset()  # names that are no user's, whoever wrote them
+    ours: frozenset = frozenset()  # names that are never a user's
 
 
-def write(path, content):
+def write_atomically(path, content):
     """Write bytes to a Path; a reader finds the old file or the whole new one, never a part.
 
-    OSError names the path, also where a disk is full.
+    Raises OSError, which names the path, also if the disk is full.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     _remove_temporaries(path)
@@ -66,10 +68,10 @@ def write(path, content):
 
 
 def _remove_temporaries(path):
-    """Remove what processes that are gone left of `write` to this path."""
+    """Remove temporary files of `write_atomically` to this path by processes that ended."""
     for file in path.parent.glob(f".{glob.escape(path.name)}.*"):
         process = file.name.rpartition(".")[2]
-        if process.isdecimal() and not runs(int(process)):
+        if process.isdecimal() and not process_exists(int(process)):
             file.unlink(missing_ok=True)
 
 
@@ -77,8 +79,8 @@ def _remove_temporaries(path):
 def staging(folder):
     """Yield a new empty folder (Path) of this process in `folder`, and remove it at the end.
 
-    Those of processes that are gone are removed first. The lowest free number makes its name, so
-    that runs which follow each other have the same paths.
+    Folders of processes that ended are removed first. The name has the lowest free number, so that
+    consecutive runs have the same paths.
     """
     folder = Path(folder)
     with locked(folder / LOCK):
@@ -88,34 +90,35 @@ def staging(folder):
         stage = next(path for n in count(1) if not (path := folder / f"{STAGE}{n}").exists())
         (stage / "files").mkdir(parents=True)
         file = open(stage / LOCK, "w")
-        take(file)
+        try_lock(file)
     try:
         yield stage / "files"
     finally:
-        with nullcontext() if REMOVABLE else locked(folder / LOCK):  # nobody else takes its number
-            if not REMOVABLE:
+        # Without the lock another process could take the number while no file of it is open.
+        with nullcontext() if CAN_REMOVE_OPEN_FILES else locked(folder / LOCK):
+            if not CAN_REMOVE_OPEN_FILES:
                 file.close()
             shutil.rmtree(stage, ignore_errors=True)
             file.close()
 
 
 def _held(stage):
-    """True if the process that made a folder by `staging` is still there."""
+    """True if the process that made a folder by `staging` still exists."""
     try:
         with open(stage / LOCK, "r+") as file:
-            return not take(file)
+            return not try_lock(file)
     except OSError:
         return False
 
 
 def require_staged(stage):
-    """Raise OSError if somebody removed this folder by `staging`, and with it files of this run."""
+    """Raise OSError if this folder by `staging` was removed, and with it files of this run."""
     if not (stage.parent / LOCK).exists():
         raise FileNotFoundError(
             errno.ENOENT, "was removed while a run wrote to it", str(stage.parent))
 
 
-def names(folder):
+def file_names(folder):
     """Sorted names (list of str) of all files in a folder (Path), relative to it."""
     return [file.relative_to(folder).as_posix()
             for file in sorted(folder.rglob("*")) if file.is_file()]
@@ -123,40 +126,39 @@ def names(folder):
 
 def require_finished(folder):
     """Raise UnfinishedError if the files of a run in this folder (Path) are not complete."""
-    if (folder / MARKER).exists():
-        raise UnfinishedError(f"{folder}: expected the files of a run that ended well; {MARKER} "
-                              "says that it did not: run it again")
+    if (folder / UNFINISHED).exists():
+        raise UnfinishedError(f"{folder}: expected the files of a run that ended well; "
+                              f"{UNFINISHED} says that it did not: run it again")
 
 
 def publish(sets):
-    """Replace the files that earlier runs wrote by those of each Set, all sets as one.
+    """Replace the files that earlier runs wrote by those of each FileSet, all sets as one.
 
-    Until the first file is removed nothing has changed: by then all that needs space on the disk,
-    and all folders, are there. OSError if a file cannot be put in its place.
+    All folders, and all that needs space on the disk, are made before the first file is removed.
+    Raises OSError if a file cannot be put in its place.
     """
     with ExitStack() as stack:
-        sets = [each for each in sets
-                if each.files or any((each.folder / name).exists() for name in [
-                    MARKER, *_old(each)])]
-        pairs = [(each, stack.enter_context(staging(each.folder))) for each in sets]
-        for folder in sorted({each.folder for each in sets}):  # in this order by all processes
+        sets = [file_set for file_set in sets if file_set.files or any(
+            (file_set.folder / name).exists() for name in [UNFINISHED, *_earlier_names(file_set)])]
+        pairs = [(file_set, stack.enter_context(staging(file_set.folder))) for file_set in sets]
+        for folder in sorted({file_set.folder for file_set in sets}):  # all processes in this order
             stack.enter_context(locked(folder / LOCK))
-        for each in sets:
-            _check(each)
-        for each, control in pairs:
-            _prepare(each, control)
-        with _undisturbed():
+        for file_set in sets:
+            _check(file_set)
+        for file_set, control in pairs:
+            _prepare(file_set, control)
+        with _signals_delayed():
             for step in (_mark, _remove_old, _move_new, _finish):
-                for each, control in pairs:
-                    step(each, control)
+                for file_set, control in pairs:
+                    step(file_set, control)
 
 
 @contextmanager
-def _undisturbed():
-    """Let signals that handlers of this process turn into an end wait until the block is done."""
+def _signals_delayed():
+    """Delay signals that have handlers in this process until the end of the block."""
     waiting, handlers = [], {}
     if threading.current_thread() is threading.main_thread():
-        handlers = {number: handler for number in (signal.SIGINT, *ENDS)
+        handlers = {number: handler for number in (signal.SIGINT, *END_SIGNALS)
                     if callable(handler := signal.getsignal(number))}
     for number in handlers:
         signal.signal(number, lambda number, _: waiting.append(number))
@@ -169,10 +171,10 @@ def _undisturbed():
             signal.raise_signal(number)
 
 
-def _check(each):
-    """Raise OSError where a file cannot be put in its place, or an earlier one not be removed."""
-    for name, staged in each.files.items():
-        target = each.folder / name
+def _check(file_set):
+    """Raise OSError if a file cannot be put in its place, or an earlier one cannot be removed."""
+    for name, staged in file_set.files.items():
+        target = file_set.folder / name
         parent = next(folder for folder in target.parents if folder.exists())
         if not parent.is_dir():
             raise _os_error(errno.ENOTDIR, parent)
@@ -180,61 +182,66 @@ def _check(each):
             raise _os_error(errno.EXDEV, target)
         if target.is_dir():
             raise _os_error(errno.EISDIR, target)
-    for name in () if REMOVABLE else sorted(_old(each)):  # one that a program shows stays as it is
-        with suppress(FileNotFoundError):
-            open(each.folder / name, "r+b").close()
-    for folder in sorted({(each.folder / name).parent for name in _old(each) | each.files.keys()}):
+    for name in () if CAN_REMOVE_OPEN_FILES else sorted(_earlier_names(file_set)):
+        with suppress(FileNotFoundError):        # PermissionError if a program has it open
+            open(file_set.folder / name, "r+b").close()
+    for folder in sorted({(file_set.folder / name).parent for name in _all_names(file_set)}):
         if folder.is_dir() and not os.access(folder, os.W_OK):
             raise _os_error(errno.EACCES, folder)
 
 
-def _prepare(each, control):
-    """Stage the control files, name all files that may be found from now on, and make folders."""
-    write(control / MARKER, SENTENCE.encode())
-    write(control / "after", json.dumps(sorted(each.files)).encode())
-    write(control / WRITTEN, json.dumps(sorted(_old(each) | each.files.keys())).encode())
-    os.replace(control / WRITTEN, each.folder / WRITTEN)
-    for name in each.files:
-        (each.folder / name).parent.mkdir(parents=True, exist_ok=True)
+def _prepare(file_set, control):
+    """Stage the control files, list old and new files in FILE_LIST, and make folders."""
+    write_atomically(control / UNFINISHED, UNFINISHED_TEXT.encode())
+    write_atomically(control / "after", json.dumps(sorted(file_set.files)).encode())
+    write_atomically(control / FILE_LIST, json.dumps(sorted(_all_names(file_set))).encode())
+    os.replace(control / FILE_LIST, file_set.folder / FILE_LIST)
+    for name in file_set.files:
+        (file_set.folder / name).parent.mkdir(parents=True, exist_ok=True)
 
 
 def _os_error(number, path):
     return OSError(number, os.strerror(number), str(path))
 
 
-def _mark(each, control):
-    os.replace(control / MARKER, each.folder / MARKER)
+def _mark(file_set, control):
+    os.replace(control / UNFINISHED, file_set.folder / UNFINISHED)
 
 
-def _remove_old(each, control):
-    for name in sorted(_old(each), key=lambda name: name != each.last):
-        path = each.folder / name
+def _remove_old(file_set, control):
+    for name in sorted(_earlier_names(file_set), key=lambda name: name != file_set.last):
+        path = file_set.folder / name
         _remove_temporaries(path)
         if path.is_symlink() or path.is_file():
             path.unlink()
 
 
-def _move_new(each, control):
-    for name in sorted(each.files, key=lambda name: name == each.last):
-        os.replace(each.files[name], each.folder / name)
+def _move_new(file_set, control):
+    for name in sorted(file_set.files, key=lambda name: name == file_set.last):
+        os.replace(file_set.files[name], file_set.folder / name)
 
 
-def _finish(each, control):
-    folders = {parent for name in _old(each) for parent in PurePosixPath(name).parents[:-1]}
+def _finish(file_set, control):
+    folders = {parent for name in _earlier_names(file_set)
+               for parent in PurePosixPath(name).parents[:-1]}
     for folder in sorted(folders, reverse=True):
         with suppress(OSError):  # it is not empty
-            (each.folder / folder).rmdir()
-    os.replace(control / "after", each.folder / WRITTEN)
-    (each.folder / MARKER).unlink(missing_ok=True)
+            (file_set.folder / folder).rmdir()
+    os.replace(control / "after", file_set.folder / FILE_LIST)
+    (file_set.folder / UNFINISHED).unlink(missing_ok=True)
 
 
-def _old(each):
-    """Names (set of str) of all files in a set's folder that may be a run's, also removed ones."""
-    file = each.folder / WRITTEN
+def _all_names(file_set):
+    return _earlier_names(file_set) | file_set.files.keys()
+
+
+def _earlier_names(file_set):
+    """Names (set of str) of files of earlier runs in a set's folder, also of removed ones."""
+    file = file_set.folder / FILE_LIST
     try:
         written = json.loads(file.read_bytes()) if file.is_file() else []
     except (ValueError, RecursionError):
-        written = []                    # not ours: what it should name is the user's
+        written = []                    # not written by slamlib
     return {name for name in (written if isinstance(written, list) else ())
             if isinstance(name, str) and name and "\0" not in name
-            and ".." not in PurePath(name).parts and not PurePath(name).anchor} | each.ours
+            and ".." not in PurePath(name).parts and not PurePath(name).anchor} | file_set.ours

@@ -1,13 +1,13 @@
-"""Files read into text and TOML entries; `DatasetError` says in one sentence what is wrong in one.
+"""Reads files into text and TOML entries.
 
-The sentence names the file, the line and what was expected there.
+A `DatasetError` is one sentence, which names the file, the line and what was expected there.
 """
 
 import re
 import stat
 import tomllib
 
-CONTROL_BYTE = re.compile(rb"[\x00-\x08\x0e-\x1f]")
+CONTROL_BYTE = re.compile(rb"[\x00-\x08\x0e-\x1f]")  # bytes that no text has
 
 
 class DatasetError(ValueError):
@@ -51,7 +51,7 @@ def read_text(path, encoding="ascii"):
     """Text of a file with line ends '\\n', and the name of its encoding if that is UTF-16, or "".
 
     Bytes that are invalid in `encoding` become '\\ufffd'. Raises DatasetError if the file cannot be
-    read or has bytes that no text has.
+    read or has control bytes.
     """
     data = read_regular(path)
     utf16 = _utf16(data)
@@ -68,7 +68,7 @@ def read_text(path, encoding="ascii"):
 
 
 def _utf16(data):
-    """The codec of UTF-16 text, or "": it has a mark, or a NUL as every second byte only."""
+    """Codec of UTF-16 text, which has a byte order mark, or NUL in every second byte; or ""."""
     if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return "utf-16"
     for codec, zeros, others in (("utf-16-le", data[1::2], data[::2]),
@@ -104,10 +104,10 @@ def read_regular(path):
         raise error(path, expected) from None
 
 
-def quoted(value, longest=60):
-    """The beginning of a value as text, in quotes."""
+def quoted(value):
+    """The first 60 characters (str) of a value, in quotes."""
     try:
         text = str(value)
     except ValueError:                         # Python writes no integers of thousands of digits
         return "a far longer number"
-    return repr(text if len(text) <= longest else text[:longest] + "...")
+    return repr(text if len(text) <= 60 else text[:60] + "...")

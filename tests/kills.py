@@ -80,8 +80,8 @@ def run(arguments, folder):
 
 def contents(folder):
     """Bytes of a run's files by name: not those of the user, nor what begins with a dot."""
-    return {name: _plain(folder / name) for name in swap.names(folder)
-            if name not in MINE and name != swap.MARKER
+    return {name: _plain(folder / name) for name in swap.file_names(folder)
+            if name not in MINE and name != swap.UNFINISHED
             and not any(part.startswith(".") for part in Path(name).parts)}
 
 
@@ -107,7 +107,7 @@ def judge(folder, references, last=None):
     for name, text in MINE.items():
         if not (folder / name).is_file() or (folder / name).read_text() != text:
             return "MIXED: lost " + name
-    marked = (folder / swap.MARKER).exists()
+    marked = (folder / swap.UNFINISHED).exists()
     if not owners or last in found and found.keys() != references[owners[0]].keys():
         return "MIXED: " + " ".join(sorted(found))
     if marked:
@@ -118,7 +118,8 @@ def judge(folder, references, last=None):
 def left(folder):
     """What lies in a folder that is no run's and no user's, empty folders too."""
     return [str(path.relative_to(folder)) for path in folder.rglob("*")
-            if path.name.startswith(".") and path.name != swap.WRITTEN or path.name == swap.MARKER
+            if path.name.startswith(".") and path.name != swap.FILE_LIST
+            or path.name == swap.UNFINISHED
             or path.is_dir() and not any(path.iterdir())]
 
 
@@ -311,7 +312,7 @@ def at_once(runs, builds, times, seed):
     return counts
 
 
-PARTS = {
+ANSWER_PARTS = {
     "solve": (Solves, [("solve, random moments", at_random, (200, 1))]),
     "steps": (StoredSolves, [("solve, every step, A then B", at_every_step, ("A", "B")),
                        ("solve, every step, B then A", at_every_step, ("B", "A"))]),
@@ -329,7 +330,7 @@ def do(parts):
     """Run parts by name, print a line for each, and return True if nothing was mixed or left."""
     well = True
     for part in parts:
-        kind, lines = PARTS[part]
+        kind, lines = ANSWER_PARTS[part]
         with tempfile.TemporaryDirectory() as folder:
             runs = kind(Path(folder).resolve())
             for title, function, arguments in lines:
@@ -341,4 +342,4 @@ def do(parts):
 
 
 if __name__ == "__main__":
-    sys.exit(not do(sys.argv[1:] or PARTS))
+    sys.exit(not do(sys.argv[1:] or ANSWER_PARTS))

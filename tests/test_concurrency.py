@@ -54,7 +54,7 @@ def wait_for(found, process, seconds=300):
 
 def hidden(folder):
     """Names in a folder that begin with a dot, but for the list of a set's files."""
-    return [str(path) for path in folder.rglob(".*") if path.name != swap.WRITTEN]
+    return [str(path) for path in folder.rglob(".*") if path.name != swap.FILE_LIST]
 
 
 @pytest.fixture
@@ -96,7 +96,7 @@ with locked(Path({str(tmp_path / "lock")!r})):
         env=os.environ | {"PYTHONPATH": str(ROOT)})
     assert holder.stdout.readline() == "held\n"
     with open(tmp_path / "lock", "a+") as file:
-        assert not locks.take(file)
+        assert not locks.try_lock(file)
     holder.kill()
     holder.communicate()
     with locks.locked(tmp_path / "lock"):
@@ -143,10 +143,10 @@ def test_a_dataset_with_fewer_sensors_leaves_no_problem_of_another(tmp_path, dri
             (tmp_path / name).write_text(name)
         (tmp_path / "problem3" / ".vehiclePose.mat.99999999").write_text("of a killed run")
         if not listed:  # written by an earlier version
-            (tmp_path / swap.WRITTEN).unlink()
+            (tmp_path / swap.FILE_LIST).unlink()
         solve_to_folder(drive.without("uwb").without("aruco"), None, tmp_path)
-        assert swap.names(tmp_path) == sorted([swap.WRITTEN, *mine, "problem1/vehiclePose.mat",
-                                               "summary.json"])
+        assert swap.file_names(tmp_path) == sorted([
+            swap.FILE_LIST, *mine, "problem1/vehiclePose.mat", "summary.json"])
         assert all((tmp_path / name).read_text() == name for name in mine)
         assert not (tmp_path / "problem3").exists() and (tmp_path / "problem2").exists()
 
@@ -161,7 +161,7 @@ def test_a_problem_written_by_itself_removes_the_summary_of_other_files(tmp_path
 def test_unfinished_results_are_not_read(tmp_path):
     poses = np.zeros((2, 3)), np.zeros((2, 3, 3))
     results.write_vehicle_poses(tmp_path / "problem1", *poses)
-    (tmp_path / swap.MARKER).write_text("")
+    (tmp_path / swap.UNFINISHED).write_text("")
     with pytest.raises(swap.UnfinishedError, match="UNFINISHED.txt says that it did not"):
         results.read_vehicle_poses(tmp_path / "problem1")
 
@@ -187,7 +187,7 @@ def test_a_full_disk_names_the_path_and_leaves_the_old_results(tmp_path, drive):
     write_dataset(tmp_path / "drive", drive)
     out = tmp_path / "out"
     solve_to_folder(drive, None, out)
-    before = {name: (out / name).read_bytes() for name in swap.names(out)}
+    before = {name: (out / name).read_bytes() for name in swap.file_names(out)}
     limit = len(before["problem3/vehiclePose.mat"]) - 1
     code = (f"import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, {limit}));"
             "from slamlib.__main__ import main; sys.exit(main())")
@@ -196,7 +196,7 @@ def test_a_full_disk_names_the_path_and_leaves_the_old_results(tmp_path, drive):
                           env=os.environ | {"PYTHONPATH": str(ROOT)})
     assert done.returncode == 2 and done.stderr.count("slamlib: ") == 1
     assert "/vehiclePose.mat: " + os.strerror(errno.EFBIG) in done.stderr
-    assert {name: (out / name).read_bytes() for name in swap.names(out)} == before
+    assert {name: (out / name).read_bytes() for name in swap.file_names(out)} == before
 
 
 @pytest.mark.parametrize("spoil, reason", [
@@ -214,7 +214,7 @@ def test_what_cannot_be_put_in_its_place_is_told_before_anything_changes(
     told = capsys.readouterr().err
     assert told.count("slamlib: ") == 1 and reason in told.splitlines()[-1]
     assert (tmp_path / "out" / "summary.json").read_text() == "old"
-    assert not (tmp_path / "out" / swap.MARKER).exists()
+    assert not (tmp_path / "out" / swap.UNFINISHED).exists()
 
 
 def test_a_staging_folder_that_somebody_removes_ends_the_run(tmp_path, drive, monkeypatch, capsys):
@@ -227,20 +227,20 @@ def test_a_staging_folder_that_somebody_removes_ends_the_run(tmp_path, drive, mo
     monkeypatch.setattr("slamlib.summary.summarize", removed)
     assert main(["solve", str(tmp_path / "drive"), "--out", str(tmp_path / "out")]) == 2
     assert "was removed while a run wrote to it" in capsys.readouterr().err
-    assert swap.names(tmp_path / "out") == []
+    assert swap.file_names(tmp_path / "out") == []
 
 
 def test_names_in_a_list_that_lead_out_of_the_folder_are_ignored(tmp_path):
     (tmp_path / "out").mkdir()
     for name in ("above.txt", "out/ours.txt"):
         (tmp_path / name).write_text("")
-    (tmp_path / "out" / swap.WRITTEN).write_text(
+    (tmp_path / "out" / swap.FILE_LIST).write_text(
         json.dumps(["../above.txt", str(tmp_path / "above.txt"), "ours.txt"]))
-    swap.publish([swap.Set(tmp_path / "out", {})])
-    assert swap.names(tmp_path) == ["above.txt", "out/.slamlib.json"]
-    (tmp_path / "out" / swap.WRITTEN).write_text("not JSON")
-    swap.publish([swap.Set(tmp_path / "out", {}, ours=RESULT_NAMES)])
-    assert swap.names(tmp_path) == ["above.txt", "out/.slamlib.json"]
+    swap.publish([swap.FileSet(tmp_path / "out", {})])
+    assert swap.file_names(tmp_path) == ["above.txt", "out/.slamlib.json"]
+    (tmp_path / "out" / swap.FILE_LIST).write_text("not JSON")
+    swap.publish([swap.FileSet(tmp_path / "out", {}, ours=RESULT_NAMES)])
+    assert swap.file_names(tmp_path) == ["above.txt", "out/.slamlib.json"]
 
 
 @pytest.mark.slow
@@ -258,8 +258,8 @@ def test_pages_and_results_that_a_build_no_longer_makes_are_removed(tmp_path):
     (tmp_path / "notebooks" / "2_goes.ipynb").unlink()
     build(tmp_path, datasets=["short"])
     assert sorted(file.name for file in (tmp_path / "report").iterdir()) == [
-        swap.WRITTEN, "1_stays.html", "index.html", "notes.html", "report.pdf"]
-    assert swap.names(tmp_path / "results") == [
+        swap.FILE_LIST, "1_stays.html", "index.html", "notes.html", "report.pdf"]
+    assert swap.file_names(tmp_path / "results") == [
         "mine/vehiclePose.mat", "short/.slamlib.json", "short/notes.txt",
         "short/problem1/vehiclePose.mat"]
 
@@ -299,7 +299,7 @@ def test_a_file_that_cannot_be_kept_is_an_error(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", swap.ENDS)
+@pytest.mark.parametrize("number", swap.END_SIGNALS)
 def test_a_signal_ends_a_build_in_order(tmp_path, number):
     make_data(tmp_path)
     write(tmp_path / "notebooks", "1_slow", "# Slow", (RESULT + """
@@ -312,8 +312,8 @@ time.sleep(100)""",))
     told = process.communicate(timeout=60)[1]
     assert process.returncode == 128 + number
     assert told.splitlines()[-1] == f"slamlib: ended by {number.name}" and "Traceback" not in told
-    assert swap.names(tmp_path / "results") == [] and hidden(tmp_path) == []
-    assert not locks.runs(kernel)
+    assert swap.file_names(tmp_path / "results") == [] and hidden(tmp_path) == []
+    assert not locks.process_exists(kernel)
 
 
 def test_a_signal_while_files_are_replaced_waits_until_they_are(tmp_path, drive, monkeypatch,
@@ -328,17 +328,17 @@ def test_a_signal_while_files_are_replaced_waits_until_they_are(tmp_path, drive,
     assert told == "slamlib: ended by SIGTERM" and all(
         line.startswith("drive: ") for line in found)
     assert (out / "summary.json").exists() and (out / "problem3" / "ArucoMap.mat").exists()
-    assert not (out / swap.MARKER).exists() and hidden(out) == []
+    assert not (out / swap.UNFINISHED).exists() and hidden(out) == []
 
 
 def test_a_folder_that_is_protected_is_told_before_anything_changes(tmp_path, drive, monkeypatch):
     solve_to_folder(drive.without("uwb"), None, tmp_path)
-    before = {name: (tmp_path / name).read_bytes() for name in swap.names(tmp_path)}
+    before = {name: (tmp_path / name).read_bytes() for name in swap.file_names(tmp_path)}
     protected = tmp_path / "problem3"
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != protected)
     with pytest.raises(PermissionError, match="problem3"):
         solve_to_folder(drive.without("uwb").without("aruco"), None, tmp_path)
-    assert before == {name: (tmp_path / name).read_bytes() for name in swap.names(tmp_path)}
+    assert before == {name: (tmp_path / name).read_bytes() for name in swap.file_names(tmp_path)}
 
 
 @pytest.mark.parametrize("content", ["5", "null", "[1, null, [], \"a\\u0000\"]", "{\"a\": 1}",
@@ -347,14 +347,14 @@ def test_a_list_of_files_that_is_none_names_no_file(tmp_path, content):
     """Not those of the user; None is a pipe, on which reading would wait."""
     (tmp_path / "mine.txt").write_text("mine")
     if content is None:
-        os.mkfifo(tmp_path / swap.WRITTEN)
+        os.mkfifo(tmp_path / swap.FILE_LIST)
     else:
-        (tmp_path / swap.WRITTEN).write_text(content)
+        (tmp_path / swap.FILE_LIST).write_text(content)
     with swap.staging(tmp_path) as stage:
-        swap.write(stage / "new.txt", b"new")
-        swap.publish([swap.Set(tmp_path, {"new.txt": stage / "new.txt"})])
-    assert swap.names(tmp_path) == [swap.WRITTEN, "mine.txt", "new.txt"]
-    assert json.loads((tmp_path / swap.WRITTEN).read_text()) == ["new.txt"]
+        swap.write_atomically(stage / "new.txt", b"new")
+        swap.publish([swap.FileSet(tmp_path, {"new.txt": stage / "new.txt"})])
+    assert swap.file_names(tmp_path) == [swap.FILE_LIST, "mine.txt", "new.txt"]
+    assert json.loads((tmp_path / swap.FILE_LIST).read_text()) == ["new.txt"]
 
 
 def test_temporary_folders_of_builds_that_are_gone_are_removed(tmp_path, monkeypatch):
@@ -371,7 +371,7 @@ def test_temporary_folders_of_builds_that_are_gone_are_removed(tmp_path, monkeyp
     assert not folder.exists()
 
 
-@pytest.mark.parametrize("number", swap.ENDS)
+@pytest.mark.parametrize("number", swap.END_SIGNALS)
 def test_a_signal_ends_a_solve_in_order(tmp_path, number):
     write_dataset(tmp_path / "drive", simulate("long", 3)[0])
     process = start(tmp_path, "solve", "drive", "--out", "out")
@@ -389,7 +389,7 @@ def test_a_signal_that_is_ignored_stays_so_and_handlers_are_as_before(tmp_path, 
     write_dataset(tmp_path / "drive", drive.without("uwb").without("aruco"))
     seen = []
     monkeypatch.setattr("slamlib.summary.merged", lambda _: seen.append(
-        [signal.getsignal(each) for each in swap.ENDS]) or [])
+        [signal.getsignal(each) for each in swap.END_SIGNALS]) or [])
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         arguments = ["solve", str(tmp_path / "drive"), "--out", str(tmp_path / "out")]

@@ -32,8 +32,8 @@ def test_real_increments_are_never_taken_for_counts_since_the_start():
         lengths = rng.choice([5, 10, 50, 200, 1000], 3)
         for part in (drive, *(cut(drive, rng.integers(2000 - n), n) for n in lengths)):
             for ticks in (part.ticks, -part.ticks):
-                assert counts.run_on(ticks, part.vehicle, part.aruco) == ""
-                assert not counts.may_run_on(ticks, part.vehicle)
+                assert counts.cumulative_reason(ticks, part.vehicle, part.aruco) == ""
+                assert not counts.may_be_cumulative(ticks, part.vehicle)
                 assert not counts.jumps(ticks).any()
 
 
@@ -119,7 +119,7 @@ def test_undecided_counts_are_doubted(change):
     """Without markers: a vehicle that speeds up for as long is possible, but not likely."""
     drive = change(simulated("short", 0)[0])
     drive = replace(drive, aruco=None, ticks=drive.ticks.cumsum(axis=0))
-    assert counts.run_on(drive.ticks, drive.vehicle, None) == ""
+    assert counts.cumulative_reason(drive.ticks, drive.vehicle, None) == ""
     doubt, = doubts_before_solving(drive)
     assert doubt.what == "counts-since-start"
     assert f"up to {abs(drive.ticks).max()} in one row" in doubt.sentence
@@ -201,8 +201,8 @@ def test_manoeuvres_are_never_taken_for_counts_since_the_start():
         ticks = np.diff(np.rint(total), axis=0, prepend=0).astype(int)
         rest = np.zeros((rng.integers(100), 2), int)
         ticks = np.insert(ticks, [rng.integers(1, len(ticks) + 1)] * len(rest), rest, axis=0)
-        assert counts.run_on(ticks, Vehicle(), None) == ""
-        assert not counts.may_run_on(ticks, Vehicle())
+        assert counts.cumulative_reason(ticks, Vehicle(), None) == ""
+        assert not counts.may_be_cumulative(ticks, Vehicle())
         assert not counts.jumps(ticks).any()
 
 
@@ -212,7 +212,7 @@ def test_fast_increments_are_not_doubted_at_a_speed_that_varies():
     for _ in range(200):
         speed = np.minimum(np.arange(400), 40)[:, None] * [500, 490]
         ticks = np.rint(speed * (1 + rng.normal(0, 0.01, (400, 2)))).astype(int)
-        assert not counts.may_run_on(ticks, Vehicle())
+        assert not counts.may_be_cumulative(ticks, Vehicle())
 
 
 def test_counts_that_end_above_the_bound_by_a_leap_are_refused(tmp_path):
@@ -229,7 +229,7 @@ def test_markers_decide_between_a_counter_and_a_vehicle_in_another_unit():
         drive = cut(simulated("short", seed)[0], 0, 400)
         for radius in (1.0, 2.0):
             vehicle = Vehicle(right_radius=radius, left_radius=radius)
-            assert counts.run_on(drive.ticks, vehicle, drive.aruco) == ""
+            assert counts.cumulative_reason(drive.ticks, vehicle, drive.aruco) == ""
 
 
 # Exchanged columns.

@@ -104,7 +104,7 @@ def test_a_moved_slider_redraws_the_figure_with_all_values(monkeypatch):
     monkeypatch.delenv("SLAMLIB_RESULTS", raising=False)
     shown, drawn = [], []
     monkeypatch.setattr(controls, "display", shown.append)
-    explore.show(drawing(drawn), a=explore.slider("a", 1, 0, 9),
+    explore.show_with_controls(drawing(drawn), a=explore.slider("a", 1, 0, 9),
                  b=explore.slider("b", 0.5, 0.0, 1.0, 0.25))
     (a, b), _, said = parts_of(shown[-1])
     assert (a.min, a.max, b.step, b.description) == (0, 9, 0.25, "b")
@@ -222,7 +222,7 @@ def test_the_true_wheels_have_a_smaller_error_than_the_nominal_ones():
     right, left, base = (t.wheel - v.wheel) / v.sigma_wheel
 
     def error(**values):
-        title = explore.wheels(drive, **WHEELS | values).axes[0].get_title(loc="left")
+        title = explore.draw_wheels(drive, **WHEELS | values).axes[0].get_title(loc="left")
         return float(re.search(r"ATE ([\d.]+) m", title)[1])
 
     assert error(right=right, left=left, base=base) < 0.1 * error()
@@ -232,7 +232,7 @@ def test_ellipses_scale_with_the_probability_and_the_sigmas():
     drive = Drive("short", *simulate("short", seed=3))
 
     def longest(**values):
-        band = explore.wheels(drive, **WHEELS | values).axes[1].collections[0]
+        band = explore.draw_wheels(drive, **WHEELS | values).axes[1].collections[0]
         return band.get_paths()[0].vertices[:, 1].max()
 
     assert longest(probability=99) == pytest.approx(
@@ -242,21 +242,21 @@ def test_ellipses_scale_with_the_probability_and_the_sigmas():
 
 def test_localization_from_markers_alone_ends_where_the_camera_sees_too_few():
     for seed in (1, 2):
-        full = curves(explore.cameras({}, explore.SIMULATED, seed, 1, 1.8, 1.0).axes[1])
-        short = curves(explore.cameras({}, explore.SIMULATED, seed, 5, 0.6, 1.0).axes[1])
+        full = curves(explore.draw_cameras({}, explore.SIMULATED, seed, 1, 1.8, 1.0).axes[1])
+        short = curves(explore.draw_cameras({}, explore.SIMULATED, seed, 5, 0.6, 1.0).axes[1])
         assert np.isfinite(full["markers alone"]).all() and np.isnan(short["markers alone"]).any()
         assert len(short["markers alone"]) < len(full["markers alone"])
         assert np.isfinite(short["fused"]).all()
 
 
 def test_without_sightings_only_odometry_is_drawn():
-    fig = explore.cameras({}, explore.SIMULATED, 1, 20, 0.0, 1.0)
+    fig = explore.draw_cameras({}, explore.SIMULATED, 1, 20, 0.0, 1.0)
     assert curves(fig.axes[1]).keys() == {"odometry"} and "only the odometry" in fig.said
 
 
 def largest_marker_errors(kernel, start):
     """Largest error of a marker in m, 5 % wrong labels: of the single kernel, and of the rounds."""
-    plan, _ = explore.graphs({}, explore.SIMULATED, 1, 1.0, 1.0, 5, kernel, start).axes
+    plan, _ = explore.draw_graphs({}, explore.SIMULATED, 1, 1.0, 1.0, 5, kernel, start).axes
     errors = [line for line in plan.lines if len(line.get_xydata()) == 2]  # from true to estimated
     return [max(np.hypot(*np.diff(line.get_xydata(), axis=0)[0]) for line in errors
                 if line.get_color() == plotting.ROLES[role]["color"])
@@ -285,7 +285,7 @@ def test_every_start_of_the_markers_is_tested():
 def test_a_graph_that_assumes_no_slip_is_overconfident():
     """A slip of 5 mm after 1 m: the NEES is consistent if the graph assumes it, and huge if not."""
     def nees(seed, assumed):
-        fig = explore.graphs({}, explore.SIMULATED, seed, 5.0, assumed, 0, "none", "consensus")
+        fig = explore.draw_graphs({}, explore.SIMULATED, seed, 5.0, assumed, 0, "none", "consensus")
         title = fig.axes[1].get_title("left")
         return float(re.search(r"NEES ([\d.]+)", title)[1])
 
@@ -319,11 +319,11 @@ def drawn_on(drive, full, **changed):
     """The figures of chapters 2 to 4 on a recorded Drive, by chapter."""
     values = {"seed": 1, "every": 1, "reach": 9.0, "claimed": 1.0, "slip": 1.0, "assumed": 1.0,
               "wrong": 0, "kernel": "none", "start": "consensus", "late": 0, "off": 0.0,
-              "part": 100, "way": "quadratic"} | changed
+              "part": 100, "range_kernel": "quadratic"} | changed
     names = {2: ("seed", "every", "reach", "claimed"),
              3: ("seed", "slip", "assumed", "wrong", "kernel", "start"),
-             4: ("seed", "late", "off", "part", "way")}
-    draw = {2: explore.cameras, 3: explore.graphs, 4: explore.ranges}
+             4: ("seed", "late", "off", "part", "range_kernel")}
+    draw = {2: explore.draw_cameras, 3: explore.draw_graphs, 4: explore.draw_ranges}
     return {chapter: draw[chapter](full[chapter], drive, **{name: values[name] for name in each})
             for chapter, each in names.items()}
 
@@ -389,13 +389,13 @@ def test_of_a_long_dataset_the_first_part_is_drawn_and_said(recorded):
     twice = aruco.select(np.r_[:len(aruco.pose), :len(aruco.pose)])
     twice = replace(twice, pose=np.r_[aruco.pose, 2000 + aruco.pose])
     part = parts.first_part(replace(often, aruco=twice), "aruco")
-    assert len(part.ticks) == 2000 and len(np.unique(part.aruco.pose)) == parts.MOST_FRAMES
-    said = parts.about(Drive("b", replace(often, aruco=twice), None), part, "it")
+    assert len(part.ticks) == 2000 and len(np.unique(part.aruco.pose)) == parts.MAX_PART_FRAMES
+    said = parts.data_sentences(Drive("b", replace(often, aruco=twice), None), part, "it")
     assert "Only the first 2,000 of the 22,000 poses of b are used." in said
     late = replace(often, aruco=replace(aruco, pose=20_000 + rows[aruco.pose % len(rows)] // 5))
     with pytest.raises(DatasetError, match="in the first 20,000 poses of b, found none"):
         parts.first_part(late, "aruco")
-    assert len(parts.first_part(late).ticks) == parts.MOST_POSES
+    assert len(parts.first_part(late).ticks) == parts.MAX_PART_POSES
 
 
 def test_a_million_poses_are_drawn_as_their_first_part(recorded):
@@ -404,7 +404,7 @@ def test_a_million_poses_are_drawn_as_their_first_part(recorded):
     poses = np.zeros((len(long.ticks), 3))
     full = {chapter: {"b": replace(found["b"], poses=poses)} for chapter, found in full.items()}
     figures = drawn_on(Drive("b", long, None), full) | {
-        1: explore.wheels(Drive("b", long, None), **WHEELS)}
+        1: explore.draw_wheels(Drive("b", long, None), **WHEELS)}
     for fig in figures.values():
         assert "Only the first 20,000 of the 1,000,000 poses of b are used." in fig.said
         assert max(len(line.get_xdata()) for ax in fig.axes for line in ax.lines) == 20_000
@@ -416,7 +416,7 @@ def test_the_camera_can_be_seen_as_far_as_any_dataset_does(recorded):
     near, far = (Drive("c", replace(drive.dataset, aruco=replace(
         a, marker_in_vehicle=a.marker_in_vehicle * [factor, factor, 1.0])), None)
         for factor in (0.5, 2.0))
-    assert explore.farthest([near]) == 1.8                   # as far as the simulated one
-    assert 3.5 < explore.farthest([drive, far, near]) < 3.8
+    assert explore.camera_reach([near]) == 1.8                   # as far as the simulated one
+    assert 3.5 < explore.camera_reach([drive, far, near]) < 3.8
     largest = np.hypot(*far.dataset.aruco.marker_in_vehicle[:, :2].T).max()
-    assert 0 <= explore.farthest([far]) - largest < 0.1 + 1e-9
+    assert 0 <= explore.camera_reach([far]) - largest < 0.1 + 1e-9

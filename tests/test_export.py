@@ -13,7 +13,7 @@ from slamlib.__main__ import main
 from slamlib.export import write_csv, write_tum
 from slamlib.results import read_vehicle_poses, write_vehicle_poses
 from slamlib.simulation import simulate, write_dataset
-from slamlib.swap import MARKER
+from slamlib.swap import UNFINISHED
 
 ABSENT = [np.nan] * 3
 
@@ -96,7 +96,7 @@ def test_evo_finds_the_errors_of_the_summary(solved, tmp_path, problem):
                      (folder / "vehiclePose.mat").write_bytes(b"no MATLAB file")),
      "vehiclePose.mat: expected poses and covariances"),
     (lambda folder: (write_vehicle_poses(folder, np.zeros((2, 3)), np.zeros((2, 3, 3))),
-                     (folder / MARKER).write_text("")), "run it again")])
+                     (folder / UNFINISHED).write_text("")), "run it again")])
 def test_a_folder_without_poses_that_can_be_read_is_one_sentence(tmp_path, capsys, make, said):
     make(tmp_path / "results")
     assert main(["export", str(tmp_path / "results"), "--out", str(tmp_path / "out")]) == 2

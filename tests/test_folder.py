@@ -9,7 +9,7 @@ from test_dialects import assert_same_but_notes
 
 from slamlib.dataset import DatasetError, dataset_names, read_dataset, read_truth
 from slamlib.folder import left_in
-from slamlib.inventory import found
+from slamlib.inventory import inventory_lines
 
 
 @pytest.mark.parametrize("variant", [
@@ -249,7 +249,7 @@ def test_what_lies_beside_the_datasets_is_named(folder):  # noqa: F811
 
 
 def test_what_was_found_is_said(folder):  # noqa: F811
-    assert found(read_dataset(folder), read_truth(folder)) == [
+    assert inventory_lines(read_dataset(folder), read_truth(folder)) == [
         "drive: encoders: 4 poses, 15 ticks right and 80019 left",
         "drive: markers: 3 sightings of 2 markers at 2 poses",
         "drive: ranges: 2 ranges to 2 antennas at 2 poses",
@@ -257,7 +257,7 @@ def test_what_was_found_is_said(folder):  # noqa: F811
     for name in ("ArucoReading.txt", "vehicle.toml"):
         (folder / name).unlink()
     write(folder / "UwbReading.txt", "# none\n")
-    assert found(read_dataset(folder), None) == [
+    assert inventory_lines(read_dataset(folder), None) == [
         "drive: encoders: 4 poses, 15 ticks right and 80019 left",
         "drive: markers: none, no ArucoReading.txt with rows",
         "drive: ranges: none, no UwbReading.txt with rows",

@@ -27,7 +27,7 @@ from slamlib.solve import allows
 drives = start()
 for problem in {problems}:
     left, found = solved([drive for drive in drives if allows(drive.dataset, problem)], [problem])
-    for drive, solution, files in delivered(left, found):
+    for drive, solution, files in write_results(left, found):
         say(f"{{drive.name}}: {{solution.problem}}")"""
 SIX = ["problem1", "problem2", "problem2_hint", "problem2_fused", "problem3", "problem4"]
 

@@ -33,7 +33,7 @@ def draw(a, seconds):
     fig = plt.figure(figsize=(2, 2))
     fig.said = f"a is {a}, drawing {next(number)}"
     return fig
-explore.show(draw, a=explore.slider("a", 10, 0, 100),
+explore.show_with_controls(draw, a=explore.slider("a", 10, 0, 100),
              seconds=explore.slider("seconds", 0.1, 0.0, 2.0, 0.1))"""
 KERNEL = {"kernelspec": {"name": "python3", "display_name": "Python 3 (ipykernel)"}}
 

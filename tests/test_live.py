@@ -12,19 +12,19 @@ import pytest
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 
 from slamlib.notebook import Drive, explore, inline, plotting
-from slamlib.notebook.live import live
+from slamlib.notebook.live import live_figure
 from slamlib.report import build_report
 from slamlib.report.sanitize import sanitized
 from slamlib.simulation import simulate, write_dataset
 
 MOST = 300_000                 # bytes of a figure that can be moved
 CODE = """from functools import partial
-from slamlib.notebook import captioned, delivered, explore, maps, solved, start
+from slamlib.notebook import captioned, write_results, explore, maps, solved, start
 drives, found = solved(start(), ["problem1", "problem4"])
-list(delivered(drives, found))
+list(write_results(drives, found))
 captioned(maps.whole_map(drives[0], found["problem4"][drives[0].name]), "Figure 1.1. Map.")"""
-EXPLORE = """explore.show(
-    partial(explore.wheels, drives[0]), grid={"base": [-40.0, 0.0, 40.0], "right": [0.0, 2.0]},
+EXPLORE = """explore.show_with_controls(
+    partial(explore.draw_wheels, drives[0]), grid={"base": [-40.0, 0.0, 40.0], "right": [0.0, 2.0]},
     right=explore.slider("error of R_R (σ)", 2.0, -4.0, 4.0, 0.25),
     left=explore.slider("error of R_L (σ)", 0.0, -4.0, 4.0, 0.25),
     base=explore.slider("error of b (σ)", 0.0, -40.0, 40.0, 1.0),
@@ -177,7 +177,7 @@ def draw(height, name="one"):
 def test_a_grid_of_figures_shares_what_they_have_in_common(capsys):
     controls = {"height": explore.slider("height", 2, 0, 9),
                 "name": explore.choice("name", ["one", "two"], "two")}
-    fig = live(draw, controls, {"height": [1, 2, 3], "name": ["one", "two"]})
+    fig = live_figure(draw, controls, {"height": [1, 2, 3], "name": ["one", "two"]})
     assert plt.get_fignums() == [fig.number] and fig.axes[0].get_title("left") == "height 2, two"
     states, said = json.loads(html.unescape(re.search('data-live="(.*?)"', fig.moving)[1])).values()
     assert said == [f"The height is {h} < {name}." for h in (1, 2, 3) for name in ("one", "two")]
@@ -190,7 +190,7 @@ def test_a_grid_of_figures_shares_what_they_have_in_common(capsys):
     used = {name for pair in re.findall(r'href="#([^"]*)"|url\(#([^)]*)\)', fig.moving)
             for name in pair if name}
     assert len(ids) == len(set(ids)) and used <= set(ids)
-    assert set(inline.outputs(fig, plotting.pictures(fig))) == {
+    assert set(inline.outputs(fig, plotting.svg_pictures(fig))) == {
         plotting.WIDE, plotting.NARROW, "text/html"}
 
 
@@ -204,7 +204,7 @@ def test_a_plan_keeps_equal_axes_for_all_values():
         return fig
 
     figures = []
-    live(plan, {"size": explore.slider("size", 1, 1, 9)}, {"size": [1, 4]})
+    live_figure(plan, {"size": explore.slider("size", 1, 1, 9)}, {"size": [1, 4]})
     for fig in figures[:2]:
         ax, = fig.axes
         metres = np.array([np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim())])
@@ -219,6 +219,6 @@ def test_the_figure_of_a_chapter_is_small():
     values = dict(right=2.0, left=0.0, base=0.0, sigma_radii=1.0, sigma_base=1.0, probability=95,
                   count=14)
     controls = {name: explore.slider(name, value, -99, 99) for name, value in values.items()}
-    fig = live(partial(explore.wheels, drive), controls, {
+    fig = live_figure(partial(explore.draw_wheels, drive), controls, {
         "base": [-40.0, -20.0, 0.0, 20.0, 40.0], "right": [-2.0, 0.0, 2.0]})
     assert len(fig.moving.encode()) < MOST

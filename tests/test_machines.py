@@ -60,7 +60,7 @@ def test_solve_writes_the_same_on_systems_that_lack_what_linux_has(system, tmp_p
         assert process.returncode == 0 and "\\u03c3: encoders: 60 poses" in told[1], told
         assert "Traceback" not in told[1] and "Warning" not in told[1], told
         assert told[0].startswith("\\u03c3: 60 poses")
-        assert [path.name for path in tmp_path.rglob(".*")] == [swap.WRITTEN]
+        assert [path.name for path in tmp_path.rglob(".*")] == [swap.FILE_LIST]
     poses = read_vehicle_poses(tmp_path / "out" / "problem4")[0]
     subprocess.run([sys.executable, "-m", "slamlib", "solve", "\u03c3", "--out", "here"],
                    cwd=tmp_path, check=True, capture_output=True,
@@ -80,7 +80,7 @@ def test_a_report_is_built_where_windows_lacks_what_unix_has(tmp_path):
     assert "transport: tcp" in (tmp_path / "report" / "1_first.html").read_text(encoding="utf-8")
     assert "href=\"../results/short/problem1/vehiclePose.mat\"" in (
         tmp_path / "report" / "index.html").read_text(encoding="utf-8")
-    assert {path.name for path in tmp_path.rglob(".slamlib*")} == {swap.WRITTEN}
+    assert {path.name for path in tmp_path.rglob(".slamlib*")} == {swap.FILE_LIST}
 
 
 @on_linux
@@ -117,7 +117,7 @@ sys.exit(main())"""
         assert process.returncode == expected, told
     assert ".mat: is open in another program" in told.splitlines()[-1] and "Traceback" not in told
     assert (tmp_path / "out" / "summary.json").exists()
-    assert not (tmp_path / "out" / swap.MARKER).exists()
+    assert not (tmp_path / "out" / swap.UNFINISHED).exists()
 
 
 def test_folders_on_two_drives_of_windows_are_told_before_anything_runs(tmp_path, monkeypatch):
@@ -133,7 +133,7 @@ def test_a_process_runs_or_not():
     """Numbers come from names of files, which may have any."""
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait()
-    assert [locks.runs(number) for number in (os.getpid(), ended.pid, 10**30)] == [
+    assert [locks.process_exists(number) for number in (os.getpid(), ended.pid, 10**30)] == [
         True, False, False]
 
 

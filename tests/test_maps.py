@@ -56,7 +56,7 @@ def test_a_map_shows_path_markers_antennas_guess_truth_and_states_the_enlargemen
         2 * factor * 2.4477 * np.sqrt(np.linalg.eigvalsh(covariances).max()), rel=1e-3)
     of_vehicle = fig.axes[0].collections[0]
     places = of_vehicle.get_offsets()
-    assert len(places) == maps.ELLIPSES and np.isin(places, result.poses[:, :2]).all()
+    assert len(places) == maps.ELLIPSE_COUNT and np.isin(places, result.poses[:, :2]).all()
     own = result.covariances[np.isin(result.poses[:, 0], places[:, 0]), :2, :2]
     assert of_vehicle.get_widths() == pytest.approx(
         2 * factor * 2.4477 * np.sqrt(np.linalg.eigvalsh(own)[:, 1]), rel=1e-3)
@@ -69,7 +69,7 @@ def test_a_map_shows_path_markers_antennas_guess_truth_and_states_the_enlargemen
 def test_a_name_with_dollar_signs_is_no_formula(solved):
     drive, result = solved
     fig = maps.whole_map(replace(drive, name=r"$\foo$ of $x$"), result)
-    wide = plotting.pictures(fig)[plotting.WIDE]
+    wide = plotting.svg_pictures(fig)[plotting.WIDE]
     assert r"$\foo$ of $x$ (95" in wide
     plt.close(fig)
 
@@ -85,8 +85,8 @@ def test_what_a_drive_lacks_is_absent_from_map_and_tables(solved, markers, anten
     expected |= {"ellipses of markers", "markers, headings"} if markers else set()
     expected |= {"antennas: guess", "antennas: estimate"} if antennas else set()
     assert labels(fig) == expected
-    assert set(plotting.pictures(fig)) == {plotting.WIDE, plotting.NARROW}
-    for table, shown in ((maps.landmark_table, antennas), (maps.marker_table, markers)):
+    assert set(plotting.svg_pictures(fig)) == {plotting.WIDE, plotting.NARROW}
+    for table, shown in ((maps.antenna_table, antennas), (maps.marker_table, markers)):
         header, rows = table(drive, result)
         assert bool(rows) == shown and not any("error" in name for name in header)
 
@@ -94,7 +94,7 @@ def test_what_a_drive_lacks_is_absent_from_map_and_tables(solved, markers, anten
 def test_a_dataset_without_guesses_has_an_empty_table(solved):
     drive, result = solved
     nothing = replace(drive, dataset=replace(drive.dataset, uwb=None, antenna_guess=None))
-    header, rows = maps.landmark_table(nothing, parts(result, antennas=False))
+    header, rows = maps.antenna_table(nothing, parts(result, antennas=False))
     assert header[0] == "antenna" and rows == []
 
 
@@ -135,7 +135,7 @@ def test_the_wide_and_the_narrow_map_fill_their_width_at_equal_scales(solved):
 
 def test_tables_hold_every_landmark_and_its_errors(solved):
     drive, result = solved
-    header, rows = maps.landmark_table(drive, result)
+    header, rows = maps.antenna_table(drive, result)
     assert [row[0] for row in rows] == [str(antenna) for antenna in result.antenna]
     assert header[-1] == "error (mm)" and all(len(row) == len(header) for row in rows)
     moved = np.hypot(*(result.antenna_in_world - drive.dataset.antenna_guess.position).T)
@@ -173,13 +173,13 @@ def test_an_antenna_in_doubt_is_called_so_and_drawn_in_its_true_size(solved):
         ")", ", in doubt (?) × 1)")
     widest = max(ellipses.get_widths().max() for ellipses in after.collections)
     assert widest == pytest.approx(2 * 2.4477 * 3, rel=1e-3)
-    assert maps.landmark_table(drive, doubted)[1][0][0] == f"{first} (in doubt)"
+    assert maps.antenna_table(drive, doubted)[1][0][0] == f"{first} (in doubt)"
 
 
 def test_every_landmark_tells_its_name_position_and_sigma_where_it_is_drawn(solved):
     drive, result = solved
     fig = maps.whole_map(drive, result)
-    texts = inline.outputs(fig, plotting.pictures(fig))
+    texts = inline.outputs(fig, plotting.svg_pictures(fig))
     assert set(texts) == {plotting.WIDE, plotting.NARROW, "text/html"}
     for svg in re.findall("<svg.*?</svg>", texts["text/html"]):
         ElementTree.fromstring(svg)
@@ -201,7 +201,7 @@ def test_ids_of_figures_in_one_page_differ(solved):
     ids, pictures = [], []
     for each in (result, parts(result, antennas=False)):
         fig = maps.whole_map(drive, each)
-        pictures.append(inline.outputs(fig, plotting.pictures(fig))["text/html"])
+        pictures.append(inline.outputs(fig, plotting.svg_pictures(fig))["text/html"])
         ids += re.findall(r' id="([^"]*)"', pictures[-1])
     assert len(ids) == len(set(ids)) > 20
     page = "".join(pictures)
@@ -214,5 +214,5 @@ def test_ids_of_figures_in_one_page_differ(solved):
 
 def test_a_figure_without_points_that_tell_stays_a_picture():
     fig, _ = plotting.panels(1)
-    pictures = plotting.pictures(fig)
+    pictures = plotting.svg_pictures(fig)
     assert inline.outputs(fig, pictures) == pictures

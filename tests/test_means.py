@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from slamlib.notebook import decided, number, share, table_text, verdict, with_error
+from slamlib.notebook import is_significant, number, share, table_text, verdict, with_error
 
 THREE = [1.0, 2.0, 3.0]      # mean 2, standard deviation 1, standard error 0.577
 
@@ -32,8 +32,8 @@ def test_shares_are_in_percent():
 
 
 def test_a_difference_is_decided_beyond_two_standard_errors():
-    assert decided(THREE) and decided([-3, -2, -1])         # 2 > 2 * 0.577
-    assert not decided([0.0, 1.0, 2.0])                     # 1 < 2 * 0.577
+    assert is_significant(THREE) and is_significant([-3, -2, -1])         # 2 > 2 * 0.577
+    assert not is_significant([0.0, 1.0, 2.0])                     # 1 < 2 * 0.577
     study = {"a x": np.array([1.0, 1.0, 1.0]), "b x": np.array([2.0, 3.0, 4.0]),
              "c x": np.array([-1.0, 0.0, -2.0]), "d x": np.array([1.0, 2.0, 0.5])}
     assert verdict(study, "abcd", "a", "x", 10) == (
@@ -43,3 +43,8 @@ def test_a_difference_is_decided_beyond_two_standard_errors():
 def test_numbers_of_a_table_have_minus_signs():
     text = table_text(["name", "x", "y"], [["a-1", "-0.5", "+1, -2 ± 3 (-4)"]])
     assert text.splitlines()[-1] == "| a-1 | −0.5 | +1, −2 ± 3 (−4) |"
+
+
+def test_a_row_of_one_cell_is_a_heading():
+    lines = table_text(["name", "x", "y"], [["*short*"], ["a", "1", "2"]]).split("\n")
+    assert lines[2:] == ["| *short* |  |  |", "| a | 1 | 2 |"]

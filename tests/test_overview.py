@@ -12,7 +12,7 @@ from test_pdf import text_of
 from slamlib import evaluation, se2
 from slamlib.dataset import read_dataset, read_truth
 from slamlib.doubt import Doubt
-from slamlib.notebook import about_dashes, median_sigmas, plotting, table_text, with_unit
+from slamlib.notebook import dash_note, median_sigmas, plotting, table_text, with_unit
 from slamlib.report import drives as solved_drives
 from slamlib.report import overview, pdf
 from slamlib.report.chapters import printed
@@ -214,8 +214,8 @@ def test_dashes_are_explained_only_where_some_truth_is_unknown(project):
     folder, written, _ = project
     drives = solved_drives.read_drives(folder / "data", folder / "results", NAMES, written)
     known = [drive for drive in drives if drive.truth is not None]
-    assert len(known) < len(drives) and "dash" in about_dashes(drives)
-    assert about_dashes(known) == ""
+    assert len(known) < len(drives) and "dash" in dash_note(drives)
+    assert dash_note(known) == ""
     assert "dash" not in overview.opening(known).cells[1].source
 
 

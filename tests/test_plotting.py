@@ -66,7 +66,7 @@ def test_a_legend_has_each_label_once_and_as_few_lines_as_fit(labels, lines):
 
 def test_pictures_are_the_same_every_time():
     with plt.rc_context({"svg.hashsalt": "slamlib"}):
-        first, second = (plotting.pictures(drawn(2, 1)[0]) for _ in range(2))
+        first, second = (plotting.svg_pictures(drawn(2, 1)[0]) for _ in range(2))
     assert first == second
     width, narrower = (float(first[kind].split('width="')[1].split("pt")[0])
                        for kind in (plotting.WIDE, plotting.NARROW))
@@ -76,13 +76,13 @@ def test_pictures_are_the_same_every_time():
 def test_a_path_fills_the_narrow_axes_too():
     fig, axes = plotting.panels(1, height=3.0, width=7.2)
     plotting.trajectory(axes[0, 0], np.array([[0.0, 0, 0], [1, 1, 0]]), "truth")
-    plotting.pictures(fig)
+    plotting.svg_pictures(fig)
     assert min(np.ptp(axes[0, 0].get_xlim()), np.ptp(axes[0, 0].get_ylim())) < 1.2
 
 
 def test_a_figure_without_axes_or_legend_stays_as_it_is():
     fig = plt.figure()
-    assert plotting.pictures(fig) == {}
+    assert plotting.svg_pictures(fig) == {}
     ax = fig.add_axes((0.1, 0.1, 0.8, 0.8))
     before = ax.get_position().bounds
     plotting.narrow(fig)

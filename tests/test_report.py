@@ -132,7 +132,7 @@ def test_files_are_index_chapters_in_order_and_the_pdf(built):
     assert [page.name for page in pages] == ["index.html", "1_odometry.html", "2_other.html",
                                              "report.pdf"]
     assert sorted((root / "report").iterdir()) == sorted(
-        [*pages, root / "report" / swap.WRITTEN])
+        [*pages, root / "report" / swap.FILE_LIST])
 
 
 def test_every_formula_arrives_once(built):
@@ -299,10 +299,10 @@ def test_a_page_of_a_notebook_that_is_gone_goes_and_the_user_s_stay(tmp_path):
     (report / "folder.html").mkdir()
     for name in ("2_gone", "3_now gone"):
         (tmp_path / "notebooks" / f"{name}.ipynb").unlink()
-    (report / swap.WRITTEN).unlink()
+    (report / swap.FILE_LIST).unlink()
     build(tmp_path)
     assert sorted(file.name for file in report.iterdir()) == sorted([
-        swap.WRITTEN, "1_text.html", "folder.html", "here.html", "index.html", "latin.html",
+        swap.FILE_LIST, "1_text.html", "folder.html", "here.html", "index.html", "latin.html",
         "my copy.html", "notes.html", "report.pdf"])
 
 
@@ -400,7 +400,7 @@ def test_a_problem_that_fails_costs_one_problem_and_exit_code_3(tmp_path, monkey
     write(tmp_path / "notebooks", "1_solve", "# 1. Solve", ("""from slamlib.notebook import *
 drives = start()
 left, found = solved(drives, ["problem2", "problem2_hint"])
-for drive, solution, files in delivered(drives, found):
+for drive, solution, files in write_results(drives, found):
     say(f"{drive.name}: {files}")""",))
     monkeypatch.chdir(tmp_path)
     reasons = []

@@ -13,13 +13,13 @@ from slamlib.dataset import DatasetError
 from slamlib.doubt import Doubt
 from slamlib.notebook import (
     Drive,
-    delivered,
     notices,
     say_doubts,
     show,
     solved,
     solving,
     where_possible,
+    write_results,
 )
 from slamlib.notebook.show import simulated_drive
 from slamlib.simulation import simulate
@@ -67,7 +67,7 @@ def test_a_drive_that_fails_is_left_out_and_said_and_its_other_problems_are_foun
 
 
 def test_a_problem_that_is_not_needed_costs_no_drive(said, drives):
-    left, found = solved(drives, PROBLEM_2[1:], besides=PROBLEM_2[:1])
+    left, found = solved(drives, PROBLEM_2[1:], optional=PROBLEM_2[:1])
     assert left == drives and set(found["problem2"]) == {"good"}
     assert len(said) == 1 and REASON in said[0][0]
 
@@ -79,7 +79,7 @@ def test_where_every_drive_fails_a_simulated_one_replaces_them(said, drives, tmp
     assert all(left[0].name in found[problem] for problem in PROBLEM_2)
     monkeypatch.setenv("SLAMLIB_RESULTS", str(tmp_path))
     written = [(drive.name, solution.problem, files)
-               for drive, solution, files in delivered(drives[1:] + left, found)]
+               for drive, solution, files in write_results(drives[1:] + left, found)]
     assert written == [("b*d", problem, "`vehiclePose.mat`") for problem in PROBLEM_2[1:]]
     assert sorted(file.relative_to(tmp_path).as_posix() for file in tmp_path.rglob("*.*t")) == [
         "b*d/problem2_fused/vehiclePose.mat", "b*d/problem2_hint/vehiclePose.mat"]
@@ -98,7 +98,7 @@ def test_problem_4_starts_from_problem_3_only_where_there_is_one(said, monkeypat
     monkeypatch.setattr(solve.slam, "estimate", estimate)
     other = replace(dataset, name="other")
     both = [Drive("short", dataset, None), Drive("other", other, None)]
-    left, found = solved(both, ["problem4"], besides=["problem3"])
+    left, found = solved(both, ["problem4"], optional=["problem3"])
     assert left == both and set(found["problem3"]) == {"other"}
     assert previous == [None, None, found["problem3"]["other"]]
     assert "matrices lose their digits &#40;Singular matrix&#41;" in said[0][0]

@@ -165,7 +165,7 @@ from slamlib.slam import *
 drives = start()
 with_sensor(drives, "uwb", "ranges")
 drives, found = solved(drives, ["problem1"])
-for drive, solution, files in delivered(drives, found):
+for drive, solution, files in write_results(drives, found):
     answer("Q", "M", "I", [result_sentence(drive, solution)], f"{files} in {code(drive.name)}")
 table(["a"], [[plain(drive.name)] for drive in drives])"""
 
@@ -274,7 +274,7 @@ def test_names_and_sentences_of_points_in_a_figure_are_text():
     fig, ((ax,),) = plotting.panels(1)
     ax.set_title(NAMES[0])
     inline.tell(ax, np.zeros((1, 2)), [f"marker {NAMES[1]}"], f"Map of {NAMES[0]}\">")
-    outputs = inline.outputs(fig, plotting.pictures(fig))
+    outputs = inline.outputs(fig, plotting.svg_pictures(fig))
     page = page_of(new_code_cell(outputs=[new_output("display_data", outputs)]))
     plt.close(fig)
     inside = page[page.index('<figure class="inline">'):]

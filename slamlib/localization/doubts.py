@@ -137,7 +137,7 @@ def doubts_before_solving(dataset):
 
 def _counts_doubts(dataset):
     """A Doubt if the counts may be those since the start; only for drives with few sightings."""
-    if not counts.may_run_on(dataset.ticks, dataset.vehicle):
+    if not counts.may_be_cumulative(dataset.ticks, dataset.vehicle):
         return []
     return [Doubt("counts-since-start", (
         "The counts in encoderReading.txt change gradually from row to row, up to "

@@ -7,12 +7,19 @@ from slamlib.notebook.answers import (
     slip_in_words,
     with_unit,
 )
-from slamlib.notebook.means import decided, mean_and_error, number, share, verdict, with_error
+from slamlib.notebook.means import (
+    is_significant,
+    mean_and_error,
+    number,
+    share,
+    verdict,
+    with_error,
+)
 from slamlib.notebook.show import (
     Drive,
-    about_dashes,
     captioned,
     code,
+    dash_note,
     interactive,
     listed,
     plain,
@@ -24,10 +31,10 @@ from slamlib.notebook.show import (
     with_sensor,
     with_truth,
 )
-from slamlib.notebook.solving import delivered, notices, say_doubts, solved, where_possible
+from slamlib.notebook.solving import notices, say_doubts, solved, where_possible, write_results
 
-__all__ = ["Drive", "about_dashes", "answer", "captioned", "code", "decided", "delivered",
-           "interactive", "listed", "mean_and_error", "median_sigmas", "notices", "number", "plain",
+__all__ = ["Drive", "answer", "captioned", "code", "dash_note", "interactive", "is_significant",
+           "listed", "mean_and_error", "median_sigmas", "notices", "number", "plain",
            "result_sentence", "results_folder", "say", "say_doubts", "share", "slip_in_words",
            "solved", "start", "table", "table_text", "verdict", "where_possible", "with_error",
-           "with_sensor", "with_truth", "with_unit"]
+           "with_sensor", "with_truth", "with_unit", "write_results"]

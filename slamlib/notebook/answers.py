@@ -1,4 +1,4 @@
-"""The box *Answer* that opens a chapter, and sentences on a result in numbers."""
+"""Shows the box *Answer* that opens a chapter, and makes sentences on a result in numbers."""
 
 import numpy as np
 
@@ -7,11 +7,12 @@ from slamlib.notebook.means import three_digits
 from slamlib.notebook.show import plain, say
 from slamlib.solve import truth_in_world
 
-PARTS = ("Question", "Method", "Initial values", "Result", "Files and figure")
+# Headings of the paragraphs of the box.
+ANSWER_PARTS = ("Question", "Method", "Initial values", "Result", "Files and figure")
 
 
 def answer(question, method, initial_values, results, files):
-    """Show the box *Answer*: a block quote, which the pages and the PDF frame.
+    """Show the box *Answer*, a block quote, around which the pages and the PDF draw a frame.
 
     Parameters
     ----------
@@ -19,7 +20,7 @@ def answer(question, method, initial_values, results, files):
     results : list of str, a sentence for each dataset, as by `result_sentence`.
     """
     texts = (question, method, initial_values, " ".join(results), files)
-    lines = [f"**{part}.** {text}" for part, text in zip(PARTS, texts) if text]
+    lines = [f"**{part}.** {text}" for part, text in zip(ANSWER_PARTS, texts) if text]
     say("> **Answer**\n>\n> " + "\n>\n> ".join(lines))
 
 
@@ -46,14 +47,14 @@ def result_sentence(drive, solution):
     return sentence + f"; ATE {with_unit(ate, 'm')}, {with_unit(aligned, 'm')} aligned."
 
 
-def slip_in_words(found):
-    """Slip after one metre in a SlamResult (str), and how well it is known or that it is given."""
-    number = f"{1e3 * found.slip:.2f} mm"
-    return f"{number} ± {100 * found.noise_sigma[0]:.0f}\u00a0%" if found.noise_sigma[0] \
+def slip_in_words(result):
+    """Slip of a SlamResult after one metre with its relative σ, or "as given" (str)."""
+    number = f"{1e3 * result.slip:.2f} mm"
+    return f"{number} ± {100 * result.noise_sigma[0]:.0f}\u00a0%" if result.noise_sigma[0] \
         else f"{number}, as given"
 
 
 def with_unit(value, unit):
-    """A value with three significant digits and its unit (str), below 1 in thousandths of it."""
+    """A value with three significant digits and its unit (str), below 1 with the prefix milli."""
     value, unit = (value, unit) if abs(value) >= 1 else (1e3 * value, f"m{unit}")
     return f"{three_digits(value)}\u00a0{unit}"

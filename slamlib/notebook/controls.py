@@ -1,8 +1,7 @@
-"""Controls of the Explore sections: widgets in JupyterLab, and fields of the report's HTML pages.
+"""Shows figures with controls: widgets in JupyterLab, and fields in the report's HTML pages.
 
-In JupyterLab the browser holds a widget's values back while the kernel draws for one of them, and
-then sends the latest only, so old ones never wait. The kernel may serve several widgets at once, in
-threads of their own; a lock lets one of them draw at a time.
+While the kernel draws for a widget, the browser keeps only the latest value of it. The kernel may
+serve several widgets in threads; a lock lets one of them draw at a time.
 """
 
 from html import escape
@@ -13,42 +12,42 @@ import matplotlib.pyplot as plt
 from IPython.display import clear_output, display
 from ipywidgets import HTML, Box, Button, Dropdown, FloatSlider, IntSlider, Layout, Output, VBox
 
-from slamlib.notebook.live import live
+from slamlib.notebook.live import live_figure
 from slamlib.notebook.show import Drive, interactive
 from slamlib.solve import UNSOLVABLE
 
-FAST = 0.3                   # s, time of drawing below which a figure follows a dragged slider
+MAX_LIVE_DRAWING = 0.3       # s, drawing time of a figure that follows a dragged slider
 SIMULATED = Drive("simulated", None, None, made_up=True)
-ROW = Layout(display="flex", flex_flow="row wrap")
-SENTENCE = Layout(min_height="3.2em", max_width="62em")       # two lines, so that nothing jumps
+CONTROLS_LAYOUT = Layout(display="flex", flex_flow="row wrap")
+SENTENCE_LAYOUT = Layout(min_height="3.2em", max_width="62em")   # always two lines high
 
 
 def slider(label, start, low, high, step=1):
-    """A slider from `low` to `high`, of integers if all its numbers are, else of floats."""
+    """A slider from `low` to `high`, of integers if all arguments are integers, else of floats."""
     whole = all(isinstance(number, int) for number in (start, low, high, step))
     return (IntSlider if whole else FloatSlider)(start, min=low, max=high, step=step,
                                                  description=label)
 
 
 def choice(label, options, start):
-    """A drop-down list of names; its value is the name chosen, `start` at first."""
+    """A drop-down list of names (str), of which `start` is chosen first."""
     return Dropdown(options=list(options), value=start, description=label)
 
 
 def drive_choice(drives):
-    """A drop-down list whose value is one of these Drives, or SIMULATED, which it is at first."""
+    """A drop-down list of SIMULATED, which is chosen first, and these recorded Drives."""
     return Dropdown(description="drive", options=[
         (drive.name, drive) for drive in (SIMULATED, *drives) if drive is SIMULATED
         or not drive.made_up])
 
 
-def show(draw, grid=None, only_simulated=(), **controls):
+def show_with_controls(draw, grid=None, only_simulated=(), **controls):
     """Show the figure of draw(**values), in JupyterLab with controls of the values.
 
     Parameters
     ----------
-    draw : function of the controls' values, by name, that makes one figure. What its attribute
-        `said` (str) says stands between the controls and the figure.
+    draw : function of the controls' values, by name, that returns a figure. Its attribute `said`
+        (str) is shown between the controls and the figure.
     grid : dict by name of the values (list) that some controls have in the report's HTML page.
     only_simulated : names of the controls that change nothing unless the control `drive`, which is
         by `drive_choice`, is SIMULATED.
@@ -57,19 +56,20 @@ def show(draw, grid=None, only_simulated=(), **controls):
     if interactive():
         display(panel(draw, controls, only_simulated))
     else:
-        live(draw, controls, grid or {})
+        live_figure(draw, controls, grid or {})
 
 
 def panel(draw, controls, only_simulated=()):
-    """A widget: the controls and a button Reset, the sentence and the figure; as of `show`.
+    """A widget of controls, a button Reset, the sentence and the figure, for `show_with_controls`.
 
     A slider redraws the figure while it is dragged if the last drawing that it or a list caused
-    took less than FAST; else when it is released. The first drawing, which also loads typefaces,
-    and those of Reset, which may be remembered, do not count. Reset replaces the widgets: values of
-    the old ones that the browser still holds back are lost with these.
+    took less than MAX_LIVE_DRAWING, else when it is released. The first drawing, which also loads
+    typefaces, and those of Reset, which may be cached, do not count. Reset replaces the widgets, so
+    that the browser drops the values of the old ones that it has not sent.
     """
-    row, reset = Box(layout=ROW), Button(description="Reset", tooltip="Return to the first values")
-    said, picture = HTML(layout=SENTENCE), Output()
+    row = Box(layout=CONTROLS_LAYOUT)
+    reset = Button(description="Reset", tooltip="Return to the first values")
+    said, picture = HTML(layout=SENTENCE_LAYOUT), Output()
     first, shown = {name: control.value for name, control in controls.items()}, {}
     lock, drawn = RLock(), {}
 
@@ -84,7 +84,7 @@ def panel(draw, controls, only_simulated=()):
                 shown[name].disabled = values["drive"] is not SIMULATED
             said.value = _drawn(draw, values, picture)
             if change is not None:
-                fast = perf_counter() - begin < FAST
+                fast = perf_counter() - begin < MAX_LIVE_DRAWING
                 sliders = [each for each in shown.values() if each.has_trait("continuous_update")]
                 for each in [change.owner] if change.owner in sliders else sliders:
                     each.continuous_update = fast
@@ -104,20 +104,18 @@ def panel(draw, controls, only_simulated=()):
 
 
 def _drawn(draw, values, picture):
-    """What the figure of draw(**values), shown in an Output, says as HTML; or why there is none."""
-    said = ""
+    """Show the figure of draw(**values) in an Output; its or the error's sentence as HTML (str)."""
     with picture:                                # which also shows other exceptions
         try:
             fig = draw(**values)
         except UNSOLVABLE as error:
             clear_output()
-            said = escape(f"There is no solution with these values: {error}.")
-        else:
-            clear_output(wait=True)
-            display(fig)
-            plt.close(fig)
-            said = escape(getattr(fig, "said", ""))
-    return said
+            return escape(f"There is no solution with these values: {error}.")
+        clear_output(wait=True)
+        display(fig)
+        plt.close(fig)
+        return escape(getattr(fig, "said", ""))
+    return ""
 
 
 def _copy(control, value):

@@ -1,7 +1,7 @@
-"""Figures that can be moved in an HTML page: drawn for a grid of values when the page is made.
+"""Makes figures with controls for HTML pages: drawn for a grid of values when the page is made.
 
-The figures of all values become one set of SVG parts and, for each value, the list of its parts;
-what figures have in common is stored once. The page's script (`report/page.js`) shows the parts of
+The figures of all values become one set of SVG parts and, for each value, the list of its parts,
+so that common parts are stored once. The page's script (`report/page.js`) shows the parts of
 the values that the reader chooses. Without a script the figure of the first values stands still.
 """
 
@@ -20,16 +20,16 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from slamlib.notebook.inline import shortened
 
 SVG, LINK = "{http://www.w3.org/2000/svg}", "{http://www.w3.org/1999/xlink}href"
-SIMPLIFY = 0.5                 # points, by which drawn curves may differ from the computed ones
+CURVE_TOLERANCE = 0.5        # points, largest difference of drawn curves from the computed ones
 
 
-def live(draw, controls, grid):
-    """The figure by draw(**values) of the controls' values, with HTML to move it as its `moving`.
+def live_figure(draw, controls, grid):
+    """The figure by draw(**values) of the controls' values; its attribute `moving` is HTML (str).
 
     Parameters
     ----------
-    draw : function of values by name that makes one figure. What its attribute `said` (str) says
-        stands below the controls.
+    draw : function of values by name that returns a figure. Its attribute `said` (str) is shown
+        below the controls.
     controls : dict of widgets by name.
     grid : dict by name of the values (list) of some controls, their own value among them.
     """
@@ -129,23 +129,23 @@ def _html(figures, fields, first):
 def _parts(fig, definitions):
     """The SVG parts (lists of str) of each axes and of the legend; their definitions by id."""
     text = io.StringIO()
-    with plt.rc_context({"path.simplify_threshold": SIMPLIFY}):
+    with plt.rc_context({"path.simplify_threshold": CURVE_TOLERANCE}):
         FigureCanvasSVG(fig).print_svg(text, metadata={"Date": None})    # without a second layout
     root = ElementTree.fromstring(text.getvalue().encode())
     for parent in list(root.iter()):
         for child in [child for child in parent if child.tag == f"{SVG}defs"]:
             for definition in child:
                 if name := definition.get("id"):
-                    definitions.setdefault(name, _text(definition))
+                    definitions.setdefault(name, _compact_element(definition))
             parent.remove(child)
     groups = {group.get("id"): group for group in root.iter(f"{SVG}g")}
     axes = [groups[f"axes_{number + 1}"] for number in range(len(fig.axes))]
-    legend = [_text(group) for name, group in groups.items() if name and name[:7] == "legend_"
-              and not any(group in list(ax) for ax in axes)]
-    return [[_text(part) for part in group] for group in axes], legend
+    legend = [_compact_element(group) for name, group in groups.items()
+              if name and name[:7] == "legend_" and not any(group in list(ax) for ax in axes)]
+    return [[_compact_element(part) for part in group] for group in axes], legend
 
 
-def _text(element):
+def _compact_element(element):
     """An element as compact SVG (str); only definitions keep their ids."""
     for part in element.iter():
         if LINK in part.attrib:

@@ -1,10 +1,8 @@
-"""The whole map of one drive: a figure of all landmarks with their names, and tables of them.
+"""Draws the whole map of one drive with the names of its landmarks, and makes tables of them.
 
 A result is a `slam.SlamResult`; it may have no markers or no antennas. Truth enters here only: it
 is drawn, and errors are computed from it, where the drive has it.
 """
-
-from dataclasses import replace
 
 import numpy as np
 
@@ -15,14 +13,14 @@ from slamlib.notebook.names import Names
 
 WIDTH = 7.4                    # inches, the whole width of the page
 HEIGHTS = 2.6, 4.0, 5.7        # inches: lowest axes; highest ones of few and of many landmarks
-MANY = 60                      # landmarks
-POINT = 1.0                    # rad^2, variance of the heading of a marker without orientation
-MARGIN = 0.04                  # of the map's extent around it
-TICK = 0.022                   # length of a marker's heading tick, of the map's extent
-ELLIPSES = 16                  # of the vehicle, at equal distances along the path
-LARGEST = 0.045                # semi-axis of the largest ellipse, of the map's extent
-NAME, ANTENNA_NAME = 6.2, 10.0                         # points, sizes of the names
-MARKER, ANTENNA = "#CC79A7", "#44AA99"                 # colours of the ellipses
+MIN_MANY_LANDMARKS = 60        # landmarks of a map that may have the largest height
+MIN_POINT_VARIANCE = 1.0       # rad^2, variance of the heading of a marker without orientation
+MAP_MARGIN = 0.04              # around the map, in its extent
+TICK_LENGTH = 0.022            # of a marker's heading tick, in the map's extent
+ELLIPSE_COUNT = 16             # ellipses of the vehicle, at equal distances along the path
+MAX_SEMI_AXIS = 0.045          # of the largest ellipse, in the map's extent
+NAME, ANTENNA_NAME = 6.2, 10.0     # points, font sizes of the names of markers and antennas
+MARKER, ANTENNA = "#CC79A7", "#44AA99"     # colours of the ellipses
 
 
 def whole_map(drive, result):
@@ -44,12 +42,13 @@ def whole_map(drive, result):
     role = "slam_uwb" if len(result.antenna) else "slam"
     plotting.trajectory(ax, result.poses, role, "vehicle", linewidth=1.5,
                         linestyle="-")
-    at = plotting.spread(result.poses, ELLIPSES)
-    plotting.ellipses(ax, result.poses[at], result.covariances[at], plotting.ROLES[role]["color"],
-                      enlarged=enlarged, fit=False, fill=0.35, label="its ellipses")
+    some = plotting.equidistant(result.poses, ELLIPSE_COUNT)
+    plotting.ellipses(ax, result.poses[some], result.covariances[some],
+                      plotting.ROLES[role]["color"], enlarged=enlarged, fit=False, fill=0.35,
+                      label="its ellipses")
     if drive.truth is not None:
         plotting.trajectory(ax, drive.truth.poses, "truth", linewidth=0.7)
-    names = [*_markers(ax, drive, result, enlarged, TICK * size),
+    names = [*_markers(ax, drive, result, enlarged, TICK_LENGTH * size),
              *_antennas(ax, drive, result, enlarged)]
     ax.set_title(_title(drive, result, enlarged))
     if is_tall:                                     # axes fill the width, with room at both sides
@@ -61,7 +60,7 @@ def whole_map(drive, result):
     for ellipses in ax.collections:
         ellipses.set_linewidth(0.7)
     ax.add_artist(Names(names, _guesses(drive, result), np.concatenate([
-        result.poses[:, :2], *_ticks(result, TICK * size), *_outlines(result, enlarged)])))
+        result.poses[:, :2], *_ticks(result, TICK_LENGTH * size), *_outlines(result, enlarged)])))
     if names:
         inline.tell(ax, np.array([place for _, place, _ in names]), _sentences(drive, result),
                     f"Map of {drive.name}")
@@ -82,15 +81,15 @@ def _markers(ax, drive, result, enlarged, tick):
     if drive.truth is not None and len(drive.truth.marker):
         ax.plot(*drive.truth.marker_in_world[:, :2].T, "+", color="black", markersize=4.5,
                 markeredgewidth=0.6, zorder=5, label="markers: truth")
-    for marker, at in zip(result.marker, place, strict=True):
-        yield str(marker), at, NAME
+    for marker, position in zip(result.marker, place, strict=True):
+        yield str(marker), position, NAME
 
 
 def _ticks(result, length):
     """Points (5, k, 2) on the heading ticks of the markers that have a heading, ends included."""
     place, heading = np.split(result.marker_in_world[_oriented(result)], [2], axis=1)
-    way = length * np.hstack([np.cos(heading), np.sin(heading)])
-    return place + np.linspace(0, 1, 5)[:, None, None] * way
+    tick = length * np.hstack([np.cos(heading), np.sin(heading)])
+    return place + np.linspace(0, 1, 5)[:, None, None] * tick
 
 
 def _antennas(ax, drive, result, enlarged):
@@ -102,38 +101,37 @@ def _antennas(ax, drive, result, enlarged):
         if which.any():
             plotting.ellipses(ax, place[which], result.antenna_covariance[which], ANTENNA,
                               enlarged=factor, fill=0.3, fit=False)
-    guess = _guesses(drive, result)
-    ax.plot(*np.stack([guess, place]).transpose(2, 0, 1), color="#999999", linewidth=0.8, zorder=2)
-    ax.plot(*guess.T, label="antennas: guess", **plotting.ROLES["guess"])
-    ax.plot(*place.T, label="antennas: estimate", **plotting.ROLES["antenna"],
-            markerfacecolor="#aaaaaa", markeredgewidth=0.8)
-    if drive.truth is not None and len(drive.truth.antenna):
-        ax.plot(*drive.truth.antenna_in_world.T, label="antennas: truth",
-                **plotting.ROLES["true antenna"])
-    for antenna, at, doubtful in zip(result.antenna, place, doubt, strict=True):
-        yield f"{antenna}{'?' * int(doubtful)}", at, ANTENNA_NAME
+    plotting.antenna_positions(
+        ax, place, _guesses(drive, result), drive.truth and drive.truth.antenna_in_world,
+        markerfacecolor="#aaaaaa", markeredgewidth=0.8)
+    for antenna, position, doubtful in zip(result.antenna, place, doubt, strict=True):
+        yield f"{antenna}{'?' * int(doubtful)}", position, ANTENNA_NAME
 
 
-def landmark_table(drive, result):
+def antenna_table(drive, result):
     """Header (list of str) and rows (lists of str) of a table of all antennas of a result.
 
     Each row has id, position, standard deviations, the distance from the guess and, where the
-    truth is known, that from the true position. An antenna in doubt is called so behind its id.
+    truth is known, that from the true position. Antennas in doubt are marked behind the id.
     """
-    moved = _apart(result.antenna_in_world, _guesses(drive, result))
-    sigma = evaluation.sigmas(result.antenna_covariance)
     header = ["antenna", "x (m)", "y (m)", "σ of x (mm)", "σ of y (mm)", "from the guess (mm)"]
-    rows = [[f"{antenna} (in doubt)" if doubtful else str(antenna), *map(_metres, place),
-             *map(_thousandths, s), _thousandths(distance)]
+    rows = _antenna_rows(drive, result)
+    if drive.truth is None or not len(drive.truth.antenna):
+        return header, rows
+    true = plotting.places_by_id(drive.truth.antenna, drive.truth.antenna_in_world, result.antenna)
+    errors = _distances(result.antenna_in_world, true)
+    return [*header, "error (mm)"], [[*row, _thousandths(error)]
+                                     for row, error in zip(rows, errors, strict=True)]
+
+
+def _antenna_rows(drive, result):
+    moved = _distances(result.antenna_in_world, _guesses(drive, result))
+    sigma = evaluation.sigmas(result.antenna_covariance)
+    return [[f"{antenna} (in doubt)" if doubtful else str(antenna), *map(_metres, place),
+             *map(_thousandths, [*s, distance])]
             for antenna, doubtful, place, s, distance in zip(
                 result.antenna, in_doubt(result), result.antenna_in_world, sigma, moved,
                 strict=True)]
-    if drive.truth is None or not len(drive.truth.antenna):
-        return header, rows
-    true = _rows(drive.truth.antenna, drive.truth.antenna_in_world, result.antenna)
-    errors = _apart(result.antenna_in_world, true)
-    return [*header, "error (mm)"], [[*row, _thousandths(error)]
-                                     for row, error in zip(rows, errors, strict=True)]
 
 
 def marker_table(drive, result):
@@ -143,37 +141,39 @@ def marker_table(drive, result):
     true position and the error of the heading. A marker without orientation has no heading.
     """
     header = ["marker", "x (m)", "y (m)", "δ (°)", "σ of x (mm)", "σ of y (mm)", "σ of δ (mrad)"]
-    sigma, known = evaluation.sigmas(result.marker_covariance), _oriented(result)
-    angle = [f"{np.degrees(heading):.1f}" if is_known else "–"
-             for heading, is_known in zip(result.marker_in_world[:, 2], known, strict=True)]
-    sigma[~known, 2] = np.nan
-    rows = [[str(marker), *map(_metres, pose[:2]), heading, *map(_thousandths, s)]
-            for marker, pose, heading, s in zip(result.marker, result.marker_in_world, angle, sigma,
-                                                strict=True)]
+    rows = _marker_rows(result)
     if drive.truth is None or not len(drive.truth.marker):
         return header, rows
-    true = _rows(drive.truth.marker, drive.truth.marker_in_world, result.marker)
-    errors = _apart(result.marker_in_world, true)
-    turned = np.where(known, np.abs(se2.wrap(result.marker_in_world[:, 2] - true[:, 2])), np.nan)
+    true = plotting.places_by_id(drive.truth.marker, drive.truth.marker_in_world, result.marker)
+    errors = _distances(result.marker_in_world, true)
+    turned = np.abs(se2.wrap(result.marker_in_world[:, 2] - true[:, 2]))
+    turned[~_oriented(result)] = np.nan
     return ([*header, "error (mm)", "error of δ (mrad)"],
             [[*row, _thousandths(error), _thousandths(angle)]
              for row, error, angle in zip(rows, errors, turned, strict=True)])
 
 
+def _marker_rows(result):
+    pose, sigma = result.marker_in_world.copy(), evaluation.sigmas(result.marker_covariance)
+    pose[~_oriented(result), 2] = sigma[~_oriented(result), 2] = np.nan
+    return [[str(marker), _metres(x), _metres(y),
+             "–" if np.isnan(heading) else f"{np.degrees(heading):.1f}", *map(_thousandths, s)]
+            for marker, (x, y, heading), s in zip(result.marker, pose, sigma, strict=True)]
+
+
 def _sentences(drive, result):
-    """What each marker, then each antenna, tells when it is pointed at, a list of str."""
-    _, rows = marker_table(replace(drive, truth=None), result)
+    """Sentences (list of str) on each marker, then on each antenna, for the pointer."""
     told = [f"marker {marker}: x {x} m, y {y} m, δ {angle}°; σ {s[0]} mm, {s[1]} mm, {s[2]} mrad"
             if angle != "–" else f"marker {marker}: x {x} m, y {y} m; σ {s[0]} mm, {s[1]} mm"
-            for marker, x, y, angle, *s in rows]
-    _, rows = landmark_table(replace(drive, truth=None), result)
+            for marker, x, y, angle, *s in _marker_rows(result)]
     return told + [f"antenna {antenna}: x {x} m, y {y} m; σ {s[0]} mm, {s[1]} mm; "
-                   f"{moved} mm from its guess" for antenna, x, y, *s, moved in rows]
+                   f"{moved} mm from its guess"
+                   for antenna, x, y, *s, moved in _antenna_rows(drive, result)]
 
 
 def _oriented(result):
     """Which markers of a result have a heading, (k,) bool; the others are points."""
-    return result.marker_covariance[:, 2, 2] < POINT
+    return result.marker_covariance[:, 2, 2] < MIN_POINT_VARIANCE
 
 
 def in_doubt(result):
@@ -186,15 +186,15 @@ def _extent(drive, result):
     shown = np.concatenate([result.poses[:, :2], result.marker_in_world[:, :2],
                             result.antenna_in_world, _guesses(drive, result)])
     low, high = np.nanmin(shown, axis=0), np.nanmax(shown, axis=0)
-    margin = MARGIN * max((high - low).max(), 1.0)
+    margin = MAP_MARGIN * max((high - low).max(), 1.0)
     return low - margin, high + margin
 
 
 def _guesses(drive, result):
     """Guessed positions (a, 2) of a result's antennas."""
     guess = drive.dataset.antenna_guess
-    return _rows(*((), np.empty((0, 2))) if guess is None else (guess.antenna, guess.position),
-                 result.antenna)
+    ids, places = ((), np.empty((0, 2))) if guess is None else (guess.antenna, guess.position)
+    return plotting.places_by_id(ids, places, result.antenna)
 
 
 def _outlines(result, enlarged):
@@ -212,22 +212,20 @@ def _height(extent, result):
     The axes have the map's shape within HEIGHTS. A tall map would be higher at the page's width.
     """
     low, few, many = HEIGHTS
-    highest = many if len(result.marker) + len(result.antenna) > MANY else few
+    highest = many if len(result.marker) + len(result.antenna) > MIN_MANY_LANDMARKS else few
     wanted = (WIDTH - 0.7) * extent[1] / extent[0]
     return float(np.clip(wanted, low, highest)) + 1.1, bool(wanted > highest)
 
 
 def _enlargement(result, size):
-    """Factor 1, 2, 5, 10, ... on the ellipses; the largest that is not in doubt is LARGEST."""
+    """Factor 1, 2, 5, 10, ... on the ellipses, of which all without doubt fit MAX_SEMI_AXIS."""
     covariances = np.concatenate([result.marker_covariance[:, :2, :2],
                                   result.antenna_covariance[~in_doubt(result)]])
     if not len(covariances):
         return 1
     axes = np.sqrt(np.linalg.eigvalsh(covariances)[:, 1])
     largest = evaluation.REACH_95 * np.quantile(axes, 0.95)
-    steps = np.outer(10.0 ** np.arange(4), [1, 2, 5]).ravel()
-    fitting = steps[steps * largest <= LARGEST * size]
-    return int(fitting[-1]) if len(fitting) else 1
+    return plotting.round_factor(largest, MAX_SEMI_AXIS * size)
 
 
 def _title(drive, result, enlarged):
@@ -238,15 +236,7 @@ def _title(drive, result, enlarged):
     return f"{name} (95 % ellipses × {enlarged}{doubtful})"
 
 
-def _rows(ids, places, wanted):
-    """Places (m, c) of the wanted ids (k,), NaN for ids that have none."""
-    found = dict(zip(np.asarray(ids).tolist(), places, strict=True))
-    none = np.full(np.shape(places)[1], np.nan)
-    return np.array([found.get(i, none) for i in np.asarray(wanted).tolist()]).reshape(
-        len(wanted), len(none))
-
-
-def _apart(places, others):
+def _distances(places, others):
     return np.hypot(*(places - others)[:, :2].T)
 
 

@@ -1,16 +1,16 @@
-"""Numbers as text: three significant digits, and means over drives with their standard errors."""
+"""Writes numbers as text: with three digits, and means over drives with their standard errors."""
 
 import numpy as np
 
 from slamlib.notebook.show import listed
 
-LARGE = 1e4                  # means above it tell nothing but that a method fails
+MAX_MEAN = 1e4               # larger means are not shown, because the method failed
 
 
 def number(value):
     """A value with three significant digits and at most two decimals (str)."""
     size = abs(value)
-    return _text(value, 0 if size >= 100 else 1 if size >= 10 else 2)
+    return _fixed_point(value, 0 if size >= 100 else 1 if size >= 10 else 2)
 
 
 def three_digits(value):
@@ -27,23 +27,23 @@ def mean_and_error(series):
 def with_error(series, scale=1.0, signed=False):
     """Mean ± standard error (str) of `scale` times a series (n,) over drives.
 
-    The error has two digits, with at most three decimals.
+    The error has two significant digits and at most three decimals.
     """
     mean, error = mean_and_error(scale * np.asarray(series, float))
-    if mean > LARGE:
-        return f"> {LARGE:,.0f}"
+    if mean > MAX_MEAN:
+        return f"> {MAX_MEAN:,.0f}"
     decimals = int(np.clip(1 - np.floor(np.log10(error)), 0, 3)) if error > 0 else 2
-    return f"{_plus(mean, signed)}{_text(mean, decimals)} ± {_text(error, decimals)}"
+    return f"{_plus(mean, signed)}{_fixed_point(mean, decimals)} ± {_fixed_point(error, decimals)}"
 
 
-def share(yes, signed=False):
-    """Share in percent ± standard error (str) of a series (n,) of 0 and 1, or of shares."""
-    mean, error = mean_and_error(100 * np.asarray(yes, float))
-    text = _plus(mean, signed) + _text(mean, 0)
+def share(series, signed=False):
+    """Percentage ± standard error (str) of a series (n,) of 0 and 1, or of shares."""
+    mean, error = mean_and_error(100 * np.asarray(series, float))
+    text = _plus(mean, signed) + _fixed_point(mean, 0)
     return f"{text}\u00a0±\u00a0{error:.0f}\u00a0%" if error else f"{text}\u00a0%"
 
 
-def _text(value, decimals):
+def _fixed_point(value, decimals):
     return f"{value:z,.{decimals}f}".replace("-", "−")
 
 
@@ -51,23 +51,23 @@ def _plus(mean, signed):
     return "+" if signed and mean > 0 else ""
 
 
-def decided(series):
-    """True if the mean of a series (n,) over drives is beyond two standard errors."""
+def is_significant(series):
+    """True if the mean of a series (n,) over drives exceeds two standard errors in size."""
     mean, error = mean_and_error(series)
     return bool(abs(mean) > 2 * error)
 
 
-def verdict(study, ways, default, key, scale):
-    """How ways differ from the default on the same drives: parts of a sentence (str).
+def verdict(study, methods, default, key, scale):
+    """Differences of methods from the default on the same drives, parts of a sentence (str).
 
-    `study` has series (n,) by the name "way key"; differences are multiplied by `scale`.
+    `study` has series (n,) by the name "method key"; differences are multiplied by `scale`.
     """
     groups = {"larger with": [], "smaller with": [], "undecided with": []}
-    for way in ways:
-        if way != default:
-            more = scale * (study[f"{way} {key}"] - study[f"{default} {key}"])
-            group = "undecided with" if not decided(more) else \
+    for method in methods:
+        if method != default:
+            more = scale * (study[f"{method} {key}"] - study[f"{default} {key}"])
+            group = "undecided with" if not is_significant(more) else \
                 "larger with" if more.mean() > 0 else "smaller with"
-            groups[group].append(f"{way} ({with_error(more, signed=True)})")
+            groups[group].append(f"{method} ({with_error(more, signed=True)})")
     return "; ".join(f"{group} {listed(found)}"
                      for group, found in groups.items() if found)

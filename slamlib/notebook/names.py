@@ -1,4 +1,4 @@
-"""Names beside landmarks in a map, placed where they cover neither each other nor a landmark."""
+"""Draws names beside landmarks in a map where they cover neither each other nor a landmark."""
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -8,23 +8,25 @@ from matplotlib.transforms import IdentityTransform
 
 from slamlib.odometry import cumulative
 
-DIRECTIONS = np.radians([40, 140, -40, -140, 90, -90, 0, 180, 65, 115, -65, -115, 20, 160])
-REACHES = (4.0, 6.0, 9.0, 13.0)      # points, from a landmark to the nearest point of its name
-OVERLAP, LANDMARK, PATH, FAR = 100.0, 30.0, 1.0, 0.6     # cost of what a place covers, and of reach
+# rad, directions from a landmark to its name, tried in this order.
+NAME_DIRECTIONS = np.radians([40, 140, -40, -140, 90, -90, 0, 180, 65, 115, -65, -115, 20, 160])
+NAME_DISTANCES = (4.0, 6.0, 9.0, 13.0)      # points, from a landmark to its name's box
+# Costs: of overlap with a name, of a covered landmark or path point, and of a point of distance.
+OVERLAP, LANDMARK, PATH, FAR = 100.0, 30.0, 1.0, 0.6
+# Background of a name.
 PAPER = dict(facecolor="white", alpha=0.7, linewidth=0, boxstyle="square,pad=0.05")
-LEADER = 7.0                         # points, from which a line leads to the name
+LEADER = 7.0                         # points, distance of a name from which a line leads to it
 
 
 class Names(Artist):
     """An artist that writes names beside landmarks.
 
-    It looks for their places whenever it is drawn, because a figure has several widths.
+    It chooses their places whenever it is drawn, because a figure has several widths.
 
     Parameters
     ----------
     names : list of (name, place (2,), font size in points); the last are placed first.
-    symbols, avoided : (m, 2) and (n, 2) points that should not be covered, symbols even less than
-        the others; NaN are left out.
+    symbols, avoided : (m, 2) and (n, 2) points to keep free, symbols first; NaN are left out.
     """
 
     def __init__(self, names, symbols, avoided):
@@ -36,7 +38,7 @@ class Names(Artist):
         self.set_in_layout(False)
 
     def draw(self, renderer):
-        """Write all names, each with a thin line to its landmark where it is far from it."""
+        """Write all names, with a thin line to landmarks that are far."""
         if not self.names:
             return
         for text, line in self.placed(renderer):
@@ -53,7 +55,7 @@ class Names(Artist):
         to_display, point = self.axes.transData, renderer.points_to_pixels(1.0)
         anchors = to_display.transform(np.array([place for _, place, _ in self.names]))
         symbols = np.vstack([anchors, to_display.transform(self.symbols)])
-        path = _thinned(to_display.transform(self.avoided), 2 * point)
+        path = _spaced_points(to_display.transform(self.avoided), 2 * point)
         frame, boxes, placed = self.axes.bbox, np.empty((0, 4)), []
         for (name, _, size), anchor in zip(self.names, anchors, strict=True):
             text = Text(0, 0, name, fontsize=size, color="black", ha="center",
@@ -73,9 +75,9 @@ class Names(Artist):
 
 def _candidates(anchor, half, point):
     """Centres (c, 2) in pixels of places around an anchor, and their distances (c,) in points."""
-    direction = np.column_stack([np.cos(DIRECTIONS), np.sin(DIRECTIONS)])
-    reach = np.repeat(REACHES, len(direction))
-    direction = np.tile(direction, (len(REACHES), 1))
+    direction = np.column_stack([np.cos(NAME_DIRECTIONS), np.sin(NAME_DIRECTIONS)])
+    reach = np.repeat(NAME_DISTANCES, len(direction))
+    direction = np.tile(direction, (len(NAME_DISTANCES), 1))
     # from the anchor, `reach` to the edge of the name's box
     edge = np.min(half / np.maximum(np.abs(direction), 1e-9), axis=1)
     return anchor + direction * (edge + reach * point)[:, None], reach
@@ -84,18 +86,18 @@ def _candidates(anchor, half, point):
 def _costs(centres, half, boxes, symbols, path, frame):
     """Cost (c,) of names with half sizes (2,) at centres (c, 2), all in pixels."""
     low, high = centres - half, centres + half
-    over = np.prod(np.clip(np.minimum(high[:, None], boxes[:, 2:] + 1)
-                           - np.maximum(low[:, None], boxes[:, :2] - 1), 0, None), axis=2)
-    cost = OVERLAP * np.sum(over > 0, axis=1) + OVERLAP * over.sum(axis=1) / np.prod(2 * half)
-    for points, each in ((symbols, LANDMARK), (path, PATH)):
+    overlap = np.prod(np.clip(np.minimum(high[:, None], boxes[:, 2:] + 1)
+                              - np.maximum(low[:, None], boxes[:, :2] - 1), 0, None), axis=2)
+    cost = OVERLAP * (np.sum(overlap > 0, axis=1) + overlap.sum(axis=1) / np.prod(2 * half))
+    for points, weight in ((symbols, LANDMARK), (path, PATH)):
         points = points[((points > low.min(0) - 2) & (points < high.max(0) + 2)).all(axis=1)]
         inside = ((points > low[:, None] - 2) & (points < high[:, None] + 2)).all(axis=2)
-        cost = cost + each * inside.sum(axis=1)
+        cost = cost + weight * inside.sum(axis=1)
     outside = (low < [frame.x0, frame.y0]).any(axis=1) | (high > [frame.x1, frame.y1]).any(axis=1)
     return cost + OVERLAP * outside
 
 
-def _thinned(points, step):
+def _spaced_points(points, step):
     """Points (n, 2) of a path, each at least about `step` from the one before."""
     travelled = cumulative(np.hypot(*np.diff(points, axis=0).T))
     return points[np.unique(np.searchsorted(travelled, np.arange(0, travelled[-1] + step, step),

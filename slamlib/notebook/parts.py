@@ -1,17 +1,33 @@
-"""What the Explore sections draw: simulated drives, parts of datasets, and their comparison."""
+"""Draws what the Explore figures have in common: drives or parts of them, and their reference."""
+
+from dataclasses import dataclass
 
 import numpy as np
 
 from slamlib import evaluation, odometry
-from slamlib.dataset import DatasetError
+from slamlib.dataset import DatasetError, Truth
 from slamlib.notebook import plotting
 from slamlib.notebook.show import Drive
 from slamlib.simulation import CAMERA_REACH, simulate
 
-MINIMUM_PATH = 1.0           # m, path length from which a drive is worth drawing
-SMALLEST_ERROR = 1.0         # mm, lower limit of the axis of errors
-MOST_POSES = 20_000          # poses of a dataset's first part, at most, and
-MOST_FRAMES = 200            # of them with measurements: as many as a simulated drive has
+MIN_PATH_LENGTH = 1.0           # m, path length of a drive that is drawn
+MIN_SHOWN_ERROR = 1.0         # mm, lower limit of the axis of errors
+MAX_PART_POSES = 20_000      # poses of a dataset's first part
+MAX_PART_FRAMES = 200        # poses with measurements in it, as many as a simulated drive has
+
+
+@dataclass(frozen=True)
+class Reference:
+    """The solution that an Explore figure is compared with."""
+
+    solution: object  # Truth, or a Fusion or SlamResult of all measurements
+    poses: np.ndarray  # (n, 3), of the part that is drawn
+    label: str  # "truth", or the name of the solution
+
+    @property
+    def is_truth(self):
+        """True if the figure shows errors, False if distances."""
+        return isinstance(self.solution, Truth)
 
 
 def simulated(seed, **options):
@@ -20,27 +36,27 @@ def simulated(seed, **options):
 
 
 def moving_drive(drives):
-    """The first Drive whose first part is a path of MINIMUM_PATH, or else a simulated one."""
+    """The first Drive whose first part is a path of MIN_PATH_LENGTH, or else a simulated one."""
     for drive in drives:
         d = first_part(drive.dataset)
-        if evaluation.path_length(odometry.dead_reckoning(d.ticks, d.vehicle)) >= MINIMUM_PATH:
+        if evaluation.path_length(odometry.dead_reckoning(d.ticks, d.vehicle)) >= MIN_PATH_LENGTH:
             return drive
     return simulated(1)
 
 
-def farthest(drives):
-    """The largest distance in m, rounded up, at which the camera of any of these Drives sees."""
-    seen = [drive.dataset.aruco.marker_in_vehicle for drive in drives]
-    return max(CAMERA_REACH, *(float(np.ceil(10 * np.hypot(*z[:, :2].T).max()) / 10)
-                               for z in seen))
+def camera_reach(drives):
+    """The largest distance of a sighting of these Drives in m, rounded up to decimetres."""
+    largest = max(np.hypot(*drive.dataset.aruco.marker_in_vehicle[:, :2].T).max()
+                  for drive in drives)
+    return max(CAMERA_REACH, float(np.ceil(10 * largest) / 10))
 
 
 def first_part(dataset, sensor=None):
-    """The dataset until MOST_POSES, or until MOST_FRAMES of a sensor, "aruco" or "uwb".
+    """The first MAX_PART_POSES of a Dataset, or MAX_PART_FRAMES of a sensor, "aruco" or "uwb".
 
     Raises DatasetError if this part has no measurement of the sensor.
     """
-    part = dataset.first(MOST_POSES)
+    part = dataset.first(MAX_PART_POSES)
     if sensor is None:
         return part
     readings = getattr(part, sensor)
@@ -48,18 +64,17 @@ def first_part(dataset, sensor=None):
         raise DatasetError(f"expected measurements in the first {len(part.ticks):,} poses of "
                            f"{dataset.name}, found none")
     frames = np.unique(readings.pose)
-    return part.first(frames[MOST_FRAMES]) if len(frames) > MOST_FRAMES else part
+    return part.first(frames[MAX_PART_FRAMES]) if len(frames) > MAX_PART_FRAMES else part
 
 
-def compared_with(drive, full, name):
-    """What a Drive is compared with, its role and label: its Truth, or else full[drive.name]."""
-    if drive.truth is not None:
-        return drive.truth, "truth", "truth"
-    return full[drive.name], "sample", name
+def reference_of(drive, full, name, count):
+    """The Reference of the first `count` poses of a Drive: its Truth, else full[drive.name]."""
+    solution = full[drive.name] if drive.truth is None else drive.truth
+    return Reference(solution, solution.poses[:count], name if drive.truth is None else "truth")
 
 
-def about(drive, part, label=None):
-    """Sentences (str) on what of a recorded Drive is drawn, a Dataset, and on lost truth.
+def data_sentences(drive, part, label=None):
+    """Sentences (str) on the part of a recorded Drive that is drawn, a Dataset, and missing truth.
 
     `label` names what replaces the truth; None leaves the second sentence out.
     """
@@ -74,37 +89,39 @@ def about(drive, part, label=None):
     return said
 
 
-def known_places(ids, known, places):
-    """(k, 2) of the landmarks `ids` (k,), NaN for those without a row in `known` and `places`."""
-    found, there = np.full((len(ids), 2), np.nan), np.isin(ids, known)
-    found[there] = places[np.searchsorted(known, ids[there]), :2]
-    return found
+def figure_with_reference(reference):
+    """A figure, and its axes of the plan, with the reference, and of the errors.
+
+    A reference that is not the truth is drawn wide, below the other paths.
+    """
+    fig, ((plan,), (side,)) = plotting.panels(2, height=3.6)
+    if reference.is_truth:
+        plotting.trajectory(plan, reference.poses, "truth")
+    else:
+        plotting.trajectory(plan, reference.poses, "sample", reference.label, linewidth=4.0)
+    return fig, plan, side
 
 
-def reference(ax, true, role, label):
-    """Draw the path that others are compared with; without truth it is wide, below the others."""
-    plotting.trajectory(ax, true, role, label, **{} if role == "truth" else {"linewidth": 4.0})
-
-
-def nees_text(found, true, role):
-    """Text (str) with the average NEES of a SlamResult where its role says that truth is known."""
-    if role != "truth":
+def nees_text(found, reference):
+    """Text (str) with the average NEES of a SlamResult, empty without truth."""
+    if not reference.is_truth:
         return ""
-    return f", NEES {evaluation.anees(found.poses, found.covariances, true):.1f}"
+    return f", NEES {evaluation.anees(found.poses, found.covariances, reference.poses):.1f}"
 
 
-def error_curve(ax, poses, true, role, label=None, **look):
-    """Draw the distance in mm of poses (n, 3) from others over the pose number."""
-    apart = np.hypot(*(poses - true)[:, :2].T)
-    plotting.curve(ax, 1e3 * apart, role, label=label, **look)
+def error_curve(ax, poses, reference, role, label=None, frame=None):
+    """Draw distances in mm of poses (n, 3) from the reference; `frame` (n,) are their indices."""
+    true = reference.poses if frame is None else reference.poses[frame]
+    plotting.curve(ax, 1e3 * np.hypot(*(poses - true)[:, :2].T), role, frame, label)
 
 
-def finished(fig, label):
-    """The figure with a logarithmic axis of errors, the second one, and a legend."""
-    side = fig.axes[1]
-    side.set(yscale="log", ylabel="position error (mm)" if label == "truth"
+def finished(fig, drive, part, reference):
+    """The figure with a logarithmic axis of errors, a legend, and sentences on its data."""
+    label, side = reference.label, fig.axes[1]
+    side.set(yscale="log", ylabel="position error (mm)" if reference.is_truth
              else f"distance from {label} (mm)")
     side.yaxis.set_major_formatter("{x:g}")
-    side.set_ylim(SMALLEST_ERROR, max(2 * side.dataLim.y1, 10 * SMALLEST_ERROR))
+    side.set_ylim(MIN_SHOWN_ERROR, max(2 * side.dataLim.y1, 10 * MIN_SHOWN_ERROR))
     plotting.legend_below(fig)
+    fig.said += data_sentences(drive, part, label)
     return fig

@@ -1,4 +1,4 @@
-"""Trajectories, covariance ellipses and curves over poses, with one style for each role everywhere.
+"""Draws trajectories, covariance ellipses and curves over poses, with one style for each role.
 
 Functions with an argument `ax` or `axes` draw on these matplotlib axes and return them. Poses are
 (n, 3) [x, y, heading] in m and rad, NaN without an estimate; covariances are (n, 3, 3) of the same.
@@ -57,7 +57,7 @@ def use_style():
 
 
 def literal(text):
-    """Text (str) as a figure shows it, without formulas: names may have dollar signs."""
+    """Text (str) with dollar signs escaped, which matplotlib would take for formulas."""
     return text.replace("$", r"\$")
 
 
@@ -89,7 +89,7 @@ def narrow(fig, width=NARROW_WIDTH):
         fig.set_size_inches(width, height + fig.legends[0].get_window_extent().height / fig.dpi)
 
 
-def pictures(fig):
+def svg_pictures(fig):
     """A figure as SVG by MIME type, first WIDE, then NARROW; {} if empty. It stays narrow."""
     draw = partial(print_figure, fig, "svg", metadata={"Date": None})
     texts = {WIDE: draw()}
@@ -134,24 +134,37 @@ def ellipses(ax, positions, covariances, color, probability=0.95, label=None, fi
     return ax
 
 
-def markers(ax, in_world, covariances, role="marker", label="markers"):
+def draw_markers(ax, in_world, covariances, role="marker", label="markers"):
     """Draw markers in_world (k, >= 2) as squares with their 95 % ellipses."""
     ellipses(ax, in_world, covariances, "#bbbbbb", fill=0.35)
     ax.plot(in_world[:, 0], in_world[:, 1], label=label, **ROLES[role])
     return ax
 
 
-def antennas(ax, positions, covariances, guess=None, truth=None, enlarged=1):
+def draw_antennas(ax, positions, covariances, guess=None, truth=None, enlarged=1):
     """Draw antennas (a, 2) with 95 % ellipses, and their guessed and true positions (a, 2)."""
     ellipses(ax, positions, covariances, "#999999", fill=0.35, enlarged=enlarged)
+    return antenna_positions(ax, positions, guess, truth)
+
+
+def antenna_positions(ax, positions, guess=None, truth=None, **look):
+    """Draw positions (a, 2) of antennas, lines from their guesses (a, 2), and truth (t, 2)."""
     if guess is not None:
         ends = np.stack([guess, positions])
         ax.plot(ends[..., 0], ends[..., 1], color="#999999", linewidth=0.8, zorder=2)
         ax.plot(*guess.T, label="antennas: guess", **ROLES["guess"])
-    ax.plot(*positions.T, label="antennas: estimate", **ROLES["antenna"])
-    if truth is not None:
+    ax.plot(*positions.T, label="antennas: estimate", **{**ROLES["antenna"], **look})
+    if truth is not None and len(truth):
         ax.plot(*truth.T, label="antennas: truth", **ROLES["true antenna"])
     return ax
+
+
+def places_by_id(ids, places, wanted):
+    """Places (m, c) of the wanted ids (m,) out of ids (k,) with places (k, c), NaN if missing."""
+    found = dict(zip(np.asarray(ids).tolist(), places, strict=True))
+    none = np.full(np.shape(places)[1], np.nan)
+    return np.array([found.get(i, none) for i in np.asarray(wanted).tolist()]).reshape(
+        len(wanted), len(none))
 
 
 def likelihood(ax, positions, ranges, sigma, window):
@@ -176,12 +189,16 @@ def enlargement(poses, covariances, share=0.05):
     known = np.isfinite(poses[:, 0])
     extent = np.ptp(poses[known, :2], axis=0).max()
     largest = REACH_95 * np.sqrt(np.linalg.eigvalsh(covariances[known, :2, :2])[:, 1].max())
-    wanted = share * extent / largest if largest > 0 else 1
-    steps = np.outer(10.0 ** np.arange(4), [1, 2, 5]).ravel()
-    return int(steps[max(0, np.searchsorted(steps, wanted, side="right") - 1)])
+    return round_factor(largest, share * extent) if largest > 0 else 1
 
 
-def spread(poses, count=14):
+def round_factor(length, limit):
+    """The largest factor 1, 2, 5, 10, ..., 5000 with which a length is within a limit, or 1."""
+    factors = np.outer(10 ** np.arange(4), [1, 2, 5]).ravel()
+    return int(max(factors[factors * length <= limit], default=1))
+
+
+def equidistant(poses, count=14):
     """Indices of about `count` known poses at equal distances along the path."""
     known = np.flatnonzero(np.isfinite(poses[:, 0]))
     travelled = cumulative(np.hypot(*np.diff(poses[known, :2], axis=0).T))
@@ -203,19 +220,19 @@ def legend_below(fig):
         handles, labels = ax.get_legend_handles_labels()
         entries |= {label: handle for handle, label in zip(handles, labels, strict=True)
                     if label not in entries}
-    for most in range(4, 0, -1):
+    for columns in range(4, 0, -1):
         while fig.legends:
             fig.legends[0].remove()
-        lines = -(-len(entries) // most)
+        lines = -(-len(entries) // columns)
         legend = fig.legend(entries.values(), entries.keys(), loc="outside lower center",
                             ncols=-(-len(entries) // lines))
         if legend.get_window_extent().width <= fig.bbox.width:
             break
 
 
-def curve(ax, values, role, at=None, label=None, **look):
-    """Draw values (n,) over the pose number; `at` (n,) are the indices from 0 of their poses."""
-    at = np.arange(len(values)) if at is None else at
-    ax.plot(at + 1, values, label=label or role, **{**ROLES[role], **look})
+def curve(ax, values, role, frame=None, label=None, **look):
+    """Draw values (n,) over the pose number; `frame` (n,) are the indices from 0 of their poses."""
+    frame = np.arange(len(values)) if frame is None else frame
+    ax.plot(frame + 1, values, label=label or role, **{**ROLES[role], **look})
     ax.set(xlabel="pose number")
     return ax

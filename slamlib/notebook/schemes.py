@@ -1,4 +1,4 @@
-"""The factor graphs of problems 3 and 4 as schemes."""
+"""Draws schemes of the factor graphs of problems 3 and 4."""
 
 import numpy as np
 
@@ -21,16 +21,17 @@ def slam_graph(ax, count, sightings, markers, ranges=(), antennas=()):
     `ax`
     """
     poses = np.array([(i, 0.0) for i in range(count)])
-    above, below = (_row(count, len(names), y) for names, y in ((markers, 1.3), (antennas, -2.0)))
+    above, below = (_places_in_row(count, len(names), y)
+                    for names, y in ((markers, 1.3), (antennas, -2.0)))
     wheel = np.array([poses[:, 0].mean(), -0.8])
     for i, j in sightings:
-        _factor(ax, [poses[i], above[j]], ROLES["aruco"]["color"])
+        _draw_factor(ax, [poses[i], above[j]], ROLES["aruco"]["color"])
     for i, k in ranges:
-        _factor(ax, [poses[i], below[k]], ROLES["slam_uwb"]["color"], at=0.75)
+        _draw_factor(ax, [poses[i], below[k]], ROLES["slam_uwb"]["color"], share=0.75)
     for i in range(count - 1):
-        _factor(ax, [poses[i], poses[i + 1], wheel], ROLES["odometry"]["color"])
+        _draw_factor(ax, [poses[i], poses[i + 1], wheel], ROLES["odometry"]["color"])
     for place, side in [(poses[0], -0.3), (wheel, -0.3), *((place, 0.3) for place in below)]:
-        _factor(ax, [place, place + [side, 0.0]], "black", at=1.0)
+        _draw_factor(ax, [place, place + [side, 0.0]], "black", share=1.0)
     for place, name, color in [
             *((place, f"$X_{i + 1}$", "white") for i, place in enumerate(poses)),
             *((place, f"$L_{{{name}}}$", "#dddddd") for place, name in zip(above, markers)),
@@ -43,15 +44,15 @@ def slam_graph(ax, count, sightings, markers, ranges=(), antennas=()):
     return ax
 
 
-def _row(count, landmarks, y):
+def _places_in_row(count, landmarks, y):
     """Places (landmarks, 2) at equal distances in a row above or below `count` poses."""
     x = np.linspace(-0.7, count - 0.3, landmarks + 2)[1:-1]
     return np.column_stack([x, np.full(landmarks, y)])
 
 
-def _factor(ax, ends, color, at=None):
-    """Draw a factor between the places `ends`; of two, at a fraction of the way to the second."""
-    middle = np.mean(ends, axis=0) if at is None else (1 - at) * ends[0] + at * ends[1]
+def _draw_factor(ax, ends, color, share=0.5):
+    """Draw a factor between `ends`; of two, its square is at a share of the line to the second."""
+    middle = np.mean(ends, axis=0) if len(ends) > 2 else (1 - share) * ends[0] + share * ends[1]
     for end in ends:
         ax.plot(*np.stack([end, middle]).T, color=color, linewidth=0.9, zorder=1)
     ax.plot(*middle, "s", color=color, markersize=4.5, zorder=2)

@@ -1,4 +1,4 @@
-"""Shared code of the notebooks: drives to run on, folders of results, sentences and tables."""
+"""Gives notebooks their drives and folders of results, and shows sentences and tables."""
 
 import os
 import re
@@ -17,9 +17,9 @@ from slamlib.notebook import inline, plotting
 from slamlib.simulation import simulate
 
 
-@dataclass(frozen=True, eq=False)          # a drive is itself alone: arrays have no hash
+@dataclass(frozen=True, eq=False)          # compared by identity, because arrays have no hash
 class Drive:
-    """A dataset with, for figures and tables only, its truth."""
+    """A dataset and its truth, which serves figures and tables only."""
 
     name: str
     dataset: Dataset
@@ -55,14 +55,14 @@ def start():
 
 
 def _show_figures():
-    """Show figures as SVG, in the report in two widths between which its pages choose."""
+    """Show figures as SVG, in the report in two widths, of which its pages choose one."""
     if interactive():
         plt.rcParams["svg.fonttype"] = "path"       # pages bring the typeface
         set_matplotlib_formats("svg", metadata={"Date": None})
     else:
         set_matplotlib_formats()
         InteractiveShell.instance().display_formatter.mimebundle_formatter.for_type(
-            Figure, lambda fig, **_: inline.outputs(fig, plotting.pictures(fig)))
+            Figure, lambda fig, **_: inline.outputs(fig, plotting.svg_pictures(fig)))
 
 
 def results_folder(drive):
@@ -76,11 +76,11 @@ def results_folder(drive):
 
 
 def with_truth(drives):
-    """The drives whose truth is known: errors are shown of these only."""
+    """The drives with truth; errors are shown of these only."""
     return [drive for drive in drives if drive.truth is not None]
 
 
-def about_dashes(drives):
+def dash_note(drives):
     """Sentence (str) for the caption of a table of errors; empty if all drives have truth."""
     return " A dash stands where no truth is known." if with_truth(drives) != drives else ""
 
@@ -161,10 +161,11 @@ def table(header, rows, caption=None, texts=1):
 def table_text(header, rows, texts=1):
     """Table in Markdown, a str.
 
-    `header` is a list of c str, `rows` a list of such lists. The first `texts` columns are aligned
-    left as text, the others right as numbers, with minus signs. Rows that begin alike are a group:
-    only its first row shows this beginning.
+    `header` is a list of c str, `rows` a list of such lists, or of one str as a heading of the rows
+    below it. The first `texts` columns are aligned left as text, the others right as numbers, with
+    minus signs. Of consecutive rows with the same first cell only the first row shows it.
     """
+    rows = [row if len(row) > 1 else [*row, *[""] * (len(header) - 1)] for row in rows]
     above = [None, *(row[0] for row in rows)]
     grouped = [["" if row[0] == first else row[0], *row[1:texts],
                 *(re.sub(r"(?<![\w.])-(?=\d)", "−", cell) for cell in row[max(1, texts):])]

@@ -1,4 +1,4 @@
-"""Problems solved in a chapter. What fails or is doubted is said there, and on the first page.
+"""Solves the problems of a chapter, and shows failures and doubts there and on the first page.
 
 Each of these sentences carries its record in the metadata of the notebook's output. The report's
 first page collects the records from the executed notebooks by `notices`, so the results folders
@@ -22,11 +22,12 @@ from slamlib.notebook.show import (
     simulated_drive,
 )
 
-KEY = "slamlib"  # in the metadata of outputs
+KEY = "slamlib"  # of records in the metadata of outputs
+# Types of records by their key.
 RECORDS = {"doubt": Doubt, "failure": solve.Failure}
 
 
-def solved(drives, problems, besides=()):
+def solved(drives, problems, optional=()):
     """The drives on which all `problems` can be solved, and all results.
 
     Sentences say what could not be solved where, and why. If no drive is left, a simulated short
@@ -36,7 +37,7 @@ def solved(drives, problems, besides=()):
     ----------
     drives : list of Drive
     problems : list of str, names of `solve.PROBLEMS` that the chapter needs.
-    besides : list of str, problems that are solved first, where they can be, and not needed.
+    optional : list of str, problems that are solved first where possible.
 
     Returns
     -------
@@ -44,7 +45,7 @@ def solved(drives, problems, besides=()):
     found : dict by problem of dicts by the name of the drive, what `solve.find` returns; also of
         drives that the chapter leaves out.
     """
-    found = {problem: {} for problem in (*besides, *problems)}
+    found = {problem: {} for problem in (*optional, *problems)}
     pairs = [(drive, problem) for drive in drives for problem in found]
     for drive, problem in tqdm(pairs, disable=not interactive(), leave=False):
         _solve(drive, problem, found)
@@ -54,7 +55,7 @@ def solved(drives, problems, besides=()):
         say(f"*This chapter leaves out {listed(without)}.*")
     if not left:
         say("*No drive is left, so this chapter runs on a simulated drive instead.*")
-        left, others = solved([simulated_drive(drives)], problems, besides)
+        left, others = solved([simulated_drive(drives)], problems, optional)
         found = {problem: found[problem] | others[problem] for problem in found}
     return left, found
 
@@ -75,9 +76,9 @@ def _solve(drive, problem, found):
 
 
 def where_possible(drives, function, what):
-    """{name of the drive: function(drive)}; `what` is missing where it raises, a sentence says so.
+    """{name of the drive: function(drive)} of drives on which it can be solved.
 
-    For comparisons that a chapter shows beside the results of its problem.
+    A sentence says on which drives `what` cannot be shown. For comparisons with a chapter's result.
     """
     found = {}
     for drive in drives:
@@ -96,11 +97,11 @@ def say_doubts(drive, doubts):
 
 def _say(drive, markdown, **record):
     (kind, value), = record.items()
-    about = {"dataset": drive.name, kind: asdict(value)}
-    display(Markdown(markdown), metadata={} if drive.made_up else {KEY: about})
+    entry = {"dataset": drive.name, kind: asdict(value)}
+    display(Markdown(markdown), metadata={} if drive.made_up else {KEY: entry})
 
 
-def delivered(drives, found):
+def write_results(drives, found):
     """Write the files of all results that `solved` found, and yield what was written.
 
     Yields (Drive, Solution, names of the files as a str); a simulated drive has no files, and a
@@ -117,12 +118,12 @@ def delivered(drives, found):
 
 
 def notices(books):
-    """What executed notebooks say of each dataset: {name: list of Doubt and Failure}, each once."""
+    """Records in executed notebooks, by dataset: {name: list of Doubt and Failure}, each once."""
     found = {}
     for book in books:
         for cell in book.cells:
             for output in cell.get("outputs", ()):
-                about = output.get("metadata", {}).get(KEY, {})
-                for kind in RECORDS.keys() & about.keys():
-                    found.setdefault(about["dataset"], []).append(RECORDS[kind](**about[kind]))
+                entry = output.get("metadata", {}).get(KEY, {})
+                for kind in RECORDS.keys() & entry.keys():
+                    found.setdefault(entry["dataset"], []).append(RECORDS[kind](**entry[kind]))
     return {name: list(dict.fromkeys(records)) for name, records in found.items()}

@@ -65,7 +65,7 @@ def _layer(name, count, solution, color, enlarged, on_page, scale):
     """Return a Solution's path, ellipses and vehicle in SVG (str), and the CSS that moves them."""
     known = np.flatnonzero(np.isfinite(solution.poses[:, 0]))
     poses = solution.poses[known]
-    indices = plotting.spread(poses, count)
+    indices = plotting.equidistant(poses, count)
     drawn, rules = [], []
     for number, (i, ellipse) in enumerate(zip(indices, _ellipses(
             on_page(poses[indices]), solution.covariances[known[indices]], enlarged * scale),

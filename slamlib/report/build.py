@@ -22,7 +22,7 @@ except ImportError:  # Windows
 from slamlib import locks, swap
 from slamlib.dataset import DatasetError, dataset_names, read_dataset, read_truth
 from slamlib.folder import left_in
-from slamlib.inventory import found
+from slamlib.inventory import inventory_lines
 from slamlib.notebook import notices
 from slamlib.report import cache, overview
 from slamlib.report.chapters import available, chapter_of, in_order, printed, with_data
@@ -107,10 +107,10 @@ def build_report(notebooks, data, report, results, datasets=None, options=Option
         drives = read_drives(data, stage, selected, written, notices(books.values()))
         made = rendered(books, drives, options, address, has)
         for name, content in made.items():
-            swap.write(pages / name, content)
+            swap.write_atomically(pages / name, content)
         swap.require_staged(stage)
         swap.publish([
-            swap.Set(report, {name: pages / name for name in made}, last=next(iter(made)),
+            swap.FileSet(report, {name: pages / name for name in made}, last=next(iter(made)),
                      ours=frozenset(own_pages(report))),  # also of notebooks that are gone
             *_result_sets(results, stage, selected, written)])
     _tell(_resources_used(time.monotonic() - start))
@@ -158,7 +158,7 @@ def _checked_input(notebooks, data, datasets, options):
                                "the name of this dataset: rename its folder")
     read = [(read_dataset(data / name), read_truth(data / name)) for name in selected]
     for dataset, truth in read:
-        print("\n".join(found(dataset, truth)), file=sys.stderr)
+        print("\n".join(inventory_lines(dataset, truth)), file=sys.stderr)
     for sentence in left_in(data):
         print(sentence, file=sys.stderr)
     has = available(read)
@@ -169,12 +169,12 @@ def _checked_input(notebooks, data, datasets, options):
 
 
 def _result_sets(results, stage, selected, written):
-    """Return a swap.Set for each of the datasets that are selected or have files in `stage`."""
+    """Return a swap.FileSet for each of the datasets that are selected or have files in `stage`."""
     files = {name: {} for name in selected}
     for path in written:
         dataset, name = path.split("/", 1) if "/" in path else ("", path)
         files.setdefault(dataset, {})[name] = stage / path
-    return [swap.Set(results / dataset, found, ours=RESULT_NAMES)
+    return [swap.FileSet(results / dataset, found, ours=RESULT_NAMES)
             for dataset, found in files.items()]
 
 

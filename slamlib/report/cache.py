@@ -87,7 +87,7 @@ def recall(folder, source, key, book, results):
     for cell, other in zip(_code_cells(book), kept, strict=True):
         cell.outputs, cell.execution_count = other.outputs, other.execution_count
     for name, content in files.items():
-        swap.write(results / name, b64decode(content))
+        swap.write_atomically(results / name, b64decode(content))
     path.touch()
     return [*files]
 
@@ -102,7 +102,7 @@ def keep(folder, source, key, book, results, names):
     """
     files = {name: b64encode((results / name).read_bytes()).decode() for name in names}
     content = json.dumps([key, book, files]).encode()
-    swap.write(entry(folder, source, key), gzip.compress(content, compresslevel=1))
+    swap.write_atomically(entry(folder, source, key), gzip.compress(content, compresslevel=1))
     versions = [file for file in Path(folder).glob("*.executed")
                 if file.name.rsplit(".", 2)[0] == source.stem]
     for old in sorted(versions, key=lambda file: file.stat().st_mtime_ns)[:-VERSIONS]:

@@ -87,7 +87,7 @@ def temporary_folder():
     parent = Path("/tmp" if TRANSPORT == "ipc" and len(parent) > LONGEST_FOLDER else parent)
     for old in parent.glob(f"{PREFIX}*-*"):
         process = old.name.split("-")[1]
-        if process.isdecimal() and not locks.runs(int(process)):
+        if process.isdecimal() and not locks.process_exists(int(process)):
             shutil.rmtree(old, ignore_errors=True)
     with tempfile.TemporaryDirectory(dir=parent, prefix=f"{PREFIX}{os.getpid()}-",
                                      ignore_cleanup_errors=True) as folder:
@@ -153,7 +153,7 @@ async def _watch(progress):
 
 def _publish(stage, results):
     """Move all files of a folder to another, and return their names relative to it."""
-    names = swap.names(stage)
+    names = swap.file_names(stage)
     for name in names:
         (results / name).parent.mkdir(parents=True, exist_ok=True)
         os.replace(stage / name, results / name)

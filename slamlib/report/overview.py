@@ -13,7 +13,7 @@ from nbformat.v4 import new_markdown_cell, new_notebook
 
 from slamlib import evaluation, odometry
 from slamlib.checks import consistency
-from slamlib.notebook import about_dashes, code, listed, median_sigmas, plain, table_text, with_unit
+from slamlib.notebook import code, dash_note, listed, median_sigmas, plain, table_text, with_unit
 from slamlib.report.animation import moving
 from slamlib.report.chapters import HTML_ONLY
 from slamlib.report.drives import order
@@ -234,7 +234,7 @@ def _result_table(drives):
            "nearest to the truth (aligned); " if known else "")
         + "the medians over all estimated poses of the standard deviation σ that a method claims, "
         "of position (the larger of $x$ and $y$) and of heading; how many poses are estimated."
-        + (about_dashes(drives) if known else "")
+        + (dash_note(drives) if known else "")
         + (" *Hint*: as the assignment suggests, overconfident (chapter 2)."
            if "problem2_hint" in problems else ""))
     for sensor, name in SENSORS.items():

@@ -51,7 +51,7 @@ def trajectories(drive):
         right.set(yscale="log", ylabel="σ of position (m)")
         right.set_ylim(bottom=_shown_from(drive))
         plotting.legend_below(fig)
-        return plotting.pictures(fig)
+        return plotting.svg_pictures(fig)
 
 
 def title_picture(drive):
@@ -62,9 +62,9 @@ def title_picture(drive):
         solution = drive.solutions[-1]
         plotting.trajectory(ax, _few(solution.poses), _role(solution), linestyle="-", linewidth=1.2)
         if solution.aruco_map is not None:
-            plotting.markers(ax, *solution.aruco_map[1:])
+            plotting.draw_markers(ax, *solution.aruco_map[1:])
         if solution.uwb_map is not None:
-            plotting.antennas(ax, *solution.uwb_map[1:])
+            plotting.draw_antennas(ax, *solution.uwb_map[1:])
         ax.axis("off")
         return print_figure(fig, "svg", metadata={"Date": None})
 

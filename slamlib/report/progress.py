@@ -57,7 +57,7 @@ class Progress:
         """Write what the cells of a notebook took, in the place of what they took before."""
         keys = (key for key, _ in self.cells[name])
         self.known[name] = dict(zip(keys, self.seconds[name]))
-        swap.write(self.file, json.dumps(self.known, indent=1).encode())
+        swap.write_atomically(self.file, json.dumps(self.known, indent=1).encode())
 
     def show(self):
         """Bring the bar up to date; without one print a line, if LINE_INTERVAL has passed."""
