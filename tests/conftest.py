@@ -4,6 +4,7 @@ No study is recalled that was kept before the tests.
 """
 
 import os
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -62,6 +63,26 @@ def look():
 
 BROUGHT = ("new seed", "no_truth", "wheels_only", "waits", "one_pose", "backs_up", "one_sighting",
            "sparse")
+
+
+def copied(target, chapters, grids=False, first=None):
+    """Write notebooks to a folder, by a pattern of their names; their Explore shows one figure.
+
+    With `grids`, all figures between which its sliders move, which `report_on_all` draws, too.
+    A code cell `first` (str) stands before all others.
+    """
+    import nbformat
+    target.mkdir()
+    for source in sorted((ROOT / "notebooks").glob(chapters)):
+        book = nbformat.read(source, as_version=4)
+        if first:
+            book.cells.insert(1, nbformat.v4.new_code_cell(first, id="first"))
+        for cell in [] if grids else book.cells:
+            if "explore.show(" in cell.source:
+                cell.source, count = re.subn(r"\n *grid=\{.*?\},(?=\n)", "", cell.source,
+                                             flags=re.DOTALL)
+                assert count == 1
+        nbformat.write(book, target / source.name)
 
 
 def contradicted(aruco):
