@@ -68,8 +68,8 @@ BROUGHT = ("new seed", "no_truth", "wheels_only", "waits", "one_pose", "backs_up
 def copied(target, chapters, grids=False, first=None):
     """Write notebooks to a folder, by a pattern of their names; their Explore shows one figure.
 
-    With `grids`, all figures between which its sliders move, which `report_on_all` draws, too.
-    A code cell `first` (str) stands before all others.
+    With `grids`, all figures between which its sliders move, which `report_on_all` draws, too. A
+    code cell `first` (str) stands before all others. Studies run on the short path only.
     """
     import nbformat
     target.mkdir()
@@ -77,8 +77,9 @@ def copied(target, chapters, grids=False, first=None):
         book = nbformat.read(source, as_version=4)
         if first:
             book.cells.insert(1, nbformat.v4.new_code_cell(first, id="first"))
-        for cell in [] if grids else book.cells:
-            if "explore.show(" in cell.source:
+        for cell in book.cells:
+            cell.source = cell.source.replace('path="long"', 'path="short"')
+            if "explore.show(" in cell.source and not grids:
                 cell.source, count = re.subn(r"\n *grid=\{.*?\},(?=\n)", "", cell.source,
                                              flags=re.DOTALL)
                 assert count == 1
@@ -128,7 +129,8 @@ def report_on_all(tmp_path_factory, kept):
     for name, rows in (("one_sighting", seen[:1]), ("sparse", seen[seen[:, 0] % 500 == 1])):
         shutil.copytree(data / "new seed", data / name)
         np.savetxt(data / name / "ArucoReading.txt", rows, fmt="%d %d" + 9 * " %.6g")
+    copied(folder / "notebooks", "*.ipynb", grids=True)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SLAMLIB_SEEDS", STUDY_SEEDS)
-        build_report(ROOT / "notebooks", data, folder / "report", folder / "results", kept=kept)
+        build_report(folder / "notebooks", data, folder / "report", folder / "results", kept=kept)
     return folder

@@ -9,6 +9,7 @@ import matplotlib.pyplot as plt
 import nbformat
 import numpy as np
 import pytest
+from conftest import copied
 
 from slamlib import localization, slam
 from slamlib.dataset import DatasetError
@@ -25,9 +26,14 @@ NOTEBOOKS = sorted((ROOT / "notebooks").glob("[0-9]*.ipynb"))        # appendice
 
 @pytest.fixture(scope="module")
 def sections(tmp_path_factory):
-    """Code cells of each Explore section, executed after the notebook's first code cell alone."""
+    """Code cells of each Explore section, executed after the notebook's first code cell alone.
+
+    They show one figure; test_pages looks at those that sliders move.
+    """
     folder = tmp_path_factory.mktemp("explore")
-    books = {folder / source.name: nbformat.read(source, as_version=4) for source in NOTEBOOKS}
+    copied(folder / "notebooks", "[0-9]*.ipynb")
+    books = {source: nbformat.read(source, as_version=4)
+             for source in sorted((folder / "notebooks").iterdir())}
     for book in books.values():
         begin = next(i for i, cell in enumerate(book.cells) if cell.source.startswith("## Explore"))
         first = next(cell for cell in book.cells if cell.cell_type == "code")
