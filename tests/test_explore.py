@@ -333,6 +333,7 @@ def drawn_on(drive, full, **changed):
             for chapter, each in names.items()}
 
 
+@pytest.mark.slow
 def test_with_truth_the_figures_of_a_dataset_show_errors(recorded):
     drive, _, full = recorded
     for fig in drawn_on(drive, full).values():
@@ -358,6 +359,7 @@ def test_without_truth_a_dataset_is_compared_with_its_solution_and_nothing_says_
     np.testing.assert_allclose(same, 0, atol=1e-6)      # of the same sightings, with the same slip
 
 
+@pytest.mark.slow
 def test_errors_of_the_controls_are_added_to_a_dataset(recorded):
     drive, _, full = recorded
     clean, spoilt = drawn_on(drive, full), drawn_on(drive, full, wrong=15, late=30, off=3.0)
@@ -403,6 +405,7 @@ def test_of_a_long_dataset_the_first_part_is_drawn_and_said(recorded):
     assert len(parts.first_part(late).ticks) == parts.MOST_POSES
 
 
+@pytest.mark.slow
 def test_a_million_poses_are_drawn_as_their_first_part(recorded):
     _, drive, full = recorded
     long = replace(drive.dataset, name="b", ticks=np.tile(drive.dataset.ticks, (500, 1)))

@@ -49,6 +49,7 @@ def test_simulate_then_solve(tmp_path):
     assert summary["dataset"] == "drive" and 0 < summary["problems"]["problem1"]["ate_m"] < 1
 
 
+@pytest.mark.slow
 def test_what_vehicle_toml_gives_of_the_noise_is_taken_and_the_summary_says_so(tmp_path, capsys):
     """By each problem that has such noise; the rest is learned. Without entries nothing is said."""
     write_dataset(tmp_path / "drive", simulate("short", seed=3)[0].first(300))

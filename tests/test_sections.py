@@ -165,6 +165,7 @@ def built(tmp_path_factory):
     return root
 
 
+@pytest.mark.slow
 def test_the_report_closes_the_gaps(built):
     page, more = (Page(built / "report" / f"{name}.html") for name in ("1_one", "A_more"))
     assert "See errors, two, equation 1.1 and" in page.text and "#Last" in page.links
