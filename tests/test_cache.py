@@ -51,6 +51,7 @@ def executions(folder, **options):
     return tuple(len((folder / f"count_{name}").read_text()) for name in "ab")
 
 
+@pytest.mark.slow
 def test_a_changed_notebook_is_executed_again_and_only_that_one(project, capsys):
     assert executions(project) == (1, 1)
     pages = [file.read_bytes() for file in sorted((project / "report").iterdir())]
@@ -64,6 +65,7 @@ def test_a_changed_notebook_is_executed_again_and_only_that_one(project, capsys)
     assert executions(project) == (1, 2)
 
 
+@pytest.mark.slow
 def test_results_that_are_gone_or_changed_are_written_again_without_an_execution(project):
     assert executions(project) == (1, 1)
     a, b = (project / "results" / "short" / name for name in ("a.mat", "b.mat"))

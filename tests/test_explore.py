@@ -10,10 +10,11 @@ import nbformat
 import numpy as np
 import pytest
 from conftest import copied
+from test_plotting import require_contours
 
-from slamlib import localization, slam
+from slamlib import localization, odometry, slam
 from slamlib.dataset import DatasetError
-from slamlib.evaluation import nees_band
+from slamlib.evaluation import REACH_95, nees_band
 from slamlib.notebook import Drive, controls, explore, parts, plotting
 from slamlib.report.execution import execute, kernel_environment
 from slamlib.simulation import manoeuvre, simulate
@@ -245,6 +246,22 @@ def test_ellipses_scale_with_the_probability_and_the_sigmas():
     assert longest(sigma_radii=3.0) > 2 * longest()
 
 
+def test_ellipses_are_contours_of_the_covariances_that_they_show():
+    """Of equation 2 at 95 % in chapter 1, and of the fused poses, enlarged, in chapter 2."""
+    drive = Drive("short", *simulate("short", seed=3))
+    poses, covariances = odometry.equation2(drive.dataset.ticks, drive.dataset.vehicle)
+    fused = localization.fuse(drive.dataset)
+    plan = explore.cameras({"short": fused}, drive, 1, 1, 9.0, 1.0).axes[0]
+    enlarged = int(re.search(r"ellipses × (\d+)", plan.get_title("left"))[1])
+    for ax, means, spread, factor in (
+            (explore.wheels(drive, **WHEELS).axes[0], poses, covariances, 1),
+            (plan, fused.poses, fused.covariances, enlarged)):
+        patches, = ax.collections
+        rows = [int(np.argmin(np.hypot(*(means[:, :2] - place).T)))
+                for place in patches.get_offsets()]
+        require_contours(patches, means[rows], spread[rows], factor * REACH_95)
+
+
 def test_localization_from_markers_alone_ends_where_the_camera_sees_too_few():
     for seed in (1, 2):
         full = curves(explore.cameras({}, explore.SIMULATED, seed, 1, 1.8, 1.0).axes[1])
@@ -342,6 +359,7 @@ def test_with_truth_the_figures_of_a_dataset_show_errors(recorded):
         assert "truth" in curves(plan) and "No truth" not in fig.said and "Only" not in fig.said
 
 
+@pytest.mark.slow
 def test_without_truth_a_dataset_is_compared_with_its_solution_and_nothing_says_error(recorded):
     _, drive, full = recorded
     names = {2: "this chapter's fusion", 3: "problem 3's solution", 4: "problem 4's solution"}

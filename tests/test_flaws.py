@@ -169,6 +169,7 @@ def test_a_slip_that_was_given_is_not_explained_by_other_wheels():
     assert given.slip == 1e-2 and "wheel-parameters" not in names(given.drive_doubts)
 
 
+@pytest.mark.slow
 def test_markers_of_another_size_are_named_with_the_wheels():
     """Lengths by markers 5 % too large: the same as wheels that are larger than stated."""
     dataset, _ = simulate("short", 61)
@@ -190,6 +191,7 @@ def test_sightings_that_are_late_are_named(poses):
         assert names(found.drive_doubts) == {"time-offset"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", [(0.1, 0.0, 0.0), (0.0, 0.1, 0.0), (0.0, 0.0, 0.05)])
 def test_a_camera_that_is_not_in_the_origin_is_named(place):
     dataset, _ = simulate("short", 61)

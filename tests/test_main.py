@@ -117,6 +117,7 @@ def test_a_second_process_that_is_killed_costs_time_only(tmp_path, monkeypatch):
     assert not any("failed" in row for row in rows.values())
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux forks safely")
 @pytest.mark.parametrize("end", ["SIGTERM", "SIGKILL"])
 def test_no_process_survives_a_solve_that_is_killed(end, tmp_path):

@@ -458,6 +458,7 @@ def test_a_simulated_drive_in_a_mirror_has_mirrored_estimates(simulated):
     assert_same(before, solved(mirrored(dataset), slip=1e-3), ROUNDING, factor=(1, -1, -1))
 
 
+@pytest.mark.slow
 def test_the_unit_of_length_of_a_simulated_drive_is_a_convention(simulated, monkeypatch):
     dataset, before = simulated
     constants_in_quarters(monkeypatch)

@@ -573,6 +573,7 @@ def test_the_scatter_of_residuals_gives_factors_of_at_least_one():
     assert noise_of_scatter(few, state).ranges == 1 < noise_of_scatter(few, state).sightings
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("known", [
     {"slip": 2e-3}, {"marker_noise_factor": 1.3}, {"range_noise_factor": 0.8},
     {"slip": 2e-3, "marker_noise_factor": 1.3, "range_noise_factor": 0.8}])

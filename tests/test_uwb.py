@@ -382,6 +382,7 @@ def test_places_within_a_fifth_of_the_distance_are_one():
     assert ((apart == 0) | (apart > 0.2 * 19.5)).all()
 
 
+@pytest.mark.slow
 def test_second_moment_is_the_sum_over_the_places_of_the_grid():
     """Every place by itself, from the definition: Cauchy likelihood, guess, area of the cell."""
     ranges, estimate = line_of_ranges(5), np.array([2.9, 4.2])
