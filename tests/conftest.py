@@ -55,6 +55,7 @@ def look():
     import matplotlib.pyplot as plt
 
     from slamlib.notebook import plotting
+    plt.close("all")                                 # the README's example leaves one open
     with plt.rc_context():
         plotting.use_style()
         yield
