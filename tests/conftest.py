@@ -23,12 +23,14 @@ settings.load_profile("short")           # another one by `pytest --hypothesis-p
 
 ROOT = Path(__file__).parents[1]
 STUDY_SEEDS = "2"            # in pages that tests build: their claims are tested on more drives
+LONGEST = ("test_pages", "test_slam", "test_flaws", "test_uwb", "test_concurrency", "test_lab")
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 
 def pytest_collection_modifyitems(items):
-    """The file that takes longest comes first, while the other process runs the others."""
-    items.sort(key=lambda item: item.path.stem != "test_pages")
+    """The files that take longest come first, so that both processes end at about the same time."""
+    items.sort(key=lambda item: LONGEST.index(item.path.stem) if item.path.stem in LONGEST
+               else len(LONGEST))
 
 
 @pytest.fixture(scope="module")
