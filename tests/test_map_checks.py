@@ -28,7 +28,7 @@ def test_degrees_of_freedom_are_those_of_the_dense_matrices():
         taken = np.array([np.trace(j @ C[np.ix_(r, r)] @ j.T) for j, r in zip(J, rows)])
         label = f.landmark - f.landmark.min()
         expected = 3 if f is poses else \
-            map_checks.consistency_factor(fit.problem.measured.range_kernel)
+            map_checks.consistency_factor(fit.problem.accepted.range_kernel)
         dof = np.bincount(label, expected * f.weight - taken)
         np.testing.assert_allclose(found.dof, dof, rtol=1e-5)
         np.testing.assert_allclose(found.chi2, np.bincount(label, np.sum(f.e**2, axis=1)))

@@ -12,7 +12,7 @@ of the next; the modules in the order of the stages (stage 4 uses stage 5 on lon
     2  errors               errors of the factors and their derivatives, in numpy
        odometry_factors     odometry between frames, which depends on the wheel errors w
        measurement_factors  weights and kernels of sightings and ranges
-       linear_factors       sightings and ranges linearised in numpy
+       measurement_factors       sightings and ranges linearised in numpy
        noise                slip, and factors on the sigmas of sightings and ranges
     3  state                values of all variables: State
        problem              Measurements, factors and noise -> Problem, the factor graph
@@ -24,7 +24,7 @@ of the next; the modules in the order of the stages (stage 4 uses stage 5 on lon
     5  robust               Problem, State -> State by robust kernels; the accepted measurements
     6  evidence             Problem, State -> evidence of every value of the noise
        first_frames         the part of a very long drive from which the noise is learned
-       noise_posterior      Problem, State -> posterior of the noise
+       noise_learning      Problem, State -> posterior of the noise
        fit                  Problem, State -> Fit: wheels, noise, accepted measurements, in turn
        model_choice         Fit -> Fit: arcs or Euler's steps
        range_calibration    Fit -> Fit: with offset and scale of the ranges, if there are any

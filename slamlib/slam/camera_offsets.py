@@ -45,7 +45,7 @@ def estimate_camera_offsets(equations):
     """The CameraOffsets by the NormalEquations at the State that solves their problem."""
     problem, state = equations.problem, equations.state
     H, g, *_ = equations.sums(
-        problem.noise, (1.0, 1.0, consistency_factor(problem.measured.range_kernel)))
+        problem.noise, (1.0, 1.0, consistency_factor(problem.accepted.range_kernel)))
     lu = decomposition(equations.structure.matrix(H))
     velocity, sightings = _velocities(problem.measurements, state), equations.factors[:2]
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slamlib.slam.measurement_factors import GUESS_PRIOR_SIGMA
+from slamlib.slam.measurements import GUESS_PRIOR_SIGMA
 from slamlib.slam.trilateration import SAME_PLACE, ranges_by_antenna, second_moment, trilaterate
 
 MIN_ACCEPTED_RANGES = 5      # number of accepted ranges of an antenna that is not in doubt

@@ -42,7 +42,7 @@ def turn_doubts(problem):
     """
     odometry, frame = problem.odometry, problem.measurements.frame
     variance = np.sum(odometry.by_w[:, 2]**2, axis=1) \
-        + odometry.noise(problem.noise.slip)[:, 2, 2]
+        + odometry.covariance(problem.noise.slip)[:, 2, 2]
     if not len(variance) or np.sqrt(variance.max()) < MAX_TURN_SIGMA:
         return []
     k = int(variance.argmax())
@@ -184,8 +184,8 @@ def sighting_doubts(measurements, rejected):
         sentences.append(f"{left_out} of {count} sightings contradict the rest and are left out"
                          + (f", {repeated} of them another one of the same marker at the same pose"
                             if repeated else ""))
-    seen = np.bincount(measurements.label, minlength=len(measurements.marker))
-    wrong = np.bincount(measurements.label, rejected, len(measurements.marker))
+    seen = np.bincount(measurements.marker_row, minlength=len(measurements.marker))
+    wrong = np.bincount(measurements.marker_row, rejected, len(measurements.marker))
     markers = measurements.marker[
         (seen >= MIN_SIGHTINGS_PER_MARKER) & (wrong > seen / 2)].tolist()
     if markers:

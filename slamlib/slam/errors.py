@@ -25,32 +25,6 @@ def between_error(z, first, second):
             log_jacobian @ by_z)
 
 
-def point_error(z, pose, point):
-    """Errors R^T (point - t) - z (m, 2) of points z (m, 2) m measured from poses (t, R), (m, 3).
-
-    Also their derivatives by pose (m, 2, 3) and point (m, 2, 2).
-    """
-    R_t = se2.rotation(-pose[:, 2])
-    expected = (R_t @ (point - pose[:, :2])[..., None])[..., 0]
-    by_pose = np.zeros((len(z), 2, 3))
-    by_pose[:, 0, 0] = by_pose[:, 1, 1] = -1
-    by_pose[:, 0, 2], by_pose[:, 1, 2] = expected[:, 1], -expected[:, 0]
-    return expected - z, by_pose, R_t
-
-
-def range_error(r, pose, antenna):
-    """Errors |antenna - t| - r (m,) of ranges r (m,) m from poses (m, 3) to antennas (m, 2) m.
-
-    Also their derivatives by pose (m, 1, 3) and antenna (m, 1, 2). GTSAM: RangeFactor2D.
-    """
-    difference = antenna - pose[:, :2]
-    distance = np.hypot(*difference.T)
-    direction = difference[:, None, :] / np.maximum(distance, 1e-9)[:, None, None]
-    by_position = -direction @ se2.rotation(pose[:, 2])
-    by_pose = np.concatenate([by_position, np.zeros((len(r), 1, 1))], axis=2)
-    return distance - r, by_pose, direction
-
-
 def square_root_information(covariance):
     """Upper triangular U (..., d, d) with U^T U = C^-1, from covariances C: U e is whitened."""
     return np.swapaxes(np.linalg.cholesky(np.linalg.inv(covariance)), -1, -2)

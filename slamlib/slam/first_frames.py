@@ -23,19 +23,19 @@ def equations_of_first_frames(equations):
     if len(m.frame) <= count:
         return equations
     part = measure(m.dataset.first(int(m.frame[count - 1]) + 1))
-    if len(part.label) < min(MIN_MEASUREMENTS, len(m.label)) \
+    if len(part.marker_row) < min(MIN_MEASUREMENTS, len(m.marker_row)) \
             or len(part.ranges.row) < min(MIN_MEASUREMENTS, len(m.ranges.row)):
         return equations
     markers = np.searchsorted(m.marker, part.marker)
     antennas = np.searchsorted(m.antenna, part.antenna)
     part = replace(part, oriented=m.oriented[markers], calibrated=m.calibrated)
-    measured = replace(problem.measured, measurements=part, weight=np.r_[
-        problem.measured.sighting_weight[:len(part.label)],
-        problem.measured.range_weight[:len(part.ranges.row)]])
+    accepted = replace(problem.accepted, measurements=part, weight=np.r_[
+        problem.accepted.sighting_weight[:len(part.marker_row)],
+        problem.accepted.range_weight[:len(part.ranges.row)]])
     odometry = replace(problem.odometry, **{
         name: getattr(problem.odometry, name)[:count - 1]
-        for name in ("increment", "by_w", "rounding", "slipping")})
+        for name in ("increment", "by_w", "quantization", "slipping")})
     return NormalEquations(
-        replace(problem, odometry=odometry, measured=measured),
+        replace(problem, odometry=odometry, accepted=accepted),
         replace(state, poses=state.poses[:count], markers=state.markers[markers],
                 antennas=state.antennas[antennas]))

@@ -6,7 +6,7 @@
 * the odometry between consecutive frames, which depends on w. It is linearised in numpy: as a
   custom factor in Python it would be slow, because GTSAM copies all values for every call.
 
-Two more kinds of factors are linearised in numpy, by `linear_factors.py`: sightings of points,
+Two more kinds of factors are linearised in numpy, by `measurement_factors.py`: sightings of points,
 whose heading is unknown, and ranges whose offset and scale c are variables.
 """
 
@@ -17,8 +17,8 @@ import numpy as np
 from gtsam.symbol_shorthand import A, C, L, P, W, X
 
 from slamlib.dataset import DatasetError
-from slamlib.slam.linear_factors import range_factors, sighting_factors
-from slamlib.slam.measurement_factors import GUESS_PRIOR_SIGMA, WEAK_SIGMA
+from slamlib.slam.measurement_factors import linearize_ranges, linearize_sightings
+from slamlib.slam.measurements import GUESS_PRIOR_SIGMA, WEAK_SIGMA
 from slamlib.slam.odometry_factors import odometry_error
 
 
@@ -51,11 +51,11 @@ def linearize(problem, state):
     U, _ = problem.odometry.whitening(problem.noise.slip)
     for i, (e, J) in enumerate(zip((U @ errors[..., None])[..., 0], U @ jacobians)):
         graph.add(X(i), J[:, :3], X(i + 1), J[:, 3:6], W(0), J[:, 6:], -e)
-    f = sighting_factors(problem.measured, problem.noise, state, as_pose=False)
+    f = linearize_sightings(problem.accepted, problem.noise, state, as_pose=False)
     for i, j, e, J in zip(f.row.tolist(), f.landmark.tolist(), f.e, f.J):
         graph.add(X(i), J[:, :3], P(j), J[:, 3:], -e)
     if problem.measurements.calibrated:
-        f = range_factors(problem.measured, problem.noise, state)
+        f = linearize_ranges(problem.accepted, problem.noise, state)
         antennas = f.landmark - len(problem.measurements.marker)
         for i, k, e, J in zip(f.row.tolist(), antennas.tolist(), f.e, f.J):
             graph.add(X(i), J[:, :3], A(k), J[:, 3:5], C(0), J[:, 5:], -e)
@@ -64,12 +64,12 @@ def linearize(problem, state):
 
 def nonlinear_graph(problem):
     """The gtsam.NonlinearFactorGraph of a Problem: sightings, ranges and priors, with kernels."""
-    factors, noise, model = problem.measured, problem.noise, gtsam.noiseModel
+    factors, noise, model = problem.accepted, problem.noise, gtsam.noiseModel
     m, graph = problem.measurements, gtsam.NonlinearFactorGraph()
     s, weight = m.sightings, factors.sighting_weight * m.as_pose
     roots = m.sighting_roots[0] * (np.sqrt(weight) / noise.sightings)[:, None, None]
     used = np.flatnonzero(weight)
-    for i, j, z, root in zip(s.row[used].tolist(), m.label[used].tolist(), s.z[used].tolist(),
+    for i, j, z, root in zip(s.row[used].tolist(), m.marker_row[used].tolist(), s.z[used].tolist(),
                              roots[used]):
         graph.add(gtsam.BetweenFactorPose2(X(i), L(j), gtsam.Pose2(*z), _robust(
             factors.sighting_kernel, model.Gaussian.SqrtInformation(root, False))))

@@ -80,8 +80,8 @@ def consensus_markers(measurements, in_world, covariances):
 
     `in_world` (s, 3) and `covariances` (s, 3, 3) are the marker poses by each sighting.
     """
-    chosen = evenly_chosen(measurements.label, MAX_VOTES)
-    best = consensus(measurements.label[chosen], in_world[chosen], covariances[chosen])
+    chosen = evenly_chosen(measurements.marker_row, MAX_VOTES)
+    best = consensus(measurements.marker_row[chosen], in_world[chosen], covariances[chosen])
     return in_world[chosen[best]]
 
 

@@ -79,6 +79,6 @@ def _increments(problem, w, frame, start, end):
     d = problem.measurements.dataset
     vehicle, ticks = d.vehicle.with_deviation(w), d.ticks[frame[0]:frame[-1] + 1]
     start, end = start - frame[0], end - frame[0]
-    delta, by_w = increments.between_poses(ticks, vehicle, start, end, problem.odometry.model)
-    rounding, slipping = odometry_noise(ticks, vehicle, start, end, len(d.ticks) - 1)
-    return delta, by_w * vehicle.sigma_wheel, rounding + problem.noise.slip**2 * slipping
+    delta, by_wheel = increments.between_poses(ticks, vehicle, start, end, problem.odometry.model)
+    quantization, slipping = odometry_noise(ticks, vehicle, start, end, len(d.ticks) - 1)
+    return delta, by_wheel * vehicle.sigma_wheel, quantization + problem.noise.slip**2 * slipping

@@ -13,8 +13,8 @@ import numpy as np
 from scipy.sparse.linalg import splu
 
 from slamlib import se2
-from slamlib.slam.linear_factors import linearize_measurements
-from slamlib.slam.measurement_factors import GUESS_PRIOR_SIGMA, WEAK_SIGMA
+from slamlib.slam.measurement_factors import linearize_measurements
+from slamlib.slam.measurements import GUESS_PRIOR_SIGMA, WEAK_SIGMA
 from slamlib.slam.odometry_factors import odometry_error
 from slamlib.slam.problem import Problem
 from slamlib.slam.state import State
@@ -52,8 +52,8 @@ class NormalEquations:
 
     @cached_property
     def factors(self):
-        """The LinearFactors of sightings of poses, of points, and of ranges."""
-        return linearize_measurements(self.problem.measured, self.problem.noise, self.state)
+        """The LinearizedMeasurements of sightings of poses, of points, and of ranges."""
+        return linearize_measurements(self.problem.accepted, self.problem.noise, self.state)
 
     def step(self):
         """The Gauss-Newton step delta (n,), or None where H is singular to rounding."""
@@ -97,7 +97,7 @@ class NormalEquations:
                  (v.antennas, state.antennas - m.guess, GUESS_PRIOR_SIGMA),
                  (v.w, state.w[None], 1.0)]
         parts += [(v.markers[[j]], state.markers[[j], :2 + m.oriented[j]], WEAK_SIGMA)
-                  for j in self.problem.measured.unsupported]
+                  for j in self.problem.accepted.unsupported]
         if m.calibrated:
             parts.append((v.c, state.c[None], 1.0))
         H, e = np.zeros((2, len(self.structure.diagonal)))

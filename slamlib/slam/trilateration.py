@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slamlib.slam.measurement_factors import GUESS_PRIOR_SIGMA
+from slamlib.slam.measurements import GUESS_PRIOR_SIGMA
 
 MAX_RANGES = 150             # maximum number of ranges used per antenna, evenly chosen
 SAME_PLACE = 0.2             # of the median range: positions closer than this are one

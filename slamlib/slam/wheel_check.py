@@ -39,14 +39,14 @@ def with_checked_wheels(found, fit, solve):
         sigma_wheelbase=WEAK_WHEEL_SIGMA * stated.wheelbase)
     try:
         alternative = solve(measure(replace(dataset, vehicle=uncertain)), found)
-        measured = replace(alternative.problem.measured, measurements=fit.problem.measurements)
-        compared = refine(replace(fit.problem, measured=measured), fit.state, accept=None)
+        accepted = replace(alternative.problem.accepted, measurements=fit.problem.measurements)
+        compared = refine(replace(fit.problem, accepted=accepted), fit.state, accept=None)
     except (DatasetError, np.linalg.LinAlgError):
         return found
     wheel = stated.wheel + uncertain.sigma_wheel * alternative.state.w
     lead = alternative.posterior.density - compared.posterior.density
-    if alternative.problem.measured.weight.sum() \
-            < MIN_ACCEPTED * fit.problem.measured.weight.sum() \
+    if alternative.problem.accepted.weight.sum() \
+            < MIN_ACCEPTED * fit.problem.accepted.weight.sum() \
             or alternative.problem.noise.slip > MAX_SLIP_RATIO * found.slip \
             or lead < max(MIN_LEAD, found.camera.time.gain, found.camera.place.gain) \
             or not far_off(stated, wheel).any():
