@@ -21,7 +21,7 @@ def test_degrees_of_freedom_are_those_of_the_dense_matrices():
     markers, antennas = map_checks.residuals_by_landmark(fit)
     m, equations = fit.problem.measurements, fit.equations
     C = np.linalg.inv(m.structure.matrix(equations.sums(fit.problem.noise)[0]).toarray())
-    poses, _, ranges = equations.factors
+    poses, _, ranges = equations.linearized
     for f, (_, rows), found in ((poses, m.factor_places[1], markers),
                                 (ranges, m.factor_places[3], antennas)):
         J, rows = f.J, rows[f.index]

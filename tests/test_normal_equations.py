@@ -54,7 +54,7 @@ def test_gtsam_has_the_same_error_and_takes_the_same_step():
     others = odometry_factors.odometry_error(problem.odometry, state.poses, state.w)[0]
     others = problem.odometry.whitening(2e-3)[0] @ others[..., None]
     expected = gtsam_graph.nonlinear_graph(problem).error(values) + np.sum(others**2) / 2 \
-        + equations.factors[1].error
+        + equations.linearized[1].error
     assert np.isclose(equations.error, expected, rtol=1e-12)
     step = gtsam_graph.gtsam_step(problem, state)
     np.testing.assert_allclose(equations.step(), step, rtol=1e-5, atol=1e-6 * np.abs(step).max())
@@ -134,10 +134,10 @@ def test_the_first_frames_are_a_drive_of_their_own(monkeypatch):
     np.testing.assert_array_equal(part.problem.accepted.weight, np.r_[
         weight[:len(m.marker_row)][rows], weight[len(m.marker_row):][kept]])
     whole = NormalEquations(problem, state)
-    np.testing.assert_allclose(part.factors[0].e,
-                               whole.factors[0].e[whole.factors[0].row < 60], rtol=1e-12)
-    np.testing.assert_allclose(part.factors[2].e,
-                               whole.factors[2].e[whole.factors[2].row < 60], rtol=1e-12)
+    np.testing.assert_allclose(part.linearized[0].e,
+                               whole.linearized[0].e[whole.linearized[0].row < 60], rtol=1e-12)
+    np.testing.assert_allclose(part.linearized[2].e,
+                               whole.linearized[2].e[whole.linearized[2].row < 60], rtol=1e-12)
     assert np.isfinite(part.step()).all()
     monkeypatch.setattr(first_frames, "LEARNING_FRAMES", len(m.frame))
     assert equations_of_first_frames(whole) is whole

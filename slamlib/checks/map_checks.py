@@ -48,7 +48,7 @@ def residuals_by_landmark(fit):
     of_poses = np.concatenate([pairs[:, :3, :3], pairs[-1:, 3:6, 3:6]])
     totals = np.zeros((3, len(m.marker) + len(m.antenna)))
     of_kernel = consistency_factor(fit.problem.accepted.range_kernel)
-    for f, (_, rows), expected in zip(equations.factors, m.factor_places[1:], (1, 1, of_kernel)):
+    for f, (_, rows), expected in zip(equations.linearized, m.factor_places[1:], (1, 1, of_kernel)):
         if not len(f.row):                                              # of no width
             continue
         rows, J = rows[f.index], f.J

@@ -47,7 +47,7 @@ def estimate_camera_offsets(equations):
     H, g, *_ = equations.sums(
         problem.noise, (1.0, 1.0, consistency_factor(problem.accepted.range_kernel)))
     lu = decomposition(equations.structure.matrix(H))
-    velocity, sightings = _velocities(problem.measurements, state), equations.factors[:2]
+    velocity, sightings = _velocities(problem.measurements, state), equations.linearized[:2]
 
     def shared(columns):
         """SharedError with columns (m, d, p) for both kinds of sightings."""
@@ -89,7 +89,7 @@ def _velocities(measurements, state):
     row = np.arange(len(measurements.frame))
     earlier = np.maximum(row - VELOCITY_FRAMES, 0)
     later = np.minimum(row + VELOCITY_FRAMES, len(row) - 1)
-    moved = se2.between(state.poses, state.poses[later]) \
+    motion = se2.between(state.poses, state.poses[later]) \
         - se2.between(state.poses, state.poses[earlier])
     steps = measurements.frame[later] - measurements.frame[earlier]
-    return moved / np.maximum(steps, 1)[:, None]
+    return motion / np.maximum(steps, 1)[:, None]

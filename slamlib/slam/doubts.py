@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from slamlib.slam.measurement_factors import MIN_DISTANCE
 from slamlib.slam.measurements import GUESS_PRIOR_SIGMA
 from slamlib.slam.trilateration import SAME_PLACE, ranges_by_antenna, second_moment, trilaterate
 
@@ -66,6 +67,6 @@ def _sigma_by_ranges(ranges, estimate, weight):
     whole map.
     """
     difference = estimate - ranges.positions
-    direction = difference / np.maximum(np.hypot(*difference.T), 1e-9)[:, None]
+    direction = difference / np.maximum(np.hypot(*difference.T), MIN_DISTANCE)[:, None]
     information = direction.T @ (direction * (weight / ranges.sigma**2)[:, None])
     return 1 / np.sqrt(max(np.linalg.eigvalsh(information)[0], GUESS_PRIOR_SIGMA**-2))

@@ -1,7 +1,7 @@
-"""Stage 2: errors e of the factors and their derivatives in numpy, all factors of a kind at once.
+"""Stage 2: the error of a between factor, for odometry and markers, and whitening, in numpy.
 
-Derivatives are by GTSAM's tangent vectors: a pose X moves as X exp(xi), in its own axes. GTSAM has
-the same errors in BetweenFactorPose2 and RangeFactor2D; tests compare them.
+Derivatives by poses are by GTSAM's tangent vectors: X moves as X exp(xi), in its own axes. Those of
+`se2` are by coordinates. Tests compare the error with GTSAM's BetweenFactorPose2.
 """
 
 import numpy as np
@@ -10,7 +10,7 @@ from slamlib import se2
 
 
 def between_error(z, first, second):
-    """Errors log(z^-1 X^-1 X') and their derivatives by X and X', and by the coordinates of z.
+    """Errors log(z^-1 X^-1 X') (m, 3) and their derivatives by X, X', and the coordinates of z.
 
     Measured poses z, first poses X and second poses X' are (m, 3), m, m, rad; the derivatives
     (m, 3, 3). GTSAM: BetweenFactorPose2.

@@ -1,4 +1,4 @@
-"""Stage 6: the normal equations of the first frames of a very long drive, at the same state."""
+"""Stage 6: on a very long drive, noise is learned from the first frames only."""
 
 from dataclasses import replace
 
@@ -7,7 +7,7 @@ import numpy as np
 from slamlib.slam.measurements import measure
 from slamlib.slam.normal_equations import NormalEquations
 
-LEARNING_FRAMES = 20_000     # number of frames from which the noise of a longer drive is learned
+LEARNING_FRAMES = 20_000     # number of first frames from which noise is learned on a long drive
 MIN_MEASUREMENTS = 5000      # of a sensor: they determine the factor on its sigmas to 1 %
 
 

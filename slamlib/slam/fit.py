@@ -36,7 +36,10 @@ class Fit:
 
 
 def solved_by_gtsam(fit):
-    """The Fit at the end of GTSAM's optimisation of the same graph, from the state of `fit`."""
+    """The Fit after GTSAM's optimisation, started at the state of `fit`.
+
+    Raises DatasetError as `optimize`.
+    """
     return replace(fit, state=optimize(fit.problem, fit.state, by_gtsam=True).state)
 
 
@@ -45,7 +48,8 @@ def refine(problem, state, accept=accepted_measurements, preintegrate=preintegra
 
     They depend on each other, so each is updated in turn until the accepted measurements no longer
     change. From a Problem and a State near its solution. `accept` makes AcceptedMeasurements from
-    Problem and State; None keeps those of the problem. `preintegrate` as in `build_problem`.
+    Problem and State; None keeps those of the problem. `preintegrate` as in `build_problem`. Raises
+    DatasetError as `optimize`, and numpy.linalg.LinAlgError if odometry's covariance is singular.
     """
     m, model, posterior = problem.measurements, problem.odometry.model, None
     if accept is not None:

@@ -13,7 +13,7 @@ from slamlib import se2
 from slamlib.slam.errors import between_error
 from slamlib.slam.state import RANGE_SIGMA
 
-MIN_DISTANCE = 1e-9          # m, below which a range to an antenna has no direction
+MIN_DISTANCE = 1e-9          # m, below which a range has no direction
 
 
 @dataclass(frozen=True)

@@ -140,10 +140,10 @@ class Measurements:
         numbers = {"x": v.frames, "l": v.markers, "p": v.markers, "a": v.antennas, "w": v.w,
                    "c": v.c}
         keys = (gtsam.Symbol(order.at(i)) for i in range(order.size()))
-        rank = np.argsort([numbers[chr(key.chr())][key.index()] for key in keys])
-        width = np.full(len(rank), 2)
+        elimination_order = np.argsort([numbers[chr(key.chr())][key.index()] for key in keys])
+        width = np.full(len(elimination_order), 2)
         width[np.r_[v.frames, v.markers[self.oriented], v.w]] = 3
-        return block_structure(width, rank, self.factor_variables)
+        return block_structure(width, elimination_order, self.factor_variables)
 
     @cached_property
     def factor_places(self):

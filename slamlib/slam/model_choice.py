@@ -43,7 +43,7 @@ def _with_fixed_weights(fit):
 def _log_density(equations, posterior, is_greatest=False):
     """Log evidence of known noise, or greatest log posterior density of learned noise.
 
-    `is_greatest` says that the noise of the equations' problem is the mode already.
+    If `is_greatest`, the noise of the equations' problem is the mode already.
     """
     if posterior is None or not posterior.covariance.any():          # nothing was learned
         return laplace_approximation(equations, equations.problem.noise)[1]

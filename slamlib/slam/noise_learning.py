@@ -1,4 +1,4 @@
-"""Stage 6: the posterior of the noise parameters, learned from the drive's own measurements.
+"""Stage 6: the noise parameters learned from the drive's own measurements: their posterior.
 
 The evidence times the prior is the posterior of the logarithms of slip and factors. Newton's method
 finds its mode, differences give its covariance. Poses and landmarks are averaged over a few points
@@ -26,6 +26,7 @@ from slamlib.slam.noise import (
 MAX_DIFFERENCE = 0.2         # of a logarithm, largest one of a difference quotient
 MIN_DIFFERENCE = 0.003       # of a logarithm, smallest one of a difference quotient
 MAX_STEP = 1.5               # of a logarithm, longest step of Newton's method
+SHORTEST_STEP = 0.1          # sigmas, to which a step that does not ascend is halved
 MAX_NEWTON_STEPS = 12        # number of steps of Newton's method
 CONVERGED_GAIN = 0.01        # log posterior gained by the last step of Newton's method
 POINT_OFFSETS = 1.5 * np.arange(-2, 3)       # sigmas of log slip, points of the average
@@ -108,11 +109,12 @@ def _mode(function, x, value, free, steps, correlation=None):
         coarse, steps = (steps > 2 * sigma).any(), sigma
         step = covariance @ gradient
         step *= MAX_STEP / max(MAX_STEP, np.abs(step).max())
-        while (new := function(_moved(x, free, step))) < value and np.abs(step / sigma).max() > 0.1:
+        while (new := function(_with_step(x, free, step))) < value \
+                and np.abs(step / sigma).max() > SHORTEST_STEP:
             step = step / 2
         gain = new - value
         if gain > 0:
-            x, value = _moved(x, free, step), new
+            x, value = _with_step(x, free, step), new
         if gain < CONVERGED_GAIN and not coarse:
             break
     full = np.zeros((len(x), len(x)))
@@ -120,11 +122,11 @@ def _mode(function, x, value, free, steps, correlation=None):
     return x, value, full
 
 
-def _moved(x, free, step):
+def _with_step(x, free, step):
     """x (3,) with `step` (p,) added to the components `free` (p,), within BOUNDS."""
-    moved = x.copy()
-    moved[free] += step
-    return np.clip(moved, *BOUNDS)
+    stepped = x.copy()
+    stepped[free] += step
+    return np.clip(stepped, *BOUNDS)
 
 
 def _differences(function, x, value, free, steps, correlation=None):
@@ -136,7 +138,7 @@ def _differences(function, x, value, free, steps, correlation=None):
     offsets = [*unit, *-unit]
     if correlation is None:
         offsets += [unit[i] + unit[j] for i, j in pairs]
-    values = np.array([function(_moved(x, free, off)) for off in offsets])
+    values = np.array([function(_with_step(x, free, offset)) for offset in offsets])
     up, down, both = np.split(values, [len(free), 2 * len(free)])
     gradient, hessian = (up - down) / (2 * steps), np.diag((up + down - 2 * value) / steps**2)
     if correlation is not None:
@@ -150,7 +152,8 @@ def _differences(function, x, value, free, steps, correlation=None):
 def _points(log_posterior, mode, density, covariance):
     """Tuple of (probability, Noise) along the slip, each with the most probable factors.
 
-    The remaining variance at a point is included in its Noise: sigmas are root mean squares.
+    At each point the sigmas are replaced by their root mean square over the remaining uncertainty.
+    `mode` and `covariance`, (3,) and (3, 3), are of the logarithms, `density` that at the mode.
     """
     sigma = np.sqrt(covariance[0, 0])
     direction = covariance[0] / (sigma or 1)     # (3,) for one sigma of log slip; 0 if it is known

@@ -4,8 +4,8 @@ Each stage is a function from one frozen record to the next; stages have the num
 `slamlib.slam`:
 
     1   measure           Dataset -> Measurements
-    2   build_problem     Measurements -> the factors of odometry, sightings and ranges,
-    3                     and with the noise -> Problem, the factor graph
+    2   build_problem     Measurements, Noise -> Problem, the factor graph
+    3   optimize          Problem, State -> Optimum by Gauss-Newton, in all later stages
     4   initial_state     Measurements -> State, the start values
     5   narrow_kernels    Problem, State -> State, by robust kernels
     6   refine            Problem, State -> Fit: wheels, noise and accepted measurements in turn
@@ -34,7 +34,7 @@ from slamlib.slam.result import slam_result
 from slamlib.slam.robust import CAUCHY_SCALES, narrow_kernels
 from slamlib.slam.wheel_check import with_checked_wheels
 
-WARM_START_CONVERGED = 1e-3  # relative decrease of the error at which the start from a result ends
+WARM_START_CONVERGED = 1e-3  # decrease, over 1 + error, at which the start from a result ends
 
 
 def estimate(dataset, slip=None, model=None, previous=None, *, marker_noise_factor=None,
@@ -62,12 +62,13 @@ def estimate(dataset, slip=None, model=None, previous=None, *, marker_noise_fact
     Raises
     ------
     DatasetError : the measurements do not determine every pose and landmark.
+    numpy.linalg.LinAlgError : a covariance is singular to rounding.
     ValueError : an option has no such name, or is not within the limits of vehicle.toml.
 
     >>> from slamlib.simulation import simulate
     >>> dataset, truth = simulate("short", seed=1)
-    >>> found = estimate(dataset.first(200), slip=1e-3, kernel="Huber")
-    >>> found.poses.shape, found.antenna.tolist(), found.noise.slip
+    >>> result = estimate(dataset.first(200), slip=1e-3, kernel="Huber")
+    >>> result.poses.shape, result.antenna.tolist(), result.noise.slip
     ((200, 3), [5, 13, 36, 46], 0.001)
     >>> estimate(dataset, kernel="L2")
     Traceback (most recent call last):
@@ -96,7 +97,7 @@ def fit_from_odometry(measurements, model="arc", preintegrate=preintegrate_odome
     `model` and `preintegrate` as in `build_problem`, `accept` as in `refine`. Raises DatasetError
     as `estimate`.
     """
-    problem = build_problem(measurements, model, _initial_noise(measurements),        # 2 and 3
+    problem = build_problem(measurements, model, _initial_noise(measurements),        # 2
                             preintegrate=preintegrate)
     state = initial_state(measurements, model, preintegrate)                          # 4
     state = narrow_kernels(problem, state)                                            # 5

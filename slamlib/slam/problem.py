@@ -1,4 +1,4 @@
-"""Stage 3: the factor graph: measurements, odometry and noise.
+"""Stage 2: the factor graph: odometry, accepted measurements and noise.
 
 All odometry factors share the variable w, because the same wheel errors act in every increment.
 Independent noise in each factor would not model this.

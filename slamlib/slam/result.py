@@ -61,7 +61,7 @@ class SlamResult:
 def slam_result(fit):
     """The SlamResult of a Fit.
 
-    Raises DatasetError as `marginal_covariances`.
+    Raises DatasetError and LinAlgError as `marginal_covariances`.
     """
     problem, m = fit.problem, fit.problem.measurements
     vehicle = m.dataset.vehicle
@@ -75,7 +75,7 @@ def slam_result(fit):
     markers[:, 2] = se2.wrap(markers[:, 2])
     antennas = antenna_doubts(problem, state, pose_covariances[m.frame], marginal.antennas,
                               range_weight)
-    found = SlamResult(
+    result = SlamResult(
         poses=poses, covariances=pose_covariances,
         marker=m.marker[mapped], marker_in_world=markers,
         marker_covariance=se2.rotate_covariance(
@@ -94,7 +94,7 @@ def slam_result(fit):
         chi2_per_dof_of_all=chi2_per_dof(problem, state, m.unit_weights),
         rejected=problem.accepted.sighting_weight == 0, residual=residual,
         range_weight=range_weight, range_residual=range_residual)
-    return replace(found, drive_doubts=(*solution_doubts(m, found), *turn_doubts(problem)))
+    return replace(result, drive_doubts=(*solution_doubts(m, result), *turn_doubts(problem)))
 
 
 def _mapped(problem, blocks):
