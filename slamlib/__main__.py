@@ -137,7 +137,7 @@ def _report_exit_code(report):
 
 
 def _exit_code(failures):
-    """Prints the (dataset, problem, reason) of every unsolved problem; returns 3 if there are any."""
+    """Print each (dataset, problem, reason) not solved; return 3 if there are any, or 0."""
     for dataset, problem, reason in failures:
         print(f"slamlib: {dataset}: {problem} could not be solved: {reason}", file=sys.stderr)
     return 3 if failures else 0

@@ -428,7 +428,7 @@ def test_the_gate_has_a_smaller_error_than_hubers_kernel_with_wrong_labels():
     runs = studies.run(kernels.wrong_labels, range(8), methods=("gate", "Huber", *others),
                        mislabelled=0.03)
     assert decided(runs["Huber ate"] - runs["gate ate"])
-    assert all(decided(1.15 * runs[f"{way} ate"] - runs["gate ate"]) for way in others)
+    assert all(decided(1.15 * runs[f"{method} ate"] - runs["gate ate"]) for method in others)
 
 
 def test_refine_keeps_the_accepted_measurements_if_accept_is_none():

@@ -228,10 +228,10 @@ def test_the_default_kernel_has_smaller_antenna_errors_than_symmetric_kernels():
     symmetric = ("quadratic", "Huber", "Cauchy", "gate", "GNC")
     runs = studies.run(kernels.late_ranges, range(10), late_ranges=0.3,
                        methods=(*symmetric, "asymmetric Tukey", "asymmetric gate"))
-    squared = {way: runs[f"{way} antenna error"]**2
-               for way in (*symmetric, "asymmetric Tukey", "asymmetric gate")}
+    squared = {method: runs[f"{method} antenna error"]**2
+               for method in (*symmetric, "asymmetric Tukey", "asymmetric gate")}
     default = squared["asymmetric Tukey"]
-    assert all(decided(squared[way] - default) for way in symmetric)
+    assert all(decided(squared[method] - default) for method in symmetric)
     assert decided(1.1**2 * squared["asymmetric gate"] - default)
     low, high = nees_band(10, 2, 0.999)
     assert low < runs["asymmetric Tukey antenna nees"].mean() < high
@@ -241,10 +241,10 @@ def test_the_default_kernel_has_smaller_antenna_errors_than_symmetric_kernels():
 @pytest.mark.slow
 def test_the_default_kernel_has_smaller_antenna_errors_than_convex_kernels_without_markers():
     """15 % late, 12 drives, and the poses are not overconfident."""
-    ways = ("quadratic", "Huber", "asymmetric Tukey")
+    methods = ("quadratic", "Huber", "asymmetric Tukey")
     runs = studies.run(
-        kernels.late_ranges, range(12), markers=False, late_ranges=0.15, methods=ways)
-    quadratic, huber, default = (runs[f"{way} antenna error"]**2 for way in ways)
+        kernels.late_ranges, range(12), markers=False, late_ranges=0.15, methods=methods)
+    quadratic, huber, default = (runs[f"{method} antenna error"]**2 for method in methods)
     assert decided(huber - default) and decided(quadratic - 9 * default)
     assert runs["asymmetric Tukey nees"].mean() < 6 < runs["quadratic nees"].mean()
     low, high = nees_band(12, 2, 0.999)

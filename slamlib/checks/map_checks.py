@@ -19,7 +19,7 @@ from slamlib.slam.pipeline import fit_from_odometry
 from slamlib.slam.range_calibration import calibrated
 from slamlib.slam.result import slam_result
 
-MIN_SIGHTINGS_PER_MARKER = 3  # accepted sightings; fewer may all have wrong labels
+MIN_SIGHTINGS_IN_HALF = 3   # accepted sightings of a marker; fewer may all have wrong labels
 ALIGNMENT_ITERATIONS = 10     # Gauss-Newton iterations for the motion between two maps
 
 
@@ -111,7 +111,7 @@ def estimated_map(dataset):
     rows = m.structure.rows
     accepted = np.bincount(m.marker_row, fit.problem.accepted.sighting_weight, len(m.marker))
     marker = np.flatnonzero(np.isin(m.marker, found.marker) & m.oriented
-                            & (accepted >= MIN_SIGHTINGS_PER_MARKER))
+                            & (accepted >= MIN_SIGHTINGS_IN_HALF))
     antenna = np.flatnonzero(~np.isin(m.antenna, list(found.doubts)))
     f, k = len(m.frame), len(m.marker)
     unknowns = np.concatenate([rows(f + marker, 3).ravel(), rows(f + k + antenna, 2).ravel()])

@@ -39,7 +39,7 @@ MIN_LOG_ODDS = 10.0       # log odds by which a hypothesis explains the incremen
 MIN_AGREEING_SHARE = 0.7  # share of the increments that agree with an accepted hypothesis
 AGREEMENT_GATE = 7.8147   # squared Mahalanobis distance of increments that agree: the 95 %
                           # quantile of chi-squared with 3 degrees of freedom
-MIN_CONTRADICTION = 4.0   # standard errors of the mean agreement of headings and positions below 0
+MIN_DISAGREEMENT = 4.0   # standard errors of the mean agreement of headings and positions below 0
 MIN_FIT_RATIO = 3.0       # ratio of the ranges' median residuals that decides between two paths
 
 
@@ -163,7 +163,7 @@ def _headings_contradict(sightings, found):
     smaller = np.minimum(smaller, np.median(smaller) if len(same) else 0)    # wrong labels
     agreement = np.sign(turn * seen_turn) * smaller
     error = np.sqrt(np.sum(agreement**2))
-    return bool(len(same) >= MIN_INCREMENTS and agreement.sum() < -MIN_CONTRADICTION * error)
+    return bool(len(same) >= MIN_INCREMENTS and agreement.sum() < -MIN_DISAGREEMENT * error)
 
 
 def _compare(dataset, sightings, found):

@@ -10,8 +10,8 @@ from slamlib import odometry, se2
 from slamlib.doubt import Doubt
 
 MIN_FACTOR = 5.0           # ratio of lengths from which on the unit is in doubt
-MIN_MEASUREMENTS = 10      # number of measurements for a decision
-MIN_RANGES_PER_ANTENNA = 4  # if no antenna has MIN_MEASUREMENTS; all together need as many
+MIN_UNIT_MEASUREMENTS = 10      # number of measurements for a decision
+MIN_RANGES_PER_ANTENNA = 4  # if no antenna has MIN_UNIT_MEASUREMENTS; all together need as many
 NOISE_SIGMAS = 2.0         # sigmas by which noise spreads few ranges
 MAX_ODOMETRY_HEADING_SIGMA = 0.1   # rad, at the end of the part of the path that is compared
 MIN_EXTENT = 1e-3          # m, standard deviation of the path that ranges are compared with
@@ -26,7 +26,7 @@ SECOND_DIFFERENCE = 0.6745 * 6**0.5
 MAX_SIGMA_RATIO = 15.0     # of a stated standard deviation to the scatter; in degrees it is 57
 
 
-def path_and_antennas(dataset, min_ranges=MIN_MEASUREMENTS):
+def path_and_antennas(dataset, min_ranges=MIN_UNIT_MEASUREMENTS):
     """The first part of odometry's path (p, 2) in m, and the ranges on it by antenna.
 
     The path ends where the heading's standard deviation exceeds MAX_ODOMETRY_HEADING_SIGMA. Of
@@ -84,7 +84,7 @@ def range_units(dataset):
     few = not antennas
     if few:
         _, antennas = path_and_antennas(dataset, MIN_RANGES_PER_ANTENNA)
-    if sum(len(r) for _, r, _ in antennas) < MIN_MEASUREMENTS \
+    if sum(len(r) for _, r, _ in antennas) < MIN_UNIT_MEASUREMENTS \
             or (extent := np.hypot(*path.std(axis=0))) < MIN_EXTENT:
         return []
     # Between the quartiles lie 1.35 standard deviations of a normal distribution.
@@ -147,7 +147,7 @@ def _scatter(pose, landmark, values, wrap=lambda x: x):
 def _sigma_doubts(what, unit, scatters, sigma, look):
     """A Doubt if the stated standard deviations (m,) exceed MAX_SIGMA_RATIO times the scatter."""
     sizes = np.concatenate(scatters)
-    if len(sizes) < MIN_MEASUREMENTS:
+    if len(sizes) < MIN_UNIT_MEASUREMENTS:
         return []
     scatter, stated = np.median(sizes), np.median(sigma)
     if not 0 < MAX_SIGMA_RATIO * scatter < stated:

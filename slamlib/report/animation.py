@@ -21,7 +21,7 @@ WIDTH, HEIGHTS = 720, (280, 460)  # units of the drawing, about pixels: width, l
 DRAWING_MARGIN = 24  # units of the drawing
 PATH_POINTS, STOPS = 500, 40  # numbers of points of a path, and of those where its time is exact
 ELLIPSE_COUNTS = 8, 16  # of odometry, and of the estimate beside it
-MAX_SEMI_AXIS = 0.08  # of the path's extent: the estimate's ellipses are enlarged up to it
+SEMI_AXIS_LIMIT = 0.08  # of the path's extent: the estimate's ellipses are enlarged up to it
 BESIDE_ODOMETRY = ("problem4", "problem3", "problem2_fused")  # estimates, the best first
 
 
@@ -43,8 +43,8 @@ def animated(drive):
     shown = [solved["problem1"].poses, best.poses]
     shown += [drive.truth.poses] if drive.truth else []
     on_page, height, scale = _projection(shown)
-    layers = [(solved["problem1"], "#D55E00", 1),
-              (best, "#0072B2", plotting.enlargement(best.poses, best.covariances, MAX_SEMI_AXIS))]
+    enlarged = plotting.enlargement(best.poses, best.covariances, SEMI_AXIS_LIMIT)
+    layers = [(solved["problem1"], "#D55E00", 1), (best, "#0072B2", enlarged)]
     parts, rules = [], []
     own = f"d{sha256(np.concatenate(shown).tobytes()).hexdigest()[:6]}"
     if drive.truth is not None:

@@ -86,12 +86,13 @@ def _what_was_done(sensors):
     """Return the first sentence of the abstract for a set of SENSORS."""
     data = ["wheel encoders", *["ArUco markers on the ceiling"] * ("aruco" in sensors),
             *["UWB ranges"] * ("uwb" in sensors)]
-    ways = ["by odometry"] + ["by markers", "by a filter that fuses both"] * ("aruco" in sensors) \
-        + ["by one factor graph in GTSAM"] * bool(sensors)
+    methods = ["by odometry",
+               *["by markers", "by a filter that fuses both"] * ("aruco" in sensors),
+               *["by one factor graph in GTSAM"] * bool(sensors)]
     return ("We estimate the trajectory of a differential-drive vehicle"
             + " and map its landmarks" * bool(sensors) + f" from {listed(data)}"
-            + (f": {', '.join(ways[:-1])}, and {ways[-1]}." if len(ways) > 2
-               else f", {listed(ways)}."))
+            + (f": {', '.join(methods[:-1])}, and {methods[-1]}." if len(methods) > 2
+               else f", {listed(methods)}."))
 
 
 def _said_of_simulated(names):

@@ -52,10 +52,10 @@ def compare_kernels(seeds):
         runs = studies.run(kernels.late_ranges, seeds, markers=False, late_ranges=late)
         print(f"{100 * late:.0f} % late{'':12}{'ATE (mm)':>10}{'NEES':>8}{'antennas (mm)':>15}"
               f"{'NEES':>8}")
-        for way in kernels.RANGE_METHODS:
-            of = {key: runs[f"{way} {key}"]
+        for method in kernels.RANGE_METHODS:
+            of = {key: runs[f"{method} {key}"]
                   for key in ("ate", "nees", "antenna error", "antenna nees")}
-            print(f"  {way:18}{1e3 * np.sqrt(np.mean(of['ate']**2)):10.1f}"
+            print(f"  {method:18}{1e3 * np.sqrt(np.mean(of['ate']**2)):10.1f}"
                   f"{of['nees'].mean():8.2f}"
                   f"{1e3 * np.sqrt(np.mean(of['antenna error']**2)):15.1f}"
                   f"{of['antenna nees'].mean():8.2f}")
