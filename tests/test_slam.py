@@ -21,7 +21,7 @@ from slamlib.slam.initialization import GROWTH, extended, part_lengths
 from slamlib.slam.measurements import measure
 from slamlib.slam.model_choice import DECISIVE_LEAD, better_model
 from slamlib.slam.moments import posterior_moments
-from slamlib.slam.noise import NOISE_KEYS, Noise, from_logarithms, log_prior
+from slamlib.slam.noise import NOISE_KEYS, Noise, log_prior
 from slamlib.slam.noise_learning import learn_noise
 from slamlib.slam.normal_equations import NormalEquations
 from slamlib.slam.pipeline import fit_from_odometry
@@ -193,7 +193,7 @@ def test_the_learned_noise_has_the_greatest_posterior(poses, slip):
     found = learn_noise(equations)
 
     def log_posterior(logarithms):
-        return laplace_approximation(equations, from_logarithms(logarithms))[1] \
+        return laplace_approximation(equations, Noise.from_logarithms(logarithms))[1] \
             + np.sum(log_prior(logarithms))
 
     sigma = np.sqrt(np.diag(found.covariance))

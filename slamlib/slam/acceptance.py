@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 
 from slamlib import se2
+from slamlib.sightings import GATE, POINT_GATE
 from slamlib.slam.measurements import Measurements
 
 EARLY_GATE = 3.3             # sigmas; a range that is shorter than expected by more is rejected
@@ -105,7 +106,8 @@ def within_gates(problem, state, early, late):
     a point. A range may be too short by `early` and too long by `late` sigmas.
     """
     sightings, ranges = residuals(problem.measurements, state, problem.noise)
-    return np.r_[np.sum(sightings**2, axis=1) < problem.measurements.squared_gate,
+    squared_gate = np.where(problem.measurements.as_pose, GATE, POINT_GATE)
+    return np.r_[np.sum(sightings**2, axis=1) < squared_gate,
                  (ranges > -early) & (ranges < late)].astype(float)
 
 

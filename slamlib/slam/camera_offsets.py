@@ -64,8 +64,8 @@ def estimate_camera_offsets(equations):
     if lu is None or not sum(f.e.size for f in sightings):
         return CameraOffsets(_undetermined(1), _undetermined(3))
     by_pose = [f.J[:, :, :3] for f in sightings]
-    late = [-J @ velocity[f.row, :, None] for f, J in zip(sightings, by_pose)]
-    return CameraOffsets(shared(late), shared(by_pose))
+    delayed = [-J @ velocity[f.row, :, None] for f, J in zip(sightings, by_pose)]
+    return CameraOffsets(shared(delayed), shared(by_pose))
 
 
 def _estimate(full, information, gradient):

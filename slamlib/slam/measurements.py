@@ -1,6 +1,6 @@
 """Stage 1: all measurements of a dataset as arrays.
 
-Frames are the encoder poses that are variables X_i of the graph: the first, the last, and each one
+Frames (keyframes) are the encoder poses that are variables X_i of the graph: the first, the last,
 with a sighting or a range. Measurements are numbered: first the s sightings, then the r ranges.
 """
 
@@ -14,10 +14,8 @@ from gtsam.symbol_shorthand import A, C, L, P, W, X
 from slamlib import odometry, se2
 from slamlib.dataset import Dataset, UwbReadings
 from slamlib.sightings import (
-    GATE,
     MAX_HEADING_SIGMA,
     MIN_MEASUREMENT_SIGMA,
-    POINT_GATE,
     Sightings,
     sightings_by_frame,
 )
@@ -72,11 +70,6 @@ class Measurements:
     def as_pose(self):
         """(s,) bool, sightings of markers with a heading."""
         return self.oriented[self.marker_row]
-
-    @property
-    def squared_gate(self):
-        """(s,) squared Mahalanobis distance from which a sighting is rejected."""
-        return np.where(self.as_pose, GATE, POINT_GATE)
 
     @property
     def unit_weights(self):

@@ -31,10 +31,10 @@ class Noise:
         """(3,) natural logarithms of slip and both factors."""
         return np.log([self.slip, self.sightings, self.ranges])
 
-
-def from_logarithms(logarithms):
-    """The Noise of `Noise.logarithms` (3,)."""
-    return Noise(*np.exp(logarithms).tolist())
+    @classmethod
+    def from_logarithms(cls, logarithms):
+        """The Noise of `logarithms` (3,)."""
+        return cls(*np.exp(logarithms).tolist())
 
 
 def with_noise(dataset, slip=None, marker_noise_factor=None, range_noise_factor=None):

@@ -13,15 +13,7 @@ import numpy as np
 
 from slamlib.slam.evidence import laplace_approximation
 from slamlib.slam.first_frames import equations_of_first_frames
-from slamlib.slam.noise import (
-    BOUNDS,
-    MEDIAN,
-    PRIOR_SIGMA,
-    Noise,
-    from_logarithms,
-    is_known,
-    log_prior,
-)
+from slamlib.slam.noise import BOUNDS, MEDIAN, PRIOR_SIGMA, Noise, is_known, log_prior
 
 MAX_DIFFERENCE = 0.2         # of a logarithm, largest one of a difference quotient
 MIN_DIFFERENCE = 0.003       # of a logarithm, smallest one of a difference quotient
@@ -56,7 +48,7 @@ def learn_noise(equations):
     frames = len(equations.problem.measurements.frame)
     smallest = 1 / np.sqrt(2 * np.maximum([3 * frames, *equations.counts()], 1))
     mode, density, covariance = _mode(log_posterior, start, value, free, smallest[free])
-    return NoisePosterior(from_logarithms(mode), covariance, density,
+    return NoisePosterior(Noise.from_logarithms(mode), covariance, density,
                           _points(log_posterior, mode, density, covariance))
 
 
@@ -85,8 +77,8 @@ def _log_posterior(equations):
     free = problem.measurements.learned
 
     def log_posterior(logarithms):
-        return max(laplace_approximation(equations, from_logarithms(logarithms))[1], SINGULAR) \
-            + np.sum(log_prior(logarithms)[free])
+        _, evidence = laplace_approximation(equations, Noise.from_logarithms(logarithms))
+        return max(evidence, SINGULAR) + np.sum(log_prior(logarithms)[free])
 
     start = np.where(free | is_known(problem.measurements.dataset.vehicle),
                      problem.noise.logarithms, np.log(MEDIAN))
@@ -165,6 +157,6 @@ def _points(log_posterior, mode, density, covariance):
                          for offset in offsets])
         weights = np.exp(logs - logs.max())
     variance = np.maximum(np.diag(remaining), 0)
-    return tuple((float(weight), from_logarithms(mode + offset * direction + variance))
+    return tuple((float(weight), Noise.from_logarithms(mode + offset * direction + variance))
                  for weight, offset in zip(weights / weights.sum(), offsets)
                  if weight > MIN_POINT_WEIGHT)

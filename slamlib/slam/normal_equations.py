@@ -65,8 +65,8 @@ class NormalEquations:
     def sums(self, noise, consistency=(1.0, 1.0, 1.0)):
         """Data of H, g (n,), squared error at the state, and sum log|Q| of the odometry noise Q.
 
-        `consistency` (3,) divides the information of each kind of `linearized`
-        (`evidence.consistency_factors`).
+        `consistency` (3,) divides the contribution of each kind of `linearized` by its consistency
+        factor, which corrects the bias of a robust kernel (`evidence.consistency_factors`).
         """
         odometry, log_determinant = self._odometry(noise.slip)
         H, g, squared = odometry.H.copy(), odometry.g.copy(), odometry.squared

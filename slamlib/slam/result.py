@@ -73,15 +73,15 @@ def slam_result(fit):
     mapped, marker_covariance = _mapped(problem, marginal.markers)
     markers = state.markers[mapped]
     markers[:, 2] = se2.wrap(markers[:, 2])
-    antennas = antenna_doubts(problem, state, pose_covariances[m.frame], marginal.antennas,
-                              range_weight)
+    sentences, antenna_covariances = antenna_doubts(
+        problem, state, pose_covariances[m.frame], marginal.antennas, range_weight)
     result = SlamResult(
         poses=poses, covariances=pose_covariances,
         marker=m.marker[mapped], marker_in_world=markers,
         marker_covariance=se2.rotate_covariance(
             marker_covariance[mapped], markers[:, 2] * m.oriented[mapped]),
         antenna=m.antenna, antenna_in_world=state.antennas,
-        antenna_covariance=antennas.covariances, doubts=antennas.sentences,
+        antenna_covariance=antenna_covariances, doubts=sentences,
         wheel=vehicle.wheel + vehicle.sigma_wheel * state.w,
         wheel_covariance=vehicle.sigma_wheel[:, None] * marginal.w * vehicle.sigma_wheel,
         noise=problem.noise, noise_sigma=np.zeros(3) if fit.posterior is None

@@ -14,7 +14,7 @@ from slamlib.slam.optimizer import CONVERGED, optimize
 
 CAUCHY_SCALES = (100.0, 30.0, 10.0, 3.0)     # sigmas, scale of the kernel in each round
 MIN_RESIDUALS = 20           # number of measurements from which their scatter gives a factor
-CHI2_MEDIANS = (2.366, 1.386, 0.455)         # with 3, 2 and 1 degrees of freedom
+MEDIAN_CHI2 = {3: 2.366, 2: 1.386, 1: 0.455}         # medians by degrees of freedom
 
 
 def narrow_kernels(problem, state, scales=CAUCHY_SCALES, converged=CONVERGED):
@@ -40,10 +40,10 @@ def noise_of_scatter(measurements, state):
     before a factor is learned. Known noise parameters are kept.
     """
     sightings, ranges = residuals(measurements, state, Noise())
-    of_pose, of_point, of_range = CHI2_MEDIANS
-    squared = np.sum(sightings**2, axis=1) / np.where(measurements.as_pose, of_pose, of_point)
+    squared = np.sum(sightings**2, axis=1) / np.where(
+        measurements.as_pose, MEDIAN_CHI2[3], MEDIAN_CHI2[2])
     return with_known(
-        Noise(sightings=_at_least_one(squared), ranges=_at_least_one(ranges**2 / of_range)),
+        Noise(sightings=_at_least_one(squared), ranges=_at_least_one(ranges**2 / MEDIAN_CHI2[1])),
         measurements.dataset.vehicle)
 
 
