@@ -455,7 +455,7 @@ def test_ranges_are_named_as_not_as_stated_from_a_decisive_gain_on(offset, scale
 def test_many_rejected_sightings_and_markers_of_which_most_are_rejected_are_named():
     """Sightings of markers 11, 12 and 13: ten, four and forty; of 13 hardly any is rejected."""
     label = np.repeat([0, 1, 2], [10, 4, 40])
-    measurements = SimpleNamespace(label=label, marker=np.array([11, 12, 13]),
+    measurements = SimpleNamespace(marker_row=label, marker=np.array([11, 12, 13]),
                                    sightings=SimpleNamespace(contradicting=0))
 
     def said(*rejected_of_each):
@@ -481,7 +481,8 @@ def test_a_turn_that_the_wheels_hardly_know_is_named_where_it_is():
         return SimpleNamespace(
             measurements=SimpleNamespace(frame=np.array([0, 10, 30, 70])),
             noise=SimpleNamespace(slip=slip), odometry=SimpleNamespace(
-                by_w=by_w, noise=lambda slip: np.diag([0, 0, slip**2]) * [[[0]], [[1]], [[0]]]))
+                by_w=by_w,
+                covariance=lambda slip: np.diag([0, 0, slip**2]) * [[[0]], [[1]], [[0]]]))
 
     doubt, = drive_doubts.turn_doubts(problem(1.2))
     assert "Between poses 11 and 31" in doubt.sentence and "to 1.3 rad" in doubt.sentence

@@ -22,14 +22,14 @@ def test_degrees_of_freedom_are_those_of_the_dense_matrices():
     markers, antennas = map_checks.residuals_by_landmark(fit)
     m, equations = fit.problem.measurements, fit.equations
     C = np.linalg.inv(m.structure.matrix(equations.sums(fit.problem.noise)[0]).toarray())
-    poses, _, ranges = equations.factors
+    poses, _, ranges = equations.linearized
     for f, (_, rows), found in ((poses, m.factor_places[1], markers),
                                 (ranges, m.factor_places[3], antennas)):
         J, rows = f.J, rows[f.index]
         taken = np.array([np.trace(j @ C[np.ix_(r, r)] @ j.T) for j, r in zip(J, rows)])
         label = f.landmark - f.landmark.min()
         expected = 3 if f is poses else \
-            map_checks.consistency_factor(fit.problem.measured.range_kernel)
+            map_checks.consistency_factor(fit.problem.accepted.range_kernel)
         dof = np.bincount(label, expected * f.weight - taken)
         np.testing.assert_allclose(found.dof, dof, rtol=1e-5)
         np.testing.assert_allclose(found.chi2, np.bincount(label, np.sum(f.e**2, axis=1)))

@@ -16,22 +16,21 @@ from slamlib.slam import (
     drive_doubts,
     first_frames,
     gtsam_graph,
-    noise_posterior,
+    noise_learning,
     normal_equations,
     odometry_factors,
 )
+from slamlib.slam.acceptance import LATE_KERNEL, AcceptedMeasurements
 from slamlib.slam.covariances import marginal_covariances
 from slamlib.slam.evidence import laplace_approximation
 from slamlib.slam.first_frames import equations_of_first_frames
 from slamlib.slam.initialization import odometry_state, state_from_poses
-from slamlib.slam.measurement_factors import WEAK_SIGMA, MeasurementFactors
-from slamlib.slam.measurements import measure
+from slamlib.slam.measurements import WEAK_SIGMA, measure
 from slamlib.slam.noise import BOUNDS, Noise
 from slamlib.slam.normal_equations import NormalEquations
 from slamlib.slam.optimizer import optimize
 from slamlib.slam.pipeline import fit_from_odometry
 from slamlib.slam.problem import build_problem
-from slamlib.slam.robust import LATE_KERNEL
 
 
 def test_gtsam_has_the_same_error_and_takes_the_same_step():
@@ -48,19 +47,19 @@ def test_gtsam_has_the_same_error_and_takes_the_same_step():
     assert 0 < np.count_nonzero(m.oriented) < len(m.oriented)
     state = odometry_state(m, "arc")
     cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(3.0)
-    measured = MeasurementFactors(m, m.unit_weights, cauchy, LATE_KERNEL)
-    problem = replace(build_problem(m, "arc", Noise(2e-3, 1.5, 0.7)), measured=measured)
+    accepted = AcceptedMeasurements(m, m.unit_weights, cauchy, LATE_KERNEL)
+    problem = replace(build_problem(m, "arc", Noise(2e-3, 1.5, 0.7)), accepted=accepted)
     equations = NormalEquations(problem, state)
     values = gtsam_graph.values(m, state)
     others = odometry_factors.odometry_error(problem.odometry, state.poses, state.w)[0]
     others = problem.odometry.whitening(2e-3)[0] @ others[..., None]
     expected = gtsam_graph.nonlinear_graph(problem).error(values) + np.sum(others**2) / 2 \
-        + equations.factors[1].error
+        + equations.linearized[1].error
     assert np.isclose(equations.error, expected, rtol=1e-12)
     step = gtsam_graph.gtsam_step(problem, state)
     np.testing.assert_allclose(equations.step(), step, rtol=1e-5, atol=1e-6 * np.abs(step).max())
     free = replace(m, calibrated=True)
-    problem = replace(problem, measured=replace(measured, measurements=free))
+    problem = replace(problem, accepted=replace(accepted, measurements=free))
     step = gtsam_graph.gtsam_step(problem, state)
     np.testing.assert_allclose(NormalEquations(problem, state).step(), step, rtol=1e-5,
                                atol=1e-6 * np.abs(step).max())
@@ -76,9 +75,9 @@ def test_markers_without_accepted_sightings_have_a_weak_prior_and_move_nothing_e
     point, = np.flatnonzero(~m.oriented)
     first = next(j for j in range(len(m.marker) - 1) if m.oriented[j:j + 2].all())
     left = [point, first, first + 1]
-    weight = np.r_[~np.isin(m.label, left), np.ones(len(m.ranges.row), bool)].astype(float)
-    problem = replace(build_problem(m, "arc", Noise()), measured=MeasurementFactors(m, weight))
-    np.testing.assert_array_equal(problem.measured.unsupported, sorted(left))
+    weight = np.r_[~np.isin(m.marker_row, left), np.ones(len(m.ranges.row), bool)].astype(float)
+    problem = replace(build_problem(m, "arc", Noise()), accepted=AcceptedMeasurements(m, weight))
+    np.testing.assert_array_equal(problem.accepted.unsupported, sorted(left))
     state = odometry_state(m, "arc")
     equations = NormalEquations(problem, state)
     H, rows = equations.structure.matrix(equations.sums(Noise())[0]).toarray(), []
@@ -122,7 +121,7 @@ def test_the_first_frames_are_a_drive_of_their_own(monkeypatch):
     m = replace(measure(dataset), calibrated=True)
     weight = (np.arange(len(m.unit_weights)) % 7 > 0).astype(float)
     problem = build_problem(m, "arc", Noise(2e-3, 1.5, 0.7))
-    problem = replace(problem, measured=MeasurementFactors(m, weight, range_kernel=LATE_KERNEL))
+    problem = replace(problem, accepted=AcceptedMeasurements(m, weight, range_kernel=LATE_KERNEL))
     state = odometry_state(m, "arc")
     monkeypatch.setattr(first_frames, "MIN_MEASUREMENTS", 50)
     monkeypatch.setattr(first_frames, "LEARNING_FRAMES", 60)
@@ -132,13 +131,13 @@ def test_the_first_frames_are_a_drive_of_their_own(monkeypatch):
     np.testing.assert_array_equal(part.problem.measurements.frame, m.frame[:60])
     rows, kept = m.sightings.row < 60, m.ranges.row < 60
     np.testing.assert_array_equal(part.problem.measurements.sightings.z, m.sightings.z[rows])
-    np.testing.assert_array_equal(part.problem.measured.weight, np.r_[
-        weight[:len(m.label)][rows], weight[len(m.label):][kept]])
+    np.testing.assert_array_equal(part.problem.accepted.weight, np.r_[
+        weight[:len(m.marker_row)][rows], weight[len(m.marker_row):][kept]])
     whole = NormalEquations(problem, state)
-    np.testing.assert_allclose(part.factors[0].e,
-                               whole.factors[0].e[whole.factors[0].row < 60], rtol=1e-12)
-    np.testing.assert_allclose(part.factors[2].e,
-                               whole.factors[2].e[whole.factors[2].row < 60], rtol=1e-12)
+    np.testing.assert_allclose(part.linearized[0].e,
+                               whole.linearized[0].e[whole.linearized[0].row < 60], rtol=1e-12)
+    np.testing.assert_allclose(part.linearized[2].e,
+                               whole.linearized[2].e[whole.linearized[2].row < 60], rtol=1e-12)
     assert np.isfinite(part.step()).all()
     monkeypatch.setattr(first_frames, "LEARNING_FRAMES", len(m.frame))
     assert equations_of_first_frames(whole) is whole
@@ -176,7 +175,7 @@ def test_differences_of_a_quadratic_are_exact(free):
     expected = -PRECISION[np.ix_(free, free)]
     scale = np.sqrt(-np.diag(expected))
     for correlation in (None, -expected / np.outer(scale, scale)):
-        gradient, hessian = noise_posterior._differences(
+        gradient, hessian = noise_learning._differences(
             gaussian, x, gaussian(x), free, steps, correlation)
         np.testing.assert_allclose(gradient, -(PRECISION @ (x - CENTRE))[free], rtol=1e-9)
         np.testing.assert_allclose(hessian, expected, rtol=1e-8, atol=1e-8)
@@ -188,7 +187,7 @@ def test_newtons_method_finds_mode_and_covariance_of_a_gaussian(free, start):
     """What is not free keeps its start, and its covariance is zero."""
     free, x = np.array(free), CENTRE + start
     given = np.setdiff1d(range(3), free)
-    mode, value, covariance = noise_posterior._mode(
+    mode, value, covariance = noise_learning._mode(
         gaussian, x, gaussian(x), free, np.full(len(free), 0.1))
     H, cross = PRECISION[np.ix_(free, free)], PRECISION[np.ix_(free, given)]
     expected = CENTRE[free] - np.linalg.solve(H, cross @ (x - CENTRE)[given])
@@ -203,7 +202,7 @@ def test_newtons_method_stays_within_the_bounds_and_never_descends():
     """A mode beyond the bound of the slip, and a density that is not concave at the start."""
     beyond = CENTRE.copy()
     beyond[0] = BOUNDS[1, 0] + 1.0
-    mode, *_ = noise_posterior._mode(
+    mode, *_ = noise_learning._mode(
         lambda x: -50 * np.sum((x - beyond)**2), CENTRE, -1e3, np.arange(3), np.full(3, 0.1))
     np.testing.assert_allclose(mode, [BOUNDS[1, 0], *beyond[1:]], atol=1e-6)
 
@@ -211,7 +210,7 @@ def test_newtons_method_stays_within_the_bounds_and_never_descends():
         off = x[0] - CENTRE[0]
         return float(np.logaddexp(-8 * (off - 1)**2, 1 - 8 * (off + 1)**2))
 
-    mode, value, _ = noise_posterior._mode(two_hills, CENTRE + [0.05, 0, 0],
+    mode, value, _ = noise_learning._mode(two_hills, CENTRE + [0.05, 0, 0],
                                            two_hills(CENTRE + [0.05, 0, 0]), np.array([0]),
                                            np.array([0.1]))
     assert value >= two_hills(CENTRE + [0.05, 0, 0])
@@ -226,7 +225,7 @@ def test_points_of_the_posterior_have_its_moments(scale):
     """
     C = scale * np.array([[0.25, 0.06, 0.0], [0.06, 0.04, 0.01], [0.0, 0.01, 0.09]])
     information = np.linalg.inv(C)
-    points = noise_posterior._points(
+    points = noise_learning._points(
         lambda x: -(x - CENTRE) @ information @ (x - CENTRE) / 2, CENTRE, 0.0, C)
     weights, noises = zip(*points)
     assert len(points) == (5 if scale == 1 else 1) and np.isclose(sum(weights), 1)
@@ -278,8 +277,8 @@ def test_the_normal_equations_are_those_of_gtsams_linear_graph():
     """Solution and log determinant, for the noise of the problem and for another one."""
     dataset, _ = simulate("short", seed=4, mislabelled=0.02, late_ranges=0.2)
     fit = fit_from_odometry(measure(known_noise(dataset.first(600), 1e-3)))
-    measured = replace(fit.problem.measured, range_kernel=None)
-    problem = replace(fit.problem, measured=measured, noise=Noise(2e-3, 1.5, 0.7))
+    accepted = replace(fit.problem.accepted, range_kernel=None)
+    problem = replace(fit.problem, accepted=accepted, noise=Noise(2e-3, 1.5, 0.7))
     equations = NormalEquations(replace(problem, noise=Noise(1e-3)), fit.state)
     delta, found = laplace_approximation(equations, problem.noise)
     linear = gtsam_graph.linearize(problem, fit.state)
@@ -288,10 +287,10 @@ def test_the_normal_equations_are_those_of_gtsams_linear_graph():
     for i in (0, 7, len(m.frame) - 1):
         np.testing.assert_allclose(delta[equations.structure.rows([i], 3)[0]], solution.at(X(i)),
                                    rtol=1e-5, atol=1e-8)      # both square the condition number
-    S = 3 * np.count_nonzero(measured.sighting_weight)
+    S = 3 * np.count_nonzero(accepted.sighting_weight)
     expected = -linear.error(solution) - tree.logDeterminant() \
-        - np.sum(np.linalg.slogdet(problem.odometry.noise(2e-3))[1]) / 2 \
-        - S * np.log(1.5) - np.count_nonzero(measured.range_weight) * np.log(0.7)
+        - np.sum(np.linalg.slogdet(problem.odometry.covariance(2e-3))[1]) / 2 \
+        - S * np.log(1.5) - np.count_nonzero(accepted.range_weight) * np.log(0.7)
     assert np.isclose(found, expected, atol=1e-6)
 
 

@@ -12,7 +12,8 @@ from slamlib import increments, odometry, se2, simulation, slam, studies
 from slamlib.dataset import AntennaGuess, ArucoReadings, Dataset, UwbReadings, Vehicle
 from slamlib.evaluation import anees, ate, nees_band
 from slamlib.simulation import simulate
-from slamlib.slam import gtsam_graph, odometry_factors, robust
+from slamlib.slam import acceptance, gtsam_graph, odometry_factors
+from slamlib.slam.acceptance import accepted_measurements, within_gates
 from slamlib.slam.covariances import marginal_covariances
 from slamlib.slam.evidence import laplace_approximation
 from slamlib.slam.fit import refine
@@ -20,13 +21,13 @@ from slamlib.slam.initialization import GROWTH, extended, part_lengths
 from slamlib.slam.measurements import measure
 from slamlib.slam.model_choice import DECISIVE_LEAD, better_model
 from slamlib.slam.moments import posterior_moments
-from slamlib.slam.noise import NOISE_KEYS, Noise, from_logarithms, log_prior
-from slamlib.slam.noise_posterior import learn_noise
+from slamlib.slam.noise import NOISE_KEYS, Noise, log_prior
+from slamlib.slam.noise_learning import learn_noise
 from slamlib.slam.normal_equations import NormalEquations
 from slamlib.slam.pipeline import fit_from_odometry
 from slamlib.slam.problem import build_problem
 from slamlib.slam.result import _mapped, slam_result
-from slamlib.slam.robust import MIN_RESIDUALS, accepted, noise_of_scatter, within_gates
+from slamlib.slam.robust import MIN_RESIDUALS, noise_of_scatter
 from slamlib.slam.state import state_from_arrays
 from slamlib.studies import graphs, kernels, montecarlo, starts
 
@@ -87,7 +88,7 @@ def test_odometry_factor_equals_gtsams_between_factor_for_known_wheels():
         jacobian = np.concatenate([by_first[i], by_second[i]], axis=1)
         np.testing.assert_allclose(A, jacobian, atol=1e-9)
         np.testing.assert_allclose(b, -e[i], atol=1e-12)
-        noise = odometry.noise(1e-3)[i]
+        noise = odometry.covariance(1e-3)[i]
         native = gtsam.BetweenFactorPose2(0, 1, gtsam.Pose2(*odometry.increment[i]),
                                           gtsam.noiseModel.Gaussian.Covariance(noise))
         assert np.isclose(native.error(values), np.sum((U[i] @ e[i])**2) / 2, rtol=1e-6)
@@ -192,7 +193,7 @@ def test_the_learned_noise_has_the_greatest_posterior(poses, slip):
     found = learn_noise(equations)
 
     def log_posterior(logarithms):
-        return laplace_approximation(equations, from_logarithms(logarithms))[1] \
+        return laplace_approximation(equations, Noise.from_logarithms(logarithms))[1] \
             + np.sum(log_prior(logarithms))
 
     sigma = np.sqrt(np.diag(found.covariance))
@@ -434,11 +435,11 @@ def test_refine_keeps_the_accepted_measurements_if_accept_is_none():
     """Evidences can be compared only on the same measurements."""
     dataset, _ = simulate("short", seed=4, mislabelled=0.02)
     fit = fit_from_odometry(measure(known_noise(dataset.without("uwb"), 1e-3)))
-    measured = replace(fit.problem.measured, weight=np.roll(fit.problem.measured.weight, 1))
-    again = refine(replace(fit.problem, measured=measured), fit.state, accept=None)
-    assert again.problem.measured is measured
+    accepted = replace(fit.problem.accepted, weight=np.roll(fit.problem.accepted.weight, 1))
+    again = refine(replace(fit.problem, accepted=accepted), fit.state, accept=None)
+    assert again.problem.accepted is accepted
     tested = refine(again.problem, fit.state)
-    np.testing.assert_array_equal(tested.problem.measured.weight, fit.problem.measured.weight)
+    np.testing.assert_array_equal(tested.problem.accepted.weight, fit.problem.accepted.weight)
 
 
 OPEN_PATHS = {                                            # legs of (metres, radians)
@@ -542,7 +543,7 @@ def test_a_point_has_the_heading_variance_of_its_best_sighting_and_few_markers_a
     m = measure(Dataset("few", Vehicle(), np.zeros((7, 2), int), readings, None, None))
     problem = build_problem(m, "arc", Noise())
     weight = np.array([1, 1, 1, 0, 0, 1, 0.0])
-    problem = replace(problem, measured=replace(problem.measured, weight=weight))
+    problem = replace(problem, accepted=replace(problem.accepted, weight=weight))
     blocks = [np.diag([1.0, 2.0]), np.diag([3.0, 4.0, 5.0]), np.diag([6.0, 7.0, 8.0])]
     mapped, covariance = _mapped(problem, blocks)
     np.testing.assert_array_equal(m.marker[mapped], [5])
@@ -570,7 +571,7 @@ def test_the_scatter_of_residuals_gives_factors_of_at_least_one():
         found = noise_of_scatter(m, state)
         np.testing.assert_allclose([found.sightings, found.ranges], [sightings, ranges], rtol=0.1)
     few = measure(noisy.first(60))
-    assert 0 < len(few.ranges.row) < MIN_RESIDUALS < len(few.label)
+    assert 0 < len(few.ranges.row) < MIN_RESIDUALS < len(few.marker_row)
     state = state_from_arrays(few, truth.poses[few.frame], truth.marker_in_world[
         np.searchsorted(truth.marker, few.marker)], truth.antenna_in_world, np.zeros(3))
     assert noise_of_scatter(few, state).ranges == 1 < noise_of_scatter(few, state).sightings
@@ -626,7 +627,7 @@ def test_an_option_with_a_wrong_name_or_value_is_told_with_what_there_is(options
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kernel", robust.KERNELS)
+@pytest.mark.parametrize("kernel", acceptance.KERNELS)
 def test_every_kernel_solves_a_drive_with_wrong_labels_and_late_ranges(kernel):
     """With and without gates; only quadratic errors without gates follow the wrong labels.
 
@@ -639,7 +640,7 @@ def test_every_kernel_solves_a_drive_with_wrong_labels_and_late_ranges(kernel):
     assert gated.rejected.any() and not open_.rejected.any()
     assert ate(gated.poses, truth) < 0.02
     np.testing.assert_allclose(gated.noise.sightings, 1, atol=0.05)
-    assert (ate(open_.poses, truth) < 0.03) == (kernel not in ("quadratic", *robust.ONE_SIDED))
+    assert (ate(open_.poses, truth) < 0.03) == (kernel not in ("quadratic", *acceptance.ONE_SIDED))
     assert (gated.range_weight < 1).any()
 
 
@@ -657,9 +658,10 @@ def test_gates_of_poses_points_and_ranges():
     state = state_from_arrays(m, np.zeros((1, 3)), np.tile([1.0, 0, 0], (4, 1)), [[3.0, 4.0]],
                               np.zeros(3))
     problem = build_problem(m, "arc", Noise())
-    np.testing.assert_array_equal(accepted(problem, state).weight, [1, 0, 1, 0, 1, 0, 1])
+    np.testing.assert_array_equal(
+        accepted_measurements(problem, state).weight, [1, 0, 1, 0, 1, 0, 1])
     wider = replace(problem, noise=Noise(sightings=1.1, ranges=1.1))
-    np.testing.assert_array_equal(accepted(wider, state).weight, 1)
+    np.testing.assert_array_equal(accepted_measurements(wider, state).weight, 1)
     np.testing.assert_array_equal(within_gates(problem, state, 3.3, 10.0), [1, 0, 1, 0, 1, 0, 0])
 
 
@@ -679,7 +681,7 @@ def test_the_evidence_chooses_the_steps_that_the_vehicle_drives(true, other):
     found = better_model(wrong, true)
     assert found.problem.odometry.model == true
     assert found.log_evidence > wrong.log_evidence + DECISIVE_LEAD
-    np.testing.assert_array_equal(found.problem.measured.weight, wrong.problem.measured.weight)
+    np.testing.assert_array_equal(found.problem.accepted.weight, wrong.problem.accepted.weight)
 
 
 def test_headings_of_a_state_follow_the_turns_by_odometry():

@@ -16,13 +16,13 @@ from slamlib.evaluation import align, ate, nees_band
 from slamlib.odometry import dead_reckoning
 from slamlib.se2 import between, compose
 from slamlib.simulation import manoeuvre, simulate
-from slamlib.slam import doubts, errors, gtsam_graph, optimizer
+from slamlib.slam import doubts, gtsam_graph, measurement_factors, optimizer
+from slamlib.slam.acceptance import KERNELS, LATE_KERNEL, AcceptedMeasurements
 from slamlib.slam.doubts import MAX_LOG_ODDS
 from slamlib.slam.evidence import consistency_factor
 from slamlib.slam.fit import solved_by_gtsam
 from slamlib.slam.initialization import odometry_state
-from slamlib.slam.linear_factors import range_factors
-from slamlib.slam.measurement_factors import MeasurementFactors
+from slamlib.slam.measurement_factors import linearize_ranges
 from slamlib.slam.measurements import measure
 from slamlib.slam.noise import Noise
 from slamlib.slam.normal_equations import NormalEquations
@@ -31,7 +31,6 @@ from slamlib.slam.pipeline import fit_from_odometry, fit_from_previous
 from slamlib.slam.problem import build_problem
 from slamlib.slam.range_calibration import calibrated
 from slamlib.slam.result import chi2_per_dof
-from slamlib.slam.robust import KERNELS, LATE_KERNEL
 from slamlib.slam.state import state_from_arrays
 from slamlib.slam.trilateration import (
     GUESS_PRIOR_SIGMA,
@@ -81,8 +80,8 @@ def range_errors(dataset, truth):
     return (dataset.uwb.range - np.hypot(*apart.T)) / dataset.uwb.sigma
 
 
-@pytest.mark.parametrize("error, components", [(errors.range_error, ()),
-                                               (errors.point_error, (2,))])
+@pytest.mark.parametrize("error, components", [(measurement_factors.range_error, ()),
+                                               (measurement_factors.point_error, (2,))])
 def test_derivatives_against_central_differences(error, components):
     rng = np.random.default_rng(0)
     pose, place = rng.normal(0, 2, (50, 3)), rng.normal(0, 5, (50, 2))
@@ -102,7 +101,7 @@ def test_derivatives_against_central_differences(error, components):
 def test_range_error_equals_gtsams_range_factor():
     rng = np.random.default_rng(1)
     pose, place, r = rng.normal(0, 2, (20, 3)), rng.normal(0, 5, (20, 2)), rng.uniform(1, 9, 20)
-    e, by_pose, by_place = errors.range_error(r, pose, place)
+    e, by_pose, by_place = measurement_factors.range_error(r, pose, place)
     for i in range(20):
         native = gtsam.RangeFactor2D(X(0), A(0), r[i], gtsam.noiseModel.Unit.Create(1))
         values = gtsam.Values()
@@ -147,7 +146,7 @@ def test_chi_squared_over_its_degrees_of_freedom_by_hand():
         problem = build_problem(m, "arc", Noise(sightings=5.0, ranges=7.0))     # which do not count
         state = state_from_arrays(m, poses[m.frame], in_world[:len(m.marker)],
                                   place[None], np.array([1.0, -2.0, 0.0]))
-        share = np.r_[np.ones(len(m.label)), np.full(r, 0.25)]
+        share = np.r_[np.ones(len(m.marker_row)), np.full(r, 0.25)]
         for weight, ranges in ((m.unit_weights, r), (share, r / 4)):
             assert np.isclose(chi2_per_dof(problem, state, weight),
                               (ranges + chi2 + 5) / (ranges - 2 + freedom), rtol=1e-4)
@@ -258,7 +257,7 @@ def test_graduated_non_convexity_rejects_late_ranges():
     dataset, truth = simulate("short", seed=9, late_ranges=0.15)
     off = range_errors(dataset, truth)
     fit = kernels.solve_with(measure(known_noise(dataset, 1e-3)), ranges="GNC")
-    weight = fit.problem.measured.range_weight
+    weight = fit.problem.accepted.range_weight
     assert (weight[off > 10] == 0).all() and (off > 10).sum() > 10
     assert np.mean(weight[np.abs(off) < 2] == 1) > 0.98
 
@@ -534,14 +533,14 @@ def test_calibrated_ranges_have_derivatives_of_central_differences():
     rng = np.random.default_rng(0)
     markers, c = np.zeros((len(m.marker), 3)), rng.normal(size=2)
     poses, antennas = truth.poses[m.frame], truth.antenna_in_world + rng.normal(size=(4, 2))
-    factors, noise = MeasurementFactors(m, m.unit_weights), Noise(ranges=1.7)
+    factors, noise = AcceptedMeasurements(m, m.unit_weights), Noise(ranges=1.7)
 
     def error(poses=poses, antennas=antennas, c=c):
         state = state_from_arrays(m, poses, markers, antennas, np.zeros(3), c)
-        return range_factors(factors, noise, state).e
+        return linearize_ranges(factors, noise, state).e
 
     state = state_from_arrays(m, poses, markers, antennas, np.zeros(3), c)
-    found = range_factors(factors, noise, state)
+    found = linearize_ranges(factors, noise, state)
     offset, scale = state.range_calibration
     np.testing.assert_allclose([offset, scale], [0.2 * c[0], 1 + 0.05 * c[1]])
     np.testing.assert_allclose(found.J[:, 0, 5:], central_differences(

@@ -47,8 +47,8 @@ def residuals_by_landmark(fit):
     pairs = marginal_covariances(equations, fit.problem.noise).pairs
     of_poses = np.concatenate([pairs[:, :3, :3], pairs[-1:, 3:6, 3:6]])
     totals = np.zeros((3, len(m.marker) + len(m.antenna)))
-    of_kernel = consistency_factor(fit.problem.measured.range_kernel)
-    for f, (_, rows), expected in zip(equations.factors, m.factor_places[1:], (1, 1, of_kernel)):
+    of_kernel = consistency_factor(fit.problem.accepted.range_kernel)
+    for f, (_, rows), expected in zip(equations.linearized, m.factor_places[1:], (1, 1, of_kernel)):
         if not len(f.row):                                              # of no width
             continue
         rows, J = rows[f.index], f.J
@@ -109,7 +109,7 @@ def estimated_map(dataset):
     fit = calibrated(fit_from_odometry(measure(dataset)))
     m, found = fit.problem.measurements, slam_result(fit)
     rows = m.structure.rows
-    accepted = np.bincount(m.label, fit.problem.measured.sighting_weight, len(m.marker))
+    accepted = np.bincount(m.marker_row, fit.problem.accepted.sighting_weight, len(m.marker))
     marker = np.flatnonzero(np.isin(m.marker, found.marker) & m.oriented
                             & (accepted >= MIN_SIGHTINGS_IN_HALF))
     antenna = np.flatnonzero(~np.isin(m.antenna, list(found.doubts)))

@@ -28,8 +28,8 @@ from slamlib.notebook.parts import (
     simulated,
 )
 from slamlib.simulation import delay, misguess, mislabel
+from slamlib.slam.acceptance import AcceptedMeasurements
 from slamlib.slam.initialization import odometry_state, trilaterated_antennas
-from slamlib.slam.measurement_factors import MeasurementFactors
 from slamlib.slam.measurements import measure
 from slamlib.slam.noise import Noise, with_known, with_noise
 from slamlib.slam.optimizer import optimize
@@ -178,7 +178,7 @@ def draw_graphs(full, drive, seed, slip, assumed, wrong, kernel, start):
     scale = KERNEL_SCALES[kernel]
     cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(scale) if scale else None
     problem = replace(build_problem(m, model, with_known(Noise(), m.dataset.vehicle)),
-                      measured=MeasurementFactors(m, m.unit_weights, cauchy))
+                      accepted=AcceptedMeasurements(m, m.unit_weights, cauchy))
     single = optimize(problem, odometry_state(m, model, markers=LANDMARKS[start])).state
     fig, plan, side = figure_with_reference(reference)
     plotting.trajectory(plan, single.poses, "alternative", "single kernel")

@@ -209,7 +209,7 @@ def _outlines(result, enlarged):
 def _height(extent, result):
     """Height in inches of the figure for a map of extent (2,) in m, and whether the map is tall.
 
-    The axes have the map's shape within MAP_HEIGHTS. A tall map would be higher at the page's width.
+    The axes have the map's shape within MAP_HEIGHTS. At the page's width a tall map is higher.
     """
     low, few, many = MAP_HEIGHTS
     highest = many if len(result.marker) + len(result.antenna) > MIN_MANY_LANDMARKS else few

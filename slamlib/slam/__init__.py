@@ -4,27 +4,28 @@ GTSAM keeps the robust kernels, orders the elimination, takes the last steps of 
 detects variables that the measurements do not determine. The steps before, and the evidence of the
 noise, solve the same graph by normal equations in numpy, all factors of a kind at once.
 
-`pipeline` holds `estimate`, the whole way from a dataset to the result. Each stage makes the record
-of the next; the modules in the order of the stages (stage 4 uses stage 5 on long drives):
+Read `pipeline` first: its function `estimate` is the whole way from a dataset to the result. Each
+stage makes the record of the next. The modules by stage, in the order to read them (stage 4 uses
+stage 5 on long drives):
 
-    1  structure            sparsity structure of the information matrix
+    1  noise                slip, and factors on the sigmas of sightings and ranges
        measurements         Dataset -> Measurements: arrays, numbered once
-    2  errors               errors of the factors and their derivatives, in numpy
+       structure            Measurements -> Structure of the information matrix
+    2  state                values of all variables: State
+       errors               the error of a between factor, and whitening
        odometry_factors     odometry between frames, which depends on the wheel errors w
-       measurement_factors  weights and kernels of sightings and ranges
-       linear_factors       sightings and ranges linearised in numpy
-       noise                slip, and factors on the sigmas of sightings and ranges
-    3  state                values of all variables: State
-       problem              Measurements, factors and noise -> Problem, the factor graph
-       normal_equations     Problem, State -> the linearised graph, for all values of the noise
+       acceptance           the accepted measurements: weights, robust kernels and gates
+       measurement_factors  sightings and ranges: errors, derivatives, linearisation
+       problem              odometry, accepted measurements and noise -> Problem, the factor graph
+    3  normal_equations     Problem, State -> the linearised graph, for all values of the noise
        gtsam_graph          the same graph in GTSAM
        optimizer            Problem, State -> Optimum by Gauss-Newton
     4  trilateration        possible positions of an antenna from its ranges
        initialization       Measurements -> State: the start values
-    5  robust               Problem, State -> State by robust kernels; the accepted measurements
+    5  robust               Problem, State -> State by ever narrower robust kernels
     6  evidence             Problem, State -> evidence of every value of the noise
        first_frames         the part of a very long drive from which the noise is learned
-       noise_posterior      Problem, State -> posterior of the noise
+       noise_learning       Problem, State -> posterior of slip and noise factors
        fit                  Problem, State -> Fit: wheels, noise, accepted measurements, in turn
        model_choice         Fit -> Fit: arcs or Euler's steps
        range_calibration    Fit -> Fit: with offset and scale of the ranges, if there are any
@@ -54,6 +55,12 @@ n unknowns, and (m, d) are m measurements of a kind with d errors each:
     J        derivatives of whitened errors by the unknowns
     H, g     information matrix (n, n), sum J^T J, and gradient (n,), sum J^T e
     delta    (n,) step of the unknowns, H delta = -g
+
+A frame is a keyframe: an encoder pose that is a variable of the graph. Covariances change their
+axes three times. The files give those of sightings in the axes of the vehicle; `sighting_roots` of
+Measurements turns them into those of the measured pose, in which the error of a marker lives. The
+unknowns, and with them `Covariances`, are in the axes of each pose itself, as in GTSAM.
+`interpolation` turns those of poses into world axes, `result` those of markers.
 """
 
 from slamlib.slam.drive_doubts import confirmation

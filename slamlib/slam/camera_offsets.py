@@ -45,9 +45,9 @@ def estimate_camera_offsets(equations):
     """The CameraOffsets by the NormalEquations at the State that solves their problem."""
     problem, state = equations.problem, equations.state
     H, g, *_ = equations.sums(
-        problem.noise, (1.0, 1.0, consistency_factor(problem.measured.range_kernel)))
+        problem.noise, (1.0, 1.0, consistency_factor(problem.accepted.range_kernel)))
     lu = decomposition(equations.structure.matrix(H))
-    velocity, sightings = _velocities(problem.measurements, state), equations.factors[:2]
+    velocity, sightings = _velocities(problem.measurements, state), equations.linearized[:2]
 
     def shared(columns):
         """SharedError with columns (m, d, p) for both kinds of sightings."""
@@ -64,8 +64,8 @@ def estimate_camera_offsets(equations):
     if lu is None or not sum(f.e.size for f in sightings):
         return CameraOffsets(_undetermined(1), _undetermined(3))
     by_pose = [f.J[:, :, :3] for f in sightings]
-    late = [-J @ velocity[f.row, :, None] for f, J in zip(sightings, by_pose)]
-    return CameraOffsets(shared(late), shared(by_pose))
+    delayed = [-J @ velocity[f.row, :, None] for f, J in zip(sightings, by_pose)]
+    return CameraOffsets(shared(delayed), shared(by_pose))
 
 
 def _estimate(full, information, gradient):
@@ -89,7 +89,7 @@ def _velocities(measurements, state):
     row = np.arange(len(measurements.frame))
     earlier = np.maximum(row - VELOCITY_FRAMES, 0)
     later = np.minimum(row + VELOCITY_FRAMES, len(row) - 1)
-    moved = se2.between(state.poses, state.poses[later]) \
+    motion = se2.between(state.poses, state.poses[later]) \
         - se2.between(state.poses, state.poses[earlier])
     steps = measurements.frame[later] - measurements.frame[earlier]
-    return moved / np.maximum(steps, 1)[:, None]
+    return motion / np.maximum(steps, 1)[:, None]

@@ -22,7 +22,7 @@ from slamlib import se2
 from slamlib.dataset import DatasetError
 
 LEAF = 12                    # number of frames between separators
-MAX_ROUNDING = 0.05          # share of the information about the heading at pose 1
+MAX_ROUNDING = 0.05          # float rounding: share of the information about the heading at pose 1
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,8 @@ class Covariances:
 def marginal_covariances(equations, noise):
     """The Covariances for a Noise by NormalEquations at the State that solves the problem.
 
-    Raises DatasetError if rounding hides the information about the heading at pose 1.
+    Raises DatasetError if float rounding hides the information about the heading at pose 1, and
+    numpy.linalg.LinAlgError if H is singular.
     """
     m, v = equations.problem.measurements, equations.problem.measurements.variables
     k, a = len(v.markers), len(v.antennas)
@@ -75,9 +76,9 @@ def _common_turn(equations):
 
     def in_own_axes(poses):
         """Change (m, 3) of poses (m, 3) per rad, in their own axes."""
-        moved = se2.compose_jacobians(np.zeros(3), poses)[0][..., 2]
-        moved[:, :2] = (se2.rotation(-poses[:, 2]) @ moved[:, :2, None])[..., 0]
-        return moved
+        change = se2.compose_jacobians(np.zeros(3), poses)[0][..., 2]
+        change[:, :2] = (se2.rotation(-poses[:, 2]) @ change[:, :2, None])[..., 0]
+        return change
 
     antennas = np.pad(state.antennas, ((0, 0), (0, 1)))
     turn[structure.rows(v.frames, 3)] = in_own_axes(state.poses)
@@ -212,8 +213,8 @@ def _positions(rows, front):
     order = np.argsort(both)
 
     def position(wanted):
-        found = order[np.minimum(np.searchsorted(both, wanted, sorter=order), len(both) - 1)]
-        return np.where(both[found] == wanted, found, -1)
+        nearest = order[np.minimum(np.searchsorted(both, wanted, sorter=order), len(both) - 1)]
+        return np.where(both[nearest] == wanted, nearest, -1)
 
     return position
 

@@ -1,10 +1,11 @@
 """Stage 7: antennas whose position the ranges do not determine."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from slamlib.slam.measurement_factors import GUESS_PRIOR_SIGMA
+from slamlib.slam.measurement_factors import MIN_DISTANCE
+from slamlib.slam.measurements import GUESS_PRIOR_SIGMA
 from slamlib.slam.trilateration import SAME_PLACE, ranges_by_antenna, second_moment, trilaterate
 
 MIN_ACCEPTED_RANGES = 5      # number of accepted ranges of an antenna that is not in doubt
@@ -12,19 +13,16 @@ MAX_RELATIVE_SIGMA = 0.025   # of the median range: largest sigma of an antenna 
 MAX_LOG_ODDS = np.log(1000)  # log odds below which another position remains possible
 
 
-@dataclass(frozen=True)
-class AntennaDoubts:
-    """The antennas in doubt, and covariances that include the doubt."""
-
-    sentences: dict          # antenna id: reason
-    covariances: np.ndarray  # (a, 2, 2) m^2, in doubt at least the second moment of the position
-
-
 def antenna_doubts(problem, state, frame_covariances, covariances, range_weight):
-    """The AntennaDoubts at the State that solves a Problem.
+    """Reasons to doubt antennas, and covariances that include the doubt, at a Problem's solution.
 
     From covariances (f, 3, 3) of the frames and (a, 2, 2) of the antennas, in world axes, and the
     share `range_weight` (r,) of its information that each range keeps.
+
+    Returns
+    -------
+    sentences : dict of the reason for each antenna in doubt, by its id.
+    covariances : (a, 2, 2) m^2, in doubt at least the second moment of the position.
     """
     m, r, sentences, covariances = (
         problem.measurements, problem.measurements.ranges, {}, covariances.copy())
@@ -38,7 +36,7 @@ def antenna_doubts(problem, state, frame_covariances, covariances, range_weight)
             sentences[antenna] = sentence
             covariances[k] = max(covariances[k], second_moment(ranges, state.antennas[k]),
                                  key=np.trace)
-    return AntennaDoubts(sentences, covariances)
+    return sentences, covariances
 
 
 def _doubt(ranges, estimate, weight):
@@ -66,6 +64,6 @@ def _sigma_by_ranges(ranges, estimate, weight):
     whole map.
     """
     difference = estimate - ranges.positions
-    direction = difference / np.maximum(np.hypot(*difference.T), 1e-9)[:, None]
+    direction = difference / np.maximum(np.hypot(*difference.T), MIN_DISTANCE)[:, None]
     information = direction.T @ (direction * (weight / ranges.sigma**2)[:, None])
     return 1 / np.sqrt(max(np.linalg.eigvalsh(information)[0], GUESS_PRIOR_SIGMA**-2))

@@ -20,19 +20,21 @@ MAX_LATE_SHARE = 0.1         # share of the ranges that keep less than half of t
 MIN_LEAD = 5.0               # log likelihood by which the only explanation leads the others
 MAX_NOISE_FACTOR = 1.5       # on a sigma, or its inverse; beyond it the factor is reported
 MIN_FACTOR_SIGMAS = 4.0      # sigmas of the logarithm of a factor that is reported
+MAX_CONFIRMED = 1.1          # factor on a sigma, or its inverse, up to which it is confirmed
+MAX_CONFIRMED_SIGMAS = 3.0   # sigmas of the logarithm of a factor that is confirmed
 MAX_REJECTED = 0.1           # share of the sightings that are rejected
 MIN_SIGHTINGS_PER_MARKER = 5         # number of sightings, of which the majority must be accepted
 WHEEL_NAMES = ("right_radius", "left_radius", "wheelbase")
 
 
-def solution_doubts(measurements, found):
+def solution_doubts(measurements, result):
     """List of Doubt about the Measurements of a drive, from their SlamResult."""
-    return [*geometry_doubts(measurements.dataset.vehicle, found), *slip_doubts(found),
-            *noise_doubts(found), *calibration_doubts(found),
-            *sighting_doubts(measurements, found.rejected),
+    return [*geometry_doubts(measurements.dataset.vehicle, result), *slip_doubts(result),
+            *noise_doubts(result), *calibration_doubts(result),
+            *sighting_doubts(measurements, result.rejected),
             *(Doubt("antenna", f"Antenna {antenna} is in doubt: {reason}. Its covariance includes "
                                "this; look at its rows in UwbReading.txt.")
-              for antenna, reason in found.doubts.items())]
+              for antenna, reason in result.doubts.items())]
 
 
 def turn_doubts(problem):
@@ -42,7 +44,7 @@ def turn_doubts(problem):
     """
     odometry, frame = problem.odometry, problem.measurements.frame
     variance = np.sum(odometry.by_w[:, 2]**2, axis=1) \
-        + odometry.noise(problem.noise.slip)[:, 2, 2]
+        + odometry.covariance(problem.noise.slip)[:, 2, 2]
     if not len(variance) or np.sqrt(variance.max()) < MAX_TURN_SIGMA:
         return []
     k = int(variance.argmax())
@@ -53,27 +55,27 @@ def turn_doubts(problem):
         "these poses is wrong."))]
 
 
-def geometry_doubts(vehicle, found):
+def geometry_doubts(vehicle, result):
     """List of Doubt: wheels, late sightings or place of the camera, those that explain most.
 
     One cause changes the estimates of all three; those that explain less by MIN_LEAD are left out.
     """
     explained = {gain: doubt for gain, doubt in (
-        _wheel_doubt(vehicle, found), _time_doubt(found.camera.time),
-        _place_doubt(found.camera.place)) if doubt}
+        _wheel_doubt(vehicle, result), _time_doubt(result.camera.time),
+        _place_doubt(result.camera.place)) if doubt}
     return [doubt for gain, doubt in sorted(explained.items(), reverse=True)
             if gain > max(explained) - MIN_LEAD]
 
 
-def _wheel_doubt(vehicle, found):
+def _wheel_doubt(vehicle, result):
     """Cost of the wheels' prior in log likelihood, and the Doubt if one of them is far off."""
-    deviation = in_sigmas(vehicle, found.wheel)
-    if not far_off(vehicle, found.wheel).any():
+    deviation = in_sigmas(vehicle, result.wheel)
+    if not far_off(vehicle, result.wheel).any():
         return 0.0, None
     return deviation @ deviation / 2, Doubt("wheel-parameters", (
-        f"By the other sensors {wheels_in_words(vehicle, found.wheel)}, up to "
+        f"By the other sensors {wheels_in_words(vehicle, result.wheel)}, up to "
         f"{np.abs(deviation).max():.0f} standard deviations off: measure the wheels again, or "
-        "state values or larger sigmas in vehicle.toml." + marker_size(vehicle, found.wheel)))
+        "state values or larger sigmas in vehicle.toml." + marker_size(vehicle, result.wheel)))
 
 
 def in_sigmas(vehicle, wheel):
@@ -130,27 +132,27 @@ def _place_doubt(place):
         "ArucoReading.txt gives the markers in the axes of the vehicle."))
 
 
-def slip_doubts(found):
+def slip_doubts(result):
     """List of a Doubt if the slip is larger than that of any wheel."""
-    if found.slip <= MAX_SLIP or not found.noise_sigma[0]:
+    if result.slip <= MAX_SLIP or not result.noise_sigma[0]:
         return []
     return [Doubt("wheel-slip", (
-        f"By the other sensors each wheel slips by {1e3 * found.slip:.0f} mm (one standard "
+        f"By the other sensors each wheel slips by {1e3 * result.slip:.0f} mm (one standard "
         "deviation) after one metre, far more than wheels do: look whether encoderReading.txt is "
         "of the same drive as the other files, with the same pose ids."))]
 
 
-def noise_doubts(found):
+def noise_doubts(result):
     """List of Doubt for learned factors on the stated sigmas that differ from 1."""
-    late_share = np.mean(found.range_weight < 0.5) if len(found.range_weight) else 0.0
+    late_share = np.mean(result.range_weight < 0.5) if len(result.range_weight) else 0.0
     doubts = []
     for column, what, name, file in ((1, "marker-noise", "sightings", "ArucoReading.txt"),
                                      (2, "range-noise", "ranges", "UwbReading.txt")):
-        factor, sigma = getattr(found.noise, name), found.noise_sigma[column]
+        factor, sigma = getattr(result.noise, name), result.noise_sigma[column]
         if not sigma or abs(np.log(factor)) <= max(
                 np.log(MAX_NOISE_FACTOR), MIN_FACTOR_SIGMAS * sigma):
             continue
-        outside = (found.noise.logarithms[column] - BOUNDS[:, column]) * [1, -1] < sigma
+        outside = (result.noise.logarithms[column] - BOUNDS[:, column]) * [1, -1] < sigma
         number = f"at most {factor:.2g}" if outside[0] else \
             f"at least {factor:.3g}" if outside[1] else f"{factor:.2f} ± {factor * sigma:.2f}"
         reason = (f"{late_share:.0%} of them are far too long, as without line of sight."
@@ -162,15 +164,15 @@ def noise_doubts(found):
     return doubts
 
 
-def calibration_doubts(found):
+def calibration_doubts(result):
     """List of a Doubt if the offset or scale of the ranges is not 0 or 1."""
-    covariance = found.range_calibration_covariance
+    covariance = result.range_calibration_covariance
     if not covariance.any():
         return []
-    difference = found.range_calibration - [0, 1]
+    difference = result.range_calibration - [0, 1]
     if difference @ np.linalg.solve(covariance, difference) / 2 < MIN_RANGE_GAIN:
         return []
-    (offset, scale), (sigma, scale_sigma) = found.range_calibration, found.range_calibration_sigma
+    (offset, scale), (sigma, scale_sigma) = result.range_calibration, result.range_calibration_sigma
     return [Doubt("range-offset", (
         f"The ranges of UwbReading.txt are {offset:.3f} ± {sigma:.3f} m plus {scale:.4f} ± "
         f"{scale_sigma:.4f} times the distance. Problem 4 corrects this; calibrate the antennas."))]
@@ -184,8 +186,8 @@ def sighting_doubts(measurements, rejected):
         sentences.append(f"{left_out} of {count} sightings contradict the rest and are left out"
                          + (f", {repeated} of them another one of the same marker at the same pose"
                             if repeated else ""))
-    seen = np.bincount(measurements.label, minlength=len(measurements.marker))
-    wrong = np.bincount(measurements.label, rejected, len(measurements.marker))
+    seen = np.bincount(measurements.marker_row, minlength=len(measurements.marker))
+    wrong = np.bincount(measurements.marker_row, rejected, len(measurements.marker))
     markers = measurements.marker[
         (seen >= MIN_SIGHTINGS_PER_MARKER) & (wrong > seen / 2)].tolist()
     if markers:
@@ -199,17 +201,18 @@ def sighting_doubts(measurements, rejected):
                   "or are there twice.")]
 
 
-def confirmation(found, sensor):
+def confirmation(result, sensor):
     """A clause on the stated noise of a sensor, "sightings" or "ranges", from a SlamResult.
 
     The noise is confirmed if the learned factor on its standard deviations is within a tenth of 1,
     or within three of its own standard deviations.
     """
     column, file = {"sightings": (1, "ArucoReading.txt"), "ranges": (2, "UwbReading.txt")}[sensor]
-    factor, relative = getattr(found.noise, sensor), found.noise_sigma[column]
+    factor, relative = getattr(result.noise, sensor), result.noise_sigma[column]
     if not relative:
         return f"the standard deviations in {file} are multiplied by {factor:.3g}, as given"
     number = f"{factor:.2f} ± {factor * relative:.2f}"
-    if abs(np.log(factor)) < max(np.log(1.1), 3 * relative):
+    if abs(np.log(factor)) < max(
+            np.log(MAX_CONFIRMED), MAX_CONFIRMED_SIGMAS * relative):
         return f"the standard deviations in {file} are confirmed (factor {number})"
     return f"the standard deviations in {file} were multiplied by {number}"

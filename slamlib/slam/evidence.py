@@ -20,7 +20,7 @@ def laplace_approximation(equations, noise):
     minus infinity where H is singular to rounding.
     """
     H, g, squared, log_determinant = equations.sums(
-        noise, consistency_factors(equations.problem.measured))
+        noise, consistency_factors(equations.problem.accepted))
     lu = decomposition(equations.structure.matrix(H))
     pivots = np.zeros(1) if lu is None else lu.U.diagonal()
     if (pivots <= 0).any():                              # H is not positive definite
@@ -31,11 +31,11 @@ def laplace_approximation(equations, noise):
         - sightings * np.log(noise.sightings) - ranges * np.log(noise.ranges)
 
 
-def consistency_factors(measured):
+def consistency_factors(accepted):
     """`consistency_factor` (3,) of sightings of poses, of points, and of ranges."""
-    return (consistency_factor(measured.sighting_kernel, 3),
-            consistency_factor(measured.sighting_kernel, 2),
-            consistency_factor(measured.range_kernel))
+    return (consistency_factor(accepted.sighting_kernel, 3),
+            consistency_factor(accepted.sighting_kernel, 2),
+            consistency_factor(accepted.range_kernel))
 
 
 @lru_cache(maxsize=8)

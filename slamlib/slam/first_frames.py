@@ -1,4 +1,4 @@
-"""Stage 6: the normal equations of the first frames of a very long drive, at the same state."""
+"""Stage 6: on a very long drive, noise is learned from the first frames only."""
 
 from dataclasses import replace
 
@@ -7,7 +7,7 @@ import numpy as np
 from slamlib.slam.measurements import measure
 from slamlib.slam.normal_equations import NormalEquations
 
-LEARNING_FRAMES = 20_000     # number of frames from which the noise of a longer drive is learned
+LEARNING_FRAMES = 20_000     # number of first frames from which noise is learned on a long drive
 MIN_MEASUREMENTS = 5000      # of a sensor: they determine the factor on its sigmas to 1 %
 
 
@@ -23,19 +23,19 @@ def equations_of_first_frames(equations):
     if len(m.frame) <= count:
         return equations
     part = measure(m.dataset.first(int(m.frame[count - 1]) + 1))
-    if len(part.label) < min(MIN_MEASUREMENTS, len(m.label)) \
+    if len(part.marker_row) < min(MIN_MEASUREMENTS, len(m.marker_row)) \
             or len(part.ranges.row) < min(MIN_MEASUREMENTS, len(m.ranges.row)):
         return equations
     markers = np.searchsorted(m.marker, part.marker)
     antennas = np.searchsorted(m.antenna, part.antenna)
     part = replace(part, oriented=m.oriented[markers], calibrated=m.calibrated)
-    measured = replace(problem.measured, measurements=part, weight=np.r_[
-        problem.measured.sighting_weight[:len(part.label)],
-        problem.measured.range_weight[:len(part.ranges.row)]])
+    accepted = replace(problem.accepted, measurements=part, weight=np.r_[
+        problem.accepted.sighting_weight[:len(part.marker_row)],
+        problem.accepted.range_weight[:len(part.ranges.row)]])
     odometry = replace(problem.odometry, **{
         name: getattr(problem.odometry, name)[:count - 1]
-        for name in ("increment", "by_w", "rounding", "slipping")})
+        for name in ("increment", "by_w", "quantization", "slipping")})
     return NormalEquations(
-        replace(problem, odometry=odometry, measured=measured),
+        replace(problem, odometry=odometry, accepted=accepted),
         replace(state, poses=state.poses[:count], markers=state.markers[markers],
                 antennas=state.antennas[antennas]))

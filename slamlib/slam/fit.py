@@ -5,14 +5,15 @@ from functools import cached_property
 
 import numpy as np
 
+from slamlib.slam.acceptance import accepted_measurements
 from slamlib.slam.evidence import laplace_approximation
 from slamlib.slam.noise import with_known
-from slamlib.slam.noise_posterior import NoisePosterior, learn_noise
+from slamlib.slam.noise_learning import NoisePosterior, learn_noise
 from slamlib.slam.normal_equations import NormalEquations
 from slamlib.slam.odometry_factors import preintegrate_odometry
 from slamlib.slam.optimizer import optimize
 from slamlib.slam.problem import Problem
-from slamlib.slam.robust import accepted, noise_of_scatter
+from slamlib.slam.robust import noise_of_scatter
 from slamlib.slam.state import State
 
 MAX_ROUNDS = 6               # number of rounds of wheels, noise and accepted measurements
@@ -35,25 +36,29 @@ class Fit:
 
 
 def solved_by_gtsam(fit):
-    """The Fit at the end of GTSAM's optimisation of the same graph, from the state of `fit`."""
+    """The Fit after GTSAM's optimisation, started at the state of `fit`.
+
+    Raises DatasetError as `optimize`.
+    """
     return replace(fit, state=optimize(fit.problem, fit.state, by_gtsam=True).state)
 
 
-def refine(problem, state, accept=accepted, preintegrate=preintegrate_odometry):
+def refine(problem, state, accept=accepted_measurements, preintegrate=preintegrate_odometry):
     """The Fit in which wheels, noise and accepted measurements agree with each other.
 
     They depend on each other, so each is updated in turn until the accepted measurements no longer
-    change. From a Problem and a State near its solution. `accept` makes MeasurementFactors from
-    Problem and State; None keeps those of the problem. `preintegrate` as in `build_problem`.
+    change. From a Problem and a State near its solution. `accept` makes AcceptedMeasurements from
+    Problem and State; None keeps those of the problem. `preintegrate` as in `build_problem`. Raises
+    DatasetError as `optimize`, and numpy.linalg.LinAlgError if odometry's covariance is singular.
     """
     m, model, posterior = problem.measurements, problem.odometry.model, None
     if accept is not None:
         problem = replace(problem, noise=noise_of_scatter(m, state))
-    measured = problem.measured if accept is None else accept(problem, state)
+    accepted = problem.accepted if accept is None else accept(problem, state)
     changed = np.inf
     for _ in range(MAX_ROUNDS):
-        problem = replace(problem, measured=measured, odometry=preintegrate(m, model, state.w))
-        if m.learned.any() and changed > NEGLIGIBLE_CHANGE * len(measured.weight):
+        problem = replace(problem, accepted=accepted, odometry=preintegrate(m, model, state.w))
+        if m.learned.any() and changed > NEGLIGIBLE_CHANGE * len(accepted.weight):
             optimum = None                                 # frees the equations of the last round
             optimum = optimize(problem, state, max_steps=2)
             state, posterior = optimum.state, learn_noise(optimum.equations)
@@ -61,8 +66,8 @@ def refine(problem, state, accept=accepted, preintegrate=preintegrate_odometry):
         optimum = None
         optimum = optimize(problem, state)
         state = optimum.state
-        measured = problem.measured if accept is None else accept(problem, state)
-        changed = np.count_nonzero(measured.weight != problem.measured.weight)
+        accepted = problem.accepted if accept is None else accept(problem, state)
+        changed = np.count_nonzero(accepted.weight != problem.accepted.weight)
         if not changed:
             break
     _, log_evidence = laplace_approximation(optimum.equations, problem.noise)

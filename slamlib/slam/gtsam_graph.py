@@ -1,13 +1,16 @@
 """Stage 3: the factor graph in GTSAM.
 
-* a prior on pose 1, which fixes the world frame, and the prior of table 2 on w;
-* a between factor for every sighting, Z_ij = X_i^-1 L_j;
-* a range factor for every range, r_ik = |A_k - (x_i, y_i)|, and the guess as a prior on A_k;
-* the odometry between consecutive frames, which depends on w. It is linearised in numpy: as a
-  custom factor in Python it would be slow, because GTSAM copies all values for every call.
+`nonlinear_graph` has GTSAM's own factors:
 
-Two more kinds of factors are linearised in numpy, by `linear_factors.py`: sightings of points,
-whose heading is unknown, and ranges whose offset and scale c are variables.
+* a prior on pose 1, which fixes the world frame, and one on w, by the Vehicle's sigmas of the wheel
+  parameters (the assignment's table 2);
+* a between factor for every sighting of a marker with a heading, Z_ij = X_i^-1 L_j;
+* a range factor for every range, r_ik = |A_k - (x_i, y_i)|, unless the ranges are calibrated, and
+  the guess as a prior on A_k.
+
+`linearize` adds those that are linearised in numpy: the odometry between consecutive frames, which
+depends on w, sightings of points, whose heading is unknown, and ranges whose offset and scale c are
+variables. Custom factors in Python would be slow: GTSAM copies all values for every call.
 """
 
 import re
@@ -17,8 +20,8 @@ import numpy as np
 from gtsam.symbol_shorthand import A, C, L, P, W, X
 
 from slamlib.dataset import DatasetError
-from slamlib.slam.linear_factors import range_factors, sighting_factors
-from slamlib.slam.measurement_factors import GUESS_PRIOR_SIGMA, WEAK_SIGMA
+from slamlib.slam.measurement_factors import linearize_ranges, linearize_sightings
+from slamlib.slam.measurements import GUESS_PRIOR_SIGMA, WEAK_SIGMA
 from slamlib.slam.odometry_factors import odometry_error
 
 
@@ -51,11 +54,11 @@ def linearize(problem, state):
     U, _ = problem.odometry.whitening(problem.noise.slip)
     for i, (e, J) in enumerate(zip((U @ errors[..., None])[..., 0], U @ jacobians)):
         graph.add(X(i), J[:, :3], X(i + 1), J[:, 3:6], W(0), J[:, 6:], -e)
-    f = sighting_factors(problem.measured, problem.noise, state, as_pose=False)
+    f = linearize_sightings(problem.accepted, problem.noise, state, as_pose=False)
     for i, j, e, J in zip(f.row.tolist(), f.landmark.tolist(), f.e, f.J):
         graph.add(X(i), J[:, :3], P(j), J[:, 3:], -e)
     if problem.measurements.calibrated:
-        f = range_factors(problem.measured, problem.noise, state)
+        f = linearize_ranges(problem.accepted, problem.noise, state)
         antennas = f.landmark - len(problem.measurements.marker)
         for i, k, e, J in zip(f.row.tolist(), antennas.tolist(), f.e, f.J):
             graph.add(X(i), J[:, :3], A(k), J[:, 3:5], C(0), J[:, 5:], -e)
@@ -64,32 +67,33 @@ def linearize(problem, state):
 
 def nonlinear_graph(problem):
     """The gtsam.NonlinearFactorGraph of a Problem: sightings, ranges and priors, with kernels."""
-    factors, noise, model = problem.measured, problem.noise, gtsam.noiseModel
+    accepted, noise, model = problem.accepted, problem.noise, gtsam.noiseModel
     m, graph = problem.measurements, gtsam.NonlinearFactorGraph()
-    s, weight = m.sightings, factors.sighting_weight * m.as_pose
+    s, weight = m.sightings, accepted.sighting_weight * m.as_pose
     roots = m.sighting_roots[0] * (np.sqrt(weight) / noise.sightings)[:, None, None]
     used = np.flatnonzero(weight)
-    for i, j, z, root in zip(s.row[used].tolist(), m.label[used].tolist(), s.z[used].tolist(),
+    for i, j, z, root in zip(s.row[used].tolist(), m.marker_row[used].tolist(), s.z[used].tolist(),
                              roots[used]):
         graph.add(gtsam.BetweenFactorPose2(X(i), L(j), gtsam.Pose2(*z), _robust(
-            factors.sighting_kernel, model.Gaussian.SqrtInformation(root, False))))
+            accepted.sighting_kernel, model.Gaussian.SqrtInformation(root, False))))
     if not m.calibrated:
-        r, used = m.ranges, np.flatnonzero(factors.range_weight)
-        sigmas = noise.ranges * r.sigma[used] / np.sqrt(factors.range_weight[used])
+        r, used = m.ranges, np.flatnonzero(accepted.range_weight)
+        sigmas = noise.ranges * r.sigma[used] / np.sqrt(accepted.range_weight[used])
         for i, k, distance, sigma in zip(r.row[used].tolist(), r.antenna[used].tolist(),
                                          r.distance[used].tolist(), sigmas.tolist()):
             graph.add(gtsam.RangeFactor2D(X(i), A(k), distance, _robust(
-                factors.range_kernel, model.Isotropic.Sigma(1, sigma))))
-    _add_priors(graph, factors)
+                accepted.range_kernel, model.Isotropic.Sigma(1, sigma))))
+    _add_priors(graph, accepted)
     return graph
 
 
-def _add_priors(graph, factors):
-    m, model = factors.measurements, gtsam.noiseModel
+def _add_priors(graph, accepted):
+    """Add the priors of all variables of AcceptedMeasurements to a gtsam.NonlinearFactorGraph."""
+    m, model = accepted.measurements, gtsam.noiseModel
     graph.add(gtsam.PriorFactorPose2(
         X(0), gtsam.Pose2(), model.Diagonal.Sigmas(m.origin_sigma)))
     graph.add(gtsam.PriorFactorVector(W(0), np.zeros(3), model.Unit.Create(3)))
-    for j in factors.unsupported:
+    for j in accepted.unsupported:
         graph.add(gtsam.PriorFactorPose2(
             L(j), gtsam.Pose2(), model.Isotropic.Sigma(3, WEAK_SIGMA)) if m.oriented[j]
             else gtsam.PriorFactorPoint2(
@@ -102,35 +106,36 @@ def _add_priors(graph, factors):
 
 
 def _robust(kernel, noise):
+    """The gtsam noise model `noise` with a robust kernel, if it is not None."""
     return gtsam.noiseModel.Robust.Create(kernel, noise) if kernel else noise
 
 
 def values(measurements, state):
     """The gtsam.Values of a State."""
-    found = gtsam.Values()
+    entries = gtsam.Values()
     for i, pose in enumerate(state.poses.tolist()):
-        found.insert(X(i), gtsam.Pose2(*pose))
+        entries.insert(X(i), gtsam.Pose2(*pose))
     for j, (marker, oriented) in enumerate(zip(state.markers, measurements.oriented)):
         if oriented:
-            found.insert(L(j), gtsam.Pose2(*marker))
+            entries.insert(L(j), gtsam.Pose2(*marker))
         else:
-            found.insert(P(j), gtsam.Point2(*marker[:2]))
+            entries.insert(P(j), gtsam.Point2(*marker[:2]))
     for k, antenna in enumerate(state.antennas):
-        found.insert(A(k), gtsam.Point2(*antenna))
-    found.insert(W(0), state.w)
+        entries.insert(A(k), gtsam.Point2(*antenna))
+    entries.insert(W(0), state.w)
     if measurements.calibrated:
-        found.insert(C(0), state.c)
-    return found
+        entries.insert(C(0), state.c)
+    return entries
 
 
 def _variable(measurements, message):
     """The undetermined variable that GTSAM's message names, in the words of the files."""
-    m, found = measurements, re.search(r"Symbol: ([aclpwx])(\d+)", message)
-    if found is None:
+    m, symbol = measurements, re.search(r"Symbol: ([aclpwx])(\d+)", message)
+    if symbol is None:
         return "one of them"
-    if found[1] in "wc":
-        return {"w": "the wheel parameters", "c": "the offset and scale of the ranges"}[found[1]]
+    if symbol[1] in "wc":
+        return {"w": "the wheel parameters", "c": "the offset and scale of the ranges"}[symbol[1]]
     name, ids = {"x": ("pose", m.frame + 1), "l": ("the pose of marker", m.marker),
                  "p": ("the position of marker", m.marker),
-                 "a": ("the position of antenna", m.antenna)}[found[1]]
-    return f"{name} {ids[int(found[2])]}"
+                 "a": ("the position of antenna", m.antenna)}[symbol[1]]
+    return f"{name} {ids[int(symbol[2])]}"

@@ -18,6 +18,7 @@ from slamlib.slam.state import state_from_arrays
 from slamlib.slam.trilateration import ranges_by_antenna, trilaterate
 
 MAX_ODOMETRY_SIGMA = 0.5     # rad, of odometry's heading at the end of a drive's first part
+MAX_FIRST_PART = 1.5         # length of the first part over that which odometry can predict
 GROWTH = 4                   # largest ratio of the numbers of poses of a part and the one before
 MAX_VOTES = 60               # number of sightings of a marker that enter its consensus
 
@@ -47,7 +48,7 @@ def part_lengths(dataset):
     lost = np.flatnonzero(covariances[:, 2, 2] > MAX_ODOMETRY_SIGMA**2)
     ends = [len(dataset.ticks)]
     first = max(lost[0], 2) if len(lost) else ends[0]
-    while ends[0] > 1.5 * first:
+    while ends[0] > MAX_FIRST_PART * first:
         ends.insert(0, max(first, -(-ends[0] // GROWTH)))
     return ends
 
@@ -80,8 +81,8 @@ def consensus_markers(measurements, in_world, covariances):
 
     `in_world` (s, 3) and `covariances` (s, 3, 3) are the marker poses by each sighting.
     """
-    chosen = evenly_chosen(measurements.label, MAX_VOTES)
-    best = consensus(measurements.label[chosen], in_world[chosen], covariances[chosen])
+    chosen = evenly_chosen(measurements.marker_row, MAX_VOTES)
+    best = consensus(measurements.marker_row[chosen], in_world[chosen], covariances[chosen])
     return in_world[chosen[best]]
 
 

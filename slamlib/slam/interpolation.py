@@ -72,13 +72,14 @@ def _in_world_axes(pairs, poses):
 
 
 def _increments(problem, w, frame, start, end):
-    """Increments (m, 3) between poses of the section of these frames, at the wheel errors w.
+    """Increments (m, 3) from the encoder poses `start` (m,) to `end` (m,), at the wheel errors w.
 
-    Also their derivatives (m, 3, 3) by w, and their noise Q (m, 3, 3) in the axes of the start.
+    Also their derivatives (m, 3, 3) by w, and their covariances Q (m, 3, 3) in the axes of the
+    start. The poses lie in the section of the frames `frame` (g,).
     """
     d = problem.measurements.dataset
     vehicle, ticks = d.vehicle.with_deviation(w), d.ticks[frame[0]:frame[-1] + 1]
     start, end = start - frame[0], end - frame[0]
-    delta, by_w = increments.between_poses(ticks, vehicle, start, end, problem.odometry.model)
-    rounding, slipping = odometry_noise(ticks, vehicle, start, end, len(d.ticks) - 1)
-    return delta, by_w * vehicle.sigma_wheel, rounding + problem.noise.slip**2 * slipping
+    delta, by_wheel = increments.between_poses(ticks, vehicle, start, end, problem.odometry.model)
+    quantization, slipping = odometry_noise(ticks, vehicle, start, end, len(d.ticks) - 1)
+    return delta, by_wheel * vehicle.sigma_wheel, quantization + problem.noise.slip**2 * slipping

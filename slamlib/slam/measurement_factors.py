@@ -1,75 +1,116 @@
-"""Stage 2: weights and robust kernels of the factors of sightings and ranges."""
+"""Stage 2: the factors of sightings and ranges, linearised in numpy: errors and derivatives.
+
+The factor of a marker with a heading is GTSAM's between factor, that of a range its range factor.
+Without headings a marker is a point. All factors of a kind are linearised at once, whitened, and
+weighted by their kernels.
+"""
 
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 
 from slamlib import se2
-from slamlib.slam.measurements import Measurements
+from slamlib.slam.errors import between_error
+from slamlib.slam.state import RANGE_SIGMA
 
-WEAK_SIGMA = 1e5             # m and rad, weak prior of markers without accepted sightings
-GUESS_PRIOR_SIGMA = 5.0      # m, prior of an antenna at its guessed position
+MIN_DISTANCE = 1e-9          # m, below which a range has no direction
 
 
 @dataclass(frozen=True)
-class MeasurementFactors:
-    """The accepted measurements and their robust kernels.
+class LinearizedMeasurements:
+    """The m accepted measurements of one kind, linearised at a state, with d errors each."""
 
-    A weight is the share of its information that a measurement keeps: 0 if it is rejected, 1 if it
-    is accepted. Graduated non-convexity and chi-squared also use weights between 0 and 1.
+    index: np.ndarray        # (m,) row among all measurements of the kind
+    row: np.ndarray          # (m,) frame
+    landmark: np.ndarray     # (m,) row of the marker, or k plus row of the antenna
+    e: np.ndarray            # (m, d) whitened errors, expected minus measured
+    J: np.ndarray            # (m, d, p) whitened derivatives by the unknowns of pose, landmark, c
+    weight: np.ndarray       # (m,) share of its information that a measurement keeps
+    error: float             # half the sum of squared errors, or the loss of the kernel
+
+
+def linearize_measurements(accepted, noise, state):
+    """The LinearizedMeasurements of sightings of poses, of points, and of ranges.
+
+    From AcceptedMeasurements, a Noise and a State.
     """
-
-    measurements: Measurements
-    weight: np.ndarray                       # (s + r,) sightings, then ranges
-    sighting_kernel: gtsam.noiseModel.mEstimator.Base | None = None      # None: quadratic
-    range_kernel: gtsam.noiseModel.mEstimator.Base | None = None
-
-    @property
-    def sighting_weight(self):
-        """(s,) weights of the sightings."""
-        return self.weight[:len(self.measurements.label)].astype(float)
-
-    @property
-    def range_weight(self):
-        """(r,) weights of the ranges."""
-        return self.weight[len(self.measurements.label):].astype(float)
-
-    @property
-    def unsupported(self):
-        """(u,) rows in `Measurements.marker` of the markers without accepted sightings."""
-        m = self.measurements
-        return np.flatnonzero(np.bincount(m.label, self.sighting_weight, len(m.marker)) == 0)
+    return (linearize_sightings(accepted, noise, state, as_pose=True),
+            linearize_sightings(accepted, noise, state, as_pose=False),
+            linearize_ranges(accepted, noise, state))
 
 
-def kept_weights(factors, sightings, ranges):
-    """Shares of its information, (s,) and (r,), that each measurement keeps, by gates and kernels.
+def linearize_sightings(accepted, noise, state, as_pose):
+    """The LinearizedMeasurements of markers with a heading (`as_pose`), or of points."""
+    m, s = accepted.measurements, accepted.measurements.sightings
+    kind = np.flatnonzero(m.as_pose == as_pose)
+    index = np.flatnonzero(accepted.sighting_weight[kind])
+    rows = kind[index]
+    pose, marker = state.poses[s.row[rows]], state.markers[m.marker_row[rows]]
+    e, by_pose, by_marker, *_ = between_error(s.z[rows], pose, marker) if as_pose \
+        else point_error(s.z[rows, :2], pose, marker[:, :2])
+    U = m.sighting_roots[0 if as_pose else 1][rows]
+    return _whitened(index, s.row[rows], m.marker_row[rows], e, [by_pose, by_marker], U,
+                     accepted.sighting_weight[rows], noise.sightings, accepted.sighting_kernel)
 
-    From MeasurementFactors and the `residuals` of sightings (s, 3) and of ranges (r,).
-    """
-    def reweighted(weight, kernel, sizes):
-        return weight * ([kernel.weight(size) for size in sizes] if kernel else 1.0)
 
-    return (reweighted(factors.sighting_weight, factors.sighting_kernel,
-                       np.linalg.norm(sightings, axis=1)),
-            reweighted(factors.range_weight, factors.range_kernel, ranges))
-
-
-def residuals(measurements, state, noise):
-    """Whitened residuals, measured minus expected, without kernels, at a State and a Noise.
-
-    Returns
-    -------
-    (s, 3) of the sightings, in the axes of the vehicle; the third is 0 if the marker is a point.
-    (r,) of the ranges, positive for a range that is too long.
-    """
-    m, s = measurements, measurements.sightings
-    difference = s.z - se2.between(state.poses[s.row], state.markers[m.label])
-    difference[:, 2] = se2.wrap(difference[:, 2]) * m.as_pose
-    C = s.C.copy()
-    C[~m.as_pose, 2] = C[~m.as_pose, :, 2] = [0, 0, 1]          # an independent heading
+def linearize_ranges(accepted, noise, state):
+    """The LinearizedMeasurements of the ranges; expected is offset + scale * distance."""
+    m, r = accepted.measurements, accepted.measurements.ranges
+    rows = np.flatnonzero(accepted.range_weight)
     offset, scale = state.range_calibration
-    expected = offset + scale * np.hypot(
-        *(state.antennas[m.ranges.antenna] - state.poses[m.ranges.row, :2]).T)
-    return (np.linalg.solve(np.linalg.cholesky(C), difference[..., None])[..., 0] / noise.sightings,
-            (m.ranges.distance - expected) / m.ranges.sigma / noise.ranges)
+    distance, *jacobians = range_error(
+        np.zeros(len(rows)), state.poses[r.row[rows]], state.antennas[r.antenna[rows]])
+    e = (offset + scale * distance - r.distance[rows])[:, None]
+    jacobians = [scale * jacobian for jacobian in jacobians]
+    if m.calibrated:
+        jacobians.append(RANGE_SIGMA * np.stack([np.ones_like(distance), distance], -1)[:, None])
+    return _whitened(rows, r.row[rows], len(m.marker) + r.antenna[rows], e, jacobians,
+                     1 / r.sigma[rows, None, None], accepted.range_weight[rows], noise.ranges,
+                     accepted.range_kernel)
+
+
+def point_error(z, pose, point):
+    """Errors R^T (point - t) - z (m, 2) of points z (m, 2) m measured from poses (t, R), (m, 3).
+
+    Also their derivatives by pose (m, 2, 3) and point (m, 2, 2).
+    """
+    R_t = se2.rotation(-pose[:, 2])
+    expected = (R_t @ (point - pose[:, :2])[..., None])[..., 0]
+    by_pose = np.zeros((len(z), 2, 3))
+    by_pose[:, 0, 0] = by_pose[:, 1, 1] = -1
+    by_pose[:, 0, 2], by_pose[:, 1, 2] = expected[:, 1], -expected[:, 0]
+    return expected - z, by_pose, R_t
+
+
+def range_error(r, pose, antenna):
+    """Errors |antenna - t| - r (m,) of ranges r (m,) m from poses (m, 3) to antennas (m, 2) m.
+
+    Also their derivatives by pose (m, 1, 3) and antenna (m, 1, 2). GTSAM: RangeFactor2D.
+    """
+    difference = antenna - pose[:, :2]
+    distance = np.hypot(*difference.T)
+    direction = difference[:, None, :] / np.maximum(distance, MIN_DISTANCE)[:, None, None]
+    by_position = -direction @ se2.rotation(pose[:, 2])
+    by_pose = np.concatenate([by_position, np.zeros((len(r), 1, 1))], axis=2)
+    return distance - r, by_pose, direction
+
+
+def _whitened(index, row, landmark, e, jacobians, U, weight, noise_factor, kernel):
+    """The LinearizedMeasurements of errors e (m, d) with a list of derivatives (m, d, p) each.
+
+    From square root informations U (m, d, d) and weights (m,). `noise_factor` multiplies the
+    standard deviations. A kernel weighs a measurement by the norm of its whitened error; that of a
+    range has the sign of measured minus expected, as in GTSAM.
+    """
+    U = U * (np.sqrt(weight) / noise_factor)[:, None, None]
+    e = (U @ e[..., None])[..., 0]
+    size, error = -e[:, 0] if e.shape[1] == 1 else np.linalg.norm(e, axis=1), np.sum(e**2) / 2
+    if kernel is not None:
+        size = size.tolist()
+        by_kernel, error = np.array([*map(kernel.weight, size)]), sum(map(kernel.loss, size))
+        weight = weight * by_kernel
+        U = U * np.sqrt(by_kernel)[:, None, None]
+        e = e * np.sqrt(by_kernel)[:, None]
+    return LinearizedMeasurements(index=index, row=row, landmark=landmark, e=e,
+                                  J=U @ np.concatenate(jacobians, axis=2), weight=weight,
+                                  error=float(error))

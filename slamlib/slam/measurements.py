@@ -1,6 +1,6 @@
 """Stage 1: all measurements of a dataset as arrays.
 
-Frames are the encoder poses that are variables X_i of the graph: the first, the last, and each one
+Frames (keyframes) are the encoder poses that are variables X_i of the graph: the first, the last,
 with a sighting or a range. Measurements are numbered: first the s sightings, then the r ranges.
 """
 
@@ -14,10 +14,8 @@ from gtsam.symbol_shorthand import A, C, L, P, W, X
 from slamlib import odometry, se2
 from slamlib.dataset import Dataset, UwbReadings
 from slamlib.sightings import (
-    GATE,
     MAX_HEADING_SIGMA,
     MIN_MEASUREMENT_SIGMA,
-    POINT_GATE,
     Sightings,
     sightings_by_frame,
 )
@@ -25,7 +23,10 @@ from slamlib.slam.errors import square_root_information
 from slamlib.slam.noise import is_known
 from slamlib.slam.structure import block_structure, numbered_variables
 
+# Standard deviations of the priors of variables
 ORIGIN_SIGMA = 1e-5          # m, of the position of pose 1, which is zero by definition
+WEAK_SIGMA = 1e5             # m and rad, of a marker without accepted sightings
+GUESS_PRIOR_SIGMA = 5.0      # m, of an antenna about its guessed position
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class Measurements:
     frame: np.ndarray        # (f,) encoder pose of every frame, from 0
     turn: np.ndarray         # (f-1,) rad, change of heading to the next frame by odometry
     sightings: Sightings     # s of them
-    label: np.ndarray        # (s,) row of `marker`
+    marker_row: np.ndarray   # (s,) row of `marker`
     marker: np.ndarray       # (k,) ids, ascending
     oriented: np.ndarray     # (k,) bool; a marker without any sighted heading is a point
     ranges: Ranges           # r of them
@@ -63,22 +64,17 @@ class Measurements:
     def learned(self):
         """(3,) bool, noise parameters that are learned: unknown ones with measurements."""
         return ~is_known(self.dataset.vehicle) & [
-            True, len(self.label) > 0, len(self.ranges.row) > 0]
+            True, len(self.marker_row) > 0, len(self.ranges.row) > 0]
 
     @property
     def as_pose(self):
         """(s,) bool, sightings of markers with a heading."""
-        return self.oriented[self.label]
-
-    @property
-    def gate(self):
-        """(s,) squared Mahalanobis distance from which a sighting is rejected."""
-        return np.where(self.as_pose, GATE, POINT_GATE)
+        return self.oriented[self.marker_row]
 
     @property
     def unit_weights(self):
         """(s + r,) weight 1 for every measurement."""
-        return np.ones(len(self.label) + len(self.ranges.row))
+        return np.ones(len(self.marker_row) + len(self.ranges.row))
 
     @cached_property
     def sighting_roots(self):
@@ -106,7 +102,7 @@ class Measurements:
         """
         v, s, r = self.variables, self.sightings, self.ranges
         odometry = [v.frames[:-1], v.frames[1:], np.repeat(v.w, len(v.frames) - 1)]
-        sightings = np.stack([s.row, v.markers[self.label]], -1)
+        sightings = np.stack([s.row, v.markers[self.marker_row]], -1)
         ranges = [r.row, v.antennas[r.antenna]]
         if self.calibrated:
             ranges.append(np.repeat(v.c, len(r.row)))
@@ -118,7 +114,7 @@ class Measurements:
         """Elimination ordering (COLAMD) of all variables; w and c, which touch many poses, last."""
         graph, s, r = gtsam.SymbolicFactorGraph(), self.sightings, self.ranges
         graph.push_factor(X(0))
-        for i, j in zip(s.row.tolist(), self.label.tolist()):
+        for i, j in zip(s.row.tolist(), self.marker_row.tolist()):
             graph.push_factor(X(i), (L if self.oriented[j] else P)(j))
         for i, k in zip(r.row.tolist(), r.antenna.tolist()):
             graph.push_factor(X(i), A(k))
@@ -137,10 +133,10 @@ class Measurements:
         numbers = {"x": v.frames, "l": v.markers, "p": v.markers, "a": v.antennas, "w": v.w,
                    "c": v.c}
         keys = (gtsam.Symbol(order.at(i)) for i in range(order.size()))
-        rank = np.argsort([numbers[chr(key.chr())][key.index()] for key in keys])
-        width = np.full(len(rank), 2)
+        elimination_order = np.argsort([numbers[chr(key.chr())][key.index()] for key in keys])
+        width = np.full(len(elimination_order), 2)
         width[np.r_[v.frames, v.markers[self.oriented], v.w]] = 3
-        return block_structure(width, rank, self.factor_variables)
+        return block_structure(width, elimination_order, self.factor_variables)
 
     @cached_property
     def factor_places(self):
@@ -158,7 +154,7 @@ def measure(dataset, extra_poses=()):
     uwb = dataset.uwb or UwbReadings(*np.zeros((2, 0), int), *np.zeros((2, 0)))
     sightings = sightings_by_frame(dataset.aruco, np.r_[
         0, len(dataset.ticks) - 1, np.array(extra_poses, int), uwb.pose])
-    marker, label = np.unique(sightings.marker, return_inverse=True)
+    marker, marker_row = np.unique(sightings.marker, return_inverse=True)
     has_heading = sightings.C[:, 2, 2] < MAX_HEADING_SIGMA**2
     antenna, guess = np.unique(uwb.antenna), dataset.antenna_guess
     ranges = Ranges(np.searchsorted(sightings.frame, uwb.pose),
@@ -167,7 +163,8 @@ def measure(dataset, extra_poses=()):
     return Measurements(
         dataset=dataset, frame=sightings.frame,
         turn=np.diff(odometry.dead_reckoning(dataset.ticks, dataset.vehicle)[sightings.frame, 2]),
-        sightings=sightings, label=label, marker=marker,
-        oriented=np.bincount(label, has_heading, len(marker)) > 0, ranges=ranges, antenna=antenna,
+        sightings=sightings, marker_row=marker_row, marker=marker,
+        oriented=np.bincount(marker_row, has_heading, len(marker)) > 0,
+        ranges=ranges, antenna=antenna,
         guess=guess.position[np.searchsorted(guess.antenna, antenna)] if len(antenna)
         else np.zeros((0, 2)))

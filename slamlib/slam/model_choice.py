@@ -6,8 +6,8 @@ import numpy as np
 
 from slamlib.slam.evidence import laplace_approximation
 from slamlib.slam.fit import refine
-from slamlib.slam.linear_factors import range_factors
-from slamlib.slam.noise_posterior import density, greatest_density
+from slamlib.slam.measurement_factors import linearize_ranges
+from slamlib.slam.noise_learning import density, greatest_density
 from slamlib.slam.normal_equations import NormalEquations
 from slamlib.slam.odometry_factors import preintegrate_odometry
 
@@ -20,30 +20,30 @@ def better_model(fit, model):
     Both evidences are on the same measurements with the same weights, so the weights that the
     kernel of the ranges gives at `fit` are kept. The noise is learned for each model.
     """
-    current = replace(fit.problem, measured=_with_fixed_weights(fit))
+    current = replace(fit.problem, accepted=_with_fixed_weights(fit))
     odometry = preintegrate_odometry(current.measurements, model, fit.state.w)
     alternative = replace(current, odometry=odometry)
     lead = _log_density(NormalEquations(alternative, fit.state), fit.posterior) \
         - _log_density(NormalEquations(current, fit.state), fit.posterior,
-                       is_greatest=not len(current.measured.range_weight))
+                       is_greatest=not len(current.accepted.range_weight))
     if lead <= DECISIVE_LEAD:
         return fit
     return refine(replace(fit.problem, odometry=odometry), fit.state, accept=None)
 
 
 def _with_fixed_weights(fit):
-    """MeasurementFactors in which weights replace the kernel of the ranges."""
-    measured = fit.problem.measured
-    weight = measured.weight.astype(float)
-    ranges = np.flatnonzero(measured.range_weight) + len(measured.sighting_weight)
-    weight[ranges] = range_factors(measured, fit.problem.noise, fit.state).weight
-    return replace(measured, weight=weight, range_kernel=None)
+    """AcceptedMeasurements in which weights replace the kernel of the ranges."""
+    accepted = fit.problem.accepted
+    weight = accepted.weight.astype(float)
+    ranges = np.flatnonzero(accepted.range_weight) + len(accepted.sighting_weight)
+    weight[ranges] = linearize_ranges(accepted, fit.problem.noise, fit.state).weight
+    return replace(accepted, weight=weight, range_kernel=None)
 
 
 def _log_density(equations, posterior, is_greatest=False):
     """Log evidence of known noise, or greatest log posterior density of learned noise.
 
-    `is_greatest` says that the noise of the equations' problem is the mode already.
+    If `is_greatest`, the noise of the equations' problem is the mode already.
     """
     if posterior is None or not posterior.covariance.any():          # nothing was learned
         return laplace_approximation(equations, equations.problem.noise)[1]

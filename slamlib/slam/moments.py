@@ -11,13 +11,13 @@ import numpy as np
 
 from slamlib.slam.covariances import Covariances, marginal_covariances
 from slamlib.slam.evidence import laplace_approximation
-from slamlib.slam.state import moved
+from slamlib.slam.state import retract
 
 
 def posterior_moments(fit):
     """Mean State, Covariances, and root mean square of the slip in sqrt(m), of a Fit.
 
-    Raises DatasetError as `marginal_covariances`.
+    Raises DatasetError and LinAlgError as `marginal_covariances`.
     """
     noise, equations = fit.problem.noise, fit.equations
     if fit.posterior is None:
@@ -31,7 +31,7 @@ def posterior_moments(fit):
     x = np.stack([laplace_approximation(equations, point)[0] for point in noises]) \
         - laplace_approximation(equations, noise)[0]
     mean = weights @ x
-    return (moved(fit.problem.measurements, fit.state, mean),
+    return (retract(fit.problem.measurements, fit.state, mean),
             _averaged(equations, conditional, x - mean, weights), slip)
 
 

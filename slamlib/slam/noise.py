@@ -1,4 +1,4 @@
-"""Stage 2: the three noise parameters and their prior.
+"""Stage 1: the three noise parameters and their prior.
 
 Slip is the standard deviation of a wheel's slip after one metre. Two factors multiply the standard
 deviations that the files state for sightings and for ranges. All three are log-normal a priori,
@@ -31,10 +31,10 @@ class Noise:
         """(3,) natural logarithms of slip and both factors."""
         return np.log([self.slip, self.sightings, self.ranges])
 
-
-def from_logarithms(logarithms):
-    """The Noise of `Noise.logarithms` (3,)."""
-    return Noise(*np.exp(logarithms).tolist())
+    @classmethod
+    def from_logarithms(cls, logarithms):
+        """The Noise of `logarithms` (3,)."""
+        return cls(*np.exp(logarithms).tolist())
 
 
 def with_noise(dataset, slip=None, marker_noise_factor=None, range_noise_factor=None):
@@ -53,8 +53,8 @@ def with_known(noise, vehicle):
     """The Noise with the parameters that a Vehicle gives; the slip is at least 1e-5 sqrt(m)."""
     known = (getattr(vehicle, key) for key in NOISE_KEYS)
     slip, sightings, ranges = (
-        value if given is None else given
-        for given, value in zip(known, (noise.slip, noise.sightings, noise.ranges)))
+        value if stated is None else stated
+        for stated, value in zip(known, (noise.slip, noise.sightings, noise.ranges)))
     return Noise(max(slip, SLIP_BOUNDS[0]), sightings, ranges)
 
 

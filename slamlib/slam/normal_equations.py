@@ -13,8 +13,8 @@ import numpy as np
 from scipy.sparse.linalg import splu
 
 from slamlib import se2
-from slamlib.slam.linear_factors import linearize_measurements
-from slamlib.slam.measurement_factors import GUESS_PRIOR_SIGMA, WEAK_SIGMA
+from slamlib.slam.measurement_factors import linearize_measurements
+from slamlib.slam.measurements import GUESS_PRIOR_SIGMA, WEAK_SIGMA
 from slamlib.slam.odometry_factors import odometry_error
 from slamlib.slam.problem import Problem
 from slamlib.slam.state import State
@@ -48,12 +48,12 @@ class NormalEquations:
         """Half the sum of squared whitened errors, kernels applied."""
         odometry, _ = self._odometry(self.problem.noise.slip)
         return float(odometry.squared + self.priors.squared) / 2 \
-            + sum(factors.error for factors in self.factors)
+            + sum(kind.error for kind in self.linearized)
 
     @cached_property
-    def factors(self):
-        """The LinearFactors of sightings of poses, of points, and of ranges."""
-        return linearize_measurements(self.problem.measured, self.problem.noise, self.state)
+    def linearized(self):
+        """The LinearizedMeasurements of sightings of poses, of points, and of ranges."""
+        return linearize_measurements(self.problem.accepted, self.problem.noise, self.state)
 
     def step(self):
         """The Gauss-Newton step delta (n,), or None where H is singular to rounding."""
@@ -65,8 +65,8 @@ class NormalEquations:
     def sums(self, noise, consistency=(1.0, 1.0, 1.0)):
         """Data of H, g (n,), squared error at the state, and sum log|Q| of the odometry noise Q.
 
-        `consistency` (3,) divides the information of each kind of `factors`
-        (`evidence.consistency_factors`).
+        `consistency` (3,) divides the contribution of each kind of `linearized` by its consistency
+        factor, which corrects the bias of a robust kernel (`evidence.consistency_factors`).
         """
         odometry, log_determinant = self._odometry(noise.slip)
         H, g, squared = odometry.H.copy(), odometry.g.copy(), odometry.squared
@@ -76,7 +76,7 @@ class NormalEquations:
         sightings = (self.problem.noise.sightings / noise.sightings)**2
         ranges = (self.problem.noise.ranges / noise.ranges)**2
         for group, ratio, divisor in zip(
-                self._measured, (sightings, sightings, ranges), consistency):
+                self._measurement_groups, (sightings, sightings, ranges), consistency):
             if group is not None:
                 ratio = ratio / divisor
                 H += group.H if ratio == 1 else ratio * group.H
@@ -86,7 +86,7 @@ class NormalEquations:
 
     def counts(self):
         """Numbers of accepted errors of sightings and of ranges."""
-        poses, points, ranges = (f.e.shape[1] * np.sum(f.weight) for f in self.factors)
+        poses, points, ranges = (f.e.shape[1] * np.sum(f.weight) for f in self.linearized)
         return poses + points, ranges
 
     @cached_property
@@ -97,7 +97,7 @@ class NormalEquations:
                  (v.antennas, state.antennas - m.guess, GUESS_PRIOR_SIGMA),
                  (v.w, state.w[None], 1.0)]
         parts += [(v.markers[[j]], state.markers[[j], :2 + m.oriented[j]], WEAK_SIGMA)
-                  for j in self.problem.measured.unsupported]
+                  for j in self.problem.accepted.unsupported]
         if m.calibrated:
             parts.append((v.c, state.c[None], 1.0))
         H, e = np.zeros((2, len(self.structure.diagonal)))
@@ -107,12 +107,12 @@ class NormalEquations:
         return Group(H, H * e, float(np.sum(H * e**2)))
 
     @cached_property
-    def _measured(self):
-        """The Group of each kind of `factors`, None if there are no such measurements."""
+    def _measurement_groups(self):
+        """The Group of each kind of `linearized`, None if there are no such measurements."""
         return [_group(self.structure, places[f.index], rows[f.index], f.J, f.e)
                 if len(f.row) else None
                 for f, (places, rows) in zip(
-                    self.factors, self.problem.measurements.factor_places[1:])]
+                    self.linearized, self.problem.measurements.factor_places[1:])]
 
     @cached_property
     def _odometry(self):

@@ -5,7 +5,9 @@ With the increment Delta(w) = Delta(0) + dDelta/dw w between the frames X and X'
     e = log(Delta(w)^-1 X^-1 X'),
 
 that of GTSAM's between factor, except that the measurement depends on w. The noise of Delta, with
-covariance Q, is encoder rounding and wheel slip, in the axes of the increment's end.
+covariance Q, is the quantization of the encoders and wheel slip, in the axes of the increment's
+end. All derivatives by w are per standard deviation of a wheel parameter; those of
+`increments.between_poses` are per metre.
 """
 
 from dataclasses import dataclass
@@ -24,17 +26,17 @@ class OdometryFactors:
 
     model: str               # of a step, "arc" or "euler"
     increment: np.ndarray    # (f-1, 3) Delta(0), extrapolated linearly: m, m, rad
-    by_w: np.ndarray         # (f-1, 3, 3) dDelta/dw
-    rounding: np.ndarray     # (f-1, 3, 3) noise without slip, in the axes of the increment's end
-    slipping: np.ndarray     # (f-1, 3, 3) noise of slip 1 sqrt(m)
+    by_w: np.ndarray         # (f-1, 3, 3) dDelta/dw, per sigma of each wheel parameter
+    quantization: np.ndarray  # (f-1, 3, 3) covariance without slip, in the axes of the end
+    slipping: np.ndarray     # (f-1, 3, 3) covariance of slip 1 sqrt(m), in the same axes
 
-    def noise(self, slip):
+    def covariance(self, slip):
         """Covariances Q (f-1, 3, 3) for a slip in sqrt(m)."""
-        return self.rounding + slip**2 * self.slipping
+        return self.quantization + slip**2 * self.slipping
 
     def whitening(self, slip):
         """Square root information U (f-1, 3, 3), U^T U = Q^-1, and sum log|Q|, for a slip."""
-        U = square_root_information(self.noise(slip))
+        U = square_root_information(self.covariance(slip))
         return U, -2 * float(np.sum(np.log(np.diagonal(U, axis1=1, axis2=2))))
 
 
@@ -46,24 +48,24 @@ def preintegrate_odometry(measurements, model, relinearize_at=(0.0, 0.0, 0.0)):
     """
     dataset, start, end = measurements.dataset, measurements.frame[:-1], measurements.frame[1:]
     vehicle = dataset.vehicle.with_deviation(np.asarray(relinearize_at))
-    increment, by_w = increments.between_poses(dataset.ticks, vehicle, start, end, model)
-    rounding, slipping = odometry_noise(dataset.ticks, vehicle, start, end)
-    by_w = by_w * vehicle.sigma_wheel
-    turn = -increment[:, 2]
+    increment, by_wheel = increments.between_poses(dataset.ticks, vehicle, start, end, model)
+    quantization, slipping = odometry_noise(dataset.ticks, vehicle, start, end)
+    by_w, turn = by_wheel * vehicle.sigma_wheel, -increment[:, 2]
     return OdometryFactors(
         model=model, increment=increment - by_w @ relinearize_at, by_w=by_w,
-        rounding=se2.rotate_covariance(rounding, turn),
+        quantization=se2.rotate_covariance(quantization, turn),
         slipping=se2.rotate_covariance(slipping, turn))
 
 
 def odometry_noise(ticks, vehicle, start, end, steps=None):
-    """Rounding and slipping (m, 3, 3) of `increments.noise_in_drive`, regular by MINIMUM_SIGMA.
+    """Quantization and slipping (m, 3, 3) by `increments.noise_in_drive`, made regular.
 
-    A vehicle that stands still has no lateral noise, but the graph needs the inverse of Q.
+    A vehicle that stands still has no lateral noise, but the graph needs the inverse of
+    Q: MINIMUM_SIGMA is added. Axes are those of the increments' starts, lengths in m.
     """
-    rounding, slipping = increments.noise_in_drive(ticks, vehicle, start, end, steps)
-    rounding[:, [0, 1], [0, 1]] += MINIMUM_SIGMA**2
-    return rounding, slipping
+    quantization, slipping = increments.noise_in_drive(ticks, vehicle, start, end, steps)
+    quantization[:, [0, 1], [0, 1]] += MINIMUM_SIGMA**2
+    return quantization, slipping
 
 
 def odometry_error(factors, poses, w):

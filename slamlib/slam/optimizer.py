@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 from slamlib.slam.gtsam_graph import gtsam_step
 from slamlib.slam.normal_equations import NormalEquations
-from slamlib.slam.state import State, moved
+from slamlib.slam.state import State, retract
 
-CONVERGED = 1e-6             # relative decrease of the error at which iterations end
-ROUNDING = 1e-12             # relative increase of the error that is rounding
+CONVERGED = 1e-6             # decrease, over 1 + error, at which iterations end
+ROUNDING = 1e-12             # relative increase of the error that is due to float rounding
 MAX_GAUSS_NEWTON_STEPS = 40  # number of steps
 MAX_HALVINGS = 8             # number of halvings of one step
 
@@ -40,8 +40,8 @@ def optimize(problem, state, max_steps=MAX_GAUSS_NEWTON_STEPS, by_gtsam=False,
              converged=CONVERGED):
     """The Optimum of a Problem from a State.
 
-    It ends where the error decreases by less than its share `converged`. Raises DatasetError if the
-    measurements do not determine every variable.
+    It ends where the error decreases by at most `converged` times (1 + error). Raises DatasetError
+    if the measurements do not determine every variable.
     """
     equations, steps, ended = NormalEquations(problem, state), 0, False
     while steps < max_steps and not ended:
@@ -52,7 +52,7 @@ def optimize(problem, state, max_steps=MAX_GAUSS_NEWTON_STEPS, by_gtsam=False,
         if step is None:
             step = gtsam_step(problem, state)
         for _ in range(MAX_HALVINGS):
-            equations = NormalEquations(problem, moved(problem.measurements, state, step))
+            equations = NormalEquations(problem, retract(problem.measurements, state, step))
             if equations.error <= (1 + ROUNDING) * error:
                 break
             step = step / 2

@@ -4,8 +4,8 @@ Each stage is a function from one frozen record to the next; stages have the num
 `slamlib.slam`:
 
     1   measure           Dataset -> Measurements
-    2   build_problem     Measurements -> the factors of odometry, sightings and ranges,
-    3                     and with the noise -> Problem, the factor graph
+    2   build_problem     Measurements, Noise -> Problem, the factor graph
+    3   optimize          Problem, State -> Optimum by Gauss-Newton, in all later stages
     4   initial_state     Measurements -> State, the start values
     5   narrow_kernels    Problem, State -> State, by robust kernels
     6   refine            Problem, State -> Fit: wheels, noise and accepted measurements in turn
@@ -21,6 +21,7 @@ from numbers import Real
 
 from slamlib.limits import LIMITS
 from slamlib.odometry import MODELS
+from slamlib.slam.acceptance import acceptance_rule, accepted_measurements
 from slamlib.slam.fit import refine, solved_by_gtsam
 from slamlib.slam.initialization import initial_state, state_from_poses
 from slamlib.slam.measurements import measure
@@ -30,10 +31,10 @@ from slamlib.slam.odometry_factors import preintegrate_odometry
 from slamlib.slam.problem import build_problem
 from slamlib.slam.range_calibration import calibrated
 from slamlib.slam.result import slam_result
-from slamlib.slam.robust import CAUCHY_SCALES, acceptance, accepted, narrow_kernels
+from slamlib.slam.robust import CAUCHY_SCALES, narrow_kernels
 from slamlib.slam.wheel_check import with_checked_wheels
 
-WARM_START_CONVERGED = 1e-3  # relative decrease of the error at which the start from a result ends
+WARM_START_CONVERGED = 1e-3  # decrease, over 1 + error, at which the start from a result ends
 
 
 def estimate(dataset, slip=None, model=None, previous=None, *, marker_noise_factor=None,
@@ -50,7 +51,7 @@ def estimate(dataset, slip=None, model=None, previous=None, *, marker_noise_fact
     previous : SlamResult of the same drive with fewer sensors, from which the solution starts.
     marker_noise_factor, range_noise_factor : known factors on the standard deviations in the files;
         None as for `slip`.
-    kernel : name in `robust.KERNELS`, the robust kernel of sightings and ranges; that of the
+    kernel : name in `acceptance.KERNELS`, the robust kernel of sightings and ranges; that of the
         ranges only if its name begins with "asymmetric".
     gate : bool, whether measurements that contradict the solution are rejected.
 
@@ -61,12 +62,13 @@ def estimate(dataset, slip=None, model=None, previous=None, *, marker_noise_fact
     Raises
     ------
     DatasetError : the measurements do not determine every pose and landmark.
+    numpy.linalg.LinAlgError : a covariance is singular to rounding.
     ValueError : an option has no such name, or is not within the limits of vehicle.toml.
 
     >>> from slamlib.simulation import simulate
     >>> dataset, truth = simulate("short", seed=1)
-    >>> found = estimate(dataset.first(200), slip=1e-3, kernel="Huber")
-    >>> found.poses.shape, found.antenna.tolist(), found.noise.slip
+    >>> result = estimate(dataset.first(200), slip=1e-3, kernel="Huber")
+    >>> result.poses.shape, result.antenna.tolist(), result.noise.slip
     ((200, 3), [5, 13, 36, 46], 0.001)
     >>> estimate(dataset, kernel="L2")
     Traceback (most recent call last):
@@ -75,7 +77,7 @@ asymmetric Cauchy, asymmetric Tukey, not 'L2'
     """
     _check_options(model, slip, marker_noise_factor, range_noise_factor)
     dataset = with_noise(dataset, slip, marker_noise_factor, range_noise_factor)
-    accept = partial(accepted, rule=acceptance(kernel, gate))
+    accept = partial(accepted_measurements, rule=acceptance_rule(kernel, gate))
 
     measurements = measure(dataset)                                                   # 1
     if previous is not None:
@@ -89,20 +91,20 @@ asymmetric Cauchy, asymmetric Tukey, not 'L2'
 
 
 def fit_from_odometry(measurements, model="arc", preintegrate=preintegrate_odometry,
-                      accept=accepted):
+                      accept=accepted_measurements):
     """The Fit of Measurements with start values by odometry.
 
     `model` and `preintegrate` as in `build_problem`, `accept` as in `refine`. Raises DatasetError
     as `estimate`.
     """
-    problem = build_problem(measurements, model, _initial_noise(measurements),        # 2 and 3
+    problem = build_problem(measurements, model, _initial_noise(measurements),        # 2
                             preintegrate=preintegrate)
     state = initial_state(measurements, model, preintegrate)                          # 4
     state = narrow_kernels(problem, state)                                            # 5
     return refine(problem, state, accept, preintegrate)                               # 6
 
 
-def fit_from_previous(measurements, previous, model=None, accept=accepted):
+def fit_from_previous(measurements, previous, model=None, accept=accepted_measurements):
     """The Fit of Measurements from poses, wheels and model of a SlamResult; otherwise as above."""
     vehicle, frame = measurements.dataset.vehicle, measurements.frame
     w = (previous.wheel - vehicle.wheel) / vehicle.sigma_wheel

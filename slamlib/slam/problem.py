@@ -1,4 +1,4 @@
-"""Stage 3: the factor graph: measurements, odometry and noise.
+"""Stage 2: the factor graph: odometry, accepted measurements and noise.
 
 All odometry factors share the variable w, because the same wheel errors act in every increment.
 Independent noise in each factor would not model this.
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slamlib.slam.measurement_factors import MeasurementFactors
+from slamlib.slam.acceptance import AcceptedMeasurements
 from slamlib.slam.measurements import Measurements
 from slamlib.slam.noise import Noise
 from slamlib.slam.odometry_factors import OdometryFactors, preintegrate_odometry
@@ -19,13 +19,13 @@ class Problem:
     """The factor graph."""
 
     odometry: OdometryFactors
-    measured: MeasurementFactors
+    accepted: AcceptedMeasurements
     noise: Noise
 
     @property
     def measurements(self) -> Measurements:
         """The Measurements."""
-        return self.measured.measurements
+        return self.accepted.measurements
 
 
 def build_problem(measurements, model, noise, relinearize_at=np.zeros(3),
@@ -36,4 +36,4 @@ def build_problem(measurements, model, noise, relinearize_at=np.zeros(3),
     at w = `relinearize_at` (3,); studies pass other functions.
     """
     return Problem(preintegrate(measurements, model, relinearize_at),
-                   MeasurementFactors(measurements, measurements.unit_weights), noise)
+                   AcceptedMeasurements(measurements, measurements.unit_weights), noise)

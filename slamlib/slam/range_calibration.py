@@ -5,13 +5,13 @@ If it does not decide, they remain variables: a possible offset makes the antenn
 
 from dataclasses import replace
 
+from slamlib.slam.acceptance import accepted_measurements
 from slamlib.slam.evidence import log_evidence
 from slamlib.slam.fit import refine
 from slamlib.slam.model_choice import DECISIVE_LEAD
-from slamlib.slam.robust import accepted
 
 
-def calibrated(fit, accept=accepted):
+def calibrated(fit, accept=accepted_measurements):
     """The Fit with offset and scale of the ranges as variables.
 
     `fit` itself if its evidence leads by DECISIVE_LEAD or if there are no ranges. Both are compared
@@ -20,7 +20,7 @@ def calibrated(fit, accept=accepted):
     if not len(fit.problem.measurements.ranges.row):
         return fit
     m = replace(fit.problem.measurements, calibrated=True)
-    problem = replace(fit.problem, measured=replace(fit.problem.measured, measurements=m))
+    problem = replace(fit.problem, accepted=replace(fit.problem.accepted, measurements=m))
     if log_evidence(problem, fit.state) < fit.log_evidence - DECISIVE_LEAD:
         return fit
     return refine(problem, fit.state, accept)

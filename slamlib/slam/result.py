@@ -5,12 +5,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slamlib import se2
+from slamlib.slam.acceptance import AcceptedMeasurements, kept_weights, residuals
 from slamlib.slam.camera_offsets import CameraOffsets, estimate_camera_offsets
 from slamlib.slam.doubts import antenna_doubts
 from slamlib.slam.drive_doubts import solution_doubts, turn_doubts
 from slamlib.slam.interpolation import interpolate
-from slamlib.slam.linear_factors import linearize_measurements
-from slamlib.slam.measurement_factors import MeasurementFactors, kept_weights, residuals
+from slamlib.slam.measurement_factors import linearize_measurements
 from slamlib.slam.moments import posterior_moments
 from slamlib.slam.noise import Noise
 from slamlib.slam.odometry_factors import odometry_error
@@ -61,7 +61,7 @@ class SlamResult:
 def slam_result(fit):
     """The SlamResult of a Fit.
 
-    Raises DatasetError as `marginal_covariances`.
+    Raises DatasetError and LinAlgError as `marginal_covariances`.
     """
     problem, m = fit.problem, fit.problem.measurements
     vehicle = m.dataset.vehicle
@@ -69,19 +69,19 @@ def slam_result(fit):
     poses, pose_covariances = interpolate(
         replace(problem, noise=replace(problem.noise, slip=slip)), state, marginal.pairs)
     residual, range_residual = residuals(m, state, problem.noise)
-    sighting_weight, range_weight = kept_weights(problem.measured, residual, range_residual)
+    sighting_weight, range_weight = kept_weights(problem.accepted, residual, range_residual)
     mapped, marker_covariance = _mapped(problem, marginal.markers)
     markers = state.markers[mapped]
     markers[:, 2] = se2.wrap(markers[:, 2])
-    antennas = antenna_doubts(problem, state, pose_covariances[m.frame], marginal.antennas,
-                              range_weight)
-    found = SlamResult(
+    sentences, antenna_covariances = antenna_doubts(
+        problem, state, pose_covariances[m.frame], marginal.antennas, range_weight)
+    result = SlamResult(
         poses=poses, covariances=pose_covariances,
         marker=m.marker[mapped], marker_in_world=markers,
         marker_covariance=se2.rotate_covariance(
             marker_covariance[mapped], markers[:, 2] * m.oriented[mapped]),
         antenna=m.antenna, antenna_in_world=state.antennas,
-        antenna_covariance=antennas.covariances, doubts=antennas.sentences,
+        antenna_covariance=antenna_covariances, doubts=sentences,
         wheel=vehicle.wheel + vehicle.sigma_wheel * state.w,
         wheel_covariance=vehicle.sigma_wheel[:, None] * marginal.w * vehicle.sigma_wheel,
         noise=problem.noise, noise_sigma=np.zeros(3) if fit.posterior is None
@@ -92,9 +92,9 @@ def slam_result(fit):
         model=problem.odometry.model, log_evidence=float(fit.log_evidence),
         chi2_per_dof=chi2_per_dof(problem, state, np.r_[sighting_weight, range_weight]),
         chi2_per_dof_of_all=chi2_per_dof(problem, state, m.unit_weights),
-        rejected=problem.measured.sighting_weight == 0, residual=residual,
+        rejected=problem.accepted.sighting_weight == 0, residual=residual,
         range_weight=range_weight, range_residual=range_residual)
-    return replace(found, drive_doubts=(*solution_doubts(m, found), *turn_doubts(problem)))
+    return replace(result, drive_doubts=(*solution_doubts(m, result), *turn_doubts(problem)))
 
 
 def _mapped(problem, blocks):
@@ -103,13 +103,13 @@ def _mapped(problem, blocks):
     The covariances (k, 3, 3) are in GTSAM's axes. The heading of a point has the variance of its
     best sighting.
     """
-    m, accepted = problem.measurements, problem.measured.sighting_weight > 0
-    balance = np.bincount(m.label, np.where(accepted, 1, -1), len(m.marker))
+    m, accepted = problem.measurements, problem.accepted.sighting_weight > 0
+    balance = np.bincount(m.marker_row, np.where(accepted, 1, -1), len(m.marker))
     covariances = np.zeros((len(m.marker), 3, 3))
     for j, block in enumerate(blocks):
         covariances[j, :len(block), :len(block)] = block
         if not m.oriented[j]:
-            covariances[j, 2, 2] = m.sightings.C[m.label == j, 2, 2].min()
+            covariances[j, 2, 2] = m.sightings.C[m.marker_row == j, 2, 2].min()
     return np.flatnonzero(balance > 0), covariances
 
 
@@ -120,13 +120,13 @@ def chi2_per_dof(problem, state, weight):
     subtracts its dimension. Odometry and priors have as many errors as poses and w have unknowns.
     """
     m = problem.measurements
-    sightings, ranges = np.split(weight, [len(m.label)])
-    stated = MeasurementFactors(m, weight)
+    sightings, ranges = np.split(weight, [len(m.marker_row)])
+    stated = AcceptedMeasurements(m, weight)
     e, _ = odometry_error(problem.odometry, state.poses, state.w)
     U, _ = problem.odometry.whitening(problem.noise.slip)
     squared = np.sum((U @ e[..., None])**2) + np.sum(state.w**2) + 2 * sum(
         factors.error for factors in linearize_measurements(stated, Noise(), state))
-    used = np.bincount(m.label, sightings * np.where(m.as_pose, 3, 2), len(m.marker))
+    used = np.bincount(m.marker_row, sightings * np.where(m.as_pose, 3, 2), len(m.marker))
     freedom = np.sum(np.maximum(used - np.where(m.oriented, 3, 2), 0)) \
         + np.sum(ranges) - 2 * len(m.antenna)
     return float(squared / max(1, freedom))

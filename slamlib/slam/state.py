@@ -1,4 +1,4 @@
-"""Stage 3: values of all variables of the graph.
+"""Stage 2: values of all variables of the graph.
 
 Variables are the frames' poses X_i, the markers L_j (points P_j if no sighting has a heading), the
 antennas A_k, the errors w of the wheel parameters, and the calibration c of the ranges.
@@ -43,7 +43,7 @@ def state_from_arrays(measurements, poses, markers, antennas, w, c=np.zeros(2)):
                  w=np.asarray(w, dtype=float), c=np.asarray(c, dtype=float))
 
 
-def moved(measurements, state, delta):
+def retract(measurements, state, delta):
     """The State after a step delta (n,), a solution of the normal equations.
 
     Poses and markers move in their own axes, as GTSAM's do: X becomes X delta.

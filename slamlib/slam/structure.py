@@ -33,20 +33,23 @@ def numbered_variables(frames, markers, antennas, calibrated):
 
 @dataclass(frozen=True)
 class Structure:
-    """Rows of v variables with n unknowns, and places of their blocks in a matrix (n, n)."""
+    """Rows of v variables with n unknowns, and places of their blocks in a matrix (n, n).
+
+    A place is an index in the data of the matrix, which is stored column by column.
+    """
 
     width: np.ndarray        # (v,) number of unknowns of every variable
-    rank: np.ndarray         # (v,) position in the elimination ordering
-    begin: np.ndarray        # (v,) first row
-    block: np.ndarray        # (b,) every block: rank of its column times v, plus rank of its row
-    place: np.ndarray        # (b,) of a block's first entry in the data of the matrix
-    height: np.ndarray       # (v,) number of entries in every column of a variable
+    elimination_order: np.ndarray    # (v,) position of every variable in the elimination
+    first_row: np.ndarray    # (v,) row of the first unknown of every variable
+    block: np.ndarray        # (b,) every block: order of its column times v, plus order of its row
+    first_place: np.ndarray  # (b,) place of every block's first entry
+    column_height: np.ndarray        # (v,) number of entries in every column of a variable
     indices: np.ndarray      # (e,) row of every entry, column by column
     indptr: np.ndarray       # (n + 1,) where each column begins
 
     def rows(self, variables, width):
         """Rows (m, width) of the unknowns of `variables` (m,)."""
-        return self.begin[variables][:, None] + np.arange(width, dtype=np.int32)
+        return self.first_row[variables][:, None] + np.arange(width, dtype=np.int32)
 
     def rows_of_each(self, variables):
         """List of the rows (d,) of each of `variables` (m,), which may have different widths."""
@@ -58,14 +61,15 @@ class Structure:
                                zip(variables.T, self._widths(variables))], axis=1)
 
     def places(self, variables):
-        """Places (m, p, p), in the data of the matrix, of the information J^T J of such factors."""
+        """Places (m, p, p) of the information J^T J of such factors."""
         blocks = [(numbers, np.arange(width, dtype=np.int32)) for numbers, width in
                   zip(variables.T, self._widths(variables))]
 
         def places_of_block(row, column, rows, columns):
-            found = np.searchsorted(self.block, self.rank[column] * len(self.rank) + self.rank[row])
-            return (self.place[found][:, None, None] + rows
-                    + self.height[column][:, None, None] * columns[:, None])
+            order = self.elimination_order
+            block = np.searchsorted(self.block, order[column] * len(order) + order[row])
+            return (self.first_place[block][:, None, None] + rows
+                    + self.column_height[column][:, None, None] * columns[:, None])
 
         return np.concatenate([np.concatenate([
             places_of_block(row, column, rows, columns) for row, rows in blocks], axis=2)
@@ -93,33 +97,35 @@ class Structure:
                                 shape=(size, size))
 
 
-def block_structure(width, rank, factors):
-    """The Structure of variables with these widths (v,) and ranks (v,).
+def block_structure(width, elimination_order, factor_variables):
+    """The Structure of variables with these widths and positions in the elimination, (v,) each.
 
-    `factors` lists, for each kind of factor, the numbers (m, q) of the variables of its m factors.
+    `factor_variables` lists, for each kind of factor, the variables (m, q) of its m factors.
     """
     count = len(width)
-    begin = np.empty(count, np.int32)             # half the memory of int: there are many places
-    order = np.argsort(rank)
-    begin[order] = np.cumsum(width[order]) - width[order]
-    factors = [*factors, np.arange(count)[:, None]]
+    first_row = np.empty(count, np.int32)         # half the memory of int: there are many places
+    order = np.argsort(elimination_order)
+    first_row[order] = np.cumsum(width[order]) - width[order]
     block = np.unique(np.concatenate([
-        rank[column] * count + rank[row] for variables in factors
+        elimination_order[column] * count + elimination_order[row]
+        for variables in (*factor_variables, np.arange(count)[:, None])
         for column in variables.T for row in variables.T]))
     column, row = (order[part] for part in np.divmod(block, count))
     above = np.cumsum(width[row]) - width[row]                 # heights of all blocks before
-    first = np.searchsorted(block, rank[np.arange(count)] * count)
-    height = np.bincount(column, width[row], count).astype(np.int32)
-    entries = height * width
-    column_begin = np.empty(count, int)
-    column_begin[order] = np.cumsum(entries[order]) - entries[order]
-    place = (column_begin[column] + above - above[first[column]]).astype(np.int32)
+    first = np.searchsorted(block, elimination_order * count)
+    column_height = np.bincount(column, width[row], count).astype(np.int32)
+    entries = column_height * width
+    column_start = np.empty(count, int)
+    column_start[order] = np.cumsum(entries[order]) - entries[order]
+    first_place = (column_start[column] + above - above[first[column]]).astype(np.int32)
     indices = np.empty(entries.sum(), np.int32)
     for c in range(width.max()):
         for r in range(width.max()):
             inside = (c < width[column]) & (r < width[row])
-            indices[(place + c * height[column] + r)[inside]] = (begin[row] + r)[inside]
+            places = first_place + c * column_height[column] + r
+            indices[places[inside]] = (first_row[row] + r)[inside]
     indptr = np.zeros(width.sum() + 1, np.int32)
-    indptr[1:] = np.cumsum(np.repeat(height[order], width[order]))
-    return Structure(width=width, rank=rank, begin=begin, block=block, place=place, height=height,
-                     indices=indices, indptr=indptr)
+    indptr[1:] = np.cumsum(np.repeat(column_height[order], width[order]))
+    return Structure(
+        width=width, elimination_order=elimination_order, first_row=first_row, block=block,
+        first_place=first_place, column_height=column_height, indices=indices, indptr=indptr)

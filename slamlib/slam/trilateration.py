@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slamlib.slam.measurement_factors import GUESS_PRIOR_SIGMA
+from slamlib.slam.measurement_factors import MIN_DISTANCE
+from slamlib.slam.measurements import GUESS_PRIOR_SIGMA
 
 MAX_RANGES = 150             # maximum number of ranges used per antenna, evenly chosen
 SAME_PLACE = 0.2             # of the median range: positions closer than this are one
@@ -15,7 +16,12 @@ KERNEL_SCALE = 2.0           # sigmas, scale of the Cauchy kernel
 START_DIRECTIONS = 8         # number of starts on a circle about the path
 MAX_SEARCH_STEPS = 60        # number of steps of the search
 STEP_TOLERANCE = 1e-6        # m, length of a step at which the search ends
+FIRST_DAMPING = 1e-3         # share of the curvature that is added to it
+DAMPING_FACTOR = 10          # by which damping falls after a descent and grows after an ascent
+MIN_ASCENT_DAMPING = 0.1     # damping from which it grows after an ascent
 SMALLEST_CURVATURE = 1e-3    # of the smaller over the larger second derivative
+GRID = (200, 361)            # numbers of radii and angles of the grid of `second_moment`
+GRID_MARGIN = 1.5            # of the longest range, by which the grid exceeds the path
 
 
 @dataclass(frozen=True)
@@ -39,14 +45,14 @@ def ranges_by_antenna(measurements, poses, covariances):
 
     Poses (f, 3), m and rad, and covariances (f, 3, 3) of the frames are in world axes.
     """
-    r, found = measurements.ranges, []
+    r, by_antenna = measurements.ranges, []
     position_sigma = np.sqrt(np.trace(covariances[:, :2, :2], axis1=1, axis2=2) / 2)
     for k, guess in enumerate(measurements.guess):
         rows = np.flatnonzero(r.antenna == k)
-        found.append(AntennaRanges(
+        by_antenna.append(AntennaRanges(
             poses[r.row[rows], :2], r.distance[rows],
             np.hypot(r.sigma[rows], position_sigma[r.row[rows]]), guess))
-    return found
+    return by_antenna
 
 
 def trilaterate(ranges):
@@ -58,7 +64,7 @@ def trilaterate(ranges):
     Returns
     -------
     places : (p, 2) m, with distances above SAME_PLACE, in the order of their costs.
-    costs : (p,) differences from the smallest cost, log odds.
+    costs : (p,) negative log posterior, minus that of the first position.
     """
     guess, centre, radius = ranges.guess, ranges.positions.mean(0), np.median(ranges.distance)
     angle = np.arange(START_DIRECTIONS) * 2 * np.pi / START_DIRECTIONS
@@ -78,7 +84,7 @@ def _minima(ranges, places):
     Newton's method from all starts at once, with the absolute values of the second derivatives; a
     step that does not descend is repeated with more damping.
     """
-    damping, (cost, gradient, hessian) = np.full(len(places), 1e-3), _cost(ranges, places)
+    damping, (cost, gradient, hessian) = np.full(len(places), FIRST_DAMPING), _cost(ranges, places)
     for _ in range(MAX_SEARCH_STEPS):
         curvature, axes = np.linalg.eigh(hessian)
         least = SMALLEST_CURVATURE * np.abs(curvature).max(axis=1, keepdims=True)
@@ -87,7 +93,8 @@ def _minima(ranges, places):
         step = -np.einsum("pik,pk->pi", axes, along_axes)
         trial = _cost(ranges, places + step)
         better = trial[0] <= cost
-        damping = np.where(better, damping / 10, np.maximum(damping, 0.1) * 10)
+        damping = np.where(better, damping / DAMPING_FACTOR,
+                           np.maximum(damping, MIN_ASCENT_DAMPING) * DAMPING_FACTOR)
         places = np.where(better[:, None], places + step, places)
         for current, new in zip((cost, gradient, hessian), trial):
             current[better] = new[better]
@@ -102,7 +109,7 @@ def _cost(ranges, places):
     The guess counts as two more measurements.
     """
     difference, root = places[:, None] - ranges.positions, 1 / ranges.sigma
-    distance = np.maximum(np.hypot(difference[..., 0], difference[..., 1]), 1e-9)
+    distance = np.maximum(np.hypot(difference[..., 0], difference[..., 1]), MIN_DISTANCE)
     e, direction = root * (distance - ranges.distance), difference / distance[..., None]
     e_guess = (places - ranges.guess) / GUESS_PRIOR_SIGMA
     first, second = _cauchy_derivatives(e)
@@ -130,11 +137,12 @@ def second_moment(ranges, estimate):
     range: an array of the grid times all ranges would take 500 MB.
     """
     centre = ranges.positions.mean(0)
-    reach = 1.5 * ranges.distance.max() + np.ptp(ranges.positions, axis=0).max()
-    radius, angle = np.meshgrid(np.linspace(0, reach, 200)[1:], np.linspace(-np.pi, np.pi, 361)[1:])
+    reach = GRID_MARGIN * ranges.distance.max() + np.ptp(ranges.positions, axis=0).max()
+    radius, angle = np.meshgrid(np.linspace(0, reach, GRID[0])[1:],
+                                np.linspace(-np.pi, np.pi, GRID[1])[1:])
     place = centre + radius[..., None] * np.stack([np.cos(angle), np.sin(angle)], -1)
     used = ranges.evenly_chosen()
-    sigma = np.hypot(used.sigma, reach / 400)                    # at least half a cell of the grid
+    sigma = np.hypot(used.sigma, reach / GRID[0] / 2)            # at least half a cell of the grid
     cost = np.sum((place - ranges.guess)**2, axis=-1) / GUESS_PRIOR_SIGMA**2 / 2
     for origin, measured, s in zip(used.positions, used.distance, sigma):
         e = (np.hypot(place[..., 0] - origin[0], place[..., 1] - origin[1]) - measured) / s

@@ -23,37 +23,37 @@ MAX_SLIP_RATIO = 0.7         # ratio of the slips, of other to stated wheels
 EXPLAINED = {"wheel-parameters", "wheel-slip", "camera-offset", "time-offset"}
 
 
-def with_checked_wheels(found, fit, solve):
-    """The SlamResult `found` of a Fit, with a doubt if other wheels explain the drive better.
+def with_checked_wheels(result, fit, solve):
+    """The SlamResult of a Fit, with a doubt if other wheel parameters explain the drive better.
 
     `solve` makes a Fit from Measurements and a SlamResult.
     """
-    doubted = {doubt.what for doubt in found.drive_doubts}
+    doubted = {doubt.what for doubt in result.drive_doubts}
     if not fit.problem.measurements.learned[0] or not (
-            found.slip > SUSPICIOUS_SLIP or doubted & EXPLAINED):
-        return found
+            result.slip > SUSPICIOUS_SLIP or doubted & EXPLAINED):
+        return result
     dataset, stated = fit.problem.measurements.dataset, fit.problem.measurements.dataset.vehicle
     uncertain = replace(
         stated, sigma_right_radius=WEAK_WHEEL_SIGMA * stated.right_radius,
         sigma_left_radius=WEAK_WHEEL_SIGMA * stated.left_radius,
         sigma_wheelbase=WEAK_WHEEL_SIGMA * stated.wheelbase)
     try:
-        alternative = solve(measure(replace(dataset, vehicle=uncertain)), found)
-        measured = replace(alternative.problem.measured, measurements=fit.problem.measurements)
-        compared = refine(replace(fit.problem, measured=measured), fit.state, accept=None)
+        alternative = solve(measure(replace(dataset, vehicle=uncertain)), result)
+        accepted = replace(alternative.problem.accepted, measurements=fit.problem.measurements)
+        compared = refine(replace(fit.problem, accepted=accepted), fit.state, accept=None)
     except (DatasetError, np.linalg.LinAlgError):
-        return found
+        return result
     wheel = stated.wheel + uncertain.sigma_wheel * alternative.state.w
     lead = alternative.posterior.density - compared.posterior.density
-    if alternative.problem.measured.weight.sum() \
-            < MIN_ACCEPTED * fit.problem.measured.weight.sum() \
-            or alternative.problem.noise.slip > MAX_SLIP_RATIO * found.slip \
-            or lead < max(MIN_LEAD, found.camera.time.gain, found.camera.place.gain) \
+    if alternative.problem.accepted.weight.sum() \
+            < MIN_ACCEPTED * fit.problem.accepted.weight.sum() \
+            or alternative.problem.noise.slip > MAX_SLIP_RATIO * result.slip \
+            or lead < max(MIN_LEAD, result.camera.time.gain, result.camera.place.gain) \
             or not far_off(stated, wheel).any():
-        return found
+        return result
     doubt = Doubt("wheel-parameters", (
         f"The drive is explained far better if {wheels_in_words(stated, wheel)}: measure the "
         "wheels, and state their values or larger sigmas in vehicle.toml."
         + marker_size(stated, wheel)))
-    remaining = (doubt for doubt in found.drive_doubts if doubt.what not in EXPLAINED)
-    return replace(found, drive_doubts=(doubt, *remaining))
+    remaining = (doubt for doubt in result.drive_doubts if doubt.what not in EXPLAINED)
+    return replace(result, drive_doubts=(doubt, *remaining))

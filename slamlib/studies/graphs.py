@@ -32,7 +32,8 @@ def independent_chain(measurements, model, relinearize_at=None):
     factors = preintegrate_odometry(measurements, model)
     noise = se2.rotate_covariance(factors.by_w @ np.swapaxes(factors.by_w, 1, 2),
                                   -factors.increment[:, 2])
-    return replace(factors, by_w=np.zeros_like(factors.by_w), rounding=factors.rounding + noise)
+    return replace(factors, by_w=np.zeros_like(factors.by_w),
+                   quantization=factors.quantization + noise)
 
 
 WHEEL_MODELS = {"wheels as a variable": preintegrate_odometry,
@@ -75,14 +76,14 @@ def _without_wheel_errors(problem):
     known = replace(m.dataset.vehicle, sigma_right_radius=0.0, sigma_left_radius=0.0,
                     sigma_wheelbase=0.0)
     m = replace(m, dataset=replace(m.dataset, vehicle=known))
-    return replace(problem, measured=replace(problem.measured, measurements=m))
+    return replace(problem, accepted=replace(problem.accepted, measurements=m))
 
 
 def gtsam_chain(problem):
     """The gtsam.NonlinearFactorGraph of a Problem with an independent chain of between factors."""
     graph = nonlinear_graph(problem)
     chain = independent_chain(problem.measurements, problem.odometry.model)
-    for i, (step, Q) in enumerate(zip(chain.increment, chain.noise(problem.noise.slip))):
+    for i, (step, Q) in enumerate(zip(chain.increment, chain.covariance(problem.noise.slip))):
         graph.add(gtsam.BetweenFactorPose2(X(i), X(i + 1), gtsam.Pose2(*step),
                                            gtsam.noiseModel.Gaussian.Covariance(Q)))
     return graph

@@ -8,30 +8,38 @@ import numpy as np
 
 from slamlib.increments import TYPICAL_SLIP
 from slamlib.simulation import simulate
+from slamlib.slam.acceptance import (
+    EARLY_GATE,
+    AcceptedMeasurements,
+    acceptance_rule,
+    accepted_measurements,
+    kept_weights,
+    residuals,
+    within_gates,
+)
 from slamlib.slam.fit import refine
 from slamlib.slam.initialization import odometry_state, trilaterated_antennas
-from slamlib.slam.measurement_factors import MeasurementFactors, kept_weights, residuals
 from slamlib.slam.measurements import measure
 from slamlib.slam.noise import Noise, with_known, with_noise
 from slamlib.slam.optimizer import optimize
 from slamlib.slam.problem import build_problem
 from slamlib.slam.result import slam_result
-from slamlib.slam.robust import CAUCHY_SCALES, EARLY_GATE, acceptance, accepted, within_gates
+from slamlib.slam.robust import CAUCHY_SCALES
 from slamlib.slam.state import state_from_arrays
 from slamlib.studies.montecarlo import judge_slam
 
-# The `robust.Acceptance` of every method against late ranges, and against wrong labels.
+# The `AcceptanceRule` of every method against late ranges, and against wrong labels.
 RANGE_METHODS = {
-    **{name: acceptance(name, gate=False) for name in ("quadratic", "Huber", "Cauchy")},
-    "asymmetric Cauchy": acceptance("asymmetric Cauchy"),
-    "asymmetric Tukey": acceptance(),
-    "GNC": acceptance("quadratic"),
-    "gate": acceptance("quadratic"),
-    "asymmetric gate": replace(acceptance("quadratic"), late=2.0)}
+    **{name: acceptance_rule(name, gate=False) for name in ("quadratic", "Huber", "Cauchy")},
+    "asymmetric Cauchy": acceptance_rule("asymmetric Cauchy"),
+    "asymmetric Tukey": acceptance_rule(),
+    "GNC": acceptance_rule("quadratic"),
+    "gate": acceptance_rule("quadratic"),
+    "asymmetric gate": replace(acceptance_rule("quadratic"), late=2.0)}
 SIGHTING_METHODS = {
-    **{name: acceptance(name, gate=False)
+    **{name: acceptance_rule(name, gate=False)
        for name in ("quadratic", "Huber", "Cauchy", "Geman-McClure", "Tukey")},
-    "gate": acceptance()}
+    "gate": acceptance_rule()}
 CONVEX = ("quadratic", "Huber", "GNC")     # methods without rounds of narrowing kernels
 GNC_STEP = 1.4                             # factor on the control parameter in each round
 MIN_MISLABELLED_SQUARED = 50.0             # squared Mahalanobis distance of a wrong label; a right
@@ -60,29 +68,28 @@ def solve_with(measurements, sightings="gate", ranges="asymmetric Tukey",
         state = odometry_state(measurements, model, antennas=antennas)
         for scale in CAUCHY_SCALES:
             cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(scale)
-            measured = MeasurementFactors(
+            accepted = AcceptedMeasurements(
                 measurements, measurements.unit_weights,
                 sighting_kernel=convex.sighting_kernel if sightings in CONVEX else cauchy,
                 range_kernel=convex.range_kernel if ranges in CONVEX else cauchy)
-            state = optimize(replace(problem, measured=measured), state).state
+            state = optimize(replace(problem, accepted=accepted), state).state
         starts[methods] = state
     return refine(problem, starts[methods],
                   partial(_accepted, sightings=sightings, ranges=ranges))
 
 
 def _acceptance_by(sightings, ranges):
-    """The Acceptance by these methods."""
+    """The AcceptanceRule by these methods."""
     chosen = SIGHTING_METHODS[sightings]
     return replace(RANGE_METHODS[ranges], sighting_kernel=chosen.sighting_kernel,
                    gated=chosen.gated)
 
 
 def _accepted(problem, state, sightings, ranges):
-    """The MeasurementFactors that these methods accept."""
-    found = accepted(problem, state, _acceptance_by(sightings, ranges))
-    if ranges == "GNC":
-        found.weight[len(problem.measurements.label):] = graduated(problem, state)
-    return found
+    """The AcceptedMeasurements by these methods."""
+    accepted = accepted_measurements(problem, state, _acceptance_by(sightings, ranges))
+    return accepted if ranges != "GNC" else replace(
+        accepted, weight=np.r_[accepted.sighting_weight, graduated(problem, state)])
 
 
 def graduated(problem, state):
@@ -92,10 +99,11 @@ def graduated(problem, state):
     (Yang, Antonante, Tzoumas and Carlone, IEEE RA-L 5(2), 2020).
     """
     m, gate = problem.measurements, EARLY_GATE**2
-    weight, ranges = within_gates(problem, state, EARLY_GATE, EARLY_GATE), slice(len(m.label), None)
+    weight = within_gates(problem, state, EARLY_GATE, EARLY_GATE)
+    ranges = slice(len(m.marker_row), None)
     weight[ranges], control = 1, None
     while control is None or ((weight > 0) & (weight < 1)).any():
-        trial = replace(problem, measured=MeasurementFactors(m, weight.copy()))
+        trial = replace(problem, accepted=AcceptedMeasurements(m, weight.copy()))
         state = optimize(trial, state, **{} if control is None else {"max_steps": 1}).state
         squared = residuals(m, state, problem.noise)[1]**2
         control = GNC_STEP * control if control else gate / max(2 * squared.max() - gate, gate)
@@ -149,7 +157,7 @@ def wrong_labels(seed, methods=tuple(SIGHTING_METHODS), **options):
         numbers |= {f"{method} {key}": judged[key]
                     for key in ("ate", "nees", "map nees", "map worst")}
         each = residuals(measurements, fit.state, fit.problem.noise)
-        lost = kept_weights(fit.problem.measured, *each)[0] < 0.5
+        lost = kept_weights(fit.problem.accepted, *each)[0] < 0.5
         numbers |= {f"{method} wrong rejected": lost[wrong].mean() if wrong.any() else np.nan,
                     f"{method} good lost": lost[~wrong].mean()}
     return numbers

@@ -11,8 +11,8 @@ from slamlib.increments import TYPICAL_SLIP
 from slamlib.localization import localize
 from slamlib.sightings import POINT_GATE
 from slamlib.simulation import misguess, simulate
+from slamlib.slam.acceptance import AcceptedMeasurements
 from slamlib.slam.initialization import consensus_markers, odometry_state, state_from_poses
-from slamlib.slam.measurement_factors import MeasurementFactors
 from slamlib.slam.measurements import measure
 from slamlib.slam.noise import Noise, with_noise
 from slamlib.slam.normal_equations import NormalEquations
@@ -30,12 +30,12 @@ COST_TOLERANCE = 1.0         # cost above that of the right optimum: a residual 
 
 def first_sighting(measurements, in_world, covariances):
     """(k, 3) markers at their first sightings; parameters as of `consensus_markers`."""
-    return in_world[np.unique(measurements.label, return_index=True)[1]]
+    return in_world[np.unique(measurements.marker_row, return_index=True)[1]]
 
 
 def most_certain_sighting(measurements, in_world, covariances):
     """(k, 3) markers at the sighting of least covariance determinant; parameters as above."""
-    label = measurements.label
+    label = measurements.marker_row
     order = np.lexsort((np.linalg.slogdet(covariances)[1], label))
     return in_world[order[np.unique(label[order], return_index=True)[1]]]
 
@@ -47,12 +47,12 @@ def mean_by_information(measurements, in_world, covariances):
     """
     m = measurements
     middle = most_certain_sighting(m, in_world, covariances)
-    difference = in_world - middle[m.label]
+    difference = in_world - middle[m.marker_row]
     difference[:, 2] = se2.wrap(difference[:, 2])
     information = np.linalg.inv(covariances)
     total, moment = np.zeros((len(m.marker), 3, 3)), np.zeros((len(m.marker), 3))
-    np.add.at(total, m.label, information)
-    np.add.at(moment, m.label, (information @ difference[..., None])[..., 0])
+    np.add.at(total, m.marker_row, information)
+    np.add.at(moment, m.marker_row, (information @ difference[..., None])[..., 0])
     return middle + np.linalg.solve(total, moment[..., None])[..., 0]
 
 
@@ -124,7 +124,7 @@ def landmarks_of_drive(dataset, found, kernel="last", starts=tuple(LANDMARKS)):
 def _kernel_rounds(problem, kernel):
     """Problems with the scales of the Cauchy kernel, "graduated" or the "last" one only."""
     m, cauchy = problem.measurements, gtsam.noiseModel.mEstimator.Cauchy.Create
-    return [replace(problem, measured=MeasurementFactors(m, m.unit_weights, cauchy(scale)))
+    return [replace(problem, accepted=AcceptedMeasurements(m, m.unit_weights, cauchy(scale)))
             for scale in (CAUCHY_SCALES if kernel == "graduated" else CAUCHY_SCALES[-1:])]
 
 

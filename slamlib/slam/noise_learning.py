@@ -1,4 +1,4 @@
-"""Stage 6: the posterior of the noise parameters, learned from the drive's own measurements.
+"""Stage 6: the noise parameters learned from the drive's own measurements: their posterior.
 
 The evidence times the prior is the posterior of the logarithms of slip and factors. Newton's method
 finds its mode, differences give its covariance. Poses and landmarks are averaged over a few points
@@ -13,19 +13,12 @@ import numpy as np
 
 from slamlib.slam.evidence import laplace_approximation
 from slamlib.slam.first_frames import equations_of_first_frames
-from slamlib.slam.noise import (
-    BOUNDS,
-    MEDIAN,
-    PRIOR_SIGMA,
-    Noise,
-    from_logarithms,
-    is_known,
-    log_prior,
-)
+from slamlib.slam.noise import BOUNDS, MEDIAN, PRIOR_SIGMA, Noise, is_known, log_prior
 
 MAX_DIFFERENCE = 0.2         # of a logarithm, largest one of a difference quotient
 MIN_DIFFERENCE = 0.003       # of a logarithm, smallest one of a difference quotient
 MAX_STEP = 1.5               # of a logarithm, longest step of Newton's method
+SHORTEST_STEP = 0.1          # sigmas, to which a step that does not ascend is halved
 MAX_NEWTON_STEPS = 12        # number of steps of Newton's method
 CONVERGED_GAIN = 0.01        # log posterior gained by the last step of Newton's method
 POINT_OFFSETS = 1.5 * np.arange(-2, 3)       # sigmas of log slip, points of the average
@@ -55,7 +48,7 @@ def learn_noise(equations):
     frames = len(equations.problem.measurements.frame)
     smallest = 1 / np.sqrt(2 * np.maximum([3 * frames, *equations.counts()], 1))
     mode, density, covariance = _mode(log_posterior, start, value, free, smallest[free])
-    return NoisePosterior(from_logarithms(mode), covariance, density,
+    return NoisePosterior(Noise.from_logarithms(mode), covariance, density,
                           _points(log_posterior, mode, density, covariance))
 
 
@@ -84,8 +77,8 @@ def _log_posterior(equations):
     free = problem.measurements.learned
 
     def log_posterior(logarithms):
-        return max(laplace_approximation(equations, from_logarithms(logarithms))[1], SINGULAR) \
-            + np.sum(log_prior(logarithms)[free])
+        _, evidence = laplace_approximation(equations, Noise.from_logarithms(logarithms))
+        return max(evidence, SINGULAR) + np.sum(log_prior(logarithms)[free])
 
     start = np.where(free | is_known(problem.measurements.dataset.vehicle),
                      problem.noise.logarithms, np.log(MEDIAN))
@@ -108,11 +101,12 @@ def _mode(function, x, value, free, steps, correlation=None):
         coarse, steps = (steps > 2 * sigma).any(), sigma
         step = covariance @ gradient
         step *= MAX_STEP / max(MAX_STEP, np.abs(step).max())
-        while (new := function(_moved(x, free, step))) < value and np.abs(step / sigma).max() > 0.1:
+        while (new := function(_with_step(x, free, step))) < value \
+                and np.abs(step / sigma).max() > SHORTEST_STEP:
             step = step / 2
         gain = new - value
         if gain > 0:
-            x, value = _moved(x, free, step), new
+            x, value = _with_step(x, free, step), new
         if gain < CONVERGED_GAIN and not coarse:
             break
     full = np.zeros((len(x), len(x)))
@@ -120,11 +114,11 @@ def _mode(function, x, value, free, steps, correlation=None):
     return x, value, full
 
 
-def _moved(x, free, step):
+def _with_step(x, free, step):
     """x (3,) with `step` (p,) added to the components `free` (p,), within BOUNDS."""
-    moved = x.copy()
-    moved[free] += step
-    return np.clip(moved, *BOUNDS)
+    stepped = x.copy()
+    stepped[free] += step
+    return np.clip(stepped, *BOUNDS)
 
 
 def _differences(function, x, value, free, steps, correlation=None):
@@ -136,7 +130,7 @@ def _differences(function, x, value, free, steps, correlation=None):
     offsets = [*unit, *-unit]
     if correlation is None:
         offsets += [unit[i] + unit[j] for i, j in pairs]
-    values = np.array([function(_moved(x, free, off)) for off in offsets])
+    values = np.array([function(_with_step(x, free, offset)) for offset in offsets])
     up, down, both = np.split(values, [len(free), 2 * len(free)])
     gradient, hessian = (up - down) / (2 * steps), np.diag((up + down - 2 * value) / steps**2)
     if correlation is not None:
@@ -150,7 +144,8 @@ def _differences(function, x, value, free, steps, correlation=None):
 def _points(log_posterior, mode, density, covariance):
     """Tuple of (probability, Noise) along the slip, each with the most probable factors.
 
-    The remaining variance at a point is included in its Noise: sigmas are root mean squares.
+    At each point the sigmas are replaced by their root mean square over the remaining uncertainty.
+    `mode` and `covariance`, (3,) and (3, 3), are of the logarithms, `density` that at the mode.
     """
     sigma = np.sqrt(covariance[0, 0])
     direction = covariance[0] / (sigma or 1)     # (3,) for one sigma of log slip; 0 if it is known
@@ -162,6 +157,6 @@ def _points(log_posterior, mode, density, covariance):
                          for offset in offsets])
         weights = np.exp(logs - logs.max())
     variance = np.maximum(np.diag(remaining), 0)
-    return tuple((float(weight), from_logarithms(mode + offset * direction + variance))
+    return tuple((float(weight), Noise.from_logarithms(mode + offset * direction + variance))
                  for weight, offset in zip(weights / weights.sum(), offsets)
                  if weight > MIN_POINT_WEIGHT)
