@@ -1,6 +1,7 @@
 """Vehicle SLAM from wheel encoders, ceiling markers and UWB ranges: the numerics of the report.
 
-Each module holds one idea and is meant to be read top to bottom; see the README for the map.
+Each module holds one idea and is meant to be read top to bottom; docs/code.md lists them and says
+where each equation is.
 
 >>> from slamlib import evaluation, slam
 >>> from slamlib.simulation import simulate

@@ -10,7 +10,7 @@ OVERFLOW = 2**16  # number of values of a counter of 16 bits
 MIN_SIGHTING_PAIRS = 10  # pairs of sightings of a marker, for a decision
 MAX_SIGHTINGS = 20_000  # sightings; of more, the first ones decide
 MIN_DISTANCE_SIGMAS = 5.0  # distance of the wheels between two sightings, in its sigmas by markers
-MIN_DISTANCE_RATIO = 5.0  # ratio of distances by counts and by markers that contradict each other
+CONTRADICTING_RATIO = 5.0  # ratio of distances by counts and by markers that contradict each other
 MAX_AGREEMENT = 2.0  # ratio of those that agree
 MIN_ROWS = 4  # rows after the first, for a doubt
 MAX_FALLING = 0.02  # share of the rows that are smaller than the row before
@@ -69,7 +69,7 @@ def cumulative_reason(counts, vehicle, aruco):
     2. Overflow. Consecutive rows differ by less than 1 % of 2^16, or by 2^16 less such a change: no
        wheel falls from thousands of counts in a step to none in one row.
     3. Markers. Between two sightings of a marker the motion is known without wheels. The distance
-       by the counts exceeds it MIN_DISTANCE_RATIO times, and that by differences of rows agrees
+       by the counts exceeds it CONTRADICTING_RATIO times, and that by differences of rows agrees
        within the factor MAX_AGREEMENT (medians). The differences mostly have one sign between
        sightings; those of counts since the previous pose are noise about a constant speed.
 
@@ -181,7 +181,7 @@ def _reason_by_markers(counts, vehicle, aruco):
         return ""
     by_counts, net, gross, by_markers = (
         np.median(distance[moving]) for distance in (by_counts, net, gross, by_markers))
-    if (by_counts > MIN_DISTANCE_RATIO * by_markers and net > gross / MAX_AGREEMENT
+    if (by_counts > CONTRADICTING_RATIO * by_markers and net > gross / MAX_AGREEMENT
             and by_markers / MAX_AGREEMENT < net < MAX_AGREEMENT * by_markers):
         return (f"between sightings of a marker, the wheels go {by_markers / 2:.3g} m by the "
                 f"markers, {net / 2:.3g} m by the differences of rows, and else "

@@ -4,6 +4,7 @@ No study is recalled that was kept before the tests.
 """
 
 import os
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -22,12 +23,14 @@ settings.load_profile("short")           # another one by `pytest --hypothesis-p
 
 ROOT = Path(__file__).parents[1]
 STUDY_SEEDS = "2"            # in pages that tests build: their claims are tested on more drives
+LONGEST = ("test_pages", "test_slam", "test_flaws", "test_uwb", "test_concurrency", "test_lab")
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 
 def pytest_collection_modifyitems(items):
-    """The file that takes longest comes first, while the other process runs the others."""
-    items.sort(key=lambda item: item.path.stem != "test_pages")
+    """The files that take longest come first, so that both processes end at about the same time."""
+    items.sort(key=lambda item: LONGEST.index(item.path.stem) if item.path.stem in LONGEST
+               else len(LONGEST))
 
 
 @pytest.fixture(scope="module")
@@ -54,6 +57,7 @@ def look():
     import matplotlib.pyplot as plt
 
     from slamlib.notebook import plotting
+    plt.close("all")                                 # the README's example leaves one open
     with plt.rc_context():
         plotting.use_style()
         yield
@@ -62,6 +66,27 @@ def look():
 
 BROUGHT = ("new seed", "no_truth", "wheels_only", "waits", "one_pose", "backs_up", "one_sighting",
            "sparse")
+
+
+def copied(target, chapters, grids=False, first=None):
+    """Write notebooks to a folder, by a pattern of their names; their Explore shows one figure.
+
+    With `grids`, all figures between which its sliders move, which `report_on_all` draws, too. A
+    code cell `first` (str) stands before all others. Studies run on the short path only.
+    """
+    import nbformat
+    target.mkdir()
+    for source in sorted((ROOT / "notebooks").glob(chapters)):
+        book = nbformat.read(source, as_version=4)
+        if first:
+            book.cells.insert(1, nbformat.v4.new_code_cell(first, id="first"))
+        for cell in book.cells:
+            cell.source = cell.source.replace('path="long"', 'path="short"')
+            if "explore.show_with_controls(" in cell.source and not grids:
+                cell.source, count = re.subn(r"\n *grid=\{.*?\},(?=\n)", "", cell.source,
+                                             flags=re.DOTALL)
+                assert count == 1
+        nbformat.write(book, target / source.name)
 
 
 def contradicted(aruco):
@@ -107,7 +132,8 @@ def report_on_all(tmp_path_factory, kept):
     for name, rows in (("one_sighting", seen[:1]), ("sparse", seen[seen[:, 0] % 500 == 1])):
         shutil.copytree(data / "new seed", data / name)
         np.savetxt(data / name / "ArucoReading.txt", rows, fmt="%d %d" + 9 * " %.6g")
+    copied(folder / "notebooks", "*.ipynb", grids=True)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SLAMLIB_SEEDS", STUDY_SEEDS)
-        build_report(ROOT / "notebooks", data, folder / "report", folder / "results", kept=kept)
+        build_report(folder / "notebooks", data, folder / "report", folder / "results", kept=kept)
     return folder

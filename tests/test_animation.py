@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from slamlib import solve
-from slamlib.report.animation import animated, moving
+from slamlib.evaluation import REACH_95
+from slamlib.report.animation import _ellipses, animated, moving
 from slamlib.report.chapters import printed
 from slamlib.report.drives import SolvedDrive
 from slamlib.report.overview import index, opening
 from slamlib.report.pages import STYLE
+from slamlib.se2 import rotation
 from slamlib.simulation import simulate
 
 MOST = 1_000_000               # bytes
@@ -39,6 +41,23 @@ def test_the_animation_is_small_loads_nothing_and_moves_both_paths_in_time(drive
     for frames in re.findall(r"@keyframes \w+(?:line|dot)\{(.*?\})\}", html):
         times = [float(time) for time in re.findall(r"([\d.]+)%\{", frames)]
         assert times == sorted(times) and times[0] == 0 and times[-1] == 100
+
+
+def test_ellipses_lie_on_the_page_as_in_the_world(drive):
+    """Semi-axes of 4 : 1 whose major one points 30 degrees to the left: on the page y goes down."""
+    R, a, b = rotation(np.radians(30)), 0.08, 0.02
+    C = np.zeros((len(drive.dataset.ticks), 3, 3))
+    C[:, :2, :2] = R @ np.diag([a**2, b**2]) @ R.T
+    html = animated(replace(drive, solutions=tuple(
+        replace(solution, covariances=C) for solution in drive.solutions)))
+    drawn = re.findall(r'<ellipse rx="(.*?)" ry="(.*?)" transform="translate\(\S+ \S+\) '
+                       r'rotate\((.*?)\)"', html)
+    major, minor, angle = np.array(drawn, float).T
+    assert len(drawn) > 16
+    np.testing.assert_allclose(np.mod(angle, 180), 150, atol=0.5)
+    np.testing.assert_allclose(major / minor, a / b, rtol=0.05)
+    attributes, = _ellipses(np.zeros((1, 2)), C[:1], 100.0)
+    assert attributes.startswith(f'rx="{100 * REACH_95 * a:.1f}" ry="{100 * REACH_95 * b:.1f}"')
 
 
 def test_it_pauses_without_script_and_stands_still_where_no_motion_is_wanted(drive):

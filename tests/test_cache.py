@@ -48,6 +48,7 @@ def executions(folder, **options):
     return tuple(len((folder / f"count_{name}").read_text()) for name in "ab")
 
 
+@pytest.mark.slow
 def test_a_changed_notebook_is_executed_again_and_only_that_one(project, capsys):
     assert executions(project) == (1, 1)
     pages = [file.read_bytes() for file in sorted((project / "report").iterdir())]
@@ -61,6 +62,7 @@ def test_a_changed_notebook_is_executed_again_and_only_that_one(project, capsys)
     assert executions(project) == (1, 2)
 
 
+@pytest.mark.slow
 def test_results_that_are_gone_or_changed_are_written_again_without_an_execution(project):
     assert executions(project) == (1, 1)
     a, b = (project / "results" / "short" / name for name in ("a.mat", "b.mat"))
@@ -73,6 +75,7 @@ def test_results_that_are_gone_or_changed_are_written_again_without_an_execution
     assert a.read_text() == b.read_text() == "result"
 
 
+@pytest.mark.slow
 def test_a_changed_dataset_executes_all_and_fresh_does_so_without_a_change(project):
     assert executions(project, datasets=["short"]) == (1, 1)
     (project / "data" / "long" / "encoderReading.txt").write_text("1 0 0\n2 3 3\n")
@@ -83,6 +86,7 @@ def test_a_changed_dataset_executes_all_and_fresh_does_so_without_a_change(proje
     assert executions(project, datasets=["short"]) == (3, 3)
 
 
+@pytest.mark.slow
 def test_another_selection_and_back_executes_each_notebook_once_for_each(project):
     assert executions(project, datasets=["short"]) == (1, 1)
     first = [file.read_bytes() for file in sorted((project / "report").iterdir())]

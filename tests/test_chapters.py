@@ -141,6 +141,7 @@ def test_only_a_page_with_something_live_has_the_build_s_script(tmp_path, monkey
         "1. T", new_markdown_cell('<div class="live"></div>')), [])[0]
 
 
+@pytest.mark.slow
 def test_the_report_with_appendices_and_without(tmp_path, monkeypatch, capsys):
     folder_with_appendices(tmp_path)
     monkeypatch.chdir(tmp_path)

@@ -182,6 +182,7 @@ def test_a_kill_before_any_step_of_solve_mixes_nothing_and_the_next_run_cleans_u
     assert done.stdout.count("\n") == 2
 
 
+@pytest.mark.slow
 def test_a_full_disk_names_the_path_and_leaves_the_old_results(tmp_path, drive):
     """A limit on the size of files fails like a full disk: the error names no file."""
     write_dataset(tmp_path / "drive", drive)
@@ -371,6 +372,7 @@ def test_temporary_folders_of_builds_that_are_gone_are_removed(tmp_path, monkeyp
     assert not folder.exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", swap.END_SIGNALS)
 def test_a_signal_ends_a_solve_in_order(tmp_path, number):
     write_dataset(tmp_path / "drive", simulate("long", 3)[0])

@@ -1,6 +1,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from slamlib import evaluation, increments, localization, odometry, se2
 from slamlib.checks import consistency
@@ -93,6 +94,7 @@ def test_excess_is_chi_squared_for_an_estimate_from_part_of_the_data():
     assert low < np.nanmean(consistency.hausman_statistic(a, A, best, best_C)) < high
 
 
+@pytest.mark.slow
 def test_excess_shows_marker_covariances_that_are_too_small():
     """Markers alone beside their fusion with odometry, at the last frame of 12 drives."""
     def last(dataset):

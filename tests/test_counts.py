@@ -24,6 +24,7 @@ def cut(dataset, begin, count):
                    aruco=replace(seen, pose=seen.pose - begin) if len(seen.pose) else None)
 
 
+@pytest.mark.slow
 def test_real_increments_are_never_taken_for_counts_since_the_start():
     """Two hundred drives, cuts of them, and the same driven backward; no doubt either."""
     rng = np.random.default_rng(0)

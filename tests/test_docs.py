@@ -64,11 +64,11 @@ def test_every_module_has_a_page_with_its_functions(pages):
     for module in MODULES:
         text = (pages / f"{module.replace('.', '/')}.html").read_text()
         assert 'class="docstring"' in text
-    text = (pages / "slamlib" / "slam" / "estimate.html").read_text()
-    assert re.search(r"<li><code>marker_noise_factor, range_noise_factor</code>: what the", text)
+    text = (pages / "slamlib" / "slam" / "pipeline.html").read_text()
+    assert re.search(r"<li><code>marker_noise_factor, range_noise_factor</code>: known factors", text)
     assert "----" not in text.split("pdoc-code codehilite")[0]
     text = (pages / "slamlib" / "slam.html").read_text()
-    assert all(f'href="slam/{name}.html"' in text for name in ("estimate", "robust", "result"))
+    assert all(f'href="slam/{name}.html"' in text for name in ("pipeline", "robust", "result"))
 
 
 @pytest.mark.slow

@@ -99,6 +99,7 @@ FLAWS = {
 }
 
 
+@pytest.mark.slow
 def test_turns_that_only_the_wheels_have_seen_are_doubted():
     """Markers at both ends of two rounds: the heading there is known up to whole turns only."""
     dataset, _ = simulate("long", 3, rounds=2)

@@ -9,10 +9,12 @@ import matplotlib.pyplot as plt
 import nbformat
 import numpy as np
 import pytest
+from conftest import copied
+from test_plotting import require_contours
 
-from slamlib import localization, slam
+from slamlib import localization, odometry, slam
 from slamlib.dataset import DatasetError
-from slamlib.evaluation import nees_band
+from slamlib.evaluation import REACH_95, nees_band
 from slamlib.notebook import Drive, controls, explore, parts, plotting
 from slamlib.report.execution import execute, kernel_environment
 from slamlib.simulation import manoeuvre, simulate
@@ -25,9 +27,14 @@ NOTEBOOKS = sorted((ROOT / "notebooks").glob("[0-9]*.ipynb"))        # appendice
 
 @pytest.fixture(scope="module")
 def sections(tmp_path_factory):
-    """Code cells of each Explore section, executed after the notebook's first code cell alone."""
+    """Code cells of each Explore section, executed after the notebook's first code cell alone.
+
+    They show one figure; test_pages looks at those that sliders move.
+    """
     folder = tmp_path_factory.mktemp("explore")
-    books = {folder / source.name: nbformat.read(source, as_version=4) for source in NOTEBOOKS}
+    copied(folder / "notebooks", "[0-9]*.ipynb")
+    books = {source: nbformat.read(source, as_version=4)
+             for source in sorted((folder / "notebooks").iterdir())}
     for book in books.values():
         begin = next(i for i, cell in enumerate(book.cells) if cell.source.startswith("## Explore"))
         first = next(cell for cell in book.cells if cell.cell_type == "code")
@@ -240,6 +247,22 @@ def test_ellipses_scale_with_the_probability_and_the_sigmas():
     assert longest(sigma_radii=3.0) > 2 * longest()
 
 
+def test_ellipses_are_contours_of_the_covariances_that_they_show():
+    """Of equation 2 at 95 % in chapter 1, and of the fused poses, enlarged, in chapter 2."""
+    drive = Drive("short", *simulate("short", seed=3))
+    poses, covariances = odometry.equation2(drive.dataset.ticks, drive.dataset.vehicle)
+    fused = localization.fuse(drive.dataset)
+    plan = explore.draw_cameras({"short": fused}, drive, 1, 1, 9.0, 1.0).axes[0]
+    enlarged = int(re.search(r"ellipses × (\d+)", plan.get_title("left"))[1])
+    for ax, means, spread, factor in (
+            (explore.draw_wheels(drive, **WHEELS).axes[0], poses, covariances, 1),
+            (plan, fused.poses, fused.covariances, enlarged)):
+        patches, = ax.collections
+        rows = [int(np.argmin(np.hypot(*(means[:, :2] - place).T)))
+                for place in patches.get_offsets()]
+        require_contours(patches, means[rows], spread[rows], factor * REACH_95)
+
+
 def test_localization_from_markers_alone_ends_where_the_camera_sees_too_few():
     for seed in (1, 2):
         full = curves(explore.draw_cameras({}, explore.SIMULATED, seed, 1, 1.8, 1.0).axes[1])
@@ -328,6 +351,7 @@ def drawn_on(drive, full, **changed):
             for chapter, each in names.items()}
 
 
+@pytest.mark.slow
 def test_with_truth_the_figures_of_a_dataset_show_errors(recorded):
     drive, _, full = recorded
     for fig in drawn_on(drive, full).values():
@@ -336,6 +360,7 @@ def test_with_truth_the_figures_of_a_dataset_show_errors(recorded):
         assert "truth" in curves(plan) and "No truth" not in fig.said and "Only" not in fig.said
 
 
+@pytest.mark.slow
 def test_without_truth_a_dataset_is_compared_with_its_solution_and_nothing_says_error(recorded):
     _, drive, full = recorded
     names = {2: "this chapter's fusion", 3: "problem 3's solution", 4: "problem 4's solution"}
@@ -353,6 +378,7 @@ def test_without_truth_a_dataset_is_compared_with_its_solution_and_nothing_says_
     np.testing.assert_allclose(same, 0, atol=1e-6)      # of the same sightings, with the same slip
 
 
+@pytest.mark.slow
 def test_errors_of_the_controls_are_added_to_a_dataset(recorded):
     drive, _, full = recorded
     clean, spoilt = drawn_on(drive, full), drawn_on(drive, full, wrong=15, late=30, off=3.0)
@@ -398,6 +424,7 @@ def test_of_a_long_dataset_the_first_part_is_drawn_and_said(recorded):
     assert len(parts.first_part(late).ticks) == parts.MAX_PART_POSES
 
 
+@pytest.mark.slow
 def test_a_million_poses_are_drawn_as_their_first_part(recorded):
     _, drive, full = recorded
     long = replace(drive.dataset, name="b", ticks=np.tile(drive.dataset.ticks, (500, 1)))

@@ -146,6 +146,7 @@ def test_wrong_sizes_are_mended_or_named(flaw, seed):
                 right.poses, truth.poses, aligned=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong, said", [
     (dict(right_radius=0.103, left_radius=0.103), "right_radius is"),
     (dict(wheelbase=0.2), "wheelbase is"),
@@ -168,6 +169,7 @@ def test_a_slip_that_was_given_is_not_explained_by_other_wheels():
     assert given.slip == 1e-2 and "wheel-parameters" not in names(given.drive_doubts)
 
 
+@pytest.mark.slow
 def test_markers_of_another_size_are_named_with_the_wheels():
     """Lengths by markers 5 % too large: the same as wheels that are larger than stated."""
     dataset, _ = simulate("short", 61)
@@ -177,6 +179,7 @@ def test_markers_of_another_size_are_named_with_the_wheels():
     assert "ArucoReading.txt are 4." in doubt.sentence and "too small" not in doubt.sentence
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("poses", [-3, 3, 10])
 def test_sightings_that_are_late_are_named(poses):
     """Three short drives: at three poses the offset is right, at ten it is nearly."""
@@ -188,6 +191,7 @@ def test_sightings_that_are_late_are_named(poses):
         assert names(found.drive_doubts) == {"time-offset"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", [(0.1, 0.0, 0.0), (0.0, 0.1, 0.0), (0.0, 0.0, 0.05)])
 def test_a_camera_that_is_not_in_the_origin_is_named(place):
     dataset, _ = simulate("short", 61)
@@ -215,6 +219,7 @@ def test_sightings_that_are_late_are_named_on_the_long_path():
         assert names(found.drive_doubts) == {"time-offset"}
 
 
+@pytest.mark.slow
 def test_offsets_of_the_camera_have_the_standard_deviations_that_they_state():
     """Twelve clean drives of much and of little slip."""
     offsets = []
@@ -284,6 +289,7 @@ def test_markers_of_which_most_sightings_contradict_are_named():
     assert len(doubts) == 1 and f"marker {moved}" in doubts[0].sentence
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", LEGAL)
 def test_every_problem_is_solved_within_the_limits(case):
     """Finite covariances that are not negative, and of SLAM errors as those that they state."""

@@ -115,6 +115,7 @@ def test_rounding_does_not_grow_with_the_number_of_frames(count):
         np.testing.assert_allclose(variance[1000, 2], turned / 2, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_slip_is_learned_although_the_encoder_is_coarse():
     """500 counts a revolution, a frame every 10 cm: rounding is as large as slip between frames.
 

@@ -68,6 +68,7 @@ def handed(tmp_path_factory):
     return folder, ZipFile(folder / "hand-in.zip")
 
 
+@pytest.mark.slow
 def test_the_names_are_the_assignment_s_and_the_files_are_the_results(handed):
     folder, archive = handed
     files = {"problem1/vehiclePose.mat": "problem1/vehiclePose.mat",
@@ -82,6 +83,7 @@ def test_the_names_are_the_assignment_s_and_the_files_are_the_results(handed):
         assert archive.read(f"mine/{name}") == (folder / "results/mine" / result).read_bytes()
 
 
+@pytest.mark.slow
 def test_the_pdf_is_without_what_is_for_screens_and_the_usual_pages_stay(handed):
     folder, archive = handed
     text = re.sub(r"\s+", " ", text_of(archive.read("report.pdf"), folder))
@@ -90,6 +92,7 @@ def test_the_pdf_is_without_what_is_for_screens_and_the_usual_pages_stay(handed)
     assert [file.name for file in (folder / "report").iterdir()] == ["index.html"]
 
 
+@pytest.mark.slow
 def test_the_readme_is_true_of_the_files(handed):
     text = handed[1].read("README.txt").decode()
     one_line = re.sub(r"\s+", " ", text)
@@ -105,6 +108,7 @@ def test_the_readme_is_true_of_the_files(handed):
     assert max(map(len, text.split("\n"))) <= handin.LINE_WIDTH and text.endswith("\n")
 
 
+@pytest.mark.slow
 def test_equal_input_gives_equal_bytes_and_the_date_is_fixed(handed, monkeypatch, capsys):
     folder, archive = handed
     before = (folder / "hand-in.zip").read_bytes()
@@ -119,6 +123,7 @@ def test_equal_input_gives_equal_bytes_and_the_date_is_fixed(handed, monkeypatch
     assert [file.name for file in (folder / "new").iterdir()] == ["second.zip"]
 
 
+@pytest.mark.slow
 def test_what_cannot_be_solved_is_said_and_the_rest_is_handed_in(tmp_path, monkeypatch, capsys):
     """Every sighting contradicts itself; the appendix is asked for, and nobody is named."""
     dataset = drive_of(uwb=None)

@@ -6,8 +6,11 @@ import subprocess
 import sys
 import sysconfig
 from pathlib import Path
+from zipfile import ZipFile
 
 import pytest
+from test_live import CODE, EXPLORE
+from test_report import write
 
 from slamlib.__main__ import main
 from slamlib.report import sources
@@ -32,13 +35,18 @@ def run(*command, cwd, code=0):
 def installed(tmp_path_factory):
     """The `bin` of an environment with slamlib's wheel, which finds all else in that of the tests.
 
-    The wheel is built from a copy, because building leaves files beside the sources.
+    The wheel, and the folder that it is built from: a copy, because building leaves files beside
+    the sources. Its notebooks have the names of ours and little in them: a chapter that uses what
+    the wheel has besides modules, and others without code.
     """
     folder = tmp_path_factory.mktemp("installed")
     tree, environment = folder / "tree", folder / "environment"
     tree.mkdir()
-    for name in ("slamlib", "notebooks"):
-        shutil.copytree(ROOT / name, tree / name, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(ROOT / "slamlib", tree / "slamlib",
+                    ignore=shutil.ignore_patterns("__pycache__"))
+    for number, name in enumerate(NOTEBOOKS):
+        write(tree / "notebooks", name.removesuffix(".ipynb"), f"# {name[0]}. Chapter",
+              *[(CODE,), "## Explore", (EXPLORE,)] * (number == 0))
     for name in ("pyproject.toml", "README.md"):
         shutil.copy(ROOT / name, tree)
     run(sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-build-isolation", "--no-index",
@@ -49,18 +57,28 @@ def installed(tmp_path_factory):
     wheel, = folder.glob("*.whl")
     run(sys.executable, "-m", "pip", "--python", environment / "bin" / "python", "install",
         "--no-deps", "--no-index", "--quiet", wheel, cwd=folder)
-    return environment / "bin"
+    return environment / "bin", wheel, tree
+
+
+@pytest.mark.slow
+def test_the_wheel_has_all_modules_all_files_beside_them_and_all_notebooks(installed):
+    _, wheel, tree = installed
+    names = ZipFile(wheel).namelist()
+    expected = {file.relative_to(tree).as_posix() for file in (tree / "slamlib").rglob("*.*")}
+    assert {name for name in names if name.startswith("slamlib/")} == expected
+    assert {Path(name).name for name in names if "/share/slamlib/" in name} == set(NOTEBOOKS)
 
 
 @pytest.mark.slow
 def test_an_installed_slamlib_makes_a_drive_solves_it_and_reports_on_it(installed, tmp_path):
     """In a folder with nothing but `data`; the notebooks are copies of the installed ones."""
-    slamlib = installed / "slamlib"
+    programs, _, _ = installed
+    slamlib = programs / "slamlib"
     told, _ = run(slamlib, "--help", cwd=tmp_path)
     assert told.startswith("usage: slamlib ") and "export" in told
-    place, _ = run(installed / "python", "-c",
+    place, _ = run(programs / "python", "-c",
                    "from slamlib.report.sources import *; print(notebooks_folder())", cwd=tmp_path)
-    assert Path(place.strip()) == (installed.parent / "share" / "slamlib" / "notebooks").resolve()
+    assert Path(place.strip()) == (programs.parent / "share" / "slamlib" / "notebooks").resolve()
     _, told = run(slamlib, "report", cwd=tmp_path, code=2)
     assert "data: expected this folder, with a sub-folder" in told and told.count("\n") == 1
     assert not any(tmp_path.iterdir())

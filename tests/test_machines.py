@@ -49,6 +49,7 @@ def unlike(system, folder, *arguments, **options):
             "UNLIKE": system, "UNLIKE_IN": str(folder.resolve()), "PYTHONIOENCODING": "cp1252"})
 
 
+@pytest.mark.slow
 @on_linux
 @pytest.mark.parametrize("system", ["win32", "darwin"])
 def test_solve_writes_the_same_on_systems_that_lack_what_linux_has(system, tmp_path):
@@ -99,6 +100,7 @@ def test_locks_of_windows_exclude_and_end_with_their_process(tmp_path):
     assert not (tmp_path / "lock").exists()
 
 
+@pytest.mark.slow
 @on_linux
 def test_a_result_that_a_program_of_windows_shows_is_told_before_anything_changes(tmp_path):
     code = """import sys

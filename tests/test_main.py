@@ -49,6 +49,7 @@ def test_simulate_then_solve(tmp_path):
     assert summary["dataset"] == "drive" and 0 < summary["problems"]["problem1"]["ate_m"] < 1
 
 
+@pytest.mark.slow
 def test_what_vehicle_toml_gives_of_the_noise_is_taken_and_the_summary_says_so(tmp_path, capsys):
     """By each problem that has such noise; the rest is learned. Without entries nothing is said."""
     write_dataset(tmp_path / "drive", simulate("short", seed=3)[0].first(300))
@@ -116,6 +117,7 @@ def test_a_second_process_that_is_killed_costs_time_only(tmp_path, monkeypatch):
     assert not any("failed" in row for row in rows.values())
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux forks safely")
 @pytest.mark.parametrize("end", ["SIGTERM", "SIGKILL"])
 def test_no_process_survives_a_solve_that_is_killed(end, tmp_path):

@@ -1,6 +1,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from slamlib import evaluation, se2
 from slamlib.checks import map_checks
@@ -36,6 +37,7 @@ def test_degrees_of_freedom_are_those_of_the_dense_matrices():
     assert 0 < antennas.dof.sum() < antennas.count.sum() < (dataset.uwb.pose < 400).sum()
 
 
+@pytest.mark.slow
 def test_residuals_of_right_drives_are_within_their_bands():
     chi2, dof, outside, count = np.zeros(4)
     for seed in SEEDS:
@@ -113,6 +115,7 @@ def test_chi_squared_of_a_landmark_is_what_it_adds_to_that_of_the_others():
         np.testing.assert_allclose(found.chi2 - kept.chi2, each[len(ids) - 1], rtol=0.05)
 
 
+@pytest.mark.slow
 def test_differences_of_both_halves_are_chi_squared():
     chi2, dof = 0.0, 0
     for seed in SEEDS:
@@ -122,6 +125,7 @@ def test_differences_of_both_halves_are_chi_squared():
     assert low < chi2 < high
 
 
+@pytest.mark.slow
 def test_a_marker_that_was_moved_between_the_halves_stands_out():
     dataset, truth = simulate("short", 5)
     aruco = dataset.aruco

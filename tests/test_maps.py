@@ -8,8 +8,10 @@ from itertools import combinations
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from test_plotting import elongated, require_contours
 
 from slamlib import slam
+from slamlib.evaluation import REACH_95
 from slamlib.notebook import Drive, inline, maps, plotting, table_text
 from slamlib.notebook.names import Names
 from slamlib.report.sanitize import sanitized
@@ -66,6 +68,29 @@ def test_a_map_shows_path_markers_antennas_guess_truth_and_states_the_enlargemen
         assert y[0] < points[:, 1].min() and points[:, 1].max() < y[1]
 
 
+def test_ellipses_of_poses_markers_and_antennas_are_contours_of_their_own_covariances(solved):
+    """Of poses, markers and antennas in this order; names keep away from those of the markers."""
+    drive, result = solved
+    result = replace(result, covariances=elongated(len(result.poses), 0.02, 0.005),
+                     marker_covariance=elongated(len(result.marker), 0.03, 0.006),
+                     antenna_covariance=elongated(len(result.antenna), 0.025, 0.005)[:, :2, :2])
+    assert not maps.in_doubt(result).any()
+    ax, = maps.whole_map(drive, result).axes
+    k = REACH_95 * int(ax.get_title("left").split("× ")[1].rstrip(")"))
+    of_poses, of_markers, of_antennas = ax.collections
+    rows = [int(np.argmin(np.hypot(*(result.poses[:, :2] - place).T)))
+            for place in of_poses.get_offsets()]
+    for patches, means, covariances in (
+            (of_poses, result.poses[rows], result.covariances[rows]),
+            (of_markers, result.marker_in_world, result.marker_covariance),
+            (of_antennas, result.antenna_in_world, result.antenna_covariance)):
+        require_contours(patches, means, covariances, k)
+    off = maps._outlines(result, 3) - result.marker_in_world[:, :2]
+    information = np.linalg.inv(result.marker_covariance[:, :2, :2])
+    np.testing.assert_allclose(np.einsum("kmi,mij,kmj->km", off, information, off),
+                               (3 * REACH_95)**2)
+
+
 def test_a_name_with_dollar_signs_is_no_formula(solved):
     drive, result = solved
     fig = maps.whole_map(replace(drive, name=r"$\foo$ of $x$"), result)
@@ -98,11 +123,11 @@ def test_a_dataset_without_guesses_has_an_empty_table(solved):
     assert header[0] == "antenna" and rows == []
 
 
-@pytest.mark.parametrize("width", [maps.WIDTH, plotting.NARROW_WIDTH])
+@pytest.mark.parametrize("width", [maps.MAP_WIDTH, plotting.NARROW_WIDTH])
 def test_names_cover_neither_each_other_nor_what_is_around_the_axes(solved, width):
     drive, result = solved
     fig = maps.whole_map(drive, result)
-    if width < maps.WIDTH:
+    if width < maps.MAP_WIDTH:
         plotting.narrow(fig)
     fig.draw_without_rendering()
     names, = (artist for artist in fig.axes[0].artists if isinstance(artist, Names))
@@ -196,6 +221,7 @@ def test_every_landmark_tells_its_name_position_and_sigma_where_it_is_drawn(solv
     assert f"σ {sigma:.2f} mm" in told[0][2]
 
 
+@pytest.mark.slow
 def test_ids_of_figures_in_one_page_differ(solved):
     drive, result = solved
     ids, pictures = [], []

@@ -97,6 +97,7 @@ def test_the_committed_file_has_the_defaults_also_where_its_examples_are_read(tm
     assert read.appendix is False and [*read.leave_out] == ["B", "3.5", "Explore"]
 
 
+@pytest.mark.slow
 def test_the_command_line_comes_before_the_file(tmp_path, monkeypatch):
     make_data(tmp_path)
     write(tmp_path / "notebooks", "1_text", "# 1. Text\n\n## First",

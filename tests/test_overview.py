@@ -219,6 +219,7 @@ def test_dashes_are_explained_only_where_some_truth_is_unknown(project):
     assert "dash" not in overview.opening(known).cells[1].source
 
 
+@pytest.mark.slow
 def test_of_many_drives_the_abstract_names_the_shortest_and_the_longest(project, summary):
     folder, written, _ = project
     drives = solved_drives.read_drives(folder / "data", folder / "results", NAMES, written)
@@ -249,6 +250,7 @@ def test_files_to_hand_in_stand_by_problem_and_dataset(project):
     assert "notes" not in text and "other" not in text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_the_opening_of_any_one_drive_fits_on_a_page(project, tmp_path, name):
     folder, written, _ = project

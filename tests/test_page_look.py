@@ -50,6 +50,7 @@ def brightness(page, selector, name):
     return sum(map(int, re.findall(r"\d+", colour)[:3])) / 765
 
 
+@pytest.mark.slow
 def test_a_dark_page_has_light_text_and_readable_code(page):
     dark = page.scheme == "dark"
     assert (brightness(page, "body", "backgroundColor") < 0.2) == dark
@@ -59,6 +60,7 @@ def test_a_dark_page_has_light_text_and_readable_code(page):
     assert ("invert" in inverted) == dark
 
 
+@pytest.mark.slow
 def test_what_is_wide_scrolls_in_its_own_box(page):
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
     for selector in ("div.code pre", "table"):
@@ -66,6 +68,7 @@ def test_what_is_wide_scrolls_in_its_own_box(page):
             selector, "e => ['auto', 'scroll'].includes(getComputedStyle(e).overflowX)"), selector
 
 
+@pytest.mark.slow
 def test_folded_code_opens_by_its_summary(page):
     shown = "() => document.querySelector('details pre').checkVisibility()"
     assert not page.evaluate(shown)
@@ -73,6 +76,7 @@ def test_folded_code_opens_by_its_summary(page):
     assert page.evaluate(shown)
 
 
+@pytest.mark.slow
 def test_the_answer_is_framed_and_groups_of_rows_are_divided(page):
     for selector, framed in ((".answer", True), ("blockquote:not(.answer)", False)):
         width = page.eval_on_selector(selector, "e => getComputedStyle(e).borderTopWidth")

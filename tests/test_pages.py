@@ -5,7 +5,6 @@ One file, so that pytest-xdist builds the report in one process only.
 
 import html
 import re
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from urllib.parse import quote, unquote, urlparse
@@ -13,7 +12,7 @@ from urllib.parse import quote, unquote, urlparse
 import nbformat
 import numpy as np
 import pytest
-from conftest import BROUGHT, contradicted
+from conftest import BROUGHT, STUDY_SEEDS, contradicted, copied
 
 from slamlib.dataset import read_dataset
 from slamlib.odometry import equation2
@@ -132,8 +131,7 @@ def test_every_chapter_ends_with_one_figure_to_explore_and_no_widget(built):
 def test_without_any_markers_chapter_2_can_still_be_read(tmp_path, kept):
     (tmp_path / "data" / "wheels").mkdir(parents=True)
     (tmp_path / "data" / "wheels" / "encoderReading.txt").write_text("1 0 0\n2 100 90\n3 90 100\n")
-    (tmp_path / "notebooks").mkdir()
-    shutil.copy(ROOT / "notebooks" / "2_aruco_localization.ipynb", tmp_path / "notebooks")
+    copied(tmp_path / "notebooks", "2_*.ipynb")
     pages = build_report(tmp_path / "notebooks", tmp_path / "data", tmp_path / "report",
                          tmp_path / "results", kept=kept).files
     assert "runs on a simulated drive instead" in pages[1].read_text(encoding="utf-8")
@@ -167,26 +165,36 @@ def failing(dataset, *arguments, **options):
 slam.estimate = failing"""
 
 
-def test_a_drive_that_fails_is_left_out_of_its_chapter_and_costs_the_others_nothing(tmp_path, kept):
-    """Problems 2 and 3 cannot be solved on one of two drives; problem 4 can, without problem 3."""
+@pytest.fixture(scope="module")
+def mixed(tmp_path_factory, kept):
+    """The chapters on three drives, one of which fails and one of which states its noise.
+
+    Problems 2 and 3 cannot be solved on `bad`; problem 4 can, without problem 3. The folder, and
+    the Report.
+    """
+    folder = tmp_path_factory.mktemp("mixed")
     dataset, truth = simulate("short", seed=3)
     dataset = dataset.first(300)
-    write_dataset(tmp_path / "data" / "good", dataset, replace(truth, poses=truth.poses[:300]))
-    write_dataset(tmp_path / "data" / "bad", replace(dataset, aruco=contradicted(dataset.aruco)))
-    (tmp_path / "notebooks").mkdir()
-    for source in sorted((ROOT / "notebooks").glob("[1-4]*.ipynb")):
-        book = nbformat.read(source, as_version=4)
-        book.cells.insert(1, nbformat.v4.new_code_cell(FAILING, id="failing"))
-        nbformat.write(book, tmp_path / "notebooks" / source.name)
-    report = build_report(tmp_path / "notebooks", tmp_path / "data", tmp_path / "report",
-                          tmp_path / "results", kept=kept)
+    write_dataset(folder / "data" / "good", dataset, replace(truth, poses=truth.poses[:300]))
+    write_dataset(folder / "data" / "bad", replace(dataset, aruco=contradicted(dataset.aruco)))
+    given = replace(dataset.vehicle, slip=2e-3, marker_noise_factor=1.25, range_noise_factor=0.75)
+    write_dataset(folder / "data" / "told", replace(dataset, vehicle=given))
+    copied(folder / "notebooks", "[1-4]*.ipynb", first=FAILING)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SLAMLIB_SEEDS", STUDY_SEEDS)
+        return folder, build_report(folder / "notebooks", folder / "data", folder / "report",
+                                    folder / "results", kept=kept)
+
+
+def test_a_drive_that_fails_is_left_out_of_its_chapter_and_costs_the_others_nothing(mixed):
+    folder, report = mixed
     failed = {drive.name: [failure.problem for failure in drive.failures]
               for drive in report.drives}
-    assert failed == {"bad": ["problem2", "problem3"], "good": []}
-    written = {name: {folder.name for folder in (tmp_path / "results" / name).glob("[!.]*")}
+    assert failed == {"bad": ["problem2", "problem3"], "good": [], "told": []}
+    written = {name: {each.name for each in (folder / "results" / name).glob("[!.]*")}
                for name in failed}
     assert written["good"] - written["bad"] == {"problem2", "problem3"}
-    assert len(written["good"]) == len(PROBLEMS)
+    assert len(written["good"]) == len(written["told"]) == len(PROBLEMS)
     for page, title in ((report.files[2], "ArUco"), (report.files[3], "SLAM: odometry + ArUco")):
         text = re.sub(r"<[^>]+>", "", html.unescape(page.read_text(encoding="utf-8")))
         assert f"The problem “{title}” could not be solved on bad: expected" in text
@@ -197,8 +205,7 @@ def test_a_drive_that_fails_is_left_out_of_its_chapter_and_costs_the_others_noth
 def test_a_chapter_of_which_no_drive_can_be_solved_runs_on_a_simulated_one(tmp_path, kept):
     dataset = simulate("short", seed=3)[0].first(100)
     write_dataset(tmp_path / "data" / "bad", replace(dataset, aruco=contradicted(dataset.aruco)))
-    (tmp_path / "notebooks").mkdir()
-    shutil.copy(ROOT / "notebooks" / "2_aruco_localization.ipynb", tmp_path / "notebooks")
+    copied(tmp_path / "notebooks", "2_*.ipynb")
     report = build_report(tmp_path / "notebooks", tmp_path / "data", tmp_path / "report",
                           tmp_path / "results", kept=kept)
     assert "runs on a simulated drive instead" in report.files[1].read_text(encoding="utf-8")
@@ -206,17 +213,9 @@ def test_a_chapter_of_which_no_drive_can_be_solved_runs_on_a_simulated_one(tmp_p
         "problem2_fused", "problem2_hint"]
 
 
-def test_chapters_say_which_noise_was_given(tmp_path, kept):
+def test_chapters_say_which_noise_was_given(mixed):
     """And not that it was learned, of the one drive whose vehicle.toml gives it."""
-    dataset = simulate("short", seed=3)[0].first(600)
-    write_dataset(tmp_path / "data" / "own", dataset)
-    given = replace(dataset.vehicle, slip=2e-3, marker_noise_factor=1.25, range_noise_factor=0.75)
-    write_dataset(tmp_path / "data" / "told", replace(dataset, vehicle=given))
-    (tmp_path / "notebooks").mkdir()
-    for source in (ROOT / "notebooks").glob("[1-4]*.ipynb"):
-        shutil.copy(source, tmp_path / "notebooks")
-    report = build_report(tmp_path / "notebooks", tmp_path / "data", tmp_path / "report",
-                          tmp_path / "results", kept=kept)
+    _, report = mixed
     first, second, third, fourth = (
         " ".join(re.sub(r"<[^>]+>", "", html.unescape(page.read_text(encoding="utf-8"))).split())
         for page in report.files[1:5])
@@ -224,10 +223,11 @@ def test_chapters_say_which_noise_was_given(tmp_path, kept):
                        "range_noise_factor = 0.75.") == 1
     assert re.findall(r"(\d\S+) \(given\)", second) == ["2.00"]
     assert "On told the slip after one metre is 2.00 mm, as given" in third
-    assert re.search(r"On own the slip after one metre is \d\.\d\d mm ± \d+ %", third)
-    for text, file, factor in ((third, "Aruco", "1.25"), (fourth, "Uwb", "0.75")):
+    assert re.search(r"On good the slip after one metre is \d\.\d\d mm ± \d+ %", third)
+    for text, file, factor, learned in ((third, "Aruco", "1.25", ["good"]),
+                                        (fourth, "Uwb", "0.75", ["bad", "good"])):
         assert text.count(f"in {file}Reading.txt are multiplied by {factor}, as given") == 1
-        assert text.count(f"in {file}Reading.txt are confirmed (factor ") == 1
+        assert text.count(f"in {file}Reading.txt are confirmed (factor ") == len(learned)
 
 
 def captions(page):
@@ -236,17 +236,20 @@ def captions(page):
 
 def test_without_truth_nothing_is_missing_from_the_numbers_or_named_in_vain(built, kept, tmp_path):
     folder, with_truth = built
-    alone = build_report(ROOT / "notebooks", folder / "data", tmp_path / "report",
+    copied(tmp_path / "notebooks", "[1-4A]*.ipynb")           # B has a log of its own
+    alone = build_report(tmp_path / "notebooks", folder / "data", tmp_path / "report",
                          tmp_path / "results", ["no_truth"], kept=kept).files
     pages = {page.stem: page.read_text(encoding="utf-8")
              for page in alone if page.suffix == ".html"}
+    for name, page in [*pages.items(), *with_truth.items()]:
+        if name == "index":
+            continue
+        for kind in ("figure", "table"):
+            found = [(chapter, int(number))
+                     for which, chapter, number in captions(page) if which == kind]
+            assert found, name
+            assert found == [(name[0], n) for n in range(1, len(found) + 1)], name
     for name in pages.keys() - {"index"}:
-        for page in (pages[name], with_truth[name]):
-            for kind in ("figure", "table"):
-                found = [(chapter, int(number))
-                         for which, chapter, number in captions(page) if which == kind]
-                assert found, name
-                assert found == [(name[0], n) for n in range(1, len(found) + 1)], name
         if name[0].isdigit():  # a chapter, of which figures of errors are left out
             assert len(captions(pages[name])) < len(captions(with_truth[name])), name
     for name in [name for name in pages if name == "index" or name[0].isdigit()]:

@@ -101,6 +101,7 @@ def test_figures_stand_where_the_text_has_them_or_float_to_the_next_page(tmp_pat
     assert all(page.count("\n") > 20 for page in pages[:-1])
 
 
+@pytest.mark.slow
 def test_long_code_may_break_but_leaves_no_line_alone(tmp_path):
     code = "\n".join(f"line_{number:02} = {number}" for number in range(40))
     for lines in range(30, 60, 3):  # at every distance from the end of the page
@@ -277,6 +278,7 @@ def test_a_tall_figure_leaves_room_for_its_caption(tmp_path):
     assert "Figure 1. Tall." not in pages[before] and "Figure 1. Tall." in pages[before + 1]
 
 
+@pytest.mark.slow
 def test_a_paragraph_that_announces_stays_with_what_it_announces(tmp_path):
     lines = "\n\n".join(f"Line {number}." for number in range(36))
     formula = r"\begin{bmatrix} 1 \\ 2 \\ 3 \\ 4 \\ 5 \\ 6 \\ 7 \end{bmatrix}"

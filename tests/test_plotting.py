@@ -94,31 +94,50 @@ def test_every_curve_has_a_colour_of_its_own():
     assert len(set(lines)) == len(lines)
 
 
-def boundaries(ax):
-    """Points in data coordinates on the boundary of each ellipse, as it is drawn."""
-    patches, = ax.collections
+def boundaries(patches):
+    """Points in data coordinates on the boundary of each ellipse of a collection, as drawn.
+
+    The path of matplotlib's unit circle has eight cubic Bezier curves, here of nine points each.
+    """
+    ax = patches.axes
     ax.figure.draw_without_rendering()                                    # sets the transforms
-    path, = patches.get_paths()
+    vertices, t = patches.get_paths()[0].vertices[:25], np.linspace(0, 1, 9)[:, None]
+    weights = (1 - t)**3, 3 * t * (1 - t)**2, 3 * t**2 * (1 - t), t**3
+    circle = np.concatenate([sum(w * p for w, p in zip(weights, vertices[i:i + 4], strict=True))
+                             for i in range(0, 24, 3)])
     centres = patches.get_offset_transform().transform(patches.get_offsets())
     for matrix, centre in zip(patches.get_transforms(), centres, strict=True):
         to_pixels = Affine2D(matrix) + patches.get_transform() + Affine2D().translate(*centre)
-        polygon, = path.transformed(to_pixels).to_polygons()
-        yield ax.transData.inverted().transform(polygon)
+        yield ax.transData.inverted().transform(to_pixels.transform(circle))
+
+
+def require_contours(patches, means, covariances, k):
+    """(p - m)^T C^-1 (p - m) = k^2 on the boundaries of ellipses drawn at means (m, 2), of C."""
+    for points, m, C in zip(boundaries(patches), means, covariances, strict=True):
+        offset = points - m[:2]
+        squared = np.sum(offset * np.linalg.solve(C[:2, :2], offset.T).T, axis=1)
+        np.testing.assert_allclose(squared, k**2, rtol=0.01)
+
+
+def elongated(count, major, minor):
+    """Covariances (count, 3, 3) whose ellipses point into every quadrant; heading sigma 0.1 rad."""
+    R, C = rotation(0.4 + 0.7 * np.arange(count)), np.zeros((count, 3, 3))
+    C[:, :2, :2] = R @ np.diag([major**2, minor**2]) @ np.swapaxes(R, 1, 2)
+    C[:, 2, 2] = 0.1**2
+    return C
 
 
 @pytest.mark.parametrize("enlarged", [1, 3])
 def test_ellipses_are_lines_of_equal_mahalanobis_distance(enlarged):
     """(p - m)^T C^-1 (p - m) = k^2 holds on the boundary, with k^2 = -2 ln(1 - 0.95)."""
-    R = rotation(np.array([0.4, -1.2, 1.9, 2.6]))                    # an ellipse in each quadrant
-    means, covariances = np.arange(12.0).reshape(4, 3), np.zeros((4, 3, 3))
-    covariances[:, :2, :2] = R @ np.diag([2.0**2, 0.5**2]) @ np.swapaxes(R, 1, 2)
+    means, covariances = np.arange(12.0).reshape(4, 3), elongated(4, 2.0, 0.5)
     _, ((ax,),) = plotting.panels(1)                                 # scales of x and y differ
     plotting.ellipses(ax, means, covariances, "#0072B2", probability=0.95, enlarged=enlarged)
     half = 2.4477 * enlarged * np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)[:, :2])
-    for points, m, C, reach in zip(boundaries(ax), means, covariances, half, strict=True):
+    patches, = ax.collections
+    require_contours(patches, means, covariances, enlarged * np.sqrt(-2 * np.log(0.05)))
+    for points, m, reach in zip(boundaries(patches), means, half, strict=True):
         offset = points - m[:2]
-        squared = np.sum(offset * np.linalg.solve(C[:2, :2], offset.T).T, axis=1)
-        np.testing.assert_allclose(squared, -2 * np.log(0.05) * enlarged**2, rtol=0.01)
         np.testing.assert_allclose([offset.min(0), offset.max(0)], [-reach, reach], rtol=0.01)
     (x_low, x_high), (y_low, y_high) = ax.get_xlim(), ax.get_ylim()
     corners = np.array([(means[:, :2] - half).min(0), (means[:, :2] + half).max(0)])

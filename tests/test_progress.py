@@ -158,6 +158,7 @@ def test_on_a_terminal_a_bar_says_the_same(started, now, capsys, monkeypatch):
     assert "a: cell 2 of 3, Two" in shown and "1/6" in shown and "at least 23 s left" in shown
 
 
+@pytest.mark.slow
 def test_the_first_numbers_come_before_the_notebooks_the_shortest_drive_first(
         tmp_path, monkeypatch, capsys):
     """And not where a notebook is recalled."""

@@ -179,6 +179,7 @@ def test_files_of_any_bytes_are_read_or_refused_in_one_sentence(files):
 
 # All problems: estimates with covariances, or a reason that is true.
 
+@pytest.mark.slow
 @given(drives())
 def test_every_small_drive_is_solved(drive):
     """Estimates are finite with positive definite covariances; what fails, says truly why."""
@@ -388,6 +389,7 @@ def begun_by(leg, dataset):
             first, np.pad(guess.position, ((0, 0), (0, 1))))[:, :2]))
 
 
+@pytest.mark.slow
 @FEW
 @given(drives(), st.integers(0, 2**32 - 1), st.sampled_from([1e-3, None]))
 def test_ids_and_the_order_of_rows_are_names_only(drive, seed, slip):
@@ -398,6 +400,7 @@ def test_ids_and_the_order_of_rows_are_names_only(drive, seed, slip):
                 numbers)
 
 
+@pytest.mark.slow
 @FEW
 @given(drives())
 def test_a_drive_in_a_mirror_has_mirrored_estimates(drive):
@@ -406,6 +409,7 @@ def test_a_drive_in_a_mirror_has_mirrored_estimates(drive):
                 factor=(1, -1, -1))
 
 
+@pytest.mark.slow
 @FEW
 @given(drives())
 def test_the_unit_of_length_is_a_convention(drive):
@@ -418,6 +422,7 @@ def test_the_unit_of_length_is_a_convention(drive):
     assert_same(before, after, ROUNDING, factor=(4, 4, 1))
 
 
+@pytest.mark.slow
 @FEW
 @given(drives(sound=True))
 def test_the_world_may_begin_at_another_pose(drive):
@@ -447,11 +452,13 @@ def simulated():
     return dataset, before
 
 
+@pytest.mark.slow
 def test_a_simulated_drive_in_a_mirror_has_mirrored_estimates(simulated):
     dataset, before = simulated
     assert_same(before, solved(mirrored(dataset), slip=1e-3), ROUNDING, factor=(1, -1, -1))
 
 
+@pytest.mark.slow
 def test_the_unit_of_length_of_a_simulated_drive_is_a_convention(simulated, monkeypatch):
     dataset, before = simulated
     constants_in_quarters(monkeypatch)

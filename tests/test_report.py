@@ -265,6 +265,7 @@ def test_what_cannot_be_set_is_refused_before_a_kernel_starts(tmp_path, text, re
     assert not (tmp_path / "report").exists() and not (tmp_path / "results").exists()
 
 
+@pytest.mark.slow
 def test_what_is_shown_must_fit_together_in_the_executed_notebooks(tmp_path):
     make_data(tmp_path)
     write(tmp_path / "notebooks", "1_text",
@@ -285,6 +286,7 @@ def test_what_is_shown_must_fit_together_in_the_executed_notebooks(tmp_path):
     assert "Figure 1.1." in Page(tmp_path / "report" / "1_text.html").text  # the old report is left
 
 
+@pytest.mark.slow
 def test_a_page_of_a_notebook_that_is_gone_goes_and_the_user_s_stay(tmp_path):
     """Also those of builds that kept no list of their files."""
     make_data(tmp_path)
@@ -340,6 +342,7 @@ def test_bad_data_and_bad_notebooks_are_told_before_a_kernel_starts(tmp_path):
     assert not (tmp_path / "report").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("unshare") is None
                     or subprocess.run(["unshare", "-rn", "true"], capture_output=True).returncode,
                     reason="no namespace without a network can be made here")
@@ -366,6 +369,7 @@ def test_index_lists_results_of_this_build_and_the_selected_datasets_only(tmp_pa
     assert "long/vehiclePose.mat" not in index and "old.mat" not in index
 
 
+@pytest.mark.slow
 def test_the_command_line_sets_the_title_page_and_leaves_out_code(tmp_path, monkeypatch, capsys):
     make_data(tmp_path)
     write(tmp_path / "notebooks", "1_text", "# Text\n\nProse.",
@@ -390,6 +394,7 @@ def test_the_command_line_sets_the_title_page_and_leaves_out_code(tmp_path, monk
     assert b"Of the file" in (tmp_path / "report" / "report.pdf").read_bytes()
 
 
+@pytest.mark.slow
 def test_a_problem_that_fails_costs_one_problem_and_exit_code_3(tmp_path, monkeypatch, capsys):
     """One of two drives contradicts itself, and its truth begins in another frame."""
     dataset, truth = simulate("short", seed=3)

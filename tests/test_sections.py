@@ -167,6 +167,7 @@ def built(tmp_path_factory):
     return root
 
 
+@pytest.mark.slow
 def test_the_report_closes_the_gaps(built):
     page, more = (Page(built / "report" / f"{name}.html") for name in ("1_one", "A_more"))
     assert "See errors, two, equation 1.1 and" in page.text and "#Last" in page.links
@@ -177,6 +178,7 @@ def test_the_report_closes_the_gaps(built):
     assert "1.2 Last" in printed and not re.search("Errors|Skipped|Nobody|2. Two", printed)
 
 
+@pytest.mark.slow
 def test_what_is_not_shown_is_executed(built):
     assert not (built / "report" / "2_two.html").exists()
     written = json.loads((built / "results" / "short" / ".slamlib.json").read_text())

@@ -577,6 +577,7 @@ def test_the_scatter_of_residuals_gives_factors_of_at_least_one():
     assert noise_of_scatter(few, state).ranges == 1 < noise_of_scatter(few, state).sightings
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("known", [
     {"slip": 2e-3}, {"marker_noise_factor": 1.3}, {"range_noise_factor": 0.8},
     {"slip": 2e-3, "marker_noise_factor": 1.3, "range_noise_factor": 0.8}])
@@ -625,6 +626,7 @@ def test_an_option_with_a_wrong_name_or_value_is_told_with_what_there_is(options
         slam.estimate(simulate("short", seed=4)[0].first(50), **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kernel", acceptance.KERNELS)
 def test_every_kernel_solves_a_drive_with_wrong_labels_and_late_ranges(kernel):
     """With and without gates; only quadratic errors without gates follow the wrong labels.

@@ -269,6 +269,7 @@ def test_datasets_and_titles_with_hostile_names_are_shown_as_text(named, visit):
         assert all(text.count(name) > 1 for name in NAMES), path.name
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("look")
 def test_names_and_sentences_of_points_in_a_figure_are_text():
     fig, ((ax,),) = plotting.panels(1)

@@ -382,6 +382,7 @@ def test_places_within_a_fifth_of_the_distance_are_one():
     assert ((apart == 0) | (apart > 0.2 * 19.5)).all()
 
 
+@pytest.mark.slow
 def test_second_moment_is_the_sum_over_the_places_of_the_grid():
     """Every place by itself, from the definition: Cauchy likelihood, guess, area of the cell."""
     ranges, estimate = line_of_ranges(5), np.array([2.9, 4.2])
@@ -613,6 +614,6 @@ def test_gtsam_takes_the_last_steps_of_a_solution(monkeypatch):
 def test_ranges_hardly_move_a_drive_full_of_markers_and_bound_one_without():
     full = studies.run(montecarlo.ranges_added, range(4))
     assert full["moved"].max() < 0.3 and (full["sigma with"] <= full["sigma without"]).all()
-    few = studies.run(montecarlo.ranges_added, range(4), share=0.1)
-    assert few["ate with"].mean() < 0.5 * few["ate without"].mean()
+    few = studies.run(montecarlo.ranges_added, range(8), share=0.1)
+    assert decided(np.log(few["ate without"] / few["ate with"]))
     assert (few["sigma with"] < 0.6 * few["sigma without"]).all()

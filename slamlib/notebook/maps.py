@@ -11,8 +11,8 @@ from slamlib.notebook import inline, plotting
 from slamlib.notebook.means import three_digits
 from slamlib.notebook.names import Names
 
-WIDTH = 7.4                    # inches, the whole width of the page
-HEIGHTS = 2.6, 4.0, 5.7        # inches: lowest axes; highest ones of few and of many landmarks
+MAP_WIDTH = 7.4                    # inches, the whole width of the page
+MAP_HEIGHTS = 2.6, 4.0, 5.7        # inches: lowest axes; highest ones of few and of many landmarks
 MIN_MANY_LANDMARKS = 60        # landmarks of a map that may have the largest height
 MIN_POINT_VARIANCE = 1.0       # rad^2, variance of the heading of a marker without orientation
 MAP_MARGIN = 0.04              # around the map, in its extent
@@ -38,7 +38,7 @@ def whole_map(drive, result):
     size = (high - low).max()
     enlarged = _enlargement(result, size)
     height, is_tall = _height(high - low, result)
-    fig, ((ax,),) = plotting.panels(1, width=WIDTH, height=height)
+    fig, ((ax,),) = plotting.panels(1, width=MAP_WIDTH, height=height)
     role = "slam_uwb" if len(result.antenna) else "slam"
     plotting.trajectory(ax, result.poses, role, "vehicle", linewidth=1.5,
                         linestyle="-")
@@ -209,11 +209,11 @@ def _outlines(result, enlarged):
 def _height(extent, result):
     """Height in inches of the figure for a map of extent (2,) in m, and whether the map is tall.
 
-    The axes have the map's shape within HEIGHTS. A tall map would be higher at the page's width.
+    The axes have the map's shape within MAP_HEIGHTS. At the page's width a tall map is higher.
     """
-    low, few, many = HEIGHTS
+    low, few, many = MAP_HEIGHTS
     highest = many if len(result.marker) + len(result.antenna) > MIN_MANY_LANDMARKS else few
-    wanted = (WIDTH - 0.7) * extent[1] / extent[0]
+    wanted = (MAP_WIDTH - 0.7) * extent[1] / extent[0]
     return float(np.clip(wanted, low, highest)) + 1.1, bool(wanted > highest)
 
 

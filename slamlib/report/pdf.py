@@ -28,7 +28,7 @@ from slamlib.report.sanitize import sanitized
 from slamlib.report.setting import PLACES, UNKNOWN, compiled, typst_string
 from slamlib.report.svg import compressed
 
-TEMPLATE = Path(__file__).with_name("report.typ")
+TEMPLATE, TITLE_PAGE = (Path(__file__).with_name(name) for name in ("report.typ", "title_page.typ"))
 PICTURES = {"image/svg+xml": "svg", "image/png": "png", "image/jpeg": "jpg"}  # endings of files
 OUTPUT_KINDS = (*PICTURES, "text/markdown", "text/latex", "text/html", "text/plain")  # best first
 CODE_COLUMNS = 96  # width of the page in characters of code
@@ -100,7 +100,8 @@ def typst_files(chapters, opening=None, code="method", picture=None, **cover):
     text = (f'#import "{TEMPLATE.name}": *\n#import "formulas.typ": *\n'
             f"#show: report.with({lines})\n{text}\n")
     definitions = "\n".join([f'#import "{TEMPLATE.name}": display', *_definitions(book)])
-    return {TEMPLATE.name: TEMPLATE.read_bytes(), "main.typ": text.encode(),
+    return {TEMPLATE.name: TEMPLATE.read_bytes(), TITLE_PAGE.name: TITLE_PAGE.read_bytes(),
+            "main.typ": text.encode(),
             "formulas.typ": definitions.encode(), PLACES: json.dumps(UNKNOWN).encode(),
             **book.files}, book
 

@@ -13,7 +13,7 @@ from slamlib.notebook import plain, plotting
 from slamlib.solve import PROBLEMS
 
 CURVE_POINTS = 1500  # of a curve, at most
-HIDDEN = ("problem2", "problem2_hint", "problem3")  # trajectories that would lie below others
+HIDDEN_TRAJECTORIES = ("problem2", "problem2_hint", "problem3")  # they would lie below others
 LOOKS = {"problem3": dict(linewidth=4.0), "problem4": dict(linestyle="-", linewidth=1.4)}
 FIGURE_STYLE = Path(plotting.__file__).with_name("slamlib.mplstyle")
 
@@ -40,7 +40,7 @@ def trajectories(drive):
         left, right = fig.subplots(1, 2, width_ratios=(1, 1))
         for solution in drive.solutions:
             role, look = _role(solution), LOOKS.get(solution.problem, {})
-            if solution.problem not in HIDDEN or solution is drive.solutions[-1]:
+            if solution.problem not in HIDDEN_TRAJECTORIES or solution is drive.solutions[-1]:
                 plotting.trajectory(left, _few(_in_first_frame(drive, solution)), role,
                                     solution.title, **look)
             sigma = evaluation.position_sigmas(solution.covariances)

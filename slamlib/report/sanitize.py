@@ -35,7 +35,8 @@ ATTRIBUTES = set(
     "marker-mid marker-end display visibility font-family font-size font-style font-weight "
     "text-anchor dominant-baseline".split())
 ADDRESSES = {"href", "xlink:href", "src"}
-LINK = re.compile(r"(?:https?|mailto):|[^:]*(?:[/?#]|\Z)", re.IGNORECASE)  # or a relative address
+# A relative address, too.
+LINK_PATTERN = re.compile(r"(?:https?|mailto):|[^:]*(?:[/?#]|\Z)", re.IGNORECASE)
 PICTURE_DATA = re.compile(r"data:image/[\w.+-]+[;,]", re.IGNORECASE)
 STYLED = {"style", "color", "fill", "stroke", "stop-color", "clip-path", "mask", "marker-start",
           "marker-mid", "marker-end"}  # hold CSS, in which a function could load something
@@ -97,7 +98,7 @@ def _allowed(element, attribute, value):
         allowed = PICTURE_DATA.match(value)
     elif attribute in ADDRESSES:
         allowed = value.startswith("#") or (
-            element == "a" and LINK.match(value)
+            element == "a" and LINK_PATTERN.match(value)
             or element == "image" and PICTURE_DATA.match(value))
     elif attribute in STYLED:
         allowed = "\\" not in value and all(
