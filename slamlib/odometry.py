@@ -66,7 +66,7 @@ def equation2(ticks, vehicle, initial_pose=(0.0, 0.0, 0.0), initial_covariance=N
     """Poses (n, 3) by equation 1 and covariances (n, 3, 3) by equation 2 and equation 3.
 
     Equation 2 adds J C_w J^T + J S I^T + I S J^T = (I + J S)(I + J S)^T - I I^T at every step, and
-    I + J S is the next I by equation 3. The sum telescopes:
+    I + J S is the next I, the (3, 4) sum of equation 3 and not the identity. The sum telescopes:
 
         C_Xk = C_X1 + I_k I_k^T,      I_k = sum over the steps j < k of J_j S_wj.
 

@@ -65,8 +65,8 @@ def _require_digits(equations, H):
     if abs(rounding) * sigma**2 > MAX_ROUNDING:
         raise DatasetError(
             f"{m.dataset.name}: expected measurements beside which sigma_heading = {sigma:g} rad "
-            "(vehicle.toml, or table 2) is not lost in rounding; their standard deviations are too "
-            "small for it")
+            "(vehicle.toml, or the assignment's table 2) is not lost in rounding; their standard "
+            "deviations are too small for it")
 
 
 def _common_turn(equations):

@@ -1,7 +1,8 @@
 """Stage 1: all measurements of a dataset as arrays.
 
 Frames (keyframes) are the encoder poses that are variables X_i of the graph: the first, the last,
-with a sighting or a range. Measurements are numbered: first the s sightings, then the r ranges.
+and each one with a sighting or a range. Measurements are numbered: first the s sightings, then the
+r ranges.
 """
 
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ from slamlib.sightings import (
 )
 from slamlib.slam.errors import square_root_information
 from slamlib.slam.noise import is_known
-from slamlib.slam.structure import block_structure, numbered_variables
+from slamlib.slam.structure import Variables, block_structure
 
 # Standard deviations of the priors of variables
 ORIGIN_SIGMA = 1e-5          # m, of the position of pose 1, which is zero by definition
@@ -90,8 +91,9 @@ class Measurements:
     @cached_property
     def variables(self):
         """The Variables, numbered."""
-        return numbered_variables(
-            len(self.frame), len(self.marker), len(self.antenna), self.calibrated)
+        counts = [len(self.frame), len(self.marker), len(self.antenna), 1, int(self.calibrated)]
+        frames, markers, antennas, w, c = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
+        return Variables(frames=frames, markers=markers, antennas=antennas, w=w, c=c)
 
     @property
     def factor_variables(self):

@@ -25,7 +25,7 @@ def narrow_kernels(problem, state, scales=CAUCHY_SCALES, converged=CONVERGED):
     """
     m = problem.measurements
     for number, scale in enumerate(scales):
-        if number:
+        if number:                                   # the caller judges the last solution
             problem = replace(problem, noise=noise_of_scatter(m, state))
         cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(scale)
         accepted = AcceptedMeasurements(m, m.unit_weights, cauchy, cauchy)

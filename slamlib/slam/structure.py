@@ -24,13 +24,6 @@ class Variables:
     c: np.ndarray            # (1,), or (0,) if the ranges are not calibrated
 
 
-def numbered_variables(frames, markers, antennas, calibrated):
-    """The Variables of so many frames, markers and antennas; `calibrated` (bool) adds c."""
-    counts = [frames, markers, antennas, 1, int(calibrated)]
-    numbers = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
-    return Variables(**dict(zip(("frames", "markers", "antennas", "w", "c"), numbers)))
-
-
 @dataclass(frozen=True)
 class Structure:
     """Rows of v variables with n unknowns, and places of their blocks in a matrix (n, n).
