@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from slamlib import counts
+from slamlib.covariance import correlations
 from slamlib.dialects import read_table
 from slamlib.doubt import Doubt
-from slamlib.evaluation import correlations
 from slamlib.exchanged import look_exchanged
 from slamlib.filenames import ENCODER, TRUTH_FILES
 from slamlib.folder import contents, is_dataset

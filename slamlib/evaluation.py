@@ -10,6 +10,7 @@ follows Bar-Shalom, Li and Kirubarajan, *Estimation with Applications to Trackin
 import numpy as np
 
 from slamlib import se2
+from slamlib.covariance import correlations, sigmas
 
 REACH_95 = float(np.sqrt(-2 * np.log(0.05)))    # sigmas, of the 95 % ellipse of a planar Gaussian
 
@@ -117,21 +118,9 @@ def judge(poses, covariances, truth, step):
             "rpe": translation, "rpe_heading": rotation, "nees": anees(poses, covariances, truth)}
 
 
-def sigmas(covariances):
-    """Standard deviations (n, d) of covariances (n, d, d)."""
-    return np.sqrt(np.diagonal(covariances, axis1=-2, axis2=-1))
-
-
 def position_sigmas(covariances):
     """The larger standard deviation of x and y (n,), of covariances (n, >= 2, >= 2)."""
     return sigmas(covariances)[:, :2].max(axis=1)
-
-
-def correlations(covariances):
-    """Correlation matrices (n, d, d) of covariances (n, d, d); NaN where a variance is zero."""
-    sigma = sigmas(covariances)
-    scale = sigma[..., :, None] * sigma[..., None, :]
-    return np.divide(covariances, scale, out=np.full_like(scale, np.nan), where=scale > 0)
 
 
 def sigma_difference(covariances, reference):

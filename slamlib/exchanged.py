@@ -11,11 +11,10 @@ MIN_DISTANCE_RATIO = 3.0  # ratio of median distances from which columns look ex
 def look_exchanged(pose, landmark, measured, pose_count):
     """True if the ids of poses (m,) and landmarks (m,) in a file look exchanged.
 
-    Consecutive poses measure a landmark at almost the same place of the vehicle's frame, or almost
-    the same range, and one pose measures several landmarks at different ones: `measured` (m, d). So
-    columns look exchanged if the median distance between consecutive measurements of one "landmark"
-    exceeds that between those of one "pose" MIN_DISTANCE_RATIO times. With one landmark a pose, the
-    ids decide.
+    Consecutive ones of the measurements `measured` (m, d) of a landmark are similar, and those of a
+    pose differ. Columns look exchanged if the median distance between consecutive measurements of
+    one "landmark" exceeds that between those of one "pose" MIN_DISTANCE_RATIO times. With one
+    landmark a pose, the ids decide.
     """
     pose, landmark, measured = (each[:MAX_READINGS] for each in (pose, landmark, measured))
     whole = (landmark == np.rint(landmark)) & (pose == np.rint(pose))

@@ -1,8 +1,8 @@
 """Finds the files of a dataset in its folder: each file is read, named in a note, or refused.
 
-A file whose name is certainly that of a missing one, as `ArucoReading.txt.txt` where Windows hides
-extensions, is read as that. A name that only resembles a missing one is refused, because a sensor
-would be left out silently.
+A missing file is read under an unambiguous variant of its name, as `ArucoReading.txt.txt` where
+Windows hides extensions, and a note says so. A name that is only similar is refused, because a
+sensor would be left out silently.
 """
 
 import re

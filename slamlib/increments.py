@@ -62,7 +62,7 @@ def rounding_and_slipping(ticks, vehicle, start, end):
     sides = vehicle.wheelbase / 2 * np.array([[1], [-1]])
     turn = 1 / (2 * sides)                                             # by e_R, by e_L
     by_wheel = np.stack([np.cos(direction) / 2 + y * turn, np.sin(direction) / 2 - x * turn,
-                         np.broadcast_to(turn, (2, len(ds)))])   # of (end - S p_e turn, turn)
+                         np.broadcast_to(turn, (2, len(ds)))])   # d(end - S p_e turn, turn)/de
     i, j = np.triu_indices(3)
     outer = by_wheel[i] * by_wheel[j]                                  # (6, wheel, n-1)
     metres_per_count = 2 * np.pi * vehicle.wheel[:2, None] / vehicle.ticks_per_revolution

@@ -29,8 +29,8 @@ MODELS = ("euler", "arc")
 def steps(ticks, vehicle):
     """Length ds and turn dtheta of every step in equation 1, with their derivatives.
 
-    Returns ds (n-1,) in m, dtheta (n-1,) in rad, and ds_by_w and dtheta_by_w (n-1, 3), the
-    derivatives by the wheel parameters [R_R, R_L, b], without unit and in rad/m.
+    Returns ds (n-1,) in m, dtheta (n-1,) in rad, and their derivatives by the wheel parameters
+    [R_R, R_L, b] in m: ds_by_w (n-1, 3) without unit, dtheta_by_w (n-1, 3) in rad/m.
     """
     counts = np.asarray(ticks, dtype=float)[1:]
     ds_by_w = np.pi / vehicle.ticks_per_revolution * np.insert(counts, 2, 0.0, axis=1)  # b: zero

@@ -5,7 +5,7 @@ from scipy.stats import t
 
 from slamlib import slam
 from slamlib.simulation import simulate
-from slamlib.slam.noise import with_noise
+from slamlib.slam.noise import with_known_noise
 from slamlib.studies.montecarlo import judge_slam
 
 
@@ -28,7 +28,7 @@ def decided(differences):
 
 def known_noise(dataset, slip):
     """The Dataset of a drive with this slip in sqrt(m), and the noise that its files state."""
-    return with_noise(dataset, slip, marker_noise_factor=1.0, range_noise_factor=1.0)
+    return with_known_noise(dataset, slip, marker_noise_factor=1.0, range_noise_factor=1.0)
 
 
 def slam_trial(seed, ranges=True, markers=True, **options):

@@ -343,9 +343,9 @@ def test_increments_are_compared_over_a_metre():
     compared = _compare(drive, SimpleNamespace(frame=frame), SimpleNamespace(
         increment=step, covariance=C, usable=usable))
     begin = np.setdiff1d(np.arange(len(step) - 3), [17, 18, 19, 20])
-    assert compared.weight == 1 / 4 and len(compared.by_markers) == len(begin)
+    assert compared.weight == 1 / 4 and len(compared.marker_increments) == len(begin)
     wheels, by_w = increments.between_poses(ticks, Vehicle(), frame[begin], frame[begin + 4], "arc")
-    np.testing.assert_allclose(compared.by_wheels, wheels)
+    np.testing.assert_allclose(compared.wheel_increments, wheels)
     by_w = by_w * (GENEROUS_WHEEL * Vehicle().wheel)
     np.testing.assert_allclose(
         compared.covariance_wheels, by_w @ np.swapaxes(by_w, 1, 2) + increments.noise_covariances(
@@ -356,7 +356,7 @@ def test_increments_are_compared_over_a_metre():
             return se2.compose(se2.compose(se2.compose(a, b), c), d)
         D = central_differences(composed, np.zeros(12))
         expected = D @ block_diag(*C[begin[n]:begin[n] + 4]) @ D.T
-        np.testing.assert_allclose(compared.by_markers[n], composed(np.zeros(12)))
+        np.testing.assert_allclose(compared.marker_increments[n], composed(np.zeros(12)))
         np.testing.assert_allclose(compared.covariance_markers[n], expected, rtol=1e-6, atol=1e-12)
 
 

@@ -481,7 +481,7 @@ def test_a_turn_that_the_wheels_hardly_know_is_named_where_it_is():
         return SimpleNamespace(
             measurements=SimpleNamespace(frame=np.array([0, 10, 30, 70])),
             noise=SimpleNamespace(slip=slip), odometry=SimpleNamespace(
-                by_w=by_w,
+                J_w=by_w,
                 covariance=lambda slip: np.diag([0, 0, slip**2]) * [[[0]], [[1]], [[0]]]))
 
     doubt, = drive_doubts.turn_doubts(problem(1.2))

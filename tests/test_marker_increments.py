@@ -91,7 +91,7 @@ def test_derivatives_by_the_sightings_against_central_differences():
         return robust_increments(y, covariances, pair, first, second, 1).increment[0]
 
     for p in range(len(first)):
-        for k, analytic in ((first[p], found.by_first[p]), (second[p], found.by_second[p])):
+        for k, analytic in ((first[p], found.J_first[p]), (second[p], found.J_second[p])):
             numeric = central_differences(partial(moved, k), np.zeros(3), 1e-5)
             np.testing.assert_allclose(analytic, numeric, atol=0.03 * np.abs(numeric).max())
 
@@ -141,7 +141,7 @@ def test_many_increments_are_consistent():
     first = (2 * m * np.arange(count)[:, None] + np.arange(m)).ravel()
     pair = np.repeat(np.arange(count), m)
     found = robust_increments(z, covariances, pair, first, first + m, count)
-    image = sum(D @ C @ np.swapaxes(D, 1, 2) for D in (found.by_first, found.by_second))
+    image = sum(D @ C @ np.swapaxes(D, 1, 2) for D in (found.J_first, found.J_second))
     np.testing.assert_allclose(image.reshape(count, m, 3, 3).sum(1), found.covariance, atol=1e-9)
     low, high = nees_band(count)
     errors = found.increment - DELTA

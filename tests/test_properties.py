@@ -351,7 +351,7 @@ def mirrored(dataset):
 
 # Factors on the constants in m, in sqrt(m), and in [m, 1].
 LENGTHS = {"ORIGIN_SIGMA": 4, "MINIMUM_SIGMA": 4, "GUESS_PRIOR_SIGMA": 4, "STEP_TOLERANCE": 4,
-           "MINIMUM_SLIP": 2, "RANGE_SIGMA": np.array([4, 1])}
+           "MINIMUM_SLIP": 2, "CALIBRATION_SIGMA": np.array([4, 1])}
 
 
 def in_quarters(dataset):

@@ -13,7 +13,7 @@ from slamlib.dataset import AntennaGuess, ArucoReadings, Dataset, UwbReadings, V
 from slamlib.evaluation import anees, ate, nees_band
 from slamlib.simulation import simulate
 from slamlib.slam import acceptance, gtsam_graph, odometry_factors
-from slamlib.slam.acceptance import accepted_measurements, within_gates
+from slamlib.slam.acceptance import accepted_measurements, gate_weights
 from slamlib.slam.covariances import marginal_covariances
 from slamlib.slam.evidence import laplace_approximation
 from slamlib.slam.fit import refine
@@ -106,8 +106,8 @@ def test_odometry_is_that_of_the_wheels_about_which_it_is_linear(about):
         return increments.between_poses(
             dataset.ticks, dataset.vehicle.with_deviation(w), frame[:-1], frame[1:], "arc")[0]
 
-    np.testing.assert_allclose(found.increment + found.by_w @ w, by_wheels(w), atol=1e-12)
-    np.testing.assert_allclose(found.by_w, central_differences(by_wheels, w, 1e-2), atol=1e-8)
+    np.testing.assert_allclose(found.increment + found.J_w @ w, by_wheels(w), atol=1e-12)
+    np.testing.assert_allclose(found.J_w, central_differences(by_wheels, w, 1e-2), atol=1e-8)
 
 
 def test_rounding_noise_does_not_depend_on_the_number_of_factors():
@@ -662,7 +662,7 @@ def test_gates_of_poses_points_and_ranges():
         accepted_measurements(problem, state).weight, [1, 0, 1, 0, 1, 0, 1])
     wider = replace(problem, noise=Noise(sightings=1.1, ranges=1.1))
     np.testing.assert_array_equal(accepted_measurements(wider, state).weight, 1)
-    np.testing.assert_array_equal(within_gates(problem, state, 3.3, 10.0), [1, 0, 1, 0, 1, 0, 0])
+    np.testing.assert_array_equal(gate_weights(problem, state, 3.3, 10.0), [1, 0, 1, 0, 1, 0, 0])
 
 
 @pytest.mark.parametrize("true, other", [("arc", "euler"), ("euler", "arc")])

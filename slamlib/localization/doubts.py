@@ -85,8 +85,8 @@ CONTRADICTION = Doubt("camera-mirrored", (
 class _Compared:
     """Increments of the moving vehicle between n pairs of frames, by markers and by wheels."""
 
-    by_markers: np.ndarray           # (n, 3) m and rad
-    by_wheels: np.ndarray            # (n, 3)
+    marker_increments: np.ndarray    # (n, 3) m and rad
+    wheel_increments: np.ndarray     # (n, 3)
     covariance_markers: np.ndarray   # (n, 3, 3)
     covariance_wheels: np.ndarray    # (n, 3, 3), with GENEROUS_SLIP and GENEROUS_WHEEL
     weight: float                    # 1 / number of increments that overlap
@@ -95,7 +95,7 @@ class _Compared:
         """Squared Mahalanobis distances (n,) if the wheels' axes are transformed by A (2, 2)."""
         B = np.zeros((3, 3))
         B[:2, :2], B[2, 2] = A, np.linalg.det(A)
-        r = self.by_markers - self.by_wheels @ B.T
+        r = self.marker_increments - self.wheel_increments @ B.T
         r[:, 2] = se2.wrap(r[:, 2])
         W = self.covariance_markers + B @ self.covariance_wheels @ B.T
         return np.einsum("ni,ni->n", r, np.linalg.solve(W, r[..., None])[..., 0])
@@ -128,9 +128,9 @@ def doubts_before_solving(dataset):
         sightings = replace(sightings, z=sightings.z * sign, C=sightings.C * np.outer(sign, sign))
         found = consecutive_increments(sightings)
     compared = _compare(dataset, sightings, found)
-    if len(compared.by_markers) < MIN_INCREMENTS:
+    if len(compared.marker_increments) < MIN_INCREMENTS:
         return _counts_doubts(dataset) + unit_doubts
-    return (sighting_units(compared.by_markers, compared.by_wheels, compared.sigma())
+    return (sighting_units(compared.marker_increments, compared.wheel_increments, compared.sigma())
             or _axes_doubts(dataset, compared, contradicting)
             or _odometry_doubts(compared)) + unit_doubts
 
@@ -193,7 +193,7 @@ def _compare(dataset, sightings, found):
     generous = (increments.noise_covariances(*args, start, end, GENEROUS_SLIP)
                 + by_w @ np.swapaxes(by_w, 1, 2))
     moving = _moves(by_markers, covariance) | _moves(by_wheels, generous)
-    return _Compared(by_markers=by_markers[moving], by_wheels=by_wheels[moving],
+    return _Compared(marker_increments=by_markers[moving], wheel_increments=by_wheels[moving],
                      covariance_markers=covariance[moving], covariance_wheels=generous[moving],
                      weight=1 / span)
 
@@ -269,7 +269,7 @@ def _odometry_doubts(compared):
     share = np.mean(squared > AGREEMENT_GATE)
     if share < 0.5:
         return []
-    lengths, turns = median_motions(compared.by_markers, compared.by_wheels)
+    lengths, turns = median_motions(compared.marker_increments, compared.wheel_increments)
     return [Doubt("odometry", (
         f"Increments of the vehicle by markers and by wheels disagree beyond their noise at "
         f"{share:.0%} of {len(squared)} places: by the markers it moves by {lengths[0]:.3g} m and "

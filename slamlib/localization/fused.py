@@ -56,7 +56,7 @@ class _FilterInput:
     vehicle: object              # with the wheel parameters w_0 at which Delta is linearised
     pose: np.ndarray             # (f,) pose indices of the frames, pose 0 among them
     increment: np.ndarray        # (f-1, 3) Delta(w_0)
-    by_w: np.ndarray             # (f-1, 3, 3) dDelta/dw
+    J_w: np.ndarray              # (f-1, 3, 3) dDelta/dw
     rounding: np.ndarray         # (f-1, 3, 3) Q without slip
     slipping: np.ndarray         # (f-1, 3, 3) what a slip of 1 sqrt(m) adds to Q
     frames: list                 # of f tuples: z (m, 3) and C (m, 3, 3) of a frame's sightings, and
@@ -112,11 +112,11 @@ def _likeliest_slip(given):
 
     The first three points are the median of the prior and one standard deviation to both sides.
     """
-    def density(log_slip):
+    def log_density(log_slip):
         return _filter(given, np.exp(log_slip))[2].log_likelihood + log_slip_prior(log_slip)
 
     step = np.log(SLIP_FACTOR)
-    points = {point: density(point) for point in np.log(TYPICAL_SLIP) + step * np.arange(-1, 2)}
+    points = {point: log_density(point) for point in np.log(TYPICAL_SLIP) + step * np.arange(-1, 2)}
     while True:
         best = max(points, key=points.get)
         below = max((point for point in points if point < best), default=None)
@@ -128,7 +128,7 @@ def _likeliest_slip(given):
             vertex = (below + best) / 2 - slopes[0] * (above - below) / 2 / (slopes[1] - slopes[0])
         if abs(vertex - best) < LOG_SLIP_TOLERANCE:
             return float(np.exp(vertex))
-        points[vertex] = density(vertex)
+        points[vertex] = log_density(vertex)
 
 
 def _filter_input(dataset, model, vehicle):
@@ -145,7 +145,7 @@ def _filter_input(dataset, model, vehicle):
     rounding, slipping = increments.noise_in_drive(ticks, vehicle, start, end)
     return _FilterInput(
         dataset=dataset, model=model, vehicle=vehicle, pose=sightings.frame, increment=increment,
-        by_w=by_w, rounding=rounding, slipping=slipping,
+        J_w=by_w, rounding=rounding, slipping=slipping,
         frames=list(zip(*seen, *common, strict=True)))
 
 
@@ -158,7 +158,7 @@ def _filter(given, slip):
     Q, x, covariances = given.rounding + slip**2 * given.slipping, [], []
     for k, frame in enumerate(given.frames):
         if k > 0:
-            state = _predicted(state, given.increment[k - 1], given.by_w[k - 1], Q[k - 1])
+            state = _predicted(state, given.increment[k - 1], given.J_w[k - 1], Q[k - 1])
         state = _updated(state, *frame)
         x.append(state.x)
         covariances.append(state.P[:6, :6].copy())

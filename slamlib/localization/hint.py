@@ -45,7 +45,10 @@ def equation2_from(ticks, vehicle, start, poses, covariances):
 
 
 def first_order_from(ticks, vehicle, start, poses, covariances):
-    """The same by `odometry.first_order`, with all correlations of a part."""
+    """Poses (n, 3) and covariances (n, 3, 3) as `equation2_from`, by `odometry.first_order`.
+
+    They have all correlations within the part of the drive that begins at a fused pose.
+    """
     part = np.maximum(np.searchsorted(start, np.arange(len(ticks))) - 1, 0)
     delta, by_w = increments.between_poses(ticks, vehicle, start[part], np.arange(len(ticks)))
     A, B = se2.compose_jacobians(poses[part], delta)

@@ -30,8 +30,8 @@ class MarkerIncrements:
     first: np.ndarray        # (p,) row of the sighting from the earlier frame
     second: np.ndarray       # (p,) row of the sighting from the later frame
     accepted: np.ndarray     # (p,) bool, within the gate of a usable increment
-    by_first: np.ndarray     # (p, 3, 3) derivative of the increment by the earlier sighting
-    by_second: np.ndarray    # (p, 3, 3) derivative of the increment by the later sighting
+    J_first: np.ndarray     # (p, 3, 3) derivative of the increment by the earlier sighting
+    J_second: np.ndarray    # (p, 3, 3) derivative of the increment by the later sighting
     increment: np.ndarray    # (l, 3) later in earlier frame, m and rad; NaN if undetermined
     covariance: np.ndarray   # (l, 3, 3)
     usable: np.ndarray       # (l,) bool, the increment is determined and plausible
@@ -69,9 +69,9 @@ def consecutive_increments(sightings):
     usable = again.usable & ~(fast & _too_fast(again.increment, again.covariance, steps, bound))
     accepted, (by_first, by_second) = np.zeros(len(pair), bool), np.zeros((2, len(pair), 3, 3))
     accepted[allowed] = again.accepted
-    by_first[allowed], by_second[allowed] = again.by_first, again.by_second
+    by_first[allowed], by_second[allowed] = again.J_first, again.J_second
     return replace(again, pair=pair, first=first, second=second, usable=usable,
-                   accepted=accepted & usable[pair], by_first=by_first, by_second=by_second)
+                   accepted=accepted & usable[pair], J_first=by_first, J_second=by_second)
 
 
 def common_sightings(row, marker):
@@ -119,7 +119,7 @@ def robust_increments(z, C, pair, first, second, count):
     D = covariance[pair] @ gain
     return MarkerIncrements(
         pair=pair, first=first, second=second, accepted=(weight > 0) & usable[pair],
-        by_first=D, by_second=-D @ J_second, usable=usable, covariance=covariance,
+        J_first=D, J_second=-D @ J_second, usable=usable, covariance=covariance,
         increment=np.where(usable[:, None], increment, np.nan))
 
 

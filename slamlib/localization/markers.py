@@ -133,9 +133,9 @@ def _compose_increments(sightings, links, root, shared_errors):
         if shared_errors:
             rows = slice(*np.searchsorted(found.pair, (pair, pair + 1)))
             first, second = found.first[rows], found.second[rows]
-            S = A @ np.sum(H[first] @ np.swapaxes(B @ found.by_first[rows], 1, 2), axis=0)
+            S = A @ np.sum(H[first] @ np.swapaxes(B @ found.J_first[rows], 1, 2), axis=0)
             covariances[f] += S + S.T
-            H[second] = B @ found.by_second[rows] @ sightings.C[second]
+            H[second] = B @ found.J_second[rows] @ sightings.C[second]
     return poses, covariances, H
 
 

@@ -1,4 +1,4 @@
-"""Shows the box *Answer* that opens a chapter, and makes sentences on a result in numbers."""
+"""Shows the box *Answer* that opens a chapter, and states results in sentences."""
 
 import numpy as np
 

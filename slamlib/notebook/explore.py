@@ -31,7 +31,7 @@ from slamlib.simulation import delay, misguess, mislabel
 from slamlib.slam.acceptance import AcceptedMeasurements
 from slamlib.slam.initialization import odometry_state, trilaterated_antennas
 from slamlib.slam.measurements import measure
-from slamlib.slam.noise import Noise, with_known, with_noise
+from slamlib.slam.noise import Noise, with_known, with_known_noise
 from slamlib.slam.optimizer import optimize
 from slamlib.slam.pipeline import fit_from_odometry
 from slamlib.slam.problem import build_problem
@@ -218,7 +218,7 @@ def _solved_with_markers(drive, model, seed, slip, assumed, wrong):
         dataset = drive.dataset
     else:
         dataset = mislabel(first_part(drive.dataset, "aruco"), wrong / 100, seed)
-    m = measure(with_noise(dataset.without("uwb"), 1e-3 * assumed, 1.0, 1.0))
+    m = measure(with_known_noise(dataset.without("uwb"), 1e-3 * assumed, 1.0, 1.0))
     return drive, m, slam_result(fit_from_odometry(m, model))
 
 
@@ -279,5 +279,5 @@ def _solved_with_ranges(drive, slip, model, seed, late, off, part, range_kernel,
         position = dataset.antenna_guess.position
     dataset = misguess(dataset.without("aruco"), position, off, seed)
     dataset = first_part(dataset.first(-(-len(dataset.ticks) * part // 100)), "uwb")
-    m = measure(with_noise(dataset, slip, 1.0, 1.0))
+    m = measure(with_known_noise(dataset, slip, 1.0, 1.0))
     return drive, m, slam_result(solve_with(m, ranges=range_kernel, antennas=antennas, model=model))

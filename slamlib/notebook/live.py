@@ -72,7 +72,7 @@ def _align(figures):
 
 
 def _widen(ax):
-    """Extend one of an axes' limits until a metre is as long on both axes."""
+    """Extend the limits of one axis until both have the same scale."""
     size = np.array([ax.bbox.width, ax.bbox.height])
     limits = np.array([ax.get_xlim(), ax.get_ylim()])
     span = size * (np.ptp(limits, axis=1) / size).max()

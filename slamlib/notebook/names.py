@@ -1,4 +1,4 @@
-"""Draws names beside landmarks in a map where they cover neither each other nor a landmark."""
+"""Places the names of landmarks in a map without overlaps."""
 
 import numpy as np
 from matplotlib.artist import Artist

@@ -29,7 +29,7 @@ BESIDE_ODOMETRY = ("problem4", "problem3", "problem2_fused")  # estimates, the b
 def moving(drive):
     """Return a list of the cell with a SolvedDrive's animation, for pages only; [] without one."""
     html = animated(drive)
-    output = new_output("display_data", {"text/html": Markup(html)})  # a page takes it as it is
+    output = new_output("display_data", {"text/html": Markup(html)})  # not sanitized
     return [new_code_cell(outputs=[output], id="motion",
                           metadata={"tags": [HTML_ONLY]})] if html else []
 

@@ -123,7 +123,7 @@ def _tell(line):
 
 
 def _require_pages(books, options):
-    """Set the Markdown of the notebooks, which tells early what cannot be set."""
+    """Typeset the Markdown of the notebooks before they are executed, to report errors early."""
     texts = {source: nbformat.v4.new_notebook(
         cells=[cell for cell in book.cells if cell.cell_type == "markdown"])
         for source, book in books.items()}

@@ -1,4 +1,4 @@
-"""Converts TeX formulas with pandoc; names a formula that cannot be converted and loses none."""
+"""Converts TeX formulas with pandoc, and reports those that pandoc cannot convert."""
 
 import json
 import re

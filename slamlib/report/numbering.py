@@ -39,8 +39,8 @@ def _to_absent(letters):
 def numbered(books, whole=None):
     """Return copies of executed books (dict from Path to NotebookNode), numbered and with links.
 
-    `whole` is the same with what `books` leaves out: a reference to this becomes plain text, which
-    says "left out" where the number is now another's.
+    `whole` has also what `books` leaves out. A reference to an omitted part becomes plain text,
+    marked "left out" if another part has its number now.
 
     Raises
     ------

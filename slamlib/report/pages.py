@@ -1,7 +1,7 @@
 """Makes HTML pages of executed notebooks, which need no network.
 
 nbconvert makes a page by `page.html` and `page.css`; pandoc converts its formulas to MathML. A page
-with an element of class `live` has the script `page.js`, and no page has another one. What comes
+with an element of class `live` has the script `page.js`, the only one. What comes
 from cells is sanitized; besides, each page has a Content-Security-Policy, which allows this script
 and the build's own styles only.
 """
@@ -263,7 +263,7 @@ def _mended_mathml(tex, mathml):
 
 
 class _Exporter(HTMLExporter):
-    """Makes pages as nbconvert does, but for its last step, which parses and writes them anew."""
+    """nbconvert's exporter of pages, without the last step, which parses and writes each again."""
 
     def from_notebook_node(self, nb, resources=None, **options):
         return super(HTMLExporter, self).from_notebook_node(nb, resources, **options)

@@ -169,8 +169,8 @@ class Book:
     """Chapters in Typst, and what they refer to.
 
     `files` are the pictures as {name: bytes}; `texts` the chapters: file name, text without marks
-    and NotebookNode; `formulas` (list of Formula) and `commands` (list of str) what marks stand for
-    by their index. `page` is the dict of the renderer.
+    and NotebookNode; mark i stands for `formulas[i]` (list of Formula) or
+    `commands[i]` (list of str). `page` is the dict of the renderer.
     """
 
     def __init__(self, code):

@@ -1,9 +1,11 @@
 """Problems 3 and 4: SLAM with GTSAM on odometry, markers and ranges, as a pipeline.
 
-GTSAM keeps the robust kernels, orders the elimination, takes the last steps of every solution, and
-detects variables that the measurements do not determine. The steps before, and the evidence of the
-noise, solve the same graph by normal equations in numpy, all factors of a kind at once.
+GTSAM supplies weights and losses of the robust kernels, orders the elimination, takes the last
+steps of every solution, and detects variables that the measurements do not determine. The steps
+before, and the evidence of the noise, solve the same graph by normal equations in numpy, all
+factors of a kind at once.
 
+The modules use `se2`, `odometry`, `increments` and `sightings` (gates and consensus) of `slamlib`.
 Read `pipeline` first: its function `estimate` is the whole way from a dataset to the result. Each
 stage makes the record of the next. The modules by stage, in the order to read them (stage 4 uses
 stage 5 on long drives):
@@ -47,7 +49,7 @@ n unknowns, and (m, d) are m measurements of a kind with d errors each:
     L_j P_j  pose of marker j (m, m, rad), or position (m) if its heading is unknown
     A_k      position of antenna k, m
     w        (3,) errors of R_R, R_L, b, in units of their standard deviations
-    c        (2,) errors of offset and scale of the ranges, in units of RANGE_SIGMA
+    c        (2,) errors of offset and scale of the ranges, in units of CALIBRATION_SIGMA
     z, C     measured pose of a marker in the vehicle (m, m, rad), and its covariance
     e        errors, expected minus measured; whitened errors are U e, without unit
     U        square root information, upper triangular: U^T U = C^-1 or Q^-1
@@ -56,11 +58,13 @@ n unknowns, and (m, d) are m measurements of a kind with d errors each:
     H, g     information matrix (n, n), sum J^T J, and gradient (n,), sum J^T e
     delta    (n,) step of the unknowns, H delta = -g
 
-A frame is a keyframe: an encoder pose that is a variable of the graph. Covariances change their
-axes three times. The files give those of sightings in the axes of the vehicle; `sighting_roots` of
-Measurements turns them into those of the measured pose, in which the error of a marker lives. The
-unknowns, and with them `Covariances`, are in the axes of each pose itself, as in GTSAM.
-`interpolation` turns those of poses into world axes, `result` those of markers.
+A frame is a keyframe: an encoder pose that is a variable of the graph. Axes of the covariances:
+
+    sightings in the files               vehicle
+    errors of sightings with a heading   measured pose (`Measurements.sighting_roots`)
+    `Covariances` of poses and markers   each pose itself, as in GTSAM
+    `Covariances` of points, antennas    world
+    SlamResult                           world (`interpolation` for poses, `result` for markers)
 """
 
 from slamlib.slam.drive_doubts import confirmation

@@ -17,8 +17,8 @@ EARLY_GATE = 3.3             # sigmas; a range that is shorter than expected by 
 
 _kernel = gtsam.noiseModel.mEstimator
 # By name, scales in sigmas. Those of Huber, Cauchy and Tukey have 95 % efficiency on Gaussian noise
-# (Zhang, Image and Vision Computing 15(1), 1997). GTSAM gives a kernel the sign of the error only
-# if it weighs components.
+# (Zhang, Image and Vision Computing 15(1), 1997). Asymmetric kernels need signed
+# errors, which GTSAM passes to them with the scheme Scalar.
 _scalar = _kernel.Base.ReweightScheme.Scalar
 KERNELS = {
     "quadratic": None,
@@ -92,14 +92,14 @@ def acceptance_rule(kernel="asymmetric Tukey", gate=True):
 
 def accepted_measurements(problem, state, rule=AcceptanceRule()):
     """The AcceptedMeasurements that an AcceptanceRule accepts at a State, with its kernels."""
-    weight = within_gates(problem, state, rule.early, rule.late)
+    weight = gate_weights(problem, state, rule.early, rule.late)
     if not rule.gated:
         weight[:len(problem.measurements.marker_row)] = 1
     return AcceptedMeasurements(
         problem.measurements, weight, rule.sighting_kernel, rule.range_kernel)
 
 
-def within_gates(problem, state, early, late):
+def gate_weights(problem, state, early, late):
     """Weights (s + r,): 1 within the gates, else 0.
 
     The gate of a sighting is the 99.9 % quantile of chi-squared with 3 degrees of freedom, or 2 for

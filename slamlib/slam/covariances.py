@@ -27,7 +27,7 @@ MAX_ROUNDING = 0.05          # float rounding: share of the information about th
 
 @dataclass(frozen=True)
 class Covariances:
-    """Marginal covariances in GTSAM's axes, those of each pose itself."""
+    """Marginal covariances, of poses and markers in their own axes, else in world axes."""
 
     pairs: np.ndarray        # (f-1, 9, 9) of [X_i, X_{i+1}, w]
     markers: list            # k of (3, 3), or (2, 2) for a point

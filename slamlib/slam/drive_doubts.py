@@ -40,10 +40,10 @@ def solution_doubts(measurements, result):
 def turn_doubts(problem):
     """List of a Doubt if odometry does not determine the number of turns between two frames.
 
-    By the wheels of vehicle.toml: those of a solution with a wrong number of turns fit to it.
+    By the stated wheels: estimated ones adapt to a wrong number of turns.
     """
     odometry, frame = problem.odometry, problem.measurements.frame
-    variance = np.sum(odometry.by_w[:, 2]**2, axis=1) \
+    variance = np.sum(odometry.J_w[:, 2]**2, axis=1) \
         + odometry.covariance(problem.noise.slip)[:, 2, 2]
     if not len(variance) or np.sqrt(variance.max()) < MAX_TURN_SIGMA:
         return []

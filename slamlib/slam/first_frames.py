@@ -34,7 +34,7 @@ def equations_of_first_frames(equations):
         problem.accepted.range_weight[:len(part.ranges.row)]])
     odometry = replace(problem.odometry, **{
         name: getattr(problem.odometry, name)[:count - 1]
-        for name in ("increment", "by_w", "quantization", "slipping")})
+        for name in ("increment", "J_w", "quantization", "slipping")})
     return NormalEquations(
         replace(problem, odometry=odometry, accepted=accepted),
         replace(state, poses=state.poses[:count], markers=state.markers[markers],

@@ -77,7 +77,9 @@ def extended(measurements, model, part, solved):
 
 
 def consensus_markers(measurements, in_world, covariances):
-    """(k, 3) poses of the markers, each by its most certain sighting among those of most support.
+    """(k, 3) poses of the markers, each by one of its sightings.
+
+    It is the most certain one with at least half the maximum support (`sightings.consensus`).
 
     `in_world` (s, 3) and `covariances` (s, 3, 3) are the marker poses by each sighting.
     """

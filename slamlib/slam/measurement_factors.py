@@ -11,7 +11,7 @@ import numpy as np
 
 from slamlib import se2
 from slamlib.slam.errors import between_error
-from slamlib.slam.state import RANGE_SIGMA
+from slamlib.slam.state import CALIBRATION_SIGMA
 
 MIN_DISTANCE = 1e-9          # m, below which a range has no direction
 
@@ -63,7 +63,8 @@ def linearize_ranges(accepted, noise, state):
     e = (offset + scale * distance - r.distance[rows])[:, None]
     jacobians = [scale * jacobian for jacobian in jacobians]
     if m.calibrated:
-        jacobians.append(RANGE_SIGMA * np.stack([np.ones_like(distance), distance], -1)[:, None])
+        by_offset_and_scale = np.stack([np.ones_like(distance), distance], -1)
+        jacobians.append((CALIBRATION_SIGMA * by_offset_and_scale)[:, None])
     return _whitened(rows, r.row[rows], len(m.marker) + r.antenna[rows], e, jacobians,
                      1 / r.sigma[rows, None, None], accepted.range_weight[rows], noise.ranges,
                      accepted.range_kernel)

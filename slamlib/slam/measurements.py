@@ -37,7 +37,7 @@ class Ranges:
     row: np.ndarray          # (r,) row of `Measurements.frame`
     antenna: np.ndarray      # (r,) row of `Measurements.antenna`
     distance: np.ndarray     # (r,) m
-    sigma: np.ndarray        # (r,) m
+    sigma: np.ndarray        # (r,) m, at least MIN_MEASUREMENT_SIGMA
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import numpy as np
 from slamlib.slam.evidence import laplace_approximation
 from slamlib.slam.fit import refine
 from slamlib.slam.measurement_factors import linearize_ranges
-from slamlib.slam.noise_learning import density, greatest_density
+from slamlib.slam.noise_learning import greatest_log_density, log_density
 from slamlib.slam.normal_equations import NormalEquations
 from slamlib.slam.odometry_factors import preintegrate_odometry
 
@@ -47,4 +47,4 @@ def _log_density(equations, posterior, is_greatest=False):
     """
     if posterior is None or not posterior.covariance.any():          # nothing was learned
         return laplace_approximation(equations, equations.problem.noise)[1]
-    return density(equations) if is_greatest else greatest_density(equations, posterior)
+    return log_density(equations) if is_greatest else greatest_log_density(equations, posterior)

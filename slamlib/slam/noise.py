@@ -37,7 +37,7 @@ class Noise:
         return cls(*np.exp(logarithms).tolist())
 
 
-def with_noise(dataset, slip=None, marker_noise_factor=None, range_noise_factor=None):
+def with_known_noise(dataset, slip=None, marker_noise_factor=None, range_noise_factor=None):
     """The Dataset whose Vehicle has these noise parameters; None leaves that of the Vehicle."""
     values = zip(NOISE_KEYS, (slip, marker_noise_factor, range_noise_factor))
     return replace(dataset, vehicle=replace(dataset.vehicle, **{

@@ -33,7 +33,7 @@ class NoisePosterior:
 
     noise: Noise                 # the mode
     covariance: np.ndarray       # (3, 3) of its logarithms, 0 for parameters that are not learned
-    density: float               # log posterior at the mode, up to a constant
+    log_density: float           # log posterior at the mode, up to a constant
     points: tuple                # of (probability, Noise), over which estimates are averaged
 
 
@@ -47,18 +47,18 @@ def learn_noise(equations):
         return NoisePosterior(noise, np.zeros((3, 3)), SINGULAR, ((1.0, noise),))
     frames = len(equations.problem.measurements.frame)
     smallest = 1 / np.sqrt(2 * np.maximum([3 * frames, *equations.counts()], 1))
-    mode, density, covariance = _mode(log_posterior, start, value, free, smallest[free])
-    return NoisePosterior(Noise.from_logarithms(mode), covariance, density,
-                          _points(log_posterior, mode, density, covariance))
+    mode, log_density_of_mode, covariance = _mode(log_posterior, start, value, free, smallest[free])
+    return NoisePosterior(Noise.from_logarithms(mode), covariance, log_density_of_mode,
+                          _points(log_posterior, mode, log_density_of_mode, covariance))
 
 
-def density(equations):
+def log_density(equations):
     """Log posterior density of the noise of the equations' problem, up to a constant."""
     log_posterior, noise, _ = _log_posterior(equations_of_first_frames(equations))
     return log_posterior(noise)
 
 
-def greatest_density(equations, posterior):
+def greatest_log_density(equations, posterior):
     """Log posterior density at the mode that `learn_noise` finds, up to a constant.
 
     `posterior`, the NoisePosterior of nearly the same equations, gives step sizes and correlations.
@@ -141,11 +141,12 @@ def _differences(function, x, value, free, steps, correlation=None):
     return gradient, hessian
 
 
-def _points(log_posterior, mode, density, covariance):
+def _points(log_posterior, mode, log_density_of_mode, covariance):
     """Tuple of (probability, Noise) along the slip, each with the most probable factors.
 
-    At each point the sigmas are replaced by their root mean square over the remaining uncertainty.
-    `mode` and `covariance`, (3,) and (3, 3), are of the logarithms, `density` that at the mode.
+    Each point has the root mean square exp(mu + s^2) of its log-normal noise parameters.
+    `mode` (3,) and `covariance` (3, 3) are of the logarithms; `log_density_of_mode` is the log
+    posterior at the mode.
     """
     sigma = np.sqrt(covariance[0, 0])
     direction = covariance[0] / (sigma or 1)     # (3,) for one sigma of log slip; 0 if it is known
@@ -153,7 +154,7 @@ def _points(log_posterior, mode, density, covariance):
         remaining, offsets, weights = covariance, [0.0], np.ones(1)
     else:
         remaining, offsets = covariance - np.outer(direction, direction), POINT_OFFSETS
-        logs = np.array([log_posterior(mode + offset * direction) if offset else density
+        logs = np.array([log_posterior(mode + offset * direction) if offset else log_density_of_mode
                          for offset in offsets])
         weights = np.exp(logs - logs.max())
     variance = np.maximum(np.diag(remaining), 0)

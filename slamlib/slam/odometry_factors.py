@@ -26,7 +26,7 @@ class OdometryFactors:
 
     model: str               # of a step, "arc" or "euler"
     increment: np.ndarray    # (f-1, 3) Delta(0), extrapolated linearly: m, m, rad
-    by_w: np.ndarray         # (f-1, 3, 3) dDelta/dw, per sigma of each wheel parameter
+    J_w: np.ndarray          # (f-1, 3, 3) dDelta/dw, per sigma of each wheel parameter
     quantization: np.ndarray  # (f-1, 3, 3) covariance without slip, in the axes of the end
     slipping: np.ndarray     # (f-1, 3, 3) covariance of slip 1 sqrt(m), in the same axes
 
@@ -52,7 +52,7 @@ def preintegrate_odometry(measurements, model, relinearize_at=(0.0, 0.0, 0.0)):
     quantization, slipping = odometry_noise(dataset.ticks, vehicle, start, end)
     by_w, turn = by_wheel * vehicle.sigma_wheel, -increment[:, 2]
     return OdometryFactors(
-        model=model, increment=increment - by_w @ relinearize_at, by_w=by_w,
+        model=model, increment=increment - by_w @ relinearize_at, J_w=by_w,
         quantization=se2.rotate_covariance(quantization, turn),
         slipping=se2.rotate_covariance(slipping, turn))
 
@@ -73,6 +73,6 @@ def odometry_error(factors, poses, w):
 
     At poses (f, 3) of the frames and w (3,). The errors are not whitened.
     """
-    increment = factors.increment + factors.by_w @ w
+    increment = factors.increment + factors.J_w @ w
     e, by_first, by_second, by_increment = between_error(increment, poses[:-1], poses[1:])
-    return e, np.concatenate([by_first, by_second, by_increment @ factors.by_w], axis=2)
+    return e, np.concatenate([by_first, by_second, by_increment @ factors.J_w], axis=2)

@@ -26,7 +26,7 @@ from slamlib.slam.fit import refine, solved_by_gtsam
 from slamlib.slam.initialization import initial_state, state_from_poses
 from slamlib.slam.measurements import measure
 from slamlib.slam.model_choice import better_model
-from slamlib.slam.noise import NOISE_KEYS, Noise, with_known, with_noise
+from slamlib.slam.noise import NOISE_KEYS, Noise, with_known, with_known_noise
 from slamlib.slam.odometry_factors import preintegrate_odometry
 from slamlib.slam.problem import build_problem
 from slamlib.slam.range_calibration import calibrated
@@ -76,7 +76,7 @@ def estimate(dataset, slip=None, model=None, previous=None, *, marker_noise_fact
 asymmetric Cauchy, asymmetric Tukey, not 'L2'
     """
     _check_options(model, slip, marker_noise_factor, range_noise_factor)
-    dataset = with_noise(dataset, slip, marker_noise_factor, range_noise_factor)
+    dataset = with_known_noise(dataset, slip, marker_noise_factor, range_noise_factor)
     accept = partial(accepted_measurements, rule=acceptance_rule(kernel, gate))
 
     measurements = measure(dataset)                                                   # 1

@@ -1,6 +1,6 @@
-"""Stage 6: a common offset and scale of the ranges, unless the evidence decides against them.
+"""Stage 6: a common offset and scale of the ranges, estimated unless the evidence rejects them.
 
-If it does not decide, they remain variables: a possible offset makes the antennas less certain.
+Without a decision they remain variables: a possible offset makes the antennas less certain.
 """
 
 from dataclasses import replace
@@ -15,7 +15,7 @@ def calibrated(fit, accept=accepted_measurements):
     """The Fit with offset and scale of the ranges as variables.
 
     `fit` itself if its evidence leads by DECISIVE_LEAD or if there are no ranges. Both are compared
-    at its state and on its accepted measurements. `accept` as in `refine`.
+    at its state and on its accepted measurements. `accept` and errors raised as in `refine`.
     """
     if not len(fit.problem.measurements.ranges.row):
         return fit

@@ -14,7 +14,7 @@ from slamlib.slam.measurement_factors import linearize_measurements
 from slamlib.slam.moments import posterior_moments
 from slamlib.slam.noise import Noise
 from slamlib.slam.odometry_factors import odometry_error
-from slamlib.slam.state import RANGE_SIGMA
+from slamlib.slam.state import CALIBRATION_SIGMA
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,8 @@ def slam_result(fit):
         noise=problem.noise, noise_sigma=np.zeros(3) if fit.posterior is None
         else np.sqrt(np.diag(fit.posterior.covariance)),
         range_calibration=state.range_calibration,
-        range_calibration_covariance=RANGE_SIGMA[:, None] * marginal.c * RANGE_SIGMA,
+        range_calibration_covariance=(
+            CALIBRATION_SIGMA[:, None] * marginal.c * CALIBRATION_SIGMA),
         camera=estimate_camera_offsets(fit.equations),
         model=problem.odometry.model, log_evidence=float(fit.log_evidence),
         chi2_per_dof=chi2_per_dof(problem, state, np.r_[sighting_weight, range_weight]),

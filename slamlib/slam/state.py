@@ -10,7 +10,7 @@ import numpy as np
 
 from slamlib import odometry, se2
 
-RANGE_SIGMA = np.array([0.2, 0.05])      # m and 1, prior of offset and scale of the ranges
+CALIBRATION_SIGMA = np.array([0.2, 0.05])    # m and 1, prior of offset and scale of the ranges
 
 
 @dataclass(frozen=True)
@@ -21,12 +21,12 @@ class State:
     markers: np.ndarray      # (k, 3), heading 0 where a marker is a point
     antennas: np.ndarray     # (a, 2) m
     w: np.ndarray            # (3,) in units of sigma
-    c: np.ndarray            # (2,) in units of RANGE_SIGMA, 0 if the ranges are not calibrated
+    c: np.ndarray            # (2,) in units of CALIBRATION_SIGMA, 0 without calibration
 
     @property
     def range_calibration(self):
         """(2,) offset in m and scale of the ranges: measured = offset + scale * distance."""
-        return np.array([0.0, 1.0]) + RANGE_SIGMA * self.c
+        return np.array([0.0, 1.0]) + CALIBRATION_SIGMA * self.c
 
 
 def state_from_arrays(measurements, poses, markers, antennas, w, c=np.zeros(2)):
@@ -44,7 +44,7 @@ def state_from_arrays(measurements, poses, markers, antennas, w, c=np.zeros(2)):
 
 
 def retract(measurements, state, delta):
-    """The State after a step delta (n,), a solution of the normal equations.
+    """The State after a step delta (n,) in m and rad, of w and c without unit.
 
     Poses and markers move in their own axes, as GTSAM's do: X becomes X delta.
     """

@@ -34,7 +34,7 @@ class Structure:
     width: np.ndarray        # (v,) number of unknowns of every variable
     elimination_order: np.ndarray    # (v,) position of every variable in the elimination
     first_row: np.ndarray    # (v,) row of the first unknown of every variable
-    block: np.ndarray        # (b,) every block: order of its column times v, plus order of its row
+    block: np.ndarray        # (b,) sorted keys: order of the column times v, plus order of the row
     first_place: np.ndarray  # (b,) place of every block's first entry
     column_height: np.ndarray        # (v,) number of entries in every column of a variable
     indices: np.ndarray      # (e,) row of every entry, column by column

@@ -44,7 +44,7 @@ def with_checked_wheels(result, fit, solve):
     except (DatasetError, np.linalg.LinAlgError):
         return result
     wheel = stated.wheel + uncertain.sigma_wheel * alternative.state.w
-    lead = alternative.posterior.density - compared.posterior.density
+    lead = alternative.posterior.log_density - compared.posterior.log_density
     if alternative.problem.accepted.weight.sum() \
             < MIN_ACCEPTED * fit.problem.accepted.weight.sum() \
             or alternative.problem.noise.slip > MAX_SLIP_RATIO * result.slip \

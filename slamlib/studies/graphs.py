@@ -13,7 +13,7 @@ from slamlib.slam.evidence import log_evidence
 from slamlib.slam.fit import refine
 from slamlib.slam.gtsam_graph import nonlinear_graph
 from slamlib.slam.measurements import measure
-from slamlib.slam.noise import Noise, with_known, with_noise
+from slamlib.slam.noise import Noise, with_known, with_known_noise
 from slamlib.slam.odometry_factors import preintegrate_odometry
 from slamlib.slam.optimizer import optimize
 from slamlib.slam.pipeline import fit_from_odometry
@@ -24,15 +24,15 @@ from slamlib.slam.result import SlamResult, slam_result
 def fixed_wheels(measurements, model, relinearize_at=None):
     """OdometryFactors of wheels without errors; they do not depend on `relinearize_at`."""
     factors = preintegrate_odometry(measurements, model)
-    return replace(factors, by_w=np.zeros_like(factors.by_w))
+    return replace(factors, J_w=np.zeros_like(factors.J_w))
 
 
 def independent_chain(measurements, model, relinearize_at=None):
     """OdometryFactors with wheel errors as independent noise, linearised at the nominal wheels."""
     factors = preintegrate_odometry(measurements, model)
-    noise = se2.rotate_covariance(factors.by_w @ np.swapaxes(factors.by_w, 1, 2),
+    noise = se2.rotate_covariance(factors.J_w @ np.swapaxes(factors.J_w, 1, 2),
                                   -factors.increment[:, 2])
-    return replace(factors, by_w=np.zeros_like(factors.by_w),
+    return replace(factors, J_w=np.zeros_like(factors.J_w),
                    quantization=factors.quantization + noise)
 
 
@@ -113,7 +113,7 @@ def compare_graphs(seed, **options):
     """
     dataset, truth = simulate("short", seed, **options)
     numbers = {}
-    markers = with_noise(dataset.without("uwb"), options.get("slip", 1e-3), 1.0, 1.0)
+    markers = with_known_noise(dataset.without("uwb"), options.get("slip", 1e-3), 1.0, 1.0)
     for kind in graph_kinds(markers):
         name, found = f"{kind.wheels} {kind.model}", kind.result
         numbers |= {f"{name} evidence": kind.log_evidence, f"{name} chi2": found.chi2_per_dof,

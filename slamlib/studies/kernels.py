@@ -13,14 +13,14 @@ from slamlib.slam.acceptance import (
     AcceptedMeasurements,
     acceptance_rule,
     accepted_measurements,
+    gate_weights,
     kept_weights,
     residuals,
-    within_gates,
 )
 from slamlib.slam.fit import refine
 from slamlib.slam.initialization import odometry_state, trilaterated_antennas
 from slamlib.slam.measurements import measure
-from slamlib.slam.noise import Noise, with_known, with_noise
+from slamlib.slam.noise import Noise, with_known, with_known_noise
 from slamlib.slam.optimizer import optimize
 from slamlib.slam.problem import build_problem
 from slamlib.slam.result import slam_result
@@ -99,7 +99,7 @@ def graduated(problem, state):
     (Yang, Antonante, Tzoumas and Carlone, IEEE RA-L 5(2), 2020).
     """
     m, gate = problem.measurements, EARLY_GATE**2
-    weight = within_gates(problem, state, EARLY_GATE, EARLY_GATE)
+    weight = gate_weights(problem, state, EARLY_GATE, EARLY_GATE)
     ranges = slice(len(m.marker_row), None)
     weight[ranges], control = 1, None
     while control is None or ((weight > 0) & (weight < 1)).any():
@@ -127,7 +127,7 @@ def late_ranges(seed, markers=True, methods=tuple(RANGE_METHODS), **options):
     """
     dataset, truth = simulate("short", seed, **options)
     dataset, numbers = dataset if markers else dataset.without("aruco"), {}
-    measurements, starts = measure(with_noise(dataset, TYPICAL_SLIP, 1.0, 1.0)), {}
+    measurements, starts = measure(with_known_noise(dataset, TYPICAL_SLIP, 1.0, 1.0)), {}
     for method in methods:
         found = slam_result(solve_with(measurements, ranges=method, starts=starts))
         judged = judge_slam(found, dataset, truth)
@@ -149,7 +149,7 @@ def wrong_labels(seed, methods=tuple(SIGHTING_METHODS), **options):
     """
     dataset, truth = simulate("short", seed, **options)
     dataset, numbers, starts = dataset.without("uwb"), {}, {}
-    measurements = measure(with_noise(dataset, TYPICAL_SLIP, 1.0, 1.0))
+    measurements = measure(with_known_noise(dataset, TYPICAL_SLIP, 1.0, 1.0))
     wrong = mislabelled(measurements, truth)
     for method in methods:
         fit = solve_with(measurements, sightings=method, starts=starts)

@@ -2,8 +2,8 @@
 
 A study depends on the code of the numerics, on the packages that compute it, and on its trial,
 seeds and options; it does not depend on a user's datasets. While a report is built,
-SLAMLIB_STUDIES names the folder of the studies that are kept. Without it each is computed. No page
-may print times that a trial measures, because they are kept, too. SLAMLIB_SEEDS, a number, cuts
+SLAMLIB_STUDIES names the folder of the studies that are kept. Without it each is computed. Times
+that a trial measures are kept, too, so pages must not print them. SLAMLIB_SEEDS, a number, cuts
 every study to its first seeds; tests of pages use it. The build reads the progress of a study in
 the file SLAMLIB_PROGRESS; in JupyterLab, without this file, a long study shows a bar.
 """
@@ -24,7 +24,7 @@ from tqdm.auto import tqdm
 from slamlib.studies import workers
 
 SLAMLIB = Path(__file__).parents[1]
-SHOWING = ("notebook", "report")           # folders of code on which no study depends
+PAGE_PACKAGES = ("notebook", "report")     # imports run downwards: no study depends on them
 NUMERIC_PACKAGES = ("numpy", "scipy", "gtsam")
 THREADS = ("OMP_", "OPENBLAS_", "MKL_")    # prefixes of variables that set numbers of threads
 BAR_AFTER = 5.0                            # s, duration of a study from which on it shows a bar
@@ -85,11 +85,11 @@ def code_digest():
         platform.python_implementation(), platform.python_version(), platform.platform(),
         [version(package) for package in NUMERIC_PACKAGES],
         [(str(file.relative_to(SLAMLIB)), digest(file.read_bytes()))
-         for file in modules(*SHOWING)]]).encode())
+         for file in modules(*PAGE_PACKAGES)]]).encode())
 
 
 def modules(*without):
-    """Paths of slamlib's modules and styles, except the command line and the folders named."""
+    """Paths of slamlib's modules and styles, except __main__ and the packages `without` (str)."""
     return sorted(file for file in SLAMLIB.rglob("*")
                   if file.suffix in (".py", ".mplstyle") and file.name != "__main__.py"
                   and file.relative_to(SLAMLIB).parts[0] not in without)

@@ -14,7 +14,7 @@ from slamlib.simulation import misguess, simulate
 from slamlib.slam.acceptance import AcceptedMeasurements
 from slamlib.slam.initialization import consensus_markers, odometry_state, state_from_poses
 from slamlib.slam.measurements import measure
-from slamlib.slam.noise import Noise, with_noise
+from slamlib.slam.noise import Noise, with_known_noise
 from slamlib.slam.normal_equations import NormalEquations
 from slamlib.slam.optimizer import optimize
 from slamlib.slam.problem import build_problem
@@ -163,7 +163,8 @@ def guesses(seed, error, poses=None, markers=True, from_guess=True, **options):
     dataset, truth = simulate("short", seed, **options)
     dataset = misguess(dataset if markers else dataset.without("aruco"), truth.antenna_in_world,
                        error, seed)
-    dataset = with_noise(dataset if poses is None else dataset.first(poses), TYPICAL_SLIP, 1.0, 1.0)
+    dataset = dataset if poses is None else dataset.first(poses)
+    dataset = with_known_noise(dataset, TYPICAL_SLIP, 1.0, 1.0)
     measurements = measure(dataset)
     found = slam_result(solve_with(measurements))
     miss, squared = antenna_error(found, truth)

@@ -1,4 +1,4 @@
-"""Processes for trials, connected by pipes only, so that nothing remains however they end.
+"""Processes for trials, connected by pipes only; none outlives its parent, no semaphore remains.
 
 Process pools have named semaphores, which stay in shared memory if a kernel is killed, and workers
 that outlive it. A pipe is closed when the process at its other end ends.
@@ -105,7 +105,7 @@ def _serve():
     """Answer the calls that stdin brings, on stdout, until either end of a pipe is closed."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)            # which interrupts the parent, too
     with suppress(EOFError, OSError), os.fdopen(os.dup(1), "wb") as answers:
-        os.dup2(2, 1)                                       # what a trial prints is no answer
+        os.dup2(2, 1)                                       # stdout carries answers only
         while True:
             trial, seed, options = pickle.load(sys.stdin.buffer)
             try:
