@@ -1,5 +1,7 @@
 """A notebook is executed again when something changed that it depends on, and only then."""
 
+import gzip
+import json
 import shutil
 from importlib.metadata import distributions
 
@@ -159,10 +161,30 @@ def executed(folder):
     return file
 
 
+BOOK = nbformat.v4.new_notebook(cells=[new_code_cell("1 + 1", id="c")])
+
+
+def crafted(book=BOOK, files=None, key=None):
+    """A change of the only entry to one that is whole and holds this book and these files."""
+    def change(folder):
+        own = executed(folder).name.split(".")[1]
+        executed(folder).write_bytes(gzip.compress(json.dumps(
+            [key or own, book, {} if files is None else files]).encode()))
+    return change
+
+
 @pytest.mark.parametrize("change", [
     lambda folder: executed(folder).unlink(),
     lambda folder: executed(folder).write_bytes(b"\xff\x00 not this"),
     lambda folder: executed(folder).write_bytes(executed(folder).read_bytes()[:-9]),
+    lambda folder: executed(folder).write_bytes(gzip.compress(b"not JSON")),
+    lambda folder: executed(folder).write_bytes(gzip.compress(b"[1, 2]")),
+    crafted(key="another"), crafted([1]), crafted(5), crafted(nbformat.v4.new_notebook()),
+    crafted({**BOOK, "cells": [{}, *BOOK.cells]}),
+    crafted({**BOOK, "cells": [new_code_cell("1 + 2", id="c")]}),
+    crafted(files=5), crafted(files=["a.mat"]), crafted(files={"a.mat": 1}),
+    crafted(files={"a.mat": "not base64!"}), crafted(files={"../a.mat": ""}),
+    crafted(files={"/a.mat": ""}), crafted(files={"b/../../a.mat": ""}),
     lambda folder: (folder / "data" / "new.txt").write_text("new"),
     lambda folder: (folder / "helper.py").write_text("read by a notebook"),
 ])
@@ -170,6 +192,12 @@ def test_a_change_or_a_damaged_file_is_as_if_nothing_were_kept(kept, tmp_path, c
     assert kept() is not None
     change(tmp_path)
     assert kept() is None
+
+
+def test_an_entry_that_is_whole_is_recalled(kept, tmp_path):
+    """What the entries above differ from."""
+    crafted(files={"a.mat": "YQ=="})(tmp_path)
+    assert kept()[1] == ["a.mat"] and (tmp_path / "results" / "a.mat").read_text() == "a"
 
 
 def test_a_damaged_entry_never_changes_what_is_recalled(kept, tmp_path):

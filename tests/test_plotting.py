@@ -1,10 +1,13 @@
 """Figures, wide and narrow: what is in them, and that nothing exceeds them."""
 
+from functools import partial
+
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from matplotlib.transforms import Affine2D
 
+from slamlib.evaluation import REACH_95
 from slamlib.notebook import plotting, schemes
 from slamlib.se2 import rotation
 
@@ -151,3 +154,14 @@ def test_the_scheme_of_a_graph_has_a_square_for_each_factor_and_a_name_for_each_
     assert len(squares) == 3 + 2 + 2 + 3       # sightings, ranges, odometry, and three priors
     assert [text.get_text() for text in ax.texts] == [
         "$X_1$", "$X_2$", "$X_3$", "$L_{7}$", "$L_{8}$", "$A_{5}$", "$w$"]
+
+
+def test_markers_and_antennas_have_their_own_covariances():
+    positions = np.arange(8.0).reshape(4, 2)
+    covariances = elongated(4, 2.0, 0.5) * np.arange(1, 5)[:, None, None]
+    for draw, factor in ((plotting.draw_markers, 1),
+                         (partial(plotting.draw_antennas, enlarged=3), 3)):
+        _, ((ax,),) = plotting.panels(1)
+        draw(ax, positions, covariances)
+        patches, = ax.collections
+        require_contours(patches, positions, covariances, factor * REACH_95)

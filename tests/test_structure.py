@@ -1,6 +1,7 @@
 """The structure of the package: imports run downwards, modules and functions are short."""
 
 import ast
+import sys
 from pathlib import Path
 
 import pytest
@@ -41,7 +42,31 @@ def package(module):
     return parts[1] if len(parts) > 1 and (ROOT / parts[1]).is_dir() else ""
 
 
+def outside(module):
+    """Names of the packages besides slamlib that a module imports, and "importlib"."""
+    names = {name for node in ast.walk(MODULES[module]) if isinstance(node, ast.Import)
+             for name in (alias.name for alias in node.names)}
+    names |= {node.module for node in ast.walk(MODULES[module]) if isinstance(node, ast.ImportFrom)}
+    names = {name.partition(".")[0] for name in names}
+    return {name for name in names if name not in sys.stdlib_module_names - {"importlib"}
+            and name != "slamlib"}
+
+
+@pytest.mark.parametrize("module", [name for name in MODULES if package(name) in NUMERICS])
+def test_numerics_use_numpy_scipy_and_gtsam_only(module):
+    """And of slamlib's own modules none that judges, writes or simulates."""
+    assert outside(module) <= {"numpy", "scipy", "gtsam"}
+    assert not imports(module) & {f"slamlib.{name}" for name in (
+        "evaluation", "results", "export", "solve", "summary", "simulation", "swap", "locks",
+        "arguments", "inventory")}
+
+
+def test_what_reads_a_dataset_judges_nothing():
+    assert "slamlib.evaluation" not in imports("slamlib.dataset") | imports("slamlib.sightings")
+
+
 def test_the_walk_sees_what_is_imported():
+    assert outside("slamlib.studies.memory") >= {"joblib", "numpy", "tqdm"}
     assert "slamlib.slam.state" in imports("slamlib.slam.optimizer")
     assert "slamlib.summary" in imports("slamlib.__main__")
     assert "slamlib.se2" in imports("slamlib.evaluation")

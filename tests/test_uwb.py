@@ -614,6 +614,6 @@ def test_gtsam_takes_the_last_steps_of_a_solution(monkeypatch):
 def test_ranges_hardly_move_a_drive_full_of_markers_and_bound_one_without():
     full = studies.run(montecarlo.ranges_added, range(4))
     assert full["moved"].max() < 0.3 and (full["sigma with"] <= full["sigma without"]).all()
-    few = studies.run(montecarlo.ranges_added, range(8), share=0.1)
-    assert decided(np.log(few["ate without"] / few["ate with"]))
+    few = studies.run(montecarlo.ranges_added, range(16), share=0.1)
+    assert decided(few["ate without"] - 2 * few["ate with"])            # less than half on average
     assert (few["sigma with"] < 0.6 * few["sigma without"]).all()

@@ -211,9 +211,9 @@ def _executed(books, keys, environment, jobs, stage, kept, fresh):
 
 
 def _seconds(kept):
-    """Return the file of the seconds that cells take, another one, and what its seconds are.
+    """Return the paths of two files of cells' seconds, and which bound the second one gives.
 
-    They are more where studies are computed than where these are recalled.
+    Cells take longer where studies are computed than where these are recalled.
     """
     computed, recalled = kept / "seconds_computed.json", kept / "seconds_recalled.json"
     if (kept / STUDIES / CODE_DIGEST).is_dir():
@@ -248,7 +248,7 @@ def rendered(books, drives, options, address, has):
 
 
 def _resources_used(seconds):
-    """Return a sentence with the duration and, where the system tells it, the peak memory."""
+    """Return a sentence with the duration and, if available, the peak memory."""
     if resource is None:
         return f"built in {seconds:.1f} s"
     unit = 1 if sys.platform == "darwin" else 1024  # bytes in a unit of ru_maxrss

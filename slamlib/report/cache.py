@@ -11,7 +11,6 @@ nothing.
 import gzip
 import json
 import platform
-import zlib
 from base64 import b64decode, b64encode
 from importlib.metadata import distributions
 from pathlib import Path
@@ -76,20 +75,24 @@ def recall(folder, source, key, book, results):
     folder, results : str or Path, the folder of the cache; Path, the folder for the result files.
     source, key, book : Path of the notebook, str by `key_of`, and NotebookNode as it is now.
     """
-    path = entry(folder, source, key)
+    path, cells = entry(folder, source, key), _code_cells(book)
     try:
         found, executed, files = json.loads(gzip.decompress(path.read_bytes()))
-    except (OSError, EOFError, ValueError, zlib.error):  # it is absent, damaged or empty
+        executed = nbformat.from_dict(executed)
+        nbformat.validate(executed)
+        kept = _code_cells(executed)
+        contents = {name: b64decode(content, validate=True) for name, content in files.items()}
+    except Exception:  # it is absent, damaged or of another kind
         return None
-    if found != key:
+    if found != key or [cell.source for cell in kept] != [cell.source for cell in cells] \
+            or any(".." in name.split("/") or name.startswith("/") for name in contents):
         return None
-    kept = _code_cells(nbformat.from_dict(executed))
-    for cell, other in zip(_code_cells(book), kept, strict=True):
+    for cell, other in zip(cells, kept):
         cell.outputs, cell.execution_count = other.outputs, other.execution_count
-    for name, content in files.items():
-        swap.write_atomically(results / name, b64decode(content))
+    for name, content in contents.items():
+        swap.write_atomically(results / name, content)
     path.touch()
-    return [*files]
+    return [*contents]
 
 
 def keep(folder, source, key, book, results, names):

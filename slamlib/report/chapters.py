@@ -62,7 +62,7 @@ def available(drives):
 
 
 def needs(source, node):
-    """Return what a notebook or a cell (NotebookNode) says that it needs, or None.
+    """Return the data (str) that a notebook or a cell (NotebookNode) requires, or None.
 
     The metadata say so, as {"slamlib": {"needs": "uwb"}}. NotebookError, which names the file
     `source` (Path), if it is not among NEEDS.

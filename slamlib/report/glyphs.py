@@ -1,4 +1,4 @@
-"""Characters that the PDF's fonts lack, told with the words around them."""
+"""Reports characters that the PDF's fonts lack, with the words around them."""
 
 import re
 

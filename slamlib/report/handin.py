@@ -23,7 +23,7 @@ from slamlib.solve import PROBLEMS, SENSORS, title
 LINE_WIDTH = 88  # characters in a line of README.txt
 README = Path(__file__).with_name("readme.txt")  # a template of Jinja
 LEFT_OUT = ("Explore", "Files")  # titles of sections that are for screens, or on other folders
-PACKAGES_TOLD = ("slamlib", "numpy", "scipy", "gtsam")  # README.txt tells their versions
+PACKAGES_TOLD = ("slamlib", "numpy", "scipy", "gtsam")  # with versions in README.txt
 
 
 def selection(data, names=None):

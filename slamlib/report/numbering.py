@@ -28,7 +28,7 @@ TEXT_PARTS = re.compile(  # code, formulas and addresses; headings; captions; re
 
 
 def _to_absent(letters):
-    """Return a Pattern of what only points to an appendix whose letter is not in `letters`."""
+    """Return a Pattern of references to appendices whose letter is not in `letters`."""
     absent = f"(?![{letters} ])[A-Z]"
     label = rf"(?:(?i:figure|table)s?\s+{absent}\.\d+|(?i:appendix)\s+{absent}\b(?!\s+of\b))"
     sentence = rf"(?=[A-Z]){label}(?:(?!\n\n).)*?[.?!]"

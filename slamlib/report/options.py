@@ -22,7 +22,7 @@ class Cover:
 
 @dataclass(frozen=True)
 class Options:
-    """What report.toml says."""
+    """Options of report.toml."""
 
     cover: Cover = Cover()
     leave_out: dict = field(default_factory=dict)  # as of `sections.to_execute`

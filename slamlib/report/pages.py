@@ -30,7 +30,7 @@ from slamlib.report.svg import DRAWN, FAMILY, compressed
 
 PAGE = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
 STYLE = Path(__file__).with_name("page.css").read_text(encoding="utf-8")
-SCRIPT = Path(__file__).with_name("page.js")  # of what moves; without it the pictures stand still
+SCRIPT = Path(__file__).with_name("page.js")  # of moving figures, which stand still without it
 SHOWN = ["text/html", "text/markdown", "image/svg+xml", "text/latex", "image/png", "image/jpeg",
          "text/plain"]  # kinds of outputs, the first is preferred
 ANSWER = re.compile(r"<p><strong>Answer</strong></p>\n?")  # begins the block quote of an answer
@@ -120,7 +120,7 @@ def own_pages(folder):
 
 
 def new_page(source, chapters=()):
-    """Return the dict in which the renderer collects what it finds in a notebook (Path)."""
+    """Return the state (dict) of the renderer for a notebook (Path)."""
     return {"formulas": [], "section": "", "headings": [], "anchors": {}, "links": [],
             "figures": [], "chapters": chapters, "absent": (), "styles": [STYLE],
             "path": str(source.parent), "file": quote(f"{source.stem}.html"),

@@ -142,7 +142,7 @@ def _definitions(book):
 
 
 def _mended_typst(formula, typst, label):
-    """Return a Formula with its label in Typst, on one line; what pandoc sets unlike TeX is mended.
+    """Return a Formula with its label in Typst, on one line, corrected where pandoc deviates from TeX.
 
     `typst` (str) is the formula by pandoc.
     """
@@ -166,7 +166,7 @@ def _label(notebook, anchor=""):
 
 
 class Book:
-    """Chapters in Typst, and what they refer to.
+    """Chapters in Typst, and the files and marks that they refer to.
 
     `files` are the pictures as {name: bytes}; `texts` the chapters: file name, text without marks
     and NotebookNode; mark i stands for `formulas[i]` (list of Formula) or

@@ -83,7 +83,7 @@ def _role(solution):
 
 
 def _in_first_frame(drive, solution):
-    """Return the poses (n, 3) of a Solution in the frame of pose 1, where the last one knows it."""
+    """Return the poses (n, 3) of a Solution in the frame of pose 1, if the last one has it."""
     last = drive.solutions[-1].poses
     if solution.world and np.isfinite(last[solution.world, 0]):
         return se2.compose(last[solution.world], solution.poses)

@@ -54,7 +54,7 @@ class Progress:
         self.bar.update()
 
     def keep(self, name):
-        """Write what the cells of a notebook took, in the place of what they took before."""
+        """Replace the stored durations of the cells of a notebook."""
         keys = (key for key, _ in self.cells[name])
         self.known[name] = dict(zip(keys, self.seconds[name]))
         swap.write_atomically(self.file, json.dumps(self.known, indent=1).encode())

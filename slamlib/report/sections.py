@@ -64,7 +64,7 @@ def shown(books, has, leave_out):
     left_out, result = {_key(entry): place for entry, place in leave_out.items()}, {}
 
     def reason(section):
-        """Return why a section is left out (str), "" if untold, or None if it is shown."""
+        """Return why a section is left out (str), "" without a reason, or None if it is shown."""
         if section.needs not in {None, *has}:
             return f"no dataset has {section.needs}"
         return next((left_out[key] for key in (_key(section.number), _key(section.title))

@@ -43,7 +43,7 @@ def compiled(folder, book):
 
 
 def _typst_error(error, book):
-    """Return the NotebookError for what Typst says of a document."""
+    """Return the NotebookError for an error of Typst."""
     if line := re.search(r"formulas\.typ:(\d+):", error.diagnostic):  # formula 0 is on line 2
         return book.formulas[int(line[1]) - 2].error(
             f"Typst cannot set this formula, {error.message}")

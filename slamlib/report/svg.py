@@ -16,7 +16,7 @@ PAIR = r"\s*[-\d.e]+\s+[-\d.e]+"  # of coordinates
 LINES = re.compile(rf'(?<=\sd=")(?:\s*M{PAIR}(?:\s*L{PAIR})*(?:\s*z)?)+\s*(?=")')
 COORDINATES = re.compile(r'(\s(?:d|x|y|cx|cy|r|width|height|points)="|translate\()([^")]*)')
 LONG_NUMBER = re.compile(r"-?\d+\.\d{3,}")
-# The typeface of which matplotlib knows the widths, and those of the text in the PDF and the pages.
+# The typeface with which matplotlib measures text, and those of the text in the PDF and the pages.
 DRAWN = "STIXGeneral"
 FAMILY = ("'Libertinus Serif', Charter, 'Bitstream Charter', 'Iowan Old Style', 'Source Serif 4', "
           "Cambria, 'Liberation Serif', Georgia, STIXGeneral, serif")

@@ -162,8 +162,8 @@ def _dissection(H, frames):
 class _Part:
     """The elimination of the unknowns between two separators."""
 
-    rows: np.ndarray         # (e,) of what is eliminated
-    front: np.ndarray        # (s,) rows of what it is connected to
+    rows: np.ndarray         # (e,) of the eliminated unknowns
+    front: np.ndarray        # (s,) rows of the unknowns of the front
     inverse: np.ndarray      # (e, e) H_ee^-1
     K: np.ndarray            # (e, s)
     parts: tuple             # the two _Parts that are joined here, or none

@@ -23,10 +23,10 @@ MAX_SLIP_RATIO = 0.7         # ratio of the slips, of other to stated wheels
 EXPLAINED = {"wheel-parameters", "wheel-slip", "camera-offset", "time-offset"}
 
 
-def with_checked_wheels(result, fit, solve):
+def with_checked_wheels(result, fit, refit):
     """The SlamResult of a Fit, with a doubt if other wheel parameters explain the drive better.
 
-    `solve` makes a Fit from Measurements and a SlamResult.
+    `refit` makes a Fit from Measurements and a SlamResult.
     """
     doubted = {doubt.what for doubt in result.drive_doubts}
     if not fit.problem.measurements.learned[0] or not (
@@ -38,7 +38,7 @@ def with_checked_wheels(result, fit, solve):
         sigma_left_radius=WEAK_WHEEL_SIGMA * stated.left_radius,
         sigma_wheelbase=WEAK_WHEEL_SIGMA * stated.wheelbase)
     try:
-        alternative = solve(measure(replace(dataset, vehicle=uncertain)), result)
+        alternative = refit(measure(replace(dataset, vehicle=uncertain)), result)
         accepted = replace(alternative.problem.accepted, measurements=fit.problem.measurements)
         compared = refine(replace(fit.problem, accepted=accepted), fit.state, accept=None)
     except (DatasetError, np.linalg.LinAlgError):

@@ -73,7 +73,7 @@ def _worker():
 
 
 def _end(worker):
-    with suppress(OSError):                                 # what it did not read, if it was killed
+    with suppress(OSError):                                 # unread input, if it was killed
         worker.stdin.close()
     worker.stdout.close()
     worker.wait()
