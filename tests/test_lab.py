@@ -42,7 +42,7 @@ KERNEL = {"kernelspec": {"name": "python3", "display_name": "Python 3 (ipykernel
 
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory):
-    """Address and token of a JupyterLab on a copy of a notebook and 300 poses of the short dataset."""
+    """Address and token of a JupyterLab on a copy of a notebook and 300 poses of `short`."""
     folder = tmp_path_factory.mktemp("lab")
     copied(folder / "notebooks", "1_odometry.ipynb", grids=True)
     nbformat.write(new_notebook(cells=[new_code_cell(COUNTED)], metadata=KERNEL),
