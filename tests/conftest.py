@@ -72,7 +72,8 @@ def copied(target, chapters, grids=False, first=None):
     """Write notebooks to a folder, by a pattern of their names; their Explore shows one figure.
 
     With `grids`, all figures between which its sliders move, which `report_on_all` draws, too. A
-    code cell `first` (str) stands before all others. Studies run on the short path only.
+    code cell `first` (str) stands before all others. Studies run on the short path only,
+    and what cells simulate by themselves on few drives.
     """
     import nbformat
     target.mkdir()
@@ -81,7 +82,7 @@ def copied(target, chapters, grids=False, first=None):
         if first:
             book.cells.insert(1, nbformat.v4.new_code_cell(first, id="first"))
         for cell in book.cells:
-            cell.source = cell.source.replace('path="long"', 'path="short"')
+            cell.source = cell.source.replace('path="long", ', '').replace("range(100)", "range(9)")
             if "explore.show_with_controls(" in cell.source and not grids:
                 cell.source, count = re.subn(r"\n *grid=\{.*?\},(?=\n)", "", cell.source,
                                              flags=re.DOTALL)
@@ -111,25 +112,35 @@ def few_seeds(monkeypatch):
 
 @pytest.fixture(scope="session")
 def report_on_all(tmp_path_factory, kept):
-    """A folder with data, report and results: all of data/, and what else a user may bring."""
+    """A folder with data, report and results: drives of data/, and what else a user may bring.
+
+    All but `short` are cut: a longer drive has no other page.
+    """
     import numpy as np
 
+    from slamlib.dataset import read_dataset, read_truth
     from slamlib.report import build_report
     from slamlib.simulation import manoeuvre, simulate, write_dataset
     folder = tmp_path_factory.mktemp("built")
     data = folder / "data"
-    shutil.copytree(ROOT / "data", data)
-    write_dataset(data / "new seed", *simulate("short", seed=77, late_ranges=0.15))
+    shutil.copytree(ROOT / "data", data, ignore=lambda *_: ["long"])
+    long = ROOT / "data" / "long"
+    for name, poses, drive in (
+            ("long", 5000, (read_dataset(long), read_truth(long))),
+            ("new seed", 1000, simulate("short", seed=77, late_ranges=0.15))):
+        dataset, truth = drive
+        write_dataset(data / name, dataset.first(poses),
+                      replace(truth, poses=truth.poses[:poses]))
     shutil.copytree(data / "new seed", data / "no_truth", ignore=lambda *_: ["truth"])
     waiting = np.concatenate([np.zeros((100, 2), int), simulate("short", seed=78)[0].ticks[:200]])
-    for name, ticks in (("wheels_only", simulate("short", seed=77)[0].ticks), ("waits", waiting),
+    for name, ticks in (("wheels_only", dataset.ticks[:1000]), ("waits", waiting),
                         ("one_pose", [[0, 0]]),
                         ("backs_up", np.rint(manoeuvre([(2, 1.0), (-2, 0.5)])))):
         (data / name).mkdir()
         np.savetxt(data / name / "encoderReading.txt",
                    np.column_stack([np.arange(1, len(ticks) + 1), ticks]), fmt="%d")
     seen = np.loadtxt(data / "new seed" / "ArucoReading.txt")
-    for name, rows in (("one_sighting", seen[:1]), ("sparse", seen[seen[:, 0] % 500 == 1])):
+    for name, rows in (("one_sighting", seen[:1]), ("sparse", seen[seen[:, 0] % 250 == 1])):
         shutil.copytree(data / "new seed", data / name)
         np.savetxt(data / name / "ArucoReading.txt", rows, fmt="%d %d" + 9 * " %.6g")
     copied(folder / "notebooks", "*.ipynb", grids=True)

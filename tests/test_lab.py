@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import shutil
 import subprocess
 import sys
 import time
@@ -11,13 +10,16 @@ from pathlib import Path
 
 import nbformat
 import pytest
+from conftest import copied
 from nbformat.v4 import new_code_cell, new_notebook
 from test_report import build, make_data, write
 from test_studies import CELL, kept
 
 from slamlib.__main__ import main
+from slamlib.dataset import read_dataset
 from slamlib.report import lab as starting
 from slamlib.report.execution import kernel_environment
+from slamlib.simulation import write_dataset
 
 ROOT = Path(__file__).parents[1]
 SECONDS = 120
@@ -40,13 +42,12 @@ KERNEL = {"kernelspec": {"name": "python3", "display_name": "Python 3 (ipykernel
 
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory):
-    """Address and token of a JupyterLab on copies of a notebook and of the short dataset."""
+    """Address and token of a JupyterLab on a copy of a notebook and 300 poses of `short`."""
     folder = tmp_path_factory.mktemp("lab")
-    (folder / "notebooks").mkdir()
-    shutil.copy(ROOT / "notebooks" / "1_odometry.ipynb", folder / "notebooks")
+    copied(folder / "notebooks", "1_odometry.ipynb", grids=True)
     nbformat.write(new_notebook(cells=[new_code_cell(COUNTED)], metadata=KERNEL),
                    folder / "notebooks" / "counted.ipynb")
-    shutil.copytree(ROOT / "data" / "short", folder / "data" / "short")
+    write_dataset(folder / "data" / "short", read_dataset(ROOT / "data" / "short").first(300))
     environment = {name: value for name, value in os.environ.items()
                    if not name.startswith(("SLAMLIB_", "JUPYTER"))}
     environment |= {"HOME": str(folder)} | {name: str(folder / name.lower()) for name in (
