@@ -142,7 +142,7 @@ def _definitions(book):
 
 
 def _mended_typst(formula, typst, label):
-    """Return a Formula with its label in Typst on one line, corrected where pandoc differs from TeX.
+    """Return a Formula with its label in Typst on one line, corrected where pandoc and TeX differ.
 
     `typst` (str) is the formula by pandoc.
     """
