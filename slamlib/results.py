@@ -57,13 +57,13 @@ def read_vehicle_poses(folder):
 
 
 def read_aruco_map(folder):
-    """Ids (k,), poses (k, 3) and covariances (k, 3, 3) of folder/ArucoMap.mat."""
+    """Ids (k,), poses (k, 3) in m and rad, and covariances (k, 3, 3) of folder/ArucoMap.mat."""
     ids, *rest = _read_structs(Path(folder) / "ArucoMap.mat", id=(), pose=(3,), covari=(3, 3))
     return ids.astype(int), *rest
 
 
 def read_uwb_map(folder):
-    """Ids (a,), positions (a, 2) and covariances (a, 2, 2) of folder/UwbMap.mat."""
+    """Ids (a,), positions (a, 2) in m and covariances (a, 2, 2) of folder/UwbMap.mat."""
     ids, *rest = _read_structs(Path(folder) / "UwbMap.mat", id=(), position=(2,), covariance=(2, 2))
     return ids.astype(int), *rest
 

@@ -67,7 +67,7 @@ def regular(covariance):
 
 
 def merge_repeated(aruco):
-    """index, z, C and contradicting of `Sightings`, with one row per pose and marker.
+    """`index`, `z`, `C` and `contradicting` of Sightings, with one row for each pose and marker.
 
     Repeated sightings in ArucoReadings of a marker at one pose are averaged, weighted by their
     information matrices, if all of them lie within GATE of the mean. Otherwise all are rejected.

@@ -206,11 +206,11 @@ class Renderer(IPythonRenderer):
         return caption and self.anchor(f"{caption[1].lower()}-{caption[2]}")
 
     def block_html(self, text):
-        """Return HTML as it is; nbconvert parses it to embed pictures, and would close its tags."""
+        """Return HTML unchanged; nbconvert parses it to embed pictures, and would close its tags."""
         return super().block_html(text) if IMG.search(text) else f"{text.strip()}\n"
 
     def inline_html(self, text):
-        """Return a tag as it is, see `block_html`."""
+        """Return a tag unchanged, but an image as `block_html` does."""
         return super().inline_html(text) if IMG.search(text) else text
 
     def block_quote(self, text):

@@ -39,9 +39,6 @@ stage 5 on long drives):
        result               Fit -> SlamResult in world axes
        wheel_check          SlamResult -> SlamResult: whether other wheels explain the drive better
 
-With the result of a problem with fewer sensors, `estimate` starts from it, without stage 4 and the
-choice of the model.
-
 Symbols in code and docstrings; sizes are f frames, k markers, a antennas, s sightings, r ranges and
 n unknowns, and (m, d) are m measurements of a kind with d errors each:
 

@@ -24,7 +24,10 @@ MAX_VOTES = 60               # number of sightings of a marker that enter its co
 
 
 def initial_state(measurements, model, preintegrate=preintegrate_odometry):
-    """The State from which a drive is solved; `model` and `preintegrate` as in `build_problem`."""
+    """The State from which a drive is solved; `model` and `preintegrate` as in `build_problem`.
+
+    Raises DatasetError as `optimize`, for the first part of a long drive.
+    """
     dataset, noise = measurements.dataset, with_known(Noise(), measurements.dataset.vehicle)
     part, state = None, None
     for count in part_lengths(dataset):
@@ -54,7 +57,10 @@ def part_lengths(dataset):
 
 
 def odometry_state(measurements, model, **landmarks):
-    """The State with poses by odometry; `landmarks` are keywords of `state_from_poses`."""
+    """The State with poses by odometry of the model "arc" or "euler".
+
+    `landmarks` are the keywords `markers` and `antennas` of `state_from_poses`.
+    """
     d, frame = measurements.dataset, measurements.frame
     poses, covariances = odometry.first_order(d.ticks, d.vehicle, model=model)
     return state_from_poses(measurements, poses[frame], covariances[frame], **landmarks)

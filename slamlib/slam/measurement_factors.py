@@ -54,7 +54,10 @@ def linearize_sightings(accepted, noise, state, as_pose):
 
 
 def linearize_ranges(accepted, noise, state):
-    """The LinearizedMeasurements of the ranges; expected is offset + scale * distance."""
+    """The LinearizedMeasurements of the ranges at a State, whitened by a Noise.
+
+    The expected range in m is offset + scale * distance, with the range calibration of the State.
+    """
     m, r = accepted.measurements, accepted.measurements.ranges
     rows = np.flatnonzero(accepted.range_weight)
     offset, scale = state.range_calibration

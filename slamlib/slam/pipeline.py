@@ -14,6 +14,10 @@ Each stage is a function from one frozen record to the next; stages have the num
         solved_by_gtsam   Fit -> Fit: the last steps by GTSAM
     7   slam_result       Fit -> SlamResult: mean and covariances over the possible noise, poses
                           between the frames, doubts
+        with_checked_wheels   SlamResult -> SlamResult: with a doubt about the stated wheels
+
+With a SlamResult of fewer sensors, stage 4 takes its poses (`fit_from_previous`), and the model of
+odometry is that of the result: problem 4 starts from problem 3.
 """
 
 from functools import partial
@@ -81,7 +85,7 @@ asymmetric Cauchy, asymmetric Tukey, not 'L2'
 
     measurements = measure(dataset)                                                   # 1
     if previous is not None:
-        fit = fit_from_previous(measurements, previous, model, accept)
+        fit = fit_from_previous(measurements, previous, model, accept)                # 2, 5, 6
     else:
         fit = fit_from_odometry(measurements, model or "arc", accept=accept)          # 2 to 6
         fit = fit if model else better_model(fit, "euler")
@@ -105,7 +109,10 @@ def fit_from_odometry(measurements, model="arc", preintegrate=preintegrate_odome
 
 
 def fit_from_previous(measurements, previous, model=None, accept=accepted_measurements):
-    """The Fit of Measurements from poses, wheels and model of a SlamResult; otherwise as above."""
+    """The Fit of Measurements from poses, wheels and model of the SlamResult `previous`.
+
+    `model`, if not None, replaces that of `previous`. `accept` and errors raised as in `refine`.
+    """
     vehicle, frame = measurements.dataset.vehicle, measurements.frame
     w = (previous.wheel - vehicle.wheel) / vehicle.sigma_wheel
     problem = build_problem(measurements, model or previous.model, _initial_noise(measurements),

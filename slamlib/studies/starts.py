@@ -41,9 +41,9 @@ def most_certain_sighting(measurements, in_world, covariances):
 
 
 def mean_by_information(measurements, in_world, covariances):
-    """(k, 3) markers at the mean of their sightings, weighted by information; parameters as above.
+    """(k, 3) markers at the mean of their sightings, weighted by information.
 
-    Angles are averaged about the most certain sighting's.
+    Parameters as of `consensus_markers`. Angles are averaged about the most certain sighting's.
     """
     m = measurements
     middle = most_certain_sighting(m, in_world, covariances)
@@ -57,7 +57,10 @@ def mean_by_information(measurements, in_world, covariances):
 
 
 def map_of_problem_2(measurements, in_world, covariances):
-    """(k, 3) markers of problem 2's map, by consensus where it has none; parameters as above."""
+    """(k, 3) markers of problem 2's map, by consensus where it has none.
+
+    Parameters as of `consensus_markers`.
+    """
     markers = consensus_markers(measurements, in_world, covariances)
     found = localize(measurements.dataset.aruco)
     if found.frame[0] == 0 and np.isfinite(found.poses[0, 0]):          # the same world
