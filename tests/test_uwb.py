@@ -551,13 +551,20 @@ def test_calibrated_ranges_have_derivatives_of_central_differences():
         lambda xi: error(poses=compose(poses, xi))[:, 0], np.zeros(3)), atol=1e-5)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("offset, scale", [(0.4, 1.0), (0.0, 1.015), (-0.3, 0.97)])
-def test_ranges_calibrate_themselves(offset, scale):
+@pytest.fixture(scope="module")
+def long_drive():
+    """The first 8000 poses of a long drive, its Truth, and the SlamResult of its right ranges."""
     dataset, truth = simulate("long", seed=61)
     dataset = dataset.first(8000)
+    return dataset, truth, slam.estimate(dataset)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("offset, scale", [(0.4, 1.0), (0.0, 1.015), (-0.3, 0.97)])
+def test_ranges_calibrate_themselves(offset, scale, long_drive):
+    dataset, truth, right = long_drive
     wrong = replace(dataset, uwb=replace(dataset.uwb, range=offset + scale * dataset.uwb.range))
-    right, found = slam.estimate(dataset), slam.estimate(wrong)
+    found = slam.estimate(wrong)
     np.testing.assert_array_equal(right.range_calibration, [0, 1])
     off = found.range_calibration - [offset, scale]
     assert (np.abs(off) < 4 * found.range_calibration_sigma).all()
