@@ -3,8 +3,9 @@
     python tests/kills.py [solve] [steps] [report] [report-steps] [builds]
 
 prints a table of counts; without arguments it does all. It is not part of the suite, of which
-test_concurrency.py runs a part. Runs are forks of this process, so that none waits for imports. A
-folder that a run of A or B writes to is judged by the bytes that undisturbed runs wrote.
+test_concurrency.py runs a part. Runs are forks of this process, so that none waits for imports; it
+imports no more than they need, because a large process forks slowly. A folder that a run of A or B
+writes to is judged by the bytes that undisturbed runs wrote.
 """
 
 import json
@@ -18,12 +19,9 @@ import time
 from collections import Counter
 from pathlib import Path
 
-import nbformat
-
 from slamlib import summary, swap
 from slamlib.__main__ import main
 from slamlib.dataset import read_dataset
-from slamlib.report import build
 from slamlib.simulation import simulate, write_dataset
 
 STEPS = {"os.rename", "os.remove", "os.mkdir", "os.rmdir"}      # audit events, also of pathlib
@@ -187,6 +185,7 @@ class Reports:
     """The command report between the drives A and B, of two tiny notebooks."""
 
     def __init__(self, root):
+        import nbformat
         self.root = root
         make_drives(root)
         (root / "notebooks").mkdir()
@@ -241,6 +240,7 @@ class PlainReports(Reports):
     """
 
     def __init__(self, root):
+        from slamlib.report import build
         build._require_pages = lambda *_: None
         build.rendered = lambda books, drives, *_: {
             f"{name}.html": f"{name}: {[each.files for each in drives]}, "
