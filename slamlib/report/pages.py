@@ -206,7 +206,7 @@ class Renderer(IPythonRenderer):
         return caption and self.anchor(f"{caption[1].lower()}-{caption[2]}")
 
     def block_html(self, text):
-        """Return HTML unchanged; nbconvert parses it to embed pictures, and would close its tags."""
+        """Return HTML unchanged; nbconvert parses it to embed pictures, and would close tags."""
         return super().block_html(text) if IMG.search(text) else f"{text.strip()}\n"
 
     def inline_html(self, text):
