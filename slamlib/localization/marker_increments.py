@@ -67,11 +67,11 @@ def consecutive_increments(sightings):
         return found
     again = robust_increments(z, C, pair[allowed], first[allowed], second[allowed], len(steps))
     usable = again.usable & ~(fast & _too_fast(again.increment, again.covariance, steps, bound))
-    accepted, (by_first, by_second) = np.zeros(len(pair), bool), np.zeros((2, len(pair), 3, 3))
+    accepted, (J_first, J_second) = np.zeros(len(pair), bool), np.zeros((2, len(pair), 3, 3))
     accepted[allowed] = again.accepted
-    by_first[allowed], by_second[allowed] = again.J_first, again.J_second
+    J_first[allowed], J_second[allowed] = again.J_first, again.J_second
     return replace(again, pair=pair, first=first, second=second, usable=usable,
-                   accepted=accepted & usable[pair], J_first=by_first, J_second=by_second)
+                   accepted=accepted & usable[pair], J_first=J_first, J_second=J_second)
 
 
 def common_sightings(row, marker):

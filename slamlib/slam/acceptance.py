@@ -17,8 +17,8 @@ EARLY_GATE = 3.3             # sigmas; a range that is shorter than expected by 
 
 _kernel = gtsam.noiseModel.mEstimator
 # By name, scales in sigmas. Those of Huber, Cauchy and Tukey have 95 % efficiency on Gaussian noise
-# (Zhang, Image and Vision Computing 15(1), 1997). Asymmetric kernels need signed
-# errors, which GTSAM passes to them with the scheme Scalar.
+# (Zhang, Image and Vision Computing 15(1), 1997). Asymmetric kernels need signed errors, which
+# GTSAM passes to them with the scheme Scalar.
 _scalar = _kernel.Base.ReweightScheme.Scalar
 KERNELS = {
     "quadratic": None,
