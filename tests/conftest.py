@@ -23,7 +23,9 @@ settings.load_profile("short")           # another one by `pytest --hypothesis-p
 
 ROOT = Path(__file__).parents[1]
 STUDY_SEEDS = "2"            # in pages that tests build: their claims are tested on more drives
-LONGEST = ("test_pages", "test_slam", "test_flaws", "test_uwb", "test_concurrency", "test_lab")
+LONGEST = ("test_pages", "test_slam", "test_concurrency", "test_flaws", "test_uwb", "test_lab",
+           "test_machines", "test_report", "test_install", "test_docs", "test_live", "test_trust",
+           "test_properties", "test_map_checks", "test_localization")
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 
@@ -31,6 +33,12 @@ def pytest_collection_modifyitems(items):
     """The files that take longest come first, so that both processes end at about the same time."""
     items.sort(key=lambda item: LONGEST.index(item.path.stem) if item.path.stem in LONGEST
                else len(LONGEST))
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_pyfunc_call():
+    """No variable names the test: processes for studies are used again in an equal environment."""
+    os.environ.pop("PYTEST_CURRENT_TEST", None)
 
 
 @pytest.fixture(scope="module")

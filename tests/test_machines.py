@@ -12,11 +12,14 @@ import subprocess
 import sys
 import time
 import tomllib
+from importlib import metadata
 from pathlib import Path
 
 import psutil
 import pytest
 import yaml
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 from test_report import build, make_data, write
 
 from slamlib import locks, studies, swap
@@ -212,7 +215,8 @@ def test_a_report_that_is_killed_leaves_no_process_and_no_shared_memory(killed, 
     write(tmp_path / "notebooks", "1_slow", "# Slow", (SLOW_STUDY,))
     build = subprocess.Popen(
         [sys.executable, "-m", "slamlib", "report", "short"], cwd=tmp_path, text=True,
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=os.environ | {"PYTHONPATH": str(ROOT)})
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=os.environ | {"PYTHONPATH": str(ROOT)},
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))  # also in a background job
     below = processes_with(build, 2)
     kernel, = (each for each in below if each.status() != psutil.STATUS_ZOMBIE
                and "ipykernel_launcher" in each.cmdline())
@@ -286,6 +290,20 @@ def test_the_environment_of_conda_has_what_the_lock_is_made_from():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert required(project["dependencies"]).keys() <= asked.keys()
     assert conda["python"] in [f"3.{minor}.*" for minor in range(11, 15)]
+
+
+def test_the_lock_names_the_extras_that_its_packages_ask_for():
+    """Else pip asks for the hash of the newest version, which the lock has for a while only."""
+    lines = re.findall(r"^([\w.-]+)(?:\[(.*)\])?==", (ROOT / "requirements.txt").read_text(), re.M)
+    locked = {canonicalize_name(name): {*filter(None, extras.split(","))} for name, extras in lines}
+    installed = {canonicalize_name(each.name) for each in metadata.distributions()}
+    asked = [(each.name, each.extras) for name in installed & locked.keys()
+             for each in map(Requirement, metadata.requires(name) or ())
+             if each.extras and (not each.marker or any(
+                 each.marker.evaluate({"extra": extra}) for extra in ("", *locked[name])))]
+    assert asked
+    for name, extras in asked:
+        assert extras <= locked[canonicalize_name(name)], name
 
 
 def test_the_version_that_check_python_asks_for_is_the_one_that_is_pinned(monkeypatch):
