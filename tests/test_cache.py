@@ -2,6 +2,7 @@
 
 import gzip
 import json
+import re
 import shutil
 from importlib.metadata import distributions
 
@@ -25,12 +26,6 @@ def execute_without_kernel(books, environment, results, jobs, finish, seconds):
         cell, = (cell for cell in book.cells if cell.cell_type == "code")
         cell.outputs = [nbformat.v4.new_output("stream", text="executed")]
         finish(source, book, [f"short/{source.stem}.mat"])
-
-
-@pytest.fixture(autouse=True)
-def no_packages(monkeypatch):
-    """Reading what is installed takes 0.1 s; one test does so."""
-    monkeypatch.setattr(cache, "distributions", lambda: [])
 
 
 @pytest.fixture
@@ -224,11 +219,21 @@ def test_an_entry_of_another_key_is_not_recalled(kept, tmp_path):
 
 
 def test_slamlib_and_the_packages_are_among_what_matters(monkeypatch, tmp_path):
-    without_packages = cache.fingerprint([], tmp_path, {})
-    monkeypatch.setattr(cache, "distributions", distributions)
-    before = cache.fingerprint([], tmp_path, {})
+    found = [cache.fingerprint([], tmp_path, {})]
+    (tmp_path / "site" / "package-1.0.dist-info").mkdir(parents=True)
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    found.append(cache.fingerprint([], tmp_path, {}))
+    (tmp_path / "site" / "package-1.0.dist-info").rename(tmp_path / "site/package-1.1.dist-info")
+    found.append(cache.fingerprint([], tmp_path, {}))
     monkeypatch.setattr(memory, "SLAMLIB", tmp_path)
-    assert len({before, without_packages, cache.fingerprint([], tmp_path, {})}) == 3
+    assert len({*found, cache.fingerprint([], tmp_path, {})}) == 4
+
+
+def test_every_installed_package_is_found_with_its_version():
+    found = {re.sub(r"[-_.]+", "-", name.lower()) for name in cache.installed()}
+    for package in distributions():
+        name = f"{package.name}-{package.version}-dist-info".lower()
+        assert re.sub(r"[-_.]+", "-", name) in found
 
 
 @pytest.fixture

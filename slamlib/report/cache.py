@@ -11,8 +11,8 @@ nothing.
 import gzip
 import json
 import platform
+import sys
 from base64 import b64decode, b64encode
-from importlib.metadata import distributions
 from pathlib import Path
 
 import nbformat
@@ -40,10 +40,18 @@ def fingerprint(datasets, notebooks, environment):
              *(file for file in sorted(notebooks.iterdir()) if file.suffix != ".ipynb")]
     return digest(json.dumps([
         platform.python_implementation(), platform.python_version(), platform.platform(),
-        sorted(f"{package.name} {package.version}" for package in distributions()),
+        installed(),
         [(str(file), digest(file.read_bytes())) for file in files if file.is_file()],
         sorted((name, value) for name, value in environment.items()
                if name.startswith(VARIABLES) and name not in IGNORED_VARIABLES)]).encode())
+
+
+def installed():
+    """Return the sorted names (list of str) of what is installed, each with its version.
+
+    They are names of folders: reading the same from the files in them takes a hundred times longer.
+    """
+    return sorted(path.name for folder in sys.path for path in Path(folder).glob("*-info"))
 
 
 def key_of(source, book, common):

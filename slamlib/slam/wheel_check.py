@@ -39,17 +39,18 @@ def with_checked_wheels(result, fit, refit):
         sigma_wheelbase=WEAK_WHEEL_SIGMA * stated.wheelbase)
     try:
         alternative = refit(measure(replace(dataset, vehicle=uncertain)), result)
+        wheel = stated.wheel + uncertain.sigma_wheel * alternative.state.w
+        if alternative.problem.accepted.weight.sum() \
+                < MIN_ACCEPTED * fit.problem.accepted.weight.sum() \
+                or alternative.problem.noise.slip > MAX_SLIP_RATIO * result.slip \
+                or not far_off(stated, wheel).any():
+            return result
         accepted = replace(alternative.problem.accepted, measurements=fit.problem.measurements)
         compared = refine(replace(fit.problem, accepted=accepted), fit.state, accept=None)
     except (DatasetError, np.linalg.LinAlgError):
         return result
-    wheel = stated.wheel + uncertain.sigma_wheel * alternative.state.w
     lead = alternative.posterior.log_density - compared.posterior.log_density
-    if alternative.problem.accepted.weight.sum() \
-            < MIN_ACCEPTED * fit.problem.accepted.weight.sum() \
-            or alternative.problem.noise.slip > MAX_SLIP_RATIO * result.slip \
-            or lead < max(MIN_LEAD, result.camera.time.gain, result.camera.place.gain) \
-            or not far_off(stated, wheel).any():
+    if lead < max(MIN_LEAD, result.camera.time.gain, result.camera.place.gain):
         return result
     doubt = Doubt("wheel-parameters", (
         f"The drive is explained far better if {wheels_in_words(stated, wheel)}: measure the "
