@@ -103,16 +103,18 @@ def learned_slips(seed, slip):
     Returns
     -------
     dict of numbers: the "slip" learned; "nees" of the poses and "aligned" ATE in m with it;
-    "known nees" and "known aligned", those of the graph that is given the noise and the arcs;
-    "problem 4 nees", with ranges and the noise learned.
+    "rejected" sightings; "arc", 1 where arcs were chosen; "known nees" and "known aligned", those
+    of the graph that is given the noise and the arcs; "problem 4 nees", with ranges and the noise
+    learned.
     """
     dataset, truth = simulate("short", seed, slip=slip)
     markers = dataset.without("uwb")
     learned = slam.estimate(markers)
     known = slam.estimate(markers, slip, "arc", marker_noise_factor=1.0)
     with_ranges = slam.estimate(dataset, previous=learned)
-    numbers = {"slip": learned.slip, "problem 4 nees": anees(
-        with_ranges.poses, with_ranges.covariances, truth.poses)}
+    numbers = {"slip": learned.slip, "rejected": np.count_nonzero(learned.rejected),
+               "arc": float(learned.model == "arc"), "problem 4 nees": anees(
+                   with_ranges.poses, with_ranges.covariances, truth.poses)}
     for name, found in (("", learned), ("known ", known)):
         numbers |= {f"{name}nees": anees(found.poses, found.covariances, truth.poses),
                     f"{name}aligned": ate(found.poses, truth.poses, aligned=True)}
