@@ -12,7 +12,7 @@ from urllib.parse import quote, unquote, urlparse
 import nbformat
 import numpy as np
 import pytest
-from conftest import BROUGHT, STUDY_SEEDS, contradicted, copied
+from conftest import BROUGHT, STUDY_SEEDS, built_elsewhere, contradicted, copied
 
 from slamlib.dataset import read_dataset
 from slamlib.odometry import equation2
@@ -182,8 +182,8 @@ def mixed(tmp_path_factory, kept):
     copied(folder / "notebooks", "[1-4A]*.ipynb", first=FAILING)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SLAMLIB_SEEDS", STUDY_SEEDS)
-        return folder, build_report(folder / "notebooks", folder / "data", folder / "report",
-                                    folder / "results", kept=kept)
+        return folder, built_elsewhere(folder / "notebooks", folder / "data", folder / "report",
+                                       folder / "results", kept=kept)
 
 
 def test_a_drive_that_fails_is_left_out_of_its_chapter_and_costs_the_others_nothing(mixed):
