@@ -25,16 +25,17 @@ settings.load_profile("short")           # another one by `pytest --hypothesis-p
 
 ROOT = Path(__file__).parents[1]
 STUDY_SEEDS = "2"            # in pages that tests build: their claims are tested on more drives
-LONGEST = ("test_pages", "test_slam", "test_concurrency", "test_flaws", "test_uwb", "test_lab",
-           "test_machines", "test_report", "test_install", "test_docs", "test_live", "test_trust",
-           "test_properties", "test_map_checks", "test_localization")
+# Files that wait much stand beside those that start further processes, for both processors.
+FIRST = ("test_pages", "test_concurrency", "test_lab", "test_machines", "test_live", "test_slam",
+         "test_flaws", "test_uwb", "test_trust", "test_install", "test_report", "test_docs",
+         "test_localization", "test_properties", "test_map_checks", "test_doubts")
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 
 def pytest_collection_modifyitems(items):
     """The files that take longest come first, so that both processes end at about the same time."""
-    items.sort(key=lambda item: LONGEST.index(item.path.stem) if item.path.stem in LONGEST
-               else len(LONGEST))
+    items.sort(key=lambda item: FIRST.index(item.path.stem) if item.path.stem in FIRST
+               else len(FIRST))
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -134,7 +135,7 @@ def few_seeds(monkeypatch):
 def report_on_all(tmp_path_factory, kept):
     """A folder with data, report and results: drives of data/, and what else a user may bring.
 
-    All but `short` are cut to 600 or 3000 poses: no assertion on the pages needs more.
+    All but `short` are cut to 600 or 1500 poses: no assertion on the pages needs more.
     """
     import numpy as np
 
@@ -145,7 +146,7 @@ def report_on_all(tmp_path_factory, kept):
     shutil.copytree(ROOT / "data", data, ignore=lambda *_: ["long"])
     long = ROOT / "data" / "long"
     for name, poses, drive in (
-            ("long", 3000, (read_dataset(long), read_truth(long))),
+            ("long", 1500, (read_dataset(long), read_truth(long))),
             ("new seed", 600, simulate("short", seed=77, late_ranges=0.15))):
         dataset, truth = drive[0].first(poses), drive[1]
         write_dataset(data / name, dataset, replace(truth, poses=truth.poses[:poses]))

@@ -167,10 +167,18 @@ def processes_with(parent, count):
     until = time.monotonic() + 120
     while parent.poll() is None and time.monotonic() < until:
         below = psutil.Process(parent.pid).children(recursive=True)
-        if sum(workers.COMMAND in each.cmdline() for each in below if is_running(each)) == count:
+        if sum(workers.COMMAND in command(each) for each in below) == count:
             return below
         time.sleep(0.05)
     raise AssertionError(parent.communicate())
+
+
+def command(process):
+    """Arguments (list of str) of a psutil.Process, none once it is gone or waits to be buried."""
+    try:
+        return process.cmdline()
+    except psutil.NoSuchProcess:
+        return []
 
 
 def is_running(process):
@@ -218,8 +226,7 @@ def test_a_report_that_is_killed_leaves_no_process_and_no_shared_memory(killed, 
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=os.environ | {"PYTHONPATH": str(ROOT)},
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))  # also in a background job
     below = processes_with(build, 2)
-    kernel, = (each for each in below if each.status() != psutil.STATUS_ZOMBIE
-               and "ipykernel_launcher" in each.cmdline())
+    kernel, = (each for each in below if "ipykernel_launcher" in command(each))
     number = getattr(signal, name)
     os.kill(build.pid if killed == "build" else kernel.pid, number)
     told = build.communicate(timeout=60)[1]

@@ -139,12 +139,12 @@ def learned_slips(slip, drives):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("slip", [0.0, 1e-4, 1e-3, 1e-2])
+@pytest.mark.parametrize("slip", [0.0, 1e-4, 1e-2])
 def test_a_slip_that_is_not_known_widens_the_covariance(slip):
     """12 drives each: no overconfidence, and nearly the accuracy of the graph that knows the slip.
 
-    The mean NEES is at most 1.35 times that with the slip known
-    or 3.6, whichever is larger, and no drive is above 16.
+    A usual slip is in `test_monte_carlo_is_consistent`. The mean NEES is at most 1.35 times that
+    with the slip known or 3.6, whichever is larger, and no drive is above 16.
     """
     runs = learned_slips(slip, 12)
     assert runs["nees"].mean() < max(1.35 * runs["known nees"].mean(), 3.6)
