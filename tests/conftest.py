@@ -28,7 +28,8 @@ STUDY_SEEDS = "2"            # in pages that tests build: their claims are teste
 # Files that wait much stand beside those that start further processes, for both processors.
 FIRST = ("test_pages", "test_concurrency", "test_lab", "test_machines", "test_live", "test_slam",
          "test_flaws", "test_uwb", "test_trust", "test_install", "test_report", "test_docs",
-         "test_localization", "test_properties", "test_map_checks", "test_doubts")
+         "test_localization", "test_properties", "test_map_checks", "test_doubts", "test_explore",
+         "test_overview", "test_cache", "test_studies")
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 
