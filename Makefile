@@ -48,7 +48,7 @@ $(READY): requirements.txt pyproject.toml check_python.py
 		--only-binary=:all: -r requirements.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation \
 		--editable .
-	@$(BIN)/python -m compileall -q slamlib     # as pip does it for what it does not leave in place
+	@$(BIN)/python -m compileall -q slamlib              # pip does so for all others
 	@touch $@
 
 report: $(READY)

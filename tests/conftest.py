@@ -25,7 +25,7 @@ settings.load_profile("short")           # another one by `pytest --hypothesis-p
 
 ROOT = Path(__file__).parents[1]
 STUDY_SEEDS = "2"            # in pages that tests build: their claims are tested on more drives
-# Files that wait much stand beside those that start further processes, for both processors.
+# Files that mostly wait run beside files that start further processes: both processors are busy.
 FIRST = ("test_pages", "test_concurrency", "test_lab", "test_machines", "test_live", "test_slam",
          "test_flaws", "test_uwb", "test_trust", "test_install", "test_report", "test_docs",
          "test_localization", "test_properties", "test_map_checks", "test_doubts", "test_explore",
@@ -41,7 +41,10 @@ def pytest_collection_modifyitems(items):
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_pyfunc_call():
-    """No variable names the test: processes for studies are used again in an equal environment."""
+    """Remove the variable that names the test.
+
+    A process of a study is used again only where the environment is the same.
+    """
     os.environ.pop("PYTEST_CURRENT_TEST", None)
 
 

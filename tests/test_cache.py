@@ -2,13 +2,13 @@
 
 import gzip
 import json
-import re
 import shutil
 from importlib.metadata import distributions
 
 import nbformat
 import pytest
 from nbformat.v4 import new_code_cell
+from packaging.utils import canonicalize_name
 from test_report import make_data, write
 from test_strip import save_as_lab
 
@@ -230,10 +230,9 @@ def test_slamlib_and_the_packages_are_among_what_matters(monkeypatch, tmp_path):
 
 
 def test_every_installed_package_is_found_with_its_version():
-    found = {re.sub(r"[-_.]+", "-", name.lower()) for name in cache.installed()}
+    found = {*map(canonicalize_name, cache.installed())}
     for package in distributions():
-        name = f"{package.name}-{package.version}-dist-info".lower()
-        assert re.sub(r"[-_.]+", "-", name) in found
+        assert canonicalize_name(f"{package.name}-{package.version}-dist-info") in found
 
 
 @pytest.fixture
