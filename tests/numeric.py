@@ -5,7 +5,7 @@ from scipy.stats import t
 
 from slamlib import slam
 from slamlib.simulation import simulate
-from slamlib.slam.noise import with_known_noise
+from slamlib.slam.measurements import with_known_noise
 from slamlib.studies.montecarlo import judge_slam
 
 

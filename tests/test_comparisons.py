@@ -9,9 +9,9 @@ from numeric import known_noise
 
 from slamlib import slam
 from slamlib.simulation import simulate
-from slamlib.slam.gtsam_graph import values
+from slamlib.slam.fit import optimize
+from slamlib.slam.graph import values
 from slamlib.slam.measurements import measure
-from slamlib.slam.optimizer import optimize
 from slamlib.slam.pipeline import fit_from_odometry
 from slamlib.studies import graphs, kernels, starts
 

@@ -14,8 +14,8 @@ from slamlib.dataset import Vehicle, read_dataset, read_truth
 from slamlib.evaluation import anees, ate, nees_band
 from slamlib.simulation import simulate
 from slamlib.slam import drive_doubts
-from slamlib.slam.camera_offsets import CameraOffsets, SharedError, _estimate, _velocities
-from slamlib.slam.noise import Noise
+from slamlib.slam.calibrations import CameraOffsets, SharedError, _estimate, _velocities
+from slamlib.slam.measurements import Noise
 from slamlib.studies import montecarlo
 
 SHORT = Path(__file__).parents[1] / "data" / "short"

@@ -12,25 +12,15 @@ from scipy.special import chdtri
 from slamlib import sightings, slam
 from slamlib.localization import doubts
 from slamlib.simulation import simulate
-from slamlib.slam import (
-    drive_doubts,
-    first_frames,
-    gtsam_graph,
-    noise_learning,
-    normal_equations,
-    odometry_factors,
-)
-from slamlib.slam.acceptance import LATE_KERNEL, AcceptedMeasurements
+from slamlib.slam import drive_doubts, factors, graph, linear, noise
 from slamlib.slam.covariances import marginal_covariances
-from slamlib.slam.evidence import laplace_approximation
-from slamlib.slam.first_frames import equations_of_first_frames
+from slamlib.slam.factors import build_problem
+from slamlib.slam.fit import LATE_KERNEL, optimize
 from slamlib.slam.initialization import odometry_state, state_from_poses
-from slamlib.slam.measurements import WEAK_SIGMA, measure
-from slamlib.slam.noise import BOUNDS, Noise
-from slamlib.slam.normal_equations import NormalEquations
-from slamlib.slam.optimizer import optimize
+from slamlib.slam.linear import NormalEquations, laplace_approximation
+from slamlib.slam.measurements import WEAK_SIGMA, AcceptedMeasurements, Noise, measure
+from slamlib.slam.noise import BOUNDS, equations_of_first_frames
 from slamlib.slam.pipeline import fit_from_odometry
-from slamlib.slam.problem import build_problem
 
 
 def test_gtsam_has_the_same_error_and_takes_the_same_step():
@@ -50,17 +40,17 @@ def test_gtsam_has_the_same_error_and_takes_the_same_step():
     accepted = AcceptedMeasurements(m, m.unit_weights, cauchy, LATE_KERNEL)
     problem = replace(build_problem(m, "arc", Noise(2e-3, 1.5, 0.7)), accepted=accepted)
     equations = NormalEquations(problem, state)
-    values = gtsam_graph.values(m, state)
-    others = odometry_factors.odometry_error(problem.odometry, state.poses, state.w)[0]
+    values = graph.values(m, state)
+    others = factors.odometry_error(problem.odometry, state.poses, state.w)[0]
     others = problem.odometry.whitening(2e-3)[0] @ others[..., None]
-    expected = gtsam_graph.nonlinear_graph(problem).error(values) + np.sum(others**2) / 2 \
+    expected = graph.nonlinear_graph(problem).error(values) + np.sum(others**2) / 2 \
         + equations.linearized[1].error
     assert np.isclose(equations.error, expected, rtol=1e-12)
-    step = gtsam_graph.gtsam_step(problem, state)
+    step = graph.gtsam_step(problem, state)
     np.testing.assert_allclose(equations.step(), step, rtol=1e-5, atol=1e-6 * np.abs(step).max())
     free = replace(m, calibrated=True)
     problem = replace(problem, accepted=replace(accepted, measurements=free))
-    step = gtsam_graph.gtsam_step(problem, state)
+    step = graph.gtsam_step(problem, state)
     np.testing.assert_allclose(NormalEquations(problem, state).step(), step, rtol=1e-5,
                                atol=1e-6 * np.abs(step).max())
 
@@ -87,7 +77,7 @@ def test_markers_without_accepted_sightings_have_a_weak_prior_and_move_nothing_e
         assert np.count_nonzero(H[own]) == len(own)
         rows.extend(own)
     others = np.setdiff1d(np.arange(len(H)), rows)
-    step, expected = equations.step()[others], gtsam_graph.gtsam_step(problem, state)[others]
+    step, expected = equations.step()[others], graph.gtsam_step(problem, state)[others]
     np.testing.assert_allclose(step, expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
 
 
@@ -123,8 +113,8 @@ def test_the_first_frames_are_a_drive_of_their_own(monkeypatch):
     problem = build_problem(m, "arc", Noise(2e-3, 1.5, 0.7))
     problem = replace(problem, accepted=AcceptedMeasurements(m, weight, range_kernel=LATE_KERNEL))
     state = odometry_state(m, "arc")
-    monkeypatch.setattr(first_frames, "MIN_MEASUREMENTS", 50)
-    monkeypatch.setattr(first_frames, "LEARNING_FRAMES", 60)
+    monkeypatch.setattr(noise, "MIN_MEASUREMENTS", 50)
+    monkeypatch.setattr(noise, "LEARNING_FRAMES", 60)
     part = equations_of_first_frames(NormalEquations(problem, state))
     cut = measure(dataset.first(int(m.frame[59]) + 1))
     np.testing.assert_array_equal(part.problem.measurements.frame, cut.frame)
@@ -139,10 +129,10 @@ def test_the_first_frames_are_a_drive_of_their_own(monkeypatch):
     np.testing.assert_allclose(part.linearized[2].e,
                                whole.linearized[2].e[whole.linearized[2].row < 60], rtol=1e-12)
     assert np.isfinite(part.step()).all()
-    monkeypatch.setattr(first_frames, "LEARNING_FRAMES", len(m.frame))
+    monkeypatch.setattr(noise, "LEARNING_FRAMES", len(m.frame))
     assert equations_of_first_frames(whole) is whole
     monkeypatch.undo()
-    monkeypatch.setattr(first_frames, "LEARNING_FRAMES", 60)
+    monkeypatch.setattr(noise, "LEARNING_FRAMES", 60)
     assert equations_of_first_frames(whole) is whole                  # too few ranges there
 
 
@@ -152,7 +142,7 @@ def test_noise_of_a_sensor_that_starts_late_is_learned(monkeypatch):
     aruco = dataset.aruco.select(dataset.aruco.pose > 1000)
     dataset = replace(dataset, aruco=replace(aruco, covariance=aruco.covariance / 36))
     whole = slam.estimate(dataset)
-    monkeypatch.setattr(first_frames, "LEARNING_FRAMES", 40)
+    monkeypatch.setattr(noise, "LEARNING_FRAMES", 40)
     found = slam.estimate(dataset)
     assert np.isclose(found.noise.sightings, whole.noise.sightings, rtol=1e-3)
     assert 5 < found.noise.sightings < 7 and found.rejected.mean() < 0.02
@@ -175,7 +165,7 @@ def test_differences_of_a_quadratic_are_exact(free):
     expected = -PRECISION[np.ix_(free, free)]
     scale = np.sqrt(-np.diag(expected))
     for correlation in (None, -expected / np.outer(scale, scale)):
-        gradient, hessian = noise_learning._differences(
+        gradient, hessian = noise._differences(
             gaussian, x, gaussian(x), free, steps, correlation)
         np.testing.assert_allclose(gradient, -(PRECISION @ (x - CENTRE))[free], rtol=1e-9)
         np.testing.assert_allclose(hessian, expected, rtol=1e-8, atol=1e-8)
@@ -187,7 +177,7 @@ def test_newtons_method_finds_mode_and_covariance_of_a_gaussian(free, start):
     """What is not free keeps its start, and its covariance is zero."""
     free, x = np.array(free), CENTRE + start
     given = np.setdiff1d(range(3), free)
-    mode, value, covariance = noise_learning._mode(
+    mode, value, covariance = noise._mode(
         gaussian, x, gaussian(x), free, np.full(len(free), 0.1))
     H, cross = PRECISION[np.ix_(free, free)], PRECISION[np.ix_(free, given)]
     expected = CENTRE[free] - np.linalg.solve(H, cross @ (x - CENTRE)[given])
@@ -202,7 +192,7 @@ def test_newtons_method_stays_within_the_bounds_and_never_descends():
     """A mode beyond the bound of the slip, and a density that is not concave at the start."""
     beyond = CENTRE.copy()
     beyond[0] = BOUNDS[1, 0] + 1.0
-    mode, *_ = noise_learning._mode(
+    mode, *_ = noise._mode(
         lambda x: -50 * np.sum((x - beyond)**2), CENTRE, -1e3, np.arange(3), np.full(3, 0.1))
     np.testing.assert_allclose(mode, [BOUNDS[1, 0], *beyond[1:]], atol=1e-6)
 
@@ -210,9 +200,9 @@ def test_newtons_method_stays_within_the_bounds_and_never_descends():
         off = x[0] - CENTRE[0]
         return float(np.logaddexp(-8 * (off - 1)**2, 1 - 8 * (off + 1)**2))
 
-    mode, value, _ = noise_learning._mode(two_hills, CENTRE + [0.05, 0, 0],
-                                           two_hills(CENTRE + [0.05, 0, 0]), np.array([0]),
-                                           np.array([0.1]))
+    mode, value, _ = noise._mode(two_hills, CENTRE + [0.05, 0, 0],
+                                 two_hills(CENTRE + [0.05, 0, 0]), np.array([0]),
+                                 np.array([0.1]))
     assert value >= two_hills(CENTRE + [0.05, 0, 0])
     assert abs(abs(mode[0] - CENTRE[0]) - 1) < 0.05
 
@@ -225,7 +215,7 @@ def test_points_of_the_posterior_have_its_moments(scale):
     """
     C = scale * np.array([[0.25, 0.06, 0.0], [0.06, 0.04, 0.01], [0.0, 0.01, 0.09]])
     information = np.linalg.inv(C)
-    points = noise_learning._points(
+    points = noise._points(
         lambda x: -(x - CENTRE) @ information @ (x - CENTRE) / 2, CENTRE, 0.0, C)
     weights, noises = zip(*points)
     assert len(points) == (5 if scale == 1 else 1) and np.isclose(sum(weights), 1)
@@ -267,9 +257,9 @@ def test_where_cholesky_fails_qr_gives_the_same_solution(monkeypatch):
         def __getattr__(self, name):
             return getattr(self.graph, name)
 
-    linear = gtsam_graph.linearize
-    monkeypatch.setattr(gtsam_graph, "linearize", lambda *arguments: Failing(linear(*arguments)))
-    monkeypatch.setattr(normal_equations, "decomposition", lambda H: None)
+    linearize = graph.linearize
+    monkeypatch.setattr(graph, "linearize", lambda *arguments: Failing(linearize(*arguments)))
+    monkeypatch.setattr(linear, "decomposition", lambda H: None)
     np.testing.assert_allclose(optimize(fit.problem, start).state.poses, expected.poses, atol=1e-8)
 
 
@@ -281,7 +271,7 @@ def test_the_normal_equations_are_those_of_gtsams_linear_graph():
     problem = replace(fit.problem, accepted=accepted, noise=Noise(2e-3, 1.5, 0.7))
     equations = NormalEquations(replace(problem, noise=Noise(1e-3)), fit.state)
     delta, found = laplace_approximation(equations, problem.noise)
-    linear = gtsam_graph.linearize(problem, fit.state)
+    linear = graph.linearize(problem, fit.state)
     tree = linear.eliminateMultifrontal()
     solution, m = tree.optimize(), problem.measurements
     for i in (0, 7, len(m.frame) - 1):
@@ -299,7 +289,7 @@ def test_marginal_covariances_equal_gtsams():
     m = measure(known_noise(dataset, 1e-3))
     fit = fit_from_odometry(m)
     marginal = marginal_covariances(fit.equations, fit.problem.noise)
-    tree = gtsam_graph.linearize(fit.problem, fit.state).eliminateMultifrontal()
+    tree = graph.linearize(fit.problem, fit.state).eliminateMultifrontal()
     for i in range(0, len(marginal.pairs), 13):
         expected = tree.jointMarginalCovariance([X(i), X(i + 1), W(0)]).fullMatrix()
         scale = np.outer(*2 * [np.sqrt(np.diag(expected))])

@@ -12,23 +12,25 @@ from slamlib import increments, odometry, se2, simulation, slam, studies
 from slamlib.dataset import AntennaGuess, ArucoReadings, Dataset, UwbReadings, Vehicle
 from slamlib.evaluation import anees, ate, nees_band
 from slamlib.simulation import simulate
-from slamlib.slam import acceptance, gtsam_graph, odometry_factors
-from slamlib.slam.acceptance import accepted_measurements, gate_weights
-from slamlib.slam.covariances import marginal_covariances
-from slamlib.slam.evidence import laplace_approximation
-from slamlib.slam.fit import refine
+from slamlib.slam import factors, graph
+from slamlib.slam.calibrations import DECISIVE_LEAD, better_model
+from slamlib.slam.covariances import marginal_covariances, posterior_moments
+from slamlib.slam.factors import build_problem, state_from_arrays
+from slamlib.slam.fit import (
+    KERNELS,
+    MIN_RESIDUALS,
+    ONE_SIDED,
+    accepted_measurements,
+    gate_weights,
+    noise_of_scatter,
+    refine,
+)
 from slamlib.slam.initialization import GROWTH, extended, part_lengths
-from slamlib.slam.measurements import measure
-from slamlib.slam.model_choice import DECISIVE_LEAD, better_model
-from slamlib.slam.moments import posterior_moments
-from slamlib.slam.noise import NOISE_KEYS, Noise, log_prior
-from slamlib.slam.noise_learning import learn_noise
-from slamlib.slam.normal_equations import NormalEquations
+from slamlib.slam.linear import NormalEquations, laplace_approximation
+from slamlib.slam.measurements import NOISE_KEYS, Noise, measure
+from slamlib.slam.noise import learn_noise, log_prior
 from slamlib.slam.pipeline import fit_from_odometry
-from slamlib.slam.problem import build_problem
 from slamlib.slam.result import _mapped, slam_result
-from slamlib.slam.robust import MIN_RESIDUALS, noise_of_scatter
-from slamlib.slam.state import state_from_arrays
 from slamlib.studies import graphs, kernels, montecarlo, starts
 
 SEEDS = range(300, 324)
@@ -51,21 +53,21 @@ def example(seed=0):
 
 def test_odometry_derivatives_against_central_differences():
     problem, poses, w = example()
-    _, J = odometry_factors.odometry_error(problem.odometry, poses, w)
+    _, J = factors.odometry_error(problem.odometry, poses, w)
     by_first, by_second, by_w = np.split(J, 3, axis=2)
 
     def error(xi, moved):
         """Errors with every second pose, the even (0) or the odd ones (1), retracted by xi."""
         changed = poses.copy()
         changed[moved::2] = as_rows(gtsam.Pose2(*p).retract(xi) for p in poses[moved::2])
-        return odometry_factors.odometry_error(problem.odometry, changed, w)[0]
+        return factors.odometry_error(problem.odometry, changed, w)[0]
 
     for moved, (even, odd) in ((0, (by_first, by_second)), (1, (by_second, by_first))):
         numeric = central_differences(partial(error, moved=moved), np.zeros(3))
         np.testing.assert_allclose(even[::2], numeric[::2], atol=1e-7)
         np.testing.assert_allclose(odd[1::2], numeric[1::2], atol=1e-7)
     numeric = central_differences(
-        lambda v: odometry_factors.odometry_error(problem.odometry, poses, v)[0], w)
+        lambda v: factors.odometry_error(problem.odometry, poses, v)[0], w)
     np.testing.assert_allclose(by_w, numeric, atol=1e-8)
 
 
@@ -74,7 +76,7 @@ def test_odometry_factor_equals_gtsams_between_factor_for_known_wheels():
     problem, poses, _ = example()
     odometry = problem.odometry
     U, _ = odometry.whitening(problem.noise.slip)
-    e, J = odometry_factors.odometry_error(odometry, poses, np.zeros(3))
+    e, J = factors.odometry_error(odometry, poses, np.zeros(3))
     by_first, by_second, _ = np.split(J, 3, axis=2)
     assert np.abs(e).max() > 0.05
     for i in range(len(e)):
@@ -99,7 +101,7 @@ def test_odometry_is_that_of_the_wheels_about_which_it_is_linear(about):
     """The stated wheels, unless others are given; its derivatives are those at these wheels."""
     measurements = example()[0].measurements
     dataset, frame = measurements.dataset, measurements.frame
-    found = odometry_factors.preintegrate_odometry(measurements, "arc", *about)
+    found = factors.preintegrate_odometry(measurements, "arc", *about)
     w = about[0] if about else np.zeros(3)
 
     def by_wheels(w):
@@ -117,18 +119,18 @@ def test_rounding_noise_does_not_depend_on_the_number_of_factors():
     along, turned = count**2 / 6 * np.array([1 / 2, 2 / vehicle.wheelbase**2])
     for every in (1, 10, 500, 2000):
         frame = np.arange(0, 2001, every)
-        noise, _ = odometry_factors.odometry_noise(ticks, vehicle, frame[:-1], frame[1:])
+        noise, _ = factors.odometry_noise(ticks, vehicle, frame[:-1], frame[1:])
         noise = noise.sum(axis=0)
-        floor = (2000 / every * odometry_factors.MINIMUM_SIGMA**2
+        floor = (2000 / every * factors.MINIMUM_SIGMA**2
                  + increments.MINIMUM_SLIP**2 * 2000 * 127 * count)
         np.testing.assert_allclose([noise[0, 0] - floor, noise[2, 2]], [along, turned], rtol=1e-6)
 
 
 def test_a_vehicle_that_stands_has_the_smallest_noise_along_both_axes():
     frame = np.array([0, 10, 20])
-    rounding, slipping = odometry_factors.odometry_noise(
+    rounding, slipping = factors.odometry_noise(
         np.zeros((21, 2)), Vehicle(ticks_per_revolution=1e12), frame[:-1], frame[1:])
-    smallest = np.diag([odometry_factors.MINIMUM_SIGMA**2] * 2 + [0.0])
+    smallest = np.diag([factors.MINIMUM_SIGMA**2] * 2 + [0.0])
     np.testing.assert_allclose(rounding, [smallest, smallest], rtol=1e-9, atol=1e-20)
     np.testing.assert_array_equal(slipping, 0)
 
@@ -500,7 +502,7 @@ def test_an_undetermined_variable_is_named_as_in_the_files():
     message = "Indeterminate linear system detected while working near variable\n1 (Symbol: {})."
     for symbol, name in (("l2", f"the pose of marker {marker}"), ("w0", "the wheel parameters"),
                          ("a1", f"the position of antenna {antenna}"), ("x0", "pose 1")):
-        assert gtsam_graph._variable(problem.measurements, message.format(symbol)) == name
+        assert graph._variable(problem.measurements, message.format(symbol)) == name
 
 
 def test_parts_of_a_drive_grow_at_most_fourfold_from_where_the_heading_is_lost():
@@ -635,7 +637,7 @@ def test_an_option_with_a_wrong_name_or_value_is_told_with_what_there_is(options
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kernel", acceptance.KERNELS)
+@pytest.mark.parametrize("kernel", KERNELS)
 def test_every_kernel_solves_a_drive_with_wrong_labels_and_late_ranges(kernel):
     """With and without gates; only quadratic errors without gates follow the wrong labels.
 
@@ -648,7 +650,7 @@ def test_every_kernel_solves_a_drive_with_wrong_labels_and_late_ranges(kernel):
     assert gated.rejected.any() and not open_.rejected.any()
     assert ate(gated.poses, truth) < 0.02
     np.testing.assert_allclose(gated.noise.sightings, 1, atol=0.05)
-    assert (ate(open_.poses, truth) < 0.03) == (kernel not in ("quadratic", *acceptance.ONE_SIDED))
+    assert (ate(open_.poses, truth) < 0.03) == (kernel not in ("quadratic", *ONE_SIDED))
     assert (gated.range_weight < 1).any()
 
 

@@ -67,7 +67,7 @@ def test_what_reads_a_dataset_judges_nothing():
 
 def test_the_walk_sees_what_is_imported():
     assert outside("slamlib.studies.memory") >= {"joblib", "numpy", "tqdm"}
-    assert "slamlib.slam.state" in imports("slamlib.slam.optimizer")
+    assert "slamlib.slam.factors" in imports("slamlib.slam.fit")
     assert "slamlib.summary" in imports("slamlib.__main__")
     assert "slamlib.se2" in imports("slamlib.evaluation")
 

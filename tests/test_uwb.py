@@ -16,31 +16,24 @@ from slamlib.evaluation import align, ate, nees_band
 from slamlib.odometry import dead_reckoning
 from slamlib.se2 import between, compose
 from slamlib.simulation import manoeuvre, simulate
-from slamlib.slam import doubts, gtsam_graph, measurement_factors, optimizer
-from slamlib.slam.acceptance import KERNELS, LATE_KERNEL, AcceptedMeasurements
+from slamlib.slam import doubts, factors, graph
+from slamlib.slam.calibrations import calibrated
 from slamlib.slam.doubts import MAX_LOG_ODDS
-from slamlib.slam.evidence import consistency_factor
-from slamlib.slam.fit import solved_by_gtsam
-from slamlib.slam.initialization import odometry_state
-from slamlib.slam.measurement_factors import linearize_ranges
-from slamlib.slam.measurements import measure
-from slamlib.slam.noise import Noise
-from slamlib.slam.normal_equations import NormalEquations
-from slamlib.slam.optimizer import optimize
-from slamlib.slam.pipeline import fit_from_odometry, fit_from_previous
-from slamlib.slam.problem import build_problem
-from slamlib.slam.range_calibration import calibrated
-from slamlib.slam.result import chi2_per_dof
-from slamlib.slam.state import state_from_arrays
-from slamlib.slam.trilateration import (
-    GUESS_PRIOR_SIGMA,
+from slamlib.slam.factors import build_problem, linearize_ranges, state_from_arrays
+from slamlib.slam.fit import KERNELS, LATE_KERNEL, optimize, solved_by_gtsam
+from slamlib.slam.initialization import (
     KERNEL_SCALE,
     AntennaRanges,
     _cost,
+    odometry_state,
     ranges_by_antenna,
     second_moment,
     trilaterate,
 )
+from slamlib.slam.linear import NormalEquations, consistency_factor
+from slamlib.slam.measurements import GUESS_PRIOR_SIGMA, AcceptedMeasurements, Noise, measure
+from slamlib.slam.pipeline import fit_from_odometry, fit_from_previous
+from slamlib.slam.result import chi2_per_dof
 from slamlib.solve import problem_solution
 from slamlib.studies import kernels, montecarlo, plaza, starts
 
@@ -80,8 +73,8 @@ def range_errors(dataset, truth):
     return (dataset.uwb.range - np.hypot(*apart.T)) / dataset.uwb.sigma
 
 
-@pytest.mark.parametrize("error, components", [(measurement_factors.range_error, ()),
-                                               (measurement_factors.point_error, (2,))])
+@pytest.mark.parametrize("error, components", [(factors.range_error, ()),
+                                               (factors.point_error, (2,))])
 def test_derivatives_against_central_differences(error, components):
     rng = np.random.default_rng(0)
     pose, place = rng.normal(0, 2, (50, 3)), rng.normal(0, 5, (50, 2))
@@ -101,7 +94,7 @@ def test_derivatives_against_central_differences(error, components):
 def test_range_error_equals_gtsams_range_factor():
     rng = np.random.default_rng(1)
     pose, place, r = rng.normal(0, 2, (20, 3)), rng.normal(0, 5, (20, 2)), rng.uniform(1, 9, 20)
-    e, by_pose, by_place = measurement_factors.range_error(r, pose, place)
+    e, by_pose, by_place = factors.range_error(r, pose, place)
     for i in range(20):
         native = gtsam.RangeFactor2D(X(0), A(0), r[i], gtsam.noiseModel.Unit.Create(1))
         values = gtsam.Values()
@@ -605,10 +598,10 @@ def test_gtsam_takes_the_last_steps_of_a_solution(monkeypatch):
     fit, steps = fit_from_odometry(m), []
 
     def counted(problem, state):
-        steps.append(gtsam_graph.gtsam_step(problem, state))
+        steps.append(graph.gtsam_step(problem, state))
         return steps[-1]
 
-    monkeypatch.setattr(optimizer, "gtsam_step", counted)
+    monkeypatch.setattr("slamlib.slam.fit.gtsam_step", counted)
     assert 1 <= optimize(fit.problem, fit.state).steps <= 3           # it is there already
     assert optimize(fit.problem, odometry_state(m, "arc"), max_steps=2).steps == 2
     assert not steps

@@ -11,12 +11,11 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from slamlib import evaluation, se2
+from slamlib.slam.calibrations import calibrated
 from slamlib.slam.covariances import marginal_covariances
-from slamlib.slam.evidence import consistency_factor
+from slamlib.slam.linear import consistency_factor, decomposition
 from slamlib.slam.measurements import measure
-from slamlib.slam.normal_equations import decomposition
 from slamlib.slam.pipeline import fit_from_odometry
-from slamlib.slam.range_calibration import calibrated
 from slamlib.slam.result import slam_result
 
 MIN_SIGHTINGS_IN_HALF = 3   # accepted sightings of a marker; fewer may all have wrong labels

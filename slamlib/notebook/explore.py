@@ -28,13 +28,17 @@ from slamlib.notebook.parts import (
     simulated,
 )
 from slamlib.simulation import delay, misguess, mislabel
-from slamlib.slam.acceptance import AcceptedMeasurements
+from slamlib.slam.factors import build_problem
+from slamlib.slam.fit import optimize
 from slamlib.slam.initialization import odometry_state, trilaterated_antennas
-from slamlib.slam.measurements import measure
-from slamlib.slam.noise import Noise, with_known, with_known_noise
-from slamlib.slam.optimizer import optimize
+from slamlib.slam.measurements import (
+    AcceptedMeasurements,
+    Noise,
+    measure,
+    with_known,
+    with_known_noise,
+)
 from slamlib.slam.pipeline import fit_from_odometry
-from slamlib.slam.problem import build_problem
 from slamlib.slam.result import slam_result
 from slamlib.studies.kernels import solve_with
 from slamlib.studies.starts import LANDMARKS, guessed_antennas

@@ -10,34 +10,24 @@ Read `pipeline` first: its function `estimate` is the whole way from a dataset t
 stage makes the record of the next. The modules by stage, in the order to read them (stage 4 uses
 stage 5 on long drives):
 
-    1  noise                slip, and factors on the sigmas of sightings and ranges
-       measurements         Dataset -> Measurements: arrays, numbered once
+    1  measurements         Dataset -> Measurements: arrays, numbered once; their weights and noise
        structure            Measurements -> Structure of the information matrix
-    2  state                values of all variables: State
-       errors               the error of a between factor, and whitening
-       odometry_factors     odometry between frames, which depends on the wheel errors w
-       acceptance           the accepted measurements: weights, robust kernels and gates
-       measurement_factors  sightings and ranges: errors, derivatives, linearisation
-       problem              odometry, accepted measurements and noise -> Problem, the factor graph
-    3  normal_equations     Problem, State -> the linearised graph, for all values of the noise
-       gtsam_graph          the same graph in GTSAM
-       optimizer            Problem, State -> Optimum by Gauss-Newton
-    4  trilateration        possible positions of an antenna from its ranges
-       initialization       Measurements -> State: the start values
-    5  robust               Problem, State -> State by ever narrower robust kernels
-    6  evidence             Problem, State -> evidence of every value of the noise
-       first_frames         the part of a very long drive from which the noise is learned
-       noise_learning       Problem, State -> posterior of slip and noise factors
-       fit                  Problem, State -> Fit: wheels, noise, accepted measurements, in turn
-       model_choice         Fit -> Fit: arcs or Euler's steps
-       range_calibration    Fit -> Fit: with offset and scale of the ranges, if there are any
-    7  covariances          marginal covariances for one value of the noise
-       moments              Fit -> State and Covariances, averaged over the posterior of the noise
+    2  factors              State, the values of all variables; odometry, which depends on the wheel
+                            errors w; sightings and ranges; Problem, the factor graph
+    3  linear               Problem, State -> the linearised graph, and the evidence, for all values
+                            of the noise
+       graph                the same graph in GTSAM
+    4  initialization       Measurements -> State: the start values, antennas by trilateration
+    5  fit                  Problem, State -> Optimum by Gauss-Newton (stage 3); -> State by ever
+                            narrower robust kernels; -> Fit: wheels, noise, accepted measurements,
+                            in turn (stage 6)
+    6  noise                Problem, State -> posterior of slip and noise factors
+       calibrations         Fit -> Fit: arcs or Euler's steps, offset and scale of the ranges; the
+                            place and delay of the camera, and other wheels (stage 7)
+    7  covariances          Fit -> State and Covariances, averaged over the posterior of the noise
        interpolation        encoder poses between the frames
-       camera_offsets, doubts, drive_doubts
-                            where the solution contradicts the files
+       doubts, drive_doubts    where the solution contradicts the files
        result               Fit -> SlamResult in world axes
-       wheel_check          SlamResult -> SlamResult: whether other wheels explain the drive better
 
 Symbols in code and docstrings; sizes are f frames, k markers, a antennas, s sightings, r ranges and
 n unknowns, and (m, d) are m measurements of a kind with d errors each:

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from slamlib.slam.measurement_factors import MIN_DISTANCE
+from slamlib.slam.factors import MIN_DISTANCE
+from slamlib.slam.initialization import SAME_PLACE, ranges_by_antenna, second_moment, trilaterate
 from slamlib.slam.measurements import GUESS_PRIOR_SIGMA
-from slamlib.slam.trilateration import SAME_PLACE, ranges_by_antenna, second_moment, trilaterate
 
 MIN_ACCEPTED_RANGES = 5      # number of accepted ranges of an antenna that is not in doubt
 MAX_RELATIVE_SIGMA = 0.025   # of the median range: largest sigma of an antenna not in doubt

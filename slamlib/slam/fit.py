@@ -1,23 +1,225 @@
-"""Stage 6: wheels, noise and accepted measurements, estimated in turn until they agree."""
+"""Stages 3, 5 and 6: from a Problem and a State to the Fit that the measurements agree on.
+
+Gauss-Newton with step halving (`optimize`) is part of all of them. A step solves the normal
+equations in numpy and scipy, or is GTSAM's, which builds and eliminates the same graph factor by
+factor. Start values, kernels and noise take dozens of steps, by the normal equations. GTSAM takes
+the last steps of every solution, and all steps where these are singular to rounding.
+
+Robust rounds with ever narrower kernels (`narrow_kernels`) keep the solution out of the wrong
+minima to which wrong labels and late ranges lead. Then wheels, noise and accepted measurements are
+estimated in turn until they agree (`refine`). Accepted sightings count in full. Accepted ranges
+keep a one-sided kernel, which reduces the weight of late ranges only: a late range is too long,
+because it lacks the line of sight.
+"""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import gtsam
 import numpy as np
 
-from slamlib.slam.acceptance import accepted_measurements
-from slamlib.slam.evidence import laplace_approximation
-from slamlib.slam.noise import with_known
-from slamlib.slam.noise_learning import NoisePosterior, learn_noise
-from slamlib.slam.normal_equations import NormalEquations
-from slamlib.slam.odometry_factors import preintegrate_odometry
-from slamlib.slam.optimizer import optimize
-from slamlib.slam.problem import Problem
-from slamlib.slam.robust import noise_of_scatter
-from slamlib.slam.state import State
+from slamlib import se2
+from slamlib.sightings import GATE, POINT_GATE
+from slamlib.slam.factors import Problem, State, preintegrate_odometry, retract
+from slamlib.slam.graph import gtsam_step
+from slamlib.slam.linear import NormalEquations, laplace_approximation
+from slamlib.slam.measurements import AcceptedMeasurements, Noise, with_known
+from slamlib.slam.noise import NoisePosterior, learn_noise
+
+EARLY_GATE = 3.3             # sigmas; a range that is shorter than expected by more is rejected
+
+_kernel = gtsam.noiseModel.mEstimator
+# By name, scales in sigmas. Those of Huber, Cauchy and Tukey have 95 % efficiency on Gaussian noise
+# (Zhang, Image and Vision Computing 15(1), 1997). Asymmetric kernels need signed errors, which
+# GTSAM passes to them with the scheme Scalar.
+_scalar = _kernel.Base.ReweightScheme.Scalar
+KERNELS = {
+    "quadratic": None,
+    "Huber": _kernel.Huber.Create(1.345),
+    "Cauchy": _kernel.Cauchy.Create(2.385),
+    "Geman-McClure": _kernel.GemanMcClure.Create(3.0),
+    "Tukey": _kernel.Tukey.Create(4.685),
+    "asymmetric Cauchy": _kernel.AsymmetricCauchy.Create(2.385, _scalar),
+    "asymmetric Tukey": _kernel.AsymmetricTukey.Create(4.685, _scalar)}
+ONE_SIDED = ("asymmetric Cauchy", "asymmetric Tukey")
+LATE_KERNEL = KERNELS["asymmetric Tukey"]
+
+CONVERGED = 1e-6             # decrease, over 1 + error, at which iterations end
+ROUNDING = 1e-12             # relative increase of the error that is due to float rounding
+MAX_GAUSS_NEWTON_STEPS = 40  # number of steps
+MAX_HALVINGS = 8             # number of halvings of one step
+
+CAUCHY_SCALES = (100.0, 30.0, 10.0, 3.0)     # sigmas, scale of the kernel in each round
+MIN_RESIDUALS = 20           # number of measurements from which their scatter gives a factor
+MEDIAN_CHI2 = {3: 2.366, 2: 1.386, 1: 0.455}         # medians by degrees of freedom
 
 MAX_ROUNDS = 6               # number of rounds of wheels, noise and accepted measurements
 NEGLIGIBLE_CHANGE = 1e-3     # share of the measurements whose weight may change at the same noise
+
+
+@dataclass(frozen=True)
+class AcceptanceRule:
+    """How measurements are accepted, and with which kernels."""
+
+    sighting_kernel: gtsam.noiseModel.mEstimator.Base | None = None
+    gated: bool = True           # whether sightings beyond their gate are rejected
+    range_kernel: gtsam.noiseModel.mEstimator.Base | None = LATE_KERNEL
+    early: float = EARLY_GATE    # sigmas; a range that is too short by more is rejected
+    late: float = np.inf         # sigmas; the same, too long
+
+
+def acceptance_rule(kernel="asymmetric Tukey", gate=True):
+    """The AcceptanceRule with the kernel of this name in KERNELS, for sightings and ranges.
+
+    A one-sided kernel is that of the ranges only, and replaces their gate for late ones. Without
+    `gate` nothing is rejected. Raises ValueError if KERNELS has no such name.
+    """
+    if gate not in (True, False):
+        raise ValueError(f"gate must be True or False, not {gate!r}")
+    if kernel not in [*KERNELS]:                              # of any type, also not hashable
+        raise ValueError(f"kernel must be one of {', '.join(KERNELS)}, not {kernel!r}")
+    one_sided = kernel in ONE_SIDED
+    return AcceptanceRule(
+        sighting_kernel=None if one_sided else KERNELS[kernel], gated=gate,
+        range_kernel=KERNELS[kernel], early=EARLY_GATE if gate else np.inf,
+        late=EARLY_GATE if gate and not one_sided else np.inf)
+
+
+def accepted_measurements(problem, state, rule=AcceptanceRule()):
+    """The AcceptedMeasurements that an AcceptanceRule accepts at a State, with its kernels."""
+    weight = gate_weights(problem, state, rule.early, rule.late)
+    if not rule.gated:
+        weight[:len(problem.measurements.marker_row)] = 1
+    return AcceptedMeasurements(
+        problem.measurements, weight, rule.sighting_kernel, rule.range_kernel)
+
+
+def gate_weights(problem, state, early, late):
+    """Weights (s + r,): 1 within the gates, else 0.
+
+    The gate of a sighting is the 99.9 % quantile of chi-squared with 3 degrees of freedom, or 2 for
+    a point. A range may be too short by `early` and too long by `late` sigmas.
+    """
+    sightings, ranges = residuals(problem.measurements, state, problem.noise)
+    squared_gate = np.where(problem.measurements.as_pose, GATE, POINT_GATE)
+    return np.r_[np.sum(sightings**2, axis=1) < squared_gate,
+                 (ranges > -early) & (ranges < late)].astype(float)
+
+
+def kept_weights(accepted, sighting_residuals, range_residuals):
+    """Shares of its information, (s,) and (r,), that each measurement keeps, by gates and kernels.
+
+    From AcceptedMeasurements and the `residuals` of sightings (s, 3) and of ranges (r,).
+    """
+    def reweighted(weight, kernel, sizes):
+        return weight * ([kernel.weight(size) for size in sizes] if kernel else 1.0)
+
+    return (reweighted(accepted.sighting_weight, accepted.sighting_kernel,
+                       np.linalg.norm(sighting_residuals, axis=1)),
+            reweighted(accepted.range_weight, accepted.range_kernel, range_residuals))
+
+
+def residuals(measurements, state, noise):
+    """Whitened residuals, measured minus expected, without kernels, at a State and a Noise.
+
+    Returns
+    -------
+    (s, 3) of the sightings, in the axes of the vehicle; the third is 0 if the marker is a point.
+    (r,) of the ranges, positive for a range that is too long.
+
+    The errors e of the factors have the opposite sign, and those of a marker with a heading are
+    se2.log of a motion. These residuals are differences of coordinates: their gates need no more.
+    """
+    m, s = measurements, measurements.sightings
+    difference = s.z - se2.between(state.poses[s.row], state.markers[m.marker_row])
+    difference[:, 2] = se2.wrap(difference[:, 2]) * m.as_pose
+    C = s.C.copy()
+    C[~m.as_pose, 2] = C[~m.as_pose, :, 2] = [0, 0, 1]          # an independent heading
+    offset, scale = state.range_calibration
+    expected = offset + scale * np.hypot(
+        *(state.antennas[m.ranges.antenna] - state.poses[m.ranges.row, :2]).T)
+    return (np.linalg.solve(np.linalg.cholesky(C), difference[..., None])[..., 0] / noise.sightings,
+            (m.ranges.distance - expected) / m.ranges.sigma / noise.ranges)
+
+
+@dataclass(frozen=True)
+class Optimum:
+    """The end of Gauss-Newton."""
+
+    equations: NormalEquations
+    steps: int                         # number of steps taken
+
+    @property
+    def state(self) -> State:
+        """The State where the error is smallest."""
+        return self.equations.state
+
+    @property
+    def error(self):
+        """Half the sum of squared whitened errors, kernels applied."""
+        return self.equations.error
+
+
+def optimize(problem, state, max_steps=MAX_GAUSS_NEWTON_STEPS, by_gtsam=False,
+             converged=CONVERGED):
+    """The Optimum of a Problem from a State.
+
+    It ends where the error decreases by at most `converged` times (1 + error). Raises DatasetError
+    if the measurements do not determine every variable.
+    """
+    equations, steps, ended = NormalEquations(problem, state), 0, False
+    while steps < max_steps and not ended:
+        steps += 1
+        state, error = equations.state, equations.error
+        step = None if by_gtsam else equations.step()
+        equations = None                                   # of a long drive they are large
+        if step is None:
+            step = gtsam_step(problem, state)
+        for _ in range(MAX_HALVINGS):
+            equations = NormalEquations(problem, retract(problem.measurements, state, step))
+            if equations.error <= (1 + ROUNDING) * error:
+                break
+            step = step / 2
+        else:
+            equations = NormalEquations(problem, state)
+            break
+        ended = error - equations.error <= converged * (1 + error)
+    return Optimum(equations, steps)
+
+
+def narrow_kernels(problem, state, scales=CAUCHY_SCALES, converged=CONVERGED):
+    """The State after one solution for each scale of the Cauchy kernel, with all measurements.
+
+    The scales are in sigmas. The scatter of the residuals of each solution gives the noise of the
+    next. `converged` as in `optimize`. Raises DatasetError as `optimize`.
+    """
+    m = problem.measurements
+    for number, scale in enumerate(scales):
+        if number:                                   # the caller judges the last solution
+            problem = replace(problem, noise=noise_of_scatter(m, state))
+        cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(scale)
+        accepted = AcceptedMeasurements(m, m.unit_weights, cauchy, cauchy)
+        state = optimize(replace(problem, accepted=accepted), state, converged=converged).state
+    return state
+
+
+def noise_of_scatter(measurements, state):
+    """The Noise with typical slip and factors, at least 1, from the medians of the residuals.
+
+    Without these factors, covariances that are far too small would have most measurements rejected
+    before a factor is learned. Known noise parameters are kept.
+    """
+    sightings, ranges = residuals(measurements, state, Noise())
+    squared = np.sum(sightings**2, axis=1) / np.where(
+        measurements.as_pose, MEDIAN_CHI2[3], MEDIAN_CHI2[2])
+    return with_known(
+        Noise(sightings=_at_least_one(squared), ranges=_at_least_one(ranges**2 / MEDIAN_CHI2[1])),
+        measurements.dataset.vehicle)
+
+
+def _at_least_one(squared):
+    """Root of the median of squared residuals over that of chi-squared, if it exceeds 1."""
+    return max(1.0, float(np.sqrt(np.median(squared)))) if len(squared) >= MIN_RESIDUALS else 1.0
 
 
 @dataclass(frozen=True)

@@ -3,24 +3,43 @@
 On a long drive odometry loses the heading. Therefore its first part is solved by the robust rounds
 of stage 5. Odometry with the wheels that this part calibrated then predicts the poses of a longer
 part, and so on.
+
+Trilateration finds the possible positions of an antenna from its ranges, robustly. Stage 7 uses it
+again for the antennas in doubt.
 """
+
+from dataclasses import dataclass
 
 import numpy as np
 
 from slamlib import odometry, se2
 from slamlib.sightings import consensus, evenly_chosen
-from slamlib.slam.measurements import measure
-from slamlib.slam.noise import Noise, with_known
-from slamlib.slam.odometry_factors import preintegrate_odometry
-from slamlib.slam.problem import build_problem
-from slamlib.slam.robust import narrow_kernels
-from slamlib.slam.state import state_from_arrays
-from slamlib.slam.trilateration import ranges_by_antenna, trilaterate
+from slamlib.slam.factors import (
+    MIN_DISTANCE,
+    build_problem,
+    preintegrate_odometry,
+    state_from_arrays,
+)
+from slamlib.slam.fit import narrow_kernels
+from slamlib.slam.measurements import GUESS_PRIOR_SIGMA, Noise, measure, with_known
 
 MAX_ODOMETRY_SIGMA = 0.5     # rad, of odometry's heading at the end of a drive's first part
 MAX_FIRST_PART = 1.5         # length of the first part over that which odometry can predict
 GROWTH = 4                   # largest ratio of the numbers of poses of a part and the one before
 MAX_VOTES = 60               # number of sightings of a marker that enter its consensus
+
+MAX_RANGES = 150             # maximum number of ranges used per antenna, evenly chosen
+SAME_PLACE = 0.2             # of the median range: positions closer than this are one
+KERNEL_SCALE = 2.0           # sigmas, scale of the Cauchy kernel
+START_DIRECTIONS = 8         # number of starts on a circle about the path
+MAX_SEARCH_STEPS = 60        # number of steps of the search
+STEP_TOLERANCE = 1e-6        # m, length of a step at which the search ends
+FIRST_DAMPING = 1e-3         # share of the curvature that is added to it
+DAMPING_FACTOR = 10          # by which damping falls after a descent and grows after an ascent
+MIN_ASCENT_DAMPING = 0.1     # damping from which it grows after an ascent
+SMALLEST_CURVATURE = 1e-3    # of the smaller over the larger second derivative
+GRID = (200, 361)            # numbers of radii and angles of the grid of `second_moment`
+GRID_MARGIN = 1.5            # of the longest range, by which the grid exceeds the path
 
 
 def initial_state(measurements, model, preintegrate=preintegrate_odometry):
@@ -113,3 +132,131 @@ def state_from_poses(measurements, poses, covariances, w=np.zeros(3), markers=co
     return state_from_arrays(
         measurements, poses, markers(measurements, se2.compose(poses[s.row], s.z), C),
         antennas(measurements, poses, covariances), w)
+
+
+@dataclass(frozen=True)
+class AntennaRanges:
+    """The ranges to one antenna."""
+
+    positions: np.ndarray    # (m, 2) m, of the vehicle
+    distance: np.ndarray     # (m,) m, as measured
+    sigma: np.ndarray        # (m,) m, including that of the vehicle's position
+    guess: np.ndarray        # (2,) m, guessed position of the antenna
+
+    def evenly_chosen(self):
+        """AntennaRanges of at most MAX_RANGES of these."""
+        chosen = np.unique(np.linspace(0, len(self.distance) - 1, MAX_RANGES).astype(int))
+        return AntennaRanges(
+            self.positions[chosen], self.distance[chosen], self.sigma[chosen], self.guess)
+
+
+def ranges_by_antenna(measurements, poses, covariances):
+    """List of the AntennaRanges of every antenna.
+
+    Poses (f, 3), m and rad, and covariances (f, 3, 3) of the frames are in world axes.
+    """
+    r, by_antenna = measurements.ranges, []
+    position_sigma = np.sqrt(np.trace(covariances[:, :2, :2], axis1=1, axis2=2) / 2)
+    for k, guess in enumerate(measurements.guess):
+        rows = np.flatnonzero(r.antenna == k)
+        by_antenna.append(AntennaRanges(
+            poses[r.row[rows], :2], r.distance[rows],
+            np.hypot(r.sigma[rows], position_sigma[r.row[rows]]), guess))
+    return by_antenna
+
+
+def trilaterate(ranges):
+    """Possible positions of an antenna with these AntennaRanges: minima of a Cauchy cost.
+
+    The search starts at the guess, at its reflection through the centre of the path, and at
+    START_DIRECTIONS points of a circle about this centre, with the median range as radius.
+
+    Returns
+    -------
+    places : (p, 2) m, with distances above SAME_PLACE, in the order of their costs.
+    costs : (p,) negative log posterior, minus that of the first position.
+    """
+    guess, centre, radius = ranges.guess, ranges.positions.mean(0), np.median(ranges.distance)
+    angle = np.arange(START_DIRECTIONS) * 2 * np.pi / START_DIRECTIONS
+    circle = centre + radius * np.stack([np.cos(angle), np.sin(angle)], -1)
+    minima, cost = _minima(
+        ranges.evenly_chosen(), np.concatenate([[guess, 2 * centre - guess], circle]))
+    distinct = []
+    for k in np.argsort(cost, kind="stable"):
+        if all(np.hypot(*(minima[k] - minima[j])) > SAME_PLACE * radius for j in distinct):
+            distinct.append(k)
+    return minima[distinct], cost[distinct] - cost[distinct[0]]
+
+
+def _minima(ranges, places):
+    """Minima (p, 2) of the Cauchy cost from the starts `places` (p, 2), and their costs (p,).
+
+    Newton's method from all starts at once, with the absolute values of the second derivatives; a
+    step that does not descend is repeated with more damping.
+    """
+    damping, (cost, gradient, hessian) = np.full(len(places), FIRST_DAMPING), _cost(ranges, places)
+    for _ in range(MAX_SEARCH_STEPS):
+        curvature, axes = np.linalg.eigh(hessian)
+        least = SMALLEST_CURVATURE * np.abs(curvature).max(axis=1, keepdims=True)
+        curvature = np.maximum(np.abs(curvature), least) * (1 + damping[:, None])
+        along_axes = np.einsum("pik,pi->pk", axes, gradient) / curvature
+        step = -np.einsum("pik,pk->pi", axes, along_axes)
+        trial = _cost(ranges, places + step)
+        better = trial[0] <= cost
+        damping = np.where(better, damping / DAMPING_FACTOR,
+                           np.maximum(damping, MIN_ASCENT_DAMPING) * DAMPING_FACTOR)
+        places = np.where(better[:, None], places + step, places)
+        for current, new in zip((cost, gradient, hessian), trial):
+            current[better] = new[better]
+        if (np.abs(step).max(axis=1) < STEP_TOLERANCE).all():
+            break
+    return places, cost
+
+
+def _cost(ranges, places):
+    """The Cauchy cost (p,) at `places` (p, 2), its gradient (p, 2) and Hessian (p, 2, 2).
+
+    The guess counts as two more measurements.
+    """
+    difference, root = places[:, None] - ranges.positions, 1 / ranges.sigma
+    distance = np.maximum(np.hypot(difference[..., 0], difference[..., 1]), MIN_DISTANCE)
+    e, direction = root * (distance - ranges.distance), difference / distance[..., None]
+    e_guess = (places - ranges.guess) / GUESS_PRIOR_SIGMA
+    first, second = _cauchy_derivatives(e)
+    first_guess, second_guess = _cauchy_derivatives(e_guess)
+    gradient = ((root * first)[:, None] @ direction)[:, 0] + first_guess / GUESS_PRIOR_SIGMA
+    lateral = root * first / distance                            # because the direction turns
+    radial = (root**2 * second - lateral)[..., None] * direction
+    hessian = np.swapaxes(direction, 1, 2) @ radial
+    hessian[:, [0, 1], [0, 1]] += lateral.sum(1)[:, None] + second_guess / GUESS_PRIOR_SIGMA**2
+    cost = np.log1p((e / KERNEL_SCALE)**2).sum(1) + np.log1p((e_guess / KERNEL_SCALE)**2).sum(1)
+    return KERNEL_SCALE**2 / 2 * cost, gradient, hessian
+
+
+def _cauchy_derivatives(e):
+    """First and second derivative of the Cauchy cost by the errors e."""
+    squared = (e / KERNEL_SCALE)**2
+    return e / (1 + squared), (1 - squared) / (1 + squared)**2
+
+
+def second_moment(ranges, estimate):
+    """Second moment (2, 2), m^2, of an antenna's position about its estimate (2,) by AntennaRanges.
+
+    For an antenna that its ranges do not determine. The posterior, the Cauchy likelihood of the
+    ranges times the prior of the guess, is summed over a polar grid. The cost is added range by
+    range: an array of the grid times all ranges would take 500 MB.
+    """
+    centre = ranges.positions.mean(0)
+    reach = GRID_MARGIN * ranges.distance.max() + np.ptp(ranges.positions, axis=0).max()
+    radius, angle = np.meshgrid(np.linspace(0, reach, GRID[0])[1:],
+                                np.linspace(-np.pi, np.pi, GRID[1])[1:])
+    place = centre + radius[..., None] * np.stack([np.cos(angle), np.sin(angle)], -1)
+    used = ranges.evenly_chosen()
+    sigma = np.hypot(used.sigma, reach / GRID[0] / 2)            # at least half a cell of the grid
+    cost = np.sum((place - ranges.guess)**2, axis=-1) / GUESS_PRIOR_SIGMA**2 / 2
+    for origin, measured, s in zip(used.positions, used.distance, sigma):
+        e = (np.hypot(place[..., 0] - origin[0], place[..., 1] - origin[1]) - measured) / s
+        cost += KERNEL_SCALE**2 * np.log1p((e / KERNEL_SCALE)**2) / 2
+    density = radius * np.exp(cost.min() - cost)
+    difference = place - estimate
+    return np.einsum("abi,abj,ab->ij", difference, difference, density) / density.sum()

@@ -3,7 +3,7 @@
 import numpy as np
 
 from slamlib import increments, se2
-from slamlib.slam.odometry_factors import odometry_noise
+from slamlib.slam.factors import odometry_noise
 
 FRAMES_AT_ONCE = 1000        # number of frames of a section, whose arrays stay in cache
 

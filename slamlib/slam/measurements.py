@@ -1,11 +1,15 @@
-"""Stage 1: all measurements of a dataset as arrays.
+"""Stage 1: all measurements of a dataset as arrays, their weights, and their noise.
 
 Frames (keyframes) are the encoder poses that are variables X_i of the graph: the first, the last,
 and each one with a sighting or a range. Measurements are numbered: first the s sightings, then the
 r ranges.
+
+Noise has three parameters: slip, the standard deviation of a wheel's slip after one metre, and two
+factors on the standard deviations that the files state for sightings and for ranges. Those that a
+dataset's Vehicle gives are known; the others are learned from the drive.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import gtsam
@@ -14,20 +18,66 @@ from gtsam.symbol_shorthand import A, C, L, P, W, X
 
 from slamlib import odometry, se2
 from slamlib.dataset import Dataset, UwbReadings
+from slamlib.increments import SLIP_BOUNDS, TYPICAL_SLIP
 from slamlib.sightings import (
     MAX_HEADING_SIGMA,
     MIN_MEASUREMENT_SIGMA,
     Sightings,
     sightings_by_frame,
 )
-from slamlib.slam.errors import square_root_information
-from slamlib.slam.noise import is_known
 from slamlib.slam.structure import Variables, block_structure
+
+NOISE_KEYS = ("slip", "marker_noise_factor", "range_noise_factor")      # of a Vehicle, as in Noise
 
 # Standard deviations of the priors of variables
 ORIGIN_SIGMA = 1e-5          # m, of the position of pose 1, which is zero by definition
 WEAK_SIGMA = 1e5             # m and rad, of a marker without accepted sightings
 GUESS_PRIOR_SIGMA = 5.0      # m, of an antenna about its guessed position
+
+
+@dataclass(frozen=True)
+class Noise:
+    """The three noise parameters."""
+
+    slip: float = TYPICAL_SLIP     # sqrt(m), sigma of a wheel's slip after one metre
+    sightings: float = 1.0         # factor on the sigmas in ArucoReading.txt
+    ranges: float = 1.0            # factor on the sigmas in UwbReading.txt
+
+    @property
+    def logarithms(self):
+        """(3,) natural logarithms of slip and both factors."""
+        return np.log([self.slip, self.sightings, self.ranges])
+
+    @classmethod
+    def from_logarithms(cls, logarithms):
+        """The Noise of `logarithms` (3,)."""
+        return cls(*np.exp(logarithms).tolist())
+
+
+def with_known_noise(dataset, slip=None, marker_noise_factor=None, range_noise_factor=None):
+    """The Dataset whose Vehicle has these noise parameters; None leaves that of the Vehicle."""
+    values = zip(NOISE_KEYS, (slip, marker_noise_factor, range_noise_factor))
+    return replace(dataset, vehicle=replace(dataset.vehicle, **{
+        key: value for key, value in values if value is not None}))
+
+
+def is_known(vehicle):
+    """(3,) bool, which noise parameters a Vehicle gives."""
+    return np.array([getattr(vehicle, key) is not None for key in NOISE_KEYS])
+
+
+def with_known(noise, vehicle):
+    """The Noise with the parameters that a Vehicle gives; the slip is at least 1e-5 sqrt(m)."""
+    known = (getattr(vehicle, key) for key in NOISE_KEYS)
+    slip, sightings, ranges = (
+        value if stated is None else stated
+        for stated, value in zip(known, (noise.slip, noise.sightings, noise.ranges)))
+    return Noise(max(slip, SLIP_BOUNDS[0]), sightings, ranges)
+
+
+def square_root_information(covariance):
+    """Upper triangular U (..., d, d) with U^T U = C^-1, from covariances C: U e is whitened."""
+    return np.swapaxes(np.linalg.cholesky(np.linalg.inv(covariance)), -1, -2)
 
 
 @dataclass(frozen=True)
@@ -170,3 +220,33 @@ def measure(dataset, extra_poses=()):
         ranges=ranges, antenna=antenna,
         guess=guess.position[np.searchsorted(guess.antenna, antenna)] if len(antenna)
         else np.zeros((0, 2)))
+
+
+@dataclass(frozen=True)
+class AcceptedMeasurements:
+    """The accepted measurements and their robust kernels.
+
+    A weight is the share of its information that a measurement keeps: 0 if it is rejected, 1 if it
+    is accepted. Graduated non-convexity and chi-squared also use weights between 0 and 1.
+    """
+
+    measurements: Measurements
+    weight: np.ndarray                       # (s + r,) sightings, then ranges
+    sighting_kernel: gtsam.noiseModel.mEstimator.Base | None = None      # None: quadratic
+    range_kernel: gtsam.noiseModel.mEstimator.Base | None = None
+
+    @property
+    def sighting_weight(self):
+        """(s,) weights of the sightings."""
+        return self.weight[:len(self.measurements.marker_row)].astype(float)
+
+    @property
+    def range_weight(self):
+        """(r,) weights of the ranges."""
+        return self.weight[len(self.measurements.marker_row):].astype(float)
+
+    @property
+    def unsupported(self):
+        """(u,) rows in `Measurements.marker` of the markers without accepted sightings."""
+        m = self.measurements
+        return np.flatnonzero(np.bincount(m.marker_row, self.sighting_weight, len(m.marker)) == 0)

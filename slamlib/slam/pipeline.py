@@ -25,18 +25,19 @@ from numbers import Real
 
 from slamlib.limits import LIMITS
 from slamlib.odometry import MODELS
-from slamlib.slam.acceptance import acceptance_rule, accepted_measurements
-from slamlib.slam.fit import refine, solved_by_gtsam
+from slamlib.slam.calibrations import better_model, calibrated, with_checked_wheels
+from slamlib.slam.factors import build_problem, preintegrate_odometry
+from slamlib.slam.fit import (
+    CAUCHY_SCALES,
+    acceptance_rule,
+    accepted_measurements,
+    narrow_kernels,
+    refine,
+    solved_by_gtsam,
+)
 from slamlib.slam.initialization import initial_state, state_from_poses
-from slamlib.slam.measurements import measure
-from slamlib.slam.model_choice import better_model
-from slamlib.slam.noise import NOISE_KEYS, Noise, with_known, with_known_noise
-from slamlib.slam.odometry_factors import preintegrate_odometry
-from slamlib.slam.problem import build_problem
-from slamlib.slam.range_calibration import calibrated
+from slamlib.slam.measurements import NOISE_KEYS, Noise, measure, with_known, with_known_noise
 from slamlib.slam.result import slam_result
-from slamlib.slam.robust import CAUCHY_SCALES, narrow_kernels
-from slamlib.slam.wheel_check import with_checked_wheels
 
 WARM_START_CONVERGED = 1e-3  # decrease, over 1 + error, at which the start from a result ends
 
@@ -55,7 +56,7 @@ def estimate(dataset, slip=None, model=None, previous=None, *, marker_noise_fact
     previous : SlamResult of the same drive with fewer sensors, from which the solution starts.
     marker_noise_factor, range_noise_factor : known factors on the standard deviations in the files;
         None as for `slip`.
-    kernel : name in `acceptance.KERNELS`, the robust kernel of sightings and ranges; that of the
+    kernel : name in `fit.KERNELS`, the robust kernel of sightings and ranges; that of the
         ranges only if its name begins with "asymmetric".
     gate : bool, whether measurements that contradict the solution are rejected.
 

@@ -5,16 +5,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slamlib import se2
-from slamlib.slam.acceptance import AcceptedMeasurements, kept_weights, residuals
-from slamlib.slam.camera_offsets import CameraOffsets, estimate_camera_offsets
+from slamlib.slam.calibrations import CameraOffsets, estimate_camera_offsets
+from slamlib.slam.covariances import posterior_moments
 from slamlib.slam.doubts import antenna_doubts
 from slamlib.slam.drive_doubts import solution_doubts, turn_doubts
+from slamlib.slam.factors import CALIBRATION_SIGMA, linearize_measurements, odometry_error
+from slamlib.slam.fit import kept_weights, residuals
 from slamlib.slam.interpolation import interpolate
-from slamlib.slam.measurement_factors import linearize_measurements
-from slamlib.slam.moments import posterior_moments
-from slamlib.slam.noise import Noise
-from slamlib.slam.odometry_factors import odometry_error
-from slamlib.slam.state import CALIBRATION_SIGMA
+from slamlib.slam.measurements import AcceptedMeasurements, Noise
 
 
 @dataclass(frozen=True)

@@ -9,15 +9,12 @@ from gtsam.symbol_shorthand import X
 from slamlib import odometry, se2
 from slamlib.evaluation import anees, ate
 from slamlib.simulation import simulate
-from slamlib.slam.evidence import log_evidence
-from slamlib.slam.fit import refine
-from slamlib.slam.gtsam_graph import nonlinear_graph
-from slamlib.slam.measurements import measure
-from slamlib.slam.noise import Noise, with_known, with_known_noise
-from slamlib.slam.odometry_factors import preintegrate_odometry
-from slamlib.slam.optimizer import optimize
+from slamlib.slam.factors import build_problem, preintegrate_odometry
+from slamlib.slam.fit import optimize, refine
+from slamlib.slam.graph import nonlinear_graph
+from slamlib.slam.linear import log_evidence
+from slamlib.slam.measurements import Noise, measure, with_known, with_known_noise
 from slamlib.slam.pipeline import fit_from_odometry
-from slamlib.slam.problem import build_problem
 from slamlib.slam.result import SlamResult, slam_result
 
 

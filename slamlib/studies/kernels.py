@@ -8,24 +8,27 @@ import numpy as np
 
 from slamlib.increments import TYPICAL_SLIP
 from slamlib.simulation import simulate
-from slamlib.slam.acceptance import (
+from slamlib.slam.factors import build_problem, state_from_arrays
+from slamlib.slam.fit import (
+    CAUCHY_SCALES,
     EARLY_GATE,
-    AcceptedMeasurements,
     acceptance_rule,
     accepted_measurements,
     gate_weights,
     kept_weights,
+    optimize,
+    refine,
     residuals,
 )
-from slamlib.slam.fit import refine
 from slamlib.slam.initialization import odometry_state, trilaterated_antennas
-from slamlib.slam.measurements import measure
-from slamlib.slam.noise import Noise, with_known, with_known_noise
-from slamlib.slam.optimizer import optimize
-from slamlib.slam.problem import build_problem
+from slamlib.slam.measurements import (
+    AcceptedMeasurements,
+    Noise,
+    measure,
+    with_known,
+    with_known_noise,
+)
 from slamlib.slam.result import slam_result
-from slamlib.slam.robust import CAUCHY_SCALES
-from slamlib.slam.state import state_from_arrays
 from slamlib.studies.montecarlo import judge_slam
 
 # The `AcceptanceRule` of every method against late ranges, and against wrong labels.

@@ -1,9 +1,9 @@
-"""Stage 3: the normal equations H delta = -g of a problem at a state, for all values of the noise.
+"""Stage 3: the normal equations H delta = -g of a problem at a state, and the Laplace evidence.
 
 With whitened errors e and derivatives J of all factors, H = sum J^T J and g = sum J^T e. The
 factors are linearised once, and H and g are summed by groups: priors, odometry, sightings and
 ranges. The group of odometry depends on the slip, those of sightings and ranges only on their noise
-factors. Each value of the noise then costs one sparse decomposition.
+factors. Each value of the noise then costs one sparse decomposition, which gives its evidence.
 """
 
 from dataclasses import dataclass
@@ -13,11 +13,8 @@ import numpy as np
 from scipy.sparse.linalg import splu
 
 from slamlib import se2
-from slamlib.slam.measurement_factors import linearize_measurements
+from slamlib.slam.factors import Problem, State, linearize_measurements, odometry_error
 from slamlib.slam.measurements import GUESS_PRIOR_SIGMA, WEAK_SIGMA
-from slamlib.slam.odometry_factors import odometry_error
-from slamlib.slam.problem import Problem
-from slamlib.slam.state import State
 
 MAX_CACHED_SLIPS = 3         # values of the slip whose sums are kept in memory
 
@@ -66,7 +63,7 @@ class NormalEquations:
         """Data of H, g (n,), squared error at the state, and sum log|Q| of the odometry noise Q.
 
         `consistency` (3,) divides the contribution of each kind of `linearized` by its consistency
-        factor, which corrects the bias of a robust kernel (`evidence.consistency_factors`).
+        factor, which corrects the bias of a robust kernel (`consistency_factors`).
         """
         odometry, log_determinant = self._odometry(noise.slip)
         H, g, squared = odometry.H.copy(), odometry.g.copy(), odometry.squared
@@ -149,3 +146,54 @@ def decomposition(H):
                     options={"SymmetricMode": True})
     except RuntimeError:
         return None
+
+
+def laplace_approximation(equations, noise):
+    """Solution delta (n,) of NormalEquations for a Noise, and the log evidence, up to a constant.
+
+    With the whitened errors e at the solution, the noise factors l_s and l_r of S errors of
+    sightings and R of ranges,
+
+        log evidence = -|e|^2 / 2 - sum log|Q| / 2 - S log l_s - R log l_r - log|H| / 2
+
+    (MacKay, Neural Computation 4(3), 1992). The omitted constant depends on the dataset and the
+    weights: only problems on the same accepted measurements can be compared. The log evidence is
+    minus infinity where H is singular to rounding.
+    """
+    H, g, squared, log_determinant = equations.sums(
+        noise, consistency_factors(equations.problem.accepted))
+    lu = decomposition(equations.structure.matrix(H))
+    pivots = np.zeros(1) if lu is None else lu.U.diagonal()
+    if (pivots <= 0).any():                              # H is not positive definite
+        return np.full(len(g), np.nan), -np.inf
+    delta, (sightings, ranges) = -lu.solve(g), equations.counts()
+    return delta, -(squared + g @ delta) / 2 - log_determinant / 2 \
+        - np.sum(np.log(pivots)) / 2 \
+        - sightings * np.log(noise.sightings) - ranges * np.log(noise.ranges)
+
+
+def consistency_factors(accepted):
+    """`consistency_factor` (3,) of sightings of poses, of points, and of ranges."""
+    return (consistency_factor(accepted.sighting_kernel, 3),
+            consistency_factor(accepted.sighting_kernel, 2),
+            consistency_factor(accepted.range_kernel))
+
+
+@lru_cache(maxsize=8)
+def consistency_factor(kernel, size=1):
+    """Mean of the squares of standard normal residuals of `size` components, weighted by a kernel.
+
+    The kernel weighs a residual by its norm, or by its signed value if `size` is 1. It removes part
+    of the variance of Gaussian residuals; without this factor the learned sigma would be too small
+    (Huber and Ronchetti, Robust Statistics, 2009, chapter 5). The factor is 1 without kernel.
+    """
+    if kernel is None:
+        return 1.0
+    r = np.linspace(-6 if size == 1 else 0, 6, 241)
+    density = r**(size - 1) * np.exp(-r**2 / 2) * np.array([kernel.weight(x) for x in r])
+    return float(np.sum(r**2 * density) / np.sum(density)) / size
+
+
+def log_evidence(problem, state):
+    """Log evidence of a Problem by `laplace_approximation` at a State near its optimum."""
+    return laplace_approximation(NormalEquations(problem, state), problem.noise)[1]

@@ -20,9 +20,8 @@ import numpy as np
 from gtsam.symbol_shorthand import A, C, L, P, W, X
 
 from slamlib.dataset import DatasetError
-from slamlib.slam.measurement_factors import linearize_ranges, linearize_sightings
+from slamlib.slam.factors import linearize_ranges, linearize_sightings, odometry_error
 from slamlib.slam.measurements import GUESS_PRIOR_SIGMA, WEAK_SIGMA
-from slamlib.slam.odometry_factors import odometry_error
 
 
 def gtsam_step(problem, state):
