@@ -1,7 +1,5 @@
 """Stage 7: antennas whose position the ranges do not determine."""
 
-from dataclasses import replace
-
 import numpy as np
 
 from slamlib.slam.factors import MIN_DISTANCE
@@ -26,10 +24,8 @@ def antenna_doubts(problem, state, frame_covariances, covariances, range_weight)
     """
     m, r, sentences, covariances = (
         problem.measurements, problem.measurements.ranges, {}, covariances.copy())
-    offset, scale = state.range_calibration
-    corrected = replace(r, distance=(r.distance - offset) / scale,
-                        sigma=r.sigma * problem.noise.ranges / scale)
-    by_antenna = ranges_by_antenna(replace(m, ranges=corrected), state.poses, frame_covariances)
+    by_antenna = ranges_by_antenna(
+        m, state.poses, frame_covariances, state.c, problem.noise.ranges)
     for k, (antenna, ranges) in enumerate(zip(m.antenna.tolist(), by_antenna)):
         sentence = _doubt(ranges, state.antennas[k], range_weight[r.antenna == k])
         if sentence is not None:

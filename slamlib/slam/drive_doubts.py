@@ -29,8 +29,7 @@ WHEEL_NAMES = ("right_radius", "left_radius", "wheelbase")
 
 def solution_doubts(measurements, result):
     """List of Doubt about the Measurements of a drive, from their SlamResult."""
-    return [*geometry_doubts(measurements.dataset.vehicle, result), *slip_doubts(result),
-            *noise_doubts(result), *calibration_doubts(result),
+    return [*calibration_doubts(result), *slip_doubts(result), *noise_doubts(result),
             *sighting_doubts(measurements, result.rejected),
             *(Doubt("antenna", f"Antenna {antenna} is in doubt: {reason}. Its covariance includes "
                                "this; look at its rows in UwbReading.txt.")
@@ -43,7 +42,7 @@ def turn_doubts(problem):
     By the stated wheels: estimated ones adapt to a wrong number of turns.
     """
     odometry, frame = problem.odometry, problem.measurements.frame
-    variance = np.sum(odometry.J_w[:, 2]**2, axis=1) \
+    variance = np.sum((odometry.J_wheel[:, 2] * problem.measurements.dataset.vehicle.sigma_wheel)**2, axis=1) \
         + odometry.covariance(problem.noise.slip)[:, 2, 2]
     if not len(variance) or np.sqrt(variance.max()) < MAX_TURN_SIGMA:
         return []
@@ -53,83 +52,6 @@ def turn_doubts(problem):
         f"they know the turn between them to {np.sqrt(variance[k]):.1f} rad (one standard "
         "deviation): whole turns may be missing in the solution, and with them the path between "
         "these poses is wrong."))]
-
-
-def geometry_doubts(vehicle, result):
-    """List of Doubt: wheels, late sightings or place of the camera, those that explain most.
-
-    One cause changes the estimates of all three; those that explain less by MIN_LEAD are left out.
-    """
-    explained = {gain: doubt for gain, doubt in (
-        _wheel_doubt(vehicle, result), _time_doubt(result.camera.time),
-        _place_doubt(result.camera.place)) if doubt}
-    return [doubt for gain, doubt in sorted(explained.items(), reverse=True)
-            if gain > max(explained) - MIN_LEAD]
-
-
-def _wheel_doubt(vehicle, result):
-    """Cost of the wheels' prior in log likelihood, and the Doubt if one of them is far off."""
-    deviation = in_sigmas(vehicle, result.wheel)
-    if not far_off(vehicle, result.wheel).any():
-        return 0.0, None
-    return deviation @ deviation / 2, Doubt("wheel-parameters", (
-        f"By the other sensors {wheels_in_words(vehicle, result.wheel)}, up to "
-        f"{np.abs(deviation).max():.0f} standard deviations off: measure the wheels again, or "
-        "state values or larger sigmas in vehicle.toml." + marker_size(vehicle, result.wheel)))
-
-
-def in_sigmas(vehicle, wheel):
-    """Differences (3,) of parameters `wheel` (3,), m, from a Vehicle's, in its sigmas."""
-    return (wheel - vehicle.wheel) / np.maximum(vehicle.sigma_wheel, MIN_WHEEL_SIGMA)
-
-
-def far_off(vehicle, wheel):
-    """(3,) bool, parameters that differ from a Vehicle's by more than MAX_WHEEL_SIGMAS."""
-    return np.abs(in_sigmas(vehicle, wheel)) > MAX_WHEEL_SIGMAS
-
-
-def wheels_in_words(vehicle, wheel):
-    """Text of the parameters in `wheel` (3,), m, that are far off a Vehicle's."""
-    return " and ".join(
-        f"{WHEEL_NAMES[k]} is {1e3 * wheel[k]:.1f} mm (stated: {1e3 * vehicle.wheel[k]:.1f} ± "
-        f"{1e3 * vehicle.sigma_wheel[k]:.1f} mm)" for k in np.flatnonzero(far_off(vehicle, wheel)))
-
-
-def marker_size(vehicle, wheel):
-    """A sentence if both radii in `wheel` (3,) differ from a Vehicle's by one factor, else ""."""
-    factors = wheel[:2] / vehicle.wheel[:2]
-    excess = factors.mean() - 1
-    if abs(excess) < 2 * np.ptp(factors):
-        return ""
-    return (f" The same is seen if all lengths in ArucoReading.txt are {abs(excess):.1%} too "
-            f"{'large' if excess > 0 else 'small'}, as for printed markers of another size than "
-            "the detector was told.")
-
-
-def _time_doubt(time):
-    """Gain in log likelihood, and the Doubt if sightings are late or early against the encoder."""
-    delay, sigma = time.estimate[0], time.sigma[0]
-    if time.gain < MIN_TIME_GAIN or abs(delay) < MIN_DELAY:
-        return time.gain, None
-    side, sign = ("late", "large") if delay > 0 else ("early", "small")
-    number = f"{abs(delay):.1f} ± {sigma:.1f} poses" if abs(delay) < MAX_DELAY else \
-        f"{abs(delay):.0f} poses or more"
-    return time.gain, Doubt("time-offset", (
-        f"The sightings agree best if they are {number} {side} against the encoder: look whether "
-        f"the pose ids of ArucoReading.txt are too {sign}, and whether rows are missing in "
-        "encoderReading.txt."))
-
-
-def _place_doubt(place):
-    """Gain in log likelihood, and the Doubt if the camera is not in the vehicle's origin."""
-    if place.gain < MIN_PLACE_GAIN or (np.abs(place.estimate) < MIN_PLACE).all():
-        return place.gain, None
-    (x, y, turn), sigma = place.estimate, place.sigma
-    return place.gain, Doubt("camera-offset", (
-        "The sightings agree best from a camera that is not in the vehicle's origin, midway "
-        f"between the wheels, but at x = {x:.3f} ± {sigma[0]:.3f} m, y = {y:.3f} ± "
-        f"{sigma[1]:.3f} m and turned by {turn:.3f} ± {sigma[2]:.3f} rad: look whether "
-        "ArucoReading.txt gives the markers in the axes of the vehicle."))
 
 
 def slip_doubts(result):
@@ -165,17 +87,16 @@ def noise_doubts(result):
 
 
 def calibration_doubts(result):
-    """List of a Doubt if the offset or scale of the ranges is not 0 or 1."""
-    covariance = result.range_calibration_covariance
-    if not covariance.any():
-        return []
-    difference = result.range_calibration - [0, 1]
-    if difference @ np.linalg.solve(covariance, difference) / 2 < MIN_RANGE_GAIN:
-        return []
-    (offset, scale), (sigma, scale_sigma) = result.range_calibration, result.range_calibration_sigma
-    return [Doubt("range-offset", (
-        f"The ranges of UwbReading.txt are {offset:.3f} ± {sigma:.3f} m plus {scale:.4f} ± "
-        f"{scale_sigma:.4f} times the distance. Problem 4 corrects this; calibrate the antennas."))]
+    """List of a Doubt for each group of the calibration that left its stated values."""
+    stated, sigma = result.calibration, np.sqrt(np.diag(result.c_covariance))
+    doubts = []
+    for group in sorted(result.released):
+        rows = np.flatnonzero(stated.group == group)
+        numbers = ", ".join(
+            f"{stated.names[k]} is {result.c[k]:.4g} ± {sigma[k]:.2g} (stated: {stated.stated[k]:.4g}"
+            + (f" ± {stated.sigma[k]:.2g})" if stated.sigma[k] else ")") for k in rows)
+        doubts.append(Doubt(group, f"By the drive {numbers}; problems 3 and 4 use this."))
+    return doubts
 
 
 def sighting_doubts(measurements, rejected):

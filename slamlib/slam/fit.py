@@ -20,7 +20,15 @@ import numpy as np
 
 from slamlib import se2
 from slamlib.sightings import GATE, POINT_GATE
-from slamlib.slam.factors import Problem, State, preintegrate_odometry, retract
+from slamlib.slam.calibration import WHEELS
+from slamlib.slam.factors import (
+    Problem,
+    State,
+    expected_ranges,
+    expected_sightings,
+    preintegrate_odometry,
+    retract,
+)
 from slamlib.slam.graph import gtsam_step
 from slamlib.slam.linear import NormalEquations, laplace_approximation
 from slamlib.slam.measurements import AcceptedMeasurements, Noise, with_known
@@ -130,16 +138,13 @@ def residuals(measurements, state, noise):
     The errors e of the factors have the opposite sign, and those of a marker with a heading are
     se2.log of a motion. These residuals are differences of coordinates: their gates need no more.
     """
-    m, s = measurements, measurements.sightings
-    difference = s.z - se2.between(state.poses[s.row], state.markers[m.marker_row])
+    m, s, r = measurements, measurements.sightings, measurements.ranges
+    difference = s.z - expected_sightings(m, state)
     difference[:, 2] = se2.wrap(difference[:, 2]) * m.as_pose
     C = s.C.copy()
     C[~m.as_pose, 2] = C[~m.as_pose, :, 2] = [0, 0, 1]          # an independent heading
-    offset, scale = state.range_calibration
-    expected = offset + scale * np.hypot(
-        *(state.antennas[m.ranges.antenna] - state.poses[m.ranges.row, :2]).T)
     return (np.linalg.solve(np.linalg.cholesky(C), difference[..., None])[..., 0] / noise.sightings,
-            (m.ranges.distance - expected) / m.ranges.sigma / noise.ranges)
+            (r.distance - expected_ranges(m, state)) / r.sigma / noise.ranges)
 
 
 @dataclass(frozen=True)
@@ -176,7 +181,7 @@ def optimize(problem, state, max_steps=MAX_GAUSS_NEWTON_STEPS, by_gtsam=False,
         if step is None:
             step = gtsam_step(problem, state)
         for _ in range(MAX_HALVINGS):
-            equations = NormalEquations(problem, retract(problem.measurements, state, step))
+            equations = NormalEquations(problem, retract(problem, state, step))
             if equations.error <= (1 + ROUNDING) * error:
                 break
             step = step / 2
@@ -230,6 +235,13 @@ class Fit:
     state: State
     log_evidence: float                  # Laplace, up to a constant
     posterior: NoisePosterior | None     # None if all noise parameters are known
+    converged: bool = True               # whether the last iterations ended by themselves
+    explanations: tuple = (frozenset(),)     # sets of released groups that the drive cannot tell apart
+
+    @property
+    def log_density(self):
+        """Log posterior density of the noise, or log evidence if all of it is known."""
+        return self.log_evidence if self.posterior is None else self.posterior.log_density
 
     @cached_property
     def equations(self):
@@ -259,7 +271,7 @@ def refine(problem, state, accept=accepted_measurements, preintegrate=preintegra
     accepted = problem.accepted if accept is None else accept(problem, state)
     changed = np.inf
     for _ in range(MAX_ROUNDS):
-        problem = replace(problem, accepted=accepted, odometry=preintegrate(m, model, state.w))
+        problem = replace(problem, accepted=accepted, odometry=preintegrate(m, model, state.c[WHEELS]))
         if m.learned.any() and changed > NEGLIGIBLE_CHANGE * len(accepted.weight):
             optimum = None                                 # frees the equations of the last round
             optimum = optimize(problem, state, max_steps=2)

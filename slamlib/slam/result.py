@@ -5,11 +5,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slamlib import se2
-from slamlib.slam.calibrations import CameraOffsets, estimate_camera_offsets
+from slamlib.slam.calibration import WHEELS, Calibration
 from slamlib.slam.covariances import posterior_moments
 from slamlib.slam.doubts import antenna_doubts
 from slamlib.slam.drive_doubts import solution_doubts, turn_doubts
-from slamlib.slam.factors import CALIBRATION_SIGMA, linearize_measurements, odometry_error
+from slamlib.slam.factors import linearize_measurements, odometry_error
 from slamlib.slam.fit import kept_weights, residuals
 from slamlib.slam.interpolation import interpolate
 from slamlib.slam.measurements import AcceptedMeasurements, Noise
@@ -28,13 +28,13 @@ class SlamResult:
     antenna_in_world: np.ndarray    # (a, 2)
     antenna_covariance: np.ndarray  # (a, 2, 2)
     doubts: dict                    # antenna id: reason, for antennas in doubt
-    wheel: np.ndarray               # (3,) R_R, R_L, b
-    wheel_covariance: np.ndarray    # (3, 3)
+    calibration: Calibration        # p entries with what is stated of them
+    c: np.ndarray                   # (p,) their estimates
+    c_covariance: np.ndarray        # (p, p), 0 where the stated value is known
+    released: frozenset             # groups of entries that left their stated values
+    explanations: tuple             # of sets of groups, each of which explains this, or one empty
     noise: Noise                    # as given or learned
     noise_sigma: np.ndarray         # (3,) of its logarithms, 0 where not learned
-    range_calibration: np.ndarray   # (2,) offset in m and scale of the ranges, 0 and 1 if stated
-    range_calibration_covariance: np.ndarray   # (2, 2), or 0
-    camera: CameraOffsets           # errors shared by all sightings, which are not modelled
     model: str                      # "arc" or "euler", as given or chosen
     log_evidence: float             # Laplace, up to a constant of dataset and accepted measurements
     chi2_per_dof: float             # of the accepted measurements, by the files' covariances
@@ -51,9 +51,14 @@ class SlamResult:
         return self.noise.slip
 
     @property
-    def range_calibration_sigma(self):
-        """(2,) standard deviations of the ranges' offset in m and scale, or 0."""
-        return np.sqrt(np.diag(self.range_calibration_covariance))
+    def wheel(self):
+        """Wheel parameters R_R, R_L, b, (3,) m."""
+        return self.c[WHEELS]
+
+    @property
+    def wheel_covariance(self):
+        """Their covariance (3, 3), m^2."""
+        return self.c_covariance[WHEELS, WHEELS]
 
 
 def slam_result(fit):
@@ -62,7 +67,6 @@ def slam_result(fit):
     Raises DatasetError and LinAlgError as `marginal_covariances`.
     """
     problem, m = fit.problem, fit.problem.measurements
-    vehicle = m.dataset.vehicle
     state, marginal, slip = posterior_moments(fit)
     poses, pose_covariances = interpolate(
         replace(problem, noise=replace(problem.noise, slip=slip)), state, marginal.pairs)
@@ -80,14 +84,10 @@ def slam_result(fit):
             marker_covariance[mapped], markers[:, 2] * m.oriented[mapped]),
         antenna=m.antenna, antenna_in_world=state.antennas,
         antenna_covariance=antenna_covariances, doubts=sentences,
-        wheel=vehicle.wheel + vehicle.sigma_wheel * state.w,
-        wheel_covariance=vehicle.sigma_wheel[:, None] * marginal.w * vehicle.sigma_wheel,
+        calibration=m.calibration, c=state.c, c_covariance=marginal.c,
+        released=problem.released, explanations=fit.explanations,
         noise=problem.noise, noise_sigma=np.zeros(3) if fit.posterior is None
         else np.sqrt(np.diag(fit.posterior.covariance)),
-        range_calibration=state.range_calibration,
-        range_calibration_covariance=(
-            CALIBRATION_SIGMA[:, None] * marginal.c * CALIBRATION_SIGMA),
-        camera=estimate_camera_offsets(fit.equations),
         model=problem.odometry.model, log_evidence=float(fit.log_evidence),
         chi2_per_dof=chi2_per_dof(problem, state, np.r_[sighting_weight, range_weight]),
         chi2_per_dof_of_all=chi2_per_dof(problem, state, m.unit_weights),
@@ -116,15 +116,17 @@ def chi2_per_dof(problem, state, weight):
     """Chi-squared by the covariances in the files, over its degrees of freedom.
 
     With weights (s + r,), a measurement counts by its dimension times its weight, and a landmark
-    subtracts its dimension. Odometry and priors have as many errors as poses and w have unknowns.
+    subtracts its dimension. Odometry and priors have as many errors as poses and calibration
+    have unknowns.
     """
     m = problem.measurements
     sightings, ranges = np.split(weight, [len(m.marker_row)])
-    stated = AcceptedMeasurements(m, weight)
-    e, _ = odometry_error(problem.odometry, state.poses, state.w)
+    stated = replace(problem, accepted=AcceptedMeasurements(m, weight), noise=Noise())
+    e, *_ = odometry_error(problem.odometry, state.poses, state.c[WHEELS])
     U, _ = problem.odometry.whitening(problem.noise.slip)
-    squared = np.sum((U @ e[..., None])**2) + np.sum(state.w**2) + 2 * sum(
-        factors.error for factors in linearize_measurements(stated, Noise(), state))
+    e_c = (state.c - m.calibration.stated)[problem.active] / problem.sigma[problem.active]
+    squared = np.sum((U @ e[..., None])**2) + e_c @ e_c + 2 * sum(
+        factors.error for factors in linearize_measurements(stated, state))
     used = np.bincount(m.marker_row, sightings * np.where(m.as_pose, 3, 2), len(m.marker))
     freedom = np.sum(np.maximum(used - np.where(m.oriented, 3, 2), 0)) \
         + np.sum(ranges) - 2 * len(m.antenna)

@@ -91,7 +91,7 @@ def evidence_curve(fit, slips, model):
 
     The measurements are those that the Fit accepts, whatever the model of the odometry steps.
     """
-    factors = preintegrate_odometry(fit.problem.measurements, model, fit.state.w)
+    factors = preintegrate_odometry(fit.problem.measurements, model, fit.state.c[:3])
     problem, state, curve = replace(fit.problem, odometry=factors), fit.state, []
     for slip in slips:
         problem = replace(problem, noise=replace(problem.noise, slip=slip))

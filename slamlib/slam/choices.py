@@ -1,0 +1,170 @@
+"""Stage 6: what the evidence decides: arcs or Euler's steps, and which statements are wrong.
+
+Of the calibration, groups of entries may leave their stated values (`released`): they get the wide
+standard deviations of `calibration.ENTRIES`. The normal equations with columns for all entries give
+the likelihood of the whole calibration, all else eliminated, exp(-u^T L u / 2 + h^T u) with u in
+wide sigmas. For a prior of precisions P on the entries that are not known, the log evidence is
+
+    h^T (L + P)^-1 h / 2 - log|L + P| / 2 + log|P| / 2,
+
+so that one linearisation ranks all sets of groups (score tests: Rao, Proc. Camb. Phil. Soc. 44(1),
+1948). The set that it proposes is solved, and replaces the present one if its evidence leads
+decisively on the same measurements with the same weights.
+"""
+
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+
+from slamlib.dataset import DatasetError
+from slamlib.slam.factors import linearize_ranges, preintegrate_odometry
+from slamlib.slam.fit import refine
+from slamlib.slam.linear import (
+    NormalEquations,
+    consistency_factors,
+    laplace_approximation,
+    solve,
+)
+from slamlib.slam.noise import equations_of_first_frames, greatest_log_density, log_density
+
+DECISIVE_LEAD = 3.0          # log evidence by which another model of the steps replaces the default
+DECISIVE_RELEASE = 6.0       # log evidence by which a group leaves its stated values
+MIN_ACCEPTED = 0.98          # ratio of the accepted measurements, of the proposed set to the present
+MAX_PROPOSALS = 5            # number of sets that are solved
+
+
+def better_model(fit, model):
+    """The Fit of another model of odometry if its evidence leads by DECISIVE_LEAD, else `fit`.
+
+    Both evidences are on the same measurements with the same weights, so the weights that the
+    kernel of the ranges gives at `fit` are kept. The noise is learned for each model.
+    """
+    current = replace(fit.problem, accepted=_with_fixed_weights(fit))
+    odometry = preintegrate_odometry(current.measurements, model, fit.problem.odometry.wheel)
+    alternative = replace(current, odometry=odometry)
+    lead = _log_density(NormalEquations(alternative, fit.state), fit.posterior) \
+        - _log_density(NormalEquations(current, fit.state), fit.posterior,
+                       is_greatest=not len(current.accepted.range_weight))
+    if lead <= DECISIVE_LEAD:
+        return fit
+    return refine(replace(fit.problem, odometry=odometry), fit.state, accept=None)
+
+
+def released(fit, accept):
+    """The Fit in which groups of the calibration have left their stated values.
+
+    `accept` as in `refine`. Returns `fit` itself if the evidence decides for none.
+    """
+    tried = []
+    for _ in range(MAX_PROPOSALS):
+        explanations = _explanations(fit)
+        groups = frozenset().union(*explanations)
+        if groups == fit.problem.released or groups in tried:
+            break
+        tried.append(groups)
+        sigma = fit.problem.measurements.calibration.sigma_without(groups)
+        try:
+            proposed = refine(replace(fit.problem, sigma=sigma, released=groups), fit.state, accept)
+            lead = _lead(proposed, fit)
+        except (DatasetError, np.linalg.LinAlgError):
+            break
+        simpler = groups < fit.problem.released
+        if proposed.problem.accepted.weight.sum() < MIN_ACCEPTED * fit.problem.accepted.weight.sum() \
+                or lead < (-DECISIVE_RELEASE if simpler else DECISIVE_RELEASE):
+            break
+        fit = replace(proposed, explanations=explanations)
+    return fit
+
+
+def _explanations(fit):
+    """The smallest sets of groups whose log evidence is within DECISIVE_RELEASE of the greatest.
+
+    Returns a tuple of frozensets: one empty set if nothing need be released, several sets if the
+    drive cannot tell them apart.
+    """
+    calibration = fit.problem.measurements.calibration
+    L, h = _likelihood(fit)
+    informed = np.diag(L) > 0
+    groups = sorted({*calibration.group[informed].tolist()})
+    evidence = {}
+    for count in range(len(groups) + 1):
+        for some in combinations(groups, count):
+            sigma = calibration.sigma_without(some) / calibration.wide
+            evidence[frozenset(some)] = _log_evidence(L, h, sigma * informed)
+    least = max(evidence.values()) - DECISIVE_RELEASE
+    enough = [some for some, value in evidence.items() if value >= least]
+    return tuple(some for some in enough if not any(other < some for other in enough))
+
+
+def _log_evidence(L, h, sigma):
+    """Log evidence of a prior with standard deviations (p,), 0 where an entry is known.
+
+    From the information L (p, p) and h (p,) of the likelihood.
+    """
+    used = sigma > 0
+    posterior = L[np.ix_(used, used)] + np.diag(sigma[used]**-2.0)
+    sign, log_determinant = np.linalg.slogdet(posterior)
+    if sign <= 0:
+        return -np.inf
+    return h[used] @ np.linalg.solve(posterior, h[used]) / 2 - log_determinant / 2 \
+        - np.sum(np.log(sigma[used]))
+
+
+def _likelihood(fit):
+    """Information L (p, p) and h (p,) of the measurements about the whole calibration.
+
+    In wide sigmas from the stated values, at the noise of the Fit, from the first frames of a long
+    drive. Entries of antennas that these do not see have no information.
+    """
+    calibration = fit.problem.measurements.calibration
+    known = replace(fit.problem, sigma=calibration.wide)
+    equations = equations_of_first_frames(NormalEquations(known, fit.state))
+    H, border, *_ = equations.sums(
+        fit.problem.noise, consistency_factors(fit.problem.accepted))
+    solution = solve(equations.structure, H, border)
+    p = len(calibration.stated)
+    L, h = np.zeros((p, p)), np.zeros(p)
+    if solution is None:
+        return L, h
+    part = equations.problem.measurements.calibration
+    entries = [calibration.names.index(name) for name in part.names]
+    u = (equations.state.c - part.stated) / part.wide
+    information = solution.S - np.eye(len(u))              # without the prior
+    values, axes = np.linalg.eigh(information)
+    information = axes * np.maximum(values, 0) @ axes.T
+    L[np.ix_(entries, entries)] = information
+    h[entries] = information @ u - (solution.gradient - u)
+    return L, h
+
+
+def _lead(proposed, present):
+    """Difference of the log evidence of two Fits, on the measurements and weights of `proposed`.
+
+    The noise is learned for each.
+    """
+    fixed = _with_fixed_weights(proposed)
+    first, second = (refine(replace(problem, accepted=fixed), state, accept=None)
+                     for problem, state in ((proposed.problem, proposed.state),
+                                            (replace(proposed.problem, sigma=present.problem.sigma),
+                                             present.state)))
+    return first.log_density - second.log_density
+
+
+def _with_fixed_weights(fit):
+    """AcceptedMeasurements in which weights replace the kernel of the ranges."""
+    accepted = fit.problem.accepted
+    weight = accepted.weight.astype(float)
+    ranges = np.flatnonzero(accepted.range_weight) + len(accepted.sighting_weight)
+    weight[ranges] = linearize_ranges(fit.problem, fit.state).weight
+    return replace(accepted, weight=weight, range_kernel=None)
+
+
+def _log_density(equations, posterior, is_greatest=False):
+    """Log evidence of known noise, or greatest log posterior density of learned noise.
+
+    If `is_greatest`, the noise of the equations' problem is the mode already.
+    """
+    if posterior is None or not posterior.covariance.any():          # nothing was learned
+        return laplace_approximation(equations, equations.problem.noise)[1]
+    return log_density(equations) if is_greatest else greatest_log_density(equations, posterior)
