@@ -30,7 +30,10 @@ from slamlib.slam.noise import equations_of_first_frames, greatest_log_density, 
 
 DECISIVE_LEAD = 3.0          # log evidence by which another model of the steps replaces the default
 DECISIVE_RELEASE = 6.0       # log evidence by which a group leaves its stated values
+STATED = 3.0                 # log evidence beside it, if standard deviations are stated
+AMBIGUOUS = 3.0              # log evidence within which explanations cannot be told apart
 MIN_ACCEPTED = 0.98          # ratio of the accepted measurements, of the proposed set to the present
+MIN_INFORMATION = 1e-3       # about an entry, in wide sigmas, below which it is not considered
 MAX_PROPOSALS = 5            # number of sets that are solved
 
 
@@ -54,47 +57,58 @@ def better_model(fit, model):
 def released(fit, accept):
     """The Fit in which groups of the calibration have left their stated values.
 
-    `accept` as in `refine`. Returns `fit` itself if the evidence decides for none.
+    `accept` as in `refine`. Returns `fit` itself if the evidence speaks for none.
     """
     tried = []
     for _ in range(MAX_PROPOSALS):
-        explanations = _explanations(fit)
-        groups = frozenset().union(*explanations)
+        explanations, groups, expected = _proposal(fit)
         if groups == fit.problem.released or groups in tried:
-            break
+            return replace(fit, explanations=explanations) if groups == fit.problem.released else fit
         tried.append(groups)
-        sigma = fit.problem.measurements.calibration.sigma_without(groups)
+        calibration = fit.problem.measurements.calibration
+        sigma = calibration.sigma_without(groups)
+        state = replace(fit.state, c=np.where(sigma > 0, fit.state.c, calibration.stated))
         try:
-            proposed = refine(replace(fit.problem, sigma=sigma, released=groups), fit.state, accept)
+            proposed = refine(replace(fit.problem, sigma=sigma, released=groups), state, accept)
             lead = _lead(proposed, fit)
         except (DatasetError, np.linalg.LinAlgError):
-            break
-        simpler = groups < fit.problem.released
-        if proposed.problem.accepted.weight.sum() < MIN_ACCEPTED * fit.problem.accepted.weight.sum() \
-                or lead < (-DECISIVE_RELEASE if simpler else DECISIVE_RELEASE):
-            break
+            return fit
+        if proposed.problem.accepted.weight.sum() \
+                < MIN_ACCEPTED * fit.problem.accepted.weight.sum() \
+                or lead < (0 if expected >= 0 else expected - DECISIVE_RELEASE):
+            return fit
         fit = replace(proposed, explanations=explanations)
     return fit
 
 
-def _explanations(fit):
-    """The smallest sets of groups whose log evidence is within DECISIVE_RELEASE of the greatest.
+def _proposal(fit):
+    """Explanations, a tuple of frozensets of groups, the groups to release, and their lead.
 
-    Returns a tuple of frozensets: one empty set if nothing need be released, several sets if the
-    drive cannot tell them apart.
+    Every released group must raise the log evidence by DECISIVE_RELEASE, and by STATED more if its
+    standard deviations are stated. Explanations are the best set and others that come within
+    AMBIGUOUS of it, neither part of it nor more: the drive cannot tell them apart. All of them are
+    released, and what else raises the evidence at all: it is not certain enough to be told, but
+    the covariances have to include it. The lead is the log evidence of this over that of the groups
+    that are released already.
     """
     calibration = fit.problem.measurements.calibration
     L, h = _likelihood(fit)
     informed = np.diag(L) > 0
-    groups = sorted({*calibration.group[informed].tolist()})
-    evidence = {}
-    for count in range(len(groups) + 1):
-        for some in combinations(groups, count):
+    doubtful = informed & (calibration.wide > calibration.sigma)
+    candidates = frozenset(calibration.group[doubtful].tolist())
+    stated = frozenset(calibration.group[calibration.sigma > 0].tolist())
+    evidence, merit = {}, {}
+    for count in range(len(candidates) + 1):
+        for some in map(frozenset, combinations(sorted(candidates), count)):
             sigma = calibration.sigma_without(some) / calibration.wide
-            evidence[frozenset(some)] = _log_evidence(L, h, sigma * informed)
-    least = max(evidence.values()) - DECISIVE_RELEASE
-    enough = [some for some, value in evidence.items() if value >= least]
-    return tuple(some for some in enough if not any(other < some for other in enough))
+            evidence[some] = _log_evidence(L, h, sigma * informed)
+            merit[some] = evidence[some] - DECISIVE_RELEASE * count - STATED * len(some & stated)
+    best = max(merit, key=merit.get)
+    explanations = tuple(some for some in merit if some == best or (
+        merit[some] > merit[best] - AMBIGUOUS and not some < best and not some > best))
+    certain = frozenset().union(*explanations)
+    more = max((some for some in evidence if certain <= some), key=evidence.get)
+    return explanations, more, evidence[more] - evidence[fit.problem.released & candidates]
 
 
 def _log_evidence(L, h, sigma):
@@ -128,13 +142,14 @@ def _likelihood(fit):
     if solution is None:
         return L, h
     part = equations.problem.measurements.calibration
-    entries = [calibration.names.index(name) for name in part.names]
     u = (equations.state.c - part.stated) / part.wide
     information = solution.S - np.eye(len(u))              # without the prior
-    values, axes = np.linalg.eigh(information)
+    some = np.diag(information) > MIN_INFORMATION
+    values, axes = np.linalg.eigh(information[np.ix_(some, some)])
     information = axes * np.maximum(values, 0) @ axes.T
+    entries = np.array([calibration.names.index(name) for name in part.names])[some]
     L[np.ix_(entries, entries)] = information
-    h[entries] = information @ u - (solution.gradient - u)
+    h[entries] = information @ u[some] - (solution.gradient - u)[some]
     return L, h
 
 

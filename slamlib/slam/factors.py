@@ -113,11 +113,13 @@ class OdometryFactors:
     """Odometry factors between consecutive frames, for every value of the slip."""
 
     model: str               # of a step, "arc" or "euler"
-    wheel: np.ndarray        # (3,) m, wheel parameters of linearisation
+    stated: np.ndarray       # (3,) m, wheel parameters as stated, to which the covariances belong
+    wheel: np.ndarray        # (3,) m, those of linearisation
     increment: np.ndarray    # (f-1, 3) Delta(wheel): m, m, rad
     J_wheel: np.ndarray      # (f-1, 3, 3) dDelta/dwheel, per m
     quantization: np.ndarray  # (f-1, 3, 3) covariance without slip, in the axes of the end
     slipping: np.ndarray     # (f-1, 3, 3) covariance of slip 1 sqrt(m), in the same axes
+    in_counts: bool = False  # whether errors are scaled to the stated wheels, once the slip is known
 
     def covariance(self, slip):
         """Covariances Q (f-1, 3, 3) for a slip in sqrt(m)."""
@@ -139,9 +141,10 @@ def preintegrate_odometry(measurements, model, wheel=None):
     vehicle = dataset.vehicle if wheel is None else dataset.vehicle.with_wheel(wheel)
     increment, by_wheel = increments.between_poses(dataset.ticks, vehicle, start, end, model)
     quantization, slipping = (se2.rotate_covariance(part, -increment[:, 2]) for part in
-                              odometry_noise(dataset.ticks, vehicle, start, end))
-    return OdometryFactors(model=model, wheel=vehicle.wheel, increment=increment, J_wheel=by_wheel,
-                           quantization=quantization, slipping=slipping)
+                              odometry_noise(dataset.ticks, dataset.vehicle, start, end))
+    return OdometryFactors(
+        model=model, stated=dataset.vehicle.wheel, wheel=vehicle.wheel, increment=increment,
+        J_wheel=by_wheel, quantization=quantization, slipping=slipping)
 
 
 def odometry_noise(ticks, vehicle, start, end, steps=None):
@@ -160,10 +163,26 @@ def odometry_error(factors, poses, wheel):
 
     Also their derivatives (f-1, 3, 6) by X_i and X_{i+1}, and (f-1, 3, 3) by the columns WHEELS of
     the calibration. The errors are not whitened.
+
+    What the encoders measure is counts. Their errors in metres and radians grow with the wheels, so
+    with `in_counts` the errors are divided by the scale, linearised, that `wheel` has beside the
+    stated wheels, for which Q is. Otherwise wheels, and with them all lengths, would be estimated
+    too small where nothing else gives the scale.
     """
-    increment = factors.increment + factors.J_wheel @ (wheel - factors.wheel)
-    e, by_first, by_second, by_increment = between_error(increment, poses[:-1], poses[1:])
-    return e, np.concatenate([by_first, by_second], axis=2), by_increment @ factors.J_wheel
+    change = wheel - factors.wheel
+    e, by_first, by_second, by_increment = between_error(
+        factors.increment + factors.J_wheel @ change, poses[:-1], poses[1:])
+    by_wheel = by_increment @ factors.J_wheel
+    radius, ratio = factors.wheel[:2].mean(), factors.wheel / factors.stated
+    scale = factors.stated[:2].mean() / radius * np.array([1, 1, ratio[2]]) \
+        if factors.in_counts else np.ones(3)
+    relative = np.array([3 * [-1 / radius / 2], 3 * [-1 / radius / 2],
+                         [0, 0, 1 / factors.wheel[2]]]).T * factors.in_counts   # by the wheels
+    before = e - by_wheel @ change                                  # at the wheels of linearisation
+    grown = 1 + relative @ change
+    return (scale * (e + (grown - 1) * before),
+            (scale * grown)[:, None] * np.concatenate([by_first, by_second], axis=2),
+            scale[:, None] * (by_wheel + relative * before[:, :, None]))
 
 
 @dataclass(frozen=True)

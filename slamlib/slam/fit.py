@@ -62,6 +62,7 @@ MIN_RESIDUALS = 20           # number of measurements from which their scatter g
 MEDIAN_CHI2 = {3: 2.366, 2: 1.386, 1: 0.455}         # medians by degrees of freedom
 
 MAX_ROUNDS = 6               # number of rounds of wheels, noise and accepted measurements
+NEGLIGIBLE_MOVE = 3e-3       # relative, of a wheel parameter since odometry was linearised
 NEGLIGIBLE_CHANGE = 1e-3     # share of the measurements whose weight may change at the same noise
 
 
@@ -277,12 +278,14 @@ def refine(problem, state, accept=accepted_measurements, preintegrate=preintegra
             optimum = optimize(problem, state, max_steps=2)
             state, posterior = optimum.state, learn_noise(optimum.equations)
             problem = replace(problem, noise=with_known(posterior.noise, m.dataset.vehicle))
+        problem = replace(problem, odometry=replace(problem.odometry, in_counts=True))
         optimum = None
         optimum = optimize(problem, state)
         state = optimum.state
         accepted = problem.accepted if accept is None else accept(problem, state)
         changed = np.count_nonzero(accepted.weight != problem.accepted.weight)
-        if not changed:
+        moved = np.abs(state.c[WHEELS] / problem.odometry.wheel - 1).max()
+        if not changed and moved < NEGLIGIBLE_MOVE:
             break
     _, log_evidence = laplace_approximation(optimum.equations, problem.noise)
     return Fit(problem, state, log_evidence, posterior)
