@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from slamlib import localization, odometry, results, se2, slam
+from slamlib.checks.solution import solution_doubts
 from slamlib.dataset import DatasetError
 from slamlib.doubt import Doubt
 
@@ -169,7 +170,7 @@ def _fusion_fields(dataset, found):
 def _slam_fields(dataset, found):
     """Fields of the Solution of problem 3 by a SlamResult."""
     return {"aruco_map": None if dataset.aruco is None else _marker_map(found),
-            "facts": _slam_facts(found, dataset), "doubts": found.drive_doubts}
+            "facts": _slam_facts(found, dataset), "doubts": solution_doubts(found)}
 
 
 def _slam_and_antenna_fields(dataset, found):

@@ -14,7 +14,7 @@ from slamlib.localization import doubts
 from slamlib.simulation import simulate
 from slamlib.slam import drive_doubts, factors, graph, linear, noise
 from slamlib.slam.covariances import marginal_covariances
-from slamlib.slam.factors import build_problem
+from slamlib.slam.problem import build_problem
 from slamlib.slam.fit import LATE_KERNEL, optimize
 from slamlib.slam.initialization import odometry_state, state_from_poses
 from slamlib.slam.linear import NormalEquations, laplace_approximation

@@ -15,7 +15,7 @@ from slamlib.simulation import simulate
 from slamlib.slam import factors, graph
 from slamlib.slam.calibrations import DECISIVE_LEAD, better_model
 from slamlib.slam.covariances import marginal_covariances, posterior_moments
-from slamlib.slam.factors import build_problem, state_from_arrays
+from slamlib.slam.problem import build_problem, state_from_arrays
 from slamlib.slam.fit import (
     KERNELS,
     MIN_RESIDUALS,

@@ -19,7 +19,8 @@ from slamlib.simulation import manoeuvre, simulate
 from slamlib.slam import doubts, factors, graph
 from slamlib.slam.calibrations import calibrated
 from slamlib.slam.doubts import MAX_LOG_ODDS
-from slamlib.slam.factors import build_problem, linearize_ranges, state_from_arrays
+from slamlib.slam.factors import linearize_ranges
+from slamlib.slam.problem import build_problem, state_from_arrays
 from slamlib.slam.fit import KERNELS, LATE_KERNEL, optimize, solved_by_gtsam
 from slamlib.slam.initialization import (
     KERNEL_SCALE,

@@ -28,7 +28,6 @@ from slamlib.notebook.parts import (
     simulated,
 )
 from slamlib.simulation import delay, misguess, mislabel
-from slamlib.slam.factors import build_problem
 from slamlib.slam.fit import optimize
 from slamlib.slam.initialization import odometry_state, trilaterated_antennas
 from slamlib.slam.measurements import (
@@ -39,6 +38,7 @@ from slamlib.slam.measurements import (
     with_known_noise,
 )
 from slamlib.slam.pipeline import fit_from_odometry
+from slamlib.slam.problem import build_problem
 from slamlib.slam.result import slam_result
 from slamlib.studies.kernels import solve_with
 from slamlib.studies.starts import LANDMARKS, guessed_antennas

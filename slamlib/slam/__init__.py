@@ -54,8 +54,7 @@ A frame is a keyframe: an encoder pose that is a variable of the graph. Axes of 
     SlamResult                           world (`interpolation` for poses, `result` for markers)
 """
 
-from slamlib.slam.drive_doubts import confirmation
 from slamlib.slam.pipeline import estimate
 from slamlib.slam.result import SlamResult
 
-__all__ = ["SlamResult", "confirmation", "estimate"]
+__all__ = ["SlamResult", "estimate"]

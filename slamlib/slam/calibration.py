@@ -75,6 +75,30 @@ class Calibration:
         return np.array([known.get(name, value) for name, value in zip(self.names, self.stated)])
 
 
+def calibration_table(calibration, c, covariance, released):
+    """List of a dict for each entry of a Calibration, with lengths and angles as in `vehicle.toml`.
+
+    "name", "unit", "group", "stated" and "stated_sigma", "estimate" and "sigma" by the values c
+    (p,) and their covariance (p, p), and whether its group is in `released`. The height is 0 where
+    half its square, which is estimated, is negative.
+    """
+    units = [entry.unit for entry in ENTRIES]
+    units += (len(c) - len(units)) * [ANTENNA_OFFSETS.unit]
+    numbers = np.stack([calibration.stated, calibration.sigma, c, np.sqrt(np.diag(covariance))])
+    numbers[:2, HEIGHT], numbers[2:, HEIGHT] = (
+        _height(*numbers[:2, HEIGHT]), _height(*numbers[2:, HEIGHT]))
+    return [{"name": name, "unit": unit, "group": str(group), "released": group in released,
+             **dict(zip(("stated", "stated_sigma", "estimate", "sigma"), column.tolist()))}
+            for name, unit, group, column in zip(
+                calibration.names, units, calibration.group, numbers.T)]
+
+
+def _height(half_square, sigma):
+    """A height and its standard deviation in m, from those of half its square."""
+    height = np.sqrt(2 * max(half_square, 0.0))
+    return height, sigma / max(height, np.sqrt(sigma / 2)) if sigma else 0.0
+
+
 def stated_calibration(vehicle, antennas):
     """The Calibration that a Vehicle states, for `antennas` (a,), ids."""
     entries = ENTRIES + len(antennas) * (ANTENNA_OFFSETS,)

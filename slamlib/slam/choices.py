@@ -1,6 +1,6 @@
 """Stage 6: what the evidence decides: arcs or Euler's steps, and which statements are wrong.
 
-Of the calibration, groups of entries may leave their stated values (`released`): they get the wide
+Of the calibration, groups of entries may leave their stated values (`calibrated`): they get the wide
 standard deviations of `calibration.ENTRIES`. The normal equations with columns for all entries give
 the likelihood of the whole calibration, all else eliminated, exp(-u^T L u / 2 + h^T u) with u in
 wide sigmas. For a prior of precisions P on the entries that are not known, the log evidence is
@@ -18,8 +18,8 @@ from itertools import combinations
 import numpy as np
 
 from slamlib.dataset import DatasetError
-from slamlib.slam.factors import linearize_ranges, preintegrate_odometry
-from slamlib.slam.fit import refine
+from slamlib.slam.factors import linearize_ranges
+from slamlib.slam.fit import accepted_measurements, refine
 from slamlib.slam.linear import (
     NormalEquations,
     consistency_factors,
@@ -27,12 +27,13 @@ from slamlib.slam.linear import (
     solve,
 )
 from slamlib.slam.noise import equations_of_first_frames, greatest_log_density, log_density
+from slamlib.slam.problem import preintegrate_odometry
 
 DECISIVE_LEAD = 3.0          # log evidence by which another model of the steps replaces the default
 DECISIVE_RELEASE = 6.0       # log evidence by which a group leaves its stated values
 STATED = 3.0                 # log evidence beside it, if standard deviations are stated
 AMBIGUOUS = 3.0              # log evidence within which explanations cannot be told apart
-MIN_ACCEPTED = 0.98          # ratio of the accepted measurements, of the proposed set to the present
+MIN_ACCEPTED = 0.98          # of the accepted measurements, that a proposed set accepts too
 MIN_INFORMATION = 1e-3       # about an entry, in wide sigmas, below which it is not considered
 MAX_PROPOSALS = 5            # number of sets that are solved
 
@@ -54,7 +55,7 @@ def better_model(fit, model):
     return refine(replace(fit.problem, odometry=odometry), fit.state, accept=None)
 
 
-def released(fit, accept):
+def calibrated(fit, accept=accepted_measurements):
     """The Fit in which groups of the calibration have left their stated values.
 
     `accept` as in `refine`. Returns `fit` itself if the evidence speaks for none.
@@ -62,8 +63,10 @@ def released(fit, accept):
     tried = []
     for _ in range(MAX_PROPOSALS):
         explanations, groups, expected = _proposal(fit)
-        if groups == fit.problem.released or groups in tried:
-            return replace(fit, explanations=explanations) if groups == fit.problem.released else fit
+        if groups == fit.problem.released:
+            return replace(fit, explanations=explanations)
+        if groups in tried:
+            break
         tried.append(groups)
         calibration = fit.problem.measurements.calibration
         sigma = calibration.sigma_without(groups)

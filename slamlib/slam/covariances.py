@@ -28,8 +28,8 @@ from scipy.sparse import csc_array
 from slamlib import se2
 from slamlib.dataset import DatasetError
 from slamlib.slam.calibration import WHEELS
-from slamlib.slam.factors import retract
 from slamlib.slam.linear import laplace_approximation, solve
+from slamlib.slam.problem import retract
 
 LEAF = 12                    # number of frames between separators
 MAX_ROUNDING = 0.05          # float rounding: share of the information about the heading at pose 1

@@ -21,18 +21,12 @@ import numpy as np
 from slamlib import se2
 from slamlib.sightings import GATE, POINT_GATE
 from slamlib.slam.calibration import WHEELS
-from slamlib.slam.factors import (
-    Problem,
-    State,
-    expected_ranges,
-    expected_sightings,
-    preintegrate_odometry,
-    retract,
-)
+from slamlib.slam.factors import expected_ranges, expected_sightings
 from slamlib.slam.graph import gtsam_step
 from slamlib.slam.linear import NormalEquations, laplace_approximation
 from slamlib.slam.measurements import AcceptedMeasurements, Noise, with_known
 from slamlib.slam.noise import NoisePosterior, learn_noise
+from slamlib.slam.problem import Problem, State, preintegrate_odometry, retract
 
 EARLY_GATE = 3.3             # sigmas; a range that is shorter than expected by more is rejected
 
@@ -154,6 +148,7 @@ class Optimum:
 
     equations: NormalEquations
     steps: int                         # number of steps taken
+    converged: bool                    # whether the error had stopped to decrease
 
     @property
     def state(self) -> State:
@@ -187,10 +182,10 @@ def optimize(problem, state, max_steps=MAX_GAUSS_NEWTON_STEPS, by_gtsam=False,
                 break
             step = step / 2
         else:
-            equations = NormalEquations(problem, state)
+            equations, ended = NormalEquations(problem, state), True
             break
         ended = error - equations.error <= converged * (1 + error)
-    return Optimum(equations, steps)
+    return Optimum(equations, steps, ended)
 
 
 def narrow_kernels(problem, state, scales=CAUCHY_SCALES, converged=CONVERGED):
@@ -236,8 +231,8 @@ class Fit:
     state: State
     log_evidence: float                  # Laplace, up to a constant
     posterior: NoisePosterior | None     # None if all noise parameters are known
-    converged: bool = True               # whether the last iterations ended by themselves
-    explanations: tuple = (frozenset(),)     # sets of released groups that the drive cannot tell apart
+    converged: bool              # whether the last iterations ended before their number did
+    explanations: tuple = (frozenset(),)     # sets of groups, each of which explains the drive
 
     @property
     def log_density(self):
@@ -255,7 +250,8 @@ def solved_by_gtsam(fit):
 
     Raises DatasetError as `optimize`.
     """
-    return replace(fit, state=optimize(fit.problem, fit.state, by_gtsam=True).state)
+    optimum = optimize(fit.problem, fit.state, by_gtsam=True)
+    return replace(fit, state=optimum.state, converged=optimum.converged)
 
 
 def refine(problem, state, accept=accepted_measurements, preintegrate=preintegrate_odometry):
@@ -272,7 +268,8 @@ def refine(problem, state, accept=accepted_measurements, preintegrate=preintegra
     accepted = problem.accepted if accept is None else accept(problem, state)
     changed = np.inf
     for _ in range(MAX_ROUNDS):
-        problem = replace(problem, accepted=accepted, odometry=preintegrate(m, model, state.c[WHEELS]))
+        problem = replace(problem, accepted=accepted,
+                          odometry=preintegrate(m, model, state.c[WHEELS]))
         if m.learned.any() and changed > NEGLIGIBLE_CHANGE * len(accepted.weight):
             optimum = None                                 # frees the equations of the last round
             optimum = optimize(problem, state, max_steps=2)
@@ -288,4 +285,4 @@ def refine(problem, state, accept=accepted_measurements, preintegrate=preintegra
         if not changed and moved < NEGLIGIBLE_MOVE:
             break
     _, log_evidence = laplace_approximation(optimum.equations, problem.noise)
-    return Fit(problem, state, log_evidence, posterior)
+    return Fit(problem, state, log_evidence, posterior, optimum.converged)

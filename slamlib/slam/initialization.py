@@ -15,16 +15,10 @@ import numpy as np
 from slamlib import odometry, se2
 from slamlib.sightings import consensus, evenly_chosen
 from slamlib.slam.calibration import ANTENNAS, HEIGHT, OFFSET, SCALE, SIZE, WHEELS
-from slamlib.slam.factors import (
-    MIN_DISTANCE,
-    build_problem,
-    camera_poses,
-    preintegrate_odometry,
-    state_from_arrays,
-    tag_positions,
-)
+from slamlib.slam.factors import MIN_DISTANCE, camera_poses, tag_positions
 from slamlib.slam.fit import narrow_kernels
 from slamlib.slam.measurements import GUESS_PRIOR_SIGMA, Noise, measure, with_known
+from slamlib.slam.problem import build_problem, preintegrate_odometry, state_from_arrays
 
 MAX_ODOMETRY_SIGMA = 0.5     # rad, of odometry's heading at the end of a drive's first part
 MAX_FIRST_PART = 1.5         # length of the first part over that which odometry can predict

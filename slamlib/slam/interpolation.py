@@ -4,7 +4,7 @@ import numpy as np
 
 from slamlib import increments, se2
 from slamlib.slam.calibration import WHEELS
-from slamlib.slam.factors import odometry_noise
+from slamlib.slam.problem import odometry_noise
 
 FRAMES_AT_ONCE = 1000        # number of frames of a section, whose arrays stay in cache
 
@@ -76,8 +76,8 @@ def _in_world_axes(pairs, poses):
 def _increments(problem, wheel, frame, start, end):
     """Increments (m, 3) from the encoder poses `start` (m,) to `end` (m,), with `wheel` (3,) m.
 
-    Also their derivatives (m, 3, 3) by `wheel`, and their covariances Q (m, 3, 3) in the axes of the
-    start. The poses lie in the section of the frames `frame` (g,).
+    Also their derivatives (m, 3, 3) by `wheel`, and their covariances Q (m, 3, 3) in the axes of
+    the start. The poses lie in the section of the frames `frame` (g,).
     """
     d = problem.measurements.dataset
     vehicle, ticks = d.vehicle.with_wheel(wheel), d.ticks[frame[0]:frame[-1] + 1]

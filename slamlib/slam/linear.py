@@ -19,8 +19,9 @@ from scipy.sparse.linalg import splu
 
 from slamlib import se2
 from slamlib.slam.calibration import WHEELS
-from slamlib.slam.factors import Problem, State, linearize_measurements, odometry_error
+from slamlib.slam.factors import linearize_measurements, odometry_error
 from slamlib.slam.measurements import GUESS_PRIOR_SIGMA, WEAK_SIGMA
+from slamlib.slam.problem import Problem, State
 
 MAX_CACHED_SLIPS = 3         # values of the slip whose sums are kept in memory
 
@@ -151,7 +152,7 @@ class NormalEquations:
 
         J_c (m, d, u) are those by the entries `columns` (u,) of the calibration.
         """
-        n, q, u = len(self.structure.diagonal), self.problem.active.sum(), len(columns)
+        n, q = len(self.structure.diagonal), self.problem.active.sum()
         J_t, last = np.swapaxes(J, 1, 2), np.concatenate([J_c, e[..., None]], axis=2)
         border, product = np.zeros((n + q, q + 1)), J_t @ last
         for column, values in zip((*columns, q), np.moveaxis(product, 2, 0)):
@@ -198,7 +199,7 @@ def solve(structure, H, border):
 
 
 def laplace_approximation(equations, noise):
-    """Solution delta (n + q,) of NormalEquations for a Noise, and the log evidence up to a constant.
+    """Solution delta (n + q,) of NormalEquations for a Noise, and log evidence up to a constant.
 
     With the whitened errors e at the solution, the noise factors l_s and l_r of S errors of
     sightings and R of ranges, and the whole information matrix I, calibration in sigmas,

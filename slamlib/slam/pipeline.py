@@ -10,7 +10,7 @@ Each stage is a function from one frozen record to the next; stages have the num
     5   narrow_kernels    Problem, State -> State, by robust kernels
     6   refine            Problem, State -> Fit: wheels, noise and accepted measurements in turn
         better_model      Fit -> Fit: arcs or Euler's steps
-        released          Fit -> Fit: what contradicts the stated calibration leaves it
+        calibrated        Fit -> Fit: groups of the calibration leave wrong stated values
         solved_by_gtsam   Fit -> Fit: the last steps by GTSAM
     7   slam_result       Fit -> SlamResult: mean and covariances over the possible noise, poses
                           between the frames, doubts
@@ -25,8 +25,7 @@ from numbers import Real
 
 from slamlib.limits import LIMITS
 from slamlib.odometry import MODELS
-from slamlib.slam.choices import better_model, released
-from slamlib.slam.factors import build_problem, preintegrate_odometry
+from slamlib.slam.choices import better_model, calibrated
 from slamlib.slam.fit import (
     CAUCHY_SCALES,
     acceptance_rule,
@@ -37,6 +36,7 @@ from slamlib.slam.fit import (
 )
 from slamlib.slam.initialization import initial_state, state_from_poses
 from slamlib.slam.measurements import NOISE_KEYS, Noise, measure, with_known, with_known_noise
+from slamlib.slam.problem import build_problem, preintegrate_odometry
 from slamlib.slam.result import slam_result
 
 WARM_START_CONVERGED = 1e-3  # decrease, over 1 + error, at which the start from a result ends
@@ -90,7 +90,7 @@ asymmetric Cauchy, asymmetric Tukey, not 'L2'
     else:
         fit = fit_from_odometry(measurements, model or "arc", accept=accept)          # 2 to 6
         fit = fit if model else better_model(fit, "euler")
-    return slam_result(solved_by_gtsam(released(fit, accept)))                        # 7
+    return slam_result(solved_by_gtsam(calibrated(fit, accept)))                      # 7
 
 
 def fit_from_odometry(measurements, model="arc", preintegrate=preintegrate_odometry,
@@ -120,7 +120,7 @@ def fit_from_previous(measurements, previous, model=None, accept=accepted_measur
     state = state_from_poses(measurements, previous.poses[frame], previous.covariances[frame],
                              calibration.values_of(previous.calibration, previous.c))
     state = narrow_kernels(problem, state, CAUCHY_SCALES[-1:], converged=WARM_START_CONVERGED)
-    return refine(problem, state, accept)
+    return replace(refine(problem, state, accept), explanations=previous.explanations)
 
 
 def _initial_noise(measurements):

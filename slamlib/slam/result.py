@@ -1,18 +1,30 @@
-"""Stage 7: the result of a fit: every encoder pose and landmark, with covariances, and doubts."""
+"""Stage 7: the result of a fit: every encoder pose and landmark, with covariances.
+
+Antennas whose position the ranges do not determine are in doubt, and their covariances include it.
+"""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from slamlib import se2
-from slamlib.slam.calibration import WHEELS, Calibration
+from slamlib.sightings import Sightings
+from slamlib.slam.calibration import WHEELS, Calibration, calibration_table
 from slamlib.slam.covariances import posterior_moments
-from slamlib.slam.doubts import antenna_doubts
-from slamlib.slam.drive_doubts import solution_doubts, turn_doubts
-from slamlib.slam.factors import linearize_measurements, odometry_error
+from slamlib.slam.factors import MIN_DISTANCE, linearize_measurements, odometry_error
 from slamlib.slam.fit import kept_weights, residuals
+from slamlib.slam.initialization import (
+    SAME_PLACE,
+    ranges_by_antenna,
+    second_moment,
+    trilaterate,
+)
 from slamlib.slam.interpolation import interpolate
-from slamlib.slam.measurements import AcceptedMeasurements, Noise
+from slamlib.slam.measurements import GUESS_PRIOR_SIGMA, AcceptedMeasurements, Noise
+
+MIN_ACCEPTED_RANGES = 5      # number of accepted ranges of an antenna that is not in doubt
+MAX_RELATIVE_SIGMA = 0.025   # of the median range: largest sigma of an antenna not in doubt
+MAX_LOG_ODDS = np.log(1000)  # log odds below which another position remains possible
 
 
 @dataclass(frozen=True)
@@ -43,12 +55,19 @@ class SlamResult:
     residual: np.ndarray            # (s, 3) whitened residuals of the sightings
     range_weight: np.ndarray        # (r,) share of its information that each range keeps, 0 to 1
     range_residual: np.ndarray      # (r,) whitened, positive for a range that is too long
-    drive_doubts: tuple = ()        # of Doubt: where the solution contradicts the files
+    sightings: Sightings            # s of them, and the frames
+    turn_sigma: np.ndarray          # (f-1,) rad, of odometry's turns between frames, stated wheels
+    converged: bool                 # whether the last iterations ended before their number did
 
     @property
     def slip(self):
         """Standard deviation of a wheel's slip after one metre, sqrt(m), as given or learned."""
         return self.noise.slip
+
+    @property
+    def calibration_table(self):
+        """List of a dict for each of the p entries, by `calibration.calibration_table`."""
+        return calibration_table(self.calibration, self.c, self.c_covariance, self.released)
 
     @property
     def wheel(self):
@@ -77,7 +96,7 @@ def slam_result(fit):
     markers[:, 2] = se2.wrap(markers[:, 2])
     sentences, antenna_covariances = antenna_doubts(
         problem, state, pose_covariances[m.frame], marginal.antennas, range_weight)
-    result = SlamResult(
+    return SlamResult(
         poses=poses, covariances=pose_covariances,
         marker=m.marker[mapped], marker_in_world=markers,
         marker_covariance=se2.rotate_covariance(
@@ -92,8 +111,72 @@ def slam_result(fit):
         chi2_per_dof=chi2_per_dof(problem, state, np.r_[sighting_weight, range_weight]),
         chi2_per_dof_of_all=chi2_per_dof(problem, state, m.unit_weights),
         rejected=problem.accepted.sighting_weight == 0, residual=residual,
-        range_weight=range_weight, range_residual=range_residual)
-    return replace(result, drive_doubts=(*solution_doubts(m, result), *turn_doubts(problem)))
+        range_weight=range_weight, range_residual=range_residual,
+        sightings=m.sightings, turn_sigma=turn_sigma(problem), converged=fit.converged)
+
+
+def turn_sigma(problem):
+    """Standard deviations (f-1,), rad, of the turns between frames by odometry of stated wheels.
+
+    Estimated wheels adapt to a wrong number of turns.
+    """
+    stated, odometry = problem.measurements.dataset.vehicle, problem.odometry
+    variance = np.sum((odometry.J_wheel[:, 2] * stated.sigma_wheel)**2, axis=1)
+    return np.sqrt(variance + odometry.covariance(problem.noise.slip)[:, 2, 2])
+
+
+def antenna_doubts(problem, state, frame_covariances, covariances, range_weight):
+    """Reasons to doubt antennas, and covariances that include the doubt, at a Problem's solution.
+
+    From covariances (f, 3, 3) of the frames and (a, 2, 2) of the antennas, in world axes, and the
+    share `range_weight` (r,) of its information that each range keeps.
+
+    Returns
+    -------
+    sentences : dict of the reason for each antenna in doubt, by its id.
+    covariances : (a, 2, 2) m^2, in doubt at least the second moment of the position.
+    """
+    m, r, sentences, covariances = (
+        problem.measurements, problem.measurements.ranges, {}, covariances.copy())
+    by_antenna = ranges_by_antenna(
+        m, state.poses, frame_covariances, state.c, problem.noise.ranges)
+    for k, (antenna, ranges) in enumerate(zip(m.antenna.tolist(), by_antenna)):
+        sentence = _doubt(ranges, state.antennas[k], range_weight[r.antenna == k])
+        if sentence is not None:
+            sentences[antenna] = sentence
+            covariances[k] = max(covariances[k], second_moment(ranges, state.antennas[k]),
+                                 key=np.trace)
+    return sentences, covariances
+
+
+def _doubt(ranges, estimate, weight):
+    """The reason why an antenna is in doubt whose ranges have the weights (m,), or None."""
+    distance, count = np.median(ranges.distance), np.count_nonzero(weight > 0.5)
+    places, costs = trilaterate(ranges)
+    elsewhere = np.hypot(*(places - estimate).T) > SAME_PLACE * distance
+    possible = places[elsewhere & (costs < MAX_LOG_ODDS)]
+    if count < MIN_ACCEPTED_RANGES:
+        return f"only {count} of its {len(ranges.distance)} ranges agree"
+    if len(possible):
+        return "its ranges fit as well at " + " and ".join(
+            "({:.1f}, {:.1f})".format(*place) for place in possible)
+    if count < len(ranges.distance) / 2:
+        return f"{len(ranges.distance) - count} of its {len(ranges.distance)} ranges disagree"
+    if _sigma_by_ranges(ranges, estimate, weight) > MAX_RELATIVE_SIGMA * distance:
+        return "its ranges are too few or come from too few directions"
+    return None
+
+
+def _sigma_by_ranges(ranges, estimate, weight):
+    """Largest standard deviation in m of an antenna, in any direction, by its ranges alone.
+
+    Its covariance in the world also includes the uncertain heading of pose 1, which rotates the
+    whole map.
+    """
+    difference = estimate - ranges.positions
+    direction = difference / np.maximum(np.hypot(*difference.T), MIN_DISTANCE)[:, None]
+    information = direction.T @ (direction * (weight / ranges.sigma**2)[:, None])
+    return 1 / np.sqrt(max(np.linalg.eigvalsh(information)[0], GUESS_PRIOR_SIGMA**-2))
 
 
 def _mapped(problem, blocks):

@@ -1,7 +1,8 @@
 """Stage 1: the sparsity structure of the information matrix H.
 
-Variables are numbered: the frames' poses, the markers and the antennas. Their unknowns are in the order in which they are eliminated. The structure depends on
-the Measurements alone and is computed once for all states, kernels and values of the noise.
+Variables are numbered: the frames' poses, the markers and the antennas. Their unknowns are in the
+order in which they are eliminated. The structure depends on the Measurements alone and is computed
+once for all states, kernels and values of the noise.
 """
 
 from copy import copy

@@ -9,12 +9,12 @@ from gtsam.symbol_shorthand import X
 from slamlib import odometry, se2
 from slamlib.evaluation import anees, ate
 from slamlib.simulation import simulate
-from slamlib.slam.factors import build_problem, preintegrate_odometry
 from slamlib.slam.fit import optimize, refine
 from slamlib.slam.graph import nonlinear_graph
 from slamlib.slam.linear import log_evidence
 from slamlib.slam.measurements import Noise, measure, with_known, with_known_noise
 from slamlib.slam.pipeline import fit_from_odometry
+from slamlib.slam.problem import build_problem, preintegrate_odometry
 from slamlib.slam.result import SlamResult, slam_result
 
 

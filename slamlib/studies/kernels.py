@@ -8,7 +8,6 @@ import numpy as np
 
 from slamlib.increments import TYPICAL_SLIP
 from slamlib.simulation import simulate
-from slamlib.slam.factors import build_problem, state_from_arrays
 from slamlib.slam.fit import (
     CAUCHY_SCALES,
     EARLY_GATE,
@@ -28,6 +27,7 @@ from slamlib.slam.measurements import (
     with_known,
     with_known_noise,
 )
+from slamlib.slam.problem import build_problem, state_from_arrays
 from slamlib.slam.result import slam_result
 from slamlib.studies.montecarlo import judge_slam
 

@@ -1,57 +1,80 @@
-"""Stage 7: doubts where the solution contradicts the files: wheels, noise, ranges, sightings."""
+"""Doubts where the solution of problem 3 or 4, a SlamResult, contradicts what the files state."""
 
 import numpy as np
 
 from slamlib.doubt import Doubt
 from slamlib.slam.noise import BOUNDS
 
-MAX_WHEEL_SIGMAS = 4.0       # sigmas, of a wheel parameter from that in vehicle.toml
-MIN_WHEEL_SIGMA = 1e-12      # m, of a wheel parameter that studies take as known
 MAX_TURN_SIGMA = np.pi / 3   # rad, between two frames; half a turn is three sigmas
 MAX_SLIP = 0.02              # sqrt(m), of wheels on the ground
-# Log likelihoods: the 99.95 % quantiles of chi-squared with 1, 3 and 2 degrees of freedom, halved.
-MIN_TIME_GAIN = 6.0578       # of late sightings
-MIN_PLACE_GAIN = 8.8650      # of a camera that is not in the origin
-MIN_RANGE_GAIN = 7.6009      # of offset and scale of the ranges
-MIN_DELAY = 0.5              # poses, of late sightings that are reported
-MAX_DELAY = 10               # poses, above which the estimate of the delay is too small
-MIN_PLACE = (0.005, 0.005, 0.005)    # m, m, rad, of a camera whose place is reported
 MAX_LATE_SHARE = 0.1         # share of the ranges that keep less than half of their weight
-MIN_LEAD = 5.0               # log likelihood by which the only explanation leads the others
 MAX_NOISE_FACTOR = 1.5       # on a sigma, or its inverse; beyond it the factor is reported
 MIN_FACTOR_SIGMAS = 4.0      # sigmas of the logarithm of a factor that is reported
 MAX_CONFIRMED = 1.1          # factor on a sigma, or its inverse, up to which it is confirmed
 MAX_CONFIRMED_SIGMAS = 3.0   # sigmas of the logarithm of a factor that is confirmed
 MAX_REJECTED = 0.1           # share of the sightings that are rejected
 MIN_SIGHTINGS_PER_MARKER = 5         # number of sightings, of which the majority must be accepted
-WHEEL_NAMES = ("right_radius", "left_radius", "wheelbase")
+# By group of the calibration: its name in a sentence, and what to look at.
+GROUPS = {
+    "wheel-parameters": ("the wheels", "Measure them."),
+    "camera-offset": ("the place of the camera", "Measure it, from midway between the wheels."),
+    "marker-size": ("the size of the markers", "Measure a printed marker. Wheels that are all off "
+                    "by one factor look the same."),
+    "time-offset": ("a delay of the sightings", "Look at the pose ids of ArucoReading.txt, and "
+                    "whether rows are missing in encoderReading.txt."),
+    "tag-offset": ("the place of the UWB tag", "Measure it, from midway between the wheels."),
+    "antenna-height": ("the height of the antennas", "Measure it over the tag."),
+    "range-offset": ("offset and scale of the ranges", "Calibrate the antennas."),
+    "range-delay": ("a delay of the ranges", "Look at the pose ids of UwbReading.txt."),
+    "antenna-offsets": ("an offset of each antenna", "Calibrate the antennas, and look for walls "
+                        "before them.")}
 
 
-def solution_doubts(measurements, result):
-    """List of Doubt about the Measurements of a drive, from their SlamResult."""
-    return [*calibration_doubts(result), *slip_doubts(result), *noise_doubts(result),
-            *sighting_doubts(measurements, result.rejected),
+def solution_doubts(result):
+    """Tuple of Doubt where a SlamResult contradicts the files of its drive."""
+    return (*calibration_doubts(result), *slip_doubts(result), *noise_doubts(result),
+            *sighting_doubts(result), *turn_doubts(result),
             *(Doubt("antenna", f"Antenna {antenna} is in doubt: {reason}. Its covariance includes "
                                "this; look at its rows in UwbReading.txt.")
-              for antenna, reason in result.doubts.items())]
+              for antenna, reason in result.doubts.items()),
+            *([] if result.converged else [Doubt("not-converged", (
+                "The solution still changed when its number of steps ended: some poses or "
+                "landmarks may be far from where the measurements want them."))]))
 
 
-def turn_doubts(problem):
-    """List of a Doubt if odometry does not determine the number of turns between two frames.
+def calibration_doubts(result):
+    """List of a Doubt for each group of the calibration that decidedly left its stated values.
 
-    By the stated wheels: estimated ones adapt to a wrong number of turns.
+    Groups that are released without a decision only make the covariances larger.
     """
-    odometry, frame = problem.odometry, problem.measurements.frame
-    variance = np.sum((odometry.J_wheel[:, 2] * problem.measurements.dataset.vehicle.sigma_wheel)**2, axis=1) \
-        + odometry.covariance(problem.noise.slip)[:, 2, 2]
-    if not len(variance) or np.sqrt(variance.max()) < MAX_TURN_SIGMA:
+    doubts, decided = [], frozenset().union(*result.explanations)
+    common = frozenset.intersection(*result.explanations)
+    for group in (group for group in GROUPS if group in decided):
+        numbers = " and ".join(
+            f"{row['name']} = {row['estimate']:.4g} ± {row['sigma']:.2g} {row['unit']}".rstrip()
+            + f" (stated: {row['stated']:.4g}"
+            + (f" ± {row['stated_sigma']:.2g})" if row["stated_sigma"] else ")")
+            for row in result.calibration_table if row["group"] == group)
+        others = " or ".join(GROUPS[other][0] for other in GROUPS if group not in common
+                             and other in decided - common - {group})
+        instead = f" The drive cannot tell this from {others}; the covariances include both." \
+            if others else ""
+        doubts.append(Doubt(group, f"By the drive {numbers}; problems 3 and 4 use this."
+                                   f"{instead} {GROUPS[group][1]} State it in vehicle.toml."))
+    return doubts
+
+
+def turn_doubts(result):
+    """List of a Doubt if odometry does not determine the number of turns between two frames."""
+    frame, sigma = result.sightings.frame, result.turn_sigma
+    if not len(sigma) or sigma.max() < MAX_TURN_SIGMA:
         return []
-    k = int(variance.argmax())
+    k = int(sigma.argmax())
     return [Doubt("turns", (
         f"Between poses {frame[k] + 1} and {frame[k + 1] + 1} only the wheels were measured, and "
-        f"they know the turn between them to {np.sqrt(variance[k]):.1f} rad (one standard "
-        "deviation): whole turns may be missing in the solution, and with them the path between "
-        "these poses is wrong."))]
+        f"they know the turn between them to {sigma[k]:.1f} rad (one standard deviation): whole "
+        "turns may be missing in the solution, and with them the path between these poses is "
+        "wrong."))]
 
 
 def slip_doubts(result):
@@ -86,31 +109,17 @@ def noise_doubts(result):
     return doubts
 
 
-def calibration_doubts(result):
-    """List of a Doubt for each group of the calibration that left its stated values."""
-    stated, sigma = result.calibration, np.sqrt(np.diag(result.c_covariance))
-    doubts = []
-    for group in sorted(result.released):
-        rows = np.flatnonzero(stated.group == group)
-        numbers = ", ".join(
-            f"{stated.names[k]} is {result.c[k]:.4g} ± {sigma[k]:.2g} (stated: {stated.stated[k]:.4g}"
-            + (f" ± {stated.sigma[k]:.2g})" if stated.sigma[k] else ")") for k in rows)
-        doubts.append(Doubt(group, f"By the drive {numbers}; problems 3 and 4 use this."))
-    return doubts
-
-
-def sighting_doubts(measurements, rejected):
-    """List of a Doubt if `rejected` (s,), bool, has many sightings, or the majority of a marker."""
-    sentences, repeated = [], measurements.sightings.contradicting
+def sighting_doubts(result):
+    """List of a Doubt if many sightings are rejected, or the majority of a marker."""
+    sentences, rejected, repeated = [], result.rejected, result.sightings.contradicting
     left_out, count = rejected.sum() + repeated, len(rejected) + repeated
     if left_out > MAX_REJECTED * count:
         sentences.append(f"{left_out} of {count} sightings contradict the rest and are left out"
                          + (f", {repeated} of them another one of the same marker at the same pose"
                             if repeated else ""))
-    seen = np.bincount(measurements.marker_row, minlength=len(measurements.marker))
-    wrong = np.bincount(measurements.marker_row, rejected, len(measurements.marker))
-    markers = measurements.marker[
-        (seen >= MIN_SIGHTINGS_PER_MARKER) & (wrong > seen / 2)].tolist()
+    marker, row = np.unique(result.sightings.marker, return_inverse=True)
+    seen, wrong = (np.bincount(row, weight, len(marker)) for weight in (None, rejected))
+    markers = marker[(seen >= MIN_SIGHTINGS_PER_MARKER) & (wrong > seen / 2)].tolist()
     if markers:
         sentences.append(f"most sightings of marker{'s' * (len(markers) > 1)} "
                          + ", ".join(map(str, markers)) + " contradict the rest and are left out")
