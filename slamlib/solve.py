@@ -210,14 +210,12 @@ def _slam_facts(found, dataset):
                   "marker_noise_relative_sigma": sigma[1]}
     if len(found.antenna):
         facts |= {"range_noise_factor": found.noise.ranges, "range_noise_relative_sigma": sigma[2]}
-    if found.range_calibration_covariance.any():
-        facts |= dict(zip(("range_offset_m", "range_scale"), found.range_calibration.tolist()))
-        facts["range_offset_and_scale_sigmas"] = found.range_calibration_sigma.tolist()
     facts = {"slip_sqrt_m": found.slip, "slip_relative_sigma": sigma[0], **facts}
     return {**facts, **_given_facts(dataset, facts), "increments": found.model,
             "outliers": int(found.rejected.sum()), "chi2_per_dof": found.chi2_per_dof,
             "chi2_per_dof_of_all": found.chi2_per_dof_of_all,
-            "log_evidence": found.log_evidence, **_wheel_facts(found)}
+            "log_evidence": found.log_evidence, **_wheel_facts(found),
+            "calibration": [row for row in found.calibration_table if row["sigma"]]}
 
 
 def solutions(dataset, found=None, problems=tuple(PROBLEMS)):

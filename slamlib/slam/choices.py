@@ -1,9 +1,9 @@
 """Stage 6: what the evidence decides: arcs or Euler's steps, and which statements are wrong.
 
-Of the calibration, groups of entries may leave their stated values (`calibrated`): they get the wide
-standard deviations of `calibration.ENTRIES`. The normal equations with columns for all entries give
-the likelihood of the whole calibration, all else eliminated, exp(-u^T L u / 2 + h^T u) with u in
-wide sigmas. For a prior of precisions P on the entries that are not known, the log evidence is
+Of the calibration, groups of entries may leave their stated values (`calibrated`): they get the
+wide standard deviations of `calibration.ENTRIES`. The normal equations with columns for all entries
+give the likelihood of the whole calibration, all else eliminated, exp(-u^T L u / 2 + h^T u) with u
+in wide sigmas. For a prior of precisions P on the entries that are not known, the log evidence is
 
     h^T (L + P)^-1 h / 2 - log|L + P| / 2 + log|P| / 2,
 
