@@ -1,4 +1,4 @@
-"""What sensors share: derivatives, posterior, decision, and drives whose files are wrong about it."""
+"""What sensors share: derivatives, posterior, decision, and drives whose files are wrong there."""
 
 from dataclasses import replace
 from functools import cache
@@ -20,13 +20,19 @@ from slamlib.slam.calibration import (
     ANTENNAS,
     ENTRIES,
     HEIGHT,
-    RANGES,
-    SIGHTINGS,
+    RANGE_LAG,
+    SIGHTING_LAG,
     WHEELS,
     calibration_table,
     stated_calibration,
 )
-from slamlib.slam.factors import kernel_bias, odometry_error, range_error, sighting_error
+from slamlib.slam.factors import (
+    VELOCITY_STEPS,
+    kernel_bias,
+    odometry_error,
+    range_error,
+    sighting_error,
+)
 from slamlib.slam.fit import KERNELS
 from slamlib.slam.initialization import odometry_state
 from slamlib.slam.linear import NormalEquations, solve
@@ -67,7 +73,11 @@ def equations_of(vehicle, count=400, seed=4):
 @pytest.mark.parametrize("vehicle", [replace(MOUNTED, **DOUBTFUL), Vehicle(**DOUBTFUL)],
                          ids=["mounted", "in the origin"])
 def test_derivatives_by_every_entry(vehicle):
-    """Of whitened errors of sightings, of poses and of points, of ranges, and of odometry."""
+    """Of whitened errors of sightings, of poses and of points, of ranges, and of odometry.
+
+    Those by delays are averaged over some encoder steps, because counts are whole numbers; so are
+    the differences. Those of odometry leave out how the scale of the errors changes its own slope.
+    """
     equations = equations_of(vehicle)
     problem, state, n = equations.problem, equations.state, len(equations.structure.diagonal)
 
@@ -76,19 +86,23 @@ def test_derivatives_by_every_entry(vehicle):
 
     q = problem.active.sum()
     assert q == len(ENTRIES) + 4
+    delays = np.isin(np.arange(q), [SIGHTING_LAG, RANGE_LAG])
     for kind in range(3):
-        numeric = central_differences(
-            lambda delta: NormalEquations(problem, moved(delta)).linearized[kind].e, np.zeros(q))
-        f = equations.linearized[kind]
+        def errors(delta, kind=kind):
+            return NormalEquations(problem, moved(delta)).linearized[kind].e
+
+        f, numeric = equations.linearized[kind], central_differences(errors, np.zeros(q), 1e-4)
+        steps = VELOCITY_STEPS / problem.sigma[SIGHTING_LAG]
+        numeric[..., delays] = central_differences(errors, np.zeros(q), steps)[..., delays]
         J = np.zeros_like(numeric)
         J[..., f.columns] = f.J_c
-        scale = np.abs(numeric).max(axis=(0, 1)) + 1e-6
-        assert (np.abs(J - numeric) < 2e-6 * scale).all()
-        assert (np.abs(J).max(axis=(0, 1)) > 0).sum() == {0: 5, 1: 5, 2: 6 + 4}[kind]
+        scale = np.abs(numeric).max(axis=(0, 1)) + 1e-9
+        assert (np.abs(J - numeric) < np.where(delays, 0.02, 1e-6) * scale).all()
+        assert (np.abs(J).max(axis=(0, 1)) > 0).sum() == (5, 5, 6 + 4)[kind]
     numeric = central_differences(
         lambda wheel: odometry_error(problem.odometry, state.poses, wheel)[0], state.c[WHEELS])
     J = odometry_error(problem.odometry, state.poses, state.c[WHEELS])[2]
-    assert (np.abs(J - numeric) < 1e-6 * np.abs(numeric).max()).all()
+    assert (np.abs(J - numeric) < 1e-3 * np.abs(numeric).max(axis=(0, 1))).all()
 
 
 @pytest.mark.parametrize("as_pose", [True, False], ids=["pose", "point"])
@@ -265,7 +279,10 @@ def test_a_wrong_statement_is_named_and_mended(fault, seed):
     for result in (both,) if what in OF_RANGES else (markers, both):
         assert what in {doubt.what for doubt in solution_doubts(result)}
     for result, ranges in ((markers, False), (both, True)):
-        assert ate(result.poses, truth.poses, aligned=True) < 1.5 * right_ate(seed, ranges)
+        possible = right_ate(seed, ranges)
+        if what == "marker-size" and not ranges:     # all lengths are those of the wheels
+            possible = np.hypot(possible, 1e-3 * np.hypot(*truth.poses[:, :2].std(axis=0)))
+        assert ate(result.poses, truth.poses, aligned=True) < 1.5 * possible
         assert anees(result.poses, result.covariances, truth.poses) < 6
     assert antenna_nees(both, truth).mean() < 8
 
