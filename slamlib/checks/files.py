@@ -155,9 +155,9 @@ def _axes_doubts(dataset, compared):
     """Doubts that axes or signs are wrong, if with others significantly more increments agree."""
     agree = np.array([compared.squared_distances(A) < AGREEMENT_GATE for A, *_ in AXES])
     k, reverse = np.unravel_index(agree.sum(axis=2).argmax(), agree.shape[:2])
-    before, after = agree[0, 0], agree[k, reverse]
-    if after.mean() < MIN_AGREEING_SHARE or \
-            after.sum() - before.sum() <= MIN_GAIN_SIGMAS * np.sum(before != after)**0.5:
+    stated, found = agree[0, 0], agree[k, reverse]
+    if found.mean() < MIN_AGREEING_SHARE or \
+            found.sum() - stated.sum() <= MIN_GAIN_SIGMAS * np.sum(found != stated)**0.5:
         return []
     A, change, wheels = np.array(AXES[k][0]), *AXES[k][1:]
     mirrors = np.linalg.det(A) < 0
@@ -176,8 +176,8 @@ def _axes_doubts(dataset, compared):
         if max(fits) >= MIN_FIT_RATIO * min(fits):
             possible = [possible[np.argmin(fits)]]
     return [Doubt(each.what, (
-        f"Increments of the vehicle by markers and by wheels agree at {before.mean():.0%} of "
-        f"{len(before)} places, and at {after.mean():.0%} with {each.sentence}."
+        f"Increments of the vehicle by markers and by wheels agree at {stated.mean():.0%} of "
+        f"{len(stated)} places, and at {found.mean():.0%} with {each.sentence}."
         + "".join(f" Equally possible: {other.sentence}." for other in possible if other != each)))
         for each in possible]
 
@@ -207,11 +207,11 @@ def path_and_antennas(dataset):
         return np.zeros((0, 2)), []
     poses, covariances = odometry.first_order(dataset.ticks, dataset.vehicle, model="arc")
     path = poses[np.cumsum(covariances[:, 2, 2] > MAX_ODOMETRY_HEADING_SIGMA**2) == 0, :2]
-    near = dataset.uwb.select(dataset.uwb.pose < len(path))
+    heard = dataset.uwb.select(dataset.uwb.pose < len(path))
     return path, [
-        (near.pose[of], near.range[of], guess)
+        (heard.pose[mine], heard.range[mine], guess)
         for antenna, guess in zip(dataset.antenna_guess.antenna, dataset.antenna_guess.position)
-        if np.count_nonzero(of := near.antenna == antenna) >= MIN_RANGES_PER_ANTENNA]
+        if np.count_nonzero(mine := heard.antenna == antenna) >= MIN_RANGES_PER_ANTENNA]
 
 
 def range_units(dataset):

@@ -38,11 +38,7 @@ def residuals_by_landmark(fit):
     the degrees of freedom tr(J C J^T): E[e^T e] = n - tr(J C J^T). A range counts by its weight.
     """
     m, equations = fit.problem.measurements, fit.equations
-    variables = range(len(m.frame), len(m.structure.width))             # all but the poses
-    unknowns = np.concatenate([m.structure.rows([j], m.structure.width[j])[0] for j in variables])
-    column = np.full(len(m.structure.diagonal), -1)
-    column[unknowns] = np.arange(len(unknowns))
-    columns = _covariance_columns(fit, unknowns)
+    columns, column = _covariance_columns(fit)
     pairs = marginal_covariances(equations, fit.problem.noise).pairs
     of_poses = np.concatenate([pairs[:, :3, :3], pairs[-1:, 3:6, 3:6]])
     totals = np.zeros((3, len(m.marker) + len(m.antenna)))
@@ -53,20 +49,27 @@ def residuals_by_landmark(fit):
         rows, J = rows[f.index], f.J
         C = columns[rows[:, :, None], column[rows][:, None]]            # wrong in columns of poses
         C[:, :3, :3], C[:, 3:, :3] = of_poses[f.row], np.swapaxes(C[:, :3, 3:], 1, 2)
-        taken = np.einsum("mdi,mij,mdj->m", J, C, J)
-        for total, values in zip(totals, (f.weight, np.sum(f.e**2, axis=1),
-                                          expected * f.weight * f.e.shape[1] - taken)):
-            np.add.at(total, f.landmark, values)
+        np.add.at(totals.T, f.landmark, np.stack([
+            f.weight, np.sum(f.e**2, axis=1),
+            expected * f.weight * f.e.shape[1] - np.einsum("mdi,mij,mdj->m", J, C, J)], axis=1))
     markers, antennas = np.split(totals, [len(m.marker)], axis=1)
     return LandmarkResiduals(*markers), LandmarkResiduals(*antennas)
 
 
-def _covariance_columns(fit, rows):
-    """Columns `rows` (r,) of the covariance (n, n) of all unknowns of a Fit, (n, r)."""
-    H = fit.equations.structure.matrix(fit.equations.sums(fit.problem.noise)[0])
-    unit = np.zeros((H.shape[0], len(rows)))
-    unit[rows, np.arange(len(rows))] = 1
-    return decomposition(H).solve(unit)
+def _covariance_columns(fit):
+    """Covariances (n, r) of a Fit's unknowns with the r that are not of poses; their columns (n,).
+
+    Unknowns of poses have the column -1. This is all that the checks need of the information matrix
+    besides `marginal_covariances`.
+    """
+    m, equations = fit.problem.measurements, fit.equations
+    others = np.concatenate(m.structure.rows_of_each(
+        np.arange(len(m.frame), len(m.structure.width))))
+    H = m.structure.matrix(equations.sums(fit.problem.noise)[0])
+    unit, column = np.zeros((H.shape[0], len(others))), np.full(H.shape[0], -1)
+    unit[others, np.arange(len(others))] = 1
+    column[others] = np.arange(len(others))
+    return decomposition(H).solve(unit), column
 
 
 @dataclass(frozen=True)
@@ -107,17 +110,17 @@ def estimated_map(dataset):
     """
     fit = calibrated(fit_from_odometry(measure(dataset)))
     m, found = fit.problem.measurements, slam_result(fit)
-    rows = m.structure.rows
     accepted = np.bincount(m.marker_row, fit.problem.accepted.sighting_weight, len(m.marker))
     marker = np.flatnonzero(np.isin(m.marker, found.marker) & m.oriented
                             & (accepted >= MIN_SIGHTINGS_IN_HALF))
     antenna = np.flatnonzero(~np.isin(m.antenna, list(found.doubts)))
-    f, k = len(m.frame), len(m.marker)
-    unknowns = np.concatenate([rows(f + marker, 3).ravel(), rows(f + k + antenna, 2).ravel()])
     place = np.concatenate([fit.state.markers[marker],
                             np.pad(fit.state.antennas[antenna], ((0, 0), (0, 1)))])
+    rows = np.concatenate([m.structure.rows(m.variables.markers[marker], 3).ravel(),
+                           m.structure.rows(m.variables.antennas[antenna], 2).ravel()])
+    columns, column = _covariance_columns(fit)
     used, C = _coordinates(marker, antenna), np.zeros(2 * [place.size])
-    C[np.ix_(used, used)] = _covariance_columns(fit, unknowns)[unknowns]
+    C[np.ix_(used, used)] = columns[np.ix_(rows, column[rows])]
     to_world = se2.compose_jacobians(place, np.zeros(3))[1]            # from each landmark's axes
     turn = block_diag(np.zeros((0, 0)), *to_world)                     # (0, 0) also without any
     return Map(m.marker[marker], m.antenna[antenna], place, turn @ C @ turn.T)
