@@ -310,10 +310,9 @@ def test_units_of_ranges_are_judged_by_their_spread_and_by_the_guesses(factor, g
     if named:
         numbers = [float(number) for number in re.findall(r"[\d.]+(?= m\b)", doubts[0].sentence)]
         middle = np.array([0.0, 2.0])
-        typical = factor * np.hypot(*(middle - [6, 10]))
-        expected = {"spread": [factor * 2 * np.sqrt(2) / 1.35, 2.0, typical],
-                    "distance": [typical, np.hypot(*(middle - guess * np.array([6, 10])))]}[named]
-        np.testing.assert_allclose(numbers, expected, rtol=0.03)
+        np.testing.assert_allclose(numbers, [
+            factor * 2 * np.sqrt(2) / 1.35, factor * np.hypot(*(middle - [6, 10])), 2.0,
+            np.hypot(*(middle - guess * np.array([6, 10])))], rtol=0.03)
         assert ("UwbReading.txt" if named == "spread" else "UwbAntennaGuess.txt") \
             in doubts[0].sentence
 

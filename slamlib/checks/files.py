@@ -30,8 +30,7 @@ MIN_FIT_RATIO = 3.0       # ratio of the ranges' median residuals that decides b
 MAX_FACTOR = 5.0          # ratio of lengths from which on the unit is in doubt
 MAX_SIGMA_RATIO = 15.0    # of a stated standard deviation to the scatter; in degrees it is 57
 MAX_ODOMETRY_HEADING_SIGMA = 0.1   # rad, at the end of the path that is compared with ranges
-MIN_EXTENT = 1e-3         # m, standard deviation of that path
-SPREADS = 0.02, 3.5       # ratios of the ranges' standard deviation to it; 0.7 is expected
+SPREADS = 0.02, 3.5       # ratios of the ranges' standard deviation to its; 0.7 is expected
 QUARTILES = 1.35          # distance of the quartiles of a normal distribution of sigma 1
 SECOND_DIFFERENCE = 0.6745 * 6**0.5      # median size, of independent errors of sigma 1
 AXES = (                  # A, its change of x and y in the sightings, kind and change of the counts
@@ -200,8 +199,7 @@ def odometry_doubts(compared):
 def path_and_antennas(dataset):
     """Odometry's path (p, 2) in m while the heading is known, and the ranges on it by antenna.
 
-    Of every antenna with a guess and MIN_RANGES_PER_ANTENNA there are poses (m,), ranges (m,) and
-    guess (2,) in m.
+    Of antennas with MIN_RANGES_PER_ANTENNA there are poses (m,), ranges (m,) and guess (2,), m.
     """
     if dataset.uwb is None or dataset.antenna_guess is None:
         return np.zeros((0, 2)), []
@@ -217,23 +215,20 @@ def path_and_antennas(dataset):
 def range_units(dataset):
     """List of a Doubt about units of ranges and antenna guesses, compared with odometry's path."""
     path, antennas = path_and_antennas(dataset)
-    if sum(len(r) for _, r, _ in antennas) < MIN_COUNT \
-            or (extent := np.hypot(*path.std(axis=0))) < MIN_EXTENT:
+    if sum(len(r) for _, r, _ in antennas) < MIN_COUNT or not path.any():
         return []
+    extent, noise = np.hypot(*path.std(axis=0)), 2 * np.median(dataset.uwb.sigma)
     spread, typical, distance = np.median([
         (np.subtract(*np.percentile(r, [75, 25])) / QUARTILES, np.median(r),
          np.median(np.hypot(*(path[pose] - guess).T))) for pose, r, guess in antennas], axis=0)
-    noise = 2 * np.median(dataset.uwb.sigma)
-    if not SPREADS[0] * extent <= spread <= SPREADS[1] * extent + noise:
-        said = (f"ranges to an antenna spread by {spread:.4g} m, and the path by the wheels by "
-                f"{extent:.4g} m (standard deviations; median range {typical:.4g} m): look at the "
-                "units of the radii in vehicle.toml")
-    elif max(typical, distance) > MAX_FACTOR * min(typical, distance):
-        said = (f"median range is {typical:.4g} m, and the median distance from the path by the "
-                f"wheels to the guess {distance:.4g} m: look at the units of UwbAntennaGuess.txt")
-    else:
+    if SPREADS[0] * extent <= spread <= SPREADS[1] * extent + noise \
+            and max(typical, distance) <= MAX_FACTOR * min(typical, distance):
         return []
-    return [Doubt("units", f"The {said} and UwbReading.txt (metres), and at its columns.")]
+    return [Doubt("units", (
+        f"The ranges to an antenna spread by {spread:.4g} m and have the median {typical:.4g} m; "
+        f"the path by the wheels spreads by {extent:.4g} m, and its median distance to the guess "
+        f"is {distance:.4g} m: look at the units of UwbReading.txt, UwbAntennaGuess.txt and of the "
+        "radii in vehicle.toml (metres), and at the columns of UwbReading.txt."))]
 
 
 def sigma_units(dataset):
@@ -248,22 +243,22 @@ def sigma_units(dataset):
                 ([0, 1], np.inf, "m", "s_xx, s_xy and s_yy in ArucoReading.txt (m^2)"),
                 ([2], MAX_HEADING_SIGMA, "rad", "s_thetatheta in ArucoReading.txt (rad^2)")):
             sigma = np.sqrt(seen.covariance[:, columns, columns].max(axis=1))
-            known = sigma < limit
-            compared.append((seen.select(known), seen.marker[known], sigma[known], unit, look,
-                             seen.marker_in_vehicle[known][:, columns]))
+            known = seen.select(sigma < limit)
+            compared.append((known, known.marker, known.marker_in_vehicle[:, columns],
+                             sigma[sigma < limit], unit, look))
     if (r := dataset.uwb) is not None:
-        compared.append((r, r.antenna, r.sigma, "m", "sigma in UwbReading.txt (metres)",
-                         r.range[:, None]))
-    for readings, landmark, sigma, unit, look, values in compared:
+        compared.append((r, r.antenna, r.range[:, None], r.sigma, "m",
+                         "sigma in UwbReading.txt (metres)"))
+    for readings, landmark, values, sigma, unit, look in compared:
         order = np.lexsort([readings.pose, landmark])
         second = np.diff(values[order], 2, axis=0)[landmark[order][2:] == landmark[order][:-2]]
         if second.size < MIN_COUNT:
             continue
         second = np.abs(se2.wrap(second) if unit == "rad" else second)
-        scatter = np.median(second) / SECOND_DIFFERENCE
-        if 0 < MAX_SIGMA_RATIO * scatter < (stated := np.median(sigma)):
+        scatter, stated = np.median(second) / SECOND_DIFFERENCE, np.median(sigma)
+        if 0 < MAX_SIGMA_RATIO * scatter < stated:
             doubts.append(Doubt("units", (
-                f"Successive measurements of a landmark scatter by {scatter:.3g} {unit} at most, "
-                f"while their stated standard deviation is {stated:.3g} {unit} (medians): look at "
-                f"the unit of {look}.")))
+                f"Successive measurements scatter by {scatter:.3g} {unit} at most, but their "
+                f"stated standard deviation is {stated:.3g} {unit} (medians): look at the unit of "
+                f"{look}.")))
     return doubts
