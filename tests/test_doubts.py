@@ -210,15 +210,16 @@ def test_stated_covariances_that_are_too_small_are_no_other_drive(factor, sensor
 
 
 def test_headings_that_are_unknown_by_turns_are_no_wrong_unit():
-    """Every second sighting without a heading, as its sigma of 100 rad says, in either order."""
+    """Every second sighting without a heading, as its sigma of 100 rad says, or all of them."""
     for seed in SEEDS:
         dataset = simulated("short", seed)[0]
-        for first in (0, 1):
-            C = dataset.aruco.covariance.copy()
-            C[first::2, 2] = C[first::2, :, 2] = 0
-            C[first::2, 2, 2] = 1e4
-            assert doubts_before_solving(replace(
-                dataset, aruco=replace(dataset.aruco, covariance=C))) == []
+        for unknown in (slice(0, None, 2), slice(1, None, 2), slice(None)):
+            C, z = dataset.aruco.covariance.copy(), dataset.aruco.marker_in_vehicle.copy()
+            C[unknown, 2] = C[unknown, :, 2] = 0
+            C[unknown, 2, 2] = 1e4
+            z[unknown, 2] = np.random.default_rng(seed).uniform(-np.pi, np.pi, len(z[unknown]))
+            assert doubts_before_solving(replace(dataset, aruco=replace(
+                dataset.aruco, marker_in_vehicle=z, covariance=C))) == []
 
 
 def test_doubts_about_files_erase_no_others():
@@ -413,7 +414,8 @@ def test_headings_that_nothing_is_known_of_contradict_no_positions():
     dataset = camera(1, 1, -1)(simulated("short", 0)[0])
     C = dataset.aruco.covariance.copy()
     C[:, 2, 2] = 1.0
-    assert doubts_before_solving(replace(dataset, aruco=replace(dataset.aruco, covariance=C))) == []
+    found = whats(replace(dataset, aruco=replace(dataset.aruco, covariance=C)))
+    assert "camera-mirrored" not in found
 
 
 # Units of lengths: (what is multiplied, by what); every one ends in a doubt or a refusal.
@@ -472,13 +474,16 @@ def test_standard_deviations_in_another_unit_are_named(what, said):
         assert doubt.what == "units" and f"look at the unit of {said}" in doubt.sentence
 
 
-def test_variances_of_headings_in_square_degrees_are_named():
-    scale = np.array([1.0, 1.0, np.degrees(1)])
+@pytest.mark.parametrize("factor", [1.0, 3.0])
+def test_variances_of_headings_in_square_degrees_are_named(factor):
+    """Headings of 0.5 and 1.5 degrees; in radians nobody would state the latter as known."""
+    scale = np.array([1.0, 1.0, factor * np.degrees(1)])
     for seed in SEEDS:
-        dataset = simulated("short", seed)[0]
-        a = dataset.aruco
+        dataset, rng = simulated("short", seed)[0], np.random.default_rng(seed)
+        a, z = dataset.aruco, dataset.aruco.marker_in_vehicle.copy()
+        z[:, 2] += np.sqrt((factor**2 - 1) * a.covariance[:, 2, 2]) * rng.normal(size=len(z))
         doubt, = doubts_before_solving(replace(dataset, aruco=replace(
-            a, covariance=a.covariance * np.outer(scale, scale))))
+            a, marker_in_vehicle=z, covariance=a.covariance * np.outer(scale, scale))))
         assert doubt.what == "units" and "s_thetatheta" in doubt.sentence
 
 

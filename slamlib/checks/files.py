@@ -77,11 +77,12 @@ def doubts_before_solving(dataset, truth=None):
     Kinds are units, wheels-swapped, wheels-reversed, camera-mirrored, camera-turned, odometry,
     counts-since-start and those of the truth.
     """
+    about_truth = [] if truth is None else list(truth.doubts)
     try:
-        doubts = _motion_doubts(dataset) + range_units(dataset) + sigma_units(dataset)
+        return (_motion_doubts(dataset) + range_units(dataset) + sigma_units(dataset)
+                + about_truth)
     except np.linalg.LinAlgError:              # where increments have no covariance
-        doubts = []
-    return [*doubts, *(truth.doubts if truth else ())]
+        return about_truth
 
 
 def merged(doubts):
@@ -107,9 +108,8 @@ def _compare(dataset):
     """The _Compared of a Dataset, between frames about SPAN apart: turns are well above noise."""
     s, args = sightings_by_frame(dataset.aruco), (dataset.ticks, dataset.vehicle)
     step, _ = increments.between_poses(*args, s.frame[:-1], s.frame[1:], "arc")
-    typical = np.median(_sizes(step)[:, 0]) if len(step) else 0.0
-    span = int(np.ceil(SPAN / max(typical, SPAN / MAX_FRAMES)))
-    span = max(1, min(span, len(s.frame) // 4))                             # on short drives
+    typical = np.median(_sizes(step)[:, 0]) if len(step) else SPAN
+    span = max(1, min(int(SPAN / max(typical, SPAN / MAX_FRAMES) + 0.5), len(s.frame) // 4))
     start, end = s.frame[:-span], s.frame[span:]
     common = common_sightings(s.row, s.marker, span)
     found = [robust_increments(s.z @ S, S @ s.C @ S, *common, len(start))
@@ -235,14 +235,15 @@ def sigma_units(dataset):
     """Doubts about stated standard deviations that are far above the scatter of a landmark.
 
     Second differences of successive measurements show the scatter; motion only increases it.
-    Unknown headings are left out.
+    Unknown headings are left out, which are above MAX_HEADING_SIGMA while others are not.
     """
     compared, doubts = [], []
     if (seen := dataset.aruco) is not None:
-        for columns, limit, unit, look in (
-                ([0, 1], np.inf, "m", "s_xx, s_xy and s_yy in ArucoReading.txt (m^2)"),
-                ([2], MAX_HEADING_SIGMA, "rad", "s_thetatheta in ArucoReading.txt (rad^2)")):
+        for columns, unit, look in (
+                ([0, 1], "m", "s_xx, s_xy and s_yy in ArucoReading.txt (m^2)"),
+                ([2], "rad", "s_thetatheta in ArucoReading.txt (rad^2)")):
             sigma = np.sqrt(seen.covariance[:, columns, columns].max(axis=1))
+            limit = np.inf if unit == "m" else np.clip(2 * sigma.min(), MAX_HEADING_SIGMA, np.pi)
             known = seen.select(sigma < limit)
             compared.append((known, known.marker, known.marker_in_vehicle[:, columns],
                              sigma[sigma < limit], unit, look))

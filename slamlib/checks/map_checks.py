@@ -25,7 +25,6 @@ ALIGNMENT_ITERATIONS = 10     # Gauss-Newton iterations for the motion between t
 class LandmarkResiduals:
     """Squared whitened residuals of every landmark of a kind, with the learned noise."""
 
-    count: np.ndarray        # (k,) sum of the weights of the accepted measurements
     chi2: np.ndarray         # (k,) sum of the squares
     dof: np.ndarray          # (k,) its expectation
 
@@ -40,7 +39,7 @@ def residuals_by_landmark(fit):
     columns, column = _covariance_columns(fit)
     pairs = marginal_covariances(equations, fit.problem.noise).pairs
     of_poses = np.concatenate([pairs[:, :3, :3], pairs[-1:, 3:6, 3:6]])
-    totals = np.zeros((3, len(m.marker) + len(m.antenna)))
+    totals = np.zeros((len(m.marker) + len(m.antenna), 2))
     of_kernel = consistency_factor(fit.problem.accepted.range_kernel)
     for f, (_, rows), expected in zip(equations.linearized, m.factor_places[1:], (1, 1, of_kernel)):
         if not len(f.row):                                              # of no width
@@ -48,11 +47,9 @@ def residuals_by_landmark(fit):
         rows, J = rows[f.index], f.J
         C = columns[rows[:, :, None], column[rows][:, None]]            # wrong in columns of poses
         C[:, :3, :3], C[:, 3:, :3] = of_poses[f.row], np.swapaxes(C[:, :3, 3:], 1, 2)
-        np.add.at(totals.T, f.landmark, np.stack([
-            f.weight, np.sum(f.e**2, axis=1),
-            expected * f.weight * f.e.shape[1] - np.einsum("mdi,mij,mdj->m", J, C, J)], axis=1))
-    markers, antennas = np.split(totals, [len(m.marker)], axis=1)
-    return LandmarkResiduals(*markers), LandmarkResiduals(*antennas)
+        np.add.at(totals, f.landmark, np.stack([np.sum(f.e**2, axis=1), (
+            expected * f.weight * f.e.shape[1] - np.einsum("mdi,mij,mdj->m", J, C, J))], axis=1))
+    return tuple(LandmarkResiduals(*part.T) for part in np.split(totals, [len(m.marker)]))
 
 
 def _covariance_columns(fit):
