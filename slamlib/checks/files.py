@@ -33,16 +33,12 @@ MAX_ODOMETRY_HEADING_SIGMA = 0.1   # rad, at the end of the path that is compare
 SPREADS = 0.02, 3.5       # ratios of the ranges' standard deviation to its; 0.7 is expected
 QUARTILES = 1.35          # distance of the quartiles of a normal distribution of sigma 1
 SECOND_DIFFERENCE = 0.6745 * 6**0.5      # median size, of independent errors of sigma 1
-AXES = (                  # A, its change of x and y in the sightings, kind and change of the counts
-    ([[1, 0], [0, 1]], "", None),
-    ([[1, 0], [0, -1]], "the other sign of y", ("wheels-swapped", "the columns exchanged")),
-    ([[-1, 0], [0, 1]], "the other sign of x", ("wheels-reversed", "both signs reversed")),
-    ([[-1, 0], [0, -1]], "the other signs of x and y",
-     ("wheels-reversed", "both signs reversed and the columns exchanged")),
-    ([[0, -1], [1, 0]], "axes turned by a right angle", None),
-    ([[0, 1], [-1, 0]], "axes turned by a right angle", None),
-    ([[0, 1], [1, 0]], "x and y exchanged", None),
-    ([[0, -1], [-1, 0]], "x and y exchanged, with the other signs", None))
+# The matrices A, and kind and change of the counts with the effect of the first ones.
+AXES = np.array([np.diag(signs) @ order for order in (np.eye(2), np.eye(2)[::-1])
+                 for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1))])
+COUNTS = (None, ("wheels-swapped", "the columns exchanged"),
+          ("wheels-reversed", "both signs reversed"),
+          ("wheels-reversed", "both signs reversed and the columns exchanged"))
 
 
 @dataclass(frozen=True)
@@ -152,21 +148,21 @@ def motion_units(compared):
 
 def _axes_doubts(dataset, compared):
     """Doubts that axes or signs are wrong, if with others significantly more increments agree."""
-    agree = np.array([compared.squared_distances(A) < AGREEMENT_GATE for A, *_ in AXES])
+    agree = np.array([compared.squared_distances(A) < AGREEMENT_GATE for A in AXES])
     k, reverse = np.unravel_index(agree.sum(axis=2).argmax(), agree.shape[:2])
     stated, found = agree[0, 0], agree[k, reverse]
     if found.mean() < MIN_AGREEING_SHARE or \
             found.sum() - stated.sum() <= MIN_GAIN_SIGMAS * np.sum(found != stated)**0.5:
         return []
-    A, change, wheels = np.array(AXES[k][0]), *AXES[k][1:]
-    mirrors = np.linalg.det(A) < 0
-    theta = "the other sign of theta" if mirrors != reverse else ""
+    A, mirrors = AXES[k], np.linalg.det(AXES[k]) < 0
+    right = ["-" * int(row.sum() < 0) + "xy"[np.abs(row).argmax()] for row in A.T]
     possible = [Doubt("camera-mirrored" if mirrors or reverse else "camera-turned", (
-        f"sightings with {' and '.join(filter(None, (change, theta)))} "
-        "(look at x, y and theta in ArucoReading.txt)"))]
-    if wheels and not reverse:
-        possible.insert(0, Doubt(wheels[0], (
-            f"{wheels[1]} in encoderReading.txt (look at the order of right and left, and at the "
+        f"sightings with [{', '.join(right)}, {'-' * int(mirrors != reverse)}theta] in place of "
+        "[x, y, theta] in ArucoReading.txt"))]
+    if 0 < k < len(COUNTS) and not reverse:
+        kind, change = COUNTS[k]
+        possible.insert(0, Doubt(kind, (
+            f"{change} in encoderReading.txt (look at the order of right and left, and at the "
             "signs of the counts)")))
         path, antennas = path_and_antennas(dataset)      # odometry's, with A if wheels are wrong
         fits = [np.median([np.median(np.abs(np.hypot(*(positions[pose] - guess).T) - r))
