@@ -73,12 +73,11 @@ def doubts_before_solving(dataset, truth=None):
     Kinds are units, wheels-swapped, wheels-reversed, camera-mirrored, camera-turned, odometry,
     counts-since-start and those of the truth.
     """
-    about_truth = [] if truth is None else list(truth.doubts)
+    doubts = [] if truth is None else list(truth.doubts)
     try:
-        return (_motion_doubts(dataset) + range_units(dataset) + sigma_units(dataset)
-                + about_truth)
+        return _motion_doubts(dataset) + range_units(dataset) + sigma_units(dataset) + doubts
     except np.linalg.LinAlgError:              # where increments have no covariance
-        return about_truth
+        return doubts
 
 
 def merged(doubts):
@@ -93,11 +92,10 @@ def _motion_doubts(dataset):
     if len(compared.by_wheels) >= MIN_COUNT:
         return (motion_units(compared) or _axes_doubts(dataset, compared)
                 or odometry_doubts(compared))
-    if not counts.may_be_cumulative(dataset.ticks, dataset.vehicle):
-        return []
     return [Doubt("counts-since-start", (
         "The counts in encoderReading.txt change gradually from row to row, up to "
-        f"{abs(dataset.ticks).max()} in one row: look whether they are counts since the start."))]
+        f"{abs(dataset.ticks).max()} in one row: look whether they are counts since the start."
+        ))] * counts.may_be_cumulative(dataset.ticks, dataset.vehicle)
 
 
 def _compare(dataset):
@@ -187,9 +185,9 @@ def odometry_doubts(compared):
     share = np.mean((compared.squared_distances(np.eye(2))[0] > AGREEMENT_GATE)
                     & (off > MIN_DISAGREEMENT * np.maximum(*sizes)))
     return [Doubt("odometry", (
-        f"Beyond their noise, at {share:.0%} of {len(off)} places, {compared.medians()[1]}: look "
-        "whether encoderReading.txt and ArucoReading.txt are of the same drive and count the same "
-        "poses."))] * bool(share >= 0.5)
+        f"Markers and wheels disagree beyond their noise at {share:.0%} of {len(off)} places; "
+        f"{compared.medians()[1]}: look whether encoderReading.txt and ArucoReading.txt are of the "
+        "same drive and count the same poses."))] * bool(share >= 0.5)
 
 
 def path_and_antennas(dataset):
