@@ -35,9 +35,6 @@ PROBLEMS = {
     "problem3": Task("SLAM: odometry + ArUco", ("aruco",), "slam"),
     "problem4": Task("SLAM: odometry + ArUco + UWB", ("uwb",), "slam_uwb"),
 }
-# Kinds of doubts about whole files.
-FILE_DOUBTS = {"units", "wheels-swapped", "wheels-reversed", "camera-mirrored", "camera-turned",
-               "odometry", "counts-since-start"}
 COVARIANCE_FIELDS = ("marker_covariance", "antenna_covariance", "wheel_covariance")
 SENSORS = {"aruco": "markers", "uwb": "UWB ranges"}
 SUMMARY = "summary.json"
@@ -235,27 +232,6 @@ def solutions(dataset, found=None, problems=tuple(PROBLEMS)):
             yield problem_solution(problem, dataset, result)
         except UNSOLVABLE as error:
             yield failure(problem, dataset, error)
-
-
-def doubts_about_drive(dataset, truth):
-    """Doubts (tuple of Doubt) from the measurements of a Dataset and from its Truth or None."""
-    try:
-        by_measurements = localization.doubts_before_solving(dataset)
-    except np.linalg.LinAlgError:              # where increments have no covariance
-        by_measurements = []
-    return (*by_measurements, *(() if truth is None else truth.doubts))
-
-
-def merged(doubts):
-    """List of Doubt, each kind once with its last sentence; of antennas and units, each sentence.
-
-    A doubt about whole files removes those that follow from solving such files.
-    """
-    kinds = {doubt.what for doubt in doubts}
-    kept = [doubt for doubt in doubts if not kinds & FILE_DOUBTS
-            or doubt.what in FILE_DOUBTS | {"truth-frame"}]
-    return list({doubt.sentence if doubt.what in ("antenna", "units") else doubt.what: doubt
-                 for doubt in kept}.values())
 
 
 def truth_in_world(solution, truth):

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from numeric import known_noise
 
-from slamlib import localization, se2, slam, solve
+from slamlib import se2, slam, solve
+from slamlib.checks.files import doubts_before_solving
 from slamlib.dataset import Vehicle, read_dataset, read_truth
 from slamlib.evaluation import anees, ate, nees_band
 from slamlib.simulation import simulate
@@ -55,6 +56,8 @@ WRONG_FILES = {                                # found before any graph is built
 WRONG_SIZES = {                                # found by the graph, and mended but for the wheels
     "covariances a quarter": (lambda d: aruco(d, covariance=d.aruco.covariance / 4),
                               "marker-noise"),
+    "covariances a hundredth": (lambda d: aruco(d, covariance=d.aruco.covariance / 100),
+                                "marker-noise"),
     "covariances fourfold": (lambda d: aruco(d, covariance=d.aruco.covariance * 4),
                              "marker-noise"),
     "sigmas of ranges halved": (lambda d: uwb(d, sigma=d.uwb.sigma / 2), "range-noise"),
@@ -125,7 +128,7 @@ def names(*lists):
 @pytest.mark.parametrize("what", WRONG_FILES)
 def test_wrong_files_are_named_before_a_graph_is_built(what, seed):
     dataset, _ = simulate("short", seed)
-    assert what in names(localization.doubts_before_solving(WRONG_FILES[what](dataset)))
+    assert what in names(doubts_before_solving(WRONG_FILES[what](dataset)))
 
 
 @cache
@@ -146,7 +149,7 @@ def test_wrong_sizes_are_mended_or_named(flaw, seed):
     markers = right if of_ranges else slam.estimate(spoilt.without("uwb"))
     both = slam.estimate(spoilt, previous=markers)
     assert names(markers.drive_doubts, both.drive_doubts) == {what}
-    assert not localization.doubts_before_solving(spoilt)
+    assert not doubts_before_solving(spoilt)
     if what != "wheel-parameters":
         for found in (markers, both):
             assert anees(found.poses, found.covariances, truth.poses) < 6
@@ -280,7 +283,7 @@ def test_there_is_no_doubt_about_clean_drives(path, seeds, slip):
         dataset, _ = simulate(path, seed, slip=slip)
         found = slam.estimate(dataset.without("uwb"))
         both = slam.estimate(dataset, previous=found)
-        assert not names(localization.doubts_before_solving(dataset), found.drive_doubts,
+        assert not names(doubts_before_solving(dataset), found.drive_doubts,
                          both.drive_doubts)
 
 
@@ -303,7 +306,7 @@ def test_every_problem_is_solved_within_the_limits(case):
     """Finite covariances that are not negative, and of SLAM errors as those that they state."""
     dataset, truth = read_dataset(SHORT), read_truth(SHORT)
     dataset = LEGAL[case](dataset.first(300))
-    solve.doubts_about_drive(dataset, truth)                  # without a warning
+    doubts_before_solving(dataset, truth)                  # without a warning
     for solution in solve.solutions(dataset):
         assert isinstance(solution, solve.Solution), solution.reason
         known = np.isfinite(solution.poses[:, 0])

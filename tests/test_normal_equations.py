@@ -10,7 +10,7 @@ from numeric import known_noise
 from scipy.special import chdtri
 
 from slamlib import sightings, slam
-from slamlib.localization import doubts
+from slamlib.checks import files
 from slamlib.simulation import simulate
 from slamlib.slam import drive_doubts, factors, graph, linear, noise
 from slamlib.slam.covariances import marginal_covariances
@@ -233,7 +233,7 @@ def test_points_of_the_posterior_have_its_moments(scale):
 def test_gates_are_quantiles_of_chi_squared():
     """They are numbers in the code because scipy.special takes long to import."""
     assert np.allclose([sightings.GATE, sightings.POINT_GATE], chdtri([3, 2], 1e-3), rtol=1e-12)
-    assert np.isclose(doubts.AGREEMENT_GATE, chdtri(3, 0.05), rtol=1e-5)
+    assert np.isclose(files.AGREEMENT_GATE, chdtri(3, 0.05), rtol=1e-5)
     gains = [drive_doubts.MIN_TIME_GAIN, drive_doubts.MIN_PLACE_GAIN, drive_doubts.MIN_RANGE_GAIN]
     assert np.allclose(gains, chdtri([1, 3, 2], 5e-4) / 2, rtol=1e-5)
 

@@ -20,13 +20,13 @@ from numeric import known_noise
 from test_dataset import FILES, write
 
 from slamlib import localization, odometry, se2, slam
+from slamlib.checks.files import doubts_before_solving, range_units
 from slamlib.dataset import DatasetError, Vehicle, read_dataset, read_truth
-from slamlib.localization.units import range_units
 from slamlib.simulation import simulate
 from slamlib.slam.covariances import _common_turn, _require_digits, marginal_covariances
 from slamlib.slam.measurements import measure
 from slamlib.slam.pipeline import fit_from_odometry
-from slamlib.solve import Failure, doubts_about_drive, solutions
+from slamlib.solve import Failure, solutions
 from slamlib.summary import summarize
 
 QUICK = settings(max_examples=3 * settings.default.max_examples)
@@ -196,7 +196,7 @@ def test_every_small_drive_is_solved(drive):
         for C in (solution.covariances[known], *(
                 each[2] for each in (solution.aruco_map, solution.uwb_map) if each is not None)):
             assert_positive(C, least, solution.problem)
-    for doubt in doubts_about_drive(dataset, None):
+    for doubt in doubts_before_solving(dataset):
         assert doubt.sentence.endswith(".") and "nan" not in doubt.sentence
 
 
