@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slamlib import evaluation, se2
-from slamlib.slam.calibrations import calibrated
+from slamlib.slam.choices import calibrated
 from slamlib.slam.covariances import marginal_covariances
-from slamlib.slam.linear import consistency_factor, decomposition
+from slamlib.slam.linear import consistency_factor, solve
 from slamlib.slam.measurements import measure
 from slamlib.slam.pipeline import fit_from_odometry
 from slamlib.slam.result import slam_result
@@ -33,7 +33,8 @@ def residuals_by_landmark(fit):
     """LandmarkResiduals of the markers and of the antennas of a `slam.fit.Fit`.
 
     With the derivatives J of n whitened errors e by unknowns of covariance C, the solution takes
-    the degrees of freedom tr(J C J^T): E[e^T e] = n - tr(J C J^T). A range counts by its weight.
+    the degrees of freedom tr(J C J^T): E[e^T e] = n - tr(J C J^T), but for the few that the
+    calibration takes. A range counts by its weight.
     """
     m, equations = fit.problem.measurements, fit.equations
     columns, column = _covariance_columns(fit)
@@ -61,11 +62,13 @@ def _covariance_columns(fit):
     m, equations = fit.problem.measurements, fit.equations
     others = np.concatenate(m.structure.rows_of_each(
         np.arange(len(m.frame), len(m.structure.width))))
-    H = m.structure.matrix(equations.sums(fit.problem.noise)[0])
-    unit, column = np.zeros((H.shape[0], len(others))), np.full(H.shape[0], -1)
+    H, border, *_ = equations.sums(fit.problem.noise)
+    solution, n = solve(m.structure, H, border), len(m.structure.diagonal)
+    unit, column = np.zeros((n, len(others))), np.full(n, -1)
     unit[others, np.arange(len(others))] = 1
     column[others] = np.arange(len(others))
-    return decomposition(H).solve(unit), column
+    by_c = solution.by_c                                            # an uncertain calibration adds
+    return solution.lu.solve(unit) + by_c @ np.linalg.solve(solution.S, by_c[others].T), column
 
 
 @dataclass(frozen=True)
