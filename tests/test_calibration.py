@@ -35,7 +35,7 @@ from slamlib.slam.factors import (
 )
 from slamlib.slam.fit import KERNELS
 from slamlib.slam.initialization import odometry_state
-from slamlib.slam.linear import NormalEquations, solve
+from slamlib.slam.linear import NormalEquations, linear_solution
 from slamlib.slam.measurements import Noise, measure
 from slamlib.slam.problem import build_problem, retract
 
@@ -144,7 +144,7 @@ def test_the_posterior_is_that_of_gtsam():
     scale = 1 / np.sqrt(np.diag(matrix))
     inverse = np.linalg.inv(matrix * scale[:, None] * scale) * scale[:, None] * scale
     H, border, *_ = equations.sums(problem.noise)
-    solution = solve(equations.structure, H, border)
+    solution = linear_solution(equations.structure, H, border)
     np.testing.assert_allclose(np.linalg.inv(solution.S), inverse[-q:, -q:], rtol=1e-5, atol=1e-9)
     expected = inverse @ vector
     np.testing.assert_allclose(solution.delta, expected, atol=1e-6 * np.abs(expected).max())

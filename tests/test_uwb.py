@@ -575,7 +575,7 @@ def test_plaza_2_is_solved():
     beacons = compose(motion, np.column_stack([found.antenna_in_world, np.zeros(4)]))[:, :2]
     assert ate(found.poses, truth.poses, aligned=True) < 0.35
     scale, sigma = found.range_calibration[1], found.range_calibration_sigma[1]
-    assert abs(scale - plaza.calibration(2)[0]) < 2 * sigma < 0.04
+    assert abs(scale - plaza.ranges_over_distances(2)[0]) < 2 * sigma < 0.04
     assert [doubt.what for doubt in found.drive_doubts] == ["range-offset"]
     assert np.hypot(*(beacons - truth.antenna_in_world).T).max() < 0.5      # 1 % of 50 m
     assert not found.doubts and dataset.ticks.shape == (3881, 2)

@@ -12,7 +12,7 @@ import numpy as np
 from slamlib import evaluation, se2
 from slamlib.slam.choices import calibrated
 from slamlib.slam.covariances import marginal_covariances
-from slamlib.slam.linear import consistency_factor, solve
+from slamlib.slam.linear import consistency_factor, linear_solution
 from slamlib.slam.measurements import measure
 from slamlib.slam.pipeline import fit_from_odometry
 from slamlib.slam.result import slam_result
@@ -60,10 +60,10 @@ def _covariance_columns(fit):
     besides `marginal_covariances`.
     """
     m, equations = fit.problem.measurements, fit.equations
-    others = np.concatenate(m.structure.rows_of_each(
-        np.arange(len(m.frame), len(m.structure.width))))
+    others = np.concatenate([np.zeros(0, int), *m.structure.rows_of_each(
+        np.arange(len(m.frame), len(m.structure.width)))])
     H, border, *_ = equations.sums(fit.problem.noise)
-    solution, n = solve(m.structure, H, border), len(m.structure.diagonal)
+    solution, n = linear_solution(m.structure, H, border), len(m.structure.diagonal)
     unit, column = np.zeros((n, len(others))), np.full(n, -1)
     unit[others, np.arange(len(others))] = 1
     column[others] = np.arange(len(others))

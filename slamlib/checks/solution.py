@@ -32,14 +32,15 @@ GROUPS = {
 
 def solution_doubts(result):
     """Tuple of Doubt where a SlamResult contradicts the files of its drive."""
-    return (*calibration_doubts(result), *slip_doubts(result), *noise_doubts(result),
-            *sighting_doubts(result), *turn_doubts(result),
-            *(Doubt("antenna", f"Antenna {antenna} is in doubt: {reason}. Its covariance includes "
+    doubts = [Doubt("antenna", f"Antenna {antenna} is in doubt: {reason}. Its covariance includes "
                                "this; look at its rows in UwbReading.txt.")
-              for antenna, reason in result.doubts.items()),
-            *([] if result.converged else [Doubt("not-converged", (
-                "The solution still changed when its number of steps ended: some poses or "
-                "landmarks may be far from where the measurements want them."))]))
+              for antenna, reason in result.doubts.items()]
+    if not result.converged:
+        doubts.append(Doubt("not-converged", (
+            "The solution still changed when its number of steps ended: some poses or landmarks "
+            "may be far from where the measurements want them.")))
+    return tuple(sum((f(result) for f in (calibration_doubts, slip_doubts, noise_doubts,
+                                          sighting_doubts, turn_doubts)), []) + doubts)
 
 
 def calibration_doubts(result):

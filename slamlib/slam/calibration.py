@@ -48,9 +48,11 @@ ENTRIES = (
     Entry("range_scale", "", "range-offset", 0.05),
     Entry("range_lag", "poses", "range-delay", 30.0))
 ANTENNA_OFFSETS = Entry("offset of antenna", "m", "antenna-offsets", 0.3)
-WHEELS, SIGHTINGS, RANGES = slice(0, 3), slice(3, 8), slice(8, None)     # columns of each kind
-CAMERA, SIZE, SIGHTING_LAG = slice(3, 6), 6, 7
-TAG, HEIGHT, OFFSET, SCALE, RANGE_LAG, ANTENNAS = slice(8, 10), 10, 11, 12, 13, slice(14, None)
+# Columns of the vector by kind of measurement, then by entry.
+WHEELS, SIGHTINGS, RANGES = slice(0, 3), slice(3, 8), slice(8, None)
+CAMERA, SIZE, SIGHTING_LAG = slice(3, 6), 6, 7               # columns of sightings
+TAG_PLACE, HEIGHT, OFFSET, SCALE = slice(8, 10), 10, 11, 12  # columns of ranges
+RANGE_LAG, ANTENNAS = 13, slice(14, None)                    # columns of ranges
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from slamlib.slam.linear import (
     NormalEquations,
     consistency_factors,
     laplace_approximation,
-    solve,
+    linear_solution,
 )
 from slamlib.slam.noise import equations_of_first_frames, greatest_log_density, log_density
 from slamlib.slam.problem import preintegrate_odometry
@@ -139,7 +139,7 @@ def _likelihood(fit):
     equations = equations_of_first_frames(NormalEquations(known, fit.state))
     H, border, *_ = equations.sums(
         fit.problem.noise, consistency_factors(fit.problem.accepted))
-    solution = solve(equations.structure, H, border)
+    solution = linear_solution(equations.structure, H, border)
     p = len(calibration.stated)
     L, h = np.zeros((p, p)), np.zeros(p)
     if solution is None:

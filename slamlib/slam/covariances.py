@@ -28,7 +28,7 @@ from scipy.sparse import csc_array
 from slamlib import se2
 from slamlib.dataset import DatasetError
 from slamlib.slam.calibration import WHEELS
-from slamlib.slam.linear import laplace_approximation, solve
+from slamlib.slam.linear import laplace_approximation, linear_solution
 from slamlib.slam.problem import retract
 
 LEAF = 12                    # number of frames between separators
@@ -57,7 +57,7 @@ def marginal_covariances(equations, noise):
     landmarks = structure.rows_of_each(np.r_[v.markers, v.antennas])
     _, pairs = m.factor_places[0]                          # rows of X_i and X_{i+1}
     data, border, *_ = equations.sums(noise)
-    H, solution = structure.matrix(data), solve(structure, data, border)
+    H, solution = structure.matrix(data), linear_solution(structure, data, border)
     if solution is None:
         raise np.linalg.LinAlgError("singular information matrix")
     _require_digits(equations, H)

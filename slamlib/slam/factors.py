@@ -31,7 +31,7 @@ from slamlib.slam.calibration import (
     SIGHTING_LAG,
     SIGHTINGS,
     SIZE,
-    TAG,
+    TAG_PLACE,
 )
 
 VELOCITY_STEPS = 5           # encoder steps to both sides over which a velocity is averaged
@@ -74,11 +74,11 @@ def odometry_error(factors, poses, wheel):
         if factors.in_counts else np.ones(3)
     relative = np.array([3 * [-1 / radius / 2], 3 * [-1 / radius / 2],
                          [0, 0, 1 / factors.wheel[2]]]).T * factors.in_counts   # by the wheels
-    before = e - by_wheel @ change                                  # at the wheels of linearisation
+    linearized = e - by_wheel @ change                              # at the wheels of linearisation
     grown = 1 + relative @ change
-    return (scale * (e + (grown - 1) * before),
+    return (scale * (e + (grown - 1) * linearized),
             (scale * grown)[:, None] * np.concatenate([by_first, by_second], axis=2),
-            scale[:, None] * (by_wheel + relative * before[:, :, None]))
+            scale[:, None] * (by_wheel + relative * linearized[:, :, None]))
 
 
 @dataclass(frozen=True)
@@ -190,7 +190,7 @@ def tag_positions(measurements, poses, c):
     """Positions (r, 2) in m of the tag in the world at the ranges, from poses of the frames."""
     row = measurements.ranges.row
     motion, _ = delayed(measurements, row, c[RANGE_LAG])
-    return se2.compose(poses[row], se2.compose(motion, np.r_[c[TAG], 0.0]))[:, :2]
+    return se2.compose(poses[row], se2.compose(motion, np.r_[c[TAG_PLACE], 0.0]))[:, :2]
 
 
 def expected_sightings(measurements, state):
@@ -216,7 +216,7 @@ def range_error(r, poses, motion, velocity, antennas, offset, c):
     of antennas. GTSAM: RangeFactor2D.
     """
     heading = poses[:, 2] + motion[:, 2]
-    lever = se2.compose(motion, np.r_[c[TAG], 0.0])[:, :2]          # tag in vehicle
+    lever = se2.compose(motion, np.r_[c[TAG_PLACE], 0.0])[:, :2]          # tag in vehicle
     position = se2.compose(poses, np.pad(lever, ((0, 0), (0, 1))))[:, :2]
     difference = antennas - position
     distance = np.sqrt(np.maximum(np.sum(difference**2, axis=1) + 2 * c[HEIGHT], MIN_DISTANCE**2))
@@ -225,7 +225,7 @@ def range_error(r, poses, motion, velocity, antennas, offset, c):
     by_pose = np.concatenate([in_vehicle, np.sum(
         in_vehicle * np.stack([-lever[:, 1], lever[:, 0]], -1), axis=1, keepdims=True)], axis=1)
     by_tag = -(direction[:, None] @ se2.rotation(heading))[:, 0]
-    moved = velocity[:, :2] + velocity[:, 2:] * [-c[TAG][1], c[TAG][0]]
+    moved = velocity[:, :2] + velocity[:, 2:] * [-c[TAG_PLACE][1], c[TAG_PLACE][0]]
     by_c = np.stack([by_tag[:, 0], by_tag[:, 1], c[SCALE] / distance, np.ones(len(r)), distance,
                      -np.sum(by_tag * moved, axis=1)], -1)
     e = c[OFFSET] + offset + c[SCALE] * distance - r

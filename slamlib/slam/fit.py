@@ -285,4 +285,5 @@ def refine(problem, state, accept=accepted_measurements, preintegrate=preintegra
         if not changed and moved < NEGLIGIBLE_MOVE:
             break
     _, log_evidence = laplace_approximation(optimum.equations, problem.noise)
-    return Fit(problem, state, log_evidence, posterior, optimum.converged)
+    return Fit(problem=problem, state=state, log_evidence=log_evidence, posterior=posterior,
+               converged=optimum.converged)

@@ -26,7 +26,7 @@ from slamlib.slam.measurements import GUESS_PRIOR_SIGMA, WEAK_SIGMA
 
 
 def gtsam_step(problem, state):
-    """The Gauss-Newton step delta (n + q,) by GTSAM of a Problem at a State, as `linear.solve`.
+    """The Gauss-Newton step delta (n + q,) by GTSAM of a Problem at a State, in sigmas of c.
 
     Cholesky decomposition of H is fast, but fails if H is ill-conditioned. QR decomposition of its
     root then decides whether the measurements determine every variable. Raises DatasetError if they
@@ -74,9 +74,9 @@ def _add(graph, problem, symbol, row, other, e, J, J_c, columns):
     """
     by_c = np.zeros((*e.shape, problem.active.sum()))
     by_c[:, :, columns] = J_c
-    for i, j, error, by, last in zip(row.tolist(), other.tolist(), e, J, by_c):
+    for i, j, error, jacobian, last in zip(row.tolist(), other.tolist(), e, J, by_c):
         calibration = (C(0), last) if len(columns) else ()
-        graph.add(X(i), by[:, :3], symbol(j), by[:, 3:], *calibration, -error)
+        graph.add(X(i), jacobian[:, :3], symbol(j), jacobian[:, 3:], *calibration, -error)
 
 
 def _is_native(problem, kind):

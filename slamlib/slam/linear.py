@@ -36,7 +36,7 @@ class Group:
 
 
 @dataclass(frozen=True)
-class Solution:
+class LinearSolution:
     """The normal equations solved."""
 
     delta: np.ndarray        # (n + q,) the step, in sigmas of the calibration
@@ -75,7 +75,7 @@ class NormalEquations:
     def step(self):
         """The Gauss-Newton step delta (n + q,), or None where H is singular to rounding."""
         H, border, *_ = self.sums(self.problem.noise)
-        solution = solve(self.structure, H, border)
+        solution = linear_solution(self.structure, H, border)
         return solution.delta if solution is not None and solution.decrease >= 0 else None
 
     def sums(self, noise, consistency=(1.0, 1.0, 1.0)):
@@ -176,8 +176,8 @@ def decomposition(H):
         return None
 
 
-def solve(structure, H, border):
-    """The Solution of normal equations, None where they are singular to rounding.
+def linear_solution(structure, H, border):
+    """The LinearSolution of normal equations, None where they are singular to rounding.
 
     From the data of H and the `border` of the Groups' sum.
     """
@@ -193,7 +193,7 @@ def solve(structure, H, border):
         return None
     c = -np.linalg.solve(S, gradient)
     delta = np.concatenate([-solved[:, -1] - solved[:, :-1] @ c, c])
-    return Solution(delta=delta, lu=lu, by_c=solved[:, :-1], S=S, gradient=gradient,
+    return LinearSolution(delta=delta, lu=lu, by_c=solved[:, :-1], S=S, gradient=gradient,
                     log_determinant=log_determinant + np.sum(np.log(pivots)),
                     decrease=-float(border[:, -1] @ delta) / 2)
 
@@ -212,7 +212,8 @@ def laplace_approximation(equations, noise):
     """
     H, border, squared, log_determinant = equations.sums(
         noise, consistency_factors(equations.problem.accepted))
-    solution, (sightings, ranges) = solve(equations.structure, H, border), equations.counts()
+    solution = linear_solution(equations.structure, H, border)
+    sightings, ranges = equations.counts()
     if solution is None:
         return np.full(len(border), np.nan), -np.inf
     return solution.delta, -squared / 2 + solution.decrease - log_determinant / 2 \

@@ -138,6 +138,7 @@ def build_problem(measurements, model, noise, wheel=None, preintegrate=preintegr
     at `wheel` (3,) m, None for the stated one; studies pass other functions. The calibration is as
     stated.
     """
-    return Problem(preintegrate(measurements, model, wheel),
-                   AcceptedMeasurements(measurements, measurements.unit_weights), noise,
-                   measurements.calibration.sigma)
+    return Problem(
+        odometry=preintegrate(measurements, model, wheel),
+        accepted=AcceptedMeasurements(measurements, measurements.unit_weights), noise=noise,
+        sigma=measurements.calibration.sigma)
