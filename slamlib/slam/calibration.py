@@ -47,7 +47,7 @@ ENTRIES = (
     Entry("range_offset", "m", "range-offset", 0.3),
     Entry("range_scale", "", "range-offset", 0.05),
     Entry("range_lag", "poses", "range-delay", 30.0))
-ANTENNA_OFFSETS = Entry("offset of antenna", "m", "antenna-offsets", 0.3)
+ANTENNA_OFFSETS = Entry("offset of antenna", "m", "antenna-offsets", 0.15)
 # Columns of the vector by kind of measurement, then by entry.
 WHEELS, SIGHTINGS, RANGES = slice(0, 3), slice(3, 8), slice(8, None)
 CAMERA, SIZE, SIGHTING_LAG = slice(3, 6), 6, 7               # columns of sightings

@@ -68,8 +68,9 @@ def marginal_covariances(equations, noise):
     blocks = [block + by_c[rows] @ c @ by_c[rows].T for block, rows in zip(blocks, landmarks)]
     whole = np.zeros(2 * [len(active)])
     whole[np.ix_(active, active)] = c
-    joint, cross = np.zeros((len(pairs), 9, 9)), by_c[pairs] @ c
-    joint[:, :6, :6] = of_pairs + cross @ np.swapaxes(by_c[pairs], 1, 2)
+    joint, pairs = np.zeros((len(pairs), 9, 9)), pairs.reshape(-1, 6)
+    cross = by_c[pairs] @ c
+    joint[:, :6, :6] = of_pairs.reshape(-1, 6, 6) + cross @ np.swapaxes(by_c[pairs], 1, 2)
     uncertain = np.flatnonzero(active[WHEELS])                       # the first entries of c
     joint[:, :6, 6 + uncertain] = cross[:, :, :len(uncertain)]
     joint[:, 6:, :6] = np.swapaxes(joint[:, :6, 6:], 1, 2)

@@ -171,5 +171,5 @@ def mislabelled(measurements, truth):
     m = measurements
     true_map = truth.marker_in_world[np.searchsorted(truth.marker, m.marker)]
     state = state_from_arrays(m, truth.poses[m.frame], true_map,
-                              np.zeros((len(m.antenna), 2)), np.zeros(3))
+                              np.zeros((len(m.antenna), 2)), m.calibration.stated)
     return np.sum(residuals(m, state, Noise())[0]**2, axis=1) > MIN_MISLABELLED_SQUARED

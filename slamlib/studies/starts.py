@@ -71,7 +71,7 @@ LANDMARKS = {"first sighting": first_sighting, "most certain sighting": most_cer
              "problem 2's map": map_of_problem_2}
 
 
-def guessed_antennas(measurements, poses, covariances):
+def guessed_antennas(measurements, poses, covariances, c):
     """(a, 2) antennas at their guesses; parameters as of `initialization.trilaterated_antennas`."""
     return measurements.guess
 
@@ -102,7 +102,7 @@ def landmarks(seed, path="short", drift=1.0, known=True, kernel="graduated",
     rounds = _kernel_rounds(build_problem(m, "arc", noise), kernel)
     true_map = truth.marker_in_world[np.searchsorted(truth.marker, m.marker)]
     best = optimize(rounds[-1], state_from_arrays(
-        m, truth.poses[m.frame], true_map, np.zeros((0, 2)), np.zeros(3))).error
+        m, truth.poses[m.frame], true_map, np.zeros((0, 2)), m.calibration.stated)).error
     return _from_each_start(rounds, best, true_map, starts)
 
 
