@@ -215,11 +215,12 @@ def test_antenna_from_known_poses_by_hand():
 
 @pytest.mark.parametrize("markers", [True, False])
 def test_perfect_data_gives_the_exact_answer(markers):
+    """As exactly as steps end at an error that is not zero: that of a biased kernel is not."""
     dataset, truth = simulate("short", seed=1, noise=False)
     dataset = dataset if markers else dataset.without("aruco")
     found = slam.estimate(known_noise(located(dataset), 1e-3), model="arc")
-    np.testing.assert_allclose(found.poses, truth.poses, atol=1e-9)
-    np.testing.assert_allclose(found.antenna_in_world, truth.antenna_in_world, atol=1e-9)
+    np.testing.assert_allclose(found.poses, truth.poses, atol=1e-8)
+    np.testing.assert_allclose(found.antenna_in_world, truth.antenna_in_world, atol=1e-8)
 
 
 def test_start_from_problem_3_gives_the_same_result_as_start_from_odometry():
