@@ -215,11 +215,12 @@ def test_antenna_from_known_poses_by_hand():
 
 @pytest.mark.parametrize("markers", [True, False])
 def test_perfect_data_gives_the_exact_answer(markers):
+    """As exactly as steps end at an error that is not zero: that of a biased kernel is not."""
     dataset, truth = simulate("short", seed=1, noise=False)
     dataset = dataset if markers else dataset.without("aruco")
     found = slam.estimate(known_noise(located(dataset), 1e-3), model="arc")
-    np.testing.assert_allclose(found.poses, truth.poses, atol=1e-9)
-    np.testing.assert_allclose(found.antenna_in_world, truth.antenna_in_world, atol=1e-9)
+    np.testing.assert_allclose(found.poses, truth.poses, atol=1e-8)
+    np.testing.assert_allclose(found.antenna_in_world, truth.antenna_in_world, atol=1e-8)
 
 
 def test_start_from_problem_3_gives_the_same_result_as_start_from_odometry():
@@ -257,16 +258,16 @@ def test_ranges_alone_are_consistent_although_they_hardly_determine_the_slip():
 
 @pytest.mark.slow
 def test_the_default_kernel_has_smaller_antenna_errors_than_symmetric_kernels():
-    """30 % late, with markers, 10 drives; at most 10 % larger than those of the asymmetric gate."""
+    """30 % late, with markers, 16 drives; at most 10 % larger than those of the asymmetric gate."""
     symmetric = ("quadratic", "Huber", "Cauchy", "gate", "GNC")
-    runs = studies.run(kernels.late_ranges, range(10), late_ranges=0.3,
+    runs = studies.run(kernels.late_ranges, range(16), late_ranges=0.3,
                        methods=(*symmetric, "asymmetric Tukey", "asymmetric gate"))
     squared = {method: runs[f"{method} antenna error"]**2
                for method in (*symmetric, "asymmetric Tukey", "asymmetric gate")}
     default = squared["asymmetric Tukey"]
     assert all(decided(squared[method] - default) for method in symmetric)
     assert decided(1.1**2 * squared["asymmetric gate"] - default)
-    low, high = nees_band(10, 2, 0.999)
+    low, high = nees_band(16, 2, 0.999)
     assert low < runs["asymmetric Tukey antenna nees"].mean() < high
     assert high < runs["Huber antenna nees"].mean()
 
