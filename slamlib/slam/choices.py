@@ -18,6 +18,7 @@ from itertools import combinations
 import numpy as np
 
 from slamlib.dataset import DatasetError
+from slamlib.odometry import MODELS
 from slamlib.slam.factors import linearize_ranges
 from slamlib.slam.fit import accepted_measurements, refine
 from slamlib.slam.linear import (
@@ -38,21 +39,24 @@ MIN_INFORMATION = 1e-3       # about an entry, in wide sigmas, below which it is
 MAX_PROPOSALS = 5            # number of sets that are solved
 
 
-def better_model(fit, model):
-    """The Fit of another model of odometry if its evidence leads by DECISIVE_LEAD, else `fit`.
+def better_model(fit):
+    """The Fit by Euler's steps if their evidence leads that of arcs by DECISIVE_LEAD, else by arcs.
 
     Both evidences are on the same measurements with the same weights, so the weights that the
     kernel of the ranges gives at `fit` are kept. The noise is learned for each model.
     """
     current = replace(fit.problem, accepted=_with_fixed_weights(fit))
-    odometry = preintegrate_odometry(current.measurements, model, fit.problem.odometry.wheel)
-    alternative = replace(current, odometry=odometry)
-    lead = _log_density(NormalEquations(alternative, fit.state), fit.posterior) \
+    other, = {*MODELS} - {current.odometry.model}
+    odometry = replace(preintegrate_odometry(
+        current.measurements, other, current.odometry.wheel), in_counts=True)
+    lead = _log_density(NormalEquations(replace(current, odometry=odometry), fit.state),
+                        fit.posterior) \
         - _log_density(NormalEquations(current, fit.state), fit.posterior,
                        is_greatest=not len(current.accepted.range_weight))
-    if lead <= DECISIVE_LEAD:
+    if lead <= (DECISIVE_LEAD if other == "euler" else -DECISIVE_LEAD):
         return fit
-    return refine(replace(fit.problem, odometry=odometry), fit.state, accept=None)
+    return replace(refine(replace(fit.problem, odometry=odometry), fit.state, accept=None),
+                   explanations=fit.explanations)
 
 
 def calibrated(fit, accept=accepted_measurements):

@@ -34,7 +34,6 @@ from slamlib.slam.calibration import (
     TAG_PLACE,
 )
 
-VELOCITY_STEPS = 5           # encoder steps to both sides over which a velocity is averaged
 MIN_DISTANCE = 1e-9          # m, below which a range has no direction
 
 
@@ -236,18 +235,13 @@ def delayed(measurements, row, lag):
     """Where the vehicle was `lag` encoder steps before the frames `row` (m,), by odometry.
 
     Returns its poses (m, 3) in the vehicle at the frames, and its velocities (m, 3) there, in m and
-    rad per step, averaged over VELOCITY_STEPS to both sides.
+    rad per step. Of the smooth path: single steps have the noise of counts and slip.
     """
-    path, time = measurements.path, measurements.frame[row] - lag
-
-    def pose(t):
-        """Poses (m, 3) of the path at times t (m,), in encoder steps."""
-        i = np.clip(t.astype(int), 0, max(len(path) - 2, 0))
-        share = np.clip(t - i, 0, len(path) - 1 - i)[:, None]
-        return (1 - share) * path[i] + share * path[np.minimum(i + 1, len(path) - 1)]
-
-    velocity = se2.log(se2.between(pose(time - VELOCITY_STEPS), pose(time + VELOCITY_STEPS)))
-    return se2.between(path[measurements.frame[row]], pose(time)), velocity / (2 * VELOCITY_STEPS)
+    path, time = measurements.smooth_path, measurements.frame[row] - lag
+    i = np.clip(np.floor(time).astype(int), 0, max(len(path) - 2, 0))
+    begin, end, share = path[i], path[np.minimum(i + 1, len(path) - 1)], (time - i)[:, None]
+    there = (1 - share) * begin + share * end                        # or before the first pose
+    return se2.between(path[measurements.frame[row]], there), se2.log(se2.between(begin, end))
 
 
 def _whitened(problem, kind, index, row, landmark, e, jacobians, by_c, U, weight, noise_factor,

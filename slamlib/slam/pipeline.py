@@ -89,8 +89,11 @@ asymmetric Cauchy, asymmetric Tukey, not 'L2'
         fit = fit_from_previous(measurements, previous, model, accept)                # 2, 5, 6
     else:
         fit = fit_from_odometry(measurements, model or "arc", accept=accept)          # 2 to 6
-        fit = fit if model else better_model(fit, "euler")
-    return slam_result(solved_by_gtsam(calibrated(fit, accept)))                      # 7
+        fit = fit if model else better_model(fit)
+    fit = calibrated(fit, accept)
+    if fit.problem.released and not (model or previous):     # they may have looked like the model
+        fit = better_model(fit)
+    return slam_result(solved_by_gtsam(fit))                                          # 7
 
 
 def fit_from_odometry(measurements, model="arc", preintegrate=preintegrate_odometry,
