@@ -232,16 +232,18 @@ def range_error(r, poses, motion, velocity, antennas, offset, c):
 
 
 def delayed(measurements, row, lag):
-    """Where the vehicle was `lag` encoder steps before the frames `row` (m,), by odometry.
+    """Where the vehicle was `lag` encoder steps before the frames `row` (m,), in the axes there.
 
-    Returns its poses (m, 3) in the vehicle at the frames, and its velocities (m, 3) there, in m and
-    rad per step. Of the smooth path: single steps have the noise of counts and slip.
+    Also its velocities (m, 3) per step at that time, in m and rad, by the smooth path: the noise of
+    single steps would bias the delay.
     """
-    path, time = measurements.smooth_path, measurements.frame[row] - lag
+    path, smooth = measurements.path, measurements.smooth_path
+    time = measurements.frame[row] - lag
     i = np.clip(np.floor(time).astype(int), 0, max(len(path) - 2, 0))
-    begin, end, share = path[i], path[np.minimum(i + 1, len(path) - 1)], (time - i)[:, None]
-    there = (1 - share) * begin + share * end                        # or before the first pose
-    return se2.between(path[measurements.frame[row]], there), se2.log(se2.between(begin, end))
+    k = np.minimum(i + 1, len(path) - 1)
+    there = path[i] + (time - i)[:, None] * (path[k] - path[i])      # or before the first pose
+    return (se2.between(path[measurements.frame[row]], there),
+            se2.log(se2.between(smooth[i], smooth[k])))
 
 
 def _whitened(problem, kind, index, row, landmark, e, jacobians, by_c, U, weight, noise_factor,

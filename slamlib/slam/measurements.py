@@ -30,7 +30,7 @@ from slamlib.slam.structure import Variables, block_structure
 
 NOISE_KEYS = ("slip", "marker_noise_factor", "range_noise_factor")      # of a Vehicle, as in Noise
 
-SMOOTHED_STEPS = 5           # encoder steps, over which the path is averaged for delays
+SMOOTHED_STEPS = 5           # encoder steps to both sides, over which velocities are averaged
 # Standard deviations of the priors of variables
 ORIGIN_SIGMA = 1e-5          # m, of the position of pose 1, which is zero by definition
 WEAK_SIGMA = 1e5             # m and rad, of a marker without accepted sightings
@@ -116,10 +116,10 @@ class Measurements:
     @cached_property
     def smooth_path(self):
         """(n, 3) averages of `path` over SMOOTHED_STEPS to both sides, at the ends over fewer."""
-        window = np.ones(2 * SMOOTHED_STEPS + 1)
-        count = np.convolve(np.ones(len(self.path)), window, "same")
-        return np.stack([np.convolve(column, window, "same") / count
-                         for column in self.path.T], -1)
+        step = np.arange(len(self.path))
+        reach = np.minimum(np.minimum(step, step[::-1]), SMOOTHED_STEPS)
+        total = odometry.cumulative(self.path)
+        return (total[step + reach + 1] - total[step - reach]) / (2 * reach + 1)[:, None]
 
     @property
     def origin_sigma(self):
