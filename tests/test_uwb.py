@@ -612,8 +612,12 @@ def test_ranges_calibrate_themselves(offset, scale, long_drive):
     assert not solution_doubts(right)
     off = found.c[[OFFSET, SCALE]] - [offset, scale]
     sigma = np.sqrt(np.diag(found.c_covariance)[[OFFSET, SCALE]])
-    assert (np.abs(off) < 4 * sigma).all() and (sigma < [0.1, 0.01]).all()
-    assert [doubt.what for doubt in solution_doubts(found)] == ["range-offset"]
+    assert (np.abs(off) < 4 * sigma).all()
+    doubts = [doubt.what for doubt in solution_doubts(found)]
+    if doubts == ["range-offset", "antenna-offsets"]:    # offsets of antennas may be the same, too
+        assert sigma[0] < 0.15 and scale == 1
+    else:
+        assert doubts == ["range-offset"] and (sigma < [0.1, 0.01]).all()
     error, squared = montecarlo.antenna_error(found, truth)
     assert squared.mean() < 6 and error.max() < 0.2
 
