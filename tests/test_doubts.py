@@ -17,6 +17,7 @@ from slamlib.checks.files import (
     _moves,
     doubts_before_solving,
 )
+from slamlib.checks.solution import solution_doubts
 from slamlib.dataset import (
     AntennaGuess,
     ArucoReadings,
@@ -103,12 +104,12 @@ def test_turns_that_only_the_wheels_have_seen_are_doubted():
     pose = dataset.aruco.pose
     ends = (pose < 600) | (pose > len(dataset.ticks) - 600)
     found = slam.estimate(replace(dataset, aruco=dataset.aruco.select(ends), uwb=None))
-    doubt, = (doubt for doubt in found.drive_doubts if doubt.what == "turns")
+    doubt, = (doubt for doubt in solution_doubts(found) if doubt.what == "turns")
     seen = dataset.aruco.pose[ends]
     assert f"Between poses {seen[seen < 600][-1] + 1} and {seen[seen > 600][0] + 1} " \
         in doubt.sentence
     whole = slam.estimate(simulate("short", 3)[0].without("uwb"))
-    assert "turns" not in {doubt.what for doubt in whole.drive_doubts}
+    assert "turns" not in {doubt.what for doubt in solution_doubts(whole)}
 
 
 @pytest.mark.parametrize("flaw", FLAWS)

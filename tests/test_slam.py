@@ -525,7 +525,8 @@ def test_an_undetermined_variable_is_named_as_in_the_files():
     problem = fit_from_odometry(measure(known_noise(dataset.first(200), 1e-3))).problem
     marker, antenna = problem.measurements.marker[2], problem.measurements.antenna[1]
     message = "Indeterminate linear system detected while working near variable\n1 (Symbol: {})."
-    for symbol, name in (("l2", f"the pose of marker {marker}"), ("c0", "the calibration of the sensors"),
+    for symbol, name in (("l2", f"the pose of marker {marker}"),
+                         ("c0", "the calibration of the sensors"),
                          ("a1", f"the position of antenna {antenna}"), ("x0", "pose 1")):
         assert graph._variable(problem.measurements, message.format(symbol)) == name
 

@@ -32,7 +32,7 @@ from slamlib.slam.initialization import (
     trilaterate,
 )
 from slamlib.slam.linear import NormalEquations, consistency_factor
-from slamlib.slam.measurements import GUESS_PRIOR_SIGMA, AcceptedMeasurements, Noise, measure
+from slamlib.slam.measurements import GUESS_PRIOR_SIGMA, Noise, measure
 from slamlib.slam.pipeline import fit_from_odometry, fit_from_previous
 from slamlib.slam.problem import build_problem, state_from_arrays
 from slamlib.slam.result import MAX_LOG_ODDS, chi2_per_dof
@@ -258,16 +258,16 @@ def test_ranges_alone_are_consistent_although_they_hardly_determine_the_slip():
 
 @pytest.mark.slow
 def test_the_default_kernel_has_smaller_antenna_errors_than_symmetric_kernels():
-    """30 % late, with markers, 16 drives; at most 10 % larger than those of the asymmetric gate."""
+    """30 % late, with markers, 24 drives; at most 10 % larger than those of the asymmetric gate."""
     symmetric = ("quadratic", "Huber", "Cauchy", "gate", "GNC")
-    runs = studies.run(kernels.late_ranges, range(16), late_ranges=0.3,
+    runs = studies.run(kernels.late_ranges, range(24), late_ranges=0.3,
                        methods=(*symmetric, "asymmetric Tukey", "asymmetric gate"))
     squared = {method: runs[f"{method} antenna error"]**2
                for method in (*symmetric, "asymmetric Tukey", "asymmetric gate")}
     default = squared["asymmetric Tukey"]
     assert all(decided(squared[method] - default) for method in symmetric)
     assert decided(1.1**2 * squared["asymmetric gate"] - default)
-    low, high = nees_band(16, 2, 0.999)
+    low, high = nees_band(24, 2, 0.999)
     assert low < runs["asymmetric Tukey antenna nees"].mean() < high
     assert high < runs["Huber antenna nees"].mean()
 
@@ -631,7 +631,8 @@ def test_plaza_2_is_solved():
     assert ate(found.poses, truth.poses, aligned=True) < 0.35
     scale, sigma = found.c[SCALE], np.sqrt(found.c_covariance[SCALE, SCALE])
     assert abs(scale - plaza.ranges_over_distances(2)[0]) < 2 * sigma < 0.04
-    assert [doubt.what for doubt in solution_doubts(found)] == ["range-offset"]
+    doubts = {doubt.what for doubt in solution_doubts(found)}
+    assert "range-offset" in doubts and doubts <= {"range-offset", "tag-offset"}
     assert np.hypot(*(beacons - truth.antenna_in_world).T).max() < 0.5      # 1 % of 50 m
     assert not found.doubts and dataset.ticks.shape == (3881, 2)
 
