@@ -97,7 +97,7 @@ def find(problem, dataset, found=None):
     """
     solvers = {
         "problem1": lambda: odometry.equation2(dataset.ticks, dataset.vehicle),
-        "problem2": lambda: localization.localize(dataset.aruco),
+        "problem2": lambda: localization.localize(dataset.sightings),
         "problem2_hint": lambda: localization.fuse_increments(dataset),
         "problem2_fused": lambda: localization.fuse(dataset),
         "problem3": lambda: slam.estimate(dataset.without("uwb")),

@@ -37,7 +37,7 @@ def returns(dataset, gap=MIN_GAP):
     A frame returns to the earlier frame with which it has most markers in common. Errors of returns
     are correlated: they share sections of odometry, and sightings.
     """
-    s = sightings_by_frame(dataset.aruco)
+    s = sightings_by_frame(dataset.sightings)
     travelled = odometry.cumulative(np.abs(odometry.steps(dataset.ticks, dataset.vehicle)[0]))
     label = np.unique(s.marker, return_inverse=True)[1]
     sighting = np.full((len(s.frame), label.max(initial=-1) + 1), -1)          # row, or -1

@@ -100,7 +100,7 @@ def _motion_doubts(dataset):
 
 def _compare(dataset):
     """The _Compared of a Dataset, between frames about SPAN apart: turns are well above noise."""
-    s, args = sightings_by_frame(dataset.aruco), (dataset.ticks, dataset.vehicle)
+    s, args = sightings_by_frame(dataset.sightings), (dataset.ticks, dataset.vehicle)
     step, _ = increments.between_poses(*args, s.frame[:-1], s.frame[1:], "arc")
     typical = np.median(_sizes(step)[:, 0]) if len(step) else SPAN
     span = max(1, min(int(SPAN / max(typical, SPAN / MAX_FRAMES) + 0.5), len(s.frame) // 4))

@@ -135,7 +135,7 @@ def _likeliest_slip(given):
 
 def _filter_input(dataset, model, vehicle):
     """The _FilterInput with odometry linearised at the wheel parameters of `vehicle`."""
-    ticks, sightings = dataset.ticks, sightings_by_frame(dataset.aruco, extra_frames=[0])
+    ticks, sightings = dataset.ticks, sightings_by_frame(dataset.sightings, extra_frames=[0])
     start, end = sightings.frame[:-1], sightings.frame[1:]
     begins = np.searchsorted(sightings.row, np.arange(len(sightings.frame)))
     pair, first, second = common_sightings(sightings.row, sightings.marker)

@@ -65,16 +65,19 @@ class Calibration:
     sigma: np.ndarray        # (p,) as stated, 0 if known
     wide: np.ndarray         # (p,) if the statement is wrong
 
-    def sigma_without(self, groups):
-        """Standard deviations (p,) where the statements about `groups` are wrong."""
-        return np.where(np.isin(self.group, list(groups)), np.maximum(self.wide, self.sigma),
-                        self.sigma)
+    def sigma_without(self, groups, width=1.0):
+        """Standard deviations (p,) where the statements about `groups` are wrong.
 
-    def values_of(self, other, c):
-        """Values (p,): those `c` of another drive's Calibration where it has the entry, or stated.
+        `width` multiplies the wide standard deviations.
         """
-        known = dict(zip(other.names, c))
-        return np.array([known.get(name, value) for name, value in zip(self.names, self.stated)])
+        return np.where(np.isin(self.group, list(groups)),
+                        np.maximum(width * self.wide, self.sigma), self.sigma)
+
+    def taken_from(self, other, values, default):
+        """Values (p,): those of another drive's Calibration where it has the entry, or `default`.
+        """
+        known = dict(zip(other.names, values))
+        return np.array([known.get(name, value) for name, value in zip(self.names, default)])
 
 
 def calibration_table(calibration, c, covariance, released):

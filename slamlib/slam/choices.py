@@ -12,7 +12,7 @@ so that one linearisation ranks all sets of groups (score tests: Rao, Proc. Camb
 decisively on the same measurements with the same weights.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -34,6 +34,8 @@ DECISIVE_LEAD = 3.0          # log evidence by which another model of the steps 
 DECISIVE_RELEASE = 6.0       # log evidence by which a group leaves its stated values
 STATED = 3.0                 # log evidence beside it, if standard deviations are stated
 AMBIGUOUS = 3.0              # log evidence within which explanations cannot be told apart
+MAX_WIDE_SIGMAS = 4.0        # wide sigmas, of an entry; beyond them a statement is grossly wrong
+GROSS = 10.0                 # factor on the wide sigmas then
 MIN_ACCEPTED = 0.98          # of the accepted measurements, that a proposed set accepts too
 MIN_INFORMATION = 1e-3       # about an entry, in wide sigmas, below which it is not considered
 MAX_PROPOSALS = 5            # number of sets that are solved
@@ -66,37 +68,47 @@ def calibrated(fit, accept=accepted_measurements):
     """
     tried = []
     for _ in range(MAX_PROPOSALS):
-        explanations, groups, expected = _proposal(fit)
-        if groups == fit.problem.released:
-            return replace(fit, explanations=explanations)
-        if groups in tried:
+        proposal = _proposal(fit)
+        if np.array_equal(proposal.sigma, fit.problem.sigma):
+            return replace(fit, explanations=proposal.explanations)
+        if proposal.groups in tried:
             break
-        tried.append(groups)
-        calibration = fit.problem.measurements.calibration
-        sigma = calibration.sigma_without(groups)
-        state = replace(fit.state, c=np.where(sigma > 0, fit.state.c, calibration.stated))
+        tried.append(proposal.groups)
+        stated = fit.problem.measurements.calibration.stated
+        state = replace(fit.state, c=np.where(proposal.sigma > 0, fit.state.c, stated))
+        problem = replace(fit.problem, sigma=proposal.sigma, released=proposal.groups)
         try:
-            proposed = refine(replace(fit.problem, sigma=sigma, released=groups), state, accept)
+            proposed = refine(problem, state, accept)
             lead = _lead(proposed, fit)
         except (DatasetError, np.linalg.LinAlgError):
-            return fit
+            break
         if proposed.problem.accepted.weight.sum() \
                 < MIN_ACCEPTED * fit.problem.accepted.weight.sum() \
-                or lead < (0 if expected >= 0 else expected - DECISIVE_RELEASE):
-            return fit
-        fit = replace(proposed, explanations=explanations)
+                or lead < min(0, proposal.lead) - DECISIVE_RELEASE * (proposal.lead < 0):
+            break
+        fit = replace(proposed, explanations=proposal.explanations)
     return fit
 
 
+@dataclass(frozen=True)
+class _Proposal:
+    """Which groups of the calibration the evidence wants to be released."""
+
+    explanations: tuple      # of frozensets of groups, of which each one explains the drive
+    groups: frozenset        # to release: of all explanations, and what raises the evidence at all
+    sigma: np.ndarray        # (p,) with these groups released
+    lead: float              # log evidence over that of the prior as it is
+
+
 def _proposal(fit):
-    """Explanations, a tuple of frozensets of groups, the groups to release, and their lead.
+    """The _Proposal for a Fit.
 
     Every released group must raise the log evidence by DECISIVE_RELEASE, and by STATED more if its
     standard deviations are stated. Explanations are the best set and others that come within
-    AMBIGUOUS of it, neither part of it nor more: the drive cannot tell them apart. All of them are
-    released, and what else raises the evidence at all: it is not certain enough to be told, but
-    the covariances have to include it. The lead is the log evidence of this over that of the groups
-    that are released already.
+    AMBIGUOUS of it, neither part of it nor more: the drive cannot tell them apart. What else raises
+    the evidence is not certain enough to be told, but the covariances have to include it. If an
+    entry would be further off than MAX_WIDE_SIGMAS, the statement is grossly wrong, and all wide
+    standard deviations are multiplied by GROSS.
     """
     calibration = fit.problem.measurements.calibration
     L, h = _likelihood(fit)
@@ -104,32 +116,40 @@ def _proposal(fit):
     doubtful = informed & (calibration.wide > calibration.sigma)
     candidates = frozenset(calibration.group[doubtful].tolist())
     stated = frozenset(calibration.group[calibration.sigma > 0].tolist())
-    evidence, merit = {}, {}
-    for count in range(len(candidates) + 1):
-        for some in map(frozenset, combinations(sorted(candidates), count)):
-            sigma = calibration.sigma_without(some) / calibration.wide
-            evidence[some] = _log_evidence(L, h, sigma * informed)
-            merit[some] = evidence[some] - DECISIVE_RELEASE * count - STATED * len(some & stated)
-    best = max(merit, key=merit.get)
+    for width in (1.0, GROSS):
+        evidence, merit, largest = {}, {}, {}
+        for count in range(len(candidates) + 1):
+            for some in map(frozenset, combinations(sorted(candidates), count)):
+                sigma = calibration.sigma_without(some, width) / calibration.wide * informed
+                evidence[some], largest[some] = _log_evidence(L, h, sigma)
+                merit[some] = evidence[some] - DECISIVE_RELEASE * count \
+                    - STATED * len(some & stated)
+        best = max(merit, key=merit.get)
+        if not best or largest[best] < MAX_WIDE_SIGMAS:
+            break
     explanations = tuple(some for some in merit if some == best or (
         merit[some] > merit[best] - AMBIGUOUS and not some < best and not some > best))
     certain = frozenset().union(*explanations)
     more = max((some for some in evidence if certain <= some), key=evidence.get)
-    return explanations, more, evidence[more] - evidence[fit.problem.released & candidates]
+    present, _ = _log_evidence(L, h, fit.problem.sigma / calibration.wide * informed)
+    return _Proposal(explanations=explanations, groups=more, lead=evidence[more] - present,
+                     sigma=calibration.sigma_without(more, width))
 
 
 def _log_evidence(L, h, sigma):
     """Log evidence of a prior with standard deviations (p,), 0 where an entry is known.
 
-    From the information L (p, p) and h (p,) of the likelihood.
+    From the information L (p, p) and h (p,) of the likelihood. Also the largest posterior mean of
+    an entry, in its standard deviations.
     """
     used = sigma > 0
     posterior = L[np.ix_(used, used)] + np.diag(sigma[used]**-2.0)
     sign, log_determinant = np.linalg.slogdet(posterior)
     if sign <= 0:
-        return -np.inf
-    return h[used] @ np.linalg.solve(posterior, h[used]) / 2 - log_determinant / 2 \
-        - np.sum(np.log(sigma[used]))
+        return -np.inf, 0.0
+    mean = np.linalg.solve(posterior, h[used])
+    return (h[used] @ mean / 2 - log_determinant / 2 - np.sum(np.log(sigma[used])),
+            np.abs(mean / sigma[used]).max(initial=0.0))
 
 
 def _likelihood(fit):

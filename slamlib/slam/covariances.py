@@ -58,12 +58,13 @@ def marginal_covariances(equations, noise):
     _, pairs = m.factor_places[0]                          # rows of X_i and X_{i+1}
     data, border, *_ = equations.sums(noise)
     H, solution = structure.matrix(data), linear_solution(structure, data, border)
+    _require_digits(equations, H)
     if solution is None:
         raise np.linalg.LinAlgError("singular information matrix")
-    _require_digits(equations, H)
     of_pairs, blocks = selected_inverse(H, structure.rows(v.frames, 3), pairs, landmarks)
     sigma = problem.sigma[active]
     c = np.linalg.inv(solution.S) * sigma[:, None] * sigma
+    c = (c + c.T) / 2
     by_c = solution.by_c / -sigma                          # of the unknowns by c
     blocks = [block + by_c[rows] @ c @ by_c[rows].T for block, rows in zip(blocks, landmarks)]
     whole = np.zeros(2 * [len(active)])

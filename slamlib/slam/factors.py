@@ -218,14 +218,16 @@ def range_error(r, poses, motion, velocity, antennas, offset, c):
     lever = se2.compose(motion, np.r_[c[TAG_PLACE], 0.0])[:, :2]          # tag in vehicle
     position = se2.compose(poses, np.pad(lever, ((0, 0), (0, 1))))[:, :2]
     difference = antennas - position
-    distance = np.sqrt(np.maximum(np.sum(difference**2, axis=1) + 2 * c[HEIGHT], MIN_DISTANCE**2))
-    direction = c[SCALE] * difference / distance[:, None]            # by the antenna, in the world
+    squared = np.sum(difference**2, axis=1) + 2 * c[HEIGHT]
+    distance = np.sqrt(np.maximum(squared, MIN_DISTANCE**2))
+    slope = np.where(squared > MIN_DISTANCE**2, c[SCALE] / distance, 0.0)
+    direction = slope[:, None] * difference                          # by the antenna, in the world
     in_vehicle = -(direction[:, None] @ se2.rotation(poses[:, 2]))[:, 0]
     by_pose = np.concatenate([in_vehicle, np.sum(
         in_vehicle * np.stack([-lever[:, 1], lever[:, 0]], -1), axis=1, keepdims=True)], axis=1)
     by_tag = -(direction[:, None] @ se2.rotation(heading))[:, 0]
     moved = velocity[:, :2] + velocity[:, 2:] * [-c[TAG_PLACE][1], c[TAG_PLACE][0]]
-    by_c = np.stack([by_tag[:, 0], by_tag[:, 1], c[SCALE] / distance, np.ones(len(r)), distance,
+    by_c = np.stack([by_tag[:, 0], by_tag[:, 1], slope, np.ones(len(r)), distance,
                      -np.sum(by_tag * moved, axis=1)], -1)
     e = c[OFFSET] + offset + c[SCALE] * distance - r
     return e, by_pose[:, None], direction[:, None], by_c[:, None]
@@ -260,8 +262,8 @@ def _whitened(problem, kind, index, row, landmark, e, jacobians, by_c, U, weight
     by_c = by_c[:, :, active] * problem.sigma[kind][active]
     U = U * (np.sqrt(weight) / noise_factor)[:, None, None]
     e = (U @ e[..., None])[..., 0]
-    if kernel is not None and e.shape[1] == 1:
-        e = e + kernel_bias(kernel)
+    if kind == RANGES:
+        e = e + problem.accepted.range_bias
     size, error = -e[:, 0] if e.shape[1] == 1 else np.linalg.norm(e, axis=1), np.sum(e**2) / 2
     if kernel is not None:
         size = size.tolist()
@@ -282,7 +284,7 @@ def kernel_bias(kernel):
     E[weight(r - b) (r - b)] = 0. Ranges are compared with the expected ones plus b sigma.
     """
     r = np.linspace(-6, 6, 241)
-    if kernel.weight(3.0) == kernel.weight(-3.0):
+    if kernel is None or kernel.weight(3.0) == kernel.weight(-3.0):
         return 0.0
 
     def mean(b):

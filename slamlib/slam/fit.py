@@ -21,7 +21,7 @@ import numpy as np
 from slamlib import se2
 from slamlib.sightings import GATE, POINT_GATE
 from slamlib.slam.calibration import WHEELS
-from slamlib.slam.factors import expected_ranges, expected_sightings
+from slamlib.slam.factors import expected_ranges, expected_sightings, kernel_bias
 from slamlib.slam.graph import gtsam_step
 from slamlib.slam.linear import NormalEquations, laplace_approximation
 from slamlib.slam.measurements import AcceptedMeasurements, Noise, with_known
@@ -94,7 +94,8 @@ def accepted_measurements(problem, state, rule=AcceptanceRule()):
     if not rule.gated:
         weight[:len(problem.measurements.marker_row)] = 1
     return AcceptedMeasurements(
-        problem.measurements, weight, rule.sighting_kernel, rule.range_kernel)
+        measurements=problem.measurements, weight=weight, sighting_kernel=rule.sighting_kernel,
+        range_kernel=rule.range_kernel, range_bias=kernel_bias(rule.range_kernel))
 
 
 def gate_weights(problem, state, early, late):
@@ -119,7 +120,8 @@ def kept_weights(accepted, sighting_residuals, range_residuals):
 
     return (reweighted(accepted.sighting_weight, accepted.sighting_kernel,
                        np.linalg.norm(sighting_residuals, axis=1)),
-            reweighted(accepted.range_weight, accepted.range_kernel, range_residuals))
+            reweighted(accepted.range_weight, accepted.range_kernel,
+                       range_residuals - accepted.range_bias))
 
 
 def residuals(measurements, state, noise):

@@ -21,7 +21,7 @@ from gtsam.symbol_shorthand import A, C, L, P, X
 
 from slamlib.dataset import DatasetError, Vehicle
 from slamlib.slam.calibration import RANGES, SIGHTINGS, WHEELS, stated_calibration
-from slamlib.slam.factors import kernel_bias, linearize_measurements, odometry_error
+from slamlib.slam.factors import linearize_measurements, odometry_error
 from slamlib.slam.measurements import GUESS_PRIOR_SIGMA, WEAK_SIGMA
 
 
@@ -100,7 +100,7 @@ def nonlinear_graph(problem):
     if _is_native(problem, RANGES):
         r, used, kernel = m.ranges, np.flatnonzero(accepted.range_weight), accepted.range_kernel
         sigmas = noise.ranges * r.sigma[used] / np.sqrt(accepted.range_weight[used])
-        distances = r.distance[used] - (kernel_bias(kernel) if kernel else 0) * sigmas
+        distances = r.distance[used] - accepted.range_bias * sigmas
         for i, k, distance, sigma in zip(r.row[used].tolist(), r.antenna[used].tolist(),
                                          distances.tolist(), sigmas.tolist()):
             graph.add(gtsam.RangeFactor2D(

@@ -96,7 +96,8 @@ def extended(measurements, model, part, solved):
     return state_from_poses(
         measurements, np.concatenate([solved.poses[old], poses[new]]),
         np.concatenate([np.zeros((len(old), 3, 3)), covariances[new]]),
-        measurements.calibration.values_of(part.calibration, solved.c))
+        measurements.calibration.taken_from(
+            part.calibration, solved.c, measurements.calibration.stated))
 
 
 def consensus_markers(measurements, in_world, covariances):

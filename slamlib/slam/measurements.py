@@ -239,6 +239,7 @@ class AcceptedMeasurements:
     weight: np.ndarray                       # (s + r,) sightings, then ranges
     sighting_kernel: gtsam.noiseModel.mEstimator.Base | None = None      # None: quadratic
     range_kernel: gtsam.noiseModel.mEstimator.Base | None = None
+    range_bias: float = 0.0                  # sigmas, of the range kernel (`factors.kernel_bias`)
 
     @property
     def sighting_weight(self):

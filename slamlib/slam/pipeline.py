@@ -118,10 +118,10 @@ def fit_from_previous(measurements, previous, model=None, accept=accepted_measur
     frame, calibration = measurements.frame, measurements.calibration
     problem = build_problem(measurements, model or previous.model, _initial_noise(measurements),
                             previous.wheel)
-    problem = replace(problem, sigma=calibration.sigma_without(previous.released),
-                      released=previous.released)
-    state = state_from_poses(measurements, previous.poses[frame], previous.covariances[frame],
-                             calibration.values_of(previous.calibration, previous.c))
+    sigma = calibration.taken_from(previous.calibration, previous.sigma, calibration.sigma)
+    c = calibration.taken_from(previous.calibration, previous.c, calibration.stated)
+    problem = replace(problem, sigma=sigma, released=previous.released)
+    state = state_from_poses(measurements, previous.poses[frame], previous.covariances[frame], c)
     state = narrow_kernels(problem, state, CAUCHY_SCALES[-1:], converged=WARM_START_CONVERGED)
     return replace(refine(problem, state, accept), explanations=previous.explanations)
 

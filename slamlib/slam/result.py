@@ -42,6 +42,7 @@ class SlamResult:
     doubts: dict                    # antenna id: reason, for antennas in doubt
     calibration: Calibration        # p entries with what is stated of them
     c: np.ndarray                   # (p,) their estimates
+    sigma: np.ndarray               # (p,) of their prior, 0 of what is known
     c_covariance: np.ndarray        # (p, p), 0 where the stated value is known
     released: frozenset             # groups of entries that left their stated values
     explanations: tuple             # of sets of groups, each of which explains this, or one empty
@@ -103,7 +104,7 @@ def slam_result(fit):
             marker_covariance[mapped], markers[:, 2] * m.oriented[mapped]),
         antenna=m.antenna, antenna_in_world=state.antennas,
         antenna_covariance=antenna_covariances, doubts=sentences,
-        calibration=m.calibration, c=state.c, c_covariance=marginal.c,
+        calibration=m.calibration, c=state.c, sigma=problem.sigma, c_covariance=marginal.c,
         released=problem.released, explanations=fit.explanations,
         noise=problem.noise, noise_sigma=np.zeros(3) if fit.posterior is None
         else np.sqrt(np.diag(fit.posterior.covariance)),

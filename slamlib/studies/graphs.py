@@ -90,7 +90,8 @@ def evidence_curve(fit, slips, model):
 
     The measurements are those that the Fit accepts, whatever the model of the odometry steps.
     """
-    factors = preintegrate_odometry(fit.problem.measurements, model, fit.state.c[WHEELS])
+    factors = replace(preintegrate_odometry(
+        fit.problem.measurements, model, fit.state.c[WHEELS]), in_counts=True)
     problem, state, curve = replace(fit.problem, odometry=factors), fit.state, []
     for slip in slips:
         problem = replace(problem, noise=replace(problem.noise, slip=slip))

@@ -58,7 +58,7 @@ def map_of_problem_2(measurements, in_world, covariances):
     Parameters as of `consensus_markers`.
     """
     markers = consensus_markers(measurements, in_world, covariances)
-    found = localize(measurements.dataset.aruco)
+    found = localize(measurements.dataset.sightings)
     if found.frame[0] == 0 and np.isfinite(found.poses[0, 0]):          # the same world
         mapped = np.isin(measurements.marker, found.marker)
         markers[mapped] = found.marker_in_world[
@@ -112,11 +112,11 @@ def landmarks_of_drive(dataset, found, kernel="last", starts=tuple(LANDMARKS)):
     Model and noise are those of the result. Returns the numbers of `landmarks`; the optimum reached
     from the result, and its map, replace the truth.
     """
-    m, vehicle = measure(dataset.without("uwb")), dataset.vehicle
-    rounds = _kernel_rounds(build_problem(m, found.model, found.noise), kernel)
+    m = measure(dataset.without("uwb"))
+    problem = replace(build_problem(m, found.model, found.noise), sigma=found.sigma)
+    rounds = _kernel_rounds(problem, kernel)
     best = optimize(rounds[-1], state_from_poses(
-        m, found.poses[m.frame], found.covariances[m.frame],
-        (found.wheel - vehicle.wheel) / vehicle.sigma_wheel))
+        m, found.poses[m.frame], found.covariances[m.frame], found.c))
     return _from_each_start(rounds, best.error, best.state.markers, starts)
 
 
