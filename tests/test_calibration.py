@@ -241,7 +241,7 @@ FAULTS = {                         # what the right doubt names, and the drive
     "sightings late": ("time-offset", lambda d, t: seen_from(d, late=1)),
     "tag ahead": ("tag-offset", lambda d, t: ranged_from(d, t, tag=(0.3, 0.0))),
     "antennas high": ("antenna-height", lambda d, t: ranged_from(d, t, height=2.5)),
-    "a wall": ("antenna-offsets", lambda d, t: ranged_from(d, t, offsets=[0.5, 0, 0, 0])),
+    "a wall": ("antenna-offsets", lambda d, t: ranged_from(d, t, offsets=[0.7, 0, 0, 0])),
     "antennas differ": ("antenna-offsets", lambda d, t: ranged_from(
         d, t, offsets=[0.5, -0.3, 0.2, -0.6])),
     "ranges late": ("range-delay", lambda d, t: ranged_from(d, t, late=30)),

@@ -44,7 +44,7 @@ ENTRIES = (
     Entry("tag_x", "m", "tag-offset", 0.3),
     Entry("tag_y", "m", "tag-offset", 0.3),
     Entry("antenna_height", "m", "antenna-height", 2.5),
-    Entry("range_offset", "m", "range-offset", 0.3),
+    Entry("range_offset", "m", "range-offset", 0.2),
     Entry("range_scale", "", "range-offset", 0.05),
     Entry("range_lag", "poses", "range-delay", 30.0))
 ANTENNA_OFFSETS = Entry("offset of antenna", "m", "antenna-offsets", 0.15)

@@ -32,6 +32,7 @@ from slamlib.slam.problem import preintegrate_odometry
 
 DECISIVE_LEAD = 3.0          # log evidence by which another model of the steps replaces the default
 DECISIVE_RELEASE = 6.0       # log evidence by which a group leaves its stated values
+FURTHER_ENTRY = 0.5          # log evidence beside it, for each entry of a group but the first
 STATED = 3.0                 # log evidence beside it, if standard deviations are stated
 AMBIGUOUS = 3.0              # log evidence within which explanations cannot be told apart
 MAX_WIDE_SIGMAS = 4.0        # wide sigmas, of an entry; beyond them a statement is grossly wrong
@@ -103,8 +104,9 @@ class _Proposal:
 def _proposal(fit):
     """The _Proposal for a Fit.
 
-    Every released group must raise the log evidence by DECISIVE_RELEASE, and by STATED more if its
-    standard deviations are stated. Explanations are the best set and others that come within
+    Every released group must raise the log evidence by DECISIVE_RELEASE, by FURTHER_ENTRY more for
+    each of its entries but one, and by STATED more if its standard deviations are stated: these
+    are prior odds. Explanations are the best set and others that come within
     AMBIGUOUS of it, neither part of it nor more: the drive cannot tell them apart. What else raises
     the evidence is not certain enough to be told, but the covariances have to include it. If an
     entry would be further off than MAX_WIDE_SIGMAS, the statement is grossly wrong, and all wide
@@ -122,8 +124,9 @@ def _proposal(fit):
             for some in map(frozenset, combinations(sorted(candidates), count)):
                 sigma = calibration.sigma_without(some, width) / calibration.wide * informed
                 evidence[some], largest[some] = _log_evidence(L, h, sigma)
+                entries = np.count_nonzero(np.isin(calibration.group, list(some)))
                 merit[some] = evidence[some] - DECISIVE_RELEASE * count \
-                    - STATED * len(some & stated)
+                    - FURTHER_ENTRY * (entries - count) - STATED * len(some & stated)
         best = max(merit, key=merit.get)
         if not best or largest[best] < MAX_WIDE_SIGMAS:
             break
