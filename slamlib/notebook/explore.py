@@ -182,7 +182,8 @@ def draw_graphs(full, drive, seed, slip, assumed, wrong, kernel, start):
     scale = KERNEL_SCALES[kernel]
     cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(scale) if scale else None
     problem = replace(build_problem(m, model, with_known(Noise(), m.dataset.vehicle)),
-                      accepted=AcceptedMeasurements(m, m.unit_weights, cauchy))
+                      accepted=AcceptedMeasurements(
+                          measurements=m, weight=m.unit_weights, sighting_kernel=cauchy))
     single = optimize(problem, odometry_state(m, model, markers=LANDMARKS[start])).state
     fig, plan, side = figure_with_reference(reference)
     plotting.trajectory(plan, single.poses, "alternative", "single kernel")

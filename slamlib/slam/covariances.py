@@ -55,7 +55,7 @@ def marginal_covariances(equations, noise):
     problem, structure = equations.problem, equations.structure
     m, v, active = problem.measurements, problem.measurements.variables, problem.active
     landmarks = structure.rows_of_each(np.r_[v.markers, v.antennas])
-    _, pairs = m.factor_places[0]                          # rows of X_i and X_{i+1}
+    pairs = rows_of_pairs(m)
     data, border, *_ = equations.sums(noise)
     H, solution = structure.matrix(data), linear_solution(structure, data, border)
     _require_digits(equations, H)
@@ -69,9 +69,8 @@ def marginal_covariances(equations, noise):
     blocks = [block + by_c[rows] @ c @ by_c[rows].T for block, rows in zip(blocks, landmarks)]
     whole = np.zeros(2 * [len(active)])
     whole[np.ix_(active, active)] = c
-    joint, pairs = np.zeros((len(pairs), 9, 9)), pairs.reshape(-1, 6)
-    cross = by_c[pairs] @ c
-    joint[:, :6, :6] = of_pairs.reshape(-1, 6, 6) + cross @ np.swapaxes(by_c[pairs], 1, 2)
+    joint, cross = np.zeros((len(pairs), 9, 9)), by_c[pairs] @ c
+    joint[:, :6, :6] = of_pairs + cross @ np.swapaxes(by_c[pairs], 1, 2)
     uncertain = np.flatnonzero(active[WHEELS])                       # the first entries of c
     joint[:, :6, 6 + uncertain] = cross[:, :, :len(uncertain)]
     joint[:, 6:, :6] = np.swapaxes(joint[:, :6, 6:], 1, 2)
@@ -79,6 +78,12 @@ def marginal_covariances(equations, noise):
     return Covariances(
         pairs=joint, markers=blocks[:len(v.markers)],
         antennas=np.reshape(blocks[len(v.markers):], (-1, 2, 2)), c=whole)
+
+
+def rows_of_pairs(measurements):
+    """Rows (f-1, 6) of X_i and X_{i+1}."""
+    rows = measurements.structure.rows(measurements.variables.frames, 3)
+    return np.concatenate([rows[:-1], rows[1:]], axis=1)
 
 
 def _require_digits(equations, H):
@@ -278,7 +283,7 @@ def _averaged(problem, conditional, x, weights):
     """The Covariances averaged over points, with solutions x (p, n + q) about the mean."""
     m, v, structure = (problem.measurements, problem.measurements.variables,
                        problem.measurements.structure)
-    pairs, n = m.factor_places[0][1], len(structure.diagonal)
+    pairs, n = rows_of_pairs(m), len(structure.diagonal)
     of_c = np.zeros((len(x), len(problem.sigma)))
     of_c[:, problem.active] = problem.sigma[problem.active] * x[:, n:]
     of_pairs = np.concatenate([x[:, pairs], np.broadcast_to(

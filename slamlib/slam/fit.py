@@ -201,7 +201,8 @@ def narrow_kernels(problem, state, scales=CAUCHY_SCALES, converged=CONVERGED):
         if number:                                   # the caller judges the last solution
             problem = replace(problem, noise=noise_of_scatter(m, state))
         cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(scale)
-        accepted = AcceptedMeasurements(m, m.unit_weights, cauchy, cauchy)
+        accepted = AcceptedMeasurements(
+            measurements=m, weight=m.unit_weights, sighting_kernel=cauchy, range_kernel=cauchy)
         state = optimize(replace(problem, accepted=accepted), state, converged=converged).state
     return state
 

@@ -251,7 +251,8 @@ def second_moment(ranges, estimate):
     range: an array of the grid times all ranges would take 500 MB.
     """
     centre = ranges.positions.mean(0)
-    reach = GRID_MARGIN * ranges.distance.max() + np.ptp(ranges.positions, axis=0).max()
+    longest = np.maximum(ranges.distance, 3 * ranges.sigma).max()
+    reach = GRID_MARGIN * longest + np.ptp(ranges.positions, axis=0).max()
     radius, angle = np.meshgrid(np.linspace(0, reach, GRID[0])[1:],
                                 np.linspace(-np.pi, np.pi, GRID[1])[1:])
     place = centre + radius[..., None] * np.stack([np.cos(angle), np.sin(angle)], -1)

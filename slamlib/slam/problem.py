@@ -140,5 +140,6 @@ def build_problem(measurements, model, noise, wheel=None, preintegrate=preintegr
     """
     return Problem(
         odometry=preintegrate(measurements, model, wheel),
-        accepted=AcceptedMeasurements(measurements, measurements.unit_weights), noise=noise,
+        accepted=AcceptedMeasurements(
+            measurements=measurements, weight=measurements.unit_weights), noise=noise,
         sigma=measurements.calibration.sigma)

@@ -205,7 +205,8 @@ def chi2_per_dof(problem, state, weight):
     """
     m = problem.measurements
     sightings, ranges = np.split(weight, [len(m.marker_row)])
-    stated = replace(problem, accepted=AcceptedMeasurements(m, weight), noise=Noise())
+    accepted = AcceptedMeasurements(measurements=m, weight=weight)
+    stated = replace(problem, accepted=accepted, noise=Noise())
     e, *_ = odometry_error(problem.odometry, state.poses, state.c[WHEELS])
     U, _ = problem.odometry.whitening(problem.noise.slip)
     e_c = (state.c - m.calibration.stated)[problem.active] / problem.sigma[problem.active]

@@ -123,7 +123,8 @@ def landmarks_of_drive(dataset, found, kernel="last", starts=tuple(LANDMARKS)):
 def _kernel_rounds(problem, kernel):
     """Problems with the scales of the Cauchy kernel, "graduated" or the "last" one only."""
     m, cauchy = problem.measurements, gtsam.noiseModel.mEstimator.Cauchy.Create
-    return [replace(problem, accepted=AcceptedMeasurements(m, m.unit_weights, cauchy(scale)))
+    return [replace(problem, accepted=AcceptedMeasurements(
+        measurements=m, weight=m.unit_weights, sighting_kernel=cauchy(scale)))
             for scale in (CAUCHY_SCALES if kernel == "graduated" else CAUCHY_SCALES[-1:])]
 
 
