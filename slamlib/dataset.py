@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slamlib import counts
+from slamlib import counts, se2
 from slamlib.covariance import correlations
 from slamlib.dialects import read_table
 from slamlib.doubt import Doubt
@@ -76,6 +76,21 @@ class Dataset:
     uwb: UwbReadings | None
     antenna_guess: AntennaGuess | None
     notes: tuple[str, ...] = ()  # what was mended or left out while reading, a sentence each
+
+    @property
+    def sightings(self):
+        """The ArucoReadings as the vehicle's origin sees them, by the stated camera and size.
+
+        Problem 2 and the checks of files use these. None without markers.
+        """
+        v, a = self.vehicle, self.aruco
+        if a is None or (v.camera_x, v.camera_y, v.camera_turn, v.marker_size) == (0, 0, 0, 1):
+            return a
+        scale = np.array([v.marker_size, v.marker_size, 1])
+        camera = [v.camera_x, v.camera_y, v.camera_turn]
+        return replace(a, marker_in_vehicle=se2.compose(camera, scale * a.marker_in_vehicle),
+                       covariance=se2.rotate_covariance(
+                           scale[:, None] * a.covariance * scale, v.camera_turn))
 
     def without(self, sensor):
         """The Dataset without a sensor, "aruco" or "uwb"."""

@@ -32,6 +32,16 @@ _GUESS = Limit(-1e6, 1e6, "m", "a place in the frame of pose 1 in metres")
 _TRUE = Limit(-1e9, 1e9, "m", "a place in metres")
 _TRUE_ANGLE = Limit(-1e9, 1e9, "rad", "an angle in radians")
 _FACTOR = Limit(0.01, 100, "", "what the stated standard deviations are multiplied by")
+_PLACE = Limit(-10, 10, "m", "a place in the vehicle's frame in metres")
+_LAG = Limit(-1000, 1000, "", "a delay in encoder steps")
+_SENSORS = {
+    "camera_x": _PLACE, "camera_y": _PLACE,
+    "camera_turn": Limit(-6.3, 6.3, "rad", "an angle in radians"),
+    "marker_size": Limit(0.5, 2, "", "the size of the printed markers over that stated"),
+    "sighting_lag": _LAG, "tag_x": _PLACE, "tag_y": _PLACE,
+    "antenna_height": Limit(0, 100, "m", "the height of the antennas over the tag in metres"),
+    "range_offset": Limit(-100, 100, "m", "a distance in metres"),
+    "range_scale": Limit(0.5, 2, "", "measured ranges over true distances"), "range_lag": _LAG}
 
 
 def _sigma_limit(parameter):
@@ -53,7 +63,10 @@ LIMITS = {
                                "heading is unknown"),
         "slip": Limit(0, 0.1, "sqrt(m)", "the standard deviation in metres of a wheel's slip after "
                       "one metre"),
-        "marker_noise_factor": _FACTOR, "range_noise_factor": _FACTOR},
+        "marker_noise_factor": _FACTOR, "range_noise_factor": _FACTOR, **_SENSORS,
+        **{f"sigma_{name}": Limit(0, limit.maximum, limit.unit,
+                                  f"a standard deviation of {name}; 0 if it is known")
+           for name, limit in _SENSORS.items()}},
     "ArucoReading.txt": {
         "x": _SIGHTED, "y": _SIGHTED, "theta": Limit(-6.3, 6.3, "rad", "an angle in radians"),
         "s_xx": _VARIANCE, "s_yy": _VARIANCE,

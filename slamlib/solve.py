@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from slamlib import localization, odometry, results, se2, slam
+from slamlib.checks.solution import solution_doubts
 from slamlib.dataset import DatasetError
 from slamlib.doubt import Doubt
 
@@ -34,9 +35,6 @@ PROBLEMS = {
     "problem3": Task("SLAM: odometry + ArUco", ("aruco",), "slam"),
     "problem4": Task("SLAM: odometry + ArUco + UWB", ("uwb",), "slam_uwb"),
 }
-# Kinds of doubts about whole files.
-FILE_DOUBTS = {"units", "wheels-swapped", "wheels-reversed", "camera-mirrored", "camera-turned",
-               "odometry", "counts-since-start"}
 COVARIANCE_FIELDS = ("marker_covariance", "antenna_covariance", "wheel_covariance")
 SENSORS = {"aruco": "markers", "uwb": "UWB ranges"}
 SUMMARY = "summary.json"
@@ -99,7 +97,7 @@ def find(problem, dataset, found=None):
     """
     solvers = {
         "problem1": lambda: odometry.equation2(dataset.ticks, dataset.vehicle),
-        "problem2": lambda: localization.localize(dataset.aruco),
+        "problem2": lambda: localization.localize(dataset.sightings),
         "problem2_hint": lambda: localization.fuse_increments(dataset),
         "problem2_fused": lambda: localization.fuse(dataset),
         "problem3": lambda: slam.estimate(dataset.without("uwb")),
@@ -169,7 +167,7 @@ def _fusion_fields(dataset, found):
 def _slam_fields(dataset, found):
     """Fields of the Solution of problem 3 by a SlamResult."""
     return {"aruco_map": None if dataset.aruco is None else _marker_map(found),
-            "facts": _slam_facts(found, dataset), "doubts": found.drive_doubts}
+            "facts": _slam_facts(found, dataset), "doubts": solution_doubts(found)}
 
 
 def _slam_and_antenna_fields(dataset, found):
@@ -209,14 +207,12 @@ def _slam_facts(found, dataset):
                   "marker_noise_relative_sigma": sigma[1]}
     if len(found.antenna):
         facts |= {"range_noise_factor": found.noise.ranges, "range_noise_relative_sigma": sigma[2]}
-    if found.range_calibration_covariance.any():
-        facts |= dict(zip(("range_offset_m", "range_scale"), found.range_calibration.tolist()))
-        facts["range_offset_and_scale_sigmas"] = found.range_calibration_sigma.tolist()
     facts = {"slip_sqrt_m": found.slip, "slip_relative_sigma": sigma[0], **facts}
     return {**facts, **_given_facts(dataset, facts), "increments": found.model,
             "outliers": int(found.rejected.sum()), "chi2_per_dof": found.chi2_per_dof,
             "chi2_per_dof_of_all": found.chi2_per_dof_of_all,
-            "log_evidence": found.log_evidence, **_wheel_facts(found)}
+            "log_evidence": found.log_evidence, **_wheel_facts(found),
+            "calibration": [row for row in found.calibration_table if row["sigma"]]}
 
 
 def solutions(dataset, found=None, problems=tuple(PROBLEMS)):
@@ -236,27 +232,6 @@ def solutions(dataset, found=None, problems=tuple(PROBLEMS)):
             yield problem_solution(problem, dataset, result)
         except UNSOLVABLE as error:
             yield failure(problem, dataset, error)
-
-
-def doubts_about_drive(dataset, truth):
-    """Doubts (tuple of Doubt) from the measurements of a Dataset and from its Truth or None."""
-    try:
-        by_measurements = localization.doubts_before_solving(dataset)
-    except np.linalg.LinAlgError:              # where increments have no covariance
-        by_measurements = []
-    return (*by_measurements, *(() if truth is None else truth.doubts))
-
-
-def merged(doubts):
-    """List of Doubt, each kind once with its last sentence; of antennas and units, each sentence.
-
-    A doubt about whole files removes those that follow from solving such files.
-    """
-    kinds = {doubt.what for doubt in doubts}
-    kept = [doubt for doubt in doubts if not kinds & FILE_DOUBTS
-            or doubt.what in FILE_DOUBTS | {"truth-frame"}]
-    return list({doubt.sentence if doubt.what in ("antenna", "units") else doubt.what: doubt
-                 for doubt in kept}.values())
 
 
 def truth_in_world(solution, truth):

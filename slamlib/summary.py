@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from slamlib import evaluation, swap
+from slamlib.checks.files import doubts_before_solving, merged
 from slamlib.dataset import read_dataset, read_truth
 from slamlib.inventory import all_notes
 from slamlib.solve import (
@@ -25,8 +26,6 @@ from slamlib.solve import (
     RESULT_NAMES,
     SUMMARY,
     Failure,
-    doubts_about_drive,
-    merged,
     solutions,
     truth_in_world,
     write_solution,
@@ -143,7 +142,7 @@ def _written_by_all(dataset, truth, stage, jobs):
     It ends with this process, so that nothing is written later.
     """
     if jobs < 2 or sys.platform != "linux" or len(os.sched_getaffinity(0)) < 2:
-        return _written(dataset, truth, stage, PROBLEMS), doubts_about_drive(dataset, truth)
+        return _written(dataset, truth, stage, PROBLEMS), doubts_before_solving(dataset, truth)
     first = [problem for problem in PROBLEMS if problem not in PARALLEL_PROBLEMS]
     others = set(active_children())
     with ProcessPoolExecutor(1, mp_context=get_context("fork"), initializer=_ends_with,
@@ -176,7 +175,8 @@ def _ends_with(parent):
 
 def _solve_in_parallel(dataset, truth, stage):
     """The results of the second process: `_written` for its problems, doubts about the drive."""
-    return _written(dataset, truth, stage, PARALLEL_PROBLEMS), doubts_about_drive(dataset, truth)
+    return (_written(dataset, truth, stage, PARALLEL_PROBLEMS),
+            doubts_before_solving(dataset, truth))
 
 
 def _written(dataset, truth, stage, problems):

@@ -42,7 +42,9 @@ def read_toml(path, example, known, encoding="ascii"):
         at_key = re.search(rf"""^[\s\["']*{re.escape(key)}(?![\w-])""", text, re.MULTILINE)
         line = text.count("\n", 0, at_key.end()) + 1 if at_key else None
         if key not in known:
-            raise error(path, f"expected keys among {', '.join(known)}, found {quoted(key)}", line)
+            names = ", ".join(name for name in known if not name.startswith("sigma_"))
+            raise error(path, f"expected keys among {names} and their sigma_..., found "
+                        f"{quoted(key)}", line)
         entries[key] = value, line
     return entries
 

@@ -1,4 +1,4 @@
-"""The vehicle: its wheel parameters and, where known, the noise of its sensors."""
+"""The vehicle: wheels and sensors as stated, how well they are known, and known noise."""
 
 from dataclasses import asdict, dataclass, replace
 
@@ -10,9 +10,10 @@ from slamlib.textfile import error, quoted, read_toml
 
 @dataclass(frozen=True)
 class Vehicle:
-    """Wheel parameters with their standard deviations, and noise parameters or None.
+    """Wheels and sensors with their standard deviations, and noise parameters or None.
 
-    The defaults are the assignment's table 2, which gives no noise.
+    The defaults are the assignment's table 2, which gives no noise, and sensors in the vehicle's
+    origin that measure without common errors. `slam.calibration` has the model of each entry.
     """
 
     right_radius: float = 0.1  # m
@@ -26,6 +27,28 @@ class Vehicle:
     slip: float | None = None  # sqrt(m), sigma of a wheel's slip after 1 m; None: learned
     marker_noise_factor: float | None = None  # of the sigmas in ArucoReading.txt; None: learned
     range_noise_factor: float | None = None  # of the sigmas in UwbReading.txt; None: learned
+    camera_x: float = 0.0  # m, place of the camera in the vehicle
+    camera_y: float = 0.0  # m
+    camera_turn: float = 0.0  # rad, heading of the camera in the vehicle
+    marker_size: float = 1.0  # of the printed markers, over the size that the detector was told
+    sighting_lag: float = 0.0  # encoder steps by which the sightings are late
+    tag_x: float = 0.0  # m, place of the UWB tag in the vehicle
+    tag_y: float = 0.0  # m
+    antenna_height: float = 0.0  # m, of the antennas over the tag
+    range_offset: float = 0.0  # m, of all ranges
+    range_scale: float = 1.0  # of all ranges, measured over true distance
+    range_lag: float = 0.0  # encoder steps by which the ranges are late
+    sigma_camera_x: float = 0.0  # m; this and all below: 0 if known
+    sigma_camera_y: float = 0.0  # m
+    sigma_camera_turn: float = 0.0  # rad
+    sigma_marker_size: float = 0.0
+    sigma_sighting_lag: float = 0.0  # encoder steps
+    sigma_tag_x: float = 0.0  # m
+    sigma_tag_y: float = 0.0  # m
+    sigma_antenna_height: float = 0.0  # m
+    sigma_range_offset: float = 0.0  # m
+    sigma_range_scale: float = 0.0
+    sigma_range_lag: float = 0.0  # encoder steps
 
     @property
     def wheel(self):

@@ -52,6 +52,6 @@ def test_gtsam_s_chain_has_the_optimum_of_the_independent_chain(drive):
     chain = replace(problem, odometry=graphs.independent_chain(m, problem.odometry.model))
     expected = optimize(chain, fit.state).state
     found = gtsam.LevenbergMarquardtOptimizer(
-        graphs.gtsam_chain(problem), values(m, fit.state)).optimize()
+        graphs.gtsam_chain(problem), values(problem, fit.state)).optimize()
     poses = [found.atPose2(gtsam.symbol("x", i)) for i in range(len(m.frame))]
     np.testing.assert_allclose([[p.x(), p.y()] for p in poses], expected.poses[:, :2], atol=1e-4)

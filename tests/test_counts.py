@@ -8,8 +8,8 @@ import pytest
 from test_dataset import error_of, write
 
 from slamlib import counts
+from slamlib.checks.files import doubts_before_solving
 from slamlib.dataset import Vehicle, read_dataset
-from slamlib.localization import doubts_before_solving
 from slamlib.simulation import manoeuvre, simulate, write_dataset
 
 simulated = cache(simulate)

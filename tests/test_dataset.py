@@ -166,8 +166,11 @@ def test_truth_that_is_rounded_or_begins_with_full_turns_is_no_doubt(folder, sta
 def test_vehicle_defaults_are_table_2(folder):
     (folder / "vehicle.toml").unlink()
     vehicle = read_dataset(folder).vehicle
-    assert dataclasses.astuple(vehicle) == (0.1, 0.1, 0.4, 8000.0, 1e-4, 1e-4, 1e-4, 1e-4,
-                                            None, None, None)
+    assert dataclasses.astuple(vehicle)[:11] == (0.1, 0.1, 0.4, 8000.0, 1e-4, 1e-4, 1e-4, 1e-4,
+                                                 None, None, None)
+    others = [*dataclasses.asdict(vehicle).items()][11:]
+    assert {name: value for name, value in others if value} == {"marker_size": 1, "range_scale": 1}
+    assert len(others) == 22
 
 
 def test_name_of_the_folder_given_by_a_relative_path(folder, monkeypatch):

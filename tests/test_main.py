@@ -275,7 +275,7 @@ def test_a_clean_drive_has_no_doubts_and_each_doubt_is_told_once(tmp_path, monke
     dataset = replace(dataset.first(100), uwb=None)
     assert solve_to_folder(dataset, None, tmp_path)["doubts"] == []
     told = Doubt("camera-mirrored", "It is.")
-    monkeypatch.setattr("slamlib.summary.doubts_about_drive", lambda *_: (told, told))
+    monkeypatch.setattr("slamlib.summary.doubts_before_solving", lambda *_: (told, told))
     monkeypatch.setattr("slamlib.summary.solutions", lambda dataset, problems: [
         replace(solve.problem_solution("problem1", dataset),
                 doubts=(Doubt("units", "Miles."), told))])

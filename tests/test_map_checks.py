@@ -21,7 +21,9 @@ def test_degrees_of_freedom_are_those_of_the_dense_matrices():
     fit = fit_of(dataset.first(400))
     markers, antennas = map_checks.residuals_by_landmark(fit)
     m, equations = fit.problem.measurements, fit.equations
-    C = np.linalg.inv(m.structure.matrix(equations.sums(fit.problem.noise)[0]).toarray())
+    H, border, *_ = equations.sums(fit.problem.noise)
+    H, n = m.structure.matrix(H).toarray(), len(m.structure.diagonal)
+    C = np.linalg.inv(np.block([[H, border[:n, :-1]], [border[:n, :-1].T, border[n:, :-1]]]))
     poses, _, ranges = equations.linearized
     for f, (_, rows), found in ((poses, m.factor_places[1], markers),
                                 (ranges, m.factor_places[3], antennas)):
@@ -33,8 +35,7 @@ def test_degrees_of_freedom_are_those_of_the_dense_matrices():
         dof = np.bincount(label, expected * f.weight - taken)
         np.testing.assert_allclose(found.dof, dof, rtol=1e-5)
         np.testing.assert_allclose(found.chi2, np.bincount(label, np.sum(f.e**2, axis=1)))
-        np.testing.assert_allclose(found.count, np.bincount(label, f.weight))
-    assert 0 < antennas.dof.sum() < antennas.count.sum() < (dataset.uwb.pose < 400).sum()
+    assert 0 < antennas.dof.sum() < np.sum(ranges.weight) < (dataset.uwb.pose < 400).sum()
 
 
 @pytest.mark.slow
@@ -84,16 +85,17 @@ def test_maps_of_both_halves_coincide_without_noise():
     one, other = maps_of(*simulate("short", 1, noise=False))
     found = map_checks.compare_maps(one, other)
     assert len(found.marker) > 3 and len(found.antenna) == 4
-    np.testing.assert_allclose(found.distance, 0, atol=1e-5)
-    assert found.chi2 < 1e-3
+    # The correction of the kernel is for Gaussian noise: 0.08 sigma, at the smallest noise factor.
+    np.testing.assert_allclose(found.distance, 0, atol=1e-4)
+    assert found.chi2 < 0.05
 
 
 def test_two_antennas_compare_by_their_distance():
     """Each distance has the variance 2 s^2, so their difference, 0.3 m, has 4 s^2."""
     s = 0.1
-    C = np.diag(2 * [s**2, s**2, 0])
-    one = map_checks.Map(np.zeros(0, int), np.array([4, 7]), np.array([[0.0, 0, 0], [3, 4, 0]]), C)
-    other = replace(one, place=np.array([[1.0, 1, 0], [6.3, 1, 0]]))
+    C = s**2 * np.eye(4).reshape(2, 2, 2, 2)
+    one = map_checks.Map(np.zeros(0, int), np.array([4, 7]), np.array([[0.0, 0], [3, 4]]), C)
+    other = replace(one, place=np.array([[1.0, 1], [6.3, 1]]))
     found = map_checks.compare_maps(one, other)
     assert found.dof == 1
     np.testing.assert_allclose(found.chi2, 0.3**2 / (4 * s**2))
@@ -104,7 +106,7 @@ def test_two_antennas_compare_by_their_distance():
 def test_chi_squared_of_a_landmark_is_what_it_adds_to_that_of_the_others():
     one, other = maps_of(*simulate("short", 5))
     found = map_checks.compare_maps(one, other)
-    assert found.dof == 3 * len(found.marker) + 2 * len(found.antenna) - 3 == found.dofs.sum() - 3
+    assert found.dof == 2 * (len(found.marker) + len(found.antenna)) - 3
     for kind, ids, each in (("marker", found.marker, found.squared),
                             ("antenna", found.antenna, found.squared[len(found.marker):])):
         other_ids = getattr(other, kind).copy()
@@ -151,5 +153,5 @@ def test_a_wrong_label_alone_makes_no_landmark():
 def test_a_drive_without_landmarks_has_an_empty_map():
     dataset, truth = simulate("short", 1)
     one, other = maps_of(replace(dataset, aruco=None, uwb=None), truth)
-    assert one.place.shape == (0, 3) and one.covariance.shape == (0, 0)
+    assert one.place.shape == (0, 2) and one.covariance.shape == (0, 2, 0, 2)
     assert map_checks.compare_maps(one, other) is None

@@ -5,34 +5,51 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from gtsam.symbol_shorthand import A, L, W, X
+from gtsam.symbol_shorthand import A, C, L, X
 from numeric import known_noise
 from scipy.special import chdtri
 
 from slamlib import sightings, slam
-from slamlib.localization import doubts
+from slamlib.checks import files
 from slamlib.simulation import simulate
-from slamlib.slam import drive_doubts, factors, graph, linear, noise
+from slamlib.slam import factors, graph, linear, noise
+from slamlib.slam.calibration import ENTRIES, OFFSET, WHEELS
 from slamlib.slam.covariances import marginal_covariances
-from slamlib.slam.factors import build_problem
 from slamlib.slam.fit import LATE_KERNEL, optimize
 from slamlib.slam.initialization import odometry_state, state_from_poses
 from slamlib.slam.linear import NormalEquations, laplace_approximation
 from slamlib.slam.measurements import WEAK_SIGMA, AcceptedMeasurements, Noise, measure
 from slamlib.slam.noise import BOUNDS, equations_of_first_frames
 from slamlib.slam.pipeline import fit_from_odometry
+from slamlib.slam.problem import build_problem
+
+GROUPS = frozenset(entry.group for entry in ENTRIES) | {"antenna-offsets"}
+
+
+def dense(equations, noise):
+    """The whole information matrix (n + q, n + q), and the gradient (n + q,)."""
+    data, border, *_ = equations.sums(noise)
+    H, n = equations.structure.matrix(data).toarray(), len(equations.structure.diagonal)
+    B, D, g = border[:n, :-1], border[n:, :-1], border[:, -1]
+    return np.block([[H, B], [B.T, D]]), g
+
+
+def released(problem, groups):
+    """The Problem in which groups of the calibration are hardly known."""
+    sigma = problem.measurements.calibration.sigma_without(groups)
+    return replace(problem, sigma=sigma, released=frozenset(groups))
 
 
 def test_gtsam_has_the_same_error_and_takes_the_same_step():
-    """Far from the optimum, with kernels, points, wrong labels and late ranges, without and with z.
+    """Far from the optimum, with kernels, points, wrong labels, late ranges and any calibration.
 
     GTSAM evaluates, linearises and eliminates its factors one by one.
     """
     dataset, _ = simulate("short", seed=4, mislabelled=0.02, late_ranges=0.2)
     points = np.isin(dataset.aruco.marker, dataset.aruco.marker[:3])
-    C = dataset.aruco.covariance.copy()
-    C[points, 2] = C[points, :, 2] = [0, 0, 4.0]
-    m = measure(replace(dataset.first(700), aruco=replace(dataset.aruco, covariance=C)
+    covariance = dataset.aruco.covariance.copy()
+    covariance[points, 2] = covariance[points, :, 2] = [0, 0, 4.0]
+    m = measure(replace(dataset.first(700), aruco=replace(dataset.aruco, covariance=covariance)
                         .select(dataset.aruco.pose < 700)))
     assert 0 < np.count_nonzero(m.oriented) < len(m.oriented)
     state = odometry_state(m, "arc")
@@ -40,19 +57,23 @@ def test_gtsam_has_the_same_error_and_takes_the_same_step():
     accepted = AcceptedMeasurements(m, m.unit_weights, cauchy, LATE_KERNEL)
     problem = replace(build_problem(m, "arc", Noise(2e-3, 1.5, 0.7)), accepted=accepted)
     equations = NormalEquations(problem, state)
-    values = graph.values(m, state)
-    others = factors.odometry_error(problem.odometry, state.poses, state.w)[0]
+    values = graph.values(problem, state)
+    others = factors.odometry_error(problem.odometry, state.poses, state.c[WHEELS])[0]
     others = problem.odometry.whitening(2e-3)[0] @ others[..., None]
     expected = graph.nonlinear_graph(problem).error(values) + np.sum(others**2) / 2 \
         + equations.linearized[1].error
     assert np.isclose(equations.error, expected, rtol=1e-12)
     step = graph.gtsam_step(problem, state)
     np.testing.assert_allclose(equations.step(), step, rtol=1e-5, atol=1e-6 * np.abs(step).max())
-    free = replace(m, calibrated=True)
-    problem = replace(problem, accepted=replace(accepted, measurements=free))
-    step = graph.gtsam_step(problem, state)
-    np.testing.assert_allclose(NormalEquations(problem, state).step(), step, rtol=1e-5,
-                               atol=1e-6 * np.abs(step).max())
+    rng = np.random.default_rng(0)
+    for groups in ({"range-offset"}, {"camera-offset", "tag-offset"}, GROUPS):
+        free = released(problem, groups)
+        off = replace(state, c=state.c + 0.1 * free.sigma * rng.normal(size=len(state.c)))
+        for start in (state, off):
+            step = graph.gtsam_step(free, start)
+            assert len(step) == len(m.structure.diagonal) + free.active.sum()
+            np.testing.assert_allclose(NormalEquations(free, start).step(), step, rtol=1e-5,
+                                       atol=1e-6 * np.abs(step).max())
 
 
 def test_markers_without_accepted_sightings_have_a_weak_prior_and_move_nothing_else():
@@ -85,22 +106,27 @@ def test_markers_without_accepted_sightings_have_a_weak_prior_and_move_nothing_e
 def test_selected_blocks_are_those_of_the_dense_inverse(poses):
     """A part of a drive without a separator, and with many."""
     dataset, _ = simulate("short", seed=4)
-    m = replace(measure(dataset.first(poses)), calibrated=True) if poses > 1 \
-        else measure(dataset.first(1))
-    equations = NormalEquations(build_problem(m, "arc", Noise()), odometry_state(m, "arc"))
+    m = measure(dataset.first(poses))
+    problem = released(build_problem(m, "arc", Noise()), {"range-offset"} if poses > 1 else ())
+    equations = NormalEquations(problem, odometry_state(m, "arc"))
     found = marginal_covariances(equations, Noise(2e-3, 1.5, 0.7))
-    H = equations.structure.matrix(equations.sums(Noise(2e-3, 1.5, 0.7))[0]).toarray()
+    H, _ = dense(equations, Noise(2e-3, 1.5, 0.7))
     np.testing.assert_allclose(H, H.T, rtol=1e-9, atol=1e-6)
-    expected, rows = np.linalg.inv(H), equations.structure.rows
+    n, rows = len(equations.structure.diagonal), equations.structure.rows
+    unit = np.r_[np.ones(n), problem.sigma[problem.active]]
+    expected = np.linalg.inv(H) * np.outer(unit, unit)
     sigma = np.sqrt(np.diag(expected))
     expected /= np.outer(sigma, sigma)
     for i, block in enumerate(found.pairs):
-        at = np.concatenate([rows([i], 3)[0], rows([i + 1], 3)[0], rows(m.variables.w, 3)[0]])
+        at = np.concatenate([rows([i], 3)[0], rows([i + 1], 3)[0], np.arange(n, n + 3)])
         np.testing.assert_allclose(block / np.outer(sigma[at], sigma[at]), expected[np.ix_(at, at)],
                                    atol=1e-6)
-    landmarks = [*found.markers, *found.antennas, found.w] + [found.c] * m.calibrated
-    for j, block in enumerate(landmarks):
-        at = rows([len(m.frame) + j], len(block))[0]
+    places = [rows([len(m.frame) + j], len(block))[0]
+              for j, block in enumerate([*found.markers, *found.antennas])]
+    active, zero = problem.active, ~problem.active
+    assert not found.c[zero].any() and not found.c[:, zero].any()
+    for at, block in zip([*places, np.arange(n, len(H))], [
+            *found.markers, *found.antennas, found.c[np.ix_(active, active)]], strict=True):
         np.testing.assert_allclose(block / np.outer(sigma[at], sigma[at]), expected[np.ix_(at, at)],
                                    atol=1e-6)
 
@@ -108,9 +134,9 @@ def test_selected_blocks_are_those_of_the_dense_inverse(poses):
 def test_the_first_frames_are_a_drive_of_their_own(monkeypatch):
     """Equal to the equations of the drive cut there, but for the rounding of the whole drive."""
     dataset, _ = simulate("short", seed=4, mislabelled=0.02, late_ranges=0.2)
-    m = replace(measure(dataset), calibrated=True)
+    m = measure(dataset)
     weight = (np.arange(len(m.unit_weights)) % 7 > 0).astype(float)
-    problem = build_problem(m, "arc", Noise(2e-3, 1.5, 0.7))
+    problem = released(build_problem(m, "arc", Noise(2e-3, 1.5, 0.7)), GROUPS)
     problem = replace(problem, accepted=AcceptedMeasurements(m, weight, range_kernel=LATE_KERNEL))
     state = odometry_state(m, "arc")
     monkeypatch.setattr(noise, "MIN_MEASUREMENTS", 50)
@@ -233,9 +259,7 @@ def test_points_of_the_posterior_have_its_moments(scale):
 def test_gates_are_quantiles_of_chi_squared():
     """They are numbers in the code because scipy.special takes long to import."""
     assert np.allclose([sightings.GATE, sightings.POINT_GATE], chdtri([3, 2], 1e-3), rtol=1e-12)
-    assert np.isclose(doubts.AGREEMENT_GATE, chdtri(3, 0.05), rtol=1e-5)
-    gains = [drive_doubts.MIN_TIME_GAIN, drive_doubts.MIN_PLACE_GAIN, drive_doubts.MIN_RANGE_GAIN]
-    assert np.allclose(gains, chdtri([1, 3, 2], 5e-4) / 2, rtol=1e-5)
+    assert np.isclose(files.AGREEMENT_GATE, chdtri(3, 0.05), rtol=1e-5)
 
 
 def test_where_cholesky_fails_qr_gives_the_same_solution(monkeypatch):
@@ -267,7 +291,7 @@ def test_the_normal_equations_are_those_of_gtsams_linear_graph():
     """Solution and log determinant, for the noise of the problem and for another one."""
     dataset, _ = simulate("short", seed=4, mislabelled=0.02, late_ranges=0.2)
     fit = fit_from_odometry(measure(known_noise(dataset.first(600), 1e-3)))
-    accepted = replace(fit.problem.accepted, range_kernel=None)
+    accepted = replace(fit.problem.accepted, range_kernel=None, range_bias=0.0)
     problem = replace(fit.problem, accepted=accepted, noise=Noise(2e-3, 1.5, 0.7))
     equations = NormalEquations(replace(problem, noise=Noise(1e-3)), fit.state)
     delta, found = laplace_approximation(equations, problem.noise)
@@ -286,12 +310,17 @@ def test_the_normal_equations_are_those_of_gtsams_linear_graph():
 
 def test_marginal_covariances_equal_gtsams():
     dataset, _ = simulate("short", seed=4, mislabelled=0.02, late_ranges=0.2)
-    m = measure(known_noise(dataset, 1e-3))
+    vehicle = replace(dataset.vehicle, sigma_range_offset=0.2)
+    m = measure(known_noise(replace(dataset, vehicle=vehicle), 1e-3))
     fit = fit_from_odometry(m)
     marginal = marginal_covariances(fit.equations, fit.problem.noise)
+    active = fit.problem.active
+    assert active.sum() == 4 and active[WHEELS].all() and active[OFFSET]
     tree = graph.linearize(fit.problem, fit.state).eliminateMultifrontal()
     for i in range(0, len(marginal.pairs), 13):
-        expected = tree.jointMarginalCovariance([X(i), X(i + 1), W(0)]).fullMatrix()
+        expected = tree.jointMarginalCovariance([X(i), X(i + 1), C(0)]).fullMatrix()[:9, :9]
+        unit = np.r_[np.ones(6), fit.problem.sigma[WHEELS]]
+        expected = expected * np.outer(unit, unit)
         scale = np.outer(*2 * [np.sqrt(np.diag(expected))])
         np.testing.assert_allclose(marginal.pairs[i] / scale, expected / scale, atol=1e-6)
     for j, found in enumerate(marginal.markers):
@@ -299,4 +328,6 @@ def test_marginal_covariances_equal_gtsams():
                                    atol=1e-6 * found.max())
     for k, found in enumerate(marginal.antennas):
         np.testing.assert_allclose(found, tree.marginalCovariance(A(k)), rtol=1e-5, atol=1e-9)
-    np.testing.assert_allclose(marginal.w, tree.marginalCovariance(W(0)), rtol=1e-5, atol=1e-7)
+    unit = fit.problem.sigma[active]
+    np.testing.assert_allclose(marginal.c[np.ix_(active, active)] / np.outer(unit, unit),
+                               tree.marginalCovariance(C(0)), rtol=1e-5, atol=1e-7)

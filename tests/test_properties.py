@@ -20,13 +20,14 @@ from numeric import known_noise
 from test_dataset import FILES, write
 
 from slamlib import localization, odometry, se2, slam
+from slamlib.checks.files import doubts_before_solving, range_units
 from slamlib.dataset import DatasetError, Vehicle, read_dataset, read_truth
-from slamlib.localization.units import range_units
 from slamlib.simulation import simulate
+from slamlib.slam.calibration import ENTRIES
 from slamlib.slam.covariances import _common_turn, _require_digits, marginal_covariances
 from slamlib.slam.measurements import measure
 from slamlib.slam.pipeline import fit_from_odometry
-from slamlib.solve import Failure, doubts_about_drive, solutions
+from slamlib.solve import Failure, solutions
 from slamlib.summary import summarize
 
 QUICK = settings(max_examples=3 * settings.default.max_examples)
@@ -46,7 +47,15 @@ VEHICLES = st.builds(
     sigma_right_radius=st.sampled_from([1e-4, 1e-6, 5e-3]),
     sigma_left_radius=st.sampled_from([1e-4, 1e-6, 5e-3]),
     sigma_wheelbase=st.sampled_from([1e-4, 1e-6, 1e-2]),
-    sigma_heading=st.sampled_from([1e-4, 1e-6, 0.1, 1.0]))
+    sigma_heading=st.sampled_from([1e-4, 1e-6, 0.1, 1.0]),
+    sigma_camera_x=st.sampled_from([0.0, 0.0, 0.05]), sigma_camera_y=st.sampled_from([0.0, 0.02]),
+    sigma_camera_turn=st.sampled_from([0.0, 0.0, 0.02]),
+    sigma_marker_size=st.sampled_from([0.0, 0.0, 0.01]),
+    sigma_sighting_lag=st.sampled_from([0.0, 0.0, 2.0]),
+    sigma_tag_x=st.sampled_from([0.0, 0.0, 0.1]), sigma_antenna_height=st.sampled_from([0, 0, 1.0]),
+    sigma_range_offset=st.sampled_from([0.0, 0.0, 0.1]),
+    sigma_range_scale=st.sampled_from([0.0, 0.0, 0.01]),
+    sigma_range_lag=st.sampled_from([0.0, 0.0, 2.0]))
 
 
 @st.composite
@@ -196,7 +205,7 @@ def test_every_small_drive_is_solved(drive):
         for C in (solution.covariances[known], *(
                 each[2] for each in (solution.aruco_map, solution.uwb_map) if each is not None)):
             assert_positive(C, least, solution.problem)
-    for doubt in doubts_about_drive(dataset, None):
+    for doubt in doubts_before_solving(dataset):
         assert doubt.sentence.endswith(".") and "nan" not in doubt.sentence
 
 
@@ -349,9 +358,11 @@ def mirrored(dataset):
         uwb=uwb, antenna_guess=guess and replace(guess, position=guess.position * sign[:2]))
 
 
-# Factors on the constants in m, in sqrt(m), and in [m, 1].
+# Factors on the constants in m, in sqrt(m), and entries of the calibration in m.
 LENGTHS = {"ORIGIN_SIGMA": 4, "MINIMUM_SIGMA": 4, "GUESS_PRIOR_SIGMA": 4, "STEP_TOLERANCE": 4,
-           "MINIMUM_SLIP": 2, "CALIBRATION_SIGMA": np.array([4, 1])}
+           "MINIMUM_SLIP": 2}
+OF_LENGTH = [entry.name for entry in ENTRIES if entry.unit == "m"]
+RELATIVE = "wheel-parameters"        # group of which the wide standard deviations have no unit
 
 
 def in_quarters(dataset):
@@ -359,9 +370,9 @@ def in_quarters(dataset):
     v, aruco, uwb, guess = dataset.vehicle, dataset.aruco, dataset.uwb, dataset.antenna_guess
     length = np.array([4, 4, 1])
     return replace(
-        dataset, vehicle=replace(v, **{name: 4 * getattr(v, name) for name in (
-            "right_radius", "left_radius", "wheelbase", "sigma_right_radius", "sigma_left_radius",
-            "sigma_wheelbase")}),
+        dataset, vehicle=replace(v, **{
+            name: 4 * getattr(v, name)
+            for entry in OF_LENGTH for name in (entry, f"sigma_{entry}")}),
         aruco=aruco and replace(aruco, marker_in_vehicle=aruco.marker_in_vehicle * length,
                                 covariance=aruco.covariance * np.outer(length, length)),
         uwb=uwb and replace(uwb, range=4 * uwb.range, sigma=4 * uwb.sigma),
@@ -374,6 +385,16 @@ def constants_in_quarters(patch):
         for name, factor in LENGTHS.items():
             if hasattr(module, name):
                 patch.setattr(module, name, getattr(module, name) * factor)
+        if hasattr(module, "ENTRIES"):
+            patch.setattr(module, "ENTRIES", tuple(map(in_quarter_metres, module.ENTRIES)))
+        if hasattr(module, "ANTENNA_OFFSETS"):
+            patch.setattr(module, "ANTENNA_OFFSETS", in_quarter_metres(module.ANTENNA_OFFSETS))
+
+
+def in_quarter_metres(entry):
+    """An Entry of the calibration with its standard deviation in quarters of a metre."""
+    is_length = entry.unit == "m" and entry.group != RELATIVE
+    return replace(entry, wide=4 * entry.wide) if is_length else entry
 
 
 def begun_by(leg, dataset):

@@ -1,13 +1,10 @@
 """Checks of poses without truth: loop closures, and the Hausman statistic.
 
 Markers that the camera sees again measure the motion since then, and with it the error of every
-method without loop closures: `returns` and `discrepancies`.
-
-`hausman_statistic` compares a method with an efficient one. The error of the efficient estimate is
-uncorrelated with its difference from any other, so the covariance of the difference is the
-difference of both covariances (Hausman, Econometrica 46(6), 1978).
-
-Poses are [x, y, heading] in m and rad.
+method without loop closures: `returns` and `discrepancies`. `hausman_statistic` compares a method
+with an efficient one. The error of the efficient estimate is uncorrelated with its difference from
+any other, so the covariance of the difference is the difference of both covariances (Hausman,
+Econometrica 46(6), 1978). Poses are [x, y, heading] in m and rad.
 """
 
 from dataclasses import dataclass
@@ -19,7 +16,7 @@ from slamlib.localization.marker_increments import robust_increments
 from slamlib.sightings import sightings_by_frame
 
 MIN_GAP = 5.0                # m, driven between two sightings of the markers of a return
-MAX_RETURN_FRAMES = 400      # frames, evenly spaced along the path, among which returns are sought
+MAX_RETURN_FRAMES = 400      # frames, evenly chosen, among which returns are sought
 MIN_COMMON_MARKERS = 2       # markers that both frames of a return see, and that agree
 
 
@@ -40,14 +37,14 @@ def returns(dataset, gap=MIN_GAP):
     A frame returns to the earlier frame with which it has most markers in common. Errors of returns
     are correlated: they share sections of odometry, and sightings.
     """
-    s = sightings_by_frame(dataset.aruco)
+    s = sightings_by_frame(dataset.sightings)
     travelled = odometry.cumulative(np.abs(odometry.steps(dataset.ticks, dataset.vehicle)[0]))
-    frame = _spread(travelled[s.frame])
     label = np.unique(s.marker, return_inverse=True)[1]
     sighting = np.full((len(s.frame), label.max(initial=-1) + 1), -1)          # row, or -1
     sighting[s.row, label] = np.arange(len(s.row))
-    sighting, distance = sighting[frame], travelled[s.frame[frame]]
-    seen = (sighting >= 0).astype(int)
+    every = len(s.frame) // MAX_RETURN_FRAMES + 1
+    sighting, frame = sighting[::every], s.frame[::every]
+    seen, distance = (sighting >= 0).astype(int), travelled[frame]
     common = (seen @ seen.T) * (distance[:, None] - distance >= gap)     # later with earlier frames
     later = np.flatnonzero(common.max(axis=1, initial=0) >= MIN_COMMON_MARKERS)
     earlier = common[later].argmax(axis=1) if len(later) else later
@@ -55,24 +52,15 @@ def returns(dataset, gap=MIN_GAP):
     found = robust_increments(s.z, s.C, pair, sighting[earlier[pair], which],
                               sighting[later[pair], which], len(later))
     ok = found.usable & (np.bincount(pair, found.accepted, len(later)) >= MIN_COMMON_MARKERS)
-    start, end = s.frame[frame[earlier[ok]]], s.frame[frame[later[ok]]]
+    start, end = frame[earlier[ok]], frame[later[ok]]
     return Returns(start=start, end=end, driven=travelled[end] - travelled[start],
                    motion=found.increment[ok], covariance=found.covariance[ok])
 
 
-def _spread(travelled):
-    """Rows of at most MAX_RETURN_FRAMES nearly evenly spaced distances (f,), which ascend."""
-    if not len(travelled):
-        return np.zeros(0, int)
-    wanted = np.linspace(travelled[0], travelled[-1], MAX_RETURN_FRAMES)
-    return np.unique(np.searchsorted(travelled, wanted))
-
-
 def discrepancies(found, poses):
-    """Motions (m, 3) of Returns by the poses (n, 3) minus those by the markers.
+    """Motions (m, 3) by poses (n, 3) minus those of Returns `found`, in the frames of its starts.
 
-    They are in the frames of `found.start`, in m and rad with wrapped headings; NaN where a pose is
-    NaN.
+    NaN where a pose is NaN.
     """
     off = se2.between(poses[found.start], poses[found.end]) - found.motion
     off[:, 2] = se2.wrap(off[:, 2])
@@ -83,11 +71,9 @@ def hausman_statistic(poses, covariances, efficient, efficient_covariances):
     """Squared differences (n,) of poses (n, 3) from efficient ones, normalized by C - C_efficient.
 
     It is chi-squared with 3 degrees of freedom if both covariances (n, 3, 3) are right and the
-    efficient method is optimal for data that include those of the first one. NaN where
-    C - C_efficient is not positive definite: there the first method claims to be more certain than
-    the efficient one in some direction. NaN without a pose.
+    efficient method is optimal for data that include those of the first one. NaN without a pose,
+    and where C - C_efficient is not positive definite: the first method claims to be more certain.
     """
     difference = covariances - efficient_covariances
-    indefinite = ~(np.diagonal(difference, axis1=1, axis2=2) > 0).all(axis=1)
-    difference[indefinite] = 0
+    difference[~(np.diagonal(difference, axis1=1, axis2=2) > 0).all(axis=1)] = 0
     return evaluation.nees(poses, difference, efficient)

@@ -2,18 +2,17 @@
 
 `residuals_by_landmark` compares the residuals of every landmark with their expected sum of squares.
 `halves` splits a drive, and `estimated_map` solves each half in the frame of its own first pose.
-`compare_maps` aligns both maps; the remaining distances have known covariances.
+`compare_maps` aligns the positions in both maps; the remaining distances have known covariances.
 """
 
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from slamlib import evaluation, se2
-from slamlib.slam.calibrations import calibrated
+from slamlib.slam.choices import calibrated
 from slamlib.slam.covariances import marginal_covariances
-from slamlib.slam.linear import consistency_factor, decomposition
+from slamlib.slam.linear import consistency_factor, linear_solution
 from slamlib.slam.measurements import measure
 from slamlib.slam.pipeline import fit_from_odometry
 from slamlib.slam.result import slam_result
@@ -26,7 +25,6 @@ ALIGNMENT_ITERATIONS = 10     # Gauss-Newton iterations for the motion between t
 class LandmarkResiduals:
     """Squared whitened residuals of every landmark of a kind, with the learned noise."""
 
-    count: np.ndarray        # (k,) sum of the weights of the accepted measurements
     chi2: np.ndarray         # (k,) sum of the squares
     dof: np.ndarray          # (k,) its expectation
 
@@ -35,17 +33,14 @@ def residuals_by_landmark(fit):
     """LandmarkResiduals of the markers and of the antennas of a `slam.fit.Fit`.
 
     With the derivatives J of n whitened errors e by unknowns of covariance C, the solution takes
-    the degrees of freedom tr(J C J^T): E[e^T e] = n - tr(J C J^T). A range counts by its weight.
+    the degrees of freedom tr(J C J^T): E[e^T e] = n - tr(J C J^T), but for the few that the
+    calibration takes. A range counts by its weight.
     """
     m, equations = fit.problem.measurements, fit.equations
-    variables = range(len(m.frame), len(m.structure.width))             # all but the poses
-    unknowns = np.concatenate([m.structure.rows([j], m.structure.width[j])[0] for j in variables])
-    column = np.full(len(m.structure.diagonal), -1)
-    column[unknowns] = np.arange(len(unknowns))
-    columns = _covariance_columns(fit, unknowns)
+    columns, column = _covariance_columns(fit)
     pairs = marginal_covariances(equations, fit.problem.noise).pairs
     of_poses = np.concatenate([pairs[:, :3, :3], pairs[-1:, 3:6, 3:6]])
-    totals = np.zeros((3, len(m.marker) + len(m.antenna)))
+    totals = np.zeros((len(m.marker) + len(m.antenna), 2))
     of_kernel = consistency_factor(fit.problem.accepted.range_kernel)
     for f, (_, rows), expected in zip(equations.linearized, m.factor_places[1:], (1, 1, of_kernel)):
         if not len(f.row):                                              # of no width
@@ -53,30 +48,37 @@ def residuals_by_landmark(fit):
         rows, J = rows[f.index], f.J
         C = columns[rows[:, :, None], column[rows][:, None]]            # wrong in columns of poses
         C[:, :3, :3], C[:, 3:, :3] = of_poses[f.row], np.swapaxes(C[:, :3, 3:], 1, 2)
-        taken = np.einsum("mdi,mij,mdj->m", J, C, J)
-        for total, values in zip(totals, (f.weight, np.sum(f.e**2, axis=1),
-                                          expected * f.weight * f.e.shape[1] - taken)):
-            np.add.at(total, f.landmark, values)
-    markers, antennas = np.split(totals, [len(m.marker)], axis=1)
-    return LandmarkResiduals(*markers), LandmarkResiduals(*antennas)
+        np.add.at(totals, f.landmark, np.stack([np.sum(f.e**2, axis=1), (
+            expected * f.weight * f.e.shape[1] - np.einsum("mdi,mij,mdj->m", J, C, J))], axis=1))
+    return tuple(LandmarkResiduals(*part.T) for part in np.split(totals, [len(m.marker)]))
 
 
-def _covariance_columns(fit, rows):
-    """Columns `rows` (r,) of the covariance (n, n) of all unknowns of a Fit, (n, r)."""
-    H = fit.equations.structure.matrix(fit.equations.sums(fit.problem.noise)[0])
-    unit = np.zeros((H.shape[0], len(rows)))
-    unit[rows, np.arange(len(rows))] = 1
-    return decomposition(H).solve(unit)
+def _covariance_columns(fit):
+    """Covariances (n, r) of a Fit's unknowns with the r that are not of poses; their columns (n,).
+
+    Unknowns of poses have the column -1. This is all that the checks need of the information matrix
+    besides `marginal_covariances`.
+    """
+    m, equations = fit.problem.measurements, fit.equations
+    others = np.concatenate([np.zeros(0, int), *m.structure.rows_of_each(
+        np.arange(len(m.frame), len(m.structure.width)))])
+    H, border, *_ = equations.sums(fit.problem.noise)
+    solution, n = linear_solution(m.structure, H, border), len(m.structure.diagonal)
+    unit, column = np.zeros((n, len(others))), np.full(n, -1)
+    unit[others, np.arange(len(others))] = 1
+    column[others] = np.arange(len(others))
+    by_c = solution.by_c                                            # an uncertain calibration adds
+    return solution.lu.solve(unit) + by_c @ np.linalg.solve(solution.S, by_c[others].T), column
 
 
 @dataclass(frozen=True)
 class Map:
-    """Landmarks of a drive in the frame of its first pose: k markers, then a antennas."""
+    """Positions of landmarks in the frame of a drive's first pose: k markers, then a antennas."""
 
-    marker: np.ndarray       # (k,) ids, ascending, of markers with a heading
+    marker: np.ndarray       # (k,) ids, ascending
     antenna: np.ndarray      # (a,) ids, ascending
-    place: np.ndarray        # (k + a, 3) in m and rad; the heading of an antenna is 0
-    covariance: np.ndarray   # (3k + 3a, 3k + 3a) of all places jointly, in world axes
+    place: np.ndarray        # (k + a, 2) m
+    covariance: np.ndarray   # (k + a, 2, k + a, 2) m^2, of all places jointly, in world axes
 
 
 def halves(dataset, poses):
@@ -85,14 +87,14 @@ def halves(dataset, poses):
     `poses` (n, 3), of any solution, move the guesses of the antennas into the second half's frame.
     Sensors without readings are None.
     """
-    middle = len(dataset.ticks) // 2
+    middle, guess = len(dataset.ticks) // 2, dataset.antenna_guess
+    ticks = dataset.ticks[middle:].copy()
+    ticks[0] = 0
 
     def later(readings):
         late = readings and readings.select(readings.pose >= middle)
         return replace(late, pose=late.pose - middle) if late and len(late.pose) else None
 
-    ticks, guess = dataset.ticks[middle:].copy(), dataset.antenna_guess
-    ticks[0] = 0
     if guess is not None:
         there = se2.between(poses[middle], np.pad(guess.position, ((0, 0), (0, 1))))
         guess = replace(guess, position=there[:, :2])
@@ -107,26 +109,22 @@ def estimated_map(dataset):
     """
     fit = calibrated(fit_from_odometry(measure(dataset)))
     m, found = fit.problem.measurements, slam_result(fit)
-    rows = m.structure.rows
     accepted = np.bincount(m.marker_row, fit.problem.accepted.sighting_weight, len(m.marker))
-    marker = np.flatnonzero(np.isin(m.marker, found.marker) & m.oriented
-                            & (accepted >= MIN_SIGHTINGS_IN_HALF))
+    marker = np.flatnonzero(np.isin(m.marker, found.marker) & (accepted >= MIN_SIGHTINGS_IN_HALF))
     antenna = np.flatnonzero(~np.isin(m.antenna, list(found.doubts)))
-    f, k = len(m.frame), len(m.marker)
-    unknowns = np.concatenate([rows(f + marker, 3).ravel(), rows(f + k + antenna, 2).ravel()])
-    place = np.concatenate([fit.state.markers[marker],
-                            np.pad(fit.state.antennas[antenna], ((0, 0), (0, 1)))])
-    used, C = _coordinates(marker, antenna), np.zeros(2 * [place.size])
-    C[np.ix_(used, used)] = _covariance_columns(fit, unknowns)[unknowns]
-    to_world = se2.compose_jacobians(place, np.zeros(3))[1]            # from each landmark's axes
-    turn = block_diag(np.zeros((0, 0)), *to_world)                     # (0, 0) also without any
-    return Map(m.marker[marker], m.antenna[antenna], place, turn @ C @ turn.T)
+    rows = m.structure.rows(
+        np.r_[m.variables.markers[marker], m.variables.antennas[antenna]], 2).ravel()
+    columns, column = _covariance_columns(fit)
+    C = columns[np.ix_(rows, column[rows])].reshape(2 * (len(rows) // 2, 2))
+    turn = se2.rotation(np.pad(fit.state.markers[marker, 2], (0, len(antenna))))  # from their axes
+    return Map(m.marker[marker], m.antenna[antenna], np.concatenate(
+        [fit.state.markers[marker, :2], fit.state.antennas[antenna]]), _turned(turn, C))
 
 
-def _coordinates(marker, antenna):
-    """Mask (3k + 3a,) of the coordinates that landmarks have: antennas have no heading."""
-    return np.concatenate([np.ones(3 * len(marker), bool),
-                           np.tile([True, True, False], len(antenna))])
+def _turned(turn, covariance):
+    """Joint covariance (n, 2, n, 2) of places that are turned by (n, 2, 2) or by one (2, 2)."""
+    turn = np.broadcast_to(turn, (len(covariance), 2, 2))
+    return np.einsum("aij,ajbk,blk->aibl", turn, covariance, turn)
 
 
 @dataclass(frozen=True)
@@ -136,8 +134,7 @@ class Comparison:
     marker: np.ndarray       # (k,) ids
     antenna: np.ndarray      # (a,) ids
     distance: np.ndarray     # (k + a,) m, between both positions
-    squared: np.ndarray      # (k + a,) chi-squared of each landmark given all others
-    dofs: np.ndarray         # (k + a,) its degrees of freedom, 3 of a marker and 2 of an antenna
+    squared: np.ndarray      # (k + a,) chi-squared of each landmark given all others, 2 dof
     chi2: float              # of all of them together
     dof: int                 # its degrees of freedom, without the 3 of the motion
 
@@ -146,38 +143,34 @@ def compare_maps(first, second):
     """The Comparison of two independent Maps, None if they have fewer than two landmarks in common.
 
     The motion T minimises r^T W r for r = p - T q, with the places p of the first map and q of the
-    second one, of covariances C and D, and W = (C + J D J^T)^-1, J = d(T q) / dq. With
-    A = dr/dT and P = W - W A (A^T W A)^-1 A^T W, the vector u = P r has the covariance P. Landmark
-    j adds u_j^T P_jj^-1 u_j to the chi-squared of the others (Baarda, A Testing Procedure for Use
-    in Geodetic Networks, 1968).
+    second one, of covariances C and D, and W = (C + R D R^T)^-1 with the rotation R of T. With
+    A = d(T q)/dT and P = W - W A (A^T W A)^-1 A^T W, the vector u = P r has the covariance P.
+    Landmark j adds u_j^T P_jj^-1 u_j to the chi-squared of the others (Baarda, A Testing Procedure
+    for Use in Geodetic Networks, 1968).
     """
     marker, antenna = (np.intersect1d(getattr(first, kind), getattr(second, kind))
                        for kind in ("marker", "antenna"))
-    if len(marker) + len(antenna) < 2:
+    if (n := len(marker) + len(antenna)) < 2:
         return None
     (p, C), (q, D) = (_common(half, marker, antenna) for half in (first, second))
-    used = _coordinates(marker, antenna)
     T = evaluation.align(q, p)
     for _ in range(ALIGNMENT_ITERATIONS):
-        by_T, by_q = se2.compose_jacobians(T, q)
-        r = p - se2.compose(T, q)
-        r[:, 2] = se2.wrap(r[:, 2])
-        J, A, e = block_diag(*by_q), by_T.reshape(-1, 3)[used], r.ravel()[used]
-        W = np.linalg.inv((C + J @ D @ J.T)[np.ix_(used, used)])
+        there = q @ se2.rotation(T[2]).T
+        r = p - T[:2] - there
+        A = np.concatenate([np.tile(np.eye(2), (n, 1, 1)), there[:, ::-1, None] * [[-1], [1]]], 2)
+        A = A.reshape(-1, 3)
+        W = np.linalg.inv((C + _turned(se2.rotation(T[2]), D)).reshape(2 * n, 2 * n))
         gain = np.linalg.solve(A.T @ W @ A, A.T @ W)
-        T = T + gain @ e
+        T = T + gain @ r.ravel()
     P = W - W @ A @ gain
-    u, dofs = P @ e, used.reshape(-1, 3).sum(axis=1)
-    rows = np.split(np.arange(len(u)), np.cumsum(dofs)[:-1])
+    u, own = (P @ r.ravel()).reshape(n, 2, 1), P.reshape(n, 2, n, 2)[range(n), :, range(n)]
     return Comparison(
-        marker=marker, antenna=antenna, distance=np.hypot(*r[:, :2].T), dofs=dofs,
-        chi2=float(e @ u), dof=len(u) - 3,
-        squared=np.array([u[j] @ np.linalg.solve(P[np.ix_(j, j)], u[j]) for j in rows]))
+        marker=marker, antenna=antenna, distance=np.hypot(*r.T), dof=2 * n - 3,
+        chi2=float(r.ravel() @ u.ravel()), squared=np.sum(u * np.linalg.solve(own, u), axis=(1, 2)))
 
 
 def _common(half, marker, antenna):
-    """Places (k + a, 3) of some landmarks of a Map, and their covariance."""
+    """Places (n, 2) of some landmarks of a Map, and their covariance."""
     rows = np.concatenate([np.searchsorted(half.marker, marker),
                            len(half.marker) + np.searchsorted(half.antenna, antenna)])
-    coordinates = (3 * rows[:, None] + np.arange(3)).ravel()
-    return half.place[rows], half.covariance[np.ix_(coordinates, coordinates)]
+    return half.place[rows], half.covariance[rows][:, :, rows]

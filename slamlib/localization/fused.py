@@ -31,6 +31,7 @@ from slamlib.sightings import GATE, sightings_by_frame
 SLIP_FRAMES = 500            # number of frames, the first ones, from which the slip is learned
 WHEEL_FRAMES = 5000          # number of frames, the first ones, that give the wheel parameters w_0
 FRAMES_PER_BLOCK = 1000      # frames whose poses are computed together, so that they stay in cache
+MAX_SLIP_STEPS = 30          # number of parabolas
 LOG_SLIP_TOLERANCE = 0.05    # of the natural logarithm of the slip
 
 
@@ -117,7 +118,7 @@ def _likeliest_slip(given):
 
     step = np.log(SLIP_FACTOR)
     points = {point: log_density(point) for point in np.log(TYPICAL_SLIP) + step * np.arange(-1, 2)}
-    while True:
+    for _ in range(MAX_SLIP_STEPS):
         best = max(points, key=points.get)
         below = max((point for point in points if point < best), default=None)
         above = min((point for point in points if point > best), default=None)
@@ -126,14 +127,15 @@ def _likeliest_slip(given):
         else:
             slopes = [(points[point] - points[best]) / (point - best) for point in (below, above)]
             vertex = (below + best) / 2 - slopes[0] * (above - below) / 2 / (slopes[1] - slopes[0])
-        if abs(vertex - best) < LOG_SLIP_TOLERANCE:
-            return float(np.exp(vertex))
+        if not abs(vertex - best) >= LOG_SLIP_TOLERANCE:                # or not finite: no parabola
+            break
         points[vertex] = log_density(vertex)
+    return float(np.exp(vertex if np.isfinite(vertex) else best))
 
 
 def _filter_input(dataset, model, vehicle):
     """The _FilterInput with odometry linearised at the wheel parameters of `vehicle`."""
-    ticks, sightings = dataset.ticks, sightings_by_frame(dataset.aruco, extra_frames=[0])
+    ticks, sightings = dataset.ticks, sightings_by_frame(dataset.sightings, extra_frames=[0])
     start, end = sightings.frame[:-1], sightings.frame[1:]
     begins = np.searchsorted(sightings.row, np.arange(len(sightings.frame)))
     pair, first, second = common_sightings(sightings.row, sightings.marker)

@@ -64,7 +64,7 @@ def fuse_increments(dataset, propagation=equation2_from):
     `first_order_from` with all correlations.
     """
     ticks, vehicle = dataset.ticks, dataset.vehicle
-    sightings = sightings_by_frame(dataset.aruco, extra_frames=[0])
+    sightings = sightings_by_frame(dataset.sightings, extra_frames=[0])
     frame, found = sightings.frame, consecutive_increments(sightings)
     delta, C = _fused_increments(dataset, frame, found, propagation)
     heading = odometry.cumulative(delta[:, 2])

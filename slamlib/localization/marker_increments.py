@@ -74,13 +74,13 @@ def consecutive_increments(sightings):
                    accepted=accepted & usable[pair], J_first=J_first, J_second=J_second)
 
 
-def common_sightings(row, marker):
-    """pair, first and second of `MarkerIncrements`, for pairs of consecutive frames.
+def common_sightings(row, marker, span=1):
+    """pair, first and second of `MarkerIncrements`, for pairs of frames that are `span` apart.
 
     `row` and `marker` (s,) are frame and marker id of every sighting, sorted by both.
     """
     markers, label = np.unique(marker, return_inverse=True)
-    key, later_key = row * len(markers) + label, (row + 1) * len(markers) + label
+    key, later_key = row * len(markers) + label, (row + span) * len(markers) + label
     _, first, second = np.intersect1d(later_key, key, assume_unique=True, return_indices=True)
     return row[first], first, second
 

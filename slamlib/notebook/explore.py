@@ -28,7 +28,6 @@ from slamlib.notebook.parts import (
     simulated,
 )
 from slamlib.simulation import delay, misguess, mislabel
-from slamlib.slam.factors import build_problem
 from slamlib.slam.fit import optimize
 from slamlib.slam.initialization import odometry_state, trilaterated_antennas
 from slamlib.slam.measurements import (
@@ -39,6 +38,7 @@ from slamlib.slam.measurements import (
     with_known_noise,
 )
 from slamlib.slam.pipeline import fit_from_odometry
+from slamlib.slam.problem import build_problem
 from slamlib.slam.result import slam_result
 from slamlib.studies.kernels import solve_with
 from slamlib.studies.starts import LANDMARKS, guessed_antennas
@@ -182,7 +182,8 @@ def draw_graphs(full, drive, seed, slip, assumed, wrong, kernel, start):
     scale = KERNEL_SCALES[kernel]
     cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(scale) if scale else None
     problem = replace(build_problem(m, model, with_known(Noise(), m.dataset.vehicle)),
-                      accepted=AcceptedMeasurements(m, m.unit_weights, cauchy))
+                      accepted=AcceptedMeasurements(
+                          measurements=m, weight=m.unit_weights, sighting_kernel=cauchy))
     single = optimize(problem, odometry_state(m, model, markers=LANDMARKS[start])).state
     fig, plan, side = figure_with_reference(reference)
     plotting.trajectory(plan, single.poses, "alternative", "single kernel")

@@ -5,13 +5,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from slamlib.checks.files import doubts_before_solving, merged
 from slamlib.dataset import Dataset, Truth, read_dataset, read_truth
 from slamlib.doubt import Doubt
 from slamlib.inventory import all_notes
 from slamlib.notebook import Drive
 from slamlib.report.execution import NotebookError
 from slamlib.results import read_aruco_map, read_uwb_map, read_vehicle_poses
-from slamlib.solve import PROBLEMS, Failure, Solution, doubts_about_drive, merged, title
+from slamlib.solve import PROBLEMS, Failure, Solution, title
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,8 @@ def read_drives(data, results, selected, written, notices=None):
         solved = tuple(_read_solution(results / name / problem, dataset, files)
                        for problem in problems)
         told = (notices or {}).get(name, [])
-        doubts = [*doubts_about_drive(dataset, truth), *(x for x in told if isinstance(x, Doubt))]
+        doubts = [*doubts_before_solving(dataset, truth),
+                  *(x for x in told if isinstance(x, Doubt))]
         failures = sorted((x for x in told if isinstance(x, Failure)),
                           key=lambda failure: order(failure.problem))
         drives.append(SolvedDrive(

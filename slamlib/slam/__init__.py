@@ -10,10 +10,11 @@ Read `pipeline` first: its function `estimate` is the whole way from a dataset t
 stage makes the record of the next. The modules by stage, in the order to read them (stage 4 uses
 stage 5 on long drives):
 
-    1  measurements         Dataset -> Measurements: arrays, numbered once; their weights and noise
+    1  calibration          the table of what measurements share: wheels, places, sizes, delays
+       measurements         Dataset -> Measurements: arrays, numbered once; their weights and noise
        structure            Measurements -> Structure of the information matrix
-    2  factors              State, the values of all variables; odometry, which depends on the wheel
-                            errors w; sightings and ranges; Problem, the factor graph
+    2  problem              State, the values of all variables; Problem, the factor graph; odometry
+       factors              errors and derivatives of odometry, sightings and ranges
     3  linear               Problem, State -> the linearised graph, and the evidence, for all values
                             of the noise
        graph                the same graph in GTSAM
@@ -22,28 +23,27 @@ stage 5 on long drives):
                             narrower robust kernels; -> Fit: wheels, noise, accepted measurements,
                             in turn (stage 6)
     6  noise                Problem, State -> posterior of slip and noise factors
-       calibrations         Fit -> Fit: arcs or Euler's steps, offset and scale of the ranges; the
-                            place and delay of the camera, and other wheels (stage 7)
+       choices              Fit -> Fit: arcs or Euler's steps, and which statements about wheels and
+                            sensors are wrong, by the evidence
     7  covariances          Fit -> State and Covariances, averaged over the posterior of the noise
        interpolation        encoder poses between the frames
-       doubts, drive_doubts    where the solution contradicts the files
        result               Fit -> SlamResult in world axes
 
-Symbols in code and docstrings; sizes are f frames, k markers, a antennas, s sightings, r ranges and
-n unknowns, and (m, d) are m measurements of a kind with d errors each:
+Symbols in code and docstrings; sizes are f frames, k markers, a antennas, s sightings, r ranges,
+n unknowns besides the calibration, and (m, d) are m measurements of a kind with d errors each:
 
     X_i      pose of frame i: m, m, rad
     L_j P_j  pose of marker j (m, m, rad), or position (m) if its heading is unknown
     A_k      position of antenna k, m
-    w        (3,) errors of R_R, R_L, b, in units of their standard deviations
-    c        (2,) errors of offset and scale of the ranges, in units of CALIBRATION_SIGMA
+    c        (p,) calibration; q of its entries are unknowns, in the solver per standard deviation
     z, C     measured pose of a marker in the vehicle (m, m, rad), and its covariance
     e        errors, expected minus measured; whitened errors are U e, without unit
     U        square root information, upper triangular: U^T U = C^-1 or Q^-1
     Q        covariance of the odometry noise: m^2, m rad, rad^2
     J        derivatives of whitened errors by the unknowns
     H, g     information matrix (n, n), sum J^T J, and gradient (n,), sum J^T e
-    delta    (n,) step of the unknowns, H delta = -g
+    B, D     information between the n unknowns and the calibration (n, q), and about it (q, q)
+    delta    (n + q,) step of the unknowns
 
 A frame is a keyframe: an encoder pose that is a variable of the graph. Axes of the covariances:
 
@@ -54,8 +54,7 @@ A frame is a keyframe: an encoder pose that is a variable of the graph. Axes of 
     SlamResult                           world (`interpolation` for poses, `result` for markers)
 """
 
-from slamlib.slam.drive_doubts import confirmation
 from slamlib.slam.pipeline import estimate
 from slamlib.slam.result import SlamResult
 
-__all__ = ["SlamResult", "confirmation", "estimate"]
+__all__ = ["SlamResult", "estimate"]

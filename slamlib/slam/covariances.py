@@ -1,4 +1,4 @@
-"""Stage 7: marginal covariances at the solution, of consecutive frames with w and of each landmark.
+"""Stage 7: marginal covariances at the solution, of frames, landmarks and calibration.
 
 The inverse of the information matrix H is dense; only some of its blocks are computed, by nested
 dissection. Every LEAF frames there is a separator. The unknowns that are connected only to unknowns
@@ -27,8 +27,9 @@ from scipy.sparse import csc_array
 
 from slamlib import se2
 from slamlib.dataset import DatasetError
-from slamlib.slam.factors import retract
-from slamlib.slam.linear import laplace_approximation
+from slamlib.slam.calibration import WHEELS
+from slamlib.slam.linear import laplace_approximation, linear_solution
+from slamlib.slam.problem import retract
 
 LEAF = 12                    # number of frames between separators
 MAX_ROUNDING = 0.05          # float rounding: share of the information about the heading at pose 1
@@ -38,29 +39,51 @@ MAX_ROUNDING = 0.05          # float rounding: share of the information about th
 class Covariances:
     """Marginal covariances, of poses and markers in their own axes, else in world axes."""
 
-    pairs: np.ndarray        # (f-1, 9, 9) of [X_i, X_{i+1}, w]
+    pairs: np.ndarray        # (f-1, 9, 9) of [X_i, X_{i+1}, wheel parameters], wheels in m
     markers: list            # k of (3, 3), or (2, 2) for a point
     antennas: np.ndarray     # (a, 2, 2)
-    w: np.ndarray            # (3, 3)
-    c: np.ndarray            # (2, 2), 0 if the ranges are not calibrated
+    c: np.ndarray            # (p, p) of the calibration, 0 where it is known
 
 
 def marginal_covariances(equations, noise):
     """The Covariances for a Noise by NormalEquations at the State that solves the problem.
 
-    Raises DatasetError if float rounding hides the information about the heading at pose 1, and
-    numpy.linalg.LinAlgError if H is singular.
+    With the calibration c known, they are blocks of H^-1. An uncertain c of covariance S^-1 adds
+    (H^-1 B) S^-1 (H^-1 B)^T (`linear`). Raises DatasetError if float rounding hides the information
+    about the heading at pose 1, and numpy.linalg.LinAlgError if the equations are singular.
     """
-    m, v = equations.problem.measurements, equations.problem.measurements.variables
-    k, a = len(v.markers), len(v.antennas)
-    landmarks = equations.structure.rows_of_each(np.r_[v.markers, v.antennas, v.w, v.c])
-    _, pairs = m.factor_places[0]                          # rows of X_i, X_{i+1} and w
-    H = equations.structure.matrix(equations.sums(noise)[0])
+    problem, structure = equations.problem, equations.structure
+    m, v, active = problem.measurements, problem.measurements.variables, problem.active
+    landmarks = structure.rows_of_each(np.r_[v.markers, v.antennas])
+    pairs = rows_of_pairs(m)
+    data, border, *_ = equations.sums(noise)
+    H, solution = structure.matrix(data), linear_solution(structure, data, border)
     _require_digits(equations, H)
-    of_pairs, blocks = selected_inverse(H, equations.structure.rows(v.frames, 3), pairs, landmarks)
+    if solution is None:
+        raise np.linalg.LinAlgError("singular information matrix")
+    of_pairs, blocks = selected_inverse(H, structure.rows(v.frames, 3), pairs, landmarks)
+    sigma = problem.sigma[active]
+    c = np.linalg.inv(solution.S) * sigma[:, None] * sigma
+    c = (c + c.T) / 2
+    by_c = solution.by_c / -sigma                          # of the unknowns by c
+    blocks = [block + by_c[rows] @ c @ by_c[rows].T for block, rows in zip(blocks, landmarks)]
+    whole = np.zeros(2 * [len(active)])
+    whole[np.ix_(active, active)] = c
+    joint, cross = np.zeros((len(pairs), 9, 9)), by_c[pairs] @ c
+    joint[:, :6, :6] = of_pairs + cross @ np.swapaxes(by_c[pairs], 1, 2)
+    uncertain = np.flatnonzero(active[WHEELS])                       # the first entries of c
+    joint[:, :6, 6 + uncertain] = cross[:, :, :len(uncertain)]
+    joint[:, 6:, :6] = np.swapaxes(joint[:, :6, 6:], 1, 2)
+    joint[:, 6:, 6:] = whole[WHEELS, WHEELS]
     return Covariances(
-        pairs=of_pairs, markers=blocks[:k], antennas=np.reshape(blocks[k:k + a], (-1, 2, 2)),
-        w=blocks[k + a], c=blocks[-1] if m.calibrated else np.zeros((2, 2)))
+        pairs=joint, markers=blocks[:len(v.markers)],
+        antennas=np.reshape(blocks[len(v.markers):], (-1, 2, 2)), c=whole)
+
+
+def rows_of_pairs(measurements):
+    """Rows (f-1, 6) of X_i and X_{i+1}."""
+    rows = measurements.structure.rows(measurements.variables.frames, 3)
+    return np.concatenate([rows[:-1], rows[1:]], axis=1)
 
 
 def _require_digits(equations, H):
@@ -160,7 +183,7 @@ def _dissection(H, frames):
     of_entries = frame[H.indices]
     last = np.maximum.reduceat(of_entries, H.indptr[:-1])
     first = np.minimum.reduceat(np.where(of_entries < 0, count, of_entries), H.indptr[:-1])
-    alone = last < 0                                       # eliminated last, with w
+    alone = last < 0                                       # eliminated last
     first, last = np.where(alone, 0, first), np.where(alone, count - 1, last)
     return _Dissection(
         H=H, frames=frames, separators=np.r_[-1, np.arange(LEAF, count - 1, LEAF + 1), count],
@@ -252,27 +275,29 @@ def posterior_moments(fit):
     x = np.stack([laplace_approximation(equations, point)[0] for point in noises]) \
         - laplace_approximation(equations, noise)[0]
     mean = weights @ x
-    return (retract(fit.problem.measurements, fit.state, mean),
-            _averaged(equations, conditional, x - mean, weights), slip)
+    return (retract(fit.problem, fit.state, mean),
+            _averaged(fit.problem, conditional, x - mean, weights), slip)
 
 
-def _averaged(equations, conditional, x, weights):
-    """The Covariances averaged over points, with solutions x (p, n) about the mean."""
-    m, v, structure = (equations.problem.measurements, equations.problem.measurements.variables,
-                       equations.structure)
-    _, pairs = m.factor_places[0]
+def _averaged(problem, conditional, x, weights):
+    """The Covariances averaged over points, with solutions x (p, n + q) about the mean."""
+    m, v, structure = (problem.measurements, problem.measurements.variables,
+                       problem.measurements.structure)
+    pairs, n = rows_of_pairs(m), len(structure.diagonal)
+    of_c = np.zeros((len(x), len(problem.sigma)))
+    of_c[:, problem.active] = problem.sigma[problem.active] * x[:, n:]
+    of_pairs = np.concatenate([x[:, pairs], np.broadcast_to(
+        of_c[:, None, WHEELS], (len(x), len(pairs), 3))], axis=2)
 
-    def averaged(blocks, rows):
-        """sum p_k (C_k + x_k x_k^T) of blocks p of (..., d, d) with rows (..., d)."""
-        x_k = x[:, rows]
+    def averaged(blocks, x_k):
+        """sum p_k (C_k + x_k x_k^T) of blocks p of (..., d, d) with differences (p, ..., d)."""
         return np.einsum("p,p...->...", weights,
                          np.stack(blocks) + x_k[..., :, None] * x_k[..., None, :])
 
     return Covariances(
-        pairs=averaged([C.pairs for C in conditional], pairs),
-        markers=[averaged([C.markers[j] for C in conditional], rows)
+        pairs=averaged([C.pairs for C in conditional], of_pairs),
+        markers=[averaged([C.markers[j] for C in conditional], x[:, rows])
                  for j, rows in enumerate(structure.rows_of_each(v.markers))],
-        antennas=averaged([C.antennas for C in conditional], structure.rows(v.antennas, 2)),
-        w=averaged([C.w for C in conditional], structure.rows(v.w, 3)[0]),
-        c=averaged([C.c for C in conditional], structure.rows(v.c, 2)[0]) if m.calibrated
-        else conditional[0].c)
+        antennas=averaged([C.antennas for C in conditional],
+                          x[:, structure.rows(v.antennas, 2)]),
+        c=averaged([C.c for C in conditional], of_c))

@@ -1,85 +1,40 @@
-"""Stage 2: the factor graph: values of its variables, and its factors, in numpy.
+"""Stage 2: errors and derivatives of all factors, in numpy, all factors of a kind at once.
 
-Variables (`State`) are the frames' poses X_i, the markers L_j (points P_j if no sighting has a
-heading), the antennas A_k, the errors w of the wheel parameters, and the calibration c of the
-ranges. All factors of a kind are linearised at once.
+Odometry: with the increment Delta between the frames X and X' the error
 
-Odometry: with the increment Delta(w) = Delta(0) + dDelta/dw w between the frames X and X' the error
+    e = log(Delta^-1 X^-1 X')
 
-    e = log(Delta(w)^-1 X^-1 X')
+is that of GTSAM's between factor, except that Delta depends on the wheel parameters. All odometry
+factors share these, because the same wheel errors act in every increment.
 
-is that of GTSAM's between factor, except that the measurement depends on w. All odometry factors
-share w, because the same wheel errors act in every increment. The noise of Delta, with covariance
-Q, is the quantization of the encoders and wheel slip, in the axes of the increment's end. All
-derivatives by w are per standard deviation of a wheel parameter; those of
-`increments.between_poses` are per metre.
-
-Measurements: the factor of a marker with a heading is GTSAM's between factor, that of a range its
-range factor. Without headings a marker is a point. They are whitened, and weighted by their
-kernels. Derivatives by poses are by GTSAM's tangent vectors: X moves as X exp(xi), in its own axes.
+Measurements: with the calibration of a sensor in the vehicle's origin the factor of a marker with a
+heading is GTSAM's between factor, that of a range its range factor; `calibration` has the model.
+Without headings a marker is a point. They are whitened, and weighted by their kernels. Derivatives
+by poses are by GTSAM's tangent vectors: X moves as X exp(xi), in its own axes.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
+from scipy.optimize import brentq
 
-from slamlib import increments, odometry, se2
-from slamlib.slam.measurements import (
-    AcceptedMeasurements,
-    Measurements,
-    Noise,
-    square_root_information,
+from slamlib import se2
+from slamlib.slam.calibration import (
+    ANTENNAS,
+    CAMERA,
+    HEIGHT,
+    OFFSET,
+    RANGE_LAG,
+    RANGES,
+    SCALE,
+    SIGHTING_LAG,
+    SIGHTINGS,
+    SIZE,
+    TAG_PLACE,
 )
 
-CALIBRATION_SIGMA = np.array([0.2, 0.05])    # m and 1, prior of offset and scale of the ranges
-MINIMUM_SIGMA = 1e-5         # m, standard deviation of an increment's end along x and y
 MIN_DISTANCE = 1e-9          # m, below which a range has no direction
-
-
-@dataclass(frozen=True)
-class State:
-    """Values of all variables."""
-
-    poses: np.ndarray        # (f, 3) m, m, rad; headings continuous
-    markers: np.ndarray      # (k, 3), heading 0 where a marker is a point
-    antennas: np.ndarray     # (a, 2) m
-    w: np.ndarray            # (3,) in units of sigma
-    c: np.ndarray            # (2,) in units of CALIBRATION_SIGMA, 0 without calibration
-
-    @property
-    def range_calibration(self):
-        """(2,) offset in m and scale of the ranges: measured = offset + scale * distance."""
-        return np.array([0.0, 1.0]) + CALIBRATION_SIGMA * self.c
-
-
-def state_from_arrays(measurements, poses, markers, antennas, w, c=np.zeros(2)):
-    """The State of poses (f, 3), markers (k, 3), antennas (a, 2), w (3,) and c (2,).
-
-    Headings become continuous: between two frames they turn by odometry's angle, up to half a turn.
-    """
-    turn, poses = measurements.turn, np.array(poses, dtype=float)
-    correction = se2.wrap(np.diff(poses[:, 2]) - turn)
-    poses[:, 2] = odometry.cumulative(turn + correction, se2.wrap(poses[0, 2]))
-    markers = np.array(markers, dtype=float)
-    markers[~measurements.oriented, 2] = 0
-    return State(poses=poses, markers=markers, antennas=np.asarray(antennas, dtype=float),
-                 w=np.asarray(w, dtype=float), c=np.asarray(c, dtype=float))
-
-
-def retract(measurements, state, delta):
-    """The State after a step delta (n,) in m and rad, of w and c without unit.
-
-    Poses and markers move in their own axes, as GTSAM's do: X becomes X delta.
-    """
-    m, v, rows = measurements, measurements.variables, measurements.structure.rows
-    markers = state.markers.copy()
-    markers[m.oriented] = se2.compose(
-        markers[m.oriented], delta[rows(v.markers[m.oriented], 3)])
-    markers[~m.oriented, :2] += delta[rows(v.markers[~m.oriented], 2)]
-    return state_from_arrays(
-        m, se2.compose(state.poses, delta[rows(v.frames, 3)]), markers,
-        state.antennas + delta[rows(v.antennas, 2)], state.w + delta[rows(v.w, 3)[0]],
-        state.c + delta[rows(v.c, 2)[0]] if m.calibrated else state.c)
 
 
 def between_error(z, first, second):
@@ -98,62 +53,31 @@ def between_error(z, first, second):
             log_jacobian @ by_z)
 
 
-@dataclass(frozen=True)
-class OdometryFactors:
-    """Odometry factors between consecutive frames, for every value of the slip."""
+def odometry_error(factors, poses, wheel):
+    """Errors (f-1, 3) of OdometryFactors at poses (f, 3) of the frames and `wheel` (3,) m.
 
-    model: str               # of a step, "arc" or "euler"
-    increment: np.ndarray    # (f-1, 3) Delta(0), extrapolated linearly: m, m, rad
-    J_w: np.ndarray          # (f-1, 3, 3) dDelta/dw, per sigma of each wheel parameter
-    quantization: np.ndarray  # (f-1, 3, 3) covariance without slip, in the axes of the end
-    slipping: np.ndarray     # (f-1, 3, 3) covariance of slip 1 sqrt(m), in the same axes
+    Also their derivatives (f-1, 3, 6) by X_i and X_{i+1}, and (f-1, 3, 3) by the columns WHEELS of
+    the calibration. The errors are not whitened.
 
-    def covariance(self, slip):
-        """Covariances Q (f-1, 3, 3) for a slip in sqrt(m)."""
-        return self.quantization + slip**2 * self.slipping
-
-    def whitening(self, slip):
-        """Square root information U (f-1, 3, 3), U^T U = Q^-1, and sum log|Q|, for a slip."""
-        U = square_root_information(self.covariance(slip))
-        return U, -2 * float(np.sum(np.log(np.diagonal(U, axis1=1, axis2=2))))
-
-
-def preintegrate_odometry(measurements, model, relinearize_at=(0.0, 0.0, 0.0)):
-    """The OdometryFactors of Measurements, linearised at w = `relinearize_at` (3,).
-
-    `model` is "arc" or "euler". dDelta/dw accumulates over the encoder steps between two frames
-    (preintegration with calibration parameters: Forster et al., IEEE T-RO 33(1), 2017).
+    What the encoders measure is counts. Their errors in metres and radians grow with the wheels, so
+    with `in_counts` the errors are divided by the scale, linearised, that `wheel` has beside the
+    stated wheels, for which Q is. Otherwise wheels, and with them all lengths, would be estimated
+    too small where nothing else gives the scale.
     """
-    dataset, start, end = measurements.dataset, measurements.frame[:-1], measurements.frame[1:]
-    vehicle = dataset.vehicle.with_deviation(np.asarray(relinearize_at))
-    increment, by_wheel = increments.between_poses(dataset.ticks, vehicle, start, end, model)
-    quantization, slipping = odometry_noise(dataset.ticks, vehicle, start, end)
-    by_w, turn = by_wheel * vehicle.sigma_wheel, -increment[:, 2]
-    return OdometryFactors(
-        model=model, increment=increment - by_w @ relinearize_at, J_w=by_w,
-        quantization=se2.rotate_covariance(quantization, turn),
-        slipping=se2.rotate_covariance(slipping, turn))
-
-
-def odometry_noise(ticks, vehicle, start, end, steps=None):
-    """Quantization and slipping (m, 3, 3) by `increments.noise_in_drive`, made regular.
-
-    A vehicle that stands still has no lateral noise, but the graph needs the inverse of
-    Q: MINIMUM_SIGMA is added. Axes are those of the increments' starts, lengths in m.
-    """
-    quantization, slipping = increments.noise_in_drive(ticks, vehicle, start, end, steps)
-    quantization[:, [0, 1], [0, 1]] += MINIMUM_SIGMA**2
-    return quantization, slipping
-
-
-def odometry_error(factors, poses, w):
-    """Errors (f-1, 3) of OdometryFactors, and their derivatives (f-1, 3, 9) by X_i, X_{i+1} and w.
-
-    At poses (f, 3) of the frames and w (3,). The errors are not whitened.
-    """
-    increment = factors.increment + factors.J_w @ w
-    e, by_first, by_second, by_increment = between_error(increment, poses[:-1], poses[1:])
-    return e, np.concatenate([by_first, by_second, by_increment @ factors.J_w], axis=2)
+    change = wheel - factors.wheel
+    e, by_first, by_second, by_increment = between_error(
+        factors.increment + factors.J_wheel @ change, poses[:-1], poses[1:])
+    by_wheel = by_increment @ factors.J_wheel
+    radius, ratio = factors.wheel[:2].mean(), factors.wheel / factors.stated
+    scale = factors.stated[:2].mean() / radius * np.array([1, 1, ratio[2]]) \
+        if factors.in_counts else np.ones(3)
+    relative = np.array([3 * [-1 / radius / 2], 3 * [-1 / radius / 2],
+                         [0, 0, 1 / factors.wheel[2]]]).T * factors.in_counts   # by the wheels
+    linearized = e - by_wheel @ change                              # at the wheels of linearisation
+    grown = 1 + relative @ change
+    return (scale * (e + (grown - 1) * linearized),
+            (scale * grown)[:, None] * np.concatenate([by_first, by_second], axis=2),
+            scale[:, None] * (by_wheel + relative * linearized[:, :, None]))
 
 
 @dataclass(frozen=True)
@@ -164,90 +88,182 @@ class LinearizedMeasurements:
     row: np.ndarray          # (m,) frame
     landmark: np.ndarray     # (m,) row of the marker, or k plus row of the antenna
     e: np.ndarray            # (m, d) whitened errors, expected minus measured
-    J: np.ndarray            # (m, d, p) whitened derivatives by the unknowns of pose, landmark, c
+    J: np.ndarray            # (m, d, p) whitened derivatives by the unknowns of pose and landmark
+    J_c: np.ndarray          # (m, d, u) whitened, by u active entries of c, per sigma
+    columns: np.ndarray      # (u,) their numbers among the q active entries
     weight: np.ndarray       # (m,) share of its information that a measurement keeps
     error: float             # half the sum of squared errors, or the loss of the kernel
 
 
-def linearize_measurements(accepted, noise, state):
-    """The LinearizedMeasurements of sightings of poses, of points, and of ranges.
-
-    From AcceptedMeasurements, a Noise and a State.
-    """
-    return (linearize_sightings(accepted, noise, state, as_pose=True),
-            linearize_sightings(accepted, noise, state, as_pose=False),
-            linearize_ranges(accepted, noise, state))
+def linearize_measurements(problem, state):
+    """The LinearizedMeasurements of sightings of poses, of points, and of ranges at a State."""
+    return (linearize_sightings(problem, state, as_pose=True),
+            linearize_sightings(problem, state, as_pose=False), linearize_ranges(problem, state))
 
 
-def linearize_sightings(accepted, noise, state, as_pose):
+def linearize_sightings(problem, state, as_pose):
     """The LinearizedMeasurements of markers with a heading (`as_pose`), or of points."""
-    m, s = accepted.measurements, accepted.measurements.sightings
+    accepted, m, s = problem.accepted, problem.measurements, problem.measurements.sightings
     kind = np.flatnonzero(m.as_pose == as_pose)
     index = np.flatnonzero(accepted.sighting_weight[kind])
     rows = kind[index]
-    pose, marker = state.poses[s.row[rows]], state.markers[m.marker_row[rows]]
-    e, by_pose, by_marker, *_ = between_error(s.z[rows], pose, marker) if as_pose \
-        else point_error(s.z[rows, :2], pose, marker[:, :2])
+    motion = delayed(m, s.row[rows], state.c[SIGHTING_LAG])
+    e, by_pose, by_marker, by_c = sighting_error(
+        s.z[rows], state.poses[s.row[rows]], *motion, state.markers[m.marker_row[rows]], state.c,
+        as_pose)
     U = m.sighting_roots[0 if as_pose else 1][rows]
-    return _whitened(index, s.row[rows], m.marker_row[rows], e, [by_pose, by_marker], U,
-                     accepted.sighting_weight[rows], noise.sightings, accepted.sighting_kernel)
+    return _whitened(
+        problem, SIGHTINGS, index, s.row[rows], m.marker_row[rows], e, [by_pose, by_marker], by_c,
+        U, accepted.sighting_weight[rows], problem.noise.sightings, accepted.sighting_kernel)
 
 
-def linearize_ranges(accepted, noise, state):
-    """The LinearizedMeasurements of the ranges at a State, whitened by a Noise.
-
-    The expected range in m is offset + scale * distance, with the range calibration of the State.
-    """
-    m, r = accepted.measurements, accepted.measurements.ranges
+def linearize_ranges(problem, state):
+    """The LinearizedMeasurements of the ranges at a State."""
+    accepted, m, r = problem.accepted, problem.measurements, problem.measurements.ranges
     rows = np.flatnonzero(accepted.range_weight)
-    offset, scale = state.range_calibration
-    distance, *jacobians = range_error(
-        np.zeros(len(rows)), state.poses[r.row[rows]], state.antennas[r.antenna[rows]])
-    e = (offset + scale * distance - r.distance[rows])[:, None]
-    jacobians = [scale * jacobian for jacobian in jacobians]
-    if m.calibrated:
-        by_offset_and_scale = np.stack([np.ones_like(distance), distance], -1)
-        jacobians.append((CALIBRATION_SIGMA * by_offset_and_scale)[:, None])
-    return _whitened(rows, r.row[rows], len(m.marker) + r.antenna[rows], e, jacobians,
-                     1 / r.sigma[rows, None, None], accepted.range_weight[rows], noise.ranges,
-                     accepted.range_kernel)
+    antenna, row = r.antenna[rows], r.row[rows]
+    e, by_pose, by_antenna, by_c = range_error(
+        r.distance[rows], state.poses[row], *delayed(m, row, state.c[RANGE_LAG]),
+        state.antennas[antenna], state.c[ANTENNAS][antenna], state.c)
+    by_offset = (antenna[:, None] == np.arange(len(m.antenna)))[:, None]
+    return _whitened(
+        problem, RANGES, rows, row, len(m.marker) + antenna, e[:, None], [by_pose, by_antenna],
+        np.concatenate([by_c, by_offset], axis=2), 1 / r.sigma[rows, None, None],
+        accepted.range_weight[rows], problem.noise.ranges, accepted.range_kernel)
 
 
-def point_error(z, pose, point):
-    """Errors R^T (point - t) - z (m, 2) of points z (m, 2) m measured from poses (t, R), (m, 3).
+def sighting_error(z, poses, motion, velocity, markers, c, as_pose):
+    """Errors of sightings z (m, 3), and derivatives by pose, marker and the columns SIGHTINGS of c.
 
-    Also their derivatives by pose (m, 2, 3) and point (m, 2, 2).
+    From poses (m, 3) of the vehicle, its `motion` (m, 3) to where it was when the camera saw, and
+    its `velocity` (m, 3) per encoder step there (`delayed`). Of markers with a heading (`as_pose`)
+    the errors (m, 3) are log(z^-1 h) of the expected sighting h, as in GTSAM's between factor. Of
+    points they are (m, 2), h - z. The derivatives are (m, d, 3), (m, d, 3 or 2) and (m, d, 5).
     """
-    R_t = se2.rotation(-pose[:, 2])
-    expected = (R_t @ (point - pose[:, :2])[..., None])[..., 0]
-    by_pose = np.zeros((len(z), 2, 3))
-    by_pose[:, 0, 0] = by_pose[:, 1, 1] = -1
-    by_pose[:, 0, 2], by_pose[:, 1, 2] = expected[:, 1], -expected[:, 0]
-    return expected - z, by_pose, R_t
+    camera, size, d = c[CAMERA], c[SIZE], 3 if as_pose else 2
+    mounted = se2.compose(motion, camera)                            # camera in vehicle
+    Y = se2.compose(poses, mounted)
+    seen = se2.between(Y, markers)
+    h = seen / [size, size, 1]
+    if as_pose:
+        difference = se2.between(z, h)
+        e = se2.log(difference)
+        by_h = se2.log_jacobian(difference) @ se2.between_jacobians(z, h)[1]
+        by_marker = se2.rotation(seen[:, 2])
+    else:
+        e, by_h = (h - z)[:, :2], np.broadcast_to(np.eye(2, 3), (len(z), 2, 3))
+        by_marker = se2.rotation(-Y[:, 2])
+    by_seen = by_h / [size, size, 1]
+    by_Y = -by_seen @ se2.compose_jacobians(np.zeros(3), seen)[0]    # in the axes of the camera
+    by_marker = np.concatenate(
+        [by_seen[:, :, :2] @ by_marker, by_seen[:, :, 2:]], axis=2)[:, :, :d]
+    by_camera = _transported(by_Y, np.r_[0.0, 0.0, camera[2]])
+    by_c = np.empty((len(z), d, 5))
+    by_c[:, :, :3] = by_camera
+    by_c[:, :, 3] = -np.einsum("mdi,mi->md", by_seen[:, :, :2], h[:, :2])
+    by_c[:, :, 4] = -np.einsum("mdi,mi->md", _transported(by_Y, camera), velocity)
+    return e, _transported(by_Y, mounted), by_marker, by_c
 
 
-def range_error(r, pose, antenna):
-    """Errors |antenna - t| - r (m,) of ranges r (m,) m from poses (m, 3) to antennas (m, 2) m.
+def _transported(by_end, motion):
+    """Derivatives (m, d, 3) by a pose X in its axes, from those `by_end` of X composed with motion.
 
-    Also their derivatives by pose (m, 1, 3) and antenna (m, 1, 2). GTSAM: RangeFactor2D.
+    The derivative of exp(xi) M = M exp(xi') is the adjoint of M^-1.
     """
-    difference = antenna - pose[:, :2]
-    distance = np.hypot(*difference.T)
-    direction = difference[:, None, :] / np.maximum(distance, MIN_DISTANCE)[:, None, None]
-    by_position = -direction @ se2.rotation(pose[:, 2])
-    by_pose = np.concatenate([by_position, np.zeros((len(r), 1, 1))], axis=2)
-    return distance - r, by_pose, direction
+    R_t = se2.rotation(-motion[..., 2])
+    adjoint = np.zeros(motion.shape[:-1] + (3, 3))
+    adjoint[..., :2, :2], adjoint[..., 2, 2] = R_t, 1
+    lever = np.stack([-motion[..., 1], motion[..., 0]], -1)
+    adjoint[..., :2, 2] = (R_t @ lever[..., None])[..., 0]
+    return by_end @ adjoint
 
 
-def _whitened(index, row, landmark, e, jacobians, U, weight, noise_factor, kernel):
+def camera_poses(measurements, poses, c):
+    """Poses (s, 3) of the camera in the world at the sightings, from those of the frames (f, 3)."""
+    row = measurements.sightings.row
+    motion, _ = delayed(measurements, row, c[SIGHTING_LAG])
+    return se2.compose(poses[row], se2.compose(motion, c[CAMERA]))
+
+
+def tag_positions(measurements, poses, c):
+    """Positions (r, 2) in m of the tag in the world at the ranges, from poses of the frames."""
+    row = measurements.ranges.row
+    motion, _ = delayed(measurements, row, c[RANGE_LAG])
+    return se2.compose(poses[row], se2.compose(motion, np.r_[c[TAG_PLACE], 0.0]))[:, :2]
+
+
+def expected_sightings(measurements, state):
+    """Markers (s, 3) as they are seen from a State, without noise."""
+    markers = state.markers[measurements.marker_row]
+    size = state.c[SIZE]
+    return se2.between(camera_poses(measurements, state.poses, state.c), markers) / [size, size, 1]
+
+
+def expected_ranges(measurements, state):
+    """Ranges (r,) in m that are measured from a State, without noise."""
+    c, antenna = state.c, measurements.ranges.antenna
+    difference = state.antennas[antenna] - tag_positions(measurements, state.poses, c)
+    distance = np.sqrt(np.maximum(np.sum(difference**2, axis=1) + 2 * c[HEIGHT], 0))
+    return c[OFFSET] + c[ANTENNAS][antenna] + c[SCALE] * distance
+
+
+def range_error(r, poses, motion, velocity, antennas, offset, c):
+    """Errors (m,) of ranges r (m,) m, and derivatives by pose, antenna and c.
+
+    `motion` and `velocity` as in `sighting_error`; `offset` (m,) m is that of each antenna. The
+    derivatives are (m, 1, 3), (m, 1, 2), and (m, 1, 6) by the columns of RANGES without the offsets
+    of antennas. GTSAM: RangeFactor2D.
+    """
+    heading = poses[:, 2] + motion[:, 2]
+    lever = se2.compose(motion, np.r_[c[TAG_PLACE], 0.0])[:, :2]          # tag in vehicle
+    position = se2.compose(poses, np.pad(lever, ((0, 0), (0, 1))))[:, :2]
+    difference = antennas - position
+    squared = np.sum(difference**2, axis=1) + 2 * c[HEIGHT]
+    distance = np.sqrt(np.maximum(squared, MIN_DISTANCE**2))
+    slope = np.where(squared > MIN_DISTANCE**2, c[SCALE] / distance, 0.0)
+    direction = slope[:, None] * difference                          # by the antenna, in the world
+    in_vehicle = -(direction[:, None] @ se2.rotation(poses[:, 2]))[:, 0]
+    by_pose = np.concatenate([in_vehicle, np.sum(
+        in_vehicle * np.stack([-lever[:, 1], lever[:, 0]], -1), axis=1, keepdims=True)], axis=1)
+    by_tag = -(direction[:, None] @ se2.rotation(heading))[:, 0]
+    moved = velocity[:, :2] + velocity[:, 2:] * [-c[TAG_PLACE][1], c[TAG_PLACE][0]]
+    by_c = np.stack([by_tag[:, 0], by_tag[:, 1], slope, np.ones(len(r)), distance,
+                     -np.sum(by_tag * moved, axis=1)], -1)
+    e = c[OFFSET] + offset + c[SCALE] * distance - r
+    return e, by_pose[:, None], direction[:, None], by_c[:, None]
+
+
+def delayed(measurements, row, lag):
+    """Where the vehicle was `lag` encoder steps before the frames `row` (m,), in the axes there.
+
+    Also its velocities (m, 3) per step at that time, in m and rad, by the smooth path: the noise of
+    single steps would bias the delay.
+    """
+    path, smooth = measurements.path, measurements.smooth_path
+    time = measurements.frame[row] - lag
+    i = np.clip(np.floor(time).astype(int), 0, max(len(path) - 2, 0))
+    k = np.minimum(i + 1, len(path) - 1)
+    there = path[i] + (time - i)[:, None] * (path[k] - path[i])      # or before the first pose
+    return (se2.between(path[measurements.frame[row]], there),
+            se2.log(se2.between(smooth[i], smooth[k])))
+
+
+def _whitened(problem, kind, index, row, landmark, e, jacobians, by_c, U, weight, noise_factor,
+              kernel):
     """The LinearizedMeasurements of errors e (m, d) with a list of derivatives (m, d, p) each.
 
-    From square root informations U (m, d, d) and weights (m,). `noise_factor` multiplies the
-    standard deviations. A kernel weighs a measurement by the norm of its whitened error; that of a
-    range has the sign of measured minus expected, as in GTSAM.
+    `by_c` (m, d, u) are those by the columns `kind` of the calibration. From square root
+    informations U (m, d, d) and weights (m,). `noise_factor` multiplies the standard deviations. A
+    kernel weighs a measurement by the norm of its whitened error; that of a range has the sign of
+    measured minus expected, as in GTSAM.
     """
+    active = problem.active[kind]
+    columns = np.cumsum(problem.active)[kind][active] - 1
+    by_c = by_c[:, :, active] * problem.sigma[kind][active]
     U = U * (np.sqrt(weight) / noise_factor)[:, None, None]
     e = (U @ e[..., None])[..., 0]
+    if kind == RANGES:
+        e = e + problem.accepted.range_bias
     size, error = -e[:, 0] if e.shape[1] == 1 else np.linalg.norm(e, axis=1), np.sum(e**2) / 2
     if kernel is not None:
         size = size.tolist()
@@ -255,31 +271,24 @@ def _whitened(index, row, landmark, e, jacobians, U, weight, noise_factor, kerne
         weight = weight * by_kernel
         U = U * np.sqrt(by_kernel)[:, None, None]
         e = e * np.sqrt(by_kernel)[:, None]
-    return LinearizedMeasurements(index=index, row=row, landmark=landmark, e=e,
-                                  J=U @ np.concatenate(jacobians, axis=2), weight=weight,
-                                  error=float(error))
+    return LinearizedMeasurements(
+        index=index, row=row, landmark=landmark, e=e, J=U @ np.concatenate(jacobians, axis=2),
+        J_c=U @ by_c, columns=columns, weight=weight, error=float(error))
 
 
-@dataclass(frozen=True)
-class Problem:
-    """The factor graph."""
+@lru_cache(maxsize=8)
+def kernel_bias(kernel):
+    """Location b, in sigmas, for which a signed kernel weighs the residuals r - b to mean zero.
 
-    odometry: OdometryFactors
-    accepted: AcceptedMeasurements
-    noise: Noise
-
-    @property
-    def measurements(self) -> Measurements:
-        """The Measurements."""
-        return self.accepted.measurements
-
-
-def build_problem(measurements, model, noise, relinearize_at=np.zeros(3),
-                  preintegrate=preintegrate_odometry):
-    """The Problem of all Measurements with weight 1, without kernels, and of a Noise.
-
-    `preintegrate` makes the OdometryFactors of steps of the `model`, "arc" or "euler", linearised
-    at w = `relinearize_at` (3,); studies pass other functions.
+    Of standard normal residuals r, which a one-sided kernel makes too small on average (b < 0):
+    E[weight(r - b) (r - b)] = 0. Ranges are compared with the expected ones plus b sigma.
     """
-    return Problem(preintegrate(measurements, model, relinearize_at),
-                   AcceptedMeasurements(measurements, measurements.unit_weights), noise)
+    r = np.linspace(-6, 6, 241)
+    if kernel is None or kernel.weight(3.0) == kernel.weight(-3.0):
+        return 0.0
+
+    def mean(b):
+        weight = np.array([kernel.weight(x) for x in r - b])
+        return np.sum(weight * (r - b) * np.exp(-r**2 / 2))
+
+    return float(brentq(mean, -1, 1))

@@ -20,11 +20,13 @@ import numpy as np
 
 from slamlib import se2
 from slamlib.sightings import GATE, POINT_GATE
-from slamlib.slam.factors import Problem, State, preintegrate_odometry, retract
+from slamlib.slam.calibration import WHEELS
+from slamlib.slam.factors import expected_ranges, expected_sightings, kernel_bias
 from slamlib.slam.graph import gtsam_step
 from slamlib.slam.linear import NormalEquations, laplace_approximation
 from slamlib.slam.measurements import AcceptedMeasurements, Noise, with_known
 from slamlib.slam.noise import NoisePosterior, learn_noise
+from slamlib.slam.problem import Problem, State, preintegrate_odometry, retract
 
 EARLY_GATE = 3.3             # sigmas; a range that is shorter than expected by more is rejected
 
@@ -54,6 +56,7 @@ MIN_RESIDUALS = 20           # number of measurements from which their scatter g
 MEDIAN_CHI2 = {3: 2.366, 2: 1.386, 1: 0.455}         # medians by degrees of freedom
 
 MAX_ROUNDS = 6               # number of rounds of wheels, noise and accepted measurements
+NEGLIGIBLE_MOVE = 3e-3       # relative, of a wheel parameter since odometry was linearised
 NEGLIGIBLE_CHANGE = 1e-3     # share of the measurements whose weight may change at the same noise
 
 
@@ -91,7 +94,8 @@ def accepted_measurements(problem, state, rule=AcceptanceRule()):
     if not rule.gated:
         weight[:len(problem.measurements.marker_row)] = 1
     return AcceptedMeasurements(
-        problem.measurements, weight, rule.sighting_kernel, rule.range_kernel)
+        measurements=problem.measurements, weight=weight, sighting_kernel=rule.sighting_kernel,
+        range_kernel=rule.range_kernel, range_bias=kernel_bias(rule.range_kernel))
 
 
 def gate_weights(problem, state, early, late):
@@ -116,7 +120,8 @@ def kept_weights(accepted, sighting_residuals, range_residuals):
 
     return (reweighted(accepted.sighting_weight, accepted.sighting_kernel,
                        np.linalg.norm(sighting_residuals, axis=1)),
-            reweighted(accepted.range_weight, accepted.range_kernel, range_residuals))
+            reweighted(accepted.range_weight, accepted.range_kernel,
+                       range_residuals - accepted.range_bias))
 
 
 def residuals(measurements, state, noise):
@@ -130,16 +135,13 @@ def residuals(measurements, state, noise):
     The errors e of the factors have the opposite sign, and those of a marker with a heading are
     se2.log of a motion. These residuals are differences of coordinates: their gates need no more.
     """
-    m, s = measurements, measurements.sightings
-    difference = s.z - se2.between(state.poses[s.row], state.markers[m.marker_row])
+    m, s, r = measurements, measurements.sightings, measurements.ranges
+    difference = s.z - expected_sightings(m, state)
     difference[:, 2] = se2.wrap(difference[:, 2]) * m.as_pose
     C = s.C.copy()
     C[~m.as_pose, 2] = C[~m.as_pose, :, 2] = [0, 0, 1]          # an independent heading
-    offset, scale = state.range_calibration
-    expected = offset + scale * np.hypot(
-        *(state.antennas[m.ranges.antenna] - state.poses[m.ranges.row, :2]).T)
     return (np.linalg.solve(np.linalg.cholesky(C), difference[..., None])[..., 0] / noise.sightings,
-            (m.ranges.distance - expected) / m.ranges.sigma / noise.ranges)
+            (r.distance - expected_ranges(m, state)) / r.sigma / noise.ranges)
 
 
 @dataclass(frozen=True)
@@ -148,6 +150,7 @@ class Optimum:
 
     equations: NormalEquations
     steps: int                         # number of steps taken
+    converged: bool                    # whether the error had stopped to decrease
 
     @property
     def state(self) -> State:
@@ -176,15 +179,15 @@ def optimize(problem, state, max_steps=MAX_GAUSS_NEWTON_STEPS, by_gtsam=False,
         if step is None:
             step = gtsam_step(problem, state)
         for _ in range(MAX_HALVINGS):
-            equations = NormalEquations(problem, retract(problem.measurements, state, step))
+            equations = NormalEquations(problem, retract(problem, state, step))
             if equations.error <= (1 + ROUNDING) * error:
                 break
             step = step / 2
         else:
-            equations = NormalEquations(problem, state)
+            equations, ended = NormalEquations(problem, state), True
             break
         ended = error - equations.error <= converged * (1 + error)
-    return Optimum(equations, steps)
+    return Optimum(equations, steps, ended)
 
 
 def narrow_kernels(problem, state, scales=CAUCHY_SCALES, converged=CONVERGED):
@@ -198,7 +201,8 @@ def narrow_kernels(problem, state, scales=CAUCHY_SCALES, converged=CONVERGED):
         if number:                                   # the caller judges the last solution
             problem = replace(problem, noise=noise_of_scatter(m, state))
         cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(scale)
-        accepted = AcceptedMeasurements(m, m.unit_weights, cauchy, cauchy)
+        accepted = AcceptedMeasurements(
+            measurements=m, weight=m.unit_weights, sighting_kernel=cauchy, range_kernel=cauchy)
         state = optimize(replace(problem, accepted=accepted), state, converged=converged).state
     return state
 
@@ -230,6 +234,13 @@ class Fit:
     state: State
     log_evidence: float                  # Laplace, up to a constant
     posterior: NoisePosterior | None     # None if all noise parameters are known
+    converged: bool              # whether the last iterations ended before their number did
+    explanations: tuple = (frozenset(),)     # sets of groups, each of which explains the drive
+
+    @property
+    def log_density(self):
+        """Log posterior density of the noise, or log evidence if all of it is known."""
+        return self.log_evidence if self.posterior is None else self.posterior.log_density
 
     @cached_property
     def equations(self):
@@ -242,7 +253,8 @@ def solved_by_gtsam(fit):
 
     Raises DatasetError as `optimize`.
     """
-    return replace(fit, state=optimize(fit.problem, fit.state, by_gtsam=True).state)
+    optimum = optimize(fit.problem, fit.state, by_gtsam=True)
+    return replace(fit, state=optimum.state, converged=optimum.converged)
 
 
 def refine(problem, state, accept=accepted_measurements, preintegrate=preintegrate_odometry):
@@ -259,18 +271,22 @@ def refine(problem, state, accept=accepted_measurements, preintegrate=preintegra
     accepted = problem.accepted if accept is None else accept(problem, state)
     changed = np.inf
     for _ in range(MAX_ROUNDS):
-        problem = replace(problem, accepted=accepted, odometry=preintegrate(m, model, state.w))
+        problem = replace(problem, accepted=accepted,
+                          odometry=preintegrate(m, model, state.c[WHEELS]))
         if m.learned.any() and changed > NEGLIGIBLE_CHANGE * len(accepted.weight):
             optimum = None                                 # frees the equations of the last round
             optimum = optimize(problem, state, max_steps=2)
             state, posterior = optimum.state, learn_noise(optimum.equations)
             problem = replace(problem, noise=with_known(posterior.noise, m.dataset.vehicle))
+        problem = replace(problem, odometry=replace(problem.odometry, in_counts=True))
         optimum = None
         optimum = optimize(problem, state)
         state = optimum.state
         accepted = problem.accepted if accept is None else accept(problem, state)
         changed = np.count_nonzero(accepted.weight != problem.accepted.weight)
-        if not changed:
+        moved = np.abs(state.c[WHEELS] / problem.odometry.wheel - 1).max()
+        if not changed and moved < NEGLIGIBLE_MOVE:
             break
     _, log_evidence = laplace_approximation(optimum.equations, problem.noise)
-    return Fit(problem, state, log_evidence, posterior)
+    return Fit(problem=problem, state=state, log_evidence=log_evidence, posterior=posterior,
+               converged=optimum.converged)

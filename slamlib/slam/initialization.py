@@ -14,14 +14,11 @@ import numpy as np
 
 from slamlib import odometry, se2
 from slamlib.sightings import consensus, evenly_chosen
-from slamlib.slam.factors import (
-    MIN_DISTANCE,
-    build_problem,
-    preintegrate_odometry,
-    state_from_arrays,
-)
+from slamlib.slam.calibration import ANTENNAS, HEIGHT, OFFSET, SCALE, SIZE, WHEELS
+from slamlib.slam.factors import MIN_DISTANCE, camera_poses, tag_positions
 from slamlib.slam.fit import narrow_kernels
 from slamlib.slam.measurements import GUESS_PRIOR_SIGMA, Noise, measure, with_known
+from slamlib.slam.problem import build_problem, preintegrate_odometry, state_from_arrays
 
 MAX_ODOMETRY_SIGMA = 0.5     # rad, of odometry's heading at the end of a drive's first part
 MAX_FIRST_PART = 1.5         # length of the first part over that which odometry can predict
@@ -29,7 +26,7 @@ GROWTH = 4                   # largest ratio of the numbers of poses of a part a
 MAX_VOTES = 60               # number of sightings of a marker that enter its consensus
 
 MAX_RANGES = 150             # maximum number of ranges used per antenna, evenly chosen
-SAME_PLACE = 0.2             # of the median range: positions closer than this are one
+SAME_PLACE = 0.03            # of the median range: positions closer than this are one
 KERNEL_SCALE = 2.0           # sigmas, scale of the Cauchy kernel
 START_DIRECTIONS = 8         # number of starts on a circle about the path
 MAX_SEARCH_STEPS = 60        # number of steps of the search
@@ -92,13 +89,15 @@ def extended(measurements, model, part, solved):
     """
     d, frame, last = measurements.dataset, measurements.frame, part.frame[-1]
     poses, covariances = odometry.first_order(
-        d.ticks[last:], d.vehicle.with_deviation(solved.w), solved.poses[-1], np.zeros((3, 3)),
+        d.ticks[last:], d.vehicle.with_wheel(solved.c[WHEELS]), solved.poses[-1], np.zeros((3, 3)),
         model=model)
     old = np.searchsorted(part.frame, frame[frame <= last])
     new = frame[frame > last] - last
     return state_from_poses(
         measurements, np.concatenate([solved.poses[old], poses[new]]),
-        np.concatenate([np.zeros((len(old), 3, 3)), covariances[new]]), solved.w)
+        np.concatenate([np.zeros((len(old), 3, 3)), covariances[new]]),
+        measurements.calibration.taken_from(
+            part.calibration, solved.c, measurements.calibration.stated))
 
 
 def consensus_markers(measurements, in_world, covariances):
@@ -113,33 +112,33 @@ def consensus_markers(measurements, in_world, covariances):
     return in_world[chosen[best]]
 
 
-def trilaterated_antennas(measurements, poses, covariances):
+def trilaterated_antennas(measurements, poses, covariances, c):
     """(a, 2) positions of the antennas, m, by the best minimum of their trilateration."""
-    by_antenna = ranges_by_antenna(measurements, poses, covariances)
+    by_antenna = ranges_by_antenna(measurements, poses, covariances, c)
     return np.reshape([trilaterate(ranges)[0][0] for ranges in by_antenna], (-1, 2))
 
 
-def state_from_poses(measurements, poses, covariances, w=np.zeros(3), markers=consensus_markers,
+def state_from_poses(measurements, poses, covariances, c=None, markers=consensus_markers,
                      antennas=trilaterated_antennas):
     """The State with these poses of the frames, and landmarks by their measurements from there.
 
-    Poses (f, 3) and covariances (f, 3, 3) are in world axes, w (3,) in units of sigma. The
-    functions `markers` and `antennas` initialise the landmarks; studies pass others.
+    Poses (f, 3) and covariances (f, 3, 3) are in world axes, c (p,) is the calibration, None
+    as stated. The functions `markers` and `antennas` initialise the landmarks; studies pass others.
     """
-    s = measurements.sightings
-    A, B = se2.compose_jacobians(poses[s.row], s.z)
+    s, c = measurements.sightings, measurements.calibration.stated if c is None else c
+    camera, z = camera_poses(measurements, poses, c), s.z * [c[SIZE], c[SIZE], 1]
+    A, B = se2.compose_jacobians(camera, z)
     C = A @ covariances[s.row] @ np.swapaxes(A, 1, 2) + B @ s.C @ np.swapaxes(B, 1, 2)
-    return state_from_arrays(
-        measurements, poses, markers(measurements, se2.compose(poses[s.row], s.z), C),
-        antennas(measurements, poses, covariances), w)
+    return state_from_arrays(measurements, poses, markers(measurements, se2.compose(camera, z), C),
+                             antennas(measurements, poses, covariances, c), c)
 
 
 @dataclass(frozen=True)
 class AntennaRanges:
     """The ranges to one antenna."""
 
-    positions: np.ndarray    # (m, 2) m, of the vehicle
-    distance: np.ndarray     # (m,) m, as measured
+    positions: np.ndarray    # (m, 2) m, of the tag
+    distance: np.ndarray     # (m,) m in the plane, by the calibration
     sigma: np.ndarray        # (m,) m, including that of the vehicle's position
     guess: np.ndarray        # (2,) m, guessed position of the antenna
 
@@ -150,18 +149,23 @@ class AntennaRanges:
             self.positions[chosen], self.distance[chosen], self.sigma[chosen], self.guess)
 
 
-def ranges_by_antenna(measurements, poses, covariances):
+def ranges_by_antenna(measurements, poses, covariances, c, factor=1.0):
     """List of the AntennaRanges of every antenna.
 
-    Poses (f, 3), m and rad, and covariances (f, 3, 3) of the frames are in world axes.
+    Poses (f, 3), m and rad, and covariances (f, 3, 3) of the frames are in world axes; c (p,) is
+    the calibration. `factor` multiplies the sigmas of the ranges.
     """
-    r, by_antenna = measurements.ranges, []
+    r, by_antenna, positions = measurements.ranges, [], tag_positions(measurements, poses, c)
+    slant = (r.distance - c[OFFSET] - c[ANTENNAS][r.antenna]) / c[SCALE]
+    plane = np.sqrt(np.maximum(slant * np.abs(slant) - 2 * c[HEIGHT], 0)) \
+        if c[HEIGHT] else slant
+    sigma = factor * r.sigma / c[SCALE]
     position_sigma = np.sqrt(np.trace(covariances[:, :2, :2], axis1=1, axis2=2) / 2)
     for k, guess in enumerate(measurements.guess):
         rows = np.flatnonzero(r.antenna == k)
         by_antenna.append(AntennaRanges(
-            poses[r.row[rows], :2], r.distance[rows],
-            np.hypot(r.sigma[rows], position_sigma[r.row[rows]]), guess))
+            positions[rows], plane[rows],
+            np.hypot(sigma[rows], position_sigma[r.row[rows]]), guess))
     return by_antenna
 
 
@@ -247,7 +251,8 @@ def second_moment(ranges, estimate):
     range: an array of the grid times all ranges would take 500 MB.
     """
     centre = ranges.positions.mean(0)
-    reach = GRID_MARGIN * ranges.distance.max() + np.ptp(ranges.positions, axis=0).max()
+    longest = np.maximum(ranges.distance, 3 * ranges.sigma).max()
+    reach = GRID_MARGIN * longest + np.ptp(ranges.positions, axis=0).max()
     radius, angle = np.meshgrid(np.linspace(0, reach, GRID[0])[1:],
                                 np.linspace(-np.pi, np.pi, GRID[1])[1:])
     place = centre + radius[..., None] * np.stack([np.cos(angle), np.sin(angle)], -1)

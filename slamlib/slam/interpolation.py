@@ -3,7 +3,8 @@
 import numpy as np
 
 from slamlib import increments, se2
-from slamlib.slam.factors import odometry_noise
+from slamlib.slam.calibration import WHEELS
+from slamlib.slam.problem import odometry_noise
 
 FRAMES_AT_ONCE = 1000        # number of frames of a section, whose arrays stay in cache
 
@@ -11,9 +12,9 @@ FRAMES_AT_ONCE = 1000        # number of frames of a section, whose arrays stay 
 def interpolate(problem, state, pairs):
     """Every encoder pose (n, 3) and its covariance (n, 3, 3) in world axes, given the frames.
 
-    A pose k between the frames a and b depends only on them and on w. X_a Delta_ak(w) and
-    X_b Delta_kb(w)^-1 are two estimates of it, with independent noise of the encoder steps before
-    and after it. Their average by information is the conditional mean, exact to first order.
+    A pose k between the frames a and b depends only on them and on the wheels w. X_a Delta_ak(w)
+    and X_b Delta_kb(w)^-1 are two estimates of it, with independent noise of the encoder steps
+    before and after it. Their average by information is the conditional mean, exact to first order.
 
     `pairs` (f-1, 9, 9) as in `Covariances`, at the State that solves the Problem.
     """
@@ -25,11 +26,12 @@ def interpolate(problem, state, pairs):
         rows = slice(first, min(first + FRAMES_AT_ONCE, len(pairs)) + 1)          # of frames
         section = slice(frame[rows][0], frame[rows][-1] + 1)               # shares its ends
         poses[section], covariances[section] = _interpolate_section(
-            problem, state.poses[rows], state.w, frame[rows], pairs[rows.start:rows.stop - 1])
+            problem, state.poses[rows], state.c[WHEELS], frame[rows],
+            pairs[rows.start:rows.stop - 1])
     return poses, covariances
 
 
-def _interpolate_section(problem, poses, w, frame, pairs):
+def _interpolate_section(problem, poses, wheel, frame, pairs):
     """The same for the encoder poses from the first to the last of consecutive frames (g,)."""
     joint = _in_world_axes(pairs, poses)
     pose = np.arange(frame[0], frame[-1] + 1)
@@ -41,10 +43,10 @@ def _interpolate_section(problem, poses, w, frame, pairs):
         return all_poses, covariances
     a, b = last[inner], last[inner] + 1
 
-    delta_a, delta_a_by_w, Q_a = _increments(problem, w, frame, frame[a], pose[inner])
+    delta_a, a_by_wheel, Q_a = _increments(problem, wheel, frame, frame[a], pose[inner])
     A_a, B_a = se2.compose_jacobians(poses[a], delta_a)
     N_a = B_a @ Q_a @ np.swapaxes(B_a, 1, 2)
-    delta_b, delta_b_by_w, Q_b = _increments(problem, w, frame, pose[inner], frame[b])
+    delta_b, b_by_wheel, Q_b = _increments(problem, wheel, frame, pose[inner], frame[b])
     back = se2.inverse(delta_b)
     A_b, B_b = se2.compose_jacobians(poses[b], back)
     B_b = B_b @ se2.inverse_jacobian(delta_b)
@@ -56,14 +58,14 @@ def _interpolate_section(problem, poses, w, frame, pairs):
     difference = from_b - from_a
     difference[:, 2] = se2.wrap(difference[:, 2])
     F = np.concatenate([gain_a @ A_a, gain_b @ A_b,
-                        gain_a @ B_a @ delta_a_by_w + gain_b @ B_b @ delta_b_by_w], axis=2)
+                        gain_a @ B_a @ a_by_wheel + gain_b @ B_b @ b_by_wheel], axis=2)
     all_poses[inner] = from_a + np.einsum("nij,nj->ni", gain_b, difference)
     covariances[inner] = F @ joint[a] @ np.swapaxes(F, 1, 2) + gain_a @ N_a
     return all_poses, (covariances + np.swapaxes(covariances, 1, 2)) / 2
 
 
 def _in_world_axes(pairs, poses):
-    """Covariances (g-1, 9, 9) of [X_i, X_{i+1}, w] with the poses in world axes."""
+    """Covariances (g-1, 9, 9) as `Covariances.pairs` with the poses in world axes."""
     turned = np.zeros_like(pairs)
     turned[:, range(9), range(9)] = 1
     turned[:, :2, :2], turned[:, 3:5, 3:5] = (se2.rotation(poses[rows, 2])
@@ -71,15 +73,15 @@ def _in_world_axes(pairs, poses):
     return turned @ pairs @ np.swapaxes(turned, 1, 2)
 
 
-def _increments(problem, w, frame, start, end):
-    """Increments (m, 3) from the encoder poses `start` (m,) to `end` (m,), at the wheel errors w.
+def _increments(problem, wheel, frame, start, end):
+    """Increments (m, 3) from the encoder poses `start` (m,) to `end` (m,), with `wheel` (3,) m.
 
-    Also their derivatives (m, 3, 3) by w, and their covariances Q (m, 3, 3) in the axes of the
-    start. The poses lie in the section of the frames `frame` (g,).
+    Also their derivatives (m, 3, 3) by `wheel`, and their covariances Q (m, 3, 3) in the axes of
+    the start. The poses lie in the section of the frames `frame` (g,).
     """
     d = problem.measurements.dataset
-    vehicle, ticks = d.vehicle.with_deviation(w), d.ticks[frame[0]:frame[-1] + 1]
+    vehicle, ticks = d.vehicle.with_wheel(wheel), d.ticks[frame[0]:frame[-1] + 1]
     start, end = start - frame[0], end - frame[0]
     delta, by_wheel = increments.between_poses(ticks, vehicle, start, end, problem.odometry.model)
     quantization, slipping = odometry_noise(ticks, vehicle, start, end, len(d.ticks) - 1)
-    return delta, by_wheel * vehicle.sigma_wheel, quantization + problem.noise.slip**2 * slipping
+    return delta, by_wheel, quantization + problem.noise.slip**2 * slipping

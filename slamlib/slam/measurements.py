@@ -14,7 +14,7 @@ from functools import cached_property
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import A, C, L, P, W, X
+from gtsam.symbol_shorthand import A, L, P, X
 
 from slamlib import odometry, se2
 from slamlib.dataset import Dataset, UwbReadings
@@ -25,10 +25,12 @@ from slamlib.sightings import (
     Sightings,
     sightings_by_frame,
 )
+from slamlib.slam.calibration import Calibration, stated_calibration
 from slamlib.slam.structure import Variables, block_structure
 
 NOISE_KEYS = ("slip", "marker_noise_factor", "range_noise_factor")      # of a Vehicle, as in Noise
 
+SMOOTHED_STEPS = 5           # encoder steps to both sides, over which velocities are averaged
 # Standard deviations of the priors of variables
 ORIGIN_SIGMA = 1e-5          # m, of the position of pose 1, which is zero by definition
 WEAK_SIGMA = 1e5             # m and rad, of a marker without accepted sightings
@@ -96,7 +98,7 @@ class Measurements:
 
     dataset: Dataset
     frame: np.ndarray        # (f,) encoder pose of every frame, from 0
-    turn: np.ndarray         # (f-1,) rad, change of heading to the next frame by odometry
+    path: np.ndarray         # (n, 3) encoder poses by odometry, m and rad; headings continuous
     sightings: Sightings     # s of them
     marker_row: np.ndarray   # (s,) row of `marker`
     marker: np.ndarray       # (k,) ids, ascending
@@ -104,7 +106,20 @@ class Measurements:
     ranges: Ranges           # r of them
     antenna: np.ndarray      # (a,) ids, ascending, of antennas with ranges
     guess: np.ndarray        # (a, 2) m, their guessed positions
-    calibrated: bool = False     # whether offset and scale of the ranges are a variable, c
+    calibration: Calibration     # what the Vehicle states of what measurements share
+
+    @property
+    def turn(self):
+        """(f-1,) rad, change of heading to the next frame by odometry."""
+        return np.diff(self.path[self.frame, 2])
+
+    @cached_property
+    def smooth_path(self):
+        """(n, 3) averages of `path` over SMOOTHED_STEPS to both sides, at the ends over fewer."""
+        step = np.arange(len(self.path))
+        reach = np.minimum(np.minimum(step, step[::-1]), SMOOTHED_STEPS)
+        total = odometry.cumulative(self.path)
+        return (total[step + reach + 1] - total[step - reach]) / (2 * reach + 1)[:, None]
 
     @property
     def origin_sigma(self):
@@ -141,29 +156,24 @@ class Measurements:
     @cached_property
     def variables(self):
         """The Variables, numbered."""
-        counts = [len(self.frame), len(self.marker), len(self.antenna), 1, int(self.calibrated)]
-        frames, markers, antennas, w, c = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
-        return Variables(frames=frames, markers=markers, antennas=antennas, w=w, c=c)
+        counts = np.cumsum([len(self.frame), len(self.marker), len(self.antenna)])
+        return Variables(*np.split(np.arange(counts[-1]), counts[:-1]))
 
     @property
     def factor_variables(self):
         """Numbers of the variables of odometry, sightings of poses, those of points, and ranges.
 
-        (f-1, 3) of X_i, X_{i+1} and w; (m, 2) of frames and markers, twice; (r, 2) of frames and
-        antennas, or (r, 3) with c if the ranges are calibrated.
+        (f-1, 2) of X_i and X_{i+1}, (m, 2) of frames and markers, twice, and (r, 2) of frames and
+        antennas.
         """
         v, s, r = self.variables, self.sightings, self.ranges
-        odometry = [v.frames[:-1], v.frames[1:], np.repeat(v.w, len(v.frames) - 1)]
         sightings = np.stack([s.row, v.markers[self.marker_row]], -1)
-        ranges = [r.row, v.antennas[r.antenna]]
-        if self.calibrated:
-            ranges.append(np.repeat(v.c, len(r.row)))
-        return [np.stack(odometry, -1), sightings[self.as_pose], sightings[~self.as_pose],
-                np.stack(ranges, -1)]
+        return [np.stack([v.frames[:-1], v.frames[1:]], -1), sightings[self.as_pose],
+                sightings[~self.as_pose], np.stack([r.row, v.antennas[r.antenna]], -1)]
 
     @cached_property
     def ordering(self):
-        """Elimination ordering (COLAMD) of all variables; w and c, which touch many poses, last."""
+        """Elimination ordering (COLAMD) of all variables but the calibration, which is last."""
         graph, s, r = gtsam.SymbolicFactorGraph(), self.sightings, self.ranges
         graph.push_factor(X(0))
         for i, j in zip(s.row.tolist(), self.marker_row.tolist()):
@@ -172,22 +182,17 @@ class Measurements:
             graph.push_factor(X(i), A(k))
         for i in range(len(self.frame) - 1):
             graph.push_factor(X(i), X(i + 1))
-        ordering = gtsam.Ordering.ColamdSymbolicFactorGraph(graph)
-        ordering.push_back(W(0))
-        if self.calibrated:
-            ordering.push_back(C(0))
-        return ordering
+        return gtsam.Ordering.ColamdSymbolicFactorGraph(graph)
 
     @cached_property
     def structure(self):
         """The Structure of the information matrix."""
         v, order = self.variables, self.ordering
-        numbers = {"x": v.frames, "l": v.markers, "p": v.markers, "a": v.antennas, "w": v.w,
-                   "c": v.c}
+        numbers = {"x": v.frames, "l": v.markers, "p": v.markers, "a": v.antennas}
         keys = (gtsam.Symbol(order.at(i)) for i in range(order.size()))
         elimination_order = np.argsort([numbers[chr(key.chr())][key.index()] for key in keys])
         width = np.full(len(elimination_order), 2)
-        width[np.r_[v.frames, v.markers[self.oriented], v.w]] = 3
+        width[np.r_[v.frames, v.markers[self.oriented]]] = 3
         return block_structure(width, elimination_order, self.factor_variables)
 
     @cached_property
@@ -214,12 +219,12 @@ def measure(dataset, extra_poses=()):
                     np.maximum(uwb.sigma, MIN_MEASUREMENT_SIGMA))
     return Measurements(
         dataset=dataset, frame=sightings.frame,
-        turn=np.diff(odometry.dead_reckoning(dataset.ticks, dataset.vehicle)[sightings.frame, 2]),
+        path=odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc"),
         sightings=sightings, marker_row=marker_row, marker=marker,
         oriented=np.bincount(marker_row, has_heading, len(marker)) > 0,
         ranges=ranges, antenna=antenna,
         guess=guess.position[np.searchsorted(guess.antenna, antenna)] if len(antenna)
-        else np.zeros((0, 2)))
+        else np.zeros((0, 2)), calibration=stated_calibration(dataset.vehicle, antenna))
 
 
 @dataclass(frozen=True)
@@ -234,6 +239,7 @@ class AcceptedMeasurements:
     weight: np.ndarray                       # (s + r,) sightings, then ranges
     sighting_kernel: gtsam.noiseModel.mEstimator.Base | None = None      # None: quadratic
     range_kernel: gtsam.noiseModel.mEstimator.Base | None = None
+    range_bias: float = 0.0                  # sigmas, of the range kernel (`factors.kernel_bias`)
 
     @property
     def sighting_weight(self):

@@ -14,6 +14,7 @@ from itertools import combinations
 import numpy as np
 
 from slamlib.increments import SLIP_FACTOR, TYPICAL_SLIP
+from slamlib.slam.calibration import ANTENNAS
 from slamlib.slam.linear import NormalEquations, laplace_approximation
 from slamlib.slam.measurements import Noise, is_known, measure
 
@@ -194,14 +195,15 @@ def equations_of_first_frames(equations):
         return equations
     markers = np.searchsorted(m.marker, part.marker)
     antennas = np.searchsorted(m.antenna, part.antenna)
-    part = replace(part, oriented=m.oriented[markers], calibrated=m.calibrated)
+    part = replace(part, oriented=m.oriented[markers])
     accepted = replace(problem.accepted, measurements=part, weight=np.r_[
         problem.accepted.sighting_weight[:len(part.marker_row)],
         problem.accepted.range_weight[:len(part.ranges.row)]])
     odometry = replace(problem.odometry, **{
         name: getattr(problem.odometry, name)[:count - 1]
-        for name in ("increment", "J_w", "quantization", "slipping")})
+        for name in ("increment", "J_wheel", "quantization", "slipping")})
+    entries = np.r_[:ANTENNAS.start, ANTENNAS.start + antennas]
     return NormalEquations(
-        replace(problem, odometry=odometry, accepted=accepted),
+        replace(problem, odometry=odometry, accepted=accepted, sigma=problem.sigma[entries]),
         replace(state, poses=state.poses[:count], markers=state.markers[markers],
-                antennas=state.antennas[antennas]))
+                antennas=state.antennas[antennas], c=state.c[entries]))

@@ -10,23 +10,22 @@ Each stage is a function from one frozen record to the next; stages have the num
     5   narrow_kernels    Problem, State -> State, by robust kernels
     6   refine            Problem, State -> Fit: wheels, noise and accepted measurements in turn
         better_model      Fit -> Fit: arcs or Euler's steps
-        calibrated        Fit -> Fit: with offset and scale of the ranges
+        calibrated        Fit -> Fit: groups of the calibration leave wrong stated values
         solved_by_gtsam   Fit -> Fit: the last steps by GTSAM
     7   slam_result       Fit -> SlamResult: mean and covariances over the possible noise, poses
                           between the frames, doubts
-        with_checked_wheels   SlamResult -> SlamResult: with a doubt about the stated wheels
 
 With a SlamResult of fewer sensors, stage 4 takes its poses (`fit_from_previous`), and the model of
 odometry is that of the result: problem 4 starts from problem 3.
 """
 
+from dataclasses import replace
 from functools import partial
 from numbers import Real
 
 from slamlib.limits import LIMITS
 from slamlib.odometry import MODELS
-from slamlib.slam.calibrations import better_model, calibrated, with_checked_wheels
-from slamlib.slam.factors import build_problem, preintegrate_odometry
+from slamlib.slam.choices import better_model, calibrated
 from slamlib.slam.fit import (
     CAUCHY_SCALES,
     acceptance_rule,
@@ -37,6 +36,7 @@ from slamlib.slam.fit import (
 )
 from slamlib.slam.initialization import initial_state, state_from_poses
 from slamlib.slam.measurements import NOISE_KEYS, Noise, measure, with_known, with_known_noise
+from slamlib.slam.problem import build_problem, preintegrate_odometry
 from slamlib.slam.result import slam_result
 
 WARM_START_CONVERGED = 1e-3  # decrease, over 1 + error, at which the start from a result ends
@@ -89,10 +89,11 @@ asymmetric Cauchy, asymmetric Tukey, not 'L2'
         fit = fit_from_previous(measurements, previous, model, accept)                # 2, 5, 6
     else:
         fit = fit_from_odometry(measurements, model or "arc", accept=accept)          # 2 to 6
-        fit = fit if model else better_model(fit, "euler")
-    fit = solved_by_gtsam(calibrated(fit, accept))
-    return with_checked_wheels(slam_result(fit), fit,                                 # 7
-                               partial(fit_from_previous, accept=accept))
+        fit = fit if model else better_model(fit)
+    fit = calibrated(fit, accept)
+    if fit.problem.released and not (model or previous):     # they may have looked like the model
+        fit = better_model(fit)
+    return slam_result(solved_by_gtsam(fit))                                          # 7
 
 
 def fit_from_odometry(measurements, model="arc", preintegrate=preintegrate_odometry,
@@ -114,13 +115,15 @@ def fit_from_previous(measurements, previous, model=None, accept=accepted_measur
 
     `model`, if not None, replaces that of `previous`. `accept` and errors raised as in `refine`.
     """
-    vehicle, frame = measurements.dataset.vehicle, measurements.frame
-    w = (previous.wheel - vehicle.wheel) / vehicle.sigma_wheel
+    frame, calibration = measurements.frame, measurements.calibration
     problem = build_problem(measurements, model or previous.model, _initial_noise(measurements),
-                            relinearize_at=w)
-    state = state_from_poses(measurements, previous.poses[frame], previous.covariances[frame], w)
+                            previous.wheel)
+    sigma = calibration.taken_from(previous.calibration, previous.sigma, calibration.sigma)
+    c = calibration.taken_from(previous.calibration, previous.c, calibration.stated)
+    problem = replace(problem, sigma=sigma, released=previous.released)
+    state = state_from_poses(measurements, previous.poses[frame], previous.covariances[frame], c)
     state = narrow_kernels(problem, state, CAUCHY_SCALES[-1:], converged=WARM_START_CONVERGED)
-    return refine(problem, state, accept)
+    return replace(refine(problem, state, accept), explanations=previous.explanations)
 
 
 def _initial_noise(measurements):

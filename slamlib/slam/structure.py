@@ -1,8 +1,8 @@
 """Stage 1: the sparsity structure of the information matrix H.
 
-Variables are numbered: the frames' poses, the markers, the antennas, w, and c if the ranges are
-calibrated. Their unknowns are in the order in which they are eliminated. The structure depends on
-the Measurements alone and is computed once for all states, kernels and values of the noise.
+Variables are numbered: the frames' poses, the markers and the antennas. Their unknowns are in the
+order in which they are eliminated. The structure depends on the Measurements alone and is computed
+once for all states, kernels and values of the noise.
 """
 
 from copy import copy
@@ -20,8 +20,6 @@ class Variables:
     frames: np.ndarray       # (f,) of X_i
     markers: np.ndarray      # (k,) of L_j or P_j
     antennas: np.ndarray     # (a,) of A_k
-    w: np.ndarray            # (1,)
-    c: np.ndarray            # (1,), or (0,) if the ranges are not calibrated
 
 
 @dataclass(frozen=True)

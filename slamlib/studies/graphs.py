@@ -9,27 +9,28 @@ from gtsam.symbol_shorthand import X
 from slamlib import odometry, se2
 from slamlib.evaluation import anees, ate
 from slamlib.simulation import simulate
-from slamlib.slam.factors import build_problem, preintegrate_odometry
+from slamlib.slam.calibration import WHEELS
 from slamlib.slam.fit import optimize, refine
 from slamlib.slam.graph import nonlinear_graph
 from slamlib.slam.linear import log_evidence
 from slamlib.slam.measurements import Noise, measure, with_known, with_known_noise
 from slamlib.slam.pipeline import fit_from_odometry
+from slamlib.slam.problem import build_problem, preintegrate_odometry
 from slamlib.slam.result import SlamResult, slam_result
 
 
-def fixed_wheels(measurements, model, relinearize_at=None):
-    """OdometryFactors of wheels without errors; they do not depend on `relinearize_at`."""
+def fixed_wheels(measurements, model, wheel=None):
+    """OdometryFactors of wheels without errors; they do not depend on `wheel`."""
     factors = preintegrate_odometry(measurements, model)
-    return replace(factors, J_w=np.zeros_like(factors.J_w))
+    return replace(factors, J_wheel=np.zeros_like(factors.J_wheel))
 
 
-def independent_chain(measurements, model, relinearize_at=None):
+def independent_chain(measurements, model, wheel=None):
     """OdometryFactors with wheel errors as independent noise, linearised at the nominal wheels."""
     factors = preintegrate_odometry(measurements, model)
-    noise = se2.rotate_covariance(factors.J_w @ np.swapaxes(factors.J_w, 1, 2),
-                                  -factors.increment[:, 2])
-    return replace(factors, J_w=np.zeros_like(factors.J_w),
+    J_w = factors.J_wheel * measurements.dataset.vehicle.sigma_wheel
+    noise = se2.rotate_covariance(J_w @ np.swapaxes(J_w, 1, 2), -factors.increment[:, 2])
+    return replace(factors, J_wheel=np.zeros_like(factors.J_wheel),
                    quantization=factors.quantization + noise)
 
 
@@ -69,11 +70,9 @@ def graph_kinds(dataset):
 
 def _without_wheel_errors(problem):
     """The Problem in which the poses between the frames have no wheel errors either."""
-    m = problem.measurements
-    known = replace(m.dataset.vehicle, sigma_right_radius=0.0, sigma_left_radius=0.0,
-                    sigma_wheelbase=0.0)
-    m = replace(m, dataset=replace(m.dataset, vehicle=known))
-    return replace(problem, accepted=replace(problem.accepted, measurements=m))
+    sigma = problem.sigma.copy()
+    sigma[WHEELS] = 0
+    return replace(problem, sigma=sigma)
 
 
 def gtsam_chain(problem):
@@ -91,7 +90,8 @@ def evidence_curve(fit, slips, model):
 
     The measurements are those that the Fit accepts, whatever the model of the odometry steps.
     """
-    factors = preintegrate_odometry(fit.problem.measurements, model, fit.state.w)
+    factors = replace(preintegrate_odometry(
+        fit.problem.measurements, model, fit.state.c[WHEELS]), in_counts=True)
     problem, state, curve = replace(fit.problem, odometry=factors), fit.state, []
     for slip in slips:
         problem = replace(problem, noise=replace(problem.noise, slip=slip))

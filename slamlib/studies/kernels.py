@@ -8,7 +8,6 @@ import numpy as np
 
 from slamlib.increments import TYPICAL_SLIP
 from slamlib.simulation import simulate
-from slamlib.slam.factors import build_problem, state_from_arrays
 from slamlib.slam.fit import (
     CAUCHY_SCALES,
     EARLY_GATE,
@@ -28,6 +27,7 @@ from slamlib.slam.measurements import (
     with_known,
     with_known_noise,
 )
+from slamlib.slam.problem import build_problem, state_from_arrays
 from slamlib.slam.result import slam_result
 from slamlib.studies.montecarlo import judge_slam
 
@@ -72,7 +72,7 @@ def solve_with(measurements, sightings="gate", ranges="asymmetric Tukey",
         for scale in CAUCHY_SCALES:
             cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(scale)
             accepted = AcceptedMeasurements(
-                measurements, measurements.unit_weights,
+                measurements=measurements, weight=measurements.unit_weights,
                 sighting_kernel=convex.sighting_kernel if sightings in CONVEX else cauchy,
                 range_kernel=convex.range_kernel if ranges in CONVEX else cauchy)
             state = optimize(replace(problem, accepted=accepted), state).state
@@ -106,7 +106,8 @@ def graduated(problem, state):
     ranges = slice(len(m.marker_row), None)
     weight[ranges], control = 1, None
     while control is None or ((weight > 0) & (weight < 1)).any():
-        trial = replace(problem, accepted=AcceptedMeasurements(m, weight.copy()))
+        trial = replace(problem, accepted=AcceptedMeasurements(
+            measurements=m, weight=weight.copy()))
         state = optimize(trial, state, **{} if control is None else {"max_steps": 1}).state
         squared = residuals(m, state, problem.noise)[1]**2
         control = GNC_STEP * control if control else gate / max(2 * squared.max() - gate, gate)
@@ -171,5 +172,5 @@ def mislabelled(measurements, truth):
     m = measurements
     true_map = truth.marker_in_world[np.searchsorted(truth.marker, m.marker)]
     state = state_from_arrays(m, truth.poses[m.frame], true_map,
-                              np.zeros((len(m.antenna), 2)), np.zeros(3))
+                              np.zeros((len(m.antenna), 2)), m.calibration.stated)
     return np.sum(residuals(m, state, Noise())[0]**2, axis=1) > MIN_MISLABELLED_SQUARED

@@ -39,7 +39,7 @@ def read_plaza2(seed=0):
     dataset : Dataset
     truth : Truth, in the frame of pose 1.
     """
-    _, sigma = calibration(1)
+    _, sigma = ranges_over_distances(1)
     path, increments, ranges, beacons = _load(2)
     begin = np.argmax(np.cumsum(np.abs(increments[:, 1])) > STANDING)
     path, increments = path[begin:], increments[begin:]
@@ -72,7 +72,7 @@ def read_plaza2(seed=0):
                   antenna=antenna, antenna_in_world=place, vehicle=vehicle))
 
 
-def calibration(number):
+def ranges_over_distances(number):
     """Factor of measured over true ranges and their standard deviation in m, of a log, by medians.
 
     From the truth of Plaza 1 or 2.

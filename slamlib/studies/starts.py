@@ -11,11 +11,11 @@ from slamlib.increments import TYPICAL_SLIP
 from slamlib.localization import localize
 from slamlib.sightings import POINT_GATE
 from slamlib.simulation import misguess, simulate
-from slamlib.slam.factors import build_problem, state_from_arrays
 from slamlib.slam.fit import CAUCHY_SCALES, optimize
 from slamlib.slam.initialization import consensus_markers, odometry_state, state_from_poses
 from slamlib.slam.linear import NormalEquations
 from slamlib.slam.measurements import AcceptedMeasurements, Noise, measure, with_known_noise
+from slamlib.slam.problem import build_problem, state_from_arrays
 from slamlib.slam.result import slam_result
 from slamlib.studies.kernels import solve_with
 from slamlib.studies.montecarlo import antenna_error
@@ -58,7 +58,7 @@ def map_of_problem_2(measurements, in_world, covariances):
     Parameters as of `consensus_markers`.
     """
     markers = consensus_markers(measurements, in_world, covariances)
-    found = localize(measurements.dataset.aruco)
+    found = localize(measurements.dataset.sightings)
     if found.frame[0] == 0 and np.isfinite(found.poses[0, 0]):          # the same world
         mapped = np.isin(measurements.marker, found.marker)
         markers[mapped] = found.marker_in_world[
@@ -71,7 +71,7 @@ LANDMARKS = {"first sighting": first_sighting, "most certain sighting": most_cer
              "problem 2's map": map_of_problem_2}
 
 
-def guessed_antennas(measurements, poses, covariances):
+def guessed_antennas(measurements, poses, covariances, c):
     """(a, 2) antennas at their guesses; parameters as of `initialization.trilaterated_antennas`."""
     return measurements.guess
 
@@ -102,7 +102,7 @@ def landmarks(seed, path="short", drift=1.0, known=True, kernel="graduated",
     rounds = _kernel_rounds(build_problem(m, "arc", noise), kernel)
     true_map = truth.marker_in_world[np.searchsorted(truth.marker, m.marker)]
     best = optimize(rounds[-1], state_from_arrays(
-        m, truth.poses[m.frame], true_map, np.zeros((0, 2)), np.zeros(3))).error
+        m, truth.poses[m.frame], true_map, np.zeros((0, 2)), m.calibration.stated)).error
     return _from_each_start(rounds, best, true_map, starts)
 
 
@@ -112,18 +112,19 @@ def landmarks_of_drive(dataset, found, kernel="last", starts=tuple(LANDMARKS)):
     Model and noise are those of the result. Returns the numbers of `landmarks`; the optimum reached
     from the result, and its map, replace the truth.
     """
-    m, vehicle = measure(dataset.without("uwb")), dataset.vehicle
-    rounds = _kernel_rounds(build_problem(m, found.model, found.noise), kernel)
+    m = measure(dataset.without("uwb"))
+    problem = replace(build_problem(m, found.model, found.noise), sigma=found.sigma)
+    rounds = _kernel_rounds(problem, kernel)
     best = optimize(rounds[-1], state_from_poses(
-        m, found.poses[m.frame], found.covariances[m.frame],
-        (found.wheel - vehicle.wheel) / vehicle.sigma_wheel))
+        m, found.poses[m.frame], found.covariances[m.frame], found.c))
     return _from_each_start(rounds, best.error, best.state.markers, starts)
 
 
 def _kernel_rounds(problem, kernel):
     """Problems with the scales of the Cauchy kernel, "graduated" or the "last" one only."""
     m, cauchy = problem.measurements, gtsam.noiseModel.mEstimator.Cauchy.Create
-    return [replace(problem, accepted=AcceptedMeasurements(m, m.unit_weights, cauchy(scale)))
+    return [replace(problem, accepted=AcceptedMeasurements(
+        measurements=m, weight=m.unit_weights, sighting_kernel=cauchy(scale)))
             for scale in (CAUCHY_SCALES if kernel == "graduated" else CAUCHY_SCALES[-1:])]
 
 

@@ -1,0 +1,387 @@
+"""What sensors share: derivatives, posterior, decision, and drives whose files are wrong there."""
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+from gtsam.symbol_shorthand import C
+from numeric import central_differences
+
+from slamlib import se2, slam
+from slamlib.checks.solution import GROUPS, solution_doubts
+from slamlib.dataset import Vehicle, read_dataset, read_truth
+from slamlib.evaluation import align, anees, ate
+from slamlib.simulation import mislabel, simulate
+from slamlib.slam import choices, graph
+from slamlib.slam.calibration import (
+    ANTENNAS,
+    ENTRIES,
+    HEIGHT,
+    RANGE_LAG,
+    SIGHTING_LAG,
+    WHEELS,
+    calibration_table,
+    stated_calibration,
+)
+from slamlib.slam.factors import (
+    kernel_bias,
+    odometry_error,
+    range_error,
+    sighting_error,
+)
+from slamlib.slam.fit import KERNELS
+from slamlib.slam.initialization import odometry_state
+from slamlib.slam.linear import NormalEquations, linear_solution
+from slamlib.slam.measurements import SMOOTHED_STEPS, Noise, measure
+from slamlib.slam.problem import build_problem, retract
+
+REAL_LOGS = Path(__file__).parents[2] / "shared" / "real_logs"      # where they are present
+# Sensors of which every entry differs from its default.
+MOUNTED = Vehicle(camera_x=0.15, camera_y=-0.08, camera_turn=0.3, marker_size=1.03,
+                  sighting_lag=3.4, tag_x=0.2, tag_y=-0.1, antenna_height=2.0, range_offset=0.1,
+                  range_scale=1.02, range_lag=-7.6)
+DOUBTFUL = {f"sigma_{entry.name}": 0.01 for entry in ENTRIES}
+
+
+def equations_of(vehicle, count=400, seed=4):
+    """NormalEquations of a short drive whose first three markers are points, far from the optimum.
+
+    All entries of the calibration are unknowns, offsets of antennas with sigma 0.1 m.
+    """
+    dataset, _ = simulate("short", seed)
+    points = np.isin(dataset.aruco.marker, dataset.aruco.marker[:3])
+    covariance = dataset.aruco.covariance.copy()
+    covariance[points, 2] = covariance[points, :, 2] = [0, 0, 4.0]
+    dataset = replace(dataset.first(count), vehicle=vehicle)
+    dataset = replace(dataset, aruco=replace(
+        dataset.aruco, covariance=covariance[:len(dataset.aruco.pose)]))
+    m = measure(dataset)
+    assert 0 < np.count_nonzero(m.oriented) < len(m.oriented)
+    sigma = m.calibration.sigma.copy()
+    sigma[ANTENNAS] = 0.1
+    problem = replace(build_problem(m, "arc", Noise(2e-3, 1.5, 0.7)), sigma=sigma)
+    problem = replace(problem, odometry=replace(problem.odometry, in_counts=True))
+    state = odometry_state(m, "arc")
+    c = state.c + sigma * np.random.default_rng(seed).normal(size=len(sigma))
+    return NormalEquations(problem, replace(state, c=c))
+
+
+@pytest.mark.parametrize("vehicle", [replace(MOUNTED, **DOUBTFUL), Vehicle(**DOUBTFUL)],
+                         ids=["mounted", "in the origin"])
+def test_derivatives_by_every_entry(vehicle):
+    """Of whitened errors of sightings, of poses and of points, of ranges, and of odometry.
+
+    Those of odometry leave out how the scale of the errors changes its own slope. Those by delays
+    are averaged over encoder steps, because counts are whole numbers; so are the differences.
+    """
+    equations = equations_of(vehicle)
+    problem, state, n = equations.problem, equations.state, len(equations.structure.diagonal)
+    m = problem.measurements
+
+    def moved(delta):
+        return retract(problem, state, np.r_[np.zeros(n), delta])
+
+    q = problem.active.sum()
+    assert q == len(ENTRIES) + 4
+    delays = np.isin(np.arange(q), [SIGHTING_LAG, RANGE_LAG])
+    for kind in range(3):
+        def errors(delta, kind=kind):
+            return NormalEquations(problem, moved(delta)).linearized[kind].e
+
+        f, numeric = equations.linearized[kind], central_differences(errors, np.zeros(q), 1e-4)
+        steps = (SMOOTHED_STEPS + 0.5) / problem.sigma[SIGHTING_LAG]
+        numeric[..., delays] = central_differences(errors, np.zeros(q), steps)[..., delays]
+        J = np.zeros_like(numeric)
+        J[..., f.columns] = f.J_c
+        inside = (m.frame[f.row] > 20) & (m.frame[f.row] < m.frame[-1] - 20)
+        J, numeric = J[inside], numeric[inside]
+        scale = np.abs(numeric).max(axis=(0, 1)) + 1e-9
+        assert (np.abs(J - numeric) < np.where(delays, 0.1, 1e-6) * scale).all()
+        assert (np.abs(J).max(axis=(0, 1)) > 0).sum() == (5, 5, 6 + 4)[kind]
+    numeric = central_differences(
+        lambda wheel: odometry_error(problem.odometry, state.poses, wheel)[0], state.c[WHEELS])
+    J = odometry_error(problem.odometry, state.poses, state.c[WHEELS])[2]
+    assert (np.abs(J - numeric) < 1e-3 * np.abs(numeric).max(axis=(0, 1))).all()
+
+
+@pytest.mark.parametrize("as_pose", [True, False], ids=["pose", "point"])
+def test_derivatives_by_pose_and_landmark_from_a_sensor_elsewhere(as_pose):
+    """By GTSAM's tangent vectors; the tag and the camera are not in the vehicle's origin."""
+    rng = np.random.default_rng(3)
+    pose, motion, velocity, marker = rng.normal(size=(4, 1, 3))
+    antenna, c = rng.normal(size=(1, 2)), stated_calibration(MOUNTED, [7]).stated
+
+    def seen(delta):
+        moved = se2.compose(pose, delta[None, :3])
+        landmark = se2.compose(marker, delta[None, 3:]) if as_pose else marker + delta[3:]
+        return sighting_error(z, moved, motion, velocity, landmark, c, as_pose)[0]
+
+    def measured(delta):
+        moved = se2.compose(pose, np.r_[delta[:3]][None])
+        return range_error(np.zeros(1), moved, motion, velocity, antenna + delta[3:],
+                           np.zeros(1), c)[0]
+
+    z = rng.normal(size=(1, 3))
+    _, by_pose, by_marker, _ = sighting_error(z, pose, motion, velocity, marker, c, as_pose)
+    numeric = central_differences(seen, np.zeros(6))
+    width = 6 if as_pose else 5
+    np.testing.assert_allclose(np.concatenate([by_pose, by_marker], axis=2),
+                               numeric[..., :width], atol=1e-7)
+    _, by_pose, by_antenna, _ = range_error(
+        np.zeros(1), pose, motion, velocity, antenna, np.zeros(1), c)
+    np.testing.assert_allclose(np.concatenate([by_pose, by_antenna], axis=2)[0],
+                               central_differences(measured, np.zeros(5)), atol=1e-7)
+
+
+def test_the_posterior_is_that_of_gtsam():
+    """Mean and covariance of the whole vector by the dense inverse of GTSAM's Hessian."""
+    equations = equations_of(replace(MOUNTED, **DOUBTFUL), count=150)
+    problem, q = equations.problem, equations.problem.active.sum()
+    ordering = gtsam.Ordering(problem.measurements.ordering)
+    ordering.push_back(C(0))
+    matrix, vector = graph.linearize(problem, equations.state).hessian(ordering)
+    scale = 1 / np.sqrt(np.diag(matrix))
+    inverse = np.linalg.inv(matrix * scale[:, None] * scale) * scale[:, None] * scale
+    H, border, *_ = equations.sums(problem.noise)
+    solution = linear_solution(equations.structure, H, border)
+    np.testing.assert_allclose(np.linalg.inv(solution.S), inverse[-q:, -q:], rtol=1e-5, atol=1e-9)
+    expected = inverse @ vector
+    np.testing.assert_allclose(solution.delta, expected, atol=1e-6 * np.abs(expected).max())
+    step = graph.gtsam_step(problem, equations.state)
+    np.testing.assert_allclose(solution.delta, step, atol=1e-6 * np.abs(step).max())
+
+
+def test_evidence_of_one_entry_by_hand():
+    """Likelihood exp(-L u^2 / 2 + h u), prior N(0, s^2): evidence by quadrature."""
+    L, h, s = 4.0, 6.0, 0.7
+    u = np.linspace(-10, 10, 200_001)
+    density = np.exp(-L * u**2 / 2 + h * u) * np.exp(-u**2 / 2 / s**2) / s / np.sqrt(2 * np.pi)
+    found, largest = choices._log_evidence(np.array([[L]]), np.array([h]), np.array([s]))
+    assert np.isclose(found, np.log(np.trapezoid(density, u)), atol=1e-9)
+    assert np.isclose(largest, np.trapezoid(u * density, u) / np.trapezoid(density, u) / s)
+    assert choices._log_evidence(np.array([[L]]), np.array([h]), np.zeros(1)) == (0, 0)
+
+
+def test_errors_in_counts_do_not_shrink_with_the_scale():
+    """All lengths 4 % smaller, wheelbase too: whitened errors of odometry stay as they were."""
+    m = measure(simulate("short", 4)[0].first(400).without("uwb"))
+    from_stated = build_problem(m, "arc", Noise()).odometry
+    wheel = 0.96 * from_stated.stated
+    poses = odometry_state(m, "arc").poses + 1e-3 * np.random.default_rng(1).normal(size=(
+        len(m.frame), 3))
+    scaled = build_problem(m, "arc", Noise(), wheel).odometry
+    expected, *_ = odometry_error(from_stated, poses, from_stated.stated)
+    found, *_ = odometry_error(replace(scaled, in_counts=True), poses * [0.96, 0.96, 1], wheel)
+    np.testing.assert_allclose(found, expected, atol=1e-5)         # log of se2 bends a little
+    smaller, *_ = odometry_error(scaled, poses * [0.96, 0.96, 1], wheel)
+    np.testing.assert_allclose(smaller[:, :2], 0.96 * expected[:, :2], atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["asymmetric Tukey", "asymmetric Cauchy"])
+def test_ranges_without_late_ones_have_no_bias(name):
+    """The weighted mean of a million residuals is zero where the kernel's bias is counted."""
+    r, kernel = np.random.default_rng(5).normal(size=100_000), KERNELS[name]
+    b = kernel_bias(kernel)
+    assert -0.2 < b < -0.05
+
+    def mean(shift):
+        weight = np.array([kernel.weight(x) for x in r - shift])
+        return np.sum(weight * (r - shift)) / np.sum(weight)
+
+    assert abs(mean(b)) < 0.01 < abs(mean(0))
+    assert kernel_bias(KERNELS["Tukey"]) == 0
+
+
+def test_a_height_is_told_by_itself_and_not_by_half_its_square():
+    stated = stated_calibration(Vehicle(antenna_height=2.0, sigma_antenna_height=0.1), [3, 9])
+    assert np.isclose(stated.stated[HEIGHT], 2.0) and np.isclose(stated.sigma[HEIGHT], 0.2, 1e-2)
+    rows = calibration_table(stated, stated.stated, np.diag(stated.sigma**2), {"antenna-height"})
+    row = rows[HEIGHT]
+    assert (row["name"], row["unit"], row["released"]) == ("antenna_height", "m", True)
+    assert np.allclose([row["stated"], row["stated_sigma"], row["estimate"], row["sigma"]],
+                       [2.0, 0.1, 2.0, 0.1], rtol=1e-2)
+    assert [row["name"] for row in rows[ANTENNAS]] == ["offset of antenna 3", "offset of antenna 9"]
+    assert {row["group"] for row in rows} == set(GROUPS)
+
+
+# The drive of a seed as sensors elsewhere would have logged it, with the same noise.
+
+def seen_from(dataset, camera=(0.0, 0.0, 0.0), size=1.0, late=0):
+    """The dataset of a camera elsewhere, of larger markers, whose sightings are late."""
+    z = se2.compose(se2.inverse(np.array(camera)), dataset.aruco.marker_in_vehicle)
+    pose = dataset.aruco.pose + late
+    covariance = se2.rotate_covariance(dataset.aruco.covariance, -camera[2])
+    return replace(dataset, aruco=replace(
+        dataset.aruco, pose=pose, marker_in_vehicle=z / [size, size, 1],
+        covariance=covariance).select(pose < len(dataset.ticks)))
+
+
+def ranged_from(dataset, truth, tag=(0.0, 0.0), height=0.0, offsets=0.0, late=0):
+    """The dataset of a tag elsewhere, of antennas above it with offsets, whose ranges are late."""
+    u = dataset.uwb
+    antenna = np.searchsorted(truth.antenna, u.antenna)
+    pose = truth.poses[u.pose]
+    place = pose[:, :2] + (se2.rotation(pose[:, 2]) @ np.array(tag)[:, None])[..., 0]
+    noise = u.range - np.hypot(*(truth.antenna_in_world[antenna] - pose[:, :2]).T)
+    distance = np.hypot(np.hypot(*(truth.antenna_in_world[antenna] - place).T), height)
+    offsets = np.broadcast_to(offsets, len(truth.antenna))[antenna]
+    moved = u.pose + late
+    return replace(dataset, uwb=replace(
+        u, pose=moved, range=distance + offsets + noise).select(moved < len(dataset.ticks)))
+
+
+OF_RANGES = {"tag-offset", "antenna-height", "range-delay", "antenna-offsets"}
+FAULTS = {                         # what the right doubt names, and the drive
+    "camera ahead": ("camera-offset", lambda d, t: seen_from(d, (0.15, 0.0, 0.0))),
+    "camera aside and turned": ("camera-offset", lambda d, t: seen_from(d, (0.1, 0.05, 0.03))),
+    "markers too large": ("marker-size", lambda d, t: seen_from(d, size=1.04)),
+    "sightings late": ("time-offset", lambda d, t: seen_from(d, late=1)),
+    "tag ahead": ("tag-offset", lambda d, t: ranged_from(d, t, tag=(0.3, 0.0))),
+    "antennas high": ("antenna-height", lambda d, t: ranged_from(d, t, height=2.5)),
+    "a wall": ("antenna-offsets", lambda d, t: ranged_from(d, t, offsets=[0.7, 0, 0, 0])),
+    "antennas differ": ("antenna-offsets", lambda d, t: ranged_from(
+        d, t, offsets=[0.5, -0.3, 0.2, -0.6])),
+    "ranges late": ("range-delay", lambda d, t: ranged_from(d, t, late=30)),
+    "wheelbase": ("wheel-parameters", lambda d, t: replace(
+        d, vehicle=replace(d.vehicle, wheelbase=0.42)))}
+
+
+@cache
+def drive(seed):
+    return simulate("short", seed)
+
+
+@cache
+def right_ate(seed, ranges):
+    """ATE in m after alignment, of the drive as its files say."""
+    dataset, truth = drive(seed)
+    found = slam.estimate(dataset if ranges else dataset.without("uwb"))
+    assert not solution_doubts(found)
+    return ate(found.poses, truth.poses, aligned=True)
+
+
+def antenna_nees(found, truth):
+    rows = np.searchsorted(truth.antenna, found.antenna)
+    off = found.antenna_in_world - truth.antenna_in_world[rows]
+    return np.einsum("ki,kij,kj->k", off, np.linalg.inv(found.antenna_covariance), off)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 7])
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_wrong_statement_is_named_and_mended(fault, seed):
+    """The ATE is nearly that of right files, the covariances hold, and the cause has its name."""
+    what, spoil = FAULTS[fault]
+    dataset, truth = drive(seed)
+    spoilt = spoil(dataset, truth)
+    markers = slam.estimate(spoilt.without("uwb"))
+    both = slam.estimate(spoilt, previous=markers)
+    for result in (both,) if what in OF_RANGES else (markers, both):
+        assert what in {doubt.what for doubt in solution_doubts(result)}
+    for result, ranges in ((markers, False), (both, True)):
+        possible = right_ate(seed, ranges)
+        if what == "marker-size" and not ranges:     # all lengths are those of the wheels
+            possible = np.hypot(possible, 1e-3 * np.hypot(*truth.poses[:, :2].std(axis=0)))
+        assert ate(result.poses, truth.poses, aligned=True) < 1.5 * possible
+        assert anees(result.poses, result.covariances, truth.poses) < 6
+    assert antenna_nees(both, truth).mean() < 8
+
+
+@pytest.mark.slow
+def test_what_is_stated_is_used():
+    """A vehicle.toml that says where the sensors are: the same estimate, and nothing to doubt."""
+    dataset, truth = drive(1)
+    spoilt = ranged_from(seen_from(dataset, (0.15, -0.05, 0.1), size=1.03), truth, tag=(0.3, 0.1),
+                         height=2.0)
+    stated = replace(spoilt, vehicle=replace(
+        dataset.vehicle, camera_x=0.15, camera_y=-0.05, camera_turn=0.1, marker_size=1.03,
+        tag_x=0.3, tag_y=0.1, antenna_height=2.0))
+    found, right = slam.estimate(stated), slam.estimate(dataset)
+    assert not solution_doubts(found) and not found.released
+    assert np.abs(found.poses - right.poses)[:, :2].max() < 2e-3
+    assert np.abs(found.antenna_in_world - right.antenna_in_world).max() < 0.03
+
+
+@pytest.mark.slow
+def test_without_noise_the_calibration_is_found_exactly():
+    dataset, truth = simulate("short", 2, noise=False)
+    camera, vehicle = (0.12, 0.04, -0.05), replace(dataset.vehicle, sigma_heading=1e-6)
+    spoilt = ranged_from(seen_from(replace(dataset, vehicle=vehicle), camera, size=1.02), truth,
+                         height=2.0)
+    found = slam.estimate(spoilt, slip=1e-4)
+    values = {row["name"]: row["estimate"] for row in found.calibration_table}
+    assert {"camera-offset", "marker-size", "antenna-height"} <= found.released
+    assert np.allclose([values[name] for name in ("camera_x", "camera_y", "camera_turn")], camera,
+                       atol=1e-4)
+    assert np.isclose(values["marker_size"], 1.02, atol=1e-4)
+    assert np.isclose(values["antenna_height"], 2.0, atol=2e-3)
+    assert ate(found.poses, truth.poses) < 1e-3
+
+
+def test_explanations_that_the_drive_cannot_tell_apart_are_both_released():
+    """Two groups with nearly the same columns of the likelihood; a third one has no part in it."""
+    dataset, _ = drive(1)
+    fit = type("Fit", (), {})()
+    m = measure(dataset.first(200))
+    fit.problem = build_problem(m, "arc", Noise())
+    p = len(m.calibration.stated)
+    row = np.zeros(p)
+    tag_x, delay = 8, 13
+    row[tag_x], row[delay] = 1.0, 1.02
+    L, h = 400 * np.outer(row, row) + np.diag(np.r_[np.ones(p - 4), np.zeros(4)]), 100 * row
+    found = proposal(fit, L, h)
+    assert set(found.explanations) == {frozenset({"tag-offset"}), frozenset({"range-delay"})}
+    assert found.groups == {"tag-offset", "range-delay"} and found.lead > 0
+    assert found.sigma[tag_x] == m.calibration.wide[tag_x]
+    grossly = proposal(fit, L, 60 * h)
+    assert grossly.sigma[tag_x] == choices.GROSS * m.calibration.wide[tag_x]
+    right = proposal(fit, L, 0 * h)
+    assert right.explanations == (frozenset(),) and right.groups == frozenset()
+
+
+def proposal(fit, L, h):
+    """`choices._proposal` of a Fit with a given likelihood of the calibration."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(choices, "_likelihood", lambda _: (L, h))
+        return choices._proposal(fit)
+
+
+@pytest.mark.slow
+def test_no_doubt_about_clean_drives():
+    """Of all slips, with late ranges and wrong labels too; corridors may have mirrored antennas."""
+    doubts = []
+    for seed, slip in enumerate([0.0, 3e-4, 1e-3, 3e-3, 1e-2] * 4):
+        dataset, _ = simulate("short", 100 + seed, slip=slip, late_ranges=0.1 * (seed % 2))
+        if seed % 3 == 2:
+            dataset = mislabel(dataset, 0.02, seed)
+        markers = slam.estimate(dataset.without("uwb"))
+        both = slam.estimate(dataset, previous=markers)
+        doubts += [doubt.what for found in (markers, both) for doubt in solution_doubts(found)]
+    assert not doubts
+
+
+def aligned_judgement(found, truth):
+    """ATE in m and mean NEES of positions (2 is right) after alignment, without the first tenth."""
+    T = align(found.poses, truth.poses)
+    poses, covariances = se2.compose(T, found.poses), se2.rotate_covariance(found.covariances, T[2])
+    later = slice(len(poses) // 10, None)
+    off, C = (poses - truth.poses)[later, :2], covariances[later, :2, :2]
+    squared = np.einsum("ni,nij,nj->n", off, np.linalg.inv(C), off)
+    return ate(found.poses, truth.poses, aligned=True), squared.mean()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not REAL_LOGS.is_dir(), reason="the public robot logs are not here")
+@pytest.mark.parametrize("log, largest, what", [
+    ("starloc_b", 0.020, "marker-size"), ("mrclam_b", 0.100, "camera-offset")])
+def test_public_logs(log, largest, what):
+    """AprilTags with ranges, printed too large; barcodes seen by a camera behind the axle."""
+    dataset, truth = read_dataset(REAL_LOGS / log), read_truth(REAL_LOGS / log)
+    found = slam.estimate(dataset.without("uwb"))
+    for result in (found, slam.estimate(dataset, previous=found))[:1 + (dataset.uwb is not None)]:
+        assert what in {doubt.what for doubt in solution_doubts(result)}
+        error, squared = aligned_judgement(result, truth)
+        assert error < largest and squared < 4
