@@ -6,7 +6,7 @@ is drawn, and errors are computed from it, where the drive has it.
 
 import numpy as np
 
-from slamlib import evaluation, se2
+from slamlib import evaluation
 from slamlib.notebook import inline, plotting
 from slamlib.notebook.means import three_digits
 from slamlib.notebook.names import Names
@@ -132,25 +132,6 @@ def _antenna_rows(drive, result):
             for antenna, doubtful, place, s, distance in zip(
                 result.antenna, in_doubt(result), result.antenna_in_world, sigma, moved,
                 strict=True)]
-
-
-def marker_table(drive, result):
-    """Header (list of str) and rows (lists of str) of a table of all markers of a result.
-
-    Each row has id, pose, standard deviations and, where the truth is known, the distance from the
-    true position and the error of the heading. A marker without orientation has no heading.
-    """
-    header = ["marker", "x (m)", "y (m)", "δ (°)", "σ of x (mm)", "σ of y (mm)", "σ of δ (mrad)"]
-    rows = _marker_rows(result)
-    if drive.truth is None or not len(drive.truth.marker):
-        return header, rows
-    true = plotting.places_by_id(drive.truth.marker, drive.truth.marker_in_world, result.marker)
-    errors = _distances(result.marker_in_world, true)
-    turned = np.abs(se2.wrap(result.marker_in_world[:, 2] - true[:, 2]))
-    turned[~_oriented(result)] = np.nan
-    return ([*header, "error (mm)", "error of δ (mrad)"],
-            [[*row, _thousandths(error), _thousandths(angle)]
-             for row, error, angle in zip(rows, errors, turned, strict=True)])
 
 
 def _marker_rows(result):

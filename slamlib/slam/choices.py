@@ -65,7 +65,7 @@ def better_model(fit):
 def calibrated(fit, accept=accepted_measurements):
     """The Fit in which groups of the calibration have left their stated values.
 
-    `accept` as in `refine`. Returns `fit` itself if the evidence speaks for none.
+    `accept` as in `refine`. It is that of `fit` if the evidence speaks for none.
     """
     tried = []
     for _ in range(MAX_PROPOSALS):
@@ -83,9 +83,9 @@ def calibrated(fit, accept=accepted_measurements):
             lead = _lead(proposed, fit)
         except (DatasetError, np.linalg.LinAlgError):
             break
-        if proposed.problem.accepted.weight.sum() \
-                < MIN_ACCEPTED * fit.problem.accepted.weight.sum() \
-                or lead < min(0, proposal.lead) - DECISIVE_RELEASE * (proposal.lead < 0):
+        least = 0.0 if proposal.lead >= 0 else proposal.lead - DECISIVE_RELEASE
+        kept, present = (each.problem.accepted.weight.sum() for each in (proposed, fit))
+        if lead < least or kept < MIN_ACCEPTED * present:
             break
         fit = replace(proposed, explanations=proposal.explanations)
     return fit
@@ -105,12 +105,11 @@ def _proposal(fit):
     """The _Proposal for a Fit.
 
     Every released group must raise the log evidence by DECISIVE_RELEASE, by FURTHER_ENTRY more for
-    each of its entries but one, and by STATED more if its standard deviations are stated: these
-    are prior odds. Explanations are the best set and others that come within
-    AMBIGUOUS of it, neither part of it nor more: the drive cannot tell them apart. What else raises
-    the evidence is not certain enough to be told, but the covariances have to include it. If an
-    entry would be further off than MAX_WIDE_SIGMAS, the statement is grossly wrong, and all wide
-    standard deviations are multiplied by GROSS.
+    each of its entries but one, and by STATED more if its standard deviations are stated: these are
+    prior odds. Explanations are the best set and others that come within AMBIGUOUS of it, neither
+    part of it nor more: the drive cannot tell them apart. What else raises the evidence is not
+    certain enough to be told, but the covariances have to include it. If an entry would be further
+    off than MAX_WIDE_SIGMAS, a statement is grossly wrong, and wide sigmas are multiplied by GROSS.
     """
     calibration = fit.problem.measurements.calibration
     L, h = _likelihood(fit)
