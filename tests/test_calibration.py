@@ -11,9 +11,11 @@ from gtsam.symbol_shorthand import C
 from numeric import central_differences
 
 from slamlib import se2, slam
+from slamlib.checks.files import doubts_before_solving
 from slamlib.checks.solution import GROUPS, solution_doubts
 from slamlib.dataset import Vehicle, read_dataset, read_truth
 from slamlib.evaluation import align, anees, ate
+from slamlib.localization import fuse, fuse_increments, localize
 from slamlib.simulation import mislabel, simulate
 from slamlib.slam import choices, graph
 from slamlib.slam.calibration import (
@@ -213,9 +215,11 @@ def seen_from(dataset, camera=(0.0, 0.0, 0.0), size=1.0, late=0):
     """The dataset of a camera elsewhere, of larger markers, whose sightings are late."""
     z = se2.compose(se2.inverse(np.array(camera)), dataset.aruco.marker_in_vehicle)
     pose = dataset.aruco.pose + late
-    covariance = se2.rotate_covariance(dataset.aruco.covariance, -camera[2])
+    scale = np.array([size, size, 1])
+    covariance = se2.rotate_covariance(dataset.aruco.covariance, -camera[2]) \
+        / np.outer(scale, scale)
     return replace(dataset, aruco=replace(
-        dataset.aruco, pose=pose, marker_in_vehicle=z / [size, size, 1],
+        dataset.aruco, pose=pose, marker_in_vehicle=z / scale,
         covariance=covariance).select(pose < len(dataset.ticks)))
 
 
@@ -303,6 +307,19 @@ def test_what_is_stated_is_used():
     assert not solution_doubts(found) and not found.released
     assert np.abs(found.poses - right.poses)[:, :2].max() < 2e-3
     assert np.abs(found.antenna_in_world - right.antenna_in_world).max() < 0.03
+
+
+def test_problem_2_and_the_checks_of_files_see_by_the_stated_camera():
+    """A camera turned by a right angle is no flaw of the files if vehicle.toml says so."""
+    dataset, _ = drive(1)
+    dataset = dataset.without("uwb").first(500)
+    camera = (0.15, -0.05, np.pi / 2)
+    spoilt = seen_from(dataset, camera, size=1.5)
+    stated = replace(spoilt, vehicle=replace(
+        dataset.vehicle, camera_x=0.15, camera_y=-0.05, camera_turn=np.pi / 2, marker_size=1.5))
+    assert doubts_before_solving(spoilt) and not doubts_before_solving(stated)
+    for solve in (lambda d: localize(d.sightings), fuse, fuse_increments):
+        np.testing.assert_allclose(solve(stated).poses, solve(dataset).poses, atol=1e-9)
 
 
 @pytest.mark.slow
