@@ -189,6 +189,17 @@ def test_the_slip_stays_within_its_bounds(monkeypatch):
         assert np.isclose(fused._likeliest_slip(None), bound)
 
 
+@pytest.mark.parametrize("likelihood", [
+    lambda slip: np.nan, lambda slip: np.inf, lambda slip: -1e9 * (slip > 1e-3),
+    lambda slip: 1e4 * np.sin(1e4 * np.log(slip))], ids=["none", "infinite", "a cliff", "rough"])
+def test_the_search_of_the_slip_ends_whatever_the_likelihood(monkeypatch, likelihood):
+    monkeypatch.setattr(fused, "_filter", lambda given, slip: (
+        None, None, fused._State(None, None, None, None, likelihood(slip))))
+    with np.errstate(all="ignore"):
+        low, high = increments.SLIP_BOUNDS
+        assert low <= fused._likeliest_slip(None) * (1 + 1e-9) <= high * (1 + 1e-8)
+
+
 def test_the_hint_fuses_by_information():
     """One interval: C = (C_o^-1 + C_m^-1)^-1 and Delta = C (C_o^-1 Delta_o + C_m^-1 Delta_m)."""
     dataset, _ = simulate("short", seed=6)
