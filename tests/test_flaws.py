@@ -388,8 +388,8 @@ def solved(noise=(1e-3, 1.0, 1.0), noise_sigma=(0.1, 0.02, 0.03), explanations=(
     return SimpleNamespace(**dict(
         noise=Noise(*noise), slip=noise[0], noise_sigma=np.array(noise_sigma),
         range_weight=np.repeat([0.0, 1.0], [0, 20]), explanations=explanations,
-        calibration_table=table, doubts={}, converged=True, rejected=np.zeros(0, bool),
-        turn_sigma=np.zeros(0), sightings=SimpleNamespace(
+        calibration_table=table, doubts={}, converged=True, antenna=np.array([5, 6]),
+        rejected=np.zeros(0, bool), turn_sigma=np.zeros(0), sightings=SimpleNamespace(
             contradicting=0, marker=np.zeros(0, int), frame=np.arange(1))) | changes)
 
 
@@ -407,8 +407,10 @@ def test_every_group_is_named_with_what_is_stated_and_found(group):
     calibration = stated_calibration(Vehicle(), np.array([5, 6]))
     found = solved(explanations=(frozenset([group]),), c=calibration.stated + 0.01)
     doubt, = solution.calibration_doubts(found)
-    assert doubt.what == group and doubt.sentence.endswith("State it in vehicle.toml.")
-    assert "cannot tell" not in doubt.sentence
+    assert doubt.what == group and doubt.sentence.endswith(GROUPS[group][1])
+    assert "problem 4 uses this" in doubt.sentence and "cannot tell" not in doubt.sentence
+    found.antenna = np.zeros(0, int)
+    assert "problem 3 uses this" in solution.calibration_doubts(found)[0].sentence
     for name, of in zip(calibration.names, calibration.group):
         assert (f"{name} = " in doubt.sentence) == (of == group)
     assert not solution.calibration_doubts(solved(c=calibration.stated + 0.01))
@@ -426,16 +428,18 @@ def test_numbers_are_given_with_standard_deviations_and_units():
 
 
 def test_explanations_that_exclude_each_other_are_all_named():
-    """What all of them have in common is told by itself."""
+    """In the sentence of the one that is furthest off; what they have in common has its own."""
     wheels, size, tag = "wheel-parameters", "marker-size", "tag-offset"
-    found = solved(explanations=(frozenset([wheels, tag]), frozenset([size, tag])))
+    c = stated_calibration(Vehicle(), np.array([5, 6])).stated
+    c = c + 0.01 * (np.arange(16) == 6)                                # of the size
+    found = solved(explanations=(frozenset([wheels, tag]), frozenset([size, tag])), c=c)
     said = {doubt.what: doubt.sentence for doubt in solution.calibration_doubts(found)}
-    assert [*said] == [wheels, size, tag]
-    assert "cannot tell this from the size of the markers; the cov" in said[wheels]
-    assert "cannot tell this from the wheels; the cov" in said[size]
-    found = solved(explanations=(frozenset([wheels]), frozenset([size]), frozenset([tag])))
-    said = {doubt.what: doubt.sentence for doubt in solution.calibration_doubts(found)}
-    assert "from the size of the markers or the place of the UWB tag" in said[wheels]
+    assert [*said] == [size, tag]
+    assert "It may instead be the wheels: the drive cannot tell" in said[size]
+    assert "instead" not in said[tag]
+    found = solved(explanations=(frozenset([wheels]), frozenset([size]), frozenset([tag])), c=c)
+    doubt, = solution.calibration_doubts(found)
+    assert "instead be the wheels or the place of the UWB tag" in doubt.sentence
 
 
 @pytest.mark.parametrize("factor, sigma, said", [

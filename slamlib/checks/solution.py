@@ -16,15 +16,19 @@ MAX_REJECTED = 0.1           # share of the sightings that are rejected
 MIN_SIGHTINGS_PER_MARKER = 5         # number of sightings, of which the majority must be accepted
 # By group of the calibration: its name in a sentence, and what to look at.
 GROUPS = {
-    "wheel-parameters": ("the wheels", "Measure them."),
-    "camera-offset": ("the place of the camera", "Measure it, from midway between the wheels."),
-    "marker-size": ("the size of the markers", "Measure a printed marker. Wheels that are all off "
-                    "by one factor look the same."),
+    "wheel-parameters": ("the wheels", "Measure them, or state larger sigmas in vehicle.toml."),
+    "camera-offset": ("the place of the camera", "Measure it from midway between the wheels, and "
+                      "state it in vehicle.toml."),
+    "marker-size": ("the size of the markers", "Measure a printed marker, and state its size in "
+                    "vehicle.toml. Wheels that are all off by one factor look the same."),
     "time-offset": ("a delay of the sightings", "Look at the pose ids of ArucoReading.txt, and "
                     "whether rows are missing in encoderReading.txt."),
-    "tag-offset": ("the place of the UWB tag", "Measure it, from midway between the wheels."),
-    "antenna-height": ("the height of the antennas", "Measure it over the tag."),
-    "range-offset": ("offset and scale of the ranges", "Calibrate the antennas."),
+    "tag-offset": ("the place of the UWB tag", "Measure it from midway between the wheels, and "
+                   "state it in vehicle.toml."),
+    "antenna-height": ("the height of the antennas", "Measure it over the tag, and state it in "
+                       "vehicle.toml."),
+    "range-offset": ("offset and scale of the ranges", "Calibrate the antennas, and state both in "
+                     "vehicle.toml."),
     "range-delay": ("a delay of the ranges", "Look at the pose ids of UwbReading.txt."),
     "antenna-offsets": ("an offset of each antenna", "Calibrate the antennas, and look for walls "
                         "before them.")}
@@ -46,22 +50,28 @@ def solution_doubts(result):
 def calibration_doubts(result):
     """List of a Doubt for each group of the calibration that decidedly left its stated values.
 
-    Groups that are released without a decision only make the covariances larger.
+    Of groups that the drive cannot tell apart there is one Doubt, about the one that is furthest
+    from what is stated. Groups that are released without a decision only make the covariances
+    larger.
     """
-    doubts, decided = [], frozenset().union(*result.explanations)
     common = frozenset.intersection(*result.explanations)
-    for group in (group for group in GROUPS if group in decided):
+    either = frozenset().union(*result.explanations) - common
+    rows = [row for row in result.calibration_table if row["group"] in common | either]
+    distance = {group: max(abs(row["estimate"] - row["stated"]) / row["sigma"]
+                           for row in rows if row["group"] == group) for group in either}
+    furthest = {max(distance, key=distance.get)} if either else set()
+    problem, doubts = "problem 4" if len(result.antenna) else "problem 3", []
+    for group in (group for group in GROUPS if group in common | furthest):
         numbers = " and ".join(
             f"{row['name']} = {row['estimate']:.4g} ± {row['sigma']:.2g} {row['unit']}".rstrip()
             + f" (stated: {row['stated']:.4g}"
             + (f" ± {row['stated_sigma']:.2g})" if row["stated_sigma"] else ")")
-            for row in result.calibration_table if row["group"] == group)
-        others = " or ".join(GROUPS[other][0] for other in GROUPS if group not in common
-                             and other in decided - common - {group})
-        instead = f" The drive cannot tell this from {others}; the covariances include both." \
-            if others else ""
-        doubts.append(Doubt(group, f"By the drive {numbers}; problems 3 and 4 use this."
-                                   f"{instead} {GROUPS[group][1]} State it in vehicle.toml."))
+            for row in rows if row["group"] == group)
+        others = " or ".join(GROUPS[other][0] for other in GROUPS if other in either - {group})
+        instead = f" It may instead be {others}: the drive cannot tell, and the covariances " \
+            "include it." if group in furthest else ""
+        doubts.append(Doubt(group, f"By the drive {numbers}; {problem} uses this.{instead} "
+                                   f"{GROUPS[group][1]}"))
     return doubts
 
 

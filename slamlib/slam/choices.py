@@ -85,7 +85,8 @@ def calibrated(fit, accept=accepted_measurements):
             break
         least = 0.0 if proposal.lead >= 0 else proposal.lead - DECISIVE_RELEASE
         kept, present = (each.problem.accepted.weight.sum() for each in (proposed, fit))
-        if lead < least or kept < MIN_ACCEPTED * present:
+        far = np.abs(proposed.state.c - stated) > MAX_WIDE_SIGMAS * proposal.sigma
+        if lead < least or kept < MIN_ACCEPTED * present or far[proposal.sigma > 0].any():
             break
         fit = replace(proposed, explanations=proposal.explanations)
     return fit

@@ -63,8 +63,8 @@ def marginal_covariances(equations, noise):
         raise np.linalg.LinAlgError("singular information matrix")
     of_pairs, blocks = selected_inverse(H, structure.rows(v.frames, 3), pairs, landmarks)
     sigma = problem.sigma[active]
-    c = np.linalg.inv(solution.S) * sigma[:, None] * sigma
-    c = (c + c.T) / 2
+    c = np.linalg.inv(solution.S)
+    c = (c + c.T) / 2 * sigma[:, None] * sigma
     by_c = solution.by_c / -sigma                          # of the unknowns by c
     blocks = [block + by_c[rows] @ c @ by_c[rows].T for block, rows in zip(blocks, landmarks)]
     whole = np.zeros(2 * [len(active)])
@@ -75,9 +75,8 @@ def marginal_covariances(equations, noise):
     joint[:, :6, 6 + uncertain] = cross[:, :, :len(uncertain)]
     joint[:, 6:, :6] = np.swapaxes(joint[:, :6, 6:], 1, 2)
     joint[:, 6:, 6:] = whole[WHEELS, WHEELS]
-    return Covariances(
-        pairs=joint, markers=blocks[:len(v.markers)],
-        antennas=np.reshape(blocks[len(v.markers):], (-1, 2, 2)), c=whole)
+    markers, antennas = blocks[:len(v.markers)], np.reshape(blocks[len(v.markers):], (-1, 2, 2))
+    return Covariances(pairs=joint, markers=markers, antennas=antennas, c=whole)
 
 
 def rows_of_pairs(measurements):
@@ -272,8 +271,8 @@ def posterior_moments(fit):
     conditional = [marginal_covariances(equations, point) for point in noises]
     if len(noises) == 1:
         return fit.state, conditional[0], slip
-    x = np.stack([laplace_approximation(equations, point)[0] for point in noises]) \
-        - laplace_approximation(equations, noise)[0]
+    x = np.stack([laplace_approximation(equations, point)[0] for point in noises])
+    x -= laplace_approximation(equations, noise)[0]
     mean = weights @ x
     return (retract(fit.problem, fit.state, mean),
             _averaged(fit.problem, conditional, x - mean, weights), slip)
@@ -281,9 +280,8 @@ def posterior_moments(fit):
 
 def _averaged(problem, conditional, x, weights):
     """The Covariances averaged over points, with solutions x (p, n + q) about the mean."""
-    m, v, structure = (problem.measurements, problem.measurements.variables,
-                       problem.measurements.structure)
-    pairs, n = rows_of_pairs(m), len(structure.diagonal)
+    m = problem.measurements
+    v, structure, pairs, n = m.variables, m.structure, rows_of_pairs(m), len(m.structure.diagonal)
     of_c = np.zeros((len(x), len(problem.sigma)))
     of_c[:, problem.active] = problem.sigma[problem.active] * x[:, n:]
     of_pairs = np.concatenate([x[:, pairs], np.broadcast_to(
@@ -298,6 +296,5 @@ def _averaged(problem, conditional, x, weights):
         pairs=averaged([C.pairs for C in conditional], of_pairs),
         markers=[averaged([C.markers[j] for C in conditional], x[:, rows])
                  for j, rows in enumerate(structure.rows_of_each(v.markers))],
-        antennas=averaged([C.antennas for C in conditional],
-                          x[:, structure.rows(v.antennas, 2)]),
+        antennas=averaged([C.antennas for C in conditional], x[:, structure.rows(v.antennas, 2)]),
         c=averaged([C.c for C in conditional], of_c))

@@ -159,7 +159,7 @@ def ranges_by_antenna(measurements, poses, covariances, c, factor=1.0):
     slant = (r.distance - c[OFFSET] - c[ANTENNAS][r.antenna]) / c[SCALE]
     plane = np.sqrt(np.maximum(slant * np.abs(slant) - 2 * c[HEIGHT], 0)) \
         if c[HEIGHT] else slant
-    sigma = factor * r.sigma / c[SCALE]
+    sigma = factor * r.sigma / c[SCALE] * np.maximum(slant / np.maximum(plane, r.sigma), 1)
     position_sigma = np.sqrt(np.trace(covariances[:, :2, :2], axis1=1, axis2=2) / 2)
     for k, guess in enumerate(measurements.guess):
         rows = np.flatnonzero(r.antenna == k)

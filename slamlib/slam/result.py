@@ -159,8 +159,8 @@ def _doubt(ranges, estimate, weight):
     if count < MIN_ACCEPTED_RANGES:
         return f"only {count} of its {len(ranges.distance)} ranges agree"
     if len(possible):
-        return "its ranges fit as well at " + " and ".join(
-            "({:.1f}, {:.1f})".format(*place) for place in possible)
+        return "its ranges fit as well at " + " and ".join(dict.fromkeys(
+            "({:.1f}, {:.1f})".format(*place) for place in possible))
     if count < len(ranges.distance) / 2:
         return f"{len(ranges.distance) - count} of its {len(ranges.distance)} ranges disagree"
     if _sigma_by_ranges(ranges, estimate, weight) > MAX_RELATIVE_SIGMA * distance:
