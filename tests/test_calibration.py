@@ -184,7 +184,7 @@ def test_errors_in_counts_do_not_shrink_with_the_scale():
 
 @pytest.mark.parametrize("name", ["asymmetric Tukey", "asymmetric Cauchy"])
 def test_ranges_without_late_ones_have_no_bias(name):
-    """The weighted mean of a million residuals is zero where the kernel's bias is counted."""
+    """The weighted mean of 100,000 residuals is zero where the kernel's bias is counted."""
     r, kernel = np.random.default_rng(5).normal(size=100_000), KERNELS[name]
     b = kernel_bias(kernel)
     assert -0.2 < b < -0.05

@@ -107,13 +107,13 @@ def linearize_sightings(problem, state, as_pose):
     kind = np.flatnonzero(m.as_pose == as_pose)
     index = np.flatnonzero(accepted.sighting_weight[kind])
     rows = kind[index]
-    motion = delayed(m, s.row[rows], state.c[SIGHTING_LAG])
+    row = s.row[rows]
+    motion = delayed(m, row, state.c[SIGHTING_LAG], not problem.active[SIGHTING_LAG])
     e, by_pose, by_marker, by_c = sighting_error(
-        s.z[rows], state.poses[s.row[rows]], *motion, state.markers[m.marker_row[rows]], state.c,
-        as_pose)
+        s.z[rows], state.poses[row], *motion, state.markers[m.marker_row[rows]], state.c, as_pose)
     U = m.sighting_roots[0 if as_pose else 1][rows]
     return _whitened(
-        problem, SIGHTINGS, index, s.row[rows], m.marker_row[rows], e, [by_pose, by_marker], by_c,
+        problem, SIGHTINGS, index, row, m.marker_row[rows], e, [by_pose, by_marker], by_c,
         U, accepted.sighting_weight[rows], problem.noise.sightings, accepted.sighting_kernel)
 
 
@@ -122,9 +122,10 @@ def linearize_ranges(problem, state):
     accepted, m, r = problem.accepted, problem.measurements, problem.measurements.ranges
     rows = np.flatnonzero(accepted.range_weight)
     antenna, row = r.antenna[rows], r.row[rows]
+    motion = delayed(m, row, state.c[RANGE_LAG], not problem.active[RANGE_LAG])
     e, by_pose, by_antenna, by_c = range_error(
-        r.distance[rows], state.poses[row], *delayed(m, row, state.c[RANGE_LAG]),
-        state.antennas[antenna], state.c[ANTENNAS][antenna], state.c)
+        r.distance[rows], state.poses[row], *motion, state.antennas[antenna],
+        state.c[ANTENNAS][antenna], state.c)
     by_offset = (antenna[:, None] == np.arange(len(m.antenna)))[:, None]
     return _whitened(
         problem, RANGES, rows, row, len(m.marker) + antenna, e[:, None], [by_pose, by_antenna],
@@ -233,12 +234,14 @@ def range_error(r, poses, motion, velocity, antennas, offset, c):
     return e, by_pose[:, None], direction[:, None], by_c[:, None]
 
 
-def delayed(measurements, row, lag):
+def delayed(measurements, row, lag, is_known=True):
     """Where the vehicle was `lag` encoder steps before the frames `row` (m,), in the axes there.
 
     Also its velocities (m, 3) per step at that time, in m and rad, by the smooth path: the noise of
-    single steps would bias the delay.
+    single steps would bias the delay. Both are 0 where there is no lag and it `is_known`.
     """
+    if is_known and not lag:
+        return np.zeros((2, len(row), 3))
     path, smooth = measurements.path, measurements.smooth_path
     time = measurements.frame[row] - lag
     i = np.clip(np.floor(time).astype(int), 0, max(len(path) - 2, 0))
@@ -254,8 +257,8 @@ def _whitened(problem, kind, index, row, landmark, e, jacobians, by_c, U, weight
 
     `by_c` (m, d, u) are those by the columns `kind` of the calibration. From square root
     informations U (m, d, d) and weights (m,). `noise_factor` multiplies the standard deviations. A
-    kernel weighs a measurement by the norm of its whitened error; that of a range has the sign of
-    measured minus expected, as in GTSAM.
+    kernel weighs a measurement by the norm of its whitened error; that of a range, corrected by the
+    bias of its kernel, has the sign of measured minus expected, as in GTSAM.
     """
     active = problem.active[kind]
     columns = np.cumsum(problem.active)[kind][active] - 1

@@ -91,7 +91,7 @@ asymmetric Cauchy, asymmetric Tukey, not 'L2'
         fit = fit_from_odometry(measurements, model or "arc", accept=accept)          # 2 to 6
         fit = fit if model else better_model(fit)
     fit = calibrated(fit, accept)
-    if fit.problem.released and not (model or previous):     # they may have looked like the model
+    if fit.problem.released and not (model or previous):     # wrong ones may look like other steps
         fit = better_model(fit)
     return slam_result(solved_by_gtsam(fit))                                          # 7
 
