@@ -32,7 +32,8 @@ endif
 setup: $(READY)
 	@! git ls-files --error-unmatch .gitattributes >/dev/null 2>&1 || git config --local \
 		filter.slamlib-notebooks.clean "cd \"./$$(git rev-parse --show-prefix)\" && if \
-	[ -x $(BIN)/python ]; then $(BIN)/python strip_notebooks.py; else cat; fi"
+	[ -x $(BIN)/python ]; then $(BIN)/python strip_notebooks.py; else cat; fi" \
+		2>/dev/null || echo "git's configuration cannot be written: strip notebooks by 'make strip'." >&2
 
 $(READY): requirements.txt pyproject.toml check_python.py
 	@command -v "$(PYTHON)" >/dev/null || { \
@@ -79,10 +80,10 @@ strip: $(READY)
 	@$(BIN)/python strip_notebooks.py notebooks/*.ipynb
 
 bench bench-large: $(READY)
-	@for b in speed odometry localization slam; do \
+	@for b in speed localization slam; do \
 		$(BIN)/python "tests/benchmarks/$$b.py" $(patsubst bench-%,%,$(filter bench-%,$@)) || exit 1; \
 		echo; done
 
 clean:
-	rm -rf $(VENV) report results build slamlib.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) report results .report.* .results.* build slamlib.egg-info .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

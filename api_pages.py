@@ -3,11 +3,14 @@
 The pages load nothing. Every module has one, and every function is on that of its module.
 """
 
+import inspect
 import os
 import re
 import sys
+from dataclasses import is_dataclass
 from importlib import import_module
 from pathlib import Path
+from pkgutil import iter_modules, walk_packages
 
 import pdoc
 
@@ -15,9 +18,8 @@ import slamlib
 
 # A section of a docstring: its heading and its lines.
 SECTION = re.compile(r"^(Parameters|Returns|Raises)\n-+\n((?:.+\n?|\n(?! *\w+\n-))*)", re.MULTILINE)
-# Packages whose `__all__` hides their modules.
-PACKAGES = ("slamlib.slam", "slamlib.localization", "slamlib.studies", "slamlib.notebook",
-            "slamlib.report")
+# A field of a record, and the comment with its shape and unit.
+FIELD = re.compile(r"^    (\w+): .*?  # ?(.*)", re.MULTILINE)
 
 
 def as_markdown(docstring):
@@ -26,15 +28,31 @@ def as_markdown(docstring):
         r"^(\S.*?) : ", r"* `\1`: ", section[2], flags=re.MULTILINE), docstring)
 
 
+def with_fields(record):
+    """Add the comments of a class on its fields, which pages do not show, to its docstring."""
+    fields = FIELD.findall(inspect.getsource(record))
+    record.__doc__ = "\n\n".join([inspect.getdoc(record) or "", "\n".join(
+        f"* `{name}`: {comment}" for name, comment in fields)])
+
+
 def main(folder):
-    """Write the pages of all modules to `folder`."""
+    """Write the pages of all modules to `folder`, and print where they are."""
     os.environ.setdefault("PDOC_ALLOW_EXEC", "1")       # Python's module platform asks the system
-    for package in map(import_module, PACKAGES):
-        del package.__all__                  # else pdoc would leave out the package's modules
+    for module in [import_module(each.name) for each in walk_packages(
+            slamlib.__path__, "slamlib.")]:
+        if hasattr(module, "__all__") and hasattr(module, "__path__"):    # else pdoc omits modules
+            module.__all__ += [each.name for each in iter_modules(module.__path__)]
+        for name, record in inspect.getmembers(module, inspect.isclass):
+            if record.__module__ == module.__name__ and is_dataclass(record) and name[0] != "_":
+                with_fields(record)
     pdoc.docstrings.numpy = as_markdown      # pdoc's takes the first line of an entry for a type
-    pdoc.render.configure(docformat="numpy", search=False)
+    pdoc.render.configure(docformat="numpy")
     pdoc.pdoc(slamlib.__name__, output_directory=Path(folder))
+    print(f"Pages of all functions: {Path(folder).resolve() / 'index.html'}")
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    try:
+        main(*sys.argv[1:])
+    except OSError as error:
+        sys.exit(f"cannot be written: {error.filename}: {error.strerror}")

@@ -3,7 +3,8 @@
     python strip_notebooks.py FILE...     restores these files
     python strip_notebooks.py < FILE      prints what is restored; so git's filter does
 
-Outputs go, and what editors write into the metadata. It needs no package, so that git is fast.
+Outputs go, and what editors write into the metadata; in JupyterLab the code of cells with the tag
+hide-input is collapsed. It needs no package, so that git is fast.
 """
 
 import json
@@ -25,6 +26,8 @@ def restored(content):
         book["metadata"] = KERNEL | _only(NOTEBOOK_KEYS, book["metadata"])
         for cell in book["cells"]:
             cell["metadata"] = _only(CELL_KEYS, cell["metadata"])
+            if "hide-input" in cell["metadata"].get("tags", ()):
+                cell["metadata"]["jupyter"] = {"source_hidden": True}
             cell["source"] = "".join(cell["source"]).splitlines(keepends=True)
             if cell["cell_type"] == "code":
                 cell |= {"execution_count": None, "outputs": []}

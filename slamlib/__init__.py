@@ -12,3 +12,5 @@ where each equation is.
 >>> bool(evaluation.ate(found.poses, truth.poses[:400]) < 0.01)                            # m
 True
 """
+
+__version__ = "0.1.0"

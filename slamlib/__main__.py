@@ -11,11 +11,14 @@ from pathlib import Path
 # Set before numpy is imported: the matrices are so small that more threads are slower.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from slamlib.arguments import command_line_parser  # noqa: E402
+from slamlib.arguments import KNOWN_NOISE, command_line_parser  # noqa: E402
 from slamlib.dataset import DatasetError, dataset_names, read_dataset, read_truth  # noqa: E402
-from slamlib.swap import END_SIGNALS  # noqa: E402
 
 EXECUTED_NOTEBOOKS = Path("build", "executed")  # folder in which executed notebooks are kept
+PICTURES = (".png", ".pdf", ".svg")             # endings of files that `solve --plot` writes
+# Signals that end a process; Windows has no SIGHUP.
+END_SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP")
+                    if hasattr(signal, name))
 
 
 def main(arguments=None):
@@ -58,10 +61,9 @@ def _orderly_end(ended):
         interrupt = signal.getsignal(signal.SIGINT)  # the event loop's, while notebooks run
         (interrupt if callable(interrupt) else signal.default_int_handler)(signal.SIGINT, frame)
 
-    defaults = ()
-    if threading.current_thread() is threading.main_thread():
-        defaults = [each for each in END_SIGNALS
-                    if signal.getsignal(each) == signal.SIG_DFL]  # nohup's handler stays
+    here = threading.current_thread() is threading.main_thread()
+    defaults = [each for each in END_SIGNALS if here
+                and signal.getsignal(each) == signal.SIG_DFL]     # nohup's handler stays
     for each in defaults:
         signal.signal(each, end)
     try:
@@ -72,12 +74,9 @@ def _orderly_end(ended):
 
 
 def _report(arguments):
-    options = _options(arguments)
-    report = _built(arguments, options, arguments.report, _selected_datasets(arguments))
-    if report is None:
-        return 1
-    print(f"report: {report.files[0]} and {report.files[-1]}", file=sys.stderr)
-    return _report_exit_code(report)
+    return _build(
+        arguments, _options(arguments), arguments.report, _selected_datasets(arguments),
+        lambda report: f"report: {report.files[0]} and {report.files[-1]}")
 
 
 def _hand_in(arguments):
@@ -86,32 +85,32 @@ def _hand_in(arguments):
         raise DatasetError(f"{arguments.out}: expected the name of a file to write, found a folder")
     options = handin.hand_in_options(_options(arguments))
     datasets, omitted = handin.selection(arguments.data, _selected_datasets(arguments))
-    report = _built(arguments, options, Path("build", "hand-in"), datasets, files=False)
-    if report is None:
-        return 1
-    handin.write_zip(arguments.out, report, arguments.results, options, omitted)
-    print(f"hand-in: {arguments.out.resolve()}", file=sys.stderr)
-    return _report_exit_code(report)
+
+    def finish(report):
+        handin.write_zip(arguments.out, report, arguments.results, options, omitted)
+        return f"hand-in: {arguments.out.resolve()}"
+    return _build(arguments, options, Path("build", "hand-in"), datasets, finish, files=False)
 
 
 def _options(arguments):
     """The Options of report.toml; those of the command line replace them."""
     from slamlib.report.options import read_options
-    options = read_options("report.toml")
-    cover = {key: getattr(arguments, key) for key in ("author", "student_number")}
-    others = {key: getattr(arguments, key) for key in ("code", "appendix")}
-    return replace(options, cover=replace(options.cover, **_stated(cover)), **_stated(others))
+    names = ("author", "student_number", "code", "appendix")
+    return replace(read_options("report.toml"),
+                   **_stated({name: getattr(arguments, name) for name in names}))
 
 
 def _stated(values):
     return {key: value for key, value in values.items() if value is not None}
 
 
-def _built(arguments, options, folder, datasets, files=True):
-    """The Report that is built into a folder, or None if a notebook failed; prints doubts."""
+def _build(arguments, options, folder, datasets, finish, files=True):
+    """Build a Report into a folder and print doubts and finish(Report); return the exit code."""
     from slamlib.report import NotebookError, build_report
-    from slamlib.report.sources import copy_notebooks, notebooks_folder
+    from slamlib.report.notebooks import copy_notebooks, notebooks_folder
     notebooks = arguments.notebooks or notebooks_folder()
+    for out in (folder, arguments.results):
+        _require_elsewhere(out, arguments.data, notebooks)
     if arguments.notebooks_to:
         dataset_names(arguments.data, datasets)            # nothing is copied if there are none
         notebooks = copy_notebooks(notebooks, arguments.notebooks_to)
@@ -122,16 +121,13 @@ def _built(arguments, options, folder, datasets, files=True):
             fresh=arguments.fresh, files=files)
     except NotebookError as error:
         print(f"slamlib: {error}", file=sys.stderr)
-        return None
-    if not options.cover.author:
+        return 1
+    if not options.author:
         print("report.toml names no author: the PDF's title page has none", file=sys.stderr)
     for drive in report.drives:
         for doubt in drive.doubts:
             print(f"{drive.name}: doubt ({doubt.what}): {doubt.sentence}", file=sys.stderr)
-    return report
-
-
-def _report_exit_code(report):
+    print(finish(report), file=sys.stderr)
     return _exit_code([(drive.name, failure.problem, failure.reason)
                        for drive in report.drives for failure in drive.failures])
 
@@ -149,36 +145,63 @@ def _selected_datasets(arguments):
             else dataset for dataset in arguments.datasets] or None
 
 
+def _require_elsewhere(out, *folders):
+    """Raise DatasetError if a folder that a run replaces is or holds the current one or others."""
+    for folder in map(Path.resolve, (Path(), *folders)):
+        if folder.is_relative_to(out.resolve()):
+            raise DatasetError(f"{out}: expected another folder to write to: this one, which is "
+                               f"replaced, is or holds {folder}")
+
+
 def _solve(options):
+    from slamlib import solve
     from slamlib.inventory import inventory_lines
+    from slamlib.slam.fit import KERNELS
     from slamlib.summary import solve_to_folder, summary_table
+    _require_elsewhere(options.out, options.folder)
+    problems = [f"problem{each.removeprefix('problem')}" for each in options.problem or ()] \
+        or list(solve.PROBLEMS)
+    for given, known, what in (
+            (problems, solve.PROBLEMS, "problem"),
+            ([options.kernel] if options.kernel else (), KERNELS, "kernel"),
+            ([options.plot.suffix.lower()] if options.plot else (), PICTURES, "picture")):
+        for each in (each for each in given if each not in known):
+            raise DatasetError(f"expected a {what} of {', '.join(known)}, found {each!r}")
     dataset, truth = read_dataset(options.folder), read_truth(options.folder)
+    for each in problems if options.problem else ():
+        if not solve.allows(dataset, each):
+            raise DatasetError(f"{options.folder}: expected the measurements of {each} "
+                               f"({solve.title(each, dataset)}), found none")
+    stated = _stated({name: getattr(options, name) for name in (*KNOWN_NOISE, "kernel")})
+    dataset = replace(dataset, vehicle=replace(dataset.vehicle, **stated))
     print("\n".join(inventory_lines(dataset, truth)), file=sys.stderr)
-    summary = solve_to_folder(dataset, truth, options.out, jobs=2)
+    summary = solve_to_folder(dataset, truth, options.out, sorted(problems), options.csv)
     print(summary_table(summary))
+    if options.plot and any("failed" not in row for row in summary["problems"].values()):
+        from slamlib.report.overview import result_picture
+        result_picture(dataset, truth, options.out, options.plot)
     return _exit_code([(summary["dataset"], name, row["failed"])
                        for name, row in summary["problems"].items() if "failed" in row])
 
 
 def _simulate(options):
     from slamlib.simulation import simulate, write_dataset
-    dataset, truth = simulate(options.path, options.seed, slip=options.slip,
-                              late_ranges=options.nlos, mislabelled=options.mislabel,
-                              rounds=options.rounds)
-    write_dataset(options.folder, dataset, truth)
+    write_dataset(options.folder, *simulate(
+        options.path, options.seed, slip=options.slip, late_ranges=options.nlos,
+        mislabelled=options.mislabel, rounds=options.rounds))
     return 0
 
 
 def _lab(options):
     from slamlib.report.lab import start_lab
-    from slamlib.report.sources import notebooks_folder
+    from slamlib.report.notebooks import notebooks_folder
     start_lab(options.notebooks or notebooks_folder(), options.data, EXECUTED_NOTEBOOKS,
               options.others)
 
 
 def _export(options):
-    from slamlib.export import export_trajectories
-    for path in export_trajectories(options.results, options.format, options.out):
+    from slamlib.export import export_results
+    for path in export_results(options.results, options.format, options.out):
         print(path)
     return 0
 

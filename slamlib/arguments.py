@@ -4,7 +4,10 @@ import argparse
 import sys
 from pathlib import Path
 
-DATA_FOLDER = Path("data")  # default folder of the datasets
+from slamlib import __version__
+from slamlib.limits import LIMITS
+
+KNOWN_NOISE = ("slip", "marker_noise_factor", "range_noise_factor")  # options as in vehicle.toml
 
 
 def _number(kind, low, high, expected):
@@ -30,47 +33,62 @@ class _Parser(argparse.ArgumentParser):
         """End with exit code 2 and one sentence, without argparse's usage."""
         self.exit(2, f"slamlib: {' '.join(message.split())} ({self.prog} --help shows the usage)\n")
 
+    def path(self, name, help=None, **options):
+        """Add an argument that is a Path."""
+        self.add_argument(name, type=Path, help=help, **options)
+
 
 def command_line_parser():
     """The ArgumentParser of the command line; `command` of what it parses is the command's name."""
     prog = Path(sys.argv[0]).name
     whole = _Parser(prog=prog if prog == "slamlib" else "python -m slamlib",
                     description="Vehicle SLAM from wheel encoders, markers and UWB ranges.")
+    whole.add_argument("--version", action="version", version=f"slamlib {__version__}")
     commands = whole.add_subparsers(dest="command", required=True)
-
     report = commands.add_parser("report", help="execute the notebooks and build the report")
-    report.add_argument("--report", type=Path, default=Path("report"), help="folder for the pages")
+    report.path("--report", "folder for the pages", default=Path("report"))
     _build_options(report)
-
     hand_in = commands.add_parser(
         "hand-in", help="build the report and put it into a zip, with the result files")
-    hand_in.add_argument("--out", type=Path, default=Path("hand-in.zip"),
-                         help="the file to write (default %(default)s)")
+    hand_in.path("--out", "the file to write (default %(default)s)", default=Path("hand-in.zip"))
     _build_options(hand_in)
-
-    solve = commands.add_parser("solve", help="solve a dataset's problems without notebooks")
-    solve.add_argument("folder", type=Path, metavar="FOLDER", help="the dataset's folder")
-    solve.add_argument("--out", type=Path, required=True, help="folder for the results")
-
+    _solve_options(commands.add_parser("solve", help="solve problems without notebooks"))
     _simulate_options(commands.add_parser("simulate", help="make a dataset with its truth"))
-
-    export = commands.add_parser("export", help="write trajectories as TUM files or CSV")
-    export.add_argument("results", type=Path, metavar="RESULTS", help="a folder of results, of one "
-                        "problem's results, or the folder truth of a dataset")
-    export.add_argument("--format", choices=("tum", "csv"), default="tum",
-                        help="tum has pose numbers as time stamps; csv has covariances, too")
-    export.add_argument("--out", type=Path, required=True, help="folder for the files")
-
+    export = commands.add_parser("export", help="write results as TUM files or CSV")
+    export.path("results", "a folder of results, of one problem's results, or the folder truth of "
+                "a dataset", metavar="RESULTS")
+    export.add_argument("--format", choices=("tum", "csv"), default="tum", help="tum: trajectories "
+                        "with pose numbers as time stamps; csv: all files, with covariances")
+    export.path("--out", "folder for the files", required=True)
     lab = commands.add_parser("lab", help="open JupyterLab on the notebooks; it is given all other "
                                           "arguments, as --no-browser", allow_abbrev=False)
-    lab.add_argument("--data", type=Path, default=DATA_FOLDER, help="folder of the datasets")
-    lab.add_argument("--notebooks", type=Path)
+    lab.path("--data", "folder of the datasets", default=Path("data"))
+    lab.path("--notebooks")
     return whole
+
+
+def _solve_options(parser):
+    """Add the options of `solve` to its parser."""
+    parser.path("folder", "the dataset's folder", metavar="FOLDER")
+    parser.path("--out", "folder for the results", required=True)
+    parser.add_argument("--problem", action="append", metavar="NAME", help="1, 2 (markers alone), "
+                        "2_hint, 2_fused, 3 or 4; may be repeated (default: all); 4 starts from 3 "
+                        "where both are solved")
+    parser.add_argument("--kernel", metavar="NAME", help="the robust kernel of problems 3 and 4, "
+                        "as Huber")
+    for name in KNOWN_NOISE:
+        limit = LIMITS["vehicle.toml"][name]
+        number = _number(float, limit.minimum, limit.maximum, f"a number {limit}")
+        parser.add_argument(f"--{name.replace('_', '-')}", type=number, metavar="NUMBER",
+                            help="known, and not learned; as in vehicle.toml")
+    parser.path("--plot", "write a picture of map and errors: a .png, .pdf or .svg file",
+                metavar="FILE")
+    parser.add_argument("--csv", action="store_true", help="write each .mat file as CSV, too")
 
 
 def _simulate_options(parser):
     """Add the options of `simulate` to its parser."""
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help="a new or empty folder")
+    parser.path("folder", "a new or empty folder", metavar="FOLDER")
     parser.add_argument("--path", choices=("short", "long"), default="short")
     parser.add_argument("--rounds", type=_positive, default=1,
                         help="how often the path is driven; 44 long ones are a million rows")
@@ -87,14 +105,12 @@ def _build_options(parser):
     """Add the options of `report` and `hand-in` to a parser."""
     parser.add_argument("datasets", nargs="*", metavar="DATASET",
                         help="names of folders in data/ (all of them when none is named)")
-    parser.add_argument("--data", type=Path, default=DATA_FOLDER, help="folder of the datasets")
-    parser.add_argument("--notebooks", type=Path, help="folder of the notebooks (default: the "
-                        "folder notebooks where there is one, else those of the installation)")
-    parser.add_argument("--notebooks-to", type=Path, metavar="FOLDER",
-                        help="copy the notebooks to this new or empty folder first, to edit them "
-                        "there, and build the report from it")
-    parser.add_argument("--results", type=Path, default=Path("results"),
-                        help="folder for the .mat files")
+    parser.path("--data", "folder of the datasets", default=Path("data"))
+    parser.path("--notebooks", "folder of the notebooks (default: the folder notebooks where "
+                "there is one, else those of the installation)")
+    parser.path("--notebooks-to", "copy the notebooks to this new or empty folder first, to edit "
+                "them there, and build the report from it", metavar="FOLDER")
+    parser.path("--results", "folder for the .mat files", default=Path("results"))
     parser.add_argument("--jobs", type=_positive, default=2, help="notebooks executed at a time")
     code = parser.add_mutually_exclusive_group()
     code.add_argument("--no-code", dest="code", action="store_const", const="none",

@@ -1,43 +1,50 @@
 """Reads tables of numbers from .mat files, and from text as spreadsheets and MATLAB write it.
 
-The plain dialect has blanks or tabs between columns, decimal points, blank lines, and comments that
-begin with `#`, `%` or `//`. Text in another dialect is translated into the plain one, line by line,
-with a note; ambiguous text is refused. Every message names the file and the line.
+Plain text has blanks or tabs between columns, decimal points, and comments that begin with `#`.
+Other text is rewritten as plain text, line by line, with a note; ambiguous text is refused.
 """
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from io import BytesIO
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
+from scipy.io import loadmat
 
-from slamlib.matfile import Variable, variable_text
-from slamlib.textfile import error, quoted, read_text
+from slamlib.limits import LIMITS
+from slamlib.textfile import error, quoted, read_regular, read_text
 
-MAX_SIZE = 1e15  # bound on the size of numbers; float64 represents integers below it exactly
-# Words that are numbers or NaN; comments; numbers whose commas may also separate thousands.
-DECIMAL_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
-NAN = re.compile(r"[+-]?nan(\([a-z]*\))?", re.IGNORECASE)
+# Words that are numbers, by the decimal sign; comments; commas that may separate thousands.
+NUMBERS = {sign: re.compile(rf"[+-]?({digits}(e[+-]?\d+)?|nan(\([a-z]*\))?|inf(inity)?)", re.I)
+           for sign, digits in ((".", r"(\d+\.?\d*|\.\d+)"), (",", r"\d+(,\d+)?"))}
 COMMENT = re.compile(r"(#|%|//).*")
 THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(,\d{3})+")
-# Separator of columns (None for blanks) and decimal sign, by name.
-DIALECTS = {"blanks": (None, "."), "commas": (",", "."), "semicolons": (";", "."),
-            "semicolons, with decimal commas": (";", ","),
-            "blanks or tabs, with decimal commas": (None, ",")}
-# Parts of the words in headers, and the words that name a column, as patterns in small letters.
-ID_WORDS = "(id|number|num|nr|no|n|index|idx)?"
-TICK_WORDS = "(n|d|c|e|t|w|delta|ticks?|counts?|enc|encoder|wheel|ruota|pulses?|impulsi)*"
-COLUMN_WORDS = {
-    "pose id": f"{ID_WORDS}(pose|posa|step){ID_WORDS}",
-    "marker id": f"{ID_WORDS}(marker|aruco|tag|landmark)+{ID_WORDS}",
-    "antenna id": f"{ID_WORDS}(uwb)?(antenna|anchor|beacon|landmark){ID_WORDS}",
-    "right ticks": f"{TICK_WORDS}(right|destr[ao]|dx|r){TICK_WORDS}",
-    "left ticks": f"{TICK_WORDS}(left|sinistr[ao]|sx|l){TICK_WORDS}",
-    "x": "x", "y": "y", "theta": "theta|delta|heading|yaw", "range": "range|distance",
-    "sigma": "sigma|std|stddev",
-    **{f"s_{a}{b}": f"(s|sigma|cov|c|var){a[0]}({a[1:]})?{b[0]}({b[1:]})?" for a, b in (
-        ("x", "x"), ("x", "y"), ("x", "theta"), ("y", "y"), ("y", "theta"), ("theta", "theta"))}}
+SEPARATORS = {";": "semicolons", ",": "commas", None: "blanks or tabs"}
+# Words of headers that name a column; others are the ends of the columns' own names, as "xx".
+HEADER_WORDS = {"pose id": "pose posa step", "marker id": "marker aruco tag landmark",
+                "antenna id": "antenna anchor beacon landmark",
+                "right ticks": "right destra dx r", "left ticks": "left sinistra sx l",
+                "theta": "theta delta heading yaw", "range": "range distance", "sigma": "sigma std"}
+
+
+@dataclass(frozen=True)
+class Variable:
+    """A table in a .mat file, or an argument of `Dataset.from_arrays`."""
+
+    path: Path | None  # None of an argument
+    name: str  # with the struct's, as `logs.UwbReading`
+    value: object  # what scipy or numpy made of it
+
+    def __str__(self):
+        return f"{self.path}, variable {self.name}" if self.path else self.name
+
+    def text(self):
+        """The rows as text (str), one a line; DatasetError if it is no matrix of real numbers."""
+        if getattr(self.value, "ndim", 0) != 2 or self.value.dtype.kind not in "iuf":
+            raise error(self, "expected a matrix of real numbers")
+        return "\n".join(" ".join(map(repr, row)) for row in self.value.tolist())
 
 
 @dataclass(frozen=True)
@@ -46,217 +53,180 @@ class Table:
 
     source: Path | Variable | None  # None if there is no file
     numbers: np.ndarray  # (m, c)
-    text: str = ""  # in the plain dialect, with the lines of the file
+    text: str = ""  # plain, with the lines of the file
+    rows: np.ndarray | None = None  # (m,) numbers from 0 of the rows among those of the text
     notes: tuple[str, ...] = ()  # sentences on what was mended or left out
 
-    def require(self, ok, expected, column=None):
-        """Raise DatasetError for the first row where ok (m,) is False.
+    def noted(self, note):
+        """The Table with one more note, a clause about its file."""
+        return replace(self, notes=(*self.notes, f"{Path(str(self.source)).name}{note}."))
 
-        The message quotes the row, or the word in the column with this number from 0.
+    def place(self, k):
+        """Line of row k in the file, as part of a sentence, and the row's words."""
+        filled = ((n, words) for n, line in enumerate(self.text.split("\n"), start=1)
+                  if (words := line.partition("#")[0].split()))
+        line, words = next(islice(filled, int(self.rows[k]), None))
+        return f"{'row' if isinstance(self.source, Variable) else 'line'} {line}", words
+
+    def kept(self, ok, expected, share=0.0):
+        """The Table of the rows where `ok` is True, with a note on the others.
+
+        Raises DatasetError for the first of the others if they are more than a share of the rows,
+        or those of an argument.
+
+        Parameters
+        ----------
+        ok : (m,) or (m, c) bool; the latter tells the word to quote.
+        expected : str, or one for each column
         """
-        if not ok.all():
-            line, words = next(islice(_filled_lines(self.text), int(np.argmin(ok)), None))
-            found = " ".join(words) if column is None else words[column]
-            raise error(self.source, f"expected {expected}, found {quoted(found)}",
-                        _row_name(self.source, line))
+        if ok.all():
+            return self
+        bad = ~(ok if ok.ndim == 1 else ok.all(axis=1))
+        count, first = np.count_nonzero(bad), int(np.argmax(bad))
+        place, words = self.place(first)
+        column = int(np.argmin(ok[first])) if ok.ndim == 2 else None
+        found = quoted(" ".join(words) if column is None else words[column])
+        expected = expected if isinstance(expected, str) else expected[column]
+        if count > share * len(bad) or getattr(self.source, "path", self) is None:
+            raise error(self.source, f"expected {expected}, found {found}", place)
+        kept = replace(self, numbers=self.numbers[~bad], rows=self.rows[~bad])
+        return kept.noted(f": {count} of {len(bad)} rows left out, the first in {place}: expected "
+                          f"{expected}, found {found}")
 
 
-def read_table(source, columns, gaps=False, optional=None):
-    """The Table of a text file or .mat variable with c columns; m = 0 if `source` is None.
+def read_table(source, name, share=0.0, **options):
+    """The Table of a source, with numbers within LIMITS in all but a share of the rows.
+
+    The `options`, parameters and errors are those of `_read`.
+    """
+    table, limits = _read(source, name, **options), LIMITS[name]
+    if share:
+        table = table.kept(~np.isnan(table.numbers), "numbers", share=1)
+    if "range" in limits:
+        table = table.kept(table.numbers[:, 2] != 0, "a range, which 0 (no reception) is not", 1)
+    minimum, maximum, whole = np.array([
+        [limit.minimum, limit.maximum, limit.whole] for limit in limits.values()]).T
+    ok = (minimum <= table.numbers) & (table.numbers <= maximum)
+    return table.kept(ok & ((table.numbers == np.rint(table.numbers)) | (whole == 0)), [
+        f"{column}, a {'whole' if limit.whole else 'finite'} number {limit}"
+        for column, limit in limits.items()], share)
+
+
+def _read(source, name, optional=None, settled=False):
+    """The Table of a text file, .mat variable or argument; m = 0 if `source` is None.
 
     Parameters
     ----------
     source : Path, Variable or None
-    columns : str with the c names, separated by ", ".
-    gaps : bool; True leaves out rows with NaN or an empty cell, with a note.
+    name : str, key of LIMITS, which has the columns
     optional : str or None, name of one more last column, which is left out with a note.
+    settled : bool, whether other files of the folder have decimal commas.
 
     Raises
     ------
-    DatasetError : a row has another number of columns or a word that is not a number below
-        MAX_SIZE, a header names the columns in another order, or the text is ambiguous.
+    DatasetError : a row has another number of columns or a word that is not a number, a header
+        names the columns in another order, or the text is ambiguous.
     """
-    columns = columns.split(", ")
+    columns = list(LIMITS[name])
+    table = Table(source=source, numbers=np.empty((0, len(columns))), rows=np.arange(0))
     if source is None:
-        return Table(None, np.empty((0, len(columns))))
-    notes, name = [], _source_name(source)
-    if isinstance(source, Variable):
-        text = variable_text(source)
-    else:
-        text, encoding = read_text(source)
-        notes += [f"{name} was read as {encoding} text."] * bool(encoding)
-    numbers = _parsed(text, len(columns))
+        return table
+    text, encoding = (source.text(), "") if isinstance(source, Variable) else read_text(source)
+    table = table.noted(f" was read as {encoding} text") if encoding else table
+    numbers = _numbers(text)
+    if numbers is None or numbers.shape[1] != len(columns):
+        table, text = _plain(table, text, columns, optional, settled)
+        numbers = _numbers(text)
     if numbers is None:
-        text, columns, more = _in_plain_dialect(source, text, columns, gaps, optional)
-        notes += more
-        numbers = _parsed(text, len(columns), _may_be_nan(columns, gaps, optional))
-        if numbers is None:
-            raise _table_error(source, text, columns, gaps)
-        if columns[-1] == optional:
-            numbers = numbers[:, :-1]
-            notes.append(f"{name}: the last of {len(columns)} columns was taken as {optional} and "
-                         "left out; positions and ranges are taken in the plane.")
-        lacking = np.isnan(numbers).any(axis=1)
-        if lacking.any():
-            text, first = _without_rows(text, lacking)
-            numbers = numbers[~lacking]
-            notes.append(f"{name}: {np.count_nonzero(lacking)} of {len(lacking)} rows hold NaN and "
-                         f"were left out, the first in {_row_name(source, first)}.")
-    return Table(source, numbers, text, tuple(notes))
+        return table.noted(" holds no rows")
+    if numbers.shape[1] > len(columns):
+        table = table.noted(f": the last of {numbers.shape[1]} columns was taken as {optional} and "
+                            "left out; positions and ranges are taken in the plane")
+    return replace(table, numbers=numbers[:, :len(columns)], text=text,
+                   rows=np.arange(len(numbers)))
 
 
-def _source_name(source):
-    """Name (str) of a source in notes, without the folder."""
-    return f"{source.path.name}, variable {source.name}" if isinstance(source, Variable) \
-        else source.name
-
-
-def _row_name(source, line):
-    return f"row {line}" if isinstance(source, Variable) else f"line {line}"
-
-
-def _parsed(text, count, nan=False):
-    """Numbers (m, count) of text in the plain dialect, or None for other text.
-
-    `nan`, a bool or (count,) bool, is True for columns that may hold NaN.
-    """
-    if not re.search(r"^[ \t\v\f]*[^#\s]", text, re.MULTILINE):
-        return np.empty((0, count))
+def _numbers(text):
+    """Numbers (m, c) of plain text, or None for other text or none."""
     try:
-        table = np.loadtxt(text.split("\n"), comments="#", ndmin=2)
+        if re.search(r"^[^\S\n]*[^#\s]", text, re.MULTILINE):
+            return np.loadtxt(text.split("\n"), comments="#", ndmin=2)
     except ValueError:
-        return None
-    ok = abs(table) < MAX_SIZE
-    return table if table.shape[1] == count and (ok | np.isnan(table) & nan).all() else None
+        pass
+    return None
 
 
-def _may_be_nan(columns, gaps, optional):
-    """Mask (c,) of columns that may hold NaN: all with `gaps`, else the optional one."""
-    return np.array([gaps or column == optional for column in columns])
-
-
-def _in_plain_dialect(source, text, columns, gaps, optional):
-    """The text in the plain dialect, its columns (list of str) and notes (list of str)."""
-    name, notes = _source_name(source), []
-    lines = [COMMENT.sub("", line).strip() for line in text.split("\n")]
-    lines = [re.sub(r'"([^"]*)"', r"\1", line) for line in lines]
-    filled = [k for k, line in enumerate(lines) if line]
-    if not filled:
-        return "", columns, notes
-    header = lines[filled[0]]
-    if _is_header(header, columns, more=len(filled) > 1):
-        _require_order(source, header, filled[0] + 1, columns)
-        lines[filled.pop(0)] = ""
-        notes.append(f"{name}: the header {ascii(header[:60])} was left out.")
+def _plain(table, text, columns, optional, settled):
+    """The Table with notes, and its text as plain text; an empty cell is NaN."""
+    lines = [COMMENT.sub("", line).replace('"', "").strip() for line in text.split("\n")]
+    filled = [k for k, line in enumerate(lines) if line.strip(" \t,;")]
+    header = lines[filled[0]] if filled else ""
+    if re.search("[A-Za-z]", header) and not re.search(r"(?i)(^|[\s,;])\W*(\d|nan\b|inf)", header):
+        _require_order(table.source, header, filled.pop(0) + 1, columns)
+        table = table.noted(f": the header {ascii(header[:60])} was left out")
+    rows = [lines[k] for k in filled]
     for end in ",;":                                # an empty last cell in every row
-        if filled and all(lines[k].endswith(end) and lines[k] != end for k in filled):
-            lines = [line.removesuffix(end).rstrip() for line in lines]
-    for wanted in [columns] + ([[*columns, optional]] if optional else []):
-        body = "\n".join(lines)
-        fitting = [dialect for dialect in DIALECTS if _fits(body, dialect)
-                   and _parsed(_translated(body, dialect), len(wanted),
-                               _may_be_nan(wanted, gaps, optional)) is not None]
-        if fitting:
-            _require_decimals(source, lines, fitting[0])
-            notes += [f"{name} was read with columns separated by {fitting[0]}."] * (
-                fitting[0] != "blanks")
-            return _translated(body, fitting[0]), wanted, notes
-    first = lines[filled[0]]
-    commas = "commas" if "," in first.split()[0][:-1] else "blanks"
-    likely = "semicolons" if ";" in first else commas
-    dialect = next((name for name in DIALECTS if _fits(first, name) and _parsed(
-        _translated(first, name), len(columns), gaps) is not None), likely)
-    raise _table_error(source, "\n".join(lines), columns, gaps, *DIALECTS[dialect])
+        if all(row.endswith(end) for row in rows):
+            rows = [row.removesuffix(end).rstrip() for row in rows]
+    first, body = rows[0] if rows else "", "\n".join(rows)
+    # Blanks inside of a cell mean that commas are no separators.
+    separator = ";" if ";" in first else "," if "," in first and not any(
+        len(cell.split()) > 1 for cell in first.split(",")) else None
+    decimal = "," if separator != "," and "," in body and "." not in body else "."
+    if separator or decimal == ",":
+        table = table.noted(f" was read with columns separated by {SEPARATORS[separator]}"
+                            f"{', with decimal commas' if decimal == ',' else ''}")
+    if optional and len(first.split(separator)) == len(columns) + 1:
+        columns = [*columns, optional]
+    lines, commas = [""] * len(lines), []
+    for k, row in zip(filled, rows):
+        cells = _cells(table.source, k, row.split(separator), columns, NUMBERS[decimal])
+        commas += [(k, cell) for cell in cells if "," in cell]
+        lines[k] = " ".join(cells)
+    if commas and not settled and all(THOUSANDS.fullmatch(cell) for _, cell in commas):
+        k, cell = commas[0]
+        raise error(table.source, f"expected decimal points, found {quoted(cell)}, which is "
+                    f"{cell.replace(',', '.')} or {cell.replace(',', '')}", k + 1)
+    return table, re.sub(r"\([a-z]*\)", "", "\n".join(lines).lower().replace(",", "."))
 
 
-def _fits(body, dialect):
-    """True if the separators of a text can be those of a dialect."""
-    separator, decimal = DIALECTS[dialect]
-    if separator is None:
-        wrong = r";|(?<!\d),|,(?!\d)|\." if decimal == "," else r"[,;]"
-    else:                                           # blanks inside a cell would be separators, too
-        wrong = rf"[^\s{separator}][^\S\n]+[^\s{separator}]"
-        wrong += {",": "|;", ";": "|," if decimal == "." else r"|\.|(?<!\d),|,(?!\d)"}[separator]
-    return not re.search(wrong, body)
-
-
-def _translated(body, dialect):
-    """Text of a dialect in the plain one; an empty cell is NaN."""
-    separator, decimal = DIALECTS[dialect]
-    if separator is not None:
-        body = re.sub(rf"(?m)^[^\S\n]*(?={separator})|(?<={separator})[^\S\n]*(?=$|{separator})",
-                      "nan", body)
-        body = body.replace(separator, " ")
-    return re.sub(r"(?i)(?<=nan)\([a-z]*\)", "", body.replace(",", ".") if decimal == "," else body)
-
-
-def _is_header(line, columns, more):
-    """True if a line has words, none of which begins like a number.
-
-    Without `more` rows it must name two columns.
+def _cells(source, k, words, columns, number):
+    """The words of the line with index k (list of str), as many as columns; each matches `number`.
     """
-    words = [word for word in re.split(r"[\s,;]+", line) if word]
-    numbers = any(re.match(r"\W*\d", word) or NAN.fullmatch(word) or "inf" in word.lower()
-                  for word in words)
-    return bool(re.search("[A-Za-z]", line)) and not numbers and (
-        more or len(_named_columns(line, columns)) > 1)
-
-
-def _named_columns(header, columns):
-    """Indices (list) of the columns that the words of a header name, in their order there."""
-    words = [re.sub("[^a-z]", "", word) for word in re.split(r"[\s,;]+", header.lower())]
-    return [k for word in words for k, column in enumerate(columns)
-            if column in COLUMN_WORDS and re.fullmatch(COLUMN_WORDS[column], word)]
+    place = f"row {k + 1}" if isinstance(source, Variable) else k + 1
+    if len(words) != len(columns):
+        raise error(source, f"expected {len(columns)} columns ({', '.join(columns)}), found "
+                    f"{len(words)}", place)
+    cells = [word.strip() or "nan" for word in words]
+    for cell in cells:
+        if not number.fullmatch(cell):
+            raise error(source, f"expected finite numbers, found {quoted(cell)}", place)
+    return cells
 
 
 def _require_order(source, header, line, columns):
-    """Raise DatasetError if the header names columns in another order."""
-    named = _named_columns(header, columns)
-    if named != sorted(named):
+    """Raise DatasetError if a header names columns in another order."""
+    words = [HEADER_WORDS.get(column, column.rpartition("_")[2]).split() for column in columns]
+    parts = re.findall("[A-Z]?[a-z]+|[A-Z]+", header)       # `ticksLeft`, `tick_sx` and `nL`
+    named = [k for part in parts for k, names in enumerate(words) if part.lower() in names]
+    if (order := list(dict.fromkeys(named))) != sorted(order):
         raise error(source, f"expected the columns in the order ({', '.join(columns)}), found the "
                     f"header {quoted(header)}", line)
 
 
-def _require_decimals(source, lines, dialect):
-    """Raise DatasetError if all decimal commas may be separators of thousands as well."""
-    if DIALECTS[dialect][1] == ",":
-        cells = [(k, cell) for k, line in enumerate(lines, start=1)
-                 for cell in re.split(r"[\s;]+", line) if "," in cell]
-        if all(THOUSANDS.fullmatch(cell) for _, cell in cells):
-            line, cell = cells[0]
-            raise error(source, f"expected decimal points, found {quoted(cell)}, which is "
-                        f"{cell.replace(',', '.')} or {cell.replace(',', '')}", line)
+def mat_variables(path):
+    """Values (dict) of the variables and fields of a .mat file, by names as `logs.UwbReading`.
 
-
-def _without_rows(text, lacking):
-    """The text without the rows where lacking (m,) is True, and the number of the first one's line.
+    Raises DatasetError if it cannot be read, or is of another version than MATLAB's 5 to 7.
     """
-    lines = text.split("\n")
-    numbers = [line for line, _ in _filled_lines(text)]
-    left_out = [numbers[k] for k in np.flatnonzero(lacking)]
-    for line in left_out:
-        lines[line - 1] = ""
-    return "\n".join(lines), left_out[0]
-
-
-def _table_error(source, text, columns, gaps, separator=None, decimal="."):
-    """The DatasetError about the first row that does not follow a dialect."""
-    expected = f"expected {len(columns)} columns ({', '.join(columns)})"
-    for line, words in _filled_lines(text, separator):
-        place = _row_name(source, line)
-        if len(words) != len(columns):
-            return error(source, f"{expected}, found {len(words)}", place)
-        for word in words:
-            plain = word if decimal == "." else word.replace(".", "?").replace(",", ".")
-            number = DECIMAL_NUMBER.fullmatch(plain) and abs(float(plain)) < MAX_SIZE
-            if not number and not (gaps and (not word or NAN.fullmatch(word))):
-                expected = f"expected finite numbers (below {MAX_SIZE:g} in size)"
-                return error(source, f"{expected}, found {quoted(word)}", place)
-    return error(source, expected)  # unreachable unless numpy and DECIMAL_NUMBER disagree
-
-
-def _filled_lines(text, separator=None):
-    """Yield line number and words of every line that has more than a comment."""
-    for line, content in enumerate(text.split("\n"), start=1):
-        if words := content.partition("#")[0].strip():
-            yield line, [word.strip() for word in words.split(separator)]
+    data, kind = read_regular(path), "expected a .mat file of version 7 or older, saved with '-v7'"
+    try:
+        found = loadmat(BytesIO(data))
+    except Exception:                   # scipy raises many kinds about other versions and bytes
+        raise error(path, kind) from None
+    values = {name: value for name, value in found.items() if not name.startswith("__")}
+    for name, value in list(values.items()):
+        if getattr(value, "shape", None) == (1, 1) and value.dtype.names:
+            values |= {f"{name}.{each}": value[each][0, 0] for each in value.dtype.names}
+            del values[name]
+    return values

@@ -1,4 +1,4 @@
-"""Trajectories as text files: TUM format and comma-separated values.
+"""Results as text files: trajectories in TUM format, and all poses and maps as CSV.
 
 A line of a TUM file is `timestamp x y z qx qy qz qw`, the format of the TUM RGB-D benchmark that
 evo and others read. The measurements have no times, so the time stamps are pose numbers, from 1.
@@ -12,12 +12,10 @@ import numpy as np
 
 from slamlib import swap
 from slamlib.dataset import read_truth
-from slamlib.results import read_vehicle_poses
+from slamlib.results import FIELDS, read_structs
 from slamlib.textfile import DatasetError
 
 POSES = "vehiclePose.mat"
-POSE_HEADER = "pose,x,y,theta"
-COVARIANCE_HEADER = ",s_xx,s_xy,s_xtheta,s_yy,s_ytheta,s_thetatheta"
 
 
 def write_tum(path, poses):
@@ -35,71 +33,68 @@ def write_tum(path, poses):
                         np.cos(heading / 2)], " ")
 
 
-def write_csv(path, poses, covariances=None):
-    """Write poses (n, 3), NaN without an estimate, as comma-separated values with a header.
+def write_csv(path, ids, places, covariances=None):
+    """Write ids (n,), poses (n, 3) or positions (n, 2), NaN if unknown, and covariances as CSV.
 
-    Their covariances (n, 3, 3) in world axes, if given, are further columns.
+    The columns are id, x, y, theta and the upper triangle of the covariance in world axes.
     """
-    known = np.flatnonzero(np.isfinite(poses[:, 0]))
-    columns, header = [known + 1, *poses[known].T], POSE_HEADER
+    known, names = np.isfinite(places[:, 0]), ("x", "y", "theta")[:places.shape[1]]
+    columns, header = [ids[known], *places[known].T], ["id", *names]
     if covariances is not None:
-        columns += [*covariances[known][:, *np.triu_indices(3)].T]
-        header += COVARIANCE_HEADER
-    _write_lines(path, columns, ",", header)
+        upper = np.triu_indices(len(names))
+        columns += [*covariances[known][:, *upper].T]
+        header += [f"s_{names[i]}{names[j]}" for i, j in zip(*upper)]
+    _write_lines(path, columns, ",", ",".join(header))
 
 
-def export_trajectories(source, kind, out):
-    """Write the trajectories in the folder `source` to the folder `out`; returns their Paths.
+def export_results(source, kind, out):
+    """Write the results in the folder `source` as text into the folder `out`; returns the Paths.
 
     Parameters
     ----------
     source : folder of a dataset's results, of one problem's, or `truth` of a dataset.
-    kind : "tum" or "csv"; a file is named by its problem, as `problem3.tum`, or `truth.tum`.
+    kind : "tum" writes trajectories, named by their problems as `problem3.tum`; "csv" a file for
+        each .mat file, as `problem3/ArucoMap.csv`, in which a pose has its number as id.
 
     Raises
     ------
     DatasetError : there are no poses in the folder, or they cannot be read.
     """
-    source, paths = Path(source), []
-    for folder in _folders(source):
-        path = Path(out) / f"{folder.resolve().name}.{kind}"
-        if (folder / POSES).is_file():
-            poses, covariances = _read_poses(folder)
-        else:
-            poses, covariances = read_truth(folder.resolve().parent).poses, None
-        if kind == "tum":
-            write_tum(path, poses)
-        else:
-            write_csv(path, poses, covariances)
-        paths.append(path)
+    paths = []
+    for name, tables in _found(Path(source)).items():
+        for file, (ids, places, *covariances) in tables.items():
+            if kind == "csv":
+                paths.append(Path(out, name, f"{file}.csv"))
+                write_csv(paths[-1], ids, places, *covariances)
+            elif file == "vehiclePose":
+                paths.append(Path(out, f"{name}.tum"))
+                write_tum(paths[-1], places)
     return paths
 
 
-def _folders(source):
-    """The folders with poses: `source` itself, or those in it that have results."""
-    is_truth = source.is_dir() and source.resolve().name.lower() == "truth"
-    if is_truth or (source / POSES).is_file():
-        return [source]
-    folders = sorted(path.parent for path in source.glob(f"[!.]*/{POSES}"))
+def _found(source):
+    """{problem or "truth": {name of a struct: ids, places and, of results, covariances}}."""
+    if source.is_dir() and source.resolve().name.lower() == "truth":
+        truth = read_truth(source.resolve().parent)
+        return {"truth": {"vehiclePose": (np.arange(1, len(truth.poses) + 1), truth.poses),
+                          "ArucoMap": (truth.marker, truth.marker_in_world),
+                          "UwbMap": (truth.antenna, truth.antenna_in_world)}}
+    folders = [source] if (source / POSES).is_file() else sorted(
+        path.parent for path in source.glob(f"[!.]*/{POSES}"))
     if not folders:
         raise DatasetError(f"{source}: expected a folder with {POSES}, with sub-folders that have "
                            "one, or the folder truth of a dataset; found none of them")
-    return folders
-
-
-def _read_poses(folder):
-    """Poses and covariances in a problem's folder."""
     try:
-        return read_vehicle_poses(folder)
-    except swap.UnfinishedError as error:
-        raise DatasetError(str(error)) from None
+        return {folder.resolve().name: {name: read_structs(folder, name) for name in FIELDS
+                                        if (folder / f"{name}.mat").is_file()}
+                for folder in folders}
     except Exception:  # scipy and numpy raise many kinds
-        raise DatasetError(f"{folder / POSES}: expected poses and covariances as slamlib writes "
-                           "them, found something else") from None
+        raise DatasetError(f"{source}: expected .mat files as slamlib writes them, found something "
+                           "else") from None
 
 
 def _write_lines(path, columns, delimiter, header=""):
-    """Write numbers with all their digits, the pose numbers first."""
+    """Write numbers with all their digits, the ids first."""
     text = BytesIO()
     np.savetxt(text, np.column_stack(columns), header=header, comments="", delimiter=delimiter,
                fmt=["%d"] + ["%.17g"] * (len(columns) - 1))

@@ -1,33 +1,26 @@
 """Finds the files of a dataset in its folder: each file is read, named in a note, or refused.
 
-A missing file is read under an unambiguous variant of its name, as `ArucoReading.txt.txt` where
-Windows hides extensions, and a note says so. A name that is only similar is refused, because a
-sensor would be left out silently.
+A file is read under its name as browsers, editors and Windows leave it, as `ArucoReading (1).txt`
+or `ArucoReading.txt.txt`, and a note says so. Other names are not guessed.
 """
 
 import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from slamlib.filenames import (
-    ARCHIVE,
-    DATASET_FILES,
-    ENCODER,
-    TABLES,
-    is_variant,
-    listed_names,
-    misnamed_error,
-    name_in_placeholder,
-    name_of_file,
-    resembled_name,
-    similar_name,
-    stem_of,
-)
-from slamlib.matfile import Variable, mat_variables
-from slamlib.textfile import DatasetError, error, quoted, read_regular
+from slamlib.dialects import Variable, mat_variables
+from slamlib.textfile import DatasetError, error, read_regular
 
-# Names of files that systems put into folders.
-SYSTEM_FILES = re.compile(r"\..*|thumbs\.db|desktop\.ini|__macosx", re.IGNORECASE)
+ENCODER = "encoderReading.txt"
+# Names of the tables, of all files of a dataset, and of those in its folder `truth`.
+TABLES = (ENCODER, "ArucoReading.txt", "UwbReading.txt", "UwbAntennaGuess.txt")
+DATASET_FILES = (*TABLES, "vehicle.toml", "truth")
+TRUTH_FILES = ("vehiclePose.txt", "ArucoMap.txt", "UwbMap.txt", "vehicle.toml")
+# Names of files that systems put into folders; clouds leave hidden ones in place of files.
+SYSTEM_FILES = re.compile(r"\..*(?<!\.icloud)|thumbs\.db|desktop\.ini|__macosx", re.IGNORECASE)
+# What browsers, editors and file managers add to a name.
+COPY = r"( ?\(\d+\)|[ _-]+cop(y|ia)( ?\(\d+\)| \d+)?)*"
+MAX_LISTED_NAMES = 5  # file names in one sentence
 
 
 @dataclass(frozen=True)
@@ -36,13 +29,13 @@ class Contents:
 
     folder: Path  # of the files
     files: dict  # Path or Variable by name in DATASET_FILES
-    notes: tuple[str, ...]  # on unexpected names and on files that are not read
-    hint: str = ""  # end of a message on a missing file
+    notes: tuple[str, ...]  # on names of copies and on files that are not read
 
     def required(self, name):
         """The source (Path or Variable) of this name; raises DatasetError if there is none."""
         if name not in self.files:
-            raise error(self.folder / name, f"expected this file, found none{self.hint}")
+            unread = "".join(f" ({note})" for note in self.notes if "ot read" in note)
+            raise error(self.folder / name, f"expected this file, found none{unread}")
         return self.files[name]
 
 
@@ -50,196 +43,100 @@ def contents(folder, expected=DATASET_FILES):
     """The Contents of a folder (Path) with files of the names `expected`, in any case of letters.
 
     If the folder holds none of these, they may be in one of its sub-folders. Raises DatasetError if
-    two files have a name, a name is almost right, or the folder cannot be read.
+    two files that differ have a name, or the folder cannot be read.
     """
-    folder = Path(folder)
-    paths = _listed(folder)
-    if expected is DATASET_FILES and not any(name_of_file(path, expected) for path in paths):
-        deeper = [path for path in paths if path.is_dir() and _holds_encoder(path)]
-        if len(deeper) > 1:
-            raise error(folder, "expected the files of one dataset, found those of "
-                        f"{listed_names([path.name for path in deeper])} in sub-folders")
-        if deeper:
-            inner = contents(deeper[0], expected)
-            notes = [f"The files were read from the sub-folder {listed_names([deeper[0].name])}."]
-            return Contents(inner.folder, inner.files, (*notes, *_not_read(
-                [path.name for path in paths if path != deeper[0]]), *inner.notes), inner.hint)
-    files, notes, copies, hint = {}, [], set(), ""
+    folder, files, notes = Path(folder), {}, []
+    rest = _listed(folder)
     for name in expected:
-        found, others = _choose(folder, name, paths)
-        if found is not None:
-            files[name] = found
-        if found is not None and found.name.lower() != name.lower():
-            notes.append(f"{found.name} was read as {name}.")
-        notes += [f"{other.name} is not read: it is a copy of {found.name}." for other in others]
-        copies |= {found, *others}
-    rest = [path for path in paths if path not in copies]
+        same = [path for path in rest if _is_named(path, name)]
+        same.sort(key=lambda path: path.name.lower() != name.lower())     # the name itself first
+        rest = [path for path in rest if path not in same]
+        for other in same[1:]:
+            if read_regular(other) != read_regular(same[0]):
+                raise error(folder / name, f"expected one file of this name, found {same[0].name} "
+                            f"and {other.name}, which differ: move one of them away")
+            notes.append(f"{other.name} is not read: it is a copy of {same[0].name}.")
+        if same:
+            files[name] = same[0]
+            if same[0].name.lower() != name.lower():
+                notes.append(f"{same[0].name} was read as {name}.")
     if expected is DATASET_FILES:
-        variables, more, unread, hint = _mat_tables(
-            [path for path in rest if path.suffix.lower() == ".mat"],
-            [name for name in TABLES if name not in files])
-        files |= variables
-        notes += more
-        told = {*unread, *(each.path for each in variables.values())}
-        rest = [path for path in rest if path not in told]
-    _refuse_misnamed(folder, expected, files, rest)
-    archives = [path.name for path in rest if ARCHIVE.search(path.name)]
-    notes += [f"{name} is not read: unpack it here if it holds files of this dataset."
-              for name in archives]
-    others = [path.name for path in rest if path.name not in archives]
-    notes += _not_read(others)
-    return Contents(folder, files, tuple(notes),
-                    f", but {quoted(archives[0])}: unpack it" if archives else hint)
+        notes += _add_variables(files, rest)
+        deeper = [path for path in rest if path.is_dir()
+                  and any(_is_named(inner, ENCODER) for inner in path.glob("*"))]
+        if len(deeper) == 1 and not files:
+            inner, rest = contents(deeper[0]), [path for path in rest if path != deeper[0]]
+            notes.append(f"The files were read from the sub-folder {listed_names(deeper)}.")
+            folder, files, notes = inner.folder, inner.files, [*notes, *inner.notes]
+    return Contents(folder, files, (*notes, *_not_read(rest)))
 
 
 def is_dataset(folder):
-    """True if a folder (Path) or one of its sub-folders holds files of a dataset, in any form."""
-    paths = _listed(folder)
-    mats = [path for path in paths if path.suffix.lower() == ".mat"]
-    return any(name_of_file(path, DATASET_FILES) or ARCHIVE.search(path.name) for path in paths) \
-        or any(path.is_dir() and _holds_encoder(path) for path in paths) \
-        or any(name_in_placeholder(path, DATASET_FILES) for path in _hidden(folder)) \
-        or bool(_mat_tables(mats, TABLES)[0])
+    """True if a folder (Path) or one of its sub-folders holds files of a dataset."""
+    try:
+        return bool(contents(folder).files)
+    except DatasetError:
+        return True
 
 
 def left_in(data):
-    """Sentences (list of str) on archives and tables in the folder of all datasets (Path)."""
-    sentences = []
-    for path in _listed(data):
-        if path.is_file() and ARCHIVE.search(path.name):
-            sentences.append(f"{path} is not read: unpack it into a folder in {data}.")
-        elif path.is_file() and name_of_file(path, TABLES):
-            sentences.append(f"{path} is not read: move it into a folder of its dataset in {data}.")
-    return sentences
+    """Sentences (list of str) on what in the folder of all datasets (Path) is no dataset."""
+    return [f"{data}: {sentence}" for sentence in _not_read(
+        [path for path in _listed(data) if path.name != "README.md"
+         and not (path.is_dir() and is_dataset(path))])]
 
 
 def _listed(folder):
     """Sorted paths in a folder without SYSTEM_FILES."""
     try:
-        return sorted(path for path in Path(folder).iterdir()
-                      if not SYSTEM_FILES.fullmatch(path.name))
+        return sorted(path for path in folder.iterdir() if not SYSTEM_FILES.fullmatch(path.name))
     except (OSError, ValueError):  # ValueError: a NUL character in the folder's name
-        raise error(folder, "expected a folder that can be read") from None
+        place = "" if folder.is_absolute() else f" (paths are relative to {Path.cwd()})"
+        raise error(folder, f"expected a folder that can be read{place}") from None
 
 
-def _hidden(folder):
-    """Paths of the files in a folder whose names begin with a dot, sorted."""
-    return sorted(path for path in Path(folder).glob(".*") if path.is_file())
+def _is_named(path, name):
+    """True if a file (Path) has this name, apart from case and what a program adds to it."""
+    stem, ends = name.partition(".")[::2]
+    ends = rf"{COPY}\.toml(\.txt)?" if ends == "toml" else rf"(\.(txt|csv|tsv|dat)|{COPY})*"
+    return path.name.lower() == name.lower() or "." in name and not path.is_dir() and bool(
+        re.fullmatch(rf"((copy of|copia di) )?{stem}{ends}", path.name, re.IGNORECASE))
 
 
-def _refuse_misnamed(folder, expected, files, rest):
-    """Raise DatasetError if one of the paths `rest` replaces a name that is not in `files`."""
-    names = [*((path, resembled_name(path, expected)) for path in rest),
-             *((path, name_in_placeholder(path, expected)) for path in _hidden(folder))]
-    for path, name in names:
-        if name and name not in files:
-            raise misnamed_error(path, name)
-    if expected is DATASET_FILES:
-        _require_here(folder, files, [path for path in rest if path.is_dir()])
+def _add_variables(files, rest):
+    """Notes (list of str) on .mat files among the paths `rest`, which are removed from it.
 
-
-def _require_here(folder, files, others):
-    """Raise DatasetError if a table that is not in `files` is in one of the folders `others`.
-
-    A folder with its own encoder file is another dataset.
+    Variables with the names of missing TABLES are added to `files`.
     """
-    for deeper in others:
-        held = {name_of_file(path, TABLES): path for path in _listed_if_readable(deeper)
-                if any(path.name.lower() == name.lower() or is_variant(path, name)
-                       for name in TABLES)}
-        for name, path in held.items():
-            if name not in files and (ENCODER not in files or ENCODER not in held):
-                raise error(folder / name, "expected this file, found it as "
-                            f"{listed_names([f'{deeper.name}/{path.name}'])}: move it up, or away")
-
-
-def _not_read(names):
-    return [f"Not read: {listed_names(names)}."] * bool(names)
-
-
-def _choose(folder, name, paths):
-    """The path of the file of this name, or None, and copies of it that are not read.
-
-    Raises DatasetError if there are two files that differ.
-    """
-    exact = [path for path in paths if path.name.lower() == name.lower()]
-    if len(exact) > 1:
-        raise error(folder / name, "expected one file of this name, found "
-                    f"{' and '.join(path.name for path in exact)}")
-    variants = [path for path in paths if path not in exact and is_variant(path, name)]
-    first, *others = [*exact, *variants] or [None]
-    for other in others:
-        if read_regular(other) != read_regular(first):
-            raise error(folder / name, f"expected one file of this name, found {first.name} and "
-                        f"{quoted(other.name)}, which differ: move one of them away")
-    return first, others
-
-
-def _holds_encoder(folder):
-    """True if a folder holds the encoder file, in any form."""
-    return any(name_of_file(path, (ENCODER,)) for path in _listed_if_readable(folder))
-
-
-def _listed_if_readable(folder):
-    try:
-        return _listed(folder)
-    except DatasetError:
-        return []
-
-
-def _mat_tables(paths, names):
-    """Variables of .mat files by name in `names`, notes, unread files, and the hint of Contents.
-
-    A file that cannot be read is refused if its name is one of `names`, or its bytes hold one;
-    another file is refused if its name or that of a variable resembles a missing one.
-    """
-    files, notes, unread, hint, left = {}, [], [], "", {}
-    for path in paths if names else ():
+    notes, missing = [], {Path(name).stem.lower(): name for name in TABLES if name not in files}
+    for path in [path for path in rest if missing and path.suffix.lower() == ".mat"]:
+        rest.remove(path)
         try:
-            variables = mat_variables(path)
+            values = mat_variables(path)
         except DatasetError as failure:
-            content = read_regular(path).lower() if path.is_file() else b""
-            if any(stem_of(path.stem) == stem_of(name) or stem_of(name).encode() in content
-                   for name in names):
-                raise
             notes.append(f"{path.name} is not read{str(failure).removeprefix(str(path))}.")
-            hint = f", but {notes[-1][:-1]}"
-            unread.append(path)
             continue
-        for name in names:
-            found = [each for each in variables if each.rpartition(".")[2].lower() == stem_of(name)]
-            if len(variables) == 1 and stem_of(path.stem) == stem_of(name):
-                found = list(variables)
-            if len(found) > 1 or found and name in files:
-                places = found[:2] if len(found) > 1 else [files[name].path.name, path.name]
-                raise error(path.parent if len(found) == 1 else path, "expected one table "
-                            f"{Path(name).stem}, found it in {' and '.join(places)}")
-            if found:
-                files[name] = Variable(path, found[0])
-                notes.append(f"Variable {found[0]} of {path.name} was read as {name}.")
-        used = {each.name for each in files.values() if each.path == path}
-        left[path] = {each: size for each, size in variables.items()
-                      if not any(f"{name}.".startswith(f"{each}.") for name in used)}
-        if used and left[path]:
-            notes.append(f"Not read: variables {listed_names(list(left[path]))} of {path.name}.")
-    for path, variables in left.items():
-        used = any(each.path == path for each in files.values())
-        has = f"the variables {listed_names(list(variables)) or 'none'}"
-        _refuse_similar(path, variables, [name for name in names if name not in files], used, has)
-        if not used:
-            notes.append(f"{path.name} is not read: it has {has}.")
-            hint = f", but {path.name}, which has {has}: name the matrix {Path(ENCODER).stem}"
-            unread.append(path)
-    return files, notes, unread, hint
+        for each in list(values):
+            stem = path.stem if len(values) == 1 else ""
+            name = next((missing[word] for word in (each.rpartition(".")[2].lower(), stem.lower())
+                         if word in missing), None)
+            if name in files:
+                raise error(path, f"expected one table {Path(name).stem}, found it in "
+                            f"{files[name].name} of {files[name].path.name} and in {each}")
+            if name:
+                files[name] = Variable(path, each, values.pop(each))
+                notes.append(f"Variable {each} of {path.name} was read as {name}.")
+        notes += _not_read([Path(f"{each} of {path.name}") for each in values], " variables")
+    return notes
 
 
-def _refuse_similar(path, variables, missing, used, has):
-    """Raise DatasetError if a .mat file's variables or, unless it is used, its name resemble one of
-    the names `missing`.
-    """
-    words = [each.rpartition(".")[2] for each, size in variables.items() if size > 1]
-    resembled = {similar_name(word.lower(), TABLES) for word in words + [path.stem] * (not used)}
-    for name in missing:
-        if name in resembled:
-            raise error(path, f"expected a matrix named {Path(name).stem}, found {has}: rename one "
-                        "of them")
+def _not_read(paths, kind=""):
+    return [f"Not read:{kind} {listed_names(paths)}."] * bool(paths)
+
+
+def listed_names(paths):
+    """Names (str) of the first MAX_LISTED_NAMES of a list of paths, and the number of others."""
+    named = [path.name if path.name.isprintable() and path.name.isascii() and len(path.name) < 40
+             else ascii(path.name[:40]) for path in paths[:MAX_LISTED_NAMES]]
+    more = len(paths) - len(named)
+    return ", ".join(named) + (f" and {more} more" if more else "")

@@ -1,5 +1,6 @@
 """Lists for the terminal what was read of a drive."""
 
+import json
 from dataclasses import asdict
 
 import numpy as np
@@ -21,7 +22,8 @@ def inventory_lines(dataset, truth):
     truth : Truth or None
     """
     aruco, uwb, default = dataset.aruco, dataset.uwb, asdict(Vehicle())
-    changed = [f"{key} = {value:g}" for key, value in asdict(dataset.vehicle).items()
+    changed = [f"{key} = {value:g}" if isinstance(value, float) else f"{key} = {json.dumps(value)}"
+               for key, value in asdict(dataset.vehicle).items()
                if value != default[key]]
     right, left = abs(dataset.ticks).sum(axis=0)
     lines = [

@@ -1,8 +1,7 @@
 """The files to hand in: MATLAB struct arrays with the assignment's field names.
 
 Poses are [x, y, heading] and positions [x, y] in world axes, in m and rad. Covariances belong to
-the same coordinates. Writing makes the folder of a file. Reading raises `swap.UnfinishedError` if a
-run ended while it wrote the files of the folder or of its parent.
+the same coordinates.
 """
 
 import struct
@@ -16,8 +15,10 @@ from slamlib import swap
 
 _HEADER = b"MATLAB 5.0 MAT-file, written by slamlib".ljust(116)  # scipy's contains the date
 SIZE_OFFSET, COUNT_OFFSET = 132, 164  # bytes, to the array's size and its number of columns
-RESULT_FILES = ("vehiclePose.mat", "ArucoMap.mat", "UwbMap.mat")  # of a problem's folder
-MAX_STRUCTS_BY_SCIPY = 100  # number of structs above which `_tiled` writes them
+# Fields of the structs in each file: places, covariances and, of maps, ids.
+FIELDS = {"vehiclePose": ("pose", "covari"), "ArucoMap": ("pose", "covari", "id"),
+          "UwbMap": ("position", "covariance", "id")}
+RESULT_FILES = tuple(f"{name}.mat" for name in FIELDS)  # of a problem's folder
 
 
 def write_vehicle_poses(folder, poses, covariances):
@@ -25,24 +26,16 @@ def write_vehicle_poses(folder, poses, covariances):
 
     `poses` (n, 3) and `covariances` (n, 3, 3) are NaN where there is no estimate.
     """
-    _write_structs(Path(folder) / "vehiclePose.mat", pose=poses, covari=covariances)
+    _write_structs(Path(folder) / "vehiclePose.mat", poses, covariances)
 
 
-def write_aruco_map(folder, ids, poses, covariances):
-    """Write folder/ArucoMap.mat: ArucoMap(k).pose, .covari and .id, in ascending id.
+def write_map(folder, name, ids, places, covariances):
+    """Write folder/ArucoMap.mat or UwbMap.mat (`name` without .mat), in ascending id.
 
-    The marker `ids` (k,) ascend; `poses` are (k, 3) with headings in (-pi, pi], and `covariances`
-    (k, 3, 3).
+    The `ids` (k,) ascend; `places` are poses (k, 3) with headings in (-pi, pi] or positions (k, 2),
+    and `covariances` (k, 3, 3) or (k, 2, 2).
     """
-    _write_structs(Path(folder) / "ArucoMap.mat", pose=poses, covari=covariances, id=ids)
-
-
-def write_uwb_map(folder, ids, positions, covariances):
-    """Write folder/UwbMap.mat: UwbMap(k).position, .covariance and .id, in ascending id.
-
-    The antenna `ids` (a,) ascend; `positions` are (a, 2) and `covariances` (a, 2, 2).
-    """
-    _write_structs(Path(folder) / "UwbMap.mat", position=positions, covariance=covariances, id=ids)
+    _write_structs(Path(folder) / f"{name}.mat", places, covariances, ids)
 
 
 def read_vehicle_poses(folder):
@@ -53,78 +46,50 @@ def read_vehicle_poses(folder):
     >>> poses.shape, covariances.shape
     ((2, 3), (2, 3, 3))
     """
-    return _read_structs(Path(folder) / "vehiclePose.mat", pose=(3,), covari=(3, 3))
+    return read_structs(folder, "vehiclePose")[1:]
 
 
-def read_aruco_map(folder):
-    """Ids (k,), poses (k, 3) in m and rad, and covariances (k, 3, 3) of folder/ArucoMap.mat."""
-    ids, *rest = _read_structs(Path(folder) / "ArucoMap.mat", id=(), pose=(3,), covari=(3, 3))
-    return ids.astype(int), *rest
+def read_structs(folder, name):
+    """Ids (n,), poses (n, 3) or positions (n, 2), and covariances of a file in a folder.
+
+    `name` is a key of FIELDS. The ids of vehicle poses are 1 to n.
+    """
+    structs, d = loadmat(Path(folder) / f"{name}.mat")[name], 2 if name == "UwbMap" else 3
+    rows = [np.reshape([*structs[field].ravel()], (-1, *shape))
+            for field, shape in zip(FIELDS[name], ((d,), (d, d), ()))]
+    ids = rows[2].astype(int) if len(rows) > 2 else np.arange(1, len(rows[0]) + 1)
+    return ids, rows[0], rows[1]
 
 
-def read_uwb_map(folder):
-    """Ids (a,), positions (a, 2) in m and covariances (a, 2, 2) of folder/UwbMap.mat."""
-    ids, *rest = _read_structs(Path(folder) / "UwbMap.mat", id=(), position=(2,), covariance=(2, 2))
-    return ids.astype(int), *rest
+def _write_structs(path, *columns):
+    """Write one (1, n) struct array, named like the file; equal input gives equal bytes.
 
-
-def _write_structs(path, **fields):
-    """Write one (1, n) struct array, named like the file; equal input gives equal bytes."""
-    rows = {name: _matrices(values) for name, values in fields.items()}
+    scipy writes many structs slowly, one by one. Here it writes the first one, whose bytes are
+    repeated with the numbers of the others: each field is a header of 56 bytes and its numbers by
+    columns. The array's size and number of columns are set (MAT-File Format, version 5).
+    """
+    rows = dict(zip(FIELDS[path.stem], map(_matrices, columns)))
     count = len(next(iter(rows.values())))
-    content = _tiled(path.stem, rows) if count > MAX_STRUCTS_BY_SCIPY else _saved(path.stem, rows)
-    swap.write_atomically(path, _HEADER + content[len(_HEADER):])
+    first = np.empty((1, min(count, 1)), dtype=[(name, object) for name in rows])
+    for name, values in rows.items():
+        first[name][0, :] = list(values[:1])
+    buffer = BytesIO()
+    savemat(buffer, {path.stem: first})
+    content = bytearray(_HEADER + buffer.getvalue()[len(_HEADER):])
+    if count > 1:
+        layout = np.dtype([entry for name, values in rows.items() for entry in (
+            (f"header of {name}", "V56"), (name, "=f8", values.shape[:0:-1]))])
+        structs = np.repeat(np.frombuffer(content[-layout.itemsize:], layout), count)
+        for name, values in rows.items():
+            structs[name] = np.swapaxes(values, 1, 2)
+        size, = struct.unpack_from("=I", content, SIZE_OFFSET)
+        struct.pack_into("=I", content, SIZE_OFFSET, size + (count - 1) * layout.itemsize)
+        struct.pack_into("=i", content, COUNT_OFFSET, count)
+        content[-layout.itemsize:] = structs.tobytes()
+    swap.write_atomically(path, content)
 
 
 def _matrices(values):
     """Scalars (n,), vectors (n, d) or matrices (n, c, d) as (n, c, d); vectors are 1 x d."""
     rows = np.asarray(values, dtype=float)
-    while rows.ndim < 3:
-        rows = rows[:, None]
-    return rows
-
-
-def _saved(name, rows):
-    """The bytes that scipy writes for a struct array."""
-    count = len(next(iter(rows.values())))
-    structs = np.empty((1, count), dtype=[(field, object) for field in rows])
-    for field, values in rows.items():
-        structs[field][0, :] = list(values)
-    buffer = BytesIO()
-    savemat(buffer, {name: structs})
-    return buffer.getvalue()
-
-
-def _tiled(name, rows):
-    """The bytes of `_saved` for many structs; scipy writes these slowly, one by one.
-
-    All elements of the array have the same layout. Files by scipy with one and two of them give the
-    length of an element, and known numbers in them the offset of each number. The array's
-    dimensions and size contain the count (MAT-File Format, version 5).
-    """
-    count = len(next(iter(rows.values())))
-    known = iter(np.pi * np.arange(1, 1000))
-    one = {field: np.reshape([next(known) for _ in values[0].flat], (1, *values.shape[1:]))
-           for field, values in rows.items()}
-    first, second = _saved(name, one), _saved(
-        name, {field: np.repeat(values, 2, axis=0) for field, values in one.items()})
-    length = len(second) - len(first)
-    head, element = bytearray(first[:-length]), first[-length:]
-    size, = struct.unpack_from("=I", head, SIZE_OFFSET)
-    struct.pack_into("=I", head, SIZE_OFFSET, size + (count - 1) * length)
-    struct.pack_into("=i", head, COUNT_OFFSET, count)
-    elements = np.tile(np.frombuffer(element, np.uint8), (count, 1))
-    for field, values in rows.items():
-        for number, column in zip(one[field].flat, values.reshape(count, -1).T):
-            offset = element.index(struct.pack("=d", number))
-            elements[:, offset:offset + 8] = np.ascontiguousarray(column)[:, None].view(np.uint8)
-    return bytes(head) + elements.tobytes()
-
-
-def _read_structs(path, **shapes):
-    """Fields of a struct array with n elements: a tuple of arrays (n, *shape)."""
-    for folder in (path.parent, path.parent.parent):
-        swap.require_finished(folder)
-    structs = loadmat(path)[path.stem]
-    return tuple(np.reshape([*structs[name].ravel()], (-1, *shape))
-                 for name, shape in shapes.items())
+    return rows.reshape(len(rows), *(1,) * (3 - rows.ndim), *rows.shape[1:])

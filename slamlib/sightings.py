@@ -105,13 +105,18 @@ def consensus(marker, in_world, covariance):
     order = chosen[np.argsort(label[chosen], kind="stable")]
     log_determinant = np.linalg.slogdet(covariance)[1]
     for same in np.split(order, np.flatnonzero(np.diff(label[order])) + 1) if len(order) else ():
-        r = in_world[same, None] - in_world[same]
-        r[..., 2] = se2.wrap(r[..., 2])
-        W = covariance[same, None] + covariance[same]
-        squared = np.einsum("abi,abi->ab", r, np.linalg.solve(W, r[..., None])[..., 0])
+        squared = squared_distances(in_world[same, None], in_world[same],
+                                    covariance[same, None] + covariance[same])
         support = np.count_nonzero(squared < GATE, axis=1)
         best.append(min(same[support >= support.max() / 2], key=log_determinant.__getitem__))
     return np.array(best, int)
+
+
+def squared_distances(first, second, covariance):
+    """Squared Mahalanobis distances (...) of poses (..., 3) whose difference has a covariance."""
+    r = first - second
+    r[..., 2] = se2.wrap(r[..., 2])
+    return np.einsum("...i,...i->...", r, np.linalg.solve(covariance, r[..., None])[..., 0])
 
 
 def evenly_chosen(label, maximum):

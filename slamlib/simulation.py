@@ -7,9 +7,8 @@ down to whole counts. The camera sees the markers in a disc around the vehicle; 
 ranges to the antennas within reach. Both have a lower rate than the encoders.
 """
 
+import json
 import os
-import shutil
-import tempfile
 from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,8 +16,9 @@ from types import SimpleNamespace
 import numpy as np
 
 from slamlib import se2
-from slamlib.dataset import AntennaGuess, ArucoReadings, Dataset, Truth, UwbReadings, Vehicle
+from slamlib.dataset import TABLE_2, AntennaGuess, ArucoReadings, Dataset, Truth, UwbReadings
 from slamlib.odometry import cumulative
+from slamlib.swap import staging
 from slamlib.textfile import DatasetError
 
 # A path is a sum of rotating vectors (turns per round, radius in m, phase in rad). `marker_spacing`
@@ -35,12 +35,11 @@ CAMERA_REACH = 1.8      # m, largest distance in the plane at which a marker is 
 UWB_REACH = 15.0        # m, largest distance to an antenna that is measured
 LATE_RANGE_MEAN = 0.8   # m, mean of the exponential excess of late ranges
 SIMULATED_GUESS_SIGMA = 0.35   # m per axis, standard deviation of the antenna guesses
-TABLE_2 = Vehicle()     # the assignment's nominal vehicle
 WHEEL_ENTRIES = tuple(asdict(TABLE_2))[:8]      # of vehicle.toml, which are always written
 
 
-def simulate(path="short", seed=0, *, slip=1e-3, late_ranges=0.0, mislabelled=0.0, rounds=1,
-             noise=True, vehicle=TABLE_2):
+def simulate(path="short", seed=0, *, slip=1e-3, late_ranges=0.0, mislabelled=0.0, memory=0.0,
+             rounds=1, noise=True, vehicle=TABLE_2):
     """A simulated dataset and its truth.
 
     Parameters
@@ -51,6 +50,7 @@ def simulate(path="short", seed=0, *, slip=1e-3, late_ranges=0.0, mislabelled=0.
     slip : sqrt(m), standard deviation of the slip of one wheel after one metre.
     late_ranges, mislabelled : fractions of the UWB ranges that are too long (no line of sight) and
         of the sightings that have another marker's id.
+    memory : correlation of the errors of a marker's sightings from one camera frame to the next.
     rounds : number of times that the closed path is driven.
     noise : False gives the nominal vehicle, fractional counts, and exact sightings, ranges and
         antenna guesses. The stated covariances do not change.
@@ -78,7 +78,8 @@ def simulate(path="short", seed=0, *, slip=1e-3, late_ranges=0.0, mislabelled=0.
     poses, ticks = _arc_poses(*arcs), _encoder(*arcs, true_vehicle, slip, noise, rng)
     marker, marker_in_world = _place_markers(layout, poses, rng)
     antenna, antenna_in_world = _place_antennas(layout, poses, rng)
-    aruco = _camera(poses, marker, marker_in_world, layout.aruco_every, mislabelled, noise, rng)
+    aruco = _camera(poses, marker, marker_in_world, layout.aruco_every, mislabelled, memory,
+                    noise, rng)
     uwb = _uwb(poses, antenna, antenna_in_world, layout.uwb_every, late_ranges, noise, rng)
     offset = SIMULATED_GUESS_SIGMA * rng.standard_normal(antenna_in_world.shape)
     guess = AntennaGuess(antenna, antenna_in_world + noise * offset)
@@ -100,12 +101,9 @@ def misguess(dataset, position, error, seed):
 
 def mislabel(dataset, fraction, seed):
     """The Dataset with another marker's id at a fraction of its sightings; `seed` as above."""
-    rng = np.random.default_rng(seed)
     ids, label = np.unique(dataset.aruco.marker, return_inverse=True)
-    wrong = rng.uniform(size=len(label)) < fraction
-    other = (label + rng.integers(1, max(2, len(ids)), len(label))) % len(ids)
-    marker = ids[np.where(wrong, other, label)]
-    return replace(dataset, aruco=replace(dataset.aruco, marker=marker))
+    label = _relabelled(label, len(ids), fraction, np.random.default_rng(seed))
+    return replace(dataset, aruco=replace(dataset.aruco, marker=ids[label]))
 
 
 def delay(dataset, fraction, seed):
@@ -116,17 +114,10 @@ def delay(dataset, fraction, seed):
 
 
 def manoeuvre(legs, vehicle=TABLE_2, step=0.01):
-    """Counts of a drive in arcs without noise.
+    """Counts (n, 2) of the right and left wheel in a drive in arcs, with fractions, without noise.
 
-    Parameters
-    ----------
-    legs : list of (m, rad), length and turn of each arc; negative lengths are driven backwards.
-    vehicle : Vehicle
-    step : m, largest length of a step.
-
-    Returns
-    -------
-    (n, 2) counts of the right and left wheel, with fractions; row 0 is zero.
+    `legs` lists (m, rad), length and turn of each arc; negative lengths are driven backwards. A
+    step is at most `step` m long. Row 0 is zero.
     """
     half, counts = vehicle.wheelbase / 2, [np.zeros((1, 2))]
     for length, turn in legs:
@@ -145,16 +136,11 @@ def write_dataset(folder, dataset, truth=None):
     folder = Path(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise DatasetError(f"{folder}: expected a new or empty folder to write the dataset to")
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-    try:
-        temporary.chmod(0o755)
-        _write_sensors(temporary, dataset)
+    with staging(folder) as stage:
+        _write_sensors(stage, dataset)
         if truth is not None:
-            _write_truth(temporary / "truth", truth)
-        os.replace(temporary, folder)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+            _write_truth(stage / "truth", truth)
+        os.replace(stage, folder)
 
 
 def _driven_arcs(layout, rounds):
@@ -224,7 +210,7 @@ def _place_antennas(layout, poses, rng):
     return ids, position[rng.permutation(count)]
 
 
-def _camera(poses, marker, marker_in_world, every, mislabelled, noise, rng):
+def _camera(poses, marker, marker_in_world, every, mislabelled, memory, noise, rng):
     """Sightings of all markers in the disc of CAMERA_REACH around every `every`-th pose."""
     frames = np.arange(0, len(poses), every)
     in_vehicle = se2.between(poses[frames, None], marker_in_world)
@@ -232,12 +218,21 @@ def _camera(poses, marker, marker_in_world, every, mislabelled, noise, rng):
     frame, which = np.nonzero(distance < CAMERA_REACH)
     z, d = in_vehicle[frame, which], distance[frame, which]
     covariance = _sighting_covariance(z, d)
-    error = (np.linalg.cholesky(covariance) @ rng.standard_normal(z.shape)[..., None])[..., 0]
-    z = z + noise * error
+    error = rng.standard_normal(z.shape)
+    order = np.lexsort((frame, which))
+    for last, k in zip(order, order[1:]):
+        kept = memory**(frame[k] - frame[last]) if which[k] == which[last] else 0.0
+        error[k] = kept * error[last] + np.sqrt(1 - kept**2) * error[k]
+    z = z + noise * (np.linalg.cholesky(covariance) @ error[..., None])[..., 0]
     z[:, 2] = se2.wrap(z[:, 2])
-    wrong = rng.uniform(size=len(z)) < mislabelled
-    other = (which + rng.integers(1, len(marker), len(z))) % len(marker)
-    return ArucoReadings(frames[frame], marker[np.where(wrong, other, which)], z, covariance)
+    marker = marker[_relabelled(which, len(marker), mislabelled, rng)]
+    return ArucoReadings(frames[frame], marker, z, covariance)
+
+
+def _relabelled(label, count, fraction, rng):
+    """The labels (m,), numbers below `count`, with another one at a fraction of them."""
+    wrong = rng.uniform(size=len(label)) < fraction
+    return np.where(wrong, (label + rng.integers(1, max(2, count), len(label))) % count, label)
 
 
 def _sighting_covariance(z, distance):
@@ -255,26 +250,24 @@ def _uwb(poses, antenna, antenna_in_world, every, late_ranges, noise, rng):
     distance = np.hypot(*(poses[frames, None, :2] - antenna_in_world).transpose(2, 0, 1))
     frame, which = np.nonzero(distance < UWB_REACH)
     r = distance[frame, which]
-    sigma = 0.05 + 0.004 * r
-    late = rng.uniform(size=len(r)) < late_ranges
+    sigma, late = 0.05 + 0.004 * r, rng.uniform(size=len(r)) < late_ranges
     excess = rng.exponential(LATE_RANGE_MEAN, len(r)) * late
     measured = r + noise * sigma * rng.standard_normal(len(r)) + excess
     return UwbReadings(frames[frame], antenna[which], np.maximum(measured, 1e-3), sigma)
 
 
 def _write_sensors(folder, dataset):
-    n = len(dataset.ticks)
-    _savetxt(folder / "encoderReading.txt", [np.arange(1, n + 1), *dataset.ticks.T], "%d %d %d")
+    pose = np.arange(1, len(dataset.ticks) + 1)
+    _savetxt(folder / "encoderReading.txt", [pose, *dataset.ticks.T], "%d %d %d")
     if dataset.aruco is not None:
         a = dataset.aruco
         C = a.covariance[:, *np.triu_indices(3)].T
         _savetxt(folder / "ArucoReading.txt", [a.pose + 1, a.marker, *a.marker_in_vehicle.T, *C],
                  "%d %d %.5f %.5f %.5f" + 6 * " %.4e")
     if dataset.uwb is not None:
-        u, form = dataset.uwb, "%d %d %.4f %.4f"
-        _savetxt(folder / "UwbReading.txt", [u.pose + 1, u.antenna, u.range, u.sigma], form)
-    if dataset.antenna_guess is not None:
-        g = dataset.antenna_guess
+        u, g = dataset.uwb, dataset.antenna_guess
+        _savetxt(folder / "UwbReading.txt", [u.pose + 1, u.antenna, u.range, u.sigma],
+                 "%d %d %.4f %.4f")
         _savetxt(folder / "UwbAntennaGuess.txt", [g.antenna, *g.position.T], "%d %.3f %.3f")
     if dataset.vehicle != TABLE_2:
         _write_vehicle(folder / "vehicle.toml", dataset.vehicle)
@@ -282,15 +275,16 @@ def _write_sensors(folder, dataset):
 
 def _write_truth(folder, truth):
     folder.mkdir()
-    n = len(truth.poses)
-    _savetxt(folder / "vehiclePose.txt", [np.arange(1, n + 1), *truth.poses.T], "%d %.6f %.6f %.6f")
-    _savetxt(folder / "ArucoMap.txt", [truth.marker, *truth.marker_in_world.T], "%d %.6f %.6f %.6f")
-    _savetxt(folder / "UwbMap.txt", [truth.antenna, *truth.antenna_in_world.T], "%d %.6f %.6f")
+    for name, row, coordinates in (
+            ("vehiclePose", np.arange(1, len(truth.poses) + 1), truth.poses),
+            ("ArucoMap", truth.marker, truth.marker_in_world),
+            ("UwbMap", truth.antenna, truth.antenna_in_world)):
+        _savetxt(folder / f"{name}.txt", [row, *coordinates.T], "%d" + len(coordinates.T) * " %.6f")
     _write_vehicle(folder / "vehicle.toml", truth.vehicle)
 
 
 def _write_vehicle(path, vehicle):
-    lines = [f"{name} = {float(value)!r}\n" for name, value in asdict(vehicle).items()
+    lines = [f"{name} = {json.dumps(value)}\n" for name, value in asdict(vehicle).items()
              if value is not None and (name in WHEEL_ENTRIES or value != getattr(TABLE_2, name))]
     path.write_text("".join(lines), encoding="utf-8", newline="\n")
 

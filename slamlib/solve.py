@@ -103,7 +103,7 @@ def find(problem, dataset, found=None):
         "problem3": lambda: slam.estimate(dataset.without("uwb")),
         "problem4": lambda: slam.estimate(dataset, previous=(found or {}).get("problem3"))}
     result = solvers[problem]()
-    _require_covariances(result)
+    require_covariances(result)
     return result
 
 
@@ -112,7 +112,7 @@ def _poses_and_covariances(result):
     return result if isinstance(result, tuple) else (result.poses, result.covariances)
 
 
-def _require_covariances(result):
+def require_covariances(result):
     """Raise LinAlgError where a covariance of what `find` returns is lost by rounding."""
     poses, covariances = _poses_and_covariances(result)
     maps = (getattr(result, name, None) for name in COVARIANCE_FIELDS)
@@ -134,13 +134,21 @@ def problem_solution(problem, dataset, found=None):
     """
     found = find(problem, dataset) if found is None else found
     poses, covariances = _poses_and_covariances(found)
-    more = {"problem2": _marker_fields, "problem2_fused": _fusion_fields,
-            "problem3": _slam_fields, "problem4": _slam_and_antenna_fields}.get(problem)
-    fields = {"poses": poses, "covariances": covariances} | (more(dataset, found) if more else {})
+    fields = {"poses": poses, "covariances": covariances}
+    if problem == "problem2":
+        fields = _localization_fields(dataset, found)
+    elif problem == "problem2_fused":
+        fields["facts"] = _fusion_facts(dataset, found)
+    elif problem in ("problem3", "problem4"):
+        fields |= {"facts": _slam_facts(dataset, found), "doubts": solution_doubts(found)}
+        if dataset.aruco is not None:
+            fields["aruco_map"] = found.marker, found.marker_in_world, found.marker_covariance
+        if problem == "problem4":
+            fields["uwb_map"] = found.antenna, found.antenna_in_world, found.antenna_covariance
     return Solution(problem=problem, title=title(problem, dataset), **fields)
 
 
-def _marker_fields(dataset, found):
+def _localization_fields(dataset, found):
     """Fields of problem 2's Solution by a Localization; the first localized pose is the world."""
     poses = np.full((len(dataset.ticks), 3), np.nan)
     covariances = np.full((len(dataset.ticks), 3, 3), np.nan)
@@ -151,39 +159,40 @@ def _marker_fields(dataset, found):
              "sightings": len(dataset.aruco.pose), "outliers": int(found.rejected.sum()),
              "unused_sightings": int(found.unused.sum())}
     return {"poses": poses, "covariances": covariances, "world": int(found.frame[known][0]),
-            "aruco_map": _marker_map(found), "facts": facts}
+            "aruco_map": (found.marker, found.marker_in_world, found.marker_covariance),
+            "facts": facts}
 
 
-def _fusion_fields(dataset, found):
-    """Fields of the Solution of problem 2 by a Fusion with shared errors."""
-    factor = dataset.vehicle.marker_noise_factor
-    facts = {"slip_sqrt_m": found.slip}
+def _fusion_facts(dataset, found):
+    """Noise and wheel parameters of a Fusion."""
+    facts, factor = {"slip_sqrt_m": found.slip}, dataset.vehicle.marker_noise_factor
     if factor is not None:
         facts["marker_noise_factor"] = factor
-    return {"facts": {**facts, **_given_facts(dataset, facts), "outliers": found.rejected,
-                      **_wheel_facts(found)}}
+    return {**_with_given(dataset, facts), "outliers": found.rejected, **_wheel_facts(found)}
 
 
-def _slam_fields(dataset, found):
-    """Fields of the Solution of problem 3 by a SlamResult."""
-    return {"aruco_map": None if dataset.aruco is None else _marker_map(found),
-            "facts": _slam_facts(found, dataset), "doubts": solution_doubts(found)}
-
-
-def _slam_and_antenna_fields(dataset, found):
-    """Fields of the Solution of problem 4 by a SlamResult."""
-    down_weighted = {antenna: int(np.sum(found.range_weight[dataset.uwb.antenna == antenna] < 0.5))
-                     for antenna in found.antenna.tolist()}
-    fields = _slam_fields(dataset, found)
-    fields["facts"] |= {"ranges": len(dataset.uwb.pose),
-                        "ranges_down_weighted_by_antenna": down_weighted,
-                        "antennas_in_doubt": found.doubts}
-    return fields | {"uwb_map": (found.antenna, found.antenna_in_world, found.antenna_covariance)}
-
-
-def _marker_map(found):
-    """Ids, poses and covariances of the markers."""
-    return found.marker, found.marker_in_world, found.marker_covariance
+def _slam_facts(dataset, found):
+    """Noise, evidence, calibration and wheel parameters of a SlamResult, and what it rejects."""
+    facts, sigmas = {"slip_sqrt_m": found.slip}, found.noise_sigma.tolist()
+    facts["slip_relative_sigma"] = sigmas[0]
+    for name, rows, factor, sigma, correlation in (
+            ("marker", found.rejected, found.noise.sightings, sigmas[1], found.correlation[0]),
+            ("range", found.antenna, found.noise.ranges, sigmas[2], found.correlation[1])):
+        if len(rows):
+            facts |= {f"{name}_noise_factor": factor, f"{name}_noise_relative_sigma": sigma,
+                      f"{name}_error_correlation": correlation.tolist()}
+    facts = _with_given(dataset, facts) | {
+        "increments": found.model, "outliers": int(found.rejected.sum()),
+        "unconfirmed": found.unconfirmed.tolist(), "chi2_per_dof": found.chi2_per_dof,
+        "chi2_per_dof_of_all": found.chi2_per_dof_of_all, "log_evidence": found.log_evidence,
+        **_wheel_facts(found), "calibration": [row for row in found.calibration_table
+                                               if row["sigma"]]}
+    if len(found.antenna):
+        weak = dataset.uwb.antenna[found.range_weight < 0.5].tolist()
+        facts |= {"ranges": len(dataset.uwb.pose), "antennas_in_doubt": found.doubts,
+                  "ranges_down_weighted_by_antenna": {each: weak.count(each)
+                                                      for each in found.antenna.tolist()}}
+    return facts
 
 
 def _wheel_facts(found):
@@ -192,27 +201,11 @@ def _wheel_facts(found):
             "wheel_parameter_sigmas_m": np.sqrt(np.diag(found.wheel_covariance)).tolist()}
 
 
-def _given_facts(dataset, facts):
-    """The entry "given" with the names of facts that the dataset's Vehicle states, if any."""
-    names = [name for name in facts
+def _with_given(dataset, facts):
+    """Facts with the entry "given", the names of those that the Vehicle states, if any."""
+    given = [name for name in facts
              if getattr(dataset.vehicle, name.removesuffix("_sqrt_m"), None) is not None]
-    return {"given": names} if names else {}
-
-
-def _slam_facts(found, dataset):
-    """Noise, evidence and wheel parameters of a SlamResult."""
-    facts, sigma = {}, found.noise_sigma.tolist()
-    if len(found.rejected):
-        facts |= {"marker_noise_factor": found.noise.sightings,
-                  "marker_noise_relative_sigma": sigma[1]}
-    if len(found.antenna):
-        facts |= {"range_noise_factor": found.noise.ranges, "range_noise_relative_sigma": sigma[2]}
-    facts = {"slip_sqrt_m": found.slip, "slip_relative_sigma": sigma[0], **facts}
-    return {**facts, **_given_facts(dataset, facts), "increments": found.model,
-            "outliers": int(found.rejected.sum()), "chi2_per_dof": found.chi2_per_dof,
-            "chi2_per_dof_of_all": found.chi2_per_dof_of_all,
-            "log_evidence": found.log_evidence, **_wheel_facts(found),
-            "calibration": [row for row in found.calibration_table if row["sigma"]]}
+    return {**facts, "given": given} if given else facts
 
 
 def solutions(dataset, found=None, problems=tuple(PROBLEMS)):
@@ -222,9 +215,7 @@ def solutions(dataset, found=None, problems=tuple(PROBLEMS)):
     already (dict by problem).
     """
     found = dict(found or {})
-    for problem in problems:
-        if not allows(dataset, problem):
-            continue
+    for problem in (each for each in problems if allows(dataset, each)):
         try:
             result = found[problem] if problem in found else find(problem, dataset, found)
             if problem == "problem3":                    # from which problem 4 starts
@@ -249,8 +240,7 @@ def write_solution(folder, solution):
     (Path(folder) / SUMMARY).unlink(missing_ok=True)
     folder = Path(folder) / solution.problem
     results.write_vehicle_poses(folder, solution.poses, solution.covariances)
-    if solution.aruco_map is not None:
-        results.write_aruco_map(folder, *solution.aruco_map)
-    if solution.uwb_map is not None:
-        results.write_uwb_map(folder, *solution.uwb_map)
+    for name, each in (("ArucoMap", solution.aruco_map), ("UwbMap", solution.uwb_map)):
+        if each is not None:
+            results.write_map(folder, name, *each)
     return folder

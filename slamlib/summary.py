@@ -7,19 +7,17 @@ import signal
 import sys
 import threading
 import time
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import asdict
 from itertools import chain
-from multiprocessing import active_children, get_context
-from pathlib import Path
+from multiprocessing import Pipe, get_context
 
 import numpy as np
 
 from slamlib import evaluation, swap
 from slamlib.checks.files import doubts_before_solving, merged
 from slamlib.dataset import read_dataset, read_truth
+from slamlib.export import export_results
 from slamlib.inventory import all_notes
 from slamlib.solve import (
     PROBLEMS,
@@ -36,82 +34,125 @@ PR_SET_PDEATHSIG = 1                                           # Linux, prctl(2)
 PARALLEL_PROBLEMS = ("problem1", "problem2", "problem2_hint", "problem2_fused")
 
 
-def solve_to_folder(dataset, truth, out, jobs=1):
-    """Solve all problems of a Dataset and write their files below the folder `out`.
+def solve_to_folder(dataset, truth, out, problems=tuple(PROBLEMS), csv=False):
+    """Solve problems of a Dataset and write their files to the folder `out`.
 
-    Returns the summary, the dict that is written to summary.json. A problem that could not be
-    solved has the entry "failed", a sentence. The list "doubts", of "what" and "sentence", has
-    those about the drive first, then by problem. "notes" lists what was mended or left out while
-    the files were read. The Truth, or None, serves to report errors, never to estimate. When all
-    files are written they replace those of an earlier run, by `swap.publish`. With two `jobs`, a
-    second process solves problems 1 and 2.
+    When all files are written they replace those of an earlier run, by `swap.publish`. A second
+    process solves problems 1 and 2: a fork, which is safe only on Linux and of the main thread.
+
+    Parameters
+    ----------
+    dataset : Dataset
+    truth : Truth, to report errors, never to estimate; or None.
+    out : path of the folder.
+    problems : keys of `solve.PROBLEMS`; those for which there are sensors are solved.
+    csv : bool; True writes each .mat file also as text.
+
+    Returns
+    -------
+    The summary, the dict that is written to summary.json. A problem that could not be solved has
+    the entry "failed", a sentence. The list "doubts", of "what" and "sentence", has those about the
+    drive first, then by problem. "notes" lists what was mended or left out while the files were
+    read.
     """
-    out = Path(out)
     with swap.staging(out) as stage:
-        summary = _summary(dataset, truth, stage, jobs)
+        rows = _written_by_all(dataset, truth, stage, problems)
+        summary = _summary(dataset, truth, rows)
         text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
         swap.write_atomically(stage / SUMMARY, text.encode())
-        swap.require_staged(stage)
-        swap.publish([swap.FileSet(out, {name: stage / name for name in swap.file_names(stage)},
-                               last=SUMMARY, ours=RESULT_NAMES)])
+        if csv and any(stage.glob("*/*.mat")):
+            export_results(stage, "csv", stage)
+        swap.publish({out: stage}, ours=RESULT_NAMES)
     return summary
 
 
-def _summary(dataset, truth, stage, jobs):
-    """The summary; files are written to the empty folder `stage`, or none if it is None."""
-    (rows, doubts), about_drive = _written_by_all(dataset, truth, stage, jobs)
-    in_order = [problem for problem in PROBLEMS if problem in rows]
-    return {"dataset": dataset.name, "poses": len(dataset.ticks),
-            "doubts": [asdict(doubt) for doubt in merged(
-                [*about_drive, *chain(*(doubts[problem] for problem in in_order))])],
+def _summary(dataset, truth, rows):
+    """The summary of what `_written` returns."""
+    rows = {problem: rows[problem] for problem in PROBLEMS if problem in rows}
+    return {"dataset": dataset.name, "poses": len(dataset.ticks), "kernel": dataset.vehicle.kernel,
+            "doubts": [asdict(doubt) for doubt in merged(chain(
+                doubts_before_solving(dataset, truth), *(doubts for _, doubts in rows.values())))],
             "notes": list(all_notes(dataset, truth)),
-            "problems": {problem: rows[problem] for problem in in_order}}
+            "problems": {problem: row for problem, (row, _) in rows.items()}}
+
+
+def _written(dataset, truth, stage, problems):
+    """Solve problems, and write to `stage` if not None; {problem: (row of the summary, doubts)}."""
+    rows, start = {}, time.perf_counter()
+    for solution in solutions(dataset, problems=problems):
+        failed = isinstance(solution, Failure)
+        seconds = time.perf_counter() - start
+        row = {"failed": solution.reason} if failed else summarize(solution, truth)
+        rows[solution.problem] = ({"title": solution.title, **row, "seconds": seconds},
+                                  () if failed else solution.doubts)
+        if not failed and stage is not None:
+            write_solution(stage, solution)
+        start = time.perf_counter()
+    return rows
+
+
+def _written_by_all(dataset, truth, stage, problems):
+    """What `_written` returns, by two processes where that is safe."""
+    safe = sys.platform == "linux" and len(os.sched_getaffinity(0)) > 1 \
+        and threading.current_thread() is threading.main_thread()
+    second = [each for each in problems if safe and each in PARALLEL_PROBLEMS]
+    if not second:
+        return _written(dataset, truth, stage, problems)
+    receiver, sender = Pipe(duplex=False)
+    with receiver, process("fork", lambda: sender.send(_written(dataset, truth, stage, second))):
+        sender.close()
+        rows = _written(dataset, truth, stage, [x for x in problems if x not in second])
+        try:
+            return rows | receiver.recv()
+        except EOFError:            # it failed, or was killed, as where memory is short
+            return rows | _written(dataset, truth, stage, second)
 
 
 @contextmanager
-def tables(folders, tell):
-    """Context in which another process solves the datasets in `folders` (list of Path).
+def process(method, function, *arguments):
+    """Context in which a process runs a function, silently if it fails; it ends with the context.
 
-    A thread calls the function `tell` with each dataset's `summary_table` (str), the shortest
-    drive's first; nothing is written. The context's value is a function that waits for the tables
-    for at most a number of seconds. The process ends with the context.
+    `method` is that of multiprocessing to start it. The value is the multiprocessing.Process. On
+    Linux it ends with this process, too, however that ends.
     """
-    context = get_context("fork" if sys.platform == "linux" else "spawn")
-    receiver, sender = context.Pipe(duplex=False)
-    process = context.Process(target=_send_tables, args=(folders, sender, os.getpid()), daemon=True)
-    process.start()
-    sender.close()
-    listening = threading.Thread(target=_tell_all, args=(receiver, tell), daemon=True)
-    listening.start()
+    child = get_context(method).Process(target=_run, args=(os.getpid(), function, *arguments))
+    child.start()
     try:
-        yield listening.join
+        yield child
     finally:
-        process.kill()
-        process.join()
-        listening.join()
+        child.kill()
+        child.join()
 
 
-def _send_tables(folders, sender, parent):
-    """Send the summary tables of the datasets in `folders`; `parent` is a process id."""
+def _run(parent, function, *arguments):
     if sys.platform == "linux":
-        _ends_with(parent)
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != parent:                      # gone already
+            os._exit(1)
+    try:
+        function(*arguments)
+    except BaseException:                               # the parent meets it, too
+        os._exit(1)
+
+
+def tables(folders):
+    """Context in which another process prints the `summary_table` of datasets, the shortest first.
+
+    `folders` is a list of Path; nothing is written. The value is the multiprocessing.Process.
+    """
+    return process("fork" if sys.platform == "linux" else "spawn", _print_tables, folders)
+
+
+def _print_tables(folders):
+    over_a_bar = "\r\033[K" if sys.stderr.isatty() else ""
     drives = [(read_dataset(folder), read_truth(folder)) for folder in folders]
     for dataset, truth in sorted(drives, key=lambda drive: len(drive[0].ticks)):
         try:
-            text = summary_table(_summary(dataset, truth, None, 1))
+            rows = _written(dataset, truth, None, PROBLEMS)
+            text = summary_table(_summary(dataset, truth, rows))
         except Exception as error:          # the notebooks report it in full
             text = f"{dataset.name}: not solved before the notebooks: {error!r}"
-        sender.send(text)
-
-
-def _tell_all(receiver, tell):
-    """Call `tell` with every object that is received until the other end is closed."""
-    with receiver:
-        while True:
-            try:
-                tell(receiver.recv())
-            except EOFError:                # the process has ended
-                return
+        print(over_a_bar + text, file=sys.stderr, flush=True)
 
 
 def summary_table(summary):
@@ -131,67 +172,11 @@ def summary_table(summary):
         sigma = "{:7.4f} m {:7.4f} m {:6.4f}".format(*row["last_sigma"])
         error = f"{row['ate_m']:9.4f} m" if judged else ""
         lines.append(f"{name:15}{row['estimated_poses']:10}{pose:>29} {sigma:>27}{error}")
+        if once := ", ".join(map(str, row.get("unconfirmed", ()))):
+            lines.append(
+                f"{'':15}nothing confirms markers {once}: seen once, or where another one is")
     lines += [f"doubt ({doubt['what']}): {doubt['sentence']}" for doubt in summary["doubts"]]
     return "\n".join(lines)
-
-
-def _written_by_all(dataset, truth, stage, jobs):
-    """The result of `_written` for all problems, and doubts about the drive.
-
-    With two `jobs` there are two processes. The second one is a fork, which is safe only on Linux.
-    It ends with this process, so that nothing is written later.
-    """
-    if jobs < 2 or sys.platform != "linux" or len(os.sched_getaffinity(0)) < 2:
-        return _written(dataset, truth, stage, PROBLEMS), doubts_before_solving(dataset, truth)
-    first = [problem for problem in PROBLEMS if problem not in PARALLEL_PROBLEMS]
-    others = set(active_children())
-    with ProcessPoolExecutor(1, mp_context=get_context("fork"), initializer=_ends_with,
-                             initargs=(os.getpid(),)) as pool:
-        try:
-            second = pool.submit(_solve_in_parallel, dataset, truth, stage)
-            rows, doubts = _written(dataset, truth, stage, first)
-            try:
-                (more_rows, more_doubts), about_drive = second.result()
-            except BrokenProcessPool:                   # killed, as where memory is short
-                (more_rows, more_doubts), about_drive = _solve_in_parallel(dataset, truth, stage)
-            return (rows | more_rows, doubts | more_doubts), about_drive
-        except BaseException:                           # nobody needs its results
-            for process in set(active_children()) - others:
-                process.kill()
-            raise
-
-
-def _ends_with(parent):
-    """Let the kernel end this process when `parent` (process id) is gone, however it ended.
-
-    Signals that end both end this process at once: only the parent has something to put in order.
-    """
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_DFL)
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:                          # gone already
-        os._exit(1)
-
-
-def _solve_in_parallel(dataset, truth, stage):
-    """The results of the second process: `_written` for its problems, doubts about the drive."""
-    return (_written(dataset, truth, stage, PARALLEL_PROBLEMS),
-            doubts_before_solving(dataset, truth))
-
-
-def _written(dataset, truth, stage, problems):
-    """Solve some problems and write their files; rows of the summary and doubts, by problem."""
-    rows, doubts, start = {}, {}, time.perf_counter()
-    for solution in solutions(dataset, problems=problems):
-        failed = isinstance(solution, Failure)
-        seconds = time.perf_counter() - start
-        row = {"failed": solution.reason} if failed else summarize(solution, truth)
-        rows[solution.problem] = {"title": solution.title, **row, "seconds": seconds}
-        doubts[solution.problem] = () if failed else solution.doubts
-        if not failed and stage is not None:
-            write_solution(stage, solution)
-        start = time.perf_counter()
-    return rows, doubts
 
 
 def summarize(solution, truth):

@@ -6,6 +6,7 @@ A `DatasetError` is one sentence, which names the file, the line and what was ex
 import re
 import stat
 import tomllib
+from difflib import get_close_matches
 
 CONTROL_BYTE = re.compile(rb"[\x00-\x08\x0e-\x1f]")  # bytes that no text has
 
@@ -33,18 +34,15 @@ def read_toml(path, example, known, encoding="ascii"):
         entries = tomllib.loads(text)
     except (ValueError, RecursionError) as failure:
         reason, _, place = str(failure).partition(" (at ")
-        if at_line := re.match(r"line (\d+)", place):
-            line = int(at_line[1])
-        else:
-            line = text.rstrip("\n").count("\n") + 1 if place == "end of document)" else None
+        end = text.rstrip("\n").count("\n") + 1 if place == "end of document)" else None
+        line = int(found[1]) if (found := re.match(r"line (\d+)", place)) else end
         raise error(path, f"expected TOML such as '{example}' ({reason})", line) from None
     for key, value in entries.items():
         at_key = re.search(rf"""^[\s\["']*{re.escape(key)}(?![\w-])""", text, re.MULTILINE)
         line = text.count("\n", 0, at_key.end()) + 1 if at_key else None
         if key not in known:
-            names = ", ".join(name for name in known if not name.startswith("sigma_"))
-            raise error(path, f"expected keys among {names} and their sigma_..., found "
-                        f"{quoted(key)}", line)
+            nearest = ", ".join(get_close_matches(key, known, 3, cutoff=0))
+            raise error(path, f"expected an entry such as {nearest}, found {quoted(key)}", line)
         entries[key] = value, line
     return entries
 
@@ -52,32 +50,23 @@ def read_toml(path, example, known, encoding="ascii"):
 def read_text(path, encoding="ascii"):
     """Text of a file with line ends '\\n', and the name of its encoding if that is UTF-16, or "".
 
-    Bytes that are invalid in `encoding` become '\\ufffd'. Raises DatasetError if the file cannot be
-    read or has control bytes.
+    Bytes that are invalid in `encoding` become '\\ufffd'. UTF-16 has a byte order mark, or NUL in
+    every second byte. Raises DatasetError if the file cannot be read or has control bytes.
     """
     data = read_regular(path)
-    utf16 = _utf16(data)
-    if utf16:
-        try:
-            data = data.decode(utf16).encode()
-        except UnicodeError:
-            raise error(path, "expected plain text, found UTF-16 that breaks off") from None
+    utf16 = next((codec for codec, is_so in (
+        ("utf-16", data[:2] in (b"\xff\xfe", b"\xfe\xff")),
+        ("utf-16-le", data[1:] and not data[1::2].strip(b"\0")),
+        ("utf-16-be", data and not data[::2].strip(b"\0"))) if is_so), "")
+    try:
+        data = data.decode(utf16).encode() if utf16 else data
+    except UnicodeError:
+        raise error(path, "expected plain text, found UTF-16 that breaks off") from None
     data = data.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     if control := CONTROL_BYTE.search(data):
         line = data.count(b"\n", 0, control.start()) + 1
         raise error(path, f"expected plain text, found the byte 0x{control[0].hex()}", line)
     return data.decode(encoding, errors="replace"), "UTF-16" if utf16 else ""
-
-
-def _utf16(data):
-    """Codec of UTF-16 text, which has a byte order mark, or NUL in every second byte; or ""."""
-    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        return "utf-16"
-    for codec, zeros, others in (("utf-16-le", data[1::2], data[::2]),
-                                 ("utf-16-be", data[::2], data[1::2])):
-        if zeros and len(zeros) == len(others) and not zeros.strip(b"\0") and b"\0" not in others:
-            return codec
-    return ""
 
 
 def error(path, message, line=None):
@@ -98,9 +87,8 @@ def read_regular(path):
     try:
         mode = path.stat().st_mode
         if not stat.S_ISREG(mode):
-            kind = "a folder" if stat.S_ISDIR(mode) else "a pipe" if stat.S_ISFIFO(mode) \
-                else "a socket" if stat.S_ISSOCK(mode) else "a device"
-            raise error(path, f"{expected}, found {kind}")
+            raise error(path, f"{expected}, found a " + (
+                "folder" if stat.S_ISDIR(mode) else "pipe" if stat.S_ISFIFO(mode) else "device"))
         return path.read_bytes()
     except OSError:
         raise error(path, expected) from None

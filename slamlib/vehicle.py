@@ -1,10 +1,12 @@
-"""The vehicle: wheels and sensors as stated, how well they are known, and known noise."""
+"""The vehicle: wheels and sensors as stated, how well they are known, and how they are weighed."""
 
+import json
 from dataclasses import asdict, dataclass, replace
+from numbers import Real
 
 import numpy as np
 
-from slamlib.limits import LIMITS
+from slamlib.limits import KERNEL_NAMES, LIMITS
 from slamlib.textfile import error, quoted, read_toml
 
 
@@ -27,6 +29,8 @@ class Vehicle:
     slip: float | None = None  # sqrt(m), sigma of a wheel's slip after 1 m; None: learned
     marker_noise_factor: float | None = None  # of the sigmas in ArucoReading.txt; None: learned
     range_noise_factor: float | None = None  # of the sigmas in UwbReading.txt; None: learned
+    kernel: str = KERNEL_NAMES[0]  # of sightings and ranges; of ranges alone if it is asymmetric
+    gate: bool = True  # whether measurements that contradict the solution are rejected
     camera_x: float = 0.0  # m, place of the camera in the vehicle
     camera_y: float = 0.0  # m
     camera_turn: float = 0.0  # rad, heading of the camera in the vehicle
@@ -78,13 +82,29 @@ def read_vehicle(files, default):
     path = files.files.get("vehicle.toml")
     if path is None:
         return default
-    limits, values = LIMITS["vehicle.toml"], asdict(default)
-    entries = read_toml(path, "wheelbase = 0.4", list(values))
+    entries = read_toml(path, "wheelbase = 0.4", [*LIMITS["vehicle.toml"]])
+    return changed(default, {key: value for key, (value, _) in entries.items()}, path,
+                   {key: line for key, (_, line) in entries.items()})
+
+
+def changed(vehicle, entries, source, lines=None):
+    """The Vehicle with `entries`, values by the names of its fields.
+
+    Raises DatasetError for one that is not within LIMITS, with the `source`, a file or a function,
+    and the line, if `lines` has it by name.
+    """
+    limits, values = LIMITS["vehicle.toml"], asdict(vehicle)
     for key in sorted(entries, key=list(limits).index):    # a parameter before its sigma
-        (value, line), limit = entries[key], limits[key]
-        maximum = values.get(limit.maximum, limit.maximum)
-        if type(value) not in (int, float) or not limit.minimum <= value <= maximum:
-            raise error(path, f"expected {limit.expected(f'number for {key}')}, found "
-                        f"{quoted(value)}", line)
-        values[key] = float(value)
+        value, limit = entries[key], limits[key]
+        if isinstance(limit, tuple):
+            ok, expected = isinstance(value, type(limit[0])) and value in limit, " or ".join(
+                map(json.dumps, limit))
+        else:
+            maximum, expected = values.get(limit.maximum, limit.maximum), f"a number {limit}"
+            ok = isinstance(value, Real) and not isinstance(value, bool) \
+                and limit.minimum <= value <= maximum
+        if not ok:
+            raise error(source, f"expected {expected} for {key}, found {quoted(value)}",
+                        (lines or {}).get(key))
+        values[key] = value if isinstance(limit, tuple) else float(value)
     return Vehicle(**values)

@@ -79,8 +79,7 @@ def run(arguments, folder):
 def contents(folder):
     """Bytes of a run's files by name: not those of the user, nor what begins with a dot."""
     return {name: _plain(folder / name) for name in swap.file_names(folder)
-            if name not in MINE and name != swap.UNFINISHED
-            and not any(part.startswith(".") for part in Path(name).parts)}
+            if name not in MINE and not any(part.startswith(".") for part in Path(name).parts)}
 
 
 def _plain(file):
@@ -94,31 +93,32 @@ def _plain(file):
     return content
 
 
-def judge(folder, references, last=None):
+def judge(folder, references):
     """Which reference, "A" or "B", a folder holds, finished; else "unfinished" or "MIXED: ...".
 
-    Never may files of two runs be side by side, and the file `last` is there with all others only.
-    The user's files must be as they were.
+    Never may files of two runs be side by side, nor a part of them. The user's files must be as
+    they were. A folder that a run was replacing is missing, and the old one is beside it.
     """
+    if not folder.exists():
+        return "unfinished" if swap.beside(folder, "old").exists() else "MIXED: lost all"
     found = contents(folder)
-    owners = [name for name, files in references.items() if found.items() <= files.items()]
+    owners = [name for name, files in references.items() if found == files]
     for name, text in MINE.items():
         if not (folder / name).is_file() or (folder / name).read_text() != text:
             return "MIXED: lost " + name
-    marked = (folder / swap.UNFINISHED).exists()
-    if not owners or last in found and found.keys() != references[owners[0]].keys():
-        return "MIXED: " + " ".join(sorted(found))
-    if marked:
-        return "unfinished"
-    return owners[0] if found.keys() == references[owners[0]].keys() else "MIXED: not marked"
+    return owners[0] if owners else "MIXED: " + " ".join(sorted(found))
 
 
 def left(folder):
     """What lies in a folder that is no run's and no user's, empty folders too."""
     return [str(path.relative_to(folder)) for path in folder.rglob("*")
             if path.name.startswith(".") and path.name != swap.FILE_LIST
-            or path.name == swap.UNFINISHED
             or path.is_dir() and not any(path.iterdir())]
+
+
+def beside(root):
+    """What lies hidden beside the folders of runs."""
+    return [path.name for path in root.iterdir() if path.name.startswith(".")]
 
 
 def put_mine(folder):
@@ -137,8 +137,6 @@ def make_drives(root):
 
 class Solves:
     """The command solve between the drives A and B in one folder."""
-
-    last = "summary.json"
 
     def __init__(self, root):
         self.root = root
@@ -161,11 +159,11 @@ class Solves:
 
     def state(self):
         """What `judge` says."""
-        return judge(self.root / "out", self.references, self.last)
+        return judge(self.root / "out", self.references)
 
     def left(self):
         """What is there and should not be after an undisturbed run."""
-        return left(self.root / "out")
+        return [*left(self.root / "out"), *beside(self.root)]
 
 
 class StoredSolves(Solves):
@@ -194,7 +192,7 @@ class Reports:
                 nbformat.v4.new_markdown_cell(f"# {name[0]}. Chapter", id="a"),
                 nbformat.v4.new_code_cell(CODE.format(problems=problems), id="b")]),
                 root / "notebooks" / f"{name}.ipynb")
-        self.folders = {"results/short": None, "report": "index.html"}
+        self.folders = ("results/short", "report")
         self.references, self.copies = {}, {}
         for name in "AB":
             run(self.arguments(name), root)
@@ -216,10 +214,10 @@ class Reports:
             shutil.copytree(self.copies[name] / folder, self.root / folder)
 
     def state(self):
-        """What `judge` says of all folders; where none is marked, they are of one run."""
+        """What `judge` says of all folders; where none is missing, they are of one run."""
         states = {judge(self.root / folder, {
-            name: files[folder] for name, files in self.references.items()}, last)
-            for folder, last in self.folders.items()}
+            name: files[folder] for name, files in self.references.items()})
+            for folder in self.folders}
         mixed = [state for state in states if state.startswith("MIXED")]
         if mixed:
             return mixed[0]
@@ -230,7 +228,7 @@ class Reports:
     def left(self):
         """What is there and should not be after an undisturbed run."""
         return [name for folder in ("results", "report", "build/executed")
-                for name in left(self.root / folder)]
+                for name in left(self.root / folder)] + beside(self.root)
 
 
 class PlainReports(Reports):
@@ -241,8 +239,8 @@ class PlainReports(Reports):
 
     def __init__(self, root):
         from slamlib.report import build
-        build._require_pages = lambda *_: None
-        build.rendered = lambda books, drives, *_: {
+        build.render = lambda *_, **__: {}
+        build._rendered = lambda books, drives, *_: {
             f"{name}.html": f"{name}: {[each.files for each in drives]}, "
                             f"{[s.poses.tolist() for d in drives for s in d.solutions]}".encode()
             for name in ["index", *(source.stem for source in books)]}

@@ -1,5 +1,7 @@
 """Numerical derivatives, standard errors, known noise and trials, shared by the tests."""
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.stats import t
 
@@ -39,3 +41,10 @@ def slam_trial(seed, ranges=True, markers=True, **options):
         return judge_slam(found, dataset.without("uwb"), truth)
     dataset = dataset if markers else dataset.without("aruco")
     return judge_slam(slam.estimate(dataset, previous=found), dataset, truth)
+
+
+def as_points(aruco, rows, variance=1e4):
+    """ArucoReadings of which some rows (mask) are sightings of points: headings are unknown."""
+    covariance = aruco.covariance.copy()
+    covariance[rows, 2] = covariance[rows, :, 2] = [0, 0, variance]
+    return replace(aruco, covariance=covariance)

@@ -1,41 +1,55 @@
-"""Counts since the start and exchanged columns are found where that is certain, and only there."""
+"""Counts since the start, wrapped counters, exchanged columns: found, and only where they are."""
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 from test_dataset import error_of, write
 
-from slamlib import counts
 from slamlib.checks.files import doubts_before_solving
+from slamlib.counts import since_start, unwrapped
 from slamlib.dataset import Vehicle, read_dataset
 from slamlib.simulation import manoeuvre, simulate, write_dataset
 
 simulated = cache(simulate)
 
 
-def cut(dataset, begin, count):
-    """A part of a drive, with the sightings in it."""
-    ticks, seen = dataset.ticks[begin:begin + count].copy(), dataset.aruco
-    ticks[0] = 0
-    seen = seen.select((seen.pose >= begin) & (seen.pose < begin + count))
-    return replace(dataset, ticks=ticks, uwb=None, antenna_guess=None,
-                   aruco=replace(seen, pose=seen.pose - begin) if len(seen.pose) else None)
+def written(folder, ticks):
+    write(folder / "encoderReading.txt", "\n".join(
+        f"{i} {right} {left}" for i, (right, left) in enumerate(np.rint(ticks).astype(int), 1)))
+
+
+def assert_increments(ticks):
+    assert not since_start(ticks, Vehicle())
+    np.testing.assert_array_equal(unwrapped(ticks), ticks)
 
 
 @pytest.mark.slow
-def test_real_increments_are_never_taken_for_counts_since_the_start():
-    """Two hundred drives, cuts of them, and the same driven backward; no doubt either."""
+def test_real_increments_are_never_changed():
+    """Fifty drives, cuts of them, and the same driven backward; at eight rates."""
     rng = np.random.default_rng(0)
-    for seed in range(200):
-        drive, _ = simulate("short", seed, slip=rng.choice([0, 1e-3, 1e-2]))
-        lengths = rng.choice([5, 10, 50, 200, 1000], 3)
-        for part in (drive, *(cut(drive, rng.integers(2000 - n), n) for n in lengths)):
-            for ticks in (part.ticks, -part.ticks):
-                assert counts.cumulative_reason(ticks, part.vehicle, part.aruco) == ""
-                assert not counts.may_be_cumulative(ticks, part.vehicle)
-                assert not counts.jumps(ticks).any()
+    for seed in range(50):
+        ticks = simulate("short", seed, slip=rng.choice([0, 1e-3, 1e-2]))[0].ticks
+        cuts = ((begin, begin + n) for n in rng.choice([5, 10, 50, 200, 1000], 3)
+                for begin in rng.integers(2000 - n, size=1))
+        for begin, end in ((0, 2000), *cuts):
+            for rate in (1, 2, 5, 10, 20, 50, 100, 200):
+                total = ticks[begin:end].cumsum(axis=0)[::rate]
+                for sign in (1, -1):
+                    assert_increments(sign * np.diff(total, axis=0, prepend=total[:1]))
+
+
+def test_manoeuvres_are_never_changed():
+    """Fifty open paths with rests and turns back, at 1 cm to 1 m in a step, with noise."""
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        legs = [(rng.uniform(-5, 10), rng.uniform(-3, 3)) for _ in range(rng.integers(1, 6))]
+        total = manoeuvre(legs, step=rng.choice([0.01, 0.1, 1.0])).cumsum(axis=0)
+        ticks = np.diff(np.rint(total), axis=0, prepend=0).astype(int)
+        rest = np.zeros((rng.integers(100), 2), int)
+        assert_increments(np.insert(ticks, [rng.integers(1, len(ticks) + 1)] * len(rest), rest, 0))
+        fast = np.minimum(np.arange(400), 40)[:, None] * [500, 490]     # 2.5 revolutions in a step
+        assert_increments(np.rint(fast * (1 + rng.normal(0, 0.01, (400, 2)))))
 
 
 DRIVES = {
@@ -51,118 +65,16 @@ DRIVES = {
 @pytest.mark.parametrize("drive", DRIVES)
 def test_increments_of_any_drive_are_taken_as_such(drive, tmp_path):
     ticks = np.r_[np.zeros((1, 2)), DRIVES[drive]].astype(int)
-    write(tmp_path / "encoderReading.txt", "\n".join(
-        f"{i} {right} {left}" for i, (right, left) in enumerate(ticks, start=1)))
+    written(tmp_path, ticks)
     dataset = read_dataset(tmp_path)
     np.testing.assert_array_equal(dataset.ticks, ticks)
     assert dataset.notes == () and doubts_before_solving(dataset) == []
 
 
-def slow(dataset, factor=20):
+def slow(ticks, factor=20):
     """The drive at a speed that is smaller by a factor."""
-    total = np.repeat(dataset.ticks, factor, axis=0)[factor - 1:].cumsum(axis=0) // factor
-    seen = dataset.aruco
-    return replace(dataset, ticks=np.diff(total, axis=0, prepend=total[:1]), uwb=None,
-                   aruco=replace(seen, pose=seen.pose * factor))
-
-
-def resting(dataset):
-    """The drive with a rest in the middle of its first 200 poses."""
-    drive, rest = cut(dataset, 0, 200), 300
-    seen = drive.aruco
-    return replace(drive, ticks=np.insert(drive.ticks, 100, np.zeros((rest, 2), int), axis=0),
-                   aruco=replace(seen, pose=np.where(seen.pose < 100, seen.pose, seen.pose + rest)))
-
-
-RUN_ON = {                               # a drive, and what its counts since the start begin with
-    "a whole drive": (lambda d: d, 0, "one row has"),
-    "a counter that does not begin at zero": (lambda d: d, [123456, -7], "one row has"),
-    "200 poses": (lambda d: cut(d, 0, 200), 0, "between sightings of a marker"),
-    "from another count": (lambda d: cut(d, 0, 200), [32311, 29874],
-                           "between sightings of a marker"),
-    "backward": (lambda d: replace(cut(d, 0, 200), ticks=-cut(d, 0, 200).ticks), 0, "between"),
-    "a slow drive": (lambda d: cut(slow(d), 0, 3000), 0, "between sightings of a marker"),
-    "a rest": (resting, 0, "between sightings of a marker")}
-
-
-@pytest.mark.parametrize("seed", [0, 1, 2])
-@pytest.mark.parametrize("case", RUN_ON)
-def test_counts_since_the_start_are_differenced_with_a_note(case, seed, tmp_path):
-    change, begin, reason = RUN_ON[case]
-    dataset = change(simulated("short", seed)[0])
-    write_dataset(tmp_path / "drive", replace(
-        dataset, ticks=dataset.ticks.cumsum(axis=0) + np.array(begin)))
-    found = read_dataset(tmp_path / "drive")
-    np.testing.assert_array_equal(found.ticks, dataset.ticks)
-    note, = found.notes
-    assert note.startswith(f"encoderReading.txt holds counts since the start ({reason}")
-    assert doubts_before_solving(found) == doubts_before_solving(dataset)
-
-
-@pytest.mark.parametrize("begin, low", [(60_000, 0), (30_000, -2**15), (3000, 0)])
-@pytest.mark.parametrize("sign", [1, -1])
-def test_counters_of_16_bits_overflow(begin, low, sign, tmp_path):
-    drive = simulated("short", 0)[0]
-    ticks = sign * drive.ticks[:500]
-    counter = (ticks.cumsum(axis=0) + begin - low) % 2**16 + low
-    assert abs(np.diff(counter, axis=0)).max() > 2**15
-    write(tmp_path / "encoderReading.txt", "\n".join(
-        f"{i} {right} {left}" for i, (right, left) in enumerate(counter, start=1)))
-    dataset = read_dataset(tmp_path)
-    np.testing.assert_array_equal(dataset.ticks, ticks)
-    assert "they overflow at 16 bits" in dataset.notes[0]
-
-
-@pytest.mark.parametrize("change", [
-    *(lambda d, n=n: cut(d, 0, n) for n in (5, 8, 50, 200)), resting,
-    lambda d: replace(cut(d, 0, 200), ticks=-cut(d, 0, 200).ticks)])
-def test_undecided_counts_are_doubted(change):
-    """Without markers: a vehicle that speeds up for as long is possible, but not likely."""
-    drive = change(simulated("short", 0)[0])
-    drive = replace(drive, aruco=None, ticks=drive.ticks.cumsum(axis=0))
-    assert counts.cumulative_reason(drive.ticks, drive.vehicle, None) == ""
-    doubt, = doubts_before_solving(drive)
-    assert doubt.what == "counts-since-start"
-    assert f"up to {abs(drive.ticks).max()} in one row" in doubt.sentence
-
-
-def restarted(counter, row):
-    return np.r_[counter[:row], counter[row:] - counter[row]]
-
-
-def without(counter, begin, end):
-    return np.r_[counter[:begin], counter[end:]]
-
-
-JUMPS = {        # what happens to a counter, and the first line that jumps, where it is known
-    "restart after 5 rows": (lambda c: restarted(c, 5), 6),
-    "restart after 300 rows": (lambda c: restarted(c, 300), 301),
-    "restart after 1000 rows": (lambda c: restarted(c, 1000), 1001),
-    "two restarts": (lambda c: restarted(restarted(c, 1000), 300), 301),
-    "lost rows": (lambda c: without(c, 150, 200), 151),
-    "a count at the start": (lambda c: np.r_[c[:1], c[1:] + 30_000], 2),
-    **{f"modulo {m}": (lambda c, m=m: c % m, None) for m in (8000, 2**13, 2**14, 2**15, 2**17)},
-    "15 bits with a sign": (lambda c: (c + 2**14) % 2**15 - 2**14, None)}
-
-
-@pytest.mark.parametrize("seed", [0, 1, 2])
-@pytest.mark.parametrize("case", JUMPS)
-@pytest.mark.parametrize("sign", [1, -1])
-def test_a_counter_that_jumps_is_refused(case, seed, sign, tmp_path):
-    """The reader gives no step of thousands of counts to a wheel that makes hundreds."""
-    change, line = JUMPS[case]
-    drive = simulated("short", seed)[0]
-    counter = change(sign * drive.ticks.cumsum(axis=0))
-    step = np.diff(counter, axis=0)
-    row = 1 + np.flatnonzero((abs(step) > 2 * abs(drive.ticks).max()).any(axis=1))[0]
-    assert line in (None, row + 1)
-    wheel = np.argmax(abs(step[row - 1]) > 2 * abs(drive.ticks).max())
-    seen = drive.aruco.select(drive.aruco.pose < len(counter))
-    write_dataset(tmp_path / "drive", replace(drive, ticks=counter, aruco=seen, uwb=None))
-    assert (f"encoderReading.txt, line {row + 1}: expected counts since the start that run on, but "
-            f"from the row before, the count jumps from {counter[row - 1, wheel]} to "
-            f"{counter[row, wheel]}: the counter restarted or overflowed, or rows are missing, "
-            f"found '{row + 1} ") in error_of(read_dataset, tmp_path / "drive")
+    total = np.repeat(ticks, factor, axis=0)[factor - 1:].cumsum(axis=0) // factor
+    return np.diff(total, axis=0, prepend=total[:1])
 
 
 def forth(rows=300):
@@ -171,84 +83,129 @@ def forth(rows=300):
     return np.r_[[[0, 0]], np.rint(132 + slip)].astype(int)
 
 
-@pytest.mark.parametrize("ticks", [
-    np.r_[forth(), np.zeros((300, 2), int)], np.r_[forth(), -forth()],
-    np.r_[forth(), np.zeros((1000, 2), int), forth(100)], [1, -1] * forth(), [1, 0] * forth(),
-    -np.r_[forth(50), np.zeros((50, 2), int)]],
-    ids=["stands at the end", "to and fro", "stops", "on the spot", "one wheel", "backward"])
-@pytest.mark.parametrize("change", [
-    lambda c: c, lambda c: restarted(c, 250 if len(c) > 250 else 90),
-    lambda c: (c + 2**13) % 2**14 - 2**13],
-    ids=["as it is", "restarted", "overflows"])
-def test_undecided_counts_of_a_vehicle_that_stops_or_turns_back_are_doubted(
-        ticks, change, tmp_path):
-    """Without markers, and without a row of more than 10 revolutions."""
-    counter = change(ticks.cumsum(axis=0))
-    write(tmp_path / "encoderReading.txt", "\n".join(
-        f"{i} {right} {left}" for i, (right, left) in enumerate(counter, start=1)))
+RESTS = np.zeros((300, 2), int)
+RUN_ON = {                               # a drive, and what its counts since the start begin with
+    "a whole drive": (lambda t: t, 0), "another count": (lambda t: t, [123456, -7]),
+    "200 poses": (lambda t: t[:200], 0), "50 poses, fast": (lambda t: 3 * t[:50], 0),
+    "backward": (lambda t: -t[:200], 0), "slow": (lambda t: slow(t)[:3000], 0),
+    "a rest": (lambda t: np.insert(t, 100, RESTS, axis=0), 0),
+    "stands at the end": (lambda t: np.r_[forth(), RESTS], 0),
+    "to and fro": (lambda t: np.r_[forth(), -forth()], [32311, 29874]),
+    "on the spot": (lambda t: [1, -1] * forth(), 0), "one wheel": (lambda t: [1, 0] * forth(), 0)}
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("case", RUN_ON)
+def test_counts_since_the_start_are_differenced_with_a_note(case, seed, tmp_path):
+    change, begin = RUN_ON[case]
+    ticks = change(simulated("short", seed)[0].ticks)
+    written(tmp_path, ticks.cumsum(axis=0) + np.array(begin))
     dataset = read_dataset(tmp_path)
-    np.testing.assert_array_equal(dataset.ticks, counter)
-    doubt, = doubts_before_solving(dataset)
-    assert doubt.what == "counts-since-start"
-    assert f"change gradually from row to row, up to {abs(counter).max()} in" in doubt.sentence
+    np.testing.assert_array_equal(dataset.ticks, ticks)
+    note, = dataset.notes
+    assert note.startswith("encoderReading.txt holds counts since the start, which change gradual")
 
 
-def test_manoeuvres_are_never_taken_for_counts_since_the_start():
-    """Two hundred open paths with rests and turns back, at 1 cm to 1 m in a step, with noise."""
-    rng = np.random.default_rng(0)
-    for _ in range(200):
-        legs = [(rng.uniform(-5, 10), rng.uniform(-3, 3)) for _ in range(rng.integers(1, 6))]
-        total = manoeuvre(legs, step=rng.choice([0.01, 0.1, 1.0])).cumsum(axis=0)
-        ticks = np.diff(np.rint(total), axis=0, prepend=0).astype(int)
-        rest = np.zeros((rng.integers(100), 2), int)
-        ticks = np.insert(ticks, [rng.integers(1, len(ticks) + 1)] * len(rest), rest, axis=0)
-        assert counts.cumulative_reason(ticks, Vehicle(), None) == ""
-        assert not counts.may_be_cumulative(ticks, Vehicle())
-        assert not counts.jumps(ticks).any()
+@pytest.mark.parametrize("modulus", [2**15, 2**16])
+@pytest.mark.parametrize("begin, low", [(60_000, 0), (30_000, -1), (3000, 0)])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_counters_that_wrap_around_are_mended(modulus, begin, low, sign, tmp_path):
+    """Since the start, and differenced by who wrote the file, as wrapped."""
+    ticks = sign * simulated("short", 0)[0].ticks[:1000]
+    counter = (ticks.cumsum(axis=0) + begin - low * modulus // 2) % modulus + low * modulus // 2
+    steps = np.diff(counter, axis=0, prepend=counter[:1])
+    wraps = np.argwhere(steps != ticks)
+    assert len(wraps)
+    said = (f"encoderReading.txt: {len(wraps)} counts were mended that are 2^15 or 2^16 off, as of "
+            f"a counter that wraps around, the first in line {wraps[0][0] + 1}.")
+    for counts in (counter, steps):
+        written(tmp_path, counts)
+        dataset = read_dataset(tmp_path)
+        np.testing.assert_array_equal(dataset.ticks, ticks)
+        assert dataset.notes[-1] == said and len(dataset.notes) == 1 + (counts is counter)
 
 
-def test_fast_increments_are_not_doubted_at_a_speed_that_varies():
-    """From rest to 2.5 revolutions in a step, which then vary by 1 %."""
-    rng = np.random.default_rng(0)
-    for _ in range(200):
-        speed = np.minimum(np.arange(400), 40)[:, None] * [500, 490]
-        ticks = np.rint(speed * (1 + rng.normal(0, 0.01, (400, 2)))).astype(int)
-        assert not counts.may_be_cumulative(ticks, Vehicle())
+@pytest.mark.parametrize("wrong", [3000, -16_000, 30_000, 40_000, 62_000, 70_000])
+def test_other_spikes_are_no_wraps(wrong, tmp_path):
+    ticks = simulated("short", 0)[0].ticks[:300].copy()
+    ticks[150, 0] = wrong
+    written(tmp_path, ticks)
+    np.testing.assert_array_equal(read_dataset(tmp_path).ticks, ticks)
 
 
-def test_counts_that_end_above_the_bound_by_a_leap_are_refused(tmp_path):
-    """One wrong row is no counter."""
-    ticks = np.r_[np.full((50, 2), 132), [[99_999, 132]], np.full((50, 2), 132)]
-    write(tmp_path / "encoderReading.txt", "1 0 0\n" + "\n".join(
-        f"{i} {right} {left}" for i, (right, left) in enumerate(ticks, start=2)))
+def restarted(counter, row):
+    return np.r_[counter[:row], counter[row:] - counter[row]]
+
+
+JUMPS = {        # what happens to a counter, and the first line that jumps, where it is known
+    "restart after 10 rows": (lambda c: restarted(c, 10), 11),
+    "restart after 300 rows": (lambda c: restarted(c, 300), 301),
+    "two restarts": (lambda c: restarted(restarted(c, 1000), 300), 301),
+    "lost rows": (lambda c: np.r_[c[:150], c[200:]], 151),
+    "a count at the start": (lambda c: np.r_[c[:1], c[1:] + 30_000], 2),
+    **{f"modulo {m}": (lambda c, m=m: c % m, None) for m in (8000, 2**13, 2**14, 2**17)}}
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("case", JUMPS)
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_counter_that_jumps_is_refused(case, seed, sign, tmp_path):
+    """The reader gives no step of thousands of counts to a wheel that makes hundreds."""
+    change, line = JUMPS[case]
+    ticks = simulated("short", seed)[0].ticks
+    counter = change(sign * ticks.cumsum(axis=0))
+    off = (abs(np.diff(counter, axis=0)) > 2 * abs(ticks).max()).any(axis=1)
+    row = 2 + np.flatnonzero(off)[0]
+    assert line in (None, row)
+    written(tmp_path, counter)
+    assert (f"encoderReading.txt, line {row}: expected counts since the start that run on: the "
+            "counter restarted, or rows are missing, found '") in error_of(read_dataset, tmp_path)
+
+
+def test_one_wrong_row_is_no_counter(tmp_path):
+    written(tmp_path, np.r_[[[0, 0]], np.full((50, 2), 132), [[99_999, 132]]])
     assert "line 52: expected at most 10 wheel revolutions" in error_of(read_dataset, tmp_path)
-
-
-def test_markers_decide_between_a_counter_and_a_vehicle_in_another_unit():
-    """Radii in cm make increments too long, but no differences of theirs agree with markers."""
-    for seed in range(3):
-        drive = cut(simulated("short", seed)[0], 0, 400)
-        for radius in (1.0, 2.0):
-            vehicle = Vehicle(right_radius=radius, left_radius=radius)
-            assert counts.cumulative_reason(drive.ticks, vehicle, drive.aruco) == ""
 
 
 # Exchanged columns.
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-@pytest.mark.parametrize("path, count", [("short", 2000), ("short", 300), ("long", 3000)])
+@pytest.mark.parametrize("path, count", [("short", 2000), ("long", 3000)])
 @pytest.mark.parametrize("name", ["ArucoReading.txt", "UwbReading.txt"])
+@pytest.mark.parametrize("once", [False, True], ids=["", "one landmark a pose"])
 def test_columns_of_poses_and_landmarks_that_are_exchanged_are_refused(
-        seed, path, count, name, tmp_path):
-    dataset = simulated(path, seed)[0]
-    write_dataset(tmp_path / "drive", dataset.first(count))
-    rows = [line.split() for line in (tmp_path / "drive" / name).read_text().splitlines()]
+        seed, path, count, name, once, tmp_path):
+    write_dataset(tmp_path, simulated(path, seed)[0].first(count))
+    rows = [line.split() for line in (tmp_path / name).read_text().splitlines()]
+    if once:
+        rows = list({row[0]: row for row in np.random.default_rng(seed).permutation(rows)}.values())
+        rows.sort(key=lambda row: int(row[0]))
     for order in (rows, sorted(rows, key=lambda row: int(row[1])), rows[::-1]):
-        write(tmp_path / "drive" / name, "\n".join(" ".join(row) for row in order))
-        assert read_dataset(tmp_path / "drive").notes == ()
-        write(tmp_path / "drive" / name, "\n".join(
-            " ".join([row[1], row[0], *row[2:]]) for row in order))
-        message = error_of(read_dataset, tmp_path / "drive")
-        assert message.startswith(f"{tmp_path / 'drive' / name}: expected the columns (pose id, ")
-        assert "columns 1 and 2 look exchanged" in message
+        write(tmp_path / name, "\n".join(map(" ".join, order)))
+        assert read_dataset(tmp_path).notes == ()
+    write(tmp_path / name, "\n".join(" ".join([row[1], row[0], *row[2:]]) for row in rows))
+    message = error_of(read_dataset, tmp_path)
+    assert message.startswith(f"{tmp_path / name}: expected the columns (pose id, ")
+    assert "columns 1 and 2 look exchanged" in message
+
+
+K = np.arange(300)
+LEGAL = {  # pose, marker, number of poses; each marker is seen once
+    "corridor": (1 + 6 * K, 1 + K, 2000),
+    "corridor as long as its markers": (1 + K, 1 + K, 300),
+    "corridor driven backward": (300 - K, 1 + K, 300),
+    "corridor, sorted by marker": (np.random.default_rng(0).permutation(300) + 1, 1 + K, 300),
+    "one pose": (np.full(300, 7), 1 + K, 300),
+    "few poses, sorted by marker": (np.array([10, 150, 290])[K % 3], 1 + K, 300),
+    "few poses at the begin, sorted by marker": (1 + K % 3, 1 + K, 2000),
+    "marker ids are large": (1 + K % 3, 5000 + K, 2000)}
+
+
+@pytest.mark.parametrize("case", LEGAL)
+def test_legal_files_where_markers_are_seen_once(case, tmp_path):
+    pose, marker, pose_count = LEGAL[case]
+    written(tmp_path, np.zeros((pose_count, 2)))
+    write(tmp_path / "ArucoReading.txt", "\n".join(
+        f"{i} {j} 1 0 0 1 0 0 1 0 1" for i, j in zip(pose, marker)))
+    assert len(read_dataset(tmp_path).aruco.pose) == 300

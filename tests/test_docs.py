@@ -29,18 +29,26 @@ def test_examples_in_docstrings_are_true(module, tmp_path, monkeypatch):
     assert failed == 0 < tried
 
 
+def test_examples_in_the_map_of_the_code_are_true(monkeypatch):
+    monkeypatch.chdir(ROOT)
+    failed, tried = doctest.testfile(str(ROOT / "docs" / "code.md"), module_relative=False)
+    assert failed == 0 < tried
+
+
 def test_the_example_of_the_readme_runs(tmp_path, monkeypatch, capsys):
     """On data/short, in the folder of the README; what it writes is what it says."""
     text = (ROOT / "README.md").read_text()
-    section, = re.findall(r"^## As a library\n(.*?)(?=^## )", text, re.DOTALL | re.MULTILINE)
-    example, = re.findall(r"(?:^    .*\n|^\n(?=    ))+", section[section.index("    from "):],
-                          re.MULTILINE)[:1]
-    lines = [line.removeprefix("    ") for line in example.splitlines()]
-    assert 8 <= len(lines) <= 16
+    _, section = text.split("## As a library\n")
+    examples = re.findall(r"(?:^    .*\n|^\n(?=    ))+", section, re.MULTILINE)
+    lines, arrays = ([line.removeprefix("    ") for line in each.strip("\n").splitlines()]
+                     for each in examples[:2])
+    assert 8 <= len(lines) <= 16 and len(arrays) == 4
     (tmp_path / "data").symlink_to(ROOT / "data")
     monkeypatch.chdir(tmp_path)
     names = {}
     exec("\n".join(lines), names)  # noqa: S102
+    exec("\n".join(arrays), names)  # noqa: S102
+    np.testing.assert_array_equal(names["found"].poses, names["same"].poses)
     assert names["found"].poses.shape == (2000, 3) and len(capsys.readouterr().out) > 20
     rows = np.loadtxt(tmp_path / "build" / "short.tum")
     np.testing.assert_array_equal(rows[:, 1:3], names["found"].poses[:, :2])
@@ -56,6 +64,7 @@ def pages(tmp_path_factory):
                               "PATH": "/usr/bin:/bin", "PYTHONPATH": str(ROOT),
                               "OPENBLAS_NUM_THREADS": "1", "HOME": str(folder.parent)})
     assert (made.returncode, made.stderr) == (0, "")
+    assert made.stdout.endswith(f": {folder / 'index.html'}\n")
     return folder
 
 
@@ -65,11 +74,14 @@ def test_every_module_has_a_page_with_its_functions(pages):
         text = (pages / f"{module.replace('.', '/')}.html").read_text()
         assert 'class="docstring"' in text
     text = (pages / "slamlib" / "slam" / "pipeline.html").read_text()
-    assert re.search(
-        r"<li><code>marker_noise_factor, range_noise_factor</code>: known factors", text)
+    assert "<li><code>marker_noise_factor, range_noise_factor</code>:" in text
     assert "----" not in text.split("pdoc-code codehilite")[0]
     text = (pages / "slamlib" / "slam.html").read_text()
     assert all(f'href="slam/{name}.html"' in text for name in ("pipeline", "fit", "result"))
+    assert 'id="estimate"' in text and re.search(
+        r"poses(</a>)?</code>: \(n, 3\), headings continuous", text)
+    text = (pages / "slamlib" / "dataset.html").read_text()
+    assert re.search(r"ticks(</a>)?</code>: \(n, 2\) int64", text)
 
 
 @pytest.mark.slow
@@ -83,5 +95,7 @@ def test_the_pages_load_nothing(pages, chromium):
     page.wait_for_url(f"{(pages / 'slamlib.html').as_uri()}*")
     page.get_by_role("link", name="odometry", exact=True).first.click()
     page.wait_for_url("**/odometry.html")
+    page.get_by_role("searchbox").fill("from_arrays")
+    page.get_by_role("link", name="slamlib.dataset.Dataset.from_arrays").wait_for()
     page.close()
     assert all(url.startswith((pages.as_uri(), "data:")) for url in requests)

@@ -11,9 +11,8 @@ import pytest
 
 from slamlib.__main__ import main
 from slamlib.export import write_csv, write_tum
-from slamlib.results import read_vehicle_poses, write_vehicle_poses
+from slamlib.results import read_structs, write_vehicle_poses
 from slamlib.simulation import simulate, write_dataset
-from slamlib.swap import UNFINISHED
 
 ABSENT = [np.nan] * 3
 
@@ -43,30 +42,36 @@ def test_a_tum_file_has_pose_numbers_and_unit_quaternions_of_the_poses_that_are_
 def test_comma_separated_values_name_their_columns_and_keep_every_digit(tmp_path):
     poses = np.array([[1 / 3, 2.0, 0.1], ABSENT])
     C = np.array([[[1 / 7, 2, 3], [2, 4, 5], [3, 5, 6]], np.full((3, 3), np.nan)])
-    write_csv(tmp_path / "a.csv", poses, C)
+    write_csv(tmp_path / "a.csv", np.array([7, 8]), poses, C)
     header, row = (tmp_path / "a.csv").read_text().splitlines()
-    assert header == "pose,x,y,theta,s_xx,s_xy,s_xtheta,s_yy,s_ytheta,s_thetatheta"
-    assert [*map(float, row.split(","))] == [1, 1 / 3, 2, 0.1, 1 / 7, 2, 3, 4, 5, 6]
-    write_csv(tmp_path / "a.csv", poses)
-    assert (tmp_path / "a.csv").read_text().splitlines()[0] == "pose,x,y,theta"
+    assert header == "id,x,y,theta,s_xx,s_xy,s_xtheta,s_yy,s_ytheta,s_thetatheta"
+    assert [*map(float, row.split(","))] == [7, 1 / 3, 2, 0.1, 1 / 7, 2, 3, 4, 5, 6]
+    write_csv(tmp_path / "a.csv", np.array([7, 8]), poses[:, :2], C[:, :2, :2])
+    assert (tmp_path / "a.csv").read_text() == \
+        f"id,x,y,s_xx,s_xy,s_yy\n7,{1 / 3:.17g},2,{1 / 7:.17g},2,4\n"
 
 
 def test_every_problem_of_a_folder_is_exported_one_alone_and_the_truth(solved, tmp_path, capsys):
     for kind in ("tum", "csv"):
         for source in (solved / "out", solved / "out" / "problem3", solved / "drive" / "truth"):
             assert main(["export", str(source), "--format", kind, "--out", str(tmp_path)]) == 0
-    told = [Path(line) for line in capsys.readouterr().out.splitlines()]
-    names = {*(path.parent.name for path in (solved / "out").glob("*/vehiclePose.mat")), "truth"}
-    assert len(names) == 7
-    assert {path.name for path in tmp_path.iterdir()} == {path.name for path in told} \
-        == {f"{name}.{kind}" for name in names for kind in ("tum", "csv")}
-    poses, covariances = read_vehicle_poses(solved / "out" / "problem2")
-    known = np.isfinite(poses[:, 0])
-    rows = np.loadtxt(tmp_path / "problem2.csv", delimiter=",", skiprows=1)
-    np.testing.assert_array_equal(rows[:, 0], np.flatnonzero(known) + 1)
-    np.testing.assert_array_equal(rows[:, 1:4], poses[known])
-    np.testing.assert_array_equal(rows[:, [4, 7, 9]],
-                                  np.diagonal(covariances[known], axis1=1, axis2=2))
+    told = {Path(line).relative_to(tmp_path).as_posix()
+            for line in capsys.readouterr().out.splitlines()}
+    assert told == {path.relative_to(tmp_path).as_posix()
+                    for path in tmp_path.rglob("*") if path.is_file()}
+    files = [path.relative_to(solved / "out").with_suffix("").as_posix()
+             for path in (solved / "out").rglob("*.mat")]
+    names = {"truth", *(name.split("/")[0] for name in files)}
+    assert len(names) == 7 and told == {f"{name}.tum" for name in names} | {
+        f"{name}.csv" for name in (*files, "truth/vehiclePose", "truth/ArucoMap", "truth/UwbMap")}
+    for name in ("problem2/vehiclePose", "problem2/ArucoMap", "problem4/UwbMap"):
+        ids, places, covariances = read_structs((solved / "out" / name).parent, Path(name).name)
+        known = np.isfinite(places[:, 0])
+        rows = np.loadtxt(tmp_path / f"{name}.csv", delimiter=",", skiprows=1)
+        d = places.shape[1]
+        np.testing.assert_array_equal(rows[:, 0], ids[known])
+        np.testing.assert_array_equal(rows[:, 1:1 + d], places[known])
+        np.testing.assert_array_equal(rows[:, 1 + d:], covariances[known][:, *np.triu_indices(d)])
 
 
 @pytest.mark.slow
@@ -94,9 +99,7 @@ def test_evo_finds_the_errors_of_the_summary(solved, tmp_path, problem):
     (lambda folder: (folder / "problem3").mkdir(parents=True), "with sub-folders that have one"),
     (lambda folder: (write_vehicle_poses(folder, np.zeros((2, 3)), np.zeros((2, 3, 3))),
                      (folder / "vehiclePose.mat").write_bytes(b"no MATLAB file")),
-     "vehiclePose.mat: expected poses and covariances"),
-    (lambda folder: (write_vehicle_poses(folder, np.zeros((2, 3)), np.zeros((2, 3, 3))),
-                     (folder / UNFINISHED).write_text("")), "run it again")])
+     "expected .mat files as slamlib writes them")])
 def test_a_folder_without_poses_that_can_be_read_is_one_sentence(tmp_path, capsys, make, said):
     make(tmp_path / "results")
     assert main(["export", str(tmp_path / "results"), "--out", str(tmp_path / "out")]) == 2

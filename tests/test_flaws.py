@@ -1,5 +1,6 @@
 """Drives that are not as their files say: the estimate holds, or a doubt names what is wrong."""
 
+import itertools
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -10,11 +11,12 @@ import pytest
 from numeric import known_noise
 
 from slamlib import se2, slam, solve
-from slamlib.checks import solution
+from slamlib.checks import consistency
 from slamlib.checks.files import doubts_before_solving
 from slamlib.checks.solution import GROUPS, solution_doubts
 from slamlib.dataset import Vehicle, read_dataset, read_truth
 from slamlib.evaluation import anees, ate, nees_band
+from slamlib.odometry_gate import NO_JUMPS
 from slamlib.simulation import simulate
 from slamlib.slam.calibration import (
     CAMERA,
@@ -26,6 +28,7 @@ from slamlib.slam.calibration import (
 from slamlib.slam.measurements import Noise
 from slamlib.slam.result import turn_sigma
 from slamlib.studies import montecarlo
+from slamlib.summary import summarize, summary_table
 
 SHORT = Path(__file__).parents[1] / "data" / "short"
 
@@ -48,26 +51,9 @@ def late(dataset, poses):
 def larger_wheels(dataset):
     vehicle = dataset.vehicle
     return replace(dataset, vehicle=replace(vehicle, right_radius=0.101, left_radius=0.101))
-
-
-SIGN = np.array([1, -1, -1])
-WRONG_FILES = {                                # found before any graph is built
-    "wheels-swapped": lambda d: replace(d, ticks=d.ticks[:, ::-1].copy()),
-    "wheels-reversed": lambda d: replace(d, ticks=-d.ticks),
-    "camera-mirrored": lambda d: aruco(
-        d, marker_in_vehicle=d.aruco.marker_in_vehicle * SIGN,
-        covariance=d.aruco.covariance * np.outer(SIGN, SIGN)),
-    "odometry": lambda d: replace(d, ticks=np.zeros_like(d.ticks)),
-    "units": lambda d: aruco(
-        d, marker_in_vehicle=d.aruco.marker_in_vehicle * [1e3, 1e3, 1],
-        covariance=d.aruco.covariance * np.outer([1e3, 1e3, 1], [1e3, 1e3, 1]))}
 WRONG_SIZES = {                                # found by the graph, and mended
-    "covariances a quarter": (lambda d: aruco(d, covariance=d.aruco.covariance / 4),
-                              "marker-noise"),
     "covariances a hundredth": (lambda d: aruco(d, covariance=d.aruco.covariance / 100),
                                 "marker-noise"),
-    "covariances fourfold": (lambda d: aruco(d, covariance=d.aruco.covariance * 4),
-                             "marker-noise"),
     "sigmas of ranges halved": (lambda d: uwb(d, sigma=d.uwb.sigma / 2), "range-noise"),
     "ranges 1.5 % too long": (lambda d: uwb(d, range=d.uwb.range * 1.015), "range-offset"),
     "wheels 1 % too large": (larger_wheels, "wheel-parameters")}
@@ -110,20 +96,15 @@ def range_sigmas(sigma):
 
 LEGAL = {                                      # within the limits, and far from what is usual
     "an unknown heading of pose 1": vehicle(sigma_heading=10.0),
-    "an uncertain heading of pose 1": vehicle(sigma_heading=0.1),
-    "a very certain heading of pose 1": vehicle(sigma_heading=1e-9),
     "very certain wheels": vehicle(
         sigma_right_radius=1e-9, sigma_left_radius=1e-9, sigma_wheelbase=1e-9),
     "unknown wheels": vehicle(sigma_right_radius=0.1, sigma_left_radius=0.1, sigma_wheelbase=0.4),
-    "a very certain range": one_of("uwb", range_sigmas(1e-7)),
     "the most certain range": one_of("uwb", range_sigmas(1e-9)),
     "the most uncertain ranges": range_sigmas(1e4),
     "the most certain sighting": one_of("aruco", uncorrelated(1e-18, 1e-18, 1e-18)),
     "the most uncertain sightings": uncorrelated(1e8, 1e8, 1e14),
     "a sighting of a direction": one_of("aruco", uncorrelated(1e-18, 1e8, 1e-18)),
     "sightings of a distance": uncorrelated(1e8, 1e-18, 1e14),
-    "very certain sightings, and nothing else": lambda d: uncorrelated(1e-18, 1e-18, 1e-18)(
-        range_sigmas(1e4)(vehicle(sigma_heading=10.0)(d))),
     "correlations of almost 1": correlated(0, 1, 1 - 1e-11),
     "correlations with heading of almost 1": correlated(1, 2, 1 - 1e-11)}
 
@@ -132,28 +113,21 @@ def names(*lists):
     return {doubt.what for doubts in lists for doubt in doubts}
 
 
-@pytest.mark.parametrize("seed", [61, 62, 63])
-@pytest.mark.parametrize("what", WRONG_FILES)
-def test_wrong_files_are_named_before_a_graph_is_built(what, seed):
-    dataset, _ = simulate("short", seed)
-    assert what in names(doubts_before_solving(WRONG_FILES[what](dataset)))
-
-
 @cache
-def by_right_files(seed, path="short"):
-    """SlamResult of problem 3 on the drive whose files are right."""
-    return slam.estimate(simulate(path, seed)[0].without("uwb"))
+def right_ate(seed, path="short"):
+    """ATE in m of problem 3 after alignment, on the drive whose files are right."""
+    dataset, truth = simulate(path, seed)
+    return ate(slam.estimate(dataset.without("uwb")).poses, truth.poses, aligned=True)
 
 
 def assert_mended(found, truth, seed, factor=1.2):
     """The covariances hold, and the ATE is at most `factor` times that of the right files."""
     assert anees(found.poses, found.covariances, truth.poses) < 6
-    assert ate(found.poses, truth.poses, aligned=True) < factor * ate(
-        by_right_files(seed).poses, truth.poses, aligned=True)
+    assert ate(found.poses, truth.poses, aligned=True) < factor * right_ate(seed)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [61, 62, 63])
+@pytest.mark.parametrize("seed", [61, 62])
 @pytest.mark.parametrize("flaw", WRONG_SIZES)
 def test_wrong_sizes_are_mended_or_named(flaw, seed):
     """Problems 3 and 4 on short drives: as accurate as on the right files, and said.
@@ -164,9 +138,8 @@ def test_wrong_sizes_are_mended_or_named(flaw, seed):
     """
     dataset, truth = simulate("short", seed)
     spoil, what = WRONG_SIZES[flaw]
-    right, spoilt = by_right_files(seed), spoil(dataset)
-    of_ranges = spoilt.aruco is dataset.aruco and spoilt.vehicle is dataset.vehicle
-    markers = right if of_ranges else slam.estimate(spoilt.without("uwb"))
+    spoilt = spoil(dataset)
+    markers = slam.estimate(spoilt.without("uwb"))
     both = slam.estimate(spoilt, previous=markers)
     assert not doubts_before_solving(spoilt)
     assert_mended(both, truth, seed)
@@ -187,17 +160,16 @@ def test_wrong_sizes_are_mended_or_named(flaw, seed):
 def test_wheels_that_are_far_off_are_named_and_mended_although_slip_explains_the_path(
         wrong, radius, base):
     """Not by more slip than the drive has; ranges give the scale, and wheels within 1 %."""
-    for seed in (501, 502):
-        dataset, truth = simulate("short", seed)
-        spoilt = replace(dataset, vehicle=replace(dataset.vehicle, **wrong))
-        markers = slam.estimate(spoilt.without("uwb"))
-        found = slam.estimate(spoilt, previous=markers)
-        assert names(solution_doubts(markers)) & {"wheel-parameters", "marker-size"}
-        doubt = solution_doubts(found)[0]
-        assert doubt.what == "wheel-parameters" and "By the drive right_radius" in doubt.sentence
-        np.testing.assert_allclose(found.wheel, [radius, radius, base], rtol=0.01)
-        assert markers.slip < 2e-3 and found.slip < 2e-3
-        assert_mended(found, truth, seed, factor=1.3)
+    dataset, truth = simulate("short", 501)
+    spoilt = replace(dataset, vehicle=replace(dataset.vehicle, **wrong))
+    markers = slam.estimate(spoilt.without("uwb"))
+    found = slam.estimate(spoilt, previous=markers)
+    assert names(solution_doubts(markers)) & {"wheel-parameters", "marker-size"}
+    doubt = solution_doubts(found)[0]
+    assert doubt.what == "wheel-parameters" and "By the drive right_radius" in doubt.sentence
+    np.testing.assert_allclose(found.wheel, [radius, radius, base], rtol=0.01)
+    assert markers.slip < 2e-3 and found.slip < 2e-3
+    assert_mended(found, truth, 501, factor=1.3)
 
 
 def test_other_wheels_explain_a_drive_better_than_much_slip():
@@ -214,41 +186,16 @@ def test_other_wheels_explain_a_drive_better_than_much_slip():
 
 
 @pytest.mark.slow
-def test_markers_of_another_size_are_named_and_mended():
-    """Lengths by markers 5 % too large: the same as wheels that are larger, but for the ranges."""
-    dataset, truth = simulate("short", 61)
-    found = slam.estimate(aruco(
-        dataset, marker_in_vehicle=dataset.aruco.marker_in_vehicle * [1.05, 1.05, 1]))
-    doubt, = solution_doubts(found)
-    assert doubt.what == "marker-size" and "marker_size = 0.95" in doubt.sentence
-    assert "Wheels that are all off by one factor look the same" in doubt.sentence
-    assert_mended(found, truth, 61, factor=1.6)                 # the size is known to 0.7 mm/m
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("poses", [-3, 3, 10])
+@pytest.mark.parametrize("poses", [-3, 10])
 def test_sightings_that_are_late_are_named_and_mended(poses):
-    """Three short drives: the offset is right, and the ATE nearly that of the right files."""
-    for seed in (61, 62, 63):
+    """The offset is right, and the ATE nearly that of the right files."""
+    for seed in (61, 62):
         dataset, truth = simulate("short", seed)
         found = slam.estimate(late(dataset, poses).without("uwb"))
         sigma = np.sqrt(found.c_covariance[SIGHTING_LAG, SIGHTING_LAG])
         assert abs(found.c[SIGHTING_LAG] - poses) < 3 * sigma < 1
         assert names(solution_doubts(found)) == {"time-offset"}
         assert_mended(found, truth, seed, factor=1.4)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("place", [(0.1, 0.0, 0.0), (0.0, 0.1, 0.0), (0.0, 0.0, 0.05)])
-def test_a_camera_that_is_not_in_the_origin_is_named_and_mended(place):
-    dataset, truth = simulate("short", 61)
-    z = se2.between(np.array(place), dataset.aruco.marker_in_vehicle)
-    C = se2.rotate_covariance(dataset.aruco.covariance, -place[2])
-    found = slam.estimate(aruco(dataset, marker_in_vehicle=z, covariance=C).without("uwb"))
-    off = found.c[CAMERA] - place
-    assert off @ np.linalg.solve(found.c_covariance[CAMERA, CAMERA], off) < 16.3       # 99.9 %
-    assert names(solution_doubts(found)) == {"camera-offset"} and found.model == "arc"
-    assert_mended(found, truth, 61, factor=1.3)
 
 
 def test_without_sightings_nothing_is_known_of_the_camera():
@@ -265,41 +212,36 @@ def test_without_sightings_nothing_is_known_of_the_camera():
 
 @pytest.mark.slow
 def test_sightings_that_are_late_are_named_on_the_long_path():
-    for seed in (61, 62, 63):
-        dataset, truth = simulate("long", seed)
-        found, right = slam.estimate(late(dataset, 3).without("uwb")), by_right_files(seed, "long")
-        assert found.released == {"time-offset"} and names(solution_doubts(found)) <= found.released
-        assert ate(found.poses, truth.poses, aligned=True) < 2.5 * ate(      # 6 as stated
-            right.poses, truth.poses, aligned=True)
+    dataset, truth = simulate("long", 62)
+    found = slam.estimate(late(dataset, 3).without("uwb"))
+    assert found.released == {"time-offset"} and names(solution_doubts(found)) <= found.released
+    assert ate(found.poses, truth.poses, aligned=True) < 2.5 * right_ate(62, "long")  # 6 as stated
 
 
 @pytest.mark.slow
 def test_offsets_of_the_camera_have_the_standard_deviations_that_they_state():
-    """Twelve clean drives of two slips, with a camera that is hardly known."""
+    """Twelve clean drives of two slips, with a camera and a delay that are hardly known."""
     time, place = [], []
-    for seed in range(6):
-        for slip in (1e-3, 3e-3):
-            dataset, _ = simulate("short", seed, slip=slip)
-            dataset = dataset.without("uwb")
-            found = slam.estimate(vehicle(sigma_sighting_lag=10.0)(dataset))
-            time.append(found.c[SIGHTING_LAG]**2 / found.c_covariance[SIGHTING_LAG, SIGHTING_LAG])
-            found = slam.estimate(vehicle(
-                sigma_camera_x=0.2, sigma_camera_y=0.2, sigma_camera_turn=0.2)(dataset))
-            off = found.c[CAMERA]
-            place.append(off @ np.linalg.solve(found.c_covariance[CAMERA, CAMERA], off))
+    for seed, slip in itertools.product(range(6), (1e-3, 3e-3)):
+        dataset, _ = simulate("short", seed, slip=slip)
+        found = slam.estimate(vehicle(
+            sigma_sighting_lag=10.0, sigma_camera_x=0.2, sigma_camera_y=0.2,
+            sigma_camera_turn=0.2)(dataset.without("uwb")))
+        time.append(found.c[SIGHTING_LAG]**2 / found.c_covariance[SIGHTING_LAG, SIGHTING_LAG])
+        off = found.c[CAMERA]
+        place.append(off @ np.linalg.solve(found.c_covariance[CAMERA, CAMERA], off))
     for squared, dof in ((time, 1), (place, 3)):
         low, high = nees_band(12, dof, probability=0.99)
         assert low < np.mean(squared) < high, (dof, squared)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("offset", [0.1, 0.15, 0.2])
-def test_ranges_that_are_all_too_long_do_no_harm(offset):
+def test_ranges_that_are_all_too_long_do_no_harm():
     """Four short drives: hardly enough to decide for an offset, but its possibility is counted."""
     nees = []
     for seed in (61, 62, 101, 213):
         dataset, truth = simulate("short", seed)
-        found = slam.estimate(uwb(dataset, range=dataset.uwb.range + offset))
+        found = slam.estimate(uwb(dataset, range=dataset.uwb.range + 0.15))
         assert anees(found.poses, found.covariances, truth.poses) < 6
         assert names(solution_doubts(found)) <= {"range-offset", "antenna-offsets"}
         nees += montecarlo.antenna_error(found, truth)[1].tolist()
@@ -318,19 +260,17 @@ def test_contradicting_repetitions_count_as_rejected():
     found = slam.estimate(replace(dataset, aruco=both, uwb=None))
     doubt, = solution_doubts(found)
     assert doubt.what == "sightings-rejected"
-    assert f"{2 * len(again.pose)} of them another one of the same marker" in doubt.sentence
+    assert f", {2 * len(again.pose)} by another one of the same marker" in doubt.sentence
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("slip", [0.0, 1e-3, 1e-2])
-@pytest.mark.parametrize("path, seeds", [("short", (71, 72, 73)), ("long", (71,))])
-def test_there_is_no_doubt_about_clean_drives(path, seeds, slip):
-    for seed in seeds:
-        dataset, _ = simulate(path, seed, slip=slip)
-        found = slam.estimate(dataset.without("uwb"))
-        both = slam.estimate(dataset, previous=found)
-        assert not names(doubts_before_solving(dataset), solution_doubts(found),
-                         solution_doubts(both))
+@pytest.mark.parametrize("slip", [0.0, 1e-2])
+def test_there_is_no_doubt_about_clean_long_drives(slip):
+    """Short ones are in test_calibration."""
+    dataset, _ = simulate("long", 71, slip=slip)
+    found = slam.estimate(dataset.without("uwb"))
+    both = slam.estimate(dataset, previous=found)
+    assert not names(doubts_before_solving(dataset), solution_doubts(found), solution_doubts(both))
 
 
 def test_markers_of_which_most_sightings_contradict_are_named():
@@ -389,6 +329,7 @@ def solved(noise=(1e-3, 1.0, 1.0), noise_sigma=(0.1, 0.02, 0.03), explanations=(
         noise=Noise(*noise), slip=noise[0], noise_sigma=np.array(noise_sigma),
         range_weight=np.repeat([0.0, 1.0], [0, 20]), explanations=explanations,
         calibration_table=table, doubts={}, converged=True, antenna=np.array([5, 6]),
+        share=np.ones(20), places=None, jumps=NO_JUMPS,
         rejected=np.zeros(0, bool), turn_sigma=np.zeros(0), sightings=SimpleNamespace(
             contradicting=0, marker=np.zeros(0, int), frame=np.arange(1))) | changes)
 
@@ -406,21 +347,21 @@ def test_every_group_is_named_with_what_is_stated_and_found(group):
     """All its entries, and no others; nothing where its release was not decided."""
     calibration = stated_calibration(Vehicle(), np.array([5, 6]))
     found = solved(explanations=(frozenset([group]),), c=calibration.stated + 0.01)
-    doubt, = solution.calibration_doubts(found)
+    doubt, = solution_doubts(found)
     assert doubt.what == group and doubt.sentence.endswith(GROUPS[group][1])
     assert "problem 4 uses this" in doubt.sentence and "cannot tell" not in doubt.sentence
     found.antenna = np.zeros(0, int)
-    assert "problem 3 uses this" in solution.calibration_doubts(found)[0].sentence
+    assert "problem 3 uses this" in solution_doubts(found)[0].sentence
     for name, of in zip(calibration.names, calibration.group):
         assert (f"{name} = " in doubt.sentence) == (of == group)
-    assert not solution.calibration_doubts(solved(c=calibration.stated + 0.01))
+    assert not solution_doubts(solved(c=calibration.stated + 0.01))
 
 
 def test_numbers_are_given_with_standard_deviations_and_units():
     vehicle = Vehicle(sigma_camera_x=0.05, camera_y=0.1)
     c = stated_calibration(vehicle, np.array([5, 6])).stated
     c = c + 0.02 * (np.arange(16) == 3)
-    doubt, = solution.calibration_doubts(solved(
+    doubt, = solution_doubts(solved(
         explanations=(frozenset(["camera-offset"]),), c=c, vehicle=vehicle))
     assert "camera_x = 0.02 ± 0.001 m (stated: 0 ± 0.05)" in doubt.sentence
     assert "camera_y = 0.1 ± 0.001 m (stated: 0.1)" in doubt.sentence
@@ -433,12 +374,12 @@ def test_explanations_that_exclude_each_other_are_all_named():
     c = stated_calibration(Vehicle(), np.array([5, 6])).stated
     c = c + 0.01 * (np.arange(16) == 6)                                # of the size
     found = solved(explanations=(frozenset([wheels, tag]), frozenset([size, tag])), c=c)
-    said = {doubt.what: doubt.sentence for doubt in solution.calibration_doubts(found)}
+    said = {doubt.what: doubt.sentence for doubt in solution_doubts(found)}
     assert [*said] == [size, tag]
     assert "It may instead be the wheels: the drive cannot tell" in said[size]
     assert "instead" not in said[tag]
     found = solved(explanations=(frozenset([wheels]), frozenset([size]), frozenset([tag])), c=c)
-    doubt, = solution.calibration_doubts(found)
+    doubt, = solution_doubts(found)
     assert "instead be the wheels or the place of the UWB tag" in doubt.sentence
 
 
@@ -454,7 +395,7 @@ def test_scatter_that_is_decidedly_not_as_stated_is_named(factor, sigma, said):
     for column, (name, file) in enumerate(files.items(), 1):
         noise, sigmas = [1e-3, 1.0, 1.0], np.full(3, 0.02)
         noise[column], sigmas[column] = factor, sigma
-        doubts = solution.noise_doubts(solved(noise, sigmas))
+        doubts = solution_doubts(solved(noise, sigmas))
         assert len(doubts) == (said is not None)
         if said:
             assert f"The {name} {said} as much as {file} states" in doubts[0].sentence
@@ -466,48 +407,80 @@ def test_scatter_that_is_decidedly_not_as_stated_is_named(factor, sigma, said):
     (3, "15% of them are far too long")])
 def test_late_ranges_are_the_reason_for_their_scatter_if_they_are_more_than_a_tenth(late, reason):
     weight = np.repeat([0.4, 0.6], [late, 20 - late])
-    doubt, = solution.noise_doubts(solved((1e-3, 1.0, 2.0), range_weight=weight))
+    doubt, = solution_doubts(solved((1e-3, 1.0, 2.0), range_weight=weight))
     assert doubt.what == "range-noise" and reason in doubt.sentence
-    doubt, = solution.noise_doubts(solved((1e-3, 2.0, 1.0), range_weight=weight))
+    doubt, = solution_doubts(solved((1e-3, 2.0, 1.0), range_weight=weight))
     assert doubt.what == "marker-noise" and "covariances were obtained" in doubt.sentence
 
 
-@pytest.mark.parametrize("factor, sigma, said", [
-    (1.05, 0.01, "are confirmed (factor 1.05 ± 0.01)"), (0.95, 0.01, "are confirmed"),
-    (1.2, 0.1, "are confirmed"), (1.2, 0.05, "were multiplied by 1.20 ± 0.06"),
-    (0.8, 0.05, "were multiplied by 0.80 ± 0.04"), (1.0, 0.0, "are multiplied by 1, as given"),
-    (0.75, 0.0, "are multiplied by 0.75, as given")])
-def test_stated_noise_is_confirmed_within_a_tenth_or_three_standard_deviations(
-        factor, sigma, said):
-    of_sightings = solved((1e-3, factor, 9.0), (9.0, sigma, 9.0))
-    assert said in solution.confirmation(of_sightings, "sightings")
-    assert said in solution.confirmation(solved((1e-3, 9.0, factor), (9.0, 9.0, sigma)), "ranges")
-
-
 def test_slip_that_no_wheel_has_is_named_unless_it_was_given():
-    doubt, = solution.slip_doubts(solved((0.03, 1.0, 1.0)))
+    doubt, = solution_doubts(solved((0.03, 1.0, 1.0)))
     assert "slips by 30 mm" in doubt.sentence
-    assert not solution.slip_doubts(solved((0.02, 1.0, 1.0)))
-    assert not solution.slip_doubts(solved((0.03, 1.0, 1.0), np.zeros(3)))
+    assert not solution_doubts(solved((0.02, 1.0, 1.0)))
+    assert not solution_doubts(solved((0.03, 1.0, 1.0), np.zeros(3)))
 
 
-def test_many_rejected_sightings_and_markers_of_which_most_are_rejected_are_named():
-    """Sightings of markers 11, 12 and 13: ten, four and forty; of 13 hardly any is rejected."""
+def test_many_rejected_sightings_are_named_of_all_and_of_single_markers():
+    """Sightings of markers 11, 12 and 13: ten, four and forty."""
     label = np.repeat([11, 12, 13], [10, 4, 40])
 
     def said(*rejected_of_each):
         rejected = np.concatenate([np.arange(np.sum(label == k)) < count
                                    for k, count in enumerate(rejected_of_each, 11)])
-        return [doubt.sentence for doubt in solution.sighting_doubts(SimpleNamespace(
-            rejected=rejected, sightings=SimpleNamespace(contradicting=0, marker=label)))]
+        return [doubt.sentence for doubt in solution_doubts(solved(
+            rejected=rejected, sightings=SimpleNamespace(contradicting=0, marker=label,
+                                                         frame=np.arange(1))))]
 
-    assert said(5, 0, 0) == [] and said(0, 4, 1) == []
-    sentence, = said(6, 0, 0)
-    assert "6 of 54 sightings contradict" in sentence and "of marker 11 contradict" in sentence
-    sentence, = said(0, 4, 2)
-    assert "6 of 54 sightings contradict" in sentence and "of marker" not in sentence
-    sentence, = said(6, 4, 21)
-    assert "31 of 54 sightings" in sentence and "of markers 11, 13 contradict" in sentence
+    assert said(4, 0, 0) == [] and said(0, 4, 1) == [] and said(0, 0, 5) == []
+    for counts, of_markers in (((5, 0, 0), ", of marker 11 5 of 10:"), ((0, 4, 2), "left out:"),
+                               ((5, 4, 21), ", of marker 11 5 of 10, of marker 13 21 of 40:")):
+        sentence, = said(*counts)
+        assert sentence.startswith(f"{sum(counts)} of 54 sightings contradict the rest and are")
+        assert of_markers in sentence
+
+
+def test_a_marker_at_the_place_of_another_is_unconfirmed():
+    """Three successive sightings of a marker have the id of another one, which is not seen."""
+    dataset = simulate("short", 61)[0]
+    seen = dataset.aruco
+    of = [np.flatnonzero(seen.marker == each) for each in np.unique(seen.marker)[:2]]
+    marker = seen.marker.copy()
+    marker[of[0][1:4]] = marker[of[1][0]]
+    others = np.setdiff1d(np.arange(len(marker)), of[1])
+    found = slam.estimate(aruco(dataset, **vars(replace(seen, marker=marker).select(others)))
+                          .without("uwb"))
+    assert found.unconfirmed.tolist() == [seen.marker[of[1][0]]]
+
+
+def test_a_marker_with_a_single_accepted_sighting_is_unconfirmed():
+    """It has no residuals; that it is there is no doubt, but said on the terminal."""
+    dataset = simulate("short", 61)[0].first(600)
+    seen = dataset.aruco
+    label, count = np.unique(seen.marker, return_counts=True)
+    rows = np.flatnonzero(seen.marker == label[count.argmax()])
+    found = slam.estimate(aruco(dataset, **vars(seen.select(
+        np.setdiff1d(np.arange(len(seen.marker)), rows[1:])))).without("uwb"))
+    assert found.unconfirmed.tolist() == [label[count.argmax()]]
+    assert not solution_doubts(found)
+    row = solve.problem_solution("problem3", dataset.without("uwb"), found)
+    text = summary_table({"dataset": "short", "poses": 600, "doubts": [],
+                          "problems": {"problem3": summarize(row, None)}})
+    assert f"confirms markers {label[count.argmax()]}: seen once, or" in text
+    some, _, dof = consistency.residuals_by_landmark(found)
+    assert some[np.isnan(dof)].tolist() == found.unconfirmed.tolist()
+
+
+@pytest.mark.slow
+def test_a_marker_that_was_moved_halfway_is_named():
+    dataset, truth = simulate("short", 5)
+    seen = dataset.aruco
+    marker = np.min([np.bincount(seen.marker[half], minlength=500) for half in (
+        seen.pose < 1000, seen.pose >= 1000)], axis=0).argmax()
+    late, z = (seen.marker == marker) & (seen.pose >= 1000), seen.marker_in_vehicle.copy()
+    z[late, :2] += se2.rotation(-truth.poses[seen.pose[late], 2]) @ [0.1, 0]
+    found = slam.estimate(aruco(dataset, marker_in_vehicle=z).without("uwb"))
+    doubt, = solution_doubts(found)
+    assert doubt.what == "sightings-rejected" and f"of marker {marker} " in doubt.sentence
 
 
 def test_a_turn_that_the_wheels_hardly_know_is_named_where_it_is():
@@ -517,12 +490,13 @@ def test_a_turn_that_the_wheels_hardly_know_is_named_where_it_is():
 
     def doubts(slip):
         sigma = turn_sigma(SimpleNamespace(
-            measurements=SimpleNamespace(dataset=SimpleNamespace(vehicle=vehicle)),
+            measurements=SimpleNamespace(dataset=SimpleNamespace(vehicle=vehicle),
+                                         frame=np.array([0, 10, 30, 70]), jumps=NO_JUMPS),
             noise=SimpleNamespace(slip=slip), odometry=SimpleNamespace(
                 J_wheel=by_wheel,
                 covariance=lambda slip: np.diag([0, 0, slip**2]) * [[[0]], [[1]], [[0]]])))
-        return solution.turn_doubts(SimpleNamespace(
-            turn_sigma=sigma, sightings=SimpleNamespace(frame=np.array([0, 10, 30, 70]))))
+        return solution_doubts(solved(turn_sigma=sigma, sightings=SimpleNamespace(
+            contradicting=0, marker=np.zeros(0, int), frame=np.array([0, 10, 30, 70]))))
 
     doubt, = doubts(1.2)
     assert "Between poses 11 and 31" in doubt.sentence and "to 1.3 rad" in doubt.sentence
@@ -530,5 +504,3 @@ def test_a_turn_that_the_wheels_hardly_know_is_named_where_it_is():
     assert "Between poses 31 and 71" in doubt.sentence and "to 1.2 rad" in doubt.sentence
     by_wheel[2, 2] = 0
     assert not doubts(0.1)
-    assert not solution.turn_doubts(SimpleNamespace(
-        turn_sigma=np.zeros(0), sightings=SimpleNamespace(frame=np.zeros(1, int))))

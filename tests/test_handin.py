@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from conftest import contradicted
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
-from test_pdf import text_of
+from test_document import text_of
 from test_report import write
 
 from slamlib.__main__ import main
@@ -18,17 +18,16 @@ from slamlib.doubt import Doubt
 from slamlib.report import handin
 from slamlib.report.build import Report
 from slamlib.report.drives import SolvedDrive
-from slamlib.report.options import Cover, Options
+from slamlib.report.options import Options
 from slamlib.simulation import simulate, write_dataset
 from slamlib.solve import Failure, Solution
 
 SOLVE = """from slamlib.notebook import *
-from slamlib.solve import allows
+from slamlib.solve import allows, find
 drives = start()
 for problem in {problems}:
-    left, found = solved([drive for drive in drives if allows(drive.dataset, problem)], [problem])
-    for drive, solution, files in write_results(left, found):
-        say(f"{{drive.name}}: {{solution.problem}}")"""
+    if any(allows(drive.dataset, problem) for drive in drives):
+        solved(drives, **{{problem: lambda drive: find(problem, drive.dataset)}})"""
 SIX = ["problem1", "problem2", "problem2_hint", "problem2_fused", "problem3", "problem4"]
 
 
@@ -100,9 +99,8 @@ def test_the_readme_is_true_of_the_files(handed):
                  "40 poses have an estimate", "mine/problem4: vehiclePose.mat, ArucoMap.mat and "
                  "UwbMap.mat SLAM: odometry + ArUco + UWB; 40 of 40", "fused with odometry",
                  "problem2/ArucoMap.mat is the map by the ArUco measurements alone, because "
-                 "the fusion has no map of its own. Its world frame is the frame of pose 11 in "
-                 "mine.",
-                 "The simulated dataset stand_in is left out.", "gtsam 4.3", "are NaN",
+                 "the fusion has no map of its own. Its world frame is the frame of pose 11.",
+                 "Simulated and left out: stand_in.", "gtsam 4.3", "are NaN",
                  "problem2_fused of the report is problem2 here"):
         assert part in one_line
     assert max(map(len, text.split("\n"))) <= handin.LINE_WIDTH and text.endswith("\n")
@@ -136,19 +134,9 @@ def test_what_cannot_be_solved_is_said_and_the_rest_is_handed_in(tmp_path, monke
     assert archive.namelist() == ["README.txt", "bad/problem1/vehiclePose.mat", "report.pdf"]
     text = re.sub(r"\s+", " ", archive.read("README.txt").decode())
     assert "bad/problem2 (ArUco): could not be solved: expected sightings" in text
-    assert "bad/problem3 (SLAM: odometry + ArUco): the report has no result of it." in text
-    assert "/problem4 (SLAM: odometry + ArUco + UWB): there are no UWB ranges in this da" in text
+    assert "bad/problem3 (SLAM: odometry + ArUco): no result." in text
+    assert "/problem4 (SLAM: odometry + ArUco + UWB): left out: no UWB ranges." in text
     assert "Only if asked for." in text_of(archive.read("report.pdf"), tmp_path)
-
-
-def test_a_folder_in_the_place_of_the_zip_is_told_before_anything_is_built(
-        tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "out").mkdir()
-    assert main(["hand-in", "--out", "out"]) == 2
-    assert capsys.readouterr().err == (
-        "slamlib: out: expected the name of a file to write, found a folder\n")
-    assert [file.name for file in tmp_path.iterdir()] == ["out"]
 
 
 def test_simulated_datasets_are_left_out_where_there_are_recorded_ones_only(tmp_path):
@@ -195,15 +183,18 @@ def test_doubts_and_failures_are_in_the_readme_and_empty_headings_are_not():
     drive = solved_drive("problem1", files=("problem1/vehiclePose.mat",), doubts=(
         Doubt("units", "Lengths may be in millimetres."),), failures=(
         Failure("problem3", "SLAM", "no landmark"), Failure("problem2_hint", "hint", "not told")))
-    text = handin.readme([drive], Options(Cover(author="A", course="C")), ["x", "y"])
+    text = handin.readme([drive], Options(author="A", course="C"), ["x", "y"])
     assert "d: Lengths may be in millimetres." in text
-    assert "could not be solved: no landmark." in text and "not told" not in text
-    assert "The simulated datasets x and y are left out." in text
-    assert text.startswith(f"{Cover().title}\nA\nC\n")
+    assert "could not be solved: no landmark." in " ".join(text.split()) and "not told" not in text
+    assert "Simulated and left out: x and y." in text
+    assert text.startswith(f"{Options().title}\nA\nC\n")
     noted = replace(drive, dataset=replace(drive.dataset, notes=("A header was left out.",)))
     assert "d: A header was left out." in handin.readme([noted], Options())
     text = handin.readme([replace(drive, doubts=())], Options())
-    assert "Doubts" not in text and "Notes" not in text
+    assert "Doubts" not in text and "Notes" not in text and "accepted sighting" not in text
+    seen_once = replace(drive.solutions[0], facts={"unconfirmed": [7, 9]})
+    text = handin.readme([replace(drive, solutions=(seen_once,))], Options())
+    assert "nothing confirms markers 7, 9: seen once, or where another one is\n" in text
 
 
 def test_a_dataset_called_like_a_file_of_the_zip_is_refused(tmp_path):

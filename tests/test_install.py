@@ -9,11 +9,19 @@ from pathlib import Path
 from zipfile import ZipFile
 
 import pytest
-from test_live import CODE, EXPLORE
 from test_report import write
 
 from slamlib.__main__ import main
-from slamlib.report import sources
+from slamlib.report import notebooks as sources
+
+CODE = """from slamlib import solve
+from slamlib.notebook import captioned, explore, maps, solved, start
+_, found = solved(start(), **{name: lambda drive, name=name: solve.find(name, drive.dataset)
+                              for name in ("problem1", "problem4")})
+captioned(maps.whole_map(*next(iter(found.items()))), "Figure 1.1. Map.")"""
+EXPLORE = """def draw(size):
+    return explore.plotting.panels(1)[0]
+explore.show_with_controls(draw, grid={"size": [1, 2]}, size=explore.slider("size", 1, 0, 9))"""
 
 ROOT = Path(__file__).parents[1]
 NOTEBOOKS = sorted(file.name for file in (ROOT / "notebooks").glob("*.ipynb"))
@@ -77,7 +85,8 @@ def test_an_installed_slamlib_makes_a_drive_solves_it_and_reports_on_it(installe
     told, _ = run(slamlib, "--help", cwd=tmp_path)
     assert told.startswith("usage: slamlib ") and "export" in told
     place, _ = run(programs / "python", "-c",
-                   "from slamlib.report.sources import *; print(notebooks_folder())", cwd=tmp_path)
+                   "from slamlib.report import notebooks; print(notebooks.notebooks_folder())",
+                   cwd=tmp_path)
     assert Path(place.strip()) == (programs.parent / "share" / "slamlib" / "notebooks").resolve()
     _, told = run(slamlib, "report", cwd=tmp_path, code=2)
     assert "data: expected this folder, with a sub-folder" in told and told.count("\n") == 1

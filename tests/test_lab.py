@@ -2,16 +2,13 @@
 
 import json
 import os
-import re
 import subprocess
 import sys
 import time
 from pathlib import Path
 
-import nbformat
 import pytest
 from conftest import copied
-from nbformat.v4 import new_code_cell, new_notebook
 from test_report import build, make_data, write
 from test_studies import CELL, kept
 
@@ -24,20 +21,6 @@ from slamlib.simulation import write_dataset
 ROOT = Path(__file__).parents[1]
 SECONDS = 120
 NEWS = "Would you like to get notified about official Jupyter news?"
-COUNTED = """import time
-from itertools import count
-import matplotlib.pyplot as plt
-from slamlib.notebook import explore, start
-start()
-number = count(1)
-def draw(a, seconds):
-    time.sleep(seconds)
-    fig = plt.figure(figsize=(2, 2))
-    fig.said = f"a is {a}, drawing {next(number)}"
-    return fig
-explore.show_with_controls(draw, a=explore.slider("a", 10, 0, 100),
-             seconds=explore.slider("seconds", 0.1, 0.0, 2.0, 0.1))"""
-KERNEL = {"kernelspec": {"name": "python3", "display_name": "Python 3 (ipykernel)"}}
 
 
 @pytest.fixture(scope="module")
@@ -45,8 +28,6 @@ def lab(tmp_path_factory):
     """Address and token of a JupyterLab on a copy of a notebook and 300 poses of `short`."""
     folder = tmp_path_factory.mktemp("lab")
     copied(folder / "notebooks", "1_odometry.ipynb", grids=True)
-    nbformat.write(new_notebook(cells=[new_code_cell(COUNTED)], metadata=KERNEL),
-                   folder / "notebooks" / "counted.ipynb")
     write_dataset(folder / "data" / "short", read_dataset(ROOT / "data" / "short").first(300))
     environment = {name: value for name, value in os.environ.items()
                    if not name.startswith(("SLAMLIB_", "JUPYTER"))}
@@ -96,14 +77,14 @@ def test_jupyterlab_replaces_the_command_and_is_given_its_arguments(tmp_path, mo
 
 
 def test_kernels_have_the_environment_of_the_build(tmp_path, monkeypatch):
-    """But for SLAMLIB_RESULTS and SLAMLIB_PROGRESS, by which a cell knows that it is in a build."""
+    """But for SLAMLIB_RESULTS, by which a cell knows that it is in a build."""
     monkeypatch.setenv("SLAMLIB_DATASETS", "short")
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     found = starting.environment(tmp_path, tmp_path / "data", tmp_path / "kept")
     assert found == kernel_environment(tmp_path, tmp_path / "data", ["short"],
                                        tmp_path / "kept" / "studies")
     assert found["OMP_NUM_THREADS"] == found["OPENBLAS_NUM_THREADS"] == "1"
-    assert not {"SLAMLIB_RESULTS", "SLAMLIB_PROGRESS"} & found.keys()
+    assert "SLAMLIB_RESULTS" not in found
 
 
 @pytest.mark.slow
@@ -170,38 +151,3 @@ def test_moving_a_slider_changes_the_picture(run, lab):
     expect(page.get_by_text(NEWS)).to_have_count(0)
     away = [url for url in asked if not url.startswith((lab["url"], "data:", "blob:"))]
     assert asked and not away
-
-
-@pytest.mark.slow
-def test_a_dragged_slider_leaves_no_old_pictures_to_draw_and_reset_holds(run):
-    from playwright.sync_api import expect
-    page, cell = run("counted.ipynb")
-    said, sliders = cell.locator(".widget-html-content"), cell.get_by_role("slider")
-    expect(said).to_have_text("a is 10, drawing 1")
-
-    def drawings():
-        return int(said.inner_text().split()[-1])
-
-    handle = sliders.first.bounding_box()
-    x, y = handle["x"] + handle["width"] / 2, handle["y"] + handle["height"] / 2
-    page.mouse.move(x, y)
-    page.mouse.down()
-    for step in range(20):
-        page.mouse.move(x + 3 * step, y)
-    dragged = drawings()
-    page.mouse.up()
-    last = sliders.first.get_attribute("aria-valuenow").removesuffix(".0")
-    assert last != "10"
-    expect(said).to_have_text(re.compile(f"a is {last}, "))
-    sliders.last.press("End")                       # every drawing takes two seconds from here on
-    page.wait_for_timeout(3000)
-    assert drawings() - dragged <= 4                # at release one under way, a last one; End
-
-    for _ in range(3):
-        sliders.first.press("ArrowRight")           # the browser holds back the last values
-    cell.get_by_role("button", name="Reset").click()
-    expect(said).to_have_text(re.compile("a is 10, "))
-    page.wait_for_timeout(3000)
-    expect(said).to_have_text(re.compile("a is 10, "))
-    expect(sliders.first).to_have_attribute("aria-valuenow", re.compile(r"10(\.0)?"))
-    expect(page.locator("[data-mime-type*=stderr], [data-mime-type*=error]")).to_have_count(0)

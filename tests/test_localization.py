@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numeric import central_differences, decided
+from numeric import as_points, central_differences, decided
 
 from slamlib import se2, studies
 from slamlib.dataset import ArucoReadings
@@ -10,11 +10,6 @@ from slamlib.evaluation import ate, nees_band
 from slamlib.localization import localize
 from slamlib.simulation import simulate
 from slamlib.studies import montecarlo
-
-
-def only(aruco, keep):
-    return ArucoReadings(aruco.pose[keep], aruco.marker[keep], aruco.marker_in_vehicle[keep],
-                         aruco.covariance[keep])
 
 
 def test_perfect_sightings_give_the_exact_poses_and_map():
@@ -78,15 +73,6 @@ def test_covariances_are_those_of_all_sightings_through_numerical_derivatives():
     np.testing.assert_allclose(found.marker_covariance, expected_map, atol=1e-5 * scale)
 
 
-def test_world_frame_is_the_first_measured_pose():
-    dataset, truth = simulate("short", seed=1, noise=False)
-    late = only(dataset.aruco, dataset.aruco.pose >= 300)
-    found = localize(late)
-    assert found.frame[0] == 300
-    expected = se2.between(truth.poses[300], truth.poses[found.frame])
-    np.testing.assert_allclose(found.poses[:, :2], expected[:, :2], atol=1e-9)
-
-
 def test_nothing_known_until_a_known_marker_returns():
     """Two parts of the path have no common marker; then the markers of the first part return."""
     dataset, truth = simulate("short", seed=1, noise=False)
@@ -94,7 +80,7 @@ def test_nothing_known_until_a_known_marker_returns():
     early = np.unique(a.marker[a.pose < 400])
     keep = (a.pose < 400) | (a.pose > 1500) | ~np.isin(a.marker, early)
     keep &= (a.pose < 400) | (a.pose > 500)
-    found = localize(only(a, keep))
+    found = localize(a.select(keep))
     known = np.isfinite(found.poses[:, 0])
     back = found.frame[np.flatnonzero(~known)[-1] + 1]
     seen_again = np.unique(a.pose[keep & (a.pose > 1500) & np.isin(a.marker, early)])
@@ -157,9 +143,9 @@ def test_methods_that_do_not_count_shared_errors_are_inconsistent(options):
 
 @pytest.mark.slow
 def test_markers_alone_on_many_drives():
-    """Three means over 100 drives are in their bands together with 95 % probability."""
-    low, high = nees_band(100, probability=1 - 0.05 / 3)
-    runs = studies.run(montecarlo.problem2_trial, range(2000, 2100), methods=("ArUco",))
+    """Three means over 60 drives are in their bands together with 95 % probability."""
+    low, high = nees_band(60, probability=1 - 0.05 / 3)
+    runs = studies.run(montecarlo.problem2_trial, range(2000, 2060), methods=("ArUco",))
     for name in ("ArUco nees", "ArUco last nees", "map nees"):
         assert low < runs[name].mean() < high, name
 
@@ -172,22 +158,12 @@ def test_a_wrong_first_sighting_moves_the_world_frame():
     keep = ~np.isin(np.arange(len(a.pose)), first[1:])
     marker = a.marker.copy()
     marker[first[0]] = 9999
-    found = localize(only(replace(a, marker=marker), keep))
+    found = localize(replace(a, marker=marker).select(keep))
     assert np.isnan(found.poses[0]).all() and np.isfinite(found.poses[1:]).all()
     np.testing.assert_array_equal(found.poses[1], 0)
     expected = se2.between(truth.poses[found.frame[1]], truth.poses[found.frame[1:]])
     np.testing.assert_allclose(found.poses[1:, :2], expected[:, :2], atol=1e-9)
     assert found.unused[first[0]] and not found.rejected.any()
-
-
-def test_two_common_markers_relocalize_without_confirmation():
-    """Adjacent frames, 4 m apart, have no common marker; the last sees the markers of the first."""
-    dataset, truth = simulate("short", seed=1, noise=False)
-    frames = np.array([0, 10, 400, 800, 1200, 1600, 1990])
-    found = localize(only(dataset.aruco, np.isin(dataset.aruco.pose, frames)))
-    back = found.frame == 1990
-    np.testing.assert_allclose(found.poses[back, :2], truth.poses[[1990], :2], atol=1e-9)
-    assert found.parent[back][0] in (0, 1) and np.isnan(found.poses[2:-1]).all()
 
 
 def seen_in(*frames):
@@ -223,13 +199,12 @@ def test_the_map_has_markers_that_are_confirmed_and_seen_from_known_poses():
 
 def test_a_single_frame_and_markers_without_heading():
     dataset, truth = simulate("short", seed=2)
-    first = localize(only(dataset.aruco, dataset.aruco.pose == 0))
+    first = localize(dataset.aruco.select(dataset.aruco.pose == 0))
     np.testing.assert_array_equal(first.poses, [[0, 0, 0]])
     assert len(first.marker) == 0                      # nothing confirms a marker that is seen once
     a, rng = dataset.aruco, np.random.default_rng(0)
-    z, covariance = a.marker_in_vehicle.copy(), a.covariance.copy()
+    z = a.marker_in_vehicle.copy()
     z[:, 2] = rng.uniform(-np.pi, np.pi, len(z))
-    covariance[:, 2], covariance[:, :, 2], covariance[:, 2, 2] = 0, 0, 1e4
-    found = localize(replace(a, marker_in_vehicle=z, covariance=covariance))
+    found = localize(replace(as_points(a, slice(None)), marker_in_vehicle=z))
     assert np.isfinite(found.poses).all()
     assert ate(found.poses, truth.poses[found.frame]) < 0.5

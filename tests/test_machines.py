@@ -22,7 +22,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from test_report import build, make_data, write
 
-from slamlib import locks, studies, swap
+from slamlib import studies, swap
 from slamlib.dataset import DatasetError
 from slamlib.results import read_vehicle_poses
 from slamlib.simulation import simulate, write_dataset
@@ -64,7 +64,8 @@ def test_solve_writes_the_same_on_systems_that_lack_what_linux_has(system, tmp_p
         assert process.returncode == 0 and "\\u03c3: encoders: 60 poses" in told[1], told
         assert "Traceback" not in told[1] and "Warning" not in told[1], told
         assert told[0].startswith("\\u03c3: 60 poses")
-        assert [path.name for path in tmp_path.rglob(".*")] == [swap.FILE_LIST]
+        assert [path.name for path in tmp_path.rglob(".*") if path.suffix != ".lock"] == [
+            swap.FILE_LIST]                             # Windows removes locks when they are closed
     poses = read_vehicle_poses(tmp_path / "out" / "problem4")[0]
     subprocess.run([sys.executable, "-m", "slamlib", "solve", "\u03c3", "--out", "here"],
                    cwd=tmp_path, check=True, capture_output=True,
@@ -87,44 +88,6 @@ def test_a_report_is_built_where_windows_lacks_what_unix_has(tmp_path):
     assert {path.name for path in tmp_path.rglob(".slamlib*")} == {swap.FILE_LIST}
 
 
-@on_linux
-def test_locks_of_windows_exclude_and_end_with_their_process(tmp_path):
-    hold = ("from pathlib import Path\nfrom slamlib.locks import locked\n"
-            "with locked(Path('lock')): print('held', flush=True); input()")
-    first = unlike("win32", tmp_path, "-c", hold, stdin=subprocess.PIPE)
-    assert first.stdout.readline() == "held\n"
-    second = unlike("win32", tmp_path, "-c", hold, stdin=subprocess.PIPE)
-    line = second.stderr.readline()
-    assert line.startswith(f"slamlib: waits for process {first.pid}, which has written to ")
-    first.kill()
-    first.communicate()
-    assert second.stdout.readline() == "held\n"
-    assert second.communicate("\n", timeout=60) == ("", "") and second.returncode == 0
-    assert not (tmp_path / "lock").exists()
-
-
-@pytest.mark.slow
-@on_linux
-def test_a_result_that_a_program_of_windows_shows_is_told_before_anything_changes(tmp_path):
-    code = """import sys
-from slamlib import swap
-from slamlib.__main__ import main
-def refused(path, mode="r"):
-    if path.suffix == ".mat":
-        raise PermissionError(13, "is open in another program", str(path))
-    return open(path, mode)
-swap.open = refused
-sys.exit(main())"""
-    write_dataset(tmp_path / "drive", simulate("short", seed=3)[0].first(20).without("uwb"))
-    for arguments, expected in ((("-m", "slamlib"), 0), (("-c", code), 2)):
-        process = unlike("win32", tmp_path, *arguments, "solve", "drive", "--out", "out")
-        told = process.communicate(timeout=120)[1]
-        assert process.returncode == expected, told
-    assert ".mat: is open in another program" in told.splitlines()[-1] and "Traceback" not in told
-    assert (tmp_path / "out" / "summary.json").exists()
-    assert not (tmp_path / "out" / swap.UNFINISHED).exists()
-
-
 def test_folders_on_two_drives_of_windows_are_told_before_anything_runs(tmp_path, monkeypatch):
     def relpath(path, start):
         raise ValueError("path is on mount 'D:', start on mount 'C:'")
@@ -132,26 +95,6 @@ def test_folders_on_two_drives_of_windows_are_told_before_anything_runs(tmp_path
     make_data(tmp_path)
     with pytest.raises(DatasetError, match="results: expected a folder on the drive of .*report"):
         build(tmp_path)
-
-
-def test_a_process_runs_or_not():
-    """Numbers come from names of files, which may have any."""
-    ended = subprocess.Popen([sys.executable, "-c", ""])
-    ended.wait()
-    assert [locks.process_exists(number) for number in (os.getpid(), ended.pid, 10**30)] == [
-        True, False, False]
-
-
-def test_a_study_tells_how_far_it_is_and_nothing_when_it_has_ended(tmp_path, monkeypatch):
-    """The file stays: Windows removes none that the build reads."""
-    monkeypatch.setenv("SLAMLIB_PROGRESS", str(tmp_path / "told"))
-    told = []
-
-    def trial(seed):
-        told.append((tmp_path / "told").read_text() if seed else "")
-        return {"seed": seed}
-    studies.run(trial, range(3), jobs=1)
-    assert [*told, (tmp_path / "told").read_text()] == ["", "trial 1 of 3", "trial 2 of 3", ""]
 
 
 SLOW_STUDY = """import time

@@ -2,10 +2,9 @@
 
 import json
 import os
-import signal
 import subprocess
 import sys
-import time
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,14 +12,16 @@ import numpy as np
 import pytest
 from conftest import contradicted
 
-from slamlib import se2, solve
+import slamlib
+from slamlib import se2, slam, solve
 from slamlib.__main__ import main
-from slamlib.dataset import DatasetError, read_dataset
+from slamlib.dataset import read_dataset
 from slamlib.doubt import Doubt
 from slamlib.odometry import equation2
 from slamlib.results import read_vehicle_poses
 from slamlib.simulation import simulate, write_dataset
 from slamlib.summary import solve_to_folder
+from slamlib.swap import file_names
 
 ROOT = Path(__file__).parents[1]
 
@@ -87,10 +88,13 @@ def test_solve_without_truth_and_with_a_single_pose(tmp_path, capsys):
 
 
 def test_two_processes_write_what_one_does(tmp_path):
+    """In another thread than the main one there is one process."""
     dataset, truth = simulate("short", 8)
-    dataset = dataset.first(400)
-    truth = replace(truth, poses=truth.poses[:400])
-    one, two = (solve_to_folder(dataset, truth, tmp_path / str(jobs), jobs) for jobs in (1, 2))
+    both = dataset.first(400), replace(truth, poses=truth.poses[:400])
+    two, one = solve_to_folder(*both, tmp_path / "2"), {}
+    thread = threading.Thread(target=lambda: one.update(solve_to_folder(*both, tmp_path / "1")))
+    thread.start()
+    thread.join()
     assert list(one["problems"]) == list(two["problems"]) == list(solve.PROBLEMS)
     for summary in (one, two):
         assert all(row.pop("seconds") > 0 for row in summary["problems"].values())
@@ -105,43 +109,61 @@ def test_a_second_process_that_is_killed_costs_time_only(tmp_path, monkeypatch):
     dataset, _ = simulate("short", 8)
     here = os.getpid()
 
-    def killed(*arguments):
+    def killed(*arguments, **options):
         if os.getpid() != here:
             os.kill(os.getpid(), 9)
-        return find(*arguments)
+        return find(*arguments, **options)
 
     find = solve.find
     monkeypatch.setattr(solve, "find", killed)
-    rows = solve_to_folder(dataset.first(300), None, tmp_path, jobs=2)["problems"]
+    rows = solve_to_folder(dataset.first(300), None, tmp_path)["problems"]
     assert list(rows) == list(solve.PROBLEMS)
     assert not any("failed" in row for row in rows.values())
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform != "linux", reason="only Linux forks safely")
-@pytest.mark.parametrize("end", ["SIGTERM", "SIGKILL"])
-def test_no_process_survives_a_solve_that_is_killed(end, tmp_path):
-    write_dataset(tmp_path / "drive", simulate("long", 3)[0])
-    process = subprocess.Popen([sys.executable, "-m", "slamlib", "solve", "drive", "--out", "out"],
-                               cwd=tmp_path)
-    children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
-    until = time.monotonic() + 60
-    while not (found := children.read_text().split()) and time.monotonic() < until:
-        time.sleep(0.02)
-    process.send_signal(getattr(signal, end))
-    process.wait()
-    assert len(found) == 1
-    while running(found[0]) and time.monotonic() < until:
-        time.sleep(0.02)
-    assert not running(found[0])
+def test_options_of_solve_are_heeded_and_said(tmp_path, capsys):
+    """Problem 4 alone with a known slip and another kernel, beside odometry, as CSV and picture."""
+    write_dataset(tmp_path / "drive", simulate("short", seed=3)[0].first(200))
+    out, picture = tmp_path / "out", tmp_path / "new" / "map.PNG"
+    assert main(["solve", str(tmp_path / "drive"), "--out", str(out), "--problem", "4", "--slip",
+                 "2e-3", "--problem", "1", "--kernel", "Huber", "--csv", "--plot",
+                 str(picture)]) == 0
+    summary = json.loads((out / "summary.json").read_text())
+    row = summary["problems"]["problem4"]
+    assert summary["kernel"] == "Huber" and [*summary["problems"]] == ["problem1", "problem4"]
+    assert row["slip_sqrt_m"] == 2e-3 and row["given"] == ["slip_sqrt_m"]
+    expected = slam.estimate(read_dataset(tmp_path / "drive"), slip=2e-3, kernel="Huber")
+    np.testing.assert_array_equal(read_vehicle_poses(out / "problem4")[0], expected.poses)
+    assert {path.with_suffix(".csv") for path in out.rglob("*.mat")} == {*out.rglob("*.csv")}
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert "vehicle.toml: slip = 0.002" in capsys.readouterr().err
+    assert main(["solve", str(tmp_path / "drive"), "--out", str(out), "--problem", "problem1"]) == 0
+    assert file_names(out) == [".slamlib.json", "problem1/vehiclePose.mat", "summary.json"]
 
 
-def running(process):
-    """True unless a process is gone, or waits to be buried."""
-    try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except (FileNotFoundError, ProcessLookupError):
-        return False
+def test_results_never_replace_the_dataset_or_the_current_folder(tmp_path, monkeypatch, capsys):
+    write_dataset(tmp_path / "drive", simulate("short", seed=3)[0].first(40))
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    for command in (["solve", "../drive", "--out"], ["report", "--data", "..", "--report"],
+                    ["report", "--data", "..", "--results"]):
+        for out in ("..", ".", tmp_path, "../drive")[:4 if command[0] == "solve" else 3]:
+            assert main([*command, str(out)]) == 2
+            told = capsys.readouterr().err
+            assert told.startswith(f"slamlib: {out}: expected another folder") \
+                and told.count("\n") == 1
+    assert sorted(file_names(tmp_path)) == sorted(
+        f"drive/{each}" for each in file_names(tmp_path / "drive"))
+    assert main(["solve", "../drive", "--out", "../drive/out", "--problem", "1"]) == 0
+
+
+def test_version_and_a_missing_jupyterlab(monkeypatch, capsys):
+    with pytest.raises(SystemExit, match="^0$"):
+        main(["--version"])
+    assert capsys.readouterr().out == f"slamlib {slamlib.__version__}\n"
+    monkeypatch.setattr("slamlib.report.lab.find_spec", lambda _: None)
+    assert main(["lab"]) == 2
+    assert capsys.readouterr().err.startswith("slamlib: expected JupyterLab beside ")
 
 
 def test_bad_data_is_one_sentence_and_exit_code_2_and_writes_nothing(tmp_path):
@@ -157,9 +179,7 @@ def test_bad_data_is_one_sentence_and_exit_code_2_and_writes_nothing(tmp_path):
 @pytest.mark.parametrize("arguments, word", [
     (["solve", "nowhere", "--out", "out"], "nowhere"),
     (["simulate", "drive", "--nlos", "1.5"], "from 0 to 1"),
-    (["simulate", "drive", "--slip", "-1"], "from 0 to 1"),
     (["simulate", "drive", "--slip", "nan"], "from 0 to 1"),
-    (["simulate", "drive", "--slip", "1e300"], "from 0 to 1"),
     (["simulate", "drive", "--nlos", "some"], "from 0 to 1, found 'some'"),
     (["simulate", "drive", "--seed", "x"], "a whole number from 0 on, found 'x'"),
     (["simulate", "drive", "--seed", "9" * 5000], "from 0 on, found '999"),
@@ -167,11 +187,16 @@ def test_bad_data_is_one_sentence_and_exit_code_2_and_writes_nothing(tmp_path):
     (["simulate", "drive", "--path", "round"], "invalid choice: 'round'"),
     (["simulate"], "FOLDER"),
     (["solve", "drive"], "--out"),
+    (["solve", "drive", "--out", "out", "--problem", "5"], "problem4, found 'problem5'"),
+    (["solve", "drive", "--out", "out", "--kernel", "L2"], "asymmetric Tukey, found 'L2'"),
+    (["solve", "drive", "--out", "out", "--slip", "1"], "from 0 to 0.1 sqrt(m), found '1'"),
+    (["solve", "drive", "--out", "out", "--plot", "a.gif"], ".svg, found '.gif'"),
     (["solve", "drive", "--out", "out", "more\nthan one"], "more than one"),
     (["report", "--no-code", "--all-code"], "not allowed with argument --no-code"),
     (["simulate", ".", "--seed", "1"], "new or empty folder"),
     (["report", "--notebooks", ROOT / "notebooks", "--data", "nowhere"], "nowhere"),
     (["report", "--jobs", "0"], "jobs"),
+    (["hand-in", "--out", "."], "expected the name of a file to write, found a folder"),
     ([], "required"),
 ])
 def test_bad_arguments_give_exit_code_2_and_one_sentence(tmp_path, monkeypatch, capsys, arguments,
@@ -221,30 +246,6 @@ print(check_python.problem())
         assert word in said and said.count("\n") == 1, change
 
 
-def test_a_problem_that_fails_costs_the_others_nothing(tmp_path, capsys, monkeypatch):
-    """Exit code 3, a sentence in summary.json and on the terminal, and the others' results."""
-    write_dataset(tmp_path / "drive", *simulate("short", seed=3))
-    estimate = solve.slam.estimate
-
-    def failing(dataset, **options):
-        if dataset.uwb is None:
-            raise DatasetError("drive: expected measurements that determine every pose")
-        return estimate(dataset, slip=1e-3, marker_noise_factor=1, model="arc", **options)
-
-    monkeypatch.setattr(solve.slam, "estimate", failing)
-    assert main(["solve", str(tmp_path / "drive"), "--out", str(tmp_path / "out")]) == 3
-    problems = json.loads((tmp_path / "out" / "summary.json").read_text())["problems"]
-    assert "determine every pose" in problems["problem3"]["failed"]
-    assert "ate_m" in problems["problem4"]
-    assert not (tmp_path / "out" / "problem3").exists()
-    assert (tmp_path / "out" / "problem4" / "UwbMap.mat").exists()
-    told = capsys.readouterr()
-    assert told.err.splitlines()[-1] == (
-        "slamlib: drive: problem3 could not be solved: expected measurements that determine every "
-        "pose")
-    assert "problem3       could not be solved" in told.out
-
-
 def test_doubts_are_in_the_summary_and_below_the_table(tmp_path, capsys):
     """About the drive first, then by problem; an antenna of two ranges; truth in another frame."""
     dataset, truth = simulate("short", seed=3)
@@ -276,21 +277,27 @@ def test_a_clean_drive_has_no_doubts_and_each_doubt_is_told_once(tmp_path, monke
     assert solve_to_folder(dataset, None, tmp_path)["doubts"] == []
     told = Doubt("camera-mirrored", "It is.")
     monkeypatch.setattr("slamlib.summary.doubts_before_solving", lambda *_: (told, told))
-    monkeypatch.setattr("slamlib.summary.solutions", lambda dataset, problems: [
+    monkeypatch.setattr("slamlib.summary.solutions", lambda dataset, **_: [
         replace(solve.problem_solution("problem1", dataset),
                 doubts=(Doubt("units", "Miles."), told))])
     assert [doubt["what"] for doubt in solve_to_folder(dataset, None, tmp_path)["doubts"]] == [
         "camera-mirrored", "units"]
 
 
-def test_sightings_that_contradict_each_other_cost_problem_2_only(tmp_path, capsys):
+def test_a_problem_that_fails_costs_the_others_nothing(tmp_path, capsys):
     """Every marker is seen twice at a pose, at two places, and neither is confirmed."""
-    dataset = simulate("short", seed=3)[0].first(100)
+    dataset, out = simulate("short", seed=3)[0].first(100), tmp_path / "out"
     write_dataset(tmp_path / "drive", replace(dataset, aruco=contradicted(dataset.aruco)))
-    assert main(["solve", str(tmp_path / "drive"), "--out", str(tmp_path / "out")]) == 3
-    problems = json.loads((tmp_path / "out" / "summary.json").read_text())["problems"]
-    assert [name for name, row in problems.items() if "failed" in row] == ["problem2"]
-    assert "drive: problem2 could not be solved: expected sightings" in capsys.readouterr().err
+    assert main(["solve", str(tmp_path / "drive"), "--out", str(out)]) == 3
+    problems = json.loads((out / "summary.json").read_text())["problems"]
+    failed, = (name for name, row in problems.items() if "failed" in row)
+    assert failed == "problem2" and [*problems] == list(solve.PROBLEMS)
+    assert {path.name for path in out.glob("problem*")} == problems.keys() - {failed}
+    told = capsys.readouterr()
+    assert told.err.splitlines()[-1] == (
+        f"slamlib: drive: problem2 could not be solved: {problems[failed]['failed']}")
+    assert problems[failed]["failed"].startswith("expected sightings")
+    assert "problem2       could not be solved" in told.out
 
 
 def test_what_was_found_and_mended_is_said_first_and_kept_in_the_summary(tmp_path, capsys):
@@ -310,9 +317,8 @@ def test_what_was_found_and_mended_is_said_first_and_kept_in_the_summary(tmp_pat
 
 
 def test_files_that_are_refused_end_in_one_sentence(tmp_path, capsys):
-    (tmp_path / "encoderReading.txt").write_text("1 0 0\n")
-    (tmp_path / "ArucoMeasurements.txt").write_text("")
+    (tmp_path / "encoder.txt").write_text("1 0 0\n")
     assert main(["solve", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
     assert capsys.readouterr().err == (
-        f"slamlib: {tmp_path / 'ArucoMeasurements.txt'}: expected the name ArucoReading.txt: "
-        "rename it, or move it away\n")
+        f"slamlib: {tmp_path / 'encoderReading.txt'}: expected this file, found none (Not read: "
+        "encoder.txt.)\n")

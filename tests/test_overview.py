@@ -1,25 +1,23 @@
 """The summary that opens the report: its numbers are those of the files, and it names every gap."""
 
-import base64
 import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from test_pdf import text_of
+from test_document import text_of
 
 from slamlib import evaluation, se2
 from slamlib.dataset import read_dataset, read_truth
 from slamlib.doubt import Doubt
-from slamlib.notebook import dash_note, median_sigmas, plotting, table_text, with_unit
+from slamlib.notebook import plotting
 from slamlib.report import drives as solved_drives
-from slamlib.report import overview, pdf
-from slamlib.report.chapters import printed
+from slamlib.report import overview
+from slamlib.report.document import render
 from slamlib.report.execution import NotebookError
-from slamlib.report.pages import html_page
-from slamlib.report.pictures import title_picture
-from slamlib.report.svg import compressed
+from slamlib.report.options import Options
+from slamlib.report.overview import title_picture
 from slamlib.results import write_vehicle_poses
 from slamlib.simulation import simulate, write_dataset
 from slamlib.solve import Failure, Solution, problem_solution, solutions, title, write_solution
@@ -49,12 +47,18 @@ def project(tmp_path_factory):
     return folder, written, solved
 
 
+def drives_of(folder, names, written, notices=None):
+    """The SolvedDrives of datasets of these names, with what is written and told of them."""
+    read = [(read_dataset(folder / "data" / name), read_truth(folder / "data" / name))
+            for name in names]
+    return solved_drives.read_drives(read, folder / "results", written, notices)
+
+
 @pytest.fixture(scope="module")
 def summary(project):
     """The summary of the three drives."""
     folder, written, _ = project
-    return overview.opening(
-        solved_drives.read_drives(folder / "data", folder / "results", NAMES, written))
+    return overview.opening(drives_of(folder, NAMES, written))
 
 
 def result_rows(summary):
@@ -70,8 +74,9 @@ def result_rows(summary):
     return rows, text
 
 
-def pictures_of(summary):
-    return next(cell for cell in summary.cells if cell.id == "picture").outputs[0].data
+def picture_of(summary):
+    cell, = (cell for cell in summary.cells if cell.id == "picture")
+    return cell.outputs[0].data["image/svg+xml"]
 
 
 def metres(text):
@@ -96,7 +101,9 @@ def test_numbers_are_those_of_the_solver(project, summary):
         expected = summarize(solution, read_truth(folder / "data" / "all"))
         ate, aligned, position, heading, poses = rows["all", solution.title]
         assert int(poses.replace(",", "")) == expected["estimated_poses"]
-        medians = median_sigmas(solution)
+        C = solution.covariances[np.isfinite(solution.poses[:, 0])]
+        medians = [np.median(each) for each in (evaluation.position_sigmas(C),
+                                                np.sqrt(C[:, 2, 2]))]
         for shown, wanted in ((position, medians[0]), (ate, expected["ate_m"]),
                               (heading, medians[1]),
                               (aligned, expected["ate_aligned_m"])):
@@ -121,7 +128,7 @@ def test_doubts_and_failures_stand_on_the_first_page_only_where_there_are_any(pr
     notices = {"no_truth": [Failure("problem3", "SLAM: odometry + ArUco", "expected | more"),
                             Doubt("units", "Lengths are *mm*.")],
                "all": [Doubt("antenna", "Antenna 7 is in doubt.")]}
-    drives = solved_drives.read_drives(folder / "data", folder / "results", NAMES, written, notices)
+    drives = drives_of(folder, NAMES, written, notices)
     told = overview.opening(drives)
     rows, text = result_rows(told)
     assert rows["no_truth", "SLAM: odometry + ArUco"] == ["could not be solved", *["–"] * 4]
@@ -151,15 +158,14 @@ def test_a_problem_that_is_not_known_appears_by_its_folder(tmp_path):
         write_solution(tmp_path / "results" / name, problem_solution("problem1", dataset))
         written.append(f"{name}/problem1/vehiclePose.mat")
     write_vehicle_poses(tmp_path / "results" / "other" / "a", np.zeros((2, 3)), np.zeros((2, 3, 3)))
-    drives = solved_drives.read_drives(tmp_path / "data", tmp_path / "results", ["other", "plain"],
-                                  ["other/a/vehiclePose.mat", *written])
+    drives = drives_of(tmp_path, ["other", "plain"], ["other/a/vehiclePose.mat", *written])
     summary = overview.opening(drives)
     rows, _ = result_rows(summary)
     assert rows["other", "a"] == ["0.00\u00a0mm", "0.00\u00a0mrad", "2"]
     assert rows["plain", "a"][0] == "no result"
     assert [solution.problem for solution in drives[0].solutions] == ["problem1", "a"]
     color = plotting.ROLES["alternative"]["color"].lower()
-    assert color in pictures_of(summary)[plotting.WIDE]
+    assert color in picture_of(summary)
 
 
 def test_the_world_is_the_first_pose_with_an_estimate():
@@ -173,74 +179,57 @@ def test_the_world_is_the_first_pose_with_an_estimate():
     assert evaluation.ate(poses, truth.poses) > 0.1  # in the wrong frame
 
 
-def test_the_picture_is_the_same_every_time_and_needs_no_display(project, summary):
+def test_the_pictures_are_the_same_every_time_and_need_no_display(project, summary):
     folder, written, solved = project
-    drives = solved_drives.read_drives(folder / "data", folder / "results", NAMES, written)
-    pictures = pictures_of(summary)
-    assert pictures == pictures_of(overview.opening(drives))
-    assert set(pictures) == {plotting.WIDE, plotting.NARROW}
-    for text in pictures.values():
-        assert text.count("<path") > 10
-        assert not re.search(r"<dc:date|/tmp/|http://(?!www.w3.org|purl.org|creativecommons)", text)
-    for role, drawn in (("slam_uwb", True), ("fused", True), ("hint", True)):
-        assert (plotting.ROLES[role]["color"].lower() in pictures[plotting.WIDE]) == drawn
-
-
-def test_the_page_has_the_picture_wide_and_for_phones_narrow(summary):
-    page, _ = html_page(Path("index"), summary, [])
-    pictures = pictures_of(summary)
-    wide, narrow = (base64.b64encode(compressed(pictures[kind]).encode()).decode()
-                    for kind in (plotting.WIDE, plotting.NARROW))
-    picture = re.search("<picture>(.*)</picture>", page)[1]
-    assert picture.count(f' src="data:image/svg+xml;base64,{wide}"') == 1
-    assert picture.count(f' srcset="data:image/svg+xml;base64,{narrow}"') == 1
-    assert picture.count('media="screen and (max-width: 40rem)"') == 1
+    drives = drives_of(folder, NAMES, written)
+    text = picture_of(summary)
+    assert text == picture_of(overview.opening(drives)) and text.count("<path") > 10
+    assert not re.search(r"<dc:date|/tmp/|http://(?!www.w3.org|purl.org|creativecommons)", text)
+    for role in ("slam_uwb", "fused", "hint"):
+        assert plotting.ROLES[role]["color"].lower() in text
+    picture = title_picture(drives[0])
+    markers, antennas = (len(found[0]) for found in (solved[-1].aruco_map, solved[-1].uwb_map))
+    assert picture == title_picture(drives[0]) and picture.count("<use ") >= markers + antennas
 
 
 def test_the_abstract_says_what_was_found_with_the_numbers_of_the_table(project, summary):
     _, _, solved = project
+    rows, _ = result_rows(summary)
     text = summary.cells[0].source
-    first, note = text.removeprefix("# Overview\n\n").split("\n\n")
-    assert 4 <= first.count(". ") + 1 <= 6
-    for solution in solved:
-        if solution.problem != "problem2_hint":
-            assert first.count(f"{with_unit(median_sigmas(solution)[0], 'm')} ") >= 1
-    assert "On *wheels_only* the median standard deviation of position is " in first
-    assert f"{len(solved[-1].aruco_map[0])} markers and 4 antennas on *all*" in first
-    assert note.startswith("The dataset *all* is a simulated stand-in for the course's logs")
+    errors = [rows["all", solved[number].title][0] for number in (0, -1)]
+    assert f"{errors[0]} and {errors[1]} on" in text
+    assert f"{len(solved[-1].aruco_map[0])} markers and 4 antennas on *all*" in text
+    assert "*all* is a simulated stand-in" in text
 
 
 def test_dashes_are_explained_only_where_some_truth_is_unknown(project):
     folder, written, _ = project
-    drives = solved_drives.read_drives(folder / "data", folder / "results", NAMES, written)
+    drives = drives_of(folder, NAMES, written)
     known = [drive for drive in drives if drive.truth is not None]
-    assert len(known) < len(drives) and "dash" in dash_note(drives)
-    assert dash_note(known) == ""
-    assert "dash" not in overview.opening(known).cells[1].source
+    assert len(known) < len(drives)
+    assert "A dash stands" not in result_rows(overview.opening(known))[1]
 
 
 @pytest.mark.slow
 def test_of_many_drives_the_abstract_names_the_shortest_and_the_longest(project, summary):
     folder, written, _ = project
-    drives = solved_drives.read_drives(folder / "data", folder / "results", NAMES, written)
-    text = overview.abstract([drives[0], *4 * [drives[1]], drives[2]])
-    assert [name for name in NAMES if f"n *{name}* " in text] == [drives[0].name, drives[2].name]
+    drives = drives_of(folder, NAMES, written)
+    many = [drives[0], *(replace(drives[1], name=f"x{n}") for n in range(4)), drives[2]]
+    text = overview.opening(many).cells[0].source.split("\n\n")[1]
+    assert not re.search(r"\*x\d", text) and "on *all*" in text
     recorded = overview.opening([drive for drive in drives if drive.truth is None])
     rows, text = result_rows(recorded)
-    assert not re.search("simulated|ATE|(?<!_)truth", text.split("## The datasets")[0])
-    assert re.search(r"Odometry differs from this by [\d.]+\u00a0m?m on \*no_truth\* .*SLAM, which "
-                     r"uses these sightings, agrees with them to [\d.]+\u00a0mm on \*no_truth\*\.",
-                     text)
-    assert "standard deviation σ that a method claims" in text
-    assert "overconfident (chapter 2)" in text
+    assert not re.search("simulated|ATE|(?<!_)truth", text.split("Figure 1.")[0])
+    assert re.search(r"by SLAM[^.]*[\d.]+\u00a0m?m and [\d.]+\u00a0mm on \*no_truth", text)
     assert all(len(row) == 3 for row in rows.values())
 
 
 def test_files_to_hand_in_stand_by_problem_and_dataset(project):
     folder, written, _ = project
     written = [*written, "other/problem4/UwbMap.mat", "all/notes.txt"]
-    drives = solved_drives.read_drives(folder / "data", folder / "results", NAMES, written)
-    text = overview.opening(drives, "../the results").cells[2].source
+    drives = drives_of(folder, NAMES, written)
+    text = next(cell.source for cell in overview.opening(drives, "../the results").cells
+                if cell.id == "files")
     assert text.startswith("## Files to hand in")
     last = next(line for line in text.splitlines() if line.startswith("| 4. SLAM"))
     name, at, poses, _, ranges = [cell.strip() for cell in last.strip("|").split("|")]
@@ -254,26 +243,13 @@ def test_files_to_hand_in_stand_by_problem_and_dataset(project):
 @pytest.mark.parametrize("name", NAMES)
 def test_the_opening_of_any_one_drive_fits_on_a_page(project, tmp_path, name):
     folder, written, _ = project
-    drives = solved_drives.read_drives(folder / "data", folder / "results", [name], written)
-    text = text_of(pdf.typeset([], printed(overview.opening(drives)), "method",
-                               title_picture(drives[0]), title="T"), tmp_path)
-    cover, contents, *pages = text.rstrip("\f\n").split("\f")
-    assert len(pages) == 1 and "Figure 1." in pages[0] and "The datasets" not in text
+    drives = drives_of(folder, [name], written)
+    files = render({Path("index"): overview.opening(drives)}, Options(title="T"), (),
+                   title_picture(drives[0]))
+    text = text_of(files["report.pdf"], tmp_path)
+    _, _, page = text.rstrip("\f\n").split("\f")                  # after cover and contents
+    assert "Figure 1." in page and "The datasets" not in text
     assert ("ATE" in text) == (name == "all") == ("stand-in" in text)
-
-
-def test_rows_that_begin_alike_name_it_once():
-    assert table_text(["a", "b"], [["x", "1"], ["x", "2"], ["y", "2"], ["x", "2"]], 2).split(
-        "\n")[2:] == ["| x | 1 |", "|  | 2 |", "| y | 2 |", "| x | 2 |"]
-
-
-def test_the_title_picture_shows_path_and_landmarks(project):
-    folder, written, solved = project
-    drive, = solved_drives.read_drives(folder / "data", folder / "results", ["all"], written)
-    picture = title_picture(drive)
-    markers, antennas = (len(found[0]) for found in (solved[-1].aruco_map, solved[-1].uwb_map))
-    assert picture.count("<use ") >= markers + antennas
-    assert picture == title_picture(drive)
 
 
 @pytest.mark.parametrize("content, reason", [(b"", "cannot be read"), (None, "must hold")])
@@ -283,13 +259,8 @@ def test_poses_that_are_none_are_told_in_one_sentence(project, content, reason):
     write_vehicle_poses(broken, np.zeros((7, 3)), np.zeros((7, 3, 3)))
     if content is not None:
         (broken / "vehiclePose.mat").write_bytes(content)
-    with pytest.raises(NotebookError, match=f"all/broken/vehiclePose.mat, .*{reason}"):
-        solved_drives.read_drives(folder / "data", folder / "results", ["all"],
-                             ["all/broken/vehiclePose.mat"])
-
-
-def test_names_are_shown_as_they_are():
-    assert overview.plain("a_b*c|<d> $e$") == "a_b&#42;c&#124;&#60;d&#62; &#36;e&#36;"
+    with pytest.raises(NotebookError, match=f"all/broken, which a notebook wrote, {reason}"):
+        drives_of(folder, ["all"], ["all/broken/vehiclePose.mat"])
 
 
 def test_notes_on_files_stand_on_the_first_page_only_where_there_are_any(project, summary):

@@ -1,6 +1,6 @@
-"""Figures, wide and narrow: what is in them, and that nothing exceeds them."""
+"""Figures: what is in them, and that nothing exceeds them."""
 
-from functools import partial
+from types import SimpleNamespace
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -37,22 +37,15 @@ def boxes(fig):
 
 @pytest.mark.parametrize("count, rows, columns", [
     (1, 1, 2), (2, 1, 2), (2, 3, 2), (3, 2, 2), (3, 3, 3)])
-def test_panels_are_side_by_side_and_in_the_narrow_figure_below_each_other(count, rows, columns):
+def test_panels_are_side_by_side_and_within_the_figure(count, rows, columns):
     fig, axes = drawn(count, rows, columns)
     assert axes.shape == (count, rows) and fig.axes == list(axes.ravel())
-    *wide, _ = boxes(fig)
-    high = wide[0].height
+    *wide, legend = boxes(fig)
     if count > 1:
         assert wide[rows].x0 > wide[0].x1
-    plotting.narrow(fig)
-    *narrow, legend = boxes(fig)
-    assert fig.axes == list(axes.ravel())
-    for upper, lower in zip(narrow, [*narrow[1:], legend], strict=True):
-        assert upper.y0 > lower.y1 - 0.01
-    for box in (*narrow, legend):
-        assert -0.01 <= box.x0 and box.x1 <= plotting.NARROW_WIDTH + 0.01
+    for box in (*wide, legend):
+        assert -0.01 <= box.x0 and box.x1 <= fig.get_figwidth() + 0.01
         assert -0.01 <= box.y0 and box.y1 <= fig.get_figheight() + 0.01
-    assert all(box.height > 0.85 * high for box in narrow)
 
 
 @pytest.mark.parametrize("labels, lines", [
@@ -61,35 +54,11 @@ def test_panels_are_side_by_side_and_in_the_narrow_figure_below_each_other(count
 def test_a_legend_has_each_label_once_and_as_few_lines_as_fit(labels, lines):
     one_line = boxes(drawn(1, 1, labels=["d"])[0])[-1].height
     fig, _ = drawn(2, 2, labels=labels)
-    plotting.narrow(fig)
+    fig.set_size_inches(3.9, 9.0)
+    plotting.legend_below(fig)
     assert len(fig.legends) == 1
     assert [text.get_text() for text in fig.legends[0].get_texts()] == list(labels)
     assert boxes(fig)[-1].height / one_line == pytest.approx(lines, rel=0.2)
-
-
-def test_pictures_are_the_same_every_time():
-    with plt.rc_context({"svg.hashsalt": "slamlib"}):
-        first, second = (plotting.svg_pictures(drawn(2, 1)[0]) for _ in range(2))
-    assert first == second
-    width, narrower = (float(first[kind].split('width="')[1].split("pt")[0])
-                       for kind in (plotting.WIDE, plotting.NARROW))
-    assert narrower < 0.6 * width
-
-
-def test_a_path_fills_the_narrow_axes_too():
-    fig, axes = plotting.panels(1, height=3.0, width=7.2)
-    plotting.trajectory(axes[0, 0], np.array([[0.0, 0, 0], [1, 1, 0]]), "truth")
-    plotting.svg_pictures(fig)
-    assert min(np.ptp(axes[0, 0].get_xlim()), np.ptp(axes[0, 0].get_ylim())) < 1.2
-
-
-def test_a_figure_without_axes_or_legend_stays_as_it_is():
-    fig = plt.figure()
-    assert plotting.svg_pictures(fig) == {}
-    ax = fig.add_axes((0.1, 0.1, 0.8, 0.8))
-    before = ax.get_position().bounds
-    plotting.narrow(fig)
-    assert ax.get_position().bounds == before
 
 
 def test_every_curve_has_a_colour_of_its_own():
@@ -156,12 +125,57 @@ def test_the_scheme_of_a_graph_has_a_square_for_each_factor_and_a_name_for_each_
         "$X_1$", "$X_2$", "$X_3$", "$L_{7}$", "$L_{8}$", "$A_{5}$", "$w$"]
 
 
-def test_markers_and_antennas_have_their_own_covariances():
+def test_antennas_have_their_own_covariances():
     positions = np.arange(8.0).reshape(4, 2)
     covariances = elongated(4, 2.0, 0.5) * np.arange(1, 5)[:, None, None]
-    for draw, factor in ((plotting.draw_markers, 1),
-                         (partial(plotting.draw_antennas, enlarged=3), 3)):
-        _, ((ax,),) = plotting.panels(1)
-        draw(ax, positions, covariances)
-        patches, = ax.collections
-        require_contours(patches, positions, covariances, factor * REACH_95)
+    _, ((ax,),) = plotting.panels(1)
+    plotting.draw_antennas(ax, positions, covariances, enlarged=3)
+    patches, = ax.collections
+    require_contours(patches, positions, covariances, 3 * REACH_95)
+
+
+def test_an_unknown_role_is_answered_by_those_there_are():
+    _, axes = plotting.panels(1)
+    with pytest.raises(ValueError, match="a role such as truth, odometry, .*, found 'mine'"):
+        plotting.trajectory(axes[0, 0], np.zeros((2, 3)), "mine")
+
+
+def drive_with(truth=True):
+    """Results as solvers give them, and their Drive: 50 poses on a circle, errors of 1 cm."""
+    turn = np.linspace(0, 5, 50)
+    poses = np.column_stack([np.cos(turn), np.sin(turn), turn])
+    covariances = elongated(50, 0.02, 0.01)
+    return SimpleNamespace(poses=poses + [0.01, 0, 0.002], covariances=covariances), \
+        SimpleNamespace(name="a$b", truth=SimpleNamespace(poses=poses) if truth else None)
+
+
+def test_each_drive_has_its_panels_a_title_and_one_legend():
+    _, drive = drive_with()
+    for _, axes in plotting.each_drive([drive, "two"], rows=2):
+        assert len(axes) == 2
+        plotting.curve(axes[0], np.arange(3.0), "slam")
+    fig = axes[0].figure
+    assert [ax.get_title("left") for ax in fig.axes] == [r"a\$b", "", "two", ""]
+    assert len(fig.legends) == 1
+    assert list(plotting.each_drive([])) == [] and len(plt.gcf().axes) == 1
+
+
+def test_a_path_has_ellipses_of_its_covariances_and_their_factor_as_title():
+    result, drive = drive_with()
+    for _, ax in plotting.each_drive([drive]):
+        plotting.with_ellipses(ax, result.poses, result.covariances, "slam", count=9)
+    patches, = ax.collections
+    factor = int(ax.get_title("left").split("× ")[1].rstrip(")"))
+    rows = plotting.equidistant(result.poses, 9)
+    require_contours(patches, result.poses[rows], result.covariances[rows], factor * REACH_95)
+
+
+@pytest.mark.parametrize("truth", [True, False])
+def test_errors_are_in_mm_and_without_truth_the_bands_stand_alone(truth):
+    result, drive = drive_with(truth)
+    (top, bottom), = (plotting.errors(axes, result, drive)
+                      for _, axes in plotting.each_drive([drive], rows=2))
+    for ax, error, reach in ((top, 10, 20 * REACH_95), (bottom, 2, 200)):
+        assert [line.get_ydata() for line in ax.lines] == ([pytest.approx(error)] if truth else [])
+        band = ax.collections[0].get_paths()[0].vertices[:, 1]
+        assert band.max() == pytest.approx(reach)

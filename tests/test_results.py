@@ -1,10 +1,12 @@
+import errno
 import os
 import shutil
 import subprocess
+from io import BytesIO
 
 import numpy as np
 import pytest
-from scipy.io import loadmat
+from scipy.io import loadmat, savemat
 
 from slamlib import results
 
@@ -50,51 +52,22 @@ def test_round_trip_through_octave(tmp_path):
     np.testing.assert_array_equal(again["c"], covariances[6])
 
 
-def test_aruco_map_through_scipy_and_octave(tmp_path):
+@pytest.mark.parametrize("name, fields, d", [
+    ("ArucoMap", ("pose", "covari", "id"), 3), ("UwbMap", ("position", "covariance", "id"), 2)])
+def test_maps_through_scipy_and_octave(tmp_path, name, fields, d):
     poses, covariances = example(3)
-    ids = np.array([4, 17, 10**12])
-    results.write_aruco_map(tmp_path, ids, poses, covariances)
-    structs = loadmat(tmp_path / "ArucoMap.mat")["ArucoMap"]
-    assert structs.shape == (1, 3) and structs.dtype.names == ("pose", "covari", "id")
-    assert structs[0, 1]["pose"].shape == (1, 3) and structs[0, 1]["id"] == [[17]]
-    again = results.read_aruco_map(tmp_path)
-    for got, expected in zip(again, (ids, poses, covariances), strict=True):
+    content = np.array([4, 17, 10**12]), poses[:, :d], covariances[:, :d, :d]
+    results.write_map(tmp_path, name, *content)
+    structs = loadmat(tmp_path / f"{name}.mat")[name]
+    assert structs.shape == (1, 3) and structs.dtype.names == fields
+    assert [structs[0, 1][field].shape for field in fields] == [(1, d), (d, d), (1, 1)]
+    for got, expected in zip(results.read_structs(tmp_path, name), content, strict=True):
         np.testing.assert_array_equal(got, expected)
-    run_octave("load('ArucoMap.mat'); i = [ArucoMap.id]; save('-v7', 'again.mat', 'i');", tmp_path)
-    np.testing.assert_array_equal(loadmat(tmp_path / "again.mat")["i"], [ids])
-
-
-def test_uwb_map_through_scipy_and_octave(tmp_path):
-    positions, covariances = example(3)[0][:, :2], example(3)[1][:, :2, :2]
-    ids = np.array([4, 17, 51])
-    results.write_uwb_map(tmp_path, ids, positions, covariances)
-    structs = loadmat(tmp_path / "UwbMap.mat")["UwbMap"]
-    assert structs.shape == (1, 3) and structs.dtype.names == ("position", "covariance", "id")
-    assert structs[0, 1]["position"].shape == (1, 2)
-    assert structs[0, 1]["covariance"].shape == (2, 2)
-    again = results.read_uwb_map(tmp_path)
-    for got, expected in zip(again, (ids, positions, covariances), strict=True):
-        np.testing.assert_array_equal(got, expected)
-    run_octave("load('UwbMap.mat'); p = vertcat(UwbMap.position); save('-v7', 'again.mat', 'p');",
-               tmp_path)
-    np.testing.assert_array_equal(loadmat(tmp_path / "again.mat")["p"], positions)
-
-
-def test_an_empty_map(tmp_path):
-    poses, covariances = example(1)
-    results.write_aruco_map(tmp_path, np.zeros(0, int), poses[:0], covariances[:0])
-    assert loadmat(tmp_path / "ArucoMap.mat")["ArucoMap"].size == 0
-    ids, poses, covariances = results.read_aruco_map(tmp_path)
-    assert (ids.shape, poses.shape, covariances.shape) == ((0,), (0, 3), (0, 3, 3))
-
-
-def test_a_single_pose_and_equal_bytes(tmp_path):
-    poses, covariances = example(1)
-    for name in ("a", "b"):
-        results.write_vehicle_poses(tmp_path / name, poses, covariances)
-    first, second = ((tmp_path / name / "vehiclePose.mat").read_bytes() for name in ("a", "b"))
-    assert first == second
-    np.testing.assert_array_equal(results.read_vehicle_poses(tmp_path / "a")[1], covariances)
+    run_octave(f"load('{name}.mat'); i = [{name}.id]; p = vertcat({name}.{fields[0]});"
+               "save('-v7', 'again.mat', 'i', 'p');", tmp_path)
+    again = loadmat(tmp_path / "again.mat")
+    np.testing.assert_array_equal(again["i"], [content[0]])
+    np.testing.assert_array_equal(again["p"], content[1])
 
 
 def test_a_failing_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
@@ -102,7 +75,7 @@ def test_a_failing_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypa
     before = (tmp_path / "vehiclePose.mat").read_bytes()
 
     def fail(*_):
-        raise OSError("disk full")
+        raise OSError(errno.ENOSPC, "disk full")
 
     monkeypatch.setattr(os, "replace", fail)
     with pytest.raises(OSError, match="disk full"):
@@ -111,12 +84,17 @@ def test_a_failing_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypa
     assert (tmp_path / "vehiclePose.mat").read_bytes() == before
 
 
-def test_many_structs_have_the_bytes_that_scipy_writes():
+@pytest.mark.parametrize("count", [0, 1, 2, 107])
+def test_structs_have_the_bytes_that_scipy_writes_and_are_read_again(tmp_path, count):
     """Any numbers, NaN and infinity among them, for vectors, matrices and scalars."""
-    rng = np.random.default_rng(0)
-    n = results.MAX_STRUCTS_BY_SCIPY + 7
-    rows = {"pose": rng.normal(size=(n, 1, 3)), "covari": rng.normal(size=(n, 3, 3)),
-            "id": np.arange(n, dtype=float)[:, None, None]}
-    rows["pose"][3], rows["covari"][5, 1, 2] = np.nan, np.inf
-    expected, found = results._saved("ArucoMap", rows), results._tiled("ArucoMap", rows)
-    assert found[116:] == expected[116:]                     # the first bytes contain the date
+    ids, (poses, covariances) = np.arange(count), example(count)
+    poses[3:4], covariances[5:, 1, 2] = np.nan, np.inf
+    results.write_map(tmp_path, "ArucoMap", ids, poses, covariances)
+    structs = np.empty((1, count), dtype=[(name, object) for name in ("pose", "covari", "id")])
+    for row, numbers in zip(structs[0], zip(poses[:, None], covariances, ids.astype(float))):
+        row["pose"], row["covari"], row["id"] = numbers
+    buffer = BytesIO()
+    savemat(buffer, {"ArucoMap": structs})
+    assert (tmp_path / "ArucoMap.mat").read_bytes()[116:] == buffer.getvalue()[116:]   # no date
+    for got, expected in zip(results.read_structs(tmp_path, "ArucoMap"), (ids, poses, covariances)):
+        np.testing.assert_array_equal(got, expected)

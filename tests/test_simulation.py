@@ -159,23 +159,12 @@ def test_errors_are_added_to_a_dataset_by_their_seed():
     dataset, _ = simulate("short", seed=5)
     wrong, late = mislabel(dataset, 0.2, 1), delay(dataset, 0.2, 1)
     changed = wrong.aruco.marker != dataset.aruco.marker
-    assert 0.1 < changed.mean() < 0.3
-    assert set(wrong.aruco.marker) <= set(dataset.aruco.marker)
+    assert 0.1 < changed.mean() < 0.3 and set(wrong.aruco.marker) <= set(dataset.aruco.marker)
     np.testing.assert_array_equal(wrong.aruco.marker_in_vehicle, dataset.aruco.marker_in_vehicle)
     excess = late.uwb.range - dataset.uwb.range
     assert (excess >= 0).all() and 0.1 < np.mean(excess > 0) < 0.3
     assert 0.7 * LATE_RANGE_MEAN < excess[excess > 0].mean() < 1.4 * LATE_RANGE_MEAN
-    other = mislabel(dataset, 0.2, 2).aruco.marker
-    assert (other != wrong.aruco.marker).any() and (mislabel(dataset, 0, 1).aruco.marker
-                                                    == dataset.aruco.marker).all()
-    np.testing.assert_array_equal(delay(dataset, 0, 1).uwb.range, dataset.uwb.range)
-
-
-def test_a_single_marker_keeps_its_label():
-    dataset, _ = simulate("short", seed=5)
-    single = dataset.aruco.select(dataset.aruco.marker == dataset.aruco.marker[0])
-    one = mislabel(replace(dataset, aruco=single), 1.0, 1)
-    np.testing.assert_array_equal(one.aruco.marker, single.marker)
+    assert (mislabel(dataset, 0.2, 2).aruco.marker != wrong.aruco.marker).any()
 
 
 def test_guesses_are_as_wrong_as_is_asked_for():

@@ -143,7 +143,7 @@ def test_a_study_shows_a_bar_in_a_kernel_of_jupyterlab_and_not_in_the_build(
     if kernel:
         monkeypatch.setitem(sys.modules, "ipykernel", studies)
     if told:
-        monkeypatch.setenv("SLAMLIB_PROGRESS", str(tmp_path / "told"))
+        monkeypatch.setenv("SLAMLIB_RESULTS", str(tmp_path))
     study()
     assert ("problem2_trial" in capsys.readouterr().err) == shown
 

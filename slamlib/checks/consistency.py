@@ -1,18 +1,16 @@
-"""Checks of poses without truth: loop closures, and the Hausman statistic.
+"""What a drive shows without truth: loop closures, and residuals by landmark.
 
 Markers that the camera sees again measure the motion since then, and with it the error of every
-method without loop closures: `returns` and `discrepancies`. `hausman_statistic` compares a method
-with an efficient one. The error of the efficient estimate is uncorrelated with its difference from
-any other, so the covariance of the difference is the difference of both covariances (Hausman,
-Econometrica 46(6), 1978). Poses are [x, y, heading] in m and rad.
+method without loop closures. Residuals of one landmark that are larger than those of the others
+show that it moved, or that its covariances are not as stated. Poses are in m and rad.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from slamlib import evaluation, odometry, se2
-from slamlib.localization.marker_increments import robust_increments
+from slamlib import odometry, se2
+from slamlib.marker_increments import robust_increments
 from slamlib.sightings import sightings_by_frame
 
 MIN_GAP = 5.0                # m, driven between two sightings of the markers of a return
@@ -58,22 +56,28 @@ def returns(dataset, gap=MIN_GAP):
 
 
 def discrepancies(found, poses):
-    """Motions (m, 3) by poses (n, 3) minus those of Returns `found`, in the frames of its starts.
-
-    NaN where a pose is NaN.
-    """
+    """Motions (m, 3) by poses (n, 3) minus those of Returns `found`, in the axes of its starts."""
     off = se2.between(poses[found.start], poses[found.end]) - found.motion
     off[:, 2] = se2.wrap(off[:, 2])
     return off
 
 
-def hausman_statistic(poses, covariances, efficient, efficient_covariances):
-    """Squared differences (n,) of poses (n, 3) from efficient ones, normalized by C - C_efficient.
+def residuals_by_landmark(result, uwb=None):
+    """Residuals of each marker of a SlamResult, or of each antenna of the UwbReadings of its drive.
 
-    It is chi-squared with 3 degrees of freedom if both covariances (n, 3, 3) are right and the
-    efficient method is optimal for data that include those of the first one. NaN without a pose,
-    and where C - C_efficient is not positive definite: the first method claims to be more certain.
+    Returns ids (k,), ratios (k,), and degrees of freedom (k,), both NaN where nothing is redundant.
+    A ratio is the mean square of the whitened residuals of a landmark over that of all of its kind,
+    because the learned noise, poses and calibration take their degrees of freedom from all alike,
+    and the landmark its own. Times the degrees of freedom it is nearly chi-squared.
     """
-    difference = covariances - efficient_covariances
-    difference[~(np.diagonal(difference, axis1=1, axis2=2) > 0).all(axis=1)] = 0
-    return evaluation.nees(poses, difference, efficient)
+    label, weight, r = (result.sightings.marker, ~result.rejected, result.residual) if uwb is None \
+        else (uwb.antenna, result.range_weight, result.range_residual[:, None])
+    ids, row = np.unique(label, return_inverse=True)
+    size = 1 if uwb is not None else 2 + (r[:, 2] != 0)          # 2 of a marker without a heading
+    chi2, count, sightings = (np.bincount(row, weight * each, len(ids))
+                              for each in (np.sum(r**2, axis=1), size, 1.0))
+    dof = count - (2 if uwb is not None else count / np.maximum(sightings, 1))
+    dof[dof < 1] = np.nan
+    known = np.isfinite(dof)
+    usual = chi2[known].sum() / dof[known].sum() if known.any() else 1.0
+    return ids, chi2 / dof / usual, dof * usual

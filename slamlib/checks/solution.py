@@ -1,19 +1,24 @@
 """Doubts where the solution of problem 3 or 4, a SlamResult, contradicts what the files state."""
 
+from functools import reduce
+from itertools import chain
+
 import numpy as np
 
+from slamlib import se2
 from slamlib.doubt import Doubt
+from slamlib.odometry_gate import UNKNOWN_SIGMA
 from slamlib.slam.noise import BOUNDS
 
 MAX_TURN_SIGMA = np.pi / 3   # rad, between two frames; half a turn is three sigmas
+MAX_GAP = 30                 # poses, between contradictions that are told as one
 MAX_SLIP = 0.02              # sqrt(m), of wheels on the ground
 MAX_LATE_SHARE = 0.1         # share of the ranges that keep less than half of their weight
 MAX_NOISE_FACTOR = 1.5       # on a sigma, or its inverse; beyond it the factor is reported
 MIN_FACTOR_SIGMAS = 4.0      # sigmas of the logarithm of a factor that is reported
-MAX_CONFIRMED = 1.1          # factor on a sigma, or its inverse, up to which it is confirmed
-MAX_CONFIRMED_SIGMAS = 3.0   # sigmas of the logarithm of a factor that is confirmed
 MAX_REJECTED = 0.1           # share of the sightings that are rejected
-MIN_SIGHTINGS_PER_MARKER = 5         # number of sightings, of which the majority must be accepted
+MIN_REJECTED_OF_MARKER, MAX_REJECTED_OF_MARKER = 5, 0.2      # number, and share of its sightings
+MAX_MARKERS_NAMED = 8        # of those with most rejected sightings
 # By group of the calibration: its name in a sentence, and what to look at.
 GROUPS = {
     "wheel-parameters": ("the wheels", "Measure them, or state larger sigmas in vehicle.toml."),
@@ -36,32 +41,25 @@ GROUPS = {
 
 def solution_doubts(result):
     """Tuple of Doubt where a SlamResult contradicts the files of its drive."""
-    doubts = [Doubt("antenna", f"Antenna {antenna} is in doubt: {reason}. Its covariance includes "
-                               "this; look at its rows in UwbReading.txt.")
-              for antenna, reason in result.doubts.items()]
-    if not result.converged:
-        doubts.append(Doubt("not-converged", (
-            "The solution still changed when its number of steps ended: some poses or landmarks "
-            "may be far from where the measurements want them.")))
-    return tuple(sum((f(result) for f in (calibration_doubts, slip_doubts, noise_doubts,
-                                          sighting_doubts, turn_doubts)), []) + doubts)
+    return tuple(Doubt(*each) for each in chain(
+        _of_encoder(result), _of_calibration(result), _of_noise(result), _of_sightings(result),
+        _of_the_path(result),
+        (("antenna", f"Antenna {antenna} is in doubt: {reason}. Its covariance includes this; look "
+          "at its rows in UwbReading.txt.") for antenna, reason in result.doubts.items())))
 
 
-def calibration_doubts(result):
-    """List of a Doubt for each group of the calibration that decidedly left its stated values.
+def _of_calibration(result):
+    """Kind and sentence on each group of the calibration that decidedly left its stated values.
 
-    Of groups that the drive cannot tell apart there is one Doubt, about the one that is furthest
-    from what is stated. Groups that are released without a decision only make the covariances
-    larger.
+    Of groups that the drive cannot tell apart, on that which is furthest from what is stated.
     """
     common = frozenset.intersection(*result.explanations)
     either = frozenset().union(*result.explanations) - common
     rows = [row for row in result.calibration_table if row["group"] in common | either]
     distance = {group: max(abs(row["estimate"] - row["stated"]) / row["sigma"]
                            for row in rows if row["group"] == group) for group in either}
-    furthest = {max(distance, key=distance.get)} if either else set()
-    problem, doubts = "problem 4" if len(result.antenna) else "problem 3", []
-    for group in (group for group in GROUPS if group in common | furthest):
+    furthest = max(distance, key=distance.get, default=None)
+    for group in (group for group in GROUPS if group in common | {furthest}):
         numbers = " and ".join(
             f"{row['name']} = {row['estimate']:.4g} ± {row['sigma']:.2g} {row['unit']}".rstrip()
             + f" (stated: {row['stated']:.4g}"
@@ -69,42 +67,47 @@ def calibration_doubts(result):
             for row in rows if row["group"] == group)
         others = " or ".join(GROUPS[other][0] for other in GROUPS if other in either - {group})
         instead = f" It may instead be {others}: the drive cannot tell, and the covariances " \
-            "include it." if group in furthest else ""
-        doubts.append(Doubt(group, f"By the drive {numbers}; {problem} uses this.{instead} "
-                                   f"{GROUPS[group][1]}"))
-    return doubts
+            "include it." if group == furthest else ""
+        yield group, (f"By the drive {numbers}; problem {3 + bool(len(result.antenna))} uses this."
+                      f"{instead} {GROUPS[group][1]}")
 
 
-def turn_doubts(result):
-    """List of a Doubt if odometry does not determine the number of turns between two frames."""
-    frame, sigma = result.sightings.frame, result.turn_sigma
-    if not len(sigma) or sigma.max() < MAX_TURN_SIGMA:
-        return []
-    k = int(sigma.argmax())
-    return [Doubt("turns", (
-        f"Between poses {frame[k] + 1} and {frame[k + 1] + 1} only the wheels were measured, and "
-        f"they know the turn between them to {sigma[k]:.1f} rad (one standard deviation): whole "
-        "turns may be missing in the solution, and with them the path between these poses is "
-        "wrong."))]
+def _of_encoder(result):
+    """Kind and sentence if the markers contradict the counts, by stretches of the drive."""
+    jumps, sentences = result.jumps, []
+    if not len(jumps.start):
+        return
+    gaps = jumps.start[1:] - jumps.end[:-1]
+    for group in np.split(np.arange(len(gaps) + 1), np.flatnonzero(gaps > MAX_GAP) + 1):
+        ends = [reduce(se2.compose, each[group]) for each in (jumps.increment, jumps.by_odometry)]
+        by_markers, by_counts, off = (
+            f"{np.hypot(*end[:2]):.2f} m and {abs(np.degrees(se2.wrap(end[2]))):.0f} degrees"
+            for end in (*ends, se2.between(*ends)))
+        told = f"the markers say {by_markers}, which ends {off} from there" \
+            if (jumps.sigma[group] < UNKNOWN_SIGMA).all() else "all markers change at once"
+        sentences.append(f"between poses {jumps.start[group[0]] + 1} and "
+                         f"{jumps.end[group[-1]] + 1} the vehicle moved by {by_counts}, but {told}")
+    more = f"; and {len(sentences) - 3} more times" if len(sentences) > 3 else ""
+    yield "encoder", "In encoderReading.txt, " + "; ".join(sentences[:3]) + more + (
+        ". Problem 2's fusion and problems 3 and 4 do without these counts. Look at the rows, and "
+        "whether the vehicle was pushed or carried.")
 
 
-def slip_doubts(result):
-    """List of a Doubt if the slip is larger than that of any wheel."""
-    if result.slip <= MAX_SLIP or not result.noise_sigma[0]:
-        return []
-    return [Doubt("wheel-slip", (
-        f"By the other sensors each wheel slips by {1e3 * result.slip:.0f} mm (one standard "
-        "deviation) after one metre, far more than wheels do: look whether encoderReading.txt is "
-        "of the same drive as the other files, with the same pose ids."))]
-
-
-def noise_doubts(result):
-    """List of Doubt for learned factors on the stated sigmas that differ from 1."""
+def _of_noise(result):
+    """Kinds and sentences on errors with memory, and on learned factors that are not 1."""
     late_share = np.mean(result.range_weight < 0.5) if len(result.range_weight) else 0.0
-    doubts = []
     for column, what, name, file in ((1, "marker-noise", "sightings", "ArucoReading.txt"),
                                      (2, "range-noise", "ranges", "UwbReading.txt")):
         factor, sigma = getattr(result.noise, name), result.noise_sigma[column]
+        share = np.split(result.share, [len(result.rejected)])[column - 1]
+        if (share < 1).any():
+            yield what.replace("noise", "memory"), (
+                f"Errors of successive {name} are alike: the correlation of their residuals is "
+                f"{result.correlation[column - 1, 0]:.2f}. So problems 3 and 4 count {len(share)} "
+                f"{name} as {share.sum():.0f}, with {factor:.2g} times the standard deviations in "
+                f"{file}, because residuals do not show all of such errors. Look at the "
+                "calibration of the sensor, and for what blurs, hides or reflects.")
+            continue
         if not sigma or abs(np.log(factor)) <= max(
                 np.log(MAX_NOISE_FACTOR), MIN_FACTOR_SIGMAS * sigma):
             continue
@@ -114,46 +117,53 @@ def noise_doubts(result):
         reason = (f"{late_share:.0%} of them are far too long, as without line of sight."
                   if name == "ranges" and late_share > MAX_LATE_SHARE else
                   "Look at how the sensor's covariances were obtained.")
-        doubts.append(Doubt(what, (
-            f"The {name} scatter {number} times as much as {file} states: problems 3 and 4 use the "
-            f"scatter that was found, the others the file's. {reason}")))
-    return doubts
+        yield what, (f"The {name} scatter {number} times as much as {file} states: problems 3 and "
+                     f"4 use the scatter that was found, the others the file's. {reason}")
 
 
-def sighting_doubts(result):
-    """List of a Doubt if many sightings are rejected, or the majority of a marker."""
-    sentences, rejected, repeated = [], result.rejected, result.sightings.contradicting
+def _of_sightings(result):
+    """Kinds and sentences on ids of several places, and on sightings that are rejected."""
+    if result.places is not None:
+        ids, places = result.places[result.places[:, 0] != result.places[:, 1]].T
+        yield "places", (
+            f"By the path between their sightings, markers {', '.join(map(str, np.unique(ids)))} "
+            "were seen at more than one place: problems 3 and 4 have the others as markers "
+            f"{', '.join(map(str, np.unique(places)))}. Look for ids that are used twice, and for "
+            "markers that were moved.")
+    rejected, repeated = result.rejected, result.sightings.contradicting
     left_out, count = rejected.sum() + repeated, len(rejected) + repeated
-    if left_out > MAX_REJECTED * count:
-        sentences.append(f"{left_out} of {count} sightings contradict the rest and are left out"
-                         + (f", {repeated} of them another one of the same marker at the same pose"
-                            if repeated else ""))
-    marker, row = np.unique(result.sightings.marker, return_inverse=True)
-    seen, wrong = (np.bincount(row, weight, len(marker)) for weight in (None, rejected))
-    markers = marker[(seen >= MIN_SIGHTINGS_PER_MARKER) & (wrong > seen / 2)].tolist()
-    if markers:
-        sentences.append(f"most sightings of marker{'s' * (len(markers) > 1)} "
-                         + ", ".join(map(str, markers)) + " contradict the rest and are left out")
-    if not sentences:
-        return []
-    text = "; ".join(sentences)
-    return [Doubt("sightings-rejected", text[0].upper() + text[1:]
-                  + ": look at the marker ids in ArucoReading.txt, and for markers that were moved "
-                  "or are there twice.")]
+    marker, row, seen = np.unique(
+        result.sightings.marker, return_inverse=True, return_counts=True)
+    wrong = np.bincount(row, rejected, len(marker)).astype(int)
+    named = np.flatnonzero((wrong >= MIN_REJECTED_OF_MARKER)
+                           & (wrong > MAX_REJECTED_OF_MARKER * seen))
+    if left_out <= MAX_REJECTED * count and not len(named):
+        return
+    worst = named[np.argsort(-wrong[named] / seen[named], kind="stable")][:MAX_MARKERS_NAMED]
+    yield "sightings-rejected", (
+        f"{left_out} of {count} sightings contradict the rest and are left out"
+        + "".join(f", of marker {marker[k]} {wrong[k]} of {seen[k]}" for k in sorted(worst))
+        + f", {repeated} by another one of the same marker at the same pose" * bool(repeated)
+        + ": look at the marker ids in ArucoReading.txt, for markers that were moved or are there "
+        "twice, and for lost counts in encoderReading.txt.")
 
 
-def confirmation(result, sensor):
-    """A clause on the stated noise of a sensor, "sightings" or "ranges", from a SlamResult.
-
-    The noise is confirmed if the learned factor on its standard deviations is within a tenth of 1,
-    or within three of its own standard deviations.
-    """
-    column, file = {"sightings": (1, "ArucoReading.txt"), "ranges": (2, "UwbReading.txt")}[sensor]
-    factor, relative = getattr(result.noise, sensor), result.noise_sigma[column]
-    if not relative:
-        return f"the standard deviations in {file} are multiplied by {factor:.3g}, as given"
-    number = f"{factor:.2f} ± {factor * relative:.2f}"
-    if abs(np.log(factor)) < max(
-            np.log(MAX_CONFIRMED), MAX_CONFIRMED_SIGMAS * relative):
-        return f"the standard deviations in {file} are confirmed (factor {number})"
-    return f"the standard deviations in {file} were multiplied by {number}"
+def _of_the_path(result):
+    """Kinds and sentences on slip, turns between frames, and a solution that still changed."""
+    if result.slip > MAX_SLIP and result.noise_sigma[0]:
+        yield "wheel-slip", (
+            f"By the other sensors each wheel slips by {1e3 * result.slip:.0f} mm (one standard "
+            "deviation) after one metre, far more than wheels do: look whether encoderReading.txt "
+            "is of the same drive as the other files, with the same pose ids.")
+    frame, sigma = result.sightings.frame, result.turn_sigma
+    if sigma.max(initial=0) >= MAX_TURN_SIGMA:
+        k = int(sigma.argmax())
+        yield "turns", (
+            f"Between poses {frame[k] + 1} and {frame[k + 1] + 1} only the wheels were measured, "
+            f"and they know the turn between them to {sigma[k]:.1f} rad (one standard deviation): "
+            "whole turns may be missing in the solution, and with them the path between these "
+            "poses is wrong.")
+    if not result.converged:
+        yield "not-converged", (
+            "The solution still changed when its number of steps ended: some poses or landmarks "
+            "may be far from where the measurements want them.")

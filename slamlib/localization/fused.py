@@ -25,12 +25,15 @@ import numpy as np
 
 from slamlib import increments, se2
 from slamlib.increments import SLIP_BOUNDS, SLIP_FACTOR, TYPICAL_SLIP, log_slip_prior
-from slamlib.localization.marker_increments import common_sightings
+from slamlib.marker_increments import common_sightings
+from slamlib.memory import error_memory
+from slamlib.odometry_gate import NO_JUMPS, Jumps, find_jumps
 from slamlib.sightings import GATE, sightings_by_frame
 
 SLIP_FRAMES = 500            # number of frames, the first ones, from which the slip is learned
 WHEEL_FRAMES = 5000          # number of frames, the first ones, that give the wheel parameters w_0
 FRAMES_PER_BLOCK = 1000      # frames whose poses are computed together, so that they stay in cache
+MIN_JUMP_GAIN = 10.0         # log likelihood by each of many jumps; the loss by each of a few
 MAX_SLIP_STEPS = 30          # number of parabolas
 LOG_SLIP_TOLERANCE = 0.05    # of the natural logarithm of the slip
 
@@ -56,10 +59,12 @@ class _FilterInput:
     model: str
     vehicle: object              # with the wheel parameters w_0 at which Delta is linearised
     pose: np.ndarray             # (f,) pose indices of the frames, pose 0 among them
+    marker: np.ndarray           # (s,) ids of the markers of all sightings, frame by frame
     increment: np.ndarray        # (f-1, 3) Delta(w_0)
     J_w: np.ndarray              # (f-1, 3, 3) dDelta/dw
     rounding: np.ndarray         # (f-1, 3, 3) Q without slip
     slipping: np.ndarray         # (f-1, 3, 3) what a slip of 1 sqrt(m) adds to Q
+    jumps: Jumps                 # where odometry contradicts the markers
     frames: list                 # of f tuples: z (m, 3) and C (m, 3, 3) of a frame's sightings, and
                                  # rows of common markers in the previous and in this frame
 
@@ -73,6 +78,8 @@ class _State(NamedTuple):        # three are made at a frame: faster than frozen
     place: np.ndarray            # (m,) row in M of each sighting's marker, -1 if rejected
     log_likelihood: float = 0.0  # of the innovations so far, up to a constant
     rejected: int = 0            # number of sightings so far beyond the gate
+    new: np.ndarray | None = None        # (u,) rows of the sightings that were compared with M
+    v: np.ndarray | None = None  # (u, 3) their innovations
 
 
 def fuse(dataset, slip=None, model="arc"):
@@ -90,13 +97,25 @@ def fuse(dataset, slip=None, model="arc"):
     (2000, 3)
     """
     slip = dataset.vehicle.slip if slip is None else slip
-    given = _filter_input(dataset, model, dataset.vehicle)
+    jumps = find_jumps(dataset)
+    given = _filter_input(dataset, model, dataset.vehicle, jumps)
+    if len(jumps.start):
+        other = _filter_input(dataset, model, dataset.vehicle)
+        gain, = np.diff([_filter(each, slip or TYPICAL_SLIP)[2].log_likelihood
+                         for each in (other, given)])
+        least = MIN_JUMP_GAIN * len(jumps.start)
+        if gain < (-least if jumps.are_few else least):
+            given, jumps = other, NO_JUMPS
     if slip is None:
         slip = _likeliest_slip(replace(given, frames=given.frames[:SLIP_FRAMES]))
     first = replace(given, frames=given.frames[:WHEEL_FRAMES])
     wheel = given.vehicle.wheel + _filter(first, slip)[0][-1, 3:]
-    given = _filter_input(dataset, model, dataset.vehicle.with_wheel(wheel))    # linearised again
-    x, covariances, state = _filter(given, slip)
+    given = _filter_input(dataset, model, dataset.vehicle.with_wheel(wheel), jumps)
+    x, covariances, state, innovations = _filter(given, slip)
+    frames = _frames_with_memory(given, innovations)
+    if frames is not None:
+        given = replace(given, frames=frames)
+        x, covariances, state, _ = _filter(given, slip)
     blocks = [*given.pose[::FRAMES_PER_BLOCK], len(dataset.ticks)]
     poses, pose_covariances = (np.concatenate(parts) for parts in zip(*(
         _poses_from_frames(given, slip, x, covariances, np.arange(begin, end))
@@ -133,7 +152,7 @@ def _likeliest_slip(given):
     return float(np.exp(vertex if np.isfinite(vertex) else best))
 
 
-def _filter_input(dataset, model, vehicle):
+def _filter_input(dataset, model, vehicle, jumps=NO_JUMPS):
     """The _FilterInput with odometry linearised at the wheel parameters of `vehicle`."""
     ticks, sightings = dataset.ticks, sightings_by_frame(dataset.sightings, extra_frames=[0])
     start, end = sightings.frame[:-1], sightings.frame[1:]
@@ -145,26 +164,53 @@ def _filter_input(dataset, model, vehicle):
     common = (np.split(rows, splits) for rows in (first - begins[pair], second - begins[pair + 1]))
     increment, by_w = increments.between_poses(ticks, vehicle, start, end, model)
     rounding, slipping = increments.noise_in_drive(ticks, vehicle, start, end)
+    jump, unknown = jumps.added(start, end)
     return _FilterInput(
-        dataset=dataset, model=model, vehicle=vehicle, pose=sightings.frame, increment=increment,
-        J_w=by_w, rounding=rounding, slipping=slipping,
+        dataset=dataset, model=model, vehicle=vehicle, pose=sightings.frame,
+        marker=sightings.marker, increment=se2.compose(increment, jump), J_w=by_w,
+        rounding=rounding + unknown, slipping=slipping, jumps=jumps,
         frames=list(zip(*seen, *common, strict=True)))
 
 
 def _filter(given, slip):
-    """x (f, 6) and its covariances (f, 6, 6) after every frame, and the last _State."""
+    """x (f, 6) and its covariances (f, 6, 6) after every frame, the last _State, and innovations.
+
+    Innovations are (u,) rows of the sightings at a frame and (u, 3) for every frame.
+    """
     vehicle = given.dataset.vehicle
     state = _State(x=np.append(np.zeros(3), vehicle.wheel - given.vehicle.wheel),
                    M=np.zeros((0, 3)), place=np.zeros(0, int),
                    P=np.diag([0.0, 0.0, vehicle.sigma_heading, *vehicle.sigma_wheel])**2)
-    Q, x, covariances = given.rounding + slip**2 * given.slipping, [], []
+    Q, x, covariances, innovations = given.rounding + slip**2 * given.slipping, [], [], []
     for k, frame in enumerate(given.frames):
         if k > 0:
             state = _predicted(state, given.increment[k - 1], given.J_w[k - 1], Q[k - 1])
         state = _updated(state, *frame)
         x.append(state.x)
         covariances.append(state.P[:6, :6].copy())
-    return np.array(x), np.array(covariances), state
+        innovations.append((state.new, state.v))
+    return np.array(x), np.array(covariances), state, innovations
+
+
+def _frames_with_memory(given, innovations):
+    """`frames` whose covariances are larger where errors have memory, else None.
+
+    A covariance is divided by the share that its sighting keeps (`slamlib.memory`).
+    """
+    sizes = [len(z) for z, *_ in given.frames]
+    begins = np.cumsum(sizes) - sizes
+    rows = np.concatenate([begin + new for begin, (new, _) in zip(begins, innovations)])
+    v = np.concatenate([v for _, v in innovations])
+    C = np.concatenate([C for _, C, *_ in given.frames])
+    u = np.linalg.solve(np.linalg.cholesky(C[rows]), v[..., None])[..., 0]
+    used = np.sum(u**2, axis=1) < GATE
+    share = error_memory(given.marker[rows], np.repeat(given.pose, sizes)[rows], u, used).share
+    if (share == 1).all():
+        return None
+    kept = np.ones(len(C))
+    kept[rows] = share
+    shares = np.split(kept, begins[1:])
+    return [(z, C / s[:, None, None], *common) for (z, C, *common), s in zip(given.frames, shares)]
 
 
 def _predicted(state, increment, by_w, Q):
@@ -201,6 +247,7 @@ def _updated(state, z, C, earlier, later):
     old, new = state.place[earlier[known]], later[known]
     v = z[new] - state.M[old]
     v[:, 2] = se2.wrap(v[:, 2])
+    state = state._replace(new=new, v=v)
     rows = 6 + 3 * old[:, None] + np.arange(3)
     S = state.P[rows[:, :, None], rows[:, None, :]] + C[new]            # of each sighting alone
     accepted = (v * np.linalg.solve(S, v[..., None])[..., 0]).sum(axis=1) < GATE
@@ -249,8 +296,9 @@ def _poses_from_frames(given, slip, x, covariances, pose):
     steps = ticks[begin:pose[-1] + 1], given.vehicle, given.pose[last] - begin, pose - begin
     increment, by_w = increments.between_poses(*steps, given.model)
     rounding, slipping = increments.noise_in_drive(*steps, steps=len(ticks) - 1)
-    Q = rounding + slip**2 * slipping
-    delta = increment + np.einsum("nij,nj->ni", by_w, x[last, 3:])
+    jump, unknown = given.jumps.added(given.pose[last], pose)
+    Q = rounding + unknown + slip**2 * slipping
+    delta = se2.compose(increment, jump) + np.einsum("nij,nj->ni", by_w, x[last, 3:])
     A, B = se2.compose_jacobians(x[last, :3], delta)
     F = np.concatenate([A, B @ by_w], axis=2)
     return (se2.compose(x[last, :3], delta),

@@ -14,7 +14,7 @@ import numpy as np
 
 from slamlib import increments, odometry, se2
 from slamlib.localization.fused import Fusion
-from slamlib.localization.marker_increments import consecutive_increments
+from slamlib.marker_increments import consecutive_increments
 from slamlib.sightings import sightings_by_frame
 
 

@@ -23,7 +23,7 @@ import numpy as np
 
 from slamlib import se2
 from slamlib.dataset import DatasetError
-from slamlib.localization.marker_increments import consecutive_increments, robust_increments
+from slamlib.marker_increments import consecutive_increments, robust_increments
 from slamlib.sightings import consensus, sightings_by_frame
 
 MAX_CANDIDATES = 3            # number of earlier frames that are tried as parent of a frame

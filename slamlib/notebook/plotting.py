@@ -7,20 +7,24 @@ text in the legend. Ellipses state a probability: {p : (p - m)^T C^-1 (p - m) <=
 planar Gaussian with probability 1 - exp(-k^2 / 2), so that 95 % needs k = 2.4477.
 """
 
-from functools import partial
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
-from IPython.core.pylabtools import print_figure
 from matplotlib.collections import EllipseCollection
 from matplotlib.colors import to_rgb
 
 from slamlib.evaluation import REACH_95
 from slamlib.odometry import cumulative
 
+
+class _Looks(dict):
+    def __missing__(self, role):
+        raise ValueError(f"expected a role such as {', '.join(self)}, found {role!r}")
+
+
 # Colours of Okabe and Ito and of Tol, distinct for the colour-blind; line styles differ in grey.
-ROLES = {
+ROLES = _Looks({
     "truth": dict(color="black", linestyle=(0, (4, 2)), linewidth=1.1, zorder=4),
     "odometry": dict(color="#D55E00", linewidth=1.5, zorder=3),
     "exact": dict(color="#332288", linewidth=1.5, zorder=3),
@@ -38,17 +42,7 @@ ROLES = {
     "guess": dict(color="#222222", linestyle="none", marker="^", markersize=7, zorder=4,
                   markerfacecolor="none"),
     "true antenna": dict(color="black", linestyle="none", marker="+", markersize=9, zorder=6),
-}
-
-# Changes of ROLES where two estimates are drawn over a sample: a narrow dashed line on a wide one.
-COMPARED = {
-    "sample": dict(linestyle="none", marker="o", markersize=3.5, zorder=5, color="#555555"),
-    "odometry": dict(linewidth=3.2, alpha=0.75),
-    "exact": dict(linestyle=(0, (4, 2)), linewidth=1.5, zorder=4),
-}
-
-WIDE, NARROW = "image/svg+xml", "image/svg+xml;layout=narrow"    # MIME types, keys of `pictures`
-NARROW_WIDTH = 3.9                                               # inches, a column on a phone
+})
 
 
 def use_style():
@@ -71,31 +65,58 @@ def panels(count, rows=1, height=3.4, width=3.7, columns=2):
                            for row in range(rows)] for panel in range(count)])
 
 
-def narrow(fig, width=NARROW_WIDTH):
-    """Change a figure to `width` inches: all axes below each other, maps in the same shape."""
-    axes = [ax for ax in fig.axes if ax.get_visible() and ax.get_subplotspec()]
-    if not axes:
-        return
-    height = fig.get_figheight() / axes[0].get_gridspec().get_geometry()[0] * len(axes)
-    if all(ax.get_aspect() == 1 and ax.get_adjustable() == "box" for ax in axes):
-        height = sum((width - 0.65) * np.ptp(ax.get_ylim()) / np.ptp(ax.get_xlim()) + 0.8
-                     for ax in axes)
-    for ax, place in zip(axes, fig.add_gridspec(len(axes), 1), strict=True):
-        ax.set_subplotspec(place)
-        ax.autoscale_view()          # the equal aspect had extended the limits to the wide axes
-    fig.set_size_inches(width, height)
-    if fig.legends:
+def each_drive(drives, rows=1, **size):
+    """Yield each Drive with its axes, or with `rows` axes as a list; a legend ends the figure.
+
+    `drives` (iterable of Drive or of names, such as a dict by Drive) are the panels, with their
+    names as titles; `size` as of `panels`. Without a drive the figure has one empty panel.
+    """
+    drives = list(drives)
+    fig, axes = panels(max(1, len(drives)), rows, **size)
+    for drive, column in zip(drives, axes, strict=False):
+        column[0].set_title(literal(getattr(drive, "name", drive)))
+        yield drive, column if rows > 1 else column[0]
+    if any(ax.get_legend_handles_labels()[0] for ax in fig.axes):
         legend_below(fig)
-        fig.set_size_inches(width, height + fig.legends[0].get_window_extent().height / fig.dpi)
 
 
-def svg_pictures(fig):
-    """A figure as SVG by MIME type, first WIDE, then NARROW; {} if empty. It stays narrow."""
-    draw = partial(print_figure, fig, "svg", metadata={"Date": None})
-    texts = {WIDE: draw()}
-    narrow(fig)
-    texts[NARROW] = draw()
-    return texts if fig.axes else {}
+def with_ellipses(ax, poses, covariances, role, label=None, count=12, enlarged=None, **look):
+    """Draw a path with `count` filled 95 % ellipses at equal distances along it.
+
+    Ellipses are `enlarged` by this factor, by default by that of `enlargement`, which is added to
+    the axes' title.
+    """
+    enlarged = enlarged or enlargement(poses, covariances)
+    some = equidistant(poses, count)
+    trajectory(ax, poses, role, label, **{"linewidth": 1.2, "alpha": 0.8, **look})
+    ellipses(ax, poses[some], covariances[some], ROLES[role]["color"], fill=0.5, enlarged=enlarged)
+    if "ellipses" not in ax.get_title("left"):
+        factor = f" × {enlarged}" * (enlarged > 1)
+        ax.set_title(f"{ax.get_title('left')} (95 % ellipses{factor})")
+    return ax
+
+
+def errors(axes, result, drive, role="slam"):
+    """Draw errors of a result along the path in two axes: of position, and of the heading.
+
+    The bands are the longest semi-axis of the 95 % ellipse and ±2 sigma of the heading; without
+    truth they stand alone. `result` has poses and covariances of every pose of the Drive.
+    """
+    (top, bottom), color = axes, ROLES[role]["color"]
+    some = np.unique(np.linspace(0, len(result.poses) - 1, 800).astype(int))
+    C = result.covariances[some]
+    reach = 1e3 * REACH_95 * np.sqrt(np.maximum(np.linalg.eigvalsh(C[:, :2, :2])[:, 1], 0))
+    turn = 2e3 * np.sqrt(C[:, 2, 2])
+    for ax, low, high in ((top, 0 * reach, reach), (bottom, -turn, turn)):
+        ax.fill_between(some + 1, low, high, color=color, alpha=0.18, linewidth=0,
+                        label="95 % by the covariance")
+    if drive.truth is not None:
+        off = (result.poses - drive.truth.poses)[some]
+        curve(top, 1e3 * np.hypot(*off[:, :2].T), role, some, "error", linewidth=1.2)
+        curve(bottom, 1e3 * off[:, 2], role, some, "error", linewidth=0.8)
+    name_rows(axes, ("position (mm)", "δ (mrad)"))
+    top.set_ylim(0, None)
+    return axes
 
 
 def trajectory(ax, poses, role, label=None, **look):
@@ -184,7 +205,7 @@ def likelihood(ax, positions, ranges, sigma, window):
     return ax
 
 
-def enlargement(poses, covariances, share=0.05):
+def enlargement(poses, covariances, share=0.15):
     """Factor 1, 2, 5, 10, ... with which no 95 % semi-axis exceeds this share of the extent."""
     known = np.isfinite(poses[:, 0])
     extent = np.ptp(poses[known, :2], axis=0).max()

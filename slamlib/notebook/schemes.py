@@ -6,19 +6,10 @@ from slamlib.notebook.plotting import ROLES
 
 
 def slam_graph(ax, count, sightings, markers, ranges=(), antennas=()):
-    """Draw a scheme of the graph of problem 3, or with ranges that of problem 4, on `ax`.
+    """Draw a scheme of the graph of problem 3, or with ranges that of problem 4; returns `ax`.
 
-    Vehicle poses stand in a row, the markers above, the wheel parameters w and the antennas below.
-
-    Parameters
-    ----------
-    count : int, number of vehicle poses.
-    sightings, ranges : lists of (pose, landmark), indices from 0.
-    markers, antennas : lists of the landmarks' labels.
-
-    Returns
-    -------
-    `ax`
+    `count` vehicle poses stand in a row, the markers above, the wheel parameters w and the antennas
+    below; these are lists of labels. `sightings` and `ranges` are lists of (pose, landmark).
     """
     poses = np.array([(i, 0.0) for i in range(count)])
     above, below = (_places_in_row(count, len(names), y)

@@ -1,18 +1,15 @@
 """The datasets of a report with the solutions in the result files of this build."""
 
-import re
 from dataclasses import dataclass
 
 import numpy as np
 
 from slamlib.checks.files import doubts_before_solving, merged
-from slamlib.dataset import Dataset, Truth, read_dataset, read_truth
+from slamlib.dataset import Dataset, Truth
 from slamlib.doubt import Doubt
-from slamlib.inventory import all_notes
-from slamlib.notebook import Drive
 from slamlib.report.execution import NotebookError
-from slamlib.results import read_aruco_map, read_uwb_map, read_vehicle_poses
-from slamlib.solve import PROBLEMS, Failure, Solution, title
+from slamlib.results import read_structs, read_vehicle_poses
+from slamlib.solve import PROBLEMS, SENSORS, Failure, Solution, title
 
 
 @dataclass(frozen=True)
@@ -27,55 +24,34 @@ class SolvedDrive:
     failures: tuple = ()  # of Failure, in the order of PROBLEMS
     files: tuple = ()  # of str, its files to hand in, as `problem1/vehiclePose.mat`
 
-    @property
-    def origin(self):
-        """Origin of the data, a str as of `notebook.Drive`."""
-        return Drive(self.name, self.dataset, self.truth).origin
-
-    @property
-    def notes(self):
-        """What was mended or left out when the files were read, a tuple of str."""
-        return all_notes(self.dataset, self.truth)
-
-    @property
-    def simulated(self):
-        """True if the data are simulated, False if they were recorded."""
-        return self.origin == "simulated"
-
     def solution(self, problem):
         """Return the Solution of a problem (str), or None."""
         return next((known for known in self.solutions if known.problem == problem), None)
 
 
-def read_drives(data, results, selected, written, notices=None):
-    """Return the selected datasets with their solutions, a list of SolvedDrive, the shortest first.
+def read_drives(read, results, written, notices=None):
+    """Return the datasets with their solutions, a list of SolvedDrive, the shortest first.
 
-    Parameters
-    ----------
-    data, results : Path, the folders of the datasets and of the result files of this build.
-    selected : list of str, names of datasets.
-    written : list of str, this build's files, as `short/problem1/vehiclePose.mat` in `results`.
-        NotebookError if poses cannot be read or have other shapes than the dataset's.
-    notices : dict by `notebook.notices`, the doubts and failures that this build's notebooks found.
+    `read` is a list of (Dataset, Truth or None), `results` (Path) the folder of this build's files,
+    `written` (list of str) their names, as `short/problem1/vehiclePose.mat`, and `notices` a dict
+    by `notebook.notices`. NotebookError if a file cannot be read, or has another number of poses.
     """
     drives = []
-    for name in selected:
+    for dataset, truth in sorted(read, key=lambda drive: len(drive[0].ticks)):
+        name = dataset.name
         files = tuple(file.removeprefix(f"{name}/") for file in sorted(written)
                       if file.startswith(f"{name}/") and file.endswith(".mat"))
-        problems = sorted((file.split("/")[0] for file in files if re.fullmatch(
-            "[^/]+/vehiclePose.mat", file)), key=order)
-        dataset, truth = read_dataset(data / name), read_truth(data / name)
-        solved = tuple(_read_solution(results / name / problem, dataset, files)
-                       for problem in problems)
+        problems = sorted((file.split("/")[0] for file in files
+                           if file.endswith("/vehiclePose.mat")), key=order)
         told = (notices or {}).get(name, [])
-        doubts = [*doubts_before_solving(dataset, truth),
-                  *(x for x in told if isinstance(x, Doubt))]
-        failures = sorted((x for x in told if isinstance(x, Failure)),
-                          key=lambda failure: order(failure.problem))
+        doubts = [*doubts_before_solving(dataset, truth), *(x for x in told if type(x) is Doubt)]
         drives.append(SolvedDrive(
-            name=name, dataset=dataset, truth=truth, solutions=solved,
-            doubts=tuple(merged(doubts)), failures=tuple(failures), files=files))
-    return sorted(drives, key=lambda drive: len(drive.dataset.ticks))
+            name=name, dataset=dataset, truth=truth, files=files, doubts=tuple(merged(doubts)),
+            solutions=tuple(read_solution(results / name / problem, dataset, files)
+                            for problem in problems),
+            failures=tuple(sorted((x for x in told if type(x) is Failure),
+                                  key=lambda failure: order(failure.problem)))))
+    return drives
 
 
 def order(problem):
@@ -83,29 +59,28 @@ def order(problem):
     return list(PROBLEMS).index(problem) if problem in PROBLEMS else len(PROBLEMS)
 
 
-def _read_solution(folder, dataset, files):
+def why_missing(drive, problem):
+    """Return why a SolvedDrive has no solution of a problem (str)."""
+    needed = PROBLEMS[problem].sensors if problem in PROBLEMS else ()
+    lacks = [SENSORS[sensor] for sensor in needed if getattr(drive.dataset, sensor) is None]
+    reasons = [failure.reason for failure in drive.failures if failure.problem == problem]
+    return (f"left out: no {' and no '.join(lacks)}" if lacks
+            else f"could not be solved: {reasons[0]}" if reasons else "no result")
+
+
+def read_solution(folder, dataset, files):
     """Return the Solution in a results folder; its world frame is the first pose estimated."""
-    count = len(dataset.ticks)
-    poses, covariances = _read_result(read_vehicle_poses, folder, "vehiclePose.mat")
-    if poses.shape != (count, 3) or covariances.shape != (count, 3, 3):
-        raise NotebookError(
-            f"{_written_file(folder, 'vehiclePose.mat')}, must hold [x, y, heading] and a "
-            f"covariance for each of the {count} encoder poses; it holds {poses.shape}, "
-            f"{covariances.shape}")
+    place = f"{folder.parent.name}/{folder.name}, which a notebook wrote,"
+    try:
+        poses, covariances = read_vehicle_poses(folder)
+        maps = {field: read_structs(folder, name)
+                for field, name in (("aruco_map", "ArucoMap"), ("uwb_map", "UwbMap"))
+                if f"{folder.name}/{name}.mat" in files}
+    except Exception as error:  # scipy and numpy raise many kinds
+        raise NotebookError(f"{place} cannot be read: {error}") from None
+    if poses.shape != (len(dataset.ticks), 3):
+        raise NotebookError(f"{place} must hold [x, y, heading] for each of the "
+                            f"{len(dataset.ticks)} encoder poses, found {poses.shape}")
     known = np.flatnonzero(np.isfinite(poses[:, 0]))
-    maps = {field: _read_result(function, folder, file) for field, function, file in (
-        ("aruco_map", read_aruco_map, "ArucoMap.mat"), ("uwb_map", read_uwb_map, "UwbMap.mat"))
-        if f"{folder.name}/{file}" in files}
     return Solution(problem=folder.name, title=title(folder.name, dataset), poses=poses,
                     covariances=covariances, world=int(known[0]) if len(known) else 0, **maps)
-
-
-def _read_result(function, folder, file):
-    try:
-        return function(folder)
-    except Exception as error:  # scipy and numpy raise many kinds
-        raise NotebookError(f"{_written_file(folder, file)}, cannot be read: {error}") from None
-
-
-def _written_file(folder, file):
-    return f"{folder.parent.name}/{folder.name}/{file}, which a notebook wrote"

@@ -11,23 +11,18 @@ import time
 from contextlib import contextmanager
 from pathlib import Path
 
-import nbformat
 from jupyter_client import AsyncKernelManager
 from jupyter_client.kernelspec import KernelSpecManager
 from nbclient import NotebookClient
 from nbclient.exceptions import CellExecutionError
 from nbconvert.filters import strip_ansi
-from nbconvert.preprocessors import ClearOutputPreprocessor, CoalesceStreamsPreprocessor
+from nbconvert.preprocessors import CoalesceStreamsPreprocessor
 from tqdm import tqdm
 
-from slamlib import locks, swap
-from slamlib.report.progress import Progress
+from slamlib import swap
 from slamlib.studies.workers import ONE_THREAD
-from slamlib.textfile import read_regular
 
 CELL_TIMEOUT = 1800  # s, in which a cell must end
-POLL = 1.0  # s, between updates of the progress shown
-PREFIX = "slamlib-"  # begins the names of temporary folders, before the process id
 TRANSPORT = "ipc" if hasattr(socket, "AF_UNIX") else "tcp"  # Windows has no Unix sockets
 LONGEST_FOLDER = 70  # characters; paths of sockets in it have at most 103
 
@@ -43,31 +38,11 @@ class _Loop(asyncio.SelectorEventLoop):
         raise RuntimeError("notebooks install no signal handlers")
 
 
-def read_notebook(source):
-    """Return the NotebookNode in a file (Path), without outputs that an editor saved.
-
-    NotebookError if the file is not a notebook, DatasetError if it is no file that can be read.
-    """
-    data = read_regular(source)
-    try:
-        book = nbformat.reads(data.decode("utf-8-sig"), as_version=4)
-        return ClearOutputPreprocessor().preprocess(book, {})[0]
-    except UnicodeDecodeError as error:
-        byte, line = error.object[error.start], data.count(b"\n", 0, error.start) + 1
-        reason = f"expected UTF-8 text, found the byte 0x{byte:02x} in line {line}"
-    except (ValueError, nbformat.ValidationError) as error:
-        reason = str(error).partition("\n")[0]
-    except Exception:  # on other JSON nbformat fails in many ways
-        reason = "expected JSON with cells and metadata"
-    raise NotebookError(f"{source.name} is not a notebook: {reason}")
-
-
 def kernel_environment(settings, data, datasets, studies):
     """Return the kernels' environment variables (dict of str) without settings that change pages.
 
-    `settings` is a folder for the kernels' own settings, `data` that of the datasets (Path),
-    `datasets` the selected names (list of str) or None for all, `studies` the folder (Path) of the
-    studies that are kept.
+    `settings`, `data` and `studies` (Path) are the folders of the kernels' own settings, of the
+    datasets and of the studies that are kept, `datasets` the selected names (list of str) or None.
     """
     (settings / "matplotlibrc").write_text("svg.hashsalt: slamlib\n")
     return {"SOURCE_DATE_EPOCH": "0", "PYTHONHASHSEED": "0"} | ONE_THREAD | os.environ | {
@@ -79,98 +54,64 @@ def kernel_environment(settings, data, datasets, studies):
 
 @contextmanager
 def temporary_folder():
-    """Yield a new folder (Path) of this process, and remove those of builds that are gone.
-
-    Its path is short enough for sockets in it.
-    """
+    """Yield a new folder (Path), short enough for sockets."""
     parent = tempfile.gettempdir()
-    parent = Path("/tmp" if TRANSPORT == "ipc" and len(parent) > LONGEST_FOLDER else parent)
-    for old in parent.glob(f"{PREFIX}*-*"):
-        process = old.name.split("-")[1]
-        if process.isdecimal() and not locks.process_exists(int(process)):
-            shutil.rmtree(old, ignore_errors=True)
-    with tempfile.TemporaryDirectory(dir=parent, prefix=f"{PREFIX}{os.getpid()}-",
+    parent = "/tmp" if TRANSPORT == "ipc" and len(parent) > LONGEST_FOLDER else parent
+    with tempfile.TemporaryDirectory(dir=parent, prefix="slamlib-",
                                      ignore_cleanup_errors=True) as folder:
         yield Path(folder)
 
 
-def execute(books, environment, results, jobs, finish, seconds):
+def execute(books, environment, results, jobs, finish):
     """Execute notebooks in place, at most `jobs` at a time; the first failure stops the others.
 
-    Each notebook writes to its own folder inside `results`, SLAMLIB_RESULTS. When it ended without
-    error, its files are moved to `results`. NotebookError if a cell failed.
-
-    Parameters
-    ----------
-    books, environment : dict from Path to NotebookNode; dict of str, the kernels' variables.
-    results, jobs : Path, a folder of this build alone, and int.
-    finish : function of Path, NotebookNode and the names (list of str) of the result files, called
-        after each notebook.
-    seconds : the last three parameters of `Progress`, by which it tells the time left.
+    Each of `books` (dict from Path to NotebookNode) writes to its own folder, SLAMLIB_RESULTS. When
+    it ended without error, its files are moved to `results` (Path), a folder of this build alone,
+    and finish(Path, NotebookNode, names of the files) is called. NotebookError if a cell failed.
     """
     try:
         with asyncio.Runner(loop_factory=_Loop) as runner:
-            runner.run(_execute_all(books, environment, results, jobs, finish, seconds))
+            runner.run(_execute_all(books, environment, results, jobs, finish))
     except ExceptionGroup as group:
         raise group.exceptions[0] from None
 
 
-async def _execute_all(books, environment, results, jobs, finish, seconds):
+async def _execute_all(books, environment, results, jobs, finish):
     slots = asyncio.Semaphore(jobs)
+    cells = sum(cell.cell_type == "code" for book in books.values() for cell in book.cells)
 
     async def run(number, source, book):
         stage = results / f".{source.stem}"
         stage.mkdir(parents=True)
         try:
             async with slots:
-                files = {"SLAMLIB_RESULTS": str(stage), "SLAMLIB_PROGRESS": str(told / source.stem)}
-                await _execute(source, book, environment | files, folder / f"{number}.json",
-                               progress)
-            progress.keep(source.stem)
-            finish(source, book, _publish(stage, results))
+                await _execute(source, book, environment | {"SLAMLIB_RESULTS": str(stage)},
+                               folder / f"{number}.json", bar)
+            names = swap.file_names(stage)
+            for name in names:
+                (results / name).parent.mkdir(parents=True, exist_ok=True)
+                os.replace(stage / name, results / name)
+            finish(source, book, names)
         finally:
             shutil.rmtree(stage, ignore_errors=True)
 
-    with temporary_folder() as folder:
-        told = folder / "progress"
-        told.mkdir()
-        progress = Progress(books, jobs, told, *seconds)
-        watching = asyncio.create_task(_watch(progress))
-        try:
-            async with asyncio.TaskGroup() as group:
-                for number, (source, book) in reversed([*enumerate(books.items())]):
-                    group.create_task(run(number, source, book))    # later chapters take longer
-        finally:
-            watching.cancel()
-            progress.bar.close()
+    with temporary_folder() as folder, tqdm(  # on a terminal only
+            total=cells, unit="cell", leave=False, disable=None) as bar:
+        async with asyncio.TaskGroup() as group:
+            for number, (source, book) in reversed([*enumerate(books.items())]):
+                group.create_task(run(number, source, book))        # later chapters take longer
 
 
-async def _watch(progress):
-    while True:
-        progress.show()
-        await asyncio.sleep(POLL)
+async def _execute(source, book, environment, connection, bar):
+    """Execute one notebook in place with this interpreter.
 
-
-def _publish(stage, results):
-    """Move all files of a folder to another, and return their names relative to it."""
-    names = swap.file_names(stage)
-    for name in names:
-        (results / name).parent.mkdir(parents=True, exist_ok=True)
-        os.replace(stage / name, results / name)
-    return names
-
-
-async def _execute(source, book, environment, connection, progress):
-    """Execute one notebook in place with the interpreter that runs this module.
-
-    The kernel listens at sockets beside the file `connection` (Path), where the system has them: a
-    port that was free when it was chosen can be taken by another program before the kernel has it.
+    The kernel listens at sockets beside the file `connection` (Path): nobody else can take them.
     """
-    name, started, start = source.stem, [], time.monotonic()
+    started, start = [], time.monotonic()
 
     def begin(cell, cell_index):
         started.append(cell)
-        progress.begin(name)
+        bar.set_description(source.stem)
 
     manager = AsyncKernelManager(  # no folders to search: kernels of the user are not found
         kernel_name="python3", kernel_spec_manager=KernelSpecManager(kernel_dirs=[]),
@@ -180,8 +121,7 @@ async def _execute(source, book, environment, connection, progress):
         timeout=CELL_TIMEOUT, iopub_timeout=60, raise_on_iopub_timeout=True,
         record_timing=False, store_widget_state=False, shutdown_kernel="immediate",
         extra_arguments=["--IPKernelApp.log_level=ERROR"],
-        on_cell_execute=begin, on_cell_executed=lambda **_: progress.end(name))
-    tqdm.write(f"{name}: {len(progress.cells[name])} cells", file=sys.stderr)
+        on_cell_execute=begin, on_cell_executed=lambda **_: bar.update())
     try:
         await client.async_execute(env=environment, cleanup_kc=True)
         CoalesceStreamsPreprocessor().preprocess(book, {})  # kernels divide them by time
@@ -192,7 +132,7 @@ async def _execute(source, book, environment, connection, progress):
     finally:
         if manager.has_kernel:
             await manager.shutdown_kernel(now=True)
-    tqdm.write(f"{name}: done in {time.monotonic() - start:.1f} s", file=sys.stderr)
+    tqdm.write(f"{source.stem}: executed in {time.monotonic() - start:.1f} s", file=sys.stderr)
 
 
 def _failure(source, started, error):

@@ -12,25 +12,25 @@ from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 
 from jinja2 import Template
 
-from slamlib import locks, swap
+from slamlib import swap
 from slamlib.dataset import DatasetError, dataset_names, read_dataset, read_truth
-from slamlib.notebook import Drive, listed
-from slamlib.report.build import BUILD_LOCK
+from slamlib.inventory import all_notes
+from slamlib.notebook import Drive
+from slamlib.report.drives import why_missing
+from slamlib.report.markdown import listed
 from slamlib.report.options import PROBLEM2_FOLDERS
 from slamlib.results import RESULT_FILES
-from slamlib.solve import PROBLEMS, SENSORS, title
+from slamlib.solve import title
 
 LINE_WIDTH = 88  # characters in a line of README.txt
 README = Path(__file__).with_name("readme.txt")  # a template of Jinja
 LEFT_OUT = ("Explore", "Files")  # titles of sections that are for screens, or on other folders
-PACKAGES_TOLD = ("slamlib", "numpy", "scipy", "gtsam")  # with versions in README.txt
 
 
 def selection(data, names=None):
     """Return the datasets of the hand-in, as of `build_report`, and the names of those left out.
 
-    Where none is named, simulated datasets are left out if there are recorded ones in the folder
-    `data` (Path), too. DatasetError if a dataset is malformed.
+    These are simulated, where no `names` are given and `data` (Path) has recorded ones, too.
     """
     if names is not None:
         return names, []
@@ -53,29 +53,16 @@ def hand_in_options(options):
 def write_zip(path, report, results, options, omitted=()):
     """Write the zip of a Report to `path` (Path); equal input gives equal bytes.
 
-    Parameters
-    ----------
-    report : Report, whose last file is the PDF.
-    results : Path, the folder of the result files of this report.
-    options : Options, of which `problem2` says which estimate is handed in as problem 2.
-    omitted : list of str, names of simulated datasets that are left out.
-
-    Raises
-    ------
-    DatasetError : another run began to replace the result files, and did not end well.
+    `results` (Path) is the folder of its files, `omitted` (list of str) what `selection` left out.
+    DatasetError if a dataset has the name of another file in the zip.
     """
     contents = {"report.pdf": report.files[-1].read_bytes(),
                 "README.txt": readme(report.drives, options, omitted).encode()}
-    for drive in report.drives:
-        if drive.name.casefold() in {name.casefold() for name in contents}:
-            raise DatasetError(f"{drive.name}: the zip has a file of the name of this dataset: "
-                               "rename its folder")
-    with locks.locked(results.resolve() / BUILD_LOCK):
+    with swap.staging(results):                         # no build replaces them meanwhile
         for drive in report.drives:
-            try:
-                swap.require_finished(results / drive.name)
-            except swap.UnfinishedError as error:
-                raise DatasetError(str(error)) from None
+            if drive.name.casefold() in {name.casefold() for name in contents}:
+                raise DatasetError(f"{drive.name}: the zip has a file of the name of this dataset: "
+                                   "rename its folder")
             contents |= {f"{drive.name}/{name}": Path(results, drive.name, file).read_bytes()
                          for name, file in handed_in(drive, options.problem2).items()}
     archive = BytesIO()
@@ -90,8 +77,7 @@ def write_zip(path, report, results, options, omitted=()):
 def handed_in(drive, problem2):
     """Return the files of a SolvedDrive, a dict from names in the hand-in to names in its results.
 
-    Those of `problem2`, a key of PROBLEM2_FOLDERS, are in the folder problem2. An estimate without
-    a map of the markers has that of the markers alone.
+    Those of `problem2`, a key of PROBLEM2_FOLDERS, have the map by markers alone if none is theirs.
     """
     estimate = PROBLEM2_FOLDERS[problem2]
     files = {f"{problem[:8]}/{name}": f"{problem}/{name}"
@@ -105,28 +91,13 @@ def handed_in(drive, problem2):
 
 def readme(drives, options, omitted=()):
     """Return README.txt (str); parameters as of `write_zip`, with a list of SolvedDrive."""
-    cover, estimate = options.cover, PROBLEM2_FOLDERS[options.problem2]
-    named = " ".join(filter(None, [cover.author, cover.student_number]))
-    frames = [f"of pose {_world(drive, 'problem2')} in {drive.name}" for drive in drives
-              if handed_in(drive, options.problem2).get("problem2/ArucoMap.mat") not in (
-                  None, f"{estimate}/ArucoMap.mat")]
-    sections = {
-        "What is not here": [sentence for drive in drives
-                             for sentence in _missing(drive, options.problem2)],
-        "Doubts about the data": [f"{drive.name}: {doubt.sentence}"
-                                  for drive in drives for doubt in drive.doubts],
-        "Notes on the files": [f"{drive.name}: {note}"
-                               for drive in drives for note in drive.notes],
-        "Notes": [f"The simulated dataset{'s' * (len(omitted) > 1)} {listed(omitted)} "
-                  f"{'are' if len(omitted) > 1 else 'is'} left out."] if omitted else []}
-    template = Template(README.read_text(encoding="utf-8"), trim_blocks=True)
-    text = template.render(
-        title_lines=filter(None, [cover.title, named, cover.course]), estimate=estimate,
-        file_lines=[line for drive in drives for line in _file_lines(drive, options.problem2)],
-        frames=frames and listed(frames), sections=sections,
-        worlds={drive.name: _world(drive, estimate) for drive in drives},
+    estimate = PROBLEM2_FOLDERS[options.problem2]
+    text = Template(README.read_text(encoding="utf-8"), trim_blocks=True).render(
+        cover=options, estimate=estimate, omitted=listed(omitted) if omitted else "",
+        drives=[_told(drive, options.problem2) for drive in drives],
         versions=", ".join([f"Python {platform.python_version()}",
-                            *(f"{name} {version(name)}" for name in PACKAGES_TOLD)]))
+                            *(f"{name} {version(name)}"
+                              for name in ("slamlib", "numpy", "scipy", "gtsam"))]))
     lines, *paragraphs = re.split("\n{2,}", text.strip())
     return "\n\n".join([lines, *map(_wrapped, paragraphs)]) + "\n"
 
@@ -137,33 +108,25 @@ def _wrapped(paragraph):
         paragraph, LINE_WIDTH, break_long_words=False, break_on_hyphens=False)
 
 
-def _file_lines(drive, problem2):
-    """Yield a line for each folder of a SolvedDrive: its files, problem and number of poses."""
-    folders = {}
-    for name, file in handed_in(drive, problem2).items():
+def _told(drive, problem2):
+    """Return what README.txt tells of a SolvedDrive, a dict."""
+    files, folders = handed_in(drive, problem2), {}
+    for name, file in files.items():
         folders.setdefault(name.split("/")[0], []).append(file)
-    for folder, files in folders.items():
-        solution = drive.solution(files[0].split("/")[0])
-        count = int((solution.poses[:, 0] == solution.poses[:, 0]).sum())
-        yield (f"  {drive.name}/{folder}: {listed([file.split('/')[1] for file in files])}\n"
-               f"    {solution.title}; {count} of {len(solution.poses)} poses have an estimate")
-
-
-def _world(drive, problem):
-    """Return the number, from 1, of the pose whose frame is the world frame of a problem."""
-    solution = drive.solution(problem)
-    return solution.world + 1 if solution else 1
-
-
-def _missing(drive, problem2):
-    """Yield a sentence on each problem that has no files."""
-    files = handed_in(drive, problem2)
-    for problem in ("problem1", PROBLEM2_FOLDERS[problem2], "problem3", "problem4"):
-        if f"{problem[:8]}/vehiclePose.mat" not in files:
-            lacks = [SENSORS[sensor] for sensor in PROBLEMS[problem].sensors
-                     if getattr(drive.dataset, sensor) is None]
-            reasons = [f"could not be solved: {failure.reason}." for failure in drive.failures
-                       if failure.problem == problem]
-            yield f"{drive.name}/{problem[:8]} ({title(problem, drive.dataset)}): " + (
-                f"there are no {listed(lacks)} in this dataset." if lacks
-                else [*reasons, "the report has no result of it."][0])
+    solutions = {name: drive.solution(each[0].split("/")[0]) for name, each in folders.items()}
+    estimate, aruco_map = PROBLEM2_FOLDERS[problem2], files.get("problem2/ArucoMap.mat")
+    world = {problem: solution.world + 1 if (solution := drive.solution(problem)) else 1
+             for problem in ("problem2", estimate)}
+    return {
+        "name": drive.name, "doubts": drive.doubts, "world": world[estimate],
+        "notes": all_notes(drive.dataset, drive.truth),
+        "folders": {name: (
+            listed([file.split("/")[1] for file in folders[name]]), solution.title,
+            int((solution.poses[:, 0] == solution.poses[:, 0]).sum()), len(solution.poses),
+            ", ".join(map(str, solution.facts.get("unconfirmed", ()))))
+            for name, solution in solutions.items()},
+        "map_frame": aruco_map not in (None, f"{estimate}/ArucoMap.mat") and world["problem2"],
+        "missing": [
+            f"{problem[:8]} ({title(problem, drive.dataset)}): {why_missing(drive, problem)}."
+            for problem in ("problem1", estimate, "problem3", "problem4")
+            if f"{problem[:8]}/vehiclePose.mat" not in files]}

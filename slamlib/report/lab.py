@@ -3,7 +3,9 @@
 import json
 import os
 import sys
+from importlib.util import find_spec
 
+from slamlib.dataset import DatasetError
 from slamlib.report.build import STUDIES
 from slamlib.report.execution import kernel_environment
 
@@ -13,13 +15,13 @@ OVERRIDES = {"@jupyterlab/apputils-extension:notification": {
 
 
 def start_lab(notebooks, data, kept, arguments):
-    """Replace this process by JupyterLab.
+    """Replace this process by JupyterLab with its `arguments`; folders as of `build_report`.
 
-    Parameters
-    ----------
-    notebooks, data, kept : Path, folders as of `build_report`.
-    arguments : list of str, JupyterLab's.
+    Raises DatasetError if JupyterLab is not installed.
     """
+    if find_spec("jupyterlab") is None:
+        raise DatasetError(f"expected JupyterLab beside {sys.executable}, found none: install it, "
+                           "as by pip install jupyterlab")
     settings = kept.resolve() / SETTINGS
     settings.mkdir(parents=True, exist_ok=True)
     (settings / "overrides.json").write_text(json.dumps(OVERRIDES))
@@ -34,10 +36,6 @@ def start_lab(notebooks, data, kept, arguments):
 
 
 def environment(settings, data, kept):
-    """Return the environment (dict of str) of JupyterLab, whose kernels inherit it.
-
-    A cell computes there what it does in the build, with the studies that the build keeps. Its
-    selection of datasets is that of SLAMLIB_DATASETS, if it is set.
-    """
+    """Return the environment (dict of str) of JupyterLab and its kernels, that of a build."""
     selected = os.environ.get("SLAMLIB_DATASETS", "").split("\n")
     return kernel_environment(settings, data.resolve(), selected, kept / STUDIES)

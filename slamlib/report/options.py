@@ -3,33 +3,25 @@
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 
-from slamlib.report.chapters import CODE_SHOWN
 from slamlib.textfile import DatasetError, quoted, read_toml
 
+CODE_SHOWN = ("none", "method", "all")  # what code is shown: none, all that is not hidden, or all
 # Folder of the results of each estimate that may be handed in as problem 2.
 PROBLEM2_FOLDERS = {"aruco": "problem2", "fused": "problem2_fused", "hint": "problem2_hint"}
 
 
 @dataclass(frozen=True)
-class Cover:
-    """The lines of the title page; an empty line is left out."""
+class Options:
+    """Options of report.toml; an empty line of the title page is left out."""
 
     title: str = "Localization and mapping of a differential-drive vehicle"
     author: str = ""
     student_number: str = ""
     course: str = ""
-
-
-@dataclass(frozen=True)
-class Options:
-    """Options of report.toml."""
-
-    cover: Cover = Cover()
-    leave_out: dict = field(default_factory=dict)  # as of `sections.to_execute`
+    leave_out: dict = field(default_factory=dict)  # from numbers and titles to the place in a file
     appendix: bool | None = None  # None: the report has it, the hand-in has not
-    code: str = "method"  # one of chapters.CODE_SHOWN
-    problem2: str = "aruco"  # the estimate that is handed in, a key of PROBLEM2_FOLDERS: the
-    #                          assignment requires markers alone, and calls the fusion facultative
+    code: str = "method"  # one of CODE_SHOWN
+    problem2: str = "aruco"  # which is handed in, of PROBLEM2_FOLDERS; required is markers alone
 
 
 def read_options(path):
@@ -37,16 +29,12 @@ def read_options(path):
 
     DatasetError if the file is not TOML, has an unknown key, or a value is not as it must be.
     """
-    path = Path(path)
-    if not path.exists():
+    if not Path(path).exists():
         return Options()
-    lines = [line.name for line in fields(Cover)]
-    keys = [*lines, *(option.name for option in fields(Options) if option.name != "cover")]
-    entries = read_toml(path, 'author = "Ada Lovelace"', keys, encoding="utf-8")
-    values = {key: _checked(key, value, f"{path}, line {line}" if line else str(path))
-              for key, (value, line) in entries.items()}
-    cover = {key: values.pop(key) for key in lines if key in values}
-    return Options(cover=Cover(**cover), **values)
+    keys = [option.name for option in fields(Options)]
+    entries = read_toml(Path(path), 'author = "Ada Lovelace"', keys, encoding="utf-8")
+    return Options(**{key: _checked(key, value, f"{path}, line {line}" if line else str(path))
+                      for key, (value, line) in entries.items()})
 
 
 def _checked(key, value, place):
@@ -55,8 +43,7 @@ def _checked(key, value, place):
         if not ok:
             raise DatasetError(f"{place}: expected {expected} for {key}, found {quoted(value)}")
 
-    choices = {"code": CODE_SHOWN, "problem2": PROBLEM2_FOLDERS}.get(key)
-    if choices:
+    if choices := {"code": CODE_SHOWN, "problem2": PROBLEM2_FOLDERS}.get(key):
         require(type(value) is str and value in choices,
                 f"one of {', '.join(map(repr, choices))}")
     elif key == "appendix":

@@ -1,15 +1,20 @@
-"""Stage 6: what the evidence decides: arcs or Euler's steps, and which statements are wrong.
+"""Stage 6: what the drive decides: arcs or Euler's steps, wrong statements, ids of several places.
 
-Of the calibration, groups of entries may leave their stated values (`calibrated`): they get the
-wide standard deviations of `calibration.ENTRIES`. The normal equations with columns for all entries
-give the likelihood of the whole calibration, all else eliminated, exp(-u^T L u / 2 + h^T u) with u
-in wide sigmas. For a prior of precisions P on the entries that are not known, the log evidence is
+Groups of entries of the calibration may leave their stated values (`calibrated`): they get the wide
+standard deviations of `calibration.ENTRIES`. The normal equations with columns for all entries give
+the likelihood of the whole calibration, all else eliminated, exp(-u^T L u / 2 + h^T u) with u in
+wide sigmas. For a prior of precisions P on the entries that are not known, the log evidence is
 
     h^T (L + P)^-1 h / 2 - log|L + P| / 2 + log|P| / 2,
 
 so that one linearisation ranks all sets of groups (score tests: Rao, Proc. Camb. Phil. Soc. 44(1),
 1948). The set that it proposes is solved, and replaces the present one if its evidence leads
 decisively on the same measurements with the same weights.
+
+A visit is a run of sightings of an id without a long break. Where a solution rejects most sightings
+of a visit, the drive is solved once more with a landmark for every visit, so that only the path
+between them ties visits together. A visit whose landmark is further from all earlier places of its
+id than this path explains is another place (`places_of_ids`).
 """
 
 from dataclasses import dataclass, replace
@@ -17,18 +22,13 @@ from itertools import combinations
 
 import numpy as np
 
+from slamlib import se2
 from slamlib.dataset import DatasetError
+from slamlib.memory import runs
 from slamlib.odometry import MODELS
-from slamlib.slam.factors import linearize_ranges
-from slamlib.slam.fit import accepted_measurements, refine
-from slamlib.slam.linear import (
-    NormalEquations,
-    consistency_factors,
-    laplace_approximation,
-    linear_solution,
-)
-from slamlib.slam.noise import equations_of_first_frames, greatest_log_density, log_density
-from slamlib.slam.problem import preintegrate_odometry
+from slamlib.slam.factors import preintegrate_odometry
+from slamlib.slam.fit import accepted_measurements, kept_weights, refine, residuals
+from slamlib.slam.linear import NormalEquations, linear_solution, log_evidence
 
 DECISIVE_LEAD = 3.0          # log evidence by which another model of the steps replaces the default
 DECISIVE_RELEASE = 6.0       # log evidence by which a group leaves its stated values
@@ -41,21 +41,26 @@ MIN_ACCEPTED = 0.98          # of the accepted measurements, that a proposed set
 MIN_INFORMATION = 1e-3       # about an entry, in wide sigmas, below which it is not considered
 MAX_PROPOSALS = 5            # number of sets that are solved
 
+VISIT_GAP = 30               # typical intervals between sightings of a marker, that end a visit
+MIN_VISIT = 3                # number of accepted sightings of a visit that is compared
+MAX_REJECTED_SHARE = 0.5     # of the sightings of a visit
+MAX_STILL_REJECTED = 0.5     # of the rejected sightings, by an explanation that is believed
+PLACE_GATE = 60.0            # squared distance of x, y, heading in sigmas, beyond it another place
+MIN_DISTANCE_OF_PLACES = 0.1     # m or rad; what is closer is one place
+MIN_SIGMA = 0.02             # m or rad, of the path between two visits
+
 
 def better_model(fit):
     """The Fit by Euler's steps if their evidence leads that of arcs by DECISIVE_LEAD, else by arcs.
 
-    Both evidences are on the same measurements with the same weights, so the weights that the
-    kernel of the ranges gives at `fit` are kept. The noise is learned for each model.
+    Both evidences are on the same measurements with the same weights and noise.
     """
     current = replace(fit.problem, accepted=_with_fixed_weights(fit))
     other, = {*MODELS} - {current.odometry.model}
     odometry = replace(preintegrate_odometry(
         current.measurements, other, current.odometry.wheel), in_counts=True)
-    lead = _log_density(NormalEquations(replace(current, odometry=odometry), fit.state),
-                        fit.posterior) \
-        - _log_density(NormalEquations(current, fit.state), fit.posterior,
-                       is_greatest=not len(current.accepted.range_weight))
+    lead = log_evidence(replace(current, odometry=odometry), fit.state) \
+        - log_evidence(current, fit.state)
     if lead <= (DECISIVE_LEAD if other == "euler" else -DECISIVE_LEAD):
         return fit
     return replace(refine(replace(fit.problem, odometry=odometry), fit.state, accept=None),
@@ -65,29 +70,41 @@ def better_model(fit):
 def calibrated(fit, accept=accepted_measurements):
     """The Fit in which groups of the calibration have left their stated values.
 
+    Errors that a wrong statement makes look like errors with memory, which hide it. So where errors
+    have memory, a set is also proposed as if they were independent, and must then lead by its prior
+    odds, with the memory that remains.
+
     `accept` as in `refine`. It is that of `fit` if the evidence speaks for none.
     """
-    tried = []
+    tried, widths = [], (1.0, GROSS)
     for _ in range(MAX_PROPOSALS):
-        proposal = _proposal(fit)
-        if np.array_equal(proposal.sigma, fit.problem.sigma):
-            return replace(fit, explanations=proposal.explanations)
-        if proposal.groups in tried:
+        proposal, least = _proposal(fit, widths), 0.0
+        problem = fit.problem
+        fit = replace(fit, explanations=proposal.explanations)
+        if np.array_equal(proposal.sigma, problem.sigma) and problem.accepted.share is not None:
+            independent = replace(problem, accepted=replace(problem.accepted, share=None))
+            proposal = _proposal(replace(fit, problem=independent), widths)
+            least = proposal.odds
+        if np.array_equal(proposal.sigma, problem.sigma) or proposal.groups in tried:
             break
         tried.append(proposal.groups)
-        stated = fit.problem.measurements.calibration.stated
+        stated = problem.measurements.calibration.stated
         state = replace(fit.state, c=np.where(proposal.sigma > 0, fit.state.c, stated))
-        problem = replace(fit.problem, sigma=proposal.sigma, released=proposal.groups)
         try:
-            proposed = refine(problem, state, accept)
+            proposed = refine(replace(problem, sigma=proposal.sigma, released=proposal.groups),
+                              state, accept)
             lead = _lead(proposed, fit)
         except (DatasetError, np.linalg.LinAlgError):
             break
-        least = 0.0 if proposal.lead >= 0 else proposal.lead - DECISIVE_RELEASE
+        least = least if proposal.lead >= 0 else proposal.lead - DECISIVE_RELEASE
         kept, present = (each.problem.accepted.weight.sum() for each in (proposed, fit))
-        far = np.abs(proposed.state.c - stated) > MAX_WIDE_SIGMAS * proposal.sigma
-        if lead < least or kept < MIN_ACCEPTED * present or far[proposal.sigma > 0].any():
+        off = np.abs(proposed.state.c - stated) > MAX_WIDE_SIGMAS * proposal.sigma
+        far = off[proposal.sigma > 0].any()
+        if lead < least or kept < MIN_ACCEPTED * present or far and len(widths) == 1:
             break
+        if far:
+            tried, widths = [], widths[1:]
+            continue
         fit = replace(proposed, explanations=proposal.explanations)
     return fit
 
@@ -100,14 +117,15 @@ class _Proposal:
     groups: frozenset        # to release: of all explanations, and what raises the evidence at all
     sigma: np.ndarray        # (p,) with these groups released
     lead: float              # log evidence over that of the prior as it is
+    odds: float              # log prior odds against the best explanation
 
 
-def _proposal(fit):
-    """The _Proposal for a Fit.
+def _proposal(fit, widths):
+    """The _Proposal for a Fit, with the first of `widths`, factors on wide sigmas, that suffices.
 
-    Every released group must raise the log evidence by DECISIVE_RELEASE, by FURTHER_ENTRY more for
-    each of its entries but one, and by STATED more if its standard deviations are stated: these are
-    prior odds. Explanations are the best set and others that come within AMBIGUOUS of it, neither
+    Every released group must raise the log evidence by its prior odds: DECISIVE_RELEASE,
+    FURTHER_ENTRY more for each of its entries but one, and STATED more if its standard deviations
+    are stated. Explanations are the best set and others that come within AMBIGUOUS of it, neither
     part of it nor more: the drive cannot tell them apart. What else raises the evidence is not
     certain enough to be told, but the covariances have to include it. If an entry would be further
     off than MAX_WIDE_SIGMAS, a statement is grossly wrong, and wide sigmas are multiplied by GROSS.
@@ -116,17 +134,19 @@ def _proposal(fit):
     L, h = _likelihood(fit)
     informed = np.diag(L) > 0
     doubtful = informed & (calibration.wide > calibration.sigma)
-    candidates = frozenset(calibration.group[doubtful].tolist())
+    candidates = sorted({*calibration.group[doubtful].tolist()})
     stated = frozenset(calibration.group[calibration.sigma > 0].tolist())
-    for width in (1.0, GROSS):
-        evidence, merit, largest = {}, {}, {}
-        for count in range(len(candidates) + 1):
-            for some in map(frozenset, combinations(sorted(candidates), count)):
-                sigma = calibration.sigma_without(some, width) / calibration.wide * informed
-                evidence[some], largest[some] = _log_evidence(L, h, sigma)
-                entries = np.count_nonzero(np.isin(calibration.group, list(some)))
-                merit[some] = evidence[some] - DECISIVE_RELEASE * count \
-                    - FURTHER_ENTRY * (entries - count) - STATED * len(some & stated)
+    sets = [frozenset(some) for count in range(len(candidates) + 1)
+            for some in combinations(candidates, count)]
+    for width in widths:
+        evidence, odds, merit, largest = {}, {}, {}, {}
+        for some in sets:
+            sigma = calibration.sigma_without(some, width) / calibration.wide * informed
+            evidence[some], largest[some] = _log_evidence(L, h, sigma)
+            entries = np.count_nonzero(np.isin(calibration.group, list(some)))
+            odds[some] = DECISIVE_RELEASE * len(some) + FURTHER_ENTRY * (entries - len(some)) \
+                + STATED * len(some & stated)
+            merit[some] = evidence[some] - odds[some]
         best = max(merit, key=merit.get)
         if not best or largest[best] < MAX_WIDE_SIGMAS:
             break
@@ -136,7 +156,7 @@ def _proposal(fit):
     more = max((some for some in evidence if certain <= some), key=evidence.get)
     present, _ = _log_evidence(L, h, fit.problem.sigma / calibration.wide * informed)
     return _Proposal(explanations=explanations, groups=more, lead=evidence[more] - present,
-                     sigma=calibration.sigma_without(more, width))
+                     sigma=calibration.sigma_without(more, width), odds=odds[best])
 
 
 def _log_evidence(L, h, sigma):
@@ -158,28 +178,22 @@ def _log_evidence(L, h, sigma):
 def _likelihood(fit):
     """Information L (p, p) and h (p,) of the measurements about the whole calibration.
 
-    In wide sigmas from the stated values, at the noise of the Fit, from the first frames of a long
-    drive. Entries of antennas that these do not see have no information.
+    In wide sigmas from the stated values, at the noise of the Fit.
     """
     calibration = fit.problem.measurements.calibration
-    known = replace(fit.problem, sigma=calibration.wide)
-    equations = equations_of_first_frames(NormalEquations(known, fit.state))
-    H, border, *_ = equations.sums(
-        fit.problem.noise, consistency_factors(fit.problem.accepted))
+    equations = NormalEquations(replace(fit.problem, sigma=calibration.wide), fit.state)
+    H, border, *_ = equations.sums(fit.problem.noise, consistent=True)
     solution = linear_solution(equations.structure, H, border)
-    p = len(calibration.stated)
-    L, h = np.zeros((p, p)), np.zeros(p)
+    u = (fit.state.c - calibration.stated) / calibration.wide
+    L, h = np.zeros((len(u), len(u))), np.zeros(len(u))
     if solution is None:
         return L, h
-    part = equations.problem.measurements.calibration
-    u = (equations.state.c - part.stated) / part.wide
     information = solution.S - np.eye(len(u))              # without the prior
     some = np.diag(information) > MIN_INFORMATION
     values, axes = np.linalg.eigh(information[np.ix_(some, some)])
     information = axes * np.maximum(values, 0) @ axes.T
-    entries = np.array([calibration.names.index(name) for name in part.names])[some]
-    L[np.ix_(entries, entries)] = information
-    h[entries] = information @ u[some] - (solution.gradient - u)[some]
+    L[np.ix_(some, some)] = information
+    h[some] = information @ u[some] - (solution.gradient - u)[some]
     return L, h
 
 
@@ -189,27 +203,108 @@ def _lead(proposed, present):
     The noise is learned for each.
     """
     fixed = _with_fixed_weights(proposed)
-    first, second = (refine(replace(problem, accepted=fixed), state, accept=None)
-                     for problem, state in ((proposed.problem, proposed.state),
-                                            (replace(proposed.problem, sigma=present.problem.sigma),
-                                             present.state)))
+    first, second = (refine(replace(proposed.problem, accepted=fixed, sigma=each.problem.sigma),
+                            each.state, accept=None) for each in (proposed, present))
     return first.log_density - second.log_density
 
 
 def _with_fixed_weights(fit):
     """AcceptedMeasurements in which weights replace the kernel of the ranges."""
-    accepted = fit.problem.accepted
-    weight = accepted.weight.astype(float)
-    ranges = np.flatnonzero(accepted.range_weight) + len(accepted.sighting_weight)
-    weight[ranges] = linearize_ranges(fit.problem, fit.state).weight
-    return replace(accepted, weight=weight, range_kernel=None)
+    problem, accepted = fit.problem, fit.problem.accepted
+    _, ranges = kept_weights(
+        accepted, *residuals(problem.measurements, fit.state, problem.noise))
+    return replace(accepted, weight=np.r_[accepted.sighting_weight, ranges], range_kernel=None)
 
 
-def _log_density(equations, posterior, is_greatest=False):
-    """Log evidence of known noise, or greatest log posterior density of learned noise.
+def visits(aruco):
+    """Number (m,) of the visit of every one of ArucoReadings, from 0, by id, then by time."""
+    order = np.lexsort((aruco.pose, aruco.marker))
+    marker, number = aruco.marker[order], np.arange(len(order))
+    if (marker[1:] == marker[:-1]).any():
+        _, number = runs(marker, aruco.pose[order], VISIT_GAP)
+    return number[np.argsort(order)]
 
-    If `is_greatest`, the noise of the equations' problem is the mode already.
+
+def with_places(dataset, places):
+    """The Dataset with the ids of `SlamResult.places` for its markers, or itself if it is None."""
+    return dataset if places is None else replace(
+        dataset, aruco=replace(dataset.aruco, marker=places[:, 1]))
+
+
+def contradicted(fit, factor):
+    """Which sightings (s,), bool, a Fit rejects at this noise factor."""
+    noise = replace(fit.problem.noise, sightings=factor)
+    return accepted_measurements(replace(fit.problem, noise=noise), fit.state).rejected
+
+
+def has_rejected_visits(fit):
+    """Whether a Fit rejects most sightings of any visit.
+
+    A marker that was moved looks like errors with memory, and the factor learned would hide it.
     """
-    if posterior is None or not posterior.covariance.any():          # nothing was learned
-        return laplace_approximation(equations, equations.problem.noise)[1]
-    return log_density(equations) if is_greatest else greatest_log_density(equations, posterior)
+    m, factor = fit.problem.measurements, fit.problem.noise.sightings
+    if not len(m.marker_row):
+        return False
+    factor = factor if fit.problem.accepted.share is None else min(factor, 1.0)
+    number = visits(m.dataset.aruco)[m.sightings.index]
+    count, lost = np.bincount(number), np.bincount(number, contradicted(fit, factor))
+    return bool(((count >= MIN_VISIT) & (lost > MAX_REJECTED_SHARE * count)).any())
+
+
+def spares_sightings(fit, other):
+    """Whether a Fit rejects less than MAX_STILL_REJECTED of the sightings that another rejects.
+
+    Both are judged at the smaller of their noise factors.
+    """
+    factor = min(each.problem.noise.sightings for each in (fit, other))
+    count, most = (contradicted(each, factor).sum() for each in (fit, other))
+    return bool(count < MAX_STILL_REJECTED * most)
+
+
+def places_of_ids(dataset, solve):
+    """`SlamResult.places` of a Dataset, None if each id is one place.
+
+    The function `solve` makes the SlamResult of a Dataset, here of markers alone. The second place
+    of id 12 gets the number 112 where ids have up to two digits, the third one 212.
+    """
+    marker, number = dataset.aruco.marker, visits(dataset.aruco)
+    try:
+        result = solve(with_places(replace(dataset, uwb=None), np.stack([marker, number], axis=1)))
+    except (DatasetError, np.linalg.LinAlgError):
+        return None
+    ids, digits = marker.copy(), 10**len(str(marker.max()))
+    accepted = np.flatnonzero(~result.rejected)
+    seen = result.sightings.marker[accepted]
+    frame = result.sightings.frame[result.sightings.row[accepted]]
+    for each in np.unique(marker):
+        last = []                                 # of each place the last visit
+        for visit in np.intersect1d(number[marker == each], result.marker):
+            if np.count_nonzero(seen == visit) < MIN_VISIT:
+                continue
+            squared = [_squared_distance(result, other, visit, frame[seen == other][-1],
+                                         frame[seen == visit][0]) for other in last]
+            place = int(np.argmin(squared)) if min(squared, default=np.inf) < PLACE_GATE \
+                else len(last)
+            last[place:place + 1] = [visit]
+            ids[number == visit] += place * digits
+    return None if (ids == marker).all() else np.stack([marker, ids], axis=1)
+
+
+def _squared_distance(result, first, second, pose, later):
+    """Squared distance in sigmas of two visits, markers `first` and `second` of a SlamResult.
+
+    The first one was last seen at `pose`, the second one first seen at the pose `later`. The path
+    from a pose of covariance P_1 to one of P_2 adds A P_2 A^T - B P_1 B^T to the covariance of a
+    place that A and B move with these poses.
+    """
+    first, second = result.marker_in_world[np.searchsorted(result.marker, [first, second])]
+    difference = second - first
+    difference[2] = se2.wrap(difference[2])
+    if np.abs(difference).max() < MIN_DISTANCE_OF_PLACES:
+        return 0.0
+    poses, P = result.poses[[pose, later]], result.covariances[[pose, later]]
+    A, _ = se2.compose_jacobians(poses, se2.between(poses, second))
+    start, end = A @ P @ A.mT
+    growth = end - start
+    values, axes = np.linalg.eigh((growth + growth.T) / 2)
+    return float(np.sum((axes.T @ difference)**2 / np.maximum(values, MIN_SIGMA**2)))

@@ -4,22 +4,20 @@ Odometry: with the increment Delta between the frames X and X' the error
 
     e = log(Delta^-1 X^-1 X')
 
-is that of GTSAM's between factor, except that Delta depends on the wheel parameters. All odometry
-factors share these, because the same wheel errors act in every increment.
+is that of GTSAM's between factor, except that Delta depends on the wheel parameters, which all
+odometry factors share.
 
-Measurements: with the calibration of a sensor in the vehicle's origin the factor of a marker with a
-heading is GTSAM's between factor, that of a range its range factor; `calibration` has the model.
-Without headings a marker is a point. They are whitened, and weighted by their kernels. Derivatives
-by poses are by GTSAM's tangent vectors: X moves as X exp(xi), in its own axes.
+Measurements: of a sensor in the vehicle's origin the factor of a marker with a heading is GTSAM's
+between factor, that of a range its range factor; `calibration` has the model. Without headings a
+marker is a point. Errors are whitened, and weighted by their kernels. Derivatives by poses are by
+GTSAM's tangent vectors: X moves as X exp(xi), in its own axes.
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
-from scipy.optimize import brentq
 
-from slamlib import se2
+from slamlib import increments, se2
 from slamlib.slam.calibration import (
     ANTENNAS,
     CAMERA,
@@ -32,42 +30,81 @@ from slamlib.slam.calibration import (
     SIGHTINGS,
     SIZE,
     TAG_PLACE,
+    WHEELS,
 )
+from slamlib.slam.measurements import square_root_information
 
+MINIMUM_SIGMA = 1e-5         # m, standard deviation of an increment's end along x and y
 MIN_DISTANCE = 1e-9          # m, below which a range has no direction
 
 
-def between_error(z, first, second):
-    """Errors log(z^-1 X^-1 X') (m, 3) and their derivatives by X, X', and the coordinates of z.
+@dataclass(frozen=True)
+class OdometryFactors:
+    """Odometry factors between consecutive frames, for every value of the slip."""
 
-    Measured poses z, first poses X and second poses X' are (m, 3), m, m, rad; the derivatives
-    (m, 3, 3). GTSAM: BetweenFactorPose2.
+    model: str               # of a step, "arc" or "euler"
+    stated: np.ndarray       # (3,) m, wheel parameters as stated, to which the covariances belong
+    wheel: np.ndarray        # (3,) m, those of linearisation
+    increment: np.ndarray    # (f-1, 3) Delta(wheel): m, m, rad
+    J_wheel: np.ndarray      # (f-1, 3, 3) dDelta/dwheel, per m
+    quantization: np.ndarray  # (f-1, 3, 3) covariance without slip, in the axes of the end
+    slipping: np.ndarray     # (f-1, 3, 3) covariance of slip 1 sqrt(m), in the same axes
+    in_counts: bool = False  # whether errors are scaled to the stated wheels: with known slip
+
+    def covariance(self, slip):
+        """Q (f-1, 3, 3) for a slip in sqrt(m)."""
+        return self.quantization + slip**2 * self.slipping
+
+    def whitening(self, slip):
+        """Square root information U (f-1, 3, 3), U^T U = Q^-1, and sum log|Q|, for a slip."""
+        U = square_root_information(self.covariance(slip))
+        return U, -2 * float(np.sum(np.log(np.diagonal(U, axis1=1, axis2=2))))
+
+
+def preintegrate_odometry(measurements, model, wheel=None):
+    """The OdometryFactors of Measurements, linearised at `wheel` (3,) m, None for that stated.
+
+    `model` is "arc" or "euler". dDelta/dwheel accumulates over the encoder steps between two frames
+    (preintegration with calibration parameters: Forster et al., IEEE T-RO 33(1), 2017).
     """
-    h = se2.between(first, second)
-    difference = se2.between(z, h)
-    log_jacobian, origin = se2.log_jacobian(difference), np.zeros(3)
-    _, by_second = se2.compose_jacobians(difference, origin)         # difference xi for X' xi
-    h_by_first, _ = se2.compose_jacobians(origin, h)                 # xi^-1 h for X xi
-    by_z, by_h = se2.between_jacobians(z, h)
-    return (se2.log(difference), -log_jacobian @ by_h @ h_by_first, log_jacobian @ by_second,
-            log_jacobian @ by_z)
+    dataset, start, end = measurements.dataset, measurements.frame[:-1], measurements.frame[1:]
+    vehicle = dataset.vehicle if wheel is None else dataset.vehicle.with_wheel(wheel)
+    increment, by_wheel = increments.between_poses(dataset.ticks, vehicle, start, end, model)
+    quantization, slipping = (se2.rotate_covariance(part, -increment[:, 2]) for part in
+                              odometry_noise(dataset.ticks, dataset.vehicle, start, end))
+    jump, unknown = measurements.jumps.added(start, end)
+    return OdometryFactors(
+        model=model, stated=dataset.vehicle.wheel, wheel=vehicle.wheel,
+        increment=se2.compose(increment, jump), J_wheel=by_wheel,
+        quantization=quantization + unknown, slipping=slipping)
+
+
+def odometry_noise(ticks, vehicle, start, end, steps=None):
+    """Quantization and slipping (m, 3, 3) by `increments.noise_in_drive`, with MINIMUM_SIGMA added.
+
+    The graph needs the inverse of Q, but a vehicle that stands still has no lateral noise.
+    """
+    quantization, slipping = increments.noise_in_drive(ticks, vehicle, start, end, steps)
+    quantization[:, [0, 1], [0, 1]] += MINIMUM_SIGMA**2
+    return quantization, slipping
 
 
 def odometry_error(factors, poses, wheel):
     """Errors (f-1, 3) of OdometryFactors at poses (f, 3) of the frames and `wheel` (3,) m.
 
     Also their derivatives (f-1, 3, 6) by X_i and X_{i+1}, and (f-1, 3, 3) by the columns WHEELS of
-    the calibration. The errors are not whitened.
-
-    What the encoders measure is counts. Their errors in metres and radians grow with the wheels, so
-    with `in_counts` the errors are divided by the scale, linearised, that `wheel` has beside the
-    stated wheels, for which Q is. Otherwise wheels, and with them all lengths, would be estimated
-    too small where nothing else gives the scale.
+    the calibration. The errors are not whitened. Encoders measure counts, and errors in metres and
+    radians grow with the wheels. So with `in_counts` they are divided by the scale, linearised,
+    that `wheel` has beside the stated wheels, for which Q is. Otherwise all lengths would be
+    estimated too small where nothing else gives the scale.
     """
     change = wheel - factors.wheel
-    e, by_first, by_second, by_increment = between_error(
-        factors.increment + factors.J_wheel @ change, poses[:-1], poses[1:])
-    by_wheel = by_increment @ factors.J_wheel
+    z, h = factors.increment + factors.J_wheel @ change, se2.between(poses[:-1], poses[1:])
+    difference, (by_z, by_h) = se2.between(z, h), se2.between_jacobians(z, h)
+    e, J = se2.log(difference), se2.log_jacobian(difference)
+    by_first = -J @ by_h @ _moved_by(h)
+    by_second = J @ se2.compose_jacobians(difference, np.zeros(3))[1]         # by X' xi
+    by_wheel = J @ by_z @ factors.J_wheel
     radius, ratio = factors.wheel[:2].mean(), factors.wheel / factors.stated
     scale = factors.stated[:2].mean() / radius * np.array([1, 1, ratio[2]]) \
         if factors.in_counts else np.ones(3)
@@ -81,28 +118,43 @@ def odometry_error(factors, poses, wheel):
 
 
 @dataclass(frozen=True)
-class LinearizedMeasurements:
-    """The m accepted measurements of one kind, linearised at a state, with d errors each."""
+class LinearizedFactors:
+    """The m factors of one kind, linearised at a state, with d errors each."""
 
-    index: np.ndarray        # (m,) row among all measurements of the kind
-    row: np.ndarray          # (m,) frame
-    landmark: np.ndarray     # (m,) row of the marker, or k plus row of the antenna
+    index: np.ndarray        # (m,) row among all of the kind, of which some may be rejected
     e: np.ndarray            # (m, d) whitened errors, expected minus measured
-    J: np.ndarray            # (m, d, p) whitened derivatives by the unknowns of pose and landmark
+    J: np.ndarray            # (m, d, 6) whitened derivatives by the unknowns of both variables
     J_c: np.ndarray          # (m, d, u) whitened, by u active entries of c, per sigma
     columns: np.ndarray      # (u,) their numbers among the q active entries
-    weight: np.ndarray       # (m,) share of its information that a measurement keeps
+    weight: np.ndarray       # (m,) share of its information that each keeps
     error: float             # half the sum of squared errors, or the loss of the kernel
 
 
+def linearize_odometry(problem, state):
+    """Function from a slip in sqrt(m) to the LinearizedFactors of odometry, and sum log|Q|."""
+    factors, active = problem.odometry, problem.active[WHEELS]
+    e, J, J_c = odometry_error(factors, state.poses, state.c[WHEELS])
+    J_c = J_c[:, :, active] * problem.sigma[WHEELS][active]
+
+    def linearized(slip):
+        U, log_determinant = factors.whitening(slip)
+        whitened = (U @ e[..., None])[..., 0]
+        return LinearizedFactors(
+            index=np.arange(len(e)), e=whitened, J=U @ J, J_c=U @ J_c,
+            columns=np.arange(active.sum()), weight=np.ones(len(e)),
+            error=float(np.sum(whitened**2)) / 2), log_determinant
+
+    return linearized
+
+
 def linearize_measurements(problem, state):
-    """The LinearizedMeasurements of sightings of poses, of points, and of ranges at a State."""
+    """The LinearizedFactors of sightings of poses, of points, and of ranges at a State."""
     return (linearize_sightings(problem, state, as_pose=True),
             linearize_sightings(problem, state, as_pose=False), linearize_ranges(problem, state))
 
 
 def linearize_sightings(problem, state, as_pose):
-    """The LinearizedMeasurements of markers with a heading (`as_pose`), or of points."""
+    """The LinearizedFactors of markers with a heading (`as_pose`), or of points."""
     accepted, m, s = problem.accepted, problem.measurements, problem.measurements.sightings
     kind = np.flatnonzero(m.as_pose == as_pose)
     index = np.flatnonzero(accepted.sighting_weight[kind])
@@ -111,14 +163,12 @@ def linearize_sightings(problem, state, as_pose):
     motion = delayed(m, row, state.c[SIGHTING_LAG], not problem.active[SIGHTING_LAG])
     e, by_pose, by_marker, by_c = sighting_error(
         s.z[rows], state.poses[row], *motion, state.markers[m.marker_row[rows]], state.c, as_pose)
-    U = m.sighting_roots[0 if as_pose else 1][rows]
-    return _whitened(
-        problem, SIGHTINGS, index, row, m.marker_row[rows], e, [by_pose, by_marker], by_c,
-        U, accepted.sighting_weight[rows], problem.noise.sightings, accepted.sighting_kernel)
+    return _whitened(problem, SIGHTINGS, index, rows, e, [by_pose, by_marker], by_c,
+                     m.sighting_roots[0 if as_pose else 1][rows])
 
 
 def linearize_ranges(problem, state):
-    """The LinearizedMeasurements of the ranges at a State."""
+    """The LinearizedFactors of the ranges at a State."""
     accepted, m, r = problem.accepted, problem.measurements, problem.measurements.ranges
     rows = np.flatnonzero(accepted.range_weight)
     antenna, row = r.antenna[rows], r.row[rows]
@@ -127,10 +177,8 @@ def linearize_ranges(problem, state):
         r.distance[rows], state.poses[row], *motion, state.antennas[antenna],
         state.c[ANTENNAS][antenna], state.c)
     by_offset = (antenna[:, None] == np.arange(len(m.antenna)))[:, None]
-    return _whitened(
-        problem, RANGES, rows, row, len(m.marker) + antenna, e[:, None], [by_pose, by_antenna],
-        np.concatenate([by_c, by_offset], axis=2), 1 / r.sigma[rows, None, None],
-        accepted.range_weight[rows], problem.noise.ranges, accepted.range_kernel)
+    return _whitened(problem, RANGES, rows, rows, e[:, None], [by_pose, by_antenna],
+                     np.concatenate([by_c, by_offset], axis=2), 1 / r.sigma[rows, None, None])
 
 
 def sighting_error(z, poses, motion, velocity, markers, c, as_pose):
@@ -138,8 +186,8 @@ def sighting_error(z, poses, motion, velocity, markers, c, as_pose):
 
     From poses (m, 3) of the vehicle, its `motion` (m, 3) to where it was when the camera saw, and
     its `velocity` (m, 3) per encoder step there (`delayed`). Of markers with a heading (`as_pose`)
-    the errors (m, 3) are log(z^-1 h) of the expected sighting h, as in GTSAM's between factor. Of
-    points they are (m, 2), h - z. The derivatives are (m, d, 3), (m, d, 3 or 2) and (m, d, 5).
+    the errors (m, 3) are log(z^-1 h) of the expected sighting h, of points (m, 2) they are h - z.
+    The derivatives are (m, d, 3), (m, d, d) and (m, d, 5). GTSAM: BetweenFactorPose2.
     """
     camera, size, d = c[CAMERA], c[SIZE], 3 if as_pose else 2
     mounted = se2.compose(motion, camera)                            # camera in vehicle
@@ -150,17 +198,15 @@ def sighting_error(z, poses, motion, velocity, markers, c, as_pose):
         difference = se2.between(z, h)
         e = se2.log(difference)
         by_h = se2.log_jacobian(difference) @ se2.between_jacobians(z, h)[1]
-        by_marker = se2.rotation(seen[:, 2])
     else:
         e, by_h = (h - z)[:, :2], np.broadcast_to(np.eye(2, 3), (len(z), 2, 3))
-        by_marker = se2.rotation(-Y[:, 2])
     by_seen = by_h / [size, size, 1]
-    by_Y = -by_seen @ se2.compose_jacobians(np.zeros(3), seen)[0]    # in the axes of the camera
-    by_marker = np.concatenate(
-        [by_seen[:, :, :2] @ by_marker, by_seen[:, :, 2:]], axis=2)[:, :, :d]
-    by_camera = _transported(by_Y, np.r_[0.0, 0.0, camera[2]])
+    by_Y = -by_seen @ _moved_by(seen)                                # in the axes of the camera
+    by_marker = np.concatenate([                                     # a point's in the world
+        by_seen[:, :, :2] @ se2.rotation(seen[:, 2] if as_pose else -Y[:, 2]),
+        by_seen[:, :, 2:]], axis=2)[:, :, :d]
     by_c = np.empty((len(z), d, 5))
-    by_c[:, :, :3] = by_camera
+    by_c[:, :, :3] = _transported(by_Y, np.r_[0.0, 0.0, camera[2]])
     by_c[:, :, 3] = -np.einsum("mdi,mi->md", by_seen[:, :, :2], h[:, :2])
     by_c[:, :, 4] = -np.einsum("mdi,mi->md", _transported(by_Y, camera), velocity)
     return e, _transported(by_Y, mounted), by_marker, by_c
@@ -171,12 +217,14 @@ def _transported(by_end, motion):
 
     The derivative of exp(xi) M = M exp(xi') is the adjoint of M^-1.
     """
-    R_t = se2.rotation(-motion[..., 2])
-    adjoint = np.zeros(motion.shape[:-1] + (3, 3))
-    adjoint[..., :2, :2], adjoint[..., 2, 2] = R_t, 1
-    lever = np.stack([-motion[..., 1], motion[..., 0]], -1)
-    adjoint[..., :2, 2] = (R_t @ lever[..., None])[..., 0]
+    adjoint, R_t = _moved_by(motion), se2.rotation(-motion[..., 2])
+    adjoint[..., :2, :2], adjoint[..., :2, 2:] = R_t, R_t @ adjoint[..., :2, 2:]
     return by_end @ adjoint
+
+
+def _moved_by(h):
+    """Derivatives (..., 3, 3) of exp(xi) h by xi, at 0, of poses h (..., 3)."""
+    return se2.compose_jacobians(np.zeros(3), h)[0]
 
 
 def camera_poses(measurements, poses, c):
@@ -237,7 +285,7 @@ def range_error(r, poses, motion, velocity, antennas, offset, c):
 def delayed(measurements, row, lag, is_known=True):
     """Where the vehicle was `lag` encoder steps before the frames `row` (m,), in the axes there.
 
-    Also its velocities (m, 3) per step at that time, in m and rad, by the smooth path: the noise of
+    Also its velocities (m, 3) per step at that time, in m and rad, by a smooth path: the noise of
     single steps would bias the delay. Both are 0 where there is no lag and it `is_known`.
     """
     if is_known and not lag:
@@ -251,47 +299,32 @@ def delayed(measurements, row, lag, is_known=True):
             se2.log(se2.between(smooth[i], smooth[k])))
 
 
-def _whitened(problem, kind, index, row, landmark, e, jacobians, by_c, U, weight, noise_factor,
-              kernel):
-    """The LinearizedMeasurements of errors e (m, d) with a list of derivatives (m, d, p) each.
+def _whitened(problem, kind, index, rows, e, jacobians, by_c, U):
+    """The LinearizedFactors of errors e (m, d), and derivatives, of the sightings or ranges `rows`.
 
-    `by_c` (m, d, u) are those by the columns `kind` of the calibration. From square root
-    informations U (m, d, d) and weights (m,). `noise_factor` multiplies the standard deviations. A
-    kernel weighs a measurement by the norm of its whitened error; that of a range, corrected by the
-    bias of its kernel, has the sign of measured minus expected, as in GTSAM.
+    `by_c` (m, d, u) are the derivatives by the columns `kind` of the calibration, and U (m, d, d)
+    square root informations as stated. Shares multiply the loss. A kernel weighs a measurement by
+    the norm of its whitened error; that of a range, corrected by the bias of its kernel, has the
+    sign of measured minus expected, as in GTSAM.
     """
-    active = problem.active[kind]
+    accepted, noise, active = problem.accepted, problem.noise, problem.active[kind]
     columns = np.cumsum(problem.active)[kind][active] - 1
     by_c = by_c[:, :, active] * problem.sigma[kind][active]
-    U = U * (np.sqrt(weight) / noise_factor)[:, None, None]
-    e = (U @ e[..., None])[..., 0]
-    if kind == RANGES:
-        e = e + problem.accepted.range_bias
-    size, error = -e[:, 0] if e.shape[1] == 1 else np.linalg.norm(e, axis=1), np.sum(e**2) / 2
+    weight, share, factor, kernel, bias = (
+        (accepted.range_weight, accepted.shares[1], noise.ranges, accepted.range_kernel,
+         accepted.range_bias) if kind == RANGES else
+        (accepted.sighting_weight, accepted.shares[0], noise.sightings, accepted.sighting_kernel,
+         0.0))
+    weight, share = weight[rows], share[rows]
+    U = U * (np.sqrt(weight) / factor)[:, None, None]
+    e = (U @ e[..., None])[..., 0] + bias
+    kept, loss = share, np.sum(e**2, axis=1) / 2
     if kernel is not None:
-        size = size.tolist()
-        by_kernel, error = np.array([*map(kernel.weight, size)]), sum(map(kernel.loss, size))
-        weight = weight * by_kernel
-        U = U * np.sqrt(by_kernel)[:, None, None]
-        e = e * np.sqrt(by_kernel)[:, None]
-    return LinearizedMeasurements(
-        index=index, row=row, landmark=landmark, e=e, J=U @ np.concatenate(jacobians, axis=2),
-        J_c=U @ by_c, columns=columns, weight=weight, error=float(error))
-
-
-@lru_cache(maxsize=8)
-def kernel_bias(kernel):
-    """Location b, in sigmas, for which a signed kernel weighs the residuals r - b to mean zero.
-
-    Of standard normal residuals r, which a one-sided kernel makes too small on average (b < 0):
-    E[weight(r - b) (r - b)] = 0. Ranges are compared with the expected ones plus b sigma.
-    """
-    r = np.linspace(-6, 6, 241)
-    if kernel is None or kernel.weight(3.0) == kernel.weight(-3.0):
-        return 0.0
-
-    def mean(b):
-        weight = np.array([kernel.weight(x) for x in r - b])
-        return np.sum(weight * (r - b) * np.exp(-r**2 / 2))
-
-    return float(brentq(mean, -1, 1))
+        size = (-e[:, 0] if e.shape[1] == 1 else np.linalg.norm(e, axis=1)).tolist()
+        kept, loss = share * [*map(kernel.weight, size)], np.array([*map(kernel.loss, size)])
+    weight, error = weight * kept, np.sum(share * loss)
+    U, e = U * np.sqrt(kept)[:, None, None], e * np.sqrt(kept)[:, None]
+    J = np.zeros((*e.shape, 6))
+    J[:, :, :3 + jacobians[1].shape[2]] = U @ np.concatenate(jacobians, axis=2)
+    return LinearizedFactors(
+        index=index, e=e, J=J, J_c=U @ by_c, columns=columns, weight=weight, error=float(error))

@@ -1,32 +1,27 @@
-"""Stages 3, 5 and 6: from a Problem and a State to the Fit that the measurements agree on.
+"""Stages 5 and 6: from a Problem and a State to the Fit that the measurements agree on.
 
-Gauss-Newton with step halving (`optimize`) is part of all of them. A step solves the normal
-equations in numpy and scipy, or is GTSAM's, which builds and eliminates the same graph factor by
-factor. Start values, kernels and noise take dozens of steps, by the normal equations. GTSAM takes
-the last steps of every solution, and all steps where these are singular to rounding.
-
-Robust rounds with ever narrower kernels (`narrow_kernels`) keep the solution out of the wrong
-minima to which wrong labels and late ranges lead. Then wheels, noise and accepted measurements are
-estimated in turn until they agree (`refine`). Accepted sightings count in full. Accepted ranges
-keep a one-sided kernel, which reduces the weight of late ranges only: a late range is too long,
-because it lacks the line of sight.
+Rounds with ever narrower kernels (`narrow_kernels`) keep the solution out of the wrong minima to
+which wrong labels and late ranges lead. Then wheels, noise and accepted measurements are estimated
+in turn until they agree (`refine`). Accepted sightings count in full, accepted ranges by a
+one-sided kernel: without the line of sight a range is too long. Where residuals show that errors
+have memory, measurements keep a share of their information (`slamlib.memory`).
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import gtsam
 import numpy as np
+from scipy.optimize import brentq
 
 from slamlib import se2
 from slamlib.sightings import GATE, POINT_GATE
 from slamlib.slam.calibration import WHEELS
-from slamlib.slam.factors import expected_ranges, expected_sightings, kernel_bias
-from slamlib.slam.graph import gtsam_step
-from slamlib.slam.linear import NormalEquations, laplace_approximation
+from slamlib.slam.factors import expected_ranges, expected_sightings, preintegrate_odometry
+from slamlib.slam.graph import CONVERGED, optimize
+from slamlib.slam.linear import NormalEquations, Problem, State, laplace_approximation
 from slamlib.slam.measurements import AcceptedMeasurements, Noise, with_known
-from slamlib.slam.noise import NoisePosterior, learn_noise
-from slamlib.slam.problem import Problem, State, preintegrate_odometry, retract
+from slamlib.slam.noise import NoisePosterior, error_memories, learn_noise, with_hidden_errors
 
 EARLY_GATE = 3.3             # sigmas; a range that is shorter than expected by more is rejected
 
@@ -45,11 +40,6 @@ KERNELS = {
     "asymmetric Tukey": _kernel.AsymmetricTukey.Create(4.685, _scalar)}
 ONE_SIDED = ("asymmetric Cauchy", "asymmetric Tukey")
 LATE_KERNEL = KERNELS["asymmetric Tukey"]
-
-CONVERGED = 1e-6             # decrease, over 1 + error, at which iterations end
-ROUNDING = 1e-12             # relative increase of the error that is due to float rounding
-MAX_GAUSS_NEWTON_STEPS = 40  # number of steps
-MAX_HALVINGS = 8             # number of halvings of one step
 
 CAUCHY_SCALES = (100.0, 30.0, 10.0, 3.0)     # sigmas, scale of the kernel in each round
 MIN_RESIDUALS = 20           # number of measurements from which their scatter gives a factor
@@ -75,12 +65,8 @@ def acceptance_rule(kernel="asymmetric Tukey", gate=True):
     """The AcceptanceRule with the kernel of this name in KERNELS, for sightings and ranges.
 
     A one-sided kernel is that of the ranges only, and replaces their gate for late ones. Without
-    `gate` nothing is rejected. Raises ValueError if KERNELS has no such name.
+    `gate` nothing is rejected.
     """
-    if gate not in (True, False):
-        raise ValueError(f"gate must be True or False, not {gate!r}")
-    if kernel not in [*KERNELS]:                              # of any type, also not hashable
-        raise ValueError(f"kernel must be one of {', '.join(KERNELS)}, not {kernel!r}")
     one_sided = kernel in ONE_SIDED
     return AcceptanceRule(
         sighting_kernel=None if one_sided else KERNELS[kernel], gated=gate,
@@ -88,14 +74,37 @@ def acceptance_rule(kernel="asymmetric Tukey", gate=True):
         late=EARLY_GATE if gate and not one_sided else np.inf)
 
 
-def accepted_measurements(problem, state, rule=AcceptanceRule()):
-    """The AcceptedMeasurements that an AcceptanceRule accepts at a State, with its kernels."""
+def accepted_measurements(problem, state, rule=None):
+    """The AcceptedMeasurements that an AcceptanceRule accepts at a State, with its kernels.
+
+    None takes the rule of the kernel and the gate of the dataset's Vehicle.
+    """
+    vehicle = problem.measurements.dataset.vehicle
+    rule = rule or acceptance_rule(vehicle.kernel, vehicle.gate)
     weight = gate_weights(problem, state, rule.early, rule.late)
     if not rule.gated:
         weight[:len(problem.measurements.marker_row)] = 1
     return AcceptedMeasurements(
         measurements=problem.measurements, weight=weight, sighting_kernel=rule.sighting_kernel,
         range_kernel=rule.range_kernel, range_bias=kernel_bias(rule.range_kernel))
+
+
+@lru_cache(maxsize=8)
+def kernel_bias(kernel):
+    """Location b, in sigmas, for which a signed kernel weighs the residuals r - b to mean zero.
+
+    Of standard normal residuals r, which a one-sided kernel makes too small on average (b < 0):
+    E[weight(r - b) (r - b)] = 0. Ranges are compared with the expected ones plus b sigma.
+    """
+    r = np.linspace(-6, 6, 241)
+    if kernel is None or kernel.weight(3.0) == kernel.weight(-3.0):
+        return 0.0
+
+    def mean(b):
+        weight = np.array([kernel.weight(x) for x in r - b])
+        return np.sum(weight * (r - b) * np.exp(-r**2 / 2))
+
+    return float(brentq(mean, -1, 1))
 
 
 def gate_weights(problem, state, early, late):
@@ -129,11 +138,9 @@ def residuals(measurements, state, noise):
 
     Returns
     -------
-    (s, 3) of the sightings, in the axes of the vehicle; the third is 0 if the marker is a point.
+    (s, 3) of the sightings, differences of coordinates in the axes of the vehicle; the third is 0
+        if the marker is a point.
     (r,) of the ranges, positive for a range that is too long.
-
-    The errors e of the factors have the opposite sign, and those of a marker with a heading are
-    se2.log of a motion. These residuals are differences of coordinates: their gates need no more.
     """
     m, s, r = measurements, measurements.sightings, measurements.ranges
     difference = s.z - expected_sightings(m, state)
@@ -142,52 +149,6 @@ def residuals(measurements, state, noise):
     C[~m.as_pose, 2] = C[~m.as_pose, :, 2] = [0, 0, 1]          # an independent heading
     return (np.linalg.solve(np.linalg.cholesky(C), difference[..., None])[..., 0] / noise.sightings,
             (r.distance - expected_ranges(m, state)) / r.sigma / noise.ranges)
-
-
-@dataclass(frozen=True)
-class Optimum:
-    """The end of Gauss-Newton."""
-
-    equations: NormalEquations
-    steps: int                         # number of steps taken
-    converged: bool                    # whether the error had stopped to decrease
-
-    @property
-    def state(self) -> State:
-        """The State where the error is smallest."""
-        return self.equations.state
-
-    @property
-    def error(self):
-        """Half the sum of squared whitened errors, kernels applied."""
-        return self.equations.error
-
-
-def optimize(problem, state, max_steps=MAX_GAUSS_NEWTON_STEPS, by_gtsam=False,
-             converged=CONVERGED):
-    """The Optimum of a Problem from a State.
-
-    It ends where the error decreases by at most `converged` times (1 + error). Raises DatasetError
-    if the measurements do not determine every variable.
-    """
-    equations, steps, ended = NormalEquations(problem, state), 0, False
-    while steps < max_steps and not ended:
-        steps += 1
-        state, error = equations.state, equations.error
-        step = None if by_gtsam else equations.step()
-        equations = None                                   # of a long drive they are large
-        if step is None:
-            step = gtsam_step(problem, state)
-        for _ in range(MAX_HALVINGS):
-            equations = NormalEquations(problem, retract(problem, state, step))
-            if equations.error <= (1 + ROUNDING) * error:
-                break
-            step = step / 2
-        else:
-            equations, ended = NormalEquations(problem, state), True
-            break
-        ended = error - equations.error <= converged * (1 + error)
-    return Optimum(equations, steps, ended)
 
 
 def narrow_kernels(problem, state, scales=CAUCHY_SCALES, converged=CONVERGED):
@@ -199,36 +160,32 @@ def narrow_kernels(problem, state, scales=CAUCHY_SCALES, converged=CONVERGED):
     m = problem.measurements
     for number, scale in enumerate(scales):
         if number:                                   # the caller judges the last solution
-            problem = replace(problem, noise=noise_of_scatter(m, state))
-        cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(scale)
+            problem = replace(problem, noise=noise_of_scatter(problem, state))
+        cauchy = _kernel.Cauchy.Create(scale)
         accepted = AcceptedMeasurements(
             measurements=m, weight=m.unit_weights, sighting_kernel=cauchy, range_kernel=cauchy)
         state = optimize(replace(problem, accepted=accepted), state, converged=converged).state
     return state
 
 
-def noise_of_scatter(measurements, state):
-    """The Noise with typical slip and factors, at least 1, from the medians of the residuals.
+def noise_of_scatter(problem, state):
+    """The Noise with the slip of a Problem, and factors from the medians of the residuals, >= 1.
 
     Without these factors, covariances that are far too small would have most measurements rejected
     before a factor is learned. Known noise parameters are kept.
     """
+    measurements = problem.measurements
     sightings, ranges = residuals(measurements, state, Noise())
-    squared = np.sum(sightings**2, axis=1) / np.where(
-        measurements.as_pose, MEDIAN_CHI2[3], MEDIAN_CHI2[2])
-    return with_known(
-        Noise(sightings=_at_least_one(squared), ranges=_at_least_one(ranges**2 / MEDIAN_CHI2[1])),
-        measurements.dataset.vehicle)
-
-
-def _at_least_one(squared):
-    """Root of the median of squared residuals over that of chi-squared, if it exceeds 1."""
-    return max(1.0, float(np.sqrt(np.median(squared)))) if len(squared) >= MIN_RESIDUALS else 1.0
+    squared = (np.sum(sightings**2, axis=1) / np.where(
+        measurements.as_pose, MEDIAN_CHI2[3], MEDIAN_CHI2[2]), ranges**2 / MEDIAN_CHI2[1])
+    return with_known(Noise(problem.noise.slip, *(
+        max(1.0, float(np.sqrt(np.median(each)))) if len(each) >= MIN_RESIDUALS else 1.0
+        for each in squared)), measurements.dataset.vehicle)
 
 
 @dataclass(frozen=True)
 class Fit:
-    """A problem with the state that solves it."""
+    """A Problem with the State that solves it."""
 
     problem: Problem
     state: State
@@ -240,7 +197,8 @@ class Fit:
     @property
     def log_density(self):
         """Log posterior density of the noise, or log evidence if all of it is known."""
-        return self.log_evidence if self.posterior is None else self.posterior.log_density
+        learned = self.posterior is not None and self.problem.accepted.share is None
+        return self.posterior.log_density if learned else self.log_evidence
 
     @cached_property
     def equations(self):
@@ -249,10 +207,7 @@ class Fit:
 
 
 def solved_by_gtsam(fit):
-    """The Fit after GTSAM's optimisation, started at the state of `fit`.
-
-    Raises DatasetError as `optimize`.
-    """
+    """The Fit after GTSAM's optimisation; raises DatasetError as `optimize`."""
     optimum = optimize(fit.problem, fit.state, by_gtsam=True)
     return replace(fit, state=optimum.state, converged=optimum.converged)
 
@@ -261,20 +216,24 @@ def refine(problem, state, accept=accepted_measurements, preintegrate=preintegra
     """The Fit in which wheels, noise and accepted measurements agree with each other.
 
     They depend on each other, so each is updated in turn until the accepted measurements no longer
-    change. From a Problem and a State near its solution. `accept` makes AcceptedMeasurements from
+    change. The share that memory leaves of their information is found at the end, with the noise as
+    it is. From a Problem and a State near its solution. `accept` makes AcceptedMeasurements from
     Problem and State; None keeps those of the problem. `preintegrate` as in `build_problem`. Raises
     DatasetError as `optimize`, and numpy.linalg.LinAlgError if odometry's covariance is singular.
     """
     m, model, posterior = problem.measurements, problem.odometry.model, None
-    if accept is not None:
-        problem = replace(problem, noise=noise_of_scatter(m, state))
-    accepted = problem.accepted if accept is None else accept(problem, state)
-    changed = np.inf
+    share, fixed, changed = problem.accepted.share, accept is None, np.inf
+    if fixed:
+        problem = replace(problem, accepted=replace(problem.accepted, share=None))
+        accept = _those_of_the_problem
+    else:
+        problem = replace(problem, noise=noise_of_scatter(problem, state))
+    accepted = accept(problem, state)
     for _ in range(MAX_ROUNDS):
         problem = replace(problem, accepted=accepted,
                           odometry=preintegrate(m, model, state.c[WHEELS]))
+        optimum = None                                     # frees the equations of the last round
         if m.learned.any() and changed > NEGLIGIBLE_CHANGE * len(accepted.weight):
-            optimum = None                                 # frees the equations of the last round
             optimum = optimize(problem, state, max_steps=2)
             state, posterior = optimum.state, learn_noise(optimum.equations)
             problem = replace(problem, noise=with_known(posterior.noise, m.dataset.vehicle))
@@ -282,11 +241,46 @@ def refine(problem, state, accept=accepted_measurements, preintegrate=preintegra
         optimum = None
         optimum = optimize(problem, state)
         state = optimum.state
-        accepted = problem.accepted if accept is None else accept(problem, state)
+        accepted = accept(problem, state)
         changed = np.count_nonzero(accepted.weight != problem.accepted.weight)
         moved = np.abs(state.c[WHEELS] / problem.odometry.wheel - 1).max()
         if not changed and moved < NEGLIGIBLE_MOVE:
             break
+    share = share if fixed else _shares(problem, state, accept)
+    if share is not None:
+        problem, posterior = _with_shares(problem, state, posterior, share, accept)
+        optimum = None
+        optimum = optimize(problem, state)
     _, log_evidence = laplace_approximation(optimum.equations, problem.noise)
-    return Fit(problem=problem, state=state, log_evidence=log_evidence, posterior=posterior,
+    return Fit(problem=problem, state=optimum.state, log_evidence=log_evidence, posterior=posterior,
                converged=optimum.converged)
+
+
+def _those_of_the_problem(problem, state):
+    """The AcceptedMeasurements of a Problem, whatever the State."""
+    return problem.accepted
+
+
+def _shares(problem, state, accept):
+    """Shares (s + r,) that the memory of errors leaves to measurements, None if there is none."""
+    m, both = problem.measurements, (np.zeros(1), np.zeros(1))
+    problem = replace(problem, noise=with_hidden_errors(problem.noise, both, m.dataset.vehicle))
+    share = np.concatenate([memory.share for memory in error_memories(
+        accept(problem, state), *residuals(m, state, problem.noise))])
+    return share if (share < 1).any() else None
+
+
+def _with_shares(problem, state, posterior, share, accept):
+    """The Problem with shares (s + r,) of errors with memory, and the posterior of its noise.
+
+    The noise is that learned without shares, with hidden errors.
+    """
+    vehicle, shares = problem.measurements.dataset.vehicle, problem.measurements.by_kind(share)
+
+    def hidden(noise):
+        return with_hidden_errors(noise, shares, vehicle)
+
+    problem = replace(problem, noise=hidden(problem.noise))
+    problem = replace(problem, accepted=replace(accept(problem, state), share=share))
+    return problem, posterior and replace(posterior, noise=problem.noise, points=tuple(
+        (weight, hidden(noise)) for weight, noise in posterior.points))

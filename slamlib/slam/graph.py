@@ -1,28 +1,74 @@
-"""Stage 3: the factor graph in GTSAM.
+"""Stage 3: the factor graph in GTSAM, and Gauss-Newton with step halving.
 
-`nonlinear_graph` has GTSAM's own factors:
-
-* a prior on pose 1, which fixes the world frame, and one on the calibration c, in sigmas, by the
-  Vehicle (of the wheel parameters the assignment's table 2);
-* a between factor for every sighting of a marker with a heading, Z_ij = X_i^-1 L_j;
-* a range factor for every range, r_ik = |A_k - (x_i, y_i)|, and the guess as a prior on A_k.
-
-`linearize` adds those that are linearised in numpy: the odometry between consecutive frames, which
-depends on the wheel parameters in c, sightings of points, whose heading is unknown, and all
-sightings or ranges where an entry of c for them is unknown or not that of a sensor in the vehicle's
-origin. Custom factors in Python would be slow: GTSAM copies all values for every call.
+A step of `optimize` solves the normal equations in numpy and scipy, or is GTSAM's, which eliminates
+the same graph factor by factor: the last steps of every solution, and those where the normal
+equations are singular to rounding. All factors are linearised in numpy. Custom factors in Python
+would be slow: GTSAM copies all values for every call.
 """
 
 import re
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import A, C, L, P, X
+from gtsam.symbol_shorthand import C
 
-from slamlib.dataset import DatasetError, Vehicle
-from slamlib.slam.calibration import RANGES, SIGHTINGS, WHEELS, stated_calibration
-from slamlib.slam.factors import linearize_measurements, odometry_error
-from slamlib.slam.measurements import GUESS_PRIOR_SIGMA, WEAK_SIGMA
+from slamlib.dataset import DatasetError
+from slamlib.slam.factors import linearize_odometry
+from slamlib.slam.linear import NormalEquations, State, retract
+from slamlib.slam.measurements import WEAK_SIGMA
+from slamlib.slam.own import INDICES, gtsam_values, variable_keys
+
+CONVERGED = 1e-6             # decrease, over 1 + error, at which iterations end
+ROUNDING = 1e-12             # relative increase of the error that is due to float rounding
+MAX_GAUSS_NEWTON_STEPS = 40  # number of steps
+MAX_HALVINGS = 8             # number of halvings of one step
+
+
+@dataclass(frozen=True)
+class Optimum:
+    """The end of Gauss-Newton."""
+
+    equations: NormalEquations
+    steps: int                         # number of steps taken
+    converged: bool                    # whether the error had stopped to decrease
+
+    @property
+    def state(self) -> State:
+        """The State where the error is smallest."""
+        return self.equations.state
+
+    @property
+    def error(self):
+        """Half the sum of squared whitened errors there."""
+        return self.equations.error
+
+
+def optimize(problem, state, max_steps=MAX_GAUSS_NEWTON_STEPS, by_gtsam=False,
+             converged=CONVERGED):
+    """The Optimum of a Problem from a State.
+
+    It ends where the error decreases by at most `converged` times (1 + error). Raises DatasetError
+    if the measurements do not determine every variable.
+    """
+    equations, steps, ended = NormalEquations(problem, state), 0, False
+    while steps < max_steps and not ended:
+        steps += 1
+        state, error = equations.state, equations.error
+        step = None if by_gtsam else equations.step()
+        equations = None                                   # of a long drive they are large
+        if step is None:
+            step = gtsam_step(problem, state)
+        for _ in range(MAX_HALVINGS):
+            equations = NormalEquations(problem, retract(problem, state, step))
+            if equations.error <= (1 + ROUNDING) * error:
+                break
+            step = step / 2
+        else:
+            equations, ended = NormalEquations(problem, state), True
+            break
+        ended = error - equations.error <= converged * (1 + error)
+    return Optimum(equations, steps, ended)
 
 
 def gtsam_step(problem, state):
@@ -32,131 +78,74 @@ def gtsam_step(problem, state):
     root then decides whether the measurements determine every variable. Raises DatasetError if they
     do not.
     """
-    linear, ordering = linearize(problem, state), gtsam.Ordering(problem.measurements.ordering)
-    if problem.active.any():
-        ordering.push_back(C(0))
+    m, linear = problem.measurements, linearize(problem, state)
+    variables, ordering = _keys(problem), gtsam.Ordering()
+    for i in [*np.argsort(m.structure.position), *range(len(m.structure.position), len(variables))]:
+        ordering.push_back(variables[i])
     try:
         solution = linear.eliminateMultifrontal(ordering).optimize()
     except RuntimeError:
         try:
             solution = linear.eliminateSequential(ordering, gtsam.EliminateQR).optimize()
         except RuntimeError as error:             # GTSAM's, with the variable and much advice
-            m = problem.measurements
             raise DatasetError(
                 f"{m.dataset.name}: expected measurements that determine every pose and landmark; "
                 f"these do not determine {_variable(m, str(error))}") from None
-    keys = [ordering.at(i) for i in range(ordering.size())]
-    return solution.vector(gtsam.KeyVector(keys))
+    n = len(m.structure.diagonal)
+    step = np.zeros(n + problem.active.sum())
+    step[np.r_[m.structure.unknowns, n:len(step)]] = solution.vector(gtsam.KeyVector(variables))
+    return step
+
+
+def _keys(problem):
+    """List of GTSAM's keys of all variables, those of the calibration last, if there are any."""
+    return variable_keys(problem.measurements) + [C(0)] * bool(problem.active.any())
 
 
 def linearize(problem, state):
     """The gtsam.GaussianFactorGraph of a Problem at a State."""
-    m, graph = problem.measurements, gtsam.GaussianFactorGraph()
-    graph.push_back(nonlinear_graph(problem).linearize(values(problem, state)))
-    active = problem.active[WHEELS]
-    e, J, J_c = odometry_error(problem.odometry, state.poses, state.c[WHEELS])
-    U, _ = problem.odometry.whitening(problem.noise.slip)
-    J_c = U @ (J_c[:, :, active] * problem.sigma[WHEELS][active])
-    row, columns = np.arange(len(e)), np.arange(active.sum())
-    _add(graph, problem, X, row, row + 1, (U @ e[..., None])[..., 0], U @ J, J_c, columns)
-    for symbol, f, first in zip((L, P, A), linearize_measurements(problem, state),
-                                (0, 0, len(m.marker))):
-        if symbol is P or not _is_native(problem, RANGES if symbol is A else SIGHTINGS):
-            _add(graph, problem, symbol, f.row, f.landmark - first, f.e, f.J, f.J_c, f.columns)
+    equations, graph = NormalEquations(problem, state), gtsam.GaussianFactorGraph()
+    structure, variables, q = equations.structure, _keys(problem), problem.active.sum()
+    width = np.r_[2 + structure.is_pose, q].tolist()
+    odometry, _ = linearize_odometry(problem, state)(problem.noise.slip)
+    for pairs, f in zip(structure.factors, (odometry, *equations.linearized)):
+        by_c = np.zeros((*f.e.shape, q))
+        by_c[:, :, f.columns] = f.J_c
+        for (i, j), e, J, J_c in zip(pairs[f.index].tolist(), f.e, f.J, by_c):
+            calibration = (C(0), J_c) if len(f.columns) else ()
+            second = () if i == j else (variables[j], J[:, 3:3 + width[j]])
+            graph.add(variables[i], J[:, :width[i]], *second, *calibration, -e)
+    root = np.sqrt(np.r_[equations.priors.H, np.ones(q)])
+    e = equations.priors.border[:, -1] / np.maximum(root, 1 / WEAK_SIGMA)
+    first = np.r_[structure.rows(slice(None))[:, 0], len(structure.diagonal)]
+    for i, key in enumerate(variables):
+        if root[first[i]]:
+            own = slice(first[i], first[i] + width[i])
+            graph.add(key, np.diag(root[own]), -e[own])
     return graph
 
 
-def _add(graph, problem, symbol, row, other, e, J, J_c, columns):
-    """Add factors of whitened errors e (m, d) to a gtsam.GaussianFactorGraph.
+def as_gtsam(result):
+    """The gtsam.NonlinearFactorGraph of a SlamResult, linearised at its gtsam.Values, and these.
 
-    They are between the frames `row` (m,) and variables `other` (m,) of a symbol, with derivatives
-    J (m, d, p) by both and J_c (m, d, u) by the entries `columns` (u,) of the calibration.
+    Priors, odometry, sightings, ranges and factors of one's own, whitened and weighted by noise,
+    gates and kernels of the result, each a gtsam.LinearContainerFactor; `slam.own` has the keys.
+    The values are those of greatest density, at which nothing is averaged over the noise.
     """
-    by_c = np.zeros((*e.shape, problem.active.sum()))
-    by_c[:, :, columns] = J_c
-    for i, j, error, jacobian, last in zip(row.tolist(), other.tolist(), e, J, by_c):
-        calibration = (C(0), last) if len(columns) else ()
-        graph.add(X(i), jacobian[:, :3], symbol(j), jacobian[:, 3:], *calibration, -error)
-
-
-def _is_native(problem, kind):
-    """Whether the entries `kind`, a slice, of c are known to be those of Vehicle()."""
-    ideal = stated_calibration(Vehicle(), problem.measurements.antenna).stated
-    return not problem.active[kind].any() \
-        and (problem.measurements.calibration.stated == ideal)[kind].all()
-
-
-def nonlinear_graph(problem):
-    """The gtsam.NonlinearFactorGraph of a Problem: sightings, ranges and priors, with kernels."""
-    accepted, noise, model = problem.accepted, problem.noise, gtsam.noiseModel
-    m, graph = problem.measurements, gtsam.NonlinearFactorGraph()
-    s, weight = m.sightings, accepted.sighting_weight * m.as_pose
-    roots = m.sighting_roots[0] * (np.sqrt(weight) / noise.sightings)[:, None, None]
-    used = np.flatnonzero(weight) if _is_native(problem, SIGHTINGS) else []
-    for i, j, z, root in zip(s.row[used].tolist(), m.marker_row[used].tolist(), s.z[used].tolist(),
-                             roots[used]):
-        graph.add(gtsam.BetweenFactorPose2(X(i), L(j), gtsam.Pose2(*z), _robust(
-            accepted.sighting_kernel, model.Gaussian.SqrtInformation(root, False))))
-    if _is_native(problem, RANGES):
-        r, used, kernel = m.ranges, np.flatnonzero(accepted.range_weight), accepted.range_kernel
-        sigmas = noise.ranges * r.sigma[used] / np.sqrt(accepted.range_weight[used])
-        distances = r.distance[used] - accepted.range_bias * sigmas
-        for i, k, distance, sigma in zip(r.row[used].tolist(), r.antenna[used].tolist(),
-                                         distances.tolist(), sigmas.tolist()):
-            graph.add(gtsam.RangeFactor2D(
-                X(i), A(k), distance, _robust(kernel, model.Isotropic.Sigma(1, sigma))))
-    _add_priors(graph, problem)
-    return graph
-
-
-def _add_priors(graph, problem):
-    """Add the priors of all variables of a Problem to a gtsam.NonlinearFactorGraph."""
-    m, model, q = problem.measurements, gtsam.noiseModel, int(problem.active.sum())
-    graph.add(gtsam.PriorFactorPose2(
-        X(0), gtsam.Pose2(), model.Diagonal.Sigmas(m.origin_sigma)))
-    if q:
-        graph.add(gtsam.PriorFactorVector(C(0), np.zeros(q), model.Unit.Create(q)))
-    for j in problem.accepted.unsupported:
-        graph.add(gtsam.PriorFactorPose2(
-            L(j), gtsam.Pose2(), model.Isotropic.Sigma(3, WEAK_SIGMA)) if m.oriented[j]
-            else gtsam.PriorFactorPoint2(
-                P(j), np.zeros(2), model.Isotropic.Sigma(2, WEAK_SIGMA)))
-    for k, position in enumerate(m.guess):
-        graph.add(gtsam.PriorFactorPoint2(
-            A(k), position, model.Isotropic.Sigma(2, GUESS_PRIOR_SIGMA)))
-
-
-def _robust(kernel, noise):
-    """The gtsam noise model `noise` with a robust kernel, if it is not None."""
-    return gtsam.noiseModel.Robust.Create(kernel, noise) if kernel else noise
-
-
-def values(problem, state):
-    """The gtsam.Values of a State, the calibration in sigmas from what is stated."""
-    measurements, active, entries = problem.measurements, problem.active, gtsam.Values()
-    for i, pose in enumerate(state.poses.tolist()):
-        entries.insert(X(i), gtsam.Pose2(*pose))
-    for j, (marker, oriented) in enumerate(zip(state.markers, measurements.oriented)):
-        if oriented:
-            entries.insert(L(j), gtsam.Pose2(*marker))
-        else:
-            entries.insert(P(j), gtsam.Point2(*marker[:2]))
-    for k, antenna in enumerate(state.antennas):
-        entries.insert(A(k), gtsam.Point2(*antenna))
-    if active.any():
-        difference = state.c - measurements.calibration.stated
-        entries.insert(C(0), difference[active] / problem.sigma[active])
-    return entries
+    problem, state = result.fit.problem, result.fit.state
+    values = gtsam_values(problem, state)
+    return gtsam.LinearContainerFactor.ConvertLinearGraph(
+        linearize(problem, state), values), values
 
 
 def _variable(measurements, message):
     """The undetermined variable that GTSAM's message names, in the words of the files."""
-    m, symbol = measurements, re.search(r"Symbol: ([aclpx])(\d+)", message)
-    if symbol is None:
-        return "one of them"
-    if symbol[1] == "c":
-        return "the calibration of the sensors"
-    name, ids = {"x": ("pose", m.frame + 1), "l": ("the pose of marker", m.marker),
-                 "p": ("the position of marker", m.marker),
-                 "a": ("the position of antenna", m.antenna)}[symbol[1]]
-    return f"{name} {ids[int(symbol[2])]}"
+    symbol = re.search(r"Symbol: ([aclpx])(\d+)", message)
+    if symbol is None or symbol[1] == "c":
+        return "the calibration of the sensors" if symbol else "one of them"
+    ids = np.r_[measurements.marker, measurements.antenna]
+    number = {index % INDICES: index for index in ids.tolist()}
+    name = {"x": "pose", "l": "the pose of marker", "p": "the position of marker",
+            "a": "the position of antenna"}[symbol[1]]
+    index = int(symbol[2])
+    return f"{name} {index + 1 if symbol[1] == 'x' else number[index]}"

@@ -2,10 +2,7 @@
 
 On a long drive odometry loses the heading. Therefore its first part is solved by the robust rounds
 of stage 5. Odometry with the wheels that this part calibrated then predicts the poses of a longer
-part, and so on.
-
-Trilateration finds the possible positions of an antenna from its ranges, robustly. Stage 7 uses it
-again for the antennas in doubt.
+part, and so on. Stage 7 uses trilateration again for the antennas in doubt.
 """
 
 from dataclasses import dataclass
@@ -15,10 +12,10 @@ import numpy as np
 from slamlib import odometry, se2
 from slamlib.sightings import consensus, evenly_chosen
 from slamlib.slam.calibration import ANTENNAS, HEIGHT, OFFSET, SCALE, SIZE, WHEELS
-from slamlib.slam.factors import MIN_DISTANCE, camera_poses, tag_positions
+from slamlib.slam.factors import MIN_DISTANCE, camera_poses, preintegrate_odometry, tag_positions
 from slamlib.slam.fit import narrow_kernels
-from slamlib.slam.measurements import GUESS_PRIOR_SIGMA, Noise, measure, with_known
-from slamlib.slam.problem import build_problem, preintegrate_odometry, state_from_arrays
+from slamlib.slam.linear import build_problem, state_from_arrays
+from slamlib.slam.measurements import GUESS_PRIOR_SIGMA, measure
 
 MAX_ODOMETRY_SIGMA = 0.5     # rad, of odometry's heading at the end of a drive's first part
 MAX_FIRST_PART = 1.5         # length of the first part over that which odometry can predict
@@ -44,17 +41,15 @@ def initial_state(measurements, model, preintegrate=preintegrate_odometry):
 
     Raises DatasetError as `optimize`, for the first part of a long drive.
     """
-    dataset, noise = measurements.dataset, with_known(Noise(), measurements.dataset.vehicle)
     part, state = None, None
-    for count in part_lengths(dataset):
-        whole = count == len(dataset.ticks)
-        earlier, part = part, measurements if whole else measure(dataset.first(count))
-        state = odometry_state(part, model) if earlier is None else extended(
-            part, model, earlier, state)
-        if not whole:
-            problem = build_problem(part, model, noise, preintegrate=preintegrate)
-            state = narrow_kernels(problem, state)
-    return state
+    *counts, _ = part_lengths(measurements.dataset)
+    frame = measurements.frame
+    for count in counts:
+        earlier, part = part, measure(
+            measurements.dataset.first(count), frame[frame < count], measurements.jumps)
+        state = odometry_state(part, model, earlier, state)
+        state = narrow_kernels(build_problem(part, model, preintegrate=preintegrate), state)
+    return odometry_state(measurements, model, part, state)
 
 
 def part_lengths(dataset):
@@ -72,38 +67,32 @@ def part_lengths(dataset):
     return ends
 
 
-def odometry_state(measurements, model, **landmarks):
+def odometry_state(measurements, model, part=None, solved=None, **landmarks):
     """The State with poses by odometry of the model "arc" or "euler".
 
-    `landmarks` are the keywords `markers` and `antennas` of `state_from_poses`.
+    Of Measurements of which a first `part` has the State `solved`, the later poses are those of
+    odometry from the last pose of the part, with its wheels. `landmarks` are the keywords `markers`
+    and `antennas` of `state_from_poses`.
     """
-    d, frame = measurements.dataset, measurements.frame
-    poses, covariances = odometry.first_order(d.ticks, d.vehicle, model=model)
-    return state_from_poses(measurements, poses[frame], covariances[frame], **landmarks)
-
-
-def extended(measurements, model, part, solved):
-    """The State of Measurements of which a first `part` has the State `solved`.
-
-    Later poses are those of odometry from the last pose of the part, with its wheels.
-    """
-    d, frame, last = measurements.dataset, measurements.frame, part.frame[-1]
+    d, frame, jumps = measurements.dataset, measurements.frame, measurements.jumps
+    if part is None:
+        poses, covariances = odometry.first_order(d.ticks, d.vehicle, model=model)
+        return state_from_poses(measurements, jumps.mended(frame, poses[frame]),
+                                covariances[frame], **landmarks)
+    last, stated = part.frame[-1], measurements.calibration.stated
     poses, covariances = odometry.first_order(
         d.ticks[last:], d.vehicle.with_wheel(solved.c[WHEELS]), solved.poses[-1], np.zeros((3, 3)),
         model=model)
-    old = np.searchsorted(part.frame, frame[frame <= last])
-    new = frame[frame > last] - last
+    old, new = np.searchsorted(part.frame, frame[frame <= last]), frame[frame > last] - last
+    poses = np.concatenate([solved.poses[old], poses[new]])
     return state_from_poses(
-        measurements, np.concatenate([solved.poses[old], poses[new]]),
+        measurements, jumps.mended(frame, poses, last),
         np.concatenate([np.zeros((len(old), 3, 3)), covariances[new]]),
-        measurements.calibration.taken_from(
-            part.calibration, solved.c, measurements.calibration.stated))
+        measurements.calibration.taken_from(part.calibration, solved.c, stated), **landmarks)
 
 
 def consensus_markers(measurements, in_world, covariances):
-    """(k, 3) poses of the markers, each by one of its sightings.
-
-    It is the most certain one with at least half the maximum support (`sightings.consensus`).
+    """(k, 3) poses of the markers, each by one of its sightings (`sightings.consensus`).
 
     `in_world` (s, 3) and `covariances` (s, 3, 3) are the marker poses by each sighting.
     """
@@ -150,10 +139,9 @@ class AntennaRanges:
 
 
 def ranges_by_antenna(measurements, poses, covariances, c, factor=1.0):
-    """List of the AntennaRanges of every antenna.
+    """List of the AntennaRanges of every antenna; parameters as of `state_from_poses`.
 
-    Poses (f, 3), m and rad, and covariances (f, 3, 3) of the frames are in world axes; c (p,) is
-    the calibration. `factor` multiplies the sigmas of the ranges.
+    `factor` multiplies the sigmas of the ranges.
     """
     r, by_antenna, positions = measurements.ranges, [], tag_positions(measurements, poses, c)
     slant = (r.distance - c[OFFSET] - c[ANTENNAS][r.antenna]) / c[SCALE]
@@ -246,9 +234,8 @@ def _cauchy_derivatives(e):
 def second_moment(ranges, estimate):
     """Second moment (2, 2), m^2, of an antenna's position about its estimate (2,) by AntennaRanges.
 
-    For an antenna that its ranges do not determine. The posterior, the Cauchy likelihood of the
-    ranges times the prior of the guess, is summed over a polar grid. The cost is added range by
-    range: an array of the grid times all ranges would take 500 MB.
+    The posterior, the Cauchy likelihood of the ranges times the prior of the guess, is summed over
+    a polar grid, range by range: an array of the grid times all ranges would take 500 MB.
     """
     centre = ranges.positions.mean(0)
     longest = np.maximum(ranges.distance, 3 * ranges.sigma).max()

@@ -1,8 +1,10 @@
-"""Stage 3: the normal equations H delta = -g of a problem at a state, and the Laplace evidence.
+"""Stages 2 and 3: the factor graph as records, its normal equations H delta = -g, the evidence.
 
-With whitened errors e and derivatives J of all factors, H = sum J^T J and g = sum J^T e. The
-calibration c touches nearly all factors and is eliminated last: with the information matrix
-[[H, B], [B^T, D]] and the gradient [g, g_c], only H, which is sparse, is decomposed, and
+Variables (`State`) are the frames' poses X_i, the markers L_j (points P_j if no sighting has a
+heading), the antennas A_k, and the calibration c. With whitened errors e and derivatives J of all
+factors, H = sum J^T J and g = sum J^T e. The calibration touches nearly all factors and is
+eliminated last: with the information matrix [[H, B], [B^T, D]] and the gradient [g, g_c], only H,
+which is sparse, is decomposed, and
 
     S = D - B^T H^-1 B,    delta_c = -S^-1 (g_c - B^T H^-1 g),    delta = -H^-1 (g + B delta_c).
 
@@ -15,15 +17,103 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
+from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
-from slamlib import se2
-from slamlib.slam.calibration import WHEELS
-from slamlib.slam.factors import linearize_measurements, odometry_error
-from slamlib.slam.measurements import GUESS_PRIOR_SIGMA, WEAK_SIGMA
-from slamlib.slam.problem import Problem, State
+from slamlib import odometry, se2
+from slamlib.slam.factors import (
+    LinearizedFactors,
+    OdometryFactors,
+    linearize_measurements,
+    linearize_odometry,
+    preintegrate_odometry,
+)
+from slamlib.slam.measurements import (
+    GUESS_PRIOR_SIGMA,
+    WEAK_SIGMA,
+    AcceptedMeasurements,
+    Measurements,
+    Noise,
+    with_known,
+)
+from slamlib.slam.own import linearized_own
 
 MAX_CACHED_SLIPS = 3         # values of the slip whose sums are kept in memory
+
+
+@dataclass(frozen=True)
+class State:
+    """Values of all variables."""
+
+    poses: np.ndarray        # (f, 3) m, m, rad; headings continuous
+    markers: np.ndarray      # (k, 3), heading 0 where a marker is a point
+    antennas: np.ndarray     # (a, 2) m
+    c: np.ndarray            # (p,) of the calibration, in the units of its entries
+
+
+def state_from_arrays(measurements, poses, markers, antennas, c):
+    """The State of poses (f, 3), markers (k, 3), antennas (a, 2) and calibration c (p,).
+
+    Headings become continuous: between two frames they turn by odometry's angle, up to half a turn.
+    """
+    turn, poses = np.diff(measurements.path[measurements.frame, 2]), np.array(poses, dtype=float)
+    correction = se2.wrap(np.diff(poses[:, 2]) - turn)
+    poses[:, 2] = odometry.cumulative(turn + correction, se2.wrap(poses[0, 2]))
+    markers = np.array(markers, dtype=float)
+    markers[~measurements.oriented, 2] = 0
+    return State(poses=poses, markers=markers, antennas=np.asarray(antennas, dtype=float),
+                 c=np.asarray(c, dtype=float))
+
+
+def retract(problem, state, delta):
+    """The State after a step delta (n + q,) in m and rad, and in sigmas of the q unknowns of c.
+
+    Poses and markers move in their own axes: X becomes X delta.
+    """
+    m, structure, c = problem.measurements, problem.measurements.structure, state.c.copy()
+    c[problem.active] += problem.sigma[problem.active] * delta[len(structure.diagonal):]
+    poses, markers, antennas = np.split(
+        delta[structure.rows(slice(None))], np.cumsum([len(m.frame), len(m.marker)]))
+    return state_from_arrays(
+        m, se2.compose(state.poses, poses), se2.compose(state.markers, markers),
+        state.antennas + antennas[:, :2], c)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """The factor graph."""
+
+    odometry: OdometryFactors
+    accepted: AcceptedMeasurements
+    noise: Noise
+    sigma: np.ndarray        # (p,) of the prior of the calibration, 0 of what is known
+    released: frozenset = frozenset()    # groups of the calibration beyond their stated sigmas
+
+    @property
+    def measurements(self) -> Measurements:
+        """Those of which some are accepted."""
+        return self.accepted.measurements
+
+    @property
+    def active(self):
+        """(p,) bool, entries of the calibration that are among the q unknowns."""
+        return self.sigma > 0
+
+
+def build_problem(measurements, model, noise=None, wheel=None, preintegrate=preintegrate_odometry):
+    """The Problem of all Measurements with weight 1, without kernels, and of a Noise.
+
+    Without a Noise it is the typical one. Parameters that the Vehicle gives replace its own.
+    `preintegrate` makes the OdometryFactors of steps of the `model`, "arc" or "euler", linearised
+    at `wheel` (3,) m, None for the stated one; studies pass other functions. The calibration is as
+    stated.
+    """
+    return Problem(
+        odometry=preintegrate(measurements, model, wheel),
+        accepted=AcceptedMeasurements(
+            measurements=measurements, weight=measurements.unit_weights),
+        noise=with_known(noise or Noise(), measurements.dataset.vehicle),
+        sigma=measurements.calibration.sigma)
 
 
 @dataclass(frozen=True)
@@ -40,8 +130,6 @@ class LinearSolution:
     """The normal equations solved."""
 
     delta: np.ndarray        # (n + q,) the step, in sigmas of the calibration
-    lu: object               # decomposition of H
-    by_c: np.ndarray         # (n, q) H^-1 B
     S: np.ndarray            # (q, q) information about the calibration
     gradient: np.ndarray     # (q,) by the calibration, the other unknowns eliminated
     log_determinant: float   # of the information matrix
@@ -69,8 +157,11 @@ class NormalEquations:
 
     @cached_property
     def linearized(self):
-        """The LinearizedMeasurements of sightings of poses, of points, and of ranges."""
-        return linearize_measurements(self.problem, self.state)
+        """The LinearizedFactors of sightings of poses, of points, of ranges, and of one's own."""
+        e, J, error = linearized_own(self.problem, self.state)
+        return *linearize_measurements(self.problem, self.state), LinearizedFactors(
+            index=np.arange(len(e)), e=e, J=J, J_c=np.zeros((*e.shape, 0)),
+            columns=np.zeros(0, int), weight=np.ones(len(e)), error=error)
 
     def step(self):
         """The Gauss-Newton step delta (n + q,), or None where H is singular to rounding."""
@@ -78,30 +169,29 @@ class NormalEquations:
         solution = linear_solution(self.structure, H, border)
         return solution.delta if solution is not None and solution.decrease >= 0 else None
 
-    def sums(self, noise, consistency=(1.0, 1.0, 1.0)):
+    def sums(self, noise, consistent=False):
         """Data of H, border, squared error at the state, and sum log|Q| of the odometry noise Q.
 
-        `consistency` (3,) divides the contribution of each kind of `linearized` by its consistency
-        factor, which corrects the bias of a robust kernel (`consistency_factors`).
+        If `consistent`, measurements count over the `consistency_factor` of their robust kernel.
         """
         odometry, log_determinant = self._odometry(noise.slip)
         H, border = odometry.H.copy(), odometry.border + self.priors.border
         H[self.structure.diagonal] += self.priors.H
         squared = odometry.squared + self.priors.squared
-        sightings = (self.problem.noise.sightings / noise.sightings)**2
-        ranges = (self.problem.noise.ranges / noise.ranges)**2
-        for group, ratio, divisor in zip(
-                self._measurement_groups, (sightings, sightings, ranges), consistency):
-            if group is not None:
-                ratio = ratio / divisor
-                H += group.H if ratio == 1 else ratio * group.H
-                border += ratio * group.border
-                squared += ratio * group.squared
+        accepted, given = self.problem.accepted, self.problem.noise
+        sightings = (accepted.sighting_kernel, given.sightings / noise.sightings)
+        ranges = (accepted.range_kernel, given.ranges / noise.ranges)
+        kinds = sightings, sightings, ranges, (None, 1.0)
+        for group, (kernel, ratio), size in zip(self._measurement_groups, kinds, (3, 2, 1, 1)):
+            share = ratio**2 / (consistency_factor(kernel, size) if consistent else 1.0)
+            H += share * group.H
+            border += share * group.border
+            squared += share * group.squared
         return H, border, squared, log_determinant
 
     def counts(self):
         """Numbers of accepted errors of sightings and of ranges."""
-        poses, points, ranges = (f.e.shape[1] * np.sum(f.weight) for f in self.linearized)
+        poses, points, ranges = (f.e.shape[1] * np.sum(f.weight) for f in self.linearized[:3])
         return poses + points, ranges
 
     @cached_property
@@ -109,14 +199,15 @@ class NormalEquations:
         """The Group of the priors, whose H and D are diagonal."""
         problem, m, state = self.problem, self.problem.measurements, self.state
         v, active, n = m.variables, problem.active, len(self.structure.diagonal)
+        weak = problem.accepted.unsupported
         parts = [(v.frames[:1], se2.log(state.poses[:1]), m.origin_sigma),
-                 (v.antennas, state.antennas - m.guess, GUESS_PRIOR_SIGMA)]
-        parts += [(v.markers[[j]], state.markers[[j], :2 + m.oriented[j]], WEAK_SIGMA)
-                  for j in problem.accepted.unsupported]
+                 (v.antennas, state.antennas - m.guess, GUESS_PRIOR_SIGMA),
+                 (v.markers[weak], state.markers[weak], WEAK_SIGMA)]
         H, e = np.zeros((2, n))
         for variables, difference, sigma in parts:
             rows = self.structure.rows(variables, difference.shape[1])
             H[rows], e[rows] = np.broadcast_to(sigma, difference.shape)**-2.0, difference
+        H[self.structure.rows(~self.structure.is_pose)[:, 2]] = 1       # what points do not have
         e_c = ((state.c - m.calibration.stated)[active] / problem.sigma[active])
         border = np.zeros((n + len(e_c), len(e_c) + 1))
         border[:n, -1], border[n:, -1] = H * e, e_c
@@ -125,46 +216,40 @@ class NormalEquations:
 
     @cached_property
     def _measurement_groups(self):
-        """The Group of each kind of `linearized`, None if there are no such measurements."""
-        return [self._group(places[f.index], rows[f.index], f.J, f.J_c, f.columns, f.e)
-                if len(f.row) else None
-                for f, (places, rows) in zip(
-                    self.linearized, self.problem.measurements.factor_places[1:])]
+        """The Group of each kind of `linearized`."""
+        return [self._group(*each) for each in enumerate(self.linearized, start=1)]
 
     @cached_property
     def _odometry(self):
         """Function from a slip to the Group of the odometry and sum log|Q|."""
-        factors, active = self.problem.odometry, self.problem.active[WHEELS]
-        places = self.problem.measurements.factor_places[0]
-        e, J, J_c = odometry_error(factors, self.state.poses, self.state.c[WHEELS])
-        J_c = J_c[:, :, active] * self.problem.sigma[WHEELS][active]
+        linearized = linearize_odometry(self.problem, self.state)
 
         @lru_cache(maxsize=MAX_CACHED_SLIPS)
         def odometry(slip):
-            U, log_determinant = factors.whitening(slip)
-            return self._group(*places, U @ J, U @ J_c, np.arange(active.sum()),
-                               (U @ e[..., None])[..., 0]), log_determinant
+            factors, log_determinant = linearized(slip)
+            return self._group(0, factors), log_determinant
 
         return odometry
 
-    def _group(self, places, rows, J, J_c, columns, e):
-        """The Group of whitened errors e (m, d), with derivatives J (m, d, p) at `rows` (m, p).
-
-        J_c (m, d, u) are those by the entries `columns` (u,) of the calibration.
-        """
-        n, q = len(self.structure.diagonal), self.problem.active.sum()
+    def _group(self, kind, factors):
+        """The Group of LinearizedFactors of the kind with this number in `structure.factors`."""
+        structure, q = self.structure, self.problem.active.sum()
+        n, e, J, J_c = len(structure.diagonal), factors.e, factors.J, factors.J_c
         J_t, last = np.swapaxes(J, 1, 2), np.concatenate([J_c, e[..., None]], axis=2)
-        border, product = np.zeros((n + q, q + 1)), J_t @ last
-        for column, values in zip((*columns, q), np.moveaxis(product, 2, 0)):
-            border[:n, column] = _summed(rows, values, n)
-        border[n + columns[:, None], (*columns, q)] = np.tensordot(J_c, last, ([0, 1], [0, 1]))
-        return Group(_summed(places, J_t @ J, len(self.structure.indices)), border,
-                     float(np.sum(e**2)))
+        squares = (J_t @ J).reshape(-1, 2, 3, 2, 3).swapaxes(2, 3).reshape(-1, 9)
+        H = _summed(structure.blocks[kind][factors.index], squares, len(structure.indices))
+        border, columns = np.zeros((n + q, q + 1)), np.r_[factors.columns, q]
+        border[:n, columns] = _summed(
+            structure.position[structure.factors[kind][factors.index]],
+            (J_t @ last).reshape(-1, 3 * len(columns)), n // 3).reshape(n, -1)
+        border[n + columns[:-1, None], columns] = np.tensordot(J_c, last, ([0, 1], [0, 1]))
+        return Group(H.ravel(), border, float(np.sum(e**2)))
 
 
-def _summed(places, values, size):
-    """(size,) sums of the values at each place."""
-    return np.bincount(places.ravel(), values.ravel(), size).astype(float, copy=False)
+def _summed(number, values, size):
+    """(size, w) sums of the rows of values (m j, w) with each `number` (m, j)."""
+    return csc_array((np.ones(number.size), number.ravel(), np.arange(number.size + 1)),
+                     (size, number.size)) @ values
 
 
 def decomposition(H):
@@ -177,10 +262,7 @@ def decomposition(H):
 
 
 def linear_solution(structure, H, border):
-    """The LinearSolution of normal equations, None where they are singular to rounding.
-
-    From the data of H and the `border` of the Groups' sum.
-    """
+    """The LinearSolution by data of H and `border`, None where they are singular to rounding."""
     n, lu = len(structure.diagonal), decomposition(structure.matrix(H))
     pivots = np.zeros(1) if lu is None else lu.U.diagonal()
     if not (pivots > 0).all():                           # H is not positive definite
@@ -193,9 +275,9 @@ def linear_solution(structure, H, border):
         return None
     c = -np.linalg.solve(S, gradient)
     delta = np.concatenate([-solved[:, -1] - solved[:, :-1] @ c, c])
-    return LinearSolution(delta=delta, lu=lu, by_c=solved[:, :-1], S=S, gradient=gradient,
-                    log_determinant=log_determinant + np.sum(np.log(pivots)),
-                    decrease=-float(border[:, -1] @ delta) / 2)
+    return LinearSolution(delta=delta, S=S, gradient=gradient,
+                          log_determinant=log_determinant + np.sum(np.log(pivots)),
+                          decrease=-float(border[:, -1] @ delta) / 2)
 
 
 def laplace_approximation(equations, noise):
@@ -210,8 +292,7 @@ def laplace_approximation(equations, noise):
     weights: only problems on the same accepted measurements can be compared. The log evidence is
     minus infinity where the equations are singular to rounding.
     """
-    H, border, squared, log_determinant = equations.sums(
-        noise, consistency_factors(equations.problem.accepted))
+    H, border, squared, log_determinant = equations.sums(noise, consistent=True)
     solution = linear_solution(equations.structure, H, border)
     sightings, ranges = equations.counts()
     if solution is None:
@@ -219,13 +300,6 @@ def laplace_approximation(equations, noise):
     return solution.delta, -squared / 2 + solution.decrease - log_determinant / 2 \
         - solution.log_determinant / 2 \
         - sightings * np.log(noise.sightings) - ranges * np.log(noise.ranges)
-
-
-def consistency_factors(accepted):
-    """`consistency_factor` (3,) of sightings of poses, of points, and of ranges."""
-    return (consistency_factor(accepted.sighting_kernel, 3),
-            consistency_factor(accepted.sighting_kernel, 2),
-            consistency_factor(accepted.range_kernel))
 
 
 @lru_cache(maxsize=8)

@@ -1,24 +1,30 @@
-"""Stage 1: all measurements of a dataset as arrays, their weights, and their noise.
+"""Stage 1: all measurements of a dataset as arrays, their weights, their noise and their structure.
 
 Frames (keyframes) are the encoder poses that are variables X_i of the graph: the first, the last,
 and each one with a sighting or a range. Measurements are numbered: first the s sightings, then the
-r ranges.
+r ranges. Of the three noise parameters, those that a dataset's Vehicle gives are known; the others
+are learned from the drive.
 
-Noise has three parameters: slip, the standard deviation of a wheel's slip after one metre, and two
-factors on the standard deviations that the files state for sightings and for ranges. Those that a
-dataset's Vehicle gives are known; the others are learned from the drive.
+Variables are numbered: the frames' poses, the markers, the antennas. Each has three unknowns, in
+the order in which they are eliminated, so that the information matrix H consists of blocks (3, 3);
+the third unknown of a point has no derivatives. The Structure of H is the same for all states,
+kernels and values of the noise.
 """
 
+from collections import namedtuple
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import A, L, P, X
+from scipy import sparse
+from scipy.sparse.linalg import splu
 
 from slamlib import odometry, se2
 from slamlib.dataset import Dataset, UwbReadings
 from slamlib.increments import SLIP_BOUNDS, TYPICAL_SLIP
+from slamlib.odometry_gate import NO_JUMPS, Jumps
 from slamlib.sightings import (
     MAX_HEADING_SIGMA,
     MIN_MEASUREMENT_SIGMA,
@@ -26,7 +32,7 @@ from slamlib.sightings import (
     sightings_by_frame,
 )
 from slamlib.slam.calibration import Calibration, stated_calibration
-from slamlib.slam.structure import Variables, block_structure
+from slamlib.slam.own import connected, poses_of
 
 NOISE_KEYS = ("slip", "marker_noise_factor", "range_noise_factor")      # of a Vehicle, as in Noise
 
@@ -47,7 +53,7 @@ class Noise:
 
     @property
     def logarithms(self):
-        """(3,) natural logarithms of slip and both factors."""
+        """(3,) of slip and both factors."""
         return np.log([self.slip, self.sightings, self.ranges])
 
     @classmethod
@@ -70,16 +76,89 @@ def is_known(vehicle):
 
 def with_known(noise, vehicle):
     """The Noise with the parameters that a Vehicle gives; the slip is at least 1e-5 sqrt(m)."""
-    known = (getattr(vehicle, key) for key in NOISE_KEYS)
-    slip, sightings, ranges = (
-        value if stated is None else stated
-        for stated, value in zip(known, (noise.slip, noise.sightings, noise.ranges)))
-    return Noise(max(slip, SLIP_BOUNDS[0]), sightings, ranges)
+    slip, *factors = (
+        value if getattr(vehicle, key) is None else getattr(vehicle, key)
+        for key, value in zip(NOISE_KEYS, (noise.slip, noise.sightings, noise.ranges)))
+    return Noise(max(slip, SLIP_BOUNDS[0]), *factors)
 
 
 def square_root_information(covariance):
     """Upper triangular U (..., d, d) with U^T U = C^-1, from covariances C: U e is whitened."""
     return np.swapaxes(np.linalg.cholesky(np.linalg.inv(covariance)), -1, -2)
+
+
+Variables = namedtuple("Variables", "frames markers antennas")     # numbers of X_i, L_j, A_k
+
+
+@dataclass(frozen=True)
+class Structure:
+    """Places of v variables and of the blocks that connect them in a matrix (3 v, 3 v)."""
+
+    is_pose: np.ndarray      # (v,) bool, the others are points
+    position: np.ndarray     # (v,) of every variable in the elimination
+    indices: np.ndarray      # (b,) position of the other variable of a block, row by row
+    indptr: np.ndarray       # (v + 1,) where each row of blocks begins
+    factors: list            # of (m, 2) variables of each kind of factor
+    blocks: list             # of (m, 4) numbers of their blocks
+
+    def rows(self, variables, width=3):
+        """Rows (m, width) of the unknowns of `variables` (m,)."""
+        return 3 * self.position[variables][:, None] + np.arange(width)
+
+    def rows_of_each(self, variables):
+        """List of the rows (d,), 3 of a pose or 2 of a point, of each of `variables` (m,)."""
+        return [self.rows([i], 2 + self.is_pose[i])[0] for i in variables]
+
+    @property
+    def unknowns(self):
+        """Rows of the unknowns of all variables, in the order of their numbers."""
+        return self.rows(slice(None))[np.arange(3) < 2 + self.is_pose[:, None]]
+
+    @cached_property
+    def diagonal(self):
+        """(n,) places of the diagonal in the data of blocks."""
+        row = np.repeat(np.arange(len(self.position)), np.diff(self.indptr))
+        return (9 * np.flatnonzero(row == self.indices)[:, None] + [0, 4, 8]).ravel()
+
+    def chain(self, data, frames):
+        """Blocks (f, 3, 3) of `frames` (f,), and (f-1, 3, 3) between neighbours, with data (9 b,).
+
+        The first kind of factor connects each frame with the next.
+        """
+        own = self.diagonal[self.rows(frames)[:, 0]] // 9
+        return tuple(data.reshape(-1, 3, 3)[number] for number in (own, self.blocks[0][:, 1]))
+
+    def matrix(self, data):
+        """The sparse matrix (n, n), which is symmetric, with the data (9 b,) of its blocks."""
+        matrix = copy(self._places)                      # its indices are checked only once
+        matrix.data = data[matrix.data]
+        return matrix
+
+    @cached_property
+    def _places(self):
+        """The matrix with the place of each entry in the data of blocks."""
+        places = np.arange(9 * len(self.indices)).reshape(-1, 3, 3)
+        by_rows = sparse.bsr_array((places, self.indices, self.indptr)).tocsr()
+        return sparse.csc_array((by_rows.data, by_rows.indices, by_rows.indptr), by_rows.shape)
+
+
+def block_structure(is_pose, factors):
+    """The Structure of variables, of which `is_pose` (v,) are poses and the others points.
+
+    `factors` lists, for each kind of factor, the variables (m, 2) of its m factors. Variables are
+    eliminated in the order of minimum degree.
+    """
+    count = len(is_pose)
+    row, column = np.concatenate([np.repeat(np.arange(count), 2).reshape(-1, 2), *(
+        each[:, [[0, 0], [0, 1], [1, 0], [1, 1]]].reshape(-1, 2) for each in factors)]).T
+    connected = sparse.csc_array((np.where(row == column, count, 0.5), (row, column)))
+    position = splu(connected, permc_spec="MMD_AT_PLUS_A").perm_c
+    block, number = np.unique(position[row] * count + position[column], return_inverse=True)
+    ends = np.cumsum([count, *(4 * len(each) for each in factors)])
+    return Structure(
+        is_pose=is_pose, position=position, indices=block % count,
+        indptr=np.searchsorted(block, count * np.arange(count + 1)), factors=factors,
+        blocks=[each.reshape(-1, 4) for each in np.split(number, ends)[1:-1]])
 
 
 @dataclass(frozen=True)
@@ -107,11 +186,8 @@ class Measurements:
     antenna: np.ndarray      # (a,) ids, ascending, of antennas with ranges
     guess: np.ndarray        # (a, 2) m, their guessed positions
     calibration: Calibration     # what the Vehicle states of what measurements share
-
-    @property
-    def turn(self):
-        """(f-1,) rad, change of heading to the next frame by odometry."""
-        return np.diff(self.path[self.frame, 2])
+    jumps: Jumps             # where odometry contradicts the markers
+    own: gtsam.NonlinearFactorGraph      # factors of one's own
 
     @cached_property
     def smooth_path(self):
@@ -137,6 +213,10 @@ class Measurements:
         """(s,) bool, sightings of markers with a heading."""
         return self.oriented[self.marker_row]
 
+    def by_kind(self, values):
+        """(s,) of the sightings and (r,) of the ranges, of values (s + r,)."""
+        return np.split(values, [len(self.marker_row)])
+
     @property
     def unit_weights(self):
         """(s + r,) weight 1 for every measurement."""
@@ -159,64 +239,36 @@ class Measurements:
         counts = np.cumsum([len(self.frame), len(self.marker), len(self.antenna)])
         return Variables(*np.split(np.arange(counts[-1]), counts[:-1]))
 
-    @property
-    def factor_variables(self):
-        """Numbers of the variables of odometry, sightings of poses, those of points, and ranges.
-
-        (f-1, 2) of X_i and X_{i+1}, (m, 2) of frames and markers, twice, and (r, 2) of frames and
-        antennas.
-        """
-        v, s, r = self.variables, self.sightings, self.ranges
-        sightings = np.stack([s.row, v.markers[self.marker_row]], -1)
-        return [np.stack([v.frames[:-1], v.frames[1:]], -1), sightings[self.as_pose],
-                sightings[~self.as_pose], np.stack([r.row, v.antennas[r.antenna]], -1)]
-
-    @cached_property
-    def ordering(self):
-        """Elimination ordering (COLAMD) of all variables but the calibration, which is last."""
-        graph, s, r = gtsam.SymbolicFactorGraph(), self.sightings, self.ranges
-        graph.push_factor(X(0))
-        for i, j in zip(s.row.tolist(), self.marker_row.tolist()):
-            graph.push_factor(X(i), (L if self.oriented[j] else P)(j))
-        for i, k in zip(r.row.tolist(), r.antenna.tolist()):
-            graph.push_factor(X(i), A(k))
-        for i in range(len(self.frame) - 1):
-            graph.push_factor(X(i), X(i + 1))
-        return gtsam.Ordering.ColamdSymbolicFactorGraph(graph)
-
     @cached_property
     def structure(self):
         """The Structure of the information matrix."""
-        v, order = self.variables, self.ordering
-        numbers = {"x": v.frames, "l": v.markers, "p": v.markers, "a": v.antennas}
-        keys = (gtsam.Symbol(order.at(i)) for i in range(order.size()))
-        elimination_order = np.argsort([numbers[chr(key.chr())][key.index()] for key in keys])
-        width = np.full(len(elimination_order), 2)
-        width[np.r_[v.frames, v.markers[self.oriented]]] = 3
-        return block_structure(width, elimination_order, self.factor_variables)
-
-    @cached_property
-    def factor_places(self):
-        """(places, rows) in the matrix of each kind of factors, in the order `factor_variables`."""
-        return [(self.structure.places(variables), self.structure.rows_of_factors(variables))
-                for variables in self.factor_variables]
+        v, s, r = self.variables, self.sightings, self.ranges
+        sightings = np.stack([s.row, v.markers[self.marker_row]], -1)
+        return block_structure(
+            np.r_[np.ones(len(v.frames), bool), self.oriented, np.zeros(len(v.antennas), bool)],
+            [np.stack([v.frames[:-1], v.frames[1:]], -1), sightings[self.as_pose],
+             sightings[~self.as_pose], np.stack([r.row, v.antennas[r.antenna]], -1),
+             connected(self)])
 
 
-def measure(dataset, extra_poses=()):
+def measure(dataset, extra_poses=(), jumps=NO_JUMPS, own=None):
     """The Measurements of a Dataset.
 
     `extra_poses`, encoder poses from 0, are frames without a measurement: tests compare a graph of
-    all poses with poses interpolated between the frames.
+    all poses with poses interpolated between the frames. `jumps` are those of odometry, `own` is a
+    gtsam.NonlinearFactorGraph (`slam.own`), or None.
     """
     uwb = dataset.uwb or UwbReadings(*np.zeros((2, 0), int), *np.zeros((2, 0)))
+    own, count = own or gtsam.NonlinearFactorGraph(), len(dataset.ticks)
     sightings = sightings_by_frame(dataset.aruco, np.r_[
-        0, len(dataset.ticks) - 1, np.array(extra_poses, int), uwb.pose])
+        0, count - 1, np.array(extra_poses, int), poses_of(own, count), uwb.pose])
     marker, marker_row = np.unique(sightings.marker, return_inverse=True)
     has_heading = sightings.C[:, 2, 2] < MAX_HEADING_SIGMA**2
     antenna, guess = np.unique(uwb.antenna), dataset.antenna_guess
-    ranges = Ranges(np.searchsorted(sightings.frame, uwb.pose),
-                    np.searchsorted(antenna, uwb.antenna), uwb.range,
-                    np.maximum(uwb.sigma, MIN_MEASUREMENT_SIGMA))
+    ranges = Ranges(
+        row=np.searchsorted(sightings.frame, uwb.pose),
+        antenna=np.searchsorted(antenna, uwb.antenna), distance=uwb.range,
+        sigma=np.maximum(uwb.sigma, MIN_MEASUREMENT_SIGMA))
     return Measurements(
         dataset=dataset, frame=sightings.frame,
         path=odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc"),
@@ -224,32 +276,41 @@ def measure(dataset, extra_poses=()):
         oriented=np.bincount(marker_row, has_heading, len(marker)) > 0,
         ranges=ranges, antenna=antenna,
         guess=guess.position[np.searchsorted(guess.antenna, antenna)] if len(antenna)
-        else np.zeros((0, 2)), calibration=stated_calibration(dataset.vehicle, antenna))
+        else np.zeros((0, 2)), calibration=stated_calibration(dataset.vehicle, antenna),
+        jumps=jumps, own=own)
 
 
 @dataclass(frozen=True)
 class AcceptedMeasurements:
-    """The accepted measurements and their robust kernels.
-
-    A weight is the share of its information that a measurement keeps: 0 if it is rejected, 1 if it
-    is accepted. Graduated non-convexity and chi-squared also use weights between 0 and 1.
-    """
+    """The accepted measurements and their robust kernels."""
 
     measurements: Measurements
-    weight: np.ndarray                       # (s + r,) sightings, then ranges
+    weight: np.ndarray                       # (s + r,) of its information, 0 if it is rejected
     sighting_kernel: gtsam.noiseModel.mEstimator.Base | None = None      # None: quadratic
     range_kernel: gtsam.noiseModel.mEstimator.Base | None = None
     range_bias: float = 0.0                  # sigmas, of the range kernel (`factors.kernel_bias`)
+    share: np.ndarray | None = None          # (s + r,) that its neighbours leave it (`memory`)
 
     @property
     def sighting_weight(self):
         """(s,) weights of the sightings."""
-        return self.weight[:len(self.measurements.marker_row)].astype(float)
+        return self.measurements.by_kind(self.weight)[0]
 
     @property
     def range_weight(self):
         """(r,) weights of the ranges."""
-        return self.weight[len(self.measurements.marker_row):].astype(float)
+        return self.measurements.by_kind(self.weight)[1]
+
+    @property
+    def shares(self):
+        """`share` of the sightings (s,) and of the ranges (r,)."""
+        m = self.measurements
+        return m.by_kind(m.unit_weights if self.share is None else self.share)
+
+    @property
+    def rejected(self):
+        """(s,) bool, sightings without weight."""
+        return self.sighting_weight == 0
 
     @property
     def unsupported(self):

@@ -5,18 +5,17 @@ deviations of a factor of 3 and of 2. The evidence times this prior is the poste
 logarithms of slip and factors. Newton's method finds its mode, differences give its covariance.
 Poses and landmarks are averaged over a few points of it (integrated nested Laplace approximation:
 Rue, Martino and Chopin, J. R. Stat. Soc. B 71(2), 2009), so that the covariances include that the
-slip is uncertain. On a very long drive, noise is learned from the first frames only.
+slip is uncertain.
 """
 
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import numpy as np
 
 from slamlib.increments import SLIP_FACTOR, TYPICAL_SLIP
-from slamlib.slam.calibration import ANTENNAS
-from slamlib.slam.linear import NormalEquations, laplace_approximation
-from slamlib.slam.measurements import Noise, is_known, measure
+from slamlib.memory import error_memory
+from slamlib.slam.linear import laplace_approximation
+from slamlib.slam.measurements import Noise, is_known, with_known
 
 MEDIAN = np.array([TYPICAL_SLIP, 1.0, 1.0])        # sqrt(m), 1, 1: of the prior
 PRIOR_SIGMA = np.log([SLIP_FACTOR, 2.0, 2.0])      # (3,) standard deviations of the logarithms
@@ -33,8 +32,31 @@ SINGLE_POINT_SIGMA = 0.2     # of log slip, below which the mode alone is enough
 MIN_POINT_WEIGHT = 1e-3      # probability of a point; less probable ones are left out
 SINGULAR = -1e12             # log evidence of noise for which the equations are singular
 
-LEARNING_FRAMES = 20_000     # number of first frames from which noise is learned on a long drive
-MIN_MEASUREMENTS = 5000      # of a sensor: they determine the factor on its sigmas to 1 %
+HIDDEN_RATIO = 2.0           # largest ratio of errors with memory to what residuals show of them
+MAX_DIRECT = 3.3             # sigmas, of a range's residual; longer ones are echoes
+
+
+def error_memories(accepted, sighting_residuals, range_residuals):
+    """The Memory of the errors of sightings, and that of ranges, of AcceptedMeasurements.
+
+    From their `fit.residuals`, (s, 3) and (r,). Echoes, ranges far too long, do not count.
+    """
+    m, s, r = accepted.measurements, accepted.measurements.sightings, accepted.measurements.ranges
+    direct = (accepted.range_weight > 0) & (np.abs(range_residuals) < MAX_DIRECT)
+    return (error_memory(m.marker_row, m.frame[s.row], sighting_residuals, ~accepted.rejected),
+            error_memory(r.antenna, m.frame[r.row], range_residuals[:, None], direct))
+
+
+def with_hidden_errors(noise, shares, vehicle):
+    """The Noise with larger factors for errors with memory, of which residuals show only a part.
+
+    The factor of a sensor with any of its `shares`, (s,) and (r,), below 1 is at least 1, but at
+    most HIDDEN_RATIO times the learned one. Those that a Vehicle gives stay.
+    """
+    sightings, ranges = (
+        max(factor, min(1.0, HIDDEN_RATIO * factor)) if (share < 1).any() else factor
+        for factor, share in zip((noise.sightings, noise.ranges), shares))
+    return with_known(replace(noise, sightings=sightings, ranges=ranges), vehicle)
 
 
 def log_prior(logarithms):
@@ -54,74 +76,57 @@ class NoisePosterior:
 
 def learn_noise(equations):
     """The NoisePosterior by NormalEquations near the solution, from the noise of their problem."""
-    equations = equations_of_first_frames(equations)
-    log_posterior, start, free = _log_posterior(equations)
-    value = log_posterior(start)
-    if value < SINGULAR / 2:                             # nothing can be learned
-        noise = equations.problem.noise
-        return NoisePosterior(noise, np.zeros((3, 3)), SINGULAR, ((1.0, noise),))
-    frames = len(equations.problem.measurements.frame)
-    smallest = 1 / np.sqrt(2 * np.maximum([3 * frames, *equations.counts()], 1))
-    mode, log_density_of_mode, covariance = _mode(log_posterior, start, value, free, smallest[free])
-    return NoisePosterior(Noise.from_logarithms(mode), covariance, log_density_of_mode,
-                          _points(log_posterior, mode, log_density_of_mode, covariance))
-
-
-def log_density(equations):
-    """Log posterior density of the noise of the equations' problem, up to a constant."""
-    log_posterior, noise, _ = _log_posterior(equations_of_first_frames(equations))
-    return log_posterior(noise)
-
-
-def greatest_log_density(equations, posterior):
-    """Log posterior density at the mode that `learn_noise` finds, up to a constant.
-
-    `posterior`, the NoisePosterior of nearly the same equations, gives step sizes and correlations.
-    """
-    log_posterior, start, free = _log_posterior(equations_of_first_frames(equations))
-    covariance = posterior.covariance[np.ix_(free, free)]
-    information = np.linalg.inv(covariance)
-    scale = np.sqrt(np.diag(information))
-    return _mode(log_posterior, start, log_posterior(start), free, np.sqrt(np.diag(covariance)),
-                 information / np.outer(scale, scale))[1]
-
-
-def _log_posterior(equations):
-    """Log posterior, a function of `Noise.logarithms`, start (3,), and indices of learned ones."""
-    problem = equations.problem
-    free = problem.measurements.learned
+    noise, m = equations.problem.noise, equations.problem.measurements
+    free = np.flatnonzero(m.learned)
 
     def log_posterior(logarithms):
         _, evidence = laplace_approximation(equations, Noise.from_logarithms(logarithms))
         return max(evidence, SINGULAR) + np.sum(log_prior(logarithms)[free])
 
-    start = np.where(free | is_known(problem.measurements.dataset.vehicle),
-                     problem.noise.logarithms, np.log(MEDIAN))
-    return log_posterior, start, np.flatnonzero(free)
+    start = np.where(m.learned | is_known(m.dataset.vehicle), noise.logarithms, np.log(MEDIAN))
+    value = log_posterior(start)
+    if value < SINGULAR / 2:                             # nothing can be learned
+        return NoisePosterior(noise, np.zeros((3, 3)), SINGULAR, ((1.0, noise),))
+    smallest = 1 / np.sqrt(2 * np.maximum([3 * len(m.frame), *equations.counts()], 1))
+    mode, log_density_of_mode, covariance = _mode(log_posterior, start, value, free, smallest[free])
+    return NoisePosterior(Noise.from_logarithms(mode), covariance, log_density_of_mode,
+                          _points(log_posterior, mode, log_density_of_mode, covariance))
 
 
-def _mode(function, x, value, free, steps, correlation=None):
+def _mode(function, x, value, free, steps):
     """Argument, value and covariance (3, 3) of the maximum of a log density, by Newton's method.
 
     From `x` (3,) with its `value`. Derivatives by the components `free` (p,) are differences over
-    `steps` (p,), later over standard deviations. A known `correlation` (p, p) of the second
-    derivatives replaces the mixed ones.
+    `steps` (p,), later over standard deviations.
     """
     steps = np.clip(steps, MIN_DIFFERENCE, MAX_DIFFERENCE)
+
+    def moved(step):
+        """x with `step` (p,) added to the free components, within BOUNDS."""
+        stepped = x.copy()
+        stepped[free] += step
+        return np.clip(stepped, *BOUNDS)
+
     for _ in range(MAX_NEWTON_STEPS):
-        gradient, hessian = _differences(function, x, value, free, steps, correlation)
+        unit, pairs = np.diag(steps), np.triu_indices(len(free), 1)
+        offsets = np.concatenate([unit, -unit, unit[pairs[0]] + unit[pairs[1]]])
+        up, down, both = np.split(
+            np.array([function(moved(offset)) for offset in offsets]) - value,
+            [len(free), 2 * len(free)])
+        gradient, hessian = (up - down) / (2 * steps), np.diag((up + down) / steps**2)
+        mixed = (both - up[pairs[0]] - up[pairs[1]]) / (steps[pairs[0]] * steps[pairs[1]])
+        hessian[pairs] = hessian.T[pairs] = mixed
         curvature, axes = np.linalg.eigh(-hessian)
         covariance = axes / np.maximum(curvature, PRIOR_SIGMA.max()**-2) @ axes.T
         sigma = np.clip(np.sqrt(np.diag(covariance)), MIN_DIFFERENCE, MAX_DIFFERENCE)
         coarse, steps = (steps > 2 * sigma).any(), sigma
         step = covariance @ gradient
         step *= MAX_STEP / max(MAX_STEP, np.abs(step).max())
-        while (new := function(_with_step(x, free, step))) < value \
-                and np.abs(step / sigma).max() > SHORTEST_STEP:
+        while (new := function(moved(step))) < value and np.abs(step / sigma).max() > SHORTEST_STEP:
             step = step / 2
         gain = new - value
         if gain > 0:
-            x, value = _with_step(x, free, step), new
+            x, value = moved(step), new
         if gain < CONVERGED_GAIN and not coarse:
             break
     full = np.zeros((len(x), len(x)))
@@ -129,39 +134,11 @@ def _mode(function, x, value, free, steps, correlation=None):
     return x, value, full
 
 
-def _with_step(x, free, step):
-    """x (3,) with `step` (p,) added to the components `free` (p,), within BOUNDS."""
-    stepped = x.copy()
-    stepped[free] += step
-    return np.clip(stepped, *BOUNDS)
-
-
-def _differences(function, x, value, free, steps, correlation=None):
-    """Gradient (p,) and Hessian (p, p) by differences over `steps` (p,) of the components `free`.
-
-    Mixed second derivatives are those of the `correlation` (p, p) if it is not None.
-    """
-    unit, pairs = np.diag(steps), list(combinations(range(len(free)), 2))
-    offsets = [*unit, *-unit]
-    if correlation is None:
-        offsets += [unit[i] + unit[j] for i, j in pairs]
-    values = np.array([function(_with_step(x, free, offset)) for offset in offsets])
-    up, down, both = np.split(values, [len(free), 2 * len(free)])
-    gradient, hessian = (up - down) / (2 * steps), np.diag((up + down - 2 * value) / steps**2)
-    if correlation is not None:
-        scale = np.sqrt(np.abs(np.diag(hessian)))
-        return gradient, np.where(np.eye(len(free)), hessian, -correlation * np.outer(scale, scale))
-    for (i, j), value_ij in zip(pairs, both):
-        hessian[i, j] = hessian[j, i] = (value_ij - up[i] - up[j] + value) / (steps[i] * steps[j])
-    return gradient, hessian
-
-
 def _points(log_posterior, mode, log_density_of_mode, covariance):
     """Tuple of (probability, Noise) along the slip, each with the most probable factors.
 
     Each point has the root mean square exp(mu + s^2) of its log-normal noise parameters.
-    `mode` (3,) and `covariance` (3, 3) are of the logarithms; `log_density_of_mode` is the log
-    posterior at the mode.
+    `mode` (3,) and `covariance` (3, 3) are of the logarithms.
     """
     sigma = np.sqrt(covariance[0, 0])
     direction = covariance[0] / (sigma or 1)     # (3,) for one sigma of log slip; 0 if it is known
@@ -176,34 +153,3 @@ def _points(log_posterior, mode, log_density_of_mode, covariance):
     return tuple((float(weight), Noise.from_logarithms(mode + offset * direction + variance))
                  for weight, offset in zip(weights / weights.sum(), offsets)
                  if weight > MIN_POINT_WEIGHT)
-
-
-def equations_of_first_frames(equations):
-    """The NormalEquations of the measurements at the first LEARNING_FRAMES.
-
-    The odometry keeps its noise of the whole drive, and every measurement its weight. Returns
-    `equations` itself if there are no more frames, or if the first ones have fewer than
-    MIN_MEASUREMENTS of the sightings or ranges of the drive.
-    """
-    problem, state, m = equations.problem, equations.state, equations.problem.measurements
-    count = LEARNING_FRAMES
-    if len(m.frame) <= count:
-        return equations
-    part = measure(m.dataset.first(int(m.frame[count - 1]) + 1))
-    if len(part.marker_row) < min(MIN_MEASUREMENTS, len(m.marker_row)) \
-            or len(part.ranges.row) < min(MIN_MEASUREMENTS, len(m.ranges.row)):
-        return equations
-    markers = np.searchsorted(m.marker, part.marker)
-    antennas = np.searchsorted(m.antenna, part.antenna)
-    part = replace(part, oriented=m.oriented[markers])
-    accepted = replace(problem.accepted, measurements=part, weight=np.r_[
-        problem.accepted.sighting_weight[:len(part.marker_row)],
-        problem.accepted.range_weight[:len(part.ranges.row)]])
-    odometry = replace(problem.odometry, **{
-        name: getattr(problem.odometry, name)[:count - 1]
-        for name in ("increment", "J_wheel", "quantization", "slipping")})
-    entries = np.r_[:ANTENNAS.start, ANTENNAS.start + antennas]
-    return NormalEquations(
-        replace(problem, odometry=odometry, accepted=accepted, sigma=problem.sigma[entries]),
-        replace(state, poses=state.poses[:count], markers=state.markers[markers],
-                antennas=state.antennas[antennas], c=state.c[entries]))

@@ -1,5 +1,6 @@
 """Stage 7: the result of a fit: every encoder pose and landmark, with covariances.
 
+Encoder poses between the frames are conditioned on both neighbouring frames (`interpolate`).
 Antennas whose position the ranges do not determine are in doubt, and their covariances include it.
 """
 
@@ -7,27 +8,31 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slamlib import se2
+from slamlib import increments, se2
+from slamlib.odometry_gate import Jumps
 from slamlib.sightings import Sightings
 from slamlib.slam.calibration import WHEELS, Calibration, calibration_table
 from slamlib.slam.covariances import posterior_moments
-from slamlib.slam.factors import MIN_DISTANCE, linearize_measurements, odometry_error
-from slamlib.slam.fit import kept_weights, residuals
-from slamlib.slam.initialization import (
-    SAME_PLACE,
-    ranges_by_antenna,
-    second_moment,
-    trilaterate,
+from slamlib.slam.factors import (
+    MIN_DISTANCE,
+    linearize_measurements,
+    linearize_odometry,
+    odometry_noise,
 )
-from slamlib.slam.interpolation import interpolate
+from slamlib.slam.fit import Fit, kept_weights, residuals
+from slamlib.slam.initialization import SAME_PLACE, ranges_by_antenna, second_moment, trilaterate
 from slamlib.slam.measurements import GUESS_PRIOR_SIGMA, AcceptedMeasurements, Noise
+from slamlib.slam.noise import error_memories
 
 MIN_ACCEPTED_RANGES = 5      # number of accepted ranges of an antenna that is not in doubt
+SAME_MARKER = 0.05           # m, distance of two markers that must be one
 MAX_RELATIVE_SIGMA = 0.025   # of the median range: largest sigma of an antenna not in doubt
 MAX_LOG_ODDS = np.log(1000)  # log odds below which another position remains possible
+MIN_SHARE = 1e-9             # of a jump, below which there is none between two frames
+FRAMES_AT_ONCE = 1000        # number of frames of a section, whose arrays stay in cache
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class SlamResult:
     """The estimate of a drive: lengths in m, angles in rad, covariances in world axes."""
 
@@ -56,9 +61,23 @@ class SlamResult:
     residual: np.ndarray            # (s, 3) whitened residuals of the sightings
     range_weight: np.ndarray        # (r,) share of its information that each range keeps, 0 to 1
     range_residual: np.ndarray      # (r,) whitened, positive for a range that is too long
+    share: np.ndarray               # (s + r,) that memory leaves of the information of each
+    correlation: np.ndarray         # (2, 2) of neighbours' residuals of a landmark, and its sigma
     sightings: Sightings            # s of them, and the frames
+    jumps: Jumps                    # where odometry contradicts the markers
     turn_sigma: np.ndarray          # (f-1,) rad, of odometry's turns between frames, stated wheels
+    fit: Fit                        # problem and solution, for `graph.as_gtsam`
     converged: bool                 # whether the last iterations ended before their number did
+    places: np.ndarray | None = None     # (m, 2) ids of ArucoReadings, and those in the map
+
+    def __repr__(self):
+        sigma = 1e3 * np.sqrt(np.trace(self.covariances[:, :2, :2], axis1=1, axis2=2) / 2).mean()
+        return (f"SlamResult of {len(self.poses)} poses, mean sigma {sigma:.2g} mm per axis\n"
+                f"  {len(self.marker)} markers, {self.rejected.sum()} of {len(self.rejected)} "
+                f"sightings rejected\n  {len(self.antenna)} antennas, {len(self.doubts)} in doubt, "
+                f"{len(self.range_weight)} ranges\n  steps: {self.model}, slip {self.slip:.2g} "
+                f"sqrt(m), noise factors {self.noise.sightings:.2g} and {self.noise.ranges:.2g}\n"
+                f"  released from vehicle.toml: {', '.join(sorted(self.released)) or 'nothing'}")
 
     @property
     def slip(self):
@@ -69,6 +88,18 @@ class SlamResult:
     def calibration_table(self):
         """List of a dict for each of the p entries, by `calibration.calibration_table`."""
         return calibration_table(self.calibration, self.c, self.c_covariance, self.released)
+
+    @property
+    def unconfirmed(self):
+        """Ids of markers with one accepted sighting, or at the place of a marker seen more often.
+
+        Wrong labels make the latter. Antennas like them are in doubt.
+        """
+        marker, count = np.unique(self.sightings.marker[~self.rejected], return_counts=True)
+        count, place = count[np.isin(marker, self.marker)], self.marker_in_world[:, :2]
+        distance = np.hypot(*(place[:, None] - place).transpose(2, 0, 1))
+        other = (distance < SAME_MARKER) & (count > count[:, None])
+        return self.marker[(count == 1) | other.any(axis=1)]
 
     @property
     def wheel(self):
@@ -111,42 +142,42 @@ def slam_result(fit):
         model=problem.odometry.model, log_evidence=float(fit.log_evidence),
         chi2_per_dof=chi2_per_dof(problem, state, np.r_[sighting_weight, range_weight]),
         chi2_per_dof_of_all=chi2_per_dof(problem, state, m.unit_weights),
-        rejected=problem.accepted.sighting_weight == 0, residual=residual,
+        rejected=problem.accepted.rejected, residual=residual,
         range_weight=range_weight, range_residual=range_residual,
-        sightings=m.sightings, turn_sigma=turn_sigma(problem), converged=fit.converged)
+        share=np.concatenate(problem.accepted.shares), correlation=np.array([
+            (memory.correlation, memory.sigma) for memory in error_memories(
+                problem.accepted, residual, range_residual)]),
+        sightings=m.sightings, jumps=m.jumps, turn_sigma=turn_sigma(problem),
+        fit=replace(fit), converged=fit.converged)
 
 
 def turn_sigma(problem):
     """Standard deviations (f-1,), rad, of the turns between frames by odometry of stated wheels.
 
-    Estimated wheels adapt to a wrong number of turns.
+    Estimated ones adapt to a wrong number of turns.
     """
     stated, odometry = problem.measurements.dataset.vehicle, problem.odometry
+    frame = problem.measurements.frame
+    known = ~problem.measurements.jumps.share(frame[:-1], frame[1:]).any(axis=1)  # else by markers
     variance = np.sum((odometry.J_wheel[:, 2] * stated.sigma_wheel)**2, axis=1)
-    return np.sqrt(variance + odometry.covariance(problem.noise.slip)[:, 2, 2])
+    return known * np.sqrt(variance + odometry.covariance(problem.noise.slip)[:, 2, 2])
 
 
 def antenna_doubts(problem, state, frame_covariances, covariances, range_weight):
     """Reasons to doubt antennas, and covariances that include the doubt, at a Problem's solution.
 
     From covariances (f, 3, 3) of the frames and (a, 2, 2) of the antennas, in world axes, and the
-    share `range_weight` (r,) of its information that each range keeps.
-
-    Returns
-    -------
-    sentences : dict of the reason for each antenna in doubt, by its id.
-    covariances : (a, 2, 2) m^2, in doubt at least the second moment of the position.
+    share `range_weight` (r,) of its information that each range keeps. Reasons are a dict by id; in
+    doubt a covariance is at least the second moment of the position.
     """
-    m, r, sentences, covariances = (
-        problem.measurements, problem.measurements.ranges, {}, covariances.copy())
+    m, sentences, covariances = problem.measurements, {}, covariances.copy()
     by_antenna = ranges_by_antenna(
         m, state.poses, frame_covariances, state.c, problem.noise.ranges)
-    for k, (antenna, ranges) in enumerate(zip(m.antenna.tolist(), by_antenna)):
-        sentence = _doubt(ranges, state.antennas[k], range_weight[r.antenna == k])
+    for k, (place, ranges) in enumerate(zip(state.antennas, by_antenna)):
+        sentence = _doubt(ranges, place, range_weight[m.ranges.antenna == k])
         if sentence is not None:
-            sentences[antenna] = sentence
-            covariances[k] = max(covariances[k], second_moment(ranges, state.antennas[k]),
-                                 key=np.trace)
+            sentences[int(m.antenna[k])] = sentence
+            covariances[k] = max(covariances[k], second_moment(ranges, place), key=np.trace)
     return sentences, covariances
 
 
@@ -171,8 +202,7 @@ def _doubt(ranges, estimate, weight):
 def _sigma_by_ranges(ranges, estimate, weight):
     """Largest standard deviation in m of an antenna, in any direction, by its ranges alone.
 
-    Its covariance in the world also includes the uncertain heading of pose 1, which rotates the
-    whole map.
+    Its covariance in the world also includes the uncertain heading of pose 1.
     """
     difference = estimate - ranges.positions
     direction = difference / np.maximum(np.hypot(*difference.T), MIN_DISTANCE)[:, None]
@@ -183,11 +213,10 @@ def _sigma_by_ranges(ranges, estimate, weight):
 def _mapped(problem, blocks):
     """Rows of the markers with more accepted than rejected sightings, and covariances of all.
 
-    The covariances (k, 3, 3) are in GTSAM's axes. The heading of a point has the variance of its
-    best sighting.
+    These (k, 3, 3) are in own axes. The heading of a point has the variance of its best sighting.
     """
-    m, accepted = problem.measurements, problem.accepted.sighting_weight > 0
-    balance = np.bincount(m.marker_row, np.where(accepted, 1, -1), len(m.marker))
+    m = problem.measurements
+    balance = np.bincount(m.marker_row, np.where(problem.accepted.rejected, -1, 1), len(m.marker))
     covariances = np.zeros((len(m.marker), 3, 3))
     for j, block in enumerate(blocks):
         covariances[j, :len(block), :len(block)] = block
@@ -200,19 +229,93 @@ def chi2_per_dof(problem, state, weight):
     """Chi-squared by the covariances in the files, over its degrees of freedom.
 
     With weights (s + r,), a measurement counts by its dimension times its weight, and a landmark
-    subtracts its dimension. Odometry and priors have as many errors as poses and calibration
-    have unknowns.
+    subtracts its dimension. Odometry and priors have as many errors as unknowns.
     """
     m = problem.measurements
-    sightings, ranges = np.split(weight, [len(m.marker_row)])
+    sightings, ranges = m.by_kind(weight)
     accepted = AcceptedMeasurements(measurements=m, weight=weight)
     stated = replace(problem, accepted=accepted, noise=Noise())
-    e, *_ = odometry_error(problem.odometry, state.poses, state.c[WHEELS])
-    U, _ = problem.odometry.whitening(problem.noise.slip)
+    odometry, _ = linearize_odometry(problem, state)(problem.noise.slip)
     e_c = (state.c - m.calibration.stated)[problem.active] / problem.sigma[problem.active]
-    squared = np.sum((U @ e[..., None])**2) + e_c @ e_c + 2 * sum(
-        factors.error for factors in linearize_measurements(stated, state))
+    squared = e_c @ e_c + 2 * sum(
+        factors.error for factors in (odometry, *linearize_measurements(stated, state)))
     used = np.bincount(m.marker_row, sightings * np.where(m.as_pose, 3, 2), len(m.marker))
     freedom = np.sum(np.maximum(used - np.where(m.oriented, 3, 2), 0)) \
         + np.sum(ranges) - 2 * len(m.antenna)
     return float(squared / max(1, freedom))
+
+
+def interpolate(problem, state, pairs):
+    """Every encoder pose (n, 3) and its covariance (n, 3, 3) in world axes, given the frames.
+
+    A pose k between the frames a and b depends only on them and on the wheels w. X_a Delta_ak(w)
+    and X_b Delta_kb(w)^-1 are two estimates of it, with independent noise of the encoder steps
+    before and after it. Their average by information is the conditional mean, exact to first order.
+
+    `pairs` (f-1, 9, 9) as in `Covariances`, at the State that solves the Problem.
+    """
+    frame, count = problem.measurements.frame, len(problem.measurements.dataset.ticks)
+    if not len(pairs):                                       # pose 1 alone: the world's origin
+        return state.poses.copy(), np.diag(problem.measurements.origin_sigma)[None]**2
+    poses, covariances = np.empty((count, 3)), np.empty((count, 3, 3))
+    for first in range(0, len(pairs), FRAMES_AT_ONCE):
+        rows = slice(first, min(first + FRAMES_AT_ONCE, len(pairs)) + 1)          # of frames
+        section = slice(frame[rows][0], frame[rows][-1] + 1)               # shares its ends
+        poses[section], covariances[section] = _interpolate_section(
+            problem, state.poses[rows], state.c[WHEELS], frame[rows],
+            pairs[rows.start:rows.stop - 1])
+    return poses, covariances
+
+
+def _interpolate_section(problem, poses, wheel, frame, pairs):
+    """The same for the encoder poses from the first to the last of consecutive frames (g,)."""
+    turned, R = np.tile(np.eye(9), (len(pairs), 1, 1)), se2.rotation(poses[:, 2])
+    turned[:, :2, :2], turned[:, 3:5, 3:5] = R[:-1], R[1:]
+    joint = turned @ pairs @ turned.mT                       # the poses in world axes
+    pose = np.arange(frame[0], frame[-1] + 1)
+    last = np.searchsorted(frame, pose, side="right") - 1
+    all_poses = poses[last].copy()
+    covariances = np.concatenate([joint[:, :3, :3], joint[-1:, 3:6, 3:6]])[last]
+    inner = np.flatnonzero(~np.isin(pose, frame))
+    if not len(inner):
+        return all_poses, covariances
+    a, b = last[inner], last[inner] + 1
+
+    delta_a, a_by_wheel, Q_a = _increments(problem, wheel, frame, frame[a], pose[inner])
+    A_a, B_a = se2.compose_jacobians(poses[a], delta_a)
+    N_a = B_a @ Q_a @ B_a.mT
+    delta_b, b_by_wheel, Q_b = _increments(problem, wheel, frame, pose[inner], frame[b])
+    back = se2.inverse(delta_b)
+    A_b, B_b = se2.compose_jacobians(poses[b], back)
+    B_b = B_b @ se2.inverse_jacobian(delta_b)
+    N_b = B_b @ Q_b @ B_b.mT
+
+    from_a, from_b = se2.compose(poses[a], delta_a), se2.compose(poses[b], back)
+    difference = from_b - from_a
+    difference[:, 2] = se2.wrap(difference[:, 2])
+    earlier, later = (problem.measurements.jumps.share(*ends).sum(axis=1)[:, None, None] for ends in
+                     ((frame[a], pose[inner]), (pose[inner], frame[b])))
+    jump = difference[:, :, None] * difference[:, None] / np.maximum(earlier + later, MIN_SHARE)
+    N_a, N_b = N_a + earlier * jump, N_b + later * jump
+
+    gain_b = N_a @ np.linalg.inv(N_a + N_b)
+    gain_a = np.eye(3) - gain_b
+    F = np.concatenate([gain_a @ A_a, gain_b @ A_b,
+                        gain_a @ B_a @ a_by_wheel + gain_b @ B_b @ b_by_wheel], axis=2)
+    all_poses[inner] = from_a + np.einsum("nij,nj->ni", gain_b, difference)
+    covariances[inner] = F @ joint[a] @ F.mT + gain_a @ N_a
+    return all_poses, (covariances + covariances.mT) / 2
+
+
+def _increments(problem, wheel, frame, start, end):
+    """Increments (m, 3) from the encoder poses `start` (m,) to `end` (m,), with `wheel` (3,) m.
+
+    Also their derivatives (m, 3, 3) by `wheel`, and their covariances Q (m, 3, 3) in the axes of
+    the start. The poses lie in the section of the frames `frame` (g,).
+    """
+    d = problem.measurements.dataset
+    vehicle, ticks = d.vehicle.with_wheel(wheel), d.ticks[frame[0]:frame[-1] + 1]
+    start, end = start - frame[0], end - frame[0]
+    delta, by_wheel = increments.between_poses(ticks, vehicle, start, end, problem.odometry.model)
+    quantization, slipping = odometry_noise(ticks, vehicle, start, end, len(d.ticks) - 1)
+    return delta, by_wheel, quantization + problem.noise.slip**2 * slipping

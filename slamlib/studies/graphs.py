@@ -2,20 +2,16 @@
 
 from dataclasses import dataclass, replace
 
-import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import X
 
 from slamlib import odometry, se2
-from slamlib.evaluation import anees, ate
-from slamlib.simulation import simulate
 from slamlib.slam.calibration import WHEELS
-from slamlib.slam.fit import optimize, refine
-from slamlib.slam.graph import nonlinear_graph
-from slamlib.slam.linear import log_evidence
-from slamlib.slam.measurements import Noise, measure, with_known, with_known_noise
+from slamlib.slam.factors import preintegrate_odometry
+from slamlib.slam.fit import refine
+from slamlib.slam.graph import optimize
+from slamlib.slam.linear import build_problem, log_evidence
+from slamlib.slam.measurements import measure
 from slamlib.slam.pipeline import fit_from_odometry
-from slamlib.slam.problem import build_problem, preintegrate_odometry
 from slamlib.slam.result import SlamResult, slam_result
 
 
@@ -55,10 +51,10 @@ def graph_kinds(dataset):
     common accepted measurements, because only then it can be compared.
     """
     measurements = measure(dataset)
-    first, noise = fit_from_odometry(measurements), with_known(Noise(), dataset.vehicle)
+    first = fit_from_odometry(measurements)
     for wheels, preintegrate in WHEEL_MODELS.items():
         for model in odometry.MODELS:
-            problem = build_problem(measurements, model, noise, preintegrate=preintegrate)
+            problem = build_problem(measurements, model, preintegrate=preintegrate)
             fit = first if (preintegrate, model) == (preintegrate_odometry, "arc") else refine(
                 problem, first.state, preintegrate=preintegrate)
             if preintegrate is not preintegrate_odometry:
@@ -75,16 +71,6 @@ def _without_wheel_errors(problem):
     return replace(problem, sigma=sigma)
 
 
-def gtsam_chain(problem):
-    """The gtsam.NonlinearFactorGraph of a Problem with an independent chain of between factors."""
-    graph = nonlinear_graph(problem)
-    chain = independent_chain(problem.measurements, problem.odometry.model)
-    for i, (step, Q) in enumerate(zip(chain.increment, chain.covariance(problem.noise.slip))):
-        graph.add(gtsam.BetweenFactorPose2(X(i), X(i + 1), gtsam.Pose2(*step),
-                                           gtsam.noiseModel.Gaussian.Covariance(Q)))
-    return graph
-
-
 def evidence_curve(fit, slips, model):
     """Log evidence (len(slips),) of slips in sqrt(m), each at its own optimum.
 
@@ -98,23 +84,3 @@ def evidence_curve(fit, slips, model):
         state = optimize(problem, state).state
         curve.append(log_evidence(problem, state))
     return np.array(curve)
-
-
-def compare_graphs(seed, **options):
-    """All kinds of graph on one drive of the short path, given the true slip.
-
-    Returns
-    -------
-    dict of numbers for each of WHEEL_MODELS and each model: "evidence", "chi2" per degree of
-    freedom, "ate" and "aligned" in m, "nees".
-    """
-    dataset, truth = simulate("short", seed, **options)
-    numbers = {}
-    markers = with_known_noise(dataset.without("uwb"), options.get("slip", 1e-3), 1.0, 1.0)
-    for kind in graph_kinds(markers):
-        name, found = f"{kind.wheels} {kind.model}", kind.result
-        numbers |= {f"{name} evidence": kind.log_evidence, f"{name} chi2": found.chi2_per_dof,
-                    f"{name} ate": ate(found.poses, truth.poses),
-                    f"{name} aligned": ate(found.poses, truth.poses, aligned=True),
-                    f"{name} nees": anees(found.poses, found.covariances, truth.poses)}
-    return numbers

@@ -15,19 +15,13 @@ from slamlib.slam.fit import (
     accepted_measurements,
     gate_weights,
     kept_weights,
-    optimize,
     refine,
     residuals,
 )
+from slamlib.slam.graph import optimize
 from slamlib.slam.initialization import odometry_state, trilaterated_antennas
-from slamlib.slam.measurements import (
-    AcceptedMeasurements,
-    Noise,
-    measure,
-    with_known,
-    with_known_noise,
-)
-from slamlib.slam.problem import build_problem, state_from_arrays
+from slamlib.slam.linear import build_problem, state_from_arrays
+from slamlib.slam.measurements import AcceptedMeasurements, Noise, measure, with_known_noise
 from slamlib.slam.result import slam_result
 from slamlib.studies.montecarlo import judge_slam
 
@@ -63,7 +57,7 @@ def solve_with(measurements, sightings="gate", ranges="asymmetric Tukey",
         are added: methods that are not CONVEX share the rounds of narrowing kernels.
     model : "arc" or "euler", of an odometry step.
     """
-    problem = build_problem(measurements, model, with_known(Noise(), measurements.dataset.vehicle))
+    problem = build_problem(measurements, model)
     starts = {} if starts is None else starts
     methods = tuple(name if name in CONVEX else "narrowing" for name in (sightings, ranges))
     convex = _acceptance_by(sightings, ranges)
@@ -168,9 +162,13 @@ def wrong_labels(seed, methods=tuple(SIGHTING_METHODS), **options):
 
 
 def mislabelled(measurements, truth):
-    """(s,) bool, sightings of a simulated drive that have another marker's label, by its Truth."""
-    m = measurements
-    true_map = truth.marker_in_world[np.searchsorted(truth.marker, m.marker)]
+    """(s,) bool, sightings of a simulated drive that have another marker's label, by its Truth.
+
+    False where the Truth does not have the marker.
+    """
+    m, known = measurements, np.isin(measurements.marker, truth.marker)
+    true_map = np.full((len(m.marker), 3), np.nan)
+    true_map[known] = truth.marker_in_world[np.searchsorted(truth.marker, m.marker[known])]
     state = state_from_arrays(m, truth.poses[m.frame], true_map,
                               np.zeros((len(m.antenna), 2)), m.calibration.stated)
     return np.sum(residuals(m, state, Noise())[0]**2, axis=1) > MIN_MISLABELLED_SQUARED

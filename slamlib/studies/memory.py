@@ -4,8 +4,7 @@ A study depends on the code of the numerics, on the packages that compute it, an
 seeds and options; it does not depend on a user's datasets. While a report is built,
 SLAMLIB_STUDIES names the folder of the studies that are kept. Without it each is computed. Times
 that a trial measures are kept, too, so pages must not print them. SLAMLIB_SEEDS, a number, cuts
-every study to its first seeds; tests of pages use it. The build reads the progress of a study in
-the file SLAMLIB_PROGRESS; in JupyterLab, without this file, a long study shows a bar.
+every study to its first seeds; tests of pages use it. In JupyterLab a long study shows a bar.
 """
 
 import hashlib
@@ -55,15 +54,9 @@ def run(trial, seeds, jobs=2, **options):
 
 def _compute(trial, name, seeds, options, threads, jobs):
     """The numbers of `run`; joblib distinguishes studies by all arguments but trial and jobs."""
-    rows, told = [], os.environ.get("SLAMLIB_PROGRESS")
-    for row in tqdm(workers.rows(trial, seeds, options, jobs), total=len(seeds),
-                    desc=trial.__name__, leave=False, delay=BAR_AFTER,
-                    disable=bool(told) or "ipykernel" not in sys.modules):
-        rows.append(row)
-        if told:
-            Path(told).write_text(f"{trial.__name__} {len(rows)} of {len(seeds)}")
-    if told:
-        Path(told).write_text("")
+    rows = list(tqdm(workers.rows(trial, seeds, options, jobs), total=len(seeds),
+                     desc=trial.__name__, leave=False, delay=BAR_AFTER,
+                     disable="SLAMLIB_RESULTS" in os.environ or "ipykernel" not in sys.modules))
     return {key: np.array([row[key] for row in rows]) for key in rows[0]}
 
 

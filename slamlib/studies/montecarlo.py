@@ -97,8 +97,10 @@ def ranges_added(seed, share=1.0, **options):
     return numbers | {"moved": np.median(distance / position_sigmas(without.covariances[1:]))}
 
 
-def learned_slips(seed, slip):
-    """Problem 3 on one drive of the short path with this slip in sqrt(m), learned and known.
+def learned_noise(seed, slip=1e-3):
+    """Problem 3 on one drive of the short path, its noise learned and known.
+
+    `slip` in sqrt(m) as in `simulate`.
 
     Returns
     -------

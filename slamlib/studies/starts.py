@@ -11,11 +11,11 @@ from slamlib.increments import TYPICAL_SLIP
 from slamlib.localization import localize
 from slamlib.sightings import POINT_GATE
 from slamlib.simulation import misguess, simulate
-from slamlib.slam.fit import CAUCHY_SCALES, optimize
+from slamlib.slam.fit import CAUCHY_SCALES
+from slamlib.slam.graph import optimize
 from slamlib.slam.initialization import consensus_markers, odometry_state, state_from_poses
-from slamlib.slam.linear import NormalEquations
+from slamlib.slam.linear import NormalEquations, build_problem, state_from_arrays
 from slamlib.slam.measurements import AcceptedMeasurements, Noise, measure, with_known_noise
-from slamlib.slam.problem import build_problem, state_from_arrays
 from slamlib.slam.result import slam_result
 from slamlib.studies.kernels import solve_with
 from slamlib.studies.montecarlo import antenna_error

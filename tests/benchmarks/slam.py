@@ -1,4 +1,4 @@
-"""Errors of problem 3 beside a plain GTSAM script, and of the kernels for late ranges.
+"""Errors of problem 3 beside a plain GTSAM script, of kernels for late ranges, and with memory.
 
     python tests/benchmarks/slam.py [large]
 """
@@ -18,14 +18,14 @@ from plain_gtsam import plain  # noqa: E402
 from slamlib import studies  # noqa: E402
 from slamlib.evaluation import ate, nees_band  # noqa: E402
 from slamlib.simulation import simulate  # noqa: E402
-from slamlib.studies import kernels, montecarlo, workers  # noqa: E402
+from slamlib.studies import correlation, kernels, montecarlo, workers  # noqa: E402
 
 SEEDS = range(8)
 
 
 def trial(seed, slip):
     """Problem 3 on one drive: aligned ATE in m by slamlib, with known noise, and by plain; NEES."""
-    numbers = montecarlo.learned_slips(seed, slip)
+    numbers = montecarlo.learned_noise(seed, slip)
     dataset, truth = simulate("short", seed, slip=slip)
     poses, _ = plain(dataset.without("uwb"), marginals=False)
     return (numbers["aligned"], numbers["known aligned"], ate(poses, truth.poses, aligned=True),
@@ -61,10 +61,24 @@ def compare_kernels(seeds):
                   f"{of['antenna nees'].mean():8.2f}")
 
 
+def correlated_errors(seeds):
+    """Print NEES and ATE of problems 2 to 4 by the correlation of successive sightings' errors."""
+    print(f"\nErrors with memory: {len(seeds)} drives of the short path")
+    print(f"{'':14}{'NEES':>7}{'median':>8}{'ATE (mm)':>10}")
+    for each in (0.0, 0.5, 0.9, 0.97):
+        runs = studies.run(correlation.correlated_errors, seeds, correlation=each, poses=2000)
+        print(f"correlation {each:g}")
+        for method in correlation.METHODS:
+            values = runs[f"{method} nees"]
+            print(f"  {method:12}{values.mean():7.2f}{np.median(values):8.2f}"
+                  f"{1e3 * runs[f'{method} ate'].mean():10.2f}")
+
+
 def main(seeds):
     errors(seeds)
     compare_kernels(seeds)
+    correlated_errors(seeds)
 
 
 if __name__ == "__main__":
-    main(range(20) if "large" in sys.argv[1:] else SEEDS)
+    main(range(24) if "large" in sys.argv[1:] else SEEDS)

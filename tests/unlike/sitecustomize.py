@@ -13,7 +13,7 @@ from importlib import import_module
 from types import ModuleType
 
 LACKING = {
-    "win32": {"fcntl": None, "resource": None, "os": {"sched_getaffinity", "fork", "killpg"},
+    "win32": {"resource": None, "os": {"sched_getaffinity", "fork", "killpg"},
               "signal": {"SIGHUP", "SIGKILL"}, "socket": {"AF_UNIX"}},
     "darwin": {"os": {"sched_getaffinity"}}}[os.environ["UNLIKE"]]
 imported = builtins.__import__
@@ -28,18 +28,6 @@ class Lacking(ModuleType):
         return getattr(import_module(self.__name__), name)
 
 
-def locking(number, mode, count):
-    """What msvcrt.locking does where another process may hold the lock."""
-    import fcntl
-    assert (mode, count, os.lseek(number, 0, os.SEEK_CUR)) == (2, 1, 1 << 30)
-    try:
-        fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        raise PermissionError(13, "Permission denied") from error
-
-
-msvcrt = ModuleType("msvcrt")
-msvcrt.locking, msvcrt.LK_NBLCK = locking, 2
 given = {name: Lacking(name) for name in LACKING} | {"sys": Lacking("sys")}
 LACKING["sys"] = ()
 given["sys"].platform = os.environ["UNLIKE"]
@@ -52,8 +40,6 @@ def import_there(name, globals=None, *arguments, **options):
         return imported(name, globals, *arguments, **options)
     if LACKING.get(name, ()) is None:
         raise ModuleNotFoundError(f"No module named {name!r}", name=name)
-    if name == "msvcrt" and os.environ["UNLIKE"] == "win32":
-        return msvcrt
     return given.get(name) or imported(name, globals, *arguments, **options)
 
 

@@ -1,0 +1,188 @@
+"""Drives of a notebook, their results by problem, and notices of what failed or is doubted.
+
+A notice carries its record in the metadata of the notebook's output. The report's first page
+collects the records from the executed notebooks by `notices`, so the results folders hold the files
+to hand in and nothing else, and a cached notebook keeps its records.
+"""
+
+import os
+import re
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+from IPython.display import Markdown, display
+from matplotlib_inline.backend_inline import set_matplotlib_formats
+from tqdm.auto import tqdm
+
+from slamlib import solve
+from slamlib.dataset import Dataset, Truth, dataset_names, read_dataset, read_truth
+from slamlib.doubt import Doubt
+from slamlib.notebook import plotting
+from slamlib.simulation import simulate
+from slamlib.studies.memory import BAR_AFTER
+
+KEY = "slamlib"  # of records in the metadata of outputs
+# Types of records by their key.
+RECORDS = {"doubt": Doubt, "failure": solve.Failure}
+
+
+@dataclass(frozen=True, eq=False)          # compared by identity, because arrays have no hash
+class Drive:
+    """A dataset and its truth, which serves figures and tables only."""
+
+    name: str
+    dataset: Dataset = field(repr=False)
+    truth: Truth | None = field(repr=False)
+    made_up: bool = False  # True for a simulated drive that replaces datasets without a sensor
+
+    @property
+    def origin(self):
+        """Origin of the data, a str; only simulations have other true wheel parameters."""
+        if self.truth is None:
+            return "recorded"
+        same = self.truth.vehicle == self.dataset.vehicle
+        return "recorded, truth known" if same else "simulated"
+
+
+def start(sensor=None):
+    """List of the drives with a sensor, "aruco" or "uwb", the one with the fewest poses first.
+
+    A simulated drive replaces them if there is none. The environment variable SLAMLIB_DATA names
+    the data folder; by default it is the nearest `data` in this folder or above it.
+    SLAMLIB_DATASETS selects datasets by name, one a line. Also sets the style of the figures.
+
+    Raises
+    ------
+    DatasetError : a dataset does not follow the format, or there is none.
+    """
+    plotting.use_style()
+    set_matplotlib_formats("svg", metadata={"Date": None})
+    data = _folder("SLAMLIB_DATA", "data")
+    selected = os.environ.get("SLAMLIB_DATASETS")
+    names = dataset_names(data, selected.split("\n") if selected else None)
+    drives = [Drive(name, read_dataset(data / name), read_truth(data / name)) for name in names]
+    return _or_simulated([drive for drive in sorted(drives, key=lambda d: len(d.dataset.ticks))
+                          if not sensor or getattr(drive.dataset, sensor) is not None])
+
+
+def _or_simulated(drives):
+    """The drives, or a simulated short one and a notice if there is none."""
+    if not drives:
+        display(Markdown("*No dataset is left for this chapter: it runs on a simulated drive "
+                         "instead and writes no results.*"))
+    return drives or [Drive("simulated", *simulate("short", seed=1), made_up=True)]
+
+
+def results_folder(drive):
+    """Path of the folder for a drive's results.
+
+    It is in SLAMLIB_RESULTS, by default in the folder `results` beside the data folder.
+    """
+    results = os.environ.get("SLAMLIB_RESULTS")
+    folder = Path(results) if results else _folder("SLAMLIB_DATA", "data").parent / "results"
+    return folder / drive.name
+
+
+def interactive():
+    """True in JupyterLab, False while the report is built."""
+    return "SLAMLIB_RESULTS" not in os.environ
+
+
+def solved(drives, **solvers):
+    """Results of solvers by problem, as {Drive: result} of the drives on which all succeed.
+
+    Every result is written into the results folder, also of drives on which another problem fails;
+    what fails and what is doubted is shown, there and on the report's first page. If no drive is
+    left, a simulated short one replaces them, of which nothing is written.
+
+    Parameters
+    ----------
+    drives : iterable of Drive; those without a sensor that a problem needs are left out.
+    solvers : functions of a Drive by problem, names of `solve.PROBLEMS`, that return what
+        `solve.find` returns, such as `problem3=lambda drive: slam.estimate(drive.dataset)`.
+
+    Returns
+    -------
+    dict of results by Drive, or a list of such dicts if there are several solvers.
+    """
+    drives = _or_simulated([drive for drive in drives if all(
+        solve.allows(drive.dataset, problem) for problem in solvers)])
+    found = {drive: {} for drive in drives}
+    pairs = [(drive, problem) for drive in drives for problem in solvers]
+    for drive, problem in tqdm(pairs, disable=not interactive(), leave=False, delay=BAR_AFTER):
+        try:
+            found[drive][problem] = result = solvers[problem](drive)
+            solve.require_covariances(result)
+        except solve.UNSOLVABLE as error:
+            if drive.made_up:
+                raise
+            found[drive].pop(problem, None)
+            failure = solve.failure(problem, drive.dataset, error)
+            _notice(drive, f"The problem “{failure.title}” could not be solved: "
+                           f"{failure.reason}.", failure=failure)
+            continue
+        if not drive.made_up:
+            solution = solve.problem_solution(problem, drive.dataset, result)
+            solve.write_solution(results_folder(drive), solution)
+            show_doubts(drive, solution.doubts)
+    left = [drive for drive in drives if len(found[drive]) == len(solvers)]
+    if not left:
+        return solved(_or_simulated([]), **solvers)
+    by_problem = [{drive: found[drive][problem] for drive in left} for problem in solvers]
+    return by_problem if len(solvers) > 1 else by_problem[0]
+
+
+def attempted(drives, function):
+    """{Drive: function(Drive)} of the drives on which it can be solved; shows why on others not."""
+    found = {}
+    for drive in drives:
+        try:
+            found[drive] = function(drive)
+        except solve.UNSOLVABLE as error:
+            _notice(drive, f"left out here: {error}.")
+    return found
+
+
+def show_doubts(drive, doubts):
+    """Show each Doubt of a list about a Drive."""
+    for doubt in doubts:
+        _notice(drive, doubt.sentence, doubt=doubt)
+
+
+def _notice(drive, text, **record):
+    """Show a text about a Drive, with a record for `notices`."""
+    entry = {KEY: {"dataset": drive.name, **{kind: asdict(each) for kind, each in record.items()}}}
+    display(Markdown(f"**{escaped(drive.name)}**: {escaped(text)}"),
+            metadata=entry if record and not drive.made_up else {})
+
+
+def escaped(text):
+    """Text (str) in which Markdown and HTML interpret nothing."""
+    return re.sub(r"[\\`*_{}\[\]<>#|$~^&]", r"\\\g<0>", " ".join(text.split()))
+
+
+def notices(books):
+    """Records in executed notebooks, by dataset: {name: list of Doubt and Failure}, each once."""
+    found = {}
+    for book in books:
+        for cell in book.cells:
+            for output in cell.get("outputs", ()):
+                entry = output.get("metadata", {}).get(KEY, {})
+                for kind in RECORDS.keys() & entry.keys():
+                    found.setdefault(entry["dataset"], []).append(RECORDS[kind](**entry[kind]))
+    return {name: list(dict.fromkeys(records)) for name, records in found.items()}
+
+
+def captioned(fig, caption):
+    """Show a figure and, directly below it, its caption, which may contain computed numbers."""
+    display(fig)
+    plt.close(fig)  # otherwise it would be shown again at the end of the cell
+    display(Markdown(caption))
+
+
+def _folder(variable, name):
+    if os.environ.get(variable):
+        return Path(os.environ[variable])
+    here = Path.cwd()
+    return next((p / name for p in (here, *here.parents) if (p / name).is_dir()), here / name)

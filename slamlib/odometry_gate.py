@@ -1,0 +1,299 @@
+"""Jumps: intervals between two frames in which odometry contradicts the markers.
+
+Somebody pushes or carries the vehicle, an encoder fails, rows of counts are lost: one increment is
+then wrong by far more than any slip. With the increment O by odometry between two neighbouring
+frames, and sightings Z before and Z' after it of the same marker, the true increment is J O with
+
+    Z = J O Z' + noise,
+
+where J is the identity unless there was a jump. Sightings of other frames count as well: odometry
+with a generous slip transports them to the nearer of the two frames. First, each sighting is
+compared with the next one of its marker. Frames between which most of these pairs disagree are
+suspects. In the order of the drive, J is estimated by `robust_increments` between suspects, and
+kept if it is decidedly more likely than the identity (data snooping: Baarda 1968). Later poses move
+with it. Where all markers change at once and none of them is known, the motion is unknown.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from slamlib import odometry, se2
+from slamlib.marker_increments import robust_increments
+from slamlib.sightings import GATE, sightings_by_frame, squared_distances
+
+# Noise of odometry, generous
+SLIP = 0.03                  # sqrt(m), of a wheel after one metre
+FLOOR = 3e-3                 # m and rad, of an increment
+LEVER = 0.12                 # m, by which the camera may be elsewhere than stated
+LAGS = np.arange(-12, 13, 2)         # poses, by which all sightings may be late
+# Decisions; gains are of twice the log likelihood
+SUSPECT = 7.8                # 95 % quantile of chi-squared with three degrees of freedom
+MEDIAN_SQUARED = 2.366       # its median
+MIN_GAIN = 12.0              # by a jump
+MIN_LAG_GAIN = 50.0          # by a lag
+PAIRS = 2                    # of sightings of each marker that tell of a jump: one may be wrong
+NEAREST = 24                 # number of these pairs, by the frames between them
+MAX_WAY = 35.0               # m, between the sightings of a pair
+MAX_SIGMA = 1.0              # m, of a jump
+WELL_INSIDE = 0.7            # of the distance at which markers are seen
+MIN_MISSED = 6               # number of sightings that should be there, and are not
+# Jumps in odometry
+USUAL = 0.9                  # probability of the quantile of motions that is a usual one
+MIN_JUMP = 0.1               # m and rad, least standard deviation of the motion
+MAX_UNSUPPORTED = 2          # number of jumps; sensors that have more of them may be poor
+UNKNOWN_SIGMA = np.array([10.0, 10.0, np.pi])  # m, m, rad, if no marker tells
+SPIKE = 3.0                  # ratio to the counts of fast steps, above which a step is the jump
+
+
+@dataclass(frozen=True)
+class Jumps:
+    """Increments that odometry does not know, between g pairs of neighbouring frames."""
+
+    start: np.ndarray        # (g,) encoder poses from 0, ascending
+    end: np.ndarray          # (g,)
+    increment: np.ndarray    # (g, 3) by the markers: m, m, rad
+    by_odometry: np.ndarray  # (g, 3)
+    sigma: np.ndarray        # (g, 3) of the increment without these markers
+    chance: np.ndarray       # (n,) of a jump in the steps up to each pose, up to a factor
+
+    @property
+    def are_few(self):
+        """Whether there are jumps, but so few that they need no more support than the markers'."""
+        return 0 < len(self.start) <= MAX_UNSUPPORTED
+
+    def share(self, start, end):
+        """Probabilities (m, g) that the jumps are in increments between encoder poses (m,)."""
+        begin, end = np.maximum(start[:, None], self.start), np.minimum(end[:, None], self.end)
+        return np.where(begin < end, self.chance[end] - self.chance[begin], 0.0) \
+            / (self.chance[self.end] - self.chance[self.start])
+
+    def added(self, start, end):
+        """Motions (m, 3) to add to such increments, in the axes of their ends, and covariances."""
+        share = self.share(start, end)
+        return (share @ se2.between(self.by_odometry, self.increment),
+                (share @ self.sigma**2)[:, :, None] * np.eye(3))
+
+    def mended(self, pose, poses, begin=0):
+        """Poses (f, 3) of the encoder poses (f,), with these increments instead of odometry's.
+
+        Jumps up to the encoder pose `begin` are mended already.
+        """
+        for start, end, increment in zip(self.start, self.end, self.increment):
+            if begin < end <= pose[-1]:
+                i, k = np.searchsorted(pose, [start, end])
+                poses = _moved(poses, k, se2.compose(poses[i], increment))
+        return poses
+
+
+NO_JUMPS = Jumps(**dict(zip(("start", "end"), np.zeros((2, 0), int))), chance=np.zeros(1), **dict(
+    zip(("increment", "by_odometry", "sigma"), np.zeros((3, 0, 3)))))                # none at all
+
+
+def find_jumps(dataset):
+    """The Jumps of a Dataset, by its sightings as the stated camera has them."""
+    sightings = sightings_by_frame(dataset.sightings)
+    order = np.lexsort((sightings.row, sightings.marker))
+    used, row = np.unique(sightings.row[order], return_inverse=True)
+    if len(used) < 2:
+        return NO_JUMPS
+    s = replace(sightings, frame=sightings.frame[used], row=row, **{
+        name: getattr(sightings, name)[order] for name in ("index", "marker", "z", "C")})
+    path = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")
+    found = _jumps(dataset, s, path[s.frame])
+    if not len(found.start):
+        return found
+    # Sightings that are late contradict odometry wherever the speed changes.
+    late = [path[np.maximum(np.minimum(s.frame - lag, len(path) - 1), 0)] for lag in LAGS]
+    cost = [_cost(_compared(s, _drive(each, dataset.vehicle.wheelbase))[2]).sum() for each in late]
+    best = int(np.argmin(cost))
+    return found if cost[best] > cost[len(LAGS) // 2] - MIN_LAG_GAIN \
+        else _jumps(dataset, s, late[best])
+
+
+def _jumps(dataset, s, poses):
+    """The Jumps by odometry's poses (f, 3), and sightings sorted by marker, then frame."""
+    drive = _drive(poses, dataset.vehicle.wheelbase)
+    first, second, squared = _compared(s, drive)
+    close = _compared(s, drive, slip=0.0)[2][second - first == 1]
+    scale = max(1.0, np.median(close) / MEDIAN_SQUARED) if len(close) else 1.0
+    suspects = _suspects(first, second, squared / scale, len(poses) - 1)
+    agreeing = (second - first < 4) & (squared < GATE * scale)
+    scaled, breaks = replace(s, C=scale * s.C), _breaks(s, poses, first[agreeing], second[agreeing])
+    found = _bridged(scaled, drive, suspects, breaks)
+    dead = _dead(dataset.ticks, s.frame, found)
+    if len(dead):
+        found = _bridged(scaled, drive, np.union1d(suspects, dead), breaks, dead)
+    if not found:
+        return NO_JUMPS
+    k, increment, by_odometry, sigma = map(np.array, zip(*found))
+    counts = np.abs(dataset.ticks).max(axis=1)
+    spike = counts > SPIKE * np.quantile(counts, 0.99)
+    return Jumps(start=s.frame[k], end=s.frame[k + 1], increment=increment, by_odometry=by_odometry,
+                 sigma=sigma, chance=np.cumsum(np.where(spike, 1e6, 1.0)))
+
+
+def _bridged(s, drive, suspects, breaks, dead=()):
+    """List of step, increment, that by odometry, and sigma of each jump.
+
+    Steps in `breaks` and `dead` are jumps, also if the markers do not tell how long they are.
+    """
+    found, steps = [], np.union1d(suspects, breaks).astype(int)
+    moves = np.abs(se2.between(drive.poses[:-1], drive.poses[1:]))
+    usual = np.maximum(np.quantile(moves, USUAL, axis=0)[[0, 0, 2]], MIN_JUMP)
+    drive = drive.with_variance(steps, 2 * usual[0]**2, usual[2]**2)
+    for k in steps.tolist():
+        drive = drive.with_variance(k, 0.0, 0.0)
+        jump, covariance, told = _jump(s, drive, k)
+        if not told and k not in breaks and k not in dead:
+            continue
+        sigma = np.maximum(np.r_[[np.hypot(*jump[:2])] * 2, abs(jump[2])], MIN_JUMP)
+        if covariance is None:
+            sigma = UNKNOWN_SIGMA if k in breaks else 2 * usual
+            covariance = np.diag(sigma**2)
+        by_odometry = se2.between(drive.poses[k], drive.poses[k + 1])
+        increment = se2.compose(jump, by_odometry)
+        found.append((k, increment, by_odometry, sigma))
+        drive = drive.with_variance(k, np.trace(covariance[:2, :2]), covariance[2, 2])
+        drive = replace(drive, poses=_moved(
+            drive.poses, k + 1, se2.compose(drive.poses[k], increment)))
+    return found
+
+
+def _dead(ticks, frame, found):
+    """Steps from frame to frame in which a wheel is dead.
+
+    It counts nothing there, in a run of zeros in which most steps from frame to frame are jumps.
+    """
+    dead, jumps = np.zeros(len(ticks), bool), [k for k, *_ in found]
+    for zero in (ticks == 0).T:
+        run, total = np.cumsum(~zero), odometry.cumulative(zero)     # a run has one number
+        silent = total[frame[1:] + 1] - total[frame[:-1] + 1] == np.diff(frame)
+        steps, wrong = (np.bincount(run[frame[1:]][some], minlength=len(ticks) + 1)
+                        for some in (silent, np.isin(np.arange(len(silent)), jumps) & silent))
+        dead |= zero & (2 * wrong > steps)[run]
+    total = odometry.cumulative(dead)
+    return np.flatnonzero(total[frame[1:] + 1] > total[frame[:-1] + 1])
+
+
+@dataclass(frozen=True)
+class _Drive:
+    """Odometry at the frames."""
+
+    poses: np.ndarray        # (f, 3)
+    way: np.ndarray          # (f,) m, travelled so far
+    variance: np.ndarray     # (f-1, 2) of a jump in each step, m^2 and rad^2
+    wheelbase: float         # m
+
+    def with_variance(self, steps, place, turn):
+        """The _Drive with jumps of these variances, m^2 and rad^2, in `steps`, (m,) or one."""
+        variance = self.variance.copy()
+        variance[steps] = place, turn
+        return replace(self, variance=variance)
+
+    def motions(self, start, end, slip=SLIP):
+        """Motions (m, 3) between frames (m,), and their covariances (m, 3, 3), roughly."""
+        move, way = se2.between(self.poses[start], self.poses[end]), self.way[end] - self.way[start]
+        total = odometry.cumulative(self.variance)
+        place, turn = np.abs(total[end] - total[start]).T
+        turn = turn + 2 * np.abs(way) * (slip / self.wheelbase)**2 + FLOOR**2
+        place = place + turn * np.sum(move[:, :2]**2, axis=1) / 3 + FLOOR**2 \
+            + (2 * LEVER * np.sin(se2.wrap(move[:, 2]) / 2))**2
+        along = place + np.abs(way) * slip**2 / 2
+        return move, np.stack([along, place, turn], -1)[:, None] * np.eye(3)
+
+
+def _drive(poses, wheelbase):
+    """The _Drive of poses (f, 3) by odometry without jumps."""
+    return _Drive(poses, odometry.cumulative(np.hypot(*np.diff(poses[:, :2], axis=0).T)),
+                  np.zeros((len(poses) - 1, 2)), wheelbase)
+
+
+def _moved(poses, k, pose):
+    """Poses (f, 3) of which pose k and the later ones have moved with pose k to `pose` (3,)."""
+    return np.concatenate([poses[:k], se2.compose(pose, se2.between(poses[k], poses[k:]))])
+
+
+def _transported(z, C, move, Q):
+    """Markers (m, 3) at the ends of motions (m, 3) as seen from the starts, and covariances."""
+    by_move, by_z = se2.compose_jacobians(move, z)
+    return se2.compose(move, z), by_move @ Q @ by_move.mT + by_z @ C @ by_z.mT
+
+
+def _compared(s, drive, slip=SLIP):
+    """Frames (m,) of each sighting and of the next one of its marker, and their chi-squared."""
+    first = np.flatnonzero(s.marker[:-1] == s.marker[1:])
+    second = first + 1
+    move = drive.motions(s.row[first], s.row[second], slip)
+    expected, W = _transported(s.z[second], s.C[second], *move)
+    return s.row[first], s.row[second], squared_distances(s.z[first], expected, s.C[first] + W)
+
+
+def _cost(squared):
+    """Cauchy cost, twice a negative log likelihood, of squared Mahalanobis distances (m,)."""
+    return GATE * np.log1p(squared / GATE)
+
+
+def _spanning(first, second, count):
+    """Numbers (count,) of the pairs of frames, `first` and `second` (m,), that span each step."""
+    return np.cumsum(np.bincount(first, minlength=count + 1)
+                     - np.bincount(second, minlength=count + 1))[:count]
+
+
+def _suspects(first, second, squared, count):
+    """Steps, of `count` from frame to frame, that half of the pairs of sightings contradict.
+
+    Only sightings at these two frames are asked, if there are any; else all pairs that span it.
+    """
+    close, wrong = second - first == 1, squared > SUSPECT
+    linked = _spanning(first[close], second[close], count)
+    all_of, wrong_of = (np.where(linked, *(_spanning(first[some], second[some], count)
+                                           for some in (which & close, which)))
+                        for which in (close | True, wrong))
+    return np.flatnonzero((wrong_of > 0) & (2 * wrong_of >= all_of))
+
+
+def _breaks(s, poses, first, second):
+    """Steps from frame to frame in which all markers change, although odometry hardly moves.
+
+    Markers well inside the field of view should be seen again in the next few frames. At least
+    MIN_MISSED such sightings are missed, on both sides, and no pair of sightings of frames `first`
+    and `second` (m,), which agree with odometry, spans the step.
+    """
+    count, reach = len(poses) - 1, WELL_INSIDE * np.quantile(np.hypot(*s.z.T[:2]), 0.95)
+    missed = np.zeros((2, count), int)
+    for step in (1, 2, 3, -1, -2, -3):
+        rows = np.flatnonzero((s.row + step >= 0) & (s.row + step <= count))
+        there = se2.compose(se2.between(poses[s.row[rows] + step], poses[s.row[rows]]), s.z[rows])
+        inside = rows[np.hypot(*there.T[:2]) < reach]
+        missed[int(step < 0)] += np.bincount(s.row[inside] - (step < 0), minlength=count)
+    return np.flatnonzero((_spanning(first, second, count) == 0) & (missed.min(axis=0) > 1)
+                          & (missed.sum(axis=0) >= MIN_MISSED))
+
+
+def _jump(s, drive, k):
+    """The jump (3,) between the frames k and k + 1, its covariance or None, whether it is told."""
+    begins = np.flatnonzero(np.diff(s.marker, prepend=s.marker[0] - 1))
+    following = np.add.reduceat(s.row <= k, begins) + begins
+    ends = np.append(begins[1:], len(s.row))
+    rows = np.concatenate([np.stack([following - 1 - i, following + i])[
+        :, (following - 1 - i >= begins) & (following + i < ends)] for i in range(PAIRS)], axis=1)
+    way = drive.way[s.row[rows[1]]] - drive.way[s.row[rows[0]]]
+    rows = rows[:, way < MAX_WAY]
+    rows = rows[:, np.argsort(s.row[rows[1]] - s.row[rows[0]], kind="stable")[:NEAREST]]
+    if not rows.size:
+        return np.zeros(3), None, False
+    move, Q = drive.motions([k], [k + 1])
+    (z, C), later = (
+        _transported(s.z[each], s.C[each], *drive.motions(np.full(len(each), end), s.row[each]))
+        for each, end in zip(rows, (k, k + 1)))
+    later, first = _transported(*later, move, 0 * Q), np.arange(rows.shape[1])
+    found = robust_increments(*map(np.concatenate, zip((z, C), later)), 0 * first, first,
+                              first + len(first), 1)
+    jump, covariance = found.increment[0], found.covariance[0]
+    expected = [_transported(*later, each, Q) for each in (np.zeros(3), jump)]
+    cost = [_cost(squared_distances(z, each, C + W)) for each, W in expected]
+    gain = cost[0] - cost[1]
+    if not found.usable[0] or np.trace(covariance[:2, :2]) > MAX_SIGMA**2:
+        return np.zeros(3), None, False
+    return jump, covariance, gain.sum() - gain.max() > MIN_GAIN

@@ -1,0 +1,111 @@
+"""Reads the notebooks of a report, and says which of them are executed, in which order.
+
+A title `# 2. Name` makes a chapter, `# A. Name` an appendix. The metadata of a notebook, or of a
+cell that begins with a heading, may say what it needs, as `"slamlib": {"needs": "truth"}`.
+"""
+
+import re
+import shutil
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, files
+from pathlib import Path
+
+import nbformat
+from nbconvert.preprocessors import ClearOutputPreprocessor
+
+from slamlib.dataset import DatasetError
+from slamlib.report.execution import NotebookError
+from slamlib.textfile import read_text
+
+FOLDER = "notebooks"  # name of the notebooks' folder
+
+
+def notebooks_folder():
+    """Return the Path `notebooks` if it is there, else that of the installed notebooks.
+
+    DatasetError where neither is there.
+    """
+    root = Path(__file__).parents[2]
+    if Path(FOLDER).is_dir():
+        return Path(FOLDER)
+    if (root / "pyproject.toml").is_file():  # slamlib runs from its repository
+        return root / FOLDER
+    with suppress(PackageNotFoundError):
+        for file in files("slamlib") or ():
+            if file.suffix == ".ipynb":
+                return Path(file.locate()).resolve().parent
+    raise DatasetError(f"{FOLDER}: expected this folder, because slamlib was installed without its "
+                       "notebooks; found none")
+
+
+def copy_notebooks(source, folder):
+    """Copy the notebooks in a folder (Path) to a new or empty one (Path), and return that."""
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise DatasetError(f"{folder}: expected a new or empty folder to copy the notebooks to")
+    folder.mkdir(parents=True, exist_ok=True)
+    for file in sorted(source.glob("*.ipynb")):
+        shutil.copyfile(file, folder / file.name)
+    return folder
+
+
+def read_notebook(source):
+    """Return the NotebookNode in a file (Path), without outputs that an editor saved.
+
+    NotebookError if the file is not a notebook, DatasetError if it is no file that can be read.
+    """
+    text, reason = read_text(source, "utf-8")[0], "expected JSON with cells and metadata"
+    try:
+        if "\ufffd" not in text:  # which stands for bytes that are not UTF-8
+            book = nbformat.reads(text, as_version=4)
+            return ClearOutputPreprocessor().preprocess(book, {})[0]
+        reason = f"expected UTF-8 text in line {text[:text.index(chr(0xfffd))].count(chr(10)) + 1}"
+    except (ValueError, nbformat.ValidationError) as error:
+        reason = str(error).partition("\n")[0]
+    except Exception:  # noqa: S110  on other JSON nbformat fails in many ways
+        pass
+    raise NotebookError(f"{source.name} is not a notebook: {reason}")
+
+
+def to_execute(folder, options):
+    """Return the notebooks in a folder (Path) that are executed, as {Path: NotebookNode} in order.
+
+    These are all chapters, because they write results, by the names of their files, and then the
+    appendices that `options` (Options) show. DatasetError if there is none.
+    """
+    books = {source: read_notebook(source) for source in sorted(folder.glob("*.ipynb"))}
+    numbers = {chapter_of(*each)["number"] for each in books.items()} - {None}
+    for entry, place in options.leave_out.items():
+        if place and re.fullmatch(r"\d+|[A-Za-z]", entry) and entry.upper() not in numbers:
+            raise DatasetError(f"{place}: expected to leave out a chapter "
+                               f"({', '.join(sorted(numbers))}) or a section, found '{entry}'")
+    seen = shown(books, options)
+    chapters = {source: book for source, book in books.items() if not appendix_of(source, book)}
+    appendices = sorted((appendix_of(source, book), source) for source, book in seen.items()
+                        if source not in chapters and options.appendix is not False)
+    if not chapters and not appendices:
+        raise DatasetError(f"{folder}: expected notebooks (*.ipynb) that are not left out, found "
+                           "no notebooks")
+    return chapters | {source: books[source] for _, source in appendices}
+
+
+def shown(books, options):
+    """Return the books (dict from Path to NotebookNode) without the chapters that are left out."""
+    left_out = {entry.strip().removesuffix(".").casefold() for entry in options.leave_out}
+    return {source: book for source, book in books.items()
+            if (chapter_of(source, book)["number"] or "-").casefold() not in left_out}
+
+
+def chapter_of(source, book):
+    """Return title, number (or None) and lead, the first paragraph, of a chapter, a dict of str."""
+    text = "\n\n".join(cell.source for cell in book.cells if cell.cell_type == "markdown")
+    title = re.search(r"^#\s+(.+)", text, re.MULTILINE)
+    lead = re.search(r"^(?!\s|[#|<>`]|\$\$|[-*+]\s).+(?:\n.+)*", text, re.MULTILINE)
+    title = re.sub("[*_`]", "", title[1]).strip() if title else source.stem
+    number = re.match(r"(\d+|[A-Z])\.", title)
+    return {"title": title, "lead": lead[0] if lead else "", "number": number and number[1]}
+
+
+def appendix_of(source, book):
+    """Return the letter (str) of an appendix (Path, NotebookNode), "" for a chapter."""
+    number = chapter_of(source, book)["number"] or ""
+    return number if number.isalpha() else ""

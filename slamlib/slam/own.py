@@ -1,0 +1,88 @@
+"""Stage 1: GTSAM's keys and values of all variables, and factors of one's own between them.
+
+Keys are X(pose) of a pose by its row of `Dataset.ticks`, L(id) of a marker's pose, P(id) of a
+marker's position where no sighting has a heading, A(id) of an antenna, and C(0) of the calibration,
+in standard deviations from what is stated. Poses are gtsam.Pose2, positions gtsam.Point2.
+
+Factors of one's own are measurements: each linearisation asks GTSAM for theirs, so that start
+values, gates, noise and covariances heed them. The covariances need a chain of poses, given the
+landmarks. So a factor has one variable, or a pose and a landmark, or neighbouring poses. Two
+sightings of a marker that nobody else sees are a loop closure.
+"""
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import A, C, L, P, X
+
+from slamlib.dataset import DatasetError
+
+INDICES = 2**56              # number of indices of GTSAM's symbols; ids below 0 count from the end
+
+
+def variable_keys(measurements):
+    """List of GTSAM's keys of poses, markers and antennas, in the order of their numbers."""
+    m = measurements
+    markers = zip((m.marker % INDICES).tolist(), m.oriented)
+    return [*map(X, m.frame.tolist()), *((L if oriented else P)(j) for j, oriented in markers),
+            *map(A, (m.antenna % INDICES).tolist())]
+
+
+def gtsam_values(problem, state):
+    """The gtsam.Values of a State."""
+    m, active, values = problem.measurements, problem.active, gtsam.Values()
+    keys = iter(variable_keys(m))
+    for pose in state.poses.tolist():
+        values.insert(next(keys), gtsam.Pose2(*pose))
+    for marker, oriented in zip(state.markers, m.oriented):
+        values.insert(next(keys), gtsam.Pose2(*marker) if oriented else gtsam.Point2(*marker[:2]))
+    for antenna in state.antennas:
+        values.insert(next(keys), gtsam.Point2(*antenna))
+    if active.any():
+        values.insert(C(0), (state.c - m.calibration.stated)[active] / problem.sigma[active])
+    return values
+
+
+def poses_of(graph, count):
+    """Rows (p,) of `Dataset.ticks`, below `count`, of the poses in a gtsam.NonlinearFactorGraph."""
+    keys = graph.keyVector()                     # with a name: iterators do not keep it alive
+    symbols = [gtsam.Symbol(key) for key in keys]
+    rows = [symbol.index() for symbol in symbols if symbol.chr() == ord("x")]
+    return np.array([row for row in rows if row < count], int)
+
+
+def connected(measurements):
+    """Numbers (m, 2) of the variables of each factor of one's own; of one variable, twice its own.
+
+    Raises DatasetError for factors between other variables.
+    """
+    m, pairs = measurements, np.zeros((measurements.own.size(), 2), int)
+    number = {key: i for i, key in enumerate(variable_keys(m))} if len(pairs) else {}
+    for k in range(len(pairs)):
+        keys = m.own.at(k).keys()
+        rows = [number.get(key, -1) for key in keys]
+        if len(rows) > 2 or min(rows) < 0 or max(rows) < len(m.frame) and np.ptp(rows) > 1:
+            names = ", ".join(gtsam.Symbol(key).string() for key in keys)
+            raise DatasetError(
+                f"factors: expected in factor {k} one variable, a pose and a landmark, or "
+                "neighbouring poses, with keys X(row of ticks), L(marker id), A(antenna id), or "
+                f"P(id) of a marker without headings, found {names}")
+        pairs[k] = rows[0], rows[-1]
+    return pairs
+
+
+def linearized_own(problem, state):
+    """Whitened errors (m, d) of factors of one's own at a State, and derivatives (m, d, 6).
+
+    Padded by zeros. Also half the sum of the squared errors, or the loss of their kernels.
+    """
+    m = problem.measurements
+    pairs, values = m.structure.factors[-1], gtsam.Values()
+    values = gtsam_values(problem, state) if len(pairs) else values
+    jacobians = [m.own.at(k).linearize(values).jacobian() for k in range(len(pairs))]
+    size = max((len(b) for _, b in jacobians), default=1)
+    e, J = np.zeros((len(pairs), size)), np.zeros((len(pairs), size, 6))
+    for k, ((by_variables, b), i) in enumerate(zip(jacobians, pairs[:, 0])):
+        width = 2 + m.structure.is_pose[i]
+        e[k, :len(b)], J[k, :len(b), :width] = -b, by_variables[:, :width]
+        J[k, :len(b), 3:3 + by_variables.shape[1] - width] = by_variables[:, width:]
+    return e, J, m.own.error(values)

@@ -1,0 +1,93 @@
+"""The first numbers, which a build tells before it executes the notebooks."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from multiprocessing import active_children
+from pathlib import Path
+
+import pytest
+from test_report import build, make_data, write
+
+from slamlib import summary
+from slamlib.report import build as building
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.mark.slow
+def test_the_first_numbers_come_before_the_notebooks_the_shortest_drive_first(
+        tmp_path, monkeypatch, capfd):
+    """And not where a notebook is recalled."""
+    make_data(tmp_path)
+    (tmp_path / "data" / "long" / "encoderReading.txt").write_text("1 0 0\n2 9 9\n3 9 9\n")
+    write(tmp_path / "notebooks", "1_one", "# One", ("1 + 1",))
+    monkeypatch.setattr(building, "TABLES_WAIT", 300.0)
+    build(tmp_path, kept=tmp_path / "kept")
+    told = capfd.readouterr().err
+    found = re.findall(r"^(short|long|problem1|1_one):? +([0-9]+|executed)", told, re.MULTILINE)
+    assert found == [("short", "2"), ("problem1", "2"), ("long", "3"), ("problem1", "3"),
+                     ("1_one", "executed")]
+    build(tmp_path, kept=tmp_path / "kept")
+    assert "problem1" not in capfd.readouterr().err
+    build(tmp_path, kept=tmp_path / "kept", fresh=True)
+    assert "short: 2 poses" in capfd.readouterr().err
+
+
+@pytest.fixture
+def folders(tmp_path):
+    """The folders of two datasets."""
+    make_data(tmp_path)
+    return [tmp_path / "data" / "short", tmp_path / "data" / "long"]
+
+
+def test_a_drive_that_takes_long_is_not_waited_for_and_its_process_ends(folders, monkeypatch):
+    monkeypatch.setattr(summary, "_written", lambda *_: time.sleep(1000))
+    with summary.tables(folders) as first:
+        first.join(0.01)
+        assert len(active_children()) == 1
+    assert active_children() == []
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere the process is no fork")
+@pytest.mark.parametrize("end, expected", [
+    (lambda *_: 1 / 0, "short: not solved before the notebooks: "
+                       "ZeroDivisionError('division by zero')\n"),
+    (lambda *_: os.kill(os.getpid(), signal.SIGKILL), "")])
+def test_first_numbers_that_fail_end_no_build(folders, monkeypatch, capfd, end, expected):
+    monkeypatch.setattr(summary, "_written", end)
+    with summary.tables(folders[:1]) as first:
+        first.join(60)
+    assert capfd.readouterr().err == expected
+
+
+def running(process):
+    """True unless a process is gone, or waits to be buried."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only there it ends with this process")
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_no_process_survives_a_run_that_is_killed(number):
+    """Neither that of the first numbers nor the second one of solve."""
+    code = """import time
+from slamlib.summary import process
+with process("fork", time.sleep, 1000) as child:
+    print(child.pid, flush=True)
+    child.join()"""
+    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True,
+                              env=os.environ | {"PYTHONPATH": str(ROOT)})
+    child = parent.stdout.readline().strip()
+    assert running(child)
+    parent.send_signal(number)
+    parent.communicate()
+    until = time.monotonic() + 60
+    while running(child) and time.monotonic() < until:
+        time.sleep(0.02)
+    assert not running(child)

@@ -1,0 +1,231 @@
+"""As a library: arrays in, one setting of kernel and gate, and GTSAM factors of one's own."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from gtsam.symbol_shorthand import A, C, L, X
+from numeric import known_noise
+from test_dataset import assert_same
+
+from slamlib import se2, slam
+from slamlib.dataset import Dataset, DatasetError, Vehicle, read_dataset
+from slamlib.evaluation import anees, ate
+from slamlib.limits import KERNEL_NAMES
+from slamlib.simulation import simulate, write_dataset
+from slamlib.slam.fit import KERNELS, accepted_measurements
+from slamlib.slam.measurements import measure
+from slamlib.slam.pipeline import fit_from_odometry
+from slamlib.slam.result import slam_result
+
+SIGMA = gtsam.noiseModel.Isotropic.Sigma
+
+
+@pytest.fixture(scope="module")
+def drive():
+    return simulate("short", seed=3)
+
+
+def arrays(folder):
+    """The arguments of `Dataset.from_arrays` by the files of a folder."""
+    files = {"ticks": "encoderReading", "aruco": "ArucoReading", "uwb": "UwbReading",
+             "guess": "UwbAntennaGuess"}
+    found = {name: np.loadtxt(folder / f"{file}.txt") for name, file in files.items()}
+    return found | {"ticks": found["ticks"][:, 1:].astype(int)}
+
+
+def test_arrays_are_the_dataset_of_their_files(drive, tmp_path):
+    write_dataset(tmp_path / "drive", *drive)
+    given, expected = arrays(tmp_path / "drive"), read_dataset(tmp_path / "drive")
+    found = Dataset.from_arrays(**given, vehicle=expected.vehicle, name="drive")
+    assert_same(found, expected)
+    lists = {key: value.tolist() for key, value in given.items()}
+    assert_same(Dataset.from_arrays(**lists, vehicle=expected.vehicle, name="drive"), expected)
+    alone = Dataset.from_arrays(given["ticks"])
+    assert (alone.aruco, alone.uwb, alone.antenna_guess) == (None, None, None)
+
+
+def changed_at(place, value):
+    """A function that returns an array with another value at a place."""
+    def changed(array):
+        array = array.astype(float)
+        array[place] = value
+        return array
+    return changed
+
+
+@pytest.mark.parametrize("change, told", [
+    ({"ticks": lambda a: a[:, :1]}, "ticks: expected a matrix with the columns (right ticks, left"),
+    ({"ticks": lambda a: np.c_[np.arange(len(a)), a]}, "ticks: expected a matrix with the columns"),
+    ({"ticks": lambda a: "data/short"}, "ticks: expected a matrix with the columns"),
+    ({"ticks": changed_at((7, 1), np.nan)}, "ticks, row 8: expected left ticks, a whole number"),
+    ({"ticks": changed_at((7, 0), 0.5)}, "ticks, row 8: expected right ticks, a whole number"),
+    ({"ticks": lambda a: a[:0]}, "ticks: expected at least"),
+    ({"aruco": lambda a: a[:, 1:]}, "aruco, row 1: expected 11 columns (pose id, marker id, x"),
+    ({"aruco": lambda a: a[0]}, "aruco: expected a matrix of real numbers"),
+    ({"aruco": lambda a: [[1], [1, 2]]}, "aruco: expected a matrix of real numbers"),
+    ({"aruco": changed_at((3, 0), 0)}, "aruco, row 4: expected a pose id from 1 to 2000, found"),
+    ({"aruco": changed_at((3, 0), 2001)}, "aruco, row 4: expected a pose id from 1 to 2000, found"),
+    ({"aruco": changed_at((3, 2), np.nan)}, "aruco, row 4: expected numbers, found 'nan'"),
+    ({"aruco": changed_at((3, 5), -1e-4)}, "aruco, row 4: expected s_xx, a finite number from"),
+    ({"aruco": changed_at((3, 6), 1.0)}, "aruco, row 4: expected a positive definite covariance"),
+    ({"uwb": changed_at((0, 3), -0.1)}, "uwb, row 1: expected sigma, a finite number from 1e-09"),
+    ({"uwb": changed_at((5, 2), 0)}, "uwb, row 6: expected a range, which 0 (no reception) is not"),
+    ({"uwb": changed_at((5, 1), 99)}, "uwb, row 6: expected an antenna id that the guesses have"),
+    ({"guess": lambda a: None}, "uwb, row 1: expected an antenna id that the guesses have"),
+    ({"guess": lambda a: np.r_[a, a]}, "guess, row 5: expected each id only once"),
+    ({"vehicle": lambda _: "tractor"}, "vehicle: expected a Vehicle, found 'tractor'"),
+    ({"vehicle": lambda _: Vehicle(sigma_wheelbase=-1.0)}, "vehicle: expected a number from 1e-09 "
+     "to wheelbase m for sigma_wheelbase, found '-1.0'"),
+    ({"vehicle": lambda _: Vehicle(kernel="L2")}, 'vehicle: expected "asymmetric Tukey" or'),
+])
+def test_arguments_pass_the_checks_of_files_or_are_named_with_the_row(
+        drive, tmp_path, change, told):
+    write_dataset(tmp_path / "drive", *drive)
+    given = arrays(tmp_path / "drive") | {"vehicle": drive[0].vehicle}
+    (name, function), = change.items()
+    with pytest.raises(DatasetError) as caught:
+        Dataset.from_arrays(**given | {name: function(given[name])})
+    assert str(caught.value).startswith(told) and "\n" not in str(caught.value)
+
+
+def test_a_result_is_shown_in_five_lines(drive):
+    found = slam.estimate(known_noise(drive[0].first(100), 1e-3))
+    lines = repr(found).splitlines()
+    assert len(lines) == 5 and max(map(len, lines)) < 100
+    assert lines[0].startswith("SlamResult of 100 poses, mean sigma ")
+    assert lines[2] == f"  4 antennas, {len(found.doubts)} in doubt, 20 ranges"
+    assert lines[4] == "  released from vehicle.toml: nothing"
+
+
+# Kernel and gate.
+
+
+def test_kernels_have_the_names_that_vehicle_toml_knows():
+    assert {*KERNELS} == {*KERNEL_NAMES} and Vehicle().kernel == KERNEL_NAMES[0]
+
+
+def test_the_library_heeds_kernel_and_gate_of_vehicle_toml(tmp_path):
+    """As it heeds the options of `estimate`, and a note says so."""
+    dataset, truth = simulate("short", seed=4, mislabelled=0.02, late_ranges=0.2)
+    write_dataset(tmp_path / "drive", known_noise(dataset.first(400), 1e-3),
+                  replace(truth, poses=truth.poses[:400]))
+    plain = read_dataset(tmp_path / "drive")
+    with open(tmp_path / "drive" / "vehicle.toml", "a") as file:
+        file.write('kernel = "Huber"\ngate = false\n')
+    stated = read_dataset(tmp_path / "drive")
+    assert stated.notes == ('vehicle.toml sets kernel = "Huber" for problems 3 and 4.',
+                            "vehicle.toml sets gate = false for problems 3 and 4.")
+    found, default = slam.estimate(stated), slam.estimate(plain)
+    np.testing.assert_array_equal(
+        found.poses, slam.estimate(plain, kernel="Huber", gate=False).poses)
+    assert (found.range_weight > 0).all() and not (default.range_weight > 0).all()
+    again = slam.estimate(stated, kernel="asymmetric Tukey", gate=True)
+    np.testing.assert_array_equal(again.poses, default.poses)
+    fit = found.fit
+    assert accepted_measurements(fit.problem, fit.state).sighting_kernel is KERNELS["Huber"]
+
+
+# Factors of one's own.
+
+
+def compass(truth, sigma, every, seed=0):
+    """Headings of the poses, every so many, with Gaussian errors, as factors."""
+    graph, rng = gtsam.NonlinearFactorGraph(), np.random.default_rng(seed)
+    for i in range(every, len(truth.poses), every):
+        graph.add(gtsam.PoseRotationPrior2D(
+            X(i), gtsam.Rot2(truth.poses[i, 2] + sigma * rng.normal()), SIGMA(1, sigma)))
+    return graph
+
+
+def assert_equal_estimates(found, expected):
+    """Poses and maps, and covariances but of antennas in doubt by the ranges in the file."""
+    sure = ~np.isin(expected.antenna, [*expected.doubts])
+    assert np.count_nonzero(sure) == 3
+    np.testing.assert_allclose(found.poses, expected.poses, atol=1e-6)
+    np.testing.assert_allclose(found.antenna_in_world, expected.antenna_in_world, atol=1e-5)
+    for name, rows in (("covariances", ...), ("marker_covariance", ...), (
+            "antenna_covariance", sure)):
+        C = getattr(expected, name)[rows]
+        np.testing.assert_allclose(getattr(found, name)[rows], C, rtol=1e-3, atol=1e-3 * C.max())
+
+
+def test_ranges_as_factors_of_ones_own_are_those_of_the_file(drive):
+    """Without a kernel, every third range as a RangeFactor2D is the range it was."""
+    vehicle = replace(drive[0].vehicle, kernel="quadratic", gate=False)
+    whole = known_noise(replace(drive[0].first(600), vehicle=vehicle), 1e-3)
+    own, odd = gtsam.NonlinearFactorGraph(), np.arange(len(whole.uwb.pose)) % 3 == 1
+    for i, k, distance, sigma in zip(*(
+            values[odd].tolist() for values in vars(whole.uwb).values())):
+        own.add(gtsam.RangeFactor2D(X(i), A(k), distance, SIGMA(1, sigma)))
+    part = replace(whole, uwb=whole.uwb.select(~odd))
+    expected, found, without = (slam_result(fit_from_odometry(measure(data, own=graph)))
+                                for data, graph in ((whole, None), (part, own), (part, None)))
+    assert_equal_estimates(found, expected)
+    with pytest.raises(AssertionError):                     # as they do count
+        assert_equal_estimates(without, expected)
+
+
+@pytest.mark.parametrize("with_own", [False, True])
+def test_the_whole_graph_in_gtsam_has_the_solution_and_its_covariances(drive, with_own):
+    """Odometry and calibration included, and factors of one's own, of poses between frames too."""
+    dataset, truth = drive
+    own = compass(replace(truth, poses=truth.poses[:300]), 0.003, 33) if with_own else None
+    found = slam.estimate(known_noise(dataset.first(300), 1e-3), factors=own)
+    graph, values = slam.as_gtsam(found)
+    assert values.exists(C(0)) and values.exists(X(33)) == with_own
+    moved, marginals = gtsam.GaussNewtonOptimizer(graph, values).optimize(), gtsam.Marginals(
+        graph, values)
+    pose = moved.atPose2(X(299))
+    np.testing.assert_allclose([pose.x(), pose.y()], found.poses[-1, :2], atol=1e-6)
+    for key, C_world, heading in (
+            (X(299), found.covariances[-1], found.poses[-1, 2]),
+            (L(int(found.marker[0])), found.marker_covariance[0], found.marker_in_world[0, 2]),
+            (A(int(found.antenna[0])), found.antenna_covariance[0], None)):
+        expected = marginals.marginalCovariance(key)
+        expected = expected if heading is None else se2.rotate_covariance(expected, heading)
+        np.testing.assert_allclose(C_world, expected, rtol=1e-3, atol=1e-3 * expected.max())
+
+
+def test_factors_added_to_the_whole_graph_are_those_given_to_estimate(drive):
+    """Priors of a marker and of an antenna, and GPS, to first order; noise and gates are kept."""
+    dataset = known_noise(drive[0].first(300), 1e-3)
+    before, own = slam.estimate(dataset, kernel="quadratic"), gtsam.NonlinearFactorGraph()
+    marker, antenna = int(before.marker[3]), int(before.antenna[0])
+    place = before.marker_in_world[3] + [1e-3, -1e-3, 1e-3]
+    own.add(gtsam.PriorFactorPose2(L(marker), gtsam.Pose2(*place), SIGMA(3, 1e-3)))
+    own.add(gtsam.PriorFactorPoint2(A(antenna), before.antenna_in_world[0] + 0.01, SIGMA(2, 0.01)))
+    own.add(gtsam.PoseTranslationPrior2D(X(299), before.poses[299, :2] - 1e-3, SIGMA(2, 1e-3)))
+    found = slam.estimate(dataset, kernel="quadratic", factors=own)
+    graph, values = slam.as_gtsam(before)
+    graph.push_back(own)
+    solved = gtsam.GaussNewtonOptimizer(graph, values).optimize()
+    moved = np.abs(found.poses[-1, :2] - before.poses[-1, :2]).max()
+    pose, point = solved.atPose2(X(299)), solved.atPoint2(A(antenna))
+    np.testing.assert_allclose([pose.x(), pose.y()], found.poses[-1, :2], atol=0.05 * moved)
+    np.testing.assert_allclose(point, found.antenna_in_world[0], atol=1e-3)
+    expected = gtsam.Marginals(graph, solved).marginalCovariance(A(antenna))
+    np.testing.assert_allclose(found.antenna_covariance[0], expected, rtol=0.05, atol=1e-7)
+
+
+@pytest.mark.parametrize("keys, told", [
+    ([X(3), X(40)], "found x3, x40"), ([L(10**6)], "found l1000000"), ([X(5000)], "found x5000"),
+    ([C(0)], "found c0")])
+def test_factors_that_the_graph_cannot_have_are_refused(drive, keys, told):
+    own = gtsam.NonlinearFactorGraph()
+    if len(keys) == 2:
+        own.add(gtsam.BetweenFactorPose2(*keys, gtsam.Pose2(), SIGMA(3, 0.1)))
+    else:
+        own.add(gtsam.PriorFactorPose2(*keys, gtsam.Pose2(), SIGMA(3, 0.1)))
+    with pytest.raises(DatasetError, match=f"^factors: expected in factor 0 one .*{told}$"):
+        slam.estimate(known_noise(drive[0].first(100), 1e-3), factors=own)
+
+
+def test_odometry_and_a_compass_alone_are_a_problem(drive):
+    """Neither markers nor ranges; the covariances are right in a wide band."""
+    dataset, truth = drive
+    alone = known_noise(replace(dataset, aruco=None, uwb=None), 1e-3)
+    before, after = (slam.estimate(alone, factors=own) for own in (None, compass(truth, 0.01, 20)))
+    assert ate(after.poses, truth.poses) < ate(before.poses, truth.poses) / 2
+    assert 0.3 < anees(after.poses, after.covariances, truth.poses) < 10

@@ -1,0 +1,189 @@
+"""Increments of odometry that contradict the markers: found, freed, bridged and told."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numeric import as_points
+
+from slamlib import se2, slam
+from slamlib.checks.solution import _of_encoder, solution_doubts
+from slamlib.dataset import ArucoReadings, Dataset
+from slamlib.evaluation import ate, nees
+from slamlib.localization.fused import fuse
+from slamlib.odometry_gate import (
+    FLOOR,
+    NO_JUMPS,
+    UNKNOWN_SIGMA,
+    Jumps,
+    _compared,
+    _drive,
+    find_jumps,
+)
+from slamlib.sightings import sightings_by_frame
+from slamlib.simulation import TABLE_2, simulate
+
+MARKERS = np.array([[1.0, 0.0, 0.3], [0.5, 0.8, -2.0], [0.0, -1.0, 1.0]])
+
+
+BREAK = 800                  # a pose at which several markers are near
+
+
+def seen(poses, markers=MARKERS):
+    """A vehicle whose counts are 0 sees all markers from poses (f, 3), one encoder step apart."""
+    f, k = len(poses), len(markers)
+    z = se2.between(np.repeat(poses, k, axis=0), np.tile(markers, (f, 1)))
+    return Dataset("stands", TABLE_2, np.zeros((f, 2), int), ArucoReadings(
+        np.repeat(np.arange(f), k), np.tile(np.arange(k), f), z,
+        np.tile(1e-4 * np.eye(3), (f * k, 1, 1))), None, None)
+
+
+def test_the_score_of_two_sightings_by_hand():
+    """A marker 1 m ahead seems 0.1 m nearer; turns of the vehicle do not move it along x."""
+    dataset = seen(np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]), MARKERS[:1])
+    s = sightings_by_frame(dataset.aruco)
+    first, second, squared = _compared(s, _drive(np.zeros((2, 3)), TABLE_2.wheelbase))
+    assert (first, second) == (0, 1)
+    np.testing.assert_allclose(squared, 0.1**2 / (2 * 1e-4 + FLOOR**2), rtol=1e-9)
+
+
+def test_a_jump_of_a_vehicle_that_stands_is_found_where_it_is():
+    """And a second one; between them, frames that see nothing of the kind."""
+    poses = np.zeros((12, 3))
+    poses[4:] = [0.4, 0.3, 0.5]
+    poses[9:] = [-0.2, 0.3, 0.5]
+    found = find_jumps(seen(poses))
+    assert found.start.tolist() == [3, 8] and found.end.tolist() == [4, 9]
+    np.testing.assert_allclose(
+        found.increment, se2.between(poses[[3, 8]], poses[[4, 9]]), atol=1e-6)
+    np.testing.assert_allclose(found.by_odometry, 0)
+    np.testing.assert_allclose(found.sigma, [[0.5, 0.5, 0.5], [0.6, 0.6, 0.1]], atol=1e-6)
+    np.testing.assert_allclose(found.mended(np.arange(12), np.zeros((12, 3))), poses, atol=1e-6)
+
+
+def test_shares_of_a_jump_by_hand():
+    """A jump in one of four steps; of the steps 3, 4, 5 and 6 the second has a spike."""
+    jump = np.array([[0.4, 0.0, 0.2]])
+    jumps = Jumps(start=np.array([2]), end=np.array([6]), increment=jump,
+                  by_odometry=np.zeros((1, 3)), sigma=np.array([[0.4, 0.4, 0.2]]),
+                  chance=np.arange(9.0))
+    start, end = np.array([0, 2, 3, 0, 6]), np.array([2, 3, 6, 8, 8])
+    np.testing.assert_allclose(jumps.share(start, end)[:, 0], [0, 0.25, 0.75, 1, 0])
+    motion, covariance = jumps.added(start[1:2], end[1:2])
+    np.testing.assert_allclose(motion, jump / 4)
+    np.testing.assert_allclose(covariance, np.diag([0.04, 0.04, 0.01])[None])
+    spike = replace(jumps, chance=np.cumsum([1, 1, 1, 1, 1e6, 1, 1, 1, 1]))
+    np.testing.assert_allclose(spike.share(start, end)[:, 0], [0, 0, 1, 1, 0], atol=1e-5)
+    assert not NO_JUMPS.added(start, end)[1].any()
+
+
+def test_one_frame_or_none_has_no_jump():
+    for frames in (0, 1, 2):
+        assert not len(find_jumps(seen(np.zeros((frames, 3)))).start)
+
+
+def errors(result, truth):
+    """Aligned ATE in m, and NEES."""
+    return (ate(result.poses, truth.poses, aligned=True),
+            np.nanmean(nees(result.poses[5:], result.covariances[5:], truth.poses[5:])))
+
+
+def spoilt(rows, change):
+    """A fault: the counts of these rows are changed."""
+    def fault(dataset, truth):
+        ticks = dataset.ticks.copy()
+        ticks[rows] = change(ticks[rows])
+        return replace(dataset, ticks=ticks), truth
+    return fault
+
+
+def carried(begin, end):
+    """A fault: nothing is recorded from pose `begin` to `end`, while the vehicle moves."""
+    def fault(dataset, truth):
+        kept = np.r_[:begin, end:len(dataset.ticks)]
+        readings = {}
+        for name in ("aruco", "uwb"):
+            each = getattr(dataset, name)
+            readings[name] = each.select((each.pose < begin) | (each.pose >= end))
+            readings[name].pose[:] -= (end - begin) * (readings[name].pose >= end)
+        ticks = dataset.ticks[kept]
+        return (replace(dataset, ticks=ticks, **readings),
+                replace(truth, poses=truth.poses[kept]))
+    return fault
+
+
+FAULTS = {
+    "pushed by 6 cm": (carried(1003, 1009), 1.5), "carried": (carried(1001, 1301), np.inf),
+    "rows lost": (spoilt(slice(1003, 1033), lambda ticks: 0 * ticks), 1.5),
+    "one wheel dead": (spoilt(slice(1003, 1053), lambda ticks: ticks * [0, 1]), 1.5),
+    "a spike": (spoilt([1004], lambda ticks: ticks + [1500, 0]), 1.5),
+    "dead for a third": (spoilt(slice(1334, None), lambda ticks: 0 * ticks), 4.0)}
+
+
+@pytest.fixture(scope="module")
+def clean():
+    dataset, truth = simulate("short", seed=3)
+    return dataset, truth, errors(slam.estimate(dataset.without("uwb")), truth)[0]
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_fault_of_odometry_is_told_and_costs_little(name, clean):
+    fault, most = FAULTS[name]
+    dataset, truth = fault(*clean[:2])
+    result = slam.estimate(dataset.without("uwb"))
+    error, consistency = errors(result, truth)
+    assert consistency < 6 and error < most * clean[2]
+    doubt, = (each for each in solution_doubts(result) if each.what == "encoder")
+    assert "between poses 1" in doubt.sentence
+    both = slam.estimate(dataset, previous=result)
+    assert errors(both, truth)[1] < 6 and both.jumps is result.jumps
+    assert errors(fuse(dataset), truth)[1] < 6
+
+
+def test_jumps_are_found_in_the_vehicle_s_axes_of_a_camera_that_is_turned(clean):
+    """Its place is stated; in the camera's own axes good increments contradict the markers."""
+    dataset, truth = FAULTS["one wheel dead"][0](*clean[:2])
+    a, turned = dataset.aruco, [0.0, 0.0, np.pi / 2]
+    dataset = replace(
+        dataset, vehicle=replace(dataset.vehicle, camera_turn=np.pi / 2), aruco=replace(
+            a, marker_in_vehicle=se2.between(turned, a.marker_in_vehicle),
+            covariance=se2.rotate_covariance(a.covariance, -np.pi / 2)))
+    error, consistency = errors(slam.estimate(dataset.without("uwb")), truth)
+    assert consistency < 6 and error < 1.5 * clean[2]
+
+
+def test_where_all_markers_change_the_later_covariance_is_that_of_not_knowing(clean):
+    dataset, truth, _ = clean
+    aruco = dataset.aruco
+    dataset = replace(dataset, aruco=replace(
+        aruco, marker=aruco.marker + 1000 * (aruco.pose > BREAK)))
+    result = slam.estimate(dataset.without("uwb"))
+    assert (result.jumps.sigma == UNKNOWN_SIGMA).all() and len(result.jumps.start) == 1
+    sigma = np.sqrt(result.covariances[:, 0, 0])
+    assert sigma[BREAK] < 0.1 and sigma[BREAK + 20] > 5
+    assert any("all markers change at once" in doubt.sentence for doubt in solution_doubts(result))
+
+
+@pytest.mark.parametrize("options", [
+    {}, {"slip": 0.0}, {"slip": 1e-2}, {"mislabelled": 0.03}], ids=str)
+@pytest.mark.parametrize("path, seeds", [("short", (0, 1, 2)), ("long", (0,))])
+def test_no_jump_in_clean_drives(path, seeds, options):
+    """As they are, with overconfident covariances, late sightings, and sightings of points."""
+    for seed in seeds:
+        dataset, _ = simulate(path, seed=seed, **options)
+        a = dataset.aruco
+        late = replace(a, pose=np.minimum(a.pose + 8, len(dataset.ticks) - 1))
+        points = (as_points(a, slice(None)),) * ("mislabelled" not in options)
+        for aruco in (a, replace(a, covariance=a.covariance / 16), late, *points):
+            assert not len(find_jumps(replace(dataset, aruco=aruco)).start)
+
+
+def test_the_doubt_names_three_stretches_and_counts_the_others():
+    poses = np.zeros((300, 3))
+    poses[:, 0] = 0.3 * (np.arange(300) // 50 % 2)
+    result = type("result", (), {"jumps": find_jumps(seen(poses))})
+    sentence, = (sentence for _, sentence in _of_encoder(result))
+    assert "between poses 50 and 51 the vehicle moved by 0.00 m and 0 degrees, but the markers " \
+        "say 0.30 m and 0 degrees, which ends 0.30 m" in sentence
+    assert sentence.count("between") == 3 and "and 2 more times" in sentence
+    assert not list(_of_encoder(type("result", (), {"jumps": NO_JUMPS})))

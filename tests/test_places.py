@@ -1,0 +1,83 @@
+"""An id is one place until it is not: visits, and markers that are several landmarks."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from slamlib import evaluation, se2, slam
+from slamlib.checks.solution import solution_doubts
+from slamlib.dataset import ArucoReadings
+from slamlib.simulation import simulate
+from slamlib.slam.choices import has_rejected_visits, visits
+from slamlib.slam.measurements import measure
+from slamlib.slam.pipeline import fit_from_odometry
+
+
+def test_visits_end_with_a_long_break():
+    """Sightings every 10 poses; breaks of 40 poses stay within a visit, of 1,000 they end it."""
+    pose = np.r_[0:50:10, 80:120:10, 1120:1150:10, 5:35:10]
+    marker = np.repeat([3, 3, 3, 8], [5, 4, 3, 3])
+    order = np.argsort(pose, kind="stable")
+    aruco = ArucoReadings(pose[order], marker[order], None, None)
+    expected = np.repeat([0, 0, 1, 2], [5, 4, 3, 3])[order]
+    np.testing.assert_array_equal(visits(aruco), expected)
+
+
+@pytest.fixture(scope="module")
+def moved():
+    """Three rounds; before the third most markers are moved by half a metre, one is turned."""
+    dataset, truth = simulate("short", seed=5, rounds=3)
+    dataset = replace(dataset, uwb=None, antenna_guess=None)
+    rng, aruco = np.random.default_rng(0), dataset.aruco
+    marker = truth.marker[rng.permutation(len(truth.marker))[:len(truth.marker) * 3 // 4]]
+    place = truth.marker_in_world[np.searchsorted(truth.marker, aruco.marker)]
+    later = np.isin(aruco.marker, marker) & (aruco.pose >= len(dataset.ticks) * 2 // 3)
+    angle = dict(zip(marker.tolist(), rng.uniform(-np.pi, np.pi, len(marker))))
+    step = np.array([[0.5 * np.cos(angle[j]), 0.5 * np.sin(angle[j]), 0.0] if moves else np.zeros(3)
+                     for j, moves in zip(aruco.marker.tolist(), later)])
+    pose = truth.poses[aruco.pose]
+    change = se2.between(pose, place + step) - se2.between(pose, place)
+    return replace(dataset, aruco=replace(
+        aruco, marker_in_vehicle=aruco.marker_in_vehicle + change)), dataset, truth, marker
+
+
+@pytest.mark.slow
+def test_moved_markers_are_landmarks_of_their_own(moved):
+    dataset, before, truth, marker = moved
+    result, clean = slam.estimate(dataset), slam.estimate(before)
+    ids, places = result.places[result.places[:, 0] != result.places[:, 1]].T
+    assert set(ids) == set(marker) and set(places - ids) == {10**len(str(truth.marker.max()))}
+    assert np.isin(places, result.marker).all()
+    assert evaluation.ate(result.poses, truth.poses, True) < 2 * evaluation.ate(
+        clean.poses, truth.poses, True)
+    assert evaluation.anees(result.poses, result.covariances, truth.poses) < 8
+    sentence, = (doubt.sentence for doubt in solution_doubts(result) if doubt.what == "places")
+    assert all(str(each) in sentence for each in set(places))
+    assert clean.places is None
+
+
+@pytest.mark.slow
+def test_problem_4_has_the_places_of_problem_3(moved):
+    dataset, _, truth, _ = moved
+    with_ranges = simulate("short", seed=5, rounds=3)[0]
+    dataset = replace(dataset, uwb=with_ranges.uwb, antenna_guess=with_ranges.antenna_guess)
+    before = slam.estimate(dataset.without("uwb"))
+    result = slam.estimate(dataset, previous=before)
+    np.testing.assert_array_equal(result.places, before.places)
+    assert evaluation.ate(result.poses, truth.poses, True) < 0.01
+
+
+@pytest.mark.slow
+def test_noise_that_memory_learns_does_not_hide_a_moved_marker(moved):
+    """Covariances that are too small are no sign of one: their errors have no memory."""
+    dataset, before, _, _ = moved
+    small = replace(before, aruco=replace(before.aruco, covariance=before.aruco.covariance / 16))
+    for drive, share, hidden in (
+            (dataset, 0.05, True), (before, 0.05, False), (small, None, False)):
+        fit = fit_from_odometry(measure(drive.without("uwb")))
+        share = share and np.full(len(fit.problem.accepted.weight), share)
+        problem = replace(fit.problem, accepted=replace(fit.problem.accepted, share=share))
+        if share is not None:
+            problem = replace(problem, noise=replace(problem.noise, sightings=14.0))
+        assert has_rejected_visits(replace(fit, problem=problem)) == hidden
