@@ -155,7 +155,7 @@ def _require_elsewhere(out, *folders):
 
 def _solve(options):
     from slamlib import solve
-    from slamlib.inventory import inventory_lines
+    from slamlib.dataset import inventory_lines
     from slamlib.slam.fit import KERNELS
     from slamlib.summary import solve_to_folder, summary_table
     _require_elsewhere(options.out, options.folder)

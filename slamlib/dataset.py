@@ -4,31 +4,31 @@ The folder holds `encoderReading.txt` and, where the vehicle has the sensors, `A
 `UwbReading.txt` with `UwbAntennaGuess.txt`. Optional are `vehicle.toml`, with what differs from the
 assignment's table 2, and the folder `truth`. Lengths are in metres, angles in radians. Pose ids
 count from 1 in the files and from 0 in the arrays; marker and antenna ids stay unchanged. Numbers
-are within `limits.LIMITS`. `folder` finds the files, `dialects` reads their numbers.
+are within `tables.LIMITS`. `folder` finds the files, `tables` reads their numbers.
 """
 
 import json
 from dataclasses import dataclass, replace
+from numbers import Integral
 from os.path import abspath
 from pathlib import Path
 
 import numpy as np
 
-from slamlib import counts, se2
+from slamlib import se2
 from slamlib.covariance import correlations
-from slamlib.dialects import Variable, read_table
 from slamlib.doubt import Doubt
-from slamlib.folder import ENCODER, TABLES, TRUTH_FILES, Contents, contents, is_dataset
-from slamlib.limits import LIMITS
+from slamlib.folder import ENCODER, TABLES, TRUTH_FILES, Variable, contents, is_dataset
+from slamlib.tables import LIMITS, matrix, read_table
 from slamlib.textfile import DatasetError, error, quoted
 from slamlib.truth_frame import in_first_frame
-from slamlib.vehicle import Vehicle, changed, read_vehicle
+from slamlib.vehicle import Vehicle, changed, incremental_counts, read_vehicle
 
 MIN_EIGENVALUE = 1e-12  # of a correlation matrix; with a smaller one it counts as singular
 MAX_NEGATIVE_SIGMAS = 5.0  # sigmas, by which noise may make a range negative
 TABLE_2 = Vehicle()  # the assignment's nominal vehicle
 MAX_BAD_SHARE = 0.1  # of the rows of a sensor, which are left out; with more a file is refused
-MIN_EXCHANGED = 9  # ids in column 2 above which columns may look exchanged
+MIN_EXCHANGED = 10  # ids in column 2 with which columns may look exchanged
 
 
 class _Readings:
@@ -91,7 +91,6 @@ class Dataset:
         uwb : (r, 4) pose from 1 to n, antenna id, range, standard deviation; or None.
         guess : (a, 3) antenna id, x, y; or None without `uwb`.
         vehicle : Vehicle
-        name : str, for messages.
 
         Raises
         ------
@@ -103,17 +102,14 @@ class Dataset:
         >>> len(dataset.ticks), dataset.uwb.antenna.tolist()
         (2, [7])
         """
-        if not isinstance(vehicle, Vehicle):
-            raise error("vehicle", f"expected a Vehicle, found {quoted(vehicle)}")
+        _require(isinstance(vehicle, Vehicle), "vehicle", "a Vehicle", vehicle)
         stated = {key: value for key, value in vars(vehicle).items() if value is not None}
-        ticks = _array(ticks)
-        if ticks.shape[1:] != (2,):
-            raise error("ticks", "expected a matrix with the columns (right ticks, left ticks)")
+        ticks = matrix("ticks", ticks, list(LIMITS[ENCODER])[1:])
         ticks = np.column_stack([np.arange(1, len(ticks) + 1), ticks])
         arguments = {"ticks": ticks, "aruco": aruco, "uwb": uwb, "guess": guess}
-        files = {file: Variable(None, key, _array(value))
+        files = {file: Variable(None, key, value)
                  for file, (key, value) in zip(TABLES, arguments.items()) if value is not None}
-        return _dataset(Contents(None, files, ()), changed(TABLE_2, stated, "vehicle"), name)
+        return _dataset(files, changed(TABLE_2, stated, "vehicle"), name)
 
     @property
     def sightings(self):
@@ -132,14 +128,15 @@ class Dataset:
 
     def without(self, sensor):
         """The Dataset without a sensor, "aruco" or "uwb"."""
+        _require(sensor in ("aruco", "uwb"), "without", '"aruco" or "uwb"', sensor)
         return replace(self, **{sensor: None})
 
     def first(self, count):
         """The Dataset of the first `count` poses; sensors without readings are None."""
-        def until(readings):
-            early = readings and readings.select(readings.pose < count)
-            return early if early and len(early.pose) else None
-        return replace(self, ticks=self.ticks[:count], aruco=until(self.aruco), uwb=until(self.uwb))
+        _require(isinstance(count, Integral) and count > 0, "first", "a number of poses", count)
+        early = {sensor: readings.select(readings.pose < count) for sensor in ("aruco", "uwb")
+                 if (readings := getattr(self, sensor)) and (readings.pose < count).any()}
+        return replace(self, ticks=self.ticks[:count], **{"aruco": None, "uwb": None} | early)
 
 
 @dataclass(frozen=True)
@@ -167,12 +164,11 @@ def dataset_names(data, names=None):
     if not found:
         raise error(data, f"expected this folder, with a sub-folder with an {ENCODER} for each "
                     "dataset, found none")
-    selected = found if names is None else list(names)
-    for name in selected:
-        if not (data / name).is_dir():
-            raise DatasetError(f"{data}: expected one of {', '.join(found)}, found {name!r}")
+    names = found if names is None else list(names)
+    for name in names:
+        _require((data / name).is_dir(), data, f"one of {', '.join(found)}", name)
         contents(data / name).required(ENCODER)
-    return selected
+    return names
 
 
 def read_dataset(folder):
@@ -187,29 +183,23 @@ def read_dataset(folder):
     >>> len(dataset.ticks), len(dataset.aruco.pose), dataset.antenna_guess.antenna.tolist()
     (2000, 894, [5, 13, 36, 46])
     """
-    files = contents(folder)
-    return _dataset(files, read_vehicle(files, default=TABLE_2), Path(abspath(folder)).name)
+    found = contents(folder)
+    found.required(ENCODER)
+    vehicle = read_vehicle(found.files.get("vehicle.toml"), default=TABLE_2)
+    return _dataset(found.files, vehicle, Path(abspath(folder)).name, found.notes)
 
 
-def _array(value):
-    """The np.ndarray of an argument, or one without dimensions if it makes none."""
-    try:
-        return np.asarray(value)
-    except ValueError:                                       # rows of different lengths
-        return np.asarray(None)
-
-
-def _dataset(files, vehicle, name):
-    """The Dataset of this name by its Vehicle and Contents."""
-    notes = list(files.notes)
-    table, ticks = counts.incremental_counts(_read_all_poses(files, ENCODER), vehicle)
+def _dataset(files, vehicle, name, notes=()):
+    """The Dataset of this name by its Vehicle and the sources (dict) of its tables by name."""
+    table, ticks = incremental_counts(_read_all_poses(files, ENCODER), vehicle)
     for key in ("sighting_lag", "range_lag"):
         if abs(getattr(vehicle, key)) >= len(ticks) > 1:
-            raise error(files.files.get("vehicle.toml", "vehicle"), f"expected a {key} below the "
-                        f"number of poses ({len(ticks)}) in size, found {getattr(vehicle, key):g}")
-    notes += table.notes
-    notes += [f"vehicle.toml sets {key} = {json.dumps(getattr(vehicle, key))} for problems 3 and 4."
-              for key in ("kernel", "gate") if getattr(vehicle, key) != getattr(TABLE_2, key)]
+            raise error(files.get("vehicle.toml", "vehicle"), f"expected a {key} below the number "
+                        f"of poses ({len(ticks)}) in size, found {getattr(vehicle, key):g}")
+    notes, table = [*notes, *table.notes], None      # which has the rows of the file
+    notes += [
+        f"vehicle.toml sets {key} = {json.dumps(getattr(vehicle, key))} for problems 3 and 4."
+        for key in ("kernel", "gate") if getattr(vehicle, key) != getattr(TABLE_2, key)]
     aruco = _read_aruco(files, len(ticks), notes)
     uwb, guess = _read_uwb(files, len(ticks), notes)
     return Dataset(name=name, vehicle=vehicle, ticks=ticks, aruco=aruco, uwb=uwb,
@@ -227,27 +217,34 @@ def read_truth(folder):
     drive = contents(folder)
     if "truth" not in drive.files:
         return None
-    files = contents(drive.files["truth"], TRUTH_FILES)
-    vehicle = read_vehicle(drive, default=TABLE_2)
-    pose_count = len(_read_all_poses(drive, ENCODER).numbers)
-    table = _read_all_poses(files, "vehiclePose.txt")
-    poses, notes = table.numbers[:, 1:], [*files.notes, *table.notes]
+    found = contents(drive.files["truth"], TRUTH_FILES)
+    drive.required(ENCODER)
+    found.required("vehiclePose.txt")
+    vehicle = read_vehicle(drive.files.get("vehicle.toml"), default=TABLE_2)
+    pose_count = len(_read_all_poses(drive.files, ENCODER).numbers)
+    table = _read_all_poses(found.files, "vehiclePose.txt")
+    poses, notes = table.numbers[:, 1:], [*found.notes, *table.notes]
     if len(poses) != pose_count:
         raise error(table.source, f"expected {pose_count} poses (encoder file), found {len(poses)}")
-    marker, marker_in_world = _read_map(files, "ArucoMap.txt", notes)
-    antenna, antenna_in_world = _read_map(files, "UwbMap.txt", notes)
-    truth = Truth(poses=np.column_stack([poses[:, :2], np.unwrap(poses[:, 2])]),
-                  marker=marker, marker_in_world=marker_in_world,
-                  antenna=antenna, antenna_in_world=antenna_in_world,
-                  vehicle=read_vehicle(files, default=vehicle),
-                  notes=tuple(f"In truth: {note}" for note in notes))
-    return in_first_frame(truth)
+    marker, marker_in_world = _read_map(found.files, "ArucoMap.txt", notes)
+    antenna, antenna_in_world = _read_map(found.files, "UwbMap.txt", notes)
+    return in_first_frame(Truth(
+        poses=np.column_stack([poses[:, :2], np.unwrap(poses[:, 2])]),
+        marker=marker, marker_in_world=marker_in_world,
+        antenna=antenna, antenna_in_world=antenna_in_world,
+        vehicle=read_vehicle(found.files.get("vehicle.toml"), default=vehicle),
+        notes=tuple(f"In truth: {note}" for note in notes)))
+
+
+def _require(ok, source, expected, found):
+    """Raise DatasetError about an argument or a folder that is not as expected."""
+    if not ok:
+        raise DatasetError(f"{source}: expected {expected}, found {quoted(found)}")
 
 
 def _read_all_poses(files, name):
-    """The Table of a required file, with a row for each pose."""
-    files.required(name)
-    table = read_table(files.files.get(name), name)
+    """The Table of a file with a row for each pose."""
+    table = read_table(files[name], name)
     if len(table.numbers) == 0 and name == ENCODER:
         raise error(table.source, "expected at least the row '1 0 0', found no rows")
     ids = np.arange(1, len(table.numbers) + 1)
@@ -256,8 +253,7 @@ def _read_all_poses(files, name):
 
 def _read_map(files, name, notes, optional=None):
     """Landmark ids (k,), ascending, and the further columns (k, c - 1)."""
-    table = read_table(files.files.get(name), name, optional=optional,
-                          settled=any("decimal commas" in note for note in notes))
+    table = read_table(files.get(name), name, optional=optional)
     notes += table.notes
     ids, first_row = np.unique(table.numbers[:, 0], return_index=True)
     table.kept(np.isin(np.arange(len(table.numbers)), first_row), "each id only once")
@@ -266,55 +262,81 @@ def _read_map(files, name, notes, optional=None):
 
 def _read_aruco(files, pose_count, notes):
     """The ArucoReadings, or None without rows."""
-    table = _read_readings(files, "ArucoReading.txt", pose_count)
+    table = _read_sensor(files, "ArucoReading.txt", pose_count)
     # Scaled to correlations: s_thetatheta may be 1e4 rad^2 where s_xx is 1e-4 m^2.
-    smallest_eigenvalue = np.linalg.eigvalsh(correlations(_covariances(table)))[:, 0]
+    smallest_eigenvalue = np.linalg.eigvalsh(correlations(_covariances(table.numbers)))[:, 0]
     table = table.kept(smallest_eigenvalue > MIN_EIGENVALUE, "a positive definite covariance "
                        f"(smallest eigenvalue of its correlation matrix above {MIN_EIGENVALUE:g})",
                        MAX_BAD_SHARE)
     notes += table.notes
-    return _in_order(table, ArucoReadings, table.numbers[:, 2:5], _covariances(table))
+    rows = _in_order(table.numbers)
+    return ArucoReadings(*_ids(rows), rows[:, 2:5], _covariances(rows)) if len(rows) else None
 
 
-def _covariances(table):
-    """Covariances (m, 3, 3) of a Table of sightings."""
-    return table.numbers[:, 5:][:, [[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
+def _covariances(rows):
+    """Covariances (m, 3, 3) of rows (m, 11) of sightings."""
+    return rows[:, 5:][:, [[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
 
 
 def _read_uwb(files, pose_count, notes):
     """The UwbReadings, or None without rows, and the AntennaGuess, which has all of their ids."""
-    table = _read_readings(files, "UwbReading.txt", pose_count)
-    low = -MAX_NEGATIVE_SIGMAS * table.numbers[:, 3]
-    table = table.kept(table.numbers[:, 2] >= low, "a range that is not below "
-                       f"-{MAX_NEGATIVE_SIGMAS:g} sigma", MAX_BAD_SHARE)
+    table = _read_sensor(files, "UwbReading.txt", pose_count)
+    table = table.kept(table.numbers[:, 2] >= -MAX_NEGATIVE_SIGMAS * table.numbers[:, 3],
+                       f"a range that is not below -{MAX_NEGATIVE_SIGMAS:g} sigma", MAX_BAD_SHARE)
     notes += table.notes
     guess = AntennaGuess(*_read_map(files, "UwbAntennaGuess.txt", notes, optional="z"))
     table.kept(np.isin(table.numbers[:, 1], guess.antenna), "an antenna id that the guesses have: "
                "UwbAntennaGuess.txt in the same folder, or guess")
-    return _in_order(table, UwbReadings, *table.numbers[:, 2:].T), guess
+    rows = _in_order(table.numbers)
+    return UwbReadings(*_ids(rows), *rows[:, 2:].T) if len(rows) else None, guess
 
 
-def _read_readings(files, name, pose_count):
+def _read_sensor(files, name, pose_count):
     """The Table of a sensor, with pose ids of the drive."""
-    table = read_table(files.files.get(name), name, MAX_BAD_SHARE)
+    table = read_table(files.get(name), name, MAX_BAD_SHARE)
     pose, landmark = table.numbers[:, :2].T
     # Ids in column 2 ascend over most of the drive; those in column 1 do not, are fewer, and cover
     # less than half of it.
-    if (len(np.unique(landmark)) > max(len(np.unique(pose)), MIN_EXCHANGED)
-            and 1 <= landmark.min() and landmark.max() <= pose_count
-            and (np.diff(landmark) >= 0).all() and not (np.diff(pose) >= 0).all()
-            and np.ptp(landmark) > pose_count / 2 > np.ptp(pose)):
+    if (len(pose) >= MIN_EXCHANGED and (np.diff(landmark) >= 0).all() and landmark[0] >= 1
+            and landmark[-1] <= pose_count and not (np.diff(pose) >= 0).all()
+            and np.ptp(landmark) > pose_count / 2 > np.ptp(pose)
+            and len(np.unique(landmark)) >= max(len(np.unique(pose)) + 1, MIN_EXCHANGED)):
         raise error(table.source, f"expected the columns ({', '.join(LIMITS[name])}), but columns "
                     "1 and 2 look exchanged: column 2 has the pose ids of a drive")
     return table.kept((1 <= pose) & (pose <= pose_count), f"a pose id from 1 to {pose_count}",
                       MAX_BAD_SHARE)
 
 
-def _in_order(table, make, *values):
-    """Readings made of `values` in ascending order of pose, or None; rows that repeat count once.
-    """
-    pose, landmark = table.numbers[:, :2].astype(np.int64).T
-    _, rows = np.unique(table.numbers, axis=0, return_index=True)
-    rows = np.sort(rows)
-    return make(pose - 1, landmark, *values).select(
-        rows[np.argsort(pose[rows], kind="stable")]) if len(pose) else None
+def _in_order(rows):
+    """Rows in ascending order of pose; those that repeat count once."""
+    rows = rows[np.sort(np.unique(rows, axis=0, return_index=True)[1])]
+    return rows[np.argsort(rows[:, 0], kind="stable")]
+
+
+def _ids(rows):
+    """Poses, counted from 0, and landmark ids: two (m,) int64."""
+    return rows[:, 0].astype(np.int64) - 1, rows[:, 1].astype(np.int64)
+
+
+def all_notes(dataset, truth):
+    """Notes (tuple of str) on what was mended or left out of a Dataset and its Truth or None."""
+    return (*dataset.notes, *(() if truth is None else truth.notes))
+
+
+def inventory_lines(dataset, truth):
+    """Lines (list of str) on what was read of a Dataset and its Truth or None, with all notes."""
+    aruco, uwb = dataset.aruco, dataset.uwb
+    stated = [f"{key} = {value:g}" if isinstance(value, float) else f"{key} = {json.dumps(value)}"
+              for key, value in vars(dataset.vehicle).items() if value != getattr(TABLE_2, key)]
+    right, left = abs(dataset.ticks).sum(axis=0)
+    return [f"{dataset.name}: {line}" for line in (
+        f"encoders: {len(dataset.ticks)} poses, {right} ticks right and {left} left",
+        "markers: none, no ArucoReading.txt with rows" if aruco is None else
+        f"markers: {len(aruco.pose)} sightings of {len(np.unique(aruco.marker))} markers at "
+        f"{len(np.unique(aruco.pose))} poses",
+        "ranges: none, no UwbReading.txt with rows" if uwb is None else
+        f"ranges: {len(uwb.pose)} ranges to {len(np.unique(uwb.antenna))} antennas at "
+        f"{len(np.unique(uwb.pose))} poses",
+        "vehicle.toml: " + (", ".join(stated) or "none, or as the assignment's table 2"),
+        f"truth: {'no' if truth is None else 'yes'}",
+        *(f"note: {note}" for note in all_notes(dataset, truth)))]

@@ -1,15 +1,18 @@
 """Finds the files of a dataset in its folder: each file is read, named in a note, or refused.
 
 A file is read under its name as browsers, editors and Windows leave it, as `ArucoReading (1).txt`
-or `ArucoReading.txt.txt`, and a note says so. Other names are not guessed.
+or `ArucoReading.txt.txt`, and a note says so. Other names are not guessed. The matrices of .mat
+files stand in for text files that are missing.
 """
 
 import re
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 
-from slamlib.dialects import Variable, mat_variables
-from slamlib.textfile import DatasetError, error, read_regular
+from scipy.io import loadmat
+
+from slamlib.textfile import DatasetError, error, read_bytes
 
 ENCODER = "encoderReading.txt"
 # Names of the tables, of all files of a dataset, and of those in its folder `truth`.
@@ -21,6 +24,18 @@ SYSTEM_FILES = re.compile(r"\..*(?<!\.icloud)|thumbs\.db|desktop\.ini|__macosx",
 # What browsers, editors and file managers add to a name.
 COPY = r"( ?\(\d+\)|[ _-]+cop(y|ia)( ?\(\d+\)| \d+)?)*"
 MAX_LISTED_NAMES = 5  # file names in one sentence
+
+
+@dataclass(frozen=True)
+class Variable:
+    """A table in a .mat file, or an argument of `Dataset.from_arrays`."""
+
+    path: Path | None  # None of an argument
+    name: str
+    value: object  # what scipy made of it, or the user
+
+    def __str__(self):
+        return f"{self.path}, variable {self.name}" if self.path else self.name
 
 
 @dataclass(frozen=True)
@@ -48,11 +63,11 @@ def contents(folder, expected=DATASET_FILES):
     folder, files, notes = Path(folder), {}, []
     rest = _listed(folder)
     for name in expected:
-        same = [path for path in rest if _is_named(path, name)]
-        same.sort(key=lambda path: path.name.lower() != name.lower())     # the name itself first
+        same = sorted((path for path in rest if _is_named(path, name)),     # the name itself first
+                      key=lambda path: path.name.lower() != name.lower())
         rest = [path for path in rest if path not in same]
         for other in same[1:]:
-            if read_regular(other) != read_regular(same[0]):
+            if read_bytes(other) != read_bytes(same[0]):
                 raise error(folder / name, f"expected one file of this name, found {same[0].name} "
                             f"and {other.name}, which differ: move one of them away")
             notes.append(f"{other.name} is not read: it is a copy of {same[0].name}.")
@@ -66,9 +81,9 @@ def contents(folder, expected=DATASET_FILES):
                   and any(_is_named(inner, ENCODER) for inner in path.glob("*"))]
         if len(deeper) == 1 and not files:
             inner, rest = contents(deeper[0]), [path for path in rest if path != deeper[0]]
-            notes.append(f"The files were read from the sub-folder {listed_names(deeper)}.")
+            notes.append(f"The files were read from the sub-folder {_shown(deeper[0].name)}.")
             folder, files, notes = inner.folder, inner.files, [*notes, *inner.notes]
-    return Contents(folder, files, (*notes, *_not_read(rest)))
+    return Contents(folder, files, (*notes, *_not_read([path.name for path in rest])))
 
 
 def is_dataset(folder):
@@ -82,7 +97,7 @@ def is_dataset(folder):
 def left_in(data):
     """Sentences (list of str) on what in the folder of all datasets (Path) is no dataset."""
     return [f"{data}: {sentence}" for sentence in _not_read(
-        [path for path in _listed(data) if path.name != "README.md"
+        [path.name for path in _listed(data) if path.name != "README.md"
          and not (path.is_dir() and is_dataset(path))])]
 
 
@@ -112,31 +127,43 @@ def _add_variables(files, rest):
     for path in [path for path in rest if missing and path.suffix.lower() == ".mat"]:
         rest.remove(path)
         try:
-            values = mat_variables(path)
+            variables = _variables(path)
         except DatasetError as failure:
             notes.append(f"{path.name} is not read{str(failure).removeprefix(str(path))}.")
             continue
-        for each in list(values):
-            stem = path.stem if len(values) == 1 else ""
-            name = next((missing[word] for word in (each.rpartition(".")[2].lower(), stem.lower())
-                         if word in missing), None)
+        unread = []
+        for each in variables:
+            alone = len(variables) == 1 and each.name.lower() not in missing
+            name = missing.get((path.stem if alone else each.name).lower())
             if name in files:
                 raise error(path, f"expected one table {Path(name).stem}, found it in "
-                            f"{files[name].name} of {files[name].path.name} and in {each}")
+                            f"{files[name].name} of {files[name].path.name} and in {each.name}")
             if name:
-                files[name] = Variable(path, each, values.pop(each))
-                notes.append(f"Variable {each} of {path.name} was read as {name}.")
-        notes += _not_read([Path(f"{each} of {path.name}") for each in values], " variables")
+                files[name] = each
+                notes.append(f"Variable {each.name} of {path.name} was read as {name}.")
+            else:
+                unread.append(f"{each.name} of {path.name}")
+        notes += _not_read(unread, " variables")
     return notes
 
 
-def _not_read(paths, kind=""):
-    return [f"Not read:{kind} {listed_names(paths)}."] * bool(paths)
+def _variables(path):
+    """The Variables (list) of a .mat file of the versions 5 to 7; DatasetError for others."""
+    data = read_bytes(path)
+    try:
+        found = loadmat(BytesIO(data))
+    except Exception:                   # scipy raises many kinds about other versions and bytes
+        raise error(path, "expected a .mat file of version 7 or older, saved with '-v7'") from None
+    return [Variable(path, name, value) for name, value in found.items() if name[:2] != "__"]
 
 
-def listed_names(paths):
-    """Names (str) of the first MAX_LISTED_NAMES of a list of paths, and the number of others."""
-    named = [path.name if path.name.isprintable() and path.name.isascii() and len(path.name) < 40
-             else ascii(path.name[:40]) for path in paths[:MAX_LISTED_NAMES]]
-    more = len(paths) - len(named)
-    return ", ".join(named) + (f" and {more} more" if more else "")
+def _not_read(names, kind=""):
+    """A sentence (list of one or no str) with the first MAX_LISTED_NAMES, and how many more."""
+    listed = ", ".join(map(_shown, names[:MAX_LISTED_NAMES]))
+    more = f" and {len(names) - MAX_LISTED_NAMES} more" * (len(names) > MAX_LISTED_NAMES)
+    return [f"Not read:{kind} {listed}{more}."] * bool(names)
+
+
+def _shown(name):
+    """A file's name without line ends and letters that a terminal may not have."""
+    return name if re.fullmatch("[ -~]{1,39}", name) else ascii(name[:40])

@@ -16,9 +16,8 @@ import numpy as np
 
 from slamlib import evaluation, swap
 from slamlib.checks.files import doubts_before_solving, merged
-from slamlib.dataset import read_dataset, read_truth
+from slamlib.dataset import all_notes, read_dataset, read_truth
 from slamlib.export import export_results
-from slamlib.inventory import all_notes
 from slamlib.solve import (
     PROBLEMS,
     RESULT_NAMES,

@@ -4,30 +4,40 @@ A `DatasetError` is one sentence, which names the file, the line and what was ex
 """
 
 import re
-import stat
 import tomllib
 from difflib import get_close_matches
+from json import detect_encoding
 
-CONTROL_BYTE = re.compile(rb"[\x00-\x08\x0e-\x1f]")  # bytes that no text has
+CONTROL_BYTES = bytes([*range(9), *range(14, 32)])  # which no text has
 
 
 class DatasetError(ValueError):
     """A dataset does not follow the format; the message names file, line and expectation."""
 
 
+def error(source, message, line=None):
+    """DatasetError whose message begins with the source, a file or argument, and the line, if any.
+
+    `line` is a number, or a str such as "row 3" where the rows of a source are not lines.
+    """
+    place = line if isinstance(line, str) else f"line {line}"
+    return DatasetError(f"{source}{'' if line is None else f', {place}'}: {message}")
+
+
+def quoted(value):
+    """The first 60 characters (str) of a value, in quotes."""
+    try:
+        text = str(value)
+    except ValueError:                         # Python writes no integers of thousands of digits
+        return "a far longer number"
+    return repr(text if len(text) <= 60 else text[:60] + "...")
+
+
 def read_toml(path, example, known, encoding="ascii"):
     """Entries of a TOML file without tables: a dict from key to (value, line number or None).
 
-    Parameters
-    ----------
-    path : Path
-    example : str, a valid entry, quoted in the message.
-    known : list of str, the allowed keys.
-    encoding : str; bytes that are invalid in this encoding become '\\ufffd'.
-
-    Raises
-    ------
-    DatasetError : the file is not TOML, or has a key that is not allowed.
+    Raises DatasetError, which quotes the `example` of an entry, if the file is not TOML, or has a
+    key that is not among the `known` ones. For `encoding` see `read_text`.
     """
     text = read_text(path, encoding)[0]
     try:
@@ -48,56 +58,32 @@ def read_toml(path, example, known, encoding="ascii"):
 
 
 def read_text(path, encoding="ascii"):
-    """Text of a file with line ends '\\n', and the name of its encoding if that is UTF-16, or "".
+    """Text of a file with line ends '\\n', and its encoding if that is UTF-16 or UTF-32, or "".
 
-    Bytes that are invalid in `encoding` become '\\ufffd'. UTF-16 has a byte order mark, or NUL in
-    every second byte. Raises DatasetError if the file cannot be read or has control bytes.
+    Bytes that are invalid in `encoding` become '\\ufffd'. Raises DatasetError if the file cannot be
+    read or has control bytes.
     """
-    data = read_regular(path)
-    utf16 = next((codec for codec, is_so in (
-        ("utf-16", data[:2] in (b"\xff\xfe", b"\xfe\xff")),
-        ("utf-16-le", data[1:] and not data[1::2].strip(b"\0")),
-        ("utf-16-be", data and not data[::2].strip(b"\0"))) if is_so), "")
+    data = read_bytes(path)
+    codec = detect_encoding(data)                # by a byte order mark, or by where NUL bytes are
+    wide = "" if codec.startswith("utf-8") else codec[:6].upper()
     try:
-        data = data.decode(utf16).encode() if utf16 else data
+        data = data.decode(codec).encode() if wide else data
     except UnicodeError:
-        raise error(path, "expected plain text, found UTF-16 that breaks off") from None
+        raise error(path, f"expected plain text, found {wide} that breaks off") from None
     data = data.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n").replace(b"\r", b"\n")
-    if control := CONTROL_BYTE.search(data):
-        line = data.count(b"\n", 0, control.start()) + 1
-        raise error(path, f"expected plain text, found the byte 0x{control[0].hex()}", line)
-    return data.decode(encoding, errors="replace"), "UTF-16" if utf16 else ""
+    if len(data.translate(None, CONTROL_BYTES)) < len(data):
+        first = next(k for k, byte in enumerate(data) if byte in CONTROL_BYTES)
+        raise error(path, f"expected plain text, found the byte 0x{data[first]:02x}",
+                    data.count(b"\n", 0, first) + 1)
+    return data.decode(encoding, errors="replace"), wide
 
 
-def error(path, message, line=None):
-    """DatasetError whose message begins with the path and the line, if there is one.
-
-    `line` is a number, or a str such as "row 3" where the rows of a file are not lines.
-    """
-    place = "" if line is None else f", {line}" if isinstance(line, str) else f", line {line}"
-    return DatasetError(f"{path}{place}: {message}")
-
-
-def read_regular(path):
-    """Bytes of a file; DatasetError if it is no regular file or cannot be read.
-
-    Reading a pipe waits for a writer, and some devices have no end.
-    """
-    expected = "expected a file that can be read"
+def read_bytes(path):
+    """Bytes of a file; DatasetError if it cannot be read, or may not end, as a pipe or a device."""
     try:
-        mode = path.stat().st_mode
-        if not stat.S_ISREG(mode):
-            raise error(path, f"{expected}, found a " + (
-                "folder" if stat.S_ISDIR(mode) else "pipe" if stat.S_ISFIFO(mode) else "device"))
-        return path.read_bytes()
+        if path.is_file():
+            return path.read_bytes()
     except OSError:
-        raise error(path, expected) from None
-
-
-def quoted(value):
-    """The first 60 characters (str) of a value, in quotes."""
-    try:
-        text = str(value)
-    except ValueError:                         # Python writes no integers of thousands of digits
-        return "a far longer number"
-    return repr(text if len(text) <= 60 else text[:60] + "...")
+        pass
+    found = ", found a folder" if path.is_dir() else ""
+    raise error(path, f"expected a file that can be read{found}")

@@ -1,13 +1,35 @@
-"""The vehicle: wheels and sensors as stated, how well they are known, and how they are weighed."""
+"""The vehicle: wheels and sensors as stated, how well they are known, and its encoders' counts."""
 
 import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from numbers import Real
 
 import numpy as np
+from scipy.ndimage import maximum_filter
 
-from slamlib.limits import KERNEL_NAMES, LIMITS
+from slamlib.tables import Limit
 from slamlib.textfile import error, quoted, read_toml
+
+MAX_REVOLUTIONS = 10.0  # revolutions of a wheel in one step
+MIN_REVOLUTIONS = 0.9  # revolutions that counts since the start span
+MAX_SMALL_STEP = 0.025  # of that span; larger steps from row to row are jumps of the counter
+MIN_SMALL_SHARE = 0.95  # of the steps
+RUN_ROWS = 10  # rows over which counts since the start mostly change with one sign
+NEARBY = np.arange(-5, 6)[:, None] != 0  # rows before and after a step
+JUMP_RATIO = 4.0  # ratio of a counter's jump to the steps nearby and to a large step of the drive
+LARGE_STEP_QUANTILE = 0.9  # probability of the quantile of the steps that is a large step
+MODULI = 2**16, 2**15  # numbers of values of counters that wrap around
+MIN_MODULUS_RATIO = 32.0  # ratio of a modulus to a large step of the drive, for a decision
+
+
+# Robust kernels of sightings and ranges, as `slam.fit` has them; the first one is the default.
+KERNEL_NAMES = ("asymmetric Tukey", "asymmetric Cauchy", "quadratic", "Huber", "Cauchy",
+                "Geman-McClure", "Tukey")
+
+
+def _number(default, *limit):
+    """A field with its Limit(minimum, maximum, unit)."""
+    return field(default=default, metadata={"limit": Limit(*limit)})
 
 
 @dataclass(frozen=True)
@@ -18,41 +40,43 @@ class Vehicle:
     origin that measure without common errors. `slam.calibration` has the model of each entry.
     """
 
-    right_radius: float = 0.1  # m
-    left_radius: float = 0.1  # m
-    wheelbase: float = 0.4  # m
-    ticks_per_revolution: float = 8000.0
-    sigma_right_radius: float = 1e-4  # m
-    sigma_left_radius: float = 1e-4  # m
-    sigma_wheelbase: float = 1e-4  # m
-    sigma_heading: float = 1e-4  # rad, of the heading at pose 1
-    slip: float | None = None  # sqrt(m), sigma of a wheel's slip after 1 m; None: learned
-    marker_noise_factor: float | None = None  # of the sigmas in ArucoReading.txt; None: learned
-    range_noise_factor: float | None = None  # of the sigmas in UwbReading.txt; None: learned
-    kernel: str = KERNEL_NAMES[0]  # of sightings and ranges; of ranges alone if it is asymmetric
-    gate: bool = True  # whether measurements that contradict the solution are rejected
-    camera_x: float = 0.0  # m, place of the camera in the vehicle
-    camera_y: float = 0.0  # m
-    camera_turn: float = 0.0  # rad, heading of the camera in the vehicle
-    marker_size: float = 1.0  # of the printed markers, over the size that the detector was told
-    sighting_lag: float = 0.0  # encoder steps by which the sightings are late
-    tag_x: float = 0.0  # m, place of the UWB tag in the vehicle
-    tag_y: float = 0.0  # m
-    antenna_height: float = 0.0  # m, of the antennas over the tag
-    range_offset: float = 0.0  # m, of all ranges
-    range_scale: float = 1.0  # of all ranges, measured over true distance
-    range_lag: float = 0.0  # encoder steps by which the ranges are late
-    sigma_camera_x: float = 0.0  # m; this and all below: 0 if known
-    sigma_camera_y: float = 0.0  # m
-    sigma_camera_turn: float = 0.0  # rad
-    sigma_marker_size: float = 0.0
-    sigma_sighting_lag: float = 0.0  # encoder steps
-    sigma_tag_x: float = 0.0  # m
-    sigma_tag_y: float = 0.0  # m
-    sigma_antenna_height: float = 0.0  # m
-    sigma_range_offset: float = 0.0  # m
-    sigma_range_scale: float = 0.0
-    sigma_range_lag: float = 0.0  # encoder steps
+    right_radius: float = _number(0.1, 1e-3, 2.5, "m")
+    left_radius: float = _number(0.1, 1e-3, 2.5, "m")
+    wheelbase: float = _number(0.4, 1e-3, 20, "m")
+    ticks_per_revolution: float = _number(8000.0, 1, 1e10)
+    sigma_right_radius: float = _number(1e-4, 1e-9, "right_radius", "m")
+    sigma_left_radius: float = _number(1e-4, 1e-9, "left_radius", "m")
+    sigma_wheelbase: float = _number(1e-4, 1e-9, "wheelbase", "m")
+    sigma_heading: float = _number(1e-4, 1e-9, 10, "rad")  # of the heading at pose 1
+    slip: float | None = _number(None, 0, 0.1, "sqrt(m)")  # sigma after 1 m; None: learned
+    marker_noise_factor: float | None = _number(None, 0.01, 100)  # of sigmas in ArucoReading.txt
+    range_noise_factor: float | None = _number(None, 0.01, 100)  # of sigmas in UwbReading.txt
+    # of sightings and ranges; of ranges alone if it is asymmetric
+    kernel: str = field(default=KERNEL_NAMES[0], metadata={"limit": KERNEL_NAMES})
+    # whether measurements that contradict the solution are rejected
+    gate: bool = field(default=True, metadata={"limit": (True, False)})
+    camera_x: float = _number(0.0, -10, 10, "m")  # place of the camera in the vehicle
+    camera_y: float = _number(0.0, -10, 10, "m")
+    camera_turn: float = _number(0.0, -6.3, 6.3, "rad")  # heading of the camera in the vehicle
+    marker_size: float = _number(1.0, 0.5, 2)  # of markers, over that which the detector was told
+    sighting_lag: float = _number(0.0, -1000, 1000)  # encoder steps by which sightings are late
+    tag_x: float = _number(0.0, -10, 10, "m")  # place of the UWB tag in the vehicle
+    tag_y: float = _number(0.0, -10, 10, "m")
+    antenna_height: float = _number(0.0, 0, 100, "m")  # of the antennas over the tag
+    range_offset: float = _number(0.0, -100, 100, "m")  # of all ranges
+    range_scale: float = _number(1.0, 0.5, 2)  # of all ranges, measured over true distance
+    range_lag: float = _number(0.0, -1000, 1000)  # encoder steps by which the ranges are late
+    sigma_camera_x: float = _number(0.0, 0, 10, "m")  # this and all below: 0 if known
+    sigma_camera_y: float = _number(0.0, 0, 10, "m")
+    sigma_camera_turn: float = _number(0.0, 0, 6.3, "rad")
+    sigma_marker_size: float = _number(0.0, 0, 2)
+    sigma_sighting_lag: float = _number(0.0, 0, 1000)
+    sigma_tag_x: float = _number(0.0, 0, 10, "m")
+    sigma_tag_y: float = _number(0.0, 0, 10, "m")
+    sigma_antenna_height: float = _number(0.0, 0, 100, "m")
+    sigma_range_offset: float = _number(0.0, 0, 100, "m")
+    sigma_range_scale: float = _number(0.0, 0, 2)
+    sigma_range_lag: float = _number(0.0, 0, 1000)
 
     @property
     def wheel(self):
@@ -74,15 +98,18 @@ class Vehicle:
         return self.with_wheel(self.wheel + self.sigma_wheel * w)
 
 
-def read_vehicle(files, default):
-    """The Vehicle of a folder's `vehicle.toml`, whose entries replace those of a default Vehicle.
+# What each entry of vehicle.toml may be: a Limit, or a tuple of values.
+ENTRIES = {each.name: each.metadata["limit"] for each in fields(Vehicle)}
 
-    `files` are the `folder.contents`. Raises DatasetError if the file does not have the format.
+
+def read_vehicle(path, default):
+    """The Vehicle of a `vehicle.toml` (Path or None), whose entries replace those of a default.
+
+    Raises DatasetError if the file does not have the format.
     """
-    path = files.files.get("vehicle.toml")
     if path is None:
         return default
-    entries = read_toml(path, "wheelbase = 0.4", [*LIMITS["vehicle.toml"]])
+    entries = read_toml(path, "wheelbase = 0.4", [*ENTRIES])
     return changed(default, {key: value for key, (value, _) in entries.items()}, path,
                    {key: line for key, (_, line) in entries.items()})
 
@@ -90,21 +117,83 @@ def read_vehicle(files, default):
 def changed(vehicle, entries, source, lines=None):
     """The Vehicle with `entries`, values by the names of its fields.
 
-    Raises DatasetError for one that is not within LIMITS, with the `source`, a file or a function,
-    and the line, if `lines` has it by name.
+    Raises DatasetError for one that is not within its Limit, with the `source`, a file or a
+    function, and the line, if `lines` has it by name.
     """
-    limits, values = LIMITS["vehicle.toml"], asdict(vehicle)
-    for key in sorted(entries, key=list(limits).index):    # a parameter before its sigma
-        value, limit = entries[key], limits[key]
+    values = asdict(vehicle)
+    for key in sorted(entries, key=list(ENTRIES).index):    # a parameter before its sigma
+        value, limit = entries[key], ENTRIES[key]
         if isinstance(limit, tuple):
-            ok, expected = isinstance(value, type(limit[0])) and value in limit, " or ".join(
-                map(json.dumps, limit))
+            ok = isinstance(value, type(limit[0])) and value in limit
+            expected = " or ".join(map(json.dumps, limit))
         else:
-            maximum, expected = values.get(limit.maximum, limit.maximum), f"a number {limit}"
             ok = isinstance(value, Real) and not isinstance(value, bool) \
-                and limit.minimum <= value <= maximum
+                and limit.minimum <= value <= values.get(limit.maximum, limit.maximum)
+            expected = f"a number {limit}"
         if not ok:
             raise error(source, f"expected {expected} for {key}, found {quoted(value)}",
                         (lines or {}).get(key))
         values[key] = value if isinstance(limit, tuple) else float(value)
     return Vehicle(**values)
+
+
+def incremental_counts(table, vehicle):
+    """The Table of the encoders, with notes, and counts since the previous pose (n, 2) int64.
+
+    Raises DatasetError if the first row is not 0, a step exceeds MAX_REVOLUTIONS, or counts since
+    the start jump: beyond the steps nearby, because a wheel changes its speed gradually.
+    """
+    counts, limit = table.numbers[:, 1:], MAX_REVOLUTIONS * vehicle.ticks_per_revolution
+    if not since_start(counts, vehicle):
+        steps = unwrapped(counts)
+        ok = abs(steps) <= np.where(np.arange(len(steps)) == 0, 0, limit)[:, None]
+        said = (f"at most {MAX_REVOLUTIONS:g} wheel revolutions ({limit:g} ticks) in one step, and "
+                "none in the first row (counts since the previous pose, not since the start)")
+    else:
+        table = table.noted(" holds counts since the start, which change gradually up to "
+                            f"{abs(counts).max():.0f}: the difference of each row from the one "
+                            "before was taken")
+        counts = np.diff(counts, axis=0, prepend=counts[:1])
+        steps = unwrapped(counts)
+        nearby = maximum_filter(abs(steps), footprint=NEARBY, mode="constant")
+        ok = abs(steps) <= JUMP_RATIO * np.maximum(nearby, _large_step(steps))
+        said = "counts since the start that run on: the counter restarted, or rows are missing"
+    table.kept(np.pad(ok, ((0, 0), (1, 0)), constant_values=True), said)
+    if len(mended := np.flatnonzero(steps != counts) // 2):
+        table = table.noted(f": {len(mended)} counts were mended that are 2^15 or 2^16 off, as of "
+                            f"a counter that wraps around, the first in {table.place(mended[0])}")
+    return table, steps.astype(np.int64)
+
+
+def since_start(counts, vehicle):
+    """True if counts (n, 2), right and left, are since the start.
+
+    They change gradually: small steps from row to row are most of all and reach over half of the
+    span, mostly with one sign over RUN_ROWS rows; those of increments are noise about a constant
+    speed. MIN_REVOLUTIONS are a short way, but no speed to which a wheel comes in so many steps.
+    """
+    steps, span = np.diff(counts, axis=0), np.ptp(counts, axis=0).max()
+    if span < MIN_REVOLUTIONS * vehicle.ticks_per_revolution or len(steps) < RUN_ROWS:
+        return False
+    small = abs(steps) <= MAX_SMALL_STEP * span
+    total = np.cumsum(np.where(small, steps, 0), axis=0)
+    size = abs(steps[small]).sum()
+    over_run = abs(total[RUN_ROWS:] - total[:-RUN_ROWS]).sum() / RUN_ROWS
+    return bool(small.mean() >= MIN_SMALL_SHARE and size > span / 2 and over_run > size / 2)
+
+
+def unwrapped(steps):
+    """Steps (n, 2), less a modulus where that makes them as small as others."""
+    for modulus in MODULI:
+        off = np.flatnonzero(2 * abs(steps) > modulus)
+        large = _large_step(steps) if len(off) else 0
+        less = steps.flat[off] - np.sign(steps.flat[off]) * modulus
+        wraps = (abs(less) <= 2 * large) & (MIN_MODULUS_RATIO * large < modulus)
+        steps = steps.copy()
+        steps.flat[off[wraps]] = less[wraps]
+    return steps
+
+
+def _large_step(steps):
+    size = abs(steps[steps != 0])
+    return np.quantile(size, LARGE_STEP_QUANTILE) if len(size) else 0

@@ -7,7 +7,7 @@ import pytest
 from test_dataset import error_of, write
 
 from slamlib.checks.files import doubts_before_solving
-from slamlib.counts import since_start, unwrapped
+from slamlib.vehicle import since_start, unwrapped
 from slamlib.dataset import Vehicle, read_dataset
 from slamlib.simulation import manoeuvre, simulate, write_dataset
 

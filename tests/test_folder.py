@@ -14,7 +14,7 @@ from test_dataset import (  # noqa: F401
 
 from slamlib.dataset import DatasetError, dataset_names, read_dataset, read_truth
 from slamlib.folder import left_in
-from slamlib.inventory import inventory_lines
+from slamlib.dataset import inventory_lines
 
 
 @pytest.mark.parametrize("name, variant", [

@@ -12,12 +12,12 @@ from test_dataset import assert_same
 from slamlib import se2, slam
 from slamlib.dataset import Dataset, DatasetError, Vehicle, read_dataset
 from slamlib.evaluation import anees, ate
-from slamlib.limits import KERNEL_NAMES
 from slamlib.simulation import simulate, write_dataset
 from slamlib.slam.fit import KERNELS, accepted_measurements
 from slamlib.slam.measurements import measure
 from slamlib.slam.pipeline import fit_from_odometry
 from slamlib.slam.result import slam_result
+from slamlib.vehicle import KERNEL_NAMES
 
 SIGMA = gtsam.noiseModel.Isotropic.Sigma
 

@@ -12,9 +12,8 @@ from pathlib import Path
 from tqdm import tqdm
 
 from slamlib import swap
-from slamlib.dataset import DatasetError, dataset_names, read_dataset, read_truth
+from slamlib.dataset import DatasetError, dataset_names, inventory_lines, read_dataset, read_truth
 from slamlib.folder import left_in
-from slamlib.inventory import inventory_lines
 from slamlib.notebook import notices
 from slamlib.report import cache, overview
 from slamlib.report.document import render

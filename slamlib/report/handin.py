@@ -13,8 +13,7 @@ from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 from jinja2 import Template
 
 from slamlib import swap
-from slamlib.dataset import DatasetError, dataset_names, read_dataset, read_truth
-from slamlib.inventory import all_notes
+from slamlib.dataset import DatasetError, all_notes, dataset_names, read_dataset, read_truth
 from slamlib.notebook import Drive
 from slamlib.report.drives import why_missing
 from slamlib.report.markdown import listed

@@ -18,7 +18,7 @@ from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_outp
 
 from slamlib import evaluation
 from slamlib.checks import consistency
-from slamlib.inventory import all_notes
+from slamlib.dataset import all_notes
 from slamlib.notebook import Drive, accuracy, plotting
 from slamlib.report.drives import order, read_solution, why_missing
 from slamlib.report.markdown import code, listed, plain, table_text, with_unit
