@@ -7,9 +7,9 @@ import pytest
 from test_dataset import error_of, write
 
 from slamlib.checks.files import doubts_before_solving
-from slamlib.vehicle import since_start, unwrapped
 from slamlib.dataset import Vehicle, read_dataset
-from slamlib.simulation import manoeuvre, simulate, write_dataset
+from slamlib.simulation import simulate, write_dataset
+from slamlib.vehicle import since_start, unwrapped
 
 simulated = cache(simulate)
 
@@ -17,11 +17,6 @@ simulated = cache(simulate)
 def written(folder, ticks):
     write(folder / "encoderReading.txt", "\n".join(
         f"{i} {right} {left}" for i, (right, left) in enumerate(np.rint(ticks).astype(int), 1)))
-
-
-def assert_increments(ticks):
-    assert not since_start(ticks, Vehicle())
-    np.testing.assert_array_equal(unwrapped(ticks), ticks)
 
 
 @pytest.mark.slow
@@ -36,20 +31,9 @@ def test_real_increments_are_never_changed():
             for rate in (1, 2, 5, 10, 20, 50, 100, 200):
                 total = ticks[begin:end].cumsum(axis=0)[::rate]
                 for sign in (1, -1):
-                    assert_increments(sign * np.diff(total, axis=0, prepend=total[:1]))
-
-
-def test_manoeuvres_are_never_changed():
-    """Fifty open paths with rests and turns back, at 1 cm to 1 m in a step, with noise."""
-    rng = np.random.default_rng(0)
-    for _ in range(50):
-        legs = [(rng.uniform(-5, 10), rng.uniform(-3, 3)) for _ in range(rng.integers(1, 6))]
-        total = manoeuvre(legs, step=rng.choice([0.01, 0.1, 1.0])).cumsum(axis=0)
-        ticks = np.diff(np.rint(total), axis=0, prepend=0).astype(int)
-        rest = np.zeros((rng.integers(100), 2), int)
-        assert_increments(np.insert(ticks, [rng.integers(1, len(ticks) + 1)] * len(rest), rest, 0))
-        fast = np.minimum(np.arange(400), 40)[:, None] * [500, 490]     # 2.5 revolutions in a step
-        assert_increments(np.rint(fast * (1 + rng.normal(0, 0.01, (400, 2)))))
+                    steps = sign * np.diff(total, axis=0, prepend=total[:1])
+                    assert not since_start(steps, Vehicle())
+                    np.testing.assert_array_equal(unwrapped(steps), steps)
 
 
 DRIVES = {
@@ -85,8 +69,7 @@ def forth(rows=300):
 
 RESTS = np.zeros((300, 2), int)
 RUN_ON = {                               # a drive, and what its counts since the start begin with
-    "a whole drive": (lambda t: t, 0), "another count": (lambda t: t, [123456, -7]),
-    "200 poses": (lambda t: t[:200], 0), "50 poses, fast": (lambda t: 3 * t[:50], 0),
+    "a whole drive": (lambda t: t, [123456, -7]), "50 poses, fast": (lambda t: 3 * t[:50], 0),
     "backward": (lambda t: -t[:200], 0), "slow": (lambda t: slow(t)[:3000], 0),
     "a rest": (lambda t: np.insert(t, 100, RESTS, axis=0), 0),
     "stands at the end": (lambda t: np.r_[forth(), RESTS], 0),
@@ -94,11 +77,10 @@ RUN_ON = {                               # a drive, and what its counts since th
     "on the spot": (lambda t: [1, -1] * forth(), 0), "one wheel": (lambda t: [1, 0] * forth(), 0)}
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
 @pytest.mark.parametrize("case", RUN_ON)
-def test_counts_since_the_start_are_differenced_with_a_note(case, seed, tmp_path):
+def test_counts_since_the_start_are_differenced_with_a_note(case, tmp_path):
     change, begin = RUN_ON[case]
-    ticks = change(simulated("short", seed)[0].ticks)
+    ticks = change(simulated("short", len(case))[0].ticks)
     written(tmp_path, ticks.cumsum(axis=0) + np.array(begin))
     dataset = read_dataset(tmp_path)
     np.testing.assert_array_equal(dataset.ticks, ticks)
@@ -131,6 +113,9 @@ def test_other_spikes_are_no_wraps(wrong, tmp_path):
     ticks[150, 0] = wrong
     written(tmp_path, ticks)
     np.testing.assert_array_equal(read_dataset(tmp_path).ticks, ticks)
+    ticks[150, 0] = 99_999
+    written(tmp_path, ticks)
+    assert "line 151: expected at most 10 wheel revolutions" in error_of(read_dataset, tmp_path)
 
 
 def restarted(counter, row):
@@ -146,13 +131,12 @@ JUMPS = {        # what happens to a counter, and the first line that jumps, whe
     **{f"modulo {m}": (lambda c, m=m: c % m, None) for m in (8000, 2**13, 2**14, 2**17)}}
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
 @pytest.mark.parametrize("case", JUMPS)
 @pytest.mark.parametrize("sign", [1, -1])
-def test_a_counter_that_jumps_is_refused(case, seed, sign, tmp_path):
+def test_a_counter_that_jumps_is_refused(case, sign, tmp_path):
     """The reader gives no step of thousands of counts to a wheel that makes hundreds."""
     change, line = JUMPS[case]
-    ticks = simulated("short", seed)[0].ticks
+    ticks = simulated("short", len(case))[0].ticks
     counter = change(sign * ticks.cumsum(axis=0))
     off = (abs(np.diff(counter, axis=0)) > 2 * abs(ticks).max()).any(axis=1)
     row = 2 + np.flatnonzero(off)[0]
@@ -162,25 +146,16 @@ def test_a_counter_that_jumps_is_refused(case, seed, sign, tmp_path):
             "counter restarted, or rows are missing, found '") in error_of(read_dataset, tmp_path)
 
 
-def test_one_wrong_row_is_no_counter(tmp_path):
-    written(tmp_path, np.r_[[[0, 0]], np.full((50, 2), 132), [[99_999, 132]]])
-    assert "line 52: expected at most 10 wheel revolutions" in error_of(read_dataset, tmp_path)
-
-
 # Exchanged columns.
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
-@pytest.mark.parametrize("path, count", [("short", 2000), ("long", 3000)])
-@pytest.mark.parametrize("name", ["ArucoReading.txt", "UwbReading.txt"])
+@pytest.mark.parametrize("path, name", [("short", "ArucoReading.txt"), ("long", "UwbReading.txt")])
 @pytest.mark.parametrize("once", [False, True], ids=["", "one landmark a pose"])
-def test_columns_of_poses_and_landmarks_that_are_exchanged_are_refused(
-        seed, path, count, name, once, tmp_path):
-    write_dataset(tmp_path, simulated(path, seed)[0].first(count))
+def test_columns_of_poses_and_landmarks_that_are_exchanged_are_refused(path, name, once, tmp_path):
+    write_dataset(tmp_path, simulated(path, 0)[0].first(3000))
     rows = [line.split() for line in (tmp_path / name).read_text().splitlines()]
     if once:
-        rows = list({row[0]: row for row in np.random.default_rng(seed).permutation(rows)}.values())
-        rows.sort(key=lambda row: int(row[0]))
+        rows = list({row[0]: row for row in rows}.values())
     for order in (rows, sorted(rows, key=lambda row: int(row[1])), rows[::-1]):
         write(tmp_path / name, "\n".join(map(" ".join, order)))
         assert read_dataset(tmp_path).notes == ()
@@ -192,11 +167,8 @@ def test_columns_of_poses_and_landmarks_that_are_exchanged_are_refused(
 
 K = np.arange(300)
 LEGAL = {  # pose, marker, number of poses; each marker is seen once
-    "corridor": (1 + 6 * K, 1 + K, 2000),
     "corridor as long as its markers": (1 + K, 1 + K, 300),
-    "corridor driven backward": (300 - K, 1 + K, 300),
-    "corridor, sorted by marker": (np.random.default_rng(0).permutation(300) + 1, 1 + K, 300),
-    "one pose": (np.full(300, 7), 1 + K, 300),
+    "corridor driven backward": (300 - K, 1 + K, 300), "one pose": (np.full(300, 7), 1 + K, 300),
     "few poses, sorted by marker": (np.array([10, 150, 290])[K % 3], 1 + K, 300),
     "few poses at the begin, sorted by marker": (1 + K % 3, 1 + K, 2000),
     "marker ids are large": (1 + K % 3, 5000 + K, 2000)}

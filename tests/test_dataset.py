@@ -45,11 +45,13 @@ def write(path, content):
 
 
 def assert_same(a, b):
-    """Two records hold the same arrays, with the same shapes and dtypes."""
+    """Two records, or tuples of records, hold the same arrays, with the same shapes and dtypes."""
+    assert type(a) is type(b)
     if dataclasses.is_dataclass(a):
-        assert type(a) is type(b)
-        for field in dataclasses.fields(a):
-            assert_same(getattr(a, field.name), getattr(b, field.name))
+        assert_same(tuple(vars(a).values()), tuple(vars(b).values()))
+    elif isinstance(a, tuple):
+        for one, other in zip(a, b, strict=True):
+            assert_same(one, other)
     elif isinstance(a, np.ndarray):
         assert a.dtype == b.dtype
         np.testing.assert_array_equal(a, b)
@@ -119,16 +121,13 @@ def test_truth_in_another_frame_is_moved_to_its_first_pose_and_said(folder):
     for name, ids, rows in (
             ("vehiclePose", np.arange(1, 5), poses), ("ArucoMap", clean.marker, markers),
             ("UwbMap", clean.antenna, antennas)):
-        rows = np.column_stack([ids, rows]).tolist()
-        write(folder / f"truth/{name}.txt",
-              "\n".join(" ".join([f"{row[0]:.0f}", *map(repr, row[1:])]) for row in rows))
+        np.savetxt(folder / f"truth/{name}.txt", np.column_stack([ids, rows]), fmt="%.17g")
     moved = read_truth(folder)
     for name in ("poses", "marker_in_world", "antenna_in_world"):
         np.testing.assert_allclose(getattr(moved, name), getattr(clean, name), atol=1e-14)
     assert (abs(moved.marker_in_world[:, 2]) <= np.pi).all() and (abs(markers[:, 2]) > 2).any()
     doubt, = moved.doubts
-    assert doubt.what == "truth-frame"
-    assert "(12.500 m, -3.250 m, 2.8000 rad)" in doubt.sentence
+    assert doubt.what == "truth-frame" and "(12.500 m, -3.250 m, 2.8000 rad)" in doubt.sentence
 
 
 @pytest.mark.parametrize("start, doubts", [
@@ -136,11 +135,9 @@ def test_truth_in_another_frame_is_moved_to_its_first_pose_and_said(folder):
     ([2e-3, 0, 0], 1), ([0, 0, np.pi], 1), ([0, -2e-3, 2 * np.pi], 1)])
 def test_truth_that_is_rounded_or_begins_with_full_turns_is_no_doubt(folder, start, doubts):
     path = np.add(start, [[0, 0, 0], [0.1, 0, 0], [0.2, 0, 0], [0.3, 0, 0]])
-    write(folder / "truth/vehiclePose.txt",
-          "\n".join(f"{i} {x!r} {y!r} {h!r}" for i, (x, y, h) in enumerate(path.tolist(), start=1)))
+    np.savetxt(folder / "truth/vehiclePose.txt", np.c_[1:5, path], fmt="%.17g")
     truth = read_truth(folder)
     assert len(truth.doubts) == doubts
-    assert abs(truth.poses[0]).max() < (1e-12 if doubts else 1e-3)
     expected = se2.between(path[0], path) if doubts else path - [0, 0, 2 * np.pi * round(
         start[2] / (2 * np.pi))]
     np.testing.assert_allclose(truth.poses, expected, atol=1e-12)
@@ -214,42 +211,7 @@ def test_a_vehicle_by_its_deviation():
     np.testing.assert_array_equal(vehicle.sigma_wheel, [1e-4, 2e-4, 1e-4])
 
 
-# Valid variants of the format.
-
-
-def with_comments(text):
-    lines = text.splitlines()
-    return "# caf\u00e9 12\n\n \t\n" + "\n\n".join(f"{line} # 1 2, \u00b5m" for line in lines)
-
-
-ODDITIES = {
-    "CRLF": lambda text: text.replace("\n", "\r\n"),
-    "lone CR": lambda text: text.replace("\n", "\r"), "no last line end": str.rstrip,
-    "tabs": lambda text: text.replace(" ", "\t"),
-    "indented": lambda text: "  " + text.replace("\n", " \t \n   "),
-    "UTF-8 comments": with_comments,
-    "Latin-1 comments": lambda text: with_comments(text).encode("latin-1"),
-    "byte-order mark": lambda text: text.encode("utf-8-sig")}
-
-
-@pytest.mark.parametrize("oddity", ODDITIES)
-def test_oddities_of_text_change_nothing(folder, oddity):
-    clean = read_dataset(folder), read_truth(folder)
-    for name, text in FILES.items():
-        write(folder / name, ODDITIES[oddity](text))
-    assert_same(read_dataset(folder), clean[0])
-    assert_same(read_truth(folder), clean[1])
-
-
-@pytest.mark.parametrize("change", [str.upper, str.lower])
-def test_names_in_another_case_are_found(folder, change):
-    clean = read_dataset(folder), read_truth(folder)
-    for name in FILES:
-        path = folder / name
-        path.rename(path.with_name(change(path.name)))
-    (folder / "truth").rename(folder / change("truth"))
-    assert_same(read_dataset(folder), clean[0])
-    assert_same(read_truth(folder), clean[1])
+# Valid variants of the format; test_dialects.py has those of the text.
 
 
 def test_numbers_in_other_spellings(folder):
@@ -271,16 +233,16 @@ def test_ids_may_be_negative_or_huge_and_covariances_of_any_scale(folder):
         data.aruco.covariance, [[[1e-17, 0, 5e-8], [0, 1e-17, 0], [5e-8, 0, 1e4]]])
 
 
-def test_sightings_at_one_pose_keep_their_order(folder):
-    rows = [f"{4 - i % 4} {i} 0 0 0 1 0 0 1 0 1" for i in range(300)]
-    write(folder / "ArucoReading.txt", "\n".join(rows))
+def test_rows_are_in_the_order_of_poses_and_of_the_file_and_count_once_if_they_repeat(folder):
+    rows = [f"{4 - i % 4} {i} 0 0 0 1 0 0 1 0 1\n" for i in range(300)]
+    write(folder / "ArucoReading.txt", "".join(rows + rows[::7]))
     aruco = read_dataset(folder).aruco
     assert_ints(aruco.pose, np.repeat([0, 1, 2, 3], 75))
     assert_ints(aruco.marker, np.arange(300).reshape(75, 4).T[::-1].ravel())
-    write(folder / "UwbReading.txt", "\n".join(f"{4 - i % 4} 3 {i + 1} 1" for i in range(300)))
+    write(folder / "UwbReading.txt", "2 3 1.5 0.1\n1 3 -0.05 0.1\n2 3 1.5 0.1\n2 3 1.2 0.1\n")
     uwb = read_dataset(folder).uwb
-    assert_ints(uwb.pose, aruco.pose)
-    np.testing.assert_array_equal(uwb.range, aruco.marker + 1)
+    assert_ints(uwb.pose, [0, 1, 1])
+    np.testing.assert_array_equal(uwb.range, [-0.05, 1.5, 1.2])     # noise may make one negative
 
 
 # Errors: (file, its whole content or its content as a function of the valid one, line, key word).
@@ -295,7 +257,6 @@ def appended(row):
     return lambda text: text + row + "\n"
 
 
-SIGHTING = "1 40 0 0 0 "
 THIRD_ROWS = {  # rows by what is said of them
     "encoderReading.txt": {
         "3 columns (pose id, right ticks, left ticks), found": [
@@ -303,65 +264,49 @@ THIRD_ROWS = {  # rows by what is said of them
         "finite numbers, found": ["3 five 6", "3 " + "x" * 999 + " 6", "3, 5, 6", "3 1_000 6",
                                   "3 0x10 6", "3 \u0663 6", "3 1e 6", "3 . 6"],
         "right ticks, a whole number from -1e+15 to 1e+15, found": [
-            "3 nan 6", "3 inf 5", "3 -infinity 5", "3 1e999 5", "3 -2e15 5", "3 5.5 6"],
+            "3 nan 6", "3 -infinity 5", "3 1e999 5", "3 -2e15 5", "3 5.5 6"],
         "at most 10 wheel revolutions (80000 ticks)": ["3 5 80001", "3 -80001 5"],
         "in order": ["4 5 6", "2 5 6"], "pose id, a whole number": ["2.5 5 6"]},
     "ArucoReading.txt": {
-        "11 columns (pose id, marker id, x": ["1 40 0 0 0 1 0 0 1 0"],
         "pose id from 1 to 4": ["5 40 0 0 0 1 0 0 1 0 1", "0 40 0 0 0 1 0 0 1 0 1"],
-        "whole number": ["1.5 40 0 0 0 1 0 0 1 0 1", "1 4.5 0 0 0 1 0 0 1 0 1"],
-        "y, a finite number": ["1 40 0 inf 0 1 0 0 1 0 1"],
-        "positive definite": [SIGHTING + c for c in (
+        "positive definite": [f"1 40 0 0 0 {covariance}" for covariance in (
             "1 1 0 1 0 1", "1e-4 2e-4 0 1e-4 0 1e4", "1 .9 -.9 1 .9 1", "1 9e14 0 1 0 1e-18")]},
     "UwbReading.txt": {
-        "4 columns (pose id, antenna id, range, sigma), found 3": ["1 3 1"],
-        "pose id from 1 to 4": ["5 3 1 1"], "antenna id, a whole number": ["1 3.5 1 1"],
+        "antenna id, a whole number": ["1 3.5 1 1"],
         "a range that is not below -5 sigma": ["1 3 -5.1 1"],
         "an antenna id that the guesses have": ["1 4 1 1"]},
-    "UwbAntennaGuess.txt": {
-        "3 columns (antenna id, x, y)": ["1 3"], "only once": ["900 1 2"],
-        "antenna id, a whole number": ["9.5 1 2"], "x, a finite number": ["9 inf 2"]},
+    "UwbAntennaGuess.txt": {"each id only once": ["900 1 2"], "x, a finite number": ["9 inf 2"]},
     "truth/vehiclePose.txt": {"4 columns (pose id, x, y, theta)": ["3 0 0"],
                               "in order": ["4 0 0 0"]},
-    "truth/ArucoMap.txt": {"only once": ["40 0 0 0"],
-                           "4 columns (marker id, x, y, theta)": ["41 0 0"]},
-    "truth/UwbMap.txt": {"only once": ["900 0 0"], "whole number": ["9.5 0 0"]}}
-RADIUS = "a number from 0.001 to 2.5 m for left_radius, found"
+    "truth/ArucoMap.txt": {"each id only once": ["40 0 0 0"]}}
 VEHICLE_LINES = {
     "expected an entry such as wheelbase, ": ["wheel_base = 1", "[wheelbases]\nx = 1",
                                               "'wheel' = 1"],
-    "expected an entry such as ": ["'' = 1"],
-    RADIUS: [f"left_radius = {value}" for value in (
+    "a number from 0.001 to 2.5 m for left_radius, found": [f"left_radius = {value}" for value in (
         "'wide'", "[0.1]", "true", "nan", "inf", "0x" + "f" * 5000)],
     "TOML": ["left_radius = 0,1", "left_radius =", "wheelbase = 0.6"]}
+ENCODER_FILES = [  # text, line, what is said
+    ("", None, "no rows"), ("# nothing\n\n", None, "no rows"), ("\n1 0\n2 0\n", 2, "3 columns"),
+    ("\r\r1 0 0\r\r2 0\r", 5, "3 columns"), ("\r\n1 0 0\r\n2 0", 3, "3 columns"),
+    ("0 0 0\n1 5 6\n", 1, "in order"),
+    ("# head\n1 0 1\n2 5 6\n3 5 6\n4 5 6\n", 2, "none in the first row"),
+    (b"1 0 0\r\n2 5 6 # \x00\r\n", 2, "plain text"), (b"1 0 0\n2 5\x1c6\n", 2, "plain text"),
+    (b"\x89\xf0\xff 0 0\n", 1, "finite number"),
+    (gzip.compress(b"1 0 0\n", mtime=0), 1, "plain text"),
+    ("1 0 0\n".encode("utf-16")[:-1], None, "UTF-16 that breaks off")]
 ERRORS = [
     *[(name, third_row(row), 5, said) for name, told in THIRD_ROWS.items()
       for said, rows in told.items() for row in rows],
     *[("vehicle.toml", appended(line), 3, said) for said, lines in VEHICLE_LINES.items()
       for line in lines],
-    ("encoderReading.txt", "", None, "no rows"),
-    ("encoderReading.txt", "# nothing\n\n", None, "no rows"),
-    ("encoderReading.txt", "\n1 0\n2 0\n", 2, "3 columns"),
-    ("encoderReading.txt", "\r\r1 0 0\r\r2 0\r", 5, "3 columns"),
-    ("encoderReading.txt", "\r\n1 0 0\r\n2 0", 3, "3 columns"),
-    ("encoderReading.txt", "0 0 0\n1 5 6\n", 1, "in order"),
-    ("encoderReading.txt", "# head\n1 0 1\n2 5 6\n3 5 6\n4 5 6\n", 2, "none in the first row"),
-    ("encoderReading.txt", b"1 0 0\n2 5\x00 6\n", 2, "plain text"),
-    ("encoderReading.txt", b"1 0 0\r\n2 5 6 # \x00\r\n", 2, "plain text"),
-    ("encoderReading.txt", b"1 0 0\n2 5\x1c6\n", 2, "plain text"),
-    ("encoderReading.txt", b"\x89\xf0\xff 0 0\n", 1, "finite number"),
-    ("encoderReading.txt", gzip.compress(b"1 0 0\n", mtime=0), 1, "plain text"),
-    ("encoderReading.txt", "1 0 0\n".encode("utf-16")[:-1], None, "UTF-16 that breaks off"),
+    *[("encoderReading.txt", *each) for each in ENCODER_FILES],
     ("vehicle.toml", "left_radius = [1,\n2\n\n", 2, "TOML"),
     ("vehicle.toml", "# a\n\n\n  'wheel' = 1\n", 4, "an entry such as wheelbase"),
     ("vehicle.toml", appended("left_radius = " + "[" * 5000), None, "TOML"),
-    ("vehicle.toml", appended("left_radius = " + "1" * 5000), None, "TOML"),
     ("vehicle.toml", "wheelbase = \0 1\n".encode("utf-16"), 1, "plain text"),
     ("truth/vehiclePose.txt", third_row("3 0 0 0"), None, "4 poses (encoder file), found 3"),
-    ("truth/vehiclePose.txt", appended("5 0 0 0"), None, "4 poses (encoder file), found 5"),
     ("truth/vehiclePose.txt", "", None, "4 poses (encoder file), found 0"),
-    ("truth/vehicle.toml", appended("wheelbase = 0"), 2, "a number from 0.001 to 20 m"),
-]
+    ("truth/vehicle.toml", appended("wheelbase = 0"), 2, "a number from 0.001 to 20 m")]
 
 
 @pytest.mark.parametrize("name, content, line, said", ERRORS)
@@ -376,53 +321,38 @@ def test_faults_in_a_file_are_named_by_file_line_and_expectation(folder, name, c
 
 ROWS = {
     "ArucoReading.txt": "1 40 0 0 0 1 0 0 1 0 1", "UwbReading.txt": "1 3 1 1e4",
-    "UwbAntennaGuess.txt": "3 0 0", "vehiclePose.txt": "1 0 0 0", "ArucoMap.txt": "40 0 0 0",
-    "UwbMap.txt": "3 0 0"}
-PLACES = [(name, column) for name in ROWS for column, limit in LIMITS[name].items() if limit.unit]
+    "UwbAntennaGuess.txt": "3 0 0", "truth/vehiclePose.txt": "1 0 0 0",
+    "truth/ArucoMap.txt": "40 0 0 0", "truth/UwbMap.txt": "3 0 0"}
+PLACES = [
+    *[(name, column, limit) for name in ROWS for column, limit in LIMITS[Path(name).name].items()
+      if limit.unit],
+    *[("vehicle.toml", key, limit) for key, limit in ENTRIES.items() if isinstance(limit, Limit)]]
 
 
-def write_number(folder, name, column, value):
-    """Write a folder of one pose with this number in a file; path and reader of the file."""
-    words = ROWS[name].split()
-    words[list(LIMITS[name]).index(column)] = repr(value)
-    write(folder / "encoderReading.txt", "1 0 0\n")
-    path = folder / ("truth" if name in ("vehiclePose.txt", "ArucoMap.txt", "UwbMap.txt") else "") \
-        / name
-    if name.startswith("Uwb"):
-        write(folder / "UwbAntennaGuess.txt", "3 0 0\n")
-    if path.parent.name == "truth":
-        write(path.parent / "vehiclePose.txt", "1 0 0 0\n")
-    write(path, " ".join(words) + "\n")
-    return path, read_truth if path.parent.name == "truth" else read_dataset
+@pytest.mark.parametrize("name, column, limit", PLACES)
+def test_numbers_at_the_limits_are_read_and_beyond_them_refused(tmp_path, name, column, limit):
+    for other, row in {"encoderReading.txt": "1 0 0", "UwbAntennaGuess.txt": "3 0 0",
+                       "truth/vehiclePose.txt": "1 0 0 0"}.items():
+        write(tmp_path / other, row)
+    read = read_truth if name.startswith("truth") else read_dataset
 
+    def text(value):
+        if name != "vehicle.toml":
+            words = ROWS[name].split()
+            words[list(LIMITS[Path(name).name]).index(column)] = repr(value)
+            return " ".join(words)
+        return f"{column} = {value!r}\n" + f"{limit.maximum} = 2\n" * isinstance(limit.maximum, str)
 
-@pytest.mark.parametrize("name, column", PLACES)
-def test_numbers_at_the_limits_are_read_and_beyond_them_refused(tmp_path, name, column):
-    limit = LIMITS[name][column]
-    for most, away in ((limit.minimum, -np.inf), (limit.maximum, np.inf)):
-        path, read = write_number(tmp_path, name, column, float(most))
-        read(tmp_path)
-        beyond = float(np.nextafter(most, away))
-        write_number(tmp_path, name, column, beyond)
-        message = error_of(read, tmp_path)
-        assert message.startswith(f"{path}, line 1: expected ") and str(limit) in message
-        assert message.endswith(f"found '{beyond!r}'")
-
-
-@pytest.mark.parametrize("key", [key for key, limit in ENTRIES.items()
-                                 if isinstance(limit, Limit)])
-def test_a_vehicle_at_the_limits_is_read_and_beyond_them_refused(tmp_path, key):
-    limit, parameter = ENTRIES[key], key.removeprefix("sigma_")
-    write(tmp_path / "encoderReading.txt", "1 0 0\n")
-    most = 2.0 if isinstance(limit.maximum, str) else limit.maximum
-    other = f"{parameter} = 2\n" if isinstance(limit.maximum, str) else ""
-    for value, away in ((limit.minimum, -np.inf), (most, np.inf)):
-        write(tmp_path / "vehicle.toml", f"{key} = {float(value)!r}\n{other}")
-        assert getattr(read_dataset(tmp_path).vehicle, key) == value
+    most = limit.minimum, 2.0 if isinstance(limit.maximum, str) else limit.maximum
+    for value, away in zip(map(float, most), (-np.inf, np.inf)):
+        write(tmp_path / name, text(value))
+        found = read(tmp_path)
+        assert name != "vehicle.toml" or getattr(found.vehicle, column) == value
         beyond = float(np.nextafter(value, away))
-        write(tmp_path / "vehicle.toml", f"{key} = {beyond!r}\n{other}")
-        message = error_of(read_dataset, tmp_path)
-        assert message.endswith(f"line 1: expected a number {limit} for {key}, found '{beyond!r}'")
+        write(tmp_path / name, text(beyond))
+        message = error_of(read, tmp_path)
+        assert message.startswith(f"{tmp_path / name}, line 1: expected ") and str(limit) in message
+        assert column in message and message.endswith(f"found '{beyond!r}'")
 
 
 def test_the_limits_that_a_user_reads_are_those_of_the_reader():
@@ -431,9 +361,7 @@ def test_the_limits_that_a_user_reads_are_those_of_the_reader():
             if line.startswith("| `") and "| from " in line]
     told = {(file.strip("`"), column.strip("` ")): limit for file, columns, limit in rows
             for column in columns.split(",")}
-    assert told == {(file, column): str(limit) for file, columns in (LIMITS | {"vehicle.toml": ENTRIES}).items()
-                    for column, limit in columns.items()
-                    if isinstance(limit, Limit) and limit.maximum != 1e15}
+    assert told == {(Path(name).name, column): str(limit) for name, column, limit in PLACES}
 
 
 @pytest.mark.parametrize("name", ["sighting_lag", "range_lag"])
@@ -511,11 +439,3 @@ def test_dataset_names_are_those_of_folders_with_any_file_of_a_dataset(tmp_path)
         with pytest.raises(DatasetError, match=said):
             dataset_names(tmp_path, names)
 
-
-def test_rows_that_repeat_exactly_count_once_and_noise_may_make_a_range_negative(folder):
-    write(folder / "UwbReading.txt", "2 3 1.5 0.1\n1 3 -0.05 0.1\n2 3 1.5 0.1\n2 3 1.6 0.1\n")
-    write(folder / "ArucoReading.txt", 2 * FILES["ArucoReading.txt"])
-    dataset = read_dataset(folder)
-    assert dataset.uwb.pose.tolist() == [0, 1, 1]
-    assert dataset.uwb.range.tolist() == [-0.05, 1.5, 1.6]
-    assert dataset.aruco.marker.tolist() == [-7, 40, 40]

@@ -12,9 +12,8 @@ from test_dataset import (  # noqa: F401
     write,
 )
 
-from slamlib.dataset import DatasetError, dataset_names, read_dataset, read_truth
+from slamlib.dataset import DatasetError, dataset_names, inventory_lines, read_dataset, read_truth
 from slamlib.folder import left_in
-from slamlib.dataset import inventory_lines
 
 
 @pytest.mark.parametrize("name, variant", [
@@ -34,6 +33,16 @@ def test_a_name_that_is_unmistakable_is_read_with_a_note(folder, name, variant):
     assert_same(read_truth(folder), truth)
     assert dataset.notes == (f"{variant} was read as {name}.",)
     assert dataset_names(folder.parent) == ["drive"]
+
+
+@pytest.mark.parametrize("change", [str.upper, str.lower])
+def test_names_in_another_case_are_found(folder, change):  # noqa: F811
+    clean = read_dataset(folder), read_truth(folder)
+    for name in FILES:
+        path = folder / name
+        path.rename(path.with_name(change(path.name)))
+    (folder / "truth").rename(folder / change("truth"))
+    assert_same((read_dataset(folder), read_truth(folder)), clean)
 
 
 def test_names_in_the_folder_truth(folder):  # noqa: F811
