@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 from slamlib import __version__
-from slamlib.vehicle import ENTRIES
+from slamlib.vehicle import VEHICLE_LIMITS
 
 KNOWN_NOISE = ("slip", "marker_noise_factor", "range_noise_factor")  # options as in vehicle.toml
 
@@ -77,7 +77,7 @@ def _solve_options(parser):
     parser.add_argument("--kernel", metavar="NAME", help="the robust kernel of problems 3 and 4, "
                         "as Huber")
     for name in KNOWN_NOISE:
-        limit = ENTRIES[name]
+        limit = VEHICLE_LIMITS[name]
         number = _number(float, limit.minimum, limit.maximum, f"a number {limit}")
         parser.add_argument(f"--{name.replace('_', '-')}", type=number, metavar="NUMBER",
                             help="known, and not learned; as in vehicle.toml")

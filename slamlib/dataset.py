@@ -3,8 +3,8 @@
 The folder holds `encoderReading.txt` and, where the vehicle has the sensors, `ArucoReading.txt` and
 `UwbReading.txt` with `UwbAntennaGuess.txt`. Optional are `vehicle.toml`, with what differs from the
 assignment's table 2, and the folder `truth`. Lengths are in metres, angles in radians. Pose ids
-count from 1 in the files and from 0 in the arrays; marker and antenna ids stay unchanged. Numbers
-are within `tables.LIMITS`. `folder` finds the files, `tables` reads their numbers.
+count from 1 in the files and from 0 in the arrays; marker and antenna ids stay unchanged. `folder`
+finds the files, `dialects` reads their numbers.
 """
 
 import json
@@ -17,9 +17,9 @@ import numpy as np
 
 from slamlib import se2
 from slamlib.covariance import correlations
+from slamlib.dialects import LIMITS, matrix, read_table
 from slamlib.doubt import Doubt
 from slamlib.folder import ENCODER, TABLES, TRUTH_FILES, Variable, contents, is_dataset
-from slamlib.tables import LIMITS, matrix, read_table
 from slamlib.textfile import DatasetError, error, quoted
 from slamlib.truth_frame import in_first_frame
 from slamlib.vehicle import Vehicle, changed, incremental_counts, read_vehicle
@@ -92,10 +92,8 @@ class Dataset:
         guess : (a, 3) antenna id, x, y; or None without `uwb`.
         vehicle : Vehicle
 
-        Raises
-        ------
-        DatasetError : an argument does not pass the checks of its file. It names the argument and
-            the row, from 1. No row is left out.
+        Raises DatasetError, which names the argument and the row, from 1, if an argument does not
+        pass the checks of its file: no row is left out.
 
         >>> dataset = Dataset.from_arrays(ticks=[[0, 0], [10, 12]], uwb=[[2, 7, 1.5, 0.1]],
         ...                               guess=[[7, 1.0, 1.0]])
@@ -113,10 +111,7 @@ class Dataset:
 
     @property
     def sightings(self):
-        """The ArucoReadings as the vehicle's origin sees them, by the stated camera and size.
-
-        Problem 2 and the checks of files use these. None without markers.
-        """
+        """The ArucoReadings, or None, as the vehicle's origin sees them by stated camera and size."""
         v, a = self.vehicle, self.aruco
         if a is None or (v.camera_x, v.camera_y, v.camera_turn, v.marker_size) == (0, 0, 0, 1):
             return a
@@ -167,7 +162,7 @@ def dataset_names(data, names=None):
     names = found if names is None else list(names)
     for name in names:
         _require((data / name).is_dir(), data, f"one of {', '.join(found)}", name)
-        contents(data / name).required(ENCODER)
+        assert contents(data / name)[ENCODER]              # which raises DatasetError
     return names
 
 
@@ -183,21 +178,19 @@ def read_dataset(folder):
     >>> len(dataset.ticks), len(dataset.aruco.pose), dataset.antenna_guess.antenna.tolist()
     (2000, 894, [5, 13, 36, 46])
     """
-    found = contents(folder)
-    found.required(ENCODER)
-    vehicle = read_vehicle(found.files.get("vehicle.toml"), default=TABLE_2)
-    return _dataset(found.files, vehicle, Path(abspath(folder)).name, found.notes)
+    files = contents(folder)
+    vehicle = read_vehicle(files.get("vehicle.toml"), default=TABLE_2)
+    return _dataset(files, vehicle, Path(abspath(folder)).name, files.notes)
 
 
 def _dataset(files, vehicle, name, notes=()):
     """The Dataset of this name by its Vehicle and the sources (dict) of its tables by name."""
-    table, ticks = incremental_counts(_read_all_poses(files, ENCODER), vehicle)
+    encoder_notes, ticks = incremental_counts(_read_all_poses(files, ENCODER), vehicle)
     for key in ("sighting_lag", "range_lag"):
         if abs(getattr(vehicle, key)) >= len(ticks) > 1:
             raise error(files.get("vehicle.toml", "vehicle"), f"expected a {key} below the number "
                         f"of poses ({len(ticks)}) in size, found {getattr(vehicle, key):g}")
-    notes, table = [*notes, *table.notes], None      # which has the rows of the file
-    notes += [
+    notes = [*notes, *encoder_notes] + [
         f"vehicle.toml sets {key} = {json.dumps(getattr(vehicle, key))} for problems 3 and 4."
         for key in ("kernel", "gate") if getattr(vehicle, key) != getattr(TABLE_2, key)]
     aruco = _read_aruco(files, len(ticks), notes)
@@ -215,24 +208,22 @@ def read_truth(folder):
     the drive.
     """
     drive = contents(folder)
-    if "truth" not in drive.files:
+    if "truth" not in drive:
         return None
-    found = contents(drive.files["truth"], TRUTH_FILES)
-    drive.required(ENCODER)
-    found.required("vehiclePose.txt")
-    vehicle = read_vehicle(drive.files.get("vehicle.toml"), default=TABLE_2)
-    pose_count = len(_read_all_poses(drive.files, ENCODER).numbers)
-    table = _read_all_poses(found.files, "vehiclePose.txt")
-    poses, notes = table.numbers[:, 1:], [*found.notes, *table.notes]
+    files = contents(drive["truth"], TRUTH_FILES)
+    pose_count = len(_read_all_poses(drive, ENCODER).numbers)
+    table = _read_all_poses(files, "vehiclePose.txt")
+    poses, notes = table.numbers[:, 1:], [*files.notes, *table.notes]
     if len(poses) != pose_count:
         raise error(table.source, f"expected {pose_count} poses (encoder file), found {len(poses)}")
-    marker, marker_in_world = _read_map(found.files, "ArucoMap.txt", notes)
-    antenna, antenna_in_world = _read_map(found.files, "UwbMap.txt", notes)
+    marker, marker_in_world = _read_map(files, "ArucoMap.txt", notes)
+    antenna, antenna_in_world = _read_map(files, "UwbMap.txt", notes)
+    vehicle = read_vehicle(drive.get("vehicle.toml"), default=TABLE_2)
     return in_first_frame(Truth(
         poses=np.column_stack([poses[:, :2], np.unwrap(poses[:, 2])]),
         marker=marker, marker_in_world=marker_in_world,
         antenna=antenna, antenna_in_world=antenna_in_world,
-        vehicle=read_vehicle(found.files.get("vehicle.toml"), default=vehicle),
+        vehicle=read_vehicle(files.get("vehicle.toml"), default=vehicle),
         notes=tuple(f"In truth: {note}" for note in notes)))
 
 
@@ -264,13 +255,13 @@ def _read_aruco(files, pose_count, notes):
     """The ArucoReadings, or None without rows."""
     table = _read_sensor(files, "ArucoReading.txt", pose_count)
     # Scaled to correlations: s_thetatheta may be 1e4 rad^2 where s_xx is 1e-4 m^2.
-    smallest_eigenvalue = np.linalg.eigvalsh(correlations(_covariances(table.numbers)))[:, 0]
-    table = table.kept(smallest_eigenvalue > MIN_EIGENVALUE, "a positive definite covariance "
-                       f"(smallest eigenvalue of its correlation matrix above {MIN_EIGENVALUE:g})",
+    smallest = np.linalg.eigvalsh(correlations(_covariances(table.numbers)))[:, 0]
+    table = table.kept(smallest > MIN_EIGENVALUE, "a positive definite covariance (smallest "
+                       f"eigenvalue of its correlation matrix above {MIN_EIGENVALUE:g})",
                        MAX_BAD_SHARE)
     notes += table.notes
-    rows = _in_order(table.numbers)
-    return ArucoReadings(*_ids(rows), rows[:, 2:5], _covariances(rows)) if len(rows) else None
+    pose, marker, rows = _in_order(table.numbers)
+    return ArucoReadings(pose, marker, rows[:, 2:5], _covariances(rows)) if len(rows) else None
 
 
 def _covariances(rows):
@@ -287,8 +278,8 @@ def _read_uwb(files, pose_count, notes):
     guess = AntennaGuess(*_read_map(files, "UwbAntennaGuess.txt", notes, optional="z"))
     table.kept(np.isin(table.numbers[:, 1], guess.antenna), "an antenna id that the guesses have: "
                "UwbAntennaGuess.txt in the same folder, or guess")
-    rows = _in_order(table.numbers)
-    return UwbReadings(*_ids(rows), *rows[:, 2:].T) if len(rows) else None, guess
+    pose, antenna, rows = _in_order(table.numbers)
+    return UwbReadings(pose, antenna, *rows[:, 2:].T) if len(rows) else None, guess
 
 
 def _read_sensor(files, name, pose_count):
@@ -308,14 +299,11 @@ def _read_sensor(files, name, pose_count):
 
 
 def _in_order(rows):
-    """Rows in ascending order of pose; those that repeat count once."""
+    """Poses from 0, ids (m,) int64 and rows (m, c), in ascending order of pose; repeated rows once.
+    """
     rows = rows[np.sort(np.unique(rows, axis=0, return_index=True)[1])]
-    return rows[np.argsort(rows[:, 0], kind="stable")]
-
-
-def _ids(rows):
-    """Poses, counted from 0, and landmark ids: two (m,) int64."""
-    return rows[:, 0].astype(np.int64) - 1, rows[:, 1].astype(np.int64)
+    rows = rows[np.argsort(rows[:, 0], kind="stable")]
+    return rows[:, 0].astype(np.int64) - 1, rows[:, 1].astype(np.int64), rows
 
 
 def all_notes(dataset, truth):

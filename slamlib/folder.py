@@ -38,20 +38,19 @@ class Variable:
         return f"{self.path}, variable {self.name}" if self.path else self.name
 
 
-@dataclass(frozen=True)
-class Contents:
-    """The files of a dataset's folder, or of its folder `truth`."""
+class Contents(dict):
+    """Sources (Path or Variable) of a dataset's files by name; DatasetError if one is missing.
 
-    folder: Path  # of the files
-    files: dict  # Path or Variable by name in DATASET_FILES
-    notes: tuple[str, ...]  # on names of copies and on files that are not read
+    `notes` are on names of copies, and on files that are not read.
+    """
 
-    def required(self, name):
-        """The source (Path or Variable) of this name; raises DatasetError if there is none."""
-        if name not in self.files:
-            unread = "".join(f" ({note})" for note in self.notes if "ot read" in note)
-            raise error(self.folder / name, f"expected this file, found none{unread}")
-        return self.files[name]
+    def __init__(self, folder, files, notes):
+        super().__init__(files)
+        self.folder, self.notes = folder, notes
+
+    def __missing__(self, name):
+        unread = "".join(f" ({note})" for note in self.notes if "ot read" in note)
+        raise error(self.folder / name, f"expected this file, found none{unread}")
 
 
 def contents(folder, expected=DATASET_FILES):
@@ -82,14 +81,14 @@ def contents(folder, expected=DATASET_FILES):
         if len(deeper) == 1 and not files:
             inner, rest = contents(deeper[0]), [path for path in rest if path != deeper[0]]
             notes.append(f"The files were read from the sub-folder {_shown(deeper[0].name)}.")
-            folder, files, notes = inner.folder, inner.files, [*notes, *inner.notes]
+            folder, files, notes = inner.folder, inner, [*notes, *inner.notes]
     return Contents(folder, files, (*notes, *_not_read([path.name for path in rest])))
 
 
 def is_dataset(folder):
     """True if a folder (Path) or one of its sub-folders holds files of a dataset."""
     try:
-        return bool(contents(folder).files)
+        return bool(contents(folder))
     except DatasetError:
         return True
 

@@ -7,7 +7,7 @@ from numbers import Real
 import numpy as np
 from scipy.ndimage import maximum_filter
 
-from slamlib.tables import Limit
+from slamlib.dialects import Limit
 from slamlib.textfile import error, quoted, read_toml
 
 MAX_REVOLUTIONS = 10.0  # revolutions of a wheel in one step
@@ -20,8 +20,6 @@ JUMP_RATIO = 4.0  # ratio of a counter's jump to the steps nearby and to a large
 LARGE_STEP_QUANTILE = 0.9  # probability of the quantile of the steps that is a large step
 MODULI = 2**16, 2**15  # numbers of values of counters that wrap around
 MIN_MODULUS_RATIO = 32.0  # ratio of a modulus to a large step of the drive, for a decision
-
-
 # Robust kernels of sightings and ranges, as `slam.fit` has them; the first one is the default.
 KERNEL_NAMES = ("asymmetric Tukey", "asymmetric Cauchy", "quadratic", "Huber", "Cauchy",
                 "Geman-McClure", "Tukey")
@@ -99,7 +97,7 @@ class Vehicle:
 
 
 # What each entry of vehicle.toml may be: a Limit, or a tuple of values.
-ENTRIES = {each.name: each.metadata["limit"] for each in fields(Vehicle)}
+VEHICLE_LIMITS = {each.name: each.metadata["limit"] for each in fields(Vehicle)}
 
 
 def read_vehicle(path, default):
@@ -109,7 +107,7 @@ def read_vehicle(path, default):
     """
     if path is None:
         return default
-    entries = read_toml(path, "wheelbase = 0.4", [*ENTRIES])
+    entries = read_toml(path, "wheelbase = 0.4", [*VEHICLE_LIMITS])
     return changed(default, {key: value for key, (value, _) in entries.items()}, path,
                    {key: line for key, (_, line) in entries.items()})
 
@@ -121,8 +119,8 @@ def changed(vehicle, entries, source, lines=None):
     function, and the line, if `lines` has it by name.
     """
     values = asdict(vehicle)
-    for key in sorted(entries, key=list(ENTRIES).index):    # a parameter before its sigma
-        value, limit = entries[key], ENTRIES[key]
+    for key in sorted(entries, key=list(VEHICLE_LIMITS).index):    # a parameter before its sigma
+        value, limit = entries[key], VEHICLE_LIMITS[key]
         if isinstance(limit, tuple):
             ok = isinstance(value, type(limit[0])) and value in limit
             expected = " or ".join(map(json.dumps, limit))
@@ -138,7 +136,7 @@ def changed(vehicle, entries, source, lines=None):
 
 
 def incremental_counts(table, vehicle):
-    """The Table of the encoders, with notes, and counts since the previous pose (n, 2) int64.
+    """Notes on the Table of the encoders, and counts since the previous pose (n, 2) int64.
 
     Raises DatasetError if the first row is not 0, a step exceeds MAX_REVOLUTIONS, or counts since
     the start jump: beyond the steps nearby, because a wheel changes its speed gradually.
@@ -162,7 +160,7 @@ def incremental_counts(table, vehicle):
     if len(mended := np.flatnonzero(steps != counts) // 2):
         table = table.noted(f": {len(mended)} counts were mended that are 2^15 or 2^16 off, as of "
                             f"a counter that wraps around, the first in {table.place(mended[0])}")
-    return table, steps.astype(np.int64)
+    return table.notes, steps.astype(np.int64)
 
 
 def since_start(counts, vehicle):

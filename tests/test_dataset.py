@@ -10,8 +10,8 @@ import pytest
 
 from slamlib import se2
 from slamlib.dataset import DatasetError, Vehicle, dataset_names, read_dataset, read_truth
-from slamlib.tables import LIMITS, Limit
-from slamlib.vehicle import ENTRIES
+from slamlib.dialects import LIMITS, Limit
+from slamlib.vehicle import VEHICLE_LIMITS
 
 FILES = {
     "encoderReading.txt": "1 0 0\n2 10 12\n3 -5 7\n4 0 80000\n",
@@ -326,7 +326,7 @@ ROWS = {
 PLACES = [
     *[(name, column, limit) for name in ROWS for column, limit in LIMITS[Path(name).name].items()
       if limit.unit],
-    *[("vehicle.toml", key, limit) for key, limit in ENTRIES.items() if isinstance(limit, Limit)]]
+    *[("vehicle.toml", key, limit) for key, limit in VEHICLE_LIMITS.items() if isinstance(limit, Limit)]]
 
 
 @pytest.mark.parametrize("name, column, limit", PLACES)

@@ -55,7 +55,7 @@ SEPARATORS = {";": "semicolons", ",": "commas", None: "blanks or tabs"}
 EMPTY_CELL = re.compile(rf"(?:^|(?<=[;,]))[{BLANKS}]*(?=[;,]|$)", re.MULTILINE)
 NUMBER = re.compile(r"([+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf(inity)?))?", re.IGNORECASE)
 NUMBER_FIRST = re.compile(r"(^|[\s,;])\W*(\d|nan\b|inf)", re.IGNORECASE)  # in a row, not a header
-LOOSE_COMMA = re.compile(r"(?<!\d),|,(?!\d)")  # which is no decimal comma
+POINT_OR_LOOSE_COMMA = re.compile(r"\.|(?<!\d),|,(?!\d)")  # where commas are no decimal commas
 # Words of headers that name a column; others are the ends of the columns' own names, as "xx".
 HEADER_WORDS = {"pose id": "pose posa step", "marker id": "marker aruco tag landmark",
                 "antenna id": "antenna anchor beacon landmark",
@@ -117,10 +117,11 @@ def read_table(source, name, share=0.0, optional=None):
     """
     limits, columns = LIMITS[name], list(LIMITS[name])
     if source is None:
-        return Table(source, np.empty((0, len(columns))))
+        return Table(source=source, numbers=np.empty((0, len(columns))))
     if isinstance(source, Variable):
         rows = matrix(source, source.value, columns, optional)
-        table = Table(source, rows.astype(float), rows, range(1, len(rows) + 1))
+        table = Table(source=source, numbers=rows.astype(float), rows=rows,
+                      lines=range(1, len(rows) + 1))
     else:
         table = _table_of_text(source, columns, optional)
     if not len(table.numbers):
@@ -161,7 +162,7 @@ def matrix(source, value, columns, optional=None):
 def _table_of_text(source, columns, optional):
     """The Table of a text file, with NaN for empty cells."""
     text, encoding = read_text(source)
-    table = Table(source, np.empty((0, len(columns))))
+    table = Table(source=source, numbers=np.empty((0, len(columns))))
     table = table.noted(f" was read as {encoding} text") if encoding else table
     text = text.replace('"', "").replace("(ind)", "").replace("(snan)", "")    # nan(ind)
     for mark in COMMENTS:
@@ -182,8 +183,7 @@ def _table_of_text(source, columns, optional):
     # Blanks inside of a cell mean that commas are no separators.
     separator = ";" if ";" in first else "," if "," in first and not any(
         len(cell.split()) > 1 for cell in first.split(",")) else None
-    decimals = (separator != "," and "," in body and "." not in body
-                and not LOOSE_COMMA.search(body))
+    decimals = separator != "," and "," in body and not POINT_OR_LOOSE_COMMA.search(body)
     if separator or decimals:
         table = table.noted(f" was read with columns separated by {SEPARATORS[separator]}"
                             f"{', with decimal commas' * decimals}")
