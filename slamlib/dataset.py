@@ -111,7 +111,7 @@ class Dataset:
 
     @property
     def sightings(self):
-        """The ArucoReadings, or None, as the vehicle's origin sees them by stated camera and size."""
+        """The ArucoReadings, or None, as the vehicle's origin sees them by stated camera, size."""
         v, a = self.vehicle, self.aruco
         if a is None or (v.camera_x, v.camera_y, v.camera_turn, v.marker_size) == (0, 0, 0, 1):
             return a
@@ -162,7 +162,7 @@ def dataset_names(data, names=None):
     names = found if names is None else list(names)
     for name in names:
         _require((data / name).is_dir(), data, f"one of {', '.join(found)}", name)
-        assert contents(data / name)[ENCODER]              # which raises DatasetError
+        contents(data / name)[ENCODER]                     # which raises DatasetError
     return names
 
 

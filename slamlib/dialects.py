@@ -198,19 +198,21 @@ def _table_of_text(source, columns, optional):
     except ValueError:
         numbers = np.empty((0, 0))
     if numbers.shape[1] != len(columns):
-        for line, row in zip(lines, rows):
-            _require_numbers(source, line, row.split(separator), columns, decimals)
+        cells = (row.split(separator) for row in rows)
+        raise _fault(source, zip(lines, cells), columns, decimals)
     return replace(table, numbers=numbers, rows=rows, lines=lines, separator=separator)
 
 
-def _require_numbers(source, line, cells, columns, decimals):
-    """Raise DatasetError if the cells of a line are not a number for each of the columns."""
-    if len(cells) != len(columns):
-        raise error(source, f"expected {len(columns)} columns ({', '.join(columns)}), found "
-                    f"{len(cells)}", line)
-    for cell in map(str.strip, cells):
-        if not NUMBER.fullmatch(cell.replace(",", ".") if decimals else cell):
-            raise error(source, f"expected finite numbers, found {quoted(cell)}", line)
+def _fault(source, rows, columns, decimals):
+    """DatasetError about the first of the rows (line, cells) without a number for each column."""
+    for line, cells in rows:
+        if len(cells) != len(columns):
+            return error(source, f"expected {len(columns)} columns ({', '.join(columns)}), found "
+                         f"{len(cells)}", line)
+        for cell in map(str.strip, cells):
+            if not NUMBER.fullmatch(cell.replace(",", ".") if decimals else cell):
+                return error(source, f"expected finite numbers, found {quoted(cell)}", line)
+    return error(source, "expected rows of numbers")    # unless numpy and NUMBER agree
 
 
 def _require_order(source, header, line, columns):

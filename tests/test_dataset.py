@@ -326,7 +326,8 @@ ROWS = {
 PLACES = [
     *[(name, column, limit) for name in ROWS for column, limit in LIMITS[Path(name).name].items()
       if limit.unit],
-    *[("vehicle.toml", key, limit) for key, limit in VEHICLE_LIMITS.items() if isinstance(limit, Limit)]]
+    *[("vehicle.toml", key, limit) for key, limit in VEHICLE_LIMITS.items()
+      if isinstance(limit, Limit)]]
 
 
 @pytest.mark.parametrize("name, column, limit", PLACES)
