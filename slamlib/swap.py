@@ -118,22 +118,17 @@ def _add_the_users_files(folder, new, ours):
     new.mkdir(exist_ok=True)
     names = file_names(new)
     for source in (beside(folder, "old"), folder):     # the first of a run that was killed
-        users = {*file_names(source)} - {FILE_LIST, *ours, *names, *_listed(source)}
-        for name in users:
+        try:
+            listed = {*map(str, json.loads((source / FILE_LIST).read_bytes()))}
+        except (OSError, ValueError, TypeError):        # none, or not written by slamlib
+            listed = set()
+        for name in {*file_names(source)} - {FILE_LIST, *ours, *names, *listed}:
             if not name.endswith(".part"):
                 (new / name).parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(source / name, new / name, follow_symlinks=False)
                 shutil.copystat(source / name, new / name, follow_symlinks=False)
     if names:
         (new / FILE_LIST).write_text(json.dumps(names))
-
-
-def _listed(folder):
-    """Names (set of str) of the files that the last run wrote to a folder."""
-    try:
-        return {*map(str, json.loads((folder / FILE_LIST).read_bytes()))}
-    except (OSError, ValueError, TypeError):            # none, or not written by slamlib
-        return set()
 
 
 def _replace(made):

@@ -18,7 +18,7 @@ from slamlib.doubt import Doubt
 from slamlib.report import handin
 from slamlib.report.build import Report
 from slamlib.report.drives import SolvedDrive
-from slamlib.report.options import Options
+from slamlib.report.notebooks import Options
 from slamlib.simulation import simulate, write_dataset
 from slamlib.solve import Failure, Solution
 

@@ -7,7 +7,7 @@ from conftest import ROOT
 from test_report import make_data, write
 
 from slamlib.__main__ import main
-from slamlib.report.options import Options, read_options
+from slamlib.report.notebooks import Options, read_options
 
 COURSE = "Robotic Perception and Action"
 

@@ -16,7 +16,7 @@ from slamlib.report import drives as solved_drives
 from slamlib.report import overview
 from slamlib.report.document import render
 from slamlib.report.execution import NotebookError
-from slamlib.report.options import Options
+from slamlib.report.notebooks import Options
 from slamlib.report.overview import title_picture
 from slamlib.results import write_vehicle_poses
 from slamlib.simulation import simulate, write_dataset

@@ -8,8 +8,8 @@ import pytest
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_output
 
 from slamlib.report.document import render
-from slamlib.report.markdown import code, plain
-from slamlib.report.options import Options
+from slamlib.report.notebooks import Options
+from slamlib.report.overview import code, plain
 
 RUN = "document.title='ran'"
 ELSEWHERE = "https://elsewhere.example/"

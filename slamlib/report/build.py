@@ -19,14 +19,12 @@ from slamlib.notebook import notices
 from slamlib.report import cache, overview
 from slamlib.report.document import render
 from slamlib.report.drives import read_drives
-from slamlib.report.execution import execute, kernel_environment, temporary_folder
-from slamlib.report.notebooks import shown, to_execute
-from slamlib.report.options import Options
+from slamlib.report.execution import STUDIES, execute, kernel_environment, temporary_folder
+from slamlib.report.notebooks import Options, shown, to_execute
 from slamlib.solve import RESULT_NAMES, SENSORS
 from slamlib.studies.memory import forget
-from slamlib.summary import tables
+from slamlib.summary import print_tables, process
 
-STUDIES = "studies"  # in the cache, besides executed notebooks
 TABLES_WAIT = 10.0  # s, for which the notebooks wait for the first numbers
 DATASET_NAME = re.compile("[A-Za-z0-9 ._-]+")  # nothing that Markdown, HTML or Typst interprets
 
@@ -74,7 +72,7 @@ def build_report(notebooks, data, report, results, datasets=None, options=Option
         keys = partial(cache.keys, books, folders, environment | {"SLAMLIB_RESULTS": str(results)})
         recalled = not fresh and any(
             cache.entry(kept, source, key).exists() for source, key in keys().items())
-        with nullcontext() if recalled else tables(folders) as first:
+        with nullcontext() if recalled else process(print_tables, folders) as first:
             if first:  # errors of the text are told before a kernel starts
                 render(shown(books, options), options, check=True)
                 first.join(max(0.0, start + TABLES_WAIT - time.monotonic()))

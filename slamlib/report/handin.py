@@ -17,8 +17,8 @@ from slamlib.dataset import DatasetError, dataset_names, read_dataset, read_trut
 from slamlib.inventory import all_notes
 from slamlib.notebook import Drive
 from slamlib.report.drives import why_missing
-from slamlib.report.markdown import listed
-from slamlib.report.options import PROBLEM2_FOLDERS
+from slamlib.report.notebooks import PROBLEM2_FOLDERS
+from slamlib.report.overview import listed
 from slamlib.results import RESULT_FILES
 from slamlib.solve import title
 
