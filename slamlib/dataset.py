@@ -208,8 +208,6 @@ def _dataset(files, vehicle, name):
             raise error(files.files.get("vehicle.toml", "vehicle"), f"expected a {key} below the "
                         f"number of poses ({len(ticks)}) in size, found {getattr(vehicle, key):g}")
     notes += table.notes
-    notes += [f"vehicle.toml sets {key} = {json.dumps(getattr(vehicle, key))} for problems 3 and 4."
-              for key in ("kernel", "gate") if getattr(vehicle, key) != getattr(TABLE_2, key)]
     aruco = _read_aruco(files, len(ticks), notes)
     uwb, guess = _read_uwb(files, len(ticks), notes)
     return Dataset(name=name, vehicle=vehicle, ticks=ticks, aruco=aruco, uwb=uwb,

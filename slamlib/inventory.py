@@ -9,8 +9,15 @@ from slamlib.dataset import Vehicle
 
 
 def all_notes(dataset, truth):
-    """Notes (tuple of str) on what was mended or left out of a Dataset and its Truth or None."""
-    return (*dataset.notes, *(() if truth is None else truth.notes))
+    """Notes (tuple of str) on what was mended or left out of a Dataset and its Truth or None.
+
+    One says which kernel and gate are used, if they are not the default.
+    """
+    default = Vehicle()
+    weighed = [f"Problems 3 and 4 are solved with {key} = {json.dumps(value)}."
+               for key in ("kernel", "gate")
+               if (value := getattr(dataset.vehicle, key)) != getattr(default, key)]
+    return (*dataset.notes, *weighed, *(() if truth is None else truth.notes))
 
 
 def inventory_lines(dataset, truth):

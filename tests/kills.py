@@ -1,6 +1,6 @@
 """Kills solve and report at random moments and at every step, and runs several builds at once.
 
-    python tests/kills.py [solve] [steps] [report] [report-steps] [builds]
+    python tests/kills.py [steps] [random] [report-steps] [report-random] [builds]
 
 prints a table of counts; without arguments it does all. It is not part of the suite, of which
 test_concurrency.py runs a part. Runs are forks of this process, so that none waits for imports; it
@@ -116,11 +116,6 @@ def left(folder):
             or path.is_dir() and not any(path.iterdir())]
 
 
-def beside(root):
-    """What lies hidden beside the folders of runs."""
-    return [path.name for path in root.iterdir() if path.name.startswith(".")]
-
-
 def put_mine(folder):
     """Write the user's files."""
     for name, text in MINE.items():
@@ -135,82 +130,29 @@ def make_drives(root):
         write_dataset(root / name / "short", dataset.without("uwb") if name == "B" else dataset)
 
 
-class Solves:
-    """The command solve between the drives A and B in one folder."""
+class Runs:
+    """A command between the drives A and B, which writes `folders` below `root`."""
 
     def __init__(self, root):
         self.root = root
         make_drives(root)
+        self.prepare()
         self.references, self.copies = {}, {}
         for name in "AB":
-            self.copies[name] = root / f"copy_{name}"
-            run(["solve", root / name / "short", "--out", self.copies[name]], root)
-            self.references[name] = contents(self.copies[name])
-            put_mine(self.copies[name])
-
-    def arguments(self, name):
-        """Of the command line for one drive."""
-        return ["solve", self.root / name / "short", "--out", "out"]
-
-    def reset(self, name):
-        """Make the results of a drive, finished, those of the folder."""
-        shutil.rmtree(self.root / "out", ignore_errors=True)
-        shutil.copytree(self.copies[name], self.root / "out")
-
-    def state(self):
-        """What `judge` says."""
-        return judge(self.root / "out", self.references)
-
-    def left(self):
-        """What is there and should not be after an undisturbed run."""
-        return [*left(self.root / "out"), *beside(self.root)]
-
-
-class StoredSolves(Solves):
-    """The same, with problems that are solved once: only the files are written each time."""
-
-    def __init__(self, root):
-        super().__init__(root)
-        found = {}
-        for name in "AB":
-            dataset = read_dataset(root / name / "short")
-            found[dataset.uwb is None] = [*summary.solutions(dataset)]
-        summary.solutions = lambda dataset, problems: (
-            each for each in found[dataset.uwb is None] if each.problem in problems)
-
-
-class Reports:
-    """The command report between the drives A and B, of two tiny notebooks."""
-
-    def __init__(self, root):
-        import nbformat
-        self.root = root
-        make_drives(root)
-        (root / "notebooks").mkdir()
-        for name, problems in (("1_one", ["problem1"]), ("2_two", ["problem2", "problem4"])):
-            nbformat.write(nbformat.v4.new_notebook(cells=[
-                nbformat.v4.new_markdown_cell(f"# {name[0]}. Chapter", id="a"),
-                nbformat.v4.new_code_cell(CODE.format(problems=problems), id="b")]),
-                root / "notebooks" / f"{name}.ipynb")
-        self.folders = ("results/short", "report")
-        self.references, self.copies = {}, {}
-        for name in "AB":
+            self.reset()
             run(self.arguments(name), root)
             self.references[name] = {folder: contents(root / folder) for folder in self.folders}
             self.copies[name] = root / f"copy_{name}"
             for folder in self.folders:
                 shutil.copytree(root / folder, self.copies[name] / folder)
                 put_mine(self.copies[name] / folder)
-        self.reset("B")
 
-    def arguments(self, name):
-        """Of the command line for one drive."""
-        return ["report", "--data", self.root / name]
-
-    def reset(self, name):
-        """Make the report of a drive, finished, that of the folder."""
-        for folder in ("results", "report"):
-            shutil.rmtree(self.root / folder, ignore_errors=True)
+    def reset(self, name=None):
+        """Make the finished files of a drive, if one is named, those of the folders."""
+        for path in (*(self.root / Path(folder).parts[0] for folder in self.folders),
+                     *self.root.glob(".*")):                # of a run that was killed
+            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+        for folder in self.folders if name else ():
             shutil.copytree(self.copies[name] / folder, self.root / folder)
 
     def state(self):
@@ -219,32 +161,62 @@ class Reports:
             name: files[folder] for name, files in self.references.items()})
             for folder in self.folders}
         mixed = [state for state in states if state.startswith("MIXED")]
-        if mixed:
-            return mixed[0]
-        if "unfinished" in states:
-            return "unfinished"
-        return states.pop() if len(states) == 1 else "MIXED: results and pages"
+        if mixed or "unfinished" in states:
+            return mixed[0] if mixed else "unfinished"
+        return states.pop() if len(states) == 1 else "MIXED: " + " and ".join(sorted(states))
 
     def left(self):
         """What is there and should not be after an undisturbed run."""
-        return [name for folder in ("results", "report", "build/executed")
-                for name in left(self.root / folder)] + beside(self.root)
+        return [name for folder in ("out", "results", "report", "build/executed")
+                for name in left(self.root / folder)] + [
+                    path.name for path in self.root.iterdir() if path.name.startswith(".")]
 
 
-class PlainReports(Reports):
-    """The same with pages of a few bytes, which take no time: notebooks, cache and files are real.
+class Solves(Runs):
+    """The command solve, with problems that are solved once: only the files are written."""
 
-    A page holds what the result files say, so that those of A and B differ.
+    folders = ("out",)
+
+    def prepare(self):
+        found = {}
+        for name in "AB":
+            dataset = read_dataset(self.root / name / "short")
+            found[dataset.uwb is None] = [*summary.solutions(dataset)]
+        summary.solutions = lambda dataset, problems: (
+            each for each in found[dataset.uwb is None] if each.problem in problems)
+
+    def arguments(self, name):
+        """Of the command line for one drive."""
+        return ["solve", self.root / name / "short", "--out", "out"]
+
+
+class Reports(Runs):
+    """The command report of two tiny notebooks; a page holds what the result files say.
+
+    Such pages take no time: notebooks, cache and files are real.
     """
 
-    def __init__(self, root):
+    folders = ("results/short", "report")
+
+    def prepare(self):
+        import nbformat
+
         from slamlib.report import build
         build.render = lambda *_, **__: {}
         build._rendered = lambda books, drives, *_: {
             f"{name}.html": f"{name}: {[each.files for each in drives]}, "
                             f"{[s.poses.tolist() for d in drives for s in d.solutions]}".encode()
             for name in ["index", *(source.stem for source in books)]}
-        super().__init__(root)
+        (self.root / "notebooks").mkdir()
+        for name, problems in (("1_one", ["problem1"]), ("2_two", ["problem2", "problem4"])):
+            nbformat.write(nbformat.v4.new_notebook(cells=[
+                nbformat.v4.new_markdown_cell(f"# {name[0]}. Chapter", id="a"),
+                nbformat.v4.new_code_cell(CODE.format(problems=problems), id="b")]),
+                self.root / "notebooks" / f"{name}.ipynb")
+
+    def arguments(self, name):
+        """Of the command line for one drive."""
+        return ["report", "--data", self.root / name]
 
 
 def count(counts, runs, name, result):
@@ -264,16 +236,16 @@ def count(counts, runs, name, result):
         print("left:", what, file=sys.stderr)
 
 
-def at_random(runs, kills, seed, options=lambda rng: []):
+def at_random(runs, kills, seed):
     """Counts after kills at random moments of runs between two drives."""
     counts, rng, longest = Counter(), random.Random(seed), 0.0
     runs.reset("A")
     for name in "AB":
         begin = time.monotonic()
-        run([*runs.arguments(name), *options(rng)], runs.root)
+        run(runs.arguments(name), runs.root)
         longest = max(longest, time.monotonic() - begin)
     while counts["killed"] < kills:
-        process = started([*runs.arguments(rng.choice("AB")), *options(rng)], runs.root)
+        process = started(runs.arguments(rng.choice("AB")), runs.root)
         time.sleep(rng.uniform(0, longest))
         os.kill(process, signal.SIGKILL)
         counts["killed" if ended(process) == -9 else "ended before"] += 1
@@ -282,14 +254,17 @@ def at_random(runs, kills, seed, options=lambda rng: []):
 
 
 def at_every_step(runs, begin, then):
-    """Counts after kills before each step of a run of `then`, where that of `begin` ended well."""
+    """Counts after kills before each step of a run of `then`, where that of `begin` ended well.
+
+    After every third one a run is undisturbed.
+    """
     counts, step, code = Counter(), 0, -9
     while code == -9:
         step += 1
         runs.reset(begin)
         code = ended(started(runs.arguments(then), runs.root, step))
         counts["killed"] += code == -9
-        count(counts, runs, then if code == -9 else None, runs.state())
+        count(counts, runs, then if code == -9 and step % 3 == 0 else None, runs.state())
     assert code == 0
     return counts
 
@@ -310,16 +285,13 @@ def at_once(runs, builds, times, seed):
     return counts
 
 
-ANSWER_PARTS = {
-    "solve": (Solves, [("solve, random moments", at_random, (200, 1))]),
-    "steps": (StoredSolves, [("solve, every step, A then B", at_every_step, ("A", "B")),
-                       ("solve, every step, B then A", at_every_step, ("B", "A"))]),
-    "report": (Reports, [("report, random moments", at_random, (
-        40, 2, lambda rng: rng.choice([[], ["--fresh"]])))]),
-    "report-steps": (PlainReports, [
-        ("report, every step, A then B", at_every_step, ("A", "B")),
-        ("report, every step, B then A", at_every_step, ("B", "A"))]),
-    "builds": (PlainReports, [("two builds at once", at_once, (2, 20, 3)),
+STEP_BY_STEP = [("every step, A then B", at_every_step, ("A", "B")),
+                ("every step, B then A", at_every_step, ("B", "A"))]
+PARTS = {
+    "steps": (Solves, STEP_BY_STEP), "random": (Solves, [("random moments", at_random, (200, 1))]),
+    "report-steps": (Reports, STEP_BY_STEP),
+    "report-random": (Reports, [("random moments", at_random, (40, 2))]),
+    "builds": (Reports, [("two builds at once", at_once, (2, 20, 3)),
                          ("four builds at once", at_once, (4, 20, 4))]),
 }
 
@@ -328,16 +300,16 @@ def do(parts):
     """Run parts by name, print a line for each, and return True if nothing was mixed or left."""
     well = True
     for part in parts:
-        kind, lines = ANSWER_PARTS[part]
+        kind, lines = PARTS[part]
         with tempfile.TemporaryDirectory() as folder:
             runs = kind(Path(folder).resolve())
             for title, function, arguments in lines:
                 counts = function(runs, *arguments)
                 well &= not any(counts[bad] for bad in ("MIXED", "LEFT", "FAILED"))
-                print(f"{title:30}" + ", ".join(
+                print(f"{part}, {title}: " + ", ".join(
                     f"{number} {what}" for what, number in counts.items()), flush=True)
     return well
 
 
 if __name__ == "__main__":
-    sys.exit(not do(sys.argv[1:] or ANSWER_PARTS))
+    sys.exit(not do(sys.argv[1:] or PARTS))
