@@ -7,7 +7,6 @@ count from 1 in the files and from 0 in the arrays; marker and antenna ids stay 
 are within `limits.LIMITS`. `folder` finds the files, `dialects` reads their numbers.
 """
 
-import json
 from dataclasses import dataclass, replace
 from os.path import abspath
 from pathlib import Path

@@ -22,7 +22,7 @@ EXPLORE = """def draw(size):
 explore.show_with_controls(draw, grid={"size": [1, 2]}, size=explore.slider("size", 1, 0, 9))"""
 
 ROOT = Path(__file__).parents[1]
-NOTEBOOKS = sorted(file.name for file in (ROOT / "notebooks").glob("*.ipynb"))
+NOTEBOOKS = ["1_chapter.ipynb", "A_appendix.ipynb"]
 
 
 def run(*command, cwd, code=0):
@@ -42,8 +42,7 @@ def installed(tmp_path_factory):
     """The `bin` of an environment with slamlib's wheel, which finds all else in that of the tests.
 
     The wheel, and the folder that it is built from: a copy, because building leaves files beside
-    the sources. Its notebooks have the names of ours and little in them: a chapter that uses what
-    the wheel has besides modules, and others without code.
+    the sources. It has a chapter that uses what the wheel has besides modules, and an appendix.
     """
     folder = tmp_path_factory.mktemp("installed")
     tree, environment = folder / "tree", folder / "environment"
@@ -94,7 +93,7 @@ def test_an_installed_slamlib_makes_a_drive_solves_it_and_reports_on_it(installe
     (tmp_path / "drive" / "encoderReading.txt").rename(
         tmp_path / "data" / "drive" / "encoderReading.txt")
     run(slamlib, "report", "--no-appendix", cwd=tmp_path)
-    assert (tmp_path / "report" / "report.pdf").stat().st_size > 1e5
+    assert (tmp_path / "report" / "report.pdf").read_bytes().startswith(b"%PDF")
     assert (tmp_path / "results" / "drive" / "problem1" / "vehiclePose.mat").is_file()
 
 

@@ -59,10 +59,10 @@ def build_report(notebooks, data, report, results, datasets=None, options=Option
     fresh : bool; True executes everything although it is cached.
     files : bool; False leaves the table of the result files out of the opening.
     """
-    start = time.monotonic()
+    start, tell = time.monotonic(), partial(tqdm.write, file=sys.stderr)  # above the bar
     notebooks, data, report, results = (
         Path(folder).resolve() for folder in (notebooks, data, report, results))
-    address = _address(results, report) if files else None
+    address = Path(os.path.relpath(results, report)).as_posix() if files else None
     books, read, has = _checked_input(notebooks, data, datasets, options)
     folders = [data / dataset.name for dataset, _ in read]
     with ExitStack() as stack:
@@ -80,7 +80,7 @@ def build_report(notebooks, data, report, results, datasets=None, options=Option
             stage, pages = (
                 stack.enter_context(swap.staging(folder)) for folder in (results, report))
             written = _executed(books, keys, environment, jobs, stage, kept, fresh)
-        _tell("setting the pages and the PDF")
+        tell("setting the pages and the PDF")
         drives = read_drives(read, stage, written, notices(books.values()))
         made = _rendered(shown(books, options), drives, options, address, has)
         for name, content in made.items():
@@ -92,21 +92,8 @@ def build_report(notebooks, data, report, results, datasets=None, options=Option
         for name in written:
             if "/" not in name:  # of no dataset
                 os.replace(stage / name, results / name)
-    _tell(f"built in {time.monotonic() - start:.1f} s")
+    tell(f"built in {time.monotonic() - start:.1f} s")
     return Report([report / name for name in made], drives)
-
-
-def _tell(line):
-    """Print a line on stderr, above the bar where one is shown."""
-    tqdm.write(line, file=sys.stderr)
-
-
-def _address(results, report):
-    """Return the path (str) of the results from the report, as in a link."""
-    try:
-        return Path(os.path.relpath(results, report)).as_posix()
-    except ValueError:  # Windows
-        raise DatasetError(f"{results}: expected a folder on the drive of {report}") from None
 
 
 def _checked_input(notebooks, data, datasets, options):

@@ -95,17 +95,15 @@ def read_notebook(source):
 
     NotebookError if the file is not a notebook, DatasetError if it is no file that can be read.
     """
-    text, reason = read_text(source, "utf-8")[0], "expected JSON with cells and metadata"
+    text = read_text(source, "utf-8")[0]
     try:
-        if "\ufffd" not in text:  # which stands for bytes that are not UTF-8
-            book = nbformat.reads(text, as_version=4)
-            return ClearOutputPreprocessor().preprocess(book, {})[0]
-        reason = f"expected UTF-8 text in line {text[:text.index(chr(0xfffd))].count(chr(10)) + 1}"
-    except (ValueError, nbformat.ValidationError) as error:
+        if "\ufffd" in text:  # which stands for bytes that are not UTF-8
+            raise ValueError("expected UTF-8 text")
+        book = nbformat.reads(text, as_version=4)
+        return ClearOutputPreprocessor().preprocess(book, {})[0]
+    except Exception as error:  # on other JSON nbformat fails in many ways
         reason = str(error).partition("\n")[0]
-    except Exception:  # noqa: S110  on other JSON nbformat fails in many ways
-        pass
-    raise NotebookError(f"{source.name} is not a notebook: {reason}")
+        raise NotebookError(f"{source.name} is not a notebook: {reason}") from None
 
 
 def to_execute(folder, options):
