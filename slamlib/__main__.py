@@ -5,8 +5,7 @@ import os
 import signal
 import sys
 import textwrap
-import threading
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,17 +30,17 @@ def main(arguments=None):
     Returns the exit code: 0, 1 if a notebook failed, 2 for invalid input, 3 if a problem could not
     be solved, 128 + n if ended by signal n.
     """
+    ended = [signal.SIGINT]
     if arguments is None:
         sys.stdout.reconfigure(errors="backslashreplace")  # as stderr, for names in other letters
+        _end_as_by_ctrl_c(ended)
     parser = _parser()
     options, options_of_lab = parser.parse_known_args(arguments)
     if options_of_lab and options.run is not _lab:
         parser.error(f"unrecognized arguments: {' '.join(options_of_lab)}")
     options.others = options_of_lab
-    ended = [signal.SIGINT]
     try:
-        with _orderly_end(ended):
-            return options.run(options)
+        return options.run(options)
     except DatasetError as error:
         print(f"slamlib: {error}", file=sys.stderr)
         return 2
@@ -55,26 +54,18 @@ def main(arguments=None):
         return 128 + ended[-1]
 
 
-@contextmanager
-def _orderly_end(ended):
-    """Let END_SIGNALS end a run as Ctrl-C does; the list `ended` gets the signal that came."""
+def _end_as_by_ctrl_c(ended):
+    """Let END_SIGNALS end this process as Ctrl-C does; the list `ended` gets the one that came."""
     def end(number, frame):
-        for each in defaults:
-            signal.signal(each, signal.SIG_IGN)
         ended.append(signal.Signals(number))
+        for each in END_SIGNALS:
+            signal.signal(each, signal.SIG_IGN)
         interrupt = signal.getsignal(signal.SIGINT)  # the event loop's, while notebooks run
         (interrupt if callable(interrupt) else signal.default_int_handler)(signal.SIGINT, frame)
 
-    here = threading.current_thread() is threading.main_thread()
-    defaults = [each for each in END_SIGNALS if here
-                and signal.getsignal(each) == signal.SIG_DFL]     # nohup's handler stays
-    for each in defaults:
-        signal.signal(each, end)
-    try:
-        yield
-    finally:
-        for each in defaults:
-            signal.signal(each, signal.SIG_DFL)
+    for each in END_SIGNALS:
+        if signal.getsignal(each) == signal.SIG_DFL:     # nohup's handler stays
+            signal.signal(each, end)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -193,7 +184,7 @@ def _hand_in(options):
     def finish(report):
         handin.write_zip(options.out, report, options.results, shown, omitted)
         return f"hand-in: {options.out.resolve()}"
-    return _build(options, shown, Path("build", "hand-in"), datasets, finish, files=False)
+    return _build(options, shown, Path("build", "hand-in"), datasets, finish)
 
 
 def _shown(options):
@@ -202,7 +193,7 @@ def _shown(options):
     return replace(read_options("report.toml"), **_given(options, "code", "appendix"))
 
 
-def _build(options, shown, folder, datasets, finish, files=True):
+def _build(options, shown, folder, datasets, finish):
     """Build a Report into a folder and print doubts and finish(Report); return the exit code."""
     from slamlib.report import NotebookError, build_report
     from slamlib.report.notebooks import notebooks_folder
@@ -212,7 +203,7 @@ def _build(options, shown, folder, datasets, finish, files=True):
     try:
         report = build_report(
             notebooks, options.data, folder, options.results, datasets=datasets, options=shown,
-            jobs=options.jobs, kept=EXECUTED_NOTEBOOKS, fresh=options.fresh, files=files)
+            jobs=options.jobs, kept=EXECUTED_NOTEBOOKS, fresh=options.fresh)
     except NotebookError as error:
         print(f"slamlib: {error}", file=sys.stderr)
         return 1

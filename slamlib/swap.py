@@ -98,7 +98,7 @@ def publish(made, ours=()):
 
     Raises
     ------
-    OSError : a file cannot be put in its place; then all folders are as they were.
+    OSError : a file cannot be written or put in its place; in the first case nothing has changed.
     """
     made = {Path(folder).resolve(): new for folder, new in made.items()}
     with ExitStack() as stack:
@@ -133,17 +133,10 @@ def _add_the_users_files(folder, new, ours):
 
 def _replace(made):
     """Move all old folders aside, then all new ones in, and remove the old ones."""
-    moved = []
-    try:
-        for folder, new in made.items():
-            if folder.exists() and new.exists():
-                _discard_old(folder)
-                folder.rename(beside(folder, "old"))
-                moved.append(folder)
-    except OSError:                                     # on Windows, where a program shows a file
-        for folder in moved:
-            beside(folder, "old").rename(folder)
-        raise
+    for folder, new in made.items():
+        if folder.exists() and new.exists():
+            _discard_old(folder)
+            folder.rename(beside(folder, "old"))
     for folder, new in made.items():
         if new.exists():
             new.rename(folder)

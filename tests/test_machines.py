@@ -85,8 +85,7 @@ def test_a_report_is_built_where_windows_lacks_what_unix_has(tmp_path):
     assert process.returncode == 0, told
     assert re.search(r"^built in [\d.]+ s$", told, re.MULTILINE)
     assert "transport: tcp" in (tmp_path / "report" / "1_first.html").read_text(encoding="utf-8")
-    assert "href=\"../results/short/problem1/vehiclePose.mat\"" in (
-        tmp_path / "report" / "index.html").read_text(encoding="utf-8")
+    assert (tmp_path / "results" / "short" / "problem1" / "vehiclePose.mat").is_file()
     assert {path.name for path in tmp_path.rglob(".slamlib*")} == {swap.FILE_LIST}
 
 

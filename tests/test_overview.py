@@ -205,18 +205,6 @@ def test_without_truth_the_abstract_compares_at_returns(project):
     assert re.search(r"by SLAM[^.]*[\d.]+\u00a0m?m and [\d.]+\u00a0mm on \*x", text)
 
 
-def test_files_to_hand_in_stand_by_problem_and_dataset(project):
-    drives = [replace(drive, files=(*drive.files, "notes.txt")) for drive in project.drives]
-    text = next(cell.source for cell in overview.opening(drives, "../the results").cells
-                if cell.id == "files")
-    assert text.startswith("## Files to hand in")
-    last = next(line for line in text.splitlines() if line.startswith("| 4. SLAM"))
-    name, at, poses, _, ranges = [cell.strip() for cell in last.strip("|").split("|")]
-    assert (name, at) == ("4. SLAM: odometry + ArUco + UWB", "`problem4`")
-    assert ranges.startswith("[all](../the%20results/all/problem4/UwbMap.mat), [no_truth](")
-    assert poses.count("](../the%20results/") == 2 and "wheels_only" not in poses
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_the_opening_of_any_one_drive_fits_on_a_page(project, tmp_path, name):

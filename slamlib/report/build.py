@@ -38,7 +38,7 @@ class Report:
 
 
 def build_report(notebooks, data, report, results, datasets=None, options=Options(), jobs=2,
-                 kept=None, fresh=False, files=True):
+                 kept=None, fresh=False):
     """Execute all notebooks, write pages and PDF; return the Report.
 
     Kernels read the absolute paths of data and results, and the selection, from SLAMLIB_DATA,
@@ -57,12 +57,10 @@ def build_report(notebooks, data, report, results, datasets=None, options=Option
     kept : folder that caches executed notebooks and their studies, or None for one that is removed.
         Where it has none of these notebooks, the datasets are solved first, and tables printed.
     fresh : bool; True executes everything although it is cached.
-    files : bool; False leaves the table of the result files out of the opening.
     """
     start, tell = time.monotonic(), partial(tqdm.write, file=sys.stderr)  # above the bar
     notebooks, data, report, results = (
         Path(folder).resolve() for folder in (notebooks, data, report, results))
-    address = Path(os.path.relpath(results, report)).as_posix() if files else None
     books, read, has = _checked_input(notebooks, data, datasets, options)
     folders = [data / dataset.name for dataset, _ in read]
     with ExitStack() as stack:
@@ -82,7 +80,7 @@ def build_report(notebooks, data, report, results, datasets=None, options=Option
             written = _executed(books, keys, environment, jobs, stage, kept, fresh)
         tell("setting the pages and the PDF")
         drives = read_drives(read, stage, written, notices(books.values()))
-        made = _rendered(shown(books, options), drives, options, address, has)
+        made = _rendered(shown(books, options), drives, options, has)
         for name, content in made.items():
             swap.write_atomically(pages / name, content)
         made_for = {folder.name for folder in folders}
@@ -142,9 +140,9 @@ def _executed(books, keys, environment, jobs, stage, kept, fresh):
     return sorted(written)
 
 
-def _rendered(chapters, drives, options, address, has):
+def _rendered(chapters, drives, options, has):
     """Return the report's files, {name: bytes}, with the opening on `drives` as index.html."""
-    opening = overview.opening(drives, address, chapters)
+    opening = overview.opening(drives, chapters)
     solved = [drive for drive in drives if drive.solutions]
     return render({Path("index"): opening} | chapters, options, has,
                   overview.title_picture(solved[-1]) if solved else "")

@@ -4,6 +4,7 @@ A title `# 2. Name` makes a chapter, `# A. Name` an appendix. The metadata of a 
 cell that begins with a heading, may say what it needs, as `"slamlib": {"needs": "truth"}`.
 """
 
+import json
 import re
 from contextlib import suppress
 from dataclasses import dataclass, field, fields
@@ -52,24 +53,19 @@ def read_options(path):
 
 def _checked(key, value, place):
     """Return the value of a key as Options have it; DatasetError, which begins with `place`."""
-    def require(ok, expected):
-        if not ok:
-            raise DatasetError(f"{place}: expected {expected} for {key}, found {quoted(value)}")
-
-    if choices := {"code": CODE_SHOWN, "problem2": PROBLEM2_FOLDERS}.get(key):
-        require(type(value) is str and value in choices,
-                f"one of {', '.join(map(repr, choices))}")
-    elif key == "appendix":
-        require(type(value) is bool, "true or false")
+    choices = {"code": CODE_SHOWN, "problem2": [*PROBLEM2_FOLDERS], "appendix": [True, False]}
+    if key in choices:
+        ok = type(value) is type(choices[key][0]) and value in choices[key]
+        expected = f"one of {json.dumps(choices[key])[1:-1]}"
     elif key == "leave_out":
-        require(type(value) is list and all(type(entry) is str for entry in value),
-                'a list of numbers and titles in quotes, such as ["B", "3.5", "Explore"],')
-        return dict.fromkeys(value, place)
+        ok = type(value) is list and all(type(entry) is str for entry in value)
+        expected = 'a list of numbers and titles in quotes, such as ["B", "3.5", "Explore"],'
     else:
-        require(type(value) in (str, int) and str(value).isprintable(), "a line of text in quotes")
-        require("\ufffd" not in str(value), "UTF-8 text")
-        return str(value)
-    return value
+        ok = type(value) in (str, int) and re.fullmatch(r"[^\n\ufffd]*", value := str(value))
+        expected = "a line of UTF-8 text in quotes"
+    if not ok:
+        raise DatasetError(f"{place}: expected {expected} for {key}, found {quoted(value)}")
+    return dict.fromkeys(value, place) if key == "leave_out" else value
 
 
 def notebooks_folder():
