@@ -1,6 +1,6 @@
-"""Kills solve and report at random moments and at every step, and runs several builds at once.
+"""Kills solve and report at every step, and runs several builds at once.
 
-    python tests/kills.py [steps] [random] [report-steps] [report-random] [builds]
+    python tests/kills.py [steps] [report-steps] [builds]
 
 prints a table of counts; without arguments it does all. It is not part of the suite, of which
 test_concurrency.py runs a part. Runs are forks of this process, so that none waits for imports; it
@@ -220,7 +220,7 @@ class Reports(Runs):
 
 
 def count(counts, runs, name, result):
-    """Count the state after a kill; sometimes, and after each step, run again undisturbed."""
+    """Count the state after a kill, and run again undisturbed where a drive is named."""
     counts[result if result in ("A", "B", "unfinished") else "MIXED"] += 1
     if result.startswith("MIXED"):
         print(result, file=sys.stderr)
@@ -234,23 +234,6 @@ def count(counts, runs, name, result):
     if what := runs.left():
         counts["LEFT"] += 1
         print("left:", what, file=sys.stderr)
-
-
-def at_random(runs, kills, seed):
-    """Counts after kills at random moments of runs between two drives."""
-    counts, rng, longest = Counter(), random.Random(seed), 0.0
-    runs.reset("A")
-    for name in "AB":
-        begin = time.monotonic()
-        run(runs.arguments(name), runs.root)
-        longest = max(longest, time.monotonic() - begin)
-    while counts["killed"] < kills:
-        process = started(runs.arguments(rng.choice("AB")), runs.root)
-        time.sleep(rng.uniform(0, longest))
-        os.kill(process, signal.SIGKILL)
-        counts["killed" if ended(process) == -9 else "ended before"] += 1
-        count(counts, runs, rng.choice(["A", "B", None]), runs.state())
-    return counts
 
 
 def at_every_step(runs, begin, then):
@@ -288,9 +271,8 @@ def at_once(runs, builds, times, seed):
 STEP_BY_STEP = [("every step, A then B", at_every_step, ("A", "B")),
                 ("every step, B then A", at_every_step, ("B", "A"))]
 PARTS = {
-    "steps": (Solves, STEP_BY_STEP), "random": (Solves, [("random moments", at_random, (200, 1))]),
+    "steps": (Solves, STEP_BY_STEP),
     "report-steps": (Reports, STEP_BY_STEP),
-    "report-random": (Reports, [("random moments", at_random, (40, 2))]),
     "builds": (Reports, [("two builds at once", at_once, (2, 20, 3)),
                          ("four builds at once", at_once, (4, 20, 4))]),
 }

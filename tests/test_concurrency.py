@@ -185,7 +185,7 @@ def test_a_dataset_with_fewer_sensors_leaves_no_problem_of_another(tmp_path, dri
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux forks safely")
 def test_a_kill_before_any_step_of_solve_mixes_nothing_and_the_next_run_cleans_up():
-    """Exhaustive, in both directions between two drives; kills.py does more, and by chance."""
+    """Exhaustive, in both directions between two drives; kills.py does more."""
     done = subprocess.run([sys.executable, ROOT / "tests" / "kills.py", "steps"], text=True,
                           capture_output=True, timeout=600,
                           env=os.environ | {"PYTHONPATH": str(ROOT)})
