@@ -18,7 +18,8 @@ from slamlib.vehicle import changed  # noqa: E402
 
 EXECUTED_NOTEBOOKS = Path("build", "executed")  # folder in which executed notebooks are kept
 # Options of `solve` that replace entries of vehicle.toml.
-STATED = {"kernel": str, "slip": float, "marker_noise_factor": float, "range_noise_factor": float}
+VEHICLE_OPTIONS = {"kernel": str, "slip": float, "marker_noise_factor": float,
+                   "range_noise_factor": float}
 # Signals that end a process; Windows has no SIGHUP.
 END_SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP")
                     if hasattr(signal, name))
@@ -141,7 +142,7 @@ def _solve_options(parser):
                         choices=("1", "2", "2_hint", "2_fused", "3", "4"),
                         help="one of %(choices)s, of which 2 is markers alone; may be repeated "
                              "(default: all); 4 starts from 3 where both are solved")
-    for name, kind in STATED.items():
+    for name, kind in VEHICLE_OPTIONS.items():
         parser.add_argument(f"--{name.replace('_', '-')}", type=kind, metavar=kind.__name__.upper(),
                             help="instead of that of vehicle.toml")
     parser.path("--plot", "write a picture of map and errors: a .png, .pdf or .svg file",
@@ -247,7 +248,7 @@ def _solve(options):
         raise DatasetError(f"{options.plot}: expected a picture .png, .pdf or .svg")
     dataset, truth = read_dataset(options.folder), read_truth(options.folder)
     dataset = replace(dataset, vehicle=changed(
-        dataset.vehicle, _given(options, *STATED), "slamlib solve"))
+        dataset.vehicle, _given(options, *VEHICLE_OPTIONS), "slamlib solve"))
     problems = sorted(f"problem{each}" for each in options.problem) or [*PROBLEMS]
     for each in problems if options.problem else ():
         if not allows(dataset, each):

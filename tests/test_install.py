@@ -75,23 +75,15 @@ def test_the_wheel_has_all_modules_all_files_beside_them_and_all_notebooks(insta
 
 
 @pytest.mark.slow
-def test_an_installed_slamlib_makes_a_drive_solves_it_and_reports_on_it(installed, tmp_path):
+def test_an_installed_slamlib_reports_on_a_drive(installed, tmp_path):
     """In a folder with nothing but `data`; the notebooks are the installed ones."""
     programs, _, _ = installed
     slamlib = programs / "slamlib"
-    told, _ = run(slamlib, "--help", cwd=tmp_path)
-    assert told.startswith("usage: slamlib ") and "export" in told
-    place, _ = run(programs / "python", "-c",
-                   "from slamlib.report import notebooks; print(notebooks.notebooks_folder())",
-                   cwd=tmp_path)
-    assert Path(place.strip()) == (programs.parent / "share" / "slamlib" / "notebooks").resolve()
     _, told = run(slamlib, "report", cwd=tmp_path, code=2)
     assert "data: expected this folder, with a sub-folder" in told and told.count("\n") == 1
     assert not any(tmp_path.iterdir())
-    run(slamlib, "simulate", "drive", cwd=tmp_path)
     (tmp_path / "data" / "drive").mkdir(parents=True)
-    (tmp_path / "drive" / "encoderReading.txt").rename(
-        tmp_path / "data" / "drive" / "encoderReading.txt")
+    (tmp_path / "data" / "drive" / "encoderReading.txt").write_text("1 0 0\n2 10 9\n")
     run(slamlib, "report", "--no-appendix", cwd=tmp_path)
     assert (tmp_path / "report" / "report.pdf").read_bytes().startswith(b"%PDF")
     assert (tmp_path / "results" / "drive" / "problem1" / "vehiclePose.mat").is_file()
