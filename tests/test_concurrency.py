@@ -50,7 +50,9 @@ def wait_for(found, process, seconds=300):
     """Wait until a function returns something true, which is returned, while a process runs."""
     until = time.monotonic() + seconds
     while not (value := found()):
-        assert process.poll() is None and time.monotonic() < until, process.communicate()
+        if process.poll() is not None or time.monotonic() > until:
+            process.kill()
+            raise AssertionError(process.communicate())
         time.sleep(0.02)
     return value
 

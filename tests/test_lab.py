@@ -19,7 +19,7 @@ from slamlib.report.execution import kernel_environment
 from slamlib.simulation import write_dataset
 
 ROOT = Path(__file__).parents[1]
-SECONDS = 120
+SECONDS = 300
 NEWS = "Would you like to get notified about official Jupyter news?"
 
 

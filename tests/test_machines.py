@@ -105,6 +105,7 @@ def processes_with(parent, count):
         if sum(workers.COMMAND in command(each) for each in below) == count:
             return below
         time.sleep(0.05)
+    parent.kill()
     raise AssertionError(parent.communicate())
 
 

@@ -24,7 +24,7 @@ def run_octave(script, folder):
         assert not os.environ.get("CI"), "CI must have octave-cli"
         pytest.skip("octave-cli is not installed")
     subprocess.run([octave, "--quiet", "--no-init-file", "--eval", script], cwd=folder, check=True,
-                   timeout=120)
+                   timeout=300)
 
 
 @pytest.mark.parametrize("name, fields, d", [

@@ -42,7 +42,7 @@ def save_as_lab(file):
 
 def strip(*files, content=b""):
     return subprocess.run([sys.executable, STRIP, *files], input=content, capture_output=True,
-                          timeout=60)
+                          timeout=300)
 
 
 def test_what_jupyterlab_saves_is_restored_to_the_byte(tmp_path):
@@ -97,7 +97,7 @@ def test_git_finds_no_difference_in_a_notebook_that_was_executed(tmp_path):
              if not name.startswith(("MAKE", "MFLAGS"))}        # of the make that runs the tests
 
     def run(*command):
-        done = subprocess.run(command, cwd=folder, text=True, capture_output=True, timeout=60,
+        done = subprocess.run(command, cwd=folder, text=True, capture_output=True, timeout=300,
                               env=alone)
         assert done.returncode == 0, done.stderr
         return done.stdout
