@@ -190,9 +190,7 @@ def _dataset(files, vehicle, name, notes=()):
         if abs(getattr(vehicle, key)) >= len(ticks) > 1:
             raise error(files.get("vehicle.toml", "vehicle"), f"expected a {key} below the number "
                         f"of poses ({len(ticks)}) in size, found {getattr(vehicle, key):g}")
-    notes = [*notes, *encoder_notes] + [
-        f"vehicle.toml sets {key} = {json.dumps(getattr(vehicle, key))} for problems 3 and 4."
-        for key in ("kernel", "gate") if getattr(vehicle, key) != getattr(TABLE_2, key)]
+    notes = [*notes, *encoder_notes]
     aruco = _read_aruco(files, len(ticks), notes)
     uwb, guess = _read_uwb(files, len(ticks), notes)
     return Dataset(name=name, vehicle=vehicle, ticks=ticks, aruco=aruco, uwb=uwb,
@@ -299,16 +297,18 @@ def _read_sensor(files, name, pose_count):
 
 
 def _in_order(rows):
-    """Poses from 0, ids (m,) int64 and rows (m, c), in ascending order of pose; repeated rows once.
-    """
+    """Poses from 0, ids (m,) int64, rows (m, c), in ascending order of pose; repeated rows once."""
     rows = rows[np.sort(np.unique(rows, axis=0, return_index=True)[1])]
     rows = rows[np.argsort(rows[:, 0], kind="stable")]
     return rows[:, 0].astype(np.int64) - 1, rows[:, 1].astype(np.int64), rows
 
 
 def all_notes(dataset, truth):
-    """Notes (tuple of str) on what was mended or left out of a Dataset and its Truth or None."""
-    return (*dataset.notes, *(() if truth is None else truth.notes))
+    """Notes (tuple of str) on what was mended or left out, and on another kernel or gate."""
+    weighed = [f"Problems 3 and 4 are solved with {key} = {json.dumps(value)}."
+               for key in ("kernel", "gate")
+               if (value := getattr(dataset.vehicle, key)) != getattr(TABLE_2, key)]
+    return (*dataset.notes, *weighed, *(() if truth is None else truth.notes))
 
 
 def inventory_lines(dataset, truth):

@@ -11,8 +11,23 @@ import numpy as np
 
 from slamlib import se2
 from slamlib.covariance import correlations, sigmas
+from slamlib.textfile import DatasetError, quoted
 
 REACH_95 = float(np.sqrt(-2 * np.log(0.05)))    # sigmas, of the 95 % ellipse of a planar Gaussian
+
+
+def checked_poses(source, *arrays):
+    """The arguments of a function `source` as float arrays of poses, (n, 3).
+
+    Raises DatasetError where one is something else, or has another n than the first.
+    """
+    for each in arrays:
+        if not (isinstance(each, np.ndarray) and each.dtype.kind in "fiu"
+                and each.shape == (len(arrays[0]), 3)):
+            found = each.shape if isinstance(each, np.ndarray) else quoted(each)
+            raise DatasetError(f"{source}: expected numbers (n, 3), poses of the same n in each "
+                               f"array, found {found}")
+    return [each.astype(float) for each in arrays]
 
 
 def path_length(poses):
@@ -43,6 +58,7 @@ def ate(poses, truth, aligned=False):
     >>> round(ate(poses, truth), 3)
     3.536
     """
+    poses, truth = checked_poses("ate", poses, truth)
     known = np.isfinite(poses).all(axis=1)
     poses, truth = poses[known], truth[known]
     if not len(poses):
@@ -58,6 +74,7 @@ def rpe(poses, truth, step):
     Returns translation in m and rotation in rad. Increments from or to a pose that is NaN are left
     out; both results are NaN without an increment.
     """
+    poses, truth = checked_poses("rpe", poses, truth)
     estimated = se2.between(poses[:-step], poses[step:])
     error = se2.between(se2.between(truth[:-step], truth[step:]), estimated)
     error = error[np.isfinite(error).all(axis=1)]
@@ -74,6 +91,7 @@ def nees(poses, covariances, truth):
     It is chi-squared with 3 degrees of freedom, so 3 on average, if the errors are Gaussian with
     covariance C. It is NaN where C is singular, as for a known pose, and without an estimate.
     """
+    poses, truth = checked_poses("nees", poses, truth)
     error = poses - truth
     error[:, 2] = se2.wrap(error[:, 2])
     rho = correlations(covariances)

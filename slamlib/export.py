@@ -12,6 +12,7 @@ import numpy as np
 
 from slamlib import swap
 from slamlib.dataset import read_truth
+from slamlib.evaluation import checked_poses
 from slamlib.results import FIELDS, read_structs
 from slamlib.textfile import DatasetError
 
@@ -26,6 +27,7 @@ def write_tum(path, poses):
     1 0 0 0 0 0 0 1
     3 2.5 0 0 0 0 0 1
     """
+    poses, = checked_poses("write_tum", poses)
     known = np.flatnonzero(np.isfinite(poses[:, 0]))
     x, y, heading = poses[known].T
     zero = np.zeros(len(known))

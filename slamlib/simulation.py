@@ -63,14 +63,16 @@ def simulate(path="short", seed=0, *, slip=1e-3, late_ranges=0.0, mislabelled=0.
 
     Raises
     ------
-    ValueError : there is no such path.
+    DatasetError : there is no such path, or a number is not within its limits.
 
     >>> dataset, truth = simulate("short", seed=1, late_ranges=0.1)
     >>> dataset.ticks.shape, truth.poses.shape
     ((2000, 2), (2000, 3))
     """
-    if path not in PATHS:
-        raise ValueError(f"path must be one of {', '.join(PATHS)}, not {path!r}")
+    if path not in PATHS or seed < 0 or rounds < 1 or not all(
+            0 <= share <= 1 for share in (slip, late_ranges, mislabelled)):
+        raise DatasetError(f"simulate: expected one of the paths {', '.join(PATHS)}, a seed from 0 "
+                           "on, rounds from 1 on, and a slip and shares from 0 to 1")
     layout = PATHS[path]
     rng = np.random.default_rng(seed)
     true_vehicle = vehicle.with_deviation(noise * rng.standard_normal(3))
@@ -106,13 +108,6 @@ def mislabel(dataset, fraction, seed):
     return replace(dataset, aruco=replace(dataset.aruco, marker=ids[label]))
 
 
-def delay(dataset, fraction, seed):
-    """The Dataset with a fraction of its ranges too long, as by `simulate`; `seed` as above."""
-    rng, count = np.random.default_rng(seed), len(dataset.uwb.range)
-    excess = rng.exponential(LATE_RANGE_MEAN, count) * (rng.uniform(size=count) < fraction)
-    return replace(dataset, uwb=replace(dataset.uwb, range=dataset.uwb.range + excess))
-
-
 def manoeuvre(legs, vehicle=TABLE_2, step=0.01):
     """Counts (n, 2) of the right and left wheel in a drive in arcs, with fractions, without noise.
 
@@ -136,11 +131,39 @@ def write_dataset(folder, dataset, truth=None):
     folder = Path(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise DatasetError(f"{folder}: expected a new or empty folder to write the dataset to")
+    a, u, guess = dataset.aruco, dataset.uwb, dataset.antenna_guess
+    tables = {"encoderReading": ("%d %d %d", _numbers(dataset.ticks), *dataset.ticks.T)}
+    if a is not None:
+        tables["ArucoReading"] = ("%d %d %.5f %.5f %.5f" + 6 * " %.4e", a.pose + 1, a.marker,
+                                  *a.marker_in_vehicle.T, *a.covariance[:, *np.triu_indices(3)].T)
+    if u is not None:
+        tables["UwbReading"] = "%d %d %.4f %.4f", u.pose + 1, u.antenna, u.range, u.sigma
+        tables["UwbAntennaGuess"] = "%d %.3f %.3f", guess.antenna, *guess.position.T
+    if truth is not None:
+        pose = "%d %.6f %.6f %.6f"
+        tables |= {"truth/vehiclePose": (pose, _numbers(truth.poses), *truth.poses.T),
+                   "truth/ArucoMap": (pose, truth.marker, *truth.marker_in_world.T),
+                   "truth/UwbMap": ("%d %.6f %.6f", truth.antenna, *truth.antenna_in_world.T)}
     with staging(folder) as stage:
-        _write_sensors(stage, dataset)
+        if dataset.vehicle != TABLE_2:
+            _write_vehicle(stage / "vehicle.toml", dataset.vehicle)
         if truth is not None:
-            _write_truth(stage / "truth", truth)
+            (stage / "truth").mkdir()
+            _write_vehicle(stage / "truth" / "vehicle.toml", truth.vehicle)
+        for name, (fmt, *columns) in tables.items():
+            with open(stage / f"{name}.txt", "w", encoding="ascii", newline="\n") as file:
+                np.savetxt(file, np.column_stack(columns), fmt=fmt)
         os.replace(stage, folder)
+
+
+def _numbers(rows):
+    return np.arange(1, len(rows) + 1)
+
+
+def _write_vehicle(path, vehicle):
+    lines = [f"{name} = {json.dumps(value)}\n" for name, value in asdict(vehicle).items()
+             if value is not None and (name in WHEEL_ENTRIES or value != getattr(TABLE_2, name))]
+    path.write_text("".join(lines), encoding="utf-8", newline="\n")
 
 
 def _driven_arcs(layout, rounds):
@@ -254,41 +277,3 @@ def _uwb(poses, antenna, antenna_in_world, every, late_ranges, noise, rng):
     excess = rng.exponential(LATE_RANGE_MEAN, len(r)) * late
     measured = r + noise * sigma * rng.standard_normal(len(r)) + excess
     return UwbReadings(frames[frame], antenna[which], np.maximum(measured, 1e-3), sigma)
-
-
-def _write_sensors(folder, dataset):
-    pose = np.arange(1, len(dataset.ticks) + 1)
-    _savetxt(folder / "encoderReading.txt", [pose, *dataset.ticks.T], "%d %d %d")
-    if dataset.aruco is not None:
-        a = dataset.aruco
-        C = a.covariance[:, *np.triu_indices(3)].T
-        _savetxt(folder / "ArucoReading.txt", [a.pose + 1, a.marker, *a.marker_in_vehicle.T, *C],
-                 "%d %d %.5f %.5f %.5f" + 6 * " %.4e")
-    if dataset.uwb is not None:
-        u, g = dataset.uwb, dataset.antenna_guess
-        _savetxt(folder / "UwbReading.txt", [u.pose + 1, u.antenna, u.range, u.sigma],
-                 "%d %d %.4f %.4f")
-        _savetxt(folder / "UwbAntennaGuess.txt", [g.antenna, *g.position.T], "%d %.3f %.3f")
-    if dataset.vehicle != TABLE_2:
-        _write_vehicle(folder / "vehicle.toml", dataset.vehicle)
-
-
-def _write_truth(folder, truth):
-    folder.mkdir()
-    for name, row, coordinates in (
-            ("vehiclePose", np.arange(1, len(truth.poses) + 1), truth.poses),
-            ("ArucoMap", truth.marker, truth.marker_in_world),
-            ("UwbMap", truth.antenna, truth.antenna_in_world)):
-        _savetxt(folder / f"{name}.txt", [row, *coordinates.T], "%d" + len(coordinates.T) * " %.6f")
-    _write_vehicle(folder / "vehicle.toml", truth.vehicle)
-
-
-def _write_vehicle(path, vehicle):
-    lines = [f"{name} = {json.dumps(value)}\n" for name, value in asdict(vehicle).items()
-             if value is not None and (name in WHEEL_ENTRIES or value != getattr(TABLE_2, name))]
-    path.write_text("".join(lines), encoding="utf-8", newline="\n")
-
-
-def _savetxt(path, columns, fmt):
-    with open(path, "w", encoding="ascii", newline="\n") as file:
-        np.savetxt(file, np.column_stack(columns), fmt=fmt)

@@ -138,7 +138,7 @@ def problem_solution(problem, dataset, found=None):
     if problem == "problem2":
         fields = _localization_fields(dataset, found)
     elif problem == "problem2_fused":
-        fields["facts"] = _fusion_facts(dataset, found)
+        fields["facts"] = _noise_facts(found)
     elif problem in ("problem3", "problem4"):
         fields |= {"facts": _slam_facts(dataset, found), "doubts": solution_doubts(found)}
         if dataset.aruco is not None:
@@ -155,25 +155,23 @@ def _localization_fields(dataset, found):
     poses[found.frame], covariances[found.frame] = found.poses, found.covariances
     known = np.isfinite(found.poses[:, 0])
     poses[found.frame[known], 2] = np.unwrap(found.poses[known, 2])
-    facts = {"measured_poses": len(found.frame), "localized_poses": int(known.sum()),
-             "sightings": len(dataset.aruco.pose), "outliers": int(found.rejected.sum()),
-             "unused_sightings": int(found.unused.sum())}
     return {"poses": poses, "covariances": covariances, "world": int(found.frame[known][0]),
             "aruco_map": (found.marker, found.marker_in_world, found.marker_covariance),
-            "facts": facts}
+            "facts": {"measured_poses": len(found.frame), "sightings": len(dataset.aruco.pose),
+                      "outliers": int(found.rejected.sum()),
+                      "unused_sightings": int(found.unused.sum())}}
 
 
-def _fusion_facts(dataset, found):
-    """Noise and wheel parameters of a Fusion."""
-    facts, factor = {"slip_sqrt_m": found.slip}, dataset.vehicle.marker_noise_factor
-    if factor is not None:
-        facts["marker_noise_factor"] = factor
-    return {**_with_given(dataset, facts), "outliers": found.rejected, **_wheel_facts(found)}
+def _noise_facts(found):
+    """Slip, wheel parameters and number of rejected sightings of a Fusion or SlamResult."""
+    return {"slip_sqrt_m": found.slip, "outliers": int(np.sum(found.rejected)),
+            "wheel_parameters_m": found.wheel.tolist(),
+            "wheel_parameter_sigmas_m": np.sqrt(np.diag(found.wheel_covariance)).tolist()}
 
 
 def _slam_facts(dataset, found):
-    """Noise, evidence, calibration and wheel parameters of a SlamResult, and what it rejects."""
-    facts, sigmas = {"slip_sqrt_m": found.slip}, found.noise_sigma.tolist()
+    """Noise, evidence and calibration of a SlamResult, and what it rejects."""
+    facts, sigmas = _noise_facts(found), found.noise_sigma.tolist()
     facts["slip_relative_sigma"] = sigmas[0]
     for name, rows, factor, sigma, correlation in (
             ("marker", found.rejected, found.noise.sightings, sigmas[1], found.correlation[0]),
@@ -181,12 +179,10 @@ def _slam_facts(dataset, found):
         if len(rows):
             facts |= {f"{name}_noise_factor": factor, f"{name}_noise_relative_sigma": sigma,
                       f"{name}_error_correlation": correlation.tolist()}
-    facts = _with_given(dataset, facts) | {
-        "increments": found.model, "outliers": int(found.rejected.sum()),
-        "unconfirmed": found.unconfirmed.tolist(), "chi2_per_dof": found.chi2_per_dof,
-        "chi2_per_dof_of_all": found.chi2_per_dof_of_all, "log_evidence": found.log_evidence,
-        **_wheel_facts(found), "calibration": [row for row in found.calibration_table
-                                               if row["sigma"]]}
+    facts |= {"increments": found.model, "unconfirmed": found.unconfirmed.tolist(),
+              "chi2_per_dof": found.chi2_per_dof, "chi2_per_dof_of_all": found.chi2_per_dof_of_all,
+              "log_evidence": found.log_evidence,
+              "calibration": [row for row in found.calibration_table if row["sigma"]]}
     if len(found.antenna):
         weak = dataset.uwb.antenna[found.range_weight < 0.5].tolist()
         facts |= {"ranges": len(dataset.uwb.pose), "antennas_in_doubt": found.doubts,
@@ -195,29 +191,15 @@ def _slam_facts(dataset, found):
     return facts
 
 
-def _wheel_facts(found):
-    """Wheel parameters and their sigmas."""
-    return {"wheel_parameters_m": found.wheel.tolist(),
-            "wheel_parameter_sigmas_m": np.sqrt(np.diag(found.wheel_covariance)).tolist()}
-
-
-def _with_given(dataset, facts):
-    """Facts with the entry "given", the names of those that the Vehicle states, if any."""
-    given = [name for name in facts
-             if getattr(dataset.vehicle, name.removesuffix("_sqrt_m"), None) is not None]
-    return {**facts, "given": given} if given else facts
-
-
-def solutions(dataset, found=None, problems=tuple(PROBLEMS)):
+def solutions(dataset, problems=tuple(PROBLEMS)):
     """Yield the Solution of each of `problems` that the dataset's sensors allow, in order.
 
-    A problem that cannot be solved yields a Failure. `found` are results of `find` that are known
-    already (dict by problem).
+    A problem that cannot be solved yields a Failure.
     """
-    found = dict(found or {})
+    found = {}
     for problem in (each for each in problems if allows(dataset, each)):
         try:
-            result = found[problem] if problem in found else find(problem, dataset, found)
+            result = find(problem, dataset, found)
             if problem == "problem3":                    # from which problem 4 starts
                 found[problem] = result
             yield problem_solution(problem, dataset, result)

@@ -55,8 +55,7 @@ def solve_to_folder(dataset, truth, out, problems=tuple(PROBLEMS), csv=False):
     read.
     """
     with swap.staging(out) as stage:
-        rows = _written_by_all(dataset, truth, stage, problems)
-        summary = _summary(dataset, truth, rows)
+        summary = _summary(dataset, truth, _solved_by_two(dataset, truth, stage, problems))
         text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
         swap.write_atomically(stage / SUMMARY, text.encode())
         if csv and any(stage.glob("*/*.mat")):
@@ -66,7 +65,7 @@ def solve_to_folder(dataset, truth, out, problems=tuple(PROBLEMS), csv=False):
 
 
 def _summary(dataset, truth, rows):
-    """The summary of what `_written` returns."""
+    """The summary of what `_solved` returns."""
     rows = {problem: rows[problem] for problem in PROBLEMS if problem in rows}
     return {"dataset": dataset.name, "poses": len(dataset.ticks), "kernel": dataset.vehicle.kernel,
             "doubts": [asdict(doubt) for doubt in merged(chain(
@@ -75,7 +74,7 @@ def _summary(dataset, truth, rows):
             "problems": {problem: row for problem, (row, _) in rows.items()}}
 
 
-def _written(dataset, truth, stage, problems):
+def _solved(dataset, truth, stage, problems):
     """Solve problems, and write to `stage` if not None; {problem: (row of the summary, doubts)}."""
     rows, start = {}, time.perf_counter()
     for solution in solutions(dataset, problems=problems):
@@ -90,31 +89,32 @@ def _written(dataset, truth, stage, problems):
     return rows
 
 
-def _written_by_all(dataset, truth, stage, problems):
-    """What `_written` returns, by two processes where that is safe."""
+def _solved_by_two(dataset, truth, stage, problems):
+    """What `_solved` returns, by two processes where that is safe."""
     safe = sys.platform == "linux" and len(os.sched_getaffinity(0)) > 1 \
         and threading.current_thread() is threading.main_thread()
     second = [each for each in problems if safe and each in PARALLEL_PROBLEMS]
     if not second:
-        return _written(dataset, truth, stage, problems)
+        return _solved(dataset, truth, stage, problems)
     receiver, sender = Pipe(duplex=False)
-    with receiver, process("fork", lambda: sender.send(_written(dataset, truth, stage, second))):
+    with receiver, process(lambda: sender.send(_solved(dataset, truth, stage, second))):
         sender.close()
-        rows = _written(dataset, truth, stage, [x for x in problems if x not in second])
+        rows = _solved(dataset, truth, stage, [x for x in problems if x not in second])
         try:
             return rows | receiver.recv()
         except EOFError:            # it failed, or was killed, as where memory is short
-            return rows | _written(dataset, truth, stage, second)
+            return rows | _solved(dataset, truth, stage, second)
 
 
 @contextmanager
-def process(method, function, *arguments):
-    """Context in which a process runs a function, silently if it fails; it ends with the context.
+def process(function, *arguments):
+    """Context in which another process runs a function, silently if it fails, and then ends.
 
-    `method` is that of multiprocessing to start it. The value is the multiprocessing.Process. On
-    Linux it ends with this process, too, however that ends.
+    The value is the multiprocessing.Process: a fork on Linux, where it ends with this process, too,
+    however that ends.
     """
-    child = get_context(method).Process(target=_run, args=(os.getpid(), function, *arguments))
+    child = get_context("fork" if sys.platform == "linux" else "spawn").Process(
+        target=_run, args=(os.getpid(), function, *arguments))
     child.start()
     try:
         yield child
@@ -134,21 +134,16 @@ def _run(parent, function, *arguments):
         os._exit(1)
 
 
-def tables(folders):
-    """Context in which another process prints the `summary_table` of datasets, the shortest first.
+def print_tables(folders):
+    """Print the `summary_table` of datasets in folders (list of Path), the shortest first.
 
-    `folders` is a list of Path; nothing is written. The value is the multiprocessing.Process.
+    Nothing is written.
     """
-    return process("fork" if sys.platform == "linux" else "spawn", _print_tables, folders)
-
-
-def _print_tables(folders):
     over_a_bar = "\r\033[K" if sys.stderr.isatty() else ""
     drives = [(read_dataset(folder), read_truth(folder)) for folder in folders]
     for dataset, truth in sorted(drives, key=lambda drive: len(drive[0].ticks)):
         try:
-            rows = _written(dataset, truth, None, PROBLEMS)
-            text = summary_table(_summary(dataset, truth, rows))
+            text = summary_table(_summary(dataset, truth, _solved(dataset, truth, None, PROBLEMS)))
         except Exception as error:          # the notebooks report it in full
             text = f"{dataset.name}: not solved before the notebooks: {error!r}"
         print(over_a_bar + text, file=sys.stderr, flush=True)

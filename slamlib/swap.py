@@ -98,7 +98,7 @@ def publish(made, ours=()):
 
     Raises
     ------
-    OSError : a file cannot be put in its place; then all folders are as they were.
+    OSError : a file cannot be written or put in its place; in the first case nothing has changed.
     """
     made = {Path(folder).resolve(): new for folder, new in made.items()}
     with ExitStack() as stack:
@@ -118,8 +118,11 @@ def _add_the_users_files(folder, new, ours):
     new.mkdir(exist_ok=True)
     names = file_names(new)
     for source in (beside(folder, "old"), folder):     # the first of a run that was killed
-        users = {*file_names(source)} - {FILE_LIST, *ours, *names, *_listed(source)}
-        for name in users:
+        try:
+            listed = {*map(str, json.loads((source / FILE_LIST).read_bytes()))}
+        except (OSError, ValueError, TypeError):        # none, or not written by slamlib
+            listed = set()
+        for name in {*file_names(source)} - {FILE_LIST, *ours, *names, *listed}:
             if not name.endswith(".part"):
                 (new / name).parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(source / name, new / name, follow_symlinks=False)
@@ -128,27 +131,12 @@ def _add_the_users_files(folder, new, ours):
         (new / FILE_LIST).write_text(json.dumps(names))
 
 
-def _listed(folder):
-    """Names (set of str) of the files that the last run wrote to a folder."""
-    try:
-        return {*map(str, json.loads((folder / FILE_LIST).read_bytes()))}
-    except (OSError, ValueError, TypeError):            # none, or not written by slamlib
-        return set()
-
-
 def _replace(made):
     """Move all old folders aside, then all new ones in, and remove the old ones."""
-    moved = []
-    try:
-        for folder, new in made.items():
-            if folder.exists() and new.exists():
-                _discard_old(folder)
-                folder.rename(beside(folder, "old"))
-                moved.append(folder)
-    except OSError:                                     # on Windows, where a program shows a file
-        for folder in moved:
-            beside(folder, "old").rename(folder)
-        raise
+    for folder, new in made.items():
+        if folder.exists() and new.exists():
+            _discard_old(folder)
+            folder.rename(beside(folder, "old"))
     for folder, new in made.items():
         if new.exists():
             new.rename(folder)

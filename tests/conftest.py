@@ -11,6 +11,7 @@ from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 
+import psutil
 import pytest
 from hypothesis import settings
 
@@ -111,6 +112,14 @@ def contradicted(aruco):
     twice = aruco.select(np.repeat(np.arange(len(aruco.pose)), 2))
     off = np.resize([[0.0, 0.0, 0.0], [5.0, 3.0, 1.0]], twice.marker_in_vehicle.shape)
     return replace(twice, marker_in_vehicle=twice.marker_in_vehicle + off)
+
+
+def is_running(number):
+    """True unless the process with this id is gone, or waits to be buried."""
+    try:
+        return psutil.Process(number).status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
 
 
 @pytest.fixture(scope="session")

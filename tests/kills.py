@@ -1,21 +1,16 @@
-"""Kills solve and report at random moments and at every step, and runs several builds at once.
+"""Kills a run before each of its steps, and prints a line of counts for each kind of run.
 
-    python tests/kills.py [solve] [steps] [report] [report-steps] [builds]
-
-prints a table of counts; without arguments it does all. It is not part of the suite, of which
-test_concurrency.py runs a part. Runs are forks of this process, so that none waits for imports; it
+A part of test_concurrency.py. Runs are forks of this process, so that none waits for imports; it
 imports no more than they need, because a large process forks slowly. A folder that a run of A or B
 writes to is judged by the bytes that undisturbed runs wrote.
 """
 
 import json
 import os
-import random
 import shutil
 import signal
 import sys
 import tempfile
-import time
 from collections import Counter
 from pathlib import Path
 
@@ -26,28 +21,20 @@ from slamlib.simulation import simulate, write_dataset
 
 STEPS = {"os.rename", "os.remove", "os.mkdir", "os.rmdir"}      # audit events, also of pathlib
 MINE = {"notes.txt": "of the user", "mine/data.mat": "mine", "problem1/notes.txt": "too"}
-CODE = """from slamlib import solve
-from slamlib.notebook import results_folder, start
-for drive in start():
-    for problem in {problems}:
-        if solve.allows(drive.dataset, problem):
-            solution = solve.problem_solution(problem, drive.dataset)
-            solve.write_solution(results_folder(drive), solution)"""
 
 
-def started(arguments, folder, at_step=None):
-    """Process id of a fork that runs `main` in a folder, and kills itself before a step if told."""
+def run(function, name, at_step=None):
+    """Exit code of a fork that runs function(name), -9 if it killed itself before a step."""
     process = os.fork()
     if process:
-        return process
+        return os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
     code = 9
     try:
-        os.chdir(folder)
         for number in (1, 2):
             os.dup2(os.open(os.devnull, os.O_WRONLY), number)
         if at_step is not None:
             _kill_at(at_step)
-        code = main(list(map(str, arguments)))
+        code = function(name)
     finally:
         os._exit(code)
 
@@ -63,17 +50,6 @@ def _kill_at(step):
                 os.kill(here, signal.SIGKILL)
 
     sys.addaudithook(hook)
-
-
-def ended(process):
-    """Exit code of a process, -9 if it was killed."""
-    return os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
-
-
-def run(arguments, folder):
-    """Run `main` undisturbed."""
-    code = ended(started(arguments, folder))
-    assert code == 0, f"exit code {code}"
 
 
 def contents(folder):
@@ -93,251 +69,125 @@ def _plain(file):
     return content
 
 
-def judge(folder, references):
-    """Which reference, "A" or "B", a folder holds, finished; else "unfinished" or "MIXED: ...".
-
-    Never may files of two runs be side by side, nor a part of them. The user's files must be as
-    they were. A folder that a run was replacing is missing, and the old one is beside it.
-    """
-    if not folder.exists():
-        return "unfinished" if swap.beside(folder, "old").exists() else "MIXED: lost all"
-    found = contents(folder)
-    owners = [name for name, files in references.items() if found == files]
-    for name, text in MINE.items():
-        if not (folder / name).is_file() or (folder / name).read_text() != text:
-            return "MIXED: lost " + name
-    return owners[0] if owners else "MIXED: " + " ".join(sorted(found))
-
-
-def left(folder):
-    """What lies in a folder that is no run's and no user's, empty folders too."""
-    return [str(path.relative_to(folder)) for path in folder.rglob("*")
-            if path.name.startswith(".") and path.name != swap.FILE_LIST
-            or path.is_dir() and not any(path.iterdir())]
-
-
-def beside(root):
-    """What lies hidden beside the folders of runs."""
-    return [path.name for path in root.iterdir() if path.name.startswith(".")]
-
-
-def put_mine(folder):
-    """Write the user's files."""
-    for name, text in MINE.items():
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_text(text)
-
-
-def make_drives(root):
-    """Folders A (all sensors) and B (another drive, without ranges), each with data/short."""
-    for name, seed in (("A", 3), ("B", 4)):
-        dataset = simulate("short", seed)[0].first(40)
-        write_dataset(root / name / "short", dataset.without("uwb") if name == "B" else dataset)
-
-
 class Solves:
-    """The command solve between the drives A and B in one folder."""
+    """The command solve, of two drives whose problems are solved once: only files are written."""
+
+    folders = ("out",)
 
     def __init__(self, root):
-        self.root = root
-        make_drives(root)
-        self.references, self.copies = {}, {}
-        for name in "AB":
-            self.copies[name] = root / f"copy_{name}"
-            run(["solve", root / name / "short", "--out", self.copies[name]], root)
-            self.references[name] = contents(self.copies[name])
-            put_mine(self.copies[name])
-
-    def arguments(self, name):
-        """Of the command line for one drive."""
-        return ["solve", self.root / name / "short", "--out", "out"]
-
-    def reset(self, name):
-        """Make the results of a drive, finished, those of the folder."""
-        shutil.rmtree(self.root / "out", ignore_errors=True)
-        shutil.copytree(self.copies[name], self.root / "out")
-
-    def state(self):
-        """What `judge` says."""
-        return judge(self.root / "out", self.references)
-
-    def left(self):
-        """What is there and should not be after an undisturbed run."""
-        return [*left(self.root / "out"), *beside(self.root)]
-
-
-class StoredSolves(Solves):
-    """The same, with problems that are solved once: only the files are written each time."""
-
-    def __init__(self, root):
-        super().__init__(root)
-        found = {}
-        for name in "AB":
-            dataset = read_dataset(root / name / "short")
-            found[dataset.uwb is None] = [*summary.solutions(dataset)]
+        self.root, found = root, {}
+        for name, seed in (("A", 3), ("B", 4)):
+            dataset = simulate("short", seed)[0].first(40)
+            write_dataset(root / name, dataset.without("uwb") if name == "B" else dataset)
+            found[name] = [*summary.solutions(read_dataset(root / name))]
         summary.solutions = lambda dataset, problems: (
-            each for each in found[dataset.uwb is None] if each.problem in problems)
+            each for each in found[dataset.name] if each.problem in problems)
+
+    def run(self, name):
+        """One run, in a process of its own; the exit code."""
+        return main(["solve", str(self.root / name), "--out", str(self.root / "out")])
 
 
-class Reports:
-    """The command report between the drives A and B, of two tiny notebooks."""
+class Swaps:
+    """Two folders that are swapped as one, as a report and its results."""
+
+    folders = ("one", "two")
 
     def __init__(self, root):
-        import nbformat
         self.root = root
-        make_drives(root)
-        (root / "notebooks").mkdir()
-        for name, problems in (("1_one", ["problem1"]), ("2_two", ["problem2", "problem4"])):
-            nbformat.write(nbformat.v4.new_notebook(cells=[
-                nbformat.v4.new_markdown_cell(f"# {name[0]}. Chapter", id="a"),
-                nbformat.v4.new_code_cell(CODE.format(problems=problems), id="b")]),
-                root / "notebooks" / f"{name}.ipynb")
-        self.folders = ("results/short", "report")
+
+    def run(self, name):
+        """One run, in a process of its own; the exit code."""
+        one, two = (self.root / each for each in self.folders)
+        with swap.staging(one) as new_one, swap.staging(two) as new_two:
+            for stage in (new_one, new_two):
+                for file in ("both.txt", f"{name}.txt", f"problem1/{name}.txt"):
+                    swap.write_atomically(stage / file, f"{file} of {name}".encode())
+            swap.publish({one: new_one, two: new_two})
+        return 0
+
+
+class Judge:
+    """What the folders of runs hold."""
+
+    def __init__(self, runs):
+        self.root, self.folders = runs.root, runs.folders
         self.references, self.copies = {}, {}
         for name in "AB":
-            run(self.arguments(name), root)
-            self.references[name] = {folder: contents(root / folder) for folder in self.folders}
-            self.copies[name] = root / f"copy_{name}"
-            for folder in self.folders:
-                shutil.copytree(root / folder, self.copies[name] / folder)
-                put_mine(self.copies[name] / folder)
-        self.reset("B")
+            self.reset()
+            assert run(runs.run, name) == 0
+            self.references[name] = {each: contents(self.root / each) for each in self.folders}
+            self.copies[name] = self.root / f"copy_{name}"
+            for each in self.folders:
+                shutil.copytree(self.root / each, self.copies[name] / each)
+                for mine, text in MINE.items():
+                    swap.write_atomically(self.copies[name] / each / mine, text.encode())
 
-    def arguments(self, name):
-        """Of the command line for one drive."""
-        return ["report", "--data", self.root / name]
-
-    def reset(self, name):
-        """Make the report of a drive, finished, that of the folder."""
-        for folder in ("results", "report"):
-            shutil.rmtree(self.root / folder, ignore_errors=True)
-            shutil.copytree(self.copies[name] / folder, self.root / folder)
+    def reset(self, name=None):
+        """Make the finished files of a drive, if one is named, those of the folders."""
+        for path in (*(self.root / each for each in self.folders), *self.root.glob(".*")):
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
+        for each in self.folders if name else ():
+            shutil.copytree(self.copies[name] / each, self.root / each)
 
     def state(self):
-        """What `judge` says of all folders; where none is missing, they are of one run."""
-        states = {judge(self.root / folder, {
-            name: files[folder] for name, files in self.references.items()})
-            for folder in self.folders}
+        """Which run, "A" or "B", the folders are of, finished; "unfinished" or "MIXED: ..." else.
+
+        Never may files of two runs be side by side, nor a part of them. The user's files must be as
+        they were. A folder that a run was replacing is missing, and the old one is beside it.
+        """
+        states = set()
+        for each in self.folders:
+            folder = self.root / each
+            if not folder.exists():
+                states.add("unfinished" if swap.beside(folder, "old").exists() else "MIXED: lost")
+                continue
+            found = contents(folder)
+            owners = [name for name in "AB" if found == self.references[name][each]]
+            kept = all((folder / name).is_file() and (folder / name).read_text() == text
+                       for name, text in MINE.items())
+            states.add(owners[0] if owners and kept else f"MIXED: {sorted(found)}, {kept=}")
         mixed = [state for state in states if state.startswith("MIXED")]
-        if mixed:
-            return mixed[0]
-        if "unfinished" in states:
-            return "unfinished"
-        return states.pop() if len(states) == 1 else "MIXED: results and pages"
+        if mixed or "unfinished" in states:
+            return mixed[0] if mixed else "unfinished"
+        return states.pop() if len(states) == 1 else "MIXED: A and B"
 
     def left(self):
-        """What is there and should not be after an undisturbed run."""
-        return [name for folder in ("results", "report", "build/executed")
-                for name in left(self.root / folder)] + beside(self.root)
+        """What is hidden or empty, and should not be there after an undisturbed run."""
+        return [str(path) for each in self.folders for path in (self.root / each).rglob("*")
+                if path.name.startswith(".") and path.name != swap.FILE_LIST
+                or path.is_dir() and not any(path.iterdir())] + [*self.root.glob(".*")]
 
 
-class PlainReports(Reports):
-    """The same with pages of a few bytes, which take no time: notebooks, cache and files are real.
+def at_every_step(runs, judge, begin, then):
+    """Counts after kills before each step of a run of `then`, where that of `begin` ended well.
 
-    A page holds what the result files say, so that those of A and B differ.
+    After every third one a run is undisturbed.
     """
-
-    def __init__(self, root):
-        from slamlib.report import build
-        build.render = lambda *_, **__: {}
-        build._rendered = lambda books, drives, *_: {
-            f"{name}.html": f"{name}: {[each.files for each in drives]}, "
-                            f"{[s.poses.tolist() for d in drives for s in d.solutions]}".encode()
-            for name in ["index", *(source.stem for source in books)]}
-        super().__init__(root)
-
-
-def count(counts, runs, name, result):
-    """Count the state after a kill; sometimes, and after each step, run again undisturbed."""
-    counts[result if result in ("A", "B", "unfinished") else "MIXED"] += 1
-    if result.startswith("MIXED"):
-        print(result, file=sys.stderr)
-    if name is None:
-        return
-    run(runs.arguments(name), runs.root)
-    counts["runs after"] += 1
-    if runs.state() != name:
-        counts["MIXED"] += 1
-        print("after:", runs.state(), file=sys.stderr)
-    if what := runs.left():
-        counts["LEFT"] += 1
-        print("left:", what, file=sys.stderr)
-
-
-def at_random(runs, kills, seed, options=lambda rng: []):
-    """Counts after kills at random moments of runs between two drives."""
-    counts, rng, longest = Counter(), random.Random(seed), 0.0
-    runs.reset("A")
-    for name in "AB":
-        begin = time.monotonic()
-        run([*runs.arguments(name), *options(rng)], runs.root)
-        longest = max(longest, time.monotonic() - begin)
-    while counts["killed"] < kills:
-        process = started([*runs.arguments(rng.choice("AB")), *options(rng)], runs.root)
-        time.sleep(rng.uniform(0, longest))
-        os.kill(process, signal.SIGKILL)
-        counts["killed" if ended(process) == -9 else "ended before"] += 1
-        count(counts, runs, rng.choice(["A", "B", None]), runs.state())
-    return counts
-
-
-def at_every_step(runs, begin, then):
-    """Counts after kills before each step of a run of `then`, where that of `begin` ended well."""
     counts, step, code = Counter(), 0, -9
     while code == -9:
         step += 1
-        runs.reset(begin)
-        code = ended(started(runs.arguments(then), runs.root, step))
+        judge.reset(begin)
+        code = run(runs.run, then, step)
         counts["killed"] += code == -9
-        count(counts, runs, then if code == -9 else None, runs.state())
+        state = judge.state()
+        counts[state.partition(":")[0]] += 1
+        if step % 3 == 0 or state.startswith("MIXED"):
+            print(f"step {step}: {state}", file=sys.stderr)
+            assert run(runs.run, then) == 0
+            counts["runs after"] += 1
+            counts["MIXED"] += judge.state() != then
+            counts["LEFT"] += len(judge.left())
     assert code == 0
     return counts
 
 
-def at_once(runs, builds, times, seed):
-    """Counts of rounds of several builds that start at random offsets, with an empty cache."""
-    counts, rng = Counter(), random.Random(seed)
-    for _ in range(times):
-        shutil.rmtree(runs.root / "build", ignore_errors=True)
-        runs.reset("B")
-        processes = []
-        for _ in range(builds):
-            processes.append(started(runs.arguments("A"), runs.root))
-            time.sleep(rng.uniform(0, 3))
-        counts["builds"] += builds
-        counts["FAILED"] += sum(ended(process) != 0 for process in processes)
-        counts["rounds of the same bytes"] += runs.state() == "A" and not runs.left()
-    return counts
-
-
-ANSWER_PARTS = {
-    "solve": (Solves, [("solve, random moments", at_random, (200, 1))]),
-    "steps": (StoredSolves, [("solve, every step, A then B", at_every_step, ("A", "B")),
-                       ("solve, every step, B then A", at_every_step, ("B", "A"))]),
-    "report": (Reports, [("report, random moments", at_random, (
-        40, 2, lambda rng: rng.choice([[], ["--fresh"]])))]),
-    "report-steps": (PlainReports, [
-        ("report, every step, A then B", at_every_step, ("A", "B")),
-        ("report, every step, B then A", at_every_step, ("B", "A"))]),
-    "builds": (PlainReports, [("two builds at once", at_once, (2, 20, 3)),
-                         ("four builds at once", at_once, (4, 20, 4))]),
-}
-
-
-def do(parts):
-    """Run parts by name, print a line for each, and return True if nothing was mixed or left."""
-    well = True
-    for part in parts:
-        kind, lines = ANSWER_PARTS[part]
-        with tempfile.TemporaryDirectory() as folder:
-            runs = kind(Path(folder).resolve())
-            for title, function, arguments in lines:
-                counts = function(runs, *arguments)
-                well &= not any(counts[bad] for bad in ("MIXED", "LEFT", "FAILED"))
-                print(f"{title:30}" + ", ".join(
-                    f"{number} {what}" for what, number in counts.items()), flush=True)
-    return well
-
-
 if __name__ == "__main__":
-    sys.exit(not do(sys.argv[1:] or ANSWER_PARTS))
+    memory = Path("/dev/shm")                                    # where many small files are fast
+    for kind, begin, then in ((Solves, "A", "B"), (Swaps, "B", "A")):
+        with tempfile.TemporaryDirectory(dir=memory if memory.is_dir() else None) as folder:
+            runs = kind(Path(folder).resolve())
+            print(json.dumps(at_every_step(runs, Judge(runs), begin, then)), flush=True)

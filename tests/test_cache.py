@@ -29,8 +29,10 @@ def execute_without_kernel(books, environment, results, jobs, finish):
 
 @pytest.fixture
 def project(tmp_path, monkeypatch):
-    """A folder with two notebooks a and b, whose executions are counted."""
+    """A folder with two notebooks a and b, whose executions are counted; pages take no time."""
     monkeypatch.setattr(build, "execute", execute_without_kernel)
+    monkeypatch.setattr(build, "render", lambda books, *_, **__: {
+        f"{source.stem}.html": nbformat.writes(book).encode() for source, book in books.items()})
     make_data(tmp_path)
     for name in "ab":
         write(tmp_path / "notebooks", name, f"# {name}", ("1 + 1",))
@@ -44,21 +46,22 @@ def executions(folder, **options):
     return tuple(len((folder / f"count_{name}").read_text()) for name in "ab")
 
 
-@pytest.mark.slow
+def pages(folder):
+    return [(folder / "report" / f"{name}.html").read_bytes() for name in "ab"]
+
+
 def test_a_changed_notebook_is_executed_again_and_only_that_one(project, capsys):
     assert executions(project) == (1, 1)
-    pages = [file.read_bytes() for file in sorted((project / "report").iterdir())]
+    before = pages(project)
     capsys.readouterr()
     assert executions(project) == (1, 1)
     told = capsys.readouterr().err
-    assert told.count("nothing changed, not executed again") == 2
-    assert "built in" in told
-    assert [file.read_bytes() for file in sorted((project / "report").iterdir())] == pages
+    assert told.count("nothing changed, not executed again") == 2 and "built in" in told
+    assert pages(project) == before
     write(project / "notebooks", "b", "# b", ("1 + 2",))
     assert executions(project) == (1, 2)
 
 
-@pytest.mark.slow
 def test_results_that_are_gone_or_changed_are_written_again_without_an_execution(project):
     assert executions(project) == (1, 1)
     a, b = (project / "results" / "short" / name for name in ("a.mat", "b.mat"))
@@ -66,31 +69,19 @@ def test_results_that_are_gone_or_changed_are_written_again_without_an_execution
     b.unlink()
     assert executions(project) == (1, 1)
     assert a.read_text() == b.read_text() == "result"
-    shutil.rmtree(project / "results")
-    assert executions(project) == (1, 1)
-    assert a.read_text() == b.read_text() == "result"
 
 
-@pytest.mark.slow
 def test_a_changed_dataset_executes_all_and_fresh_does_so_without_a_change(project):
+    """Another selection and back executes each notebook once for each."""
     assert executions(project, datasets=["short"]) == (1, 1)
     (project / "data" / "long" / "encoderReading.txt").write_text("1 0 0\n2 3 3\n")
     assert executions(project, datasets=["short"]) == (1, 1)  # not selected
-    (project / "data" / "short" / "encoderReading.txt").write_text("1 0 0\n2 3 3\n")
-    assert executions(project, datasets=["short"]) == (2, 2)
-    assert executions(project, datasets=["short"], fresh=True) == (3, 3)
-    assert executions(project, datasets=["short"]) == (3, 3)
-
-
-@pytest.mark.slow
-def test_another_selection_and_back_executes_each_notebook_once_for_each(project):
-    assert executions(project, datasets=["short"]) == (1, 1)
-    first = [file.read_bytes() for file in sorted((project / "report").iterdir())]
     assert executions(project) == (2, 2)
     assert executions(project, datasets=["short"]) == executions(project) == (2, 2)
-    executions(project, datasets=["short"])
-    assert [file.read_bytes() for file in sorted((project / "report").iterdir())] == first
-    assert executions(project) == (2, 2)
+    (project / "data" / "short" / "encoderReading.txt").write_text("1 0 0\n2 3 3\n")
+    assert executions(project, datasets=["short"]) == (3, 3)
+    assert executions(project, datasets=["short"], fresh=True) == (4, 4)
+    assert executions(project, datasets=["short"]) == (4, 4)
 
 
 def test_the_versions_used_last_are_kept_and_other_notebooks_are_left_alone(tmp_path):
@@ -188,7 +179,7 @@ def test_a_damaged_entry_never_changes_what_is_recalled(kept, tmp_path):
     """A checksum finds it, but for a few bytes that say nothing of the contents, as a time."""
     whole, result = kept(), tmp_path / "results" / "a.mat"
     content, refused = executed(tmp_path).read_bytes(), 0
-    for place in range(len(content)):
+    for place in range(0, len(content), 7):
         executed(tmp_path).write_bytes(content[:place])
         assert kept() in (whole, None)
         executed(tmp_path).write_bytes(
@@ -196,7 +187,7 @@ def test_a_damaged_entry_never_changes_what_is_recalled(kept, tmp_path):
         found = kept()
         refused += found is None
         assert found in (whole, None) and result.read_text() == "result", place
-    assert len(content) - refused < 10
+    assert refused > 0.9 * len(content) / 7
 
 
 def test_slamlib_and_the_packages_are_among_what_matters(monkeypatch, tmp_path):
@@ -260,20 +251,18 @@ def test_code_cells_their_order_and_the_tags_that_nbclient_heeds_matter(read, ch
     assert key() != before
 
 
-def test_a_notebook_saved_in_jupyterlab_is_not_executed_and_gives_the_same_pages(project, capsys):
+def test_saved_outputs_and_changed_prose_cost_no_execution(project, capsys):
     executions(project)
-    pages = [file.read_bytes() for file in sorted((project / "report").iterdir())]
+    before = pages(project)
     for name in "ab":
         save_as_lab(project / "notebooks" / f"{name}.ipynb")
     assert executions(project) == (1, 1)
     assert capsys.readouterr().err.count("nothing changed, not executed again") == 2
-    assert [file.read_bytes() for file in sorted((project / "report").iterdir())] == pages
-
-
-def test_changed_prose_and_new_cells_of_text_cost_a_page_and_no_execution(project):
-    executions(project)
+    outputs = [[cell.get("outputs") for cell in nbformat.reads(page.decode(), 4).cells]
+               for page in (*before, *pages(project))]
+    assert outputs[:2] == outputs[2:] and "executed" in str(outputs)
     write(project / "notebooks", "a", "New prose.", "# a, changed", "More.", ("1 + 1",), "An end.")
     assert executions(project) == (1, 1)
-    page = (project / "report" / "a.html").read_text()
-    order = [page.index(f"{text}<") for text in ("New prose.", "More.", "executed", "An end.")]
+    page = pages(project)[0].decode()
+    order = [page.index(text) for text in ("New prose.", "More.", "executed", "An end.")]
     assert order == sorted(order)

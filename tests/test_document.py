@@ -11,7 +11,7 @@ from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_outp
 from slamlib.dataset import DatasetError
 from slamlib.report import NotebookError
 from slamlib.report.document import render
-from slamlib.report.options import Options
+from slamlib.report.notebooks import Options
 
 ONE, TWO, MORE = Path("1_one.ipynb"), Path("2_two.ipynb"), Path("A_more.ipynb")
 SVG = '<svg xmlns="http://www.w3.org/2000/svg" width="20" height="9"><path d="M0 0L9 9"/></svg>'

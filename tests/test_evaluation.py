@@ -1,6 +1,9 @@
 import numpy as np
+import pytest
 
 from slamlib import evaluation, se2
+from slamlib.dataset import DatasetError, Vehicle
+from slamlib.export import write_tum
 
 
 def test_ate_and_path_length_by_hand():
@@ -112,3 +115,17 @@ def test_judging_leads_no_increment_across_a_gap():
     assert whole["rpe"] < 0.5 and whole["ate"] > 10 and whole["nees"] > 1e4
     nothing = evaluation.judge(np.full((4, 3), np.nan), covariances[:4], truth[:4], 3)
     assert all(np.isnan(list(nothing.values())))
+
+
+@pytest.mark.parametrize("wrong", [
+    "poses", None, Vehicle(), np.zeros(3), np.full((5, 3), "1"), np.zeros((4, 3))])
+def test_what_is_no_array_of_poses_is_refused_in_one_sentence(wrong, tmp_path):
+    right, C = np.zeros((5, 3)), np.tile(np.eye(3), (5, 1, 1))
+    for function in (evaluation.ate, lambda *pair: evaluation.rpe(*pair, 1),
+                     lambda poses, truth: evaluation.nees(poses, C, truth)):
+        for pair in ((wrong, right), (right, wrong)):
+            with pytest.raises(DatasetError, match=": expected numbers .n, 3., poses of the same"):
+                function(*pair)
+    if np.shape(wrong) != (4, 3):
+        with pytest.raises(DatasetError, match="^write_tum: expected numbers"):
+            write_tum(tmp_path / "x.tum", wrong)

@@ -10,6 +10,7 @@ from multiprocessing import active_children
 from pathlib import Path
 
 import pytest
+from conftest import is_running
 from test_report import build, make_data, write
 
 from slamlib import summary
@@ -45,8 +46,8 @@ def folders(tmp_path):
 
 
 def test_a_drive_that_takes_long_is_not_waited_for_and_its_process_ends(folders, monkeypatch):
-    monkeypatch.setattr(summary, "_written", lambda *_: time.sleep(1000))
-    with summary.tables(folders) as first:
+    monkeypatch.setattr(summary, "_solved", lambda *_: time.sleep(1000))
+    with summary.process(summary.print_tables, folders) as first:
         first.join(0.01)
         assert len(active_children()) == 1
     assert active_children() == []
@@ -58,18 +59,10 @@ def test_a_drive_that_takes_long_is_not_waited_for_and_its_process_ends(folders,
                        "ZeroDivisionError('division by zero')\n"),
     (lambda *_: os.kill(os.getpid(), signal.SIGKILL), "")])
 def test_first_numbers_that_fail_end_no_build(folders, monkeypatch, capfd, end, expected):
-    monkeypatch.setattr(summary, "_written", end)
-    with summary.tables(folders[:1]) as first:
-        first.join(60)
+    monkeypatch.setattr(summary, "_solved", end)
+    with summary.process(summary.print_tables, folders[:1]) as first:
+        first.join(300)
     assert capfd.readouterr().err == expected
-
-
-def running(process):
-    """True unless a process is gone, or waits to be buried."""
-    try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except (FileNotFoundError, ProcessLookupError):
-        return False
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only there it ends with this process")
@@ -78,16 +71,16 @@ def test_no_process_survives_a_run_that_is_killed(number):
     """Neither that of the first numbers nor the second one of solve."""
     code = """import time
 from slamlib.summary import process
-with process("fork", time.sleep, 1000) as child:
+with process(time.sleep, 1000) as child:
     print(child.pid, flush=True)
     child.join()"""
     parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True,
                               env=os.environ | {"PYTHONPATH": str(ROOT)})
-    child = parent.stdout.readline().strip()
-    assert running(child)
+    child = int(parent.stdout.readline())
+    assert is_running(child)
     parent.send_signal(number)
     parent.communicate()
-    until = time.monotonic() + 60
-    while running(child) and time.monotonic() < until:
+    until = time.monotonic() + 300
+    while is_running(child) and time.monotonic() < until:
         time.sleep(0.02)
-    assert not running(child)
+    assert not is_running(child)

@@ -10,16 +10,16 @@ from pathlib import Path
 import pytest
 from conftest import copied
 from test_report import build, make_data, write
-from test_studies import CELL, kept
+from test_studies import CELL
+from test_studies import kept as kept_studies
 
 from slamlib.__main__ import main
 from slamlib.dataset import read_dataset
-from slamlib.report import lab as starting
 from slamlib.report.execution import kernel_environment
 from slamlib.simulation import write_dataset
 
 ROOT = Path(__file__).parents[1]
-SECONDS = 120
+SECONDS = 300
 NEWS = "Would you like to get notified about official Jupyter news?"
 
 
@@ -61,38 +61,43 @@ def _started(server, folder):
     pytest.fail("JupyterLab did not start:\n" + (folder / "log").read_text()[-2000:])
 
 
-def test_jupyterlab_replaces_the_command_and_is_given_its_arguments(tmp_path, monkeypatch):
-    started = []
-    monkeypatch.setattr(os, "execve", lambda *arguments: started.append(arguments))
-    (tmp_path / "notebooks").mkdir()
-    monkeypatch.chdir(tmp_path)
-    for user in (0, 1000):
-        monkeypatch.setattr(os, "geteuid", lambda user=user: user)
+@pytest.fixture
+def started(tmp_path, monkeypatch):
+    """Program, command and environment of what `slamlib lab` executes for a user's number."""
+    def start(user):
+        made = []
+        monkeypatch.setattr(os, "execve", lambda *arguments: made.append(arguments))
+        monkeypatch.setattr(os, "geteuid", lambda: user)
         main(["lab", "--no-browser", "--port", "9999"])
-    (program, as_root, environment), (_, command, _) = started
+        return made[0]
+    make_data(tmp_path)
+    write(tmp_path / "notebooks", "a", "# a", (CELL,))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SLAMLIB_DATASETS", "short")
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    return start
+
+
+def test_jupyterlab_replaces_the_command_and_kernels_have_the_environment_of_the_build(
+        started, tmp_path):
+    """But for SLAMLIB_RESULTS, by which a cell knows that it is in a build."""
+    (program, as_root, _), (_, command, environment) = started(0), started(1000)
     assert program == sys.executable and command[1:3] == ["-m", "jupyterlab"]
     assert command[-4:] == ["--no-browser", "--port", "9999", "notebooks"]
     assert [each for each in as_root if each not in command] == ["--allow-root"]
-    assert environment["SLAMLIB_STUDIES"] == str(tmp_path / "build" / "executed" / "studies")
-
-
-def test_kernels_have_the_environment_of_the_build(tmp_path, monkeypatch):
-    """But for SLAMLIB_RESULTS, by which a cell knows that it is in a build."""
-    monkeypatch.setenv("SLAMLIB_DATASETS", "short")
-    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
-    found = starting.environment(tmp_path, tmp_path / "data", tmp_path / "kept")
-    assert found == kernel_environment(tmp_path, tmp_path / "data", ["short"],
-                                       tmp_path / "kept" / "studies")
-    assert found["OMP_NUM_THREADS"] == found["OPENBLAS_NUM_THREADS"] == "1"
-    assert "SLAMLIB_RESULTS" not in found
+    kept = tmp_path / "build" / "executed"
+    assert environment == kernel_environment(kept / "settings", tmp_path / "data", ["short"],
+                                             kept / "studies")
+    assert environment["OMP_NUM_THREADS"] == environment["OPENBLAS_NUM_THREADS"] == "1"
+    assert "SLAMLIB_RESULTS" not in environment
 
 
 @pytest.mark.slow
-def test_studies_of_the_build_are_recalled_in_jupyterlab_and_numbers_are_the_same(tmp_path):
-    make_data(tmp_path)
-    write(tmp_path / "notebooks", "a", "# a", (CELL,))
-    page = build(tmp_path, kept=tmp_path / "kept")[1].read_text()
-    environment = starting.environment(tmp_path, tmp_path / "data", tmp_path / "kept")
+def test_studies_of_the_build_are_recalled_in_jupyterlab_and_numbers_are_the_same(
+        started, tmp_path):
+    kept = tmp_path / "build" / "executed"
+    page = build(tmp_path, kept=kept, datasets=["short"])[1].read_text()
+    environment = started(1000)[2]
 
     def printed():
         return subprocess.run([sys.executable, "-c", CELL], env=environment, text=True, check=True,
@@ -100,7 +105,7 @@ def test_studies_of_the_build_are_recalled_in_jupyterlab_and_numbers_are_the_sam
 
     numbers = printed()
     assert numbers in page and len(set(numbers.splitlines())) == 2
-    one, other = kept(tmp_path / "kept" / "studies")
+    one, other = kept_studies(kept / "studies")
     one.write_bytes(other.read_bytes())                # shows that it is recalled
     assert len(set(printed().splitlines())) == 1
 

@@ -10,7 +10,7 @@ from numeric import known_noise
 from test_dataset import assert_same
 
 from slamlib import se2, slam
-from slamlib.dataset import Dataset, DatasetError, Vehicle, read_dataset
+from slamlib.dataset import Dataset, DatasetError, Vehicle, all_notes, read_dataset
 from slamlib.evaluation import anees, ate
 from slamlib.simulation import simulate, write_dataset
 from slamlib.slam.fit import KERNELS, accepted_measurements
@@ -116,8 +116,8 @@ def test_the_library_heeds_kernel_and_gate_of_vehicle_toml(tmp_path):
     with open(tmp_path / "drive" / "vehicle.toml", "a") as file:
         file.write('kernel = "Huber"\ngate = false\n')
     stated = read_dataset(tmp_path / "drive")
-    assert stated.notes == ('vehicle.toml sets kernel = "Huber" for problems 3 and 4.',
-                            "vehicle.toml sets gate = false for problems 3 and 4.")
+    assert all_notes(stated, None) == ('Problems 3 and 4 are solved with kernel = "Huber".',
+                                       "Problems 3 and 4 are solved with gate = false.")
     found, default = slam.estimate(stated), slam.estimate(plain)
     np.testing.assert_array_equal(
         found.poses, slam.estimate(plain, kernel="Huber", gate=False).poses)

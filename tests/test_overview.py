@@ -3,6 +3,7 @@
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from slamlib.report import drives as solved_drives
 from slamlib.report import overview
 from slamlib.report.document import render
 from slamlib.report.execution import NotebookError
-from slamlib.report.options import Options
+from slamlib.report.notebooks import Options
 from slamlib.report.overview import title_picture
 from slamlib.results import write_vehicle_poses
 from slamlib.simulation import simulate, write_dataset
@@ -31,20 +32,19 @@ def project(tmp_path_factory):
     """Three drives, two of which lack something, with results; the solutions of the first drive."""
     folder = tmp_path_factory.mktemp("overview")
     dataset, truth = simulate("short", seed=5)
-    write_dataset(folder / "data" / "all", dataset, truth)
-    for name, lacking in (("no_truth", ["truth"]), ("wheels_only", [
-            "truth", "ArucoReading.txt", "UwbReading.txt", "UwbAntennaGuess.txt"])):
-        (folder / "data" / name).mkdir()
-        for file in (folder / "data" / "all").iterdir():
-            if file.name not in lacking and file.is_file():
-                (folder / "data" / name / file.name).write_bytes(file.read_bytes())
+    dataset, truth = dataset.first(1000), replace(truth, poses=truth.poses[:1000])
+    bare = dataset.without("uwb").without("aruco")
+    for name, drive in zip(NAMES, ((dataset, truth), (dataset, None), (bare, None)), strict=True):
+        write_dataset(folder / "data" / name, *drive)
     solved = tuple(solutions(read_dataset(folder / "data" / "all")))
     written = []
     for name in NAMES:
         for solution in solved[:1] if name == "wheels_only" else solved:
             at = write_solution(folder / "results" / name, solution)
             written += [f"{name}/{solution.problem}/{file.name}" for file in at.glob("*.mat")]
-    return folder, written, solved
+    drives = drives_of(folder, NAMES, written)
+    return SimpleNamespace(folder=folder, written=written, solved=solved, drives=drives,
+                           summary=overview.opening(drives))
 
 
 def drives_of(folder, names, written, notices=None):
@@ -52,13 +52,6 @@ def drives_of(folder, names, written, notices=None):
     read = [(read_dataset(folder / "data" / name), read_truth(folder / "data" / name))
             for name in names]
     return solved_drives.read_drives(read, folder / "results", written, notices)
-
-
-@pytest.fixture(scope="module")
-def summary(project):
-    """The summary of the three drives."""
-    folder, written, _ = project
-    return overview.opening(drives_of(folder, NAMES, written))
 
 
 def result_rows(summary):
@@ -84,69 +77,62 @@ def metres(text):
     return float(value) * {"m": 1, "mm": 1e-3, "rad": 1, "mrad": 1e-3}[unit]
 
 
-def test_titles_are_those_of_the_solutions(project):
-    folder, _, solved = project
-    dataset = read_dataset(folder / "data" / "all")
-    for solution in solved:
-        assert title(solution.problem, dataset) == solution.title
-    without_markers = dataset.without("aruco")
-    for solution in solutions(without_markers):
+def test_titles_and_numbers_are_those_of_the_solver(project):
+    rows, _ = result_rows(project.summary)
+    drive = project.drives[[each.name for each in project.drives].index("all")]
+    without_markers = drive.dataset.without("aruco")
+    for solution in solutions(without_markers, ("problem1", "problem4")):
         assert title(solution.problem, without_markers) == solution.title
-
-
-def test_numbers_are_those_of_the_solver(project, summary):
-    folder, _, solved = project
-    rows, _ = result_rows(summary)
-    for solution in solved:
-        expected = summarize(solution, read_truth(folder / "data" / "all"))
+    for solution in project.solved:
+        assert title(solution.problem, drive.dataset) == solution.title
+        expected = summarize(solution, drive.truth)
         ate, aligned, position, heading, poses = rows["all", solution.title]
         assert int(poses.replace(",", "")) == expected["estimated_poses"]
         C = solution.covariances[np.isfinite(solution.poses[:, 0])]
-        medians = [np.median(each) for each in (evaluation.position_sigmas(C),
-                                                np.sqrt(C[:, 2, 2]))]
-        for shown, wanted in ((position, medians[0]), (ate, expected["ate_m"]),
-                              (heading, medians[1]),
-                              (aligned, expected["ate_aligned_m"])):
+        for shown, wanted in ((position, np.median(evaluation.position_sigmas(C))),
+                              (heading, np.median(np.sqrt(C[:, 2, 2]))),
+                              (ate, expected["ate_m"]), (aligned, expected["ate_aligned_m"])):
             assert metres(shown) == pytest.approx(wanted, rel=5e-3)
 
 
-def test_what_is_left_out_is_told_with_its_reason(summary):
-    rows, text = result_rows(summary)
+def test_what_is_left_out_is_told_with_its_reason(project):
+    rows, text = result_rows(project.summary)
     assert rows["no_truth", "odometry"][:2] == ["–", "–"]
     assert "A dash stands where no truth is known." in text
     assert rows["wheels_only", "ArUco"] == ["left out: no markers", *["–"] * 4]
     assert rows["wheels_only", "SLAM: odometry + UWB"] == ["left out: no UWB ranges", *["–"] * 4]
-    assert rows["wheels_only", "odometry"][-1] == "2,000"
+    assert rows["wheels_only", "odometry"][-1] == "1,000"
     assert "There are no markers in wheels_only" in text
     assert "There are no UWB ranges in wheels_only" in text
+    known = [drive for drive in project.drives if drive.truth is not None]
+    assert "A dash stands" not in result_rows(overview.opening(known))[1]
 
 
-def test_doubts_and_failures_stand_on_the_first_page_only_where_there_are_any(project, summary):
-    folder, written, _ = project
-    assert not re.search("Doubts|not be solved", result_rows(summary)[1])
-    written = [name for name in written if not name.startswith("no_truth/problem3/")]
-    notices = {"no_truth": [Failure("problem3", "SLAM: odometry + ArUco", "expected | more"),
-                            Doubt("units", "Lengths are *mm*.")],
-               "all": [Doubt("antenna", "Antenna 7 is in doubt.")]}
-    drives = drives_of(folder, NAMES, written, notices)
-    told = overview.opening(drives)
-    rows, text = result_rows(told)
+def test_doubts_failures_and_notes_stand_on_the_first_page_only_where_there_are_any(project):
+    text = result_rows(project.summary)[1]
+    assert not re.search("Doubts|not be solved|Notes on", text)
+    failed = Failure("problem3", "SLAM: odometry + ArUco", "expected | more")
+    told = {"no_truth": dict(failures=(failed,), doubts=(Doubt("units", "Lengths are *mm*."),)),
+            "all": dict(doubts=(Doubt("antenna", "Antenna 7 is in doubt."),))}
+    drives = [replace(drive, **told.get(drive.name, {}), solutions=tuple(
+        each for each in drive.solutions if each.problem != "problem3" or drive.name == "all"))
+        for drive in project.drives]
+    drives[-1] = replace(drives[-1], dataset=replace(drives[-1].dataset, notes=(
+        "X*.txt is not read.", "Y holds no rows.")))
+    opened = overview.opening(drives)
+    rows, _ = result_rows(opened)
     assert rows["no_truth", "SLAM: odometry + ArUco"] == ["could not be solved", *["–"] * 4]
-    doubts = next(cell.source for cell in told.cells if cell.id == "doubts")
-    assert doubts.splitlines() == [
+    cells = {cell.id: cell.source for cell in opened.cells}
+    assert cells["doubts"].splitlines() == [
         "## Doubts about the data", "", "all:", "", "- Antenna 7 is in doubt.", "", "no_truth:", "",
         "- The problem &#8220;SLAM: odometry + ArUco&#8221; could not be solved: "
         "expected &#124; more.",
         "- Lengths are &#42;mm&#42;."]
-
-
-def test_a_problem_that_nothing_solves_is_in_the_table():
-    dataset = simulate("short", seed=5)[0]
-    failed = Failure("problem3", "SLAM: odometry + ArUco", "expected more")
-    solved = problem_solution("problem1", dataset)
-    drive = solved_drives.SolvedDrive("x", dataset, None, (solved,), failures=(failed,))
-    rows, _ = result_rows(overview.opening([drive]))
-    assert rows["x", "SLAM: odometry + ArUco"][0] == "could not be solved"
+    assert cells["notes"] == (f"Notes on the files of *{drives[-1].name}*: X&#42;.txt is not read. "
+                              "Y holds no rows.")
+    nothing = replace(drives[0], solutions=drives[0].solutions[:1], failures=(failed,))
+    rows, _ = result_rows(overview.opening([nothing]))
+    assert rows[nothing.name, "SLAM: odometry + ArUco"][0] == "could not be solved"
 
 
 def test_a_problem_that_is_not_known_appears_by_its_folder(tmp_path):
@@ -179,73 +165,52 @@ def test_the_world_is_the_first_pose_with_an_estimate():
     assert evaluation.ate(poses, truth.poses) > 0.1  # in the wrong frame
 
 
-def test_the_pictures_are_the_same_every_time_and_need_no_display(project, summary):
-    folder, written, solved = project
-    drives = drives_of(folder, NAMES, written)
-    text = picture_of(summary)
-    assert text == picture_of(overview.opening(drives)) and text.count("<path") > 10
+def test_the_pictures_are_the_same_every_time_and_need_no_display(project):
+    text = picture_of(project.summary)
+    assert text == picture_of(overview.opening(project.drives)) and text.count("<path") > 10
     assert not re.search(r"<dc:date|/tmp/|http://(?!www.w3.org|purl.org|creativecommons)", text)
     for role in ("slam_uwb", "fused", "hint"):
         assert plotting.ROLES[role]["color"].lower() in text
-    picture = title_picture(drives[0])
-    markers, antennas = (len(found[0]) for found in (solved[-1].aruco_map, solved[-1].uwb_map))
-    assert picture == title_picture(drives[0]) and picture.count("<use ") >= markers + antennas
+    drive, last = project.drives[0], project.solved[-1]
+    picture = title_picture(drive)
+    assert picture == title_picture(drive)
+    assert picture.count("<use ") >= len(last.aruco_map[0]) + len(last.uwb_map[0])
 
 
-def test_the_abstract_says_what_was_found_with_the_numbers_of_the_table(project, summary):
-    _, _, solved = project
-    rows, _ = result_rows(summary)
-    text = summary.cells[0].source
+def test_the_abstract_says_what_was_found_with_the_numbers_of_the_table(project):
+    rows, _ = result_rows(project.summary)
+    text, solved = project.summary.cells[0].source, project.solved
     errors = [rows["all", solved[number].title][0] for number in (0, -1)]
     assert f"{errors[0]} and {errors[1]} on" in text
     assert f"{len(solved[-1].aruco_map[0])} markers and 4 antennas on *all*" in text
     assert "*all* is a simulated stand-in" in text
 
 
-def test_dashes_are_explained_only_where_some_truth_is_unknown(project):
-    folder, written, _ = project
-    drives = drives_of(folder, NAMES, written)
-    known = [drive for drive in drives if drive.truth is not None]
-    assert len(known) < len(drives)
-    assert "A dash stands" not in result_rows(overview.opening(known))[1]
-
-
-@pytest.mark.slow
-def test_of_many_drives_the_abstract_names_the_shortest_and_the_longest(project, summary):
-    folder, written, _ = project
-    drives = drives_of(folder, NAMES, written)
+def test_of_many_drives_the_abstract_names_the_shortest_and_the_longest(project):
+    drives = project.drives
     many = [drives[0], *(replace(drives[1], name=f"x{n}") for n in range(4)), drives[2]]
     text = overview.opening(many).cells[0].source.split("\n\n")[1]
     assert not re.search(r"\*x\d", text) and "on *all*" in text
-    recorded = overview.opening([drive for drive in drives if drive.truth is None])
+
+
+def test_without_truth_the_abstract_compares_at_returns(project):
+    recorded = overview.opening([drive for drive in project.drives if drive.truth is None])
     rows, text = result_rows(recorded)
     assert not re.search("simulated|ATE|(?<!_)truth", text.split("Figure 1.")[0])
-    assert re.search(r"by SLAM[^.]*[\d.]+\u00a0m?m and [\d.]+\u00a0mm on \*no_truth", text)
     assert all(len(row) == 3 for row in rows.values())
-
-
-def test_files_to_hand_in_stand_by_problem_and_dataset(project):
-    folder, written, _ = project
-    written = [*written, "other/problem4/UwbMap.mat", "all/notes.txt"]
-    drives = drives_of(folder, NAMES, written)
-    text = next(cell.source for cell in overview.opening(drives, "../the results").cells
-                if cell.id == "files")
-    assert text.startswith("## Files to hand in")
-    last = next(line for line in text.splitlines() if line.startswith("| 4. SLAM"))
-    name, at, poses, _, ranges = [cell.strip() for cell in last.strip("|").split("|")]
-    assert (name, at) == ("4. SLAM: odometry + ArUco + UWB", "`problem4`")
-    assert ranges.startswith("[all](../the%20results/all/problem4/UwbMap.mat), [no_truth](")
-    assert poses.count("](../the%20results/") == 2 and "wheels_only" not in poses
-    assert "notes" not in text and "other" not in text
+    dataset = simulate("short", seed=5)[0]
+    solved = tuple(solutions(dataset, ("problem1", "problem3")))
+    drive = solved_drives.SolvedDrive("x", dataset, None, solved)
+    text = overview.opening([drive]).cells[0].source
+    assert re.search(r"by SLAM[^.]*[\d.]+\u00a0m?m and [\d.]+\u00a0mm on \*x", text)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_the_opening_of_any_one_drive_fits_on_a_page(project, tmp_path, name):
-    folder, written, _ = project
-    drives = drives_of(folder, [name], written)
-    files = render({Path("index"): overview.opening(drives)}, Options(title="T"), (),
-                   title_picture(drives[0]))
+    drive, = (drive for drive in project.drives if drive.name == name)
+    files = render({Path("index"): overview.opening([drive])}, Options(title="T"), (),
+                   title_picture(drive))
     text = text_of(files["report.pdf"], tmp_path)
     _, _, page = text.rstrip("\f\n").split("\f")                  # after cover and contents
     assert "Figure 1." in page and "The datasets" not in text
@@ -254,20 +219,9 @@ def test_the_opening_of_any_one_drive_fits_on_a_page(project, tmp_path, name):
 
 @pytest.mark.parametrize("content, reason", [(b"", "cannot be read"), (None, "must hold")])
 def test_poses_that_are_none_are_told_in_one_sentence(project, content, reason):
-    folder, _, _ = project
-    broken = folder / "results" / "all" / "broken"
+    broken = project.folder / "results" / "all" / "broken"
     write_vehicle_poses(broken, np.zeros((7, 3)), np.zeros((7, 3, 3)))
     if content is not None:
         (broken / "vehiclePose.mat").write_bytes(content)
     with pytest.raises(NotebookError, match=f"all/broken, which a notebook wrote, {reason}"):
-        drives_of(folder, ["all"], ["all/broken/vehiclePose.mat"])
-
-
-def test_notes_on_files_stand_on_the_first_page_only_where_there_are_any(project, summary):
-    dataset = read_dataset(project[0] / "data" / "wheels_only")
-    assert not [cell for cell in summary.cells if cell.id == "notes"]
-    drives = [solved_drives.SolvedDrive(name, replace(dataset, notes=notes), None, ())
-              for name, notes in (("a", ()), ("b_*", ("X*.txt is not read.", "Y holds no rows.")))]
-    notes = next(cell.source for cell in overview.opening(drives).cells if cell.id == "notes")
-    assert notes == ("Notes on the files of *b&#95;&#42;*: X&#42;.txt is not read. "
-                     "Y holds no rows.")
+        drives_of(project.folder, ["all"], ["all/broken/vehiclePose.mat"])

@@ -18,14 +18,12 @@ from slamlib.notebook import notices
 from slamlib.report import cache, overview
 from slamlib.report.document import render
 from slamlib.report.drives import read_drives
-from slamlib.report.execution import execute, kernel_environment, temporary_folder
-from slamlib.report.notebooks import shown, to_execute
-from slamlib.report.options import Options
+from slamlib.report.execution import STUDIES, execute, kernel_environment, temporary_folder
+from slamlib.report.notebooks import Options, shown, to_execute
 from slamlib.solve import RESULT_NAMES, SENSORS
 from slamlib.studies.memory import forget
-from slamlib.summary import tables
+from slamlib.summary import print_tables, process
 
-STUDIES = "studies"  # in the cache, besides executed notebooks
 TABLES_WAIT = 10.0  # s, for which the notebooks wait for the first numbers
 DATASET_NAME = re.compile("[A-Za-z0-9 ._-]+")  # nothing that Markdown, HTML or Typst interprets
 
@@ -39,7 +37,7 @@ class Report:
 
 
 def build_report(notebooks, data, report, results, datasets=None, options=Options(), jobs=2,
-                 kept=None, fresh=False, files=True):
+                 kept=None, fresh=False):
     """Execute all notebooks, write pages and PDF; return the Report.
 
     Kernels read the absolute paths of data and results, and the selection, from SLAMLIB_DATA,
@@ -58,12 +56,10 @@ def build_report(notebooks, data, report, results, datasets=None, options=Option
     kept : folder that caches executed notebooks and their studies, or None for one that is removed.
         Where it has none of these notebooks, the datasets are solved first, and tables printed.
     fresh : bool; True executes everything although it is cached.
-    files : bool; False leaves the table of the result files out of the opening.
     """
-    start = time.monotonic()
+    start, tell = time.monotonic(), partial(tqdm.write, file=sys.stderr)  # above the bar
     notebooks, data, report, results = (
         Path(folder).resolve() for folder in (notebooks, data, report, results))
-    address = _address(results, report) if files else None
     books, read, has = _checked_input(notebooks, data, datasets, options)
     folders = [data / dataset.name for dataset, _ in read]
     with ExitStack() as stack:
@@ -73,7 +69,7 @@ def build_report(notebooks, data, report, results, datasets=None, options=Option
         keys = partial(cache.keys, books, folders, environment | {"SLAMLIB_RESULTS": str(results)})
         recalled = not fresh and any(
             cache.entry(kept, source, key).exists() for source, key in keys().items())
-        with nullcontext() if recalled else tables(folders) as first:
+        with nullcontext() if recalled else process(print_tables, folders) as first:
             if first:  # errors of the text are told before a kernel starts
                 render(shown(books, options), options, check=True)
                 first.join(max(0.0, start + TABLES_WAIT - time.monotonic()))
@@ -81,9 +77,9 @@ def build_report(notebooks, data, report, results, datasets=None, options=Option
             stage, pages = (
                 stack.enter_context(swap.staging(folder)) for folder in (results, report))
             written = _executed(books, keys, environment, jobs, stage, kept, fresh)
-        _tell("setting the pages and the PDF")
+        tell("setting the pages and the PDF")
         drives = read_drives(read, stage, written, notices(books.values()))
-        made = _rendered(shown(books, options), drives, options, address, has)
+        made = _rendered(shown(books, options), drives, options, has)
         for name, content in made.items():
             swap.write_atomically(pages / name, content)
         made_for = {folder.name for folder in folders}
@@ -93,21 +89,8 @@ def build_report(notebooks, data, report, results, datasets=None, options=Option
         for name in written:
             if "/" not in name:  # of no dataset
                 os.replace(stage / name, results / name)
-    _tell(f"built in {time.monotonic() - start:.1f} s")
+    tell(f"built in {time.monotonic() - start:.1f} s")
     return Report([report / name for name in made], drives)
-
-
-def _tell(line):
-    """Print a line on stderr, above the bar where one is shown."""
-    tqdm.write(line, file=sys.stderr)
-
-
-def _address(results, report):
-    """Return the path (str) of the results from the report, as in a link."""
-    try:
-        return Path(os.path.relpath(results, report)).as_posix()
-    except ValueError:  # Windows
-        raise DatasetError(f"{results}: expected a folder on the drive of {report}") from None
 
 
 def _checked_input(notebooks, data, datasets, options):
@@ -156,9 +139,9 @@ def _executed(books, keys, environment, jobs, stage, kept, fresh):
     return sorted(written)
 
 
-def _rendered(chapters, drives, options, address, has):
+def _rendered(chapters, drives, options, has):
     """Return the report's files, {name: bytes}, with the opening on `drives` as index.html."""
-    opening = overview.opening(drives, address, chapters)
+    opening = overview.opening(drives, chapters)
     solved = [drive for drive in drives if drive.solutions]
     return render({Path("index"): opening} | chapters, options, has,
                   overview.title_picture(solved[-1]) if solved else "")

@@ -1,6 +1,10 @@
-"""Executes notebooks without a display, each in its own kernel, a limited number at a time."""
+"""Executes notebooks without a display, each in its own kernel, a limited number at a time.
+
+JupyterLab starts with the same settings and the same kept studies.
+"""
 
 import asyncio
+import json
 import os
 import re
 import shutil
@@ -9,6 +13,7 @@ import sys
 import tempfile
 import time
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 
 from jupyter_client import AsyncKernelManager
@@ -20,11 +25,16 @@ from nbconvert.preprocessors import CoalesceStreamsPreprocessor
 from tqdm import tqdm
 
 from slamlib import swap
+from slamlib.dataset import DatasetError
 from slamlib.studies.workers import ONE_THREAD
 
 CELL_TIMEOUT = 1800  # s, in which a cell must end
 TRANSPORT = "ipc" if hasattr(socket, "AF_UNIX") else "tcp"  # Windows has no Unix sockets
 LONGEST_FOLDER = 70  # characters; paths of sockets in it have at most 103
+STUDIES = "studies"  # in the cache, besides executed notebooks
+SETTINGS = "settings"  # there, too: of kernels, and JupyterLab's where the user has no others
+OVERRIDES = {"@jupyterlab/apputils-extension:notification": {
+    "fetchNews": "false", "checkForUpdates": False}}  # without a question when it opens
 
 
 class NotebookError(RuntimeError):
@@ -147,3 +157,25 @@ def _failure(source, started, error):
             position = f"{position}, line {frame[1]}"
             lines = [lines[int(frame[1]) - 1].strip()]
     return strip_ansi("\n    ".join([f"{position}:", *lines[:5]]) + f"\n{reason}")
+
+
+def start_lab(notebooks, data, kept, arguments):
+    """Replace this process by JupyterLab with its `arguments`; folders as of `build_report`.
+
+    Raises DatasetError if JupyterLab is not installed.
+    """
+    if find_spec("jupyterlab") is None:
+        raise DatasetError(f"expected JupyterLab beside {sys.executable}, found none: install it, "
+                           "as by pip install jupyterlab")
+    settings = kept.resolve() / SETTINGS
+    settings.mkdir(parents=True, exist_ok=True)
+    (settings / "overrides.json").write_text(json.dumps(OVERRIDES))
+    options = [f"--LabApp.app_settings_dir={settings}",
+               "--LabApp.check_for_updates_class=jupyterlab.NeverCheckForUpdate"]
+    # As in containers; JupyterLab listens to this machine alone. Windows has no such numbers.
+    if hasattr(os, "geteuid") and os.geteuid() == 0:
+        options.append("--allow-root")
+    selected = os.environ.get("SLAMLIB_DATASETS", "").split("\n")
+    os.execve(sys.executable,
+              [sys.executable, "-m", "jupyterlab", *options, *arguments, str(notebooks)],
+              kernel_environment(settings, data.resolve(), selected, kept / STUDIES))

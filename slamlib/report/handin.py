@@ -16,8 +16,8 @@ from slamlib import swap
 from slamlib.dataset import DatasetError, all_notes, dataset_names, read_dataset, read_truth
 from slamlib.notebook import Drive
 from slamlib.report.drives import why_missing
-from slamlib.report.markdown import listed
-from slamlib.report.options import PROBLEM2_FOLDERS
+from slamlib.report.notebooks import PROBLEM2_FOLDERS
+from slamlib.report.overview import listed
 from slamlib.results import RESULT_FILES
 from slamlib.solve import title
 

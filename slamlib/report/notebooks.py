@@ -1,12 +1,13 @@
-"""Reads the notebooks of a report, and says which of them are executed, in which order.
+"""Reads the notebooks of a report and report.toml: what is executed and shown, in which order.
 
 A title `# 2. Name` makes a chapter, `# A. Name` an appendix. The metadata of a notebook, or of a
 cell that begins with a heading, may say what it needs, as `"slamlib": {"needs": "truth"}`.
 """
 
+import json
 import re
-import shutil
 from contextlib import suppress
+from dataclasses import dataclass, field, fields
 from importlib.metadata import PackageNotFoundError, files
 from pathlib import Path
 
@@ -15,9 +16,56 @@ from nbconvert.preprocessors import ClearOutputPreprocessor
 
 from slamlib.dataset import DatasetError
 from slamlib.report.execution import NotebookError
-from slamlib.textfile import read_text
+from slamlib.textfile import quoted, read_text, read_toml
 
 FOLDER = "notebooks"  # name of the notebooks' folder
+CODE_SHOWN = ("none", "method", "all")  # what code is shown: none, all that is not hidden, or all
+# Folder of the results of each estimate that may be handed in as problem 2.
+PROBLEM2_FOLDERS = {"aruco": "problem2", "fused": "problem2_fused", "hint": "problem2_hint"}
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of report.toml; an empty line of the title page is left out."""
+
+    title: str = "Localization and mapping of a differential-drive vehicle"
+    author: str = ""
+    student_number: str = ""
+    course: str = ""
+    leave_out: dict = field(default_factory=dict)  # from numbers and titles to the place in a file
+    appendix: bool | None = None  # None: the report has it, the hand-in has not
+    code: str = "method"  # one of CODE_SHOWN
+    problem2: str = "aruco"  # which is handed in, of PROBLEM2_FOLDERS; required is markers alone
+
+
+def read_options(path):
+    """Return the Options that the file `path` (str or Path) describes; without it, the defaults.
+
+    DatasetError if the file is not TOML, has an unknown key, or a value is not as it must be.
+    """
+    if not Path(path).exists():
+        return Options()
+    keys = [option.name for option in fields(Options)]
+    entries = read_toml(Path(path), 'author = "Ada Lovelace"', keys, encoding="utf-8")
+    return Options(**{key: _checked(key, value, f"{path}, line {line}" if line else str(path))
+                      for key, (value, line) in entries.items()})
+
+
+def _checked(key, value, place):
+    """Return the value of a key as Options have it; DatasetError, which begins with `place`."""
+    choices = {"code": CODE_SHOWN, "problem2": [*PROBLEM2_FOLDERS], "appendix": [True, False]}
+    if key in choices:
+        ok = type(value) is type(choices[key][0]) and value in choices[key]
+        expected = f"one of {json.dumps(choices[key])[1:-1]}"
+    elif key == "leave_out":
+        ok = type(value) is list and all(type(entry) is str for entry in value)
+        expected = 'a list of numbers and titles in quotes, such as ["B", "3.5", "Explore"],'
+    else:
+        ok = type(value) in (str, int) and re.fullmatch(r"[^\n\ufffd]*", value := str(value))
+        expected = "a line of UTF-8 text in quotes"
+    if not ok:
+        raise DatasetError(f"{place}: expected {expected} for {key}, found {quoted(value)}")
+    return dict.fromkeys(value, place) if key == "leave_out" else value
 
 
 def notebooks_folder():
@@ -38,32 +86,20 @@ def notebooks_folder():
                        "notebooks; found none")
 
 
-def copy_notebooks(source, folder):
-    """Copy the notebooks in a folder (Path) to a new or empty one (Path), and return that."""
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise DatasetError(f"{folder}: expected a new or empty folder to copy the notebooks to")
-    folder.mkdir(parents=True, exist_ok=True)
-    for file in sorted(source.glob("*.ipynb")):
-        shutil.copyfile(file, folder / file.name)
-    return folder
-
-
 def read_notebook(source):
     """Return the NotebookNode in a file (Path), without outputs that an editor saved.
 
     NotebookError if the file is not a notebook, DatasetError if it is no file that can be read.
     """
-    text, reason = read_text(source, "utf-8")[0], "expected JSON with cells and metadata"
+    text = read_text(source, "utf-8")[0]
     try:
-        if "\ufffd" not in text:  # which stands for bytes that are not UTF-8
-            book = nbformat.reads(text, as_version=4)
-            return ClearOutputPreprocessor().preprocess(book, {})[0]
-        reason = f"expected UTF-8 text in line {text[:text.index(chr(0xfffd))].count(chr(10)) + 1}"
-    except (ValueError, nbformat.ValidationError) as error:
+        if "\ufffd" in text:  # which stands for bytes that are not UTF-8
+            raise ValueError("expected UTF-8 text")
+        book = nbformat.reads(text, as_version=4)
+        return ClearOutputPreprocessor().preprocess(book, {})[0]
+    except Exception as error:  # on other JSON nbformat fails in many ways
         reason = str(error).partition("\n")[0]
-    except Exception:  # noqa: S110  on other JSON nbformat fails in many ways
-        pass
-    raise NotebookError(f"{source.name} is not a notebook: {reason}")
+        raise NotebookError(f"{source.name} is not a notebook: {reason}") from None
 
 
 def to_execute(folder, options):

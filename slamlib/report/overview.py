@@ -1,10 +1,11 @@
-"""The summary that opens the report: an abstract, all results, the files to hand in, pictures.
+"""The summary that opens the report: an abstract, all results, pictures.
 
 The text is in the template overview.md. All numbers are computed from the result files and, where
 it is known, the truth.
 """
 
 import re
+import unicodedata
 from io import BytesIO
 from pathlib import Path
 from urllib.parse import quote
@@ -21,9 +22,7 @@ from slamlib.checks import consistency
 from slamlib.dataset import all_notes
 from slamlib.notebook import Drive, accuracy, plotting
 from slamlib.report.drives import order, read_solution, why_missing
-from slamlib.report.markdown import code, listed, plain, table_text, with_unit
 from slamlib.report.notebooks import chapter_of
-from slamlib.results import RESULT_FILES
 from slamlib.solve import PROBLEMS, SENSORS, title, truth_in_world
 from slamlib.swap import file_names, write_atomically
 
@@ -36,17 +35,16 @@ FIGURE_STYLE = Path(plotting.__file__).with_name("slamlib.mplstyle")
 MAX_NAMED = 3  # drives that the abstract names one by one; else the shortest and the longest
 
 
-def opening(drives, address=".", chapters=None):
+def opening(drives, chapters=None):
     """Return the opening of the report, an executed NotebookNode, for a list of SolvedDrive.
 
-    `address` (str) is the path of the results folder from that of the report, or None without a
-    table of files; `chapters` (dict from Path to NotebookNode) are those to which the page leads.
+    `chapters` (dict from Path to NotebookNode) are those to which the page leads.
     """
     template = Template(TEXT.read_text(encoding="utf-8"), trim_blocks=True, lstrip_blocks=True)
     longest = max((drive for drive in drives if drive.solutions), default=None,
                   key=lambda drive: len(drive.dataset.ticks))
     context = template.new_context(
-        _facts(drives, address, chapters or {}) | {
+        _facts(drives, chapters or {}) | {
             "longest": longest, "name": _name, "listed": listed})
     cells = []
     for name, block in template.blocks.items():
@@ -60,7 +58,7 @@ def opening(drives, address=".", chapters=None):
     return new_notebook(cells=cells)
 
 
-def _facts(drives, address, chapters):
+def _facts(drives, chapters):
     """Return what the template tells, a dict."""
     solved = [drive for drive in drives if any(map(_has_estimates, drive.solutions))]
     problems = sorted({told.problem for drive in drives
@@ -87,7 +85,6 @@ def _facts(drives, address, chapters):
             for drive in drives},
         "notes": {_name(drive): [*map(plain, all_notes(drive.dataset, drive.truth))]
                   for drive in drives},
-        "files": address and _file_table(drives, address),
         "chapters": {quote(source.name): chapter_of(source, book)
                      for source, book in chapters.items()}}
 
@@ -147,21 +144,6 @@ def result_row(drive, problem, known=True):
     position, heading = 1e-3 * found["σ (mm)"], 1e-3 * found["σ of δ (mrad)"]
     count = np.isfinite(solution.poses[:, 0]).sum()
     return [*row, *errors, with_unit(position, "m"), with_unit(heading, "rad"), f"{count:,}"]
-
-
-def _file_table(drives, address):
-    """Return the table of the files to hand in, by problem, with links; "" if there are none."""
-    first = {file.split("/")[0]: drive for drive in drives for file in drive.files}
-    files = [name for name in RESULT_FILES
-             if any(f"{folder}/{name}" in drive.files for folder in first for drive in drives)]
-
-    def links(file):
-        return ", ".join(f"[{plain(drive.name)}]({quote(f'{address}/{drive.name}/{file}')})"
-                         for drive in drives if file in drive.files) or "–"
-
-    rows = [[named(folder, first[folder].dataset), code(folder),
-             *(links(f"{folder}/{name}") for name in files)] for folder in sorted(first, key=order)]
-    return files and table_text(["problem", "folder", *map(code, files)], rows, 2 + len(files))
 
 
 def trajectories(drive):
@@ -243,3 +225,39 @@ def _few(rows):
     """Return at most CURVE_POINTS of the rows (n, ...), first and last included."""
     return rows[np.unique(np.linspace(0, len(rows) - 1, CURVE_POINTS).astype(int))] \
         if len(rows) else rows
+
+
+def plain(text):
+    """Return text (str) with the characters escaped that Markdown or HTML would interpret.
+
+    Names from folders and files pass it. A space replaces a control character.
+    """
+    seen = "".join(" " if unicodedata.category(sign)[0] == "C" else sign for sign in text)
+    return re.sub(r"[^\w\s.,:;/+-]|(?<![^\W_])_|_(?![^\W_])",
+                  lambda sign: f"&#{ord(sign[0])};", seen)
+
+
+def listed(names):
+    """Return names as a str, "a, b and c"."""
+    return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
+
+
+def table_text(header, rows, texts=1):
+    """Return a table in Markdown (str).
+
+    `header` is a list of c str, `rows` a list of such lists. The first `texts` columns are aligned
+    left as text, the others right. Of consecutive rows with the same first cell only the first row
+    shows it.
+    """
+    above = [None, *(row[0] for row in rows)]
+    grouped = [["" if row[0] == first else row[0], *row[1:]]
+               for first, row in zip(above, rows, strict=False)]
+    lines = [header, ["---"] * texts + ["---:"] * (len(header) - texts), *grouped]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def with_unit(value, unit):
+    """Return a value with three significant digits and its unit (str), below 1 with a milli."""
+    value, unit = (value, unit) if abs(value) >= 1 else (1e3 * value, f"m{unit}")
+    digits = f"{value:{',.0f' if abs(value) >= 100 else '#.3g'}}".removesuffix(".")
+    return f"{digits}\u00a0{unit}"
