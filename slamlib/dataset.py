@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 
 from slamlib import counts, se2
-from slamlib.covariance import correlations
 from slamlib.dialects import Variable, read_table
 from slamlib.doubt import Doubt
 from slamlib.folder import ENCODER, TABLES, TRUTH_FILES, Contents, contents, is_dataset
@@ -268,7 +267,7 @@ def _read_aruco(files, pose_count, notes):
     """The ArucoReadings, or None without rows."""
     table = _read_readings(files, "ArucoReading.txt", pose_count)
     # Scaled to correlations: s_thetatheta may be 1e4 rad^2 where s_xx is 1e-4 m^2.
-    smallest_eigenvalue = np.linalg.eigvalsh(correlations(_covariances(table)))[:, 0]
+    smallest_eigenvalue = np.linalg.eigvalsh(se2.correlations(_covariances(table)))[:, 0]
     table = table.kept(smallest_eigenvalue > MIN_EIGENVALUE, "a positive definite covariance "
                        f"(smallest eigenvalue of its correlation matrix above {MIN_EIGENVALUE:g})",
                        MAX_BAD_SHARE)

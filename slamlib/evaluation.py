@@ -10,7 +10,7 @@ follows Bar-Shalom, Li and Kirubarajan, *Estimation with Applications to Trackin
 import numpy as np
 
 from slamlib import se2
-from slamlib.covariance import correlations, sigmas
+from slamlib.se2 import correlations, sigmas
 
 REACH_95 = float(np.sqrt(-2 * np.log(0.05)))    # sigmas, of the 95 % ellipse of a planar Gaussian
 
@@ -141,8 +141,3 @@ def correlation_difference(covariances, reference):
     difference = correlations(covariances)[:, :2, 2] - correlations(reference)[:, :2, 2]
     difference = difference[np.isfinite(difference)]
     return float(np.sqrt(np.mean(difference**2))) if len(difference) else np.nan
-
-
-def evenly_spaced(n, count=41):
-    """Up to `count` evenly spaced indices from 1 to n - 1; [0] if n is 1."""
-    return np.unique(np.linspace(min(1, n - 1), n - 1, count).astype(int))

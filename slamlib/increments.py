@@ -113,12 +113,3 @@ def noise_in_drive(ticks, vehicle, start, end, steps=None):
     skid = MINIMUM_SLIP**2 * (travelled[end] - travelled[start])
     rounding[:, [0, 1], [0, 1]] += skid[:, None]
     return rounding, slipping
-
-
-def log_slip_prior(log_slip):
-    """Log density, up to a constant, of log slip, which is normal about log TYPICAL_SLIP.
-
-    Its standard deviation is log SLIP_FACTOR, so that it matters only where the measurements hardly
-    determine the slip. `log_slip` is the natural logarithm of the slip in sqrt(m).
-    """
-    return -((log_slip - np.log(TYPICAL_SLIP)) / np.log(SLIP_FACTOR))**2 / 2

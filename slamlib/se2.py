@@ -137,6 +137,18 @@ def rotate_covariance(covariance, heading):
     return B @ covariance @ np.swapaxes(B, -1, -2)
 
 
+def sigmas(covariances):
+    """Standard deviations (n, d) of covariances (n, d, d)."""
+    return np.sqrt(np.diagonal(covariances, axis1=-2, axis2=-1))
+
+
+def correlations(covariances):
+    """Correlation matrices (n, d, d) of covariances (n, d, d); NaN where a variance is zero."""
+    sigma = sigmas(covariances)
+    scale = sigma[..., :, None] * sigma[..., None, :]
+    return np.divide(covariances, scale, out=np.full_like(scale, np.nan), where=scale > 0)
+
+
 def _poses(x, y, heading):
     """Poses (..., 3), filled in place because np.stack is several times slower on small arrays."""
     T = np.empty(np.shape(x) + (3,))

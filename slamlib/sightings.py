@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slamlib import se2
-from slamlib.covariance import correlations, sigmas
+from slamlib.se2 import correlations, sigmas
 
 GATE = 16.26623619623813         # dimensionless, for residuals of [x, y, heading]
 MAX_SIGHTINGS_COMPARED = 200     # of a marker; the cost of comparison is quadratic

@@ -97,12 +97,6 @@ def test_differences_of_covariances():
     assert np.isnan(evaluation.correlation_difference(still, still))
 
 
-def test_indices_along_a_path():
-    np.testing.assert_array_equal(evaluation.evenly_spaced(1), [0])
-    np.testing.assert_array_equal(evaluation.evenly_spaced(2), [1])
-    np.testing.assert_array_equal(evaluation.evenly_spaced(101, 3), [1, 50, 100])
-
-
 def test_judging_leads_no_increment_across_a_gap():
     poses, truth = drive(40)
     covariances = np.tile(0.05**2 * np.eye(3), (40, 1, 1))

@@ -67,14 +67,12 @@ def better_model(fit):
                    explanations=fit.explanations)
 
 
-def calibrated(fit, accept=accepted_measurements):
+def calibrated(fit):
     """The Fit in which groups of the calibration have left their stated values.
 
     Errors that a wrong statement makes look like errors with memory, which hide it. So where errors
     have memory, a set is also proposed as if they were independent, and must then lead by its prior
     odds, with the memory that remains.
-
-    `accept` as in `refine`. It is that of `fit` if the evidence speaks for none.
     """
     tried, widths = [], (1.0, GROSS)
     for _ in range(MAX_PROPOSALS):
@@ -91,8 +89,8 @@ def calibrated(fit, accept=accepted_measurements):
         stated = problem.measurements.calibration.stated
         state = replace(fit.state, c=np.where(proposal.sigma > 0, fit.state.c, stated))
         try:
-            proposed = refine(replace(problem, sigma=proposal.sigma, released=proposal.groups),
-                              state, accept)
+            proposed = refine(
+                replace(problem, sigma=proposal.sigma, released=proposal.groups), state)
             lead = _lead(proposed, fit)
         except (DatasetError, np.linalg.LinAlgError):
             break

@@ -12,7 +12,7 @@ import numpy as np
 from slamlib import odometry, se2
 from slamlib.sightings import consensus, evenly_chosen
 from slamlib.slam.calibration import ANTENNAS, HEIGHT, OFFSET, SCALE, SIZE, WHEELS
-from slamlib.slam.factors import MIN_DISTANCE, camera_poses, preintegrate_odometry, tag_positions
+from slamlib.slam.factors import MIN_DISTANCE, camera_poses, tag_positions
 from slamlib.slam.fit import narrow_kernels
 from slamlib.slam.linear import build_problem, state_from_arrays
 from slamlib.slam.measurements import GUESS_PRIOR_SIGMA, measure
@@ -36,8 +36,8 @@ GRID = (200, 361)            # numbers of radii and angles of the grid of `secon
 GRID_MARGIN = 1.5            # of the longest range, by which the grid exceeds the path
 
 
-def initial_state(measurements, model, preintegrate=preintegrate_odometry):
-    """The State from which a drive is solved; `model` and `preintegrate` as in `build_problem`.
+def initial_state(measurements, model):
+    """The State from which a drive is solved, by odometry of the model "arc" or "euler".
 
     Raises DatasetError as `optimize`, for the first part of a long drive.
     """
@@ -48,7 +48,7 @@ def initial_state(measurements, model, preintegrate=preintegrate_odometry):
         earlier, part = part, measure(
             measurements.dataset.first(count), frame[frame < count], measurements.jumps)
         state = odometry_state(part, model, earlier, state)
-        state = narrow_kernels(build_problem(part, model, preintegrate=preintegrate), state)
+        state = narrow_kernels(build_problem(part, model), state)
     return odometry_state(measurements, model, part, state)
 
 

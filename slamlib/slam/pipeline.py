@@ -19,13 +19,7 @@ from slamlib.slam.choices import (
     spares_sightings,
     with_places,
 )
-from slamlib.slam.factors import preintegrate_odometry
-from slamlib.slam.fit import (
-    CAUCHY_SCALES,
-    narrow_kernels,
-    refine,
-    solved_by_gtsam,
-)
+from slamlib.slam.fit import CAUCHY_SCALES, narrow_kernels, refine, solved_by_gtsam
 from slamlib.slam.initialization import initial_state, state_from_poses
 from slamlib.slam.linear import build_problem
 from slamlib.slam.measurements import Noise, measure
@@ -131,14 +125,11 @@ def _fit(measurements, model=None, previous=None):
     return better_model(fit) if fit.problem.released and not model else fit
 
 
-def fit_from_odometry(measurements, model="arc", preintegrate=preintegrate_odometry):
-    """The Fit of Measurements with start values by odometry.
-
-    `model` and `preintegrate` as in `build_problem`. Raises DatasetError as `estimate`.
-    """
-    problem = build_problem(measurements, model, preintegrate=preintegrate)           # 2
-    state = narrow_kernels(problem, initial_state(measurements, model, preintegrate))    # 4, 5
-    return refine(problem, state, preintegrate=preintegrate)                          # 6
+def fit_from_odometry(measurements, model="arc"):
+    """The Fit of Measurements with start values by odometry; raises DatasetError as `estimate`."""
+    problem = build_problem(measurements, model)                                      # 2
+    state = narrow_kernels(problem, initial_state(measurements, model))               # 4, 5
+    return refine(problem, state)                                                     # 6
 
 
 def fit_from_previous(measurements, previous, model=None):
