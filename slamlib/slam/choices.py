@@ -37,7 +37,6 @@ STATED = 3.0                 # log evidence beside it, if standard deviations ar
 AMBIGUOUS = 3.0              # log evidence within which explanations cannot be told apart
 MAX_WIDE_SIGMAS = 4.0        # wide sigmas, of an entry; beyond them a statement is grossly wrong
 GROSS = 10.0                 # factor on the wide sigmas then
-MIN_ACCEPTED = 0.98          # of the accepted measurements, that a proposed set accepts too
 MIN_INFORMATION = 1e-3       # about an entry, in wide sigmas, below which it is not considered
 MAX_PROPOSALS = 5            # number of sets that are solved
 
@@ -46,7 +45,6 @@ MIN_VISIT = 3                # number of accepted sightings of a visit that is c
 MAX_REJECTED_SHARE = 0.5     # of the sightings of a visit
 MAX_STILL_REJECTED = 0.5     # of the rejected sightings, by an explanation that is believed
 PLACE_GATE = 60.0            # squared distance of x, y, heading in sigmas, beyond it another place
-MIN_DISTANCE_OF_PLACES = 0.1     # m or rad; what is closer is one place
 MIN_SIGMA = 0.02             # m or rad, of the path between two visits
 
 
@@ -68,25 +66,14 @@ def better_model(fit):
 
 
 def calibrated(fit):
-    """The Fit in which groups of the calibration have left their stated values.
-
-    Errors that a wrong statement makes look like errors with memory, which hide it. So where errors
-    have memory, a set is also proposed as if they were independent, and must then lead by its prior
-    odds, with the memory that remains.
-    """
-    tried, widths = [], (1.0, GROSS)
+    """The Fit in which groups of the calibration have left their stated values."""
+    tried, widths, stated = [], (1.0, GROSS), fit.problem.measurements.calibration.stated
     for _ in range(MAX_PROPOSALS):
-        proposal, least = _proposal(fit, widths), 0.0
-        problem = fit.problem
+        problem, proposal = fit.problem, _proposal(fit, widths)
         fit = replace(fit, explanations=proposal.explanations)
-        if np.array_equal(proposal.sigma, problem.sigma) and problem.accepted.share is not None:
-            independent = replace(problem, accepted=replace(problem.accepted, share=None))
-            proposal = _proposal(replace(fit, problem=independent), widths)
-            least = proposal.odds
         if np.array_equal(proposal.sigma, problem.sigma) or proposal.groups in tried:
             break
         tried.append(proposal.groups)
-        stated = problem.measurements.calibration.stated
         state = replace(fit.state, c=np.where(proposal.sigma > 0, fit.state.c, stated))
         try:
             proposed = refine(
@@ -94,16 +81,15 @@ def calibrated(fit):
             lead = _lead(proposed, fit)
         except (DatasetError, np.linalg.LinAlgError):
             break
-        least = least if proposal.lead >= 0 else proposal.lead - DECISIVE_RELEASE
-        kept, present = (each.problem.accepted.weight.sum() for each in (proposed, fit))
         off = np.abs(proposed.state.c - stated) > MAX_WIDE_SIGMAS * proposal.sigma
         far = off[proposal.sigma > 0].any()
-        if lead < least or kept < MIN_ACCEPTED * present or far and len(widths) == 1:
+        least = 0.0 if proposal.lead >= 0 else proposal.lead - DECISIVE_RELEASE
+        if lead < least or far and len(widths) == 1:
             break
         if far:
             tried, widths = [], widths[1:]
-            continue
-        fit = replace(proposed, explanations=proposal.explanations)
+        else:
+            fit = replace(proposed, explanations=proposal.explanations)
     return fit
 
 
@@ -115,7 +101,6 @@ class _Proposal:
     groups: frozenset        # to release: of all explanations, and what raises the evidence at all
     sigma: np.ndarray        # (p,) with these groups released
     lead: float              # log evidence over that of the prior as it is
-    odds: float              # log prior odds against the best explanation
 
 
 def _proposal(fit, widths):
@@ -137,14 +122,13 @@ def _proposal(fit, widths):
     sets = [frozenset(some) for count in range(len(candidates) + 1)
             for some in combinations(candidates, count)]
     for width in widths:
-        evidence, odds, merit, largest = {}, {}, {}, {}
+        evidence, merit, largest = {}, {}, {}
         for some in sets:
             sigma = calibration.sigma_without(some, width) / calibration.wide * informed
             evidence[some], largest[some] = _log_evidence(L, h, sigma)
             entries = np.count_nonzero(np.isin(calibration.group, list(some)))
-            odds[some] = DECISIVE_RELEASE * len(some) + FURTHER_ENTRY * (entries - len(some)) \
-                + STATED * len(some & stated)
-            merit[some] = evidence[some] - odds[some]
+            merit[some] = evidence[some] - DECISIVE_RELEASE * len(some) \
+                - FURTHER_ENTRY * (entries - len(some)) - STATED * len(some & stated)
         best = max(merit, key=merit.get)
         if not best or largest[best] < MAX_WIDE_SIGMAS:
             break
@@ -154,7 +138,7 @@ def _proposal(fit, widths):
     more = max((some for some in evidence if certain <= some), key=evidence.get)
     present, _ = _log_evidence(L, h, fit.problem.sigma / calibration.wide * informed)
     return _Proposal(explanations=explanations, groups=more, lead=evidence[more] - present,
-                     sigma=calibration.sigma_without(more, width), odds=odds[best])
+                     sigma=calibration.sigma_without(more, width))
 
 
 def _log_evidence(L, h, sigma):
@@ -298,8 +282,6 @@ def _squared_distance(result, first, second, pose, later):
     first, second = result.marker_in_world[np.searchsorted(result.marker, [first, second])]
     difference = second - first
     difference[2] = se2.wrap(difference[2])
-    if np.abs(difference).max() < MIN_DISTANCE_OF_PLACES:
-        return 0.0
     poses, P = result.poses[[pose, later]], result.covariances[[pose, later]]
     A, _ = se2.compose_jacobians(poses, se2.between(poses, second))
     start, end = A @ P @ A.mT
