@@ -21,13 +21,7 @@ from slamlib.slam.factors import expected_ranges, expected_sightings, preintegra
 from slamlib.slam.graph import CONVERGED, optimize
 from slamlib.slam.linear import NormalEquations, Problem, State, laplace_approximation
 from slamlib.slam.measurements import AcceptedMeasurements, Noise, with_known
-from slamlib.slam.noise import (
-    NoisePosterior,
-    error_memories,
-    learn_noise,
-    log_prior,
-    with_hidden_errors,
-)
+from slamlib.slam.noise import NoisePosterior, error_memories, learn_noise, with_hidden_errors
 
 EARLY_GATE = 3.3             # sigmas; a range that is shorter than expected by more is rejected
 
@@ -202,9 +196,9 @@ class Fit:
 
     @property
     def log_density(self):
-        """Log posterior density of the noise, up to a constant."""
-        learned = self.problem.measurements.learned
-        return self.log_evidence + log_prior(self.problem.noise.logarithms)[learned].sum()
+        """Log posterior density of the noise, or log evidence if all of it is known."""
+        learned = self.posterior is not None and self.problem.accepted.share is None
+        return self.posterior.log_density if learned else self.log_evidence
 
     @cached_property
     def equations(self):

@@ -70,6 +70,7 @@ class NoisePosterior:
 
     noise: Noise                 # the mode
     covariance: np.ndarray       # (3, 3) of its logarithms, 0 for parameters that are not learned
+    log_density: float           # log posterior at the mode, up to a constant
     points: tuple                # of (probability, Noise), over which estimates are averaged
 
 
@@ -85,10 +86,10 @@ def learn_noise(equations):
     start = np.where(m.learned | is_known(m.dataset.vehicle), noise.logarithms, np.log(MEDIAN))
     value = log_posterior(start)
     if value < SINGULAR / 2:                             # nothing can be learned
-        return NoisePosterior(noise, np.zeros((3, 3)), ((1.0, noise),))
+        return NoisePosterior(noise, np.zeros((3, 3)), SINGULAR, ((1.0, noise),))
     smallest = 1 / np.sqrt(2 * np.maximum([3 * len(m.frame), *equations.counts()], 1))
     mode, value, covariance = _mode(log_posterior, start, value, free, smallest[free])
-    return NoisePosterior(Noise.from_logarithms(mode), covariance,
+    return NoisePosterior(Noise.from_logarithms(mode), covariance, value,
                           _points(log_posterior, mode, value, covariance))
 
 
