@@ -72,15 +72,13 @@ def estimate(dataset, slip=None, model=None, previous=None, *, marker_noise_fact
 "asymmetric Cauchy" or "quadratic" or "Huber" or "Cauchy" or "Geman-McClure" or "Tukey" for \
 kernel, found 'L2'
     """
-    if not isinstance(dataset, Dataset):
-        raise error("slam.estimate", "expected a Dataset, such as read_dataset(folder), found "
-                    f"{quoted(dataset)}")
-    if not isinstance(factors, (NonlinearFactorGraph, type(None))):
-        raise error("slam.estimate", "expected a gtsam.NonlinearFactorGraph for factors, found "
-                    f"{quoted(factors)}")
-    if model not in (None, *MODELS):
-        raise error("slam.estimate", f"expected {' or '.join(MODELS)} for model, found "
-                    f"{quoted(model)}")
+    for value, right, expected in (
+            (dataset, isinstance(dataset, Dataset), "a Dataset, such as read_dataset(folder)"),
+            (factors, isinstance(factors, (NonlinearFactorGraph, type(None))),
+             "a gtsam.NonlinearFactorGraph for factors"),
+            (model, model in (None, *MODELS), f"{' or '.join(MODELS)} for model")):
+        if not right:
+            raise error("slam.estimate", f"expected {expected}, found {quoted(value)}")
     options = {"slip": slip, "marker_noise_factor": marker_noise_factor,
                "range_noise_factor": range_noise_factor, "kernel": kernel, "gate": gate}
     dataset = replace(dataset, vehicle=changed(dataset.vehicle, {
