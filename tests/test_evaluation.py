@@ -90,10 +90,17 @@ def test_differences_of_covariances():
     other = reference.copy()
     other[1, 0, 0], other[1, 0, 2], other[1, 2, 0] = 1.0, 0.5, 0.5
     for scale in (1.0, 1e-6):
-        np.testing.assert_allclose(evaluation.differences(scale * other, scale * reference),
-                                   [1 / 3, np.sqrt(0.25 / 4)])
+        assert np.isclose(evaluation.sigma_difference(scale * other, scale * reference), 1 / 3)
+    assert np.isclose(evaluation.correlation_difference(other, reference), np.sqrt(0.25 / 4))
     still = np.array([np.diag([0, 0, 1e-8])])
-    assert np.isnan(evaluation.differences(still, still)).all()
+    assert np.isnan(evaluation.sigma_difference(still, still))
+    assert np.isnan(evaluation.correlation_difference(still, still))
+
+
+def test_indices_along_a_path():
+    np.testing.assert_array_equal(evaluation.evenly_spaced(1), [0])
+    np.testing.assert_array_equal(evaluation.evenly_spaced(2), [1])
+    np.testing.assert_array_equal(evaluation.evenly_spaced(101, 3), [1, 50, 100])
 
 
 def test_judging_leads_no_increment_across_a_gap():
