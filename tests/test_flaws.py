@@ -27,7 +27,6 @@ from slamlib.slam.calibration import (
 )
 from slamlib.slam.measurements import Noise
 from slamlib.slam.result import turn_sigma
-from slamlib.studies import montecarlo
 from slamlib.summary import summarize, summary_table
 
 SHORT = Path(__file__).parents[1] / "data" / "short"
@@ -206,9 +205,9 @@ def test_sightings_that_are_late_are_named_on_the_long_path():
 
 @pytest.mark.slow
 def test_offsets_of_the_camera_have_the_standard_deviations_that_they_state():
-    """Twelve clean drives of two slips, with a camera and a delay that are hardly known."""
+    """Eight clean drives of two slips, with a camera and a delay that are hardly known."""
     time, place = [], []
-    for seed, slip in itertools.product(range(6), (1e-3, 3e-3)):
+    for seed, slip in itertools.product(range(4), (1e-3, 3e-3)):
         dataset, _ = simulate("short", seed, slip=slip)
         found = slam.estimate(vehicle(
             sigma_sighting_lag=10.0, sigma_camera_x=0.2, sigma_camera_y=0.2,
@@ -217,21 +216,8 @@ def test_offsets_of_the_camera_have_the_standard_deviations_that_they_state():
         off = found.c[CAMERA]
         place.append(off @ np.linalg.solve(found.c_covariance[CAMERA, CAMERA], off))
     for squared, dof in ((time, 1), (place, 3)):
-        low, high = nees_band(12, dof, probability=0.99)
+        low, high = nees_band(8, dof, probability=0.99)
         assert low < np.mean(squared) < high, (dof, squared)
-
-
-@pytest.mark.slow
-def test_ranges_that_are_all_too_long_do_no_harm():
-    """Short drives: hardly enough to decide for an offset, but its possibility is counted."""
-    nees = []
-    for seed in (61, 101, 213):
-        dataset, truth = simulate("short", seed)
-        found = slam.estimate(uwb(dataset, range=dataset.uwb.range + 0.15))
-        assert anees(found.poses, found.covariances, truth.poses) < 6
-        assert names(solution_doubts(found)) <= {"range-offset", "antenna-offsets"}
-        nees += montecarlo.antenna_error(found, truth)[1].tolist()
-    assert np.median(nees) < 6
 
 
 @pytest.mark.slow
