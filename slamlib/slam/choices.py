@@ -17,7 +17,8 @@ between them ties visits together. A visit whose landmark is further from all ea
 id than this path explains is another place (`places_of_ids`).
 """
 
-from dataclasses import dataclass, replace
+from collections import namedtuple
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -26,9 +27,11 @@ from slamlib import se2
 from slamlib.dataset import DatasetError
 from slamlib.memory import runs
 from slamlib.odometry import MODELS
+from slamlib.odometry_gate import NO_JUMPS, find_jumps
 from slamlib.slam.factors import preintegrate_odometry
 from slamlib.slam.fit import accepted_measurements, kept_weights, refine, residuals
 from slamlib.slam.linear import NormalEquations, linear_solution, log_evidence
+from slamlib.slam.result import slam_result
 
 DECISIVE_LEAD = 3.0          # log evidence by which another model of the steps replaces the default
 DECISIVE_RELEASE = 6.0       # log evidence by which a group leaves its stated values
@@ -93,25 +96,20 @@ def calibrated(fit):
     return fit
 
 
-@dataclass(frozen=True)
-class _Proposal:
-    """Which groups of the calibration the evidence wants to be released."""
-
-    explanations: tuple      # of frozensets of groups, of which each one explains the drive
-    groups: frozenset        # to release: of all explanations, and what raises the evidence at all
-    sigma: np.ndarray        # (p,) with these groups released
-    lead: float              # log evidence over that of the prior as it is
+_Proposal = namedtuple("_Proposal", "explanations groups sigma lead")
 
 
 def _proposal(fit, widths):
-    """The _Proposal for a Fit, with the first of `widths`, factors on wide sigmas, that suffices.
+    """Which groups of the calibration of a Fit the evidence wants to be released: a _Proposal.
 
     Every released group must raise the log evidence by its prior odds: DECISIVE_RELEASE,
     FURTHER_ENTRY more for each of its entries but one, and STATED more if its standard deviations
-    are stated. Explanations are the best set and others that come within AMBIGUOUS of it, neither
-    part of it nor more: the drive cannot tell them apart. What else raises the evidence is not
-    certain enough to be told, but the covariances have to include it. If an entry would be further
-    off than MAX_WIDE_SIGMAS, a statement is grossly wrong, and wide sigmas are multiplied by GROSS.
+    are stated. `explanations`, frozensets of groups, are the best set and others that come within
+    AMBIGUOUS of it, neither part of it nor more: the drive cannot tell them apart. `groups` are all
+    of theirs, and what else raises the evidence: not certain enough to be told, but the covariances
+    have to include it. `lead` is the log evidence over that of the prior as it is. `sigma` (p,) is
+    by the first of `widths`, factors on wide sigmas, that puts no entry further off than
+    MAX_WIDE_SIGMAS: beyond them a statement is grossly wrong.
     """
     calibration = fit.problem.measurements.calibration
     L, h = _likelihood(fit)
@@ -137,8 +135,8 @@ def _proposal(fit, widths):
     certain = frozenset().union(*explanations)
     more = max((some for some in evidence if certain <= some), key=evidence.get)
     present, _ = _log_evidence(L, h, fit.problem.sigma / calibration.wide * informed)
-    return _Proposal(explanations=explanations, groups=more, lead=evidence[more] - present,
-                     sigma=calibration.sigma_without(more, width))
+    return _Proposal(explanations, more, calibration.sigma_without(more, width),
+                     evidence[more] - present)
 
 
 def _log_evidence(L, h, sigma):
@@ -198,6 +196,25 @@ def _with_fixed_weights(fit):
     return replace(accepted, weight=np.r_[accepted.sighting_weight, ranges], range_kernel=None)
 
 
+def most_consistent(dataset, solve):
+    """The Fit that rejects few sightings, and `SlamResult.places`, None if each id is one place.
+
+    `solve` makes the Fit of Jumps and of places. Jumps of odometry, or else places of ids, are
+    believed where they spare most of the sightings that are rejected without them. A few jumps need
+    no such support.
+    """
+    jumps = find_jumps(dataset)
+    fit = solve(jumps if jumps.are_few else NO_JUMPS)
+    if len(jumps.start) and not jumps.are_few:
+        other = solve(jumps)
+        fit = other if spares_sightings(other, fit) else fit
+    if has_rejected_visits(fit):
+        places = places_of_ids(dataset.aruco, solve)
+        if places is not None and spares_sightings(other := solve(places=places), fit):
+            return other, places
+    return fit, None
+
+
 def visits(aruco):
     """Number (m,) of the visit of every one of ArucoReadings, from 0, by id, then by time."""
     order = np.lexsort((aruco.pose, aruco.marker))
@@ -243,15 +260,15 @@ def spares_sightings(fit, other):
     return bool(count < MAX_STILL_REJECTED * most)
 
 
-def places_of_ids(dataset, solve):
-    """`SlamResult.places` of a Dataset, None if each id is one place.
+def places_of_ids(aruco, solve):
+    """`SlamResult.places` of ArucoReadings, None if each id is one place; `solve` as above.
 
-    The function `solve` makes the SlamResult of a Dataset, here of markers alone. The second place
-    of id 12 gets the number 112 where ids have up to two digits, the third one 212.
+    The second place of id 12 gets the number 112 where ids have up to two digits, the third one
+    212.
     """
-    marker, number = dataset.aruco.marker, visits(dataset.aruco)
+    marker, number = aruco.marker, visits(aruco)
     try:
-        result = solve(with_places(replace(dataset, uwb=None), np.stack([marker, number], axis=1)))
+        result = slam_result(solve(places=np.stack([marker, number], axis=1)))
     except (DatasetError, np.linalg.LinAlgError):
         return None
     ids, digits = marker.copy(), 10**len(str(marker.max()))

@@ -10,15 +10,8 @@ from gtsam import NonlinearFactorGraph
 
 from slamlib.dataset import Dataset
 from slamlib.odometry import MODELS
-from slamlib.odometry_gate import NO_JUMPS, find_jumps
-from slamlib.slam.choices import (
-    better_model,
-    calibrated,
-    has_rejected_visits,
-    places_of_ids,
-    spares_sightings,
-    with_places,
-)
+from slamlib.odometry_gate import NO_JUMPS
+from slamlib.slam.choices import better_model, calibrated, most_consistent, with_places
 from slamlib.slam.fit import CAUCHY_SCALES, narrow_kernels, refine, solved_by_gtsam
 from slamlib.slam.initialization import initial_state, state_from_poses
 from slamlib.slam.linear import build_problem
@@ -91,26 +84,8 @@ kernel, found 'L2'
         places = previous.places
         fit = solve(previous.jumps, places)
     else:
-        fit, places = _most_consistent(dataset, solve)
+        fit, places = most_consistent(dataset, solve)
     return replace(slam_result(solved_by_gtsam(fit)), places=places)                  # 7
-
-
-def _most_consistent(dataset, solve):
-    """The Fit that rejects few sightings, and `SlamResult.places`; `solve` as in `estimate`.
-
-    Jumps of odometry, or else places of ids, are believed where they spare most of the sightings
-    that are rejected without them. A few jumps need no such support.
-    """
-    jumps = find_jumps(dataset)
-    fit = solve(jumps if jumps.are_few else NO_JUMPS)
-    if len(jumps.start) and not jumps.are_few:
-        other = solve(jumps)
-        fit = other if spares_sightings(other, fit) else fit
-    if has_rejected_visits(fit):
-        places = places_of_ids(dataset, lambda data: slam_result(_fit(measure(data))))
-        if places is not None and spares_sightings(other := solve(places=places), fit):
-            return other, places
-    return fit, None
 
 
 def _fit(measurements, model=None, previous=None):
