@@ -79,7 +79,7 @@ def rounding_and_slipping(ticks, vehicle, start, end):
         lever = poses[end] - [1, 1, 0] * origin[np.minimum(block, len(origin) - 1)]
         to_end, _ = se2.compose_jacobians(np.zeros(3), lever)          # I + [0, 0, S lever]
         parts = np.stack([each.T[:, symmetric] for each in (rounding, slipping)])
-        in_world += to_end @ parts @ np.swapaxes(to_end, 1, 2)
+        in_world += to_end @ parts @ to_end.mT
     return tuple(se2.rotate_covariance(part, -poses[start, 2]) for part in in_world)
 
 

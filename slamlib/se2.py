@@ -134,7 +134,7 @@ def rotate_covariance(covariance, heading):
     """
     B = _identity(np.shape(heading) + (3,))
     B[..., :2, :2] = rotation(heading)
-    return B @ covariance @ np.swapaxes(B, -1, -2)
+    return B @ covariance @ B.mT
 
 
 def sigmas(covariances):

@@ -299,7 +299,7 @@ def test_explanations_that_the_drive_cannot_tell_apart_are_both_released():
     def proposal(h):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(choices, "_likelihood", lambda _: (L, h))
-            return choices._proposal(fit, (1.0, choices.GROSS))
+            return choices._proposal(fit)
 
     found = proposal(h)
     assert set(found.explanations) == {frozenset({"tag-offset"}), frozenset({"range-delay"})}

@@ -304,4 +304,4 @@ def _poses_from_frames(given, slip, x, covariances, pose):
     A, B = se2.compose_jacobians(x[last, :3], delta)
     F = np.concatenate([A, B @ by_w], axis=2)
     return (se2.compose(x[last, :3], delta),
-            F @ covariances[last] @ np.swapaxes(F, 1, 2) + B @ Q @ np.swapaxes(B, 1, 2))
+            F @ covariances[last] @ F.mT + B @ Q @ B.mT)

@@ -133,7 +133,7 @@ def _compose_increments(sightings, links, root, shared_errors):
         if shared_errors:
             rows = slice(*np.searchsorted(found.pair, (pair, pair + 1)))
             first, second = found.first[rows], found.second[rows]
-            S = A @ np.sum(H[first] @ np.swapaxes(B @ found.J_first[rows], 1, 2), axis=0)
+            S = A @ np.sum(H[first] @ (B @ found.J_first[rows]).mT, axis=0)
             covariances[f] += S + S.T
             H[second] = B @ found.J_second[rows] @ sightings.C[second]
     return poses, covariances, H
@@ -147,9 +147,8 @@ def _map_markers(sightings, used, poses, covariances, H):
     row, marker, z, C = (values[used] for values in (
         sightings.row, sightings.marker, sightings.z, sightings.C))
     E, F = se2.compose_jacobians(poses[row], z)
-    T = E @ H[used] @ np.swapaxes(F, 1, 2)
-    covariance = (E @ covariances[row] @ np.swapaxes(E, 1, 2) + F @ C @ np.swapaxes(F, 1, 2)
-                  + T + np.swapaxes(T, 1, 2))
+    T = E @ H[used] @ F.mT
+    covariance = E @ covariances[row] @ E.mT + F @ C @ F.mT + T + T.mT
     in_world = se2.compose(poses[row], z)
     in_world[:, 2] = se2.wrap(in_world[:, 2])
     best = consensus(marker, in_world, covariance)

@@ -70,9 +70,9 @@ def better_model(fit):
 
 def calibrated(fit):
     """The Fit in which groups of the calibration have left their stated values."""
-    tried, widths, stated = [], (1.0, GROSS), fit.problem.measurements.calibration.stated
+    tried, stated = [], fit.problem.measurements.calibration.stated
     for _ in range(MAX_PROPOSALS):
-        problem, proposal = fit.problem, _proposal(fit, widths)
+        problem, proposal = fit.problem, _proposal(fit)
         fit = replace(fit, explanations=proposal.explanations)
         if np.array_equal(proposal.sigma, problem.sigma) or proposal.groups in tried:
             break
@@ -84,22 +84,16 @@ def calibrated(fit):
             lead = _lead(proposed, fit)
         except (DatasetError, np.linalg.LinAlgError):
             break
-        off = np.abs(proposed.state.c - stated) > MAX_WIDE_SIGMAS * proposal.sigma
-        far = off[proposal.sigma > 0].any()
-        least = 0.0 if proposal.lead >= 0 else proposal.lead - DECISIVE_RELEASE
-        if lead < least or far and len(widths) == 1:
+        if lead < (0.0 if proposal.lead >= 0 else proposal.lead - DECISIVE_RELEASE):
             break
-        if far:
-            tried, widths = [], widths[1:]
-        else:
-            fit = replace(proposed, explanations=proposal.explanations)
+        fit = replace(proposed, explanations=proposal.explanations)
     return fit
 
 
 _Proposal = namedtuple("_Proposal", "explanations groups sigma lead")
 
 
-def _proposal(fit, widths):
+def _proposal(fit):
     """Which groups of the calibration of a Fit the evidence wants to be released: a _Proposal.
 
     Every released group must raise the log evidence by its prior odds: DECISIVE_RELEASE,
@@ -107,9 +101,8 @@ def _proposal(fit, widths):
     are stated. `explanations`, frozensets of groups, are the best set and others that come within
     AMBIGUOUS of it, neither part of it nor more: the drive cannot tell them apart. `groups` are all
     of theirs, and what else raises the evidence: not certain enough to be told, but the covariances
-    have to include it. `lead` is the log evidence over that of the prior as it is. `sigma` (p,) is
-    by the first of `widths`, factors on wide sigmas, that puts no entry further off than
-    MAX_WIDE_SIGMAS: beyond them a statement is grossly wrong.
+    have to include it. `lead` is the log evidence over that of the prior as it is. Of `sigma` (p,)
+    the wide ones are multiplied by GROSS if an entry would be further off than MAX_WIDE_SIGMAS.
     """
     calibration = fit.problem.measurements.calibration
     L, h = _likelihood(fit)
@@ -119,7 +112,7 @@ def _proposal(fit, widths):
     stated = frozenset(calibration.group[calibration.sigma > 0].tolist())
     sets = [frozenset(some) for count in range(len(candidates) + 1)
             for some in combinations(candidates, count)]
-    for width in widths:
+    for width in (1.0, GROSS):
         evidence, merit, largest = {}, {}, {}
         for some in sets:
             sigma = calibration.sigma_without(some, width) / calibration.wide * informed

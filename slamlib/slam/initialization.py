@@ -117,7 +117,7 @@ def state_from_poses(measurements, poses, covariances, c=None, markers=consensus
     s, c = measurements.sightings, measurements.calibration.stated if c is None else c
     camera, z = camera_poses(measurements, poses, c), s.z * [c[SIZE], c[SIZE], 1]
     A, B = se2.compose_jacobians(camera, z)
-    C = A @ covariances[s.row] @ np.swapaxes(A, 1, 2) + B @ s.C @ np.swapaxes(B, 1, 2)
+    C = A @ covariances[s.row] @ A.mT + B @ s.C @ B.mT
     return state_from_arrays(measurements, poses, markers(measurements, se2.compose(camera, z), C),
                              antennas(measurements, poses, covariances, c), c)
 
@@ -219,7 +219,7 @@ def _cost(ranges, places):
     gradient = ((root * first)[:, None] @ direction)[:, 0] + first_guess / GUESS_PRIOR_SIGMA
     lateral = root * first / distance                            # because the direction turns
     radial = (root**2 * second - lateral)[..., None] * direction
-    hessian = np.swapaxes(direction, 1, 2) @ radial
+    hessian = direction.mT @ radial
     hessian[:, [0, 1], [0, 1]] += lateral.sum(1)[:, None] + second_guess / GUESS_PRIOR_SIGMA**2
     cost = np.log1p((e / KERNEL_SCALE)**2).sum(1) + np.log1p((e_guess / KERNEL_SCALE)**2).sum(1)
     return KERNEL_SCALE**2 / 2 * cost, gradient, hessian
