@@ -110,7 +110,7 @@ def test_a_flaw_is_named(flaw, keywords):
         spoilt = spoil(simulated("short", seed, **keywords)[0])
         doubt, = doubts_before_solving(spoilt)
         assert doubt.what == what and said in doubt.sentence
-        assert [whats(covariances(factor)(spoilt)) for factor in (0.25, 4.0)] == 2 * [[what]]
+    assert [whats(covariances(factor)(spoilt)) for factor in (0.25, 4.0)] == 2 * [[what]]
 
 
 def test_a_vehicle_in_millimetres_is_named_by_sightings_and_by_ranges():

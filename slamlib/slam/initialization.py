@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slamlib import odometry, se2
-from slamlib.sightings import consensus, evenly_chosen
+from slamlib.sightings import consensus
 from slamlib.slam.calibration import ANTENNAS, HEIGHT, OFFSET, SCALE, SIZE, WHEELS
 from slamlib.slam.factors import MIN_DISTANCE, camera_poses, tag_positions
 from slamlib.slam.fit import narrow_kernels
@@ -96,9 +96,7 @@ def consensus_markers(measurements, in_world, covariances):
 
     `in_world` (s, 3) and `covariances` (s, 3, 3) are the marker poses by each sighting.
     """
-    chosen = evenly_chosen(measurements.marker_row, MAX_VOTES)
-    best = consensus(measurements.marker_row[chosen], in_world[chosen], covariances[chosen])
-    return in_world[chosen[best]]
+    return in_world[consensus(measurements.marker_row, in_world, covariances, MAX_VOTES)]
 
 
 def trilaterated_antennas(measurements, poses, covariances, c):
