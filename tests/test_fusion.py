@@ -199,7 +199,6 @@ def test_where_markers_give_no_increment_the_hint_restarts_odometry(propagation,
     frames = [0, 400, 800, 1200]
     dataset = only(dataset, np.isin(dataset.aruco.pose, frames))
     found = fuse_increments(dataset, propagation)
-    np.testing.assert_array_equal(found.measured, frames)
     pose, covariance = np.zeros(3), np.diag([0.0, 0.0, dataset.vehicle.sigma_heading**2])
     for begin, end in zip(frames, [*frames[1:], len(dataset.ticks) - 1]):
         poses, covariances = whole(dataset.ticks[begin:end + 1], dataset.vehicle, pose, covariance)

@@ -44,7 +44,6 @@ class Fusion:
 
     poses: np.ndarray            # (n, 3) in the world frame, m and rad
     covariances: np.ndarray      # (n, 3, 3) of [x, y, heading] in world axes
-    measured: np.ndarray         # (f,) pose indices from 0 of the frames
     rejected: int                # number of sightings not used; repeated ones are used once
     slip: float | None = None    # sqrt(m), given or learned
     wheel: np.ndarray | None = None             # (3,) m, R_R, R_L, b estimated at the last frame
@@ -122,7 +121,7 @@ def fuse(dataset, slip=None, model="arc"):
         for begin, end in zip(blocks, blocks[1:]))))
     repeated = len(dataset.aruco.pose) - sum(len(z) for z, *_ in given.frames)
     return Fusion(
-        poses=poses, covariances=pose_covariances, measured=given.pose, slip=slip,
+        poses=poses, covariances=pose_covariances, slip=slip,
         rejected=state.rejected + repeated, wheel=given.vehicle.wheel + x[-1, 3:],
         wheel_covariance=covariances[-1, 3:, 3:])
 

@@ -37,7 +37,6 @@ class Localization:
     frame: np.ndarray               # (f,) pose index from 0 of every frame
     poses: np.ndarray               # (f, 3) in the first localized frame, m and rad; or NaN
     covariances: np.ndarray         # (f, 3, 3)
-    parent: np.ndarray              # (f,) row of the frame its increment starts at, -1 for none
     rejected: np.ndarray            # (m,) bool, rejected, or a repetition (`merge_repeated`)
     unused: np.ndarray              # (m,) bool, sightings of markers that no adjacent frame sees
     marker: np.ndarray              # (k,) ids of the mapped markers, ascending
@@ -77,7 +76,6 @@ def localize(aruco, shared_errors=True):
     rejected[sightings.index], unused[sightings.index] = paired & ~confirmed, ~paired
     return Localization(
         frame=sightings.frame, poses=poses, covariances=covariances,
-        parent=np.array([links[f][0] if f in links else -1 for f in range(len(poses))]),
         rejected=rejected, unused=unused, marker=marker, marker_in_world=in_world,
         marker_covariance=marker_covariance)
 
