@@ -217,12 +217,6 @@ def visits(aruco):
     return number[np.argsort(order)]
 
 
-def with_places(dataset, places):
-    """The Dataset with the ids of `SlamResult.places` for its markers, or itself if it is None."""
-    return dataset if places is None else replace(
-        dataset, aruco=replace(dataset.aruco, marker=places[:, 1]))
-
-
 def contradicted(fit, factor):
     """Which sightings (s,), bool, a Fit rejects at this noise factor."""
     noise = replace(fit.problem.noise, sightings=factor)

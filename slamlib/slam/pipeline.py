@@ -11,7 +11,7 @@ from gtsam import NonlinearFactorGraph
 from slamlib.dataset import Dataset
 from slamlib.odometry import MODELS
 from slamlib.odometry_gate import NO_JUMPS
-from slamlib.slam.choices import better_model, calibrated, most_consistent, with_places
+from slamlib.slam.choices import better_model, calibrated, most_consistent
 from slamlib.slam.fit import CAUCHY_SCALES, narrow_kernels, refine, solved_by_gtsam
 from slamlib.slam.initialization import initial_state, state_from_poses
 from slamlib.slam.linear import build_problem
@@ -78,7 +78,14 @@ kernel, found 'L2'
         key: value for key, value in options.items() if value is not None}, "slam.estimate"))
 
     def solve(jumps=NO_JUMPS, places=None):
-        return _fit(measure(with_places(dataset, places), (), jumps, factors), model, previous)  # 1
+        aruco = dataset.aruco if places is None else replace(dataset.aruco, marker=places[:, 1])
+        measurements = measure(replace(dataset, aruco=aruco), (), jumps, factors)     # 1
+        if previous is not None:
+            return calibrated(fit_from_previous(measurements, previous, model))
+        fit = fit_from_odometry(measurements, model or "arc")                         # 2 to 6
+        fit = calibrated(fit if model else better_model(fit))
+        # Wrong statements may look like other steps.
+        return better_model(fit) if fit.problem.released and not model else fit
 
     if previous is not None and len(previous.rejected):
         places = previous.places
@@ -86,16 +93,6 @@ kernel, found 'L2'
     else:
         fit, places = most_consistent(dataset, solve)
     return replace(slam_result(solved_by_gtsam(fit)), places=places)                  # 7
-
-
-def _fit(measurements, model=None, previous=None):
-    """The Fit of Measurements, with calibration; other arguments as of `estimate`."""
-    if previous is not None:
-        return calibrated(fit_from_previous(measurements, previous, model))
-    fit = fit_from_odometry(measurements, model or "arc")                             # 2 to 6
-    fit = calibrated(fit if model else better_model(fit))
-    # Wrong statements may look like other steps.
-    return better_model(fit) if fit.problem.released and not model else fit
 
 
 def fit_from_odometry(measurements, model="arc"):
