@@ -242,6 +242,16 @@ def test_a_wrong_statement_is_named_and_mended(fault):
 
 
 @pytest.mark.slow
+def test_four_wrong_statements_at_once_are_all_found():
+    dataset, truth = drive(1)
+    spoilt = ranged_from(seen_from(dataset, (0.08, 0, 0), size=1.02), truth, (0.2, 0), height=1.5)
+    found = slam.estimate(spoilt, previous=slam.estimate(spoilt.without("uwb")))
+    assert found.released == {"camera-offset", "marker-size", "tag-offset", "antenna-height"}
+    assert ate(found.poses, truth.poses, aligned=True) < 0.005
+    assert anees(found.poses, found.covariances, truth.poses) < 6
+
+
+@pytest.mark.slow
 def test_what_is_stated_is_used():
     """A vehicle.toml that says where the sensors are: the same estimate, and nothing to doubt."""
     dataset, truth = drive(1)
