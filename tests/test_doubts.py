@@ -101,7 +101,7 @@ FLAWS = {
 }
 
 
-@pytest.mark.parametrize("keywords", [{}, {"slip": 0.0}, {"mislabelled": 0.03}])
+@pytest.mark.parametrize("keywords", [{"slip": 0.0}, {"mislabelled": 0.03}])
 @pytest.mark.parametrize("flaw", FLAWS)
 def test_a_flaw_is_named(flaw, keywords):
     """With right covariances, and with sigmas of sightings that are half or twice as large."""
@@ -208,7 +208,7 @@ def test_nothing_is_doubted(case):
 def test_a_clean_drive_gives_no_doubt(path, keywords):
     for seed in SEEDS if path == "short" else SEEDS[:1]:
         dataset = simulated(path, seed, **keywords)[0]
-        for factor in (1e-4, 0.25, 1.0, 4.0):
+        for factor in (1e-4, 0.25, 1.0, 4.0) if path == "short" else (1.0,):
             assert doubts_before_solving(covariances(factor)(dataset)) == []
 
 
