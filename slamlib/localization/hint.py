@@ -83,7 +83,8 @@ def fuse_increments(dataset, propagation=equation2_from):
     path, path_covariances = propagation(ticks, vehicle, frame, poses, covariances)
     path[frame], path_covariances[frame] = poses, covariances
     used = np.union1d(*(r[found.accepted] for r in (found.first, found.second)))
-    return Fusion(path, path_covariances, rejected=len(dataset.aruco.pose) - len(used))
+    return Fusion(poses=path, covariances=path_covariances,
+                  rejected=len(dataset.aruco.pose) - len(used))
 
 
 def _fused_increments(dataset, frame, found, propagation):
