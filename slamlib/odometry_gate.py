@@ -26,12 +26,10 @@ from slamlib.sightings import GATE, sightings_by_frame, squared_distances
 SLIP = 0.03                  # sqrt(m), of a wheel after one metre
 FLOOR = 3e-3                 # m and rad, of an increment
 LEVER = 0.12                 # m, by which the camera may be elsewhere than stated
-LAGS = np.arange(-12, 13, 2)         # poses, by which all sightings may be late
 # Decisions; gains are of twice the log likelihood
 SUSPECT = 7.8                # 95 % quantile of chi-squared with three degrees of freedom
 MEDIAN_SQUARED = 2.366       # its median
 MIN_GAIN = 12.0              # by a jump
-MIN_LAG_GAIN = 50.0          # by a lag
 PAIRS = 2                    # of sightings of each marker that tell of a jump: one may be wrong
 NEAREST = 24                 # number of these pairs, by the frames between them
 MAX_WAY = 35.0               # m, between the sightings of a pair
@@ -92,27 +90,12 @@ NO_JUMPS = Jumps(**dict(zip(("start", "end"), np.zeros((2, 0), int))), chance=np
 
 def find_jumps(dataset):
     """The Jumps of a Dataset, by its sightings as the stated camera has them."""
-    sightings = sightings_by_frame(dataset.sightings)
-    order = np.lexsort((sightings.row, sightings.marker))
-    used, row = np.unique(sightings.row[order], return_inverse=True)
-    if len(used) < 2:
+    s = sightings_by_frame(dataset.sightings)
+    if len(s.frame) < 2:
         return NO_JUMPS
-    s = replace(sightings, frame=sightings.frame[used], row=row, **{
-        name: getattr(sightings, name)[order] for name in ("index", "marker", "z", "C")})
-    path = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")
-    found = _jumps(dataset, s, path[s.frame])
-    if not len(found.start):
-        return found
-    # Sightings that are late contradict odometry wherever the speed changes.
-    late = [path[np.maximum(np.minimum(s.frame - lag, len(path) - 1), 0)] for lag in LAGS]
-    cost = [_cost(_compared(s, _drive(each, dataset.vehicle.wheelbase))[2]).sum() for each in late]
-    best = int(np.argmin(cost))
-    return found if cost[best] > cost[len(LAGS) // 2] - MIN_LAG_GAIN \
-        else _jumps(dataset, s, late[best])
-
-
-def _jumps(dataset, s, poses):
-    """The Jumps by odometry's poses (f, 3), and sightings sorted by marker, then frame."""
+    order = np.lexsort((s.row, s.marker))
+    s = replace(s, **{name: getattr(s, name)[order] for name in ("row", "marker", "z", "C")})
+    poses = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")[s.frame]
     drive = _drive(poses, dataset.vehicle.wheelbase)
     first, second, squared = _compared(s, drive)
     close = _compared(s, drive, slip=0.0)[2][second - first == 1]
