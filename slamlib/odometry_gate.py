@@ -25,11 +25,13 @@ from slamlib.sightings import GATE, sightings_by_frame, squared_distances
 # Noise of odometry, generous
 SLIP = 0.03                  # sqrt(m), of a wheel after one metre
 FLOOR = 3e-3                 # m and rad, of an increment
+LAGS = np.arange(-12, 13, 2)         # poses, by which all sightings may be late
 LEVER = 0.12                 # m, by which the camera may be elsewhere than stated
 # Decisions; gains are of twice the log likelihood
 SUSPECT = 7.8                # 95 % quantile of chi-squared with three degrees of freedom
 MEDIAN_SQUARED = 2.366       # its median
 MIN_GAIN = 12.0              # by a jump
+MIN_LAG_GAIN = 50.0          # by a lag
 PAIRS = 2                    # of sightings of each marker that tell of a jump: one may be wrong
 NEAREST = 24                 # number of these pairs, by the frames between them
 MAX_WAY = 35.0               # m, between the sightings of a pair
@@ -54,6 +56,7 @@ class Jumps:
     by_odometry: np.ndarray  # (g, 3)
     sigma: np.ndarray        # (g, 3) of the increment without these markers
     chance: np.ndarray       # (n,) of a jump in the steps up to each pose, up to a factor
+    lag: int = 0             # poses, by which all sightings seem later than stated
 
     @property
     def are_few(self):
@@ -95,7 +98,18 @@ def find_jumps(dataset):
         return NO_JUMPS
     order = np.lexsort((s.row, s.marker))
     s = replace(s, **{name: getattr(s, name)[order] for name in ("row", "marker", "z", "C")})
-    poses = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")[s.frame]
+    # Sightings that are late contradict odometry wherever the speed changes.
+    path = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")
+    late = [path[np.clip(s.frame - round(dataset.vehicle.sighting_lag) - lag, 0, len(path) - 1)]
+            for lag in LAGS]
+    cost = [_cost(_compared(s, _drive(each, dataset.vehicle.wheelbase))[2]).sum() for each in late]
+    stated, best = len(LAGS) // 2, int(np.argmin(cost))
+    best = best if cost[best] < cost[stated] - MIN_LAG_GAIN else stated
+    return replace(_jumps(dataset, s, late[best]), lag=LAGS[best])
+
+
+def _jumps(dataset, s, poses):
+    """The Jumps by odometry's poses (f, 3), and sightings sorted by marker, then frame."""
     drive = _drive(poses, dataset.vehicle.wheelbase)
     first, second, squared = _compared(s, drive)
     close = _compared(s, drive, slip=0.0)[2][second - first == 1]

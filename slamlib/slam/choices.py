@@ -197,7 +197,7 @@ def most_consistent(dataset, solve):
     no such support.
     """
     jumps = find_jumps(dataset)
-    fit = solve(jumps if jumps.are_few else NO_JUMPS)
+    fit = solve(jumps if jumps.are_few else replace(NO_JUMPS, lag=jumps.lag))
     if len(jumps.start) and not jumps.are_few:
         other = solve(jumps)
         fit = other if spares_sightings(other, fit) else fit

@@ -11,7 +11,7 @@ import numpy as np
 
 from slamlib import odometry, se2
 from slamlib.sightings import consensus
-from slamlib.slam.calibration import ANTENNAS, HEIGHT, OFFSET, SCALE, SIZE, WHEELS
+from slamlib.slam.calibration import ANTENNAS, HEIGHT, OFFSET, SCALE, SIGHTING_LAG, SIZE, WHEELS
 from slamlib.slam.factors import MIN_DISTANCE, camera_poses, tag_positions
 from slamlib.slam.fit import narrow_kernels
 from slamlib.slam.linear import build_problem, state_from_arrays
@@ -112,7 +112,10 @@ def state_from_poses(measurements, poses, covariances, c=None, markers=consensus
     Poses (f, 3) and covariances (f, 3, 3) are in world axes, c (p,) is the calibration, None
     as stated. The functions `markers` and `antennas` initialise the landmarks; studies pass others.
     """
-    s, c = measurements.sightings, measurements.calibration.stated if c is None else c
+    s = measurements.sightings
+    if c is None:
+        c = measurements.calibration.stated.copy()
+        c[SIGHTING_LAG] += measurements.jumps.lag
     camera, z = camera_poses(measurements, poses, c), s.z * [c[SIZE], c[SIZE], 1]
     A, B = se2.compose_jacobians(camera, z)
     C = A @ covariances[s.row] @ A.mT + B @ s.C @ B.mT
