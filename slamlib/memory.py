@@ -12,6 +12,9 @@ errors,
 
     rho = mean of u u' + 1 - mean of u^2.
 
+The residuals of n independent errors of a landmark correlate by -1/n without their mean, so (1 -
+correlation) / n is added to the correlation of neighbours, by which memory is recognised.
+
 After a break the sensor sees the landmark from elsewhere, with another error.
 """
 
@@ -32,7 +35,7 @@ MIN_PAIRS = 30               # number of pairs at a lag, below which it is left 
 class Memory:
     """What the residuals of m measurements of a kind say of the memory of their errors."""
 
-    correlation: float           # of the residuals of neighbours, 0 if there are none
+    correlation: float           # of the errors of neighbours, 0 if there are none
     sigma: float                 # its standard deviation where errors are independent
     share: np.ndarray            # (m,) that each measurement keeps, 1 if errors are independent
 
@@ -72,7 +75,9 @@ def error_memory(landmark, pose, u, used):
     i, j, lag = np.concatenate(pairs, axis=1)
     count = np.bincount(lag, minlength=MAX_LAG + 1)
     product = np.bincount(lag, np.mean(u[i] * u[j], axis=1), MAX_LAG + 1) / np.maximum(count, 1)
-    correlation, sigma = product[1] / variance, 1 / np.sqrt(max(count[1] * u.shape[1], 1))
+    correlation = product[1] / variance
+    correlation += (1 - correlation) * len(np.unique(landmark)) / len(rows)
+    sigma = 1 / np.sqrt(max(count[1] * u.shape[1], 1))
     if correlation < max(MIN_CORRELATION, MIN_SIGNIFICANCE * sigma):
         return Memory(correlation=correlation, sigma=sigma, share=share)
     rho = product + max(0.0, 1 - variance)
