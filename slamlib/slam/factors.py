@@ -206,20 +206,17 @@ def sighting_error(z, poses, motion, velocity, markers, c, as_pose):
         by_seen[:, :, :2] @ se2.rotation(seen[:, 2] if as_pose else -Y[:, 2]),
         by_seen[:, :, 2:]], axis=2)[:, :, :d]
     by_c = np.empty((len(z), d, 5))
-    by_c[:, :, :3] = _transported(by_Y, np.r_[0.0, 0.0, camera[2]])
+    by_c[:, :, :3] = by_Y @ inverse_adjoint(np.r_[0.0, 0.0, camera[2]])
     by_c[:, :, 3] = -np.einsum("mdi,mi->md", by_seen[:, :, :2], h[:, :2])
-    by_c[:, :, 4] = -np.einsum("mdi,mi->md", _transported(by_Y, camera), velocity)
-    return e, _transported(by_Y, mounted), by_marker, by_c
+    by_c[:, :, 4] = -np.einsum("mdi,mi->md", by_Y @ inverse_adjoint(camera), velocity)
+    return e, by_Y @ inverse_adjoint(mounted), by_marker, by_c
 
 
-def _transported(by_end, motion):
-    """Derivatives (m, d, 3) by a pose X in its axes, from those `by_end` of X composed with motion.
-
-    The derivative of exp(xi) M = M exp(xi') is the adjoint of M^-1.
-    """
+def inverse_adjoint(motion):
+    """Derivatives (..., 3, 3) of xi' by xi where exp(xi) M = M exp(xi'), of motions M (..., 3)."""
     adjoint, R_t = _moved_by(motion), se2.rotation(-motion[..., 2])
     adjoint[..., :2, :2], adjoint[..., :2, 2:] = R_t, R_t @ adjoint[..., :2, 2:]
-    return by_end @ adjoint
+    return adjoint
 
 
 def _moved_by(h):
