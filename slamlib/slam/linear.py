@@ -237,7 +237,7 @@ class NormalEquations:
         n, e, J, J_c = len(structure.diagonal), factors.e, factors.J, factors.J_c
         J_t, last = np.swapaxes(J, 1, 2), np.concatenate([J_c, e[..., None]], axis=2)
         squares = (J_t @ J).reshape(-1, 2, 3, 2, 3).swapaxes(2, 3).reshape(-1, 9)
-        H = _summed(structure.blocks[kind][factors.index], squares, len(structure.indices))
+        H = _summed(structure.blocks[kind][factors.index], squares, structure.places.nnz // 9)
         border, columns = np.zeros((n + q, q + 1)), np.r_[factors.columns, q]
         border[:n, columns] = _summed(
             structure.position[structure.factors[kind][factors.index]],

@@ -92,22 +92,17 @@ Variables = namedtuple("Variables", "frames markers antennas")     # numbers of 
 
 @dataclass(frozen=True)
 class Structure:
-    """Places of v variables and of the blocks that connect them in a matrix (3 v, 3 v)."""
+    """Places of v variables and of the b blocks that connect them in a matrix (3 v, 3 v)."""
 
     is_pose: np.ndarray      # (v,) bool, the others are points
     position: np.ndarray     # (v,) of every variable in the elimination
-    indices: np.ndarray      # (b,) position of the other variable of a block, row by row
-    indptr: np.ndarray       # (v + 1,) where each row of blocks begins
+    places: sparse.csc_array     # the matrix with the place of each entry in the data (9 b,)
     factors: list            # of (m, 2) variables of each kind of factor
     blocks: list             # of (m, 4) numbers of their blocks
 
     def rows(self, variables, width=3):
         """Rows (m, width) of the unknowns of `variables` (m,)."""
         return 3 * self.position[variables][:, None] + np.arange(width)
-
-    def rows_of_each(self, variables):
-        """List of the rows (d,), 3 of a pose or 2 of a point, of each of `variables` (m,)."""
-        return [self.rows([i], 2 + self.is_pose[i])[0] for i in variables]
 
     @property
     def unknowns(self):
@@ -117,29 +112,13 @@ class Structure:
     @cached_property
     def diagonal(self):
         """(n,) places of the diagonal in the data of blocks."""
-        row = np.repeat(np.arange(len(self.position)), np.diff(self.indptr))
-        return (9 * np.flatnonzero(row == self.indices)[:, None] + [0, 4, 8]).ravel()
-
-    def chain(self, data, frames):
-        """Blocks (f, 3, 3) of `frames` (f,), and (f-1, 3, 3) between neighbours, with data (9 b,).
-
-        The first kind of factor connects each frame with the next.
-        """
-        own = self.diagonal[self.rows(frames)[:, 0]] // 9
-        return tuple(data.reshape(-1, 3, 3)[number] for number in (own, self.blocks[0][:, 1]))
+        return self.places.diagonal()
 
     def matrix(self, data):
         """The sparse matrix (n, n), which is symmetric, with the data (9 b,) of its blocks."""
-        matrix = copy(self._places)                      # its indices are checked only once
+        matrix = copy(self.places)                       # its indices are checked only once
         matrix.data = data[matrix.data]
         return matrix
-
-    @cached_property
-    def _places(self):
-        """The matrix with the place of each entry in the data of blocks."""
-        places = np.arange(9 * len(self.indices)).reshape(-1, 3, 3)
-        by_rows = sparse.bsr_array((places, self.indices, self.indptr)).tocsr()
-        return sparse.csc_array((by_rows.data, by_rows.indices, by_rows.indptr), by_rows.shape)
 
 
 def block_structure(is_pose, factors):
@@ -154,10 +133,13 @@ def block_structure(is_pose, factors):
     connected = sparse.csc_array((np.where(row == column, count, 0.5), (row, column)))
     position = splu(connected, permc_spec="MMD_AT_PLUS_A").perm_c
     block, number = np.unique(position[row] * count + position[column], return_inverse=True)
+    by_rows = sparse.bsr_array((
+        np.arange(9 * len(block)).reshape(-1, 3, 3), block % count,
+        np.searchsorted(block, count * np.arange(count + 1)))).tocsr()
     ends = np.cumsum([count, *(4 * len(each) for each in factors)])
     return Structure(
-        is_pose=is_pose, position=position, indices=block % count,
-        indptr=np.searchsorted(block, count * np.arange(count + 1)), factors=factors,
+        is_pose=is_pose, position=position, factors=factors,
+        places=sparse.csc_array((by_rows.data, by_rows.indices, by_rows.indptr), by_rows.shape),
         blocks=[each.reshape(-1, 4) for each in np.split(number, ends)[1:-1]])
 
 
