@@ -18,21 +18,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from slamlib import increments, se2
-from slamlib.slam.calibration import (
-    ANTENNAS,
-    CAMERA,
-    HEIGHT,
-    OFFSET,
-    RANGE_LAG,
-    RANGES,
-    SCALE,
-    SIGHTING_LAG,
-    SIGHTINGS,
-    SIZE,
-    TAG_PLACE,
-    WHEELS,
-)
+from slamlib.slam import calibration
+from slamlib.slam.calibration import RANGES, SIGHTINGS, WHEELS
 from slamlib.slam.measurements import square_root_information
+from slamlib.slam.own import linearized_own
 
 MINIMUM_SIGMA = 1e-5         # m, standard deviation of an increment's end along x and y
 MIN_DISTANCE = 1e-9          # m, below which a range has no direction
@@ -104,16 +93,16 @@ def odometry_error(factors, poses, wheel):
     e, J = se2.log(difference), se2.log_jacobian(difference)
     by_first = -J @ by_h @ _moved_by(h)
     by_second = J @ se2.compose_jacobians(difference, np.zeros(3))[1]         # by X' xi
-    by_wheel = J @ by_z @ factors.J_wheel
+    by_poses, by_wheel = np.concatenate([by_first, by_second], axis=2), J @ by_z @ factors.J_wheel
+    if not factors.in_counts:
+        return e, by_poses, by_wheel
     radius, ratio = factors.wheel[:2].mean(), factors.wheel / factors.stated
-    scale = factors.stated[:2].mean() / radius * np.array([1, 1, ratio[2]]) \
-        if factors.in_counts else np.ones(3)
-    relative = np.array([3 * [-1 / radius / 2], 3 * [-1 / radius / 2],
-                         [0, 0, 1 / factors.wheel[2]]]).T * factors.in_counts   # by the wheels
+    scale = factors.stated[:2].mean() / radius * np.array([1, 1, ratio[2]])
+    relative = np.array([2 * [-1 / radius / 2] + [0], 2 * [-1 / radius / 2] + [0],
+                         2 * [-1 / radius / 2] + [1 / factors.wheel[2]]])      # by the wheels
     linearized = e - by_wheel @ change                              # at the wheels of linearisation
     grown = 1 + relative @ change
-    return (scale * (e + (grown - 1) * linearized),
-            (scale * grown)[:, None] * np.concatenate([by_first, by_second], axis=2),
+    return (scale * (e + (grown - 1) * linearized), (scale * grown)[:, None] * by_poses,
             scale[:, None] * (by_wheel + relative * linearized[:, :, None]))
 
 
@@ -148,37 +137,37 @@ def linearize_odometry(problem, state):
 
 
 def linearize_measurements(problem, state):
-    """The LinearizedFactors of sightings of poses, of points, and of ranges at a State."""
-    return (linearize_sightings(problem, state, as_pose=True),
-            linearize_sightings(problem, state, as_pose=False), linearize_ranges(problem, state))
+    """The LinearizedFactors of sightings of poses, of points, of ranges, and of one's own."""
+    e, J, error = linearized_own(problem, state)
+    own = LinearizedFactors(
+        index=np.arange(len(e)), e=e, J=J, J_c=np.zeros((*e.shape, 0)), columns=np.zeros(0, int),
+        weight=np.ones(len(e)), error=error)
+    return (*(linearize_sightings(problem, state, as_pose) for as_pose in (True, False)),
+            linearize_ranges(problem, state), own)
 
 
 def linearize_sightings(problem, state, as_pose):
     """The LinearizedFactors of markers with a heading (`as_pose`), or of points."""
-    accepted, m, s = problem.accepted, problem.measurements, problem.measurements.sightings
+    m, s, lag = problem.measurements, problem.measurements.sightings, calibration.SIGHTING_LAG
     kind = np.flatnonzero(m.as_pose == as_pose)
-    index = np.flatnonzero(accepted.sighting_weight[kind])
+    index = np.flatnonzero(problem.accepted.sighting_weight[kind])
     rows = kind[index]
     row = s.row[rows]
-    motion = delayed(m, row, state.c[SIGHTING_LAG], not problem.active[SIGHTING_LAG])
-    e, by_pose, by_marker, by_c = sighting_error(
-        s.z[rows], state.poses[row], *motion, state.markers[m.marker_row[rows]], state.c, as_pose)
-    return _whitened(problem, SIGHTINGS, index, rows, e, [by_pose, by_marker], by_c,
-                     m.sighting_roots[0 if as_pose else 1][rows])
+    errors = sighting_error(
+        s.z[rows], state.poses[row], *delayed(m, row, state.c[lag], not problem.active[lag]),
+        state.markers[m.marker_row[rows]], state.c, as_pose)
+    return _whitened(problem, SIGHTINGS, index, rows, *errors, m.sighting_roots[1 - as_pose][rows])
 
 
 def linearize_ranges(problem, state):
     """The LinearizedFactors of the ranges at a State."""
-    accepted, m, r = problem.accepted, problem.measurements, problem.measurements.ranges
-    rows = np.flatnonzero(accepted.range_weight)
-    antenna, row = r.antenna[rows], r.row[rows]
-    motion = delayed(m, row, state.c[RANGE_LAG], not problem.active[RANGE_LAG])
-    e, by_pose, by_antenna, by_c = range_error(
-        r.distance[rows], state.poses[row], *motion, state.antennas[antenna],
-        state.c[ANTENNAS][antenna], state.c)
-    by_offset = (antenna[:, None] == np.arange(len(m.antenna)))[:, None]
-    return _whitened(problem, RANGES, rows, rows, e[:, None], [by_pose, by_antenna],
-                     np.concatenate([by_c, by_offset], axis=2), 1 / r.sigma[rows, None, None])
+    m, r, lag = problem.measurements, problem.measurements.ranges, calibration.RANGE_LAG
+    rows = np.flatnonzero(problem.accepted.range_weight)
+    errors = range_error(
+        r.distance[rows], state.poses[r.row[rows]],
+        *delayed(m, r.row[rows], state.c[lag], not problem.active[lag]), state.antennas,
+        r.antenna[rows], state.c)
+    return _whitened(problem, RANGES, rows, rows, *errors, 1 / r.sigma[rows, None, None])
 
 
 def sighting_error(z, poses, motion, velocity, markers, c, as_pose):
@@ -189,7 +178,7 @@ def sighting_error(z, poses, motion, velocity, markers, c, as_pose):
     the errors (m, 3) are log(z^-1 h) of the expected sighting h, of points (m, 2) they are h - z.
     The derivatives are (m, d, 3), (m, d, d) and (m, d, 5). GTSAM: BetweenFactorPose2.
     """
-    camera, size, d = c[CAMERA], c[SIZE], 3 if as_pose else 2
+    camera, size, d = c[calibration.CAMERA], c[calibration.SIZE], 3 if as_pose else 2
     mounted = se2.compose(motion, camera)                            # camera in vehicle
     Y = se2.compose(poses, mounted)
     seen = se2.between(Y, markers)
@@ -201,15 +190,45 @@ def sighting_error(z, poses, motion, velocity, markers, c, as_pose):
     else:
         e, by_h = (h - z)[:, :2], np.broadcast_to(np.eye(2, 3), (len(z), 2, 3))
     by_seen = by_h / [size, size, 1]
-    by_Y = -by_seen @ _moved_by(seen)                                # in the axes of the camera
     by_marker = np.concatenate([                                     # a point's in the world
         by_seen[:, :, :2] @ se2.rotation(seen[:, 2] if as_pose else -Y[:, 2]),
         by_seen[:, :, 2:]], axis=2)[:, :, :d]
-    by_c = np.empty((len(z), d, 5))
-    by_c[:, :, :3] = by_Y @ inverse_adjoint(np.r_[0.0, 0.0, camera[2]])
-    by_c[:, :, 3] = -np.einsum("mdi,mi->md", by_seen[:, :, :2], h[:, :2])
-    by_c[:, :, 4] = -np.einsum("mdi,mi->md", by_Y @ inverse_adjoint(camera), velocity)
-    return e, by_Y @ inverse_adjoint(mounted), by_marker, by_c
+    by_pose, by_camera, by_lag = _by_sensor(-by_seen @ _moved_by(seen), mounted, camera, velocity)
+    by_size = -np.einsum("mdi,mi->md", by_seen[:, :, :2], h[:, :2])
+    return e, by_pose, by_marker, np.concatenate(
+        [by_camera, by_size[:, :, None], by_lag[:, :, None]], axis=2)
+
+
+def range_error(r, poses, motion, velocity, antennas, antenna, c):
+    """Errors (m, 1) of ranges r (m,), m, to the rows `antenna` (m,) of antennas (a, 2), m.
+
+    Also derivatives by pose (m, 1, 3), antenna (m, 1, 2) and the columns RANGES of c (m, 1, 6 + a).
+    `motion` and `velocity` as in `sighting_error`. GTSAM: RangeFactor2D.
+    """
+    tag = np.r_[c[calibration.TAG_PLACE], 0.0]
+    mounted = se2.compose(motion, tag)                               # tag in vehicle
+    Y = se2.compose(poses, mounted)
+    difference = antennas[antenna] - Y[:, :2]
+    squared = np.sum(difference**2, axis=1) + 2 * c[calibration.HEIGHT]
+    distance = np.sqrt(np.maximum(squared, MIN_DISTANCE**2))
+    slope = np.where(squared > MIN_DISTANCE**2, c[calibration.SCALE] / distance, 0.0)
+    by_antenna = (slope[:, None] * difference)[:, None]              # in the world
+    by_Y = np.pad(-by_antenna @ se2.rotation(Y[:, 2]), ((0, 0), (0, 0), (0, 1)))
+    by_pose, by_tag, by_lag = _by_sensor(by_Y, mounted, tag, velocity)
+    by_c = np.c_[by_tag[:, 0, :2], slope, np.ones(len(r)), distance, by_lag,
+                 np.eye(len(antennas))[antenna]]
+    e = c[calibration.OFFSET] + c[calibration.ANTENNAS][antenna] + c[calibration.SCALE] * distance
+    return (e - r)[:, None], by_pose, by_antenna, by_c[:, None]
+
+
+def _by_sensor(by_Y, mounted, place, velocity):
+    """Derivatives by the vehicle's pose and a sensor's place, (m, d, 3), and by its lag (m, d).
+
+    From those by the pose Y of the sensor, in its axes (m, d, 3). Its `place` (3,) in the vehicle
+    is `mounted` (m, 3) with the motion since; `velocity` (m, 3) is the vehicle's.
+    """
+    return (by_Y @ inverse_adjoint(mounted), by_Y @ inverse_adjoint(place * [0, 0, 1]),
+            -np.einsum("mdi,mi->md", by_Y @ inverse_adjoint(place), velocity))
 
 
 def inverse_adjoint(motion):
@@ -227,56 +246,29 @@ def _moved_by(h):
 def camera_poses(measurements, poses, c):
     """Poses (s, 3) of the camera in the world at the sightings, from those of the frames (f, 3)."""
     row = measurements.sightings.row
-    motion, _ = delayed(measurements, row, c[SIGHTING_LAG])
-    return se2.compose(poses[row], se2.compose(motion, c[CAMERA]))
+    motion, _ = delayed(measurements, row, c[calibration.SIGHTING_LAG])
+    return se2.compose(poses[row], se2.compose(motion, c[calibration.CAMERA]))
 
 
 def tag_positions(measurements, poses, c):
     """Positions (r, 2) in m of the tag in the world at the ranges, from poses of the frames."""
-    row = measurements.ranges.row
-    motion, _ = delayed(measurements, row, c[RANGE_LAG])
-    return se2.compose(poses[row], se2.compose(motion, np.r_[c[TAG_PLACE], 0.0]))[:, :2]
+    row, place = measurements.ranges.row, np.r_[c[calibration.TAG_PLACE], 0.0]
+    motion, _ = delayed(measurements, row, c[calibration.RANGE_LAG])
+    return se2.compose(poses[row], se2.compose(motion, place))[:, :2]
 
 
 def expected_sightings(measurements, state):
     """Markers (s, 3) as they are seen from a State, without noise."""
-    markers = state.markers[measurements.marker_row]
-    size = state.c[SIZE]
+    markers, size = state.markers[measurements.marker_row], state.c[calibration.SIZE]
     return se2.between(camera_poses(measurements, state.poses, state.c), markers) / [size, size, 1]
 
 
 def expected_ranges(measurements, state):
     """Ranges (r,) in m that are measured from a State, without noise."""
-    c, antenna = state.c, measurements.ranges.antenna
-    difference = state.antennas[antenna] - tag_positions(measurements, state.poses, c)
-    distance = np.sqrt(np.maximum(np.sum(difference**2, axis=1) + 2 * c[HEIGHT], 0))
-    return c[OFFSET] + c[ANTENNAS][antenna] + c[SCALE] * distance
-
-
-def range_error(r, poses, motion, velocity, antennas, offset, c):
-    """Errors (m,) of ranges r (m,) m, and derivatives by pose, antenna and c.
-
-    `motion` and `velocity` as in `sighting_error`; `offset` (m,) m is that of each antenna. The
-    derivatives are (m, 1, 3), (m, 1, 2), and (m, 1, 6) by the columns of RANGES without the offsets
-    of antennas. GTSAM: RangeFactor2D.
-    """
-    heading = poses[:, 2] + motion[:, 2]
-    lever = se2.compose(motion, np.r_[c[TAG_PLACE], 0.0])[:, :2]          # tag in vehicle
-    position = se2.compose(poses, np.pad(lever, ((0, 0), (0, 1))))[:, :2]
-    difference = antennas - position
-    squared = np.sum(difference**2, axis=1) + 2 * c[HEIGHT]
-    distance = np.sqrt(np.maximum(squared, MIN_DISTANCE**2))
-    slope = np.where(squared > MIN_DISTANCE**2, c[SCALE] / distance, 0.0)
-    direction = slope[:, None] * difference                          # by the antenna, in the world
-    in_vehicle = -(direction[:, None] @ se2.rotation(poses[:, 2]))[:, 0]
-    by_pose = np.concatenate([in_vehicle, np.sum(
-        in_vehicle * np.stack([-lever[:, 1], lever[:, 0]], -1), axis=1, keepdims=True)], axis=1)
-    by_tag = -(direction[:, None] @ se2.rotation(heading))[:, 0]
-    moved = velocity[:, :2] + velocity[:, 2:] * [-c[TAG_PLACE][1], c[TAG_PLACE][0]]
-    by_c = np.stack([by_tag[:, 0], by_tag[:, 1], slope, np.ones(len(r)), distance,
-                     -np.sum(by_tag * moved, axis=1)], -1)
-    e = c[OFFSET] + offset + c[SCALE] * distance - r
-    return e, by_pose[:, None], direction[:, None], by_c[:, None]
+    c, r = state.c, measurements.ranges
+    motion = delayed(measurements, r.row, c[calibration.RANGE_LAG])
+    return range_error(np.zeros(len(r.row)), state.poses[r.row], *motion, state.antennas,
+                       r.antenna, c)[0][:, 0]
 
 
 def delayed(measurements, row, lag, is_known=True):
@@ -296,7 +288,7 @@ def delayed(measurements, row, lag, is_known=True):
             se2.log(se2.between(smooth[i], smooth[k])))
 
 
-def _whitened(problem, kind, index, rows, e, jacobians, by_c, U):
+def _whitened(problem, kind, index, rows, e, by_pose, by_landmark, by_c, U):
     """The LinearizedFactors of errors e (m, d), and derivatives, of the sightings or ranges `rows`.
 
     `by_c` (m, d, u) are the derivatives by the columns `kind` of the calibration, and U (m, d, d)
@@ -305,8 +297,6 @@ def _whitened(problem, kind, index, rows, e, jacobians, by_c, U):
     sign of measured minus expected, as in GTSAM.
     """
     accepted, noise, active = problem.accepted, problem.noise, problem.active[kind]
-    columns = np.cumsum(problem.active)[kind][active] - 1
-    by_c = by_c[:, :, active] * problem.sigma[kind][active]
     weight, share, factor, kernel, bias = (
         (accepted.range_weight, accepted.shares[1], noise.ranges, accepted.range_kernel,
          accepted.range_bias) if kind == RANGES else
@@ -319,9 +309,11 @@ def _whitened(problem, kind, index, rows, e, jacobians, by_c, U):
     if kernel is not None:
         size = (-e[:, 0] if e.shape[1] == 1 else np.linalg.norm(e, axis=1)).tolist()
         kept, loss = share * [*map(kernel.weight, size)], np.array([*map(kernel.loss, size)])
-    weight, error = weight * kept, np.sum(share * loss)
-    U, e = U * np.sqrt(kept)[:, None, None], e * np.sqrt(kept)[:, None]
+    U = U * np.sqrt(kept)[:, None, None]
     J = np.zeros((*e.shape, 6))
-    J[:, :, :3 + jacobians[1].shape[2]] = U @ np.concatenate(jacobians, axis=2)
+    J[:, :, :3 + by_landmark.shape[2]] = U @ np.concatenate([by_pose, by_landmark], axis=2)
     return LinearizedFactors(
-        index=index, e=e, J=J, J_c=U @ by_c, columns=columns, weight=weight, error=float(error))
+        index=index, e=e * np.sqrt(kept)[:, None], J=J,
+        J_c=U @ (by_c[:, :, active] * problem.sigma[kind][active]),
+        columns=np.cumsum(problem.active)[kind][active] - 1, weight=weight * kept,
+        error=float(np.sum(share * loss)))

@@ -22,7 +22,6 @@ from scipy.sparse.linalg import splu
 
 from slamlib import odometry, se2
 from slamlib.slam.factors import (
-    LinearizedFactors,
     OdometryFactors,
     linearize_measurements,
     linearize_odometry,
@@ -36,7 +35,6 @@ from slamlib.slam.measurements import (
     Noise,
     with_known,
 )
-from slamlib.slam.own import linearized_own
 
 MAX_CACHED_SLIPS = 3         # values of the slip whose sums are kept in memory
 
@@ -158,10 +156,7 @@ class NormalEquations:
     @cached_property
     def linearized(self):
         """The LinearizedFactors of sightings of poses, of points, of ranges, and of one's own."""
-        e, J, error = linearized_own(self.problem, self.state)
-        return *linearize_measurements(self.problem, self.state), LinearizedFactors(
-            index=np.arange(len(e)), e=e, J=J, J_c=np.zeros((*e.shape, 0)),
-            columns=np.zeros(0, int), weight=np.ones(len(e)), error=error)
+        return linearize_measurements(self.problem, self.state)
 
     def step(self):
         """The Gauss-Newton step delta (n + q,), or None where H is singular to rounding."""

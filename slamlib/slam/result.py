@@ -232,7 +232,7 @@ def chi2_per_dof(problem, state, weight):
     odometry, _ = linearize_odometry(problem, state)(problem.noise.slip)
     e_c = (state.c - m.calibration.stated)[problem.active] / problem.sigma[problem.active]
     squared = e_c @ e_c + 2 * sum(
-        factors.error for factors in (odometry, *linearize_measurements(stated, state)))
+        factors.error for factors in (odometry, *linearize_measurements(stated, state)[:3]))
     used = np.bincount(m.marker_row, sightings * np.where(m.as_pose, 3, 2), len(m.marker))
     freedom = np.sum(np.maximum(used - np.where(m.oriented, 3, 2), 0)) \
         + np.sum(ranges) - 2 * len(m.antenna)
