@@ -138,36 +138,27 @@ def linearize_odometry(problem, state):
 
 def linearize_measurements(problem, state):
     """The LinearizedFactors of sightings of poses, of points, of ranges, and of one's own."""
+    m, accepted, c, linearized = problem.measurements, problem.accepted, state.c, []
+    s, r = m.sightings, m.ranges
+
+    def motions(row, lag):
+        return delayed(m, row, c[lag], not problem.active[lag])
+
+    for as_pose, roots in zip((True, False), m.sighting_roots):
+        kind = np.flatnonzero(m.as_pose == as_pose)
+        index = np.flatnonzero(accepted.sighting_weight[kind])
+        rows = kind[index]
+        linearized.append(_whitened(problem, SIGHTINGS, index, rows, *sighting_error(
+            s.z[rows], state.poses[s.row[rows]], *motions(s.row[rows], calibration.SIGHTING_LAG),
+            state.markers[m.marker_row[rows]], c, as_pose), roots[rows]))
+    rows = np.flatnonzero(accepted.range_weight)
+    linearized.append(_whitened(problem, RANGES, rows, rows, *range_error(
+        r.distance[rows], state.poses[r.row[rows]], *motions(r.row[rows], calibration.RANGE_LAG),
+        state.antennas, r.antenna[rows], c), 1 / r.sigma[rows, None, None]))
     e, J, error = linearized_own(problem, state)
-    own = LinearizedFactors(
+    return *linearized, LinearizedFactors(
         index=np.arange(len(e)), e=e, J=J, J_c=np.zeros((*e.shape, 0)), columns=np.zeros(0, int),
         weight=np.ones(len(e)), error=error)
-    return (*(linearize_sightings(problem, state, as_pose) for as_pose in (True, False)),
-            linearize_ranges(problem, state), own)
-
-
-def linearize_sightings(problem, state, as_pose):
-    """The LinearizedFactors of markers with a heading (`as_pose`), or of points."""
-    m, s, lag = problem.measurements, problem.measurements.sightings, calibration.SIGHTING_LAG
-    kind = np.flatnonzero(m.as_pose == as_pose)
-    index = np.flatnonzero(problem.accepted.sighting_weight[kind])
-    rows = kind[index]
-    row = s.row[rows]
-    errors = sighting_error(
-        s.z[rows], state.poses[row], *delayed(m, row, state.c[lag], not problem.active[lag]),
-        state.markers[m.marker_row[rows]], state.c, as_pose)
-    return _whitened(problem, SIGHTINGS, index, rows, *errors, m.sighting_roots[1 - as_pose][rows])
-
-
-def linearize_ranges(problem, state):
-    """The LinearizedFactors of the ranges at a State."""
-    m, r, lag = problem.measurements, problem.measurements.ranges, calibration.RANGE_LAG
-    rows = np.flatnonzero(problem.accepted.range_weight)
-    errors = range_error(
-        r.distance[rows], state.poses[r.row[rows]],
-        *delayed(m, r.row[rows], state.c[lag], not problem.active[lag]), state.antennas,
-        r.antenna[rows], state.c)
-    return _whitened(problem, RANGES, rows, rows, *errors, 1 / r.sigma[rows, None, None])
 
 
 def sighting_error(z, poses, motion, velocity, markers, c, as_pose):
@@ -243,32 +234,27 @@ def _moved_by(h):
     return se2.compose_jacobians(np.zeros(3), h)[0]
 
 
-def camera_poses(measurements, poses, c):
-    """Poses (s, 3) of the camera in the world at the sightings, from those of the frames (f, 3)."""
-    row = measurements.sightings.row
-    motion, _ = delayed(measurements, row, c[calibration.SIGHTING_LAG])
-    return se2.compose(poses[row], se2.compose(motion, c[calibration.CAMERA]))
+def sensor_poses(measurements, poses, c):
+    """Poses in the world of the camera at the sightings (s, 3), of the tag at the ranges (r, 3).
+
+    From poses (f, 3) of the frames and the calibration c (p,). The tag has the vehicle's heading.
+    """
+    m, tag = measurements, np.r_[c[calibration.TAG_PLACE], 0.0]
+    kinds = ((m.sightings.row, calibration.SIGHTING_LAG, c[calibration.CAMERA]),
+             (m.ranges.row, calibration.RANGE_LAG, tag))
+    return [se2.compose(poses[row], se2.compose(delayed(m, row, c[lag])[0], place))
+            for row, lag, place in kinds]
 
 
-def tag_positions(measurements, poses, c):
-    """Positions (r, 2) in m of the tag in the world at the ranges, from poses of the frames."""
-    row, place = measurements.ranges.row, np.r_[c[calibration.TAG_PLACE], 0.0]
-    motion, _ = delayed(measurements, row, c[calibration.RANGE_LAG])
-    return se2.compose(poses[row], se2.compose(motion, place))[:, :2]
-
-
-def expected_sightings(measurements, state):
-    """Markers (s, 3) as they are seen from a State, without noise."""
-    markers, size = state.markers[measurements.marker_row], state.c[calibration.SIZE]
-    return se2.between(camera_poses(measurements, state.poses, state.c), markers) / [size, size, 1]
-
-
-def expected_ranges(measurements, state):
-    """Ranges (r,) in m that are measured from a State, without noise."""
-    c, r = state.c, measurements.ranges
-    motion = delayed(measurements, r.row, c[calibration.RANGE_LAG])
-    return range_error(np.zeros(len(r.row)), state.poses[r.row], *motion, state.antennas,
-                       r.antenna, c)[0][:, 0]
+def expected_measurements(measurements, state):
+    """Markers (s, 3) as they are seen, and ranges (r,) in m, from a State, without noise."""
+    m, c, antenna = measurements, state.c, measurements.ranges.antenna
+    size = c[calibration.SIZE]
+    camera, tag = sensor_poses(m, state.poses, c)
+    squared = np.sum((state.antennas[antenna] - tag[:, :2])**2, axis=1) + 2 * c[calibration.HEIGHT]
+    return (se2.between(camera, state.markers[m.marker_row]) / [size, size, 1],
+            c[calibration.OFFSET] + c[calibration.ANTENNAS][antenna]
+            + c[calibration.SCALE] * np.sqrt(np.maximum(squared, 0)))
 
 
 def delayed(measurements, row, lag, is_known=True):

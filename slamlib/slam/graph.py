@@ -7,7 +7,7 @@ would be slow: GTSAM copies all values for every call.
 """
 
 import re
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -25,23 +25,14 @@ MAX_GAUSS_NEWTON_STEPS = 40  # number of steps
 MAX_HALVINGS = 8             # number of halvings of one step
 
 
-@dataclass(frozen=True)
-class Optimum:
+class Optimum(NamedTuple):
     """The end of Gauss-Newton."""
 
     equations: NormalEquations
-    steps: int                         # number of steps taken
-    converged: bool                    # whether the error had stopped to decrease
-
-    @property
-    def state(self) -> State:
-        """The State where the error is smallest."""
-        return self.equations.state
-
-    @property
-    def error(self):
-        """Half the sum of squared whitened errors there."""
-        return self.equations.error
+    state: State             # where the error is smallest
+    error: float             # half the sum of squared whitened errors there
+    steps: int               # number of steps taken
+    converged: bool          # whether the error had stopped to decrease
 
 
 def optimize(problem, state, max_steps=MAX_GAUSS_NEWTON_STEPS, by_gtsam=False,
@@ -51,22 +42,23 @@ def optimize(problem, state, max_steps=MAX_GAUSS_NEWTON_STEPS, by_gtsam=False,
     It ends where the error decreases by at most `converged` times (1 + error). Raises DatasetError
     if the measurements do not determine every variable.
     """
-    equations = NormalEquations(problem, state)
-    for steps in range(1, max_steps + 1):
+    equations, steps, ended = NormalEquations(problem, state), 0, False
+    while steps < max_steps and not ended:
+        steps += 1
         state, error = equations.state, equations.error
         step = None if by_gtsam else equations.step()
         equations = None                                   # of a long drive they are large
         if step is None:
             step = gtsam_step(problem, state)
-        for halvings in range(MAX_HALVINGS):
-            equations = NormalEquations(problem, retract(problem, state, step / 2**halvings))
+        for scale in 0.5**np.arange(MAX_HALVINGS):
+            equations = NormalEquations(problem, retract(problem, state, scale * step))
             if equations.error <= (1 + ROUNDING) * error:
                 break
         else:
-            return Optimum(NormalEquations(problem, state), steps, True)
-        if error - equations.error <= converged * (1 + error):
-            return Optimum(equations, steps, True)
-    return Optimum(equations, max_steps, False)
+            equations = NormalEquations(problem, state)
+        ended = error - equations.error <= converged * (1 + error)
+    return Optimum(equations=equations, state=equations.state, error=equations.error, steps=steps,
+                   converged=ended)
 
 
 def gtsam_step(problem, state):

@@ -12,7 +12,7 @@ import numpy as np
 from slamlib import odometry, se2
 from slamlib.sightings import consensus, evenly_chosen
 from slamlib.slam.calibration import ANTENNAS, HEIGHT, OFFSET, SCALE, SIZE, WHEELS
-from slamlib.slam.factors import MIN_DISTANCE, camera_poses, preintegrate_odometry, tag_positions
+from slamlib.slam.factors import MIN_DISTANCE, preintegrate_odometry, sensor_poses
 from slamlib.slam.fit import narrow_kernels
 from slamlib.slam.linear import build_problem, state_from_arrays
 from slamlib.slam.measurements import GUESS_PRIOR_SIGMA, measure
@@ -115,7 +115,7 @@ def state_from_poses(measurements, poses, covariances, c=None, markers=consensus
     as stated. The functions `markers` and `antennas` initialise the landmarks; studies pass others.
     """
     s, c = measurements.sightings, measurements.calibration.stated if c is None else c
-    camera, z = camera_poses(measurements, poses, c), s.z * [c[SIZE], c[SIZE], 1]
+    camera, z = sensor_poses(measurements, poses, c)[0], s.z * [c[SIZE], c[SIZE], 1]
     A, B = se2.compose_jacobians(camera, z)
     C = A @ covariances[s.row] @ np.swapaxes(A, 1, 2) + B @ s.C @ np.swapaxes(B, 1, 2)
     return state_from_arrays(measurements, poses, markers(measurements, se2.compose(camera, z), C),
@@ -143,7 +143,8 @@ def ranges_by_antenna(measurements, poses, covariances, c, factor=1.0):
 
     `factor` multiplies the sigmas of the ranges.
     """
-    r, by_antenna, positions = measurements.ranges, [], tag_positions(measurements, poses, c)
+    r, by_antenna = measurements.ranges, []
+    positions = sensor_poses(measurements, poses, c)[1][:, :2]
     slant = (r.distance - c[OFFSET] - c[ANTENNAS][r.antenna]) / c[SCALE]
     plane = np.sqrt(np.maximum(slant * np.abs(slant) - 2 * c[HEIGHT], 0)) \
         if c[HEIGHT] else slant

@@ -11,14 +11,9 @@ import numpy as np
 from slamlib import increments, se2
 from slamlib.odometry_gate import Jumps
 from slamlib.sightings import Sightings
+from slamlib.slam import factors
 from slamlib.slam.calibration import WHEELS, Calibration, calibration_table
 from slamlib.slam.covariances import posterior_moments
-from slamlib.slam.factors import (
-    MIN_DISTANCE,
-    linearize_measurements,
-    linearize_odometry,
-    odometry_noise,
-)
 from slamlib.slam.fit import Fit, kept_weights, residuals
 from slamlib.slam.initialization import SAME_PLACE, ranges_by_antenna, second_moment, trilaterate
 from slamlib.slam.measurements import GUESS_PRIOR_SIGMA, AcceptedMeasurements, Noise
@@ -47,7 +42,6 @@ class SlamResult:
     doubts: dict                    # antenna id: reason, for antennas in doubt
     calibration: Calibration        # p entries with what is stated of them
     c: np.ndarray                   # (p,) their estimates
-    sigma: np.ndarray               # (p,) of their prior, 0 of what is known
     c_covariance: np.ndarray        # (p, p), 0 where the stated value is known
     released: frozenset             # groups of entries that left their stated values
     explanations: tuple             # of sets of groups, each of which explains this, or one empty
@@ -127,7 +121,8 @@ def slam_result(fit):
     best = np.full(len(m.marker), np.inf)         # a point has the heading of its best sighting
     np.minimum.at(best, m.marker_row, m.sightings.C[:, 2, 2])
     markers[~m.oriented, 2, 2] = best[~m.oriented]
-    mapped = mapped_markers(problem.accepted)
+    balance = np.bincount(m.marker_row, np.where(problem.accepted.rejected, -1, 1), len(m.marker))
+    mapped = balance > 0                          # markers with more accepted than rejected ones
     place = np.c_[state.markers[mapped, :2], se2.wrap(state.markers[mapped, 2])]
     sentences, antenna_covariances = antenna_doubts(
         problem, state, pose_covariances[m.frame], antennas[:, :2, :2], range_weight)
@@ -137,7 +132,7 @@ def slam_result(fit):
         marker_covariance=se2.rotate_covariance(markers[mapped], place[:, 2]),
         antenna=m.antenna, antenna_in_world=state.antennas,
         antenna_covariance=antenna_covariances, doubts=sentences,
-        calibration=m.calibration, c=state.c, sigma=problem.sigma, c_covariance=marginal.c,
+        calibration=m.calibration, c=state.c, c_covariance=marginal.c,
         released=problem.released, explanations=fit.explanations,
         noise=problem.noise, noise_sigma=np.zeros(3) if fit.posterior is None
         else np.sqrt(np.diag(fit.posterior.covariance)),
@@ -153,22 +148,14 @@ def slam_result(fit):
         fit=replace(fit), converged=fit.converged)
 
 
-def mapped_markers(accepted):
-    """Rows of the markers with more accepted than rejected sightings."""
-    m = accepted.measurements
-    balance = np.bincount(m.marker_row, np.where(accepted.rejected, -1, 1), len(m.marker))
-    return np.flatnonzero(balance > 0)
-
-
 def turn_sigma(problem):
     """Standard deviations (f-1,), rad, of the turns between frames by odometry of stated wheels.
 
     Estimated ones adapt to a wrong number of turns.
     """
-    stated, odometry = problem.measurements.dataset.vehicle, problem.odometry
-    frame = problem.measurements.frame
-    known = ~problem.measurements.jumps.share(frame[:-1], frame[1:]).any(axis=1)  # else by markers
-    variance = np.sum((odometry.J_wheel[:, 2] * stated.sigma_wheel)**2, axis=1)
+    m, odometry = problem.measurements, problem.odometry
+    known = ~m.jumps.share(m.frame[:-1], m.frame[1:]).any(axis=1)        # else by markers
+    variance = np.sum((odometry.J_wheel[:, 2] * m.dataset.vehicle.sigma_wheel)**2, axis=1)
     return known * np.sqrt(variance + odometry.covariance(problem.noise.slip)[:, 2, 2])
 
 
@@ -214,7 +201,7 @@ def _sigma_by_ranges(ranges, estimate, weight):
     Its covariance in the world also includes the uncertain heading of pose 1.
     """
     difference = estimate - ranges.positions
-    direction = difference / np.maximum(np.hypot(*difference.T), MIN_DISTANCE)[:, None]
+    direction = difference / np.maximum(np.hypot(*difference.T), factors.MIN_DISTANCE)[:, None]
     information = direction.T @ (direction * (weight / ranges.sigma**2)[:, None])
     return 1 / np.sqrt(max(np.linalg.eigvalsh(information)[0], GUESS_PRIOR_SIGMA**-2))
 
@@ -225,14 +212,14 @@ def chi2_per_dof(problem, state, weight):
     With weights (s + r,), a measurement counts by its dimension times its weight, and a landmark
     subtracts its dimension. Odometry and priors have as many errors as unknowns.
     """
-    m = problem.measurements
+    m, active = problem.measurements, problem.active
+    e_c = (state.c - m.calibration.stated)[active] / problem.sigma[active]
     sightings, ranges = m.by_kind(weight)
-    accepted = AcceptedMeasurements(measurements=m, weight=weight)
-    stated = replace(problem, accepted=accepted, noise=Noise())
-    odometry, _ = linearize_odometry(problem, state)(problem.noise.slip)
-    e_c = (state.c - m.calibration.stated)[problem.active] / problem.sigma[problem.active]
+    stated = replace(problem, noise=Noise(), accepted=AcceptedMeasurements(
+        measurements=m, weight=weight))
+    odometry, _ = factors.linearize_odometry(problem, state)(problem.noise.slip)
     squared = e_c @ e_c + 2 * sum(
-        factors.error for factors in (odometry, *linearize_measurements(stated, state)[:3]))
+        kind.error for kind in (odometry, *factors.linearize_measurements(stated, state)[:3]))
     used = np.bincount(m.marker_row, sightings * np.where(m.as_pose, 3, 2), len(m.marker))
     freedom = np.sum(np.maximum(used - np.where(m.oriented, 3, 2), 0)) \
         + np.sum(ranges) - 2 * len(m.antenna)
@@ -276,7 +263,7 @@ def _interpolate_section(problem, state, pairs, rows):
     vehicle, ticks = m.dataset.vehicle.with_wheel(state.c[WHEELS]), m.dataset.ticks[pose]
     ends = np.r_[frame[a], pose[inner]], np.r_[pose[inner], frame[b]]
     of_section = [each - frame[0] for each in ends]
-    quantization, slipping = odometry_noise(
+    quantization, slipping = factors.odometry_noise(
         ticks, vehicle, *of_section, len(m.dataset.ticks) - 1)
     (delta_a, delta_b), (a_by_wheel, b_by_wheel), (Q_a, Q_b), (jump_a, jump_b) = (
         np.split(each, 2) for each in (
