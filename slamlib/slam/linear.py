@@ -15,6 +15,7 @@ noise factors. Each value of the noise then costs one decomposition, which gives
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import csc_array
@@ -114,8 +115,7 @@ def build_problem(measurements, model, noise=None, wheel=None, preintegrate=prei
         sigma=measurements.calibration.sigma)
 
 
-@dataclass(frozen=True)
-class Group:
+class Group(NamedTuple):
     """Sums over a group of factors of n unknowns and q entries of the calibration."""
 
     H: np.ndarray            # data of `Structure.matrix`; of the priors the diagonal (n,)
@@ -170,19 +170,17 @@ class NormalEquations:
         If `consistent`, measurements count over the `consistency_factor` of their robust kernel.
         """
         odometry, log_determinant = self._odometry(noise.slip)
-        H, border = odometry.H.copy(), odometry.border + self.priors.border
-        H[self.structure.diagonal] += self.priors.H
-        squared = odometry.squared + self.priors.squared
+        total = odometry.H.copy(), odometry.border + self.priors.border, \
+            odometry.squared + self.priors.squared
+        total[0][self.structure.diagonal] += self.priors.H
         accepted, given = self.problem.accepted, self.problem.noise
         sightings = (accepted.sighting_kernel, given.sightings / noise.sightings)
         ranges = (accepted.range_kernel, given.ranges / noise.ranges)
         kinds = sightings, sightings, ranges, (None, 1.0)
         for group, (kernel, ratio), size in zip(self._measurement_groups, kinds, (3, 2, 1, 1)):
             share = ratio**2 / (consistency_factor(kernel, size) if consistent else 1.0)
-            H += share * group.H
-            border += share * group.border
-            squared += share * group.squared
-        return H, border, squared, log_determinant
+            total = [before + share * part for before, part in zip(total, group)]
+        return *total, log_determinant
 
     def counts(self):
         """Numbers of accepted errors of sightings and of ranges."""
@@ -194,7 +192,7 @@ class NormalEquations:
         """The Group of the priors, whose H and D are diagonal."""
         problem, m, state = self.problem, self.problem.measurements, self.state
         v, active, n = m.variables, problem.active, len(self.structure.diagonal)
-        weak = problem.accepted.unsupported
+        weak = np.bincount(m.marker_row, problem.accepted.sighting_weight, len(m.marker)) == 0
         parts = [(v.frames[:1], se2.log(state.poses[:1]), m.origin_sigma),
                  (v.antennas, state.antennas - m.guess, GUESS_PRIOR_SIGMA),
                  (v.markers[weak], state.markers[weak], WEAK_SIGMA)]
@@ -247,19 +245,15 @@ def _summed(number, values, size):
                      (size, number.size)) @ values
 
 
-def decomposition(H):
-    """Sparse decomposition of H (n, n), ordered for elimination; None if H is singular."""
-    try:
-        return splu(H, permc_spec="NATURAL", diag_pivot_thresh=0.0, relax=1, panel_size=1,
-                    options={"SymmetricMode": True})
-    except RuntimeError:
-        return None
-
-
 def linear_solution(structure, H, border):
     """The LinearSolution by data of H and `border`, None where they are singular to rounding."""
-    n, lu = len(structure.diagonal), decomposition(structure.matrix(H))
-    pivots = np.zeros(1) if lu is None else lu.U.diagonal()
+    n = len(structure.diagonal)
+    try:                                                 # H is ordered for elimination
+        lu = splu(structure.matrix(H), permc_spec="NATURAL", diag_pivot_thresh=0.0, relax=1,
+                  panel_size=1, options={"SymmetricMode": True})
+    except RuntimeError:
+        return None
+    pivots = lu.U.diagonal()
     if not (pivots > 0).all():                           # H is not positive definite
         return None
     solved = lu.solve(border[:n])

@@ -99,6 +99,7 @@ class Structure:
     places: sparse.csc_array     # the matrix with the place of each entry in the data (9 b,)
     factors: list            # of (m, 2) variables of each kind of factor
     blocks: list             # of (m, 4) numbers of their blocks
+    diagonal: np.ndarray     # (n,) places of the diagonal in the data of blocks
 
     def rows(self, variables, width=3):
         """Rows (m, width) of the unknowns of `variables` (m,)."""
@@ -108,11 +109,6 @@ class Structure:
     def unknowns(self):
         """Rows of the unknowns of all variables, in the order of their numbers."""
         return self.rows(slice(None))[np.arange(3) < 2 + self.is_pose[:, None]]
-
-    @cached_property
-    def diagonal(self):
-        """(n,) places of the diagonal in the data of blocks."""
-        return self.places.diagonal()
 
     def matrix(self, data):
         """The sparse matrix (n, n), which is symmetric, with the data (9 b,) of its blocks."""
@@ -136,11 +132,11 @@ def block_structure(is_pose, factors):
     by_rows = sparse.bsr_array((
         np.arange(9 * len(block)).reshape(-1, 3, 3), block % count,
         np.searchsorted(block, count * np.arange(count + 1)))).tocsr()
+    places = sparse.csc_array((by_rows.data, by_rows.indices, by_rows.indptr), by_rows.shape)
     ends = np.cumsum([count, *(4 * len(each) for each in factors)])
     return Structure(
-        is_pose=is_pose, position=position, factors=factors,
-        places=sparse.csc_array((by_rows.data, by_rows.indices, by_rows.indptr), by_rows.shape),
-        blocks=[each.reshape(-1, 4) for each in np.split(number, ends)[1:-1]])
+        is_pose=is_pose, position=position, places=places, diagonal=places.diagonal(),
+        factors=factors, blocks=[each.reshape(-1, 4) for each in np.split(number, ends)[1:-1]])
 
 
 @dataclass(frozen=True)
@@ -293,9 +289,3 @@ class AcceptedMeasurements:
     def rejected(self):
         """(s,) bool, sightings without weight."""
         return self.sighting_weight == 0
-
-    @property
-    def unsupported(self):
-        """(u,) rows in `Measurements.marker` of the markers without accepted sightings."""
-        m = self.measurements
-        return np.flatnonzero(np.bincount(m.marker_row, self.sighting_weight, len(m.marker)) == 0)
