@@ -109,9 +109,9 @@ def test_kernels_have_the_names_that_vehicle_toml_knows():
 
 def test_the_library_heeds_kernel_and_gate_of_vehicle_toml(tmp_path):
     """As it heeds the options of `estimate`, and a note says so."""
-    dataset, truth = simulate("short", seed=4, late_ranges=0.2)
-    write_dataset(tmp_path / "drive", known_noise(dataset.first(200), 1e-3),
-                  replace(truth, poses=truth.poses[:200]))
+    dataset, truth = simulate("short", seed=4, late_ranges=0.05)
+    write_dataset(tmp_path / "drive", known_noise(dataset.first(400), 1e-3),
+                  replace(truth, poses=truth.poses[:400]))
     plain = read_dataset(tmp_path / "drive")
     with open(tmp_path / "drive" / "vehicle.toml", "a") as file:
         file.write('kernel = "Huber"\ngate = false\n')

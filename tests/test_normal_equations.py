@@ -42,26 +42,26 @@ def native_graph(problem):
     """The same factors as GTSAM has them, but odometry and sightings of points."""
     accepted, noise, model = problem.accepted, problem.noise, gtsam.noiseModel
     m, native = problem.measurements, gtsam.NonlinearFactorGraph()
-    key, v, s = variable_keys(m), m.variables, m.sightings
+    key, s, k = variable_keys(m), m.sightings, len(m.frame) + len(m.marker)
     weight = accepted.sighting_weight * m.as_pose
     roots = m.sighting_roots[0] * (np.sqrt(weight) / noise.sightings)[:, None, None]
     for row in np.flatnonzero(weight):
         native.add(gtsam.BetweenFactorPose2(
-            key[s.row[row]], key[v.markers[m.marker_row[row]]], gtsam.Pose2(*s.z[row]),
+            key[s.row[row]], key[len(m.frame) + m.marker_row[row]], gtsam.Pose2(*s.z[row]),
             model.Robust.Create(accepted.sighting_kernel,
                                 model.Gaussian.SqrtInformation(roots[row], False))))
     r, sigmas = m.ranges, noise.ranges * m.ranges.sigma
     for row in np.flatnonzero(accepted.range_weight):
         native.add(gtsam.RangeFactor2D(
-            key[r.row[row]], key[v.antennas[r.antenna[row]]],
+            key[r.row[row]], key[k + r.antenna[row]],
             r.distance[row] - accepted.range_bias * sigmas[row], model.Robust.Create(
                 accepted.range_kernel, model.Isotropic.Sigma(1, sigmas[row]))))
     q = int(problem.active.sum())
     native.add(gtsam.PriorFactorPose2(key[0], gtsam.Pose2(), model.Diagonal.Sigmas(m.origin_sigma)))
     native.add(gtsam.PriorFactorVector(C(0), np.zeros(q), model.Unit.Create(q)))
-    for k, position in enumerate(m.guess):
+    for each, position in zip(key[k:], m.guess):
         native.add(gtsam.PriorFactorPoint2(
-            key[v.antennas[k]], position, model.Isotropic.Sigma(2, GUESS_PRIOR_SIGMA)))
+            each, position, model.Isotropic.Sigma(2, GUESS_PRIOR_SIGMA)))
     return native
 
 
@@ -80,10 +80,9 @@ def test_gtsam_has_the_same_error_and_takes_the_same_step():
     problem = replace(build_problem(m, "arc", Noise(2e-3, 1.5, 0.7)), accepted=accepted)
     equations = NormalEquations(problem, state)
     values, native = gtsam_values(problem, state), native_graph(problem)
-    others = factors.odometry_error(problem.odometry, state.poses, state.c[WHEELS])[0]
-    others = problem.odometry.whitening(2e-3)[0] @ others[..., None]
-    expected = native.error(values) + np.sum(others**2) / 2 \
-        + equations.linearized[1].error
+    e, *_ = factors.odometry_error(problem.odometry, state.poses, state.c[WHEELS])
+    squared = np.sum(e * np.linalg.solve(problem.odometry.covariance(2e-3), e[..., None])[..., 0])
+    expected = native.error(values) + squared / 2 + equations.linearized[1].error
     assert np.isclose(equations.error, expected, rtol=1e-12)
     own, (poses, _, ranges, _) = native.linearize(values), equations.linearized
     for i, (J, e) in enumerate(zip([*poses.J, *ranges.J[:, :, :5]], [*poses.e, *ranges.e])):

@@ -374,19 +374,6 @@ def test_ranges_carry_the_uncertainty_of_the_place_they_were_measured_from():
     np.testing.assert_array_equal(ranges.guess, [3.5, 4.0])
 
 
-def test_an_antenna_is_known_by_its_ranges_across_the_worst_direction():
-    """Four ranges of 0.1 m from two directions at right angles, one weighing a quarter.
-
-    The information is 2 / 0.01 along y and 1.25 / 0.01 along x. Without the second direction only
-    the guess is left there: 5 m.
-    """
-    ranges = AntennaRanges(np.array([[0.0, 0], [0, 10], [4, 5], [-4, 5]]),
-                           np.array([5.0, 5, 4, 4]), np.full(4, 0.1), np.zeros(2))
-    for weight, expected in ([1, 1, 1, 0.25], 0.1 / np.sqrt(1.25)), ([1, 1, 0, 0], 5.0):
-        assert np.isclose(expected, result._sigma_by_ranges(
-            ranges, np.array([0.0, 5.0]), np.array(weight)))
-
-
 @pytest.mark.parametrize("weight, said", [
     (np.ones(40), None), (np.repeat([1.0, 0.4], [21, 19]), None),
     (np.repeat([1.0, 0.4], [19, 21]), "21 of its 40 ranges disagree"),
@@ -399,8 +386,10 @@ def test_an_antenna_is_doubted_if_most_of_its_ranges_disagree(weight, said):
     ranges = AntennaRanges(path, np.hypot(*(path - place).T), np.full(40, 0.05), place + 0.2)
     assert result._doubt(ranges, place, weight) == said
     coarse = replace(ranges, sigma=np.full(40, 1.0))
-    if said is None:                                      # sigma 0.2 m or so: above 2.5 % of 5 m
-        assert "too few or come from too few" in result._doubt(coarse, place, weight)
+    narrow = replace(ranges, positions=0.15 * path, distance=np.hypot(*(0.15 * path - place).T))
+    if said is None:                           # in the worst direction above 2.5 % of 5 m
+        for each in coarse, narrow:
+            assert "too few or come from too few" in result._doubt(each, place, weight)
 
 
 def test_a_kernel_takes_a_known_part_of_the_variance():

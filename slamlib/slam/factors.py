@@ -1,16 +1,11 @@
 """Stage 2: errors and derivatives of all factors, in numpy, all factors of a kind at once.
 
-Odometry: with the increment Delta between the frames X and X' the error
-
-    e = log(Delta^-1 X^-1 X')
-
+With the increment Delta between the frames X and X' the error of odometry, log(Delta^-1 X^-1 X'),
 is that of GTSAM's between factor, except that Delta depends on the wheel parameters, which all
-odometry factors share.
-
-Measurements: of a sensor in the vehicle's origin the factor of a marker with a heading is GTSAM's
-between factor, that of a range its range factor; `calibration` has the model. Without headings a
-marker is a point. Errors are whitened, and weighted by their kernels. Derivatives by poses are by
-GTSAM's tangent vectors: X moves as X exp(xi), in its own axes.
+odometry factors share. Of a sensor in the vehicle's origin the factor of a marker with a heading is
+GTSAM's between factor, that of a range its range factor; `calibration` has the model. Without
+headings a marker is a point. Errors are whitened, and weighted by their kernels. Derivatives by
+poses are by GTSAM's tangent vectors: X moves as X exp(xi), in its own axes.
 """
 
 from dataclasses import dataclass
@@ -43,11 +38,6 @@ class OdometryFactors:
     def covariance(self, slip):
         """Q (f-1, 3, 3) for a slip in sqrt(m)."""
         return self.quantization + slip**2 * self.slipping
-
-    def whitening(self, slip):
-        """Square root information U (f-1, 3, 3), U^T U = Q^-1, and sum log|Q|, for a slip."""
-        U = square_root_information(self.covariance(slip))
-        return U, -2 * float(np.sum(np.log(np.diagonal(U, axis1=1, axis2=2))))
 
 
 def preintegrate_odometry(measurements, model, wheel=None):
@@ -126,7 +116,8 @@ def linearize_odometry(problem, state):
     J_c = J_c[:, :, active] * problem.sigma[WHEELS][active]
 
     def linearized(slip):
-        U, log_determinant = factors.whitening(slip)
+        U = square_root_information(factors.covariance(slip))
+        log_determinant = -2 * float(np.sum(np.log(np.diagonal(U, axis1=1, axis2=2))))
         whitened = (U @ e[..., None])[..., 0]
         return LinearizedFactors(
             index=np.arange(len(e)), e=whitened, J=U @ J, J_c=U @ J_c,

@@ -1,10 +1,8 @@
 """Stages 2 and 3: the factor graph as records, its normal equations H delta = -g, the evidence.
 
-Variables (`State`) are the frames' poses X_i, the markers L_j (points P_j if no sighting has a
-heading), the antennas A_k, and the calibration c. With whitened errors e and derivatives J of all
-factors, H = sum J^T J and g = sum J^T e. The calibration touches nearly all factors and is
-eliminated last: with the information matrix [[H, B], [B^T, D]] and the gradient [g, g_c], only H,
-which is sparse, is decomposed, and
+With whitened errors e and derivatives J of all factors, H = sum J^T J and g = sum J^T e. The
+calibration touches nearly all factors and is eliminated last: with the information matrix
+[[H, B], [B^T, D]] and the gradient [g, g_c], only H, which is sparse, is decomposed, and
 
     S = D - B^T H^-1 B,    delta_c = -S^-1 (g_c - B^T H^-1 g),    delta = -H^-1 (g + B delta_c).
 
@@ -191,11 +189,11 @@ class NormalEquations:
     def priors(self):
         """The Group of the priors, whose H and D are diagonal."""
         problem, m, state = self.problem, self.problem.measurements, self.state
-        v, active, n = m.variables, problem.active, len(self.structure.diagonal)
+        f, active, n = len(m.frame), problem.active, len(self.structure.diagonal)
         weak = np.bincount(m.marker_row, problem.accepted.sighting_weight, len(m.marker)) == 0
-        parts = [(v.frames[:1], se2.log(state.poses[:1]), m.origin_sigma),
-                 (v.antennas, state.antennas - m.guess, GUESS_PRIOR_SIGMA),
-                 (v.markers[weak], state.markers[weak], WEAK_SIGMA)]
+        parts = [([0], se2.log(state.poses[:1]), m.origin_sigma),
+                 (slice(f + len(m.marker), None), state.antennas - m.guess, GUESS_PRIOR_SIGMA),
+                 (f + np.flatnonzero(weak), state.markers[weak], WEAK_SIGMA)]
         H, e = np.zeros((2, n))
         for variables, difference, sigma in parts:
             rows = self.structure.rows(variables, difference.shape[1])

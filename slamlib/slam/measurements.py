@@ -1,17 +1,15 @@
 """Stage 1: all measurements of a dataset as arrays, their weights, their noise and their structure.
 
-Frames (keyframes) are the encoder poses that are variables X_i of the graph: the first, the last,
-and each one with a sighting or a range. Measurements are numbered: first the s sightings, then the
-r ranges. Of the three noise parameters, those that a dataset's Vehicle gives are known; the others
-are learned from the drive.
+Frames are the first encoder pose, the last, and each one with a sighting or a range. Measurements
+are numbered: first the s sightings, then the r ranges. Of the three noise parameters, those that a
+dataset's Vehicle gives are known; the others are learned from the drive.
 
-Variables are numbered: the frames' poses, the markers, the antennas. Each has three unknowns, in
+Variables are numbered: f poses of frames, k markers, the antennas. Each has three unknowns, in
 the order in which they are eliminated, so that the information matrix H consists of blocks (3, 3);
 the third unknown of a point has no derivatives. The Structure of H is the same for all states,
 kernels and values of the noise.
 """
 
-from collections import namedtuple
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -85,9 +83,6 @@ def with_known(noise, vehicle):
 def square_root_information(covariance):
     """Upper triangular U (..., d, d) with U^T U = C^-1, from covariances C: U e is whitened."""
     return np.swapaxes(np.linalg.cholesky(np.linalg.inv(covariance)), -1, -2)
-
-
-Variables = namedtuple("Variables", "frames markers antennas")     # numbers of X_i, L_j, A_k
 
 
 @dataclass(frozen=True)
@@ -212,21 +207,14 @@ class Measurements:
                 square_root_information(s.C[:, :2, :2]))
 
     @cached_property
-    def variables(self):
-        """The Variables, numbered."""
-        counts = np.cumsum([len(self.frame), len(self.marker), len(self.antenna)])
-        return Variables(*np.split(np.arange(counts[-1]), counts[:-1]))
-
-    @cached_property
     def structure(self):
         """The Structure of the information matrix."""
-        v, s, r = self.variables, self.sightings, self.ranges
-        sightings = np.stack([s.row, v.markers[self.marker_row]], -1)
+        f, k, s, r = len(self.frame), len(self.marker), self.sightings, self.ranges
+        sightings = np.stack([s.row, f + self.marker_row], -1)
         return block_structure(
-            np.r_[np.ones(len(v.frames), bool), self.oriented, np.zeros(len(v.antennas), bool)],
-            [np.stack([v.frames[:-1], v.frames[1:]], -1), sightings[self.as_pose],
-             sightings[~self.as_pose], np.stack([r.row, v.antennas[r.antenna]], -1),
-             connected(self)])
+            np.r_[np.ones(f, bool), self.oriented, np.zeros(len(self.antenna), bool)],
+            [np.arange(f - 1)[:, None] + [0, 1], sightings[self.as_pose], sightings[~self.as_pose],
+             np.stack([r.row, f + k + r.antenna], -1), connected(self)])
 
 
 def measure(dataset, extra_poses=(), jumps=NO_JUMPS, own=None):

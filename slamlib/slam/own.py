@@ -4,10 +4,9 @@ Keys are X(pose) of a pose by its row of `Dataset.ticks`, L(id) of a marker's po
 marker's position where no sighting has a heading, A(id) of an antenna, and C(0) of the calibration,
 in standard deviations from what is stated. Poses are gtsam.Pose2, positions gtsam.Point2.
 
-Factors of one's own are measurements: each linearisation asks GTSAM for theirs, so that start
-values, gates, noise and covariances heed them. The covariances need a chain of poses, given the
-landmarks. So a factor has one variable, or a pose and a landmark, or neighbouring poses. Two
-sightings of a marker that nobody else sees are a loop closure.
+Each linearisation asks GTSAM for that of factors of one's own, so that start values, gates, noise
+and covariances heed them. The covariances need a chain of poses, given the landmarks: a factor has
+one variable, or a pose and a landmark, or neighbouring poses.
 """
 
 import gtsam

@@ -178,11 +178,19 @@ def antenna_doubts(problem, state, frame_covariances, covariances, range_weight)
 
 
 def _doubt(ranges, estimate, weight):
-    """The reason why an antenna is in doubt whose ranges have the weights (m,), or None."""
+    """The reason why an antenna is in doubt whose ranges have the weights (m,), or None.
+
+    Its standard deviation in the worst direction is by its ranges alone: the covariance in the
+    world also includes the uncertain heading of pose 1.
+    """
     distance, count = np.median(ranges.distance), np.count_nonzero(weight > 0.5)
     places, costs = trilaterate(ranges)
     elsewhere = np.hypot(*(places - estimate).T) > SAME_PLACE * distance
     possible = places[elsewhere & (costs < MAX_LOG_ODDS)]
+    difference = estimate - ranges.positions
+    direction = difference / np.maximum(np.hypot(*difference.T), factors.MIN_DISTANCE)[:, None]
+    information = direction.T @ (direction * (weight / ranges.sigma**2)[:, None])
+    sigma = 1 / np.sqrt(max(np.linalg.eigvalsh(information)[0], GUESS_PRIOR_SIGMA**-2))
     if count < MIN_ACCEPTED_RANGES:
         return f"only {count} of its {len(ranges.distance)} ranges agree"
     if len(possible):
@@ -190,20 +198,9 @@ def _doubt(ranges, estimate, weight):
             "({:.1f}, {:.1f})".format(*place) for place in possible))
     if count < len(ranges.distance) / 2:
         return f"{len(ranges.distance) - count} of its {len(ranges.distance)} ranges disagree"
-    if _sigma_by_ranges(ranges, estimate, weight) > MAX_RELATIVE_SIGMA * distance:
+    if sigma > MAX_RELATIVE_SIGMA * distance:
         return "its ranges are too few or come from too few directions"
     return None
-
-
-def _sigma_by_ranges(ranges, estimate, weight):
-    """Largest standard deviation in m of an antenna, in any direction, by its ranges alone.
-
-    Its covariance in the world also includes the uncertain heading of pose 1.
-    """
-    difference = estimate - ranges.positions
-    direction = difference / np.maximum(np.hypot(*difference.T), factors.MIN_DISTANCE)[:, None]
-    information = direction.T @ (direction * (weight / ranges.sigma**2)[:, None])
-    return 1 / np.sqrt(max(np.linalg.eigvalsh(information)[0], GUESS_PRIOR_SIGMA**-2))
 
 
 def chi2_per_dof(problem, state, weight):
