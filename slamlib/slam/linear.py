@@ -177,7 +177,7 @@ class NormalEquations:
         kinds = sightings, sightings, ranges, (None, 1.0)
         for group, (kernel, ratio), size in zip(self._measurement_groups, kinds, (3, 2, 1, 1)):
             share = ratio**2 / (consistency_factor(kernel, size) if consistent else 1.0)
-            total = [before + share * part for before, part in zip(total, group)]
+            total = [each + share * part for each, part in zip(total, group)]
         return *total, log_determinant
 
     def counts(self):
@@ -215,12 +215,11 @@ class NormalEquations:
         """Function from a slip to the Group of the odometry and sum log|Q|."""
         linearized = linearize_odometry(self.problem, self.state)
 
-        @lru_cache(maxsize=MAX_CACHED_SLIPS)
         def odometry(slip):
             factors, log_determinant = linearized(slip)
             return self._group(0, factors), log_determinant
 
-        return odometry
+        return lru_cache(maxsize=MAX_CACHED_SLIPS)(odometry)
 
     def _group(self, kind, factors):
         """The Group of LinearizedFactors of the kind with this number in `structure.factors`."""
