@@ -88,8 +88,8 @@ def odometry_error(factors, poses, wheel):
         return e, by_poses, by_wheel
     radius, ratio = factors.wheel[:2].mean(), factors.wheel / factors.stated
     scale = factors.stated[:2].mean() / radius * np.array([1, 1, ratio[2]])
-    relative = np.array([2 * [-1 / radius / 2] + [0], 2 * [-1 / radius / 2] + [0],
-                         2 * [-1 / radius / 2] + [1 / factors.wheel[2]]])      # by the wheels
+    relative = np.array([3 * [-1 / radius / 2], 3 * [-1 / radius / 2],
+                         [0, 0, 1 / factors.wheel[2]]]).T                      # by the wheels
     linearized = e - by_wheel @ change                              # at the wheels of linearisation
     grown = 1 + relative @ change
     return (scale * (e + (grown - 1) * linearized), (scale * grown)[:, None] * by_poses,
