@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 
 from slamlib import se2
-from slamlib.covariance import correlations
 from slamlib.dialects import LIMITS, matrix, read_table
 from slamlib.doubt import Doubt
 from slamlib.folder import ENCODER, TABLES, TRUTH_FILES, Variable, contents, is_dataset
@@ -253,7 +252,7 @@ def _read_aruco(files, pose_count, notes):
     """The ArucoReadings, or None without rows."""
     table = _read_sensor(files, "ArucoReading.txt", pose_count)
     # Scaled to correlations: s_thetatheta may be 1e4 rad^2 where s_xx is 1e-4 m^2.
-    smallest = np.linalg.eigvalsh(correlations(_covariances(table.numbers)))[:, 0]
+    smallest = np.linalg.eigvalsh(se2.correlations(_covariances(table.numbers)))[:, 0]
     table = table.kept(smallest > MIN_EIGENVALUE, "a positive definite covariance (smallest "
                        f"eigenvalue of its correlation matrix above {MIN_EIGENVALUE:g})",
                        MAX_BAD_SHARE)

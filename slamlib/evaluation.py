@@ -1,8 +1,8 @@
 """Measures of the error of an estimate against the truth, and sizes of covariances.
 
 Poses are (n, 3) [x, y, heading] in m and rad, covariances (n, 3, 3) of the same in world axes.
-Estimate and truth hold the same pose in the same row. Poses without an estimate are NaN. ATE and
-RPE follow Sturm et al., *A benchmark for the evaluation of RGB-D SLAM systems* (IROS 2012); NEES
+Estimate and truth hold the same pose in the same row. Poses without an estimate are NaN. ATE
+follows Sturm et al., *A benchmark for the evaluation of RGB-D SLAM systems* (IROS 2012); NEES
 follows Bar-Shalom, Li and Kirubarajan, *Estimation with Applications to Tracking and Navigation*
 (2001), section 5.4.
 """
@@ -10,7 +10,7 @@ follows Bar-Shalom, Li and Kirubarajan, *Estimation with Applications to Trackin
 import numpy as np
 
 from slamlib import se2
-from slamlib.covariance import correlations, sigmas
+from slamlib.se2 import correlations, sigmas
 from slamlib.textfile import DatasetError, quoted
 
 REACH_95 = float(np.sqrt(-2 * np.log(0.05)))    # sigmas, of the 95 % ellipse of a planar Gaussian
@@ -68,23 +68,6 @@ def ate(poses, truth, aligned=False):
     return float(np.sqrt(np.mean(np.sum((poses[:, :2] - truth[:, :2])**2, axis=1))))
 
 
-def rpe(poses, truth, step):
-    """Relative pose error: root mean square of the errors of all increments over `step` rows.
-
-    Returns translation in m and rotation in rad. Increments from or to a pose that is NaN are left
-    out; both results are NaN without an increment.
-    """
-    poses, truth = checked_poses("rpe", poses, truth)
-    estimated = se2.between(poses[:-step], poses[step:])
-    error = se2.between(se2.between(truth[:-step], truth[step:]), estimated)
-    error = error[np.isfinite(error).all(axis=1)]
-    if not len(error):
-        return np.nan, np.nan
-    error[:, 2] = se2.wrap(error[:, 2])
-    squared = np.mean(error**2, axis=0)
-    return float(np.sqrt(squared[0] + squared[1])), float(np.sqrt(squared[2]))
-
-
 def nees(poses, covariances, truth):
     """Normalized estimation error squared e^T C^-1 e of every pose, (n,).
 
@@ -124,16 +107,6 @@ def nees_band(count, dof=3, probability=0.95):
 
     tail = (1 - probability) / 2
     return tuple(chdtri(dof * count, [1 - tail, tail]) / count)
-
-
-def judge(poses, covariances, truth, step):
-    """ATE, aligned ATE, RPE over `step` rows and average NEES of a trajectory: a dict of numbers.
-
-    The keys are ate, aligned, rpe (all in m), rpe_heading (rad) and nees.
-    """
-    translation, rotation = rpe(poses, truth, step)
-    return {"ate": ate(poses, truth), "aligned": ate(poses, truth, aligned=True),
-            "rpe": translation, "rpe_heading": rotation, "nees": anees(poses, covariances, truth)}
 
 
 def position_sigmas(covariances):

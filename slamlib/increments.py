@@ -79,7 +79,7 @@ def rounding_and_slipping(ticks, vehicle, start, end):
         lever = poses[end] - [1, 1, 0] * origin[np.minimum(block, len(origin) - 1)]
         to_end, _ = se2.compose_jacobians(np.zeros(3), lever)          # I + [0, 0, S lever]
         parts = np.stack([each.T[:, symmetric] for each in (rounding, slipping)])
-        in_world += to_end @ parts @ np.swapaxes(to_end, 1, 2)
+        in_world += to_end @ parts @ to_end.mT
     return tuple(se2.rotate_covariance(part, -poses[start, 2]) for part in in_world)
 
 
@@ -113,12 +113,3 @@ def noise_in_drive(ticks, vehicle, start, end, steps=None):
     skid = MINIMUM_SLIP**2 * (travelled[end] - travelled[start])
     rounding[:, [0, 1], [0, 1]] += skid[:, None]
     return rounding, slipping
-
-
-def log_slip_prior(log_slip):
-    """Log density, up to a constant, of log slip, which is normal about log TYPICAL_SLIP.
-
-    Its standard deviation is log SLIP_FACTOR, so that it matters only where the measurements hardly
-    determine the slip. `log_slip` is the natural logarithm of the slip in sqrt(m).
-    """
-    return -((log_slip - np.log(TYPICAL_SLIP)) / np.log(SLIP_FACTOR))**2 / 2

@@ -105,7 +105,7 @@ def robust_increments(z, C, pair, first, second, count):
             J_delta, J_second = se2.compose_jacobians(increment[pair], z2)
             r, information, squared = _residuals(increment[pair], J_second, z1, C1, z2, C2)
             weight = squared < GATE if gated else 1 / (1 + squared / GATE)
-            gain = np.swapaxes(J_delta, 1, 2) @ information * weight[:, None, None]
+            gain = J_delta.mT @ information * weight[:, None, None]
             H, gradient = np.zeros((count, 3, 3)), np.zeros((count, 3))
             np.add.at(H, pair, gain @ J_delta)
             np.add.at(gradient, pair, np.einsum("nij,nj->ni", gain, r))
@@ -127,7 +127,7 @@ def _residuals(increment, J_second, z1, C1, z2, C2):
     """r, W^-1 and r^T W^-1 r of each common sighting, with J' = J_second."""
     r = z1 - se2.compose(increment, z2)
     r[:, 2] = se2.wrap(r[:, 2])
-    information = np.linalg.inv(C1 + J_second @ C2 @ np.swapaxes(J_second, 1, 2))
+    information = np.linalg.inv(C1 + J_second @ C2 @ J_second.mT)
     return r, information, np.einsum("ni,nij,nj->n", r, information, r)
 
 
@@ -140,8 +140,7 @@ def _best_hypothesis(z1, C1, z2, C2, pair, count):
     begins, ends = (np.searchsorted(pair, np.arange(count), side) for side in ("left", "right"))
     oriented = (C1[:, 2, 2] + C2[:, 2, 2]) < MAX_HEADING_SIGMA**2
     two_of_each = [
-        _evenly_chosen_pairs(np.add(np.triu_indices(ends[k] - begins[k], 1), begins[k]))
-        for k in np.setdiff1d(pair, pair[oriented])]
+        begins[k] + _pairs(ends[k] - begins[k]) for k in np.setdiff1d(pair, pair[oriented])]
     i, j = np.concatenate([np.zeros((2, 0), int), *two_of_each], axis=1)
     hypothesis = np.concatenate([
         np.zeros((count, 3)),
@@ -163,10 +162,11 @@ def _best_hypothesis(z1, C1, z2, C2, pair, count):
     return hypothesis[order[np.searchsorted(pair_of[order], np.arange(count))]]
 
 
-def _evenly_chosen_pairs(pairs):
-    """At most POINT_PAIRS columns of pairs (2, m), evenly chosen."""
-    m = pairs.shape[1]
-    return pairs[:, np.linspace(0, m - 1, POINT_PAIRS).astype(int)] if m > POINT_PAIRS else pairs
+def _pairs(count):
+    """At most POINT_PAIRS pairs (2, m) of `count` numbers, evenly chosen."""
+    pairs = np.array(np.triu_indices(count, 1))
+    chosen = np.linspace(0, pairs.shape[1] - 1, min(POINT_PAIRS, pairs.shape[1]))
+    return pairs[:, chosen.astype(int)]
 
 
 def _increment_of_two_points(p1, q1, p2, q2):
@@ -181,8 +181,8 @@ def _single_increments(z1, C1, z2, C2):
     """Increment (p, 3) from each common sighting alone, Z Z'^-1, and its covariance (p, 3, 3)."""
     by_first, by_inverse = se2.compose_jacobians(z1, se2.inverse(z2))
     by_second = by_inverse @ se2.inverse_jacobian(z2)
-    return se2.compose(z1, se2.inverse(z2)), (by_first @ C1 @ np.swapaxes(by_first, 1, 2)
-                                              + by_second @ C2 @ np.swapaxes(by_second, 1, 2))
+    return (se2.compose(z1, se2.inverse(z2)),
+            by_first @ C1 @ by_first.mT + by_second @ C2 @ by_second.mT)
 
 
 def _distance_and_turn(increment):

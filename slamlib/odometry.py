@@ -88,7 +88,7 @@ def equation2(ticks, vehicle, initial_pose=(0.0, 0.0, 0.0), initial_covariance=N
     integral[1:, :, :3] = np.cumsum(J[:, :, :3] * vehicle.sigma_wheel, axis=0)
     sigma_heading = np.sqrt(initial_covariance[2, 2] + np.sum(integral[:-1, 2, :3]**2, axis=-1))
     integral[1:, :, 3] = np.cumsum(J[:, :, 3] * sigma_heading[:, None], axis=0)
-    return poses, initial_covariance + integral @ np.swapaxes(integral, -1, -2)
+    return poses, initial_covariance + integral @ integral.mT
 
 
 def step_jacobian(ticks, vehicle, heading):
@@ -145,8 +145,7 @@ def first_order(ticks, vehicle, initial_pose=(0.0, 0.0, 0.0), initial_covariance
     poses = dead_reckoning(ticks, vehicle, initial_pose, model)
     G = wheel_jacobian(ticks, vehicle, initial_pose[2], model) * vehicle.sigma_wheel
     A, _ = se2.compose_jacobians(poses[0], se2.between(poses[0], poses))
-    A_t, G_t = np.swapaxes(A, -1, -2), np.swapaxes(G, -1, -2)
-    return poses, A @ initial_covariance @ A_t + G @ G_t
+    return poses, A @ initial_covariance @ A.mT + G @ G.mT
 
 
 def cumulative(increments, initial=0.0):

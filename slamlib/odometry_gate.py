@@ -25,8 +25,8 @@ from slamlib.sightings import GATE, sightings_by_frame, squared_distances
 # Noise of odometry, generous
 SLIP = 0.03                  # sqrt(m), of a wheel after one metre
 FLOOR = 3e-3                 # m and rad, of an increment
-LEVER = 0.12                 # m, by which the camera may be elsewhere than stated
 LAGS = np.arange(-12, 13, 2)         # poses, by which all sightings may be late
+LEVER = 0.12                 # m, by which the camera may be elsewhere than stated
 # Decisions; gains are of twice the log likelihood
 SUSPECT = 7.8                # 95 % quantile of chi-squared with three degrees of freedom
 MEDIAN_SQUARED = 2.366       # its median
@@ -56,6 +56,7 @@ class Jumps:
     by_odometry: np.ndarray  # (g, 3)
     sigma: np.ndarray        # (g, 3) of the increment without these markers
     chance: np.ndarray       # (n,) of a jump in the steps up to each pose, up to a factor
+    lag: int = 0             # poses, by which all sightings seem later than stated
 
     @property
     def are_few(self):
@@ -92,23 +93,19 @@ NO_JUMPS = Jumps(**dict(zip(("start", "end"), np.zeros((2, 0), int))), chance=np
 
 def find_jumps(dataset):
     """The Jumps of a Dataset, by its sightings as the stated camera has them."""
-    sightings = sightings_by_frame(dataset.sightings)
-    order = np.lexsort((sightings.row, sightings.marker))
-    used, row = np.unique(sightings.row[order], return_inverse=True)
-    if len(used) < 2:
+    s = sightings_by_frame(dataset.sightings)
+    if len(s.frame) < 2:
         return NO_JUMPS
-    s = replace(sightings, frame=sightings.frame[used], row=row, **{
-        name: getattr(sightings, name)[order] for name in ("index", "marker", "z", "C")})
-    path = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")
-    found = _jumps(dataset, s, path[s.frame])
-    if not len(found.start):
-        return found
+    order = np.lexsort((s.row, s.marker))
+    s = replace(s, **{name: getattr(s, name)[order] for name in ("row", "marker", "z", "C")})
     # Sightings that are late contradict odometry wherever the speed changes.
-    late = [path[np.maximum(np.minimum(s.frame - lag, len(path) - 1), 0)] for lag in LAGS]
+    path = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")
+    late = [path[np.clip(s.frame - round(dataset.vehicle.sighting_lag) - lag, 0, len(path) - 1)]
+            for lag in LAGS]
     cost = [_cost(_compared(s, _drive(each, dataset.vehicle.wheelbase))[2]).sum() for each in late]
-    best = int(np.argmin(cost))
-    return found if cost[best] > cost[len(LAGS) // 2] - MIN_LAG_GAIN \
-        else _jumps(dataset, s, late[best])
+    stated, best = len(LAGS) // 2, int(np.argmin(cost))
+    best = best if cost[best] < cost[stated] - MIN_LAG_GAIN else stated
+    return replace(_jumps(dataset, s, late[best]), lag=LAGS[best])
 
 
 def _jumps(dataset, s, poses):

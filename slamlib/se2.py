@@ -134,7 +134,19 @@ def rotate_covariance(covariance, heading):
     """
     B = _identity(np.shape(heading) + (3,))
     B[..., :2, :2] = rotation(heading)
-    return B @ covariance @ np.swapaxes(B, -1, -2)
+    return B @ covariance @ B.mT
+
+
+def sigmas(covariances):
+    """Standard deviations (n, d) of covariances (n, d, d)."""
+    return np.sqrt(np.diagonal(covariances, axis1=-2, axis2=-1))
+
+
+def correlations(covariances):
+    """Correlation matrices (n, d, d) of covariances (n, d, d); NaN where a variance is zero."""
+    sigma = sigmas(covariances)
+    scale = sigma[..., :, None] * sigma[..., None, :]
+    return np.divide(covariances, scale, out=np.full_like(scale, np.nan), where=scale > 0)
 
 
 def _poses(x, y, heading):

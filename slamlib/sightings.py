@@ -10,10 +10,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slamlib import se2
-from slamlib.covariance import correlations, sigmas
+from slamlib.se2 import correlations, sigmas
 
 GATE = 16.26623619623813         # dimensionless, for residuals of [x, y, heading]
-MAX_SIGHTINGS_COMPARED = 200     # of a marker; the cost of comparison is quadratic
 POINT_GATE = 13.815510557964274  # dimensionless, for residuals of [x, y]
 MIN_MEASUREMENT_SIGMA = 1e-6     # m or rad, of one coordinate given the others
 MIN_SIGMA_RATIO = 1e-6           # of the standard deviations of x and y
@@ -91,17 +90,17 @@ def merge_repeated(aruco):
     return order[begins], z[begins], C[begins], contradicting
 
 
-def consensus(marker, in_world, covariance):
+def consensus(marker, in_world, covariance, maximum=200):
     """Rows (k,) of one sighting of each marker, well supported and certain, in ascending id.
 
     The support of a sighting is the number of sightings of its marker within GATE of it. Of those
     with at least half the maximum support, the most certain one has the smallest determinant of its
     covariance. `marker` (s,) are ids, `in_world` (s, 3), m and rad, and `covariance` (s, 3, 3) the
-    poses of these markers in world axes by each sighting. Of a marker with more than
-    MAX_SIGHTINGS_COMPARED sightings, so many evenly chosen ones are compared.
+    poses of these markers in world axes by each sighting. Of a marker with more than `maximum`
+    sightings, so many evenly chosen ones are compared: the cost is quadratic.
     """
     _, label = np.unique(marker, return_inverse=True)
-    chosen, best = evenly_chosen(label, MAX_SIGHTINGS_COMPARED), []
+    chosen, best = evenly_chosen(label, maximum), []
     order = chosen[np.argsort(label[chosen], kind="stable")]
     log_determinant = np.linalg.slogdet(covariance)[1]
     for same in np.split(order, np.flatnonzero(np.diff(label[order])) + 1) if len(order) else ():

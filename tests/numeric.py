@@ -1,4 +1,4 @@
-"""Numerical derivatives, standard errors, known noise and trials, shared by the tests."""
+"""Numerical derivatives, standard errors, changed drives and trials, shared by the tests."""
 
 from dataclasses import replace
 
@@ -27,6 +27,11 @@ def decided(differences):
     """True where the mean of paired differences (s,) is above zero in a t test of 2.5 %."""
     error = differences.std(ddof=1) / np.sqrt(len(differences))
     return differences.mean() > t.ppf(0.975, len(differences) - 1) * error
+
+
+def changed(dataset, sensor, **fields):
+    """The Dataset with other `fields` of its readings "aruco" or "uwb"."""
+    return replace(dataset, **{sensor: replace(getattr(dataset, sensor), **fields)})
 
 
 def known_noise(dataset, slip):

@@ -2,13 +2,13 @@
 
 import itertools
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from numeric import known_noise
+from numeric import changed, known_noise
 
 from slamlib import se2, slam, solve
 from slamlib.checks import consistency
@@ -27,18 +27,12 @@ from slamlib.slam.calibration import (
 )
 from slamlib.slam.measurements import Noise
 from slamlib.slam.result import turn_sigma
-from slamlib.studies import montecarlo
 from slamlib.summary import summarize, summary_table
 
 SHORT = Path(__file__).parents[1] / "data" / "short"
 
 
-def aruco(dataset, **changes):
-    return replace(dataset, aruco=replace(dataset.aruco, **changes))
-
-
-def uwb(dataset, **changes):
-    return replace(dataset, uwb=replace(dataset.uwb, **changes))
+aruco, uwb = (partial(changed, sensor=sensor) for sensor in ("aruco", "uwb"))
 
 
 def late(dataset, poses):
@@ -48,15 +42,16 @@ def late(dataset, poses):
     return replace(dataset, aruco=replace(dataset.aruco, pose=moved).select(kept))
 
 
-def larger_wheels(dataset):
-    vehicle = dataset.vehicle
-    return replace(dataset, vehicle=replace(vehicle, right_radius=0.101, left_radius=0.101))
+def vehicle(**changes):
+    return lambda d: replace(d, vehicle=replace(d.vehicle, **changes))
+
+
 WRONG_SIZES = {                                # found by the graph, and mended
     "covariances a hundredth": (lambda d: aruco(d, covariance=d.aruco.covariance / 100),
                                 "marker-noise"),
     "sigmas of ranges halved": (lambda d: uwb(d, sigma=d.uwb.sigma / 2), "range-noise"),
     "ranges 1.5 % too long": (lambda d: uwb(d, range=d.uwb.range * 1.015), "range-offset"),
-    "wheels 1 % too large": (larger_wheels, "wheel-parameters")}
+    "wheels 1 % too large": (vehicle(right_radius=0.101, left_radius=0.101), "wheel-parameters")}
 
 
 def uncorrelated(*variances):
@@ -65,11 +60,11 @@ def uncorrelated(*variances):
         np.diag(variances), d.aruco.covariance.shape))
 
 
-def correlated(i, j, by):
-    """A change of all sightings: two coordinates, and no others, are correlated by `by`."""
+def correlated(i, j):
+    """A change of all sightings: two coordinates, and no others, are almost fully correlated."""
     def change(d):
         C = d.aruco.covariance * np.eye(3)
-        C[:, i, j] = C[:, j, i] = by * np.sqrt(C[:, i, i] * C[:, j, j])
+        C[:, i, j] = C[:, j, i] = (1 - 1e-11) * np.sqrt(C[:, i, i] * C[:, j, j])
         return aruco(d, covariance=C)
     return change
 
@@ -84,10 +79,6 @@ def one_of(sensor, change):
                                   values[half + 1:]])
             for name, values in vars(readings).items()})})
     return of_one
-
-
-def vehicle(**changes):
-    return lambda d: replace(d, vehicle=replace(d.vehicle, **changes))
 
 
 def range_sigmas(sigma):
@@ -105,8 +96,8 @@ LEGAL = {                                      # within the limits, and far from
     "the most uncertain sightings": uncorrelated(1e8, 1e8, 1e14),
     "a sighting of a direction": one_of("aruco", uncorrelated(1e-18, 1e8, 1e-18)),
     "sightings of a distance": uncorrelated(1e8, 1e-18, 1e14),
-    "correlations of almost 1": correlated(0, 1, 1 - 1e-11),
-    "correlations with heading of almost 1": correlated(1, 2, 1 - 1e-11)}
+    "correlations of almost 1": correlated(0, 1),
+    "correlations with heading of almost 1": correlated(1, 2)}
 
 
 def names(*lists):
@@ -127,9 +118,8 @@ def assert_mended(found, truth, seed, factor=1.2):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [61, 62])
 @pytest.mark.parametrize("flaw", WRONG_SIZES)
-def test_wrong_sizes_are_mended_or_named(flaw, seed):
+def test_wrong_sizes_are_mended_or_named(flaw, seed=61):
     """Problems 3 and 4 on short drives: as accurate as on the right files, and said.
 
     By markers alone, wheels that are larger by one factor and markers that are smaller by it are
@@ -154,20 +144,18 @@ def test_wrong_sizes_are_mended_or_named(flaw, seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("wrong, radius, base", [
-    (dict(right_radius=0.103, left_radius=0.103), 0.1, 0.4), (dict(wheelbase=0.2), 0.1, 0.4),
-    (dict(ticks_per_revolution=9600.0), 0.12, 0.4)])
-def test_wheels_that_are_far_off_are_named_and_mended_although_slip_explains_the_path(
-        wrong, radius, base):
+@pytest.mark.parametrize("wrong", [dict(right_radius=0.103, left_radius=0.103),
+                                   dict(wheelbase=0.2)])
+def test_wheels_that_are_far_off_are_named_and_mended_although_slip_explains_the_path(wrong):
     """Not by more slip than the drive has; ranges give the scale, and wheels within 1 %."""
     dataset, truth = simulate("short", 501)
-    spoilt = replace(dataset, vehicle=replace(dataset.vehicle, **wrong))
+    spoilt = vehicle(**wrong)(dataset)
     markers = slam.estimate(spoilt.without("uwb"))
     found = slam.estimate(spoilt, previous=markers)
     assert names(solution_doubts(markers)) & {"wheel-parameters", "marker-size"}
     doubt = solution_doubts(found)[0]
     assert doubt.what == "wheel-parameters" and "By the drive right_radius" in doubt.sentence
-    np.testing.assert_allclose(found.wheel, [radius, radius, base], rtol=0.01)
+    np.testing.assert_allclose(found.wheel, [0.1, 0.1, 0.4], rtol=0.01)
     assert markers.slip < 2e-3 and found.slip < 2e-3
     assert_mended(found, truth, 501, factor=1.3)
 
@@ -176,8 +164,7 @@ def test_other_wheels_explain_a_drive_better_than_much_slip():
     """Radii 3 % off, on 16 m: slip that is learned, and slip that was given as far too much."""
     dataset, truth = simulate("short", 501)
     dataset = dataset.without("uwb").first(800)
-    spoilt = replace(dataset, vehicle=replace(dataset.vehicle, right_radius=0.103,
-                                              left_radius=0.103))
+    spoilt = vehicle(right_radius=0.103, left_radius=0.103)(dataset)
     found, given = slam.estimate(spoilt), slam.estimate(known_noise(spoilt, 1e-2), model="arc")
     for each in (found, given):             # all lengths may be those of the markers, or the wheels
         assert names(solution_doubts(each)) <= {"wheel-parameters", "marker-size"}
@@ -186,24 +173,22 @@ def test_other_wheels_explain_a_drive_better_than_much_slip():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("poses", [-3, 10])
-def test_sightings_that_are_late_are_named_and_mended(poses):
+@pytest.mark.parametrize("poses, seed", [(-3, 61), (10, 62)])
+def test_sightings_that_are_late_are_named_and_mended(poses, seed):
     """The offset is right, and the ATE nearly that of the right files."""
-    for seed in (61, 62):
-        dataset, truth = simulate("short", seed)
-        found = slam.estimate(late(dataset, poses).without("uwb"))
-        sigma = np.sqrt(found.c_covariance[SIGHTING_LAG, SIGHTING_LAG])
-        assert abs(found.c[SIGHTING_LAG] - poses) < 3 * sigma < 1
-        assert names(solution_doubts(found)) == {"time-offset"}
-        assert_mended(found, truth, seed, factor=1.4)
+    dataset, truth = simulate("short", seed)
+    found = slam.estimate(late(dataset, poses).without("uwb"))
+    sigma = np.sqrt(found.c_covariance[SIGHTING_LAG, SIGHTING_LAG])
+    assert abs(found.c[SIGHTING_LAG] - poses) < 3 * sigma < 1
+    assert names(solution_doubts(found)) == {"time-offset"}
+    assert_mended(found, truth, seed, factor=1.4)
 
 
 def test_without_sightings_nothing_is_known_of_the_camera():
     dataset = known_noise(simulate("short", 61)[0].first(300).without("aruco"), 1e-3)
-    stated = Vehicle(camera_x=0.1, sigma_camera_x=0.02, marker_size=1.01, sighting_lag=2.0)
-    for vehicle in (Vehicle(), stated):
-        found = slam.estimate(replace(dataset, vehicle=replace(
-            vehicle, slip=1e-3, marker_noise_factor=1.0, range_noise_factor=1.0)), model="arc")
+    stated = vehicle(camera_x=0.1, sigma_camera_x=0.02, marker_size=1.01, sighting_lag=2.0)
+    for drive in (dataset, stated(dataset)):
+        found = slam.estimate(drive, model="arc")
         np.testing.assert_array_equal(found.c[SIGHTINGS], found.calibration.stated[SIGHTINGS])
         np.testing.assert_allclose(found.c_covariance[SIGHTINGS, SIGHTINGS],
                                    np.diag(found.calibration.sigma[SIGHTINGS]**2), atol=1e-15)
@@ -220,9 +205,9 @@ def test_sightings_that_are_late_are_named_on_the_long_path():
 
 @pytest.mark.slow
 def test_offsets_of_the_camera_have_the_standard_deviations_that_they_state():
-    """Twelve clean drives of two slips, with a camera and a delay that are hardly known."""
+    """Eight clean drives of two slips, with a camera and a delay that are hardly known."""
     time, place = [], []
-    for seed, slip in itertools.product(range(6), (1e-3, 3e-3)):
+    for seed, slip in itertools.product(range(4), (1e-3, 3e-3)):
         dataset, _ = simulate("short", seed, slip=slip)
         found = slam.estimate(vehicle(
             sigma_sighting_lag=10.0, sigma_camera_x=0.2, sigma_camera_y=0.2,
@@ -231,59 +216,17 @@ def test_offsets_of_the_camera_have_the_standard_deviations_that_they_state():
         off = found.c[CAMERA]
         place.append(off @ np.linalg.solve(found.c_covariance[CAMERA, CAMERA], off))
     for squared, dof in ((time, 1), (place, 3)):
-        low, high = nees_band(12, dof, probability=0.99)
+        low, high = nees_band(8, dof, probability=0.99)
         assert low < np.mean(squared) < high, (dof, squared)
 
 
 @pytest.mark.slow
-def test_ranges_that_are_all_too_long_do_no_harm():
-    """Four short drives: hardly enough to decide for an offset, but its possibility is counted."""
-    nees = []
-    for seed in (61, 62, 101, 213):
-        dataset, truth = simulate("short", seed)
-        found = slam.estimate(uwb(dataset, range=dataset.uwb.range + 0.15))
-        assert anees(found.poses, found.covariances, truth.poses) < 6
-        assert names(solution_doubts(found)) <= {"range-offset", "antenna-offsets"}
-        nees += montecarlo.antenna_error(found, truth)[1].tolist()
-    assert np.median(nees) < 6
-
-
-def test_contradicting_repetitions_count_as_rejected():
-    """A second row, a metre off, for 40 % of the sightings."""
-    dataset, _ = simulate("short", 61)
-    seen = dataset.aruco
-    again = seen.select(np.flatnonzero(np.arange(len(seen.pose)) % 5 < 2))
-    again = replace(again, marker_in_vehicle=again.marker_in_vehicle + [1, 0, 0])
-    both = replace(seen, **{name: np.concatenate([getattr(seen, name), getattr(again, name)])
-                            for name in vars(seen)})
-    both = both.select(np.argsort(both.pose, kind="stable"))
-    found = slam.estimate(replace(dataset, aruco=both, uwb=None))
-    doubt, = solution_doubts(found)
-    assert doubt.what == "sightings-rejected"
-    assert f", {2 * len(again.pose)} by another one of the same marker" in doubt.sentence
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("slip", [0.0, 1e-2])
-def test_there_is_no_doubt_about_clean_long_drives(slip):
+def test_there_is_no_doubt_about_a_clean_long_drive():
     """Short ones are in test_calibration."""
-    dataset, _ = simulate("long", 71, slip=slip)
+    dataset, _ = simulate("long", 71, slip=1e-2)
     found = slam.estimate(dataset.without("uwb"))
     both = slam.estimate(dataset, previous=found)
     assert not names(doubts_before_solving(dataset), solution_doubts(found), solution_doubts(both))
-
-
-def test_markers_of_which_most_sightings_contradict_are_named():
-    """The sightings of one marker scatter by a metre."""
-    dataset, _ = simulate("short", 61)
-    label, count = np.unique(dataset.aruco.marker, return_counts=True)
-    moved = label[count.argmax()]
-    rows = np.flatnonzero(dataset.aruco.marker == moved)
-    z = dataset.aruco.marker_in_vehicle.copy()
-    z[rows] += np.random.default_rng(0).normal(0, 1, (len(rows), 3)) * [1, 1, 0]
-    found = slam.estimate(aruco(dataset, marker_in_vehicle=z).without("uwb"))
-    doubts = [doubt for doubt in solution_doubts(found) if doubt.what == "sightings-rejected"]
-    assert len(doubts) == 1 and f"marker {moved}" in doubts[0].sentence
 
 
 @pytest.mark.slow
@@ -424,11 +367,11 @@ def test_many_rejected_sightings_are_named_of_all_and_of_single_markers():
     """Sightings of markers 11, 12 and 13: ten, four and forty."""
     label = np.repeat([11, 12, 13], [10, 4, 40])
 
-    def said(*rejected_of_each):
+    def said(*rejected_of_each, repeated=0):
         rejected = np.concatenate([np.arange(np.sum(label == k)) < count
                                    for k, count in enumerate(rejected_of_each, 11)])
         return [doubt.sentence for doubt in solution_doubts(solved(
-            rejected=rejected, sightings=SimpleNamespace(contradicting=0, marker=label,
+            rejected=rejected, sightings=SimpleNamespace(contradicting=repeated, marker=label,
                                                          frame=np.arange(1))))]
 
     assert said(4, 0, 0) == [] and said(0, 4, 1) == [] and said(0, 0, 5) == []
@@ -437,6 +380,8 @@ def test_many_rejected_sightings_are_named_of_all_and_of_single_markers():
         sentence, = said(*counts)
         assert sentence.startswith(f"{sum(counts)} of 54 sightings contradict the rest and are")
         assert of_markers in sentence
+    sentence, = said(1, 0, 0, repeated=6)
+    assert sentence.startswith("7 of 60") and ", 6 by another one of the same marker" in sentence
 
 
 def test_a_marker_at_the_place_of_another_is_unconfirmed():
@@ -447,9 +392,9 @@ def test_a_marker_at_the_place_of_another_is_unconfirmed():
     marker = seen.marker.copy()
     marker[of[0][1:4]] = marker[of[1][0]]
     others = np.setdiff1d(np.arange(len(marker)), of[1])
-    found = slam.estimate(aruco(dataset, **vars(replace(seen, marker=marker).select(others)))
-                          .without("uwb"))
-    assert found.unconfirmed.tolist() == [seen.marker[of[1][0]]]
+    seen = replace(seen, marker=marker).select(others)
+    found = slam.estimate(replace(dataset, aruco=seen, uwb=None))
+    assert found.unconfirmed.tolist() == [marker[of[1][0]]]
 
 
 def test_a_marker_with_a_single_accepted_sighting_is_unconfirmed():
@@ -458,8 +403,8 @@ def test_a_marker_with_a_single_accepted_sighting_is_unconfirmed():
     seen = dataset.aruco
     label, count = np.unique(seen.marker, return_counts=True)
     rows = np.flatnonzero(seen.marker == label[count.argmax()])
-    found = slam.estimate(aruco(dataset, **vars(seen.select(
-        np.setdiff1d(np.arange(len(seen.marker)), rows[1:])))).without("uwb"))
+    found = slam.estimate(replace(dataset, uwb=None, aruco=seen.select(
+        np.setdiff1d(np.arange(len(seen.marker)), rows[1:]))))
     assert found.unconfirmed.tolist() == [label[count.argmax()]]
     assert not solution_doubts(found)
     row = solve.problem_solution("problem3", dataset.without("uwb"), found)

@@ -88,31 +88,6 @@ def test_without_markers_it_is_the_first_order_propagation():
     np.testing.assert_allclose(fused.covariances, covariances, atol=1e-5 * covariances[-1].max())
 
 
-@pytest.mark.parametrize("count", [0, 1])
-def test_rounding_does_not_grow_with_the_number_of_frames(count):
-    """A vehicle that stands still, or travels one count in each of 2,000 steps.
-
-    Sightings are useless and everything but rounding is known. The last pose has the rounding of
-    one difference of counts (and the skid), however many frames there are. As a random walk its
-    variance would be larger by the number of frames.
-    """
-    vehicle = replace(TABLE_2, sigma_heading=1e-9, sigma_right_radius=1e-12,
-                      sigma_left_radius=1e-12, sigma_wheelbase=1e-12)
-    ticks = np.full((2001, 2), count)
-    metres = 2 * np.pi * vehicle.right_radius / vehicle.ticks_per_revolution
-    along, turned = metres**2 / 6 * np.array([1 / 2, 2 / vehicle.wheelbase**2])
-    along += increments.MINIMUM_SLIP**2 * 2000 * count * metres
-    for every in (1, 10, 2000):
-        frame = np.arange(0, 2001, every)
-        seen, useless = np.tile([1.0, 0.0, 0.0], (len(frame), 1)), 1e12 * np.eye(3)
-        aruco = ArucoReadings(frame, np.full(len(frame), 7), seen,
-                              np.tile(useless, (len(frame), 1, 1)))
-        fused = fuse(Dataset("slow", vehicle, ticks, aruco, None, None), slip=0.0)
-        variance = np.diagonal(fused.covariances, axis1=1, axis2=2)
-        np.testing.assert_allclose(variance[-1, [0, 2]], [along, turned], rtol=1e-3)
-        np.testing.assert_allclose(variance[1000, 2], turned / 2, rtol=1e-3)
-
-
 @pytest.mark.slow
 def test_slip_is_learned_although_the_encoder_is_coarse():
     """500 counts a revolution, a frame every 10 cm: rounding is as large as slip between frames.
@@ -174,7 +149,7 @@ def test_the_slip_that_is_learned_has_the_greatest_density(slip):
     given = fused._filter_input(dataset, "arc", dataset.vehicle)
     found = fused._likeliest_slip(given)
     log_density = [fused._filter(given, each)[2].log_likelihood
-                   + increments.log_slip_prior(np.log(each))
+                   - (np.log(each / 1e-3) / np.log(3))**2 / 2
                    for each in (0.8 * found, found, 1.2 * found)]
     assert np.argmax(log_density) == 1
 
@@ -224,7 +199,6 @@ def test_where_markers_give_no_increment_the_hint_restarts_odometry(propagation,
     frames = [0, 400, 800, 1200]
     dataset = only(dataset, np.isin(dataset.aruco.pose, frames))
     found = fuse_increments(dataset, propagation)
-    np.testing.assert_array_equal(found.measured, frames)
     pose, covariance = np.zeros(3), np.diag([0.0, 0.0, dataset.vehicle.sigma_heading**2])
     for begin, end in zip(frames, [*frames[1:], len(dataset.ticks) - 1]):
         poses, covariances = whole(dataset.ticks[begin:end + 1], dataset.vehicle, pose, covariance)
@@ -233,22 +207,8 @@ def test_where_markers_give_no_increment_the_hint_restarts_odometry(propagation,
         pose, covariance = poses[-1], covariances[-1]
 
 
-def test_sparse_and_late_markers_leave_odometry_between():
-    dataset, truth = simulate("short", seed=7)
-    dataset = only(dataset, dataset.aruco.pose >= 800)
-    expected = odometry.first_order(dataset.ticks, dataset.vehicle, model="arc")[0]
-    fused, hint = fuse(dataset, slip=1e-3), fuse_increments(dataset)
-    np.testing.assert_allclose(fused.poses[:801], expected[:801], atol=2e-4)  # other wheels
-    np.testing.assert_allclose(
-        hint.poses[:801], odometry.dead_reckoning(dataset.ticks, dataset.vehicle)[:801], atol=1e-12)
-    for each in (fused, hint):
-        assert len(each.poses) == len(dataset.ticks) and np.isfinite(each.covariances).all()
-        assert ate(each.poses, truth.poses) < 1.0
-
-
 @pytest.mark.parametrize("keep", [
-    lambda a: a.pose % 300 == 0, lambda a: a.pose % 200 == 0,
-    lambda a: np.arange(len(a.pose)) == 0])
+    lambda a: a.pose % 200 == 0, lambda a: np.arange(len(a.pose)) == 0])
 def test_without_information_on_the_slip_the_prior_decides(keep):
     """Few frames or a single sighting: NEES of the last heading over 20 drives is in its band.
 

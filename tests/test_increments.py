@@ -99,12 +99,6 @@ def test_noise_in_drive_does_not_depend_on_how_the_drive_is_cut():
         np.testing.assert_array_equal(part, 0)
 
 
-def test_slip_prior_is_normal_in_the_logarithm():
-    typical, factor = np.log(increments.TYPICAL_SLIP), np.log(increments.SLIP_FACTOR)
-    np.testing.assert_allclose(
-        increments.log_slip_prior(typical + factor * np.array([0, 1, -1, 2])), [0, -0.5, -0.5, -2])
-
-
 def test_noise_does_not_depend_on_where_the_increment_lies():
     """The same winding metres at the beginning and after 20 km straight ahead."""
     ticks, far = curvy_ticks()[1:], np.full((200_000, 2), 1_270)

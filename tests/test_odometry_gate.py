@@ -11,6 +11,7 @@ from slamlib.checks.solution import _of_encoder, solution_doubts
 from slamlib.dataset import ArucoReadings, Dataset
 from slamlib.evaluation import ate, nees
 from slamlib.localization.fused import fuse
+from slamlib.odometry import dead_reckoning
 from slamlib.odometry_gate import (
     FLOOR,
     NO_JUMPS,
@@ -162,6 +163,30 @@ def test_where_all_markers_change_the_later_covariance_is_that_of_not_knowing(cl
     sigma = np.sqrt(result.covariances[:, 0, 0])
     assert sigma[BREAK] < 0.1 and sigma[BREAK + 20] > 5
     assert any("all markers change at once" in doubt.sentence for doubt in solution_doubts(result))
+
+
+@pytest.mark.parametrize("stated", [0, 4])
+def test_sightings_that_are_late_are_no_jumps_and_start_at_their_delay(stated):
+    """Ten poses, on lanes 1.5 m long with sharp turns between them, at which most are wrong."""
+    rng, vehicle = np.random.default_rng(0), replace(TABLE_2, sighting_lag=stated)
+    turn = np.repeat([0, 1, 0, -1] * 3, [150, 40] * 6)[:, None] * [1, -1]
+    ticks = 127 + 200 * turn
+    path = dead_reckoning(ticks, TABLE_2, model="arc")
+    assert 3.1 < np.ptp(path[:, 2]) < 3.2
+    markers = path[rng.integers(0, len(path), 30)] + rng.uniform(-1, 1, (30, 3))
+    frame = np.arange(10, len(path), 10)
+    z = se2.between(path[frame - 10, None], markers)
+    near = np.hypot(*z.T[:2]).T < 1.5
+    row, marker = near.nonzero()
+    aruco = ArucoReadings(frame[row], marker, z[near] + 0.01 * rng.standard_normal((near.sum(), 3)),
+                          np.tile(1e-4 * np.eye(3), (near.sum(), 1, 1)))
+    drive = Dataset("lanes", vehicle, ticks, aruco, None, None)
+    jumps = find_jumps(drive)
+    assert jumps.lag == 10 - stated and not len(jumps.start)
+    found = slam.estimate(drive)
+    lag, = (row for row in found.calibration_table if row["name"] == "sighting_lag")
+    assert found.released == {"time-offset"} and abs(lag["estimate"] - 10) < 4 * lag["sigma"] < 0.5
+    assert ate(found.poses, path) < 3e-3 and found.rejected.mean() < 0.01
 
 
 @pytest.mark.parametrize("options", [

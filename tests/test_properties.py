@@ -29,7 +29,7 @@ from slamlib.solve import Failure, solutions
 from slamlib.summary import summarize
 
 QUICK = settings(max_examples=3 * settings.default.max_examples)
-FEW = settings(max_examples=settings.default.max_examples // 3)
+HALF, FEW = (settings(max_examples=settings.default.max_examples // by) for by in (2, 6))
 
 # Drives.
 
@@ -188,6 +188,7 @@ def test_files_of_any_bytes_are_read_or_refused_in_one_sentence(files):
 # All problems: estimates with covariances, or a reason that is true.
 
 @pytest.mark.slow
+@HALF
 @given(drives())
 def test_every_small_drive_is_solved(drive):
     """Estimates are finite with positive definite covariances; what fails, says truly why."""
@@ -342,8 +343,6 @@ def mirrored(dataset):
         uwb=uwb, antenna_guess=guess and replace(guess, position=guess.position * sign[:2]))
 
 
-
-
 def begun_by(leg, dataset):
     """The Dataset of a drive that begins elsewhere: with `leg`, (steps, right and left counts)."""
     ticks = np.concatenate([[[0, 0]], np.tile(leg[1:], (leg[0], 1))])
@@ -379,22 +378,16 @@ SIMULATED = simulated()
 @FEW
 @example(SIMULATED, 1, 1e-3)
 @given(drives(), st.integers(0, 2**32 - 1), st.sampled_from([1e-3, None]))
-def test_ids_and_the_order_of_rows_are_names_only(drive, seed, slip):
+def test_ids_the_order_of_rows_and_the_side_are_names_only(drive, seed, slip):
+    """Other ids in files in the opposite order; and the same drive in a mirror."""
     ids = sorted({row[1] for row in drive.sightings} | {row[0] for row in drive.guesses})
     numbers = dict(zip(ids, np.random.default_rng(seed).permutation(ids).tolist()))
-    other, before = read(reversed_rows(renumbered(drive, numbers))), solved(read(drive), slip)
+    dataset, other = read(drive), read(reversed_rows(renumbered(drive, numbers)))
+    before = solved(dataset, slip)
     assert drive is not SIMULATED or {"problem2_fused", "problem3", "problem4"} <= before.keys()
-    assert_same(before, solved(other, slip), ROUNDING if slip else LEARNED, numbers)
-
-
-@pytest.mark.slow
-@FEW
-@example(SIMULATED)
-@given(drives())
-def test_a_drive_in_a_mirror_has_mirrored_estimates(drive):
-    dataset = read(drive)
-    assert_same(solved(dataset, slip=1e-3), solved(mirrored(dataset), slip=1e-3), ROUNDING,
-                factor=(1, -1, -1))
+    tolerance = ROUNDING if slip else LEARNED
+    assert_same(before, solved(other, slip), tolerance, numbers)
+    assert_same(before, solved(mirrored(dataset), slip), tolerance, factor=(1, -1, -1))
 
 
 @pytest.mark.slow

@@ -57,7 +57,7 @@ def motion_doubts(dataset):
     markers, wheels, sigma = moving_increments(dataset)
     if len(wheels) < MIN_COUNT:
         return []
-    turned = np.concatenate([wheels[:, :2] @ np.swapaxes(AXES, 1, 2),
+    turned = np.concatenate([wheels[:, :2] @ AXES.mT,
                              np.linalg.det(AXES)[:, None, None] * wheels[:, 2:]], axis=2)
     size = np.maximum(*(np.hypot(*_sizes(each).T) for each in (markers[0], wheels)))
     agree = np.linalg.norm(_sizes(markers - turned[:, None]), axis=-1) \

@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 
 from slamlib import increments, se2
-from slamlib.increments import SLIP_BOUNDS, SLIP_FACTOR, TYPICAL_SLIP, log_slip_prior
+from slamlib.increments import SLIP_BOUNDS, SLIP_FACTOR, TYPICAL_SLIP
 from slamlib.marker_increments import common_sightings
 from slamlib.memory import error_memory
 from slamlib.odometry_gate import NO_JUMPS, Jumps, find_jumps
@@ -44,7 +44,6 @@ class Fusion:
 
     poses: np.ndarray            # (n, 3) in the world frame, m and rad
     covariances: np.ndarray      # (n, 3, 3) of [x, y, heading] in world axes
-    measured: np.ndarray         # (f,) pose indices from 0 of the frames
     rejected: int                # number of sightings not used; repeated ones are used once
     slip: float | None = None    # sqrt(m), given or learned
     wheel: np.ndarray | None = None             # (3,) m, R_R, R_L, b estimated at the last frame
@@ -87,9 +86,9 @@ def fuse(dataset, slip=None, model="arc"):
 
     `slip` in sqrt(m) is the standard deviation of the slip of one wheel after 1 m; None takes that
     of the dataset's Vehicle or, if it has none, the maximum of the posterior density by the
-    innovations and `log_slip_prior`. A marker_noise_factor of the Vehicle multiplies the standard
-    deviations of the sightings. `model` is that of the increments, "arc" or "euler"; another one
-    raises ValueError.
+    innovations and the prior of `increments`. A marker_noise_factor of the Vehicle multiplies the
+    standard deviations of the sightings. `model` is that of the increments, "arc" or "euler";
+    another one raises ValueError.
 
     >>> from slamlib.simulation import simulate
     >>> dataset, truth = simulate("short", seed=1)
@@ -122,7 +121,7 @@ def fuse(dataset, slip=None, model="arc"):
         for begin, end in zip(blocks, blocks[1:]))))
     repeated = len(dataset.aruco.pose) - sum(len(z) for z, *_ in given.frames)
     return Fusion(
-        poses=poses, covariances=pose_covariances, measured=given.pose, slip=slip,
+        poses=poses, covariances=pose_covariances, slip=slip,
         rejected=state.rejected + repeated, wheel=given.vehicle.wheel + x[-1, 3:],
         wheel_covariance=covariances[-1, 3:, 3:])
 
@@ -132,11 +131,13 @@ def _likeliest_slip(given):
 
     The first three points are the median of the prior and one standard deviation to both sides.
     """
-    def log_density(log_slip):
-        return _filter(given, np.exp(log_slip))[2].log_likelihood + log_slip_prior(log_slip)
+    middle, step = np.log([TYPICAL_SLIP, SLIP_FACTOR])
 
-    step = np.log(SLIP_FACTOR)
-    points = {point: log_density(point) for point in np.log(TYPICAL_SLIP) + step * np.arange(-1, 2)}
+    def log_density(log_slip):
+        return _filter(given, np.exp(log_slip))[2].log_likelihood \
+            - ((log_slip - middle) / step)**2 / 2
+
+    points = {point: log_density(point) for point in middle + step * np.arange(-1, 2)}
     for _ in range(MAX_SLIP_STEPS):
         best = max(points, key=points.get)
         below = max((point for point in points if point < best), default=None)
@@ -302,4 +303,4 @@ def _poses_from_frames(given, slip, x, covariances, pose):
     A, B = se2.compose_jacobians(x[last, :3], delta)
     F = np.concatenate([A, B @ by_w], axis=2)
     return (se2.compose(x[last, :3], delta),
-            F @ covariances[last] @ np.swapaxes(F, 1, 2) + B @ Q @ np.swapaxes(B, 1, 2))
+            F @ covariances[last] @ F.mT + B @ Q @ B.mT)

@@ -41,7 +41,7 @@ def equation2_from(ticks, vehicle, start, poses, covariances):
     np.cumsum(J[:, :, 3] * sigma_heading[:, None], axis=0, out=integral[1:, :, 3])
     integral -= integral[start[part]]
     return (se2.compose(poses[part], se2.between(driven[start[part]], driven)),
-            covariances[part] + integral @ np.swapaxes(integral, 1, 2))
+            covariances[part] + integral @ integral.mT)
 
 
 def first_order_from(ticks, vehicle, start, poses, covariances):
@@ -54,7 +54,7 @@ def first_order_from(ticks, vehicle, start, poses, covariances):
     A, B = se2.compose_jacobians(poses[part], delta)
     G = B @ by_w * vehicle.sigma_wheel
     return (se2.compose(poses[part], delta),
-            A @ covariances[part] @ np.swapaxes(A, 1, 2) + G @ np.swapaxes(G, 1, 2))
+            A @ covariances[part] @ A.mT + G @ G.mT)
 
 
 def fuse_increments(dataset, propagation=equation2_from):
@@ -71,7 +71,7 @@ def fuse_increments(dataset, propagation=equation2_from):
     turned = (se2.rotation(heading[:-1]) @ delta[:, :2, None])[..., 0]
     poses = np.column_stack([odometry.cumulative(turned), heading])
     A, B = se2.compose_jacobians(poses[:-1], delta)
-    noise, covariances = B @ C @ np.swapaxes(B, 1, 2), np.zeros((len(frame), 3, 3))
+    noise, covariances = B @ C @ B.mT, np.zeros((len(frame), 3, 3))
     covariances[0, 2, 2] = vehicle.sigma_heading**2
     for k, (start, end) in enumerate(zip(frame, frame[1:])):
         if found.usable[k]:
@@ -83,7 +83,7 @@ def fuse_increments(dataset, propagation=equation2_from):
     path, path_covariances = propagation(ticks, vehicle, frame, poses, covariances)
     path[frame], path_covariances[frame] = poses, covariances
     used = np.union1d(*(r[found.accepted] for r in (found.first, found.second)))
-    return Fusion(poses=path, covariances=path_covariances, measured=frame,
+    return Fusion(poses=path, covariances=path_covariances,
                   rejected=len(dataset.aruco.pose) - len(used))
 
 
@@ -104,4 +104,4 @@ def _fused_increments(dataset, frame, found, propagation):
     C[use] = gain @ found.covariance[use]
     fused = by_odometry.copy()
     fused[use] += (gain @ difference[use, :, None])[..., 0]
-    return fused, (C + np.swapaxes(C, 1, 2)) / 2
+    return fused, (C + C.mT) / 2

@@ -37,7 +37,6 @@ class Localization:
     frame: np.ndarray               # (f,) pose index from 0 of every frame
     poses: np.ndarray               # (f, 3) in the first localized frame, m and rad; or NaN
     covariances: np.ndarray         # (f, 3, 3)
-    parent: np.ndarray              # (f,) row of the frame its increment starts at, -1 for none
     rejected: np.ndarray            # (m,) bool, rejected, or a repetition (`merge_repeated`)
     unused: np.ndarray              # (m,) bool, sightings of markers that no adjacent frame sees
     marker: np.ndarray              # (k,) ids of the mapped markers, ascending
@@ -77,7 +76,6 @@ def localize(aruco, shared_errors=True):
     rejected[sightings.index], unused[sightings.index] = paired & ~confirmed, ~paired
     return Localization(
         frame=sightings.frame, poses=poses, covariances=covariances,
-        parent=np.array([links[f][0] if f in links else -1 for f in range(len(poses))]),
         rejected=rejected, unused=unused, marker=marker, marker_in_world=in_world,
         marker_covariance=marker_covariance)
 
@@ -133,7 +131,7 @@ def _compose_increments(sightings, links, root, shared_errors):
         if shared_errors:
             rows = slice(*np.searchsorted(found.pair, (pair, pair + 1)))
             first, second = found.first[rows], found.second[rows]
-            S = A @ np.sum(H[first] @ np.swapaxes(B @ found.J_first[rows], 1, 2), axis=0)
+            S = A @ np.sum(H[first] @ (B @ found.J_first[rows]).mT, axis=0)
             covariances[f] += S + S.T
             H[second] = B @ found.J_second[rows] @ sightings.C[second]
     return poses, covariances, H
@@ -147,9 +145,8 @@ def _map_markers(sightings, used, poses, covariances, H):
     row, marker, z, C = (values[used] for values in (
         sightings.row, sightings.marker, sightings.z, sightings.C))
     E, F = se2.compose_jacobians(poses[row], z)
-    T = E @ H[used] @ np.swapaxes(F, 1, 2)
-    covariance = (E @ covariances[row] @ np.swapaxes(E, 1, 2) + F @ C @ np.swapaxes(F, 1, 2)
-                  + T + np.swapaxes(T, 1, 2))
+    T = E @ H[used] @ F.mT
+    covariance = E @ covariances[row] @ E.mT + F @ C @ F.mT + T + T.mT
     in_world = se2.compose(poses[row], z)
     in_world[:, 2] = se2.wrap(in_world[:, 2])
     best = consensus(marker, in_world, covariance)

@@ -17,7 +17,8 @@ between them ties visits together. A visit whose landmark is further from all ea
 id than this path explains is another place (`places_of_ids`).
 """
 
-from dataclasses import dataclass, replace
+from collections import namedtuple
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -26,9 +27,11 @@ from slamlib import se2
 from slamlib.dataset import DatasetError
 from slamlib.memory import runs
 from slamlib.odometry import MODELS
+from slamlib.odometry_gate import NO_JUMPS, find_jumps
 from slamlib.slam.factors import preintegrate_odometry
 from slamlib.slam.fit import accepted_measurements, kept_weights, refine, residuals
 from slamlib.slam.linear import NormalEquations, linear_solution, log_evidence
+from slamlib.slam.result import slam_result
 
 DECISIVE_LEAD = 3.0          # log evidence by which another model of the steps replaces the default
 DECISIVE_RELEASE = 6.0       # log evidence by which a group leaves its stated values
@@ -37,7 +40,6 @@ STATED = 3.0                 # log evidence beside it, if standard deviations ar
 AMBIGUOUS = 3.0              # log evidence within which explanations cannot be told apart
 MAX_WIDE_SIGMAS = 4.0        # wide sigmas, of an entry; beyond them a statement is grossly wrong
 GROSS = 10.0                 # factor on the wide sigmas then
-MIN_ACCEPTED = 0.98          # of the accepted measurements, that a proposed set accepts too
 MIN_INFORMATION = 1e-3       # about an entry, in wide sigmas, below which it is not considered
 MAX_PROPOSALS = 5            # number of sets that are solved
 
@@ -46,7 +48,6 @@ MIN_VISIT = 3                # number of accepted sightings of a visit that is c
 MAX_REJECTED_SHARE = 0.5     # of the sightings of a visit
 MAX_STILL_REJECTED = 0.5     # of the rejected sightings, by an explanation that is believed
 PLACE_GATE = 60.0            # squared distance of x, y, heading in sigmas, beyond it another place
-MIN_DISTANCE_OF_PLACES = 0.1     # m or rad; what is closer is one place
 MIN_SIGMA = 0.02             # m or rad, of the path between two visits
 
 
@@ -67,68 +68,41 @@ def better_model(fit):
                    explanations=fit.explanations)
 
 
-def calibrated(fit, accept=accepted_measurements):
-    """The Fit in which groups of the calibration have left their stated values.
-
-    Errors that a wrong statement makes look like errors with memory, which hide it. So where errors
-    have memory, a set is also proposed as if they were independent, and must then lead by its prior
-    odds, with the memory that remains.
-
-    `accept` as in `refine`. It is that of `fit` if the evidence speaks for none.
-    """
-    tried, widths = [], (1.0, GROSS)
+def calibrated(fit):
+    """The Fit in which groups of the calibration have left their stated values."""
+    tried, stated = [], fit.problem.measurements.calibration.stated
     for _ in range(MAX_PROPOSALS):
-        proposal, least = _proposal(fit, widths), 0.0
-        problem = fit.problem
+        problem, proposal = fit.problem, _proposal(fit)
         fit = replace(fit, explanations=proposal.explanations)
-        if np.array_equal(proposal.sigma, problem.sigma) and problem.accepted.share is not None:
-            independent = replace(problem, accepted=replace(problem.accepted, share=None))
-            proposal = _proposal(replace(fit, problem=independent), widths)
-            least = proposal.odds
         if np.array_equal(proposal.sigma, problem.sigma) or proposal.groups in tried:
             break
         tried.append(proposal.groups)
-        stated = problem.measurements.calibration.stated
         state = replace(fit.state, c=np.where(proposal.sigma > 0, fit.state.c, stated))
         try:
-            proposed = refine(replace(problem, sigma=proposal.sigma, released=proposal.groups),
-                              state, accept)
+            proposed = refine(
+                replace(problem, sigma=proposal.sigma, released=proposal.groups), state)
             lead = _lead(proposed, fit)
         except (DatasetError, np.linalg.LinAlgError):
             break
-        least = least if proposal.lead >= 0 else proposal.lead - DECISIVE_RELEASE
-        kept, present = (each.problem.accepted.weight.sum() for each in (proposed, fit))
-        off = np.abs(proposed.state.c - stated) > MAX_WIDE_SIGMAS * proposal.sigma
-        far = off[proposal.sigma > 0].any()
-        if lead < least or kept < MIN_ACCEPTED * present or far and len(widths) == 1:
+        if lead < (0.0 if proposal.lead >= 0 else proposal.lead - DECISIVE_RELEASE):
             break
-        if far:
-            tried, widths = [], widths[1:]
-            continue
         fit = replace(proposed, explanations=proposal.explanations)
     return fit
 
 
-@dataclass(frozen=True)
-class _Proposal:
-    """Which groups of the calibration the evidence wants to be released."""
-
-    explanations: tuple      # of frozensets of groups, of which each one explains the drive
-    groups: frozenset        # to release: of all explanations, and what raises the evidence at all
-    sigma: np.ndarray        # (p,) with these groups released
-    lead: float              # log evidence over that of the prior as it is
-    odds: float              # log prior odds against the best explanation
+_Proposal = namedtuple("_Proposal", "explanations groups sigma lead")
 
 
-def _proposal(fit, widths):
-    """The _Proposal for a Fit, with the first of `widths`, factors on wide sigmas, that suffices.
+def _proposal(fit):
+    """Which groups of the calibration of a Fit the evidence wants to be released: a _Proposal.
 
     Every released group must raise the log evidence by its prior odds: DECISIVE_RELEASE,
     FURTHER_ENTRY more for each of its entries but one, and STATED more if its standard deviations
-    are stated. Explanations are the best set and others that come within AMBIGUOUS of it, neither
-    part of it nor more: the drive cannot tell them apart. What else raises the evidence is not
-    certain enough to be told, but the covariances have to include it. If an entry would be further
-    off than MAX_WIDE_SIGMAS, a statement is grossly wrong, and wide sigmas are multiplied by GROSS.
+    are stated. `explanations`, frozensets of groups, are the best set and others that come within
+    AMBIGUOUS of it, neither part of it nor more: the drive cannot tell them apart. `groups` are all
+    of theirs, and what else raises the evidence: not certain enough to be told, but the covariances
+    have to include it. `lead` is the log evidence over that of the prior as it is. Of `sigma` (p,)
+    the wide ones are multiplied by GROSS if an entry would be further off than MAX_WIDE_SIGMAS.
     """
     calibration = fit.problem.measurements.calibration
     L, h = _likelihood(fit)
@@ -138,15 +112,14 @@ def _proposal(fit, widths):
     stated = frozenset(calibration.group[calibration.sigma > 0].tolist())
     sets = [frozenset(some) for count in range(len(candidates) + 1)
             for some in combinations(candidates, count)]
-    for width in widths:
-        evidence, odds, merit, largest = {}, {}, {}, {}
+    for width in (1.0, GROSS):
+        evidence, merit, largest = {}, {}, {}
         for some in sets:
             sigma = calibration.sigma_without(some, width) / calibration.wide * informed
             evidence[some], largest[some] = _log_evidence(L, h, sigma)
             entries = np.count_nonzero(np.isin(calibration.group, list(some)))
-            odds[some] = DECISIVE_RELEASE * len(some) + FURTHER_ENTRY * (entries - len(some)) \
-                + STATED * len(some & stated)
-            merit[some] = evidence[some] - odds[some]
+            merit[some] = evidence[some] - DECISIVE_RELEASE * len(some) \
+                - FURTHER_ENTRY * (entries - len(some)) - STATED * len(some & stated)
         best = max(merit, key=merit.get)
         if not best or largest[best] < MAX_WIDE_SIGMAS:
             break
@@ -155,8 +128,8 @@ def _proposal(fit, widths):
     certain = frozenset().union(*explanations)
     more = max((some for some in evidence if certain <= some), key=evidence.get)
     present, _ = _log_evidence(L, h, fit.problem.sigma / calibration.wide * informed)
-    return _Proposal(explanations=explanations, groups=more, lead=evidence[more] - present,
-                     sigma=calibration.sigma_without(more, width), odds=odds[best])
+    return _Proposal(explanations, more, calibration.sigma_without(more, width),
+                     evidence[more] - present)
 
 
 def _log_evidence(L, h, sigma):
@@ -216,6 +189,25 @@ def _with_fixed_weights(fit):
     return replace(accepted, weight=np.r_[accepted.sighting_weight, ranges], range_kernel=None)
 
 
+def most_consistent(dataset, solve):
+    """The Fit that rejects few sightings, and `SlamResult.places`, None if each id is one place.
+
+    `solve` makes the Fit of Jumps and of places. Jumps of odometry, or else places of ids, are
+    believed where they spare most of the sightings that are rejected without them. A few jumps need
+    no such support.
+    """
+    jumps = find_jumps(dataset)
+    fit = solve(jumps if jumps.are_few else replace(NO_JUMPS, lag=jumps.lag))
+    if len(jumps.start) and not jumps.are_few:
+        other = solve(jumps)
+        fit = other if spares_sightings(other, fit) else fit
+    if has_rejected_visits(fit):
+        places = places_of_ids(dataset.aruco, solve)
+        if places is not None and spares_sightings(other := solve(places=places), fit):
+            return other, places
+    return fit, None
+
+
 def visits(aruco):
     """Number (m,) of the visit of every one of ArucoReadings, from 0, by id, then by time."""
     order = np.lexsort((aruco.pose, aruco.marker))
@@ -223,12 +215,6 @@ def visits(aruco):
     if (marker[1:] == marker[:-1]).any():
         _, number = runs(marker, aruco.pose[order], VISIT_GAP)
     return number[np.argsort(order)]
-
-
-def with_places(dataset, places):
-    """The Dataset with the ids of `SlamResult.places` for its markers, or itself if it is None."""
-    return dataset if places is None else replace(
-        dataset, aruco=replace(dataset.aruco, marker=places[:, 1]))
 
 
 def contradicted(fit, factor):
@@ -261,15 +247,15 @@ def spares_sightings(fit, other):
     return bool(count < MAX_STILL_REJECTED * most)
 
 
-def places_of_ids(dataset, solve):
-    """`SlamResult.places` of a Dataset, None if each id is one place.
+def places_of_ids(aruco, solve):
+    """`SlamResult.places` of ArucoReadings, None if each id is one place; `solve` as above.
 
-    The function `solve` makes the SlamResult of a Dataset, here of markers alone. The second place
-    of id 12 gets the number 112 where ids have up to two digits, the third one 212.
+    The second place of id 12 gets the number 112 where ids have up to two digits, the third one
+    212.
     """
-    marker, number = dataset.aruco.marker, visits(dataset.aruco)
+    marker, number = aruco.marker, visits(aruco)
     try:
-        result = solve(with_places(replace(dataset, uwb=None), np.stack([marker, number], axis=1)))
+        result = slam_result(solve(places=np.stack([marker, number], axis=1)))
     except (DatasetError, np.linalg.LinAlgError):
         return None
     ids, digits = marker.copy(), 10**len(str(marker.max()))
@@ -300,8 +286,6 @@ def _squared_distance(result, first, second, pose, later):
     first, second = result.marker_in_world[np.searchsorted(result.marker, [first, second])]
     difference = second - first
     difference[2] = se2.wrap(difference[2])
-    if np.abs(difference).max() < MIN_DISTANCE_OF_PLACES:
-        return 0.0
     poses, P = result.poses[[pose, later]], result.covariances[[pose, later]]
     A, _ = se2.compose_jacobians(poses, se2.between(poses, second))
     start, end = A @ P @ A.mT

@@ -8,7 +8,7 @@ have memory, measurements keep a share of their information (`slamlib.memory`).
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 
 import gtsam
 import numpy as np
@@ -226,7 +226,7 @@ def refine(problem, state, accept=accepted_measurements, preintegrate=preintegra
     share, fixed, changed = problem.accepted.share, accept is None, np.inf
     if fixed:
         problem = replace(problem, accepted=replace(problem.accepted, share=None))
-        accept = _those_of_the_problem
+        accept = lambda problem, _: problem.accepted
     else:
         problem = replace(problem, noise=noise_of_scatter(problem, state))
     accepted = accept(problem, state)
@@ -257,17 +257,12 @@ def refine(problem, state, accept=accepted_measurements, preintegrate=preintegra
                converged=optimum.converged)
 
 
-def _those_of_the_problem(problem, state):
-    """The AcceptedMeasurements of a Problem, whatever the State."""
-    return problem.accepted
-
-
 def _shares(problem, state, accept):
     """Shares (s + r,) that the memory of errors leaves to measurements, None if there is none."""
-    m, both = problem.measurements, (np.zeros(1), np.zeros(1))
-    problem = replace(problem, noise=with_hidden_errors(problem.noise, both, m.dataset.vehicle))
+    m = problem.measurements
+    noise = with_hidden_errors(problem.noise, (True, True), m.dataset.vehicle)
     share = np.concatenate([memory.share for memory in error_memories(
-        accept(problem, state), *residuals(m, state, problem.noise))])
+        accept(replace(problem, noise=noise), state), *residuals(m, state, noise))])
     return share if (share < 1).any() else None
 
 
@@ -276,11 +271,9 @@ def _with_shares(problem, state, posterior, share, accept):
 
     The noise is that learned without shares, with hidden errors.
     """
-    vehicle, shares = problem.measurements.dataset.vehicle, problem.measurements.by_kind(share)
-
-    def hidden(noise):
-        return with_hidden_errors(noise, shares, vehicle)
-
+    m = problem.measurements
+    hidden = partial(with_hidden_errors, vehicle=m.dataset.vehicle, remember=[
+        (each < 1).any() for each in m.by_kind(share)])
     problem = replace(problem, noise=hidden(problem.noise))
     problem = replace(problem, accepted=replace(accept(problem, state), share=share))
     return problem, posterior and replace(posterior, noise=problem.noise, points=tuple(

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from slamlib import odometry, se2
-from slamlib.sightings import consensus, evenly_chosen
-from slamlib.slam.calibration import ANTENNAS, HEIGHT, OFFSET, SCALE, SIZE, WHEELS
-from slamlib.slam.factors import MIN_DISTANCE, preintegrate_odometry, sensor_poses
+from slamlib.sightings import consensus
+from slamlib.slam.calibration import ANTENNAS, HEIGHT, OFFSET, SCALE, SIGHTING_LAG, SIZE, WHEELS
+from slamlib.slam.factors import MIN_DISTANCE, sensor_poses
 from slamlib.slam.fit import narrow_kernels
 from slamlib.slam.linear import build_problem, state_from_arrays
 from slamlib.slam.measurements import GUESS_PRIOR_SIGMA, measure
@@ -36,8 +36,8 @@ GRID = (200, 361)            # numbers of radii and angles of the grid of `secon
 GRID_MARGIN = 1.5            # of the longest range, by which the grid exceeds the path
 
 
-def initial_state(measurements, model, preintegrate=preintegrate_odometry):
-    """The State from which a drive is solved; `model` and `preintegrate` as in `build_problem`.
+def initial_state(measurements, model):
+    """The State from which a drive is solved, by odometry of the model "arc" or "euler".
 
     Raises DatasetError as `optimize`, for the first part of a long drive.
     """
@@ -48,7 +48,7 @@ def initial_state(measurements, model, preintegrate=preintegrate_odometry):
         earlier, part = part, measure(
             measurements.dataset.first(count), frame[frame < count], measurements.jumps)
         state = odometry_state(part, model, earlier, state)
-        state = narrow_kernels(build_problem(part, model, preintegrate=preintegrate), state)
+        state = narrow_kernels(build_problem(part, model), state)
     return odometry_state(measurements, model, part, state)
 
 
@@ -96,9 +96,7 @@ def consensus_markers(measurements, in_world, covariances):
 
     `in_world` (s, 3) and `covariances` (s, 3, 3) are the marker poses by each sighting.
     """
-    chosen = evenly_chosen(measurements.marker_row, MAX_VOTES)
-    best = consensus(measurements.marker_row[chosen], in_world[chosen], covariances[chosen])
-    return in_world[chosen[best]]
+    return in_world[consensus(measurements.marker_row, in_world, covariances, MAX_VOTES)]
 
 
 def trilaterated_antennas(measurements, poses, covariances, c):
@@ -114,10 +112,13 @@ def state_from_poses(measurements, poses, covariances, c=None, markers=consensus
     Poses (f, 3) and covariances (f, 3, 3) are in world axes, c (p,) is the calibration, None
     as stated. The functions `markers` and `antennas` initialise the landmarks; studies pass others.
     """
-    s, c = measurements.sightings, measurements.calibration.stated if c is None else c
+    s = measurements.sightings
+    if c is None:
+        c = measurements.calibration.stated.copy()
+        c[SIGHTING_LAG] += measurements.jumps.lag
     camera, z = sensor_poses(measurements, poses, c)[0], s.z * [c[SIZE], c[SIZE], 1]
     A, B = se2.compose_jacobians(camera, z)
-    C = A @ covariances[s.row] @ np.swapaxes(A, 1, 2) + B @ s.C @ np.swapaxes(B, 1, 2)
+    C = A @ covariances[s.row] @ A.mT + B @ s.C @ B.mT
     return state_from_arrays(measurements, poses, markers(measurements, se2.compose(camera, z), C),
                              antennas(measurements, poses, covariances, c), c)
 
@@ -220,7 +221,7 @@ def _cost(ranges, places):
     gradient = ((root * first)[:, None] @ direction)[:, 0] + first_guess / GUESS_PRIOR_SIGMA
     lateral = root * first / distance                            # because the direction turns
     radial = (root**2 * second - lateral)[..., None] * direction
-    hessian = np.swapaxes(direction, 1, 2) @ radial
+    hessian = direction.mT @ radial
     hessian[:, [0, 1], [0, 1]] += lateral.sum(1)[:, None] + second_guess / GUESS_PRIOR_SIGMA**2
     cost = np.log1p((e / KERNEL_SCALE)**2).sum(1) + np.log1p((e_guess / KERNEL_SCALE)**2).sum(1)
     return KERNEL_SCALE**2 / 2 * cost, gradient, hessian

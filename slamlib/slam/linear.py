@@ -103,14 +103,15 @@ def build_problem(measurements, model, noise=None, wheel=None, preintegrate=prei
     Without a Noise it is the typical one. Parameters that the Vehicle gives replace its own.
     `preintegrate` makes the OdometryFactors of steps of the `model`, "arc" or "euler", linearised
     at `wheel` (3,) m, None for the stated one; studies pass other functions. The calibration is as
-    stated.
+    stated, but for the delay of sightings that are late.
     """
+    late = frozenset({"time-offset"} if measurements.jumps.lag else ())
     return Problem(
         odometry=preintegrate(measurements, model, wheel),
         accepted=AcceptedMeasurements(
             measurements=measurements, weight=measurements.unit_weights),
         noise=with_known(noise or Noise(), measurements.dataset.vehicle),
-        sigma=measurements.calibration.sigma)
+        sigma=measurements.calibration.sigma_without(late), released=late)
 
 
 class Group(NamedTuple):

@@ -8,7 +8,7 @@ Rue, Martino and Chopin, J. R. Stat. Soc. B 71(2), 2009), so that the covariance
 slip is uncertain.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -47,16 +47,16 @@ def error_memories(accepted, sighting_residuals, range_residuals):
             error_memory(r.antenna, m.frame[r.row], range_residuals[:, None], direct))
 
 
-def with_hidden_errors(noise, shares, vehicle):
+def with_hidden_errors(noise, remember, vehicle):
     """The Noise with larger factors for errors with memory, of which residuals show only a part.
 
-    The factor of a sensor with any of its `shares`, (s,) and (r,), below 1 is at least 1, but at
-    most HIDDEN_RATIO times the learned one. Those that a Vehicle gives stay.
+    The factors of sightings and of ranges, where their errors `remember` (2,), are at least 1, but
+    at most HIDDEN_RATIO times the learned ones. Those that a Vehicle gives stay.
     """
     sightings, ranges = (
-        max(factor, min(1.0, HIDDEN_RATIO * factor)) if (share < 1).any() else factor
-        for factor, share in zip((noise.sightings, noise.ranges), shares))
-    return with_known(replace(noise, sightings=sightings, ranges=ranges), vehicle)
+        max(factor, min(1.0, HIDDEN_RATIO * factor)) if remembers else factor
+        for factor, remembers in zip((noise.sightings, noise.ranges), remember))
+    return with_known(Noise(noise.slip, sightings, ranges), vehicle)
 
 
 def log_prior(logarithms):
@@ -88,9 +88,9 @@ def learn_noise(equations):
     if value < SINGULAR / 2:                             # nothing can be learned
         return NoisePosterior(noise, np.zeros((3, 3)), SINGULAR, ((1.0, noise),))
     smallest = 1 / np.sqrt(2 * np.maximum([3 * len(m.frame), *equations.counts()], 1))
-    mode, log_density_of_mode, covariance = _mode(log_posterior, start, value, free, smallest[free])
-    return NoisePosterior(Noise.from_logarithms(mode), covariance, log_density_of_mode,
-                          _points(log_posterior, mode, log_density_of_mode, covariance))
+    mode, value, covariance = _mode(log_posterior, start, value, free, smallest[free])
+    return NoisePosterior(Noise.from_logarithms(mode), covariance, value,
+                          _points(log_posterior, mode, value, covariance))
 
 
 def _mode(function, x, value, free, steps):
@@ -134,11 +134,11 @@ def _mode(function, x, value, free, steps):
     return x, value, full
 
 
-def _points(log_posterior, mode, log_density_of_mode, covariance):
+def _points(log_posterior, mode, value, covariance):
     """Tuple of (probability, Noise) along the slip, each with the most probable factors.
 
     Each point has the root mean square exp(mu + s^2) of its log-normal noise parameters.
-    `mode` (3,) and `covariance` (3, 3) are of the logarithms.
+    `mode` (3,), with its `value`, and `covariance` (3, 3) are of the logarithms.
     """
     sigma = np.sqrt(covariance[0, 0])
     direction = covariance[0] / (sigma or 1)     # (3,) for one sigma of log slip; 0 if it is known
@@ -146,7 +146,7 @@ def _points(log_posterior, mode, log_density_of_mode, covariance):
         remaining, offsets, weights = covariance, [0.0], np.ones(1)
     else:
         remaining, offsets = covariance - np.outer(direction, direction), POINT_OFFSETS
-        logs = np.array([log_posterior(mode + offset * direction) if offset else log_density_of_mode
+        logs = np.array([log_posterior(mode + offset * direction) if offset else value
                          for offset in offsets])
         weights = np.exp(logs - logs.max())
     variance = np.maximum(np.diag(remaining), 0)

@@ -10,22 +10,9 @@ from gtsam import NonlinearFactorGraph
 
 from slamlib.dataset import Dataset
 from slamlib.odometry import MODELS
-from slamlib.odometry_gate import NO_JUMPS, find_jumps
-from slamlib.slam.choices import (
-    better_model,
-    calibrated,
-    has_rejected_visits,
-    places_of_ids,
-    spares_sightings,
-    with_places,
-)
-from slamlib.slam.factors import preintegrate_odometry
-from slamlib.slam.fit import (
-    CAUCHY_SCALES,
-    narrow_kernels,
-    refine,
-    solved_by_gtsam,
-)
+from slamlib.odometry_gate import NO_JUMPS
+from slamlib.slam.choices import better_model, calibrated, most_consistent
+from slamlib.slam.fit import CAUCHY_SCALES, narrow_kernels, refine, solved_by_gtsam
 from slamlib.slam.initialization import initial_state, state_from_poses
 from slamlib.slam.linear import build_problem
 from slamlib.slam.measurements import Noise, measure
@@ -78,67 +65,41 @@ def estimate(dataset, slip=None, model=None, previous=None, *, marker_noise_fact
 "asymmetric Cauchy" or "quadratic" or "Huber" or "Cauchy" or "Geman-McClure" or "Tukey" for \
 kernel, found 'L2'
     """
-    if not isinstance(dataset, Dataset):
-        raise error("slam.estimate", "expected a Dataset, such as read_dataset(folder), found "
-                    f"{quoted(dataset)}")
-    if not isinstance(factors, (NonlinearFactorGraph, type(None))):
-        raise error("slam.estimate", "expected a gtsam.NonlinearFactorGraph for factors, found "
-                    f"{quoted(factors)}")
-    if model not in (None, *MODELS):
-        raise error("slam.estimate", f"expected {' or '.join(MODELS)} for model, found "
-                    f"{quoted(model)}")
+    for value, right, expected in (
+            (dataset, isinstance(dataset, Dataset), "a Dataset, such as read_dataset(folder)"),
+            (factors, isinstance(factors, (NonlinearFactorGraph, type(None))),
+             "a gtsam.NonlinearFactorGraph for factors"),
+            (model, model in (None, *MODELS), f"{' or '.join(MODELS)} for model")):
+        if not right:
+            raise error("slam.estimate", f"expected {expected}, found {quoted(value)}")
     options = {"slip": slip, "marker_noise_factor": marker_noise_factor,
                "range_noise_factor": range_noise_factor, "kernel": kernel, "gate": gate}
     dataset = replace(dataset, vehicle=changed(dataset.vehicle, {
         key: value for key, value in options.items() if value is not None}, "slam.estimate"))
 
     def solve(jumps=NO_JUMPS, places=None):
-        return _fit(measure(with_places(dataset, places), (), jumps, factors), model, previous)  # 1
+        aruco = dataset.aruco if places is None else replace(dataset.aruco, marker=places[:, 1])
+        measurements = measure(replace(dataset, aruco=aruco), (), jumps, factors)     # 1
+        if previous is not None:
+            return calibrated(fit_from_previous(measurements, previous, model))
+        fit = fit_from_odometry(measurements, model or "arc")                         # 2 to 6
+        fit = calibrated(fit if model else better_model(fit))
+        # Wrong statements may look like other steps.
+        return better_model(fit) if fit.problem.released and not model else fit
 
     if previous is not None and len(previous.rejected):
         places = previous.places
         fit = solve(previous.jumps, places)
     else:
-        fit, places = _most_consistent(dataset, solve)
+        fit, places = most_consistent(dataset, solve)
     return replace(slam_result(solved_by_gtsam(fit)), places=places)                  # 7
 
 
-def _most_consistent(dataset, solve):
-    """The Fit that rejects few sightings, and `SlamResult.places`; `solve` as in `estimate`.
-
-    Jumps of odometry, or else places of ids, are believed where they spare most of the sightings
-    that are rejected without them. A few jumps need no such support.
-    """
-    jumps = find_jumps(dataset)
-    fit = solve(jumps if jumps.are_few else NO_JUMPS)
-    if len(jumps.start) and not jumps.are_few:
-        other = solve(jumps)
-        fit = other if spares_sightings(other, fit) else fit
-    if has_rejected_visits(fit):
-        places = places_of_ids(dataset, lambda data: slam_result(_fit(measure(data))))
-        if places is not None and spares_sightings(other := solve(places=places), fit):
-            return other, places
-    return fit, None
-
-
-def _fit(measurements, model=None, previous=None):
-    """The Fit of Measurements, with calibration; other arguments as of `estimate`."""
-    if previous is not None:
-        return calibrated(fit_from_previous(measurements, previous, model))
-    fit = fit_from_odometry(measurements, model or "arc")                             # 2 to 6
-    fit = calibrated(fit if model else better_model(fit))
-    # Wrong statements may look like other steps.
-    return better_model(fit) if fit.problem.released and not model else fit
-
-
-def fit_from_odometry(measurements, model="arc", preintegrate=preintegrate_odometry):
-    """The Fit of Measurements with start values by odometry.
-
-    `model` and `preintegrate` as in `build_problem`. Raises DatasetError as `estimate`.
-    """
-    problem = build_problem(measurements, model, preintegrate=preintegrate)           # 2
-    state = narrow_kernels(problem, initial_state(measurements, model, preintegrate))    # 4, 5
-    return refine(problem, state, preintegrate=preintegrate)                          # 6
+def fit_from_odometry(measurements, model="arc"):
+    """The Fit of Measurements with start values by odometry; raises DatasetError as `estimate`."""
+    problem = build_problem(measurements, model)                                      # 2
+    state = narrow_kernels(problem, initial_state(measurements, model))               # 4, 5
+    return refine(problem, state)                                                     # 6
 
 
 def fit_from_previous(measurements, previous, model=None):
