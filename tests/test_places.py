@@ -34,8 +34,8 @@ def moved():
     place = truth.marker_in_world[np.searchsorted(truth.marker, aruco.marker)]
     later = np.isin(aruco.marker, marker) & (aruco.pose >= len(dataset.ticks) * 2 // 3)
     angle = dict(zip(marker.tolist(), rng.uniform(-np.pi, np.pi, len(marker))))
-    step = np.array([[0.5 * np.cos(angle[j]), 0.5 * np.sin(angle[j]), 0.0] if moves else np.zeros(3)
-                     for j, moves in zip(aruco.marker.tolist(), later)])
+    angle = np.array([angle.get(j, 0.0) for j in aruco.marker.tolist()])
+    step = 0.5 * later[:, None] * np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1)
     pose = truth.poses[aruco.pose]
     change = se2.between(pose, place + step) - se2.between(pose, place)
     return changed(dataset, "aruco", marker_in_vehicle=aruco.marker_in_vehicle + change), \

@@ -21,18 +21,19 @@ def name_of(file):
 MODULES = {name_of(file): ast.parse(file.read_text(encoding="utf-8")) for file in FILES}
 
 
-def imports(module):
-    """Names of slamlib's modules that a module imports, in functions too."""
-    found = set()
+def imported(module):
+    """Full names of what a module imports, in functions too, beside the modules that hold them."""
     for node in ast.walk(MODULES[module]):
         if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
+            yield from ((alias.name, alias.name) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert not node.level, f"{module}: expected absolute imports"
-            for alias in node.names:
-                inner = f"{node.module}.{alias.name}"
-                found.add(inner if inner in MODULES else node.module)
-    return {name for name in found if name in MODULES}
+            yield from ((f"{node.module}.{alias.name}", node.module) for alias in node.names)
+
+
+def imports(module):
+    """Names of slamlib's modules that a module imports."""
+    return {name if name in MODULES else owner for name, owner in imported(module)} & {*MODULES}
 
 
 def package(module):
@@ -43,12 +44,8 @@ def package(module):
 
 def outside(module):
     """Names of the packages besides slamlib that a module imports, and "importlib"."""
-    names = {name for node in ast.walk(MODULES[module]) if isinstance(node, ast.Import)
-             for name in (alias.name for alias in node.names)}
-    names |= {node.module for node in ast.walk(MODULES[module]) if isinstance(node, ast.ImportFrom)}
-    names = {name.partition(".")[0] for name in names}
-    return {name for name in names if name not in sys.stdlib_module_names - {"importlib"}
-            and name != "slamlib"}
+    names = {owner.partition(".")[0] for _, owner in imported(module)}
+    return names - (sys.stdlib_module_names - {"importlib"}) - {"slamlib"}
 
 
 def test_numerics_use_numpy_scipy_and_gtsam_only():

@@ -5,23 +5,8 @@ detects variables that the measurements do not determine. The steps before, and 
 noise, solve the same linearised graph by normal equations in numpy, all factors of a kind at once.
 
 Read `pipeline` first: its function `estimate` is the whole way from a dataset to the result. Each
-stage makes the record of the next. The modules by stage (4 uses 5 on long drives):
-
-    1  calibration          the table of what measurements share: wheels, places, sizes, delays
-       measurements         Dataset -> Measurements: arrays, their weights, noise and structure
-       own                  keys and values of GTSAM, and factors of one's own
-    2  factors              odometry between the frames; errors and derivatives of all factors
-    3  linear               State, the values of all variables; Problem, the factor graph; both ->
-                            the linearised graph, and the evidence, for all values of the noise
-       graph                the same graph in GTSAM; Problem, State -> Optimum by Gauss-Newton
-    4  initialization       Measurements -> State: the start values, antennas by trilateration
-    5  fit                  Problem, State -> State by ever narrower robust kernels; -> Fit: wheels,
-                            noise, accepted measurements, memory of errors, in turn (stage 6)
-    6  noise                Problem, State -> posterior of slip and noise factors
-       choices              Fit -> Fit: arcs or Euler's steps, and which statements about wheels and
-                            sensors are wrong; SlamResult -> ids of markers that are several places
-    7  covariances          Fit -> State and Covariances, averaged over the posterior of the noise
-       result               Fit -> SlamResult in world axes, with the poses between the frames
+stage makes the record of the next: Measurements, Problem and State, Fit, SlamResult. Modules begin
+with the number of their stage, by which docs/code.md lists them.
 
 Symbols in code and docstrings; sizes are f frames, k markers, a antennas, s sightings, r ranges,
 n unknowns besides the calibration, three of every variable, and (m, d) are m measurements of a kind

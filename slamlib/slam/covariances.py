@@ -5,9 +5,9 @@ frames (block tridiagonal), E between them and b, and F about b,
 
     Cov(b) = (F - E^T T^-1 E)^-1 = C C^T,    Cov(frames) = T^-1 + M M^T,    M = T^-1 E C,
 
-and the blocks of T^-1 between neighbours follow by cyclic reduction (`chain_inverse`). All
-sums are of positive terms. GTSAM's marginals are the same numbers, one query at a time; a test
-compares them.
+and the blocks of T^-1 between neighbours follow from a banded Cholesky decomposition of T. All sums
+are of positive terms. GTSAM's marginals are the same numbers, one query at a time; a test compares
+them.
 
 The result averages them over the points of the noise posterior (`posterior_moments`). With
 probability p_k of point k, x_k its solution and C_k its covariance, the moments are
@@ -18,14 +18,15 @@ in the tangent space at the state that solves the problem of greatest posterior 
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
-from scipy.linalg import solve_triangular
-from scipy.sparse import csc_array, hstack
+from scipy.linalg import cho_solve_banded, cholesky_banded, solve_triangular
+from scipy.sparse import block_array, csc_array
 
-from slamlib import se2
 from slamlib.dataset import DatasetError
 from slamlib.slam.calibration import WHEELS
+from slamlib.slam.factors import inverse_adjoint
 from slamlib.slam.linear import laplace_approximation, retract
 
 COLUMNS_AT_ONCE = 128        # columns of M that are held in memory
@@ -37,8 +38,7 @@ class Covariances:
     """Marginal covariances, of poses and markers in their own axes, else in world axes."""
 
     pairs: np.ndarray        # (f-1, 9, 9) of [X_i, X_{i+1}, wheel parameters], wheels in m
-    markers: list            # k of (3, 3), or (2, 2) for a point
-    antennas: np.ndarray     # (a, 2, 2)
+    landmarks: np.ndarray    # (k + a, 3, 3) of markers and antennas; of a point (2, 2) counts
     c: np.ndarray            # (p, p) of the calibration, 0 where it is known
 
 
@@ -48,72 +48,55 @@ def marginal_covariances(equations, noise):
     Raises DatasetError if float rounding hides the information about the heading at pose 1, and
     numpy.linalg.LinAlgError if the equations are singular.
     """
-    problem, structure = equations.problem, equations.structure
-    v, active, n = problem.measurements.variables, problem.active, len(structure.diagonal)
+    problem, structure, active = equations.problem, equations.structure, equations.problem.active
     data, border, *_ = equations.sums(noise)
-    H = structure.matrix(data)
+    H, n, q = structure.matrix(data), len(structure.diagonal), active.sum()
     _require_digits(equations, H)
-    frames, others = np.split(structure.unknowns, [3 * len(v.frames)])
-    of_others, B = H[:, others], border[others, :-1]
-    E = csc_array(hstack([of_others[frames], border[frames, :-1]]))
-    F = np.block([[of_others[others].toarray(), B], [B.T, border[n:, :-1]]])
-    chain, chunks = structure.chain(data, v.frames), [
-        slice(i, i + COLUMNS_AT_ONCE) for i in range(0, max(1, len(F)), COLUMNS_AT_ONCE)]
+    B, D = csc_array(border[:n, :-1]), csc_array(border[n:, :-1])
+    rows = structure.rows(slice(None)).ravel()
+    frames, others = np.split(np.r_[rows, n:n + q], [3 * len(problem.measurements.frame)])
+    of_others = block_array([[H, B], [B.T, D]], format="csc")[:, others]
+    E, F = of_others[frames], of_others[others].toarray()
+    solve, own, joint = _chain_inverse(H[frames][:, frames])
+    chunks = [slice(i, i + COLUMNS_AT_ONCE) for i in range(0, len(F), COLUMNS_AT_ONCE)]
     for chunk in chunks:
-        F[:, chunk] -= E.T @ np.concatenate(chain_inverse(*chain, E[:, chunk].toarray())[2])
+        F[:, chunk] -= E.T @ solve(E[:, chunk].toarray())
     C = solve_triangular(np.linalg.cholesky(F), np.eye(len(F)), lower=True).T
-    by_c = np.zeros((len(active), len(F)))
-    by_c[active] = problem.sigma[active, None] * C[len(others):]
-    c = by_c @ by_c.T
-    own, joint, wheels = np.zeros((3, len(v.frames), 3, 3))
+    of_landmarks, of_c = np.split(C, [len(F) - q])
+    by_c, wheels = np.zeros((len(active), len(F))), np.zeros_like(own)
+    by_c[active] = problem.sigma[active, None] * of_c
     for chunk in chunks:
-        given, given_joint, M = chain_inverse(*chain, E @ -C[:, chunk])
+        M = solve(E @ C[:, chunk]).reshape(own.shape[:2] + (-1,))
         own += M @ M.mT
-        joint[:-1] += M[:-1] @ M[1:].mT
-        wheels += M @ by_c[WHEELS, chunk].T
-    own, joint = own + (given + given.mT) / 2, joint[:-1] + given_joint
+        joint += M[:-1] @ M[1:].mT
+        wheels -= M @ by_c[WHEELS, chunk].T
+    c, of_landmarks = by_c @ by_c.T, of_landmarks.reshape(-1, 3, len(F))
     of_wheels = np.broadcast_to(c[WHEELS, WHEELS], joint.shape)
     pairs = np.block([[own[:-1], joint, wheels[:-1]], [joint.mT, own[1:], wheels[1:]],
                       [wheels[:-1].mT, wheels[1:].mT, of_wheels]])
-    width = 2 + structure.is_pose[len(v.frames):]
-    blocks = [part @ part.T for part in np.split(C, np.cumsum(width))[:-1]]
-    return Covariances(pairs=pairs, markers=blocks[:len(v.markers)],
-                       antennas=np.reshape(blocks[len(v.markers):], (-1, 2, 2)), c=c)
+    return Covariances(pairs=pairs, landmarks=of_landmarks @ of_landmarks.mT, c=c)
 
 
-def chain_inverse(D, upper, right):
-    """Blocks of T^-1 on the diagonal (f, 3, 3) and above (f-1, 3, 3), and T^-1 `right` (f, 3, w).
+def _chain_inverse(T):
+    """Function from b (3 f, w) to T^-1 b; blocks of T^-1 (f, 3, 3), and (f-1, 3, 3) above these.
 
-    T is block tridiagonal, with the blocks D (f, 3, 3) on the diagonal and `upper` (f-1, 3, 3)
-    above; `right` is (3 f, w). Every second one is eliminated, given its neighbours (cyclic
-    reduction: Golub and Van Loan, Matrix Computations, 2013, section 4.5).
+    T (3 f, 3 f) is block tridiagonal. With its Cholesky factor L and W = L_{i+1,i} L_ii^-1 they are
+
+        Z_ii = L_ii^-T L_ii^-1 + W^T Z_{i+1,i+1} W,    Z_{i,i+1} = -W^T Z_{i+1,i+1}
+
+    (Takahashi, Fagan and Chin, Formation of a sparse bus impedance matrix, PICA 1973).
     """
-    count, right = len(D), right.reshape(len(D), 3, -1)
-    if count < 3:
-        whole = np.block([[D[0], upper[0]], [upper[0].T, D[1]]]) if count == 2 else D[0]
-        inverse = np.linalg.inv(whole)
-        blocks = inverse.reshape(count, 3, count, 3).swapaxes(1, 2)
-        return (blocks[range(count), range(count)], blocks[range(count - 1), range(1, count)],
-                (inverse @ np.concatenate(right)).reshape(right.shape))
-    if not count % 2:                                        # one more, which is independent
-        D = np.concatenate([D, np.eye(3)[None]])
-        upper, right = (np.pad(each, ((0, 1), (0, 0), (0, 0))) for each in (upper, right))
-    left, following, inverse = upper[::2], upper[1::2], np.linalg.inv(D[1::2])
-    K, solved = inverse @ np.concatenate([left.mT, following], axis=2), inverse @ right[1::2]
-    rest, x = D[::2].copy(), np.empty_like(right)
-    x[::2] = right[::2]
-    for to_odd, of_odd, own, own_x in ((left, K[:, :, :3], rest[:-1], x[:-1:2]),
-                                       (following.mT, K[:, :, 3:], rest[1:], x[2::2])):
-        own -= to_odd @ of_odd
-        own_x -= to_odd @ solved
-    diagonal, above = np.empty_like(D), np.empty_like(upper)
-    diagonal[::2], joint, x[::2] = chain_inverse(rest, -left @ K[:, :, 3:], x[::2])
-    S = np.block([[diagonal[:-1:2], joint], [joint.mT, diagonal[2::2]]])
-    x[1::2] = solved - K[:, :, :3] @ x[:-1:2] - K[:, :, 3:] @ x[2::2]
-    cross = -K @ S
-    diagonal[1::2] = inverse - cross @ K.mT
-    above[::2], above[1::2] = cross[:, :, :3].mT, cross[:, :, 3:]
-    return diagonal[:count], above[:count - 1], x[:count]
+    bands = [np.pad(T.diagonal(-k), (0, k))[:T.shape[0]] for k in range(6)]
+    L = cholesky_banded(bands, lower=True)
+    i, j = np.indices((3, 3))
+    blocks = L.reshape(6, -1, 3)
+    inverse = np.linalg.inv(np.tril(blocks[np.maximum(i - j, 0), :, j].transpose(2, 0, 1)))
+    W = (blocks[3 + i - j, :, j].transpose(2, 0, 1) @ inverse)[:-1]
+    Z = inverse.mT @ inverse
+    for k in reversed(range(len(W))):
+        Z[k] += W[k].T @ Z[k + 1] @ W[k]
+    Z = (Z + Z.mT) / 2
+    return partial(cho_solve_banded, (L, True)), Z, -W.mT @ Z[1:]
 
 
 def _require_digits(equations, H):
@@ -122,10 +105,13 @@ def _require_digits(equations, H):
     A common rotation of all poses and landmarks about pose 1 changes no measurement of the files:
     only priors and factors of one's own have information about it. Any more in H is rounding.
     """
-    m, turn = equations.problem.measurements, _common_turn(equations)
-    own, pairs = equations.linearized[-1].J, m.structure.factors[-1]
+    m, state, structure = equations.problem.measurements, equations.state, equations.structure
+    poses = np.concatenate([state.poses, state.markers, np.pad(state.antennas, ((0, 0), (0, 1)))])
+    turn = np.empty(len(structure.diagonal))                 # change of the unknowns, per rad
+    turn[structure.rows(slice(None))] = inverse_adjoint(poses)[:, :, 2]
+    own, pairs = equations.linearized[-1].J, structure.factors[-1]
     known = equations.priors.H @ turn**2 + np.sum(
-        (own @ turn[m.structure.rows(pairs.ravel())].reshape(-1, 6, 1))**2)
+        (own @ turn[structure.rows(pairs.ravel())].reshape(-1, 6, 1))**2)
     rounding, sigma = turn @ (H @ turn) - known, m.origin_sigma[2]
     if abs(rounding) * sigma**2 > MAX_ROUNDING:
         raise DatasetError(
@@ -134,57 +120,35 @@ def _require_digits(equations, H):
             "deviations are too small for it")
 
 
-def _common_turn(equations):
-    """Change (n,) of all unknowns per rad of a rotation of poses and landmarks about the origin."""
-    state, structure = equations.state, equations.structure
-    poses = np.concatenate([state.poses, state.markers, np.pad(state.antennas, ((0, 0), (0, 1)))])
-    lever = np.stack([-poses[:, 1], poses[:, 0]], -1)
-    turn = np.empty(len(structure.diagonal))
-    turn[structure.rows(slice(None))] = np.c_[
-        (se2.rotation(-poses[:, 2]) @ lever[:, :, None])[..., 0], structure.is_pose]
-    return turn
-
-
 def posterior_moments(fit):
     """Mean State, Covariances, and root mean square of the slip in sqrt(m), of a Fit.
 
     Raises DatasetError and LinAlgError as `marginal_covariances`.
     """
-    noise, equations = fit.problem.noise, fit.equations
-    if fit.posterior is None:
-        return fit.state, marginal_covariances(equations, noise), noise.slip
-    weights, noises = zip(*fit.posterior.points)
+    problem, equations = fit.problem, fit.equations
+    weights, noises = zip(*fit.posterior.points) if fit.posterior else ((1.0,), (problem.noise,))
     weights = np.array(weights) / sum(weights)
     slip = np.sqrt(weights @ np.square([point.slip for point in noises]))
     conditional = [marginal_covariances(equations, point) for point in noises]
     if len(noises) == 1:
         return fit.state, conditional[0], slip
     x = np.stack([laplace_approximation(equations, point)[0] for point in noises])
-    x -= laplace_approximation(equations, noise)[0]
-    mean = weights @ x
-    return (retract(fit.problem, fit.state, mean),
-            _averaged(fit.problem, conditional, x - mean, weights), slip)
-
-
-def _averaged(problem, conditional, x, weights):
-    """The Covariances averaged over points, with solutions x (p, n + q) about the mean."""
-    structure, v = problem.measurements.structure, problem.measurements.variables
-    c = len(structure.diagonal) + np.arange(len(problem.sigma))
-    off = np.zeros((len(x), c[-1] + 1))                    # also of what is known of c
-    off[:, np.r_[:c[0], c[problem.active]]] = x
-    off[:, c] *= problem.sigma
+    x -= laplace_approximation(equations, problem.noise)[0]
+    mean, structure, n = weights @ x, equations.structure, len(equations.structure.diagonal)
+    off = np.zeros((len(x), n + len(problem.sigma)))         # from the mean; 0 of what is known
+    off[:, np.r_[:n, n + np.flatnonzero(problem.active)]] = x - mean
+    off[:, n:] *= problem.sigma
 
     def averaged(blocks, rows):
         """sum p_k (C_k + x_k x_k^T) of blocks p of (..., d, d) at rows (..., d)."""
         x_k = off[:, rows]
         return np.einsum("p,p...->...", weights,
-                         np.stack([*blocks]) + x_k[..., :, None] * x_k[..., None, :])
+                         np.stack(blocks) + x_k[..., :, None] * x_k[..., None, :])
 
-    frames = structure.rows(v.frames)
+    c = n + np.arange(len(problem.sigma))
+    frames, landmarks = np.split(structure.rows(slice(None)), [len(problem.measurements.frame)])
     pairs = [frames[:-1], frames[1:], np.broadcast_to(c[WHEELS], frames[1:].shape)]
-    return Covariances(
-        pairs=averaged((C.pairs for C in conditional), np.concatenate(pairs, axis=1)),
-        markers=[averaged((C.markers[j] for C in conditional), rows)
-                 for j, rows in enumerate(structure.rows_of_each(v.markers))],
-        antennas=averaged((C.antennas for C in conditional), structure.rows(v.antennas, 2)),
-        c=averaged((C.c for C in conditional), c))
+    return retract(problem, fit.state, mean), Covariances(
+        pairs=averaged([C.pairs for C in conditional], np.concatenate(pairs, axis=1)),
+        landmarks=averaged([C.landmarks for C in conditional], landmarks),
+        c=averaged([C.c for C in conditional], c)), slip

@@ -1,16 +1,11 @@
 """Stage 2: errors and derivatives of all factors, in numpy, all factors of a kind at once.
 
-Odometry: with the increment Delta between the frames X and X' the error
-
-    e = log(Delta^-1 X^-1 X')
-
+With the increment Delta between the frames X and X' the error of odometry, log(Delta^-1 X^-1 X'),
 is that of GTSAM's between factor, except that Delta depends on the wheel parameters, which all
-odometry factors share.
-
-Measurements: of a sensor in the vehicle's origin the factor of a marker with a heading is GTSAM's
-between factor, that of a range its range factor; `calibration` has the model. Without headings a
-marker is a point. Errors are whitened, and weighted by their kernels. Derivatives by poses are by
-GTSAM's tangent vectors: X moves as X exp(xi), in its own axes.
+odometry factors share. Of a sensor in the vehicle's origin the factor of a marker with a heading is
+GTSAM's between factor, that of a range its range factor; `calibration` has the model. Without
+headings a marker is a point. Errors are whitened, and weighted by their kernels. Derivatives by
+poses are by GTSAM's tangent vectors: X moves as X exp(xi), in its own axes.
 """
 
 from dataclasses import dataclass
@@ -18,21 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from slamlib import increments, se2
-from slamlib.slam.calibration import (
-    ANTENNAS,
-    CAMERA,
-    HEIGHT,
-    OFFSET,
-    RANGE_LAG,
-    RANGES,
-    SCALE,
-    SIGHTING_LAG,
-    SIGHTINGS,
-    SIZE,
-    TAG_PLACE,
-    WHEELS,
-)
+from slamlib.slam import calibration
+from slamlib.slam.calibration import RANGES, SIGHTINGS, WHEELS
 from slamlib.slam.measurements import square_root_information
+from slamlib.slam.own import linearized_own
 
 MINIMUM_SIGMA = 1e-5         # m, standard deviation of an increment's end along x and y
 MIN_DISTANCE = 1e-9          # m, below which a range has no direction
@@ -54,11 +38,6 @@ class OdometryFactors:
     def covariance(self, slip):
         """Q (f-1, 3, 3) for a slip in sqrt(m)."""
         return self.quantization + slip**2 * self.slipping
-
-    def whitening(self, slip):
-        """Square root information U (f-1, 3, 3), U^T U = Q^-1, and sum log|Q|, for a slip."""
-        U = square_root_information(self.covariance(slip))
-        return U, -2 * float(np.sum(np.log(np.diagonal(U, axis1=1, axis2=2))))
 
 
 def preintegrate_odometry(measurements, model, wheel=None):
@@ -104,16 +83,16 @@ def odometry_error(factors, poses, wheel):
     e, J = se2.log(difference), se2.log_jacobian(difference)
     by_first = -J @ by_h @ _moved_by(h)
     by_second = J @ se2.compose_jacobians(difference, np.zeros(3))[1]         # by X' xi
-    by_wheel = J @ by_z @ factors.J_wheel
+    by_poses, by_wheel = np.concatenate([by_first, by_second], axis=2), J @ by_z @ factors.J_wheel
+    if not factors.in_counts:
+        return e, by_poses, by_wheel
     radius, ratio = factors.wheel[:2].mean(), factors.wheel / factors.stated
-    scale = factors.stated[:2].mean() / radius * np.array([1, 1, ratio[2]]) \
-        if factors.in_counts else np.ones(3)
+    scale = factors.stated[:2].mean() / radius * np.array([1, 1, ratio[2]])
     relative = np.array([3 * [-1 / radius / 2], 3 * [-1 / radius / 2],
-                         [0, 0, 1 / factors.wheel[2]]]).T * factors.in_counts   # by the wheels
+                         [0, 0, 1 / factors.wheel[2]]]).T                      # by the wheels
     linearized = e - by_wheel @ change                              # at the wheels of linearisation
     grown = 1 + relative @ change
-    return (scale * (e + (grown - 1) * linearized),
-            (scale * grown)[:, None] * np.concatenate([by_first, by_second], axis=2),
+    return (scale * (e + (grown - 1) * linearized), (scale * grown)[:, None] * by_poses,
             scale[:, None] * (by_wheel + relative * linearized[:, :, None]))
 
 
@@ -137,7 +116,8 @@ def linearize_odometry(problem, state):
     J_c = J_c[:, :, active] * problem.sigma[WHEELS][active]
 
     def linearized(slip):
-        U, log_determinant = factors.whitening(slip)
+        U = square_root_information(factors.covariance(slip))
+        log_determinant = -2 * float(np.sum(np.log(np.diagonal(U, axis1=1, axis2=2))))
         whitened = (U @ e[..., None])[..., 0]
         return LinearizedFactors(
             index=np.arange(len(e)), e=whitened, J=U @ J, J_c=U @ J_c,
@@ -148,37 +128,28 @@ def linearize_odometry(problem, state):
 
 
 def linearize_measurements(problem, state):
-    """The LinearizedFactors of sightings of poses, of points, and of ranges at a State."""
-    return (linearize_sightings(problem, state, as_pose=True),
-            linearize_sightings(problem, state, as_pose=False), linearize_ranges(problem, state))
+    """The LinearizedFactors of sightings of poses, of points, of ranges, and of one's own."""
+    m, accepted, c, linearized = problem.measurements, problem.accepted, state.c, []
+    s, r = m.sightings, m.ranges
 
+    def motions(row, lag):
+        return delayed(m, row, c[lag], not problem.active[lag])
 
-def linearize_sightings(problem, state, as_pose):
-    """The LinearizedFactors of markers with a heading (`as_pose`), or of points."""
-    accepted, m, s = problem.accepted, problem.measurements, problem.measurements.sightings
-    kind = np.flatnonzero(m.as_pose == as_pose)
-    index = np.flatnonzero(accepted.sighting_weight[kind])
-    rows = kind[index]
-    row = s.row[rows]
-    motion = delayed(m, row, state.c[SIGHTING_LAG], not problem.active[SIGHTING_LAG])
-    e, by_pose, by_marker, by_c = sighting_error(
-        s.z[rows], state.poses[row], *motion, state.markers[m.marker_row[rows]], state.c, as_pose)
-    return _whitened(problem, SIGHTINGS, index, rows, e, [by_pose, by_marker], by_c,
-                     m.sighting_roots[0 if as_pose else 1][rows])
-
-
-def linearize_ranges(problem, state):
-    """The LinearizedFactors of the ranges at a State."""
-    accepted, m, r = problem.accepted, problem.measurements, problem.measurements.ranges
+    for as_pose, roots in zip((True, False), m.sighting_roots):
+        kind = np.flatnonzero(m.as_pose == as_pose)
+        index = np.flatnonzero(accepted.sighting_weight[kind])
+        rows = kind[index]
+        linearized.append(_whitened(problem, SIGHTINGS, index, rows, *sighting_error(
+            s.z[rows], state.poses[s.row[rows]], *motions(s.row[rows], calibration.SIGHTING_LAG),
+            state.markers[m.marker_row[rows]], c, as_pose), roots[rows]))
     rows = np.flatnonzero(accepted.range_weight)
-    antenna, row = r.antenna[rows], r.row[rows]
-    motion = delayed(m, row, state.c[RANGE_LAG], not problem.active[RANGE_LAG])
-    e, by_pose, by_antenna, by_c = range_error(
-        r.distance[rows], state.poses[row], *motion, state.antennas[antenna],
-        state.c[ANTENNAS][antenna], state.c)
-    by_offset = (antenna[:, None] == np.arange(len(m.antenna)))[:, None]
-    return _whitened(problem, RANGES, rows, rows, e[:, None], [by_pose, by_antenna],
-                     np.concatenate([by_c, by_offset], axis=2), 1 / r.sigma[rows, None, None])
+    linearized.append(_whitened(problem, RANGES, rows, rows, *range_error(
+        r.distance[rows], state.poses[r.row[rows]], *motions(r.row[rows], calibration.RANGE_LAG),
+        state.antennas, r.antenna[rows], c), 1 / r.sigma[rows, None, None]))
+    e, J, error = linearized_own(problem, state)
+    return *linearized, LinearizedFactors(
+        index=np.arange(len(e)), e=e, J=J, J_c=np.zeros((*e.shape, 0)), columns=np.zeros(0, int),
+        weight=np.ones(len(e)), error=error)
 
 
 def sighting_error(z, poses, motion, velocity, markers, c, as_pose):
@@ -189,7 +160,7 @@ def sighting_error(z, poses, motion, velocity, markers, c, as_pose):
     the errors (m, 3) are log(z^-1 h) of the expected sighting h, of points (m, 2) they are h - z.
     The derivatives are (m, d, 3), (m, d, d) and (m, d, 5). GTSAM: BetweenFactorPose2.
     """
-    camera, size, d = c[CAMERA], c[SIZE], 3 if as_pose else 2
+    camera, size, d = c[calibration.CAMERA], c[calibration.SIZE], 3 if as_pose else 2
     mounted = se2.compose(motion, camera)                            # camera in vehicle
     Y = se2.compose(poses, mounted)
     seen = se2.between(Y, markers)
@@ -201,25 +172,52 @@ def sighting_error(z, poses, motion, velocity, markers, c, as_pose):
     else:
         e, by_h = (h - z)[:, :2], np.broadcast_to(np.eye(2, 3), (len(z), 2, 3))
     by_seen = by_h / [size, size, 1]
-    by_Y = -by_seen @ _moved_by(seen)                                # in the axes of the camera
     by_marker = np.concatenate([                                     # a point's in the world
         by_seen[:, :, :2] @ se2.rotation(seen[:, 2] if as_pose else -Y[:, 2]),
         by_seen[:, :, 2:]], axis=2)[:, :, :d]
-    by_c = np.empty((len(z), d, 5))
-    by_c[:, :, :3] = _transported(by_Y, np.r_[0.0, 0.0, camera[2]])
-    by_c[:, :, 3] = -np.einsum("mdi,mi->md", by_seen[:, :, :2], h[:, :2])
-    by_c[:, :, 4] = -np.einsum("mdi,mi->md", _transported(by_Y, camera), velocity)
-    return e, _transported(by_Y, mounted), by_marker, by_c
+    by_pose, by_camera, by_lag = _by_sensor(-by_seen @ _moved_by(seen), mounted, camera, velocity)
+    by_size = -np.einsum("mdi,mi->md", by_seen[:, :, :2], h[:, :2])
+    return e, by_pose, by_marker, np.concatenate(
+        [by_camera, by_size[:, :, None], by_lag[:, :, None]], axis=2)
 
 
-def _transported(by_end, motion):
-    """Derivatives (m, d, 3) by a pose X in its axes, from those `by_end` of X composed with motion.
+def range_error(r, poses, motion, velocity, antennas, antenna, c):
+    """Errors (m, 1) of ranges r (m,), m, to the rows `antenna` (m,) of antennas (a, 2), m.
 
-    The derivative of exp(xi) M = M exp(xi') is the adjoint of M^-1.
+    Also derivatives by pose (m, 1, 3), antenna (m, 1, 2) and the columns RANGES of c (m, 1, 6 + a).
+    `motion` and `velocity` as in `sighting_error`. GTSAM: RangeFactor2D.
     """
+    tag = np.r_[c[calibration.TAG_PLACE], 0.0]
+    mounted = se2.compose(motion, tag)                               # tag in vehicle
+    Y = se2.compose(poses, mounted)
+    difference = antennas[antenna] - Y[:, :2]
+    squared = np.sum(difference**2, axis=1) + 2 * c[calibration.HEIGHT]
+    distance = np.sqrt(np.maximum(squared, MIN_DISTANCE**2))
+    slope = np.where(squared > MIN_DISTANCE**2, c[calibration.SCALE] / distance, 0.0)
+    by_antenna = (slope[:, None] * difference)[:, None]              # in the world
+    by_Y = np.pad(-by_antenna @ se2.rotation(Y[:, 2]), ((0, 0), (0, 0), (0, 1)))
+    by_pose, by_tag, by_lag = _by_sensor(by_Y, mounted, tag, velocity)
+    by_c = np.c_[by_tag[:, 0, :2], slope, np.ones(len(r)), distance, by_lag,
+                 np.eye(len(antennas))[antenna]]
+    e = c[calibration.OFFSET] + c[calibration.ANTENNAS][antenna] + c[calibration.SCALE] * distance
+    return (e - r)[:, None], by_pose, by_antenna, by_c[:, None]
+
+
+def _by_sensor(by_Y, mounted, place, velocity):
+    """Derivatives by the vehicle's pose and a sensor's place, (m, d, 3), and by its lag (m, d).
+
+    From those by the pose Y of the sensor, in its axes (m, d, 3). Its `place` (3,) in the vehicle
+    is `mounted` (m, 3) with the motion since; `velocity` (m, 3) is the vehicle's.
+    """
+    return (by_Y @ inverse_adjoint(mounted), by_Y @ inverse_adjoint(place * [0, 0, 1]),
+            -np.einsum("mdi,mi->md", by_Y @ inverse_adjoint(place), velocity))
+
+
+def inverse_adjoint(motion):
+    """Derivatives (..., 3, 3) of xi' by xi where exp(xi) M = M exp(xi'), of motions M (..., 3)."""
     adjoint, R_t = _moved_by(motion), se2.rotation(-motion[..., 2])
     adjoint[..., :2, :2], adjoint[..., :2, 2:] = R_t, R_t @ adjoint[..., :2, 2:]
-    return by_end @ adjoint
+    return adjoint
 
 
 def _moved_by(h):
@@ -227,59 +225,27 @@ def _moved_by(h):
     return se2.compose_jacobians(np.zeros(3), h)[0]
 
 
-def camera_poses(measurements, poses, c):
-    """Poses (s, 3) of the camera in the world at the sightings, from those of the frames (f, 3)."""
-    row = measurements.sightings.row
-    motion, _ = delayed(measurements, row, c[SIGHTING_LAG])
-    return se2.compose(poses[row], se2.compose(motion, c[CAMERA]))
+def sensor_poses(measurements, poses, c):
+    """Poses in the world of the camera at the sightings (s, 3), of the tag at the ranges (r, 3).
 
-
-def tag_positions(measurements, poses, c):
-    """Positions (r, 2) in m of the tag in the world at the ranges, from poses of the frames."""
-    row = measurements.ranges.row
-    motion, _ = delayed(measurements, row, c[RANGE_LAG])
-    return se2.compose(poses[row], se2.compose(motion, np.r_[c[TAG_PLACE], 0.0]))[:, :2]
-
-
-def expected_sightings(measurements, state):
-    """Markers (s, 3) as they are seen from a State, without noise."""
-    markers = state.markers[measurements.marker_row]
-    size = state.c[SIZE]
-    return se2.between(camera_poses(measurements, state.poses, state.c), markers) / [size, size, 1]
-
-
-def expected_ranges(measurements, state):
-    """Ranges (r,) in m that are measured from a State, without noise."""
-    c, antenna = state.c, measurements.ranges.antenna
-    difference = state.antennas[antenna] - tag_positions(measurements, state.poses, c)
-    distance = np.sqrt(np.maximum(np.sum(difference**2, axis=1) + 2 * c[HEIGHT], 0))
-    return c[OFFSET] + c[ANTENNAS][antenna] + c[SCALE] * distance
-
-
-def range_error(r, poses, motion, velocity, antennas, offset, c):
-    """Errors (m,) of ranges r (m,) m, and derivatives by pose, antenna and c.
-
-    `motion` and `velocity` as in `sighting_error`; `offset` (m,) m is that of each antenna. The
-    derivatives are (m, 1, 3), (m, 1, 2), and (m, 1, 6) by the columns of RANGES without the offsets
-    of antennas. GTSAM: RangeFactor2D.
+    From poses (f, 3) of the frames and the calibration c (p,). The tag has the vehicle's heading.
     """
-    heading = poses[:, 2] + motion[:, 2]
-    lever = se2.compose(motion, np.r_[c[TAG_PLACE], 0.0])[:, :2]          # tag in vehicle
-    position = se2.compose(poses, np.pad(lever, ((0, 0), (0, 1))))[:, :2]
-    difference = antennas - position
-    squared = np.sum(difference**2, axis=1) + 2 * c[HEIGHT]
-    distance = np.sqrt(np.maximum(squared, MIN_DISTANCE**2))
-    slope = np.where(squared > MIN_DISTANCE**2, c[SCALE] / distance, 0.0)
-    direction = slope[:, None] * difference                          # by the antenna, in the world
-    in_vehicle = -(direction[:, None] @ se2.rotation(poses[:, 2]))[:, 0]
-    by_pose = np.concatenate([in_vehicle, np.sum(
-        in_vehicle * np.stack([-lever[:, 1], lever[:, 0]], -1), axis=1, keepdims=True)], axis=1)
-    by_tag = -(direction[:, None] @ se2.rotation(heading))[:, 0]
-    moved = velocity[:, :2] + velocity[:, 2:] * [-c[TAG_PLACE][1], c[TAG_PLACE][0]]
-    by_c = np.stack([by_tag[:, 0], by_tag[:, 1], slope, np.ones(len(r)), distance,
-                     -np.sum(by_tag * moved, axis=1)], -1)
-    e = c[OFFSET] + offset + c[SCALE] * distance - r
-    return e, by_pose[:, None], direction[:, None], by_c[:, None]
+    m, tag = measurements, np.r_[c[calibration.TAG_PLACE], 0.0]
+    kinds = ((m.sightings.row, calibration.SIGHTING_LAG, c[calibration.CAMERA]),
+             (m.ranges.row, calibration.RANGE_LAG, tag))
+    return [se2.compose(poses[row], se2.compose(delayed(m, row, c[lag])[0], place))
+            for row, lag, place in kinds]
+
+
+def expected_measurements(measurements, state):
+    """Markers (s, 3) as they are seen, and ranges (r,) in m, from a State, without noise."""
+    m, c, antenna = measurements, state.c, measurements.ranges.antenna
+    size = c[calibration.SIZE]
+    camera, tag = sensor_poses(m, state.poses, c)
+    squared = np.sum((state.antennas[antenna] - tag[:, :2])**2, axis=1) + 2 * c[calibration.HEIGHT]
+    return (se2.between(camera, state.markers[m.marker_row]) / [size, size, 1],
+            c[calibration.OFFSET] + c[calibration.ANTENNAS][antenna]
+            + c[calibration.SCALE] * np.sqrt(np.maximum(squared, 0)))
 
 
 def delayed(measurements, row, lag, is_known=True):
@@ -299,7 +265,7 @@ def delayed(measurements, row, lag, is_known=True):
             se2.log(se2.between(smooth[i], smooth[k])))
 
 
-def _whitened(problem, kind, index, rows, e, jacobians, by_c, U):
+def _whitened(problem, kind, index, rows, e, by_pose, by_landmark, by_c, U):
     """The LinearizedFactors of errors e (m, d), and derivatives, of the sightings or ranges `rows`.
 
     `by_c` (m, d, u) are the derivatives by the columns `kind` of the calibration, and U (m, d, d)
@@ -308,8 +274,6 @@ def _whitened(problem, kind, index, rows, e, jacobians, by_c, U):
     sign of measured minus expected, as in GTSAM.
     """
     accepted, noise, active = problem.accepted, problem.noise, problem.active[kind]
-    columns = np.cumsum(problem.active)[kind][active] - 1
-    by_c = by_c[:, :, active] * problem.sigma[kind][active]
     weight, share, factor, kernel, bias = (
         (accepted.range_weight, accepted.shares[1], noise.ranges, accepted.range_kernel,
          accepted.range_bias) if kind == RANGES else
@@ -322,9 +286,11 @@ def _whitened(problem, kind, index, rows, e, jacobians, by_c, U):
     if kernel is not None:
         size = (-e[:, 0] if e.shape[1] == 1 else np.linalg.norm(e, axis=1)).tolist()
         kept, loss = share * [*map(kernel.weight, size)], np.array([*map(kernel.loss, size)])
-    weight, error = weight * kept, np.sum(share * loss)
-    U, e = U * np.sqrt(kept)[:, None, None], e * np.sqrt(kept)[:, None]
+    U = U * np.sqrt(kept)[:, None, None]
     J = np.zeros((*e.shape, 6))
-    J[:, :, :3 + jacobians[1].shape[2]] = U @ np.concatenate(jacobians, axis=2)
+    J[:, :, :3 + by_landmark.shape[2]] = U @ np.concatenate([by_pose, by_landmark], axis=2)
     return LinearizedFactors(
-        index=index, e=e, J=J, J_c=U @ by_c, columns=columns, weight=weight, error=float(error))
+        index=index, e=e * np.sqrt(kept)[:, None], J=J,
+        J_c=U @ (by_c[:, :, active] * problem.sigma[kind][active]),
+        columns=np.cumsum(problem.active)[kind][active] - 1, weight=weight * kept,
+        error=float(np.sum(share * loss)))

@@ -17,7 +17,7 @@ from scipy.optimize import brentq
 from slamlib import se2
 from slamlib.sightings import GATE, POINT_GATE
 from slamlib.slam.calibration import WHEELS
-from slamlib.slam.factors import expected_ranges, expected_sightings, preintegrate_odometry
+from slamlib.slam.factors import expected_measurements, preintegrate_odometry
 from slamlib.slam.graph import CONVERGED, optimize
 from slamlib.slam.linear import NormalEquations, Problem, State, laplace_approximation
 from slamlib.slam.measurements import AcceptedMeasurements, Noise, with_known
@@ -143,12 +143,13 @@ def residuals(measurements, state, noise):
     (r,) of the ranges, positive for a range that is too long.
     """
     m, s, r = measurements, measurements.sightings, measurements.ranges
-    difference = s.z - expected_sightings(m, state)
+    seen, distance = expected_measurements(m, state)
+    difference = s.z - seen
     difference[:, 2] = se2.wrap(difference[:, 2]) * m.as_pose
     C = s.C.copy()
     C[~m.as_pose, 2] = C[~m.as_pose, :, 2] = [0, 0, 1]          # an independent heading
     return (np.linalg.solve(np.linalg.cholesky(C), difference[..., None])[..., 0] / noise.sightings,
-            (r.distance - expected_ranges(m, state)) / r.sigma / noise.ranges)
+            (r.distance - distance) / r.sigma / noise.ranges)
 
 
 def narrow_kernels(problem, state, scales=CAUCHY_SCALES, converged=CONVERGED):

@@ -7,7 +7,7 @@ would be slow: GTSAM copies all values for every call.
 """
 
 import re
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -17,7 +17,7 @@ from slamlib.dataset import DatasetError
 from slamlib.slam.factors import linearize_odometry
 from slamlib.slam.linear import NormalEquations, State, retract
 from slamlib.slam.measurements import WEAK_SIGMA
-from slamlib.slam.own import INDICES, gtsam_values, variable_keys
+from slamlib.slam.own import gtsam_values, variable_keys
 
 CONVERGED = 1e-6             # decrease, over 1 + error, at which iterations end
 ROUNDING = 1e-12             # relative increase of the error that is due to float rounding
@@ -25,23 +25,14 @@ MAX_GAUSS_NEWTON_STEPS = 40  # number of steps
 MAX_HALVINGS = 8             # number of halvings of one step
 
 
-@dataclass(frozen=True)
-class Optimum:
+class Optimum(NamedTuple):
     """The end of Gauss-Newton."""
 
     equations: NormalEquations
-    steps: int                         # number of steps taken
-    converged: bool                    # whether the error had stopped to decrease
-
-    @property
-    def state(self) -> State:
-        """The State where the error is smallest."""
-        return self.equations.state
-
-    @property
-    def error(self):
-        """Half the sum of squared whitened errors there."""
-        return self.equations.error
+    state: State             # where the error is smallest
+    error: float             # half the sum of squared whitened errors there
+    steps: int               # number of steps taken
+    converged: bool          # whether the error had stopped to decrease
 
 
 def optimize(problem, state, max_steps=MAX_GAUSS_NEWTON_STEPS, by_gtsam=False,
@@ -59,16 +50,15 @@ def optimize(problem, state, max_steps=MAX_GAUSS_NEWTON_STEPS, by_gtsam=False,
         equations = None                                   # of a long drive they are large
         if step is None:
             step = gtsam_step(problem, state)
-        for _ in range(MAX_HALVINGS):
-            equations = NormalEquations(problem, retract(problem, state, step))
+        for scale in 0.5**np.arange(MAX_HALVINGS):
+            equations = NormalEquations(problem, retract(problem, state, scale * step))
             if equations.error <= (1 + ROUNDING) * error:
                 break
-            step = step / 2
         else:
-            equations, ended = NormalEquations(problem, state), True
-            break
+            equations = NormalEquations(problem, state)
         ended = error - equations.error <= converged * (1 + error)
-    return Optimum(equations, steps, ended)
+    return Optimum(equations=equations, state=equations.state, error=equations.error, steps=steps,
+                   converged=ended)
 
 
 def gtsam_step(problem, state):
@@ -78,9 +68,9 @@ def gtsam_step(problem, state):
     root then decides whether the measurements determine every variable. Raises DatasetError if they
     do not.
     """
-    m, linear = problem.measurements, linearize(problem, state)
-    variables, ordering = _keys(problem), gtsam.Ordering()
-    for i in [*np.argsort(m.structure.position), *range(len(m.structure.position), len(variables))]:
+    m, linear, ordering = problem.measurements, linearize(problem, state), gtsam.Ordering()
+    variables, structure = _keys(problem), m.structure
+    for i in [*np.argsort(structure.position), *range(len(structure.position), len(variables))]:
         ordering.push_back(variables[i])
     try:
         solution = linear.eliminateMultifrontal(ordering).optimize()
@@ -90,11 +80,19 @@ def gtsam_step(problem, state):
         except RuntimeError as error:             # GTSAM's, with the variable and much advice
             raise DatasetError(
                 f"{m.dataset.name}: expected measurements that determine every pose and landmark; "
-                f"these do not determine {_variable(m, str(error))}") from None
-    n = len(m.structure.diagonal)
+                f"these do not determine {_variable(problem, str(error))}") from None
+    n = len(structure.diagonal)
     step = np.zeros(n + problem.active.sum())
-    step[np.r_[m.structure.unknowns, n:len(step)]] = solution.vector(gtsam.KeyVector(variables))
+    step[np.r_[structure.unknowns, n:len(step)]] = solution.vector(gtsam.KeyVector(variables))
     return step
+
+
+def _variable(problem, message):
+    """The undetermined variable whose key GTSAM's message has, in the words of the files."""
+    m, key = problem.measurements, re.search(r"variable\s+(\d+)", message)
+    names = [*(f"pose {i + 1}" for i in m.frame), *(f"the place of marker {i}" for i in m.marker),
+             *(f"the place of antenna {i}" for i in m.antenna), "the calibration of the sensors"]
+    return dict(zip(map(str, _keys(problem)), names)).get(key and key[1], "one of them")
 
 
 def _keys(problem):
@@ -118,9 +116,9 @@ def linearize(problem, state):
     root = np.sqrt(np.r_[equations.priors.H, np.ones(q)])
     e = equations.priors.border[:, -1] / np.maximum(root, 1 / WEAK_SIGMA)
     first = np.r_[structure.rows(slice(None))[:, 0], len(structure.diagonal)]
-    for i, key in enumerate(variables):
-        if root[first[i]]:
-            own = slice(first[i], first[i] + width[i])
+    for key, start, count in zip(variables, first, width):
+        own = slice(start, start + count)
+        if root[start]:
             graph.add(key, np.diag(root[own]), -e[own])
     return graph
 
@@ -136,16 +134,3 @@ def as_gtsam(result):
     values = gtsam_values(problem, state)
     return gtsam.LinearContainerFactor.ConvertLinearGraph(
         linearize(problem, state), values), values
-
-
-def _variable(measurements, message):
-    """The undetermined variable that GTSAM's message names, in the words of the files."""
-    symbol = re.search(r"Symbol: ([aclpx])(\d+)", message)
-    if symbol is None or symbol[1] == "c":
-        return "the calibration of the sensors" if symbol else "one of them"
-    ids = np.r_[measurements.marker, measurements.antenna]
-    number = {index % INDICES: index for index in ids.tolist()}
-    name = {"x": "pose", "l": "the pose of marker", "p": "the position of marker",
-            "a": "the position of antenna"}[symbol[1]]
-    index = int(symbol[2])
-    return f"{name} {index + 1 if symbol[1] == 'x' else number[index]}"

@@ -12,7 +12,7 @@ import numpy as np
 from slamlib import odometry, se2
 from slamlib.sightings import consensus
 from slamlib.slam.calibration import ANTENNAS, HEIGHT, OFFSET, SCALE, SIGHTING_LAG, SIZE, WHEELS
-from slamlib.slam.factors import MIN_DISTANCE, camera_poses, tag_positions
+from slamlib.slam.factors import MIN_DISTANCE, sensor_poses
 from slamlib.slam.fit import narrow_kernels
 from slamlib.slam.linear import build_problem, state_from_arrays
 from slamlib.slam.measurements import GUESS_PRIOR_SIGMA, measure
@@ -116,7 +116,7 @@ def state_from_poses(measurements, poses, covariances, c=None, markers=consensus
     if c is None:
         c = measurements.calibration.stated.copy()
         c[SIGHTING_LAG] += measurements.jumps.lag
-    camera, z = camera_poses(measurements, poses, c), s.z * [c[SIZE], c[SIZE], 1]
+    camera, z = sensor_poses(measurements, poses, c)[0], s.z * [c[SIZE], c[SIZE], 1]
     A, B = se2.compose_jacobians(camera, z)
     C = A @ covariances[s.row] @ A.mT + B @ s.C @ B.mT
     return state_from_arrays(measurements, poses, markers(measurements, se2.compose(camera, z), C),
@@ -144,7 +144,8 @@ def ranges_by_antenna(measurements, poses, covariances, c, factor=1.0):
 
     `factor` multiplies the sigmas of the ranges.
     """
-    r, by_antenna, positions = measurements.ranges, [], tag_positions(measurements, poses, c)
+    r, by_antenna = measurements.ranges, []
+    positions = sensor_poses(measurements, poses, c)[1][:, :2]
     slant = (r.distance - c[OFFSET] - c[ANTENNAS][r.antenna]) / c[SCALE]
     plane = np.sqrt(np.maximum(slant * np.abs(slant) - 2 * c[HEIGHT], 0)) \
         if c[HEIGHT] else slant

@@ -1,10 +1,8 @@
 """Stages 2 and 3: the factor graph as records, its normal equations H delta = -g, the evidence.
 
-Variables (`State`) are the frames' poses X_i, the markers L_j (points P_j if no sighting has a
-heading), the antennas A_k, and the calibration c. With whitened errors e and derivatives J of all
-factors, H = sum J^T J and g = sum J^T e. The calibration touches nearly all factors and is
-eliminated last: with the information matrix [[H, B], [B^T, D]] and the gradient [g, g_c], only H,
-which is sparse, is decomposed, and
+With whitened errors e and derivatives J of all factors, H = sum J^T J and g = sum J^T e. The
+calibration touches nearly all factors and is eliminated last: with the information matrix
+[[H, B], [B^T, D]] and the gradient [g, g_c], only H, which is sparse, is decomposed, and
 
     S = D - B^T H^-1 B,    delta_c = -S^-1 (g_c - B^T H^-1 g),    delta = -H^-1 (g + B delta_c).
 
@@ -15,6 +13,7 @@ noise factors. Each value of the noise then costs one decomposition, which gives
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import csc_array
@@ -22,7 +21,6 @@ from scipy.sparse.linalg import splu
 
 from slamlib import odometry, se2
 from slamlib.slam.factors import (
-    LinearizedFactors,
     OdometryFactors,
     linearize_measurements,
     linearize_odometry,
@@ -36,7 +34,6 @@ from slamlib.slam.measurements import (
     Noise,
     with_known,
 )
-from slamlib.slam.own import linearized_own
 
 MAX_CACHED_SLIPS = 3         # values of the slip whose sums are kept in memory
 
@@ -117,8 +114,7 @@ def build_problem(measurements, model, noise=None, wheel=None, preintegrate=prei
         sigma=measurements.calibration.sigma_without(late), released=late)
 
 
-@dataclass(frozen=True)
-class Group:
+class Group(NamedTuple):
     """Sums over a group of factors of n unknowns and q entries of the calibration."""
 
     H: np.ndarray            # data of `Structure.matrix`; of the priors the diagonal (n,)
@@ -159,10 +155,7 @@ class NormalEquations:
     @cached_property
     def linearized(self):
         """The LinearizedFactors of sightings of poses, of points, of ranges, and of one's own."""
-        e, J, error = linearized_own(self.problem, self.state)
-        return *linearize_measurements(self.problem, self.state), LinearizedFactors(
-            index=np.arange(len(e)), e=e, J=J, J_c=np.zeros((*e.shape, 0)),
-            columns=np.zeros(0, int), weight=np.ones(len(e)), error=error)
+        return linearize_measurements(self.problem, self.state)
 
     def step(self):
         """The Gauss-Newton step delta (n + q,), or None where H is singular to rounding."""
@@ -176,19 +169,17 @@ class NormalEquations:
         If `consistent`, measurements count over the `consistency_factor` of their robust kernel.
         """
         odometry, log_determinant = self._odometry(noise.slip)
-        H, border = odometry.H.copy(), odometry.border + self.priors.border
-        H[self.structure.diagonal] += self.priors.H
-        squared = odometry.squared + self.priors.squared
+        total = odometry.H.copy(), odometry.border + self.priors.border, \
+            odometry.squared + self.priors.squared
+        total[0][self.structure.diagonal] += self.priors.H
         accepted, given = self.problem.accepted, self.problem.noise
         sightings = (accepted.sighting_kernel, given.sightings / noise.sightings)
         ranges = (accepted.range_kernel, given.ranges / noise.ranges)
         kinds = sightings, sightings, ranges, (None, 1.0)
         for group, (kernel, ratio), size in zip(self._measurement_groups, kinds, (3, 2, 1, 1)):
             share = ratio**2 / (consistency_factor(kernel, size) if consistent else 1.0)
-            H += share * group.H
-            border += share * group.border
-            squared += share * group.squared
-        return H, border, squared, log_determinant
+            total = [each + share * part for each, part in zip(total, group)]
+        return *total, log_determinant
 
     def counts(self):
         """Numbers of accepted errors of sightings and of ranges."""
@@ -199,11 +190,11 @@ class NormalEquations:
     def priors(self):
         """The Group of the priors, whose H and D are diagonal."""
         problem, m, state = self.problem, self.problem.measurements, self.state
-        v, active, n = m.variables, problem.active, len(self.structure.diagonal)
-        weak = problem.accepted.unsupported
-        parts = [(v.frames[:1], se2.log(state.poses[:1]), m.origin_sigma),
-                 (v.antennas, state.antennas - m.guess, GUESS_PRIOR_SIGMA),
-                 (v.markers[weak], state.markers[weak], WEAK_SIGMA)]
+        f, active, n = len(m.frame), problem.active, len(self.structure.diagonal)
+        weak = np.bincount(m.marker_row, problem.accepted.sighting_weight, len(m.marker)) == 0
+        parts = [([0], se2.log(state.poses[:1]), m.origin_sigma),
+                 (slice(f + len(m.marker), None), state.antennas - m.guess, GUESS_PRIOR_SIGMA),
+                 (f + np.flatnonzero(weak), state.markers[weak], WEAK_SIGMA)]
         H, e = np.zeros((2, n))
         for variables, difference, sigma in parts:
             rows = self.structure.rows(variables, difference.shape[1])
@@ -225,12 +216,11 @@ class NormalEquations:
         """Function from a slip to the Group of the odometry and sum log|Q|."""
         linearized = linearize_odometry(self.problem, self.state)
 
-        @lru_cache(maxsize=MAX_CACHED_SLIPS)
         def odometry(slip):
             factors, log_determinant = linearized(slip)
             return self._group(0, factors), log_determinant
 
-        return odometry
+        return lru_cache(maxsize=MAX_CACHED_SLIPS)(odometry)
 
     def _group(self, kind, factors):
         """The Group of LinearizedFactors of the kind with this number in `structure.factors`."""
@@ -238,7 +228,7 @@ class NormalEquations:
         n, e, J, J_c = len(structure.diagonal), factors.e, factors.J, factors.J_c
         J_t, last = np.swapaxes(J, 1, 2), np.concatenate([J_c, e[..., None]], axis=2)
         squares = (J_t @ J).reshape(-1, 2, 3, 2, 3).swapaxes(2, 3).reshape(-1, 9)
-        H = _summed(structure.blocks[kind][factors.index], squares, len(structure.indices))
+        H = _summed(structure.blocks[kind][factors.index], squares, structure.places.nnz // 9)
         border, columns = np.zeros((n + q, q + 1)), np.r_[factors.columns, q]
         border[:n, columns] = _summed(
             structure.position[structure.factors[kind][factors.index]],
@@ -253,19 +243,15 @@ def _summed(number, values, size):
                      (size, number.size)) @ values
 
 
-def decomposition(H):
-    """Sparse decomposition of H (n, n), ordered for elimination; None if H is singular."""
-    try:
-        return splu(H, permc_spec="NATURAL", diag_pivot_thresh=0.0, relax=1, panel_size=1,
-                    options={"SymmetricMode": True})
-    except RuntimeError:
-        return None
-
-
 def linear_solution(structure, H, border):
     """The LinearSolution by data of H and `border`, None where they are singular to rounding."""
-    n, lu = len(structure.diagonal), decomposition(structure.matrix(H))
-    pivots = np.zeros(1) if lu is None else lu.U.diagonal()
+    n = len(structure.diagonal)
+    try:                                                 # H is ordered for elimination
+        lu = splu(structure.matrix(H), permc_spec="NATURAL", diag_pivot_thresh=0.0, relax=1,
+                  panel_size=1, options={"SymmetricMode": True})
+    except RuntimeError:
+        return None
+    pivots = lu.U.diagonal()
     if not (pivots > 0).all():                           # H is not positive definite
         return None
     solved = lu.solve(border[:n])

@@ -1,17 +1,15 @@
 """Stage 1: all measurements of a dataset as arrays, their weights, their noise and their structure.
 
-Frames (keyframes) are the encoder poses that are variables X_i of the graph: the first, the last,
-and each one with a sighting or a range. Measurements are numbered: first the s sightings, then the
-r ranges. Of the three noise parameters, those that a dataset's Vehicle gives are known; the others
-are learned from the drive.
+Frames are the first encoder pose, the last, and each one with a sighting or a range. Measurements
+are numbered: first the s sightings, then the r ranges. Of the three noise parameters, those that a
+dataset's Vehicle gives are known; the others are learned from the drive.
 
-Variables are numbered: the frames' poses, the markers, the antennas. Each has three unknowns, in
+Variables are numbered: f poses of frames, k markers, the antennas. Each has three unknowns, in
 the order in which they are eliminated, so that the information matrix H consists of blocks (3, 3);
 the third unknown of a point has no derivatives. The Structure of H is the same for all states,
 kernels and values of the noise.
 """
 
-from collections import namedtuple
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -87,59 +85,31 @@ def square_root_information(covariance):
     return np.swapaxes(np.linalg.cholesky(np.linalg.inv(covariance)), -1, -2)
 
 
-Variables = namedtuple("Variables", "frames markers antennas")     # numbers of X_i, L_j, A_k
-
-
 @dataclass(frozen=True)
 class Structure:
-    """Places of v variables and of the blocks that connect them in a matrix (3 v, 3 v)."""
+    """Places of v variables and of the b blocks that connect them in a matrix (3 v, 3 v)."""
 
     is_pose: np.ndarray      # (v,) bool, the others are points
     position: np.ndarray     # (v,) of every variable in the elimination
-    indices: np.ndarray      # (b,) position of the other variable of a block, row by row
-    indptr: np.ndarray       # (v + 1,) where each row of blocks begins
+    places: sparse.csc_array     # the matrix with the place of each entry in the data (9 b,)
     factors: list            # of (m, 2) variables of each kind of factor
     blocks: list             # of (m, 4) numbers of their blocks
+    diagonal: np.ndarray     # (n,) places of the diagonal in the data of blocks
 
     def rows(self, variables, width=3):
         """Rows (m, width) of the unknowns of `variables` (m,)."""
         return 3 * self.position[variables][:, None] + np.arange(width)
-
-    def rows_of_each(self, variables):
-        """List of the rows (d,), 3 of a pose or 2 of a point, of each of `variables` (m,)."""
-        return [self.rows([i], 2 + self.is_pose[i])[0] for i in variables]
 
     @property
     def unknowns(self):
         """Rows of the unknowns of all variables, in the order of their numbers."""
         return self.rows(slice(None))[np.arange(3) < 2 + self.is_pose[:, None]]
 
-    @cached_property
-    def diagonal(self):
-        """(n,) places of the diagonal in the data of blocks."""
-        row = np.repeat(np.arange(len(self.position)), np.diff(self.indptr))
-        return (9 * np.flatnonzero(row == self.indices)[:, None] + [0, 4, 8]).ravel()
-
-    def chain(self, data, frames):
-        """Blocks (f, 3, 3) of `frames` (f,), and (f-1, 3, 3) between neighbours, with data (9 b,).
-
-        The first kind of factor connects each frame with the next.
-        """
-        own = self.diagonal[self.rows(frames)[:, 0]] // 9
-        return tuple(data.reshape(-1, 3, 3)[number] for number in (own, self.blocks[0][:, 1]))
-
     def matrix(self, data):
         """The sparse matrix (n, n), which is symmetric, with the data (9 b,) of its blocks."""
-        matrix = copy(self._places)                      # its indices are checked only once
+        matrix = copy(self.places)                       # its indices are checked only once
         matrix.data = data[matrix.data]
         return matrix
-
-    @cached_property
-    def _places(self):
-        """The matrix with the place of each entry in the data of blocks."""
-        places = np.arange(9 * len(self.indices)).reshape(-1, 3, 3)
-        by_rows = sparse.bsr_array((places, self.indices, self.indptr)).tocsr()
-        return sparse.csc_array((by_rows.data, by_rows.indices, by_rows.indptr), by_rows.shape)
 
 
 def block_structure(is_pose, factors):
@@ -154,11 +124,14 @@ def block_structure(is_pose, factors):
     connected = sparse.csc_array((np.where(row == column, count, 0.5), (row, column)))
     position = splu(connected, permc_spec="MMD_AT_PLUS_A").perm_c
     block, number = np.unique(position[row] * count + position[column], return_inverse=True)
+    by_rows = sparse.bsr_array((
+        np.arange(9 * len(block)).reshape(-1, 3, 3), block % count,
+        np.searchsorted(block, count * np.arange(count + 1)))).tocsr()
+    places = sparse.csc_array((by_rows.data, by_rows.indices, by_rows.indptr), by_rows.shape)
     ends = np.cumsum([count, *(4 * len(each) for each in factors)])
     return Structure(
-        is_pose=is_pose, position=position, indices=block % count,
-        indptr=np.searchsorted(block, count * np.arange(count + 1)), factors=factors,
-        blocks=[each.reshape(-1, 4) for each in np.split(number, ends)[1:-1]])
+        is_pose=is_pose, position=position, places=places, diagonal=places.diagonal(),
+        factors=factors, blocks=[each.reshape(-1, 4) for each in np.split(number, ends)[1:-1]])
 
 
 @dataclass(frozen=True)
@@ -234,21 +207,14 @@ class Measurements:
                 square_root_information(s.C[:, :2, :2]))
 
     @cached_property
-    def variables(self):
-        """The Variables, numbered."""
-        counts = np.cumsum([len(self.frame), len(self.marker), len(self.antenna)])
-        return Variables(*np.split(np.arange(counts[-1]), counts[:-1]))
-
-    @cached_property
     def structure(self):
         """The Structure of the information matrix."""
-        v, s, r = self.variables, self.sightings, self.ranges
-        sightings = np.stack([s.row, v.markers[self.marker_row]], -1)
+        f, k, s, r = len(self.frame), len(self.marker), self.sightings, self.ranges
+        sightings = np.stack([s.row, f + self.marker_row], -1)
         return block_structure(
-            np.r_[np.ones(len(v.frames), bool), self.oriented, np.zeros(len(v.antennas), bool)],
-            [np.stack([v.frames[:-1], v.frames[1:]], -1), sightings[self.as_pose],
-             sightings[~self.as_pose], np.stack([r.row, v.antennas[r.antenna]], -1),
-             connected(self)])
+            np.r_[np.ones(f, bool), self.oriented, np.zeros(len(self.antenna), bool)],
+            [np.arange(f - 1)[:, None] + [0, 1], sightings[self.as_pose], sightings[~self.as_pose],
+             np.stack([r.row, f + k + r.antenna], -1), connected(self)])
 
 
 def measure(dataset, extra_poses=(), jumps=NO_JUMPS, own=None):
@@ -311,9 +277,3 @@ class AcceptedMeasurements:
     def rejected(self):
         """(s,) bool, sightings without weight."""
         return self.sighting_weight == 0
-
-    @property
-    def unsupported(self):
-        """(u,) rows in `Measurements.marker` of the markers without accepted sightings."""
-        m = self.measurements
-        return np.flatnonzero(np.bincount(m.marker_row, self.sighting_weight, len(m.marker)) == 0)

@@ -4,10 +4,9 @@ Keys are X(pose) of a pose by its row of `Dataset.ticks`, L(id) of a marker's po
 marker's position where no sighting has a heading, A(id) of an antenna, and C(0) of the calibration,
 in standard deviations from what is stated. Poses are gtsam.Pose2, positions gtsam.Point2.
 
-Factors of one's own are measurements: each linearisation asks GTSAM for theirs, so that start
-values, gates, noise and covariances heed them. The covariances need a chain of poses, given the
-landmarks. So a factor has one variable, or a pose and a landmark, or neighbouring poses. Two
-sightings of a marker that nobody else sees are a loop closure.
+Each linearisation asks GTSAM for that of factors of one's own, so that start values, gates, noise
+and covariances heed them. The covariances need a chain of poses, given the landmarks: a factor has
+one variable, or a pose and a landmark, or neighbouring poses.
 """
 
 import gtsam
@@ -30,13 +29,11 @@ def variable_keys(measurements):
 def gtsam_values(problem, state):
     """The gtsam.Values of a State."""
     m, active, values = problem.measurements, problem.active, gtsam.Values()
-    keys = iter(variable_keys(m))
-    for pose in state.poses.tolist():
-        values.insert(next(keys), gtsam.Pose2(*pose))
-    for marker, oriented in zip(state.markers, m.oriented):
-        values.insert(next(keys), gtsam.Pose2(*marker) if oriented else gtsam.Point2(*marker[:2]))
-    for antenna in state.antennas:
-        values.insert(next(keys), gtsam.Point2(*antenna))
+    variables = [*(gtsam.Pose2(*pose) for pose in state.poses.tolist()), *(
+        gtsam.Pose2(*marker) if oriented else gtsam.Point2(*marker[:2])
+        for marker, oriented in zip(state.markers, m.oriented)), *state.antennas]
+    for key, variable in zip(variable_keys(m), variables):
+        values.insert(key, variable)
     if active.any():
         values.insert(C(0), (state.c - m.calibration.stated)[active] / problem.sigma[active])
     return values
@@ -46,8 +43,8 @@ def poses_of(graph, count):
     """Rows (p,) of `Dataset.ticks`, below `count`, of the poses in a gtsam.NonlinearFactorGraph."""
     keys = graph.keyVector()                     # with a name: iterators do not keep it alive
     symbols = [gtsam.Symbol(key) for key in keys]
-    rows = [symbol.index() for symbol in symbols if symbol.chr() == ord("x")]
-    return np.array([row for row in rows if row < count], int)
+    return np.array([symbol.index() for symbol in symbols
+                     if symbol.chr() == ord("x") and symbol.index() < count], int)
 
 
 def connected(measurements):
@@ -75,14 +72,13 @@ def linearized_own(problem, state):
 
     Padded by zeros. Also half the sum of the squared errors, or the loss of their kernels.
     """
-    m = problem.measurements
-    pairs, values = m.structure.factors[-1], gtsam.Values()
-    values = gtsam_values(problem, state) if len(pairs) else values
+    m, pairs = problem.measurements, problem.measurements.structure.factors[-1]
+    values = gtsam_values(problem, state) if len(pairs) else gtsam.Values()
     jacobians = [m.own.at(k).linearize(values).jacobian() for k in range(len(pairs))]
     size = max((len(b) for _, b in jacobians), default=1)
     e, J = np.zeros((len(pairs), size)), np.zeros((len(pairs), size, 6))
-    for k, ((by_variables, b), i) in enumerate(zip(jacobians, pairs[:, 0])):
-        width = 2 + m.structure.is_pose[i]
+    for k, (by_variables, b) in enumerate(jacobians):
+        width = 2 + m.structure.is_pose[pairs[k, 0]]
         e[k, :len(b)], J[k, :len(b), :width] = -b, by_variables[:, :width]
         J[k, :len(b), 3:3 + by_variables.shape[1] - width] = by_variables[:, width:]
     return e, J, m.own.error(values)

@@ -1,7 +1,7 @@
 """The pipeline of problems 3 and 4, from a Dataset to a SlamResult.
 
-Each stage is a function from one frozen record to the next. Comments number them as the list in
-`slamlib.slam` does. Problem 4 starts from the poses of problem 3 (`fit_from_previous`).
+Each stage is a function from one frozen record to the next. Comments number them as docs/code.md
+does. Problem 4 starts from the poses of problem 3 (`fit_from_previous`).
 """
 
 from dataclasses import replace
@@ -109,7 +109,7 @@ def fit_from_previous(measurements, previous, model=None):
     """
     frame, calibration = measurements.frame, measurements.calibration
     sigma, c = (calibration.taken_from(previous.calibration, *values) for values in (
-        (previous.sigma, calibration.sigma), (previous.c, calibration.stated)))
+        (previous.fit.problem.sigma, calibration.sigma), (previous.c, calibration.stated)))
     problem = replace(
         build_problem(measurements, model or previous.model, Noise(previous.slip), previous.wheel),
         sigma=sigma, released=previous.released)

@@ -11,14 +11,9 @@ import numpy as np
 from slamlib import increments, se2
 from slamlib.odometry_gate import Jumps
 from slamlib.sightings import Sightings
+from slamlib.slam import factors
 from slamlib.slam.calibration import WHEELS, Calibration, calibration_table
 from slamlib.slam.covariances import posterior_moments
-from slamlib.slam.factors import (
-    MIN_DISTANCE,
-    linearize_measurements,
-    linearize_odometry,
-    odometry_noise,
-)
 from slamlib.slam.fit import Fit, kept_weights, residuals
 from slamlib.slam.initialization import SAME_PLACE, ranges_by_antenna, second_moment, trilaterate
 from slamlib.slam.measurements import GUESS_PRIOR_SIGMA, AcceptedMeasurements, Noise
@@ -47,7 +42,6 @@ class SlamResult:
     doubts: dict                    # antenna id: reason, for antennas in doubt
     calibration: Calibration        # p entries with what is stated of them
     c: np.ndarray                   # (p,) their estimates
-    sigma: np.ndarray               # (p,) of their prior, 0 of what is known
     c_covariance: np.ndarray        # (p, p), 0 where the stated value is known
     released: frozenset             # groups of entries that left their stated values
     explanations: tuple             # of sets of groups, each of which explains this, or one empty
@@ -123,19 +117,22 @@ def slam_result(fit):
         replace(problem, noise=replace(problem.noise, slip=slip)), state, marginal.pairs)
     residual, range_residual = residuals(m, state, problem.noise)
     sighting_weight, range_weight = kept_weights(problem.accepted, residual, range_residual)
-    mapped, marker_covariance = _mapped(problem, marginal.markers)
-    markers = state.markers[mapped]
-    markers[:, 2] = se2.wrap(markers[:, 2])
+    markers, antennas = np.split(marginal.landmarks, [len(m.marker)])
+    best = np.full(len(m.marker), np.inf)         # a point has the heading of its best sighting
+    np.minimum.at(best, m.marker_row, m.sightings.C[:, 2, 2])
+    markers[~m.oriented, 2, 2] = best[~m.oriented]
+    balance = np.bincount(m.marker_row, np.where(problem.accepted.rejected, -1, 1), len(m.marker))
+    mapped = balance > 0                          # markers with more accepted than rejected ones
+    place = np.c_[state.markers[mapped, :2], se2.wrap(state.markers[mapped, 2])]
     sentences, antenna_covariances = antenna_doubts(
-        problem, state, pose_covariances[m.frame], marginal.antennas, range_weight)
+        problem, state, pose_covariances[m.frame], antennas[:, :2, :2], range_weight)
     return SlamResult(
         poses=poses, covariances=pose_covariances,
-        marker=m.marker[mapped], marker_in_world=markers,
-        marker_covariance=se2.rotate_covariance(
-            marker_covariance[mapped], markers[:, 2] * m.oriented[mapped]),
+        marker=m.marker[mapped], marker_in_world=place,
+        marker_covariance=se2.rotate_covariance(markers[mapped], place[:, 2]),
         antenna=m.antenna, antenna_in_world=state.antennas,
         antenna_covariance=antenna_covariances, doubts=sentences,
-        calibration=m.calibration, c=state.c, sigma=problem.sigma, c_covariance=marginal.c,
+        calibration=m.calibration, c=state.c, c_covariance=marginal.c,
         released=problem.released, explanations=fit.explanations,
         noise=problem.noise, noise_sigma=np.zeros(3) if fit.posterior is None
         else np.sqrt(np.diag(fit.posterior.covariance)),
@@ -156,10 +153,9 @@ def turn_sigma(problem):
 
     Estimated ones adapt to a wrong number of turns.
     """
-    stated, odometry = problem.measurements.dataset.vehicle, problem.odometry
-    frame = problem.measurements.frame
-    known = ~problem.measurements.jumps.share(frame[:-1], frame[1:]).any(axis=1)  # else by markers
-    variance = np.sum((odometry.J_wheel[:, 2] * stated.sigma_wheel)**2, axis=1)
+    m, odometry = problem.measurements, problem.odometry
+    known = ~m.jumps.share(m.frame[:-1], m.frame[1:]).any(axis=1)        # else by markers
+    variance = np.sum((odometry.J_wheel[:, 2] * m.dataset.vehicle.sigma_wheel)**2, axis=1)
     return known * np.sqrt(variance + odometry.covariance(problem.noise.slip)[:, 2, 2])
 
 
@@ -182,11 +178,19 @@ def antenna_doubts(problem, state, frame_covariances, covariances, range_weight)
 
 
 def _doubt(ranges, estimate, weight):
-    """The reason why an antenna is in doubt whose ranges have the weights (m,), or None."""
+    """The reason why an antenna is in doubt whose ranges have the weights (m,), or None.
+
+    Its standard deviation in the worst direction is by its ranges alone: the covariance in the
+    world also includes the uncertain heading of pose 1.
+    """
     distance, count = np.median(ranges.distance), np.count_nonzero(weight > 0.5)
     places, costs = trilaterate(ranges)
     elsewhere = np.hypot(*(places - estimate).T) > SAME_PLACE * distance
     possible = places[elsewhere & (costs < MAX_LOG_ODDS)]
+    difference = estimate - ranges.positions
+    direction = difference / np.maximum(np.hypot(*difference.T), factors.MIN_DISTANCE)[:, None]
+    information = direction.T @ (direction * (weight / ranges.sigma**2)[:, None])
+    sigma = 1 / np.sqrt(max(np.linalg.eigvalsh(information)[0], GUESS_PRIOR_SIGMA**-2))
     if count < MIN_ACCEPTED_RANGES:
         return f"only {count} of its {len(ranges.distance)} ranges agree"
     if len(possible):
@@ -194,35 +198,9 @@ def _doubt(ranges, estimate, weight):
             "({:.1f}, {:.1f})".format(*place) for place in possible))
     if count < len(ranges.distance) / 2:
         return f"{len(ranges.distance) - count} of its {len(ranges.distance)} ranges disagree"
-    if _sigma_by_ranges(ranges, estimate, weight) > MAX_RELATIVE_SIGMA * distance:
+    if sigma > MAX_RELATIVE_SIGMA * distance:
         return "its ranges are too few or come from too few directions"
     return None
-
-
-def _sigma_by_ranges(ranges, estimate, weight):
-    """Largest standard deviation in m of an antenna, in any direction, by its ranges alone.
-
-    Its covariance in the world also includes the uncertain heading of pose 1.
-    """
-    difference = estimate - ranges.positions
-    direction = difference / np.maximum(np.hypot(*difference.T), MIN_DISTANCE)[:, None]
-    information = direction.T @ (direction * (weight / ranges.sigma**2)[:, None])
-    return 1 / np.sqrt(max(np.linalg.eigvalsh(information)[0], GUESS_PRIOR_SIGMA**-2))
-
-
-def _mapped(problem, blocks):
-    """Rows of the markers with more accepted than rejected sightings, and covariances of all.
-
-    These (k, 3, 3) are in own axes. The heading of a point has the variance of its best sighting.
-    """
-    m = problem.measurements
-    balance = np.bincount(m.marker_row, np.where(problem.accepted.rejected, -1, 1), len(m.marker))
-    covariances = np.zeros((len(m.marker), 3, 3))
-    for j, block in enumerate(blocks):
-        covariances[j, :len(block), :len(block)] = block
-        if not m.oriented[j]:
-            covariances[j, 2, 2] = m.sightings.C[m.marker_row == j, 2, 2].min()
-    return np.flatnonzero(balance > 0), covariances
 
 
 def chi2_per_dof(problem, state, weight):
@@ -231,14 +209,14 @@ def chi2_per_dof(problem, state, weight):
     With weights (s + r,), a measurement counts by its dimension times its weight, and a landmark
     subtracts its dimension. Odometry and priors have as many errors as unknowns.
     """
-    m = problem.measurements
+    m, active = problem.measurements, problem.active
+    e_c = (state.c - m.calibration.stated)[active] / problem.sigma[active]
     sightings, ranges = m.by_kind(weight)
-    accepted = AcceptedMeasurements(measurements=m, weight=weight)
-    stated = replace(problem, accepted=accepted, noise=Noise())
-    odometry, _ = linearize_odometry(problem, state)(problem.noise.slip)
-    e_c = (state.c - m.calibration.stated)[problem.active] / problem.sigma[problem.active]
+    stated = replace(problem, noise=Noise(), accepted=AcceptedMeasurements(
+        measurements=m, weight=weight))
+    odometry, _ = factors.linearize_odometry(problem, state)(problem.noise.slip)
     squared = e_c @ e_c + 2 * sum(
-        factors.error for factors in (odometry, *linearize_measurements(stated, state)))
+        kind.error for kind in (odometry, *factors.linearize_measurements(stated, state)[:3]))
     used = np.bincount(m.marker_row, sightings * np.where(m.as_pose, 3, 2), len(m.marker))
     freedom = np.sum(np.maximum(used - np.where(m.oriented, 3, 2), 0)) \
         + np.sum(ranges) - 2 * len(m.antenna)
@@ -262,42 +240,43 @@ def interpolate(problem, state, pairs):
         rows = slice(first, min(first + FRAMES_AT_ONCE, len(pairs)) + 1)          # of frames
         section = slice(frame[rows][0], frame[rows][-1] + 1)               # shares its ends
         poses[section], covariances[section] = _interpolate_section(
-            problem, state.poses[rows], state.c[WHEELS], frame[rows],
-            pairs[rows.start:rows.stop - 1])
+            problem, state, pairs[first:rows.stop - 1], rows)
     return poses, covariances
 
 
-def _interpolate_section(problem, poses, wheel, frame, pairs):
-    """The same for the encoder poses from the first to the last of consecutive frames (g,)."""
+def _interpolate_section(problem, state, pairs, rows):
+    """The same for the encoder poses from the first to the last of the frames `rows` (slice)."""
+    m, poses, frame = problem.measurements, state.poses[rows], problem.measurements.frame[rows]
     turned, R = np.tile(np.eye(9), (len(pairs), 1, 1)), se2.rotation(poses[:, 2])
     turned[:, :2, :2], turned[:, 3:5, 3:5] = R[:-1], R[1:]
     joint = turned @ pairs @ turned.mT                       # the poses in world axes
     pose = np.arange(frame[0], frame[-1] + 1)
     last = np.searchsorted(frame, pose, side="right") - 1
-    all_poses = poses[last].copy()
+    all_poses = poses[last]
     covariances = np.concatenate([joint[:, :3, :3], joint[-1:, 3:6, 3:6]])[last]
     inner = np.flatnonzero(~np.isin(pose, frame))
-    if not len(inner):
-        return all_poses, covariances
     a, b = last[inner], last[inner] + 1
 
-    delta_a, a_by_wheel, Q_a = _increments(problem, wheel, frame, frame[a], pose[inner])
-    A_a, B_a = se2.compose_jacobians(poses[a], delta_a)
-    N_a = B_a @ Q_a @ B_a.mT
-    delta_b, b_by_wheel, Q_b = _increments(problem, wheel, frame, pose[inner], frame[b])
+    vehicle, ticks = m.dataset.vehicle.with_wheel(state.c[WHEELS]), m.dataset.ticks[pose]
+    ends = np.r_[frame[a], pose[inner]], np.r_[pose[inner], frame[b]]
+    of_section = [each - frame[0] for each in ends]
+    quantization, slipping = factors.odometry_noise(
+        ticks, vehicle, *of_section, len(m.dataset.ticks) - 1)
+    (delta_a, delta_b), (a_by_wheel, b_by_wheel), (Q_a, Q_b), (jump_a, jump_b) = (
+        np.split(each, 2) for each in (
+            *increments.between_poses(ticks, vehicle, *of_section, problem.odometry.model),
+            quantization + problem.noise.slip**2 * slipping,
+            m.jumps.share(*ends).sum(axis=1)[:, None, None]))
     back = se2.inverse(delta_b)
+    A_a, B_a = se2.compose_jacobians(poses[a], delta_a)
     A_b, B_b = se2.compose_jacobians(poses[b], back)
     B_b = B_b @ se2.inverse_jacobian(delta_b)
-    N_b = B_b @ Q_b @ B_b.mT
 
     from_a, from_b = se2.compose(poses[a], delta_a), se2.compose(poses[b], back)
     difference = from_b - from_a
     difference[:, 2] = se2.wrap(difference[:, 2])
-    earlier, later = (problem.measurements.jumps.share(*ends).sum(axis=1)[:, None, None] for ends in
-                     ((frame[a], pose[inner]), (pose[inner], frame[b])))
-    jump = difference[:, :, None] * difference[:, None] / np.maximum(earlier + later, MIN_SHARE)
-    N_a, N_b = N_a + earlier * jump, N_b + later * jump
-
+    jump = difference[:, :, None] * difference[:, None] / np.maximum(jump_a + jump_b, MIN_SHARE)
+    N_a, N_b = B_a @ Q_a @ B_a.mT + jump_a * jump, B_b @ Q_b @ B_b.mT + jump_b * jump
     gain_b = N_a @ np.linalg.inv(N_a + N_b)
     gain_a = np.eye(3) - gain_b
     F = np.concatenate([gain_a @ A_a, gain_b @ A_b,
@@ -305,17 +284,3 @@ def _interpolate_section(problem, poses, wheel, frame, pairs):
     all_poses[inner] = from_a + np.einsum("nij,nj->ni", gain_b, difference)
     covariances[inner] = F @ joint[a] @ F.mT + gain_a @ N_a
     return all_poses, (covariances + covariances.mT) / 2
-
-
-def _increments(problem, wheel, frame, start, end):
-    """Increments (m, 3) from the encoder poses `start` (m,) to `end` (m,), with `wheel` (3,) m.
-
-    Also their derivatives (m, 3, 3) by `wheel`, and their covariances Q (m, 3, 3) in the axes of
-    the start. The poses lie in the section of the frames `frame` (g,).
-    """
-    d = problem.measurements.dataset
-    vehicle, ticks = d.vehicle.with_wheel(wheel), d.ticks[frame[0]:frame[-1] + 1]
-    start, end = start - frame[0], end - frame[0]
-    delta, by_wheel = increments.between_poses(ticks, vehicle, start, end, problem.odometry.model)
-    quantization, slipping = odometry_noise(ticks, vehicle, start, end, len(d.ticks) - 1)
-    return delta, by_wheel, quantization + problem.noise.slip**2 * slipping

@@ -79,7 +79,7 @@ def estimate_correlated(dataset, slip, correlation):
         if np.abs(step).max() < NEGLIGIBLE_STEP:
             break
     m, q = problem.measurements, problem.active.sum()
-    frames = m.structure.rows(m.variables.frames)
+    frames = m.structure.rows(slice(len(m.frame)))
     wheels = np.broadcast_to(len(H) - q + np.arange(3), frames[1:].shape)
     pairs = np.concatenate([frames[:-1], frames[1:], wheels], axis=1)
     unit = np.r_[np.ones(len(H) - q), problem.sigma[problem.active]]

@@ -113,7 +113,7 @@ def landmarks_of_drive(dataset, found, kernel="last", starts=tuple(LANDMARKS)):
     from the result, and its map, replace the truth.
     """
     m = measure(dataset.without("uwb"))
-    problem = replace(build_problem(m, found.model, found.noise), sigma=found.sigma)
+    problem = replace(build_problem(m, found.model, found.noise), sigma=found.fit.problem.sigma)
     rounds = _kernel_rounds(problem, kernel)
     best = optimize(rounds[-1], state_from_poses(
         m, found.poses[m.frame], found.covariances[m.frame], found.c))
