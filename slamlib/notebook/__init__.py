@@ -1,9 +1,8 @@
-"""What cells call: drives and their results, tables of data, figures, the map, sliders."""
+"""What cells call: drives and their results, tables of data, figures, the map."""
 
 from slamlib.notebook.drives import (
     Drive,
     attempted,
-    captioned,
     notices,
     results_folder,
     show_doubts,
@@ -12,5 +11,5 @@ from slamlib.notebook.drives import (
 )
 from slamlib.notebook.tabular import accuracy, antenna_rows, calibration_rows, table
 
-__all__ = ["Drive", "accuracy", "antenna_rows", "attempted", "calibration_rows", "captioned",
+__all__ = ["Drive", "accuracy", "antenna_rows", "attempted", "calibration_rows",
            "notices", "results_folder", "show_doubts", "solved", "start", "table"]

@@ -8,19 +8,17 @@ to hand in and nothing else, and a cached notebook keeps its records.
 import os
 import re
 from dataclasses import asdict, dataclass, field
+from itertools import product
 from pathlib import Path
 
-import matplotlib.pyplot as plt
 from IPython.display import Markdown, display
 from matplotlib_inline.backend_inline import set_matplotlib_formats
-from tqdm.auto import tqdm
 
 from slamlib import solve
 from slamlib.dataset import Dataset, Truth, dataset_names, read_dataset, read_truth
 from slamlib.doubt import Doubt
 from slamlib.notebook import plotting
 from slamlib.simulation import simulate
-from slamlib.studies.memory import BAR_AFTER
 
 KEY = "slamlib"  # of records in the metadata of outputs
 # Types of records by their key.
@@ -84,11 +82,6 @@ def results_folder(drive):
     return folder / drive.name
 
 
-def interactive():
-    """True in JupyterLab, False while the report is built."""
-    return "SLAMLIB_RESULTS" not in os.environ
-
-
 def solved(drives, **solvers):
     """Results of solvers by problem, as {Drive: result} of the drives on which all succeed.
 
@@ -109,8 +102,7 @@ def solved(drives, **solvers):
     drives = _or_simulated([drive for drive in drives if all(
         solve.allows(drive.dataset, problem) for problem in solvers)])
     found = {drive: {} for drive in drives}
-    pairs = [(drive, problem) for drive in drives for problem in solvers]
-    for drive, problem in tqdm(pairs, disable=not interactive(), leave=False, delay=BAR_AFTER):
+    for drive, problem in product(drives, solvers):
         try:
             found[drive][problem] = result = solvers[problem](drive)
             solve.require_covariances(result)
@@ -172,13 +164,6 @@ def notices(books):
                 for kind in RECORDS.keys() & entry.keys():
                     found.setdefault(entry["dataset"], []).append(RECORDS[kind](**entry[kind]))
     return {name: list(dict.fromkeys(records)) for name, records in found.items()}
-
-
-def captioned(fig, caption):
-    """Show a figure and, directly below it, its caption, which may contain computed numbers."""
-    display(fig)
-    plt.close(fig)  # otherwise it would be shown again at the end of the cell
-    display(Markdown(caption))
 
 
 def _folder(variable, name):

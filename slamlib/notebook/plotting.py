@@ -14,17 +14,12 @@ import numpy as np
 from matplotlib.collections import EllipseCollection
 from matplotlib.colors import to_rgb
 
+from slamlib import se2
 from slamlib.evaluation import REACH_95
 from slamlib.odometry import cumulative
 
-
-class _Looks(dict):
-    def __missing__(self, role):
-        raise ValueError(f"expected a role such as {', '.join(self)}, found {role!r}")
-
-
 # Colours of Okabe and Ito and of Tol, distinct for the colour-blind; line styles differ in grey.
-ROLES = _Looks({
+ROLES = {
     "truth": dict(color="black", linestyle=(0, (4, 2)), linewidth=1.1, zorder=4),
     "odometry": dict(color="#D55E00", linewidth=1.5, zorder=3),
     "exact": dict(color="#332288", linewidth=1.5, zorder=3),
@@ -42,7 +37,7 @@ ROLES = _Looks({
     "guess": dict(color="#222222", linestyle="none", marker="^", markersize=7, zorder=4,
                   markerfacecolor="none"),
     "true antenna": dict(color="black", linestyle="none", marker="+", markersize=9, zorder=6),
-})
+}
 
 
 def use_style():
@@ -80,6 +75,22 @@ def each_drive(drives, rows=1, **size):
         legend_below(fig)
 
 
+def estimates(result, drive):
+    """Indices (m,), poses (m, 3), covariances (m, 3, 3) and true poses of what is estimated.
+
+    `result` is (poses, covariances), or has these attributes: a Solution, Localization, Fusion or
+    SlamResult. The truth, None where the Drive has none, is in the world frame of the result.
+    """
+    poses, covariances = result if isinstance(result, tuple) else (result.poses, result.covariances)
+    known = np.isfinite(poses[:, 0])
+    frame = getattr(result, "frame", np.arange(len(poses)))[known]
+    true = None if drive.truth is None else drive.truth.poses
+    world = getattr(result, "world", frame[0] if hasattr(result, "frame") else 0)
+    if true is not None:
+        true = (se2.between(true[world], true) if world else true)[frame]
+    return frame, poses[known], covariances[known], true
+
+
 def with_ellipses(ax, poses, covariances, role, label=None, count=12, enlarged=None, **look):
     """Draw a path with `count` filled 95 % ellipses at equal distances along it.
 
@@ -100,20 +111,21 @@ def errors(axes, result, drive, role="slam"):
     """Draw errors of a result along the path in two axes: of position, and of the heading.
 
     The bands are the longest semi-axis of the 95 % ellipse and ±2 sigma of the heading; without
-    truth they stand alone. `result` has poses and covariances of every pose of the Drive.
+    truth they stand alone. `result` as of `estimates`.
     """
     (top, bottom), color = axes, ROLES[role]["color"]
-    some = np.unique(np.linspace(0, len(result.poses) - 1, 800).astype(int))
-    C = result.covariances[some]
+    frame, poses, C, true = estimates(result, drive)
+    some = np.unique(np.linspace(0, len(frame) - 1, 800).astype(int))
+    frame, C = frame[some], C[some]
     reach = 1e3 * REACH_95 * np.sqrt(np.maximum(np.linalg.eigvalsh(C[:, :2, :2])[:, 1], 0))
     turn = 2e3 * np.sqrt(C[:, 2, 2])
     for ax, low, high in ((top, 0 * reach, reach), (bottom, -turn, turn)):
-        ax.fill_between(some + 1, low, high, color=color, alpha=0.18, linewidth=0,
+        ax.fill_between(frame + 1, low, high, color=color, alpha=0.18, linewidth=0,
                         label="95 % by the covariance")
-    if drive.truth is not None:
-        off = (result.poses - drive.truth.poses)[some]
-        curve(top, 1e3 * np.hypot(*off[:, :2].T), role, some, "error", linewidth=1.2)
-        curve(bottom, 1e3 * off[:, 2], role, some, "error", linewidth=0.8)
+    if true is not None:
+        off = 1e3 * (poses - true)[some]
+        curve(top, np.hypot(*off[:, :2].T), role, frame, "error", linewidth=1.2)
+        curve(bottom, off[:, 2], role, frame, "error", linewidth=0.8)
     name_rows(axes, ("position (mm)", "δ (mrad)"))
     top.set_ylim(0, None)
     return axes
@@ -129,52 +141,50 @@ def trajectory(ax, poses, role, label=None, **look):
     return ax
 
 
-def ellipses(ax, positions, covariances, color, probability=0.95, label=None, fill=0.12, enlarged=1,
-             fit=True):
+def ellipses(ax, positions, covariances, color, probability=0.95, label=None, fill=0.12,
+             enlarged=1):
     """Draw ellipses of a probability at positions (m, >= 2) with covariances (m, >= 2, >= 2).
 
-    `fill` is the opacity. `enlarged` scales the ellipses, which the figure must state. The axes are
-    extended to contain the ellipses unless `fit` is False.
+    `fill` is the opacity. `enlarged`, a number or (m,), scales the ellipses, which the figure must
+    state. The axes are extended to contain them.
     """
-    k, centre = enlarged * np.sqrt(-2 * np.log(1 - probability)), np.asarray(positions)[:, :2]
+    k = np.sqrt(-2 * np.log(1 - probability)) * np.reshape(enlarged, (-1, 1))
+    centre = np.asarray(positions)[:, :2]
     variances, axes = np.linalg.eigh(np.asarray(covariances)[:, :2, :2])
     widths = 2 * k * np.sqrt(np.maximum(variances, 0))
     angles = np.degrees(np.arctan2(axes[:, 1, 1], axes[:, 0, 1]))
     rgb = np.array(to_rgb(color))
     face, edge = (*rgb, fill), tuple(0.6 * rgb)           # darker than the path below them
-    patches = EllipseCollection(
+    ax.add_collection(EllipseCollection(
         widths[:, 1], widths[:, 0], angles, units="xy", offsets=centre,
-        offset_transform=ax.transData, facecolors=face, edgecolors=edge, linewidths=1.1, zorder=3.5)
-    ax.add_collection(patches)
-    if fit:
-        reach = k * np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)[:, :2])
-        ax.update_datalim(np.concatenate([centre - reach, centre + reach]))
+        offset_transform=ax.transData, facecolors=face, edgecolors=edge, linewidths=0.9,
+        zorder=3.5))
+    reach = k * np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)[:, :2])
+    ax.update_datalim(np.concatenate([centre - reach, centre + reach]))
     if label:
         ax.plot([], [], "o", markersize=9, markerfacecolor=face, markeredgecolor=edge, label=label)
     ax.autoscale_view()
     return ax
 
 
-def draw_markers(ax, in_world, covariances, role="marker", label="markers"):
-    """Draw markers in_world (k, >= 2) as squares with their 95 % ellipses."""
-    ellipses(ax, in_world, covariances, "#bbbbbb", fill=0.35)
-    ax.plot(in_world[:, 0], in_world[:, 1], label=label, **ROLES[role])
+def draw_markers(ax, in_world, covariances, enlarged=1):
+    """Draw markers in_world (k, 3) as squares with their 95 % ellipses."""
+    ellipses(ax, in_world, covariances, ROLES["aruco"]["color"], fill=0.3, enlarged=enlarged)
+    ax.plot(*in_world[:, :2].T, label="markers", **ROLES["marker"])
     return ax
 
 
 def draw_antennas(ax, positions, covariances, guess=None, truth=None, enlarged=1):
-    """Draw antennas (a, 2) with 95 % ellipses, and their guessed and true positions (a, 2)."""
-    ellipses(ax, positions, covariances, "#999999", fill=0.35, enlarged=enlarged)
-    return antenna_positions(ax, positions, guess, truth)
+    """Draw antennas (a, 2) with 95 % ellipses, lines from their guesses (a, 2), and truth (t, 2).
 
-
-def antenna_positions(ax, positions, guess=None, truth=None, **look):
-    """Draw positions (a, 2) of antennas, lines from their guesses (a, 2), and truth (t, 2)."""
+    `enlarged`, the factor on the ellipses, may be (a,).
+    """
+    ellipses(ax, positions, covariances, "#44AA99", fill=0.3, enlarged=enlarged)
     if guess is not None:
-        ends = np.stack([guess, positions])
-        ax.plot(ends[..., 0], ends[..., 1], color="#999999", linewidth=0.8, zorder=2)
+        ax.plot(*np.stack([guess, positions]).transpose(2, 0, 1), color="#999999", linewidth=0.8,
+                zorder=2)
         ax.plot(*guess.T, label="antennas: guess", **ROLES["guess"])
-    ax.plot(*positions.T, label="antennas: estimate", **{**ROLES["antenna"], **look})
+    ax.plot(*positions.T, label="antennas: estimate", **ROLES["antenna"])
     if truth is not None and len(truth):
         ax.plot(*truth.T, label="antennas: truth", **ROLES["true antenna"])
     return ax
@@ -186,23 +196,6 @@ def places_by_id(ids, places, wanted):
     none = np.full(np.shape(places)[1], np.nan)
     return np.array([found.get(i, none) for i in np.asarray(wanted).tolist()]).reshape(
         len(wanted), len(none))
-
-
-def likelihood(ax, positions, ranges, sigma, window):
-    """Shade the likelihood of an antenna's position relative to its maximum, all in m.
-
-    Ranges (m,) from positions (m, 2) have the same standard deviation `sigma`. `window` is
-    ((x_low, x_high), (y_low, y_high)).
-    """
-    x, y = (np.linspace(low, high, 161) for low, high in window)
-    grid = np.stack(np.meshgrid(x, y), -1)
-    off = (np.linalg.norm(grid[:, :, None] - positions, axis=-1) - ranges) / sigma
-    cost = np.sum(off**2, axis=-1) / 2
-    ax.contourf(x, y, np.exp(cost.min() - cost), levels=[1e-6, 1e-3, 0.05, 0.3, 1.01],
-                colors=["#e3f1fa", "#b5dbf3", "#7cbfe8", "#0072B2"])
-    ax.set_aspect("equal", adjustable="box")
-    ax.set(xlabel="x (m)", ylabel="y (m)")
-    return ax
 
 
 def enlargement(poses, covariances, share=0.15):
@@ -256,4 +249,30 @@ def curve(ax, values, role, frame=None, label=None, **look):
     frame = np.arange(len(values)) if frame is None else frame
     ax.plot(frame + 1, values, label=label or role, **{**ROLES[role], **look})
     ax.set(xlabel="pose number")
+    return ax
+
+
+def slam_graph(ax, poses, sightings):
+    """Draw a scheme of problem 3's graph: poses in a row, markers above, wheel parameters w below.
+
+    `poses` is their number; `sightings` are pairs of a pose from 0 and a marker from 1.
+    """
+    markers = sorted({marker for _, marker in sightings})
+    places = {f"$X_{i + 1}$": (i, 0.0) for i in range(poses)} | {"$w$": (poses / 2 - 0.5, -0.8)} | {
+        f"$L_{{{marker}}}$": (x, 1.3) for marker, x in zip(
+            markers, np.linspace(-0.7, poses - 0.3, len(markers) + 2)[1:-1], strict=True)}
+    factors = [("aruco", f"$X_{i + 1}$", f"$L_{{{marker}}}$") for i, marker in sightings]
+    factors += [("odometry", f"$X_{i}$", f"$X_{i + 1}$", "$w$") for i in range(1, poses)]
+    for role, *names in factors + [("truth", "$X_1$"), ("truth", "$w$")]:
+        ends = np.array([places[name] for name in names])
+        middle = ends.mean(axis=0) - [0.3 * (len(names) == 1), 0.0]         # priors stand beside
+        for end in ends:
+            ax.plot(*np.stack([end, middle]).T, color=ROLES[role]["color"], linewidth=0.9, zorder=1)
+        ax.plot(*middle, "s", color=ROLES[role]["color"], markersize=4.5, zorder=2)
+    for name, place in places.items():
+        color = {"L": "#dddddd", "w": "#ffe0b0"}.get(name[1], "white")
+        ax.text(*place, name, ha="center", va="center", fontsize=11, zorder=4,
+                bbox=dict(boxstyle="circle,pad=0.25", facecolor=color, edgecolor="black"))
+    ax.set(xlim=(-0.8, poses - 0.2), ylim=(-1.3, 1.8))
+    ax.axis("off")
     return ax

@@ -5,8 +5,8 @@ import re
 import numpy as np
 from IPython.display import Markdown
 
-from slamlib import evaluation, se2
-from slamlib.notebook.plotting import places_by_id
+from slamlib import evaluation
+from slamlib.notebook.plotting import estimates, places_by_id
 from slamlib.slam.calibration import RANGES
 
 DASH = "–"
@@ -23,30 +23,28 @@ def table(rows, caption=None):
     dashes; columns of nothing else are left out. Of consecutive rows with the same first cell only
     the first shows it. `caption` (str) stands below.
     """
-    rows = list(rows)
-    header = [name for name in dict.fromkeys(name for row in rows for name in row)
-              if not all(_missing(row.get(name)) for row in rows)] or [DASH]
-    texts = [not all(NUMERIC.match(cell(row.get(name))) for row in rows) for name in header]
-    cells = [[cell(row.get(name)) if text else re.sub(MINUS, "−", cell(row.get(name)))
-              for name, text in zip(header, texts, strict=True)] for row in rows or [{}]]
-    above = [None, *(row[0] for row in cells)]
-    cells = [["" if row[0] == first and len(row) > 1 else row[0], *row[1:]]
-             for first, row in zip(above, cells, strict=False)]
-    lines = [header, ["---" if text else "---:" for text in texts], *cells]
-    text = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    rows = [{name: cell(value) for name, value in row.items()} for row in rows]
+    columns = {name: [row.get(name, DASH) for row in rows] for row in rows for name in row}
+    columns = {name: column for name, column in columns.items()
+               if set(column) != {DASH}} or {DASH: [DASH]}
+    lines = [list(columns), []]
+    for name, column in columns.items():
+        numeric = all(map(NUMERIC.match, column))
+        lines[1].append("---:" if numeric else "---")
+        columns[name] = [MINUS.sub("−", text) for text in column] if numeric else column
+    first, *others = columns.values()
+    if others:
+        first = [text * (text != above) for above, text in zip([None, *first], first)]
+    text = "\n".join("| " + " | ".join(line) + " |" for line in (*lines, *zip(first, *others)))
     return Markdown(text + (f"\n\n{caption}" if caption else ""))
-
-
-def _missing(value):
-    return value is None or isinstance(value, float | np.floating) and np.isnan(value)
 
 
 def cell(value):
     """Text (str) of a value of `table`."""
-    if _missing(value):
-        return DASH
     if isinstance(value, str):
         return value
+    if value is None or np.ndim(value) == 0 and np.isnan(value):
+        return DASH
     if isinstance(value, bool | np.bool_):
         return "yes" if value else "no"
     if isinstance(value, int | np.integer):
@@ -77,25 +75,18 @@ def _over_drives(values):
 def accuracy(result, drive):
     """Row of `table` on what a solver found of a Drive: median sigmas, errors where truth is known.
 
-    `result` is (poses, covariances), or has these attributes: a Solution, Localization, Fusion or
-    SlamResult. Poses that are NaN are left out. The sigma of position is the larger of x and y.
+    `result` as of `plotting.estimates`. The sigma of position is the larger of x and y.
     """
-    poses, covariances = result if isinstance(result, tuple) else (result.poses, result.covariances)
-    known = np.isfinite(poses[:, 0])
-    frame = getattr(result, "frame", np.arange(len(poses)))[known]
-    poses, covariances = poses[known], covariances[known]
+    _, poses, covariances, true = estimates(result, drive)
     row = {"dataset": drive.name,
            "σ (mm)": 1e3 * np.median(evaluation.position_sigmas(covariances)),
            "σ of δ (mrad)": 1e3 * np.median(evaluation.sigmas(covariances)[:, 2])}
-    if drive.truth is None:
+    if true is None:
         return row
-    true = drive.truth.poses
-    if world := getattr(result, "world", frame[0] if hasattr(result, "frame") else 0):
-        true = se2.between(true[world], true)
-    nees = evaluation.nees(poses, covariances, true[frame])
+    nees = evaluation.nees(poses, covariances, true)
     nees = nees[np.isfinite(nees)]
-    return row | {"ATE (mm)": 1e3 * evaluation.ate(poses, true[frame]),
-                  "aligned (mm)": 1e3 * evaluation.ate(poses, true[frame], aligned=True),
+    return row | {"ATE (mm)": 1e3 * evaluation.ate(poses, true),
+                  "aligned (mm)": 1e3 * evaluation.ate(poses, true, aligned=True),
                   "NEES, mean": nees.mean() if len(nees) else None,
                   "NEES, median": np.median(nees) if len(nees) else None}
 
@@ -122,18 +113,23 @@ def calibration_rows(result, drive):
 
 
 def antenna_rows(result, drive):
-    """Rows of `table` on the antennas of a SlamResult: position, sigmas, distances in mm."""
-    guess, truth = drive.dataset.antenna_guess, drive.truth
+    """Rows of `table` on the antennas of a SlamResult: position, sigmas, distances in mm.
+
+    `d²` is the squared error in units of the covariance, `late` the percentage of the ranges that
+    keep less than half of their weight.
+    """
     if not len(result.antenna):
         return
-    moved = result.antenna_in_world - places_by_id(guess.antenna, guess.position, result.antenna)
-    error = np.full(len(moved), np.nan) if truth is None or not len(truth.antenna) else np.hypot(
-        *(result.antenna_in_world
-          - places_by_id(truth.antenna, truth.antenna_in_world, result.antenna)).T)
-    sigma = 1e3 * evaluation.sigmas(result.antenna_covariance)
+    place, C, uwb = result.antenna_in_world, result.antenna_covariance, drive.dataset.uwb
+    guess, truth = drive.dataset.antenna_guess, drive.truth
+    moved = place - places_by_id(guess.antenna, guess.position, result.antenna)
+    off = np.full_like(place, np.nan) if truth is None else place - places_by_id(
+        truth.antenna, truth.antenna_in_world, result.antenna)
+    squared = np.einsum("ni,nij,nj->n", off, np.linalg.inv(C), off)
     for k, antenna in enumerate(result.antenna.tolist()):
-        yield {"dataset": drive.name, "antenna": str(antenna) + "?" * (antenna in result.doubts),
-               "x (m)": f"{result.antenna_in_world[k, 0]:.3f}",
-               "y (m)": f"{result.antenna_in_world[k, 1]:.3f}",
-               "σ of x (mm)": sigma[k, 0], "σ of y (mm)": sigma[k, 1],
-               "from the guess (mm)": 1e3 * np.hypot(*moved[k]), "error (mm)": 1e3 * error[k]}
+        yield {"dataset": drive.name, "antenna": f"{antenna}{'?' * (antenna in result.doubts)}",
+               "x (m)": f"{place[k, 0]:.3f}", "y (m)": f"{place[k, 1]:.3f}",
+               "σ of x (mm)": 1e3 * np.sqrt(C[k, 0, 0]), "σ of y (mm)": 1e3 * np.sqrt(C[k, 1, 1]),
+               "from the guess (mm)": 1e3 * np.hypot(*moved[k]),
+               "error (mm)": 1e3 * np.hypot(*off[k]), "d²": squared[k],
+               "late (%)": 100 * np.mean(result.range_weight[uwb.antenna == antenna] < 0.5)}
