@@ -4,7 +4,6 @@ No study is recalled that was kept before the tests.
 """
 
 import os
-import re
 import shutil
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
@@ -29,7 +28,7 @@ STUDY_SEEDS = "2"            # in pages that tests build: their claims are teste
 # Files that mostly wait run beside files that start further processes: both processors are busy.
 FIRST = ("test_pages", "test_concurrency", "test_lab", "test_machines", "test_slam",
          "test_flaws", "test_uwb", "test_trust", "test_install", "test_report", "test_docs",
-         "test_localization", "test_properties", "test_doubts", "test_explore",
+         "test_localization", "test_properties", "test_doubts",
          "test_overview", "test_cache", "test_studies")
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
@@ -84,12 +83,11 @@ BROUGHT = ("new seed", "no_truth", "wheels_only", "waits", "one_pose", "backs_up
            "sparse")
 
 
-def copied(target, chapters, grids=False, first=None):
-    """Write notebooks to a folder, by a pattern of their names; their Explore shows one figure.
+def copied(target, chapters, first=None):
+    """Write notebooks to a folder, by a pattern of their names.
 
-    With `grids`, all figures between which its sliders move, which `report_on_all` draws, too. A
-    code cell `first` (str) stands before all others. Studies run on the short path only,
-    and what cells simulate by themselves on few drives.
+    A code cell `first` (str) stands before all others. Studies run on the short path only, and what
+    cells simulate by themselves on few drives.
     """
     import nbformat
     target.mkdir()
@@ -99,10 +97,6 @@ def copied(target, chapters, grids=False, first=None):
             book.cells.insert(1, nbformat.v4.new_code_cell(first, id="first"))
         for cell in book.cells:
             cell.source = cell.source.replace('path="long", ', '').replace("range(100)", "range(9)")
-            if "explore.show_with_controls(" in cell.source and not grids:
-                cell.source, count = re.subn(r"\n *grid=\{.*?\},(?=\n)", "", cell.source,
-                                             flags=re.DOTALL)
-                assert count == 1
         nbformat.write(book, target / source.name)
 
 
@@ -175,7 +169,7 @@ def report_on_all(tmp_path_factory, kept):
     for name, rows in (("one_sighting", seen[:1]), ("sparse", seen[seen[:, 0] % 150 == 1])):
         shutil.copytree(data / "new seed", data / name)
         np.savetxt(data / name / "ArucoReading.txt", rows, fmt="%d %d" + 9 * " %.6g")
-    copied(folder / "notebooks", "*.ipynb", grids=True)
+    copied(folder / "notebooks", "*.ipynb")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SLAMLIB_SEEDS", STUDY_SEEDS)
         built_elsewhere(folder / "notebooks", data, folder / "report", folder / "results",

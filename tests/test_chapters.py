@@ -1,10 +1,13 @@
-"""Functions that chapters show are those of the library, where the chapter does not check it."""
+"""The notebooks as they are written, and what they show and do not check themselves."""
 
+import re
+import symtable
 from dataclasses import replace
 from pathlib import Path
 
 import nbformat
 import numpy as np
+import pytest
 from scipy.linalg import block_diag
 
 from slamlib import increments, localization, se2
@@ -12,16 +15,76 @@ from slamlib.sightings import sightings_by_frame
 from slamlib.simulation import simulate
 
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
+CHAPTERS = sorted(NOTEBOOKS.glob("[0-9]*.ipynb"))
+MAX_NAMES = 12               # imported before the first result
 
 
-def shown(chapter, name):
-    """The function `name` as a cell of the notebook `chapter` defines it."""
+def cells_of(source, kind="code"):
+    return [cell for cell in nbformat.read(source, as_version=4).cells if cell.cell_type == kind]
+
+
+def has(cell, tag):
+    return tag in cell.metadata.get("tags", ())
+
+
+@pytest.mark.parametrize("source", CHAPTERS, ids=lambda path: path.stem)
+def test_captions_are_in_order_and_a_chapter_ends_with_what_was_learned_and_try_it(source):
+    cells = cells_of(source, "markdown")
+    headings = re.findall("(?m)^## (.+)$", "\n".join(cell.source for cell in cells))
+    assert headings[-1] == "Try it" and "What was learned" in headings[-3:-1]
+    assert all(has(cell, "lab-only") == (i >= next(
+        i for i, cell in enumerate(cells) if cell.source.startswith("## Try it")))
+        for i, cell in enumerate(cells))
+    text = "\n".join(cell.source for cell in nbformat.read(source, as_version=4).cells)
+    for kind in ("Figure", "Table"):
+        numbers = re.findall(rf'^(?:.*")?{kind} (\d+\.\d+)\. ', text, re.MULTILINE)
+        assert numbers == [f"{source.name[0]}.{n}" for n in range(1, len(numbers) + 1)]
+        for number in numbers:
+            assert re.search(rf"(?i){kind}s? (\S+ and )?{re.escape(number)}(?!\. \S)", text), number
+
+
+@pytest.mark.parametrize("source", CHAPTERS, ids=lambda path: path.stem)
+def test_code_is_short_and_what_pages_fold_is_collapsed_in_jupyterlab(source):
+    code = cells_of(source)
+    assert max(len(cell.source.splitlines()) for cell in code) <= 25
+    assert sum(bool(line.strip()) for cell in code for line in cell.source.splitlines()) <= 260
+    for cell in code:
+        assert cell.metadata.get("jupyter", {}).get("source_hidden", False) == has(
+            cell, "hide-input")
+
+
+def names_of(source):
+    """Global names that code defines, imports and uses, in its functions too: three sets."""
+    whole = symtable.symtable(source, "cell", "exec")
+    tables, used = [whole], set()
+    while tables:
+        table = tables.pop()
+        used |= {each.get_name() for each in table.get_symbols()
+                 if each.is_global() or table is whole and each.is_referenced()}
+        tables += table.get_children()
+    return ({each.get_name() for each in whole.get_symbols() if each.is_assigned()},
+            {each.get_name() for each in whole.get_symbols() if each.is_imported()}, used)
+
+
+@pytest.mark.parametrize("source", CHAPTERS, ids=lambda path: path.stem)
+def test_what_is_shown_runs_without_what_is_hidden_and_imports_few_names(source):
+    hidden, shown, needed, first, solved = set(), set(), set(), set(), False
+    for cell in cells_of(source):
+        assigned, imported, used = names_of(cell.source)
+        solved = solved or "solved(" in cell.source
+        first |= set() if solved else imported
+        if has(cell, "hide-input"):
+            hidden |= assigned | imported
+        elif not has(cell, "lab-only"):
+            shown |= assigned | imported
+            needed |= used - shown
+    assert needed & hidden == set() and len(first) <= MAX_NAMES
+
+
+def cell_that_defines(chapter, name):
     source, = NOTEBOOKS.glob(f"{chapter}_*.ipynb")
-    cell, = (cell.source for cell in nbformat.read(source, as_version=4).cells
-             if cell.cell_type == "code" and f"def {name}(" in cell.source)
-    names = {"np": np, "se2": se2}
-    exec(cell, names)
-    return names[name]
+    cell, = (cell.source for cell in cells_of(source) if f"def {name}(" in cell.source)
+    return cell
 
 
 def test_two_steps_of_the_filter_of_chapter_2_are_those_of_fuse():
@@ -33,13 +96,14 @@ def test_two_steps_of_the_filter_of_chapter_2_are_those_of_fuse():
     _, first, second = np.intersect1d(g.marker[earlier], g.marker[later], return_indices=True)
     first, second = earlier[first], later[second]
     ticks = dataset.ticks[begin:end + 1] * (np.arange(end - begin + 1) > 0)[:, None]
-    start, ends, wheel = [0], [end - begin], v.wheel
+    start, ends, wheel, known = [0], [end - begin], v.wheel, {"np": np, "se2": se2}
+    exec(cell_that_defines(2, "filter_step"), known)
     for _ in range(2):
         at = v.with_wheel(wheel)
         delta, by_w = increments.between_poses(ticks, at, start, ends, "arc")
         rounding, slipping = increments.noise_in_drive(ticks, at, start, ends)
         P = block_diag(np.diag([0, 0, v.sigma_heading, *v.sigma_wheel])**2, *g.C[first])
-        X, w, P = shown(2, "filter_step")(
+        X, w, P = known["filter_step"](
             np.zeros(3), v.wheel - wheel, g.z[first], P, delta[0], by_w[0],
             rounding[0] + slip**2 * slipping[0], g.z[second], g.C[second])
         wheel = wheel + w

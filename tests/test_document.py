@@ -213,17 +213,16 @@ def test_outputs_are_shown_by_the_best_kind_and_html_tables_are_tables(tmp_path)
         "1. One", new_code_cell(outputs=[
             shown(image_png="iVBORw0KGgo=", text_plain="no", **{"image_svg+xml": SVG}),
             shown(text_html=table, text_plain="no"), shown(text_markdown="Table 1.1. Frames."),
-            shown(text_html="<div class='states'>buttons</div>", text_plain="no"),
             shown(text_plain="last"), new_output("stream", name="stderr", text="\x1b[31mtold\n")]),
         new_raw_cell("raw"))
     found, content = pages({ONE: book})
     found = found["1"]
     assert found.count("<img") == 1 and 'src="data:image/svg+xml;base64' in found
-    assert 'id="table-1.1"' in found and "<style" not in found and "class='states'" in found
+    assert 'id="table-1.1"' in found and "<style" not in found
     assert "last" in found and re.search('<pre class="output stderr"><code>told', found)
     text = text_of(content, tmp_path)
     assert "cell" in text and "last" in text and "told" in text
-    assert not re.search(r"\bno\b|buttons", text)
+    assert not re.search(r"\bno\b", text)
 
 
 def test_pictures_beside_the_notebook_and_attachments_are_embedded(tmp_path):

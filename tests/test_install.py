@@ -14,12 +14,9 @@ from test_report import write
 from slamlib.report import notebooks as sources
 
 CODE = """from slamlib import solve
-from slamlib.notebook import captioned, explore, solved, start
+from slamlib.notebook import plotting, solved, start
 solved(start(), problem1=lambda drive: solve.find("problem1", drive.dataset))
-captioned(explore.plotting.panels(1)[0], "Figure 1.1. Empty.")"""
-EXPLORE = """def draw(size):
-    return explore.plotting.panels(1)[0]
-explore.show_with_controls(draw, grid={"size": [1, 2]}, size=explore.slider("size", 1, 0, 9))"""
+plotting.panels(1);"""
 
 ROOT = Path(__file__).parents[1]
 NOTEBOOKS = ["1_chapter.ipynb", "A_appendix.ipynb"]
@@ -51,7 +48,7 @@ def installed(tmp_path_factory):
                     ignore=shutil.ignore_patterns("__pycache__"))
     for number, name in enumerate(NOTEBOOKS):
         write(tree / "notebooks", name.removesuffix(".ipynb"), f"# {name[0]}. Chapter",
-              *[(CODE,), "## Explore", (EXPLORE,)] * (number == 0))
+              *[(CODE,), "Figure 1.1. Empty."] * (number == 0))
     for name in ("pyproject.toml", "README.md"):
         shutil.copy(ROOT / name, tree)
     run(sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-build-isolation", "--no-index",

@@ -1,4 +1,4 @@
-"""JupyterLab as a user sees it: a notebook is opened and run, and sliders of Explore are moved."""
+"""JupyterLab as a user sees it: a notebook is opened and run, and a slider is moved."""
 
 import json
 import os
@@ -27,7 +27,7 @@ NEWS = "Would you like to get notified about official Jupyter news?"
 def lab(tmp_path_factory):
     """Address and token of a JupyterLab on a copy of a notebook and 300 poses of `short`."""
     folder = tmp_path_factory.mktemp("lab")
-    copied(folder / "notebooks", "1_odometry.ipynb", grids=True)
+    copied(folder / "notebooks", "1_odometry.ipynb")
     write_dataset(folder / "data" / "short", read_dataset(ROOT / "data" / "short").first(300))
     environment = {name: value for name, value in os.environ.items()
                    if not name.startswith(("SLAMLIB_", "JUPYTER"))}

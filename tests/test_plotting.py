@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from matplotlib.transforms import Affine2D
 
+from slamlib import se2
 from slamlib.evaluation import REACH_95
-from slamlib.notebook import plotting, schemes
+from slamlib.notebook import plotting
 from slamlib.se2 import rotation
 
 pytestmark = pytest.mark.usefixtures("look")
@@ -99,15 +100,16 @@ def elongated(count, major, minor):
     return C
 
 
-@pytest.mark.parametrize("enlarged", [1, 3])
+@pytest.mark.parametrize("enlarged", [1, 3, np.arange(1, 5)])
 def test_ellipses_are_lines_of_equal_mahalanobis_distance(enlarged):
     """(p - m)^T C^-1 (p - m) = k^2 holds on the boundary, with k^2 = -2 ln(1 - 0.95)."""
     means, covariances = np.arange(12.0).reshape(4, 3), elongated(4, 2.0, 0.5)
     _, ((ax,),) = plotting.panels(1)                                 # scales of x and y differ
     plotting.ellipses(ax, means, covariances, "#0072B2", probability=0.95, enlarged=enlarged)
-    half = 2.4477 * enlarged * np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)[:, :2])
+    k = np.resize(enlarged, 4)
+    half = 2.4477 * k[:, None] * np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)[:, :2])
     patches, = ax.collections
-    require_contours(patches, means, covariances, enlarged * np.sqrt(-2 * np.log(0.05)))
+    require_contours(patches, means, covariances * k[:, None, None]**2, np.sqrt(-2 * np.log(0.05)))
     for points, m, reach in zip(boundaries(patches), means, half, strict=True):
         offset = points - m[:2]
         np.testing.assert_allclose([offset.min(0), offset.max(0)], [-reach, reach], rtol=0.01)
@@ -118,26 +120,11 @@ def test_ellipses_are_lines_of_equal_mahalanobis_distance(enlarged):
 
 def test_the_scheme_of_a_graph_has_a_square_for_each_factor_and_a_name_for_each_variable():
     _, ((ax,),) = plotting.panels(1)
-    schemes.slam_graph(ax, 3, [(0, 0), (1, 0), (2, 1)], [7, 8], [(0, 0), (2, 0)], [5])
+    plotting.slam_graph(ax, 3, [(0, 7), (1, 7), (2, 8)])
     squares = [line for line in ax.lines if line.get_marker() == "s"]
-    assert len(squares) == 3 + 2 + 2 + 3       # sightings, ranges, odometry, and three priors
+    assert len(squares) == 3 + 2 + 2                          # sightings, odometry, two priors
     assert [text.get_text() for text in ax.texts] == [
-        "$X_1$", "$X_2$", "$X_3$", "$L_{7}$", "$L_{8}$", "$A_{5}$", "$w$"]
-
-
-def test_antennas_have_their_own_covariances():
-    positions = np.arange(8.0).reshape(4, 2)
-    covariances = elongated(4, 2.0, 0.5) * np.arange(1, 5)[:, None, None]
-    _, ((ax,),) = plotting.panels(1)
-    plotting.draw_antennas(ax, positions, covariances, enlarged=3)
-    patches, = ax.collections
-    require_contours(patches, positions, covariances, 3 * REACH_95)
-
-
-def test_an_unknown_role_is_answered_by_those_there_are():
-    _, axes = plotting.panels(1)
-    with pytest.raises(ValueError, match="a role such as truth, odometry, .*, found 'mine'"):
-        plotting.trajectory(axes[0, 0], np.zeros((2, 3)), "mine")
+        "$X_1$", "$X_2$", "$X_3$", "$w$", "$L_{7}$", "$L_{8}$"]
 
 
 def drive_with(truth=True):
@@ -171,8 +158,15 @@ def test_a_path_has_ellipses_of_its_covariances_and_their_factor_as_title():
 
 
 @pytest.mark.parametrize("truth", [True, False])
-def test_errors_are_in_mm_and_without_truth_the_bands_stand_alone(truth):
+@pytest.mark.parametrize("world", [0, 7])
+def test_errors_are_in_mm_and_without_truth_the_bands_stand_alone(truth, world):
+    """Also of a Localization, which has some poses only, in the frame of the first of them."""
     result, drive = drive_with(truth)
+    if world:
+        true = drive_with()[1].truth.poses
+        off = se2.between(true[world], result.poses - [0.01, 0, 0.002]) + [0.01, 0, 0.002]
+        result = SimpleNamespace(poses=off[world::2], frame=np.arange(world, 50, 2),
+                                 covariances=result.covariances[world::2])
     (top, bottom), = (plotting.errors(axes, result, drive)
                       for _, axes in plotting.each_drive([drive], rows=2))
     for ax, error, reach in ((top, 10, 20 * REACH_95), (bottom, 2, 200)):

@@ -19,12 +19,11 @@ from nbformat import NotebookNode
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_raw_cell
 
 from slamlib.dataset import DatasetError
-from slamlib.report.execution import NotebookError
+from slamlib.report.execution import LAB_ONLY, NotebookError
 from slamlib.report.notebooks import appendix_of
 
 HERE = Path(__file__).parent
 TEMPLATES = {"html": "page.html", "typst": "report.typ"}
-LAB_ONLY = "lab-only"  # tag of cells that neither pages nor the PDF show
 SHOWN = ("image/svg+xml", "image/png", "image/jpeg", "text/markdown", "text/latex", "text/html",
          "text/plain")  # kinds of outputs, the first is preferred
 

@@ -30,6 +30,7 @@ from slamlib.studies.workers import ONE_THREAD
 
 CELL_TIMEOUT = 1800  # s, in which a cell must end
 TRANSPORT = "ipc" if hasattr(socket, "AF_UNIX") else "tcp"  # Windows has no Unix sockets
+LAB_ONLY = "lab-only"  # tag of cells that are not executed, and not shown on pages or in the PDF
 LONGEST_FOLDER = 70  # characters; paths of sockets in it have at most 103
 STUDIES = "studies"  # in the cache, besides executed notebooks
 SETTINGS = "settings"  # there, too: of kernels, and JupyterLab's where the user has no others
@@ -129,7 +130,8 @@ async def _execute(source, book, environment, connection, bar):
     client = NotebookClient(
         book, km=manager, resources={"metadata": {"path": str(source.parent)}},
         timeout=CELL_TIMEOUT, iopub_timeout=60, raise_on_iopub_timeout=True,
-        record_timing=False, store_widget_state=False, shutdown_kernel="immediate",
+        record_timing=False, store_widget_state=False, skip_cells_with_tag=LAB_ONLY,
+        shutdown_kernel="immediate",
         extra_arguments=["--IPKernelApp.log_level=ERROR"],
         on_cell_execute=begin, on_cell_executed=lambda **_: bar.update())
     try:

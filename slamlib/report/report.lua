@@ -240,10 +240,15 @@ local function set_target(chapter, kind, label, number)
   return id
 end
 
--- The figure or table `above` with its caption.
-local function captioned(chapter, above, block, kind, label, counts)
-  if not (kind == "table" and above and above.tag == "Table" or kind == "figure"
-    and is_picture(above)) then
+-- The table or the pictures at the end of `blocks`, which are removed there, with their caption.
+local function captioned(chapter, blocks, block, kind, label, counts)
+  local above, last = pandoc.List{}, blocks[#blocks]
+  while last and (kind == "figure" and is_picture(last)
+    or kind == "table" and last.tag == "Table" and #above == 0) do
+    above:insert(1, blocks:remove())
+    last = blocks[#blocks]
+  end
+  if #above == 0 then
     refuse(("the caption of %s %s is not directly below a %s"):format(kind, label, kind))
   end
   counts[kind] = counts[kind] + 1
@@ -251,10 +256,10 @@ local function captioned(chapter, above, block, kind, label, counts)
   local attr = attributes(chapter, set_target(chapter, kind, label, number))
   local caption = {long = {pandoc.Plain(renumbered(block.content, label, number))}}
   if kind == "table" and typst then
-    above.caption, above.attr = caption, attr
-    return above
+    above[1].caption, above[1].attr = caption, attr
+    return above[1]
   end
-  return pandoc.Figure({above}, caption, attr)
+  return pandoc.Figure(above, caption, attr)
 end
 
 -- Text that pandoc writes into a cell of Typst as a numbered list.
@@ -361,11 +366,10 @@ local function set_blocks(chapter)
       block:walk{Math = function(math)
         known["equation " .. (math.text:match "\\tag%*?%s*{([^{}]*)}" or "")] = true end}
     elseif kind then
-      local above = #blocks
-      if above > 0 and blocks[above].tag == "Div" and blocks[above].classes[1] == "folded" then
-        above = above - 1
-      end
-      blocks[above] = captioned(chapter, blocks[above], mended(block)[1], kind, label, counts)
+      local last = blocks[#blocks]
+      local folded = last and last.tag == "Div" and last.classes[1] == "folded" and blocks:remove()
+      blocks:insert(captioned(chapter, blocks, mended(block)[1], kind, label, counts))
+      if folded then blocks:insert(folded) end
     elseif typst and block.tag == "Para" and stringify(block):find ":$" then -- stays with the next
       blocks:insert(pandoc.Div(mended(block), {["typst:sticky"] = "true"}))
     else
