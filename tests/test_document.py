@@ -72,13 +72,14 @@ def links(text):
 # Figures, tables and references.
 
 
-def test_gaps_are_closed_and_references_follow(tmp_path):
+def test_gaps_are_closed_references_follow_and_a_figure_may_have_two_pictures(tmp_path):
     books = {ONE: titled(
-        "1. One", figure(), "Figure 1.2. One, not figure 1.5.", figure("Figure 1.5. Two."),
+        "1. One", figure(), figure(), "Figure 1.2. One, not figure 1.5.", figure("Figure 1.5. Two."),
         f"{TABLE}Table 1.4. A table.\n\nSee figures 1.2 and 1.5, table 1.4, `figure 1.9`.")}
     found, content = pages(books)
     assert re.findall(r'id="((?:figure|table)[^"]*)"', found["1"]) == [
         "figure-1.1", "figure-1.2", "table-1.1"]
+    assert [part.count("<img") for part in found["1"].split("<figcaption")] == [2, 1, 0, 0]
     assert links(found["1"])[:4] == [("#figure-1.2", "1.2"), ("#figure-1.1", "1.1"),
                                      ("#figure-1.2", "1.2"), ("#table-1.1", "1.1")]
     assert "Figure 1.1. One, not figure 1.2." in words(found["1"]) and "figure 1.9" in found["1"]

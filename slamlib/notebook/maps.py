@@ -12,9 +12,9 @@ TICK_LENGTH = 0.022            # of a marker's heading tick, in the map's extent
 ELLIPSE_COUNT = 24             # ellipses of the vehicle, at equal distances along the path
 MAX_SEMI_AXIS = 0.09           # of the largest ellipse, in the map's extent
 NAME, ANTENNA_NAME = 6.2, 10.0     # points, font sizes of the names of markers and antennas
-# rad, directions from a landmark to its name, and points to its name's box, tried in this order.
+# Directions from a landmark to its name, in rad, tried in this order.
 NAME_DIRECTIONS = np.radians([40, 140, -40, -140, 90, -90, 0, 180, 65, 115, -65, -115, 20, 160])
-NAME_DISTANCES = 4.0, 6.0, 9.0, 13.0
+NAME_DISTANCES = 4.0, 6.0, 9.0, 13.0       # points, from a landmark to its name's box
 # Costs: of a covered name, landmark or path point, and of a point of distance.
 OVERLAP, LANDMARK, PATH, FAR = 100.0, 30.0, 1.0, 0.6
 

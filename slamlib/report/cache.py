@@ -16,12 +16,13 @@ from pathlib import Path
 import joblib
 
 from slamlib import swap
+from slamlib.report.execution import LAB_ONLY
 from slamlib.studies import memory
 from slamlib.studies.memory import digest
 
 VARIABLES, IGNORED = "SLAMLIB_", "SLAMLIB_STUDIES"  # begins those heeded, but this one
 UNSEEN = re.compile(r"(^|/)(\.|__pycache__/|build/|report/|results/)|\.ipynb$")  # paths
-HEEDED_TAGS = {"raises-exception", "skip-execution"}  # the tags of cells that nbclient heeds
+HEEDED_TAGS = {"raises-exception", LAB_ONLY}  # the tags of cells that nbclient heeds
 VERSIONS = 4  # of each notebook, the last used
 
 
