@@ -242,7 +242,7 @@ def test_prose_metadata_and_saved_outputs_do_not_matter(read):
 @pytest.mark.parametrize("change", [
     lambda cells: cells[1].update(source="1 + 2"), lambda cells: cells.append(cells[1]),
     lambda cells: cells.pop(), lambda cells: cells.insert(0, cells.pop()),
-    lambda cells: cells[2].metadata.update(tags=["skip-execution"]),
+    lambda cells: cells[2].metadata.update(tags=["lab-only"]),
     lambda cells: cells[2].metadata.update(tags=["raises-exception"])])
 def test_code_cells_their_order_and_the_tags_that_nbclient_heeds_matter(read, change):
     book, key = read

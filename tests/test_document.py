@@ -74,7 +74,8 @@ def links(text):
 
 def test_gaps_are_closed_references_follow_and_a_figure_may_have_two_pictures(tmp_path):
     books = {ONE: titled(
-        "1. One", figure(), figure(), "Figure 1.2. One, not figure 1.5.", figure("Figure 1.5. Two."),
+        "1. One", figure(), figure(), "Figure 1.2. One, not figure 1.5.",
+        figure("Figure 1.5. Two."),
         f"{TABLE}Table 1.4. A table.\n\nSee figures 1.2 and 1.5, table 1.4, `figure 1.9`.")}
     found, content = pages(books)
     assert re.findall(r'id="((?:figure|table)[^"]*)"', found["1"]) == [
