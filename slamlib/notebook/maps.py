@@ -6,7 +6,7 @@ from slamlib import evaluation
 from slamlib.notebook import plotting
 
 MAP_WIDTH = 7.4                    # inches, the whole width of the page
-MAP_HEIGHTS = 2.6, 5.4             # inches: lowest and highest axes
+MAP_HEIGHTS = 2.6, 4.6             # inches: lowest and highest axes
 MIN_POINT_VARIANCE = 1.0       # rad^2, variance of the heading of a marker without orientation
 TICK_LENGTH = 0.022            # of a marker's heading tick, in the map's extent
 ELLIPSE_COUNT = 24             # ellipses of the vehicle, at equal distances along the path

@@ -493,7 +493,6 @@ end
 local function whole_document(meta)
   local blocks = pandoc.Blocks{}
   for _, chapter in ipairs(chapters) do
-    blocks:insert(raw "#pagebreak(weak: true)")
     blocks:insert(pandoc.Header(1, chapter.heading, attributes(chapter, "")))
     blocks:insert(raw "#[")
     blocks:extend(chapter.blocks)
