@@ -114,26 +114,6 @@ def position_sigmas(covariances):
     return sigmas(covariances)[:, :2].max(axis=1)
 
 
-def sigma_difference(covariances, reference):
-    """Largest relative difference between the position sigmas of covariances (n, 3, 3) of two sets.
-
-    It is relative to the largest position sigma of the reference, because ratios are meaningless
-    where both sigmas are almost zero. It is NaN if all sigmas of the reference are 0.
-    """
-    sigma, expected = sigmas(covariances)[:, :2], sigmas(reference)[:, :2]
-    return float(np.abs(sigma - expected).max() / expected.max()) if expected.max() > 0 else np.nan
-
-
-def correlation_difference(covariances, reference):
-    """Root mean square difference between the correlations of x and y with the heading.
-
-    Both arguments are (n, 3, 3). Undefined correlations are left out; NaN if all are undefined.
-    """
-    difference = correlations(covariances)[:, :2, 2] - correlations(reference)[:, :2, 2]
-    difference = difference[np.isfinite(difference)]
-    return float(np.sqrt(np.mean(difference**2))) if len(difference) else np.nan
-
-
 def evenly_spaced(n, count=41):
     """Up to `count` evenly spaced indices from 1 to n - 1; [0] if n is 1."""
     return np.unique(np.linspace(min(1, n - 1), n - 1, count).astype(int))

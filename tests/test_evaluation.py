@@ -77,18 +77,6 @@ def test_nees_band_is_that_of_the_tables():
     np.testing.assert_allclose(evaluation.nees_band(50), [117.985 / 50, 185.800 / 50], atol=1e-4)
 
 
-def test_differences_of_covariances():
-    reference = np.array([np.diag(variances) for variances in ([0, 0, 1e-8], [4, 1, 1], [9, 1, 1])])
-    other = reference.copy()
-    other[1, 0, 0], other[1, 0, 2], other[1, 2, 0] = 1.0, 0.5, 0.5
-    for scale in (1.0, 1e-6):
-        assert np.isclose(evaluation.sigma_difference(scale * other, scale * reference), 1 / 3)
-    assert np.isclose(evaluation.correlation_difference(other, reference), np.sqrt(0.25 / 4))
-    still = np.array([np.diag([0, 0, 1e-8])])
-    assert np.isnan(evaluation.sigma_difference(still, still))
-    assert np.isnan(evaluation.correlation_difference(still, still))
-
-
 def test_indices_along_a_path():
     np.testing.assert_array_equal(evaluation.evenly_spaced(1), [0])
     np.testing.assert_array_equal(evaluation.evenly_spaced(2), [1])
