@@ -316,7 +316,7 @@ def test_a_report_has_contents_a_title_page_and_equal_bytes(tmp_path):
     assert files == render(books, options, ALL, picture=SVG)
     assert [*files] == ["1_one.html", "2_two.html", "report.pdf"]
     text = text_of(files["report.pdf"], tmp_path)
-    for line in ('A "title" *and* #x', "A. Author", "4711", "Contents", "2. “Two” #x"):
+    for line in ('A "title" *and* #x', "A. Author", "4711", "1.1 First", "2. “Two” #x"):
         assert line.replace("“", '"').replace("”", '"') in text.replace("“", '"').replace("”", '"')
     page = files["2_two.html"].decode()
     assert '<a href="1_one.html">1. One</a>' in page and 'href="#Second"' in page
