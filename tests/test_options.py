@@ -78,7 +78,7 @@ def test_the_committed_file_has_the_defaults_also_where_its_examples_are_read(tm
     (tmp_path / "report.toml").write_text(examples)
     read = read_options(tmp_path / "report.toml")
     assert (read.code, read.problem2, read.title) == ("method", "aruco", Options().title)
-    assert read.appendix is False and [*read.leave_out] == ["B", "3.5", "Explore"]
+    assert read.appendix is False and [*read.leave_out] == ["B", "3.5", "References"]
 
 
 @pytest.mark.slow

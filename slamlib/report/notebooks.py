@@ -59,7 +59,7 @@ def _checked(key, value, place):
         expected = f"one of {json.dumps(choices[key])[1:-1]}"
     elif key == "leave_out":
         ok = type(value) is list and all(type(entry) is str for entry in value)
-        expected = 'a list of numbers and titles in quotes, such as ["B", "3.5", "Explore"],'
+        expected = 'a list of numbers and titles in quotes, such as ["B", "3.5", "References"],'
     else:
         ok = type(value) in (str, int) and re.fullmatch(r"[^\n\ufffd]*", value := str(value))
         expected = "a line of UTF-8 text in quotes"
