@@ -34,8 +34,6 @@ def test_the_first_numbers_come_before_the_notebooks_the_shortest_drive_first(
                      ("1_one", "executed")]
     build(tmp_path, kept=tmp_path / "kept")
     assert "problem1" not in capfd.readouterr().err
-    build(tmp_path, kept=tmp_path / "kept", fresh=True)
-    assert "short: 2 poses" in capfd.readouterr().err
 
 
 @pytest.fixture
