@@ -26,7 +26,7 @@ from slamlib.slam.measurements import AcceptedMeasurements, measure, with_known_
 from slamlib.slam.pipeline import fit_from_odometry
 from slamlib.slam.result import slam_result
 from slamlib.solve import UNSOLVABLE
-from slamlib.studies.kernels import solve_with
+from slamlib.studies.kernels import rounds, solve_with
 from slamlib.studies.starts import LANDMARKS, guessed_antennas
 
 # Scales of the Cauchy kernel in standard deviations, by name.
@@ -162,7 +162,7 @@ def _solved_with_ranges(seed, late, off, part, range_kernel, antennas):
     dataset = misguess(dataset.without("aruco"), truth.antenna_in_world, off, seed).first(count)
     m = measure(with_known_noise(dataset, TYPICAL_SLIP, 1.0, 1.0))
     return (replace(truth, poses=truth.poses[:count]), m,
-            slam_result(solve_with(m, ranges=range_kernel, antennas=antennas, model="arc")))
+            slam_result(solve_with(m, rounds(m, antennas), ranges=range_kernel)))
 
 
 def _figure(truth, results):
