@@ -27,7 +27,7 @@ MEMORY_METHODS = ("markers", "fused", "problem 3", "independent")
 
 
 def drive(seed, poses=None, **options):
-    """The Dataset and Truth of one simulated drive of the short path, of its first `poses` or all."""
+    """The Dataset and Truth of a simulated drive of the short path, or of its first `poses`."""
     dataset, truth = simulate("short", seed, **options)
     return (dataset.first(poses or len(dataset.ticks)), replace(truth, poses=truth.poses[:poses]))
 
