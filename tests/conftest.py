@@ -39,15 +39,6 @@ def pytest_collection_modifyitems(items):
                else len(FIRST))
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_pyfunc_call():
-    """Remove the variable that names the test.
-
-    A process of a study is used again only where the environment is the same.
-    """
-    os.environ.pop("PYTEST_CURRENT_TEST", None)
-
-
 @pytest.fixture(scope="module")
 def chromium():
     """A headless Chromium that finds no host but this one (a playwright Browser).

@@ -6,10 +6,11 @@ import numpy as np
 from scipy.stats import t
 
 from slamlib import slam
+from slamlib.evaluation import ate, nees
 from slamlib.simulation import simulate
 from slamlib.slam.linear import state_from_arrays
 from slamlib.slam.measurements import with_known_noise
-from slamlib.studies.montecarlo import judge_slam
+from slamlib.studies.montecarlo import antenna_error, map_nees, wheel_nees
 
 
 def central_differences(function, x, step=1e-6):
@@ -40,13 +41,31 @@ def known_noise(dataset, slip):
 
 
 def slam_trial(seed, ranges=True, markers=True, **options):
-    """`judge_slam` of SLAM on one simulated drive of the short path, with these sensors."""
+    """SLAM with these sensors on one simulated drive of the short path, by its truth.
+
+    "nees" is that of the measured poses, "nees between" that of the others.
+    """
     dataset, truth = simulate("short", seed, **options)
     found = slam.estimate(dataset.without("uwb")) if markers else None
-    if not ranges:
-        return judge_slam(found, dataset.without("uwb"), truth)
     dataset = dataset if markers else dataset.without("aruco")
-    return judge_slam(slam.estimate(dataset, previous=found), dataset, truth)
+    dataset = dataset if ranges else dataset.without("uwb")
+    found = slam.estimate(dataset, previous=found) if ranges else found
+    measured = [sensor.pose for sensor in (dataset.aruco, dataset.uwb) if sensor is not None]
+    frames = np.isin(np.arange(len(truth.poses)), np.concatenate(measured))
+    values = nees(found.poses, found.covariances, truth.poses)
+    numbers = {"nees": np.nanmean(values[frames]), "nees between": np.nanmean(values[~frames]),
+               "last nees": values[-1], "wheel nees": wheel_nees(found, truth),
+               "ate": ate(found.poses, truth.poses), "slip": found.slip,
+               "chi2": found.chi2_per_dof, "arc": float(found.model == "arc")}
+    if markers:
+        true_map = truth.marker_in_world[np.searchsorted(truth.marker, found.marker)]
+        numbers |= {"map nees": map_nees(found, truth).mean(),
+                    "map worst": np.abs(found.marker_in_world - true_map)[:, :2].max()}
+    if ranges:
+        error, squared = antenna_error(found, truth)
+        numbers |= {"antenna nees": np.mean(squared), "antenna error": np.sqrt(np.mean(error**2)),
+                    "doubts": len(found.doubts)}
+    return numbers
 
 
 def as_points(aruco, rows, variance=1e4):

@@ -7,7 +7,6 @@ from numeric import central_differences
 from slamlib import odometry
 from slamlib.dataset import Vehicle
 from slamlib.simulation import manoeuvre, simulate
-from slamlib.studies import montecarlo
 
 VEHICLE = Vehicle()
 BOTH = pytest.mark.parametrize("model", odometry.MODELS)
@@ -143,6 +142,13 @@ def test_unknown_model_is_refused():
         odometry.dead_reckoning(curvy_ticks(), VEHICLE, model="midpoint")
 
 
+def odometry_draws(ticks, vehicle, kept, rng, draws):
+    """Poses (draws, m, 3) with indices `kept`, for random wheel parameters and first headings."""
+    return np.stack([odometry.dead_reckoning(
+        ticks, vehicle.with_deviation(z[:3]), (0.0, 0.0, z[3] * vehicle.sigma_heading))[kept]
+        for z in rng.standard_normal((draws, 4))])
+
+
 @pytest.mark.parametrize("legs, equation2_holds", [
     ([(5, np.pi / 2)], True),                                             # a quarter turn
     ([(3, 0), (4, 2.5), (3, -1.0)], True),                                # bends to both sides
@@ -158,7 +164,7 @@ def test_both_covariances_against_monte_carlo(legs, equation2_holds):
     zero. Notebook 1 explains these findings.
     """
     ticks = manoeuvre(legs)
-    samples = montecarlo.odometry_draws(ticks, VEHICLE, [-1], np.random.default_rng(11), draws=4000)
+    samples = odometry_draws(ticks, VEHICLE, [-1], np.random.default_rng(11), draws=4000)
     errors = samples[:, 0] - odometry.dead_reckoning(ticks, VEHICLE)[-1]
     sampled = errors.T @ errors / len(errors)
     sigma = np.sqrt(np.diag(sampled))
@@ -205,7 +211,7 @@ def test_monte_carlo_draws_from_the_vehicle_sigmas():
     10 m sqrt(2) sigma_R / (R b) and sigma_heading together.
     """
     ticks = np.full((1001, 2), 10 / 1000 / (2 * np.pi * 0.1) * 8000)
-    samples = montecarlo.odometry_draws(ticks, replace(VEHICLE, sigma_heading=0.03), [0, -1],
+    samples = odometry_draws(ticks, replace(VEHICLE, sigma_heading=0.03), [0, -1],
                                         np.random.default_rng(2), draws=2000)
     np.testing.assert_allclose(samples[:, 0, :2], 0)
     np.testing.assert_allclose(samples[:, 0, 2].std(), 0.03, rtol=0.07)

@@ -26,7 +26,7 @@ from tqdm import tqdm
 
 from slamlib import swap
 from slamlib.dataset import DatasetError
-from slamlib.studies.workers import ONE_THREAD
+from slamlib.studies.memory import ONE_THREAD
 
 CELL_TIMEOUT = 1800  # s, in which a cell must end
 TRANSPORT = "ipc" if hasattr(socket, "AF_UNIX") else "tcp"  # Windows has no Unix sockets

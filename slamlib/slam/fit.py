@@ -213,14 +213,14 @@ def solved_by_gtsam(fit):
     return replace(fit, state=optimum.state, converged=optimum.converged)
 
 
-def refine(problem, state, accept=accepted_measurements, preintegrate=preintegrate_odometry):
+def refine(problem, state, accept=accepted_measurements):
     """The Fit in which wheels, noise and accepted measurements agree with each other.
 
     They depend on each other, so each is updated in turn until the accepted measurements no longer
     change. The share that memory leaves of their information is found at the end, with the noise as
     it is. From a Problem and a State near its solution. `accept` makes AcceptedMeasurements from
-    Problem and State; None keeps those of the problem. `preintegrate` as in `build_problem`. Raises
-    DatasetError as `optimize`, and numpy.linalg.LinAlgError if odometry's covariance is singular.
+    Problem and State; None keeps those of the problem. Raises DatasetError as `optimize`, and
+    numpy.linalg.LinAlgError if odometry's covariance is singular.
     """
     m, model, posterior = problem.measurements, problem.odometry.model, None
     share, fixed, changed = problem.accepted.share, accept is None, np.inf
@@ -232,7 +232,7 @@ def refine(problem, state, accept=accepted_measurements, preintegrate=preintegra
     accepted = accept(problem, state)
     for _ in range(MAX_ROUNDS):
         problem = replace(problem, accepted=accepted,
-                          odometry=preintegrate(m, model, state.c[WHEELS]))
+                          odometry=preintegrate_odometry(m, model, state.c[WHEELS]))
         optimum = None                                     # frees the equations of the last round
         if m.learned.any() and changed > NEGLIGIBLE_CHANGE * len(accepted.weight):
             optimum = optimize(problem, state, max_steps=2)

@@ -97,17 +97,17 @@ class Problem:
         return self.sigma > 0
 
 
-def build_problem(measurements, model, noise=None, wheel=None, preintegrate=preintegrate_odometry):
+def build_problem(measurements, model, noise=None, wheel=None):
     """The Problem of all Measurements with weight 1, without kernels, and of a Noise.
 
     Without a Noise it is the typical one. Parameters that the Vehicle gives replace its own.
-    `preintegrate` makes the OdometryFactors of steps of the `model`, "arc" or "euler", linearised
-    at `wheel` (3,) m, None for the stated one; studies pass other functions. The calibration is as
-    stated, but for the delay of sightings that are late.
+    Odometry has steps of the `model`, "arc" or "euler", and is linearised at `wheel` (3,) m, None
+    for the stated one. The calibration is as stated, but for the delay of sightings that are
+    late.
     """
     late = frozenset({"time-offset"} if measurements.jumps.lag else ())
     return Problem(
-        odometry=preintegrate(measurements, model, wheel),
+        odometry=preintegrate_odometry(measurements, model, wheel),
         accepted=AcceptedMeasurements(
             measurements=measurements, weight=measurements.unit_weights),
         noise=with_known(noise or Noise(), measurements.dataset.vehicle),

@@ -1,4 +1,4 @@
-"""Studies run over seeds in parallel, and kept between builds of the report.
+"""Studies run over seeds by joblib, and kept between builds of the report.
 
 A study depends on the code of the numerics, on the packages that compute it, and on its trial,
 seeds and options; it does not depend on a user's datasets. While a report is built,
@@ -11,71 +11,62 @@ import hashlib
 import os
 import platform
 import shutil
-import sys
 import warnings
 from importlib.metadata import version
 from pathlib import Path
 
-import numpy as np
-from joblib import Memory
+import pandas as pd
+from joblib import Memory, Parallel, cpu_count, delayed
 from tqdm.auto import tqdm
-
-from slamlib.studies import workers
 
 SLAMLIB = Path(__file__).parents[1]
 PAGE_PACKAGES = ("notebook", "report")     # imports run downwards: no study depends on them
 NUMERIC_PACKAGES = ("numpy", "scipy", "gtsam")
-THREADS = ("OMP_", "OPENBLAS_", "MKL_")    # prefixes of variables that set numbers of threads
+# The matrices are small: more threads cost time.
+ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+KEPT = 200                                 # number of studies that are kept, the last used
 BAR_AFTER = 5.0                            # s, duration of a study from which on it shows a bar
 
 
-def run(trial, seeds, jobs=2, **options):
-    """Numbers of trial(seed, **options) for all seeds: a dict of (s,) arrays.
+def run(trial, seeds, jobs=None, **options):
+    """DataFrame of what trial(seed, **options) returns, a dict, with one row for each seed.
 
     Parameters
     ----------
-    trial : function of a module in slamlib.studies that returns a dict of numbers.
+    trial : function; if it is of a module in slamlib.studies, the study is kept.
     seeds : iterable of int.
-    jobs : number of processes.
+    jobs : number of processes. None for one in a build, which executes several notebooks at a time
+        and kills their kernels, after which processes would wait for minutes; else all processors.
     """
+    seeds = list(seeds)[:int(os.environ.get("SLAMLIB_SEEDS", 0)) or None]
+    jobs = jobs or (1 if "SLAMLIB_RESULTS" in os.environ else cpu_count())
     name = f"{trial.__module__}.{trial.__name__}"
-    seeds = list(seeds)[:int(os.environ.get("SLAMLIB_SEEDS", len(seeds)))]
-    arguments = trial, name, seeds, options, _threads(), jobs
-    folder = os.environ.get("SLAMLIB_STUDIES")
-    ours = name.startswith(f"{__package__}.")
-    if not folder or not ours or code_digest() != CODE_DIGEST:          # or edited meanwhile
-        return _compute(*arguments)
-    forget(folder, keep=CODE_DIGEST)
-    memory = Memory(Path(folder) / CODE_DIGEST, verbose=0, compress=True)  # finds damaged files
+    kept = name.startswith(f"{__package__}.") and code_digest() == CODE_DIGEST  # not edited since
+    memory = Memory(os.environ.get("SLAMLIB_STUDIES") if kept else None, verbose=0, compress=True)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Exception while loading results")    # computed again
-        return memory.cache(_compute, ignore=["trial", "jobs"])(*arguments)
+        rows = memory.cache(_rows, ignore=["trial", "jobs"])(
+            trial, name, seeds, options, CODE_DIGEST, jobs)
+    memory.reduce_size(items_limit=KEPT)
+    return pd.DataFrame(rows, index=pd.Index(seeds, name="seed"))
 
 
-def _compute(trial, name, seeds, options, threads, jobs):
-    """The numbers of `run`; joblib distinguishes studies by all arguments but trial and jobs."""
-    rows = list(tqdm(workers.rows(trial, seeds, options, jobs), total=len(seeds),
-                     desc=trial.__name__, leave=False, delay=BAR_AFTER,
-                     disable="SLAMLIB_RESULTS" in os.environ or "ipykernel" not in sys.modules))
-    return {key: np.array([row[key] for row in rows]) for key in rows[0]}
+def _rows(trial, name, seeds, options, code, jobs):
+    """The rows of `run`, a list of dict, which joblib keeps by all arguments but trial and jobs."""
+    bar = tqdm(seeds, desc=trial.__name__, leave=False, delay=BAR_AFTER,
+               disable="SLAMLIB_RESULTS" in os.environ)
+    return Parallel(jobs)(delayed(trial)(seed, **options) for seed in bar)
 
 
-def _threads():
-    """The environment's variables that set numbers of threads, sorted pairs of name and value."""
-    return sorted(item for item in os.environ.items() if item[0].startswith(THREADS))
-
-
-def forget(folder, keep=None):
-    """Remove the studies in a folder, except those of the code with the digest `keep`."""
-    for kept in Path(folder).glob("[0-9a-f]" * 64):
-        if kept.name != keep:
-            shutil.rmtree(kept, ignore_errors=True)
+def forget(folder):
+    """Remove the studies that are kept in a folder."""
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 def code_digest():
     """Digest (str) of what all studies depend on: the current slamlib, Python and packages."""
     return digest(repr([
-        platform.python_implementation(), platform.python_version(), platform.platform(),
+        platform.python_version(), platform.platform(),
         [version(package) for package in NUMERIC_PACKAGES],
         [(str(file.relative_to(SLAMLIB)), digest(file.read_bytes()))
          for file in modules(*PAGE_PACKAGES)]]).encode())

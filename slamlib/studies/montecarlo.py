@@ -1,6 +1,7 @@
 """Trials of the methods of problems 2 to 4: one simulated drive, judged against its truth.
 
-`memory.run` runs a trial over many seeds.
+A trial is a function of a seed and of options that returns a dict of numbers. `memory.run` runs it
+over many seeds. Options that a trial does not name are those of `simulation.simulate`.
 """
 
 from dataclasses import replace
@@ -12,6 +13,8 @@ from slamlib.evaluation import anees, ate, nees, position_sigmas
 from slamlib.localization.hint import first_order_from
 from slamlib.sightings import sightings_by_frame
 from slamlib.simulation import simulate
+from slamlib.slam.fit import refine
+from slamlib.slam.result import slam_result
 
 PROBLEM2_METHODS = {
     "odometry": lambda dataset: odometry.dead_reckoning(dataset.ticks, dataset.vehicle),
@@ -20,32 +23,17 @@ PROBLEM2_METHODS = {
     "hint": localization.fuse_increments,
     "exact hint": lambda dataset: localization.fuse_increments(dataset, first_order_from),
     "fused": localization.fuse}
+MEMORY_METHODS = ("markers", "fused", "problem 3", "independent")
 
 
-def odometry_draws(ticks, vehicle, kept, rng, draws=400, model="euler"):
-    """Dead-reckoned poses for random wheel parameters and initial headings.
-
-    Parameters
-    ----------
-    ticks : (n, 2) counts of the right and left wheel, the same for every draw.
-    vehicle : Vehicle, with means and standard deviations of the normal distributions.
-    kept : (m,) indices from 0 of the poses to return.
-    rng : numpy random generator.
-    draws : number of draws.
-    model : "euler" or "arc".
-
-    Returns
-    -------
-    (draws, m, 3) poses [x, y, heading].
-    """
-    return np.stack([
-        odometry.dead_reckoning(ticks, vehicle.with_deviation(z[:3]),
-                       (0.0, 0.0, z[3] * vehicle.sigma_heading), model)[kept]
-        for z in rng.standard_normal((draws, 4))])
+def drive(seed, poses=None, **options):
+    """The Dataset and Truth of a simulated drive of the short path, or of its first `poses`."""
+    dataset, truth = simulate("short", seed, **options)
+    return (dataset.first(poses or len(dataset.ticks)), replace(truth, poses=truth.poses[:poses]))
 
 
 def problem2_trial(seed, methods=tuple(PROBLEM2_METHODS), **options):
-    """Methods of problem 2 on one drive of the short path, simulated with these options.
+    """Methods of problem 2 on one `drive`.
 
     Returns
     -------
@@ -53,7 +41,7 @@ def problem2_trial(seed, methods=tuple(PROBLEM2_METHODS), **options):
     "ate" in m (of odometry the ATE only). With "ArUco" there is "map nees", with "fused" there are
     "wheel nees" and "slip" in sqrt(m).
     """
-    dataset, truth = simulate("short", seed, **options)
+    dataset, truth = drive(seed, **options)
     frame, numbers = sightings_by_frame(dataset.aruco).frame, {}
     for method in methods:
         found = PROBLEM2_METHODS[method](dataset)
@@ -66,18 +54,14 @@ def problem2_trial(seed, methods=tuple(PROBLEM2_METHODS), **options):
                     f"{method} last nees": nees(poses, covariances, truth.poses[frame])[-1],
                     f"{method} ate": ate(poses, truth.poses[frame])}
         if method == "ArUco":
-            numbers["map nees"] = _map_nees(found, truth).mean()
+            numbers["map nees"] = map_nees(found, truth).mean()
         if method == "fused":
-            numbers |= {"wheel nees": _wheel_nees(found, truth), "slip": found.slip}
+            numbers |= {"wheel nees": wheel_nees(found, truth), "slip": found.slip}
     return numbers
 
 
 def ranges_added(seed, share=1.0, **options):
-    """Problems 3 and 4 on one drive of the short path, for the information that ranges add.
-
-    Parameters
-    ----------
-    share : the markers are seen over this first share of the drive only.
+    """Problems 3 and 4 on one `drive`, with markers over the first `share` of the drive only.
 
     Returns
     -------
@@ -85,7 +69,7 @@ def ranges_added(seed, share=1.0, **options):
     "sigma without", the median over the poses of the larger sigma of x and y, in m; and so on. Also
     "moved", the median distance between the positions of both, over this sigma of each pose.
     """
-    dataset, truth = simulate("short", seed, **options)
+    dataset, truth = drive(seed, **options)
     dataset = replace(dataset, aruco=dataset.first(round(share * len(dataset.ticks))).aruco)
     without = slam.estimate(dataset.without("uwb"))
     solved, numbers = {"without": without, "with": slam.estimate(dataset, previous=without)}, {}
@@ -97,58 +81,27 @@ def ranges_added(seed, share=1.0, **options):
     return numbers | {"moved": np.median(distance / position_sigmas(without.covariances[1:]))}
 
 
-def learned_noise(seed, slip=1e-3):
-    """Problem 3 on one drive of the short path, its noise learned and known.
-
-    `slip` in sqrt(m) as in `simulate`.
+def correlated_errors(seed, correlation, **options):
+    """Problems 2 and 3 on one `drive`; `correlation` is the `memory` of `simulate`.
 
     Returns
     -------
-    dict of numbers: the "slip" learned; "nees" of the poses and "aligned" ATE in m with it;
-    "rejected" sightings; "arc", 1 where arcs were chosen; "known nees" and "known aligned", those
-    of the graph that is given the noise and the arcs; "problem 4 nees", with ranges and the noise
-    learned.
+    dict of "nees" and aligned "ate" in m of MEMORY_METHODS, as "fused nees"; "independent" is
+    problem 3 without a memory of errors. Also of problem 3 the mean "share" of its information that
+    a sighting keeps, and the "residuals", the correlation of those of neighbours.
     """
-    dataset, truth = simulate("short", seed, slip=slip)
-    markers = dataset.without("uwb")
-    learned = slam.estimate(markers)
-    known = slam.estimate(markers, slip, "arc", marker_noise_factor=1.0)
-    with_ranges = slam.estimate(dataset, previous=learned)
-    numbers = {"slip": learned.slip, "rejected": np.count_nonzero(learned.rejected),
-               "arc": float(learned.model == "arc"), "problem 4 nees": anees(
-                   with_ranges.poses, with_ranges.covariances, truth.poses)}
-    for name, found in (("", learned), ("known ", known)):
-        numbers |= {f"{name}nees": anees(found.poses, found.covariances, truth.poses),
-                    f"{name}aligned": ate(found.poses, truth.poses, aligned=True)}
-    return numbers
-
-
-def judge_slam(found, dataset, truth):
-    """A SlamResult against the truth, as a dict of numbers.
-
-    "nees" of the measured poses, "nees between" of the others, "last nees", "wheel nees"; "ate" and
-    "aligned" in m; "rejected" sightings; "slip" in sqrt(m); "chi2" per degree of freedom; "arc", 1
-    where arcs were chosen; with markers "map nees" and "map worst" error in m; with antennas
-    "antenna nees", their rms "antenna error" in m, and the number in "doubts".
-    """
-    measured = [sensor.pose for sensor in (dataset.aruco, dataset.uwb) if sensor is not None]
-    frames = np.isin(np.arange(len(truth.poses)), np.concatenate(measured))
-    values = nees(found.poses, found.covariances, truth.poses)
-    numbers = {"nees": np.nanmean(values[frames]), "nees between": np.nanmean(values[~frames]),
-               "last nees": values[-1], "wheel nees": _wheel_nees(found, truth),
-               "ate": ate(found.poses, truth.poses),
-               "aligned": ate(found.poses, truth.poses, aligned=True),
-               "rejected": np.count_nonzero(found.rejected), "slip": found.slip,
-               "chi2": found.chi2_per_dof, "arc": float(found.model == "arc")}
-    if len(found.marker):
-        true_map = truth.marker_in_world[np.searchsorted(truth.marker, found.marker)]
-        numbers |= {"map nees": _map_nees(found, truth).mean(),
-                    "map worst": np.abs(found.marker_in_world - true_map)[:, :2].max()}
-    if len(found.antenna):
-        error, squared = antenna_error(found, truth)
-        numbers |= {"antenna nees": np.mean(squared), "antenna error": np.sqrt(np.mean(error**2)),
-                    "doubts": len(found.doubts)}
-    return numbers
+    dataset, truth = drive(seed, memory=correlation, **options)
+    dataset, markers = dataset.without("uwb"), localization.localize(dataset.aruco)
+    problem3, numbers = slam.estimate(dataset), {}
+    problem = problem3.fit.problem
+    white = replace(problem, accepted=replace(problem.accepted, share=None))
+    independent = slam_result(refine(white, problem3.fit.state, accept=None))
+    for name, found in zip(MEMORY_METHODS, (
+            markers, localization.fuse(dataset), problem3, independent)):
+        true = truth.poses[getattr(found, "frame", slice(None))]
+        numbers |= {f"{name} nees": anees(found.poses, found.covariances, true),
+                    f"{name} ate": ate(found.poses, true, aligned=True)}
+    return numbers | {"share": problem3.share.mean(), "residuals": problem3.correlation[0, 0]}
 
 
 def antenna_error(found, truth):
@@ -159,13 +112,13 @@ def antenna_error(found, truth):
         "ni,nij,nj->n", error, np.linalg.inv(found.antenna_covariance), error)
 
 
-def _map_nees(found, truth):
+def map_nees(found, truth):
     """NEES (k,) of the markers of a SlamResult or a Localization."""
     true_map = truth.marker_in_world[np.searchsorted(truth.marker, found.marker)]
     return nees(found.marker_in_world, found.marker_covariance, true_map)
 
 
-def _wheel_nees(found, truth):
+def wheel_nees(found, truth):
     """Squared error of the wheel parameters over their covariance."""
     error = found.wheel - truth.vehicle.wheel
     return error @ np.linalg.solve(found.wheel_covariance, error)

@@ -30,14 +30,7 @@ BEACON_GUESS_SIGMA = 2.0    # m, standard deviation of the guessed beacons on ea
 def read_plaza2(seed=0):
     """Plaza 2 as a Dataset with ranges and without markers, and its Truth.
 
-    Parameters
-    ----------
-    seed : of the errors of the antenna guess, which is not part of the log.
-
-    Returns
-    -------
-    dataset : Dataset
-    truth : Truth, in the frame of pose 1.
+    The Truth is in the frame of pose 1. The log has no antenna guess; `seed` is of its errors.
     """
     _, sigma = ranges_over_distances(1)
     path, increments, ranges, beacons = _load(2)
@@ -47,24 +40,21 @@ def read_plaza2(seed=0):
     travel, turn = increments[:, 1], increments[:, 2]
     wheels = np.stack([travel + BASE / 2 * turn, travel - BASE / 2 * turn], -1)
     total = np.cumsum(np.concatenate([np.zeros((1, 2)), wheels]), axis=0)
-    total = np.rint(total / COUNT).astype(int)
-    ticks = np.diff(total, axis=0, prepend=np.zeros((1, 2), int))
+    ticks = np.diff(np.rint(total / COUNT).astype(int), axis=0, prepend=np.zeros((1, 2), int))
     vehicle = Vehicle(
         right_radius=RADIUS, left_radius=RADIUS, wheelbase=BASE,
         ticks_per_revolution=2 * np.pi * RADIUS / COUNT, sigma_right_radius=WHEEL_SIGMA * RADIUS,
         sigma_left_radius=WHEEL_SIGMA * RADIUS, sigma_wheelbase=WHEEL_SIGMA * BASE)
 
     pose = _nearest(path[:, 0], ranges[:, 0])
-    order = np.argsort(pose, kind="stable")
-    uwb = UwbReadings(pose[order], ranges[order, 2].astype(int), ranges[order, 3],
-                      np.full(len(ranges), sigma))
+    uwb = UwbReadings(pose, ranges[:, 2].astype(int), ranges[:, 3],
+                      np.full(len(ranges), sigma)).select(np.argsort(pose, kind="stable"))
     poses = path[:, 1:4] + [0, 0, np.pi]
-    start = poses[0]
     beacons = beacons[np.argsort(beacons[:, 0])]
-    antenna, place = beacons[:, 0].astype(int), beacons[:, 1:3]
-    place = se2.between(start, np.column_stack([place, np.zeros(len(place))]))[:, :2]
+    antenna = beacons[:, 0].astype(int)
+    place = se2.between(poses[0], beacons[:, 1:3] @ np.eye(2, 3))[:, :2]
     guess = place + BEACON_GUESS_SIGMA * np.random.default_rng(seed).standard_normal(place.shape)
-    poses = se2.between(start, poses)
+    poses = se2.between(poses[0], poses)
     poses[:, 2] = np.unwrap(poses[:, 2])
     return (Dataset(name="Plaza 2", vehicle=vehicle, ticks=ticks, aruco=None, uwb=uwb,
                     antenna_guess=AntennaGuess(antenna, guess)),
@@ -97,5 +87,4 @@ def _load(number):
 
 def _nearest(times, wanted):
     """Indices (m,) of the ascending times (n,) nearest to the wanted ones (m,)."""
-    later = np.clip(np.searchsorted(times, wanted), 1, len(times) - 1)
-    return later - (wanted - times[later - 1] < times[later] - wanted)
+    return np.searchsorted((times[1:] + times[:-1]) / 2, wanted)

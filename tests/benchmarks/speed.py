@@ -1,4 +1,4 @@
-"""Time and memory of `slamlib solve`, beside a plain script, and by length and shape of a drive.
+"""Time and memory of `slamlib solve`, beside a plain script, and by the length of a drive.
 
     python tests/benchmarks/speed.py [large]
 
@@ -11,14 +11,11 @@ import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 
 from slamlib import simulation
-from slamlib.simulation import simulate, write_dataset
 from slamlib.solve import PROBLEMS
 
 HERE, LONG = Path(__file__).parent, Path(__file__).parents[2] / "data" / "long"
@@ -91,38 +88,12 @@ def growth(folder, large):
               + f"{seconds:9.1f}{1e6 * seconds / rows:10.0f}{memory:7.0f}{beside}", flush=True)
 
 
-def shapes(folder):
-    """Print times of drives that are no closed loops, beside a loop of about as many rows."""
-    print("\nDrives of other shapes, whole process")
-    print(f"{'drive':36}{'rows':>9}{'solve (s)':>11}{'ms/1000':>9}")
-    simulation.PATHS["corridor"] = replace_path(vectors=((1, 200.0, 0.0),), poses=125_664)
-    corridor = simulate("corridor", 5)[0].first(10_000)
-    ends = simulate("long", 3, rounds=2)[0]
-    outside = (ends.aruco.pose < 600) | (ends.aruco.pose > len(ends.ticks) - 600)
-    drives = {"closed loop, five rounds of 20 m": simulate("short", 3, rounds=5)[0],
-              "corridor of 100 m": corridor,
-              "closed loop of 230 m, two rounds": simulate("long", 3, rounds=2)[0],
-              "the same, markers at both ends only": replace(
-                  ends, aruco=ends.aruco.select(outside), uwb=None)}
-    for name, dataset in drives.items():
-        write_dataset(folder / name, dataset)
-        seconds, _, _ = solve(folder / name)
-        print(f"{name:36}{len(dataset.ticks):9,}{seconds:11.2f}"
-              f"{1e6 * seconds / len(dataset.ticks):9.0f}", flush=True)
-
-
-def replace_path(**changes):
-    """The long path of the simulator with changes."""
-    return SimpleNamespace(**vars(simulation.PATHS["long"]) | {"markers_missing": None} | changes)
-
-
 def main(large=False):
     print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.2f} before")
     if LONG.exists():
         pairs()
     with tempfile.TemporaryDirectory() as folder:
-        growth(Path(folder), large)      # first: a process begins with the memory of this one
-        shapes(Path(folder))
+        growth(Path(folder), large)
     print(f"load {os.getloadavg()[0]:.2f} after")
 
 
