@@ -93,7 +93,7 @@ def test_covariances_are_honest(correlation):
     for method in ("markers", "fused", "problem 3"):
         assert 1 < runs[f"{method} nees"].mean() < 5, method
     assert ((runs["share"] < 1) == (correlation > 0)).all()
-    assert (runs["residuals"] < correlation + 0.05).all()
+    assert runs["residuals"].mean() < correlation + 0.05
     assert (runs["independent nees"].mean() > nees_band(8)[1]) == (correlation > 0)
 
 
