@@ -50,43 +50,24 @@ NEGLIGIBLE_MOVE = 3e-3       # relative, of a wheel parameter since odometry was
 NEGLIGIBLE_CHANGE = 1e-3     # share of the measurements whose weight may change at the same noise
 
 
-@dataclass(frozen=True)
-class AcceptanceRule:
-    """How measurements are accepted, and with which kernels."""
+def accepted_measurements(problem, state, sightings=None, ranges=None):
+    """The AcceptedMeasurements at a State, by kernel and gate of sightings and of ranges.
 
-    sighting_kernel: gtsam.noiseModel.mEstimator.Base | None = None
-    gated: bool = True           # whether sightings beyond their gate are rejected
-    range_kernel: gtsam.noiseModel.mEstimator.Base | None = LATE_KERNEL
-    early: float = EARLY_GATE    # sigmas; a range that is too short by more is rejected
-    late: float = np.inf         # sigmas; the same, too long
-
-
-def acceptance_rule(kernel="asymmetric Tukey", gate=True):
-    """The AcceptanceRule with the kernel of this name in KERNELS, for sightings and ranges.
-
-    A one-sided kernel is that of the ranges only, and replaces their gate for late ones. Without
-    `gate` nothing is rejected.
+    `sightings` and `ranges` are a name in KERNELS and whether what contradicts the State is
+    rejected; None takes those of the dataset's Vehicle. A one-sided kernel is that of the ranges
+    only, and replaces their gate for late ones.
     """
-    one_sided = kernel in ONE_SIDED
-    return AcceptanceRule(
-        sighting_kernel=None if one_sided else KERNELS[kernel], gated=gate,
-        range_kernel=KERNELS[kernel], early=EARLY_GATE if gate else np.inf,
-        late=EARLY_GATE if gate and not one_sided else np.inf)
-
-
-def accepted_measurements(problem, state, rule=None):
-    """The AcceptedMeasurements that an AcceptanceRule accepts at a State, with its kernels.
-
-    None takes the rule of the kernel and the gate of the dataset's Vehicle.
-    """
-    vehicle = problem.measurements.dataset.vehicle
-    rule = rule or acceptance_rule(vehicle.kernel, vehicle.gate)
-    weight = gate_weights(problem, state, rule.early, rule.late)
-    if not rule.gated:
-        weight[:len(problem.measurements.marker_row)] = 1
+    m, vehicle = problem.measurements, problem.measurements.dataset.vehicle
+    (kernel, gated), (range_kernel, range_gated) = (
+        each or (vehicle.kernel, vehicle.gate) for each in (sightings, ranges))
+    early = EARLY_GATE if range_gated else np.inf
+    weight = gate_weights(problem, state, early, np.inf if range_kernel in ONE_SIDED else early)
+    if not gated:
+        weight[:len(m.marker_row)] = 1
     return AcceptedMeasurements(
-        measurements=problem.measurements, weight=weight, sighting_kernel=rule.sighting_kernel,
-        range_kernel=rule.range_kernel, range_bias=kernel_bias(rule.range_kernel))
+        measurements=m, weight=weight,
+        sighting_kernel=None if kernel in ONE_SIDED else KERNELS[kernel],
+        range_kernel=KERNELS[range_kernel], range_bias=kernel_bias(KERNELS[range_kernel]))
 
 
 @lru_cache(maxsize=8)

@@ -101,9 +101,8 @@ def build_problem(measurements, model, noise=None, wheel=None):
     """The Problem of all Measurements with weight 1, without kernels, and of a Noise.
 
     Without a Noise it is the typical one. Parameters that the Vehicle gives replace its own.
-    Odometry has steps of the `model`, "arc" or "euler", and is linearised at `wheel` (3,) m, None
-    for the stated one. The calibration is as stated, but for the delay of sightings that are
-    late.
+    Odometry is of the `model` "arc" or "euler", linearised at `wheel` (3,) m, None for the stated
+    one. The calibration is as stated, but for the delay of sightings that are late.
     """
     late = frozenset({"time-offset"} if measurements.jumps.lag else ())
     return Problem(

@@ -1,6 +1,5 @@
 """Comparison of kernels and gates against wrong labels and late ranges in the SLAM graph."""
 
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -10,7 +9,6 @@ from slamlib.increments import TYPICAL_SLIP
 from slamlib.slam.fit import (
     KERNELS,
     ONE_SIDED,
-    acceptance_rule,
     accepted_measurements,
     kept_weights,
     narrow_kernels,
@@ -23,9 +21,8 @@ from slamlib.slam.measurements import Noise, measure, with_known_noise
 from slamlib.slam.result import slam_result
 from slamlib.studies.montecarlo import antenna_error, drive
 
-# The `AcceptanceRule` of every method, and those that late ranges and wrong labels are met with.
-METHODS = {name: acceptance_rule(name, gate=name in ONE_SIDED) for name in KERNELS} | {
-    "gate": acceptance_rule("quadratic")}
+# Kernel and gate of every method, and those that late ranges and wrong labels are met with.
+METHODS = {name: (name, name in ONE_SIDED) for name in KERNELS} | {"gate": ("quadratic", True)}
 RANGE_METHODS = ("quadratic", "Huber", "Cauchy", "asymmetric Tukey")
 SIGHTING_METHODS = ("Huber", "Cauchy", "Geman-McClure", "Tukey", "gate")
 MIN_MISLABELLED_SQUARED = 50.0             # squared Mahalanobis distance of a wrong label; a right
@@ -46,11 +43,8 @@ def solve_with(measurements, start, sightings="gate", ranges="asymmetric Tukey")
 
     The noise of the measurements is known.
     """
-    of_sightings = METHODS[sightings]
-    rule = replace(METHODS[ranges], sighting_kernel=of_sightings.sighting_kernel,
-                   gated=of_sightings.gated)
-    return refine(build_problem(measurements, "arc"), start,
-                  partial(accepted_measurements, rule=rule))
+    return refine(build_problem(measurements, "arc"), start, partial(
+        accepted_measurements, sightings=METHODS[sightings], ranges=METHODS[ranges]))
 
 
 def late_ranges(seed, markers=True, methods=RANGE_METHODS, **options):
