@@ -1,8 +1,7 @@
-"""What a drive shows without truth: loop closures, and residuals by landmark.
+"""What a drive shows without truth: loop closures.
 
 Markers that the camera sees again measure the motion since then, and with it the error of every
-method without loop closures. Residuals of one landmark that are larger than those of the others
-show that it moved, or that its covariances are not as stated. Poses are in m and rad.
+method without loop closures. Poses are in m and rad.
 """
 
 from dataclasses import dataclass
@@ -60,24 +59,3 @@ def discrepancies(found, poses):
     off = se2.between(poses[found.start], poses[found.end]) - found.motion
     off[:, 2] = se2.wrap(off[:, 2])
     return off
-
-
-def residuals_by_landmark(result, uwb=None):
-    """Residuals of each marker of a SlamResult, or of each antenna of the UwbReadings of its drive.
-
-    Returns ids (k,), ratios (k,), and degrees of freedom (k,), both NaN where nothing is redundant.
-    A ratio is the mean square of the whitened residuals of a landmark over that of all of its kind,
-    because the learned noise, poses and calibration take their degrees of freedom from all alike,
-    and the landmark its own. Times the degrees of freedom it is nearly chi-squared.
-    """
-    label, weight, r = (result.sightings.marker, ~result.rejected, result.residual) if uwb is None \
-        else (uwb.antenna, result.range_weight, result.range_residual[:, None])
-    ids, row = np.unique(label, return_inverse=True)
-    size = 1 if uwb is not None else 2 + (r[:, 2] != 0)          # 2 of a marker without a heading
-    chi2, count, sightings = (np.bincount(row, weight * each, len(ids))
-                              for each in (np.sum(r**2, axis=1), size, 1.0))
-    dof = count - (2 if uwb is not None else count / np.maximum(sightings, 1))
-    dof[dof < 1] = np.nan
-    known = np.isfinite(dof)
-    usual = chi2[known].sum() / dof[known].sum() if known.any() else 1.0
-    return ids, chi2 / dof / usual, dof * usual
