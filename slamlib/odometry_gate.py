@@ -32,6 +32,7 @@ SUSPECT = 7.8                # 95 % quantile of chi-squared with three degrees o
 MEDIAN_SQUARED = 2.366       # its median
 MIN_GAIN = 12.0              # by a jump
 MIN_LAG_GAIN = 50.0          # by a lag
+MAX_LAG_COST = 0.8           # of that without it; with slip a wrong lag costs 0.95
 PAIRS = 2                    # of sightings of each marker that tell of a jump: one may be wrong
 NEAREST = 24                 # number of these pairs, by the frames between them
 MAX_WAY = 35.0               # m, between the sightings of a pair
@@ -104,8 +105,10 @@ def find_jumps(dataset):
             for lag in LAGS]
     cost = [_cost(_compared(s, _drive(each, dataset.vehicle.wheelbase))[2]).sum() for each in late]
     stated, best = len(LAGS) // 2, int(np.argmin(cost))
-    best = best if cost[best] < cost[stated] - MIN_LAG_GAIN else stated
-    return replace(_jumps(dataset, s, late[best]), lag=LAGS[best])
+    best = best if cost[best] < min(
+        cost[stated] - MIN_LAG_GAIN, MAX_LAG_COST * cost[stated]) else stated
+    found = (_jumps(dataset, s, late[each]) for each in sorted({stated, best}))
+    return replace(min(found, key=lambda jumps: len(jumps.start)), lag=LAGS[best])
 
 
 def _jumps(dataset, s, poses):

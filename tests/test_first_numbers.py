@@ -47,8 +47,8 @@ def test_a_drive_that_takes_long_is_not_waited_for_and_its_process_ends(folders,
     monkeypatch.setattr(summary, "_solved", lambda *_: time.sleep(1000))
     with summary.process(summary.print_tables, folders) as first:
         first.join(0.01)
-        assert len(active_children()) == 1
-    assert active_children() == []
+        assert first in active_children()
+    assert first not in active_children()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere the process is no fork")

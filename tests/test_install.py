@@ -47,7 +47,7 @@ def installed(tmp_path_factory):
     shutil.copytree(ROOT / "slamlib", tree / "slamlib",
                     ignore=shutil.ignore_patterns("__pycache__"))
     for number, name in enumerate(NOTEBOOKS):
-        write(tree / "notebooks", name.removesuffix(".ipynb"), f"# {name[0]}. Chapter",
+        write(tree / "notebooks", name.removesuffix(".ipynb"), f"# {name[0]}. Chapter\n\nText.",
               *[(CODE,), "Figure 1.1. Empty."] * (number == 0))
     for name in ("pyproject.toml", "README.md"):
         shutil.copy(ROOT / name, tree)

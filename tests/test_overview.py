@@ -212,7 +212,7 @@ def test_the_opening_of_any_one_drive_fits_on_a_page(project, tmp_path, name):
     files = render({Path("index"): overview.opening([drive])}, Options(title="T"), (),
                    title_picture(drive))
     text = text_of(files["report.pdf"], tmp_path)
-    _, _, page = text.rstrip("\f\n").split("\f")                  # after cover and contents
+    _, page = text.rstrip("\f\n").split("\f")                     # after the cover
     assert "Figure 1." in page and "The datasets" not in text
     assert ("ATE" in text) == (name == "all") == ("stand-in" in text)
 
