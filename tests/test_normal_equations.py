@@ -15,7 +15,7 @@ from slamlib.simulation import simulate
 from slamlib.slam import factors, graph, linear, noise
 from slamlib.slam.calibration import ENTRIES, WHEELS
 from slamlib.slam.covariances import marginal_covariances
-from slamlib.slam.fit import LATE_KERNEL
+from slamlib.slam.fit import KERNELS
 from slamlib.slam.graph import optimize
 from slamlib.slam.initialization import odometry_state
 from slamlib.slam.linear import NormalEquations, build_problem, laplace_approximation
@@ -76,7 +76,7 @@ def test_gtsam_has_the_same_error_and_takes_the_same_step():
     assert 0 < np.count_nonzero(m.oriented) < len(m.oriented)
     state = odometry_state(m, "arc")
     cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(3.0)
-    accepted = AcceptedMeasurements(m, m.unit_weights, cauchy, LATE_KERNEL)
+    accepted = AcceptedMeasurements(m, m.unit_weights, cauchy, KERNELS["asymmetric Tukey"])
     problem = replace(build_problem(m, "arc", Noise(2e-3, 1.5, 0.7)), accepted=accepted)
     equations = NormalEquations(problem, state)
     values, native = gtsam_values(problem, state), native_graph(problem)

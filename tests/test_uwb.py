@@ -19,7 +19,7 @@ from slamlib.se2 import between, compose
 from slamlib.simulation import manoeuvre, simulate
 from slamlib.slam import factors, graph, result
 from slamlib.slam.calibration import OFFSET, RANGES, SCALE, SIGHTINGS, stated_calibration
-from slamlib.slam.fit import LATE_KERNEL, kernel_bias, solved_by_gtsam
+from slamlib.slam.fit import KERNELS, kernel_bias, solved_by_gtsam
 from slamlib.slam.graph import optimize
 from slamlib.slam.initialization import (
     KERNEL_SCALE,
@@ -67,7 +67,7 @@ def located(dataset):
     Of noisy ranges it weighs late ones less, so the mean that it finds is less than theirs: the
     ranges that it takes as exact are shorter by 0.0758 sigmas.
     """
-    bias = kernel_bias(LATE_KERNEL)
+    bias = kernel_bias(KERNELS["asymmetric Tukey"])
     assert np.isclose(bias, -0.0758, atol=1e-4)
     return replace(dataset, uwb=replace(
         dataset.uwb, range=dataset.uwb.range + bias * dataset.uwb.sigma))
@@ -386,7 +386,7 @@ def test_an_antenna_is_doubted_if_most_of_its_ranges_disagree(weight, said):
 def test_a_kernel_takes_a_known_part_of_the_variance():
     """The integral of r^2 w(r) phi(r) over that of w(r) phi(r); without a kernel it is 1."""
     assert consistency_factor(None) == 1
-    for kernel in (LATE_KERNEL, gtsam.noiseModel.mEstimator.Cauchy.Create(3.0)):
+    for kernel in (KERNELS["asymmetric Tukey"], gtsam.noiseModel.mEstimator.Cauchy.Create(3.0)):
         def weighted(r, power, of=kernel):
             return r**power * of.weight(r) * np.exp(-r**2 / 2)
 

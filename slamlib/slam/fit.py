@@ -39,7 +39,6 @@ KERNELS = {
     "asymmetric Cauchy": _kernel.AsymmetricCauchy.Create(2.385, _scalar),
     "asymmetric Tukey": _kernel.AsymmetricTukey.Create(4.685, _scalar)}
 ONE_SIDED = ("asymmetric Cauchy", "asymmetric Tukey")
-LATE_KERNEL = KERNELS["asymmetric Tukey"]
 
 CAUCHY_SCALES = (100.0, 30.0, 10.0, 3.0)     # sigmas, scale of the kernel in each round
 MIN_RESIDUALS = 20           # number of measurements from which their scatter gives a factor
