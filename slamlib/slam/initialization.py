@@ -8,6 +8,7 @@ part, and so on. Stage 7 uses trilateration again for the antennas in doubt.
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from slamlib import odometry, se2
 from slamlib.sightings import consensus
@@ -25,15 +26,8 @@ MAX_VOTES = 60               # number of sightings of a marker that enter its co
 MAX_RANGES = 150             # maximum number of ranges used per antenna, evenly chosen
 SAME_PLACE = 0.03            # of the median range: positions closer than this are one
 KERNEL_SCALE = 2.0           # sigmas, scale of the Cauchy kernel
-START_DIRECTIONS = 8         # number of starts on a circle about the path
-MAX_SEARCH_STEPS = 60        # number of steps of the search
-STEP_TOLERANCE = 1e-6        # m, length of a step at which the search ends
-FIRST_DAMPING = 1e-3         # share of the curvature that is added to it
-DAMPING_FACTOR = 10          # by which damping falls after a descent and grows after an ascent
-MIN_ASCENT_DAMPING = 0.1     # damping from which it grows after an ascent
-SMALLEST_CURVATURE = 1e-3    # of the smaller over the larger second derivative
-GRID = (200, 361)            # numbers of radii and angles of the grid of `second_moment`
-GRID_MARGIN = 1.5            # of the longest range, by which the grid exceeds the path
+START_DIRECTIONS = 4         # number of starts on a circle about the path
+TOLERANCE = 1e-6             # relative, of cost and position, at which the search ends
 
 
 def initial_state(measurements, model):
@@ -162,95 +156,48 @@ def ranges_by_antenna(measurements, poses, covariances, c, factor=1.0):
 def trilaterate(ranges):
     """Possible positions of an antenna with these AntennaRanges: minima of a Cauchy cost.
 
-    The search starts at the guess, at its reflection through the centre of the path, and at
-    START_DIRECTIONS points of a circle about this centre, with the median range as radius.
+    The guess counts as two more measurements. The search starts there, at the reflection of the
+    guess through the centre of the path, and at START_DIRECTIONS points of a circle about this
+    centre, with the median range as radius.
 
     Returns
     -------
     places : (p, 2) m, with distances above SAME_PLACE, in the order of their costs.
     costs : (p,) negative log posterior, minus that of the first position.
+    covariances : (p, 2, 2) m^2, of the position about each of them, from the curvature there.
     """
     guess, centre, radius = ranges.guess, ranges.positions.mean(0), np.median(ranges.distance)
     angle = np.arange(START_DIRECTIONS) * 2 * np.pi / START_DIRECTIONS
     circle = centre + radius * np.stack([np.cos(angle), np.sin(angle)], -1)
-    minima, cost = _minima(
-        ranges.evenly_chosen(), np.concatenate([[guess, 2 * centre - guess], circle]))
-    distinct = []
-    for k in np.argsort(cost, kind="stable"):
-        if all(np.hypot(*(minima[k] - minima[j])) > SAME_PLACE * radius for j in distinct):
-            distinct.append(k)
-    return minima[distinct], cost[distinct] - cost[distinct[0]]
-
-
-def _minima(ranges, places):
-    """Minima (p, 2) of the Cauchy cost from the starts `places` (p, 2), and their costs (p,).
-
-    Newton's method from all starts at once, with the absolute values of the second derivatives; a
-    step that does not descend is repeated with more damping.
-    """
-    damping, (cost, gradient, hessian) = np.full(len(places), FIRST_DAMPING), _cost(ranges, places)
-    for _ in range(MAX_SEARCH_STEPS):
-        curvature, axes = np.linalg.eigh(hessian)
-        least = SMALLEST_CURVATURE * np.abs(curvature).max(axis=1, keepdims=True)
-        curvature = np.maximum(np.abs(curvature), least) * (1 + damping[:, None])
-        along_axes = np.einsum("pik,pi->pk", axes, gradient) / curvature
-        step = -np.einsum("pik,pk->pi", axes, along_axes)
-        trial = _cost(ranges, places + step)
-        better = trial[0] <= cost
-        damping = np.where(better, damping / DAMPING_FACTOR,
-                           np.maximum(damping, MIN_ASCENT_DAMPING) * DAMPING_FACTOR)
-        places = np.where(better[:, None], places + step, places)
-        for current, new in zip((cost, gradient, hessian), trial):
-            current[better] = new[better]
-        if (np.abs(step).max(axis=1) < STEP_TOLERANCE).all():
-            break
-    return places, cost
-
-
-def _cost(ranges, places):
-    """The Cauchy cost (p,) at `places` (p, 2), its gradient (p, 2) and Hessian (p, 2, 2).
-
-    The guess counts as two more measurements.
-    """
-    difference, root = places[:, None] - ranges.positions, 1 / ranges.sigma
-    distance = np.maximum(np.hypot(difference[..., 0], difference[..., 1]), MIN_DISTANCE)
-    e, direction = root * (distance - ranges.distance), difference / distance[..., None]
-    e_guess = (places - ranges.guess) / GUESS_PRIOR_SIGMA
-    first, second = _cauchy_derivatives(e)
-    first_guess, second_guess = _cauchy_derivatives(e_guess)
-    gradient = ((root * first)[:, None] @ direction)[:, 0] + first_guess / GUESS_PRIOR_SIGMA
-    lateral = root * first / distance                            # because the direction turns
-    radial = (root**2 * second - lateral)[..., None] * direction
-    hessian = direction.mT @ radial
-    hessian[:, [0, 1], [0, 1]] += lateral.sum(1)[:, None] + second_guess / GUESS_PRIOR_SIGMA**2
-    cost = np.log1p((e / KERNEL_SCALE)**2).sum(1) + np.log1p((e_guess / KERNEL_SCALE)**2).sum(1)
-    return KERNEL_SCALE**2 / 2 * cost, gradient, hessian
-
-
-def _cauchy_derivatives(e):
-    """First and second derivative of the Cauchy cost by the errors e."""
-    squared = (e / KERNEL_SCALE)**2
-    return e / (1 + squared), (1 - squared) / (1 + squared)**2
-
-
-def second_moment(ranges, estimate):
-    """Second moment (2, 2), m^2, of an antenna's position about its estimate (2,) by AntennaRanges.
-
-    The posterior, the Cauchy likelihood of the ranges times the prior of the guess, is summed over
-    a polar grid, range by range: an array of the grid times all ranges would take 500 MB.
-    """
-    centre = ranges.positions.mean(0)
-    longest = np.maximum(ranges.distance, 3 * ranges.sigma).max()
-    reach = GRID_MARGIN * longest + np.ptp(ranges.positions, axis=0).max()
-    radius, angle = np.meshgrid(np.linspace(0, reach, GRID[0])[1:],
-                                np.linspace(-np.pi, np.pi, GRID[1])[1:])
-    place = centre + radius[..., None] * np.stack([np.cos(angle), np.sin(angle)], -1)
     used = ranges.evenly_chosen()
-    sigma = np.hypot(used.sigma, reach / GRID[0] / 2)            # at least half a cell of the grid
-    cost = np.sum((place - ranges.guess)**2, axis=-1) / GUESS_PRIOR_SIGMA**2 / 2
-    for origin, measured, s in zip(used.positions, used.distance, sigma):
-        e = (np.hypot(place[..., 0] - origin[0], place[..., 1] - origin[1]) - measured) / s
-        cost += KERNEL_SCALE**2 * np.log1p((e / KERNEL_SCALE)**2) / 2
-    density = radius * np.exp(cost.min() - cost)
-    difference = place - estimate
-    return np.einsum("abi,abj,ab->ij", difference, difference, density) / density.sum()
+
+    def errors(place):
+        return np.r_[(np.hypot(*(place - used.positions).T) - used.distance) / used.sigma,
+                     (place - guess) / GUESS_PRIOR_SIGMA]
+
+    def derivatives(place):
+        difference = place - used.positions
+        slope = np.maximum(np.hypot(*difference.T), MIN_DISTANCE) * used.sigma
+        return np.r_[difference / slope[:, None], np.eye(2) / GUESS_PRIOR_SIGMA]
+
+    minima = sorted((least_squares(errors, start, derivatives, loss="cauchy", f_scale=KERNEL_SCALE,
+                                   ftol=TOLERANCE, xtol=TOLERANCE)
+                     for start in (guess, 2 * centre - guess, *circle)), key=lambda each: each.cost)
+    distinct = []
+    for each in minima:
+        if all(np.hypot(*(each.x - other.x)) > SAME_PLACE * radius for other in distinct):
+            distinct.append(each)
+    return (np.array([each.x for each in distinct]),
+            np.array([each.cost - minima[0].cost for each in distinct]),
+            np.linalg.inv([each.jac[:-2].T @ each.jac[:-2] + np.eye(2) / GUESS_PRIOR_SIGMA**2
+                           for each in distinct]))
+
+
+def second_moment(places, costs, covariances, estimate):
+    """Second moment (2, 2), m^2, of an antenna's position about its estimate (2,).
+
+    From what `trilaterate` returns: a mixture of Gaussians, each with the mass of its minimum.
+    """
+    mass = np.exp(-costs) * np.sqrt(np.linalg.det(covariances))
+    off = places - estimate
+    return np.tensordot(mass / mass.sum(), covariances + off[:, :, None] * off[:, None], 1)

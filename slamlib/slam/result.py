@@ -170,21 +170,21 @@ def antenna_doubts(problem, state, frame_covariances, covariances, range_weight)
     by_antenna = ranges_by_antenna(
         m, state.poses, frame_covariances, state.c, problem.noise.ranges)
     for k, (place, ranges) in enumerate(zip(state.antennas, by_antenna)):
-        sentence = _doubt(ranges, place, range_weight[m.ranges.antenna == k])
+        found = trilaterate(ranges)
+        sentence = _doubt(ranges, place, range_weight[m.ranges.antenna == k], *found[:2])
         if sentence is not None:
             sentences[int(m.antenna[k])] = sentence
-            covariances[k] = max(covariances[k], second_moment(ranges, place), key=np.trace)
+            covariances[k] = max(covariances[k], second_moment(*found, place), key=np.trace)
     return sentences, covariances
 
 
-def _doubt(ranges, estimate, weight):
+def _doubt(ranges, estimate, weight, places, costs):
     """The reason why an antenna is in doubt whose ranges have the weights (m,), or None.
 
-    Its standard deviation in the worst direction is by its ranges alone: the covariance in the
-    world also includes the uncertain heading of pose 1.
+    It may be at `places` (p, 2) of `costs` (p,). Its standard deviation in the worst direction is
+    by its ranges alone: the covariance in the world also includes the uncertain heading of pose 1.
     """
     distance, count = np.median(ranges.distance), np.count_nonzero(weight > 0.5)
-    places, costs = trilaterate(ranges)
     elsewhere = np.hypot(*(places - estimate).T) > SAME_PLACE * distance
     possible = places[elsewhere & (costs < MAX_LOG_ODDS)]
     difference = estimate - ranges.positions
