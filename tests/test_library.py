@@ -10,6 +10,7 @@ from numeric import known_noise
 from test_dataset import assert_same
 
 from slamlib import se2, slam
+from slamlib.checks.solution import solution_doubts
 from slamlib.dataset import Dataset, DatasetError, Vehicle, all_notes, read_dataset
 from slamlib.evaluation import anees, ate
 from slamlib.simulation import simulate, write_dataset
@@ -204,3 +205,18 @@ def test_odometry_and_a_compass_alone_are_a_problem(drive):
     before, after = (slam.estimate(alone, factors=own) for own in (None, compass(truth, 0.01, 20)))
     assert ate(after.poses, truth.poses) < ate(before.poses, truth.poses) / 2
     assert 0.3 < anees(after.poses, after.covariances, truth.poses) < 10
+
+
+def test_a_factor_that_contradicts_the_rest_is_named(drive):
+    """A place one metre off: the solution bends to it, unless its noise model is robust."""
+    dataset, truth = drive[0].first(600), drive[1]
+    plain = SIGMA(2, 0.05)
+    robust = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(1.0), plain)
+    for wrong, model, named in ((0, plain, []), (1, plain, ["own-factors"]), (1, robust, [])):
+        own = gtsam.NonlinearFactorGraph()
+        for i in (100, 300, 500):
+            own.add(gtsam.PoseTranslationPrior2D(
+                X(i), truth.poses[i, :2] + [wrong * (i == 300), 0.0], model))
+        doubts = solution_doubts(slam.estimate(known_noise(dataset, 1e-3), factors=own))
+        assert [each.what for each in doubts if each.what == "own-factors"] == named
+        assert all("factor 1 by " in each.sentence for each in doubts if each.what in named)

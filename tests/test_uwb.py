@@ -391,7 +391,9 @@ def test_places_are_minima_of_the_cost():
     m = measure(dataset.first(500))
     for ranges in ranges_by_antenna(m, truth.poses[m.frame], np.zeros((len(m.frame), 3, 3)),
                                     m.calibration.stated):
-        def cost(place, of=ranges.evenly_chosen()):
+        of = ranges.evenly_chosen()
+
+        def cost(place, of=of):
             e = np.r_[(np.hypot(*(of.positions - place).T) - of.distance) / of.sigma,
                       (place - of.guess) / GUESS_PRIOR_SIGMA]
             return KERNEL_SCALE**2 / 2 * np.log1p((e / KERNEL_SCALE)**2).sum()

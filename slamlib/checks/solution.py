@@ -9,6 +9,7 @@ from slamlib import se2
 from slamlib.doubt import Doubt
 from slamlib.odometry_gate import UNKNOWN_SIGMA
 from slamlib.slam.noise import BOUNDS
+from slamlib.slam.own import linearized_own
 
 MAX_TURN_SIGMA = np.pi / 3   # rad, between two frames; half a turn is three sigmas
 MAX_GAP = 30                 # poses, between contradictions that are told as one
@@ -19,6 +20,7 @@ MIN_FACTOR_SIGMAS = 4.0      # sigmas of the logarithm of a factor that is repor
 MAX_REJECTED = 0.1           # share of the sightings that are rejected
 MIN_REJECTED_OF_MARKER, MAX_REJECTED_OF_MARKER = 5, 0.2      # number, and share of its sightings
 MAX_MARKERS_NAMED = 8        # of those with most rejected sightings
+MAX_OWN_ERROR = 6.0          # sigmas, of a factor of one's own
 # By group of the calibration: its name in a sentence, and what to look at.
 GROUPS = {
     "wheel-parameters": ("the wheels", "Measure them, or state larger sigmas in vehicle.toml."),
@@ -43,7 +45,7 @@ def solution_doubts(result):
     """Tuple of Doubt where a SlamResult contradicts the files of its drive."""
     return tuple(Doubt(*each) for each in chain(
         _of_encoder(result), _of_calibration(result), _of_noise(result), _of_sightings(result),
-        _of_the_path(result),
+        _of_the_path(result), _of_own_factors(result),
         (("antenna", f"Antenna {antenna} is in doubt: {reason}. Its covariance includes this; look "
           "at its rows in UwbReading.txt.") for antenna, reason in result.doubts.items())))
 
@@ -167,3 +169,14 @@ def _of_the_path(result):
         yield "not-converged", (
             "The solution still changed when its number of steps ended: some poses or landmarks "
             "may be far from where the measurements want them.")
+
+
+def _of_own_factors(result):
+    """Kind and sentence if factors of one's own contradict the rest, which bends to them."""
+    e, *_ = linearized_own(result.fit.problem, result.fit.state)
+    size = np.linalg.norm(e, axis=1)
+    if size.max(initial=0) > MAX_OWN_ERROR:
+        yield "own-factors", (
+            f"{np.count_nonzero(size > MAX_OWN_ERROR)} of {len(size)} factors of your own "
+            f"contradict the rest, factor {size.argmax()} by {size.max():.0f} standard deviations, "
+            "and the solution bends to them: correct them, or give them a robust noise model.")

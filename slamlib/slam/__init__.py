@@ -25,13 +25,8 @@ with d errors each:
     B, D     information between the n unknowns and the calibration (n, q), and about it (q, q)
     delta    (n + q,) step of the unknowns
 
-A frame is a keyframe: an encoder pose that is a variable of the graph. Axes of the covariances:
-
-    sightings in the files               vehicle
-    errors of sightings with a heading   measured pose (`Measurements.sighting_roots`)
-    `Covariances` of poses and markers   each pose itself, as in GTSAM
-    `Covariances` of points, antennas    world
-    SlamResult                           world
+A frame is a keyframe: an encoder pose that is a variable of the graph. docs/code.md has the axes of
+all covariances.
 """
 
 from slamlib.slam.graph import as_gtsam

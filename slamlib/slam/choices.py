@@ -184,8 +184,7 @@ def _lead(proposed, present):
 def _with_fixed_weights(fit):
     """AcceptedMeasurements in which weights replace the kernel of the ranges."""
     problem, accepted = fit.problem, fit.problem.accepted
-    _, ranges = kept_weights(
-        accepted, *residuals(problem.measurements, fit.state, problem.noise))
+    _, ranges = kept_weights(accepted, *residuals(problem, fit.state))
     return replace(accepted, weight=np.r_[accepted.sighting_weight, ranges], range_kernel=None)
 
 

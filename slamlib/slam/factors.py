@@ -237,17 +237,6 @@ def sensor_poses(measurements, poses, c):
             for row, lag, place in kinds]
 
 
-def expected_measurements(measurements, state):
-    """Markers (s, 3) as they are seen, and ranges (r,) in m, from a State, without noise."""
-    m, c, antenna = measurements, state.c, measurements.ranges.antenna
-    size = c[calibration.SIZE]
-    camera, tag = sensor_poses(m, state.poses, c)
-    squared = np.sum((state.antennas[antenna] - tag[:, :2])**2, axis=1) + 2 * c[calibration.HEIGHT]
-    return (se2.between(camera, state.markers[m.marker_row]) / [size, size, 1],
-            c[calibration.OFFSET] + c[calibration.ANTENNAS][antenna]
-            + c[calibration.SCALE] * np.sqrt(np.maximum(squared, 0)))
-
-
 def delayed(measurements, row, lag, is_known=True):
     """Where the vehicle was `lag` encoder steps before the frames `row` (m,), in the axes there.
 

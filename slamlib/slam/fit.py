@@ -14,10 +14,9 @@ import gtsam
 import numpy as np
 from scipy.optimize import brentq
 
-from slamlib import se2
 from slamlib.sightings import GATE, POINT_GATE
 from slamlib.slam.calibration import WHEELS
-from slamlib.slam.factors import expected_measurements, preintegrate_odometry
+from slamlib.slam.factors import linearize_measurements, preintegrate_odometry
 from slamlib.slam.graph import CONVERGED, optimize
 from slamlib.slam.linear import NormalEquations, Problem, State, laplace_approximation
 from slamlib.slam.measurements import AcceptedMeasurements, Noise, with_known
@@ -93,7 +92,7 @@ def gate_weights(problem, state, early, late):
     The gate of a sighting is the 99.9 % quantile of chi-squared with 3 degrees of freedom, or 2 for
     a point. A range may be too short by `early` and too long by `late` sigmas.
     """
-    sightings, ranges = residuals(problem.measurements, state, problem.noise)
+    sightings, ranges = residuals(problem, state)
     squared_gate = np.where(problem.measurements.as_pose, GATE, POINT_GATE)
     return np.r_[np.sum(sightings**2, axis=1) < squared_gate,
                  (ranges > -early) & (ranges < late)].astype(float)
@@ -113,23 +112,21 @@ def kept_weights(accepted, sighting_residuals, range_residuals):
                        range_residuals - accepted.range_bias))
 
 
-def residuals(measurements, state, noise):
-    """Whitened residuals, measured minus expected, without kernels, at a State and a Noise.
+def residuals(problem, state):
+    """Whitened residuals, measured minus expected, of all measurements, without kernels.
 
     Returns
     -------
-    (s, 3) of the sightings, differences of coordinates in the axes of the vehicle; the third is 0
-        if the marker is a point.
+    (s, 3) of the sightings, in the axes of the measured pose, or for a marker that is a point in
+        those of the vehicle with 0 as the third.
     (r,) of the ranges, positive for a range that is too long.
     """
-    m, s, r = measurements, measurements.sightings, measurements.ranges
-    seen, distance = expected_measurements(m, state)
-    difference = s.z - seen
-    difference[:, 2] = se2.wrap(difference[:, 2]) * m.as_pose
-    C = s.C.copy()
-    C[~m.as_pose, 2] = C[~m.as_pose, :, 2] = [0, 0, 1]          # an independent heading
-    return (np.linalg.solve(np.linalg.cholesky(C), difference[..., None])[..., 0] / noise.sightings,
-            (r.distance - distance) / r.sigma / noise.ranges)
+    m = problem.measurements
+    everything = AcceptedMeasurements(measurements=m, weight=m.unit_weights)
+    poses, points, ranges, _ = linearize_measurements(replace(problem, accepted=everything), state)
+    sightings = np.zeros((len(m.marker_row), 3))
+    sightings[m.as_pose], sightings[~m.as_pose, :2] = -poses.e, -points.e
+    return sightings, -ranges.e[:, 0]
 
 
 def narrow_kernels(problem, state, scales=CAUCHY_SCALES, converged=CONVERGED):
@@ -156,7 +153,7 @@ def noise_of_scatter(problem, state):
     before a factor is learned. Known noise parameters are kept.
     """
     measurements = problem.measurements
-    sightings, ranges = residuals(measurements, state, Noise())
+    sightings, ranges = residuals(replace(problem, noise=Noise()), state)
     squared = (np.sum(sightings**2, axis=1) / np.where(
         measurements.as_pose, MEDIAN_CHI2[3], MEDIAN_CHI2[2]), ranges**2 / MEDIAN_CHI2[1])
     return with_known(Noise(problem.noise.slip, *(
@@ -240,9 +237,10 @@ def refine(problem, state, accept=accepted_measurements):
 def _shares(problem, state, accept):
     """Shares (s + r,) that the memory of errors leaves to measurements, None if there is none."""
     m = problem.measurements
-    noise = with_hidden_errors(problem.noise, (True, True), m.dataset.vehicle)
+    problem = replace(problem, noise=with_hidden_errors(
+        problem.noise, (True, True), m.dataset.vehicle))
     share = np.concatenate([memory.share for memory in error_memories(
-        accept(replace(problem, noise=noise), state), *residuals(m, state, noise))])
+        accept(problem, state), *residuals(problem, state))])
     return share if (share < 1).any() else None
 
 

@@ -17,6 +17,7 @@ from functools import cached_property
 import gtsam
 import numpy as np
 from scipy import sparse
+from scipy.ndimage import uniform_filter1d
 from scipy.sparse.linalg import splu
 
 from slamlib import odometry, se2
@@ -164,11 +165,8 @@ class Measurements:
 
     @cached_property
     def smooth_path(self):
-        """(n, 3) averages of `path` over SMOOTHED_STEPS to both sides, at the ends over fewer."""
-        step = np.arange(len(self.path))
-        reach = np.minimum(np.minimum(step, step[::-1]), SMOOTHED_STEPS)
-        total = odometry.cumulative(self.path)
-        return (total[step + reach + 1] - total[step - reach]) / (2 * reach + 1)[:, None]
+        """(n, 3) averages of `path` over SMOOTHED_STEPS to both sides."""
+        return uniform_filter1d(self.path, 2 * SMOOTHED_STEPS + 1, axis=0, mode="nearest")
 
     @property
     def origin_sigma(self):

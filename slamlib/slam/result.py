@@ -16,6 +16,7 @@ from slamlib.slam.calibration import WHEELS, Calibration, calibration_table
 from slamlib.slam.covariances import posterior_moments
 from slamlib.slam.fit import Fit, kept_weights, residuals
 from slamlib.slam.initialization import SAME_PLACE, ranges_by_antenna, second_moment, trilaterate
+from slamlib.slam.linear import NormalEquations
 from slamlib.slam.measurements import GUESS_PRIOR_SIGMA, AcceptedMeasurements, Noise
 from slamlib.slam.noise import error_memories
 
@@ -52,7 +53,6 @@ class SlamResult:
     chi2_per_dof: float             # of the accepted measurements, by the files' covariances
     chi2_per_dof_of_all: float      # the same of all measurements
     rejected: np.ndarray            # (s,) bool, beyond the gate, rows of Measurements.sightings
-    residual: np.ndarray            # (s, 3) whitened residuals of the sightings
     range_weight: np.ndarray        # (r,) share of its information that each range keeps, 0 to 1
     range_residual: np.ndarray      # (r,) whitened, positive for a range that is too long
     share: np.ndarray               # (s + r,) that memory leaves of the information of each
@@ -115,7 +115,7 @@ def slam_result(fit):
     state, marginal, slip = posterior_moments(fit)
     poses, pose_covariances = interpolate(
         replace(problem, noise=replace(problem.noise, slip=slip)), state, marginal.pairs)
-    residual, range_residual = residuals(m, state, problem.noise)
+    residual, range_residual = residuals(problem, state)
     sighting_weight, range_weight = kept_weights(problem.accepted, residual, range_residual)
     markers, antennas = np.split(marginal.landmarks, [len(m.marker)])
     best = np.full(len(m.marker), np.inf)         # a point has the heading of its best sighting
@@ -139,8 +139,8 @@ def slam_result(fit):
         model=problem.odometry.model, log_evidence=float(fit.log_evidence),
         chi2_per_dof=chi2_per_dof(problem, state, np.r_[sighting_weight, range_weight]),
         chi2_per_dof_of_all=chi2_per_dof(problem, state, m.unit_weights),
-        rejected=problem.accepted.rejected, residual=residual,
-        range_weight=range_weight, range_residual=range_residual,
+        rejected=problem.accepted.rejected, range_weight=range_weight,
+        range_residual=range_residual,
         share=np.concatenate(problem.accepted.shares), correlation=np.array([
             (memory.correlation, memory.sigma) for memory in error_memories(
                 problem.accepted, residual, range_residual)]),
@@ -209,14 +209,11 @@ def chi2_per_dof(problem, state, weight):
     With weights (s + r,), a measurement counts by its dimension times its weight, and a landmark
     subtracts its dimension. Odometry and priors have as many errors as unknowns.
     """
-    m, active = problem.measurements, problem.active
-    e_c = (state.c - m.calibration.stated)[active] / problem.sigma[active]
+    m = problem.measurements
     sightings, ranges = m.by_kind(weight)
-    stated = replace(problem, noise=Noise(), accepted=AcceptedMeasurements(
+    stated = replace(problem, noise=Noise(problem.noise.slip), accepted=AcceptedMeasurements(
         measurements=m, weight=weight))
-    odometry, _ = factors.linearize_odometry(problem, state)(problem.noise.slip)
-    squared = e_c @ e_c + 2 * sum(
-        kind.error for kind in (odometry, *factors.linearize_measurements(stated, state)[:3]))
+    squared = 2 * NormalEquations(stated, state).error
     used = np.bincount(m.marker_row, sightings * np.where(m.as_pose, 3, 2), len(m.marker))
     freedom = np.sum(np.maximum(used - np.where(m.oriented, 3, 2), 0)) \
         + np.sum(ranges) - 2 * len(m.antenna)

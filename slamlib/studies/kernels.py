@@ -17,7 +17,7 @@ from slamlib.slam.fit import (
 )
 from slamlib.slam.initialization import odometry_state, trilaterated_antennas
 from slamlib.slam.linear import build_problem, state_from_arrays
-from slamlib.slam.measurements import Noise, measure, with_known_noise
+from slamlib.slam.measurements import measure, with_known_noise
 from slamlib.slam.result import slam_result
 from slamlib.studies.montecarlo import antenna_error, drive
 
@@ -83,7 +83,7 @@ def wrong_labels(seed, methods=SIGHTING_METHODS, **options):
     for method in methods:
         fit = solve_with(measurements, start, sightings=method)
         found = slam_result(fit)
-        each = residuals(measurements, fit.state, fit.problem.noise)
+        each = residuals(fit.problem, fit.state)
         lost = kept_weights(fit.problem.accepted, *each)[0] < 0.5
         numbers |= {f"{method} ate": ate(found.poses, truth.poses),
                     f"{method} nees": anees(found.poses, found.covariances, truth.poses),
@@ -102,4 +102,4 @@ def mislabelled(measurements, truth):
     true_map[known] = truth.marker_in_world[np.searchsorted(truth.marker, m.marker[known])]
     state = state_from_arrays(m, truth.poses[m.frame], true_map,
                               np.zeros((len(m.antenna), 2)), m.calibration.stated)
-    return np.sum(residuals(m, state, Noise())[0]**2, axis=1) > MIN_MISLABELLED_SQUARED
+    return np.sum(residuals(build_problem(m, "arc"), state)[0]**2, axis=1) > MIN_MISLABELLED_SQUARED
