@@ -29,7 +29,6 @@ from slamlib.slam.fit import (
     ONE_SIDED,
     Fit,
     accepted_measurements,
-    gate_weights,
     noise_of_scatter,
     refine,
 )
@@ -572,7 +571,9 @@ def test_gates_of_poses_points_and_ranges():
         accepted_measurements(problem, state).weight, [1, 0, 1, 0, 1, 0, 1])
     wider = replace(problem, noise=Noise(sightings=1.1, ranges=1.1))
     np.testing.assert_array_equal(accepted_measurements(wider, state).weight, 1)
-    np.testing.assert_array_equal(gate_weights(problem, state, 3.3, 10.0), [1, 0, 1, 0, 1, 0, 0])
+    gates = ("quadratic", True), ("Huber", True)
+    np.testing.assert_array_equal(
+        accepted_measurements(problem, state, *gates).weight, [1, 0, 1, 0, 1, 0, 0])
 
 
 @pytest.mark.parametrize("true, other", [("arc", "euler"), ("euler", "arc")])

@@ -24,13 +24,10 @@ import numpy as np
 from scipy.linalg import cho_solve_banded, cholesky_banded, solve_triangular
 from scipy.sparse import block_array, csc_array
 
-from slamlib.dataset import DatasetError
 from slamlib.slam.calibration import WHEELS
-from slamlib.slam.factors import inverse_adjoint
 from slamlib.slam.linear import laplace_approximation, retract
 
 COLUMNS_AT_ONCE = 128        # columns of M that are held in memory
-MAX_ROUNDING = 0.05          # float rounding: share of the information about the heading at pose 1
 
 
 @dataclass(frozen=True)
@@ -45,13 +42,11 @@ class Covariances:
 def marginal_covariances(equations, noise):
     """The Covariances for a Noise by NormalEquations at the State that solves the problem.
 
-    Raises DatasetError if float rounding hides the information about the heading at pose 1, and
-    numpy.linalg.LinAlgError if the equations are singular.
+    Raises numpy.linalg.LinAlgError if the equations are singular.
     """
     problem, structure, active = equations.problem, equations.structure, equations.problem.active
     data, border, *_ = equations.sums(noise)
     H, n, q = structure.matrix(data), len(structure.diagonal), active.sum()
-    _require_digits(equations, H)
     B, D = csc_array(border[:n, :-1]), csc_array(border[n:, :-1])
     rows = structure.rows(slice(None)).ravel()
     frames, others = np.split(np.r_[rows, n:n + q], [3 * len(problem.measurements.frame)])
@@ -99,31 +94,10 @@ def _chain_inverse(T):
     return partial(cho_solve_banded, (L, True)), Z, -W.mT @ Z[1:]
 
 
-def _require_digits(equations, H):
-    """Raise DatasetError if rounding in the information matrix H hides the prior of the heading.
-
-    A common rotation of all poses and landmarks about pose 1 changes no measurement of the files:
-    only priors and factors of one's own have information about it. Any more in H is rounding.
-    """
-    m, state, structure = equations.problem.measurements, equations.state, equations.structure
-    poses = np.concatenate([state.poses, state.markers, np.pad(state.antennas, ((0, 0), (0, 1)))])
-    turn = np.empty(len(structure.diagonal))                 # change of the unknowns, per rad
-    turn[structure.rows(slice(None))] = inverse_adjoint(poses)[:, :, 2]
-    own, pairs = equations.linearized[-1].J, structure.factors[-1]
-    known = equations.priors.H @ turn**2 + np.sum(
-        (own @ turn[structure.rows(pairs.ravel())].reshape(-1, 6, 1))**2)
-    rounding, sigma = turn @ (H @ turn) - known, m.origin_sigma[2]
-    if abs(rounding) * sigma**2 > MAX_ROUNDING:
-        raise DatasetError(
-            f"{m.dataset.name}: expected measurements beside which sigma_heading = {sigma:g} rad "
-            "(vehicle.toml, or the assignment's table 2) is not lost in rounding; their standard "
-            "deviations are too small for it")
-
-
 def posterior_moments(fit):
     """Mean State, Covariances, and root mean square of the slip in sqrt(m), of a Fit.
 
-    Raises DatasetError and LinAlgError as `marginal_covariances`.
+    Raises LinAlgError as `marginal_covariances`.
     """
     problem, equations = fit.problem, fit.equations
     weights, noises = zip(*fit.posterior.points) if fit.posterior else ((1.0,), (problem.noise,))

@@ -17,12 +17,12 @@ from scipy.optimize import brentq
 from slamlib.sightings import GATE, POINT_GATE
 from slamlib.slam.calibration import WHEELS
 from slamlib.slam.factors import linearize_measurements, preintegrate_odometry
-from slamlib.slam.graph import CONVERGED, optimize
+from slamlib.slam.graph import optimize
 from slamlib.slam.linear import NormalEquations, Problem, State, laplace_approximation
 from slamlib.slam.measurements import AcceptedMeasurements, Noise, with_known
 from slamlib.slam.noise import NoisePosterior, error_memories, learn_noise, with_hidden_errors
 
-EARLY_GATE = 3.3             # sigmas; a range that is shorter than expected by more is rejected
+RANGE_GATE = 3.3             # sigmas; a range that is shorter than expected by more is rejected
 
 _kernel = gtsam.noiseModel.mEstimator
 # By name, scales in sigmas. Those of Huber, Cauchy and Tukey have 95 % efficiency on Gaussian noise
@@ -52,18 +52,18 @@ def accepted_measurements(problem, state, sightings=None, ranges=None):
     """The AcceptedMeasurements at a State, by kernel and gate of sightings and of ranges.
 
     `sightings` and `ranges` are a name in KERNELS and whether what contradicts the State is
-    rejected; None takes those of the dataset's Vehicle. A one-sided kernel is that of the ranges
-    only, and replaces their gate for late ones.
+    rejected; None takes those of the dataset's Vehicle. The gate of a sighting is the 99.9 %
+    quantile of chi-squared with 3 degrees of freedom, or 2 for a point. A one-sided kernel is that
+    of the ranges only, and replaces their gate for late ones.
     """
     m, vehicle = problem.measurements, problem.measurements.dataset.vehicle
     (kernel, gated), (range_kernel, range_gated) = (
         each or (vehicle.kernel, vehicle.gate) for each in (sightings, ranges))
-    early = EARLY_GATE if range_gated else np.inf
-    weight = gate_weights(problem, state, early, np.inf if range_kernel in ONE_SIDED else early)
-    if not gated:
-        weight[:len(m.marker_row)] = 1
+    residual, late = residuals(problem, state)
+    near = np.sum(residual**2, axis=1) < np.where(m.as_pose, GATE, POINT_GATE)
+    early, too_late = late <= -RANGE_GATE, (late >= RANGE_GATE) & (range_kernel not in ONE_SIDED)
     return AcceptedMeasurements(
-        measurements=m, weight=weight,
+        measurements=m, weight=1.0 - np.r_[gated & ~near, range_gated & (early | too_late)],
         sighting_kernel=None if kernel in ONE_SIDED else KERNELS[kernel],
         range_kernel=KERNELS[range_kernel], range_bias=kernel_bias(KERNELS[range_kernel]))
 
@@ -84,18 +84,6 @@ def kernel_bias(kernel):
         return np.sum(weight * (r - b) * np.exp(-r**2 / 2))
 
     return float(brentq(mean, -1, 1))
-
-
-def gate_weights(problem, state, early, late):
-    """Weights (s + r,): 1 within the gates, else 0.
-
-    The gate of a sighting is the 99.9 % quantile of chi-squared with 3 degrees of freedom, or 2 for
-    a point. A range may be too short by `early` and too long by `late` sigmas.
-    """
-    sightings, ranges = residuals(problem, state)
-    squared_gate = np.where(problem.measurements.as_pose, GATE, POINT_GATE)
-    return np.r_[np.sum(sightings**2, axis=1) < squared_gate,
-                 (ranges > -early) & (ranges < late)].astype(float)
 
 
 def kept_weights(accepted, sighting_residuals, range_residuals):
@@ -129,11 +117,11 @@ def residuals(problem, state):
     return sightings, -ranges.e[:, 0]
 
 
-def narrow_kernels(problem, state, scales=CAUCHY_SCALES, converged=CONVERGED):
+def narrow_kernels(problem, state, scales=CAUCHY_SCALES):
     """The State after one solution for each scale of the Cauchy kernel, with all measurements.
 
     The scales are in sigmas. The scatter of the residuals of each solution gives the noise of the
-    next. `converged` as in `optimize`. Raises DatasetError as `optimize`.
+    next. Raises DatasetError as `optimize`.
     """
     m = problem.measurements
     for number, scale in enumerate(scales):
@@ -142,7 +130,7 @@ def narrow_kernels(problem, state, scales=CAUCHY_SCALES, converged=CONVERGED):
         cauchy = _kernel.Cauchy.Create(scale)
         accepted = AcceptedMeasurements(
             measurements=m, weight=m.unit_weights, sighting_kernel=cauchy, range_kernel=cauchy)
-        state = optimize(replace(problem, accepted=accepted), state, converged=converged).state
+        state = optimize(replace(problem, accepted=accepted), state).state
     return state
 
 

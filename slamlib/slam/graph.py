@@ -35,11 +35,10 @@ class Optimum(NamedTuple):
     converged: bool          # whether the error had stopped to decrease
 
 
-def optimize(problem, state, max_steps=MAX_GAUSS_NEWTON_STEPS, by_gtsam=False,
-             converged=CONVERGED):
+def optimize(problem, state, max_steps=MAX_GAUSS_NEWTON_STEPS, by_gtsam=False):
     """The Optimum of a Problem from a State.
 
-    It ends where the error decreases by at most `converged` times (1 + error). Raises DatasetError
+    It ends where the error decreases by at most CONVERGED times (1 + error). Raises DatasetError
     if the measurements do not determine every variable.
     """
     equations, steps, ended = NormalEquations(problem, state), 0, False
@@ -56,7 +55,7 @@ def optimize(problem, state, max_steps=MAX_GAUSS_NEWTON_STEPS, by_gtsam=False,
                 break
         else:
             equations = NormalEquations(problem, state)
-        ended = error - equations.error <= converged * (1 + error)
+        ended = error - equations.error <= CONVERGED * (1 + error)
     return Optimum(equations=equations, state=equations.state, error=equations.error, steps=steps,
                    converged=ended)
 

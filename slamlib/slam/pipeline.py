@@ -20,8 +20,6 @@ from slamlib.slam.result import slam_result
 from slamlib.textfile import error, quoted
 from slamlib.vehicle import changed
 
-WARM_START_CONVERGED = 1e-3  # decrease, over 1 + error, at which the start from a result ends
-
 
 def estimate(dataset, slip=None, model=None, previous=None, *, marker_noise_factor=None,
              range_noise_factor=None, kernel=None, gate=None, factors=None):
@@ -114,5 +112,5 @@ def fit_from_previous(measurements, previous, model=None):
         build_problem(measurements, model or previous.model, Noise(previous.slip), previous.wheel),
         sigma=sigma, released=previous.released)
     state = state_from_poses(measurements, previous.poses[frame], previous.covariances[frame], c)
-    state = narrow_kernels(problem, state, CAUCHY_SCALES[-1:], converged=WARM_START_CONVERGED)
+    state = narrow_kernels(problem, state, CAUCHY_SCALES[-1:])
     return replace(refine(problem, state), explanations=previous.explanations)

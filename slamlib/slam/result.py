@@ -109,7 +109,7 @@ class SlamResult:
 def slam_result(fit):
     """The SlamResult of a Fit.
 
-    Raises DatasetError and LinAlgError as `marginal_covariances`.
+    Raises LinAlgError as `marginal_covariances`.
     """
     problem, m = fit.problem, fit.problem.measurements
     state, marginal, slip = posterior_moments(fit)
