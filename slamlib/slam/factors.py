@@ -11,6 +11,7 @@ poses are by GTSAM's tangent vectors: X moves as X exp(xi), in its own axes.
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from slamlib import increments, se2
 from slamlib.slam import calibration
@@ -20,6 +21,7 @@ from slamlib.slam.own import linearized_own
 
 MINIMUM_SIGMA = 1e-5         # m, standard deviation of an increment's end along x and y
 MIN_DISTANCE = 1e-9          # m, below which a range has no direction
+SMOOTHED_STEPS = 11          # encoder steps over which velocities are averaged
 
 
 @dataclass(frozen=True)
@@ -245,7 +247,8 @@ def delayed(measurements, row, lag, is_known=True):
     """
     if is_known and not lag:
         return np.zeros((2, len(row), 3))
-    path, smooth = measurements.path, measurements.smooth_path
+    path = measurements.path
+    smooth = uniform_filter1d(path, SMOOTHED_STEPS, axis=0, mode="nearest")
     time = measurements.frame[row] - lag
     i = np.clip(np.floor(time).astype(int), 0, max(len(path) - 2, 0))
     k = np.minimum(i + 1, len(path) - 1)

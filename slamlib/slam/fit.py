@@ -8,11 +8,10 @@ have memory, measurements keep a share of their information (`slamlib.memory`).
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, partial
 
 import gtsam
 import numpy as np
-from scipy.optimize import brentq
 
 from slamlib.sightings import GATE, POINT_GATE
 from slamlib.slam.calibration import WHEELS
@@ -37,7 +36,9 @@ KERNELS = {
     "Tukey": _kernel.Tukey.Create(4.685),
     "asymmetric Cauchy": _kernel.AsymmetricCauchy.Create(2.385, _scalar),
     "asymmetric Tukey": _kernel.AsymmetricTukey.Create(4.685, _scalar)}
-ONE_SIDED = ("asymmetric Cauchy", "asymmetric Tukey")
+# Location b, in sigmas, for which a one-sided kernel weighs standard normal residuals r to
+# E[weight(r - b) (r - b)] = 0: it makes their mean too small. Ranges are compared with it.
+ONE_SIDED = {"asymmetric Cauchy": -0.10555, "asymmetric Tukey": -0.07581}
 
 CAUCHY_SCALES = (100.0, 30.0, 10.0, 3.0)     # sigmas, scale of the kernel in each round
 MIN_RESIDUALS = 20           # number of measurements from which their scatter gives a factor
@@ -65,25 +66,7 @@ def accepted_measurements(problem, state, sightings=None, ranges=None):
     return AcceptedMeasurements(
         measurements=m, weight=1.0 - np.r_[gated & ~near, range_gated & (early | too_late)],
         sighting_kernel=None if kernel in ONE_SIDED else KERNELS[kernel],
-        range_kernel=KERNELS[range_kernel], range_bias=kernel_bias(KERNELS[range_kernel]))
-
-
-@lru_cache(maxsize=8)
-def kernel_bias(kernel):
-    """Location b, in sigmas, for which a signed kernel weighs the residuals r - b to mean zero.
-
-    Of standard normal residuals r, which a one-sided kernel makes too small on average (b < 0):
-    E[weight(r - b) (r - b)] = 0. Ranges are compared with the expected ones plus b sigma.
-    """
-    r = np.linspace(-6, 6, 241)
-    if kernel is None or kernel.weight(3.0) == kernel.weight(-3.0):
-        return 0.0
-
-    def mean(b):
-        weight = np.array([kernel.weight(x) for x in r - b])
-        return np.sum(weight * (r - b) * np.exp(-r**2 / 2))
-
-    return float(brentq(mean, -1, 1))
+        range_kernel=KERNELS[range_kernel], range_bias=ONE_SIDED.get(range_kernel, 0.0))
 
 
 def kept_weights(accepted, sighting_residuals, range_residuals):
@@ -170,12 +153,6 @@ class Fit:
     def equations(self):
         """The NormalEquations at the state."""
         return NormalEquations(self.problem, self.state)
-
-
-def solved_by_gtsam(fit):
-    """The Fit after GTSAM's optimisation; raises DatasetError as `optimize`."""
-    optimum = optimize(fit.problem, fit.state, by_gtsam=True)
-    return replace(fit, state=optimum.state, converged=optimum.converged)
 
 
 def refine(problem, state, accept=accepted_measurements):

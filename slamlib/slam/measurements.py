@@ -17,7 +17,6 @@ from functools import cached_property
 import gtsam
 import numpy as np
 from scipy import sparse
-from scipy.ndimage import uniform_filter1d
 from scipy.sparse.linalg import splu
 
 from slamlib import odometry, se2
@@ -35,7 +34,6 @@ from slamlib.slam.own import connected, poses_of
 
 NOISE_KEYS = ("slip", "marker_noise_factor", "range_noise_factor")      # of a Vehicle, as in Noise
 
-SMOOTHED_STEPS = 5           # encoder steps to both sides, over which velocities are averaged
 # Standard deviations of the priors of variables
 ORIGIN_SIGMA = 1e-5          # m, of the position of pose 1, which is zero by definition
 WEAK_SIGMA = 1e5             # m and rad, of a marker without accepted sightings
@@ -163,11 +161,6 @@ class Measurements:
     jumps: Jumps             # where odometry contradicts the markers
     own: gtsam.NonlinearFactorGraph      # factors of one's own
 
-    @cached_property
-    def smooth_path(self):
-        """(n, 3) averages of `path` over SMOOTHED_STEPS to both sides."""
-        return uniform_filter1d(self.path, 2 * SMOOTHED_STEPS + 1, axis=0, mode="nearest")
-
     @property
     def origin_sigma(self):
         """(3,) standard deviations of pose 1: m, m, rad."""
@@ -252,7 +245,7 @@ class AcceptedMeasurements:
     weight: np.ndarray                       # (s + r,) of its information, 0 if it is rejected
     sighting_kernel: gtsam.noiseModel.mEstimator.Base | None = None      # None: quadratic
     range_kernel: gtsam.noiseModel.mEstimator.Base | None = None
-    range_bias: float = 0.0                  # sigmas, of the range kernel (`factors.kernel_bias`)
+    range_bias: float = 0.0                  # sigmas, of the range kernel (`fit.ONE_SIDED`)
     share: np.ndarray | None = None          # (s + r,) that its neighbours leave it (`memory`)
 
     @property

@@ -12,7 +12,8 @@ from slamlib.dataset import Dataset
 from slamlib.odometry import MODELS
 from slamlib.odometry_gate import NO_JUMPS
 from slamlib.slam.choices import better_model, calibrated, most_consistent
-from slamlib.slam.fit import CAUCHY_SCALES, narrow_kernels, refine, solved_by_gtsam
+from slamlib.slam.fit import CAUCHY_SCALES, narrow_kernels, refine
+from slamlib.slam.graph import optimize
 from slamlib.slam.initialization import initial_state, state_from_poses
 from slamlib.slam.linear import build_problem
 from slamlib.slam.measurements import Noise, measure
@@ -90,7 +91,9 @@ kernel, found 'L2'
         fit = solve(previous.jumps, places)
     else:
         fit, places = most_consistent(dataset, solve)
-    return replace(slam_result(solved_by_gtsam(fit)), places=places)                  # 7
+    optimum = optimize(fit.problem, fit.state, by_gtsam=True)
+    fit = replace(fit, state=optimum.state, converged=optimum.converged)
+    return replace(slam_result(fit), places=places)                                   # 7
 
 
 def fit_from_odometry(measurements, model="arc"):
