@@ -168,7 +168,7 @@ def test_the_slip_stays_within_its_bounds_whatever_the_likelihood(
         found = fused._likeliest_slip(None)
     low, high = increments.SLIP_BOUNDS
     assert low <= found * (1 + 1e-9) <= high * (1 + 1e-8)
-    assert expected is None or np.isclose(found, increments.SLIP_BOUNDS[expected])
+    assert expected is None or np.isclose(found, increments.SLIP_BOUNDS[expected], rtol=0.05)
 
 
 def test_the_hint_fuses_by_information():
