@@ -328,17 +328,6 @@ def test_second_moment_is_that_of_a_mixture_of_both_mirror_images():
                                C + [[0, 0], [0, 64 / 2]], rtol=1e-2, atol=1e-3)
 
 
-def test_of_many_ranges_150_are_used():
-    """Evenly, from the first to the last one."""
-    for count in (1, 150, 151, 1000):
-        ranges = line_of_ranges(count)
-        few, used = ranges.evenly_chosen(), min(count, 150)
-        rows = np.searchsorted(ranges.positions[:, 0], few.positions[:, 0])
-        assert len(rows) == len(few.sigma) == used and rows[0] == 0 and rows[-1] == count - 1
-        assert np.diff(rows).max(initial=0) <= np.diff(rows).min(initial=count) + 1
-        np.testing.assert_array_equal(few.distance, ranges.distance[rows])
-
-
 def test_ranges_carry_the_uncertainty_of_the_place_they_were_measured_from():
     """sigma^2 is that of the range plus the mean variance of the vehicle's x and y."""
     dataset, poses = drive([(2.0, 1.0)], np.array([3.0, 4.0]), (3.5, 4.0), every=50)
@@ -390,9 +379,7 @@ def test_places_are_minima_of_the_cost():
     m = measure(dataset.first(500))
     for ranges in ranges_by_antenna(m, truth.poses[m.frame], np.zeros((len(m.frame), 3, 3)),
                                     m.calibration.stated):
-        of = ranges.evenly_chosen()
-
-        def cost(place, of=of):
+        def cost(place, of=ranges):
             e = np.r_[(np.hypot(*(of.positions - place).T) - of.distance) / of.sigma,
                       (place - of.guess) / GUESS_PRIOR_SIGMA]
             return KERNEL_SCALE**2 / 2 * np.log1p((e / KERNEL_SCALE)**2).sum()

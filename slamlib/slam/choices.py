@@ -30,7 +30,7 @@ from slamlib.odometry import MODELS
 from slamlib.odometry_gate import NO_JUMPS, find_jumps
 from slamlib.slam.factors import preintegrate_odometry
 from slamlib.slam.fit import accepted_measurements, kept_weights, refine, residuals
-from slamlib.slam.linear import NormalEquations, linear_solution, log_evidence
+from slamlib.slam.linear import NormalEquations, laplace_approximation, linear_solution
 from slamlib.slam.result import slam_result
 
 DECISIVE_LEAD = 3.0          # log evidence by which another model of the steps replaces the default
@@ -60,9 +60,10 @@ def better_model(fit):
     other, = {*MODELS} - {current.odometry.model}
     odometry = replace(preintegrate_odometry(
         current.measurements, other, current.odometry.wheel), in_counts=True)
-    lead = log_evidence(replace(current, odometry=odometry), fit.state) \
-        - log_evidence(current, fit.state)
-    if lead <= (DECISIVE_LEAD if other == "euler" else -DECISIVE_LEAD):
+    of_current, of_other = (laplace_approximation(
+        NormalEquations(each, fit.state), current.noise)[1]
+        for each in (current, replace(current, odometry=odometry)))
+    if of_other - of_current <= (DECISIVE_LEAD if other == "euler" else -DECISIVE_LEAD):
         return fit
     return replace(refine(replace(fit.problem, odometry=odometry), fit.state, accept=None),
                    explanations=fit.explanations)

@@ -126,12 +126,6 @@ class AntennaRanges:
     sigma: np.ndarray        # (m,) m, including that of the vehicle's position
     guess: np.ndarray        # (2,) m, guessed position of the antenna
 
-    def evenly_chosen(self):
-        """AntennaRanges of at most MAX_RANGES of these."""
-        chosen = np.unique(np.linspace(0, len(self.distance) - 1, MAX_RANGES).astype(int))
-        return AntennaRanges(
-            self.positions[chosen], self.distance[chosen], self.sigma[chosen], self.guess)
-
 
 def ranges_by_antenna(measurements, poses, covariances, c, factor=1.0):
     """List of the AntennaRanges of every antenna; parameters as of `state_from_poses`.
@@ -169,15 +163,16 @@ def trilaterate(ranges):
     guess, centre, radius = ranges.guess, ranges.positions.mean(0), np.median(ranges.distance)
     angle = np.arange(START_DIRECTIONS) * 2 * np.pi / START_DIRECTIONS
     circle = centre + radius * np.stack([np.cos(angle), np.sin(angle)], -1)
-    used = ranges.evenly_chosen()
+    used = np.unique(np.linspace(0, len(ranges.distance) - 1, MAX_RANGES).astype(int))
+    positions, distance, sigma = ranges.positions[used], ranges.distance[used], ranges.sigma[used]
 
     def errors(place):
-        return np.r_[(np.hypot(*(place - used.positions).T) - used.distance) / used.sigma,
+        return np.r_[(np.hypot(*(place - positions).T) - distance) / sigma,
                      (place - guess) / GUESS_PRIOR_SIGMA]
 
     def derivatives(place):
-        difference = place - used.positions
-        slope = np.maximum(np.hypot(*difference.T), MIN_DISTANCE) * used.sigma
+        difference = place - positions
+        slope = np.maximum(np.hypot(*difference.T), MIN_DISTANCE) * sigma
         return np.r_[difference / slope[:, None], np.eye(2) / GUESS_PRIOR_SIGMA]
 
     minima = sorted((least_squares(errors, start, derivatives, loss="cauchy", f_scale=KERNEL_SCALE,

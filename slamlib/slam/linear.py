@@ -301,8 +301,3 @@ def consistency_factor(kernel, size=1):
     r = np.linspace(-6 if size == 1 else 0, 6, 241)
     density = r**(size - 1) * np.exp(-r**2 / 2) * np.array([kernel.weight(x) for x in r])
     return float(np.sum(r**2 * density) / np.sum(density)) / size
-
-
-def log_evidence(problem, state):
-    """Log evidence of a Problem by `laplace_approximation` at a State near its optimum."""
-    return laplace_approximation(NormalEquations(problem, state), problem.noise)[1]

@@ -59,11 +59,6 @@ def with_hidden_errors(noise, remember, vehicle):
     return with_known(Noise(noise.slip, sightings, ranges), vehicle)
 
 
-def log_prior(logarithms):
-    """Log prior density (3,), up to a constant, of each of `Noise.logarithms` (3,)."""
-    return -((logarithms - np.log(MEDIAN)) / PRIOR_SIGMA)**2 / 2
-
-
 @dataclass(frozen=True)
 class NoisePosterior:
     """Posterior of the noise given the measurements."""
@@ -81,7 +76,8 @@ def learn_noise(equations):
 
     def log_posterior(logarithms):
         _, evidence = laplace_approximation(equations, Noise.from_logarithms(logarithms))
-        return max(evidence, SINGULAR) + np.sum(log_prior(logarithms)[free])
+        prior = -((logarithms - np.log(MEDIAN)) / PRIOR_SIGMA)[free]**2 / 2
+        return max(evidence, SINGULAR) + np.sum(prior)
 
     start = np.where(m.learned | is_known(m.dataset.vehicle), noise.logarithms, np.log(MEDIAN))
     value = log_posterior(start)

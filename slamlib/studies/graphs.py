@@ -7,7 +7,7 @@ import numpy as np
 from slamlib.slam.calibration import WHEELS
 from slamlib.slam.factors import preintegrate_odometry
 from slamlib.slam.graph import optimize
-from slamlib.slam.linear import log_evidence
+from slamlib.slam.linear import laplace_approximation
 
 
 def evidence_curve(fit, slips, model):
@@ -20,6 +20,7 @@ def evidence_curve(fit, slips, model):
     problem, state, curve = replace(fit.problem, odometry=factors), fit.state, []
     for slip in slips:
         problem = replace(problem, noise=replace(problem.noise, slip=slip))
-        state = optimize(problem, state).state
-        curve.append(log_evidence(problem, state))
+        optimum = optimize(problem, state)
+        state = optimum.state
+        curve.append(laplace_approximation(optimum.equations, problem.noise)[1])
     return np.array(curve)
