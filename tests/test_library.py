@@ -57,7 +57,7 @@ def changed_at(place, value):
 
 @pytest.mark.parametrize("change, told", [
     ({"ticks": lambda a: a[:, :1]}, "ticks: expected a matrix of real numbers with 2 columns "
-     "(right ticks, left ticks), found int64 of shape (2000, 1)"),
+     "(right ticks, left ticks), found float64 of shape (2000, 1)"),
     ({"ticks": lambda a: "data/short"}, "ticks: expected a matrix of real numbers with 2 columns"),
     ({"ticks": changed_at((7, 1), np.nan)}, "ticks, row 8: expected left ticks, a whole number"),
     ({"ticks": changed_at((7, 0), 0.5)}, "ticks, row 8: expected right ticks, a whole number"),
