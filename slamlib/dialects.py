@@ -49,7 +49,7 @@ LIMITS = {
     "ArucoMap.txt": {"marker id": _WHOLE, "x": _TRUE, "y": _TRUE, "theta": _TRUE_ANGLE},
     "UwbMap.txt": {"antenna id": _WHOLE, "x": _TRUE, "y": _TRUE}}
 
-IGNORED = re.compile(r'(#|%|//).*|"')
+COMMENT_OR_QUOTE = re.compile(r'(#|%|//).*|"')
 EMPTY_CELL = re.compile(r"(?:^|(?<=[;,]))[^\S\n]*(?=[;,]|$)", re.MULTILINE)
 NUMBER_FIRST = re.compile(r"(^|[\s,;])\W*(\d|nan\b|inf)", re.IGNORECASE)  # in a row, not a header
 POINT_OR_LOOSE_COMMA = re.compile(r"\.|(?<!\d),|,(?!\d)")  # where commas are no decimal commas
@@ -144,7 +144,7 @@ def _table_of_text(source, name):
     """The Table of a text file, with NaN for empty cells."""
     columns = list(LIMITS[name])
     table = Table(source=source, numbers=np.empty((0, len(columns))))
-    rows = IGNORED.sub("", read_text(source)).split("\n")
+    rows = COMMENT_OR_QUOTE.sub("", read_text(source)).split("\n")
     lines = [k for k, row in enumerate(rows, start=1) if row.strip(",; \t").strip()]
     header = rows[lines[0] - 1].strip() if lines else ""
     if re.search("[A-Za-z]", header) and not NUMBER_FIRST.search(header):
