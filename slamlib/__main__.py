@@ -53,10 +53,11 @@ def main(arguments=None):
 
 
 def _end_as_by_ctrl_c(number, frame):
-    """Let the first of END_SIGNALS do what Ctrl-C does, also in the event loop of the notebooks."""
+    """Let the first of END_SIGNALS do what Ctrl-C does."""
     for each in END_SIGNALS:
         signal.signal(each, signal.SIG_IGN)
-    signal.raise_signal(signal.SIGINT)
+    interrupt = signal.getsignal(signal.SIGINT)  # the event loop's, while notebooks run
+    (interrupt if callable(interrupt) else signal.default_int_handler)(signal.SIGINT, frame)
 
 
 class _Parser(argparse.ArgumentParser):

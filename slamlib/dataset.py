@@ -246,7 +246,7 @@ def _read_map(files, name, notes):
 
 def _read_aruco(files, pose_count, notes):
     """The ArucoReadings, or None without rows."""
-    table = _read_sensor(files, "ArucoReading.txt", pose_count)
+    table = read_table(files.get("ArucoReading.txt"), "ArucoReading.txt", MAX_BAD_SHARE, pose_count)
     # Scaled to correlations: s_thetatheta may be 1e4 rad^2 where s_xx is 1e-4 m^2.
     smallest = np.linalg.eigvalsh(se2.correlations(_covariances(table.numbers)))[:, 0]
     table = table.kept(smallest > MIN_EIGENVALUE, "a positive definite covariance (smallest "
@@ -264,7 +264,7 @@ def _covariances(rows):
 
 def _read_uwb(files, pose_count, notes):
     """The UwbReadings, or None without rows, and the AntennaGuess, which has all of their ids."""
-    table = _read_sensor(files, "UwbReading.txt", pose_count)
+    table = read_table(files.get("UwbReading.txt"), "UwbReading.txt", MAX_BAD_SHARE, pose_count)
     table = table.kept(table.numbers[:, 2] >= -MAX_NEGATIVE_SIGMAS * table.numbers[:, 3],
                        f"a range that is not below -{MAX_NEGATIVE_SIGMAS:g} sigma", MAX_BAD_SHARE)
     notes += table.notes
@@ -273,14 +273,6 @@ def _read_uwb(files, pose_count, notes):
                "UwbAntennaGuess.txt in the same folder, or guess")
     pose, antenna, rows = _in_order(table.numbers)
     return UwbReadings(pose, antenna, *rows[:, 2:].T) if len(rows) else None, guess
-
-
-def _read_sensor(files, name, pose_count):
-    """The Table of a sensor, with pose ids of the drive."""
-    table = read_table(files.get(name), name, MAX_BAD_SHARE)
-    pose = table.numbers[:, 0]
-    return table.kept((1 <= pose) & (pose <= pose_count), f"a pose id from 1 to {pose_count}",
-                      MAX_BAD_SHARE)
 
 
 def _in_order(rows):

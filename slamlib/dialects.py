@@ -97,14 +97,17 @@ class Table:
         return kept.noted(f": {count} of {len(bad)} rows left out, the first in {place}: {said}")
 
 
-def read_table(source, name, share=0.0):
+def read_table(source, name, share=0.0, pose_count=None):
     """The Table of a text file (Path), a Variable, or None, which has no rows.
 
-    The columns are those of LIMITS[name]. A share of the rows may be beyond LIMITS, and if it is
-    not 0, any may have NaN. Raises DatasetError if there are more, a row has other than a number
-    for each column, or a header names the columns in another order.
+    The columns are those of LIMITS[name]. A share of the rows may be beyond LIMITS, or have pose
+    ids beyond `pose_count`, and if it is not 0, any may have NaN. Raises DatasetError if there are
+    more, a row has other than a number for each column, or a header names the columns in another
+    order.
     """
-    limits, columns = LIMITS[name], list(LIMITS[name])
+    limits, columns = dict(LIMITS[name]), list(LIMITS[name])
+    if pose_count is not None:
+        limits["pose id"] = Limit(1, pose_count, whole=True)
     if source is None:
         return Table(source=source, numbers=np.empty((0, len(columns))))
     if isinstance(source, Variable):

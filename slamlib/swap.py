@@ -130,6 +130,7 @@ def _add_the_users_files(folder, new, ours):
     for name in {*file_names(source)} - {FILE_LIST, *ours, *names, *listed}:
         if not name.endswith(".part"):
             (new / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(source / name, new / name, follow_symlinks=False)
+            shutil.copyfile(source / name, new / name, follow_symlinks=False)
+            shutil.copystat(source / name, new / name, follow_symlinks=False)
     if names:
         (new / FILE_LIST).write_text(json.dumps(names))

@@ -267,7 +267,7 @@ THIRD_ROWS = {  # rows by what is said of them
         "at most 4 wheel revolutions (32000 ticks)": ["3 5 32001", "3 -32001 5"],
         "in order": ["4 5 6", "2 5 6"], "pose id, a whole number": ["2.5 5 6"]},
     "ArucoReading.txt": {
-        "pose id from 1 to 4": ["5 40 0 0 0 1 0 0 1 0 1", "0 40 0 0 0 1 0 0 1 0 1"],
+        "pose id, a whole number from 1 to 4": ["5 40 0 0 0 1 0 0 1 0 1", "0 40 0 0 0 1 0 0 1 0 1"],
         "positive definite": [f"1 40 0 0 0 {covariance}" for covariance in (
             "1 1 0 1 0 1", "1e-4 2e-4 0 1e-4 0 1e4", "1 .9 -.9 1 .9 1", "1 9e14 0 1 0 1e-18")]},
     "UwbReading.txt": {

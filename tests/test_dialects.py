@@ -142,13 +142,13 @@ def test_rows_of_measurements_with_nan_or_without_reception_are_left_out(folder,
 BAD_ROWS = {  # a row that cannot be, and what is said of it
     "ArucoReading.txt": [
         ("1 40 0 0 0 1 1 0 1 0 1", "a positive definite covariance"),
-        ("2001 40 0 0 0 1 0 0 1 0 1", "a pose id from 1 to 2000"),
+        ("2001 40 0 0 0 1 0 0 1 0 1", "pose id, a whole number from 1 to 2000"),
         ("1 40 0 inf 0 1 0 0 1 0 1", "y, a finite number from -10000 to 10000 m, found 'inf'"),
         ("1 4.5 0 0 0 1 0 0 1 0 1", "marker id, a whole number")],
     "UwbReading.txt": [
         ("1 5 -5.1 1", "a range that is not below -5 sigma"),
         ("1 5 1 0", "sigma, a finite number from 1e-09 to 10000 m, found '0'"),
-        ("0 5 1 1", "a pose id from 1 to 2000")]}
+        ("0 5 1 1", "pose id, a whole number from 1 to 2000")]}
 
 
 @pytest.mark.parametrize("name, row, said", [
@@ -172,7 +172,7 @@ def test_a_bad_row_costs_a_row_up_to_a_tenth_of_the_file(tmp_path, name, row, sa
 
 def test_lines_are_counted_as_in_the_file_where_rows_were_left_out(folder):  # noqa: F811
     write(folder / "UwbReading.txt", "pose;antenna\n\n1;3;nan;1\n1;3;2,5;1\n9;3;1,5;1\n")
-    assert "UwbReading.txt, line 5: expected a pose id from 1 to 4" in error_of(
+    assert "UwbReading.txt, line 5: expected pose id, a whole number from 1 to 4" in error_of(
         read_dataset, folder)
 
 
@@ -214,7 +214,8 @@ def test_rows_of_a_matrix_are_left_out_too(folder):  # noqa: F811
 
 
 @pytest.mark.parametrize("value, said", [
-    (np.array([[1, 3, 1.5, 0.1], [9, 3, 1.5, 0.1]]), ", row 2: expected a pose id from 1 to 4"),
+    (np.array([[1, 3, 1.5, 0.1], [9, 3, 1.5, 0.1]]), ", row 2: expected pose id, a whole "
+     "number from 1 to 4"),
     (np.ones((2, 3)), ": expected a matrix of real numbers with 4 columns (pose id, antenna id, "
      "range, sigma), found float64 of shape (2, 3)"),
     (np.array([[1, "a"]], dtype=object), ": expected a matrix of real numbers"),
