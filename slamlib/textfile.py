@@ -24,7 +24,10 @@ def error(source, message, line=None):
 
 def quoted(value):
     """The first 60 characters (str) of a value, in quotes."""
-    text = str(value)
+    try:
+        text = str(value)
+    except ValueError:                         # Python writes no integers of thousands of digits
+        return "a far longer number"
     return repr(text if len(text) <= 60 else text[:60] + "...")
 
 

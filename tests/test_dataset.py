@@ -282,7 +282,7 @@ VEHICLE_LINES = {
     "expected an entry such as wheelbase, ": ["wheel_base = 1", "[wheelbases]\nx = 1",
                                               "'wheel' = 1"],
     "a number from 0.001 to 2.5 m for left_radius, found": [f"left_radius = {value}" for value in (
-        "'wide'", "[0.1]", "true", "nan", "inf")]}
+        "'wide'", "[0.1]", "true", "nan", "inf", "0x" + "f" * 5000)]}
 TOML_LINES = ["left_radius = 0,1", "left_radius =", "wheelbase = 0.6", "left_radius = \0 1",
               "left_radius = " + "[" * 5000]
 ENCODER_FILES = [  # text, line, what is said
