@@ -17,9 +17,6 @@ from slamlib.dataset import DatasetError, read_dataset, read_truth  # noqa: E402
 from slamlib.vehicle import changed  # noqa: E402
 
 EXECUTED_NOTEBOOKS = Path("build", "executed")  # folder in which executed notebooks are kept
-# Options of `solve` that replace entries of vehicle.toml.
-VEHICLE_OPTIONS = {"kernel": str, "slip": float, "marker_noise_factor": float,
-                   "range_noise_factor": float}
 # Signals that end a process; Windows has no SIGHUP.
 END_SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP")
                     if hasattr(signal, name))
@@ -29,12 +26,13 @@ def main(arguments=None):
     """Run one command of `arguments` (list of str, or None for the command line's).
 
     Returns the exit code: 0, 1 if a notebook failed, 2 for invalid input, 3 if a problem could not
-    be solved, 128 + n if ended by signal n.
+    be solved, 130 if ended by a signal.
     """
-    ended = [signal.SIGINT]
     if arguments is None:
         sys.stdout.reconfigure(errors="backslashreplace")  # as stderr, for names in other letters
-        _end_as_by_ctrl_c(ended)
+        for each in END_SIGNALS:
+            if signal.getsignal(each) == signal.SIG_DFL:     # nohup's handler stays
+                signal.signal(each, _end_as_by_ctrl_c)
     parser = _parser()
     options, options_of_lab = parser.parse_known_args(arguments)
     if options_of_lab and options.run is not _lab:
@@ -43,30 +41,23 @@ def main(arguments=None):
     try:
         return options.run(options)
     except DatasetError as error:
-        print(f"slamlib: {error}", file=sys.stderr)
-        return 2
+        reason, code = error, 2
     except OSError as error:
-        reason = f"{error.filename}: {error.strerror}" if error.filename else error
-        print(f"slamlib: cannot be read or written: {reason}", file=sys.stderr)
-        return 2
+        place = f"{error.filename}: {error.strerror}" if error.filename else error
+        reason, code = f"cannot be read or written: {place}", 2
     except KeyboardInterrupt:
-        with suppress(OSError):  # the terminal may be gone
-            print(f"slamlib: ended by {ended[-1].name}", file=sys.stderr)
-        return 128 + ended[-1]
+        reason, code = "ended by a signal", 130
+    with suppress(OSError):  # the terminal may be gone
+        print(f"slamlib: {reason}", file=sys.stderr)
+    return code
 
 
-def _end_as_by_ctrl_c(ended):
-    """Let END_SIGNALS end this process as Ctrl-C does; the list `ended` gets the one that came."""
-    def end(number, frame):
-        ended.append(signal.Signals(number))
-        for each in END_SIGNALS:
-            signal.signal(each, signal.SIG_IGN)
-        interrupt = signal.getsignal(signal.SIGINT)  # the event loop's, while notebooks run
-        (interrupt if callable(interrupt) else signal.default_int_handler)(signal.SIGINT, frame)
-
+def _end_as_by_ctrl_c(number, frame):
+    """Let the first of END_SIGNALS do what Ctrl-C does."""
     for each in END_SIGNALS:
-        if signal.getsignal(each) == signal.SIG_DFL:     # nohup's handler stays
-            signal.signal(each, end)
+        signal.signal(each, signal.SIG_IGN)
+    interrupt = signal.getsignal(signal.SIGINT)  # the event loop's, while notebooks run
+    (interrupt if callable(interrupt) else signal.default_int_handler)(signal.SIGINT, frame)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -82,8 +73,7 @@ class _Parser(argparse.ArgumentParser):
 
 def _parser():
     """The parser of the command line; `run` of what it parses is the function of the command."""
-    prog = Path(sys.argv[0]).name
-    whole = _Parser(prog=prog if prog == "slamlib" else "python -m slamlib",
+    whole = _Parser(prog="slamlib",
                     description="Vehicle SLAM from wheel encoders, markers and UWB ranges.")
     whole.add_argument("--version", action="version", version=f"slamlib {__version__}")
     commands = whole.add_subparsers(required=True, metavar="COMMAND")
@@ -93,21 +83,17 @@ def _parser():
         parser.set_defaults(run=run)
         return parser
 
-    report = command("report", _report, "execute the notebooks and build the report")
+    report = command("report", _build, "execute the notebooks and build the report")
     report.path("--report", "folder for the pages", default=Path("report"))
-    _build_options(report)
-    hand_in = command("hand-in", _hand_in,
+    hand_in = command("hand-in", _build,
                       "build the report and put it into a zip, with the result files")
     hand_in.path("--out", "the file to write (default %(default)s)", default=Path("hand-in.zip"))
-    _build_options(hand_in)
+    for parser in (report, hand_in):
+        parser.set_defaults(**{"out": None} if parser is report else {
+            "report": Path("build", "hand-in")})
+        _build_options(parser)
     _solve_options(command("solve", _solve, "solve problems without notebooks"))
     _simulate_options(command("simulate", _simulate, "make a dataset with its truth"))
-    export = command("export", _export, "write results as TUM files or CSV")
-    export.path("results", "a folder of results, of one problem's results, or the folder truth of "
-                "a dataset", metavar="RESULTS")
-    export.add_argument("--format", choices=("tum", "csv"), default="tum", help="tum: trajectories "
-                        "with pose numbers as time stamps; csv: all files, with covariances")
-    export.path("--out", "folder for the files", required=True)
     lab = command("lab", _lab, "open JupyterLab on the notebooks; it is given all other arguments, "
                   "as --no-browser", allow_abbrev=False)
     lab.path("--data", "folder of the datasets", default=Path("data"))
@@ -124,11 +110,6 @@ def _build_options(parser):
                 "there is one, else those of the installation)")
     parser.path("--results", "folder for the .mat files", default=Path("results"))
     parser.add_argument("--jobs", type=int, default=2, help="notebooks executed at a time")
-    parser.add_argument("--code", choices=("none", "method", "all"), help="the code that is shown, "
-                        "as in report.toml")
-    parser.add_argument("--appendix", action=argparse.BooleanOptionalAction,
-                        help="show the notebooks whose title begins with a letter, or leave them "
-                             "out (the report has them, the hand-in has not)")
     parser.add_argument("--fresh", action="store_true",
                         help="execute all notebooks and studies, also where nothing changed")
 
@@ -142,12 +123,13 @@ def _solve_options(parser):
                         choices=("1", "2", "2_hint", "2_fused", "3", "4"),
                         help="one of %(choices)s, of which 2 is markers alone; may be repeated "
                              "(default: all); 4 starts from 3 where both are solved")
-    for name, kind in VEHICLE_OPTIONS.items():
-        parser.add_argument(f"--{name.replace('_', '-')}", type=kind, metavar=kind.__name__.upper(),
+    for name, kind in (("kernel", str), ("slip", float)):
+        parser.add_argument(f"--{name}", type=kind, metavar=name.upper(),
                             help="instead of that of vehicle.toml")
     parser.path("--plot", "write a picture of map and errors: a .png, .pdf or .svg file",
                 metavar="FILE")
-    parser.add_argument("--csv", action="store_true", help="write each .mat file as CSV, too")
+    parser.add_argument("--csv", action="store_true", help="write poses and maps as text, too: CSV "
+                        "with covariances, and trajectories as TUM files for evo")
 
 
 def _simulate_options(parser):
@@ -165,46 +147,25 @@ def _simulate_options(parser):
                             help=help)
 
 
-def _given(options, *names):
-    """Options of the command line (dict by name) that were given."""
-    return {name: value for name in names if (value := getattr(options, name)) is not None}
-
-
-def _report(options):
-    return _build(options, _shown(options), options.report, _selected_datasets(options),
-                  lambda report: f"report: {report.files[0]} and {report.files[-1]}")
-
-
-def _hand_in(options):
-    from slamlib.report import handin
-    if options.out.is_dir():
-        raise DatasetError(f"{options.out}: expected the name of a file to write, found a folder")
-    shown = handin.hand_in_options(_shown(options))
-    datasets, omitted = handin.selection(options.data, _selected_datasets(options))
-
-    def finish(report):
-        handin.write_zip(options.out, report, options.results, shown, omitted)
-        return f"hand-in: {options.out.resolve()}"
-    return _build(options, shown, Path("build", "hand-in"), datasets, finish)
-
-
-def _shown(options):
-    """The Options of report.toml; those of the command line replace them."""
-    from slamlib.report.notebooks import read_options
-    return replace(read_options("report.toml"), **_given(options, "code", "appendix"))
-
-
-def _build(options, shown, folder, datasets, finish):
-    """Build a Report into a folder and print doubts and finish(Report); return the exit code."""
-    from slamlib.report import NotebookError, build_report
-    from slamlib.report.notebooks import notebooks_folder
+def _build(options):
+    """Build the report, and write the zip to hand in where `options.out` is its Path."""
+    from slamlib.report import NotebookError, build_report, handin
+    from slamlib.report.notebooks import notebooks_folder, read_options
+    shown, omitted = read_options("report.toml"), ()
     notebooks = options.notebooks or notebooks_folder()
-    for out in (folder, options.results):
-        _require_elsewhere(out, options.data, notebooks)
+    datasets = [Path(each).name if Path(each).resolve().parent == options.data.resolve() else each
+                for each in options.datasets] or None            # names, or paths in data/
+    for folder in (options.report, options.results):
+        _require_elsewhere(folder, options.data, notebooks)
+    if options.out:
+        if options.out.is_dir():
+            raise DatasetError(f"{options.out}: expected a file to write, found a folder")
+        shown = handin.hand_in_options(shown)
+        datasets, omitted = handin.selection(options.data, datasets)
     try:
         report = build_report(
-            notebooks, options.data, folder, options.results, datasets=datasets, options=shown,
-            jobs=options.jobs, kept=EXECUTED_NOTEBOOKS, fresh=options.fresh)
+            notebooks, options.data, options.report, options.results, datasets=datasets,
+            options=shown, jobs=options.jobs, kept=EXECUTED_NOTEBOOKS, fresh=options.fresh)
     except NotebookError as error:
         print(f"slamlib: {error}", file=sys.stderr)
         return 1
@@ -213,7 +174,11 @@ def _build(options, shown, folder, datasets, finish):
     for drive in report.drives:
         for doubt in drive.doubts:
             print(f"{drive.name}: doubt ({doubt.what}): {doubt.sentence}", file=sys.stderr)
-    print(finish(report), file=sys.stderr)
+    if options.out:
+        handin.write_zip(options.out, report, options.results, shown, omitted)
+        print(f"hand-in: {options.out.resolve()}", file=sys.stderr)
+    else:
+        print(f"report: {report.files[0]} and {report.files[-1]}", file=sys.stderr)
     return _exit_code([(drive.name, failure.problem, failure.reason)
                        for drive in report.drives for failure in drive.failures])
 
@@ -223,12 +188,6 @@ def _exit_code(failures):
     for dataset, problem, reason in failures:
         print(f"slamlib: {dataset}: {problem} could not be solved: {reason}", file=sys.stderr)
     return 3 if failures else 0
-
-
-def _selected_datasets(options):
-    """Names (list of str) of the datasets, given by names or paths of folders in data/, or None."""
-    return [Path(each).name if Path(each).resolve().parent == options.data.resolve() else each
-            for each in options.datasets] or None
 
 
 def _require_elsewhere(out, *folders):
@@ -247,8 +206,9 @@ def _solve(options):
     if options.plot and options.plot.suffix.lower() not in (".png", ".pdf", ".svg"):
         raise DatasetError(f"{options.plot}: expected a picture .png, .pdf or .svg")
     dataset, truth = read_dataset(options.folder), read_truth(options.folder)
-    dataset = replace(dataset, vehicle=changed(
-        dataset.vehicle, _given(options, *VEHICLE_OPTIONS), "slamlib solve"))
+    given = {name: value for name in ("kernel", "slip")
+             if (value := getattr(options, name)) is not None}
+    dataset = replace(dataset, vehicle=changed(dataset.vehicle, given, "slamlib solve"))
     problems = sorted(f"problem{each}" for each in options.problem) or [*PROBLEMS]
     for each in problems if options.problem else ():
         if not allows(dataset, each):
@@ -277,13 +237,6 @@ def _lab(options):
     from slamlib.report.notebooks import notebooks_folder
     start_lab(options.notebooks or notebooks_folder(), options.data, EXECUTED_NOTEBOOKS,
               options.others)
-
-
-def _export(options):
-    from slamlib.export import export_results
-    for path in export_results(options.results, options.format, options.out):
-        print(path)
-    return 0
 
 
 if __name__ == "__main__":

@@ -27,7 +27,6 @@ MIN_EIGENVALUE = 1e-12  # of a correlation matrix; with a smaller one it counts 
 MAX_NEGATIVE_SIGMAS = 5.0  # sigmas, by which noise may make a range negative
 TABLE_2 = Vehicle()  # the assignment's nominal vehicle
 MAX_BAD_SHARE = 0.1  # of the rows of a sensor, which are left out; with more a file is refused
-MIN_EXCHANGED = 10  # ids in column 2 with which columns may look exchanged
 
 
 class _Readings:
@@ -104,7 +103,7 @@ class Dataset:
         ticks = matrix("ticks", ticks, list(LIMITS[ENCODER])[1:])
         ticks = np.column_stack([np.arange(1, len(ticks) + 1), ticks])
         arguments = {"ticks": ticks, "aruco": aruco, "uwb": uwb, "guess": guess}
-        files = {file: Variable(None, key, value)
+        files = {file: Variable(key, value, exact=True)
                  for file, (key, value) in zip(TABLES, arguments.items()) if value is not None}
         return _dataset(files, changed(TABLE_2, stated, "vehicle"), name)
 
@@ -161,7 +160,7 @@ def dataset_names(data, names=None):
     names = found if names is None else list(names)
     for name in names:
         _require((data / name).is_dir(), data, f"one of {', '.join(found)}", name)
-        contents(data / name)[ENCODER]                     # which raises DatasetError
+        contents(data / name, required=ENCODER)
     return names
 
 
@@ -177,19 +176,16 @@ def read_dataset(folder):
     >>> len(dataset.ticks), len(dataset.aruco.pose), dataset.antenna_guess.antenna.tolist()
     (2000, 894, [5, 13, 36, 46])
     """
-    files = contents(folder)
+    files, notes = contents(folder, required=ENCODER)
     vehicle = read_vehicle(files.get("vehicle.toml"), default=TABLE_2)
-    return _dataset(files, vehicle, Path(abspath(folder)).name, files.notes)
+    return _dataset(files, vehicle, Path(abspath(folder)).name, notes)
 
 
 def _dataset(files, vehicle, name, notes=()):
     """The Dataset of this name by its Vehicle and the sources (dict) of its tables by name."""
-    encoder_notes, ticks = incremental_counts(_read_all_poses(files, ENCODER), vehicle)
-    for key in ("sighting_lag", "range_lag"):
-        if abs(getattr(vehicle, key)) >= len(ticks) > 1:
-            raise error(files.get("vehicle.toml", "vehicle"), f"expected a {key} below the number "
-                        f"of poses ({len(ticks)}) in size, found {getattr(vehicle, key):g}")
-    notes = [*notes, *encoder_notes]
+    encoders = _read_all_poses(files, ENCODER)
+    ticks = incremental_counts(encoders, vehicle)
+    notes = [*notes, *encoders.notes]
     aruco = _read_aruco(files, len(ticks), notes)
     uwb, guess = _read_uwb(files, len(ticks), notes)
     return Dataset(name=name, vehicle=vehicle, ticks=ticks, aruco=aruco, uwb=uwb,
@@ -204,13 +200,13 @@ def read_truth(folder):
     so. Raises DatasetError if a file does not have the format or the number of poses is not that of
     the drive.
     """
-    drive = contents(folder)
+    drive, _ = contents(folder, required=ENCODER)
     if "truth" not in drive:
         return None
-    files = contents(drive["truth"], TRUTH_FILES)
+    files, notes = contents(drive["truth"], TRUTH_FILES, required="vehiclePose.txt")
     pose_count = len(_read_all_poses(drive, ENCODER).numbers)
     table = _read_all_poses(files, "vehiclePose.txt")
-    poses, notes = table.numbers[:, 1:], [*files.notes, *table.notes]
+    poses, notes = table.numbers[:, 1:], [*notes, *table.notes]
     if len(poses) != pose_count:
         raise error(table.source, f"expected {pose_count} poses (encoder file), found {len(poses)}")
     marker, marker_in_world = _read_map(files, "ArucoMap.txt", notes)
@@ -239,9 +235,9 @@ def _read_all_poses(files, name):
     return table.kept(table.numbers[:, 0] == ids, "pose ids 1, 2, 3, ... in order")
 
 
-def _read_map(files, name, notes, optional=None):
+def _read_map(files, name, notes):
     """Landmark ids (k,), ascending, and the further columns (k, c - 1)."""
-    table = read_table(files.get(name), name, optional=optional)
+    table = read_table(files.get(name), name)
     notes += table.notes
     ids, first_row = np.unique(table.numbers[:, 0], return_index=True)
     table.kept(np.isin(np.arange(len(table.numbers)), first_row), "each id only once")
@@ -250,7 +246,7 @@ def _read_map(files, name, notes, optional=None):
 
 def _read_aruco(files, pose_count, notes):
     """The ArucoReadings, or None without rows."""
-    table = _read_sensor(files, "ArucoReading.txt", pose_count)
+    table = read_table(files.get("ArucoReading.txt"), "ArucoReading.txt", MAX_BAD_SHARE, pose_count)
     # Scaled to correlations: s_thetatheta may be 1e4 rad^2 where s_xx is 1e-4 m^2.
     smallest = np.linalg.eigvalsh(se2.correlations(_covariances(table.numbers)))[:, 0]
     table = table.kept(smallest > MIN_EIGENVALUE, "a positive definite covariance (smallest "
@@ -268,31 +264,15 @@ def _covariances(rows):
 
 def _read_uwb(files, pose_count, notes):
     """The UwbReadings, or None without rows, and the AntennaGuess, which has all of their ids."""
-    table = _read_sensor(files, "UwbReading.txt", pose_count)
+    table = read_table(files.get("UwbReading.txt"), "UwbReading.txt", MAX_BAD_SHARE, pose_count)
     table = table.kept(table.numbers[:, 2] >= -MAX_NEGATIVE_SIGMAS * table.numbers[:, 3],
                        f"a range that is not below -{MAX_NEGATIVE_SIGMAS:g} sigma", MAX_BAD_SHARE)
     notes += table.notes
-    guess = AntennaGuess(*_read_map(files, "UwbAntennaGuess.txt", notes, optional="z"))
+    guess = AntennaGuess(*_read_map(files, "UwbAntennaGuess.txt", notes))
     table.kept(np.isin(table.numbers[:, 1], guess.antenna), "an antenna id that the guesses have: "
                "UwbAntennaGuess.txt in the same folder, or guess")
     pose, antenna, rows = _in_order(table.numbers)
     return UwbReadings(pose, antenna, *rows[:, 2:].T) if len(rows) else None, guess
-
-
-def _read_sensor(files, name, pose_count):
-    """The Table of a sensor, with pose ids of the drive."""
-    table = read_table(files.get(name), name, MAX_BAD_SHARE)
-    pose, landmark = table.numbers[:, :2].T
-    # Ids in column 2 ascend over most of the drive; those in column 1 do not, are fewer, and cover
-    # less than half of it.
-    if (len(pose) >= MIN_EXCHANGED and (np.diff(landmark) >= 0).all() and landmark[0] >= 1
-            and landmark[-1] <= pose_count and not (np.diff(pose) >= 0).all()
-            and np.ptp(landmark) > pose_count / 2 > np.ptp(pose)
-            and len(np.unique(landmark)) >= max(len(np.unique(pose)) + 1, MIN_EXCHANGED)):
-        raise error(table.source, f"expected the columns ({', '.join(LIMITS[name])}), but columns "
-                    "1 and 2 look exchanged: column 2 has the pose ids of a drive")
-    return table.kept((1 <= pose) & (pose <= pose_count), f"a pose id from 1 to {pose_count}",
-                      MAX_BAD_SHARE)
 
 
 def _in_order(rows):

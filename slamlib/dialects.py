@@ -1,7 +1,7 @@
 """Tables of numbers, from text as editors, spreadsheets and MATLAB write it, and from arrays.
 
 Plain text has blanks or tabs between columns, decimal points, and comments that begin with `#`, `%`
-or `//`. Other separators, decimal commas and a header are read with a note. The limits of the
+or X The limits of the
 numbers are far wider than vehicles, cameras and antennas need: a number beyond them has another
 unit, or float64 loses digits beside it. data/README.md lists them.
 """
@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slamlib.folder import Variable
+from slamlib.folder import ENCODER, Variable
 from slamlib.textfile import error, quoted, read_text
 
 
@@ -49,29 +49,23 @@ LIMITS = {
     "ArucoMap.txt": {"marker id": _WHOLE, "x": _TRUE, "y": _TRUE, "theta": _TRUE_ANGLE},
     "UwbMap.txt": {"antenna id": _WHOLE, "x": _TRUE, "y": _TRUE}}
 
-COMMENTS = "#", "%", "//"
-BLANKS = " \t\v\f"
-SEPARATORS = {";": "semicolons", ",": "commas", None: "blanks or tabs"}
-EMPTY_CELL = re.compile(rf"(?:^|(?<=[;,]))[{BLANKS}]*(?=[;,]|$)", re.MULTILINE)
-NUMBER = re.compile(r"([+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf(inity)?))?", re.IGNORECASE)
+COMMENT_OR_QUOTE = re.compile(r'(#|%|//).*|"')
+EMPTY_CELL = re.compile(r"(?:^|(?<=[;,]))[^\S\n]*(?=[;,]|$)", re.MULTILINE)
 NUMBER_FIRST = re.compile(r"(^|[\s,;])\W*(\d|nan\b|inf)", re.IGNORECASE)  # in a row, not a header
 POINT_OR_LOOSE_COMMA = re.compile(r"\.|(?<!\d),|,(?!\d)")  # where commas are no decimal commas
-# Words of headers that name a column; others are the ends of the columns' own names, as "xx".
-HEADER_WORDS = {"pose id": "pose posa step", "marker id": "marker aruco tag landmark",
-                "antenna id": "antenna anchor beacon landmark",
-                "right ticks": "right destra dx r", "left ticks": "left sinistra sx l",
-                "theta": "theta delta heading yaw", "range": "range distance", "sigma": "sigma std"}
+# Words of headers for two columns, in the order of the file.
+HEADER_ORDER = {ENCODER: (r"right|dx|destra|r\b", r"left|sx|sinistra|l\b"),
+                "ArucoReading.txt": ("pos[ea]", "marker|aruco|tag|landmark"),
+                "UwbReading.txt": ("pos[ea]", "antenna|anchor|beacon|landmark")}
 
 
 @dataclass(frozen=True)
 class Table:
-    """The numbers of a table, with its rows for messages."""
+    """The numbers of a table, with the lines of its rows for messages."""
 
     source: Path | Variable | None  # None if there is no file
     numbers: np.ndarray  # (m, c)
-    rows: list | np.ndarray = ()  # (m,) str, or (m, c) of a Variable
-    lines: list | np.ndarray = ()  # (m,) of the rows in the file, from 1
-    separator: str | None = None  # of the rows' words
+    lines: np.ndarray = ()  # (m,) of the rows in the file, from 1
     notes: tuple[str, ...] = ()  # sentences on what was mended or left out
 
     def noted(self, note):
@@ -85,51 +79,42 @@ class Table:
     def kept(self, ok, expected, share=0.0):
         """The Table of the rows where `ok` is True, with a note on the others.
 
-        `ok` (m,) or (m, c) is bool; the latter tells the word to quote, and `expected` (str) may be
-        one for each column. Raises DatasetError for the first of the others if they are more than a
-        share of the rows, or those of an argument.
+        `ok` (m,) or (m, c) is bool; the latter tells the number to quote, and `expected` (str) may
+        be one for each column. Raises DatasetError for the first of the others if they are more
+        than a share of the rows, or of an exact Variable.
         """
         if ok.all():
             return self
         bad = ~ok.reshape(len(ok), -1).all(axis=1)
         count, first = np.count_nonzero(bad), int(np.argmax(bad))
-        row, place = self.rows[first], self.place(first)
-        words = row.split(self.separator) if isinstance(row, str) else map(repr, row.tolist())
-        words = [word.strip() for word in words]
         column = int(np.argmin(ok[first])) if ok.ndim == 2 else slice(None)
         expected = expected if isinstance(expected, str) else expected[column]
-        found = quoted(" ".join(np.atleast_1d(words[column])))
-        if count > share * len(bad) or getattr(self.source, "path", self) is None:
-            raise error(self.source, f"expected {expected}, found {found}", place)
-        kept = replace(self, numbers=self.numbers[~bad], lines=np.array(self.lines)[~bad],
-                       rows=np.array(self.rows, dtype=object)[~bad])
-        return kept.noted(f": {count} of {len(bad)} rows left out, the first in {place}: expected "
-                          f"{expected}, found {found}")
+        found = " ".join(f"{x:.12g}" for x in np.atleast_1d(self.numbers[first, column]))
+        said, place = f"expected {expected}, found '{found}'", self.place(first)
+        if count > share * len(bad) or getattr(self.source, "exact", False):
+            raise error(self.source, said, place)
+        kept = replace(self, numbers=self.numbers[~bad], lines=self.lines[~bad])
+        return kept.noted(f": {count} of {len(bad)} rows left out, the first in {place}: {said}")
 
 
-def read_table(source, name, share=0.0, optional=None):
+def read_table(source, name, share=0.0, pose_count=None):
     """The Table of a text file (Path), a Variable, or None, which has no rows.
 
-    The columns are those of LIMITS[name]. One more last column, called `optional`, is left out with
-    a note. A share of the rows may be beyond LIMITS, and if it is not 0, any may have NaN. Raises
-    DatasetError if there are more, a row has another number of columns or a word that is not a
-    number, or a header names the columns in another order.
+    The columns are those of LIMITS[name]. A share of the rows may be beyond LIMITS, or have pose
+    ids beyond `pose_count`, and if it is not 0, any may have NaN. Raises DatasetError if there are
+    more, a row has other than a number for each column, or a header names the columns in another
+    order.
     """
-    limits, columns = LIMITS[name], list(LIMITS[name])
+    limits, columns = dict(LIMITS[name]), list(LIMITS[name])
+    if pose_count is not None:
+        limits["pose id"] = Limit(1, pose_count, whole=True)
     if source is None:
         return Table(source=source, numbers=np.empty((0, len(columns))))
     if isinstance(source, Variable):
-        rows = matrix(source, source.value, columns, optional)
-        table = Table(source=source, numbers=rows.astype(float), rows=rows,
-                      lines=range(1, len(rows) + 1))
+        rows = matrix(source, source.value, columns)
+        table = Table(source=source, numbers=rows, lines=np.arange(1, len(rows) + 1))
     else:
-        table = _table_of_text(source, columns, optional)
-    if not len(table.numbers):
-        return table.noted(" holds no rows")
-    if table.numbers.shape[1] > len(columns):
-        table = table.noted(f": the last of {len(columns) + 1} columns was taken as {optional} and "
-                            "left out; positions and ranges are taken in the plane")
-        table = replace(table, numbers=table.numbers[:, :-1])
+        table = _table_of_text(source, name)
     if share:
         table = table.kept(~np.isnan(table.numbers), [f"{each}, a number" for each in columns], 1)
     if "range" in limits:
@@ -141,85 +126,64 @@ def read_table(source, name, share=0.0, optional=None):
         for column, limit in limits.items()], share)
 
 
-def matrix(source, value, columns, optional=None):
-    """The array (m, c) of a `value` with these columns; m = 0 if it is empty.
+def matrix(source, value, columns):
+    """The array (m, c) of float of a `value` with these columns; m = 0 if it is empty.
 
     Raises DatasetError for another shape and if it holds no real numbers.
     """
     try:
-        array = np.asarray(value)
-    except ValueError:                                       # rows of different lengths
+        array = np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
         array = np.asarray(value, dtype=object)
     if array.size == 0:
         return np.empty((0, len(columns)))
-    if array.dtype.kind not in "iuf" or array.ndim != 2 \
-            or array.shape[1] - len(columns) not in (0, bool(optional)):
+    if array.dtype == object or array.ndim != 2 or array.shape[1] != len(columns):
         raise error(source, f"expected a matrix of real numbers with {len(columns)} columns "
                     f"({', '.join(columns)}), found {array.dtype} of shape {array.shape}")
     return array
 
 
-def _table_of_text(source, columns, optional):
+def _table_of_text(source, name):
     """The Table of a text file, with NaN for empty cells."""
-    text, encoding = read_text(source)
+    columns = list(LIMITS[name])
     table = Table(source=source, numbers=np.empty((0, len(columns))))
-    table = table.noted(f" was read as {encoding} text") if encoding else table
-    text = text.replace('"', "").replace("(ind)", "").replace("(snan)", "")    # nan(ind)
-    for mark in COMMENTS:
-        text = re.sub(f"{mark}.*", "", text) if mark in text else text
-    rows = text.rstrip().split("\n")
-    lines = [k for k, row in enumerate(rows, start=1) if row.strip(BLANKS + ",;")]
+    rows = COMMENT_OR_QUOTE.sub("", read_text(source)).split("\n")
+    lines = [k for k, row in enumerate(rows, start=1) if row.strip(",; \t").strip()]
     header = rows[lines[0] - 1].strip() if lines else ""
     if re.search("[A-Za-z]", header) and not NUMBER_FIRST.search(header):
-        _require_order(source, header, lines.pop(0), columns)
-        table = table.noted(f": the header {ascii(header[:60])} was left out")
+        found = [re.search(words, header, re.I) for words in HEADER_ORDER.get(name, ())]
+        if found and all(found) and found[1].start() < found[0].start():
+            raise error(source, f"expected the columns in the order ({', '.join(columns)}), found "
+                        f"the header {quoted(header)}", lines[0])
+        table = table.noted(f": the header {quoted(header)} was left out")
+        del lines[0]
     if not lines:
         return table
-    rows = [rows[k - 1] for k in lines] if len(lines) < len(rows) else rows
+    rows = [rows[k - 1].strip() for k in lines]
     for end in ",;":                                # an empty last cell in every row
-        if all(row.rstrip().endswith(end) for row in rows):
-            rows = [row.rstrip().removesuffix(end) for row in rows]
-    first, body = rows[0], "\n".join(rows) if "," in text or ";" in text else ""
+        if all(row.endswith(end) for row in rows):
+            rows = [row[:-1] for row in rows]
+    first, body = rows[0], "\n".join(rows)
     # Blanks inside of a cell mean that commas are no separators.
     separator = ";" if ";" in first else "," if "," in first and not any(
         len(cell.split()) > 1 for cell in first.split(",")) else None
-    decimals = separator != "," and "," in body and not POINT_OR_LOOSE_COMMA.search(body)
-    if separator or decimals:
-        table = table.noted(f" was read with columns separated by {SEPARATORS[separator]}"
-                            f"{', with decimal commas' * decimals}")
-    if optional and len(first.split(separator)) == len(columns) + 1:
-        columns = [*columns, optional]
-    plain = rows
-    if separator or decimals:
-        body = body.replace(",", ".") if decimals else body
-        plain = (EMPTY_CELL.sub("nan", body) if separator else body).split("\n")
+    if separator != "," and "," in body and not POINT_OR_LOOSE_COMMA.search(body):
+        table, body = table.noted(" was read with decimal commas"), body.replace(",", ".")
+    if separator:
+        body = EMPTY_CELL.sub("nan", body)
+    rows = body.split("\n")
+    numbers = _numbers(rows, separator)
+    if np.shape(numbers) != (len(rows), len(columns)):
+        k = next(k for k, row in enumerate(rows)
+                 if np.shape(_numbers([row], separator)) != (1, len(columns)))
+        raise error(source, f"expected {len(columns)} numbers ({', '.join(columns)}), found "
+                    f"{quoted(rows[k])}", lines[k])
+    return replace(table, numbers=numbers, lines=np.array(lines))
+
+
+def _numbers(rows, separator):
+    """The numbers (m, c) in rows of text, or None if there are words, or c differs."""
     try:
-        numbers = np.loadtxt(plain, delimiter=separator, comments=None, ndmin=2)
+        return np.loadtxt(rows, delimiter=separator, comments=None, ndmin=2)
     except ValueError:
-        numbers = np.empty((0, 0))
-    if numbers.shape[1] != len(columns):
-        cells = (row.split(separator) for row in rows)
-        raise _fault(source, zip(lines, cells), columns, decimals)
-    return replace(table, numbers=numbers, rows=rows, lines=lines, separator=separator)
-
-
-def _fault(source, rows, columns, decimals):
-    """DatasetError about the first of the rows (line, cells) without a number for each column."""
-    for line, cells in rows:
-        if len(cells) != len(columns):
-            return error(source, f"expected {len(columns)} columns ({', '.join(columns)}), found "
-                         f"{len(cells)}", line)
-        for cell in map(str.strip, cells):
-            if not NUMBER.fullmatch(cell.replace(",", ".") if decimals else cell):
-                return error(source, f"expected finite numbers, found {quoted(cell)}", line)
-    return error(source, "expected rows of numbers")    # unless numpy and NUMBER agree
-
-
-def _require_order(source, header, line, columns):
-    """Raise DatasetError if a header names columns in another order."""
-    words = [HEADER_WORDS.get(column, column.rpartition("_")[2]).split() for column in columns]
-    parts = re.findall("[A-Z]?[a-z]+|[A-Z]+", header)       # `ticksLeft`, `tick_sx` and `nL`
-    named = [k for part in parts for k, names in enumerate(words) if part.lower() in names]
-    if (order := list(dict.fromkeys(named))) != sorted(order):
-        raise error(source, f"expected the columns in the order ({', '.join(columns)}), found the "
-                    f"header {quoted(header)}", line)
+        return None

@@ -1,18 +1,17 @@
-"""Finds the files of a dataset in its folder: each file is read, named in a note, or refused.
+"""Finds the files of a dataset in its folder: each file is read, listed as not read, or refused.
 
-A file is read under its name as browsers, editors and Windows leave it, as `ArucoReading (1).txt`
-or `ArucoReading.txt.txt`, and a note says so. Other names are not guessed. The matrices of .mat
-files stand in for text files that are missing.
+A file is read under its name as browsers and Windows leave it, as `ArucoReading (1).txt` or
+`ArucoReading.txt.txt`, and a note says so. Other names are not guessed. The matrices of .mat files
+stand in for text files that are missing.
 """
 
 import re
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 
 from scipy.io import loadmat
 
-from slamlib.textfile import DatasetError, error, read_bytes
+from slamlib.textfile import DatasetError, error, quoted
 
 ENCODER = "encoderReading.txt"
 # Names of the tables, of all files of a dataset, and of those in its folder `truth`.
@@ -21,83 +20,63 @@ DATASET_FILES = (*TABLES, "vehicle.toml", "truth")
 TRUTH_FILES = ("vehiclePose.txt", "ArucoMap.txt", "UwbMap.txt", "vehicle.toml")
 # Names of files that systems put into folders; clouds leave hidden ones in place of files.
 SYSTEM_FILES = re.compile(r"\..*(?<!\.icloud)|thumbs\.db|desktop\.ini|__macosx", re.IGNORECASE)
-# What browsers, editors and file managers add to a name.
-COPY = r"( ?\(\d+\)|[ _-]+cop(y|ia)( ?\(\d+\)| \d+)?)*"
+# What browsers and Windows add to a name, and endings by that of the format.
+COPY = r"( - copy)?( ?\(\d+\))?"
+ENDINGS = {".txt": rf"{COPY}(\.(txt|csv|tsv|dat))*", ".toml": rf"{COPY}\.toml(\.txt)?", "": ""}
 MAX_LISTED_NAMES = 5  # file names in one sentence
 
 
 @dataclass(frozen=True)
 class Variable:
-    """A table in a .mat file, or an argument of `Dataset.from_arrays`."""
+    """A matrix in place of a text file."""
 
-    path: Path | None  # None of an argument
-    name: str
-    value: object  # what scipy made of it, or the user
+    name: str  # in messages
+    value: object
+    exact: bool = False  # True for an argument of `Dataset.from_arrays`: no row may be left out
 
     def __str__(self):
-        return f"{self.path}, variable {self.name}" if self.path else self.name
+        return self.name
 
 
-class Contents(dict):
-    """Sources (Path or Variable) of a dataset's files by name; DatasetError if one is missing.
+def contents(folder, expected=DATASET_FILES, required=None):
+    """Sources (dict of Path or Variable) of the files of a folder by name, and notes (list of str).
 
-    `notes` are on names of copies, and on files that are not read.
-    """
-
-    def __init__(self, folder, files, notes):
-        super().__init__(files)
-        self.folder, self.notes = folder, notes
-
-    def __missing__(self, name):
-        unread = "".join(f" ({note})" for note in self.notes if "ot read" in note)
-        raise error(self.folder / name, f"expected this file, found none{unread}")
-
-
-def contents(folder, expected=DATASET_FILES):
-    """The Contents of a folder (Path) with files of the names `expected`, in any case of letters.
-
-    If the folder holds none of these, they may be in one of its sub-folders. Raises DatasetError if
-    two files that differ have a name, or the folder cannot be read.
+    Raises DatasetError if the folder cannot be read, the file `required` is missing, or two files
+    have one of the names `expected`.
     """
     folder, files, notes = Path(folder), {}, []
     rest = _listed(folder)
     for name in expected:
-        same = sorted((path for path in rest if _is_named(path, name)),     # the name itself first
-                      key=lambda path: path.name.lower() != name.lower())
+        same = [path for path in rest if _is_named(path, name)]
         rest = [path for path in rest if path not in same]
-        for other in same[1:]:
-            if read_bytes(other) != read_bytes(same[0]):
-                raise error(folder / name, f"expected one file of this name, found {same[0].name} "
-                            f"and {other.name}, which differ: move one of them away")
-            notes.append(f"{other.name} is not read: it is a copy of {same[0].name}.")
+        if len(same) > 1:
+            raise error(folder / name, f"expected one file of this name, found {same[0].name} and "
+                        f"{same[1].name}: move one of them away")
         if same:
             files[name] = same[0]
-            if same[0].name.lower() != name.lower():
-                notes.append(f"{same[0].name} was read as {name}.")
+        if same and same[0].name.lower() != name.lower():
+            notes.append(f"{same[0].name} was read as {name}.")
     if expected is DATASET_FILES:
-        notes += _add_variables(files, rest)
-        deeper = [path for path in rest if path.is_dir()
-                  and any(_is_named(inner, ENCODER) for inner in path.glob("*"))]
-        if len(deeper) == 1 and not files:
-            inner, rest = contents(deeper[0]), [path for path in rest if path != deeper[0]]
-            notes.append(f"The files were read from the sub-folder {_shown(deeper[0].name)}.")
-            folder, files, notes = inner.folder, inner, [*notes, *inner.notes]
-    return Contents(folder, files, (*notes, *_not_read([path.name for path in rest])))
+        rest = _add_variables(files, rest, notes)
+    unread = _not_read(rest)
+    if required and required not in files:
+        raise error(folder / required, f"expected this file, found none. {unread}".rstrip(". "))
+    return files, notes + [unread] * bool(unread)
 
 
 def is_dataset(folder):
-    """True if a folder (Path) or one of its sub-folders holds files of a dataset."""
+    """True if a folder (Path) holds files of a dataset."""
     try:
-        return bool(contents(folder))
+        return bool(contents(folder)[0])
     except DatasetError:
         return True
 
 
 def left_in(data):
     """Sentences (list of str) on what in the folder of all datasets (Path) is no dataset."""
-    return [f"{data}: {sentence}" for sentence in _not_read(
-        [path.name for path in _listed(data) if path.name != "README.md"
-         and not (path.is_dir() and is_dataset(path))])]
+    unread = _not_read([path for path in _listed(data) if path.name != "README.md"
+                        and not (path.is_dir() and is_dataset(path))])
+    return [f"{data}: {unread}"] * bool(unread)
 
 
 def _listed(folder):
@@ -110,59 +89,35 @@ def _listed(folder):
 
 
 def _is_named(path, name):
-    """True if a file (Path) has this name, apart from case and what a program adds to it."""
-    stem, ends = name.partition(".")[::2]
-    ends = rf"{COPY}\.toml(\.txt)?" if ends == "toml" else rf"(\.(txt|csv|tsv|dat)|{COPY})*"
-    return path.name.lower() == name.lower() or "." in name and not path.is_dir() and bool(
-        re.fullmatch(rf"((copy of|copia di) )?{stem}{ends}", path.name, re.IGNORECASE))
+    """True if a file (Path) has this name, apart from case and ENDINGS."""
+    pattern = Path(name).stem + ENDINGS[Path(name).suffix]
+    return bool(re.fullmatch(pattern, path.name, re.IGNORECASE)) and (
+        name == "truth" or not path.is_dir())
 
 
-def _add_variables(files, rest):
-    """Notes (list of str) on .mat files among the paths `rest`, which are removed from it.
+def _add_variables(files, rest, notes):
+    """The paths `rest` without .mat files that are read.
 
-    Variables with the names of missing TABLES are added to `files`.
+    Their variables with the names of missing TABLES are added to `files`, with `notes`.
     """
-    notes, missing = [], {Path(name).stem.lower(): name for name in TABLES if name not in files}
-    for path in [path for path in rest if missing and path.suffix.lower() == ".mat"]:
-        rest.remove(path)
+    missing, unread = {Path(name).stem.lower(): name for name in TABLES if name not in files}, []
+    for path in rest:
         try:
-            variables = _variables(path)
-        except DatasetError as failure:
-            notes.append(f"{path.name} is not read{str(failure).removeprefix(str(path))}.")
-            continue
-        unread = []
-        for each in variables:
-            alone = len(variables) == 1 and each.name.lower() not in missing
-            name = missing.get((path.stem if alone else each.name).lower())
+            variables = loadmat(path) if missing and path.suffix.lower() == ".mat" else {}
+        except Exception:           # scipy raises many kinds about other versions and bytes
+            variables = {}
+        found = {missing[key.lower()]: key for key in variables if key.lower() in missing}
+        for name, key in found.items():
             if name in files:
-                raise error(path, f"expected one table {Path(name).stem}, found it in "
-                            f"{files[name].name} of {files[name].path.name} and in {each.name}")
-            if name:
-                files[name] = each
-                notes.append(f"Variable {each.name} of {path.name} was read as {name}.")
-            else:
-                unread.append(f"{each.name} of {path.name}")
-        notes += _not_read(unread, " variables")
-    return notes
+                raise error(path, f"expected one variable {key}, found another in {files[name]}")
+            files[name] = Variable(f"{path}, variable {key}", variables[key])
+            notes.append(f"Variable {key} of {path.name} was read as {name}.")
+        unread += [path] * (not found)
+    return unread
 
 
-def _variables(path):
-    """The Variables (list) of a .mat file of the versions 5 to 7; DatasetError for others."""
-    data = read_bytes(path)
-    try:
-        found = loadmat(BytesIO(data))
-    except Exception:                   # scipy raises many kinds about other versions and bytes
-        raise error(path, "expected a .mat file of version 7 or older, saved with '-v7'") from None
-    return [Variable(path, name, value) for name, value in found.items() if name[:2] != "__"]
-
-
-def _not_read(names, kind=""):
-    """A sentence (list of one or no str) with the first MAX_LISTED_NAMES, and how many more."""
-    listed = ", ".join(map(_shown, names[:MAX_LISTED_NAMES]))
-    more = f" and {len(names) - MAX_LISTED_NAMES} more" * (len(names) > MAX_LISTED_NAMES)
-    return [f"Not read:{kind} {listed}{more}."] * bool(names)
-
-
-def _shown(name):
-    """A file's name without line ends and letters that a terminal may not have."""
-    return name if re.fullmatch("[ -~]{1,39}", name) else ascii(name[:40])
+def _not_read(paths):
+    """A sentence (str) with the first MAX_LISTED_NAMES and how many more, or ""."""
+    listed = ", ".join(quoted(path.name) for path in paths[:MAX_LISTED_NAMES])
+    more = f" and {len(paths) - MAX_LISTED_NAMES} more" * (len(paths) > MAX_LISTED_NAMES)
+    return f"Not read: {listed}{more}." if paths else ""

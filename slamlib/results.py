@@ -1,7 +1,9 @@
-"""The files to hand in: MATLAB struct arrays with the assignment's field names.
+"""The files to hand in: MATLAB struct arrays with the assignment's field names; the same as text.
 
 Poses are [x, y, heading] and positions [x, y] in world axes, in m and rad. Covariances belong to
-the same coordinates.
+the same coordinates. A line of a TUM file is `timestamp x y z qx qy qz qw`, the format of the TUM
+RGB-D benchmark that evo and others read. The measurements have no times, so the time stamps are
+pose numbers, from 1. Text files leave out poses without an estimate.
 """
 
 import struct
@@ -12,6 +14,7 @@ import numpy as np
 from scipy.io import loadmat, savemat
 
 from slamlib import swap
+from slamlib.evaluation import checked_poses
 
 _HEADER = b"MATLAB 5.0 MAT-file, written by slamlib".ljust(116)  # scipy's contains the date
 SIZE_OFFSET, COUNT_OFFSET = 132, 164  # bytes, to the array's size and its number of columns
@@ -26,16 +29,7 @@ def write_vehicle_poses(folder, poses, covariances):
 
     `poses` (n, 3) and `covariances` (n, 3, 3) are NaN where there is no estimate.
     """
-    _write_structs(Path(folder) / "vehiclePose.mat", poses, covariances)
-
-
-def write_map(folder, name, ids, places, covariances):
-    """Write folder/ArucoMap.mat or UwbMap.mat (`name` without .mat), in ascending id.
-
-    The `ids` (k,) ascend; `places` are poses (k, 3) with headings in (-pi, pi] or positions (k, 2),
-    and `covariances` (k, 3, 3) or (k, 2, 2).
-    """
-    _write_structs(Path(folder) / f"{name}.mat", places, covariances, ids)
+    write_structs(folder, "vehiclePose", None, poses, covariances)
 
 
 def read_vehicle_poses(folder):
@@ -61,35 +55,72 @@ def read_structs(folder, name):
     return ids, rows[0], rows[1]
 
 
-def _write_structs(path, *columns):
-    """Write one (1, n) struct array, named like the file; equal input gives equal bytes.
+def write_structs(folder, name, ids, places, covariances):
+    """Write folder/name.mat with one (1, n) struct array; equal input gives equal bytes.
+
+    `name` is a key of FIELDS. The ids (n,) of maps ascend; `places` are poses (n, 3), of markers
+    with headings in (-pi, pi], or positions (n, 2); `covariances` are (n, 3, 3) or (n, 2, 2).
 
     scipy writes many structs slowly, one by one. Here it writes the first one, whose bytes are
     repeated with the numbers of the others: each field is a header of 56 bytes and its numbers by
     columns. The array's size and number of columns are set (MAT-File Format, version 5).
     """
-    rows = dict(zip(FIELDS[path.stem], map(_matrices, columns)))
+    columns = zip(FIELDS[name], (places, covariances, ids))
+    rows = {field: _matrices(values) for field, values in columns}
     count = len(next(iter(rows.values())))
-    first = np.empty((1, min(count, 1)), dtype=[(name, object) for name in rows])
-    for name, values in rows.items():
-        first[name][0, :] = list(values[:1])
+    first = np.empty((1, min(count, 1)), dtype=[(field, object) for field in rows])
+    for field, values in rows.items():
+        first[field][0, :] = list(values[:1])
     buffer = BytesIO()
-    savemat(buffer, {path.stem: first})
+    savemat(buffer, {name: first})
     content = bytearray(_HEADER + buffer.getvalue()[len(_HEADER):])
     if count > 1:
-        layout = np.dtype([entry for name, values in rows.items() for entry in (
-            (f"header of {name}", "V56"), (name, "=f8", values.shape[:0:-1]))])
+        layout = np.dtype([entry for field, values in rows.items() for entry in (
+            (f"header of {field}", "V56"), (field, "=f8", values.shape[:0:-1]))])
         structs = np.repeat(np.frombuffer(content[-layout.itemsize:], layout), count)
-        for name, values in rows.items():
-            structs[name] = np.swapaxes(values, 1, 2)
+        for field, values in rows.items():
+            structs[field] = np.swapaxes(values, 1, 2)
         size, = struct.unpack_from("=I", content, SIZE_OFFSET)
         struct.pack_into("=I", content, SIZE_OFFSET, size + (count - 1) * layout.itemsize)
         struct.pack_into("=i", content, COUNT_OFFSET, count)
         content[-layout.itemsize:] = structs.tobytes()
-    swap.write_atomically(path, content)
+    swap.write_atomically(Path(folder) / f"{name}.mat", content)
 
 
 def _matrices(values):
     """Scalars (n,), vectors (n, d) or matrices (n, c, d) as (n, c, d); vectors are 1 x d."""
     rows = np.asarray(values, dtype=float)
     return rows.reshape(len(rows), *(1,) * (3 - rows.ndim), *rows.shape[1:])
+
+
+def write_tum(path, poses):
+    """Write poses (n, 3), which are NaN without an estimate, as a TUM file; z is 0.
+
+    >>> write_tum("line.tum", np.array([[0, 0, 0], [np.nan, np.nan, np.nan], [2.5, 0, 0]]))
+    >>> print(Path("line.tum").read_text(), end="")
+    1 0 0 0 0 0 0 1
+    3 2.5 0 0 0 0 0 1
+    """
+    poses, = checked_poses("write_tum", poses)
+    x, y, heading = poses.T
+    zero = np.zeros(len(poses))
+    _write_text(path, np.arange(1, len(poses) + 1), [
+        x, y, zero, zero, zero, np.sin(heading / 2), np.cos(heading / 2)], " ")
+
+
+def write_csv(path, ids, places, covariances):
+    """Write ids (n,), poses (n, 3) or positions (n, 2), NaN if unknown, and covariances as CSV.
+
+    The columns are id, x, y, theta and the upper triangle of the covariance in world axes.
+    """
+    names, upper = ("x", "y", "theta")[:places.shape[1]], np.triu_indices(places.shape[1])
+    header = ["id", *names, *(f"s_{names[i]}{names[j]}" for i, j in zip(*upper))]
+    _write_text(path, ids, [*places.T, *covariances[:, *upper].T], ",", ",".join(header))
+
+
+def _write_text(path, ids, columns, delimiter, header=""):
+    """Write ids (n,) and columns, numbers (n,) with all their digits, without rows of NaN."""
+    text, known = BytesIO(), np.isfinite(columns[0])
+    np.savetxt(text, np.column_stack([ids, *columns])[known], header=header, comments="",
+               delimiter=delimiter, fmt=["%d"] + ["%.17g"] * len(columns))
+    swap.write_atomically(Path(path), text.getvalue())

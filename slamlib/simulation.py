@@ -132,7 +132,8 @@ def write_dataset(folder, dataset, truth=None):
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise DatasetError(f"{folder}: expected a new or empty folder to write the dataset to")
     a, u, guess = dataset.aruco, dataset.uwb, dataset.antenna_guess
-    tables = {"encoderReading": ("%d %d %d", _numbers(dataset.ticks), *dataset.ticks.T)}
+    number = np.arange(1, len(dataset.ticks) + 1)
+    tables = {"encoderReading": ("%d %d %d", number, *dataset.ticks.T)}
     if a is not None:
         tables["ArucoReading"] = ("%d %d %.5f %.5f %.5f" + 6 * " %.4e", a.pose + 1, a.marker,
                                   *a.marker_in_vehicle.T, *a.covariance[:, *np.triu_indices(3)].T)
@@ -141,7 +142,7 @@ def write_dataset(folder, dataset, truth=None):
         tables["UwbAntennaGuess"] = "%d %.3f %.3f", guess.antenna, *guess.position.T
     if truth is not None:
         pose = "%d %.6f %.6f %.6f"
-        tables |= {"truth/vehiclePose": (pose, _numbers(truth.poses), *truth.poses.T),
+        tables |= {"truth/vehiclePose": (pose, number, *truth.poses.T),
                    "truth/ArucoMap": (pose, truth.marker, *truth.marker_in_world.T),
                    "truth/UwbMap": ("%d %.6f %.6f", truth.antenna, *truth.antenna_in_world.T)}
     with staging(folder) as stage:
@@ -154,10 +155,6 @@ def write_dataset(folder, dataset, truth=None):
             with open(stage / f"{name}.txt", "w", encoding="ascii", newline="\n") as file:
                 np.savetxt(file, np.column_stack(columns), fmt=fmt)
         os.replace(stage, folder)
-
-
-def _numbers(rows):
-    return np.arange(1, len(rows) + 1)
 
 
 def _write_vehicle(path, vehicle):

@@ -157,8 +157,7 @@ def _localization_fields(dataset, found):
     poses[found.frame[known], 2] = np.unwrap(found.poses[known, 2])
     return {"poses": poses, "covariances": covariances, "world": int(found.frame[known][0]),
             "aruco_map": (found.marker, found.marker_in_world, found.marker_covariance),
-            "facts": {"measured_poses": len(found.frame), "sightings": len(dataset.aruco.pose),
-                      "outliers": int(found.rejected.sum()),
+            "facts": {"sightings": len(dataset.aruco.pose), "outliers": int(found.rejected.sum()),
                       "unused_sightings": int(found.unused.sum())}}
 
 
@@ -170,24 +169,18 @@ def _noise_facts(found):
 
 
 def _slam_facts(dataset, found):
-    """Noise, evidence and calibration of a SlamResult, and what it rejects."""
-    facts, sigmas = _noise_facts(found), found.noise_sigma.tolist()
-    facts["slip_relative_sigma"] = sigmas[0]
-    for name, rows, factor, sigma, correlation in (
-            ("marker", found.rejected, found.noise.sightings, sigmas[1], found.correlation[0]),
-            ("range", found.antenna, found.noise.ranges, sigmas[2], found.correlation[1])):
-        if len(rows):
-            facts |= {f"{name}_noise_factor": factor, f"{name}_noise_relative_sigma": sigma,
-                      f"{name}_error_correlation": correlation.tolist()}
-    facts |= {"increments": found.model, "unconfirmed": found.unconfirmed.tolist(),
-              "chi2_per_dof": found.chi2_per_dof, "chi2_per_dof_of_all": found.chi2_per_dof_of_all,
-              "log_evidence": found.log_evidence,
-              "calibration": [row for row in found.calibration_table if row["sigma"]]}
+    """Noise, calibration and doubtful landmarks of a SlamResult."""
+    facts = _noise_facts(found) | {
+        "increments": found.model, "unconfirmed": found.unconfirmed.tolist(),
+        "chi2_per_dof": found.chi2_per_dof,
+        "calibration": [row for row in found.calibration_table if row["sigma"]]}
+    if len(found.rejected):
+        facts["marker_noise_factor"] = found.noise.sightings
     if len(found.antenna):
         weak = dataset.uwb.antenna[found.range_weight < 0.5].tolist()
-        facts |= {"ranges": len(dataset.uwb.pose), "antennas_in_doubt": found.doubts,
-                  "ranges_down_weighted_by_antenna": {each: weak.count(each)
-                                                      for each in found.antenna.tolist()}}
+        facts |= {"range_noise_factor": found.noise.ranges, "ranges": len(dataset.uwb.pose),
+                  "antennas_in_doubt": found.doubts, "ranges_down_weighted_by_antenna": {
+                      each: weak.count(each) for each in found.antenna.tolist()}}
     return facts
 
 
@@ -214,15 +207,20 @@ def truth_in_world(solution, truth):
     return se2.between(truth.poses[solution.world], truth.poses)
 
 
-def write_solution(folder, solution):
+def write_solution(folder, solution, text=False):
     """Write the .mat files of a Solution into folder/<problem>/; returns the Path of that folder.
 
-    A summary in `folder` is removed, because it belongs to other files.
+    With `text` it writes CSV files beside them, too, and folder/<problem>.tum. A summary in
+    `folder` is removed, because it belongs to other files.
     """
     (Path(folder) / SUMMARY).unlink(missing_ok=True)
-    folder = Path(folder) / solution.problem
-    results.write_vehicle_poses(folder, solution.poses, solution.covariances)
-    for name, each in (("ArucoMap", solution.aruco_map), ("UwbMap", solution.uwb_map)):
+    own = Path(folder) / solution.problem
+    poses = np.arange(1, len(solution.poses) + 1), solution.poses, solution.covariances
+    for name, each in zip(results.FIELDS, (poses, solution.aruco_map, solution.uwb_map)):
         if each is not None:
-            results.write_map(folder, name, *each)
-    return folder
+            results.write_structs(own, name, *each)
+        if each is not None and text:
+            results.write_csv(own / f"{name}.csv", *each)
+    if text:
+        results.write_tum(own.with_suffix(".tum"), solution.poses)
+    return own

@@ -1,23 +1,19 @@
 """Solving all problems of a dataset into a folder, with a summary of plain numbers."""
 
-import ctypes
 import json
-import os
 import signal
 import sys
-import threading
 import time
 from contextlib import contextmanager
 from dataclasses import asdict
-from itertools import chain
-from multiprocessing import Pipe, get_context
+from multiprocessing import get_context
 
 import numpy as np
 
 from slamlib import evaluation, swap
 from slamlib.checks.files import doubts_before_solving, merged
 from slamlib.dataset import all_notes, read_dataset, read_truth
-from slamlib.export import export_results
+from slamlib.results import write_tum
 from slamlib.solve import (
     PROBLEMS,
     RESULT_NAMES,
@@ -28,16 +24,11 @@ from slamlib.solve import (
     write_solution,
 )
 
-PR_SET_PDEATHSIG = 1                                           # Linux, prctl(2)
-# Problems of the second process: no other problem needs their results.
-PARALLEL_PROBLEMS = ("problem1", "problem2", "problem2_hint", "problem2_fused")
-
 
 def solve_to_folder(dataset, truth, out, problems=tuple(PROBLEMS), csv=False):
     """Solve problems of a Dataset and write their files to the folder `out`.
 
-    When all files are written they replace those of an earlier run, by `swap.publish`. A second
-    process solves problems 1 and 2: a fork, which is safe only on Linux and of the main thread.
+    When all files are written they replace those of an earlier run, by `swap.publish`.
 
     Parameters
     ----------
@@ -45,7 +36,7 @@ def solve_to_folder(dataset, truth, out, problems=tuple(PROBLEMS), csv=False):
     truth : Truth, to report errors, never to estimate; or None.
     out : path of the folder.
     problems : keys of `solve.PROBLEMS`; those for which there are sensors are solved.
-    csv : bool; True writes each .mat file also as text.
+    csv : bool; True writes each .mat file also as CSV, and trajectories and truth as TUM files.
 
     Returns
     -------
@@ -55,66 +46,38 @@ def solve_to_folder(dataset, truth, out, problems=tuple(PROBLEMS), csv=False):
     read.
     """
     with swap.staging(out) as stage:
-        summary = _summary(dataset, truth, _solved_by_two(dataset, truth, stage, problems))
+        summary = _solved(dataset, truth, problems, lambda solution: write_solution(
+            stage, solution, csv))
         text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
         swap.write_atomically(stage / SUMMARY, text.encode())
-        if csv and any(stage.glob("*/*.mat")):
-            export_results(stage, "csv", stage)
+        if csv and truth is not None:
+            write_tum(stage / "truth.tum", truth.poses)
         swap.publish({out: stage}, ours=RESULT_NAMES)
     return summary
 
 
-def _summary(dataset, truth, rows):
-    """The summary of what `_solved` returns."""
-    rows = {problem: rows[problem] for problem in PROBLEMS if problem in rows}
-    return {"dataset": dataset.name, "poses": len(dataset.ticks), "kernel": dataset.vehicle.kernel,
-            "doubts": [asdict(doubt) for doubt in merged(chain(
-                doubts_before_solving(dataset, truth), *(doubts for _, doubts in rows.values())))],
-            "notes": list(all_notes(dataset, truth)),
-            "problems": {problem: row for problem, (row, _) in rows.items()}}
-
-
-def _solved(dataset, truth, stage, problems):
-    """Solve problems, and write to `stage` if not None; {problem: (row of the summary, doubts)}."""
-    rows, start = {}, time.perf_counter()
+def _solved(dataset, truth, problems, write=lambda solution: None):
+    """The summary of problems, each of which is solved and its Solution written."""
+    rows, doubts, start = {}, doubts_before_solving(dataset, truth), time.perf_counter()
     for solution in solutions(dataset, problems=problems):
         failed = isinstance(solution, Failure)
-        seconds = time.perf_counter() - start
         row = {"failed": solution.reason} if failed else summarize(solution, truth)
-        rows[solution.problem] = ({"title": solution.title, **row, "seconds": seconds},
-                                  () if failed else solution.doubts)
-        if not failed and stage is not None:
-            write_solution(stage, solution)
+        rows[solution.problem] = {
+            "title": solution.title, **row, "seconds": time.perf_counter() - start}
+        if not failed:
+            doubts += solution.doubts
+            write(solution)
         start = time.perf_counter()
-    return rows
-
-
-def _solved_by_two(dataset, truth, stage, problems):
-    """What `_solved` returns, by two processes where that is safe."""
-    safe = sys.platform == "linux" and len(os.sched_getaffinity(0)) > 1 \
-        and threading.current_thread() is threading.main_thread()
-    second = [each for each in problems if safe and each in PARALLEL_PROBLEMS]
-    if not second:
-        return _solved(dataset, truth, stage, problems)
-    receiver, sender = Pipe(duplex=False)
-    with receiver, process(lambda: sender.send(_solved(dataset, truth, stage, second))):
-        sender.close()
-        rows = _solved(dataset, truth, stage, [x for x in problems if x not in second])
-        try:
-            return rows | receiver.recv()
-        except EOFError:            # it failed, or was killed, as where memory is short
-            return rows | _solved(dataset, truth, stage, second)
+    return {"dataset": dataset.name, "poses": len(dataset.ticks), "kernel": dataset.vehicle.kernel,
+            "doubts": [asdict(doubt) for doubt in merged(doubts)],
+            "notes": list(all_notes(dataset, truth)), "problems": rows}
 
 
 @contextmanager
 def process(function, *arguments):
-    """Context in which another process runs a function, silently if it fails, and then ends.
-
-    The value is the multiprocessing.Process: a fork on Linux, where it ends with this process, too,
-    however that ends.
-    """
+    """Context in which another process (multiprocessing.Process) runs a function, and then ends."""
     child = get_context("fork" if sys.platform == "linux" else "spawn").Process(
-        target=_run, args=(os.getpid(), function, *arguments))
+        target=function, args=arguments)
     child.start()
     try:
         yield child
@@ -123,27 +86,17 @@ def process(function, *arguments):
         child.join()
 
 
-def _run(parent, function, *arguments):
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != parent:                      # gone already
-            os._exit(1)
-    try:
-        function(*arguments)
-    except BaseException:                               # the parent meets it, too
-        os._exit(1)
-
-
 def print_tables(folders):
     """Print the `summary_table` of datasets in folders (list of Path), the shortest first.
 
-    Nothing is written.
+    It is the function of a `process`, which Ctrl-C does not end. Nothing is written.
     """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     over_a_bar = "\r\033[K" if sys.stderr.isatty() else ""
     drives = [(read_dataset(folder), read_truth(folder)) for folder in folders]
     for dataset, truth in sorted(drives, key=lambda drive: len(drive[0].ticks)):
         try:
-            text = summary_table(_summary(dataset, truth, _solved(dataset, truth, None, PROBLEMS)))
+            text = summary_table(_solved(dataset, truth, PROBLEMS))
         except Exception as error:          # the notebooks report it in full
             text = f"{dataset.name}: not solved before the notebooks: {error!r}"
         print(over_a_bar + text, file=sys.stderr, flush=True)

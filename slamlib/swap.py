@@ -106,50 +106,31 @@ def publish(made, ours=()):
             stack.enter_context(locked(folder))
         for folder, new in made.items():
             _add_the_users_files(folder, new, ours)
-        try:
-            _replace(made)
-        except KeyboardInterrupt:
-            _replace(made)                              # what is left of it
-            raise
+        for folder in made:
+            if folder.exists():
+                shutil.rmtree(beside(folder, "old"), ignore_errors=True)
+                folder.rename(beside(folder, "old"))
+        for folder, new in made.items():
+            new.rename(folder)
+        for folder in made:
+            shutil.rmtree(beside(folder, "old"), ignore_errors=True)
+            with suppress(OSError):
+                folder.rmdir()                          # if it is empty
 
 
 def _add_the_users_files(folder, new, ours):
     """Copy the files that no run wrote from a folder, if it exists, to the new one."""
     new.mkdir(exist_ok=True)
     names = file_names(new)
-    for source in (beside(folder, "old"), folder):     # the first of a run that was killed
-        try:
-            listed = {*map(str, json.loads((source / FILE_LIST).read_bytes()))}
-        except (OSError, ValueError, TypeError):        # none, or not written by slamlib
-            listed = set()
-        for name in {*file_names(source)} - {FILE_LIST, *ours, *names, *listed}:
-            if not name.endswith(".part"):
-                (new / name).parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(source / name, new / name, follow_symlinks=False)
-                shutil.copystat(source / name, new / name, follow_symlinks=False)
+    source = folder if folder.exists() else beside(folder, "old")   # of a run that was killed
+    try:
+        listed = {*map(str, json.loads((source / FILE_LIST).read_bytes()))}
+    except (OSError, ValueError, TypeError):            # none, or not written by slamlib
+        listed = set()
+    for name in {*file_names(source)} - {FILE_LIST, *ours, *names, *listed}:
+        if not name.endswith(".part"):
+            (new / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(source / name, new / name, follow_symlinks=False)
+            shutil.copystat(source / name, new / name, follow_symlinks=False)
     if names:
         (new / FILE_LIST).write_text(json.dumps(names))
-
-
-def _replace(made):
-    """Move all old folders aside, then all new ones in, and remove the old ones."""
-    for folder, new in made.items():
-        if folder.exists() and new.exists():
-            _discard_old(folder)
-            folder.rename(beside(folder, "old"))
-    for folder, new in made.items():
-        if new.exists():
-            new.rename(folder)
-    for folder in made:
-        with suppress(OSError):
-            _discard_old(folder)
-            folder.rmdir()                              # if it is empty
-
-
-def _discard_old(folder):
-    """Remove the folder that was moved aside, which is never there in part."""
-    old, trash = beside(folder, "old"), beside(folder, "trash")
-    shutil.rmtree(trash, ignore_errors=True)
-    if old.exists():
-        old.rename(trash)
-        shutil.rmtree(trash, ignore_errors=True)

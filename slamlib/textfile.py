@@ -8,8 +8,6 @@ import tomllib
 from difflib import get_close_matches
 from json import detect_encoding
 
-CONTROL_BYTES = bytes([*range(9), *range(14, 32)])  # which no text has
-
 
 class DatasetError(ValueError):
     """A dataset does not follow the format; the message names file, line and expectation."""
@@ -33,20 +31,17 @@ def quoted(value):
     return repr(text if len(text) <= 60 else text[:60] + "...")
 
 
-def read_toml(path, example, known, encoding="ascii"):
+def read_toml(path, example, known):
     """Entries of a TOML file without tables: a dict from key to (value, line number or None).
 
     Raises DatasetError, which quotes the `example` of an entry, if the file is not TOML, or has a
-    key that is not among the `known` ones. For `encoding` see `read_text`.
+    key that is not among the `known` ones.
     """
-    text = read_text(path, encoding)[0]
+    text = read_text(path)
     try:
         entries = tomllib.loads(text)
     except (ValueError, RecursionError) as failure:
-        reason, _, place = str(failure).partition(" (at ")
-        end = text.rstrip("\n").count("\n") + 1 if place == "end of document)" else None
-        line = int(found[1]) if (found := re.match(r"line (\d+)", place)) else end
-        raise error(path, f"expected TOML such as '{example}' ({reason})", line) from None
+        raise error(path, f"expected TOML such as '{example}', found: {failure}") from None
     for key, value in entries.items():
         at_key = re.search(rf"""^[\s\["']*{re.escape(key)}(?![\w-])""", text, re.MULTILINE)
         line = text.count("\n", 0, at_key.end()) + 1 if at_key else None
@@ -57,33 +52,18 @@ def read_toml(path, example, known, encoding="ascii"):
     return entries
 
 
-def read_text(path, encoding="ascii"):
-    """Text of a file with line ends '\\n', and its encoding if that is UTF-16 or UTF-32, or "".
+def read_text(path):
+    """Text of a file in UTF-8, UTF-16 or UTF-32, with line ends '\\n'.
 
-    Bytes that are invalid in `encoding` become '\\ufffd'. Raises DatasetError if the file cannot be
-    read or has control bytes.
+    Bytes that are invalid in it become '\\ufffd'. Raises DatasetError if the file cannot be read,
+    or may not end, as a pipe or a device.
     """
-    data = read_bytes(path)
-    codec = detect_encoding(data)                # by a byte order mark, or by where NUL bytes are
-    wide = "" if codec.startswith("utf-8") else codec[:6].upper()
     try:
-        data = data.decode(codec).encode() if wide else data
-    except UnicodeError:
-        raise error(path, f"expected plain text, found {wide} that breaks off") from None
-    data = data.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n").replace(b"\r", b"\n")
-    if len(data.translate(None, CONTROL_BYTES)) < len(data):
-        first = next(k for k, byte in enumerate(data) if byte in CONTROL_BYTES)
-        raise error(path, f"expected plain text, found the byte 0x{data[first]:02x}",
-                    data.count(b"\n", 0, first) + 1)
-    return data.decode(encoding, errors="replace"), wide
-
-
-def read_bytes(path):
-    """Bytes of a file; DatasetError if it cannot be read, or may not end, as a pipe or a device."""
-    try:
-        if path.is_file():
-            return path.read_bytes()
+        data = path.read_bytes() if path.is_file() else None
     except OSError:
-        pass
-    found = ", found a folder" if path.is_dir() else ""
-    raise error(path, f"expected a file that can be read{found}")
+        data = None
+    if data is None:
+        raise error(path, "expected a file that can be read")
+    encoding = detect_encoding(data)             # by a byte order mark, or by where NUL bytes are
+    text = data.decode(encoding, errors="replace").removeprefix("\ufeff")
+    return text.replace("\r\n", "\n").replace("\r", "\n")

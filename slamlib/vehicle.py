@@ -5,21 +5,15 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from numbers import Real
 
 import numpy as np
-from scipy.ndimage import maximum_filter
 
 from slamlib.dialects import Limit
 from slamlib.textfile import error, quoted, read_toml
 
-MAX_REVOLUTIONS = 10.0  # revolutions of a wheel in one step
+MAX_REVOLUTIONS = 4.0  # revolutions of a wheel in one step; a wrapped counter makes more
 MIN_REVOLUTIONS = 0.9  # revolutions that counts since the start span
-MAX_SMALL_STEP = 0.025  # of that span; larger steps from row to row are jumps of the counter
-MIN_SMALL_SHARE = 0.95  # of the steps
+MAX_SMALL_STEP = 0.025  # of that span; larger changes from row to row are jumps of the counter
+MIN_SMALL_SHARE = 0.95  # of the changes
 RUN_ROWS = 10  # rows over which counts since the start mostly change with one sign
-NEARBY = np.arange(-5, 6)[:, None] != 0  # rows before and after a step
-JUMP_RATIO = 4.0  # ratio of a counter's jump to the steps nearby and to a large step of the drive
-LARGE_STEP_QUANTILE = 0.9  # probability of the quantile of the steps that is a large step
-MODULI = 2**16, 2**15  # numbers of values of counters that wrap around
-MIN_MODULUS_RATIO = 32.0  # ratio of a modulus to a large step of the drive, for a decision
 # Robust kernels of sightings and ranges, as `slam.fit` has them; the first one is the default.
 KERNEL_NAMES = ("asymmetric Tukey", "asymmetric Cauchy", "quadratic", "Huber", "Cauchy",
                 "Geman-McClure", "Tukey")
@@ -136,62 +130,35 @@ def changed(vehicle, entries, source, lines=None):
 
 
 def incremental_counts(table, vehicle):
-    """Notes on the Table of the encoders, and counts since the previous pose (n, 2) int64.
+    """Counts since the previous pose, (n, 2) int64, of the Table of the encoders.
 
-    Raises DatasetError if the first row is not 0, a step exceeds MAX_REVOLUTIONS, or counts since
-    the start jump: beyond the steps nearby, because a wheel changes its speed gradually.
+    Raises DatasetError if the first row is not 0, a step exceeds MAX_REVOLUTIONS, or the counts are
+    since the start.
     """
     counts, limit = table.numbers[:, 1:], MAX_REVOLUTIONS * vehicle.ticks_per_revolution
-    if not since_start(counts, vehicle):
-        steps = unwrapped(counts)
-        ok = abs(steps) <= np.where(np.arange(len(steps)) == 0, 0, limit)[:, None]
-        said = (f"at most {MAX_REVOLUTIONS:g} wheel revolutions ({limit:g} ticks) in one step, and "
-                "none in the first row (counts since the previous pose, not since the start)")
-    else:
-        table = table.noted(" holds counts since the start, which change gradually up to "
-                            f"{abs(counts).max():.0f}: the difference of each row from the one "
-                            "before was taken")
-        counts = np.diff(counts, axis=0, prepend=counts[:1])
-        steps = unwrapped(counts)
-        nearby = maximum_filter(abs(steps), footprint=NEARBY, mode="constant")
-        ok = abs(steps) <= JUMP_RATIO * np.maximum(nearby, _large_step(steps))
-        said = "counts since the start that run on: the counter restarted, or rows are missing"
-    table.kept(np.pad(ok, ((0, 0), (1, 0)), constant_values=True), said)
-    if len(mended := np.flatnonzero(steps != counts) // 2):
-        table = table.noted(f": {len(mended)} counts were mended that are 2^15 or 2^16 off, as of "
-                            f"a counter that wraps around, the first in {table.place(mended[0])}")
-    return table.notes, steps.astype(np.int64)
+    if since_start(counts, vehicle):
+        raise error(table.source, "expected counts since the previous pose, found counts since the "
+                    f"start, which change gradually up to {abs(counts).max():.0f}: take the "
+                    "difference of each row from the one before")
+    ok = abs(counts) <= np.where(np.arange(len(counts)) == 0, 0, limit)[:, None]
+    table.kept(np.pad(ok, ((0, 0), (1, 0)), constant_values=True), (
+        f"at most {MAX_REVOLUTIONS:g} wheel revolutions ({limit:g} ticks) in one step, and none in "
+        "the first row"))
+    return counts.astype(np.int64)
 
 
 def since_start(counts, vehicle):
     """True if counts (n, 2), right and left, are since the start.
 
-    They change gradually: small steps from row to row are most of all and reach over half of the
+    They change gradually: small changes from row to row are most of all and reach over half of the
     span, mostly with one sign over RUN_ROWS rows; those of increments are noise about a constant
     speed. MIN_REVOLUTIONS are a short way, but no speed to which a wheel comes in so many steps.
     """
-    steps, span = np.diff(counts, axis=0), np.ptp(counts, axis=0).max()
-    if span < MIN_REVOLUTIONS * vehicle.ticks_per_revolution or len(steps) < RUN_ROWS:
+    change, span = np.diff(counts, axis=0), np.ptp(counts, axis=0).max()
+    if span < MIN_REVOLUTIONS * vehicle.ticks_per_revolution or len(change) < RUN_ROWS:
         return False
-    small = abs(steps) <= MAX_SMALL_STEP * span
-    total = np.cumsum(np.where(small, steps, 0), axis=0)
-    size = abs(steps[small]).sum()
+    small = abs(change) <= MAX_SMALL_STEP * span
+    total = np.cumsum(np.where(small, change, 0), axis=0)
+    size = abs(change[small]).sum()
     over_run = abs(total[RUN_ROWS:] - total[:-RUN_ROWS]).sum() / RUN_ROWS
     return bool(small.mean() >= MIN_SMALL_SHARE and size > span / 2 and over_run > size / 2)
-
-
-def unwrapped(steps):
-    """Steps (n, 2), less a modulus where that makes them as small as others."""
-    for modulus in MODULI:
-        off = np.flatnonzero(2 * abs(steps) > modulus)
-        large = _large_step(steps) if len(off) else 0
-        less = steps.flat[off] - np.sign(steps.flat[off]) * modulus
-        wraps = (abs(less) <= 2 * large) & (MIN_MODULUS_RATIO * large < modulus)
-        steps = steps.copy()
-        steps.flat[off[wraps]] = less[wraps]
-    return steps
-
-
-def _large_step(steps):
-    size = abs(steps[steps != 0])
-    return np.quantile(size, LARGE_STEP_QUANTILE) if len(size) else 0

@@ -14,7 +14,7 @@ from slamlib.dialects import LIMITS, Limit
 from slamlib.vehicle import VEHICLE_LIMITS
 
 FILES = {
-    "encoderReading.txt": "1 0 0\n2 10 12\n3 -5 7\n4 0 80000\n",
+    "encoderReading.txt": "1 0 0\n2 10 12\n3 -5 7\n4 0 32000\n",
     # Out of order in pose, and marker 40 seen twice at pose 3.
     "ArucoReading.txt": (
         "3 40 1.5 -2 0.5 4e-4 1e-4 0 9e-4 0 1e-4\n"
@@ -83,7 +83,7 @@ def test_measurements_are_exactly_those_written(folder):
     data = read_dataset(folder)
     assert data.name == "drive" and data.vehicle == VEHICLE
     assert isinstance(data.vehicle.ticks_per_revolution, float)
-    assert_ints(data.ticks, [[0, 0], [10, 12], [-5, 7], [0, 80000]])
+    assert_ints(data.ticks, [[0, 0], [10, 12], [-5, 7], [0, 32000]])
     assert_ints(data.aruco.pose, [1, 2, 2])
     assert_ints(data.aruco.marker, [-7, 40, 40])
     np.testing.assert_array_equal(
@@ -216,7 +216,7 @@ def test_a_vehicle_by_its_deviation():
 
 def test_numbers_in_other_spellings(folder):
     clean = read_dataset(folder)
-    write(folder / "encoderReading.txt", "1.0 -0 0e5\n+2 1E1 12.\n3e0 -.5e1 7\n004 0 8e+4\n")
+    write(folder / "encoderReading.txt", "1.0 -0 0e5\n+2 1E1 12.\n3e0 -.5e1 7\n004 0 3.2e+4\n")
     assert_same(read_dataset(folder), clean)
 
 
@@ -259,16 +259,15 @@ def appended(row):
 
 THIRD_ROWS = {  # rows by what is said of them
     "encoderReading.txt": {
-        "3 columns (pose id, right ticks, left ticks), found": [
-            "3 5", "3 5 6 7", "3,5,6", "3\u00a05 6"],
-        "finite numbers, found": ["3 five 6", "3 " + "x" * 999 + " 6", "3, 5, 6", "3 1_000 6",
-                                  "3 0x10 6", "3 \u0663 6", "3 1e 6", "3 . 6"],
+        "3 numbers (pose id, right ticks, left ticks), found": [
+            "3 5", "3 5 6 7", "3,5,6", "3 five 6", "3 " + "x" * 999 + " 6", "3, 5, 6", "3 1_000 6",
+            "3 0x10 6", "3 \u0663 6", "3 1e 6", "3 . 6", "3 5 6 \0"],
         "right ticks, a whole number from -1e+15 to 1e+15, found": [
             "3 nan 6", "3 -infinity 5", "3 1e999 5", "3 -2e15 5", "3 5.5 6"],
-        "at most 10 wheel revolutions (80000 ticks)": ["3 5 80001", "3 -80001 5"],
+        "at most 4 wheel revolutions (32000 ticks)": ["3 5 32001", "3 -32001 5"],
         "in order": ["4 5 6", "2 5 6"], "pose id, a whole number": ["2.5 5 6"]},
     "ArucoReading.txt": {
-        "pose id from 1 to 4": ["5 40 0 0 0 1 0 0 1 0 1", "0 40 0 0 0 1 0 0 1 0 1"],
+        "pose id, a whole number from 1 to 4": ["5 40 0 0 0 1 0 0 1 0 1", "0 40 0 0 0 1 0 0 1 0 1"],
         "positive definite": [f"1 40 0 0 0 {covariance}" for covariance in (
             "1 1 0 1 0 1", "1e-4 2e-4 0 1e-4 0 1e4", "1 .9 -.9 1 .9 1", "1 9e14 0 1 0 1e-18")]},
     "UwbReading.txt": {
@@ -276,34 +275,31 @@ THIRD_ROWS = {  # rows by what is said of them
         "a range that is not below -5 sigma": ["1 3 -5.1 1"],
         "an antenna id that the guesses have": ["1 4 1 1"]},
     "UwbAntennaGuess.txt": {"each id only once": ["900 1 2"], "x, a finite number": ["9 inf 2"]},
-    "truth/vehiclePose.txt": {"4 columns (pose id, x, y, theta)": ["3 0 0"],
+    "truth/vehiclePose.txt": {"4 numbers (pose id, x, y, theta)": ["3 0 0"],
                               "in order": ["4 0 0 0"]},
     "truth/ArucoMap.txt": {"each id only once": ["40 0 0 0"]}}
 VEHICLE_LINES = {
     "expected an entry such as wheelbase, ": ["wheel_base = 1", "[wheelbases]\nx = 1",
                                               "'wheel' = 1"],
     "a number from 0.001 to 2.5 m for left_radius, found": [f"left_radius = {value}" for value in (
-        "'wide'", "[0.1]", "true", "nan", "inf", "0x" + "f" * 5000)],
-    "TOML": ["left_radius = 0,1", "left_radius =", "wheelbase = 0.6"]}
+        "'wide'", "[0.1]", "true", "nan", "inf", "0x" + "f" * 5000)]}
+TOML_LINES = ["left_radius = 0,1", "left_radius =", "wheelbase = 0.6", "left_radius = \0 1",
+              "left_radius = " + "[" * 5000]
 ENCODER_FILES = [  # text, line, what is said
-    ("", None, "no rows"), ("# nothing\n\n", None, "no rows"), ("\n1 0\n2 0\n", 2, "3 columns"),
-    ("\r\r1 0 0\r\r2 0\r", 5, "3 columns"), ("\r\n1 0 0\r\n2 0", 3, "3 columns"),
+    ("", None, "no rows"), ("# nothing\n\n", None, "no rows"), ("\n1 0\n2 0\n", 2, "3 numbers"),
+    ("\r\r1 0 0\r\r2 0\r", 5, "3 numbers"), ("\r\n1 0 0\r\n2 0", 3, "3 numbers"),
     ("0 0 0\n1 5 6\n", 1, "in order"),
     ("# head\n1 0 1\n2 5 6\n3 5 6\n4 5 6\n", 2, "none in the first row"),
-    (b"1 0 0\r\n2 5 6 # \x00\r\n", 2, "plain text"), (b"1 0 0\n2 5\x1c6\n", 2, "plain text"),
-    (b"\x89\xf0\xff 0 0\n", 1, "finite number"),
-    (gzip.compress(b"1 0 0\n", mtime=0), 1, "plain text"),
-    ("1 0 0\n".encode("utf-16")[:-1], None, "UTF-16 that breaks off")]
+    (b"\x89\xf0\xff 0 0\n", 1, "3 numbers"), (gzip.compress(b"1 0 0\n", mtime=0), 1, "3 numbers"),
+    ("1 0 0\n".encode("utf-16")[:-1], 1, "3 numbers")]
 ERRORS = [
     *[(name, third_row(row), 5, said) for name, told in THIRD_ROWS.items()
       for said, rows in told.items() for row in rows],
     *[("vehicle.toml", appended(line), 3, said) for said, lines in VEHICLE_LINES.items()
       for line in lines],
     *[("encoderReading.txt", *each) for each in ENCODER_FILES],
-    ("vehicle.toml", "left_radius = [1,\n2\n\n", 2, "TOML"),
+    *[("vehicle.toml", appended(line), None, "TOML") for line in TOML_LINES],
     ("vehicle.toml", "# a\n\n\n  'wheel' = 1\n", 4, "an entry such as wheelbase"),
-    ("vehicle.toml", appended("left_radius = " + "[" * 5000), None, "TOML"),
-    ("vehicle.toml", "wheelbase = \0 1\n".encode("utf-16"), 1, "plain text"),
     ("truth/vehiclePose.txt", third_row("3 0 0 0"), None, "4 poses (encoder file), found 3"),
     ("truth/vehiclePose.txt", "", None, "4 poses (encoder file), found 0"),
     ("truth/vehicle.toml", appended("wheelbase = 0"), 2, "a number from 0.001 to 20 m")]
@@ -353,7 +349,8 @@ def test_numbers_at_the_limits_are_read_and_beyond_them_refused(tmp_path, name, 
         write(tmp_path / name, text(beyond))
         message = error_of(read, tmp_path)
         assert message.startswith(f"{tmp_path / name}, line 1: expected ") and str(limit) in message
-        assert column in message and message.endswith(f"found '{beyond!r}'")
+        assert column in message and message.endswith(
+            f"found '{beyond:.12g}'" if name != "vehicle.toml" else f"found '{beyond!r}'")
 
 
 def test_the_limits_that_a_user_reads_are_those_of_the_reader():
@@ -363,17 +360,6 @@ def test_the_limits_that_a_user_reads_are_those_of_the_reader():
     told = {(file.strip("`"), column.strip("` ")): limit for file, columns, limit in rows
             for column in columns.split(",")}
     assert told == {(Path(name).name, column): str(limit) for name, column, limit in PLACES}
-
-
-@pytest.mark.parametrize("name", ["sighting_lag", "range_lag"])
-@pytest.mark.parametrize("lag", [4, -4])
-def test_a_lag_is_below_the_length_of_the_drive(folder, name, lag):
-    write(folder / "vehicle.toml", f"{name} = {lag}\n")
-    assert error_of(read_dataset, folder) == (
-        f"{folder / 'vehicle.toml'}: expected a {name} below the number of poses (4) in size, "
-        f"found {lag}")
-    write(folder / "vehicle.toml", f"{name} = {0.99 * lag}\n")
-    assert getattr(read_dataset(folder).vehicle, name) == 0.99 * lag
 
 
 def test_missing_files(folder):
@@ -398,9 +384,8 @@ def test_missing_folder_or_not_a_folder(folder, name, read):
 
 @pytest.mark.parametrize("name", FILES)
 def test_files_that_cannot_be_read_are_refused_and_not_waited_for(folder, name, monkeypatch):
-    """Without permission, as a broken link, a folder, a device or a pipe."""
+    """Without permission, as a broken link, a device or a pipe."""
     path, read_bytes = folder / name, Path.read_bytes
-    place = f"{path}: expected a file that can be read"
     read = read_truth if name.startswith("truth/") else read_dataset
 
     def refusing(self):                                     # tests may run as root
@@ -410,13 +395,12 @@ def test_files_that_cannot_be_read_are_refused_and_not_waited_for(folder, name, 
 
     with monkeypatch.context() as patch:
         patch.setattr(Path, "read_bytes", refusing)
-        assert error_of(read, folder) == place
+        assert error_of(read, folder) == f"{path}: expected a file that can be read"
     os.mkfifo(folder / "pipe")
-    for target, found in (("nothing", ""), ("/dev/zero", ""), (folder / "pipe", ""),
-                          (folder.parent, ", found a folder")):
+    for target in ("nothing", "/dev/zero", folder / "pipe"):
         path.unlink()
         path.symlink_to(target)
-        assert error_of(read, folder) == place + found
+        assert error_of(read, folder) == f"{path}: expected a file that can be read"
 
 
 def test_a_relative_path_names_the_dataset_and_stands_in_messages(folder, monkeypatch):

@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[1]
 MODULES = sorted(".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
                  for path in (ROOT / "slamlib").rglob("*.py") if path.stem != "__main__")
 WITH_EXAMPLES = {f"slamlib.{name}" for name in (
-    "se2", "odometry", "evaluation", "dataset", "results", "export", "simulation", "slam.pipeline",
+    "se2", "odometry", "evaluation", "dataset", "results", "simulation", "slam.pipeline",
     "localization.markers", "localization.fused")} | {"slamlib"}
 
 

@@ -3,7 +3,7 @@ import pytest
 
 from slamlib import evaluation, se2
 from slamlib.dataset import DatasetError, Vehicle
-from slamlib.export import write_tum
+from slamlib.results import write_tum
 
 
 def test_ate_and_path_length_by_hand():

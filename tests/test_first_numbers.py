@@ -3,20 +3,15 @@
 import os
 import re
 import signal
-import subprocess
 import sys
 import time
 from multiprocessing import active_children
-from pathlib import Path
 
 import pytest
-from conftest import is_running
 from test_report import build, make_data, write
 
 from slamlib import summary
 from slamlib.report import build as building
-
-ROOT = Path(__file__).parents[1]
 
 
 @pytest.mark.slow
@@ -61,24 +56,3 @@ def test_first_numbers_that_fail_end_no_build(folders, monkeypatch, capfd, end, 
     with summary.process(summary.print_tables, folders[:1]) as first:
         first.join(300)
     assert capfd.readouterr().err == expected
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="only there it ends with this process")
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
-def test_no_process_survives_a_run_that_is_killed(number):
-    """Neither that of the first numbers nor the second one of solve."""
-    code = """import time
-from slamlib.summary import process
-with process(time.sleep, 1000) as child:
-    print(child.pid, flush=True)
-    child.join()"""
-    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True,
-                              env=os.environ | {"PYTHONPATH": str(ROOT)})
-    child = int(parent.stdout.readline())
-    assert is_running(child)
-    parent.send_signal(number)
-    parent.communicate()
-    until = time.monotonic() + 300
-    while is_running(child) and time.monotonic() < until:
-        time.sleep(0.02)
-    assert not is_running(child)

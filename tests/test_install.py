@@ -81,7 +81,8 @@ def test_an_installed_slamlib_reports_on_a_drive(installed, tmp_path):
     assert not any(tmp_path.iterdir())
     (tmp_path / "data" / "drive").mkdir(parents=True)
     (tmp_path / "data" / "drive" / "encoderReading.txt").write_text("1 0 0\n2 10 9\n")
-    run(slamlib, "report", "--no-appendix", cwd=tmp_path)
+    (tmp_path / "report.toml").write_text("appendix = false\n")
+    run(slamlib, "report", cwd=tmp_path)
     assert (tmp_path / "report" / "report.pdf").read_bytes().startswith(b"%PDF")
     assert (tmp_path / "results" / "drive" / "problem1" / "vehiclePose.mat").is_file()
 

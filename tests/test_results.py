@@ -1,14 +1,24 @@
+"""The files of results: as MATLAB, spreadsheets and evo read them."""
+
 import errno
+import json
 import os
 import shutil
 import subprocess
+import sys
+from dataclasses import replace
 from io import BytesIO
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.io import loadmat, savemat
 
 from slamlib import results
+from slamlib.__main__ import main
+from slamlib.simulation import simulate, write_dataset
+
+ABSENT = [np.nan] * 3
 
 
 def example(n=5):
@@ -41,7 +51,7 @@ def test_structs_through_scipy_and_octave(tmp_path, name, fields, d):
         results.write_vehicle_poses(folder, poses, covariances)
         np.testing.assert_array_equal(results.read_vehicle_poses(folder)[0], poses)
     else:
-        results.write_map(folder, name, *content)
+        results.write_structs(folder, name, *content)
     structs = loadmat(folder / f"{name}.mat")[name]
     assert structs.shape == (1, 4) and structs.dtype.names == fields
     shapes = [structs[0, 1][field].shape for field in fields]
@@ -75,7 +85,7 @@ def test_structs_have_the_bytes_that_scipy_writes_and_are_read_again(tmp_path, c
     """Any numbers, NaN and infinity among them, for vectors, matrices and scalars."""
     ids, (poses, covariances) = np.arange(count), example(count)
     poses[3:4], covariances[5:, 1, 2] = np.nan, np.inf
-    results.write_map(tmp_path, "ArucoMap", ids, poses, covariances)
+    results.write_structs(tmp_path, "ArucoMap", ids, poses, covariances)
     structs = np.empty((1, count), dtype=[(name, object) for name in ("pose", "covari", "id")])
     for row, numbers in zip(structs[0], zip(poses[:, None], covariances, ids.astype(float))):
         row["pose"], row["covari"], row["id"] = numbers
@@ -84,3 +94,53 @@ def test_structs_have_the_bytes_that_scipy_writes_and_are_read_again(tmp_path, c
     assert (tmp_path / "ArucoMap.mat").read_bytes()[116:] == buffer.getvalue()[116:]   # no date
     for got, expected in zip(results.read_structs(tmp_path, "ArucoMap"), (ids, poses, covariances)):
         np.testing.assert_array_equal(got, expected)
+
+
+def test_a_tum_file_has_pose_numbers_and_unit_quaternions_of_the_poses_that_are_known(tmp_path):
+    poses = np.array([[1.0, 2.0, 0.1], ABSENT, [1 / 3, -1e-9, 7.0]])
+    results.write_tum(tmp_path / "a" / "b.tum", poses)
+    rows = np.loadtxt(tmp_path / "a" / "b.tum")
+    np.testing.assert_array_equal(rows[:, 0], [1, 3])
+    np.testing.assert_array_equal(rows[:, 1:3], poses[[0, 2], :2])
+    np.testing.assert_array_equal(rows[:, 3:6], 0)
+    np.testing.assert_allclose(np.hypot(rows[:, 6], rows[:, 7]), 1, atol=1e-15)
+    np.testing.assert_allclose(2 * np.arctan2(rows[:, 6], rows[:, 7]) - poses[[0, 2], 2],
+                               [0, -4 * np.pi], atol=1e-12)
+
+
+def test_comma_separated_values_name_their_columns_and_keep_every_digit(tmp_path):
+    poses = np.array([[1 / 3, 2.0, 0.1], ABSENT])
+    C = np.array([[[1 / 7, 2, 3], [2, 4, 5], [3, 5, 6]], np.full((3, 3), np.nan)])
+    results.write_csv(tmp_path / "a.csv", np.array([7, 8]), poses, C)
+    header, row = (tmp_path / "a.csv").read_text().splitlines()
+    assert header == "id,x,y,theta,s_xx,s_xy,s_xtheta,s_yy,s_ytheta,s_thetatheta"
+    assert [*map(float, row.split(","))] == [7, 1 / 3, 2, 0.1, 1 / 7, 2, 3, 4, 5, 6]
+    results.write_csv(tmp_path / "a.csv", np.array([7, 8]), poses[:, :2], C[:, :2, :2])
+    assert (tmp_path / "a.csv").read_text() == \
+        f"id,x,y,s_xx,s_xy,s_yy\n7,{1 / 3:.17g},2,{1 / 7:.17g},2,4\n"
+
+
+@pytest.mark.slow
+def test_evo_finds_the_errors_of_the_summary_in_what_solve_writes_as_text(tmp_path):
+    """By evo's own command line, as it is and aligned; problem 2 has a tenth of the poses."""
+    dataset, truth = simulate("short", 3)
+    write_dataset(tmp_path / "drive", dataset.first(300), replace(truth, poses=truth.poses[:300]))
+    out = tmp_path / "out"
+    assert main(["solve", str(tmp_path / "drive"), "--out", str(out), "--csv"]) == 0
+    for name in ("problem2/vehiclePose", "problem2/ArucoMap", "problem4/UwbMap"):
+        ids, places, covariances = results.read_structs((out / name).parent, Path(name).name)
+        known, d = np.isfinite(places[:, 0]), places.shape[1]
+        np.testing.assert_array_equal(
+            np.loadtxt(out / f"{name}.csv", delimiter=",", skiprows=1), np.column_stack([
+                ids, places, covariances[:, *np.triu_indices(d)]])[known])
+    rows = json.loads((out / "summary.json").read_text())["problems"]
+    for problem in ("problem2", "problem4"):
+        for options, key in (([], "ate_m"), (["--align"], "ate_aligned_m")):
+            told = subprocess.run(
+                [Path(sys.executable).with_name("evo_ape"), "tum", "truth.tum", f"{problem}.tum",
+                 *options], cwd=out, text=True, capture_output=True, timeout=300,
+                env={"HOME": str(tmp_path), "PATH": "", "MPLBACKEND": "agg"})
+            assert told.returncode == 0, told.stderr
+            found, = (float(line.split()[1]) for line in told.stdout.splitlines()
+                      if line.split()[:1] == ["rmse"])
+            assert np.isclose(found, rows[problem][key], rtol=0, atol=1e-6)  # evo: six digits

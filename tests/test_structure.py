@@ -51,7 +51,7 @@ def outside(module):
 def test_numerics_use_numpy_scipy_and_gtsam_only():
     """And of slamlib's own modules none that judges, writes or simulates."""
     others = {f"slamlib.{name}" for name in (
-        "evaluation", "results", "export", "solve", "summary", "simulation", "swap")}
+        "evaluation", "results", "solve", "summary", "simulation", "swap")}
     for module in MODULES:
         if package(module) in NUMERICS:
             assert outside(module) <= {"numpy", "scipy", "gtsam"}, module

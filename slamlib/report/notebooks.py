@@ -46,7 +46,7 @@ def read_options(path):
     if not Path(path).exists():
         return Options()
     keys = [option.name for option in fields(Options)]
-    entries = read_toml(Path(path), 'author = "Ada Lovelace"', keys, encoding="utf-8")
+    entries = read_toml(Path(path), 'author = "Ada Lovelace"', keys)
     return Options(**{key: _checked(key, value, f"{path}, line {line}" if line else str(path))
                       for key, (value, line) in entries.items()})
 
@@ -91,7 +91,7 @@ def read_notebook(source):
 
     NotebookError if the file is not a notebook, DatasetError if it is no file that can be read.
     """
-    text = read_text(source, "utf-8")[0]
+    text = read_text(source)
     try:
         if "\ufffd" in text:  # which stands for bytes that are not UTF-8
             raise ValueError("expected UTF-8 text")

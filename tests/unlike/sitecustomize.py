@@ -14,8 +14,7 @@ from types import ModuleType
 
 LACKING = {
     "win32": {"resource": None, "os": {"sched_getaffinity", "fork", "killpg"},
-              "signal": {"SIGHUP", "SIGKILL"}, "socket": {"AF_UNIX"}},
-    "darwin": {"os": {"sched_getaffinity"}}}[os.environ["UNLIKE"]]
+              "signal": {"SIGHUP", "SIGKILL"}, "socket": {"AF_UNIX"}}}[os.environ["UNLIKE"]]
 imported = builtins.__import__
 
 
