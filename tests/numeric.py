@@ -10,7 +10,7 @@ from slamlib.evaluation import ate, nees
 from slamlib.simulation import simulate
 from slamlib.slam.linear import state_from_arrays
 from slamlib.slam.measurements import with_known_noise
-from slamlib.studies.montecarlo import antenna_error, map_nees, wheel_nees
+from slamlib.studies.montecarlo import antenna_error
 
 
 def central_differences(function, x, step=1e-6):
@@ -38,6 +38,18 @@ def changed(dataset, sensor, **fields):
 def known_noise(dataset, slip):
     """The Dataset of a drive with this slip in sqrt(m), and the noise that its files state."""
     return with_known_noise(dataset, slip, marker_noise_factor=1.0, range_noise_factor=1.0)
+
+
+def map_nees(found, truth):
+    """NEES (k,) of the markers of a SlamResult or a Localization."""
+    true_map = truth.marker_in_world[np.searchsorted(truth.marker, found.marker)]
+    return nees(found.marker_in_world, found.marker_covariance, true_map)
+
+
+def wheel_nees(found, truth):
+    """Squared error of the wheel parameters over their covariance."""
+    error = found.wheel - truth.vehicle.wheel
+    return error @ np.linalg.solve(found.wheel_covariance, error)
 
 
 def slam_trial(seed, ranges=True, markers=True, **options):

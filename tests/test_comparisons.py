@@ -32,7 +32,7 @@ def test_wrong_labels_are_those_that_differ_from_the_same_drive_without(drive):
 
 
 def test_the_gate_rejects_wrong_labels_and_hardly_any_others():
-    numbers = kernels.wrong_labels(6, methods=("quadratic", "gate"), mislabelled=0.03)
+    numbers = kernels.compare(6, "sightings", ("quadratic", "gate"), mislabelled=0.03)
     assert numbers["gate wrong rejected"] == 1 and numbers["gate good lost"] < 0.005
     assert numbers["quadratic wrong rejected"] == numbers["quadratic good lost"] == 0
 

@@ -359,7 +359,8 @@ def test_markers_of_unknown_heading_are_mapped_as_points():
 @pytest.mark.slow
 def test_the_gate_has_a_smaller_error_than_hubers_kernel_with_wrong_labels():
     """3 % wrong labels, 8 drives."""
-    runs = studies.run(kernels.wrong_labels, range(8), methods=("gate", "Huber"), mislabelled=0.03)
+    runs = studies.run(kernels.compare, range(8), kind="sightings", methods=("gate", "Huber"),
+                       mislabelled=0.03)
     assert decided(runs["Huber ate"] - runs["gate ate"])
 
 

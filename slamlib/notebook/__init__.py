@@ -9,7 +9,16 @@ from slamlib.notebook.drives import (
     solved,
     start,
 )
-from slamlib.notebook.tabular import accuracy, antenna_rows, calibration_rows, table
+from slamlib.notebook.tabular import (
+    accuracy,
+    antenna_rows,
+    calibration_rows,
+    dataset_row,
+    learned_row,
+    table,
+    vehicle_row,
+)
 
-__all__ = ["Drive", "accuracy", "antenna_rows", "attempted", "calibration_rows",
-           "notices", "results_folder", "show_doubts", "solved", "start", "table"]
+__all__ = ["Drive", "accuracy", "antenna_rows", "attempted", "calibration_rows", "dataset_row",
+           "learned_row", "notices", "results_folder", "show_doubts", "solved", "start", "table",
+           "vehicle_row"]

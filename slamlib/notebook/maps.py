@@ -10,21 +10,23 @@ MAP_HEIGHTS = 2.6, 4.6             # inches: lowest and highest axes
 MIN_POINT_VARIANCE = 1.0       # rad^2, variance of the heading of a marker without orientation
 TICK_LENGTH = 0.022            # of a marker's heading tick, in the map's extent
 ELLIPSE_COUNT = 24             # ellipses of the vehicle, at equal distances along the path
-MAX_SEMI_AXIS = 0.09           # of the largest ellipse, in the map's extent
-NAME, ANTENNA_NAME = 6.2, 10.0     # points, font sizes of the names of markers and antennas
+OUTLINE = np.linspace(0, 2 * np.pi, 12, endpoint=False)    # rad, points of ellipses to leave free
+NAME, ANTENNA_NAME = 7.0, 10.5     # points, font sizes of the names of markers and antennas
 # Directions from a landmark to its name, in rad, tried in this order.
 NAME_DIRECTIONS = np.radians([40, 140, -40, -140, 90, -90, 0, 180, 65, 115, -65, -115, 20, 160])
 NAME_DISTANCES = 4.0, 6.0, 9.0, 13.0       # points, from a landmark to its name's box
 # Costs: of a covered name, landmark or path point, and of a point of distance.
-OVERLAP, LANDMARK, PATH, FAR = 100.0, 30.0, 1.0, 0.6
+OVERLAP, LANDMARK, PATH, FAR = 100.0, 30.0, 2.0, 0.6
+MAX_COST = 12.0                # of a marker's name, which else is left out
 
 
 def whole_map(drive, result):
     """The figure of a Drive's map: path, markers, antennas, their names, and truth if known.
 
-    `result` is a SlamResult. Ellipses hold 95 %; the title states how much they are enlarged. Those
-    of antennas in doubt have their true size, because they may be as large as the map. A question
-    mark stands at the names of antennas in doubt and of markers that nothing confirms.
+    `result` is a SlamResult. Ellipses hold 95 %; the title states how much they are enlarged, which
+    is `plotting.enlargement` of the vehicle's. Those of antennas in doubt have their true size,
+    because they may be as large as the map. A question mark stands at the names of antennas in
+    doubt and of markers that nothing confirms. A marker's name without a free place is left out.
     """
     guess, truth, places = drive.dataset.antenna_guess, drive.truth, result.marker_in_world
     guess = None if guess is None else plotting.places_by_id(
@@ -34,7 +36,7 @@ def whole_map(drive, result):
                             *([] if guess is None else [guess])])
     extent = np.maximum(np.nanmax(shown, axis=0) - np.nanmin(shown, axis=0), 0.1)
     height = np.clip((MAP_WIDTH - 0.7) * extent[1] / extent[0], *MAP_HEIGHTS) + 1.1
-    enlarged = _enlargement(result, doubt, extent.max())
+    enlarged = plotting.enlargement(result.poses, result.covariances)
     fig, ((ax,),) = plotting.panels(1, width=MAP_WIDTH, height=height)
     role, some = ("slam_uwb" if len(result.antenna) else "slam",
                   plotting.equidistant(result.poses, ELLIPSE_COUNT))
@@ -60,29 +62,23 @@ def whole_map(drive, result):
     ax.set_title(f"{plotting.literal(drive.name)} (95 % ellipses{factor * (enlarged > 1)})")
     plotting.legend_below(fig)
     weak = np.isin(result.marker, result.unconfirmed)
+    variances, axes = np.linalg.eigh(result.marker_covariance[:, :2, :2])
+    outlines = places[:, :2, None] + enlarged * evaluation.REACH_95 * axes * np.sqrt(
+        np.maximum(variances, 0))[:, None] @ [np.cos(OUTLINE), np.sin(OUTLINE)]
     write_names(ax, [
         *((f"{name}{'?' * int(unsure)}", place, ANTENNA_NAME) for name, place, unsure in zip(
             result.antenna, result.antenna_in_world, doubt, strict=True)),
         *((f"{name}{'?' * int(unsure)}", place[:2], NAME) for name, place, unsure in zip(
-            result.marker, places, weak, strict=True))], result.poses[::10, :2])
+            result.marker, places, weak, strict=True))],
+        np.concatenate([result.poses[::10, :2], *outlines.swapaxes(1, 2)]))
     return fig
-
-
-def _enlargement(result, doubt, size):
-    """Factor 1, 2, 5, 10, ... on the ellipses, with which nearly all fit MAX_SEMI_AXIS."""
-    covariances = np.concatenate([result.marker_covariance[:, :2, :2],
-                                  result.antenna_covariance[~doubt]])
-    if not len(covariances):
-        return plotting.enlargement(result.poses, result.covariances, MAX_SEMI_AXIS)
-    semi_axes = evaluation.REACH_95 * np.sqrt(np.linalg.eigvalsh(covariances)[:, 1])
-    return plotting.round_factor(np.quantile(semi_axes, 0.95), MAX_SEMI_AXIS * size)
 
 
 def write_names(ax, names, path):
     """Write names beside landmarks where they cover least, once the figure has its legend.
 
     `names` is a list of (name, place (2,), font size in points), `path` (m, 2) are points that
-    names should leave free.
+    names should leave free. A name of size NAME that costs more than MAX_COST is left out.
     """
     ax.figure.draw_without_rendering()                            # fixes the axes
     renderer, frame, boxes = ax.figure.canvas.get_renderer(), ax.bbox, np.empty((0, 4))
@@ -106,7 +102,10 @@ def write_names(ax, names, path):
         names_hit = ((low[:, None] < boxes[:, 2:]) & (high[:, None] > boxes[:, :2])).all(axis=2)
         points_hit = ((covered > low[:, None]) & (covered < high[:, None])).all(axis=2)
         outside = (low < frame.min).any(axis=1) | (high > frame.max).any(axis=1)
-        best = np.argmin(OVERLAP * (names_hit.sum(axis=1) + outside) + points_hit @ weight
-                         + FAR * reach)
+        cost = OVERLAP * (names_hit.sum(axis=1) + outside) + points_hit @ weight + FAR * reach
+        best = np.argmin(cost)
+        if size == NAME and cost[best] > MAX_COST:
+            text.remove()
+            continue
         text.set_position(offset[best] / point)
         boxes = np.vstack([boxes, [*low[best], *high[best]]])

@@ -39,6 +39,8 @@ ROLES = {
     "true antenna": dict(color="black", linestyle="none", marker="+", markersize=9, zorder=6),
 }
 
+MAX_SEMI_AXIS = 0.08         # of enlarged 95 % ellipses, in the larger extent of the path
+
 
 def use_style():
     """Set the style of all later figures of this process."""
@@ -198,18 +200,13 @@ def places_by_id(ids, places, wanted):
         len(wanted), len(none))
 
 
-def enlargement(poses, covariances, share=0.15):
-    """Factor 1, 2, 5, 10, ... with which no 95 % semi-axis exceeds this share of the extent."""
+def enlargement(poses, covariances):
+    """The largest factor 1, 2, 5, 10, ..., 5000 on 95 % ellipses that fit MAX_SEMI_AXIS, or 1."""
     known = np.isfinite(poses[:, 0])
-    extent = np.ptp(poses[known, :2], axis=0).max()
+    limit = MAX_SEMI_AXIS * np.ptp(poses[known, :2], axis=0).max()
     largest = REACH_95 * np.sqrt(np.linalg.eigvalsh(covariances[known, :2, :2])[:, 1].max())
-    return round_factor(largest, share * extent) if largest > 0 else 1
-
-
-def round_factor(length, limit):
-    """The largest factor 1, 2, 5, 10, ..., 5000 with which a length is within a limit, or 1."""
     factors = np.outer(10 ** np.arange(4), [1, 2, 5]).ravel()
-    return int(max(factors[factors * length <= limit], default=1))
+    return int(max(factors[factors * largest <= limit], default=1)) if largest > 0 else 1
 
 
 def equidistant(poses, count=14):

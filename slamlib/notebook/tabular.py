@@ -7,7 +7,11 @@ from IPython.display import Markdown
 
 from slamlib import evaluation
 from slamlib.notebook.plotting import estimates, places_by_id
+from slamlib.odometry import dead_reckoning
 from slamlib.slam.calibration import RANGES
+from slamlib.slam.fit import ONE_SIDED
+from slamlib.slam.measurements import NOISE_KEYS
+from slamlib.studies.kernels import mislabelled
 
 DASH = "–"
 NUMERIC = re.compile(rf"[-+−>]? ?\d|{DASH}")          # begins a cell of a column of numbers
@@ -72,6 +76,25 @@ def _over_drives(values):
     return text + (unit or f" ({number(np.median(values), decimals)})")
 
 
+def dataset_row(drive):
+    """Row of `table` on what a Drive has: poses, length of the path, counts of measurements."""
+    d = drive.dataset
+    return {"dataset": drive.name, "origin": drive.origin, "encoder poses": len(d.ticks),
+            "path by odometry (m)": evaluation.path_length(dead_reckoning(d.ticks, d.vehicle)),
+            **{name: f"{len(each.pose):,} at {len(np.unique(each.pose)):,} poses"
+               for name, each in (("marker sightings", d.aruco), ("UWB ranges", d.uwb)) if each}}
+
+
+def vehicle_row(drive):
+    """Row of `table` on what is stated of a Drive's vehicle and noise."""
+    v = drive.dataset.vehicle
+    wheel = {name: f"{mean:g} ± {sigma:g}" for name, mean, sigma in zip(
+        ("$R_R$ (m)", "$R_L$ (m)", "$b$ (m)"), v.wheel, v.sigma_wheel, strict=True)}
+    return {"dataset": drive.name, **wheel, "$n_0$": f"{v.ticks_per_revolution:g}",
+            r"$\sigma_\delta$ (rad)": f"{v.sigma_heading:g}",
+            **{f"`{key}`": getattr(v, key) for key in NOISE_KEYS}}
+
+
 def accuracy(result, drive):
     """Row of `table` on what a solver found of a Drive: median sigmas, errors where truth is known.
 
@@ -91,11 +114,31 @@ def accuracy(result, drive):
                   "NEES, median": np.median(nees) if len(nees) else None}
 
 
+def learned_row(result, drive):
+    """Row of `table` on what a SlamResult learned of a Drive's noise and rejected.
+
+    The truth of a simulated Drive says how many wrong labels are rejected. A kernel for ranges
+    alone is absent, because sightings then count in full within the gate.
+    """
+    vehicle, (factor, sigma) = drive.dataset.vehicle, (result.noise.sightings, result.noise_sigma)
+    row = {"dataset": drive.name, "gate": vehicle.gate,
+           "kernel": None if vehicle.kernel in ONE_SIDED else vehicle.kernel,
+           "slip (mm)": f"{1e3 * result.slip:.2f} ± {1e3 * result.slip * sigma[0]:.2f}",
+           "factor": f"{factor:.2f} ± {factor * sigma[1]:.2f}", "step": result.model,
+           "χ²/dof, all": result.chi2_per_dof_of_all, "accepted": result.chi2_per_dof,
+           "sightings": len(result.rejected), "rejected": result.rejected.sum()}
+    if drive.origin == "simulated":
+        wrong = mislabelled(result.fit.problem.measurements, drive.truth)
+        row["of wrong labels"] = f"{(wrong & result.rejected).sum()} of {wrong.sum()}"
+    return row
+
+
 def calibration_rows(result, drive):
     """Rows of `table` on the entries of a SlamResult's calibration: stated, estimated, true, used.
 
     The true value is that of the wheels of a simulated Drive. Without ranges their entries have no
     row; offsets of single antennas, which are stated as zero, have one where they are estimated.
+    The last one is the factor on the standard deviations of the ranges.
     """
     own = slice(None) if len(result.antenna) else slice(RANGES.start)
     for entry in result.calibration_table[own]:
@@ -110,6 +153,12 @@ def calibration_rows(result, drive):
                "estimated": f"{entry['estimate']:{digits}} ± {sigma:{digits}}" if sigma else None,
                "true": None if true is None else f"{true:{digits}}",
                "used": "statement" if not sigma else "estimate" if entry["released"] else "both"}
+    if len(result.antenna):
+        given, factor = drive.dataset.vehicle.range_noise_factor, result.noise.ranges
+        sigma = factor * result.noise_sigma[2]
+        yield {"dataset": drive.name, "entry": "`range_noise_factor`", "unit": DASH,
+               "stated": given, "estimated": None if given else f"{factor:.2f} ± {sigma:.2f}",
+               "used": "statement" if given else "estimate"}
 
 
 def antenna_rows(result, drive):

@@ -21,10 +21,8 @@ from slamlib.slam.measurements import measure, with_known_noise
 from slamlib.slam.result import slam_result
 from slamlib.studies.montecarlo import antenna_error, drive
 
-# Kernel and gate of every method, and those that late ranges and wrong labels are met with.
+# Kernel and gate of every method.
 METHODS = {name: (name, name in ONE_SIDED) for name in KERNELS} | {"gate": ("quadratic", True)}
-RANGE_METHODS = ("quadratic", "Huber", "Cauchy", "asymmetric Tukey")
-SIGHTING_METHODS = ("Huber", "Cauchy", "Geman-McClure", "Tukey", "gate")
 MIN_MISLABELLED_SQUARED = 50.0             # squared Mahalanobis distance of a wrong label; a right
                                            # one reaches it once in ten billion sightings
 
@@ -47,48 +45,36 @@ def solve_with(measurements, start, sightings="gate", ranges="asymmetric Tukey")
         accepted_measurements, sightings=METHODS[sightings], ranges=METHODS[ranges]))
 
 
-def late_ranges(seed, markers=True, methods=RANGE_METHODS, **options):
-    """METHODS for ranges on one `drive`, with or without markers, the slip and the arcs given.
+def compare(seed, kind, methods, markers=True, **options):
+    """METHODS for a `kind`, "sightings" or "ranges", on one `drive`, the slip and the arcs given.
+
+    Ranges are compared with or without `markers`, sightings without ranges.
 
     Returns
     -------
-    dict of numbers for each method: "ate" and rms "antenna error" in m, "nees", "antenna nees".
+    dict of numbers for each method: "ate" in m and "nees"; of ranges the rms "antenna error" in m
+    and "antenna nees"; of sightings the shares "wrong rejected" of the wrong labels (NaN without
+    any) and "good lost" of the others that keep less than half of their weight.
     """
     dataset, truth = drive(seed, **options)
-    dataset, numbers = dataset if markers else dataset.without("aruco"), {}
-    measurements = measure(with_known_noise(dataset, TYPICAL_SLIP, 1.0, 1.0))
-    start = rounds(measurements)
-    for method in methods:
-        found = slam_result(solve_with(measurements, start, ranges=method))
-        error, squared = antenna_error(found, truth)
-        numbers |= {f"{method} ate": ate(found.poses, truth.poses),
-                    f"{method} nees": anees(found.poses, found.covariances, truth.poses),
-                    f"{method} antenna error": np.sqrt(np.mean(error**2)),
-                    f"{method} antenna nees": np.mean(squared)}
-    return numbers
-
-
-def wrong_labels(seed, methods=SIGHTING_METHODS, **options):
-    """METHODS for sightings on one `drive`, the slip and the arcs given.
-
-    Returns
-    -------
-    dict of numbers for each method: "ate" in m, "nees"; the shares "wrong rejected" of the wrong
-    labels (NaN without any) and "good lost" of the others that keep less than half of their weight.
-    """
-    dataset, truth = drive(seed, **options)
-    dataset, numbers = dataset.without("uwb"), {}
+    dataset = dataset if markers else dataset.without("aruco")
+    dataset, numbers = dataset if kind == "ranges" else dataset.without("uwb"), {}
     measurements = measure(with_known_noise(dataset, TYPICAL_SLIP, 1.0, 1.0))
     wrong, start = mislabelled(measurements, truth), rounds(measurements)
     for method in methods:
-        fit = solve_with(measurements, start, sightings=method)
+        fit = solve_with(measurements, start, **{kind: method})
         found = slam_result(fit)
-        each = residuals(fit.problem, fit.state)
-        lost = kept_weights(fit.problem.accepted, *each)[0] < 0.5
         numbers |= {f"{method} ate": ate(found.poses, truth.poses),
-                    f"{method} nees": anees(found.poses, found.covariances, truth.poses),
-                    f"{method} wrong rejected": lost[wrong].mean() if wrong.any() else np.nan,
-                    f"{method} good lost": lost[~wrong].mean()}
+                    f"{method} nees": anees(found.poses, found.covariances, truth.poses)}
+        if kind == "ranges":
+            error, squared = antenna_error(found, truth)
+            numbers |= {f"{method} antenna error": np.sqrt(np.mean(error**2)),
+                        f"{method} antenna nees": np.mean(squared)}
+        else:
+            each = residuals(fit.problem, fit.state)
+            lost = kept_weights(fit.problem.accepted, *each)[0] < 0.5
+            numbers |= {f"{method} wrong rejected": lost[wrong].mean() if wrong.any() else np.nan,
+                        f"{method} good lost": lost[~wrong].mean()}
     return numbers
 
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from slamlib import localization, odometry, slam
-from slamlib.evaluation import anees, ate, nees, position_sigmas
+from slamlib.evaluation import anees, ate, position_sigmas
 from slamlib.localization.hint import first_order_from
 from slamlib.sightings import sightings_by_frame
 from slamlib.simulation import simulate
@@ -23,7 +23,7 @@ PROBLEM2_METHODS = {
     "hint": localization.fuse_increments,
     "exact hint": lambda dataset: localization.fuse_increments(dataset, first_order_from),
     "fused": localization.fuse}
-MEMORY_METHODS = ("markers", "fused", "problem 3", "independent")
+MEMORY_METHODS = ("markers", "problem 3", "independent")
 
 
 def drive(seed, poses=None, **options):
@@ -37,9 +37,8 @@ def problem2_trial(seed, methods=tuple(PROBLEM2_METHODS), **options):
 
     Returns
     -------
-    dict of numbers for each of `methods`: "nees", the mean over the measured poses, "last nees" and
-    "ate" in m (of odometry the ATE only). With "ArUco" there is "map nees", with "fused" there are
-    "wheel nees" and "slip" in sqrt(m).
+    dict of numbers for each of `methods`: "nees", the mean over the measured poses, and "ate" in m
+    (of odometry the ATE only).
     """
     dataset, truth = drive(seed, **options)
     frame, numbers = sightings_by_frame(dataset.aruco).frame, {}
@@ -51,12 +50,7 @@ def problem2_trial(seed, methods=tuple(PROBLEM2_METHODS), **options):
         measured = slice(None) if len(found.poses) == len(frame) else frame
         poses, covariances = found.poses[measured], found.covariances[measured]
         numbers |= {f"{method} nees": anees(poses, covariances, truth.poses[frame]),
-                    f"{method} last nees": nees(poses, covariances, truth.poses[frame])[-1],
                     f"{method} ate": ate(poses, truth.poses[frame])}
-        if method == "ArUco":
-            numbers["map nees"] = map_nees(found, truth).mean()
-        if method == "fused":
-            numbers |= {"wheel nees": wheel_nees(found, truth), "slip": found.slip}
     return numbers
 
 
@@ -86,7 +80,7 @@ def correlated_errors(seed, correlation, **options):
 
     Returns
     -------
-    dict of "nees" and aligned "ate" in m of MEMORY_METHODS, as "fused nees"; "independent" is
+    dict of "nees" and aligned "ate" in m of MEMORY_METHODS, as "markers nees"; "independent" is
     problem 3 without a memory of errors. Also of problem 3 the mean "share" of its information that
     a sighting keeps, and the "residuals", the correlation of those of neighbours.
     """
@@ -96,8 +90,7 @@ def correlated_errors(seed, correlation, **options):
     problem = problem3.fit.problem
     white = replace(problem, accepted=replace(problem.accepted, share=None))
     independent = slam_result(refine(white, problem3.fit.state, accept=None))
-    for name, found in zip(MEMORY_METHODS, (
-            markers, localization.fuse(dataset), problem3, independent)):
+    for name, found in zip(MEMORY_METHODS, (markers, problem3, independent)):
         true = truth.poses[getattr(found, "frame", slice(None))]
         numbers |= {f"{name} nees": anees(found.poses, found.covariances, true),
                     f"{name} ate": ate(found.poses, true, aligned=True)}
@@ -110,15 +103,3 @@ def antenna_error(found, truth):
         np.searchsorted(truth.antenna, found.antenna)]
     return np.hypot(*error.T), np.einsum(
         "ni,nij,nj->n", error, np.linalg.inv(found.antenna_covariance), error)
-
-
-def map_nees(found, truth):
-    """NEES (k,) of the markers of a SlamResult or a Localization."""
-    true_map = truth.marker_in_world[np.searchsorted(truth.marker, found.marker)]
-    return nees(found.marker_in_world, found.marker_covariance, true_map)
-
-
-def wheel_nees(found, truth):
-    """Squared error of the wheel parameters over their covariance."""
-    error = found.wheel - truth.vehicle.wheel
-    return error @ np.linalg.solve(found.wheel_covariance, error)

@@ -28,20 +28,14 @@ def first_sighting(measurements, in_world, covariances):
     return in_world[np.unique(measurements.marker_row, return_index=True)[1]]
 
 
-def most_certain_sighting(measurements, in_world, covariances):
-    """(k, 3) markers at the sighting of least covariance determinant; parameters as above."""
-    label = measurements.marker_row
-    order = np.lexsort((np.linalg.slogdet(covariances)[1], label))
-    return in_world[order[np.unique(label[order], return_index=True)[1]]]
-
-
 def mean_by_information(measurements, in_world, covariances):
     """(k, 3) markers at the mean of their sightings, weighted by information.
 
     Parameters as of `consensus_markers`. Angles are averaged about the most certain sighting's.
     """
     m = measurements
-    middle = most_certain_sighting(m, in_world, covariances)
+    order = np.lexsort((np.linalg.slogdet(covariances)[1], m.marker_row))
+    middle = in_world[order[np.unique(m.marker_row[order], return_index=True)[1]]]
     difference = in_world - middle[m.marker_row]
     difference[:, 2] = se2.wrap(difference[:, 2])
     information = np.linalg.inv(covariances)
@@ -65,9 +59,8 @@ def map_of_problem_2(measurements, in_world, covariances):
     return markers
 
 
-LANDMARKS = {"first sighting": first_sighting, "most certain sighting": most_certain_sighting,
-             "mean by information": mean_by_information, "consensus": consensus_markers,
-             "problem 2's map": map_of_problem_2}
+LANDMARKS = {"first sighting": first_sighting, "mean by information": mean_by_information,
+             "consensus": consensus_markers, "problem 2's map": map_of_problem_2}
 
 
 def guessed_antennas(measurements, poses, covariances, c):
