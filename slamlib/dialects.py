@@ -21,13 +21,12 @@ class Limit:
     """The closed interval in which a number lies."""
 
     minimum: float
-    maximum: float | str     # a str names the entry of the same file that is the maximum
+    maximum: float
     unit: str = ""
     whole: bool = False
 
     def __str__(self):
-        maximum = self.maximum if isinstance(self.maximum, str) else f"{self.maximum:g}"
-        return f"from {self.minimum:g} to {maximum} {self.unit}".rstrip()
+        return f"from {self.minimum:g} to {self.maximum:g} {self.unit}".rstrip()
 
 
 _ANY = Limit(-1e15, 1e15)               # float64 represents whole numbers up to there exactly

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from scipy.io import loadmat
 
-from slamlib.textfile import DatasetError, error, quoted
+from slamlib.textfile import error, quoted
 
 ENCODER = "encoderReading.txt"
 # Names of the tables, of all files of a dataset, and of those in its folder `truth`.
@@ -65,11 +65,8 @@ def contents(folder, expected=DATASET_FILES, required=None):
 
 
 def is_dataset(folder):
-    """True if a folder (Path) holds files of a dataset."""
-    try:
-        return bool(contents(folder)[0])
-    except DatasetError:
-        return True
+    """True if a folder (Path) holds files of a dataset; raises what `contents` raises."""
+    return bool(contents(folder)[0])
 
 
 def left_in(data):

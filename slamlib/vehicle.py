@@ -1,7 +1,7 @@
 """The vehicle: wheels and sensors as stated, how well they are known, and its encoders' counts."""
 
 import json
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from numbers import Real
 
 import numpy as np
@@ -36,9 +36,9 @@ class Vehicle:
     left_radius: float = _number(0.1, 1e-3, 2.5, "m")
     wheelbase: float = _number(0.4, 1e-3, 20, "m")
     ticks_per_revolution: float = _number(8000.0, 1, 1e10)
-    sigma_right_radius: float = _number(1e-4, 1e-9, "right_radius", "m")
-    sigma_left_radius: float = _number(1e-4, 1e-9, "left_radius", "m")
-    sigma_wheelbase: float = _number(1e-4, 1e-9, "wheelbase", "m")
+    sigma_right_radius: float = _number(1e-4, 1e-9, 2.5, "m")
+    sigma_left_radius: float = _number(1e-4, 1e-9, 2.5, "m")
+    sigma_wheelbase: float = _number(1e-4, 1e-9, 20, "m")
     sigma_heading: float = _number(1e-4, 1e-9, 10, "rad")  # of the heading at pose 1
     slip: float | None = _number(None, 0, 0.1, "sqrt(m)")  # sigma after 1 m; None: learned
     marker_noise_factor: float | None = _number(None, 0.01, 100)  # of sigmas in ArucoReading.txt
@@ -112,21 +112,21 @@ def changed(vehicle, entries, source, lines=None):
     Raises DatasetError for one that is not within its Limit, with the `source`, a file or a
     function, and the line, if `lines` has it by name.
     """
-    values = asdict(vehicle)
-    for key in sorted(entries, key=list(VEHICLE_LIMITS).index):    # a parameter before its sigma
-        value, limit = entries[key], VEHICLE_LIMITS[key]
+    values = {}
+    for key, value in entries.items():
+        limit = VEHICLE_LIMITS[key]
         if isinstance(limit, tuple):
             ok = isinstance(value, type(limit[0])) and value in limit
             expected = " or ".join(map(json.dumps, limit))
         else:
             ok = isinstance(value, Real) and not isinstance(value, bool) \
-                and limit.minimum <= value <= values.get(limit.maximum, limit.maximum)
+                and limit.minimum <= value <= limit.maximum
             expected = f"a number {limit}"
         if not ok:
             raise error(source, f"expected {expected} for {key}, found {quoted(value)}",
                         (lines or {}).get(key))
         values[key] = value if isinstance(limit, tuple) else float(value)
-    return Vehicle(**values)
+    return replace(vehicle, **values)
 
 
 def incremental_counts(table, vehicle):

@@ -79,7 +79,7 @@ def changed_at(place, value):
     ({"guess": lambda a: np.r_[a, a]}, "guess, row 5: expected each id only once"),
     ({"vehicle": lambda _: "tractor"}, "vehicle: expected a Vehicle, found 'tractor'"),
     ({"vehicle": lambda _: Vehicle(sigma_wheelbase=-1.0)}, "vehicle: expected a number from 1e-09 "
-     "to wheelbase m for sigma_wheelbase, found '-1.0'"),
+     "to 20 m for sigma_wheelbase, found '-1.0'"),
     ({"vehicle": lambda _: Vehicle(kernel="L2")}, 'vehicle: expected "asymmetric Tukey" or'),
 ])
 def test_arguments_pass_the_checks_of_files_or_are_named_with_the_row(

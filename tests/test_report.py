@@ -222,7 +222,7 @@ def test_bad_data_and_bad_notebooks_are_told_before_a_kernel_starts(tmp_path):
     make_data(tmp_path)
     write(tmp_path / "notebooks", "1_text", "# Text", ("raise SystemExit('never reached')",))
     (tmp_path / "data" / "long" / "encoderReading.txt").write_text("1 0 0\n2 1\n")
-    with pytest.raises(DatasetError, match="encoderReading.txt, line 2: expected 3 columns"):
+    with pytest.raises(DatasetError, match="encoderReading.txt, line 2: expected 3 numbers"):
         build(tmp_path)
     broken = tmp_path / "notebooks" / "2_broken.ipynb"
     for content, reason in (
