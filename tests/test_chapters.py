@@ -44,10 +44,14 @@ def test_captions_are_in_order_and_a_chapter_ends_with_what_was_learned_and_try_
 
 
 @pytest.mark.parametrize("source", CHAPTERS, ids=lambda path: path.stem)
-def test_code_is_short_and_what_pages_fold_is_collapsed_in_jupyterlab(source):
+def test_code_is_short_and_mostly_shown_and_what_pages_fold_is_collapsed_in_jupyterlab(source):
     code = cells_of(source)
     assert max(len(cell.source.splitlines()) for cell in code) <= 25
-    assert sum(bool(line.strip()) for cell in code for line in cell.source.splitlines()) <= 260
+    lines = {tag: sum(bool(line.strip()) for cell in code if has(cell, tag) or tag == "all"
+                      for line in cell.source.splitlines())
+             for tag in ("all", "hide-input", "lab-only")}
+    assert lines["all"] <= 260
+    assert lines["hide-input"] < (lines["all"] - lines["lab-only"]) / 2
     for cell in code:
         assert cell.metadata.get("jupyter", {}).get("source_hidden", False) == has(
             cell, "hide-input")

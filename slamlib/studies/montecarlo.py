@@ -23,7 +23,7 @@ PROBLEM2_METHODS = {
     "hint": localization.fuse_increments,
     "exact hint": lambda dataset: localization.fuse_increments(dataset, first_order_from),
     "fused": localization.fuse}
-MEMORY_METHODS = ("markers", "problem 3", "independent")
+MEMORY_METHODS = ("markers", "problem 3", "known", "independent")
 
 
 def drive(seed, poses=None, **options):
@@ -80,21 +80,37 @@ def correlated_errors(seed, correlation, **options):
 
     Returns
     -------
-    dict of "nees" and aligned "ate" in m of MEMORY_METHODS, as "markers nees"; "independent" is
-    problem 3 without a memory of errors. Also of problem 3 the mean "share" of its information that
-    a sighting keeps, and the "residuals", the correlation of those of neighbours.
+    dict of "nees" and aligned "ate" in m of MEMORY_METHODS, as "markers nees"; "known" is problem 3
+    with the `known_shares` of information, "independent" with all of it. Also of problem 3 the mean
+    "share" of its information that a sighting keeps, and the "residuals", the correlation of those
+    of neighbours.
     """
     dataset, truth = drive(seed, memory=correlation, **options)
     dataset, markers = dataset.without("uwb"), localization.localize(dataset.aruco)
     problem3, numbers = slam.estimate(dataset), {}
     problem = problem3.fit.problem
-    white = replace(problem, accepted=replace(problem.accepted, share=None))
-    independent = slam_result(refine(white, problem3.fit.state, accept=None))
-    for name, found in zip(MEMORY_METHODS, (markers, problem3, independent)):
+    known, independent = (slam_result(refine(replace(problem, accepted=replace(
+        problem.accepted, share=share)), problem3.fit.state, accept=None))
+        for share in (known_shares(problem.measurements, correlation), None))
+    for name, found in zip(MEMORY_METHODS, (markers, problem3, known, independent)):
         true = truth.poses[getattr(found, "frame", slice(None))]
         numbers |= {f"{name} nees": anees(found.poses, found.covariances, true),
                     f"{name} ate": ate(found.poses, true, aligned=True)}
     return numbers | {"share": problem3.share.mean(), "residuals": problem3.correlation[0, 0]}
+
+
+def known_shares(measurements, correlation):
+    """Shares (s,) of its information that a sighting keeps, by the true correlation of errors.
+
+    The design effect, as in slamlib.memory: 1 / (1 + sum of the correlations with the errors of all
+    other sightings of its marker), which is `correlation` to the power of the number of camera
+    frames between them.
+    """
+    g, label = measurements.sightings, measurements.marker_row
+    pose = measurements.frame[g.row]
+    lag = np.abs(pose[:, None] - pose) / np.median(np.diff(np.unique(pose)))
+    same = label[:, None] == label
+    return 1 / np.sum(same * np.where(lag > 0, correlation**lag, 1.0), axis=1)
 
 
 def antenna_error(found, truth):
