@@ -172,7 +172,6 @@ def _slam_facts(dataset, found):
     """Noise, calibration and doubtful landmarks of a SlamResult."""
     facts = _noise_facts(found) | {
         "increments": found.model, "unconfirmed": found.unconfirmed.tolist(),
-        "chi2_per_dof": found.chi2_per_dof,
         "calibration": [row for row in found.calibration_table if row["sigma"]]}
     if len(found.rejected):
         facts["marker_noise_factor"] = found.noise.sightings

@@ -9,7 +9,6 @@ from slamlib import slam
 from slamlib.evaluation import ate, nees
 from slamlib.simulation import simulate
 from slamlib.slam.linear import state_from_arrays
-from slamlib.slam.measurements import with_known_noise
 from slamlib.studies.montecarlo import antenna_error
 
 
@@ -37,7 +36,8 @@ def changed(dataset, sensor, **fields):
 
 def known_noise(dataset, slip):
     """The Dataset of a drive with this slip in sqrt(m), and the noise that its files state."""
-    return with_known_noise(dataset, slip, marker_noise_factor=1.0, range_noise_factor=1.0)
+    return replace(dataset, vehicle=replace(
+        dataset.vehicle, slip=slip, marker_noise_factor=1.0, range_noise_factor=1.0))
 
 
 def map_nees(found, truth):
@@ -68,7 +68,7 @@ def slam_trial(seed, ranges=True, markers=True, **options):
     numbers = {"nees": np.nanmean(values[frames]), "nees between": np.nanmean(values[~frames]),
                "last nees": values[-1], "wheel nees": wheel_nees(found, truth),
                "ate": ate(found.poses, truth.poses), "slip": found.slip,
-               "chi2": found.chi2_per_dof, "arc": float(found.model == "arc")}
+               "factor": found.noise.sightings, "arc": float(found.model == "arc")}
     if markers:
         true_map = truth.marker_in_world[np.searchsorted(truth.marker, found.marker)]
         numbers |= {"map nees": map_nees(found, truth).mean(),

@@ -125,7 +125,6 @@ def learned_row(result, drive):
            "kernel": None if vehicle.kernel in ONE_SIDED else vehicle.kernel,
            "slip (mm)": f"{1e3 * result.slip:.2f} ± {1e3 * result.slip * sigma[0]:.2f}",
            "factor": f"{factor:.2f} ± {factor * sigma[1]:.2f}", "step": result.model,
-           "χ²/dof, all": result.chi2_per_dof_of_all, "accepted": result.chi2_per_dof,
            "sightings": len(result.rejected), "rejected": result.rejected.sum()}
     if drive.origin == "simulated":
         wrong = mislabelled(result.fit.problem.measurements, drive.truth)

@@ -11,7 +11,7 @@ kernels and values of the noise.
 """
 
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import gtsam
@@ -57,13 +57,6 @@ class Noise:
     def from_logarithms(cls, logarithms):
         """The Noise of `logarithms` (3,)."""
         return cls(*np.exp(logarithms).tolist())
-
-
-def with_known_noise(dataset, slip=None, marker_noise_factor=None, range_noise_factor=None):
-    """The Dataset whose Vehicle has these noise parameters; None leaves that of the Vehicle."""
-    values = zip(NOISE_KEYS, (slip, marker_noise_factor, range_noise_factor))
-    return replace(dataset, vehicle=replace(dataset.vehicle, **{
-        key: value for key, value in values if value is not None}))
 
 
 def is_known(vehicle):

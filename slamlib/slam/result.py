@@ -16,8 +16,7 @@ from slamlib.slam.calibration import WHEELS, Calibration, calibration_table
 from slamlib.slam.covariances import posterior_moments
 from slamlib.slam.fit import Fit, kept_weights, residuals
 from slamlib.slam.initialization import SAME_PLACE, ranges_by_antenna, second_moment, trilaterate
-from slamlib.slam.linear import NormalEquations
-from slamlib.slam.measurements import GUESS_PRIOR_SIGMA, AcceptedMeasurements, Noise
+from slamlib.slam.measurements import GUESS_PRIOR_SIGMA, Noise
 from slamlib.slam.noise import error_memories
 
 MIN_ACCEPTED_RANGES = 5      # number of accepted ranges of an antenna that is not in doubt
@@ -50,8 +49,6 @@ class SlamResult:
     noise_sigma: np.ndarray         # (3,) of its logarithms, 0 where not learned
     model: str                      # "arc" or "euler", as given or chosen
     log_evidence: float             # Laplace, up to a constant of dataset and accepted measurements
-    chi2_per_dof: float             # of the accepted measurements, by the files' covariances
-    chi2_per_dof_of_all: float      # the same of all measurements
     rejected: np.ndarray            # (s,) bool, beyond the gate, rows of Measurements.sightings
     range_weight: np.ndarray        # (r,) share of its information that each range keeps, 0 to 1
     range_residual: np.ndarray      # (r,) whitened, positive for a range that is too long
@@ -116,7 +113,7 @@ def slam_result(fit):
     poses, pose_covariances = interpolate(
         replace(problem, noise=replace(problem.noise, slip=slip)), state, marginal.pairs)
     residual, range_residual = residuals(problem, state)
-    sighting_weight, range_weight = kept_weights(problem.accepted, residual, range_residual)
+    _, range_weight = kept_weights(problem.accepted, residual, range_residual)
     markers, antennas = np.split(marginal.landmarks, [len(m.marker)])
     best = np.full(len(m.marker), np.inf)         # a point has the heading of its best sighting
     np.minimum.at(best, m.marker_row, m.sightings.C[:, 2, 2])
@@ -137,8 +134,6 @@ def slam_result(fit):
         noise=problem.noise, noise_sigma=np.zeros(3) if fit.posterior is None
         else np.sqrt(np.diag(fit.posterior.covariance)),
         model=problem.odometry.model, log_evidence=float(fit.log_evidence),
-        chi2_per_dof=chi2_per_dof(problem, state, np.r_[sighting_weight, range_weight]),
-        chi2_per_dof_of_all=chi2_per_dof(problem, state, m.unit_weights),
         rejected=problem.accepted.rejected, range_weight=range_weight,
         range_residual=range_residual,
         share=np.concatenate(problem.accepted.shares), correlation=np.array([
@@ -201,23 +196,6 @@ def _doubt(ranges, estimate, weight, places, costs):
     if sigma > MAX_RELATIVE_SIGMA * distance:
         return "its ranges are too few or come from too few directions"
     return None
-
-
-def chi2_per_dof(problem, state, weight):
-    """Chi-squared by the covariances in the files, over its degrees of freedom.
-
-    With weights (s + r,), a measurement counts by its dimension times its weight, and a landmark
-    subtracts its dimension. Odometry and priors have as many errors as unknowns.
-    """
-    m = problem.measurements
-    sightings, ranges = m.by_kind(weight)
-    stated = replace(problem, noise=Noise(problem.noise.slip), accepted=AcceptedMeasurements(
-        measurements=m, weight=weight))
-    squared = 2 * NormalEquations(stated, state).error
-    used = np.bincount(m.marker_row, sightings * np.where(m.as_pose, 3, 2), len(m.marker))
-    freedom = np.sum(np.maximum(used - np.where(m.oriented, 3, 2), 0)) \
-        + np.sum(ranges) - 2 * len(m.antenna)
-    return float(squared / max(1, freedom))
 
 
 def interpolate(problem, state, pairs):

@@ -1,5 +1,6 @@
 """Comparison of kernels and gates against wrong labels and late ranges in the SLAM graph."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -17,7 +18,7 @@ from slamlib.slam.fit import (
 )
 from slamlib.slam.initialization import odometry_state, trilaterated_antennas
 from slamlib.slam.linear import build_problem, state_from_arrays
-from slamlib.slam.measurements import measure, with_known_noise
+from slamlib.slam.measurements import measure
 from slamlib.slam.result import slam_result
 from slamlib.studies.montecarlo import antenna_error, drive
 
@@ -59,7 +60,8 @@ def compare(seed, kind, methods, markers=True, **options):
     dataset, truth = drive(seed, **options)
     dataset = dataset if markers else dataset.without("aruco")
     dataset, numbers = dataset if kind == "ranges" else dataset.without("uwb"), {}
-    measurements = measure(with_known_noise(dataset, TYPICAL_SLIP, 1.0, 1.0))
+    measurements = measure(replace(dataset, vehicle=replace(
+        dataset.vehicle, slip=TYPICAL_SLIP, marker_noise_factor=1.0, range_noise_factor=1.0)))
     wrong, start = mislabelled(measurements, truth), rounds(measurements)
     for method in methods:
         fit = solve_with(measurements, start, **{kind: method})

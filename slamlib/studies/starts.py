@@ -14,7 +14,7 @@ from slamlib.slam.fit import CAUCHY_SCALES, narrow_kernels
 from slamlib.slam.graph import optimize
 from slamlib.slam.initialization import consensus_markers, odometry_state, state_from_poses
 from slamlib.slam.linear import build_problem, state_from_arrays
-from slamlib.slam.measurements import AcceptedMeasurements, measure, with_known_noise
+from slamlib.slam.measurements import AcceptedMeasurements, measure
 from slamlib.slam.result import slam_result
 from slamlib.studies.kernels import rounds, solve_with
 from slamlib.studies.montecarlo import antenna_error, drive
@@ -133,7 +133,8 @@ def guesses(seed, error, markers=True, **options):
     dataset, truth = drive(seed, **options)
     dataset = misguess(dataset if markers else dataset.without("aruco"), truth.antenna_in_world,
                        error, seed)
-    measurements = measure(with_known_noise(dataset, TYPICAL_SLIP, 1.0, 1.0))
+    measurements = measure(replace(dataset, vehicle=replace(
+        dataset.vehicle, slip=TYPICAL_SLIP, marker_noise_factor=1.0, range_noise_factor=1.0)))
     found = slam_result(solve_with(measurements, rounds(measurements)))
     untrilaterated = solve_with(measurements, rounds(measurements, guessed_antennas)).state.antennas
     from_guess = np.hypot(*(untrilaterated - truth.antenna_in_world).T)
