@@ -183,9 +183,8 @@ def read_dataset(folder):
 
 def _dataset(files, vehicle, name, notes=()):
     """The Dataset of this name by its Vehicle and the sources (dict) of its tables by name."""
-    encoders = _read_all_poses(files, ENCODER)
-    ticks = incremental_counts(encoders, vehicle)
-    notes = [*notes, *encoders.notes]
+    ticks, encoder_notes = incremental_counts(_read_all_poses(files, ENCODER), vehicle)
+    notes = [*notes, *encoder_notes]
     aruco = _read_aruco(files, len(ticks), notes)
     uwb, guess = _read_uwb(files, len(ticks), notes)
     return Dataset(name=name, vehicle=vehicle, ticks=ticks, aruco=aruco, uwb=uwb,

@@ -9,7 +9,9 @@ import numpy as np
 from slamlib.dialects import Limit
 from slamlib.textfile import error, quoted, read_toml
 
-MAX_REVOLUTIONS = 4.0  # revolutions of a wheel in one step; a wrapped counter makes more
+MAX_REVOLUTIONS = 10.0  # revolutions of a wheel in one step
+MODULI = 2**16, 2**15  # numbers of values of counters that wrap around
+MIN_MODULUS_RATIO = 32.0  # ratio of a modulus to a large step of the drive, for a decision
 MIN_REVOLUTIONS = 0.9  # revolutions that counts since the start span
 MAX_SMALL_STEP = 0.025  # of that span; larger changes from row to row are jumps of the counter
 MIN_SMALL_SHARE = 0.95  # of the changes
@@ -130,12 +132,16 @@ def changed(vehicle, entries, source, lines=None):
 
 
 def incremental_counts(table, vehicle):
-    """Counts since the previous pose, (n, 2) int64, of the Table of the encoders.
+    """Counts since the previous pose, (n, 2) int64, of the Table of the encoders, and its notes.
 
-    Raises DatasetError if the first row is not 0, a step exceeds MAX_REVOLUTIONS, or the counts are
-    since the start.
+    Those of a counter that wraps around are mended. Raises DatasetError if the first row is not 0,
+    a step exceeds MAX_REVOLUTIONS, or the counts are since the start.
     """
-    counts, limit = table.numbers[:, 1:], MAX_REVOLUTIONS * vehicle.ticks_per_revolution
+    read, limit = table.numbers[:, 1:], MAX_REVOLUTIONS * vehicle.ticks_per_revolution
+    counts = unwrapped(read)
+    if len(mended := np.flatnonzero((counts != read).any(axis=1))):
+        table = table.noted(f": {len(mended)} rows were mended whose counts are 2^15 or 2^16 off, as "
+                            f"of a counter that wraps around, the first in {table.place(mended[0])}")
     if since_start(counts, vehicle):
         raise error(table.source, "expected counts since the previous pose, found counts since the "
                     f"start, which change gradually up to {abs(counts).max():.0f}: take the "
@@ -144,7 +150,17 @@ def incremental_counts(table, vehicle):
     table.kept(np.pad(ok, ((0, 0), (1, 0)), constant_values=True), (
         f"at most {MAX_REVOLUTIONS:g} wheel revolutions ({limit:g} ticks) in one step, and none in "
         "the first row"))
-    return counts.astype(np.int64)
+    return counts.astype(np.int64), table.notes
+
+
+def unwrapped(counts):
+    """Counts (n, 2) in a step, less a modulus where that makes them as small as most others."""
+    large = np.quantile(abs(counts[counts != 0]), 0.9) if counts.any() else 0.0
+    for modulus in MODULI:
+        less = counts - np.sign(counts) * modulus
+        if 0 < MIN_MODULUS_RATIO * large < modulus:
+            counts = np.where(abs(less) <= 2 * large, less, counts)
+    return counts
 
 
 def since_start(counts, vehicle):

@@ -1,4 +1,4 @@
-"""Counts since the start and of wrapped counters: refused, and only where they are."""
+"""Counts since the start are refused, those of wrapped counters mended, where they are."""
 
 from functools import cache
 
@@ -103,15 +103,32 @@ def test_a_counter_that_jumps_is_one_since_the_start(change, sign, tmp_path):
     assert "found counts since the start" in error_of(read_dataset, tmp_path)
 
 
-@pytest.mark.parametrize("wrong, read", [(3000, True), (-16_000, True), (30_000, True),
-                                         (2**16 - 132, False), (-2**15 - 132, False)])
-def test_spikes_are_read_and_wraps_of_a_counter_are_refused(wrong, read, tmp_path):
+@pytest.mark.parametrize("modulus", [2**15, 2**16])
+@pytest.mark.parametrize("begin, low", [(60_000, 0), (30_000, -1), (3000, 0)])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_counters_that_wrap_around_are_mended(modulus, begin, low, sign, tmp_path):
+    """Differenced by who wrote the file, as wrapped."""
+    ticks = sign * simulated("short", 0)[0].ticks[:1000]
+    counter = (ticks.cumsum(axis=0) + begin - low * modulus // 2) % modulus + low * modulus // 2
+    steps = np.diff(counter, axis=0, prepend=counter[:1])
+    wraps = np.flatnonzero((steps != ticks).any(axis=1))
+    assert len(wraps)
+    written(tmp_path, steps)
+    dataset = read_dataset(tmp_path)
+    np.testing.assert_array_equal(dataset.ticks, ticks)
+    note, = dataset.notes
+    assert note == (f"encoderReading.txt: {len(wraps)} rows were mended whose counts are 2^15 or "
+                    "2^16 off, as of a counter that wraps around, the first in line "
+                    f"{wraps[0] + 1}.")
+
+
+@pytest.mark.parametrize("wrong", [3000, -16_000, 30_000, 40_000, 62_000, 70_000])
+def test_other_spikes_are_no_wraps(wrong, tmp_path):
     """The gate of the odometry finds what is below MAX_REVOLUTIONS."""
     ticks = simulated("short", 0)[0].ticks[:300].copy()
     ticks[150, 0] = wrong
     written(tmp_path, ticks)
-    if read:
-        np.testing.assert_array_equal(read_dataset(tmp_path).ticks, ticks)
-    else:
-        assert "line 151: expected at most 4 wheel revolutions (32000 ticks)" in error_of(
-            read_dataset, tmp_path)
+    np.testing.assert_array_equal(read_dataset(tmp_path).ticks, ticks)
+    ticks[150, 0] = 99_999
+    written(tmp_path, ticks)
+    assert "line 151: expected at most 10 wheel revolutions" in error_of(read_dataset, tmp_path)

@@ -264,7 +264,7 @@ THIRD_ROWS = {  # rows by what is said of them
             "3 0x10 6", "3 \u0663 6", "3 1e 6", "3 . 6", "3 5 6 \0"],
         "right ticks, a whole number from -1e+15 to 1e+15, found": [
             "3 nan 6", "3 -infinity 5", "3 1e999 5", "3 -2e15 5", "3 5.5 6"],
-        "at most 4 wheel revolutions (32000 ticks)": ["3 5 32001", "3 -32001 5"],
+        "at most 10 wheel revolutions (80000 ticks)": ["3 5 80001", "3 -80001 5"],
         "in order": ["4 5 6", "2 5 6"], "pose id, a whole number": ["2.5 5 6"]},
     "ArucoReading.txt": {
         "pose id, a whole number from 1 to 4": ["5 40 0 0 0 1 0 0 1 0 1", "0 40 0 0 0 1 0 0 1 0 1"],
