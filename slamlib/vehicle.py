@@ -140,8 +140,8 @@ def incremental_counts(table, vehicle):
     read, limit = table.numbers[:, 1:], MAX_REVOLUTIONS * vehicle.ticks_per_revolution
     counts = unwrapped(read)
     if len(mended := np.flatnonzero((counts != read).any(axis=1))):
-        table = table.noted(f": {len(mended)} rows were mended whose counts are 2^15 or 2^16 off, as "
-                            f"of a counter that wraps around, the first in {table.place(mended[0])}")
+        table = table.noted(f": {len(mended)} rows were mended whose counts are 2^15 or 2^16 off, "
+                            f"as of a counter that wraps around, first {table.place(mended[0])}")
     if since_start(counts, vehicle):
         raise error(table.source, "expected counts since the previous pose, found counts since the "
                     f"start, which change gradually up to {abs(counts).max():.0f}: take the "

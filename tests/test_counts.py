@@ -118,8 +118,7 @@ def test_counters_that_wrap_around_are_mended(modulus, begin, low, sign, tmp_pat
     np.testing.assert_array_equal(dataset.ticks, ticks)
     note, = dataset.notes
     assert note == (f"encoderReading.txt: {len(wraps)} rows were mended whose counts are 2^15 or "
-                    "2^16 off, as of a counter that wraps around, the first in line "
-                    f"{wraps[0] + 1}.")
+                    f"2^16 off, as of a counter that wraps around, first line {wraps[0] + 1}.")
 
 
 @pytest.mark.parametrize("wrong", [3000, -16_000, 30_000, 40_000, 62_000, 70_000])
