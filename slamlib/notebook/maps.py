@@ -61,7 +61,13 @@ def whole_map(drive, result):
     factor = f" × {enlarged}" + ", in doubt (?) × 1" * bool(doubt.any())
     ax.set_title(f"{plotting.literal(drive.name)} (95 % ellipses{factor * (enlarged > 1)})")
     plotting.legend_below(fig)
-    weak = np.isin(result.marker, result.unconfirmed)
+    _name_landmarks(ax, result, doubt, enlarged)
+    return fig
+
+
+def _name_landmarks(ax, result, doubt, enlarged):
+    """Write the names of a SlamResult's landmarks; `doubt` (a,) bool is of the antennas."""
+    places, weak = result.marker_in_world, np.isin(result.marker, result.unconfirmed)
     variances, axes = np.linalg.eigh(result.marker_covariance[:, :2, :2])
     outlines = places[:, :2, None] + enlarged * evaluation.REACH_95 * axes * np.sqrt(
         np.maximum(variances, 0))[:, None] @ [np.cos(OUTLINE), np.sin(OUTLINE)]
@@ -71,7 +77,6 @@ def whole_map(drive, result):
         *((f"{name}{'?' * int(unsure)}", place[:2], NAME) for name, place, unsure in zip(
             result.marker, places, weak, strict=True))],
         np.concatenate([result.poses[::10, :2], *outlines.swapaxes(1, 2)]))
-    return fig
 
 
 def write_names(ax, names, path):
