@@ -19,7 +19,7 @@ from slamlib import se2
 from slamlib.dialects import LIMITS, matrix, read_table
 from slamlib.doubt import Doubt
 from slamlib.folder import ENCODER, TABLES, TRUTH_FILES, Variable, contents, is_dataset
-from slamlib.textfile import DatasetError, error, quoted
+from slamlib.textfile import error, require
 from slamlib.truth_frame import in_first_frame
 from slamlib.vehicle import Vehicle, changed, incremental_counts, read_vehicle
 
@@ -98,7 +98,7 @@ class Dataset:
         >>> len(dataset.ticks), dataset.uwb.antenna.tolist()
         (2, [7])
         """
-        _require(isinstance(vehicle, Vehicle), "vehicle", "a Vehicle", vehicle)
+        require(isinstance(vehicle, Vehicle), "vehicle", "a Vehicle", vehicle)
         stated = {key: value for key, value in vars(vehicle).items() if value is not None}
         ticks = matrix("ticks", ticks, list(LIMITS[ENCODER])[1:])
         ticks = np.column_stack([np.arange(1, len(ticks) + 1), ticks])
@@ -121,12 +121,12 @@ class Dataset:
 
     def without(self, sensor):
         """The Dataset without a sensor, "aruco" or "uwb"."""
-        _require(sensor in ("aruco", "uwb"), "without", '"aruco" or "uwb"', sensor)
+        require(sensor in ("aruco", "uwb"), "without", '"aruco" or "uwb"', sensor)
         return replace(self, **{sensor: None})
 
     def first(self, count):
         """The Dataset of the first `count` poses; sensors without readings are None."""
-        _require(isinstance(count, Integral) and count > 0, "first", "a number of poses", count)
+        require(isinstance(count, Integral) and count > 0, "first", "a number of poses", count)
         early = {sensor: readings.select(readings.pose < count) for sensor in ("aruco", "uwb")
                  if (readings := getattr(self, sensor)) and (readings.pose < count).any()}
         return replace(self, ticks=self.ticks[:count], **{"aruco": None, "uwb": None} | early)
@@ -159,7 +159,7 @@ def dataset_names(data, names=None):
                     "dataset, found none")
     names = found if names is None else list(names)
     for name in names:
-        _require((data / name).is_dir(), data, f"one of {', '.join(found)}", name)
+        require((data / name).is_dir(), data, f"one of {', '.join(found)}", name)
         contents(data / name, required=ENCODER)
     return names
 
@@ -217,12 +217,6 @@ def read_truth(folder):
         antenna=antenna, antenna_in_world=antenna_in_world,
         vehicle=read_vehicle(files.get("vehicle.toml"), default=vehicle),
         notes=tuple(f"In truth: {note}" for note in notes)))
-
-
-def _require(ok, source, expected, found):
-    """Raise DatasetError about an argument or a folder that is not as expected."""
-    if not ok:
-        raise DatasetError(f"{source}: expected {expected}, found {quoted(found)}")
 
 
 def _read_all_poses(files, name):

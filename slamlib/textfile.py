@@ -22,6 +22,18 @@ def error(source, message, line=None):
     return DatasetError(f"{source}{'' if line is None else f', {place}'}: {message}")
 
 
+def require(ok, source, expected, found):
+    """Raise DatasetError about an argument or a folder that is not as expected."""
+    if not ok:
+        raise DatasetError(f"{source}: expected {expected}, found {quoted(found)}")
+
+
+def require_type(value, kind, source):
+    """Raise DatasetError if an argument of the function `source` (str) is not of a kind."""
+    name = getattr(kind, "__name__", kind)
+    require(isinstance(value, kind), source, f"an argument of type {name}", value)
+
+
 def quoted(value):
     """The first 60 characters (str) of a value, in quotes."""
     try:

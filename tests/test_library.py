@@ -9,7 +9,7 @@ from gtsam.symbol_shorthand import A, C, L, X
 from numeric import known_noise
 from test_dataset import assert_same
 
-from slamlib import se2, slam
+from slamlib import localization, se2, slam
 from slamlib.checks.solution import solution_doubts
 from slamlib.dataset import Dataset, DatasetError, Vehicle, all_notes, read_dataset
 from slamlib.evaluation import anees, ate
@@ -45,6 +45,14 @@ def test_arrays_are_the_dataset_of_their_files(drive, tmp_path):
     assert_same(Dataset.from_arrays(**lists, vehicle=expected.vehicle, name="drive"), expected)
     alone = Dataset.from_arrays(given["ticks"])
     assert (alone.aruco, alone.uwb, alone.antenna_guess) == (None, None, None)
+
+
+@pytest.mark.parametrize("function", [
+    slam.as_gtsam, localization.fuse, localization.fuse_increments, localization.localize])
+def test_what_is_of_another_type_is_told(function):
+    """`slam.estimate`'s arguments are in test_slam."""
+    with pytest.raises(DatasetError, match=f"{function.__name__}: expected a.*, found 'data/short'"):
+        function("data/short")
 
 
 def changed_at(place, value):

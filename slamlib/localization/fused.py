@@ -25,11 +25,13 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from slamlib import increments, se2
+from slamlib.dataset import Dataset
 from slamlib.increments import SLIP_BOUNDS, SLIP_FACTOR, TYPICAL_SLIP
 from slamlib.marker_increments import common_sightings
 from slamlib.memory import error_memory
 from slamlib.odometry_gate import NO_JUMPS, Jumps, find_jumps
 from slamlib.sightings import GATE, sightings_by_frame
+from slamlib.textfile import require_type
 
 SLIP_FRAMES = 500            # number of frames, the first ones, from which the slip is learned
 WHEEL_FRAMES = 5000          # number of frames, the first ones, that give the wheel parameters w_0
@@ -95,6 +97,7 @@ def fuse(dataset, slip=None, model="arc"):
     >>> fuse(dataset, slip=1e-3).poses.shape
     (2000, 3)
     """
+    require_type(dataset, Dataset, "fuse")
     slip = dataset.vehicle.slip if slip is None else slip
     jumps = find_jumps(dataset)
     given = _filter_input(dataset, model, dataset.vehicle, jumps)

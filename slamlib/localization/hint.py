@@ -13,9 +13,11 @@ all increments, consecutive marker increments share sightings, and equation 2 ha
 import numpy as np
 
 from slamlib import increments, odometry, se2
+from slamlib.dataset import Dataset
 from slamlib.localization.fused import Fusion
 from slamlib.marker_increments import consecutive_increments
 from slamlib.sightings import sightings_by_frame
+from slamlib.textfile import require_type
 
 
 def equation2_from(ticks, vehicle, start, poses, covariances):
@@ -63,6 +65,7 @@ def fuse_increments(dataset, propagation=equation2_from):
     Where markers give no increment, odometry alone is used. `propagation` is `equation2_from`, or
     `first_order_from` with all correlations.
     """
+    require_type(dataset, Dataset, "fuse_increments")
     ticks, vehicle = dataset.ticks, dataset.vehicle
     sightings = sightings_by_frame(dataset.sightings, extra_frames=[0])
     frame, found = sightings.frame, consecutive_increments(sightings)

@@ -22,9 +22,10 @@ from heapq import nlargest
 import numpy as np
 
 from slamlib import se2
-from slamlib.dataset import DatasetError
+from slamlib.dataset import ArucoReadings, DatasetError
 from slamlib.marker_increments import consecutive_increments, robust_increments
 from slamlib.sightings import consensus, sightings_by_frame
+from slamlib.textfile import require_type
 
 MAX_CANDIDATES = 3            # number of earlier frames that are tried as parent of a frame
 MAX_FRAMES_PER_MARKER = 200   # number of frames, the latest that saw a marker, to choose them from
@@ -59,6 +60,7 @@ def localize(aruco, shared_errors=True):
     >>> found.frame[:3].tolist(), found.poses.shape
     ([0, 10, 20], (200, 3))
     """
+    require_type(aruco, ArucoReadings, "localize")
     sightings = sightings_by_frame(aruco)
     if not len(sightings.frame):
         raise DatasetError("expected sightings that agree; all contradict another one of the same "

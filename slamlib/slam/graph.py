@@ -18,6 +18,7 @@ from slamlib.slam.factors import linearize_odometry
 from slamlib.slam.linear import NormalEquations, State, retract
 from slamlib.slam.measurements import WEAK_SIGMA
 from slamlib.slam.own import gtsam_values, variable_keys
+from slamlib.textfile import require
 
 CONVERGED = 1e-6             # decrease, over 1 + error, at which iterations end
 ROUNDING = 1e-12             # relative increase of the error that is due to float rounding
@@ -129,6 +130,7 @@ def as_gtsam(result):
     gates and kernels of the result, each a gtsam.LinearContainerFactor; `slam.own` has the keys.
     The values are those of greatest density, at which nothing is averaged over the noise.
     """
+    require(hasattr(result, "fit"), "slam.as_gtsam", "a SlamResult", result)
     problem, state = result.fit.problem, result.fit.state
     values = gtsam_values(problem, state)
     return gtsam.LinearContainerFactor.ConvertLinearGraph(

@@ -35,8 +35,6 @@ from slamlib.slam.measurements import (
     with_known,
 )
 
-MAX_CACHED_SLIPS = 3         # values of the slip whose sums are kept in memory
-
 
 @dataclass(frozen=True)
 class State:
@@ -219,7 +217,7 @@ class NormalEquations:
             factors, log_determinant = linearized(slip)
             return self._group(0, factors), log_determinant
 
-        return lru_cache(maxsize=MAX_CACHED_SLIPS)(odometry)
+        return lru_cache(maxsize=3)(odometry)
 
     def _group(self, kind, factors):
         """The Group of LinearizedFactors of the kind with this number in `structure.factors`."""

@@ -18,7 +18,7 @@ from slamlib.slam.initialization import initial_state, state_from_poses
 from slamlib.slam.linear import build_problem
 from slamlib.slam.measurements import Noise, measure
 from slamlib.slam.result import slam_result
-from slamlib.textfile import error, quoted
+from slamlib.textfile import require, require_type
 from slamlib.vehicle import changed
 
 
@@ -64,13 +64,9 @@ def estimate(dataset, slip=None, model=None, previous=None, *, marker_noise_fact
 "asymmetric Cauchy" or "quadratic" or "Huber" or "Cauchy" or "Geman-McClure" or "Tukey" for \
 kernel, found 'L2'
     """
-    for value, right, expected in (
-            (dataset, isinstance(dataset, Dataset), "a Dataset, such as read_dataset(folder)"),
-            (factors, isinstance(factors, (NonlinearFactorGraph, type(None))),
-             "a gtsam.NonlinearFactorGraph for factors"),
-            (model, model in (None, *MODELS), f"{' or '.join(MODELS)} for model")):
-        if not right:
-            raise error("slam.estimate", f"expected {expected}, found {quoted(value)}")
+    require_type(dataset, Dataset, "slam.estimate")
+    require_type(factors, NonlinearFactorGraph | None, "slam.estimate")
+    require(model in (None, *MODELS), "slam.estimate", f"{' or '.join(MODELS)} for model", model)
     options = {"slip": slip, "marker_noise_factor": marker_noise_factor,
                "range_noise_factor": range_noise_factor, "kernel": kernel, "gate": gate}
     dataset = replace(dataset, vehicle=changed(dataset.vehicle, {
