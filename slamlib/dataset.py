@@ -19,6 +19,7 @@ from slamlib import se2
 from slamlib.dialects import LIMITS, matrix, read_table
 from slamlib.doubt import Doubt
 from slamlib.folder import ENCODER, TABLES, TRUTH_FILES, Variable, contents, is_dataset
+from slamlib.textfile import DatasetError as DatasetError
 from slamlib.textfile import error, require
 from slamlib.truth_frame import in_first_frame
 from slamlib.vehicle import Vehicle, changed, incremental_counts, read_vehicle

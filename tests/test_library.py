@@ -51,8 +51,8 @@ def test_arrays_are_the_dataset_of_their_files(drive, tmp_path):
     slam.as_gtsam, localization.fuse, localization.fuse_increments, localization.localize])
 def test_what_is_of_another_type_is_told(function):
     """`slam.estimate`'s arguments are in test_slam."""
-    with pytest.raises(DatasetError, match=f"{function.__name__}: expected a.*, found 'data/short'"):
-        function("data/short")
+    with pytest.raises(DatasetError, match=f"{function.__name__}: expected a.*, found 'drive'"):
+        function("drive")
 
 
 def changed_at(place, value):
