@@ -44,7 +44,7 @@ class ArucoReadings(_Readings):
 
     pose: np.ndarray  # (m,) int64, row of `Dataset.ticks`
     marker: np.ndarray  # (m,) int64, marker id
-    marker_in_vehicle: np.ndarray  # (m, 3) [x, y, heading] in m, m, rad
+    marker_in_vehicle: np.ndarray  # (m, 3) [x, y, heading] in m, m, rad; as a camera at its origin
     covariance: np.ndarray  # (m, 3, 3) of [x, y, heading] in the axes of the vehicle
 
 

@@ -1,9 +1,9 @@
 """Tables of numbers, from text as editors, spreadsheets and MATLAB write it, and from arrays.
 
 Plain text has blanks or tabs between columns, decimal points, and comments that begin with `#`, `%`
-or X The limits of the
-numbers are far wider than vehicles, cameras and antennas need: a number beyond them has another
-unit, or float64 loses digits beside it. data/README.md lists them.
+or `//`. Other separators, decimal commas and a header are read. The limits of the numbers are far
+wider than vehicles, cameras and antennas need: a number beyond them has another unit, or float64
+loses digits beside it. data/README.md lists them.
 """
 
 import re

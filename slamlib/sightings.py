@@ -1,7 +1,8 @@
 """Sightings of markers, merged and sorted by frame, and the gates of problems 2 to 4.
 
 A frame is a pose of the vehicle with a measurement. A sighting is the pose z of a marker in the
-vehicle frame with the covariance C of [x, y, heading]. A gate is the 99.9 % quantile of the squared
+frame of the camera or, where what is stated of the camera is applied (`Dataset.sightings`), of the
+vehicle, with the covariance C of [x, y, heading]. A gate is the 99.9 % quantile of the squared
 Mahalanobis distance r^T W^-1 r of a residual r with covariance W; beyond it r is rejected.
 """
 

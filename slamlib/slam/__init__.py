@@ -5,8 +5,8 @@ detects variables that the measurements do not determine. The steps before, and 
 noise, solve the same linearised graph by normal equations in numpy, all factors of a kind at once.
 
 Read `pipeline` first: its function `estimate` is the whole way from a dataset to the result. Each
-stage makes the record of the next: Measurements, Problem and State, Fit, SlamResult. Modules begin
-with the number of their stage, by which docs/code.md lists them.
+stage makes the record of the next: Measurements, Problem and State, Fit, SlamResult. docs/code.md
+lists the modules by their stages.
 
 Symbols in code and docstrings; sizes are f frames, k markers, a antennas, s sightings, r ranges,
 n unknowns besides the calibration, three of every variable, and (m, d) are m measurements of a kind
@@ -16,7 +16,7 @@ with d errors each:
     L_j P_j  pose of marker j (m, m, rad), or position (m) if its heading is unknown
     A_k      position of antenna k, m
     c        (p,) calibration; q of its entries are unknowns, in the solver per standard deviation
-    z, C     measured pose of a marker in the vehicle (m, m, rad), and its covariance
+    z, C     measured pose of a marker in the camera (m, m, rad), and its covariance
     e        errors, expected minus measured; whitened errors are U e, without unit
     U        square root information, upper triangular: U^T U = C^-1 or Q^-1
     Q        covariance of the odometry noise: m^2, m rad, rad^2

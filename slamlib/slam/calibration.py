@@ -12,9 +12,10 @@ D(lag) during the last `lag` encoder steps, D = X^-1 X(lag steps earlier), the m
                 + range_scale sqrt(|A - t|^2 + antenna_height^2),   t = X D(range_lag) tag
 
 with the pose L of the marker and the positions A of the antenna and t of the tag. The entry for the
-height is half its square, in which the squared distance is linear. Derivatives by the columns
-of each kind, WHEELS, SIGHTINGS and RANGES, are in `factors`. (Kuemmerle, Grisetti, Burgard,
-Simultaneous Calibration, Localization, and Mapping, IROS 2011.)
+height is half its square, in which the squared distance is linear. This model and its derivatives
+are `factors.sighting_error` and `range_error`; `choices.calibrated` decides what is wrong, and
+`checks.solution` tells it. Before the graph, `Dataset.sightings` applies what is stated.
+(Kuemmerle, Grisetti, Burgard, Simultaneous Calibration, Localization, and Mapping, IROS 2011.)
 """
 
 from dataclasses import dataclass

@@ -8,8 +8,8 @@ wide sigmas. For a prior of precisions P on the entries that are not known, the 
     h^T (L + P)^-1 h / 2 - log|L + P| / 2 + log|P| / 2,
 
 so that one linearisation ranks all sets of groups (score tests: Rao, Proc. Camb. Phil. Soc. 44(1),
-1948). The set that it proposes is solved, and replaces the present one if its evidence leads
-decisively on the same measurements with the same weights.
+1948). What leads decisively is told; what leads at all is solved as well, and the covariances
+include it, if its evidence still leads on the same measurements with the same weights.
 
 A visit is a run of sightings of an id without a long break. Where a solution rejects most sightings
 of a visit, the drive is solved once more with a landmark for every visit, so that only the path
@@ -34,7 +34,7 @@ from slamlib.slam.linear import NormalEquations, laplace_approximation, linear_s
 from slamlib.slam.result import slam_result
 
 DECISIVE_LEAD = 3.0          # log evidence by which another model of the steps replaces the default
-DECISIVE_RELEASE = 6.0       # log evidence by which a group leaves its stated values
+DECISIVE_RELEASE = 6.0       # log evidence by which a group is told to be wrong
 FURTHER_ENTRY = 0.5          # log evidence beside it, for each entry of a group but the first
 STATED = 3.0                 # log evidence beside it, if standard deviations are stated
 AMBIGUOUS = 3.0              # log evidence within which explanations cannot be told apart
@@ -97,11 +97,11 @@ _Proposal = namedtuple("_Proposal", "explanations groups sigma lead")
 def _proposal(fit):
     """Which groups of the calibration of a Fit the evidence wants to be released: a _Proposal.
 
-    Every released group must raise the log evidence by its prior odds: DECISIVE_RELEASE,
-    FURTHER_ENTRY more for each of its entries but one, and STATED more if its standard deviations
-    are stated. `explanations`, frozensets of groups, are the best set and others that come within
-    AMBIGUOUS of it, neither part of it nor more: the drive cannot tell them apart. `groups` are all
-    of theirs, and what else raises the evidence: not certain enough to be told, but the covariances
+    `explanations`, frozensets of groups, are the best set and others that come within AMBIGUOUS of
+    it, neither part of it nor more: the drive cannot tell them apart. Each of their groups must
+    raise the log evidence by its prior odds: DECISIVE_RELEASE, FURTHER_ENTRY more for each of its
+    entries but one, and STATED more if its standard deviations are stated. `groups` are all of
+    theirs, and what else raises the evidence: not certain enough to be told, but the covariances
     have to include it. `lead` is the log evidence over that of the prior as it is. Of `sigma` (p,)
     the wide ones are multiplied by GROSS if an entry would be further off than MAX_WIDE_SIGMAS.
     """

@@ -2,8 +2,8 @@
 
 A step of `optimize` solves the normal equations in numpy and scipy, or is GTSAM's, which eliminates
 the same graph factor by factor: the last steps of every solution, and those where the normal
-equations are singular to rounding. All factors are linearised in numpy. Custom factors in Python
-would be slow: GTSAM copies all values for every call.
+equations are singular to rounding. All factors but one's own are linearised in numpy. Custom
+factors in Python would be slow: GTSAM copies all values for every call.
 """
 
 import re

@@ -100,7 +100,7 @@ def fit_from_odometry(measurements, model="arc"):
 
 
 def fit_from_previous(measurements, previous, model=None):
-    """The Fit of Measurements from poses, wheels and model of the SlamResult `previous`.
+    """The Fit of Measurements from poses, calibration, slip and model of the SlamResult `previous`.
 
     `model`, if not None, replaces that of `previous`. Errors raised as in `refine`.
     """

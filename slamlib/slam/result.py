@@ -48,7 +48,6 @@ class SlamResult:
     noise: Noise                    # as given or learned
     noise_sigma: np.ndarray         # (3,) of its logarithms, 0 where not learned
     model: str                      # "arc" or "euler", as given or chosen
-    log_evidence: float             # Laplace, up to a constant of dataset and accepted measurements
     rejected: np.ndarray            # (s,) bool, beyond the gate, rows of Measurements.sightings
     range_weight: np.ndarray        # (r,) share of its information that each range keeps, 0 to 1
     range_residual: np.ndarray      # (r,) whitened, positive for a range that is too long
@@ -133,12 +132,10 @@ def slam_result(fit):
         released=problem.released, explanations=fit.explanations,
         noise=problem.noise, noise_sigma=np.zeros(3) if fit.posterior is None
         else np.sqrt(np.diag(fit.posterior.covariance)),
-        model=problem.odometry.model, log_evidence=float(fit.log_evidence),
-        rejected=problem.accepted.rejected, range_weight=range_weight,
-        range_residual=range_residual,
-        share=np.concatenate(problem.accepted.shares), correlation=np.array([
-            (memory.correlation, memory.sigma) for memory in error_memories(
-                problem.accepted, residual, range_residual)]),
+        model=problem.odometry.model, rejected=problem.accepted.rejected, range_weight=range_weight,
+        range_residual=range_residual, share=np.concatenate(problem.accepted.shares),
+        correlation=np.array([(memory.correlation, memory.sigma) for memory in error_memories(
+            problem.accepted, residual, range_residual)]),
         sightings=m.sightings, jumps=m.jumps, turn_sigma=turn_sigma(problem),
         fit=replace(fit), converged=fit.converged)
 
