@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from itertools import combinations
+from types import SimpleNamespace
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from test_plotting import elongated, require_contours
 
 from slamlib import slam
+from slamlib.dataset import AntennaGuess, UwbReadings
 from slamlib.evaluation import REACH_95
 from slamlib.notebook import Drive, antenna_rows, maps
 from slamlib.simulation import simulate
@@ -115,6 +117,20 @@ def test_the_map_fills_its_width_at_equal_scales(solved):
     assert across == pytest.approx(up, rel=1e-3)
     assert ax.bbox.width > 0.75 * fig.bbox.width
     plt.close(fig)
+
+
+@pytest.mark.parametrize("angles, millimetres", [
+    ((0.0, 0.0), 100.0), ((0.0, np.pi / 2), 100 * np.sqrt(2)), (np.arange(8) * np.pi / 4, 0.0)])
+def test_an_offset_of_all_ranges_moves_an_antenna_that_is_seen_from_one_side(angles, millimetres):
+    """From a circle around it not at all; from two sides by 0.1 m along both."""
+    path = 3 * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(len(angles))])
+    ids, ones = np.full(len(path), 7), np.ones(len(path))
+    dataset = SimpleNamespace(uwb=UwbReadings(np.arange(len(path)), ids, 3 * ones, 0.1 * ones),
+                              antenna_guess=AntennaGuess(ids[:1], np.zeros((1, 2))))
+    result = SimpleNamespace(antenna=ids[:1], antenna_in_world=np.zeros((1, 2)), poses=path,
+                             antenna_covariance=np.eye(2)[None], range_weight=ones, doubts={})
+    row, = antenna_rows(result, SimpleNamespace(name="drive", dataset=dataset, truth=None))
+    assert row["by 0.1 m (mm)"] == pytest.approx(millimetres, abs=1e-9)
 
 
 def test_rows_hold_every_antenna_and_its_errors(solved):

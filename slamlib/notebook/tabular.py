@@ -164,7 +164,8 @@ def antenna_rows(result, drive):
     """Rows of `table` on the antennas of a SlamResult: position, sigmas, distances in mm.
 
     `d²` is the squared error in units of the covariance, `late` the percentage of the ranges that
-    keep less than half of their weight.
+    keep less than half of their weight, `by 0.1 m` how far an antenna would be elsewhere, on the
+    same path, if all its ranges were 0.1 m too long.
     """
     if not len(result.antenna):
         return
@@ -175,9 +176,15 @@ def antenna_rows(result, drive):
         truth.antenna, truth.antenna_in_world, result.antenna)
     squared = np.einsum("ni,nij,nj->n", off, np.linalg.inv(C), off)
     for k, antenna in enumerate(result.antenna.tolist()):
+        own = uwb.antenna == antenna
+        away, root = place[k] - result.poses[uwb.pose[own], :2], 1 / uwb.sigma[own]
+        root *= np.sqrt(result.range_weight[own])
+        direction = away / np.maximum(np.hypot(*away.T), 1e-9)[:, None]
+        shift = np.linalg.lstsq(root[:, None] * direction, 0.1 * root)[0]
         yield {"dataset": drive.name, "antenna": f"{antenna}{'?' * (antenna in result.doubts)}",
                "x (m)": f"{place[k, 0]:.3f}", "y (m)": f"{place[k, 1]:.3f}",
                "σ of x (mm)": 1e3 * np.sqrt(C[k, 0, 0]), "σ of y (mm)": 1e3 * np.sqrt(C[k, 1, 1]),
                "from the guess (mm)": 1e3 * np.hypot(*moved[k]),
                "error (mm)": 1e3 * np.hypot(*off[k]), "d²": squared[k],
-               "late (%)": 100 * np.mean(result.range_weight[uwb.antenna == antenna] < 0.5)}
+               "late (%)": 100 * np.mean(result.range_weight[own] < 0.5),
+               "by 0.1 m (mm)": 1e3 * np.hypot(*shift)}
