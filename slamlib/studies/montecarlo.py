@@ -23,7 +23,7 @@ PROBLEM2_METHODS = {
     "hint": localization.fuse_increments,
     "exact hint": lambda dataset: localization.fuse_increments(dataset, first_order_from),
     "fused": localization.fuse}
-MEMORY_METHODS = ("markers", "problem 3", "known", "independent")
+MEMORY_METHODS = ("markers", "problem 3", "problem 4", "known", "independent")
 
 
 def drive(seed, poses=None, **options):
@@ -76,7 +76,7 @@ def ranges_added(seed, share=1.0, **options):
 
 
 def correlated_errors(seed, correlation, **options):
-    """Problems 2 and 3 on one `drive`; `correlation` is the `memory` of `simulate`.
+    """Problems 2 to 4 on one `drive`; `correlation` is the `memory` of `simulate`.
 
     Returns
     -------
@@ -86,13 +86,13 @@ def correlated_errors(seed, correlation, **options):
     of neighbours.
     """
     dataset, truth = drive(seed, memory=correlation, **options)
-    dataset, markers = dataset.without("uwb"), localization.localize(dataset.aruco)
-    problem3, numbers = slam.estimate(dataset), {}
+    markers, problem3 = localization.localize(dataset.aruco), slam.estimate(dataset.without("uwb"))
+    problem4, numbers = slam.estimate(dataset, previous=problem3), {}
     problem = problem3.fit.problem
     known, independent = (slam_result(refine(replace(problem, accepted=replace(
         problem.accepted, share=share)), problem3.fit.state, accept=None))
         for share in (known_shares(problem.measurements, correlation), None))
-    for name, found in zip(MEMORY_METHODS, (markers, problem3, known, independent)):
+    for name, found in zip(MEMORY_METHODS, (markers, problem3, problem4, known, independent)):
         true = truth.poses[getattr(found, "frame", slice(None))]
         numbers |= {f"{name} nees": anees(found.poses, found.covariances, true),
                     f"{name} ate": ate(found.poses, true, aligned=True)}
