@@ -120,7 +120,7 @@ def require_covariances(result):
         np.diagonal(C, axis1=-2, axis2=-1).ravel()
         for C in (covariances[np.isfinite(poses[:, 0])], *maps) if C is not None])
     if not ((0 <= variances) & (variances < np.inf)).all() \
-            or not np.isfinite(getattr(result, "log_evidence", 0.0)):
+            or not np.isfinite(getattr(getattr(result, "fit", None), "log_evidence", 0.0)):
         raise np.linalg.LinAlgError("a variance is negative or not finite")
 
 

@@ -249,9 +249,11 @@ def test_a_solution_that_rounding_spoilt_is_none(monkeypatch):
     dataset, _ = simulate("short", 61)
     dataset = replace(dataset.first(100), uwb=None)
     found = slam.estimate(dataset)
-    for name, value in (("covariances", np.nan), ("c_covariance", -1e-30),
-                        ("marker_covariance", np.inf), ("log_evidence", -np.inf)):
-        spoilt = replace(found, **{name: np.full_like(getattr(found, name), value)})
+    for changes in (
+            {"covariances": np.nan * found.covariances}, {"c_covariance": -1e-30 * np.eye(14)},
+            {"marker_covariance": np.full_like(found.marker_covariance, np.inf)},
+            {"fit": replace(found.fit, log_evidence=-np.inf)}):
+        spoilt = replace(found, **changes)
         monkeypatch.setattr(solve.slam, "estimate", lambda _, spoilt=spoilt: spoilt)
         failure, = solve.solutions(dataset, problems=("problem3",))
         assert "float64" in failure.reason and "a variance is negative" in failure.reason
