@@ -159,18 +159,6 @@ def test_wheels_that_are_far_off_are_named_and_mended_although_slip_explains_the
     assert_mended(found, truth, 501, factor=1.3)
 
 
-def test_other_wheels_explain_a_drive_better_than_much_slip():
-    """Radii 3 % off, on 16 m: slip that is learned, and slip that was given as far too much."""
-    dataset, truth = simulate("short", 501)
-    dataset = dataset.without("uwb").first(800)
-    spoilt = vehicle(right_radius=0.103, left_radius=0.103)(dataset)
-    found, given = slam.estimate(spoilt), slam.estimate(known_noise(spoilt, 1e-2), model="arc")
-    for each in (found, given):             # all lengths may be those of the markers, or the wheels
-        assert names(solution_doubts(each)) <= {"wheel-parameters", "marker-size"}
-        assert names(solution_doubts(each))
-    assert found.slip < 2e-3 and given.slip == 1e-2
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("poses, seed", [(-3, 61), (10, 62)])
 def test_sightings_that_are_late_are_named_and_mended(poses, seed):

@@ -5,7 +5,6 @@ import json
 import os
 import re
 import sys
-import tempfile
 from dataclasses import replace
 from html.parser import HTMLParser
 
@@ -160,26 +159,6 @@ def test_what_is_printed_in_a_row_is_one_output_however_long_it_takes(built):
         "one\ntwo", "three", "a picture", "and another", "four"]
 
 
-def test_kernels_listen_at_sockets_not_at_ports(tmp_path, monkeypatch):
-    """Another program can take a port between its choice and the kernel; nobody takes a socket."""
-    long = tmp_path / ("x" * 60)  # a folder with too long a name for sockets
-    long.mkdir()
-    monkeypatch.setattr(tempfile, "tempdir", str(long))
-    make_data(tmp_path)
-    write(tmp_path / "notebooks", "1_kernel", "# Kernel", (
-        "from ipykernel.connect import get_connection_info\n"
-        "print(get_connection_info(unpack=True)['transport'])",))
-    page = build(tmp_path)[1].read_text(encoding="utf-8")
-    assert re.search(r'<pre class="output[^>]*><code>\s*ipc\s*</code>', page)
-
-
-@pytest.mark.slow
-def test_a_second_build_gives_the_same_bytes(built):
-    root, pages = built
-    before = [page.read_bytes() for page in pages]
-    assert [page.read_bytes() for page in build(root, datasets=["short"])] == before
-
-
 @pytest.mark.parametrize("good, bad, told", [
     ("import time\ntime.sleep(60)", ["# Bad", ("x = 0",), ("y = 1\nz = y / x",)],
      "2_bad.ipynb, cell 2, line 2:\n    z = y / x\nZeroDivisionError: division by zero"),
@@ -196,15 +175,6 @@ def test_a_notebook_that_fails_is_named_and_leaves_the_old_report(tmp_path, good
     assert str(caught.value) == told
     assert [path.name for path in (tmp_path / "report").iterdir()] == ["1_good.html"]
     assert (tmp_path / "report" / "1_good.html").read_text() == "old"
-
-
-def test_what_cannot_be_set_is_refused_before_a_kernel_starts(tmp_path):
-    make_data(tmp_path)
-    write(tmp_path / "notebooks", "1_text", "## Two\n\nBefore $\\nonsense{x}$ after",
-          ("raise SystemExit",))
-    with pytest.raises(NotebookError, match="(?s)^1_text.ipynb, section 'Two': .*nonsense"):
-        build(tmp_path)
-    assert not (tmp_path / "report").exists() and not (tmp_path / "results").exists()
 
 
 def test_missing_folders_and_names_are_told_in_one_sentence(tmp_path):
