@@ -3,6 +3,7 @@
 from dataclasses import replace
 from itertools import combinations
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from test_plotting import elongated, require_contours
@@ -95,6 +96,17 @@ def test_names_cover_neither_each_other_nor_what_is_around_the_axes(solved):
              for text in ax.texts]
     assert not any(a.overlaps(b) for a, b in combinations(boxes, 2))
     assert all(ax.bbox.x0 <= box.x0 and box.x1 <= ax.bbox.x1 for box in boxes)
+
+
+def test_the_map_fills_its_width_at_equal_scales(solved):
+    drive, result = solved
+    fig = maps.whole_map(drive, result)
+    ax, = fig.axes
+    fig.draw_without_rendering()
+    (across, up), = np.diff(ax.transData.transform([[0, 0], [1, 1]]), axis=0)
+    assert across == pytest.approx(up, rel=1e-3)
+    assert ax.bbox.width > 0.75 * fig.bbox.width
+    plt.close(fig)
 
 
 def test_rows_hold_every_antenna_and_its_errors(solved):
