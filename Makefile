@@ -80,7 +80,7 @@ strip: $(READY)
 	@$(BIN)/python strip_notebooks.py notebooks/*.ipynb
 
 bench bench-large: $(READY)
-	@for b in speed localization slam; do \
+	@for b in speed slam; do \
 		$(BIN)/python "tests/benchmarks/$$b.py" $(patsubst bench-%,%,$(filter bench-%,$@)) || exit 1; \
 		echo; done
 

@@ -26,9 +26,8 @@ settings.load_profile("short")           # another one by `pytest --hypothesis-p
 ROOT = Path(__file__).parents[1]
 STUDY_SEEDS = "2"            # in pages that tests build: their claims are tested on more drives
 # Files that mostly wait run beside files that start further processes: both processors are busy.
-FIRST = ("test_pages", "test_concurrency", "test_lab", "test_machines", "test_slam",
-         "test_flaws", "test_uwb", "test_trust", "test_install", "test_report", "test_docs",
-         "test_localization", "test_properties", "test_doubts",
+FIRST = ("test_pages", "test_concurrency", "test_lab", "test_slam", "test_flaws", "test_uwb",
+         "test_report", "test_docs", "test_localization", "test_properties", "test_doubts",
          "test_overview", "test_cache", "test_studies")
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 

@@ -8,7 +8,6 @@ from scipy.stats import t
 from slamlib import slam
 from slamlib.evaluation import ate, nees
 from slamlib.simulation import simulate
-from slamlib.slam.linear import state_from_arrays
 from slamlib.studies.montecarlo import antenna_error
 
 
@@ -85,11 +84,3 @@ def as_points(aruco, rows, variance=1e4):
     covariance = aruco.covariance.copy()
     covariance[rows, 2] = covariance[rows, :, 2] = [0, 0, variance]
     return replace(aruco, covariance=covariance)
-
-
-def true_state(measurements, truth):
-    """The State of Measurements by the Truth of their drive, with the stated calibration."""
-    m, rows = measurements, np.searchsorted(truth.marker, measurements.marker)
-    return state_from_arrays(m, truth.poses[m.frame], truth.marker_in_world[rows],
-                             truth.antenna_in_world[np.isin(truth.antenna, m.antenna)],
-                             m.calibration.stated)

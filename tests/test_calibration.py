@@ -3,7 +3,6 @@
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from types import SimpleNamespace
 
 import gtsam
 import numpy as np
@@ -13,7 +12,7 @@ from numeric import as_points, central_differences, changed
 
 from slamlib import se2, slam
 from slamlib.checks.files import doubts_before_solving
-from slamlib.checks.solution import GROUPS, solution_doubts
+from slamlib.checks.solution import solution_doubts
 from slamlib.dataset import Vehicle, read_dataset, read_truth
 from slamlib.evaluation import align, anees, ate
 from slamlib.localization import fuse, fuse_increments, localize
@@ -22,13 +21,10 @@ from slamlib.slam import choices, graph, own
 from slamlib.slam.calibration import (
     ANTENNAS,
     ENTRIES,
-    HEIGHT,
     RANGE_LAG,
     SIGHTING_LAG,
-    calibration_table,
-    stated_calibration,
 )
-from slamlib.slam.factors import SMOOTHED_STEPS, odometry_error
+from slamlib.slam.factors import SMOOTHED_STEPS
 from slamlib.slam.fit import KERNELS, ONE_SIDED
 from slamlib.slam.initialization import odometry_state
 from slamlib.slam.linear import NormalEquations, build_problem, linear_solution, retract
@@ -128,21 +124,6 @@ def test_evidence_of_one_entry_by_hand():
     assert choices._log_evidence(np.array([[L]]), np.array([h]), np.zeros(1)) == (0, 0)
 
 
-def test_errors_in_counts_do_not_shrink_with_the_scale():
-    """All lengths 4 % smaller, wheelbase too: whitened errors of odometry stay as they were."""
-    m = measure(simulate("short", 4)[0].first(400).without("uwb"))
-    from_stated = build_problem(m, "arc", Noise()).odometry
-    wheel = 0.96 * from_stated.stated
-    poses = odometry_state(m, "arc").poses + 1e-3 * np.random.default_rng(1).normal(size=(
-        len(m.frame), 3))
-    scaled = build_problem(m, "arc", Noise(), wheel).odometry
-    expected, *_ = odometry_error(from_stated, poses, from_stated.stated)
-    found, *_ = odometry_error(replace(scaled, in_counts=True), poses * [0.96, 0.96, 1], wheel)
-    np.testing.assert_allclose(found, expected, atol=1e-5)         # log of se2 bends a little
-    smaller, *_ = odometry_error(scaled, poses * [0.96, 0.96, 1], wheel)
-    np.testing.assert_allclose(smaller[:, :2], 0.96 * expected[:, :2], atol=1e-5)
-
-
 @pytest.mark.parametrize("name", ["asymmetric Tukey", "asymmetric Cauchy"])
 def test_ranges_without_late_ones_have_no_bias(name):
     """E[weight(r - b) (r - b)] of standard normal r is zero where the bias b is counted."""
@@ -153,18 +134,6 @@ def test_ranges_without_late_ones_have_no_bias(name):
         return np.sum(weight * (r - shift)) / np.sum(weight)
 
     assert abs(mean(b)) < 1e-4 < 0.05 < abs(mean(0))
-
-
-def test_a_height_is_told_by_itself_and_not_by_half_its_square():
-    stated = stated_calibration(Vehicle(antenna_height=2.0, sigma_antenna_height=0.1), [3, 9])
-    assert np.isclose(stated.stated[HEIGHT], 2.0) and np.isclose(stated.sigma[HEIGHT], 0.2, 1e-2)
-    rows = calibration_table(stated, stated.stated, np.diag(stated.sigma**2), {"antenna-height"})
-    row = rows[HEIGHT]
-    assert (row["name"], row["unit"], row["released"]) == ("antenna_height", "m", True)
-    assert np.allclose([row["stated"], row["stated_sigma"], row["estimate"], row["sigma"]],
-                       [2.0, 0.1, 2.0, 0.1], rtol=1e-2)
-    assert [row["name"] for row in rows[ANTENNAS]] == ["offset of antenna 3", "offset of antenna 9"]
-    assert {row["group"] for row in rows} == set(GROUPS)
 
 
 # The drive of a seed as sensors elsewhere would have logged it, with the same noise.
@@ -290,31 +259,6 @@ def test_without_noise_the_calibration_is_found_exactly():
     assert np.isclose(values["marker_size"], 1.02, atol=1e-4)
     assert np.isclose(values["antenna_height"], 2.0, atol=2e-3)
     assert ate(found.poses, truth.poses) < 1e-3
-
-
-def test_explanations_that_the_drive_cannot_tell_apart_are_both_released():
-    """Two groups with nearly the same columns of the likelihood; a third one has no part in it."""
-    dataset, _ = drive(1)
-    m = measure(dataset.first(200))
-    fit = SimpleNamespace(problem=build_problem(m, "arc", Noise()))
-    p = len(m.calibration.stated)
-    row = np.zeros(p)
-    tag_x, delay = 8, 13
-    row[tag_x], row[delay] = 1.0, 1.02
-    L, h = 400 * np.outer(row, row) + np.diag(np.r_[np.ones(p - 4), np.zeros(4)]), 100 * row
-
-    def proposal(h):
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(choices, "_likelihood", lambda _: (L, h))
-            return choices._proposal(fit)
-
-    found = proposal(h)
-    assert set(found.explanations) == {frozenset({"tag-offset"}), frozenset({"range-delay"})}
-    assert found.groups == {"tag-offset", "range-delay"} and found.lead > 0
-    assert found.sigma[tag_x] == m.calibration.wide[tag_x]
-    assert proposal(60 * h).sigma[tag_x] == choices.GROSS * m.calibration.wide[tag_x]
-    right = proposal(0 * h)
-    assert right.explanations == (frozenset(),) and right.groups == frozenset()
 
 
 @pytest.mark.slow

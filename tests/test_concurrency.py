@@ -3,7 +3,6 @@
 import errno
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -13,12 +12,11 @@ from pathlib import Path
 
 import pytest
 from conftest import is_running
-from nbformat.v4 import new_notebook
 from test_report import build, make_data, write
 
 from slamlib import results, swap
 from slamlib.__main__ import END_SIGNALS, main
-from slamlib.report import NotebookError, cache
+from slamlib.report import NotebookError
 from slamlib.simulation import simulate, write_dataset
 from slamlib.solve import RESULT_NAMES, problem_solution, write_solution
 from slamlib.summary import solve_to_folder
@@ -120,25 +118,6 @@ def publish(folder, **files):
 def texts(folder):
     """Texts of all files in a folder, by name."""
     return {name: (folder / name).read_text() for name in swap.file_names(folder)}
-
-
-@pytest.mark.parametrize("killed", ["while it wrote", "between", "after"])
-def test_what_a_killed_run_left_goes_and_the_user_s_files_stay(tmp_path, killed):
-    out, old = tmp_path / "out", tmp_path / ".out.old"
-    publish(out, ours="1", gone="1")
-    for name in ("b.txt", "mine/a.txt"):
-        swap.write_atomically(out / name, b"mine")
-    (tmp_path / ".out.new").mkdir()
-    (tmp_path / ".out.new" / "ours.txt").write_text("2")
-    if killed != "while it wrote":
-        out.rename(old)
-    if killed == "after":
-        shutil.copytree(old, out)
-        (out / "b.txt").write_text("changed since")
-    publish(out, ours="3")
-    changed = "changed since" if killed == "after" else "mine"
-    assert texts(tmp_path) == {"out/.slamlib.json": '["ours.txt"]', "out/ours.txt": "3",
-                               "out/b.txt": changed, "out/mine/a.txt": "mine"}
 
 
 def test_a_folder_that_is_a_link_stays_one_and_one_that_gets_empty_goes(tmp_path):
@@ -271,12 +250,6 @@ def test_a_notebook_that_fails_leaves_old_results_and_what_was_executed_is_kept(
     assert len(results.read_vehicle_poses(old.parent)[0]) == 2
 
 
-def test_a_file_that_cannot_be_kept_is_an_error(tmp_path):
-    with pytest.raises(FileNotFoundError):
-        cache.keep(tmp_path / "kept", tmp_path / "a.ipynb", "0", new_notebook(), tmp_path, ["a"])
-    assert not (tmp_path / "kept").exists()
-
-
 @pytest.mark.slow
 def test_a_signal_ends_a_build_in_order(tmp_path):
     make_data(tmp_path)
@@ -314,16 +287,3 @@ sys.exit(main())""")
     assert all(line.startswith("drive: ") for line in lines)
     assert process.returncode == 130 and not (tmp_path / "out").exists()
     assert hidden(tmp_path) == []
-
-
-def test_a_signal_that_is_ignored_stays_so():
-    """As SIGHUP under nohup."""
-    done = subprocess.run([sys.executable, "-c", """import signal
-from slamlib.__main__ import END_SIGNALS, main
-signal.signal(signal.SIGHUP, signal.SIG_IGN)
-try:
-    main()
-except SystemExit:
-    print(*(callable(signal.getsignal(each)) for each in END_SIGNALS))"""], text=True, check=True,
-                          capture_output=True, env=os.environ | {"PYTHONPATH": str(ROOT)})
-    assert done.stdout == "True False\n"

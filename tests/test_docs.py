@@ -82,20 +82,3 @@ def test_every_module_has_a_page_with_its_functions(pages):
         r"poses(</a>)?</code>: \(n, 3\), headings continuous", text)
     text = (pages / "slamlib" / "dataset.html").read_text()
     assert re.search(r"ticks(</a>)?</code>: \(n, 2\) int64", text)
-
-
-@pytest.mark.slow
-def test_the_pages_load_nothing(pages, chromium):
-    """But each other: no request leaves the folder, and the first page leads to the others."""
-    page, requests = chromium.new_page(), []
-    page.on("request", lambda request: requests.append(request.url))
-    for name in ("slamlib/slam/pipeline.html", "slamlib/odometry.html"):
-        page.goto((pages / name).as_uri())
-    page.goto((pages / "index.html").as_uri())
-    page.wait_for_url(f"{(pages / 'slamlib.html').as_uri()}*")
-    page.get_by_role("link", name="odometry", exact=True).first.click()
-    page.wait_for_url("**/odometry.html")
-    page.get_by_role("searchbox").fill("from_arrays")
-    page.get_by_role("link", name="slamlib.dataset.Dataset.from_arrays").wait_for()
-    page.close()
-    assert all(url.startswith((pages.as_uri(), "data:")) for url in requests)

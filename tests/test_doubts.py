@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from numeric import as_points, changed
 
-from slamlib import odometry, se2
 from slamlib.checks import files
 from slamlib.checks.files import doubts_before_solving
 from slamlib.dataset import (
@@ -297,34 +296,6 @@ def test_units_of_few_ranges_and_of_a_vehicle_that_stands_are_not_judged():
                        (ranges_on_a_circle(1e3, count=9), 0),
                        (replace(drive, ticks=0 * drive.ticks), 0), (drive.without("uwb"), 0)):
         assert len(list(files.range_units(few))) == count
-
-
-def test_ranges_are_compared_only_while_odometry_knows_the_heading():
-    """A heading that is lost after 2 rad leaves the first poses; one that is known all of them."""
-    drive = ranges_on_a_circle()
-    path, antennas = files.path_and_antennas(drive)
-    assert len(path) == len(drive.ticks) and len(antennas[0][0]) == 200
-    path, antennas = files.path_and_antennas(
-        replace(drive, vehicle=Vehicle(sigma_wheelbase=0.02)))             # 0.1 rad after 2 rad
-    assert np.isclose(len(path), len(drive.ticks) / np.pi, rtol=0.01)
-    (pose, distance, guess), = antennas
-    assert pose.max() < len(path) <= drive.uwb.pose[len(pose)]
-    np.testing.assert_array_equal(distance, drive.uwb.range[:len(pose)])
-    np.testing.assert_array_equal(guess, [6.0, 10.0])
-
-
-def test_increments_are_compared_over_a_metre():
-    """Frames every 10 cm: by markers, without noise, the true increments between ten of them."""
-    dataset, truth = simulate("short", 0, noise=False)
-    frame = np.unique(dataset.aruco.pose)
-    markers, wheels, sigma = files.moving_increments(dataset)
-    path = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")
-    true, by_wheels = (se2.between(poses[frame[:-10]], poses[frame[10:]])
-                       for poses in (truth.poses, path))
-    at = [np.abs(by_wheels - row).sum(axis=1).argmin() for row in wheels]
-    assert len(at) > 0.8 * len(true) and (0 < sigma).all() and (sigma < 0.1).all()
-    np.testing.assert_allclose(markers[0], true[at], atol=1e-8)
-    np.testing.assert_array_equal(wheels, by_wheels[at])
 
 
 LENGTHS = [

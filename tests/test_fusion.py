@@ -4,7 +4,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from slamlib import increments, odometry, se2, slam
+from slamlib import odometry, se2, slam
 from slamlib.dataset import ArucoReadings, Dataset
 from slamlib.evaluation import anees, ate, nees_band
 from slamlib.localization import fuse, fuse_increments, fused, hint, localize
@@ -32,22 +32,6 @@ def test_sections_of_a_drive_have_no_seams(module, block, solve, monkeypatch):
     sections = solve(dataset)
     np.testing.assert_allclose(sections.poses, whole.poses, atol=1e-10)
     np.testing.assert_allclose(sections.covariances, whole.covariances, rtol=1e-7, atol=1e-14)
-
-
-@pytest.mark.parametrize("restarted, whole", [
-    (hint.equation2_from, odometry.equation2), (hint.first_order_from, odometry.first_order)])
-def test_restarted_propagation_is_that_of_every_part(restarted, whole):
-    dataset, _ = simulate("short", seed=3)
-    rng = np.random.default_rng(0)
-    start = np.array([0, 1, 40, 41, 500, 1990])
-    poses, root = rng.normal(0, 2, (len(start), 3)), rng.normal(0, 0.1, (len(start), 3, 3))
-    covariances = root @ np.swapaxes(root, 1, 2)
-    found = restarted(dataset.ticks, dataset.vehicle, start, poses, covariances)
-    for k, (begin, end) in enumerate(zip(start, [*start[1:], 1999])):
-        expected = whole(dataset.ticks[begin:end + 1], dataset.vehicle, poses[k], covariances[k])
-        for got, part in zip(found, expected):
-            np.testing.assert_allclose(got[begin + 1:end + 1], part[1:], atol=1e-9)
-    np.testing.assert_allclose(found[0][0], poses[0], atol=1e-12)
 
 
 def only(dataset, keep):
@@ -152,23 +136,6 @@ def test_the_slip_that_is_learned_has_the_greatest_density(slip):
                    - (np.log(each / 1e-3) / np.log(3))**2 / 2
                    for each in (0.8 * found, found, 1.2 * found)]
     assert np.argmax(log_density) == 1
-
-
-@pytest.mark.parametrize("likelihood, expected", [
-    (lambda slip: 100 * np.log(slip), 1), (lambda slip: -100 * np.log(slip), 0),
-    (lambda slip: np.nan, None), (lambda slip: np.inf, None),
-    (lambda slip: -1e9 * (slip > 1e-3), None),
-    (lambda slip: 1e4 * np.sin(1e4 * np.log(slip)), None)],
-    ids=["rises", "falls", "none", "infinite", "a cliff", "rough"])
-def test_the_slip_stays_within_its_bounds_whatever_the_likelihood(
-        monkeypatch, likelihood, expected):
-    monkeypatch.setattr(fused, "_filter", lambda given, slip: (
-        None, None, fused._State(None, None, None, None, likelihood(slip))))
-    with np.errstate(all="ignore"):
-        found = fused._likeliest_slip(None)
-    low, high = increments.SLIP_BOUNDS
-    assert low <= found * (1 + 1e-9) <= high * (1 + 1e-8)
-    assert expected is None or np.isclose(found, increments.SLIP_BOUNDS[expected], rtol=0.05)
 
 
 def test_the_hint_fuses_by_information():

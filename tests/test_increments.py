@@ -97,20 +97,3 @@ def test_noise_in_drive_does_not_depend_on_how_the_drive_is_cut():
         np.testing.assert_array_equal(part, 0)
     for part in increments.noise_in_drive(ticks[:1], VEHICLE, [0], [0]):    # a single pose
         np.testing.assert_array_equal(part, 0)
-
-
-def test_noise_does_not_depend_on_where_the_increment_lies():
-    """The same winding metres at the beginning and after 20 km straight ahead."""
-    ticks, far = curvy_ticks()[1:], np.full((200_000, 2), 1_270)
-    ticks = np.concatenate([np.zeros((1, 2)), ticks, far, ticks])
-    count = len(curvy_ticks()) - 1
-    start = np.array([0, 10, 35, 200])
-    end = np.array([10, 35, 190, count])
-    near = increments.noise_covariances(ticks, VEHICLE, start, end, 1e-3)
-    shift = count + len(far)
-    for got in (increments.noise_covariances(ticks, VEHICLE, start + shift, end + shift, 1e-3),
-                np.concatenate([increments.noise_covariances(ticks, VEHICLE, [s], [e], 1e-3)
-                                for s, e in zip(start + shift, end + shift, strict=True)])):
-        scale = np.sqrt(np.einsum("nii,njj->nij", near, near))
-        np.testing.assert_allclose(got / scale, near / scale, atol=1e-5)
-    np.testing.assert_array_equal(np.linalg.eigvalsh(near)[:, 0] > 0, True)

@@ -9,9 +9,8 @@ from pathlib import Path
 
 import pytest
 from conftest import copied
-from test_report import build, make_data, write
+from test_report import make_data, write
 from test_studies import CELL
-from test_studies import kept as kept_studies
 
 from slamlib.__main__ import main
 from slamlib.dataset import read_dataset
@@ -90,24 +89,6 @@ def test_jupyterlab_replaces_the_command_and_kernels_have_the_environment_of_the
                                              kept / "studies")
     assert environment["OMP_NUM_THREADS"] == environment["OPENBLAS_NUM_THREADS"] == "1"
     assert "SLAMLIB_RESULTS" not in environment
-
-
-@pytest.mark.slow
-def test_studies_of_the_build_are_recalled_in_jupyterlab_and_numbers_are_the_same(
-        started, tmp_path):
-    kept = tmp_path / "build" / "executed"
-    page = build(tmp_path, kept=kept, datasets=["short"])[1].read_text()
-    environment = started(1000)[2]
-
-    def printed():
-        return subprocess.run([sys.executable, "-c", CELL], env=environment, text=True, check=True,
-                              capture_output=True).stdout
-
-    numbers = printed()
-    assert numbers in page and len(set(numbers.splitlines())) == 2
-    one, other = kept_studies(kept / "studies")
-    one.write_bytes(other.read_bytes())                # shows that it is recalled
-    assert len(set(printed().splitlines())) == 1
 
 
 @pytest.fixture

@@ -122,8 +122,7 @@ def test_monte_carlo_is_consistent(options):
 
     A mean over the poses of a drive varies less than a single NEES. Six means under two options
     are in their bands together with 95 % probability if each is with 1 - 0.05 / 12 (Bonferroni).
-    tests/benchmarks/localization.py has narrower bands of more drives. The ATE is below 0.6 of that
-    of odometry, and the learned slip is near the truth.
+    The ATE is below 0.6 of that of odometry, and the learned slip is near the truth.
     """
     seeds, methods = range(200, 224), ("odometry", "ArUco", "fused")
     runs = studies.run(trial, seeds, **options)

@@ -14,11 +14,9 @@ import slamlib
 from slamlib import se2, slam, solve
 from slamlib.__main__ import main
 from slamlib.dataset import read_dataset
-from slamlib.doubt import Doubt
 from slamlib.odometry import equation2
 from slamlib.results import read_vehicle_poses
 from slamlib.simulation import simulate, write_dataset
-from slamlib.summary import solve_to_folder
 from slamlib.swap import file_names
 
 ROOT = Path(__file__).parents[1]
@@ -60,21 +58,6 @@ def test_simulate_then_solve(tmp_path):
         np.testing.assert_array_equal(got, expected)
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["dataset"] == "drive" and 0 < summary["problems"]["problem1"]["ate_m"] < 1
-
-
-def test_what_vehicle_toml_gives_of_the_noise_is_taken_and_the_rest_is_learned(tmp_path, drive):
-    write_dataset(tmp_path / "drive", drive[0])
-    for given in ({"slip": 2e-3, "range_noise_factor": 0.5}, {"marker_noise_factor": 1.25}):
-        (tmp_path / "drive" / "vehicle.toml").write_text(
-            "".join(f"{name} = {value}\n" for name, value in given.items()))
-        rows = solved(tmp_path, "--problem", 2, "--problem", "problem2_fused", "--problem", 3,
-                      "--problem", 4)["problems"]
-        for name, value, key, problems in (
-                ("slip", 2e-3, "slip_sqrt_m", ("2_fused", "3", "4")),
-                ("marker_noise_factor", 1.25, "marker_noise_factor", "34"),
-                ("range_noise_factor", 0.5, "range_noise_factor", "4")):
-            for row in (rows[f"problem{each}"] for each in problems):
-                assert (row[key] == value) == (name in given)
 
 
 def test_simulated_paths_are_driven_several_times(tmp_path):
@@ -232,19 +215,6 @@ def test_doubts_are_in_the_summary_and_below_the_table(tmp_path, capsys, drive):
     told = capsys.readouterr().out.splitlines()
     assert told[-2:] == [f"doubt ({doubt['what']}): {doubt['sentence']}" for doubt in (
         frame, antenna)]
-
-
-def test_a_clean_drive_has_no_doubts_and_each_doubt_is_told_once(tmp_path, monkeypatch, drive):
-    dataset = replace(drive[0], uwb=None)
-    assert solve_to_folder(dataset, None, tmp_path)["doubts"] == []
-    told = Doubt("camera-mirrored", "It is.")
-    monkeypatch.setattr("slamlib.summary.doubts_before_solving", lambda *_: (told, told))
-    monkeypatch.setattr("slamlib.summary.solutions", lambda dataset, problems: [
-        replace(solve.problem_solution(problem, dataset),
-                doubts=(Doubt("units", "Miles."), told)) for problem in problems])
-    assert [doubt["what"] for doubt in solve_to_folder(
-        dataset, None, tmp_path, problems=("problem1", "problem3"))["doubts"]] == [
-            "camera-mirrored", "units"]
 
 
 def test_a_problem_that_fails_costs_the_others_nothing(tmp_path, capsys, drive):

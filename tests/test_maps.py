@@ -71,14 +71,6 @@ def test_ellipses_of_poses_markers_and_antennas_are_contours_of_their_own_covari
         require_contours(patches, means, covariances, k)
 
 
-def test_a_name_with_dollar_signs_is_no_formula(solved):
-    drive, result = solved
-    fig = maps.whole_map(replace(drive, name=r"$\foo$ of $x$"), result)
-    fig.draw_without_rendering()                  # an unknown command of TeX would be refused
-    assert r"\$\foo\$ of \$x\$ (95" in fig.axes[0].get_title("left")
-    plt.close(fig)
-
-
 @pytest.mark.parametrize("markers, antennas", [(True, False), (False, True), (False, False)])
 def test_what_a_drive_lacks_is_absent_from_map_and_tables(solved, markers, antennas):
     drive, result = solved
@@ -144,16 +136,6 @@ def test_rows_hold_every_antenna_and_its_errors(solved):
     squared = [each @ np.linalg.solve(C, each)
                for each, C in zip(off, result.antenna_covariance, strict=True)]
     assert [row["d²"] for row in rows] == pytest.approx(squared)
-
-
-def test_a_marker_without_orientation_has_no_heading(solved):
-    drive, result = solved
-    covariances = result.marker_covariance.copy()
-    covariances[0, 2, 2] = 1e8
-    before, after = (
-        sum(len(line.get_xydata()) == 2 for line in maps.whole_map(drive, each).axes[0].lines)
-        for each in (result, replace(result, marker_covariance=covariances)))
-    assert before == after + 1
 
 
 def test_an_antenna_in_doubt_is_called_so_and_drawn_in_its_true_size(solved):

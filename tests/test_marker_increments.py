@@ -1,4 +1,3 @@
-import tracemalloc
 from functools import partial
 
 import numpy as np
@@ -9,9 +8,6 @@ from slamlib import se2
 from slamlib.dataset import ArucoReadings
 from slamlib.evaluation import nees, nees_band
 from slamlib.marker_increments import (
-    _inverse_where_regular,
-    _similar,
-    _single_increments,
     common_sightings,
     consecutive_increments,
     robust_increments,
@@ -19,9 +15,7 @@ from slamlib.marker_increments import (
 from slamlib.sightings import (
     Sightings,
     consensus,
-    evenly_chosen,
     merge_repeated,
-    sightings_by_frame,
 )
 
 DELTA = np.array([0.12, -0.03, 0.2])
@@ -37,21 +31,6 @@ def sightings(delta=DELTA, markers=MARKERS, covariance=C, rng=None):
         z = z + rng.multivariate_normal(np.zeros(3), covariance, len(z))
     m = len(markers)
     return z, covariances, np.zeros(m, int), np.arange(m), np.arange(m, 2 * m)
-
-
-def test_of_many_sightings_a_few_of_each_marker_are_chosen_evenly():
-    """Ids may be large."""
-    marker = np.sort(np.random.default_rng(2).choice([10**14, 5, 7], 3000))
-    label = np.searchsorted([5, 7, 10**14], marker)
-    few = evenly_chosen(label, 100)
-    assert np.bincount(label[few]).tolist() == [100, 100, 100]
-    for k in range(3):
-        rows = np.searchsorted(np.flatnonzero(label == k), few[label[few] == k])
-        assert rows[0] == 0 and np.ptp(np.diff(rows)) <= 1
-    assert evenly_chosen(label, 2000).tolist() == list(range(3000))
-    place = label[:, None] * [1.0, 2.0, 0.1]
-    rows = consensus(marker, place, np.broadcast_to(1e-4 * np.eye(3), (3000, 3, 3)))
-    assert marker[rows].tolist() == [5, 7, 10**14]
 
 
 def test_exact_sightings_give_the_exact_increment():
@@ -89,31 +68,6 @@ def test_derivatives_by_the_sightings_against_central_differences():
         for k, analytic in ((first[p], found.J_first[p]), (second[p], found.J_second[p])):
             numeric = central_differences(partial(moved, k), np.zeros(3), 1e-5)
             np.testing.assert_allclose(analytic, numeric, atol=0.03 * np.abs(numeric).max())
-
-
-def test_the_increment_from_one_marker_has_the_covariance_of_both_its_sightings():
-    """Z Z'^-1 moves by its numerical derivatives; both covariances have correlations."""
-    z1, z2 = MARKERS[0], se2.between(DELTA, MARKERS[0])
-    C2 = 3 * C[::-1, ::-1]
-    (increment,), (covariance,) = _single_increments(z1[None], C[None], z2[None], C2[None])
-    np.testing.assert_allclose(increment, DELTA, atol=1e-12)
-    by_first = central_differences(lambda z: se2.compose(z, se2.inverse(z2)), z1)
-    by_second = central_differences(lambda z: se2.compose(z1, se2.inverse(z)), z2)
-    expected = by_first @ C @ by_first.T + by_second @ C2 @ by_second.T
-    np.testing.assert_allclose(covariance, expected, rtol=1e-6, atol=1e-12)
-
-
-@pytest.mark.parametrize("units", [[1, 1, 1], [1e6, 1e6, 1e-3], [1e-9, 1e3, 1]])
-def test_whether_an_information_is_singular_does_not_depend_on_the_units(units):
-    """In other units of x, y and heading, H becomes D H D with a diagonal D."""
-    D = np.diag(units)
-    regular = D @ np.linalg.inv(C) @ D
-    one_point = np.array([[1.0, 0, 0.4], [0, 1, 1.2]])             # the heading moves it, too
-    singular = D @ one_point.T @ one_point @ D
-    found = _inverse_where_regular(np.array([
-        regular, singular, np.full((3, 3), np.nan), np.zeros((3, 3))]))
-    np.testing.assert_allclose(D @ found[0] @ D, C, rtol=1e-9)
-    assert np.isnan(found[1:]).all()
 
 
 def test_many_increments_are_consistent():
@@ -194,25 +148,6 @@ def test_an_implausible_speed_makes_an_increment_unusable():
     assert alone.usable.all()                               # the test of the speed rejected it
 
 
-@pytest.mark.parametrize("a, b, similar", [
-    ((0.06, 0.08, 0.01), (0.06, 0.02, 0.01), False), ((0.06, 0.08, 0.01), (0.06, 0.04, 0.01), True),
-    ((1e-3, 0.0, 0.1), (1e-3, 0.0, 0.06), True), ((1e-3, 0.0, 0.1), (1e-3, 0.0, 0.04), False),
-    ((0.1, 0.0, 1.8e-3), (0.1, 0.0, 0.0), True), ((0.1, 0.0, 2.2e-3), (0.1, 0.0, 0.0), False)])
-def test_velocities_are_similar_if_they_differ_by_less_than_half_the_larger(a, b, similar):
-    """In speed and in turn; turns also if they differ by less than 1 mrad more than that."""
-    a, b = 1.001 * np.array([a]), np.array([b])
-    assert _similar(a, b) == _similar(b, a) == similar
-
-
-def test_common_sightings_by_hand():
-    row = np.array([0, 0, 0, 1, 1, 2, 2, 3])
-    marker = np.array([3, 5, 9, 5, 8, 5, 8, 3])
-    pair, first, second = common_sightings(row, marker)
-    np.testing.assert_array_equal(pair, [0, 1, 1])
-    np.testing.assert_array_equal(first, [1, 3, 4])
-    np.testing.assert_array_equal(second, [3, 5, 6])
-
-
 def test_repeated_sightings_are_averaged_or_dropped():
     readings = ArucoReadings(
         pose=np.array([0, 0, 0, 4, 4]), marker=np.array([7, 2, 7, 2, 2]),
@@ -227,17 +162,6 @@ def test_repeated_sightings_are_averaged_or_dropped():
     np.testing.assert_allclose(z, [[0, 2, 0], [1.02, 1, np.pi]], atol=1e-12)
     np.testing.assert_allclose(covariance[1], np.diag([5e-3, 5e-3, 7.5e-3]))
     np.testing.assert_array_equal(readings.marker_in_vehicle, before)
-
-
-def test_sightings_are_sorted_by_frame_and_extra_frames_have_none():
-    readings = ArucoReadings(np.array([3, 3, 8]), np.array([6, 2, 6]), np.zeros((3, 3)),
-                             np.tile(np.eye(3), (3, 1, 1)))
-    found = sightings_by_frame(readings, extra_frames=[0, 8])
-    np.testing.assert_array_equal(found.frame, [0, 3, 8])
-    np.testing.assert_array_equal(found.row, [1, 1, 2])
-    np.testing.assert_array_equal(found.marker, [2, 6, 6])
-    np.testing.assert_array_equal(found.index, [1, 0, 2])
-    np.testing.assert_array_equal(sightings_by_frame(None, [4, 0]).frame, [0, 4])
 
 
 def test_consensus_takes_the_most_certain_sighting_among_the_supported():
@@ -263,24 +187,3 @@ def test_a_start_from_rest_is_plausible():
     found = consecutive(z, np.tile(1e-6 * np.eye(3), (len(z), 1, 1)), row, marker)
     common = np.bincount(found.pair, minlength=214)
     assert (common[199:] == 1).all() and found.usable.all() and found.accepted.all()
-
-
-def test_many_points_take_little_memory():
-    """Forty points at each of fifty frames: 780 pairs of points for every pair of frames."""
-    rng = np.random.default_rng(0)
-    frames, points = 50, 40
-    place = rng.uniform(-5, 5, (points, 2))
-    along = np.linspace(0, 1, frames)
-    poses = np.column_stack([along, np.zeros(frames), along])
-    z = np.concatenate([se2.between(pose, np.column_stack([place, np.zeros(points)]))
-                        for pose in poses])
-    z[:, :2] += rng.normal(0, 1e-3, (len(z), 2))
-    C = np.tile(np.diag([1e-6, 1e-6, 1e4]), (len(z), 1, 1))
-    row, marker = np.repeat(np.arange(frames), points), np.tile(np.arange(points), frames)
-    pair, first, second = common_sightings(row, marker)
-    tracemalloc.start()
-    found = robust_increments(z, C, pair, first, second, frames - 1)
-    _, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert peak < 60e6
-    np.testing.assert_allclose(found.increment, se2.between(poses[:-1], poses[1:]), atol=2e-3)

@@ -26,7 +26,6 @@ from slamlib.slam.measurements import (
     Noise,
     measure,
 )
-from slamlib.slam.noise import BOUNDS
 from slamlib.slam.own import gtsam_values, variable_keys
 
 GROUPS = frozenset(entry.group for entry in ENTRIES) | {"antenna-offsets"}
@@ -152,48 +151,7 @@ def test_selected_blocks_are_those_of_the_dense_inverse(poses):
             blocks / scale, expected[at[:, :, None], at[:, None]] / scale, atol=1e-6)
 
 
-PRECISION = np.array([[40.0, 12.0, 0.0], [12.0, 90.0, -20.0], [0.0, -20.0, 60.0]])
 CENTRE = np.log([2e-3, 1.3, 0.8])
-
-
-def gaussian(x):
-    """A log density of the three logarithms, with its maximum 7 at CENTRE."""
-    return 7.0 - (x - CENTRE) @ PRECISION @ (x - CENTRE) / 2
-
-
-@pytest.mark.parametrize("free", [[0, 1, 2], [0, 1]])
-@pytest.mark.parametrize("start", [[0.1, 0.0, 0.1], [2.5, -2.0, 1.5]])
-def test_newtons_method_finds_mode_and_covariance_of_a_gaussian(free, start):
-    """What is not free keeps its start, and its covariance is zero."""
-    free, x = np.array(free), CENTRE + start
-    given = np.setdiff1d(range(3), free)
-    mode, value, covariance = noise._mode(
-        gaussian, x, gaussian(x), free, np.full(len(free), 0.1))
-    H, cross = PRECISION[np.ix_(free, free)], PRECISION[np.ix_(free, given)]
-    expected = CENTRE[free] - np.linalg.solve(H, cross @ (x - CENTRE)[given])
-    np.testing.assert_allclose(mode[free], expected, atol=1e-6)
-    np.testing.assert_array_equal(mode[given], x[given])
-    assert np.isclose(value, gaussian(mode)) and value > gaussian(x)
-    np.testing.assert_allclose(covariance[np.ix_(free, free)], np.linalg.inv(H), rtol=1e-6)
-    assert not covariance[given].any() and not covariance[:, given].any()
-
-
-def test_newtons_method_stays_within_the_bounds_and_never_descends():
-    """A mode beyond the bound of the slip, and a density that is not concave at the start."""
-    beyond = np.r_[BOUNDS[1, 0] + 1.0, CENTRE[1:]]
-    mode, *_ = noise._mode(
-        lambda x: -50 * np.sum((x - beyond)**2), CENTRE, -1e3, np.arange(3), np.full(3, 0.1))
-    np.testing.assert_allclose(mode, [BOUNDS[1, 0], *beyond[1:]], atol=1e-6)
-
-    def two_hills(x):
-        off = x[0] - CENTRE[0]
-        return float(np.logaddexp(-8 * (off - 1)**2, 1 - 8 * (off + 1)**2))
-
-    start = CENTRE + [0.05, 0, 0]
-    mode, value, _ = noise._mode(
-        two_hills, start, two_hills(start), np.array([0]), np.array([0.1]))
-    assert value >= two_hills(start)
-    assert abs(abs(mode[0] - CENTRE[0]) - 1) < 0.05
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.01])

@@ -204,30 +204,3 @@ def test_a_single_pose_has_the_initial_covariance():
         poses, covariances = function(np.zeros((1, 2), int), VEHICLE)
         np.testing.assert_array_equal(poses, [[0, 0, 0]])
         np.testing.assert_array_equal(covariances, [np.diag([0, 0, 1e-8])])
-
-
-def test_monte_carlo_draws_from_the_vehicle_sigmas():
-    """Sigmas after 10 m straight ahead: of the length 10 m sigma_R / R / sqrt(2), of the heading
-    10 m sqrt(2) sigma_R / (R b) and sigma_heading together.
-    """
-    ticks = np.full((1001, 2), 10 / 1000 / (2 * np.pi * 0.1) * 8000)
-    samples = odometry_draws(ticks, replace(VEHICLE, sigma_heading=0.03), [0, -1],
-                                        np.random.default_rng(2), draws=2000)
-    np.testing.assert_allclose(samples[:, 0, :2], 0)
-    np.testing.assert_allclose(samples[:, 0, 2].std(), 0.03, rtol=0.07)
-    np.testing.assert_allclose(samples[:, 1, 2].std(), np.hypot(0.03, 0.01 * np.sqrt(2) / 0.4),
-                               rtol=0.07)
-    length = np.hypot(samples[:, 1, 0], samples[:, 1, 1])
-    np.testing.assert_allclose(length.std(), 0.01 / np.sqrt(2), rtol=0.07)
-
-
-def test_the_chord_of_a_large_turn_is_the_same_to_both_sides():
-    """A unit arc that turns by d has the chord sin(d / 2) / (d / 2)."""
-    turn = np.array([-3.0, -1.0, -1e-5, 0.0, 1e-5, 1.0, 3.0])
-    chord, slope, share = odometry._chord(turn, "arc")
-    half = np.where(turn == 0, 1, turn) / 2
-    np.testing.assert_allclose(chord, np.where(turn == 0, 1, np.sin(half) / half))
-    h = 1e-6
-    numeric = (odometry._chord(turn + h, "arc")[0] - odometry._chord(turn - h, "arc")[0]) / (2 * h)
-    np.testing.assert_allclose(slope, numeric, atol=1e-9)
-    assert share == 0.5

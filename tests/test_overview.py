@@ -186,13 +186,6 @@ def test_the_abstract_says_what_was_found_with_the_numbers_of_the_table(project)
     assert "*all* is a simulated stand-in" in text
 
 
-def test_of_many_drives_the_abstract_names_the_shortest_and_the_longest(project):
-    drives = project.drives
-    many = [drives[0], *(replace(drives[1], name=f"x{n}") for n in range(4)), drives[2]]
-    text = overview.opening(many).cells[0].source.split("\n\n")[1]
-    assert not re.search(r"\*x\d", text) and "on *all*" in text
-
-
 def test_without_truth_the_abstract_compares_at_returns(project):
     recorded = overview.opening([drive for drive in project.drives if drive.truth is None])
     rows, text = result_rows(recorded)

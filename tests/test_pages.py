@@ -146,17 +146,6 @@ def test_a_drive_that_fails_is_left_out_of_its_chapter_and_costs_the_others_noth
     assert ">bad</td>" in report.files[4].read_text(encoding="utf-8")
 
 
-def test_a_chapter_of_which_no_drive_can_be_solved_runs_on_a_simulated_one(tmp_path, kept):
-    dataset = simulate("short", seed=3)[0].first(100)
-    write_dataset(tmp_path / "data" / "bad", replace(dataset, aruco=contradicted(dataset.aruco)))
-    copied(tmp_path / "notebooks", "2_*.ipynb")
-    report = build_report(tmp_path / "notebooks", tmp_path / "data", tmp_path / "report",
-                          tmp_path / "results", kept=kept)
-    assert "runs on a simulated drive instead" in report.files[1].read_text(encoding="utf-8")
-    assert [folder.name for folder in sorted((tmp_path / "results" / "bad").glob("[!.]*"))] == [
-        "problem2_fused", "problem2_hint"]
-
-
 def rows_of(page, name):
     """The texts of the cells of all rows that begin with the name of a drive."""
     rows = [[html.unescape(re.sub(r"<[^>]+>", "", cell)).strip()

@@ -62,11 +62,6 @@ def test_a_legend_has_each_label_once_and_as_few_lines_as_fit(labels, lines):
     assert boxes(fig)[-1].height / one_line == pytest.approx(lines, rel=0.2)
 
 
-def test_every_curve_has_a_colour_of_its_own():
-    lines = [look["color"] for look in plotting.ROLES.values() if look.get("linestyle") != "none"]
-    assert len(set(lines)) == len(lines)
-
-
 def boundaries(patches):
     """Points in data coordinates on the boundary of each ellipse of a collection, as drawn.
 
@@ -118,15 +113,6 @@ def test_ellipses_are_lines_of_equal_mahalanobis_distance(enlarged):
     assert ([x_low, y_low] < corners[0]).all() and (corners[1] < [x_high, y_high]).all()
 
 
-def test_the_scheme_of_a_graph_has_a_square_for_each_factor_and_a_name_for_each_variable():
-    _, ((ax,),) = plotting.panels(1)
-    plotting.slam_graph(ax, 3, [(0, 7), (1, 7), (2, 8)])
-    squares = [line for line in ax.lines if line.get_marker() == "s"]
-    assert len(squares) == 3 + 2 + 2                          # sightings, odometry, two priors
-    assert [text.get_text() for text in ax.texts] == [
-        "$X_1$", "$X_2$", "$X_3$", "$w$", "$L_{7}$", "$L_{8}$"]
-
-
 def drive_with(truth=True):
     """Results as solvers give them, and their Drive: 50 poses on a circle, errors of 1 cm."""
     turn = np.linspace(0, 5, 50)
@@ -145,16 +131,6 @@ def test_each_drive_has_its_panels_a_title_and_one_legend():
     assert [ax.get_title("left") for ax in fig.axes] == [r"a\$b", "", "two", ""]
     assert len(fig.legends) == 1
     assert list(plotting.each_drive([])) == [] and len(plt.gcf().axes) == 1
-
-
-def test_a_path_has_ellipses_of_its_covariances_and_their_factor_as_title():
-    result, drive = drive_with()
-    for _, ax in plotting.each_drive([drive]):
-        plotting.with_ellipses(ax, result.poses, result.covariances, "slam", count=9)
-    patches, = ax.collections
-    factor = int(ax.get_title("left").split("× ")[1].rstrip(")"))
-    rows = plotting.equidistant(result.poses, 9)
-    require_contours(patches, result.poses[rows], result.covariances[rows], factor * REACH_95)
 
 
 @pytest.mark.parametrize("truth", [True, False])

@@ -1,6 +1,5 @@
 """The files of results: as MATLAB, spreadsheets and evo read them."""
 
-import errno
 import json
 import os
 import shutil
@@ -64,20 +63,6 @@ def test_structs_through_scipy_and_octave(tmp_path, name, fields, d):
     again = loadmat(folder / "again.mat")
     for key, expected in (("i", [content[0]]), ("p", content[1]), ("c", content[2][1])):
         np.testing.assert_array_equal(again[key], expected)
-
-
-def test_a_failing_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
-    results.write_vehicle_poses(tmp_path, *example())
-    before = (tmp_path / "vehiclePose.mat").read_bytes()
-
-    def fail(*_):
-        raise OSError(errno.ENOSPC, "disk full")
-
-    monkeypatch.setattr(os, "replace", fail)
-    with pytest.raises(OSError, match="disk full"):
-        results.write_vehicle_poses(tmp_path, *example(9))
-    assert [f.name for f in tmp_path.iterdir()] == ["vehiclePose.mat"]
-    assert (tmp_path / "vehiclePose.mat").read_bytes() == before
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 107])

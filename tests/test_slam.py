@@ -6,9 +6,9 @@ import gtsam
 import numpy as np
 import pytest
 from gtsam.symbol_shorthand import A, C, L, X
-from numeric import as_points, central_differences, decided, known_noise, slam_trial, true_state
+from numeric import as_points, central_differences, decided, known_noise, slam_trial
 
-from slamlib import increments, odometry, se2, simulation, slam, studies
+from slamlib import odometry, se2, simulation, slam, studies
 from slamlib.dataset import (
     AntennaGuess,
     ArucoReadings,
@@ -22,17 +22,12 @@ from slamlib.simulation import simulate
 from slamlib.slam import factors, graph
 from slamlib.slam.choices import DECISIVE_LEAD, better_model
 from slamlib.slam.covariances import marginal_covariances, posterior_moments
-from slamlib.slam.factors import MINIMUM_SIGMA, odometry_noise, preintegrate_odometry
 from slamlib.slam.fit import (
     KERNELS,
-    MIN_RESIDUALS,
     ONE_SIDED,
-    Fit,
     accepted_measurements,
-    noise_of_scatter,
-    refine,
 )
-from slamlib.slam.initialization import GROWTH, odometry_state, part_lengths
+from slamlib.slam.initialization import GROWTH, part_lengths
 from slamlib.slam.linear import (
     NormalEquations,
     build_problem,
@@ -100,35 +95,6 @@ def test_odometry_factor_equals_gtsams_between_factor_for_known_wheels(example):
         np.testing.assert_allclose(np.c_[A, b], np.c_[J[i], -e[i]], atol=1e-9)
         native = gtsam.BetweenFactorPose2(0, 1, increment, gtsam.noiseModel.Gaussian.Covariance(Q))
         assert np.isclose(native.error(values), np.sum((U[i] @ e[i])**2) / 2, rtol=1e-6)
-
-
-@pytest.mark.parametrize("about", [[], [np.array([0.1003, 0.0998, 0.4001])]])
-def test_odometry_is_that_of_the_wheels_about_which_it_is_linear(example, about):
-    """The stated wheels, unless others are given; its derivatives are those at these wheels."""
-    m = example[0].measurements
-    found, of_stated = preintegrate_odometry(m, "arc", *about), example[0].odometry
-    stated = m.dataset.vehicle.wheel
-    wheel = about[0] if about else stated
-
-    def by_wheels(wheel):
-        return increments.between_poses(m.dataset.ticks, m.dataset.vehicle.with_wheel(wheel),
-                                        m.frame[:-1], m.frame[1:], "arc")[0]
-
-    np.testing.assert_array_equal([found.stated, found.wheel], [stated, wheel])
-    np.testing.assert_allclose(found.increment, by_wheels(wheel), atol=1e-12)
-    np.testing.assert_allclose(found.J_wheel, central_differences(by_wheels, wheel), rtol=1e-6,
-                               atol=1e-6)
-    np.testing.assert_allclose(found.covariance(2e-3), se2.rotate_covariance(
-        of_stated.covariance(2e-3), of_stated.increment[:, 2] - found.increment[:, 2]), atol=1e-15)
-
-
-def test_a_vehicle_that_stands_has_the_smallest_noise_along_both_axes():
-    frame = np.array([0, 10, 20])
-    rounding, slipping = odometry_noise(
-        np.zeros((21, 2)), Vehicle(ticks_per_revolution=1e12), frame[:-1], frame[1:])
-    smallest = np.diag([MINIMUM_SIGMA**2] * 2 + [0.0])
-    np.testing.assert_allclose(rounding, [smallest, smallest], rtol=1e-9, atol=1e-20)
-    np.testing.assert_array_equal(slipping, 0)
 
 
 def learned_noise(seed, slip):
@@ -363,16 +329,10 @@ def test_the_gate_has_a_smaller_error_than_hubers_kernel_with_wrong_labels():
     assert decided(runs["Huber ate"] - runs["gate ate"])
 
 
-def test_refine_keeps_the_accepted_measurements_if_accept_is_none():
-    """Evidences can be compared only on the same measurements."""
-    dataset = simulate("short", seed=4, mislabelled=0.02)[0].first(600)
-    fit = fit_from_odometry(measure(known_noise(dataset.without("uwb"), 1e-3)))
-    assert fit.problem.accepted.rejected.any()
-    accepted = replace(fit.problem.accepted, weight=np.roll(fit.problem.accepted.weight, 1))
-    again = refine(replace(fit.problem, accepted=accepted), fit.state, accept=None)
-    assert again.problem.accepted.weight is accepted.weight
-    tested = refine(again.problem, fit.state)
-    np.testing.assert_array_equal(tested.problem.accepted.weight, fit.problem.accepted.weight)
+def test_the_gate_rejects_wrong_labels_and_hardly_any_others():
+    numbers = kernels.compare(6, "sightings", ("quadratic", "gate"), mislabelled=0.03)
+    assert numbers["gate wrong rejected"] == 1 and numbers["gate good lost"] < 0.005
+    assert numbers["quadratic wrong rejected"] == numbers["quadratic good lost"] == 0
 
 
 OPEN_PATHS = {                                            # legs of (metres, radians)
@@ -439,63 +399,6 @@ def test_parts_of_a_drive_grow_at_most_fourfold_from_where_the_heading_is_lost()
     blind = replace(vehicle, sigma_heading=1.0)       # the same error at all poses loses no turn
     for other, expected in ((sure, [count]), (blind, ends)):
         assert part_lengths(replace(drive, vehicle=other)) == expected
-
-
-def test_a_longer_part_goes_on_from_the_last_solved_pose_with_its_wheels():
-    dataset, truth = simulate("short", seed=4, noise=False)
-    dataset = dataset.without("uwb")
-    part, whole = measure(dataset.first(500)), measure(dataset)
-    wheel, rng = np.array([0.1003, 0.0998, 0.4001]), np.random.default_rng(0)
-    c = np.r_[wheel, part.calibration.stated[3:] + rng.normal(0, 0.01, 11)]
-    poses = truth.poses[part.frame] + rng.normal(0, 0.01, (len(part.frame), 3))
-    solved = state_from_arrays(part, poses, np.zeros((len(part.marker), 3)), np.zeros((0, 2)), c)
-    found = odometry_state(whole, "arc", part, solved)
-    last = len(part.frame) - 1
-    kept = np.searchsorted(whole.frame, part.frame[:-1])
-    np.testing.assert_allclose(found.poses[kept], solved.poses[:-1], atol=1e-12)
-    np.testing.assert_array_equal(found.c, c)
-    expected = odometry.dead_reckoning(
-        dataset.ticks[499:], dataset.vehicle.with_wheel(wheel), solved.poses[last], "arc")
-    later = whole.frame > 499
-    np.testing.assert_allclose(found.poses[later], expected[whole.frame[later] - 499], atol=1e-9)
-
-
-def test_a_point_has_the_heading_variance_of_its_best_sighting_and_few_markers_are_left_out():
-    """Marker 5 is a point; two of three sightings of 6 are rejected, and one of two of 7."""
-    pose, marker = np.arange(7), np.array([5, 5, 6, 6, 6, 7, 7])
-    C = np.tile(1e-4 * np.eye(3), (7, 1, 1))
-    C[:2, 2, 2] = [9.0, 4.0]
-    m, problem = standing(ArucoReadings(pose, marker, np.tile([1.0, 0, 0], (7, 1)), C), 7)
-    for weight, expected in ([1, 1, 1, 0, 0, 1, 0], [5]), (np.ones(7), [5, 6, 7]):
-        accepted = replace(problem.accepted, weight=np.array(weight, float))
-        found = slam_result(Fit(
-            problem=replace(problem, accepted=accepted), state=odometry_state(m, "arc"),
-            log_evidence=0.0, posterior=None, converged=True))
-        np.testing.assert_array_equal(found.marker, expected)
-        np.testing.assert_allclose(found.marker_covariance[0, 2], [0, 0, 4])
-
-
-def test_the_scatter_of_residuals_gives_factors_of_at_least_one():
-    """Medians of chi-squared with 3, 2 and 1 degrees of freedom, for poses, points and ranges."""
-    rng, (dataset, truth) = np.random.default_rng(0), simulate("short", seed=4)
-
-    def stated(variance, sigma):
-        a, u = dataset.aruco, dataset.uwb
-        return replace(dataset, aruco=replace(a, covariance=variance * a.covariance),
-                       uwb=replace(u, sigma=sigma * u.sigma))
-
-    noisy = stated(1 / 9, 1 / 4)
-    points = replace(noisy, aruco=as_points(noisy.aruco, slice(None)))
-    for drive, sightings, ranges in ((noisy, 3, 4), (points, 3, 4), (stated(9, 1), 1, 1)):
-        m = measure(drive)
-        state = true_state(m, truth)
-        state = replace(state, c=state.c + m.calibration.sigma * rng.normal(size=len(state.c)))
-        found = noise_of_scatter(build_problem(m, "arc"), state)
-        np.testing.assert_allclose([found.sightings, found.ranges], [sightings, ranges], rtol=0.1)
-    few = measure(noisy.first(60))
-    assert 0 < len(few.ranges.row) < MIN_RESIDUALS < len(few.marker_row)
-    found = noise_of_scatter(build_problem(few, "arc"), true_state(few, truth))
-    assert found.ranges == 1 < found.sightings
 
 
 @pytest.mark.slow
@@ -593,19 +496,6 @@ def test_the_evidence_chooses_the_steps_that_the_vehicle_drives(true, other):
     assert found.problem.odometry.model == true
     assert found.log_evidence > wrong.log_evidence + DECISIVE_LEAD
     np.testing.assert_array_equal(found.problem.accepted.weight, wrong.problem.accepted.weight)
-
-
-def test_headings_of_a_state_follow_the_turns_by_odometry():
-    """Whatever whole turns are in the poses; the first heading is wrapped."""
-    dataset, truth = simulate("short", seed=5, rounds=2)
-    m, rng = measure(dataset.without("uwb")), np.random.default_rng(0)
-    right = true_state(m, truth)
-    assert np.ptp(right.poses[:, 2]) > 12
-    turns = rng.integers(-3, 4, len(m.frame))
-    for whole in (turns, np.zeros(len(m.frame)), np.full(len(m.frame), -1)):
-        state = state_from_arrays(m, right.poses + 2 * np.pi * whole[:, None] * [0, 0, 1],
-                                  right.markers, right.antennas, right.c)
-        np.testing.assert_allclose(state.poses, truth.poses[m.frame], atol=1e-9)
 
 
 def test_headings_are_continuous_where_frames_are_rounds_apart():

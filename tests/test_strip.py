@@ -1,14 +1,11 @@
 """Saved notebooks go back to the committed bytes, by `make strip` and by git's filter."""
 
 import json
-import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import nbformat
-import pytest
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
@@ -79,54 +76,3 @@ def test_what_is_no_notebook_is_told_and_left_as_it_is(tmp_path):
         assert file.read_bytes() == content
     done = strip(content=b"[]")
     assert done.returncode == 1 and done.stdout == b"" and done.stderr.count(b"\n") == 1
-
-
-@pytest.mark.skipif(not all(map(shutil.which, ("git", "make"))), reason="no git or no make here")
-def test_git_finds_no_difference_in_a_notebook_that_was_executed(tmp_path):
-    """After `make setup` alone, also in a folder of a repository, and where .venv is gone."""
-    folder = tmp_path / "a folder" / "project"
-    (folder / "notebooks").mkdir(parents=True)
-    for name in (".gitattributes", "Makefile", "check_python.py", "pyproject.toml",
-                 "requirements.txt", STRIP.name):
-        shutil.copy(ROOT / name, folder)
-    notebook = folder / "notebooks" / "1_odometry.ipynb"
-    notebook.write_bytes(strip(content=NOTEBOOKS[0].read_bytes()).stdout)
-    (tmp_path / ".gitignore").write_text(".venv\n")
-
-    alone = {name: value for name, value in os.environ.items()
-             if not name.startswith(("MAKE", "MFLAGS"))}        # of the make that runs the tests
-
-    def run(*command):
-        done = subprocess.run(command, cwd=folder, text=True, capture_output=True, timeout=300,
-                              env=alone)
-        assert done.returncode == 0, done.stderr
-        return done.stdout
-
-    def git(*arguments):
-        return run("git", "-c", "user.name=a", "-c", "user.email=a@b", *arguments)
-
-    (folder / ".venv" / "bin").mkdir(parents=True)              # an environment that is ready
-    (folder / ".venv" / "bin" / "python").symlink_to(sys.executable)
-    ready = run("make", "--eval=ready:;@echo $(READY)", "ready").strip()
-    (folder / ready).touch()
-    run("make", "setup")                                        # no repository yet
-    git("init", "--quiet", str(tmp_path))
-    git("add", "--all", str(tmp_path))
-    git("commit", "--quiet", "--message=first")
-    save_as_lab(notebook)
-    assert "of JupyterLab" in git("diff")                       # what the filter is for
-    git("checkout", ".")
-    run("make", "setup")
-    notebook.touch()
-    assert git("status", "--porcelain") == ""
-    save_as_lab(notebook)
-    assert git("diff") == ""
-    git("add", "--all")                                         # status goes by the size until then
-    assert git("status", "--porcelain") == git("diff", "--cached") == ""
-    notebook.write_text(notebook.read_text(encoding="utf-8").replace('"# 1. O', '"# 1. o'),
-                        encoding="utf-8")
-    assert [line for line in git("diff").splitlines() if line[:1] in "+-"][2:] == [
-        '-    "# 1. Odometry from wheel counts\\n",', '+    "# 1. odometry from wheel counts\\n",']
-    shutil.rmtree(folder / ".venv")
-    notebook.touch()
-    assert "of JupyterLab" in git("diff")

@@ -80,6 +80,13 @@ def test_no_module_imports_itself_by_way_of_others():
                        for module in MODULES}).prepare()
 
 
+def test_dataclasses_are_frozen():
+    made = [(module, ast.unparse(decorator)) for module, tree in MODULES.items()
+            for node in ast.walk(tree) if isinstance(node, ast.ClassDef)
+            for decorator in node.decorator_list if "dataclass" in ast.unparse(decorator)]
+    assert len(made) > 20 and all("frozen=True" in decorator for _, decorator in made)
+
+
 def test_modules_and_functions_are_short():
     for file in FILES:
         assert file.read_text(encoding="utf-8").count("\n") <= MAX_MODULE, file

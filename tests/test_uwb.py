@@ -21,10 +21,8 @@ from slamlib.slam.calibration import OFFSET, RANGES, SCALE, SIGHTINGS, stated_ca
 from slamlib.slam.fit import KERNELS, ONE_SIDED
 from slamlib.slam.graph import optimize
 from slamlib.slam.initialization import (
-    KERNEL_SCALE,
     AntennaRanges,
     odometry_state,
-    ranges_by_antenna,
     second_moment,
     trilaterate,
 )
@@ -110,14 +108,6 @@ def test_derivatives_against_central_differences(error, kind, size, ideal):
     by_c = error(z, pose, place, c, motion)[3]                # a delay moves nothing that stands
     numeric = central_differences(lambda c: error(z, pose, place, c, motion)[0], c)[..., kind]
     np.testing.assert_allclose(by_c, numeric, atol=1e-7)
-
-
-def test_a_range_has_offset_scale_and_height():
-    c = stated_calibration(Vehicle(range_offset=0.1, range_scale=1.5, antenna_height=2.0),
-                           np.arange(2)).stated + np.r_[np.zeros(14), 0.0, 0.3]
-    e, *_ = factors.range_error(np.array([7.0]), np.array([[1.0, 1, 2]]), np.zeros((1, 3)),
-                                np.zeros((1, 3)), np.array([[9.0, 9], [4, 5]]), np.array([1]), c)
-    np.testing.assert_allclose(e, [[0.1 + 0.3 + 1.5 * np.sqrt(9 + 16 + 4) - 7]], atol=1e-12)
 
 
 def test_antenna_from_known_poses_by_hand():
@@ -297,20 +287,6 @@ def test_second_moment_is_that_of_a_mixture_of_both_mirror_images():
                                C + [[0, 0], [0, 64 / 2]], rtol=1e-2, atol=1e-3)
 
 
-def test_ranges_carry_the_uncertainty_of_the_place_they_were_measured_from():
-    """sigma^2 is that of the range plus the mean variance of the vehicle's x and y."""
-    dataset, poses = drive([(2.0, 1.0)], np.array([3.0, 4.0]), (3.5, 4.0), every=50)
-    m = measure(dataset)
-    variance = 1e-4 * np.arange(len(m.frame))
-    C = np.zeros((len(m.frame), 3, 3))
-    C[:, 0, 0], C[:, 1, 1], C[:, 2, 2] = variance, 3 * variance, 9.0
-    ranges, = ranges_by_antenna(m, poses[m.frame], C, m.calibration.stated)
-    np.testing.assert_allclose(ranges.sigma**2, 0.05**2 + 2 * variance[m.ranges.row])
-    np.testing.assert_allclose(ranges.positions, poses[dataset.uwb.pose, :2])
-    np.testing.assert_array_equal(ranges.distance, dataset.uwb.range)
-    np.testing.assert_array_equal(ranges.guess, [3.5, 4.0])
-
-
 @pytest.mark.parametrize("weight, said", [
     (np.ones(40), None), (np.repeat([1.0, 0.4], [21, 19]), None),
     (np.repeat([1.0, 0.4], [19, 21]), "21 of its 40 ranges disagree"),
@@ -340,25 +316,6 @@ def test_a_kernel_takes_a_known_part_of_the_variance():
         below, above = (quad(weighted, -8, 8, (power,))[0] for power in (0, 2))
         assert 0.5 < consistency_factor(kernel) < 1
         assert np.isclose(consistency_factor(kernel), above / below, rtol=1e-4)
-
-
-def test_places_are_minima_of_the_cost():
-    """At places from many starts the cost rises in all directions; the first is the lowest."""
-    dataset, truth = simulate("short", seed=7, late_ranges=0.2)
-    m = measure(dataset.first(500))
-    for ranges in ranges_by_antenna(m, truth.poses[m.frame], np.zeros((len(m.frame), 3, 3)),
-                                    m.calibration.stated):
-        def cost(place, of=ranges):
-            e = np.r_[(np.hypot(*(of.positions - place).T) - of.distance) / of.sigma,
-                      (place - of.guess) / GUESS_PRIOR_SIGMA]
-            return KERNEL_SCALE**2 / 2 * np.log1p((e / KERNEL_SCALE)**2).sum()
-
-        places, costs, _ = trilaterate(ranges)
-        assert costs[0] == 0 and (np.diff(costs) >= 0).all()
-        for place, above in zip(places, costs):
-            assert np.isclose(cost(place) - cost(places[0]), above)
-            for step in 0.01 * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]]):
-                assert cost(place + step) > cost(place)
 
 
 @pytest.fixture(scope="module")

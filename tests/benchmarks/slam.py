@@ -1,4 +1,4 @@
-"""Errors of problem 3 beside a plain GTSAM script, of kernels for late ranges, and with memory.
+"""Errors of problem 3 beside a plain GTSAM script.
 
     python tests/benchmarks/slam.py [large]
 """
@@ -18,10 +18,8 @@ from plain_gtsam import plain  # noqa: E402
 from slamlib import slam, studies  # noqa: E402
 from slamlib.evaluation import anees, ate, nees_band  # noqa: E402
 from slamlib.simulation import simulate  # noqa: E402
-from slamlib.studies import kernels, montecarlo  # noqa: E402
 
 SEEDS = range(8)
-RANGE_METHODS = ("quadratic", "Huber", "Cauchy", "asymmetric Tukey")
 
 
 def trial(seed, slip):
@@ -49,38 +47,5 @@ def errors(seeds):
               f"{rms['learned'] / rms['plain']:10.2f}{runs['nees'].mean():8.2f}")
 
 
-def compare_kernels(seeds):
-    """Print the errors and NEES of the kernels for late ranges."""
-    print(f"\nProblem 4 without markers: late ranges, {len(seeds)} drives of the short path")
-    for late in (0.0, 0.05, 0.15, 0.30):
-        runs = studies.run(kernels.compare, seeds, kind="ranges", methods=RANGE_METHODS,
-                           markers=False, late_ranges=late)
-        print(f"{100 * late:.0f} % late{'':12}{'ATE (mm)':>10}{'NEES':>8}{'antennas (mm)':>15}"
-              f"{'NEES':>8}")
-        rms, mean = np.sqrt((runs**2).mean()), runs.mean()
-        for name in RANGE_METHODS:
-            print(f"  {name:18}{1e3 * rms[f'{name} ate']:10.1f}{mean[f'{name} nees']:8.2f}"
-                  f"{1e3 * rms[f'{name} antenna error']:15.1f}{mean[f'{name} antenna nees']:8.2f}")
-
-
-def correlated_errors(seeds):
-    """Print NEES and ATE of problems 2 and 3 by the correlation of successive sightings' errors."""
-    print(f"\nErrors with memory: {len(seeds)} drives of the short path")
-    print(f"{'':14}{'NEES':>7}{'median':>8}{'ATE (mm)':>10}")
-    for each in (0.0, 0.5, 0.9, 0.97):
-        runs = studies.run(montecarlo.correlated_errors, seeds, correlation=each)
-        print(f"correlation {each:g}")
-        for method in montecarlo.MEMORY_METHODS:
-            values = runs[f"{method} nees"]
-            print(f"  {method:12}{values.mean():7.2f}{values.median():8.2f}"
-                  f"{1e3 * runs[f'{method} ate'].mean():10.2f}")
-
-
-def main(seeds):
-    errors(seeds)
-    compare_kernels(seeds)
-    correlated_errors(seeds)
-
-
 if __name__ == "__main__":
-    main(range(24) if "large" in sys.argv[1:] else SEEDS)
+    errors(range(24) if "large" in sys.argv[1:] else SEEDS)
