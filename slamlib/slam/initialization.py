@@ -26,8 +26,8 @@ MAX_VOTES = 60               # number of sightings of a marker that enter its co
 MAX_RANGES = 150             # maximum number of ranges used per antenna, evenly chosen
 SAME_PLACE = 0.03            # of the median range: positions closer than this are one
 KERNEL_SCALE = 2.0           # sigmas, scale of the Cauchy kernel
-START_DIRECTIONS = 4         # number of starts on a circle about the path
-TOLERANCE = 1e-6             # relative, of cost and position, at which the search ends
+START_DIRECTIONS = 3         # number of starts on a circle about the path
+TOLERANCE = 1e-4             # relative, of cost and position, at which the search ends
 
 
 def initial_state(measurements, model):
@@ -150,9 +150,9 @@ def ranges_by_antenna(measurements, poses, covariances, c, factor=1.0):
 def trilaterate(ranges):
     """Possible positions of an antenna with these AntennaRanges: minima of a Cauchy cost.
 
-    The guess counts as two more measurements. The search starts there, at the reflection of the
-    guess through the centre of the path, and at START_DIRECTIONS points of a circle about this
-    centre, with the median range as radius.
+    The guess counts as two more measurements. The search starts there, and at START_DIRECTIONS
+    points of a circle about the centre of the path, with the median range as radius: three are on
+    both sides of any line through this centre.
 
     Returns
     -------
@@ -177,7 +177,7 @@ def trilaterate(ranges):
 
     minima = sorted((least_squares(errors, start, derivatives, loss="cauchy", f_scale=KERNEL_SCALE,
                                    ftol=TOLERANCE, xtol=TOLERANCE)
-                     for start in (guess, 2 * centre - guess, *circle)), key=lambda each: each.cost)
+                     for start in (guess, *circle)), key=lambda each: each.cost)
     distinct = []
     for each in minima:
         if all(np.hypot(*(each.x - other.x)) > SAME_PLACE * radius for other in distinct):
