@@ -6,10 +6,7 @@ import pytest
 
 from slamlib import odometry, se2
 from slamlib.dataset import Vehicle, read_dataset, read_truth
-from slamlib.simulation import (
-    simulate,
-    write_dataset,
-)
+from slamlib.simulation import simulate, write_dataset
 
 DATA = Path(__file__).parents[1] / "data"
 RECIPES = {"short": dict(path="short", seed=1),
