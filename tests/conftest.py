@@ -25,10 +25,12 @@ settings.load_profile("short")           # another one by `pytest --hypothesis-p
 
 ROOT = Path(__file__).parents[1]
 STUDY_SEEDS = "2"            # in pages that tests build: their claims are tested on more drives
-# Files that mostly wait run beside files that start further processes: both processors are busy.
-FIRST = ("test_pages", "test_concurrency", "test_lab", "test_slam", "test_flaws", "test_uwb",
-         "test_report", "test_docs", "test_localization", "test_properties", "test_doubts",
-         "test_overview", "test_cache", "test_studies")
+# The longest come first, and those that mostly wait beside those that start further processes.
+FIRST = ("test_pages", "test_concurrency", "test_lab", "test_slam", "test_flaws", "test_memory",
+         "test_uwb", "test_localization", "test_odometry_gate", "test_calibration", "test_docs",
+         "test_doubts", "test_fusion", "test_report", "test_properties", "test_main", "test_handin",
+         "test_overview", "test_document", "test_library", "test_maps", "test_cache",
+         "test_studies")
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 

@@ -18,12 +18,7 @@ from slamlib.evaluation import align, anees, ate
 from slamlib.localization import fuse, fuse_increments, localize
 from slamlib.simulation import mislabel, simulate
 from slamlib.slam import choices, graph, own
-from slamlib.slam.calibration import (
-    ANTENNAS,
-    ENTRIES,
-    RANGE_LAG,
-    SIGHTING_LAG,
-)
+from slamlib.slam.calibration import ANTENNAS, ENTRIES, RANGE_LAG, SIGHTING_LAG
 from slamlib.slam.factors import SMOOTHED_STEPS
 from slamlib.slam.fit import KERNELS, ONE_SIDED
 from slamlib.slam.initialization import odometry_state

@@ -120,15 +120,6 @@ def texts(folder):
     return {name: (folder / name).read_text() for name in swap.file_names(folder)}
 
 
-def test_a_folder_that_is_a_link_stays_one_and_one_that_gets_empty_goes(tmp_path):
-    (tmp_path / "there").mkdir()
-    (tmp_path / "out").symlink_to("there")
-    publish(tmp_path / "out", a="new")
-    assert (tmp_path / "out").is_symlink() and texts(tmp_path / "there")["a.txt"] == "new"
-    publish(tmp_path / "there")
-    assert not (tmp_path / "there").exists() and hidden(tmp_path) == []
-
-
 @pytest.mark.parametrize("content", ["5", "[1, null, \"../a\"]", "no JSON"])
 def test_a_list_of_files_that_is_none_names_no_file(tmp_path, content):
     swap.write_atomically(tmp_path / "out" / "mine.txt", b"mine")

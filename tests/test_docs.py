@@ -29,6 +29,7 @@ def test_examples_in_docstrings_are_true(module, tmp_path, monkeypatch):
     assert failed == 0 < tried
 
 
+@pytest.mark.slow
 def test_examples_in_the_map_of_the_code_are_true(monkeypatch):
     monkeypatch.chdir(ROOT)
     failed, tried = doctest.testfile(str(ROOT / "docs" / "code.md"), module_relative=False)

@@ -10,14 +10,7 @@ from numeric import as_points, changed
 
 from slamlib.checks import files
 from slamlib.checks.files import doubts_before_solving
-from slamlib.dataset import (
-    AntennaGuess,
-    Dataset,
-    DatasetError,
-    UwbReadings,
-    Vehicle,
-    read_dataset,
-)
+from slamlib.dataset import AntennaGuess, Dataset, DatasetError, UwbReadings, Vehicle, read_dataset
 from slamlib.doubt import Doubt
 from slamlib.simulation import manoeuvre, simulate, write_dataset
 

@@ -3,14 +3,7 @@
 import shutil
 
 import pytest
-from test_dataset import (  # noqa: F401
-    FILES,
-    assert_same,
-    assert_same_but_notes,
-    error_of,
-    folder,
-    write,
-)
+from test_dataset import FILES, assert_same, assert_same_but_notes, error_of, folder, write  # noqa: F401
 
 from slamlib.dataset import DatasetError, dataset_names, inventory_lines, read_dataset, read_truth
 from slamlib.folder import left_in

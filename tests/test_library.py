@@ -67,22 +67,16 @@ def changed_at(place, value):
 @pytest.mark.parametrize("change, told", [
     ({"ticks": lambda a: a[:, :1]}, "ticks: expected a matrix of real numbers with 2 columns "
      "(right ticks, left ticks), found float64 of shape (2000, 1)"),
-    ({"ticks": lambda a: "data/short"}, "ticks: expected a matrix of real numbers with 2 columns"),
     ({"ticks": changed_at((7, 1), np.nan)}, "ticks, row 8: expected left ticks, a whole number"),
-    ({"ticks": changed_at((7, 0), 0.5)}, "ticks, row 8: expected right ticks, a whole number"),
     ({"ticks": lambda a: a[:0]}, "ticks: expected at least"),
     ({"aruco": lambda a: a[:, 1:]}, "aruco: expected a matrix of real numbers with 11 columns "
      "(pose id, marker id, x"),
-    ({"aruco": lambda a: a[0]}, "aruco: expected a matrix of real numbers"),
     ({"aruco": lambda a: [[1], [1, 2]]}, "aruco: expected a matrix of real numbers"),
-    ({"aruco": changed_at((3, 0), 0)}, "aruco, row 4: expected pose id, a whole number"),
     ({"aruco": changed_at((3, 0), 2001)}, "aruco, row 4: expected pose id, a whole number"),
     ({"aruco": changed_at((3, 2), np.nan)}, "aruco, row 4: expected x, a number, found 'nan'"),
-    ({"aruco": changed_at((3, 5), -1e-4)}, "aruco, row 4: expected s_xx, a finite number from"),
     ({"aruco": changed_at((3, 6), 1.0)}, "aruco, row 4: expected a positive definite covariance"),
     ({"uwb": changed_at((0, 3), -0.1)}, "uwb, row 1: expected sigma, a finite number from 1e-09"),
     ({"uwb": changed_at((5, 2), 0)}, "uwb, row 6: expected a range, which 0 (no reception) is not"),
-    ({"uwb": changed_at((5, 1), 99)}, "uwb, row 6: expected an antenna id that the guesses have"),
     ({"guess": lambda a: None}, "uwb, row 1: expected an antenna id that the guesses have"),
     ({"guess": lambda a: np.r_[a, a]}, "guess, row 5: expected each id only once"),
     ({"vehicle": lambda _: "tractor"}, "vehicle: expected a Vehicle, found 'tractor'"),

@@ -165,35 +165,6 @@ def test_a_command_in_a_process_of_its_own_ends_in_one_sentence_too(tmp_path):
     assert done.returncode == 2 and done.stdout == "" and done.stderr.count("\n") == 1
 
 
-def test_wrong_python_or_platform_is_one_sentence():
-    check = """
-import platform, sys
-sys.path.insert(0, {root!r})
-import check_python
-check_python.installed = lambda: None
-system, machine, libc = platform.system, platform.machine, platform.libc_ver
-version = sys.version_info
-for change in {changes!r}:
-    exec(change)
-    print(check_python.problem())
-    platform.system, sys.version_info, platform.machine = system, version, machine
-    platform.libc_ver, check_python.installed = libc, lambda: None
-"""
-    conda = "platform.system = lambda: 'Windows'; check_python.installed = lambda: ['4', '{}']"
-    cases = {"pass": "None", conda.format(3): "None", conda.format(2): "WSL2",
-             conda.format(3) + "; sys.version_info = (3, 10, 9)": "WSL2",
-             "sys.version_info = (3, 10, 9)": "Python 3.11 to 3.14",
-             "sys.version_info = (3, 15, 0)": "Python 3.11 to 3.14",
-             "platform.system = lambda: 'Windows'": "environment.yml",
-             "platform.machine = lambda: 'riscv64'": "riscv64",
-             "platform.system = lambda: 'Linux'; platform.libc_ver = lambda: ('', '')": "glibc"}
-    said = subprocess.run(
-        [sys.executable, "-c", check.format(root=str(ROOT), changes=[*cases])], text=True,
-        capture_output=True, check=True).stdout.splitlines()
-    for line, (change, word) in zip(said, cases.items(), strict=True):
-        assert word in line, change
-
-
 def test_doubts_are_in_the_summary_and_below_the_table(tmp_path, capsys, drive):
     """About the drive first, then by problem; an antenna of two ranges; truth in another frame."""
     dataset, truth = drive

@@ -7,16 +7,8 @@ from numeric import central_differences
 from slamlib import se2
 from slamlib.dataset import ArucoReadings
 from slamlib.evaluation import nees, nees_band
-from slamlib.marker_increments import (
-    common_sightings,
-    consecutive_increments,
-    robust_increments,
-)
-from slamlib.sightings import (
-    Sightings,
-    consensus,
-    merge_repeated,
-)
+from slamlib.marker_increments import common_sightings, consecutive_increments, robust_increments
+from slamlib.sightings import Sightings, consensus, merge_repeated
 
 DELTA = np.array([0.12, -0.03, 0.2])
 MARKERS = np.array([[1.2, 0.4, 0.3], [-0.7, 1.1, -2.9], [0.2, -1.3, 3.1], [-1.0, -0.8, 1.0]])

@@ -83,6 +83,7 @@ def test_the_same_step_by_gtsam(remembering):
         NormalEquations(problem, state).step(), gtsam_step(problem, state), atol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("correlation", [0.0, 0.5, 0.9, 0.97])
 def test_covariances_are_honest(correlation):
     """Mean NEES of every method, 3 is expected; without memory of errors it is overconfident.
@@ -97,6 +98,7 @@ def test_covariances_are_honest(correlation):
     assert (runs["independent nees"].mean() > nees_band(8)[1]) == (correlation > 0)
 
 
+@pytest.mark.slow
 def test_echoes_that_stay():
     """Ranges with slowly changing errors: antennas are as far off as their covariances say."""
     squared = []

@@ -127,6 +127,7 @@ def clean():
     return dataset, truth, errors(slam.estimate(dataset.without("uwb")), truth)[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_fault_of_odometry_is_told_and_costs_little(name, clean):
     fault, most = FAULTS[name]

@@ -6,27 +6,24 @@
 import json
 import tempfile
 from collections import Counter
-from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
-from numeric import known_noise
 from test_dataset import FILES, write
 
-from slamlib import localization, odometry, se2, slam
+from slamlib import odometry, se2
 from slamlib.checks.files import doubts_before_solving
-from slamlib.dataset import DatasetError, Vehicle, read_dataset, read_truth
+from slamlib.dataset import Dataset, DatasetError, Vehicle, read_dataset, read_truth
 from slamlib.simulation import simulate
 from slamlib.solve import Failure, solutions
 from slamlib.summary import summarize
 
 QUICK = settings(max_examples=3 * settings.default.max_examples)
-HALF, FEW = (settings(max_examples=settings.default.max_examples // by) for by in (2, 6))
+HALF = settings(max_examples=settings.default.max_examples // 2)
 
 # Drives.
 
@@ -221,120 +218,56 @@ def assert_positive(covariances, least, problem):
 # Changes of a drive that change nothing but what they must.
 
 SMALLEST = 1e-9            # m and rad, sigma of what has none: position of pose 1 in problem 1
-# Tolerances are in sigmas. Rounding is 1e-16 of the information, which reaches 1e10 / m^2 (by
-# MINIMUM_SIGMA of the odometry) beside the 1 / rad^2 of the first heading: 1e-6, here times 100.
-ROUNDING = 1e-4
-# The search of the noise ends where it gains 0.01 in log density, 0.14 of its own sigma from the
-# maximum. Rounding decides where, and so little of the noise changes a covariance by few percent.
+# In sigmas. The search of the noise ends where it gains 0.01 in log density, 0.14 of its own sigma
+# from the maximum. Rounding decides where, and so little of the noise changes a covariance by few
+# percent.
 LEARNED = 0.05
 
 
-def solved(dataset, slip=None):
-    """By problem, a list of what was estimated: ids (m,), values (m, d), covariances (m, d, d).
+def estimates(dataset, numbers=None, factor=(1, 1, 1)):
+    """Ids (m,), values (m, d) and covariances (m, d, d) of poses and maps, sorted by id.
 
-    Poses, markers and antennas. Not problem 4 with an antenna in doubt: beside the antenna, the
-    direction of a range is that of rounding, and few ranges may leave Gauss-Newton in a valley in
-    which it ends by its number of steps.
+    Ids become `numbers` (dict), and values [x, y, heading] are multiplied by `factor`.
     """
-    pose, found = np.arange(len(dataset.ticks)), {}
-    found["problem1"] = [(pose, *odometry.equation2(dataset.ticks, dataset.vehicle))]
-    if dataset.aruco is not None:
-        with suppress(DatasetError):                        # all sightings contradict each other
-            each = localization.localize(dataset.aruco)
-            found["problem2"] = [(each.frame, each.poses, each.covariances),
-                                 (each.marker, each.marker_in_world, each.marker_covariance)]
-        for name, each in (("problem2_hint", localization.fuse_increments(dataset)),
-                           ("problem2_fused", localization.fuse(dataset, slip))):
-            found[name] = [(pose, each.poses, each.covariances)]
-    for name, sensors in (("problem3", dataset.without("uwb")), ("problem4", dataset)):
-        if sensors.aruco is not None or sensors.uwb is not None:
-            each = slam.estimate(sensors if slip is None else known_noise(sensors, slip))
-            if each.doubts:
-                continue
-            found[name] = [(pose, each.poses, each.covariances),
-                           (each.marker, each.marker_in_world, each.marker_covariance),
-                           (each.antenna, each.antenna_in_world, each.antenna_covariance)]
-    return found
-
-
-def assert_same(before, after, tolerance, numbers=None, factor=(1, 1, 1)):
-    """Estimates differ by `tolerance` sigmas, covariances by as much of a product of sigmas.
-
-    After the change, what had the id `i` has the id `numbers[i]`, and values [x, y, heading] are
-    multiplied by `factor`.
-    """
-    assert before.keys() == after.keys()
-    for problem, kinds in before.items():
-        for k, ((ids, x, C), (other_ids, other, other_C)) in enumerate(
-                zip(kinds, after[problem], strict=True)):
-            expected = ids if k == 0 or numbers is None else np.array([*map(numbers.get, ids)], int)
-            order = np.argsort(expected)
-            np.testing.assert_array_equal(expected[order], other_ids)
-            by = np.array(factor[:x.shape[1]])
-            off = other / by - x[order]
-            off[:, 2:] = se2.wrap(off[:, 2:])
-            sigma = np.sqrt(np.diagonal(C[order], axis1=1, axis2=2)) + SMALLEST
-            products = sigma[:, :, None] * sigma[:, None, :]
-            for share in (off / sigma, (other_C / np.outer(by, by) - C[order]) / products):
-                np.testing.assert_allclose(share, 0 * share, 0, tolerance, err_msg=problem)
-
-
-def renumbered(drive, ids):
-    """The drive with other ids, from a dict."""
-    return SimpleNamespace(**{**vars(drive), **{
-        name: [(row[0], ids[row[1]], *row[2:]) for row in getattr(drive, name)]
-        for name in ("sightings", "ranges")},
-        "guesses": [(ids[row[0]], *row[1:]) for row in drive.guesses]})
-
-
-def reversed_rows(drive):
-    """The drive with the rows of its sensors in the opposite order."""
-    return SimpleNamespace(**{**vars(drive), **{
-        name: getattr(drive, name)[::-1] for name in ("sightings", "ranges", "guesses")}})
-
-
-def mirrored(dataset):
-    """The Dataset of the drive seen in a mirror: y and headings have the other sign."""
-    sign, v = np.array([1, -1, -1]), dataset.vehicle
-    aruco, uwb, guess = dataset.aruco, dataset.uwb, dataset.antenna_guess
-    return replace(
-        dataset, ticks=dataset.ticks[:, ::-1].copy(), vehicle=replace(
-            v, right_radius=v.left_radius, left_radius=v.right_radius,
-            sigma_right_radius=v.sigma_left_radius, sigma_left_radius=v.sigma_right_radius),
-        aruco=aruco and replace(aruco, marker_in_vehicle=aruco.marker_in_vehicle * sign,
-                                covariance=aruco.covariance * np.outer(sign, sign)),
-        uwb=uwb, antenna_guess=guess and replace(guess, position=guess.position * sign[:2]))
-
-
-def simulated():
-    """Rows of the files of a simulated drive, whose problem 4 leaves no antenna in doubt."""
-    dataset, _ = simulate("short", 7, late_ranges=0.1, mislabelled=0.02)
-    a, u, guess = dataset.aruco, dataset.uwb, dataset.antenna_guess
-    sightings = np.column_stack([a.marker_in_vehicle, a.covariance[:, *np.triu_indices(3)]])
-
-    def rows(pose, ids, values):
-        return [(int(i) + 1, int(k), *row) for i, k, row in zip(pose, ids, values.tolist())]
-
-    return SimpleNamespace(
-        vehicle=dataset.vehicle, ticks=dataset.ticks, sightings=rows(a.pose, a.marker, sightings),
-        ranges=rows(u.pose, u.antenna, np.column_stack([u.range, u.sigma])),
-        guesses=[(int(k), *row) for k, row in zip(guess.antenna, guess.position.tolist())])
-
-
-SIMULATED = simulated()
+    for found in solutions(dataset):
+        poses = np.arange(len(found.poses)), found.poses, found.covariances
+        for kind, each in (("poses", poses), ("markers", found.aruco_map),
+                           ("antennas", found.uwb_map)):
+            if each is not None:
+                ids, x, C = each
+                ids = ids if numbers is None or kind == "poses" else np.array(
+                    [numbers[i] for i in ids.tolist()])
+                order, by = np.argsort(ids), np.array(factor[:x.shape[1]])
+                yield f"{found.problem} {kind}", ids[order], by * x[order], (
+                    C * np.outer(by, by))[order]
 
 
 @pytest.mark.slow
-@FEW
-@example(SIMULATED, 1, 1e-3)
-@given(drives(), st.integers(0, 2**32 - 1), st.sampled_from([1e-3, None]))
-def test_ids_the_order_of_rows_and_the_side_are_names_only(drive, seed, slip):
-    """Other ids in files in the opposite order; and the same drive in a mirror."""
-    ids = sorted({row[1] for row in drive.sightings} | {row[0] for row in drive.guesses})
-    numbers = dict(zip(ids, np.random.default_rng(seed).permutation(ids).tolist()))
-    dataset, other = read(drive), read(reversed_rows(renumbered(drive, numbers)))
-    before = solved(dataset, slip)
-    assert drive is not SIMULATED or {"problem2_fused", "problem3", "problem4"} <= before.keys()
-    tolerance = ROUNDING if slip else LEARNED
-    assert_same(before, solved(other, slip), tolerance, numbers)
-    assert_same(before, solved(mirrored(dataset), slip), tolerance, factor=(1, -1, -1))
+def test_ids_the_order_of_rows_and_the_side_are_names_only():
+    """Other ids in tables in the opposite order; and the same drive in a mirror."""
+    dataset = simulate("short", 7, late_ranges=0.1, mislabelled=0.02)[0].first(1000)
+    a, u, guess = dataset.aruco, dataset.uwb, dataset.antenna_guess
+    C = a.covariance[:, *np.triu_indices(3)]
+    rows = {"aruco": np.column_stack([a.pose + 1, a.marker, a.marker_in_vehicle, C]),
+            "uwb": np.column_stack([u.pose + 1, u.antenna, u.range, u.sigma]),
+            "guess": np.column_stack([guess.antenna, guess.position])}
+    ids = np.unique(np.r_[a.marker, guess.antenna])
+    new = np.random.default_rng(0).permutation(ids)
+    renamed = {name: table[::-1].copy() for name, table in rows.items()}
+    for name, column in (("aruco", 1), ("uwb", 1), ("guess", 0)):
+        renamed[name][:, column] = new[np.searchsorted(ids, renamed[name][:, column])]
+    side = {"aruco": [1, 1, 1, -1, -1, 1, -1, -1, 1, 1, 1], "uwb": 1, "guess": [1, 1, -1]}
+    mirrored = {name: table * side[name] for name, table in rows.items()}
+    numbers = dict(zip(ids.tolist(), new.tolist()))
+    for ticks, tables, changes in (
+            (dataset.ticks, renamed, {"numbers": numbers}),
+            (dataset.ticks[:, ::-1], mirrored, {"factor": (1, -1, -1)})):
+        others = estimates(Dataset.from_arrays(ticks, **tables, vehicle=dataset.vehicle))
+        for (name, expected, x, C), (_, found, other, other_C) in zip(
+                estimates(dataset, **changes), others, strict=True):
+            np.testing.assert_array_equal(found, expected, err_msg=name)
+            off = other - x
+            off[:, 2:] = se2.wrap(off[:, 2:])
+            sigma = np.sqrt(np.diagonal(C, axis1=1, axis2=2)) + SMALLEST
+            for share in (off / sigma, (other_C - C) / (sigma[:, :, None] * sigma[:, None])):
+                np.testing.assert_allclose(share, 0 * share, 0, LEARNED, err_msg=name)

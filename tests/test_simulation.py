@@ -5,12 +5,8 @@ import numpy as np
 import pytest
 
 from slamlib import odometry, se2
-from slamlib.dataset import DatasetError, Vehicle, read_dataset, read_truth
-from slamlib.simulation import (
-    manoeuvre,
-    simulate,
-    write_dataset,
-)
+from slamlib.dataset import Vehicle, read_dataset, read_truth
+from slamlib.simulation import simulate, write_dataset
 
 DATA = Path(__file__).parents[1] / "data"
 RECIPES = {"short": dict(path="short", seed=1),
@@ -133,19 +129,3 @@ def test_files_round_trip_through_the_reader(tmp_path):
     np.testing.assert_allclose(again.uwb.range, dataset.uwb.range, atol=6e-5)
     np.testing.assert_allclose(true_again.poses, truth.poses, atol=6e-7)
     np.testing.assert_allclose(true_again.marker_in_world, truth.marker_in_world, atol=6e-7)
-
-
-def test_writing_never_overwrites(tmp_path):
-    (tmp_path / "drive").mkdir()
-    (tmp_path / "drive" / "notes.txt").write_text("mine")
-    with pytest.raises(DatasetError, match="new or empty folder"):
-        write_dataset(tmp_path / "drive", *simulate("short"))
-    assert [f.name for f in tmp_path.rglob("*")] == ["drive", "notes.txt"]
-
-
-def test_manoeuvres_drive_their_legs():
-    ticks = manoeuvre([(1.0, np.pi / 2), (0.0, np.pi / 2), (-2 / np.pi, 0.0)])
-    poses = odometry.dead_reckoning(ticks, Vehicle(), model="arc")
-    np.testing.assert_allclose(poses[-1], [4 / np.pi, 2 / np.pi, np.pi], atol=1e-12)
-    ds, _, _, _ = odometry.steps(ticks, Vehicle())
-    assert np.abs(ds).max() <= 0.01 + 1e-15

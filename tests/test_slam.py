@@ -9,25 +9,14 @@ from gtsam.symbol_shorthand import A, C, L, X
 from numeric import as_points, central_differences, decided, known_noise, slam_trial
 
 from slamlib import odometry, se2, simulation, slam, studies
-from slamlib.dataset import (
-    AntennaGuess,
-    ArucoReadings,
-    Dataset,
-    DatasetError,
-    UwbReadings,
-    Vehicle,
-)
+from slamlib.dataset import AntennaGuess, ArucoReadings, Dataset, DatasetError, UwbReadings, Vehicle
 from slamlib.evaluation import anees, ate, nees_band
 from slamlib.simulation import simulate
 from slamlib.slam import factors, graph
 from slamlib.slam.choices import DECISIVE_LEAD, better_model
 from slamlib.slam.covariances import marginal_covariances, posterior_moments
-from slamlib.slam.fit import (
-    KERNELS,
-    ONE_SIDED,
-    accepted_measurements,
-)
-from slamlib.slam.initialization import GROWTH, part_lengths
+from slamlib.slam.fit import KERNELS, ONE_SIDED, accepted_measurements
+from slamlib.slam.initialization import GROWTH, odometry_state, part_lengths
 from slamlib.slam.linear import (
     NormalEquations,
     build_problem,
@@ -399,6 +388,25 @@ def test_parts_of_a_drive_grow_at_most_fourfold_from_where_the_heading_is_lost()
     blind = replace(vehicle, sigma_heading=1.0)       # the same error at all poses loses no turn
     for other, expected in ((sure, [count]), (blind, ends)):
         assert part_lengths(replace(drive, vehicle=other)) == expected
+
+
+def test_a_longer_part_goes_on_from_the_last_solved_pose_with_its_wheels():
+    dataset, truth = simulate("short", seed=4, noise=False)
+    dataset = dataset.without("uwb")
+    part, whole = measure(dataset.first(500)), measure(dataset)
+    wheel, rng = np.array([0.1003, 0.0998, 0.4001]), np.random.default_rng(0)
+    c = np.r_[wheel, part.calibration.stated[3:] + rng.normal(0, 0.01, 11)]
+    poses = truth.poses[part.frame] + rng.normal(0, 0.01, (len(part.frame), 3))
+    solved = state_from_arrays(part, poses, np.zeros((len(part.marker), 3)), np.zeros((0, 2)), c)
+    found = odometry_state(whole, "arc", part, solved)
+    last = len(part.frame) - 1
+    kept = np.searchsorted(whole.frame, part.frame[:-1])
+    np.testing.assert_allclose(found.poses[kept], solved.poses[:-1], atol=1e-12)
+    np.testing.assert_array_equal(found.c, c)
+    expected = odometry.dead_reckoning(
+        dataset.ticks[499:], dataset.vehicle.with_wheel(wheel), solved.poses[last], "arc")
+    later = whole.frame > 499
+    np.testing.assert_allclose(found.poses[later], expected[whole.frame[later] - 499], atol=1e-9)
 
 
 @pytest.mark.slow

@@ -20,16 +20,8 @@ from slamlib.slam import factors, graph, result
 from slamlib.slam.calibration import OFFSET, RANGES, SCALE, SIGHTINGS, stated_calibration
 from slamlib.slam.fit import KERNELS, ONE_SIDED
 from slamlib.slam.graph import optimize
-from slamlib.slam.initialization import (
-    AntennaRanges,
-    odometry_state,
-    second_moment,
-    trilaterate,
-)
-from slamlib.slam.linear import (
-    NormalEquations,
-    consistency_factor,
-)
+from slamlib.slam.initialization import AntennaRanges, odometry_state, second_moment, trilaterate
+from slamlib.slam.linear import NormalEquations, consistency_factor
 from slamlib.slam.measurements import GUESS_PRIOR_SIGMA, measure
 from slamlib.slam.pipeline import fit_from_previous
 from slamlib.solve import problem_solution
