@@ -22,7 +22,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from slamlib import increments, se2
 from slamlib.dataset import Dataset
@@ -37,6 +36,7 @@ SLIP_FRAMES = 500            # number of frames, the first ones, from which the 
 WHEEL_FRAMES = 5000          # number of frames, the first ones, that give the wheel parameters w_0
 FRAMES_PER_BLOCK = 1000      # frames whose poses are computed together, so that they stay in cache
 MIN_JUMP_GAIN = 10.0         # log likelihood by each of many jumps; the loss by each of a few
+MAX_SLIP_STEPS = 30          # number of parabolas
 LOG_SLIP_TOLERANCE = 0.05    # of the natural logarithm of the slip
 
 
@@ -130,13 +130,30 @@ def fuse(dataset, slip=None, model="arc"):
 
 
 def _likeliest_slip(given):
-    """Slip in sqrt(m) of maximum posterior density, with the log-normal prior of `increments`."""
-    def cost(log_slip):
-        return ((log_slip - np.log(TYPICAL_SLIP)) / np.log(SLIP_FACTOR))**2 / 2 \
-            - _filter(given, np.exp(log_slip))[2].log_likelihood
+    """Slip in sqrt(m) of maximum posterior density, by parabolas over the logarithm of slip.
 
-    found = minimize_scalar(cost, bounds=np.log(SLIP_BOUNDS), options={"xatol": LOG_SLIP_TOLERANCE})
-    return float(np.exp(found.x))
+    The first three points are the median of the prior and one standard deviation to both sides.
+    """
+    middle, step = np.log([TYPICAL_SLIP, SLIP_FACTOR])
+
+    def log_density(log_slip):
+        return _filter(given, np.exp(log_slip))[2].log_likelihood \
+            - ((log_slip - middle) / step)**2 / 2
+
+    points = {point: log_density(point) for point in middle + step * np.arange(-1, 2)}
+    for _ in range(MAX_SLIP_STEPS):
+        best = max(points, key=points.get)
+        below = max((point for point in points if point < best), default=None)
+        above = min((point for point in points if point > best), default=None)
+        if below is None or above is None:                     # the maximum is further outside
+            vertex = np.clip(best + (step if above is None else -step), *np.log(SLIP_BOUNDS))
+        else:
+            slopes = [(points[point] - points[best]) / (point - best) for point in (below, above)]
+            vertex = (below + best) / 2 - slopes[0] * (above - below) / 2 / (slopes[1] - slopes[0])
+        if not abs(vertex - best) >= LOG_SLIP_TOLERANCE:                # or not finite: no parabola
+            break
+        points[vertex] = log_density(vertex)
+    return float(np.exp(vertex if np.isfinite(vertex) else best))
 
 
 def _filter_input(dataset, model, vehicle, jumps=NO_JUMPS):
