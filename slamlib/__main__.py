@@ -14,12 +14,11 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from slamlib import __version__  # noqa: E402
 from slamlib.dataset import DatasetError, read_dataset, read_truth  # noqa: E402
+from slamlib.textfile import require  # noqa: E402
 from slamlib.vehicle import changed  # noqa: E402
 
 EXECUTED_NOTEBOOKS = Path("build", "executed")  # folder in which executed notebooks are kept
-# Signals that end a process; Windows has no SIGHUP.
-END_SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP")
-                    if hasattr(signal, name))
+END_SIGNALS = {signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)}  # Windows has no SIGHUP
 
 
 def main(arguments=None):
@@ -66,10 +65,6 @@ class _Parser(argparse.ArgumentParser):
         self.exit(2, f"slamlib: {textwrap.shorten(message, 200, placeholder=' ...')} "
                      f"({self.prog} --help shows the usage)\n")
 
-    def path(self, name, help=None, **options):
-        """Add an argument that is a Path."""
-        self.add_argument(name, type=Path, help=help, **options)
-
 
 def _parser():
     """The parser of the command line; `run` of what it parses is the function of the command."""
@@ -78,105 +73,102 @@ def _parser():
     whole.add_argument("--version", action="version", version=f"slamlib {__version__}")
     commands = whole.add_subparsers(required=True, metavar="COMMAND")
 
-    def command(name, run, help, **options):
+    def command(name, run, help, *paths, **options):
+        """Add a command with (option, default, help) of its paths."""
         parser = commands.add_parser(name, help=help, **options)
         parser.set_defaults(run=run)
-        return parser
+        for option, default, help in paths:
+            default = {"default": Path(default)} if default else {}
+            parser.add_argument(option, type=Path, **default,
+                                help=help + " (default %(default)s)" * bool(default))
+        return parser.add_argument
 
-    report = command("report", _build, "execute the notebooks and build the report")
-    report.path("--report", "folder for the pages", default=Path("report"))
-    hand_in = command("hand-in", _build,
-                      "build the report and put it into a zip, with the result files")
-    hand_in.path("--out", "the file to write (default %(default)s)", default=Path("hand-in.zip"))
-    for parser in (report, hand_in):
-        parser.set_defaults(**{"out": None} if parser is report else {
-            "report": Path("build", "hand-in")})
-        _build_options(parser)
-    _solve_options(command("solve", _solve, "solve problems without notebooks"))
-    _simulate_options(command("simulate", _simulate, "make a dataset with its truth"))
-    lab = command("lab", _lab, "open JupyterLab on the notebooks; it is given all other arguments, "
-                  "as --no-browser", allow_abbrev=False)
-    lab.path("--data", "folder of the datasets", default=Path("data"))
-    lab.path("--notebooks")
+    data = "--data", "data", "folder of the datasets"
+    notebooks = ("--notebooks", None, "folder of the notebooks (default: the folder notebooks "
+                 "where there is one, else those of the installation)")
+    made = data, notebooks, ("--results", "results", "folder for the .mat files")
+    for add in (command("report", _build, "execute the notebooks and build the report", *made,
+                        ("--report", "report", "folder for the pages")),
+                command("hand-in", _build, "build the report, and zip it with the result files",
+                        *made, ("--out", "hand-in.zip", "the file to write"))):
+        add("datasets", nargs="*", metavar="DATASET",
+            help="names of folders in data/ (all of them when none is named)")
+        add("--jobs", type=int, default=2, help="notebooks executed at a time")
+        add("--fresh", action="store_true",
+            help="execute all notebooks and studies, also where nothing changed")
+
+    add = command("solve", _solve, "solve problems without notebooks",
+                  ("folder", None, "the dataset's folder"),
+                  ("--plot", None, "write a picture of map and errors: a .png, .pdf or .svg file"))
+    _solve_options(add)
+    add = command("simulate", _simulate, "make a dataset with its truth",
+                  ("folder", None, "a new or empty folder"))
+    _simulate_options(add)
+    command("lab", _lab, "open JupyterLab on the notebooks; it is given all other arguments, as "
+            "--no-browser", data, notebooks, allow_abbrev=False)
     return whole
 
 
-def _build_options(parser):
-    """Add the options of `report` and `hand-in` to a parser."""
-    parser.add_argument("datasets", nargs="*", metavar="DATASET",
-                        help="names of folders in data/ (all of them when none is named)")
-    parser.path("--data", "folder of the datasets", default=Path("data"))
-    parser.path("--notebooks", "folder of the notebooks (default: the folder notebooks where "
-                "there is one, else those of the installation)")
-    parser.path("--results", "folder for the .mat files", default=Path("results"))
-    parser.add_argument("--jobs", type=int, default=2, help="notebooks executed at a time")
-    parser.add_argument("--fresh", action="store_true",
-                        help="execute all notebooks and studies, also where nothing changed")
+def _solve_options(add):
+    add("--out", type=Path, required=True, help="folder for the results")
+    add("--problem", action="append", default=[], metavar="NAME",
+        type=lambda text: text.removeprefix("problem"),
+        choices=("1", "2", "2_hint", "2_fused", "3", "4"),
+        help="one of %(choices)s, of which 2 is markers alone; may be repeated (default: all); 4 "
+             "starts from 3 where both are solved")
+    add("--kernel", help="instead of that of vehicle.toml")
+    add("--slip", type=float, help="instead of that of vehicle.toml")
+    add("--csv", action="store_true", help="write poses and maps as text, too: CSV with "
+        "covariances, and trajectories as TUM files for evo")
 
 
-def _solve_options(parser):
-    """Add the options of `solve` to its parser."""
-    parser.path("folder", "the dataset's folder", metavar="FOLDER")
-    parser.path("--out", "folder for the results", required=True)
-    parser.add_argument("--problem", action="append", default=[], metavar="NAME",
-                        type=lambda text: text.removeprefix("problem"),
-                        choices=("1", "2", "2_hint", "2_fused", "3", "4"),
-                        help="one of %(choices)s, of which 2 is markers alone; may be repeated "
-                             "(default: all); 4 starts from 3 where both are solved")
-    for name, kind in (("kernel", str), ("slip", float)):
-        parser.add_argument(f"--{name}", type=kind, metavar=name.upper(),
-                            help="instead of that of vehicle.toml")
-    parser.path("--plot", "write a picture of map and errors: a .png, .pdf or .svg file",
-                metavar="FILE")
-    parser.add_argument("--csv", action="store_true", help="write poses and maps as text, too: CSV "
-                        "with covariances, and trajectories as TUM files for evo")
-
-
-def _simulate_options(parser):
-    """Add the options of `simulate` to its parser."""
-    parser.path("folder", "a new or empty folder", metavar="FOLDER")
-    parser.add_argument("--path", choices=("short", "long"), default="short")
-    parser.add_argument("--rounds", type=int, default=1,
-                        help="how often the path is driven; 44 long ones are a million rows")
-    parser.add_argument("--seed", type=int, default=0)
-    for name, default, help in (
-            ("slip", 1e-3, "wheel slip: sigma after one metre, in m (default %(default)s)"),
-            ("nlos", 0.0, "share of UWB ranges without line of sight, which are too long"),
-            ("mislabel", 0.0, "share of marker sightings that carry another marker's id")):
-        parser.add_argument(f"--{name}", type=float, default=default, metavar="NUMBER",
-                            help=help)
+def _simulate_options(add):
+    add("--path", choices=("short", "long"), default="short")
+    add("--rounds", type=int, default=1,
+        help="how often the path is driven; 44 long ones are a million rows")
+    add("--seed", type=int, default=0)
+    add("--slip", type=float, default=1e-3,
+        help="wheel slip: sigma after one metre, in m (default %(default)s)")
+    add("--nlos", type=float, default=0.0,
+        help="share of UWB ranges without line of sight, which are too long")
+    add("--mislabel", type=float, default=0.0,
+        help="share of marker sightings that carry another marker's id")
 
 
 def _build(options):
-    """Build the report, and write the zip to hand in where `options.out` is its Path."""
+    """Build the report, and write the zip to hand in where `out` is one of the options."""
     from slamlib.report import NotebookError, build_report, handin
     from slamlib.report.notebooks import notebooks_folder, read_options
-    shown, omitted = read_options("report.toml"), ()
+    from slamlib.summary import summarize, summary_table
+    shown, omitted, out = read_options("report.toml"), (), vars(options).get("out")
+    pages = Path("build", "hand-in") if out else options.report
     notebooks = options.notebooks or notebooks_folder()
     datasets = [Path(each).name if Path(each).resolve().parent == options.data.resolve() else each
                 for each in options.datasets] or None            # names, or paths in data/
-    for folder in (options.report, options.results):
+    for folder in (pages, options.results):
         _require_elsewhere(folder, options.data, notebooks)
-    if options.out:
-        if options.out.is_dir():
-            raise DatasetError(f"{options.out}: expected a file to write, found a folder")
+    if out:
+        require(not out.is_dir(), out, "a file to write, found a folder")
         shown = handin.hand_in_options(shown)
         datasets, omitted = handin.selection(options.data, datasets)
     try:
         report = build_report(
-            notebooks, options.data, options.report, options.results, datasets=datasets,
-            options=shown, jobs=options.jobs, kept=EXECUTED_NOTEBOOKS, fresh=options.fresh)
+            notebooks, options.data, pages, options.results, datasets=datasets, options=shown,
+            jobs=options.jobs, kept=EXECUTED_NOTEBOOKS, fresh=options.fresh)
     except NotebookError as error:
         print(f"slamlib: {error}", file=sys.stderr)
         return 1
     if not shown.author:
         print("report.toml names no author: the PDF's title page has none", file=sys.stderr)
     for drive in report.drives:
+        rows = {each.problem: summarize(each, drive.truth) for each in drive.solutions}
+        print(summary_table({"dataset": drive.name, "poses": len(drive.dataset.ticks),
+                             "problems": rows, "doubts": []}), file=sys.stderr)
         for doubt in drive.doubts:
             print(f"{drive.name}: doubt ({doubt.what}): {doubt.sentence}", file=sys.stderr)
-    if options.out:
-        handin.write_zip(options.out, report, options.results, shown, omitted)
-        print(f"hand-in: {options.out.resolve()}", file=sys.stderr)
+    if out:
+        handin.write_zip(out, report, options.results, shown, omitted)
+        print(f"hand-in: {out.resolve()}", file=sys.stderr)
     else:
         print(f"report: {report.files[0]} and {report.files[-1]}", file=sys.stderr)
     return _exit_code([(drive.name, failure.problem, failure.reason)
@@ -193,9 +185,8 @@ def _exit_code(failures):
 def _require_elsewhere(out, *folders):
     """Raise DatasetError if a folder that a run replaces is or holds the current one or others."""
     for folder in map(Path.resolve, (Path(), *folders)):
-        if folder.is_relative_to(out.resolve()):
-            raise DatasetError(f"{out}: expected another folder to write to: this one, which is "
-                               f"replaced, is or holds {folder}")
+        require(not folder.is_relative_to(out.resolve()), out, "another folder to write to: this "
+                f"one, which is replaced, is or holds {folder}")
 
 
 def _solve(options):
@@ -203,17 +194,16 @@ def _solve(options):
     from slamlib.solve import PROBLEMS, allows, title
     from slamlib.summary import solve_to_folder, summary_table
     _require_elsewhere(options.out, options.folder)
-    if options.plot and options.plot.suffix.lower() not in (".png", ".pdf", ".svg"):
-        raise DatasetError(f"{options.plot}: expected a picture .png, .pdf or .svg")
+    ending = options.plot.suffix.lower() if options.plot else ".png"
+    require(ending in (".png", ".pdf", ".svg"), "--plot", "a .png, .pdf or .svg file", options.plot)
     dataset, truth = read_dataset(options.folder), read_truth(options.folder)
     given = {name: value for name in ("kernel", "slip")
              if (value := getattr(options, name)) is not None}
     dataset = replace(dataset, vehicle=changed(dataset.vehicle, given, "slamlib solve"))
     problems = sorted(f"problem{each}" for each in options.problem) or [*PROBLEMS]
     for each in problems if options.problem else ():
-        if not allows(dataset, each):
-            raise DatasetError(f"{options.folder}: expected the measurements of {each} "
-                               f"({title(each, dataset)}), found none")
+        require(allows(dataset, each), options.folder,
+                f"the measurements of {each} ({title(each, dataset)})")
     print("\n".join(inventory_lines(dataset, truth)), file=sys.stderr)
     summary = solve_to_folder(dataset, truth, options.out, problems, options.csv)
     print(summary_table(summary))

@@ -3,8 +3,8 @@
 The folder holds `encoderReading.txt` and, where the vehicle has the sensors, `ArucoReading.txt` and
 `UwbReading.txt` with `UwbAntennaGuess.txt`. Optional are `vehicle.toml`, with what differs from the
 assignment's table 2, and the folder `truth`. Lengths are in metres, angles in radians. Pose ids
-count from 1 in the files and from 0 in the arrays; marker and antenna ids stay unchanged. `folder`
-finds the files, `dialects` reads their numbers.
+count from 1 in the files and from 0 in the arrays; marker and antenna ids stay unchanged. `tables`
+finds and reads the files.
 """
 
 import json
@@ -15,12 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
-from slamlib import se2
-from slamlib.dialects import LIMITS, matrix, read_table
+from slamlib import se2, tables
 from slamlib.doubt import Doubt
-from slamlib.folder import ENCODER, TABLES, TRUTH_FILES, Variable, contents, is_dataset
+from slamlib.tables import ENCODER, TABLES, TRUTH_FILES, contents, datasets_in, read_table
 from slamlib.textfile import DatasetError as DatasetError
-from slamlib.textfile import error, require
+from slamlib.textfile import require, require_type
 from slamlib.truth_frame import in_first_frame
 from slamlib.vehicle import Vehicle, changed, incremental_counts, read_vehicle
 
@@ -99,26 +98,22 @@ class Dataset:
         >>> len(dataset.ticks), dataset.uwb.antenna.tolist()
         (2, [7])
         """
-        require(isinstance(vehicle, Vehicle), "vehicle", "a Vehicle", vehicle)
+        require_type(vehicle, Vehicle, "vehicle")
         stated = {key: value for key, value in vars(vehicle).items() if value is not None}
-        ticks = matrix("ticks", ticks, list(LIMITS[ENCODER])[1:])
-        ticks = np.column_stack([np.arange(1, len(ticks) + 1), ticks])
-        arguments = {"ticks": ticks, "aruco": aruco, "uwb": uwb, "guess": guess}
-        files = {file: Variable(key, value, exact=True)
-                 for file, (key, value) in zip(TABLES, arguments.items()) if value is not None}
+        arguments = zip(TABLES, ("ticks", "aruco", "uwb", "guess"), (ticks, aruco, uwb, guess))
+        files = {file: tables.table_of_array(key, value, file, counted=key == "ticks")
+                 for file, key, value in arguments if value is not None or key == "ticks"}
         return _dataset(files, changed(TABLE_2, stated, "vehicle"), name)
 
     @property
     def sightings(self):
         """The ArucoReadings, or None, as the vehicle's origin sees them by stated camera, size."""
         v, a = self.vehicle, self.aruco
-        if a is None or (v.camera_x, v.camera_y, v.camera_turn, v.marker_size) == (0, 0, 0, 1):
-            return a
         scale = np.array([v.marker_size, v.marker_size, 1])
         camera = [v.camera_x, v.camera_y, v.camera_turn]
-        return replace(a, marker_in_vehicle=se2.compose(camera, scale * a.marker_in_vehicle),
-                       covariance=se2.rotate_covariance(
-                           scale[:, None] * a.covariance * scale, v.camera_turn))
+        return a and replace(
+            a, marker_in_vehicle=se2.compose(camera, scale * a.marker_in_vehicle),
+            covariance=se2.rotate_covariance(scale[:, None] * a.covariance * scale, v.camera_turn))
 
     def without(self, sensor):
         """The Dataset without a sensor, "aruco" or "uwb"."""
@@ -154,10 +149,9 @@ def dataset_names(data, names=None):
     encoderReading.txt in a sub-folder.
     """
     data = Path(data)
-    found = sorted(path.name for path in data.glob("[!.]*") if path.is_dir() and is_dataset(path))
-    if not found:
-        raise error(data, f"expected this folder, with a sub-folder with an {ENCODER} for each "
-                    "dataset, found none")
+    found = datasets_in(data)[0] if data.is_dir() else []
+    require(found, data, f"this folder, with a sub-folder with an {ENCODER} for each dataset, "
+            "found none")
     names = found if names is None else list(names)
     for name in names:
         require((data / name).is_dir(), data, f"one of {', '.join(found)}", name)
@@ -179,17 +173,26 @@ def read_dataset(folder):
     """
     files, notes = contents(folder, required=ENCODER)
     vehicle = read_vehicle(files.get("vehicle.toml"), default=TABLE_2)
-    return _dataset(files, vehicle, Path(abspath(folder)).name, notes)
+    return _dataset(files, vehicle, Path(abspath(folder)).name, notes, MAX_BAD_SHARE)
 
 
-def _dataset(files, vehicle, name, notes=()):
-    """The Dataset of this name by its Vehicle and the sources (dict) of its tables by name."""
-    ticks, encoder_notes = incremental_counts(_read_all_poses(files, ENCODER), vehicle)
-    notes = [*notes, *encoder_notes]
-    aruco = _read_aruco(files, len(ticks), notes)
-    uwb, guess = _read_uwb(files, len(ticks), notes)
-    return Dataset(name=name, vehicle=vehicle, ticks=ticks, aruco=aruco, uwb=uwb,
-                   antenna_guess=guess if len(guess.antenna) else None, notes=tuple(notes))
+def _dataset(files, vehicle, name, notes=(), share=0.0):
+    """The Dataset by its Vehicle and the sources (dict) of its tables by name.
+
+    A share of the rows of a sensor may be bad, and is left out.
+    """
+    encoders, ticks = incremental_counts(_table(files, ENCODER), vehicle)
+    guess = _table(files, "UwbAntennaGuess.txt")
+    seen, heard = (_table(files, each, share, len(ticks)) for each in TABLES[1:3])
+    heard.kept(np.isin(heard.numbers[:, 1], guess.numbers[:, 0]), "an antenna id that the guesses "
+               "have: UwbAntennaGuess.txt in the same folder, or guess")
+    (*sighting, rows), (*measured, ranges) = map(_in_order, (seen.numbers, heard.numbers))
+    return Dataset(
+        name=name, vehicle=vehicle, ticks=ticks,
+        aruco=ArucoReadings(*sighting, rows[:, 2:5], _covariances(rows)) if len(rows) else None,
+        uwb=UwbReadings(*measured, *ranges[:, 2:].T) if len(ranges) else None,
+        antenna_guess=AntennaGuess(*_by_id(guess)) if len(guess.numbers) else None,
+        notes=(*notes, *encoders.notes, *seen.notes, *heard.notes, *guess.notes))
 
 
 def read_truth(folder):
@@ -203,52 +206,19 @@ def read_truth(folder):
     drive, _ = contents(folder, required=ENCODER)
     if "truth" not in drive:
         return None
-    files, notes = contents(drive["truth"], TRUTH_FILES, required="vehiclePose.txt")
-    pose_count = len(_read_all_poses(drive, ENCODER).numbers)
-    table = _read_all_poses(files, "vehiclePose.txt")
-    poses, notes = table.numbers[:, 1:], [*notes, *table.notes]
-    if len(poses) != pose_count:
-        raise error(table.source, f"expected {pose_count} poses (encoder file), found {len(poses)}")
-    marker, marker_in_world = _read_map(files, "ArucoMap.txt", notes)
-    antenna, antenna_in_world = _read_map(files, "UwbMap.txt", notes)
+    files, notes = contents(drive["truth"], TRUTH_FILES, "vehiclePose.txt")
+    path, *maps = read = [_table(files, name) for name in TRUTH_FILES[:3]]
+    poses, count = path.numbers[:, 1:], len(_table(drive, ENCODER).numbers)
+    require(len(poses) == count, path.source,
+            f"{count} poses (encoder file), found {len(poses)}")
+    (marker, marker_in_world), (antenna, antenna_in_world) = map(_by_id, maps)
     vehicle = read_vehicle(drive.get("vehicle.toml"), default=TABLE_2)
     return in_first_frame(Truth(
         poses=np.column_stack([poses[:, :2], np.unwrap(poses[:, 2])]),
         marker=marker, marker_in_world=marker_in_world,
         antenna=antenna, antenna_in_world=antenna_in_world,
         vehicle=read_vehicle(files.get("vehicle.toml"), default=vehicle),
-        notes=tuple(f"In truth: {note}" for note in notes)))
-
-
-def _read_all_poses(files, name):
-    """The Table of a file with a row for each pose."""
-    table = read_table(files[name], name)
-    if len(table.numbers) == 0 and name == ENCODER:
-        raise error(table.source, "expected at least the row '1 0 0', found no rows")
-    ids = np.arange(1, len(table.numbers) + 1)
-    return table.kept(table.numbers[:, 0] == ids, "pose ids 1, 2, 3, ... in order")
-
-
-def _read_map(files, name, notes):
-    """Landmark ids (k,), ascending, and the further columns (k, c - 1)."""
-    table = read_table(files.get(name), name)
-    notes += table.notes
-    ids, first_row = np.unique(table.numbers[:, 0], return_index=True)
-    table.kept(np.isin(np.arange(len(table.numbers)), first_row), "each id only once")
-    return ids.astype(np.int64), table.numbers[first_row, 1:]
-
-
-def _read_aruco(files, pose_count, notes):
-    """The ArucoReadings, or None without rows."""
-    table = read_table(files.get("ArucoReading.txt"), "ArucoReading.txt", MAX_BAD_SHARE, pose_count)
-    # Scaled to correlations: s_thetatheta may be 1e4 rad^2 where s_xx is 1e-4 m^2.
-    smallest = np.linalg.eigvalsh(se2.correlations(_covariances(table.numbers)))[:, 0]
-    table = table.kept(smallest > MIN_EIGENVALUE, "a positive definite covariance (smallest "
-                       f"eigenvalue of its correlation matrix above {MIN_EIGENVALUE:g})",
-                       MAX_BAD_SHARE)
-    notes += table.notes
-    pose, marker, rows = _in_order(table.numbers)
-    return ArucoReadings(pose, marker, rows[:, 2:5], _covariances(rows)) if len(rows) else None
+        notes=tuple(f"In truth: {note}" for note in sum((each.notes for each in read), (*notes,)))))
 
 
 def _covariances(rows):
@@ -256,17 +226,35 @@ def _covariances(rows):
     return rows[:, 5:][:, [[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
 
 
-def _read_uwb(files, pose_count, notes):
-    """The UwbReadings, or None without rows, and the AntennaGuess, which has all of their ids."""
-    table = read_table(files.get("UwbReading.txt"), "UwbReading.txt", MAX_BAD_SHARE, pose_count)
-    table = table.kept(table.numbers[:, 2] >= -MAX_NEGATIVE_SIGMAS * table.numbers[:, 3],
-                       f"a range that is not below -{MAX_NEGATIVE_SIGMAS:g} sigma", MAX_BAD_SHARE)
-    notes += table.notes
-    guess = AntennaGuess(*_read_map(files, "UwbAntennaGuess.txt", notes))
-    table.kept(np.isin(table.numbers[:, 1], guess.antenna), "an antenna id that the guesses have: "
-               "UwbAntennaGuess.txt in the same folder, or guess")
-    pose, antenna, rows = _in_order(table.numbers)
-    return UwbReadings(pose, antenna, *rows[:, 2:].T) if len(rows) else None, guess
+_COUNTED = (lambda x: x[:, 0] == np.arange(1, len(x) + 1), "pose ids 1, 2, 3, ... in order")
+_UNIQUE = (lambda x: np.isin(np.arange(len(x)), np.unique(x[:, 0], return_index=True)[1]),
+           "each id only once")
+# By file, which rows of its numbers (m, c) are right, and what is expected of them. Covariances are
+# scaled to correlations: s_thetatheta may be 1e4 rad^2 where s_xx is 1e-4 m^2.
+CHECKS = {
+    ENCODER: _COUNTED, "vehiclePose.txt": _COUNTED, "UwbAntennaGuess.txt": _UNIQUE,
+    "ArucoMap.txt": _UNIQUE, "UwbMap.txt": _UNIQUE,
+    "ArucoReading.txt": (
+        lambda x: np.linalg.eigvalsh(se2.correlations(_covariances(x)))[:, 0] > MIN_EIGENVALUE,
+        "a positive definite covariance (smallest eigenvalue of its correlation matrix above "
+        f"{MIN_EIGENVALUE:g})"),
+    "UwbReading.txt": (lambda x: x[:, 2] >= -MAX_NEGATIVE_SIGMAS * x[:, 3],
+                       f"a range that is not below -{MAX_NEGATIVE_SIGMAS:g} sigma")}
+
+
+def _table(files, name, share=0.0, pose_count=None):
+    """The Table of a file whose rows have passed all checks."""
+    table = read_table(files.get(name), name, share, pose_count)
+    require(len(table.numbers) or name != ENCODER, table.source,
+            "at least the row '1 0 0', found no rows")
+    right, expected = CHECKS[name]
+    return table.kept(right(table.numbers), expected, share)
+
+
+def _by_id(table):
+    """Landmark ids (k,), ascending, and the further columns (k, c - 1)."""
+    rows = table.numbers[np.argsort(table.numbers[:, 0])]
+    return rows[:, 0].astype(np.int64), rows[:, 1:]
 
 
 def _in_order(rows):

@@ -10,8 +10,9 @@ follows Bar-Shalom, Li and Kirubarajan, *Estimation with Applications to Trackin
 import numpy as np
 
 from slamlib import se2
-from slamlib.se2 import correlations, sigmas
-from slamlib.textfile import DatasetError, quoted
+from slamlib.se2 import correlations as correlations
+from slamlib.se2 import sigmas
+from slamlib.textfile import require
 
 REACH_95 = float(np.sqrt(-2 * np.log(0.05)))    # sigmas, of the 95 % ellipse of a planar Gaussian
 
@@ -22,11 +23,9 @@ def checked_poses(source, *arrays):
     Raises DatasetError where one is something else, or has another n than the first.
     """
     for each in arrays:
-        if not (isinstance(each, np.ndarray) and each.dtype.kind in "fiu"
-                and each.shape == (len(arrays[0]), 3)):
-            found = each.shape if isinstance(each, np.ndarray) else quoted(each)
-            raise DatasetError(f"{source}: expected numbers (n, 3), poses of the same n in each "
-                               f"array, found {found}")
+        require(isinstance(each, np.ndarray) and each.dtype.kind in "fiu"
+                and each.shape == (len(arrays[0]), 3), source,
+                "numbers (n, 3), poses of the same n in each array", getattr(each, "shape", each))
     return [each.astype(float) for each in arrays]
 
 
@@ -75,15 +74,8 @@ def nees(poses, covariances, truth):
     covariance C. It is NaN where C is singular, as for a known pose, and without an estimate.
     """
     poses, truth = checked_poses("nees", poses, truth)
-    error = poses - truth
-    error[:, 2] = se2.wrap(error[:, 2])
-    rho = correlations(covariances)
-    regular = np.isfinite(rho).all(axis=(1, 2))
-    regular[regular] = np.linalg.eigvalsh(rho[regular])[:, 0] > 1e-12      # else singular
-    scaled = error[regular] / sigmas(covariances[regular])
-    result = np.full(len(error), np.nan)
-    result[regular] = np.einsum("ni,ni->n", scaled,
-                                np.linalg.solve(rho[regular], scaled[..., None])[..., 0])
+    result, ok = np.full(len(poses), np.nan), se2.regular(covariances)
+    result[ok] = se2.squared_distances(poses[ok], truth[ok], covariances[ok])
     return result
 
 
@@ -112,8 +104,3 @@ def nees_band(count, dof=3, probability=0.95):
 def position_sigmas(covariances):
     """The larger standard deviation of x and y (n,), of covariances (n, >= 2, >= 2)."""
     return sigmas(covariances)[:, :2].max(axis=1)
-
-
-def evenly_spaced(n, count=41):
-    """Up to `count` evenly spaced indices from 1 to n - 1; [0] if n is 1."""
-    return np.unique(np.linspace(min(1, n - 1), n - 1, count).astype(int))

@@ -1,10 +1,10 @@
 """Increments between any two poses by odometry, their noise, and the prior of the wheel slip.
 
 A wheel that travels s metres slips with variance slip^2 |s|, independently from step to step. Each
-encoder rounds its cumulative count. `noise_covariances` is for a single increment, `noise_in_drive`
-for increments of one drive that are used together. An increment is the pose `end` in the frame of
-the pose `start`; both are arrays (m,) of indices from 0. The `ticks` (n, 2), `vehicle` and `model`
-are those of module `odometry`.
+encoder rounds its cumulative count. `rounding_and_slipping` is for single increments,
+`noise_in_drive` for increments of one drive that are used together. An increment is the pose `end`
+in the frame of the pose `start`; both are arrays (m,) of indices from 0. The `ticks` (n, 2),
+`vehicle` and `model` are those of module `odometry`.
 """
 
 import numpy as np
@@ -18,10 +18,7 @@ SLIP_FACTOR = 3.0           # its logarithm is the standard deviation of the pri
 
 
 def between_poses(ticks, vehicle, start, end, model="euler"):
-    """Increments (m, 3) by odometry, m and rad, and derivatives (m, 3, 3) by [R_R, R_L, b].
-
-    Raises ValueError if `model` is not in `odometry.MODELS`.
-    """
+    """Increments (m, 3) by odometry, m and rad, and derivatives (m, 3, 3) by [R_R, R_L, b]."""
     poses = odometry.dead_reckoning(ticks, vehicle, model=model)
     by_w = odometry.wheel_jacobian(ticks, vehicle, model=model)
     by_start, by_end = se2.between_jacobians(poses[start], poses[end])
@@ -29,58 +26,44 @@ def between_poses(ticks, vehicle, start, end, model="euler"):
             by_start @ by_w[start] + by_end @ by_w[end])
 
 
-def noise_covariances(ticks, vehicle, start, end, slip):
-    """Covariances (m, 3, 3) of increments, of [x, y, heading] in the axes of pose `start`.
-
-    `slip` in sqrt(m) is the standard deviation of the slip of one wheel after one metre. Rounding
-    at both ends of an increment has a variance of one sixth of a squared count, spread over its
-    steps. No `end` may be before its `start`; the covariance of an increment without steps is zero.
-    """
-    rounding, slipping = rounding_and_slipping(ticks, vehicle, start, end)
-    return rounding + slip**2 * slipping
-
-
 def rounding_and_slipping(ticks, vehicle, start, end):
-    """Parts of `noise_covariances`, each (m, 3, 3): rounding, and a slip of 1 sqrt(m).
+    """Covariances of single increments by encoder rounding, and by a slip of 1 sqrt(m).
 
-    Wheel errors e_R, e_L in the step at p along the unit vector u lengthen the step by
-    (e_R + e_L) / 2. They turn the later path by (e_R - e_L) / b, which moves its end p_e by this
-    angle times S (p_e - p), S = [[0, -1], [1, 0]]. The effect of a step is linear in p_e, so one
-    cumulative sum over the steps serves all increments.
+    Both are (m, 3, 3), of [x, y, heading] in the axes of pose `start`; no `end` may be before its
+    `start`. Rounding at both ends of an increment has a variance of one sixth of a squared count,
+    spread over its steps. Wheel errors e_R, e_L in the step at p along the unit vector u lengthen
+    the step by (e_R + e_L) / 2. They turn the later path by (e_R - e_L) / b, which moves its end
+    p_e by this angle times S (p_e - p), S = [[0, -1], [1, 0]]. The effect of a step is linear in
+    p_e, so one cumulative sum over the steps serves all increments.
 
     The sum is over positions relative to the beginning of a block of steps. Relative to pose 1,
     its differences would lose all digits some ten kilometres away. A block is as long as the
     longest increment, so that an increment lies in two blocks at most.
     """
     poses = odometry.dead_reckoning(ticks, vehicle, model="arc")
-    ds, dtheta, _, _ = odometry.steps(ticks, vehicle)
-    direction = poses[:-1, 2] + dtheta / 2
+    ds, dtheta, _, _ = (each[..., None] for each in odometry.steps(ticks, vehicle))
+    direction = poses[:-1, 2:] + dtheta / 2
     start, end = np.asarray(start), np.asarray(end)
     length = np.max(end - start, initial=1)
     origin = poses[:max(1, len(ds)):length]
-    x, y = ((poses[:-1, :2] + poses[1:, :2]) / 2 - origin[np.arange(len(ds)) // length, :2]).T
-    sides = vehicle.wheelbase / 2 * np.array([[1], [-1]])
+    middle = (poses[:-1] + poses[1:]) / 2 - origin[np.arange(len(ds)) // length]
+    sides = vehicle.wheelbase / 2 * np.array([1, -1])
     turn = 1 / (2 * sides)                                             # by e_R, by e_L
-    by_wheel = np.stack([np.cos(direction) / 2 + y * turn, np.sin(direction) / 2 - x * turn,
-                         np.broadcast_to(turn, (2, len(ds)))])   # d(end - S p_e turn, turn)/de
-    i, j = np.triu_indices(3)
-    outer = by_wheel[i] * by_wheel[j]                                  # (6, wheel, n-1)
-    metres_per_count = 2 * np.pi * vehicle.wheel[:2, None] / vehicle.ticks_per_revolution
-    totals = np.zeros((2, 6, len(ds) + 1))
-    for total, variance in zip(totals, (np.abs(ds + sides * dtheta), metres_per_count**2 / 6)):
-        np.cumsum(np.sum(outer * variance, axis=1), axis=1, out=total[:, 1:])
-    symmetric = np.empty((3, 3), int)
-    symmetric[i, j] = symmetric[j, i] = np.arange(6)
-    in_world = np.zeros((2, len(start), 3, 3))
+    by_wheel = np.stack([
+        np.cos(direction) / 2 + middle[:, 1:2] * turn, np.sin(direction) / 2 - middle[:, :1] * turn,
+        np.broadcast_to(turn, (len(ds), 2))], 1)[:, None]        # d(end - S p_e turn, turn)/de
+    metres_per_count = 2 * np.pi * vehicle.wheel[:2] / vehicle.ticks_per_revolution
+    slipped = np.abs(ds + sides * dtheta)
+    variance = np.stack([np.broadcast_to(metres_per_count**2 / 6, slipped.shape), slipped], 1)
+    total = odometry.cumulative((by_wheel * variance[:, :, None]) @ by_wheel.mT)
+    in_world = np.zeros((len(start), 2, 3, 3))
     for block in (start // length, start // length + 1):
         begins, ends = (np.clip(edge * length, start, end) for edge in (block, block + 1))
-        slipping, rounding = totals[..., ends] - totals[..., begins]
-        rounding = rounding / np.maximum(end - start, 1)
         lever = poses[end] - [1, 1, 0] * origin[np.minimum(block, len(origin) - 1)]
-        to_end, _ = se2.compose_jacobians(np.zeros(3), lever)          # I + [0, 0, S lever]
-        parts = np.stack([each.T[:, symmetric] for each in (rounding, slipping)])
-        in_world += to_end @ parts @ to_end.mT
-    return tuple(se2.rotate_covariance(part, -poses[start, 2]) for part in in_world)
+        to_end, _ = se2.compose_jacobians(np.zeros(3), lever[:, None])      # I + [0, 0, S lever]
+        in_world += to_end @ (total[ends] - total[begins]) @ to_end.mT
+    in_world[:, 0] /= np.maximum(end - start, 1)[:, None, None]
+    return tuple(np.moveaxis(se2.rotate_covariance(in_world, -poses[start, 2:]), 1, 0))
 
 
 def noise_in_drive(ticks, vehicle, start, end, steps=None):

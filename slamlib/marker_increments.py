@@ -53,25 +53,27 @@ def consecutive_increments(sightings):
     agreed = found.usable & (np.bincount(pair[found.accepted], minlength=len(steps)) > 1)
     if not agreed.any():
         return found
-    speed = np.abs(_distance_and_turn(found.increment)) / steps[:, None]
+    speed = distance_and_turn(found.increment) / steps[:, None]
     bound = SPEED_RATIO * np.maximum(
         np.percentile(speed[agreed], 99, axis=0),
         np.percentile(speed[found.usable], 90, axis=0, method="lower"))
+
+    def too_fast(increment, covariance, steps):
+        limit = bound * steps[:, None] + 3 * distance_and_turn_sigmas(covariance)
+        return np.any(distance_and_turn(increment) > limit, axis=1)
+
     velocity = found.increment / steps[:, None]
     similar = np.r_[False, _similar(velocity[:-1], velocity[1:]), False]
-    fast = _too_fast(found.increment, found.covariance, steps, bound)
-    fast &= found.usable & ~(similar[:-1] | similar[1:])
-    single = _single_increments(z[first], C[first], z[second], C[second])
-    allowed = ~(fast[pair] & _too_fast(*single, steps[pair], bound))
+    fast = found.usable & too_fast(found.increment, found.covariance, steps) \
+        & ~(similar[:-1] | similar[1:])
+    z2, J = se2.inverse(z[second]), se2.inverse_jacobian(z[second])
+    alone = se2.compose_uncertain(z[first], C[first], z2, J @ C[second] @ J.mT)     # Z Z'^-1
+    allowed = ~(fast[pair] & too_fast(*alone, steps[pair]))
     if allowed.all():
         return found
     again = robust_increments(z, C, pair[allowed], first[allowed], second[allowed], len(steps))
-    usable = again.usable & ~(fast & _too_fast(again.increment, again.covariance, steps, bound))
-    accepted, (J_first, J_second) = np.zeros(len(pair), bool), np.zeros((2, len(pair), 3, 3))
-    accepted[allowed] = again.accepted
-    J_first[allowed], J_second[allowed] = again.J_first, again.J_second
-    return replace(again, pair=pair, first=first, second=second, usable=usable,
-                   accepted=accepted & usable[pair], J_first=J_first, J_second=J_second)
+    usable = again.usable & ~(fast & too_fast(again.increment, again.covariance, steps))
+    return replace(again, usable=usable, accepted=again.accepted & usable[again.pair])
 
 
 def common_sightings(row, marker, span=1):
@@ -106,11 +108,11 @@ def robust_increments(z, C, pair, first, second, count):
             r, information, squared = _residuals(increment[pair], J_second, z1, C1, z2, C2)
             weight = squared < GATE if gated else 1 / (1 + squared / GATE)
             gain = J_delta.mT @ information * weight[:, None, None]
-            H, gradient = np.zeros((count, 3, 3)), np.zeros((count, 3))
-            np.add.at(H, pair, gain @ J_delta)
-            np.add.at(gradient, pair, np.einsum("nij,nj->ni", gain, r))
-            covariance = _inverse_where_regular(H)
-            step = np.einsum("nij,nj->ni", covariance, gradient)
+            total = np.zeros((count, 3, 4))
+            np.add.at(total, pair, gain @ np.concatenate([J_delta, r[..., None]], axis=2))
+            regular, covariance = se2.regular(total[..., :3]), np.full((count, 3, 3), np.nan)
+            covariance[regular] = np.linalg.inv(total[regular, :, :3])
+            step = (covariance @ total[..., 3:])[..., 0]
             increment = increment + step
             if not np.nanmax(np.abs(step), initial=0) > INCREMENT_STEP_TOLERANCE:
                 break
@@ -125,8 +127,7 @@ def robust_increments(z, C, pair, first, second, count):
 
 def _residuals(increment, J_second, z1, C1, z2, C2):
     """r, W^-1 and r^T W^-1 r of each common sighting, with J' = J_second."""
-    r = z1 - se2.compose(increment, z2)
-    r[:, 2] = se2.wrap(r[:, 2])
+    r = se2.difference(z1, se2.compose(increment, z2))
     information = np.linalg.inv(C1 + J_second @ C2 @ J_second.mT)
     return r, information, np.einsum("ni,nij,nj->n", r, information, r)
 
@@ -149,15 +150,14 @@ def _best_hypothesis(z1, C1, z2, C2, pair, count):
     pair_of = np.concatenate([np.arange(count), pair[oriented], pair[i]])
     number = (ends - begins)[pair_of]                   # of common sightings of each hypothesis
     block_of = np.cumsum(number) // SIGHTINGS_PER_BLOCK         # together they need gigabytes
-    cost = np.empty(len(number))
+    cost = np.zeros(len(number))
     for block in np.split(np.arange(len(number)), np.flatnonzero(np.diff(block_of)) + 1):
         n = number[block]
-        which = np.repeat(np.arange(len(block)), n)
+        which = np.repeat(block, n)
         k = np.arange(len(which)) - np.repeat(np.cumsum(n) - n - begins[pair_of[block]], n)
-        supposed = hypothesis[block][which]
-        J_second = se2.compose_jacobians(supposed, z2[k])[1]
-        squared = _residuals(supposed, J_second, z1[k], C1[k], z2[k], C2[k])[2]
-        cost[block] = np.bincount(which, np.log1p(squared / GATE), len(block))
+        J_second = se2.compose_jacobians(hypothesis[which], z2[k])[1]
+        squared = _residuals(hypothesis[which], J_second, z1[k], C1[k], z2[k], C2[k])[2]
+        cost += np.bincount(which, np.log1p(squared / GATE), len(cost))
     order = np.lexsort((cost, pair_of))
     return hypothesis[order[np.searchsorted(pair_of[order], np.arange(count))]]
 
@@ -177,39 +177,18 @@ def _increment_of_two_points(p1, q1, p2, q2):
     return np.column_stack([shift, turn])
 
 
-def _single_increments(z1, C1, z2, C2):
-    """Increment (p, 3) from each common sighting alone, Z Z'^-1, and its covariance (p, 3, 3)."""
-    by_first, by_inverse = se2.compose_jacobians(z1, se2.inverse(z2))
-    by_second = by_inverse @ se2.inverse_jacobian(z2)
-    return (se2.compose(z1, se2.inverse(z2)),
-            by_first @ C1 @ by_first.mT + by_second @ C2 @ by_second.mT)
+def distance_and_turn(increment):
+    """Distance in m and size of the turn in rad, (..., 2), of increments (..., 3)."""
+    return np.stack([np.linalg.norm(increment[..., :2], axis=-1),
+                     np.abs(se2.wrap(increment[..., 2]))], axis=-1)
 
 
-def _distance_and_turn(increment):
-    """Distance in m and turn in rad, (n, 2), of increments (n, 3)."""
-    return np.stack([np.hypot(increment[:, 0], increment[:, 1]), se2.wrap(increment[:, 2])], -1)
-
-
-def _too_fast(increment, covariance, steps, bound):
-    """True where distance or turn exceeds bound * steps by more than three standard deviations."""
-    variance = np.stack([covariance[:, 0, 0] + covariance[:, 1, 1], covariance[:, 2, 2]], -1)
-    limit = bound * steps[:, None] + 3 * np.sqrt(variance)
-    return np.any(np.abs(_distance_and_turn(increment)) > limit, axis=1)
+def distance_and_turn_sigmas(covariance):
+    """Standard deviations (n, 2) of them, in m and rad, by covariances (n, 3, 3)."""
+    return np.sqrt(np.diagonal(covariance, axis1=1, axis2=2) @ [[1, 0], [1, 0], [0, 1]])
 
 
 def _similar(a, b):
     """True where velocities (n, 3) differ by less than half the larger one, in speed and turn."""
-    speed, turn = np.hypot(*(a - b)[:, :2].T), np.abs(a[:, 2] - b[:, 2])
-    largest = np.maximum(np.abs(_distance_and_turn(a)), np.abs(_distance_and_turn(b)))
-    return (speed < largest[:, 0] / 2) & (turn < largest[:, 1] / 2 + MIN_TURN_RATE)
-
-
-def _inverse_where_regular(H):
-    """Inverses of (l, 3, 3), NaN where H is singular or, without accepted sightings, not finite."""
-    scale = np.sqrt(np.maximum(np.diagonal(H, axis1=1, axis2=2), 1e-300))
-    finite = np.isfinite(H).all(axis=(1, 2))
-    scaled = np.where(finite[:, None, None], H / (scale[:, :, None] * scale[:, None, :]), 0)
-    regular = finite & (np.linalg.eigvalsh(scaled)[:, 0] > 1e-12)
-    inverse = np.full_like(H, np.nan)
-    inverse[regular] = np.linalg.inv(H[regular])
-    return inverse
+    largest = np.maximum(distance_and_turn(a), distance_and_turn(b))
+    return np.all(distance_and_turn(a - b) < largest / 2 + [0, MIN_TURN_RATE], axis=1)

@@ -44,8 +44,6 @@ def steps(ticks, vehicle):
 def dead_reckoning(ticks, vehicle, initial_pose=(0.0, 0.0, 0.0), model="euler"):
     """Poses (n, 3) from `initial_pose` (3,) by equation 1 or, with model "arc", by exact arcs.
 
-    Raises ValueError if `model` is not in MODELS.
-
     One revolution of both wheels, whose radii are 0.1 m:
 
     >>> from slamlib.dataset import Vehicle
@@ -98,22 +96,17 @@ def step_jacobian(ticks, vehicle, heading):
     the start of each Euler step, in rad.
     """
     ds, _, ds_by_w, dtheta_by_w = steps(ticks, vehicle)
-    c, s = np.cos(heading), np.sin(heading)
-    J = np.zeros((len(ds), 3, 4))
-    J[:, 0, :3] = c[:, None] * ds_by_w
-    J[:, 1, :3] = s[:, None] * ds_by_w
-    J[:, 2, :3] = dtheta_by_w
-    J[:, 0, 3] = -ds * s
-    J[:, 1, 3] = ds * c
-    return J
+    c, s = np.cos(heading)[:, None], np.sin(heading)[:, None]
+    by_wheels = np.stack([c * ds_by_w, s * ds_by_w, dtheta_by_w], axis=1)
+    by_heading = np.hstack([-s, c, 0 * c]) * ds[:, None]
+    return np.concatenate([by_wheels, by_heading[..., None]], axis=2)
 
 
 def wheel_jacobian(ticks, vehicle, initial_heading=0.0, model="euler"):
     """Derivatives (n, 3, 3) of the poses of `dead_reckoning` by [R_R, R_L, b], with pose 1 fixed.
 
     A wheel-parameter error is constant. It acts in every step and, through the heading, on all
-    later steps: the derivatives accumulate, not the variances. `initial_heading` is in rad. Raises
-    ValueError if `model` is not in MODELS.
+    later steps: the derivatives accumulate, not the variances. `initial_heading` is in rad.
     """
     ds, dtheta, ds_by_w, dtheta_by_w = steps(ticks, vehicle)
     heading = cumulative(dtheta, initial_heading)
@@ -138,7 +131,6 @@ def first_order(ticks, vehicle, initial_pose=(0.0, 0.0, 0.0), initial_covariance
 
     Unlike equation 2 it contains the correlation of position and heading, because A_k and G_k
     propagate a heading error to all later positions. Shapes and defaults are those of `equation2`.
-    Raises ValueError if `model` is not in MODELS.
     """
     if initial_covariance is None:
         initial_covariance = np.diag([0.0, 0.0, vehicle.sigma_heading**2])

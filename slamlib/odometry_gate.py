@@ -20,7 +20,7 @@ import numpy as np
 
 from slamlib import odometry, se2
 from slamlib.marker_increments import robust_increments
-from slamlib.sightings import GATE, sightings_by_frame, squared_distances
+from slamlib.sightings import GATE, sightings_by_frame
 
 # Noise of odometry, generous
 SLIP = 0.03                  # sqrt(m), of a wheel after one metre
@@ -37,7 +37,7 @@ PAIRS = 2                    # of sightings of each marker that tell of a jump: 
 NEAREST = 24                 # number of these pairs, by the frames between them
 MAX_WAY = 35.0               # m, between the sightings of a pair
 MAX_SIGMA = 1.0              # m, of a jump
-WELL_INSIDE = 0.7            # of the distance at which markers are seen
+WELL_INSIDE = 0.15, 0.85      # quantiles of x and of y at which markers are seen
 MIN_MISSED = 6               # number of sightings that should be there, and are not
 # Jumps in odometry
 USUAL = 0.9                  # probability of the quantile of motions that is a usual one
@@ -101,29 +101,30 @@ def find_jumps(dataset):
     s = replace(s, **{name: getattr(s, name)[order] for name in ("row", "marker", "z", "C")})
     # Sightings that are late contradict odometry wherever the speed changes.
     path = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")
-    late = [path[np.clip(s.frame - round(dataset.vehicle.sighting_lag) - lag, 0, len(path) - 1)]
-            for lag in LAGS]
-    cost = [_cost(_compared(s, _drive(each, dataset.vehicle.wheelbase))[2]).sum() for each in late]
+    late = [s.frame - round(dataset.vehicle.sighting_lag) - lag for lag in LAGS]
+    drives = [_Drive.without_jumps(path[np.clip(each, 0, len(path) - 1)], dataset.vehicle.wheelbase)
+              for each in late]
+    cost = [_cost(_compared(s, each)[2]).sum() for each in drives]
     stated, best = len(LAGS) // 2, int(np.argmin(cost))
     best = best if cost[best] < min(
         cost[stated] - MIN_LAG_GAIN, MAX_LAG_COST * cost[stated]) else stated
-    found = (_jumps(dataset, s, late[each]) for each in sorted({stated, best}))
+    found = (_jumps(dataset, s, drives[each]) for each in sorted({stated, best}))
     return replace(min(found, key=lambda jumps: len(jumps.start)), lag=LAGS[best])
 
 
-def _jumps(dataset, s, poses):
-    """The Jumps by odometry's poses (f, 3), and sightings sorted by marker, then frame."""
-    drive = _drive(poses, dataset.vehicle.wheelbase)
+def _jumps(dataset, s, drive):
+    """The Jumps by a _Drive, and sightings sorted by marker, then frame."""
     first, second, squared = _compared(s, drive)
     close = _compared(s, drive, slip=0.0)[2][second - first == 1]
     scale = max(1.0, np.median(close) / MEDIAN_SQUARED) if len(close) else 1.0
-    suspects = _suspects(first, second, squared / scale, len(poses) - 1)
+    suspects, rank = _suspects(first, second, squared / scale, len(drive.way) - 1)
     agreeing = (second - first < 4) & (squared < GATE * scale)
-    scaled, breaks = replace(s, C=scale * s.C), _breaks(s, poses, first[agreeing], second[agreeing])
-    found = _bridged(scaled, drive, suspects, breaks)
-    dead = _dead(dataset.ticks, s.frame, found)
+    breaks = _breaks(s, drive.poses, first[agreeing], second[agreeing])
+    scaled = replace(s, C=scale * s.C)
+    found, contradicted = _bridged(scaled, drive, suspects, breaks, rank)
+    dead = _dead(dataset.ticks, s.frame, contradicted)
     if len(dead):
-        found = _bridged(scaled, drive, np.union1d(suspects, dead), breaks, dead)
+        found, _ = _bridged(scaled, drive, np.union1d(suspects, dead), breaks, rank, dead)
     if not found:
         return NO_JUMPS
     k, increment, by_odometry, sigma = map(np.array, zip(*found))
@@ -133,20 +134,27 @@ def _jumps(dataset, s, poses):
                  sigma=sigma, chance=np.cumsum(np.where(spike, 1e6, 1.0)))
 
 
-def _bridged(s, drive, suspects, breaks, dead=()):
-    """List of step, increment, that by odometry, and sigma of each jump.
+def _bridged(s, drive, suspects, breaks, rank, dead=()):
+    """Ascending list of step, increment, that by odometry, and sigma of each jump.
 
-    Steps in `breaks` and `dead` are jumps, also if the markers do not tell how long they are.
+    Also a list of the steps that any pair contradicts. Steps are taken by their `rank` (f-1,).
+    Those in `breaks` and `dead` are jumps, also if the markers do not tell how long they are.
     """
-    found, steps = [], np.union1d(suspects, breaks).astype(int)
+    found, contradicted, steps = [], [], np.union1d(suspects, breaks).astype(int)
     moves = np.abs(se2.between(drive.poses[:-1], drive.poses[1:]))
     usual = np.maximum(np.quantile(moves, USUAL, axis=0)[[0, 0, 2]], MIN_JUMP)
-    drive = drive.with_variance(steps, 2 * usual[0]**2, usual[2]**2)
-    for k in steps.tolist():
-        drive = drive.with_variance(k, 0.0, 0.0)
-        jump, covariance, told = _jump(s, drive, k)
+    drive = drive.with_variance(steps, *UNKNOWN_SIGMA[1:]**2)
+    steps = steps[np.argsort(rank[steps], kind="stable")]
+    for i, k in enumerate(steps.tolist()):
+        if rank[k] > -np.inf:                    # all pairs that tell of it may span others, too
+            drive = drive.with_variance(steps[i:], 2 * usual[0]**2, usual[2]**2)
+        known = drive.with_variance(k, 0.0, 0.0)
+        jump, covariance, gain, told = _jump(s, known, k)
+        contradicted += [k] if gain > MIN_GAIN else []
         if not told and k not in breaks and k not in dead:
+            drive = drive if gain > MIN_GAIN else known        # one pair, maybe a wrong label
             continue
+        drive = known
         sigma = np.maximum(np.r_[[np.hypot(*jump[:2])] * 2, abs(jump[2])], MIN_JUMP)
         if covariance is None:
             sigma = UNKNOWN_SIGMA if k in breaks else 2 * usual
@@ -157,21 +165,21 @@ def _bridged(s, drive, suspects, breaks, dead=()):
         drive = drive.with_variance(k, np.trace(covariance[:2, :2]), covariance[2, 2])
         drive = replace(drive, poses=_moved(
             drive.poses, k + 1, se2.compose(drive.poses[k], increment)))
-    return found
+    return sorted(found, key=lambda jump: jump[0]), contradicted
 
 
-def _dead(ticks, frame, found):
+def _dead(ticks, frame, contradicted):
     """Steps from frame to frame in which a wheel is dead.
 
-    It counts nothing there, in a run of zeros in which most steps from frame to frame are jumps.
+    It counts nothing there, in a run of zeros in which half of the steps are in `contradicted`.
     """
-    dead, jumps = np.zeros(len(ticks), bool), [k for k, *_ in found]
+    dead, told = np.zeros(len(ticks), bool), np.isin(np.arange(len(frame) - 1), contradicted)
     for zero in (ticks == 0).T:
         run, total = np.cumsum(~zero), odometry.cumulative(zero)     # a run has one number
         silent = total[frame[1:] + 1] - total[frame[:-1] + 1] == np.diff(frame)
-        steps, wrong = (np.bincount(run[frame[1:]][some], minlength=len(ticks) + 1)
-                        for some in (silent, np.isin(np.arange(len(silent)), jumps) & silent))
-        dead |= zero & (2 * wrong > steps)[run]
+        steps, wrong = (np.bincount(run[frame[1:]], some, len(ticks) + 1)
+                        for some in (silent, silent & told))
+        dead |= zero & (wrong > 0)[run] & (2 * wrong >= steps)[run]
     total = odometry.cumulative(dead)
     return np.flatnonzero(total[frame[1:] + 1] > total[frame[:-1] + 1])
 
@@ -184,6 +192,11 @@ class _Drive:
     way: np.ndarray          # (f,) m, travelled so far
     variance: np.ndarray     # (f-1, 2) of a jump in each step, m^2 and rad^2
     wheelbase: float         # m
+
+    @classmethod
+    def without_jumps(cls, poses, wheelbase):
+        way = odometry.cumulative(np.hypot(*np.diff(poses[:, :2], axis=0).T))
+        return cls(poses, way, np.zeros((len(poses) - 1, 2)), wheelbase)
 
     def with_variance(self, steps, place, turn):
         """The _Drive with jumps of these variances, m^2 and rad^2, in `steps`, (m,) or one."""
@@ -203,30 +216,17 @@ class _Drive:
         return move, np.stack([along, place, turn], -1)[:, None] * np.eye(3)
 
 
-def _drive(poses, wheelbase):
-    """The _Drive of poses (f, 3) by odometry without jumps."""
-    return _Drive(poses, odometry.cumulative(np.hypot(*np.diff(poses[:, :2], axis=0).T)),
-                  np.zeros((len(poses) - 1, 2)), wheelbase)
-
-
 def _moved(poses, k, pose):
     """Poses (f, 3) of which pose k and the later ones have moved with pose k to `pose` (3,)."""
     return np.concatenate([poses[:k], se2.compose(pose, se2.between(poses[k], poses[k:]))])
 
 
-def _transported(z, C, move, Q):
-    """Markers (m, 3) at the ends of motions (m, 3) as seen from the starts, and covariances."""
-    by_move, by_z = se2.compose_jacobians(move, z)
-    return se2.compose(move, z), by_move @ Q @ by_move.mT + by_z @ C @ by_z.mT
-
-
 def _compared(s, drive, slip=SLIP):
     """Frames (m,) of each sighting and of the next one of its marker, and their chi-squared."""
-    first = np.flatnonzero(s.marker[:-1] == s.marker[1:])
-    second = first + 1
-    move = drive.motions(s.row[first], s.row[second], slip)
-    expected, W = _transported(s.z[second], s.C[second], *move)
-    return s.row[first], s.row[second], squared_distances(s.z[first], expected, s.C[first] + W)
+    k = np.flatnonzero(s.marker[:-1] == s.marker[1:])
+    first, second = s.row[k], s.row[k + 1]
+    z, C = se2.compose_uncertain(*drive.motions(first, second, slip), s.z[k + 1], s.C[k + 1])
+    return first, second, se2.squared_distances(s.z[k], z, s.C[k] + C)
 
 
 def _cost(squared):
@@ -244,13 +244,16 @@ def _suspects(first, second, squared, count):
     """Steps, of `count` from frame to frame, that half of the pairs of sightings contradict.
 
     Only sightings at these two frames are asked, if there are any; else all pairs that span it.
+    Also the rank (count,) of each step: those with such sightings come first, then those that most
+    contradicting pairs span. A pair over a long way does not tell where on it a jump was.
     """
     close, wrong = second - first == 1, squared > SUSPECT
-    linked = _spanning(first[close], second[close], count)
-    all_of, wrong_of = (np.where(linked, *(_spanning(first[some], second[some], count)
-                                           for some in (which & close, which)))
-                        for which in (close | True, wrong))
-    return np.flatnonzero((wrong_of > 0) & (2 * wrong_of >= all_of))
+    of_close, all_of, wrong_of_close, all_wrong = (
+        _spanning(first[some], second[some], count)
+        for some in (close, close | True, close & wrong, wrong))
+    all_of, wrong_of = np.where(of_close, [of_close, wrong_of_close], [all_of, all_wrong])
+    return (np.flatnonzero((wrong_of > 0) & (2 * wrong_of >= all_of)),
+            np.where(of_close > 0, -np.inf, -all_wrong))
 
 
 def _breaks(s, poses, first, second):
@@ -260,40 +263,41 @@ def _breaks(s, poses, first, second):
     MIN_MISSED such sightings are missed, on both sides, and no pair of sightings of frames `first`
     and `second` (m,), which agree with odometry, spans the step.
     """
-    count, reach = len(poses) - 1, WELL_INSIDE * np.quantile(np.hypot(*s.z.T[:2]), 0.95)
+    count, (low, high) = len(poses) - 1, np.quantile(s.z[:, :2], WELL_INSIDE, axis=0)
     missed = np.zeros((2, count), int)
     for step in (1, 2, 3, -1, -2, -3):
         rows = np.flatnonzero((s.row + step >= 0) & (s.row + step <= count))
         there = se2.compose(se2.between(poses[s.row[rows] + step], poses[s.row[rows]]), s.z[rows])
-        inside = rows[np.hypot(*there.T[:2]) < reach]
-        missed[int(step < 0)] += np.bincount(s.row[inside] - (step < 0), minlength=count)
+        inside = rows[((low < there[:, :2]) & (there[:, :2] < high)).all(axis=1)]
+        crossed = s.row[inside] + np.arange(min(step, 0), max(step, 0))[:, None]
+        missed[int(step < 0)] += np.bincount(crossed.ravel(), minlength=count)
     return np.flatnonzero((_spanning(first, second, count) == 0) & (missed.min(axis=0) > 1)
                           & (missed.sum(axis=0) >= MIN_MISSED))
 
 
 def _jump(s, drive, k):
-    """The jump (3,) between the frames k and k + 1, its covariance or None, whether it is told."""
-    begins = np.flatnonzero(np.diff(s.marker, prepend=s.marker[0] - 1))
-    following = np.add.reduceat(s.row <= k, begins) + begins
-    ends = np.append(begins[1:], len(s.row))
-    rows = np.concatenate([np.stack([following - 1 - i, following + i])[
-        :, (following - 1 - i >= begins) & (following + i < ends)] for i in range(PAIRS)], axis=1)
+    """The jump (3,) between the frames k and k + 1, its covariance or None, its gain.
+
+    Also whether it is told: without the pair that gains most.
+    """
+    before = np.flatnonzero((s.row[:-1] <= k) & (k < s.row[1:]) & (s.marker[:-1] == s.marker[1:]))
+    rows = np.concatenate([[before - i, before + 1 + i] for i in range(PAIRS)], axis=1)
+    rows = rows[:, (rows[0] >= 0) & (rows[1] < len(s.row))]
     way = drive.way[s.row[rows[1]]] - drive.way[s.row[rows[0]]]
-    rows = rows[:, way < MAX_WAY]
+    rows = rows[:, (s.marker[rows[0]] == s.marker[rows[1]]) & (way < MAX_WAY)]
     rows = rows[:, np.argsort(s.row[rows[1]] - s.row[rows[0]], kind="stable")[:NEAREST]]
     if not rows.size:
-        return np.zeros(3), None, False
+        return np.zeros(3), None, 0.0, False
     move, Q = drive.motions([k], [k + 1])
-    (z, C), later = (
-        _transported(s.z[each], s.C[each], *drive.motions(np.full(len(each), end), s.row[each]))
+    (z, C), later = (se2.compose_uncertain(
+        *drive.motions(np.full(len(each), end), s.row[each]), s.z[each], s.C[each])
         for each, end in zip(rows, (k, k + 1)))
-    later, first = _transported(*later, move, 0 * Q), np.arange(rows.shape[1])
+    later, first = se2.compose_uncertain(move, 0 * Q, *later), np.arange(rows.shape[1])
     found = robust_increments(*map(np.concatenate, zip((z, C), later)), 0 * first, first,
                               first + len(first), 1)
     jump, covariance = found.increment[0], found.covariance[0]
-    expected = [_transported(*later, each, Q) for each in (np.zeros(3), jump)]
-    cost = [_cost(squared_distances(z, each, C + W)) for each, W in expected]
-    gain = cost[0] - cost[1]
+    expected = [se2.compose_uncertain(each, Q, *later) for each in (np.zeros(3), jump)]
+    gain = np.subtract(*(_cost(se2.squared_distances(z, each, C + W)) for each, W in expected))
     if not found.usable[0] or np.trace(covariance[:2, :2]) > MAX_SIGMA**2:
-        return np.zeros(3), None, False
-    return jump, covariance, gain.sum() - gain.max() > MIN_GAIN
+        return np.zeros(3), None, 0.0, False
+    return jump, covariance, gain.sum(), gain.sum() - gain.max() > MIN_GAIN

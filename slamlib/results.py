@@ -24,29 +24,15 @@ FIELDS = {"vehiclePose": ("pose", "covari"), "ArucoMap": ("pose", "covari", "id"
 RESULT_FILES = tuple(f"{name}.mat" for name in FIELDS)  # of a problem's folder
 
 
-def write_vehicle_poses(folder, poses, covariances):
-    """Write folder/vehiclePose.mat: vehiclePose(k).pose, .covari for pose k of the encoder file.
-
-    `poses` (n, 3) and `covariances` (n, 3, 3) are NaN where there is no estimate.
-    """
-    write_structs(folder, "vehiclePose", None, poses, covariances)
-
-
-def read_vehicle_poses(folder):
-    """Poses (n, 3) and covariances (n, 3, 3) of folder/vehiclePose.mat.
-
-    >>> write_vehicle_poses("problem1", np.zeros((2, 3)), np.zeros((2, 3, 3)))
-    >>> poses, covariances = read_vehicle_poses("problem1")
-    >>> poses.shape, covariances.shape
-    ((2, 3), (2, 3, 3))
-    """
-    return read_structs(folder, "vehiclePose")[1:]
-
-
 def read_structs(folder, name):
     """Ids (n,), poses (n, 3) or positions (n, 2), and covariances of a file in a folder.
 
     `name` is a key of FIELDS. The ids of vehicle poses are 1 to n.
+
+    >>> write_structs("problem1", "vehiclePose", None, np.zeros((2, 3)), np.zeros((2, 3, 3)))
+    >>> ids, poses, covariances = read_structs("problem1", "vehiclePose")
+    >>> ids.tolist(), poses.shape, covariances.shape
+    ([1, 2], (2, 3), (2, 3, 3))
     """
     structs, d = loadmat(Path(folder) / f"{name}.mat")[name], 2 if name == "UwbMap" else 3
     rows = [np.reshape([*structs[field].ravel()], (-1, *shape))
@@ -58,32 +44,28 @@ def read_structs(folder, name):
 def write_structs(folder, name, ids, places, covariances):
     """Write folder/name.mat with one (1, n) struct array; equal input gives equal bytes.
 
-    `name` is a key of FIELDS. The ids (n,) of maps ascend; `places` are poses (n, 3), of markers
-    with headings in (-pi, pi], or positions (n, 2); `covariances` are (n, 3, 3) or (n, 2, 2).
+    `name` is a key of FIELDS. The ids (n,) of maps ascend, those of vehicle poses are not written;
+    `places` are poses (n, 3), of markers with headings in (-pi, pi], or positions (n, 2);
+    `covariances` are (n, 3, 3) or (n, 2, 2). They are NaN where there is no estimate.
 
-    scipy writes many structs slowly, one by one. Here it writes the first one, whose bytes are
-    repeated with the numbers of the others: each field is a header of 56 bytes and its numbers by
-    columns. The array's size and number of columns are set (MAT-File Format, version 5).
+    scipy writes many structs slowly, one by one. Here it writes one of zeros, whose bytes are
+    repeated with the numbers: each field is a header of 56 bytes and its numbers by columns. The
+    array's size and number of columns are set (MAT-File Format, version 5).
     """
     columns = zip(FIELDS[name], (places, covariances, ids))
     rows = {field: _matrices(values) for field, values in columns}
-    count = len(next(iter(rows.values())))
-    first = np.empty((1, min(count, 1)), dtype=[(field, object) for field in rows])
-    for field, values in rows.items():
-        first[field][0, :] = list(values[:1])
-    buffer = BytesIO()
-    savemat(buffer, {name: first})
+    buffer, count = BytesIO(), len(places)
+    savemat(buffer, {name: {field: np.zeros(values.shape[1:]) for field, values in rows.items()}})
     content = bytearray(_HEADER + buffer.getvalue()[len(_HEADER):])
-    if count > 1:
-        layout = np.dtype([entry for field, values in rows.items() for entry in (
-            (f"header of {field}", "V56"), (field, "=f8", values.shape[:0:-1]))])
-        structs = np.repeat(np.frombuffer(content[-layout.itemsize:], layout), count)
-        for field, values in rows.items():
-            structs[field] = np.swapaxes(values, 1, 2)
-        size, = struct.unpack_from("=I", content, SIZE_OFFSET)
-        struct.pack_into("=I", content, SIZE_OFFSET, size + (count - 1) * layout.itemsize)
-        struct.pack_into("=i", content, COUNT_OFFSET, count)
-        content[-layout.itemsize:] = structs.tobytes()
+    layout = np.dtype([entry for field, values in rows.items() for entry in (
+        (f"header of {field}", "V56"), (field, "=f8", values.shape[:0:-1]))])
+    structs = np.repeat(np.frombuffer(content[-layout.itemsize:], layout), count)
+    for field, values in rows.items():
+        structs[field] = np.swapaxes(values, 1, 2)
+    size, = struct.unpack_from("=I", content, SIZE_OFFSET)
+    struct.pack_into("=I", content, SIZE_OFFSET, size + (count - 1) * layout.itemsize)
+    struct.pack_into("=i", content, COUNT_OFFSET, count)
+    content[-layout.itemsize:] = structs.tobytes()
     swap.write_atomically(Path(folder) / f"{name}.mat", content)
 
 

@@ -64,6 +64,13 @@ def between(T_wa, T_wb):
     return _poses(c * dx + s * dy, -s * dx + c * dy, T_wb[..., 2] - T_wa[..., 2])
 
 
+def difference(first, second):
+    """first - second, (..., 3), with the difference of the headings in (-pi, pi]."""
+    r = np.subtract(first, second)
+    r[..., 2] = wrap(r[..., 2])
+    return r
+
+
 def compose_jacobians(T_ab, T_bc):
     """Derivatives of compose, d T_ac / d T_ab and d T_ac / d T_bc, each (..., 3, 3)."""
     shape = np.broadcast_shapes(np.shape(T_ab), np.shape(T_bc))
@@ -80,6 +87,12 @@ def compose_jacobians(T_ab, T_bc):
 def inverse_jacobian(T_ab):
     """Derivative of inverse, d T_ba / d T_ab, (..., 3, 3)."""
     return between_jacobians(T_ab, np.zeros(3))[0]
+
+
+def compose_uncertain(T_ab, C_ab, T_bc, C_bc):
+    """T_ac, (..., 3), and its covariance (..., 3, 3), by independent motions and covariances."""
+    A, B = compose_jacobians(T_ab, T_bc)
+    return compose(T_ab, T_bc), A @ C_ab @ A.mT + B @ C_bc @ B.mT
 
 
 def between_jacobians(T_wa, T_wb):
@@ -101,30 +114,26 @@ def log(T):
     It is [a x + h y / 2, -h x / 2 + a y, h] with the wrapped heading h and a = (h / 2) cot(h / 2).
     GTSAM computes the error of its between factors with it (`Pose2::Logmap`).
     """
-    T = np.asarray(T, dtype=float)
-    h, x, y = wrap(T[..., 2]), T[..., 0], T[..., 1]
-    a, _ = _half_cotangent(h)
-    return np.stack([a * x + h * y / 2, -h * x / 2 + a * y, h], -1)
+    x, y, h, a = _log_terms(T)
+    return _poses(a * x + h * y / 2, -h * x / 2 + a * y, h)
 
 
 def log_jacobian(T):
     """Derivative of `log` at motions T (..., 3) by [x, y, heading], (..., 3, 3)."""
-    T = np.asarray(T, dtype=float)
-    h, x, y = wrap(T[..., 2]), T[..., 0], T[..., 1]
-    a, slope = _half_cotangent(h)
-    jacobian = _identity(T.shape)
+    x, y, h, a = _log_terms(T)
+    small = np.abs(h) < 1e-3                                 # there the derivative of a cancels
+    slope = np.where(small, -h / 6, (a - a**2 - h**2 / 4) / np.where(small, 1.0, h))
+    jacobian = _identity(np.shape(T))
     jacobian[..., 0, 0], jacobian[..., 0, 1], jacobian[..., 0, 2] = a, h / 2, slope * x + y / 2
     jacobian[..., 1, 0], jacobian[..., 1, 1], jacobian[..., 1, 2] = -h / 2, a, slope * y - x / 2
     return jacobian
 
 
-def _half_cotangent(h):
-    """(h / 2) cot(h / 2) and its derivative by h, with their series near zero."""
-    small = np.abs(h) < 1e-3
-    half = np.where(small, 1.0, h / 2)
-    a = np.where(small, 1 - h**2 / 12, half / np.tan(half))
-    slope = np.where(small, -h / 6, (1 / np.tan(half) - half / np.sin(half)**2) / 2)
-    return a, slope
+def _log_terms(T):
+    """x, y, h and a of `log`."""
+    x, y, h = np.moveaxis(np.asarray(T, dtype=float), -1, 0)
+    h = wrap(h)
+    return x, y, h, np.cos(h / 2) / np.sinc(h / (2 * np.pi))
 
 
 def rotate_covariance(covariance, heading):
@@ -147,6 +156,20 @@ def correlations(covariances):
     sigma = sigmas(covariances)
     scale = sigma[..., :, None] * sigma[..., None, :]
     return np.divide(covariances, scale, out=np.full_like(scale, np.nan), where=scale > 0)
+
+
+def regular(covariances):
+    """True (n,) where covariances (n, d, d) are finite and, as correlations, not singular."""
+    rho = correlations(covariances)
+    found = np.isfinite(rho).all(axis=(1, 2))
+    found[found] = np.linalg.eigvalsh(rho[found])[:, 0] > 1e-12
+    return found
+
+
+def squared_distances(first, second, covariance):
+    """Squared Mahalanobis distances (...) of poses (..., 3) whose difference has a covariance."""
+    r = difference(first, second)
+    return np.sum(r * np.linalg.solve(covariance, r[..., None])[..., 0], axis=-1)
 
 
 def _poses(x, y, heading):

@@ -80,8 +80,7 @@ def merge_repeated(aruco):
     for i in np.flatnonzero(count > 1):
         same = slice(begins[i], begins[i] + count[i])
         information = np.linalg.inv(C[same])
-        r = z[same] - z[begins[i]]
-        r[:, 2] = se2.wrap(r[:, 2])
+        r = se2.difference(z[same], z[begins[i]])
         mean_covariance = np.linalg.inv(information.sum(0))
         mean = mean_covariance @ np.einsum("nij,nj->i", information, r)
         agrees[i] = np.all(np.einsum("ni,nij,nj->n", r - mean, information, r - mean) < GATE)
@@ -100,32 +99,13 @@ def consensus(marker, in_world, covariance, maximum=200):
     poses of these markers in world axes by each sighting. Of a marker with more than `maximum`
     sightings, so many evenly chosen ones are compared: the cost is quadratic.
     """
-    _, label = np.unique(marker, return_inverse=True)
-    chosen, best = evenly_chosen(label, maximum), []
-    order = chosen[np.argsort(label[chosen], kind="stable")]
+    order, best = np.argsort(marker, kind="stable"), []
     log_determinant = np.linalg.slogdet(covariance)[1]
-    for same in np.split(order, np.flatnonzero(np.diff(label[order])) + 1) if len(order) else ():
-        squared = squared_distances(in_world[same, None], in_world[same],
-                                    covariance[same, None] + covariance[same])
+    for same in np.split(order, np.flatnonzero(np.diff(marker[order])) + 1) if len(order) else ():
+        k, few = np.arange(len(same)), min(len(same), maximum)
+        same = same[k * few // len(same) != (k - 1) * few // len(same)]
+        squared = se2.squared_distances(in_world[same, None], in_world[same],
+                                        covariance[same, None] + covariance[same])
         support = np.count_nonzero(squared < GATE, axis=1)
         best.append(min(same[support >= support.max() / 2], key=log_determinant.__getitem__))
     return np.array(best, int)
-
-
-def squared_distances(first, second, covariance):
-    """Squared Mahalanobis distances (...) of poses (..., 3) whose difference has a covariance."""
-    r = first - second
-    r[..., 2] = se2.wrap(r[..., 2])
-    return np.einsum("...i,...i->...", r, np.linalg.solve(covariance, r[..., None])[..., 0])
-
-
-def evenly_chosen(label, maximum):
-    """Rows, ascending, of at most `maximum` evenly spaced entries of every label, with its first.
-
-    `label` (s,) are integers from 0.
-    """
-    order = np.argsort(label, kind="stable")
-    count = np.bincount(label)[label[order]]
-    number = np.arange(len(order)) - np.searchsorted(label[order], label[order])
-    few = np.minimum(count, maximum)
-    return np.sort(order[(number * few) // count != ((number - 1) * few) // count])

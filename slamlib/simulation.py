@@ -17,16 +17,16 @@ import numpy as np
 
 from slamlib import se2
 from slamlib.dataset import TABLE_2, AntennaGuess, ArucoReadings, Dataset, Truth, UwbReadings
-from slamlib.odometry import cumulative
+from slamlib.odometry import cumulative, dead_reckoning
 from slamlib.swap import staging
-from slamlib.textfile import DatasetError
+from slamlib.textfile import require
 
 # A path is a sum of rotating vectors (turns per round, radius in m, phase in rad). `marker_spacing`
 # is in m; no markers are in a disc with its centre at a fraction of the path and its radius in m.
 PATHS = {
     "short": SimpleNamespace(
         vectors=((1, 2.9, 0.0), (-1, 0.9, 0.3), (2, 0.7, 2.0), (3, 0.2, 1.0)), poses=2000,
-        aruco_every=10, marker_spacing=1.5, markers_missing=None, uwb_every=20, antennas=4),
+        aruco_every=10, marker_spacing=1.5, markers_missing=(0.0, 0.0), uwb_every=20, antennas=4),
     "long": SimpleNamespace(
         vectors=((4, 8.9, 0.0), (-3, 3.9, 0.5), (1, 3.3, 1.0)), poses=23000,
         aruco_every=12, marker_spacing=1.9, markers_missing=(0.42, 3.5), uwb_every=25, antennas=8),
@@ -58,26 +58,22 @@ def simulate(path="short", seed=0, *, slip=1e-3, late_ranges=0.0, mislabelled=0.
 
     Returns
     -------
-    dataset : Dataset
-    truth : Truth
-
-    Raises
-    ------
-    DatasetError : there is no such path, or a number is not within its limits.
+    Dataset and Truth. Raises DatasetError if there is no such path, or a number is beyond limits.
 
     >>> dataset, truth = simulate("short", seed=1, late_ranges=0.1)
     >>> dataset.ticks.shape, truth.poses.shape
     ((2000, 2), (2000, 3))
     """
-    if path not in PATHS or seed < 0 or rounds < 1 or not all(
-            0 <= share <= 1 for share in (slip, late_ranges, mislabelled)):
-        raise DatasetError(f"simulate: expected one of the paths {', '.join(PATHS)}, a seed from 0 "
-                           "on, rounds from 1 on, and a slip and shares from 0 to 1")
+    shares = slip, late_ranges, mislabelled
+    require(path in PATHS and seed >= 0 and rounds >= 1 and all(0 <= each <= 1 for each in shares),
+            "simulate", f"one of the paths {', '.join(PATHS)}, a seed from 0 on, rounds from 1 on, "
+            "slip and shares from 0 to 1")
     layout = PATHS[path]
     rng = np.random.default_rng(seed)
     true_vehicle = vehicle.with_deviation(noise * rng.standard_normal(3))
-    arcs = _driven_arcs(layout, rounds)
-    poses, ticks = _arc_poses(*arcs), _encoder(*arcs, true_vehicle, slip, noise, rng)
+    counts = _counts(*_driven_arcs(layout, rounds), true_vehicle)
+    poses = dead_reckoning(counts, true_vehicle, model="arc")
+    whole = _encoder(counts, true_vehicle, slip, rng)
     marker, marker_in_world = _place_markers(layout, poses, rng)
     antenna, antenna_in_world = _place_antennas(layout, poses, rng)
     aruco = _camera(poses, marker, marker_in_world, layout.aruco_every, mislabelled, memory,
@@ -85,8 +81,8 @@ def simulate(path="short", seed=0, *, slip=1e-3, late_ranges=0.0, mislabelled=0.
     uwb = _uwb(poses, antenna, antenna_in_world, layout.uwb_every, late_ranges, noise, rng)
     offset = SIMULATED_GUESS_SIGMA * rng.standard_normal(antenna_in_world.shape)
     guess = AntennaGuess(antenna, antenna_in_world + noise * offset)
-    return (Dataset(name=path, vehicle=vehicle, ticks=ticks, aruco=aruco, uwb=uwb,
-                    antenna_guess=guess),
+    return (Dataset(name=path, vehicle=vehicle, ticks=whole if noise else counts, aruco=aruco,
+                    uwb=uwb, antenna_guess=guess),
             Truth(poses=poses, marker=marker, marker_in_world=marker_in_world, antenna=antenna,
                   antenna_in_world=antenna_in_world, vehicle=true_vehicle))
 
@@ -108,19 +104,15 @@ def mislabel(dataset, fraction, seed):
     return replace(dataset, aruco=replace(dataset.aruco, marker=ids[label]))
 
 
-def manoeuvre(legs, vehicle=TABLE_2, step=0.01):
+def manoeuvre(legs, vehicle=TABLE_2):
     """Counts (n, 2) of the right and left wheel in a drive in arcs, with fractions, without noise.
 
     `legs` lists (m, rad), length and turn of each arc; negative lengths are driven backwards. A
-    step is at most `step` m long. Row 0 is zero.
+    step is at most 1 cm long, or turns a wheel by as much about the middle. Row 0 is zero.
     """
-    half, counts = vehicle.wheelbase / 2, [np.zeros((1, 2))]
-    for length, turn in legs:
-        steps = int(np.ceil(max(abs(length), abs(turn) * half) / step))
-        travel = np.array([length + half * turn, length - half * turn]) / steps
-        circumference = 2 * np.pi * vehicle.wheel[:2]
-        counts.append(np.tile(travel * vehicle.ticks_per_revolution / circumference, (steps, 1)))
-    return np.concatenate(counts)
+    legs = np.asarray(legs, dtype=float)
+    steps = np.ceil(np.abs(legs * [1, vehicle.wheelbase / 2]).max(axis=1) / 0.01).astype(int)
+    return _counts(*np.repeat(legs / steps[:, None], steps, axis=0).T, vehicle)
 
 
 def write_dataset(folder, dataset, truth=None):
@@ -129,8 +121,8 @@ def write_dataset(folder, dataset, truth=None):
     Raises DatasetError if the folder exists and is not empty.
     """
     folder = Path(folder)
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise DatasetError(f"{folder}: expected a new or empty folder to write the dataset to")
+    require(not folder.exists() or folder.is_dir() and not any(folder.iterdir()), folder,
+            "a new or empty folder to write the dataset to")
     a, u, guess = dataset.aruco, dataset.uwb, dataset.antenna_guess
     number = np.arange(1, len(dataset.ticks) + 1)
     tables = {"encoderReading": ("%d %d %d", number, *dataset.ticks.T)}
@@ -181,25 +173,20 @@ def _driven_arcs(layout, rounds):
     return np.diff(travelled), np.diff(np.unwrap(np.arctan2(direction[1], direction[0])))
 
 
-def _arc_poses(ds, dtheta):
-    """Poses (n, 3) along arcs of length ds and turn dtheta, from [0, 0, 0]."""
-    heading = cumulative(dtheta)
-    chord, direction = ds * np.sinc(dtheta / (2 * np.pi)), heading[:-1] + dtheta / 2
-    steps = chord[:, None] * np.stack([np.cos(direction), np.sin(direction)], -1)
-    return np.column_stack([cumulative(steps), heading])
-
-
-def _encoder(ds, dtheta, vehicle, slip, noise, rng):
-    """Counts (n, 2), right and left; whole numbers unless noise is False."""
+def _counts(ds, dtheta, vehicle):
+    """Counts (n, 2), right and left, with fractions, on arcs of length ds and turn dtheta."""
     half_turn = vehicle.wheelbase * dtheta / 2
-    travel = np.stack([ds + half_turn, ds - half_turn], -1)
-    slipped = travel + slip * np.sqrt(np.abs(travel)) * rng.standard_normal(travel.shape)
-    phase = rng.uniform(size=2)
-    metres_per_count = 2 * np.pi * vehicle.wheel[:2] / vehicle.ticks_per_revolution
-    if not noise:
-        return np.concatenate([np.zeros((1, 2)), travel / metres_per_count])
-    total = np.floor(np.cumsum(slipped, axis=0) / metres_per_count + phase).astype(np.int64)
-    return np.concatenate([total[:1] * 0, np.diff(total, axis=0, prepend=0)])
+    travel = np.pad(np.stack([ds + half_turn, ds - half_turn], -1), ((1, 0), (0, 0)))
+    return travel * vehicle.ticks_per_revolution / (2 * np.pi * vehicle.wheel[:2])
+
+
+def _encoder(counts, vehicle, slip, rng):
+    """Whole counts (n, 2) of an encoder on wheels that slip, of counts with fractions."""
+    length = 2 * np.pi * vehicle.wheel[:2] / vehicle.ticks_per_revolution      # m, of a count
+    slipped = counts[1:] + slip * np.sqrt(abs(counts[1:]) / length) * rng.standard_normal(
+        counts[1:].shape)
+    total = np.floor(np.cumsum(slipped, axis=0) + rng.uniform(size=2)).astype(np.int64)
+    return np.diff(total, axis=0, prepend=[[0, 0], [0, 0]])
 
 
 def _place_markers(layout, poses, rng):
@@ -209,11 +196,9 @@ def _place_markers(layout, poses, rng):
     grid = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
     grid += layout.marker_spacing * rng.uniform(-0.35, 0.35, grid.shape)
     visible = np.array([np.hypot(*(poses[::10, :2] - p).T).min() < CAMERA_REACH for p in grid])
-    if layout.markers_missing is not None:
-        fraction, radius = layout.markers_missing
-        centre = poses[int(fraction * len(poses)), :2]
-        visible &= np.hypot(*(grid - centre).T) > radius
-    grid = grid[visible]
+    fraction, radius = layout.markers_missing
+    centre = poses[int(fraction * len(poses)), :2]
+    grid = grid[visible & (np.hypot(*(grid - centre).T) > radius)]
     ids = np.sort(rng.choice(np.arange(1, max(250, len(grid) + 1)), len(grid), replace=False))
     order = rng.permutation(len(grid))
     return ids, np.column_stack([grid[order], rng.uniform(-np.pi, np.pi, len(grid))])
@@ -221,8 +206,7 @@ def _place_markers(layout, poses, rng):
 
 def _place_antennas(layout, poses, rng):
     """Ids (a,) and positions (a, 2) of antennas on an ellipse around the driven area."""
-    low, high = poses[:, :2].min(0), poses[:, :2].max(0)
-    count = layout.antennas
+    low, high, count = poses[:, :2].min(0), poses[:, :2].max(0), layout.antennas
     angle = 2 * np.pi * (np.arange(count) + rng.uniform(-0.2, 0.2, count)) / count + np.pi / 4
     direction = np.stack([np.cos(angle), np.sin(angle)], -1)
     position = (low + high) / 2 + (0.6 * (high - low) + 1.0) * direction

@@ -35,7 +35,6 @@ PROBLEMS = {
     "problem3": Task("SLAM: odometry + ArUco", ("aruco",), "slam"),
     "problem4": Task("SLAM: odometry + ArUco + UWB", ("uwb",), "slam_uwb"),
 }
-COVARIANCE_FIELDS = ("marker_covariance", "antenna_covariance", "wheel_covariance")
 SENSORS = {"aruco": "markers", "uwb": "UWB ranges"}
 SUMMARY = "summary.json"
 RESULT_NAMES = frozenset([  # relative paths of all files that a drive's results may have
@@ -102,26 +101,7 @@ def find(problem, dataset, found=None):
         "problem2_fused": lambda: localization.fuse(dataset),
         "problem3": lambda: slam.estimate(dataset.without("uwb")),
         "problem4": lambda: slam.estimate(dataset, previous=(found or {}).get("problem3"))}
-    result = solvers[problem]()
-    require_covariances(result)
-    return result
-
-
-def _poses_and_covariances(result):
-    """Poses and covariances of what `find` returns."""
-    return result if isinstance(result, tuple) else (result.poses, result.covariances)
-
-
-def require_covariances(result):
-    """Raise LinAlgError where a covariance of what `find` returns is lost by rounding."""
-    poses, covariances = _poses_and_covariances(result)
-    maps = (getattr(result, name, None) for name in COVARIANCE_FIELDS)
-    variances = np.concatenate([
-        np.diagonal(C, axis1=-2, axis2=-1).ravel()
-        for C in (covariances[np.isfinite(poses[:, 0])], *maps) if C is not None])
-    if not ((0 <= variances) & (variances < np.inf)).all() \
-            or not np.isfinite(getattr(getattr(result, "fit", None), "log_evidence", 0.0)):
-        raise np.linalg.LinAlgError("a variance is negative or not finite")
+    return solvers[problem]()
 
 
 def problem_solution(problem, dataset, found=None):
@@ -130,10 +110,18 @@ def problem_solution(problem, dataset, found=None):
     Problem 1 is odometry, equation 1 with the covariance of equation 2. Problem 2 is incremental
     localization: "problem2" from the markers alone, "problem2_hint" fused as the assignment
     suggests, "problem2_fused" fused with all shared errors. Problem 3 is SLAM with odometry and
-    markers, problem 4 with ranges, too. Raises UNSOLVABLE if `found` is None.
+    markers, problem 4 with ranges, too. Raises UNSOLVABLE, also where a covariance is lost by
+    rounding.
     """
     found = find(problem, dataset) if found is None else found
-    poses, covariances = _poses_and_covariances(found)
+    poses, covariances = found if isinstance(found, tuple) else (found.poses, found.covariances)
+    others = (getattr(found, f"{kind}_covariance", None) for kind in ("marker", "antenna", "wheel"))
+    variances = np.concatenate([
+        np.diagonal(C, axis1=-2, axis2=-1).ravel()
+        for C in (covariances[np.isfinite(poses[:, 0])], *others) if C is not None])
+    if not ((0 <= variances) & (variances < np.inf)).all() \
+            or not np.isfinite(getattr(getattr(found, "fit", None), "log_evidence", 0.0)):
+        raise np.linalg.LinAlgError("a variance is negative or not finite")
     fields = {"poses": poses, "covariances": covariances}
     if problem == "problem2":
         fields = _localization_fields(dataset, found)
@@ -192,9 +180,9 @@ def solutions(dataset, problems=tuple(PROBLEMS)):
     for problem in (each for each in problems if allows(dataset, each)):
         try:
             result = find(problem, dataset, found)
-            if problem == "problem3":                    # from which problem 4 starts
-                found[problem] = result
-            yield problem_solution(problem, dataset, result)
+            solution = problem_solution(problem, dataset, result)
+            found[problem] = result
+            yield solution
         except UNSOLVABLE as error:
             yield failure(problem, dataset, error)
 

@@ -4,37 +4,30 @@ import json
 import signal
 import sys
 import time
-from contextlib import contextmanager
+from contextlib import suppress
 from dataclasses import asdict
-from multiprocessing import get_context
+from multiprocessing import Pipe, get_context
 
 import numpy as np
 
-from slamlib import evaluation, swap
+from slamlib import evaluation, solve, swap
 from slamlib.checks.files import doubts_before_solving, merged
-from slamlib.dataset import all_notes, read_dataset, read_truth
+from slamlib.dataset import all_notes
 from slamlib.results import write_tum
-from slamlib.solve import (
-    PROBLEMS,
-    RESULT_NAMES,
-    SUMMARY,
-    Failure,
-    solutions,
-    truth_in_world,
-    write_solution,
-)
+
+# Problems that the second process solves: no other problem needs their results.
+INDEPENDENT = ("problem1", "problem2", "problem2_hint", "problem2_fused")
 
 
-def solve_to_folder(dataset, truth, out, problems=tuple(PROBLEMS), csv=False):
+def solve_to_folder(dataset, truth, out, problems=tuple(solve.PROBLEMS), csv=False):
     """Solve problems of a Dataset and write their files to the folder `out`.
 
-    When all files are written they replace those of an earlier run, by `swap.publish`.
+    When all files are written they replace those of an earlier run, by `swap.publish`. On Linux,
+    where a fork is safe, a second process solves problems 1 and 2.
 
     Parameters
     ----------
-    dataset : Dataset
     truth : Truth, to report errors, never to estimate; or None.
-    out : path of the folder.
     problems : keys of `solve.PROBLEMS`; those for which there are sensors are solved.
     csv : bool; True writes each .mat file also as CSV, and trajectories and truth as TUM files.
 
@@ -46,21 +39,49 @@ def solve_to_folder(dataset, truth, out, problems=tuple(PROBLEMS), csv=False):
     read.
     """
     with swap.staging(out) as stage:
-        summary = _solved(dataset, truth, problems, lambda solution: write_solution(
-            stage, solution, csv))
+        summary = _solved(dataset, truth, problems,
+                          lambda solution: solve.write_solution(stage, solution, csv))
         text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-        swap.write_atomically(stage / SUMMARY, text.encode())
+        swap.write_atomically(stage / solve.SUMMARY, text.encode())
         if csv and truth is not None:
             write_tum(stage / "truth.tum", truth.poses)
-        swap.publish({out: stage}, ours=RESULT_NAMES)
+        swap.publish({out: stage}, ours=solve.RESULT_NAMES)
     return summary
 
 
-def _solved(dataset, truth, problems, write=lambda solution: None):
-    """The summary of problems, each of which is solved and its Solution written."""
-    rows, doubts, start = {}, doubts_before_solving(dataset, truth), time.perf_counter()
-    for solution in solutions(dataset, problems=problems):
-        failed = isinstance(solution, Failure)
+def _solved(dataset, truth, problems, write):
+    """The summary of problems, each of which is solved; `write` takes each Solution."""
+    arguments = dataset, truth, problems, write
+    if sys.platform == "linux":
+        receiver, sender = Pipe(duplex=False)
+        child = get_context("fork").Process(target=_send_rows, args=(sender, *arguments))
+        child.start()
+        sender.close()
+    try:
+        late = _rows(*arguments, False)
+        early = receiver.recv() if sys.platform == "linux" else _rows(*arguments, True)
+    except EOFError:                            # the child was killed, or failed: here it is told
+        early = _rows(*arguments, True)
+    finally:
+        if sys.platform == "linux":
+            child.kill()
+            child.join()
+            receiver.close()
+    return {"dataset": dataset.name, "poses": len(dataset.ticks), "kernel": dataset.vehicle.kernel,
+            "doubts": [asdict(doubt) for doubt in merged([*early[1], *late[1]])],
+            "notes": list(all_notes(dataset, truth)), "problems": early[0] | late[0]}
+
+
+def _rows(dataset, truth, problems, write, independent):
+    """Rows of the summary of problems, those INDEPENDENT or all others, and list of the doubts.
+
+    With the former come the doubts before solving.
+    """
+    doubts = doubts_before_solving(dataset, truth) if independent else []
+    rows, start = {}, time.perf_counter()
+    problems = [problem for problem in problems if (problem in INDEPENDENT) == independent]
+    for solution in solve.solutions(dataset, problems=problems):
+        failed = isinstance(solution, solve.Failure)
         row = {"failed": solution.reason} if failed else summarize(solution, truth)
         rows[solution.problem] = {
             "title": solution.title, **row, "seconds": time.perf_counter() - start}
@@ -68,38 +89,14 @@ def _solved(dataset, truth, problems, write=lambda solution: None):
             doubts += solution.doubts
             write(solution)
         start = time.perf_counter()
-    return {"dataset": dataset.name, "poses": len(dataset.ticks), "kernel": dataset.vehicle.kernel,
-            "doubts": [asdict(doubt) for doubt in merged(doubts)],
-            "notes": list(all_notes(dataset, truth)), "problems": rows}
+    return rows, doubts
 
 
-@contextmanager
-def process(function, *arguments):
-    """Context in which another process (multiprocessing.Process) runs a function, and then ends."""
-    child = get_context("fork" if sys.platform == "linux" else "spawn").Process(
-        target=function, args=arguments)
-    child.start()
-    try:
-        yield child
-    finally:
-        child.kill()
-        child.join()
-
-
-def print_tables(folders):
-    """Print the `summary_table` of datasets in folders (list of Path), the shortest first.
-
-    It is the function of a `process`, which Ctrl-C does not end. Nothing is written.
-    """
+def _send_rows(sender, *arguments):
+    """Send the rows of problems INDEPENDENT from a process that Ctrl-C does not end."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    over_a_bar = "\r\033[K" if sys.stderr.isatty() else ""
-    drives = [(read_dataset(folder), read_truth(folder)) for folder in folders]
-    for dataset, truth in sorted(drives, key=lambda drive: len(drive[0].ticks)):
-        try:
-            text = summary_table(_solved(dataset, truth, PROBLEMS))
-        except Exception as error:          # the notebooks report it in full
-            text = f"{dataset.name}: not solved before the notebooks: {error!r}"
-        print(over_a_bar + text, file=sys.stderr, flush=True)
+    with sender, suppress(BaseException):
+        sender.send(_rows(*arguments, True))
 
 
 def summary_table(summary):
@@ -136,7 +133,7 @@ def summarize(solution, truth):
                "last_sigma": evaluation.sigmas(solution.covariances[last]).tolist(),
                **solution.facts}
     if truth is not None:
-        true_poses = truth_in_world(solution, truth)
+        true_poses = solve.truth_in_world(solution, truth)
         summary["ate_m"] = evaluation.ate(solution.poses, true_poses)
         summary["ate_aligned_m"] = evaluation.ate(solution.poses, true_poses, aligned=True)
     return summary

@@ -13,19 +13,11 @@ class DatasetError(ValueError):
     """A dataset does not follow the format; the message names file, line and expectation."""
 
 
-def error(source, message, line=None):
-    """DatasetError whose message begins with the source, a file or argument, and the line, if any.
-
-    `line` is a number, or a str such as "row 3" where the rows of a source are not lines.
-    """
-    place = line if isinstance(line, str) else f"line {line}"
-    return DatasetError(f"{source}{'' if line is None else f', {place}'}: {message}")
-
-
-def require(ok, source, expected, found):
-    """Raise DatasetError about an argument or a folder that is not as expected."""
+def require(ok, source, expected, found=None):
+    """Raise DatasetError about a source, a file with its line or an argument, unless it is `ok`."""
     if not ok:
-        raise DatasetError(f"{source}: expected {expected}, found {quoted(found)}")
+        told = "" if found is None else f", found {quoted(found)}"
+        raise DatasetError(f"{source}: expected {expected}{told}")
 
 
 def require_type(value, kind, source):
@@ -36,15 +28,12 @@ def require_type(value, kind, source):
 
 def quoted(value):
     """The first 60 characters (str) of a value, in quotes."""
-    try:
-        text = str(value)
-    except ValueError:                         # Python writes no integers of thousands of digits
-        return "a far longer number"
+    text = str(value)
     return repr(text if len(text) <= 60 else text[:60] + "...")
 
 
 def read_toml(path, example, known):
-    """Entries of a TOML file without tables: a dict from key to (value, line number or None).
+    """Entries of a TOML file without tables: a dict from key to (value, file and line).
 
     Raises DatasetError, which quotes the `example` of an entry, if the file is not TOML, or has a
     key that is not among the `known` ones.
@@ -53,14 +42,13 @@ def read_toml(path, example, known):
     try:
         entries = tomllib.loads(text)
     except (ValueError, RecursionError) as failure:
-        raise error(path, f"expected TOML such as '{example}', found: {failure}") from None
+        raise DatasetError(f"{path}: expected TOML such as '{example}', found: {failure}") from None
     for key, value in entries.items():
         at_key = re.search(rf"""^[\s\["']*{re.escape(key)}(?![\w-])""", text, re.MULTILINE)
-        line = text.count("\n", 0, at_key.end()) + 1 if at_key else None
-        if key not in known:
-            nearest = ", ".join(get_close_matches(key, known, 3, cutoff=0))
-            raise error(path, f"expected an entry such as {nearest}, found {quoted(key)}", line)
-        entries[key] = value, line
+        line = f", line {text.count(chr(10), 0, at_key.end()) + 1}" if at_key else ""
+        nearest = ", ".join(get_close_matches(key, known, 3, cutoff=0))
+        require(key in known, f"{path}{line}", f"an entry such as {nearest}", key)
+        entries[key] = value, f"{path}{line}"
     return entries
 
 
@@ -74,8 +62,7 @@ def read_text(path):
         data = path.read_bytes() if path.is_file() else None
     except OSError:
         data = None
-    if data is None:
-        raise error(path, "expected a file that can be read")
+    require(data is not None, path, "a file that can be read")
     encoding = detect_encoding(data)             # by a byte order mark, or by where NUL bytes are
     text = data.decode(encoding, errors="replace").removeprefix("\ufeff")
     return text.replace("\r\n", "\n").replace("\r", "\n")

@@ -6,16 +6,12 @@ from numbers import Real
 
 import numpy as np
 
-from slamlib.dialects import Limit
-from slamlib.textfile import error, quoted, read_toml
+from slamlib.tables import Limit
+from slamlib.textfile import read_toml, require
 
 MAX_REVOLUTIONS = 10.0  # revolutions of a wheel in one step
 MODULI = 2**16, 2**15  # numbers of values of counters that wrap around
 MIN_MODULUS_RATIO = 32.0  # ratio of a modulus to a large step of the drive, for a decision
-MIN_REVOLUTIONS = 0.9  # revolutions that counts since the start span
-MAX_SMALL_STEP = 0.025  # of that span; larger changes from row to row are jumps of the counter
-MIN_SMALL_SHARE = 0.95  # of the changes
-RUN_ROWS = 10  # rows over which counts since the start mostly change with one sign
 # Robust kernels of sightings and ranges, as `slam.fit` has them; the first one is the default.
 KERNEL_NAMES = ("asymmetric Tukey", "asymmetric Cauchy", "quadratic", "Huber", "Cauchy",
                 "Geman-McClure", "Tukey")
@@ -103,54 +99,47 @@ def read_vehicle(path, default):
     """
     if path is None:
         return default
-    entries = read_toml(path, "wheelbase = 0.4", [*VEHICLE_LIMITS])
-    return changed(default, {key: value for key, (value, _) in entries.items()}, path,
-                   {key: line for key, (_, line) in entries.items()})
+    for key, (value, place) in read_toml(path, "wheelbase = 0.4", [*VEHICLE_LIMITS]).items():
+        default = changed(default, {key: value}, place)
+    return default
 
 
-def changed(vehicle, entries, source, lines=None):
+def changed(vehicle, entries, source):
     """The Vehicle with `entries`, values by the names of its fields.
 
-    Raises DatasetError for one that is not within its Limit, with the `source`, a file or a
-    function, and the line, if `lines` has it by name.
+    Raises DatasetError, which names the `source`, for one that is not within its Limit.
     """
     values = {}
     for key, value in entries.items():
         limit = VEHICLE_LIMITS[key]
-        if isinstance(limit, tuple):
-            ok = isinstance(value, type(limit[0])) and value in limit
-            expected = " or ".join(map(json.dumps, limit))
+        if isinstance(limit, Limit):
+            ok = isinstance(value, Real) and type(value) is not bool and limit.holds(value)
+            value, expected = float(value) if ok else value, f"a number {limit}"
         else:
-            ok = isinstance(value, Real) and not isinstance(value, bool) \
-                and limit.minimum <= value <= limit.maximum
-            expected = f"a number {limit}"
-        if not ok:
-            raise error(source, f"expected {expected} for {key}, found {quoted(value)}",
-                        (lines or {}).get(key))
-        values[key] = value if isinstance(limit, tuple) else float(value)
+            ok = type(value) is type(limit[0]) and value in limit
+            expected = " or ".join(map(json.dumps, limit))
+        require(ok, source, f"{expected} for {key}", value)
+        values[key] = value
     return replace(vehicle, **values)
 
 
 def incremental_counts(table, vehicle):
-    """Counts since the previous pose, (n, 2) int64, of the Table of the encoders, and its notes.
+    """The Table of the encoders, and its counts since the previous pose, (n, 2) int64.
 
     Those of a counter that wraps around are mended. Raises DatasetError if the first row is not 0,
-    a step exceeds MAX_REVOLUTIONS, or the counts are since the start.
+    or a step exceeds MAX_REVOLUTIONS.
     """
     read, limit = table.numbers[:, 1:], MAX_REVOLUTIONS * vehicle.ticks_per_revolution
     counts = unwrapped(read)
     if len(mended := np.flatnonzero((counts != read).any(axis=1))):
-        table = table.noted(f": {len(mended)} rows were mended whose counts are 2^15 or 2^16 off, "
-                            f"as of a counter that wraps around, first {table.place(mended[0])}")
-    if since_start(counts, vehicle):
-        raise error(table.source, "expected counts since the previous pose, found counts since the "
-                    f"start, which change gradually up to {abs(counts).max():.0f}: take the "
-                    "difference of each row from the one before")
-    ok = abs(counts) <= np.where(np.arange(len(counts)) == 0, 0, limit)[:, None]
-    table.kept(np.pad(ok, ((0, 0), (1, 0)), constant_values=True), (
-        f"at most {MAX_REVOLUTIONS:g} wheel revolutions ({limit:g} ticks) in one step, and none in "
-        "the first row"))
-    return counts.astype(np.int64), table.notes
+        table = table.noted(
+            f": {len(mended)} rows were mended whose counts are 2^15 or 2^16 off, as of a counter "
+            f"that wraps around, first line {table.lines[mended[0]]}")
+    step = abs(counts).max(axis=1)
+    table.kept(step <= np.where(np.arange(len(step)) == 0, 0, limit), (
+        f"at most {MAX_REVOLUTIONS:g} wheel revolutions ({limit:g} ticks) since the pose before, "
+        "not since the start, and none in the first row"))
+    return table, counts.astype(np.int64)
 
 
 def unwrapped(counts):
@@ -161,20 +150,3 @@ def unwrapped(counts):
         if 0 < MIN_MODULUS_RATIO * large < modulus:
             counts = np.where(abs(less) <= 2 * large, less, counts)
     return counts
-
-
-def since_start(counts, vehicle):
-    """True if counts (n, 2), right and left, are since the start.
-
-    They change gradually: small changes from row to row are most of all and reach over half of the
-    span, mostly with one sign over RUN_ROWS rows; those of increments are noise about a constant
-    speed. MIN_REVOLUTIONS are a short way, but no speed to which a wheel comes in so many steps.
-    """
-    change, span = np.diff(counts, axis=0), np.ptp(counts, axis=0).max()
-    if span < MIN_REVOLUTIONS * vehicle.ticks_per_revolution or len(change) < RUN_ROWS:
-        return False
-    small = abs(change) <= MAX_SMALL_STEP * span
-    total = np.cumsum(np.where(small, change, 0), axis=0)
-    size = abs(change[small]).sum()
-    over_run = abs(total[RUN_ROWS:] - total[:-RUN_ROWS]).sum() / RUN_ROWS
-    return bool(small.mean() >= MIN_SMALL_SHARE and size > span / 2 and over_run > size / 2)

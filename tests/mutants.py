@@ -41,7 +41,7 @@ MODULES = ("se2", "odometry", "evaluation", "results", "dataset", "increments", 
 FILES = [f"test_{name}.py" for name in (
     "se2", "odometry", "evaluation", "results", "dataset", "increments", "marker_increments",
     "localization", "fusion", "odometry_gate", "memory", "places", "doubts", "calibration",
-    "normal_equations", "slam", "uwb", "flaws")]
+    "normal_equations", "slam", "uwb", "library", "flaws")]
 ENOUGH = 20                            # seconds, of the tests of one mutant
 MEMORY = 8 << 30                       # bytes, of a mutant's process
 PATIENCE = 3                           # times as long as without a mutant, and START seconds
@@ -51,7 +51,7 @@ SWAPS = {ast.Add: ast.Sub, ast.Mult: ast.Div, ast.BitAnd: ast.BitOr, ast.And: as
 SWAPS |= {other: one for one, other in SWAPS.items()} | {ast.Pow: ast.Mult, ast.FloorDiv: ast.Mult}
 DROPPED = {"wrap", "unwrap", "swapaxes", "transpose", "abs", "sqrt"}
 SYMMETRIC = {"maximum", "minimum", "max", "min", "hypot", "union1d", "isclose", "allclose",
-             "isinstance", "getattr"}
+             "isinstance", "getattr", "array_equal"}
 
 
 def is_text(node):

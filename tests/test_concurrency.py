@@ -14,21 +14,24 @@ import pytest
 from conftest import is_running
 from test_report import build, make_data, write
 
-from slamlib import results, swap
+from slamlib import results, solve, swap
 from slamlib.__main__ import END_SIGNALS, main
 from slamlib.report import NotebookError
 from slamlib.simulation import simulate, write_dataset
-from slamlib.solve import RESULT_NAMES, problem_solution, write_solution
+from slamlib.solve import problem_solution, write_solution
 from slamlib.summary import solve_to_folder
 
 ROOT = Path(__file__).parents[1]
 RESULT = """import os, time
 from pathlib import Path
 import numpy as np
-from slamlib.results import write_vehicle_poses
-poses = np.zeros((2, 3)), np.zeros((2, 3, 3))
-write_vehicle_poses(Path(os.environ["SLAMLIB_RESULTS"], "short", "problem1"), *poses)
+from slamlib.results import write_structs
+poses = None, np.zeros((2, 3)), np.zeros((2, 3, 3))
+write_structs(Path(os.environ["SLAMLIB_RESULTS"], "short", "problem1"), "vehiclePose", *poses)
 """
+
+
+PROCESSES = 1 + (sys.platform == "linux")        # of solve
 
 
 def start(folder, *arguments, code=None, **options):
@@ -106,27 +109,17 @@ def test_a_lock_has_one_holder_at_a_time_although_its_file_is_removed(tmp_path):
     assert len(most) == 200 and max(most) == 1 and hidden(tmp_path) == []
 
 
-def publish(folder, **files):
-    """Replace a folder by one with these texts, by their names without `.txt`."""
-    with swap.staging(folder) as stage:
-        assert [*stage.iterdir()] == []
-        for name, text in files.items():
-            (stage / f"{name}.txt").write_text(text)
-        swap.publish({folder: stage}, ours=RESULT_NAMES)
-
-
-def texts(folder):
-    """Texts of all files in a folder, by name."""
-    return {name: (folder / name).read_text() for name in swap.file_names(folder)}
-
-
 @pytest.mark.parametrize("content", ["5", "[1, null, \"../a\"]", "no JSON"])
 def test_a_list_of_files_that_is_none_names_no_file(tmp_path, content):
-    swap.write_atomically(tmp_path / "out" / "mine.txt", b"mine")
-    (tmp_path / "out" / swap.FILE_LIST).write_text(content)
-    publish(tmp_path / "out", new="new")
-    assert texts(tmp_path) == {"out/mine.txt": "mine", "out/new.txt": "new",
-                               "out/.slamlib.json": '["new.txt"]'}
+    out = tmp_path / "out"
+    swap.write_atomically(out / "mine.txt", b"mine")
+    (out / swap.FILE_LIST).write_text(content)
+    with swap.staging(out) as stage:
+        assert [*stage.iterdir()] == []
+        (stage / "new.txt").write_text("new")
+        swap.publish({out: stage}, ours=solve.RESULT_NAMES)
+    assert {name: (out / name).read_text() for name in swap.file_names(out)} == {
+        "mine.txt": "mine", "new.txt": "new", ".slamlib.json": '["new.txt"]'}
 
 
 def test_a_dataset_with_fewer_sensors_leaves_no_problem_of_another(tmp_path, drive):
@@ -203,42 +196,35 @@ def test_what_cannot_be_put_in_its_place_is_told_before_anything_changes(
 
 
 @pytest.mark.slow
-def test_pages_and_results_that_a_build_no_longer_makes_are_removed(tmp_path):
+def test_a_build_that_fails_changes_nothing_and_the_next_removes_what_is_no_longer_made(
+        tmp_path, capsys):
+    """What the user put there stays, and what was executed before the failure is kept."""
     make_data(tmp_path)
-    write(tmp_path / "notebooks", "1_stays", "# Stays", (RESULT,))
-    write(tmp_path / "notebooks", "2_goes", "# Goes", (RESULT.replace("problem1", "other"),))
-    build(tmp_path, datasets=["short"])
-    mine = [tmp_path / "report" / "notes.html", tmp_path / "results" / "short" / "notes.txt",
-            tmp_path / "results" / "mine" / "vehiclePose.mat"]
-    for path in mine:
-        path.parent.mkdir(exist_ok=True)
-        path.write_text("mine")
-    assert (tmp_path / "results" / "short" / "other" / "vehiclePose.mat").exists()
-    (tmp_path / "notebooks" / "2_goes.ipynb").unlink()
-    build(tmp_path, datasets=["short"])
-    assert sorted(file.name for file in (tmp_path / "report").iterdir()) == [
-        swap.FILE_LIST, "1_stays.html", "index.html", "notes.html", "report.pdf"]
-    assert swap.file_names(tmp_path / "results") == [
-        "mine/vehiclePose.mat", "short/.slamlib.json", "short/notes.txt",
-        "short/problem1/vehiclePose.mat"]
-
-
-@pytest.mark.slow
-def test_a_notebook_that_fails_leaves_old_results_and_what_was_executed_is_kept(tmp_path, capsys):
-    make_data(tmp_path)
-    write(tmp_path / "notebooks", "1_bad", "# Bad", ("1 / 0",))  # one at a time, the last first
-    write(tmp_path / "notebooks", "2_good", "# Good", (RESULT,))
+    options = {"datasets": ["short"], "kept": tmp_path / "kept", "jobs": 1}
+    write(tmp_path / "notebooks", "1_goes", "# Goes", (RESULT.replace("problem1", "other"),))
+    write(tmp_path / "notebooks", "2_stays", "# Stays", (RESULT,))
+    build(tmp_path, **options)
+    for name in ("report/notes.html", "results/short/notes.txt", "results/mine/vehiclePose.mat"):
+        swap.write_atomically(tmp_path / name, b"mine")
+    before = [swap.file_names(tmp_path / name) for name in ("report", "results")]
+    assert "short/other/vehiclePose.mat" in before[1]
+    write(tmp_path / "notebooks", "1_goes", "# Goes", ("1 / 0",))  # one at a time, the last first
+    write(tmp_path / "notebooks", "2_stays", "# Stays", (RESULT + "1 + 1",))
     old = tmp_path / "results" / "short" / "problem1" / "vehiclePose.mat"
-    old.parent.mkdir(parents=True)
     old.write_text("old")
     with pytest.raises(NotebookError):
-        build(tmp_path, datasets=["short"], kept=tmp_path / "kept", jobs=1)
+        build(tmp_path, **options)
+    assert before == [swap.file_names(tmp_path / name) for name in ("report", "results")]
     assert old.read_text() == "old" and hidden(tmp_path) == []
-    write(tmp_path / "notebooks", "1_bad", "# Good now")
+    (tmp_path / "notebooks" / "1_goes.ipynb").unlink()
     capsys.readouterr()
-    build(tmp_path, datasets=["short"], kept=tmp_path / "kept", jobs=1)
-    assert "2_good: nothing changed" in capsys.readouterr().err
-    assert len(results.read_vehicle_poses(old.parent)[0]) == 2
+    build(tmp_path, **options)
+    assert "2_stays: nothing changed" in capsys.readouterr().err
+    assert len(results.read_structs(old.parent, "vehiclePose")[0]) == 2
+    assert [*map(swap.file_names, (tmp_path / "report", tmp_path / "results"))] == [
+        [swap.FILE_LIST, "2_stays.html", "index.html", "notes.html", "report.pdf"],
+        ["mine/vehiclePose.mat", "short/.slamlib.json", "short/notes.txt",
+         "short/problem1/vehiclePose.mat"]]
 
 
 @pytest.mark.slow
@@ -260,17 +246,18 @@ time.sleep(1000)""",))
 
 @pytest.mark.parametrize("number", END_SIGNALS)
 def test_a_signal_ends_a_solve_in_order(tmp_path, drive, number):
+    """Both of its processes, while each solves a problem."""
     write_dataset(tmp_path / "drive", drive)
-    process = start(tmp_path, "solve", "drive", "--out", "out", code="""import sys, time
+    process = start(tmp_path, "solve", "drive", "--out", "out", code="""import os, sys, time
 from pathlib import Path
 from slamlib import solve
 from slamlib.__main__ import main
 def find(*_):
-    Path("solves").touch()
+    Path(f"of {os.getpid()}").touch()
     time.sleep(1000)
 solve.find = find
 sys.exit(main())""")
-    wait_for((tmp_path / "solves").exists, process)
+    found = wait_for(lambda: len(of := [*tmp_path.glob("of *")]) == PROCESSES and of, process)
     process.send_signal(number)
     out, told = process.communicate(timeout=300)
     *lines, last = told.splitlines()
@@ -278,3 +265,22 @@ sys.exit(main())""")
     assert all(line.startswith("drive: ") for line in lines)
     assert process.returncode == 130 and not (tmp_path / "out").exists()
     assert hidden(tmp_path) == []
+    assert not any(is_running(int(file.name.split()[1])) for file in found)
+
+
+@pytest.mark.skipif(PROCESSES < 2, reason="elsewhere one process solves all problems")
+@pytest.mark.parametrize("fails", [
+    lambda *_: 1 / 0, lambda *_: os.kill(os.getpid(), signal.SIGKILL)])
+def test_a_process_takes_over_the_problems_of_one_that_fails(
+        tmp_path, drive, monkeypatch, capfd, fails):
+    expected = solve_to_folder(drive, None, tmp_path / "expected")
+    parent, find = os.getpid(), solve.find
+    monkeypatch.setattr(solve, "find", lambda *arguments: (
+        find if os.getpid() == parent else fails)(*arguments))
+    found = solve_to_folder(drive, None, tmp_path / "found")
+    for summary in (expected, found):
+        assert all(row.pop("seconds") >= 0 for row in summary["problems"].values())
+    assert found == expected and capfd.readouterr() == ("", "")
+    for name in swap.file_names(tmp_path / "expected"):
+        assert name.endswith(".json") or (tmp_path / "found" / name).read_bytes() \
+            == (tmp_path / "expected" / name).read_bytes()

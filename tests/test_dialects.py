@@ -1,12 +1,31 @@
-"""Tables as spreadsheets and MATLAB write them: the same numbers with a note, or one sentence."""
+"""Files as they come: the same numbers with a note, named as not read, or refused."""
+
+import re
+import shutil
 
 import numpy as np
 import pytest
 from scipy.io import savemat
-from test_dataset import FILES, assert_same_but_notes, error_of, folder, write  # noqa: F401
+from test_dataset import (  # noqa: F401
+    FILES,
+    assert_same,
+    assert_same_but_notes,
+    error_of,
+    folder,
+    write,
+)
 
-from slamlib.dataset import DatasetError, read_dataset, read_truth
+from slamlib.dataset import (
+    Dataset,
+    DatasetError,
+    Vehicle,
+    dataset_names,
+    inventory_lines,
+    read_dataset,
+    read_truth,
+)
 from slamlib.simulation import simulate, write_dataset
+from slamlib.tables import datasets_in
 from slamlib.textfile import quoted
 
 TABLES = ("encoderReading.txt", "ArucoReading.txt", "UwbReading.txt", "UwbAntennaGuess.txt")
@@ -71,44 +90,6 @@ def test_a_table_in_another_dialect_is_the_same_with_a_note(folder, dialect):  #
     assert bool(true.notes) == (note is not None and len(names) > 3)
 
 
-ROW = "1;40;0;0;0;1;0;0;1;0;1"
-IN_ORDER = "expected the columns in the order ("
-FOUR = "expected 4 numbers (pose id, antenna id, range, sigma), "
-REFUSED = [
-    ("encoderReading.txt", "1 0 0\n2 990 1,020", 2, "left ticks, a whole number from -1e+15 to "
-     "1e+15, found '1.02'"),
-    *[("UwbReading.txt", text, line, FOUR + f"found '{text.split(chr(10))[line - 1]}'")
-      for text, line in (("1,3,1,5,0,1", 1), ("1;3;1,5;0.1", 1), ("1,3,1.5,0.1\n2 3 1.6 0.1", 2),
-                         ("1,3,1.5,0.1\n2,3 1.6,0.1", 2), ("1,3,1.5,0.1\n2,3 4,1.6,0.1", 2),
-                         ("1;3;1.5;0.1\n2;3;1.6;0.1,2", 2), ("1a 3b 1.5c 0.1d\n1 3 1.5 0.1", 1))],
-    ("encoderReading.txt", "pose;right;left\n1;0;0\n2;;12", 3, "right ticks, a whole number from "
-     "-1e+15 to 1e+15, found 'nan'"),
-    ("encoderReading.txt", "pose right left\nid ticks ticks\n1 0 0", 2, "found 'id ticks ticks'"),
-    ("UwbAntennaGuess.txt", "900 1 2\n3 nan 5.5\n", 2, "x, a finite number from -1e+06 to 1e+06 m, "
-     "found 'nan'"),
-    ("UwbAntennaGuess.txt", "3 1 2 0.5\n900 1 2", 1, "expected 3 numbers (antenna id, x, y"),
-    ("encoderReading.txt", "pose, left ticks, right ticks\n1, 0, 0", 1, IN_ORDER + "pose id, right "
-     "ticks, left ticks), found the header 'pose, left ticks, right ticks'"),
-    ("UwbReading.txt", "id_beacon id_pose\n1 3 1 1", 1, IN_ORDER),
-    *[("encoderReading.txt", f"{header}\n1;0;0", 1, IN_ORDER)
-      for header in ("pose;tick_sx;tick_dx", "pose,nL,nR", "ticksLeft;ticksRight")],
-    *[("ArucoReading.txt", f"{header}\n" + ROW, 1, IN_ORDER)
-      for header in ("marker pose x y theta", "id_aruco,id_pose,x,y,d", "LandmarkId;PoseId")]]
-
-
-@pytest.mark.parametrize("name, text, line, said", REFUSED)
-def test_what_has_two_readings_or_none_is_refused(folder, name, text, line, said):  # noqa: F811
-    write(folder / name, text)
-    message = error_of(read_dataset, folder)
-    assert message.startswith(f"{folder / name}, line {line}: expected ") and said in message
-
-
-def test_a_header_alone_is_a_table_without_rows(folder):  # noqa: F811
-    write(folder / "UwbReading.txt", "pose id;antenna id;range;sigma\n;;;\n")
-    dataset = read_dataset(folder)
-    assert dataset.uwb is None and dataset.antenna_guess is not None
-
-
 @pytest.mark.parametrize("header", [
     "pose_id,marker_id,x,y,theta,s_xx,s_xy,s_xtheta,s_yy,s_ytheta,s_thetatheta",
     "Pose Marker x y heading cov_xx cov_xy cov_xt cov_yy cov_yt cov_tt", "id tag", "k j dx dy",
@@ -118,7 +99,11 @@ def test_headers_in_the_order_of_the_format_are_left_out(folder, header):  # noq
     write(folder / "ArucoReading.txt", header + "\n" + FILES["ArucoReading.txt"])
     found = read_dataset(folder)
     assert_same_but_notes(found, clean)
-    assert found.notes == (f"ArucoReading.txt: the header {quoted(header)} was left out.",)
+    note = f"ArucoReading.txt: the header {quoted(header)} was left out."
+    assert found.notes == (note,)
+    write(folder / "ArucoReading.txt", header + "\n;;;\n")
+    found = read_dataset(folder)
+    assert found.aruco is None and found.notes == (note,)
 
 
 @pytest.mark.parametrize("nan", ["nan", "NaN", "-nan"])
@@ -132,9 +117,8 @@ def test_rows_of_measurements_with_nan_or_without_reception_are_left_out(folder,
     assert_same_but_notes(found, clean)
     assert found.notes == (
         "ArucoReading.txt: 2 of 5 rows left out, the first in line 1: expected x, a number, found "
-        "'nan'.", "UwbReading.txt: 1 of 4 rows left out, the first in line 4: expected range, a "
-        "number, found 'nan'.", "UwbReading.txt: 1 of 3 rows left out, the first in line 5: "
-        "expected a range, which 0 (no reception) is not, found '1 3 0 0'.")
+        "'nan'.", "UwbReading.txt: 2 of 4 rows left out, the first in line 4: expected range, a "
+        "number (0 is no reception), found 'nan'.")
     write(folder / "UwbReading.txt", f"1 3 {nan} 1\n2 3 0 0\n")
     assert read_dataset(folder).uwb is None
 
@@ -152,7 +136,7 @@ BAD_ROWS = {  # a row that cannot be, and what is said of it
 
 
 @pytest.mark.parametrize("name, row, said", [
-    (name, row, said) for name, bad in BAD_ROWS.items() for row, said in bad])
+    (name, *bad) for name, rows in BAD_ROWS.items() for bad in rows])
 def test_a_bad_row_costs_a_row_up_to_a_tenth_of_the_file(tmp_path, name, row, said):
     write_dataset(tmp_path, simulate("short", 1)[0])
     clean, lines = read_dataset(tmp_path), (tmp_path / name).read_text().splitlines()
@@ -170,12 +154,6 @@ def test_a_bad_row_costs_a_row_up_to_a_tenth_of_the_file(tmp_path, name, row, sa
     assert message.startswith(f"{tmp_path / name}, line 3: expected {said}")
 
 
-def test_lines_are_counted_as_in_the_file_where_rows_were_left_out(folder):  # noqa: F811
-    write(folder / "UwbReading.txt", "pose;antenna\n\n1;3;nan;1\n1;3;2,5;1\n9;3;1,5;1\n")
-    assert "UwbReading.txt, line 5: expected pose id, a whole number from 1 to 4" in error_of(
-        read_dataset, folder)
-
-
 # Files of MATLAB.
 
 
@@ -183,43 +161,31 @@ def matrix(name):
     return np.array([line.split() for line in FILES[name].splitlines()], float)
 
 
-def test_tables_in_one_mat_file(folder):  # noqa: F811
+def test_tables_in_one_mat_file_where_the_text_is_missing(folder):  # noqa: F811
     clean = read_dataset(folder)
-    for name in TABLES:
-        (folder / name).unlink()
     values = {"ENCODERreading": matrix("encoderReading.txt").astype("int32"), "x": 1.0,
               **{name.removesuffix(".txt"): matrix(name) for name in SENSORS}}
-    savemat(folder / "drive.mat", values)
-    found = read_dataset(folder)
-    assert_same_but_notes(found, clean)
-    assert "Variable ENCODERreading of drive.mat was read as encoderReading.txt." in found.notes
-    savemat(folder / "other.mat", values)
-    with pytest.raises(DatasetError, match="other.mat: expected one variable ENCODERreading, found "
-                       "another in .*drive.mat, variable ENCODERreading$"):
-        read_dataset(folder)
-
-
-def test_rows_of_a_matrix_are_left_out_too(folder):  # noqa: F811
-    clean = read_dataset(folder)
-    table = np.vstack([matrix("UwbReading.txt"), [1, 3, np.nan, 1]])
-    savemat(folder / "logs.mat", {"UwbReading": table}, do_compression=True)
-    assert read_dataset(folder).notes == ("Not read: 'logs.mat'.",)
-    (folder / "UwbReading.txt").unlink()
+    values["UwbReading"] = np.vstack([values["UwbReading"], [1, 3, np.nan, 1]])
+    for name in ("drive.mat", "other.mat"):
+        savemat(folder / name, values, do_compression=True)
+    assert read_dataset(folder).notes == ("Not read: 'drive.mat', 'other.mat'.",)
+    for name in TABLES:
+        (folder / name).unlink()
     found = read_dataset(folder)
     assert_same_but_notes(found, clean)
     assert found.notes == (
-        "Variable UwbReading of logs.mat was read as UwbReading.txt.",
-        "logs.mat, variable UwbReading: 1 of 3 rows left out, the first in row 3: expected range, "
-        "a number, found 'nan'.")
+        *(f"Variable {variable} of drive.mat was read as {name}." for variable, name in zip(
+            ["ENCODERreading", *(name.removesuffix(".txt") for name in SENSORS)], TABLES)),
+        "Not read: 'other.mat'.",
+        "drive.mat, variable UwbReading: 1 of 3 rows left out, the first in row 3: expected range, "
+        "a number (0 is no reception), found 'nan'.")
 
 
 @pytest.mark.parametrize("value, said", [
     (np.array([[1, 3, 1.5, 0.1], [9, 3, 1.5, 0.1]]), ", row 2: expected pose id, a whole "
      "number from 1 to 4"),
-    (np.ones((2, 3)), ": expected a matrix of real numbers with 4 columns (pose id, antenna id, "
-     "range, sigma), found float64 of shape (2, 3)"),
-    (np.array([[1, "a"]], dtype=object), ": expected a matrix of real numbers"),
-    ("1 3 1 1", ": expected a matrix of real numbers")])
+    (np.array([[1, "a"]], dtype=object), ": expected a matrix of real numbers with 4 columns (pose "
+     "id, antenna id, range, sigma), found object of shape (1, 2)")])
 def test_faults_in_a_mat_file_are_named_by_variable_and_row(folder, value, said):  # noqa: F811
     (folder / "UwbReading.txt").unlink()
     savemat(folder / "logs.mat", {"UwbReading": value})
@@ -235,3 +201,149 @@ def test_a_mat_file_that_cannot_be_read_is_listed(folder, content):  # noqa: F81
     assert read_dataset(folder).notes == ("Not read: 'UwbReading.mat'.",)
     (folder / "encoderReading.txt").unlink()
     assert error_of(read_dataset, folder).endswith("found none. Not read: 'UwbReading.mat'")
+
+
+# Arrays in place of files.
+
+ARRAYS = {"ticks": matrix("encoderReading.txt")[:, 1:], **{
+    argument: matrix(name) for argument, name in zip(("aruco", "uwb", "guess"), SENSORS)}}
+
+
+def test_arrays_are_the_dataset_of_their_files(folder):  # noqa: F811
+    expected = read_dataset(folder)
+    for given in (ARRAYS, {name: value.tolist() for name, value in ARRAYS.items()}):
+        found = Dataset.from_arrays(**given, vehicle=expected.vehicle, name="drive")
+        assert_same(found, expected)
+    alone = Dataset.from_arrays(ARRAYS["ticks"])
+    assert (alone.aruco, alone.uwb, alone.antenna_guess) == (None, None, None)
+
+
+@pytest.mark.parametrize("name, place, value, told", [
+    ("ticks", None, [[0], [1]], ": expected a matrix of real numbers with 2 columns (right ticks, "
+     "left ticks), found float64 of shape (2, 1)"), ("ticks", None, [], ": expected at least"),
+    ("ticks", (3, 1), np.nan, ", row 4: expected left ticks, a number"),
+    ("aruco", None, [[1], [1, 2]], ": expected a matrix of real numbers with 11 columns (pose id"),
+    ("aruco", (2, 0), 5, ", row 3: expected pose id, a whole number from 1 to 4"),
+    ("aruco", (2, 2), np.nan, ", row 3: expected x, a number, found 'nan'"),
+    ("aruco", (2, 6), 1.0, ", row 3: expected a positive definite covariance"),
+    ("uwb", (0, 3), -0.1, ", row 1: expected sigma, a finite number from 1e-09"),
+    ("uwb", (1, 2), 0, ", row 2: expected range, a number (0 is no reception)"),
+    ("uwb", (1, 1), 4, ", row 2: expected an antenna id that the guesses have"),
+    ("guess", (1, 0), 900, ", row 2: expected each id only once"),
+    ("vehicle", None, "tractor", ": expected an argument of type Vehicle, found 'tractor'"),
+    ("vehicle", None, Vehicle(sigma_wheelbase=-1.0), ": expected a number from 1e-09 to 20 m for "
+     "sigma_wheelbase, found '-1.0'"),
+    ("vehicle", None, Vehicle(kernel="L2"), ': expected "asymmetric Tukey" or')])
+def test_arguments_pass_the_checks_of_files_or_are_named_with_the_row(name, place, value, told):
+    if place:
+        value, number = ARRAYS[name].copy(), value
+        value[place] = number
+    with pytest.raises(DatasetError, match="^" + re.escape(name + told)):
+        Dataset.from_arrays(**ARRAYS | {name: value})
+
+
+# Which file of a folder is which.
+
+
+@pytest.mark.parametrize("name, variant", [
+    *[("ArucoReading.txt", variant) for variant in (
+        "ArucoReading.txt.txt", "ArucoReading (1).txt", "ArucoReading(2).txt", "ArucoReading",
+        "ArucoReading - Copy.txt", "ArucoReading - Copy (2).txt", "ArucoReading.csv",
+        "ArucoReading.tsv", "ArucoReading.dat", "arucoreading.CSV.TXT")],
+    ("encoderReading.txt", "encoderReading.csv"), ("UwbReading.txt", "UwbReading"),
+    ("UwbAntennaGuess.txt", "UwbAntennaGuess.txt.txt"), ("vehicle.toml", "vehicle.toml.txt"),
+    ("vehicle.toml", "vehicle (1).toml"), ("vehicle.toml", "vehicle - Copy.toml")])
+def test_a_name_that_is_unmistakable_is_read_with_a_note(folder, name, variant):  # noqa: F811
+    clean, truth = read_dataset(folder), read_truth(folder)
+    (folder / name).rename(folder / variant)
+    dataset = read_dataset(folder)
+    assert_same_but_notes(dataset, clean)
+    assert_same(read_truth(folder), truth)
+    assert dataset.notes == (f"{variant} was read as {name}.",)
+    assert dataset_names(folder.parent) == ["drive"]
+
+
+@pytest.mark.parametrize("change", [str.upper, str.lower])
+def test_names_in_another_case_are_found_in_the_folder_truth_too(folder, change):  # noqa: F811
+    clean, truth = read_dataset(folder), read_truth(folder)
+    for name in FILES:
+        path = folder / name
+        path.rename(path.with_name(change(path.name)))
+    (folder / "truth").rename(truths := folder / change("truth"))
+    assert_same((read_dataset(folder), read_truth(folder)), (clean, truth))
+    (truths / change("ArucoMap.txt")).rename(truths / "ArucoMap (1).txt")
+    write(truths / "sketch.png", b"\x89")
+    found = read_truth(folder)
+    assert_same_but_notes(found, truth)
+    assert found.notes == ("In truth: ArucoMap (1).txt was read as ArucoMap.txt.",
+                           "In truth: Not read: 'sketch.png'.")
+
+
+def test_two_files_of_one_name_are_refused(folder):  # noqa: F811
+    shutil.copy(folder / "ArucoReading.txt", folder / "ArucoReading (1).txt")
+    assert error_of(read_dataset, folder) == error_of(dataset_names, folder.parent) == (
+        f"{folder / 'ArucoReading.txt'}: expected one file of this name, found ArucoReading (1).txt"
+        " and ArucoReading.txt: move one of them away")
+
+
+@pytest.mark.parametrize("name", [
+    "ArucoMeasurements.txt", "markers.csv", "ArucoReading_2.txt", "ArucoReading.txt.bak",
+    "ArucoReading.json", "ArucoReading.xlsx", "ArucoReading.pdf", "ArucoReading.txt.gz",
+    "ArucoReading.zip", "ArucoReading.txt.crdownload", ".ArucoReading.txt.icloud", "logs.zip"])
+def test_other_names_are_not_guessed_but_listed(folder, name):  # noqa: F811
+    clean = read_dataset(folder)
+    (folder / "ArucoReading.txt").rename(folder / name)
+    dataset = read_dataset(folder)
+    assert_same_but_notes(dataset, clean.without("aruco"))
+    assert dataset.notes == (f"Not read: '{name}'.",)
+    (folder / "encoderReading.txt").unlink()
+    assert error_of(read_dataset, folder) == (
+        f"{folder / 'encoderReading.txt'}: expected this file, found none. Not read: '{name}'")
+
+
+def test_other_files_are_named_and_those_of_systems_are_not(folder):  # noqa: F811
+    for name in (".DS_Store", "._ArucoReading.txt", "Thumbs.db", "desktop.ini", "README.md",
+                 "notes.txt", "photo.jpg", "uwb.pdf", "\u6d4b\n.txt"):
+        write(folder / name, b"\0")
+    (folder / "__MACOSX").mkdir()
+    (folder / "photos").mkdir()
+    assert read_dataset(folder).notes == (
+        "Not read: 'README.md', 'notes.txt', 'photo.jpg', 'photos', 'uwb.pdf' and 1 more.",)
+    (folder / "README.md").unlink()
+    assert read_dataset(folder).notes == (
+        "Not read: 'notes.txt', 'photo.jpg', 'photos', 'uwb.pdf', '\u6d4b\\n.txt'.",)
+
+
+def test_datasets_are_the_folders_with_any_file_of_one_and_all_others_are_named(tmp_path):
+    for name in ("b/encoderReading.txt", "a/ENCODERREADING.TXT", ".hidden/encoderReading.txt",
+                 "README.md"):
+        write(tmp_path / name, "1 0 0\n")
+    assert datasets_in(tmp_path) == (["a", "b"], [])
+    for name in ("notes.txt", "encoder.txt", "vehiclePose.mat", "drive.zip"):
+        write(tmp_path / "notes" / name, b"\0")
+    write(tmp_path / "course.zip", b"PK")
+    assert datasets_in(tmp_path)[1] == [f"{tmp_path}: Not read: 'course.zip', 'notes'."]
+    assert dataset_names(tmp_path) == ["a", "b"] and dataset_names(tmp_path, ["b"]) == ["b"]
+    for name in ("UwbReading.txt", "vehicle.toml.txt"):
+        write(tmp_path / f"{name}_alone" / name, "")
+    assert datasets_in(tmp_path)[0] == ["UwbReading.txt_alone", "a", "b", "vehicle.toml.txt_alone"]
+    absent = "encoderReading.txt: expected this file, found none"
+    for names, said in ((["c"], "expected one of UwbReading.txt_alone, a, b, .*, found 'c'"),
+                        (["notes"], f"notes.{absent}"), (None, f"UwbReading.txt_alone.{absent}")):
+        with pytest.raises(DatasetError, match=said):
+            dataset_names(tmp_path, names)
+
+
+def test_what_was_found_is_said(folder):  # noqa: F811
+    wheels = "drive: encoders: 4 poses, 15 ticks right and 32019 left"
+    assert inventory_lines(read_dataset(folder), read_truth(folder)) == [
+        wheels, "drive: markers: 3 sightings of 2 markers at 2 poses",
+        "drive: ranges: 2 ranges to 2 antennas at 2 poses",
+        "drive: vehicle.toml: wheelbase = 0.5", "drive: truth: yes"]
+    for name in ("ArucoReading.txt", "vehicle.toml"):
+        (folder / name).unlink()
+    write(folder / "UwbReading.txt", "# none\n")
+    assert inventory_lines(read_dataset(folder), None) == [
+        wheels, "drive: markers: none, no ArucoReading.txt with rows",
+        "drive: ranges: none, no UwbReading.txt with rows",
+        "drive: vehicle.toml: none, or as the assignment's table 2", "drive: truth: no"]

@@ -1,4 +1,4 @@
-"""As a library: arrays in, one setting of kernel and gate, and GTSAM factors of one's own."""
+"""As a library: one setting of kernel and gate, and GTSAM factors of one's own."""
 
 from dataclasses import replace
 
@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import A, C, L, X
 from numeric import known_noise
-from test_dataset import assert_same
 
 from slamlib import localization, se2, slam
 from slamlib.checks.solution import solution_doubts
-from slamlib.dataset import Dataset, DatasetError, Vehicle, all_notes, read_dataset
+from slamlib.dataset import DatasetError, Vehicle, all_notes, read_dataset
 from slamlib.evaluation import anees, ate
 from slamlib.simulation import simulate, write_dataset
 from slamlib.slam.fit import KERNELS
@@ -28,70 +27,12 @@ def drive():
     return simulate("short", seed=3)
 
 
-def arrays(folder):
-    """The arguments of `Dataset.from_arrays` by the files of a folder."""
-    files = {"ticks": "encoderReading", "aruco": "ArucoReading", "uwb": "UwbReading",
-             "guess": "UwbAntennaGuess"}
-    found = {name: np.loadtxt(folder / f"{file}.txt") for name, file in files.items()}
-    return found | {"ticks": found["ticks"][:, 1:].astype(int)}
-
-
-def test_arrays_are_the_dataset_of_their_files(drive, tmp_path):
-    write_dataset(tmp_path / "drive", *drive)
-    given, expected = arrays(tmp_path / "drive"), read_dataset(tmp_path / "drive")
-    found = Dataset.from_arrays(**given, vehicle=expected.vehicle, name="drive")
-    assert_same(found, expected)
-    lists = {key: value.tolist() for key, value in given.items()}
-    assert_same(Dataset.from_arrays(**lists, vehicle=expected.vehicle, name="drive"), expected)
-    alone = Dataset.from_arrays(given["ticks"])
-    assert (alone.aruco, alone.uwb, alone.antenna_guess) == (None, None, None)
-
-
 @pytest.mark.parametrize("function", [
     slam.as_gtsam, localization.fuse, localization.fuse_increments, localization.localize])
 def test_what_is_of_another_type_is_told(function):
     """`slam.estimate`'s arguments are in test_slam."""
     with pytest.raises(DatasetError, match=f"{function.__name__}: expected a.*, found 'drive'"):
         function("drive")
-
-
-def changed_at(place, value):
-    """A function that returns an array with another value at a place."""
-    def changed(array):
-        array = array.astype(float)
-        array[place] = value
-        return array
-    return changed
-
-
-@pytest.mark.parametrize("change, told", [
-    ({"ticks": lambda a: a[:, :1]}, "ticks: expected a matrix of real numbers with 2 columns "
-     "(right ticks, left ticks), found float64 of shape (2000, 1)"),
-    ({"ticks": changed_at((7, 1), np.nan)}, "ticks, row 8: expected left ticks, a whole number"),
-    ({"ticks": lambda a: a[:0]}, "ticks: expected at least"),
-    ({"aruco": lambda a: a[:, 1:]}, "aruco: expected a matrix of real numbers with 11 columns "
-     "(pose id, marker id, x"),
-    ({"aruco": lambda a: [[1], [1, 2]]}, "aruco: expected a matrix of real numbers"),
-    ({"aruco": changed_at((3, 0), 2001)}, "aruco, row 4: expected pose id, a whole number"),
-    ({"aruco": changed_at((3, 2), np.nan)}, "aruco, row 4: expected x, a number, found 'nan'"),
-    ({"aruco": changed_at((3, 6), 1.0)}, "aruco, row 4: expected a positive definite covariance"),
-    ({"uwb": changed_at((0, 3), -0.1)}, "uwb, row 1: expected sigma, a finite number from 1e-09"),
-    ({"uwb": changed_at((5, 2), 0)}, "uwb, row 6: expected a range, which 0 (no reception) is not"),
-    ({"guess": lambda a: None}, "uwb, row 1: expected an antenna id that the guesses have"),
-    ({"guess": lambda a: np.r_[a, a]}, "guess, row 5: expected each id only once"),
-    ({"vehicle": lambda _: "tractor"}, "vehicle: expected a Vehicle, found 'tractor'"),
-    ({"vehicle": lambda _: Vehicle(sigma_wheelbase=-1.0)}, "vehicle: expected a number from 1e-09 "
-     "to 20 m for sigma_wheelbase, found '-1.0'"),
-    ({"vehicle": lambda _: Vehicle(kernel="L2")}, 'vehicle: expected "asymmetric Tukey" or'),
-])
-def test_arguments_pass_the_checks_of_files_or_are_named_with_the_row(
-        drive, tmp_path, change, told):
-    write_dataset(tmp_path / "drive", *drive)
-    given = arrays(tmp_path / "drive") | {"vehicle": drive[0].vehicle}
-    (name, function), = change.items()
-    with pytest.raises(DatasetError) as caught:
-        Dataset.from_arrays(**given | {name: function(given[name])})
-    assert str(caught.value).startswith(told) and "\n" not in str(caught.value)
 
 
 def test_a_result_is_shown_in_five_lines(drive):

@@ -13,12 +13,14 @@ from slamlib.simulation import simulate
 from slamlib.studies import montecarlo
 
 
-def test_perfect_sightings_give_the_exact_poses_and_map():
+def test_perfect_data_give_the_exact_poses_map_and_wheels():
     dataset, truth = simulate("short", seed=1, noise=False)
+    for fused in (fuse(dataset, slip=1e-3), fuse(dataset)):
+        np.testing.assert_allclose(fused.poses, truth.poses, atol=1e-9)
+        np.testing.assert_allclose(fused.wheel, [0.1, 0.1, 0.4], atol=1e-9)
     found = localize(dataset.aruco)
-    error = found.poses - truth.poses[found.frame]
-    np.testing.assert_allclose(error[:, :2], 0, atol=1e-9)
-    np.testing.assert_allclose(se2.wrap(error[:, 2]), 0, atol=1e-9)
+    error = se2.difference(found.poses, truth.poses[found.frame])
+    np.testing.assert_allclose(error, 0, atol=1e-9)
     true_map = truth.marker_in_world[np.searchsorted(truth.marker, found.marker)]
     np.testing.assert_allclose(found.marker_in_world, true_map, atol=1e-9)
 
@@ -71,25 +73,6 @@ def test_covariances_are_those_of_all_sightings_through_numerical_derivatives():
     scale = np.abs(expected_poses).max()
     np.testing.assert_allclose(found.covariances, expected_poses, atol=1e-5 * scale)
     np.testing.assert_allclose(found.marker_covariance, expected_map, atol=1e-5 * scale)
-
-
-def test_nothing_known_until_a_known_marker_returns():
-    """Two parts of the path have no common marker; then the markers of the first part return."""
-    dataset, truth = simulate("short", seed=1, noise=False)
-    a = dataset.aruco
-    early = np.unique(a.marker[a.pose < 400])
-    keep = (a.pose < 400) | (a.pose > 1500) | ~np.isin(a.marker, early)
-    keep &= (a.pose < 400) | (a.pose > 500)
-    found = localize(a.select(keep))
-    known = np.isfinite(found.poses[:, 0])
-    back = found.frame[np.flatnonzero(~known)[-1] + 1]
-    seen_again = np.unique(a.pose[keep & (a.pose > 1500) & np.isin(a.marker, early)])
-    assert back in seen_again[:2]                   # the second, if the first is not confirmed yet
-    assert (found.frame[~known] > 400).all() and (~known).sum() > 20
-    assert known[found.frame >= back].all()
-    expected = truth.poses[found.frame[known], :2]
-    np.testing.assert_allclose(found.poses[known, :2], expected, atol=1e-9)
-    assert np.isnan(found.covariances[~known]).all()
 
 
 OPTIONS = [{"mislabelled": 0.03}, {"slip": 3e-3}]
@@ -156,22 +139,6 @@ def test_methods_that_do_not_count_shared_errors_are_inconsistent(options):
         assert rms(runs[f"{hint} ate"]) > 0.9 * rms(runs["odometry ate"])
 
 
-def test_a_wrong_first_sighting_moves_the_world_frame():
-    """Pose 1 sees one marker with a wrong label: the world frame is that of the next frame."""
-    dataset, truth = simulate("short", seed=4, noise=False)
-    a = dataset.aruco
-    first = np.flatnonzero(a.pose == 0)
-    keep = ~np.isin(np.arange(len(a.pose)), first[1:])
-    marker = a.marker.copy()
-    marker[first[0]] = 9999
-    found = localize(replace(a, marker=marker).select(keep))
-    assert np.isnan(found.poses[0]).all() and np.isfinite(found.poses[1:]).all()
-    np.testing.assert_array_equal(found.poses[1], 0)
-    expected = se2.between(truth.poses[found.frame[1]], truth.poses[found.frame[1:]])
-    np.testing.assert_allclose(found.poses[1:, :2], expected[:, :2], atol=1e-9)
-    assert found.unused[first[0]] and not found.rejected.any()
-
-
 def seen_in(*frames):
     """Exact ArucoReadings of a straight drive that sees these markers (numbers) in its frames."""
     pose, marker = np.array([(10 * f, m) for f, markers in enumerate(frames) for m in markers]).T
@@ -185,11 +152,20 @@ def seen_in(*frames):
     ([[1, 2], [1, 2], [3], [1]], [True, True, False, False]),
     ([[1, 2], [1, 2], [3], [1], [1]], 2 * [True] + [False] + 2 * [True]),
     ([[1, 2], [2], [3], [1], [1]], 2 * [True] + 3 * [False]),
-    ([[1, 2], [2], [3], [1, 2]], 2 * [True] + [False, True])])
-def test_one_marker_relocalizes_only_if_adjacent_frames_confirm_both_sightings(frames, known):
-    found = localize(seen_in(*frames))
+    ([[1, 2], [2], [3], [1, 2]], 2 * [True] + [False, True]),
+    ([[1, 2], [1, 2], [3, 4], [3, 4], [3, 4], [2, 1], [1]], 2 * [True] + 3 * [False] + 2 * [True]),
+    ([[9], [1, 2], [1, 2]], [False, True, True])])
+def test_frames_are_known_by_two_markers_or_one_that_adjacent_frames_confirm(frames, known):
+    """In the frame of the first one that is tied to the next; of others nothing is known.
+
+    A known marker that returns relocalizes only if adjacent frames confirm both sightings.
+    """
+    found, known = localize(seen_in(*frames)), np.array(known)
     np.testing.assert_array_equal(np.isfinite(found.poses[:, 0]), known)
-    np.testing.assert_allclose(found.poses[known, 0], 0.1 * np.flatnonzero(known), atol=1e-12)
+    np.testing.assert_array_equal(np.isfinite(found.covariances[:, 0, 0]), known)
+    np.testing.assert_allclose(
+        found.poses[known, 0], 0.1 * (np.flatnonzero(known) - known.argmax()), atol=1e-12)
+    assert not found.rejected.any() and (found.unused[0] or frames[0] != [9])
 
 
 def test_the_map_has_markers_that_are_confirmed_and_seen_from_known_poses():

@@ -15,7 +15,7 @@ from slamlib import se2, slam, solve
 from slamlib.__main__ import main
 from slamlib.dataset import read_dataset
 from slamlib.odometry import equation2
-from slamlib.results import read_vehicle_poses
+from slamlib.results import read_structs
 from slamlib.simulation import simulate, write_dataset
 from slamlib.swap import file_names
 
@@ -43,28 +43,26 @@ def solved(folder, *options, code=0):
 
 @pytest.mark.slow
 def test_simulate_then_solve(tmp_path):
-    made = run("simulate", "drive", "--path", "short", "--seed", 21, "--nlos", 0.15, cwd=tmp_path)
+    """In processes of their own; a path is driven twice."""
+    made = run("simulate", "drive", "--path", "short", "--seed", 21, "--nlos", 0.15, "--rounds", 2,
+               cwd=tmp_path)
     assert (made.returncode, made.stdout, made.stderr) == (0, "", "")
-    done = run("solve", "drive", "--out", "out", "--problem", 1, "--problem", 2, cwd=tmp_path)
+    done = run("solve", "drive", "--out", "out", "--problem", 1, cwd=tmp_path)
     assert done.returncode == 0
     assert [line.split(":")[1] for line in done.stderr.splitlines()] == [
         " encoders", " markers", " ranges", " vehicle.toml", " truth"]
     lines = done.stdout.splitlines()
-    assert lines[0] == "drive: 2000 poses" and lines[2].startswith("problem1 ")
+    assert lines[0] == "drive: 4000 poses" and lines[2].startswith("problem1 ")
     assert max(map(len, lines)) <= 100
-    dataset = read_dataset(tmp_path / "drive")
-    for got, expected in zip(read_vehicle_poses(tmp_path / "out" / "problem1"),
-                             equation2(dataset.ticks, dataset.vehicle), strict=True):
+    dataset, expected = read_dataset(tmp_path / "drive"), simulate("short", 21, rounds=2)[0]
+    np.testing.assert_array_equal(dataset.ticks, expected.ticks)
+    _, *found = read_structs(tmp_path / "out" / "problem1", "vehiclePose")
+    for got, expected in zip(found, equation2(dataset.ticks, dataset.vehicle), strict=True):
         np.testing.assert_array_equal(got, expected)
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["dataset"] == "drive" and 0 < summary["problems"]["problem1"]["ate_m"] < 1
-
-
-def test_simulated_paths_are_driven_several_times(tmp_path):
-    assert main(["simulate", str(tmp_path / "drive"), "--rounds", "3", "--seed", "5"]) == 0
-    found, (expected, _) = read_dataset(tmp_path / "drive"), simulate("short", 5, rounds=3)
-    assert len(found.ticks) == 6000
-    np.testing.assert_array_equal(found.ticks, expected.ticks)
+    done = run("solve", "nowhere", "--out", "out", cwd=tmp_path)
+    assert done.returncode == 2 and done.stdout == "" and done.stderr.count("\n") == 1
 
 
 def test_options_of_solve_are_heeded_and_said(tmp_path, capsys, drive):
@@ -77,7 +75,7 @@ def test_options_of_solve_are_heeded_and_said(tmp_path, capsys, drive):
     assert summary["kernel"] == "Huber" and [*summary["problems"]] == ["problem1", "problem4"]
     assert summary["problems"]["problem4"]["slip_sqrt_m"] == 2e-3
     expected = slam.estimate(read_dataset(tmp_path / "drive"), slip=2e-3, kernel="Huber")
-    np.testing.assert_array_equal(read_vehicle_poses(out / "problem4")[0], expected.poses)
+    np.testing.assert_array_equal(read_structs(out / "problem4", "vehiclePose")[1], expected.poses)
     assert {path.with_suffix(".csv") for path in out.rglob("*.mat")} == {*out.rglob("*.csv")}
     assert {path.name for path in out.rglob("*.tum")} == {"problem1.tum", "problem4.tum"}
     assert picture.read_bytes().startswith(b"\x89PNG")
@@ -128,13 +126,13 @@ SOLVE = ["solve", "good", "--out", "out"]
     (["simulate", "drive", "--seed", "-1"], "a seed from 0 on"),
     (["simulate", "drive", "--rounds", "0"], "rounds from 1 on"),
     (["simulate", "drive", "--path", "round"], "invalid choice: 'round'"),
-    (["simulate"], "FOLDER"),
+    (["simulate"], "folder"),
     (["solve", "good"], "--out"),
     ([*SOLVE, "--problem", "5"], "invalid choice: '5'"),
     ([*SOLVE, "--problem", "3"], "expected the measurements of problem3"),
     ([*SOLVE, "--kernel", "L2"], "for kernel, found 'L2'"),
     ([*SOLVE, "--slip", "1"], "from 0 to 0.1 sqrt(m) for slip, found '1.0'"),
-    ([*SOLVE, "--plot", "a.gif"], "a.gif: expected a picture .png"),
+    ([*SOLVE, "--plot", "a.gif"], "--plot: expected a .png, .pdf or .svg file, found 'a.gif'"),
     ([*SOLVE, "more\nthan one"], "more than one"),
     (["simulate", ".", "--seed", "1"], "new or empty folder"),
     (["report", "--notebooks", ROOT / "notebooks", "--data", "nowhere"], "nowhere"),
@@ -160,12 +158,7 @@ def test_bad_arguments_give_exit_code_2_and_one_sentence(tmp_path, monkeypatch, 
     assert file_names(tmp_path) == before
 
 
-def test_a_command_in_a_process_of_its_own_ends_in_one_sentence_too(tmp_path):
-    done = run("solve", "nowhere", "--out", "out", cwd=tmp_path)
-    assert done.returncode == 2 and done.stdout == "" and done.stderr.count("\n") == 1
-
-
-def test_doubts_are_in_the_summary_and_below_the_table(tmp_path, capsys, drive):
+def test_notes_and_doubts_are_said_and_in_the_summary(tmp_path, capsys, drive):
     """About the drive first, then by problem; an antenna of two ranges; truth in another frame."""
     dataset, truth = drive
     first = dataset.uwb.antenna[0]
@@ -174,7 +167,10 @@ def test_doubts_are_in_the_summary_and_below_the_table(tmp_path, capsys, drive):
     truth = replace(truth, poses=se2.compose([1, 2, 0.5], truth.poses), **{
         name: getattr(truth, name)[:0]
         for name in ("marker", "marker_in_world", "antenna", "antenna_in_world")})
-    write_dataset(tmp_path / "drive", dataset, truth)
+    folder = tmp_path / "drive"
+    write_dataset(folder, dataset, truth)
+    (folder / "ArucoReading.txt").rename(folder / "ArucoReading.txt.txt")
+    (folder / "truth" / "ArucoMap.txt").rename(folder / "truth" / "ArucoMap.csv")
     summary = solved(tmp_path)
     frame, antenna = summary["doubts"]
     assert set(frame) == set(antenna) == {"what", "sentence"}
@@ -183,9 +179,12 @@ def test_doubts_are_in_the_summary_and_below_the_table(tmp_path, capsys, drive):
     assert antenna["sentence"].startswith(f"Antenna {first} is in doubt: only 2 of its 2 ranges")
     assert list(summary["problems"]["problem4"]["antennas_in_doubt"]) == [str(first)]
     assert summary["problems"]["problem3"]["ate_m"] < 0.05          # in the frame of the estimate
-    told = capsys.readouterr().out.splitlines()
-    assert told[-2:] == [f"doubt ({doubt['what']}): {doubt['sentence']}" for doubt in (
-        frame, antenna)]
+    told = capsys.readouterr()
+    assert told.out.splitlines()[-2:] == [
+        f"doubt ({doubt['what']}): {doubt['sentence']}" for doubt in (frame, antenna)]
+    assert summary["notes"] == ["ArucoReading.txt.txt was read as ArucoReading.txt.",
+                                "In truth: ArucoMap.csv was read as ArucoMap.txt."]
+    assert told.err.splitlines()[-2:] == [f"drive: note: {note}" for note in summary["notes"]]
 
 
 def test_a_problem_that_fails_costs_the_others_nothing(tmp_path, capsys, drive):
@@ -200,19 +199,3 @@ def test_a_problem_that_fails_costs_the_others_nothing(tmp_path, capsys, drive):
         f"slamlib: drive: problem2 could not be solved: {problems[failed]['failed']}")
     assert problems[failed]["failed"].startswith("expected sightings")
     assert "problem2       could not be solved" in told.out
-
-
-def test_what_was_found_and_mended_is_said_first_and_kept_in_the_summary(tmp_path, capsys, drive):
-    folder = tmp_path / "drive"
-    write_dataset(folder, *drive)
-    (folder / "ArucoReading.txt").rename(folder / "ArucoReading.txt.txt")
-    (folder / "UwbReading.txt").unlink()
-    (folder / "truth" / "ArucoMap.txt").rename(folder / "truth" / "ArucoMap.csv")
-    summary = solved(tmp_path, "--problem", 1)
-    *found, first, second = capsys.readouterr().err.splitlines()
-    assert found[1].startswith("drive: markers: ") and "sightings of " in found[1]
-    assert found[2] == "drive: ranges: none, no UwbReading.txt with rows"
-    notes = ["ArucoReading.txt.txt was read as ArucoReading.txt.",
-             "In truth: ArucoMap.csv was read as ArucoMap.txt."]
-    assert [first, second] == [f"drive: note: {note}" for note in notes]
-    assert summary["notes"] == notes

@@ -1,8 +1,5 @@
-from functools import partial
-
 import numpy as np
 import pytest
-from numeric import central_differences
 
 from slamlib import se2
 from slamlib.dataset import ArucoReadings
@@ -13,6 +10,7 @@ from slamlib.sightings import Sightings, consensus, merge_repeated
 DELTA = np.array([0.12, -0.03, 0.2])
 MARKERS = np.array([[1.2, 0.4, 0.3], [-0.7, 1.1, -2.9], [0.2, -1.3, 3.1], [-1.0, -0.8, 1.0]])
 C = np.array([[4e-4, 5e-5, 1e-5], [5e-5, 2e-4, -4e-5], [1e-5, -4e-5, 1e-4]])
+POINT = np.diag([1e-4, 1e-4, 1e4])
 
 
 def sightings(delta=DELTA, markers=MARKERS, covariance=C, rng=None):
@@ -25,12 +23,14 @@ def sightings(delta=DELTA, markers=MARKERS, covariance=C, rng=None):
     return z, covariances, np.zeros(m, int), np.arange(m), np.arange(m, 2 * m)
 
 
-def test_exact_sightings_give_the_exact_increment():
-    for delta in (DELTA, np.zeros(3), np.array([0.5, 0.4, np.pi]), np.array([-1, 2, -3.1])):
-        for count in (1, 2, 4):
-            found = robust_increments(*sightings(delta, MARKERS[:count]), 1)
-            np.testing.assert_allclose(se2.wrap(found.increment[0] - delta), 0, atol=1e-11)
-            assert found.accepted.all() and found.usable.all()
+@pytest.mark.parametrize("delta", [
+    DELTA, np.zeros(3), [0.5, 0.4, np.pi], [-1, 2, -3.1], [2.0, -1.0, 2.5]])
+@pytest.mark.parametrize("count, covariance", [(1, C), (2, C), (4, C), (2, POINT), (3, POINT)])
+def test_exact_sightings_give_the_exact_increment(delta, count, covariance):
+    """One marker determines it, or two without heading."""
+    found = robust_increments(*sightings(delta, MARKERS[:count], covariance), 1)
+    np.testing.assert_allclose(se2.difference(found.increment[0], delta), 0, atol=1e-8)
+    assert found.accepted.all() and found.usable.all() and found.covariance[0, 2, 2] < 0.02**2
 
 
 def test_covariance_by_hand():
@@ -44,22 +44,6 @@ def test_covariance_by_hand():
     args = sightings(np.zeros(3), z, np.diag([s**2, s**2, t**2]))
     expected = np.diag([s**2, s**2, 1 / (d**2 / s**2 + 1 / t**2)])
     np.testing.assert_allclose(robust_increments(*args, 1).covariance[0], expected, atol=1e-18)
-
-
-def test_derivatives_by_the_sightings_against_central_differences():
-    rng = np.random.default_rng(4)
-    z, covariances, pair, first, second = sightings(rng=rng)
-    found = robust_increments(z, covariances, pair, first, second, 1)
-
-    def moved(k, change):
-        y = z.copy()
-        y[k] += change
-        return robust_increments(y, covariances, pair, first, second, 1).increment[0]
-
-    for p in range(len(first)):
-        for k, analytic in ((first[p], found.J_first[p]), (second[p], found.J_second[p])):
-            numeric = central_differences(partial(moved, k), np.zeros(3), 1e-5)
-            np.testing.assert_allclose(analytic, numeric, atol=0.03 * np.abs(numeric).max())
 
 
 def test_many_increments_are_consistent():
@@ -94,20 +78,11 @@ def test_wrong_labels_are_rejected(count, wrong, oriented):
         np.testing.assert_allclose(found.increment[0], DELTA, atol=0.1)
 
 
-def test_markers_without_heading_determine_an_increment_only_in_pairs():
-    covariance = np.diag([1e-4, 1e-4, 1e4])
-    two = robust_increments(*sightings(markers=MARKERS[:2], covariance=covariance), 1)
-    assert two.usable[0] and np.sqrt(two.covariance[0, 2, 2]) < 0.02
-    np.testing.assert_allclose(two.increment[0], DELTA, atol=1e-8)
-    far = robust_increments(*sightings(np.array([2.0, -1.0, 2.5]), MARKERS[:3], covariance), 1)
-    np.testing.assert_allclose(far.increment[0], [2.0, -1.0, 2.5], atol=1e-8)
-
-
 def test_what_determines_no_increment_is_not_usable():
     """One point; no common marker; two sightings that exclude each other, seven sigmas apart."""
     apart = np.array([[1.0, 0, 0], [-1.0, 0, 0], [1.07, 0, 0], [-1.07, 0, 0]])
     pairs, none = (np.zeros(2, int), np.arange(2), np.arange(2, 4)), 3 * [np.zeros(0, int)]
-    for arguments in (sightings(markers=MARKERS[:1], covariance=np.diag([1e-4, 1e-4, 1e4])),
+    for arguments in (sightings(markers=MARKERS[:1], covariance=POINT),
                       (*sightings()[:2], *none),
                       (apart, np.broadcast_to(1e-4 * np.eye(3), (4, 3, 3)), *pairs)):
         found = robust_increments(*arguments, 1)

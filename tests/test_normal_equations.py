@@ -177,6 +177,33 @@ def test_points_of_the_posterior_have_its_moments(scale):
                                np.outer(C[0], C[0]) / C[0, 0], rtol=0.02, atol=1e-12)
 
 
+@pytest.mark.parametrize("free", [[0, 1, 2], [0, 2]], ids=str)
+@pytest.mark.parametrize("skew, steps, calls", [
+    (0.0, 0.1, 1), (0.0, 1e-6, 1), (0.0, 5.0, 2), (0.5, 0.1, 5)])
+def test_newton_finds_the_mode_of_a_log_density_and_its_covariance(free, skew, steps, calls):
+    """A quadratic takes one step, if differences are over less than two standard deviations."""
+    C, values = np.diag([0.04, 0.01, 0.0025])[free][:, free], []
+    C[0, 1] = C[1, 0] = 0.5 * np.sqrt(C[0, 0] * C[1, 1])
+
+    def log_density(x):
+        off = (x - CENTRE)[free]
+        u = off[0] / np.sqrt(C[0, 0])
+        values.append(-off @ np.linalg.inv(C) @ off / 2
+                      + skew * (1 + u + u**2 / 2 - np.exp(u)))       # not at 0
+        return values[-1]
+
+    start = CENTRE + 3 * np.sqrt([0.04, 0.01, 0.0025]) * np.isin(range(3), free)
+    x, value, covariance = noise._mode(
+        log_density, start, log_density(start), np.array(free), np.full(len(free), steps))
+    assert np.abs((x - CENTRE)[free] / np.sqrt(np.diag(C))).max() < 0.1
+    assert value == log_density(x) == max(values)
+    expected = np.zeros((3, 3))
+    expected[np.ix_(free, free)] = C
+    np.testing.assert_allclose(covariance, expected, atol=1e-6 + 0.1 * skew * C.max())
+    pairs = len(free) * (len(free) - 1) // 2
+    assert len(values) - 2 == calls * (2 * len(free) + pairs + 1)
+
+
 def test_gates_are_quantiles_of_chi_squared():
     """They are numbers in the code because scipy.special takes long to import."""
     assert np.allclose([sightings.GATE, sightings.POINT_GATE], chdtri([3, 2], 1e-3), rtol=1e-12)

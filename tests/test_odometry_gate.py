@@ -18,11 +18,11 @@ from slamlib.odometry_gate import (
     UNKNOWN_SIGMA,
     Jumps,
     _compared,
-    _drive,
+    _Drive,
     find_jumps,
 )
 from slamlib.sightings import sightings_by_frame
-from slamlib.simulation import TABLE_2, simulate
+from slamlib.simulation import TABLE_2, manoeuvre, simulate
 
 MARKERS = np.array([[1.0, 0.0, 0.3], [0.5, 0.8, -2.0], [0.0, -1.0, 1.0]])
 
@@ -43,7 +43,7 @@ def test_the_score_of_two_sightings_by_hand():
     """A marker 1 m ahead seems 0.1 m nearer; turns of the vehicle do not move it along x."""
     dataset = seen(np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]), MARKERS[:1])
     s = sightings_by_frame(dataset.aruco)
-    first, second, squared = _compared(s, _drive(np.zeros((2, 3)), TABLE_2.wheelbase))
+    first, second, squared = _compared(s, _Drive.without_jumps(np.zeros((2, 3)), TABLE_2.wheelbase))
     assert (first, second) == (0, 1)
     np.testing.assert_allclose(squared, 0.1**2 / (2 * 1e-4 + FLOOR**2), rtol=1e-9)
 
@@ -60,6 +60,19 @@ def test_a_jump_of_a_vehicle_that_stands_is_found_where_it_is():
     np.testing.assert_allclose(found.by_odometry, 0)
     np.testing.assert_allclose(found.sigma, [[0.5, 0.5, 0.5], [0.6, 0.6, 0.1]], atol=1e-6)
     np.testing.assert_allclose(found.mended(np.arange(12), np.zeros((12, 3))), poses, atol=1e-6)
+
+
+def test_a_jump_is_where_most_contradicting_pairs_span_it():
+    """Rooms A, B, again A, B; carried from B to A. No marker is seen from two rooms."""
+    poses, markers = np.zeros((40, 3)), np.tile(MARKERS, (2, 1))
+    poses[20:] = [0.4, 0.3, 0.5]
+    dataset = seen(poses, markers)
+    a = dataset.aruco
+    in_room = a.pose // 10 % 2 == a.marker // 3
+    found = find_jumps(replace(dataset, aruco=replace(a, **{
+        name: getattr(a, name)[in_room] for name in (
+            "pose", "marker", "marker_in_vehicle", "covariance")})))
+    np.testing.assert_allclose(found.mended(np.arange(40), np.zeros((40, 3))), poses, atol=1e-6)
 
 
 def test_shares_of_a_jump_by_hand():
@@ -202,6 +215,20 @@ def test_no_jump_in_clean_drives(path, seeds, options):
         points = (as_points(a, slice(None)),) * ("mislabelled" not in options)
         for aruco in (a, replace(a, covariance=a.covariance / 16), late, *points):
             assert not len(find_jumps(replace(dataset, aruco=aruco)).start)
+
+
+def test_turns_on_the_spot_under_a_camera_that_looks_ahead_are_no_breaks():
+    """Within a frame or two all markers leave the image, and others come."""
+    ticks = manoeuvre(3 * [(2.0, 0.0), (0.0, 2 * np.pi / 3)])
+    poses, rng = dead_reckoning(ticks, TABLE_2), np.random.default_rng(3)
+    pose = np.arange(0, len(ticks), 30)
+    markers = np.c_[rng.uniform(-3, 5, (120, 2)), rng.uniform(-np.pi, np.pi, 120)]
+    z = se2.between(poses[pose, None], markers)
+    row, marker = np.nonzero(
+        (0.2 < z[..., 0]) & (z[..., 0] < 1.9) & (np.abs(z[..., 1]) < 0.4 + 0.4 * z[..., 0]))
+    aruco = ArucoReadings(pose[row], marker, z[row, marker], np.tile(
+        1e-4 * np.eye(3), (len(row), 1, 1)))
+    assert not len(find_jumps(Dataset("turns", TABLE_2, ticks, aruco, None, None)).start)
 
 
 def test_the_doubt_names_three_stretches_and_counts_the_others():

@@ -19,7 +19,7 @@ from slamlib.report.document import render
 from slamlib.report.execution import NotebookError
 from slamlib.report.notebooks import Options
 from slamlib.report.overview import title_picture
-from slamlib.results import write_vehicle_poses
+from slamlib.results import write_structs
 from slamlib.simulation import simulate, write_dataset
 from slamlib.solve import Failure, Solution, problem_solution, solutions, title, write_solution
 from slamlib.summary import summarize
@@ -143,7 +143,8 @@ def test_a_problem_that_is_not_known_appears_by_its_folder(tmp_path):
         dataset = read_dataset(tmp_path / "data" / name)
         write_solution(tmp_path / "results" / name, problem_solution("problem1", dataset))
         written.append(f"{name}/problem1/vehiclePose.mat")
-    write_vehicle_poses(tmp_path / "results" / "other" / "a", np.zeros((2, 3)), np.zeros((2, 3, 3)))
+    write_structs(tmp_path / "results" / "other" / "a", "vehiclePose", None, np.zeros((2, 3)),
+                  np.zeros((2, 3, 3)))
     drives = drives_of(tmp_path, ["other", "plain"], ["other/a/vehiclePose.mat", *written])
     summary = overview.opening(drives)
     rows, _ = result_rows(summary)
@@ -213,7 +214,7 @@ def test_the_opening_of_any_one_drive_fits_on_a_page(project, tmp_path, name):
 @pytest.mark.parametrize("content, reason", [(b"", "cannot be read"), (None, "must hold")])
 def test_poses_that_are_none_are_told_in_one_sentence(project, content, reason):
     broken = project.folder / "results" / "all" / "broken"
-    write_vehicle_poses(broken, np.zeros((7, 3)), np.zeros((7, 3, 3)))
+    write_structs(broken, "vehiclePose", None, np.zeros((7, 3)), np.zeros((7, 3, 3)))
     if content is not None:
         (broken / "vehiclePose.mat").write_bytes(content)
     with pytest.raises(NotebookError, match=f"all/broken, which a notebook wrote, {reason}"):

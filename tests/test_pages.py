@@ -17,7 +17,7 @@ from conftest import BROUGHT, STUDY_SEEDS, built_elsewhere, contradicted, copied
 from slamlib.dataset import read_dataset
 from slamlib.odometry import equation2
 from slamlib.report import build_report
-from slamlib.results import read_structs, read_vehicle_poses
+from slamlib.results import read_structs
 from slamlib.simulation import simulate, write_dataset
 from slamlib.solve import PROBLEMS
 
@@ -48,14 +48,15 @@ def test_results_are_those_of_the_library_and_of_problem_2_where_there_are_marke
     for data in filter(Path.is_dir, (folder / "data").iterdir()):
         dataset, results = read_dataset(data), folder / "results" / data.name
         expected = equation2(dataset.ticks, dataset.vehicle)
-        for got, wanted in zip(read_vehicle_poses(results / "problem1"), expected, strict=True):
+        _, *found = read_structs(results / "problem1", "vehiclePose")
+        for got, wanted in zip(found, expected, strict=True):
             np.testing.assert_array_equal(got, wanted)
         for problem in ("problem2", "problem2_fused"):
             assert (results / problem).exists() == (dataset.aruco is not None)
         if dataset.aruco is None:
             continue
-        alone, covariances = read_vehicle_poses(results / "problem2")
-        fused, _ = read_vehicle_poses(results / "problem2_fused")
+        alone, covariances = read_structs(results / "problem2", "vehiclePose")[1:]
+        fused, _ = read_structs(results / "problem2_fused", "vehiclePose")[1:]
         known = np.isfinite(alone[:, 0])
         assert np.isin(np.flatnonzero(known), dataset.aruco.pose).all() and known.any()
         assert (np.isfinite(covariances[:, 0, 0]) == known).all()

@@ -178,6 +178,8 @@ solved(start(), problem2=lambda drive: find("problem2", drive.dataset),
         told = capsys.readouterr().err.splitlines()
         reasons += [line for line in told if line.startswith("slamlib: ")]
         assert [line for line in told if line.startswith("bad: doubt (truth-frame): In truth/")]
+        table = told.index("good: 50 poses")
+        assert "ATE" in told[table + 1] and told[table + 2].startswith("problem2  ")
     assert len(reasons) == 2 and "nothing changed" in " ".join(told)
     assert reasons[1].startswith("slamlib: bad: problem2 could not be solved: expected sightings")
     files = [file.relative_to(tmp_path / "results").as_posix()

@@ -46,11 +46,8 @@ def test_structs_through_scipy_and_octave(tmp_path, name, fields, d):
     content = np.array([4, 17, 18, 10**12]), poses[:, :d], covariances[:, :d, :d]
     folder = tmp_path / "new" / "folder"
     if name == "vehiclePose":
-        content = np.arange(1, 5), poses, covariances
-        results.write_vehicle_poses(folder, poses, covariances)
-        np.testing.assert_array_equal(results.read_vehicle_poses(folder)[0], poses)
-    else:
-        results.write_structs(folder, name, *content)
+        content = np.arange(1, 5), *content[1:]
+    results.write_structs(folder, name, *content)
     structs = loadmat(folder / f"{name}.mat")[name]
     assert structs.shape == (1, 4) and structs.dtype.names == fields
     shapes = [structs[0, 1][field].shape for field in fields]
@@ -81,28 +78,23 @@ def test_structs_have_the_bytes_that_scipy_writes_and_are_read_again(tmp_path, c
         np.testing.assert_array_equal(got, expected)
 
 
-def test_a_tum_file_has_pose_numbers_and_unit_quaternions_of_the_poses_that_are_known(tmp_path):
+def test_text_keeps_every_digit_of_the_poses_that_are_known(tmp_path):
+    """CSV names its columns; TUM has pose numbers and unit quaternions."""
     poses = np.array([[1.0, 2.0, 0.1], ABSENT, [1 / 3, -1e-9, 7.0]])
     results.write_tum(tmp_path / "a" / "b.tum", poses)
     rows = np.loadtxt(tmp_path / "a" / "b.tum")
-    np.testing.assert_array_equal(rows[:, 0], [1, 3])
-    np.testing.assert_array_equal(rows[:, 1:3], poses[[0, 2], :2])
-    np.testing.assert_array_equal(rows[:, 3:6], 0)
+    np.testing.assert_array_equal(rows[:, :6], [[1, 1, 2, 0, 0, 0], [3, 1 / 3, -1e-9, 0, 0, 0]])
     np.testing.assert_allclose(np.hypot(rows[:, 6], rows[:, 7]), 1, atol=1e-15)
     np.testing.assert_allclose(2 * np.arctan2(rows[:, 6], rows[:, 7]) - poses[[0, 2], 2],
                                [0, -4 * np.pi], atol=1e-12)
-
-
-def test_comma_separated_values_name_their_columns_and_keep_every_digit(tmp_path):
-    poses = np.array([[1 / 3, 2.0, 0.1], ABSENT])
-    C = np.array([[[1 / 7, 2, 3], [2, 4, 5], [3, 5, 6]], np.full((3, 3), np.nan)])
-    results.write_csv(tmp_path / "a.csv", np.array([7, 8]), poses, C)
-    header, row = (tmp_path / "a.csv").read_text().splitlines()
-    assert header == "id,x,y,theta,s_xx,s_xy,s_xtheta,s_yy,s_ytheta,s_thetatheta"
-    assert [*map(float, row.split(","))] == [7, 1 / 3, 2, 0.1, 1 / 7, 2, 3, 4, 5, 6]
-    results.write_csv(tmp_path / "a.csv", np.array([7, 8]), poses[:, :2], C[:, :2, :2])
-    assert (tmp_path / "a.csv").read_text() == \
-        f"id,x,y,s_xx,s_xy,s_yy\n7,{1 / 3:.17g},2,{1 / 7:.17g},2,4\n"
+    C = np.array([[[1 / 7, 2, 3], [2, 4, 5], [3, 5, 6]]] * 3)
+    for d, header, row in (
+            (3, "id,x,y,theta,s_xx,s_xy,s_xtheta,s_yy,s_ytheta,s_thetatheta",
+             [9, 1 / 3, -1e-9, 7, 1 / 7, 2, 3, 4, 5, 6]),
+            (2, "id,x,y,s_xx,s_xy,s_yy", [9, 1 / 3, -1e-9, 1 / 7, 2, 4])):
+        results.write_csv(tmp_path / "a.csv", np.array([7, 8, 9]), poses[:, :d], C[:, :d, :d])
+        first, *_, last = (tmp_path / "a.csv").read_text().splitlines()
+        assert first == header and [*map(float, last.split(","))] == row
 
 
 @pytest.mark.slow

@@ -40,35 +40,34 @@ def test_stand_ins_are_what_the_readme_says(name):
     np.testing.assert_allclose(truth.poses[-1, :2], 0, atol=1e-3)                    # closed
 
 
+def errors(dataset, truth):
+    """Errors of sightings (m, 3) and of ranges (r,)."""
+    a, u = dataset.aruco, dataset.uwb
+    marker = truth.marker_in_world[np.searchsorted(truth.marker, a.marker)]
+    antenna = truth.antenna_in_world[np.searchsorted(truth.antenna, u.antenna)]
+    off = a.marker_in_vehicle - se2.between(truth.poses[a.pose], marker)
+    return np.column_stack([off[:, :2], se2.wrap(off[:, 2])]), u.range - np.hypot(
+        *(truth.poses[u.pose, :2] - antenna).T)
+
+
 def test_perfect_data_agrees_with_its_truth():
     dataset, truth = simulate("short", seed=4, noise=False)
     poses = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")
-    np.testing.assert_allclose(poses, truth.poses, atol=1e-10)
-    a, u = dataset.aruco, dataset.uwb
-    marker = truth.marker_in_world[np.searchsorted(truth.marker, a.marker)]
-    expected = se2.between(truth.poses[a.pose], marker)
-    np.testing.assert_allclose(a.marker_in_vehicle[:, :2], expected[:, :2], atol=1e-10)
-    np.testing.assert_allclose(se2.wrap(a.marker_in_vehicle[:, 2] - expected[:, 2]), 0, atol=1e-10)
-    antenna = truth.antenna_in_world[np.searchsorted(truth.antenna, u.antenna)]
-    np.testing.assert_allclose(
-        u.range, np.linalg.norm(truth.poses[u.pose, :2] - antenna, axis=1), atol=1e-10)
+    for off in (poses - truth.poses, *errors(dataset, truth)):
+        np.testing.assert_allclose(off, 0, atol=1e-10)
     np.testing.assert_array_equal(dataset.antenna_guess.position, truth.antenna_in_world)
 
 
 def test_noise_has_the_covariances_that_the_files_state():
     """Mean squared Mahalanobis length of m whitened d-vectors: d +- 4 sqrt(2 d / m)."""
     dataset, truth = simulate("long", seed=6)
-    a, u = dataset.aruco, dataset.uwb
-    marker = truth.marker_in_world[np.searchsorted(truth.marker, a.marker)]
-    error = a.marker_in_vehicle - se2.between(truth.poses[a.pose], marker)
-    error[:, 2] = se2.wrap(error[:, 2])
+    a, (error, off) = dataset.aruco, errors(dataset, truth)
     chi2 = np.einsum("ni,ni->n", error, np.linalg.solve(a.covariance, error[..., None])[..., 0])
     assert abs(chi2.mean() - 3) < 4 * np.sqrt(6 / len(chi2))
     distance = np.linalg.norm(a.marker_in_vehicle[:, :2], axis=1)
     sigma = np.sqrt(np.trace(a.covariance, axis1=1, axis2=2))
     assert np.corrcoef(distance, sigma)[0, 1] > 0.99 and np.all(a.covariance[:, 0, 2] != 0)
-    antenna = truth.antenna_in_world[np.searchsorted(truth.antenna, u.antenna)]
-    z = (u.range - np.linalg.norm(truth.poses[u.pose, :2] - antenna, axis=1)) / u.sigma
+    z = off / dataset.uwb.sigma
     assert abs(np.mean(z**2) - 1) < 4 * np.sqrt(2 / len(z)) and abs(z.mean()) < 4 / np.sqrt(len(z))
     off = np.linalg.norm(dataset.antenna_guess.position - truth.antenna_in_world, axis=1)
     assert 0.2 < np.sqrt(np.mean(off**2)) < 0.8
@@ -78,13 +77,12 @@ def test_noise_has_the_covariances_that_the_files_state():
 def test_encoder_error_is_rounding_and_a_random_walk(slip):
     """With the true wheels the travelled distance errs by at most a count, plus slip^2 a metre."""
     dataset, truth = simulate("long", seed=7, slip=slip)
-    ds, dtheta, _, _ = odometry.steps(dataset.ticks, truth.vehicle)
+    length = 2 * np.pi * truth.vehicle.wheel[:2] / truth.vehicle.ticks_per_revolution
     step = se2.between(truth.poses[:-1], truth.poses[1:])
     true_ds = np.hypot(step[:, 0], step[:, 1]) / np.sinc(step[:, 2] / (2 * np.pi))
-    half_base = truth.vehicle.wheelbase / 2
-    error = np.cumsum(np.stack([ds + half_base * dtheta, ds - half_base * dtheta])
-                      - np.stack([true_ds + half_base * step[:, 2],
-                                  true_ds - half_base * step[:, 2]]), axis=1)
+    turn = truth.vehicle.wheelbase / 2 * step[:, 2]
+    error = np.cumsum(length * dataset.ticks[1:] - np.stack([true_ds + turn, true_ds - turn], -1),
+                      axis=0).T
     one_count = 2 * np.pi * 0.1 / 8000
     if slip == 0:
         assert np.abs(error).max() < 1.01 * one_count
@@ -122,10 +120,9 @@ def test_files_round_trip_through_the_reader(tmp_path):
     again, true_again = read_dataset(tmp_path / "drive"), read_truth(tmp_path / "drive")
     assert again.vehicle == vehicle and true_again.vehicle == truth.vehicle
     np.testing.assert_array_equal(again.ticks, dataset.ticks)
-    np.testing.assert_array_equal(again.aruco.marker, dataset.aruco.marker)
-    np.testing.assert_allclose(again.aruco.marker_in_vehicle, dataset.aruco.marker_in_vehicle,
-                               atol=6e-6)
-    np.testing.assert_allclose(again.aruco.covariance, dataset.aruco.covariance, rtol=1e-4)
-    np.testing.assert_allclose(again.uwb.range, dataset.uwb.range, atol=6e-5)
-    np.testing.assert_allclose(true_again.poses, truth.poses, atol=6e-7)
-    np.testing.assert_allclose(true_again.marker_in_world, truth.marker_in_world, atol=6e-7)
+    for found, written in ((again.aruco, dataset.aruco), (again.uwb, dataset.uwb),
+                           (again.antenna_guess, dataset.antenna_guess)):
+        for got, expected in zip(vars(found).values(), vars(written).values()):
+            np.testing.assert_allclose(got, expected, rtol=1e-4, atol=6e-4)
+    for name in ("poses", "marker", "marker_in_world", "antenna", "antenna_in_world"):
+        np.testing.assert_allclose(getattr(true_again, name), getattr(truth, name), atol=6e-7)

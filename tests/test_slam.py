@@ -143,10 +143,11 @@ def test_the_learned_noise_has_the_greatest_posterior(poses, slip):
     """Many and few measurements: derivatives at the mode, by small steps, are nearly zero."""
     dataset, _ = simulate("short", seed=6, slip=slip)
     fit = fit_from_odometry(measure(dataset.first(poses)))
-    found = learn_noise(fit.equations)
+    equations = NormalEquations(fit.problem, fit.state)
+    found = learn_noise(equations)
 
     def log_posterior(logarithms):
-        return laplace_approximation(fit.equations, Noise.from_logarithms(logarithms))[1] \
+        return laplace_approximation(equations, Noise.from_logarithms(logarithms))[1] \
             - np.sum(((logarithms - np.log([1e-3, 1, 1])) / np.log([3, 2, 2]))**2) / 2
 
     sigma = np.sqrt(np.diag(found.covariance))
@@ -170,7 +171,8 @@ def test_averages_over_the_noise_are_moments_of_a_mixture():
     fit = fit_from_odometry(measure(dataset))
     weights, noises = zip(*fit.posterior.points)
     assert len(weights) > 2 and np.isclose(sum(weights), 1, atol=1e-2)
-    equations, m, active = fit.equations, fit.problem.measurements, fit.problem.active
+    equations, m = NormalEquations(fit.problem, fit.state), fit.problem.measurements
+    active = fit.problem.active
     assert active.sum() == 5 and not m.oriented.all()
     x = np.stack([laplace_approximation(equations, each)[0]
                   for each in (fit.problem.noise, *noises)])

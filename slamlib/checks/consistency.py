@@ -56,6 +56,4 @@ def returns(dataset, gap=MIN_GAP):
 
 def discrepancies(found, poses):
     """Motions (m, 3) by poses (n, 3) minus those of Returns `found`, in the axes of its starts."""
-    off = se2.between(poses[found.start], poses[found.end]) - found.motion
-    off[:, 2] = se2.wrap(off[:, 2])
-    return off
+    return se2.difference(se2.between(poses[found.start], poses[found.end]), found.motion)

@@ -13,7 +13,12 @@ import numpy as np
 
 from slamlib import odometry, se2
 from slamlib.doubt import Doubt
-from slamlib.marker_increments import common_sightings, robust_increments
+from slamlib.marker_increments import (
+    common_sightings,
+    distance_and_turn,
+    distance_and_turn_sigmas,
+    robust_increments,
+)
 from slamlib.sightings import sightings_by_frame
 
 MIN_COUNT = 10            # measurements for a decision
@@ -59,8 +64,8 @@ def motion_doubts(dataset):
         return []
     turned = np.concatenate([wheels[:, :2] @ AXES.mT,
                              np.linalg.det(AXES)[:, None, None] * wheels[:, 2:]], axis=2)
-    size = np.maximum(*(np.hypot(*_sizes(each).T) for each in (markers[0], wheels)))
-    agree = np.linalg.norm(_sizes(markers - turned[:, None]), axis=-1) \
+    size = np.maximum(*(np.hypot(*distance_and_turn(each).T) for each in (markers[0], wheels)))
+    agree = np.linalg.norm(distance_and_turn(markers - turned[:, None]), axis=-1) \
         < AGREEMENT[0] * size + AGREEMENT[1] * np.hypot(*sigma.T)                # (8, 2, n)
     return list(wrong_axes(dataset, agree)) or list(
         wrong_sizes(markers[0], wheels, sigma, agree[0, 0]))
@@ -81,17 +86,11 @@ def moving_increments(dataset):
     common = common_sightings(s.row, s.marker, span)
     found, reversed_theta = (robust_increments(s.z @ S, S @ s.C @ S, *common, len(wheels))
                              for S in (np.eye(3), np.diag([1.0, 1.0, -1.0])))
-    sigma = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2) @ [[1, 0], [1, 0], [0, 1]])
-    size = np.maximum(_sizes(found.increment), _sizes(wheels))
+    sigma = distance_and_turn_sigmas(found.covariance)
+    size = np.maximum(distance_and_turn(found.increment), distance_and_turn(wheels))
     moving = found.usable & (size > MIN_MOTION_SIGMAS * sigma).any(axis=1)
     return (np.array([found.increment, reversed_theta.increment])[:, moving], wheels[moving],
             sigma[moving])
-
-
-def _sizes(increment):
-    """Distance in m and turn in rad, (..., 2), of increments (..., 3)."""
-    return np.stack([np.linalg.norm(increment[..., :2], axis=-1),
-                     np.abs(se2.wrap(increment[..., 2]))], axis=-1)
 
 
 def wrong_axes(dataset, agree):
@@ -132,7 +131,7 @@ def wrong_sizes(markers, wheels, sigma, agree):
     Of other units if the medians of length or turn differ by MAX_FACTOR, of other drives if most
     increments do not agree, `agree` (n,). `sigma` (n, 2) is that of lengths and turns by markers.
     """
-    medians = np.median([_sizes(markers), _sizes(wheels)], axis=1)
+    medians = np.median([distance_and_turn(markers), distance_and_turn(wheels)], axis=1)
     least = np.maximum(MAX_FACTOR * medians.min(axis=0), MIN_MOTION_SIGMAS * np.median(sigma, 0))
     units = ((medians.max(axis=0) > least) & (medians[1] > 0)).any()
     if units or agree.mean() <= 0.5:

@@ -130,8 +130,8 @@ def _of_sightings(result):
         yield "places", (
             f"By the path between their sightings, markers {', '.join(map(str, np.unique(ids)))} "
             "were seen at more than one place: problems 3 and 4 have the others as markers "
-            f"{', '.join(map(str, np.unique(places)))}. Look for ids that are used twice, and for "
-            "markers that were moved.")
+            f"{', '.join(map(str, np.unique(places)))}. Look for ids that are used twice, for "
+            "markers that were moved, and whether the vehicle was carried where it saw none.")
     rejected, repeated = result.rejected, result.sightings.contradicting
     left_out, count = rejected.sum() + repeated, len(rejected) + repeated
     marker, row, seen = np.unique(

@@ -34,7 +34,6 @@ from slamlib.textfile import require_type
 
 SLIP_FRAMES = 500            # number of frames, the first ones, from which the slip is learned
 WHEEL_FRAMES = 5000          # number of frames, the first ones, that give the wheel parameters w_0
-FRAMES_PER_BLOCK = 1000      # frames whose poses are computed together, so that they stay in cache
 MIN_JUMP_GAIN = 10.0         # log likelihood by each of many jumps; the loss by each of a few
 MAX_SLIP_STEPS = 30          # number of parabolas
 LOG_SLIP_TOLERANCE = 0.05    # of the natural logarithm of the slip
@@ -57,7 +56,6 @@ class _FilterInput:
     """The data of the filter, the same for all values of slip."""
 
     dataset: object
-    model: str
     vehicle: object              # with the wheel parameters w_0 at which Delta is linearised
     pose: np.ndarray             # (f,) pose indices of the frames, pose 0 among them
     marker: np.ndarray           # (s,) ids of the markers of all sightings, frame by frame
@@ -83,14 +81,13 @@ class _State(NamedTuple):        # three are made at a frame: faster than frozen
     v: np.ndarray | None = None  # (u, 3) their innovations
 
 
-def fuse(dataset, slip=None, model="arc"):
+def fuse(dataset, slip=None):
     """Fusion of a Dataset's odometry and markers for problem 2, with correct shared errors.
 
     `slip` in sqrt(m) is the standard deviation of the slip of one wheel after 1 m; None takes that
     of the dataset's Vehicle or, if it has none, the maximum of the posterior density by the
     innovations and the prior of `increments`. A marker_noise_factor of the Vehicle multiplies the
-    standard deviations of the sightings. `model` is that of the increments, "arc" or "euler";
-    another one raises ValueError.
+    standard deviations of the sightings. Increments are exact arcs.
 
     >>> from slamlib.simulation import simulate
     >>> dataset, truth = simulate("short", seed=1)
@@ -100,9 +97,9 @@ def fuse(dataset, slip=None, model="arc"):
     require_type(dataset, Dataset, "fuse")
     slip = dataset.vehicle.slip if slip is None else slip
     jumps = find_jumps(dataset)
-    given = _filter_input(dataset, model, dataset.vehicle, jumps)
+    given = _filter_input(dataset, dataset.vehicle, jumps)
     if len(jumps.start):
-        other = _filter_input(dataset, model, dataset.vehicle)
+        other = _filter_input(dataset, dataset.vehicle)
         gain, = np.diff([_filter(each, slip or TYPICAL_SLIP)[2].log_likelihood
                          for each in (other, given)])
         least = MIN_JUMP_GAIN * len(jumps.start)
@@ -112,16 +109,13 @@ def fuse(dataset, slip=None, model="arc"):
         slip = _likeliest_slip(replace(given, frames=given.frames[:SLIP_FRAMES]))
     first = replace(given, frames=given.frames[:WHEEL_FRAMES])
     wheel = given.vehicle.wheel + _filter(first, slip)[0][-1, 3:]
-    given = _filter_input(dataset, model, dataset.vehicle.with_wheel(wheel), jumps)
+    given = _filter_input(dataset, dataset.vehicle.with_wheel(wheel), jumps)
     x, covariances, state, innovations = _filter(given, slip)
     frames = _frames_with_memory(given, innovations)
     if frames is not None:
         given = replace(given, frames=frames)
         x, covariances, state, _ = _filter(given, slip)
-    blocks = [*given.pose[::FRAMES_PER_BLOCK], len(dataset.ticks)]
-    poses, pose_covariances = (np.concatenate(parts) for parts in zip(*(
-        _poses_from_frames(given, slip, x, covariances, np.arange(begin, end))
-        for begin, end in zip(blocks, blocks[1:]))))
+    poses, pose_covariances = _poses_from_frames(given, slip, x, covariances)
     repeated = len(dataset.aruco.pose) - sum(len(z) for z, *_ in given.frames)
     return Fusion(
         poses=poses, covariances=pose_covariances, slip=slip,
@@ -156,7 +150,7 @@ def _likeliest_slip(given):
     return float(np.exp(vertex if np.isfinite(vertex) else best))
 
 
-def _filter_input(dataset, model, vehicle, jumps=NO_JUMPS):
+def _filter_input(dataset, vehicle, jumps=NO_JUMPS):
     """The _FilterInput with odometry linearised at the wheel parameters of `vehicle`."""
     ticks, sightings = dataset.ticks, sightings_by_frame(dataset.sightings, extra_frames=[0])
     start, end = sightings.frame[:-1], sightings.frame[1:]
@@ -166,12 +160,12 @@ def _filter_input(dataset, model, vehicle, jumps=NO_JUMPS):
     C = (vehicle.marker_noise_factor or 1.0)**2 * sightings.C
     seen = (np.split(values, begins[1:]) for values in (sightings.z, C))
     common = (np.split(rows, splits) for rows in (first - begins[pair], second - begins[pair + 1]))
-    increment, by_w = increments.between_poses(ticks, vehicle, start, end, model)
+    increment, by_w = increments.between_poses(ticks, vehicle, start, end, "arc")
     rounding, slipping = increments.noise_in_drive(ticks, vehicle, start, end)
     jump, unknown = jumps.added(start, end)
     return _FilterInput(
-        dataset=dataset, model=model, vehicle=vehicle, pose=sightings.frame,
-        marker=sightings.marker, increment=se2.compose(increment, jump), J_w=by_w,
+        dataset=dataset, vehicle=vehicle, pose=sightings.frame, marker=sightings.marker,
+        increment=se2.compose(increment, jump), J_w=by_w,
         rounding=rounding + unknown, slipping=slipping, jumps=jumps,
         frames=list(zip(*seen, *common, strict=True)))
 
@@ -257,10 +251,9 @@ def _updated(state, z, C, earlier, later):
     accepted = (v * np.linalg.solve(S, v[..., None])[..., 0]).sum(axis=1) < GATE
     if not accepted.all():
         # A rejected sighting has the density at the gate, so that rejections do not favour a slip.
-        rejected = int(np.count_nonzero(~accepted))
-        density = rejected * GATE / 2 + np.sum(np.linalg.slogdet(S[~accepted])[1]) / 2
+        density = np.sum(GATE + np.linalg.slogdet(S[~accepted])[1]) / 2
         state = state._replace(log_likelihood=state.log_likelihood - density,
-                               rejected=state.rejected + rejected)
+                               rejected=state.rejected + int(np.count_nonzero(~accepted)))
         old, rows = old[accepted], rows[accepted]
     if len(rows):
         state = _corrected(state, rows.ravel(), v[accepted].ravel(), C[new[accepted]])
@@ -289,17 +282,16 @@ def _corrected(state, rows, v, C):
                           P=(P + P.T) / 2, log_likelihood=state.log_likelihood - density)
 
 
-def _poses_from_frames(given, slip, x, covariances, pose):
-    """Successive poses and their covariances, by odometry from the last frame before each.
+def _poses_from_frames(given, slip, x, covariances):
+    """All poses (n, 3) and covariances, by odometry from the last frame before each.
 
-    `pose` (n,) are indices from 0, the first one that of a frame; x and covariances are those of
-    `_filter`.
+    `x` and `covariances` are those of `_filter`.
     """
-    begin, ticks = pose[0], given.dataset.ticks
+    pose = np.arange(len(given.dataset.ticks))
     last = np.searchsorted(given.pose, pose, side="right") - 1
-    steps = ticks[begin:pose[-1] + 1], given.vehicle, given.pose[last] - begin, pose - begin
-    increment, by_w = increments.between_poses(*steps, given.model)
-    rounding, slipping = increments.noise_in_drive(*steps, steps=len(ticks) - 1)
+    steps = given.dataset.ticks, given.vehicle, given.pose[last], pose
+    increment, by_w = increments.between_poses(*steps, "arc")
+    rounding, slipping = increments.noise_in_drive(*steps)
     jump, unknown = given.jumps.added(given.pose[last], pose)
     Q = rounding + unknown + slip**2 * slipping
     delta = se2.compose(increment, jump) + np.einsum("nij,nj->ni", by_w, x[last, 3:])

@@ -53,10 +53,8 @@ def first_order_from(ticks, vehicle, start, poses, covariances):
     """
     part = np.maximum(np.searchsorted(start, np.arange(len(ticks))) - 1, 0)
     delta, by_w = increments.between_poses(ticks, vehicle, start[part], np.arange(len(ticks)))
-    A, B = se2.compose_jacobians(poses[part], delta)
-    G = B @ by_w * vehicle.sigma_wheel
-    return (se2.compose(poses[part], delta),
-            A @ covariances[part] @ A.mT + G @ G.mT)
+    by_w *= vehicle.sigma_wheel
+    return se2.compose_uncertain(poses[part], covariances[part], delta, by_w @ by_w.mT)
 
 
 def fuse_increments(dataset, propagation=equation2_from):
@@ -69,15 +67,21 @@ def fuse_increments(dataset, propagation=equation2_from):
     ticks, vehicle = dataset.ticks, dataset.vehicle
     sightings = sightings_by_frame(dataset.sightings, extra_frames=[0])
     frame, found = sightings.frame, consecutive_increments(sightings)
-    delta, C = _fused_increments(dataset, frame, found, propagation)
+    delta, C = (each[frame[1:]] for each in propagation(
+        ticks, vehicle, frame, np.zeros((len(frame), 3)), np.zeros((len(frame), 3, 3))))
+    use = found.usable
+    gain = C[use] @ np.linalg.inv(C[use] + found.covariance[use])
+    C[use] = gain @ found.covariance[use]
+    difference = se2.difference(found.increment[use], delta[use])
+    delta[use] += (gain @ difference[..., None])[..., 0]
     heading = odometry.cumulative(delta[:, 2])
     turned = (se2.rotation(heading[:-1]) @ delta[:, :2, None])[..., 0]
     poses = np.column_stack([odometry.cumulative(turned), heading])
     A, B = se2.compose_jacobians(poses[:-1], delta)
-    noise, covariances = B @ C @ B.mT, np.zeros((len(frame), 3, 3))
+    noise, covariances = B @ (C + C.mT) @ B.mT / 2, np.zeros((len(frame), 3, 3))
     covariances[0, 2, 2] = vehicle.sigma_heading**2
     for k, (start, end) in enumerate(zip(frame, frame[1:])):
-        if found.usable[k]:
+        if use[k]:
             covariances[k + 1] = A[k] @ covariances[k] @ A[k].T + noise[k]
         else:
             covariances[k + 1] = propagation(
@@ -88,23 +92,3 @@ def fuse_increments(dataset, propagation=equation2_from):
     used = np.union1d(*(r[found.accepted] for r in (found.first, found.second)))
     return Fusion(poses=path, covariances=path_covariances,
                   rejected=len(dataset.aruco.pose) - len(used))
-
-
-def _fused_increments(dataset, frame, found, propagation):
-    """Increments (f-1, 3) between the frames by odometry and markers, and covariances (f-1, 3, 3).
-
-    `found` are the MarkerIncrements between them. Where they are not usable, the increments are
-    those by odometry, and the covariances NaN.
-    """
-    zero = np.zeros((len(frame), 3))
-    by_odometry, C_odometry = (each[frame[1:]] for each in propagation(
-        dataset.ticks, dataset.vehicle, frame, zero, np.zeros((len(frame), 3, 3))))
-    difference = found.increment - by_odometry
-    difference[:, 2] = se2.wrap(difference[:, 2])
-    C = np.full_like(C_odometry, np.nan)
-    use = found.usable
-    gain = C_odometry[use] @ np.linalg.inv(C_odometry[use] + found.covariance[use])
-    C[use] = gain @ found.covariance[use]
-    fused = by_odometry.copy()
-    fused[use] += (gain @ difference[use, :, None])[..., 0]
-    return fused, (C + C.mT) / 2

@@ -23,7 +23,11 @@ import numpy as np
 
 from slamlib import se2
 from slamlib.dataset import ArucoReadings, DatasetError
-from slamlib.marker_increments import consecutive_increments, robust_increments
+from slamlib.marker_increments import (
+    common_sightings,
+    consecutive_increments,
+    robust_increments,
+)
 from slamlib.sightings import consensus, sightings_by_frame
 from slamlib.textfile import require_type
 
@@ -66,12 +70,10 @@ def localize(aruco, shared_errors=True):
         raise DatasetError("expected sightings that agree; all contradict another one of the same "
                            "marker at the same pose")
     increments = consecutive_increments(sightings)
-    paired, confirmed = np.zeros((2, len(sightings.row)), bool)
-    for rows in (increments.first, increments.second):
-        paired[rows], confirmed[rows[increments.accepted]] = True, True
-    root = int(np.argmax(increments.usable)) if increments.usable.any() else 0
-    links = _links(sightings, increments, confirmed, root)
-    poses, covariances, H = _compose_increments(sightings, links, root, shared_errors)
+    _, *common = common_sightings(sightings.row, sightings.marker)
+    used = [rows[increments.accepted] for rows in (increments.first, increments.second)]
+    paired, confirmed = (np.isin(np.arange(len(sightings.row)), each) for each in (common, used))
+    poses, covariances, H = _composed(sightings, increments, confirmed, shared_errors)
     used = np.flatnonzero(confirmed & np.isfinite(poses[sightings.row, 0]))
     marker, in_world, marker_covariance = _map_markers(sightings, used, poses, covariances, H)
     rejected, unused = np.ones(len(aruco.pose), bool), np.zeros(len(aruco.pose), bool)
@@ -82,30 +84,42 @@ def localize(aruco, shared_errors=True):
         marker_covariance=marker_covariance)
 
 
-def _links(sightings, increments, confirmed, root):
-    """A dict, in ascending order, from localized frames to (parent, MarkerIncrements, pair)."""
+def _composed(sightings, increments, confirmed, shared_errors):
+    """Poses (f, 3) and covariances (f, 3, 3), NaN where unknown, and H (s, 3, 3) of sightings."""
     count = len(sightings.frame)
     rows_of = np.split(np.arange(len(sightings.row)),
                        np.searchsorted(sightings.row, np.arange(1, count)))
     # By marker id, the latest localized frames that saw it.
-    links, seen_in = {}, defaultdict(lambda: deque(maxlen=MAX_FRAMES_PER_MARKER))
+    seen_in = defaultdict(lambda: deque(maxlen=MAX_FRAMES_PER_MARKER))
+    poses, covariances = np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan)
+    H = np.zeros((len(sightings.row), 3, 3))
+    root = int(np.argmax([*increments.usable, False]))
+    poses[root], covariances[root] = 0.0, 0.0
     for f in range(root, count):
         if f > root:
-            previous = f - 1 == root or f - 1 in links
-            link = (f - 1, increments, f - 1) if previous and increments.usable[f - 1] \
-                else _relocalize(sightings, confirmed, rows_of, f, seen_in)
-            if link is None:
+            p, found, pair = f - 1, increments, f - 1
+            if not increments.usable[pair] or np.isnan(poses[p, 0]):
+                p, found, pair = *_relocalize(sightings, confirmed, rows_of, f, seen_in), 0
+            if found is None:
                 continue
-            links[f] = link
+            A, B = se2.compose_jacobians(poses[p], found.increment[pair])
+            poses[f] = se2.compose(poses[p], found.increment[pair])
+            covariances[f] = A @ covariances[p] @ A.T + B @ found.covariance[pair] @ B.T
+            if shared_errors:
+                rows = slice(*np.searchsorted(found.pair, (pair, pair + 1)))
+                first, second = found.first[rows], found.second[rows]
+                S = A @ np.sum(H[first] @ (B @ found.J_first[rows]).mT, axis=0)
+                covariances[f] += S + S.T
+                H[second] = B @ found.J_second[rows] @ sightings.C[second]
         for m in sightings.marker[rows_of[f]].tolist():
             seen_in[m].append(f)
-    return links
+    return poses, covariances, H
 
 
 def _relocalize(sightings, confirmed, rows_of, frame, seen_in):
-    """The link (parent, MarkerIncrements, 0) of a frame to an earlier localized one, or None.
+    """The parent of a frame and the MarkerIncrements from it to this frame, or None and None.
 
-    Candidates are the localized frames with the most common markers, the latest first. A link
+    Candidates are the localized frames with the most common markers, the latest first. A parent
     requires two accepted markers, or one whose two sightings adjacent frames confirm.
     """
     marker, rows = sightings.marker, rows_of[frame]
@@ -116,27 +130,8 @@ def _relocalize(sightings, confirmed, rows_of, frame, seen_in):
         found = robust_increments(sightings.z, sightings.C, np.zeros_like(first), first, second, 1)
         sure = found.accepted & confirmed[first] & confirmed[second]
         if found.usable[0] and (found.accepted.sum() > 1 or sure.any()):
-            return f, found, 0
-    return None
-
-
-def _compose_increments(sightings, links, root, shared_errors):
-    """Poses (f, 3) and covariances (f, 3, 3), NaN where unknown, and H (s, 3, 3) of sightings."""
-    count = len(sightings.frame)
-    poses, covariances = np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan)
-    poses[root], covariances[root] = 0.0, 0.0
-    H = np.zeros((len(sightings.row), 3, 3))
-    for f, (p, found, pair) in links.items():
-        poses[f] = se2.compose(poses[p], found.increment[pair])
-        A, B = se2.compose_jacobians(poses[p], found.increment[pair])
-        covariances[f] = A @ covariances[p] @ A.T + B @ found.covariance[pair] @ B.T
-        if shared_errors:
-            rows = slice(*np.searchsorted(found.pair, (pair, pair + 1)))
-            first, second = found.first[rows], found.second[rows]
-            S = A @ np.sum(H[first] @ (B @ found.J_first[rows]).mT, axis=0)
-            covariances[f] += S + S.T
-            H[second] = B @ found.J_second[rows] @ sightings.C[second]
-    return poses, covariances, H
+            return f, found
+    return None, None
 
 
 def _map_markers(sightings, used, poses, covariances, H):

@@ -104,18 +104,17 @@ def solved(drives, **solvers):
     found = {drive: {} for drive in drives}
     for drive, problem in product(drives, solvers):
         try:
-            found[drive][problem] = result = solvers[problem](drive)
-            solve.require_covariances(result)
+            result = solvers[problem](drive)
+            solution = solve.problem_solution(problem, drive.dataset, result)
         except solve.UNSOLVABLE as error:
             if drive.made_up:
                 raise
-            found[drive].pop(problem, None)
             failure = solve.failure(problem, drive.dataset, error)
             _notice(drive, f"The problem “{failure.title}” could not be solved: "
                            f"{failure.reason}.", failure=failure)
             continue
+        found[drive][problem] = result
         if not drive.made_up:
-            solution = solve.problem_solution(problem, drive.dataset, result)
             solve.write_solution(results_folder(drive), solution)
             show_doubts(drive, solution.doubts)
     left = [drive for drive in drives if len(found[drive]) == len(solvers)]

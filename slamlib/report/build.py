@@ -4,7 +4,7 @@ import os
 import re
 import sys
 import time
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -13,7 +13,6 @@ from tqdm import tqdm
 
 from slamlib import swap
 from slamlib.dataset import DatasetError, dataset_names, inventory_lines, read_dataset, read_truth
-from slamlib.folder import left_in
 from slamlib.notebook import notices
 from slamlib.report import cache, overview
 from slamlib.report.document import render
@@ -22,9 +21,8 @@ from slamlib.report.execution import STUDIES, execute, kernel_environment, tempo
 from slamlib.report.notebooks import Options, shown, to_execute
 from slamlib.solve import RESULT_NAMES, SENSORS
 from slamlib.studies.memory import forget
-from slamlib.summary import print_tables, process
+from slamlib.tables import datasets_in
 
-TABLES_WAIT = 10.0  # s, for which the notebooks wait for the first numbers
 DATASET_NAME = re.compile("[A-Za-z0-9 ._-]+")  # nothing that Markdown, HTML or Typst interprets
 
 
@@ -54,7 +52,6 @@ def build_report(notebooks, data, report, results, datasets=None, options=Option
     options : Options, the title page and what is shown.
     jobs : int, notebooks executed at a time.
     kept : folder that caches executed notebooks and their studies, or None for one that is removed.
-        Where it has none of these notebooks, the datasets are solved first, and tables printed.
     fresh : bool; True executes everything although it is cached.
     """
     start, tell = time.monotonic(), partial(tqdm.write, file=sys.stderr)  # above the bar
@@ -67,16 +64,12 @@ def build_report(notebooks, data, report, results, datasets=None, options=Option
         kept = Path(kept or temporary / "kept").resolve()
         environment = kernel_environment(temporary, data, datasets, kept / STUDIES)
         keys = partial(cache.keys, books, folders, environment | {"SLAMLIB_RESULTS": str(results)})
-        recalled = not fresh and any(
-            cache.entry(kept, source, key).exists() for source, key in keys().items())
-        with nullcontext() if recalled else process(print_tables, folders) as first:
-            if first:  # errors of the text are told before a kernel starts
-                render(shown(books, options), options, check=True)
-                first.join(max(0.0, start + TABLES_WAIT - time.monotonic()))
-            stack.enter_context(swap.locked(kept))
-            stage, pages = (
-                stack.enter_context(swap.staging(folder)) for folder in (results, report))
-            written = _executed(books, keys, environment, jobs, stage, kept, fresh)
+        if fresh or not all(
+                cache.entry(kept, source, key).exists() for source, key in keys().items()):
+            render(shown(books, options), options, check=True)     # before a kernel starts
+        stack.enter_context(swap.locked(kept))
+        stage, pages = (stack.enter_context(swap.staging(folder)) for folder in (results, report))
+        written = _executed(books, keys, environment, jobs, stage, kept, fresh)
         tell("setting the pages and the PDF")
         drives = read_drives(read, stage, written, notices(books.values()))
         made = _rendered(shown(books, options), drives, options, has)
@@ -104,7 +97,7 @@ def _checked_input(notebooks, data, datasets, options):
     read = [(read_dataset(data / name), read_truth(data / name)) for name in names]
     for dataset, truth in read:
         print("\n".join(inventory_lines(dataset, truth)), file=sys.stderr)
-    for sentence in left_in(data):
+    for sentence in datasets_in(data)[1]:
         print(sentence, file=sys.stderr)
     has = {sensor for sensor in SENSORS for dataset, _ in read
            if getattr(dataset, sensor) is not None} | {"truth" for _, truth in read if truth}

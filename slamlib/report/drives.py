@@ -8,7 +8,7 @@ from slamlib.checks.files import doubts_before_solving, merged
 from slamlib.dataset import Dataset, Truth
 from slamlib.doubt import Doubt
 from slamlib.report.execution import NotebookError
-from slamlib.results import read_structs, read_vehicle_poses
+from slamlib.results import read_structs
 from slamlib.solve import PROBLEMS, SENSORS, Failure, Solution, title
 
 
@@ -72,7 +72,7 @@ def read_solution(folder, dataset, files):
     """Return the Solution in a results folder; its world frame is the first pose estimated."""
     place = f"{folder.parent.name}/{folder.name}, which a notebook wrote,"
     try:
-        poses, covariances = read_vehicle_poses(folder)
+        _, poses, covariances = read_structs(folder, "vehiclePose")
         maps = {field: read_structs(folder, name)
                 for field, name in (("aruco_map", "ArucoMap"), ("uwb_map", "UwbMap"))
                 if f"{folder.name}/{name}.mat" in files}

@@ -47,8 +47,7 @@ def read_options(path):
         return Options()
     keys = [option.name for option in fields(Options)]
     entries = read_toml(Path(path), 'author = "Ada Lovelace"', keys)
-    return Options(**{key: _checked(key, value, f"{path}, line {line}" if line else str(path))
-                      for key, (value, line) in entries.items()})
+    return Options(**{key: _checked(key, *entry) for key, entry in entries.items()})
 
 
 def _checked(key, value, place):

@@ -111,16 +111,15 @@ def _proposal(fit):
     doubtful = informed & (calibration.wide > calibration.sigma)
     candidates = sorted({*calibration.group[doubtful].tolist()})
     stated = frozenset(calibration.group[calibration.sigma > 0].tolist())
+    entries = {each: np.count_nonzero(calibration.group == each) for each in candidates}
     sets = [frozenset(some) for count in range(len(candidates) + 1)
             for some in combinations(candidates, count)]
     for width in (1.0, GROSS):
-        evidence, merit, largest = {}, {}, {}
-        for some in sets:
-            sigma = calibration.sigma_without(some, width) / calibration.wide * informed
-            evidence[some], largest[some] = _log_evidence(L, h, sigma)
-            entries = np.count_nonzero(np.isin(calibration.group, list(some)))
-            merit[some] = evidence[some] - DECISIVE_RELEASE * len(some) \
-                - FURTHER_ENTRY * (entries - len(some)) - STATED * len(some & stated)
+        found = _log_evidence(L, h, informed / calibration.wide * [
+            calibration.sigma_without(some, width) for some in sets])
+        evidence, largest = (dict(zip(sets, each.tolist())) for each in found)
+        merit = {some: evidence[some] - DECISIVE_RELEASE * len(some) - STATED * len(some & stated)
+                 - FURTHER_ENTRY * sum(entries[each] - 1 for each in some) for some in sets}
         best = max(merit, key=merit.get)
         if not best or largest[best] < MAX_WIDE_SIGMAS:
             break
@@ -134,19 +133,15 @@ def _proposal(fit):
 
 
 def _log_evidence(L, h, sigma):
-    """Log evidence of a prior with standard deviations (p,), 0 where an entry is known.
+    """Log evidences (...) of priors with standard deviations (..., p), 0 where an entry is known.
 
     From the information L (p, p) and h (p,) of the likelihood. Also the largest posterior mean of
-    an entry, in its standard deviations.
+    an entry, (...), in its standard deviations, in which the equations are solved.
     """
-    used = sigma > 0
-    posterior = L[np.ix_(used, used)] + np.diag(sigma[used]**-2.0)
-    sign, log_determinant = np.linalg.slogdet(posterior)
-    if sign <= 0:
-        return -np.inf, 0.0
-    mean = np.linalg.solve(posterior, h[used])
-    return (h[used] @ mean / 2 - log_determinant / 2 - np.sum(np.log(sigma[used])),
-            np.abs(mean / sigma[used]).max(initial=0.0))
+    posterior = np.eye(len(h)) + sigma[..., :, None] * L * sigma[..., None, :]
+    mean = np.linalg.solve(posterior, (sigma * h)[..., None])[..., 0]
+    return (np.sum(sigma * h * mean, axis=-1) / 2 - np.linalg.slogdet(posterior)[1] / 2,
+            np.abs(mean).max(axis=-1))
 
 
 def _likelihood(fit):
@@ -284,11 +279,10 @@ def _squared_distance(result, first, second, pose, later):
     place that A and B move with these poses.
     """
     first, second = result.marker_in_world[np.searchsorted(result.marker, [first, second])]
-    difference = second - first
-    difference[2] = se2.wrap(difference[2])
     poses, P = result.poses[[pose, later]], result.covariances[[pose, later]]
     A, _ = se2.compose_jacobians(poses, se2.between(poses, second))
     start, end = A @ P @ A.mT
     growth = end - start
     values, axes = np.linalg.eigh((growth + growth.T) / 2)
-    return float(np.sum((axes.T @ difference)**2 / np.maximum(values, MIN_SIGMA**2)))
+    off = axes.T @ se2.difference(second, first)
+    return float(np.sum(off**2 / np.maximum(values, MIN_SIGMA**2)))

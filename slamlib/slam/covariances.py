@@ -18,16 +18,15 @@ in the tangent space at the state that solves the problem of greatest posterior 
 """
 
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
-from scipy.linalg import cho_solve_banded, cholesky_banded, solve_triangular
+from scipy.linalg import cholesky_banded, solve_triangular
 from scipy.sparse import block_array, csc_array
 
 from slamlib.slam.calibration import WHEELS
-from slamlib.slam.linear import laplace_approximation, retract
+from slamlib.slam.linear import NormalEquations, laplace_approximation, retract
 
-COLUMNS_AT_ONCE = 128        # columns of M that are held in memory
+COLUMNS_AT_ONCE = 256        # columns of M that are held in memory
 
 
 @dataclass(frozen=True)
@@ -75,7 +74,8 @@ def marginal_covariances(equations, noise):
 def _chain_inverse(T):
     """Function from b (3 f, w) to T^-1 b; blocks of T^-1 (f, 3, 3), and (f-1, 3, 3) above these.
 
-    T (3 f, 3 f) is block tridiagonal. With its Cholesky factor L and W = L_{i+1,i} L_ii^-1 they are
+    T (3 f, 3 f) is block tridiagonal. With its Cholesky factor L and W = L_{i+1,i} L_ii^-1 it is
+    eliminated and substituted back block by block. The blocks are
 
         Z_ii = L_ii^-T L_ii^-1 + W^T Z_{i+1,i+1} W,    Z_{i,i+1} = -W^T Z_{i+1,i+1}
 
@@ -91,7 +91,17 @@ def _chain_inverse(T):
     for k in reversed(range(len(W))):
         Z[k] += W[k].T @ Z[k + 1] @ W[k]
     Z = (Z + Z.mT) / 2
-    return partial(cho_solve_banded, (L, True)), Z, -W.mT @ Z[1:]
+
+    def solve(b):
+        x = b.reshape(len(inverse), 3, -1).copy()
+        for k, step in enumerate(W):
+            x[k + 1] -= step @ x[k]
+        x = inverse.mT @ (inverse @ x)
+        for k in reversed(range(len(W))):
+            x[k] -= W[k].T @ x[k + 1]
+        return x.reshape(b.shape)
+
+    return solve, Z, -W.mT @ Z[1:]
 
 
 def posterior_moments(fit):
@@ -99,7 +109,7 @@ def posterior_moments(fit):
 
     Raises LinAlgError as `marginal_covariances`.
     """
-    problem, equations = fit.problem, fit.equations
+    problem, equations = fit.problem, NormalEquations(fit.problem, fit.state)
     weights, noises = zip(*fit.posterior.points) if fit.posterior else ((1.0,), (problem.noise,))
     weights = np.array(weights) / sum(weights)
     slip = np.sqrt(weights @ np.square([point.slip for point in noises]))

@@ -11,9 +11,8 @@ poses are by GTSAM's tangent vectors: X moves as X exp(xi), in its own axes.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 
-from slamlib import increments, se2
+from slamlib import increments, odometry, se2
 from slamlib.slam import calibration
 from slamlib.slam.calibration import RANGES, SIGHTINGS, WHEELS
 from slamlib.slam.measurements import square_root_information
@@ -111,6 +110,11 @@ class LinearizedFactors:
     error: float             # half the sum of squared errors, or the loss of the kernel
 
 
+_empty = np.zeros((0, 1, 6))
+NONE = LinearizedFactors(index=np.zeros(0, int), e=_empty[:, :, 0], J=_empty, J_c=_empty[:, :, :0],
+                         columns=np.zeros(0, int), weight=np.zeros(0), error=0.0)
+
+
 def linearize_odometry(problem, state):
     """Function from a slip in sqrt(m) to the LinearizedFactors of odometry, and sum log|Q|."""
     factors, active = problem.odometry, problem.active[WHEELS]
@@ -143,11 +147,11 @@ def linearize_measurements(problem, state):
         rows = kind[index]
         linearized.append(_whitened(problem, SIGHTINGS, index, rows, *sighting_error(
             s.z[rows], state.poses[s.row[rows]], *motions(s.row[rows], calibration.SIGHTING_LAG),
-            state.markers[m.marker_row[rows]], c, as_pose), roots[rows]))
+            state.markers[m.marker_row[rows]], c, as_pose), roots[rows]) if len(rows) else NONE)
     rows = np.flatnonzero(accepted.range_weight)
     linearized.append(_whitened(problem, RANGES, rows, rows, *range_error(
         r.distance[rows], state.poses[r.row[rows]], *motions(r.row[rows], calibration.RANGE_LAG),
-        state.antennas, r.antenna[rows], c), 1 / r.sigma[rows, None, None]))
+        state.antennas, r.antenna[rows], c), 1 / r.sigma[rows, None, None]) if len(rows) else NONE)
     e, J, error = linearized_own(problem, state)
     return *linearized, LinearizedFactors(
         index=np.arange(len(e)), e=e, J=J, J_c=np.zeros((*e.shape, 0)), columns=np.zeros(0, int),
@@ -157,10 +161,10 @@ def linearize_measurements(problem, state):
 def sighting_error(z, poses, motion, velocity, markers, c, as_pose):
     """Errors of sightings z (m, 3), and derivatives by pose, marker and the columns SIGHTINGS of c.
 
-    From poses (m, 3) of the vehicle, its `motion` (m, 3) to where it was when the camera saw, and
-    its `velocity` (m, 3) per encoder step there (`delayed`). Of markers with a heading (`as_pose`)
-    the errors (m, 3) are log(z^-1 h) of the expected sighting h, of points (m, 2) they are h - z.
-    The derivatives are (m, d, 3), (m, d, d) and (m, d, 5). GTSAM: BetweenFactorPose2.
+    From poses (m, 3) of the vehicle, its `motion` to where it was when the camera saw, and its
+    `velocity` per encoder step there (`delayed`), each (m, 3) or (3,). Of markers with a heading
+    (`as_pose`) the errors (m, 3) are log(z^-1 h) of the expected sighting h, of points (m, 2) they
+    are h - z. The derivatives are (m, d, 3), (m, d, d) and (m, d, 5). GTSAM: BetweenFactorPose2.
     """
     camera, size, d = c[calibration.CAMERA], c[calibration.SIZE], 3 if as_pose else 2
     mounted = se2.compose(motion, camera)                            # camera in vehicle
@@ -209,10 +213,10 @@ def _by_sensor(by_Y, mounted, place, velocity):
     """Derivatives by the vehicle's pose and a sensor's place, (m, d, 3), and by its lag (m, d).
 
     From those by the pose Y of the sensor, in its axes (m, d, 3). Its `place` (3,) in the vehicle
-    is `mounted` (m, 3) with the motion since; `velocity` (m, 3) is the vehicle's.
+    is `mounted` with the motion since; `velocity` is the vehicle's, both (m, 3) or (3,).
     """
     return (by_Y @ inverse_adjoint(mounted), by_Y @ inverse_adjoint(place * [0, 0, 1]),
-            -np.einsum("mdi,mi->md", by_Y @ inverse_adjoint(place), velocity))
+            -(by_Y @ inverse_adjoint(place) @ velocity[..., None])[..., 0])
 
 
 def inverse_adjoint(motion):
@@ -243,12 +247,13 @@ def delayed(measurements, row, lag, is_known=True):
     """Where the vehicle was `lag` encoder steps before the frames `row` (m,), in the axes there.
 
     Also its velocities (m, 3) per step at that time, in m and rad, by a smooth path: the noise of
-    single steps would bias the delay. Both are 0 where there is no lag and it `is_known`.
+    single steps would bias the delay. Both are 0 (3,) where there is no lag and it `is_known`.
     """
     if is_known and not lag:
-        return np.zeros((2, len(row), 3))
-    path = measurements.path
-    smooth = uniform_filter1d(path, SMOOTHED_STEPS, axis=0, mode="nearest")
+        return np.zeros((2, 3))
+    path, half = measurements.path, SMOOTHED_STEPS // 2
+    total = odometry.cumulative(np.pad(path, ((half, half), (0, 0)), "edge"))
+    smooth = (total[SMOOTHED_STEPS:] - total[:-SMOOTHED_STEPS]) / SMOOTHED_STEPS
     time = measurements.frame[row] - lag
     i = np.clip(np.floor(time).astype(int), 0, max(len(path) - 2, 0))
     k = np.minimum(i + 1, len(path) - 1)

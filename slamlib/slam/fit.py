@@ -8,7 +8,7 @@ have memory, measurements keep a share of their information (`slamlib.memory`).
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 
 import gtsam
 import numpy as np
@@ -17,7 +17,7 @@ from slamlib.sightings import GATE, POINT_GATE
 from slamlib.slam.calibration import WHEELS
 from slamlib.slam.factors import linearize_measurements, preintegrate_odometry
 from slamlib.slam.graph import optimize
-from slamlib.slam.linear import NormalEquations, Problem, State, laplace_approximation
+from slamlib.slam.linear import Problem, State, laplace_approximation
 from slamlib.slam.measurements import AcceptedMeasurements, Noise, with_known
 from slamlib.slam.noise import NoisePosterior, error_memories, learn_noise, with_hidden_errors
 
@@ -41,6 +41,7 @@ KERNELS = {
 ONE_SIDED = {"asymmetric Cauchy": -0.10555, "asymmetric Tukey": -0.07581}
 
 CAUCHY_SCALES = (100.0, 30.0, 10.0, 3.0)     # sigmas, scale of the kernel in each round
+ROUGH = 1e-3                 # relative decrease of the error at which a round ends
 MIN_RESIDUALS = 20           # number of measurements from which their scatter gives a factor
 MEDIAN_CHI2 = {3: 2.366, 2: 1.386, 1: 0.455}         # medians by degrees of freedom
 
@@ -113,7 +114,7 @@ def narrow_kernels(problem, state, scales=CAUCHY_SCALES):
         cauchy = _kernel.Cauchy.Create(scale)
         accepted = AcceptedMeasurements(
             measurements=m, weight=m.unit_weights, sighting_kernel=cauchy, range_kernel=cauchy)
-        state = optimize(replace(problem, accepted=accepted), state).state
+        state = optimize(replace(problem, accepted=accepted), state, tolerance=ROUGH).state
     return state
 
 
@@ -148,11 +149,6 @@ class Fit:
         """Log posterior density of the noise, or log evidence if all of it is known."""
         learned = self.posterior is not None and self.problem.accepted.share is None
         return self.posterior.log_density if learned else self.log_evidence
-
-    @cached_property
-    def equations(self):
-        """The NormalEquations at the state."""
-        return NormalEquations(self.problem, self.state)
 
 
 def refine(problem, state, accept=accepted_measurements):
@@ -189,8 +185,12 @@ def refine(problem, state, accept=accepted_measurements):
         moved = np.abs(state.c[WHEELS] / problem.odometry.wheel - 1).max()
         if not changed and moved < NEGLIGIBLE_MOVE:
             break
-    share = share if fixed else _shares(problem, state, accept)
-    if share is not None:
+    if not fixed:
+        all_hidden = replace(problem, noise=with_hidden_errors(
+            problem.noise, (True, True), m.dataset.vehicle))
+        share = np.concatenate([memory.share for memory in error_memories(
+            accept(all_hidden, state), *residuals(all_hidden, state))])
+    if share is not None and (share < 1).any():
         problem, posterior = _with_shares(problem, state, posterior, share, accept)
         optimum = None
         optimum = optimize(problem, state)
@@ -199,24 +199,13 @@ def refine(problem, state, accept=accepted_measurements):
                converged=optimum.converged)
 
 
-def _shares(problem, state, accept):
-    """Shares (s + r,) that the memory of errors leaves to measurements, None if there is none."""
-    m = problem.measurements
-    problem = replace(problem, noise=with_hidden_errors(
-        problem.noise, (True, True), m.dataset.vehicle))
-    share = np.concatenate([memory.share for memory in error_memories(
-        accept(problem, state), *residuals(problem, state))])
-    return share if (share < 1).any() else None
-
-
 def _with_shares(problem, state, posterior, share, accept):
     """The Problem with shares (s + r,) of errors with memory, and the posterior of its noise.
 
     The noise is that learned without shares, with hidden errors.
     """
-    m = problem.measurements
-    hidden = partial(with_hidden_errors, vehicle=m.dataset.vehicle, remember=[
-        (each < 1).any() for each in m.by_kind(share)])
+    hidden = partial(with_hidden_errors, vehicle=problem.measurements.dataset.vehicle, remember=[
+        (each < 1).any() for each in problem.measurements.by_kind(share)])
     problem = replace(problem, noise=hidden(problem.noise))
     problem = replace(problem, accepted=replace(accept(problem, state), share=share))
     return problem, posterior and replace(posterior, noise=problem.noise, points=tuple(

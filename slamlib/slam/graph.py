@@ -22,7 +22,7 @@ from slamlib.textfile import require
 
 CONVERGED = 1e-6             # decrease, over 1 + error, at which iterations end
 ROUNDING = 1e-12             # relative increase of the error that is due to float rounding
-MAX_GAUSS_NEWTON_STEPS = 40  # number of steps
+MAX_STEPS = 40               # number of steps of Gauss-Newton
 MAX_HALVINGS = 8             # number of halvings of one step
 
 
@@ -31,15 +31,14 @@ class Optimum(NamedTuple):
 
     equations: NormalEquations
     state: State             # where the error is smallest
-    error: float             # half the sum of squared whitened errors there
     steps: int               # number of steps taken
     converged: bool          # whether the error had stopped to decrease
 
 
-def optimize(problem, state, max_steps=MAX_GAUSS_NEWTON_STEPS, by_gtsam=False):
+def optimize(problem, state, max_steps=MAX_STEPS, by_gtsam=False, tolerance=CONVERGED):
     """The Optimum of a Problem from a State.
 
-    It ends where the error decreases by at most CONVERGED times (1 + error). Raises DatasetError
+    It ends where the error decreases by at most `tolerance` times (1 + error). Raises DatasetError
     if the measurements do not determine every variable.
     """
     equations, steps, ended = NormalEquations(problem, state), 0, False
@@ -56,9 +55,8 @@ def optimize(problem, state, max_steps=MAX_GAUSS_NEWTON_STEPS, by_gtsam=False):
                 break
         else:
             equations = NormalEquations(problem, state)
-        ended = error - equations.error <= CONVERGED * (1 + error)
-    return Optimum(equations=equations, state=equations.state, error=equations.error, steps=steps,
-                   converged=ended)
+        ended = error - equations.error <= tolerance * (1 + error)
+    return Optimum(equations=equations, state=equations.state, steps=steps, converged=ended)
 
 
 def gtsam_step(problem, state):

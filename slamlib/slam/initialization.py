@@ -111,9 +111,8 @@ def state_from_poses(measurements, poses, covariances, c=None, markers=consensus
         c = measurements.calibration.stated.copy()
         c[SIGHTING_LAG] += measurements.jumps.lag
     camera, z = sensor_poses(measurements, poses, c)[0], s.z * [c[SIZE], c[SIZE], 1]
-    A, B = se2.compose_jacobians(camera, z)
-    C = A @ covariances[s.row] @ A.mT + B @ s.C @ B.mT
-    return state_from_arrays(measurements, poses, markers(measurements, se2.compose(camera, z), C),
+    in_world = se2.compose_uncertain(camera, covariances[s.row], z, s.C)
+    return state_from_arrays(measurements, poses, markers(measurements, *in_world),
                              antennas(measurements, poses, covariances, c), c)
 
 

@@ -175,7 +175,8 @@ class NormalEquations:
         kinds = sightings, sightings, ranges, (None, 1.0)
         for group, (kernel, ratio), size in zip(self._measurement_groups, kinds, (3, 2, 1, 1)):
             share = ratio**2 / (consistency_factor(kernel, size) if consistent else 1.0)
-            total = [each + share * part for each, part in zip(total, group)]
+            if group is not None:
+                total = [each + share * part for each, part in zip(total, group)]
         return *total, log_determinant
 
     def counts(self):
@@ -205,8 +206,9 @@ class NormalEquations:
 
     @cached_property
     def _measurement_groups(self):
-        """The Group of each kind of `linearized`."""
-        return [self._group(*each) for each in enumerate(self.linearized, start=1)]
+        """The Group of each kind of `linearized`, None where there are no factors."""
+        return [self._group(kind, factors) if len(factors.e) else None
+                for kind, factors in enumerate(self.linearized, start=1)]
 
     @cached_property
     def _odometry(self):

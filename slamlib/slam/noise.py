@@ -26,7 +26,7 @@ MIN_DIFFERENCE = 0.003       # of a logarithm, smallest one of a difference quot
 MAX_STEP = 1.5               # of a logarithm, longest step of Newton's method
 SHORTEST_STEP = 0.1          # sigmas, to which a step that does not ascend is halved
 MAX_NEWTON_STEPS = 12        # number of steps of Newton's method
-CONVERGED_GAIN = 0.01        # log posterior gained by the last step of Newton's method
+CONVERGED_GAIN = 0.01        # log posterior gained by Newton's last step, beside what it predicts
 POINT_OFFSETS = 1.5 * np.arange(-2, 3)       # sigmas of log slip, points of the average
 SINGLE_POINT_SIGMA = 0.2     # of log slip, below which the mode alone is enough
 MIN_POINT_WEIGHT = 1e-3      # probability of a point; less probable ones are left out
@@ -123,7 +123,7 @@ def _mode(function, x, value, free, steps):
         gain = new - value
         if gain > 0:
             x, value = moved(step), new
-        if gain < CONVERGED_GAIN and not coarse:
+        if min(gain, abs(gain - gradient @ step / 2)) < CONVERGED_GAIN and not coarse:
             break
     full = np.zeros((len(x), len(x)))
     full[np.ix_(free, free)] = covariance

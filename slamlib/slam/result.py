@@ -156,7 +156,7 @@ def antenna_doubts(problem, state, frame_covariances, covariances, range_weight)
 
     From covariances (f, 3, 3) of the frames and (a, 2, 2) of the antennas, in world axes, and the
     share `range_weight` (r,) of its information that each range keeps. Reasons are a dict by id; in
-    doubt a covariance is at least the second moment of the position.
+    doubt the second moment of the position is added to a covariance.
     """
     m, sentences, covariances = problem.measurements, {}, covariances.copy()
     by_antenna = ranges_by_antenna(
@@ -166,7 +166,7 @@ def antenna_doubts(problem, state, frame_covariances, covariances, range_weight)
         sentence = _doubt(ranges, place, range_weight[m.ranges.antenna == k], *found[:2])
         if sentence is not None:
             sentences[int(m.antenna[k])] = sentence
-            covariances[k] = max(covariances[k], second_moment(*found, place), key=np.trace)
+            covariances[k] += second_moment(*found, place)
     return sentences, covariances
 
 
@@ -245,8 +245,7 @@ def _interpolate_section(problem, state, pairs, rows):
     B_b = B_b @ se2.inverse_jacobian(delta_b)
 
     from_a, from_b = se2.compose(poses[a], delta_a), se2.compose(poses[b], back)
-    difference = from_b - from_a
-    difference[:, 2] = se2.wrap(difference[:, 2])
+    difference = se2.difference(from_b, from_a)
     jump = difference[:, :, None] * difference[:, None] / np.maximum(jump_a + jump_b, MIN_SHARE)
     N_a, N_b = B_a @ Q_a @ B_a.mT + jump_a * jump, B_b @ Q_b @ B_b.mT + jump_b * jump
     gain_b = N_a @ np.linalg.inv(N_a + N_b)

@@ -36,8 +36,7 @@ def mean_by_information(measurements, in_world, covariances):
     m = measurements
     order = np.lexsort((np.linalg.slogdet(covariances)[1], m.marker_row))
     middle = in_world[order[np.unique(m.marker_row[order], return_index=True)[1]]]
-    difference = in_world - middle[m.marker_row]
-    difference[:, 2] = se2.wrap(difference[:, 2])
+    difference = se2.difference(in_world, middle[m.marker_row])
     information = np.linalg.inv(covariances)
     total, moment = np.zeros((len(m.marker), 3, 3)), np.zeros((len(m.marker), 3))
     np.add.at(total, m.marker_row, information)
@@ -113,8 +112,9 @@ def _from_each_start(problem, right, kernel, starts):
         off = (state.markers - best.state.markers)[:, :2]
         if kernel == "graduated":
             state = narrow_kernels(problem, state, CAUCHY_SCALES[:-1])
-        cost = optimize(last, state).error
-        numbers |= {f"{name} cost": cost, f"{name} right": cost < best.error + COST_TOLERANCE,
+        cost = optimize(last, state).equations.error
+        numbers |= {f"{name} cost": cost,
+                    f"{name} right": cost < best.equations.error + COST_TOLERANCE,
                     f"{name} initial error": np.sqrt(np.mean(np.sum(off**2, axis=1)))}
     return numbers
 

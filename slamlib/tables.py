@@ -1,0 +1,281 @@
+"""Finds the files of a dataset in its folder, and reads tables of numbers from them.
+
+A file is read under its name as browsers and Windows leave it, as `ArucoReading (1).txt` or
+`ArucoReading.txt.txt`, and a note says so. Other names are not guessed, but listed. The matrices of
+.mat files stand in for text files that are missing.
+
+Plain text has blanks or tabs between columns, decimal points, and comments that begin with `#`, `%`
+or `//`. Other separators, decimal commas and a header are read. The limits of the numbers are far
+wider than vehicles, cameras and antennas need: a number beyond them has another unit, or float64
+loses digits beside it. data/README.md lists them.
+"""
+
+import re
+from bisect import bisect_left
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.io import loadmat
+
+from slamlib.textfile import DatasetError, quoted, read_text, require
+
+ENCODER = "encoderReading.txt"
+
+
+@dataclass(frozen=True)
+class Limit:
+    """The closed interval in which a number lies."""
+
+    minimum: float
+    maximum: float
+    unit: str = ""
+    whole: bool = False
+
+    def __str__(self):
+        return f"from {self.minimum:g} to {self.maximum:g} {self.unit}".rstrip()
+
+    def holds(self, x):
+        """True where numbers are in the interval, and whole if they must be."""
+        return (self.minimum <= x) & (x <= self.maximum) & (not self.whole or x == np.rint(x))
+
+
+_ANY = Limit(-1e15, 1e15)               # float64 represents whole numbers up to there exactly
+_WHOLE = Limit(-1e15, 1e15, whole=True)  # ids and counts
+_VARIANCE = Limit(1e-18, 1e8, "m^2")
+_IN_VEHICLE, _GUESS, _TRUE = (Limit(-size, size, "m") for size in (1e4, 1e6, 1e9))
+_ANGLE, _TRUE_ANGLE = (Limit(-size, size, "rad") for size in (6.3, 1e9))
+# Limits by the name of a file and by its column, in the order of the file.
+LIMITS = {
+    ENCODER: {"pose id": _WHOLE, "right ticks": _WHOLE, "left ticks": _WHOLE},
+    "ArucoReading.txt": {
+        "pose id": _WHOLE, "marker id": _WHOLE, "x": _IN_VEHICLE, "y": _IN_VEHICLE, "theta": _ANGLE,
+        "s_xx": _VARIANCE, "s_xy": _ANY, "s_xtheta": _ANY, "s_yy": _VARIANCE, "s_ytheta": _ANY,
+        "s_thetatheta": Limit(1e-18, 1e14, "rad^2")},
+    "UwbReading.txt": {"pose id": _WHOLE, "antenna id": _WHOLE, "range": Limit(-5e4, 1e5, "m"),
+                       "sigma": Limit(1e-9, 1e4, "m")},
+    "UwbAntennaGuess.txt": {"antenna id": _WHOLE, "x": _GUESS, "y": _GUESS},
+    "vehiclePose.txt": {"pose id": _WHOLE, "x": _TRUE, "y": _TRUE, "theta": _TRUE_ANGLE},
+    "ArucoMap.txt": {"marker id": _WHOLE, "x": _TRUE, "y": _TRUE, "theta": _TRUE_ANGLE},
+    "UwbMap.txt": {"antenna id": _WHOLE, "x": _TRUE, "y": _TRUE}}
+
+# Names of the tables of a drive and of its truth, and of all files in its folder.
+TABLES, TRUTH_FILES = tuple(LIMITS)[:4], (*tuple(LIMITS)[4:], "vehicle.toml")
+DATASET_FILES = (*TABLES, "vehicle.toml", "truth")
+# Names of files that systems put into folders; clouds leave hidden ones in place of files.
+SYSTEM_FILES = re.compile(r"\..*(?<!\.icloud)|thumbs\.db|desktop\.ini|__macosx", re.IGNORECASE)
+# What browsers and Windows add to a name, and endings by that of the format.
+COPY = r"( - copy)?( ?\(\d+\))?"
+ENDINGS = {".txt": rf"{COPY}(\.(txt|csv|tsv|dat))*", ".toml": rf"{COPY}\.toml(\.txt)?", "": ""}
+MAX_LISTED_NAMES = 5  # file names in one sentence
+
+COMMENT_OR_QUOTE = re.compile(r'(#|%|//).*|"')
+EMPTY_CELL = re.compile(r"(?:^|(?<=[;,]))[^\S\n]*(?=[;,]|$)", re.MULTILINE)
+NUMBER_FIRST = re.compile(r"(^|[\s,;])\W*(\d|nan\b|inf)", re.IGNORECASE)  # in a row, not a header
+NO_DECIMAL_COMMA = re.compile(r"\.|(?<!\d),|,(?!\d)")
+DIALECTS = (None, "."), (",", "."), (";", "."), (None, ","), (";", ",")  # separator, decimal sign
+# Words of headers for two columns, in their order, by the second column of the file.
+HEADER_ORDER = {"right ticks": (r"right|dx|destra|r\b", r"left|sx|sinistra|l\b"),
+                "marker id": ("pos[ea]", "marker|aruco|tag|landmark"),
+                "antenna id": ("pos[ea]", "antenna|anchor|beacon|landmark")}
+
+
+@dataclass(frozen=True)
+class Table:
+    """The numbers of a table, with the places of its rows for messages."""
+
+    source: Path | str | None  # a file or an argument; None if there is none
+    numbers: np.ndarray  # (m, c)
+    lines: np.ndarray = ()  # (m,) of the rows, from 1
+    row: str = "line"  # what messages call one
+    notes: tuple[str, ...] = ()  # sentences on what was mended or left out
+
+    def noted(self, note):
+        """The Table with one more note, a clause about its file."""
+        return replace(self, notes=(*self.notes, f"{Path(str(self.source)).name}{note}."))
+
+    def kept(self, ok, expected, share=0.0):
+        """The Table of the rows where `ok` is True, with a note on the others.
+
+        `ok` (m,) or (m, c) is bool; the latter tells the number to quote, and `expected` (str) may
+        be one for each column. Raises DatasetError for the first of the others if they are more
+        than a share of the rows.
+        """
+        if ok.all():
+            return self
+        bad = ~ok.reshape(len(ok), -1).all(axis=1)
+        count, first = np.count_nonzero(bad), int(np.argmax(bad))
+        column = int(np.argmin(ok[first])) if ok.ndim == 2 else slice(None)
+        expected = expected if isinstance(expected, str) else expected[column]
+        found = " ".join(f"{x:.12g}" for x in np.atleast_1d(self.numbers[first, column]))
+        said, place = f"{expected}, found '{found}'", f"{self.row} {self.lines[first]}"
+        require(count <= share * len(bad), f"{self.source}, {place}", said)
+        kept = replace(self, numbers=self.numbers[~bad], lines=self.lines[~bad])
+        return kept.noted(f": {count} of {len(bad)} rows left out, the first in {place}: expected "
+                          f"{said}")
+
+
+def read_table(source, name, share=0.0, pose_count=None):
+    """The Table of a text file (Path) or Table, within LIMITS[name]; of None it has no rows.
+
+    A share of the rows may be beyond LIMITS, or have pose ids beyond `pose_count`, and if it is not
+    0, any may have NaN or no range. Raises DatasetError if there are more, or a row has words or
+    another number of columns.
+    """
+    limits = LIMITS[name] | ({"pose id": Limit(1, pose_count, whole=True)} if pose_count else {})
+    table = (_table_of_text(source, list(limits)) if isinstance(source, Path)
+             else source or Table(None, np.empty((0, len(limits)))))
+    measured = ~np.isnan(table.numbers)
+    if "range" in limits:
+        measured[:, 2] &= table.numbers[:, 2] != 0
+    table = table.kept(measured, [
+        f"{column}, a number{' (0 is no reception)' * (column == 'range')}" for column in limits],
+        share > 0)
+    ok = [limit.holds(x) for limit, x in zip(limits.values(), table.numbers.T)]
+    return table.kept(np.stack(ok, axis=-1), [
+        f"{column}, a {'whole' if limit.whole else 'finite'} number {limit}"
+        for column, limit in limits.items()], share)
+
+
+def table_of_array(source, value, name, counted=False):
+    """The Table of a `value` with the columns LIMITS[name], without rows if it is empty.
+
+    If `counted`, the first column, the numbers of the rows, is not among them. Raises DatasetError,
+    which names the `source` (str), if it is no matrix of real numbers.
+    """
+    columns = list(LIMITS[name])[counted:]
+    try:
+        array = np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        array = np.asarray(value, dtype=object)
+    array = array if array.size else np.empty((0, len(columns)))
+    require(array.dtype == float and array.ndim == 2 and array.shape[1] == len(columns), source,
+            f"a matrix of real numbers with {len(columns)} columns ({', '.join(columns)}), found "
+            f"{array.dtype} of shape {array.shape}")
+    rows = np.arange(1, len(array) + 1)
+    return Table(source, np.column_stack([rows, array]) if counted else array, rows, "row")
+
+
+def _table_of_text(source, columns):
+    """The Table of a text file with these columns, with NaN for empty cells."""
+    table = Table(source, np.empty((0, len(columns))))
+    rows = COMMENT_OR_QUOTE.sub("", read_text(source)).split("\n")
+    lines = [k for k, row in enumerate(rows, start=1) if row.strip(",; \t").strip()]
+    rows = [rows[k - 1].strip() for k in lines]
+    if rows and re.search("[A-Za-z]", rows[0]) and not NUMBER_FIRST.search(rows[0]):
+        words = [re.search(each, rows[0], re.I) for each in HEADER_ORDER.get(columns[1], ())]
+        require(None in words or words == sorted(words, key=re.Match.start),
+                f"{source}, line {lines[0]}", f"the columns {', '.join(columns)}", rows[0])
+        table = table.noted(f": the header {quoted(rows[0])} was left out")
+        rows, lines = rows[1:], lines[1:]
+    if not rows:
+        return table
+    for end in ",;":                                # an empty last cell in every row
+        if all(row.endswith(end) for row in rows):
+            rows = [row[:-1] for row in rows]
+    numbers, decimal = _numbers(rows, len(columns))
+    if numbers is None:
+        k = bisect_left(range(len(rows)), True,  # the first row that ends all dialects
+                        key=lambda k: _numbers(rows[:k + 1], len(columns))[0] is None)
+        require(False, f"{source}, line {lines[k]}",
+                f"{len(columns)} numbers ({', '.join(columns)})", rows[k])
+    table = table.noted(" was read with decimal commas") if decimal == "," else table
+    return replace(table, numbers=numbers, lines=np.array(lines))
+
+
+def _numbers(rows, count):
+    """Numbers (m, count) in rows of text and the decimal sign, by the first dialect that has them.
+
+    They are None if there is none.
+    """
+    text = "\n".join(rows)
+    for separator, decimal in DIALECTS:
+        if decimal == "," and NO_DECIMAL_COMMA.search(text):
+            continue
+        cells = text.replace(",", ".") if decimal == "," else text
+        cells = EMPTY_CELL.sub("nan", cells) if separator else cells
+        try:
+            numbers = np.loadtxt(cells.split("\n"), delimiter=separator, comments=None, ndmin=2)
+        except ValueError:                              # words, or rows of different length
+            continue
+        if numbers.shape == (len(rows), count):
+            return numbers, decimal
+    return None, None
+
+
+def contents(folder, expected=DATASET_FILES, required=None):
+    """Sources (dict of Path or Table) of the files of a folder by name, and notes (list of str).
+
+    Raises DatasetError if the folder cannot be read, the file `required` is missing, or two files
+    have one of the names `expected`.
+    """
+    folder, files, notes, rest = Path(folder), {}, [], []
+    for path in _listed(folder):
+        name = next((name for name in expected if _is_named(path, name)), None)
+        if name is None:
+            rest.append(path)
+        else:
+            require(name not in files, folder / name, "one file of this name, found "
+                    f"{files.get(name, path).name} and {path.name}: move one of them away")
+            files[name] = path
+            notes += [f"{path.name} was read as {name}."] * (path.name.lower() != name.lower())
+    if expected is DATASET_FILES:
+        rest = _add_variables(files, rest, notes)
+    require(required in (None, *files), folder / (required or ""),
+            ". ".join(["this file, found none", *_not_read(rest)]).rstrip("."))
+    return files, notes + _not_read(rest)
+
+
+def datasets_in(data):
+    """Names of the sub-folders with files of a dataset, and sentences on what else is there.
+
+    Raises what `contents` raises.
+    """
+    data = Path(data)
+    rest = [path for path in _listed(data) if path.name != "README.md"]
+    found = [path for path in rest if path.is_dir() and contents(path)[0]]
+    unread = _not_read([path for path in rest if path not in found])
+    return [path.name for path in found], [f"{data}: {each}" for each in unread]
+
+
+def _listed(folder):
+    """Sorted paths in a folder without SYSTEM_FILES."""
+    try:
+        return sorted(path for path in folder.iterdir() if not SYSTEM_FILES.fullmatch(path.name))
+    except (OSError, ValueError):  # ValueError: a NUL character in the folder's name
+        place = "" if folder.is_absolute() else f" (paths are relative to {Path.cwd()})"
+        raise DatasetError(f"{folder}: expected a folder that can be read{place}") from None
+
+
+def _is_named(path, name):
+    """True if a file (Path) has this name, apart from case and ENDINGS."""
+    pattern = Path(name).stem + ENDINGS[Path(name).suffix]
+    return bool(re.fullmatch(pattern, path.name, re.IGNORECASE)) and (
+        name == "truth" or not path.is_dir())
+
+
+def _add_variables(files, rest, notes):
+    """The paths `rest` without .mat files that are read.
+
+    Their variables with the names of missing TABLES are added to `files`, with `notes`.
+    """
+    unread = []
+    for path in rest:
+        missing = {Path(name).stem.lower(): name for name in TABLES if name not in files}
+        try:
+            variables = loadmat(path) if missing and path.suffix.lower() == ".mat" else {}
+        except Exception:           # scipy raises many kinds about other versions and bytes
+            variables = {}
+        found = {missing[key.lower()]: key for key in variables if key.lower() in missing}
+        for name, key in found.items():
+            files[name] = table_of_array(f"{path}, variable {key}", variables[key], name)
+            notes.append(f"Variable {key} of {path.name} was read as {name}.")
+        unread += [path] * (not found)
+    return unread
+
+
+def _not_read(paths):
+    """Sentences (list of str) with the first MAX_LISTED_NAMES, and how many more there are."""
+    listed = ", ".join(quoted(path.name) for path in paths[:MAX_LISTED_NAMES])
+    more = f" and {len(paths) - MAX_LISTED_NAMES} more" * (len(paths) > MAX_LISTED_NAMES)
+    return [f"Not read: {listed}{more}."] * bool(paths)
