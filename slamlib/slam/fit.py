@@ -41,7 +41,7 @@ KERNELS = {
 ONE_SIDED = {"asymmetric Cauchy": -0.10555, "asymmetric Tukey": -0.07581}
 
 CAUCHY_SCALES = (100.0, 30.0, 10.0, 3.0)     # sigmas, scale of the kernel in each round
-ROUGH = 1e-3                 # relative decrease of the error at which a round ends
+ROUGH = 1e-4                 # relative decrease of the error at which a round ends
 MIN_RESIDUALS = 20           # number of measurements from which their scatter gives a factor
 MEDIAN_CHI2 = {3: 2.366, 2: 1.386, 1: 0.455}         # medians by degrees of freedom
 
