@@ -11,8 +11,7 @@ import numpy as np
 
 from slamlib import localization, odometry, results, se2, slam
 from slamlib.checks.solution import solution_doubts
-from slamlib.dataset import DatasetError
-from slamlib.doubt import Doubt
+from slamlib.dataset import DatasetError, Doubt
 
 UNSOLVABLE = (DatasetError, np.linalg.LinAlgError)  # what `find` raises where there is no solution
 

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 from scipy.io import loadmat
 
+from slamlib import se2
 from slamlib.textfile import DatasetError, quoted, read_text, require
 
 ENCODER = "encoderReading.txt"
@@ -59,14 +60,37 @@ LIMITS = {
     "ArucoMap.txt": {"marker id": _WHOLE, "x": _TRUE, "y": _TRUE, "theta": _TRUE_ANGLE},
     "UwbMap.txt": {"antenna id": _WHOLE, "x": _TRUE, "y": _TRUE}}
 
+MAX_BAD_SHARE = 0.1  # of the rows of a sensor, which are left out; with more a file is refused
+MIN_EIGENVALUE = 1e-12  # of a correlation matrix; with a smaller one it counts as singular
+MAX_NEGATIVE_SIGMAS = 5.0  # sigmas, by which noise may make a range negative
+
+
+def covariances(rows):
+    """Covariances (m, 3, 3) of rows (m, 11) of sightings."""
+    return rows[:, [5, 6, 7, 6, 8, 9, 7, 9, 10]].reshape(-1, 3, 3)
+
+
+_COUNTED = (lambda x: x[:, 0] == np.arange(1, len(x) + 1), "pose ids 1, 2, 3, ... in order")
+_UNIQUE = (lambda x: np.isin(np.arange(len(x)), np.unique(x[:, 0], return_index=True)[1]),
+           "each id only once")
+# By file, which rows of its numbers (m, c) are right, and what is expected of them. Covariances are
+# scaled to correlations: s_thetatheta may be 1e4 rad^2 where s_xx is 1e-4 m^2.
+CHECKS = {
+    ENCODER: _COUNTED, "vehiclePose.txt": _COUNTED, "UwbAntennaGuess.txt": _UNIQUE,
+    "ArucoMap.txt": _UNIQUE, "UwbMap.txt": _UNIQUE,
+    "ArucoReading.txt": (
+        lambda x: np.linalg.eigvalsh(se2.correlations(covariances(x)))[:, 0] > MIN_EIGENVALUE,
+        "a positive definite covariance (smallest eigenvalue of its correlation matrix above "
+        f"{MIN_EIGENVALUE:g})"),
+    "UwbReading.txt": (lambda x: x[:, 2] >= -MAX_NEGATIVE_SIGMAS * x[:, 3],
+                       f"a range that is not below -{MAX_NEGATIVE_SIGMAS:g} sigma")}
 # Names of the tables of a drive and of its truth, and of all files in its folder.
 TABLES, TRUTH_FILES = tuple(LIMITS)[:4], (*tuple(LIMITS)[4:], "vehicle.toml")
 DATASET_FILES = (*TABLES, "vehicle.toml", "truth")
+# What may stand after a name without its ending, as browsers and Windows leave it.
+ENDING = r"( - copy)?( ?\(\d+\))?(\.(txt|csv|tsv|dat|toml))*"
 # Names of files that systems put into folders; clouds leave hidden ones in place of files.
 SYSTEM_FILES = re.compile(r"\..*(?<!\.icloud)|thumbs\.db|desktop\.ini|__macosx", re.IGNORECASE)
-# What browsers and Windows add to a name, and endings by that of the format.
-COPY = r"( - copy)?( ?\(\d+\))?"
-ENDINGS = {".txt": rf"{COPY}(\.(txt|csv|tsv|dat))*", ".toml": rf"{COPY}\.toml(\.txt)?", "": ""}
 MAX_LISTED_NAMES = 5  # file names in one sentence
 
 COMMENT_OR_QUOTE = re.compile(r'(#|%|//).*|"')
@@ -115,14 +139,17 @@ class Table:
                           f"{said}")
 
 
-def read_table(source, name, share=0.0, pose_count=None):
-    """The Table of a text file (Path) or Table, within LIMITS[name]; of None it has no rows.
+def read_table(source, name, pose_count=None):
+    """The Table of a text file (Path) or Table, whose rows pass all checks; of None it has no rows.
 
-    A share of the rows may be beyond LIMITS, or have pose ids beyond `pose_count`, and if it is not
-    0, any may have NaN or no range. Raises DatasetError if there are more, or a row has words or
-    another number of columns.
+    The checks are LIMITS[name] and CHECKS[name]. Readings of a sensor have pose ids up to
+    `pose_count`; of them are left out, with a note, rows with NaN or without a range, and up to
+    MAX_BAD_SHARE of others that do not pass. Raises DatasetError for any other row, as one with
+    words or another number of columns.
     """
-    limits = LIMITS[name] | ({"pose id": Limit(1, pose_count, whole=True)} if pose_count else {})
+    limits, share = LIMITS[name], MAX_BAD_SHARE if pose_count else 0.0
+    if pose_count:
+        limits = limits | {"pose id": Limit(1, pose_count, whole=True)}
     table = (_table_of_text(source, list(limits)) if isinstance(source, Path)
              else source or Table(None, np.empty((0, len(limits)))))
     measured = ~np.isnan(table.numbers)
@@ -132,9 +159,11 @@ def read_table(source, name, share=0.0, pose_count=None):
         f"{column}, a number{' (0 is no reception)' * (column == 'range')}" for column in limits],
         share > 0)
     ok = [limit.holds(x) for limit, x in zip(limits.values(), table.numbers.T)]
-    return table.kept(np.stack(ok, axis=-1), [
+    table = table.kept(np.stack(ok, axis=-1), [
         f"{column}, a {'whole' if limit.whole else 'finite'} number {limit}"
         for column, limit in limits.items()], share)
+    right, expected = CHECKS[name]
+    return table.kept(right(table.numbers), expected, share)
 
 
 def table_of_array(source, value, name, counted=False):
@@ -210,32 +239,42 @@ def contents(folder, expected=DATASET_FILES, required=None):
     have one of the names `expected`.
     """
     folder, files, notes, rest = Path(folder), {}, [], []
+    patterns = {name: name if name == "truth" else Path(name).stem + ENDING for name in expected}
     for path in _listed(folder):
-        name = next((name for name in expected if _is_named(path, name)), None)
+        name = next((name for name, pattern in patterns.items()
+                     if re.fullmatch(pattern, path.name, re.IGNORECASE)
+                     and (name == "truth" or not path.is_dir())), None)
         if name is None:
             rest.append(path)
-        else:
-            require(name not in files, folder / name, "one file of this name, found "
-                    f"{files.get(name, path).name} and {path.name}: move one of them away")
-            files[name] = path
-            notes += [f"{path.name} was read as {name}."] * (path.name.lower() != name.lower())
+            continue
+        require(name not in files, folder / name, "one file of this name, found "
+                f"{files.get(name, path).name} and {path.name}: move one of them away")
+        files[name] = path
+        notes += [f"{path.name} was read as {name}."] * (path.name.lower() != name.lower())
     if expected is DATASET_FILES:
-        rest = _add_variables(files, rest, notes)
+        rest = [path for path in rest if not _add_variables(files, path, notes)]
     require(required in (None, *files), folder / (required or ""),
             ". ".join(["this file, found none", *_not_read(rest)]).rstrip("."))
     return files, notes + _not_read(rest)
 
 
-def datasets_in(data):
-    """Names of the sub-folders with files of a dataset, and sentences on what else is there.
+def datasets_in(data, names=None):
+    """Names (list) of the datasets in a folder, and sentences (list) on what else is there.
 
-    Raises what `contents` raises.
+    They are all sub-folders with files of a dataset, or those that `names` selects. Raises
+    DatasetError if there is none, no sub-folder of a selected name, or no encoderReading.txt in it.
     """
     data = Path(data)
     rest = [path for path in _listed(data) if path.name != "README.md"]
-    found = [path for path in rest if path.is_dir() and contents(path)[0]]
-    unread = _not_read([path for path in rest if path not in found])
-    return [path.name for path in found], [f"{data}: {each}" for each in unread]
+    found = [path.name for path in rest if path.is_dir() and contents(path)[0]]
+    require(found, data, f"this folder, with a sub-folder with an {ENCODER} for each dataset, "
+            "found none")
+    unread = _not_read([path for path in rest if path.name not in found])
+    names = found if names is None else list(names)
+    for name in names:
+        require((data / name).is_dir(), data, f"one of {', '.join(found)}", name)
+        contents(data / name, required=ENCODER)
+    return names, [f"{data}: {each}" for each in unread]
 
 
 def _listed(folder):
@@ -247,31 +286,18 @@ def _listed(folder):
         raise DatasetError(f"{folder}: expected a folder that can be read{place}") from None
 
 
-def _is_named(path, name):
-    """True if a file (Path) has this name, apart from case and ENDINGS."""
-    pattern = Path(name).stem + ENDINGS[Path(name).suffix]
-    return bool(re.fullmatch(pattern, path.name, re.IGNORECASE)) and (
-        name == "truth" or not path.is_dir())
-
-
-def _add_variables(files, rest, notes):
-    """The paths `rest` without .mat files that are read.
-
-    Their variables with the names of missing TABLES are added to `files`, with `notes`.
-    """
-    unread = []
-    for path in rest:
-        missing = {Path(name).stem.lower(): name for name in TABLES if name not in files}
-        try:
-            variables = loadmat(path) if missing and path.suffix.lower() == ".mat" else {}
-        except Exception:           # scipy raises many kinds about other versions and bytes
-            variables = {}
-        found = {missing[key.lower()]: key for key in variables if key.lower() in missing}
-        for name, key in found.items():
-            files[name] = table_of_array(f"{path}, variable {key}", variables[key], name)
-            notes.append(f"Variable {key} of {path.name} was read as {name}.")
-        unread += [path] * (not found)
-    return unread
+def _add_variables(files, path, notes):
+    """Add variables of a .mat file with the names of missing TABLES; False if there is none."""
+    missing = {Path(name).stem.lower(): name for name in TABLES if name not in files}
+    try:
+        variables = loadmat(path) if missing and path.suffix.lower() == ".mat" else {}
+    except Exception:               # scipy raises many kinds about other versions and bytes
+        return False
+    found = {missing[key.lower()]: key for key in variables if key.lower() in missing}
+    for name, key in found.items():
+        files[name] = table_of_array(f"{path}, variable {key}", variables[key], name)
+        notes.append(f"Variable {key} of {path.name} was read as {name}.")
+    return bool(found)
 
 
 def _not_read(paths):

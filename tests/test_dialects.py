@@ -19,7 +19,6 @@ from slamlib.dataset import (
     Dataset,
     DatasetError,
     Vehicle,
-    dataset_names,
     inventory_lines,
     read_dataset,
     read_truth,
@@ -260,7 +259,7 @@ def test_a_name_that_is_unmistakable_is_read_with_a_note(folder, name, variant):
     assert_same_but_notes(dataset, clean)
     assert_same(read_truth(folder), truth)
     assert dataset.notes == (f"{variant} was read as {name}.",)
-    assert dataset_names(folder.parent) == ["drive"]
+    assert datasets_in(folder.parent) == (["drive"], [])
 
 
 @pytest.mark.parametrize("change", [str.upper, str.lower])
@@ -281,7 +280,7 @@ def test_names_in_another_case_are_found_in_the_folder_truth_too(folder, change)
 
 def test_two_files_of_one_name_are_refused(folder):  # noqa: F811
     shutil.copy(folder / "ArucoReading.txt", folder / "ArucoReading (1).txt")
-    assert error_of(read_dataset, folder) == error_of(dataset_names, folder.parent) == (
+    assert error_of(read_dataset, folder) == error_of(datasets_in, folder.parent) == (
         f"{folder / 'ArucoReading.txt'}: expected one file of this name, found ArucoReading (1).txt"
         " and ArucoReading.txt: move one of them away")
 
@@ -323,15 +322,16 @@ def test_datasets_are_the_folders_with_any_file_of_one_and_all_others_are_named(
         write(tmp_path / "notes" / name, b"\0")
     write(tmp_path / "course.zip", b"PK")
     assert datasets_in(tmp_path)[1] == [f"{tmp_path}: Not read: 'course.zip', 'notes'."]
-    assert dataset_names(tmp_path) == ["a", "b"] and dataset_names(tmp_path, ["b"]) == ["b"]
+    assert datasets_in(tmp_path)[0] == ["a", "b"] and datasets_in(tmp_path, ["b"])[0] == ["b"]
     for name in ("UwbReading.txt", "vehicle.toml.txt"):
         write(tmp_path / f"{name}_alone" / name, "")
-    assert datasets_in(tmp_path)[0] == ["UwbReading.txt_alone", "a", "b", "vehicle.toml.txt_alone"]
+    with pytest.raises(DatasetError, match="UwbReading.txt_alone.enc.*expected this file"):
+        datasets_in(tmp_path)
     absent = "encoderReading.txt: expected this file, found none"
     for names, said in ((["c"], "expected one of UwbReading.txt_alone, a, b, .*, found 'c'"),
                         (["notes"], f"notes.{absent}"), (None, f"UwbReading.txt_alone.{absent}")):
         with pytest.raises(DatasetError, match=said):
-            dataset_names(tmp_path, names)
+            datasets_in(tmp_path, names)
 
 
 def test_what_was_found_is_said(folder):  # noqa: F811

@@ -10,8 +10,15 @@ from numeric import as_points, changed
 
 from slamlib.checks import files
 from slamlib.checks.files import doubts_before_solving
-from slamlib.dataset import AntennaGuess, Dataset, DatasetError, UwbReadings, Vehicle, read_dataset
-from slamlib.doubt import Doubt
+from slamlib.dataset import (
+    AntennaGuess,
+    Dataset,
+    DatasetError,
+    Doubt,
+    UwbReadings,
+    Vehicle,
+    read_dataset,
+)
 from slamlib.simulation import manoeuvre, simulate, write_dataset
 
 SEEDS = (0, 1)

@@ -12,8 +12,7 @@ from test_document import text_of
 from test_report import write
 
 from slamlib.__main__ import main
-from slamlib.dataset import DatasetError
-from slamlib.doubt import Doubt
+from slamlib.dataset import DatasetError, Doubt
 from slamlib.report import handin
 from slamlib.report.build import Report
 from slamlib.report.drives import SolvedDrive

@@ -10,8 +10,7 @@ import pytest
 from test_document import text_of
 
 from slamlib import evaluation, se2
-from slamlib.dataset import read_dataset, read_truth
-from slamlib.doubt import Doubt
+from slamlib.dataset import Doubt, read_dataset, read_truth
 from slamlib.notebook import plotting
 from slamlib.report import drives as solved_drives
 from slamlib.report import overview

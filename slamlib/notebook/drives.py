@@ -15,10 +15,10 @@ from IPython.display import Markdown, display
 from matplotlib_inline.backend_inline import set_matplotlib_formats
 
 from slamlib import solve
-from slamlib.dataset import Dataset, Truth, dataset_names, read_dataset, read_truth
-from slamlib.doubt import Doubt
+from slamlib.dataset import Dataset, Doubt, Truth, read_dataset, read_truth
 from slamlib.notebook import plotting
 from slamlib.simulation import simulate
+from slamlib.tables import datasets_in
 
 KEY = "slamlib"  # of records in the metadata of outputs
 # Types of records by their key.
@@ -58,7 +58,7 @@ def start(sensor=None):
     set_matplotlib_formats("svg", metadata={"Date": None})
     data = _folder("SLAMLIB_DATA", "data")
     selected = os.environ.get("SLAMLIB_DATASETS")
-    names = dataset_names(data, selected.split("\n") if selected else None)
+    names, _ = datasets_in(data, selected.split("\n") if selected else None)
     drives = [Drive(name, read_dataset(data / name), read_truth(data / name)) for name in names]
     return _or_simulated([drive for drive in sorted(drives, key=lambda d: len(d.dataset.ticks))
                           if not sensor or getattr(drive.dataset, sensor) is not None])

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slamlib.checks.files import doubts_before_solving, merged
-from slamlib.dataset import Dataset, Truth
-from slamlib.doubt import Doubt
+from slamlib.dataset import Dataset, Doubt, Truth
 from slamlib.report.execution import NotebookError
 from slamlib.results import read_structs
 from slamlib.solve import PROBLEMS, SENSORS, Failure, Solution, title
