@@ -15,16 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from slamlib import se2
-from slamlib.tables import (
-    ENCODER,
-    TABLES,
-    TRUTH_FILES,
-    contents,
-    covariances,
-    read_table,
-    table_of_array,
-)
+from slamlib import se2, tables
+from slamlib.tables import ENCODER, TABLES, TRUTH_FILES, contents, read_table
 from slamlib.textfile import DatasetError as DatasetError
 from slamlib.textfile import require, require_type
 from slamlib.vehicle import Vehicle, changed, incremental_counts, read_vehicle
@@ -105,7 +97,7 @@ class Dataset:
         """
         require_type(vehicle, Vehicle, "vehicle")
         arguments = ("ticks", ticks), ("aruco", aruco), ("uwb", uwb), ("guess", guess)
-        files = {file: table_of_array(key, () if value is None else value, file, key == "ticks")
+        files = {file: tables.table_of_array(key, value, file, counted=key == "ticks")
                  for file, (key, value) in zip(TABLES, arguments)}
         return _dataset(files, changed(TABLE_2, vars(vehicle), "vehicle"), name)
 
@@ -185,7 +177,8 @@ def _dataset(files, vehicle, name, notes=()):
     (*sighting, rows), (*measured, ranges) = map(_in_order, (seen.numbers, heard.numbers))
     return Dataset(
         name=name, vehicle=vehicle, ticks=ticks,
-        aruco=ArucoReadings(*sighting, rows[:, 2:5], covariances(rows)) if len(rows) else None,
+        aruco=ArucoReadings(*sighting, rows[:, 2:5], rows[:, tables.COVARIANCE]
+                            ) if len(rows) else None,
         uwb=UwbReadings(*measured, *ranges[:, 2:].T) if len(ranges) else None,
         antenna_guess=AntennaGuess(*_by_id(guess)) if len(guess.numbers) else None,
         notes=(*notes, *encoders.notes, *seen.notes, *heard.notes, *guess.notes))
@@ -245,14 +238,14 @@ def all_notes(dataset, truth):
     weighed = [f"Problems 3 and 4 are solved with {key} = {json.dumps(value)}."
                for key in ("kernel", "gate")
                if (value := getattr(dataset.vehicle, key)) != getattr(TABLE_2, key)]
-    return (*dataset.notes, *weighed, *(() if truth is None else truth.notes))
+    return (*dataset.notes, *weighed, *(truth.notes if truth else ()))
 
 
 def inventory_lines(dataset, truth):
     """Lines (list of str) on what was read of a Dataset and its Truth or None, with all notes."""
     aruco, uwb = dataset.aruco, dataset.uwb
-    stated = [f"{key} = {value:g}" if isinstance(value, float) else f"{key} = {json.dumps(value)}"
-              for key, value in vars(dataset.vehicle).items() if value != getattr(TABLE_2, key)]
+    stated = [f"{key} = {json.dumps(value)}" for key, value in vars(dataset.vehicle).items()
+              if value != getattr(TABLE_2, key)]
     right, left = abs(dataset.ticks).sum(axis=0)
     return [f"{dataset.name}: {line}" for line in (
         f"encoders: {len(dataset.ticks)} poses, {right} ticks right and {left} left",

@@ -1,18 +1,16 @@
 """Finds the files of a dataset in its folder, and reads tables of numbers from them.
 
-A file is read under its name as browsers and Windows leave it, as `ArucoReading (1).txt` or
-`ArucoReading.txt.txt`, and a note says so. Other names are not guessed, but listed. The matrices of
-.mat files stand in for text files that are missing.
-
-Plain text has blanks or tabs between columns, decimal points, and comments that begin with `#`, `%`
-or `//`. Other separators, decimal commas and a header are read. The limits of the numbers are far
+A file is read under its name as browsers and Windows leave it, as `ArucoReading (1).txt`, and a
+note says so. Other names are not guessed, but listed. Matrices of .mat files stand in for missing
+text files. Text has blanks between columns, decimal points, and comments that begin with `#`, `%`
+or `//`; other separators, decimal commas and a header are read. The limits of the numbers are far
 wider than vehicles, cameras and antennas need: a number beyond them has another unit, or float64
 loses digits beside it. data/README.md lists them.
 """
 
 import re
-from bisect import bisect_left
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
@@ -63,12 +61,7 @@ LIMITS = {
 MAX_BAD_SHARE = 0.1  # of the rows of a sensor, which are left out; with more a file is refused
 MIN_EIGENVALUE = 1e-12  # of a correlation matrix; with a smaller one it counts as singular
 MAX_NEGATIVE_SIGMAS = 5.0  # sigmas, by which noise may make a range negative
-
-
-def covariances(rows):
-    """Covariances (m, 3, 3) of rows (m, 11) of sightings."""
-    return rows[:, [5, 6, 7, 6, 8, 9, 7, 9, 10]].reshape(-1, 3, 3)
-
+COVARIANCE = [[5, 6, 7], [6, 8, 9], [7, 9, 10]]  # columns of the covariance of a sighting
 
 _COUNTED = (lambda x: x[:, 0] == np.arange(1, len(x) + 1), "pose ids 1, 2, 3, ... in order")
 _UNIQUE = (lambda x: np.isin(np.arange(len(x)), np.unique(x[:, 0], return_index=True)[1]),
@@ -79,7 +72,7 @@ CHECKS = {
     ENCODER: _COUNTED, "vehiclePose.txt": _COUNTED, "UwbAntennaGuess.txt": _UNIQUE,
     "ArucoMap.txt": _UNIQUE, "UwbMap.txt": _UNIQUE,
     "ArucoReading.txt": (
-        lambda x: np.linalg.eigvalsh(se2.correlations(covariances(x)))[:, 0] > MIN_EIGENVALUE,
+        lambda x: np.linalg.eigvalsh(se2.correlations(x[:, COVARIANCE]))[:, 0] > MIN_EIGENVALUE,
         "a positive definite covariance (smallest eigenvalue of its correlation matrix above "
         f"{MIN_EIGENVALUE:g})"),
     "UwbReading.txt": (lambda x: x[:, 2] >= -MAX_NEGATIVE_SIGMAS * x[:, 3],
@@ -94,9 +87,9 @@ SYSTEM_FILES = re.compile(r"\..*(?<!\.icloud)|thumbs\.db|desktop\.ini|__macosx",
 MAX_LISTED_NAMES = 5  # file names in one sentence
 
 COMMENT_OR_QUOTE = re.compile(r'(#|%|//).*|"')
-EMPTY_CELL = re.compile(r"(?:^|(?<=[;,]))[^\S\n]*(?=[;,]|$)", re.MULTILINE)
 NUMBER_FIRST = re.compile(r"(^|[\s,;])\W*(\d|nan\b|inf)", re.IGNORECASE)  # in a row, not a header
-NO_DECIMAL_COMMA = re.compile(r"\.|(?<!\d),|,(?!\d)")
+NUMBER = {sign: rf"[+-]?(?:(?:{digits})(?:e[+-]?[0-9]+)?|nan|inf(?:inity)?)" for sign, digits in (
+    (".", r"[0-9]+\.?[0-9]*|\.[0-9]+"), (",", "[0-9]+(?:,[0-9]+)?"))}
 DIALECTS = (None, "."), (",", "."), (";", "."), (None, ","), (";", ",")  # separator, decimal sign
 # Words of headers for two columns, in their order, by the second column of the file.
 HEADER_ORDER = {"right ticks": (r"right|dx|destra|r\b", r"left|sx|sinistra|l\b"),
@@ -147,17 +140,14 @@ def read_table(source, name, pose_count=None):
     MAX_BAD_SHARE of others that do not pass. Raises DatasetError for any other row, as one with
     words or another number of columns.
     """
-    limits, share = LIMITS[name], MAX_BAD_SHARE if pose_count else 0.0
-    if pose_count:
-        limits = limits | {"pose id": Limit(1, pose_count, whole=True)}
+    limits = LIMITS[name] | ({"pose id": Limit(1, pose_count, whole=True)} if pose_count else {})
     table = (_table_of_text(source, list(limits)) if isinstance(source, Path)
              else source or Table(None, np.empty((0, len(limits)))))
-    measured = ~np.isnan(table.numbers)
-    if "range" in limits:
-        measured[:, 2] &= table.numbers[:, 2] != 0
-    table = table.kept(measured, [
+    measured = (table.numbers != 0) | (np.array([*limits]) != "range")
+    table = table.kept(measured & ~np.isnan(table.numbers), [
         f"{column}, a number{' (0 is no reception)' * (column == 'range')}" for column in limits],
-        share > 0)
+        share=bool(pose_count))
+    share = MAX_BAD_SHARE * bool(pose_count)
     ok = [limit.holds(x) for limit, x in zip(limits.values(), table.numbers.T)]
     table = table.kept(np.stack(ok, axis=-1), [
         f"{column}, a {'whole' if limit.whole else 'finite'} number {limit}"
@@ -177,7 +167,7 @@ def table_of_array(source, value, name, counted=False):
         array = np.asarray(value, dtype=float)
     except (TypeError, ValueError):
         array = np.asarray(value, dtype=object)
-    array = array if array.size else np.empty((0, len(columns)))
+    array = np.empty((0, len(columns))) if value is None or not array.size else array
     require(array.dtype == float and array.ndim == 2 and array.shape[1] == len(columns), source,
             f"a matrix of real numbers with {len(columns)} columns ({', '.join(columns)}), found "
             f"{array.dtype} of shape {array.shape}")
@@ -189,7 +179,7 @@ def _table_of_text(source, columns):
     """The Table of a text file with these columns, with NaN for empty cells."""
     table = Table(source, np.empty((0, len(columns))))
     rows = COMMENT_OR_QUOTE.sub("", read_text(source)).split("\n")
-    lines = [k for k, row in enumerate(rows, start=1) if row.strip(",; \t").strip()]
+    lines = [k for k, row in enumerate(rows, start=1) if re.search(r"[^,;\s]", row)]
     rows = [rows[k - 1].strip() for k in lines]
     if rows and re.search("[A-Za-z]", rows[0]) and not NUMBER_FIRST.search(rows[0]):
         words = [re.search(each, rows[0], re.I) for each in HEADER_ORDER.get(columns[1], ())]
@@ -199,37 +189,22 @@ def _table_of_text(source, columns):
         rows, lines = rows[1:], lines[1:]
     if not rows:
         return table
-    for end in ",;":                                # an empty last cell in every row
-        if all(row.endswith(end) for row in rows):
-            rows = [row[:-1] for row in rows]
-    numbers, decimal = _numbers(rows, len(columns))
-    if numbers is None:
-        k = bisect_left(range(len(rows)), True,  # the first row that ends all dialects
-                        key=lambda k: _numbers(rows[:k + 1], len(columns))[0] is None)
-        require(False, f"{source}, line {lines[k]}",
-                f"{len(columns)} numbers ({', '.join(columns)})", rows[k])
+    cells, decimal = max(((_cells(rows, len(columns), *dialect), dialect[1])
+                          for dialect in DIALECTS), key=lambda each: len(each[0]))
+    if len(cells) < len(rows):
+        require(False, f"{source}, line {lines[len(cells)]}",
+                f"{len(columns)} numbers ({', '.join(columns)})", rows[len(cells)])
     table = table.noted(" was read with decimal commas") if decimal == "," else table
+    numbers = np.array([[float(cell.replace(",", ".")) for cell in row] for row in cells])
     return replace(table, numbers=numbers, lines=np.array(lines))
 
 
-def _numbers(rows, count):
-    """Numbers (m, count) in rows of text and the decimal sign, by the first dialect that has them.
-
-    They are None if there is none.
-    """
-    text = "\n".join(rows)
-    for separator, decimal in DIALECTS:
-        if decimal == "," and NO_DECIMAL_COMMA.search(text):
-            continue
-        cells = text.replace(",", ".") if decimal == "," else text
-        cells = EMPTY_CELL.sub("nan", cells) if separator else cells
-        try:
-            numbers = np.loadtxt(cells.split("\n"), delimiter=separator, comments=None, ndmin=2)
-        except ValueError:                              # words, or rows of different length
-            continue
-        if numbers.shape == (len(rows), count):
-            return numbers, decimal
-    return None, None
+def _cells(rows, count, separator, decimal):
+    """Numbers as text, `count` for each of the rows that a dialect has before the first other."""
+    number = f"({NUMBER[decimal]})"
+    cells = [rf"\s*(?:{number}\s*)?" if separator else number] * count
+    row = re.compile((separator or r"\s+").join(cells) + r"[\s,;]*", re.IGNORECASE)
+    return [match.groups("nan") for match in takewhile(bool, map(row.fullmatch, rows))]
 
 
 def contents(folder, expected=DATASET_FILES, required=None):
