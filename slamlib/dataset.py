@@ -3,8 +3,7 @@
 The folder holds `encoderReading.txt` and, where the vehicle has the sensors, `ArucoReading.txt` and
 `UwbReading.txt` with `UwbAntennaGuess.txt`. Optional are `vehicle.toml`, with what differs from the
 assignment's table 2, and the folder `truth`. Lengths are in metres, angles in radians. Pose ids
-count from 1 in the files and from 0 in the arrays; marker and antenna ids stay unchanged. `tables`
-finds and reads the files.
+count from 1 in the files and from 0 in the arrays; marker and antenna ids stay unchanged.
 """
 
 import json
@@ -86,9 +85,8 @@ class Dataset:
         guess : (a, 3) antenna id, x, y, of all antennas in `uwb`; or None.
         vehicle : Vehicle
 
-        A bad row of `aruco` or `uwb` is left out, with a note, where one of a file is. Raises
-        DatasetError, which names the argument and the row, from 1, if another row or an argument
-        does not pass the checks of its file.
+        Rows are checked, and bad ones left out with a note, as those of files. Raises DatasetError,
+        which names the argument and the row, from 1, where a file would be refused.
 
         >>> dataset = Dataset.from_arrays(ticks=[[0, 0], [10, 12]], uwb=[[2, 7, 1.5, 0.1]],
         ...                               guess=[[7, 1.0, 1.0]])

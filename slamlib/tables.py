@@ -104,41 +104,41 @@ class Table:
     source: Path | str | None  # a file or an argument; None if there is none
     numbers: np.ndarray  # (m, c)
     lines: np.ndarray = ()  # (m,) of the rows, from 1
-    row: str = "line"  # what messages call one
     notes: tuple[str, ...] = ()  # sentences on what was mended or left out
 
     def noted(self, note):
         """The Table with one more note, a clause about its file."""
         return replace(self, notes=(*self.notes, f"{Path(str(self.source)).name}{note}."))
 
-    def kept(self, ok, expected, share=0.0):
-        """The Table of the rows where `ok` is True, with a note on the others.
+    def place(self, k):
+        """What messages call row k (str)."""
+        return f"{'line' if isinstance(self.source, Path) else 'row'} {self.lines[k]}"
 
-        `ok` (m,) or (m, c) is bool; the latter tells the number to quote, and `expected` (str) may
-        be one for each column. Raises DatasetError for the first of the others if they are more
-        than a share of the rows.
+    def kept(self, ok, expected, share=0.0):
+        """The Table of the rows where `ok` (m,) or (m, c) is True, with a note on the others.
+
+        `expected` (str) may be one for each of c columns. Raises DatasetError for the first of the
+        others if they are more than a share of the rows.
         """
         if ok.all():
             return self
         bad = ~ok.reshape(len(ok), -1).all(axis=1)
         count, first = np.count_nonzero(bad), int(np.argmax(bad))
-        column = int(np.argmin(ok[first])) if ok.ndim == 2 else slice(None)
+        column = int(np.argmin(ok[first])) if ok.ndim == 2 else slice(None)  # what is quoted
         expected = expected if isinstance(expected, str) else expected[column]
         found = " ".join(f"{x:.12g}" for x in np.atleast_1d(self.numbers[first, column]))
-        said, place = f"{expected}, found '{found}'", f"{self.row} {self.lines[first]}"
+        said, place = f"{expected}, found '{found}'", self.place(first)
         require(count <= share * len(bad), f"{self.source}, {place}", said)
-        kept = replace(self, numbers=self.numbers[~bad], lines=self.lines[~bad])
-        return kept.noted(f": {count} of {len(bad)} rows left out, the first in {place}: expected "
-                          f"{said}")
+        return replace(self, numbers=self.numbers[~bad], lines=self.lines[~bad]).noted(
+            f": {count} of {len(bad)} rows left out, the first in {place}: expected {said}")
 
 
 def read_table(source, name, pose_count=None):
     """The Table of a text file (Path) or Table, whose rows pass all checks; of None it has no rows.
 
-    The checks are LIMITS[name] and CHECKS[name]. Readings of a sensor have pose ids up to
-    `pose_count`; of them are left out, with a note, rows with NaN or without a range, and up to
-    MAX_BAD_SHARE of others that do not pass. Raises DatasetError for any other row, as one with
-    words or another number of columns.
+    The checks are LIMITS[name] and CHECKS[name]. Those of a sensor have pose ids up to `pose_count`
+    and are left out with a note: any with NaN or without a range, and up to MAX_BAD_SHARE of others
+    that do not pass. Raises DatasetError for all others, as those with words.
     """
     limits = LIMITS[name] | ({"pose id": Limit(1, pose_count, whole=True)} if pose_count else {})
     table = (_table_of_text(source, list(limits)) if isinstance(source, Path)
@@ -172,7 +172,7 @@ def table_of_array(source, value, name, counted=False):
             f"a matrix of real numbers with {len(columns)} columns ({', '.join(columns)}), found "
             f"{array.dtype} of shape {array.shape}")
     rows = np.arange(1, len(array) + 1)
-    return Table(source, np.column_stack([rows, array]) if counted else array, rows, "row")
+    return Table(source, np.column_stack([rows, array]) if counted else array, rows)
 
 
 def _table_of_text(source, columns):
@@ -237,19 +237,18 @@ def datasets_in(data, names=None):
     """Names (list) of the datasets in a folder, and sentences (list) on what else is there.
 
     They are all sub-folders with files of a dataset, or those that `names` selects. Raises
-    DatasetError if there is none, no sub-folder of a selected name, or no encoderReading.txt in it.
+    DatasetError if there is none, or no sub-folder of a selected name.
     """
     data = Path(data)
     rest = [path for path in _listed(data) if path.name != "README.md"]
     found = [path.name for path in rest if path.is_dir() and contents(path)[0]]
     require(found, data, f"this folder, with a sub-folder with an {ENCODER} for each dataset, "
             "found none")
-    unread = _not_read([path for path in rest if path.name not in found])
     names = found if names is None else list(names)
     for name in names:
         require((data / name).is_dir(), data, f"one of {', '.join(found)}", name)
-        contents(data / name, required=ENCODER)
-    return names, [f"{data}: {each}" for each in unread]
+    return names, [f"{data}: {each}" for each in _not_read(
+        [path for path in rest if path.name not in found])]
 
 
 def _listed(folder):

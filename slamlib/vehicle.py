@@ -138,7 +138,7 @@ def incremental_counts(table, vehicle):
     if len(mended := np.flatnonzero((counts != read).any(axis=1))):
         table = table.noted(
             f": {len(mended)} rows were mended whose counts are 2^15 or 2^16 off, as of a counter "
-            f"that wraps around, first line {table.lines[mended[0]]}")
+            f"that wraps around, first {table.place(mended[0])}")
     most = np.where(np.arange(len(read)) == 0, 0, limit)
     table.kept(np.insert(abs(counts) <= most[:, None], 0, True, axis=1), (
         f"at most {MAX_REVOLUTIONS:g} wheel revolutions ({limit:g} ticks) since the pose before, "

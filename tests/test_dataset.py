@@ -3,6 +3,7 @@
 import dataclasses
 import gzip
 import os
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -46,23 +47,10 @@ def write(path, content):
     path.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
-def assert_same(a, b):
-    """Two records, or tuples of records, hold the same arrays, with the same shapes and dtypes."""
-    assert type(a) is type(b)
-    if dataclasses.is_dataclass(a):
-        assert_same(tuple(vars(a).values()), tuple(vars(b).values()))
-    elif isinstance(a, tuple):
-        for one, other in zip(a, b, strict=True):
-            assert_same(one, other)
-    elif isinstance(a, np.ndarray):
-        assert a.dtype == b.dtype
-        np.testing.assert_array_equal(a, b)
-    else:
-        assert a == b
-
-
-def assert_same_but_notes(record, clean):
-    assert_same(dataclasses.replace(record, notes=()), clean)
+def assert_same(found, clean, *notes):
+    """Two records hold the same numbers, types and shapes; the first one has these notes."""
+    with np.printoptions(threshold=sys.maxsize, floatmode="unique"):
+        assert repr(found) == repr(dataclasses.replace(clean, notes=notes))
 
 
 def assert_ints(array, expected):
@@ -182,7 +170,7 @@ def test_readings_are_selected_by_mask_and_by_index(folder):
     for readings in (data.aruco, data.uwb):
         mask = readings.pose != 1
         kept = readings.select(mask)
-        assert_same(kept, readings.select(np.flatnonzero(mask)))
+        assert repr(kept) == repr(readings.select(np.flatnonzero(mask)))
         assert len(kept.pose) == np.count_nonzero(mask) > 0 and (kept.pose != 1).all()
     assert_ints(data.aruco.select([2, 0]).marker, [40, -7])
 
@@ -267,14 +255,7 @@ THIRD_ROWS = {  # rows by what is said of them
             "3 infinity 6", "3 -infinity 5", "3 1e999 5", "3 -2e15 5", "3 5.5 6"],
         "at most 10 wheel revolutions (80000 ticks)": ["3 5 80001", "3 -80001 5"],
         "in order": ["4 5 6", "2 5 6"], "pose id, a whole number": ["2.5 5 6"]},
-    "ArucoReading.txt": {
-        "pose id, a whole number from 1 to 4": ["5 40 0 0 0 1 0 0 1 0 1", "0 40 0 0 0 1 0 0 1 0 1"],
-        "positive definite": [f"1 40 0 0 0 {covariance}" for covariance in (
-            "1 1 0 1 0 1", "1e-4 2e-4 0 1e-4 0 1e4", "1 .9 -.9 1 .9 1", "1 9e14 0 1 0 1e-18")]},
-    "UwbReading.txt": {
-        "antenna id, a whole number": ["1 3.5 1 1"],
-        "a range that is not below -5 sigma": ["1 3 -5.1 1"],
-        "an antenna id that the guesses have": ["1 4 1 1"]},
+    "UwbReading.txt": {"an antenna id that the guesses have": ["1 4 1 1"]},
     "UwbAntennaGuess.txt": {"each id only once": ["900 1 2"], "x, a finite number": ["9 inf 2"]},
     "truth/vehiclePose.txt": {"4 numbers (pose id, x, y, theta)": ["3 0 0"],
                               "in order": ["4 0 0 0"]},
