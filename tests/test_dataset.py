@@ -11,7 +11,16 @@ import pytest
 
 from slamlib import se2
 from slamlib.checks.files import doubts_before_solving
-from slamlib.dataset import DatasetError, Vehicle, read_dataset, read_truth
+from slamlib.dataset import (
+    AntennaGuess,
+    ArucoReadings,
+    Dataset,
+    DatasetError,
+    UwbReadings,
+    Vehicle,
+    read_dataset,
+    read_truth,
+)
 from slamlib.simulation import simulate
 from slamlib.tables import LIMITS, Limit
 from slamlib.vehicle import VEHICLE_LIMITS
@@ -58,9 +67,9 @@ def assert_ints(array, expected):
     np.testing.assert_array_equal(array, expected)
 
 
-def error_of(read, folder):
+def error_of(read, *given):
     with pytest.raises(DatasetError) as caught:
-        read(folder)
+        read(*given)
     message = str(caught.value)
     assert "\n" not in message and "expected" in message and len(message) < 400
     return message
@@ -70,23 +79,17 @@ def error_of(read, folder):
 
 
 def test_measurements_are_exactly_those_written(folder):
-    data = read_dataset(folder)
-    assert data.name == "drive" and data.vehicle == VEHICLE
-    assert isinstance(data.vehicle.ticks_per_revolution, float)
-    assert_ints(data.ticks, [[0, 0], [10, 12], [-5, 7], [0, 32000]])
-    assert_ints(data.aruco.pose, [1, 2, 2])
-    assert_ints(data.aruco.marker, [-7, 40, 40])
-    np.testing.assert_array_equal(
-        data.aruco.marker_in_vehicle, [[0.1, 0.2, 4.0], [1.5, -2, 0.5], [1.6, -2.1, 0.6]])
-    np.testing.assert_array_equal(data.aruco.covariance, [
-        [[1e-4, 0, 1e-5], [0, 1e-4, 2e-5], [1e-5, 2e-5, 1e4]],
-        [[4e-4, 1e-4, 0], [1e-4, 9e-4, 0], [0, 0, 1e-4]],
-        [[4e-4, 0, 0], [0, 4e-4, 0], [0, 0, 4e-4]]])
-    assert_ints(data.uwb.pose, [0, 3])
-    assert_ints(data.uwb.antenna, [3, 900])
-    np.testing.assert_array_equal([data.uwb.range, data.uwb.sigma], [[1.25, 2.5], [0.2, 0.1]])
-    assert_ints(data.antenna_guess.antenna, [3, 900])
-    np.testing.assert_array_equal(data.antenna_guess.position, [[-4, 5.5], [1, 2]])
+    assert_same(read_dataset(folder), Dataset(
+        "drive", VEHICLE, np.array([[0, 0], [10, 12], [-5, 7], [0, 32000]]),
+        ArucoReadings(
+            np.array([1, 2, 2]), np.array([-7, 40, 40]),
+            np.array([[0.1, 0.2, 4.0], [1.5, -2, 0.5], [1.6, -2.1, 0.6]]), np.array([
+                [[1e-4, 0, 1e-5], [0, 1e-4, 2e-5], [1e-5, 2e-5, 1e4]],
+                [[4e-4, 1e-4, 0], [1e-4, 9e-4, 0], [0, 0, 1e-4]],
+                [[4e-4, 0, 0], [0, 4e-4, 0], [0, 0, 4e-4]]])),
+        UwbReadings(np.array([0, 3]), np.array([3, 900]), np.array([1.25, 2.5]),
+                    np.array([0.2, 0.1])),
+        AntennaGuess(np.array([3, 900]), np.array([[-4, 5.5], [1, 2]]))))
 
 
 def test_truth_is_exactly_that_written(folder):
@@ -101,35 +104,28 @@ def test_truth_is_exactly_that_written(folder):
     assert truth.vehicle == dataclasses.replace(VEHICLE, sigma_wheelbase=0.002)
 
 
-def test_truth_in_another_frame_is_moved_to_its_first_pose_and_said(folder):
-    """Moved out of its frame and read again, the truth is the same, and one doubt says it."""
+@pytest.mark.parametrize("start, doubts", [
+    ([12.5, -3.25, 2.8], 1), ([2e-3, 0, 0], 1), ([0, 0, np.pi], 1), ([0, -2e-3, 2 * np.pi], 1),
+    ([9e-4, -9e-4, 9e-4], 0), ([0, 0, 2 * np.pi], 0), ([0, 0, -4 * np.pi + 5e-4], 0)])
+def test_truth_in_another_frame_is_moved_to_its_first_pose_and_said(folder, start, doubts):
+    """Unless its first pose is rounded, or has full turns."""
     clean = read_truth(folder)
     assert clean.doubts == ()
-    first = np.array([12.5, -3.25, 2.8])
-    poses, markers = (se2.compose(first, p) for p in (clean.poses, clean.marker_in_world))
-    antennas = se2.compose(first, np.pad(clean.antenna_in_world, ((0, 0), (0, 1))))[:, :2]
-    for name, ids, rows in (
-            ("vehiclePose", np.arange(1, 5), poses), ("ArucoMap", clean.marker, markers),
-            ("UwbMap", clean.antenna, antennas)):
-        np.savetxt(folder / f"truth/{name}.txt", np.column_stack([ids, rows]), fmt="%.17g")
-    moved = read_truth(folder)
-    for name in ("poses", "marker_in_world", "antenna_in_world"):
-        np.testing.assert_allclose(getattr(moved, name), getattr(clean, name), atol=1e-14)
-    assert (abs(moved.marker_in_world[:, 2]) <= np.pi).all() and (abs(markers[:, 2]) > 2).any()
-    doubt, = moved.doubts
-    assert doubt.what == "truth-frame" and "(12.500 m, -3.250 m, 2.8000 rad)" in doubt.sentence
-
-
-@pytest.mark.parametrize("start, doubts", [
-    ([9e-4, -9e-4, 9e-4], 0), ([0, 0, 2 * np.pi], 0), ([0, 0, -4 * np.pi + 5e-4], 0),
-    ([2e-3, 0, 0], 1), ([0, 0, np.pi], 1), ([0, -2e-3, 2 * np.pi], 1)])
-def test_truth_that_is_rounded_or_begins_with_full_turns_is_no_doubt(folder, start, doubts):
-    path = np.add(start, [[0.1 * k, 0, 0] for k in range(4)])
-    np.savetxt(folder / "truth/vehiclePose.txt", np.c_[1:5, path], fmt="%.17g")
-    truth = read_truth(folder)
-    assert len(truth.doubts) == doubts
-    expected = se2.between(path[0], path) if doubts else se2.wrap(path)
-    np.testing.assert_allclose(truth.poses, expected, atol=1e-12)
+    antennas = np.pad(clean.antenna_in_world, ((0, 0), (0, 1)))
+    places = {"poses": clean.poses, "marker_in_world": clean.marker_in_world,
+              "antenna_in_world": antennas}
+    moved = {name: se2.compose(start, each) for name, each in places.items()}
+    for name, ids, rows, columns in zip(
+            ("vehiclePose", "ArucoMap", "UwbMap"), (np.arange(1, 5), clean.marker, clean.antenna),
+            moved.values(), (3, 3, 2)):
+        np.savetxt(folder / f"truth/{name}.txt", np.c_[ids, rows[:, :columns]], fmt="%.17g")
+    moved["poses"] = moved["poses"] - [0, 0, start[2] - se2.wrap(start[2])]
+    found = read_truth(folder)
+    for name, expected in (places if doubts else moved).items():
+        array = getattr(found, name)
+        np.testing.assert_allclose(array, expected[:, :array.shape[1]], atol=1e-12)
+    assert [doubt.what for doubt in found.doubts] == ["truth-frame"] * doubts
+    assert start[0] < 1 or "(12.500 m, -3.250 m, 2.8000 rad)" in found.doubts[0].sentence
 
 
 def test_vehicle_defaults_are_table_2(folder):
