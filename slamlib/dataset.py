@@ -79,9 +79,9 @@ class Dataset:
         Parameters
         ----------
         ticks : (n, 2) counts of the right and left wheel since the previous pose; the first are 0.
-        aruco : (m, 11) pose from 1 to n, marker id, x, y, heading of the marker in the vehicle, and
-            their covariances xx, xy, x heading, yy, y heading, heading heading; or None.
-        uwb : (r, 4) pose from 1 to n, antenna id, range, standard deviation; or None.
+        aruco : (m, 11) pose id from 1 to n, marker id, x, y, heading of the marker in the vehicle,
+            and their covariances xx, xy, x heading, yy, y heading, heading heading; or None.
+        uwb : (r, 4) pose id from 1 to n, antenna id, range, standard deviation; or None.
         guess : (a, 3) antenna id, x, y, of all antennas in `uwb`; or None.
         vehicle : Vehicle
 

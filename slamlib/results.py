@@ -3,7 +3,7 @@
 Poses are [x, y, heading] and positions [x, y] in world axes, in m and rad. Covariances belong to
 the same coordinates. A line of a TUM file is `timestamp x y z qx qy qz qw`, the format of the TUM
 RGB-D benchmark that evo and others read. The measurements have no times, so the time stamps are
-pose numbers, from 1. Text files leave out poses without an estimate.
+pose ids, from 1. Text files leave out poses without an estimate.
 """
 
 import struct

@@ -240,7 +240,7 @@ def datasets_in(data, names=None):
     DatasetError if there is none, or no sub-folder of a selected name.
     """
     data = Path(data)
-    rest = [path for path in _listed(data) if path.name != "README.md"]
+    rest = [path for path in _listed(data) if path.name != "README.md"] if data.is_dir() else []
     found = [path.name for path in rest if path.is_dir() and contents(path)[0]]
     require(found, data, f"this folder, with a sub-folder with an {ENCODER} for each dataset, "
             "found none")
