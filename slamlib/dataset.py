@@ -18,9 +18,8 @@ from slamlib import se2, tables
 from slamlib.tables import ENCODER, TABLES, TRUTH_FILES, contents, read_table
 from slamlib.textfile import DatasetError as DatasetError
 from slamlib.textfile import require, require_type
-from slamlib.vehicle import Vehicle, changed, incremental_counts, read_vehicle
+from slamlib.vehicle import TABLE_2, Vehicle, changed, incremental_counts, read_vehicle
 
-TABLE_2 = Vehicle()  # the assignment's nominal vehicle
 ORIGIN_TOLERANCE = 1e-3  # m and rad; a first true pose within it is taken as the origin
 
 
@@ -161,7 +160,7 @@ def read_dataset(folder):
     (2000, 894, [5, 13, 36, 46])
     """
     files, notes = contents(folder, required=ENCODER)
-    vehicle = read_vehicle(files.get("vehicle.toml"), default=TABLE_2)
+    vehicle = read_vehicle(files.get("vehicle.toml"))
     return _dataset(files, vehicle, Path(abspath(folder)).name, notes)
 
 
@@ -211,10 +210,10 @@ def read_truth(folder):
             "the origin. The true poses and maps were moved into the frame of the first true pose, "
             "in which the estimates are. If errors are large, check that all files in truth/ are "
             "in the same frame.").format(*first)),)
-    vehicle = read_vehicle(drive.get("vehicle.toml"), default=TABLE_2)
+    vehicle, true = (each.get("vehicle.toml") for each in (drive, files))
     return Truth(
         poses, marker, marker_in_world, antenna, antenna_in_world,
-        read_vehicle(files.get("vehicle.toml"), default=vehicle), doubts,
+        read_vehicle(true, read_vehicle(vehicle)), doubts,
         tuple(f"In truth: {note}" for note in sum((each.notes for each in read), (*notes,))))
 
 

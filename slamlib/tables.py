@@ -189,12 +189,12 @@ def _table_of_text(source, columns):
         rows, lines = rows[1:], lines[1:]
     if not rows:
         return table
-    cells, decimal = max(((_cells(rows, len(columns), *dialect), dialect[1])
-                          for dialect in DIALECTS), key=lambda each: len(each[0]))
+    cells = max((_cells(rows, len(columns), *dialect) for dialect in DIALECTS), key=len)
     if len(cells) < len(rows):
         require(False, f"{source}, line {lines[len(cells)]}",
                 f"{len(columns)} numbers ({', '.join(columns)})", rows[len(cells)])
-    table = table.noted(" was read with decimal commas") if decimal == "," else table
+    if any("," in cell for row in cells for cell in row):
+        table = table.noted(" was read with decimal commas")
     numbers = np.array([[float(cell.replace(",", ".")) for cell in row] for row in cells])
     return replace(table, numbers=numbers, lines=np.array(lines))
 

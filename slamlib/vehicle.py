@@ -90,9 +90,10 @@ class Vehicle:
 
 # What each entry of vehicle.toml may be: a Limit, or a tuple of values.
 VEHICLE_LIMITS = {each.name: each.metadata["limit"] for each in fields(Vehicle)}
+TABLE_2 = Vehicle()  # the assignment's nominal vehicle
 
 
-def read_vehicle(path, default):
+def read_vehicle(path, default=TABLE_2):
     """The Vehicle of a `vehicle.toml` (Path or None), whose entries replace those of a default.
 
     Raises DatasetError if the file does not have the format.
