@@ -89,7 +89,7 @@ MAX_LISTED_NAMES = 5  # file names in one sentence
 COMMENT_OR_QUOTE = re.compile(r'(#|%|//).*|"')
 NUMBER_FIRST = re.compile(r"(^|[\s,;])\W*(\d|nan\b|inf)", re.IGNORECASE)  # in a row, not a header
 NUMBER = {sign: rf"[+-]?(?:(?:{digits})(?:e[+-]?[0-9]+)?|nan|inf(?:inity)?)" for sign, digits in (
-    (".", r"[0-9]+\.?[0-9]*|\.[0-9]+"), (",", "[0-9]+(?:,[0-9]+)?"))}
+    (".", r"[0-9]+(?:\.[0-9]*)?|\.[0-9]+"), (",", "[0-9]+(?:,[0-9]+)?"))}
 DIALECTS = (None, "."), (",", "."), (";", "."), (None, ","), (";", ",")  # separator, decimal sign
 # Words of headers for two columns, in their order, by the second column of the file.
 HEADER_ORDER = {"right ticks": (r"right|dx|destra|r\b", r"left|sx|sinistra|l\b"),
