@@ -81,7 +81,7 @@ class Dataset:
         aruco : (m, 11) pose id from 1 to n, marker id, x, y, heading of the marker in the vehicle,
             and their covariances xx, xy, x heading, yy, y heading, heading heading; or None.
         uwb : (r, 4) pose id from 1 to n, antenna id, range, standard deviation; or None.
-        guess : (a, 3) antenna id, x, y, of at least the antennas in `uwb`; or None without any.
+        guess : (a, 3) antenna id, x, y, of at least the antennas in `uwb`; or None.
         vehicle : Vehicle
 
         Rows are checked, and bad ones left out with a note, as those of files. Raises DatasetError,

@@ -136,9 +136,9 @@ class Table:
 def read_table(source, name, pose_count=None):
     """The Table of a text file (Path) or Table, whose rows pass all checks; of None it has no rows.
 
-    The checks are LIMITS[name] and CHECKS[name]. Those of a sensor have pose ids up to `pose_count`
-    and are left out with a note: any with NaN or without a range, and up to MAX_BAD_SHARE of others
-    that do not pass. Raises DatasetError for all others, as those with words.
+    The checks are LIMITS[name] and CHECKS[name]. Pose ids of a sensor are at most `pose_count`; its
+    rows with NaN or without a range are left out with a note, and up to MAX_BAD_SHARE of others
+    that do not pass. Raises DatasetError for any other row, as one with words.
     """
     limits = LIMITS[name] | ({"pose id": Limit(1, pose_count, whole=True)} if pose_count else {})
     table = (_table_of_text(source, list(limits)) if isinstance(source, Path)
