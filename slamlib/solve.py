@@ -1,17 +1,24 @@
 """The assignment's problems: which of them a dataset allows, their solutions and files.
 
 `find` runs the solver of a problem; `problem_solution` makes a Solution of its result, with what
-the files and figures of every problem need.
+the files and figures of every problem need; `solve_to_folder` solves all problems and writes their
+files, with a summary of plain numbers.
 """
 
-from dataclasses import dataclass, field
-from pathlib import Path
+import json
+import signal
+import sys
+import time
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
+from multiprocessing import Pipe, get_context
 
 import numpy as np
 
-from slamlib import localization, odometry, results, se2, slam
+from slamlib import evaluation, localization, odometry, results, se2, slam, swap
+from slamlib.checks.files import doubts_before_solving, merged
 from slamlib.checks.solution import solution_doubts
-from slamlib.dataset import DatasetError
+from slamlib.dataset import DatasetError, all_notes
 from slamlib.doubt import Doubt
 
 UNSOLVABLE = (DatasetError, np.linalg.LinAlgError)  # what `find` raises where there is no solution
@@ -35,10 +42,12 @@ PROBLEMS = {
     "problem3": Task("SLAM: odometry + ArUco", ("aruco",), "slam"),
     "problem4": Task("SLAM: odometry + ArUco + UWB", ("uwb",), "slam_uwb"),
 }
+# Problems that the second process solves: no other problem needs their results.
+INDEPENDENT = ("problem1", "problem2", "problem2_hint", "problem2_fused")
 SENSORS = {"aruco": "markers", "uwb": "UWB ranges"}
-SUMMARY = "summary.json"
 RESULT_NAMES = frozenset([  # relative paths of all files that a drive's results may have
-    SUMMARY, *(f"{problem}/{file}" for problem in PROBLEMS for file in results.RESULT_FILES)])
+    results.SUMMARY, *(f"{problem}/{file}" for problem in PROBLEMS
+                       for file in results.RESULT_FILES)])
 
 
 def title(problem, dataset):
@@ -189,25 +198,100 @@ def solutions(dataset, problems=tuple(PROBLEMS)):
 
 def truth_in_world(solution, truth):
     """The true poses (n, 3) in the world frame of a Solution."""
-    if solution.world == 0:
-        return truth.poses
     return se2.between(truth.poses[solution.world], truth.poses)
 
 
-def write_solution(folder, solution, text=False):
-    """Write the .mat files of a Solution into folder/<problem>/; returns the Path of that folder.
+def solve_to_folder(dataset, truth, out, problems=tuple(PROBLEMS), csv=False):
+    """Solve problems of a Dataset and write their files to the folder `out`.
 
-    With `text` it writes CSV files beside them, too, and folder/<problem>.tum. A summary in
-    `folder` is removed, because it belongs to other files.
+    When all files are written they replace those of an earlier run, by `swap.publish`. On Linux,
+    where a fork is safe, a second process solves problems 1 and 2.
+
+    Parameters
+    ----------
+    truth : Truth, to report errors, never to estimate; or None.
+    problems : keys of `PROBLEMS`; those for which there are sensors are solved.
+    csv : bool; True writes each .mat file also as CSV, and trajectories and truth as TUM files.
+
+    Returns
+    -------
+    The summary, the dict that is written to summary.json. A problem that could not be solved has
+    the entry "failed", a sentence. The list "doubts", of "what" and "sentence", has those about the
+    drive first, then by problem. "notes" lists what was mended or left out while the files were
+    read.
     """
-    (Path(folder) / SUMMARY).unlink(missing_ok=True)
-    own = Path(folder) / solution.problem
-    poses = np.arange(1, len(solution.poses) + 1), solution.poses, solution.covariances
-    for name, each in zip(results.FIELDS, (poses, solution.aruco_map, solution.uwb_map)):
-        if each is not None:
-            results.write_structs(own, name, *each)
-        if each is not None and text:
-            results.write_csv(own / f"{name}.csv", *each)
-    if text:
-        results.write_tum(own.with_suffix(".tum"), solution.poses)
-    return own
+    with swap.staging(out) as stage:
+        summary = _solved(dataset, truth, stage, problems, csv)
+        text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+        swap.write_atomically(stage / results.SUMMARY, text.encode())
+        if csv and truth is not None:
+            results.write_tum(stage / "truth.tum", truth.poses)
+        swap.publish({out: stage}, ours=RESULT_NAMES)
+    return summary
+
+
+def _solved(dataset, truth, *arguments):
+    """The summary of problems, each of which is solved and written."""
+    receiver, sender = Pipe(duplex=False)
+    if forks := sys.platform == "linux":
+        child = get_context("fork").Process(
+            target=_send_rows, args=(sender, dataset, truth, *arguments))
+        child.start()
+    sender.close()
+    try:
+        late = _rows(False, dataset, truth, *arguments)
+        early = receiver.recv()
+    except EOFError:                       # no child, or it was killed, or failed: here it is told
+        early = _rows(True, dataset, truth, *arguments)
+    finally:
+        receiver.close()
+        if forks:
+            child.kill()
+            child.join()
+    return {"dataset": dataset.name, "poses": len(dataset.ticks), "kernel": dataset.vehicle.kernel,
+            "doubts": [asdict(doubt) for doubt in merged([*early[1], *late[1]])],
+            "notes": list(all_notes(dataset, truth)), "problems": early[0] | late[0]}
+
+
+def _rows(independent, dataset, truth, folder, problems, csv):
+    """Rows of the summary of problems, those INDEPENDENT or all others, and list of the doubts.
+
+    With the former come the doubts before solving. Files are written to the folder.
+    """
+    doubts = doubts_before_solving(dataset, truth) if independent else []
+    rows, start = {}, time.perf_counter()
+    problems = [problem for problem in problems if (problem in INDEPENDENT) == independent]
+    for solution in solutions(dataset, problems=problems):
+        if isinstance(solution, Failure):
+            row = {"failed": solution.reason}
+        else:
+            row = summarize(solution, truth)
+            doubts += solution.doubts
+            results.write_solution(folder, solution, csv)
+        rows[solution.problem] = {
+            "title": solution.title, **row, "seconds": time.perf_counter() - start}
+        start = time.perf_counter()
+    return rows, doubts
+
+
+def _send_rows(sender, *arguments):
+    """Send the rows of problems INDEPENDENT from a process that Ctrl-C does not end."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with sender, suppress(BaseException):
+        sender.send(_rows(True, *arguments))
+
+
+def summarize(solution, truth):
+    """Last estimate with its sigmas and, where there is truth, errors: a dict of plain numbers."""
+    known = np.flatnonzero(np.isfinite(solution.poses[:, 0]))
+    last = known[-1]
+    summary = {"path_length_m": evaluation.path_length(solution.poses),
+               "estimated_poses": len(known), "world_is_pose": solution.world + 1,
+               "last_pose_number": int(last) + 1, "last_pose": solution.poses[last].tolist(),
+               "last_sigma": evaluation.sigmas(solution.covariances[last]).tolist(),
+               **solution.facts}
+    if truth is not None:
+        true_poses = truth_in_world(solution, truth)
+        summary["ate_m"] = evaluation.ate(solution.poses, true_poses)
+        summary["ate_aligned_m"] = evaluation.ate(solution.poses, true_poses, aligned=True)
+    return summary

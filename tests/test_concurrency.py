@@ -18,8 +18,7 @@ from slamlib import results, solve, swap
 from slamlib.__main__ import END_SIGNALS, main
 from slamlib.report import NotebookError
 from slamlib.simulation import simulate, write_dataset
-from slamlib.solve import problem_solution, write_solution
-from slamlib.summary import solve_to_folder
+from slamlib.solve import problem_solution, solve_to_folder
 
 ROOT = Path(__file__).parents[1]
 RESULT = """import os, time
@@ -140,7 +139,7 @@ def test_a_dataset_with_fewer_sensors_leaves_no_problem_of_another(tmp_path, dri
             swap.FILE_LIST, *mine, "problem1/vehiclePose.mat", "summary.json"])
         assert all((tmp_path / name).read_text() == name for name in mine)
         assert not (tmp_path / "problem3").exists() and (tmp_path / "problem2").exists()
-    write_solution(tmp_path, problem_solution("problem1", drive.first(9)))
+    results.write_solution(tmp_path, problem_solution("problem1", drive.first(9)))
     assert not (tmp_path / "summary.json").exists()                 # which is of other files
 
 

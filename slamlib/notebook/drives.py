@@ -18,6 +18,7 @@ from slamlib import solve
 from slamlib.dataset import Dataset, Truth, dataset_names, read_dataset, read_truth
 from slamlib.doubt import Doubt
 from slamlib.notebook import plotting
+from slamlib.results import write_solution
 from slamlib.simulation import simulate
 
 KEY = "slamlib"  # of records in the metadata of outputs
@@ -115,7 +116,7 @@ def solved(drives, **solvers):
             continue
         found[drive][problem] = result
         if not drive.made_up:
-            solve.write_solution(results_folder(drive), solution)
+            write_solution(results_folder(drive), solution)
             show_doubts(drive, solution.doubts)
     left = [drive for drive in drives if len(found[drive]) == len(solvers)]
     if not left:
