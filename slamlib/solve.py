@@ -221,7 +221,19 @@ def solve_to_folder(dataset, truth, out, problems=tuple(PROBLEMS), csv=False):
     read.
     """
     with swap.staging(out) as stage:
-        summary = _solved(dataset, truth, stage, problems, csv)
+        doubts, solved = _in_two_processes(dataset, truth, problems)
+        rows = {}
+        for solution, seconds in solved:
+            if isinstance(solution, Failure):
+                row = {"failed": solution.reason}
+            else:
+                row = summarize(solution, truth)
+                doubts += solution.doubts
+                results.write_solution(stage, solution, csv)
+            rows[solution.problem] = {"title": solution.title, **row, "seconds": seconds}
+        summary = {"dataset": dataset.name, "poses": len(dataset.ticks),
+                   "kernel": dataset.vehicle.kernel, "doubts": [*map(asdict, merged(doubts))],
+                   "notes": all_notes(dataset, truth), "problems": rows}
         text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
         swap.write_atomically(stage / results.SUMMARY, text.encode())
         if csv and truth is not None:
@@ -230,55 +242,45 @@ def solve_to_folder(dataset, truth, out, problems=tuple(PROBLEMS), csv=False):
     return summary
 
 
-def _solved(dataset, truth, *arguments):
-    """The summary of problems, each of which is solved and written."""
+def _in_two_processes(*arguments):
+    """What `_solved` returns of all problems, in order; the second process solves INDEPENDENT."""
     receiver, sender = Pipe(duplex=False)
     if forks := sys.platform == "linux":
-        child = get_context("fork").Process(
-            target=_send_rows, args=(sender, dataset, truth, *arguments))
+        child = get_context("fork").Process(target=_send, args=(sender, *arguments))
         child.start()
     sender.close()
     try:
-        late = _rows(False, dataset, truth, *arguments)
-        early = receiver.recv()
-    except EOFError:                       # no child, or it was killed, or failed: here it is told
-        early = _rows(True, dataset, truth, *arguments)
+        _, late = _solved(False, *arguments)
+        doubts, early = receiver.recv()
+    except (EOFError, OSError):            # no child, or it was killed, or failed: here it is told
+        doubts, early = _solved(True, *arguments)
     finally:
         receiver.close()
         if forks:
             child.kill()
             child.join()
-    return {"dataset": dataset.name, "poses": len(dataset.ticks), "kernel": dataset.vehicle.kernel,
-            "doubts": [asdict(doubt) for doubt in merged([*early[1], *late[1]])],
-            "notes": list(all_notes(dataset, truth)), "problems": early[0] | late[0]}
+    return doubts, early + late
 
 
-def _rows(independent, dataset, truth, folder, problems, csv):
-    """Rows of the summary of problems, those INDEPENDENT or all others, and list of the doubts.
-
-    With the former come the doubts before solving. Files are written to the folder.
-    """
-    doubts = doubts_before_solving(dataset, truth) if independent else []
-    rows, start = {}, time.perf_counter()
-    problems = [problem for problem in problems if (problem in INDEPENDENT) == independent]
-    for solution in solutions(dataset, problems=problems):
-        if isinstance(solution, Failure):
-            row = {"failed": solution.reason}
-        else:
-            row = summarize(solution, truth)
-            doubts += solution.doubts
-            results.write_solution(folder, solution, csv)
-        rows[solution.problem] = {
-            "title": solution.title, **row, "seconds": time.perf_counter() - start}
-        start = time.perf_counter()
-    return rows, doubts
-
-
-def _send_rows(sender, *arguments):
-    """Send the rows of problems INDEPENDENT from a process that Ctrl-C does not end."""
+def _send(sender, *arguments):
+    """Send what `_solved` returns from a process that Ctrl-C does not end."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with sender, suppress(BaseException):
-        sender.send(_rows(True, *arguments))
+        sender.send(_solved(True, *arguments))
+
+
+def _solved(independent, dataset, truth, problems):
+    """Doubts before solving, and (Solution or Failure, seconds) of problems, both lists.
+
+    The problems are those INDEPENDENT, or the others, without the doubts.
+    """
+    doubts = doubts_before_solving(dataset, truth) if independent else []
+    solved, start = [], time.perf_counter()
+    problems = [problem for problem in problems if (problem in INDEPENDENT) == independent]
+    for solution in solutions(dataset, problems=problems):
+        solved.append((solution, time.perf_counter() - start))
+        start = time.perf_counter()
+    return doubts, solved
 
 
 def summarize(solution, truth):

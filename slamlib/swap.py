@@ -108,6 +108,7 @@ def publish(made, ours=()):
             shutil.rmtree(beside(folder, "old"), ignore_errors=True)
             folder.rename(beside(folder, "old"))
     for folder, new in made.items():
+        folder.parent.mkdir(parents=True, exist_ok=True)
         new.rename(folder)
     for folder in made:
         shutil.rmtree(beside(folder, "old"), ignore_errors=True)

@@ -108,19 +108,6 @@ def test_a_lock_has_one_holder_at_a_time_although_its_file_is_removed(tmp_path):
     assert len(most) == 200 and max(most) == 1 and hidden(tmp_path) == []
 
 
-@pytest.mark.parametrize("content", ["5", "[1, null, \"../a\"]", "no JSON"])
-def test_a_list_of_files_that_is_none_names_no_file(tmp_path, content):
-    out = tmp_path / "out"
-    swap.write_atomically(out / "mine.txt", b"mine")
-    (out / swap.FILE_LIST).write_text(content)
-    with swap.staging(out) as stage:
-        assert [*stage.iterdir()] == []
-        (stage / "new.txt").write_text("new")
-        swap.publish({out: stage}, ours=solve.RESULT_NAMES)
-    assert {name: (out / name).read_text() for name in swap.file_names(out)} == {
-        "mine.txt": "mine", "new.txt": "new", ".slamlib.json": '["new.txt"]'}
-
-
 def test_a_dataset_with_fewer_sensors_leaves_no_problem_of_another(tmp_path, drive):
     """What the user put there stays, also in a folder of a problem; so without a list of files."""
     mine = ["notes.txt", "mine/problem2.mat", "problem2/notes.txt", "problem4/mine/a.mat"]
