@@ -173,16 +173,15 @@ def _build(options):
 def summary_table(summary):
     """The summary as a table (str), a line for each problem, and sentences on doubts below it."""
     lines = [f"{summary['dataset']}: {summary['poses']} poses",
-             f"{'problem':15}{'estimates':>10}{'last x, y, heading':>29}{'their sigmas':>28}"
-             f"{'ATE':>11}"]
+             f"problem{'estimates':>18}{'last x, y, heading':>29}{'their sigmas':>28}{'ATE':>11}"]
     for name, row in summary["problems"].items():
         if "failed" in row:
             lines.append(f"{name:15}could not be solved: {row['failed']}")
             continue
-        pose = "{:8.3f} m {:8.3f} m {:7.4f}".format(*row["last_pose"])
-        sigma = "{:7.4f} m {:7.4f} m {:6.4f}".format(*row["last_sigma"])
+        numbers = "{:10}{:8.3f} m {:8.3f} m {:7.4f}  {:7.4f} m {:7.4f} m {:6.4f}".format(
+            row["estimated_poses"], *row["last_pose"], *row["last_sigma"])
         error = f"{row['ate_m']:.4f} m" if "ate_m" in row else "-"
-        lines.append(f"{name:15}{row['estimated_poses']:10}{pose:>29} {sigma:>27}{error:>11}")
+        lines.append(f"{name:15}{numbers}{error:>11}")
         if once := ", ".join(map(str, row.get("unconfirmed", ()))):
             lines.append(
                 f"{'':15}nothing confirms markers {once}: seen once, or where another one is")
@@ -201,8 +200,8 @@ def _solve(options):
     from slamlib.dataset import inventory_lines
     from slamlib.solve import PROBLEMS, allows, solve_to_folder, title
     _require_elsewhere(options.out, options.folder)
-    ending = options.plot.suffix.lower() if options.plot else ".png"
-    require(ending in (".png", ".pdf", ".svg"), "--plot", "a .png, .pdf or .svg file", options.plot)
+    require(not options.plot or options.plot.suffix.lower() in (".png", ".pdf", ".svg"), "--plot",
+            "a .png, .pdf or .svg file", options.plot)
     dataset, truth = read_dataset(options.folder), read_truth(options.folder)
     given = {name: value for name in ("kernel", "slip")
              if (value := getattr(options, name)) is not None}

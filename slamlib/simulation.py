@@ -185,8 +185,8 @@ def _encoder(counts, vehicle, slip, rng):
 def _place_markers(layout, poses, rng):
     """Ids (k,) and poses (k, 3) of markers on a jittered grid over the driven area."""
     low, high = poses[:, :2].min(0) - CAMERA_REACH, poses[:, :2].max(0) + CAMERA_REACH
-    x, y = (np.arange(low[i], high[i], layout.marker_spacing) for i in range(2))
-    grid = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+    axes = (np.arange(*ends, layout.marker_spacing) for ends in zip(low, high))
+    grid = np.stack(np.meshgrid(*axes), -1).reshape(-1, 2)
     grid += layout.marker_spacing * rng.uniform(-0.35, 0.35, grid.shape)
     visible = np.array([np.hypot(*(poses[::10, :2] - p).T).min() < CAMERA_REACH for p in grid])
     fraction, radius = layout.markers_missing

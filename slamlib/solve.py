@@ -9,6 +9,7 @@ import json
 import signal
 import sys
 import time
+from collections import namedtuple
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from multiprocessing import Pipe, get_context
@@ -24,16 +25,9 @@ from slamlib.doubt import Doubt
 UNSOLVABLE = (DatasetError, np.linalg.LinAlgError)  # what `find` raises where there is no solution
 
 
-@dataclass(frozen=True)
-class Task:
-    """Title, required sensors and role in figures of a problem."""
-
-    title: str
-    sensors: tuple                 # attributes of Dataset that it needs besides the ticks
-    role: str                      # key of its colour and line, `notebook.plotting.ROLES`
-
-
-# Every problem in the order of solution, by the name of its results folder.
+# Every problem in the order of solution, by the name of its results folder: its title, the sensors
+# that it needs (attributes of Dataset), and its role in figures (`notebook.plotting.ROLES`).
+Task = namedtuple("Task", "title sensors role")
 PROBLEMS = {
     "problem1": Task("odometry", (), "odometry"),
     "problem2": Task("ArUco", ("aruco",), "aruco"),
