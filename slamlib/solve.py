@@ -11,7 +11,7 @@ import sys
 import time
 from collections import namedtuple
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from multiprocessing import Pipe, get_context
 
 import numpy as np
@@ -177,15 +177,17 @@ def _slam_facts(dataset, found):
 def solutions(dataset, problems=tuple(PROBLEMS)):
     """Yield the Solution of each of `problems` that the dataset's sensors allow, in order.
 
-    A problem that cannot be solved yields a Failure.
+    A problem that cannot be solved yields a Failure. Facts include the seconds that it took.
     """
     found = {}
     for problem in (each for each in problems if allows(dataset, each)):
+        start = time.perf_counter()
         try:
             result = find(problem, dataset, found)
             solution = problem_solution(problem, dataset, result)
             found[problem] = result
-            yield solution
+            seconds = time.perf_counter() - start
+            yield replace(solution, facts=solution.facts | {"seconds": seconds})
         except UNSOLVABLE as error:
             yield failure(problem, dataset, error)
 
@@ -217,14 +219,14 @@ def solve_to_folder(dataset, truth, out, problems=tuple(PROBLEMS), csv=False):
     with swap.staging(out) as stage:
         doubts, solved = _in_two_processes(dataset, truth, problems)
         rows = {}
-        for solution, seconds in solved:
+        for solution in solved:
             if isinstance(solution, Failure):
                 row = {"failed": solution.reason}
             else:
                 row = summarize(solution, truth)
                 doubts += solution.doubts
                 results.write_solution(stage, solution, csv)
-            rows[solution.problem] = {"title": solution.title, **row, "seconds": seconds}
+            rows[solution.problem] = {"title": solution.title, **row}
         summary = {"dataset": dataset.name, "poses": len(dataset.ticks),
                    "kernel": dataset.vehicle.kernel, "doubts": [*map(asdict, merged(doubts))],
                    "notes": all_notes(dataset, truth), "problems": rows}
@@ -264,17 +266,10 @@ def _send(sender, *arguments):
 
 
 def _solved(independent, dataset, truth, problems):
-    """Doubts before solving, and (Solution or Failure, seconds) of problems, both lists.
-
-    The problems are those INDEPENDENT, or the others, without the doubts.
-    """
-    doubts = doubts_before_solving(dataset, truth) if independent else []
-    solved, start = [], time.perf_counter()
+    """Doubts before solving and `solutions` of problems INDEPENDENT, or none and of the others."""
     problems = [problem for problem in problems if (problem in INDEPENDENT) == independent]
-    for solution in solutions(dataset, problems=problems):
-        solved.append((solution, time.perf_counter() - start))
-        start = time.perf_counter()
-    return doubts, solved
+    return (doubts_before_solving(dataset, truth) if independent else [],
+            [*solutions(dataset, problems)])
 
 
 def summarize(solution, truth):
