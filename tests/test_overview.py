@@ -18,10 +18,9 @@ from slamlib.report.document import render
 from slamlib.report.execution import NotebookError
 from slamlib.report.notebooks import Options
 from slamlib.report.overview import title_picture
-from slamlib.results import write_structs
+from slamlib.results import write_solution, write_structs
 from slamlib.simulation import simulate, write_dataset
-from slamlib.solve import Failure, Solution, problem_solution, solutions, title, write_solution
-from slamlib.summary import summarize
+from slamlib.solve import Failure, Solution, problem_solution, solutions, summarize, title
 
 NAMES = ("all", "no_truth", "wheels_only")
 

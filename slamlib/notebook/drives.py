@@ -17,6 +17,7 @@ from matplotlib_inline.backend_inline import set_matplotlib_formats
 from slamlib import solve
 from slamlib.dataset import Dataset, Doubt, Truth, read_dataset, read_truth
 from slamlib.notebook import plotting
+from slamlib.results import write_solution
 from slamlib.simulation import simulate
 from slamlib.tables import datasets_in
 
@@ -115,7 +116,7 @@ def solved(drives, **solvers):
             continue
         found[drive][problem] = result
         if not drive.made_up:
-            solve.write_solution(results_folder(drive), solution)
+            write_solution(results_folder(drive), solution)
             show_doubts(drive, solution.doubts)
     left = [drive for drive in drives if len(found[drive]) == len(solvers)]
     if not left:
