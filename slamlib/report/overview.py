@@ -17,8 +17,7 @@ from jinja2 import Template
 from matplotlib.figure import Figure
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_output
 
-from slamlib import evaluation
-from slamlib.checks import consistency
+from slamlib import evaluation, marker_increments
 from slamlib.dataset import all_notes
 from slamlib.notebook import Drive, accuracy, plotting
 from slamlib.report.drives import order, read_solution, why_missing
@@ -103,11 +102,11 @@ def _compared(drive):
     both = [drive.solution("problem1"), drive.solution("problem4") or drive.solution("problem3")]
     errors = returns = None
     if all(map(_has_estimates, both)):
-        found = consistency.returns(drive.dataset)
+        found = marker_increments.returns(drive.dataset)
         if drive.truth is not None:
             errors = [_ate(drive, solution) for solution in both]
         elif len(found.start):
-            off = [consistency.discrepancies(found, solution.poses)[:, :2] for solution in both]
+            off = [found.discrepancies(solution.poses)[:, :2] for solution in both]
             returns = [with_unit(np.sqrt(np.mean(np.sum(each**2, axis=1))), "m") for each in off]
     counts = []
     for kind, name in (("aruco_map", "marker"), ("uwb_map", "antenna")):
