@@ -211,11 +211,8 @@ def returns(dataset):
     """
     s = sightings_by_frame(dataset.sightings)
     travelled = odometry.cumulative(np.abs(odometry.steps(dataset.ticks, dataset.vehicle)[0]))
-    label = np.unique(s.marker, return_inverse=True)[1]
-    sighting = np.full((len(s.frame), label.max(initial=-1) + 1), -1)          # row, or -1
-    sighting[s.row, label] = np.arange(len(s.row))
     every = len(s.frame) // MAX_RETURN_FRAMES + 1
-    sighting, frame = sighting[::every], s.frame[::every]
+    sighting, frame = s.table()[::every], s.frame[::every]
     seen, distance = (sighting >= 0).astype(int), travelled[frame]
     common = (seen @ seen.T) * (distance[:, None] - distance >= MIN_GAP)  # later, earlier frames
     later = np.flatnonzero(common.max(axis=1, initial=0) >= MIN_COMMON_MARKERS)

@@ -15,9 +15,7 @@ is C_M = E C_X E^T + F C F^T + T + T^T. This is the correlated state of Smith, S
 Estimating Uncertain Spatial Relationships in Robotics, 1990, without the states of earlier frames.
 """
 
-from collections import Counter, defaultdict, deque
 from dataclasses import dataclass
-from heapq import nlargest
 
 import numpy as np
 
@@ -32,7 +30,6 @@ from slamlib.sightings import consensus, sightings_by_frame
 from slamlib.textfile import require_type
 
 MAX_CANDIDATES = 3            # number of earlier frames that are tried as parent of a frame
-MAX_FRAMES_PER_MARKER = 200   # number of frames, the latest that saw a marker, to choose them from
 
 
 @dataclass(frozen=True)
@@ -86,11 +83,7 @@ def localize(aruco, shared_errors=True):
 
 def _composed(sightings, increments, confirmed, shared_errors):
     """Poses (f, 3) and covariances (f, 3, 3), NaN where unknown, and H (s, 3, 3) of sightings."""
-    count = len(sightings.frame)
-    rows_of = np.split(np.arange(len(sightings.row)),
-                       np.searchsorted(sightings.row, np.arange(1, count)))
-    # By marker id, the latest localized frames that saw it.
-    seen_in = defaultdict(lambda: deque(maxlen=MAX_FRAMES_PER_MARKER))
+    count, table = len(sightings.frame), sightings.table()
     poses, covariances = np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan)
     H = np.zeros((len(sightings.row), 3, 3))
     root = int(np.argmax([*increments.usable, False]))
@@ -99,7 +92,7 @@ def _composed(sightings, increments, confirmed, shared_errors):
         if f > root:
             p, found, pair = f - 1, increments, f - 1
             if not increments.usable[pair] or np.isnan(poses[p, 0]):
-                p, found, pair = *_relocalize(sightings, confirmed, rows_of, f, seen_in), 0
+                p, found, pair = *_relocalize(sightings, confirmed, table, poses, f), 0
             if found is None:
                 continue
             A, B = se2.compose_jacobians(poses[p], found.increment[pair])
@@ -111,23 +104,20 @@ def _composed(sightings, increments, confirmed, shared_errors):
                 S = A @ np.sum(H[first] @ (B @ found.J_first[rows]).mT, axis=0)
                 covariances[f] += S + S.T
                 H[second] = B @ found.J_second[rows] @ sightings.C[second]
-        for m in sightings.marker[rows_of[f]].tolist():
-            seen_in[m].append(f)
     return poses, covariances, H
 
 
-def _relocalize(sightings, confirmed, rows_of, frame, seen_in):
+def _relocalize(sightings, confirmed, table, poses, frame):
     """The parent of a frame and the MarkerIncrements from it to this frame, or None and None.
 
-    Candidates are the localized frames with the most common markers, the latest first. A parent
-    requires two accepted markers, or one whose two sightings adjacent frames confirm.
+    Candidates are the frames with known `poses` and the most common markers, the latest first. A
+    parent requires two accepted markers, or one whose two sightings adjacent frames confirm.
     """
-    marker, rows = sightings.marker, rows_of[frame]
-    shared = Counter(f for m in marker[rows].tolist() for f in seen_in[m])
-    for f in nlargest(MAX_CANDIDATES, shared, key=lambda f: (shared[f], f)):
-        _, first, second = np.intersect1d(marker[rows_of[f]], marker[rows], return_indices=True)
-        first, second = rows_of[f][first], rows[second]
-        found = robust_increments(sightings.z, sightings.C, np.zeros_like(first), first, second, 1)
+    common = (table[:frame] >= 0) & (table[frame] >= 0) & np.isfinite(poses[:frame, :1])
+    shared = common.sum(axis=1)
+    for f in np.lexsort((np.arange(frame), shared))[:-MAX_CANDIDATES - 1:-1]:
+        first, second = table[f, common[f]], table[frame, common[f]]
+        found = robust_increments(sightings.z, sightings.C, 0 * first, first, second, 1)
         sure = found.accepted & confirmed[first] & confirmed[second]
         if found.usable[0] and (found.accepted.sum() > 1 or sure.any()):
             return f, found
