@@ -46,36 +46,23 @@ def consecutive_increments(sightings):
     the larger of the 99th percentile over increments on which two or more markers agree and the
     90th percentile over all. An increment is implausible if its speed, less three standard
     deviations, exceeds SPEED_RATIO times the usual one and its velocity differs from the previous
-    and the next one. It is estimated again from those of its sightings that alone imply a plausible
-    speed. Speeds are in m and rad per encoder step, the difference of `sightings.frame`.
+    and the next one. Speeds are in m and rad per encoder step, the difference of `sightings.frame`.
     """
-    z, C, steps = sightings.z, sightings.C, np.diff(sightings.frame)
+    steps = np.diff(sightings.frame)[:, None]
     pair, first, second = common_sightings(sightings.row, sightings.marker)
-    found = robust_increments(z, C, pair, first, second, len(steps))
+    found = robust_increments(sightings.z, sightings.C, pair, first, second, len(steps))
     agreed = found.usable & (np.bincount(pair[found.accepted], minlength=len(steps)) > 1)
     if not agreed.any():
         return found
-    speed = distance_and_turn(found.increment) / steps[:, None]
+    velocity = found.increment / steps
+    speed = distance_and_turn(velocity)
     bound = SPEED_RATIO * np.maximum(
         np.percentile(speed[agreed], 99, axis=0),
         np.percentile(speed[found.usable], 90, axis=0, method="lower"))
-
-    def too_fast(increment, covariance, steps):
-        limit = bound * steps[:, None] + 3 * distance_and_turn_sigmas(covariance)
-        return np.any(distance_and_turn(increment) > limit, axis=1)
-
-    velocity = found.increment / steps[:, None]
+    fast = (speed > bound + 3 * distance_and_turn_sigmas(found.covariance) / steps).any(axis=1)
     similar = np.r_[False, _similar(velocity[:-1], velocity[1:]), False]
-    fast = found.usable & too_fast(found.increment, found.covariance, steps) \
-        & ~(similar[:-1] | similar[1:])
-    z2, J = se2.inverse(z[second]), se2.inverse_jacobian(z[second])
-    alone = se2.compose_uncertain(z[first], C[first], z2, J @ C[second] @ J.mT)     # Z Z'^-1
-    allowed = ~(fast[pair] & too_fast(*alone, steps[pair]))
-    if allowed.all():
-        return found
-    again = robust_increments(z, C, pair[allowed], first[allowed], second[allowed], len(steps))
-    usable = again.usable & ~(fast & too_fast(again.increment, again.covariance, steps))
-    return replace(again, usable=usable, accepted=again.accepted & usable[again.pair])
+    usable = found.usable & ~(fast & ~(similar[:-1] | similar[1:]))
+    return replace(found, usable=usable, accepted=found.accepted & usable[pair])
 
 
 def common_sightings(row, marker, span=1):

@@ -35,7 +35,7 @@ class Sightings:
     def table(self):
         """Row (f, k) of the sighting of each marker, in ascending id, at each frame, or -1."""
         markers, label = np.unique(self.marker, return_inverse=True)
-        table = np.full((len(self.frame), len(markers)), -1)
+        table = np.full((len(self.frame), len(markers)), -1, np.int32)
         table[self.row, label] = np.arange(len(self.row))
         return table
 
