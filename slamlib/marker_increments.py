@@ -60,7 +60,9 @@ def consecutive_increments(sightings):
         np.percentile(speed[agreed], 99, axis=0),
         np.percentile(speed[found.usable], 90, axis=0, method="lower"))
     fast = (speed > bound + 3 * distance_and_turn_sigmas(found.covariance) / steps).any(axis=1)
-    similar = np.r_[False, _similar(velocity[:-1], velocity[1:]), False]
+    change = distance_and_turn(np.diff(velocity, axis=0))   # less than half the larger velocity?
+    similar = (change < np.maximum(speed[:-1], speed[1:]) / 2 + [0, MIN_TURN_RATE]).all(axis=1)
+    similar = np.r_[False, similar, False]
     usable = found.usable & ~(fast & ~(similar[:-1] | similar[1:]))
     return replace(found, usable=usable, accepted=found.accepted & usable[pair])
 
@@ -167,12 +169,6 @@ def distance_and_turn(increment):
 def distance_and_turn_sigmas(covariance):
     """Standard deviations (n, 2) of them, in m and rad, by covariances (n, 3, 3)."""
     return np.sqrt(np.diagonal(covariance, axis1=1, axis2=2) @ [[1, 0], [1, 0], [0, 1]])
-
-
-def _similar(a, b):
-    """True where velocities (n, 3) differ by less than half the larger one, in speed and turn."""
-    largest = np.maximum(distance_and_turn(a), distance_and_turn(b))
-    return np.all(distance_and_turn(a - b) < largest / 2 + [0, MIN_TURN_RATE], axis=1)
 
 
 @dataclass(frozen=True)

@@ -115,12 +115,6 @@ def test_a_flaw_is_named(flaw, keywords):
     assert [whats(covariances(factor)(spoilt)) for factor in (0.25, 4.0)] == 2 * [what.split()]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("flaw", ["columns of counts", "y", "ranges in mm"])
-def test_a_flaw_is_named_on_a_long_drive(flaw):
-    assert whats(FLAWS[flaw][0](simulated("long", 0)[0])) == FLAWS[flaw][1].split()
-
-
 # Drives with nothing to doubt: functions of a simulated drive and a random generator.
 
 def wheels_off(**wrong):

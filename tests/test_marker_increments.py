@@ -182,11 +182,8 @@ def test_a_drive_without_markers_or_that_goes_nowhere_again_has_no_returns():
 
 def test_the_covariance_of_returns_is_consistent():
     """The last return of each of 30 drives, so that they are independent."""
-    values = []
-    for seed in range(30):
-        dataset, truth = simulate("short", seed, slip=3e-3)
-        found = returns(dataset)
-        off = found.discrepancies(truth.poses)
-        values.append(nees(off, found.covariance, 0 * off)[-1])
-    low, high = nees_band(len(values))
-    assert low < np.mean(values) < high
+    drives = [simulate("short", seed, slip=3e-3) for seed in range(30)]
+    found = [(each.discrepancies(truth.poses), each.covariance)
+             for each, truth in ((returns(dataset), truth) for dataset, truth in drives)]
+    low, high = nees_band(len(found))
+    assert low < np.mean([nees(off, C, 0 * off)[-1] for off, C in found]) < high
