@@ -21,11 +21,7 @@ import numpy as np
 
 from slamlib import se2
 from slamlib.dataset import ArucoReadings, DatasetError
-from slamlib.marker_increments import (
-    common_sightings,
-    consecutive_increments,
-    robust_increments,
-)
+from slamlib.marker_increments import consecutive_increments, robust_increments
 from slamlib.sightings import consensus, sightings_by_frame
 from slamlib.textfile import require_type
 
@@ -67,9 +63,9 @@ def localize(aruco, shared_errors=True):
         raise DatasetError("expected sightings that agree; all contradict another one of the same "
                            "marker at the same pose")
     increments = consecutive_increments(sightings)
-    _, *common = common_sightings(sightings.row, sightings.marker)
-    used = [rows[increments.accepted] for rows in (increments.first, increments.second)]
-    paired, confirmed = (np.isin(np.arange(len(sightings.row)), each) for each in (common, used))
+    common = np.stack([increments.first, increments.second])
+    paired, confirmed = (np.isin(np.arange(len(sightings.row)), rows)
+                         for rows in (common, common[:, increments.accepted]))
     poses, covariances, H = _composed(sightings, increments, confirmed, shared_errors)
     used = np.flatnonzero(confirmed & np.isfinite(poses[sightings.row, 0]))
     marker, in_world, marker_covariance = _map_markers(sightings, used, poses, covariances, H)
@@ -88,22 +84,21 @@ def _composed(sightings, increments, confirmed, shared_errors):
     H = np.zeros((len(sightings.row), 3, 3))
     root = int(np.argmax([*increments.usable, False]))
     poses[root], covariances[root] = 0.0, 0.0
-    for f in range(root, count):
-        if f > root:
-            p, found, pair = f - 1, increments, f - 1
-            if not increments.usable[pair] or np.isnan(poses[p, 0]):
-                p, found, pair = *_relocalize(sightings, confirmed, table, poses, f), 0
-            if found is None:
-                continue
-            A, B = se2.compose_jacobians(poses[p], found.increment[pair])
-            poses[f] = se2.compose(poses[p], found.increment[pair])
-            covariances[f] = A @ covariances[p] @ A.T + B @ found.covariance[pair] @ B.T
-            if shared_errors:
-                rows = slice(*np.searchsorted(found.pair, (pair, pair + 1)))
-                first, second = found.first[rows], found.second[rows]
-                S = A @ np.sum(H[first] @ (B @ found.J_first[rows]).mT, axis=0)
-                covariances[f] += S + S.T
-                H[second] = B @ found.J_second[rows] @ sightings.C[second]
+    for f in range(root + 1, count):
+        p, found, pair = f - 1, increments, f - 1
+        if not increments.usable[p] or np.isnan(poses[p, 0]):
+            p, found, pair = *_relocalize(sightings, confirmed, table, poses, f), 0
+        if found is None:
+            continue
+        A, B = se2.compose_jacobians(poses[p], found.increment[pair])
+        poses[f] = se2.compose(poses[p], found.increment[pair])
+        covariances[f] = A @ covariances[p] @ A.T + B @ found.covariance[pair] @ B.T
+        if shared_errors:
+            rows = slice(*np.searchsorted(found.pair, (pair, pair + 1)))
+            first, second = found.first[rows], found.second[rows]
+            S = A @ np.sum(H[first] @ (B @ found.J_first[rows]).mT, axis=0)
+            covariances[f] += S + S.T
+            H[second] = B @ found.J_second[rows] @ sightings.C[second]
     return poses, covariances, H
 
 
