@@ -41,7 +41,7 @@ MODULES = ("se2", "odometry", "evaluation", "results", "dataset", "increments", 
 FILES = [f"test_{name}.py" for name in (
     "se2", "odometry", "evaluation", "results", "dataset", "increments", "marker_increments",
     "localization", "fusion", "odometry_gate", "memory", "places", "doubts", "calibration",
-    "normal_equations", "slam", "uwb", "library", "flaws")]
+    "normal_equations", "slam", "uwb", "library", "numbers", "flaws")]
 ENOUGH = 20                            # seconds, of the tests of one mutant
 MEMORY = 8 << 30                       # bytes, of a mutant's process
 PATIENCE = 3                           # times as long as without a mutant, and START seconds
