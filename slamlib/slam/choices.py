@@ -29,7 +29,7 @@ from slamlib.memory import runs
 from slamlib.odometry import MODELS
 from slamlib.odometry_gate import NO_JUMPS, find_jumps
 from slamlib.slam.factors import preintegrate_odometry
-from slamlib.slam.fit import accepted_measurements, kept_weights, refine, residuals
+from slamlib.slam.fit import accepted_measurements, refine, residuals
 from slamlib.slam.linear import NormalEquations, laplace_approximation, linear_solution
 from slamlib.slam.result import slam_result
 
@@ -181,9 +181,9 @@ def _lead(proposed, present):
 
 def _with_fixed_weights(fit):
     """AcceptedMeasurements in which weights replace the kernel of the ranges."""
-    problem, accepted = fit.problem, fit.problem.accepted
-    _, ranges = kept_weights(accepted, *residuals(problem, fit.state))
-    return replace(accepted, weight=np.r_[accepted.sighting_weight, ranges], range_kernel=None)
+    accepted, (_, late) = fit.problem.accepted, residuals(fit.problem, fit.state)
+    return accepted._replace(ranges=replace(
+        accepted.ranges, weight=accepted.ranges.kept(late), kernel=None))
 
 
 def most_consistent(dataset, solve):
@@ -216,8 +216,8 @@ def visits(aruco):
 
 def contradicted(fit, factor):
     """Which sightings (s,), bool, a Fit rejects at this noise factor."""
-    noise = replace(fit.problem.noise, sightings=factor)
-    return accepted_measurements(replace(fit.problem, noise=noise), fit.state).rejected
+    problem = replace(fit.problem, noise=fit.problem.noise._replace(sightings=factor))
+    return accepted_measurements(problem, fit.state).sightings.weight == 0
 
 
 def has_rejected_visits(fit):
@@ -228,7 +228,7 @@ def has_rejected_visits(fit):
     m, factor = fit.problem.measurements, fit.problem.noise.sightings
     if not len(m.marker_row):
         return False
-    factor = factor if fit.problem.accepted.share is None else min(factor, 1.0)
+    factor = factor if (fit.problem.accepted.share == 1).all() else min(factor, 1.0)
     number = visits(m.dataset.aruco)[m.sightings.index]
     count, lost = np.bincount(number), np.bincount(number, contradicted(fit, factor))
     return bool(((count >= MIN_VISIT) & (lost > MAX_REJECTED_SHARE * count)).any())

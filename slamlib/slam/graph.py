@@ -66,22 +66,20 @@ def gtsam_step(problem, state):
     root then decides whether the measurements determine every variable. Raises DatasetError if they
     do not.
     """
-    m, linear, ordering = problem.measurements, linearize(problem, state), gtsam.Ordering()
-    variables, structure = _keys(problem), m.structure
-    for i in [*np.argsort(structure.position), *range(len(structure.position), len(variables))]:
-        ordering.push_back(variables[i])
+    m, linear = problem.measurements, linearize(problem, state)
     try:
-        solution = linear.eliminateMultifrontal(ordering).optimize()
+        solution = linear.optimize()
     except RuntimeError:
         try:
-            solution = linear.eliminateSequential(ordering, gtsam.EliminateQR).optimize()
+            solution = linear.optimize(gtsam.EliminateQR)
         except RuntimeError as error:             # GTSAM's, with the variable and much advice
             raise DatasetError(
                 f"{m.dataset.name}: expected measurements that determine every pose and landmark; "
                 f"these do not determine {_variable(problem, str(error))}") from None
-    n = len(structure.diagonal)
+    n = len(m.structure.diagonal)
     step = np.zeros(n + problem.active.sum())
-    step[np.r_[structure.unknowns, n:len(step)]] = solution.vector(gtsam.KeyVector(variables))
+    step[np.r_[m.structure.unknowns, n:len(step)]] = solution.vector(
+        gtsam.KeyVector(_keys(problem)))
     return step
 
 
@@ -103,7 +101,7 @@ def linearize(problem, state):
     equations, graph = NormalEquations(problem, state), gtsam.GaussianFactorGraph()
     structure, variables, q = equations.structure, _keys(problem), problem.active.sum()
     width = np.r_[2 + structure.is_pose, q].tolist()
-    odometry, _ = linearize_odometry(problem, state)(problem.noise.slip)
+    odometry, _ = linearize_odometry(problem, state, problem.noise.slip)
     for pairs, f in zip(structure.factors, (odometry, *equations.linearized)):
         by_c = np.zeros((*f.e.shape, q))
         by_c[:, :, f.columns] = f.J_c

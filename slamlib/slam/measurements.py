@@ -11,8 +11,9 @@ kernels and values of the noise.
 """
 
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -40,23 +41,12 @@ WEAK_SIGMA = 1e5             # m and rad, of a marker without accepted sightings
 GUESS_PRIOR_SIGMA = 5.0      # m, of an antenna about its guessed position
 
 
-@dataclass(frozen=True)
-class Noise:
+class Noise(NamedTuple):
     """The three noise parameters."""
 
     slip: float = TYPICAL_SLIP     # sqrt(m), sigma of a wheel's slip after one metre
     sightings: float = 1.0         # factor on the sigmas in ArucoReading.txt
     ranges: float = 1.0            # factor on the sigmas in UwbReading.txt
-
-    @property
-    def logarithms(self):
-        """(3,) of slip and both factors."""
-        return np.log([self.slip, self.sightings, self.ranges])
-
-    @classmethod
-    def from_logarithms(cls, logarithms):
-        """The Noise of `logarithms` (3,)."""
-        return cls(*np.exp(logarithms).tolist())
 
 
 def is_known(vehicle):
@@ -66,9 +56,8 @@ def is_known(vehicle):
 
 def with_known(noise, vehicle):
     """The Noise with the parameters that a Vehicle gives; the slip is at least 1e-5 sqrt(m)."""
-    slip, *factors = (
-        value if getattr(vehicle, key) is None else getattr(vehicle, key)
-        for key, value in zip(NOISE_KEYS, (noise.slip, noise.sightings, noise.ranges)))
+    given = [getattr(vehicle, key) for key in NOISE_KEYS]
+    slip, *factors = (own if known is None else known for own, known in zip(noise, given))
     return Noise(max(slip, SLIP_BOUNDS[0]), *factors)
 
 
@@ -170,34 +159,26 @@ class Measurements:
         """(s,) bool, sightings of markers with a heading."""
         return self.oriented[self.marker_row]
 
-    def by_kind(self, values):
-        """(s,) of the sightings and (r,) of the ranges, of values (s + r,)."""
-        return np.split(values, [len(self.marker_row)])
-
-    @property
-    def unit_weights(self):
-        """(s + r,) weight 1 for every measurement."""
-        return np.ones(len(self.marker_row) + len(self.ranges.row))
-
     @cached_property
     def sighting_roots(self):
-        """Square root informations (s, 3, 3) of the sightings, and (s, 2, 2) of their positions.
+        """Square root informations (s, 3, 3) of the sightings; of points (2, 2) of them, else 0.
 
         `ArucoReading.txt` gives the covariance C in the axes of the vehicle. The error of a marker
         with a heading lives in the axes of the measured pose z: R(heading)^T C R(heading).
         """
-        s = self.sightings
-        return (square_root_information(se2.rotate_covariance(s.C, -s.z[:, 2])),
-                square_root_information(s.C[:, :2, :2]))
+        s, points = self.sightings, ~self.as_pose
+        U = square_root_information(se2.rotate_covariance(s.C, -s.z[:, 2]))
+        U[points] = 0
+        U[points, :2, :2] = square_root_information(s.C[points, :2, :2])
+        return U
 
     @cached_property
     def structure(self):
         """The Structure of the information matrix."""
         f, k, s, r = len(self.frame), len(self.marker), self.sightings, self.ranges
-        sightings = np.stack([s.row, f + self.marker_row], -1)
         return block_structure(
             np.r_[np.ones(f, bool), self.oriented, np.zeros(len(self.antenna), bool)],
-            [np.arange(f - 1)[:, None] + [0, 1], sightings[self.as_pose], sightings[~self.as_pose],
+            [np.arange(f - 1)[:, None] + [0, 1], np.stack([s.row, f + self.marker_row], -1),
              np.stack([r.row, f + k + r.antenna], -1), connected(self)])
 
 
@@ -231,33 +212,38 @@ def measure(dataset, extra_poses=(), jumps=NO_JUMPS, own=None):
 
 
 @dataclass(frozen=True)
-class AcceptedMeasurements:
-    """The accepted measurements and their robust kernels."""
+class Accepted:
+    """Which of the m measurements of a kind are accepted, and their robust kernel."""
 
-    measurements: Measurements
-    weight: np.ndarray                       # (s + r,) of its information, 0 if it is rejected
-    sighting_kernel: gtsam.noiseModel.mEstimator.Base | None = None      # None: quadratic
-    range_kernel: gtsam.noiseModel.mEstimator.Base | None = None
-    range_bias: float = 0.0                  # sigmas, of the range kernel (`fit.ONE_SIDED`)
-    share: np.ndarray | None = None          # (s + r,) that its neighbours leave it (`memory`)
+    weight: np.ndarray       # (m,) of its information, 0 if it is rejected
+    share: np.ndarray        # (m,) of it that its neighbours leave each (`memory`)
+    kernel: gtsam.noiseModel.mEstimator.Base | None = None      # None: quadratic
+    bias: float = 0.0        # sigmas, of the kernel (`fit.ONE_SIDED`)
 
-    @property
-    def sighting_weight(self):
-        """(s,) weights of the sightings."""
-        return self.measurements.by_kind(self.weight)[0]
+    def kept(self, residual):
+        """(m,) weights, including the kernel's, by signed or absolute whitened residuals (m,)."""
+        return self.weight * ([self.kernel.weight(x) for x in residual - self.bias]
+                              if self.kernel else 1.0)
 
-    @property
-    def range_weight(self):
-        """(r,) weights of the ranges."""
-        return self.measurements.by_kind(self.weight)[1]
 
-    @property
-    def shares(self):
-        """`share` of the sightings (s,) and of the ranges (r,)."""
-        m = self.measurements
-        return m.by_kind(m.unit_weights if self.share is None else self.share)
+class AcceptedMeasurements(NamedTuple):
+    """The accepted measurements of both kinds."""
+
+    sightings: Accepted
+    ranges: Accepted
 
     @property
-    def rejected(self):
-        """(s,) bool, sightings without weight."""
-        return self.sighting_weight == 0
+    def share(self):
+        """(s + r,) shares of both kinds."""
+        return np.concatenate([kind.share for kind in self])
+
+    def with_shares(self, shares):
+        """The same with other shares, (s,) of the sightings and (r,) of the ranges."""
+        return AcceptedMeasurements(*(
+            replace(accepted, share=share) for accepted, share in zip(self, shares)))
+
+
+def all_accepted(measurements, kernel=None):
+    """The AcceptedMeasurements that count all of Measurements in full, by one kernel or none."""
+    return AcceptedMeasurements(*(Accepted(*np.ones((2, len(kind.row))), kernel) for kind in (
+        measurements.sightings, measurements.ranges)))
