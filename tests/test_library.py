@@ -68,7 +68,7 @@ def test_the_library_heeds_kernel_and_gate_of_vehicle_toml(tmp_path):
     np.testing.assert_array_equal(found.poses, same.poses)
     np.testing.assert_array_equal(again.poses, default.poses)
     assert (found.range_weight > 0).all() and not (default.range_weight > 0).all()
-    assert found.fit.problem.accepted.sighting_kernel is KERNELS["Huber"]
+    assert found.fit.problem.accepted.sightings.kernel is KERNELS["Huber"]
 
 
 # Factors of one's own.

@@ -105,7 +105,7 @@ def _of_noise(result):
         if (share < 1).any():
             yield what.replace("noise", "memory"), (
                 f"Errors of successive {name} are alike: the correlation of their residuals is "
-                f"{result.correlation[column - 1, 0]:.2f}. So problems 3 and 4 count {len(share)} "
+                f"{result.correlation[column - 1]:.2f}. So problems 3 and 4 count {len(share)} "
                 f"{name} as {share.sum():.0f}, with {factor:.2g} times the standard deviations in "
                 f"{file}, because residuals do not show all of such errors. Look at the "
                 "calibration of the sensor, and for what blurs, hides or reflects.")

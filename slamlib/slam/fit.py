@@ -19,13 +19,7 @@ from slamlib.slam.calibration import WHEELS
 from slamlib.slam.factors import linearize_measurements, preintegrate_odometry
 from slamlib.slam.graph import optimize
 from slamlib.slam.linear import Problem, State, laplace_approximation
-from slamlib.slam.measurements import (
-    Accepted,
-    AcceptedMeasurements,
-    Noise,
-    all_accepted,
-    with_known,
-)
+from slamlib.slam.measurements import Accepted, AcceptedMeasurements, Noise, accept_all, with_known
 from slamlib.slam.noise import NoisePosterior, learn_noise, with_hidden_errors
 
 RANGE_GATE = 3.3             # sigmas; a range that is shorter than expected by more is rejected
@@ -88,7 +82,7 @@ def residuals(problem, state):
         those of the vehicle with 0 as the third.
     (r,) of the ranges, positive for a range that is too long.
     """
-    everything = replace(problem, accepted=all_accepted(problem.measurements))
+    everything = replace(problem, accepted=accept_all(problem.measurements))
     sightings, ranges, _ = linearize_measurements(everything, state)
     return -sightings.e, -ranges.e[:, 0]
 
@@ -114,7 +108,7 @@ def narrow_kernels(problem, state, scales=CAUCHY_SCALES):
     for number, scale in enumerate(scales):
         if number:                                   # the caller judges the last solution
             problem = replace(problem, noise=noise_of_scatter(problem, state))
-        accepted = all_accepted(problem.measurements, _kernel.Cauchy.Create(scale))
+        accepted = accept_all(problem.measurements, _kernel.Cauchy.Create(scale))
         state = optimize(replace(problem, accepted=accepted), state, tolerance=ROUGH).state
     return state
 
@@ -172,13 +166,11 @@ def refine(problem, state, accept=accepted_measurements):
     for _ in range(MAX_ROUNDS):
         problem = replace(problem, accepted=accepted,
                           odometry=preintegrate_odometry(m, model, state.c[WHEELS]))
-        optimum = None                                     # frees the equations of the last round
         if m.learned.any() and changed > NEGLIGIBLE_CHANGE * len(accepted.share):
             optimum = optimize(problem, state, max_steps=2)
             state, posterior = optimum.state, learn_noise(optimum.equations)
             problem = replace(problem, noise=with_known(posterior.noise, m.dataset.vehicle))
         problem = replace(problem, odometry=replace(problem.odometry, in_counts=True))
-        optimum = None
         optimum = optimize(problem, state)
         state = optimum.state
         accepted = accept(problem, state)
@@ -194,7 +186,6 @@ def refine(problem, state, accept=accepted_measurements):
             replace(hidden, accepted=accept(hidden, state)), state)]
     if any((share < 1).any() for share in shares):
         problem, posterior = _with_shares(problem, state, posterior, shares, accept)
-        optimum = None
         optimum = optimize(problem, state)
     _, log_evidence = laplace_approximation(optimum.equations, problem.noise)
     return Fit(problem=problem, state=optimum.state, log_evidence=log_evidence, posterior=posterior,

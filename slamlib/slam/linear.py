@@ -32,7 +32,7 @@ from slamlib.slam.measurements import (
     AcceptedMeasurements,
     Measurements,
     Noise,
-    all_accepted,
+    accept_all,
     with_known,
 )
 
@@ -102,7 +102,7 @@ def build_problem(measurements, model, noise=None, wheel=None):
     late = frozenset({"time-offset"} if measurements.jumps.lag else ())
     return Problem(
         measurements=measurements, odometry=preintegrate_odometry(measurements, model, wheel),
-        accepted=all_accepted(measurements),
+        accepted=accept_all(measurements),
         noise=with_known(noise or Noise(), measurements.dataset.vehicle),
         sigma=measurements.calibration.sigma_without(late), released=late)
 

@@ -49,11 +49,6 @@ class Noise(NamedTuple):
     ranges: float = 1.0            # factor on the sigmas in UwbReading.txt
 
 
-def is_known(vehicle):
-    """(3,) bool, which noise parameters a Vehicle gives."""
-    return np.array([getattr(vehicle, key) is not None for key in NOISE_KEYS])
-
-
 def with_known(noise, vehicle):
     """The Noise with the parameters that a Vehicle gives; the slip is at least 1e-5 sqrt(m)."""
     given = [getattr(vehicle, key) for key in NOISE_KEYS]
@@ -93,28 +88,6 @@ class Structure:
         return matrix
 
 
-def block_structure(is_pose, factors):
-    """The Structure of variables, of which `is_pose` (v,) are poses and the others points.
-
-    `factors` lists, for each kind of factor, the variables (m, 2) of its m factors. Variables are
-    eliminated in the order of minimum degree.
-    """
-    count = len(is_pose)
-    row, column = np.concatenate([np.repeat(np.arange(count), 2).reshape(-1, 2), *(
-        each[:, [[0, 0], [0, 1], [1, 0], [1, 1]]].reshape(-1, 2) for each in factors)]).T
-    connected = sparse.csc_array((np.where(row == column, count, 0.5), (row, column)))
-    position = splu(connected, permc_spec="MMD_AT_PLUS_A").perm_c
-    block, number = np.unique(position[row] * count + position[column], return_inverse=True)
-    by_rows = sparse.bsr_array((
-        np.arange(9 * len(block)).reshape(-1, 3, 3), block % count,
-        np.searchsorted(block, count * np.arange(count + 1)))).tocsr()
-    places = sparse.csc_array((by_rows.data, by_rows.indices, by_rows.indptr), by_rows.shape)
-    ends = np.cumsum([count, *(4 * len(each) for each in factors)])
-    return Structure(
-        is_pose=is_pose, position=position, places=places, diagonal=places.diagonal(),
-        factors=factors, blocks=[each.reshape(-1, 4) for each in np.split(number, ends)[1:-1]])
-
-
 @dataclass(frozen=True)
 class Ranges:
     """Ranges from frames to antennas."""
@@ -151,8 +124,9 @@ class Measurements:
     @property
     def learned(self):
         """(3,) bool, noise parameters that are learned: unknown ones with measurements."""
-        return ~is_known(self.dataset.vehicle) & [
-            True, len(self.marker_row) > 0, len(self.ranges.row) > 0]
+        counts = 1, len(self.marker_row), len(self.ranges.row)
+        return np.array([getattr(self.dataset.vehicle, key) is None and count > 0
+                         for key, count in zip(NOISE_KEYS, counts)])
 
     @property
     def as_pose(self):
@@ -174,12 +148,24 @@ class Measurements:
 
     @cached_property
     def structure(self):
-        """The Structure of the information matrix."""
+        """The Structure of the information matrix, eliminated in the order of minimum degree."""
         f, k, s, r = len(self.frame), len(self.marker), self.sightings, self.ranges
-        return block_structure(
-            np.r_[np.ones(f, bool), self.oriented, np.zeros(len(self.antenna), bool)],
-            [np.arange(f - 1)[:, None] + [0, 1], np.stack([s.row, f + self.marker_row], -1),
-             np.stack([r.row, f + k + r.antenna], -1), connected(self)])
+        is_pose = np.r_[np.ones(f, bool), self.oriented, np.zeros(len(self.antenna), bool)]
+        factors = [np.arange(f - 1)[:, None] + [0, 1], np.stack([s.row, f + self.marker_row], -1),
+                   np.stack([r.row, f + k + r.antenna], -1), connected(self)]
+        count, ends = len(is_pose), np.cumsum([len(is_pose), *(4 * len(each) for each in factors)])
+        row, column = np.concatenate([np.repeat(np.arange(count), 2).reshape(-1, 2), *(
+            each[:, [[0, 0], [0, 1], [1, 0], [1, 1]]].reshape(-1, 2) for each in factors)]).T
+        neighbours = sparse.csc_array((np.where(row == column, count, 0.5), (row, column)))
+        position = splu(neighbours, permc_spec="MMD_AT_PLUS_A").perm_c
+        block, number = np.unique(position[row] * count + position[column], return_inverse=True)
+        by_rows = sparse.bsr_array((
+            np.arange(9 * len(block)).reshape(-1, 3, 3), block % count,
+            np.searchsorted(block, count * np.arange(count + 1)))).tocsr()
+        places = sparse.csc_array((by_rows.data, by_rows.indices, by_rows.indptr), by_rows.shape)
+        return Structure(
+            is_pose=is_pose, position=position, places=places, diagonal=places.diagonal(),
+            factors=factors, blocks=[each.reshape(-1, 4) for each in np.split(number, ends)[1:-1]])
 
 
 def measure(dataset, extra_poses=(), jumps=NO_JUMPS, own=None):
@@ -243,7 +229,7 @@ class AcceptedMeasurements(NamedTuple):
             replace(accepted, share=share) for accepted, share in zip(self, shares)))
 
 
-def all_accepted(measurements, kernel=None):
+def accept_all(measurements, kernel=None):
     """The AcceptedMeasurements that count all of Measurements in full, by one kernel or none."""
     return AcceptedMeasurements(*(Accepted(*np.ones((2, len(kind.row))), kernel) for kind in (
         measurements.sightings, measurements.ranges)))

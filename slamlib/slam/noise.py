@@ -14,7 +14,7 @@ import numpy as np
 
 from slamlib.increments import SLIP_FACTOR, TYPICAL_SLIP
 from slamlib.slam.linear import laplace_approximation
-from slamlib.slam.measurements import Noise, is_known, with_known
+from slamlib.slam.measurements import Noise, with_known
 
 MEDIAN = np.array([TYPICAL_SLIP, 1.0, 1.0])        # sqrt(m), 1, 1: of the prior
 PRIOR_SIGMA = np.log([SLIP_FACTOR, 2.0, 2.0])      # (3,) standard deviations of the logarithms
@@ -66,7 +66,7 @@ def learn_noise(equations):
         prior = -((logarithms - np.log(MEDIAN)) / PRIOR_SIGMA)[free]**2 / 2
         return max(evidence, SINGULAR) + np.sum(prior)
 
-    start = np.where(m.learned | is_known(m.dataset.vehicle), np.log(noise), np.log(MEDIAN))
+    start = np.log(noise)
     value = log_posterior(start)
     if value < SINGULAR / 2:                             # nothing can be learned
         return NoisePosterior(noise, np.zeros((3, 3)), SINGULAR, ((1.0, noise),))

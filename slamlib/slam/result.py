@@ -43,7 +43,7 @@ class SlamResult:
     rejected: np.ndarray            # (s,) bool, beyond the gate, rows of Measurements.sightings
     range_weight: np.ndarray        # (r,) share of its information that each range keeps, 0 to 1
     range_residual: np.ndarray      # (r,) whitened, positive for a range that is too long
-    correlation: np.ndarray         # (2, 2) of neighbours' residuals of a landmark, and its sigma
+    correlation: tuple              # of neighbours' residuals of a marker, and of an antenna
     turn_sigma: np.ndarray          # (f-1,) rad, of odometry's turns between frames, stated wheels
     fit: Fit                        # problem and solution, for `graph.as_gtsam`
     places: np.ndarray | None = None     # (m, 2) ids of ArucoReadings, and those in the map
@@ -59,6 +59,8 @@ class SlamResult:
     sightings = property(attrgetter("fit.problem.measurements.sightings"))      # s of the graph
     jumps = property(attrgetter("fit.problem.measurements.jumps"))     # odometry against markers
     converged = property(attrgetter("fit.converged"))            # before MAX_STEPS of steps
+    wheel = property(lambda self: self.c[WHEELS])                # (3,) m: R_R, R_L, b
+    wheel_covariance = property(lambda self: self.c_covariance[WHEELS, WHEELS])      # (3, 3) m^2
 
     def __repr__(self):
         sigma = 1e3 * np.sqrt(np.trace(self.covariances[:, :2, :2], axis1=1, axis2=2) / 2).mean()
@@ -86,22 +88,9 @@ class SlamResult:
         other = (distance < SAME_MARKER) & (count > count[:, None])
         return self.marker[(count == 1) | other.any(axis=1)]
 
-    @property
-    def wheel(self):
-        """Wheel parameters R_R, R_L, b, (3,) m."""
-        return self.c[WHEELS]
-
-    @property
-    def wheel_covariance(self):
-        """Their covariance (3, 3), m^2."""
-        return self.c_covariance[WHEELS, WHEELS]
-
 
 def slam_result(fit):
-    """The SlamResult of a Fit.
-
-    Raises LinAlgError as `marginal_covariances`.
-    """
+    """The SlamResult of a Fit; raises LinAlgError as `marginal_covariances`."""
     problem, m = fit.problem, fit.problem.measurements
     state, marginal, slip = posterior_moments(fit)
     poses, pose_covariances = interpolate(
@@ -126,8 +115,7 @@ def slam_result(fit):
         c=state.c, c_covariance=marginal.c, noise_sigma=np.zeros(3) if fit.posterior is None
         else np.sqrt(np.diag(fit.posterior.covariance)),
         rejected=rejected, range_weight=range_weight, range_residual=range_residual,
-        correlation=np.array([(memory.correlation, memory.sigma)
-                              for memory in error_memories(problem, state)]),
+        correlation=tuple(each.correlation for each in error_memories(problem, state)),
         turn_sigma=turn_sigma(problem), fit=fit)
 
 

@@ -95,7 +95,7 @@ def correlated_errors(seed, correlation, **options):
         true = truth.poses[getattr(found, "frame", slice(None))]
         numbers |= {f"{name} nees": anees(found.poses, found.covariances, true),
                     f"{name} ate": ate(found.poses, true, aligned=True)}
-    return numbers | {"share": problem3.share.mean(), "residuals": problem3.correlation[0, 0]}
+    return numbers | {"share": problem3.share.mean(), "residuals": problem3.correlation[0]}
 
 
 def known_shares(measurements, correlation):
