@@ -13,11 +13,11 @@ from slamlib.dataset import Dataset
 from slamlib.odometry import MODELS
 from slamlib.odometry_gate import NO_JUMPS
 from slamlib.slam.choices import better_model, calibrated, most_consistent
-from slamlib.slam.covariances import marginal_covariances
+from slamlib.slam.covariances import posterior_moments
 from slamlib.slam.fit import CAUCHY_SCALES, narrow_kernels, refine
 from slamlib.slam.graph import optimize
 from slamlib.slam.initialization import initial_state, state_from_poses
-from slamlib.slam.linear import NormalEquations, build_problem
+from slamlib.slam.linear import build_problem
 from slamlib.slam.measurements import Noise, measure
 from slamlib.slam.own import linearized_own
 from slamlib.slam.result import slam_result
@@ -126,14 +126,14 @@ def own_contradictions(fit):
     Of a pose and a landmark, whose errors may be correlated, twice the sum of theirs is counted.
     """
     problem, m = fit.problem, fit.problem.measurements
-    e, J, _ = linearized_own(problem, fit.state)
+    e, *_ = linearized_own(problem, fit.state)
     if not len(e):
         return np.zeros(0)
     rest = calibrated(fit_from_odometry(
         replace(m, own=NonlinearFactorGraph()), problem.odometry.model))
-    found = marginal_covariances(NormalEquations(rest.problem, rest.state), rest.problem.noise)
+    state, found, _ = posterior_moments(rest)
     C = np.concatenate([found.pairs[:1, :3, :3], found.pairs[:, 3:6, 3:6], found.landmarks])
-    off, J, _ = linearized_own(problem, rest.state)
+    off, J, _ = linearized_own(problem, state)
     J = J.reshape(*off.shape, 2, 3).swapaxes(1, 2)                       # (m, 2, d, 3)
     predicted = 2 * np.sum(J @ C[m.structure.factors[-1]] @ J.mT, axis=1) + np.eye(off.shape[1])
     squared = np.einsum("ni,ni->n", off, np.linalg.solve(predicted, off[..., None])[..., 0])
