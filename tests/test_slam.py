@@ -200,20 +200,6 @@ def test_averages_over_the_noise_are_moments_of_a_mixture():
     assert np.isclose(slip**2, sum(p * noise.slip**2 for p, noise in zip(weights, noises)))
 
 
-def test_an_error_of_one_sigma_costs_one_half():
-    """A sighting in vehicle axes with error e and covariance C costs e^T C^-1 e / 2."""
-    rng = np.random.default_rng(1)
-    for _ in range(20):
-        root = rng.normal(0, 0.01, (3, 3))
-        C, z = root @ root.T + 1e-6 * np.eye(3), np.array([1.0, -0.5, rng.uniform(-3, 3)])
-        e = np.linalg.cholesky(C) @ rng.normal(size=3) * [1, 1, 0]   # so the axes stay the same
-        m, problem = standing(ArucoReadings(np.array([0]), np.array([4]), z[None], C[None]))
-        state = state_from_arrays(m, np.zeros((1, 3)), [z + e], np.zeros((0, 2)),
-                                  m.calibration.stated)
-        assert np.isclose(NormalEquations(problem, state).error, e @ np.linalg.solve(C, e) / 2,
-                          rtol=1e-9)
-
-
 def test_two_poses_and_one_marker_by_hand():
     """Poses at 0 and x on a line, a marker at m seen from both, headings known.
 

@@ -244,13 +244,6 @@ def test_a_standing_vehicle_learns_only_the_distances_of_its_antennas():
     np.testing.assert_allclose(np.hypot(*found.antenna_in_world.T), np.hypot(*place.T), atol=0.05)
 
 
-def line_of_ranges(count):
-    """Ranges without error to an antenna at (3, 4), from a straight path."""
-    path = np.column_stack([np.linspace(0, 6, count), np.zeros(count)])
-    return AntennaRanges(path, np.hypot(*(path - [3.0, 4.0]).T), np.full(count, 0.05),
-                         np.array([2.0, 3.0]))
-
-
 def test_places_within_three_hundredths_of_the_distance_are_one():
     """A path of one metre and its antenna 20 m ahead, to one side; its mirror image is as far."""
     path = np.column_stack([np.linspace(0, 1, 30), np.zeros(30)])
@@ -265,8 +258,9 @@ def test_places_within_three_hundredths_of_the_distance_are_one():
 
 def test_second_moment_is_that_of_a_mixture_of_both_mirror_images():
     """Exact ranges from a straight path: (3, 4) and (3, -4), between which the guess decides."""
-    ranges, estimate = line_of_ranges(50), np.array([3.0, 4.0])
-    ranges = replace(ranges, guess=np.array([3.0, 0.0]))               # as far from both
+    path, estimate = np.column_stack([np.linspace(0, 6, 50), np.zeros(50)]), np.array([3.0, 4.0])
+    ranges = AntennaRanges(path, np.hypot(*(path - estimate).T), np.full(50, 0.05),
+                           np.array([3.0, 0.0]))                       # as far from both
     places, costs, covariances = trilaterate(ranges)
     np.testing.assert_allclose(np.sort(places[:2, 1]), [-4, 4], atol=1e-3)
     assert abs(costs[1]) < 1e-6

@@ -52,10 +52,7 @@ MIN_SIGMA = 0.02             # m or rad, of the path between two visits
 
 
 def better_model(fit):
-    """The Fit by Euler's steps if their evidence leads that of arcs by DECISIVE_LEAD, else by arcs.
-
-    Both evidences are on the same measurements with the same weights and noise.
-    """
+    """The Fit by Euler's steps if their evidence leads that of arcs by DECISIVE_LEAD, or arcs."""
     current = replace(fit.problem, accepted=_with_fixed_weights(fit))
     other, = {*MODELS} - {current.odometry.model}
     odometry = replace(preintegrate_odometry(
@@ -147,10 +144,7 @@ def _log_evidence(L, h, sigma):
 
 
 def _likelihood(fit):
-    """Information L (p, p) and h (p,) of the measurements about the whole calibration.
-
-    In wide sigmas from the stated values, at the noise of the Fit.
-    """
+    """Information L (p, p) and h (p,) about the calibration, in wide sigmas from what is stated."""
     calibration = fit.problem.measurements.calibration
     equations = NormalEquations(replace(fit.problem, sigma=calibration.wide), fit.state)
     H, border, *_ = equations.sums(fit.problem.noise, consistent=True)
@@ -169,10 +163,7 @@ def _likelihood(fit):
 
 
 def _lead(proposed, present):
-    """Difference of the log evidence of two Fits, on the measurements and weights of `proposed`.
-
-    The noise is learned for each.
-    """
+    """Log evidence of a Fit minus that of another, on the weights of `proposed`, noise learned."""
     fixed = _with_fixed_weights(proposed)
     first, second = (refine(replace(proposed.problem, accepted=fixed, sigma=each.problem.sigma),
                             each.state, accept=None) for each in (proposed, present))
@@ -235,10 +226,7 @@ def has_rejected_visits(fit):
 
 
 def spares_sightings(fit, other):
-    """Whether a Fit rejects less than MAX_STILL_REJECTED of the sightings that another rejects.
-
-    Both are judged at the smaller of their noise factors.
-    """
+    """Whether a Fit rejects less than MAX_STILL_REJECTED of the sightings that another rejects."""
     factor = min(each.problem.noise.sightings for each in (fit, other))
     count, most = (contradicted(each, factor).sum() for each in (fit, other))
     return bool(count < MAX_STILL_REJECTED * most)
@@ -247,8 +235,7 @@ def spares_sightings(fit, other):
 def places_of_ids(aruco, solve):
     """`SlamResult.places` of ArucoReadings, None if each id is one place; `solve` as above.
 
-    The second place of id 12 gets the number 112 where ids have up to two digits, the third one
-    212.
+    The second place of id 12 gets the number 112 where ids have up to two digits, then 212.
     """
     marker, number = aruco.marker, visits(aruco)
     try:

@@ -88,10 +88,7 @@ def residuals(problem, state):
 
 
 def error_memories(problem, state):
-    """The Memory of the errors of sightings, and that of ranges, at a State near the solution.
-
-    Echoes, ranges far too long, do not count.
-    """
+    """The Memory of the errors of sightings, and that of ranges but echoes, at a solution."""
     m, (sightings, ranges) = problem.measurements, problem.accepted
     residual, late = residuals(problem, state)
     direct = (ranges.weight > 0) & (np.abs(late) < MAX_DIRECT)
@@ -193,10 +190,7 @@ def refine(problem, state, accept=accepted_measurements):
 
 
 def _with_shares(problem, state, posterior, shares, accept):
-    """The Problem with shares (s,) and (r,) of errors with memory, and the posterior of its noise.
-
-    The noise is that learned without shares, with hidden errors.
-    """
+    """The Problem with shares (s,) and (r,) of errors with memory, and its noise's posterior."""
     hidden = partial(with_hidden_errors, vehicle=problem.measurements.dataset.vehicle, remember=[
         (share < 1).any() for share in shares])
     problem = replace(problem, noise=hidden(problem.noise))

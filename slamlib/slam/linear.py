@@ -13,6 +13,7 @@ noise factors. Each value of the noise then costs one decomposition, which gives
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -85,11 +86,7 @@ class Problem:
     noise: Noise
     sigma: np.ndarray        # (p,) of the prior of the calibration, 0 of what is known
     released: frozenset = frozenset()    # groups of the calibration beyond their stated sigmas
-
-    @property
-    def active(self):
-        """(p,) bool, entries of the calibration that are among the q unknowns."""
-        return self.sigma > 0
+    active = property(lambda self: self.sigma > 0)      # (p,) bool, entries among the q unknowns
 
 
 def build_problem(measurements, model, noise=None, wheel=None):
@@ -132,11 +129,7 @@ class NormalEquations:
 
     problem: Problem
     state: State
-
-    @property
-    def structure(self):
-        """The Structure of H."""
-        return self.problem.measurements.structure
+    structure = property(attrgetter("problem.measurements.structure"))      # of H
 
     @cached_property
     def error(self):

@@ -31,7 +31,7 @@ from slamlib.sightings import (
     sightings_by_frame,
 )
 from slamlib.slam.calibration import Calibration, stated_calibration
-from slamlib.slam.own import connected, poses_of
+from slamlib.slam.own import connected
 
 NOISE_KEYS = ("slip", "marker_noise_factor", "range_noise_factor")      # of a Vehicle, as in Noise
 
@@ -115,6 +115,7 @@ class Measurements:
     calibration: Calibration     # what the Vehicle states of what measurements share
     jumps: Jumps             # where odometry contradicts the markers
     own: gtsam.NonlinearFactorGraph      # factors of one's own
+    as_pose = property(lambda self: self.oriented[self.marker_row])    # (s,) bool, with a heading
 
     @property
     def origin_sigma(self):
@@ -127,11 +128,6 @@ class Measurements:
         counts = 1, len(self.marker_row), len(self.ranges.row)
         return np.array([getattr(self.dataset.vehicle, key) is None and count > 0
                          for key, count in zip(NOISE_KEYS, counts)])
-
-    @property
-    def as_pose(self):
-        """(s,) bool, sightings of markers with a heading."""
-        return self.oriented[self.marker_row]
 
     @cached_property
     def sighting_roots(self):
@@ -171,14 +167,15 @@ class Measurements:
 def measure(dataset, extra_poses=(), jumps=NO_JUMPS, own=None):
     """The Measurements of a Dataset.
 
-    `extra_poses`, encoder poses from 0, are frames without a measurement: tests compare a graph of
-    all poses with poses interpolated between the frames. `jumps` are those of odometry, `own` is a
-    gtsam.NonlinearFactorGraph (`slam.own`), or None.
+    `extra_poses`, encoder poses from 0, are frames without a measurement. `jumps` are those of
+    odometry, `own` is a gtsam.NonlinearFactorGraph (`slam.own`), or None.
     """
     uwb = dataset.uwb or UwbReadings(*np.zeros((2, 0), int), *np.zeros((2, 0)))
     own, count = own or gtsam.NonlinearFactorGraph(), len(dataset.ticks)
-    sightings = sightings_by_frame(dataset.aruco, np.r_[
-        0, count - 1, np.array(extra_poses, int), poses_of(own, count), uwb.pose])
+    keys = own.keyVector()                       # with a name: iterators do not keep it alive
+    own_poses = [gtsam.symbolIndex(key) for key in keys if gtsam.symbolChr(key) == ord("x")]
+    sightings = sightings_by_frame(dataset.aruco, np.r_[0, count - 1, np.array(
+        [*extra_poses, *(i for i in own_poses if i < count)], int), uwb.pose])
     marker, marker_row = np.unique(sightings.marker, return_inverse=True)
     has_heading = sightings.C[:, 2, 2] < MAX_HEADING_SIGMA**2
     antenna, guess = np.unique(uwb.antenna), dataset.antenna_guess
@@ -217,11 +214,7 @@ class AcceptedMeasurements(NamedTuple):
 
     sightings: Accepted
     ranges: Accepted
-
-    @property
-    def share(self):
-        """(s + r,) shares of both kinds."""
-        return np.concatenate([kind.share for kind in self])
+    share = property(lambda self: np.concatenate([kind.share for kind in self]))      # (s + r,)
 
     def with_shares(self, shares):
         """The same with other shares, (s,) of the sightings and (r,) of the ranges."""

@@ -40,14 +40,6 @@ def gtsam_values(problem, state):
     return values
 
 
-def poses_of(graph, count):
-    """Rows (p,) of `Dataset.ticks`, below `count`, of the poses in a gtsam.NonlinearFactorGraph."""
-    keys = graph.keyVector()                     # with a name: iterators do not keep it alive
-    symbols = [gtsam.Symbol(key) for key in keys]
-    return np.array([symbol.index() for symbol in symbols
-                     if symbol.chr() == ord("x") and symbol.index() < count], int)
-
-
 def connected(measurements):
     """Numbers (m, 2) of the variables of each factor of one's own; of one variable, twice its own.
 

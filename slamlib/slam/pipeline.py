@@ -87,8 +87,7 @@ kernel, found 'L2'
         return fit if other is fit else calibrated(other)
 
     if previous is not None and len(previous.rejected):
-        places = previous.places
-        fit = solve(previous.jumps, places)
+        fit, places = solve(previous.jumps, previous.places), previous.places
     else:
         fit, places = most_consistent(dataset, solve)
     optimum = optimize(fit.problem, fit.state, by_gtsam=True)
@@ -104,10 +103,7 @@ def fit_from_odometry(measurements, model="arc"):
 
 
 def fit_from_previous(measurements, previous, model=None):
-    """The Fit of Measurements from poses, calibration, slip and model of the SlamResult `previous`.
-
-    `model`, if not None, replaces that of `previous`. Errors raised as in `refine`.
-    """
+    """The Fit of Measurements from a SlamResult, with another `model` if not None."""
     frame, calibration = measurements.frame, measurements.calibration
     sigma, c = (calibration.taken_from(previous.calibration, *values) for values in (
         (previous.fit.problem.sigma, calibration.sigma), (previous.c, calibration.stated)))

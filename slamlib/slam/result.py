@@ -59,6 +59,8 @@ class SlamResult:
     sightings = property(attrgetter("fit.problem.measurements.sightings"))      # s of the graph
     jumps = property(attrgetter("fit.problem.measurements.jumps"))     # odometry against markers
     converged = property(attrgetter("fit.converged"))            # before MAX_STEPS of steps
+    calibration_table = property(lambda self: calibration_table(           # list of p dicts
+        self.calibration, self.c, self.c_covariance, self.released))
     wheel = property(lambda self: self.c[WHEELS])                # (3,) m: R_R, R_L, b
     wheel_covariance = property(lambda self: self.c_covariance[WHEELS, WHEELS])      # (3, 3) m^2
 
@@ -70,11 +72,6 @@ class SlamResult:
                 f"{len(self.range_weight)} ranges\n  steps: {self.model}, slip {self.slip:.2g} "
                 f"sqrt(m), noise factors {self.noise.sightings:.2g} and {self.noise.ranges:.2g}\n"
                 f"  released from vehicle.toml: {', '.join(sorted(self.released)) or 'nothing'}")
-
-    @property
-    def calibration_table(self):
-        """List of a dict for each of the p entries, by `calibration.calibration_table`."""
-        return calibration_table(self.calibration, self.c, self.c_covariance, self.released)
 
     @property
     def unconfirmed(self):
@@ -120,10 +117,7 @@ def slam_result(fit):
 
 
 def turn_sigma(problem):
-    """Standard deviations (f-1,), rad, of the turns between frames by odometry of stated wheels.
-
-    Estimated ones adapt to a wrong number of turns.
-    """
+    """Standard deviations (f-1,), rad, of the turns between frames by odometry of stated wheels."""
     m, odometry = problem.measurements, problem.odometry
     known = ~m.jumps.share(m.frame[:-1], m.frame[1:]).any(axis=1)        # else by markers
     variance = np.sum((odometry.J_wheel[:, 2] * m.dataset.vehicle.sigma_wheel)**2, axis=1)
@@ -171,7 +165,6 @@ def _doubt(ranges, estimate, weight, places, costs):
         return f"{len(ranges.distance) - count} of its {len(ranges.distance)} ranges disagree"
     if sigma > MAX_RELATIVE_SIGMA * distance:
         return "its ranges are too few or come from too few directions"
-    return None
 
 
 def interpolate(problem, state, pairs):
