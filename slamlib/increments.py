@@ -66,7 +66,7 @@ def rounding_and_slipping(ticks, vehicle, start, end):
     return tuple(np.moveaxis(se2.rotate_covariance(in_world, -poses[start, 2:]), 1, 0))
 
 
-def noise_in_drive(ticks, vehicle, start, end, steps=None):
+def noise_in_drive(ticks, vehicle, start, end):
     """Noise of increments of one drive by encoder rounding, and by a slip of 1 sqrt(m).
 
     The rounding at a pose enters the increment before it and, with the opposite sign, the one after
@@ -82,7 +82,6 @@ def noise_in_drive(ticks, vehicle, start, end, steps=None):
     Parameters
     ----------
     ticks : (n, 2) counts; vehicle : Vehicle; start, end : (m,) poses from 0, start <= end.
-    steps : number of steps of the drive if the ticks are those of a part; default n - 1.
 
     Returns
     -------
@@ -91,7 +90,7 @@ def noise_in_drive(ticks, vehicle, start, end, steps=None):
     """
     start, end = np.asarray(start), np.asarray(end)
     rounding, slipping = rounding_and_slipping(ticks, vehicle, start, end)
-    rounding *= ((end - start) / max(1, steps or len(ticks) - 1))[:, None, None]
+    rounding *= ((end - start) / max(1, len(ticks) - 1))[:, None, None]
     travelled = odometry.cumulative(np.abs(odometry.steps(ticks, vehicle)[0]))
     skid = MINIMUM_SLIP**2 * (travelled[end] - travelled[start])
     rounding[:, [0, 1], [0, 1]] += skid[:, None]

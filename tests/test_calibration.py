@@ -71,7 +71,7 @@ def test_derivatives_by_every_entry(vehicle):
     q = problem.active.sum()
     assert q == len(ENTRIES) + 4
     delays = np.isin(np.arange(q), [SIGHTING_LAG, RANGE_LAG])
-    for kind in range(3):
+    for kind in range(2):
         def errors(delta, kind=kind):
             return NormalEquations(problem, moved(delta)).linearized[kind].e
 
@@ -85,7 +85,7 @@ def test_derivatives_by_every_entry(vehicle):
         J, numeric = J[inside], numeric[inside]
         scale = np.abs(numeric).max(axis=(0, 1)) + 1e-9
         assert (np.abs(J - numeric) < np.where(delays, 0.1, 1e-6) * scale).all()
-        assert (np.abs(J).max(axis=(0, 1)) > 0).sum() == (5, 5, 6 + 4)[kind]
+        assert (np.abs(J).max(axis=(0, 1)) > 0).sum() == (5, 6 + 4)[kind]
 
 
 def test_the_posterior_is_that_of_gtsam():
@@ -104,8 +104,6 @@ def test_the_posterior_is_that_of_gtsam():
     expected, n = np.zeros(len(solution.delta)), len(structure.diagonal)
     expected[np.r_[structure.unknowns, n:n + q]] = inverse @ vector
     np.testing.assert_allclose(solution.delta, expected, atol=1e-6 * np.abs(expected).max())
-    step = graph.gtsam_step(problem, equations.state)
-    np.testing.assert_allclose(solution.delta, step, atol=1e-6 * np.abs(step).max())
 
 
 def test_evidence_of_one_entry_by_hand():
@@ -252,24 +250,8 @@ def test_problem_2_and_the_checks_of_files_see_by_the_stated_camera():
 
 
 @pytest.mark.slow
-def test_without_noise_the_calibration_is_found_exactly():
-    dataset, truth = simulate("short", 2, noise=False)
-    camera, vehicle = (0.12, 0.04, -0.05), replace(dataset.vehicle, sigma_heading=1e-6)
-    spoilt = ranged_from(seen_from(replace(dataset, vehicle=vehicle), camera, size=1.02), truth,
-                         height=2.0)
-    found = slam.estimate(spoilt, slip=1e-4)
-    values = {row["name"]: row["estimate"] for row in found.calibration_table}
-    assert {"camera-offset", "marker-size", "antenna-height"} <= found.released
-    assert np.allclose([values[name] for name in ("camera_x", "camera_y", "camera_turn")], camera,
-                       atol=1e-4)
-    assert np.isclose(values["marker_size"], 1.02, atol=1e-4)
-    assert np.isclose(values["antenna_height"], 2.0, atol=2e-3)
-    assert ate(found.poses, truth.poses) < 1e-3
-
-
-@pytest.mark.slow
 def test_no_doubt_about_clean_drives():
-    """Of all slips, with late ranges and wrong labels too; corridors may have mirrored antennas."""
+    """Of all slips, with late ranges and wrong labels too; a long one is in test_uwb."""
     doubts = []
     for seed, slip in enumerate([0.0, 3e-4, 1e-3, 3e-3, 1e-2] * 2):
         dataset, _ = simulate("short", 100 + seed, slip=slip, late_ranges=0.1 * (seed % 2))

@@ -209,15 +209,6 @@ def test_offsets_of_the_camera_have_the_standard_deviations_that_they_state():
 
 
 @pytest.mark.slow
-def test_there_is_no_doubt_about_a_clean_long_drive():
-    """Short ones are in test_calibration."""
-    dataset, _ = simulate("long", 71, slip=1e-2)
-    found = slam.estimate(dataset.without("uwb"))
-    both = slam.estimate(dataset, previous=found)
-    assert not names(doubts_before_solving(dataset), solution_doubts(found), solution_doubts(both))
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("case", LEGAL)
 def test_every_problem_is_solved_within_the_limits(case):
     """Finite covariances that are not negative, and of SLAM errors as those that they state.

@@ -3,23 +3,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from slamlib import odometry, se2, slam
+from slamlib import odometry, se2
 from slamlib.dataset import ArucoReadings, Dataset
 from slamlib.evaluation import anees, ate, nees_band
 from slamlib.localization import fuse, fuse_increments, fused, localize
 from slamlib.sightings import GATE
 from slamlib.simulation import TABLE_2, simulate
-from slamlib.slam import result
-
-
-def test_sections_of_a_drive_have_no_seams(monkeypatch):
-    dataset, _ = simulate("short", seed=3)
-    dataset = only(dataset.first(600), dataset.first(600).aruco.pose < 500)    # odometry at the end
-    whole = slam.estimate(dataset, slip=1e-3, model="arc")
-    monkeypatch.setattr(result, "FRAMES_AT_ONCE", 7)
-    sections = slam.estimate(dataset, slip=1e-3, model="arc")
-    np.testing.assert_allclose(sections.poses, whole.poses, atol=1e-10)
-    np.testing.assert_allclose(sections.covariances, whole.covariances, rtol=1e-7, atol=1e-14)
 
 
 def only(dataset, keep):

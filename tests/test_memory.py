@@ -66,7 +66,7 @@ def remembering():
 
 def test_memory_is_told_and_counted(remembering):
     dataset, _, result = remembering
-    assert result.correlation[0, 0] > 0.4 and result.correlation[1, 0] == 0
+    assert result.correlation[0] > 0.4 and result.correlation[1] == 0
     assert result.share.sum() < len(dataset.aruco.pose) / 3 and result.noise.sightings == 1
     sentence, = (doubt.sentence for doubt in solution_doubts(result)
                  if doubt.what == "marker-memory")
@@ -76,8 +76,9 @@ def test_memory_is_told_and_counted(remembering):
 def test_the_same_step_by_gtsam(remembering):
     """With shares of sightings and of ranges, the latter with their kernel."""
     fit = fit_from_odometry(measure(remembering[0]))
-    share = np.random.default_rng(0).uniform(0.1, 1, len(fit.problem.accepted.weight))
-    problem = replace(fit.problem, accepted=replace(fit.problem.accepted, share=share))
+    rng, accepted = np.random.default_rng(0), fit.problem.accepted
+    problem = replace(fit.problem, accepted=accepted.with_shares(
+        rng.uniform(0.1, 1, len(each.share)) for each in accepted))
     state = replace(fit.state, antennas=fit.state.antennas + 0.01)
     np.testing.assert_allclose(
         NormalEquations(problem, state).step(), gtsam_step(problem, state), atol=1e-7)

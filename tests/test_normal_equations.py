@@ -15,17 +15,11 @@ from slamlib.simulation import simulate
 from slamlib.slam import factors, graph, linear, noise
 from slamlib.slam.calibration import ENTRIES, WHEELS
 from slamlib.slam.covariances import marginal_covariances
-from slamlib.slam.fit import KERNELS
+from slamlib.slam.fit import KERNELS, residuals
 from slamlib.slam.graph import optimize
 from slamlib.slam.initialization import odometry_state
 from slamlib.slam.linear import NormalEquations, build_problem, laplace_approximation
-from slamlib.slam.measurements import (
-    GUESS_PRIOR_SIGMA,
-    WEAK_SIGMA,
-    AcceptedMeasurements,
-    Noise,
-    measure,
-)
+from slamlib.slam.measurements import GUESS_PRIOR_SIGMA, WEAK_SIGMA, Noise, accept_all, measure
 from slamlib.slam.own import gtsam_values, variable_keys
 
 GROUPS = frozenset(entry.group for entry in ENTRIES) | {"antenna-offsets"}
@@ -42,19 +36,19 @@ def native_graph(problem):
     accepted, noise, model = problem.accepted, problem.noise, gtsam.noiseModel
     m, native = problem.measurements, gtsam.NonlinearFactorGraph()
     key, s, k = variable_keys(m), m.sightings, len(m.frame) + len(m.marker)
-    weight = accepted.sighting_weight * m.as_pose
-    roots = m.sighting_roots[0] * (np.sqrt(weight) / noise.sightings)[:, None, None]
+    weight = accepted.sightings.weight * m.as_pose
+    roots = m.sighting_roots * (np.sqrt(weight) / noise.sightings)[:, None, None]
     for row in np.flatnonzero(weight):
         native.add(gtsam.BetweenFactorPose2(
             key[s.row[row]], key[len(m.frame) + m.marker_row[row]], gtsam.Pose2(*s.z[row]),
-            model.Robust.Create(accepted.sighting_kernel,
+            model.Robust.Create(accepted.sightings.kernel,
                                 model.Gaussian.SqrtInformation(roots[row], False))))
     r, sigmas = m.ranges, noise.ranges * m.ranges.sigma
-    for row in np.flatnonzero(accepted.range_weight):
+    for row in np.flatnonzero(accepted.ranges.weight):
         native.add(gtsam.RangeFactor2D(
             key[r.row[row]], key[k + r.antenna[row]],
-            r.distance[row] - accepted.range_bias * sigmas[row], model.Robust.Create(
-                accepted.range_kernel, model.Isotropic.Sigma(1, sigmas[row]))))
+            r.distance[row] - accepted.ranges.bias * sigmas[row], model.Robust.Create(
+                accepted.ranges.kernel, model.Isotropic.Sigma(1, sigmas[row]))))
     q = int(problem.active.sum())
     native.add(gtsam.PriorFactorPose2(key[0], gtsam.Pose2(), model.Diagonal.Sigmas(m.origin_sigma)))
     native.add(gtsam.PriorFactorVector(C(0), np.zeros(q), model.Unit.Create(q)))
@@ -75,16 +69,21 @@ def test_gtsam_has_the_same_error_and_takes_the_same_step():
     assert 0 < np.count_nonzero(m.oriented) < len(m.oriented)
     state = odometry_state(m, "arc")
     cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(3.0)
-    accepted = AcceptedMeasurements(m, m.unit_weights, cauchy, KERNELS["asymmetric Tukey"])
+    accepted = accept_all(m, cauchy)
+    accepted = accepted._replace(ranges=replace(
+        accepted.ranges, kernel=KERNELS["asymmetric Tukey"]))
     problem = replace(build_problem(m, "arc", Noise(2e-3, 1.5, 0.7)), accepted=accepted)
     equations = NormalEquations(problem, state)
     values, native = gtsam_values(problem, state), native_graph(problem)
     e, *_ = factors.odometry_error(problem.odometry, state.poses, state.c[WHEELS])
     squared = np.sum(e * np.linalg.solve(problem.odometry.covariance(2e-3), e[..., None])[..., 0])
-    expected = native.error(values) + squared / 2 + equations.linearized[1].error
-    assert np.isclose(equations.error, expected, rtol=1e-12)
-    own, (poses, _, ranges, _) = native.linearize(values), equations.linearized
-    for i, (J, e) in enumerate(zip([*poses.J, *ranges.J[:, :, :5]], [*poses.e, *ranges.e])):
+    own, (seen, ranges, _) = native.linearize(values), equations.linearized
+    off = np.linalg.norm(residuals(problem, state)[0][~m.as_pose], axis=1)
+    of_points = sum(map(cauchy.loss, off))
+    assert np.isclose(
+        equations.error, native.error(values) + squared / 2 + of_points, rtol=1e-12)
+    for i, (J, e) in enumerate(zip([*seen.J[m.as_pose], *ranges.J[:, :, :5]],
+                                   [*seen.e[m.as_pose], *ranges.e])):
         found = np.c_[own.at(i).jacobian()]        # of small angles its logarithm's is rounded
         np.testing.assert_allclose(np.c_[J, -e], found, atol=1e-4 * np.abs(J).max())
     step = graph.gtsam_step(problem, state)
@@ -107,8 +106,9 @@ def test_markers_without_accepted_sightings_have_a_weak_prior_and_move_nothing_e
     m = measure(replace(dataset, aruco=as_points(dataset.aruco, points, 4.0)).first(500))
     point, = np.flatnonzero(~m.oriented)
     first = np.flatnonzero(m.oriented[1:] & m.oriented[:-1])[0]
-    weight = np.r_[~np.isin(m.marker_row, [point, first, first + 1]), np.ones(len(m.ranges.row))]
-    problem = replace(build_problem(m, "arc"), accepted=AcceptedMeasurements(m, weight))
+    problem, accepted = build_problem(m, "arc"), accept_all(m)
+    problem = replace(problem, accepted=accepted._replace(sightings=replace(
+        accepted.sightings, weight=1.0 - np.isin(m.marker_row, [point, first, first + 1]))))
     state = odometry_state(m, "arc")
     equations, left = NormalEquations(problem, state), []
     H = equations.structure.matrix(equations.sums(problem.noise)[0]).toarray()
@@ -166,7 +166,7 @@ def test_points_of_the_posterior_have_its_moments(scale):
         lambda x: -(x - CENTRE) @ information @ (x - CENTRE) / 2, CENTRE, 0.0, C)
     weights, noises = zip(*points)
     assert len(points) == (5 if scale == 1 else 1) and np.isclose(sum(weights), 1)
-    logs = np.array([noise.logarithms for noise in noises])
+    logs = np.log(noises)
     if scale < 1:
         np.testing.assert_allclose(logs[0], CENTRE + np.diag(C), rtol=1e-12)
         return
@@ -214,13 +214,14 @@ def test_where_cholesky_fails_qr_gives_the_same_solution(monkeypatch):
     problem, start, linearize = build_problem(m, "arc"), odometry_state(m, "arc"), graph.linearize
     expected = optimize(problem, start).state
 
-    def cholesky(ordering):
-        raise RuntimeError("Indeterminate linear system")
-
     def failing(*arguments):
         """A linearised graph whose Cholesky decomposition fails."""
-        return SimpleNamespace(eliminateMultifrontal=cholesky,
-                               eliminateSequential=linearize(*arguments).eliminateSequential)
+        def solved(*by_qr):
+            if not by_qr:
+                raise RuntimeError("Indeterminate linear system")
+            return linearize(*arguments).optimize(*by_qr)
+
+        return SimpleNamespace(optimize=solved)
 
     monkeypatch.setattr(graph, "linearize", failing)
     monkeypatch.setattr(linear, "linear_solution", lambda *_: None)

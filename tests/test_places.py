@@ -67,10 +67,11 @@ def test_noise_that_memory_learns_does_not_hide_a_moved_marker(moved):
     dataset, before, _, _ = moved
     small = changed(before, "aruco", covariance=before.aruco.covariance / 16)
     for drive, share, hidden in (
-            (dataset, 0.05, True), (before, 0.05, False), (small, None, False)):
+            (dataset, 0.05, True), (before, 0.05, False), (small, 1, False)):
         fit = fit_from_odometry(measure(drive.without("uwb")))
-        share = share and np.full(len(fit.problem.accepted.weight), share)
-        problem = replace(fit.problem, accepted=replace(fit.problem.accepted, share=share))
-        if share is not None:
-            problem = replace(problem, noise=replace(problem.noise, sightings=14.0))
+        accepted = fit.problem.accepted
+        problem = replace(fit.problem, accepted=accepted.with_shares(
+            np.full(len(each.share), share) for each in accepted))
+        if share < 1:
+            problem = replace(problem, noise=problem.noise._replace(sightings=14.0))
         assert has_rejected_visits(replace(fit, problem=problem)) == hidden

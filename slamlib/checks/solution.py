@@ -9,7 +9,7 @@ from slamlib import se2
 from slamlib.dataset import Doubt
 from slamlib.odometry_gate import UNKNOWN_SIGMA
 from slamlib.slam.noise import BOUNDS
-from slamlib.slam.own import linearized_own
+from slamlib.slam.pipeline import own_contradictions
 
 MAX_TURN_SIGMA = np.pi / 3   # rad, between two frames; half a turn is three sigmas
 MAX_GAP = 30                 # poses, between contradictions that are told as one
@@ -44,8 +44,8 @@ GROUPS = {
 def solution_doubts(result):
     """Tuple of Doubt where a SlamResult contradicts the files of its drive."""
     return tuple(Doubt(*each) for each in chain(
-        _of_encoder(result), _of_calibration(result), _of_noise(result), _of_sightings(result),
-        _of_the_path(result), _of_own_factors(result),
+        _of_own_factors(result), _of_encoder(result), _of_calibration(result), _of_noise(result),
+        _of_sightings(result), _of_the_path(result),
         (("antenna", f"Antenna {antenna} is in doubt: {reason}. Its covariance includes this; look "
           "at its rows in UwbReading.txt.") for antenna, reason in result.doubts.items())))
 
@@ -105,7 +105,7 @@ def _of_noise(result):
         if (share < 1).any():
             yield what.replace("noise", "memory"), (
                 f"Errors of successive {name} are alike: the correlation of their residuals is "
-                f"{result.correlation[column - 1, 0]:.2f}. So problems 3 and 4 count {len(share)} "
+                f"{result.correlation[column - 1]:.2f}. So problems 3 and 4 count {len(share)} "
                 f"{name} as {share.sum():.0f}, with {factor:.2g} times the standard deviations in "
                 f"{file}, because residuals do not show all of such errors. Look at the "
                 "calibration of the sensor, and for what blurs, hides or reflects.")
@@ -113,7 +113,7 @@ def _of_noise(result):
         if not sigma or abs(np.log(factor)) <= max(
                 np.log(MAX_NOISE_FACTOR), MIN_FACTOR_SIGMAS * sigma):
             continue
-        outside = (result.noise.logarithms[column] - BOUNDS[:, column]) * [1, -1] < sigma
+        outside = (np.log(result.noise)[column] - BOUNDS[:, column]) * [1, -1] < sigma
         number = f"at most {factor:.2g}" if outside[0] else \
             f"at least {factor:.3g}" if outside[1] else f"{factor:.2f} ± {factor * sigma:.2f}"
         reason = (f"{late_share:.0%} of them are far too long, as without line of sight."
@@ -173,10 +173,10 @@ def _of_the_path(result):
 
 def _of_own_factors(result):
     """Kind and sentence if factors of one's own contradict the rest, which bends to them."""
-    e, *_ = linearized_own(result.fit.problem, result.fit.state)
-    size = np.linalg.norm(e, axis=1)
+    size = own_contradictions(result.fit)
     if size.max(initial=0) > MAX_OWN_ERROR:
         yield "own-factors", (
             f"{np.count_nonzero(size > MAX_OWN_ERROR)} of {len(size)} factors of your own "
             f"contradict the rest, factor {size.argmax()} by {size.max():.0f} standard deviations, "
-            "and the solution bends to them: correct them, or give them a robust noise model.")
+            "and the solution bends to them: look whether they are in the frame of pose 1, correct "
+            "them, or give them a robust noise model.")

@@ -18,21 +18,13 @@ are `factors.sighting_error` and `range_error`; `choices.calibrated` decides wha
 (Kuemmerle, Grisetti, Burgard, Simultaneous Calibration, Localization, and Mapping, IROS 2011.)
 """
 
+from collections import namedtuple
 from dataclasses import dataclass
 
 import numpy as np
 
-
-@dataclass(frozen=True)
-class Entry:
-    """One entry of the calibration."""
-
-    name: str
-    unit: str
-    group: str               # also the kind of the doubt
-    wide: float              # sigma in `unit` if the statement is wrong; of a wheel relative
-
-
+# The group is also the kind of the doubt. Of a wheel the wide sigma is relative.
+Entry = namedtuple("Entry", "name unit group wide")
 ENTRIES = (
     Entry("right_radius", "m", "wheel-parameters", 0.05),
     Entry("left_radius", "m", "wheel-parameters", 0.05),
@@ -67,10 +59,7 @@ class Calibration:
     wide: np.ndarray         # (p,) if the statement is wrong
 
     def sigma_without(self, groups, width=1.0):
-        """Standard deviations (p,) where the statements about `groups` are wrong.
-
-        `width` multiplies the wide standard deviations.
-        """
+        """Standard deviations (p,), of `groups` the wide ones times `width`, else as stated."""
         return np.where(np.isin(self.group, list(groups)),
                         np.maximum(width * self.wide, self.sigma), self.sigma)
 
@@ -88,15 +77,13 @@ def calibration_table(calibration, c, covariance, released):
     (p,) and their covariance (p, p), and whether its group is in `released`. The height is 0 where
     half its square, which is estimated, is negative.
     """
-    units = [entry.unit for entry in ENTRIES]
-    units += (len(c) - len(units)) * [ANTENNA_OFFSETS.unit]
+    entries = ENTRIES + (len(c) - len(ENTRIES)) * (ANTENNA_OFFSETS,)
     numbers = np.stack([calibration.stated, calibration.sigma, c, np.sqrt(np.diag(covariance))])
     numbers[:2, HEIGHT], numbers[2:, HEIGHT] = (
         _height(*numbers[:2, HEIGHT]), _height(*numbers[2:, HEIGHT]))
-    return [{"name": name, "unit": unit, "group": str(group), "released": group in released,
-             **dict(zip(("stated", "stated_sigma", "estimate", "sigma"), column.tolist()))}
-            for name, unit, group, column in zip(
-                calibration.names, units, calibration.group, numbers.T)]
+    return [entry._asdict() | {"name": name, "released": entry.group in released} | dict(zip(
+                ("stated", "stated_sigma", "estimate", "sigma"), column.tolist()))
+            for name, entry, column in zip(calibration.names, entries, numbers.T)]
 
 
 def _height(half_square, sigma):

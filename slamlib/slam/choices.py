@@ -29,7 +29,7 @@ from slamlib.memory import runs
 from slamlib.odometry import MODELS
 from slamlib.odometry_gate import NO_JUMPS, find_jumps
 from slamlib.slam.factors import preintegrate_odometry
-from slamlib.slam.fit import accepted_measurements, kept_weights, refine, residuals
+from slamlib.slam.fit import accepted_measurements, refine, residuals
 from slamlib.slam.linear import NormalEquations, laplace_approximation, linear_solution
 from slamlib.slam.result import slam_result
 
@@ -52,10 +52,7 @@ MIN_SIGMA = 0.02             # m or rad, of the path between two visits
 
 
 def better_model(fit):
-    """The Fit by Euler's steps if their evidence leads that of arcs by DECISIVE_LEAD, else by arcs.
-
-    Both evidences are on the same measurements with the same weights and noise.
-    """
+    """The Fit by Euler's steps if their evidence leads that of arcs by DECISIVE_LEAD, or arcs."""
     current = replace(fit.problem, accepted=_with_fixed_weights(fit))
     other, = {*MODELS} - {current.odometry.model}
     odometry = replace(preintegrate_odometry(
@@ -147,10 +144,7 @@ def _log_evidence(L, h, sigma):
 
 
 def _likelihood(fit):
-    """Information L (p, p) and h (p,) of the measurements about the whole calibration.
-
-    In wide sigmas from the stated values, at the noise of the Fit.
-    """
+    """Information L (p, p) and h (p,) about the calibration, in wide sigmas from what is stated."""
     calibration = fit.problem.measurements.calibration
     equations = NormalEquations(replace(fit.problem, sigma=calibration.wide), fit.state)
     H, border, *_ = equations.sums(fit.problem.noise, consistent=True)
@@ -169,10 +163,7 @@ def _likelihood(fit):
 
 
 def _lead(proposed, present):
-    """Difference of the log evidence of two Fits, on the measurements and weights of `proposed`.
-
-    The noise is learned for each.
-    """
+    """Log evidence of a Fit minus that of another, on the weights of `proposed`, noise learned."""
     fixed = _with_fixed_weights(proposed)
     first, second = (refine(replace(proposed.problem, accepted=fixed, sigma=each.problem.sigma),
                             each.state, accept=None) for each in (proposed, present))
@@ -181,9 +172,9 @@ def _lead(proposed, present):
 
 def _with_fixed_weights(fit):
     """AcceptedMeasurements in which weights replace the kernel of the ranges."""
-    problem, accepted = fit.problem, fit.problem.accepted
-    _, ranges = kept_weights(accepted, *residuals(problem, fit.state))
-    return replace(accepted, weight=np.r_[accepted.sighting_weight, ranges], range_kernel=None)
+    accepted, (_, late) = fit.problem.accepted, residuals(fit.problem, fit.state)
+    return accepted._replace(ranges=replace(
+        accepted.ranges, weight=accepted.ranges.kept(late), kernel=None))
 
 
 def most_consistent(dataset, solve):
@@ -216,8 +207,8 @@ def visits(aruco):
 
 def contradicted(fit, factor):
     """Which sightings (s,), bool, a Fit rejects at this noise factor."""
-    noise = replace(fit.problem.noise, sightings=factor)
-    return accepted_measurements(replace(fit.problem, noise=noise), fit.state).rejected
+    problem = replace(fit.problem, noise=fit.problem.noise._replace(sightings=factor))
+    return accepted_measurements(problem, fit.state).sightings.weight == 0
 
 
 def has_rejected_visits(fit):
@@ -228,17 +219,14 @@ def has_rejected_visits(fit):
     m, factor = fit.problem.measurements, fit.problem.noise.sightings
     if not len(m.marker_row):
         return False
-    factor = factor if fit.problem.accepted.share is None else min(factor, 1.0)
+    factor = factor if (fit.problem.accepted.share == 1).all() else min(factor, 1.0)
     number = visits(m.dataset.aruco)[m.sightings.index]
     count, lost = np.bincount(number), np.bincount(number, contradicted(fit, factor))
     return bool(((count >= MIN_VISIT) & (lost > MAX_REJECTED_SHARE * count)).any())
 
 
 def spares_sightings(fit, other):
-    """Whether a Fit rejects less than MAX_STILL_REJECTED of the sightings that another rejects.
-
-    Both are judged at the smaller of their noise factors.
-    """
+    """Whether a Fit rejects less than MAX_STILL_REJECTED of the sightings that another rejects."""
     factor = min(each.problem.noise.sightings for each in (fit, other))
     count, most = (contradicted(each, factor).sum() for each in (fit, other))
     return bool(count < MAX_STILL_REJECTED * most)
@@ -247,8 +235,7 @@ def spares_sightings(fit, other):
 def places_of_ids(aruco, solve):
     """`SlamResult.places` of ArucoReadings, None if each id is one place; `solve` as above.
 
-    The second place of id 12 gets the number 112 where ids have up to two digits, the third one
-    212.
+    The second place of id 12 gets the number 112 where ids have up to two digits, then 212.
     """
     marker, number = aruco.marker, visits(aruco)
     try:

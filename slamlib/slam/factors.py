@@ -59,12 +59,12 @@ def preintegrate_odometry(measurements, model, wheel=None):
         quantization=quantization + unknown, slipping=slipping)
 
 
-def odometry_noise(ticks, vehicle, start, end, steps=None):
+def odometry_noise(ticks, vehicle, start, end):
     """Quantization and slipping (m, 3, 3) by `increments.noise_in_drive`, with MINIMUM_SIGMA added.
 
     The graph needs the inverse of Q, but a vehicle that stands still has no lateral noise.
     """
-    quantization, slipping = increments.noise_in_drive(ticks, vehicle, start, end, steps)
+    quantization, slipping = increments.noise_in_drive(ticks, vehicle, start, end)
     quantization[:, [0, 1], [0, 1]] += MINIMUM_SIGMA**2
     return quantization, slipping
 
@@ -110,77 +110,60 @@ class LinearizedFactors:
     error: float             # half the sum of squared errors, or the loss of the kernel
 
 
-_empty = np.zeros((0, 1, 6))
-NONE = LinearizedFactors(index=np.zeros(0, int), e=_empty[:, :, 0], J=_empty, J_c=_empty[:, :, :0],
-                         columns=np.zeros(0, int), weight=np.zeros(0), error=0.0)
-
-
-def linearize_odometry(problem, state):
-    """Function from a slip in sqrt(m) to the LinearizedFactors of odometry, and sum log|Q|."""
+def linearize_odometry(problem, state, slip):
+    """The LinearizedFactors of odometry with a slip in sqrt(m), and sum log|Q|."""
     factors, active = problem.odometry, problem.active[WHEELS]
     e, J, J_c = odometry_error(factors, state.poses, state.c[WHEELS])
-    J_c = J_c[:, :, active] * problem.sigma[WHEELS][active]
-
-    def linearized(slip):
-        U = square_root_information(factors.covariance(slip))
-        log_determinant = -2 * float(np.sum(np.log(np.diagonal(U, axis1=1, axis2=2))))
-        whitened = (U @ e[..., None])[..., 0]
-        return LinearizedFactors(
-            index=np.arange(len(e)), e=whitened, J=U @ J, J_c=U @ J_c,
-            columns=np.arange(active.sum()), weight=np.ones(len(e)),
-            error=float(np.sum(whitened**2)) / 2), log_determinant
-
-    return linearized
+    U = square_root_information(factors.covariance(slip))
+    log_determinant = -2 * float(np.sum(np.log(np.diagonal(U, axis1=1, axis2=2))))
+    e, J_c = (U @ e[..., None])[..., 0], J_c[:, :, active] * problem.sigma[WHEELS][active]
+    return LinearizedFactors(
+        index=np.arange(len(e)), e=e, J=U @ J, J_c=U @ J_c, columns=np.arange(active.sum()),
+        weight=np.ones(len(e)), error=float(np.sum(e**2)) / 2), log_determinant
 
 
 def linearize_measurements(problem, state):
-    """The LinearizedFactors of sightings of poses, of points, of ranges, and of one's own."""
-    m, accepted, c, linearized = problem.measurements, problem.accepted, state.c, []
+    """The LinearizedFactors of sightings, of ranges, and of one's own."""
+    m, c = problem.measurements, state.c
     s, r = m.sightings, m.ranges
 
     def motions(row, lag):
         return delayed(m, row, c[lag], not problem.active[lag])
 
-    for as_pose, roots in zip((True, False), m.sighting_roots):
-        kind = np.flatnonzero(m.as_pose == as_pose)
-        index = np.flatnonzero(accepted.sighting_weight[kind])
-        rows = kind[index]
-        linearized.append(_whitened(problem, SIGHTINGS, index, rows, *sighting_error(
-            s.z[rows], state.poses[s.row[rows]], *motions(s.row[rows], calibration.SIGHTING_LAG),
-            state.markers[m.marker_row[rows]], c, as_pose), roots[rows]) if len(rows) else NONE)
-    rows = np.flatnonzero(accepted.range_weight)
-    linearized.append(_whitened(problem, RANGES, rows, rows, *range_error(
-        r.distance[rows], state.poses[r.row[rows]], *motions(r.row[rows], calibration.RANGE_LAG),
-        state.antennas, r.antenna[rows], c), 1 / r.sigma[rows, None, None]) if len(rows) else NONE)
+    seen, ranged = (np.flatnonzero(kind.weight) for kind in problem.accepted)
+    sightings = sighting_error(
+        s.z[seen], state.poses[s.row[seen]], *motions(s.row[seen], calibration.SIGHTING_LAG),
+        state.markers[m.marker_row[seen]], c, m.as_pose[seen])
+    ranges = range_error(
+        r.distance[ranged], state.poses[r.row[ranged]],
+        *motions(r.row[ranged], calibration.RANGE_LAG), state.antennas, r.antenna[ranged], c)
     e, J, error = linearized_own(problem, state)
-    return *linearized, LinearizedFactors(
-        index=np.arange(len(e)), e=e, J=J, J_c=np.zeros((*e.shape, 0)), columns=np.zeros(0, int),
-        weight=np.ones(len(e)), error=error)
+    return (_whitened(problem, 0, seen, m.sighting_roots[seen], *sightings),
+            _whitened(problem, 1, ranged, 1 / r.sigma[ranged, None, None], *ranges),
+            LinearizedFactors(index=np.arange(len(e)), e=e, J=J, J_c=np.zeros((*e.shape, 0)),
+                              columns=np.zeros(0, int), weight=np.ones(len(e)), error=error))
 
 
 def sighting_error(z, poses, motion, velocity, markers, c, as_pose):
     """Errors of sightings z (m, 3), and derivatives by pose, marker and the columns SIGHTINGS of c.
 
     From poses (m, 3) of the vehicle, its `motion` to where it was when the camera saw, and its
-    `velocity` per encoder step there (`delayed`), each (m, 3) or (3,). Of markers with a heading
-    (`as_pose`) the errors (m, 3) are log(z^-1 h) of the expected sighting h, of points (m, 2) they
-    are h - z. The derivatives are (m, d, 3), (m, d, d) and (m, d, 5). GTSAM: BetweenFactorPose2.
+    `velocity` per encoder step there (`delayed`), each (m, 3) or (3,). Of markers with a heading,
+    `as_pose` (m,), the errors (m, 3) are log(z^-1 h) of the expected sighting h, of points h - z
+    and 0. The derivatives are (m, 3, 3), (m, 3, 3) and (m, 3, 5). GTSAM: BetweenFactorPose2.
     """
-    camera, size, d = c[calibration.CAMERA], c[calibration.SIZE], 3 if as_pose else 2
+    camera, size = c[calibration.CAMERA], c[calibration.SIZE]
     mounted = se2.compose(motion, camera)                            # camera in vehicle
     Y = se2.compose(poses, mounted)
     seen = se2.between(Y, markers)
     h = seen / [size, size, 1]
-    if as_pose:
-        difference = se2.between(z, h)
-        e = se2.log(difference)
-        by_h = se2.log_jacobian(difference) @ se2.between_jacobians(z, h)[1]
-    else:
-        e, by_h = (h - z)[:, :2], np.broadcast_to(np.eye(2, 3), (len(z), 2, 3))
-    by_seen = by_h / [size, size, 1]
+    difference = se2.between(z, h)
+    e, by_h = se2.log(difference), \
+        se2.log_jacobian(difference) @ se2.between_jacobians(z, h)[1]
+    e[~as_pose], by_h[~as_pose] = (h - z)[~as_pose] * [1, 1, 0], np.diag([1.0, 1, 0])
+    by_seen, turn = by_h / [size, size, 1], np.where(as_pose, seen[:, 2], -Y[:, 2])
     by_marker = np.concatenate([                                     # a point's in the world
-        by_seen[:, :, :2] @ se2.rotation(seen[:, 2] if as_pose else -Y[:, 2]),
-        by_seen[:, :, 2:]], axis=2)[:, :, :d]
+        by_seen[:, :, :2] @ se2.rotation(turn), by_seen[:, :, 2:]], axis=2)
     by_pose, by_camera, by_lag = _by_sensor(-by_seen @ _moved_by(seen), mounted, camera, velocity)
     by_size = -np.einsum("mdi,mi->md", by_seen[:, :, :2], h[:, :2])
     return e, by_pose, by_marker, np.concatenate(
@@ -262,32 +245,28 @@ def delayed(measurements, row, lag, is_known=True):
             se2.log(se2.between(smooth[i], smooth[k])))
 
 
-def _whitened(problem, kind, index, rows, e, by_pose, by_landmark, by_c, U):
-    """The LinearizedFactors of errors e (m, d), and derivatives, of the sightings or ranges `rows`.
+def _whitened(problem, kind, rows, U, e, by_pose, by_landmark, by_c):
+    """The LinearizedFactors of the measurements `rows` of a kind, 0 for sightings, 1 for ranges.
 
-    `by_c` (m, d, u) are the derivatives by the columns `kind` of the calibration, and U (m, d, d)
-    square root informations as stated. Shares multiply the loss. A kernel weighs a measurement by
-    the norm of its whitened error; that of a range, corrected by the bias of its kernel, has the
-    sign of measured minus expected, as in GTSAM.
+    From square root informations U (m, d, d) as stated, errors e (m, d), and derivatives, `by_c`
+    (m, d, u) by the columns of the kind in the calibration. Shares multiply the loss. A kernel
+    weighs a measurement by the norm of its whitened error; that of a range, corrected by the bias
+    of its kernel, has the sign of measured minus expected, as in GTSAM.
     """
-    accepted, noise, active = problem.accepted, problem.noise, problem.active[kind]
-    weight, share, factor, kernel, bias = (
-        (accepted.range_weight, accepted.shares[1], noise.ranges, accepted.range_kernel,
-         accepted.range_bias) if kind == RANGES else
-        (accepted.sighting_weight, accepted.shares[0], noise.sightings, accepted.sighting_kernel,
-         0.0))
-    weight, share = weight[rows], share[rows]
-    U = U * (np.sqrt(weight) / factor)[:, None, None]
-    e = (U @ e[..., None])[..., 0] + bias
+    accepted, columns = problem.accepted[kind], (SIGHTINGS, RANGES)[kind]
+    weight, share, active = accepted.weight[rows], accepted.share[rows], problem.active[columns]
+    U = U * (np.sqrt(weight) / problem.noise[1 + kind])[:, None, None]
+    e = (U @ e[..., None])[..., 0] + accepted.bias
     kept, loss = share, np.sum(e**2, axis=1) / 2
-    if kernel is not None:
+    if accepted.kernel is not None:
         size = (-e[:, 0] if e.shape[1] == 1 else np.linalg.norm(e, axis=1)).tolist()
-        kept, loss = share * [*map(kernel.weight, size)], np.array([*map(kernel.loss, size)])
+        kept, loss = (share * [*map(accepted.kernel.weight, size)],
+                      np.array([*map(accepted.kernel.loss, size)]))
     U = U * np.sqrt(kept)[:, None, None]
     J = np.zeros((*e.shape, 6))
     J[:, :, :3 + by_landmark.shape[2]] = U @ np.concatenate([by_pose, by_landmark], axis=2)
     return LinearizedFactors(
-        index=index, e=e * np.sqrt(kept)[:, None], J=J,
-        J_c=U @ (by_c[:, :, active] * problem.sigma[kind][active]),
-        columns=np.cumsum(problem.active)[kind][active] - 1, weight=weight * kept,
+        index=rows, e=e * np.sqrt(kept)[:, None], J=J,
+        J_c=U @ (by_c[:, :, active] * problem.sigma[columns][active]),
+        columns=np.cumsum(problem.active)[columns][active] - 1, weight=weight * kept,
         error=float(np.sum(share * loss)))

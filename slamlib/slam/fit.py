@@ -13,15 +13,17 @@ from functools import partial
 import gtsam
 import numpy as np
 
+from slamlib.memory import error_memory
 from slamlib.sightings import GATE, POINT_GATE
 from slamlib.slam.calibration import WHEELS
 from slamlib.slam.factors import linearize_measurements, preintegrate_odometry
 from slamlib.slam.graph import optimize
 from slamlib.slam.linear import Problem, State, laplace_approximation
-from slamlib.slam.measurements import AcceptedMeasurements, Noise, with_known
-from slamlib.slam.noise import NoisePosterior, error_memories, learn_noise, with_hidden_errors
+from slamlib.slam.measurements import Accepted, AcceptedMeasurements, Noise, accept_all, with_known
+from slamlib.slam.noise import NoisePosterior, learn_noise, with_hidden_errors
 
 RANGE_GATE = 3.3             # sigmas; a range that is shorter than expected by more is rejected
+MAX_DIRECT = 3.3             # sigmas, of a range's residual; longer ones are echoes
 
 _kernel = gtsam.noiseModel.mEstimator
 # By name, scales in sigmas. Those of Huber, Cauchy and Tukey have 95 % efficiency on Gaussian noise
@@ -62,26 +64,13 @@ def accepted_measurements(problem, state, sightings=None, ranges=None):
     (kernel, gated), (range_kernel, range_gated) = (
         each or (vehicle.kernel, vehicle.gate) for each in (sightings, ranges))
     residual, late = residuals(problem, state)
-    near = np.sum(residual**2, axis=1) < np.where(m.as_pose, GATE, POINT_GATE)
-    early, too_late = late <= -RANGE_GATE, (late >= RANGE_GATE) & (range_kernel not in ONE_SIDED)
+    far = np.sum(residual**2, axis=1) >= np.where(m.as_pose, GATE, POINT_GATE)
+    wrong = (late <= -RANGE_GATE) | (late >= RANGE_GATE) & (range_kernel not in ONE_SIDED)
     return AcceptedMeasurements(
-        measurements=m, weight=1.0 - np.r_[gated & ~near, range_gated & (early | too_late)],
-        sighting_kernel=None if kernel in ONE_SIDED else KERNELS[kernel],
-        range_kernel=KERNELS[range_kernel], range_bias=ONE_SIDED.get(range_kernel, 0.0))
-
-
-def kept_weights(accepted, sighting_residuals, range_residuals):
-    """Shares of its information, (s,) and (r,), that each measurement keeps, by gates and kernels.
-
-    From AcceptedMeasurements and the `residuals` of sightings (s, 3) and of ranges (r,).
-    """
-    def reweighted(weight, kernel, sizes):
-        return weight * ([kernel.weight(size) for size in sizes] if kernel else 1.0)
-
-    return (reweighted(accepted.sighting_weight, accepted.sighting_kernel,
-                       np.linalg.norm(sighting_residuals, axis=1)),
-            reweighted(accepted.range_weight, accepted.range_kernel,
-                       range_residuals - accepted.range_bias))
+        Accepted(1.0 - (gated & far), np.ones(len(far)),
+                 None if kernel in ONE_SIDED else KERNELS[kernel]),
+        Accepted(1.0 - (range_gated & wrong), np.ones(len(wrong)), KERNELS[range_kernel],
+                 ONE_SIDED.get(range_kernel, 0.0)))
 
 
 def residuals(problem, state):
@@ -93,12 +82,18 @@ def residuals(problem, state):
         those of the vehicle with 0 as the third.
     (r,) of the ranges, positive for a range that is too long.
     """
-    m = problem.measurements
-    everything = AcceptedMeasurements(measurements=m, weight=m.unit_weights)
-    poses, points, ranges, _ = linearize_measurements(replace(problem, accepted=everything), state)
-    sightings = np.zeros((len(m.marker_row), 3))
-    sightings[m.as_pose], sightings[~m.as_pose, :2] = -poses.e, -points.e
-    return sightings, -ranges.e[:, 0]
+    everything = replace(problem, accepted=accept_all(problem.measurements))
+    sightings, ranges, _ = linearize_measurements(everything, state)
+    return -sightings.e, -ranges.e[:, 0]
+
+
+def error_memories(problem, state):
+    """The Memory of the errors of sightings, and that of ranges but echoes, at a solution."""
+    m, (sightings, ranges) = problem.measurements, problem.accepted
+    residual, late = residuals(problem, state)
+    direct = (ranges.weight > 0) & (np.abs(late) < MAX_DIRECT)
+    return (error_memory(m.marker_row, m.frame[m.sightings.row], residual, sightings.weight > 0),
+            error_memory(m.ranges.antenna, m.frame[m.ranges.row], late[:, None], direct))
 
 
 def narrow_kernels(problem, state, scales=CAUCHY_SCALES):
@@ -107,13 +102,10 @@ def narrow_kernels(problem, state, scales=CAUCHY_SCALES):
     The scales are in sigmas. The scatter of the residuals of each solution gives the noise of the
     next. Raises DatasetError as `optimize`.
     """
-    m = problem.measurements
     for number, scale in enumerate(scales):
         if number:                                   # the caller judges the last solution
             problem = replace(problem, noise=noise_of_scatter(problem, state))
-        cauchy = _kernel.Cauchy.Create(scale)
-        accepted = AcceptedMeasurements(
-            measurements=m, weight=m.unit_weights, sighting_kernel=cauchy, range_kernel=cauchy)
+        accepted = accept_all(problem.measurements, _kernel.Cauchy.Create(scale))
         state = optimize(replace(problem, accepted=accepted), state, tolerance=ROUGH).state
     return state
 
@@ -147,7 +139,7 @@ class Fit:
     @property
     def log_density(self):
         """Log posterior density of the noise, or log evidence if all of it is known."""
-        learned = self.posterior is not None and self.problem.accepted.share is None
+        learned = self.posterior is not None and (self.problem.accepted.share == 1).all()
         return self.posterior.log_density if learned else self.log_evidence
 
 
@@ -161,52 +153,47 @@ def refine(problem, state, accept=accepted_measurements):
     numpy.linalg.LinAlgError if odometry's covariance is singular.
     """
     m, model, posterior = problem.measurements, problem.odometry.model, None
-    share, fixed, changed = problem.accepted.share, accept is None, np.inf
+    shares, fixed, changed = [kind.share for kind in problem.accepted], accept is None, np.inf
     if fixed:
-        problem = replace(problem, accepted=replace(problem.accepted, share=None))
-        accept = lambda problem, _: problem.accepted
+        given = problem.accepted.with_shares(map(np.ones_like, shares))
+        accept = lambda *_: given
     else:
         problem = replace(problem, noise=noise_of_scatter(problem, state))
     accepted = accept(problem, state)
     for _ in range(MAX_ROUNDS):
         problem = replace(problem, accepted=accepted,
                           odometry=preintegrate_odometry(m, model, state.c[WHEELS]))
-        optimum = None                                     # frees the equations of the last round
-        if m.learned.any() and changed > NEGLIGIBLE_CHANGE * len(accepted.weight):
+        if m.learned.any() and changed > NEGLIGIBLE_CHANGE * len(accepted.share):
             optimum = optimize(problem, state, max_steps=2)
             state, posterior = optimum.state, learn_noise(optimum.equations)
             problem = replace(problem, noise=with_known(posterior.noise, m.dataset.vehicle))
         problem = replace(problem, odometry=replace(problem.odometry, in_counts=True))
-        optimum = None
         optimum = optimize(problem, state)
         state = optimum.state
         accepted = accept(problem, state)
-        changed = np.count_nonzero(accepted.weight != problem.accepted.weight)
+        changed = sum(np.count_nonzero(new.weight != old.weight)
+                      for new, old in zip(accepted, problem.accepted))
         moved = np.abs(state.c[WHEELS] / problem.odometry.wheel - 1).max()
         if not changed and moved < NEGLIGIBLE_MOVE:
             break
     if not fixed:
-        all_hidden = replace(problem, noise=with_hidden_errors(
+        hidden = replace(problem, noise=with_hidden_errors(
             problem.noise, (True, True), m.dataset.vehicle))
-        share = np.concatenate([memory.share for memory in error_memories(
-            accept(all_hidden, state), *residuals(all_hidden, state))])
-    if share is not None and (share < 1).any():
-        problem, posterior = _with_shares(problem, state, posterior, share, accept)
-        optimum = None
+        shares = [memory.share for memory in error_memories(
+            replace(hidden, accepted=accept(hidden, state)), state)]
+    if any((share < 1).any() for share in shares):
+        problem, posterior = _with_shares(problem, state, posterior, shares, accept)
         optimum = optimize(problem, state)
     _, log_evidence = laplace_approximation(optimum.equations, problem.noise)
     return Fit(problem=problem, state=optimum.state, log_evidence=log_evidence, posterior=posterior,
                converged=optimum.converged)
 
 
-def _with_shares(problem, state, posterior, share, accept):
-    """The Problem with shares (s + r,) of errors with memory, and the posterior of its noise.
-
-    The noise is that learned without shares, with hidden errors.
-    """
+def _with_shares(problem, state, posterior, shares, accept):
+    """The Problem with shares (s,) and (r,) of errors with memory, and its noise's posterior."""
     hidden = partial(with_hidden_errors, vehicle=problem.measurements.dataset.vehicle, remember=[
-        (each < 1).any() for each in problem.measurements.by_kind(share)])
+        (share < 1).any() for share in shares])
     problem = replace(problem, noise=hidden(problem.noise))
-    problem = replace(problem, accepted=replace(accept(problem, state), share=share))
+    problem = replace(problem, accepted=accept(problem, state).with_shares(shares))
     return problem, posterior and replace(posterior, noise=problem.noise, points=tuple(
         (weight, hidden(noise)) for weight, noise in posterior.points))

@@ -6,7 +6,6 @@ equations are singular to rounding. All factors but one's own are linearised in 
 factors in Python would be slow: GTSAM copies all values for every call.
 """
 
-import re
 from typing import NamedTuple
 
 import gtsam
@@ -46,7 +45,6 @@ def optimize(problem, state, max_steps=MAX_STEPS, by_gtsam=False, tolerance=CONV
         steps += 1
         state, error = equations.state, equations.error
         step = None if by_gtsam else equations.step()
-        equations = None                                   # of a long drive they are large
         if step is None:
             step = gtsam_step(problem, state)
         for scale in 0.5**np.arange(MAX_HALVINGS):
@@ -66,31 +64,20 @@ def gtsam_step(problem, state):
     root then decides whether the measurements determine every variable. Raises DatasetError if they
     do not.
     """
-    m, linear, ordering = problem.measurements, linearize(problem, state), gtsam.Ordering()
-    variables, structure = _keys(problem), m.structure
-    for i in [*np.argsort(structure.position), *range(len(structure.position), len(variables))]:
-        ordering.push_back(variables[i])
+    m, linear = problem.measurements, linearize(problem, state)
     try:
-        solution = linear.eliminateMultifrontal(ordering).optimize()
+        solution = linear.optimize()
     except RuntimeError:
         try:
-            solution = linear.eliminateSequential(ordering, gtsam.EliminateQR).optimize()
-        except RuntimeError as error:             # GTSAM's, with the variable and much advice
-            raise DatasetError(
-                f"{m.dataset.name}: expected measurements that determine every pose and landmark; "
-                f"these do not determine {_variable(problem, str(error))}") from None
-    n = len(structure.diagonal)
+            solution = linear.optimize(gtsam.EliminateQR)
+        except RuntimeError:                      # GTSAM's, with much advice
+            raise DatasetError(f"{m.dataset.name}: expected measurements that determine every pose "
+                               "and landmark") from None
+    n = len(m.structure.diagonal)
     step = np.zeros(n + problem.active.sum())
-    step[np.r_[structure.unknowns, n:len(step)]] = solution.vector(gtsam.KeyVector(variables))
+    step[np.r_[m.structure.unknowns, n:len(step)]] = solution.vector(
+        gtsam.KeyVector(_keys(problem)))
     return step
-
-
-def _variable(problem, message):
-    """The undetermined variable whose key GTSAM's message has, in the words of the files."""
-    m, key = problem.measurements, re.search(r"variable\s+(\d+)", message)
-    names = [*(f"pose {i + 1}" for i in m.frame), *(f"the place of marker {i}" for i in m.marker),
-             *(f"the place of antenna {i}" for i in m.antenna), "the calibration of the sensors"]
-    return dict(zip(map(str, _keys(problem)), names)).get(key and key[1], "one of them")
 
 
 def _keys(problem):
@@ -103,7 +90,7 @@ def linearize(problem, state):
     equations, graph = NormalEquations(problem, state), gtsam.GaussianFactorGraph()
     structure, variables, q = equations.structure, _keys(problem), problem.active.sum()
     width = np.r_[2 + structure.is_pose, q].tolist()
-    odometry, _ = linearize_odometry(problem, state)(problem.noise.slip)
+    odometry, _ = linearize_odometry(problem, state, problem.noise.slip)
     for pairs, f in zip(structure.factors, (odometry, *equations.linearized)):
         by_c = np.zeros((*f.e.shape, q))
         by_c[:, :, f.columns] = f.J_c

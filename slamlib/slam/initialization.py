@@ -127,10 +127,7 @@ class AntennaRanges:
 
 
 def ranges_by_antenna(measurements, poses, covariances, c, factor=1.0):
-    """List of the AntennaRanges of every antenna; parameters as of `state_from_poses`.
-
-    `factor` multiplies the sigmas of the ranges.
-    """
+    """List of the AntennaRanges of every antenna, sigmas times `factor`; as `state_from_poses`."""
     r, by_antenna = measurements.ranges, []
     positions = sensor_poses(measurements, poses, c)[1][:, :2]
     slant = (r.distance - c[OFFSET] - c[ANTENNAS][r.antenna]) / c[SCALE]

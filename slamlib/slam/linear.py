@@ -13,6 +13,7 @@ noise factors. Each value of the noise then costs one decomposition, which gives
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -32,6 +33,7 @@ from slamlib.slam.measurements import (
     AcceptedMeasurements,
     Measurements,
     Noise,
+    accept_all,
     with_known,
 )
 
@@ -78,21 +80,13 @@ def retract(problem, state, delta):
 class Problem:
     """The factor graph."""
 
+    measurements: Measurements
     odometry: OdometryFactors
     accepted: AcceptedMeasurements
     noise: Noise
     sigma: np.ndarray        # (p,) of the prior of the calibration, 0 of what is known
     released: frozenset = frozenset()    # groups of the calibration beyond their stated sigmas
-
-    @property
-    def measurements(self) -> Measurements:
-        """Those of which some are accepted."""
-        return self.accepted.measurements
-
-    @property
-    def active(self):
-        """(p,) bool, entries of the calibration that are among the q unknowns."""
-        return self.sigma > 0
+    active = property(lambda self: self.sigma > 0)      # (p,) bool, entries among the q unknowns
 
 
 def build_problem(measurements, model, noise=None, wheel=None):
@@ -104,9 +98,8 @@ def build_problem(measurements, model, noise=None, wheel=None):
     """
     late = frozenset({"time-offset"} if measurements.jumps.lag else ())
     return Problem(
-        odometry=preintegrate_odometry(measurements, model, wheel),
-        accepted=AcceptedMeasurements(
-            measurements=measurements, weight=measurements.unit_weights),
+        measurements=measurements, odometry=preintegrate_odometry(measurements, model, wheel),
+        accepted=accept_all(measurements),
         noise=with_known(noise or Noise(), measurements.dataset.vehicle),
         sigma=measurements.calibration.sigma_without(late), released=late)
 
@@ -136,11 +129,7 @@ class NormalEquations:
 
     problem: Problem
     state: State
-
-    @property
-    def structure(self):
-        """The Structure of H."""
-        return self.problem.measurements.structure
+    structure = property(attrgetter("problem.measurements.structure"))      # of H
 
     @cached_property
     def error(self):
@@ -151,7 +140,7 @@ class NormalEquations:
 
     @cached_property
     def linearized(self):
-        """The LinearizedFactors of sightings of poses, of points, of ranges, and of one's own."""
+        """The LinearizedFactors of sightings, of ranges, and of one's own."""
         return linearize_measurements(self.problem, self.state)
 
     def step(self):
@@ -169,27 +158,27 @@ class NormalEquations:
         total = odometry.H.copy(), odometry.border + self.priors.border, \
             odometry.squared + self.priors.squared
         total[0][self.structure.diagonal] += self.priors.H
-        accepted, given = self.problem.accepted, self.problem.noise
-        sightings = (accepted.sighting_kernel, given.sightings / noise.sightings)
-        ranges = (accepted.range_kernel, given.ranges / noise.ranges)
-        kinds = sightings, sightings, ranges, (None, 1.0)
-        for group, (kernel, ratio), size in zip(self._measurement_groups, kinds, (3, 2, 1, 1)):
-            share = ratio**2 / (consistency_factor(kernel, size) if consistent else 1.0)
+        sizes = 2 + self.problem.measurements.oriented.any(), 1
+        shares = [(given / wanted)**2 / (consistency_factor(kind.kernel, size) if consistent else 1)
+                  for kind, size, given, wanted in zip(
+                      self.problem.accepted, sizes, self.problem.noise[1:], noise[1:])]
+        for group, share in zip(self._measurement_groups, (*shares, 1.0)):
             if group is not None:
                 total = [each + share * part for each, part in zip(total, group)]
         return *total, log_determinant
 
     def counts(self):
         """Numbers of accepted errors of sightings and of ranges."""
-        poses, points, ranges = (f.e.shape[1] * np.sum(f.weight) for f in self.linearized[:3])
-        return poses + points, ranges
+        sightings, ranges, _ = self.linearized
+        size = 2 + self.problem.measurements.as_pose[sightings.index]
+        return np.sum(size * sightings.weight), np.sum(ranges.weight)
 
     @cached_property
     def priors(self):
         """The Group of the priors, whose H and D are diagonal."""
         problem, m, state = self.problem, self.problem.measurements, self.state
         f, active, n = len(m.frame), problem.active, len(self.structure.diagonal)
-        weak = np.bincount(m.marker_row, problem.accepted.sighting_weight, len(m.marker)) == 0
+        weak = np.bincount(m.marker_row, problem.accepted.sightings.weight, len(m.marker)) == 0
         parts = [([0], se2.log(state.poses[:1]), m.origin_sigma),
                  (slice(f + len(m.marker), None), state.antennas - m.guess, GUESS_PRIOR_SIGMA),
                  (f + np.flatnonzero(weak), state.markers[weak], WEAK_SIGMA)]
@@ -213,10 +202,8 @@ class NormalEquations:
     @cached_property
     def _odometry(self):
         """Function from a slip to the Group of the odometry and sum log|Q|."""
-        linearized = linearize_odometry(self.problem, self.state)
-
         def odometry(slip):
-            factors, log_determinant = linearized(slip)
+            factors, log_determinant = linearize_odometry(self.problem, self.state, slip)
             return self._group(0, factors), log_determinant
 
         return lru_cache(maxsize=3)(odometry)

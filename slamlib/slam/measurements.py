@@ -11,8 +11,9 @@ kernels and values of the noise.
 """
 
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -30,7 +31,7 @@ from slamlib.sightings import (
     sightings_by_frame,
 )
 from slamlib.slam.calibration import Calibration, stated_calibration
-from slamlib.slam.own import connected, poses_of
+from slamlib.slam.own import connected
 
 NOISE_KEYS = ("slip", "marker_noise_factor", "range_noise_factor")      # of a Vehicle, as in Noise
 
@@ -40,35 +41,18 @@ WEAK_SIGMA = 1e5             # m and rad, of a marker without accepted sightings
 GUESS_PRIOR_SIGMA = 5.0      # m, of an antenna about its guessed position
 
 
-@dataclass(frozen=True)
-class Noise:
+class Noise(NamedTuple):
     """The three noise parameters."""
 
     slip: float = TYPICAL_SLIP     # sqrt(m), sigma of a wheel's slip after one metre
     sightings: float = 1.0         # factor on the sigmas in ArucoReading.txt
     ranges: float = 1.0            # factor on the sigmas in UwbReading.txt
 
-    @property
-    def logarithms(self):
-        """(3,) of slip and both factors."""
-        return np.log([self.slip, self.sightings, self.ranges])
-
-    @classmethod
-    def from_logarithms(cls, logarithms):
-        """The Noise of `logarithms` (3,)."""
-        return cls(*np.exp(logarithms).tolist())
-
-
-def is_known(vehicle):
-    """(3,) bool, which noise parameters a Vehicle gives."""
-    return np.array([getattr(vehicle, key) is not None for key in NOISE_KEYS])
-
 
 def with_known(noise, vehicle):
     """The Noise with the parameters that a Vehicle gives; the slip is at least 1e-5 sqrt(m)."""
-    slip, *factors = (
-        value if getattr(vehicle, key) is None else getattr(vehicle, key)
-        for key, value in zip(NOISE_KEYS, (noise.slip, noise.sightings, noise.ranges)))
+    given = [getattr(vehicle, key) for key in NOISE_KEYS]
+    slip, *factors = (own if known is None else known for own, known in zip(noise, given))
     return Noise(max(slip, SLIP_BOUNDS[0]), *factors)
 
 
@@ -104,28 +88,6 @@ class Structure:
         return matrix
 
 
-def block_structure(is_pose, factors):
-    """The Structure of variables, of which `is_pose` (v,) are poses and the others points.
-
-    `factors` lists, for each kind of factor, the variables (m, 2) of its m factors. Variables are
-    eliminated in the order of minimum degree.
-    """
-    count = len(is_pose)
-    row, column = np.concatenate([np.repeat(np.arange(count), 2).reshape(-1, 2), *(
-        each[:, [[0, 0], [0, 1], [1, 0], [1, 1]]].reshape(-1, 2) for each in factors)]).T
-    connected = sparse.csc_array((np.where(row == column, count, 0.5), (row, column)))
-    position = splu(connected, permc_spec="MMD_AT_PLUS_A").perm_c
-    block, number = np.unique(position[row] * count + position[column], return_inverse=True)
-    by_rows = sparse.bsr_array((
-        np.arange(9 * len(block)).reshape(-1, 3, 3), block % count,
-        np.searchsorted(block, count * np.arange(count + 1)))).tocsr()
-    places = sparse.csc_array((by_rows.data, by_rows.indices, by_rows.indptr), by_rows.shape)
-    ends = np.cumsum([count, *(4 * len(each) for each in factors)])
-    return Structure(
-        is_pose=is_pose, position=position, places=places, diagonal=places.diagonal(),
-        factors=factors, blocks=[each.reshape(-1, 4) for each in np.split(number, ends)[1:-1]])
-
-
 @dataclass(frozen=True)
 class Ranges:
     """Ranges from frames to antennas."""
@@ -153,6 +115,7 @@ class Measurements:
     calibration: Calibration     # what the Vehicle states of what measurements share
     jumps: Jumps             # where odometry contradicts the markers
     own: gtsam.NonlinearFactorGraph      # factors of one's own
+    as_pose = property(lambda self: self.oriented[self.marker_row])    # (s,) bool, with a heading
 
     @property
     def origin_sigma(self):
@@ -162,56 +125,57 @@ class Measurements:
     @property
     def learned(self):
         """(3,) bool, noise parameters that are learned: unknown ones with measurements."""
-        return ~is_known(self.dataset.vehicle) & [
-            True, len(self.marker_row) > 0, len(self.ranges.row) > 0]
-
-    @property
-    def as_pose(self):
-        """(s,) bool, sightings of markers with a heading."""
-        return self.oriented[self.marker_row]
-
-    def by_kind(self, values):
-        """(s,) of the sightings and (r,) of the ranges, of values (s + r,)."""
-        return np.split(values, [len(self.marker_row)])
-
-    @property
-    def unit_weights(self):
-        """(s + r,) weight 1 for every measurement."""
-        return np.ones(len(self.marker_row) + len(self.ranges.row))
+        counts = 1, len(self.marker_row), len(self.ranges.row)
+        return np.array([getattr(self.dataset.vehicle, key) is None and count > 0
+                         for key, count in zip(NOISE_KEYS, counts)])
 
     @cached_property
     def sighting_roots(self):
-        """Square root informations (s, 3, 3) of the sightings, and (s, 2, 2) of their positions.
+        """Square root informations (s, 3, 3) of the sightings; of points (2, 2) of them, else 0.
 
         `ArucoReading.txt` gives the covariance C in the axes of the vehicle. The error of a marker
         with a heading lives in the axes of the measured pose z: R(heading)^T C R(heading).
         """
-        s = self.sightings
-        return (square_root_information(se2.rotate_covariance(s.C, -s.z[:, 2])),
-                square_root_information(s.C[:, :2, :2]))
+        s, points = self.sightings, ~self.as_pose
+        U = square_root_information(se2.rotate_covariance(s.C, -s.z[:, 2]))
+        U[points] = 0
+        U[points, :2, :2] = square_root_information(s.C[points, :2, :2])
+        return U
 
     @cached_property
     def structure(self):
-        """The Structure of the information matrix."""
+        """The Structure of the information matrix, eliminated in the order of minimum degree."""
         f, k, s, r = len(self.frame), len(self.marker), self.sightings, self.ranges
-        sightings = np.stack([s.row, f + self.marker_row], -1)
-        return block_structure(
-            np.r_[np.ones(f, bool), self.oriented, np.zeros(len(self.antenna), bool)],
-            [np.arange(f - 1)[:, None] + [0, 1], sightings[self.as_pose], sightings[~self.as_pose],
-             np.stack([r.row, f + k + r.antenna], -1), connected(self)])
+        is_pose = np.r_[np.ones(f, bool), self.oriented, np.zeros(len(self.antenna), bool)]
+        factors = [np.arange(f - 1)[:, None] + [0, 1], np.stack([s.row, f + self.marker_row], -1),
+                   np.stack([r.row, f + k + r.antenna], -1), connected(self)]
+        count, ends = len(is_pose), np.cumsum([len(is_pose), *(4 * len(each) for each in factors)])
+        row, column = np.concatenate([np.repeat(np.arange(count), 2).reshape(-1, 2), *(
+            each[:, [[0, 0], [0, 1], [1, 0], [1, 1]]].reshape(-1, 2) for each in factors)]).T
+        neighbours = sparse.csc_array((np.where(row == column, count, 0.5), (row, column)))
+        position = splu(neighbours, permc_spec="MMD_AT_PLUS_A").perm_c
+        block, number = np.unique(position[row] * count + position[column], return_inverse=True)
+        by_rows = sparse.bsr_array((
+            np.arange(9 * len(block)).reshape(-1, 3, 3), block % count,
+            np.searchsorted(block, count * np.arange(count + 1)))).tocsr()
+        places = sparse.csc_array((by_rows.data, by_rows.indices, by_rows.indptr), by_rows.shape)
+        return Structure(
+            is_pose=is_pose, position=position, places=places, diagonal=places.diagonal(),
+            factors=factors, blocks=[each.reshape(-1, 4) for each in np.split(number, ends)[1:-1]])
 
 
 def measure(dataset, extra_poses=(), jumps=NO_JUMPS, own=None):
     """The Measurements of a Dataset.
 
-    `extra_poses`, encoder poses from 0, are frames without a measurement: tests compare a graph of
-    all poses with poses interpolated between the frames. `jumps` are those of odometry, `own` is a
-    gtsam.NonlinearFactorGraph (`slam.own`), or None.
+    `extra_poses`, encoder poses from 0, are frames without a measurement. `jumps` are those of
+    odometry, `own` is a gtsam.NonlinearFactorGraph (`slam.own`), or None.
     """
     uwb = dataset.uwb or UwbReadings(*np.zeros((2, 0), int), *np.zeros((2, 0)))
     own, count = own or gtsam.NonlinearFactorGraph(), len(dataset.ticks)
-    sightings = sightings_by_frame(dataset.aruco, np.r_[
-        0, count - 1, np.array(extra_poses, int), poses_of(own, count), uwb.pose])
+    keys = own.keyVector()                       # with a name: iterators do not keep it alive
+    own_poses = [gtsam.symbolIndex(key) for key in keys if gtsam.symbolChr(key) == ord("x")]
+    sightings = sightings_by_frame(dataset.aruco, np.r_[0, count - 1, np.array(
+        [*extra_poses, *(i for i in own_poses if i < count)], int), uwb.pose])
     marker, marker_row = np.unique(sightings.marker, return_inverse=True)
     has_heading = sightings.C[:, 2, 2] < MAX_HEADING_SIGMA**2
     antenna, guess = np.unique(uwb.antenna), dataset.antenna_guess
@@ -231,33 +195,34 @@ def measure(dataset, extra_poses=(), jumps=NO_JUMPS, own=None):
 
 
 @dataclass(frozen=True)
-class AcceptedMeasurements:
-    """The accepted measurements and their robust kernels."""
+class Accepted:
+    """Which of the m measurements of a kind are accepted, and their robust kernel."""
 
-    measurements: Measurements
-    weight: np.ndarray                       # (s + r,) of its information, 0 if it is rejected
-    sighting_kernel: gtsam.noiseModel.mEstimator.Base | None = None      # None: quadratic
-    range_kernel: gtsam.noiseModel.mEstimator.Base | None = None
-    range_bias: float = 0.0                  # sigmas, of the range kernel (`fit.ONE_SIDED`)
-    share: np.ndarray | None = None          # (s + r,) that its neighbours leave it (`memory`)
+    weight: np.ndarray       # (m,) of its information, 0 if it is rejected
+    share: np.ndarray        # (m,) of it that its neighbours leave each (`memory`)
+    kernel: gtsam.noiseModel.mEstimator.Base | None = None      # None: quadratic
+    bias: float = 0.0        # sigmas, of the kernel (`fit.ONE_SIDED`)
 
-    @property
-    def sighting_weight(self):
-        """(s,) weights of the sightings."""
-        return self.measurements.by_kind(self.weight)[0]
+    def kept(self, residual):
+        """(m,) weights, including the kernel's, by signed or absolute whitened residuals (m,)."""
+        return self.weight * ([self.kernel.weight(x) for x in residual - self.bias]
+                              if self.kernel else 1.0)
 
-    @property
-    def range_weight(self):
-        """(r,) weights of the ranges."""
-        return self.measurements.by_kind(self.weight)[1]
 
-    @property
-    def shares(self):
-        """`share` of the sightings (s,) and of the ranges (r,)."""
-        m = self.measurements
-        return m.by_kind(m.unit_weights if self.share is None else self.share)
+class AcceptedMeasurements(NamedTuple):
+    """The accepted measurements of both kinds."""
 
-    @property
-    def rejected(self):
-        """(s,) bool, sightings without weight."""
-        return self.sighting_weight == 0
+    sightings: Accepted
+    ranges: Accepted
+    share = property(lambda self: np.concatenate([kind.share for kind in self]))      # (s + r,)
+
+    def with_shares(self, shares):
+        """The same with other shares, (s,) of the sightings and (r,) of the ranges."""
+        return AcceptedMeasurements(*(
+            replace(accepted, share=share) for accepted, share in zip(self, shares)))
+
+
+def accept_all(measurements, kernel=None):
+    """The AcceptedMeasurements that count all of Measurements in full, by one kernel or none."""
+    return AcceptedMeasurements(*(Accepted(*np.ones((2, len(kind.row))), kernel) for kind in (
+        measurements.sightings, measurements.ranges)))

@@ -13,9 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from slamlib.increments import SLIP_FACTOR, TYPICAL_SLIP
-from slamlib.memory import error_memory
 from slamlib.slam.linear import laplace_approximation
-from slamlib.slam.measurements import Noise, is_known, with_known
+from slamlib.slam.measurements import Noise, with_known
 
 MEDIAN = np.array([TYPICAL_SLIP, 1.0, 1.0])        # sqrt(m), 1, 1: of the prior
 PRIOR_SIGMA = np.log([SLIP_FACTOR, 2.0, 2.0])      # (3,) standard deviations of the logarithms
@@ -33,18 +32,6 @@ MIN_POINT_WEIGHT = 1e-3      # probability of a point; less probable ones are le
 SINGULAR = -1e12             # log evidence of noise for which the equations are singular
 
 HIDDEN_RATIO = 2.0           # largest ratio of errors with memory to what residuals show of them
-MAX_DIRECT = 3.3             # sigmas, of a range's residual; longer ones are echoes
-
-
-def error_memories(accepted, sighting_residuals, range_residuals):
-    """The Memory of the errors of sightings, and that of ranges, of AcceptedMeasurements.
-
-    From their `fit.residuals`, (s, 3) and (r,). Echoes, ranges far too long, do not count.
-    """
-    m, s, r = accepted.measurements, accepted.measurements.sightings, accepted.measurements.ranges
-    direct = (accepted.range_weight > 0) & (np.abs(range_residuals) < MAX_DIRECT)
-    return (error_memory(m.marker_row, m.frame[s.row], sighting_residuals, ~accepted.rejected),
-            error_memory(r.antenna, m.frame[r.row], range_residuals[:, None], direct))
 
 
 def with_hidden_errors(noise, remember, vehicle):
@@ -55,7 +42,7 @@ def with_hidden_errors(noise, remember, vehicle):
     """
     sightings, ranges = (
         max(factor, min(1.0, HIDDEN_RATIO * factor)) if remembers else factor
-        for factor, remembers in zip((noise.sightings, noise.ranges), remember))
+        for factor, remembers in zip(noise[1:], remember))
     return with_known(Noise(noise.slip, sightings, ranges), vehicle)
 
 
@@ -75,17 +62,17 @@ def learn_noise(equations):
     free = np.flatnonzero(m.learned)
 
     def log_posterior(logarithms):
-        _, evidence = laplace_approximation(equations, Noise.from_logarithms(logarithms))
+        _, evidence = laplace_approximation(equations, Noise(*np.exp(logarithms)))
         prior = -((logarithms - np.log(MEDIAN)) / PRIOR_SIGMA)[free]**2 / 2
         return max(evidence, SINGULAR) + np.sum(prior)
 
-    start = np.where(m.learned | is_known(m.dataset.vehicle), noise.logarithms, np.log(MEDIAN))
+    start = np.log(noise)
     value = log_posterior(start)
     if value < SINGULAR / 2:                             # nothing can be learned
         return NoisePosterior(noise, np.zeros((3, 3)), SINGULAR, ((1.0, noise),))
     smallest = 1 / np.sqrt(2 * np.maximum([3 * len(m.frame), *equations.counts()], 1))
     mode, value, covariance = _mode(log_posterior, start, value, free, smallest[free])
-    return NoisePosterior(Noise.from_logarithms(mode), covariance, value,
+    return NoisePosterior(Noise(*np.exp(mode)), covariance, value,
                           _points(log_posterior, mode, value, covariance))
 
 
@@ -146,6 +133,6 @@ def _points(log_posterior, mode, value, covariance):
                          for offset in offsets])
         weights = np.exp(logs - logs.max())
     variance = np.maximum(np.diag(remaining), 0)
-    return tuple((float(weight), Noise.from_logarithms(mode + offset * direction + variance))
+    return tuple((float(weight), Noise(*np.exp(mode + offset * direction + variance)))
                  for weight, offset in zip(weights / weights.sum(), offsets)
                  if weight > MIN_POINT_WEIGHT)

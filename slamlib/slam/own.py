@@ -14,6 +14,7 @@ import numpy as np
 from gtsam.symbol_shorthand import A, C, L, P, X
 
 from slamlib.dataset import DatasetError
+from slamlib.textfile import require
 
 INDICES = 2**56              # number of indices of GTSAM's symbols; ids below 0 count from the end
 
@@ -39,14 +40,6 @@ def gtsam_values(problem, state):
     return values
 
 
-def poses_of(graph, count):
-    """Rows (p,) of `Dataset.ticks`, below `count`, of the poses in a gtsam.NonlinearFactorGraph."""
-    keys = graph.keyVector()                     # with a name: iterators do not keep it alive
-    symbols = [gtsam.Symbol(key) for key in keys]
-    return np.array([symbol.index() for symbol in symbols
-                     if symbol.chr() == ord("x") and symbol.index() < count], int)
-
-
 def connected(measurements):
     """Numbers (m, 2) of the variables of each factor of one's own; of one variable, twice its own.
 
@@ -58,11 +51,11 @@ def connected(measurements):
         keys = m.own.at(k).keys()
         rows = [number.get(key, -1) for key in keys]
         if len(rows) > 2 or min(rows) < 0 or max(rows) < len(m.frame) and np.ptp(rows) > 1:
-            names = ", ".join(gtsam.Symbol(key).string() for key in keys)
             raise DatasetError(
                 f"factors: expected in factor {k} one variable, a pose and a landmark, or "
-                "neighbouring poses, with keys X(row of ticks), L(marker id), A(antenna id), or "
-                f"P(id) of a marker without headings, found {names}")
+                "neighbouring poses, with keys X(row of ticks, from 0), L(marker id), A(antenna "
+                "id), or P(id) of a marker without headings, found "
+                + ", ".join(map(gtsam.DefaultKeyFormatter, keys)))
         pairs[k] = rows[0], rows[-1]
     return pairs
 
@@ -70,11 +63,20 @@ def connected(measurements):
 def linearized_own(problem, state):
     """Whitened errors (m, d) of factors of one's own at a State, and derivatives (m, d, 6).
 
-    Padded by zeros. Also half the sum of the squared errors, or the loss of their kernels.
+    Padded by zeros. Also half the sum of the squared errors, or the loss of their kernels. Raises
+    DatasetError for factors of other types of variables, or with numbers that are not finite.
     """
     m, pairs = problem.measurements, problem.measurements.structure.factors[-1]
     values = gtsam_values(problem, state) if len(pairs) else gtsam.Values()
-    jacobians = [m.own.at(k).linearize(values).jacobian() for k in range(len(pairs))]
+    jacobians = []
+    for k in range(len(pairs)):
+        try:
+            jacobians.append(m.own.at(k).linearize(values).jacobian())
+        except RuntimeError:                              # GTSAM's, on types of C++
+            raise DatasetError(
+                f"factors: expected in factor {k} one of gtsam.Pose2 for poses and markers, and "
+                f"gtsam.Point2 for antennas, found {type(m.own.at(k)).__name__}") from None
+        require(np.isfinite(np.c_[jacobians[k]]).all(), "factors", f"finite numbers in factor {k}")
     size = max((len(b) for _, b in jacobians), default=1)
     e, J = np.zeros((len(pairs), size)), np.zeros((len(pairs), size, 6))
     for k, (by_variables, b) in enumerate(jacobians):

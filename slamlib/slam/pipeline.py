@@ -6,17 +6,20 @@ does. Problem 4 starts from the poses of problem 3 (`fit_from_previous`).
 
 from dataclasses import replace
 
+import numpy as np
 from gtsam import NonlinearFactorGraph
 
 from slamlib.dataset import Dataset
 from slamlib.odometry import MODELS
 from slamlib.odometry_gate import NO_JUMPS
 from slamlib.slam.choices import better_model, calibrated, most_consistent
+from slamlib.slam.covariances import posterior_moments
 from slamlib.slam.fit import CAUCHY_SCALES, narrow_kernels, refine
 from slamlib.slam.graph import optimize
 from slamlib.slam.initialization import initial_state, state_from_poses
 from slamlib.slam.linear import build_problem
 from slamlib.slam.measurements import Noise, measure
+from slamlib.slam.own import linearized_own
 from slamlib.slam.result import slam_result
 from slamlib.textfile import require, require_type
 from slamlib.vehicle import changed
@@ -28,7 +31,7 @@ def estimate(dataset, slip=None, model=None, previous=None, *, marker_noise_fact
 
     Parameters
     ----------
-    dataset : Dataset with markers, ranges or both.
+    dataset : Dataset; markers and ranges may be absent.
     slip : sqrt(m), known standard deviation of a wheel's slip after one metre; None takes that of
         the dataset's Vehicle, or learns it if the Vehicle has none.
     model : "arc" or "euler", of an odometry step; None lets the evidence choose, or takes that of
@@ -84,8 +87,7 @@ kernel, found 'L2'
         return fit if other is fit else calibrated(other)
 
     if previous is not None and len(previous.rejected):
-        places = previous.places
-        fit = solve(previous.jumps, places)
+        fit, places = solve(previous.jumps, previous.places), previous.places
     else:
         fit, places = most_consistent(dataset, solve)
     optimum = optimize(fit.problem, fit.state, by_gtsam=True)
@@ -101,10 +103,7 @@ def fit_from_odometry(measurements, model="arc"):
 
 
 def fit_from_previous(measurements, previous, model=None):
-    """The Fit of Measurements from poses, calibration, slip and model of the SlamResult `previous`.
-
-    `model`, if not None, replaces that of `previous`. Errors raised as in `refine`.
-    """
+    """The Fit of Measurements from a SlamResult, with another `model` if not None."""
     frame, calibration = measurements.frame, measurements.calibration
     sigma, c = (calibration.taken_from(previous.calibration, *values) for values in (
         (previous.fit.problem.sigma, calibration.sigma), (previous.c, calibration.stated)))
@@ -114,3 +113,24 @@ def fit_from_previous(measurements, previous, model=None):
     state = state_from_poses(measurements, previous.poses[frame], previous.covariances[frame], c)
     state = narrow_kernels(problem, state, CAUCHY_SCALES[-1:])
     return replace(refine(problem, state), explanations=previous.explanations)
+
+
+def own_contradictions(fit):
+    """Errors (m,) of the factors of one's own of a Fit, in standard deviations, the larger of two.
+
+    Those at its solution, and those that the rest alone predicts, with the covariances of both.
+    Of a pose and a landmark, whose errors may be correlated, twice the sum of theirs is counted.
+    """
+    problem, m = fit.problem, fit.problem.measurements
+    e, *_ = linearized_own(problem, fit.state)
+    if not len(e):
+        return np.zeros(0)
+    rest = calibrated(fit_from_odometry(
+        replace(m, own=NonlinearFactorGraph()), problem.odometry.model))
+    state, found, _ = posterior_moments(rest)
+    C = np.concatenate([found.pairs[:1, :3, :3], found.pairs[:, 3:6, 3:6], found.landmarks])
+    off, J, _ = linearized_own(problem, state)
+    J = J.reshape(*off.shape, 2, 3).swapaxes(1, 2)                       # (m, 2, d, 3)
+    predicted = 2 * np.sum(J @ C[m.structure.factors[-1]] @ J.mT, axis=1) + np.eye(off.shape[1])
+    squared = np.einsum("ni,ni->n", off, np.linalg.solve(predicted, off[..., None])[..., 0])
+    return np.maximum(np.linalg.norm(e, axis=1), np.sqrt(squared))

@@ -5,26 +5,23 @@ Antennas whose position the ranges do not determine are in doubt, and their cova
 """
 
 from dataclasses import dataclass, replace
+from operator import attrgetter
 
 import numpy as np
 
 from slamlib import increments, se2
-from slamlib.odometry_gate import Jumps
-from slamlib.sightings import Sightings
 from slamlib.slam import factors
-from slamlib.slam.calibration import WHEELS, Calibration, calibration_table
+from slamlib.slam.calibration import WHEELS, calibration_table
 from slamlib.slam.covariances import posterior_moments
-from slamlib.slam.fit import Fit, kept_weights, residuals
+from slamlib.slam.fit import Fit, error_memories, residuals
 from slamlib.slam.initialization import SAME_PLACE, ranges_by_antenna, second_moment, trilaterate
-from slamlib.slam.measurements import GUESS_PRIOR_SIGMA, Noise
-from slamlib.slam.noise import error_memories
+from slamlib.slam.measurements import GUESS_PRIOR_SIGMA
 
 MIN_ACCEPTED_RANGES = 5      # number of accepted ranges of an antenna that is not in doubt
 SAME_MARKER = 0.05           # m, distance of two markers that must be one
 MAX_RELATIVE_SIGMA = 0.025   # of the median range: largest sigma of an antenna not in doubt
 MAX_LOG_ODDS = np.log(1000)  # log odds below which another position remains possible
 MIN_SHARE = 1e-9             # of a jump, below which there is none between two frames
-FRAMES_AT_ONCE = 1000        # number of frames of a section, whose arrays stay in cache
 
 
 @dataclass(frozen=True, repr=False)
@@ -40,25 +37,32 @@ class SlamResult:
     antenna_in_world: np.ndarray    # (a, 2)
     antenna_covariance: np.ndarray  # (a, 2, 2)
     doubts: dict                    # antenna id: reason, for antennas in doubt
-    calibration: Calibration        # p entries with what is stated of them
-    c: np.ndarray                   # (p,) their estimates
+    c: np.ndarray                   # (p,) estimates of the entries of `calibration`
     c_covariance: np.ndarray        # (p, p), 0 where the stated value is known
-    released: frozenset             # groups of entries that left their stated values
-    explanations: tuple             # of sets of groups, each of which explains this, or one empty
-    noise: Noise                    # as given or learned
-    noise_sigma: np.ndarray         # (3,) of its logarithms, 0 where not learned
-    model: str                      # "arc" or "euler", as given or chosen
+    noise_sigma: np.ndarray         # (3,) of the logarithms of `noise`, 0 where not learned
     rejected: np.ndarray            # (s,) bool, beyond the gate, rows of Measurements.sightings
     range_weight: np.ndarray        # (r,) share of its information that each range keeps, 0 to 1
     range_residual: np.ndarray      # (r,) whitened, positive for a range that is too long
-    share: np.ndarray               # (s + r,) that memory leaves of the information of each
-    correlation: np.ndarray         # (2, 2) of neighbours' residuals of a landmark, and its sigma
-    sightings: Sightings            # s of them, and the frames
-    jumps: Jumps                    # where odometry contradicts the markers
+    correlation: tuple              # of neighbours' residuals of a marker, and of an antenna
     turn_sigma: np.ndarray          # (f-1,) rad, of odometry's turns between frames, stated wheels
     fit: Fit                        # problem and solution, for `graph.as_gtsam`
-    converged: bool                 # whether the last iterations ended before their number did
     places: np.ndarray | None = None     # (m, 2) ids of ArucoReadings, and those in the map
+
+    # Parts of the fit
+    calibration = property(attrgetter("fit.problem.measurements.calibration"))   # p stated entries
+    released = property(attrgetter("fit.problem.released"))      # groups that left what is stated
+    explanations = property(attrgetter("fit.explanations"))      # sets of groups: each explains it
+    noise = property(attrgetter("fit.problem.noise"))            # as given or learned
+    slip = property(attrgetter("noise.slip"))                    # sqrt(m), of a wheel after 1 m
+    model = property(attrgetter("fit.problem.odometry.model"))   # "arc" or "euler"
+    share = property(attrgetter("fit.problem.accepted.share"))   # (s + r,) of memory, `Accepted`
+    sightings = property(attrgetter("fit.problem.measurements.sightings"))      # s of the graph
+    jumps = property(attrgetter("fit.problem.measurements.jumps"))     # odometry against markers
+    converged = property(attrgetter("fit.converged"))            # before MAX_STEPS of steps
+    calibration_table = property(lambda self: calibration_table(           # list of p dicts
+        self.calibration, self.c, self.c_covariance, self.released))
+    wheel = property(lambda self: self.c[WHEELS])                # (3,) m: R_R, R_L, b
+    wheel_covariance = property(lambda self: self.c_covariance[WHEELS, WHEELS])      # (3, 3) m^2
 
     def __repr__(self):
         sigma = 1e3 * np.sqrt(np.trace(self.covariances[:, :2, :2], axis1=1, axis2=2) / 2).mean()
@@ -68,16 +72,6 @@ class SlamResult:
                 f"{len(self.range_weight)} ranges\n  steps: {self.model}, slip {self.slip:.2g} "
                 f"sqrt(m), noise factors {self.noise.sightings:.2g} and {self.noise.ranges:.2g}\n"
                 f"  released from vehicle.toml: {', '.join(sorted(self.released)) or 'nothing'}")
-
-    @property
-    def slip(self):
-        """Standard deviation of a wheel's slip after one metre, sqrt(m), as given or learned."""
-        return self.noise.slip
-
-    @property
-    def calibration_table(self):
-        """List of a dict for each of the p entries, by `calibration.calibration_table`."""
-        return calibration_table(self.calibration, self.c, self.c_covariance, self.released)
 
     @property
     def unconfirmed(self):
@@ -91,33 +85,20 @@ class SlamResult:
         other = (distance < SAME_MARKER) & (count > count[:, None])
         return self.marker[(count == 1) | other.any(axis=1)]
 
-    @property
-    def wheel(self):
-        """Wheel parameters R_R, R_L, b, (3,) m."""
-        return self.c[WHEELS]
-
-    @property
-    def wheel_covariance(self):
-        """Their covariance (3, 3), m^2."""
-        return self.c_covariance[WHEELS, WHEELS]
-
 
 def slam_result(fit):
-    """The SlamResult of a Fit.
-
-    Raises LinAlgError as `marginal_covariances`.
-    """
+    """The SlamResult of a Fit; raises LinAlgError as `marginal_covariances`."""
     problem, m = fit.problem, fit.problem.measurements
     state, marginal, slip = posterior_moments(fit)
     poses, pose_covariances = interpolate(
-        replace(problem, noise=replace(problem.noise, slip=slip)), state, marginal.pairs)
-    residual, range_residual = residuals(problem, state)
-    _, range_weight = kept_weights(problem.accepted, residual, range_residual)
+        replace(problem, noise=problem.noise._replace(slip=slip)), state, marginal.pairs)
+    range_residual, rejected = residuals(problem, state)[1], problem.accepted.sightings.weight == 0
+    range_weight = problem.accepted.ranges.kept(range_residual)
     markers, antennas = np.split(marginal.landmarks, [len(m.marker)])
     best = np.full(len(m.marker), np.inf)         # a point has the heading of its best sighting
     np.minimum.at(best, m.marker_row, m.sightings.C[:, 2, 2])
     markers[~m.oriented, 2, 2] = best[~m.oriented]
-    balance = np.bincount(m.marker_row, np.where(problem.accepted.rejected, -1, 1), len(m.marker))
+    balance = np.bincount(m.marker_row, np.where(rejected, -1, 1), len(m.marker))
     mapped = balance > 0                          # markers with more accepted than rejected ones
     place = np.c_[state.markers[mapped, :2], se2.wrap(state.markers[mapped, 2])]
     sentences, antenna_covariances = antenna_doubts(
@@ -128,23 +109,15 @@ def slam_result(fit):
         marker_covariance=se2.rotate_covariance(markers[mapped], place[:, 2]),
         antenna=m.antenna, antenna_in_world=state.antennas,
         antenna_covariance=antenna_covariances, doubts=sentences,
-        calibration=m.calibration, c=state.c, c_covariance=marginal.c,
-        released=problem.released, explanations=fit.explanations,
-        noise=problem.noise, noise_sigma=np.zeros(3) if fit.posterior is None
+        c=state.c, c_covariance=marginal.c, noise_sigma=np.zeros(3) if fit.posterior is None
         else np.sqrt(np.diag(fit.posterior.covariance)),
-        model=problem.odometry.model, rejected=problem.accepted.rejected, range_weight=range_weight,
-        range_residual=range_residual, share=np.concatenate(problem.accepted.shares),
-        correlation=np.array([(memory.correlation, memory.sigma) for memory in error_memories(
-            problem.accepted, residual, range_residual)]),
-        sightings=m.sightings, jumps=m.jumps, turn_sigma=turn_sigma(problem),
-        fit=replace(fit), converged=fit.converged)
+        rejected=rejected, range_weight=range_weight, range_residual=range_residual,
+        correlation=tuple(each.correlation for each in error_memories(problem, state)),
+        turn_sigma=turn_sigma(problem), fit=fit)
 
 
 def turn_sigma(problem):
-    """Standard deviations (f-1,), rad, of the turns between frames by odometry of stated wheels.
-
-    Estimated ones adapt to a wrong number of turns.
-    """
+    """Standard deviations (f-1,), rad, of the turns between frames by odometry of stated wheels."""
     m, odometry = problem.measurements, problem.odometry
     known = ~m.jumps.share(m.frame[:-1], m.frame[1:]).any(axis=1)        # else by markers
     variance = np.sum((odometry.J_wheel[:, 2] * m.dataset.vehicle.sigma_wheel)**2, axis=1)
@@ -192,7 +165,6 @@ def _doubt(ranges, estimate, weight, places, costs):
         return f"{len(ranges.distance) - count} of its {len(ranges.distance)} ranges disagree"
     if sigma > MAX_RELATIVE_SIGMA * distance:
         return "its ranges are too few or come from too few directions"
-    return None
 
 
 def interpolate(problem, state, pairs):
@@ -204,39 +176,23 @@ def interpolate(problem, state, pairs):
 
     `pairs` (f-1, 9, 9) as in `Covariances`, at the State that solves the Problem.
     """
-    frame, count = problem.measurements.frame, len(problem.measurements.dataset.ticks)
+    m, poses, frame = problem.measurements, state.poses, problem.measurements.frame
     if not len(pairs):                                       # pose 1 alone: the world's origin
-        return state.poses.copy(), np.diag(problem.measurements.origin_sigma)[None]**2
-    poses, covariances = np.empty((count, 3)), np.empty((count, 3, 3))
-    for first in range(0, len(pairs), FRAMES_AT_ONCE):
-        rows = slice(first, min(first + FRAMES_AT_ONCE, len(pairs)) + 1)          # of frames
-        section = slice(frame[rows][0], frame[rows][-1] + 1)               # shares its ends
-        poses[section], covariances[section] = _interpolate_section(
-            problem, state, pairs[first:rows.stop - 1], rows)
-    return poses, covariances
-
-
-def _interpolate_section(problem, state, pairs, rows):
-    """The same for the encoder poses from the first to the last of the frames `rows` (slice)."""
-    m, poses, frame = problem.measurements, state.poses[rows], problem.measurements.frame[rows]
+        return poses.copy(), np.diag(m.origin_sigma)[None]**2
     turned, R = np.tile(np.eye(9), (len(pairs), 1, 1)), se2.rotation(poses[:, 2])
     turned[:, :2, :2], turned[:, 3:5, 3:5] = R[:-1], R[1:]
     joint = turned @ pairs @ turned.mT                       # the poses in world axes
-    pose = np.arange(frame[0], frame[-1] + 1)
-    last = np.searchsorted(frame, pose, side="right") - 1
+    pose = np.arange(len(m.dataset.ticks))
+    last, inner = np.searchsorted(frame, pose, side="right") - 1, np.setdiff1d(pose, frame)
     all_poses = poses[last]
     covariances = np.concatenate([joint[:, :3, :3], joint[-1:, 3:6, 3:6]])[last]
-    inner = np.flatnonzero(~np.isin(pose, frame))
     a, b = last[inner], last[inner] + 1
-
-    vehicle, ticks = m.dataset.vehicle.with_wheel(state.c[WHEELS]), m.dataset.ticks[pose]
-    ends = np.r_[frame[a], pose[inner]], np.r_[pose[inner], frame[b]]
-    of_section = [each - frame[0] for each in ends]
-    quantization, slipping = factors.odometry_noise(
-        ticks, vehicle, *of_section, len(m.dataset.ticks) - 1)
+    vehicle, ticks = m.dataset.vehicle.with_wheel(state.c[WHEELS]), m.dataset.ticks
+    ends = np.r_[frame[a], inner], np.r_[inner, frame[b]]
+    quantization, slipping = factors.odometry_noise(ticks, vehicle, *ends)
     (delta_a, delta_b), (a_by_wheel, b_by_wheel), (Q_a, Q_b), (jump_a, jump_b) = (
         np.split(each, 2) for each in (
-            *increments.between_poses(ticks, vehicle, *of_section, problem.odometry.model),
+            *increments.between_poses(ticks, vehicle, *ends, problem.odometry.model),
             quantization + problem.noise.slip**2 * slipping,
             m.jumps.share(*ends).sum(axis=1)[:, None, None]))
     back = se2.inverse(delta_b)

@@ -11,7 +11,6 @@ from slamlib.slam.fit import (
     KERNELS,
     ONE_SIDED,
     accepted_measurements,
-    kept_weights,
     narrow_kernels,
     refine,
     residuals,
@@ -73,8 +72,8 @@ def compare(seed, kind, methods, markers=True, **options):
             numbers |= {f"{method} antenna error": np.sqrt(np.mean(error**2)),
                         f"{method} antenna nees": np.mean(squared)}
         else:
-            each = residuals(fit.problem, fit.state)
-            lost = kept_weights(fit.problem.accepted, *each)[0] < 0.5
+            size = np.linalg.norm(residuals(fit.problem, fit.state)[0], axis=1)
+            lost = fit.problem.accepted.sightings.kept(size) < 0.5
             numbers |= {f"{method} wrong rejected": lost[wrong].mean() if wrong.any() else np.nan,
                         f"{method} good lost": lost[~wrong].mean()}
     return numbers

@@ -88,14 +88,14 @@ def correlated_errors(seed, correlation, **options):
     markers, problem3 = localization.localize(dataset.aruco), slam.estimate(dataset.without("uwb"))
     problem4, numbers = slam.estimate(dataset, previous=problem3), {}
     problem = problem3.fit.problem
-    known, independent = (slam_result(refine(replace(problem, accepted=replace(
-        problem.accepted, share=share)), problem3.fit.state, accept=None))
-        for share in (known_shares(problem.measurements, correlation), None))
+    known = known_shares(problem.measurements, correlation)
+    known, independent = (slam_result(refine(replace(problem, accepted=problem.accepted.with_shares(
+        [share, np.ones(0)])), problem3.fit.state, accept=None)) for share in (known, known**0))
     for name, found in zip(MEMORY_METHODS, (markers, problem3, problem4, known, independent)):
         true = truth.poses[getattr(found, "frame", slice(None))]
         numbers |= {f"{name} nees": anees(found.poses, found.covariances, true),
                     f"{name} ate": ate(found.poses, true, aligned=True)}
-    return numbers | {"share": problem3.share.mean(), "residuals": problem3.correlation[0, 0]}
+    return numbers | {"share": problem3.share.mean(), "residuals": problem3.correlation[0]}
 
 
 def known_shares(measurements, correlation):

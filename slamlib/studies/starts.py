@@ -14,7 +14,7 @@ from slamlib.slam.fit import CAUCHY_SCALES, narrow_kernels
 from slamlib.slam.graph import optimize
 from slamlib.slam.initialization import consensus_markers, odometry_state, state_from_poses
 from slamlib.slam.linear import build_problem, state_from_arrays
-from slamlib.slam.measurements import AcceptedMeasurements, measure
+from slamlib.slam.measurements import accept_all, measure
 from slamlib.slam.result import slam_result
 from slamlib.studies.kernels import rounds, solve_with
 from slamlib.studies.montecarlo import antenna_error, drive
@@ -104,8 +104,7 @@ def _from_each_start(problem, right, kernel, starts):
     """The numbers of `landmarks`; from the State `right` the optimum is the right one."""
     m, numbers = problem.measurements, {}
     cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(CAUCHY_SCALES[-1])
-    last = replace(problem, accepted=AcceptedMeasurements(
-        measurements=m, weight=m.unit_weights, sighting_kernel=cauchy))
+    last = replace(problem, accepted=accept_all(m, cauchy))
     best = optimize(last, right)
     for name in starts:
         state = odometry_state(m, problem.odometry.model, markers=LANDMARKS[name])
