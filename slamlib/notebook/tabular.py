@@ -14,7 +14,8 @@ from slamlib.slam.measurements import NOISE_KEYS
 from slamlib.studies.kernels import mislabelled
 
 DASH = "–"
-NUMERIC = re.compile(rf"[-+−>]? ?\d|{DASH}")          # begins a cell of a column of numbers
+# What begins a cell of a column of numbers, or is an italic remark in it.
+NUMERIC = re.compile(rf"[-+−>]? ?\d(?!\. )|{DASH}|\*[^*]+\*$")
 MINUS = re.compile(r"(?<![\w.])-(?=\d)")
 MAX_NUMBER = 1e6             # larger numbers are not shown, because the method failed
 

@@ -29,7 +29,7 @@ class SolvedDrive:
         return next((known for known in self.solutions if known.problem == problem), None)
 
 
-def read_drives(read, results, written, notices=None):
+def read_drives(read, results, written, notices):
     """Return the datasets with their solutions, a list of SolvedDrive, the shortest first.
 
     `read` is a list of (Dataset, Truth or None), `results` (Path) the folder of this build's files,
@@ -43,7 +43,7 @@ def read_drives(read, results, written, notices=None):
                       if file.startswith(f"{name}/") and file.endswith(".mat"))
         problems = sorted((file.split("/")[0] for file in files
                            if file.endswith("/vehiclePose.mat")), key=order)
-        told = (notices or {}).get(name, [])
+        told = notices.get(name, [])
         doubts = [*doubts_before_solving(dataset, truth), *(x for x in told if type(x) is Doubt)]
         drives.append(SolvedDrive(
             name=name, dataset=dataset, truth=truth, files=files, doubts=tuple(merged(doubts)),
@@ -78,9 +78,9 @@ def read_solution(folder, dataset, files):
                 if f"{folder.name}/{name}.mat" in files}
     except Exception as error:  # scipy and numpy raise many kinds
         raise NotebookError(f"{place} cannot be read: {error}") from None
-    if poses.shape != (len(dataset.ticks), 3):
+    if poses.shape != (len(dataset.ticks), 3) or not np.isfinite(poses[:, 0]).any():
         raise NotebookError(f"{place} must hold [x, y, heading] for each of the "
-                            f"{len(dataset.ticks)} encoder poses, found {poses.shape}")
-    known = np.flatnonzero(np.isfinite(poses[:, 0]))
+                            f"{len(dataset.ticks)} encoder poses, one of them at least not NaN, "
+                            f"found {poses.shape}")
     return Solution(problem=folder.name, title=title(folder.name, dataset), poses=poses,
-                    covariances=covariances, world=int(known[0]) if len(known) else 0, **maps)
+                    covariances=covariances, world=int(np.isfinite(poses[:, 0]).argmax()), **maps)

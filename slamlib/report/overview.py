@@ -20,7 +20,7 @@ from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_outp
 from slamlib import evaluation
 from slamlib.checks import consistency
 from slamlib.dataset import all_notes
-from slamlib.notebook import Drive, accuracy, plotting
+from slamlib.notebook import Drive, accuracy, plotting, table
 from slamlib.report.drives import order, read_solution, why_missing
 from slamlib.report.notebooks import chapter_of
 from slamlib.solve import PROBLEMS, SENSORS, title, truth_in_world
@@ -60,13 +60,9 @@ def opening(drives, chapters=None):
 
 def _facts(drives, chapters):
     """Return what the template tells, a dict."""
-    solved = [drive for drive in drives if any(map(_has_estimates, drive.solutions))]
+    solved = [drive for drive in drives if drive.solutions]
     problems = sorted({told.problem for drive in drives
                        for told in (*drive.solutions, *drive.failures)}, key=order)
-    known = any(drive.truth is not None for drive in drives)
-    header = ["dataset", "problem", *["ATE", "ATE, aligned"] * known, "σ of position",
-              "σ of heading", "poses"]
-    rows = [result_row(drive, problem, known) for drive in drives for problem in problems]
     return {
         "sensors": {sensor for sensor in SENSORS for drive in drives
                     if getattr(drive.dataset, sensor) is not None},
@@ -74,8 +70,10 @@ def _facts(drives, chapters):
                           else [solved[0], solved[-1]])],
         "simulated": [_name(drive) for drive in drives if Drive(
             drive.name, drive.dataset, drive.truth).origin == "simulated"],
-        "results": solved and table_text(header, rows, texts=2), "results_of": problems,
-        "known": known, "dashes": not all(drive.truth for drive in drives),
+        "results": solved and table(
+            result_row(drive, problem) for drive in drives for problem in problems).data,
+        "results_of": problems, "known": any(drive.truth for drive in drives),
+        "dashes": not all(drive.truth for drive in drives),
         "without": {name: [plain(drive.name) for drive in drives
                            if getattr(drive.dataset, sensor) is None]
                     for sensor, name in SENSORS.items()},
@@ -93,22 +91,18 @@ def _name(drive):
     return f"*{plain(drive.name)}*"
 
 
-def _has_estimates(solution):
-    """Return True if a Solution or None has an estimate of any pose."""
-    return solution is not None and bool(np.isfinite(solution.poses[:, 0]).any())
-
-
 def _compared(drive):
     """Return what the abstract tells of a SolvedDrive, a dict: odometry against the best SLAM."""
     both = [drive.solution("problem1"), drive.solution("problem4") or drive.solution("problem3")]
     errors = returns = None
-    if all(map(_has_estimates, both)):
+    if all(both):
         found = consistency.returns(drive.dataset)
         if drive.truth is not None:
-            errors = [_ate(drive, solution) for solution in both]
+            errors = [with_unit(accuracy(each, drive)["ATE (mm)"], "m") for each in both]
         elif len(found.start):
             off = [consistency.discrepancies(found, solution.poses)[:, :2] for solution in both]
-            returns = [with_unit(np.sqrt(np.mean(np.sum(each**2, axis=1))), "m") for each in off]
+            returns = [with_unit(1e3 * np.sqrt(np.mean(np.sum(each**2, axis=1))), "m")
+                       for each in off]
     counts = []
     for kind, name in (("aruco_map", "marker"), ("uwb_map", "antenna")):
         maps = [getattr(solution, kind) for solution in drive.solutions]
@@ -118,32 +112,24 @@ def _compared(drive):
             "landmarks": listed(counts) if counts else ""}
 
 
-def _ate(drive, solution, aligned=False):
-    truth = truth_in_world(solution, drive.truth)
-    return with_unit(evaluation.ate(solution.poses, truth, aligned), "m")
-
-
 def named(problem, dataset):
     """Return number and title of a problem on a dataset (str), as "3. SLAM: odometry + ArUco"."""
     number = re.match(r"problem(\d+)", problem)
     return (f"{number[1]}. " if number else "") + plain(title(problem, dataset))
 
 
-def result_row(drive, problem, known=True):
-    """Return a row of the table of results (list of str); `known`: it has columns of errors."""
-    row, errors = [plain(drive.name), named(problem, drive.dataset)], ["–", "–"] * known
+def result_row(drive, problem):
+    """Return a row of the table of results, for `notebook.table` (dict)."""
     solution = drive.solution(problem)
-    if solution is None:
-        reason = re.sub("(?<=solved):.*", "", why_missing(drive, problem))
-        return [*row, reason, *errors, "–", "–"]
-    if not _has_estimates(solution):
-        return [*row, *errors, "–", "–", "0"]
-    if known and drive.truth is not None:
-        errors = [_ate(drive, solution), _ate(drive, solution, aligned=True)]
-    found = accuracy(solution, drive)
-    position, heading = 1e-3 * found["σ (mm)"], 1e-3 * found["σ of δ (mrad)"]
-    count = np.isfinite(solution.poses[:, 0]).sum()
-    return [*row, *errors, with_unit(position, "m"), with_unit(heading, "rad"), f"{count:,}"]
+    found = accuracy(solution, drive) if solution else {}
+    row = {"dataset": plain(drive.name), "problem": named(problem, drive.dataset)} | {
+        name: with_unit(found[key], unit) if key in found else None for name, key, unit in (
+            ("ATE", "ATE (mm)", "m"), ("ATE, aligned", "aligned (mm)", "m"),
+            ("σ of position", "σ (mm)", "m"), ("σ of heading", "σ of δ (mrad)", "rad"))}
+    if solution:
+        return row | {"poses": int(np.isfinite(solution.poses[:, 0]).sum())}
+    reason = re.sub("(?<=solved):.*", "", why_missing(drive, problem))
+    return row | {"σ of position": f"*{reason}*"}
 
 
 def trajectories(drive):
@@ -242,22 +228,8 @@ def listed(names):
     return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
 
 
-def table_text(header, rows, texts=1):
-    """Return a table in Markdown (str).
-
-    `header` is a list of c str, `rows` a list of such lists. The first `texts` columns are aligned
-    left as text, the others right. Of consecutive rows with the same first cell only the first row
-    shows it.
-    """
-    above = [None, *(row[0] for row in rows)]
-    grouped = [["" if row[0] == first else row[0], *row[1:]]
-               for first, row in zip(above, rows, strict=False)]
-    lines = [header, ["---"] * texts + ["---:"] * (len(header) - texts), *grouped]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
 def with_unit(value, unit):
-    """Return a value with three significant digits and its unit (str), below 1 with a milli."""
-    value, unit = (value, unit) if abs(value) >= 1 else (1e3 * value, f"m{unit}")
+    """Return a value in mm or mrad with three significant digits in its unit or in thousandths."""
+    value, unit = (1e-3 * value, unit) if abs(value) >= 1e3 else (value, f"m{unit}")
     digits = f"{value:{',.0f' if abs(value) >= 100 else '#.3g'}}".removesuffix(".")
     return f"{digits}\u00a0{unit}"
