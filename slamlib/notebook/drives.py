@@ -7,10 +7,12 @@ to hand in and nothing else, and a cached notebook keeps its records.
 
 import os
 import re
+import unicodedata
 from dataclasses import asdict, dataclass, field
 from itertools import product
 from pathlib import Path
 
+from IPython import get_ipython
 from IPython.display import Markdown, display
 from matplotlib_inline.backend_inline import set_matplotlib_formats
 
@@ -21,8 +23,8 @@ from slamlib.notebook import plotting
 from slamlib.simulation import simulate
 
 KEY = "slamlib"  # of records in the metadata of outputs
-# Types of records by their key.
-RECORDS = {"doubt": Doubt, "failure": solve.Failure}
+RECORDS = {"doubt": Doubt, "failure": solve.Failure}  # types of records by their key
+_WRITTEN = {}  # by the folder of files that this kernel wrote: the cell that did, and its execution
 
 
 @dataclass(frozen=True, eq=False)          # compared by identity, because arrays have no hash
@@ -86,7 +88,8 @@ def solved(drives, **solvers):
     """Results of solvers by problem, as {Drive: result} of the drives on which all succeed.
 
     Every result is written into the results folder, also of drives on which another problem fails;
-    what fails and what is doubted is shown, there and on the report's first page. If no drive is
+    what fails and what is doubted is shown, there and on the report's first page. A second call for
+    a problem of a drive writes nothing and says so, unless its cell is run again. If no drive is
     left, a simulated short one replaces them, of which nothing is written.
 
     Parameters
@@ -114,14 +117,27 @@ def solved(drives, **solvers):
                            f"{failure.reason}.", failure=failure)
             continue
         found[drive][problem] = result
-        if not drive.made_up:
+        if not drive.made_up and _writes(results_folder(drive) / problem):
             solve.write_solution(results_folder(drive), solution)
             show_doubts(drive, solution.doubts)
+        elif not drive.made_up:
+            _notice(drive, f"the files of {problem} stay those of the first call of solved in this "
+                           "notebook; for comparisons there is attempted.")
     left = [drive for drive in drives if len(found[drive]) == len(solvers)]
     if not left:
         return solved(_or_simulated([]), **solvers)
     by_problem = [{drive: found[drive][problem] for drive in left} for problem in solvers]
     return by_problem if len(solvers) > 1 else by_problem[0]
+
+
+def _writes(folder):
+    """True for the first call that writes a folder, and where JupyterLab runs its cell again."""
+    request = getattr(get_ipython(), "parent_header", {})
+    this = request.get("metadata", {}).get("cellId"), request.get("header", {}).get("msg_id")
+    cell, execution = _WRITTEN.setdefault(folder, this)
+    if this[0] and cell == this[0] and execution != this[1]:
+        _WRITTEN[folder] = this
+    return _WRITTEN[folder] is this
 
 
 def attempted(drives, function):
@@ -144,13 +160,18 @@ def show_doubts(drive, doubts):
 def _notice(drive, text, **record):
     """Show a text about a Drive, with a record for `notices`."""
     entry = {KEY: {"dataset": drive.name, **{kind: asdict(each) for kind, each in record.items()}}}
-    display(Markdown(f"**{escaped(drive.name)}**: {escaped(text)}"),
+    display(Markdown(f"**{plain(drive.name)}**: {plain(text)}"),
             metadata=entry if record and not drive.made_up else {})
 
 
-def escaped(text):
-    """Text (str) in which Markdown and HTML interpret nothing."""
-    return re.sub(r"[\\`*_{}\[\]<>#|$~^&]", r"\\\g<0>", " ".join(text.split()))
+def plain(text):
+    """Text (str) with the characters escaped that Markdown or HTML would interpret.
+
+    Names from folders and files pass it. A space replaces a control character.
+    """
+    seen = "".join(" " if unicodedata.category(sign)[0] == "C" else sign for sign in text)
+    return re.sub(r"[^\w\s.,:;/+-]|(?<![^\W_])_|_(?![^\W_])",
+                  lambda sign: f"&#{ord(sign[0])};", seen)
 
 
 def notices(books):

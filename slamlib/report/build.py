@@ -61,7 +61,7 @@ def build_report(notebooks, data, report, results, datasets=None, options=Option
     books, read, has = _checked_input(notebooks, data, datasets, options)
     chapters, folders = shown(books, options), [data / dataset.name for dataset, _ in read]
     with ExitStack() as stack:
-        temporary = stack.enter_context(temporary_folder())
+        temporary = Path(stack.enter_context(temporary_folder()))
         kept = Path(kept or temporary / "kept").resolve()
         environment = kernel_environment(temporary, data, datasets, kept / STUDIES)
         keys = partial(cache.keys, books, folders, environment | {"SLAMLIB_RESULTS": str(results)})

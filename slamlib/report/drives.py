@@ -5,21 +5,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from slamlib.checks.files import doubts_before_solving, merged
-from slamlib.dataset import Dataset, Truth
 from slamlib.doubt import Doubt
+from slamlib.notebook import Drive
 from slamlib.report.execution import NotebookError
 from slamlib.results import read_structs
 from slamlib.solve import PROBLEMS, SENSORS, Failure, Solution, title
 
 
-@dataclass(frozen=True)
-class SolvedDrive:
-    """A dataset with the solutions that this build computed for it."""
+@dataclass(frozen=True, eq=False)
+class SolvedDrive(Drive):
+    """A Drive with the solutions that this build computed for it."""
 
-    name: str
-    dataset: Dataset
-    truth: Truth | None
-    solutions: tuple  # of Solution, in the order of PROBLEMS
+    solutions: tuple = ()  # of Solution, in the order of PROBLEMS
     doubts: tuple = ()  # of Doubt, first about the drive, then by problem
     failures: tuple = ()  # of Failure, in the order of PROBLEMS
     files: tuple = ()  # of str, its files to hand in, as `problem1/vehiclePose.mat`
@@ -38,31 +35,23 @@ def read_drives(read, results, written, notices):
     """
     drives = []
     for dataset, truth in sorted(read, key=lambda drive: len(drive[0].ticks)):
-        name = dataset.name
+        name, told = dataset.name, notices.get(dataset.name, [])
         files = tuple(file.removeprefix(f"{name}/") for file in sorted(written)
                       if file.startswith(f"{name}/") and file.endswith(".mat"))
-        problems = sorted((file.split("/")[0] for file in files
-                           if file.endswith("/vehiclePose.mat")), key=order)
-        told = notices.get(name, [])
         doubts = [*doubts_before_solving(dataset, truth), *(x for x in told if type(x) is Doubt)]
         drives.append(SolvedDrive(
-            name=name, dataset=dataset, truth=truth, files=files, doubts=tuple(merged(doubts)),
+            name, dataset, truth, files=files, doubts=tuple(merged(doubts)),
             solutions=tuple(read_solution(results / name / problem, dataset, files)
-                            for problem in problems),
-            failures=tuple(sorted((x for x in told if type(x) is Failure),
-                                  key=lambda failure: order(failure.problem)))))
+                            for problem in PROBLEMS if f"{problem}/vehiclePose.mat" in files),
+            failures=tuple(x for problem in PROBLEMS for x in told
+                           if type(x) is Failure and x.problem == problem)))
     return drives
-
-
-def order(problem):
-    """Return the index of a problem in PROBLEMS; unknown problems come last."""
-    return list(PROBLEMS).index(problem) if problem in PROBLEMS else len(PROBLEMS)
 
 
 def why_missing(drive, problem):
     """Return why a SolvedDrive has no solution of a problem (str)."""
-    needed = PROBLEMS[problem].sensors if problem in PROBLEMS else ()
-    lacks = [SENSORS[sensor] for sensor in needed if getattr(drive.dataset, sensor) is None]
+    lacks = [SENSORS[sensor] for sensor in PROBLEMS[problem].sensors
+             if getattr(drive.dataset, sensor) is None]
     reasons = [failure.reason for failure in drive.failures if failure.problem == problem]
     return (f"left out: no {' and no '.join(lacks)}" if lacks
             else f"could not be solved: {reasons[0]}" if reasons else "no result")

@@ -12,7 +12,6 @@ import socket
 import sys
 import tempfile
 import time
-from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -63,14 +62,11 @@ def kernel_environment(settings, data, datasets, studies):
         "MPLBACKEND": "module://matplotlib_inline.backend_inline"}
 
 
-@contextmanager
 def temporary_folder():
-    """Yield a new folder (Path), short enough for sockets."""
+    """Return a context manager of a new folder, a str short enough for sockets."""
     parent = tempfile.gettempdir()
     parent = "/tmp" if TRANSPORT == "ipc" and len(parent) > LONGEST_FOLDER else parent
-    with tempfile.TemporaryDirectory(dir=parent, prefix="slamlib-",
-                                     ignore_cleanup_errors=True) as folder:
-        yield Path(folder)
+    return tempfile.TemporaryDirectory(dir=parent, prefix="slamlib-", ignore_cleanup_errors=True)
 
 
 def execute(books, environment, results, jobs, finish):
@@ -88,7 +84,7 @@ def execute(books, environment, results, jobs, finish):
 
 
 async def _execute_all(books, environment, results, jobs, finish):
-    slots = asyncio.Semaphore(jobs)
+    slots, settings = asyncio.Semaphore(jobs), Path(environment["IPYTHONDIR"])
     cells = sum(cell.cell_type == "code" for book in books.values() for cell in book.cells)
 
     async def run(number, source, book):
@@ -97,7 +93,7 @@ async def _execute_all(books, environment, results, jobs, finish):
         try:
             async with slots:
                 await _execute(source, book, environment | {"SLAMLIB_RESULTS": str(stage)},
-                               folder / f"{number}.json", bar)
+                               settings / f"{number}.json", bar)
             names = swap.file_names(stage)
             for name in names:
                 (results / name).parent.mkdir(parents=True, exist_ok=True)
@@ -106,8 +102,7 @@ async def _execute_all(books, environment, results, jobs, finish):
         finally:
             shutil.rmtree(stage, ignore_errors=True)
 
-    with temporary_folder() as folder, tqdm(  # on a terminal only
-            total=cells, unit="cell", leave=False, disable=None) as bar:
+    with tqdm(total=cells, unit="cell", leave=False, disable=None) as bar:  # on a terminal only
         async with asyncio.TaskGroup() as group:
             for number, (source, book) in reversed([*enumerate(books.items())]):
                 group.create_task(run(number, source, book))        # later chapters take longer

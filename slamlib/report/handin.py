@@ -10,10 +10,11 @@ from io import BytesIO
 from pathlib import Path
 from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 
+import numpy as np
 from jinja2 import Template
 
 from slamlib import swap
-from slamlib.dataset import DatasetError, all_notes, dataset_names, read_dataset, read_truth
+from slamlib.dataset import all_notes, dataset_names, read_dataset, read_truth
 from slamlib.notebook import Drive
 from slamlib.report.drives import why_missing
 from slamlib.report.notebooks import PROBLEM2_FOLDERS
@@ -53,15 +54,11 @@ def write_zip(path, report, results, options, omitted=()):
     """Write the zip of a Report to `path` (Path); equal input gives equal bytes.
 
     `results` (Path) is the folder of its files, `omitted` (list of str) what `selection` left out.
-    DatasetError if a dataset has the name of another file in the zip.
     """
     contents = {"report.pdf": report.files[-1].read_bytes(),
                 "README.txt": readme(report.drives, options, omitted).encode()}
     with swap.staging(results):                         # no build replaces them meanwhile
         for drive in report.drives:
-            if drive.name.casefold() in {name.casefold() for name in contents}:
-                raise DatasetError(f"{drive.name}: the zip has a file of the name of this dataset: "
-                                   "rename its folder")
             contents |= {f"{drive.name}/{name}": Path(results, drive.name, file).read_bytes()
                          for name, file in handed_in(drive, options.problem2).items()}
     archive = BytesIO()
@@ -109,22 +106,18 @@ def _wrapped(paragraph):
 
 def _told(drive, problem2):
     """Return what README.txt tells of a SolvedDrive, a dict."""
-    files, folders = handed_in(drive, problem2), {}
+    files, estimate, folders = handed_in(drive, problem2), PROBLEM2_FOLDERS[problem2], {}
     for name, file in files.items():
-        folders.setdefault(name.split("/")[0], []).append(file)
-    solutions = {name: drive.solution(each[0].split("/")[0]) for name, each in folders.items()}
-    estimate, aruco_map = PROBLEM2_FOLDERS[problem2], files.get("problem2/ArucoMap.mat")
-    world = {problem: solution.world + 1 if (solution := drive.solution(problem)) else 1
-             for problem in ("problem2", estimate)}
+        solution = drive.solution(file.split("/")[0])
+        folders.setdefault(name.split("/")[0], (solution, []))[1].append(name.split("/")[1])
+    world = {solution.problem: solution.world + 1 for solution in drive.solutions}
     return {
-        "name": drive.name, "doubts": drive.doubts, "world": world[estimate],
+        "name": drive.name, "doubts": drive.doubts, "world": world.get(estimate, 1),
         "notes": all_notes(drive.dataset, drive.truth),
-        "folders": {name: (
-            listed([file.split("/")[1] for file in folders[name]]), solution.title,
-            int((solution.poses[:, 0] == solution.poses[:, 0]).sum()), len(solution.poses),
-            ", ".join(map(str, solution.facts.get("unconfirmed", ()))))
-            for name, solution in solutions.items()},
-        "map_frame": aruco_map not in (None, f"{estimate}/ArucoMap.mat") and world["problem2"],
+        "folders": {name: (listed(each), solution.title, np.isfinite(solution.poses[:, 0]).sum(),
+                           len(solution.poses)) for name, (solution, each) in folders.items()},
+        "map_frame": files.get("problem2/ArucoMap.mat") not in (None, f"{estimate}/ArucoMap.mat")
+        and world.get("problem2", 1),
         "missing": [
             f"{problem[:8]} ({title(problem, drive.dataset)}): {why_missing(drive, problem)}."
             for problem in ("problem1", estimate, "problem3", "problem4")

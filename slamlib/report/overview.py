@@ -5,7 +5,6 @@ it is known, the truth.
 """
 
 import re
-import unicodedata
 from io import BytesIO
 from pathlib import Path
 from urllib.parse import quote
@@ -20,8 +19,9 @@ from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_outp
 from slamlib import evaluation
 from slamlib.checks import consistency
 from slamlib.dataset import all_notes
-from slamlib.notebook import Drive, accuracy, plotting, table
-from slamlib.report.drives import order, read_solution, why_missing
+from slamlib.notebook import accuracy, plotting, table
+from slamlib.notebook.drives import plain
+from slamlib.report.drives import read_solution, why_missing
 from slamlib.report.notebooks import chapter_of
 from slamlib.solve import PROBLEMS, SENSORS, title, truth_in_world
 from slamlib.swap import file_names, write_atomically
@@ -61,15 +61,14 @@ def opening(drives, chapters=None):
 def _facts(drives, chapters):
     """Return what the template tells, a dict."""
     solved = [drive for drive in drives if drive.solutions]
-    problems = sorted({told.problem for drive in drives
-                       for told in (*drive.solutions, *drive.failures)}, key=order)
+    problems = [problem for problem in PROBLEMS if any(
+        told.problem == problem for drive in drives for told in drive.solutions + drive.failures)]
     return {
         "sensors": {sensor for sensor in SENSORS for drive in drives
                     if getattr(drive.dataset, sensor) is not None},
         "compared": [*map(_compared, solved if len(solved) <= MAX_NAMED
                           else [solved[0], solved[-1]])],
-        "simulated": [_name(drive) for drive in drives if Drive(
-            drive.name, drive.dataset, drive.truth).origin == "simulated"],
+        "simulated": [_name(drive) for drive in drives if drive.origin == "simulated"],
         "results": solved and table(
             result_row(drive, problem) for drive in drives for problem in problems).data,
         "results_of": problems, "known": any(drive.truth for drive in drives),
@@ -112,17 +111,12 @@ def _compared(drive):
             "landmarks": listed(counts) if counts else ""}
 
 
-def named(problem, dataset):
-    """Return number and title of a problem on a dataset (str), as "3. SLAM: odometry + ArUco"."""
-    number = re.match(r"problem(\d+)", problem)
-    return (f"{number[1]}. " if number else "") + plain(title(problem, dataset))
-
-
 def result_row(drive, problem):
     """Return a row of the table of results, for `notebook.table` (dict)."""
     solution = drive.solution(problem)
     found = accuracy(solution, drive) if solution else {}
-    row = {"dataset": plain(drive.name), "problem": named(problem, drive.dataset)} | {
+    name = f"{problem.removeprefix('problem')[0]}. {plain(title(problem, drive.dataset))}"
+    row = {"dataset": plain(drive.name), "problem": name} | {
         name: with_unit(found[key], unit) if key in found else None for name, key, unit in (
             ("ATE", "ATE (mm)", "m"), ("ATE, aligned", "aligned (mm)", "m"),
             ("σ of position", "σ (mm)", "m"), ("σ of heading", "σ of δ (mrad)", "rad"))}
@@ -168,7 +162,7 @@ def _draw(fig, shown, solutions, truth, off, name, landmarks=False):
     """Draw trajectories of the problems `shown`, and off(Solution) in m of all Solutions."""
     left, right = fig.subplots(1, 2)
     for solution in solutions:
-        role, look = _role(solution), LOOKS.get(solution.problem, {})
+        role, look = PROBLEMS[solution.problem].role, LOOKS.get(solution.problem, {})
         if solution.problem in shown:
             plotting.trajectory(left, _few(solution.poses), role, solution.title, **look)
         values = off(solution)
@@ -189,7 +183,8 @@ def title_picture(drive):
         fig = Figure(figsize=(6.3, 4.6))  # inches
         ax = fig.add_subplot()
         solution = drive.solutions[-1]
-        plotting.trajectory(ax, _few(solution.poses), _role(solution), linestyle="-", linewidth=1.2)
+        plotting.trajectory(ax, _few(solution.poses), PROBLEMS[solution.problem].role,
+                            linestyle="-", linewidth=1.2)
         _draw_landmarks(ax, solution)
         ax.axis("off")
         return print_figure(fig, "svg", metadata={"Date": None})
@@ -202,25 +197,10 @@ def _draw_landmarks(ax, solution):
         plotting.draw_antennas(ax, *solution.uwb_map[1:])
 
 
-def _role(solution):
-    task = PROBLEMS.get(solution.problem)
-    return task.role if task else "alternative"
-
-
 def _few(rows):
     """Return at most CURVE_POINTS of the rows (n, ...), first and last included."""
     return rows[np.unique(np.linspace(0, len(rows) - 1, CURVE_POINTS).astype(int))] \
         if len(rows) else rows
-
-
-def plain(text):
-    """Return text (str) with the characters escaped that Markdown or HTML would interpret.
-
-    Names from folders and files pass it. A space replaces a control character.
-    """
-    seen = "".join(" " if unicodedata.category(sign)[0] == "C" else sign for sign in text)
-    return re.sub(r"[^\w\s.,:;/+-]|(?<![^\W_])_|_(?![^\W_])",
-                  lambda sign: f"&#{ord(sign[0])};", seen)
 
 
 def listed(names):
