@@ -14,6 +14,7 @@ from pathlib import Path
 
 from IPython import get_ipython
 from IPython.display import Markdown, display
+from matplotlib import style
 from matplotlib_inline.backend_inline import set_matplotlib_formats
 
 from slamlib import solve
@@ -56,9 +57,9 @@ def start(sensor=None):
     ------
     DatasetError : a dataset does not follow the format, or there is none.
     """
-    plotting.use_style()
+    style.use(plotting.STYLE)
     set_matplotlib_formats("svg", metadata={"Date": None})
-    data = _folder("SLAMLIB_DATA", "data")
+    data = _data_folder()
     selected = os.environ.get("SLAMLIB_DATASETS")
     names = dataset_names(data, selected.split("\n") if selected else None)
     drives = [Drive(name, read_dataset(data / name), read_truth(data / name)) for name in names]
@@ -74,23 +75,14 @@ def _or_simulated(drives):
     return drives or [Drive("simulated", *simulate("short", seed=1), made_up=True)]
 
 
-def results_folder(drive):
-    """Path of the folder for a drive's results.
-
-    It is in SLAMLIB_RESULTS, by default in the folder `results` beside the data folder.
-    """
-    results = os.environ.get("SLAMLIB_RESULTS")
-    folder = Path(results) if results else _folder("SLAMLIB_DATA", "data").parent / "results"
-    return folder / drive.name
-
-
 def solved(drives, **solvers):
     """Results of solvers by problem, as {Drive: result} of the drives on which all succeed.
 
     Every result is written into the results folder, also of drives on which another problem fails;
     what fails and what is doubted is shown, there and on the report's first page. A second call for
     a problem of a drive writes nothing and says so, unless its cell is run again. If no drive is
-    left, a simulated short one replaces them, of which nothing is written.
+    left, a simulated short one replaces them, of which nothing is written. The environment variable
+    SLAMLIB_RESULTS names the results folder; by default it is `results` beside the data folder.
 
     Parameters
     ----------
@@ -105,6 +97,7 @@ def solved(drives, **solvers):
     drives = _or_simulated([drive for drive in drives if all(
         solve.allows(drive.dataset, problem) for problem in solvers)])
     found = {drive: {} for drive in drives}
+    results = Path(os.environ.get("SLAMLIB_RESULTS") or _data_folder().parent / "results")
     for drive, problem in product(drives, solvers):
         try:
             result = solvers[problem](drive)
@@ -117,8 +110,8 @@ def solved(drives, **solvers):
                            f"{failure.reason}.", failure=failure)
             continue
         found[drive][problem] = result
-        if not drive.made_up and _writes(results_folder(drive) / problem):
-            solve.write_solution(results_folder(drive), solution)
+        if not drive.made_up and _writes(results / drive.name / problem):
+            solve.write_solution(results / drive.name, solution)
             show_doubts(drive, solution.doubts)
         elif not drive.made_up:
             _notice(drive, f"the files of {problem} stay those of the first call of solved in this "
@@ -177,17 +170,15 @@ def plain(text):
 def notices(books):
     """Records in executed notebooks, by dataset: {name: list of Doubt and Failure}, each once."""
     found = {}
-    for book in books:
-        for cell in book.cells:
-            for output in cell.get("outputs", ()):
-                entry = output.get("metadata", {}).get(KEY, {})
-                for kind in RECORDS.keys() & entry.keys():
-                    found.setdefault(entry["dataset"], []).append(RECORDS[kind](**entry[kind]))
-    return {name: list(dict.fromkeys(records)) for name, records in found.items()}
+    cells = (cell for book in books for cell in book.cells)
+    for output in (each for cell in cells for each in cell.get("outputs", ())):
+        entry = output.get("metadata", {}).get(KEY, {})
+        for kind in RECORDS.keys() & entry.keys():
+            found.setdefault(entry["dataset"], {})[RECORDS[kind](**entry[kind])] = True
+    return {name: [*records] for name, records in found.items()}
 
 
-def _folder(variable, name):
-    if os.environ.get(variable):
-        return Path(os.environ[variable])
+def _data_folder():
     here = Path.cwd()
-    return next((p / name for p in (here, *here.parents) if (p / name).is_dir()), here / name)
+    near = (each / "data" for each in (here, *here.parents) if (each / "data").is_dir())
+    return Path(os.environ.get("SLAMLIB_DATA") or next(near, here / "data"))

@@ -45,12 +45,8 @@ ROLES = _Roles({
                   markerfacecolor="none"),
     "true antenna": dict(color="black", linestyle="none", marker="+", markersize=9, zorder=6),
 })
+STYLE = Path(__file__).with_name("slamlib.mplstyle")  # for matplotlib.style
 MAX_SEMI_AXIS = 0.08         # of enlarged 95 % ellipses, in the larger extent of the path
-
-
-def use_style():
-    """Set the style of all later figures of this process."""
-    plt.style.use(Path(__file__).with_name("slamlib.mplstyle"))
 
 
 def literal(text):

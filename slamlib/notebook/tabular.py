@@ -17,16 +17,15 @@ DASH = "–"
 # What begins a cell of a column of numbers, or is an italic remark in it.
 NUMERIC = re.compile(rf"[-+−>]? ?\d(?!\. )|{DASH}|\*[^*]+\*$")
 MINUS = re.compile(r"(?<![\w.])-(?=\d)")
-MAX_NUMBER = 1e6             # larger numbers are not shown, because the method failed
 
 
 def table(rows, caption=None):
     """Table in Markdown, an object that Jupyter shows, of rows (iterable of dict from header).
 
     Values are str, numbers (three significant digits), or arrays (s,) over drives: mean ± standard
-    error, and the median in brackets; of bool, the percentage. None, NaN and absent keys are
-    dashes; columns of nothing else are left out. Of consecutive rows with the same first cell only
-    the first shows it. `caption` (str) stands below.
+    error, and the median in brackets. None, NaN and absent keys are dashes; columns of nothing else
+    are left out. Of consecutive rows with the same first cell only the first shows it. `caption`
+    (str) stands below.
     """
     rows = [{name: cell(value) for name, value in row.items()} for row in rows]
     columns = {name: [row.get(name, DASH) for row in rows] for row in rows for name in row}
@@ -54,27 +53,22 @@ def cell(value):
         return "yes" if value else "no"
     if isinstance(value, int | np.integer):
         return f"{value:,}".replace("-", "−")
-    return number(value) if np.ndim(value) == 0 else _over_drives(np.asarray(value))
+    return number(value) if np.ndim(value) == 0 else _over_drives(np.asarray(value, float))
 
 
 def number(value, decimals=None):
     """A value with three significant digits, or this number of decimals (str)."""
-    if abs(value) > MAX_NUMBER:
-        return "> 10⁶"
     if decimals is None:
         decimals = int(np.clip(2 - np.floor(np.log10(abs(value))), 0, 6)) if value else 0
     return f"{value:z,.{decimals}f}".replace("-", "−")
 
 
 def _over_drives(values):
-    """Mean ± standard error and median of values (s,), one a drive, or a percentage of bools."""
-    values, unit = (100 * values, " %") if values.dtype == bool else (values.astype(float), "")
-    mean = values.mean()
+    """Mean ± standard error and median of values (s,), one a drive."""
     error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else 0.0
     decimals = int(np.clip(1 - np.floor(np.log10(error)), 0, 3)) if error > 0 else None
-    decimals = 0 if unit else decimals
-    text = number(mean, decimals) + (f" ± {number(error, decimals)}" if error > 0 else "")
-    return text + (unit or f" ({number(np.median(values), decimals)})")
+    text = number(values.mean(), decimals) + (f" ± {number(error, decimals)}" if error > 0 else "")
+    return f"{text} ({number(np.median(values), decimals)})"
 
 
 def dataset_row(drive):
@@ -175,17 +169,17 @@ def antenna_rows(result, drive):
     moved = place - places_by_id(guess.antenna, guess.position, result.antenna)
     off = np.full_like(place, np.nan) if truth is None else place - places_by_id(
         truth.antenna, truth.antenna_in_world, result.antenna)
-    squared = np.einsum("ni,nij,nj->n", off, np.linalg.inv(C), off)
     for k, antenna in enumerate(result.antenna.tolist()):
         own = uwb.antenna == antenna
-        away, root = place[k] - result.poses[uwb.pose[own], :2], 1 / uwb.sigma[own]
-        root *= np.sqrt(result.range_weight[own])
+        away = place[k] - result.poses[uwb.pose[own], :2]
+        root = np.sqrt(result.range_weight[own]) / uwb.sigma[own]
         direction = away / np.maximum(np.hypot(*away.T), 1e-9)[:, None]
         shift = np.linalg.lstsq(root[:, None] * direction, 0.1 * root)[0]
         yield {"dataset": drive.name, "antenna": f"{antenna}{'?' * (antenna in result.doubts)}",
                "x (m)": f"{place[k, 0]:.3f}", "y (m)": f"{place[k, 1]:.3f}",
                "σ of x (mm)": 1e3 * np.sqrt(C[k, 0, 0]), "σ of y (mm)": 1e3 * np.sqrt(C[k, 1, 1]),
                "from the guess (mm)": 1e3 * np.hypot(*moved[k]),
-               "error (mm)": 1e3 * np.hypot(*off[k]), "d²": squared[k],
+               "error (mm)": 1e3 * np.hypot(*off[k]),
+               "d²": off[k] @ np.linalg.solve(C[k], off[k]),
                "late (%)": 100 * np.mean(result.range_weight[own] < 0.5),
                "by 0.1 m (mm)": 1e3 * np.hypot(*shift)}

@@ -20,7 +20,7 @@ from nbformat.v4 import new_code_cell, new_markdown_cell, new_raw_cell
 
 from slamlib.dataset import DatasetError
 from slamlib.report.execution import LAB_ONLY, NotebookError
-from slamlib.report.notebooks import appendix_of
+from slamlib.report.notebooks import chapter_of
 
 HERE = Path(__file__).parent
 TEMPLATES = {"html": "page.html", "typst": "report.typ"}
@@ -80,7 +80,7 @@ def _pandoc(text, kind, folder, settings):
 
 def _merged(books):
     """Return one notebook of all books; a cell with the name of each precedes its own."""
-    letters = "".join(appendix_of(*each) for each in books.items())
+    letters = "".join(chapter_of(*each)["letter"] for each in books.items())
     cells = []
     for source, book in books.items():
         cells.append(new_markdown_cell(metadata={"chapter": source.stem}))

@@ -3,7 +3,6 @@
 import platform
 import re
 import sys
-import textwrap
 from dataclasses import replace
 from importlib.metadata import version
 from io import BytesIO
@@ -87,21 +86,13 @@ def handed_in(drive, problem2):
 
 def readme(drives, options, omitted=()):
     """Return README.txt (str); parameters as of `write_zip`, with a list of SolvedDrive."""
-    estimate = PROBLEM2_FOLDERS[options.problem2]
     text = Template(README.read_text(encoding="utf-8"), trim_blocks=True).render(
-        cover=options, estimate=estimate, omitted=listed(omitted) if omitted else "",
-        drives=[_told(drive, options.problem2) for drive in drives],
+        cover=options, estimate=PROBLEM2_FOLDERS[options.problem2], omitted=listed(omitted),
+        width=LINE_WIDTH, drives=[_told(drive, options.problem2) for drive in drives],
         versions=", ".join([f"Python {platform.python_version()}",
                             *(f"{name} {version(name)}"
                               for name in ("slamlib", "numpy", "scipy", "gtsam"))]))
-    lines, *paragraphs = re.split("\n{2,}", text.strip())
-    return "\n\n".join([lines, *map(_wrapped, paragraphs)]) + "\n"
-
-
-def _wrapped(paragraph):
-    """Return a paragraph in lines of at most LINE_WIDTH characters; headings and lists stay."""
-    return paragraph if paragraph.startswith(" ") or paragraph.endswith("--") else textwrap.fill(
-        paragraph, LINE_WIDTH, break_long_words=False, break_on_hyphens=False)
+    return re.sub("\n{3,}", "\n\n", text.strip()) + "\n"
 
 
 def _told(drive, problem2):

@@ -31,7 +31,6 @@ ON_SCREEN = ("pdf", "chapters")  # blocks of the text that the PDF leaves out
 CURVE_POINTS = 1500  # of a curve, at most
 HIDDEN_TRAJECTORIES = ("problem2", "problem2_hint", "problem3")  # they would lie below others
 LOOKS = {"problem3": dict(linewidth=4.0), "problem4": dict(linestyle="-", linewidth=1.4)}
-FIGURE_STYLE = Path(plotting.__file__).with_name("slamlib.mplstyle")
 MAX_NAMED = 3  # drives that the abstract names one by one; else the shortest and the longest
 
 
@@ -102,13 +101,11 @@ def _compared(drive):
             off = [consistency.discrepancies(found, solution.poses)[:, :2] for solution in both]
             returns = [with_unit(1e3 * np.sqrt(np.mean(np.sum(each**2, axis=1))), "m")
                        for each in off]
-    counts = []
-    for kind, name in (("aruco_map", "marker"), ("uwb_map", "antenna")):
-        maps = [getattr(solution, kind) for solution in drive.solutions]
-        if count := max((len(each[0]) for each in maps if each is not None), default=0):
-            counts.append(f"{count} {name}{'s' * (count > 1)}")
+    last = drive.solutions[-1]
+    counts = [f"{len(each[0])} {name}{'s' * (len(each[0]) > 1)}" for name, each in (
+        ("marker", last.aruco_map), ("antenna", last.uwb_map)) if each is not None]
     return {"name": _name(drive), "errors": errors, "returns": returns,
-            "landmarks": listed(counts) if counts else ""}
+            "landmarks": listed(counts)}
 
 
 def result_row(drive, problem):
@@ -128,12 +125,12 @@ def result_row(drive, problem):
 
 def trajectories(drive):
     """Return the figure of a SolvedDrive's trajectories and sigmas as SVG (str)."""
-    with plt.style.context(FIGURE_STYLE, after_reset=True):
-        shown = {each.problem for each in drive.solutions if each is drive.solutions[-1]
-                 or each.problem not in HIDDEN_TRAJECTORIES}
+    with plt.style.context(plotting.STYLE, after_reset=True):
         fig = Figure(figsize=(7.2, 2.7))  # inches
-        _draw(fig, shown, drive.solutions, drive.truth,
-              lambda each: evaluation.position_sigmas(each.covariances), "σ of position (m)")
+        _draw(fig, drive.solutions, drive.truth, {
+            each.problem for each in drive.solutions if each is drive.solutions[-1]
+            or each.problem not in HIDDEN_TRAJECTORIES})
+        plotting.legend_below(fig)
         return print_figure(fig, "svg", metadata={"Date": None})
 
 
@@ -144,42 +141,35 @@ def result_picture(dataset, truth, results, path):
     """
     solutions = [read_solution(file.parent, dataset, file_names(results))
                  for file in sorted(results.glob("problem*/vehiclePose.mat"))]
-
-    def off(solution):
-        if truth is None:
-            return evaluation.position_sigmas(solution.covariances)
-        return np.hypot(*(solution.poses - truth_in_world(solution, truth))[:, :2].T)
-
-    with plt.style.context(FIGURE_STYLE, after_reset=True):
+    with plt.style.context(plotting.STYLE, after_reset=True):
         fig, content = Figure(figsize=(11, 5.5)), BytesIO()
-        _draw(fig, PROBLEMS, solutions, truth, off,
-              f"{'σ' if truth is None else 'error'} of position (m)", landmarks=True)
+        _draw(fig, solutions, truth, PROBLEMS, errors=truth is not None)
+        _draw_landmarks(fig.axes[0], solutions[-1])
+        plotting.legend_below(fig)
         fig.savefig(content, format=path.suffix[1:].lower(), dpi=150)
     write_atomically(path, content.getvalue())
 
 
-def _draw(fig, shown, solutions, truth, off, name, landmarks=False):
-    """Draw trajectories of the problems `shown`, and off(Solution) in m of all Solutions."""
+def _draw(fig, solutions, truth, shown, errors=False):
+    """Draw trajectories of the problems `shown`, and errors or sigmas of all Solutions."""
     left, right = fig.subplots(1, 2)
     for solution in solutions:
         role, look = PROBLEMS[solution.problem].role, LOOKS.get(solution.problem, {})
         if solution.problem in shown:
             plotting.trajectory(left, _few(solution.poses), role, solution.title, **look)
-        values = off(solution)
+        values = np.hypot(*(solution.poses - truth_in_world(solution, truth))[:, :2].T) \
+            if errors else evaluation.position_sigmas(solution.covariances)
         values[:len(values) // 50] = np.nan  # nearly zero, on a logarithmic axis
         known = _few(np.flatnonzero(values > 0))
         plotting.curve(right, values[known], role, known, solution.title, **look)
     if truth is not None:
         plotting.trajectory(left, _few(truth.poses), "truth")
-    if landmarks:
-        _draw_landmarks(left, solutions[-1])
-    right.set(yscale="log", ylabel=name)
-    plotting.legend_below(fig)
+    right.set(yscale="log", ylabel=f"{'error' if errors else 'σ'} of position (m)")
 
 
 def title_picture(drive):
     """Return a SolvedDrive's last trajectory with its landmarks, without axes, as SVG (str)."""
-    with plt.style.context(FIGURE_STYLE, after_reset=True):
+    with plt.style.context(plotting.STYLE, after_reset=True):
         fig = Figure(figsize=(6.3, 4.6))  # inches
         ax = fig.add_subplot()
         solution = drive.solutions[-1]
@@ -204,8 +194,8 @@ def _few(rows):
 
 
 def listed(names):
-    """Return names as a str, "a, b and c"."""
-    return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
+    """Return names (list of str) as "a, b and c"."""
+    return " and ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))
 
 
 def with_unit(value, unit):
