@@ -14,8 +14,8 @@ from test_report import write
 from slamlib.__main__ import main
 from slamlib.doubt import Doubt
 from slamlib.report import handin
-from slamlib.report.drives import SolvedDrive
 from slamlib.report.notebooks import Options
+from slamlib.report.overview import SolvedDrive
 from slamlib.simulation import simulate, write_dataset
 from slamlib.solve import Failure, Solution
 

@@ -13,7 +13,6 @@ from slamlib import evaluation, se2
 from slamlib.dataset import read_dataset, read_truth
 from slamlib.doubt import Doubt
 from slamlib.notebook import plotting
-from slamlib.report import drives as solved_drives
 from slamlib.report import overview
 from slamlib.report.document import render
 from slamlib.report.execution import NotebookError
@@ -51,7 +50,7 @@ def drives_of(folder, results, names, written):
     """The SolvedDrives of datasets of these names, with what is written and told of them."""
     read = [(read_dataset(folder / "data" / name), read_truth(folder / "data" / name))
             for name in names]
-    return solved_drives.read_drives(read, results, written, {})
+    return overview.read_drives(read, results, written, {})
 
 
 def result_rows(summary):
@@ -143,7 +142,7 @@ def test_the_world_is_the_first_pose_with_an_estimate():
     poses = np.full_like(truth.poses, np.nan)
     poses[40:] = se2.between(truth.poses[40], truth.poses[40:])
     solution = Solution("problem2", "ArUco", poses, np.zeros((len(poses), 3, 3)), 40)
-    solved = solved_drives.SolvedDrive("x", *drive, solutions=(solution,))
+    solved = overview.SolvedDrive("x", *drive, solutions=(solution,))
     row = overview.result_row(solved, "problem2")
     assert metres(row["ATE"]) == pytest.approx(0, abs=1e-9)
     assert evaluation.ate(poses, truth.poses) > 0.1  # in the wrong frame
@@ -177,7 +176,7 @@ def test_without_truth_the_abstract_compares_at_returns(project):
     assert all(len(row) == 3 for row in rows.values())
     dataset = simulate("short", seed=5)[0]
     solved = tuple(solutions(dataset, ("problem1", "problem3")))
-    drive = solved_drives.SolvedDrive("x", dataset, None, solutions=solved)
+    drive = overview.SolvedDrive("x", dataset, None, solutions=solved)
     text = overview.opening([drive]).cells[0].source
     assert re.search(r"by SLAM[^.]*[\d.]+\u00a0m?m and [\d.]+\u00a0mm on \*x", text)
 

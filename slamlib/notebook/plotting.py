@@ -49,11 +49,6 @@ STYLE = Path(__file__).with_name("slamlib.mplstyle")  # for matplotlib.style
 MAX_SEMI_AXIS = 0.08         # of enlarged 95 % ellipses, in the larger extent of the path
 
 
-def literal(text):
-    """Text (str) with dollar signs escaped, which matplotlib would take for formulas."""
-    return text.replace("$", r"\$")
-
-
 def panels(count, rows=1, height=3.4, width=3.7, columns=2):
     """A figure and its axes (count, rows): `columns` panels side by side, sizes in inches each."""
     columns = min(columns, count)
@@ -73,7 +68,7 @@ def each_drive(drives, rows=1, **size):
     drives = list(drives)
     fig, axes = panels(max(1, len(drives)), rows, **size)
     for drive, column in zip(drives, axes, strict=False):
-        column[0].set_title(literal(getattr(drive, "name", drive)))
+        column[0].set_title(getattr(drive, "name", drive))
         yield drive, column if rows > 1 else column[0]
     if any(ax.get_legend_handles_labels()[0] for ax in fig.axes):
         legend_below(fig)

@@ -5,8 +5,8 @@ import re
 import shutil
 import sys
 import time
+from collections import namedtuple
 from contextlib import ExitStack
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -17,22 +17,17 @@ from slamlib.dataset import DatasetError, dataset_names, inventory_lines, read_d
 from slamlib.notebook import notices
 from slamlib.report import cache
 from slamlib.report.document import render
-from slamlib.report.drives import read_drives
 from slamlib.report.execution import STUDIES, execute, kernel_environment, temporary_folder
 from slamlib.report.notebooks import Options, shown, to_execute
-from slamlib.report.overview import opening, title_picture
+from slamlib.report.overview import opening, read_drives, title_picture
 from slamlib.solve import RESULT_NAMES, SENSORS
 from slamlib.tables import datasets_in
 
 DATASET_NAME = re.compile("[A-Za-z0-9 ._-]+")  # nothing that Markdown, HTML or Typst interprets
 
 
-@dataclass(frozen=True)
-class Report:
-    """A report that was written."""
-
-    files: list  # of Path, `index.html` first
-    drives: list  # of drives.SolvedDrive, with what is doubted and what could not be solved
+# Files (list of Path, `index.html` first) and drives (list of overview.SolvedDrive) of a report.
+Report = namedtuple("Report", ("files", "drives"))
 
 
 def build_report(notebooks, data, report, results, datasets=None, options=Options(), jobs=2,

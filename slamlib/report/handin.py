@@ -15,9 +15,8 @@ from jinja2 import Template
 from slamlib import swap
 from slamlib.dataset import all_notes, dataset_names, read_dataset, read_truth
 from slamlib.notebook import Drive
-from slamlib.report.drives import why_missing
 from slamlib.report.notebooks import PROBLEM2_FOLDERS
-from slamlib.report.overview import listed
+from slamlib.report.overview import listed, why_missing
 from slamlib.results import RESULT_FILES
 from slamlib.solve import title
 

@@ -108,16 +108,15 @@ def to_execute(folder, options):
     appendices that `options` (Options) show. DatasetError if there is none.
     """
     books = {source: read_notebook(source) for source in sorted(folder.glob("*.ipynb"))}
-    numbers = {chapter_of(*each)["number"] for each in books.items()} - {None}
+    about = {source: chapter_of(source, book) for source, book in books.items()}
+    numbers = {each["number"] for each in about.values()} - {None}
     for entry, place in options.leave_out.items():
         if place and re.fullmatch(r"\d+|[A-Za-z]", entry) and entry.upper() not in numbers:
             raise DatasetError(f"{place}: expected to leave out a chapter "
                                f"({', '.join(sorted(numbers))}) or a section, found '{entry}'")
-    seen = shown(books, options)
-    letters = {source: chapter_of(source, book)["letter"] for source, book in books.items()}
-    chapters = {source: book for source, book in books.items() if not letters[source]}
-    appendices = sorted((letters[source], source) for source in seen
-                        if letters[source] and options.appendix is not False)
+    chapters = {source: book for source, book in books.items() if not about[source]["letter"]}
+    appendices = sorted((about[source]["letter"], source) for source in shown(books, options)
+                        if source not in chapters and options.appendix is not False)
     if not chapters and not appendices:
         raise DatasetError(f"{folder}: expected notebooks (*.ipynb) that are not left out, found "
                            "no notebooks")

@@ -1,10 +1,11 @@
 """The summary that opens the report: an abstract, all results, pictures.
 
-The text is in the template overview.md. All numbers are computed from the result files and, where
-it is known, the truth.
+The text is in the template overview.md. All numbers are computed from the files to hand in of this
+build, which `read_drives` reads, and, where it is known, the truth.
 """
 
 import re
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from urllib.parse import quote
@@ -18,12 +19,15 @@ from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_outp
 
 from slamlib import evaluation
 from slamlib.checks import consistency
+from slamlib.checks.files import doubts_before_solving, merged
 from slamlib.dataset import all_notes
-from slamlib.notebook import accuracy, plotting, table
+from slamlib.doubt import Doubt
+from slamlib.notebook import Drive, accuracy, plotting, table
 from slamlib.notebook.drives import plain
-from slamlib.report.drives import read_solution, why_missing
+from slamlib.report.execution import NotebookError
 from slamlib.report.notebooks import chapter_of
-from slamlib.solve import PROBLEMS, SENSORS, title, truth_in_world
+from slamlib.results import read_structs
+from slamlib.solve import PROBLEMS, SENSORS, Failure, Solution, title, truth_in_world
 from slamlib.swap import file_names, write_atomically
 
 TEXT = Path(__file__).with_name("overview.md")
@@ -32,6 +36,69 @@ CURVE_POINTS = 1500  # of a curve, at most
 HIDDEN_TRAJECTORIES = ("problem2", "problem2_hint", "problem3")  # they would lie below others
 LOOKS = {"problem3": dict(linewidth=4.0), "problem4": dict(linestyle="-", linewidth=1.4)}
 MAX_NAMED = 3  # drives that the abstract names one by one; else the shortest and the longest
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedDrive(Drive):
+    """A Drive with the solutions that this build computed for it."""
+
+    solutions: tuple = ()  # of Solution, in the order of PROBLEMS
+    doubts: tuple = ()  # of Doubt, first about the drive, then by problem
+    failures: tuple = ()  # of Failure, in the order of PROBLEMS
+    files: tuple = ()  # of str, its files to hand in, as `problem1/vehiclePose.mat`
+
+    def solution(self, problem):
+        """Return the Solution of a problem (str), or None."""
+        return next((known for known in self.solutions if known.problem == problem), None)
+
+
+def read_drives(read, results, written, notices):
+    """Return the datasets with their solutions, a list of SolvedDrive, the shortest first.
+
+    `read` is a list of (Dataset, Truth or None), `results` (Path) the folder of this build's files,
+    `written` (list of str) their names, as `short/problem1/vehiclePose.mat`, and `notices` a dict
+    by `notebook.notices`. NotebookError if a file cannot be read, or has another number of poses.
+    """
+    drives = []
+    for dataset, truth in sorted(read, key=lambda drive: len(drive[0].ticks)):
+        name, told = dataset.name, notices.get(dataset.name, [])
+        files = tuple(file.removeprefix(f"{name}/") for file in sorted(written)
+                      if file.startswith(f"{name}/") and file.endswith(".mat"))
+        doubts = [*doubts_before_solving(dataset, truth), *(x for x in told if type(x) is Doubt)]
+        drives.append(SolvedDrive(
+            name, dataset, truth, files=files, doubts=tuple(merged(doubts)),
+            solutions=tuple(read_solution(results / name / problem, dataset, files)
+                            for problem in PROBLEMS if f"{problem}/vehiclePose.mat" in files),
+            failures=tuple(x for problem in PROBLEMS for x in told
+                           if type(x) is Failure and x.problem == problem)))
+    return drives
+
+
+def why_missing(drive, problem):
+    """Return why a SolvedDrive has no solution of a problem (str)."""
+    lacks = [SENSORS[sensor] for sensor in PROBLEMS[problem].sensors
+             if getattr(drive.dataset, sensor) is None]
+    reasons = [failure.reason for failure in drive.failures if failure.problem == problem]
+    return (f"left out: no {' and no '.join(lacks)}" if lacks
+            else f"could not be solved: {reasons[0]}" if reasons else "no result")
+
+
+def read_solution(folder, dataset, files):
+    """Return the Solution in a results folder; its world frame is the first pose estimated."""
+    place = f"{folder.parent.name}/{folder.name}, which a notebook wrote,"
+    try:
+        _, poses, covariances = read_structs(folder, "vehiclePose")
+        maps = {field: read_structs(folder, name)
+                for field, name in (("aruco_map", "ArucoMap"), ("uwb_map", "UwbMap"))
+                if f"{folder.name}/{name}.mat" in files}
+    except Exception as error:  # scipy and numpy raise many kinds
+        raise NotebookError(f"{place} cannot be read: {error}") from None
+    if poses.shape != (len(dataset.ticks), 3) or not np.isfinite(poses[:, 0]).any():
+        raise NotebookError(f"{place} must hold [x, y, heading] for each of the "
+                            f"{len(dataset.ticks)} encoder poses, one of them at least not NaN, "
+                            f"found {poses.shape}")
+    return Solution(problem=folder.name, title=title(folder.name, dataset), poses=poses,
+                    covariances=covariances, world=int(np.isfinite(poses[:, 0]).argmax()), **maps)
 
 
 def opening(drives, chapters=None):
