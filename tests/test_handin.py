@@ -4,10 +4,8 @@ import re
 from dataclasses import replace
 from zipfile import ZipFile
 
-import nbformat
 import numpy as np
 import pytest
-from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 from test_document import text_of
 from test_report import write
 
@@ -20,32 +18,16 @@ from slamlib.simulation import simulate, write_dataset
 from slamlib.solve import Failure, Solution
 
 SOLVE = """from slamlib.notebook import *
-from slamlib.solve import allows, find
-drives = start()
-for problem in {problems}:
-    if any(allows(drive.dataset, problem) for drive in drives):
-        solved(drives, **{{problem: lambda drive: find(problem, drive.dataset)}})"""
-SIX = ["problem1", "problem2", "problem2_hint", "problem2_fused", "problem3", "problem4"]
+from slamlib.solve import PROBLEMS, find
+for problem in PROBLEMS:
+    solved(start(), **{problem: lambda drive: find(problem, drive.dataset)})"""
 
 
-def drive_of(name="mine", first=40, **without):
+def drive_of(name="mine", first=40):
     """The first poses of a simulated drive, whose first sighting is at a later pose, no truth."""
-    dataset, _ = simulate("short", seed=3)
-    dataset = dataset.first(first)
+    dataset = simulate("short", seed=3)[0].first(first)
     later = dataset.aruco.select(dataset.aruco.pose >= 10)
-    return replace(dataset, name=name, aruco=later, **without)
-
-
-def project(folder, problems=SIX, **datasets):
-    """A folder with datasets and notebooks: a chapter for all problems, and an appendix."""
-    for name, dataset in datasets.items():
-        write_dataset(folder / "data" / name, *dataset)
-    write(folder / "notebooks", "A_more", "# A. More\n\nOnly if asked for.")
-    cells = [new_markdown_cell("# 1. All"), new_code_cell(SOLVE.format(problems=problems)),
-             new_markdown_cell("## Middle\n\nRead this."),
-             new_markdown_cell("## Files\n\nOf another folder."),
-             new_markdown_cell("## Explore\n\nMove the slider.")]
-    nbformat.write(new_notebook(cells=cells), folder / "notebooks" / "1_all.ipynb")
+    return replace(dataset, name=name, aruco=later)
 
 
 @pytest.fixture(scope="module")
@@ -53,8 +35,12 @@ def handed(tmp_path_factory):
     """A hand-in of a recorded dataset beside a simulated one, and what the run said."""
     folder = tmp_path_factory.mktemp("hand in")
     simulated, truth = simulate("short", seed=4)
-    project(folder, mine=(drive_of(), None),
-            stand_in=(simulated.first(30), replace(truth, poses=truth.poses[:30])))
+    write_dataset(folder / "data" / "mine", drive_of())
+    write_dataset(folder / "data" / "stand_in", simulated.first(30),
+                  replace(truth, poses=truth.poses[:30]))
+    write(folder / "notebooks", "A_more", "# A. More\n\nOnly if asked for.")
+    write(folder / "notebooks", "1_all", "# 1. All", (SOLVE,), "## Middle\n\nRead this.",
+          "## Files\n\nOf another folder.", "## Explore\n\nMove the slider.")
     (folder / "report.toml").write_text('author = "Ada"\nproblem2 = "fused"\n')
     (folder / "report").mkdir()
     (folder / "report" / "index.html").write_text("the pages of the usual build")
