@@ -17,6 +17,7 @@ DASH = "–"
 # What begins a cell of a column of numbers, or is an italic remark in it.
 NUMERIC = re.compile(rf"[-+−>]? ?\d(?!\. )|{DASH}|\*[^*]+\*$")
 MINUS = re.compile(r"(?<![\w.])-(?=\d)")
+MAX_NUMBER = 1e6             # larger numbers are not shown, because the method failed
 
 
 def table(rows, caption=None):
@@ -58,6 +59,8 @@ def cell(value):
 
 def number(value, decimals=None):
     """A value with three significant digits, or this number of decimals (str)."""
+    if abs(value) > MAX_NUMBER:
+        return "> 10⁶"
     if decimals is None:
         decimals = int(np.clip(2 - np.floor(np.log10(abs(value))), 0, 6)) if value else 0
     return f"{value:z,.{decimals}f}".replace("-", "−")

@@ -20,7 +20,7 @@ from slamlib.report.overview import listed, why_missing
 from slamlib.results import RESULT_FILES
 from slamlib.solve import title
 
-LINE_WIDTH = 88  # characters in a line of README.txt
+LINE_WIDTH = 100  # characters in a line of README.txt
 README = Path(__file__).with_name("readme.txt")  # a template of Jinja
 LEFT_OUT = ("Explore", "Files")  # titles of sections that are for screens, or on other folders
 
