@@ -50,7 +50,8 @@ def pages(folder):
     return [(folder / "report" / f"{name}.html").read_bytes() for name in "ab"]
 
 
-def test_a_changed_notebook_is_executed_again_and_only_that_one(project, capsys):
+def test_without_a_change_nothing_is_executed_and_results_that_are_gone_are_written_again(
+        project, capsys):
     assert executions(project) == (1, 1)
     before = pages(project)
     capsys.readouterr()
@@ -58,12 +59,6 @@ def test_a_changed_notebook_is_executed_again_and_only_that_one(project, capsys)
     told = capsys.readouterr().err
     assert told.count("nothing changed, not executed again") == 2 and "built in" in told
     assert pages(project) == before
-    write(project / "notebooks", "b", "# b", ("1 + 2",))
-    assert executions(project) == (1, 2)
-
-
-def test_results_that_are_gone_or_changed_are_written_again_without_an_execution(project):
-    assert executions(project) == (1, 1)
     a, b = (project / "results" / "short" / name for name in ("a.mat", "b.mat"))
     a.write_text("changed")
     b.unlink()

@@ -42,7 +42,7 @@ def project(tmp_path_factory):
             at = write_solution(folder / "results" / name, solution)
             written += [f"{name}/{solution.problem}/{file.name}" for file in at.glob("*.mat")]
     drives = drives_of(folder, folder / "results", NAMES, written)
-    return SimpleNamespace(folder=folder, written=written, solved=solved, drives=drives,
+    return SimpleNamespace(folder=folder, solved=solved, drives=drives,
                            summary=overview.opening(drives))
 
 

@@ -220,14 +220,10 @@ def formulas(notebook):
     return re.findall(r"(?s)\$\$.+?\$\$|\$[^$]+\$", text)
 
 
-def test_nothing_is_loaded_and_no_error_is_told(visited):
+def test_nothing_is_loaded_no_error_is_told_and_every_formula_takes_room(visited):
     for path, page in visited:
         assert [url for url in page.asked if not url.startswith("data:")] == [path.as_uri()]
         assert page.said == []
-
-
-def test_every_formula_of_a_notebook_is_on_its_page_and_takes_room(visited):
-    for path, page in visited:
         if path.stem == "index":
             continue
         wide = page.eval_on_selector_all("main math", "all => all.map("
@@ -236,17 +232,13 @@ def test_every_formula_of_a_notebook_is_on_its_page_and_takes_room(visited):
         assert all(width > 1 for width in wide)
 
 
-def test_every_figure_is_drawn_and_can_be_read_on_a_phone(visited):
+def test_figures_can_be_read_equations_have_numbers_tables_scroll_and_nothing_sticks_out(visited):
     for path, page in visited:
         figures = page.eval_on_selector_all("figure > p > img", """all => all.map(
             image => [image.naturalWidth, image.width])""")
         assert figures or path.stem == "A_studies"
         assert all(natural > 0 and shown >= 330 for natural, shown in figures), (
             path.name, figures)
-
-
-def test_numbers_of_equations_stay_in_view_and_tables_scroll(visited):
-    for path, page in visited:
         outside = page.eval_on_selector_all(".equation > .number", """all => all.filter(
             number => number.getBoundingClientRect().right > innerWidth)
             .map(number => number.textContent)""")
@@ -254,6 +246,8 @@ def test_numbers_of_equations_stay_in_view_and_tables_scroll(visited):
         for selector in ("table", ".sourceCode pre"):
             assert set(page.eval_on_selector_all(selector, """all => all.map(
                 each => getComputedStyle(each).overflowX)""")) <= {"auto"}, path.name
+        assert page.evaluate(STICKING_OUT) == [], path.name
+        assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth"), path.name
 
 
 def test_code_opens_by_its_summary(visited):
@@ -273,18 +267,11 @@ def test_a_dark_page_has_light_text(chromium, pages):
     assert "invert" in page.eval_on_selector("figure img", "e => getComputedStyle(e).filter")
 
 
-def test_nothing_sticks_out_of_the_column(visited):
-    for path, page in visited:
-        assert page.evaluate(STICKING_OUT) == [], path.name
-        assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth"), path.name
-
-
 def test_links_inside_the_report_lead_somewhere(visited):
     ids = {path.name: set(page.eval_on_selector_all("[id]", "all => all.map(e => e.id)"))
            for path, page in visited}
     for path, page in visited:
-        links = page.eval_on_selector_all("a[href]", "all => all.map(a => a.href)")
-        for link in links:
+        for link in page.eval_on_selector_all("a[href]", "all => all.map(a => a.href)"):
             address = urlparse(link)
             if address.scheme != "file":
                 continue
