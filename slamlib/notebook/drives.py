@@ -52,10 +52,7 @@ def start(sensor=None):
     A simulated drive replaces them if there is none. The environment variable SLAMLIB_DATA names
     the data folder; by default it is the nearest `data` in this folder or above it.
     SLAMLIB_DATASETS selects datasets by name, one a line. Also sets the style of the figures.
-
-    Raises
-    ------
-    DatasetError : a dataset does not follow the format, or there is none.
+    Raises DatasetError if a dataset does not follow the format, or there is none.
     """
     style.use(plotting.STYLE)
     set_matplotlib_formats("svg", metadata={"Date": None})
@@ -170,11 +167,10 @@ def plain(text):
 def notices(books):
     """Records in executed notebooks, by dataset: {name: list of Doubt and Failure}, each once."""
     found = {}
-    cells = (cell for book in books for cell in book.cells)
-    for output in (each for cell in cells for each in cell.get("outputs", ())):
-        entry = output.get("metadata", {}).get(KEY, {})
-        for kind in RECORDS.keys() & entry.keys():
-            found.setdefault(entry["dataset"], {})[RECORDS[kind](**entry[kind])] = True
+    for cell in (cell for book in books for cell in book.cells):
+        for entry in (each.get("metadata", {}).get(KEY, {}) for each in cell.get("outputs", ())):
+            for kind in RECORDS.keys() & entry.keys():
+                found.setdefault(entry["dataset"], {})[RECORDS[kind](**entry[kind])] = True
     return {name: [*records] for name, records in found.items()}
 
 

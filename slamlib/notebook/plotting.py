@@ -114,8 +114,7 @@ def errors(axes, result, drive, role="slam", label=None):
     first result on these axes, precedes its entries in the legend.
     """
     (top, bottom), color = axes, ROLES[role]["color"]
-    label = label or role * bool(top.collections)
-    of = label + ": " * bool(label)
+    of = f"{label or role}: " if label or top.collections else ""
     frame, poses, C, true = estimates(result, drive)
     some = np.unique(np.linspace(0, len(frame) - 1, 800).astype(int))
     frame, C = frame[some], C[some]
@@ -228,8 +227,7 @@ def legend_below(fig):
         entries |= {label: handle for handle, label in zip(handles, labels, strict=True)
                     if label not in entries}
     for columns in range(4, 0, -1):
-        while fig.legends:
-            fig.legends[0].remove()
+        fig.legends.clear()
         lines = -(-len(entries) // columns)
         legend = fig.legend(entries.values(), entries.keys(), loc="outside lower center",
                             ncols=-(-len(entries) // lines))

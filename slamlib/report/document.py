@@ -84,18 +84,16 @@ def _merged(books):
     cells = []
     for source, book in books.items():
         cells.append(new_markdown_cell(metadata={"chapter": source.stem}))
-        for cell in book.cells:
-            if LAB_ONLY in cell.metadata.get("tags", ()):
-                continue
-            for part in _parts(cell) if cell.cell_type == "code" else [cell]:
-                if part.cell_type == "markdown":
-                    part = NotebookNode(part | {"source": _without_absent(part.source, letters)})
-                cells.append(part)
+        cells += [NotebookNode(part | {"source": _without_absent(part.source, letters)})
+                  if part.cell_type == "markdown" else part for cell in book.cells
+                  if LAB_ONLY not in cell.metadata.get("tags", ()) for part in _parts(cell)]
     return {"cells": cells, "metadata": {}, "nbformat": 4, "nbformat_minor": 5}
 
 
 def _parts(cell):
     """Return the code and each output of a cell as cells; code that is folded comes last."""
+    if cell.cell_type != "code":
+        return [cell]
     code = new_code_cell(cell.source, metadata=cell.metadata)
     outputs = [_shown(output, cell.metadata) for output in cell.outputs]
     return [*outputs, code] if "hide-input" in cell.metadata.get("tags", ()) else [code, *outputs]

@@ -114,11 +114,6 @@ async def _execute(source, book, environment, connection, bar):
     The kernel listens at sockets beside the file `connection` (Path): nobody else can take them.
     """
     started, start = [], time.monotonic()
-
-    def begin(cell, cell_index):
-        started.append(cell)
-        bar.set_description(source.stem)
-
     manager = AsyncKernelManager(  # no folders to search: kernels of the user are not found
         kernel_name="python3", kernel_spec_manager=KernelSpecManager(kernel_dirs=[]),
         transport=TRANSPORT, connection_file=str(connection))
@@ -126,9 +121,9 @@ async def _execute(source, book, environment, connection, bar):
         book, km=manager, resources={"metadata": {"path": str(source.parent)}},
         timeout=CELL_TIMEOUT, iopub_timeout=60, raise_on_iopub_timeout=True,
         record_timing=False, store_widget_state=False, skip_cells_with_tag=LAB_ONLY,
-        shutdown_kernel="immediate",
-        extra_arguments=["--IPKernelApp.log_level=ERROR"],
-        on_cell_execute=begin, on_cell_executed=lambda **_: bar.update())
+        shutdown_kernel="immediate", extra_arguments=["--IPKernelApp.log_level=ERROR"],
+        on_cell_execute=lambda cell, **_: started.append(cell),
+        on_cell_executed=lambda **_: bar.update())
     try:
         await client.async_execute(env=environment, cleanup_kc=True)
         CoalesceStreamsPreprocessor().preprocess(book, {})  # kernels divide them by time

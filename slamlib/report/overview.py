@@ -6,7 +6,6 @@ build, which `read_drives` reads, and, where it is known, the truth.
 
 import re
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from urllib.parse import quote
 
@@ -28,7 +27,7 @@ from slamlib.report.execution import NotebookError
 from slamlib.report.notebooks import chapter_of
 from slamlib.results import read_structs
 from slamlib.solve import PROBLEMS, SENSORS, Failure, Solution, title, truth_in_world
-from slamlib.swap import file_names, write_atomically
+from slamlib.swap import file_names
 
 TEXT = Path(__file__).with_name("overview.md")
 ON_SCREEN = ("pdf", "chapters")  # blocks of the text that the PDF leaves out
@@ -209,12 +208,12 @@ def result_picture(dataset, truth, results, path):
     solutions = [read_solution(file.parent, dataset, file_names(results))
                  for file in sorted(results.glob("problem*/vehiclePose.mat"))]
     with plt.style.context(plotting.STYLE, after_reset=True):
-        fig, content = Figure(figsize=(11, 5.5)), BytesIO()
+        fig = Figure(figsize=(11, 5.5))
         _draw(fig, solutions, truth, PROBLEMS, errors=truth is not None)
         _draw_landmarks(fig.axes[0], solutions[-1])
         plotting.legend_below(fig)
-        fig.savefig(content, format=path.suffix[1:].lower(), dpi=150)
-    write_atomically(path, content.getvalue())
+        path.parent.mkdir(parents=True, exist_ok=True)
+        fig.savefig(path, dpi=150)
 
 
 def _draw(fig, solutions, truth, shown, errors=False):
