@@ -32,15 +32,13 @@ def table(rows, caption=None):
     columns = {name: [row.get(name, DASH) for row in rows] for row in rows for name in row}
     columns = {name: column for name, column in columns.items()
                if set(column) != {DASH}} or {DASH: [DASH]}
-    lines = [list(columns), []]
-    for name, column in columns.items():
-        numeric = all(map(NUMERIC.match, column))
-        lines[1].append("---:" if numeric else "---")
-        columns[name] = [MINUS.sub("−", text) for text in column] if numeric else column
-    first, *others = columns.values()
+    numeric = [all(map(NUMERIC.match, column)) for column in columns.values()]
+    first, *others = ([MINUS.sub("−", text) if each else text for text in column]
+                      for each, column in zip(numeric, columns.values()))
     if others:
         first = [text * (text != above) for above, text in zip([None, *first], first)]
-    text = "\n".join("| " + " | ".join(line) + " |" for line in (*lines, *zip(first, *others)))
+    lines = [columns, ["---:" if each else "---" for each in numeric], *zip(first, *others)]
+    text = "\n".join("| " + " | ".join(line) + " |" for line in lines)
     return Markdown(text + (f"\n\n{caption}" if caption else ""))
 
 

@@ -56,17 +56,13 @@ def _code_cells(book):
     return [cell for cell in book.cells if cell.cell_type == "code"]
 
 
-def _entry(folder, source, key):
-    return Path(folder, f"{source.stem}.{key}.executed")
-
-
 def recall(folder, source, key, book, results):
     """Return the names of a notebook's results, or None if it must be executed.
 
     Its result files are written below `results` (Path), and its outputs into `book`, the
     NotebookNode as it is now. `folder` is that of the cache, `source` the notebook's Path.
     """
-    path = _entry(folder, source, key)
+    path = Path(folder, f"{source.stem}.{key}.executed")
     try:
         executed, contents = joblib.load(path)
     except Exception:  # it is absent or damaged
@@ -88,7 +84,7 @@ def keep(folder, source, key, book, results, names):
     content = BytesIO()
     joblib.dump([executed, {name: (results / name).read_bytes() for name in names}], content,
                 compress=1)  # with a checksum
-    swap.write_atomically(_entry(folder, source, key), content.getvalue())
+    swap.write_atomically(Path(folder, f"{source.stem}.{key}.executed"), content.getvalue())
     versions = [file for file in Path(folder).glob("*.executed")
                 if file.name.rsplit(".", 2)[0] == source.stem]
     for old in sorted(versions, key=lambda file: file.stat().st_mtime_ns)[:-VERSIONS]:

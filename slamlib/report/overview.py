@@ -108,9 +108,8 @@ def opening(drives, chapters=None):
     template = Template(TEXT.read_text(encoding="utf-8"), trim_blocks=True, lstrip_blocks=True)
     longest = max((drive for drive in drives if drive.solutions), default=None,
                   key=lambda drive: len(drive.dataset.ticks))
-    context = template.new_context(
-        _facts(drives, chapters or {}) | {
-            "longest": longest, "name": _name, "listed": listed})
+    context = template.new_context(_facts(drives, chapters or {}) | {
+        "longest": longest, "name": _name, "listed": listed})
     cells = []
     for name, block in template.blocks.items():
         if name == "caption" and longest:
