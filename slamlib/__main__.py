@@ -4,7 +4,6 @@ import argparse
 import os
 import signal
 import sys
-import textwrap
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -33,10 +32,9 @@ def main(arguments=None):
             if signal.getsignal(each) == signal.SIG_DFL:     # nohup's handler stays
                 signal.signal(each, _end_as_by_ctrl_c)
     parser = _parser()
-    options, options_of_lab = parser.parse_known_args(arguments)
-    if options_of_lab and options.run is not _lab:
-        parser.error(f"unrecognized arguments: {' '.join(options_of_lab)}")
-    options.others = options_of_lab
+    options, options.others = parser.parse_known_args(arguments)
+    if options.others and options.run is not _lab:
+        parser.error(f"unrecognized arguments: {' '.join(options.others)}")
     try:
         return options.run(options)
     except DatasetError as error:
@@ -62,8 +60,7 @@ def _end_as_by_ctrl_c(number, frame):
 class _Parser(argparse.ArgumentParser):
     def error(self, message):
         """End with exit code 2 and one sentence, without argparse's usage."""
-        self.exit(2, f"slamlib: {textwrap.shorten(message, 200, placeholder=' ...')} "
-                     f"({self.prog} --help shows the usage)\n")
+        self.exit(2, f"slamlib: {message} ({self.prog} --help shows the usage)\n")
 
 
 def _parser():
@@ -139,7 +136,7 @@ def _build(options):
     """Build the report, and write the zip to hand in where `out` is one of the options."""
     from slamlib.report import NotebookError, build_report, handin
     from slamlib.report.notebooks import notebooks_folder, read_options
-    from slamlib.summary import summarize, summary_table
+    from slamlib.solve import summarize
     shown, omitted, out = read_options("report.toml"), (), vars(options).get("out")
     pages = Path("build", "hand-in") if out else options.report
     notebooks = options.notebooks or notebooks_folder()
@@ -161,25 +158,35 @@ def _build(options):
     if not shown.author:
         print("report.toml names no author: the PDF's title page has none", file=sys.stderr)
     for drive in report.drives:
-        rows = {each.problem: summarize(each, drive.truth) for each in drive.solutions}
+        rows = {each.problem: summarize(each, drive.truth) for each in drive.solutions} | {
+            each.problem: {"failed": each.reason} for each in drive.failures}
         print(summary_table({"dataset": drive.name, "poses": len(drive.dataset.ticks),
-                             "problems": rows, "doubts": []}), file=sys.stderr)
-        for doubt in drive.doubts:
-            print(f"{drive.name}: doubt ({doubt.what}): {doubt.sentence}", file=sys.stderr)
+                             "problems": rows, "doubts": map(vars, drive.doubts)}), file=sys.stderr)
     if out:
         handin.write_zip(out, report, options.results, shown, omitted)
         print(f"hand-in: {out.resolve()}", file=sys.stderr)
     else:
         print(f"report: {report.files[0]} and {report.files[-1]}", file=sys.stderr)
-    return _exit_code([(drive.name, failure.problem, failure.reason)
-                       for drive in report.drives for failure in drive.failures])
+    return 3 if any(drive.failures for drive in report.drives) else 0
 
 
-def _exit_code(failures):
-    """Print each (dataset, problem, reason) not solved; return 3 if there are any, or 0."""
-    for dataset, problem, reason in failures:
-        print(f"slamlib: {dataset}: {problem} could not be solved: {reason}", file=sys.stderr)
-    return 3 if failures else 0
+def summary_table(summary):
+    """The summary as a table (str), a line for each problem, and sentences on doubts below it."""
+    lines = [f"{summary['dataset']}: {summary['poses']} poses",
+             f"problem{'estimates':>18}{'last x, y, heading':>29}{'their sigmas':>28}{'ATE':>11}"]
+    for name, row in summary["problems"].items():
+        if "failed" in row:
+            lines.append(f"{name:15}could not be solved: {row['failed']}")
+            continue
+        numbers = "{:10}{:8.3f} m {:8.3f} m {:7.4f}  {:7.4f} m {:7.4f} m {:6.4f}".format(
+            row["estimated_poses"], *row["last_pose"], *row["last_sigma"])
+        error = f"{row['ate_m']:.4f} m" if "ate_m" in row else "-"
+        lines.append(f"{name:15}{numbers}{error:>11}")
+        if once := ", ".join(map(str, row.get("unconfirmed", ()))):
+            lines.append(
+                f"{'':15}nothing confirms markers {once}: seen once, or where another one is")
+    lines += [f"doubt ({doubt['what']}): {doubt['sentence']}" for doubt in summary["doubts"]]
+    return "\n".join(lines)
 
 
 def _require_elsewhere(out, *folders):
@@ -191,11 +198,10 @@ def _require_elsewhere(out, *folders):
 
 def _solve(options):
     from slamlib.dataset import inventory_lines
-    from slamlib.solve import PROBLEMS, allows, title
-    from slamlib.summary import solve_to_folder, summary_table
+    from slamlib.solve import PROBLEMS, allows, solve_to_folder, title
     _require_elsewhere(options.out, options.folder)
-    ending = options.plot.suffix.lower() if options.plot else ".png"
-    require(ending in (".png", ".pdf", ".svg"), "--plot", "a .png, .pdf or .svg file", options.plot)
+    require(not options.plot or options.plot.suffix.lower() in (".png", ".pdf", ".svg"), "--plot",
+            "a .png, .pdf or .svg file", options.plot)
     dataset, truth = read_dataset(options.folder), read_truth(options.folder)
     given = {name: value for name in ("kernel", "slip")
              if (value := getattr(options, name)) is not None}
@@ -207,11 +213,12 @@ def _solve(options):
     print("\n".join(inventory_lines(dataset, truth)), file=sys.stderr)
     summary = solve_to_folder(dataset, truth, options.out, problems, options.csv)
     print(summary_table(summary))
+    print(f"results: {options.out.resolve()}", file=sys.stderr)
     if options.plot and any("failed" not in row for row in summary["problems"].values()):
         from slamlib.report.overview import result_picture
         result_picture(dataset, truth, options.out, options.plot)
-    return _exit_code([(summary["dataset"], name, row["failed"])
-                       for name, row in summary["problems"].items() if "failed" in row])
+        print(f"picture: {options.plot.resolve()}", file=sys.stderr)
+    return 3 if any("failed" in row for row in summary["problems"].values()) else 0
 
 
 def _simulate(options):

@@ -3,8 +3,7 @@
 The folder holds `encoderReading.txt` and, where the vehicle has the sensors, `ArucoReading.txt` and
 `UwbReading.txt` with `UwbAntennaGuess.txt`. Optional are `vehicle.toml`, with what differs from the
 assignment's table 2, and the folder `truth`. Lengths are in metres, angles in radians. Pose ids
-count from 1 in the files and from 0 in the arrays; marker and antenna ids stay unchanged. `tables`
-finds and reads the files.
+count from 1 in the files and from 0 in the arrays; marker and antenna ids stay unchanged.
 """
 
 import json
@@ -16,17 +15,12 @@ from pathlib import Path
 import numpy as np
 
 from slamlib import se2, tables
-from slamlib.doubt import Doubt
-from slamlib.tables import ENCODER, TABLES, TRUTH_FILES, contents, datasets_in, read_table
+from slamlib.tables import ENCODER, TABLES, TRUTH_FILES, contents, read_table
 from slamlib.textfile import DatasetError as DatasetError
 from slamlib.textfile import require, require_type
-from slamlib.truth_frame import in_first_frame
-from slamlib.vehicle import Vehicle, changed, incremental_counts, read_vehicle
+from slamlib.vehicle import TABLE_2, Vehicle, changed, incremental_counts, read_vehicle
 
-MIN_EIGENVALUE = 1e-12  # of a correlation matrix; with a smaller one it counts as singular
-MAX_NEGATIVE_SIGMAS = 5.0  # sigmas, by which noise may make a range negative
-TABLE_2 = Vehicle()  # the assignment's nominal vehicle
-MAX_BAD_SHARE = 0.1  # of the rows of a sensor, which are left out; with more a file is refused
+ORIGIN_TOLERANCE = 1e-3  # m and rad; a first true pose within it is taken as the origin
 
 
 class _Readings:
@@ -84,14 +78,14 @@ class Dataset:
         Parameters
         ----------
         ticks : (n, 2) counts of the right and left wheel since the previous pose; the first are 0.
-        aruco : (m, 11) pose from 1 to n, marker id, x, y, heading of the marker in the vehicle, and
-            their covariances xx, xy, x heading, yy, y heading, heading heading; or None.
-        uwb : (r, 4) pose from 1 to n, antenna id, range, standard deviation; or None.
-        guess : (a, 3) antenna id, x, y; or None without `uwb`.
+        aruco : (m, 11) pose id from 1 to n, marker id, x, y, heading of the marker in the vehicle,
+            and their covariances xx, xy, x heading, yy, y heading, heading heading; or None.
+        uwb : (r, 4) pose id from 1 to n, antenna id, range, standard deviation; or None.
+        guess : (a, 3) antenna id, x, y, of at least the antennas in `uwb`; or None.
         vehicle : Vehicle
 
-        Raises DatasetError, which names the argument and the row, from 1, if an argument does not
-        pass the checks of its file: no row is left out.
+        Rows are checked, and bad ones left out with a note, as those of files. Raises DatasetError,
+        which names the argument and the row, from 1, where a file would be refused.
 
         >>> dataset = Dataset.from_arrays(ticks=[[0, 0], [10, 12]], uwb=[[2, 7, 1.5, 0.1]],
         ...                               guess=[[7, 1.0, 1.0]])
@@ -99,11 +93,10 @@ class Dataset:
         (2, [7])
         """
         require_type(vehicle, Vehicle, "vehicle")
-        stated = {key: value for key, value in vars(vehicle).items() if value is not None}
-        arguments = zip(TABLES, ("ticks", "aruco", "uwb", "guess"), (ticks, aruco, uwb, guess))
+        arguments = ("ticks", ticks), ("aruco", aruco), ("uwb", uwb), ("guess", guess)
         files = {file: tables.table_of_array(key, value, file, counted=key == "ticks")
-                 for file, key, value in arguments if value is not None or key == "ticks"}
-        return _dataset(files, changed(TABLE_2, stated, "vehicle"), name)
+                 for file, (key, value) in zip(TABLES, arguments)}
+        return _dataset(files, changed(TABLE_2, vars(vehicle), "vehicle"), name)
 
     @property
     def sightings(self):
@@ -129,6 +122,18 @@ class Dataset:
 
 
 @dataclass(frozen=True)
+class Doubt:
+    """A possible error in the files of a drive, for the user to check.
+
+    `what` is its kind in kebab case ("wheels-swapped"), for programs. `sentence` states the
+    evidence and what to check in which file.
+    """
+
+    what: str
+    sentence: str
+
+
+@dataclass(frozen=True)
 class Truth:
     """True poses, maps and wheel parameters of a simulated or surveyed drive."""
 
@@ -140,23 +145,6 @@ class Truth:
     vehicle: Vehicle
     doubts: tuple[Doubt, ...] = ()
     notes: tuple[str, ...] = ()  # as those of a Dataset
-
-
-def dataset_names(data, names=None):
-    """Names of the datasets in a folder: all sub-folders with files of one, or the list `names`.
-
-    Raises DatasetError if there is no dataset, no sub-folder of a selected name, or no
-    encoderReading.txt in a sub-folder.
-    """
-    data = Path(data)
-    found = datasets_in(data)[0] if data.is_dir() else []
-    require(found, data, f"this folder, with a sub-folder with an {ENCODER} for each dataset, "
-            "found none")
-    names = found if names is None else list(names)
-    for name in names:
-        require((data / name).is_dir(), data, f"one of {', '.join(found)}", name)
-        contents(data / name, required=ENCODER)
-    return names
 
 
 def read_dataset(folder):
@@ -172,24 +160,22 @@ def read_dataset(folder):
     (2000, 894, [5, 13, 36, 46])
     """
     files, notes = contents(folder, required=ENCODER)
-    vehicle = read_vehicle(files.get("vehicle.toml"), default=TABLE_2)
-    return _dataset(files, vehicle, Path(abspath(folder)).name, notes, MAX_BAD_SHARE)
+    vehicle = read_vehicle(files.get("vehicle.toml"))
+    return _dataset(files, vehicle, Path(abspath(folder)).name, notes)
 
 
-def _dataset(files, vehicle, name, notes=(), share=0.0):
-    """The Dataset by its Vehicle and the sources (dict) of its tables by name.
-
-    A share of the rows of a sensor may be bad, and is left out.
-    """
-    encoders, ticks = incremental_counts(_table(files, ENCODER), vehicle)
-    guess = _table(files, "UwbAntennaGuess.txt")
-    seen, heard = (_table(files, each, share, len(ticks)) for each in TABLES[1:3])
+def _dataset(files, vehicle, name, notes=()):
+    """The Dataset by its Vehicle and the sources (dict) of its tables by name."""
+    encoders, ticks = incremental_counts(read_table(files[ENCODER], ENCODER), vehicle)
+    seen, heard = (read_table(files.get(each), each, len(ticks)) for each in TABLES[1:3])
+    guess = read_table(files.get(TABLES[3]), TABLES[3])
     heard.kept(np.isin(heard.numbers[:, 1], guess.numbers[:, 0]), "an antenna id that the guesses "
                "have: UwbAntennaGuess.txt in the same folder, or guess")
     (*sighting, rows), (*measured, ranges) = map(_in_order, (seen.numbers, heard.numbers))
     return Dataset(
         name=name, vehicle=vehicle, ticks=ticks,
-        aruco=ArucoReadings(*sighting, rows[:, 2:5], _covariances(rows)) if len(rows) else None,
+        aruco=ArucoReadings(*sighting, rows[:, 2:5], rows[:, tables.COVARIANCE]
+                            ) if len(rows) else None,
         uwb=UwbReadings(*measured, *ranges[:, 2:].T) if len(ranges) else None,
         antenna_guess=AntennaGuess(*_by_id(guess)) if len(guess.numbers) else None,
         notes=(*notes, *encoders.notes, *seen.notes, *heard.notes, *guess.notes))
@@ -199,56 +185,36 @@ def read_truth(folder):
     """Truth of one drive, from the sub-folder `truth` of its folder, or None without it.
 
     Maps without a file have length 0. Wheel parameters that `truth/vehicle.toml` does not give are
-    those of the dataset. Truth whose first pose is not the origin is moved there, and a doubt says
-    so. Raises DatasetError if a file does not have the format or the number of poses is not that of
-    the drive.
+    those of the dataset. Truth whose first pose T_w1 is not the origin is moved there, T_1v =
+    inverse(T_w1) T_wv, and a doubt says so. Raises DatasetError if a file does not have the format
+    or the number of poses is not that of the drive.
     """
     drive, _ = contents(folder, required=ENCODER)
     if "truth" not in drive:
         return None
     files, notes = contents(drive["truth"], TRUTH_FILES, "vehiclePose.txt")
-    path, *maps = read = [_table(files, name) for name in TRUTH_FILES[:3]]
-    poses, count = path.numbers[:, 1:], len(_table(drive, ENCODER).numbers)
+    path, *maps = read = [read_table(files.get(name), name) for name in TRUTH_FILES[:3]]
+    poses, count = path.numbers[:, 1:], len(read_table(drive[ENCODER], ENCODER).numbers)
     require(len(poses) == count, path.source,
             f"{count} poses (encoder file), found {len(poses)}")
+    turns = 2 * np.pi * np.rint(poses[0, 2] / (2 * np.pi))
+    poses = np.column_stack([poses[:, :2], np.unwrap(poses[:, 2]) - turns])
     (marker, marker_in_world), (antenna, antenna_in_world) = map(_by_id, maps)
-    vehicle = read_vehicle(drive.get("vehicle.toml"), default=TABLE_2)
-    return in_first_frame(Truth(
-        poses=np.column_stack([poses[:, :2], np.unwrap(poses[:, 2])]),
-        marker=marker, marker_in_world=marker_in_world,
-        antenna=antenna, antenna_in_world=antenna_in_world,
-        vehicle=read_vehicle(files.get("vehicle.toml"), default=vehicle),
-        notes=tuple(f"In truth: {note}" for note in sum((each.notes for each in read), (*notes,)))))
-
-
-def _covariances(rows):
-    """Covariances (m, 3, 3) of rows (m, 11) of sightings."""
-    return rows[:, 5:][:, [[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
-
-
-_COUNTED = (lambda x: x[:, 0] == np.arange(1, len(x) + 1), "pose ids 1, 2, 3, ... in order")
-_UNIQUE = (lambda x: np.isin(np.arange(len(x)), np.unique(x[:, 0], return_index=True)[1]),
-           "each id only once")
-# By file, which rows of its numbers (m, c) are right, and what is expected of them. Covariances are
-# scaled to correlations: s_thetatheta may be 1e4 rad^2 where s_xx is 1e-4 m^2.
-CHECKS = {
-    ENCODER: _COUNTED, "vehiclePose.txt": _COUNTED, "UwbAntennaGuess.txt": _UNIQUE,
-    "ArucoMap.txt": _UNIQUE, "UwbMap.txt": _UNIQUE,
-    "ArucoReading.txt": (
-        lambda x: np.linalg.eigvalsh(se2.correlations(_covariances(x)))[:, 0] > MIN_EIGENVALUE,
-        "a positive definite covariance (smallest eigenvalue of its correlation matrix above "
-        f"{MIN_EIGENVALUE:g})"),
-    "UwbReading.txt": (lambda x: x[:, 2] >= -MAX_NEGATIVE_SIGMAS * x[:, 3],
-                       f"a range that is not below -{MAX_NEGATIVE_SIGMAS:g} sigma")}
-
-
-def _table(files, name, share=0.0, pose_count=None):
-    """The Table of a file whose rows have passed all checks."""
-    table = read_table(files.get(name), name, share, pose_count)
-    require(len(table.numbers) or name != ENCODER, table.source,
-            "at least the row '1 0 0', found no rows")
-    right, expected = CHECKS[name]
-    return table.kept(right(table.numbers), expected, share)
+    doubts, first = (), poses[0]
+    if (abs(first) > ORIGIN_TOLERANCE).any():
+        poses = se2.between(first, poses)
+        marker_in_world = se2.difference(se2.between(first, marker_in_world), np.zeros(3))
+        antenna_in_world = se2.between(first, np.pad(antenna_in_world, ((0, 0), (0, 1))))[:, :2]
+        doubts = (Doubt("truth-frame", (
+            "In truth/vehiclePose.txt the drive begins at ({:.3f} m, {:.3f} m, {:.4f} rad), not at "
+            "the origin. The true poses and maps were moved into the frame of the first true pose, "
+            "in which the estimates are. If errors are large, check that all files in truth/ are "
+            "in the same frame.").format(*first)),)
+    vehicle, true = (each.get("vehicle.toml") for each in (drive, files))
+    return Truth(
+        poses, marker, marker_in_world, antenna, antenna_in_world,
+        read_vehicle(true, read_vehicle(vehicle)), doubts,
+        tuple(f"In truth: {note}" for note in sum((each.notes for each in read), (*notes,))))
 
 
 def _by_id(table):
@@ -269,14 +235,14 @@ def all_notes(dataset, truth):
     weighed = [f"Problems 3 and 4 are solved with {key} = {json.dumps(value)}."
                for key in ("kernel", "gate")
                if (value := getattr(dataset.vehicle, key)) != getattr(TABLE_2, key)]
-    return (*dataset.notes, *weighed, *(() if truth is None else truth.notes))
+    return (*dataset.notes, *weighed, *(truth.notes if truth else ()))
 
 
 def inventory_lines(dataset, truth):
     """Lines (list of str) on what was read of a Dataset and its Truth or None, with all notes."""
     aruco, uwb = dataset.aruco, dataset.uwb
-    stated = [f"{key} = {value:g}" if isinstance(value, float) else f"{key} = {json.dumps(value)}"
-              for key, value in vars(dataset.vehicle).items() if value != getattr(TABLE_2, key)]
+    stated = [f"{key} = {json.dumps(value)}" for key, value in vars(dataset.vehicle).items()
+              if value != getattr(TABLE_2, key)]
     right, left = abs(dataset.ticks).sum(axis=0)
     return [f"{dataset.name}: {line}" for line in (
         f"encoders: {len(dataset.ticks)} poses, {right} ticks right and {left} left",

@@ -8,25 +8,13 @@ follows Bar-Shalom, Li and Kirubarajan, *Estimation with Applications to Trackin
 """
 
 import numpy as np
+from scipy.special import chdtri
 
 from slamlib import se2
 from slamlib.se2 import correlations as correlations
 from slamlib.se2 import sigmas
-from slamlib.textfile import require
 
 REACH_95 = float(np.sqrt(-2 * np.log(0.05)))    # sigmas, of the 95 % ellipse of a planar Gaussian
-
-
-def checked_poses(source, *arrays):
-    """The arguments of a function `source` as float arrays of poses, (n, 3).
-
-    Raises DatasetError where one is something else, or has another n than the first.
-    """
-    for each in arrays:
-        require(isinstance(each, np.ndarray) and each.dtype.kind in "fiu"
-                and each.shape == (len(arrays[0]), 3), source,
-                "numbers (n, 3), poses of the same n in each array", getattr(each, "shape", each))
-    return [each.astype(float) for each in arrays]
 
 
 def path_length(poses):
@@ -57,7 +45,7 @@ def ate(poses, truth, aligned=False):
     >>> round(ate(poses, truth), 3)
     3.536
     """
-    poses, truth = checked_poses("ate", poses, truth)
+    poses, truth = np.asarray([poses, truth], dtype=float)
     known = np.isfinite(poses).all(axis=1)
     poses, truth = poses[known], truth[known]
     if not len(poses):
@@ -73,7 +61,7 @@ def nees(poses, covariances, truth):
     It is chi-squared with 3 degrees of freedom, so 3 on average, if the errors are Gaussian with
     covariance C. It is NaN where C is singular, as for a known pose, and without an estimate.
     """
-    poses, truth = checked_poses("nees", poses, truth)
+    poses, truth = np.asarray([poses, truth], dtype=float)
     result, ok = np.full(len(poses), np.nan), se2.regular(covariances)
     result[ok] = se2.squared_distances(poses[ok], truth[ok], covariances[ok])
     return result
@@ -82,8 +70,7 @@ def nees(poses, covariances, truth):
 def anees(poses, covariances, truth):
     """Average NEES over the poses that have one; NaN if none has."""
     values = nees(poses, covariances, truth)
-    values = values[np.isfinite(values)]
-    return float(values.mean()) if len(values) else np.nan
+    return float(np.nanmean(values)) if np.isfinite(values).any() else np.nan
 
 
 def nees_band(count, dof=3, probability=0.95):
@@ -95,8 +82,6 @@ def nees_band(count, dof=3, probability=0.95):
     >>> np.round(nees_band(8), 2)
     array([1.55, 4.92])
     """
-    from scipy.special import chdtri  # imported here: it is slow and no solver needs it
-
     tail = (1 - probability) / 2
     return tuple(chdtri(dof * count, [1 - tail, tail]) / count)
 

@@ -3,10 +3,9 @@
 Poses are [x, y, heading] and positions [x, y] in world axes, in m and rad. Covariances belong to
 the same coordinates. A line of a TUM file is `timestamp x y z qx qy qz qw`, the format of the TUM
 RGB-D benchmark that evo and others read. The measurements have no times, so the time stamps are
-pose numbers, from 1. Text files leave out poses without an estimate.
+pose ids, from 1. Text files leave out poses without an estimate.
 """
 
-import struct
 from io import BytesIO
 from pathlib import Path
 
@@ -14,7 +13,6 @@ import numpy as np
 from scipy.io import loadmat, savemat
 
 from slamlib import swap
-from slamlib.evaluation import checked_poses
 
 _HEADER = b"MATLAB 5.0 MAT-file, written by slamlib".ljust(116)  # scipy's contains the date
 SIZE_OFFSET, COUNT_OFFSET = 132, 164  # bytes, to the array's size and its number of columns
@@ -22,6 +20,26 @@ SIZE_OFFSET, COUNT_OFFSET = 132, 164  # bytes, to the array's size and its numbe
 FIELDS = {"vehiclePose": ("pose", "covari"), "ArucoMap": ("pose", "covari", "id"),
           "UwbMap": ("position", "covariance", "id")}
 RESULT_FILES = tuple(f"{name}.mat" for name in FIELDS)  # of a problem's folder
+SUMMARY = "summary.json"
+
+
+def write_solution(folder, solution, text=False):
+    """Write the .mat files of a Solution into folder/<problem>/; returns the Path of that folder.
+
+    With `text` it writes CSV files beside them, too, and folder/<problem>.tum. A summary in
+    `folder` is removed, because it belongs to other files.
+    """
+    (Path(folder) / SUMMARY).unlink(missing_ok=True)
+    own = Path(folder) / solution.problem
+    poses = np.arange(1, len(solution.poses) + 1), solution.poses, solution.covariances
+    for name, each in zip(FIELDS, (poses, solution.aruco_map, solution.uwb_map)):
+        if each is not None:
+            write_structs(own, name, *each)
+            if text:
+                write_csv(own / f"{name}.csv", *each)
+    if text:
+        write_tum(own.with_suffix(".tum"), solution.poses)
+    return own
 
 
 def read_structs(folder, name):
@@ -52,9 +70,10 @@ def write_structs(folder, name, ids, places, covariances):
     repeated with the numbers: each field is a header of 56 bytes and its numbers by columns. The
     array's size and number of columns are set (MAT-File Format, version 5).
     """
-    columns = zip(FIELDS[name], (places, covariances, ids))
-    rows = {field: _matrices(values) for field, values in columns}
-    buffer, count = BytesIO(), len(places)
+    buffer, (count, d) = BytesIO(), np.shape(places)
+    columns = zip(FIELDS[name], (places, covariances, ids), ((1, d), (d, d), (1, 1)))
+    rows = {field: np.reshape(values, (count, *shape)).astype(float)
+            for field, values, shape in columns}
     savemat(buffer, {name: {field: np.zeros(values.shape[1:]) for field, values in rows.items()}})
     content = bytearray(_HEADER + buffer.getvalue()[len(_HEADER):])
     layout = np.dtype([entry for field, values in rows.items() for entry in (
@@ -62,17 +81,10 @@ def write_structs(folder, name, ids, places, covariances):
     structs = np.repeat(np.frombuffer(content[-layout.itemsize:], layout), count)
     for field, values in rows.items():
         structs[field] = np.swapaxes(values, 1, 2)
-    size, = struct.unpack_from("=I", content, SIZE_OFFSET)
-    struct.pack_into("=I", content, SIZE_OFFSET, size + (count - 1) * layout.itemsize)
-    struct.pack_into("=i", content, COUNT_OFFSET, count)
-    content[-layout.itemsize:] = structs.tobytes()
-    swap.write_atomically(Path(folder) / f"{name}.mat", content)
-
-
-def _matrices(values):
-    """Scalars (n,), vectors (n, d) or matrices (n, c, d) as (n, c, d); vectors are 1 x d."""
-    rows = np.asarray(values, dtype=float)
-    return rows.reshape(len(rows), *(1,) * (3 - rows.ndim), *rows.shape[1:])
+    np.frombuffer(content, "=i4", 1, SIZE_OFFSET)[0] += (count - 1) * layout.itemsize
+    np.frombuffer(content, "=i4", 1, COUNT_OFFSET)[0] = count
+    swap.write_atomically(Path(folder) / f"{name}.mat",
+                          content[:-layout.itemsize] + structs.tobytes())
 
 
 def write_tum(path, poses):
@@ -83,8 +95,7 @@ def write_tum(path, poses):
     1 0 0 0 0 0 0 1
     3 2.5 0 0 0 0 0 1
     """
-    poses, = checked_poses("write_tum", poses)
-    x, y, heading = poses.T
+    x, y, heading = np.transpose(poses)
     zero = np.zeros(len(poses))
     _write_text(path, np.arange(1, len(poses) + 1), [
         x, y, zero, zero, zero, np.sin(heading / 2), np.cos(heading / 2)], " ")

@@ -8,8 +8,7 @@ ranges to the antennas within reach. Both have a lower rate than the encoders.
 """
 
 import json
-import os
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -18,7 +17,6 @@ import numpy as np
 from slamlib import se2
 from slamlib.dataset import TABLE_2, AntennaGuess, ArucoReadings, Dataset, Truth, UwbReadings
 from slamlib.odometry import cumulative, dead_reckoning
-from slamlib.swap import staging
 from slamlib.textfile import require
 
 # A path is a sum of rotating vectors (turns per round, radius in m, phase in rad). `marker_spacing`
@@ -35,7 +33,6 @@ CAMERA_REACH = 1.8      # m, largest distance in the plane at which a marker is 
 UWB_REACH = 15.0        # m, largest distance to an antenna that is measured
 LATE_RANGE_MEAN = 0.8   # m, mean of the exponential excess of late ranges
 SIMULATED_GUESS_SIGMA = 0.35   # m per axis, standard deviation of the antenna guesses
-WHEEL_ENTRIES = tuple(asdict(TABLE_2))[:8]      # of vehicle.toml, which are always written
 
 
 def simulate(path="short", seed=0, *, slip=1e-3, late_ranges=0.0, mislabelled=0.0, memory=0.0,
@@ -56,9 +53,8 @@ def simulate(path="short", seed=0, *, slip=1e-3, late_ranges=0.0, mislabelled=0.
         antenna guesses. The stated covariances do not change.
     vehicle : Vehicle, the nominal one.
 
-    Returns
-    -------
-    Dataset and Truth. Raises DatasetError if there is no such path, or a number is beyond limits.
+    Returns Dataset and Truth. Raises DatasetError if there is no such path, or a number is beyond
+    its limits.
 
     >>> dataset, truth = simulate("short", seed=1, late_ranges=0.1)
     >>> dataset.ticks.shape, truth.poses.shape
@@ -116,7 +112,7 @@ def manoeuvre(legs, vehicle=TABLE_2):
 
 
 def write_dataset(folder, dataset, truth=None):
-    """Write a Dataset, and its Truth if given, as the assignment's text files: all or nothing.
+    """Write a Dataset, and its Truth if given, as the assignment's text files.
 
     Raises DatasetError if the folder exists and is not empty.
     """
@@ -137,21 +133,20 @@ def write_dataset(folder, dataset, truth=None):
         tables |= {"truth/vehiclePose": (pose, number, *truth.poses.T),
                    "truth/ArucoMap": (pose, truth.marker, *truth.marker_in_world.T),
                    "truth/UwbMap": ("%d %.6f %.6f", truth.antenna, *truth.antenna_in_world.T)}
-    with staging(folder) as stage:
-        if dataset.vehicle != TABLE_2:
-            _write_vehicle(stage / "vehicle.toml", dataset.vehicle)
-        if truth is not None:
-            (stage / "truth").mkdir()
-            _write_vehicle(stage / "truth" / "vehicle.toml", truth.vehicle)
-        for name, (fmt, *columns) in tables.items():
-            with open(stage / f"{name}.txt", "w", encoding="ascii", newline="\n") as file:
-                np.savetxt(file, np.column_stack(columns), fmt=fmt)
-        os.replace(stage, folder)
+    (folder if truth is None else folder / "truth").mkdir(parents=True, exist_ok=True)
+    if dataset.vehicle != TABLE_2:
+        _write_vehicle(folder / "vehicle.toml", dataset.vehicle)
+    if truth is not None:
+        _write_vehicle(folder / "truth" / "vehicle.toml", truth.vehicle)
+    for name, (fmt, *columns) in tables.items():
+        with open(folder / f"{name}.txt", "wb") as file:        # the same line ends everywhere
+            np.savetxt(file, np.column_stack(columns), fmt=fmt)
 
 
 def _write_vehicle(path, vehicle):
-    lines = [f"{name} = {json.dumps(value)}\n" for name, value in asdict(vehicle).items()
-             if value is not None and (name in WHEEL_ENTRIES or value != getattr(TABLE_2, name))]
+    """Write the eight entries of the wheels, and of all others those that differ from table 2."""
+    lines = [f"{name} = {json.dumps(value)}\n" for row, (name, value) in enumerate(
+        vars(vehicle).items()) if row < 8 or value != getattr(TABLE_2, name)]
     path.write_text("".join(lines), encoding="utf-8", newline="\n")
 
 
@@ -160,17 +155,15 @@ def _driven_arcs(layout, rounds):
     turns, radius, phase = np.array(layout.vectors).T[:, :, None]
 
     def velocity(u):
-        angle = turns * u + phase
-        return np.stack([-radius * turns * np.sin(angle), radius * turns * np.cos(angle)]).sum(1)
+        return np.sum(1j * radius * turns * np.exp(1j * (turns * u + phase)), axis=0)
 
     fine = np.linspace(0, 2 * np.pi * rounds, 200 * layout.poses // 20 * rounds + 1)
-    speed = np.hypot(*velocity(fine))
-    middle = np.hypot(*velocity((fine[1:] + fine[:-1]) / 2))
+    speed, middle = abs(velocity(fine)), abs(velocity((fine[1:] + fine[:-1]) / 2))
     length = cumulative((speed[1:] + 4 * middle + speed[:-1]) / 6) * fine[1]         # Simpson
     time = np.linspace(0, 1, layout.poses * rounds)
     travelled = length[-1] * (time - 0.15 * np.sin(2 * np.pi * 5 * time) / (2 * np.pi * 5))
-    direction = velocity(np.interp(travelled, length, fine))
-    return np.diff(travelled), np.diff(np.unwrap(np.arctan2(direction[1], direction[0])))
+    direction = np.angle(velocity(np.interp(travelled, length, fine)))
+    return np.diff(travelled), np.diff(np.unwrap(direction))
 
 
 def _counts(ds, dtheta, vehicle):
@@ -192,8 +185,8 @@ def _encoder(counts, vehicle, slip, rng):
 def _place_markers(layout, poses, rng):
     """Ids (k,) and poses (k, 3) of markers on a jittered grid over the driven area."""
     low, high = poses[:, :2].min(0) - CAMERA_REACH, poses[:, :2].max(0) + CAMERA_REACH
-    x, y = (np.arange(low[i], high[i], layout.marker_spacing) for i in range(2))
-    grid = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+    axes = (np.arange(*ends, layout.marker_spacing) for ends in zip(low, high))
+    grid = np.stack(np.meshgrid(*axes), -1).reshape(-1, 2)
     grid += layout.marker_spacing * rng.uniform(-0.35, 0.35, grid.shape)
     visible = np.array([np.hypot(*(poses[::10, :2] - p).T).min() < CAMERA_REACH for p in grid])
     fraction, radius = layout.markers_missing
@@ -220,8 +213,10 @@ def _camera(poses, marker, marker_in_world, every, mislabelled, memory, noise, r
     in_vehicle = se2.between(poses[frames, None], marker_in_world)
     distance = np.hypot(in_vehicle[..., 0], in_vehicle[..., 1])
     frame, which = np.nonzero(distance < CAMERA_REACH)
-    z, d = in_vehicle[frame, which], distance[frame, which]
-    covariance = _sighting_covariance(z, d)
+    z, correlation = in_vehicle[frame, which], [[1, 0, 0], [0, 1, 0.4], [0, 0.4, 1]]
+    sigma = [4e-3, 3e-3, 4e-3] + distance[frame, which, None] * [5e-3, 3e-3, 3e-3]
+    covariance = se2.rotate_covariance(                     # most along the line of sight
+        sigma[:, :, None] * correlation * sigma[:, None], np.arctan2(z[:, 1], z[:, 0]))
     error = rng.standard_normal(z.shape)
     order = np.lexsort((frame, which))
     for last, k in zip(order, order[1:]):
@@ -237,15 +232,6 @@ def _relabelled(label, count, fraction, rng):
     """The labels (m,), numbers below `count`, with another one at a fraction of them."""
     wrong = rng.uniform(size=len(label)) < fraction
     return np.where(wrong, (label + rng.integers(1, max(2, count), len(label))) % count, label)
-
-
-def _sighting_covariance(z, distance):
-    """Covariances (m, 3, 3) whose sigmas grow with distance (m,), most along the line of sight."""
-    radial, across, turn = 4e-3 + 5e-3 * distance, 3e-3 + 3e-3 * distance, 4e-3 + 3e-3 * distance
-    C = np.zeros((len(z), 3, 3))
-    C[:, 0, 0], C[:, 1, 1], C[:, 2, 2] = radial**2, across**2, turn**2
-    C[:, 1, 2] = C[:, 2, 1] = 0.4 * across * turn
-    return se2.rotate_covariance(C, np.arctan2(z[:, 1], z[:, 0]))
 
 
 def _uwb(poses, antenna, antenna_in_world, every, late_ranges, noise, rng):

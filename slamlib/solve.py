@@ -1,32 +1,32 @@
 """The assignment's problems: which of them a dataset allows, their solutions and files.
 
 `find` runs the solver of a problem; `problem_solution` makes a Solution of its result, with what
-the files and figures of every problem need.
+the files and figures of every problem need; `solve_to_folder` solves all problems and writes their
+files, with a summary of plain numbers.
 """
 
-from dataclasses import dataclass, field
-from pathlib import Path
+import json
+import signal
+import sys
+import time
+from collections import namedtuple
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, replace
+from multiprocessing import Pipe, get_context
 
 import numpy as np
 
-from slamlib import localization, odometry, results, se2, slam
+from slamlib import evaluation, localization, odometry, results, se2, slam, swap
+from slamlib.checks.files import doubts_before_solving, merged
 from slamlib.checks.solution import solution_doubts
-from slamlib.dataset import DatasetError
-from slamlib.doubt import Doubt
+from slamlib.dataset import DatasetError, Doubt, all_notes
 
 UNSOLVABLE = (DatasetError, np.linalg.LinAlgError)  # what `find` raises where there is no solution
 
 
-@dataclass(frozen=True)
-class Task:
-    """Title, required sensors and role in figures of a problem."""
-
-    title: str
-    sensors: tuple                 # attributes of Dataset that it needs besides the ticks
-    role: str                      # key of its colour and line, `notebook.plotting.ROLES`
-
-
-# Every problem in the order of solution, by the name of its results folder.
+# Every problem in the order of solution, by the name of its results folder: its title, the sensors
+# that it needs (attributes of Dataset), and its role in figures (`notebook.plotting.ROLES`).
+Task = namedtuple("Task", "title sensors role")
 PROBLEMS = {
     "problem1": Task("odometry", (), "odometry"),
     "problem2": Task("ArUco", ("aruco",), "aruco"),
@@ -35,10 +35,12 @@ PROBLEMS = {
     "problem3": Task("SLAM: odometry + ArUco", ("aruco",), "slam"),
     "problem4": Task("SLAM: odometry + ArUco + UWB", ("uwb",), "slam_uwb"),
 }
+# Problems that the second process solves: no other problem needs their results.
+INDEPENDENT = ("problem1", "problem2", "problem2_hint", "problem2_fused")
 SENSORS = {"aruco": "markers", "uwb": "UWB ranges"}
-SUMMARY = "summary.json"
 RESULT_NAMES = frozenset([  # relative paths of all files that a drive's results may have
-    SUMMARY, *(f"{problem}/{file}" for problem in PROBLEMS for file in results.RESULT_FILES)])
+    results.SUMMARY, *(f"{problem}/{file}" for problem in PROBLEMS
+                       for file in results.RESULT_FILES)])
 
 
 def title(problem, dataset):
@@ -174,40 +176,112 @@ def _slam_facts(dataset, found):
 def solutions(dataset, problems=tuple(PROBLEMS)):
     """Yield the Solution of each of `problems` that the dataset's sensors allow, in order.
 
-    A problem that cannot be solved yields a Failure.
+    A problem that cannot be solved yields a Failure. Facts include the seconds that it took.
     """
     found = {}
     for problem in (each for each in problems if allows(dataset, each)):
+        start = time.perf_counter()
         try:
             result = find(problem, dataset, found)
             solution = problem_solution(problem, dataset, result)
             found[problem] = result
-            yield solution
+            seconds = time.perf_counter() - start
+            yield replace(solution, facts=solution.facts | {"seconds": seconds})
         except UNSOLVABLE as error:
             yield failure(problem, dataset, error)
 
 
 def truth_in_world(solution, truth):
     """The true poses (n, 3) in the world frame of a Solution."""
-    if solution.world == 0:
-        return truth.poses
     return se2.between(truth.poses[solution.world], truth.poses)
 
 
-def write_solution(folder, solution, text=False):
-    """Write the .mat files of a Solution into folder/<problem>/; returns the Path of that folder.
+def solve_to_folder(dataset, truth, out, problems=tuple(PROBLEMS), csv=False):
+    """Solve problems of a Dataset and write their files to the folder `out`.
 
-    With `text` it writes CSV files beside them, too, and folder/<problem>.tum. A summary in
-    `folder` is removed, because it belongs to other files.
+    When all files are written they replace those of an earlier run, by `swap.publish`. On Linux,
+    where a fork is safe, a second process solves problems 1 and 2.
+
+    Parameters
+    ----------
+    truth : Truth, to report errors, never to estimate; or None.
+    problems : keys of `PROBLEMS`; those for which there are sensors are solved.
+    csv : bool; True writes each .mat file also as CSV, and trajectories and truth as TUM files.
+
+    Returns
+    -------
+    The summary, the dict that is written to summary.json. A problem that could not be solved has
+    the entry "failed", a sentence. The list "doubts", of "what" and "sentence", has those about the
+    drive first, then by problem. "notes" lists what was mended or left out while the files were
+    read.
     """
-    (Path(folder) / SUMMARY).unlink(missing_ok=True)
-    own = Path(folder) / solution.problem
-    poses = np.arange(1, len(solution.poses) + 1), solution.poses, solution.covariances
-    for name, each in zip(results.FIELDS, (poses, solution.aruco_map, solution.uwb_map)):
-        if each is not None:
-            results.write_structs(own, name, *each)
-        if each is not None and text:
-            results.write_csv(own / f"{name}.csv", *each)
-    if text:
-        results.write_tum(own.with_suffix(".tum"), solution.poses)
-    return own
+    with swap.staging(out) as stage:
+        doubts, solved = _in_two_processes(dataset, truth, problems)
+        rows = {}
+        for solution in solved:
+            if isinstance(solution, Failure):
+                row = {"failed": solution.reason}
+            else:
+                row = summarize(solution, truth)
+                doubts += solution.doubts
+                results.write_solution(stage, solution, csv)
+            rows[solution.problem] = {"title": solution.title, **row}
+        summary = {"dataset": dataset.name, "poses": len(dataset.ticks),
+                   "kernel": dataset.vehicle.kernel, "doubts": [*map(asdict, merged(doubts))],
+                   "notes": all_notes(dataset, truth), "problems": rows}
+        text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+        swap.write_atomically(stage / results.SUMMARY, text.encode())
+        if csv and truth is not None:
+            results.write_tum(stage / "truth.tum", truth.poses)
+        swap.publish({out: stage}, ours=RESULT_NAMES)
+    return summary
+
+
+def _in_two_processes(*arguments):
+    """What `_solved` returns of all problems, in order; the second process solves INDEPENDENT."""
+    receiver, sender = Pipe(duplex=False)
+    if forks := sys.platform == "linux":
+        child = get_context("fork").Process(target=_send, args=(sender, *arguments))
+        child.start()
+    sender.close()
+    try:
+        _, late = _solved(False, *arguments)
+        doubts, early = receiver.recv()
+    except (EOFError, OSError):            # no child, or it was killed, or failed: here it is told
+        doubts, early = _solved(True, *arguments)
+    finally:
+        receiver.close()
+        if forks:
+            child.kill()
+            child.join()
+    return doubts, early + late
+
+
+def _send(sender, *arguments):
+    """Send what `_solved` returns from a process that Ctrl-C does not end."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with sender, suppress(BaseException):
+        sender.send(_solved(True, *arguments))
+
+
+def _solved(independent, dataset, truth, problems):
+    """Doubts before solving and `solutions` of problems INDEPENDENT, or none and of the others."""
+    problems = [problem for problem in problems if (problem in INDEPENDENT) == independent]
+    return (doubts_before_solving(dataset, truth) if independent else [],
+            [*solutions(dataset, problems)])
+
+
+def summarize(solution, truth):
+    """Last estimate with its sigmas and, where there is truth, errors: a dict of plain numbers."""
+    known = np.flatnonzero(np.isfinite(solution.poses[:, 0]))
+    last = known[-1]
+    summary = {"path_length_m": evaluation.path_length(solution.poses),
+               "estimated_poses": len(known), "world_is_pose": solution.world + 1,
+               "last_pose_number": int(last) + 1, "last_pose": solution.poses[last].tolist(),
+               "last_sigma": evaluation.sigmas(solution.covariances[last]).tolist(),
+               **solution.facts}
+    if truth is not None:
+        true_poses = truth_in_world(solution, truth)
+        summary["ate_m"] = evaluation.ate(solution.poses, true_poses)
+        summary["ate_aligned_m"] = evaluation.ate(solution.poses, true_poses, aligned=True)
+    return summary

@@ -9,7 +9,7 @@ import json
 import os
 import shutil
 import sys
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -23,12 +23,12 @@ def beside(path, what):
 
 
 @contextmanager
-def locked(folder, what="lock"):
-    """Hold a lock of a kind (str) of a folder (Path); a process that waits for it says so.
+def locked(folder):
+    """Hold the lock of a folder (Path); a process that waits for it says so.
 
     The system releases it when the process that holds it ends.
     """
-    file = beside(folder, what)
+    file = beside(folder, "lock")
     file.parent.mkdir(parents=True, exist_ok=True)
     lock = FileLock(file)
     try:
@@ -71,7 +71,7 @@ def staging(folder):
     if folder.exists():
         os.listdir(folder)
     stage = beside(folder, "new")
-    with locked(folder, "new.lock"):
+    with locked(folder):
         shutil.rmtree(stage, ignore_errors=True)        # of a run that was killed
         stage.mkdir()
         try:
@@ -101,21 +101,19 @@ def publish(made, ours=()):
     OSError : a file cannot be written or put in its place; in the first case nothing has changed.
     """
     made = {Path(folder).resolve(): new for folder, new in made.items()}
-    with ExitStack() as stack:
-        for folder in sorted(made):                     # all processes in this order
-            stack.enter_context(locked(folder))
-        for folder, new in made.items():
-            _add_the_users_files(folder, new, ours)
-        for folder in made:
-            if folder.exists():
-                shutil.rmtree(beside(folder, "old"), ignore_errors=True)
-                folder.rename(beside(folder, "old"))
-        for folder, new in made.items():
-            new.rename(folder)
-        for folder in made:
+    for folder, new in made.items():
+        _add_the_users_files(folder, new, ours)
+    for folder in made:
+        if folder.exists():
             shutil.rmtree(beside(folder, "old"), ignore_errors=True)
-            with suppress(OSError):
-                folder.rmdir()                          # if it is empty
+            folder.rename(beside(folder, "old"))
+    for folder, new in made.items():
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        new.rename(folder)
+    for folder in made:
+        shutil.rmtree(beside(folder, "old"), ignore_errors=True)
+        with suppress(OSError):
+            folder.rmdir()                              # if it is empty
 
 
 def _add_the_users_files(folder, new, ours):
@@ -123,11 +121,9 @@ def _add_the_users_files(folder, new, ours):
     new.mkdir(exist_ok=True)
     names = file_names(new)
     source = folder if folder.exists() else beside(folder, "old")   # of a run that was killed
-    try:
-        listed = {*map(str, json.loads((source / FILE_LIST).read_bytes()))}
-    except (OSError, ValueError, TypeError):            # none, or not written by slamlib
-        listed = set()
-    for name in {*file_names(source)} - {FILE_LIST, *ours, *names, *listed}:
+    listed = source / FILE_LIST
+    ours = {FILE_LIST, *ours, *names, *(json.loads(listed.read_bytes()) if listed.exists() else ())}
+    for name in {*file_names(source)} - ours:
         if not name.endswith(".part"):
             (new / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(source / name, new / name, follow_symlinks=False)

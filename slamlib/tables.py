@@ -1,23 +1,22 @@
 """Finds the files of a dataset in its folder, and reads tables of numbers from them.
 
-A file is read under its name as browsers and Windows leave it, as `ArucoReading (1).txt` or
-`ArucoReading.txt.txt`, and a note says so. Other names are not guessed, but listed. The matrices of
-.mat files stand in for text files that are missing.
-
-Plain text has blanks or tabs between columns, decimal points, and comments that begin with `#`, `%`
-or `//`. Other separators, decimal commas and a header are read. The limits of the numbers are far
+A file is read under its name as browsers and Windows leave it, as `ArucoReading (1).txt`, and a
+note says so. Other names are not guessed, but listed. Matrices of .mat files stand in for missing
+text files. Text has blanks between columns, decimal points, and comments that begin with `#`, `%`
+or `//`; other separators, decimal commas and a header are read. The limits of the numbers are far
 wider than vehicles, cameras and antennas need: a number beyond them has another unit, or float64
 loses digits beside it. data/README.md lists them.
 """
 
 import re
-from bisect import bisect_left
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
 from scipy.io import loadmat
 
+from slamlib import se2
 from slamlib.textfile import DatasetError, quoted, read_text, require
 
 ENCODER = "encoderReading.txt"
@@ -59,20 +58,38 @@ LIMITS = {
     "ArucoMap.txt": {"marker id": _WHOLE, "x": _TRUE, "y": _TRUE, "theta": _TRUE_ANGLE},
     "UwbMap.txt": {"antenna id": _WHOLE, "x": _TRUE, "y": _TRUE}}
 
+MAX_BAD_SHARE = 0.1  # of the rows of a sensor, which are left out; with more a file is refused
+MIN_EIGENVALUE = 1e-12  # of a correlation matrix; with a smaller one it counts as singular
+MAX_NEGATIVE_SIGMAS = 5.0  # sigmas, by which noise may make a range negative
+COVARIANCE = [[5, 6, 7], [6, 8, 9], [7, 9, 10]]  # columns of the covariance of a sighting
+
+_COUNTED = (lambda x: x[:, 0] == np.arange(1, len(x) + 1), "pose ids 1, 2, 3, ... in order")
+_UNIQUE = (lambda x: np.isin(np.arange(len(x)), np.unique(x[:, 0], return_index=True)[1]),
+           "each id only once")
+# By file, which rows of its numbers (m, c) are right, and what is expected of them. Covariances are
+# scaled to correlations: s_thetatheta may be 1e4 rad^2 where s_xx is 1e-4 m^2.
+CHECKS = {
+    ENCODER: _COUNTED, "vehiclePose.txt": _COUNTED, "UwbAntennaGuess.txt": _UNIQUE,
+    "ArucoMap.txt": _UNIQUE, "UwbMap.txt": _UNIQUE,
+    "ArucoReading.txt": (
+        lambda x: np.linalg.eigvalsh(se2.correlations(x[:, COVARIANCE]))[:, 0] > MIN_EIGENVALUE,
+        "a positive definite covariance (smallest eigenvalue of its correlation matrix above "
+        f"{MIN_EIGENVALUE:g})"),
+    "UwbReading.txt": (lambda x: x[:, 2] >= -MAX_NEGATIVE_SIGMAS * x[:, 3],
+                       f"a range that is not below -{MAX_NEGATIVE_SIGMAS:g} sigma")}
 # Names of the tables of a drive and of its truth, and of all files in its folder.
 TABLES, TRUTH_FILES = tuple(LIMITS)[:4], (*tuple(LIMITS)[4:], "vehicle.toml")
 DATASET_FILES = (*TABLES, "vehicle.toml", "truth")
+# What may stand after a name without its ending, as browsers and Windows leave it.
+ENDING = r"( - copy)?( ?\(\d+\))?(\.(txt|csv|tsv|dat|toml))*"
 # Names of files that systems put into folders; clouds leave hidden ones in place of files.
 SYSTEM_FILES = re.compile(r"\..*(?<!\.icloud)|thumbs\.db|desktop\.ini|__macosx", re.IGNORECASE)
-# What browsers and Windows add to a name, and endings by that of the format.
-COPY = r"( - copy)?( ?\(\d+\))?"
-ENDINGS = {".txt": rf"{COPY}(\.(txt|csv|tsv|dat))*", ".toml": rf"{COPY}\.toml(\.txt)?", "": ""}
 MAX_LISTED_NAMES = 5  # file names in one sentence
 
 COMMENT_OR_QUOTE = re.compile(r'(#|%|//).*|"')
-EMPTY_CELL = re.compile(r"(?:^|(?<=[;,]))[^\S\n]*(?=[;,]|$)", re.MULTILINE)
 NUMBER_FIRST = re.compile(r"(^|[\s,;])\W*(\d|nan\b|inf)", re.IGNORECASE)  # in a row, not a header
-NO_DECIMAL_COMMA = re.compile(r"\.|(?<!\d),|,(?!\d)")
+NUMBER = {sign: rf"[+-]?(?:(?:{digits})(?:e[+-]?[0-9]+)?|nan|inf(?:inity)?)" for sign, digits in (
+    (".", r"[0-9]+(?:\.[0-9]*)?|\.[0-9]+"), (",", "[0-9]+(?:,[0-9]+)?"))}
 DIALECTS = (None, "."), (",", "."), (";", "."), (None, ","), (";", ",")  # separator, decimal sign
 # Words of headers for two columns, in their order, by the second column of the file.
 HEADER_ORDER = {"right ticks": (r"right|dx|destra|r\b", r"left|sx|sinistra|l\b"),
@@ -87,54 +104,56 @@ class Table:
     source: Path | str | None  # a file or an argument; None if there is none
     numbers: np.ndarray  # (m, c)
     lines: np.ndarray = ()  # (m,) of the rows, from 1
-    row: str = "line"  # what messages call one
     notes: tuple[str, ...] = ()  # sentences on what was mended or left out
 
     def noted(self, note):
         """The Table with one more note, a clause about its file."""
         return replace(self, notes=(*self.notes, f"{Path(str(self.source)).name}{note}."))
 
-    def kept(self, ok, expected, share=0.0):
-        """The Table of the rows where `ok` is True, with a note on the others.
+    def place(self, k):
+        """What messages call row k (str)."""
+        return f"{'line' if isinstance(self.source, Path) else 'row'} {self.lines[k]}"
 
-        `ok` (m,) or (m, c) is bool; the latter tells the number to quote, and `expected` (str) may
-        be one for each column. Raises DatasetError for the first of the others if they are more
-        than a share of the rows.
+    def kept(self, ok, expected, share=0.0):
+        """The Table of the rows where `ok` (m,) or (m, c) is True, with a note on the others.
+
+        `expected` (str) may be one for each of c columns. Raises DatasetError for the first of the
+        others if they are more than a share of the rows.
         """
         if ok.all():
             return self
         bad = ~ok.reshape(len(ok), -1).all(axis=1)
         count, first = np.count_nonzero(bad), int(np.argmax(bad))
-        column = int(np.argmin(ok[first])) if ok.ndim == 2 else slice(None)
+        column = int(np.argmin(ok[first])) if ok.ndim == 2 else slice(None)  # what is quoted
         expected = expected if isinstance(expected, str) else expected[column]
         found = " ".join(f"{x:.12g}" for x in np.atleast_1d(self.numbers[first, column]))
-        said, place = f"{expected}, found '{found}'", f"{self.row} {self.lines[first]}"
+        said, place = f"{expected}, found '{found}'", self.place(first)
         require(count <= share * len(bad), f"{self.source}, {place}", said)
-        kept = replace(self, numbers=self.numbers[~bad], lines=self.lines[~bad])
-        return kept.noted(f": {count} of {len(bad)} rows left out, the first in {place}: expected "
-                          f"{said}")
+        return replace(self, numbers=self.numbers[~bad], lines=self.lines[~bad]).noted(
+            f": {count} of {len(bad)} rows left out, the first in {place}: expected {said}")
 
 
-def read_table(source, name, share=0.0, pose_count=None):
-    """The Table of a text file (Path) or Table, within LIMITS[name]; of None it has no rows.
+def read_table(source, name, pose_count=None):
+    """The Table of a text file (Path) or Table, whose rows pass all checks; of None it has no rows.
 
-    A share of the rows may be beyond LIMITS, or have pose ids beyond `pose_count`, and if it is not
-    0, any may have NaN or no range. Raises DatasetError if there are more, or a row has words or
-    another number of columns.
+    The checks are LIMITS[name] and CHECKS[name]. Pose ids of a sensor are at most `pose_count`; its
+    rows with NaN or without a range are left out with a note, and up to MAX_BAD_SHARE of others
+    that do not pass. Raises DatasetError for any other row, as one with words.
     """
     limits = LIMITS[name] | ({"pose id": Limit(1, pose_count, whole=True)} if pose_count else {})
     table = (_table_of_text(source, list(limits)) if isinstance(source, Path)
              else source or Table(None, np.empty((0, len(limits)))))
-    measured = ~np.isnan(table.numbers)
-    if "range" in limits:
-        measured[:, 2] &= table.numbers[:, 2] != 0
-    table = table.kept(measured, [
+    measured = (table.numbers != 0) | (np.array([*limits]) != "range")
+    table = table.kept(measured & ~np.isnan(table.numbers), [
         f"{column}, a number{' (0 is no reception)' * (column == 'range')}" for column in limits],
-        share > 0)
+        share=bool(pose_count))
+    share = MAX_BAD_SHARE * bool(pose_count)
     ok = [limit.holds(x) for limit, x in zip(limits.values(), table.numbers.T)]
-    return table.kept(np.stack(ok, axis=-1), [
+    table = table.kept(np.stack(ok, axis=-1), [
         f"{column}, a {'whole' if limit.whole else 'finite'} number {limit}"
         for column, limit in limits.items()], share)
+    right, expected = CHECKS[name]
+    return table.kept(right(table.numbers), expected, share)
 
 
 def table_of_array(source, value, name, counted=False):
@@ -148,19 +167,19 @@ def table_of_array(source, value, name, counted=False):
         array = np.asarray(value, dtype=float)
     except (TypeError, ValueError):
         array = np.asarray(value, dtype=object)
-    array = array if array.size else np.empty((0, len(columns)))
+    array = np.empty((0, len(columns))) if value is None or not array.size else array
     require(array.dtype == float and array.ndim == 2 and array.shape[1] == len(columns), source,
             f"a matrix of real numbers with {len(columns)} columns ({', '.join(columns)}), found "
             f"{array.dtype} of shape {array.shape}")
     rows = np.arange(1, len(array) + 1)
-    return Table(source, np.column_stack([rows, array]) if counted else array, rows, "row")
+    return Table(source, np.column_stack([rows, array]) if counted else array, rows)
 
 
 def _table_of_text(source, columns):
     """The Table of a text file with these columns, with NaN for empty cells."""
     table = Table(source, np.empty((0, len(columns))))
     rows = COMMENT_OR_QUOTE.sub("", read_text(source)).split("\n")
-    lines = [k for k, row in enumerate(rows, start=1) if row.strip(",; \t").strip()]
+    lines = [k for k, row in enumerate(rows, start=1) if re.search(r"[^,;\s]", row)]
     rows = [rows[k - 1].strip() for k in lines]
     if rows and re.search("[A-Za-z]", rows[0]) and not NUMBER_FIRST.search(rows[0]):
         words = [re.search(each, rows[0], re.I) for each in HEADER_ORDER.get(columns[1], ())]
@@ -170,37 +189,22 @@ def _table_of_text(source, columns):
         rows, lines = rows[1:], lines[1:]
     if not rows:
         return table
-    for end in ",;":                                # an empty last cell in every row
-        if all(row.endswith(end) for row in rows):
-            rows = [row[:-1] for row in rows]
-    numbers, decimal = _numbers(rows, len(columns))
-    if numbers is None:
-        k = bisect_left(range(len(rows)), True,  # the first row that ends all dialects
-                        key=lambda k: _numbers(rows[:k + 1], len(columns))[0] is None)
-        require(False, f"{source}, line {lines[k]}",
-                f"{len(columns)} numbers ({', '.join(columns)})", rows[k])
-    table = table.noted(" was read with decimal commas") if decimal == "," else table
+    cells = max((_cells(rows, len(columns), *dialect) for dialect in DIALECTS), key=len)
+    if len(cells) < len(rows):
+        require(False, f"{source}, line {lines[len(cells)]}",
+                f"{len(columns)} numbers ({', '.join(columns)})", rows[len(cells)])
+    if any("," in cell for row in cells for cell in row):
+        table = table.noted(" was read with decimal commas")
+    numbers = np.array([[float(cell.replace(",", ".")) for cell in row] for row in cells])
     return replace(table, numbers=numbers, lines=np.array(lines))
 
 
-def _numbers(rows, count):
-    """Numbers (m, count) in rows of text and the decimal sign, by the first dialect that has them.
-
-    They are None if there is none.
-    """
-    text = "\n".join(rows)
-    for separator, decimal in DIALECTS:
-        if decimal == "," and NO_DECIMAL_COMMA.search(text):
-            continue
-        cells = text.replace(",", ".") if decimal == "," else text
-        cells = EMPTY_CELL.sub("nan", cells) if separator else cells
-        try:
-            numbers = np.loadtxt(cells.split("\n"), delimiter=separator, comments=None, ndmin=2)
-        except ValueError:                              # words, or rows of different length
-            continue
-        if numbers.shape == (len(rows), count):
-            return numbers, decimal
-    return None, None
+def _cells(rows, count, separator, decimal):
+    """Numbers as text, `count` for each of the rows that a dialect has before the first other."""
+    number = f"({NUMBER[decimal]})"
+    cells = [rf"\s*(?:{number}\s*)?" if separator else number] * count
+    row = re.compile((separator or r"\s+").join(cells) + r"[\s,;]*", re.IGNORECASE)
+    return [match.groups("nan") for match in takewhile(bool, map(row.fullmatch, rows))]
 
 
 def contents(folder, expected=DATASET_FILES, required=None):
@@ -210,32 +214,41 @@ def contents(folder, expected=DATASET_FILES, required=None):
     have one of the names `expected`.
     """
     folder, files, notes, rest = Path(folder), {}, [], []
+    patterns = {name: name if name == "truth" else Path(name).stem + ENDING for name in expected}
     for path in _listed(folder):
-        name = next((name for name in expected if _is_named(path, name)), None)
+        name = next((name for name, pattern in patterns.items()
+                     if re.fullmatch(pattern, path.name, re.IGNORECASE)
+                     and (name == "truth" or not path.is_dir())), None)
         if name is None:
             rest.append(path)
-        else:
-            require(name not in files, folder / name, "one file of this name, found "
-                    f"{files.get(name, path).name} and {path.name}: move one of them away")
-            files[name] = path
-            notes += [f"{path.name} was read as {name}."] * (path.name.lower() != name.lower())
+            continue
+        require(name not in files, folder / name, "one file of this name, found "
+                f"{files.get(name, path).name} and {path.name}: move one of them away")
+        files[name] = path
+        notes += [f"{path.name} was read as {name}."] * (path.name.lower() != name.lower())
     if expected is DATASET_FILES:
-        rest = _add_variables(files, rest, notes)
+        rest = [path for path in rest if not _add_variables(files, path, notes)]
     require(required in (None, *files), folder / (required or ""),
             ". ".join(["this file, found none", *_not_read(rest)]).rstrip("."))
     return files, notes + _not_read(rest)
 
 
-def datasets_in(data):
-    """Names of the sub-folders with files of a dataset, and sentences on what else is there.
+def datasets_in(data, names=None):
+    """Names (list) of the datasets in a folder, and sentences (list) on what else is there.
 
-    Raises what `contents` raises.
+    They are all sub-folders with files of a dataset, or those that `names` selects. Raises
+    DatasetError if there is none, or no sub-folder of a selected name.
     """
     data = Path(data)
-    rest = [path for path in _listed(data) if path.name != "README.md"]
-    found = [path for path in rest if path.is_dir() and contents(path)[0]]
-    unread = _not_read([path for path in rest if path not in found])
-    return [path.name for path in found], [f"{data}: {each}" for each in unread]
+    rest = [path for path in _listed(data) if path.name != "README.md"] if data.is_dir() else []
+    found = [path.name for path in rest if path.is_dir() and contents(path)[0]]
+    require(found, data, f"this folder, with a sub-folder with an {ENCODER} for each dataset, "
+            "found none")
+    names = found if names is None else list(names)
+    for name in names:
+        require((data / name).is_dir(), data, f"one of {', '.join(found)}", name)
+    return names, [f"{data}: {each}" for each in _not_read(
+        [path for path in rest if path.name not in found])]
 
 
 def _listed(folder):
@@ -247,31 +260,18 @@ def _listed(folder):
         raise DatasetError(f"{folder}: expected a folder that can be read{place}") from None
 
 
-def _is_named(path, name):
-    """True if a file (Path) has this name, apart from case and ENDINGS."""
-    pattern = Path(name).stem + ENDINGS[Path(name).suffix]
-    return bool(re.fullmatch(pattern, path.name, re.IGNORECASE)) and (
-        name == "truth" or not path.is_dir())
-
-
-def _add_variables(files, rest, notes):
-    """The paths `rest` without .mat files that are read.
-
-    Their variables with the names of missing TABLES are added to `files`, with `notes`.
-    """
-    unread = []
-    for path in rest:
-        missing = {Path(name).stem.lower(): name for name in TABLES if name not in files}
-        try:
-            variables = loadmat(path) if missing and path.suffix.lower() == ".mat" else {}
-        except Exception:           # scipy raises many kinds about other versions and bytes
-            variables = {}
-        found = {missing[key.lower()]: key for key in variables if key.lower() in missing}
-        for name, key in found.items():
-            files[name] = table_of_array(f"{path}, variable {key}", variables[key], name)
-            notes.append(f"Variable {key} of {path.name} was read as {name}.")
-        unread += [path] * (not found)
-    return unread
+def _add_variables(files, path, notes):
+    """Add variables of a .mat file with the names of missing TABLES; False if there is none."""
+    missing = {Path(name).stem.lower(): name for name in TABLES if name not in files}
+    try:
+        variables = loadmat(path) if missing and path.suffix.lower() == ".mat" else {}
+    except Exception:               # scipy raises many kinds about other versions and bytes
+        return False
+    found = {missing[key.lower()]: key for key in variables if key.lower() in missing}
+    for name, key in found.items():
+        files[name] = table_of_array(f"{path}, variable {key}", variables[key], name)
+        notes.append(f"Variable {key} of {path.name} was read as {name}.")
+    return bool(found)
 
 
 def _not_read(paths):

@@ -1,7 +1,4 @@
-"""Reads files into text and TOML entries.
-
-A `DatasetError` is one sentence, which names the file, the line and what was expected there.
-"""
+"""Reads files into text and TOML entries."""
 
 import re
 import tomllib
@@ -10,7 +7,7 @@ from json import detect_encoding
 
 
 class DatasetError(ValueError):
-    """A dataset does not follow the format; the message names file, line and expectation."""
+    """A dataset does not follow the format; one sentence names file, line and expectation."""
 
 
 def require(ok, source, expected, found=None):

@@ -90,63 +90,58 @@ class Vehicle:
 
 # What each entry of vehicle.toml may be: a Limit, or a tuple of values.
 VEHICLE_LIMITS = {each.name: each.metadata["limit"] for each in fields(Vehicle)}
+TABLE_2 = Vehicle()  # the assignment's nominal vehicle
 
 
-def read_vehicle(path, default):
+def read_vehicle(path, default=TABLE_2):
     """The Vehicle of a `vehicle.toml` (Path or None), whose entries replace those of a default.
 
     Raises DatasetError if the file does not have the format.
     """
-    if path is None:
-        return default
-    for key, (value, place) in read_toml(path, "wheelbase = 0.4", [*VEHICLE_LIMITS]).items():
+    entries = read_toml(path, "wheelbase = 0.4", VEHICLE_LIMITS) if path else {}
+    for key, (value, place) in entries.items():
         default = changed(default, {key: value}, place)
     return default
 
 
 def changed(vehicle, entries, source):
-    """The Vehicle with `entries`, values by the names of its fields.
+    """The Vehicle with `entries`, values by the names of its fields; None leaves one as it is.
 
-    Raises DatasetError, which names the `source`, for one that is not within its Limit.
+    Raises DatasetError, which names the `source`, for a value that is not within its Limit.
     """
-    values = {}
     for key, value in entries.items():
         limit = VEHICLE_LIMITS[key]
         if isinstance(limit, Limit):
             ok = isinstance(value, Real) and type(value) is not bool and limit.holds(value)
-            value, expected = float(value) if ok else value, f"a number {limit}"
+            expected = f"a number {limit}"
         else:
             ok = type(value) is type(limit[0]) and value in limit
             expected = " or ".join(map(json.dumps, limit))
-        require(ok, source, f"{expected} for {key}", value)
-        values[key] = value
-    return replace(vehicle, **values)
+        require(ok or value is None, source, f"{expected} for {key}", value)
+    return replace(vehicle, **{key: value if isinstance(value, bool | str) else float(value)
+                               for key, value in entries.items() if value is not None})
 
 
 def incremental_counts(table, vehicle):
     """The Table of the encoders, and its counts since the previous pose, (n, 2) int64.
 
-    Those of a counter that wraps around are mended. Raises DatasetError if the first row is not 0,
-    or a step exceeds MAX_REVOLUTIONS.
+    Those of a counter that wraps around are mended: counts less a modulus, where that makes them
+    as small as most others. Raises DatasetError if there is no row, the first is not 0, or a step
+    exceeds MAX_REVOLUTIONS.
     """
     read, limit = table.numbers[:, 1:], MAX_REVOLUTIONS * vehicle.ticks_per_revolution
-    counts = unwrapped(read)
+    require(len(read), table.source, "at least the row '1 0 0', found no rows")
+    counts, large = read, np.quantile(abs(read[read != 0]), 0.9) if read.any() else 0.0
+    for modulus in MODULI:
+        less = counts - np.sign(counts) * modulus
+        if MIN_MODULUS_RATIO * large < modulus:
+            counts = np.where(abs(less) <= 2 * large, less, counts)
     if len(mended := np.flatnonzero((counts != read).any(axis=1))):
         table = table.noted(
             f": {len(mended)} rows were mended whose counts are 2^15 or 2^16 off, as of a counter "
-            f"that wraps around, first line {table.lines[mended[0]]}")
-    step = abs(counts).max(axis=1)
-    table.kept(step <= np.where(np.arange(len(step)) == 0, 0, limit), (
+            f"that wraps around, first {table.place(mended[0])}")
+    most = np.where(np.arange(len(read)) == 0, 0, limit)
+    table.kept(np.insert(abs(counts) <= most[:, None], 0, True, axis=1), (
         f"at most {MAX_REVOLUTIONS:g} wheel revolutions ({limit:g} ticks) since the pose before, "
         "not since the start, and none in the first row"))
     return table, counts.astype(np.int64)
-
-
-def unwrapped(counts):
-    """Counts (n, 2) in a step, less a modulus where that makes them as small as most others."""
-    large = np.quantile(abs(counts[counts != 0]), 0.9) if counts.any() else 0.0
-    for modulus in MODULI:
-        less = counts - np.sign(counts) * modulus
-        if 0 < MIN_MODULUS_RATIO * large < modulus:
-            counts = np.where(abs(less) <= 2 * large, less, counts)
-    return counts

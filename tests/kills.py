@@ -13,6 +13,7 @@ import signal
 import sys
 import tempfile
 from collections import Counter
+from itertools import product
 from pathlib import Path
 
 from slamlib import solve, swap
@@ -54,17 +55,12 @@ def _kill_at(step):
 
 
 def contents(folder):
-    """Bytes of the files in a folder by name, but those that begin with a dot."""
-    return {name: _plain(folder / name) for name in swap.file_names(folder)
-            if not Path(name).name.startswith(".")}
+    """Bytes of the files in a folder by name, without hidden ones and the times in a summary."""
+    return {name: re.sub(rb'"seconds": [^\n]*', b"", (folder / name).read_bytes())
+            for name in swap.file_names(folder) if not Path(name).name.startswith(".")}
 
 
-def _plain(file):
-    """Bytes of a file, of a summary without its times."""
-    return re.sub(rb'"seconds": [^\n]*', b"", file.read_bytes())
-
-
-def solves(root):
+def solves(root, one):
     """The command solve, of two drives whose problems are solved once: only files are written."""
     found = {}
     for name, seed in (("A", 3), ("B", 4)):
@@ -73,13 +69,12 @@ def solves(root):
         found[name] = [*solve.solutions(read_dataset(root / name))]
     solve.solutions = lambda dataset, problems: (
         each for each in found[dataset.name] if each.problem in problems)
-    return lambda name: main(["solve", str(root / name), "--out", str(root / "one")])
+    return lambda name: main(["solve", str(root / name), "--out", str(one)])
 
 
-def swaps(root):
+def swaps(_, one, two):
     """Two folders that are swapped as one, as a report and its results."""
     def swapped(name):
-        one, two = root / "one", root / "two"
         with swap.staging(one) as new_one, swap.staging(two) as new_two:
             for stage in (new_one, new_two):
                 for file in ("both.txt", f"{name}.txt", f"problem1/{name}.txt"):
@@ -89,74 +84,50 @@ def swaps(root):
     return swapped
 
 
-class Judge:
-    """What the folders (list of Path) of runs hold: the files of A or of B, and the user's."""
+def state(folders, expected):
+    """Which run, "A" or "B", the folders are of, finished; "unfinished" or "MIXED" else.
 
-    def __init__(self, folders, function):
-        self.folders, self.root, self.expected = folders, folders[0].parent, {}
-        for name in "AB":
-            self.reset()
-            for folder in folders:
-                for mine, text in MINE.items():
-                    swap.write_atomically(folder / mine, text.encode())
-            assert run(function, name) == 0
-            self.expected[name] = [*map(contents, folders)]
-            assert all(MINE.keys() <= found.keys() for found in self.expected[name])
-            for folder in folders:
-                shutil.copytree(folder, self.root / f"copy_{name}" / folder.name)
-
-    def reset(self, name=None):
-        """Make the folders those after the run of a name, or remove them."""
-        for path in (*self.folders, *self.root.glob(".*")):
-            if path.is_dir():
-                shutil.rmtree(path)
-            else:
-                path.unlink(missing_ok=True)
-        if name:
-            shutil.copytree(self.root / f"copy_{name}", self.root, dirs_exist_ok=True)
-
-    def state(self):
-        """Which run, "A" or "B", the folders are of, finished; "unfinished" or "MIXED: ..." else.
-
-        Never may files of two runs be side by side, nor a part of them. The user's files must be as
-        they were. A folder that a run was replacing is missing, and the old one is beside it.
-        """
-        found = [contents(folder) if folder.exists() else None for folder in self.folders]
-        if any(each is None and not swap.beside(folder, "old").exists()
-               for each, folder in zip(found, self.folders)):
-            return "MIXED: lost"
-        owners = {next((name for name in "AB" if each == self.expected[name][k]), "MIXED")
-                  for k, each in enumerate(found) if each is not None}
-        if "MIXED" in owners or None not in found and len(owners) > 1:
-            return f"MIXED: {owners}, {[sorted(each or {}) for each in found]}"
-        return "unfinished" if None in found else owners.pop()
-
-    def left(self):
-        """What is hidden or empty, and should not be there after an undisturbed run."""
-        return [path for folder in self.folders for path in folder.rglob("*")
-                if path.name.startswith(".") and path.name != swap.FILE_LIST
-                or path.is_dir() and not any(path.iterdir())] + [*self.root.glob(".*")]
+    Never may files of two runs be side by side, nor a part of them. The user's files must be as
+    they were. A folder that a run was replacing is missing, and the old one is beside it.
+    """
+    found = [contents(folder) if folder.exists() else None for folder in folders]
+    lost = any(each is None and not swap.beside(folder, "old").exists()
+               for each, folder in zip(found, folders))
+    owners = [name for name in "AB" if all(
+        each in (None, wanted) for each, wanted in zip(found, expected[name]))]
+    return "MIXED" if lost or not owners else "unfinished" if None in found else owners[0]
 
 
-def at_every_step(function, judge, begin, then):
+def at_every_step(function, folders, begin, then):
     """Counts after kills before each step of a run of `then`, where that of `begin` ended well.
 
-    After every third one a run is undisturbed.
+    After every third one a run is undisturbed, and nothing may be left that is hidden or empty.
     """
+    work, expected = folders[0].parent, {}
+    for name in "AB":
+        for folder, (mine, text) in product(folders, MINE.items()):
+            swap.write_atomically(folder / mine, text.encode())
+        assert run(function, name) == 0
+        expected[name] = [*map(contents, folders)]
+        assert all(MINE.keys() <= found.keys() for found in expected[name])
+        work.rename(work.with_name(f"after {name}"))
     counts, step, code = Counter(), 0, -9
     while code == -9:
         step += 1
-        judge.reset(begin)
+        shutil.rmtree(work, ignore_errors=True)
+        shutil.copytree(work.with_name(f"after {begin}"), work)
         code = run(function, then, step)
         counts["killed"] += code == -9
-        state = judge.state()
-        counts[state.partition(":")[0]] += 1
-        if step % 3 == 0 or state.startswith("MIXED"):
-            print(f"step {step}: {state}", file=sys.stderr)
+        found = state(folders, expected)
+        counts[found] += 1
+        if step % 3 == 0 or found == "MIXED":
+            print(f"step {step}: {found}", file=sys.stderr)
             assert run(function, then) == 0
             counts["runs after"] += 1
-            counts["MIXED"] += judge.state() != then
-            counts["LEFT"] += len(judge.left())
+            counts["MIXED"] += state(folders, expected) != then
+            counts["LEFT"] += sum(
+                path.name.startswith(".") and path.name != swap.FILE_LIST
+                or path.is_dir() and not any(path.iterdir()) for path in work.rglob("*"))
     assert code == 0
     return counts
 
@@ -166,6 +137,5 @@ if __name__ == "__main__":
     for kind, names, begin, then in ((solves, ["one"], *"AB"), (swaps, ["one", "two"], *"BA")):
         with tempfile.TemporaryDirectory(dir=memory if memory.is_dir() else None) as folder:
             root = Path(folder).resolve()
-            function = kind(root)
-            judge = Judge([root / name for name in names], function)
-            print(json.dumps(at_every_step(function, judge, begin, then)), flush=True)
+            folders = [root / "work" / name for name in names]
+            print(json.dumps(at_every_step(kind(root, *folders), folders, begin, then)), flush=True)

@@ -1,33 +1,19 @@
 """Files as they come: the same numbers with a note, named as not read, or refused."""
 
-import re
 import shutil
 
 import numpy as np
 import pytest
+import test_dataset
 from scipy.io import savemat
-from test_dataset import (  # noqa: F401
-    FILES,
-    assert_same,
-    assert_same_but_notes,
-    error_of,
-    folder,
-    write,
-)
+from test_dataset import FILES, assert_same, error_of, write
 
-from slamlib.dataset import (
-    Dataset,
-    DatasetError,
-    Vehicle,
-    dataset_names,
-    inventory_lines,
-    read_dataset,
-    read_truth,
-)
+from slamlib.dataset import Dataset, Vehicle, inventory_lines, read_dataset, read_truth
 from slamlib.simulation import simulate, write_dataset
 from slamlib.tables import datasets_in
 from slamlib.textfile import quoted
 
+folder = test_dataset.folder
 TABLES = ("encoderReading.txt", "ArucoReading.txt", "UwbReading.txt", "UwbAntennaGuess.txt")
 SENSORS = TABLES[1:]
 
@@ -46,7 +32,6 @@ def with_comments(text):
         f"{line} # 1 2, \u00b5m" for line in text.splitlines())
 
 
-DECIMALS = "{} was read with decimal commas."
 PLAIN = {  # what all files may have, as a function of their text
     "CRLF": lambda text: text.replace("\n", "\r\n"), "no last line end": str.rstrip,
     "lone CR": lambda text: text.replace("\n", "\r"),
@@ -55,103 +40,94 @@ PLAIN = {  # what all files may have, as a function of their text
     "UTF-8 comments": with_comments,
     "Latin-1 comments": lambda text: with_comments(text).encode("latin-1"),
     "byte-order mark": lambda text: text.encode("utf-8-sig")}
-DIALECTS = {  # the dialect of a table as a function of the plain text; the note on each table
-    "commas": (rows(","), None), "commas and blanks": (rows(" , "), None),
-    "a comma at the end": (rows(",", end=","), None), "quotes": (quotes, None),
-    "empty rows of a spreadsheet": (lambda text: rows(",")(text) + "\n,,,\n,,,\n", None),
-    "semicolons": (rows(";"), None), "semicolons at the end": (rows(" ", end=" ;"), None),
-    "semicolons, decimal commas": (rows(";", ","), DECIMALS),
-    "tabs, decimal commas": (rows("\t", ","), DECIMALS),
-    "blanks, decimal commas": (rows(" ", ","), DECIMALS),
-    "comments of MATLAB": (lambda text: "% c, 1\n" + text.replace("\n", " % 1;2\n"), None),
-    "comments of C": (lambda text: "// c, 1\n" + text.replace("\n", " // 1;2\n"), None),
-    "header": (lambda text: "\n# c\n id  words\n" + text,
-               "{}: the header 'id  words' was left out."),
-    "header and commas": (lambda text: "id, no number\n" + rows(",")(text),
-                          "{}: the header 'id, no number' was left out."),
-    **{codec: (lambda text, codec=codec: text.encode(codec), None)
-       for codec in ("UTF-16", "UTF-16-be", "UTF-16-le", "UTF-32", "UTF-32-le")},
-    **{name: (function, None) for name, function in PLAIN.items()}}
+DIALECTS = {  # those of a table
+    "commas": rows(","), "commas and blanks": rows(" , "), "a comma at the end": rows(",", end=","),
+    "quotes": quotes, "semicolons": rows(";"), "semicolons at the end": rows(" ", end=" ;"),
+    "empty rows of a spreadsheet": lambda text: rows(",")(text) + "\n,,,\n,,,\n",
+    "semicolons, decimal commas": rows(";", ","), "tabs, decimal commas": rows("\t", ","),
+    "blanks, decimal commas": rows(" ", ","),
+    "comments of MATLAB": lambda text: "% c, 1\n" + text.replace("\n", " % 1;2\n"),
+    "comments of C": lambda text: "// c, 1\n" + text.replace("\n", " // 1;2\n"),
+    "header": lambda text: "\n# c\n id  words\n" + text,
+    "header and commas": lambda text: "id  words\n" + rows(",")(text),
+    **{codec: lambda text, codec=codec: text.encode(codec)
+       for codec in ("UTF-16", "UTF-16-be", "UTF-16-le", "UTF-32", "UTF-32-le")}, **PLAIN}
+NOTES = {"decimal": " was read with decimal commas.", "header": ": the header 'id  words' was left "
+         "out."}
 
 
 @pytest.mark.parametrize("dialect", DIALECTS)
-def test_a_table_in_another_dialect_is_the_same_with_a_note(folder, dialect):  # noqa: F811
+def test_a_table_in_another_dialect_is_the_same_with_a_note(folder, dialect):
     clean, truth = read_dataset(folder), read_truth(folder)
-    translated, note = DIALECTS[dialect]
     names = SENSORS if "decimal" in dialect else FILES if dialect in PLAIN else (
         *TABLES, "truth/vehiclePose.txt")
     for name in names:
-        write(folder / name, translated(FILES[name]))
-    found, true = read_dataset(folder), read_truth(folder)
-    assert_same_but_notes(found, clean)
-    assert_same_but_notes(true, truth)
-    assert {note.format(name) for name in TABLES if name in names and note} <= set(found.notes)
-    assert bool(found.notes) == (note is not None)
-    assert bool(true.notes) == (note is not None and len(names) > 3)
+        write(folder / name, DIALECTS[dialect](FILES[name]))
+    noted = [f"{name}{note}" for word, note in NOTES.items() if word in dialect for name in names]
+    assert_same(read_dataset(folder), clean, *(note for note in noted if "truth/" not in note))
+    assert_same(read_truth(folder), truth, *(
+        note.replace("truth/", "In truth: ") for note in noted if "truth/" in note))
 
 
 @pytest.mark.parametrize("header", [
     "pose_id,marker_id,x,y,theta,s_xx,s_xy,s_xtheta,s_yy,s_ytheta,s_thetatheta",
     "Pose Marker x y heading cov_xx cov_xy cov_xt cov_yy cov_yt cov_tt", "id tag", "k j dx dy",
     "id_pose;id_aruco;dx;dy", "pose_id marker_id pose_x pose_y", "n landmark l r"])
-def test_headers_in_the_order_of_the_format_are_left_out(folder, header):  # noqa: F811
+def test_headers_in_the_order_of_the_format_are_left_out(folder, header):
     clean = read_dataset(folder)
     write(folder / "ArucoReading.txt", header + "\n" + FILES["ArucoReading.txt"])
-    found = read_dataset(folder)
-    assert_same_but_notes(found, clean)
     note = f"ArucoReading.txt: the header {quoted(header)} was left out."
-    assert found.notes == (note,)
+    assert_same(read_dataset(folder), clean, note)
     write(folder / "ArucoReading.txt", header + "\n;;;\n")
-    found = read_dataset(folder)
-    assert found.aruco is None and found.notes == (note,)
+    assert_same(read_dataset(folder), clean.without("aruco"), note)
 
 
 @pytest.mark.parametrize("nan", ["nan", "NaN", "-nan"])
-def test_rows_of_measurements_with_nan_or_without_reception_are_left_out(folder, nan):  # noqa: F811
+def test_rows_of_measurements_with_nan_or_without_reception_are_left_out(folder, nan):
     clean = read_dataset(folder)
     write(folder / "ArucoReading.txt", f"1 40 {nan} 0 0 1 0 0 1 0 1\n" + FILES["ArucoReading.txt"]
           + f"{nan} 40 0 0 0 1 0 0 1 0 1\n")
     write(folder / "UwbReading.txt", "# c\n" + rows(",")(FILES["UwbReading.txt"])
           + "\n1,3,,1\n1,3,0,0")
-    found = read_dataset(folder)
-    assert_same_but_notes(found, clean)
-    assert found.notes == (
-        "ArucoReading.txt: 2 of 5 rows left out, the first in line 1: expected x, a number, found "
-        "'nan'.", "UwbReading.txt: 2 of 4 rows left out, the first in line 4: expected range, a "
-        "number (0 is no reception), found 'nan'.")
+    assert_same(
+        read_dataset(folder), clean, "ArucoReading.txt: 2 of 5 rows left out, the first in line 1: "
+        "expected x, a number, found 'nan'.", "UwbReading.txt: 2 of 4 rows left out, the first in "
+        "line 4: expected range, a number (0 is no reception), found 'nan'.")
     write(folder / "UwbReading.txt", f"1 3 {nan} 1\n2 3 0 0\n")
     assert read_dataset(folder).uwb is None
 
 
-BAD_ROWS = {  # a row that cannot be, and what is said of it
-    "ArucoReading.txt": [
-        ("1 40 0 0 0 1 1 0 1 0 1", "a positive definite covariance"),
-        ("2001 40 0 0 0 1 0 0 1 0 1", "pose id, a whole number from 1 to 2000"),
-        ("1 40 0 inf 0 1 0 0 1 0 1", "y, a finite number from -10000 to 10000 m, found 'inf'"),
-        ("1 4.5 0 0 0 1 0 0 1 0 1", "marker id, a whole number")],
-    "UwbReading.txt": [
-        ("1 5 -5.1 1", "a range that is not below -5 sigma"),
-        ("1 5 1 0", "sigma, a finite number from 1e-09 to 10000 m, found '0'"),
-        ("0 5 1 1", "pose id, a whole number from 1 to 2000")]}
+POSE, ID = "pose id, a whole number from 1 to 300", "a whole number from -1e+15 to 1e+15"
+BAD_ROWS = {  # rows that cannot be, by what is said of them
+    "ArucoReading.txt": {
+        "a positive definite covariance": [f"1 40 0 0 0 {covariance}" for covariance in (
+            "1 1 0 1 0 1", "1e-4 2e-4 0 1e-4 0 1e4", "1 .9 -.9 1 .9 1", "1 9e14 0 1 0 1e-18")],
+        POSE: ["301 40 0 0 0 1 0 0 1 0 1", "0 40 0 0 0 1 0 0 1 0 1"],
+        "y, a finite number from -10000 to 10000 m, found 'inf'": ["1 40 0 inf 0 1 0 0 1 0 1"],
+        f"marker id, {ID}": ["1 4.5 0 0 0 1 0 0 1 0 1"]},
+    "UwbReading.txt": {
+        "a range that is not below -5 sigma": ["1 5 -5.1 1"], POSE: ["0 5 1 1"],
+        "sigma, a finite number from 1e-09 to 10000 m, found '0'": ["1 5 1 0"],
+        f"antenna id, {ID}": ["1 3.5 1 1"]}}
 
 
-@pytest.mark.parametrize("name, row, said", [
-    (name, *bad) for name, rows in BAD_ROWS.items() for bad in rows])
-def test_a_bad_row_costs_a_row_up_to_a_tenth_of_the_file(tmp_path, name, row, said):
-    write_dataset(tmp_path, simulate("short", 1)[0])
+@pytest.mark.parametrize("name, said, row", [
+    (name, said, row) for name, told in BAD_ROWS.items() for said, rows in told.items()
+    for row in rows])
+def test_a_bad_row_costs_a_row_up_to_a_tenth_of_the_file(tmp_path, name, said, row):
+    write_dataset(tmp_path, simulate("short", 1)[0].first(300))
     clean, lines = read_dataset(tmp_path), (tmp_path / name).read_text().splitlines()
     most = len(lines) // 9                            # rows that are a tenth of the file
     lines[2:2] = [row, "# comment"]
     lines += [row] * (most - 1)
     write(tmp_path / name, "\n".join(lines))
-    found = read_dataset(tmp_path)
-    assert_same_but_notes(found, clean)
-    note, = found.notes
+    note, = (found := read_dataset(tmp_path)).notes
+    assert_same(found, clean, note)
     assert note.startswith(f"{name}: {most} of {len(lines) - 1} rows left out, the first in line 3:"
                            f" expected {said}")
     write(tmp_path / name, "\n".join(lines + [row] * 2))
-    message = error_of(read_dataset, tmp_path)
-    assert message.startswith(f"{tmp_path / name}, line 3: expected {said}")
+    assert error_of(read_dataset, tmp_path).startswith(
+        f"{tmp_path / name}, line 3: expected {said}")
 
 
 # Files of MATLAB.
@@ -161,7 +137,7 @@ def matrix(name):
     return np.array([line.split() for line in FILES[name].splitlines()], float)
 
 
-def test_tables_in_one_mat_file_where_the_text_is_missing(folder):  # noqa: F811
+def test_tables_in_one_mat_file_where_the_text_is_missing(folder):
     clean = read_dataset(folder)
     values = {"ENCODERreading": matrix("encoderReading.txt").astype("int32"), "x": 1.0,
               **{name.removesuffix(".txt"): matrix(name) for name in SENSORS}}
@@ -171,9 +147,8 @@ def test_tables_in_one_mat_file_where_the_text_is_missing(folder):  # noqa: F811
     assert read_dataset(folder).notes == ("Not read: 'drive.mat', 'other.mat'.",)
     for name in TABLES:
         (folder / name).unlink()
-    found = read_dataset(folder)
-    assert_same_but_notes(found, clean)
-    assert found.notes == (
+    assert_same(
+        read_dataset(folder), clean,
         *(f"Variable {variable} of drive.mat was read as {name}." for variable, name in zip(
             ["ENCODERreading", *(name.removesuffix(".txt") for name in SENSORS)], TABLES)),
         "Not read: 'other.mat'.",
@@ -181,21 +156,17 @@ def test_tables_in_one_mat_file_where_the_text_is_missing(folder):  # noqa: F811
         "a number (0 is no reception), found 'nan'.")
 
 
-@pytest.mark.parametrize("value, said", [
-    (np.array([[1, 3, 1.5, 0.1], [9, 3, 1.5, 0.1]]), ", row 2: expected pose id, a whole "
-     "number from 1 to 4"),
-    (np.array([[1, "a"]], dtype=object), ": expected a matrix of real numbers with 4 columns (pose "
-     "id, antenna id, range, sigma), found object of shape (1, 2)")])
-def test_faults_in_a_mat_file_are_named_by_variable_and_row(folder, value, said):  # noqa: F811
+def test_faults_in_a_mat_file_are_named_by_variable_and_row(folder):
     (folder / "UwbReading.txt").unlink()
-    savemat(folder / "logs.mat", {"UwbReading": value})
-    message = error_of(read_dataset, folder)
-    assert message.startswith(f"{folder / 'logs.mat'}, variable UwbReading{said}")
+    savemat(folder / "logs.mat", {"UwbReading": [[1, 3, 1.5, 0.1], [9, 3, 1.5, 0.1]]})
+    assert error_of(read_dataset, folder).startswith(
+        f"{folder / 'logs.mat'}, variable UwbReading, row 2: expected pose id, a whole number from "
+        "1 to 4")
 
 
 @pytest.mark.parametrize("content", [
     b"", b"nonsense", b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + b"\0" * 99])
-def test_a_mat_file_that_cannot_be_read_is_listed(folder, content):  # noqa: F811
+def test_a_mat_file_that_cannot_be_read_is_listed(folder, content):
     write(folder / "UwbReading.mat", content)
     (folder / "UwbReading.txt").unlink()
     assert read_dataset(folder).notes == ("Not read: 'UwbReading.mat'.",)
@@ -209,13 +180,20 @@ ARRAYS = {"ticks": matrix("encoderReading.txt")[:, 1:], **{
     argument: matrix(name) for argument, name in zip(("aruco", "uwb", "guess"), SENSORS)}}
 
 
-def test_arrays_are_the_dataset_of_their_files(folder):  # noqa: F811
+def test_arrays_are_the_dataset_of_their_files(folder):
     expected = read_dataset(folder)
+    options = {"vehicle": expected.vehicle, "name": "drive"}
     for given in (ARRAYS, {name: value.tolist() for name, value in ARRAYS.items()}):
-        found = Dataset.from_arrays(**given, vehicle=expected.vehicle, name="drive")
-        assert_same(found, expected)
+        assert_same(Dataset.from_arrays(**given, **options), expected)
     alone = Dataset.from_arrays(ARRAYS["ticks"])
     assert (alone.aruco, alone.uwb, alone.antenna_guess) == (None, None, None)
+    gaps = {"aruco": [[1, 4, np.nan, *ARRAYS["aruco"][0, 3:]], *ARRAYS["aruco"]],
+            "uwb": [*ARRAYS["uwb"], [1, 3, 0, 1]]}
+    assert_same(
+        Dataset.from_arrays(**ARRAYS | gaps, **options), expected,
+        "aruco: 1 of 4 rows left out, the first in row 1: expected x, a number, found 'nan'.",
+        "uwb: 1 of 3 rows left out, the first in row 3: expected range, a number (0 is no "
+        "reception), found '0'.")
 
 
 @pytest.mark.parametrize("name, place, value, told", [
@@ -223,11 +201,11 @@ def test_arrays_are_the_dataset_of_their_files(folder):  # noqa: F811
      "left ticks), found float64 of shape (2, 1)"), ("ticks", None, [], ": expected at least"),
     ("ticks", (3, 1), np.nan, ", row 4: expected left ticks, a number"),
     ("aruco", None, [[1], [1, 2]], ": expected a matrix of real numbers with 11 columns (pose id"),
+    ("uwb", None, [[1, "a"]], ": expected a matrix of real numbers with 4 columns (pose id, "
+     "antenna id, range, sigma), found object of shape (1, 2)"),
     ("aruco", (2, 0), 5, ", row 3: expected pose id, a whole number from 1 to 4"),
-    ("aruco", (2, 2), np.nan, ", row 3: expected x, a number, found 'nan'"),
-    ("aruco", (2, 6), 1.0, ", row 3: expected a positive definite covariance"),
-    ("uwb", (0, 3), -0.1, ", row 1: expected sigma, a finite number from 1e-09"),
-    ("uwb", (1, 2), 0, ", row 2: expected range, a number (0 is no reception)"),
+    ("ticks", (2, 0), 80_001, ", row 3: expected at most 10 wheel revolutions (80000 ticks) since "
+     "the pose before, not since the start, and none in the first row, found '80001'"),
     ("uwb", (1, 1), 4, ", row 2: expected an antenna id that the guesses have"),
     ("guess", (1, 0), 900, ", row 2: expected each id only once"),
     ("vehicle", None, "tractor", ": expected an argument of type Vehicle, found 'tractor'"),
@@ -238,8 +216,8 @@ def test_arguments_pass_the_checks_of_files_or_are_named_with_the_row(name, plac
     if place:
         value, number = ARRAYS[name].copy(), value
         value[place] = number
-    with pytest.raises(DatasetError, match="^" + re.escape(name + told)):
-        Dataset.from_arrays(**ARRAYS | {name: value})
+    given = ARRAYS | {name: value}
+    assert error_of(Dataset.from_arrays, *given.values()).startswith(name + told)
 
 
 # Which file of a folder is which.
@@ -253,35 +231,32 @@ def test_arguments_pass_the_checks_of_files_or_are_named_with_the_row(name, plac
     ("encoderReading.txt", "encoderReading.csv"), ("UwbReading.txt", "UwbReading"),
     ("UwbAntennaGuess.txt", "UwbAntennaGuess.txt.txt"), ("vehicle.toml", "vehicle.toml.txt"),
     ("vehicle.toml", "vehicle (1).toml"), ("vehicle.toml", "vehicle - Copy.toml")])
-def test_a_name_that_is_unmistakable_is_read_with_a_note(folder, name, variant):  # noqa: F811
+def test_a_name_that_is_unmistakable_is_read_with_a_note(folder, name, variant):
     clean, truth = read_dataset(folder), read_truth(folder)
     (folder / name).rename(folder / variant)
-    dataset = read_dataset(folder)
-    assert_same_but_notes(dataset, clean)
+    assert_same(read_dataset(folder), clean, f"{variant} was read as {name}.")
     assert_same(read_truth(folder), truth)
-    assert dataset.notes == (f"{variant} was read as {name}.",)
-    assert dataset_names(folder.parent) == ["drive"]
+    assert datasets_in(folder.parent) == (["drive"], [])
 
 
 @pytest.mark.parametrize("change", [str.upper, str.lower])
-def test_names_in_another_case_are_found_in_the_folder_truth_too(folder, change):  # noqa: F811
+def test_names_in_another_case_are_found_in_the_folder_truth_too(folder, change):
     clean, truth = read_dataset(folder), read_truth(folder)
     for name in FILES:
         path = folder / name
         path.rename(path.with_name(change(path.name)))
     (folder / "truth").rename(truths := folder / change("truth"))
-    assert_same((read_dataset(folder), read_truth(folder)), (clean, truth))
+    assert_same(read_dataset(folder), clean)
+    assert_same(read_truth(folder), truth)
     (truths / change("ArucoMap.txt")).rename(truths / "ArucoMap (1).txt")
     write(truths / "sketch.png", b"\x89")
-    found = read_truth(folder)
-    assert_same_but_notes(found, truth)
-    assert found.notes == ("In truth: ArucoMap (1).txt was read as ArucoMap.txt.",
-                           "In truth: Not read: 'sketch.png'.")
+    assert_same(read_truth(folder), truth, "In truth: ArucoMap (1).txt was read as ArucoMap.txt.",
+                "In truth: Not read: 'sketch.png'.")
 
 
-def test_two_files_of_one_name_are_refused(folder):  # noqa: F811
+def test_two_files_of_one_name_are_refused(folder):
     shutil.copy(folder / "ArucoReading.txt", folder / "ArucoReading (1).txt")
-    assert error_of(read_dataset, folder) == error_of(dataset_names, folder.parent) == (
+    assert error_of(read_dataset, folder) == error_of(datasets_in, folder.parent) == (
         f"{folder / 'ArucoReading.txt'}: expected one file of this name, found ArucoReading (1).txt"
         " and ArucoReading.txt: move one of them away")
 
@@ -290,18 +265,16 @@ def test_two_files_of_one_name_are_refused(folder):  # noqa: F811
     "ArucoMeasurements.txt", "markers.csv", "ArucoReading_2.txt", "ArucoReading.txt.bak",
     "ArucoReading.json", "ArucoReading.xlsx", "ArucoReading.pdf", "ArucoReading.txt.gz",
     "ArucoReading.zip", "ArucoReading.txt.crdownload", ".ArucoReading.txt.icloud", "logs.zip"])
-def test_other_names_are_not_guessed_but_listed(folder, name):  # noqa: F811
+def test_other_names_are_not_guessed_but_listed(folder, name):
     clean = read_dataset(folder)
     (folder / "ArucoReading.txt").rename(folder / name)
-    dataset = read_dataset(folder)
-    assert_same_but_notes(dataset, clean.without("aruco"))
-    assert dataset.notes == (f"Not read: '{name}'.",)
+    assert_same(read_dataset(folder), clean.without("aruco"), f"Not read: '{name}'.")
     (folder / "encoderReading.txt").unlink()
     assert error_of(read_dataset, folder) == (
         f"{folder / 'encoderReading.txt'}: expected this file, found none. Not read: '{name}'")
 
 
-def test_other_files_are_named_and_those_of_systems_are_not(folder):  # noqa: F811
+def test_other_files_are_named_and_those_of_systems_are_not(folder):
     for name in (".DS_Store", "._ArucoReading.txt", "Thumbs.db", "desktop.ini", "README.md",
                  "notes.txt", "photo.jpg", "uwb.pdf", "\u6d4b\n.txt"):
         write(folder / name, b"\0")
@@ -322,19 +295,18 @@ def test_datasets_are_the_folders_with_any_file_of_one_and_all_others_are_named(
     for name in ("notes.txt", "encoder.txt", "vehiclePose.mat", "drive.zip"):
         write(tmp_path / "notes" / name, b"\0")
     write(tmp_path / "course.zip", b"PK")
-    assert datasets_in(tmp_path)[1] == [f"{tmp_path}: Not read: 'course.zip', 'notes'."]
-    assert dataset_names(tmp_path) == ["a", "b"] and dataset_names(tmp_path, ["b"]) == ["b"]
+    for names in (["a", "b"], ["b"]):
+        assert datasets_in(tmp_path, names) == (names, [
+            f"{tmp_path}: Not read: 'course.zip', 'notes'."])
     for name in ("UwbReading.txt", "vehicle.toml.txt"):
         write(tmp_path / f"{name}_alone" / name, "")
     assert datasets_in(tmp_path)[0] == ["UwbReading.txt_alone", "a", "b", "vehicle.toml.txt_alone"]
-    absent = "encoderReading.txt: expected this file, found none"
-    for names, said in ((["c"], "expected one of UwbReading.txt_alone, a, b, .*, found 'c'"),
-                        (["notes"], f"notes.{absent}"), (None, f"UwbReading.txt_alone.{absent}")):
-        with pytest.raises(DatasetError, match=said):
-            dataset_names(tmp_path, names)
+    said = "expected one of UwbReading.txt_alone, a, b, vehicle.toml.txt_alone, found 'c'"
+    assert error_of(datasets_in, tmp_path, ["b", "c"]) == f"{tmp_path}: {said}"
+    assert "with a sub-folder with an enc" in error_of(datasets_in, tmp_path / "a")
 
 
-def test_what_was_found_is_said(folder):  # noqa: F811
+def test_what_was_found_is_said(folder):
     wheels = "drive: encoders: 4 poses, 15 ticks right and 32019 left"
     assert inventory_lines(read_dataset(folder), read_truth(folder)) == [
         wheels, "drive: markers: 3 sightings of 2 markers at 2 poses",

@@ -11,7 +11,6 @@ from numeric import as_points, changed
 from slamlib.checks import files
 from slamlib.checks.files import doubts_before_solving
 from slamlib.dataset import AntennaGuess, Dataset, DatasetError, UwbReadings, Vehicle, read_dataset
-from slamlib.doubt import Doubt
 from slamlib.simulation import manoeuvre, simulate, write_dataset
 
 SEEDS = (0, 1)
@@ -218,10 +217,10 @@ def test_too_little_to_decide_gives_no_doubt():
 def test_doubts_about_files_erase_no_others():
     """Each kind is told once; of antennas and units, each sentence."""
     kinds = ["units", "odometry", "marker-noise", "antenna", "truth-frame", "antenna", "units"]
-    doubts = [Doubt(kind, f"Sentence {k}.") for k, kind in enumerate(kinds)]
+    doubts = [files.Doubt(kind, f"Sentence {k}.") for k, kind in enumerate(kinds)]
     assert files.merged(doubts) == doubts
-    assert files.merged([*doubts, Doubt("odometry", "Again."), doubts[0]]) == [
-        doubts[0], Doubt("odometry", "Again."), *doubts[2:]]
+    again = files.Doubt("odometry", "Again.")
+    assert files.merged([*doubts, again, doubts[0]]) == [doubts[0], again, *doubts[2:]]
 
 
 def moved_by(length, turn, count=20):

@@ -9,8 +9,7 @@ from conftest import contradicted
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_output
 
 from slamlib import localization, solve
-from slamlib.dataset import DatasetError
-from slamlib.doubt import Doubt
+from slamlib.dataset import DatasetError, Doubt
 from slamlib.notebook import Drive, attempted, drives, notices, show_doubts, solved
 from slamlib.results import read_structs
 from slamlib.simulation import simulate

@@ -12,6 +12,7 @@ import pytest
 from numeric import changed, known_noise
 
 from slamlib import se2, slam, solve
+from slamlib.__main__ import summary_table
 from slamlib.checks.files import doubts_before_solving
 from slamlib.checks.solution import GROUPS, solution_doubts
 from slamlib.dataset import Vehicle, read_dataset, read_truth
@@ -27,7 +28,6 @@ from slamlib.slam.calibration import (
 )
 from slamlib.slam.measurements import Noise
 from slamlib.slam.result import turn_sigma
-from slamlib.summary import summarize, summary_table
 
 SHORT = Path(__file__).parents[1] / "data" / "short"
 
@@ -402,7 +402,7 @@ def test_a_marker_with_a_single_accepted_sighting_is_unconfirmed():
     assert not solution_doubts(found)
     row = solve.problem_solution("problem3", dataset.without("uwb"), found)
     text = summary_table({"dataset": "short", "poses": 600, "doubts": [],
-                          "problems": {"problem3": summarize(row, None)}})
+                          "problems": {"problem3": solve.summarize(row, None)}})
     assert f"confirms markers {label[count.argmax()]}: seen once, or" in text
 
 

@@ -3,11 +3,13 @@
 import re
 import sys
 import tomllib
+from importlib.metadata import packages_distributions, requires
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import yaml
+from test_structure import MODULES, outside
 
 from slamlib.report import notebooks
 
@@ -35,6 +37,15 @@ def test_the_environment_of_conda_has_what_the_lock_is_made_from():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert required(project["dependencies"]).keys() <= asked.keys()
     assert conda["python"] in [f"3.{minor}.*" for minor in range(11, 15)]
+
+
+def test_what_slamlib_imports_is_a_dependency_or_comes_with_one():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    asked = required(project["dependencies"])
+    there = asked.keys() | required(line for each in asked for line in requires(each) or ()
+                                    if "extra ==" not in line).keys()
+    found = {name for module in MODULES for name in outside(module) - {"importlib"}}
+    assert {packages_distributions()[name][0].lower().replace("_", "-") for name in found} <= there
 
 
 def test_the_version_that_check_python_asks_for_is_the_one_that_is_pinned():

@@ -133,10 +133,8 @@ def test_the_whole_graph_in_gtsam_has_the_solution_and_its_covariances(drive):
     ([C(0)], "found c0")])
 def test_factors_that_the_graph_cannot_have_are_refused(drive, keys, told):
     own = gtsam.NonlinearFactorGraph()
-    if len(keys) == 2:
-        own.add(gtsam.BetweenFactorPose2(*keys, gtsam.Pose2(), SIGMA(3, 0.1)))
-    else:
-        own.add(gtsam.PriorFactorPose2(*keys, gtsam.Pose2(), SIGMA(3, 0.1)))
+    factor = gtsam.BetweenFactorPose2 if len(keys) == 2 else gtsam.PriorFactorPose2
+    own.add(factor(*keys, gtsam.Pose2(), SIGMA(3, 0.1)))
     with pytest.raises(DatasetError, match=f"^factors: expected in factor 0 one .*{told}$"):
         slam.estimate(known_noise(drive[0].first(100), 1e-3), factors=own)
 

@@ -49,8 +49,10 @@ def test_simulate_then_solve(tmp_path):
     assert (made.returncode, made.stdout, made.stderr) == (0, "", "")
     done = run("solve", "drive", "--out", "out", "--problem", 1, cwd=tmp_path)
     assert done.returncode == 0
-    assert [line.split(":")[1] for line in done.stderr.splitlines()] == [
+    *found, last = done.stderr.splitlines()
+    assert [line.split(":")[1] for line in found] == [
         " encoders", " markers", " ranges", " vehicle.toml", " truth"]
+    assert last == f"results: {tmp_path / 'out'}"
     lines = done.stdout.splitlines()
     assert lines[0] == "drive: 4000 poses" and lines[2].startswith("problem1 ")
     assert max(map(len, lines)) <= 100
@@ -61,8 +63,6 @@ def test_simulate_then_solve(tmp_path):
         np.testing.assert_array_equal(got, expected)
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["dataset"] == "drive" and 0 < summary["problems"]["problem1"]["ate_m"] < 1
-    done = run("solve", "nowhere", "--out", "out", cwd=tmp_path)
-    assert done.returncode == 2 and done.stdout == "" and done.stderr.count("\n") == 1
 
 
 def test_options_of_solve_are_heeded_and_said(tmp_path, capsys, drive):
@@ -79,9 +79,10 @@ def test_options_of_solve_are_heeded_and_said(tmp_path, capsys, drive):
     assert {path.with_suffix(".csv") for path in out.rglob("*.mat")} == {*out.rglob("*.csv")}
     assert {path.name for path in out.rglob("*.tum")} == {"problem1.tum", "problem4.tum"}
     assert picture.read_bytes().startswith(b"\x89PNG")
-    told = capsys.readouterr().err
+    table, told = capsys.readouterr()
     assert "slip = 0.002" in told and 'kernel = "Huber"' in told and "Cauchy" not in told
-    assert "ATE" not in told                                          # there is no truth
+    assert told.splitlines()[-2:] == [f"results: {out}", f"picture: {picture}"]
+    assert [line[-2:] for line in table.splitlines()[1:4]] == ["TE", " -", " -"]       # no truth
     solved(tmp_path, "--problem", "problem1")
     assert file_names(out) == [".slamlib.json", "problem1/vehiclePose.mat", "summary.json"]
 
@@ -119,21 +120,17 @@ SOLVE = ["solve", "good", "--out", "out"]
     (["solve", "bad", "--out", "out"], "bad/encoderReading.txt, line 2: expected "),
     (["solve", "good", "--out", "good/encoderReading.txt"], "Not a directory"),
     (["solve", ".", "--out", "out"], "encoderReading.txt: expected this file, found none. Not"),
-    (["simulate", "drive", "--nlos", "1.5"], "from 0 to 1"),
     (["simulate", "drive", "--slip", "nan"], "from 0 to 1"),
     (["simulate", "drive", "--nlos", "some"], "invalid float value: 'some'"),
-    (["simulate", "drive", "--seed", "9" * 5000], "invalid int value"),
     (["simulate", "drive", "--seed", "-1"], "a seed from 0 on"),
     (["simulate", "drive", "--rounds", "0"], "rounds from 1 on"),
-    (["simulate", "drive", "--path", "round"], "invalid choice: 'round'"),
-    (["simulate"], "folder"),
     (["solve", "good"], "--out"),
     ([*SOLVE, "--problem", "5"], "invalid choice: '5'"),
     ([*SOLVE, "--problem", "3"], "expected the measurements of problem3"),
     ([*SOLVE, "--kernel", "L2"], "for kernel, found 'L2'"),
     ([*SOLVE, "--slip", "1"], "from 0 to 0.1 sqrt(m) for slip, found '1.0'"),
     ([*SOLVE, "--plot", "a.gif"], "--plot: expected a .png, .pdf or .svg file, found 'a.gif'"),
-    ([*SOLVE, "more\nthan one"], "more than one"),
+    ([*SOLVE, "more"], "unrecognized arguments: more"),
     (["simulate", ".", "--seed", "1"], "new or empty folder"),
     (["report", "--notebooks", ROOT / "notebooks", "--data", "nowhere"], "nowhere"),
     (["hand-in", "--out", "."], "expected a file to write, found a folder"),
@@ -184,7 +181,7 @@ def test_notes_and_doubts_are_said_and_in_the_summary(tmp_path, capsys, drive):
         f"doubt ({doubt['what']}): {doubt['sentence']}" for doubt in (frame, antenna)]
     assert summary["notes"] == ["ArucoReading.txt.txt was read as ArucoReading.txt.",
                                 "In truth: ArucoMap.csv was read as ArucoMap.txt."]
-    assert told.err.splitlines()[-2:] == [f"drive: note: {note}" for note in summary["notes"]]
+    assert told.err.splitlines()[-3:-1] == [f"drive: note: {note}" for note in summary["notes"]]
 
 
 def test_a_problem_that_fails_costs_the_others_nothing(tmp_path, capsys, drive):
@@ -194,8 +191,6 @@ def test_a_problem_that_fails_costs_the_others_nothing(tmp_path, capsys, drive):
     failed, = (name for name, row in problems.items() if "failed" in row)
     assert failed == "problem2" and [*problems] == list(solve.PROBLEMS)
     assert {path.name for path in tmp_path.glob("out/problem*")} == problems.keys() - {failed}
-    told = capsys.readouterr()
-    assert told.err.splitlines()[-1] == (
-        f"slamlib: drive: problem2 could not be solved: {problems[failed]['failed']}")
     assert problems[failed]["failed"].startswith("expected sightings")
-    assert "problem2       could not be solved" in told.out
+    assert f"problem2       could not be solved: {problems[failed]['failed']}\n" \
+        in capsys.readouterr().out

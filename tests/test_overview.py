@@ -10,18 +10,16 @@ import pytest
 from test_document import text_of
 
 from slamlib import evaluation, se2
-from slamlib.dataset import read_dataset, read_truth
-from slamlib.doubt import Doubt
+from slamlib.dataset import Doubt, read_dataset, read_truth
 from slamlib.notebook import plotting
 from slamlib.report import overview
 from slamlib.report.document import render
 from slamlib.report.execution import NotebookError
 from slamlib.report.notebooks import Options
 from slamlib.report.overview import title_picture
-from slamlib.results import write_structs
+from slamlib.results import write_solution, write_structs
 from slamlib.simulation import simulate, write_dataset
-from slamlib.solve import Failure, Solution, solutions, title, write_solution
-from slamlib.summary import summarize
+from slamlib.solve import Failure, Solution, solutions, summarize, title
 
 NAMES = ("all", "no_truth", "wheels_only")
 

@@ -19,8 +19,7 @@ from slamlib import odometry, se2
 from slamlib.checks.files import doubts_before_solving
 from slamlib.dataset import Dataset, DatasetError, Vehicle, read_dataset, read_truth
 from slamlib.simulation import simulate
-from slamlib.solve import Failure, solutions
-from slamlib.summary import summarize
+from slamlib.solve import Failure, solutions, summarize
 
 QUICK = settings(max_examples=3 * settings.default.max_examples)
 HALF = settings(max_examples=settings.default.max_examples // 2)

@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from slamlib import odometry, se2
+from slamlib import evaluation, odometry, se2
 from slamlib.dataset import Vehicle, read_dataset, read_truth
 from slamlib.simulation import simulate, write_dataset
 
@@ -25,17 +25,13 @@ def test_committed_stand_ins_are_regenerated_to_the_byte(name, tmp_path):
     assert [f for f in made if made[f] != committed[f]] == []
 
 
-@pytest.mark.parametrize("name", RECIPES)
-def test_stand_ins_are_what_the_readme_says(name):
+@pytest.mark.parametrize("name, poses, metres, shortest_gap, longest_gap", [
+    ("short", 2000, 20, 10, 10), ("long", 23000, 230, 400, 1500)])       # one without markers
+def test_stand_ins_are_what_the_readme_says(name, poses, metres, shortest_gap, longest_gap):
     dataset, truth = simulate(**RECIPES[name])
-    length = np.hypot(*np.diff(truth.poses[:, :2], axis=0).T).sum()
-    gap = np.diff(np.unique(dataset.aruco.pose)).max()
-    if name == "short":
-        assert len(dataset.ticks) == 2000 and 19 < length < 22
-        assert gap == 10
-    else:
-        assert len(dataset.ticks) >= 20000 and length > 200
-        assert gap > 400                                          # the stretch without markers
+    assert len(dataset.ticks) == poses
+    assert np.isclose(evaluation.path_length(truth.poses), metres, rtol=0.05)
+    assert shortest_gap <= np.diff(np.unique(dataset.aruco.pose)).max() <= longest_gap
     assert len(np.unique(dataset.aruco.pose)) < 0.2 * len(dataset.ticks)
     np.testing.assert_allclose(truth.poses[-1, :2], 0, atol=1e-3)                    # closed
 

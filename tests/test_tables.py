@@ -38,7 +38,7 @@ def drive():
     return Drive("short", *simulate("short", seed=4))
 
 
-def test_accuracy_is_that_of_every_kind_of_result(drive):
+def test_accuracy_is_that_of_every_kind_of_result_and_without_truth_sigmas_only(drive):
     """The same poses with their frames, or in all rows; markers alone in their first frame."""
     alone = localization.localize(drive.dataset.aruco)
     row = accuracy(alone, drive)
@@ -48,9 +48,6 @@ def test_accuracy_is_that_of_every_kind_of_result(drive):
     assert accuracy(found, drive)["ATE (mm)"] == 1e3 * ate(found[0], drive.truth.poses)
     late = drive.dataset.aruco.select(drive.dataset.aruco.pose > 500)     # another world
     assert accuracy(localization.localize(late), drive)["ATE (mm)"] < 200
-
-
-def test_without_truth_there_are_sigmas_only(drive):
     row = accuracy(localization.fuse(drive.dataset), replace(drive, truth=None))
     assert [*row] == ["dataset", "σ (mm)", "σ of δ (mrad)"] and row["σ (mm)"] > 0
 

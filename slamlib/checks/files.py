@@ -12,7 +12,7 @@ from contextlib import suppress
 import numpy as np
 
 from slamlib import odometry, se2
-from slamlib.doubt import Doubt
+from slamlib.dataset import Doubt
 from slamlib.marker_increments import (
     common_sightings,
     distance_and_turn,

@@ -18,10 +18,11 @@ from matplotlib import style
 from matplotlib_inline.backend_inline import set_matplotlib_formats
 
 from slamlib import solve
-from slamlib.dataset import Dataset, Truth, dataset_names, read_dataset, read_truth
-from slamlib.doubt import Doubt
+from slamlib.dataset import Dataset, Doubt, Truth, read_dataset, read_truth
 from slamlib.notebook import plotting
+from slamlib.results import write_solution
 from slamlib.simulation import simulate
+from slamlib.tables import datasets_in
 
 KEY = "slamlib"  # of records in the metadata of outputs
 RECORDS = {"doubt": Doubt, "failure": solve.Failure}  # types of records by their key
@@ -58,7 +59,7 @@ def start(sensor=None):
     set_matplotlib_formats("svg", metadata={"Date": None})
     data = _data_folder()
     selected = os.environ.get("SLAMLIB_DATASETS")
-    names = dataset_names(data, selected.split("\n") if selected else None)
+    names, _ = datasets_in(data, selected.split("\n") if selected else None)
     drives = [Drive(name, read_dataset(data / name), read_truth(data / name)) for name in names]
     return _or_simulated([drive for drive in sorted(drives, key=lambda d: len(d.dataset.ticks))
                           if not sensor or getattr(drive.dataset, sensor) is not None])
@@ -108,7 +109,7 @@ def solved(drives, **solvers):
             continue
         found[drive][problem] = result
         if not drive.made_up and _writes(results / drive.name / problem):
-            solve.write_solution(results / drive.name, solution)
+            write_solution(results / drive.name, solution)
             show_doubts(drive, solution.doubts)
         elif not drive.made_up:
             _notice(drive, f"the files of {problem} stay those of the first call of solved in this "

@@ -13,7 +13,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from slamlib import swap
-from slamlib.dataset import DatasetError, dataset_names, inventory_lines, read_dataset, read_truth
+from slamlib.dataset import DatasetError, inventory_lines, read_dataset, read_truth
 from slamlib.notebook import notices
 from slamlib.report import cache
 from slamlib.report.document import render
@@ -85,16 +85,14 @@ def build_report(notebooks, data, report, results, datasets=None, options=Option
 def _checked_input(notebooks, data, datasets, options):
     """Return the notebooks by their paths, in order, datasets with truth, and what these have."""
     books = to_execute(notebooks, options)
-    names = dataset_names(data, datasets)
+    names, unread = datasets_in(data, datasets)
     for name in names:
         if not DATASET_NAME.fullmatch(name):
             raise DatasetError(f"{data / name}: expected letters from a to z, digits, spaces, "
                                "dots, dashes and underscores in its name: rename this folder")
     read = [(read_dataset(data / name), read_truth(data / name)) for name in names]
-    for dataset, truth in read:
-        print("\n".join(inventory_lines(dataset, truth)), file=sys.stderr)
-    for sentence in datasets_in(data)[1]:
-        print(sentence, file=sys.stderr)
+    lines = [line for dataset, truth in read for line in inventory_lines(dataset, truth)]
+    print(*lines, *unread, sep="\n", file=sys.stderr)
     has = {sensor for sensor in SENSORS for dataset, _ in read
            if getattr(dataset, sensor) is not None} | {"truth" for _, truth in read if truth}
     served = {source: book for source, book in books.items()

@@ -13,12 +13,13 @@ import numpy as np
 from jinja2 import Template
 
 from slamlib import swap
-from slamlib.dataset import all_notes, dataset_names, read_dataset, read_truth
+from slamlib.dataset import all_notes, read_dataset, read_truth
 from slamlib.notebook import Drive
 from slamlib.report.notebooks import PROBLEM2_FOLDERS
 from slamlib.report.overview import listed, why_missing
 from slamlib.results import RESULT_FILES
 from slamlib.solve import title
+from slamlib.tables import datasets_in
 
 LINE_WIDTH = 100  # characters in a line of README.txt
 README = Path(__file__).with_name("readme.txt")  # a template of Jinja
@@ -33,7 +34,7 @@ def selection(data, names=None):
     if names is not None:
         return names, []
     origins = {name: Drive(name, read_dataset(data / name), read_truth(data / name)).origin
-               for name in dataset_names(data)}
+               for name in datasets_in(data)[0]}
     simulated = [name for name, origin in origins.items() if origin == "simulated"]
     if not simulated or len(simulated) == len(origins):
         return None, []

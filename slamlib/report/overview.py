@@ -19,8 +19,7 @@ from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_outp
 from slamlib import evaluation
 from slamlib.checks import consistency
 from slamlib.checks.files import doubts_before_solving, merged
-from slamlib.dataset import all_notes
-from slamlib.doubt import Doubt
+from slamlib.dataset import Doubt, all_notes
 from slamlib.notebook import Drive, accuracy, plotting, table
 from slamlib.notebook.drives import plain
 from slamlib.report.execution import NotebookError
