@@ -1,4 +1,4 @@
-"""Problem 2, increments of the vehicle between a pair of frames, from their common markers.
+"""Increments of the vehicle between a pair of frames, from their common markers.
 
 With Z_j and Z'_j the sightings of marker j from the earlier and the later frame, and C_j and C'_j
 their covariances, the increment Delta, the later frame in the earlier one, minimises the sum of
@@ -11,15 +11,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slamlib import se2
-from slamlib.sightings import GATE, MAX_HEADING_SIGMA
+from slamlib import odometry, se2
+from slamlib.sightings import GATE, MAX_HEADING_SIGMA, sightings_by_frame
 
 INCREMENT_ITERATIONS = 8, 6   # numbers of Gauss-Newton iterations: Cauchy weights, then the gate
 INCREMENT_STEP_TOLERANCE = 1e-10  # m and rad; iterations end after a smaller step
 SPEED_RATIO = 3.0             # ratio of the largest plausible speed to the usual speed
 POINT_PAIRS = 60              # pairs of points that give hypotheses, of every pair of frames
-SIGHTINGS_PER_BLOCK = 20_000  # sightings whose residuals are computed together
 MIN_TURN_RATE = 1e-3          # rad per encoder step; smaller differences of turn rates are ignored
+MIN_GAP = 5.0                 # m, driven between two sightings of the markers of a return
+MAX_RETURN_FRAMES = 400       # frames, evenly chosen, among which returns are sought
+MIN_COMMON_MARKERS = 2        # markers that both frames of a return see, and that agree
 
 
 @dataclass(frozen=True)
@@ -44,36 +46,25 @@ def consecutive_increments(sightings):
     the larger of the 99th percentile over increments on which two or more markers agree and the
     90th percentile over all. An increment is implausible if its speed, less three standard
     deviations, exceeds SPEED_RATIO times the usual one and its velocity differs from the previous
-    and the next one. It is estimated again from those of its sightings that alone imply a plausible
-    speed. Speeds are in m and rad per encoder step, the difference of `sightings.frame`.
+    and the next one. Speeds are in m and rad per encoder step, the difference of `sightings.frame`.
     """
-    z, C, steps = sightings.z, sightings.C, np.diff(sightings.frame)
+    steps = np.diff(sightings.frame)[:, None]
     pair, first, second = common_sightings(sightings.row, sightings.marker)
-    found = robust_increments(z, C, pair, first, second, len(steps))
+    found = robust_increments(sightings.z, sightings.C, pair, first, second, len(steps))
     agreed = found.usable & (np.bincount(pair[found.accepted], minlength=len(steps)) > 1)
     if not agreed.any():
         return found
-    speed = distance_and_turn(found.increment) / steps[:, None]
+    velocity = found.increment / steps
+    speed = distance_and_turn(velocity)
     bound = SPEED_RATIO * np.maximum(
         np.percentile(speed[agreed], 99, axis=0),
         np.percentile(speed[found.usable], 90, axis=0, method="lower"))
-
-    def too_fast(increment, covariance, steps):
-        limit = bound * steps[:, None] + 3 * distance_and_turn_sigmas(covariance)
-        return np.any(distance_and_turn(increment) > limit, axis=1)
-
-    velocity = found.increment / steps[:, None]
-    similar = np.r_[False, _similar(velocity[:-1], velocity[1:]), False]
-    fast = found.usable & too_fast(found.increment, found.covariance, steps) \
-        & ~(similar[:-1] | similar[1:])
-    z2, J = se2.inverse(z[second]), se2.inverse_jacobian(z[second])
-    alone = se2.compose_uncertain(z[first], C[first], z2, J @ C[second] @ J.mT)     # Z Z'^-1
-    allowed = ~(fast[pair] & too_fast(*alone, steps[pair]))
-    if allowed.all():
-        return found
-    again = robust_increments(z, C, pair[allowed], first[allowed], second[allowed], len(steps))
-    usable = again.usable & ~(fast & too_fast(again.increment, again.covariance, steps))
-    return replace(again, usable=usable, accepted=again.accepted & usable[again.pair])
+    fast = (speed > bound + 3 * distance_and_turn_sigmas(found.covariance) / steps).any(axis=1)
+    change = distance_and_turn(np.diff(velocity, axis=0))   # less than half the larger velocity?
+    similar = (change < np.maximum(speed[:-1], speed[1:]) / 2 + [0, MIN_TURN_RATE]).all(axis=1)
+    similar = np.r_[False, similar, False]
+    usable = found.usable & ~(fast & ~(similar[:-1] | similar[1:]))
+    return replace(found, usable=usable, accepted=found.accepted & usable[pair])
 
 
 def common_sightings(row, marker, span=1):
@@ -104,8 +95,8 @@ def robust_increments(z, C, pair, first, second, count):
     increment = _best_hypothesis(z1, C1, z2, C2, pair, count)
     for gated, iterations in enumerate(INCREMENT_ITERATIONS):
         for _ in range(iterations):
-            J_delta, J_second = se2.compose_jacobians(increment[pair], z2)
-            r, information, squared = _residuals(increment[pair], J_second, z1, C1, z2, C2)
+            r, J_delta, J_second, information, squared = _residuals(
+                increment[pair], z1, C1, z2, C2)
             weight = squared < GATE if gated else 1 / (1 + squared / GATE)
             gain = J_delta.mT @ information * weight[:, None, None]
             total = np.zeros((count, 3, 4))
@@ -125,11 +116,12 @@ def robust_increments(z, C, pair, first, second, count):
         increment=np.where(usable[:, None], increment, np.nan))
 
 
-def _residuals(increment, J_second, z1, C1, z2, C2):
-    """r, W^-1 and r^T W^-1 r of each common sighting, with J' = J_second."""
+def _residuals(increment, z1, C1, z2, C2):
+    """r, J, J', W^-1 and r^T W^-1 r of each common sighting."""
+    J_delta, J_second = se2.compose_jacobians(increment, z2)
     r = se2.difference(z1, se2.compose(increment, z2))
     information = np.linalg.inv(C1 + J_second @ C2 @ J_second.mT)
-    return r, information, np.einsum("ni,nij,nj->n", r, information, r)
+    return r, J_delta, J_second, information, np.einsum("ni,nij,nj->n", r, information, r)
 
 
 def _best_hypothesis(z1, C1, z2, C2, pair, count):
@@ -138,35 +130,26 @@ def _best_hypothesis(z1, C1, z2, C2, pair, count):
     Hypotheses are no motion, the increment from each marker with a heading, and, in pairs without
     such a marker, the increment from two positions, of which at most POINT_PAIRS are tried.
     """
-    begins, ends = (np.searchsorted(pair, np.arange(count), side) for side in ("left", "right"))
     oriented = (C1[:, 2, 2] + C2[:, 2, 2]) < MAX_HEADING_SIGMA**2
-    two_of_each = [
-        begins[k] + _pairs(ends[k] - begins[k]) for k in np.setdiff1d(pair, pair[oriented])]
-    i, j = np.concatenate([np.zeros((2, 0), int), *two_of_each], axis=1)
+    points = [np.zeros((2, 0), int)]
+    for k in np.setdiff1d(pair, pair[oriented]):
+        two = np.searchsorted(pair, k) + np.array(np.triu_indices(np.sum(pair == k), 1))
+        points.append(two[:, ::two.shape[1] // (POINT_PAIRS + 1) + 1])
+    i, j = np.concatenate(points, axis=1)
     hypothesis = np.concatenate([
-        np.zeros((count, 3)),
         se2.compose(z1[oriented], se2.inverse(z2[oriented])),
         _increment_of_two_points(z1[i, :2], z1[j, :2], z2[i, :2], z2[j, :2])])
-    pair_of = np.concatenate([np.arange(count), pair[oriented], pair[i]])
-    number = (ends - begins)[pair_of]                   # of common sightings of each hypothesis
-    block_of = np.cumsum(number) // SIGHTINGS_PER_BLOCK         # together they need gigabytes
-    cost = np.zeros(len(number))
-    for block in np.split(np.arange(len(number)), np.flatnonzero(np.diff(block_of)) + 1):
-        n = number[block]
-        which = np.repeat(block, n)
-        k = np.arange(len(which)) - np.repeat(np.cumsum(n) - n - begins[pair_of[block]], n)
-        J_second = se2.compose_jacobians(hypothesis[which], z2[k])[1]
-        squared = _residuals(hypothesis[which], J_second, z1[k], C1[k], z2[k], C2[k])[2]
-        cost += np.bincount(which, np.log1p(squared / GATE), len(cost))
-    order = np.lexsort((cost, pair_of))
-    return hypothesis[order[np.searchsorted(pair_of[order], np.arange(count))]]
-
-
-def _pairs(count):
-    """At most POINT_PAIRS pairs (2, m) of `count` numbers, evenly chosen."""
-    pairs = np.array(np.triu_indices(count, 1))
-    chosen = np.linspace(0, pairs.shape[1] - 1, min(POINT_PAIRS, pairs.shape[1]))
-    return pairs[:, chosen.astype(int)]
+    pair_of = np.concatenate([pair[oriented], pair[i]])        # those of a pair follow each other
+    _, first, which = np.unique(pair_of, return_index=True, return_inverse=True)
+    number = np.arange(len(pair_of)) - first[which]
+    best, least = np.zeros((count, 3)), np.full(count, np.inf)
+    for k in range(-1, number.max(initial=-1) + 1):
+        tried = best.copy()
+        tried[pair_of[number == k]] = hypothesis[number == k]
+        *_, squared = _residuals(tried[pair], z1, C1, z2, C2)
+        cost = np.bincount(pair, np.log1p(squared / GATE), count)
+        best, least = np.where((cost < least)[:, None], tried, best), np.minimum(cost, least)
+    return best
 
 
 def _increment_of_two_points(p1, q1, p2, q2):
@@ -188,7 +171,38 @@ def distance_and_turn_sigmas(covariance):
     return np.sqrt(np.diagonal(covariance, axis1=1, axis2=2) @ [[1, 0], [1, 0], [0, 1]])
 
 
-def _similar(a, b):
-    """True where velocities (n, 3) differ by less than half the larger one, in speed and turn."""
-    largest = np.maximum(distance_and_turn(a), distance_and_turn(b))
-    return np.all(distance_and_turn(a - b) < largest / 2 + [0, MIN_TURN_RATE], axis=1)
+@dataclass(frozen=True)
+class Returns:
+    """Pairs of frames that see the same markers after a loop, and the motion between them."""
+
+    start: np.ndarray        # (m,) pose index from 0 of the earlier frame
+    end: np.ndarray          # (m,) pose index of the later frame, ascending
+    motion: np.ndarray       # (m, 3) later in earlier frame, by these markers, m and rad
+    covariance: np.ndarray   # (m, 3, 3) of the motion, by the covariances of the sightings
+
+    def discrepancies(self, poses):
+        """Motions (m, 3) by poses (n, 3) minus these, in the axes of the earlier frames."""
+        return se2.difference(se2.between(poses[self.start], poses[self.end]), self.motion)
+
+
+def returns(dataset):
+    """The Returns of a Dataset after at least MIN_GAP of driving; none without markers.
+
+    They show the error of every method without loop closures, without truth. A frame returns to the
+    earlier frame with which it has most markers in common. Errors of returns are correlated: they
+    share sections of odometry, and sightings.
+    """
+    s = sightings_by_frame(dataset.sightings)
+    travelled = odometry.cumulative(np.abs(odometry.steps(dataset.ticks, dataset.vehicle)[0]))
+    every = len(s.frame) // MAX_RETURN_FRAMES + 1
+    sighting, frame = s.table()[::every], s.frame[::every]
+    seen, distance = (sighting >= 0).astype(int), travelled[frame]
+    common = (seen @ seen.T) * (distance[:, None] - distance >= MIN_GAP)  # later, earlier frames
+    later = np.flatnonzero(common.max(axis=1, initial=0) >= MIN_COMMON_MARKERS)
+    earlier = common[later].argmax(axis=1) if len(later) else later
+    pair, which = np.nonzero(seen[earlier] & seen[later])
+    found = robust_increments(s.z, s.C, pair, sighting[earlier[pair], which],
+                              sighting[later[pair], which], len(later))
+    ok = found.usable & (np.bincount(pair, found.accepted, len(later)) >= MIN_COMMON_MARKERS)
+    return Returns(start=frame[earlier[ok]], end=frame[later[ok]], motion=found.increment[ok],
+                   covariance=found.covariance[ok])

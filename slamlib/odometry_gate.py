@@ -35,7 +35,6 @@ MIN_LAG_GAIN = 50.0          # by a lag
 MAX_LAG_COST = 0.8           # of that without it; with slip a wrong lag costs 0.95
 PAIRS = 2                    # of sightings of each marker that tell of a jump: one may be wrong
 NEAREST = 24                 # number of these pairs, by the frames between them
-MAX_WAY = 35.0               # m, between the sightings of a pair
 MAX_SIGMA = 1.0              # m, of a jump
 WELL_INSIDE = 0.15, 0.85      # quantiles of x and of y at which markers are seen
 MIN_MISSED = 6               # number of sightings that should be there, and are not
@@ -88,8 +87,7 @@ class Jumps:
         return poses
 
 
-NO_JUMPS = Jumps(**dict(zip(("start", "end"), np.zeros((2, 0), int))), chance=np.zeros(1), **dict(
-    zip(("increment", "by_odometry", "sigma"), np.zeros((3, 0, 3)))))                # none at all
+NO_JUMPS = Jumps(*np.zeros((2, 0), int), *np.zeros((3, 0, 3)), chance=np.zeros(1))   # none at all
 
 
 def find_jumps(dataset):
@@ -283,8 +281,7 @@ def _jump(s, drive, k):
     before = np.flatnonzero((s.row[:-1] <= k) & (k < s.row[1:]) & (s.marker[:-1] == s.marker[1:]))
     rows = np.concatenate([[before - i, before + 1 + i] for i in range(PAIRS)], axis=1)
     rows = rows[:, (rows[0] >= 0) & (rows[1] < len(s.row))]
-    way = drive.way[s.row[rows[1]]] - drive.way[s.row[rows[0]]]
-    rows = rows[:, (s.marker[rows[0]] == s.marker[rows[1]]) & (way < MAX_WAY)]
+    rows = rows[:, s.marker[rows[0]] == s.marker[rows[1]]]
     rows = rows[:, np.argsort(s.row[rows[1]] - s.row[rows[0]], kind="stable")[:NEAREST]]
     if not rows.size:
         return np.zeros(3), None, 0.0, False

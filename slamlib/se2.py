@@ -73,13 +73,11 @@ def difference(first, second):
 
 def compose_jacobians(T_ab, T_bc):
     """Derivatives of compose, d T_ac / d T_ab and d T_ac / d T_bc, each (..., 3, 3)."""
-    shape = np.broadcast_shapes(np.shape(T_ab), np.shape(T_bc))
-    T_ab, T_ac = np.broadcast_to(T_ab, shape), compose(T_ab, T_bc)
+    T_ab, T_ac = np.asarray(T_ab), compose(T_ab, T_bc)
     lever = T_ac[..., :2] - T_ab[..., :2]                # position of c from b, in axes of a
-    by_first = _identity(shape)
+    by_first, by_second = _identity(T_ac.shape), _identity(T_ac.shape)
     by_first[..., 0, 2] = -lever[..., 1]
     by_first[..., 1, 2] = lever[..., 0]
-    by_second = _identity(shape)
     by_second[..., :2, :2] = rotation(T_ab[..., 2])
     return by_first, by_second
 
@@ -97,11 +95,9 @@ def compose_uncertain(T_ab, C_ab, T_bc, C_bc):
 
 def between_jacobians(T_wa, T_wb):
     """Derivatives of between, d T_ab / d T_wa and d T_ab / d T_wb, each (..., 3, 3)."""
-    shape = np.broadcast_shapes(np.shape(T_wa), np.shape(T_wb))
     T_ab = between(T_wa, T_wb)
-    world_in_a = rotation(-np.broadcast_to(T_wa, shape)[..., 2])
-    by_second = _identity(shape)
-    by_second[..., :2, :2] = world_in_a
+    by_second = _identity(T_ab.shape)
+    by_second[..., :2, :2] = rotation(-np.asarray(T_wa)[..., 2])
     by_first = -by_second
     by_first[..., 0, 2] = T_ab[..., 1]
     by_first[..., 1, 2] = -T_ab[..., 0]
@@ -181,4 +177,4 @@ def _poses(x, y, heading):
 
 def _identity(shape):
     """Identity matrices (..., 3, 3), one for each pose of an array of this shape, (..., 3)."""
-    return np.broadcast_to(np.eye(3), shape + (3,)).copy()
+    return np.zeros(shape + (3,)) + np.eye(3)

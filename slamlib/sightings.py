@@ -32,6 +32,13 @@ class Sightings:
     frame: np.ndarray        # (f,) pose index from 0 of every frame, ascending
     contradicting: int = 0   # number of repeated sightings that contradict each other
 
+    def table(self):
+        """Row (f, k) of the sighting of each marker, in ascending id, at each frame, or -1."""
+        markers, label = np.unique(self.marker, return_inverse=True)
+        table = np.full((len(self.frame), len(markers)), -1, np.int32)
+        table[self.row, label] = np.arange(len(self.row))
+        return table
+
 
 def sightings_by_frame(aruco, extra_frames=()):
     """Sightings of ArucoReadings, or of None if there are no markers, merged by `merge_repeated`.

@@ -6,7 +6,7 @@ import pytest
 from slamlib import odometry, se2, slam
 from slamlib.dataset import ArucoReadings, Dataset
 from slamlib.evaluation import anees, ate, nees_band
-from slamlib.localization import fuse, fuse_increments, fused, hint, localize
+from slamlib.localization import fuse, fuse_increments, fused, localize
 from slamlib.sightings import GATE
 from slamlib.simulation import TABLE_2, simulate
 from slamlib.slam import result
@@ -119,40 +119,24 @@ def test_the_slip_that_is_learned_has_the_greatest_density(slip):
     assert np.argmax(log_density) == 1
 
 
-def test_the_hint_fuses_by_information():
+@pytest.mark.parametrize("propagation", [odometry.equation2, odometry.first_order])
+def test_the_hint_fuses_by_information(propagation):
     """One interval: C = (C_o^-1 + C_m^-1)^-1 and Delta = C (C_o^-1 Delta_o + C_m^-1 Delta_m)."""
     dataset, _ = simulate("short", seed=6)
     sure = replace(dataset.vehicle, sigma_heading=1e-9)
     dataset = replace(only(dataset, dataset.aruco.pose <= 10), vehicle=sure)
-    fused, marker = fuse_increments(dataset), localize(dataset.aruco)
-    poses, covariances = odometry.equation2(dataset.ticks[:11], sure,
-                                            initial_covariance=np.zeros((3, 3)))
+    fused, marker = fuse_increments(dataset, propagation), localize(dataset.aruco)
+    poses, covariances = propagation(dataset.ticks[:11], sure, initial_covariance=np.zeros((3, 3)))
     information = [np.linalg.inv(covariances[-1]), np.linalg.inv(marker.covariances[1])]
     C = np.linalg.inv(sum(information))
     delta = C @ (information[0] @ poses[-1] + information[1] @ marker.poses[1])
     np.testing.assert_allclose(fused.poses[10], delta, atol=1e-9)
     np.testing.assert_allclose(fused.covariances[10], C, atol=1e-6 * np.abs(C).max())
-    # From there on equation 2 goes on alone, restarted.
-    expected, expected_covariances = odometry.equation2(
+    # From there on odometry goes on alone, restarted.
+    expected, expected_covariances = propagation(
         dataset.ticks[10:], sure, fused.poses[10], fused.covariances[10])
     np.testing.assert_allclose(fused.poses[10:], expected, atol=1e-12)
     np.testing.assert_allclose(fused.covariances[10:], expected_covariances, atol=1e-15)
-
-
-@pytest.mark.parametrize("propagation, whole", [
-    (hint.equation2_from, odometry.equation2), (hint.first_order_from, odometry.first_order)])
-def test_where_markers_give_no_increment_the_hint_restarts_odometry(propagation, whole):
-    """Three frames without common markers: the covariance is restarted at every frame."""
-    dataset, _ = simulate("short", seed=7)
-    frames = [0, 400, 800, 1200]
-    dataset = only(dataset, np.isin(dataset.aruco.pose, frames))
-    found = fuse_increments(dataset, propagation)
-    pose, covariance = np.zeros(3), np.diag([0.0, 0.0, dataset.vehicle.sigma_heading**2])
-    for begin, end in zip(frames, [*frames[1:], len(dataset.ticks) - 1]):
-        poses, covariances = whole(dataset.ticks[begin:end + 1], dataset.vehicle, pose, covariance)
-        np.testing.assert_allclose(found.poses[begin:end], poses[:-1], atol=1e-9)
-        np.testing.assert_allclose(found.covariances[begin:end], covariances[:-1], atol=1e-9)
-        pose, covariance = poses[-1], covariances[-1]
 
 
 @pytest.mark.parametrize("keep", [
@@ -190,14 +174,13 @@ def test_wheels_far_from_nominal_are_learned():
 def test_the_slip_and_the_factor_that_a_vehicle_gives_are_taken():
     """The slip as by the option; twice the sigmas at a factor of one half change nothing."""
     dataset = simulate("short", seed=5)[0].first(600)
-    known = replace(dataset, vehicle=replace(TABLE_2, slip=3e-3))
-    for found in (fuse(known), fuse(dataset, slip=3e-3)):
-        assert found.slip == 3e-3
-        np.testing.assert_array_equal(found.poses, fuse(known).poses)
-    assert fuse(known, slip=1e-3).slip == 1e-3
-    assert np.abs(fuse(known).poses - fuse(dataset).poses).max() > 1e-6
+    known, plain = replace(dataset, vehicle=replace(TABLE_2, slip=3e-3)), fuse(dataset)
+    given, option = fuse(known), fuse(dataset, slip=3e-3)
+    assert given.slip == option.slip == 3e-3 and fuse(known, slip=1e-3).slip == 1e-3
+    np.testing.assert_array_equal(given.poses, option.poses)
+    assert np.abs(given.poses - plain.poses).max() > 1e-6
     halved = replace(
         dataset, vehicle=replace(TABLE_2, marker_noise_factor=0.5),
         aruco=replace(dataset.aruco, covariance=4 * dataset.aruco.covariance))
-    np.testing.assert_allclose(fuse(halved).poses, fuse(dataset).poses, rtol=0, atol=1e-12)
-    assert np.abs(fuse(replace(halved, vehicle=TABLE_2)).poses - fuse(dataset).poses).max() > 1e-6
+    np.testing.assert_allclose(fuse(halved).poses, plain.poses, rtol=0, atol=1e-12)
+    assert np.abs(fuse(replace(halved, vehicle=TABLE_2)).poses - plain.poses).max() > 1e-6

@@ -6,7 +6,6 @@ from test_odometry import BOTH, curvy_ticks
 
 from slamlib import increments, odometry, se2
 from slamlib.dataset import Vehicle
-from slamlib.evaluation import nees, nees_band
 from slamlib.simulation import simulate
 
 VEHICLE = Vehicle()
@@ -60,20 +59,6 @@ def test_noise_is_the_sum_over_steps():
     for s, e, noise in zip(start, end, got, strict=True):
         expected = literal_noise(ticks, VEHICLE, s, e, 2e-3)
         np.testing.assert_allclose(noise, expected, atol=1e-9 * np.abs(expected).max())
-
-
-def test_noise_against_simulated_slip():
-    """NEES of 38 x 20 increments of 1 m, by odometry with the true wheel parameters."""
-    errors, covariances = [], []
-    for seed in range(38):
-        dataset, truth = simulate("short", seed=seed, slip=3e-3)
-        start = np.arange(0, 1900, 95)
-        got, _ = increments.between_poses(dataset.ticks, truth.vehicle, start, start + 95, "arc")
-        errors.append(got - se2.between(truth.poses[start], truth.poses[start + 95]))
-        covariances.append(noise_alone(dataset.ticks, truth.vehicle, start, start + 95, 3e-3))
-    errors, covariances = np.concatenate(errors), np.concatenate(covariances)
-    low, high = nees_band(len(errors), probability=0.999)
-    assert low < nees(errors, covariances, np.zeros_like(errors)).mean() < high
 
 
 def test_noise_in_drive_does_not_depend_on_how_the_drive_is_cut():

@@ -4,8 +4,14 @@ import pytest
 from slamlib import se2
 from slamlib.dataset import ArucoReadings
 from slamlib.evaluation import nees, nees_band
-from slamlib.marker_increments import common_sightings, consecutive_increments, robust_increments
+from slamlib.marker_increments import (
+    common_sightings,
+    consecutive_increments,
+    returns,
+    robust_increments,
+)
 from slamlib.sightings import Sightings, consensus, merge_repeated
+from slamlib.simulation import simulate
 
 DELTA = np.array([0.12, -0.03, 0.2])
 MARKERS = np.array([[1.2, 0.4, 0.3], [-0.7, 1.1, -2.9], [0.2, -1.3, 3.1], [-1.0, -0.8, 1.0]])
@@ -154,3 +160,30 @@ def test_a_start_from_rest_is_plausible():
     found = consecutive(z, np.tile(1e-6 * np.eye(3), (len(z), 1, 1)), row, marker)
     common = np.bincount(found.pair, minlength=214)
     assert (common[199:] == 1).all() and found.usable.all() and found.accepted.all()
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.05])
+def test_returns_measure_the_true_motion(wrong):
+    """Without noise the markers give it exactly, also where some labels are wrong."""
+    dataset, truth = simulate("short", 3, noise=False, mislabelled=wrong)
+    found = returns(dataset)
+    assert len(found.start) > 5 and (found.end - found.start > 450).all()          # poses, of 5 m
+    assert (np.diff(found.end) > 0).all()
+    np.testing.assert_allclose(found.discrepancies(truth.poses), 0, atol=1e-8)
+
+
+def test_a_drive_without_markers_or_that_goes_nowhere_again_has_no_returns():
+    dataset, truth = simulate("short", 3)
+    for each in (dataset.without("aruco"), dataset.first(700), dataset.first(1)):
+        found = returns(each)
+        assert found.discrepancies(truth.poses).shape == (0, 3)
+        assert found.covariance.shape == (0, 3, 3)
+
+
+def test_the_covariance_of_returns_is_consistent():
+    """The last return of each of 30 drives, so that they are independent."""
+    drives = [simulate("short", seed, slip=3e-3) for seed in range(30)]
+    found = [(each.discrepancies(truth.poses), each.covariance)
+             for each, truth in ((returns(dataset), truth) for dataset, truth in drives)]
+    low, high = nees_band(len(found))
+    assert low < np.mean([nees(off, C, 0 * off)[-1] for off, C in found]) < high

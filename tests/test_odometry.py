@@ -83,13 +83,6 @@ def test_one_step_by_hand(model, expected):
     np.testing.assert_allclose(poses, [[1, 2, np.pi / 2], expected], atol=1e-15)
 
 
-@BOTH
-def test_turn_on_the_spot_and_standstill_stay_in_place(model):
-    poses = odometry.dead_reckoning([[0, 0], [500, -500], [0, 0]], VEHICLE, model=model)
-    np.testing.assert_allclose(poses[:, :2], 0, atol=1e-17)
-    assert poses[1, 2] == poses[2, 2] > 0
-
-
 def test_step_jacobian_against_central_differences():
     ticks = curvy_ticks()
     heading = odometry.dead_reckoning(ticks, VEHICLE)[:-1, 2]

@@ -2,9 +2,8 @@
 
 Markers and wheels both measure increments [x, y, heading] of the vehicle. Wrong axes or signs of
 one of them change these to [A (x, y), det(A) heading], A one of the eight symmetries of a square.
-Exchanged wheels and a camera mirrored in y and theta have the same A: ranges decide if the guesses
-of the antennas are accurate enough. Wrong units show in ratios of lengths, and of stated standard
-deviations to the scatter of measurements.
+Exchanged wheels and a camera mirrored in y and theta have the same A. Wrong units show in ratios of
+lengths, and of stated standard deviations to the scatter of measurements.
 """
 
 from contextlib import suppress
@@ -28,7 +27,6 @@ MIN_MOTION_SIGMAS = 5.0   # sigmas by markers of distance or turn, from which on
 AGREEMENT = 0.1, 3.0     # of an increment and of its sigmas, within which markers and wheels agree
 MIN_AGREEING_SHARE = 0.7  # of the increments with an accepted A
 MIN_GAIN_SIGMAS = 4.0     # sigmas of the number of increments that agree in addition
-MIN_FIT_RATIO = 3.0       # ratio of the ranges' median residuals that decides between two paths
 MAX_FACTOR = 5.0          # ratio of lengths from which on the unit is in doubt
 MAX_SIGMA_RATIO = 15.0    # of a stated standard deviation to the scatter; in degrees it is 57
 MAX_ODOMETRY_HEADING_SIGMA = 0.1   # rad, at the end of the path that is compared with ranges
@@ -67,8 +65,7 @@ def motion_doubts(dataset):
     size = np.maximum(*(np.hypot(*distance_and_turn(each).T) for each in (markers[0], wheels)))
     agree = np.linalg.norm(distance_and_turn(markers - turned[:, None]), axis=-1) \
         < AGREEMENT[0] * size + AGREEMENT[1] * np.hypot(*sigma.T)                # (8, 2, n)
-    return list(wrong_axes(dataset, agree)) or list(
-        wrong_sizes(markers[0], wheels, sigma, agree[0, 0]))
+    return list(wrong_axes(agree)) or list(wrong_sizes(markers[0], wheels, sigma, agree[0, 0]))
 
 
 def moving_increments(dataset):
@@ -93,7 +90,7 @@ def moving_increments(dataset):
             sigma[moving])
 
 
-def wrong_axes(dataset, agree):
+def wrong_axes(agree):
     """Kinds and sentences, if with other axes or signs significantly more increments agree.
 
     `agree` (8, 2, n) tells it by AXES, for theta as stated and reversed.
@@ -112,12 +109,6 @@ def wrong_axes(dataset, agree):
         possible.insert(0, (COUNTS[k][0], (
             f"{COUNTS[k][1]} in encoderReading.txt (look at the order of right and left, and at "
             "the signs of the counts)")))
-        path, antennas = path_and_antennas(dataset)      # odometry's, with A if wheels are wrong
-        fits = [np.median([np.median(np.abs(np.hypot(*(positions[pose] - guess).T) - r))
-                           for pose, r, guess in antennas] or 1.0)
-                for positions in (path @ A.T, path)]
-        if max(fits) >= MIN_FIT_RATIO * min(fits):
-            possible = [possible[np.argmin(fits)]]
     for what, change in possible:
         others = "".join(f" Equally possible: {each}." for _, each in possible if each != change)
         yield what, ("Increments of the vehicle by markers and by wheels agree at "
@@ -145,25 +136,19 @@ def wrong_sizes(markers, wheels, sigma, agree):
                 "the same poses")
 
 
-def path_and_antennas(dataset):
-    """Odometry's path (p, 2) in m while the heading is known, and the ranges on it by antenna.
+def range_units(dataset):
+    """Kind and sentence, if ranges do not fit the size of odometry's path, or the guesses.
 
-    Of antennas with MIN_RANGES_PER_ANTENNA there are poses (m,), ranges (m,) and guess (2,), m.
+    Of the path while its heading is known, and of antennas with MIN_RANGES_PER_ANTENNA on it.
     """
     if dataset.uwb is None or dataset.antenna_guess is None:
-        return np.zeros((0, 2)), []
+        return
     poses, covariances = odometry.first_order(dataset.ticks, dataset.vehicle, model="arc")
     path = poses[np.cumsum(covariances[:, 2, 2] > MAX_ODOMETRY_HEADING_SIGMA**2) == 0, :2]
     heard = dataset.uwb.select(dataset.uwb.pose < len(path))
-    return path, [
-        (heard.pose[mine], heard.range[mine], guess)
-        for antenna, guess in zip(dataset.antenna_guess.antenna, dataset.antenna_guess.position)
-        if np.count_nonzero(mine := heard.antenna == antenna) >= MIN_RANGES_PER_ANTENNA]
-
-
-def range_units(dataset):
-    """Kind and sentence, if ranges do not fit the size of odometry's path, or the guesses."""
-    path, antennas = path_and_antennas(dataset)
+    antennas = [(heard.pose[mine], heard.range[mine], guess) for antenna, guess in zip(
+                    dataset.antenna_guess.antenna, dataset.antenna_guess.position)
+                if np.count_nonzero(mine := heard.antenna == antenna) >= MIN_RANGES_PER_ANTENNA]
     if sum(len(r) for _, r, _ in antennas) < MIN_COUNT or not path.any():
         return
     extent, noise = np.hypot(*path.std(axis=0)), 3 * np.median(dataset.uwb.sigma)

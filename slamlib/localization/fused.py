@@ -17,19 +17,17 @@ and those out of view, and adds new ones with covariance C_j. Without markers th
 first-order propagation of odometry; with uninformative odometry and one marker it is `localize`.
 """
 
-import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from slamlib import increments, se2
-from slamlib.dataset import Dataset
+from slamlib.dataset import Dataset, Vehicle
 from slamlib.increments import SLIP_BOUNDS, SLIP_FACTOR, TYPICAL_SLIP
-from slamlib.marker_increments import common_sightings
 from slamlib.memory import error_memory
 from slamlib.odometry_gate import NO_JUMPS, Jumps, find_jumps
-from slamlib.sightings import GATE, sightings_by_frame
+from slamlib.sightings import GATE, Sightings, sightings_by_frame
 from slamlib.textfile import require_type
 
 SLIP_FRAMES = 500            # number of frames, the first ones, from which the slip is learned
@@ -55,30 +53,24 @@ class Fusion:
 class _FilterInput:
     """The data of the filter, the same for all values of slip."""
 
-    dataset: object
-    vehicle: object              # with the wheel parameters w_0 at which Delta is linearised
-    pose: np.ndarray             # (f,) pose indices of the frames, pose 0 among them
-    marker: np.ndarray           # (s,) ids of the markers of all sightings, frame by frame
-    increment: np.ndarray        # (f-1, 3) Delta(w_0)
-    J_w: np.ndarray              # (f-1, 3, 3) dDelta/dw
-    rounding: np.ndarray         # (f-1, 3, 3) Q without slip
-    slipping: np.ndarray         # (f-1, 3, 3) what a slip of 1 sqrt(m) adds to Q
+    dataset: Dataset
+    vehicle: Vehicle             # with the wheel parameters w_0 at which Delta is linearised
     jumps: Jumps                 # where odometry contradicts the markers
-    frames: list                 # of f tuples: z (m, 3) and C (m, 3, 3) of a frame's sightings, and
-                                 # rows of common markers in the previous and in this frame
+    sightings: Sightings         # of f frames, pose 0 among them
+    odometry: tuple              # of f-1 increments between them, see `_odometry`
 
 
-class _State(NamedTuple):        # three are made at a frame: faster than frozen dataclasses
-    """The filter after a frame with m sightings; rejected markers are not in the state."""
+class _State(NamedTuple):        # two are made at a frame: faster than frozen dataclasses
+    """The filter after a frame, and how k markers of the frame before were seen in it."""
 
     x: np.ndarray                # (6,) pose X and w - w_0
-    M: np.ndarray                # (k, 3) markers in the frame
-    P: np.ndarray                # (6 + 3k, 6 + 3k) covariance of x and M
-    place: np.ndarray            # (m,) row in M of each sighting's marker, -1 if rejected
+    marker: np.ndarray           # (m,) ids of the markers in the state, not of rejected ones
+    M: np.ndarray                # (m, 3) these markers in the frame
+    P: np.ndarray                # (6 + 3m, 6 + 3m) covariance of x and M
     log_likelihood: float = 0.0  # of the innovations so far, up to a constant
     rejected: int = 0            # number of sightings so far beyond the gate
-    new: np.ndarray | None = None        # (u,) rows of the sightings that were compared with M
-    v: np.ndarray | None = None  # (u, 3) their innovations
+    new: np.ndarray | None = None        # (k,) their rows in the frame
+    v: np.ndarray | None = None  # (k, 3) their innovations
 
 
 def fuse(dataset, slip=None):
@@ -96,30 +88,27 @@ def fuse(dataset, slip=None):
     """
     require_type(dataset, Dataset, "fuse")
     slip = dataset.vehicle.slip if slip is None else slip
-    jumps = find_jumps(dataset)
-    given = _filter_input(dataset, dataset.vehicle, jumps)
+    vehicle, jumps = dataset.vehicle, find_jumps(dataset)
     if len(jumps.start):
-        other = _filter_input(dataset, dataset.vehicle)
-        gain, = np.diff([_filter(each, slip or TYPICAL_SLIP)[2].log_likelihood
-                         for each in (other, given)])
+        without, gain = (_filter(_filter_input(dataset, vehicle, each), slip or TYPICAL_SLIP)[2]
+                         .log_likelihood for each in (NO_JUMPS, jumps))
         least = MIN_JUMP_GAIN * len(jumps.start)
-        if gain < (-least if jumps.are_few else least):
-            given, jumps = other, NO_JUMPS
-    if slip is None:
-        slip = _likeliest_slip(replace(given, frames=given.frames[:SLIP_FRAMES]))
-    first = replace(given, frames=given.frames[:WHEEL_FRAMES])
-    wheel = given.vehicle.wheel + _filter(first, slip)[0][-1, 3:]
-    given = _filter_input(dataset, dataset.vehicle.with_wheel(wheel), jumps)
-    x, covariances, state, innovations = _filter(given, slip)
-    frames = _frames_with_memory(given, innovations)
-    if frames is not None:
-        given = replace(given, frames=frames)
-        x, covariances, state, _ = _filter(given, slip)
+        if gain - without < (-least if jumps.are_few else least):
+            jumps = NO_JUMPS
+    given = _filter_input(dataset, vehicle, jumps)
+    slip = _likeliest_slip(given) if slip is None else slip
+    wheel = vehicle.wheel + _filter(given, slip, WHEEL_FRAMES)[0][-1, 3:]
+    given = _filter_input(dataset, vehicle.with_wheel(wheel), jumps)
+    x, covariances, state, *innovations = _filter(given, slip)
+    C = _with_memory(given.sightings, *innovations)
+    if (C != given.sightings.C).any():
+        given = replace(given, sightings=replace(given.sightings, C=C))
+        x, covariances, state, *_ = _filter(given, slip)
     poses, pose_covariances = _poses_from_frames(given, slip, x, covariances)
-    repeated = len(dataset.aruco.pose) - sum(len(z) for z, *_ in given.frames)
+    repeated = len(dataset.aruco.pose) - len(given.sightings.row)
     return Fusion(
         poses=poses, covariances=pose_covariances, slip=slip,
-        rejected=state.rejected + repeated, wheel=given.vehicle.wheel + x[-1, 3:],
+        rejected=state.rejected + repeated, wheel=wheel + x[-1, 3:],
         wheel_covariance=covariances[-1, 3:, 3:])
 
 
@@ -131,7 +120,7 @@ def _likeliest_slip(given):
     middle, step = np.log([TYPICAL_SLIP, SLIP_FACTOR])
 
     def log_density(log_slip):
-        return _filter(given, np.exp(log_slip))[2].log_likelihood \
+        return _filter(given, np.exp(log_slip), SLIP_FRAMES)[2].log_likelihood \
             - ((log_slip - middle) / step)**2 / 2
 
     points = {point: log_density(point) for point in middle + step * np.arange(-1, 2)}
@@ -152,134 +141,105 @@ def _likeliest_slip(given):
 
 def _filter_input(dataset, vehicle, jumps=NO_JUMPS):
     """The _FilterInput with odometry linearised at the wheel parameters of `vehicle`."""
-    ticks, sightings = dataset.ticks, sightings_by_frame(dataset.sightings, extra_frames=[0])
-    start, end = sightings.frame[:-1], sightings.frame[1:]
-    begins = np.searchsorted(sightings.row, np.arange(len(sightings.frame)))
-    pair, first, second = common_sightings(sightings.row, sightings.marker)
-    splits = np.searchsorted(pair, np.arange(len(start)))
-    C = (vehicle.marker_noise_factor or 1.0)**2 * sightings.C
-    seen = (np.split(values, begins[1:]) for values in (sightings.z, C))
-    common = (np.split(rows, splits) for rows in (first - begins[pair], second - begins[pair + 1]))
+    s = sightings_by_frame(dataset.sightings, extra_frames=[0])
+    return _FilterInput(
+        dataset=dataset, vehicle=vehicle, jumps=jumps,
+        sightings=replace(s, C=(vehicle.marker_noise_factor or 1.0)**2 * s.C),
+        odometry=_odometry(dataset.ticks, vehicle, jumps, s.frame[:-1], s.frame[1:]))
+
+
+def _odometry(ticks, vehicle, jumps, start, end):
+    """Delta(w_0) (m, 3), dDelta/dw, Q without slip, and what a slip of 1 sqrt(m) adds to Q."""
     increment, by_w = increments.between_poses(ticks, vehicle, start, end, "arc")
     rounding, slipping = increments.noise_in_drive(ticks, vehicle, start, end)
     jump, unknown = jumps.added(start, end)
-    return _FilterInput(
-        dataset=dataset, vehicle=vehicle, pose=sightings.frame, marker=sightings.marker,
-        increment=se2.compose(increment, jump), J_w=by_w,
-        rounding=rounding + unknown, slipping=slipping, jumps=jumps,
-        frames=list(zip(*seen, *common, strict=True)))
+    return se2.compose(increment, jump), by_w, rounding + unknown, slipping
 
 
-def _filter(given, slip):
-    """x (f, 6) and its covariances (f, 6, 6) after every frame, the last _State, and innovations.
+def _filter(given, slip, frames=None):
+    """x (f, 6) and its covariances (f, 6, 6) after every frame, and the last _State.
 
-    Innovations are (u,) rows of the sightings at a frame and (u, 3) for every frame.
+    Also rows (u,) of the sightings of a marker that the state has, and their innovations (u, 3).
+    `frames` is the number of frames, the first ones; None takes all.
     """
-    vehicle = given.dataset.vehicle
+    vehicle, s = given.dataset.vehicle, given.sightings
+    increment, by_w, Q, slipping = given.odometry
+    Q, x, covariances, rows, v = Q + slip**2 * slipping, [], [], [], []
     state = _State(x=np.append(np.zeros(3), vehicle.wheel - given.vehicle.wheel),
-                   M=np.zeros((0, 3)), place=np.zeros(0, int),
+                   marker=np.zeros(0, int), M=np.zeros((0, 3)),
                    P=np.diag([0.0, 0.0, vehicle.sigma_heading, *vehicle.sigma_wheel])**2)
-    Q, x, covariances, innovations = given.rounding + slip**2 * given.slipping, [], [], []
-    for k, frame in enumerate(given.frames):
+    begins = np.searchsorted(s.row, np.arange(len(s.frame) + 1))
+    for k, (begin, end) in enumerate(zip(begins[:frames], begins[1:])):
         if k > 0:
-            state = _predicted(state, given.increment[k - 1], given.J_w[k - 1], Q[k - 1])
-        state = _updated(state, *frame)
+            state = _predicted(state, increment[k - 1], by_w[k - 1], Q[k - 1])
+        state = _updated(state, s.marker[begin:end], s.z[begin:end], s.C[begin:end])
         x.append(state.x)
-        covariances.append(state.P[:6, :6].copy())
-        innovations.append((state.new, state.v))
-    return np.array(x), np.array(covariances), state, innovations
+        covariances.append(state.P[:6, :6])
+        rows.append(begin + state.new)
+        v.append(state.v)
+    return np.array(x), np.array(covariances), state, np.concatenate(rows), np.concatenate(v)
 
 
-def _frames_with_memory(given, innovations):
-    """`frames` whose covariances are larger where errors have memory, else None.
+def _with_memory(s, rows, v):
+    """Covariances (s, 3, 3) of Sightings, larger where errors have memory, by innovations `v`.
 
     A covariance is divided by the share that its sighting keeps (`slamlib.memory`).
     """
-    sizes = [len(z) for z, *_ in given.frames]
-    begins = np.cumsum(sizes) - sizes
-    rows = np.concatenate([begin + new for begin, (new, _) in zip(begins, innovations)])
-    v = np.concatenate([v for _, v in innovations])
-    C = np.concatenate([C for _, C, *_ in given.frames])
-    u = np.linalg.solve(np.linalg.cholesky(C[rows]), v[..., None])[..., 0]
-    used = np.sum(u**2, axis=1) < GATE
-    share = error_memory(given.marker[rows], np.repeat(given.pose, sizes)[rows], u, used).share
-    if (share == 1).all():
-        return None
-    kept = np.ones(len(C))
-    kept[rows] = share
-    shares = np.split(kept, begins[1:])
-    return [(z, C / s[:, None, None], *common) for (z, C, *common), s in zip(given.frames, shares)]
+    u = np.linalg.solve(np.linalg.cholesky(s.C[rows]), v[..., None])[..., 0]
+    used, share = np.sum(u**2, axis=1) < GATE, np.ones(len(s.C))
+    share[rows] = error_memory(s.marker[rows], s.frame[s.row[rows]], u, used).share
+    return s.C / share[:, None, None]
 
 
 def _predicted(state, increment, by_w, Q):
-    """The _State after one odometry increment.
-
-    The derivatives are those of `se2.compose` and `se2.between`, written out: the arrays of one
-    frame are so small that calls take longer than arithmetic.
-    """
+    """The _State after one odometry increment."""
     delta = increment + by_w @ state.x[3:]
-    x, y, heading = state.x[:3].tolist()
-    turned, back = _rotation(heading), _rotation(-delta[2])
-    pose, M = state.x[:3] + turned @ delta, (state.M - delta) @ back.T
-    F, L = np.eye(len(state.P)), np.zeros((len(state.P), 3))
-    F[0, 2], F[1, 2] = y - pose[1], pose[0] - x
-    L[:3] = turned
-    L[6:] = np.tile(-back, (len(M), 1))
-    L[6::3, 2], L[7::3, 2] = M[:, 1], -M[:, 0]
+    by_pose, by_delta = se2.compose_jacobians(state.x[:3], delta)
+    M_by_delta, M_by_M = se2.between_jacobians(delta, state.M)
+    L = np.concatenate([by_delta, np.zeros((3, 3)), M_by_delta.reshape(-1, 3)])
+    F = _joined(np.eye(6), M_by_M)
+    F[:3, :3] = by_pose
     F[:, 3:6] += L @ by_w
-    rows = 6 + np.arange(3 * len(M)).reshape(-1, 3)
-    F[rows[:, :, None], rows[:, None, :]] = back
-    return state._replace(x=np.concatenate([pose, state.x[3:]]), M=M,
-                          P=F @ state.P @ F.T + L @ Q @ L.T)
+    return state._replace(
+        x=np.append(se2.compose(state.x[:3], delta), state.x[3:]), M=se2.between(delta, state.M),
+        P=F @ state.P @ F.T + L @ Q @ L.T)
 
 
-def _rotation(angle):
-    """The matrix (3, 3) that turns the position of [x, y, heading] by an angle in rad."""
-    c, s = math.cos(angle), math.sin(angle)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
-def _updated(state, z, C, earlier, later):
-    """The _State after a frame's sightings z (m, 3) and C (m, 3, 3), as in `_FilterInput`."""
-    known = state.place[earlier] >= 0
-    old, new = state.place[earlier[known]], later[known]
-    v = z[new] - state.M[old]
-    v[:, 2] = se2.wrap(v[:, 2])
-    state = state._replace(new=new, v=v)
-    rows = 6 + 3 * old[:, None] + np.arange(3)
-    S = state.P[rows[:, :, None], rows[:, None, :]] + C[new]            # of each sighting alone
-    accepted = (v * np.linalg.solve(S, v[..., None])[..., 0]).sum(axis=1) < GATE
-    if not accepted.all():
-        # A rejected sighting has the density at the gate, so that rejections do not favour a slip.
-        density = np.sum(GATE + np.linalg.slogdet(S[~accepted])[1]) / 2
-        state = state._replace(log_likelihood=state.log_likelihood - density,
-                               rejected=state.rejected + int(np.count_nonzero(~accepted)))
-        old, rows = old[accepted], rows[accepted]
-    if len(rows):
-        state = _corrected(state, rows.ravel(), v[accepted].ravel(), C[new[accepted]])
-    added = np.ones(len(z), bool)
-    added[new] = False
-    kept, rows = len(old), np.concatenate([np.arange(6), rows.ravel()])
-    P = np.zeros(2 * [len(rows) + 3 * np.count_nonzero(added)])
-    P[:len(rows), :len(rows)] = state.P[rows[:, None], rows]
-    rows = len(rows) + np.arange(len(P) - len(rows)).reshape(-1, 3)
-    P[rows[:, :, None], rows[:, None, :]] = C[added]
-    place = np.full(len(z), -1)
-    place[new[accepted]] = np.arange(kept)
-    place[added] = kept + np.arange(len(rows))
-    return state._replace(P=P, M=np.concatenate([state.M[old], z[added]]), place=place)
-
-
-def _corrected(state, rows, v, C):
-    """The _State after the Kalman update by innovations v (3m,) of these rows (3m,) of P."""
-    S, HP = state.P[rows[:, None], rows], state.P[rows]
-    block = np.arange(len(v)).reshape(-1, 3)
-    S[block[:, :, None], block[:, None, :]] += C
-    solved = np.linalg.solve(S, np.column_stack([HP, v]))
+def _updated(state, marker, z, C):
+    """The _State after a frame's sightings of markers (m,), z (m, 3) with C (m, 3, 3)."""
+    known = state.marker[:, None] == marker
+    old, new = known.nonzero()
+    v = se2.difference(z[new], state.M[old])
+    rows, each = (6 + 3 * old[:, None] + np.arange(3)).ravel(), np.arange(len(new))
+    S = state.P[rows[:, None], rows]
+    blocks = S.reshape(2 * (len(new), 3))                               # of the same memory
+    S_each = blocks[each, :, each] = blocks[each, :, each] + C[new]
+    accepted = (v * np.linalg.solve(S_each, v[..., None])[..., 0]).sum(axis=1) < GATE
+    # A rejected sighting has the density at the gate, so that rejections do not favour a slip.
+    rejected = GATE + np.linalg.slogdet(S_each[~accepted])[1]
+    used = np.repeat(accepted, 3)
+    rows, S, u = rows[used], S[used][:, used], v[accepted].ravel()
+    HP = state.P[rows]
+    solved = np.linalg.solve(S, np.column_stack([HP, u]))
     change, P = HP.T @ solved[:, -1], state.P - HP.T @ solved[:, :-1]
-    density = (v @ solved[:, -1] + np.linalg.slogdet(S)[1]) / 2
-    return state._replace(x=state.x + change[:6], M=state.M + change[6:].reshape(-1, 3),
-                          P=(P + P.T) / 2, log_likelihood=state.log_likelihood - density)
+    kept, added = np.concatenate([np.arange(6), rows]), ~known.any(axis=0)
+    M = (state.M + change[6:].reshape(-1, 3))[old[accepted]]
+    return _State(
+        x=state.x + change[:6], M=np.concatenate([M, z[added]]),
+        marker=np.concatenate([marker[new[accepted]], marker[added]]),
+        P=_joined((P + P.T)[kept[:, None], kept] / 2, C[added]),
+        log_likelihood=state.log_likelihood - (
+            rejected.sum() + u @ solved[:, -1] + np.linalg.slogdet(S)[1]) / 2,
+        rejected=state.rejected + len(rejected), new=new, v=v)
+
+
+def _joined(P, C):
+    """The block-diagonal matrix (n + 3k, n + 3k) of P (n, n) and C (k, 3, 3)."""
+    rows = len(P) + np.arange(3 * len(C)).reshape(-1, 3)
+    joined = np.zeros(2 * [len(P) + rows.size])
+    joined[:len(P), :len(P)] = P
+    joined[rows[:, :, None], rows[:, None, :]] = C
+    return joined
 
 
 def _poses_from_frames(given, slip, x, covariances):
@@ -287,15 +247,12 @@ def _poses_from_frames(given, slip, x, covariances):
 
     `x` and `covariances` are those of `_filter`.
     """
-    pose = np.arange(len(given.dataset.ticks))
-    last = np.searchsorted(given.pose, pose, side="right") - 1
-    steps = given.dataset.ticks, given.vehicle, given.pose[last], pose
-    increment, by_w = increments.between_poses(*steps, "arc")
-    rounding, slipping = increments.noise_in_drive(*steps)
-    jump, unknown = given.jumps.added(given.pose[last], pose)
-    Q = rounding + unknown + slip**2 * slipping
-    delta = se2.compose(increment, jump) + np.einsum("nij,nj->ni", by_w, x[last, 3:])
+    pose, frame = np.arange(len(given.dataset.ticks)), given.sightings.frame
+    last = np.searchsorted(frame, pose, side="right") - 1
+    increment, by_w, Q, slipping = _odometry(
+        given.dataset.ticks, given.vehicle, given.jumps, frame[last], pose)
+    delta = increment + (by_w @ x[last, 3:, None])[..., 0]
     A, B = se2.compose_jacobians(x[last, :3], delta)
     F = np.concatenate([A, B @ by_w], axis=2)
     return (se2.compose(x[last, :3], delta),
-            F @ covariances[last] @ F.mT + B @ Q @ B.mT)
+            F @ covariances[last] @ F.mT + B @ (Q + slip**2 * slipping) @ B.mT)

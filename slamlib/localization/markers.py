@@ -15,24 +15,17 @@ is C_M = E C_X E^T + F C F^T + T + T^T. This is the correlated state of Smith, S
 Estimating Uncertain Spatial Relationships in Robotics, 1990, without the states of earlier frames.
 """
 
-from collections import Counter, defaultdict, deque
 from dataclasses import dataclass
-from heapq import nlargest
 
 import numpy as np
 
 from slamlib import se2
 from slamlib.dataset import ArucoReadings, DatasetError
-from slamlib.marker_increments import (
-    common_sightings,
-    consecutive_increments,
-    robust_increments,
-)
+from slamlib.marker_increments import consecutive_increments, robust_increments
 from slamlib.sightings import consensus, sightings_by_frame
 from slamlib.textfile import require_type
 
 MAX_CANDIDATES = 3            # number of earlier frames that are tried as parent of a frame
-MAX_FRAMES_PER_MARKER = 200   # number of frames, the latest that saw a marker, to choose them from
 
 
 @dataclass(frozen=True)
@@ -70,9 +63,9 @@ def localize(aruco, shared_errors=True):
         raise DatasetError("expected sightings that agree; all contradict another one of the same "
                            "marker at the same pose")
     increments = consecutive_increments(sightings)
-    _, *common = common_sightings(sightings.row, sightings.marker)
-    used = [rows[increments.accepted] for rows in (increments.first, increments.second)]
-    paired, confirmed = (np.isin(np.arange(len(sightings.row)), each) for each in (common, used))
+    common = np.stack([increments.first, increments.second])
+    paired, confirmed = (np.isin(np.arange(len(sightings.row)), rows)
+                         for rows in (common, common[:, increments.accepted]))
     poses, covariances, H = _composed(sightings, increments, confirmed, shared_errors)
     used = np.flatnonzero(confirmed & np.isfinite(poses[sightings.row, 0]))
     marker, in_world, marker_covariance = _map_markers(sightings, used, poses, covariances, H)
@@ -86,48 +79,40 @@ def localize(aruco, shared_errors=True):
 
 def _composed(sightings, increments, confirmed, shared_errors):
     """Poses (f, 3) and covariances (f, 3, 3), NaN where unknown, and H (s, 3, 3) of sightings."""
-    count = len(sightings.frame)
-    rows_of = np.split(np.arange(len(sightings.row)),
-                       np.searchsorted(sightings.row, np.arange(1, count)))
-    # By marker id, the latest localized frames that saw it.
-    seen_in = defaultdict(lambda: deque(maxlen=MAX_FRAMES_PER_MARKER))
+    count, table = len(sightings.frame), sightings.table()
     poses, covariances = np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan)
     H = np.zeros((len(sightings.row), 3, 3))
     root = int(np.argmax([*increments.usable, False]))
     poses[root], covariances[root] = 0.0, 0.0
-    for f in range(root, count):
-        if f > root:
-            p, found, pair = f - 1, increments, f - 1
-            if not increments.usable[pair] or np.isnan(poses[p, 0]):
-                p, found, pair = *_relocalize(sightings, confirmed, rows_of, f, seen_in), 0
-            if found is None:
-                continue
-            A, B = se2.compose_jacobians(poses[p], found.increment[pair])
-            poses[f] = se2.compose(poses[p], found.increment[pair])
-            covariances[f] = A @ covariances[p] @ A.T + B @ found.covariance[pair] @ B.T
-            if shared_errors:
-                rows = slice(*np.searchsorted(found.pair, (pair, pair + 1)))
-                first, second = found.first[rows], found.second[rows]
-                S = A @ np.sum(H[first] @ (B @ found.J_first[rows]).mT, axis=0)
-                covariances[f] += S + S.T
-                H[second] = B @ found.J_second[rows] @ sightings.C[second]
-        for m in sightings.marker[rows_of[f]].tolist():
-            seen_in[m].append(f)
+    for f in range(root + 1, count):
+        p, found, pair = f - 1, increments, f - 1
+        if not increments.usable[p] or np.isnan(poses[p, 0]):
+            p, found, pair = *_relocalize(sightings, confirmed, table, poses, f), 0
+        if found is None:
+            continue
+        A, B = se2.compose_jacobians(poses[p], found.increment[pair])
+        poses[f] = se2.compose(poses[p], found.increment[pair])
+        covariances[f] = A @ covariances[p] @ A.T + B @ found.covariance[pair] @ B.T
+        if shared_errors:
+            rows = slice(*np.searchsorted(found.pair, (pair, pair + 1)))
+            first, second = found.first[rows], found.second[rows]
+            S = A @ np.sum(H[first] @ (B @ found.J_first[rows]).mT, axis=0)
+            covariances[f] += S + S.T
+            H[second] = B @ found.J_second[rows] @ sightings.C[second]
     return poses, covariances, H
 
 
-def _relocalize(sightings, confirmed, rows_of, frame, seen_in):
+def _relocalize(sightings, confirmed, table, poses, frame):
     """The parent of a frame and the MarkerIncrements from it to this frame, or None and None.
 
-    Candidates are the localized frames with the most common markers, the latest first. A parent
-    requires two accepted markers, or one whose two sightings adjacent frames confirm.
+    Candidates are the frames with known `poses` and the most common markers, the latest first. A
+    parent requires two accepted markers, or one whose two sightings adjacent frames confirm.
     """
-    marker, rows = sightings.marker, rows_of[frame]
-    shared = Counter(f for m in marker[rows].tolist() for f in seen_in[m])
-    for f in nlargest(MAX_CANDIDATES, shared, key=lambda f: (shared[f], f)):
-        _, first, second = np.intersect1d(marker[rows_of[f]], marker[rows], return_indices=True)
-        first, second = rows_of[f][first], rows[second]
-        found = robust_increments(sightings.z, sightings.C, np.zeros_like(first), first, second, 1)
+    common = (table[:frame] >= 0) & (table[frame] >= 0) & np.isfinite(poses[:frame, :1])
+    shared = common.sum(axis=1)
+    for f in np.lexsort((np.arange(frame), shared))[:-MAX_CANDIDATES - 1:-1]:
+        first, second = table[f, common[f]], table[frame, common[f]]
+        found = robust_increments(sightings.z, sightings.C, 0 * first, first, second, 1)
         sure = found.accepted & confirmed[first] & confirmed[second]
         if found.usable[0] and (found.accepted.sum() > 1 or sure.any()):
             return f, found

@@ -16,8 +16,7 @@ from jinja2 import Template
 from matplotlib.figure import Figure
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_output
 
-from slamlib import evaluation
-from slamlib.checks import consistency
+from slamlib import evaluation, marker_increments
 from slamlib.checks.files import doubts_before_solving, merged
 from slamlib.dataset import Doubt, all_notes
 from slamlib.notebook import Drive, accuracy, plotting, table
@@ -158,11 +157,11 @@ def _compared(drive):
     both = [drive.solution("problem1"), drive.solution("problem4") or drive.solution("problem3")]
     errors = returns = None
     if all(both):
-        found = consistency.returns(drive.dataset)
+        found = marker_increments.returns(drive.dataset)
         if drive.truth is not None:
             errors = [with_unit(accuracy(each, drive)["ATE (mm)"], "m") for each in both]
         elif len(found.start):
-            off = [consistency.discrepancies(found, solution.poses)[:, :2] for solution in both]
+            off = [found.discrepancies(solution.poses)[:, :2] for solution in both]
             returns = [with_unit(1e3 * np.sqrt(np.mean(np.sum(each**2, axis=1))), "m")
                        for each in off]
     last = drive.solutions[-1]

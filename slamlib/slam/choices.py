@@ -74,8 +74,10 @@ def calibrated(fit):
     tried, stated = [], fit.problem.measurements.calibration.stated
     for _ in range(MAX_PROPOSALS):
         problem, proposal = fit.problem, _proposal(fit)
-        fit = replace(fit, explanations=proposal.explanations)
-        if np.array_equal(proposal.sigma, problem.sigma) or proposal.groups in tried:
+        if np.array_equal(proposal.sigma, problem.sigma):
+            fit = replace(fit, explanations=proposal.explanations)
+            break
+        if proposal.groups in tried:
             break
         tried.append(proposal.groups)
         state = replace(fit.state, c=np.where(proposal.sigma > 0, fit.state.c, stated))

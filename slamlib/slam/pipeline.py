@@ -79,8 +79,9 @@ kernel, found 'L2'
             return calibrated(fit_from_previous(measurements, previous, model))
         fit = fit_from_odometry(measurements, model or "arc")                         # 2 to 6
         fit = calibrated(fit if model else better_model(fit))
-        # Wrong statements may look like other steps.
-        return better_model(fit) if fit.problem.released and not model else fit
+        # Wrong statements may look like other steps, and these like other statements.
+        other = better_model(fit) if fit.problem.released and not model else fit
+        return fit if other is fit else calibrated(other)
 
     if previous is not None and len(previous.rejected):
         places = previous.places

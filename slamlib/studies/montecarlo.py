@@ -10,7 +10,6 @@ import numpy as np
 
 from slamlib import localization, odometry, slam
 from slamlib.evaluation import anees, ate, position_sigmas
-from slamlib.localization.hint import first_order_from
 from slamlib.sightings import sightings_by_frame
 from slamlib.simulation import simulate
 from slamlib.slam.fit import refine
@@ -21,7 +20,7 @@ PROBLEM2_METHODS = {
     "ArUco": lambda dataset: localization.localize(dataset.aruco),
     "naive": lambda dataset: localization.localize(dataset.aruco, shared_errors=False),
     "hint": localization.fuse_increments,
-    "exact hint": lambda dataset: localization.fuse_increments(dataset, first_order_from),
+    "exact hint": lambda dataset: localization.fuse_increments(dataset, odometry.first_order),
     "fused": localization.fuse}
 MEMORY_METHODS = ("markers", "problem 3", "problem 4", "known", "independent")
 
