@@ -166,7 +166,7 @@ def _compared(drive):
                        for each in off]
     last = drive.solutions[-1]
     counts = [f"{len(each[0])} {name}{'s' * (len(each[0]) > 1)}" for name, each in (
-        ("marker", last.aruco_map), ("antenna", last.uwb_map)) if each is not None]
+        ("marker", last.aruco_map), ("antenna", last.uwb_map)) if each and len(each[0])]
     return {"name": _name(drive), "errors": errors, "returns": returns,
             "landmarks": listed(counts)}
 
