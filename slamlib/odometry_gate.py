@@ -44,6 +44,7 @@ MIN_JUMP = 0.1               # m and rad, least standard deviation of the motion
 MAX_UNSUPPORTED = 2          # number of jumps; sensors that have more of them may be poor
 UNKNOWN_SIGMA = np.array([10.0, 10.0, np.pi])  # m, m, rad, if no marker tells
 SPIKE = 3.0                  # ratio to the counts of fast steps, above which a step is the jump
+SPIKE_CHANCE = 1e6           # of a jump in such a step, relative to others
 
 
 @dataclass(frozen=True)
@@ -60,8 +61,9 @@ class Jumps:
 
     @property
     def are_few(self):
-        """Whether there are jumps, but so few that they need no more support than the markers'."""
-        return 0 < len(self.start) <= MAX_UNSUPPORTED
+        """Whether there are jumps, but few that no spike of the counts supports."""
+        supported = self.chance[self.end] - self.chance[self.start] > SPIKE_CHANCE
+        return len(self.start) > 0 and np.sum(~supported) <= MAX_UNSUPPORTED
 
     def share(self, start, end):
         """Probabilities (m, g) that the jumps are in increments between encoder poses (m,)."""
@@ -129,7 +131,7 @@ def _jumps(dataset, s, drive):
     counts = np.abs(dataset.ticks).max(axis=1)
     spike = counts > SPIKE * np.quantile(counts, 0.99)
     return Jumps(start=s.frame[k], end=s.frame[k + 1], increment=increment, by_odometry=by_odometry,
-                 sigma=sigma, chance=np.cumsum(np.where(spike, 1e6, 1.0)))
+                 sigma=sigma, chance=np.cumsum(np.where(spike, SPIKE_CHANCE, 1.0)))
 
 
 def _bridged(s, drive, suspects, breaks, rank, dead=()):

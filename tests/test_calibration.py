@@ -18,7 +18,7 @@ from slamlib.evaluation import align, anees, ate
 from slamlib.localization import fuse, fuse_increments, localize
 from slamlib.simulation import mislabel, simulate
 from slamlib.slam import choices, graph, own
-from slamlib.slam.calibration import ANTENNAS, ENTRIES, RANGE_LAG, SIGHTING_LAG
+from slamlib.slam.calibration import ANTENNAS, ENTRIES, RANGE_LAG, SIGHTING_LAG, SIZE
 from slamlib.slam.factors import SMOOTHED_STEPS
 from slamlib.slam.fit import KERNELS, ONE_SIDED
 from slamlib.slam.initialization import odometry_state
@@ -200,6 +200,17 @@ def test_a_wrong_statement_is_named_and_mended(fault):
         assert ate(result.poses, truth.poses, aligned=True) < 1.5 * possible
         assert anees(result.poses, result.covariances, truth.poses) < 6
     assert antenna_error(both, truth)[1].mean() < 8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 2])
+def test_the_model_of_a_step_that_a_wrong_size_made_does_not_blame_the_wheels(seed):
+    """A camera 0.2 m ahead, as stated, and larger markers look like Euler's steps at first."""
+    dataset = seen_from(simulate("short", seed)[0].without("uwb"), (0.2, 0.0, 0.0), size=1.04)
+    found = slam.estimate(replace(dataset, vehicle=replace(dataset.vehicle, camera_x=0.2)))
+    assert found.model == "arc" and found.released == {"marker-size"}
+    assert [doubt.what for doubt in solution_doubts(found)] == ["marker-size"]
+    assert found.c[SIZE] == pytest.approx(1.04, abs=0.004)
 
 
 @pytest.mark.slow

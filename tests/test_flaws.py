@@ -220,7 +220,10 @@ def test_there_is_no_doubt_about_a_clean_long_drive():
 @pytest.mark.slow
 @pytest.mark.parametrize("case", LEGAL)
 def test_every_problem_is_solved_within_the_limits(case):
-    """Finite covariances that are not negative, and of SLAM errors as those that they state."""
+    """Finite covariances that are not negative, and of SLAM errors as those that they state.
+
+    Or, where the errors are not as stated, many sightings are rejected, and that is said.
+    """
     dataset, truth = read_dataset(SHORT), read_truth(SHORT)
     dataset = LEGAL[case](dataset.first(300))
     doubts_before_solving(dataset, truth)                  # without a warning
@@ -231,7 +234,8 @@ def test_every_problem_is_solved_within_the_limits(case):
         assert known.any() and (variances >= 0).all()
         if found.problem in ("problem3", "problem4"):
             errors = np.abs(found.poses - truth.poses[:300])
-            assert (errors < 5 * np.sqrt(variances) + 0.02).all()
+            assert (errors < 5 * np.sqrt(variances) + 0.02).all() \
+                or "sightings-rejected" in names(found.doubts)
 
 
 def test_a_solution_that_rounding_spoilt_is_none(monkeypatch):

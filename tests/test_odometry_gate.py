@@ -131,6 +131,7 @@ FAULTS = {
     "rows lost": (spoilt(slice(1003, 1033), lambda ticks: 0 * ticks), 1.5),
     "one wheel dead": (spoilt(slice(1003, 1053), lambda ticks: ticks * [0, 1]), 1.5),
     "a spike": (spoilt([1004], lambda ticks: ticks + [1500, 0]), 1.5),
+    "three spikes": (spoilt([1004, 1404, 1803], lambda ticks: ticks + [4096, 0]), 1.5),
     "dead for a third": (spoilt(slice(1334, None), lambda ticks: 0 * ticks), 4.0)}
 
 
