@@ -66,7 +66,7 @@ def look():
     from slamlib.notebook import plotting
     plt.close("all")                                 # the README's example leaves one open
     with plt.rc_context():
-        plotting.use_style()
+        plt.style.use(plotting.STYLE)
         yield
         plt.close("all")
 

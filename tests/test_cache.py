@@ -1,5 +1,6 @@
 """A notebook is executed again when something changed that it depends on, and only then."""
 
+import os
 import shutil
 
 import joblib
@@ -20,8 +21,9 @@ def execute_without_kernel(books, environment, results, jobs, finish):
             count.write("x")
         (results / "short").mkdir(parents=True, exist_ok=True)
         (results / "short" / f"{source.stem}.mat").write_text("result")
-        cell, = (cell for cell in book.cells if cell.cell_type == "code")
-        cell.outputs = [nbformat.v4.new_output("stream", text="executed")]
+        for cell in book.cells:
+            if cell.cell_type == "code":
+                cell.outputs = [nbformat.v4.new_output("stream", text="executed")]
         finish(source, book, [f"short/{source.stem}.mat"])
 
 
@@ -48,7 +50,8 @@ def pages(folder):
     return [(folder / "report" / f"{name}.html").read_bytes() for name in "ab"]
 
 
-def test_a_changed_notebook_is_executed_again_and_only_that_one(project, capsys):
+def test_without_a_change_nothing_is_executed_and_results_that_are_gone_are_written_again(
+        project, capsys):
     assert executions(project) == (1, 1)
     before = pages(project)
     capsys.readouterr()
@@ -56,12 +59,6 @@ def test_a_changed_notebook_is_executed_again_and_only_that_one(project, capsys)
     told = capsys.readouterr().err
     assert told.count("nothing changed, not executed again") == 2 and "built in" in told
     assert pages(project) == before
-    write(project / "notebooks", "b", "# b", ("1 + 2",))
-    assert executions(project) == (1, 2)
-
-
-def test_results_that_are_gone_or_changed_are_written_again_without_an_execution(project):
-    assert executions(project) == (1, 1)
     a, b = (project / "results" / "short" / name for name in ("a.mat", "b.mat"))
     a.write_text("changed")
     b.unlink()
@@ -99,116 +96,77 @@ def test_the_versions_used_last_are_kept_and_other_notebooks_are_left_alone(tmp_
     assert len(list(kept.iterdir())) == cache.VERSIONS + 2
 
 
-@pytest.fixture
-def kept(tmp_path):
-    """A notebook that is kept with one result; returns a function that recalls it, or None."""
-    (tmp_path / "data").mkdir()
-    (tmp_path / "data" / "ticks.txt").write_text("1 0 0")
-    write(tmp_path / "notebooks", "a", "# a", ("1 + 1",))
-    source = tmp_path / "notebooks" / "a.ipynb"
-    book = nbformat.read(source, as_version=4)
-    results = tmp_path / "results"
-    results.mkdir()
-    (results / "a.mat").write_text("result")
-
-    def key(variables):
-        common = cache.fingerprint([tmp_path / "data"], source.parent, variables)
-        return cache.key_of(source, book, common)
-
-    def recall(**variables):
-        now = nbformat.read(source, as_version=4)
-        names = cache.recall(tmp_path / "kept", source, key(variables), now, results)
-        return names if names is None else (now, names)
-
-    book.cells[1].outputs = [nbformat.v4.new_output("stream", text="2")]
-    cache.keep(tmp_path / "kept", source, key({}), book, results, ["a.mat"])
-    return recall
-
-
-def test_what_is_kept_is_recalled_with_its_results(kept, tmp_path):
-    result = tmp_path / "results" / "a.mat"
-    result.unlink()
-    book, names = kept()
-    assert book.cells[1].outputs[0].text == "2" and names == ["a.mat"]
-    assert result.read_text() == "result"
-    assert kept(HOME="/elsewhere", PYTHON="python3", SLAMLIB_STUDIES="/x") is not None
-    assert kept(SLAMLIB_DATASETS="x") is None
-
-
 def executed(folder):
-    """The only executed notebook that is kept in this folder."""
-    file, = (folder / "kept").glob("*.executed")
+    """The executed notebook a that is kept."""
+    file, = (folder / "kept").glob("a.*.executed")
     return file
 
 
-def write_helper(folder, name):
-    """A module that notebooks in this folder may import."""
-    file = folder / "notebooks" / name
+def add(folder, name):
+    """A file of this name in a folder that is made for it."""
+    file = folder / name
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text("value = 1")
 
 
-@pytest.mark.parametrize("change", [
-    lambda folder: executed(folder).unlink(),
-    lambda folder: executed(folder).write_bytes(b"\xff\x00 not this"),
-    lambda folder: executed(folder).write_bytes(executed(folder).read_bytes()[:-9]),
-    lambda folder: joblib.dump([1, 2], executed(folder)),
-    lambda folder: joblib.dump(["another key", [], {}], executed(folder)),
-    lambda folder: (folder / "data" / "new.txt").write_text("new"),
-    lambda folder: write_helper(folder, "helper.py"),
-    lambda folder: write_helper(folder, "a/b/c.py"),
-])
-def test_a_change_or_a_damaged_file_is_as_if_nothing_were_kept(kept, tmp_path, change):
-    assert kept() is not None
-    change(tmp_path)
-    assert kept() is None
+def cells_changed(change):
+    """What changes the list of cells of notebook a: its text and a code cell, and another one."""
+    def changed(folder):
+        book = nbformat.read(folder / "notebooks" / "a.ipynb", as_version=4)
+        change(book.cells)
+        nbformat.write(book, folder / "notebooks" / "a.ipynb")
+    return changed
 
 
-@pytest.mark.parametrize("name", [
-    "helpers/__pycache__/c.pyc", ".ipynb_checkpoints/a.ipynb", "b.ipynb", "results/a/b.mat",
-    "helpers/d.ipynb"])
-def test_what_kernels_editors_and_builds_write_beside_a_notebook_does_not_matter(
-        kept, tmp_path, name):
-    write_helper(tmp_path, name)
-    assert kept() is not None
+@pytest.mark.parametrize("change, counts", [
+    (lambda folder: executed(folder).unlink(), (2, 1)),
+    (lambda folder: executed(folder).write_bytes(b"\xff\x00 not this"), (2, 1)),
+    (lambda folder: executed(folder).write_bytes(executed(folder).read_bytes()[:-9]), (2, 1)),
+    (lambda folder: joblib.dump([1, 2, 3], executed(folder)), (2, 1)),
+    (cells_changed(lambda cells: cells[1].update(source="1 + 2")), (2, 1)),
+    (cells_changed(lambda cells: cells.append(new_code_cell("2 + 2"))), (2, 1)),
+    (cells_changed(lambda cells: cells.pop()), (2, 1)),
+    (cells_changed(lambda cells: cells.insert(0, cells.pop())), (2, 1)),
+    (cells_changed(lambda cells: cells[1].metadata.update(tags=["lab-only"])), (2, 1)),
+    (cells_changed(lambda cells: cells[1].metadata.update(tags=["raises-exception"])), (2, 1)),
+    (cells_changed(lambda cells: cells[1].metadata.update(tags=["hide-input"])), (1, 1)),
+    (lambda folder: add(folder, "data/short/new.txt"), (2, 2)),
+    (lambda folder: add(folder, "notebooks/helper.py"), (2, 2)),
+    (lambda folder: add(folder, "notebooks/a/b/c.py"), (2, 2)),
+    (lambda folder: add(folder, "notebooks/helpers/__pycache__/c.pyc"), (1, 1)),
+    (lambda folder: add(folder, "notebooks/.ipynb_checkpoints/a.ipynb"), (1, 1)),
+    (lambda folder: add(folder, "notebooks/results/a/b.mat"), (1, 1)),
+    (lambda folder: add(folder, "notebooks/helpers/d.ipynb"), (1, 1)),
+    (lambda folder: os.environ.update(SLAMLIB_OWN="x"), (2, 2)),
+    (lambda folder: os.environ.update(OWN="x", PYTHON="python3"), (1, 1))])
+def test_what_a_notebook_depends_on_and_damage_count_and_nothing_else(
+        project, monkeypatch, change, counts):
+    for name in ("SLAMLIB_OWN", "OWN", "PYTHON"):
+        monkeypatch.setenv(name, "")                     # undone at the end
+    cells_changed(lambda cells: cells.append(new_code_cell("3 + 3")))(project)
+    assert executions(project) == executions(project) == (1, 1)
+    change(project)
+    assert executions(project) == executions(project) == counts
 
 
 def test_slamlib_and_the_packages_are_among_what_matters(monkeypatch, tmp_path):
-    found = [cache.fingerprint([], tmp_path, {})]
+    def key():
+        source = tmp_path / "notebooks" / "a.ipynb"
+        return cache.keys({source: nbformat.v4.new_notebook()}, [], {})[source]
+
+    found = [key()]
     (tmp_path / "site" / "package-1.0.dist-info").mkdir(parents=True)
     monkeypatch.syspath_prepend(tmp_path / "site")
-    found.append(cache.fingerprint([], tmp_path, {}))
+    found.append(key())
     (tmp_path / "site" / "package-1.0.dist-info").rename(tmp_path / "site/package-1.1.dist-info")
-    found.append(cache.fingerprint([], tmp_path, {}))
+    found.append(key())
     (tmp_path / "site" / "other.egg-info").mkdir()          # beside the sources, and of no version
     (tmp_path / "site" / "slamlib-9.dist-info").mkdir()
-    assert cache.fingerprint([], tmp_path, {}) == found[-1]
-    before = cache.fingerprint([], tmp_path / "site", {})
     copied = shutil.copytree(memory.SLAMLIB, tmp_path / "elsewhere")
     monkeypatch.setattr(memory, "SLAMLIB", copied)                            # as by pip install
-    assert cache.fingerprint([], tmp_path / "site", {}) == before
+    assert key() == found[-1]
     monkeypatch.setattr(memory, "SLAMLIB", tmp_path)
-    assert len({*found, cache.fingerprint([], tmp_path, {})}) == 4
-
-
-@pytest.fixture
-def read(tmp_path):
-    """A notebook with two code cells, and a function that returns its key."""
-    book = nbformat.v4.new_notebook(cells=[
-        nbformat.v4.new_markdown_cell("# a"), new_code_cell("1 + 1"), new_code_cell("2 + 2")])
-    return book, lambda: cache.key_of(tmp_path / "a.ipynb", book, "")
-
-
-@pytest.mark.parametrize("change", [
-    lambda cells: cells[1].update(source="1 + 2"), lambda cells: cells.append(cells[1]),
-    lambda cells: cells.pop(), lambda cells: cells.insert(0, cells.pop()),
-    lambda cells: cells[2].metadata.update(tags=["lab-only"]),
-    lambda cells: cells[2].metadata.update(tags=["raises-exception"])])
-def test_code_cells_their_order_and_the_tags_that_nbclient_heeds_matter(read, change):
-    book, key = read
-    before = key()
-    change(book.cells)
-    assert key() != before
+    assert len({*found, key()}) == 4
 
 
 def test_saved_outputs_and_changed_prose_cost_no_execution(project, capsys):

@@ -85,12 +85,6 @@ def test_what_is_shown_runs_without_what_is_hidden_and_imports_few_names(source)
     assert needed & hidden == set() and len(first) <= MAX_NAMES
 
 
-def cell_that_defines(chapter, name):
-    source, = NOTEBOOKS.glob(f"{chapter}_*.ipynb")
-    cell, = (cell.source for cell in cells_of(source) if f"def {name}(" in cell.source)
-    return cell
-
-
 def test_two_steps_of_the_filter_of_chapter_2_are_those_of_fuse():
     """Between two frames, linearised at the nominal wheels and then at the wheels found."""
     dataset, slip = simulate("short", seed=3)[0], 1e-3
@@ -101,7 +95,8 @@ def test_two_steps_of_the_filter_of_chapter_2_are_those_of_fuse():
     first, second = earlier[first], later[second]
     ticks = dataset.ticks[begin:end + 1] * (np.arange(end - begin + 1) > 0)[:, None]
     start, ends, wheel, known = [0], [end - begin], v.wheel, {"np": np, "se2": se2}
-    exec(cell_that_defines(2, "filter_step"), known)
+    cell, = (each for each in cells_of(CHAPTERS[1]) if "def filter_step(" in each.source)
+    exec(cell.source, known)
     for _ in range(2):
         at = v.with_wheel(wheel)
         delta, by_w = increments.between_poses(ticks, at, start, ends, "arc")

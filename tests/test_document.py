@@ -154,13 +154,21 @@ def test_before_the_execution_only_the_text_is_checked():
 # Formulas, tables and other parts.
 
 
+FORMULAS = [  # what authors write, and a part of what can be set
+    (r"\bigl\lVert r \bigr\rVert", "‖𝑟‖"), (r"a\!b", "𝑎𝑏"), (r"\|x\|", "‖𝑥‖"),
+    (r"\lvert Q \rvert", "|𝑄|"), (r"\big( a \big)^2", "𝑎"), (r"\tfrac12 \dfrac{a}{b}", "𝑎"),
+    (r"\underbrace{x}_{\text{d}}", "d"), (r"\arg\min_x f", "min"),
+    (r"\begin{bmatrix}3\end{bmatrix}", "3")]
+
+
 def test_every_formula_arrives_with_its_number(tmp_path):
     cells = [r"Norms $\lVert r \rVert^2$ and $$ \begin{aligned} x &= \frac{a}{b}\,\cos\delta_k \\ "
              r"y &= \left\lVert r \right\rVert \end{aligned} \tag{1.1} $$.",
              "| $a < b$ | 2 |\n| --- | --- |\n| $$ \\sqrt2 \\tag{7} $$ | `$code$` |",
-             new_code_cell(outputs=[shown(text_latex="$\\hat\\theta$", text_plain="no")])]
+             new_code_cell(outputs=[shown(text_latex="$\\hat\\theta$", text_plain="no")]),
+             *(f"Now: $$ {tex} $$" for tex, _ in FORMULAS)]
     found, content = pages({ONE: titled("1. Of $x$", "## And $y$", *cells)})
-    assert found["1"].count("<math") == 7 and "<code>$code$</code>" in found["1"]
+    assert found["1"].count("<math") == 7 + len(FORMULAS) and "<code>$code$</code>" in found["1"]
     assert re.findall(r'class="number">\(([\d.]+)\)', found["1"]) == ["1.1", "7"]
     assert {"eq-1.1", "eq-7"} <= set(re.findall(r'id="([^"]+)"', found["1"]))
     left = re.sub(r"(?s)<math.*?</math>|<code>.*?</code>", "", found["1"])
@@ -168,44 +176,25 @@ def test_every_formula_arrives_with_its_number(tmp_path):
     text = text_of(content, tmp_path)
     assert re.search(r"\s\(1\.1\)\s", text) and re.search(r"\s\(7\)\s", text)
     assert "‖𝑟‖" in text and "∥" not in text and "parallel" not in text
-
-
-FORMULAS = [
-    (r"\bigl\lVert r \bigr\rVert", "‖𝑟‖"), (r"a\!b", "𝑎𝑏"), (r"\|x\|", "‖𝑥‖"),
-    (r"\lvert Q \rvert", "|𝑄|"), (r"\big( a \big)^2", "𝑎"), (r"\tfrac12 \dfrac{a}{b}", "𝑎"),
-    (r"\underbrace{x}_{\text{d}}", "d"), (r"\arg\min_x f", "min"),
-    (r"\begin{bmatrix}3\end{bmatrix}", "3")]
-
-
-def test_formulas_that_authors_write_can_be_set(tmp_path):
-    content = pages({ONE: titled("1. One", *(f"Now: $$ {tex} $$" for tex, _ in FORMULAS))})[1]
-    _, *said = text_of(content, tmp_path).replace(" ", "").split("Now:")
+    _, *said = text.replace(" ", "").split("Now:")
     for each, (_, expected) in zip(said, FORMULAS, strict=True):
         assert expected in each
 
 
-def test_a_wide_formula_shrinks_and_a_long_table_breaks(tmp_path):
+def test_wide_formulas_shrink_long_tables_break_and_rows_have_groups_and_headings(tmp_path):
     rows = "\n".join(f"| {row} | {row**2} |" for row in range(150))
     wide = " + ".join(f"x_{{{number}}}" for number in range(36))
-    content = pages({ONE: titled("1. One", f"| a | b |\n| - | - |\n{rows}\n\nTable 1.1. Squares.",
-                                 f"$$ {wide} \\tag{{1}} $$")})[1]
-    text = text_of(content, tmp_path)
+    found, content = pages({ONE: titled(
+        "1. One", f"| a | b |\n| - | - |\n{rows}\n\nTable 1.1. Squares.",
+        f"$$ {wide} \\tag{{1}} $$", "> **Answer**\n>\n> **Question.** Why $x$?", "> A quote.",
+        "| n | x |\n| --- | --- |\n| a | 1. *one* |\n| | 2 |\n| b | 3 |\n",
+        "| n | x |\n| --- | --- |\n| **all** | |\n| c | 4 |")})
+    found, text = found["1"], text_of(content, tmp_path)
     assert all(re.search(rf"\b{row}\s+{row**2}\b", text) for row in range(150))
     assert next(line for line in text.splitlines() if line.endswith("(1)")).count("+") == 35
-
-
-def test_rows_of_a_group_have_one_name_and_headings_of_rows_span_the_table(tmp_path):
-    found, content = pages({ONE: titled(
-        "1. One", "| n | x |\n| --- | --- |\n| a | 1. *one* |\n| | 2 |\n| b | 3 |\n",
-        "| n | x |\n| --- | --- |\n| **all** | |\n| c | 4 |")})
-    assert re.findall(r'<td[^>]*rowspan="2"[^>]*>(.*?)<', found["1"]) == ["a"]
-    assert found["1"].count('<tr class="group">') == 1
-    assert re.search(r'<td colspan="2"[^>]*><strong>all', found["1"])
-    assert "1. one" in text_of(content, tmp_path)
-
-
-def test_the_box_answer_and_quotes():
-    found = page("> **Answer**\n>\n> **Question.** Why $x$?", "> A quote.")
+    assert re.findall(r'<td[^>]*rowspan="2"[^>]*>(.*?)<', found) == ["a"] and "1. one" in text
+    assert found.count('<tr class="group">') == 1
+    assert re.search(r'<td colspan="2"[^>]*><strong>all', found)
     assert found.count('<div class="answer">') == found.count("<blockquote>") == 1
 
 

@@ -1,6 +1,7 @@
 """Problems solved in a chapter: what fails is left out and said, there and on the first page."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_outp
 from slamlib import localization, solve
 from slamlib.dataset import DatasetError, Doubt
 from slamlib.notebook import Drive, attempted, drives, notices, show_doubts, solved
+from slamlib.results import read_structs
 from slamlib.simulation import simulate
 
 REASON = "expected sightings that agree"
@@ -55,9 +57,29 @@ def test_a_drive_that_fails_is_left_out_and_said_and_its_other_problems_are_writ
                                "good/problem2/ArucoMap.mat", "good/problem2/vehiclePose.mat",
                                "good/problem2_fused/vehiclePose.mat"]
     (text, _), = said
-    assert text.startswith(r"**b\*d**: The problem “ArUco” could not be solved: " + REASON)
+    assert text.startswith(
+        "**b&#42;d**: The problem &#8220;ArUco&#8221; could not be solved: " + REASON)
     failure, = notices([book_of(said), book_of(said)])["b*d"]          # once, of two chapters
     assert failure.problem == "problem2" and failure.reason.startswith(REASON)
+
+
+@pytest.mark.parametrize("calls, written", [
+    ([(None, 1), (None, 2), ("a", 3), ("a", 4)], [1, 1, 1, 1]),       # not in JupyterLab: no cells
+    ([("a", 1), ("a", 2), ("a", 2), ("b", 3), ("a", 4)], [1, 2, 2, 2, 5])])
+def test_a_second_call_for_a_problem_writes_nothing_unless_its_cell_is_run_again(
+        said, both, tmp_path, monkeypatch, calls, written):
+    """Calls of a cell and an execution, each with poses of its number."""
+    shell, found = SimpleNamespace(), []
+    monkeypatch.setattr(drives, "get_ipython", lambda: shell)
+    for number, (cell, execution) in enumerate(calls, start=1):
+        shell.parent_header = {"metadata": {"cellId": cell}, "header": {"msg_id": execution}}
+        poses = np.full((100, 3), float(number)), np.zeros((100, 3, 3))
+        result, = solved(both[:1], problem1={both[0]: poses}.get).values()
+        assert result is poses
+        found.append(read_structs(tmp_path / "good" / "problem1", "vehiclePose")[1][0, 0])
+    assert found == written
+    told = "**good**: the files of problem1 stay those of the first call of solved in this"
+    assert [text[:len(told)] for text, _ in said] == [told] * (len(calls) - len(set(written)))
 
 
 def test_drives_without_a_sensor_are_left_out(said, both):
@@ -70,10 +92,8 @@ def test_where_every_drive_fails_a_simulated_one_replaces_them(said, both, tmp_p
     found = solved(both[1:], problem2=SOLVERS["problem2"])
     assert [drive.made_up for drive in found] == [True]
     assert "runs on a simulated drive" in said[-1][0] and files(tmp_path) == []
-
-
-def test_a_result_that_rounding_lost_is_a_failure(said, both, tmp_path):
-    lost = np.zeros((100, 3)), np.full((100, 3, 3), -1.0)
+    said.clear()
+    lost = np.zeros((100, 3)), np.full((100, 3, 3), -1.0)              # by rounding
     good = solved(both[:1], problem1=lambda drive: lost if not drive.made_up else
                   solve.find("problem1", drive.dataset))
     assert [drive.made_up for drive in good] == [True]
@@ -91,13 +111,13 @@ def test_a_simulated_drive_that_fails_is_a_defect(said, both):
 def test_a_comparison_that_fails_is_said_and_no_failure_of_a_problem(said, both):
     assert [*attempted(both, SOLVERS["problem2"])] == both[:1]
     (text, metadata), = said
-    assert text.startswith(r"**b\*d**: left out here: " + REASON) and metadata == {}
+    assert text.startswith("**b&#42;d**: left out here: " + REASON) and metadata == {}
 
 
 def test_doubts_are_said_where_they_are_found_and_told_to_the_first_page(said, both):
     doubts = [Doubt("units", "Lengths are in mm."), Doubt("antenna", "Antenna 7 is *far*.")]
     show_doubts(both[0], doubts)
     show_doubts(Drive("simulated", None, None, made_up=True), doubts)
-    assert said[1][0] == r"**good**: Antenna 7 is \*far\*."
+    assert said[1][0] == "**good**: Antenna 7 is &#42;far&#42;."
     assert notices([book_of(said)]) == {"good": doubts}
     assert notices([new_notebook()]) == {}

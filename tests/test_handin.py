@@ -4,49 +4,30 @@ import re
 from dataclasses import replace
 from zipfile import ZipFile
 
-import nbformat
 import numpy as np
 import pytest
-from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 from test_document import text_of
 from test_report import write
 
 from slamlib.__main__ import main
-from slamlib.dataset import DatasetError, Doubt
+from slamlib.dataset import Doubt
 from slamlib.report import handin
-from slamlib.report.build import Report
-from slamlib.report.drives import SolvedDrive
 from slamlib.report.notebooks import Options
+from slamlib.report.overview import SolvedDrive
 from slamlib.simulation import simulate, write_dataset
 from slamlib.solve import Failure, Solution
 
 SOLVE = """from slamlib.notebook import *
-from slamlib.solve import allows, find
-drives = start()
-for problem in {problems}:
-    if any(allows(drive.dataset, problem) for drive in drives):
-        solved(drives, **{{problem: lambda drive: find(problem, drive.dataset)}})"""
-SIX = ["problem1", "problem2", "problem2_hint", "problem2_fused", "problem3", "problem4"]
+from slamlib.solve import PROBLEMS, find
+for problem in PROBLEMS:
+    solved(start(), **{problem: lambda drive: find(problem, drive.dataset)})"""
 
 
-def drive_of(name="mine", first=40, **without):
+def drive_of(name="mine", first=40):
     """The first poses of a simulated drive, whose first sighting is at a later pose, no truth."""
-    dataset, _ = simulate("short", seed=3)
-    dataset = dataset.first(first)
+    dataset = simulate("short", seed=3)[0].first(first)
     later = dataset.aruco.select(dataset.aruco.pose >= 10)
-    return replace(dataset, name=name, aruco=later, **without)
-
-
-def project(folder, problems=SIX, **datasets):
-    """A folder with datasets and notebooks: a chapter for all problems, and an appendix."""
-    for name, dataset in datasets.items():
-        write_dataset(folder / "data" / name, *dataset)
-    write(folder / "notebooks", "A_more", "# A. More\n\nOnly if asked for.")
-    cells = [new_markdown_cell("# 1. All"), new_code_cell(SOLVE.format(problems=problems)),
-             new_markdown_cell("## Middle\n\nRead this."),
-             new_markdown_cell("## Files\n\nOf another folder."),
-             new_markdown_cell("## Explore\n\nMove the slider.")]
-    nbformat.write(new_notebook(cells=cells), folder / "notebooks" / "1_all.ipynb")
+    return replace(dataset, name=name, aruco=later)
 
 
 @pytest.fixture(scope="module")
@@ -54,8 +35,12 @@ def handed(tmp_path_factory):
     """A hand-in of a recorded dataset beside a simulated one, and what the run said."""
     folder = tmp_path_factory.mktemp("hand in")
     simulated, truth = simulate("short", seed=4)
-    project(folder, mine=(drive_of(), None),
-            stand_in=(simulated.first(30), replace(truth, poses=truth.poses[:30])))
+    write_dataset(folder / "data" / "mine", drive_of())
+    write_dataset(folder / "data" / "stand_in", simulated.first(30),
+                  replace(truth, poses=truth.poses[:30]))
+    write(folder / "notebooks", "A_more", "# A. More\n\nOnly if asked for.")
+    write(folder / "notebooks", "1_all", "# 1. All", (SOLVE,), "## Middle\n\nRead this.",
+          "## Files\n\nOf another folder.", "## Explore\n\nMove the slider.")
     (folder / "report.toml").write_text('author = "Ada"\nproblem2 = "fused"\n')
     (folder / "report").mkdir()
     (folder / "report" / "index.html").write_text("the pages of the usual build")
@@ -144,7 +129,7 @@ def solved_drive(*problems, **others):
     poses = np.zeros((2, 3))
     solutions = [Solution(problem, problem, poses, np.zeros((2, 3, 3)),
                           world=int(problem == "problem2")) for problem in problems]
-    return SolvedDrive("d", dataset, None, tuple(solutions), **others)
+    return SolvedDrive("d", dataset, None, solutions=tuple(solutions), **others)
 
 
 @pytest.mark.parametrize("problem2, folder, aruco_map", [
@@ -183,16 +168,4 @@ def test_doubts_and_failures_are_in_the_readme_and_empty_headings_are_not():
     noted = replace(drive, dataset=replace(drive.dataset, notes=("A header was left out.",)))
     assert "d: A header was left out." in handin.readme([noted], Options())
     text = handin.readme([replace(drive, doubts=())], Options())
-    assert "Doubts" not in text and "Notes" not in text and "accepted sighting" not in text
-    seen_once = replace(drive.solutions[0], facts={"unconfirmed": [7, 9]})
-    text = handin.readme([replace(drive, solutions=(seen_once,))], Options())
-    assert "nothing confirms markers 7, 9: seen once, or where another one is\n" in text
-
-
-def test_a_dataset_called_like_a_file_of_the_zip_is_refused(tmp_path):
-    report = Report([tmp_path / "index.html", tmp_path / "report.pdf"], [
-        replace(solved_drive("problem1"), name="readme.TXT")])
-    report.files[-1].write_bytes(b"")
-    with pytest.raises(DatasetError, match="readme.TXT: the zip has a file of the name"):
-        handin.write_zip(tmp_path / "hand-in.zip", report, tmp_path, Options())
-    assert not (tmp_path / "hand-in.zip").exists()
+    assert "Doubts" not in text and "Notes" not in text

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 from conftest import copied
-from test_report import make_data, write
-from test_studies import CELL
+from test_report import make_data
 
 from slamlib.__main__ import main
 from slamlib.dataset import read_dataset
@@ -60,27 +59,20 @@ def _started(server, folder):
     pytest.fail("JupyterLab did not start:\n" + (folder / "log").read_text()[-2000:])
 
 
-@pytest.fixture
-def started(tmp_path, monkeypatch):
-    """Program, command and environment of what `slamlib lab` executes for a user's number."""
-    def start(user):
-        made = []
-        monkeypatch.setattr(os, "execve", lambda *arguments: made.append(arguments))
-        monkeypatch.setattr(os, "geteuid", lambda: user)
-        main(["lab", "--no-browser", "--port", "9999"])
-        return made[0]
+def test_jupyterlab_replaces_the_command_and_kernels_have_the_environment_of_the_build(
+        tmp_path, monkeypatch):
+    """But for SLAMLIB_RESULTS, by which a cell knows that it is in a build."""
+    made = []
     make_data(tmp_path)
-    write(tmp_path / "notebooks", "a", "# a", (CELL,))
+    (tmp_path / "notebooks").mkdir()
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("SLAMLIB_DATASETS", "short")
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
-    return start
-
-
-def test_jupyterlab_replaces_the_command_and_kernels_have_the_environment_of_the_build(
-        started, tmp_path):
-    """But for SLAMLIB_RESULTS, by which a cell knows that it is in a build."""
-    (program, as_root, _), (_, command, environment) = started(0), started(1000)
+    monkeypatch.setattr(os, "execve", lambda *arguments: made.append(arguments))
+    for user in (0, 1000):
+        monkeypatch.setattr(os, "geteuid", lambda user=user: user)
+        main(["lab", "--no-browser", "--port", "9999"])
+    (program, as_root, _), (_, command, environment) = made
     assert program == sys.executable and command[1:3] == ["-m", "jupyterlab"]
     assert command[-4:] == ["--no-browser", "--port", "9999", "notebooks"]
     assert [each for each in as_root if each not in command] == ["--allow-root"]
@@ -91,35 +83,19 @@ def test_jupyterlab_replaces_the_command_and_kernels_have_the_environment_of_the
     assert "SLAMLIB_RESULTS" not in environment
 
 
-@pytest.fixture
-def run(chromium, lab):
-    """A function that opens a notebook and runs it: its page, and the cell with sliders."""
+@pytest.mark.slow
+def test_moving_a_slider_changes_the_picture(chromium, lab):
     from playwright.sync_api import expect
     expect.set_options(timeout=1000 * SECONDS)
-    pages = []
-
-    def opened(name, listen=lambda request: None):
-        page = chromium.new_page(viewport={"width": 1300, "height": 1000})
-        pages.append(page)
-        page.set_default_timeout(1000 * SECONDS)
-        page.on("request", listen)
-        page.goto(f"{lab['url']}lab/tree/{name}?token={lab['token']}&reset")
-        # Before the kernel is the notebook's own, JupyterLab asks which one shall run the cells.
-        page.get_by_text("Python 3 (ipykernel) | Idle", exact=True).wait_for()
-        page.get_by_role("menuitem", name="Run", exact=True).click()
-        page.get_by_text("Run All Cells", exact=True).click()
-        return page, page.locator(".jp-CodeCell").filter(has=page.get_by_role("slider"))
-
-    yield opened
-    for page in pages:
-        page.close()
-
-
-@pytest.mark.slow
-def test_moving_a_slider_changes_the_picture(run, lab):
-    from playwright.sync_api import expect
-    asked = []
-    page, cell = run("1_odometry.ipynb", lambda request: asked.append(request.url))
+    page, asked = chromium.new_page(viewport={"width": 1300, "height": 1000}), []
+    page.set_default_timeout(1000 * SECONDS)
+    page.on("request", lambda request: asked.append(request.url))
+    page.goto(f"{lab['url']}lab/tree/1_odometry.ipynb?token={lab['token']}&reset")
+    # Before the kernel is the notebook's own, JupyterLab asks which one shall run the cells.
+    page.get_by_text("Python 3 (ipykernel) | Idle", exact=True).wait_for()
+    page.get_by_role("menuitem", name="Run", exact=True).click()
+    page.get_by_text("Run All Cells", exact=True).click()
+    cell = page.locator(".jp-CodeCell").filter(has=page.get_by_role("slider"))
     picture, slider = cell.locator("img"), cell.get_by_role("slider").first
     expect(picture).to_have_count(1)
     first, value = picture.get_attribute("src"), slider.get_attribute("aria-valuenow")
@@ -132,7 +108,6 @@ def test_moving_a_slider_changes_the_picture(run, lab):
     expect(picture).to_have_attribute("src", first)
     expect(picture).to_have_count(1)
     assert second != first
-
     expect(page.locator("[data-mime-type*=stderr], [data-mime-type*=error]")).to_have_count(0)
     expect(page.get_by_text(NEWS)).to_have_count(0)
     away = [url for url in asked if not url.startswith((lab["url"], "data:", "blob:"))]

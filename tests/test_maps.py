@@ -4,7 +4,6 @@ from dataclasses import replace
 from itertools import combinations
 from types import SimpleNamespace
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from test_plotting import elongated, require_contours
@@ -23,16 +22,6 @@ def solved():
     """A simulated Drive and its SlamResult with markers and antennas."""
     drive = Drive("short", *simulate("short", seed=4))
     return drive, slam.estimate(drive.dataset)
-
-
-def parts(result, markers=True, antennas=True):
-    """A result without its markers or antennas."""
-    k, a = len(result.marker) * markers, len(result.antenna) * antennas
-    return replace(
-        result, marker=result.marker[:k], marker_in_world=result.marker_in_world[:k],
-        marker_covariance=result.marker_covariance[:k], antenna=result.antenna[:a],
-        antenna_in_world=result.antenna_in_world[:a],
-        antenna_covariance=result.antenna_covariance[:a])
 
 
 def labels(fig):
@@ -74,20 +63,21 @@ def test_ellipses_of_poses_markers_and_antennas_are_contours_of_their_own_covari
 @pytest.mark.parametrize("markers, antennas", [(True, False), (False, True), (False, False)])
 def test_what_a_drive_lacks_is_absent_from_map_and_tables(solved, markers, antennas):
     drive, result = solved
-    drive, result = replace(drive, truth=None), parts(result, markers, antennas)
+    drive = replace(drive, truth=None)
+    for kind in ["marker"] * (not markers) + ["antenna"] * (not antennas):
+        result = replace(result, **{name: getattr(result, name)[:0] for name in (
+            kind, f"{kind}_in_world", f"{kind}_covariance")})
     if not antennas:
         drive = replace(drive, dataset=drive.dataset.without("uwb"))
     fig = maps.whole_map(drive, result)
-    expected = {"vehicle", "its ellipses"}
-    expected |= {"markers"} if markers else set()
-    expected |= {"antennas: guess", "antennas: estimate"} if antennas else set()
-    assert labels(fig) == expected
+    assert labels(fig) == {"vehicle", "its ellipses", *["markers"] * markers,
+                           *["antennas: guess", "antennas: estimate"] * antennas}
     fig.draw_without_rendering()
     rows = list(antenna_rows(result, drive))
     assert bool(rows) == antennas and all(np.isnan(row["error (mm)"]) for row in rows)
 
 
-def test_names_cover_neither_each_other_nor_what_is_around_the_axes(solved):
+def test_names_cover_neither_each_other_nor_what_is_around_axes_of_equal_scales(solved):
     drive, result = solved
     fig = maps.whole_map(drive, result)
     fig.draw_without_rendering()
@@ -98,17 +88,9 @@ def test_names_cover_neither_each_other_nor_what_is_around_the_axes(solved):
              for text in ax.texts]
     assert not any(a.overlaps(b) for a, b in combinations(boxes, 2))
     assert all(ax.bbox.x0 <= box.x0 and box.x1 <= ax.bbox.x1 for box in boxes)
-
-
-def test_the_map_fills_its_width_at_equal_scales(solved):
-    drive, result = solved
-    fig = maps.whole_map(drive, result)
-    ax, = fig.axes
-    fig.draw_without_rendering()
     (across, up), = np.diff(ax.transData.transform([[0, 0], [1, 1]]), axis=0)
     assert across == pytest.approx(up, rel=1e-3)
     assert ax.bbox.width > 0.75 * fig.bbox.width
-    plt.close(fig)
 
 
 @pytest.mark.parametrize("angles, millimetres", [

@@ -65,7 +65,7 @@ def test_results_are_those_of_the_library_and_of_problem_2_where_there_are_marke
         assert np.isin(ids, dataset.aruco.marker).all() and np.isfinite(markers).all()
 
 
-def test_chapters_name_the_datasets_that_have_what_they_need(built):
+def test_chapters_name_the_datasets_that_have_what_they_need_and_show_no_warning_or_nan(built):
     _, pages = built
     assert pages.keys() == {path.stem for path in (ROOT / "notebooks").glob("*.ipynb")} | {"index"}
     text = html.unescape(re.sub(r"<[^>]+>", "", pages["1_odometry"]))
@@ -73,12 +73,7 @@ def test_chapters_name_the_datasets_that_have_what_they_need(built):
         assert name in text and name in pages["index"]
     markers = html.unescape(re.sub(r"<[^>]+>", "", pages["2_aruco_localization"]))
     assert "sparse" in markers and not re.search("wheels_only|waits|one_pose|backs_up", markers)
-
-
-def test_no_page_shows_a_warning_nan_or_an_object_s_address(built):
-    """Each is a defect of the notebook."""
-    _, pages = built
-    for name, page in pages.items():
+    for name, page in pages.items():                              # no defects of the notebooks
         assert 'class="output stderr"' not in page, name
         assert not re.search(r"\bnan\b", re.sub(r"<pre.*?</pre>", "", page, flags=re.DOTALL)), name
         assert not re.search(r" at 0x[0-9a-f]{6}", page), name
@@ -166,10 +161,6 @@ def test_chapters_say_which_noise_was_given(mixed):
     assert not any(cell.endswith("± 0.00") for cell in good[1])
 
 
-def captions(page):
-    return re.findall(r'<figure id="(figure|table)-(\d+|[A-Z])\.(\d+)">', page)
-
-
 def test_without_truth_nothing_is_missing_from_the_numbers_or_named_in_vain(built, mixed):
     (_, with_truth), (_, report) = built, mixed
     pages = {page.stem: page.read_text(encoding="utf-8")
@@ -178,8 +169,8 @@ def test_without_truth_nothing_is_missing_from_the_numbers_or_named_in_vain(buil
         if name == "index":
             continue
         for kind in ("figure", "table"):
-            found = [(chapter, int(number))
-                     for which, chapter, number in captions(page) if which == kind]
+            found = [(chapter, int(number)) for chapter, number in re.findall(
+                rf'<figure id="{kind}-(\d+|[A-Z])\.(\d+)">', page)]
             assert found or (name, kind) == ("A_studies", "figure")
             assert found == [(name[0], n) for n in range(1, len(found) + 1)], name
     for name in [name for name in pages if name == "index" or name[0].isdigit()]:
@@ -212,41 +203,28 @@ def visited(request, pages, chromium):
     context.close()
 
 
-def formulas(notebook):
-    """TeX formulas in a notebook's text, by their dollars."""
-    text = "\n\n".join(cell.source for cell in nbformat.read(notebook, as_version=4).cells
-                       if cell.cell_type == "markdown")
-    text = re.sub(r"(?s)```.*?```|`[^`]*`", "", text)
-    return re.findall(r"(?s)\$\$.+?\$\$|\$[^$]+\$", text)
-
-
-def test_nothing_is_loaded_and_no_error_is_told(visited):
+def test_nothing_is_loaded_no_error_is_told_and_every_formula_takes_room(visited):
     for path, page in visited:
         assert [url for url in page.asked if not url.startswith("data:")] == [path.as_uri()]
         assert page.said == []
-
-
-def test_every_formula_of_a_notebook_is_on_its_page_and_takes_room(visited):
-    for path, page in visited:
         if path.stem == "index":
             continue
         wide = page.eval_on_selector_all("main math", "all => all.map("
                                          "m => m.getBoundingClientRect().width)")
-        assert len(wide) >= len(formulas(ROOT / "notebooks" / f"{path.stem}.ipynb")) > 0
+        book = nbformat.read(ROOT / "notebooks" / f"{path.stem}.ipynb", as_version=4)
+        text = "\n\n".join(cell.source for cell in book.cells if cell.cell_type == "markdown")
+        text = re.sub(r"(?s)```.*?```|`[^`]*`", "", text)
+        assert len(wide) >= len(re.findall(r"(?s)\$\$.+?\$\$|\$[^$]+\$", text)) > 0
         assert all(width > 1 for width in wide)
 
 
-def test_every_figure_is_drawn_and_can_be_read_on_a_phone(visited):
+def test_figures_can_be_read_equations_have_numbers_tables_scroll_and_nothing_sticks_out(visited):
     for path, page in visited:
         figures = page.eval_on_selector_all("figure > p > img", """all => all.map(
             image => [image.naturalWidth, image.width])""")
         assert figures or path.stem == "A_studies"
         assert all(natural > 0 and shown >= 330 for natural, shown in figures), (
             path.name, figures)
-
-
-def test_numbers_of_equations_stay_in_view_and_tables_scroll(visited):
-    for path, page in visited:
         outside = page.eval_on_selector_all(".equation > .number", """all => all.filter(
             number => number.getBoundingClientRect().right > innerWidth)
             .map(number => number.textContent)""")
@@ -254,6 +232,8 @@ def test_numbers_of_equations_stay_in_view_and_tables_scroll(visited):
         for selector in ("table", ".sourceCode pre"):
             assert set(page.eval_on_selector_all(selector, """all => all.map(
                 each => getComputedStyle(each).overflowX)""")) <= {"auto"}, path.name
+        assert page.evaluate(STICKING_OUT) == [], path.name
+        assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth"), path.name
 
 
 def test_code_opens_by_its_summary(visited):
@@ -273,18 +253,11 @@ def test_a_dark_page_has_light_text(chromium, pages):
     assert "invert" in page.eval_on_selector("figure img", "e => getComputedStyle(e).filter")
 
 
-def test_nothing_sticks_out_of_the_column(visited):
-    for path, page in visited:
-        assert page.evaluate(STICKING_OUT) == [], path.name
-        assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth"), path.name
-
-
 def test_links_inside_the_report_lead_somewhere(visited):
     ids = {path.name: set(page.eval_on_selector_all("[id]", "all => all.map(e => e.id)"))
            for path, page in visited}
     for path, page in visited:
-        links = page.eval_on_selector_all("a[href]", "all => all.map(a => a.href)")
-        for link in links:
+        for link in page.eval_on_selector_all("a[href]", "all => all.map(a => a.href)"):
             address = urlparse(link)
             if address.scheme != "file":
                 continue

@@ -119,7 +119,7 @@ def drive_with(truth=True):
     poses = np.column_stack([np.cos(turn), np.sin(turn), turn])
     covariances = elongated(50, 0.02, 0.01)
     return SimpleNamespace(poses=poses + [0.01, 0, 0.002], covariances=covariances), \
-        SimpleNamespace(name="a$b", truth=SimpleNamespace(poses=poses) if truth else None)
+        SimpleNamespace(name="a", truth=SimpleNamespace(poses=poses) if truth else None)
 
 
 def test_each_drive_has_its_panels_a_title_and_one_legend():
@@ -128,7 +128,7 @@ def test_each_drive_has_its_panels_a_title_and_one_legend():
         assert len(axes) == 2
         plotting.curve(axes[0], np.arange(3.0), "slam")
     fig = axes[0].figure
-    assert [ax.get_title("left") for ax in fig.axes] == [r"a\$b", "", "two", ""]
+    assert [ax.get_title("left") for ax in fig.axes] == ["a", "", "two", ""]
     assert len(fig.legends) == 1
     assert list(plotting.each_drive([])) == [] and len(plt.gcf().axes) == 1
 
@@ -149,3 +149,16 @@ def test_errors_are_in_mm_and_without_truth_the_bands_stand_alone(truth, world):
         assert [line.get_ydata() for line in ax.lines] == ([pytest.approx(error)] if truth else [])
         band = ax.collections[0].get_paths()[0].vertices[:, 1]
         assert band.max() == pytest.approx(reach)
+
+
+def test_a_second_result_on_the_same_axes_has_labels_and_an_unknown_role_is_told():
+    result, drive = drive_with()
+    for _, axes in plotting.each_drive([drive], rows=2):
+        for role, label in (("slam", None), ("fused", None), ("hint", "my hint")):
+            plotting.errors(axes, result, drive, role, label=label)
+    of = ("", "fused: ", "my hint: ")
+    assert {text.get_text() for text in axes[0].figure.legends[0].get_texts()} == {
+        f"{each}{entry}" for each in of for entry in ("error", "95 % by the covariance")}
+    for draw in (plotting.trajectory, plotting.curve):
+        with pytest.raises(ValueError, match="role, one of truth, odometry, .*; found 'mine'"):
+            draw(axes[0], np.zeros((2, 3)), "mine")

@@ -92,7 +92,8 @@ def test_files_are_index_chapters_in_order_and_the_pdf(built):
         "short/own/ArucoMap.mat"]                                     # also if not selected
 
 
-def test_kernels_see_the_folders_and_run_this_interpreter(built):
+def test_kernels_see_the_folders_and_what_is_printed_in_a_row_is_one_output(built):
+    """However long it takes. Kernels run this interpreter."""
     root, pages = built
     text = pages[2].read_text(encoding="utf-8")
     for value in (root / "data", root / ".results.new", sys.executable):
@@ -100,10 +101,6 @@ def test_kernels_see_the_folders_and_run_this_interpreter(built):
     assert '<pre class="output stderr"><code>stderr is shown' in text
     assert re.search(r"\nshort\n?</code></pre>", text)
     assert "SLAMLIB_DATA" not in os.environ
-
-
-def test_what_is_printed_in_a_row_is_one_output_however_long_it_takes(built):
-    text = built[1][2].read_text(encoding="utf-8")
     outputs = re.findall(r'<pre class="output[^>]*><code>(.*?)\s*</code>', text, re.DOTALL)
     assert [html.unescape(part).strip("'") for part in outputs[-5:]] == [
         "one\ntwo", "three", "a picture", "and another", "four"]

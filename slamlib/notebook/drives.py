@@ -7,11 +7,14 @@ to hand in and nothing else, and a cached notebook keeps its records.
 
 import os
 import re
+import unicodedata
 from dataclasses import asdict, dataclass, field
 from itertools import product
 from pathlib import Path
 
+from IPython import get_ipython
 from IPython.display import Markdown, display
+from matplotlib import style
 from matplotlib_inline.backend_inline import set_matplotlib_formats
 
 from slamlib import solve
@@ -22,8 +25,8 @@ from slamlib.simulation import simulate
 from slamlib.tables import datasets_in
 
 KEY = "slamlib"  # of records in the metadata of outputs
-# Types of records by their key.
-RECORDS = {"doubt": Doubt, "failure": solve.Failure}
+RECORDS = {"doubt": Doubt, "failure": solve.Failure}  # types of records by their key
+_WRITTEN = {}  # by the folder of files that this kernel wrote: the cell that did, and its execution
 
 
 @dataclass(frozen=True, eq=False)          # compared by identity, because arrays have no hash
@@ -50,14 +53,11 @@ def start(sensor=None):
     A simulated drive replaces them if there is none. The environment variable SLAMLIB_DATA names
     the data folder; by default it is the nearest `data` in this folder or above it.
     SLAMLIB_DATASETS selects datasets by name, one a line. Also sets the style of the figures.
-
-    Raises
-    ------
-    DatasetError : a dataset does not follow the format, or there is none.
+    Raises DatasetError if a dataset does not follow the format, or there is none.
     """
-    plotting.use_style()
+    style.use(plotting.STYLE)
     set_matplotlib_formats("svg", metadata={"Date": None})
-    data = _folder("SLAMLIB_DATA", "data")
+    data = _data_folder()
     selected = os.environ.get("SLAMLIB_DATASETS")
     names, _ = datasets_in(data, selected.split("\n") if selected else None)
     drives = [Drive(name, read_dataset(data / name), read_truth(data / name)) for name in names]
@@ -73,22 +73,14 @@ def _or_simulated(drives):
     return drives or [Drive("simulated", *simulate("short", seed=1), made_up=True)]
 
 
-def results_folder(drive):
-    """Path of the folder for a drive's results.
-
-    It is in SLAMLIB_RESULTS, by default in the folder `results` beside the data folder.
-    """
-    results = os.environ.get("SLAMLIB_RESULTS")
-    folder = Path(results) if results else _folder("SLAMLIB_DATA", "data").parent / "results"
-    return folder / drive.name
-
-
 def solved(drives, **solvers):
     """Results of solvers by problem, as {Drive: result} of the drives on which all succeed.
 
     Every result is written into the results folder, also of drives on which another problem fails;
-    what fails and what is doubted is shown, there and on the report's first page. If no drive is
-    left, a simulated short one replaces them, of which nothing is written.
+    what fails and what is doubted is shown, there and on the report's first page. A second call for
+    a problem of a drive writes nothing and says so, unless its cell is run again. If no drive is
+    left, a simulated short one replaces them, of which nothing is written. The environment variable
+    SLAMLIB_RESULTS names the results folder; by default it is `results` beside the data folder.
 
     Parameters
     ----------
@@ -103,6 +95,7 @@ def solved(drives, **solvers):
     drives = _or_simulated([drive for drive in drives if all(
         solve.allows(drive.dataset, problem) for problem in solvers)])
     found = {drive: {} for drive in drives}
+    results = Path(os.environ.get("SLAMLIB_RESULTS") or _data_folder().parent / "results")
     for drive, problem in product(drives, solvers):
         try:
             result = solvers[problem](drive)
@@ -115,14 +108,27 @@ def solved(drives, **solvers):
                            f"{failure.reason}.", failure=failure)
             continue
         found[drive][problem] = result
-        if not drive.made_up:
-            write_solution(results_folder(drive), solution)
+        if not drive.made_up and _writes(results / drive.name / problem):
+            write_solution(results / drive.name, solution)
             show_doubts(drive, solution.doubts)
+        elif not drive.made_up:
+            _notice(drive, f"the files of {problem} stay those of the first call of solved in this "
+                           "notebook; for comparisons there is attempted.")
     left = [drive for drive in drives if len(found[drive]) == len(solvers)]
     if not left:
         return solved(_or_simulated([]), **solvers)
     by_problem = [{drive: found[drive][problem] for drive in left} for problem in solvers]
     return by_problem if len(solvers) > 1 else by_problem[0]
+
+
+def _writes(folder):
+    """True for the first call that writes a folder, and where JupyterLab runs its cell again."""
+    request = getattr(get_ipython(), "parent_header", {})
+    this = request.get("metadata", {}).get("cellId"), request.get("header", {}).get("msg_id")
+    cell, execution = _WRITTEN.setdefault(folder, this)
+    if this[0] and cell == this[0] and execution != this[1]:
+        _WRITTEN[folder] = this
+    return _WRITTEN[folder] is this
 
 
 def attempted(drives, function):
@@ -145,29 +151,31 @@ def show_doubts(drive, doubts):
 def _notice(drive, text, **record):
     """Show a text about a Drive, with a record for `notices`."""
     entry = {KEY: {"dataset": drive.name, **{kind: asdict(each) for kind, each in record.items()}}}
-    display(Markdown(f"**{escaped(drive.name)}**: {escaped(text)}"),
+    display(Markdown(f"**{plain(drive.name)}**: {plain(text)}"),
             metadata=entry if record and not drive.made_up else {})
 
 
-def escaped(text):
-    """Text (str) in which Markdown and HTML interpret nothing."""
-    return re.sub(r"[\\`*_{}\[\]<>#|$~^&]", r"\\\g<0>", " ".join(text.split()))
+def plain(text):
+    """Text (str) with the characters escaped that Markdown or HTML would interpret.
+
+    Names from folders and files pass it. A space replaces a control character.
+    """
+    seen = "".join(" " if unicodedata.category(sign)[0] == "C" else sign for sign in text)
+    return re.sub(r"[^\w\s.,:;/+-]|(?<![^\W_])_|_(?![^\W_])",
+                  lambda sign: f"&#{ord(sign[0])};", seen)
 
 
 def notices(books):
     """Records in executed notebooks, by dataset: {name: list of Doubt and Failure}, each once."""
     found = {}
-    for book in books:
-        for cell in book.cells:
-            for output in cell.get("outputs", ()):
-                entry = output.get("metadata", {}).get(KEY, {})
-                for kind in RECORDS.keys() & entry.keys():
-                    found.setdefault(entry["dataset"], []).append(RECORDS[kind](**entry[kind]))
-    return {name: list(dict.fromkeys(records)) for name, records in found.items()}
+    for cell in (cell for book in books for cell in book.cells):
+        for entry in (each.get("metadata", {}).get(KEY, {}) for each in cell.get("outputs", ())):
+            for kind in RECORDS.keys() & entry.keys():
+                found.setdefault(entry["dataset"], {})[RECORDS[kind](**entry[kind])] = True
+    return {name: [*records] for name, records in found.items()}
 
 
-def _folder(variable, name):
-    if os.environ.get(variable):
-        return Path(os.environ[variable])
+def _data_folder():
     here = Path.cwd()
-    return next((p / name for p in (here, *here.parents) if (p / name).is_dir()), here / name)
+    near = (each / "data" for each in (here, *here.parents) if (each / "data").is_dir())
+    return Path(os.environ.get("SLAMLIB_DATA") or next(near, here / "data"))

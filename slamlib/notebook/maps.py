@@ -1,5 +1,7 @@
 """Draws the whole map of one drive with the names of its landmarks, which avoid each other."""
 
+from itertools import repeat
+
 import numpy as np
 
 from slamlib import evaluation
@@ -59,45 +61,38 @@ def whole_map(drive, result):
                                None if truth is None else truth.antenna_in_world,
                                np.where(doubt, 1, enlarged))
     factor = f" × {enlarged}" + ", in doubt (?) × 1" * bool(doubt.any())
-    ax.set_title(f"{plotting.literal(drive.name)} (95 % ellipses{factor * (enlarged > 1)})")
+    ax.set_title(f"{drive.name} (95 % ellipses{factor * (enlarged > 1)})")
     plotting.legend_below(fig)
     _name_landmarks(ax, result, doubt, enlarged)
     return fig
 
 
 def _name_landmarks(ax, result, doubt, enlarged):
-    """Write the names of a SlamResult's landmarks; `doubt` (a,) bool is of the antennas."""
+    """Write the names of landmarks where they cover least, once the figure has its legend.
+
+    Of a SlamResult; `doubt` (a,) bool is of the antennas. A marker's name that costs more than
+    MAX_COST is left out.
+    """
     places, weak = result.marker_in_world, np.isin(result.marker, result.unconfirmed)
     variances, axes = np.linalg.eigh(result.marker_covariance[:, :2, :2])
     outlines = places[:, :2, None] + enlarged * evaluation.REACH_95 * axes * np.sqrt(
         np.maximum(variances, 0))[:, None] @ [np.cos(OUTLINE), np.sin(OUTLINE)]
-    write_names(ax, [
-        *((f"{name}{'?' * int(unsure)}", place, ANTENNA_NAME) for name, place, unsure in zip(
-            result.antenna, result.antenna_in_world, doubt, strict=True)),
-        *((f"{name}{'?' * int(unsure)}", place[:2], NAME) for name, place, unsure in zip(
-            result.marker, places, weak, strict=True))],
-        np.concatenate([result.poses[::10, :2], *outlines.swapaxes(1, 2)]))
-
-
-def write_names(ax, names, path):
-    """Write names beside landmarks where they cover least, once the figure has its legend.
-
-    `names` is a list of (name, place (2,), font size in points), `path` (m, 2) are points that
-    names should leave free. A name of size NAME that costs more than MAX_COST is left out.
-    """
+    names = [*zip(result.antenna, result.antenna_in_world, doubt, repeat(ANTENNA_NAME)),
+             *zip(result.marker, places[:, :2], weak, repeat(NAME))]
     ax.figure.draw_without_rendering()                            # fixes the axes
     renderer, frame, boxes = ax.figure.canvas.get_renderer(), ax.bbox, np.empty((0, 4))
     point = renderer.points_to_pixels(1.0)
-    landmarks = ax.transData.transform(np.reshape([place for _, place, _ in names], (-1, 2)))
-    covered = np.vstack([landmarks, ax.transData.transform(path)])
-    weight = np.repeat([LANDMARK, PATH], [len(landmarks), len(path)])
+    landmarks = ax.transData.transform(np.concatenate([result.antenna_in_world, places[:, :2]]))
+    covered = np.vstack([landmarks, ax.transData.transform(
+        np.concatenate([result.poses[::10, :2], *outlines.swapaxes(1, 2)]))])
+    weight = np.where(np.arange(len(covered)) < len(landmarks), LANDMARK, PATH)
     direction = np.column_stack([np.cos(NAME_DIRECTIONS), np.sin(NAME_DIRECTIONS)])
     reach = np.repeat(NAME_DISTANCES, len(direction))
     direction = np.tile(direction, (len(NAME_DISTANCES), 1))
-    for (name, place, size), anchor in zip(names, landmarks, strict=True):
-        text = ax.annotate(name, place, (0, 0), textcoords="offset points", fontsize=size,
-                           ha="center", va="center", zorder=7, annotation_clip=False,
-                           fontweight="bold" if size > NAME else "normal")
+    for (name, place, unsure, size), anchor in zip(names, landmarks, strict=True):
+        text = ax.annotate(f"{name}{'?' * int(unsure)}", place, (0, 0), ha="center", va="center",
+                           textcoords="offset points", annotation_clip=False, zorder=7,
+                           fontsize=size, fontweight="bold" if size > NAME else "normal")
         text.set_in_layout(False)
         extent = text.get_window_extent(renderer)
         half = np.array([extent.width, 0.8 * size * point]) / 2

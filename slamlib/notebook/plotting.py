@@ -11,6 +11,7 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
+import pandas as pd
 from matplotlib.collections import EllipseCollection
 from matplotlib.colors import to_rgb
 
@@ -18,8 +19,14 @@ from slamlib import se2
 from slamlib.evaluation import REACH_95
 from slamlib.odometry import cumulative
 
+
+class _Roles(dict):
+    def __missing__(self, role):
+        raise ValueError(f"expected a role, one of {', '.join(self)}; found {role!r}")
+
+
 # Colours of Okabe and Ito and of Tol, distinct for the colour-blind; line styles differ in grey.
-ROLES = {
+ROLES = _Roles({
     "truth": dict(color="black", linestyle=(0, (4, 2)), linewidth=1.1, zorder=4),
     "odometry": dict(color="#D55E00", linewidth=1.5, zorder=3),
     "exact": dict(color="#332288", linewidth=1.5, zorder=3),
@@ -37,19 +44,9 @@ ROLES = {
     "guess": dict(color="#222222", linestyle="none", marker="^", markersize=7, zorder=4,
                   markerfacecolor="none"),
     "true antenna": dict(color="black", linestyle="none", marker="+", markersize=9, zorder=6),
-}
-
+})
+STYLE = Path(__file__).with_name("slamlib.mplstyle")  # for matplotlib.style
 MAX_SEMI_AXIS = 0.08         # of enlarged 95 % ellipses, in the larger extent of the path
-
-
-def use_style():
-    """Set the style of all later figures of this process."""
-    plt.style.use(Path(__file__).with_name("slamlib.mplstyle"))
-
-
-def literal(text):
-    """Text (str) with dollar signs escaped, which matplotlib would take for formulas."""
-    return text.replace("$", r"\$")
 
 
 def panels(count, rows=1, height=3.4, width=3.7, columns=2):
@@ -71,7 +68,7 @@ def each_drive(drives, rows=1, **size):
     drives = list(drives)
     fig, axes = panels(max(1, len(drives)), rows, **size)
     for drive, column in zip(drives, axes, strict=False):
-        column[0].set_title(literal(getattr(drive, "name", drive)))
+        column[0].set_title(getattr(drive, "name", drive))
         yield drive, column if rows > 1 else column[0]
     if any(ax.get_legend_handles_labels()[0] for ax in fig.axes):
         legend_below(fig)
@@ -109,13 +106,15 @@ def with_ellipses(ax, poses, covariances, role, label=None, count=12, enlarged=N
     return ax
 
 
-def errors(axes, result, drive, role="slam"):
+def errors(axes, result, drive, role="slam", label=None):
     """Draw errors of a result along the path in two axes: of position, and of the heading.
 
     The bands are the longest semi-axis of the 95 % ellipse and ±2 sigma of the heading; without
-    truth they stand alone. `result` as of `estimates`.
+    truth they stand alone. `result` as of `estimates`. `label`, by default the role of all but the
+    first result on these axes, precedes its entries in the legend.
     """
     (top, bottom), color = axes, ROLES[role]["color"]
+    of = f"{label or role}: " if label or top.collections else ""
     frame, poses, C, true = estimates(result, drive)
     some = np.unique(np.linspace(0, len(frame) - 1, 800).astype(int))
     frame, C = frame[some], C[some]
@@ -123,11 +122,11 @@ def errors(axes, result, drive, role="slam"):
     turn = 2e3 * np.sqrt(C[:, 2, 2])
     for ax, low, high in ((top, 0 * reach, reach), (bottom, -turn, turn)):
         ax.fill_between(frame + 1, low, high, color=color, alpha=0.18, linewidth=0,
-                        label="95 % by the covariance")
+                        label=f"{of}95 % by the covariance")
     if true is not None:
         off = 1e3 * (poses - true)[some]
-        curve(top, np.hypot(*off[:, :2].T), role, frame, "error", linewidth=1.2)
-        curve(bottom, off[:, 2], role, frame, "error", linewidth=0.8)
+        curve(top, np.hypot(*off[:, :2].T), role, frame, f"{of}error", linewidth=1.2)
+        curve(bottom, off[:, 2], role, frame, f"{of}error", linewidth=0.8)
     name_rows(axes, ("position (mm)", "δ (mrad)"))
     top.set_ylim(0, None)
     return axes
@@ -135,8 +134,7 @@ def errors(axes, result, drive, role="slam"):
 
 def trajectory(ax, poses, role, label=None, **look):
     """Draw the path of poses (n, >= 2) with a dot at its start and equal axes."""
-    look = {**ROLES[role], **look}
-    line, = ax.plot(poses[:, 0], poses[:, 1], label=label or role, **look)
+    line, = ax.plot(poses[:, 0], poses[:, 1], label=label or role, **ROLES[role] | look)
     ax.plot(*poses[np.isfinite(poses[:, 0])][:1, :2].T, "o", color=line.get_color(), markersize=4)
     ax.set_aspect("equal", adjustable="datalim")
     ax.set(xlabel="x (m)", ylabel="y (m)")
@@ -194,10 +192,7 @@ def draw_antennas(ax, positions, covariances, guess=None, truth=None, enlarged=1
 
 def places_by_id(ids, places, wanted):
     """Places (m, c) of the wanted ids (m,) out of ids (k,) with places (k, c), NaN if missing."""
-    found = dict(zip(np.asarray(ids).tolist(), places, strict=True))
-    none = np.full(np.shape(places)[1], np.nan)
-    return np.array([found.get(i, none) for i in np.asarray(wanted).tolist()]).reshape(
-        len(wanted), len(none))
+    return pd.DataFrame(places, index=ids).reindex(wanted).to_numpy()
 
 
 def enlargement(poses, covariances):
@@ -232,8 +227,7 @@ def legend_below(fig):
         entries |= {label: handle for handle, label in zip(handles, labels, strict=True)
                     if label not in entries}
     for columns in range(4, 0, -1):
-        while fig.legends:
-            fig.legends[0].remove()
+        fig.legends.clear()
         lines = -(-len(entries) // columns)
         legend = fig.legend(entries.values(), entries.keys(), loc="outside lower center",
                             ncols=-(-len(entries) // lines))
@@ -244,7 +238,7 @@ def legend_below(fig):
 def curve(ax, values, role, frame=None, label=None, **look):
     """Draw values (n,) over the pose number; `frame` (n,) are the indices from 0 of their poses."""
     frame = np.arange(len(values)) if frame is None else frame
-    ax.plot(frame + 1, values, label=label or role, **{**ROLES[role], **look})
+    ax.plot(frame + 1, values, label=label or role, **ROLES[role] | look)
     ax.set(xlabel="pose number")
     return ax
 

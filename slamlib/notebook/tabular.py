@@ -14,7 +14,8 @@ from slamlib.slam.measurements import NOISE_KEYS
 from slamlib.studies.kernels import mislabelled
 
 DASH = "–"
-NUMERIC = re.compile(rf"[-+−>]? ?\d|{DASH}")          # begins a cell of a column of numbers
+# What begins a cell of a column of numbers, or is an italic remark in it.
+NUMERIC = re.compile(rf"[-+−>]? ?\d(?!\. )|{DASH}|\*[^*]+\*$")
 MINUS = re.compile(r"(?<![\w.])-(?=\d)")
 MAX_NUMBER = 1e6             # larger numbers are not shown, because the method failed
 
@@ -23,23 +24,21 @@ def table(rows, caption=None):
     """Table in Markdown, an object that Jupyter shows, of rows (iterable of dict from header).
 
     Values are str, numbers (three significant digits), or arrays (s,) over drives: mean ± standard
-    error, and the median in brackets; of bool, the percentage. None, NaN and absent keys are
-    dashes; columns of nothing else are left out. Of consecutive rows with the same first cell only
-    the first shows it. `caption` (str) stands below.
+    error, and the median in brackets. None, NaN and absent keys are dashes; columns of nothing else
+    are left out. Of consecutive rows with the same first cell only the first shows it. `caption`
+    (str) stands below.
     """
     rows = [{name: cell(value) for name, value in row.items()} for row in rows]
     columns = {name: [row.get(name, DASH) for row in rows] for row in rows for name in row}
     columns = {name: column for name, column in columns.items()
                if set(column) != {DASH}} or {DASH: [DASH]}
-    lines = [list(columns), []]
-    for name, column in columns.items():
-        numeric = all(map(NUMERIC.match, column))
-        lines[1].append("---:" if numeric else "---")
-        columns[name] = [MINUS.sub("−", text) for text in column] if numeric else column
-    first, *others = columns.values()
+    numeric = [all(map(NUMERIC.match, column)) for column in columns.values()]
+    first, *others = ([MINUS.sub("−", text) if each else text for text in column]
+                      for each, column in zip(numeric, columns.values()))
     if others:
         first = [text * (text != above) for above, text in zip([None, *first], first)]
-    text = "\n".join("| " + " | ".join(line) + " |" for line in (*lines, *zip(first, *others)))
+    lines = [columns, ["---:" if each else "---" for each in numeric], *zip(first, *others)]
+    text = "\n".join("| " + " | ".join(line) + " |" for line in lines)
     return Markdown(text + (f"\n\n{caption}" if caption else ""))
 
 
@@ -53,7 +52,7 @@ def cell(value):
         return "yes" if value else "no"
     if isinstance(value, int | np.integer):
         return f"{value:,}".replace("-", "−")
-    return number(value) if np.ndim(value) == 0 else _over_drives(np.asarray(value))
+    return number(value) if np.ndim(value) == 0 else _over_drives(np.asarray(value, float))
 
 
 def number(value, decimals=None):
@@ -66,14 +65,11 @@ def number(value, decimals=None):
 
 
 def _over_drives(values):
-    """Mean ± standard error and median of values (s,), one a drive, or a percentage of bools."""
-    values, unit = (100 * values, " %") if values.dtype == bool else (values.astype(float), "")
-    mean = values.mean()
+    """Mean ± standard error and median of values (s,), one a drive."""
     error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else 0.0
     decimals = int(np.clip(1 - np.floor(np.log10(error)), 0, 3)) if error > 0 else None
-    decimals = 0 if unit else decimals
-    text = number(mean, decimals) + (f" ± {number(error, decimals)}" if error > 0 else "")
-    return text + (unit or f" ({number(np.median(values), decimals)})")
+    text = number(values.mean(), decimals) + (f" ± {number(error, decimals)}" if error > 0 else "")
+    return f"{text} ({number(np.median(values), decimals)})"
 
 
 def dataset_row(drive):
@@ -174,17 +170,17 @@ def antenna_rows(result, drive):
     moved = place - places_by_id(guess.antenna, guess.position, result.antenna)
     off = np.full_like(place, np.nan) if truth is None else place - places_by_id(
         truth.antenna, truth.antenna_in_world, result.antenna)
-    squared = np.einsum("ni,nij,nj->n", off, np.linalg.inv(C), off)
     for k, antenna in enumerate(result.antenna.tolist()):
         own = uwb.antenna == antenna
-        away, root = place[k] - result.poses[uwb.pose[own], :2], 1 / uwb.sigma[own]
-        root *= np.sqrt(result.range_weight[own])
+        away = place[k] - result.poses[uwb.pose[own], :2]
+        root = np.sqrt(result.range_weight[own]) / uwb.sigma[own]
         direction = away / np.maximum(np.hypot(*away.T), 1e-9)[:, None]
         shift = np.linalg.lstsq(root[:, None] * direction, 0.1 * root)[0]
         yield {"dataset": drive.name, "antenna": f"{antenna}{'?' * (antenna in result.doubts)}",
                "x (m)": f"{place[k, 0]:.3f}", "y (m)": f"{place[k, 1]:.3f}",
                "σ of x (mm)": 1e3 * np.sqrt(C[k, 0, 0]), "σ of y (mm)": 1e3 * np.sqrt(C[k, 1, 1]),
                "from the guess (mm)": 1e3 * np.hypot(*moved[k]),
-               "error (mm)": 1e3 * np.hypot(*off[k]), "d²": squared[k],
+               "error (mm)": 1e3 * np.hypot(*off[k]),
+               "d²": off[k] @ np.linalg.solve(C[k], off[k]),
                "late (%)": 100 * np.mean(result.range_weight[own] < 0.5),
                "by 0.1 m (mm)": 1e3 * np.hypot(*shift)}

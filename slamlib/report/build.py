@@ -2,10 +2,11 @@
 
 import os
 import re
+import shutil
 import sys
 import time
+from collections import namedtuple
 from contextlib import ExitStack
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -14,24 +15,19 @@ from tqdm import tqdm
 from slamlib import swap
 from slamlib.dataset import DatasetError, inventory_lines, read_dataset, read_truth
 from slamlib.notebook import notices
-from slamlib.report import cache, overview
+from slamlib.report import cache
 from slamlib.report.document import render
-from slamlib.report.drives import read_drives
 from slamlib.report.execution import STUDIES, execute, kernel_environment, temporary_folder
 from slamlib.report.notebooks import Options, shown, to_execute
+from slamlib.report.overview import opening, read_drives, title_picture
 from slamlib.solve import RESULT_NAMES, SENSORS
-from slamlib.studies.memory import forget
 from slamlib.tables import datasets_in
 
 DATASET_NAME = re.compile("[A-Za-z0-9 ._-]+")  # nothing that Markdown, HTML or Typst interprets
 
 
-@dataclass(frozen=True)
-class Report:
-    """A report that was written."""
-
-    files: list  # of Path, `index.html` first
-    drives: list  # of drives.SolvedDrive, with what is doubted and what could not be solved
+# Files (list of Path, `index.html` first) and drives (list of overview.SolvedDrive) of a report.
+Report = namedtuple("Report", ("files", "drives"))
 
 
 def build_report(notebooks, data, report, results, datasets=None, options=Options(), jobs=2,
@@ -58,21 +54,21 @@ def build_report(notebooks, data, report, results, datasets=None, options=Option
     notebooks, data, report, results = (
         Path(folder).resolve() for folder in (notebooks, data, report, results))
     books, read, has = _checked_input(notebooks, data, datasets, options)
-    folders = [data / dataset.name for dataset, _ in read]
+    chapters, folders = shown(books, options), [data / dataset.name for dataset, _ in read]
     with ExitStack() as stack:
-        temporary = stack.enter_context(temporary_folder())
+        temporary = Path(stack.enter_context(temporary_folder()))
         kept = Path(kept or temporary / "kept").resolve()
         environment = kernel_environment(temporary, data, datasets, kept / STUDIES)
         keys = partial(cache.keys, books, folders, environment | {"SLAMLIB_RESULTS": str(results)})
-        if fresh or not all(
-                cache.entry(kept, source, key).exists() for source, key in keys().items()):
-            render(shown(books, options), options, check=True)     # before a kernel starts
         stack.enter_context(swap.locked(kept))
         stage, pages = (stack.enter_context(swap.staging(folder)) for folder in (results, report))
-        written = _executed(books, keys, environment, jobs, stage, kept, fresh)
+        check = partial(render, chapters, options, check=True)
+        written = _executed(books, keys, check, environment, jobs, stage, kept, fresh)
         tell("setting the pages and the PDF")
         drives = read_drives(read, stage, written, notices(books.values()))
-        made = _rendered(shown(books, options), drives, options, has)
+        solved = [drive for drive in drives if drive.solutions]
+        made = render({Path("index"): opening(drives, chapters)} | chapters, options, has,
+                      title_picture(solved[-1]) if solved else "")
         for name, content in made.items():
             swap.write_atomically(pages / name, content)
         made_for = {folder.name for folder in folders}
@@ -106,10 +102,11 @@ def _checked_input(notebooks, data, datasets, options):
     return served, read, has
 
 
-def _executed(books, keys, environment, jobs, stage, kept, fresh):
+def _executed(books, keys, check, environment, jobs, stage, kept, fresh):
     """Execute books in place, or recall their outputs; return the sorted names of their files.
 
-    `keys` is a function that returns `cache.keys` as they are now, `stage` the folder of the files.
+    `keys` returns `cache.keys` as they are now, `check` refuses bad text before a kernel starts,
+    `stage` is the folder of the files.
     """
     written, begun, left = set(), keys(), dict(books)
 
@@ -118,21 +115,15 @@ def _executed(books, keys, environment, jobs, stage, kept, fresh):
         if keys() == begun:  # nothing was edited meanwhile
             cache.keep(kept, source, begun[source], book, stage, names)
 
+    for source, book in books.items():
+        names = None if fresh else cache.recall(kept, source, begun[source], book, stage)
+        if names is not None:
+            written.update(names)
+            del left[source]
+            print(f"{source.stem}: nothing changed, not executed again", file=sys.stderr)
+    if left:
+        check()
     if fresh:
-        forget(kept / STUDIES)
-    else:
-        for source, book in books.items():
-            if (names := cache.recall(kept, source, begun[source], book, stage)) is not None:
-                written.update(names)
-                del left[source]
-                print(f"{source.stem}: nothing changed, not executed again", file=sys.stderr)
+        shutil.rmtree(kept / STUDIES, ignore_errors=True)
     execute(left, environment, stage, max(1, jobs), finish)
     return sorted(written)
-
-
-def _rendered(chapters, drives, options, has):
-    """Return the report's files, {name: bytes}, with the opening on `drives` as index.html."""
-    opening = overview.opening(drives, chapters)
-    solved = [drive for drive in drives if drive.solutions]
-    return render({Path("index"): opening} | chapters, options, has,
-                  overview.title_picture(solved[-1]) if solved else "")

@@ -27,52 +27,33 @@ VERSIONS = 4  # of each notebook, the last used
 
 
 def keys(books, datasets, environment):
-    """Return {source: key} of books (dict from Path to NotebookNode); others as `fingerprint`."""
-    common = fingerprint(datasets, next(iter(books)).parent, environment)
-    return {source: key_of(source, book, common) for source, book in books.items()}
+    """Return {source: key} of books (dict from Path to NotebookNode), digests of what they need.
 
-
-def fingerprint(datasets, notebooks, environment):
-    """Return a digest (str) of everything besides its own cells that a notebook depends on.
-
-    `datasets` (list of Path) are the folders of the selected datasets, `notebooks` (Path) that of
-    the notebooks, and `environment` (dict of str) the environment variables of the kernels. Where
-    these folders are, and slamlib's, does not matter.
+    `datasets` (list of Path) are the folders of the selected datasets, `environment` (dict of str)
+    the environment variables of the kernels. Where these folders are, and slamlib's, does not
+    matter.
     """
+    notebooks = next(iter(books)).parent
     files = [(memory.SLAMLIB, file) for file in memory.modules("report")]
     files += [(Path(__file__).parent, Path(__file__))]                 # for the format of the cache
     files += [(folder.parent, file) for folder in datasets for file in sorted(folder.rglob("*"))]
     files += [(notebooks, file) for file in sorted(notebooks.rglob("*"))
               if not UNSEEN.search(file.relative_to(notebooks).as_posix())]
-    return digest(json.dumps([
+    common = [
         platform.python_implementation(), platform.python_version(), platform.platform(),
-        installed(),
+        sorted({path.name for folder in sys.path for path in Path(folder).glob("*.dist-info")
+                if not path.name.startswith("slamlib-")}),             # reading them takes long
         [(file.relative_to(folder).as_posix(), digest(file.read_bytes()))
          for folder, file in files if file.is_file()],
         sorted((name, value) for name, value in environment.items()
-               if name.startswith(VARIABLES) and name != IGNORED)]).encode())
-
-
-def installed():
-    """Return the sorted names (list of str) of all packages but slamlib, with their versions."""
-    return sorted({path.name for folder in sys.path for path in Path(folder).glob("*.dist-info")
-                   if not path.name.startswith("slamlib-")})  # reading the files takes long
-
-
-def key_of(source, book, common):
-    """Return the key (str) of a notebook (Path and NotebookNode) with a fingerprint `common`."""
-    cells = [(cell.source, sorted(HEEDED_TAGS.intersection(cell.metadata.get("tags", ()))))
-             for cell in _code_cells(book)]
-    return digest(json.dumps([source.name, cells, common]).encode())
+               if name.startswith(VARIABLES) and name != IGNORED)]
+    return {source: digest(json.dumps([common, source.name, [
+        (cell.source, sorted(HEEDED_TAGS.intersection(cell.metadata.get("tags", ()))))
+        for cell in _code_cells(book)]]).encode()) for source, book in books.items()}
 
 
 def _code_cells(book):
     return [cell for cell in book.cells if cell.cell_type == "code"]
-
-
-def entry(folder, source, key):
-    """Return the Path of the file in the cache `folder` for a notebook (Path) with this key."""
-    return Path(folder, f"{source.stem}.{key}.executed")
 
 
 def recall(folder, source, key, book, results):
@@ -81,12 +62,10 @@ def recall(folder, source, key, book, results):
     Its result files are written below `results` (Path), and its outputs into `book`, the
     NotebookNode as it is now. `folder` is that of the cache, `source` the notebook's Path.
     """
-    path = entry(folder, source, key)
+    path = Path(folder, f"{source.stem}.{key}.executed")
     try:
-        found, executed, contents = joblib.load(path)
-    except Exception:  # it is absent, damaged or of another kind
-        return None
-    if found != key:
+        executed, contents = joblib.load(path)
+    except Exception:  # it is absent or damaged
         return None
     for cell, (outputs, count) in zip(_code_cells(book), executed, strict=True):
         cell.outputs, cell.execution_count = outputs, count
@@ -103,9 +82,9 @@ def keep(folder, source, key, book, results, names):
     """
     executed = [(cell.outputs, cell.execution_count) for cell in _code_cells(book)]
     content = BytesIO()
-    joblib.dump([key, executed, {name: (results / name).read_bytes() for name in names}], content,
+    joblib.dump([executed, {name: (results / name).read_bytes() for name in names}], content,
                 compress=1)  # with a checksum
-    swap.write_atomically(entry(folder, source, key), content.getvalue())
+    swap.write_atomically(Path(folder, f"{source.stem}.{key}.executed"), content.getvalue())
     versions = [file for file in Path(folder).glob("*.executed")
                 if file.name.rsplit(".", 2)[0] == source.stem]
     for old in sorted(versions, key=lambda file: file.stat().st_mtime_ns)[:-VERSIONS]:

@@ -20,7 +20,7 @@ from nbformat.v4 import new_code_cell, new_markdown_cell, new_raw_cell
 
 from slamlib.dataset import DatasetError
 from slamlib.report.execution import LAB_ONLY, NotebookError
-from slamlib.report.notebooks import appendix_of
+from slamlib.report.notebooks import chapter_of
 
 HERE = Path(__file__).parent
 TEMPLATES = {"html": "page.html", "typst": "report.typ"}
@@ -80,22 +80,20 @@ def _pandoc(text, kind, folder, settings):
 
 def _merged(books):
     """Return one notebook of all books; a cell with the name of each precedes its own."""
-    letters = "".join(appendix_of(*each) for each in books.items())
+    letters = "".join(chapter_of(*each)["letter"] for each in books.items())
     cells = []
     for source, book in books.items():
         cells.append(new_markdown_cell(metadata={"chapter": source.stem}))
-        for cell in book.cells:
-            if LAB_ONLY in cell.metadata.get("tags", ()):
-                continue
-            for part in _parts(cell) if cell.cell_type == "code" else [cell]:
-                if part.cell_type == "markdown":
-                    part = NotebookNode(part | {"source": _without_absent(part.source, letters)})
-                cells.append(part)
+        cells += [NotebookNode(part | {"source": _without_absent(part.source, letters)})
+                  if part.cell_type == "markdown" else part for cell in book.cells
+                  if LAB_ONLY not in cell.metadata.get("tags", ()) for part in _parts(cell)]
     return {"cells": cells, "metadata": {}, "nbformat": 4, "nbformat_minor": 5}
 
 
 def _parts(cell):
     """Return the code and each output of a cell as cells; code that is folded comes last."""
+    if cell.cell_type != "code":
+        return [cell]
     code = new_code_cell(cell.source, metadata=cell.metadata)
     outputs = [_shown(output, cell.metadata) for output in cell.outputs]
     return [*outputs, code] if "hide-input" in cell.metadata.get("tags", ()) else [code, *outputs]

@@ -12,7 +12,6 @@ import socket
 import sys
 import tempfile
 import time
-from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -63,14 +62,11 @@ def kernel_environment(settings, data, datasets, studies):
         "MPLBACKEND": "module://matplotlib_inline.backend_inline"}
 
 
-@contextmanager
 def temporary_folder():
-    """Yield a new folder (Path), short enough for sockets."""
+    """Return a context manager of a new folder, a str short enough for sockets."""
     parent = tempfile.gettempdir()
     parent = "/tmp" if TRANSPORT == "ipc" and len(parent) > LONGEST_FOLDER else parent
-    with tempfile.TemporaryDirectory(dir=parent, prefix="slamlib-",
-                                     ignore_cleanup_errors=True) as folder:
-        yield Path(folder)
+    return tempfile.TemporaryDirectory(dir=parent, prefix="slamlib-", ignore_cleanup_errors=True)
 
 
 def execute(books, environment, results, jobs, finish):
@@ -88,7 +84,7 @@ def execute(books, environment, results, jobs, finish):
 
 
 async def _execute_all(books, environment, results, jobs, finish):
-    slots = asyncio.Semaphore(jobs)
+    slots, settings = asyncio.Semaphore(jobs), Path(environment["IPYTHONDIR"])
     cells = sum(cell.cell_type == "code" for book in books.values() for cell in book.cells)
 
     async def run(number, source, book):
@@ -97,7 +93,7 @@ async def _execute_all(books, environment, results, jobs, finish):
         try:
             async with slots:
                 await _execute(source, book, environment | {"SLAMLIB_RESULTS": str(stage)},
-                               folder / f"{number}.json", bar)
+                               settings / f"{number}.json", bar)
             names = swap.file_names(stage)
             for name in names:
                 (results / name).parent.mkdir(parents=True, exist_ok=True)
@@ -106,8 +102,7 @@ async def _execute_all(books, environment, results, jobs, finish):
         finally:
             shutil.rmtree(stage, ignore_errors=True)
 
-    with temporary_folder() as folder, tqdm(  # on a terminal only
-            total=cells, unit="cell", leave=False, disable=None) as bar:
+    with tqdm(total=cells, unit="cell", leave=False, disable=None) as bar:  # on a terminal only
         async with asyncio.TaskGroup() as group:
             for number, (source, book) in reversed([*enumerate(books.items())]):
                 group.create_task(run(number, source, book))        # later chapters take longer
@@ -119,11 +114,6 @@ async def _execute(source, book, environment, connection, bar):
     The kernel listens at sockets beside the file `connection` (Path): nobody else can take them.
     """
     started, start = [], time.monotonic()
-
-    def begin(cell, cell_index):
-        started.append(cell)
-        bar.set_description(source.stem)
-
     manager = AsyncKernelManager(  # no folders to search: kernels of the user are not found
         kernel_name="python3", kernel_spec_manager=KernelSpecManager(kernel_dirs=[]),
         transport=TRANSPORT, connection_file=str(connection))
@@ -131,9 +121,9 @@ async def _execute(source, book, environment, connection, bar):
         book, km=manager, resources={"metadata": {"path": str(source.parent)}},
         timeout=CELL_TIMEOUT, iopub_timeout=60, raise_on_iopub_timeout=True,
         record_timing=False, store_widget_state=False, skip_cells_with_tag=LAB_ONLY,
-        shutdown_kernel="immediate",
-        extra_arguments=["--IPKernelApp.log_level=ERROR"],
-        on_cell_execute=begin, on_cell_executed=lambda **_: bar.update())
+        shutdown_kernel="immediate", extra_arguments=["--IPKernelApp.log_level=ERROR"],
+        on_cell_execute=lambda cell, **_: started.append(cell),
+        on_cell_executed=lambda **_: bar.update())
     try:
         await client.async_execute(env=environment, cleanup_kc=True)
         CoalesceStreamsPreprocessor().preprocess(book, {})  # kernels divide them by time

@@ -3,26 +3,25 @@
 import platform
 import re
 import sys
-import textwrap
 from dataclasses import replace
 from importlib.metadata import version
 from io import BytesIO
 from pathlib import Path
 from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 
+import numpy as np
 from jinja2 import Template
 
 from slamlib import swap
-from slamlib.dataset import DatasetError, all_notes, read_dataset, read_truth
+from slamlib.dataset import all_notes, read_dataset, read_truth
 from slamlib.notebook import Drive
-from slamlib.report.drives import why_missing
 from slamlib.report.notebooks import PROBLEM2_FOLDERS
-from slamlib.report.overview import listed
+from slamlib.report.overview import listed, why_missing
 from slamlib.results import RESULT_FILES
 from slamlib.solve import title
 from slamlib.tables import datasets_in
 
-LINE_WIDTH = 88  # characters in a line of README.txt
+LINE_WIDTH = 100  # characters in a line of README.txt
 README = Path(__file__).with_name("readme.txt")  # a template of Jinja
 LEFT_OUT = ("Explore", "Files")  # titles of sections that are for screens, or on other folders
 
@@ -54,15 +53,11 @@ def write_zip(path, report, results, options, omitted=()):
     """Write the zip of a Report to `path` (Path); equal input gives equal bytes.
 
     `results` (Path) is the folder of its files, `omitted` (list of str) what `selection` left out.
-    DatasetError if a dataset has the name of another file in the zip.
     """
     contents = {"report.pdf": report.files[-1].read_bytes(),
                 "README.txt": readme(report.drives, options, omitted).encode()}
     with swap.staging(results):                         # no build replaces them meanwhile
         for drive in report.drives:
-            if drive.name.casefold() in {name.casefold() for name in contents}:
-                raise DatasetError(f"{drive.name}: the zip has a file of the name of this dataset: "
-                                   "rename its folder")
             contents |= {f"{drive.name}/{name}": Path(results, drive.name, file).read_bytes()
                          for name, file in handed_in(drive, options.problem2).items()}
     archive = BytesIO()
@@ -91,41 +86,29 @@ def handed_in(drive, problem2):
 
 def readme(drives, options, omitted=()):
     """Return README.txt (str); parameters as of `write_zip`, with a list of SolvedDrive."""
-    estimate = PROBLEM2_FOLDERS[options.problem2]
     text = Template(README.read_text(encoding="utf-8"), trim_blocks=True).render(
-        cover=options, estimate=estimate, omitted=listed(omitted) if omitted else "",
-        drives=[_told(drive, options.problem2) for drive in drives],
+        cover=options, estimate=PROBLEM2_FOLDERS[options.problem2], omitted=listed(omitted),
+        width=LINE_WIDTH, drives=[_told(drive, options.problem2) for drive in drives],
         versions=", ".join([f"Python {platform.python_version()}",
                             *(f"{name} {version(name)}"
                               for name in ("slamlib", "numpy", "scipy", "gtsam"))]))
-    lines, *paragraphs = re.split("\n{2,}", text.strip())
-    return "\n\n".join([lines, *map(_wrapped, paragraphs)]) + "\n"
-
-
-def _wrapped(paragraph):
-    """Return a paragraph in lines of at most LINE_WIDTH characters; headings and lists stay."""
-    return paragraph if paragraph.startswith(" ") or paragraph.endswith("--") else textwrap.fill(
-        paragraph, LINE_WIDTH, break_long_words=False, break_on_hyphens=False)
+    return re.sub("\n{3,}", "\n\n", text.strip()) + "\n"
 
 
 def _told(drive, problem2):
     """Return what README.txt tells of a SolvedDrive, a dict."""
-    files, folders = handed_in(drive, problem2), {}
+    files, estimate, folders = handed_in(drive, problem2), PROBLEM2_FOLDERS[problem2], {}
     for name, file in files.items():
-        folders.setdefault(name.split("/")[0], []).append(file)
-    solutions = {name: drive.solution(each[0].split("/")[0]) for name, each in folders.items()}
-    estimate, aruco_map = PROBLEM2_FOLDERS[problem2], files.get("problem2/ArucoMap.mat")
-    world = {problem: solution.world + 1 if (solution := drive.solution(problem)) else 1
-             for problem in ("problem2", estimate)}
+        solution = drive.solution(file.split("/")[0])
+        folders.setdefault(name.split("/")[0], (solution, []))[1].append(name.split("/")[1])
+    world = {solution.problem: solution.world + 1 for solution in drive.solutions}
     return {
-        "name": drive.name, "doubts": drive.doubts, "world": world[estimate],
+        "name": drive.name, "doubts": drive.doubts, "world": world.get(estimate, 1),
         "notes": all_notes(drive.dataset, drive.truth),
-        "folders": {name: (
-            listed([file.split("/")[1] for file in folders[name]]), solution.title,
-            int((solution.poses[:, 0] == solution.poses[:, 0]).sum()), len(solution.poses),
-            ", ".join(map(str, solution.facts.get("unconfirmed", ()))))
-            for name, solution in solutions.items()},
-        "map_frame": aruco_map not in (None, f"{estimate}/ArucoMap.mat") and world["problem2"],
+        "folders": {name: (listed(each), solution.title, np.isfinite(solution.poses[:, 0]).sum(),
+                           len(solution.poses)) for name, (solution, each) in folders.items()},
+        "map_frame": files.get("problem2/ArucoMap.mat") not in (None, f"{estimate}/ArucoMap.mat")
+        and world.get("problem2", 1),
         "missing": [
             f"{problem[:8]} ({title(problem, drive.dataset)}): {why_missing(drive, problem)}."
             for problem in ("problem1", estimate, "problem3", "problem4")

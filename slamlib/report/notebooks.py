@@ -108,14 +108,14 @@ def to_execute(folder, options):
     appendices that `options` (Options) show. DatasetError if there is none.
     """
     books = {source: read_notebook(source) for source in sorted(folder.glob("*.ipynb"))}
-    numbers = {chapter_of(*each)["number"] for each in books.items()} - {None}
+    about = {source: chapter_of(source, book) for source, book in books.items()}
+    numbers = {each["number"] for each in about.values()} - {None}
     for entry, place in options.leave_out.items():
         if place and re.fullmatch(r"\d+|[A-Za-z]", entry) and entry.upper() not in numbers:
             raise DatasetError(f"{place}: expected to leave out a chapter "
                                f"({', '.join(sorted(numbers))}) or a section, found '{entry}'")
-    seen = shown(books, options)
-    chapters = {source: book for source, book in books.items() if not appendix_of(source, book)}
-    appendices = sorted((appendix_of(source, book), source) for source, book in seen.items()
+    chapters = {source: book for source, book in books.items() if not about[source]["letter"]}
+    appendices = sorted((about[source]["letter"], source) for source in shown(books, options)
                         if source not in chapters and options.appendix is not False)
     if not chapters and not appendices:
         raise DatasetError(f"{folder}: expected notebooks (*.ipynb) that are not left out, found "
@@ -131,16 +131,14 @@ def shown(books, options):
 
 
 def chapter_of(source, book):
-    """Return title, number (or None) and lead, the first paragraph, of a chapter, a dict of str."""
+    """Return title, number (or None), lead and letter of a chapter, a dict of str.
+
+    The lead is the first paragraph, the letter that of an appendix or "".
+    """
     text = "\n\n".join(cell.source for cell in book.cells if cell.cell_type == "markdown")
     title = re.search(r"^#\s+(.+)", text, re.MULTILINE)
     lead = re.search(r"^(?!\s|[#|<>`]|\$\$|[-*+]\s).+(?:\n.+)*", text, re.MULTILINE)
     title = re.sub("[*_`]", "", title[1]).strip() if title else source.stem
-    number = re.match(r"(\d+|[A-Z])\.", title)
-    return {"title": title, "lead": lead[0] if lead else "", "number": number and number[1]}
-
-
-def appendix_of(source, book):
-    """Return the letter (str) of an appendix (Path, NotebookNode), "" for a chapter."""
-    number = chapter_of(source, book)["number"] or ""
-    return number if number.isalpha() else ""
+    number = re.match(r"(\d+|([A-Z]))\.", title)
+    return {"title": title, "lead": lead[0] if lead else "", "number": number and number[1],
+            "letter": number and number[2] or ""}

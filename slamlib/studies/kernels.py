@@ -23,8 +23,7 @@ from slamlib.studies.montecarlo import antenna_error, drive
 
 # Kernel and gate of every method.
 METHODS = {name: (name, name in ONE_SIDED) for name in KERNELS} | {"gate": ("quadratic", True)}
-MIN_MISLABELLED_SQUARED = 50.0             # squared Mahalanobis distance of a wrong label; a right
-                                           # one reaches it once in ten billion sightings
+MIN_MISLABELLED_SQUARED = 50.0   # Mahalanobis; a right label reaches it once in 10^10 sightings
 
 
 def rounds(measurements, antennas=trilaterated_antennas):

@@ -10,7 +10,6 @@ every study to its first seeds; tests of pages use it. In JupyterLab a long stud
 import hashlib
 import os
 import platform
-import shutil
 import warnings
 from importlib.metadata import version
 from pathlib import Path
@@ -56,11 +55,6 @@ def _rows(trial, name, seeds, options, code, jobs):
     bar = tqdm(seeds, desc=trial.__name__, leave=False, delay=BAR_AFTER,
                disable="SLAMLIB_RESULTS" in os.environ)
     return Parallel(jobs)(delayed(trial)(seed, **options) for seed in bar)
-
-
-def forget(folder):
-    """Remove the studies that are kept in a folder."""
-    shutil.rmtree(folder, ignore_errors=True)
 
 
 def code_digest():
