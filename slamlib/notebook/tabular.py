@@ -159,7 +159,7 @@ def calibration_rows(result, drive):
 def antenna_rows(result, drive):
     """Rows of `table` on the antennas of a SlamResult: position, sigmas, distances in mm.
 
-    `d²` is the squared error in units of the covariance, `late` the percentage of the ranges that
+    `d²` is the squared error in units of the covariance, `down-weighted` the percentage of the ranges that
     keep less than half of their weight, `by 0.1 m` how far an antenna would be elsewhere, on the
     same path, if all its ranges were 0.1 m too long.
     """
@@ -182,5 +182,5 @@ def antenna_rows(result, drive):
                "from the guess (mm)": 1e3 * np.hypot(*moved[k]),
                "error (mm)": 1e3 * np.hypot(*off[k]),
                "d²": off[k] @ np.linalg.solve(C[k], off[k]),
-               "late (%)": 100 * np.mean(result.range_weight[own] < 0.5),
+               "down-weighted (%)": 100 * np.mean(result.range_weight[own] < 0.5),
                "by 0.1 m (mm)": 1e3 * np.hypot(*shift)}
