@@ -60,7 +60,7 @@ def test_structs_have_the_bytes_that_scipy_writes_and_octave_reads(
 
 
 def test_text_keeps_every_digit_of_the_poses_that_are_known(tmp_path):
-    """CSV names its columns; TUM has pose numbers and unit quaternions."""
+    """CSV names its columns; TUM has pose ids and unit quaternions."""
     poses = np.array([[1.0, 2.0, 0.1], ABSENT, [1 / 3, -1e-9, 7.0]])
     results.write_tum(tmp_path / "a" / "b.tum", poses)
     rows = np.loadtxt(tmp_path / "a" / "b.tum")

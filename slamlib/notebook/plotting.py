@@ -213,10 +213,10 @@ def equidistant(poses, count=14):
 
 
 def name_rows(axes, names):
-    """Set the labels of the vertical axes of one panel; the last axes show the pose number."""
+    """Set the labels of the vertical axes of one panel; the last axes show the pose id."""
     for ax, name in zip(axes, names, strict=True):
         ax.set(ylabel=name, xlabel=None)
-    axes[-1].set(xlabel="pose number")
+    axes[-1].set(xlabel="pose id")
 
 
 def legend_below(fig):
@@ -236,10 +236,10 @@ def legend_below(fig):
 
 
 def curve(ax, values, role, frame=None, label=None, **look):
-    """Draw values (n,) over the pose number; `frame` (n,) are the indices from 0 of their poses."""
+    """Draw values (n,) over the pose id; `frame` (n,) are the indices from 0 of their poses."""
     frame = np.arange(len(values)) if frame is None else frame
     ax.plot(frame + 1, values, label=label or role, **ROLES[role] | look)
-    ax.set(xlabel="pose number")
+    ax.set(xlabel="pose id")
     return ax
 
 
