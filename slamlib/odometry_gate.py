@@ -77,6 +77,16 @@ class Jumps:
         return (share @ se2.between(self.by_odometry, self.increment),
                 (share @ self.sigma**2)[:, :, None] * np.eye(3))
 
+    def joined_by(self, start, end, increment, by_odometry, count):
+        """The Jumps and one more, of `count` encoder poses."""
+        k = np.searchsorted(self.start, start)
+        sigma = _sigma_of(se2.compose(increment, se2.inverse(by_odometry)))
+        chance = self.chance if len(self.start) else np.arange(float(count))
+        return replace(self, chance=chance, **{
+            name: np.insert(getattr(self, name), k, each, axis=0) for name, each in (
+                ("start", start), ("end", end), ("increment", increment),
+                ("by_odometry", by_odometry), ("sigma", sigma))})
+
     def mended(self, pose, poses, begin=0):
         """Poses (f, 3) of the encoder poses (f,), with these increments instead of odometry's.
 
@@ -90,6 +100,11 @@ class Jumps:
 
 
 NO_JUMPS = Jumps(*np.zeros((2, 0), int), *np.zeros((3, 0, 3)), chance=np.zeros(1))   # none at all
+
+
+def _sigma_of(jump):
+    """Standard deviations (3,) of a motion that may be as large as the jump (3,)."""
+    return np.maximum(np.r_[[np.hypot(*jump[:2])] * 2, abs(jump[2])], MIN_JUMP)
 
 
 def find_jumps(dataset):
@@ -155,7 +170,7 @@ def _bridged(s, drive, suspects, breaks, rank, dead=()):
             drive = drive if gain > MIN_GAIN else known        # one pair, maybe a wrong label
             continue
         drive = known
-        sigma = np.maximum(np.r_[[np.hypot(*jump[:2])] * 2, abs(jump[2])], MIN_JUMP)
+        sigma = _sigma_of(jump)
         if covariance is None:
             sigma = UNKNOWN_SIGMA if k in breaks else 2 * usual
             covariance = np.diag(sigma**2)

@@ -156,6 +156,18 @@ def test_a_fault_of_odometry_is_told_and_costs_little(name, clean):
     assert errors(fuse(dataset), truth)[1] < 6
 
 
+@pytest.mark.slow
+def test_a_push_that_no_marker_saw_is_found_at_the_solution():
+    """In 200 poses without markers, which a second round bridges; else slip is ten times as large."""
+    dataset, truth = carried(1103, 1109)(*simulate("short", seed=2, rounds=2, slip=3e-4))
+    pose = dataset.aruco.pose
+    found = slam.estimate(replace(dataset, uwb=None, aruco=dataset.aruco.select(
+        (pose < 1040) | (pose > 1240))))
+    assert [doubt.what for doubt in solution_doubts(found)] == ["encoder"]
+    assert found.jumps.start < 1103 < found.jumps.end and found.slip < 5e-4
+    assert errors(found, truth)[1] < 6
+
+
 def test_jumps_are_found_in_the_vehicle_s_axes_of_a_camera_that_is_turned(clean):
     """Its place is stated; in the camera's own axes good increments contradict the markers."""
     dataset, truth = FAULTS["one wheel dead"][0](*clean[:2])

@@ -159,9 +159,9 @@ def calibration_rows(result, drive):
 def antenna_rows(result, drive):
     """Rows of `table` on the antennas of a SlamResult: position, sigmas, distances in mm.
 
-    `d²` is the squared error in units of the covariance, `down-weighted` the percentage of the ranges that
-    keep less than half of their weight, `by 0.1 m` how far an antenna would be elsewhere, on the
-    same path, if all its ranges were 0.1 m too long.
+    `d²` is the squared error in units of the covariance, `down-weighted` the percentage of the
+    ranges that keep less than half of their weight, `by 0.1 m` how far an antenna would be
+    elsewhere, on the same path, if all its ranges were 0.1 m too long.
     """
     if not len(result.antenna):
         return

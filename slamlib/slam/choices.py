@@ -28,7 +28,9 @@ from slamlib.dataset import DatasetError
 from slamlib.memory import runs
 from slamlib.odometry import MODELS
 from slamlib.odometry_gate import NO_JUMPS, find_jumps
-from slamlib.slam.factors import preintegrate_odometry
+from slamlib.sightings import GATE
+from slamlib.slam.calibration import WHEELS
+from slamlib.slam.factors import odometry_error, preintegrate_odometry
 from slamlib.slam.fit import accepted_measurements, refine, residuals
 from slamlib.slam.linear import NormalEquations, laplace_approximation, linear_solution
 from slamlib.slam.result import slam_result
@@ -42,6 +44,8 @@ MAX_WIDE_SIGMAS = 4.0        # wide sigmas, of an entry; beyond them a statement
 GROSS = 10.0                 # factor on the wide sigmas then
 MIN_INFORMATION = 1e-3       # about an entry, in wide sigmas, below which it is not considered
 MAX_PROPOSALS = 5            # number of sets that are solved
+MAX_STRETCHED = 3            # number of jumps that are found at the solution
+MIN_JUMP_LEAD = 10.0         # log evidence by which one of them is believed
 
 VISIT_GAP = 30               # typical intervals between sightings of a marker, that end a visit
 MIN_VISIT = 3                # number of accepted sightings of a visit that is compared
@@ -182,7 +186,8 @@ def most_consistent(dataset, solve):
 
     `solve` makes the Fit of Jumps and of places. Jumps of odometry, or else places of ids, are
     believed where they spare most of the sightings that are rejected without them. A few jumps need
-    no such support.
+    no such support. Where a solution stretches odometry beyond the slip that it learned, most of
+    all over a way without markers, one more jump is believed if the evidence leads decisively.
     """
     jumps = find_jumps(dataset)
     fit = solve(jumps if jumps.are_few else replace(NO_JUMPS, lag=jumps.lag))
@@ -193,7 +198,30 @@ def most_consistent(dataset, solve):
         places = places_of_ids(dataset.aruco, solve)
         if places is not None and spares_sightings(other := solve(places=places), fit):
             return other, places
+    for _ in range(MAX_STRETCHED):
+        jumps = with_stretched(fit)
+        if not jumps or (other := solve(jumps)).log_density < fit.log_density + MIN_JUMP_LEAD:
+            break
+        fit = other
     return fit, None
+
+
+def with_stretched(fit):
+    """The Jumps of a Fit and the step that contradicts odometry most, None if that is within GATE.
+
+    Data snooping (Baarda 1968) with the slip that is learned. There is no such step where it is
+    given, and none beside factors of one's own, which may be what is wrong.
+    """
+    m, odometry, poses = fit.problem.measurements, fit.problem.odometry, fit.state.poses
+    if not m.learned[0] or not len(m.marker_row) or m.own.size():
+        return None
+    e, *_ = odometry_error(odometry, poses, fit.state.c[WHEELS])
+    C = odometry.covariance(fit.problem.noise.slip)
+    squared = np.einsum("ni,nij,nj->n", e, np.linalg.inv(C), e)
+    k = int(squared.argmax())
+    return m.jumps.joined_by(
+        m.frame[k], m.frame[k + 1], se2.between(poses[k], poses[k + 1]), odometry.increment[k],
+        len(m.dataset.ticks)) if squared[k] > GATE else None
 
 
 def visits(aruco):
