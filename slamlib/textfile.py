@@ -1,6 +1,5 @@
 """Reads files into text and TOML entries."""
 
-import re
 import tomllib
 from difflib import get_close_matches
 from json import detect_encoding
@@ -30,7 +29,7 @@ def quoted(value):
 
 
 def read_toml(path, example, known):
-    """Entries of a TOML file without tables: a dict from key to (value, file and line).
+    """Entries (dict) of a TOML file without tables.
 
     Raises DatasetError, which quotes the `example` of an entry, if the file is not TOML, or has a
     key that is not among the `known` ones.
@@ -40,12 +39,9 @@ def read_toml(path, example, known):
         entries = tomllib.loads(text)
     except (ValueError, RecursionError) as failure:
         raise DatasetError(f"{path}: expected TOML such as '{example}', found: {failure}") from None
-    for key, value in entries.items():
-        at_key = re.search(rf"""^[\s\["']*{re.escape(key)}(?![\w-])""", text, re.MULTILINE)
-        line = f", line {text.count(chr(10), 0, at_key.end()) + 1}" if at_key else ""
+    for key in entries:
         nearest = ", ".join(get_close_matches(key, known, 3, cutoff=0))
-        require(key in known, f"{path}{line}", f"an entry such as {nearest}", key)
-        entries[key] = value, f"{path}{line}"
+        require(key in known, path, f"an entry such as {nearest}", key)
     return entries
 
 

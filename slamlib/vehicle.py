@@ -99,9 +99,7 @@ def read_vehicle(path, default=TABLE_2):
     Raises DatasetError if the file does not have the format.
     """
     entries = read_toml(path, "wheelbase = 0.4", VEHICLE_LIMITS) if path else {}
-    for key, (value, place) in entries.items():
-        default = changed(default, {key: value}, place)
-    return default
+    return changed(default, entries, path)
 
 
 def changed(vehicle, entries, source):

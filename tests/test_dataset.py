@@ -264,7 +264,7 @@ ERRORS = [
       for line, texts in TWO_READINGS.items() for text in texts],
     *[(name, third_row(row), 5, said) for name, told in THIRD_ROWS.items()
       for said, rows in told.items() for row in rows],
-    *[("vehicle.toml", appended(line), 3, said) for said, lines in VEHICLE_LINES.items()
+    *[("vehicle.toml", appended(line), None, said) for said, lines in VEHICLE_LINES.items()
       for line in lines],
     *[("encoderReading.txt", *each) for each in ENCODER_FILES],
     *[("vehicle.toml", appended(line), None, "TOML") for line in TOML_LINES],
@@ -274,10 +274,10 @@ ERRORS = [
     ("UwbReading.txt", "pose;antenna\n\n1;3;nan;1\n1;3;2,5;1\n9;3;1,5;1\n", 5, "from 1 to 4"),
     ("UwbAntennaGuess.txt", "900 1 2\n3 nan 5.5\n", 2, "x, a number, found 'nan'"),
     ("UwbAntennaGuess.txt", "3 1 2 0.5\n900 1 2", 1, "expected 3 numbers (antenna id, x, y"),
-    ("vehicle.toml", "# a\n\n\n  'wheel' = 1\n", 4, "an entry such as wheelbase"),
+    ("vehicle.toml", "# a\n\n\n  'wheel' = 1\n", None, "an entry such as wheelbase"),
     ("truth/vehiclePose.txt", third_row("3 0 0 0"), None, "4 poses (encoder file), found 3"),
     ("truth/vehiclePose.txt", "", None, "4 poses (encoder file), found 0"),
-    ("truth/vehicle.toml", appended("wheelbase = 0"), 2, "a number from 0.001 to 20 m")]
+    ("truth/vehicle.toml", appended("wheelbase = 0"), None, "a number from 0.001 to 20 m")]
 
 
 @pytest.mark.parametrize("name, content, line, said", ERRORS)
@@ -322,7 +322,8 @@ def test_numbers_at_the_limits_are_read_and_beyond_them_refused(tmp_path, name, 
         beyond = float(np.nextafter(value, away))
         write(tmp_path / name, text(beyond))
         message = error_of(read, tmp_path)
-        assert message.startswith(f"{tmp_path / name}, line 1: expected ") and str(limit) in message
+        line = ", line 1" if name.endswith(".txt") else ""
+        assert message.startswith(f"{tmp_path / name}{line}: expected ") and str(limit) in message
         assert column in message and message.endswith(
             f"found '{beyond:.12g}'" if name != "vehicle.toml" else f"found '{beyond!r}'")
 

@@ -286,7 +286,7 @@ def test_lengths_in_another_unit_are_doubted_or_refused(what, factor, count, tmp
     """Of short drives of 1.5 m and 20 m; in the data they come with a vehicle of table 2."""
     write_dataset(tmp_path / "drive", in_unit(what, factor)(simulated("short", 0)[0].first(count)))
     if "radii" in what or "base" in what:
-        with pytest.raises(DatasetError, match="vehicle.toml, line .: expected a number from "):
+        with pytest.raises(DatasetError, match="vehicle.toml: expected a number from "):
             read_dataset(tmp_path / "drive")
     else:
         assert set(whats(read_dataset(tmp_path / "drive"))) == {"units"}

@@ -32,7 +32,7 @@ class Options:
     author: str = ""
     student_number: str = ""
     course: str = ""
-    leave_out: dict = field(default_factory=dict)  # from numbers and titles to the place in a file
+    leave_out: dict = field(default_factory=dict)  # from numbers and titles to their file
     appendix: bool | None = None  # None: the report has it, the hand-in has not
     code: str = "method"  # one of CODE_SHOWN
     problem2: str = "aruco"  # which is handed in, of PROBLEM2_FOLDERS; required is markers alone
@@ -47,7 +47,7 @@ def read_options(path):
         return Options()
     keys = [option.name for option in fields(Options)]
     entries = read_toml(Path(path), 'author = "Ada Lovelace"', keys)
-    return Options(**{key: _checked(key, *entry) for key, entry in entries.items()})
+    return Options(**{key: _checked(key, value, str(path)) for key, value in entries.items()})
 
 
 def _checked(key, value, place):
