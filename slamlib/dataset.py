@@ -231,11 +231,8 @@ def _in_order(rows):
 
 
 def all_notes(dataset, truth):
-    """Notes (tuple of str) on what was mended or left out, and on another kernel or gate."""
-    weighed = [f"Problems 3 and 4 are solved with {key} = {json.dumps(value)}."
-               for key in ("kernel", "gate")
-               if (value := getattr(dataset.vehicle, key)) != getattr(TABLE_2, key)]
-    return (*dataset.notes, *weighed, *(truth.notes if truth else ()))
+    """Notes (tuple of str) on what was mended or left out of a Dataset and its Truth or None."""
+    return dataset.notes + (truth.notes if truth else ())
 
 
 def inventory_lines(dataset, truth):
