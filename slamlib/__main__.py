@@ -30,7 +30,7 @@ def main(arguments=None):
         sys.stdout.reconfigure(errors="backslashreplace")  # as stderr, for names in other letters
         for each in END_SIGNALS:
             if signal.getsignal(each) == signal.SIG_DFL:     # nohup's handler stays
-                signal.signal(each, _end_as_by_ctrl_c)
+                signal.signal(each, signal.default_int_handler)      # as by Ctrl-C
     parser = _parser()
     options, options.others = parser.parse_known_args(arguments)
     if options.others and options.run is not _lab:
@@ -40,8 +40,7 @@ def main(arguments=None):
     except DatasetError as error:
         reason, code = error, 2
     except OSError as error:
-        place = f"{error.filename}: {error.strerror}" if error.filename else error
-        reason, code = f"cannot be read or written: {place}", 2
+        reason, code = f"cannot be read or written: {error}", 2
     except KeyboardInterrupt:
         reason, code = "ended by a signal", 130
     with suppress(OSError):  # the terminal may be gone
@@ -49,24 +48,10 @@ def main(arguments=None):
     return code
 
 
-def _end_as_by_ctrl_c(number, frame):
-    """Let the first of END_SIGNALS do what Ctrl-C does."""
-    for each in END_SIGNALS:
-        signal.signal(each, signal.SIG_IGN)
-    interrupt = signal.getsignal(signal.SIGINT)  # the event loop's, while notebooks run
-    (interrupt if callable(interrupt) else signal.default_int_handler)(signal.SIGINT, frame)
-
-
-class _Parser(argparse.ArgumentParser):
-    def error(self, message):
-        """End with exit code 2 and one sentence, without argparse's usage."""
-        self.exit(2, f"slamlib: {message} ({self.prog} --help shows the usage)\n")
-
-
 def _parser():
     """The parser of the command line; `run` of what it parses is the function of the command."""
-    whole = _Parser(prog="slamlib",
-                    description="Vehicle SLAM from wheel encoders, markers and UWB ranges.")
+    whole = argparse.ArgumentParser(
+        prog="slamlib", description="Vehicle SLAM from wheel encoders, markers and UWB ranges.")
     whole.add_argument("--version", action="version", version=f"slamlib {__version__}")
     commands = whole.add_subparsers(required=True, metavar="COMMAND")
 
@@ -75,8 +60,7 @@ def _parser():
         parser = commands.add_parser(name, help=help, **options)
         parser.set_defaults(run=run)
         for option, default, help in paths:
-            default = {"default": Path(default)} if default else {}
-            parser.add_argument(option, type=Path, **default,
+            parser.add_argument(option, type=Path, default=default,
                                 help=help + " (default %(default)s)" * bool(default))
         return parser.add_argument
 
@@ -94,19 +78,16 @@ def _parser():
         add("--fresh", action="store_true",
             help="execute all notebooks and studies, also where nothing changed")
 
-    add = command("solve", _solve, "solve problems without notebooks",
-                  ("folder", None, "the dataset's folder"),
-                  ("--plot", None, "write a picture of map and errors: a .png, .pdf or .svg file"))
-    _solve_options(add)
-    add = command("simulate", _simulate, "make a dataset with its truth",
-                  ("folder", None, "a new or empty folder"))
-    _simulate_options(add)
+    _add_solve_and_simulate(command)
     command("lab", _lab, "open JupyterLab on the notebooks; it is given all other arguments, as "
             "--no-browser", data, notebooks, allow_abbrev=False)
     return whole
 
 
-def _solve_options(add):
+def _add_solve_and_simulate(command):
+    add = command("solve", _solve, "solve problems without notebooks",
+                  ("folder", None, "the dataset's folder"),
+                  ("--plot", None, "write a picture of map and errors: a .png, .pdf or .svg file"))
     add("--out", type=Path, required=True, help="folder for the results")
     add("--problem", action="append", default=[], metavar="NAME",
         type=lambda text: text.removeprefix("problem"),
@@ -118,8 +99,8 @@ def _solve_options(add):
     add("--csv", action="store_true", help="write poses and maps as text, too: CSV with "
         "covariances, and trajectories as TUM files for evo")
 
-
-def _simulate_options(add):
+    add = command("simulate", _simulate, "make a dataset with its truth",
+                  ("folder", None, "a new or empty folder"))
     add("--path", choices=("short", "long"), default="short")
     add("--rounds", type=int, default=1,
         help="how often the path is driven; 44 long ones are a million rows")
@@ -203,9 +184,8 @@ def _solve(options):
     require(not options.plot or options.plot.suffix.lower() in (".png", ".pdf", ".svg"), "--plot",
             "a .png, .pdf or .svg file", options.plot)
     dataset, truth = read_dataset(options.folder), read_truth(options.folder)
-    given = {name: value for name in ("kernel", "slip")
-             if (value := getattr(options, name)) is not None}
-    dataset = replace(dataset, vehicle=changed(dataset.vehicle, given, "slamlib solve"))
+    dataset = replace(dataset, vehicle=changed(
+        dataset.vehicle, {"kernel": options.kernel, "slip": options.slip}, "slamlib solve"))
     problems = sorted(f"problem{each}" for each in options.problem) or [*PROBLEMS]
     for each in problems if options.problem else ():
         require(allows(dataset, each), options.folder,
