@@ -45,18 +45,12 @@ def locked(folder):
 
 
 def write_atomically(path, content):
-    """Write bytes to a Path; a reader finds the old file or the whole new one, never a part.
-
-    Raises OSError, which names the path, also if the disk is full.
-    """
+    """Write bytes to a Path; a reader finds the old file or the whole new one, never a part."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = beside(path, "part")
     try:
         part.write_bytes(content)
         os.replace(part, path)
-    except OSError as error:
-        error.filename = str(path)
-        raise
     finally:
         part.unlink(missing_ok=True)
 

@@ -141,8 +141,8 @@ def test_a_kill_before_any_step_mixes_nothing_and_the_next_run_cleans_up():
 
 
 @pytest.mark.slow
-def test_a_full_disk_names_the_path_and_leaves_the_old_results(tmp_path, drive):
-    """A limit on the size of files fails like a full disk: the error names no file."""
+def test_a_full_disk_is_told_and_leaves_the_old_results(tmp_path, drive):
+    """A limit on the size of files fails like a full disk."""
     write_dataset(tmp_path / "drive", drive)
     out = tmp_path / "out"
     solve_to_folder(drive, None, out)
@@ -153,7 +153,7 @@ def test_a_full_disk_names_the_path_and_leaves_the_old_results(tmp_path, drive):
         "from slamlib.__main__ import main; sys.exit(main())"))
     told = process.communicate(timeout=300)[1]
     assert process.returncode == 2 and told.count("slamlib: ") == 1
-    assert "/vehiclePose.mat: " + os.strerror(errno.EFBIG) in told
+    assert os.strerror(errno.EFBIG) in told
     assert {name: (out / name).read_bytes() for name in swap.file_names(out)} == before
 
 

@@ -9,6 +9,7 @@ from collections import namedtuple
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from tqdm import tqdm
 
@@ -17,7 +18,7 @@ from slamlib.dataset import DatasetError, inventory_lines, read_dataset, read_tr
 from slamlib.notebook import notices
 from slamlib.report import cache
 from slamlib.report.document import render
-from slamlib.report.execution import STUDIES, execute, kernel_environment, temporary_folder
+from slamlib.report.execution import STUDIES, TRANSPORT, execute, kernel_environment
 from slamlib.report.notebooks import Options, shown, to_execute
 from slamlib.report.overview import opening, read_drives, title_picture
 from slamlib.solve import RESULT_NAMES, SENSORS
@@ -56,7 +57,9 @@ def build_report(notebooks, data, report, results, datasets=None, options=Option
     books, read, has = _checked_input(notebooks, data, datasets, options)
     chapters, folders = shown(books, options), [data / dataset.name for dataset, _ in read]
     with ExitStack() as stack:
-        temporary = Path(stack.enter_context(temporary_folder()))
+        temporary = Path(stack.enter_context(TemporaryDirectory(
+            dir="/tmp" if TRANSPORT == "ipc" else None,     # paths of sockets must be short
+            prefix="slamlib-", ignore_cleanup_errors=True)))
         kept = Path(kept or temporary / "kept").resolve()
         environment = kernel_environment(temporary, data, datasets, kept / STUDIES)
         keys = partial(cache.keys, books, folders, environment | {"SLAMLIB_RESULTS": str(results)})

@@ -10,9 +10,7 @@ import re
 import shutil
 import socket
 import sys
-import tempfile
 import time
-from importlib.util import find_spec
 from pathlib import Path
 
 from jupyter_client import AsyncKernelManager
@@ -24,13 +22,11 @@ from nbconvert.preprocessors import CoalesceStreamsPreprocessor
 from tqdm import tqdm
 
 from slamlib import swap
-from slamlib.dataset import DatasetError
 from slamlib.studies.memory import ONE_THREAD
 
 CELL_TIMEOUT = 1800  # s, in which a cell must end
 TRANSPORT = "ipc" if hasattr(socket, "AF_UNIX") else "tcp"  # Windows has no Unix sockets
 LAB_ONLY = "lab-only"  # tag of cells that are not executed, and not shown on pages or in the PDF
-LONGEST_FOLDER = 70  # characters; paths of sockets in it have at most 103
 STUDIES = "studies"  # in the cache, besides executed notebooks
 SETTINGS = "settings"  # there, too: of kernels, and JupyterLab's where the user has no others
 OVERRIDES = {"@jupyterlab/apputils-extension:notification": {
@@ -60,13 +56,6 @@ def kernel_environment(settings, data, datasets, studies):
         "SLAMLIB_STUDIES": str(studies.resolve()), "IPYTHONDIR": str(settings),
         "MATPLOTLIBRC": str(settings / "matplotlibrc"),
         "MPLBACKEND": "module://matplotlib_inline.backend_inline"}
-
-
-def temporary_folder():
-    """Return a context manager of a new folder, a str short enough for sockets."""
-    parent = tempfile.gettempdir()
-    parent = "/tmp" if TRANSPORT == "ipc" and len(parent) > LONGEST_FOLDER else parent
-    return tempfile.TemporaryDirectory(dir=parent, prefix="slamlib-", ignore_cleanup_errors=True)
 
 
 def execute(books, environment, results, jobs, finish):
@@ -152,13 +141,7 @@ def _failure(source, started, error):
 
 
 def start_lab(notebooks, data, kept, arguments):
-    """Replace this process by JupyterLab with its `arguments`; folders as of `build_report`.
-
-    Raises DatasetError if JupyterLab is not installed.
-    """
-    if find_spec("jupyterlab") is None:
-        raise DatasetError(f"expected JupyterLab beside {sys.executable}, found none: install it, "
-                           "as by pip install jupyterlab")
+    """Replace this process by JupyterLab with its `arguments`; folders as of `build_report`."""
     settings = kept.resolve() / SETTINGS
     settings.mkdir(parents=True, exist_ok=True)
     (settings / "overrides.json").write_text(json.dumps(OVERRIDES))
