@@ -1,5 +1,6 @@
 """Kept Monte Carlo studies: recalled only if nothing changed, and equal to computed ones."""
 
+import os
 import re
 import shutil
 import subprocess
@@ -8,6 +9,7 @@ import sys
 import numpy as np
 import pandas as pd
 import pytest
+from joblib import cpu_count
 from test_report import make_data, write
 
 from slamlib import studies
@@ -16,12 +18,13 @@ from slamlib.studies import memory, montecarlo
 
 
 def study(seeds=range(2), **options):
-    return studies.run(montecarlo.problem2_trial, seeds, jobs=1, **options)
+    return studies.run(montecarlo.problem2_trial, seeds, **options)
 
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     monkeypatch.setenv("SLAMLIB_STUDIES", str(tmp_path / "studies"))
+    monkeypatch.setenv("SLAMLIB_RESULTS", str(tmp_path))              # one process, as in a build
     return tmp_path / "studies"
 
 
@@ -60,7 +63,7 @@ def test_a_study_is_recalled_exactly_and_computed_again_if_damaged(folder, compu
 def test_no_study_is_kept_without_the_environment_variable_or_of_a_trial_outside_slamlib(
         folder, computed, monkeypatch):
     for _ in range(2):
-        assert list(studies.run(lambda seed: {"seed": seed}, [3], jobs=1)["seed"]) == [3]
+        assert list(studies.run(lambda seed: {"seed": seed}, [3])["seed"]) == [3]
     assert not folder.exists()
     monkeypatch.delenv("SLAMLIB_STUDIES")
     study(), study()
@@ -110,11 +113,12 @@ def test_a_study_of_several_processes_equals_that_of_one(monkeypatch, tmp_path):
         import os
         return {"seed": factor * seed, "process": os.getpid()}
 
-    one, two = (studies.run(trial, [3, 1, 2], jobs, factor=7) for jobs in (1, 2))
-    assert one["seed"].tolist() == two["seed"].tolist() == [21, 7, 14]
-    assert one["process"].nunique() == 1 and one["process"][3] not in set(two["process"])
+    many = studies.run(trial, [3, 1, 2], factor=7)
     monkeypatch.setenv("SLAMLIB_RESULTS", str(tmp_path))
-    assert studies.run(trial, [3], factor=7)["process"].tolist() == one["process"].tolist()[:1]
+    one = studies.run(trial, [3, 1, 2], factor=7)
+    assert one["seed"].tolist() == many["seed"].tolist() == [21, 7, 14]
+    assert set(one["process"]) == {os.getpid()}
+    assert (cpu_count() == 1) == (os.getpid() in set(many["process"]))
 
 
 CELL = """from slamlib import studies

@@ -15,7 +15,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pandas as pd
-from joblib import Memory, Parallel, cpu_count, delayed
+from joblib import Memory, Parallel, delayed
 from tqdm.auto import tqdm
 
 SLAMLIB = Path(__file__).parents[1]
@@ -27,34 +27,34 @@ KEPT = 200                                 # number of studies that are kept, th
 BAR_AFTER = 5.0                            # s, duration of a study from which on it shows a bar
 
 
-def run(trial, seeds, jobs=None, **options):
+def run(trial, seeds, **options):
     """DataFrame of what trial(seed, **options) returns, a dict, with one row for each seed.
 
     Parameters
     ----------
     trial : function; if it is of a module in slamlib.studies, the study is kept.
     seeds : iterable of int.
-    jobs : number of processes. None for one in a build, which executes several notebooks at a time
-        and kills their kernels, after which processes would wait for minutes; else all processors.
     """
     seeds = list(seeds)[:int(os.environ.get("SLAMLIB_SEEDS", 0)) or None]
-    jobs = jobs or (1 if "SLAMLIB_RESULTS" in os.environ else cpu_count())
     name = f"{trial.__module__}.{trial.__name__}"
     kept = name.startswith(f"{__package__}.") and code_digest() == CODE_DIGEST  # not edited since
     memory = Memory(os.environ.get("SLAMLIB_STUDIES") if kept else None, verbose=0, compress=True)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Exception while loading results")    # computed again
-        rows = memory.cache(_rows, ignore=["trial", "jobs"])(
-            trial, name, seeds, options, CODE_DIGEST, jobs)
+        rows = memory.cache(_rows, ignore=["trial"])(trial, name, seeds, options, CODE_DIGEST)
     memory.reduce_size(items_limit=KEPT)
     return pd.DataFrame(rows, index=pd.Index(seeds, name="seed"))
 
 
-def _rows(trial, name, seeds, options, code, jobs):
-    """The rows of `run`, a list of dict, which joblib keeps by all arguments but trial and jobs."""
-    bar = tqdm(seeds, desc=trial.__name__, leave=False, delay=BAR_AFTER,
-               disable="SLAMLIB_RESULTS" in os.environ)
-    return Parallel(jobs)(delayed(trial)(seed, **options) for seed in bar)
+def _rows(trial, name, seeds, options, code):
+    """The rows of `run`, a list of dict, which joblib keeps by all arguments but trial.
+
+    A build has one process for it: it executes several notebooks at a time, and kills their
+    kernels, after which further processes would wait for minutes.
+    """
+    in_build = "SLAMLIB_RESULTS" in os.environ
+    bar = tqdm(seeds, desc=trial.__name__, leave=False, delay=BAR_AFTER, disable=in_build)
+    return Parallel(1 if in_build else -1)(delayed(trial)(seed, **options) for seed in bar)
 
 
 def code_digest():
