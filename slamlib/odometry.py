@@ -142,9 +142,7 @@ def first_order(ticks, vehicle, initial_pose=(0.0, 0.0, 0.0), initial_covariance
 
 def cumulative(increments, initial=0.0):
     """Cumulative sums (n+1, ...) of increments (n, ...) over the first axis, after `initial`."""
-    total = np.zeros((len(increments) + 1,) + np.shape(increments)[1:])
-    np.cumsum(increments, axis=0, out=total[1:])
-    return total + initial
+    return np.cumulative_sum(increments, axis=0, include_initial=True) + initial
 
 
 def _chord(dtheta, model):

@@ -82,11 +82,6 @@ def compose_jacobians(T_ab, T_bc):
     return by_first, by_second
 
 
-def inverse_jacobian(T_ab):
-    """Derivative of inverse, d T_ba / d T_ab, (..., 3, 3)."""
-    return between_jacobians(T_ab, np.zeros(3))[0]
-
-
 def compose_uncertain(T_ab, C_ab, T_bc, C_bc):
     """T_ac, (..., 3), and its covariance (..., 3, 3), by independent motions and covariances."""
     A, B = compose_jacobians(T_ab, T_bc)

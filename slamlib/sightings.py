@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slamlib import se2
+from slamlib.dataset import ArucoReadings
 from slamlib.se2 import correlations, sigmas
 
 GATE = 16.26623619623813         # dimensionless, for residuals of [x, y, heading]
@@ -45,10 +46,7 @@ def sightings_by_frame(aruco, extra_frames=()):
 
     `extra_frames` are pose indices from 0 that are frames even if no marker is seen there.
     """
-    if aruco is None:
-        none = np.zeros(0, int)
-        return Sightings(index=none, row=none, marker=none, z=np.zeros((0, 3)),
-                         C=np.zeros((0, 3, 3)), frame=np.unique(extra_frames).astype(int))
+    aruco = aruco or ArucoReadings(*np.zeros((2, 0), int), np.zeros((0, 3)), np.zeros((0, 3, 3)))
     index, z, C, contradicting = merge_repeated(replace(
         aruco, covariance=regular(aruco.covariance)))
     frame = np.union1d(aruco.pose[index], extra_frames).astype(int)

@@ -64,8 +64,7 @@ class Calibration:
                         np.maximum(width * self.wide, self.sigma), self.sigma)
 
     def taken_from(self, other, values, default):
-        """Values (p,): those of another drive's Calibration where it has the entry, or `default`.
-        """
+        """Values (p,): another drive's Calibration's where it has the entry, or `default`."""
         known = dict(zip(other.names, values))
         return np.array([known.get(name, value) for name, value in zip(self.names, default)])
 

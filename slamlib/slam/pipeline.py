@@ -61,19 +61,13 @@ def estimate(dataset, slip=None, model=None, previous=None, *, marker_noise_fact
     >>> result = estimate(dataset.first(200), slip=1e-3, kernel="Huber")
     >>> result.poses.shape, result.antenna.tolist(), result.noise.slip
     ((200, 3), [5, 13, 36, 46], 0.001)
-    >>> estimate(dataset, kernel="L2")
-    Traceback (most recent call last):
-    slamlib.textfile.DatasetError: slam.estimate: expected "asymmetric Tukey" or \
-"asymmetric Cauchy" or "quadratic" or "Huber" or "Cauchy" or "Geman-McClure" or "Tukey" for \
-kernel, found 'L2'
     """
     require_type(dataset, Dataset, "slam.estimate")
     require_type(factors, NonlinearFactorGraph | None, "slam.estimate")
     require(model in (None, *MODELS), "slam.estimate", f"{' or '.join(MODELS)} for model", model)
     options = {"slip": slip, "marker_noise_factor": marker_noise_factor,
                "range_noise_factor": range_noise_factor, "kernel": kernel, "gate": gate}
-    dataset = replace(dataset, vehicle=changed(dataset.vehicle, {
-        key: value for key, value in options.items() if value is not None}, "slam.estimate"))
+    dataset = replace(dataset, vehicle=changed(dataset.vehicle, options, "slam.estimate"))
 
     def solve(jumps=NO_JUMPS, places=None):
         aruco = dataset.aruco if places is None else replace(dataset.aruco, marker=places[:, 1])

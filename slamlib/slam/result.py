@@ -198,7 +198,7 @@ def interpolate(problem, state, pairs):
     back = se2.inverse(delta_b)
     A_a, B_a = se2.compose_jacobians(poses[a], delta_a)
     A_b, B_b = se2.compose_jacobians(poses[b], back)
-    B_b = B_b @ se2.inverse_jacobian(delta_b)
+    B_b = B_b @ se2.between_jacobians(delta_b, np.zeros(3))[0]       # of the inverse
 
     from_a, from_b = se2.compose(poses[a], delta_a), se2.compose(poses[b], back)
     difference = se2.difference(from_b, from_a)
