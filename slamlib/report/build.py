@@ -14,7 +14,7 @@ from tempfile import TemporaryDirectory
 from tqdm import tqdm
 
 from slamlib import swap
-from slamlib.dataset import DatasetError, inventory_lines, read_dataset, read_truth
+from slamlib.dataset import inventory_lines, read_dataset, read_truth
 from slamlib.notebook import notices
 from slamlib.report import cache
 from slamlib.report.document import render
@@ -23,6 +23,7 @@ from slamlib.report.notebooks import Options, shown, to_execute
 from slamlib.report.overview import opening, read_drives, title_picture
 from slamlib.solve import RESULT_NAMES, SENSORS
 from slamlib.tables import datasets_in
+from slamlib.textfile import require
 
 DATASET_NAME = re.compile("[A-Za-z0-9 ._-]+")  # nothing that Markdown, HTML or Typst interprets
 
@@ -90,9 +91,8 @@ def _checked_input(notebooks, data, datasets, options):
     books = to_execute(notebooks, options)
     names, unread = datasets_in(data, datasets)
     for name in names:
-        if not DATASET_NAME.fullmatch(name):
-            raise DatasetError(f"{data / name}: expected letters from a to z, digits, spaces, "
-                               "dots, dashes and underscores in its name: rename this folder")
+        require(DATASET_NAME.fullmatch(name), data / name, "letters from a to z, digits, spaces, "
+                "dots, dashes and underscores in its name: rename this folder")
     read = [(read_dataset(data / name), read_truth(data / name)) for name in names]
     lines = [line for dataset, truth in read for line in inventory_lines(dataset, truth)]
     print(*lines, *unread, sep="\n", file=sys.stderr)

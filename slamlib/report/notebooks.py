@@ -16,7 +16,7 @@ from nbconvert.preprocessors import ClearOutputPreprocessor
 
 from slamlib.dataset import DatasetError
 from slamlib.report.execution import NotebookError
-from slamlib.textfile import quoted, read_text, read_toml
+from slamlib.textfile import read_text, read_toml, require
 
 FOLDER = "notebooks"  # name of the notebooks' folder
 CODE_SHOWN = ("none", "method", "all")  # what code is shown: none, all that is not hidden, or all
@@ -62,8 +62,7 @@ def _checked(key, value, place):
     else:
         ok = type(value) in (str, int) and re.fullmatch(r"[^\n\ufffd]*", value := str(value))
         expected = "a line of UTF-8 text in quotes"
-    if not ok:
-        raise DatasetError(f"{place}: expected {expected} for {key}, found {quoted(value)}")
+    require(ok, place, f"{expected} for {key}", value)
     return dict.fromkeys(value, place) if key == "leave_out" else value
 
 
@@ -111,15 +110,14 @@ def to_execute(folder, options):
     about = {source: chapter_of(source, book) for source, book in books.items()}
     numbers = {each["number"] for each in about.values()} - {None}
     for entry, place in options.leave_out.items():
-        if place and re.fullmatch(r"\d+|[A-Za-z]", entry) and entry.upper() not in numbers:
-            raise DatasetError(f"{place}: expected to leave out a chapter "
-                               f"({', '.join(sorted(numbers))}) or a section, found '{entry}'")
+        known = entry.upper() in numbers or not re.fullmatch(r"\d+|[A-Za-z]", entry)
+        require(known or not place, place,
+                f"to leave out a chapter ({', '.join(sorted(numbers))}) or a section", entry)
     chapters = {source: book for source, book in books.items() if not about[source]["letter"]}
     appendices = sorted((about[source]["letter"], source) for source in shown(books, options)
                         if source not in chapters and options.appendix is not False)
-    if not chapters and not appendices:
-        raise DatasetError(f"{folder}: expected notebooks (*.ipynb) that are not left out, found "
-                           "no notebooks")
+    require(chapters or appendices, folder,
+            "notebooks (*.ipynb) that are not left out, found no notebooks")
     return chapters | {source: books[source] for _, source in appendices}
 
 

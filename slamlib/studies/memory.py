@@ -47,11 +47,9 @@ def run(trial, seeds, **options):
 
 
 def _rows(trial, name, seeds, options, code):
-    """The rows of `run`, a list of dict, which joblib keeps by all arguments but trial.
-
-    A build has one process for it: it executes several notebooks at a time, and kills their
-    kernels, after which further processes would wait for minutes.
-    """
+    """The rows of `run`, a list of dict, which joblib keeps by all arguments but trial."""
+    # A build executes several notebooks at a time, and kills their kernels, after which further
+    # processes would wait for minutes.
     in_build = "SLAMLIB_RESULTS" in os.environ
     bar = tqdm(seeds, desc=trial.__name__, leave=False, delay=BAR_AFTER, disable=in_build)
     return Parallel(1 if in_build else -1)(delayed(trial)(seed, **options) for seed in bar)
