@@ -18,7 +18,9 @@ from slamlib.odometry_gate import (
     UNKNOWN_SIGMA,
     Jumps,
     _compared,
+    _dead,
     _Drive,
+    _suspects,
     find_jumps,
 )
 from slamlib.sightings import sightings_by_frame
@@ -89,6 +91,23 @@ def test_shares_of_a_jump_by_hand():
     spike = replace(jumps, chance=np.cumsum([1, 1, 1, 1, 1e6, 1, 1, 1, 1]))
     np.testing.assert_allclose(spike.share(start, end)[:, 0], [0, 0, 1, 1, 0], atol=1e-5)
     assert not NO_JUMPS.added(start, end)[1].any()
+
+
+def test_suspects_by_hand():
+    """Of the pairs of each step only those at its two frames are asked, if there are any."""
+    first, second = np.array([0, 1, 1, 2, 3, 3, 1]), np.array([1, 2, 2, 4, 5, 5, 3])
+    suspects, rank = _suspects(first, second, np.array([1.0, 99, 1, 99, 1, 1, 99]), 5)
+    assert suspects.tolist() == [1, 2]
+    assert rank.tolist() == [-np.inf, -np.inf, -2, -1, 0]
+
+
+@pytest.mark.parametrize("contradicted, dead", [
+    ([3], []), ([2, 3], [1, 2, 3, 4]), ([2, 3, 7], [1, 2, 3, 4, 6, 7]), ([0, 5], [])])
+def test_a_dead_wheel_by_hand(contradicted, dead):
+    """Zeros from row 8 to 25 and, of the other wheel, from 33 on: steps 2 to 4 and 7 are silent."""
+    ticks, frame = np.ones((41, 2), int), np.arange(0, 41, 5)
+    ticks[8:26, 0] = ticks[33:, 1] = 0
+    assert _dead(ticks, frame, contradicted).tolist() == dead
 
 
 def test_one_frame_or_none_has_no_jump():

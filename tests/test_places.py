@@ -1,6 +1,7 @@
 """An id is one place until it is not: visits, and markers that are several landmarks."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from slamlib import evaluation, se2, slam
 from slamlib.checks.solution import solution_doubts
 from slamlib.dataset import ArucoReadings
 from slamlib.simulation import simulate
-from slamlib.slam.choices import has_rejected_visits, visits
+from slamlib.slam.choices import _squared_distance, has_rejected_visits, visits
 from slamlib.slam.measurements import measure
 from slamlib.slam.pipeline import fit_from_odometry
 
@@ -23,6 +24,25 @@ def test_visits_end_with_a_long_break():
     aruco = ArucoReadings(pose[order], marker[order], None, None)
     expected = np.repeat([0, 0, 1, 2], [5, 4, 3, 3])[order]
     np.testing.assert_array_equal(visits(aruco), expected)
+
+
+@pytest.mark.parametrize("off, P_1, P_2, squared", [
+    ([0.3, 0, 0], 0, 1, 0.3**2 / 0.1**2), ([0, 0.3, 0], 0, 1, 0.3**2 / 0.1**2),
+    ([0, 0.2 * 2, 0.2], 0, 1, 0.2**2 / 0.1**2), ([0, 0.4, 0.2], 1, 5, 0.2**2 / 0.2**2),
+    ([0.1, 0, 0.2], 1, 1, (0.1**2 + 0.2**2) / 0.02**2), ([0.1, 0, 0], 2, 1, 0.1**2 / 0.02**2)])
+def test_the_distance_of_two_visits_by_hand(off, P_1, P_2, squared):
+    """Seen 2 m ahead of one pose, whose covariance is 0.01 times P_1, then P_2, in x, y, heading.
+
+    Of the growth A A^T, A = [[1, 0, 0], [0, 1, 2], [0, 0, 1]], x has the variance 1, and the vector
+    a = [0, 2, 1] = A e_3 has a^T (A A^T)^-1 a = 1.
+    """
+    second = np.array([2.0, 0.0, np.pi - 0.1])
+    result = SimpleNamespace(
+        marker=np.array([4, 6]), marker_in_world=np.array([second - off, second]),
+        poses=np.zeros((9, 3)), covariances=np.zeros((9, 3, 3)))
+    result.covariances[[3, 7]] = 0.01 * np.array([P_1, P_2])[:, None, None] * np.eye(3)
+    result.marker_in_world[0, 2] += 2 * np.pi
+    np.testing.assert_allclose(_squared_distance(result, 4, 6, 3, 7), squared)
 
 
 @pytest.fixture(scope="module")
