@@ -11,7 +11,8 @@ from slamlib import evaluation, se2, slam
 from slamlib.checks.solution import solution_doubts
 from slamlib.dataset import ArucoReadings
 from slamlib.simulation import simulate
-from slamlib.slam.choices import _squared_distance, has_rejected_visits, visits
+from slamlib.slam import choices
+from slamlib.slam.choices import _squared_distance, has_rejected_visits, places_of_ids, visits
 from slamlib.slam.measurements import measure
 from slamlib.slam.pipeline import fit_from_odometry
 
@@ -43,6 +44,31 @@ def test_the_distance_of_two_visits_by_hand(off, P_1, P_2, squared):
     result.covariances[[3, 7]] = 0.01 * np.array([P_1, P_2])[:, None, None] * np.eye(3)
     result.marker_in_world[0, 2] += 2 * np.pi
     np.testing.assert_allclose(_squared_distance(result, 4, 6, 3, 7), squared)
+
+
+def test_places_of_ids_by_hand(monkeypatch):
+    """Four visits of id 12, of which the second is 0.3 m off, and the fourth nearly as far.
+
+    The variance grows by 0 from the end of each to the beginning of each other one, but along and
+    from other poses of theirs. Two accepted sightings are too few to compare: those of id 12 last.
+    """
+    begins, variance = np.array([50, 0, 1000, 2000, 3000, 4000]), np.zeros(4100)
+    pose = (begins[:, None] + [0, 10, 20]).ravel()
+    variance[pose] = np.r_[0, 0, 0, 5, 0, 1, 1, 5, 1, 1, 3, 1, 1, 9, 1, 1, 9, 0]
+    place = np.zeros((6, 3))
+    place[[2, 4, 5], 0] = 0.3, 0.31, 9.0
+    visit, order = np.repeat(np.arange(6), 3), np.argsort(pose)
+    aruco = ArucoReadings(pose[order], np.where(visit == 0, 7, 12)[order], None, None)
+    result = SimpleNamespace(
+        rejected=np.arange(18) == 17, marker=np.arange(6), marker_in_world=place,
+        poses=np.zeros((4100, 3)), covariances=variance[:, None, None] * np.eye(3),
+        sightings=SimpleNamespace(marker=visit, row=np.arange(18), frame=pose))
+    monkeypatch.setattr(choices, "slam_result", lambda solved: result)
+    marker, ids = places_of_ids(aruco, lambda places: places).T
+    np.testing.assert_array_equal(marker, aruco.marker)
+    np.testing.assert_array_equal(ids, np.repeat([7, 12, 112, 12, 112, 12], 3)[order])
+    place[:] = 0
+    assert places_of_ids(aruco, lambda places: places) is None
 
 
 @pytest.fixture(scope="module")
