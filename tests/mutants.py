@@ -51,15 +51,14 @@ SWAPS = {ast.Add: ast.Sub, ast.Mult: ast.Div, ast.BitAnd: ast.BitOr, ast.And: as
 SWAPS |= {other: one for one, other in SWAPS.items()} | {ast.Pow: ast.Mult, ast.FloorDiv: ast.Mult}
 DROPPED = {"wrap", "unwrap", "swapaxes", "transpose", "abs", "sqrt"}
 SYMMETRIC = {"maximum", "minimum", "max", "min", "hypot", "union1d", "isclose", "allclose",
-             "isinstance", "getattr", "array_equal", "squared_distances", "rmse"}
+             "isinstance", "getattr", "array_equal", "squared_distances", "clip"}
 AXES = {"reshape", "stack", "moveaxis", "axis", "assume_unique"}    # where -1 or False is as good
 FIRST_ONLY = {"require", "_number"}
 
 
 def is_text(node):
     """True of an expression with text, for which operators mean something else."""
-    return any(isinstance(part, ast.JoinedStr) or isinstance(part, ast.Constant)
-               and isinstance(part.value, (str, bytes)) for part in ast.walk(node))
+    return bool({"'", '"'} & {*ast.unparse(node)})
 
 
 def is_message(node):

@@ -18,17 +18,8 @@ from slamlib.dataset import Vehicle, read_dataset, read_truth
 from slamlib.evaluation import align, anees, ate
 from slamlib.localization import fuse, fuse_increments, localize
 from slamlib.simulation import mislabel, simulate
-from slamlib.slam import choices, graph, own
-from slamlib.slam.calibration import (
-    ANTENNAS,
-    ENTRIES,
-    HEIGHT,
-    RANGE_LAG,
-    SIGHTING_LAG,
-    SIZE,
-    calibration_table,
-    stated_calibration,
-)
+from slamlib.slam import calibration, choices, graph, own
+from slamlib.slam.calibration import ANTENNAS, ENTRIES, HEIGHT, RANGE_LAG, SIGHTING_LAG, SIZE
 from slamlib.slam.factors import SMOOTHED_STEPS
 from slamlib.slam.fit import KERNELS, ONE_SIDED
 from slamlib.slam.initialization import odometry_state
@@ -131,11 +122,12 @@ def test_evidence_of_one_entry_by_hand():
 def test_what_is_stated_is_what_the_table_says(height, sigma):
     """The vector has half the squared height h^2 / 2, whose sigma is h sigma, or sigma^2 / 2."""
     vehicle = replace(MOUNTED, antenna_height=height, **DOUBTFUL | {"sigma_antenna_height": sigma})
-    stated = stated_calibration(vehicle, [5, 7])
+    stated = calibration.stated_calibration(vehicle, [5, 7])
     assert stated.stated[HEIGHT] == height**2 / 2
     np.testing.assert_allclose(stated.wide[[0, 3, HEIGHT, 15]], [
         0.05 * vehicle.right_radius, 0.2, np.hypot(height, 1.25) * 2.5, 0.15])
-    rows = calibration_table(stated, stated.stated, np.diag(stated.sigma**2), {"tag-offset"})
+    rows = calibration.calibration_table(
+        stated, stated.stated, np.diag(stated.sigma**2), {"tag-offset"})
     assert [row["name"] for row in rows[14:]] == ["offset of antenna 5", "offset of antenna 7"]
     assert [row["name"] for row in rows if row["released"]] == ["tag_x", "tag_y"]
     for row in rows[:14]:
@@ -143,7 +135,7 @@ def test_what_is_stated_is_what_the_table_says(height, sigma):
         for columns in (("stated", "stated_sigma"), ("estimate", "sigma")):
             np.testing.assert_allclose([row[each] for each in columns], expected, rtol=1e-6)
     below = stated.stated - 99 * (np.arange(16) == HEIGHT)         # a squared height below zero
-    assert calibration_table(stated, below, np.eye(16), ())[HEIGHT]["estimate"] == 0
+    assert calibration.calibration_table(stated, below, np.eye(16), ())[HEIGHT]["estimate"] == 0
 
 
 @pytest.mark.parametrize("off, sigma, named, width", [
@@ -154,7 +146,7 @@ def test_what_a_drive_cannot_tell_apart_by_hand(monkeypatch, off, sigma, named, 
 
     The prior odds of the camera, with an entry more, are less by 0.5, and by 3 if it is stated.
     """
-    stated = stated_calibration(Vehicle(sigma_camera_x=sigma), [])
+    stated = calibration.stated_calibration(Vehicle(sigma_camera_x=sigma), [])
     both = np.isin(np.arange(14), [3, 8])
     L, h = 100.0 * np.outer(both, both), 100 * off * both
     monkeypatch.setattr(choices, "_likelihood", lambda fit: (L, h))

@@ -2,14 +2,14 @@
 
 import itertools
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
 import gtsam
 import numpy as np
 import pytest
-from numeric import changed, known_noise
+from numeric import aruco, known_noise, uwb, vehicle
 
 from slamlib import se2, slam, solve
 from slamlib.__main__ import summary_table
@@ -32,18 +32,11 @@ from slamlib.slam.result import turn_sigma
 SHORT = Path(__file__).parents[1] / "data" / "short"
 
 
-aruco, uwb = (partial(changed, sensor=sensor) for sensor in ("aruco", "uwb"))
-
-
 def late(dataset, poses):
     """The dataset with sightings that are late."""
     moved = dataset.aruco.pose + poses
     kept = (moved >= 0) & (moved < len(dataset.ticks))
     return replace(dataset, aruco=replace(dataset.aruco, pose=moved).select(kept))
-
-
-def vehicle(**changes):
-    return lambda d: replace(d, vehicle=replace(d.vehicle, **changes))
 
 
 WRONG_SIZES = {                                # found by the graph, and mended

@@ -15,17 +15,11 @@ from slamlib.evaluation import align, ate, nees_band
 from slamlib.odometry import dead_reckoning
 from slamlib.se2 import compose
 from slamlib.simulation import manoeuvre, simulate
-from slamlib.slam import factors, graph, result
+from slamlib.slam import factors, graph, initialization, result
 from slamlib.slam.calibration import OFFSET, RANGES, SCALE, SIGHTINGS, stated_calibration
 from slamlib.slam.fit import KERNELS, ONE_SIDED
 from slamlib.slam.graph import optimize
-from slamlib.slam.initialization import (
-    AntennaRanges,
-    odometry_state,
-    ranges_by_antenna,
-    second_moment,
-    trilaterate,
-)
+from slamlib.slam.initialization import AntennaRanges, odometry_state, second_moment, trilaterate
 from slamlib.slam.linear import NormalEquations, consistency_factor
 from slamlib.slam.measurements import GUESS_PRIOR_SIGMA, measure
 from slamlib.slam.pipeline import fit_from_previous
@@ -260,7 +254,8 @@ def test_ranges_in_the_plane_by_hand():
         dataset.uwb, range=np.full(len(dataset.uwb.pose), 1.02 * 2.5 + 0.1)), vehicle=replace(
             dataset.vehicle, antenna_height=2.0, range_offset=0.1, range_scale=1.02)))
     poses, C = np.zeros((len(m.frame), 3)), np.diag([0.09, 0.03, 0.5])
-    found, = ranges_by_antenna(m, poses, np.tile(C, (len(poses), 1, 1)), m.calibration.stated, 3.0)
+    found, = initialization.ranges_by_antenna(
+        m, poses, np.tile(C, (len(poses), 1, 1)), m.calibration.stated, 3.0)
     np.testing.assert_allclose(found.distance, 1.5)
     np.testing.assert_allclose(found.sigma, np.hypot(3 * 0.05 / 1.02 * 2.5 / 1.5, np.sqrt(0.06)))
     np.testing.assert_array_equal(found.guess, [2.5, 4.0])
