@@ -153,18 +153,6 @@ def test_wheels_that_are_far_off_are_named_and_mended_although_slip_explains_the
     assert_mended(found, truth, 501, factor=1.3)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("poses, seed", [(-3, 61), (10, 62)])
-def test_sightings_that_are_late_are_named_and_mended(poses, seed):
-    """The offset is right, and the ATE nearly that of the right files."""
-    dataset, truth = simulate("short", seed)
-    found = slam.estimate(late(dataset, poses).without("uwb"))
-    sigma = np.sqrt(found.c_covariance[SIGHTING_LAG, SIGHTING_LAG])
-    assert abs(found.c[SIGHTING_LAG] - poses) < 3 * sigma < 1
-    assert names(solution_doubts(found)) == {"time-offset"}
-    assert_mended(found, truth, seed, factor=1.4)
-
-
 def test_without_sightings_nothing_is_known_of_the_camera():
     dataset = known_noise(simulate("short", 61)[0].first(300).without("aruco"), 1e-3)
     stated = vehicle(camera_x=0.1, sigma_camera_x=0.02, marker_size=1.01, sighting_lag=2.0)

@@ -54,7 +54,7 @@ def test_places_of_ids_by_hand(monkeypatch):
     """
     begins, variance = np.array([50, 0, 1000, 2000, 3000, 4000]), np.zeros(4100)
     pose = (begins[:, None] + [0, 10, 20]).ravel()
-    variance[pose] = np.r_[0, 0, 0, 5, 0, 1, 1, 5, 1, 1, 3, 1, 1, 9, 1, 1, 9, 0]
+    variance[pose] = np.r_[9, 0, 0, 5, 0, 1, 1, 5, 1, 1, 3, 1, 1, 9, 1, 1, 9, 0]
     place = np.zeros((6, 3))
     place[[2, 4, 5], 0] = 0.3, 0.31, 9.0
     visit, order = np.repeat(np.arange(6), 3), np.argsort(pose)
