@@ -13,7 +13,6 @@ Numbers that a module names in capital letters are left out: a threshold of 21 i
 import argparse
 import ast
 import compileall
-import copy
 import os
 import pickle
 import random
@@ -73,10 +72,7 @@ def name_of(function):
 
 
 def changed(node, **fields):
-    other = copy.copy(node)
-    for name, value in fields.items():
-        setattr(other, name, value)
-    return other
+    return type(node)(**vars(node) | fields)
 
 
 def changes(node):

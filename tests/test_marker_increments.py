@@ -181,8 +181,8 @@ def test_covariances_that_are_nearly_singular_are_increased_by_hand():
     C[:, 1, 0] = C[:, 0, 1]
     added = np.array([0, 1e-12, 0])[:, None, None] * np.diag([1, 1, 0])
     np.testing.assert_allclose(regular(C) - C, added, rtol=1e-3, atol=1e-18)
-    far = np.diag([1e8, 1e-18, 1e-4])[None]           # one digit in a million, of the larger sigma
-    np.testing.assert_allclose(regular(far) - far, np.diag([0, 1e-4, 0])[None])
+    far = np.array([np.diag([1e8, 1e-18, 1e-4]), np.diag([1e-18, 1e8, 1e-4])])   # a millionth
+    np.testing.assert_allclose(regular(far) - far, [np.diag([0, 1e-4, 0]), np.diag([1e-4, 0, 0])])
 
 
 def test_consensus_takes_the_most_certain_sighting_among_the_supported():

@@ -32,10 +32,9 @@ def test_visits_end_with_a_long_break():
     ([0, 0.2 * 2, 0.2], 0, 1, 0.2**2 / 0.1**2), ([0, 0.4, 0.2], 1, 5, 0.2**2 / 0.2**2),
     ([0.1, 0, 0.2], 1, 1, (0.1**2 + 0.2**2) / 0.02**2), ([0.1, 0, 0], 2, 1, 0.1**2 / 0.02**2)])
 def test_the_distance_of_two_visits_by_hand(off, P_1, P_2, squared):
-    """Seen 2 m ahead of one pose, whose covariance is 0.01 times P_1, then P_2, in x, y, heading.
+    """Seen 2 m ahead of a pose of covariance 0.01 P_1, then 0.01 P_2: A's second row is [0, 1, 2].
 
-    Of the growth A A^T, A = [[1, 0, 0], [0, 1, 2], [0, 0, 1]], x has the variance 1, and the vector
-    a = [0, 2, 1] = A e_3 has a^T (A A^T)^-1 a = 1.
+    Of the growth A A^T x has the variance 1, and a = [0, 2, 1] = A e_3 has a^T (A A^T)^-1 a = 1.
     """
     second = np.array([2.0, 0.0, np.pi - 0.1])
     result = SimpleNamespace(
