@@ -47,7 +47,7 @@ def rounding_and_slipping(ticks, vehicle, start, end):
     length = np.max(end - start, initial=1)
     origin = poses[:max(1, len(ds)):length]
     middle = (poses[:-1] + poses[1:]) / 2 - origin[np.arange(len(ds)) // length]
-    sides = vehicle.wheelbase / 2 * np.array([1, -1])
+    sides = vehicle.wheelbase / np.array([2, -2])
     turn = 1 / (2 * sides)                                             # by e_R, by e_L
     by_wheel = np.stack([
         np.cos(direction) / 2 + middle[:, 1:2] * turn, np.sin(direction) / 2 - middle[:, :1] * turn,

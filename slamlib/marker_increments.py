@@ -198,7 +198,7 @@ def returns(dataset):
     sighting, frame = s.table()[::every], s.frame[::every]
     seen, distance = (sighting >= 0).astype(int), travelled[frame]
     common = (seen @ seen.T) * (distance[:, None] - distance >= MIN_GAP)  # later, earlier frames
-    later = np.flatnonzero(common.max(axis=1, initial=0) >= MIN_COMMON_MARKERS)
+    later = np.flatnonzero((common >= MIN_COMMON_MARKERS).any(axis=1))
     earlier = common[later].argmax(axis=1) if len(later) else later
     pair, which = np.nonzero(seen[earlier] & seen[later])
     found = robust_increments(s.z, s.C, pair, sighting[earlier[pair], which],

@@ -59,8 +59,7 @@ def error_memory(landmark, pose, u, used):
     rows, share = np.flatnonzero(used), np.ones(len(used))
     rows = rows[np.lexsort((pose[rows], landmark[rows]))]
     landmark, pose, u = landmark[rows], pose[rows], u[rows]
-    neighbours = landmark[1:] == landmark[:-1]
-    variance = np.mean(u**2) if neighbours.any() else 0.0
+    variance = np.mean(u**2) if len(np.unique(landmark)) < len(rows) else 0.0
     if variance < MIN_VARIANCE:
         return Memory(correlation=0.0, sigma=1.0, share=share)
     interval, run = runs(landmark, pose, MAX_PAUSE)

@@ -35,7 +35,7 @@ MIN_LAG_GAIN = 50.0          # by a lag
 MAX_LAG_COST = 0.8           # of that without it; with slip a wrong lag costs 0.95
 PAIRS = 2                    # of sightings of each marker that tell of a jump: one may be wrong
 NEAREST = 24                 # number of these pairs, by the frames between them
-MAX_SIGMA = 1.0              # m, of a jump
+MAX_VARIANCE = 1.0           # m^2, of the place after a jump
 WELL_INSIDE = 0.15, 0.85      # quantiles of x and of y at which markers are seen
 MIN_MISSED = 6               # number of sightings that should be there, and are not
 # Jumps in odometry
@@ -312,6 +312,6 @@ def _jump(s, drive, k):
     jump, covariance = found.increment[0], found.covariance[0]
     expected = [se2.compose_uncertain(each, Q, *later) for each in (np.zeros(3), jump)]
     gain = np.subtract(*(_cost(se2.squared_distances(z, each, C + W)) for each, W in expected))
-    if not found.usable[0] or np.trace(covariance[:2, :2]) > MAX_SIGMA**2:
+    if not found.usable[0] or np.trace(covariance[:2, :2]) > MAX_VARIANCE:
         return np.zeros(3), None, 0.0, False
     return jump, covariance, gain.sum(), gain.sum() - gain.max() > MIN_GAIN

@@ -13,7 +13,6 @@ Numbers that a module names in capital letters are left out: a threshold of 21 i
 import argparse
 import ast
 import compileall
-import copy
 import os
 import pickle
 import random
@@ -36,12 +35,12 @@ import scipy.stats  # noqa: E402, F401
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("localization", "slam")
-MODULES = ("se2", "odometry", "evaluation", "results", "dataset", "increments", "sightings",
-           "marker_increments", "odometry_gate", "memory")
+MODULES = ("se2", "odometry", "evaluation", "results", "dataset", "tables", "vehicle", "increments",
+           "sightings", "marker_increments", "odometry_gate", "memory")
 FILES = [f"test_{name}.py" for name in (
-    "se2", "odometry", "evaluation", "results", "dataset", "increments", "marker_increments",
-    "localization", "fusion", "odometry_gate", "memory", "places", "doubts", "calibration",
-    "normal_equations", "slam", "uwb", "library", "numbers", "flaws")]
+    "se2", "odometry", "evaluation", "results", "dataset", "tables", "dialects", "increments",
+    "marker_increments", "localization", "fusion", "odometry_gate", "memory", "places", "doubts",
+    "calibration", "normal_equations", "slam", "uwb", "library", "numbers", "flaws")]
 ENOUGH = 20                            # seconds, of the tests of one mutant
 MEMORY = 8 << 30                       # bytes, of a mutant's process
 PATIENCE = 3                           # times as long as without a mutant, and START seconds
@@ -51,20 +50,29 @@ SWAPS = {ast.Add: ast.Sub, ast.Mult: ast.Div, ast.BitAnd: ast.BitOr, ast.And: as
 SWAPS |= {other: one for one, other in SWAPS.items()} | {ast.Pow: ast.Mult, ast.FloorDiv: ast.Mult}
 DROPPED = {"wrap", "unwrap", "swapaxes", "transpose", "abs", "sqrt"}
 SYMMETRIC = {"maximum", "minimum", "max", "min", "hypot", "union1d", "isclose", "allclose",
-             "isinstance", "getattr", "array_equal"}
+             "isinstance", "getattr", "array_equal", "squared_distances", "clip"}
+AXES = {"reshape", "stack", "moveaxis", "axis", "assume_unique"}    # where -1 or False is as good
+FIRST_ONLY = {"require", "_number"}
 
 
 def is_text(node):
     """True of an expression with text, for which operators mean something else."""
-    return any(isinstance(part, ast.JoinedStr) or isinstance(part, ast.Constant)
-               and isinstance(part.value, (str, bytes)) for part in ast.walk(node))
+    return bool({"'", '"'} & {*ast.unparse(node)})
+
+
+def is_message(node):
+    """True of an expression of text: it may be left out, but nothing in it is changed."""
+    return isinstance(node, ast.Raise | ast.JoinedStr) or isinstance(node, ast.Call) and isinstance(
+        node.func, ast.Attribute) and isinstance(node.func.value, ast.Constant)
+
+
+def name_of(function):
+    """Name of a function in a call, or nothing."""
+    return getattr(function, "attr", getattr(function, "id", ""))
 
 
 def changed(node, **fields):
-    other = copy.copy(node)
-    for name, value in fields.items():
-        setattr(other, name, value)
-    return other
+    return type(node)(**vars(node) | fields)
 
 
 def changes(node):
@@ -75,7 +83,8 @@ def changes(node):
             found.append(changed(node, op=SWAPS[type(node.op)]()))
         elif isinstance(node.op, ast.MatMult) and isinstance(node, ast.BinOp):
             found.append(changed(node, left=node.right, right=node.left))
-    elif isinstance(node, ast.BoolOp):
+    elif isinstance(node, ast.BoolOp) and not any(
+            is_text(each) for each in node.values if not isinstance(each, ast.Compare)):
         found.append(changed(node, op=SWAPS[type(node.op)]()))
     elif isinstance(node, ast.Compare) and type(node.ops[0]) in SWAPS:
         found.append(changed(node, ops=[SWAPS[type(node.ops[0])](), *node.ops[1:]]))
@@ -90,28 +99,34 @@ def changes(node):
     elif isinstance(node, ast.Return) and isinstance(node.value, ast.BinOp) and not is_text(node):
         found.append(changed(node, value=ast.UnaryOp(ast.USub(), node.value)))
     elif isinstance(node, ast.Call):
-        name = getattr(node.func, "attr", getattr(node.func, "id", ""))
+        name = name_of(node.func)
         if name in DROPPED and node.args:
             found.append(node.args[0])
         elif name not in SYMMETRIC and len(node.args) > 1 and not any(
                 isinstance(each, (ast.Constant, ast.UnaryOp, ast.List, ast.Tuple, ast.Starred))
-                for each in node.args[:2]):
+                or is_text(each) for each in node.args[:2]):
             found.append(changed(node, args=[*node.args[1::-1], *node.args[2:]]))
     return [new for new in found if ast.unparse(new) != ast.unparse(node)]
 
 
 def places(node):
-    """Nodes of a syntax tree that may be changed, without annotations, decorators and messages."""
-    if isinstance(node, ast.Raise):
+    """Nodes of a syntax tree that may be changed, without annotations, decorators and messages.
+
+    Arguments of FIRST_ONLY but the first are a message or limits.
+    """
+    if is_message(node):
         return
     if changes(node):
         yield node
     for field, value in ast.iter_fields(node):
         if field in ("annotation", "returns", "decorator_list", "format_spec"):
             continue
-        for child in value if isinstance(value, list) else [value]:
+        name = name_of(node.func) if isinstance(node, ast.Call) else getattr(node, "arg", "")
+        children = value if isinstance(value, list) else [value]
+        for child in children[:1] if name in FIRST_ONLY else children:
             threshold = isinstance(node, ast.Module) and isinstance(child, ast.Assign)
-            if isinstance(child, ast.AST) and not threshold:
+            axis = name in AXES and isinstance(child, (ast.UnaryOp, ast.Constant))
+            if isinstance(child, ast.AST) and not threshold and not axis:
                 yield from places(child)
 
 

@@ -1,6 +1,7 @@
 """Numerical derivatives, standard errors, changed drives and trials, shared by the tests."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from scipy.stats import t
@@ -31,6 +32,33 @@ def decided(differences):
 def changed(dataset, sensor, **fields):
     """The Dataset with other `fields` of its readings "aruco" or "uwb"."""
     return replace(dataset, **{sensor: replace(getattr(dataset, sensor), **fields)})
+
+
+aruco, uwb = (partial(changed, sensor=sensor) for sensor in ("aruco", "uwb"))
+
+
+def vehicle(**fields):
+    """A change of a Dataset: other fields of its Vehicle."""
+    return lambda d: replace(d, vehicle=replace(d.vehicle, **fields))
+
+
+def counts(rows, change):
+    """A change of a Dataset: of the counts in some rows."""
+    def of(d):
+        ticks = d.ticks.copy()
+        ticks[rows] = change(ticks[rows])
+        return replace(d, ticks=ticks)
+    return of
+
+
+def carried(d, begin, end):
+    """The Dataset without what is recorded from pose `begin` to `end`, while the vehicle moves."""
+    readings = {}
+    for name in ("aruco", "uwb"):
+        each = getattr(d, name)
+        each = each.select((each.pose < begin) | (each.pose >= end))
+        readings[name] = replace(each, pose=each.pose - (end - begin) * (each.pose >= end))
+    return replace(d, ticks=np.delete(d.ticks, slice(begin, end), axis=0), **readings)
 
 
 def known_noise(dataset, slip):

@@ -3,11 +3,10 @@
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
-import gtsam
 import numpy as np
 import pytest
-from gtsam.symbol_shorthand import C
 from numeric import as_points, central_differences, changed
 
 from slamlib import se2, slam
@@ -17,12 +16,12 @@ from slamlib.dataset import Vehicle, read_dataset, read_truth
 from slamlib.evaluation import align, anees, ate
 from slamlib.localization import fuse, fuse_increments, localize
 from slamlib.simulation import mislabel, simulate
-from slamlib.slam import choices, graph, own
-from slamlib.slam.calibration import ANTENNAS, ENTRIES, RANGE_LAG, SIGHTING_LAG, SIZE
+from slamlib.slam import calibration, choices
+from slamlib.slam.calibration import ANTENNAS, ENTRIES, HEIGHT, RANGE_LAG, SIGHTING_LAG, SIZE
 from slamlib.slam.factors import SMOOTHED_STEPS
 from slamlib.slam.fit import KERNELS, ONE_SIDED
 from slamlib.slam.initialization import odometry_state
-from slamlib.slam.linear import NormalEquations, build_problem, linear_solution, retract
+from slamlib.slam.linear import NormalEquations, build_problem, retract
 from slamlib.slam.measurements import Noise, measure
 from slamlib.studies.montecarlo import antenna_error
 
@@ -88,24 +87,6 @@ def test_derivatives_by_every_entry(vehicle):
         assert (np.abs(J).max(axis=(0, 1)) > 0).sum() == (5, 6 + 4)[kind]
 
 
-def test_the_posterior_is_that_of_gtsam():
-    """Mean and covariance of the whole vector by the dense inverse of GTSAM's Hessian."""
-    equations = equations_of(replace(MOUNTED, **DOUBTFUL), count=150)
-    problem, q = equations.problem, equations.problem.active.sum()
-    ordering, structure = gtsam.Ordering(), equations.structure
-    for key in [*own.variable_keys(problem.measurements), C(0)]:
-        ordering.push_back(key)
-    matrix, vector = graph.linearize(problem, equations.state).hessian(ordering)
-    scale = 1 / np.sqrt(np.diag(matrix))
-    inverse = np.linalg.inv(matrix * scale[:, None] * scale) * scale[:, None] * scale
-    H, border, *_ = equations.sums(problem.noise)
-    solution = linear_solution(structure, H, border)
-    np.testing.assert_allclose(np.linalg.inv(solution.S), inverse[-q:, -q:], rtol=1e-5, atol=1e-9)
-    expected, n = np.zeros(len(solution.delta)), len(structure.diagonal)
-    expected[np.r_[structure.unknowns, n:n + q]] = inverse @ vector
-    np.testing.assert_allclose(solution.delta, expected, atol=1e-6 * np.abs(expected).max())
-
-
 def test_evidence_of_one_entry_by_hand():
     """Likelihood exp(-L u^2 / 2 + h u), prior N(0, s^2): evidence by quadrature."""
     L, h, s = 4.0, 6.0, 0.7
@@ -115,6 +96,49 @@ def test_evidence_of_one_entry_by_hand():
     assert np.isclose(found, np.log(np.trapezoid(density, u)), atol=1e-9)
     assert np.isclose(largest, np.trapezoid(u * density, u) / np.trapezoid(density, u) / s)
     assert choices._log_evidence(np.array([[L]]), np.array([h]), np.zeros(1)) == (0, 0)
+
+
+@pytest.mark.parametrize("height, sigma", [(0.0, 0.5), (2.0, 1e-3), (0.0, 0.0)])
+def test_what_is_stated_is_what_the_table_says(height, sigma):
+    """The vector has half the squared height h^2 / 2, whose sigma is h sigma, or sigma^2 / 2."""
+    vehicle = replace(MOUNTED, antenna_height=height, **DOUBTFUL | {"sigma_antenna_height": sigma})
+    stated = calibration.stated_calibration(vehicle, [5, 7])
+    assert stated.stated[HEIGHT] == height**2 / 2
+    np.testing.assert_allclose(stated.wide[[0, 3, HEIGHT, 15]], [
+        0.05 * vehicle.right_radius, 0.2, np.hypot(height, 1.25) * 2.5, 0.15])
+    rows = calibration.calibration_table(
+        stated, stated.stated, np.diag(stated.sigma**2), {"tag-offset"})
+    assert [row["name"] for row in rows[14:]] == ["offset of antenna 5", "offset of antenna 7"]
+    assert [row["name"] for row in rows if row["released"]] == ["tag_x", "tag_y"]
+    for row in rows[:14]:
+        expected = [getattr(vehicle, name + row["name"]) for name in ("", "sigma_")]
+        for columns in (("stated", "stated_sigma"), ("estimate", "sigma")):
+            np.testing.assert_allclose([row[each] for each in columns], expected, rtol=1e-6)
+    below = stated.stated - 99 * (np.arange(16) == HEIGHT)         # a squared height below zero
+    assert calibration.calibration_table(stated, below, np.eye(16), ())[HEIGHT]["estimate"] == 0
+
+
+@pytest.mark.parametrize("off, sigma, named, width", [
+    (0.5, 0.0, ["tag-offset", "camera-offset"], 1), (0.5, 0.01, ["tag-offset"], 1),
+    (0.3, 0.0, [], 1), (10.0, 0.0, ["tag-offset", "camera-offset"], 10)])
+def test_what_a_drive_cannot_tell_apart_by_hand(monkeypatch, off, sigma, named, width):
+    """L = 100 in camera_x + tag_x, which are `off`: evidence (100 off)^2 / 202 - log(101) / 2.
+
+    The prior odds of the camera, with an entry more, are less by 0.5, and by 3 if it is stated.
+    """
+    stated = calibration.stated_calibration(Vehicle(sigma_camera_x=sigma), [])
+    both = np.isin(np.arange(14), [3, 8])
+    L, h = 100.0 * np.outer(both, both), 100 * off * both
+    monkeypatch.setattr(choices, "_likelihood", lambda fit: (L, h))
+    problem = SimpleNamespace(measurements=SimpleNamespace(calibration=stated), sigma=stated.sigma)
+    found = choices._proposal(SimpleNamespace(problem=problem))
+    assert {*found.explanations} == ({frozenset([each]) for each in named} or {frozenset()})
+    assert found.groups >= {*named}
+    chosen = np.isin(stated.group, [*found.groups])
+    np.testing.assert_allclose(found.sigma[chosen], width * stated.wide[chosen])
+    np.testing.assert_array_equal(found.sigma[~chosen], stated.sigma[~chosen])
+    if off == 0.5 and not sigma:
+        assert found.lead == pytest.approx(2500 / 201 - np.log(201) / 2)
 
 
 @pytest.mark.parametrize("name", ["asymmetric Tukey", "asymmetric Cauchy"])

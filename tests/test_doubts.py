@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from numeric import as_points, changed
+from numeric import as_points, changed, vehicle
 
 from slamlib.checks import files
 from slamlib.checks.files import doubts_before_solving
@@ -36,10 +36,6 @@ def camera(*matrix):
 
 def covariances(factor):
     return lambda dataset: changed(dataset, "aruco", covariance=factor * dataset.aruco.covariance)
-
-
-def vehicle(**parameters):
-    return lambda dataset: replace(dataset, vehicle=Vehicle(**parameters))
 
 
 def another_drive(dataset):

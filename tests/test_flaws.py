@@ -2,14 +2,14 @@
 
 import itertools
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
 import gtsam
 import numpy as np
 import pytest
-from numeric import changed, known_noise
+from numeric import aruco, known_noise, uwb, vehicle
 
 from slamlib import se2, slam, solve
 from slamlib.__main__ import summary_table
@@ -30,20 +30,6 @@ from slamlib.slam.measurements import Noise
 from slamlib.slam.result import turn_sigma
 
 SHORT = Path(__file__).parents[1] / "data" / "short"
-
-
-aruco, uwb = (partial(changed, sensor=sensor) for sensor in ("aruco", "uwb"))
-
-
-def late(dataset, poses):
-    """The dataset with sightings that are late."""
-    moved = dataset.aruco.pose + poses
-    kept = (moved >= 0) & (moved < len(dataset.ticks))
-    return replace(dataset, aruco=replace(dataset.aruco, pose=moved).select(kept))
-
-
-def vehicle(**changes):
-    return lambda d: replace(d, vehicle=replace(d.vehicle, **changes))
 
 
 WRONG_SIZES = {                                # found by the graph, and mended
@@ -105,9 +91,9 @@ def names(*lists):
 
 
 @cache
-def right_ate(seed, path="short"):
+def right_ate(seed):
     """ATE in m of problem 3 after alignment, on the drive whose files are right."""
-    dataset, truth = simulate(path, seed)
+    dataset, truth = simulate("short", seed)
     return ate(slam.estimate(dataset.without("uwb")).poses, truth.poses, aligned=True)
 
 
@@ -160,18 +146,6 @@ def test_wheels_that_are_far_off_are_named_and_mended_although_slip_explains_the
     assert_mended(found, truth, 501, factor=1.3)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("poses, seed", [(-3, 61), (10, 62)])
-def test_sightings_that_are_late_are_named_and_mended(poses, seed):
-    """The offset is right, and the ATE nearly that of the right files."""
-    dataset, truth = simulate("short", seed)
-    found = slam.estimate(late(dataset, poses).without("uwb"))
-    sigma = np.sqrt(found.c_covariance[SIGHTING_LAG, SIGHTING_LAG])
-    assert abs(found.c[SIGHTING_LAG] - poses) < 3 * sigma < 1
-    assert names(solution_doubts(found)) == {"time-offset"}
-    assert_mended(found, truth, seed, factor=1.4)
-
-
 def test_without_sightings_nothing_is_known_of_the_camera():
     dataset = known_noise(simulate("short", 61)[0].first(300).without("aruco"), 1e-3)
     stated = vehicle(camera_x=0.1, sigma_camera_x=0.02, marker_size=1.01, sighting_lag=2.0)
@@ -181,14 +155,6 @@ def test_without_sightings_nothing_is_known_of_the_camera():
         np.testing.assert_allclose(found.c_covariance[SIGHTINGS, SIGHTINGS],
                                    np.diag(found.calibration.sigma[SIGHTINGS]**2), atol=1e-15)
         assert not found.released & set(found.calibration.group[SIGHTINGS])
-
-
-@pytest.mark.slow
-def test_sightings_that_are_late_are_named_on_the_long_path():
-    dataset, truth = simulate("long", 62)
-    found = slam.estimate(late(dataset, 3).without("uwb"))
-    assert found.released == {"time-offset"} and names(solution_doubts(found)) <= found.released
-    assert ate(found.poses, truth.poses, aligned=True) < 2.5 * right_ate(62, "long")  # 6 as stated
 
 
 @pytest.mark.slow

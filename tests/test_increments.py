@@ -61,6 +61,13 @@ def test_noise_is_the_sum_over_steps():
         np.testing.assert_allclose(noise, expected, atol=1e-9 * np.abs(expected).max())
 
 
+def test_noise_keeps_its_digits_far_from_the_origin():
+    """Steps of 157 m: the last one, 300 km away, has the noise of the first."""
+    ticks, vehicle = np.full((2001, 2), 80_000), Vehicle(right_radius=2.5, left_radius=2.5)
+    for part in increments.rounding_and_slipping(ticks, vehicle, [0, 1999], [1, 2000]):
+        np.testing.assert_allclose(part[1], part[0], rtol=1e-9, atol=1e-9 * part[0, 2, 2])
+
+
 def test_noise_in_drive_does_not_depend_on_how_the_drive_is_cut():
     """A straight drive: the rounding of one difference of counts, the skid and the slip."""
     ticks = np.full((2001, 2), 127)

@@ -83,20 +83,6 @@ def test_one_step_by_hand(model, expected):
     np.testing.assert_allclose(poses, [[1, 2, np.pi / 2], expected], atol=1e-15)
 
 
-def test_step_jacobian_against_central_differences():
-    ticks = curvy_ticks()
-    heading = odometry.dead_reckoning(ticks, VEHICLE)[:-1, 2]
-    J = odometry.step_jacobian(ticks, VEHICLE, heading)
-
-    for k in (0, 45, 85, 155, 205, 298):
-        def step(w, counts=ticks[[0, k + 1]]):
-            pose = odometry.dead_reckoning(counts, VEHICLE.with_wheel(w[:3]), (0, 0, w[3]))
-            return pose[1] - pose[0]
-
-        numeric = central_differences(step, [*VEHICLE.wheel, heading[k]])
-        np.testing.assert_allclose(J[k], numeric, atol=1e-9)
-
-
 @BOTH
 @pytest.mark.parametrize("ticks", [curvy_ticks(), *(np.array(
     [[0, 0], [100 + more, 100], [100, 100 + more]]) for more in (0, 1, 3, 40))])

@@ -69,19 +69,3 @@ def test_the_committed_file_has_the_defaults_also_where_its_examples_are_read(tm
     read = read_options(tmp_path / "report.toml")
     assert (read.code, read.problem2, read.title) == ("method", "aruco", Options().title)
     assert read.appendix is False and [*read.leave_out] == ["B", "3.5", "References"]
-
-
-@pytest.mark.slow
-def test_the_file_says_what_pages_and_pdf_show(tmp_path, monkeypatch):
-    make_data(tmp_path)
-    write(tmp_path / "notebooks", "1_text", "# 1. Text\n\n## First",
-          ("print('told' * 2)",), "## Second")
-    write(tmp_path / "notebooks", "A_more", "# A. More")
-    (tmp_path / "report.toml").write_text(
-        'author = "Of the file"\ncode = "none"\nappendix = false\nleave_out = ["second"]\n')
-    monkeypatch.chdir(tmp_path)
-    assert main(["report", "short", "--jobs", "1"]) == 0
-    page = (tmp_path / "report" / "1_text.html").read_text()
-    assert "First</h2>" in page and "Second" not in page and "toldtold" not in page
-    assert not (tmp_path / "report" / "A_more.html").exists()
-    assert b"Of the file" in (tmp_path / "report" / "report.pdf").read_bytes()

@@ -1,6 +1,7 @@
 """An id is one place until it is not: visits, and markers that are several landmarks."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ from slamlib import evaluation, se2, slam
 from slamlib.checks.solution import solution_doubts
 from slamlib.dataset import ArucoReadings
 from slamlib.simulation import simulate
-from slamlib.slam.choices import has_rejected_visits, visits
+from slamlib.slam import choices
+from slamlib.slam.choices import _squared_distance, has_rejected_visits, places_of_ids, visits
 from slamlib.slam.measurements import measure
 from slamlib.slam.pipeline import fit_from_odometry
 
@@ -23,6 +25,49 @@ def test_visits_end_with_a_long_break():
     aruco = ArucoReadings(pose[order], marker[order], None, None)
     expected = np.repeat([0, 0, 1, 2], [5, 4, 3, 3])[order]
     np.testing.assert_array_equal(visits(aruco), expected)
+
+
+@pytest.mark.parametrize("off, P_1, P_2, squared", [
+    ([0.3, 0, 0], 0, 1, 0.3**2 / 0.1**2), ([0, 0.3, 0], 0, 1, 0.3**2 / 0.1**2),
+    ([0, 0.2 * 2, 0.2], 0, 1, 0.2**2 / 0.1**2), ([0, 0.4, 0.2], 1, 5, 0.2**2 / 0.2**2),
+    ([0.1, 0, 0.2], 1, 1, (0.1**2 + 0.2**2) / 0.02**2), ([0.1, 0, 0], 2, 1, 0.1**2 / 0.02**2)])
+def test_the_distance_of_two_visits_by_hand(off, P_1, P_2, squared):
+    """Seen 2 m ahead of a pose of covariance 0.01 P_1, then 0.01 P_2: A's second row is [0, 1, 2].
+
+    Of the growth A A^T x has the variance 1, and a = [0, 2, 1] = A e_3 has a^T (A A^T)^-1 a = 1.
+    """
+    second = np.array([2.0, 0.0, np.pi - 0.1])
+    result = SimpleNamespace(
+        marker=np.array([4, 6]), marker_in_world=np.array([second - off, second]),
+        poses=np.zeros((9, 3)), covariances=np.zeros((9, 3, 3)))
+    result.covariances[[3, 7]] = 0.01 * np.array([P_1, P_2])[:, None, None] * np.eye(3)
+    result.marker_in_world[0, 2] += 2 * np.pi
+    np.testing.assert_allclose(_squared_distance(result, 4, 6, 3, 7), squared)
+
+
+def test_places_of_ids_by_hand(monkeypatch):
+    """Four visits of id 12, of which the second is 0.3 m off, and the fourth nearly as far.
+
+    The variance grows by 0 from the end of each to the beginning of each other one, but along and
+    from other poses of theirs. Two accepted sightings are too few to compare: those of id 12 last.
+    """
+    begins, variance = np.array([50, 0, 1000, 2000, 3000, 4000]), np.zeros(4100)
+    pose = (begins[:, None] + [0, 10, 20]).ravel()
+    variance[pose] = np.r_[9, 0, 0, 5, 0, 1, 1, 5, 1, 1, 3, 1, 1, 9, 1, 1, 9, 0]
+    place = np.zeros((6, 3))
+    place[[2, 4, 5], 0] = 0.3, 0.31, 9.0
+    visit, order = np.repeat(np.arange(6), 3), np.argsort(pose)
+    aruco = ArucoReadings(pose[order], np.where(visit == 0, 7, 12)[order], None, None)
+    result = SimpleNamespace(
+        rejected=np.arange(18) == 17, marker=np.arange(6), marker_in_world=place,
+        poses=np.zeros((4100, 3)), covariances=variance[:, None, None] * np.eye(3),
+        sightings=SimpleNamespace(marker=visit, row=np.arange(18), frame=pose))
+    monkeypatch.setattr(choices, "slam_result", lambda solved: result)
+    marker, ids = places_of_ids(aruco, lambda places: places).T
+    np.testing.assert_array_equal(marker, aruco.marker)
+    np.testing.assert_array_equal(ids, np.repeat([7, 12, 112, 12, 112, 12], 3)[order])
+    place[:] = 0
+    assert places_of_ids(aruco, lambda places: places) is None
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from slamlib.evaluation import align, ate, nees_band
 from slamlib.odometry import dead_reckoning
 from slamlib.se2 import compose
 from slamlib.simulation import manoeuvre, simulate
-from slamlib.slam import factors, graph, result
+from slamlib.slam import factors, graph, initialization, result
 from slamlib.slam.calibration import OFFSET, RANGES, SCALE, SIGHTINGS, stated_calibration
 from slamlib.slam.fit import KERNELS, ONE_SIDED
 from slamlib.slam.graph import optimize
@@ -242,6 +242,23 @@ def test_a_standing_vehicle_learns_only_the_distances_of_its_antennas():
     found = slam.estimate(dataset)
     assert np.abs(found.poses).max() < 0.01 and set(found.doubts) == {0, 1, 2, 3}
     np.testing.assert_allclose(np.hypot(*found.antenna_in_world.T), np.hypot(*place.T), atol=0.05)
+
+
+def test_ranges_in_the_plane_by_hand():
+    """Slant ranges of 2.5 m, 1.02 times and 0.1 m too long, to antennas 2 m higher: 1.5 m.
+
+    An error in the slant range is 2.5 / 1.5 times as large in the plane; poses add theirs.
+    """
+    dataset, _ = drive([(4.0, 2.0)], np.array([2.0, 5.0]), (2.5, 4.0))
+    m = measure(replace(dataset, uwb=replace(
+        dataset.uwb, range=np.full(len(dataset.uwb.pose), 1.02 * 2.5 + 0.1)), vehicle=replace(
+            dataset.vehicle, antenna_height=2.0, range_offset=0.1, range_scale=1.02)))
+    poses, C = np.zeros((len(m.frame), 3)), np.diag([0.09, 0.03, 0.5])
+    found, = initialization.ranges_by_antenna(
+        m, poses, np.tile(C, (len(poses), 1, 1)), m.calibration.stated, 3.0)
+    np.testing.assert_allclose(found.distance, 1.5)
+    np.testing.assert_allclose(found.sigma, np.hypot(3 * 0.05 / 1.02 * 2.5 / 1.5, np.sqrt(0.06)))
+    np.testing.assert_array_equal(found.guess, [2.5, 4.0])
 
 
 def test_places_within_three_hundredths_of_the_distance_are_one():

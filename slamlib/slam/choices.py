@@ -299,7 +299,6 @@ def _squared_distance(result, first, second, pose, later):
     poses, P = result.poses[[pose, later]], result.covariances[[pose, later]]
     A, _ = se2.compose_jacobians(poses, se2.between(poses, second))
     start, end = A @ P @ A.mT
-    growth = end - start
-    values, axes = np.linalg.eigh((growth + growth.T) / 2)
+    values, axes = np.linalg.eigh(end - start)
     off = axes.T @ se2.difference(second, first)
     return float(np.sum(off**2 / np.maximum(values, MIN_SIGMA**2)))

@@ -106,8 +106,8 @@ class LinearizedFactors:
     J: np.ndarray            # (m, d, 6) whitened derivatives by the unknowns of both variables
     J_c: np.ndarray          # (m, d, u) whitened, by u active entries of c, per sigma
     columns: np.ndarray      # (u,) their numbers among the q active entries
-    weight: np.ndarray       # (m,) share of its information that each keeps
-    error: float             # half the sum of squared errors, or the loss of the kernel
+    weight: np.ndarray | None = None     # (m,) share of its information that each keeps, or all
+    error: float | None = None           # loss of the kernel, of measurements
 
 
 def linearize_odometry(problem, state, slip):
@@ -118,8 +118,8 @@ def linearize_odometry(problem, state, slip):
     log_determinant = -2 * float(np.sum(np.log(np.diagonal(U, axis1=1, axis2=2))))
     e, J_c = (U @ e[..., None])[..., 0], J_c[:, :, active] * problem.sigma[WHEELS][active]
     return LinearizedFactors(
-        index=np.arange(len(e)), e=e, J=U @ J, J_c=U @ J_c, columns=np.arange(active.sum()),
-        weight=np.ones(len(e)), error=float(np.sum(e**2)) / 2), log_determinant
+        index=np.arange(len(e)), e=e, J=U @ J, J_c=U @ J_c,
+        columns=np.arange(active.sum())), log_determinant
 
 
 def linearize_measurements(problem, state):
