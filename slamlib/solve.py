@@ -6,9 +6,13 @@ files, with a summary of plain numbers.
 """
 
 import json
+import signal
+import sys
 import time
 from collections import namedtuple
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
+from multiprocessing import Pipe, get_context
 
 import numpy as np
 
@@ -18,6 +22,7 @@ from slamlib.checks.solution import solution_doubts
 from slamlib.dataset import DatasetError, Doubt, all_notes
 
 UNSOLVABLE = (DatasetError, np.linalg.LinAlgError)  # what `find` raises where there is no solution
+
 
 # Every problem in the order of solution, by the name of its results folder: its title, the sensors
 # that it needs (attributes of Dataset), and its role in figures (`notebook.plotting.ROLES`).
@@ -30,6 +35,8 @@ PROBLEMS = {
     "problem3": Task("SLAM: odometry + ArUco", ("aruco",), "slam"),
     "problem4": Task("SLAM: odometry + ArUco + UWB", ("uwb",), "slam_uwb"),
 }
+# Problems that the second process solves: no other problem needs their results.
+INDEPENDENT = ("problem1", "problem2", "problem2_hint", "problem2_fused")
 SENSORS = {"aruco": "markers", "uwb": "UWB ranges"}
 RESULT_NAMES = frozenset([  # relative paths of all files that a drive's results may have
     results.SUMMARY, *(f"{problem}/{file}" for problem in PROBLEMS
@@ -192,7 +199,8 @@ def truth_in_world(solution, truth):
 def solve_to_folder(dataset, truth, out, problems=tuple(PROBLEMS), csv=False):
     """Solve problems of a Dataset and write their files to the folder `out`.
 
-    When all files are written they replace those of an earlier run, by `swap.publish`.
+    When all files are written they replace those of an earlier run, by `swap.publish`. On Linux,
+    where a fork is safe, a second process solves problems 1 and 2.
 
     Parameters
     ----------
@@ -208,8 +216,9 @@ def solve_to_folder(dataset, truth, out, problems=tuple(PROBLEMS), csv=False):
     read.
     """
     with swap.staging(out) as stage:
-        doubts, rows = doubts_before_solving(dataset, truth), {}
-        for solution in solutions(dataset, problems):
+        doubts, solved = _in_two_processes(dataset, truth, problems)
+        rows = {}
+        for solution in solved:
             if isinstance(solution, Failure):
                 row = {"failed": solution.reason}
             else:
@@ -226,6 +235,40 @@ def solve_to_folder(dataset, truth, out, problems=tuple(PROBLEMS), csv=False):
             results.write_tum(stage / "truth.tum", truth.poses)
         swap.publish({out: stage}, ours=RESULT_NAMES)
     return summary
+
+
+def _in_two_processes(*arguments):
+    """What `_solved` returns of all problems, in order; the second process solves INDEPENDENT."""
+    receiver, sender = Pipe(duplex=False)
+    if forks := sys.platform == "linux":
+        child = get_context("fork").Process(target=_send, args=(sender, *arguments))
+        child.start()
+    sender.close()
+    try:
+        _, late = _solved(False, *arguments)
+        doubts, early = receiver.recv()
+    except (EOFError, OSError):            # no child, or it was killed, or failed: here it is told
+        doubts, early = _solved(True, *arguments)
+    finally:
+        receiver.close()
+        if forks:
+            child.kill()
+            child.join()
+    return doubts, early + late
+
+
+def _send(sender, *arguments):
+    """Send what `_solved` returns from a process that Ctrl-C does not end."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with sender, suppress(BaseException):
+        sender.send(_solved(True, *arguments))
+
+
+def _solved(independent, dataset, truth, problems):
+    """Doubts before solving and `solutions` of problems INDEPENDENT, or none and of the others."""
+    problems = [problem for problem in problems if (problem in INDEPENDENT) == independent]
+    return (doubts_before_solving(dataset, truth) if independent else [],
+            [*solutions(dataset, problems)])
 
 
 def summarize(solution, truth):

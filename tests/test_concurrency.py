@@ -14,7 +14,7 @@ import pytest
 from conftest import is_running
 from test_report import build, make_data, write
 
-from slamlib import results, swap
+from slamlib import results, solve, swap
 from slamlib.__main__ import END_SIGNALS, main
 from slamlib.report import NotebookError
 from slamlib.simulation import simulate, write_dataset
@@ -28,6 +28,9 @@ from slamlib.results import write_structs
 poses = None, np.zeros((2, 3)), np.zeros((2, 3, 3))
 write_structs(Path(os.environ["SLAMLIB_RESULTS"], "short", "problem1"), "vehiclePose", *poses)
 """
+
+
+PROCESSES = 1 + (sys.platform == "linux")        # of solve
 
 
 def start(folder, *arguments, code=None, **options):
@@ -223,17 +226,18 @@ time.sleep(1000)""",))
 
 @pytest.mark.parametrize("number", END_SIGNALS)
 def test_a_signal_ends_a_solve_in_order(tmp_path, drive, number):
+    """Both of its processes, while each solves a problem."""
     write_dataset(tmp_path / "drive", drive)
-    process = start(tmp_path, "solve", "drive", "--out", "out", code="""import sys, time
+    process = start(tmp_path, "solve", "drive", "--out", "out", code="""import os, sys, time
 from pathlib import Path
 from slamlib import solve
 from slamlib.__main__ import main
 def find(*_):
-    Path("begun").touch()
+    Path(f"of {os.getpid()}").touch()
     time.sleep(1000)
 solve.find = find
 sys.exit(main())""")
-    wait_for((tmp_path / "begun").is_file, process)
+    found = wait_for(lambda: len(of := [*tmp_path.glob("of *")]) == PROCESSES and of, process)
     process.send_signal(number)
     out, told = process.communicate(timeout=300)
     *lines, last = told.splitlines()
@@ -241,3 +245,22 @@ sys.exit(main())""")
     assert all(line.startswith("drive: ") for line in lines)
     assert process.returncode == 130 and not (tmp_path / "out").exists()
     assert hidden(tmp_path) == []
+    assert not any(is_running(int(file.name.split()[1])) for file in found)
+
+
+@pytest.mark.skipif(PROCESSES < 2, reason="elsewhere one process solves all problems")
+@pytest.mark.parametrize("fails", [
+    lambda *_: 1 / 0, lambda *_: os.kill(os.getpid(), signal.SIGKILL)])
+def test_a_process_takes_over_the_problems_of_one_that_fails(
+        tmp_path, drive, monkeypatch, capfd, fails):
+    expected = solve_to_folder(drive, None, tmp_path / "expected")
+    parent, find = os.getpid(), solve.find
+    monkeypatch.setattr(solve, "find", lambda *arguments: (
+        find if os.getpid() == parent else fails)(*arguments))
+    found = solve_to_folder(drive, None, tmp_path / "found")
+    for summary in (expected, found):
+        assert all(row.pop("seconds") >= 0 for row in summary["problems"].values())
+    assert found == expected and capfd.readouterr() == ("", "")
+    for name in swap.file_names(tmp_path / "expected"):
+        assert name.endswith(".json") or (tmp_path / "found" / name).read_bytes() \
+            == (tmp_path / "expected" / name).read_bytes()

@@ -68,7 +68,8 @@ def pairs(count=PAIRS):
         print(f"{load:6.2f}{ours:12.2f}{theirs:12.2f}{ours / theirs:8.2f}{whole:20.2f}"
               f"{ours / whole:8.2f}", flush=True)
     print(f"median ratio {np.median(ratios):.2f}; of the last run: " + ", ".join(
-        f"{name} {seconds:.2f} s" for name, seconds in parts.items()))
+        f"{name} {seconds:.2f} s" for name, seconds in parts.items())
+        + " (problems 1 and 2 in a second process, where there is a second core)")
 
 
 def growth(folder, large):
