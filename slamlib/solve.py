@@ -23,7 +23,6 @@ from slamlib.dataset import DatasetError, Doubt, all_notes
 
 UNSOLVABLE = (DatasetError, np.linalg.LinAlgError)  # what `find` raises where there is no solution
 
-
 # Every problem in the order of solution, by the name of its results folder: its title, the sensors
 # that it needs (attributes of Dataset), and its role in figures (`notebook.plotting.ROLES`).
 Task = namedtuple("Task", "title sensors role")
@@ -240,20 +239,14 @@ def solve_to_folder(dataset, truth, out, problems=tuple(PROBLEMS), csv=False):
 def _in_two_processes(*arguments):
     """What `_solved` returns of all problems, in order; the second process solves INDEPENDENT."""
     receiver, sender = Pipe(duplex=False)
-    if forks := sys.platform == "linux":
-        child = get_context("fork").Process(target=_send, args=(sender, *arguments))
-        child.start()
+    if sys.platform == "linux":
+        get_context("fork").Process(target=_send, args=(sender, *arguments), daemon=True).start()
     sender.close()
+    _, late = _solved(False, *arguments)
     try:
-        _, late = _solved(False, *arguments)
         doubts, early = receiver.recv()
     except (EOFError, OSError):            # no child, or it was killed, or failed: here it is told
         doubts, early = _solved(True, *arguments)
-    finally:
-        receiver.close()
-        if forks:
-            child.kill()
-            child.join()
     return doubts, early + late
 
 

@@ -16,7 +16,7 @@ MODULES = sorted(".".join(path.relative_to(ROOT).with_suffix("").parts).removesu
                  for path in (ROOT / "slamlib").rglob("*.py") if path.stem != "__main__")
 WITH_EXAMPLES = {f"slamlib.{name}" for name in (
     "se2", "odometry", "evaluation", "dataset", "results", "simulation", "slam.pipeline",
-    "localization.markers", "localization.fused")} | {"slamlib"}
+    "localization.markers", "localization.fused")}
 
 
 @pytest.mark.parametrize("module", MODULES)

@@ -13,6 +13,7 @@ from test_report import make_data
 
 from slamlib.__main__ import main
 from slamlib.dataset import read_dataset
+from slamlib.report import execution
 from slamlib.report.execution import kernel_environment
 from slamlib.simulation import write_dataset
 
@@ -60,7 +61,7 @@ def _started(server, folder):
 
 
 def test_jupyterlab_replaces_the_command_and_kernels_have_the_environment_of_the_build(
-        tmp_path, monkeypatch):
+        tmp_path, monkeypatch, capsys):
     """But for SLAMLIB_RESULTS, by which a cell knows that it is in a build."""
     made = []
     make_data(tmp_path)
@@ -81,6 +82,8 @@ def test_jupyterlab_replaces_the_command_and_kernels_have_the_environment_of_the
                                              kept / "studies")
     assert environment["OMP_NUM_THREADS"] == environment["OPENBLAS_NUM_THREADS"] == "1"
     assert "SLAMLIB_RESULTS" not in environment
+    monkeypatch.setattr(execution, "find_spec", lambda _: None)
+    assert main(["lab"]) == 2 and "expected JupyterLab, as by pip install" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -27,7 +27,6 @@ from slamlib.textfile import require
 
 DATASET_NAME = re.compile("[A-Za-z0-9 ._-]+")  # nothing that Markdown, HTML or Typst interprets
 
-
 # Files (list of Path, `index.html` first) and drives (list of overview.SolvedDrive) of a report.
 Report = namedtuple("Report", ("files", "drives"))
 

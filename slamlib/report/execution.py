@@ -11,6 +11,7 @@ import shutil
 import socket
 import sys
 import time
+from importlib.util import find_spec
 from pathlib import Path
 
 from jupyter_client import AsyncKernelManager
@@ -23,6 +24,7 @@ from tqdm import tqdm
 
 from slamlib import swap
 from slamlib.studies.memory import ONE_THREAD
+from slamlib.textfile import require
 
 CELL_TIMEOUT = 1800  # s, in which a cell must end
 TRANSPORT = "ipc" if hasattr(socket, "AF_UNIX") else "tcp"  # Windows has no Unix sockets
@@ -142,6 +144,7 @@ def _failure(source, started, error):
 
 def start_lab(notebooks, data, kept, arguments):
     """Replace this process by JupyterLab with its `arguments`; folders as of `build_report`."""
+    require(find_spec("jupyterlab"), "lab", "JupyterLab, as by pip install jupyterlab", "none")
     settings = kept.resolve() / SETTINGS
     settings.mkdir(parents=True, exist_ok=True)
     (settings / "overrides.json").write_text(json.dumps(OVERRIDES))
