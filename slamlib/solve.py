@@ -34,8 +34,7 @@ PROBLEMS = {
     "problem3": Task("SLAM: odometry + ArUco", ("aruco",), "slam"),
     "problem4": Task("SLAM: odometry + ArUco + UWB", ("uwb",), "slam_uwb"),
 }
-# Problems that the second process solves: no other problem needs their results.
-INDEPENDENT = ("problem1", "problem2", "problem2_hint", "problem2_fused")
+INDEPENDENT = ("problem1", "problem2", "problem2_hint", "problem2_fused")  # no other needs them
 SENSORS = {"aruco": "markers", "uwb": "UWB ranges"}
 RESULT_NAMES = frozenset([  # relative paths of all files that a drive's results may have
     results.SUMMARY, *(f"{problem}/{file}" for problem in PROBLEMS
@@ -43,11 +42,8 @@ RESULT_NAMES = frozenset([  # relative paths of all files that a drive's results
 
 
 def title(problem, dataset):
-    """Title of a problem for a Dataset; one that is not in PROBLEMS has the name of its folder.
-
-    The title of problem 4 tells whether markers take part.
-    """
-    name = PROBLEMS[problem].title if problem in PROBLEMS else problem
+    """Title of a problem for a Dataset; that of problem 4 tells whether markers take part."""
+    name = PROBLEMS[problem].title
     return name if dataset.aruco is not None else name.replace(" + ArUco + UWB", " + UWB")
 
 
@@ -129,7 +125,8 @@ def problem_solution(problem, dataset, found=None):
     elif problem == "problem2_fused":
         fields["facts"] = _noise_facts(found)
     elif problem in ("problem3", "problem4"):
-        fields |= {"facts": _slam_facts(dataset, found), "doubts": solution_doubts(found)}
+        fields |= {"facts": _slam_facts(dataset, found),
+                   "doubts": (*_option_doubts(problem, dataset, found), *solution_doubts(found))}
         if dataset.aruco is not None:
             fields["aruco_map"] = found.marker, found.marker_in_world, found.marker_covariance
         if problem == "problem4":
@@ -148,6 +145,16 @@ def _localization_fields(dataset, found):
             "aruco_map": (found.marker, found.marker_in_world, found.marker_covariance),
             "facts": {"sightings": len(dataset.aruco.pose), "outliers": int(found.rejected.sum()),
                       "unused_sightings": int(found.unused.sum())}}
+
+
+def _option_doubts(problem, dataset, found):
+    """A Doubt if a SlamResult has options that the Vehicle of its Dataset does not state."""
+    used = vars(found.fit.problem.measurements.dataset.vehicle)
+    said = [f"{key} = {value}" for key, value in used.items()
+            if value != getattr(dataset.vehicle, key)]
+    if said:
+        yield Doubt("options", f"The files of {problem} are solved with {', '.join(said)}, unlike "
+                    "other chapters and `slamlib solve`: state it in vehicle.toml, which all heed.")
 
 
 def _noise_facts(found):

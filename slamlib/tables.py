@@ -147,6 +147,7 @@ def read_table(source, name, pose_count=None):
     table = table.kept(measured & ~np.isnan(table.numbers), [
         f"{column}, a number{' (0 is no reception)' * (column == 'range')}" for column in limits],
         share=bool(pose_count))
+    table.kept((table.numbers[:, 0] != 0) | (not pose_count), "pose ids from 1 on")
     share = MAX_BAD_SHARE * bool(pose_count)
     ok = [limit.holds(x) for limit, x in zip(limits.values(), table.numbers.T)]
     table = table.kept(np.stack(ok, axis=-1), [

@@ -102,11 +102,11 @@ BAD_ROWS = {  # rows that cannot be, by what is said of them
     "ArucoReading.txt": {
         "a positive definite covariance": [f"1 40 0 0 0 {covariance}" for covariance in (
             "1 1 0 1 0 1", "1e-4 2e-4 0 1e-4 0 1e4", "1 .9 -.9 1 .9 1", "1 9e14 0 1 0 1e-18")],
-        POSE: ["301 40 0 0 0 1 0 0 1 0 1", "0 40 0 0 0 1 0 0 1 0 1"],
+        POSE: ["301 40 0 0 0 1 0 0 1 0 1"],
         "y, a finite number from -10000 to 10000 m, found 'inf'": ["1 40 0 inf 0 1 0 0 1 0 1"],
         f"marker id, {ID}": ["1 4.5 0 0 0 1 0 0 1 0 1"]},
     "UwbReading.txt": {
-        "a range that is not below -5 sigma": ["1 5 -5.1 1"], POSE: ["0 5 1 1"],
+        "a range that is not below -5 sigma": ["1 5 -5.1 1"], POSE: ["301 5 1 1"],
         "sigma, a finite number from 1e-09 to 10000 m, found '0'": ["1 5 1 0"],
         f"antenna id, {ID}": ["1 3.5 1 1"]}}
 

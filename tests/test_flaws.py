@@ -177,10 +177,7 @@ def test_offsets_of_the_camera_have_the_standard_deviations_that_they_state():
 @pytest.mark.slow
 @pytest.mark.parametrize("case", LEGAL)
 def test_every_problem_is_solved_within_the_limits(case):
-    """Finite covariances that are not negative, and of SLAM errors as those that they state.
-
-    Or, where the errors are not as stated, many sightings are rejected, and that is said.
-    """
+    """Finite covariances, not negative; SLAM's errors as they state, or its rejections are told."""
     dataset, truth = read_dataset(SHORT), read_truth(SHORT)
     dataset = LEGAL[case](dataset.first(300))
     doubts_before_solving(dataset, truth)                  # without a warning

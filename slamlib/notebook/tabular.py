@@ -116,7 +116,8 @@ def learned_row(result, drive):
     The truth of a simulated Drive says how many wrong labels are rejected. A kernel for ranges
     alone is absent, because sightings then count in full within the gate.
     """
-    vehicle, (factor, sigma) = drive.dataset.vehicle, (result.noise.sightings, result.noise_sigma)
+    vehicle = result.fit.problem.measurements.dataset.vehicle
+    factor, sigma = result.noise.sightings, result.noise_sigma
     row = {"dataset": drive.name, "gate": vehicle.gate,
            "kernel": None if vehicle.kernel in ONE_SIDED else vehicle.kernel,
            "slip (mm)": f"{1e3 * result.slip:.2f} ± {1e3 * result.slip * sigma[0]:.2f}",

@@ -44,8 +44,7 @@ MAX_WIDE_SIGMAS = 4.0        # wide sigmas, of an entry; beyond them a statement
 GROSS = 10.0                 # factor on the wide sigmas then
 MIN_INFORMATION = 1e-3       # about an entry, in wide sigmas, below which it is not considered
 MAX_PROPOSALS = 5            # number of sets that are solved
-MAX_STRETCHED = 3            # number of jumps that are found at the solution
-MIN_JUMP_LEAD = 10.0         # log evidence by which one of them is believed
+MIN_JUMP_LEAD = 10.0         # log evidence by which a jump found at the solution is believed
 
 VISIT_GAP = 30               # typical intervals between sightings of a marker, that end a visit
 MIN_VISIT = 3                # number of accepted sightings of a visit that is compared
@@ -198,11 +197,9 @@ def most_consistent(dataset, solve):
         places = places_of_ids(dataset.aruco, solve)
         if places is not None and spares_sightings(other := solve(places=places), fit):
             return other, places
-    for _ in range(MAX_STRETCHED):
-        jumps = with_stretched(fit)
-        if not jumps or (other := solve(jumps)).log_density < fit.log_density + MIN_JUMP_LEAD:
-            break
-        fit = other
+    jumps = with_stretched(fit)
+    if jumps and (other := solve(jumps)).log_density > fit.log_density + MIN_JUMP_LEAD:
+        return other, None
     return fit, None
 
 

@@ -7,14 +7,7 @@ import numpy as np
 
 from slamlib.evaluation import anees, ate
 from slamlib.increments import TYPICAL_SLIP
-from slamlib.slam.fit import (
-    KERNELS,
-    ONE_SIDED,
-    accepted_measurements,
-    narrow_kernels,
-    refine,
-    residuals,
-)
+from slamlib.slam import fit as stages
 from slamlib.slam.initialization import odometry_state, trilaterated_antennas
 from slamlib.slam.linear import build_problem, state_from_arrays
 from slamlib.slam.measurements import measure
@@ -22,7 +15,8 @@ from slamlib.slam.result import slam_result
 from slamlib.studies.montecarlo import antenna_error, drive
 
 # Kernel and gate of every method.
-METHODS = {name: (name, name in ONE_SIDED) for name in KERNELS} | {"gate": ("quadratic", True)}
+METHODS = {name: (name, name in stages.ONE_SIDED) for name in stages.KERNELS} | {
+    "gate": ("quadratic", True)}
 MIN_MISLABELLED_SQUARED = 50.0   # Mahalanobis; a right label reaches it once in 10^10 sightings
 
 
@@ -32,7 +26,7 @@ def rounds(measurements, antennas=trilaterated_antennas):
     `antennas` as of `initialization.state_from_poses`.
     """
     state = odometry_state(measurements, "arc", antennas=antennas)
-    return narrow_kernels(build_problem(measurements, "arc"), state)
+    return stages.narrow_kernels(build_problem(measurements, "arc"), state)
 
 
 def solve_with(measurements, start, sightings="gate", ranges="asymmetric Tukey"):
@@ -40,8 +34,8 @@ def solve_with(measurements, start, sightings="gate", ranges="asymmetric Tukey")
 
     The noise of the measurements is known.
     """
-    return refine(build_problem(measurements, "arc"), start, partial(
-        accepted_measurements, sightings=METHODS[sightings], ranges=METHODS[ranges]))
+    return stages.refine(build_problem(measurements, "arc"), start, partial(
+        stages.accepted_measurements, sightings=METHODS[sightings], ranges=METHODS[ranges]))
 
 
 def compare(seed, kind, methods, markers=True, **options):
@@ -71,7 +65,7 @@ def compare(seed, kind, methods, markers=True, **options):
             numbers |= {f"{method} antenna error": np.sqrt(np.mean(error**2)),
                         f"{method} antenna nees": np.mean(squared)}
         else:
-            size = np.linalg.norm(residuals(fit.problem, fit.state)[0], axis=1)
+            size = np.linalg.norm(stages.residuals(fit.problem, fit.state)[0], axis=1)
             lost = fit.problem.accepted.sightings.kept(size) < 0.5
             numbers |= {f"{method} wrong rejected": lost[wrong].mean() if wrong.any() else np.nan,
                         f"{method} good lost": lost[~wrong].mean()}
@@ -88,4 +82,5 @@ def mislabelled(measurements, truth):
     true_map[known] = truth.marker_in_world[np.searchsorted(truth.marker, m.marker[known])]
     state = state_from_arrays(m, truth.poses[m.frame], true_map,
                               np.zeros((len(m.antenna), 2)), m.calibration.stated)
-    return np.sum(residuals(build_problem(m, "arc"), state)[0]**2, axis=1) > MIN_MISLABELLED_SQUARED
+    residual, _ = stages.residuals(build_problem(m, "arc"), state)
+    return np.sum(residual**2, axis=1) > MIN_MISLABELLED_SQUARED
