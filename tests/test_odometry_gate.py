@@ -174,7 +174,9 @@ def test_a_fault_of_odometry_is_told_and_costs_little(name, clean):
 @pytest.mark.slow
 def test_a_push_that_no_marker_saw_is_found_at_the_solution():
     """In 200 poses without markers, which a second round bridges; else slip seems tenfold."""
-    dataset, truth = carried(1103, 1109)(*simulate("short", seed=2, rounds=2, slip=3e-4))
+    dataset, truth = simulate("short", seed=2, rounds=2, slip=3e-4)
+    truth = replace(truth, poses=np.delete(truth.poses, slice(1103, 1109), axis=0))
+    dataset = carried(dataset, 1103, 1109)
     pose = dataset.aruco.pose
     found = slam.estimate(replace(dataset, uwb=None, aruco=dataset.aruco.select(
         (pose < 1040) | (pose > 1240))))
