@@ -21,6 +21,7 @@ def test_nees_by_hand_and_across_the_cut_of_the_heading():
     before = poses.copy()
     np.testing.assert_allclose(evaluation.nees(poses, C, truth), [3, 3, 1, np.nan], rtol=1e-9)
     np.testing.assert_array_equal(poses, before)
+    np.testing.assert_allclose(evaluation.position_sigmas(C), [2, 2, 0.01, 0])
 
 
 def as_evo(poses):

@@ -10,9 +10,10 @@ from slamlib.checks.solution import solution_doubts
 from slamlib.evaluation import nees_band
 from slamlib.memory import error_memory
 from slamlib.simulation import simulate
+from slamlib.slam.fit import _with_shares
 from slamlib.slam.graph import gtsam_step
 from slamlib.slam.linear import NormalEquations
-from slamlib.slam.measurements import measure
+from slamlib.slam.measurements import Noise, measure
 from slamlib.slam.pipeline import fit_from_odometry
 from slamlib.studies.montecarlo import correlated_errors
 
@@ -79,6 +80,10 @@ def test_the_same_step_by_gtsam(remembering):
     rng, accepted = np.random.default_rng(0), fit.problem.accepted
     problem = replace(fit.problem, accepted=accepted.with_shares(
         rng.uniform(0.1, 1, len(each.share)) for each in accepted))
+    low, shares = replace(problem, noise=Noise(1e-3, 0.3, 0.3)), [
+        np.full(len(each.share), share) for each, share in zip(accepted, (0.5, 1.0))]
+    found, _ = _with_shares(low, fit.state, None, shares, lambda problem, _: problem.accepted)
+    assert found.noise == (1e-3, 0.6, 0.3)               # twice as large for errors with memory
     state = replace(fit.state, antennas=fit.state.antennas + 0.01)
     np.testing.assert_allclose(
         NormalEquations(problem, state).step(), gtsam_step(problem, state), atol=1e-7)

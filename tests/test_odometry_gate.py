@@ -91,7 +91,7 @@ def test_shares_of_a_jump_by_hand():
     np.testing.assert_allclose(covariance, np.diag([0.04, 0.04, 0.01])[None])
     spike = replace(jumps, chance=np.cumsum([1, 1, 1, 1, 1e6, 1, 1, 1, 1]))
     np.testing.assert_allclose(spike.share(start, end)[:, 0], [0, 0, 1, 1, 0], atol=1e-5)
-    assert not NO_JUMPS.added(start, end)[1].any()
+    assert not NO_JUMPS.added(start, end)[1].any() and not NO_JUMPS.are_few
 
 
 def test_suspects_by_hand():
@@ -174,7 +174,9 @@ def test_a_fault_of_odometry_is_told_and_costs_little(name, clean):
 @pytest.mark.slow
 def test_a_push_that_no_marker_saw_is_found_at_the_solution():
     """In 200 poses without markers, which a second round bridges; else slip seems tenfold."""
-    dataset, truth = carried(1103, 1109)(*simulate("short", seed=2, rounds=2, slip=3e-4))
+    dataset, truth = simulate("short", seed=2, rounds=2, slip=3e-4)
+    truth = replace(truth, poses=np.delete(truth.poses, slice(1103, 1109), axis=0))
+    dataset = carried(dataset, 1103, 1109)
     pose = dataset.aruco.pose
     found = slam.estimate(replace(dataset, uwb=None, aruco=dataset.aruco.select(
         (pose < 1040) | (pose > 1240))))

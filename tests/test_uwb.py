@@ -99,6 +99,9 @@ def test_derivatives_against_central_differences(error, kind, size, ideal):
     by_c = error(z, pose, place, c, motion)[3]                # a delay moves nothing that stands
     numeric = central_differences(lambda c: error(z, pose, place, c, motion)[0], c)[..., kind]
     np.testing.assert_allclose(by_c, numeric, atol=1e-7)
+    if ideal and size == 2:
+        *_, near, _ = of_ranges(STILL, STILL, STILL + [1e-6, 0, 0], c, STILL)
+        np.testing.assert_allclose(near[:, 0], STILL[:, :2] + [1, 0])      # however near it is
 
 
 def test_antenna_from_known_poses_by_hand():
