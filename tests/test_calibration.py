@@ -5,8 +5,10 @@ from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
+import gtsam
 import numpy as np
 import pytest
+from gtsam.symbol_shorthand import C
 from numeric import as_points, central_differences, changed
 
 from slamlib import se2, slam
@@ -16,12 +18,12 @@ from slamlib.dataset import Vehicle, read_dataset, read_truth
 from slamlib.evaluation import align, anees, ate
 from slamlib.localization import fuse, fuse_increments, localize
 from slamlib.simulation import mislabel, simulate
-from slamlib.slam import calibration, choices
+from slamlib.slam import calibration, choices, graph, own
 from slamlib.slam.calibration import ANTENNAS, ENTRIES, HEIGHT, RANGE_LAG, SIGHTING_LAG, SIZE
 from slamlib.slam.factors import SMOOTHED_STEPS
 from slamlib.slam.fit import KERNELS, ONE_SIDED
 from slamlib.slam.initialization import odometry_state
-from slamlib.slam.linear import NormalEquations, build_problem, retract
+from slamlib.slam.linear import NormalEquations, build_problem, linear_solution, retract
 from slamlib.slam.measurements import Noise, measure
 from slamlib.studies.montecarlo import antenna_error
 
@@ -85,6 +87,24 @@ def test_derivatives_by_every_entry(vehicle):
         scale = np.abs(numeric).max(axis=(0, 1)) + 1e-9
         assert (np.abs(J - numeric) < np.where(delays, 0.1, 1e-6) * scale).all()
         assert (np.abs(J).max(axis=(0, 1)) > 0).sum() == (5, 6 + 4)[kind]
+
+
+def test_the_posterior_is_that_of_gtsam():
+    """Mean and covariance of the whole vector by the dense inverse of GTSAM's Hessian."""
+    equations = equations_of(replace(MOUNTED, **DOUBTFUL), count=150)
+    problem, q = equations.problem, equations.problem.active.sum()
+    ordering, structure = gtsam.Ordering(), equations.structure
+    for key in [*own.variable_keys(problem.measurements), C(0)]:
+        ordering.push_back(key)
+    matrix, vector = graph.linearize(problem, equations.state).hessian(ordering)
+    scale = 1 / np.sqrt(np.diag(matrix))
+    inverse = np.linalg.inv(matrix * scale[:, None] * scale) * scale[:, None] * scale
+    H, border, *_ = equations.sums(problem.noise)
+    solution = linear_solution(structure, H, border)
+    np.testing.assert_allclose(np.linalg.inv(solution.S), inverse[-q:, -q:], rtol=1e-5, atol=1e-9)
+    expected, n = np.zeros(len(solution.delta)), len(structure.diagonal)
+    expected[np.r_[structure.unknowns, n:n + q]] = inverse @ vector
+    np.testing.assert_allclose(solution.delta, expected, atol=1e-6 * np.abs(expected).max())
 
 
 def test_evidence_of_one_entry_by_hand():

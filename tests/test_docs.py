@@ -1,4 +1,4 @@
-"""Examples in docstrings and in the README run, and the pages of the functions load nothing."""
+"""Examples run in docstrings and in the README; pages of functions and docs/code.md are right."""
 
 import doctest
 import re
@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 
 ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "slamlib"
+CODE_PAGE = (ROOT / "docs" / "code.md").read_text(encoding="utf-8")
 MODULES = sorted(".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
                  for path in (ROOT / "slamlib").rglob("*.py") if path.stem != "__main__")
 WITH_EXAMPLES = {f"slamlib.{name}" for name in (
@@ -83,3 +85,22 @@ def test_every_module_has_a_page_with_its_functions(pages):
         r"poses(</a>)?</code>: \(n, 3\), headings continuous", text)
     text = (pages / "slamlib" / "dataset.html").read_text()
     assert re.search(r"ticks(</a>)?</code>: \(n, 2\) int64", text)
+
+
+def test_the_tables_of_modules_and_packages_are_complete():
+    rows = [line.split("|")[1] for line in CODE_PAGE.splitlines() if line.startswith("| `")]
+    modules = [file.relative_to(PACKAGE).as_posix() for file in PACKAGE.rglob("*.py")]
+    assert sorted(name for row in rows for name in re.findall(r"`([\w/]+\.py)`", row)) == sorted(
+        name for name in modules if not name.endswith("__init__.py"))
+    assert set(re.findall(r"^\| `slamlib/(\w+)/` \|", CODE_PAGE, re.MULTILINE)) == {
+        file.parent.name for file in PACKAGE.glob("*/__init__.py")}
+
+
+def test_functions_that_it_names_exist():
+    text = CODE_PAGE.split("## Where to look")[1].split("## Factors of your own")[0]
+    names = set(re.findall(r"`(\w[\w.]*\.\w+)`", text)) - {
+        "module.function", "UwbReading.txt", "UwbMap.mat"}
+    assert len(names) > 20
+    for name in names:
+        module, _, function = name.rpartition(".")
+        assert callable(getattr(import_module(f"slamlib.{module}"), function)), name

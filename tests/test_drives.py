@@ -8,7 +8,7 @@ import pytest
 from conftest import contradicted
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_output
 
-from slamlib import localization, solve
+from slamlib import localization, slam, solve
 from slamlib.dataset import DatasetError, Doubt
 from slamlib.notebook import Drive, attempted, drives, notices, show_doubts, solved
 from slamlib.results import read_structs
@@ -80,6 +80,12 @@ def test_a_second_call_for_a_problem_writes_nothing_unless_its_cell_is_run_again
     assert found == written
     told = "**good**: the files of problem1 stay those of the first call of solved in this"
     assert [text[:len(told)] for text, _ in said] == [told] * (len(calls) - len(set(written)))
+
+
+def test_options_that_vehicle_toml_does_not_state_are_told_in_the_overview(said, both):
+    solved(both[:1], problem3=lambda drive: slam.estimate(drive.dataset, kernel="Huber"))
+    doubt, = (doubt for doubt in notices([book_of(said)])["good"] if doubt.what == "options")
+    assert "problem3 are solved with kernel = Huber, unlike" in doubt.sentence
 
 
 def test_drives_without_a_sensor_are_left_out(said, both):

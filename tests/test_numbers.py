@@ -16,14 +16,6 @@ from slamlib.checks.files import doubts_before_solving
 from slamlib.simulation import simulate
 
 
-def few_markers(d):
-    """Of every third sighting, some twice and some with the next marker's id."""
-    a = d.aruco.select(np.sort(np.r_[:len(d.aruco.pose):3, :len(d.aruco.pose):30]))
-    return aruco(d, **{name: getattr(a, name) for name in (
-        "pose", "marker_in_vehicle", "covariance")}, marker=np.where(
-            np.arange(len(a.pose)) % 9 == 4, np.roll(a.marker, 1), a.marker))
-
-
 def moved_markers(d):
     z = d.aruco.marker_in_vehicle + 0.4 * ((d.aruco.pose > 900) & (d.aruco.marker % 2))[:, None]
     return aruco(d, marker_in_vehicle=z)
@@ -47,9 +39,7 @@ DRIVES = {
     "pushed, a spike, a dead wheel": ({}, 1200, lambda d: counts(
         slice(900, 950), lambda t: t * [0, 1])(counts([600], lambda t: t + [1500, 0])(
             carried(d, 300, 306)))),
-    "carried": ({}, 800, lambda d: carried(d, 300, 380)),
     "moved markers": ({"rounds": 2}, 1400, moved_markers),
-    "few markers": ({}, 1200, few_markers),
     "ranges alone": ({}, 900, lambda d: vehicle(sigma_heading=0.1)(d.without("aruco")))}
 
 NUMBERS = {
@@ -69,12 +59,8 @@ NUMBERS = {
         0, 0.05625943, 7.918267, -0.05216777, -0.1929082, -0.07825621, 2.302814]),
     "pushed, a spike, a dead wheel": ("encoder", [-0.0283807, 0, 0.03501923, 183.1801, -0.02704271,
         0, -0.02577777, -0.05126301, -0.006147174, -0.06618535, -0.01468291, -4.713509]),
-    "carried": ("encoder", [0.1012191, 0, 0.04164449, 105.6667, 0.1153933, 0, 0.09098952,
-        -0.0512599, 0.02830846, -0.06482167, 0.02516871, -2.855785]),
     "moved markers": ("sightings-rejected", [-0.03875102, 0, -0.001022218, 225.3154, -0.03053639, 0,
         -0.02378711, 1.637253, 0.04340797, -0.7146973, 0.01143733, -4.09533]),
-    "few markers": ("encoder sightings-rejected", [0.04705019, 0, -0.03489566, 71.70191, 0.06157747,
-        0, 0.02844994, 2.785353, -0.02894155, -2.628034, -0.03296805, -5.133544]),
     "ranges alone": ("antenna", [0.02467799, 0, 0.03886915, -4.643803])}
 
 
