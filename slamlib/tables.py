@@ -191,13 +191,13 @@ def _table_of_text(source, columns):
     if not rows:
         return table
     cells = max((_cells(rows, len(columns), *dialect) for dialect in DIALECTS), key=len)
-    if len(cells) < len(rows):
-        require(False, f"{source}, line {lines[len(cells)]}",
-                f"{len(columns)} numbers ({', '.join(columns)})", rows[len(cells)])
-    if any("," in cell for row in cells for cell in row):
+    k = min(len(cells), len(rows) - 1)
+    require(len(cells) == len(rows), f"{source}, line {lines[k]}",
+            f"{len(columns)} numbers ({', '.join(columns)})", rows[k])
+    numbers = np.strings.replace(np.array(cells), ",", ".")
+    if (numbers != np.array(cells)).any():
         table = table.noted(" was read with decimal commas")
-    numbers = np.array([[float(cell.replace(",", ".")) for cell in row] for row in cells])
-    return replace(table, numbers=numbers, lines=np.array(lines))
+    return replace(table, numbers=numbers.astype(float), lines=np.array(lines))
 
 
 def _cells(rows, count, separator, decimal):
