@@ -119,7 +119,7 @@ def test_links_lead_to_other_chapters_by_their_file_and_anchor(capsys):
     assert [each for each in links(found["2"]) if "index" not in each[0]][:5] == [
         ("1_one.html#eq-1", "1"), ("1_one.html#A-section", "there"), ("1_one.html", "one"),
         ("notes.txt", "data"), ("https://example.org/p", "paper")]
-    assert "there is no 3_x.ipynb, so 'no' is not a link" in capsys.readouterr().err
+    assert "this report has no 3_x.ipynb, so 'no' is not a link" in capsys.readouterr().err
     assert b"https://example.org/p" in content and b"notes.txt" not in content
 
 

@@ -450,7 +450,7 @@ local function resolved(element, here)
   end
   local chapter = by_name[(name:gsub("%%20", " "))]
   if not chapter then
-    tell(("%s: there is no %s.ipynb, so '%s' is not a link"):format(
+    tell(("%s: this report has no %s.ipynb, so '%s' is not a link"):format(
       here.name, name, stringify(element)))
     return element.content
   elseif not chapter.ids[id] then
