@@ -62,7 +62,7 @@ class Jumps:
     @property
     def are_few(self):
         """Whether there are jumps, but few that no spike of the counts supports."""
-        supported = self.chance[self.end] - self.chance[self.start] > SPIKE_CHANCE
+        supported = self.chance[self.end] - self.chance[self.start] >= SPIKE_CHANCE
         return len(self.start) > 0 and np.sum(~supported) <= MAX_UNSUPPORTED
 
     def share(self, start, end):

@@ -82,6 +82,10 @@ def test_shares_of_a_jump_by_hand():
     spike = replace(jumps, chance=np.cumsum([1, 1, 1, 1, 1e6, 1, 1, 1, 1]))
     np.testing.assert_allclose(spike.share(start, end)[:, 0], [0, 0, 1, 1, 0], atol=1e-5)
     assert not gate.NO_JUMPS.added(start, end)[1].any() and not gate.NO_JUMPS.are_few
+    steps, every = np.arange(3), {"increment": jump[[0] * 3], "by_odometry": 0 * jump[[0] * 3]}
+    three = replace(jumps, start=steps, end=steps + 1, sigma=jump[[0] * 3], **every)
+    assert not three.are_few                 # as by a poor sensor, unless each is at a spike
+    assert replace(three, chance=gate.SPIKE_CHANCE * np.arange(9.0)).are_few
 
 
 def test_suspects_by_hand():
