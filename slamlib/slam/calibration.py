@@ -80,7 +80,8 @@ def calibration_table(calibration, c, covariance, released):
     numbers = np.stack([calibration.stated, calibration.sigma, c, np.sqrt(np.diag(covariance))])
     numbers[:2, HEIGHT], numbers[2:, HEIGHT] = (
         _height(*numbers[:2, HEIGHT]), _height(*numbers[2:, HEIGHT]))
-    return [entry._asdict() | {"name": name, "released": entry.group in released} | dict(zip(
+    return [{"name": name, "unit": entry.unit, "group": entry.group,
+             "released": entry.group in released} | dict(zip(
                 ("stated", "stated_sigma", "estimate", "sigma"), column.tolist()))
             for name, entry, column in zip(calibration.names, entries, numbers.T)]
 
