@@ -194,8 +194,8 @@ def _table_of_text(source, columns):
     k = min(len(cells), len(rows) - 1)
     require(len(cells) == len(rows), f"{source}, line {lines[k]}",
             f"{len(columns)} numbers ({', '.join(columns)})", rows[k])
-    numbers = np.strings.replace(np.array(cells), ",", ".")
-    if (numbers != np.array(cells)).any():
+    numbers = np.strings.replace(text := np.array(cells), ",", ".")
+    if (numbers != text).any():
         table = table.noted(" was read with decimal commas")
     return replace(table, numbers=numbers.astype(float), lines=np.array(lines))
 
