@@ -8,7 +8,6 @@ count from 1 in the files and from 0 in the arrays; marker and antenna ids stay 
 
 import json
 from dataclasses import dataclass, replace
-from numbers import Integral
 from os.path import abspath
 from pathlib import Path
 
@@ -17,7 +16,7 @@ import numpy as np
 from slamlib import se2, tables
 from slamlib.tables import ENCODER, TABLES, TRUTH_FILES, contents, read_table
 from slamlib.textfile import DatasetError as DatasetError
-from slamlib.textfile import require, require_type
+from slamlib.textfile import require
 from slamlib.vehicle import TABLE_2, Vehicle, changed, incremental_counts, read_vehicle
 
 ORIGIN_TOLERANCE = 1e-3  # m and rad; a first true pose within it is taken as the origin
@@ -92,7 +91,7 @@ class Dataset:
         >>> len(dataset.ticks), dataset.uwb.antenna.tolist()
         (2, [7])
         """
-        require_type(vehicle, Vehicle, "vehicle")
+        require(isinstance(vehicle, Vehicle), "vehicle", "a Vehicle", vehicle)
         arguments = ("ticks", ticks), ("aruco", aruco), ("uwb", uwb), ("guess", guess)
         files = {file: tables.table_of_array(key, value, file, counted=key == "ticks")
                  for file, (key, value) in zip(TABLES, arguments)}
@@ -110,27 +109,13 @@ class Dataset:
 
     def without(self, sensor):
         """The Dataset without a sensor, "aruco" or "uwb"."""
-        require(sensor in ("aruco", "uwb"), "without", '"aruco" or "uwb"', sensor)
         return replace(self, **{sensor: None})
 
     def first(self, count):
         """The Dataset of the first `count` poses; sensors without readings are None."""
-        require(isinstance(count, Integral) and count > 0, "first", "a number of poses", count)
         early = {sensor: readings.select(readings.pose < count) for sensor in ("aruco", "uwb")
                  if (readings := getattr(self, sensor)) and (readings.pose < count).any()}
         return replace(self, ticks=self.ticks[:count], **{"aruco": None, "uwb": None} | early)
-
-
-@dataclass(frozen=True)
-class Doubt:
-    """A possible error in the files of a drive, for the user to check.
-
-    `what` is its kind in kebab case ("wheels-swapped"), for programs. `sentence` states the
-    evidence and what to check in which file.
-    """
-
-    what: str
-    sentence: str
 
 
 @dataclass(frozen=True)
@@ -143,7 +128,6 @@ class Truth:
     antenna: np.ndarray  # (a,) int64, antenna id, ascending
     antenna_in_world: np.ndarray  # (a, 2) [x, y] in m
     vehicle: Vehicle
-    doubts: tuple[Doubt, ...] = ()
     notes: tuple[str, ...] = ()  # as those of a Dataset
 
 
@@ -152,12 +136,6 @@ def read_dataset(folder):
 
     `Dataset.notes` state what was mended, left out or not read. Raises DatasetError if a file does
     not have the format.
-
-    >>> from slamlib.simulation import simulate, write_dataset
-    >>> write_dataset("drive", *simulate("short", seed=1))
-    >>> dataset = read_dataset("drive")
-    >>> len(dataset.ticks), len(dataset.aruco.pose), dataset.antenna_guess.antenna.tolist()
-    (2000, 894, [5, 13, 36, 46])
     """
     files, notes = contents(folder, required=ENCODER)
     vehicle = read_vehicle(files.get("vehicle.toml"))
@@ -186,35 +164,31 @@ def read_truth(folder):
 
     Maps without a file have length 0. Wheel parameters that `truth/vehicle.toml` does not give are
     those of the dataset. Truth whose first pose T_w1 is not the origin is moved there, T_1v =
-    inverse(T_w1) T_wv, and a doubt says so. Raises DatasetError if a file does not have the format
-    or the number of poses is not that of the drive.
+    inverse(T_w1) T_wv, with a note. Raises DatasetError if a file does not have the format or the
+    number of poses is not that of the drive.
     """
     drive, _ = contents(folder, required=ENCODER)
     if "truth" not in drive:
         return None
     files, notes = contents(drive["truth"], TRUTH_FILES, "vehiclePose.txt")
-    path, *maps = read = [read_table(files.get(name), name) for name in TRUTH_FILES[:3]]
+    path, *maps = (read_table(files.get(name), name) for name in TRUTH_FILES[:3])
     poses, count = path.numbers[:, 1:], len(read_table(drive[ENCODER], ENCODER).numbers)
     require(len(poses) == count, path.source,
             f"{count} poses (encoder file), found {len(poses)}")
     turns = 2 * np.pi * np.rint(poses[0, 2] / (2 * np.pi))
     poses = np.column_stack([poses[:, :2], np.unwrap(poses[:, 2]) - turns])
     (marker, marker_in_world), (antenna, antenna_in_world) = map(_by_id, maps)
-    doubts, first = (), poses[0]
-    if (abs(first) > ORIGIN_TOLERANCE).any():
+    if (abs(first := poses[0]) > ORIGIN_TOLERANCE).any():
         poses = se2.between(first, poses)
         marker_in_world = se2.difference(se2.between(first, marker_in_world), np.zeros(3))
         antenna_in_world = se2.between(first, np.pad(antenna_in_world, ((0, 0), (0, 1))))[:, :2]
-        doubts = (Doubt("truth-frame", (
-            "In truth/vehiclePose.txt the drive begins at ({:.3f} m, {:.3f} m, {:.4f} rad), not at "
-            "the origin. The true poses and maps were moved into the frame of the first true pose, "
-            "in which the estimates are. If errors are large, check that all files in truth/ are "
-            "in the same frame.").format(*first)),)
-    vehicle, true = (each.get("vehicle.toml") for each in (drive, files))
+        path = path.noted((
+            " begins at ({:.3f} m, {:.3f} m, {:.4f} rad): poses and maps were moved into the frame "
+            "of its first pose, in which the estimates are").format(*first))
     return Truth(
         poses, marker, marker_in_world, antenna, antenna_in_world,
-        read_vehicle(true, read_vehicle(vehicle)), doubts,
-        tuple(f"In truth: {note}" for note in sum((each.notes for each in read), (*notes,))))
+        read_vehicle(files.get("vehicle.toml"), read_vehicle(drive.get("vehicle.toml"))),
+        tuple(f"In truth: {note}" for note in sum((e.notes for e in (path, *maps)), (*notes,))))
 
 
 def _by_id(table):

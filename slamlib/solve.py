@@ -17,9 +17,9 @@ from multiprocessing import Pipe, get_context
 import numpy as np
 
 from slamlib import evaluation, localization, odometry, results, se2, slam, swap
-from slamlib.checks.files import doubts_before_solving, merged
+from slamlib.checks.files import Doubt, doubts_before_solving, merged
 from slamlib.checks.solution import solution_doubts
-from slamlib.dataset import DatasetError, Doubt, all_notes
+from slamlib.dataset import DatasetError, all_notes
 
 UNSOLVABLE = (DatasetError, np.linalg.LinAlgError)  # what `find` raises where there is no solution
 
@@ -222,7 +222,7 @@ def solve_to_folder(dataset, truth, out, problems=tuple(PROBLEMS), csv=False):
     read.
     """
     with swap.staging(out) as stage:
-        doubts, solved = _in_two_processes(dataset, truth, problems)
+        doubts, solved = _in_two_processes(dataset, problems)
         rows = {}
         for solution in solved:
             if isinstance(solution, Failure):
@@ -264,10 +264,10 @@ def _send(sender, *arguments):
         sender.send(_solved(True, *arguments))
 
 
-def _solved(independent, dataset, truth, problems):
+def _solved(independent, dataset, problems):
     """Doubts before solving and `solutions` of problems INDEPENDENT, or none and of the others."""
     problems = [problem for problem in problems if (problem in INDEPENDENT) == independent]
-    return (doubts_before_solving(dataset, truth) if independent else [],
+    return (doubts_before_solving(dataset) if independent else [],
             [*solutions(dataset, problems)])
 
 

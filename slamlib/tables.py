@@ -91,10 +91,6 @@ NUMBER_FIRST = re.compile(r"(^|[\s,;])\W*(\d|nan\b|inf)", re.IGNORECASE)  # in a
 NUMBER = {sign: rf"[+-]?(?:(?:{digits})(?:e[+-]?[0-9]+)?|nan|inf(?:inity)?)" for sign, digits in (
     (".", r"[0-9]+(?:\.[0-9]*)?|\.[0-9]+"), (",", "[0-9]+(?:,[0-9]+)?"))}
 DIALECTS = (None, "."), (",", "."), (";", "."), (None, ","), (";", ",")  # separator, decimal sign
-# Words of headers for two columns, in their order, by the second column of the file.
-HEADER_ORDER = {"right ticks": (r"right|dx|destra|r\b", r"left|sx|sinistra|l\b"),
-                "marker id": ("pos[ea]", "marker|aruco|tag|landmark"),
-                "antenna id": ("pos[ea]", "antenna|anchor|beacon|landmark")}
 
 
 @dataclass(frozen=True)
@@ -183,10 +179,8 @@ def _table_of_text(source, columns):
     lines = [k for k, row in enumerate(rows, start=1) if re.search(r"[^,;\s]", row)]
     rows = [rows[k - 1].strip() for k in lines]
     if rows and re.search("[A-Za-z]", rows[0]) and not NUMBER_FIRST.search(rows[0]):
-        words = [re.search(each, rows[0], re.I) for each in HEADER_ORDER.get(columns[1], ())]
-        require(None in words or words == sorted(words, key=re.Match.start),
-                f"{source}, line {lines[0]}", f"the columns {', '.join(columns)}", rows[0])
-        table = table.noted(f": the header {quoted(rows[0])} was left out")
+        table = table.noted(f": the header {quoted(rows[0])} was left out; columns were read as "
+                            + ", ".join(columns))
         rows, lines = rows[1:], lines[1:]
     if not rows:
         return table

@@ -16,12 +16,6 @@ def require(ok, source, expected, found=None):
         raise DatasetError(f"{source}: expected {expected}{told}")
 
 
-def require_type(value, kind, source):
-    """Raise DatasetError if an argument of the function `source` (str) is not of a kind."""
-    name = getattr(kind, "__name__", kind)
-    require(isinstance(value, kind), source, f"an argument of type {name}", value)
-
-
 def quoted(value):
     """The first 60 characters (str) of a value, in quotes."""
     text = str(value)

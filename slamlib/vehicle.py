@@ -83,10 +83,6 @@ class Vehicle:
         right, left, base = map(float, wheel)
         return replace(self, right_radius=right, left_radius=left, wheelbase=base)
 
-    def with_deviation(self, w):
-        """The Vehicle with wheel parameters wheel + sigma_wheel * w; w (3,) has no unit."""
-        return self.with_wheel(self.wheel + self.sigma_wheel * w)
-
 
 # What each entry of vehicle.toml may be: a Limit, or a tuple of values.
 VEHICLE_LIMITS = {each.name: each.metadata["limit"] for each in fields(Vehicle)}

@@ -194,7 +194,7 @@ def test_too_little_to_decide_gives_no_doubt():
 
 def test_doubts_about_files_erase_no_others():
     """Each kind is told once; of antennas and units, each sentence."""
-    kinds = ["units", "odometry", "marker-noise", "antenna", "truth-frame", "antenna", "units"]
+    kinds = ["units", "odometry", "marker-noise", "antenna", "places", "antenna", "units"]
     doubts = [files.Doubt(kind, f"Sentence {k}.") for k, kind in enumerate(kinds)]
     assert files.merged(doubts) == doubts
     again = files.Doubt("odometry", "Again.")

@@ -9,7 +9,8 @@ from conftest import contradicted
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_output
 
 from slamlib import localization, slam, solve
-from slamlib.dataset import DatasetError, Doubt
+from slamlib.checks.files import Doubt
+from slamlib.dataset import DatasetError
 from slamlib.notebook import Drive, attempted, drives, notices, show_doubts, solved
 from slamlib.results import read_structs
 from slamlib.simulation import simulate

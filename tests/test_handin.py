@@ -10,7 +10,7 @@ from test_document import text_of
 from test_report import write
 
 from slamlib.__main__ import main
-from slamlib.dataset import Doubt
+from slamlib.checks.files import Doubt
 from slamlib.report import handin
 from slamlib.report.notebooks import Options
 from slamlib.report.overview import SolvedDrive

@@ -116,7 +116,8 @@ def test_both_covariances_against_monte_carlo(legs, equation2_holds):
     zero. Notebook 1 explains these findings.
     """
     ticks = manoeuvre(legs)
-    errors = [odometry.dead_reckoning(ticks, VEHICLE.with_deviation(z[:3]), (
+    errors = [odometry.dead_reckoning(ticks, VEHICLE.with_wheel(
+        VEHICLE.wheel + z[:3] * VEHICLE.sigma_wheel), (
         0.0, 0.0, z[3] * VEHICLE.sigma_heading))[-1]
         for z in np.random.default_rng(11).standard_normal((4000, 4))]
     errors = errors - odometry.dead_reckoning(ticks, VEHICLE)[-1]

@@ -10,7 +10,8 @@ import pytest
 from test_document import text_of
 
 from slamlib import evaluation, se2
-from slamlib.dataset import Doubt, read_dataset, read_truth
+from slamlib.checks.files import Doubt
+from slamlib.dataset import read_dataset, read_truth
 from slamlib.notebook import plotting
 from slamlib.report import overview
 from slamlib.report.document import render

@@ -50,7 +50,8 @@ def drives(draw):
     ticks = np.concatenate([[[0, 0]], *(np.tile(leg[1:], (leg[0], 1)) for leg in legs)])
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     path = odometry.dead_reckoning(
-        ticks, vehicle.with_deviation(rng.normal(size=3)), model="arc")
+        ticks, vehicle.with_wheel(
+            vehicle.wheel + rng.normal(size=3) * vehicle.sigma_wheel), model="arc")
     return SimpleNamespace(
         vehicle=vehicle, ticks=ticks, sightings=draw(sightings(path, rng)),
         **dict(zip(("ranges", "guesses"), draw(ranges(path, rng)))))

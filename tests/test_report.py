@@ -175,10 +175,9 @@ solved(start(), problem2=lambda drive: find("problem2", drive.dataset),
         good, bad = told.index("good: 50 poses"), told.index("bad: 50 poses")
         assert "ATE" in told[good + 1] and told[good + 2].startswith("problem2  ")
         assert told[bad + 3].startswith("problem2       could not be solved: expected sightings")
-        assert told[bad + 4].startswith("doubt (truth-frame): In truth/")
     assert "nothing changed" in " ".join(told)
     text = html.unescape((tmp_path / "report" / "index.html").read_text(encoding="utf-8"))
-    assert re.search(r"Doubts about the data.*bad:.*\(7\.000 m, 0\.000 m, 0\.0000 rad\)", text,
-                     re.DOTALL)
+    assert re.search(r"Notes on the files of <em>bad</em>:.*\(7\.000 m, 0\.000 m, 0\.0000 rad\)",
+                     text, re.DOTALL)
     assert "The problem “ArUco” could not be solved: expected sightings" in text
     assert "good:</p>" not in text

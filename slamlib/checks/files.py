@@ -7,11 +7,11 @@ lengths, and of stated standard deviations to the scatter of measurements.
 """
 
 from contextlib import suppress
+from dataclasses import dataclass
 
 import numpy as np
 
 from slamlib import odometry, se2
-from slamlib.dataset import Doubt
 from slamlib.marker_increments import (
     common_sightings,
     distance_and_turn,
@@ -40,13 +40,25 @@ COUNTS = {1: ("wheels-swapped", "the columns exchanged"),
           3: ("wheels-reversed", "both signs reversed and the columns exchanged")}
 
 
-def doubts_before_solving(dataset, truth=None):
-    """List of Doubts about the files of a Dataset and its Truth, where enough is known."""
+@dataclass(frozen=True)
+class Doubt:
+    """A possible error in the files of a drive, for the user to check.
+
+    `what` is its kind in kebab case ("wheels-swapped"), for programs. `sentence` states the
+    evidence and what to check in which file.
+    """
+
+    what: str
+    sentence: str
+
+
+def doubts_before_solving(dataset):
+    """List of Doubts about the files of a Dataset, where enough is known."""
     doubts = []
     for check in (motion_doubts, range_units, sigma_units):
         with suppress(np.linalg.LinAlgError):              # where increments have no covariance
             doubts += [Doubt(*each) for each in check(dataset)]
-    return doubts + ([] if truth is None else list(truth.doubts))
+    return doubts
 
 
 def merged(doubts):

@@ -6,7 +6,7 @@ from itertools import chain
 import numpy as np
 
 from slamlib import se2
-from slamlib.dataset import Doubt
+from slamlib.checks.files import Doubt
 from slamlib.odometry_gate import UNKNOWN_SIGMA
 from slamlib.slam.noise import BOUNDS
 from slamlib.slam.pipeline import own_contradictions

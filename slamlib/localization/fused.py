@@ -28,7 +28,7 @@ from slamlib.increments import SLIP_BOUNDS, SLIP_FACTOR, TYPICAL_SLIP
 from slamlib.memory import error_memory
 from slamlib.odometry_gate import NO_JUMPS, Jumps, find_jumps
 from slamlib.sightings import GATE, Sightings, sightings_by_frame
-from slamlib.textfile import require_type
+from slamlib.textfile import require
 
 SLIP_FRAMES = 500            # number of frames, the first ones, from which the slip is learned
 WHEEL_FRAMES = 5000          # number of frames, the first ones, that give the wheel parameters w_0
@@ -86,7 +86,7 @@ def fuse(dataset, slip=None):
     >>> fuse(dataset, slip=1e-3).poses.shape
     (2000, 3)
     """
-    require_type(dataset, Dataset, "fuse")
+    require(isinstance(dataset, Dataset), "fuse", "a Dataset", dataset)
     slip = dataset.vehicle.slip if slip is None else slip
     vehicle, jumps = dataset.vehicle, find_jumps(dataset)
     if len(jumps.start):

@@ -19,7 +19,7 @@ from slamlib.dataset import Dataset
 from slamlib.localization.fused import Fusion
 from slamlib.marker_increments import consecutive_increments
 from slamlib.sightings import sightings_by_frame
-from slamlib.textfile import require_type
+from slamlib.textfile import require
 
 
 def fuse_increments(dataset, propagation=odometry.equation2):
@@ -28,7 +28,7 @@ def fuse_increments(dataset, propagation=odometry.equation2):
     Where markers give no increment, odometry alone is used. `propagation` is `odometry.equation2`,
     or `odometry.first_order` with all correlations between two frames.
     """
-    require_type(dataset, Dataset, "fuse_increments")
+    require(isinstance(dataset, Dataset), "fuse_increments", "a Dataset", dataset)
     ticks, vehicle = dataset.ticks, dataset.vehicle
     sightings = sightings_by_frame(dataset.sightings, extra_frames=[0])
     found = consecutive_increments(sightings)

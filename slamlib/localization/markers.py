@@ -23,7 +23,7 @@ from slamlib import se2
 from slamlib.dataset import ArucoReadings, DatasetError
 from slamlib.marker_increments import consecutive_increments, robust_increments
 from slamlib.sightings import consensus, sightings_by_frame
-from slamlib.textfile import require_type
+from slamlib.textfile import require
 
 MAX_CANDIDATES = 3            # number of earlier frames that are tried as parent of a frame
 
@@ -57,7 +57,7 @@ def localize(aruco, shared_errors=True):
     >>> found.frame[:3].tolist(), found.poses.shape
     ([0, 10, 20], (200, 3))
     """
-    require_type(aruco, ArucoReadings, "localize")
+    require(isinstance(aruco, ArucoReadings), "localize", "an ArucoReadings", aruco)
     sightings = sightings_by_frame(aruco)
     if not len(sightings.frame):
         raise DatasetError("expected sightings that agree; all contradict another one of the same "

@@ -18,14 +18,14 @@ from matplotlib import style
 from matplotlib_inline.backend_inline import set_matplotlib_formats
 
 from slamlib import solve
-from slamlib.dataset import Dataset, Doubt, Truth, read_dataset, read_truth
+from slamlib.dataset import Dataset, Truth, read_dataset, read_truth
 from slamlib.notebook import plotting
 from slamlib.results import write_solution
 from slamlib.simulation import simulate
 from slamlib.tables import datasets_in
 
 KEY = "slamlib"  # of records in the metadata of outputs
-RECORDS = {"doubt": Doubt, "failure": solve.Failure}  # types of records by their key
+RECORDS = {"doubt": solve.Doubt, "failure": solve.Failure}  # types of records by their key
 _WRITTEN = {}  # by the folder of files that this kernel wrote: the cell that did, and its execution
 
 

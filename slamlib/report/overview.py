@@ -17,8 +17,8 @@ from matplotlib.figure import Figure
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_output
 
 from slamlib import evaluation, marker_increments
-from slamlib.checks.files import doubts_before_solving, merged
-from slamlib.dataset import Doubt, all_notes
+from slamlib.checks.files import Doubt, doubts_before_solving, merged
+from slamlib.dataset import all_notes
 from slamlib.notebook import Drive, accuracy, plotting, table
 from slamlib.notebook.drives import plain
 from slamlib.report.execution import NotebookError
@@ -61,7 +61,7 @@ def read_drives(read, results, written, notices):
         name, told = dataset.name, notices.get(dataset.name, [])
         files = tuple(file.removeprefix(f"{name}/") for file in sorted(written)
                       if file.startswith(f"{name}/") and file.endswith(".mat"))
-        doubts = [*doubts_before_solving(dataset, truth), *(x for x in told if type(x) is Doubt)]
+        doubts = [*doubts_before_solving(dataset), *(x for x in told if type(x) is Doubt)]
         drives.append(SolvedDrive(
             name, dataset, truth, files=files, doubts=tuple(merged(doubts)),
             solutions=tuple(read_solution(results / name / problem, dataset, files)

@@ -21,7 +21,7 @@ from slamlib.slam.linear import build_problem
 from slamlib.slam.measurements import Noise, measure
 from slamlib.slam.own import linearized_own
 from slamlib.slam.result import slam_result
-from slamlib.textfile import require, require_type
+from slamlib.textfile import require
 from slamlib.vehicle import changed
 
 
@@ -62,8 +62,9 @@ def estimate(dataset, slip=None, model=None, previous=None, *, marker_noise_fact
     >>> result.poses.shape, result.antenna.tolist(), result.noise.slip
     ((200, 3), [5, 13, 36, 46], 0.001)
     """
-    require_type(dataset, Dataset, "slam.estimate")
-    require_type(factors, NonlinearFactorGraph | None, "slam.estimate")
+    require(isinstance(dataset, Dataset), "slam.estimate", "a Dataset", dataset)
+    require(isinstance(factors, NonlinearFactorGraph | None), "slam.estimate",
+            "a gtsam.NonlinearFactorGraph for factors", factors)
     require(model in (None, *MODELS), "slam.estimate", f"{' or '.join(MODELS)} for model", model)
     options = {"slip": slip, "marker_noise_factor": marker_noise_factor,
                "range_noise_factor": range_noise_factor, "kernel": kernel, "gate": gate}
