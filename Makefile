@@ -6,8 +6,7 @@
 # make lab      opens JupyterLab on the notebooks, with ARGS="--no-browser --port 9999" or others
 # make docs     writes pages of slamlib's functions to build/api
 # make strip    restores saved notebooks to the form in which they are committed
-# make bench    prints the benchmarks' tables
-# make bench-large   the same on more drives, and the plain script on long ones
+# make bench    prints how long what takes, beside a plain GTSAM script
 # Every target sets up what it needs in .venv first. Choose the Python with PYTHON=python3.12.
 
 VENV := .venv
@@ -24,7 +23,7 @@ ifneq ($(shell $(BIN)/python -c 'print("runs")' 2>/dev/null),runs)
 $(shell rm -f $(READY))
 endif
 
-.PHONY: setup report hand-in test quick mutants lab docs strip bench bench-large clean
+.PHONY: setup report hand-in test quick mutants lab docs strip bench clean
 .DEFAULT_GOAL := report
 
 # In a git checkout, also configures the filter that .gitattributes names: git stores notebooks as
@@ -79,10 +78,8 @@ docs: $(READY)
 strip: $(READY)
 	@$(BIN)/python strip_notebooks.py notebooks/*.ipynb
 
-bench bench-large: $(READY)
-	@for b in speed slam; do \
-		$(BIN)/python "tests/benchmarks/$$b.py" $(patsubst bench-%,%,$(filter bench-%,$@)) || exit 1; \
-		echo; done
+bench: $(READY)
+	@$(BIN)/python tests/benchmarks/speed.py
 
 clean:
 	rm -rf $(VENV) report results .report.* .results.* build slamlib.egg-info .pytest_cache .ruff_cache .hypothesis

@@ -28,7 +28,7 @@ STUDY_SEEDS = "2"            # in pages that tests build: their claims are teste
 # The longest come first, and those that mostly wait beside those that start further processes.
 FIRST = ("test_pages", "test_concurrency", "test_lab", "test_slam", "test_flaws", "test_memory",
          "test_uwb", "test_localization", "test_odometry_gate", "test_calibration", "test_docs",
-         "test_doubts", "test_fusion", "test_report", "test_properties", "test_main", "test_handin",
+         "test_doubts", "test_report", "test_properties", "test_main", "test_handin",
          "test_overview", "test_document", "test_library", "test_maps", "test_cache",
          "test_studies")
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
@@ -134,7 +134,7 @@ def few_seeds(monkeypatch):
 def report_on_all(tmp_path_factory, kept):
     """A folder with data, report and results: drives of data/, and what else a user may bring.
 
-    All but `short` are cut to 600 or 1500 poses: no assertion on the pages needs more.
+    All but `short` are cut to 300 or 900 poses: no assertion on the pages needs more.
     """
     import numpy as np
 
@@ -145,8 +145,8 @@ def report_on_all(tmp_path_factory, kept):
     shutil.copytree(ROOT / "data", data, ignore=lambda *_: ["long"])
     long = ROOT / "data" / "long"
     for name, poses, drive in (
-            ("long", 1500, (read_dataset(long), read_truth(long))),
-            ("new seed", 600, simulate("short", seed=77, late_ranges=0.15))):
+            ("long", 900, (read_dataset(long), read_truth(long))),
+            ("new seed", 300, simulate("short", seed=77, late_ranges=0.15))):
         dataset, truth = drive[0].first(poses), drive[1]
         write_dataset(data / name, dataset, replace(truth, poses=truth.poses[:poses]))
     shutil.copytree(data / "new seed", data / "no_truth", ignore=lambda *_: ["truth"])

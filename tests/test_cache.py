@@ -7,8 +7,8 @@ import joblib
 import nbformat
 import pytest
 from nbformat.v4 import new_code_cell
+from test_project import save_as_lab
 from test_report import make_data, write
-from test_strip import save_as_lab
 
 from slamlib.report import build, build_report, cache
 from slamlib.studies import memory

@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 import pytest
 from gtsam.symbol_shorthand import C
-from numeric import as_points, central_differences, changed
+from numeric import as_points, central_differences, changed, vehicle
 
 from slamlib import se2, slam
 from slamlib.checks.files import doubts_before_solving
@@ -206,8 +206,16 @@ FAULTS = {                         # what the right doubt names, and the drive
     "antennas differ": ("antenna-offsets", lambda d, t: ranged_from(
         d, t, offsets=[0.5, -0.3, 0.2, -0.6])),
     "ranges late": ("range-delay", lambda d, t: ranged_from(d, t, late=30)),
-    "wheelbase": ("wheel-parameters", lambda d, t: replace(
-        d, vehicle=replace(d.vehicle, wheelbase=0.42)))}
+    "wheelbase": ("wheel-parameters", lambda d, t: vehicle(wheelbase=0.42)(d)),
+    "half the wheelbase": ("wheel-parameters", lambda d, t: vehicle(wheelbase=0.2)(d)),
+    **{f"wheels of {radius} m": ("wheel-parameters", lambda d, t, radius=radius: vehicle(
+        right_radius=radius, left_radius=radius)(d)) for radius in (0.101, 0.103)},
+    "covariances a hundredth": ("marker-noise", lambda d, t: changed(
+        d, "aruco", covariance=d.aruco.covariance / 100)),
+    "sigmas of ranges halved": ("range-noise", lambda d, t: changed(
+        d, "uwb", sigma=d.uwb.sigma / 2)),
+    "ranges 1.5 % too long": ("range-offset", lambda d, t: changed(
+        d, "uwb", range=d.uwb.range * 1.015))}
 
 
 @cache
@@ -227,17 +235,27 @@ def right_ate(ranges):
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_wrong_statement_is_named_and_mended(fault):
-    """The ATE is nearly that of right files, the covariances hold, and the cause has its name."""
+    """The ATE is nearly that of right files, the covariances hold, and the cause has its name.
+
+    By markers alone, wheels that are larger by one factor and markers that are smaller by it are
+    the same: one of them is named, and the other beside it. Ranges give the scale.
+    """
     what, spoil = FAULTS[fault]
     dataset, truth = drive(1)
-    spoilt = spoil(dataset, truth)
+    spoilt, far_off = spoil(dataset, truth), fault.startswith(("wheels", "half"))
     markers = slam.estimate(spoilt.without("uwb"))
     both = slam.estimate(spoilt, previous=markers)
-    for result in (both,) if what.startswith(("tag", "antenna", "range")) else (markers, both):
-        assert what in {doubt.what for doubt in solution_doubts(result)}
-    for result, ranges in ((markers, False), (both, True)):
+    said = [{doubt.what for doubt in solution_doubts(result)} for result in (markers, both)]
+    assert what in said[1] and (what.startswith(("tag", "antenna", "range")) or said[0] & (
+        {what, "marker-size"} if far_off else {what}))
+    if what.endswith("noise"):
+        assert said[1] == {what} and not doubts_before_solving(spoilt)
+    if what == "wheel-parameters":
+        np.testing.assert_allclose(both.wheel, [0.1, 0.1, 0.4], rtol=0.01)
+        assert markers.slip < 2e-3 and both.slip < 2e-3        # which would explain the path
+    for result, ranges in ((both, True), (markers, False))[:2 - far_off]:
         possible = right_ate(ranges)
-        if what == "marker-size" and not ranges:     # all lengths are those of the wheels
+        if not ranges and what == "marker-size":       # all lengths are those of the wheels
             possible = np.hypot(possible, 1e-3 * np.hypot(*truth.poses[:, :2].std(axis=0)))
         assert ate(result.poses, truth.poses, aligned=True) < 1.5 * possible
         assert anees(result.poses, result.covariances, truth.poses) < 6

@@ -3,19 +3,18 @@
 import re
 import symtable
 from dataclasses import replace
-from pathlib import Path
 
 import nbformat
 import numpy as np
 import pytest
+from conftest import ROOT
 from scipy.linalg import block_diag
 
 from slamlib import increments, localization, se2
 from slamlib.sightings import sightings_by_frame
 from slamlib.simulation import simulate
 
-NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
-CHAPTERS = sorted(NOTEBOOKS.glob("[0-9]*.ipynb"))
+CHAPTERS = sorted((ROOT / "notebooks").glob("[0-9]*.ipynb"))
 MAX_NAMES = 12               # imported before the first result
 
 

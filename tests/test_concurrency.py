@@ -8,10 +8,9 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import pytest
-from conftest import is_running
+from conftest import ROOT, is_running
 from test_report import build, make_data, write
 
 from slamlib import results, solve, swap
@@ -20,7 +19,6 @@ from slamlib.report import NotebookError
 from slamlib.simulation import simulate, write_dataset
 from slamlib.solve import problem_solution, solve_to_folder
 
-ROOT = Path(__file__).parents[1]
 RESULT = """import os, time
 from pathlib import Path
 import numpy as np

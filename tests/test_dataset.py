@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import ROOT
 
 from slamlib import dataset, se2
 from slamlib.checks.files import doubts_before_solving
@@ -139,16 +140,6 @@ def test_absent_truth_is_none_and_absent_maps_are_empty(folder):
     (folder / "truth/vehiclePose.txt").unlink()
     (folder / "truth").rmdir()
     assert read_truth(folder) is None
-
-
-def test_readings_are_selected_by_mask_and_by_index(folder):
-    data = read_dataset(folder)
-    for readings in (data.aruco, data.uwb):
-        mask = readings.pose != 1
-        kept = readings.select(mask)
-        assert repr(kept) == repr(readings.select(np.flatnonzero(mask)))
-        assert len(kept.pose) == np.count_nonzero(mask) > 0 and (kept.pose != 1).all()
-    assert data.aruco.select([2, 0]).marker.tolist() == [40, -7]
 
 
 def test_the_first_poses_have_the_readings_until_then(folder):
@@ -316,7 +307,7 @@ def test_numbers_at_the_limits_are_read_and_beyond_them_refused(tmp_path, name, 
 
 
 def test_the_limits_that_a_user_reads_are_those_of_the_reader():
-    text = (Path(__file__).parents[1] / "data" / "README.md").read_text()
+    text = (ROOT / "data" / "README.md").read_text()
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines()
             if line.startswith("| `") and "| from " in line]
     told = {(file.strip("`"), column.strip("` ")): limit for file, columns, limit in rows

@@ -2,13 +2,12 @@
 
 import itertools
 from dataclasses import replace
-from functools import cache
-from pathlib import Path
 from types import SimpleNamespace
 
 import gtsam
 import numpy as np
 import pytest
+from conftest import ROOT
 from numeric import aruco, known_noise, uwb, vehicle
 
 from slamlib import se2, slam, solve
@@ -16,7 +15,7 @@ from slamlib.__main__ import summary_table
 from slamlib.checks.files import doubts_before_solving
 from slamlib.checks.solution import GROUPS, solution_doubts
 from slamlib.dataset import Vehicle, read_dataset, read_truth
-from slamlib.evaluation import anees, ate, nees_band
+from slamlib.evaluation import nees_band
 from slamlib.odometry_gate import NO_JUMPS
 from slamlib.simulation import simulate
 from slamlib.slam.calibration import (
@@ -28,16 +27,6 @@ from slamlib.slam.calibration import (
 )
 from slamlib.slam.measurements import Noise
 from slamlib.slam.result import turn_sigma
-
-SHORT = Path(__file__).parents[1] / "data" / "short"
-
-
-WRONG_SIZES = {                                # found by the graph, and mended
-    "covariances a hundredth": (lambda d: aruco(d, covariance=d.aruco.covariance / 100),
-                                "marker-noise"),
-    "sigmas of ranges halved": (lambda d: uwb(d, sigma=d.uwb.sigma / 2), "range-noise"),
-    "ranges 1.5 % too long": (lambda d: uwb(d, range=d.uwb.range * 1.015), "range-offset"),
-    "wheels 1 % too large": (vehicle(right_radius=0.101, left_radius=0.101), "wheel-parameters")}
 
 
 def uncorrelated(*variances):
@@ -90,62 +79,6 @@ def names(*lists):
     return {doubt.what for doubts in lists for doubt in doubts}
 
 
-@cache
-def right_ate(seed):
-    """ATE in m of problem 3 after alignment, on the drive whose files are right."""
-    dataset, truth = simulate("short", seed)
-    return ate(slam.estimate(dataset.without("uwb")).poses, truth.poses, aligned=True)
-
-
-def assert_mended(found, truth, seed, factor=1.2):
-    """The covariances hold, and the ATE is at most `factor` times that of the right files."""
-    assert anees(found.poses, found.covariances, truth.poses) < 6
-    assert ate(found.poses, truth.poses, aligned=True) < factor * right_ate(seed)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("flaw", WRONG_SIZES)
-def test_wrong_sizes_are_mended_or_named(flaw, seed=61):
-    """Problems 3 and 4 on short drives: as accurate as on the right files, and said.
-
-    By markers alone, wheels that are larger by one factor and markers that are smaller by it are
-    the same. Of the wheels a standard deviation is stated, so the markers are named, and the wheels
-    beside them.
-    """
-    dataset, truth = simulate("short", seed)
-    spoil, what = WRONG_SIZES[flaw]
-    spoilt = spoil(dataset)
-    markers = slam.estimate(spoilt.without("uwb"))
-    both = slam.estimate(spoilt, previous=markers)
-    assert not doubts_before_solving(spoilt)
-    assert_mended(both, truth, seed)
-    if what == "wheel-parameters":
-        assert names(solution_doubts(both)) == {what}
-        doubt, *others = solution_doubts(markers)
-        assert names(others) <= {"wheel-parameters"}
-        assert doubt.what == "wheel-parameters" or "Wheels that are all off" in doubt.sentence
-        return
-    assert names(solution_doubts(markers), solution_doubts(both)) == {what}
-    assert_mended(markers, truth, seed)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("wrong", [dict(right_radius=0.103, left_radius=0.103),
-                                   dict(wheelbase=0.2)])
-def test_wheels_that_are_far_off_are_named_and_mended_although_slip_explains_the_path(wrong):
-    """Not by more slip than the drive has; ranges give the scale, and wheels within 1 %."""
-    dataset, truth = simulate("short", 501)
-    spoilt = vehicle(**wrong)(dataset)
-    markers = slam.estimate(spoilt.without("uwb"))
-    found = slam.estimate(spoilt, previous=markers)
-    assert names(solution_doubts(markers)) & {"wheel-parameters", "marker-size"}
-    doubt = solution_doubts(found)[0]
-    assert doubt.what == "wheel-parameters" and "By the drive right_radius" in doubt.sentence
-    np.testing.assert_allclose(found.wheel, [0.1, 0.1, 0.4], rtol=0.01)
-    assert markers.slip < 2e-3 and found.slip < 2e-3
-    assert_mended(found, truth, 501, factor=1.3)
-
-
 def test_without_sightings_nothing_is_known_of_the_camera():
     dataset = known_noise(simulate("short", 61)[0].first(300).without("aruco"), 1e-3)
     stated = vehicle(camera_x=0.1, sigma_camera_x=0.02, marker_size=1.01, sighting_lag=2.0)
@@ -178,7 +111,8 @@ def test_offsets_of_the_camera_have_the_standard_deviations_that_they_state():
 @pytest.mark.parametrize("case", LEGAL)
 def test_every_problem_is_solved_within_the_limits(case):
     """Finite covariances, not negative; SLAM's errors as they state, or its rejections are told."""
-    dataset, truth = read_dataset(SHORT), read_truth(SHORT)
+    short = ROOT / "data" / "short"
+    dataset, truth = read_dataset(short), read_truth(short)
     dataset = LEGAL[case](dataset.first(300))
     doubts_before_solving(dataset)                         # without a warning
     for found in solve.solutions(dataset):

@@ -5,10 +5,9 @@ import os
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
-from conftest import copied
+from conftest import ROOT, copied
 from test_report import make_data
 
 from slamlib.__main__ import main
@@ -17,7 +16,6 @@ from slamlib.report import execution
 from slamlib.report.execution import kernel_environment
 from slamlib.simulation import write_dataset
 
-ROOT = Path(__file__).parents[1]
 SECONDS = 300
 NEWS = "Would you like to get notified about official Jupyter news?"
 

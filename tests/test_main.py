@@ -4,11 +4,10 @@ import json
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import contradicted
+from conftest import ROOT, contradicted
 
 import slamlib
 from slamlib import se2, slam, solve
@@ -18,8 +17,6 @@ from slamlib.odometry import equation2
 from slamlib.results import read_structs
 from slamlib.simulation import simulate, write_dataset
 from slamlib.swap import file_names
-
-ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture
@@ -130,6 +127,9 @@ SOLVE = ["solve", "good", "--out", "out"]
     ([*SOLVE, "more"], "unrecognized arguments: more"),
     (["simulate", ".", "--seed", "1"], "new or empty folder"),
     (["report", "--notebooks", ROOT / "notebooks", "--data", "nowhere"], "nowhere"),
+    (["report", "--notebooks", ".", "--data", "."], "found no notebooks"),
+    (["report", "medium", "good", "--notebooks", ROOT / "notebooks", "--data", "."],
+     ": expected one of bad, good, found 'medium'"),
     (["hand-in", "--out", "."], "expected a file to write, found a folder"),
     ([], "required"),
 ])

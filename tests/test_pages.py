@@ -12,7 +12,7 @@ from urllib.parse import unquote, urlparse
 import nbformat
 import numpy as np
 import pytest
-from conftest import BROUGHT, STUDY_SEEDS, built_elsewhere, contradicted, copied
+from conftest import BROUGHT, ROOT, STUDY_SEEDS, built_elsewhere, contradicted, copied
 
 from slamlib.dataset import read_dataset
 from slamlib.odometry import equation2
@@ -21,7 +21,6 @@ from slamlib.results import read_structs
 from slamlib.simulation import simulate, write_dataset
 from slamlib.solve import PROBLEMS
 
-ROOT = Path(__file__).parents[1]
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_seeds")]
 # Elements that reach beyond the column, unless what holds them can be scrolled sideways.
 STICKING_OUT = """() => {

@@ -1,14 +1,14 @@
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import ROOT
 
 from slamlib import evaluation, odometry, se2
 from slamlib.dataset import Vehicle, read_dataset, read_truth
 from slamlib.simulation import simulate, write_dataset
 
-DATA = Path(__file__).parents[1] / "data"
+DATA = ROOT / "data"
 RECIPES = {"short": dict(path="short", seed=1),
            "long": dict(path="long", seed=2, late_ranges=0.05, mislabelled=0.005)}
 

@@ -3,8 +3,6 @@
 import os
 import re
 import shutil
-import subprocess
-import sys
 
 import numpy as np
 import pandas as pd
@@ -97,14 +95,6 @@ def test_the_digest_of_the_code_changes_with_every_module_that_computes(tmp_path
     installed = memory.version
     monkeypatch.setattr(memory, "version", lambda name: installed(name) + (name == "gtsam") * "1")
     assert memory.code_digest() != memory.CODE_DIGEST
-
-
-def test_montecarlo_imports_no_module_that_the_digest_leaves_out():
-    program = "import sys, slamlib.studies.montecarlo; print(*sys.modules)"
-    loaded = subprocess.run([sys.executable, "-c", program], text=True, capture_output=True,
-                            check=True)
-    assert "slamlib.slam" in loaded.stdout.split()
-    assert not re.search(r"slamlib\.(notebook|report|__main__)", loaded.stdout)
 
 
 def test_a_study_of_several_processes_equals_that_of_one(monkeypatch, tmp_path):

@@ -1,9 +1,4 @@
-"""Time and memory of `slamlib solve`, beside a plain script, and by the length of a drive.
-
-    python tests/benchmarks/speed.py [large]
-
-With `large` the plain script runs on the longer drives too.
-"""
+"""Time and memory of `slamlib solve`, beside a plain script, and by the length of a drive."""
 
 import json
 import os
@@ -72,30 +67,29 @@ def pairs(count=PAIRS):
         + " (problems 1 and 2 in a second process, where there is a second core)")
 
 
-def growth(folder, large):
+def growth(folder):
     """Print times and memory by the length of the drive."""
     print("\nThe long path driven several times: seconds of each problem, and of all")
     print(f"{'rows':>10}" + "".join(f"{name.removeprefix('problem'):>9}" for name in PROBLEMS)
-          + f"{'solve':>9}{'ms/1000':>10}{'MB':>7}{'plain 4':>9}")
+          + f"{'solve':>9}{'ms/1000':>10}{'MB':>7}")
     for rounds in ROUNDS:
         drive = folder / f"{rounds} rounds"
         subprocess.run([sys.executable, "-m", "slamlib", "simulate", drive, "--path", "long",
                         "--seed", "3", "--rounds", str(rounds)], check=True)
         seconds, parts, memory = solve(drive)
         rows = rounds * simulation.PATHS["long"].poses
-        beside = f"{plain(drive)[0]:9.1f}" if large or rounds == 1 else f"{'–':>9}"
         print(f"{rows:10,}" + "".join(f"{parts[name]:9.2f}" for name in PROBLEMS)
-              + f"{seconds:9.1f}{1e6 * seconds / rows:10.0f}{memory:7.0f}{beside}", flush=True)
+              + f"{seconds:9.1f}{1e6 * seconds / rows:10.0f}{memory:7.0f}", flush=True)
 
 
-def main(large=False):
+def main():
     print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.2f} before")
     if LONG.exists():
         pairs()
     with tempfile.TemporaryDirectory() as folder:
-        growth(Path(folder), large)
+        growth(Path(folder))
     print(f"load {os.getloadavg()[0]:.2f} after")
 
 
 if __name__ == "__main__":
-    main("large" in sys.argv[1:])
+    main()

@@ -1,0 +1,241 @@
+"""The project: imports run downwards, installations are complete, notebooks are stripped."""
+
+import ast
+import json
+import re
+import subprocess
+import sys
+import tomllib
+from graphlib import TopologicalSorter
+from importlib.metadata import packages_distributions, requires
+from pathlib import Path
+from types import SimpleNamespace
+
+import nbformat
+import pytest
+import yaml
+from conftest import ROOT
+
+from slamlib.report import notebooks
+
+sys.path.insert(0, str(ROOT))
+import check_python  # noqa: E402
+from strip_notebooks import main, restored  # noqa: E402
+
+PACKAGE, STRIP = ROOT / "slamlib", ROOT / "strip_notebooks.py"
+NUMERICS = ("localization", "slam")          # and the modules of slamlib itself
+FILES = sorted(PACKAGE.rglob("*.py"))
+MAX_MODULE, MAX_BODY = 330, 40               # lines; of a function without its docstring
+
+
+def name_of(file):
+    parts = ("slamlib", *file.relative_to(PACKAGE).with_suffix("").parts)
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+MODULES = {name_of(file): ast.parse(file.read_text(encoding="utf-8")) for file in FILES}
+
+
+def imported(module):
+    """Full names of what a module imports, in functions too, beside the modules that hold them."""
+    for node in ast.walk(MODULES[module]):
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert not node.level, f"{module}: expected absolute imports"
+            yield from ((f"{node.module}.{alias.name}", node.module) for alias in node.names)
+
+
+def imports(module):
+    """Names of slamlib's modules that a module imports."""
+    return {name if name in MODULES else owner for name, owner in imported(module)} & {*MODULES}
+
+
+def package(module):
+    """The sub-package of a module, "" for the modules of slamlib itself."""
+    parts = module.split(".")
+    return parts[1] if len(parts) > 1 and (PACKAGE / parts[1]).is_dir() else ""
+
+
+def outside(module):
+    """Names of the packages besides slamlib that a module imports, and "importlib"."""
+    names = {owner.partition(".")[0] for _, owner in imported(module)}
+    return names - (sys.stdlib_module_names - {"importlib"}) - {"slamlib"}
+
+
+def test_numerics_use_numpy_scipy_and_gtsam_only():
+    """And of slamlib's own modules none that judges, writes or simulates."""
+    others = {f"slamlib.{name}" for name in (
+        "evaluation", "results", "solve", "simulation", "swap")}
+    for module in MODULES:
+        if package(module) in NUMERICS:
+            assert outside(module) <= {"numpy", "scipy", "gtsam"}, module
+            assert not imports(module) & others, module
+    assert "slamlib.evaluation" not in imports("slamlib.dataset") | imports("slamlib.sightings")
+
+
+def test_arrows_run_downwards():
+    """Numerics import no studies, notebooks or pages; studies import no notebooks or pages."""
+    lower = {"": {""}, "localization": {""}, "slam": {""}, "checks": {"", *NUMERICS},
+             "studies": {"", *NUMERICS}, "notebook": {"", *NUMERICS, "studies"},
+             "report": {"", *NUMERICS, "checks", "studies", "notebook"}}
+    above = {"slamlib.solve": {*NUMERICS, "checks"}}
+    for module in MODULES:
+        of, own = package(module), module.rpartition(".")[0]
+        if module != "slamlib.__main__":
+            assert {package(name) for name in imports(module)} <= {
+                of, *lower[of], *above.get(module, ())}, module
+        assert own == "slamlib" or own not in imports(module), f"{module} imports its own package"
+
+
+def test_no_module_imports_itself_by_way_of_others():
+    """A package's __init__ only gathers names: its own modules do not count as importing it."""
+    TopologicalSorter({module: {name for name in imports(module)
+                                if not module.startswith(f"{name}.")}
+                       for module in MODULES}).prepare()
+
+
+def test_modules_and_functions_are_short():
+    for file in FILES:
+        assert file.read_text(encoding="utf-8").count("\n") <= MAX_MODULE, file
+        for node in ast.walk(MODULES[name_of(file)]):
+            if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+                first = node.body[bool(ast.get_docstring(node) and len(node.body) > 1)]
+                assert node.end_lineno - first.lineno + 1 <= MAX_BODY, (file, node.name)
+
+
+# Installations.
+
+
+def required(lines):
+    """Requirements as {name: the rest of its line}, of lines as `numpy` or `gtsam==4.3.0`."""
+    found = (re.fullmatch(r"([\w-]+)(.*)", line) for line in lines)
+    return {each[1].lower().replace("_", "-"): each[2].strip() for each in found}
+
+
+def test_the_environment_of_conda_has_what_the_lock_is_made_from():
+    """What pip installs there has the lock's versions, and gtsam the first two numbers of its."""
+    *conda, by_pip = yaml.safe_load((ROOT / "environment.yml").read_text())["dependencies"]
+    conda, by_pip = required(conda), required(by_pip["pip"])
+    asked = required(line for line in (ROOT / "requirements.in").read_text().splitlines()
+                     if not line.startswith("#"))
+    assert conda.keys() | by_pip.keys() == asked.keys() | {"python", "pip"}
+    assert not conda.keys() & by_pip.keys()
+    assert {name: asked[name] for name in by_pip} == by_pip
+    assert asked["gtsam"].startswith(f"=={conda['gtsam'].removesuffix('*')}")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert required(project["dependencies"]).keys() <= asked.keys()
+    assert conda["python"] in [f"3.{minor}.*" for minor in range(11, 15)]
+
+
+def test_what_slamlib_imports_is_a_dependency_or_comes_with_one():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    asked = required(project["dependencies"])
+    there = asked.keys() | required(line for each in asked for line in requires(each) or ()
+                                    if "extra ==" not in line).keys()
+    found = {name for module in MODULES for name in outside(module) - {"importlib"}}
+    assert {packages_distributions()[name][0].lower().replace("_", "-") for name in found} <= there
+
+
+def test_the_version_that_check_python_asks_for_is_the_one_that_is_pinned():
+    assert check_python.installed() == check_python.GTSAM
+    asked = (ROOT / "requirements.in").read_text()
+    assert f"gtsam=={'.'.join(check_python.GTSAM)}." in asked
+
+
+RIGHT = {"system": "Linux", "machine": "x86_64", "libc": "glibc", "version": (3, 12, 0)}
+
+
+@pytest.mark.parametrize("wrong, gtsam, said", [
+    ({}, None, None), ({"machine": "riscv64"}, None, "riscv64"), ({"libc": ""}, None, "glibc"),
+    ({"version": (3, 10, 9)}, None, "Python 3.11 to 3.14"),
+    ({"version": (3, 15, 0)}, None, "Python 3.11 to 3.14"),
+    ({"system": "Windows"}, None, "environment.yml"), ({"system": "Windows"}, "4.3", None),
+    ({"system": "Windows"}, "4.2", "WSL2"),
+    ({"system": "Windows", "version": (3, 10, 9)}, "4.3", "WSL2")])
+def test_wrong_python_or_platform_is_one_sentence(monkeypatch, wrong, gtsam, said):
+    """Unless the gtsam of conda is there."""
+    here = SimpleNamespace(**RIGHT | wrong)
+    monkeypatch.setattr(check_python, "installed", lambda: gtsam and gtsam.split("."))
+    monkeypatch.setattr(check_python, "sys", SimpleNamespace(
+        version_info=here.version, executable="python"))
+    monkeypatch.setattr(check_python, "platform", SimpleNamespace(
+        system=lambda: here.system, machine=lambda: here.machine,
+        libc_ver=lambda: (here.libc, ""), python_implementation=lambda: "CPython"))
+    found = check_python.problem()
+    assert found is None if said is None else said in found and "\n" not in found
+
+
+def test_notebooks_are_those_of_the_folder_else_those_beside_the_sources(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert notebooks.notebooks_folder() == ROOT / "notebooks"
+    (tmp_path / "notebooks").mkdir()
+    assert notebooks.notebooks_folder() == Path("notebooks")
+
+
+# Notebooks as JupyterLab saves them go back to the committed bytes.
+
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+
+
+def save_as_lab(file):
+    """Save a notebook as JupyterLab does after a run: with outputs, counts and its metadata."""
+    book = nbformat.read(file, as_version=4)
+    for number, cell in enumerate(book.cells):
+        cell.metadata |= {"editable": True, "slideshow": {"slide_type": ""},
+                          "tags": cell.metadata.get("tags", [])}
+        if cell.cell_type == "code":
+            cell.metadata |= {"execution": {"iopub.execute_input": "2026-01-01T00:00:00.0Z"},
+                              "jupyter": {"source_hidden": True}, "collapsed": True,
+                              "scrolled": True, "trusted": True}
+            cell.outputs = [nbformat.v4.new_output("stream", text="of JupyterLab: \u00e9")]
+            cell.execution_count = number
+        else:
+            cell.attachments = {}
+    book.metadata |= {
+        "kernelspec": {"display_name": ".venv (3.99)", "language": "python", "name": "python3"},
+        "language_info": {"name": "python", "version": "3.99", "pygments_lexer": "ipython3",
+                          "codemirror_mode": {"name": "ipython", "version": 3}},
+        "widgets": {"application/vnd.jupyter.widget-state+json": {"state": {}}}}
+    nbformat.write(book, file)
+
+
+def strip(*files, content=b""):
+    return subprocess.run([sys.executable, STRIP, *files], input=content, capture_output=True,
+                          timeout=300)
+
+
+def test_what_jupyterlab_saves_is_restored_to_the_byte(tmp_path):
+    saved, committed = [], [restored(source.read_bytes()) for source in NOTEBOOKS]
+    for source, content in zip(NOTEBOOKS, committed):      # the files may hold outputs here
+        saved += [tmp_path / source.name, tmp_path / f"other {source.name}"]
+        saved[-2].write_bytes(content)
+        save_as_lab(saved[-2])
+        saved[-1].write_text(json.dumps(json.loads(content), indent=4), encoding="utf-8")
+        assert content not in (file.read_bytes() for file in saved[-2:])
+    assert strip(content=saved[0].read_bytes()).stdout == committed[0]
+    assert strip(*saved).returncode == 0
+    for number, file in enumerate(saved):
+        assert file.read_bytes() == committed[number // 2]
+        nbformat.validate(nbformat.read(file, as_version=4))
+
+
+def test_what_the_report_reads_stays():
+    cell = nbformat.v4.new_code_cell("1", id="a", metadata={"tags": ["html-only"], "alt": "A dot"})
+    text = nbformat.v4.new_markdown_cell("![](attachment:a.png)", id="b", attachments={
+        "a.png": {"image/png": "AA=="}})
+    book = nbformat.v4.new_notebook(cells=[cell, text], metadata={"slamlib": {"needs": "uwb"}})
+    found = nbformat.reads(restored(nbformat.writes(book).encode()).decode(), 4)
+    assert found.metadata.slamlib == {"needs": "uwb"}
+    assert found.cells == book.cells
+
+
+def test_what_is_no_notebook_is_told_and_left_as_it_is(tmp_path):
+    file = tmp_path / "a.ipynb"
+    for content in (b"not JSON", b"[]", b"{}", b'{"cells": [5], "metadata": {}}', b"\xff",
+                    b'{"cells": [{}], "metadata": {}}'):
+        file.write_bytes(content)
+        assert "a.ipynb is not a notebook: " in main([str(file)])
+        assert file.read_bytes() == content
+    done = strip(content=b"[]")
+    assert done.returncode == 1 and done.stdout == b"" and done.stderr.count(b"\n") == 1
