@@ -100,7 +100,7 @@ def trial(seed, poses, **options):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("options, poses", [*zip(OPTIONS, (1000, 1000))])
+@pytest.mark.parametrize("options, poses", [*zip(OPTIONS, (2000, 1000))])
 def test_monte_carlo_is_consistent(options, poses):
     """Means over 24 drives lie in the band of the mean of 24 independent NEES.
 
