@@ -14,6 +14,7 @@ TICK_LENGTH = 0.022            # of a marker's heading tick, in the map's extent
 ELLIPSE_COUNT = 24             # ellipses of the vehicle, at equal distances along the path
 OUTLINE = np.linspace(0, 2 * np.pi, 12, endpoint=False)    # rad, points of ellipses to leave free
 NAME, ANTENNA_NAME = 7.0, 10.5     # points, font sizes of the names of markers and antennas
+MARGIN = 0.8                       # points, left free around a name
 # Directions from a landmark to its name, in rad, tried in this order.
 NAME_DIRECTIONS = np.radians([40, 140, -40, -140, 90, -90, 0, 180, 65, 115, -65, -115, 20, 160])
 NAME_DISTANCES = 4.0, 6.0, 9.0, 13.0       # points, from a landmark to its name's box
@@ -74,8 +75,11 @@ def _name_landmarks(ax, result, doubt, enlarged):
     MAX_COST is left out.
     """
     places, weak = result.marker_in_world, np.isin(result.marker, result.unconfirmed)
-    variances, axes = np.linalg.eigh(result.marker_covariance[:, :2, :2])
-    outlines = places[:, :2, None] + enlarged * evaluation.REACH_95 * axes * np.sqrt(
+    some = plotting.equidistant(result.poses, ELLIPSE_COUNT)
+    centres = np.concatenate([places[:, :2], result.poses[some, :2]])
+    variances, axes = np.linalg.eigh(np.concatenate([
+        result.marker_covariance, result.covariances[some]])[:, :2, :2])
+    outlines = centres[:, :, None] + enlarged * evaluation.REACH_95 * axes * np.sqrt(
         np.maximum(variances, 0))[:, None] @ [np.cos(OUTLINE), np.sin(OUTLINE)]
     names = [*zip(result.antenna, result.antenna_in_world, doubt, repeat(ANTENNA_NAME)),
              *zip(result.marker, places[:, :2], weak, repeat(NAME))]
@@ -95,7 +99,7 @@ def _name_landmarks(ax, result, doubt, enlarged):
                            fontsize=size, fontweight="bold" if size > NAME else "normal")
         text.set_in_layout(False)
         extent = text.get_window_extent(renderer)
-        half = np.array([extent.width, 0.8 * size * point]) / 2
+        half = np.array([extent.width, 0.8 * size * point]) / 2 + MARGIN * point
         edge = np.min(half / np.maximum(np.abs(direction), 1e-9), axis=1)   # to that of its box
         offset = direction * (edge + reach * point * size / NAME)[:, None]
         low, high = anchor + offset - half, anchor + offset + half

@@ -256,7 +256,8 @@ def slam_graph(ax, poses, sightings):
     factors += [("odometry", f"$X_{i}$", f"$X_{i + 1}$", "$w$") for i in range(1, poses)]
     for role, *names in factors + [("truth", "$X_1$"), ("truth", "$w$")]:
         ends = np.array([places[name] for name in names])
-        middle = ends.mean(axis=0) - [0.3 * (len(names) == 1), 0.0]         # priors stand beside
+        middle = np.average(ends, axis=0, weights=[0.6, 0.4] if len(ends) == 2 else None) - [
+            0.3 * (len(names) == 1), 0.0]         # priors stand beside; no squares at crossings
         for end in ends:
             ax.plot(*np.stack([end, middle]).T, color=ROLES[role]["color"], linewidth=0.9, zorder=1)
         ax.plot(*middle, "s", color=ROLES[role]["color"], markersize=4.5, zorder=2)
