@@ -17,10 +17,11 @@ from slamlib.checks.solution import solution_doubts
 from slamlib.dataset import Vehicle, read_dataset, read_truth
 from slamlib.evaluation import align, anees, ate
 from slamlib.localization import fuse, fuse_increments, localize
+from slamlib.odometry import dead_reckoning
 from slamlib.simulation import mislabel, simulate
 from slamlib.slam import calibration, choices, graph, own
 from slamlib.slam.calibration import ANTENNAS, ENTRIES, HEIGHT, RANGE_LAG, SIGHTING_LAG, SIZE
-from slamlib.slam.factors import SMOOTHED_STEPS
+from slamlib.slam.factors import SMOOTHED_STEPS, sensor_poses
 from slamlib.slam.fit import KERNELS, ONE_SIDED
 from slamlib.slam.initialization import odometry_state
 from slamlib.slam.linear import NormalEquations, build_problem, linear_solution, retract
@@ -87,6 +88,20 @@ def test_derivatives_by_every_entry(vehicle):
         scale = np.abs(numeric).max(axis=(0, 1)) + 1e-9
         assert (np.abs(J - numeric) < np.where(delays, 0.1, 1e-6) * scale).all()
         assert (np.abs(J).max(axis=(0, 1)) > 0).sum() == (5, 6 + 4)[kind]
+
+
+def test_sensors_are_where_the_vehicle_was_by_their_delay():
+    """On the path of odometry, a camera that is four and a tag that is seven encoder steps late."""
+    dataset, c = simulate("short", 4)[0].first(400), calibration.stated_calibration(
+        MOUNTED, []).stated
+    m, path = measure(dataset), dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")
+    c[[SIGHTING_LAG, RANGE_LAG]] = 4, 7
+    for found, row, late, place in zip(
+            sensor_poses(m, path[m.frame], c), (m.sightings.row, m.ranges.row), (4, 7),
+            (c[calibration.CAMERA], [*c[calibration.TAG_PLACE], 0.0])):
+        later = m.frame[row] >= late
+        expected = se2.compose(path[m.frame[row[later]] - late], place)
+        np.testing.assert_allclose(found[later], expected, atol=1e-9)
 
 
 def test_the_posterior_is_that_of_gtsam():

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from conftest import ROOT, contradicted
 
-import slamlib
 from slamlib import se2, slam, solve
 from slamlib.__main__ import main
 from slamlib.dataset import read_dataset
@@ -98,12 +97,6 @@ def test_results_never_replace_the_dataset_or_the_current_folder(tmp_path, monke
                 and told.count("\n") == 1
     assert file_names(tmp_path) == ["drive/encoderReading.txt"]
     assert main(["solve", "../drive", "--out", "../drive/out", "--problem", "1"]) == 0
-
-
-def test_version(capsys):
-    with pytest.raises(SystemExit, match="^0$"):
-        main(["--version"])
-    assert capsys.readouterr().out == f"slamlib {slamlib.__version__}\n"
 
 
 SOLVE = ["solve", "good", "--out", "out"]

@@ -89,14 +89,6 @@ def test_encoder_error_is_rounding_and_a_random_walk(slip):
         assert abs(ratio - 1) < 4 * np.sqrt(2 / per_metre.size)
 
 
-def test_wheel_parameters_are_drawn_from_table_2():
-    draws = np.array([[v.right_radius, v.left_radius, v.wheelbase]
-                      for v in (simulate("short", seed)[1].vehicle for seed in range(60))])
-    z = (draws - [0.1, 0.1, 0.4]) / 1e-4
-    assert np.abs(z.mean(0)).max() < 4 / np.sqrt(60)
-    assert np.abs(np.mean(z**2, 0) - 1).max() < 4 * np.sqrt(2 / 60)
-
-
 def test_outliers_come_at_the_asked_rates_and_late_ranges_are_too_long():
     clean, truth = simulate("long", seed=8)
     dirty, same_truth = simulate("long", seed=8, late_ranges=0.15, mislabelled=0.03)
