@@ -78,10 +78,6 @@ def test_covariances_are_those_of_all_sightings_through_numerical_derivatives():
 OPTIONS = [{"mislabelled": 0.03}, {"slip": 3e-3}]
 
 
-def rms(values):
-    return np.sqrt(np.mean(values**2))
-
-
 def trial(seed, poses, **options):
     """Errors of markers alone and of the fusion on one drive, their NEES, and the slip found."""
     dataset, truth = simulate("short", seed, **options)
@@ -119,7 +115,7 @@ def test_monte_carlo_is_consistent(options, poses):
         assert np.median(runs[f"{method} ate"] / runs["odometry ate"]) < 0.6
         assert decided(0.6**2 * squared["odometry"] - squared[method])
     assert decided(squared["ArUco"] - squared["fused"])
-    assert rms(runs["ArUco ate"]) < 0.1                                         # m, on 20 m
+    assert np.sqrt(np.mean(runs["ArUco ate"]**2)) < 0.1                         # m, on 20 m
     assert 0.8 < np.exp(np.mean(np.log(runs["slip"]))) / options.get("slip", 1e-3) < 1.25
 
 
