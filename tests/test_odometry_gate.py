@@ -41,6 +41,17 @@ def test_the_score_of_two_sightings_by_hand():
     np.testing.assert_allclose(squared, 0.1**2 / (2 * 1e-4 + gate.FLOOR**2), rtol=1e-9)
 
 
+def test_the_noise_of_motions_by_hand():
+    """Half a metre straight on, and 60 degrees on the spot, whose lever arm is that of a camera."""
+    path = np.array([[0, 0, 0], [0.3, 0.4, 0], [0.3, 0.4, np.pi / 3]])
+    drive = gate._Drive.without_jumps(path, 0.4)
+    (straight, spot), floor = drive.motions([0, 1], [1, 2])[1], gate.FLOOR**2
+    turn = 2 * 0.5 * (gate.SLIP / 0.4)**2 + floor
+    across = turn * 0.5**2 / 3 + floor
+    np.testing.assert_allclose(straight, np.diag([across + 0.5 * gate.SLIP**2 / 2, across, turn]))
+    np.testing.assert_allclose(spot, np.diag([gate.LEVER**2 + floor] * 2 + [floor]))
+
+
 def test_a_jump_of_a_vehicle_that_stands_is_found_where_it_is():
     """And a second one; between them, frames that see nothing of the kind."""
     poses = np.zeros((12, 3))
