@@ -175,8 +175,6 @@ solved(start(), problem2=lambda drive: find("problem2", drive.dataset),
 
 # report.toml
 
-COURSE = "Robotic Perception and Action"
-
 
 @pytest.mark.parametrize("text, expected", [
     ('author = "A"\nautor = "B"', "expected an entry such as author, "),
@@ -229,7 +227,7 @@ def test_every_entry_is_read_with_the_place_of_what_is_left_out(tmp_path):
 
 def test_the_committed_file_has_the_defaults_also_where_its_examples_are_read(tmp_path):
     text = (ROOT / "report.toml").read_text(encoding="utf-8")
-    assert read_options(ROOT / "report.toml") == Options(course=COURSE)
+    assert read_options(ROOT / "report.toml") == Options(course="Robotic Perception and Action")
     examples = re.sub(r"^# (?=\w+ = )", "", text, flags=re.MULTILINE)
     (tmp_path / "report.toml").write_text(examples)
     read = read_options(tmp_path / "report.toml")
