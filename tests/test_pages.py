@@ -143,7 +143,7 @@ def test_a_drive_that_fails_is_left_out_of_its_chapter_and_costs_the_others_noth
 
 def rows_of(page, name):
     """The texts of the cells of all rows that begin with the name of a drive."""
-    rows = [[html.unescape(re.sub(r"<[^>]+>", "", cell)).strip()
+    rows = [[html.unescape(re.sub(r"<[^>]+>", "", cell)).replace("\u00a0", " ").strip()
              for cell in re.findall(r"<td.*?</td>", row, re.DOTALL)]
             for row in re.findall(r"<tr.*?</tr>", page, re.DOTALL)]
     return [row[1:] for row in rows if row and row[0] == name]

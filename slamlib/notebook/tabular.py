@@ -28,7 +28,8 @@ def table(rows, caption=None):
     are left out. Of consecutive rows with the same first cell only the first shows it. `caption`
     (str) stands below.
     """
-    rows = [{name: cell(value) for name, value in row.items()} for row in rows]
+    rows = [{name: cell(value).replace(" ± ", "\u00a0±\u00a0") for name, value in row.items()}
+            for row in rows]
     columns = {name: [row.get(name, DASH) for row in rows] for row in rows for name in row}
     columns = {name: column for name, column in columns.items()
                if set(column) != {DASH}} or {DASH: [DASH]}
