@@ -247,7 +247,8 @@ def _in_two_processes(*arguments):
     """What `_solved` returns of all problems, in order; the second process solves INDEPENDENT."""
     receiver, sender = Pipe(duplex=False)
     if sys.platform == "linux":
-        get_context("fork").Process(target=_send, args=(sender, *arguments), daemon=True).start()
+        get_context("fork").Process(
+            target=_send, args=(receiver, sender, *arguments), daemon=True).start()
     sender.close()
     _, late = _solved(False, *arguments)
     try:
@@ -257,8 +258,9 @@ def _in_two_processes(*arguments):
     return doubts, early + late
 
 
-def _send(sender, *arguments):
+def _send(receiver, sender, *arguments):
     """Send what `_solved` returns from a process that Ctrl-C does not end."""
+    receiver.close()                       # so that the pipe breaks when the other one is killed
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with sender, suppress(BaseException):
         sender.send(_solved(True, *arguments))

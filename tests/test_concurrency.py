@@ -9,6 +9,7 @@ import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 
+import psutil
 import pytest
 from conftest import ROOT, is_running
 from test_report import build, make_data, write
@@ -244,6 +245,22 @@ sys.exit(main())""")
     assert process.returncode == 130 and not (tmp_path / "out").exists()
     assert hidden(tmp_path) == []
     assert not any(is_running(int(file.name.split()[1])) for file in found)
+
+
+@pytest.mark.skipif(PROCESSES < 2, reason="elsewhere one process solves all problems")
+def test_a_killed_solve_leaves_no_process_behind(tmp_path):
+    """Of the second one, whose results do not fit into the pipe to the first."""
+    write_dataset(tmp_path / "drive", simulate("short", seed=3)[0])
+    process = start(tmp_path, "solve", "drive", "--out", "out", code="""import os, sys, time
+from slamlib import solve
+from slamlib.__main__ import main
+find, first = solve.find, os.getpid()
+solve.find = lambda *given: time.sleep(1000) if os.getpid() == first else find(*given)
+sys.exit(main())""")
+    second = wait_for(psutil.Process(process.pid).children, process)
+    process.kill()
+    assert psutil.wait_procs(second, timeout=60)[1] == []
+    process.communicate()
 
 
 @pytest.mark.skipif(PROCESSES < 2, reason="elsewhere one process solves all problems")
