@@ -78,7 +78,6 @@ def test_text_keeps_every_digit_of_the_poses_that_are_known(tmp_path):
         assert first == header and [*map(float, last.split(","))] == row
 
 
-@pytest.mark.slow
 def test_evo_finds_the_errors_of_the_summary_in_what_solve_writes_as_text(tmp_path):
     """By evo's own command line, as it is and aligned; problem 2 has a tenth of the poses."""
     dataset, truth = simulate("short", 3)
