@@ -123,8 +123,8 @@ def _build(options):
     notebooks = options.notebooks or notebooks_folder()
     datasets = [Path(each).name if Path(each).resolve().parent == options.data.resolve() else each
                 for each in options.datasets] or None            # names, or paths in data/
-    for folder in (pages, options.results):
-        _require_elsewhere(folder, options.data, notebooks)
+    for folder, other in ((pages, options.results), (options.results, pages)):
+        _require_elsewhere(folder, options.data, notebooks, other)
     if out:
         require(not out.is_dir(), out, "a file to write, found a folder")
         shown = handin.hand_in_options(shown)
@@ -180,7 +180,7 @@ def _require_elsewhere(out, *folders):
 def _solve(options):
     from slamlib.dataset import inventory_lines
     from slamlib.solve import PROBLEMS, allows, solve_to_folder, title
-    _require_elsewhere(options.out, options.folder)
+    _require_elsewhere(options.out, options.folder, options.folder / "truth")
     require(not options.plot or options.plot.suffix.lower() in (".png", ".pdf", ".svg"), "--plot",
             "a .png, .pdf or .svg file", options.plot)
     dataset, truth = read_dataset(options.folder), read_truth(options.folder)

@@ -66,8 +66,7 @@ def simulate(path="short", seed=0, *, slip=1e-3, late_ranges=0.0, mislabelled=0.
             "slip and shares from 0 to 1")
     layout = PATHS[path]
     rng = np.random.default_rng(seed)
-    true_vehicle = vehicle.with_wheel(
-        vehicle.wheel + noise * rng.standard_normal(3) * vehicle.sigma_wheel)
+    true_vehicle = vehicle.with_wheel(vehicle.wheel + noise * rng.normal(0, vehicle.sigma_wheel))
     counts = _counts(*_driven_arcs(layout, rounds), true_vehicle)
     poses = dead_reckoning(counts, true_vehicle, model="arc")
     whole = _encoder(counts, true_vehicle, slip, rng)

@@ -235,8 +235,8 @@ def solve_to_folder(dataset, truth, out, problems=tuple(PROBLEMS), csv=False):
         summary = {"dataset": dataset.name, "poses": len(dataset.ticks),
                    "kernel": dataset.vehicle.kernel, "doubts": [*map(asdict, merged(doubts))],
                    "notes": all_notes(dataset, truth), "problems": rows}
-        text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-        swap.write_atomically(stage / results.SUMMARY, text.encode())
+        text = json.dumps(summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+        swap.write_atomically(stage / results.SUMMARY, text.encode(errors="backslashreplace"))
         if csv and truth is not None:
             results.write_tum(stage / "truth.tum", truth.poses)
         swap.publish({out: stage}, ours=RESULT_NAMES)
@@ -245,10 +245,9 @@ def solve_to_folder(dataset, truth, out, problems=tuple(PROBLEMS), csv=False):
 
 def _in_two_processes(*arguments):
     """What `_solved` returns of all problems, in order; the second process solves INDEPENDENT."""
-    receiver, sender = Pipe(duplex=False)
+    receiver, sender = pipe = Pipe(duplex=False)
     if sys.platform == "linux":
-        get_context("fork").Process(
-            target=_send, args=(receiver, sender, *arguments), daemon=True).start()
+        get_context("fork").Process(target=_send, args=(pipe, *arguments), daemon=True).start()
     sender.close()
     _, late = _solved(False, *arguments)
     try:
@@ -258,12 +257,12 @@ def _in_two_processes(*arguments):
     return doubts, early + late
 
 
-def _send(receiver, sender, *arguments):
+def _send(pipe, *arguments):
     """Send what `_solved` returns from a process that Ctrl-C does not end."""
-    receiver.close()                       # so that the pipe breaks when the other one is killed
+    pipe[0].close()                        # so that the pipe breaks when the other one is killed
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    with sender, suppress(BaseException):
-        sender.send(_solved(True, *arguments))
+    with pipe[1], suppress(BaseException):
+        pipe[1].send(_solved(True, *arguments))
 
 
 def _solved(independent, dataset, problems):

@@ -111,16 +111,17 @@ def publish(made, ours=()):
 
 
 def _add_the_users_files(folder, new, ours):
-    """Copy the files that no run wrote from a folder, if it exists, to the new one."""
+    """Copy the files that no run wrote from a folder, and of a killed run's, to the new one."""
     new.mkdir(exist_ok=True)
     names = file_names(new)
-    source = folder if folder.exists() else beside(folder, "old")   # of a run that was killed
-    listed = source / FILE_LIST
-    ours = {FILE_LIST, *ours, *names, *(json.loads(listed.read_bytes()) if listed.exists() else ())}
-    for name in {*file_names(source)} - ours:
-        if not name.endswith(".part"):
-            (new / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(source / name, new / name, follow_symlinks=False)
-            shutil.copystat(source / name, new / name, follow_symlinks=False)
+    for source in filter(Path.exists, (beside(folder, "old"), folder)):
+        listed = []
+        with suppress(OSError, ValueError, TypeError):      # there is none, or it is damaged
+            listed = [*json.loads((source / FILE_LIST).read_bytes())]
+        for name in {*file_names(source)} - {FILE_LIST, *ours, *names, *listed}:
+            if not (name.endswith(".part") and Path(name).name.startswith(".")):
+                (new / name).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(source / name, new / name, follow_symlinks=False)
+                shutil.copystat(source / name, new / name, follow_symlinks=False)
     if names:
         (new / FILE_LIST).write_text(json.dumps(names))

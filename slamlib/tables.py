@@ -87,7 +87,7 @@ SYSTEM_FILES = re.compile(r"\..*(?<!\.icloud)|thumbs\.db|desktop\.ini|__macosx",
 MAX_LISTED_NAMES = 5  # file names in one sentence
 
 COMMENT_OR_QUOTE = re.compile(r'(#|%|//).*|"')
-NUMBER_FIRST = re.compile(r"(^|[\s,;])\W*(\d|nan\b|inf)", re.IGNORECASE)  # in a row, not a header
+NUMBER_FIRST = re.compile(r"(^|[\s,;])\W*(\d|nan\b|inf(inity)?\b)", re.I)  # in a row, not a header
 NUMBER = {sign: rf"[+-]?(?:(?:{digits})(?:e[+-]?[0-9]+)?|nan|inf(?:inity)?)" for sign, digits in (
     (".", r"[0-9]+(?:\.[0-9]*)?|\.[0-9]+"), (",", "[0-9]+(?:,[0-9]+)?"))}
 DIALECTS = (None, "."), (",", "."), (";", "."), (None, ","), (";", ",")  # separator, decimal sign
@@ -110,11 +110,11 @@ class Table:
         """What messages call row k (str)."""
         return f"{'line' if isinstance(self.source, Path) else 'row'} {self.lines[k]}"
 
-    def kept(self, ok, expected, share=0.0):
+    def kept(self, ok, expected, most=0):
         """The Table of the rows where `ok` (m,) or (m, c) is True, with a note on the others.
 
         `expected` (str) may be one for each of c columns. Raises DatasetError for the first of the
-        others if they are more than a share of the rows.
+        others if they are more than `most`.
         """
         if ok.all():
             return self
@@ -124,7 +124,7 @@ class Table:
         expected = expected if isinstance(expected, str) else expected[column]
         found = " ".join(f"{x:.12g}" for x in np.atleast_1d(self.numbers[first, column]))
         said, place = f"{expected}, found '{found}'", self.place(first)
-        require(count <= share * len(bad), f"{self.source}, {place}", said)
+        require(count <= most, f"{self.source}, {place}", said)
         return replace(self, numbers=self.numbers[~bad], lines=self.lines[~bad]).noted(
             f": {count} of {len(bad)} rows left out, the first in {place}: expected {said}")
 
@@ -142,15 +142,15 @@ def read_table(source, name, pose_count=None):
     measured = (table.numbers != 0) | (np.array([*limits]) != "range")
     table = table.kept(measured & ~np.isnan(table.numbers), [
         f"{column}, a number{' (0 is no reception)' * (column == 'range')}" for column in limits],
-        share=bool(pose_count))
+        most=len(table.numbers) * bool(pose_count))
     table.kept((table.numbers[:, 0] != 0) | (not pose_count), "pose ids from 1 on")
-    share = MAX_BAD_SHARE * bool(pose_count)
+    most, rows = MAX_BAD_SHARE * len(table.numbers) * bool(pose_count), len(table.numbers)
     ok = [limit.holds(x) for limit, x in zip(limits.values(), table.numbers.T)]
     table = table.kept(np.stack(ok, axis=-1), [
         f"{column}, a {'whole' if limit.whole else 'finite'} number {limit}"
-        for column, limit in limits.items()], share)
-    right, expected = CHECKS[name]
-    return table.kept(right(table.numbers), expected, share)
+        for column, limit in limits.items()], most)
+    return table.kept(CHECKS[name][0](table.numbers), CHECKS[name][1],
+                      most - rows + len(table.numbers))
 
 
 def table_of_array(source, value, name, counted=False):
@@ -161,7 +161,7 @@ def table_of_array(source, value, name, counted=False):
     """
     columns = list(LIMITS[name])[counted:]
     try:
-        array = np.asarray(value, dtype=float)
+        array = np.asarray(value, dtype=float if np.isrealobj(value) else object)
     except (TypeError, ValueError):
         array = np.asarray(value, dtype=object)
     array = np.empty((0, len(columns))) if value is None or not array.size else array
@@ -222,7 +222,8 @@ def contents(folder, expected=DATASET_FILES, required=None):
         files[name] = path
         notes += [f"{path.name} was read as {name}."] * (path.name.lower() != name.lower())
     if expected is DATASET_FILES:
-        rest = [path for path in rest if not _add_variables(files, path, notes)]
+        rest = [path for path in rest
+                if not path.is_file() or not _add_variables(files, path, notes)]
     require(required in (None, *files), folder / (required or ""),
             ". ".join(["this file, found none", *_not_read(rest)]).rstrip("."))
     return files, notes + _not_read(rest)

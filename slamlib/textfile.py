@@ -50,6 +50,5 @@ def read_text(path):
     except OSError:
         data = None
     require(data is not None, path, "a file that can be read")
-    encoding = detect_encoding(data)             # by a byte order mark, or by where NUL bytes are
-    text = data.decode(encoding, errors="replace").removeprefix("\ufeff")
+    text = data.decode(detect_encoding(data), errors="replace").removeprefix("\ufeff")
     return text.replace("\r\n", "\n").replace("\r", "\n")

@@ -28,9 +28,7 @@ STUDY_SEEDS = "2"            # in pages that tests build: their claims are teste
 # The longest come first, and those that mostly wait beside those that start further processes.
 FIRST = ("test_pages", "test_concurrency", "test_lab", "test_slam", "test_flaws", "test_memory",
          "test_uwb", "test_localization", "test_odometry_gate", "test_calibration", "test_docs",
-         "test_doubts", "test_report", "test_properties", "test_main", "test_handin",
-         "test_overview", "test_document", "test_library", "test_maps", "test_cache",
-         "test_studies")
+         "test_properties", "test_numbers", "test_report", "test_studies", "test_library")
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 

@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -103,7 +104,8 @@ def test_a_lock_has_one_holder_at_a_time_although_its_file_is_removed(tmp_path):
 
 def test_a_dataset_with_fewer_sensors_leaves_no_problem_of_another(tmp_path, drive):
     """What the user put there stays, also in a folder of a problem; so without a list of files."""
-    mine = ["notes.txt", "mine/problem2.mat", "problem2/notes.txt", "problem4/mine/a.mat"]
+    mine = ["notes.txt", "movie.part", "mine/problem2.mat", "problem2/notes.txt",
+            "problem4/mine/a.mat"]
     tmp_path /= "out"
     for listed in (True, False):
         solve_to_folder(drive, None, tmp_path)
@@ -112,8 +114,10 @@ def test_a_dataset_with_fewer_sensors_leaves_no_problem_of_another(tmp_path, dri
             (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
             (tmp_path / name).write_text(name)
         (tmp_path / "problem3" / ".vehiclePose.mat.part").write_text("of a killed run")
-        if not listed:  # written by an earlier version
-            (tmp_path / swap.FILE_LIST).unlink()
+        if not listed:  # damaged, or written by an earlier version
+            (tmp_path / swap.FILE_LIST).write_text("5")
+            (old := swap.beside(tmp_path, "old")).mkdir()        # a run was killed
+            shutil.move(tmp_path / "mine", old)
         solve_to_folder(drive.without("uwb").without("aruco"), None, tmp_path)
         assert swap.file_names(tmp_path) == sorted([
             swap.FILE_LIST, *mine, "problem1/vehiclePose.mat", "summary.json"])

@@ -1,5 +1,6 @@
 """Files as they come: the same numbers with a note, named as not read, or refused."""
 
+import os
 import shutil
 from pathlib import Path
 
@@ -125,6 +126,14 @@ def test_a_bad_row_costs_a_row_up_to_a_tenth_of_the_file(tmp_path, name, said, r
         f"{tmp_path / name}, line 3: expected {said}")
 
 
+def test_bad_rows_of_all_kinds_together_are_a_tenth_at_most(tmp_path):
+    write_dataset(tmp_path, simulate("short", 1)[0].first(300))
+    lines, bad = (tmp_path / "UwbReading.txt").read_text().splitlines(), ["1 5 -9 1", "999 5 1 1"]
+    each = len(lines) // 18 + 1
+    write(tmp_path / "UwbReading.txt", "\n".join(lines + [row for row in bad for _ in range(each)]))
+    assert "a range that is not below -5 sigma" in error_of(read_dataset, tmp_path)
+
+
 # Files of MATLAB.
 
 
@@ -160,9 +169,12 @@ def test_faults_in_a_mat_file_are_named_by_variable_and_row(folder):
 
 
 @pytest.mark.parametrize("content", [
-    b"", b"nonsense", b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + b"\0" * 99])
+    None, b"", b"nonsense", b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + b"\0" * 99])
 def test_a_mat_file_that_cannot_be_read_is_listed(folder, content):
-    write(folder / "UwbReading.mat", content)
+    if content is None:
+        os.mkfifo(folder / "UwbReading.mat")
+    else:
+        write(folder / "UwbReading.mat", content)
     (folder / "UwbReading.txt").unlink()
     assert read_dataset(folder).notes == ("Not read: 'UwbReading.mat'.",)
     (folder / "encoderReading.txt").unlink()
@@ -196,6 +208,7 @@ def test_arrays_are_the_dataset_of_their_files(folder):
      "left ticks), found float64 of shape (2, 1)"), ("ticks", None, [], ": expected at least"),
     ("ticks", (3, 1), np.nan, ", row 4: expected left ticks, a number"),
     ("aruco", None, [[1], [1, 2]], ": expected a matrix of real numbers with 11 columns (pose id"),
+    ("uwb", None, [[1, 3, 1j, 1]], "found object of shape (1, 4)"),
     ("uwb", None, [[1, "a"]], ": expected a matrix of real numbers with 4 columns (pose id, "
      "antenna id, range, sigma), found object of shape (1, 2)"),
     ("aruco", (2, 0), 5, ", row 3: expected pose id, a whole number from 1 to 4"),
@@ -212,7 +225,8 @@ def test_arguments_pass_the_checks_of_files_or_are_named_with_the_row(name, plac
         value, number = ARRAYS[name].copy(), value
         value[place] = number
     given = ARRAYS | {name: value}
-    assert error_of(Dataset.from_arrays, *given.values()).startswith(name + told)
+    said = error_of(Dataset.from_arrays, *given.values())
+    assert said.startswith(name) and told in said
 
 
 # Which file of a folder is which.

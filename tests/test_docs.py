@@ -15,15 +15,11 @@ PACKAGE = ROOT / "slamlib"
 CODE_PAGE = (ROOT / "docs" / "code.md").read_text(encoding="utf-8")
 MODULES = sorted(".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
                  for path in (ROOT / "slamlib").rglob("*.py") if path.stem != "__main__")
-WITH_EXAMPLES = {f"slamlib.{name}" for name in (
-    "se2", "odometry", "evaluation", "dataset", "results", "simulation", "slam.pipeline",
-    "localization.markers", "localization.fused")}
 
 
 @pytest.mark.parametrize("module", MODULES)
 def test_examples_in_docstrings_are_true(module, tmp_path, monkeypatch):
     if ">>> " not in find_spec(module).loader.get_source(module):
-        assert module not in WITH_EXAMPLES
         return
     monkeypatch.chdir(tmp_path)                                         # some write files
     failed, tried = doctest.testmod(import_module(module))

@@ -123,6 +123,11 @@ def test_links_lead_to_other_chapters_by_their_file_and_anchor(capsys):
     assert b"https://example.org/p" in content and b"notes.txt" not in content
 
 
+def test_a_name_of_a_file_in_the_overview_is_no_reference():
+    overview = titled("Overview", "Not read: 'figure 1.9.png'.")
+    assert "figure 1.9.png" in pages({Path("index"): overview, ONE: titled("1. One")})[0]["i"]
+
+
 @pytest.mark.parametrize("cells, reason", [
     ([figure("Figure 1.1. A."), "See figure 1.2."],
      "the text refers to figure 1.2, which does not exist"),

@@ -90,12 +90,14 @@ def test_results_never_replace_the_dataset_or_the_current_folder(tmp_path, monke
     monkeypatch.chdir(tmp_path / "here")
     for command in (["solve", "../drive", "--out"], ["report", "--data", "..", "--report"],
                     ["report", "--data", "..", "--results"]):
-        for out in ("..", ".", tmp_path, "../drive")[:4 if command[0] == "solve" else 3]:
+        for out in ("..", ".", tmp_path, "../drive", "../drive/truth")[
+                :5 if command[0] == "solve" else 3]:
             assert main([*command, str(out)]) == 2
             told = capsys.readouterr().err
             assert told.startswith(f"slamlib: {out}: expected another folder") \
                 and told.count("\n") == 1
     assert file_names(tmp_path) == ["drive/encoderReading.txt"]
+    assert main(["report", "--data", "..", "--notebooks", "..", "--report", "results/drive"]) == 2
     assert main(["solve", "../drive", "--out", "../drive/out", "--problem", "1"]) == 0
 
 

@@ -21,7 +21,7 @@ from slamlib.studies import memory
 from slamlib.studies.memory import digest
 
 VARIABLES, IGNORED = "SLAMLIB_", "SLAMLIB_STUDIES"  # begins those heeded, but this one
-UNSEEN = re.compile(r"(^|/)(\.|__pycache__/|build/|report/|results/)|\.ipynb$")  # paths
+UNSEEN = re.compile(r"(^|/)(\.|__pycache__/)|^(build|report|results)/|\.ipynb$")  # paths
 HEEDED_TAGS = {"raises-exception", LAB_ONLY}  # the tags of cells that nbclient heeds
 VERSIONS = 4  # of each notebook, the last used
 
@@ -30,8 +30,7 @@ def keys(books, datasets, environment):
     """Return {source: key} of books (dict from Path to NotebookNode), digests of what they need.
 
     `datasets` (list of Path) are the folders of the selected datasets, `environment` (dict of str)
-    the environment variables of the kernels. Where these folders are, and slamlib's, does not
-    matter.
+    the environment variables of the kernels. Where slamlib's code is does not matter.
     """
     notebooks = next(iter(books)).parent
     files = [(memory.SLAMLIB, file) for file in memory.modules("report")]
