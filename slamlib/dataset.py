@@ -148,7 +148,7 @@ def _dataset(files, vehicle, name, notes=()):
     seen, heard = (read_table(files.get(each), each, len(ticks)) for each in TABLES[1:3])
     guess = read_table(files.get(TABLES[3]), TABLES[3])
     heard.kept(np.isin(heard.numbers[:, 1], guess.numbers[:, 0]), "an antenna id that the guesses "
-               "have: UwbAntennaGuess.txt in the same folder, or guess")
+               "have, which ranges need: UwbAntennaGuess.txt in the same folder, or guess")
     (*sighting, rows), (*measured, ranges) = map(_in_order, (seen.numbers, heard.numbers))
     return Dataset(
         name=name, vehicle=vehicle, ticks=ticks,
