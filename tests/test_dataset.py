@@ -318,8 +318,8 @@ def test_the_limits_that_a_user_reads_are_those_of_the_reader():
 def test_missing_files(folder):
     (folder / "UwbAntennaGuess.txt").unlink()
     assert error_of(read_dataset, folder) == (
-        f"{folder / 'UwbReading.txt'}, line 1: expected an antenna id that the guesses have, "
-        "which ranges need: UwbAntennaGuess.txt in the same folder, or guess, found '4 900 2.5 0.1'")
+        f"{folder / 'UwbReading.txt'}, line 1: expected an antenna id that the guesses have, which "
+        "ranges need: UwbAntennaGuess.txt in the same folder, or guess, found '4 900 2.5 0.1'")
     for read, name in ((read_truth, "truth/vehiclePose.txt"), (read_dataset, "encoderReading.txt")):
         (folder / name).unlink()
         assert error_of(read, folder) == f"{folder / name}: expected this file, found none"
