@@ -235,7 +235,7 @@ def solve_to_folder(dataset, truth, out, problems=tuple(PROBLEMS), csv=False):
         summary = {"dataset": dataset.name, "poses": len(dataset.ticks),
                    "kernel": dataset.vehicle.kernel, "doubts": [*map(asdict, merged(doubts))],
                    "notes": all_notes(dataset, truth), "problems": rows}
-        text = json.dumps(summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+        text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
         swap.write_atomically(stage / results.SUMMARY, text.encode(errors="backslashreplace"))
         if csv and truth is not None:
             results.write_tum(stage / "truth.tum", truth.poses)

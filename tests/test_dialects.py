@@ -171,10 +171,8 @@ def test_faults_in_a_mat_file_are_named_by_variable_and_row(folder):
 @pytest.mark.parametrize("content", [
     None, b"", b"nonsense", b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + b"\0" * 99])
 def test_a_mat_file_that_cannot_be_read_is_listed(folder, content):
-    if content is None:
-        os.mkfifo(folder / "UwbReading.mat")
-    else:
-        write(folder / "UwbReading.mat", content)
+    path = folder / "UwbReading.mat"
+    os.mkfifo(path) if content is None else write(path, content)
     (folder / "UwbReading.txt").unlink()
     assert read_dataset(folder).notes == ("Not read: 'UwbReading.mat'.",)
     (folder / "encoderReading.txt").unlink()
@@ -208,7 +206,8 @@ def test_arrays_are_the_dataset_of_their_files(folder):
      "left ticks), found float64 of shape (2, 1)"), ("ticks", None, [], ": expected at least"),
     ("ticks", (3, 1), np.nan, ", row 4: expected left ticks, a number"),
     ("aruco", None, [[1], [1, 2]], ": expected a matrix of real numbers with 11 columns (pose id"),
-    ("uwb", None, [[1, 3, 1j, 1]], "found object of shape (1, 4)"),
+    ("uwb", None, [[1, 3, 1j, 1]], ": expected a matrix of real numbers with 4 columns (pose id, "
+     "antenna id, range, sigma), found object of shape (1, 4)"),
     ("uwb", None, [[1, "a"]], ": expected a matrix of real numbers with 4 columns (pose id, "
      "antenna id, range, sigma), found object of shape (1, 2)"),
     ("aruco", (2, 0), 5, ", row 3: expected pose id, a whole number from 1 to 4"),
@@ -225,8 +224,7 @@ def test_arguments_pass_the_checks_of_files_or_are_named_with_the_row(name, plac
         value, number = ARRAYS[name].copy(), value
         value[place] = number
     given = ARRAYS | {name: value}
-    said = error_of(Dataset.from_arrays, *given.values())
-    assert said.startswith(name) and told in said
+    assert error_of(Dataset.from_arrays, *given.values()).startswith(name + told)
 
 
 # Which file of a folder is which.
