@@ -38,8 +38,10 @@ def with_fields(record):
 def main(folder):
     """Write the pages of all modules to `folder`, and print where they are."""
     os.environ.setdefault("PDOC_ALLOW_EXEC", "1")       # Python's module platform asks the system
-    for module in [import_module(each.name) for each in walk_packages(
-            slamlib.__path__, "slamlib.")]:
+    for name in slamlib.__all__:
+        getattr(slamlib, name)                          # imported when it is asked for
+    for module in [slamlib, *(import_module(each.name) for each in walk_packages(
+            slamlib.__path__, "slamlib."))]:
         if hasattr(module, "__all__") and hasattr(module, "__path__"):    # else pdoc omits modules
             module.__all__ += [each.name for each in iter_modules(module.__path__)]
         for name, record in inspect.getmembers(module, inspect.isclass):

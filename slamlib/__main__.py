@@ -12,9 +12,9 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from slamlib import __version__  # noqa: E402
-from slamlib.dataset import DatasetError, read_dataset, read_truth  # noqa: E402
-from slamlib.textfile import require  # noqa: E402
-from slamlib.vehicle import changed  # noqa: E402
+from slamlib.core.errors import DatasetError, require  # noqa: E402
+from slamlib.core.vehicle import changed  # noqa: E402
+from slamlib.io.dataset import read_dataset, read_truth  # noqa: E402
 
 EXECUTED_NOTEBOOKS = Path("build", "executed")  # folder in which executed notebooks are kept
 END_SIGNALS = {signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)}  # Windows has no SIGHUP
@@ -178,7 +178,7 @@ def _require_elsewhere(out, *folders):
 
 
 def _solve(options):
-    from slamlib.dataset import inventory_lines
+    from slamlib.io.dataset import inventory_lines
     from slamlib.solve import PROBLEMS, allows, solve_to_folder, title
     _require_elsewhere(options.out, options.folder, options.folder / "truth")
     require(not options.plot or options.plot.suffix.lower() in (".png", ".pdf", ".svg"), "--plot",
@@ -202,7 +202,7 @@ def _solve(options):
 
 
 def _simulate(options):
-    from slamlib.simulation import simulate, write_dataset
+    from slamlib.studies.simulation import simulate, write_dataset
     write_dataset(options.folder, *simulate(
         options.path, options.seed, slip=options.slip, late_ranges=options.nlos,
         mislabelled=options.mislabel, rounds=options.rounds))

@@ -16,10 +16,13 @@ from multiprocessing import Pipe, get_context
 
 import numpy as np
 
-from slamlib import evaluation, localization, odometry, results, se2, slam, swap
-from slamlib.checks.files import Doubt, doubts_before_solving, merged
-from slamlib.checks.solution import solution_doubts
-from slamlib.dataset import DatasetError, all_notes
+from slamlib import estimate, fuse, fuse_increments, localize
+from slamlib.core import evaluation, odometry, se2
+from slamlib.core.errors import DatasetError
+from slamlib.io import results, swap
+from slamlib.io.dataset import all_notes
+from slamlib.robust.file_doubts import Doubt, doubts_before_solving, merged
+from slamlib.robust.solution_doubts import solution_doubts
 
 UNSOLVABLE = (DatasetError, np.linalg.LinAlgError)  # what `find` raises where there is no solution
 
@@ -93,11 +96,11 @@ def find(problem, dataset, found=None):
     """
     solvers = {
         "problem1": lambda: odometry.equation2(dataset.ticks, dataset.vehicle),
-        "problem2": lambda: localization.localize(dataset.sightings),
-        "problem2_hint": lambda: localization.fuse_increments(dataset),
-        "problem2_fused": lambda: localization.fuse(dataset),
-        "problem3": lambda: slam.estimate(dataset.without("uwb")),
-        "problem4": lambda: slam.estimate(dataset, previous=(found or {}).get("problem3"))}
+        "problem2": lambda: localize(dataset.sightings),
+        "problem2_hint": lambda: fuse_increments(dataset),
+        "problem2_fused": lambda: fuse(dataset),
+        "problem3": lambda: estimate(dataset.without("uwb")),
+        "problem4": lambda: estimate(dataset, previous=(found or {}).get("problem3"))}
     return solvers[problem]()
 
 

@@ -136,8 +136,8 @@ def report_on_all(tmp_path_factory, kept):
     """
     import numpy as np
 
-    from slamlib.dataset import read_dataset, read_truth
-    from slamlib.simulation import manoeuvre, simulate, write_dataset
+    from slamlib.io.dataset import read_dataset, read_truth
+    from slamlib.studies.simulation import manoeuvre, simulate, write_dataset
     folder = tmp_path_factory.mktemp("built")
     data = folder / "data"
     shutil.copytree(ROOT / "data", data, ignore=lambda *_: ["long"])

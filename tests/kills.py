@@ -16,10 +16,11 @@ from collections import Counter
 from itertools import product
 from pathlib import Path
 
-from slamlib import solve, swap
+from slamlib import solve
 from slamlib.__main__ import main
-from slamlib.dataset import read_dataset
-from slamlib.simulation import simulate, write_dataset
+from slamlib.io import swap
+from slamlib.io.dataset import read_dataset
+from slamlib.studies.simulation import simulate, write_dataset
 
 STEPS = {"os.rename", "os.remove", "os.mkdir", "os.rmdir"}      # audit events, also of pathlib
 MINE = {"notes.txt": "of the user", "mine/data.mat": "mine", "problem1/notes.txt": "too"}

@@ -4,7 +4,7 @@ A mutant is slamlib with one change: an operator or comparison exchanged, a tran
 sign or `not` dropped, two arguments exchanged, a number one more or less. For each of some mutants,
 drawn at random, the tests that enter its function run until one fails; without one that fails, the
 mutant survives. Every survivor is a missing test, dead code, or equivalent: no input tells it from
-the original. `make mutants` runs this; `make mutants ARGS="--only slam --count 50"` a part of it.
+the original. `make mutants` runs this; `make mutants ARGS="--only robust --count 50"` a part of it.
 
 Numbers that a module names in capital letters are left out: a threshold of 21 is as good as one of
 20. What mutants say in messages is left out, too.
@@ -33,9 +33,7 @@ import scipy.sparse.linalg  # noqa: E402, F401
 import scipy.stats  # noqa: E402, F401
 
 ROOT = Path(__file__).parents[1]
-FOLDERS = ("localization", "slam")
-MODULES = ("se2", "odometry", "evaluation", "results", "dataset", "tables", "vehicle", "increments",
-           "sightings", "marker_increments", "odometry_gate", "memory")
+FOLDERS = ("core/", "robust/", "io/")
 FILES = [f"test_{name}.py" for name in (
     "se2", "odometry", "results", "dataset", "dialects", "marker_increments", "localization",
     "odometry_gate", "memory", "doubts", "calibration", "normal_equations", "slam", "uwb",
@@ -140,11 +138,11 @@ def mutated(text, node, new):
 
 
 def module_of(file, root):
-    """The numerical module of a file in this package's folder, "slam/fit", or None."""
+    """The numerical module of a file in this package's folder, "robust/fit", or None."""
     if not file.startswith(f"{root}/slamlib/") or not file.endswith(".py"):
         return None
     module = file.removeprefix(f"{root}/slamlib/").removesuffix(".py")
-    return module if module in MODULES or module.startswith(FOLDERS) else None
+    return module if module.startswith(FOLDERS) else None
 
 
 def file_of(test):
@@ -263,7 +261,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--count", type=int, default=300, help="number of mutants (default 300)")
     parser.add_argument("--seed", type=int, default=0, help="of the draw (default 0)")
-    parser.add_argument("--only", default="", help="modules whose name begins so: slam, slam/fit")
+    parser.add_argument("--only", default="", help="modules whose name begins so: core, robust/fit")
     given = parser.parse_args()
     rng, found = random.Random(given.seed), all_places(given.only)
     drawn = rng.sample(range(len(found)), min(given.count, len(found)))

@@ -6,10 +6,10 @@ from functools import partial
 import numpy as np
 from scipy.stats import t
 
-from slamlib import slam
-from slamlib.evaluation import ate, nees
-from slamlib.simulation import simulate
+from slamlib import estimate
+from slamlib.core.evaluation import ate, nees
 from slamlib.studies.montecarlo import antenna_error
+from slamlib.studies.simulation import simulate
 
 
 def central_differences(function, x, step=1e-6):
@@ -85,10 +85,10 @@ def slam_trial(seed, ranges=True, markers=True, **options):
     "nees" is that of the measured poses, "nees between" that of the others.
     """
     dataset, truth = simulate("short", seed, **options)
-    found = slam.estimate(dataset.without("uwb")) if markers else None
+    found = estimate(dataset.without("uwb")) if markers else None
     dataset = dataset if markers else dataset.without("aruco")
     dataset = dataset if ranges else dataset.without("uwb")
-    found = slam.estimate(dataset, previous=found) if ranges else found
+    found = estimate(dataset, previous=found) if ranges else found
     measured = [sensor.pose for sensor in (dataset.aruco, dataset.uwb) if sensor is not None]
     frames = np.isin(np.arange(len(truth.poses)), np.concatenate(measured))
     values = nees(found.poses, found.covariances, truth.poses)

@@ -11,7 +11,7 @@ from test_project import save_as_lab
 from test_report import make_data, write
 
 from slamlib.report import build, build_report, cache
-from slamlib.studies import memory
+from slamlib.studies import runs as memory
 
 
 def execute_without_kernel(books, environment, results, jobs, finish):

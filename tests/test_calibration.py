@@ -11,22 +11,24 @@ import pytest
 from gtsam.symbol_shorthand import C
 from numeric import aruco, as_points, central_differences, changed, uwb, vehicle
 
-from slamlib import se2, slam
-from slamlib.checks.files import doubts_before_solving
-from slamlib.checks.solution import solution_doubts
-from slamlib.dataset import Vehicle, read_dataset, read_truth
-from slamlib.evaluation import align, anees, ate
-from slamlib.localization import fuse, fuse_increments, localize
-from slamlib.odometry import dead_reckoning
-from slamlib.simulation import mislabel, simulate
-from slamlib.slam import calibration, choices, graph, own
-from slamlib.slam.calibration import ANTENNAS, ENTRIES, HEIGHT, RANGE_LAG, SIGHTING_LAG, SIZE
-from slamlib.slam.factors import SMOOTHED_STEPS, sensor_poses
-from slamlib.slam.fit import KERNELS, ONE_SIDED
-from slamlib.slam.initialization import odometry_state
-from slamlib.slam.linear import NormalEquations, build_problem, linear_solution, retract
-from slamlib.slam.measurements import Noise, measure
+from slamlib import estimate, fuse, fuse_increments, localize
+from slamlib.core import se2
+from slamlib.core.evaluation import align, anees, ate
+from slamlib.core.kernels import KERNELS, ONE_SIDED
+from slamlib.core.odometry import dead_reckoning
+from slamlib.core.vehicle import Vehicle
+from slamlib.io.dataset import read_dataset, read_truth
+from slamlib.robust import calibration, choices, own
+from slamlib.robust import optimize as graph
+from slamlib.robust.calibration import ANTENNAS, ENTRIES, HEIGHT, RANGE_LAG, SIGHTING_LAG, SIZE
+from slamlib.robust.factors import SMOOTHED_STEPS, sensor_poses
+from slamlib.robust.file_doubts import doubts_before_solving
+from slamlib.robust.initialization import odometry_state
+from slamlib.robust.linear import NormalEquations, build_problem, linear_solution, retract
+from slamlib.robust.measurements import Noise, measure
+from slamlib.robust.solution_doubts import solution_doubts
 from slamlib.studies.montecarlo import antenna_error
+from slamlib.studies.simulation import mislabel, simulate
 
 REAL_LOGS = Path(__file__).parents[2] / "shared" / "real_logs"      # where they are present
 # Sensors of which every entry differs from its default.
@@ -240,7 +242,7 @@ def drive(seed):
 def right_ate(seed, ranges):
     """ATE in m after alignment, of the drive as its files say."""
     dataset, truth = drive(seed)
-    found = slam.estimate(dataset if ranges else dataset.without("uwb"))
+    found = estimate(dataset if ranges else dataset.without("uwb"))
     assert not solution_doubts(found)
     return ate(found.poses, truth.poses, aligned=True)
 
@@ -256,8 +258,8 @@ def test_a_wrong_statement_is_named_and_mended(fault):
         "wheels", "half"))
     dataset, truth = drive(seed := 61 if alone else 501 if far_off else 1)
     spoilt = spoil(dataset, truth)
-    markers = slam.estimate(spoilt.without("uwb"))
-    both = slam.estimate(spoilt, previous=markers)
+    markers = estimate(spoilt.without("uwb"))
+    both = estimate(spoilt, previous=markers)
     said = [{doubt.what for doubt in solution_doubts(result)} for result in (markers, both)]
     assert what in said[1] and (what.startswith(("tag", "antenna", "range")) or said[0] & (
         {what, "marker-size"} if far_off else {what}))
@@ -284,7 +286,7 @@ def test_a_wrong_statement_is_named_and_mended(fault):
 def test_the_model_of_a_step_that_a_wrong_size_made_does_not_blame_the_wheels(seed):
     """A camera 0.2 m ahead, as stated, and larger markers look like Euler's steps at first."""
     dataset = seen_from(simulate("short", seed)[0].without("uwb"), (0.2, 0.0, 0.0), size=1.04)
-    found = slam.estimate(replace(dataset, vehicle=replace(dataset.vehicle, camera_x=0.2)))
+    found = estimate(replace(dataset, vehicle=replace(dataset.vehicle, camera_x=0.2)))
     assert found.model == "arc" and found.released == {"marker-size"}
     assert [doubt.what for doubt in solution_doubts(found)] == ["marker-size"]
     assert found.c[SIZE] == pytest.approx(1.04, abs=0.004)
@@ -294,7 +296,7 @@ def test_the_model_of_a_step_that_a_wrong_size_made_does_not_blame_the_wheels(se
 def test_four_wrong_statements_at_once_are_all_found():
     dataset, truth = drive(1)
     spoilt = ranged_from(seen_from(dataset, (0.08, 0, 0), size=1.02), truth, (0.2, 0), height=1.5)
-    found = slam.estimate(spoilt, previous=slam.estimate(spoilt.without("uwb")))
+    found = estimate(spoilt, previous=estimate(spoilt.without("uwb")))
     assert found.released == {"camera-offset", "marker-size", "tag-offset", "antenna-height"}
     assert ate(found.poses, truth.poses, aligned=True) < 0.005
     assert anees(found.poses, found.covariances, truth.poses) < 6
@@ -309,7 +311,7 @@ def test_what_is_stated_is_used():
     stated = replace(spoilt, vehicle=replace(
         dataset.vehicle, camera_x=0.15, camera_y=-0.05, camera_turn=0.1, marker_size=1.03,
         tag_x=0.3, tag_y=0.1, antenna_height=2.0))
-    found, right = slam.estimate(stated), slam.estimate(dataset)
+    found, right = estimate(stated), estimate(dataset)
     assert not solution_doubts(found) and not found.released
     assert np.abs(found.poses - right.poses)[:, :2].max() < 2e-3
     assert np.abs(found.antenna_in_world - right.antenna_in_world).max() < 0.03
@@ -336,8 +338,8 @@ def test_no_doubt_about_clean_drives():
         dataset, _ = simulate("short", 100 + seed, slip=slip, late_ranges=0.1 * (seed % 2))
         if seed % 3 == 2:
             dataset = mislabel(dataset, 0.02, seed)
-        markers = slam.estimate(dataset.without("uwb"))
-        both = slam.estimate(dataset, previous=markers)
+        markers = estimate(dataset.without("uwb"))
+        both = estimate(dataset, previous=markers)
         doubts += [doubt.what for found in (markers, both) for doubt in solution_doubts(found)]
     assert not doubts
 
@@ -360,8 +362,8 @@ def test_public_logs(log, largest, what):
     """AprilTags with ranges, printed too large; barcodes whose sightings are late."""
     dataset, truth = read_dataset(REAL_LOGS / log).first(6500), read_truth(REAL_LOGS / log)
     truth = replace(truth, poses=truth.poses[:6500])
-    found = slam.estimate(dataset.without("uwb"))
-    for result in (found, *([slam.estimate(dataset, previous=found)] if dataset.uwb else [])):
+    found = estimate(dataset.without("uwb"))
+    for result in (found, *([estimate(dataset, previous=found)] if dataset.uwb else [])):
         assert what in {doubt.what for doubt in solution_doubts(result)}
         error, squared = aligned_judgement(result, truth)
         assert error < largest and squared < 4

@@ -10,9 +10,10 @@ import pytest
 from conftest import ROOT
 from scipy.linalg import block_diag
 
-from slamlib import increments, localization, se2
-from slamlib.sightings import sightings_by_frame
-from slamlib.simulation import simulate
+from slamlib import fuse
+from slamlib.core import increments, se2
+from slamlib.core.sightings import sightings_by_frame
+from slamlib.studies.simulation import simulate
 
 CHAPTERS = sorted((ROOT / "notebooks").glob("[0-9]*.ipynb"))
 MAX_NAMES = 12               # imported before the first result
@@ -107,7 +108,7 @@ def test_two_steps_of_the_filter_of_chapter_2_are_those_of_fuse():
         wheel = wheel + w
     seen = dataset.aruco.select(np.isin(np.arange(len(dataset.aruco.pose)),
                                         g.index[np.r_[first, second]]))
-    found = localization.fuse(replace(
+    found = fuse(replace(
         dataset, ticks=ticks, aruco=replace(seen, pose=seen.pose - begin)), slip)
     assert found.rejected == 0 and len(first) > 1
     np.testing.assert_allclose(X, found.poses[-1], atol=1e-9)

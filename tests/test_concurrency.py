@@ -15,16 +15,17 @@ import pytest
 from conftest import ROOT, is_running
 from test_report import build, make_data, write
 
-from slamlib import results, solve, swap
+from slamlib import solve
 from slamlib.__main__ import END_SIGNALS, main
+from slamlib.io import results, swap
 from slamlib.report import NotebookError
-from slamlib.simulation import simulate, write_dataset
 from slamlib.solve import problem_solution, solve_to_folder
+from slamlib.studies.simulation import simulate, write_dataset
 
 RESULT = """import os, time
 from pathlib import Path
 import numpy as np
-from slamlib.results import write_structs
+from slamlib.io.results import write_structs
 poses = None, np.zeros((2, 3)), np.zeros((2, 3, 3))
 write_structs(Path(os.environ["SLAMLIB_RESULTS"], "short", "problem1"), "vehiclePose", *poses)
 """

@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
-from slamlib import dataset, se2
-from slamlib.checks.files import doubts_before_solving
-from slamlib.dataset import DatasetError, Vehicle, read_dataset, read_truth
-from slamlib.simulation import simulate
-from slamlib.tables import LIMITS, Limit
-from slamlib.vehicle import VEHICLE_LIMITS
+from slamlib.core import se2
+from slamlib.core.errors import DatasetError
+from slamlib.core.vehicle import VEHICLE_LIMITS, Limit, Vehicle
+from slamlib.io import dataset
+from slamlib.io.dataset import read_dataset, read_truth
+from slamlib.io.tables import LIMITS
+from slamlib.robust.file_doubts import doubts_before_solving
+from slamlib.studies.simulation import simulate
 
 FILES = {
     "encoderReading.txt": "1 0 0\n2 10 12\n3 -5 7\n4 0 32000\n",

@@ -10,9 +10,10 @@ import test_dataset
 from scipy.io import savemat
 from test_dataset import FILES, assert_same, error_of, write
 
-from slamlib.dataset import Dataset, Vehicle, inventory_lines, read_dataset, read_truth
-from slamlib.simulation import simulate, write_dataset
-from slamlib.tables import LIMITS, datasets_in
+from slamlib.core.vehicle import Vehicle
+from slamlib.io.dataset import dataset_from_arrays, inventory_lines, read_dataset, read_truth
+from slamlib.io.tables import LIMITS, datasets_in
+from slamlib.studies.simulation import simulate, write_dataset
 
 folder = test_dataset.folder
 TABLES = ("encoderReading.txt", "ArucoReading.txt", "UwbReading.txt", "UwbAntennaGuess.txt")
@@ -189,13 +190,13 @@ def test_arrays_are_the_dataset_of_their_files(folder):
     expected = read_dataset(folder)
     options = {"vehicle": expected.vehicle, "name": "drive"}
     for given in (ARRAYS, {name: value.tolist() for name, value in ARRAYS.items()}):
-        assert_same(Dataset.from_arrays(**given, **options), expected)
-    alone = Dataset.from_arrays(ARRAYS["ticks"])
+        assert_same(dataset_from_arrays(**given, **options), expected)
+    alone = dataset_from_arrays(ARRAYS["ticks"])
     assert (alone.aruco, alone.uwb, alone.antenna_guess) == (None, None, None)
     gaps = {"aruco": [[1, 4, np.nan, *ARRAYS["aruco"][0, 3:]], *ARRAYS["aruco"]],
             "uwb": [*ARRAYS["uwb"], [1, 3, 0, 1]]}
     assert_same(
-        Dataset.from_arrays(**ARRAYS | gaps, **options), expected,
+        dataset_from_arrays(**ARRAYS | gaps, **options), expected,
         "aruco: 1 of 4 rows left out, the first in row 1: expected x, a number, found 'nan'.",
         "uwb: 1 of 3 rows left out, the first in row 3: expected range, a number (0 is no "
         "reception), found '0'.")
@@ -224,7 +225,7 @@ def test_arguments_pass_the_checks_of_files_or_are_named_with_the_row(name, plac
         value, number = ARRAYS[name].copy(), value
         value[place] = number
     given = ARRAYS | {name: value}
-    assert error_of(Dataset.from_arrays, *given.values()).startswith(name + told)
+    assert error_of(dataset_from_arrays, *given.values()).startswith(name + told)
 
 
 # Which file of a folder is which.

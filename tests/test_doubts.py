@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 from numeric import as_points, changed, vehicle
 
-from slamlib.checks import files
-from slamlib.checks.files import doubts_before_solving
-from slamlib.dataset import AntennaGuess, Dataset, DatasetError, UwbReadings, Vehicle, read_dataset
-from slamlib.simulation import manoeuvre, simulate, write_dataset
+from slamlib.core.errors import DatasetError
+from slamlib.core.records import AntennaGuess, Dataset, UwbReadings
+from slamlib.core.vehicle import Vehicle
+from slamlib.io.dataset import read_dataset
+from slamlib.robust import file_doubts as files
+from slamlib.robust.file_doubts import doubts_before_solving
+from slamlib.studies.simulation import manoeuvre, simulate, write_dataset
 
 SEEDS = (0, 1)
 simulated = cache(simulate)

@@ -8,16 +8,16 @@ import pytest
 from conftest import contradicted
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_output
 
-from slamlib import localization, slam, solve
-from slamlib.checks.files import Doubt
-from slamlib.dataset import DatasetError
+from slamlib import estimate, fuse, localize, solve
+from slamlib.core.errors import DatasetError
+from slamlib.io.results import read_structs
 from slamlib.notebook import Drive, attempted, drives, notices, show_doubts, solved
-from slamlib.results import read_structs
-from slamlib.simulation import simulate
+from slamlib.robust.file_doubts import Doubt
+from slamlib.studies.simulation import simulate
 
 REASON = "expected sightings that agree"
-SOLVERS = {"problem2": lambda drive: localization.localize(drive.dataset.sightings),
-           "problem2_fused": lambda drive: localization.fuse(drive.dataset)}
+SOLVERS = {"problem2": lambda drive: localize(drive.dataset.sightings),
+           "problem2_fused": lambda drive: fuse(drive.dataset)}
 
 
 @pytest.fixture
@@ -84,7 +84,7 @@ def test_a_second_call_for_a_problem_writes_nothing_unless_its_cell_is_run_again
 
 
 def test_options_that_vehicle_toml_does_not_state_are_told_in_the_overview(said, both):
-    solved(both[:1], problem3=lambda drive: slam.estimate(drive.dataset, kernel="Huber"))
+    solved(both[:1], problem3=lambda drive: estimate(drive.dataset, kernel="Huber"))
     doubt, = (doubt for doubt in notices([book_of(said)])["good"] if doubt.what == "options")
     assert "problem3 are solved with kernel = Huber, unlike" in doubt.sentence
 

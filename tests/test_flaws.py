@@ -10,23 +10,25 @@ import pytest
 from conftest import ROOT
 from numeric import aruco, known_noise, uwb, vehicle
 
-from slamlib import se2, slam, solve
+from slamlib import estimate, solve
 from slamlib.__main__ import summary_table
-from slamlib.checks.files import doubts_before_solving
-from slamlib.checks.solution import GROUPS, solution_doubts
-from slamlib.dataset import Vehicle, read_dataset, read_truth
-from slamlib.evaluation import nees_band
-from slamlib.odometry_gate import NO_JUMPS
-from slamlib.simulation import simulate
-from slamlib.slam.calibration import (
+from slamlib.core import se2
+from slamlib.core.evaluation import nees_band
+from slamlib.core.vehicle import Vehicle
+from slamlib.io.dataset import read_dataset, read_truth
+from slamlib.robust.calibration import (
     CAMERA,
     SIGHTING_LAG,
     SIGHTINGS,
     calibration_table,
     stated_calibration,
 )
-from slamlib.slam.measurements import Noise
-from slamlib.slam.result import turn_sigma
+from slamlib.robust.file_doubts import doubts_before_solving
+from slamlib.robust.jumps import NO_JUMPS
+from slamlib.robust.measurements import Noise
+from slamlib.robust.result import turn_sigma
+from slamlib.robust.solution_doubts import GROUPS, solution_doubts
+from slamlib.studies.simulation import simulate
 
 
 def uncorrelated(*variances):
@@ -83,7 +85,7 @@ def test_without_sightings_nothing_is_known_of_the_camera():
     dataset = known_noise(simulate("short", 61)[0].first(300).without("aruco"), 1e-3)
     stated = vehicle(camera_x=0.1, sigma_camera_x=0.02, marker_size=1.01, sighting_lag=2.0)
     for drive in (dataset, stated(dataset)):
-        found = slam.estimate(drive, model="arc")
+        found = estimate(drive, model="arc")
         np.testing.assert_array_equal(found.c[SIGHTINGS], found.calibration.stated[SIGHTINGS])
         np.testing.assert_allclose(found.c_covariance[SIGHTINGS, SIGHTINGS],
                                    np.diag(found.calibration.sigma[SIGHTINGS]**2), atol=1e-15)
@@ -96,7 +98,7 @@ def test_offsets_of_the_camera_have_the_standard_deviations_that_they_state():
     time, place = [], []
     for seed, slip in itertools.product(range(4), (1e-3, 3e-3)):
         dataset, _ = simulate("short", seed, slip=slip)
-        found = slam.estimate(vehicle(
+        found = estimate(vehicle(
             sigma_sighting_lag=10.0, sigma_camera_x=0.2, sigma_camera_y=0.2,
             sigma_camera_turn=0.2)(dataset.without("uwb")))
         time.append(found.c[SIGHTING_LAG]**2 / found.c_covariance[SIGHTING_LAG, SIGHTING_LAG])
@@ -129,13 +131,13 @@ def test_every_problem_is_solved_within_the_limits(case):
 def test_a_solution_that_rounding_spoilt_is_none(monkeypatch):
     dataset, _ = simulate("short", 61)
     dataset = replace(dataset.first(100), uwb=None)
-    found = slam.estimate(dataset)
+    found = estimate(dataset)
     for changes in (
             {"covariances": np.nan * found.covariances}, {"c_covariance": -1e-30 * np.eye(14)},
             {"marker_covariance": np.full_like(found.marker_covariance, np.inf)},
             {"fit": replace(found.fit, log_evidence=-np.inf)}):
         spoilt = replace(found, **changes)
-        monkeypatch.setattr(solve.slam, "estimate", lambda _, spoilt=spoilt: spoilt)
+        monkeypatch.setattr(solve, "estimate", lambda _, spoilt=spoilt: spoilt)
         failure, = solve.solutions(dataset, problems=("problem3",))
         assert "float64" in failure.reason and "a variance is negative" in failure.reason
 
@@ -278,7 +280,7 @@ def test_a_marker_at_the_place_of_another_is_unconfirmed():
     marker[of[0][1:4]] = marker[of[1][0]]
     others = np.setdiff1d(np.arange(len(marker)), of[1])
     seen = replace(seen, marker=marker).select(others)
-    found = slam.estimate(replace(dataset, aruco=seen, uwb=None))
+    found = estimate(replace(dataset, aruco=seen, uwb=None))
     assert found.unconfirmed.tolist() == [marker[of[1][0]]]
 
 
@@ -288,7 +290,7 @@ def test_a_marker_with_a_single_accepted_sighting_is_unconfirmed():
     seen = dataset.aruco
     label, count = np.unique(seen.marker, return_counts=True)
     rows = np.flatnonzero(seen.marker == label[count.argmax()])
-    found = slam.estimate(replace(dataset, uwb=None, aruco=seen.select(
+    found = estimate(replace(dataset, uwb=None, aruco=seen.select(
         np.setdiff1d(np.arange(len(seen.marker)), rows[1:]))))
     assert found.unconfirmed.tolist() == [label[count.argmax()]]
     assert not solution_doubts(found)
@@ -306,7 +308,7 @@ def test_a_marker_that_was_moved_halfway_is_named():
         seen.pose < 1000, seen.pose >= 1000)], axis=0).argmax()
     late, z = (seen.marker == marker) & (seen.pose >= 1000), seen.marker_in_vehicle.copy()
     z[late, :2] += se2.rotation(-truth.poses[seen.pose[late], 2]) @ [0.1, 0]
-    found = slam.estimate(aruco(dataset, marker_in_vehicle=z).without("uwb"))
+    found = estimate(aruco(dataset, marker_in_vehicle=z).without("uwb"))
     doubt, = solution_doubts(found)
     assert doubt.what == "sightings-rejected" and f"of marker {marker} " in doubt.sentence
 

@@ -10,12 +10,12 @@ from test_document import text_of
 from test_report import write
 
 from slamlib.__main__ import main
-from slamlib.checks.files import Doubt
 from slamlib.report import handin
 from slamlib.report.notebooks import Options
 from slamlib.report.overview import SolvedDrive
-from slamlib.simulation import simulate, write_dataset
+from slamlib.robust.file_doubts import Doubt
 from slamlib.solve import Failure, Solution
+from slamlib.studies.simulation import simulate, write_dataset
 
 SOLVE = """from slamlib.notebook import *
 from slamlib.solve import PROBLEMS, find

@@ -11,10 +11,10 @@ from conftest import ROOT, copied
 from test_report import make_data
 
 from slamlib.__main__ import main
-from slamlib.dataset import read_dataset
+from slamlib.io.dataset import read_dataset
 from slamlib.report import execution
 from slamlib.report.execution import kernel_environment
-from slamlib.simulation import write_dataset
+from slamlib.studies.simulation import write_dataset
 
 SECONDS = 300
 NEWS = "Would you like to get notified about official Jupyter news?"

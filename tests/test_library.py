@@ -8,16 +8,17 @@ import pytest
 from gtsam.symbol_shorthand import A, C, L, X
 from numeric import known_noise
 
-from slamlib import localization, se2, slam
-from slamlib.checks.solution import solution_doubts
-from slamlib.dataset import DatasetError, Vehicle, read_dataset
-from slamlib.evaluation import anees, ate
-from slamlib.simulation import simulate, write_dataset
-from slamlib.slam.fit import KERNELS
-from slamlib.slam.measurements import measure
-from slamlib.slam.pipeline import fit_from_odometry
-from slamlib.slam.result import slam_result
-from slamlib.vehicle import KERNEL_NAMES
+from slamlib import as_gtsam, estimate, fuse, fuse_increments, localize
+from slamlib.core import se2
+from slamlib.core.errors import DatasetError
+from slamlib.core.evaluation import anees, ate
+from slamlib.core.kernels import KERNELS
+from slamlib.io.dataset import read_dataset
+from slamlib.robust.measurements import measure
+from slamlib.robust.pipeline import fit_from_odometry
+from slamlib.robust.result import slam_result
+from slamlib.robust.solution_doubts import solution_doubts
+from slamlib.studies.simulation import simulate, write_dataset
 
 SIGMA, COVARIANCE = gtsam.noiseModel.Isotropic.Sigma, gtsam.noiseModel.Gaussian.Covariance
 
@@ -28,15 +29,15 @@ def drive():
 
 
 @pytest.mark.parametrize("function", [
-    slam.as_gtsam, localization.fuse, localization.fuse_increments, localization.localize])
+    as_gtsam, fuse, fuse_increments, localize])
 def test_what_is_of_another_type_is_told(function):
-    """`slam.estimate`'s arguments are in test_slam."""
+    """`estimate`'s arguments are in test_slam."""
     with pytest.raises(DatasetError, match=f"{function.__name__}: expected a.*, found 'drive'"):
         function("drive")
 
 
 def test_a_result_is_shown_in_five_lines(drive):
-    found = slam.estimate(known_noise(drive[0].first(100), 1e-3))
+    found = estimate(known_noise(drive[0].first(100), 1e-3))
     lines = repr(found).splitlines()
     assert len(lines) == 5 and max(map(len, lines)) < 100
     assert lines[0].startswith("SlamResult of 100 poses, mean sigma ")
@@ -45,10 +46,6 @@ def test_a_result_is_shown_in_five_lines(drive):
 
 
 # Kernel and gate.
-
-
-def test_kernels_have_the_names_that_vehicle_toml_knows():
-    assert {*KERNELS} == {*KERNEL_NAMES} and Vehicle().kernel == KERNEL_NAMES[0]
 
 
 def test_the_library_heeds_kernel_and_gate_of_vehicle_toml(tmp_path):
@@ -60,7 +57,7 @@ def test_the_library_heeds_kernel_and_gate_of_vehicle_toml(tmp_path):
     with open(tmp_path / "drive" / "vehicle.toml", "a") as file:
         file.write('kernel = "Huber"\ngate = false\n')
     stated = read_dataset(tmp_path / "drive")
-    found, same, default, again = (slam.estimate(data, **options) for data, options in (
+    found, same, default, again = (estimate(data, **options) for data, options in (
         (stated, {}), (plain, {"kernel": "Huber", "gate": False}), (plain, {}),
         (stated, {"kernel": "asymmetric Tukey", "gate": True})))
     np.testing.assert_array_equal(found.poses, same.poses)
@@ -113,8 +110,8 @@ def test_the_whole_graph_in_gtsam_has_the_solution_and_its_covariances(drive):
     own = compass(truth, 0.003, 33)
     own.add(gtsam.BetweenFactorPose2(X(30), X(33), gtsam.Pose2(
         *se2.between(truth.poses[30], truth.poses[33])), SIGMA(3, 1e-3)))
-    found = slam.estimate(known_noise(dataset, 1e-3), factors=own)
-    graph, values = slam.as_gtsam(found)
+    found = estimate(known_noise(dataset, 1e-3), factors=own)
+    graph, values = as_gtsam(found)
     assert values.exists(C(0)) and values.exists(X(33)) and not values.exists(X(34))
     moved, marginals = gtsam.GaussNewtonOptimizer(graph, values).optimize(), gtsam.Marginals(
         graph, values)
@@ -139,14 +136,14 @@ def test_factors_that_the_graph_cannot_have_are_refused(drive, factor, told):
     own = gtsam.NonlinearFactorGraph()
     own.add(factor)
     with pytest.raises(DatasetError, match=f"^factors: expected (in factor 0 )?{told}$"):
-        slam.estimate(known_noise(drive[0].first(100), 1e-3), factors=own)
+        estimate(known_noise(drive[0].first(100), 1e-3), factors=own)
 
 
 def test_odometry_and_a_compass_alone_are_a_problem(drive):
     """Neither markers nor ranges; the covariances are right in a wide band."""
     dataset, truth = drive
     alone = known_noise(replace(dataset, aruco=None, uwb=None), 1e-3)
-    before, after = (slam.estimate(alone, factors=own) for own in (None, compass(truth, 0.01, 20)))
+    before, after = (estimate(alone, factors=own) for own in (None, compass(truth, 0.01, 20)))
     assert ate(after.poses, truth.poses) < ate(before.poses, truth.poses) / 2
     assert 0.3 < anees(after.poses, after.covariances, truth.poses) < 10
 
@@ -169,7 +166,7 @@ def test_a_factor_that_contradicts_the_rest_is_named(drive):
     for wrong, model, named in ((0, None, []), (1, None, ["own-factors"]), (1, robust, [])):
         own = gps(truth, 150, lambda place, wrong=wrong: place + wrong * np.array(
             [np.hypot(*(place - far)) < 0.3, 0]), model)
-        doubts = solution_doubts(slam.estimate(dataset, factors=own))
+        doubts = solution_doubts(estimate(dataset, factors=own))
         assert [each.what for each in doubts if each.what == "own-factors"] == named
         assert all("1 of 3 factors" in each.sentence and "factor 1 by " in each.sentence
                    for each in doubts if each.what in named)
@@ -180,7 +177,7 @@ def test_factors_in_another_frame_are_the_first_doubt(drive, turn, shift):
     """GPS of 5 cm by its own axes and origin: what it does to wheels and slip comes later."""
     dataset, truth = drive[0].without("uwb"), drive[1]
     own = gps(truth, 100, lambda place: se2.rotation(turn) @ place + [shift, 0])
-    first, *_ = solution_doubts(slam.estimate(dataset, factors=own))
+    first, *_ = solution_doubts(estimate(dataset, factors=own))
     assert first.what == "own-factors" and "frame of pose 1" in first.sentence
     if turn > 1:
         assert first.sentence.startswith("19 of 19 factors of your own contradict the rest")

@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 from numeric import as_points, central_differences, decided, map_nees, wheel_nees
 
-from slamlib import odometry, se2, studies
-from slamlib.dataset import ArucoReadings, Dataset
-from slamlib.evaluation import anees, ate, nees, nees_band
-from slamlib.localization import fuse, fuse_increments, fused, localize
-from slamlib.odometry import dead_reckoning
-from slamlib.sightings import GATE
-from slamlib.simulation import TABLE_2, simulate
+from slamlib import fuse, fuse_increments, localize, studies
+from slamlib.core import odometry, se2
+from slamlib.core.evaluation import anees, ate, nees, nees_band
+from slamlib.core.odometry import dead_reckoning
+from slamlib.core.records import ArucoReadings, Dataset
+from slamlib.core.sightings import GATE
+from slamlib.robust import fused
+from slamlib.studies.simulation import TABLE_2, simulate
 
 
 def test_perfect_data_give_the_exact_poses_map_and_wheels():

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from conftest import ROOT, contradicted
 
-from slamlib import se2, slam, solve
+from slamlib import estimate, solve
 from slamlib.__main__ import main
-from slamlib.dataset import read_dataset
-from slamlib.odometry import equation2
-from slamlib.results import read_structs
-from slamlib.simulation import simulate, write_dataset
-from slamlib.swap import file_names
+from slamlib.core import se2
+from slamlib.core.odometry import equation2
+from slamlib.io.dataset import read_dataset
+from slamlib.io.results import read_structs
+from slamlib.io.swap import file_names
+from slamlib.studies.simulation import simulate, write_dataset
 
 
 @pytest.fixture
@@ -70,7 +71,7 @@ def test_options_of_solve_are_heeded_and_said(tmp_path, capsys, drive):
                      "--csv", "--plot", picture)
     assert summary["kernel"] == "Huber" and [*summary["problems"]] == ["problem1", "problem4"]
     assert summary["problems"]["problem4"]["slip_sqrt_m"] == 2e-3
-    expected = slam.estimate(read_dataset(tmp_path / "drive"), slip=2e-3, kernel="Huber")
+    expected = estimate(read_dataset(tmp_path / "drive"), slip=2e-3, kernel="Huber")
     np.testing.assert_array_equal(read_structs(out / "problem4", "vehiclePose")[1], expected.poses)
     assert {path.with_suffix(".csv") for path in out.rglob("*.mat")} == {*out.rglob("*.csv")}
     assert {path.name for path in out.rglob("*.tum")} == {"problem1.tum", "problem4.tum"}

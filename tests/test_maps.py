@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from test_plotting import elongated, require_contours
 
-from slamlib import localization, odometry, slam
-from slamlib.dataset import AntennaGuess, UwbReadings
-from slamlib.evaluation import REACH_95, ate
+from slamlib import estimate, fuse, localize
+from slamlib.core import odometry
+from slamlib.core.evaluation import REACH_95, ate
+from slamlib.core.records import AntennaGuess, UwbReadings
 from slamlib.notebook import Drive, accuracy, antenna_rows, calibration_rows, maps, table
 from slamlib.notebook.tabular import cell
-from slamlib.simulation import simulate
 from slamlib.solve import problem_solution
+from slamlib.studies.simulation import simulate
 
 pytestmark = pytest.mark.usefixtures("look")
 
@@ -23,7 +24,7 @@ pytestmark = pytest.mark.usefixtures("look")
 def solved():
     """A simulated Drive and its SlamResult with markers and antennas."""
     drive = Drive("short", *simulate("short", seed=4))
-    return drive, slam.estimate(drive.dataset)
+    return drive, estimate(drive.dataset)
 
 
 @pytest.fixture
@@ -176,20 +177,20 @@ def test_what_is_missing_is_a_dash_and_a_column_of_it_is_absent():
 
 def test_accuracy_is_that_of_every_kind_of_result_and_without_truth_sigmas_only(drive):
     """The same poses with their frames, or in all rows; markers alone in their first frame."""
-    alone = localization.localize(drive.dataset.aruco)
+    alone = localize(drive.dataset.aruco)
     row = accuracy(alone, drive)
     assert accuracy(problem_solution("problem2", drive.dataset, alone), drive) == row
     assert row["ATE (mm)"] > 0 and row["dataset"] == "short"
     found = odometry.equation2(drive.dataset.ticks, drive.dataset.vehicle)
     assert accuracy(found, drive)["ATE (mm)"] == 1e3 * ate(found[0], drive.truth.poses)
     late = drive.dataset.aruco.select(drive.dataset.aruco.pose > 500)     # another world
-    assert accuracy(localization.localize(late), drive)["ATE (mm)"] < 200
-    row = accuracy(localization.fuse(drive.dataset), replace(drive, truth=None))
+    assert accuracy(localize(late), drive)["ATE (mm)"] < 200
+    row = accuracy(fuse(drive.dataset), replace(drive, truth=None))
     assert [*row] == ["dataset", "σ (mm)", "σ of δ (mrad)"] and row["σ (mm)"] > 0
 
 
 def test_calibration_rows_state_and_estimate_and_know_the_wheels_of_simulated_drives(drive):
-    result = slam.estimate(drive.dataset.without("uwb").first(400))
+    result = estimate(drive.dataset.without("uwb").first(400))
     rows = {row["entry"]: row for row in calibration_rows(result, drive)}
     assert not any("range" in entry or "tag" in entry for entry in rows)
     wheel = rows["`right_radius`"]

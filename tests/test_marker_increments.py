@@ -1,10 +1,9 @@
 import numpy as np
 import pytest
 
-from slamlib import se2
-from slamlib.dataset import ArucoReadings
-from slamlib.evaluation import nees, nees_band
-from slamlib.marker_increments import (
+from slamlib.core import se2
+from slamlib.core.evaluation import nees, nees_band
+from slamlib.core.marker_increments import (
     _best_hypothesis,
     common_sightings,
     consecutive_increments,
@@ -13,8 +12,9 @@ from slamlib.marker_increments import (
     returns,
     robust_increments,
 )
-from slamlib.sightings import Sightings, consensus, merge_repeated, regular
-from slamlib.simulation import simulate
+from slamlib.core.records import ArucoReadings
+from slamlib.core.sightings import Sightings, consensus, merge_repeated, regular
+from slamlib.studies.simulation import simulate
 
 DELTA = np.array([0.12, -0.03, 0.2])
 MARKERS = np.array([[1.2, 0.4, 0.3], [-0.7, 1.1, -2.9], [0.2, -1.3, 3.1], [-1.0, -0.8, 1.0]])

@@ -7,20 +7,21 @@ import numpy as np
 import pytest
 from numeric import changed
 
-from slamlib import evaluation, se2, slam, studies
-from slamlib.checks.solution import solution_doubts
-from slamlib.dataset import ArucoReadings
-from slamlib.evaluation import nees_band
-from slamlib.memory import error_memory
-from slamlib.simulation import simulate
-from slamlib.slam import choices
-from slamlib.slam.choices import _squared_distance, has_rejected_visits, places_of_ids, visits
-from slamlib.slam.fit import _with_shares
-from slamlib.slam.graph import gtsam_step
-from slamlib.slam.linear import NormalEquations
-from slamlib.slam.measurements import Noise, measure
-from slamlib.slam.pipeline import fit_from_odometry
+from slamlib import estimate, studies
+from slamlib.core import evaluation, se2
+from slamlib.core.evaluation import nees_band
+from slamlib.core.records import ArucoReadings
+from slamlib.robust import choices
+from slamlib.robust.choices import _squared_distance, has_rejected_visits, places_of_ids, visits
+from slamlib.robust.error_memory import error_memory
+from slamlib.robust.fit import _with_shares
+from slamlib.robust.linear import NormalEquations
+from slamlib.robust.measurements import Noise, measure
+from slamlib.robust.optimize import gtsam_step
+from slamlib.robust.pipeline import fit_from_odometry
+from slamlib.robust.solution_doubts import solution_doubts
 from slamlib.studies.montecarlo import correlated_errors
+from slamlib.studies.simulation import simulate
 
 LANDMARKS, EACH = 40, 10
 
@@ -67,7 +68,7 @@ def test_shares_by_hand():
 @pytest.fixture(scope="module")
 def remembering():
     dataset, truth = simulate("short", seed=3, memory=0.9)
-    return dataset, truth, slam.estimate(replace(dataset, uwb=None))
+    return dataset, truth, estimate(replace(dataset, uwb=None))
 
 
 def test_memory_is_told_and_counted(remembering):
@@ -123,7 +124,7 @@ def test_echoes_that_stay():
             for row, share in zip(rows[1:], kept):
                 value = share * value + 0.2 * np.sqrt(1 - share**2) * rng.standard_normal()
                 slow[row] = value
-        result = slam.estimate(replace(dataset, uwb=replace(uwb, range=uwb.range + slow)))
+        result = estimate(replace(dataset, uwb=replace(uwb, range=uwb.range + slow)))
         error = result.antenna_in_world - truth.antenna_in_world
         squared += [e @ np.linalg.solve(C, e) for e, C in zip(error, result.antenna_covariance)]
         assert result.released <= {"range-delay"}
@@ -207,7 +208,7 @@ def moved():
 def test_moved_markers_are_landmarks_of_their_own(moved):
     """In problem 4 the same as in problem 3."""
     dataset, before, truth, marker = moved
-    result, clean = slam.estimate(dataset.without("uwb")), slam.estimate(before)
+    result, clean = estimate(dataset.without("uwb")), estimate(before)
     ids, places = result.places[result.places[:, 0] != result.places[:, 1]].T
     assert set(ids) == set(marker) and set(places - ids) == {10**len(str(truth.marker.max()))}
     assert np.isin(places, result.marker).all()
@@ -217,7 +218,7 @@ def test_moved_markers_are_landmarks_of_their_own(moved):
     sentence, = (doubt.sentence for doubt in solution_doubts(result) if doubt.what == "places")
     assert all(str(each) in sentence for each in set(places))
     assert clean.places is None
-    both = slam.estimate(dataset, previous=result)
+    both = estimate(dataset, previous=result)
     np.testing.assert_array_equal(both.places, result.places)
     assert evaluation.ate(both.poses, truth.poses, True) < 0.01
 

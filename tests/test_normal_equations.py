@@ -10,17 +10,19 @@ from gtsam.symbol_shorthand import C
 from numeric import as_points, known_noise
 from scipy.special import chdtri
 
-from slamlib import sightings
-from slamlib.simulation import simulate
-from slamlib.slam import factors, graph, linear, noise
-from slamlib.slam.calibration import ENTRIES, WHEELS
-from slamlib.slam.covariances import marginal_covariances
-from slamlib.slam.fit import KERNELS, residuals
-from slamlib.slam.graph import optimize
-from slamlib.slam.initialization import odometry_state
-from slamlib.slam.linear import NormalEquations, build_problem, laplace_approximation
-from slamlib.slam.measurements import GUESS_PRIOR_SIGMA, WEAK_SIGMA, Noise, accept_all, measure
-from slamlib.slam.own import gtsam_values, variable_keys
+from slamlib.core import sightings
+from slamlib.core.kernels import KERNELS
+from slamlib.robust import factors, linear, noise
+from slamlib.robust import optimize as graph
+from slamlib.robust.calibration import ENTRIES, WHEELS
+from slamlib.robust.covariances import marginal_covariances
+from slamlib.robust.fit import residuals
+from slamlib.robust.initialization import odometry_state
+from slamlib.robust.linear import NormalEquations, build_problem, laplace_approximation
+from slamlib.robust.measurements import GUESS_PRIOR_SIGMA, WEAK_SIGMA, Noise, accept_all, measure
+from slamlib.robust.optimize import optimize
+from slamlib.robust.own import gtsam_values, variable_keys
+from slamlib.studies.simulation import simulate
 
 GROUPS = frozenset(entry.group for entry in ENTRIES) | {"antenna-offsets"}
 

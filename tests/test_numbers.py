@@ -12,8 +12,8 @@ import pytest
 from numeric import aruco, as_points, carried, counts, uwb, vehicle
 
 from slamlib import solve
-from slamlib.checks.files import doubts_before_solving
-from slamlib.simulation import simulate
+from slamlib.robust.file_doubts import doubts_before_solving
+from slamlib.studies.simulation import simulate
 
 
 def moved_markers(d):

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from numeric import central_differences
 
-from slamlib import increments, odometry, se2
-from slamlib.dataset import Vehicle
-from slamlib.se2 import correlations
-from slamlib.simulation import manoeuvre, simulate
+from slamlib.core import increments, odometry, se2
+from slamlib.core.se2 import correlations
+from slamlib.core.vehicle import Vehicle
+from slamlib.studies.simulation import manoeuvre, simulate
 
 VEHICLE = Vehicle()
 BOTH = pytest.mark.parametrize("model", odometry.MODELS)

@@ -6,15 +6,16 @@ import numpy as np
 import pytest
 from numeric import as_points, carried, counts
 
-from slamlib import odometry_gate as gate
-from slamlib import se2, slam
-from slamlib.checks.solution import _of_encoder, solution_doubts
-from slamlib.dataset import ArucoReadings, Dataset
-from slamlib.evaluation import ate, nees
-from slamlib.localization.fused import fuse
-from slamlib.odometry import dead_reckoning
-from slamlib.sightings import sightings_by_frame
-from slamlib.simulation import TABLE_2, manoeuvre, simulate
+from slamlib import estimate
+from slamlib.core import se2
+from slamlib.core.evaluation import ate, nees
+from slamlib.core.odometry import dead_reckoning
+from slamlib.core.records import ArucoReadings, Dataset
+from slamlib.core.sightings import sightings_by_frame
+from slamlib.robust import jumps as gate
+from slamlib.robust.fused import fuse
+from slamlib.robust.solution_doubts import _of_encoder, solution_doubts
+from slamlib.studies.simulation import TABLE_2, manoeuvre, simulate
 
 MARKERS = np.array([[1.0, 0.0, 0.3], [0.5, 0.8, -2.0], [0.0, -1.0, 1.0]])
 
@@ -156,7 +157,7 @@ FAULTS = {                                                # and the largest rati
 @pytest.fixture(scope="module")
 def clean():
     dataset, truth = simulate("short", seed=3)
-    return dataset, truth, errors(slam.estimate(dataset.without("uwb")), truth)[0]
+    return dataset, truth, errors(estimate(dataset.without("uwb")), truth)[0]
 
 
 @pytest.mark.slow
@@ -166,12 +167,12 @@ def test_a_fault_of_odometry_is_told_and_costs_little(name, clean):
     dataset, truth = fault(clean[0]), clean[1]
     lost = slice(1001, 1001 + len(truth.poses) - len(dataset.ticks))
     truth = replace(truth, poses=np.delete(truth.poses, lost, axis=0))
-    result = slam.estimate(dataset.without("uwb"))
+    result = estimate(dataset.without("uwb"))
     error, consistency = errors(result, truth)
     assert consistency < 6 and error < most * clean[2]
     doubt, = (each for each in solution_doubts(result) if each.what == "encoder")
     assert "between poses 1" in doubt.sentence
-    both = slam.estimate(dataset, previous=result)
+    both = estimate(dataset, previous=result)
     assert errors(both, truth)[1] < 6 and both.jumps is result.jumps
     assert errors(fuse(dataset), truth)[1] < 6
 
@@ -183,7 +184,7 @@ def test_a_push_that_no_marker_saw_is_found_at_the_solution():
     truth = replace(truth, poses=np.delete(truth.poses, slice(1103, 1109), axis=0))
     dataset = carried(dataset, 1103, 1109)
     pose = dataset.aruco.pose
-    found = slam.estimate(replace(dataset, uwb=None, aruco=dataset.aruco.select(
+    found = estimate(replace(dataset, uwb=None, aruco=dataset.aruco.select(
         (pose < 1040) | (pose > 1240))))
     assert [doubt.what for doubt in solution_doubts(found)] == ["encoder"]
     assert found.jumps.start < 1103 < found.jumps.end and found.slip < 5e-4
@@ -198,7 +199,7 @@ def test_jumps_are_found_in_the_vehicle_s_axes_of_a_camera_that_is_turned(clean)
         dataset, vehicle=replace(dataset.vehicle, camera_turn=np.pi / 2), aruco=replace(
             a, marker_in_vehicle=se2.between(turned, a.marker_in_vehicle),
             covariance=se2.rotate_covariance(a.covariance, -np.pi / 2)))
-    error, consistency = errors(slam.estimate(dataset.without("uwb")), truth)
+    error, consistency = errors(estimate(dataset.without("uwb")), truth)
     assert consistency < 6 and error < 1.5 * clean[2]
 
 
@@ -207,7 +208,7 @@ def test_where_all_markers_change_the_later_covariance_is_that_of_not_knowing(cl
     aruco = dataset.aruco
     dataset = replace(dataset, aruco=replace(
         aruco, marker=aruco.marker + 1000 * (aruco.pose > BREAK)))
-    result = slam.estimate(dataset.without("uwb"))
+    result = estimate(dataset.without("uwb"))
     assert (result.jumps.sigma == gate.UNKNOWN_SIGMA).all() and len(result.jumps.start) == 1
     sigma = np.sqrt(result.covariances[:, 0, 0])
     assert sigma[BREAK] < 0.1 and sigma[BREAK + 20] > 5
@@ -232,7 +233,7 @@ def test_sightings_that_are_late_are_no_jumps_and_start_at_their_delay(stated):
     drive = Dataset("lanes", vehicle, ticks, aruco, None, None)
     jumps = gate.find_jumps(drive)
     assert jumps.lag == 10 - stated and not len(jumps.start)
-    found = slam.estimate(drive)
+    found = estimate(drive)
     lag, = (row for row in found.calibration_table if row["name"] == "sighting_lag")
     assert found.released == {"time-offset"} and abs(lag["estimate"] - 10) < 4 * lag["sigma"] < 0.5
     assert ate(found.poses, path) < 3e-3 and found.rejected.mean() < 0.01

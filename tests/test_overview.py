@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from test_document import text_of
 
-from slamlib import evaluation, se2
-from slamlib.checks.files import Doubt
-from slamlib.dataset import read_dataset, read_truth
+from slamlib.core import evaluation, se2
+from slamlib.io.dataset import read_dataset, read_truth
+from slamlib.io.results import write_solution, write_structs
 from slamlib.notebook import plotting
 from slamlib.report import overview
 from slamlib.report.document import render
 from slamlib.report.execution import NotebookError
 from slamlib.report.notebooks import Options
 from slamlib.report.overview import title_picture
-from slamlib.results import write_solution, write_structs
-from slamlib.simulation import simulate, write_dataset
+from slamlib.robust.file_doubts import Doubt
 from slamlib.solve import Failure, Solution, solutions, summarize, title
+from slamlib.studies.simulation import simulate, write_dataset
 
 NAMES = ("all", "no_truth", "wheels_only")
 

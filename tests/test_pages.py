@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 from conftest import BROUGHT, ROOT, STUDY_SEEDS, built_elsewhere, contradicted, copied
 
-from slamlib.dataset import read_dataset
-from slamlib.odometry import equation2
+from slamlib.core.odometry import equation2
+from slamlib.io.dataset import read_dataset
+from slamlib.io.results import read_structs
 from slamlib.report import build_report
-from slamlib.results import read_structs
-from slamlib.simulation import simulate, write_dataset
 from slamlib.solve import PROBLEMS
+from slamlib.studies.simulation import simulate, write_dataset
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_seeds")]
 # Elements that reach beyond the column, unless what holds them can be scrolled sideways.
@@ -95,14 +95,14 @@ def test_a_chapter_whose_sensor_no_dataset_has_is_left_out(tmp_path):
 
 FAILING = """import numpy as np
 from slamlib import slam
-estimate = slam.estimate
+estimate = estimate
 
 def failing(dataset, *arguments, **options):
     if dataset.name == "bad" and dataset.uwb is None:
         raise np.linalg.LinAlgError("Singular matrix")
     return estimate(dataset, *arguments, **options)
 
-slam.estimate = failing"""
+estimate = failing"""
 
 
 @pytest.fixture(scope="module")

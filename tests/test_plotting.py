@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from matplotlib.transforms import Affine2D
 
-from slamlib import se2
-from slamlib.evaluation import REACH_95
+from slamlib.core import se2
+from slamlib.core.evaluation import REACH_95
+from slamlib.core.se2 import rotation
 from slamlib.notebook import plotting
-from slamlib.se2 import rotation
 
 pytestmark = pytest.mark.usefixtures("look")
 

@@ -15,11 +15,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_dataset import FILES, write
 
-from slamlib import odometry, se2
-from slamlib.checks.files import doubts_before_solving
-from slamlib.dataset import Dataset, DatasetError, Vehicle, read_dataset, read_truth
-from slamlib.simulation import simulate
+from slamlib.core import odometry, se2
+from slamlib.core.errors import DatasetError
+from slamlib.core.vehicle import Vehicle
+from slamlib.io.dataset import dataset_from_arrays, read_dataset, read_truth
+from slamlib.robust.file_doubts import doubts_before_solving
 from slamlib.solve import Failure, solutions, summarize
+from slamlib.studies.simulation import simulate
 
 QUICK = settings(max_examples=3 * settings.default.max_examples)
 HALF = settings(max_examples=settings.default.max_examples // 2)
@@ -158,7 +160,7 @@ def test_files_of_any_bytes_are_read_or_refused_in_one_sentence(files):
 @given(drives())
 def test_every_small_drive_is_solved(drive):
     """Estimates are finite with positive definite covariances; what fails, says truly why."""
-    dataset = Dataset.from_arrays(drive.ticks, drive.sightings, drive.ranges, drive.guesses,
+    dataset = dataset_from_arrays(drive.ticks, drive.sightings, drive.ranges, drive.guesses,
                                   drive.vehicle)
     for solution in solutions(dataset):
         if isinstance(solution, Failure):
@@ -239,7 +241,7 @@ def test_ids_the_order_of_rows_and_the_side_are_names_only():
     for ticks, tables, changes in (
             (dataset.ticks, renamed, {"numbers": numbers}),
             (dataset.ticks[:, ::-1], mirrored, {"factor": (1, -1, -1)})):
-        others = estimates(Dataset.from_arrays(ticks, **tables, vehicle=dataset.vehicle))
+        others = estimates(dataset_from_arrays(ticks, **tables, vehicle=dataset.vehicle))
         for (name, expected, x, C), (_, found, other, other_C) in zip(
                 estimates(dataset, **changes), others, strict=True):
             np.testing.assert_array_equal(found, expected, err_msg=name)

@@ -12,13 +12,13 @@ import pytest
 from conftest import ROOT, contradicted
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 
-from slamlib import swap
 from slamlib.__main__ import main
-from slamlib.dataset import DatasetError
+from slamlib.core.errors import DatasetError
+from slamlib.core.se2 import compose
+from slamlib.io import swap
 from slamlib.report import NotebookError, build_report
 from slamlib.report.notebooks import Options, read_options
-from slamlib.se2 import compose
-from slamlib.simulation import simulate, write_dataset
+from slamlib.studies.simulation import simulate, write_dataset
 
 ENVIRONMENT = """import os, sys
 print("stderr is shown", file=sys.stderr)

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from scipy.io import loadmat, savemat
 
-from slamlib import results
 from slamlib.__main__ import main
-from slamlib.simulation import simulate, write_dataset
+from slamlib.io import results
+from slamlib.studies.simulation import simulate, write_dataset
 
 ABSENT = [np.nan] * 3
 

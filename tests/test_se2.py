@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 from numeric import central_differences
 
-from slamlib import evaluation, se2
+from slamlib.core import evaluation, se2
 
 HEADINGS = [0.0, 1e-8, -1e-8, 0.7, -2.1, np.pi, -np.pi, np.pi - 1e-9, 5.0]
 POSES = np.array([[x, y, h] for h in HEADINGS for x, y in [(0.0, 0.0), (1.5, -2.5)]])

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
-from slamlib import odometry, se2
-from slamlib.dataset import Vehicle, read_dataset, read_truth
-from slamlib.simulation import simulate, write_dataset
+from slamlib.core import odometry, se2
+from slamlib.core.vehicle import Vehicle
+from slamlib.io.dataset import read_dataset, read_truth
+from slamlib.studies.simulation import simulate, write_dataset
 
 DATA = ROOT / "data"
 RECIPES = {"short": dict(path="short", seed=1),

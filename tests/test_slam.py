@@ -7,26 +7,30 @@ import numpy as np
 import pytest
 from numeric import as_points, central_differences, known_noise, slam_trial
 
-from slamlib import odometry, se2, simulation, slam, studies
-from slamlib.dataset import AntennaGuess, ArucoReadings, Dataset, DatasetError, UwbReadings, Vehicle
-from slamlib.evaluation import anees, ate, nees_band
-from slamlib.simulation import simulate
-from slamlib.slam import factors
-from slamlib.slam.choices import DECISIVE_LEAD, better_model
-from slamlib.slam.covariances import marginal_covariances, posterior_moments
-from slamlib.slam.fit import KERNELS, ONE_SIDED, accepted_measurements
-from slamlib.slam.initialization import GROWTH, odometry_state, part_lengths
-from slamlib.slam.linear import (
+from slamlib import estimate, studies
+from slamlib.core import odometry, se2
+from slamlib.core.errors import DatasetError
+from slamlib.core.evaluation import anees, ate, nees_band
+from slamlib.core.kernels import KERNELS, ONE_SIDED
+from slamlib.core.records import AntennaGuess, ArucoReadings, Dataset, UwbReadings
+from slamlib.core.vehicle import Vehicle
+from slamlib.robust import factors
+from slamlib.robust.choices import DECISIVE_LEAD, better_model
+from slamlib.robust.covariances import marginal_covariances, posterior_moments
+from slamlib.robust.fit import accepted_measurements
+from slamlib.robust.initialization import GROWTH, odometry_state, part_lengths
+from slamlib.robust.linear import (
     NormalEquations,
     build_problem,
     laplace_approximation,
     state_from_arrays,
 )
-from slamlib.slam.measurements import NOISE_KEYS, Noise, measure, square_root_information
-from slamlib.slam.noise import learn_noise
-from slamlib.slam.pipeline import fit_from_odometry
-from slamlib.slam.result import interpolate, slam_result
-from slamlib.studies import kernels, starts
+from slamlib.robust.measurements import NOISE_KEYS, Noise, measure, square_root_information
+from slamlib.robust.noise import learn_noise
+from slamlib.robust.pipeline import fit_from_odometry
+from slamlib.robust.result import interpolate, slam_result
+from slamlib.studies import kernels, simulation, starts
+from slamlib.studies.simulation import simulate
 
 
 @pytest.fixture(scope="module")
@@ -83,9 +87,9 @@ def learned_noise(seed, slip):
     """Problems 3 and 4 with the noise learned, and problem 3 where it is known, on one drive."""
     dataset, truth = simulate("short", seed, slip=slip)
     markers = dataset.without("uwb")
-    learned = slam.estimate(markers)
-    found = {"": learned, "known ": slam.estimate(known_noise(markers, slip), model="arc"),
-             "problem 4 ": slam.estimate(dataset, previous=learned)}
+    learned = estimate(markers)
+    found = {"": learned, "known ": estimate(known_noise(markers, slip), model="arc"),
+             "problem 4 ": estimate(dataset, previous=learned)}
     return {"slip": learned.slip, "rejected": np.count_nonzero(learned.rejected),
             "arc": float(learned.model == "arc")} | {
         f"{name}{key}": value for name, r in found.items() for key, value in (
@@ -122,7 +126,7 @@ def test_wrong_covariances_of_sightings_are_scaled(scale=1 / 16):
     """The estimate is nearly the one from the right covariances, and its factor is known."""
     dataset = simulate("short", seed=61)[0].without("uwb")
     aruco = replace(dataset.aruco, covariance=scale * dataset.aruco.covariance)
-    expected, found = slam.estimate(dataset), slam.estimate(replace(dataset, aruco=aruco))
+    expected, found = estimate(dataset), estimate(replace(dataset, aruco=aruco))
     assert abs(np.log(found.noise.sightings * np.sqrt(scale))) < 4 * found.noise_sigma[1]
     assert 0.005 < found.noise_sigma[1] < 0.03               # about 2700 errors: 1 / sqrt(2 * 2700)
     sigma = np.sqrt(np.diagonal(expected.covariances, axis1=1, axis2=2))[1:]
@@ -215,7 +219,7 @@ def test_two_poses_and_one_marker_by_hand():
     readings = ArucoReadings(np.array([0, 100]), np.array([9, 9]),
                              np.array([[s_1, 0, 0], [s_2, 0, 0]]), np.array([C, C]))
     dataset = Dataset("line", vehicle, ticks, readings, None, None)
-    found = slam.estimate(known_noise(dataset, slip), model="arc")
+    found = estimate(known_noise(dataset, slip), model="arc")
     q = slip**2 * o / 2
     expected = (2 * r * o + q * (s_1 - s_2)) / (2 * r + q)
     np.testing.assert_allclose(found.poses[100, 0], expected, atol=1e-5)
@@ -232,7 +236,7 @@ def test_interpolated_poses_equal_those_of_a_graph_with_all_poses(every, sigma):
     dataset = replace(dataset, uwb=None, vehicle=vehicle, ticks=dataset.ticks[:106])
     keep = (dataset.aruco.pose <= 100) & (dataset.aruco.pose % every == 0)
     dataset = replace(dataset, aruco=dataset.aruco.select(keep))
-    sparse = slam.estimate(known_noise(dataset, 3e-3), model="arc")
+    sparse = estimate(known_noise(dataset, 3e-3), model="arc")
     dense = slam_result(fit_from_odometry(measure(known_noise(dataset, 3e-3), range(106))))
     sigma, expected = (np.sqrt(np.diagonal(c, axis1=1, axis2=2))
                        for c in (sparse.covariances, dense.covariances))
@@ -282,7 +286,7 @@ def test_markers_of_unknown_heading_are_mapped_as_points():
     z[:, 2] = rng.uniform(-np.pi, np.pi, len(z))
     dataset = replace(dataset, uwb=None, aruco=replace(
         as_points(seen, slice(None)), marker_in_vehicle=z))
-    found = slam.estimate(dataset)
+    found = estimate(dataset)
     assert ate(found.poses, truth.poses) < 0.03 and found.rejected.mean() < 0.01
     assert anees(found.poses, found.covariances, truth.poses) < nees_band(1, probability=0.999)[1]
     np.testing.assert_allclose(found.marker_covariance[:, 2, 2], 1e4)
@@ -326,8 +330,8 @@ def test_open_paths_are_solved(shape):
     values, errors = [], []
     for seed in range(3):
         dataset, truth = open_path(OPEN_PATHS[shape], seed)
-        found = slam.estimate(dataset)
-        known = slam.estimate(known_noise(dataset, 1e-3), model="arc")
+        found = estimate(dataset)
+        known = estimate(known_noise(dataset, 1e-3), model="arc")
         errors.append([ate(r.poses, truth.poses, aligned=True) for r in (found, known)])
         assert found.rejected.mean() < 0.01
         values.append(anees(found.poses, found.covariances, truth.poses))
@@ -378,10 +382,10 @@ def test_a_longer_part_goes_on_from_the_last_solved_pose_with_its_wheels():
 def test_noise_that_is_known_is_not_learned_and_the_rest_is(known):
     """By an option and by the vehicle alike, from odometry and from a result; sigmas say which."""
     dataset = simulate("short", seed=4)[0].first(400)
-    before = slam.estimate(dataset.without("uwb"))
-    found = slam.estimate(dataset, **known)
-    by_vehicle = slam.estimate(replace(dataset, vehicle=replace(dataset.vehicle, **known)))
-    again = slam.estimate(dataset, previous=before, **known)
+    before = estimate(dataset.without("uwb"))
+    found = estimate(dataset, **known)
+    by_vehicle = estimate(replace(dataset, vehicle=replace(dataset.vehicle, **known)))
+    again = estimate(dataset, previous=before, **known)
     np.testing.assert_array_equal(found.poses, by_vehicle.poses)
     for each in (found, again):
         given = np.array([name in known for name in NOISE_KEYS])
@@ -390,7 +394,7 @@ def test_noise_that_is_known_is_not_learned_and_the_rest_is(known):
         np.testing.assert_allclose(values[given], list(known.values()), rtol=1e-12)
         assert (values[~given] != np.array([1e-3, 1, 1])[~given]).all()
         np.testing.assert_allclose(values[1:][~given[1:]], 1, atol=0.2)
-    assert np.abs(found.poses[-1] - slam.estimate(dataset).poses[-1]).max() > 1e-6
+    assert np.abs(found.poses[-1] - estimate(dataset).poses[-1]).max() > 1e-6
 
 
 @pytest.mark.parametrize("options, told", [
@@ -407,8 +411,8 @@ def test_noise_that_is_known_is_not_learned_and_the_rest_is(known):
     ({"factors": []}, r"expected a gtsam.NonlinearFactorGraph for factors, found .\[\]"),
     ({"dataset": "data/short"}, "expected a Dataset, found .data/short.")])
 def test_an_option_with_a_wrong_name_or_value_is_told_with_what_there_is(options, told):
-    with pytest.raises(DatasetError, match=f"^slam.estimate: {told}" if told[0] == "e" else told):
-        slam.estimate(**{"dataset": simulate("short", seed=4)[0].first(50)} | options)
+    with pytest.raises(DatasetError, match=f"^estimate: {told}" if told[0] == "e" else told):
+        estimate(**{"dataset": simulate("short", seed=4)[0].first(50)} | options)
 
 
 @pytest.mark.slow
@@ -420,12 +424,12 @@ def test_every_kernel_solves_a_drive_with_wrong_labels_and_late_ranges(kernel):
     """
     dataset, truth = simulate("short", seed=4, mislabelled=0.01, late_ranges=0.05)
     dataset, truth = dataset.first(800), truth.poses[:800]
-    gated = slam.estimate(dataset, kernel=kernel, model="arc")
+    gated = estimate(dataset, kernel=kernel, model="arc")
     assert gated.rejected.any() and ate(gated.poses, truth) < 0.02
     np.testing.assert_allclose(gated.noise.sightings, 1, atol=0.05)
     assert (gated.range_weight < 1).any()
     if kernel not in ONE_SIDED:                     # those leave the errors of sightings quadratic
-        found = slam.estimate(dataset, kernel=kernel, model="arc", gate=False)
+        found = estimate(dataset, kernel=kernel, model="arc", gate=False)
         assert not found.rejected.any()
         assert (ate(found.poses, truth) < 0.03) == (kernel != "quadratic")
 
@@ -477,7 +481,7 @@ def test_headings_are_continuous_where_frames_are_rounds_apart():
     dataset, truth = simulate("short", seed=5, rounds=3)
     last = len(dataset.ticks) - 1
     ends = (dataset.aruco.pose < 50) | (dataset.aruco.pose > last - 50)
-    found = slam.estimate(replace(dataset, uwb=None, aruco=dataset.aruco.select(ends)))
+    found = estimate(replace(dataset, uwb=None, aruco=dataset.aruco.select(ends)))
     assert abs(truth.poses[-1, 2]) > 18
     np.testing.assert_allclose(found.poses[:, 2], truth.poses[:, 2], atol=0.3)
     assert np.abs(np.diff(found.poses[:, 2])).max() < 0.1

@@ -12,7 +12,8 @@ from test_report import make_data, write
 
 from slamlib import studies
 from slamlib.report import build_report
-from slamlib.studies import memory, montecarlo
+from slamlib.studies import montecarlo
+from slamlib.studies import runs as memory
 
 
 def study(seeds=range(2), **options):

@@ -8,23 +8,25 @@ import pytest
 from numeric import central_differences, decided, known_noise, slam_trial
 from scipy.integrate import quad
 
-from slamlib import slam, studies
-from slamlib.checks.solution import solution_doubts
-from slamlib.dataset import AntennaGuess, Dataset, UwbReadings, Vehicle
-from slamlib.evaluation import align, ate, nees_band
-from slamlib.odometry import dead_reckoning
-from slamlib.se2 import compose
-from slamlib.simulation import manoeuvre, simulate
-from slamlib.slam import factors, graph, initialization, result
-from slamlib.slam.calibration import OFFSET, RANGES, SCALE, SIGHTINGS, stated_calibration
-from slamlib.slam.fit import KERNELS, ONE_SIDED
-from slamlib.slam.graph import optimize
-from slamlib.slam.initialization import AntennaRanges, odometry_state, second_moment, trilaterate
-from slamlib.slam.linear import NormalEquations, consistency_factor
-from slamlib.slam.measurements import GUESS_PRIOR_SIGMA, measure
-from slamlib.slam.pipeline import fit_from_previous
+from slamlib import estimate, studies
+from slamlib.core.evaluation import align, ate, nees_band
+from slamlib.core.kernels import KERNELS, ONE_SIDED
+from slamlib.core.odometry import dead_reckoning
+from slamlib.core.records import AntennaGuess, Dataset, UwbReadings
+from slamlib.core.se2 import compose
+from slamlib.core.vehicle import Vehicle
+from slamlib.robust import factors, initialization, result
+from slamlib.robust import optimize as graph
+from slamlib.robust.calibration import OFFSET, RANGES, SCALE, SIGHTINGS, stated_calibration
+from slamlib.robust.initialization import AntennaRanges, odometry_state, second_moment, trilaterate
+from slamlib.robust.linear import NormalEquations, consistency_factor
+from slamlib.robust.measurements import GUESS_PRIOR_SIGMA, measure
+from slamlib.robust.optimize import optimize
+from slamlib.robust.pipeline import fit_from_previous
+from slamlib.robust.solution_doubts import solution_doubts
 from slamlib.solve import problem_solution
 from slamlib.studies import kernels, montecarlo, plaza, starts
+from slamlib.studies.simulation import manoeuvre, simulate
 
 # A vehicle of exact odometry, so that only the geometry of the ranges matters.
 EXACT = Vehicle(sigma_right_radius=1e-9, sigma_left_radius=1e-9, sigma_wheelbase=1e-9,
@@ -108,7 +110,7 @@ def test_antenna_from_known_poses_by_hand():
     """The information is the sum of u u^T / sigma^2 over unit directions u, plus the guess's."""
     place = np.array([2.0, 5.0])
     dataset, poses = drive([(4.0, 2.0), (3.0, -1.0)], place, (2.5, 4.0))
-    found = slam.estimate(known_noise(located(dataset), 1e-5), model="arc")
+    found = estimate(known_noise(located(dataset), 1e-5), model="arc")
     u = place - poses[dataset.uwb.pose, :2]
     u /= np.hypot(*u.T)[:, None]
     expected = np.linalg.inv(u.T @ u / 0.05**2 + np.eye(2) / 5.0**2)
@@ -123,7 +125,7 @@ def test_perfect_data_gives_the_exact_answer(without, tolerance):
     """As exactly as steps end at an error that is not zero: that of a biased kernel is not."""
     dataset, truth = simulate("short", seed=1, noise=False)
     dataset = located(dataset).without(without) if without else located(dataset)
-    found = slam.estimate(known_noise(dataset, 1e-3), model="arc")
+    found = estimate(known_noise(dataset, 1e-3), model="arc")
     seen = np.searchsorted(truth.marker, found.marker)
     for values, expected in (
             (found.poses, truth.poses), (found.wheel, [0.1, 0.1, 0.4]),
@@ -143,8 +145,8 @@ def late():
 
 def test_problem_4_from_problem_3_or_odometry_down_weights_late_ranges_only(late):
     dataset, off = late
-    before, alone = slam.estimate(dataset.without("uwb")), slam.estimate(dataset)
-    after = slam.estimate(dataset, previous=before)
+    before, alone = estimate(dataset.without("uwb")), estimate(dataset)
+    after = estimate(dataset, previous=before)
     sigma = np.sqrt(np.diagonal(alone.covariances, axis1=1, axis2=2))
     assert (np.abs(after.poses - alone.poses) < 0.05 * sigma + 1e-6).all()
     np.testing.assert_allclose(after.antenna_in_world, alone.antenna_in_world, atol=1e-3)
@@ -211,7 +213,7 @@ def test_a_mirrored_place_is_corrected_on_a_curved_path_and_told_on_a_straight_o
     place = np.array([3.0, 4.0])
     dataset, _ = drive([(3.0, 0.0), (2.0, turn), (3.0, 0.0)], place,
                        (3.0, -4.0) if turn else (2.5, 3.0 * side))
-    found = slam.estimate(known_noise(located(dataset) if turn else dataset, 1e-5), model="arc")
+    found = estimate(known_noise(located(dataset) if turn else dataset, 1e-5), model="arc")
     np.testing.assert_allclose(found.antenna_in_world[0], place * [1, side], atol=1e-2)
     if turn:
         assert not found.doubts
@@ -224,7 +226,7 @@ def test_few_ranges_give_a_large_covariance_and_a_doubt(count, reason):
     dataset, _ = drive([(4.0, 2.0), (3.0, -1.0)], np.array([2.0, 5.0]), (2.5, 4.5))
     few = np.linspace(0, len(dataset.uwb.pose) - 1, count).astype(int)
     dataset = replace(dataset, uwb=dataset.uwb.select(few))
-    found = slam.estimate(known_noise(dataset, 1e-5), model="arc")
+    found = estimate(known_noise(dataset, 1e-5), model="arc")
     assert reason in found.doubts[7]
     largest = np.sqrt(np.linalg.eigvalsh(found.antenna_covariance[0])[-1])
     assert largest > (2 if count == 1 else 0.15)
@@ -242,7 +244,7 @@ def test_a_standing_vehicle_learns_only_the_distances_of_its_antennas():
     dataset = Dataset("still", Vehicle(), np.zeros((2000, 2), int), None,
                       UwbReadings(pose, antenna, ranges, np.full(400, 0.05)),
                       AntennaGuess(np.arange(4), place + 0.3))
-    found = slam.estimate(dataset)
+    found = estimate(dataset)
     assert np.abs(found.poses).max() < 0.01 and set(found.doubts) == {0, 1, 2, 3}
     np.testing.assert_allclose(np.hypot(*found.antenna_in_world.T), np.hypot(*place.T), atol=0.05)
 
@@ -328,7 +330,7 @@ def long_drive():
     """The first 8000 poses of a long drive, its Truth, and the SlamResult of its right ranges."""
     dataset, truth = simulate("long", seed=61)
     dataset = dataset.first(8000)
-    return dataset, truth, slam.estimate(dataset)
+    return dataset, truth, estimate(dataset)
 
 
 @pytest.mark.slow
@@ -336,7 +338,7 @@ def long_drive():
 def test_ranges_calibrate_themselves(offset, scale, long_drive):
     dataset, truth, right = long_drive
     wrong = replace(dataset, uwb=replace(dataset.uwb, range=offset + scale * dataset.uwb.range))
-    found = slam.estimate(wrong)
+    found = estimate(wrong)
     assert not solution_doubts(right)
     off = found.c[[OFFSET, SCALE]] - [offset, scale]
     sigma = np.sqrt(np.diag(found.c_covariance)[[OFFSET, SCALE]])
@@ -353,7 +355,7 @@ def test_ranges_calibrate_themselves(offset, scale, long_drive):
 @pytest.mark.slow
 def test_plaza_2_is_solved():
     dataset, truth = plaza.read_plaza2()
-    found = slam.estimate(dataset)
+    found = estimate(dataset)
     motion = align(found.poses, truth.poses)
     beacons = compose(motion, np.column_stack([found.antenna_in_world, np.zeros(4)]))[:, :2]
     assert ate(found.poses, truth.poses, aligned=True) < 0.35
@@ -371,7 +373,7 @@ def test_gtsam_takes_the_last_steps_and_reaches_one_optimum_from_two_starts(monk
     The steps before the last are by normal equations.
     """
     dataset, steps = simulate("short", seed=3, late_ranges=0.1)[0].first(600), []
-    before, gtsam_step = slam.estimate(dataset.without("uwb")), graph.gtsam_step
+    before, gtsam_step = estimate(dataset.without("uwb")), graph.gtsam_step
     monkeypatch.setattr(graph, "gtsam_step", lambda *given: steps.append(1) or gtsam_step(*given))
     fit = fit_from_previous(measure(dataset), before)
     first = odometry_state(fit.problem.measurements, "arc", antennas=starts.guessed_antennas)

@@ -18,11 +18,12 @@ from matplotlib import style
 from matplotlib_inline.backend_inline import set_matplotlib_formats
 
 from slamlib import solve
-from slamlib.dataset import Dataset, Truth, read_dataset, read_truth
+from slamlib.core.records import Dataset, Truth
+from slamlib.io.dataset import read_dataset, read_truth
+from slamlib.io.results import write_solution
+from slamlib.io.tables import datasets_in
 from slamlib.notebook import plotting
-from slamlib.results import write_solution
-from slamlib.simulation import simulate
-from slamlib.tables import datasets_in
+from slamlib.studies.simulation import simulate
 
 KEY = "slamlib"  # of records in the metadata of outputs
 RECORDS = {"doubt": solve.Doubt, "failure": solve.Failure}  # types of records by their key
@@ -86,7 +87,7 @@ def solved(drives, **solvers):
     ----------
     drives : iterable of Drive; those without a sensor that a problem needs are left out.
     solvers : functions of a Drive by problem, names of `solve.PROBLEMS`, that return what
-        `solve.find` returns, such as `problem3=lambda drive: slam.estimate(drive.dataset)`.
+        `solve.find` returns, such as `problem3=lambda drive: estimate(drive.dataset)`.
 
     Returns
     -------

@@ -4,7 +4,7 @@ from itertools import repeat
 
 import numpy as np
 
-from slamlib import evaluation
+from slamlib.core import evaluation
 from slamlib.notebook import plotting
 
 MAP_WIDTH = 7.4                    # inches, the whole width of the page

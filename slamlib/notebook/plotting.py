@@ -15,9 +15,9 @@ import pandas as pd
 from matplotlib.collections import EllipseCollection
 from matplotlib.colors import to_rgb
 
-from slamlib import se2
-from slamlib.evaluation import REACH_95
-from slamlib.odometry import cumulative
+from slamlib.core import se2
+from slamlib.core.evaluation import REACH_95
+from slamlib.core.odometry import cumulative
 
 
 class _Roles(dict):

@@ -5,12 +5,12 @@ import re
 import numpy as np
 from IPython.display import Markdown
 
-from slamlib import evaluation
+from slamlib.core import evaluation
+from slamlib.core.kernels import ONE_SIDED
+from slamlib.core.odometry import dead_reckoning
 from slamlib.notebook.plotting import estimates, places_by_id
-from slamlib.odometry import dead_reckoning
-from slamlib.slam.calibration import RANGES
-from slamlib.slam.fit import ONE_SIDED
-from slamlib.slam.measurements import NOISE_KEYS
+from slamlib.robust.calibration import RANGES
+from slamlib.robust.measurements import NOISE_KEYS
 from slamlib.studies.kernels import mislabelled
 
 DASH = "–"

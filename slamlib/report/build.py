@@ -13,8 +13,10 @@ from tempfile import TemporaryDirectory
 
 from tqdm import tqdm
 
-from slamlib import swap
-from slamlib.dataset import inventory_lines, read_dataset, read_truth
+from slamlib.core.errors import require
+from slamlib.io import swap
+from slamlib.io.dataset import inventory_lines, read_dataset, read_truth
+from slamlib.io.tables import datasets_in
 from slamlib.notebook import notices
 from slamlib.report import cache
 from slamlib.report.document import render
@@ -22,8 +24,6 @@ from slamlib.report.execution import STUDIES, TRANSPORT, execute, kernel_environ
 from slamlib.report.notebooks import Options, shown, to_execute
 from slamlib.report.overview import opening, read_drives, title_picture
 from slamlib.solve import RESULT_NAMES, SENSORS
-from slamlib.tables import datasets_in
-from slamlib.textfile import require
 
 DATASET_NAME = re.compile("[A-Za-z0-9 ._-]+")  # nothing that Markdown, HTML or Typst interprets
 

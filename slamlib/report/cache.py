@@ -15,10 +15,10 @@ from pathlib import Path
 
 import joblib
 
-from slamlib import swap
+from slamlib.io import swap
 from slamlib.report.execution import LAB_ONLY
-from slamlib.studies import memory
-from slamlib.studies.memory import digest
+from slamlib.studies import runs as memory
+from slamlib.studies.runs import digest
 
 VARIABLES, IGNORED = "SLAMLIB_", "SLAMLIB_STUDIES"  # begins those heeded, but this one
 UNSEEN = re.compile(r"(^|/)(\.|__pycache__/)|^(build|report|results)/|\.ipynb$")  # paths

@@ -18,7 +18,7 @@ import typst
 from nbformat import NotebookNode
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_raw_cell
 
-from slamlib.dataset import DatasetError
+from slamlib.core.errors import DatasetError
 from slamlib.report.execution import LAB_ONLY, NotebookError
 from slamlib.report.notebooks import chapter_of
 

@@ -22,9 +22,9 @@ from nbconvert.filters import strip_ansi
 from nbconvert.preprocessors import CoalesceStreamsPreprocessor
 from tqdm import tqdm
 
-from slamlib import swap
-from slamlib.studies.memory import ONE_THREAD
-from slamlib.textfile import require
+from slamlib.core.errors import require
+from slamlib.io import swap
+from slamlib.studies.runs import ONE_THREAD
 
 CELL_TIMEOUT = 1800  # s, in which a cell must end
 TRANSPORT = "ipc" if hasattr(socket, "AF_UNIX") else "tcp"  # Windows has no Unix sockets

@@ -12,14 +12,14 @@ from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 import numpy as np
 from jinja2 import Template
 
-from slamlib import swap
-from slamlib.dataset import all_notes, read_dataset, read_truth
+from slamlib.io import swap
+from slamlib.io.dataset import all_notes, read_dataset, read_truth
+from slamlib.io.results import RESULT_FILES
+from slamlib.io.tables import datasets_in
 from slamlib.notebook import Drive
 from slamlib.report.notebooks import PROBLEM2_FOLDERS
 from slamlib.report.overview import listed, why_missing
-from slamlib.results import RESULT_FILES
 from slamlib.solve import title
-from slamlib.tables import datasets_in
 
 LINE_WIDTH = 100  # characters in a line of README.txt
 README = Path(__file__).with_name("readme.txt")  # a template of Jinja

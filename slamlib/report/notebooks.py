@@ -14,9 +14,9 @@ from pathlib import Path
 import nbformat
 from nbconvert.preprocessors import ClearOutputPreprocessor
 
-from slamlib.dataset import DatasetError
+from slamlib.core.errors import DatasetError, require
+from slamlib.io.textfile import read_text, read_toml
 from slamlib.report.execution import NotebookError
-from slamlib.textfile import read_text, read_toml, require
 
 FOLDER = "notebooks"  # name of the notebooks' folder
 CODE_SHOWN = ("none", "method", "all")  # what code is shown: none, all that is not hidden, or all

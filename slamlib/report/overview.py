@@ -16,16 +16,16 @@ from jinja2 import Template
 from matplotlib.figure import Figure
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_output
 
-from slamlib import evaluation, marker_increments
-from slamlib.checks.files import Doubt, doubts_before_solving, merged
-from slamlib.dataset import all_notes
+from slamlib.core import evaluation, marker_increments
+from slamlib.io.dataset import all_notes
+from slamlib.io.results import read_structs
+from slamlib.io.swap import file_names
 from slamlib.notebook import Drive, accuracy, plotting, table
 from slamlib.notebook.drives import plain
 from slamlib.report.execution import NotebookError
 from slamlib.report.notebooks import chapter_of
-from slamlib.results import read_structs
+from slamlib.robust.file_doubts import Doubt, doubts_before_solving, merged
 from slamlib.solve import PROBLEMS, SENSORS, Failure, Solution, title, truth_in_world
-from slamlib.swap import file_names
 
 TEXT = Path(__file__).with_name("overview.md")
 ON_SCREEN = ("pdf", "chapters")  # blocks of the text that the PDF leaves out

@@ -1,5 +1,5 @@
 """Studies that justify choices: Monte Carlo trials, comparisons, a real log; `run` runs a trial."""
 
-from slamlib.studies.memory import run
+from slamlib.studies.runs import run
 
 __all__ = ["run"]

@@ -5,13 +5,13 @@ from functools import partial
 
 import numpy as np
 
-from slamlib.evaluation import anees, ate
-from slamlib.increments import TYPICAL_SLIP
-from slamlib.slam import fit as stages
-from slamlib.slam.initialization import odometry_state, trilaterated_antennas
-from slamlib.slam.linear import build_problem, state_from_arrays
-from slamlib.slam.measurements import measure
-from slamlib.slam.result import slam_result
+from slamlib.core.evaluation import anees, ate
+from slamlib.core.increments import TYPICAL_SLIP
+from slamlib.robust import fit as stages
+from slamlib.robust.initialization import odometry_state, trilaterated_antennas
+from slamlib.robust.linear import build_problem, state_from_arrays
+from slamlib.robust.measurements import measure
+from slamlib.robust.result import slam_result
 from slamlib.studies.montecarlo import antenna_error, drive
 
 # Kernel and gate of every method.
@@ -30,7 +30,7 @@ def rounds(measurements, antennas=trilaterated_antennas):
 
 
 def solve_with(measurements, start, sightings="gate", ranges="asymmetric Tukey"):
-    """The Fit from a State, as of `rounds`, by METHODS; the defaults are those of `slam.estimate`.
+    """The Fit from a State, as of `rounds`, by METHODS; the defaults are those of `estimate`.
 
     The noise of the measurements is known.
     """

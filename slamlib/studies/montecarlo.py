@@ -8,20 +8,21 @@ from dataclasses import replace
 
 import numpy as np
 
-from slamlib import localization, odometry, slam
-from slamlib.evaluation import anees, ate, position_sigmas
-from slamlib.sightings import sightings_by_frame
-from slamlib.simulation import simulate
-from slamlib.slam.fit import refine
-from slamlib.slam.result import slam_result
+from slamlib import estimate, fuse, fuse_increments, localize
+from slamlib.core import odometry
+from slamlib.core.evaluation import anees, ate, position_sigmas
+from slamlib.core.sightings import sightings_by_frame
+from slamlib.robust.fit import refine
+from slamlib.robust.result import slam_result
+from slamlib.studies.simulation import simulate
 
 PROBLEM2_METHODS = {
     "odometry": lambda dataset: odometry.dead_reckoning(dataset.ticks, dataset.vehicle),
-    "ArUco": lambda dataset: localization.localize(dataset.aruco),
-    "naive": lambda dataset: localization.localize(dataset.aruco, shared_errors=False),
-    "hint": localization.fuse_increments,
-    "exact hint": lambda dataset: localization.fuse_increments(dataset, odometry.first_order),
-    "fused": localization.fuse}
+    "ArUco": lambda dataset: localize(dataset.aruco),
+    "naive": lambda dataset: localize(dataset.aruco, shared_errors=False),
+    "hint": fuse_increments,
+    "exact hint": lambda dataset: fuse_increments(dataset, odometry.first_order),
+    "fused": fuse}
 MEMORY_METHODS = ("markers", "problem 3", "problem 4", "known", "independent")
 
 
@@ -64,8 +65,8 @@ def ranges_added(seed, share=1.0, **options):
     """
     dataset, truth = drive(seed, **options)
     dataset = replace(dataset, aruco=dataset.first(round(share * len(dataset.ticks))).aruco)
-    without = slam.estimate(dataset.without("uwb"))
-    solved, numbers = {"without": without, "with": slam.estimate(dataset, previous=without)}, {}
+    without = estimate(dataset.without("uwb"))
+    solved, numbers = {"without": without, "with": estimate(dataset, previous=without)}, {}
     for name, found in solved.items():
         numbers |= {f"ate {name}": ate(found.poses, truth.poses),
                     f"aligned {name}": ate(found.poses, truth.poses, aligned=True),
@@ -85,8 +86,8 @@ def correlated_errors(seed, correlation, **options):
     of neighbours.
     """
     dataset, truth = drive(seed, memory=correlation, **options)
-    markers, problem3 = localization.localize(dataset.aruco), slam.estimate(dataset.without("uwb"))
-    problem4, numbers = slam.estimate(dataset, previous=problem3), {}
+    markers, problem3 = localize(dataset.aruco), estimate(dataset.without("uwb"))
+    problem4, numbers = estimate(dataset, previous=problem3), {}
     problem = problem3.fit.problem
     known = known_shares(problem.measurements, correlation)
     known, independent = (slam_result(refine(replace(problem, accepted=problem.accepted.with_shares(
@@ -101,9 +102,9 @@ def correlated_errors(seed, correlation, **options):
 def known_shares(measurements, correlation):
     """Shares (s,) of its information that a sighting keeps, by the true correlation of errors.
 
-    The design effect, as in slamlib.memory: 1 / (1 + sum of the correlations with the errors of all
-    other sightings of its marker), which is `correlation` to the power of the number of camera
-    frames between them.
+    The design effect, as in slamlib.robust.error_memory: 1 / (1 + sum of the correlations with the
+    errors of all other sightings of its marker), which is `correlation` to the power of the number
+    of camera frames between them.
     """
     g, label = measurements.sightings, measurements.marker_row
     pose = measurements.frame[g.row]

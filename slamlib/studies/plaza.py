@@ -17,8 +17,9 @@ import gtsam
 import numpy as np
 from scipy.io import loadmat
 
-from slamlib import se2
-from slamlib.dataset import AntennaGuess, Dataset, Truth, UwbReadings, Vehicle
+from slamlib.core import se2
+from slamlib.core.records import AntennaGuess, Dataset, Truth, UwbReadings
+from slamlib.core.vehicle import Vehicle
 
 COUNT = 1e-4                # m, travel of a wheel in one count
 RADIUS, BASE = 0.2, 0.8     # m, nominal wheel radius and wheelbase

@@ -5,19 +5,19 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
-from slamlib import se2
-from slamlib.increments import TYPICAL_SLIP
-from slamlib.localization import localize
-from slamlib.sightings import POINT_GATE
-from slamlib.simulation import misguess
-from slamlib.slam.fit import CAUCHY_SCALES, narrow_kernels
-from slamlib.slam.graph import optimize
-from slamlib.slam.initialization import consensus_markers, odometry_state, state_from_poses
-from slamlib.slam.linear import build_problem, state_from_arrays
-from slamlib.slam.measurements import accept_all, measure
-from slamlib.slam.result import slam_result
+from slamlib import localize
+from slamlib.core import se2
+from slamlib.core.increments import TYPICAL_SLIP
+from slamlib.core.sightings import POINT_GATE
+from slamlib.robust.fit import CAUCHY_SCALES, narrow_kernels
+from slamlib.robust.initialization import consensus_markers, odometry_state, state_from_poses
+from slamlib.robust.linear import build_problem, state_from_arrays
+from slamlib.robust.measurements import accept_all, measure
+from slamlib.robust.optimize import optimize
+from slamlib.robust.result import slam_result
 from slamlib.studies.kernels import rounds, solve_with
 from slamlib.studies.montecarlo import antenna_error, drive
+from slamlib.studies.simulation import misguess
 
 MAX_ANTENNA_ERROR = 0.5      # m, error below which an antenna is right
 MAX_MARKER_ERROR = 0.1       # m, distance from the right optimum above which a marker is off

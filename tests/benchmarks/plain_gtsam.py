@@ -15,8 +15,8 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import A, L, X
 
-from slamlib import evaluation, odometry, se2
-from slamlib.dataset import read_dataset, read_truth
+from slamlib.core import evaluation, odometry, se2
+from slamlib.io.dataset import read_dataset, read_truth
 
 FLOOR = np.array([1e-4, 1e-4, 1e-3])          # m, m, rad in one step
 

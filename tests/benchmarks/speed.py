@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from slamlib import simulation
 from slamlib.solve import PROBLEMS
+from slamlib.studies import simulation
 
 HERE, LONG = Path(__file__).parent, Path(__file__).parents[2] / "data" / "long"
 PAIRS = 5                    # runs of `solve` and of the plain script, in turn
@@ -20,7 +20,7 @@ PLAIN = """
 import sys, time
 sys.path.insert(0, sys.argv[1])
 from plain_gtsam import plain
-from slamlib.dataset import read_dataset
+from slamlib.io.dataset import read_dataset
 dataset = read_dataset(sys.argv[2])
 start = time.perf_counter()
 plain(dataset)

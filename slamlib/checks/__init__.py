@@ -1,1 +1,0 @@
-"""Checks that need no truth: they compare the measurements of a drive with each other."""

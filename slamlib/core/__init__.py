@@ -1,0 +1,1 @@
+"""What the chapters derive: motions, odometry, markers, and the factor graph in GTSAM."""

@@ -1,0 +1,91 @@
+"""Measures of the error of an estimate against the truth, and sizes of covariances.
+
+Poses are (n, 3) [x, y, heading] in m and rad, covariances (n, 3, 3) of the same in world axes.
+Estimate and truth hold the same pose in the same row. Poses without an estimate are NaN. ATE
+follows Sturm et al., *A benchmark for the evaluation of RGB-D SLAM systems* (IROS 2012); NEES
+follows Bar-Shalom, Li and Kirubarajan, *Estimation with Applications to Tracking and Navigation*
+(2001), section 5.4.
+"""
+
+import numpy as np
+from scipy.special import chdtri
+
+from slamlib.core import se2
+from slamlib.core.se2 import correlations as correlations
+from slamlib.core.se2 import sigmas
+
+REACH_95 = float(np.sqrt(-2 * np.log(0.05)))    # sigmas, of the 95 % ellipse of a planar Gaussian
+
+
+def path_length(poses):
+    """Sum in m of the distances between consecutive known poses (n, >= 2)."""
+    known = poses[np.isfinite(poses[:, 0]), :2]
+    return float(np.hypot(*np.diff(known, axis=0).T).sum())
+
+
+def align(poses, truth):
+    """Motion T (3,) of SE(2) for which compose(T, poses) is closest to the truth.
+
+    Least squares of the positions, Horn's problem in the plane (J. Opt. Soc. Am. A 4(4), 1987): the
+    cross and dot products of the centred positions give the rotation. Both are (n, >= 2), finite.
+    """
+    mean, true_mean = poses[:, :2].mean(0), truth[:, :2].mean(0)
+    p, q = poses[:, :2] - mean, truth[:, :2] - true_mean
+    turn = np.arctan2(np.sum(p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]), np.sum(p * q))
+    return np.append(true_mean - se2.rotation(turn) @ mean, turn)
+
+
+def ate(poses, truth, aligned=False):
+    """Absolute trajectory error: root mean square in m of the position errors.
+
+    Poses that are NaN are left out; the result is NaN if all are. With `aligned` the poses are
+    first aligned with the truth by one motion of SE(2).
+
+    >>> poses, truth = np.array([[0, 0, 0], [3, 4, 0]]), np.zeros((2, 3))
+    >>> round(ate(poses, truth), 3)
+    3.536
+    """
+    poses, truth = np.asarray([poses, truth], dtype=float)
+    known = np.isfinite(poses).all(axis=1)
+    poses, truth = poses[known], truth[known]
+    if not len(poses):
+        return np.nan
+    if aligned:
+        poses = se2.compose(align(poses, truth), poses)
+    return float(np.sqrt(np.mean(np.sum((poses[:, :2] - truth[:, :2])**2, axis=1))))
+
+
+def nees(poses, covariances, truth):
+    """Normalized estimation error squared e^T C^-1 e of every pose, (n,).
+
+    It is chi-squared with 3 degrees of freedom, so 3 on average, if the errors are Gaussian with
+    covariance C. It is NaN where C is singular, as for a known pose, and without an estimate.
+    """
+    poses, truth = np.asarray([poses, truth], dtype=float)
+    result, ok = np.full(len(poses), np.nan), se2.regular(covariances)
+    result[ok] = se2.squared_distances(poses[ok], truth[ok], covariances[ok])
+    return result
+
+
+def anees(poses, covariances, truth):
+    """Average NEES over the poses that have one; NaN if none has."""
+    values = nees(poses, covariances, truth)
+    return float(np.nanmean(values)) if np.isfinite(values).any() else np.nan
+
+
+def nees_band(count, dof=3, probability=0.95):
+    """Two-sided band (low, high) that contains the mean of `count` independent NEES.
+
+    The sum of the NEES is chi-squared with count * dof degrees of freedom; the mean lies in the
+    band with the given probability.
+
+    >>> np.round(nees_band(8), 2)
+    array([1.55, 4.92])
+    """
+    tail = (1 - probability) / 2
+    return tuple(chdtri(dof * count, [1 - tail, tail]) / count)
+
+
+def position_sigmas(covariances):
+    """The larger standard deviation of x and y (n,), of covariances (n, >= 2, >= 2)."""
+    return sigmas(covariances)[:, :2].max(axis=1)

@@ -1,0 +1,135 @@
+"""Problem 2: incremental localization from the markers alone, without encoders.
+
+The increment Delta between two frames is estimated from the sightings Z_j and Z'_j of their common
+markers j (`marker_increments`), with covariances C_j and C'_j. Poses follow by composition,
+X' = X Delta, with A = dX'/dX and B = dX'/dDelta. Consecutive increments share the sightings of the
+frame between them with opposite sign: the second increment cancels their error in the first.
+Therefore each pose X carries the cross-covariances H_j = Cov(error of X, error of Z_j) with the
+sightings of its frame,
+
+    C_X' = A C_X A^T + B C_Delta B^T + S + S^T,    S = A sum_j H_j (B D_j)^T,
+    H'_j = B D'_j C'_j,    D_j = dDelta/dZ_j,    D'_j = dDelta/dZ'_j.
+
+A marker sighted as Z from X is at M = X Z. With E = dM/dX, F = dM/dZ and T = E H F^T its covariance
+is C_M = E C_X E^T + F C F^T + T + T^T. This is the correlated state of Smith, Self and Cheeseman,
+Estimating Uncertain Spatial Relationships in Robotics, 1990, without the states of earlier frames.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slamlib.core import se2
+from slamlib.core.errors import DatasetError, require
+from slamlib.core.marker_increments import consecutive_increments, robust_increments
+from slamlib.core.records import ArucoReadings
+from slamlib.core.sightings import consensus, sightings_by_frame
+
+MAX_CANDIDATES = 3            # number of earlier frames that are tried as parent of a frame
+
+
+@dataclass(frozen=True)
+class Localization:
+    """Poses of the frames, where markers determine them, and the map of the markers."""
+
+    frame: np.ndarray               # (f,) pose index from 0 of every frame
+    poses: np.ndarray               # (f, 3) in the first localized frame, m and rad; or NaN
+    covariances: np.ndarray         # (f, 3, 3)
+    rejected: np.ndarray            # (m,) bool, rejected, or a repetition (`merge_repeated`)
+    unused: np.ndarray              # (m,) bool, sightings of markers that no adjacent frame sees
+    marker: np.ndarray              # (k,) ids of the mapped markers, ascending
+    marker_in_world: np.ndarray     # (k, 3) m and rad
+    marker_covariance: np.ndarray   # (k, 3, 3) of [x, y, heading] in world axes
+
+
+def localize(aruco, shared_errors=True):
+    """Localization for problem 2: incremental, from the ArucoReadings alone.
+
+    A frame is localized against its parent: the previous frame if the increment from it is usable,
+    else an earlier frame (`_relocalize`). Without a parent its pose is unknown. The world frame is
+    that of the first frame with a usable increment to the next. Without `shared_errors` H_j = 0,
+    as for independent increments; this is conservative. Raises DatasetError if no sighting agrees
+    with the others of its marker at its pose.
+
+    >>> from slamlib.studies.simulation import simulate
+    >>> dataset, truth = simulate("short", seed=1)
+    >>> found = localize(dataset.aruco)
+    >>> found.frame[:3].tolist(), found.poses.shape
+    ([0, 10, 20], (200, 3))
+    """
+    require(isinstance(aruco, ArucoReadings), "localize", "an ArucoReadings", aruco)
+    sightings = sightings_by_frame(aruco)
+    if not len(sightings.frame):
+        raise DatasetError("expected sightings that agree; all contradict another one of the same "
+                           "marker at the same pose")
+    increments = consecutive_increments(sightings)
+    common = np.stack([increments.first, increments.second])
+    paired, confirmed = (np.isin(np.arange(len(sightings.row)), rows)
+                         for rows in (common, common[:, increments.accepted]))
+    poses, covariances, H = _composed(sightings, increments, confirmed, shared_errors)
+    used = np.flatnonzero(confirmed & np.isfinite(poses[sightings.row, 0]))
+    marker, in_world, marker_covariance = _map_markers(sightings, used, poses, covariances, H)
+    rejected, unused = np.ones(len(aruco.pose), bool), np.zeros(len(aruco.pose), bool)
+    rejected[sightings.index], unused[sightings.index] = paired & ~confirmed, ~paired
+    return Localization(
+        frame=sightings.frame, poses=poses, covariances=covariances,
+        rejected=rejected, unused=unused, marker=marker, marker_in_world=in_world,
+        marker_covariance=marker_covariance)
+
+
+def _composed(sightings, increments, confirmed, shared_errors):
+    """Poses (f, 3) and covariances (f, 3, 3), NaN where unknown, and H (s, 3, 3) of sightings."""
+    count, table = len(sightings.frame), sightings.table()
+    poses, covariances = np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan)
+    H = np.zeros((len(sightings.row), 3, 3))
+    root = int(np.argmax([*increments.usable, False]))
+    poses[root], covariances[root] = 0.0, 0.0
+    for f in range(root + 1, count):
+        p, found, pair = f - 1, increments, f - 1
+        if not increments.usable[p] or np.isnan(poses[p, 0]):
+            p, found, pair = *_relocalize(sightings, confirmed, table, poses, f), 0
+        if found is None:
+            continue
+        A, B = se2.compose_jacobians(poses[p], found.increment[pair])
+        poses[f] = se2.compose(poses[p], found.increment[pair])
+        covariances[f] = A @ covariances[p] @ A.T + B @ found.covariance[pair] @ B.T
+        if shared_errors:
+            rows = slice(*np.searchsorted(found.pair, (pair, pair + 1)))
+            first, second = found.first[rows], found.second[rows]
+            S = A @ np.sum(H[first] @ (B @ found.J_first[rows]).mT, axis=0)
+            covariances[f] += S + S.T
+            H[second] = B @ found.J_second[rows] @ sightings.C[second]
+    return poses, covariances, H
+
+
+def _relocalize(sightings, confirmed, table, poses, frame):
+    """The parent of a frame and the MarkerIncrements from it to this frame, or None and None.
+
+    Candidates are the frames with known `poses` and the most common markers, the latest first. A
+    parent requires two accepted markers, or one whose two sightings adjacent frames confirm.
+    """
+    common = (table[:frame] >= 0) & (table[frame] >= 0) & np.isfinite(poses[:frame, :1])
+    shared = common.sum(axis=1)
+    for f in np.lexsort((np.arange(frame), shared))[:-MAX_CANDIDATES - 1:-1]:
+        first, second = table[f, common[f]], table[frame, common[f]]
+        found = robust_increments(sightings.z, sightings.C, 0 * first, first, second, 1)
+        sure = found.accepted & confirmed[first] & confirmed[second]
+        if found.usable[0] and (found.accepted.sum() > 1 or sure.any()):
+            return f, found
+    return None, None
+
+
+def _map_markers(sightings, used, poses, covariances, H):
+    """Ids (k,), poses (k, 3) and covariances (k, 3, 3) of markers, each from one used sighting.
+
+    Sightings of a marker are correlated through the poses, so an average would be overconfident.
+    """
+    row, marker, z, C = (values[used] for values in (
+        sightings.row, sightings.marker, sightings.z, sightings.C))
+    E, F = se2.compose_jacobians(poses[row], z)
+    T = E @ H[used] @ F.mT
+    covariance = E @ covariances[row] @ E.mT + F @ C @ F.mT + T + T.mT
+    in_world = se2.compose(poses[row], z)
+    in_world[:, 2] = se2.wrap(in_world[:, 2])
+    best = consensus(marker, in_world, covariance)
+    return marker[best], in_world[best], covariance[best]

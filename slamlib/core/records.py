@@ -1,0 +1,99 @@
+"""Records of one drive: its measurements, and what is true where that is known.
+
+Lengths are in metres, angles in radians. Rows of arrays count from 0; marker and antenna ids are
+labels. `slamlib.io` reads these records from files.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from slamlib.core import se2
+from slamlib.core.vehicle import Vehicle
+
+
+class _Readings:
+    """Readings of one sensor: arrays with a row for each reading."""
+
+    def select(self, keep: np.ndarray):
+        """The readings that `keep` selects: a mask (m,) of bool or an array of row indices."""
+        return replace(self, **{name: values[keep] for name, values in vars(self).items()})
+
+
+@dataclass(frozen=True)
+class ArucoReadings(_Readings):
+    """Sightings of markers, in ascending order of pose."""
+
+    pose: np.ndarray                 # (m,) int64, row of `Dataset.ticks`
+    marker: np.ndarray               # (m,) int64, marker id
+    marker_in_vehicle: np.ndarray    # (m, 3) [x, y, heading]; as a camera at its origin sees it
+    covariance: np.ndarray           # (m, 3, 3) of [x, y, heading] in the axes of the vehicle
+
+
+@dataclass(frozen=True)
+class UwbReadings(_Readings):
+    """Ranges between the antennas and the vehicle, in ascending order of pose."""
+
+    pose: np.ndarray                 # (m,) int64, row of `Dataset.ticks`
+    antenna: np.ndarray              # (m,) int64, antenna id
+    range: np.ndarray                # (m,) m
+    sigma: np.ndarray                # (m,) m, standard deviation of the range
+
+
+@dataclass(frozen=True)
+class AntennaGuess:
+    """Guessed positions of the antennas, in ascending order of id."""
+
+    antenna: np.ndarray              # (a,) int64, antenna id
+    position: np.ndarray             # (a, 2) [x, y] in m
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """All measurements of one drive."""
+
+    name: str                        # of the folder
+    vehicle: Vehicle
+    ticks: np.ndarray                # (n, 2) int64 [right, left], counts to each pose; row 0 is 0
+    aruco: ArucoReadings | None
+    uwb: UwbReadings | None
+    antenna_guess: AntennaGuess | None
+    notes: tuple[str, ...] = ()      # what was mended or left out while reading, a sentence each
+
+    @property
+    def sightings(self) -> ArucoReadings | None:
+        """The ArucoReadings, or None, as the vehicle's origin sees them by stated camera, size."""
+        if self.aruco is None:
+            return None
+        v, a = self.vehicle, self.aruco
+        scale = np.array([v.marker_size, v.marker_size, 1])
+        camera = [v.camera_x, v.camera_y, v.camera_turn]
+        return replace(
+            a, marker_in_vehicle=se2.compose(camera, scale * a.marker_in_vehicle),
+            covariance=se2.rotate_covariance(scale[:, None] * a.covariance * scale, v.camera_turn))
+
+    def without(self, sensor: str) -> "Dataset":
+        """The Dataset without a sensor, "aruco" or "uwb"."""
+        return replace(self, **{sensor: None})
+
+    def first(self, count: int) -> "Dataset":
+        """The Dataset of the first `count` poses; sensors without readings are None."""
+        early = {"aruco": None, "uwb": None}
+        for sensor in early:
+            readings = getattr(self, sensor)
+            if readings is not None and (readings.pose < count).any():
+                early[sensor] = readings.select(readings.pose < count)
+        return replace(self, ticks=self.ticks[:count], **early)
+
+
+@dataclass(frozen=True)
+class Truth:
+    """True poses, maps and wheel parameters of a simulated or surveyed drive."""
+
+    poses: np.ndarray                # (n, 3) [x, y, heading]; headings are continuous
+    marker: np.ndarray               # (k,) int64, marker id, ascending
+    marker_in_world: np.ndarray      # (k, 3) [x, y, heading]
+    antenna: np.ndarray              # (a,) int64, antenna id, ascending
+    antenna_in_world: np.ndarray     # (a, 2) [x, y] in m
+    vehicle: Vehicle
+    notes: tuple[str, ...] = ()      # as those of a Dataset

@@ -1,0 +1,116 @@
+"""Sightings of markers, merged and sorted by frame, and the gates of problems 2 to 4.
+
+A frame is a pose of the vehicle with a measurement. A sighting is the pose z of a marker in the
+frame of the camera or, where what is stated of the camera is applied (`Dataset.sightings`), of the
+vehicle, with the covariance C of [x, y, heading]. A gate is the 99.9 % quantile of the squared
+Mahalanobis distance r^T W^-1 r of a residual r with covariance W; beyond it r is rejected.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from slamlib.core import se2
+from slamlib.core.records import ArucoReadings
+from slamlib.core.se2 import correlations, sigmas
+
+GATE = 16.26623619623813         # dimensionless, for residuals of [x, y, heading]
+POINT_GATE = 13.815510557964274  # dimensionless, for residuals of [x, y]
+MIN_MEASUREMENT_SIGMA = 1e-6     # m or rad, of one coordinate given the others
+MIN_SIGMA_RATIO = 1e-6           # of the standard deviations of x and y
+MAX_HEADING_SIGMA = 0.5          # rad; with a larger standard deviation a heading is unknown
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """At most one sighting per frame and marker, sorted by frame, then by marker id."""
+
+    index: np.ndarray        # (s,) row in ArucoReadings
+    row: np.ndarray          # (s,) row in `frame`
+    marker: np.ndarray       # (s,) marker id
+    z: np.ndarray            # (s, 3) marker in vehicle, m and rad
+    C: np.ndarray            # (s, 3, 3) covariance of z
+    frame: np.ndarray        # (f,) pose index from 0 of every frame, ascending
+    contradicting: int = 0   # number of repeated sightings that contradict each other
+
+    def table(self):
+        """Row (f, k) of the sighting of each marker, in ascending id, at each frame, or -1."""
+        markers, label = np.unique(self.marker, return_inverse=True)
+        table = np.full((len(self.frame), len(markers)), -1, np.int32)
+        table[self.row, label] = np.arange(len(self.row))
+        return table
+
+
+def sightings_by_frame(aruco, extra_frames=()):
+    """Sightings of ArucoReadings, or of None if there are no markers, merged by `merge_repeated`.
+
+    `extra_frames` are pose indices from 0 that are frames even if no marker is seen there.
+    """
+    aruco = aruco or ArucoReadings(*np.zeros((2, 0), int), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+    index, z, C, contradicting = merge_repeated(replace(
+        aruco, covariance=regular(aruco.covariance)))
+    frame = np.union1d(aruco.pose[index], extra_frames).astype(int)
+    return Sightings(index=index, row=np.searchsorted(frame, aruco.pose[index]),
+                     marker=aruco.marker[index], z=z, C=C, frame=frame,
+                     contradicting=contradicting)
+
+
+def regular(covariance):
+    """Covariances (m, 3, 3), increased where float64 could not invert or add their information.
+
+    Where the standard deviation of x, y or heading, given the other two, is below
+    MIN_MEASUREMENT_SIGMA, as of fully correlated coordinates, the variance is increased by its
+    square. For x and y the bound is at least MIN_SIGMA_RATIO of the larger standard deviation.
+    """
+    sigma, information = sigmas(covariance), np.linalg.inv(correlations(covariance))
+    conditional = sigma**2 / np.diagonal(information, axis1=1, axis2=2)
+    bound = np.full_like(sigma, MIN_MEASUREMENT_SIGMA)
+    bound[:, :2] = np.maximum(
+        MIN_MEASUREMENT_SIGMA, MIN_SIGMA_RATIO * sigma[:, :2].max(axis=1, keepdims=True))
+    added = np.where(conditional < bound**2, bound**2, 0.0)
+    return covariance + added[:, :, None] * np.eye(3)
+
+
+def merge_repeated(aruco):
+    """`index`, `z`, `C` and `contradicting` of Sightings, with one row for each pose and marker.
+
+    Repeated sightings in ArucoReadings of a marker at one pose are averaged, weighted by their
+    information matrices, if all of them lie within GATE of the mean. Otherwise all are rejected.
+    """
+    order = np.lexsort((aruco.marker, aruco.pose))
+    key = np.stack([aruco.pose[order], aruco.marker[order]], -1)
+    _, begins, count = np.unique(key, axis=0, return_index=True, return_counts=True)
+    z, C = aruco.marker_in_vehicle[order], aruco.covariance[order]
+    agrees = np.ones(len(begins), bool)
+    for i in np.flatnonzero(count > 1):
+        same = slice(begins[i], begins[i] + count[i])
+        information = np.linalg.inv(C[same])
+        r = se2.difference(z[same], z[begins[i]])
+        mean_covariance = np.linalg.inv(information.sum(0))
+        mean = mean_covariance @ np.einsum("nij,nj->i", information, r)
+        agrees[i] = np.all(np.einsum("ni,nij,nj->n", r - mean, information, r - mean) < GATE)
+        z[begins[i]] += mean
+        C[begins[i]] = mean_covariance
+    begins, contradicting = begins[agrees], int(count[~agrees].sum())
+    return order[begins], z[begins], C[begins], contradicting
+
+
+def consensus(marker, in_world, covariance, maximum=200):
+    """Rows (k,) of one sighting of each marker, well supported and certain, in ascending id.
+
+    The support of a sighting is the number of sightings of its marker within GATE of it. Of those
+    with at least half the maximum support, the most certain one has the smallest determinant of its
+    covariance. `marker` (s,) are ids, `in_world` (s, 3), m and rad, and `covariance` (s, 3, 3) the
+    poses of these markers in world axes by each sighting. Of a marker with more than `maximum`
+    sightings, so many evenly chosen ones are compared: the cost is quadratic.
+    """
+    order, best = np.argsort(marker, kind="stable"), []
+    log_determinant = np.linalg.slogdet(covariance)[1]
+    for same in np.split(order, np.flatnonzero(np.diff(marker[order])) + 1) if len(order) else ():
+        k, few = np.arange(len(same)), min(len(same), maximum)
+        same = same[k * few // len(same) != (k - 1) * few // len(same)]
+        squared = se2.squared_distances(in_world[same, None], in_world[same],
+                                        covariance[same, None] + covariance[same])
+        support = np.count_nonzero(squared < GATE, axis=1)
+        best.append(min(same[support >= support.max() / 2], key=log_determinant.__getitem__))
+    return np.array(best, int)

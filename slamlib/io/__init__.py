@@ -1,0 +1,1 @@
+"""Files: a dataset's folder read, results written."""

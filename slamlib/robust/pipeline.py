@@ -1,0 +1,131 @@
+"""The pipeline of problems 3 and 4, from a Dataset to a SlamResult.
+
+Each stage is a function from one frozen record to the next. Comments number them as docs/code.md
+does. Problem 4 starts from the poses of problem 3 (`fit_from_previous`).
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from gtsam import NonlinearFactorGraph
+
+from slamlib.core.errors import require
+from slamlib.core.odometry import MODELS
+from slamlib.core.records import Dataset
+from slamlib.core.vehicle import changed
+from slamlib.robust.choices import better_model, calibrated, most_consistent
+from slamlib.robust.covariances import posterior_moments
+from slamlib.robust.fit import CAUCHY_SCALES, narrow_kernels, refine
+from slamlib.robust.initialization import initial_state, state_from_poses
+from slamlib.robust.jumps import NO_JUMPS
+from slamlib.robust.linear import build_problem
+from slamlib.robust.measurements import Noise, measure
+from slamlib.robust.optimize import optimize
+from slamlib.robust.own import linearized_own
+from slamlib.robust.result import slam_result
+
+
+def estimate(dataset, slip=None, model=None, previous=None, *, marker_noise_factor=None,
+             range_noise_factor=None, kernel=None, gate=None, factors=None):
+    """SLAM on odometry and on the markers and ranges that the dataset has.
+
+    Parameters
+    ----------
+    dataset : Dataset; markers and ranges may be absent.
+    slip : sqrt(m), known standard deviation of a wheel's slip after one metre; None takes that of
+        the dataset's Vehicle, or learns it if the Vehicle has none.
+    model : "arc" or "euler", of an odometry step; None lets the evidence choose, or takes that of
+        `previous`.
+    previous : SlamResult of the same drive with fewer sensors, from which the solution starts.
+    marker_noise_factor, range_noise_factor : known factors on the standard deviations in the files;
+        None as for `slip`.
+    kernel : name in `fit.KERNELS`, the robust kernel of sightings and ranges; that of the
+        ranges only if its name begins with "asymmetric". None takes that of the Vehicle.
+    gate : bool, whether measurements that contradict the solution are rejected; None as for
+        `kernel`.
+    factors : gtsam.NonlinearFactorGraph of factors of one's own, with the keys of `slam.own`, or
+        None. Their poses become frames.
+
+    Returns
+    -------
+    SlamResult
+
+    Raises
+    ------
+    DatasetError : the measurements do not determine every pose and landmark, or an option has no
+        such name, or is not within the limits of vehicle.toml.
+    numpy.linalg.LinAlgError : a covariance is singular to rounding.
+
+    >>> from slamlib.studies.simulation import simulate
+    >>> dataset, truth = simulate("short", seed=1)
+    >>> result = estimate(dataset.first(200), slip=1e-3, kernel="Huber")
+    >>> result.poses.shape, result.antenna.tolist(), result.noise.slip
+    ((200, 3), [5, 13, 36, 46], 0.001)
+    """
+    require(isinstance(dataset, Dataset), "estimate", "a Dataset", dataset)
+    require(isinstance(factors, NonlinearFactorGraph | None), "estimate",
+            "a gtsam.NonlinearFactorGraph for factors", factors)
+    require(model in (None, *MODELS), "estimate", f"{' or '.join(MODELS)} for model", model)
+    options = {"slip": slip, "marker_noise_factor": marker_noise_factor,
+               "range_noise_factor": range_noise_factor, "kernel": kernel, "gate": gate}
+    dataset = replace(dataset, vehicle=changed(dataset.vehicle, options, "estimate"))
+
+    def solve(jumps=NO_JUMPS, places=None):
+        aruco = dataset.aruco if places is None else replace(dataset.aruco, marker=places[:, 1])
+        measurements = measure(replace(dataset, aruco=aruco), (), jumps, factors)     # 1
+        if previous is not None:
+            return calibrated(fit_from_previous(measurements, previous, model))
+        fit = fit_from_odometry(measurements, model or "arc")                         # 2 to 6
+        fit = calibrated(fit if model else better_model(fit))
+        # Wrong statements may look like other steps, and these like other statements.
+        other = better_model(fit) if fit.problem.released and not model else fit
+        return fit if other is fit else calibrated(other)
+
+    if previous is not None and len(previous.rejected):
+        fit, places = solve(previous.jumps, previous.places), previous.places
+    else:
+        fit, places = most_consistent(dataset, solve)
+    optimum = optimize(fit.problem, fit.state, by_gtsam=True)
+    fit = replace(fit, state=optimum.state, converged=optimum.converged)
+    return replace(slam_result(fit), places=places)                                   # 7
+
+
+def fit_from_odometry(measurements, model="arc"):
+    """The Fit of Measurements with start values by odometry; raises DatasetError as `estimate`."""
+    problem = build_problem(measurements, model)                                      # 2
+    state = narrow_kernels(problem, initial_state(measurements, model))               # 4, 5
+    return refine(problem, state)                                                     # 6
+
+
+def fit_from_previous(measurements, previous, model=None):
+    """The Fit of Measurements from a SlamResult, with another `model` if not None."""
+    frame, calibration = measurements.frame, measurements.calibration
+    sigma, c = (calibration.taken_from(previous.calibration, *values) for values in (
+        (previous.fit.problem.sigma, calibration.sigma), (previous.c, calibration.stated)))
+    problem = replace(
+        build_problem(measurements, model or previous.model, Noise(previous.slip), previous.wheel),
+        sigma=sigma, released=previous.released)
+    state = state_from_poses(measurements, previous.poses[frame], previous.covariances[frame], c)
+    state = narrow_kernels(problem, state, CAUCHY_SCALES[-1:])
+    return replace(refine(problem, state), explanations=previous.explanations)
+
+
+def own_contradictions(fit):
+    """Errors (m,) of the factors of one's own of a Fit, in standard deviations, the larger of two.
+
+    Those at its solution, and those that the rest alone predicts, with the covariances of both.
+    Of a pose and a landmark, whose errors may be correlated, twice the sum of theirs is counted.
+    """
+    problem, m = fit.problem, fit.problem.measurements
+    e, *_ = linearized_own(problem, fit.state)
+    if not len(e):
+        return np.zeros(0)
+    rest = calibrated(fit_from_odometry(
+        replace(m, own=NonlinearFactorGraph()), problem.odometry.model))
+    state, found, _ = posterior_moments(rest)
+    C = np.concatenate([found.pairs[:1, :3, :3], found.pairs[:, 3:6, 3:6], found.landmarks])
+    off, J, _ = linearized_own(problem, state)
+    J = J.reshape(*off.shape, 2, 3).swapaxes(1, 2)                       # (m, 2, d, 3)
+    predicted = 2 * np.sum(J @ C[m.structure.factors[-1]] @ J.mT, axis=1) + np.eye(off.shape[1])
+    squared = np.einsum("ni,ni->n", off, np.linalg.solve(predicted, off[..., None])[..., 0])
+    return np.maximum(np.linalg.norm(e, axis=1), np.sqrt(squared))
