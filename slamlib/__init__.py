@@ -21,7 +21,10 @@ _MODULES = {
     "fuse": "robust.fused",
     "estimate": "robust.pipeline",
     "SlamResult": "robust.result",
-    "as_gtsam": "robust.optimize",
+    "count_everything": "core.graph",
+    "build_graph": "core.graph",
+    "initial_values": "core.graph",
+    "solve_graph": "core.graph_solution",
 }
 __all__ = [*_MODULES]
 

@@ -170,7 +170,8 @@ def _noise_facts(found):
 def _slam_facts(dataset, found):
     """Noise, calibration and doubtful landmarks of a SlamResult."""
     facts = _noise_facts(found) | {
-        "increments": found.model, "unconfirmed": found.unconfirmed.tolist(),
+        "gtsam": _gtsam_facts(found), "increments": found.model,
+        "unconfirmed": found.unconfirmed.tolist(),
         "calibration": [row for row in found.calibration_table if row["sigma"]]}
     if len(found.rejected):
         facts["marker_noise_factor"] = found.noise.sightings
@@ -180,6 +181,15 @@ def _slam_facts(dataset, found):
                   "antennas_in_doubt": found.doubts, "ranges_down_weighted_by_antenna": {
                       each: weak.count(each) for each in found.antenna.tolist()}}
     return facts
+
+
+def _gtsam_facts(found):
+    """What GTSAM solved, and how far it is from the engine that decided, of a SlamResult."""
+    by_gtsam = found.gtsam
+    return {"factors": by_gtsam.factors, "variables": by_gtsam.variables,
+            "steps": by_gtsam.steps, "start": by_gtsam.start,
+            "largest_difference_in_sigmas": found.agreement[0],
+            "largest_relative_difference_of_sigmas": found.agreement[1]}
 
 
 def solutions(dataset, problems=tuple(PROBLEMS)):

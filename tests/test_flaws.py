@@ -4,7 +4,6 @@ import itertools
 from dataclasses import replace
 from types import SimpleNamespace
 
-import gtsam
 import numpy as np
 import pytest
 from conftest import ROOT
@@ -149,8 +148,6 @@ def solved(noise=(1e-3, 1.0, 1.0), noise_sigma=(0.1, 0.02, 0.03), explanations=(
     There are two antennas; all estimates have a standard deviation of a thousandth.
     """
     calibration = stated_calibration(vehicle, np.array([5, 6]))
-    none = SimpleNamespace(structure=SimpleNamespace(factors=[np.zeros((0, 2), int)]),
-                           own=gtsam.NonlinearFactorGraph())
     table = calibration_table(
         calibration, calibration.stated if c is None else c, 1e-6 * np.eye(16),
         frozenset().union(*explanations))
@@ -159,7 +156,7 @@ def solved(noise=(1e-3, 1.0, 1.0), noise_sigma=(0.1, 0.02, 0.03), explanations=(
         range_weight=np.repeat([0.0, 1.0], [0, 20]), explanations=explanations,
         calibration_table=table, doubts={}, converged=True, antenna=np.array([5, 6]),
         share=np.ones(20), places=None, jumps=NO_JUMPS,
-        fit=SimpleNamespace(problem=SimpleNamespace(measurements=none), state=None),
+        agreement=(0.0, 0.0),
         rejected=np.zeros(0, bool), turn_sigma=np.zeros(0), sightings=SimpleNamespace(
             contradicting=0, marker=np.zeros(0, int), frame=np.arange(1))) | changes)
 

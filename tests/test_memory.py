@@ -91,8 +91,8 @@ def test_the_same_step_by_gtsam(remembering):
     found, _ = _with_shares(low, fit.state, None, shares, lambda problem, _: problem.accepted)
     assert found.noise == (1e-3, 0.6, 0.3)               # twice as large for errors with memory
     state = replace(fit.state, antennas=fit.state.antennas + 0.01)
-    np.testing.assert_allclose(
-        NormalEquations(problem, state).step(), gtsam_step(problem, state), atol=1e-7)
+    equations = NormalEquations(problem, state)
+    np.testing.assert_allclose(equations.step(), gtsam_step(problem, equations), atol=1e-7)
 
 
 @pytest.mark.slow

@@ -76,7 +76,8 @@ def digest(drive):
         maps = [each for each in (solution.aruco_map, solution.uwb_map) if each is not None]
         logs = [np.log(1e-12 + np.diagonal(C, axis1=1, axis2=2)) for C in (
             solution.covariances, *(C for *_, C in maps))]
-        facts = {key: each for key, each in solution.facts.items() if key != "seconds"}
+        facts = {key: each for key, each in solution.facts.items()
+                 if key not in ("seconds", "gtsam")}
         found += [weighted(solution.poses, *(place for _, place, _ in maps), *logs),
                   weighted(flat(facts))]
         said |= {doubt.what for doubt in solution.doubts}

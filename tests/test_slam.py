@@ -408,7 +408,6 @@ def test_noise_that_is_known_is_not_learned_and_the_rest_is(known):
     ({"range_noise_factor": True}, "for range_noise_factor, found 'True'"),
     ({"marker_noise_factor": 0.0}, "expected a number from 0.01 to 100 for marker_noise_factor"),
     ({"range_noise_factor": 1e3}, "for range_noise_factor, found '1000.0'"),
-    ({"factors": []}, r"expected a gtsam.NonlinearFactorGraph for factors, found .\[\]"),
     ({"dataset": "data/short"}, "expected a Dataset, found .data/short.")])
 def test_an_option_with_a_wrong_name_or_value_is_told_with_what_there_is(options, told):
     with pytest.raises(DatasetError, match=f"^estimate: {told}" if told[0] == "e" else told):

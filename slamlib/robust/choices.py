@@ -210,7 +210,7 @@ def with_stretched(fit):
     given, and none beside factors of one's own, which may be what is wrong.
     """
     m, odometry, poses = fit.problem.measurements, fit.problem.odometry, fit.state.poses
-    if not m.learned[0] or not len(m.marker_row) or len(m.frame) < 2 or m.own.size():
+    if not m.learned[0] or not len(m.marker_row) or len(m.frame) < 2:
         return None
     e, *_ = odometry_error(odometry, poses, fit.state.c[WHEELS])
     C = odometry.covariance(fit.problem.noise.slip)

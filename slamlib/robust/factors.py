@@ -8,69 +8,35 @@ headings a marker is a point. Errors are whitened, and weighted by their kernels
 poses are by GTSAM's tangent vectors: X moves as X exp(xi), in its own axes.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slamlib.core import increments, odometry, se2
+from slamlib.core import odometry, se2
+from slamlib.core.preintegration import preintegrate
 from slamlib.robust import calibration
 from slamlib.robust.calibration import RANGES, SIGHTINGS, WHEELS
 from slamlib.robust.measurements import square_root_information
-from slamlib.robust.own import linearized_own
 
-MINIMUM_SIGMA = 1e-5         # m, standard deviation of an increment's end along x and y
 MIN_DISTANCE = 1e-9          # m, below which a range has no direction
 SMOOTHED_STEPS = 11          # encoder steps over which velocities are averaged
 
 
-@dataclass(frozen=True)
-class OdometryFactors:
-    """Odometry factors between consecutive frames, for every value of the slip."""
-
-    model: str               # of a step, "arc" or "euler"
-    stated: np.ndarray       # (3,) m, wheel parameters as stated, to which the covariances belong
-    wheel: np.ndarray        # (3,) m, those of linearisation
-    increment: np.ndarray    # (f-1, 3) Delta(wheel): m, m, rad
-    J_wheel: np.ndarray      # (f-1, 3, 3) dDelta/dwheel, per m
-    quantization: np.ndarray  # (f-1, 3, 3) covariance without slip, in the axes of the end
-    slipping: np.ndarray     # (f-1, 3, 3) covariance of slip 1 sqrt(m), in the same axes
-    in_counts: bool = False  # whether errors are scaled to the stated wheels: with known slip
-
-    def covariance(self, slip):
-        """Q (f-1, 3, 3) for a slip in sqrt(m)."""
-        return self.quantization + slip**2 * self.slipping
-
-
 def preintegrate_odometry(measurements, model, wheel=None):
-    """The OdometryFactors of Measurements, linearised at `wheel` (3,) m, None for that stated.
+    """The OdometryIncrements of Measurements, linearised at `wheel` (3,) m, None for that stated.
 
-    `model` is "arc" or "euler". dDelta/dwheel accumulates over the encoder steps between two frames
-    (preintegration with calibration parameters: Forster et al., IEEE T-RO 33(1), 2017).
+    `model` is "arc" or "euler". Jumps are added where there are some.
     """
-    dataset, start, end = measurements.dataset, measurements.frame[:-1], measurements.frame[1:]
-    vehicle = dataset.vehicle if wheel is None else dataset.vehicle.with_wheel(wheel)
-    increment, by_wheel = increments.between_poses(dataset.ticks, vehicle, start, end, model)
-    quantization, slipping = (se2.rotate_covariance(part, -increment[:, 2]) for part in
-                              odometry_noise(dataset.ticks, dataset.vehicle, start, end))
-    jump, unknown = measurements.jumps.added(start, end)
-    return OdometryFactors(
-        model=model, stated=dataset.vehicle.wheel, wheel=vehicle.wheel,
-        increment=se2.compose(increment, jump), J_wheel=by_wheel,
-        quantization=quantization + unknown, slipping=slipping)
-
-
-def odometry_noise(ticks, vehicle, start, end):
-    """Quantization and slipping (m, 3, 3) by `increments.noise_in_drive`, with MINIMUM_SIGMA added.
-
-    The graph needs the inverse of Q, but a vehicle that stands still has no lateral noise.
-    """
-    quantization, slipping = increments.noise_in_drive(ticks, vehicle, start, end)
-    quantization[:, [0, 1], [0, 1]] += MINIMUM_SIGMA**2
-    return quantization, slipping
+    m, jumps = measurements, measurements.jumps
+    increments = replace(preintegrate(m.dataset, m.frame, model, wheel), in_counts=False)
+    jump, unknown = jumps.added(m.frame[:-1], m.frame[1:])
+    return replace(
+        increments, increment=se2.compose(increments.increment, jump),
+        quantization=increments.quantization + unknown)
 
 
 def odometry_error(factors, poses, wheel):
-    """Errors (f-1, 3) of OdometryFactors at poses (f, 3) of the frames and `wheel` (3,) m.
+    """Errors (f-1, 3) of OdometryIncrements at poses (f, 3) of the frames and `wheel` (3,) m.
 
     Also their derivatives (f-1, 3, 6) by X_i and X_{i+1}, and (f-1, 3, 3) by the columns WHEELS of
     the calibration. The errors are not whitened. Encoders measure counts, and errors in metres and
@@ -123,7 +89,7 @@ def linearize_odometry(problem, state, slip):
 
 
 def linearize_measurements(problem, state):
-    """The LinearizedFactors of sightings, of ranges, and of one's own."""
+    """The LinearizedFactors of sightings and of ranges."""
     m, c = problem.measurements, state.c
     s, r = m.sightings, m.ranges
 
@@ -137,11 +103,8 @@ def linearize_measurements(problem, state):
     ranges = range_error(
         r.distance[ranged], state.poses[r.row[ranged]],
         *motions(r.row[ranged], calibration.RANGE_LAG), state.antennas, r.antenna[ranged], c)
-    e, J, error = linearized_own(problem, state)
     return (_whitened(problem, 0, seen, m.sighting_roots[seen], *sightings),
-            _whitened(problem, 1, ranged, 1 / r.sigma[ranged, None, None], *ranges),
-            LinearizedFactors(index=np.arange(len(e)), e=e, J=J, J_c=np.zeros((*e.shape, 0)),
-                              columns=np.zeros(0, int), weight=np.ones(len(e)), error=error))
+            _whitened(problem, 1, ranged, 1 / r.sigma[ranged, None, None], *ranges))
 
 
 def sighting_error(z, poses, motion, velocity, markers, c, as_pose):

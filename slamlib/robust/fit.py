@@ -73,7 +73,7 @@ def residuals(problem, state):
     (r,) of the ranges, positive for a range that is too long.
     """
     everything = replace(problem, accepted=accept_all(problem.measurements))
-    sightings, ranges, _ = linearize_measurements(everything, state)
+    sightings, ranges = linearize_measurements(everything, state)
     return -sightings.e, -ranges.e[:, 0]
 
 

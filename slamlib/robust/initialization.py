@@ -11,12 +11,13 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from slamlib.core import odometry, se2
+from slamlib.core.graph import GUESS_PRIOR_SIGMA
 from slamlib.core.sightings import consensus
 from slamlib.robust.calibration import ANTENNAS, HEIGHT, OFFSET, SCALE, SIGHTING_LAG, SIZE, WHEELS
 from slamlib.robust.factors import MIN_DISTANCE, sensor_poses
 from slamlib.robust.fit import narrow_kernels
 from slamlib.robust.linear import build_problem, state_from_arrays
-from slamlib.robust.measurements import GUESS_PRIOR_SIGMA, measure
+from slamlib.robust.measurements import measure
 
 MAX_ODOMETRY_SIGMA = 0.5     # rad, of odometry's heading at the end of a drive's first part
 MAX_FIRST_PART = 1.5         # length of the first part over that which odometry can predict

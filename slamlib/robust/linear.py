@@ -21,14 +21,14 @@ from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
 from slamlib.core import odometry, se2
+from slamlib.core.graph import GUESS_PRIOR_SIGMA
+from slamlib.core.preintegration import OdometryIncrements
 from slamlib.robust.factors import (
-    OdometryFactors,
     linearize_measurements,
     linearize_odometry,
     preintegrate_odometry,
 )
 from slamlib.robust.measurements import (
-    GUESS_PRIOR_SIGMA,
     WEAK_SIGMA,
     AcceptedMeasurements,
     Measurements,
@@ -81,7 +81,7 @@ class Problem:
     """The factor graph."""
 
     measurements: Measurements
-    odometry: OdometryFactors
+    odometry: OdometryIncrements
     accepted: AcceptedMeasurements
     noise: Noise
     sigma: np.ndarray        # (p,) of the prior of the calibration, 0 of what is known
@@ -140,7 +140,7 @@ class NormalEquations:
 
     @cached_property
     def linearized(self):
-        """The LinearizedFactors of sightings, of ranges, and of one's own."""
+        """The LinearizedFactors of sightings and of ranges."""
         return linearize_measurements(self.problem, self.state)
 
     def step(self):
@@ -162,14 +162,14 @@ class NormalEquations:
         shares = [(given / wanted)**2 / (consistency_factor(kind.kernel, size) if consistent else 1)
                   for kind, size, given, wanted in zip(
                       self.problem.accepted, sizes, self.problem.noise[1:], noise[1:])]
-        for group, share in zip(self._measurement_groups, (*shares, 1.0)):
+        for group, share in zip(self._measurement_groups, shares):
             if group is not None:
                 total = [each + share * part for each, part in zip(total, group)]
         return *total, log_determinant
 
     def counts(self):
         """Numbers of accepted errors of sightings and of ranges."""
-        sightings, ranges, _ = self.linearized
+        sightings, ranges = self.linearized
         size = 2 + self.problem.measurements.as_pose[sightings.index]
         return np.sum(size * sightings.weight), np.sum(ranges.weight)
 

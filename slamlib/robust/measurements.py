@@ -21,6 +21,7 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from slamlib.core import odometry, se2
+from slamlib.core.graph import ORIGIN_SIGMA
 from slamlib.core.increments import SLIP_BOUNDS, TYPICAL_SLIP
 from slamlib.core.records import Dataset, UwbReadings
 from slamlib.core.sightings import (
@@ -31,14 +32,11 @@ from slamlib.core.sightings import (
 )
 from slamlib.robust.calibration import Calibration, stated_calibration
 from slamlib.robust.jumps import NO_JUMPS, Jumps
-from slamlib.robust.own import connected
 
 NOISE_KEYS = ("slip", "marker_noise_factor", "range_noise_factor")      # of a Vehicle, as in Noise
 
 # Standard deviations of the priors of variables
-ORIGIN_SIGMA = 1e-5          # m, of the position of pose 1, which is zero by definition
 WEAK_SIGMA = 1e5             # m and rad, of a marker without accepted sightings
-GUESS_PRIOR_SIGMA = 5.0      # m, of an antenna about its guessed position
 
 
 class Noise(NamedTuple):
@@ -114,7 +112,6 @@ class Measurements:
     guess: np.ndarray        # (a, 2) m, their guessed positions
     calibration: Calibration     # what the Vehicle states of what measurements share
     jumps: Jumps             # where odometry contradicts the markers
-    own: gtsam.NonlinearFactorGraph      # factors of one's own
     as_pose = property(lambda self: self.oriented[self.marker_row])    # (s,) bool, with a heading
 
     @property
@@ -148,7 +145,7 @@ class Measurements:
         f, k, s, r = len(self.frame), len(self.marker), self.sightings, self.ranges
         is_pose = np.r_[np.ones(f, bool), self.oriented, np.zeros(len(self.antenna), bool)]
         factors = [np.arange(f - 1)[:, None] + [0, 1], np.stack([s.row, f + self.marker_row], -1),
-                   np.stack([r.row, f + k + r.antenna], -1), connected(self)]
+                   np.stack([r.row, f + k + r.antenna], -1)]
         count, ends = len(is_pose), np.cumsum([len(is_pose), *(4 * len(each) for each in factors)])
         row, column = np.concatenate([np.repeat(np.arange(count), 2).reshape(-1, 2), *(
             each[:, [[0, 0], [0, 1], [1, 0], [1, 1]]].reshape(-1, 2) for each in factors)]).T
@@ -164,18 +161,16 @@ class Measurements:
             factors=factors, blocks=[each.reshape(-1, 4) for each in np.split(number, ends)[1:-1]])
 
 
-def measure(dataset, extra_poses=(), jumps=NO_JUMPS, own=None):
+def measure(dataset, extra_poses=(), jumps=NO_JUMPS):
     """The Measurements of a Dataset.
 
     `extra_poses`, encoder poses from 0, are frames without a measurement. `jumps` are those of
-    odometry, `own` is a gtsam.NonlinearFactorGraph (`slam.own`), or None.
+    odometry.
     """
     uwb = dataset.uwb or UwbReadings(*np.zeros((2, 0), int), *np.zeros((2, 0)))
-    own, count = own or gtsam.NonlinearFactorGraph(), len(dataset.ticks)
-    keys = own.keyVector()                       # with a name: iterators do not keep it alive
-    own_poses = [gtsam.symbolIndex(key) for key in keys if gtsam.symbolChr(key) == ord("x")]
-    sightings = sightings_by_frame(dataset.aruco, np.r_[0, count - 1, np.array(
-        [*extra_poses, *(i for i in own_poses if i < count)], int), uwb.pose])
+    extra = np.asarray(extra_poses, dtype=int)
+    sightings = sightings_by_frame(
+        dataset.aruco, np.concatenate([[0, len(dataset.ticks) - 1], extra, uwb.pose]))
     marker, marker_row = np.unique(sightings.marker, return_inverse=True)
     has_heading = sightings.C[:, 2, 2] < MAX_HEADING_SIGMA**2
     antenna, guess = np.unique(uwb.antenna), dataset.antenna_guess
@@ -191,7 +186,7 @@ def measure(dataset, extra_poses=(), jumps=NO_JUMPS, own=None):
         ranges=ranges, antenna=antenna,
         guess=guess.position[np.searchsorted(guess.antenna, antenna)] if len(antenna)
         else np.zeros((0, 2)), calibration=stated_calibration(dataset.vehicle, antenna),
-        jumps=jumps, own=own)
+        jumps=jumps)
 
 
 @dataclass(frozen=True)

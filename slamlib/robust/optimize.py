@@ -1,22 +1,19 @@
-"""Stage 3: the factor graph in GTSAM, and Gauss-Newton with step halving.
+"""Stage 3: Gauss-Newton with step halving, by which the engine decides.
 
-A step of `optimize` solves the normal equations in numpy and scipy, or is GTSAM's, which eliminates
-the same graph factor by factor: the last steps of every solution, and those where the normal
-equations are singular to rounding. All factors but one's own are linearised in numpy. Custom
-factors in Python would be slow: GTSAM copies all values for every call.
+A step solves the normal equations in numpy and scipy. Where these are singular to rounding, GTSAM's
+QR decomposition of the same linearised factors tells whether the measurements determine every
+variable. What is handed in GTSAM solves itself (`robust.solution`).
 """
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import C
 
-from slamlib.core.errors import DatasetError, require
+from slamlib.core.graph_solution import eliminated
 from slamlib.robust.factors import linearize_odometry
-from slamlib.robust.linear import NormalEquations, State, retract
+from slamlib.robust.linear import NormalEquations, Problem, State, retract
 from slamlib.robust.measurements import WEAK_SIGMA
-from slamlib.robust.own import gtsam_values, variable_keys
 
 CONVERGED = 1e-6             # decrease, over 1 + error, at which iterations end
 ROUNDING = 1e-12             # relative increase of the error that is due to float rounding
@@ -24,7 +21,8 @@ MAX_STEPS = 40               # number of steps of Gauss-Newton
 MAX_HALVINGS = 8             # number of halvings of one step
 
 
-class Optimum(NamedTuple):
+@dataclass(frozen=True)
+class Optimum:
     """The end of Gauss-Newton."""
 
     equations: NormalEquations
@@ -33,89 +31,80 @@ class Optimum(NamedTuple):
     converged: bool          # whether the error had stopped to decrease
 
 
-def optimize(problem, state, max_steps=MAX_STEPS, by_gtsam=False, tolerance=CONVERGED):
+def optimize(problem: Problem, state: State, max_steps: int = MAX_STEPS,
+             tolerance: float = CONVERGED) -> Optimum:
     """The Optimum of a Problem from a State.
 
     It ends where the error decreases by at most `tolerance` times (1 + error). Raises DatasetError
     if the measurements do not determine every variable.
     """
-    equations, steps, ended = NormalEquations(problem, state), 0, False
+    equations = NormalEquations(problem, state)
+    steps, ended = 0, False
     while steps < max_steps and not ended:
         steps += 1
-        state, error = equations.state, equations.error
-        step = None if by_gtsam else equations.step()
+        error = equations.error
+        step = equations.step()
         if step is None:
-            step = gtsam_step(problem, state)
-        for scale in 0.5**np.arange(MAX_HALVINGS):
-            equations = NormalEquations(problem, retract(problem, state, scale * step))
-            if equations.error <= (1 + ROUNDING) * error:
-                break
-        else:
-            equations = NormalEquations(problem, state)
+            step = gtsam_step(problem, equations)
+        equations = descended(equations, step)
         ended = error - equations.error <= tolerance * (1 + error)
     return Optimum(equations=equations, state=equations.state, steps=steps, converged=ended)
 
 
-def gtsam_step(problem, state):
-    """The Gauss-Newton step delta (n + q,) by GTSAM of a Problem at a State, in sigmas of c.
+def descended(equations: NormalEquations, step: np.ndarray) -> NormalEquations:
+    """The NormalEquations after a step, halved until the error does not grow."""
+    problem, state = equations.problem, equations.state
+    for halving in range(MAX_HALVINGS):
+        moved = NormalEquations(problem, retract(problem, state, 0.5**halving * step))
+        if moved.error <= (1 + ROUNDING) * equations.error:
+            return moved
+    return NormalEquations(problem, state)
 
-    Cholesky decomposition of H is fast, but fails if H is ill-conditioned. QR decomposition of its
-    root then decides whether the measurements determine every variable. Raises DatasetError if they
-    do not.
+
+def gtsam_step(problem: Problem, equations: NormalEquations) -> np.ndarray:
+    """The Gauss-Newton step delta (n + q,) by GTSAM of NormalEquations, in sigmas of c.
+
+    Raises DatasetError if the measurements do not determine every variable.
     """
-    m, linear = problem.measurements, linearize(problem, state)
-    try:
-        solution = linear.optimize()
-    except RuntimeError:
-        try:
-            solution = linear.optimize(gtsam.EliminateQR)
-        except RuntimeError:                      # GTSAM's, with much advice
-            raise DatasetError(f"{m.dataset.name}: expected measurements that determine every pose "
-                               "and landmark") from None
-    n = len(m.structure.diagonal)
-    step = np.zeros(n + problem.active.sum())
-    step[np.r_[m.structure.unknowns, n:len(step)]] = solution.vector(
-        gtsam.KeyVector(_keys(problem)))
+    structure = problem.measurements.structure
+    solution = eliminated(linearize(problem, equations)).optimize()
+    n, q = len(structure.diagonal), problem.active.sum()
+    step = np.zeros(n + q)
+    keys = list(range(len(structure.is_pose) + bool(q)))
+    step[np.concatenate([structure.unknowns, np.arange(n, n + q)])] = solution.vector(keys)
     return step
 
 
-def _keys(problem):
-    """List of GTSAM's keys of all variables, those of the calibration last, if there are any."""
-    return variable_keys(problem.measurements) + [C(0)] * bool(problem.active.any())
-
-
-def linearize(problem, state):
-    """The gtsam.GaussianFactorGraph of a Problem at a State."""
-    equations, graph = NormalEquations(problem, state), gtsam.GaussianFactorGraph()
-    structure, variables, q = equations.structure, _keys(problem), problem.active.sum()
-    width = np.r_[2 + structure.is_pose, q].tolist()
-    odometry, _ = linearize_odometry(problem, state, problem.noise.slip)
-    for pairs, f in zip(structure.factors, (odometry, *equations.linearized)):
-        by_c = np.zeros((*f.e.shape, q))
-        by_c[:, :, f.columns] = f.J_c
-        for (i, j), e, J, J_c in zip(pairs[f.index].tolist(), f.e, f.J, by_c):
-            calibration = (C(0), J_c) if len(f.columns) else ()
-            second = () if i == j else (variables[j], J[:, 3:3 + width[j]])
-            graph.add(variables[i], J[:, :width[i]], *second, *calibration, -e)
-    root = np.sqrt(np.r_[equations.priors.H, np.ones(q)])
-    e = equations.priors.border[:, -1] / np.maximum(root, 1 / WEAK_SIGMA)
-    first = np.r_[structure.rows(slice(None))[:, 0], len(structure.diagonal)]
-    for key, start, count in zip(variables, first, width):
-        own = slice(start, start + count)
-        if root[start]:
-            graph.add(key, np.diag(root[own]), -e[own])
+def linearize(problem: Problem, equations: NormalEquations) -> gtsam.GaussianFactorGraph:
+    """The gtsam.GaussianFactorGraph of NormalEquations; keys number the variables, c is last."""
+    graph, structure = gtsam.GaussianFactorGraph(), equations.structure
+    q, calibration = problem.active.sum(), len(structure.is_pose)
+    width = 2 + structure.is_pose
+    odometry, _ = linearize_odometry(problem, equations.state, problem.noise.slip)
+    for pairs, factors in zip(structure.factors, (odometry, *equations.linearized)):
+        by_c = np.zeros((*factors.e.shape, q))
+        by_c[:, :, factors.columns] = factors.J_c
+        for k, (i, j) in enumerate(pairs[factors.index].tolist()):
+            J = factors.J[k]
+            terms = [i, J[:, :width[i]], j, J[:, 3:3 + width[j]]]
+            if q:
+                terms += [calibration, by_c[k]]
+            graph.add(*terms, -factors.e[k])
+    add_priors(graph, equations, width, q)
     return graph
 
 
-def as_gtsam(result):
-    """The gtsam.NonlinearFactorGraph of a SlamResult, linearised at its gtsam.Values, and these.
-
-    Priors, odometry, sightings, ranges and factors of one's own, whitened and weighted by noise,
-    gates and kernels of the result, each a gtsam.LinearContainerFactor; `slam.own` has the keys.
-    The values are those of greatest density, at which nothing is averaged over the noise.
-    """
-    require(hasattr(result, "fit"), "as_gtsam", "a SlamResult", result)
-    problem, state = result.fit.problem, result.fit.state
-    values = gtsam_values(problem, state)
-    return gtsam.LinearContainerFactor.ConvertLinearGraph(
-        linearize(problem, state), values), values
+def add_priors(graph: gtsam.GaussianFactorGraph, equations: NormalEquations, width: np.ndarray,
+               q: int):
+    """Add the priors of the variables, each of this width (v,), and of q unknowns of c."""
+    structure, priors = equations.structure, equations.priors
+    root = np.sqrt(np.append(priors.H, np.ones(q)))
+    e = priors.border[:, -1] / np.maximum(root, 1 / WEAK_SIGMA)
+    first = structure.rows(slice(None))[:, 0]
+    for variable, (start, size) in enumerate(zip(first, width)):
+        rows = slice(start, start + size)
+        if root[start]:
+            graph.add(variable, np.diag(root[rows]), -e[rows])
+    if q:
+        rows = slice(len(structure.diagonal), None)
+        graph.add(len(width), np.diag(root[rows]), -e[rows])

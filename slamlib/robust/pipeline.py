@@ -7,26 +7,23 @@ does. Problem 4 starts from the poses of problem 3 (`fit_from_previous`).
 from dataclasses import replace
 
 import numpy as np
-from gtsam import NonlinearFactorGraph
 
 from slamlib.core.errors import require
 from slamlib.core.odometry import MODELS
 from slamlib.core.records import Dataset
 from slamlib.core.vehicle import changed
 from slamlib.robust.choices import better_model, calibrated, most_consistent
-from slamlib.robust.covariances import posterior_moments
 from slamlib.robust.fit import CAUCHY_SCALES, narrow_kernels, refine
 from slamlib.robust.initialization import initial_state, state_from_poses
 from slamlib.robust.jumps import NO_JUMPS
 from slamlib.robust.linear import build_problem
 from slamlib.robust.measurements import Noise, measure
-from slamlib.robust.optimize import optimize
-from slamlib.robust.own import linearized_own
-from slamlib.robust.result import slam_result
+from slamlib.robust.result import SlamResult, slam_result
+from slamlib.robust.solution import solve_by_gtsam
 
 
 def estimate(dataset, slip=None, model=None, previous=None, *, marker_noise_factor=None,
-             range_noise_factor=None, kernel=None, gate=None, factors=None):
+             range_noise_factor=None, kernel=None, gate=None, poses=()):
     """SLAM on odometry and on the markers and ranges that the dataset has.
 
     Parameters
@@ -43,8 +40,8 @@ def estimate(dataset, slip=None, model=None, previous=None, *, marker_noise_fact
         ranges only if its name begins with "asymmetric". None takes that of the Vehicle.
     gate : bool, whether measurements that contradict the solution are rejected; None as for
         `kernel`.
-    factors : gtsam.NonlinearFactorGraph of factors of one's own, with the keys of `slam.own`, or
-        None. Their poses become frames.
+    poses : rows of `dataset.ticks`, from 0, that are variables of the graph also where nothing was
+        measured, for factors of one's own (`SlamResult.graph`).
 
     Returns
     -------
@@ -63,8 +60,8 @@ def estimate(dataset, slip=None, model=None, previous=None, *, marker_noise_fact
     ((200, 3), [5, 13, 36, 46], 0.001)
     """
     require(isinstance(dataset, Dataset), "estimate", "a Dataset", dataset)
-    require(isinstance(factors, NonlinearFactorGraph | None), "estimate",
-            "a gtsam.NonlinearFactorGraph for factors", factors)
+    require_poses(dataset, poses)
+    require_same_drive(dataset, previous)
     require(model in (None, *MODELS), "estimate", f"{' or '.join(MODELS)} for model", model)
     options = {"slip": slip, "marker_noise_factor": marker_noise_factor,
                "range_noise_factor": range_noise_factor, "kernel": kernel, "gate": gate}
@@ -72,7 +69,7 @@ def estimate(dataset, slip=None, model=None, previous=None, *, marker_noise_fact
 
     def solve(jumps=NO_JUMPS, places=None):
         aruco = dataset.aruco if places is None else replace(dataset.aruco, marker=places[:, 1])
-        measurements = measure(replace(dataset, aruco=aruco), (), jumps, factors)     # 1
+        measurements = measure(replace(dataset, aruco=aruco), poses, jumps)           # 1
         if previous is not None:
             return calibrated(fit_from_previous(measurements, previous, model))
         fit = fit_from_odometry(measurements, model or "arc")                         # 2 to 6
@@ -85,9 +82,25 @@ def estimate(dataset, slip=None, model=None, previous=None, *, marker_noise_fact
         fit, places = solve(previous.jumps, previous.places), previous.places
     else:
         fit, places = most_consistent(dataset, solve)
-    optimum = optimize(fit.problem, fit.state, by_gtsam=True)
-    fit = replace(fit, state=optimum.state, converged=optimum.converged)
-    return replace(slam_result(fit), places=places)                                   # 7
+    return replace(slam_result(fit, solve_by_gtsam(fit)), places=places)              # 7
+
+
+def require_poses(dataset, poses):
+    """Raise DatasetError unless `poses` are rows of the ticks of a Dataset."""
+    for pose in poses:
+        ok = isinstance(pose, int | np.integer) and 0 <= pose < len(dataset.ticks)
+        require(ok, "estimate", f"rows from 0 to {len(dataset.ticks) - 1} for poses", pose)
+
+
+def require_same_drive(dataset, previous):
+    """Raise DatasetError unless `previous` is None or a SlamResult of the drive of a Dataset."""
+    if previous is None:
+        return
+    require(isinstance(previous, SlamResult), "estimate", "a SlamResult for previous", previous)
+    ticks = previous.fit.problem.measurements.dataset.ticks
+    require(np.array_equal(ticks, dataset.ticks), "estimate",
+            f"a result of the same drive for previous, of {len(dataset.ticks)} poses with the same "
+            f"counts, found one of {len(ticks)} poses")
 
 
 def fit_from_odometry(measurements, model="arc"):
@@ -108,24 +121,3 @@ def fit_from_previous(measurements, previous, model=None):
     state = state_from_poses(measurements, previous.poses[frame], previous.covariances[frame], c)
     state = narrow_kernels(problem, state, CAUCHY_SCALES[-1:])
     return replace(refine(problem, state), explanations=previous.explanations)
-
-
-def own_contradictions(fit):
-    """Errors (m,) of the factors of one's own of a Fit, in standard deviations, the larger of two.
-
-    Those at its solution, and those that the rest alone predicts, with the covariances of both.
-    Of a pose and a landmark, whose errors may be correlated, twice the sum of theirs is counted.
-    """
-    problem, m = fit.problem, fit.problem.measurements
-    e, *_ = linearized_own(problem, fit.state)
-    if not len(e):
-        return np.zeros(0)
-    rest = calibrated(fit_from_odometry(
-        replace(m, own=NonlinearFactorGraph()), problem.odometry.model))
-    state, found, _ = posterior_moments(rest)
-    C = np.concatenate([found.pairs[:1, :3, :3], found.pairs[:, 3:6, 3:6], found.landmarks])
-    off, J, _ = linearized_own(problem, state)
-    J = J.reshape(*off.shape, 2, 3).swapaxes(1, 2)                       # (m, 2, d, 3)
-    predicted = 2 * np.sum(J @ C[m.structure.factors[-1]] @ J.mT, axis=1) + np.eye(off.shape[1])
-    squared = np.einsum("ni,ni->n", off, np.linalg.solve(predicted, off[..., None])[..., 0])
-    return np.maximum(np.linalg.norm(e, axis=1), np.sqrt(squared))

@@ -10,12 +10,14 @@ from operator import attrgetter
 import numpy as np
 
 from slamlib.core import increments, se2
-from slamlib.robust import factors
+from slamlib.core.graph import GUESS_PRIOR_SIGMA
+from slamlib.core.preintegration import odometry_noise
 from slamlib.robust.calibration import WHEELS, calibration_table
 from slamlib.robust.covariances import posterior_moments
+from slamlib.robust.factors import MIN_DISTANCE
 from slamlib.robust.fit import Fit, error_memories, residuals
 from slamlib.robust.initialization import SAME_PLACE, ranges_by_antenna, second_moment, trilaterate
-from slamlib.robust.measurements import GUESS_PRIOR_SIGMA
+from slamlib.robust.solution import GtsamSolution, graph_and_values
 
 MIN_ACCEPTED_RANGES = 5      # number of accepted ranges of an antenna that is not in doubt
 SAME_MARKER = 0.05           # m, distance of two markers that must be one
@@ -45,7 +47,9 @@ class SlamResult:
     range_residual: np.ndarray      # (r,) whitened, positive for a range that is too long
     correlation: tuple              # of neighbours' residuals of a marker, and of an antenna
     turn_sigma: np.ndarray          # (f-1,) rad, of odometry's turns between frames, stated wheels
-    fit: Fit                        # problem and solution, for `graph.as_gtsam`
+    fit: Fit                        # what was decided, and by which solution
+    gtsam: GtsamSolution | None     # what is handed in; None while the engine decides
+    agreement: tuple[float, float]  # of both: largest difference, sigmas; relative of sigmas
     places: np.ndarray | None = None     # (m, 2) ids of ArucoReadings, and those in the map
 
     # Parts of the fit
@@ -58,7 +62,7 @@ class SlamResult:
     share = property(attrgetter("fit.problem.accepted.share"))   # (s + r,) of memory, `Accepted`
     sightings = property(attrgetter("fit.problem.measurements.sightings"))      # s of the graph
     jumps = property(attrgetter("fit.problem.measurements.jumps"))     # odometry against markers
-    converged = property(attrgetter("fit.converged"))            # before MAX_STEPS of steps
+    converged = property(lambda self: self.gtsam.converged if self.gtsam else self.fit.converged)
     calibration_table = property(lambda self: calibration_table(           # list of p dicts
         self.calibration, self.c, self.c_covariance, self.released))
     wheel = property(lambda self: self.c[WHEELS])                # (3,) m: R_R, R_L, b
@@ -73,6 +77,14 @@ class SlamResult:
                 f"sqrt(m), noise factors {self.noise.sightings:.2g} and {self.noise.ranges:.2g}\n"
                 f"  released from vehicle.toml: {', '.join(sorted(self.released)) or 'nothing'}")
 
+    def graph(self):
+        """The gtsam.NonlinearFactorGraph that was decided, and gtsam.Values at its solution.
+
+        For factors of one's own, and GTSAM's own tools; `core.graph` has the keys. Nothing is
+        averaged over the noise. `core.graph_solution.solve_graph` solves it.
+        """
+        return graph_and_values(self.fit.problem, self.fit.state)
+
     @property
     def unconfirmed(self):
         """Ids of markers with one accepted sighting, or at the place of a marker seen more often.
@@ -86,15 +98,26 @@ class SlamResult:
         return self.marker[(count == 1) | other.any(axis=1)]
 
 
-def slam_result(fit):
-    """The SlamResult of a Fit; raises LinAlgError as `marginal_covariances`."""
+def slam_result(fit, by_gtsam=None):
+    """The SlamResult of a Fit, with the GtsamSolution of its graph or, without one, the engine's.
+
+    Cross-covariances of neighbouring frames, by which encoder poses between them follow, are the
+    engine's. Raises LinAlgError as `marginal_covariances`.
+    """
     problem, m = fit.problem, fit.problem.measurements
     state, marginal, slip = posterior_moments(fit)
+    agreement, landmarks, c_covariance = (0.0, 0.0), marginal.landmarks, marginal.c
+    if by_gtsam is not None:
+        agreement = agreement_of(by_gtsam, state, marginal)
+        state, landmarks, c_covariance = by_gtsam.state, by_gtsam.landmarks, by_gtsam.c
     poses, pose_covariances = interpolate(
         replace(problem, noise=problem.noise._replace(slip=slip)), state, marginal.pairs)
+    if by_gtsam is not None:
+        pose_covariances[m.frame] = se2.rotate_covariance(
+            by_gtsam.frames, state.poses[:, 2])
     range_residual, rejected = residuals(problem, state)[1], problem.accepted.sightings.weight == 0
     range_weight = problem.accepted.ranges.kept(range_residual)
-    markers, antennas = np.split(marginal.landmarks, [len(m.marker)])
+    markers, antennas = np.split(landmarks.copy(), [len(m.marker)])
     best = np.full(len(m.marker), np.inf)         # a point has the heading of its best sighting
     np.minimum.at(best, m.marker_row, m.sightings.C[:, 2, 2])
     markers[~m.oriented, 2, 2] = best[~m.oriented]
@@ -109,11 +132,31 @@ def slam_result(fit):
         marker_covariance=se2.rotate_covariance(markers[mapped], place[:, 2]),
         antenna=m.antenna, antenna_in_world=state.antennas,
         antenna_covariance=antenna_covariances, doubts=sentences,
-        c=state.c, c_covariance=marginal.c, noise_sigma=np.zeros(3) if fit.posterior is None
+        c=state.c, c_covariance=c_covariance, noise_sigma=np.zeros(3) if fit.posterior is None
         else np.sqrt(np.diag(fit.posterior.covariance)),
         rejected=rejected, range_weight=range_weight, range_residual=range_residual,
         correlation=tuple(each.correlation for each in error_memories(problem, state)),
+        gtsam=by_gtsam, agreement=agreement,
         turn_sigma=turn_sigma(problem), fit=fit)
+
+
+def agreement_of(by_gtsam, state, marginal):
+    """Largest difference of GTSAM's poses and markers from the engine's, in its sigmas.
+
+    Also the largest relative difference of their sigmas. From the engine's mean State and
+    Covariances.
+    """
+    found = np.concatenate([by_gtsam.state.poses, by_gtsam.state.markers])
+    engine = np.concatenate([state.poses, state.markers])
+    frames = np.concatenate([marginal.pairs[:1, :3, :3], marginal.pairs[:, 3:6, 3:6]])
+    landmarks = marginal.landmarks[:len(state.markers)]
+    of_engine = np.concatenate([frames, landmarks])
+    of_gtsam = np.concatenate([by_gtsam.frames, by_gtsam.landmarks[:len(state.markers)]])
+    in_both = np.diagonal(of_gtsam, axis1=1, axis2=2) > 0
+    sigma = se2.sigmas(np.where(in_both[:, :, None], of_engine, 1.0))
+    off = np.abs(se2.difference(se2.between(engine, found), np.zeros(3))) / sigma
+    ratio = np.abs(se2.sigmas(np.where(in_both[:, :, None], of_gtsam, 1.0)) / sigma - 1)
+    return float(off[in_both].max(initial=0.0)), float(ratio[in_both].max(initial=0.0))
 
 
 def turn_sigma(problem):
@@ -153,7 +196,7 @@ def _doubt(ranges, estimate, weight, places, costs):
     elsewhere = np.hypot(*(places - estimate).T) > SAME_PLACE * distance
     possible = places[elsewhere & (costs < MAX_LOG_ODDS)]
     difference = estimate - ranges.positions
-    direction = difference / np.maximum(np.hypot(*difference.T), factors.MIN_DISTANCE)[:, None]
+    direction = difference / np.maximum(np.hypot(*difference.T), MIN_DISTANCE)[:, None]
     information = direction.T @ (direction * (weight / ranges.sigma**2)[:, None])
     sigma = 1 / np.sqrt(max(np.linalg.eigvalsh(information)[0], GUESS_PRIOR_SIGMA**-2))
     if count < MIN_ACCEPTED_RANGES:
@@ -189,7 +232,7 @@ def interpolate(problem, state, pairs):
     a, b = last[inner], last[inner] + 1
     vehicle, ticks = m.dataset.vehicle.with_wheel(state.c[WHEELS]), m.dataset.ticks
     ends = np.r_[frame[a], inner], np.r_[inner, frame[b]]
-    quantization, slipping = factors.odometry_noise(ticks, vehicle, *ends)
+    quantization, slipping = odometry_noise(ticks, vehicle, *ends)
     (delta_a, delta_b), (a_by_wheel, b_by_wheel), (Q_a, Q_b), (jump_a, jump_b) = (
         np.split(each, 2) for each in (
             *increments.between_poses(ticks, vehicle, *ends, problem.odometry.model),

@@ -9,7 +9,6 @@ from slamlib.core import se2
 from slamlib.robust.file_doubts import Doubt
 from slamlib.robust.jumps import UNKNOWN_SIGMA
 from slamlib.robust.noise import BOUNDS
-from slamlib.robust.pipeline import own_contradictions
 
 MAX_TURN_SIGMA = np.pi / 3   # rad, between two frames; half a turn is three sigmas
 MAX_GAP = 30                 # poses, between contradictions that are told as one
@@ -20,7 +19,7 @@ MIN_FACTOR_SIGMAS = 4.0      # sigmas of the logarithm of a factor that is repor
 MAX_REJECTED = 0.1           # share of the sightings that are rejected
 MIN_REJECTED_OF_MARKER, MAX_REJECTED_OF_MARKER = 5, 0.2      # number, and share of its sightings
 MAX_MARKERS_NAMED = 8        # of those with most rejected sightings
-MAX_OWN_ERROR = 6.0          # sigmas, of a factor of one's own
+MAX_DISAGREEMENT = 0.1       # sigmas of a pose, and relative of a sigma, by engine and GTSAM
 # By group of the calibration: its name in a sentence, and what to look at.
 GROUPS = {
     "wheel-parameters": ("the wheels", "Measure them, or state larger sigmas in vehicle.toml."),
@@ -44,8 +43,8 @@ GROUPS = {
 def solution_doubts(result):
     """Tuple of Doubt where a SlamResult contradicts the files of its drive."""
     return tuple(Doubt(*each) for each in chain(
-        _of_own_factors(result), _of_encoder(result), _of_calibration(result), _of_noise(result),
-        _of_sightings(result), _of_the_path(result),
+        _of_encoder(result), _of_calibration(result), _of_noise(result),
+        _of_sightings(result), _of_the_path(result), _of_agreement(result),
         (("antenna", f"Antenna {antenna} is in doubt: {reason}. Its covariance includes this; look "
           "at its rows in UwbReading.txt.") for antenna, reason in result.doubts.items())))
 
@@ -171,12 +170,11 @@ def _of_the_path(result):
             "may be far from where the measurements want them.")
 
 
-def _of_own_factors(result):
-    """Kind and sentence if factors of one's own contradict the rest, which bends to them."""
-    size = own_contradictions(result.fit)
-    if size.max(initial=0) > MAX_OWN_ERROR:
-        yield "own-factors", (
-            f"{np.count_nonzero(size > MAX_OWN_ERROR)} of {len(size)} factors of your own "
-            f"contradict the rest, factor {size.argmax()} by {size.max():.0f} standard deviations, "
-            "and the solution bends to them: look whether they are in the frame of pose 1, correct "
-            "them, or give them a robust noise model.")
+def _of_agreement(result):
+    """Kind and sentence if GTSAM's solution is not that by which the engine decided."""
+    off, ratio = result.agreement
+    if max(off, ratio) > MAX_DISAGREEMENT:
+        yield "agreement", (
+            f"GTSAM's solution differs by up to {off:.2g} standard deviations from that by which "
+            f"noise and outliers were decided, and its standard deviations by up to {ratio:.0%}: "
+            "what was decided may not fit it.")

@@ -1,0 +1,256 @@
+"""Problems 3 and 4: the factor graph in GTSAM.
+
+The variables are X(i), the pose in row i of the encoder file, for the poses with a measurement;
+L(id), the pose of a marker, or P(id), its position where no sighting has a heading; A(id), the
+position of an antenna; and W(0), the wheel parameters [R_R, R_L, b] in standard deviations from
+what is stated. Poses are gtsam.Pose2, positions gtsam.Point2, all in the frame of pose 1.
+
+    odometry    log(Delta(w)^-1 X_i^-1 X_k)        a custom factor: all increments share w
+    sighting    log(Z^-1 X^-1 L)                   BetweenFactorPose2, or BearingRangeFactor2D
+    range       |A - p| - r                        RangeFactor2D, with a robust kernel
+
+Decisions are what enters the graph, and how much it counts. `count_everything` decides nothing: all
+measurements count as the files state them, which is the plain solver of chapters 3 and 4.
+`robust` decides more. GTSAM moves a pose by X exp(xi): errors and covariances of its poses are in
+the axes of the pose itself.
+"""
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import A, L, P, W, X
+
+from slamlib.core import odometry, se2
+from slamlib.core.increments import TYPICAL_SLIP
+from slamlib.core.kernels import ONE_SIDED, kernel_of
+from slamlib.core.preintegration import OdometryIncrements, preintegrate
+from slamlib.core.records import AntennaGuess, ArucoReadings, Dataset, UwbReadings
+from slamlib.core.sightings import MAX_HEADING_SIGMA, consensus
+
+ORIGIN_SIGMA = 1e-5          # m, of the position of pose 1, which is zero by definition
+GUESS_PRIOR_SIGMA = 5.0      # m, of an antenna about its guessed position
+INDICES = 2**56              # number of indices of GTSAM's symbols; ids below 0 count from the end
+
+
+@dataclass(frozen=True)
+class Decisions:
+    """What enters the graph of a drive, with which noise."""
+
+    odometry: OdometryIncrements
+    slip: float                          # sqrt(m), sigma of a wheel's slip after one metre
+    sigma_heading: float                 # rad, of pose 1
+    sigma_wheel: np.ndarray              # (3,) m, of the prior of the wheel parameters
+    sightings: ArucoReadings | None      # those that count, in the vehicle, with their covariances
+    ranges: UwbReadings | None           # those that count, with their standard deviations
+    guess: AntennaGuess | None
+    points: np.ndarray                   # ids of the markers whose heading no sighting knows
+    sighting_share: np.ndarray | None = None     # (s,) of information that each keeps; None: all
+    range_share: np.ndarray | None = None        # (r,)
+    sighting_kernel: str = "quadratic"
+    range_kernel: str = "quadratic"
+
+
+def frames_of(dataset: Dataset, extra: np.ndarray = ()) -> np.ndarray:
+    """Encoder poses (f,) that are variables: the first, the last, with a measurement, `extra`."""
+    measured = [readings.pose for readings in (dataset.aruco, dataset.uwb) if readings is not None]
+    return np.unique(np.concatenate([[0, len(dataset.ticks) - 1], *measured, extra]).astype(int))
+
+
+def count_everything(dataset: Dataset, kernel: str = "Cauchy", slip: float = TYPICAL_SLIP,
+                     extra: np.ndarray = ()) -> Decisions:
+    """The Decisions by which all measurements of a Dataset count as its files state them.
+
+    `kernel` is a name in `kernels.KERNELS`, of sightings and ranges, `slip` is in sqrt(m), and
+    `extra` are further encoder poses that are variables.
+    """
+    return Decisions(
+        odometry=preintegrate(dataset, frames_of(dataset, extra)),
+        slip=slip,
+        sigma_heading=dataset.vehicle.sigma_heading,
+        sigma_wheel=dataset.vehicle.sigma_wheel,
+        sightings=dataset.sightings,
+        ranges=dataset.uwb,
+        guess=dataset.antenna_guess,
+        points=markers_without_heading(dataset.sightings),
+        sighting_kernel="quadratic" if kernel in ONE_SIDED else kernel,
+        range_kernel=kernel)
+
+
+def build_graph(decisions: Decisions) -> gtsam.NonlinearFactorGraph:
+    """The factor graph of Decisions."""
+    graph = gtsam.NonlinearFactorGraph()
+    add_priors(graph, decisions)
+    add_odometry(graph, decisions)
+    if decisions.sightings is not None:
+        add_sightings(graph, decisions)
+    if decisions.ranges is not None:
+        add_ranges(graph, decisions)
+    return graph
+
+
+def add_priors(graph: gtsam.NonlinearFactorGraph, decisions: Decisions):
+    """Add the priors of pose 1, of the wheel parameters, and of the antennas with ranges."""
+    noise = gtsam.noiseModel
+    origin = noise.Diagonal.Sigmas([ORIGIN_SIGMA, ORIGIN_SIGMA, decisions.sigma_heading])
+    graph.add(gtsam.PriorFactorPose2(X(0), gtsam.Pose2(), origin))
+    graph.add(gtsam.PriorFactorVector(W(0), np.zeros(3), noise.Unit.Create(3)))
+    if decisions.ranges is not None:
+        add_antenna_priors(graph, decisions.guess, decisions.ranges.antenna)
+
+
+def add_antenna_priors(graph: gtsam.NonlinearFactorGraph, guess: AntennaGuess,
+                       antennas: np.ndarray):
+    """Add the prior of each of these antennas, ids (r,), about its guess."""
+    noise = gtsam.noiseModel.Isotropic.Sigma(2, GUESS_PRIOR_SIGMA)
+    for antenna, position in guessed(guess, antennas).items():
+        graph.add(gtsam.PriorFactorPoint2(A(antenna), position, noise))
+
+
+def guessed(guess: AntennaGuess, antennas: np.ndarray) -> dict[int, np.ndarray]:
+    """The guessed position (2,) in m of each of these antennas, by the index of its symbol."""
+    used = np.isin(guess.antenna, antennas)
+    return dict(zip((guess.antenna[used] % INDICES).tolist(), guess.position[used]))
+
+
+def add_odometry(graph: gtsam.NonlinearFactorGraph, decisions: Decisions):
+    """Add a factor between successive frames, which all depend on the same wheel parameters."""
+    increments = decisions.odometry
+    covariances = increments.covariance(decisions.slip)
+    for k, covariance in enumerate(covariances):
+        graph.add(gtsam.CustomFactor(
+            gtsam.noiseModel.Gaussian.Covariance(covariance),
+            [X(int(increments.frame[k])), X(int(increments.frame[k + 1])), W(0)],
+            odometry_error(increments, k, decisions.sigma_wheel)))
+
+
+def odometry_error(increments: OdometryIncrements, k: int, sigma_wheel: np.ndarray):
+    """The error function of the increment k, for gtsam.CustomFactor.
+
+    With the scale s of the stated wheels over w, in heading times the ratio of the wheelbases, the
+    error is s log(Delta(w)^-1 X_i^-1 X_k): encoders measure counts, and an error of a count grows
+    with the wheels. Otherwise all lengths would be estimated too small where nothing else gives the
+    scale.
+    """
+    increment, J_wheel = increments.increment[k], increments.J_wheel[k]
+    stated, linearised = increments.stated, increments.wheel
+
+    def error(factor, values, jacobians):
+        first, second, wheels = factor.keys()
+        wheel = stated + sigma_wheel * values.atVector(wheels)
+        measured = gtsam.Pose2(*(increment + J_wheel @ (wheel - linearised)))
+        radius = wheel[:2].mean()
+        scale = np.full(3, stated[:2].mean() / radius)
+        scale[2] *= wheel[2] / stated[2]
+        X_i, X_k = values.atPose2(first), values.atPose2(second)
+        if jacobians is None:
+            return scale * gtsam.Pose2.Logmap(measured.between(X_i.between(X_k)))
+        by_first, by_second, by_measured, by_expected, by_difference = np.zeros(
+            (5, 3, 3)).transpose(0, 2, 1)                    # columns first, as GTSAM wants
+        expected = X_i.between(X_k, by_first, by_second)
+        difference = measured.between(expected, by_measured, by_expected)
+        unscaled = gtsam.Pose2.Logmap(difference, by_difference)
+        scaled_by_expected = scale[:, None] * (by_difference @ by_expected)
+        by_wheel = by_difference @ by_measured @ in_own_axes(measured) @ J_wheel
+        by_scale = np.array([[-1, -1, 0], [-1, -1, 0], [-1, -1, 0]]) / (2 * radius)
+        by_scale[2, 2] = 1 / wheel[2]
+        jacobians[0] = scaled_by_expected @ by_first
+        jacobians[1] = scaled_by_expected @ by_second
+        jacobians[2] = scale[:, None] * (by_wheel + unscaled[:, None] * by_scale) * sigma_wheel
+        return scale * unscaled
+
+    return error
+
+
+def in_own_axes(pose: gtsam.Pose2) -> np.ndarray:
+    """Derivative (3, 3) of GTSAM's tangent vector at a pose by its coordinates [x, y, heading]."""
+    by_coordinates = np.eye(3)
+    by_coordinates[:2, :2] = pose.rotation().matrix().T
+    return by_coordinates
+
+
+def noise_model(covariance: np.ndarray, kernel: str, share: float) -> gtsam.noiseModel.Base:
+    """GTSAM's noise of a measurement that keeps a share of its information, with a kernel.
+
+    The share multiplies the loss. It divides the covariance, and the kernel, whose argument it
+    changed so, becomes wider by its root.
+    """
+    gaussian = gtsam.noiseModel.Gaussian.Covariance(covariance / share)
+    robust = kernel_of(kernel, width=share**0.5)
+    return gaussian if robust is None else gtsam.noiseModel.Robust.Create(robust, gaussian)
+
+
+def markers_without_heading(sightings: ArucoReadings | None) -> np.ndarray:
+    """Ids (k,) of the markers of which no sighting knows the heading."""
+    if sightings is None:
+        return np.zeros(0, int)
+    known = sightings.covariance[:, 2, 2] < MAX_HEADING_SIGMA**2
+    return np.setdiff1d(sightings.marker, sightings.marker[known])
+
+
+def add_sightings(graph: gtsam.NonlinearFactorGraph, decisions: Decisions):
+    """Add a factor for each sighting.
+
+    The files give the covariance C of Z in the axes of the vehicle; the error of a marker's pose
+    lives in those of the measured pose, R(heading)^T C R(heading) (equation 3.1).
+    """
+    sightings = decisions.sightings
+    shares = np.ones(len(sightings.pose)) if decisions.sighting_share is None \
+        else decisions.sighting_share
+    markers = (sightings.marker % INDICES).tolist()
+    poses = sightings.pose.tolist()
+    is_point = np.isin(sightings.marker, decisions.points)
+    for k, z in enumerate(sightings.marker_in_vehicle):
+        C = sightings.covariance[k]
+        if is_point[k]:
+            distance = np.hypot(z[0], z[1])
+            bearing = gtsam.Rot2(np.arctan2(z[1], z[0]))
+            polar = np.array([[-z[1] / distance**2, z[0] / distance**2],
+                              [z[0] / distance, z[1] / distance]])       # by x and y
+            noise = noise_model(
+                polar @ C[:2, :2] @ polar.T, decisions.sighting_kernel, shares[k])
+            graph.add(gtsam.BearingRangeFactor2D(
+                X(poses[k]), P(markers[k]), bearing, distance, noise))
+        else:
+            noise = noise_model(
+                se2.rotate_covariance(C, -z[2]), decisions.sighting_kernel, shares[k])
+            graph.add(gtsam.BetweenFactorPose2(
+                X(poses[k]), L(markers[k]), gtsam.Pose2(*z), noise))
+
+
+def add_ranges(graph: gtsam.NonlinearFactorGraph, decisions: Decisions):
+    """Add a factor for each range, which is compared with the bias of a one-sided kernel."""
+    ranges = decisions.ranges
+    shares = np.ones(len(ranges.pose)) if decisions.range_share is None else decisions.range_share
+    measured = ranges.range - ONE_SIDED.get(decisions.range_kernel, 0.0) * ranges.sigma
+    antennas = (ranges.antenna % INDICES).tolist()
+    poses = ranges.pose.tolist()
+    for k, sigma in enumerate(ranges.sigma):
+        noise = noise_model(np.array([[sigma**2]]), decisions.range_kernel, shares[k])
+        graph.add(gtsam.RangeFactor2D(X(poses[k]), A(antennas[k]), measured[k], noise))
+
+
+def initial_values(dataset: Dataset, decisions: Decisions) -> gtsam.Values:
+    """Poses by odometry, markers at the consensus of their sightings, antennas at the guesses."""
+    values = gtsam.Values()
+    values.insert(W(0), np.zeros(3))
+    poses, covariances = odometry.first_order(
+        dataset.ticks, dataset.vehicle, model=decisions.odometry.model)
+    for i in decisions.odometry.frame.tolist():
+        values.insert(X(i), gtsam.Pose2(*poses[i]))
+    if decisions.sightings is not None:
+        sightings = decisions.sightings
+        i = sightings.pose
+        in_world, C = se2.compose_uncertain(
+            poses[i], covariances[i], sightings.marker_in_vehicle, sightings.covariance)
+        for k in consensus(sightings.marker, in_world, C):
+            marker = int(sightings.marker[k] % INDICES)
+            if sightings.marker[k] in decisions.points:
+                values.insert(P(marker), in_world[k, :2])
+            else:
+                values.insert(L(marker), gtsam.Pose2(*in_world[k]))
+    if decisions.ranges is not None:
+        at_guesses = guessed(decisions.guess, decisions.ranges.antenna)
+        for antenna, position in at_guesses.items():
+            values.insert(A(antenna), position)
+    return values

@@ -1,0 +1,241 @@
+"""Gauss-Newton on a factor graph of GTSAM, and the marginal covariances of its solution.
+
+A step linearises all factors, eliminates the variables, which gives the Bayes tree, and moves every
+variable by its solution. The steps are driven from here, because inside GTSAM's own optimizers each
+call of a custom factor copies all values. Any graph with the keys of `core.graph` is solved, also
+with factors and variables of one's own.
+"""
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from slamlib.core import se2
+from slamlib.core.errors import DatasetError
+from slamlib.core.graph import INDICES
+
+CONVERGED = 1e-6             # decrease of the error, over 1 + error, at which steps end
+ROUNDING = 1e-12             # relative increase of the error that is due to float rounding
+MAX_STEPS = 30               # number of steps of Gauss-Newton
+MAX_HALVINGS = 8             # number of halvings of one step
+MAX_CONTRADICTION = 10.0     # sigmas, of a factor at the solution that is consistent
+
+LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class GraphSolution:
+    """Poses and maps at the solution of a graph, covariances in world axes: m, m, rad.
+
+    A marker without heading has a NaN heading. `marginals` has the covariances of all variables,
+    those of one's own too, in GTSAM's axes.
+    """
+
+    graph: gtsam.NonlinearFactorGraph
+    values: gtsam.Values
+    marginals: "Marginals"
+    pose: np.ndarray                # (f,) rows of the encoder file, from 0, ascending
+    poses: np.ndarray               # (f, 3)
+    covariances: np.ndarray         # (f, 3, 3)
+    marker: np.ndarray              # (k,) ids, ascending
+    marker_in_world: np.ndarray     # (k, 3)
+    marker_covariance: np.ndarray   # (k, 3, 3)
+    antenna: np.ndarray             # (a,) ids, ascending
+    antenna_in_world: np.ndarray    # (a, 2)
+    antenna_covariance: np.ndarray  # (a, 2, 2)
+    steps: int                      # of Gauss-Newton
+    error: float                    # half the sum of squared whitened errors, or kernels' losses
+    converged: bool                 # whether the error stopped to fall, and no factor contradicts
+    contradiction: str              # a sentence on the factor that contradicts most, or ""
+
+
+@dataclass(frozen=True)
+class Marginals:
+    """Covariances of variables by the Bayes tree of a linear graph, in GTSAM's axes.
+
+    As `eliminated`, by QR decomposition where Cholesky's fails.
+    """
+
+    tree: gtsam.GaussianBayesTree
+
+    def covariance(self, key: int) -> np.ndarray:
+        """The covariance (d, d) of a variable."""
+        try:
+            return self.tree.marginalCovariance(key)
+        except RuntimeError:
+            root, _ = self.tree.marginalFactor(key, gtsam.EliminateQR).jacobian()
+            return covariance_of_root(root)
+
+    def joint(self, first: int, second: int) -> np.ndarray:
+        """The covariance (d, e) between two variables."""
+        try:
+            return self.tree.jointMarginalCovariance([first, second]).at(first, second)
+        except RuntimeError:
+            ordering = gtsam.Ordering()
+            ordering.push_back(first)
+            ordering.push_back(second)
+            root, _ = self.tree.joint(first, second, gtsam.EliminateQR).jacobian(ordering)
+            size = len(self.covariance(first))
+            return covariance_of_root(np.linalg.qr(root, mode="r"))[:size, size:]
+
+
+def covariance_of_root(root: np.ndarray) -> np.ndarray:
+    """The covariance (d, d) by the upper triangular square root (d, d) of the information."""
+    inverse = np.linalg.inv(root)
+    return inverse @ inverse.T
+
+
+@dataclass(frozen=True)
+class GaussNewton:
+    """The end of Gauss-Newton."""
+
+    values: gtsam.Values
+    error: float             # half the sum of squared whitened errors, or kernels' losses
+    steps: int               # number of steps
+    converged: bool          # whether the error had stopped to fall
+
+
+def solve_graph(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> GraphSolution:
+    """The GraphSolution of a graph from initial values.
+
+    Raises DatasetError, which names a variable, if the factors do not determine every one.
+    """
+    found = gauss_newton(graph, values)
+    marginals = Marginals(eliminated(graph.linearize(found.values)))
+    worst = contradiction(graph, found.values)
+    if worst:
+        LOG.warning(worst)
+    if not found.converged:
+        LOG.warning("the error still falls after %d steps, to %.4g: is a factor far from the rest, "
+                    "or an initial value?", found.steps, found.error)
+    return GraphSolution(
+        graph=graph, values=found.values, marginals=marginals, steps=found.steps,
+        error=found.error, converged=found.converged and not worst, contradiction=worst,
+        **places(found.values, marginals.covariance))
+
+
+def gauss_newton(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> GaussNewton:
+    """The end of Gauss-Newton on a graph from initial values.
+
+    Raises DatasetError, which names a variable, if the factors do not determine every one.
+    """
+    error = graph.error(values)
+    for steps in range(1, MAX_STEPS + 1):
+        step = eliminated(graph.linearize(values)).optimize()
+        before = error
+        values, error = descended(graph, values, step, error)
+        LOG.debug("Gauss-Newton step %d: error %.6g", steps, error)
+        if before - error <= CONVERGED * (1 + before):
+            return GaussNewton(values, error, steps, converged=True)
+    return GaussNewton(values, error, MAX_STEPS, converged=False)
+
+
+def descended(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, step: gtsam.VectorValues,
+              error: float) -> tuple[gtsam.Values, float]:
+    """Values after a step, halved until the error does not grow, and their error."""
+    for halving in range(MAX_HALVINGS):
+        moved = values.retract(step.scale(0.5**halving))
+        new = graph.error(moved)
+        if new <= (1 + ROUNDING) * error:
+            return moved, new
+    return values, error
+
+
+def eliminated(linear: gtsam.GaussianFactorGraph) -> gtsam.GaussianBayesTree:
+    """The Bayes tree of a linear graph.
+
+    Cholesky decomposition is fast, but fails where the information is ill-conditioned. There QR
+    decomposition decides whether the factors determine every variable. Raises DatasetError if they
+    do not.
+    """
+    try:
+        return linear.eliminateMultifrontal()
+    except RuntimeError:
+        pass
+    try:
+        ordering = gtsam.Ordering.ColamdGaussianFactorGraph(linear)
+        return linear.eliminateMultifrontal(ordering, gtsam.EliminateQR)
+    except RuntimeError as failure:                      # GTSAM's, with much advice
+        _, _, rest = str(failure).partition("Symbol: ")
+        near = f", near {rest.partition(')')[0]}" if rest else ""
+        raise DatasetError("expected measurements that determine every pose and landmark, found "
+                           f"some that do not{near}") from None
+
+
+def contradiction(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> str:
+    """A sentence on the factor of largest error if this exceeds MAX_CONTRADICTION, or "".
+
+    Factors with a robust noise model may contradict the rest.
+    """
+    largest, worst = 0.0, None
+    for k in range(graph.size()):
+        factor = graph.at(k)
+        size = np.sqrt(2 * factor.error(values))
+        if size > largest and not is_robust(factor):
+            largest, worst = size, k
+    if largest <= MAX_CONTRADICTION:
+        return ""
+    keys = ", ".join(gtsam.DefaultKeyFormatter(key) for key in graph.at(worst).keys())
+    return (f"factor {worst}, on {keys}, contradicts the rest by {largest:.0f} standard "
+            "deviations, and the solution bends to it: look whether it is in the frame of pose 1, "
+            "correct it, or give it a robust noise model")
+
+
+def is_robust(factor: gtsam.NonlinearFactor) -> bool:
+    """Whether the noise model of a factor has a robust kernel."""
+    return isinstance(factor, gtsam.NoiseModelFactor) and isinstance(
+        factor.noiseModel(), gtsam.noiseModel.Robust)
+
+
+def places(values: gtsam.Values, covariance_of: Callable[[int], np.ndarray]) -> dict:
+    """Fields of a GraphSolution by values, and covariances by key in GTSAM's axes."""
+    keys = {symbol: [] for symbol in "xlpa"}
+    for key in values.keys():
+        symbol = chr(gtsam.symbolChr(key)) if gtsam.symbolChr(key) else ""
+        if symbol in keys:
+            keys[symbol].append(key)
+    poses, covariances = poses_in_world(values, keys["x"], covariance_of)
+    marker_poses, marker_covariances = poses_in_world(values, keys["l"], covariance_of)
+    points, point_covariances = points_in_world(values, keys["p"], covariance_of)
+    antennas, antenna_covariances = points_in_world(values, keys["a"], covariance_of)
+    marker = ids_of(keys["l"] + keys["p"])
+    marker_in_world = np.concatenate([
+        marker_poses, np.pad(points, ((0, 0), (0, 1)), constant_values=np.nan)])
+    marker_covariance = np.concatenate([
+        marker_covariances, np.pad(point_covariances, ((0, 0), (0, 1), (0, 1)),
+                                   constant_values=np.nan)])
+    by_id, antenna = np.argsort(marker), ids_of(keys["a"])
+    by_antenna = np.argsort(antenna)
+    return {"pose": ids_of(keys["x"]), "poses": poses, "covariances": covariances,
+            "marker": marker[by_id], "marker_in_world": marker_in_world[by_id],
+            "marker_covariance": marker_covariance[by_id],
+            "antenna": antenna[by_antenna], "antenna_in_world": antennas[by_antenna],
+            "antenna_covariance": antenna_covariances[by_antenna]}
+
+
+def ids_of(keys: list[int]) -> np.ndarray:
+    """Ids (n,), which may be negative, by GTSAM's keys."""
+    index = np.array([gtsam.symbolIndex(key) for key in keys], dtype=np.int64)
+    return np.where(index < INDICES // 2, index, index - INDICES)
+
+
+def poses_in_world(values: gtsam.Values, keys: list[int], covariance_of: Callable):
+    """Poses (n, 3) of these keys, and their covariances (n, 3, 3) in world axes."""
+    poses, covariances = np.zeros((len(keys), 3)), np.zeros((len(keys), 3, 3))
+    for k, key in enumerate(keys):
+        pose = values.atPose2(key)
+        poses[k] = pose.x(), pose.y(), pose.theta()
+        covariances[k] = covariance_of(key)
+    return poses, se2.rotate_covariance(covariances, poses[:, 2])
+
+
+def points_in_world(values: gtsam.Values, keys: list[int], covariance_of: Callable):
+    """Positions (n, 2) of these keys, and their covariances (n, 2, 2)."""
+    points, covariances = np.zeros((len(keys), 2)), np.zeros((len(keys), 2, 2))
+    for k, key in enumerate(keys):
+        points[k] = values.atPoint2(key)
+        covariances[k] = covariance_of(key)
+    return points, covariances

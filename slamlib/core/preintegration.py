@@ -1,0 +1,68 @@
+"""Odometry between the poses that are variables of the graph, as it depends on the wheels.
+
+The increment Delta from one frame to the next accumulates all encoder steps between them. It is
+linear in the wheel parameters w = [R_R, R_L, b] about the value w_0 of linearisation,
+
+    Delta(w) = Delta(w_0) + dDelta/dw (w - w_0),
+
+because the errors of the wheels are the same in every step (preintegration with calibration
+parameters: Forster, Carlone, Dellaert and Scaramuzza, IEEE T-RO 33(1), 2017).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from slamlib.core import increments, se2
+from slamlib.core.records import Dataset
+from slamlib.core.vehicle import Vehicle
+
+MINIMUM_SIGMA = 1e-5         # m, standard deviation of an increment's end along x and y
+
+
+@dataclass(frozen=True)
+class OdometryIncrements:
+    """Increments between f consecutive frames, for every value of the slip."""
+
+    frame: np.ndarray        # (f,) encoder poses from 0, ascending
+    model: str               # of a step, "arc" or "euler"
+    stated: np.ndarray       # (3,) m, wheel parameters as stated, to which the covariances belong
+    wheel: np.ndarray        # (3,) m, those of linearisation
+    increment: np.ndarray    # (f-1, 3) Delta(wheel): m, m, rad
+    J_wheel: np.ndarray      # (f-1, 3, 3) dDelta/dwheel, per m
+    quantization: np.ndarray     # (f-1, 3, 3) covariance without slip, in the axes of the end
+    slipping: np.ndarray     # (f-1, 3, 3) covariance of slip 1 sqrt(m), in the same axes
+    in_counts: bool = True   # whether errors are scaled to the stated wheels: with known slip
+
+    def covariance(self, slip: float) -> np.ndarray:
+        """Q (f-1, 3, 3) for a slip in sqrt(m)."""
+        return self.quantization + slip**2 * self.slipping
+
+
+def preintegrate(dataset: Dataset, frame: np.ndarray, model: str = "arc",
+                 wheel: np.ndarray | None = None) -> OdometryIncrements:
+    """The OdometryIncrements between frames (f,), linearised at `wheel` (3,) m, None if stated.
+
+    `model` is "arc" or "euler".
+    """
+    stated = dataset.vehicle
+    vehicle = stated if wheel is None else stated.with_wheel(wheel)
+    start, end = frame[:-1], frame[1:]
+    increment, J_wheel = increments.between_poses(dataset.ticks, vehicle, start, end, model)
+    quantization, slipping = odometry_noise(dataset.ticks, stated, start, end)
+    return OdometryIncrements(
+        frame=frame, model=model, stated=stated.wheel, wheel=vehicle.wheel,
+        increment=increment, J_wheel=J_wheel,
+        quantization=se2.rotate_covariance(quantization, -increment[:, 2]),
+        slipping=se2.rotate_covariance(slipping, -increment[:, 2]))
+
+
+def odometry_noise(ticks: np.ndarray, vehicle: Vehicle, start: np.ndarray,
+                   end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Quantization and slipping (m, 3, 3) by `increments.noise_in_drive`, with MINIMUM_SIGMA added.
+
+    The graph needs the inverse of Q, but a vehicle that stands still has no lateral noise.
+    """
+    quantization, slipping = increments.noise_in_drive(ticks, vehicle, start, end)
+    quantization[:, [0, 1], [0, 1]] += MINIMUM_SIGMA**2
+    return quantization, slipping

@@ -1,0 +1,457 @@
+"""The factor graph in GTSAM: its factors, its solution, and factors of one's own."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from gtsam.symbol_shorthand import A, L, P, W, X
+from numeric import aruco, as_points, known_noise, uwb, vehicle
+
+from slamlib import (
+    build_graph,
+    count_everything,
+    dead_reckoning,
+    estimate,
+    initial_values,
+    solve_graph,
+)
+from slamlib.core import graph as core_graph
+from slamlib.core import graph_solution, se2
+from slamlib.core.errors import DatasetError
+from slamlib.core.evaluation import anees, ate, nees_band
+from slamlib.core.kernels import KERNELS, ONE_SIDED
+from slamlib.core.preintegration import preintegrate
+from slamlib.robust import solution
+from slamlib.robust.calibration import ENTRIES, WHEELS
+from slamlib.robust.factors import odometry_error, preintegrate_odometry
+from slamlib.robust.initialization import odometry_state
+from slamlib.robust.linear import NormalEquations, build_problem
+from slamlib.robust.measurements import Accepted, AcceptedMeasurements, Noise, measure
+from slamlib.robust.solution_doubts import solution_doubts
+from slamlib.studies.simulation import simulate
+
+SIGMA = gtsam.noiseModel.Isotropic.Sigma
+
+
+@pytest.fixture(scope="module")
+def drive():
+    dataset, truth = simulate("short", seed=3)
+    return dataset.first(700), replace(truth, poses=truth.poses[:700])
+
+
+def plain(dataset, **options):
+    decisions = count_everything(dataset, **options)
+    return build_graph(decisions), initial_values(dataset, decisions)
+
+
+# Factors.
+
+
+def test_odometry_factors_have_the_derivatives_of_their_errors(drive):
+    """Central differences on all of their variables, far from the optimum."""
+    decisions = count_everything(drive[0])
+    rng = np.random.default_rng(0)
+    sigma = 100 * decisions.sigma_wheel
+    for k in range(0, 30, 5):
+        error = core_graph.odometry_error(decisions.odometry, k, sigma)
+        factor = gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(3), [X(0), X(1), W(0)], error)
+        values = gtsam.Values()
+        values.insert(X(0), gtsam.Pose2(*rng.normal(size=3)))
+        values.insert(X(1), gtsam.Pose2(*rng.normal(size=3)))
+        values.insert(W(0), rng.normal(size=3))
+        derivatives, _ = factor.linearize(values).jacobian()
+        for column in range(9):
+            ends = []
+            for step in (1e-6, -1e-6):
+                moved = gtsam.VectorValues()
+                off = step * (np.arange(9) == column)
+                for i, key in enumerate((X(0), X(1), W(0))):
+                    moved.insert(key, off[3 * i:3 * i + 3])
+                ends.append(error(factor, values.retract(moved), None))
+            np.testing.assert_allclose(
+                derivatives[:, column], (ends[0] - ends[1]) / 2e-6, atol=1e-7)
+
+
+def test_odometry_factors_are_gtsams_between_factors_for_the_stated_wheels(drive):
+    increments = count_everything(drive[0]).odometry
+    values, unit = gtsam.Values(), gtsam.noiseModel.Unit.Create(3)
+    for key, pose in ((X(0), (0.3, 0.1, 0.2)), (X(1), (0.5, -0.1, 3.0))):
+        values.insert(key, gtsam.Pose2(*pose))
+    values.insert(W(0), np.zeros(3))
+    error = core_graph.odometry_error(increments, 4, np.full(3, 1e-4))
+    own = gtsam.CustomFactor(unit, [X(0), X(1), W(0)], error)
+    native = gtsam.BetweenFactorPose2(X(0), X(1), gtsam.Pose2(*increments.increment[4]), unit)
+    J, b = own.linearize(values).jacobian()
+    expected_J, expected_b = native.linearize(values).jacobian()
+    np.testing.assert_allclose(J[:, :6], expected_J, atol=1e-9)
+    np.testing.assert_allclose(b, expected_b, atol=1e-9)
+
+
+@pytest.mark.parametrize("share", [1.0, 0.25])
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_a_residual_of_one_sigma_costs_its_share_of_the_loss(kernel, share):
+    """One half without a kernel. The kernel sees the residual in the stated sigma."""
+    for sign in (1, -1):
+        model = core_graph.noise_model(np.array([[0.3**2]]), kernel, share)
+        factor = gtsam.RangeFactor2D(X(0), A(0), 2.0 + sign * 0.3, model)
+        values = gtsam.Values()
+        values.insert(X(0), gtsam.Pose2())
+        values.insert(A(0), np.array([2.0, 0.0]))
+        loss = 0.5 if KERNELS[kernel] is None else KERNELS[kernel].loss(float(sign))
+        assert np.isclose(factor.error(values), share * loss, rtol=1e-9)
+
+
+def test_a_sighting_off_by_one_sigma_along_each_axis_of_the_vehicle_costs_one_half():
+    """The file's covariance is in the axes of the vehicle, GTSAM's error in those of the marker."""
+    dataset = simulate("short", seed=3)[0].first(30)
+    one = dataset.aruco.select(np.arange(1))
+    C = np.diag([0.1, 0.02, 0.05])**2
+    for axis in range(3):
+        z = np.array([[0.5, 0.3, 2.0]])
+        seen = replace(one, pose=np.zeros(1, int), marker=np.array([7]), marker_in_vehicle=z,
+                       covariance=C[None])
+        decisions = count_everything(replace(dataset, aruco=seen, uwb=None), "quadratic")
+        graph = gtsam.NonlinearFactorGraph()
+        core_graph.add_sightings(graph, decisions)
+        values = gtsam.Values()
+        values.insert(X(0), gtsam.Pose2())
+        off = 1e-4 * np.sqrt(np.diag(C)) * (np.arange(3) == axis)     # small: log is not linear
+        values.insert(L(7), gtsam.Pose2(*(z[0] + off)))
+        assert np.isclose(graph.error(values), 0.5e-8, rtol=1e-3)
+
+
+GROUPS = [(), ("camera-offset",), ("marker-size", "time-offset"), ("range-offset", "tag-offset"),
+          tuple({entry.group for entry in ENTRIES} | {"antenna-offsets"})]
+
+
+@pytest.mark.parametrize("groups", GROUPS, ids=len)
+@pytest.mark.parametrize("kernel", ["asymmetric Tukey", "Cauchy"])
+def test_the_graph_is_the_one_by_which_the_engine_decides(groups, kernel):
+    """Error, information and gradient, for kernels, shares, noise, jumps and any calibration."""
+    dataset = vehicle(kernel=kernel)(simulate("short", seed=4, late_ranges=0.2)[0].first(500))
+    rng, m = np.random.default_rng(1), measure(dataset)
+    state = odometry_state(m, "arc")
+    sigma = m.calibration.sigma_without(groups)
+    off = 2e-3 * rng.normal(size=state.poses.shape)
+    off[0] = 0                            # the engine's prior of pose 1 has the derivative 1
+    state = replace(
+        state, poses=state.poses + off,
+        c=state.c + 0.05 * sigma * rng.normal(size=len(sigma)))
+    of_sightings = None if kernel in ONE_SIDED else KERNELS[kernel]
+    accepted = AcceptedMeasurements(*(
+        Accepted(weight=(rng.uniform(size=count) < 0.9) * 1.0,
+                 share=rng.uniform(0.2, 1, count), kernel=by, bias=bias)
+        for count, by, bias in ((len(m.marker_row), of_sightings, 0.0),
+                                (len(m.ranges.row), KERNELS[kernel], ONE_SIDED.get(kernel, 0.0)))))
+    problem = replace(
+        build_problem(m, "arc", Noise(2e-3, 1.5, 0.7)), sigma=sigma, accepted=accepted,
+        odometry=replace(preintegrate_odometry(m, "arc", state.c[WHEELS]), in_counts=True))
+    equations = NormalEquations(problem, state)
+    graph, values = solution.graph_and_values(problem, state)
+    assert np.isclose(graph.error(values), equations.error, rtol=1e-9)
+    data, border, *_ = equations.sums(problem.noise)
+    n, rows = len(m.structure.diagonal), m.structure.unknowns
+    whole = np.block([[m.structure.matrix(data).toarray(), border[:n, :-1]], [border[:, :-1].T]])
+    rows = np.append(rows, np.arange(n, len(whole)))
+    ordering = gtsam.Ordering()
+    calibration = [key for key, _ in solution.CALIBRATION_KEYS if values.exists(key)]
+    for key in solution.variable_keys(problem) + calibration:
+        ordering.push_back(key)
+    information, gradient = graph.linearize(values).hessian(ordering)
+    expected = whole[np.ix_(rows, rows)]
+    unit = 1 / np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(
+        unit[:, None] * information * unit, unit[:, None] * expected * unit,
+        atol=5e-6)                        # of small angles GTSAM's logarithm is rounded
+    np.testing.assert_allclose(
+        -gradient * unit, border[rows, -1] * unit, atol=1e-6 * np.abs(gradient * unit).max())
+
+
+def test_jumps_stand_in_the_increments(drive):
+    """The engine's increments with a jump are those that the graph is made of."""
+    jumped = estimate(known_noise(drive[0].first(400), 1e-3))
+    odometry = jumped.fit.problem.odometry
+    expected = preintegrate(drive[0].first(400), odometry.frame, odometry.model, odometry.wheel)
+    np.testing.assert_array_equal(odometry.increment, expected.increment)
+    e, *_ = odometry_error(odometry, jumped.fit.state.poses, jumped.fit.state.c[WHEELS])
+    assert np.abs(e).max() < 0.05
+
+
+# The plain solver.
+
+
+def test_without_noise_the_plain_solver_finds_the_truth():
+    """The path that the counts say, and markers and antennas exactly as seen from there."""
+    dataset, truth = simulate("short", seed=5)
+    dataset = dataset.first(400)
+    poses = dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")
+    markers = truth.marker_in_world[np.searchsorted(truth.marker, dataset.aruco.marker)]
+    antennas = truth.antenna_in_world[np.searchsorted(truth.antenna, dataset.uwb.antenna)]
+    seen = se2.between(poses[dataset.aruco.pose], markers)
+    distance = np.hypot(*(antennas - poses[dataset.uwb.pose, :2]).T)
+    exact = uwb(aruco(dataset, marker_in_vehicle=seen), range=distance)
+    guess = replace(dataset.antenna_guess, position=truth.antenna_in_world)   # its prior is exact
+    found = solve_graph(*plain(replace(exact, antenna_guess=guess)))
+    assert found.converged and found.error < 1e-9
+    np.testing.assert_allclose(found.poses[:, :2], poses[found.pose, :2], atol=1e-9)
+    mapped = np.isin(truth.marker, found.marker)
+    np.testing.assert_allclose(
+        found.marker_in_world[:, :2], truth.marker_in_world[mapped, :2], atol=1e-9)
+    np.testing.assert_allclose(found.antenna_in_world, truth.antenna_in_world, atol=1e-9)
+
+
+def test_the_plain_solver_is_consistent():
+    """Right slip, no wrong label: mean NEES of eight drives in the band fixed beforehand."""
+    values = []
+    for seed in range(8):
+        dataset, truth = simulate("short", seed=seed)
+        found = solve_graph(*plain(dataset.first(1000)))
+        assert found.converged
+        values.append(anees(found.poses, found.covariances, truth.poses[found.pose]))
+    low, high = nees_band(8)
+    assert low < np.mean(values) < high
+
+
+def test_points_are_mapped_as_positions(drive):
+    points = np.isin(drive[0].aruco.marker, drive[0].aruco.marker[:3])
+    dataset = replace(drive[0], aruco=as_points(drive[0].aruco, points))
+    graph, values = plain(dataset)
+    found = solve_graph(graph, values)
+    assert values.exists(P(int(drive[0].aruco.marker[0])))
+    is_point = np.isnan(found.marker_in_world[:, 2])
+    assert set(found.marker[is_point]) == set(drive[0].aruco.marker[points])
+    np.testing.assert_allclose(
+        found.marker_in_world[:, :2],
+        drive[1].marker_in_world[np.isin(drive[1].marker, found.marker), :2], atol=0.05)
+
+
+def test_what_is_not_determined_is_told_with_a_variable(drive):
+    graph, values = plain(drive[0].first(100))
+    graph.add(gtsam.PriorFactorPoint2(A(777), np.zeros(2), SIGMA(2, 1.0)))
+    graph.add(gtsam.RangeFactor2D(X(99), A(778), 1.0, SIGMA(1, 1.0)))
+    values.insert(A(777), np.zeros(2))
+    values.insert(A(778), np.ones(2))
+    with pytest.raises(DatasetError, match="determine every pose and landmark.*near a778$"):
+        solve_graph(graph, values)
+
+
+def test_where_cholesky_fails_qr_gives_the_same_solution(drive, monkeypatch):
+    graph, values = plain(drive[0].first(200))
+    expected, tried = solve_graph(graph, values), []
+
+    class Failing:
+        """A linear graph whose Cholesky decomposition fails."""
+
+        def __init__(self, linear):
+            self.linear = linear
+
+        def eliminateMultifrontal(self, *by_qr):           # noqa: N802, as GTSAM calls it
+            tried.append(by_qr)
+            if not by_qr:
+                raise RuntimeError("Indeterminate linear system")
+            return self.linear.eliminateMultifrontal(*by_qr)
+
+    ordering = gtsam.Ordering.ColamdGaussianFactorGraph
+    eliminated = graph_solution.eliminated
+    monkeypatch.setattr(graph_solution, "eliminated", lambda linear: eliminated(Failing(linear)))
+    monkeypatch.setattr(graph_solution.gtsam.Ordering, "ColamdGaussianFactorGraph", staticmethod(
+        lambda failing: ordering(failing.linear)))
+    found = solve_graph(graph, values)
+    assert tried and tried[1]
+    np.testing.assert_allclose(found.poses, expected.poses, atol=1e-8)
+
+
+# What is handed in.
+
+
+def test_what_is_handed_in_is_gtsams_from_problem_1s_odometry(drive):
+    """Several steps; poses, maps and covariances are its values and marginals, and the engine's."""
+    found = estimate(known_noise(drive[0], 1e-3))
+    assert found.gtsam.start == solution.FROM_ODOMETRY and 2 <= found.gtsam.steps <= 10
+    assert found.converged and max(found.agreement) < 1e-3
+    again = solve_graph(*found.graph())
+    frames = again.pose
+    np.testing.assert_allclose(found.poses[frames, :2], again.poses[:, :2], atol=1e-5)
+    for C, expected in ((found.covariances[frames], again.covariances),
+                        (found.marker_covariance, again.marker_covariance)):
+        np.testing.assert_allclose(C, expected, rtol=1e-3, atol=1e-3 * expected.max())
+    np.testing.assert_array_equal(found.marker, again.marker)
+    sure = ~np.isin(found.antenna, [*found.doubts])
+    np.testing.assert_allclose(
+        found.antenna_covariance[sure], again.antenna_covariance[sure], rtol=1e-3, atol=1e-7)
+
+
+def test_from_odometry_alone_a_wrong_minimum_is_left_for_the_engines_solution(drive, monkeypatch):
+    """Of two minima the one of smaller error is handed in."""
+    dataset = known_noise(drive[0], 1e-3)
+    expected = estimate(dataset)
+    start = solution.odometry_state
+
+    def astray(measurements, model):
+        state = start(measurements, model)
+        return replace(state, antennas=state.antennas + [40.0, -30.0])
+
+    monkeypatch.setattr(solution, "odometry_state", astray)
+    found = estimate(dataset)
+    assert found.gtsam.start == solution.FROM_ENGINE
+    np.testing.assert_allclose(found.antenna_in_world, expected.antenna_in_world, atol=1e-3)
+
+
+def test_the_average_over_the_slip_is_that_of_the_engine():
+    """A short drive, whose slip is uncertain: five solutions and their covariances."""
+    found = estimate(simulate("short", seed=8)[0].without("uwb").first(600))
+    assert len(found.fit.posterior.points) > 1
+    assert max(found.agreement) < 1e-3
+
+
+@pytest.mark.parametrize("change", [
+    {"camera_x": 0.1, "sigma_camera_x": 0.05, "sigma_camera_turn": 0.02},
+    {"tag_x": 0.1, "sigma_range_scale": 0.01}, {"sighting_lag": 2.0},
+    {"antenna_height": 1.0, "sigma_antenna_height": 0.2, "range_offset": 0.05}], ids=str)
+def test_with_a_calibration_that_is_stated_or_unknown_both_agree(drive, change):
+    found = estimate(vehicle(slip=1e-3, **change)(drive[0]))
+    assert max(found.agreement) < 0.01
+
+
+def test_a_disagreement_of_engine_and_gtsam_is_a_doubt(drive):
+    found = estimate(known_noise(drive[0].first(200), 1e-3))
+    assert "agreement" not in {doubt.what for doubt in solution_doubts(found)}
+    doubts = solution_doubts(replace(found, agreement=(0.3, 0.02)))
+    sentence, = (doubt.sentence for doubt in doubts if doubt.what == "agreement")
+    assert "0.3 standard deviations" in sentence and "2%" in sentence
+
+
+def test_a_previous_result_of_another_drive_is_told(drive):
+    """Shorter, or of equal length: by its counts."""
+    dataset = known_noise(drive[0].first(300), 1e-3)
+    other = known_noise(simulate("short", seed=9)[0].first(300), 1e-3)
+    for before in (dataset.first(200), other):
+        with pytest.raises(DatasetError, match="estimate: expected a result of the same drive"):
+            estimate(dataset, previous=estimate(before.without("uwb")))
+    with pytest.raises(DatasetError, match="estimate: expected a SlamResult for previous"):
+        estimate(dataset, previous="problem3")
+
+
+# Factors of one's own.
+
+
+@pytest.fixture(scope="module")
+def solved(drive):
+    """A drive without ranges, with two poses that are no frames as variables."""
+    return estimate(known_noise(drive[0].without("uwb"), 1e-3), poses=[33, 471])
+
+
+def test_poses_between_measurements_are_variables_where_they_are_asked_for(drive, solved):
+    graph, values = solved.graph()
+    assert values.exists(X(33)) and values.exists(X(471)) and not values.exists(X(34))
+    again = solve_graph(graph, values)
+    np.testing.assert_allclose(again.poses[again.pose == 33], solved.poses[[33]], atol=1e-5)
+    joint = gtsam.Marginals(graph, again.values).jointMarginalCovariance([X(33), X(471)])
+    assert np.linalg.eigvalsh(joint.fullMatrix()).min() > 0
+    for pose in (-1, 700, 2.5):
+        with pytest.raises(DatasetError, match="estimate: expected rows from 0 to 699 for poses"):
+            estimate(drive[0], poses=[pose])
+
+
+def test_a_loop_closure_between_distant_poses_counts(drive, solved):
+    """A lidar that measures the motion from pose 34 to 472 to a millimetre."""
+    graph, values = solved.graph()
+    truth = drive[1].poses
+    motion = se2.between(truth[33], truth[471])
+    before = solve_graph(graph, values)
+    graph.add(gtsam.BetweenFactorPose2(X(33), X(471), gtsam.Pose2(*motion), SIGMA(3, 1e-4)))
+    after = solve_graph(graph, values)
+
+    def error(found):
+        i, k = np.searchsorted(found.pose, [33, 471])
+        return np.abs(se2.between(found.poses[i], found.poses[k]) - motion).max()
+
+    assert error(after) < 2e-4 < error(before)
+    assert np.trace(after.covariances[-1]) < np.trace(before.covariances[-1])
+
+
+def gps(truth, sigma=0.05, every=100, moved=lambda place: place, seed=0):
+    rng = np.random.default_rng(seed)
+    for i in range(every, len(truth.poses), every):
+        yield i, moved(truth.poses[i, :2] + sigma * rng.normal(size=2))
+
+
+def test_a_gps_in_utm_has_its_datum_as_a_variable(drive, solved):
+    """Eastings of half a million metres; the pose of the world in UTM is unknown."""
+    datum = np.array([432_100.0, 5_123_400.0, 0.7])
+    graph, values = solved.graph()
+    for i, place in gps(drive[1], moved=lambda place: se2.compose(datum, [*place, 0])[:2]):
+        graph.add(gps_factor(i, place, 0.05))
+        values.insert(X(i), values.atPose2(X(i))) if not values.exists(X(i)) else None
+    values.insert(gtsam.symbol("d", 0), gtsam.Pose2(432_090.0, 5_123_390.0, 0.0))
+    found = solve_graph(graph, values)
+    assert found.converged and found.steps < 15
+    pose = found.values.atPose2(gtsam.symbol("d", 0))
+    np.testing.assert_allclose([pose.x(), pose.y(), pose.theta()], datum, atol=0.1)
+    assert found.marginals.covariance(gtsam.symbol("d", 0)).shape == (3, 3)
+
+
+def gps_factor(i, place, sigma):
+    """The place of pose i in UTM, with the pose of the world in UTM as the variable d0."""
+    def error(factor, values, jacobians):
+        world, pose = (values.atPose2(key) for key in factor.keys())
+        by_world, by_pose = np.zeros((2, 3, 3)).transpose(0, 2, 1)
+        there = world.compose(pose, by_world, by_pose)
+        turned = there.rotation().matrix()
+        if jacobians is not None:
+            jacobians[0] = turned @ by_world[:2]
+            jacobians[1] = turned @ by_pose[:2]
+        return np.array([there.x(), there.y()]) - place
+
+    return gtsam.CustomFactor(SIGMA(2, sigma), [gtsam.symbol("d", 0), X(i)], error)
+
+
+@pytest.mark.parametrize("far", [10.0, 500.0])
+def test_a_gps_that_contradicts_is_told_and_not_converged(drive, solved, far, caplog):
+    """One place is wrong, then all: the sentence names the factor; a robust one may be wrong."""
+    for only, named in (({300}, True), (set(range(700)), True)):
+        graph, values = solved.graph()
+        count = graph.size()
+        for i, place in gps(drive[1]):
+            off = np.array([far, 0]) if i in only else 0.0
+            graph.add(gtsam.PoseTranslationPrior2D(X(i), place + off, SIGMA(2, 0.05)))
+        found = solve_graph(graph, values)
+        assert not found.converged and named
+        number = int(found.contradiction.split(",")[0].removeprefix("factor "))
+        assert number >= count or far > 100
+        assert found.contradiction in caplog.text
+    robust = gtsam.noiseModel.Robust.Create(
+        gtsam.noiseModel.mEstimator.Cauchy.Create(1.0), SIGMA(2, 0.05))
+    graph, values = solved.graph()
+    for i, place in gps(drive[1]):
+        off = np.array([far, 0]) * (i == 300)
+        graph.add(gtsam.PoseTranslationPrior2D(X(i), place + off, robust))
+    found = solve_graph(graph, values)
+    assert found.converged and not found.contradiction
+    assert ate(found.poses, drive[1].poses[found.pose]) < 0.03
+
+
+def test_the_graph_is_one_for_gtsams_own_tools(drive, solved, tmp_path):
+    """Edges in a g2o file; an online session with iSAM2."""
+    graph, values = solved.graph()
+    gtsam.writeG2o(graph, values, str(tmp_path / "graph.g2o"))
+    edges = (tmp_path / "graph.g2o").read_text().count("EDGE_SE2")
+    assert edges == np.count_nonzero(~solved.rejected)
+    online = gtsam.ISAM2()
+    online.update(graph, values)
+    estimated = online.calculateEstimate()
+    expected = solve_graph(graph, values)
+    for pose, place in zip(expected.pose.tolist(), expected.poses):
+        found = estimated.atPose2(X(pose))
+        np.testing.assert_allclose([found.x(), found.y()], place[:2], atol=1e-4)
+
+
+def test_negative_ids_are_those_of_the_files(drive):
+    dataset = drive[0].without("uwb").first(200)
+    renamed = aruco(dataset, marker=-dataset.aruco.marker)
+    found = solve_graph(*plain(renamed))
+    assert (np.diff(found.marker) > 0).all()
+    assert set(found.marker) == set(renamed.aruco.marker)
+
+
