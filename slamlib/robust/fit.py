@@ -39,6 +39,7 @@ MEDIAN_CHI2 = {3: 2.366, 2: 1.386, 1: 0.455}         # medians by degrees of fre
 
 MAX_ROUNDS = 6               # number of rounds of wheels, noise and accepted measurements
 NEGLIGIBLE_MOVE = 3e-3       # relative, of a wheel parameter since odometry was linearised
+SETTLED_MOVE = 1e-4          # the same, at the solution that is handed in
 NEGLIGIBLE_CHANGE = 1e-3     # share of the measurements whose weight may change at the same noise
 
 
@@ -178,6 +179,23 @@ def refine(problem, state, accept=accepted_measurements):
     _, log_evidence = laplace_approximation(optimum.equations, problem.noise)
     return Fit(problem=problem, state=optimum.state, log_evidence=log_evidence, posterior=posterior,
                converged=optimum.converged)
+
+
+def settled(fit):
+    """The Fit with odometry linearised at its own wheels, for the same measurements and noise.
+
+    Rounds that end by their number leave it elsewhere, where the increments have other scales.
+    """
+    problem, state, converged = fit.problem, fit.state, fit.converged
+    for _ in range(MAX_ROUNDS):
+        if np.abs(state.c[WHEELS] / problem.odometry.wheel - 1).max() < SETTLED_MOVE:
+            break
+        odometry = preintegrate_odometry(
+            problem.measurements, problem.odometry.model, state.c[WHEELS])
+        problem = replace(problem, odometry=replace(odometry, in_counts=True))
+        optimum = optimize(problem, state)
+        state, converged = optimum.state, optimum.converged
+    return replace(fit, problem=problem, state=state, converged=converged)
 
 
 def _with_shares(problem, state, posterior, shares, accept):

@@ -13,7 +13,7 @@ from slamlib.core.odometry import MODELS
 from slamlib.core.records import Dataset
 from slamlib.core.vehicle import changed
 from slamlib.robust.choices import better_model, calibrated, most_consistent
-from slamlib.robust.fit import CAUCHY_SCALES, narrow_kernels, refine
+from slamlib.robust.fit import CAUCHY_SCALES, narrow_kernels, refine, settled
 from slamlib.robust.initialization import initial_state, state_from_poses
 from slamlib.robust.jumps import NO_JUMPS
 from slamlib.robust.linear import build_problem
@@ -82,6 +82,7 @@ def estimate(dataset, slip=None, model=None, previous=None, *, marker_noise_fact
         fit, places = solve(previous.jumps, previous.places), previous.places
     else:
         fit, places = most_consistent(dataset, solve)
+    fit = settled(fit)
     return replace(slam_result(fit, solve_by_gtsam(fit)), places=places)              # 7
 
 
