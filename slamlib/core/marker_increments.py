@@ -77,18 +77,6 @@ class _Common:
         squared = self.linearized(increment).squared
         return np.bincount(self.pair, np.log1p(squared / GATE), self.count)
 
-@dataclass(frozen=True)
-class _Iteration:
-    """A Gauss-Newton iteration of increments."""
-
-    increment: np.ndarray    # (l, 3) after it
-    step: np.ndarray         # (l, 3); NaN where undetermined
-    covariance: np.ndarray   # (l, 3, 3) C_Delta
-    gain: np.ndarray         # (p, 3, 3) J^T W^-1, weighted
-    weight: np.ndarray       # (p,)
-    J_second: np.ndarray     # (p, 3, 3)
-
-
 def consecutive_increments(sightings: Sightings) -> MarkerIncrements:
     """MarkerIncrements from every frame of Sightings to the next, usable if plausibly slow.
 
@@ -99,10 +87,10 @@ def consecutive_increments(sightings: Sightings) -> MarkerIncrements:
     and the next one. Speeds are in m and rad per encoder step, the difference of `sightings.frame`.
     """
     steps = np.diff(sightings.frame)[:, None]
-    pair, first, second = common_sightings(sightings.row, sightings.marker)
-    found = robust_increments(sightings.z, sightings.C, pair, first, second, len(steps))
-    markers = np.bincount(pair[found.accepted], minlength=len(steps))
-    redundant = found.usable & (markers > 1)
+    common = common_sightings(sightings.row, sightings.marker)
+    found = robust_increments(sightings.z, sightings.C, *common, len(steps))
+    agreeing = np.bincount(found.pair, found.accepted, len(steps))
+    redundant = found.usable & (agreeing > 1)
     if not redundant.any():
         return found
     velocity = found.increment / steps
@@ -112,7 +100,7 @@ def consecutive_increments(sightings: Sightings) -> MarkerIncrements:
     sigma = distance_and_turn_sigmas(found.covariance) / steps
     fast = (speed > SPEED_RATIO * usual + 3 * sigma).any(axis=1)
     usable = found.usable & ~(fast & _differs_from_neighbours(velocity))
-    return replace(found, usable=usable, accepted=found.accepted & usable[pair])
+    return replace(found, usable=usable, accepted=found.accepted & usable[found.pair])
 
 
 def _differs_from_neighbours(velocity):
@@ -156,41 +144,39 @@ def robust_increments(z: np.ndarray, C: np.ndarray, pair: np.ndarray, first: np.
     `pair`, `first` and `second` (p,) those of MarkerIncrements, sorted by pair.
     """
     common = _Common(pair, z[first], C[first], z[second], C[second], count)
-    start = _best_hypothesis(common)
-    robust = _gauss_newton(common, start, _cauchy_weight, CAUCHY_ITERATIONS)
-    last = _gauss_newton(common, robust.increment, _within_gate, GATE_ITERATIONS)
-    usable = last.covariance[:, 2, 2] < MAX_HEADING_SIGMA**2
-    wrapped = se2.difference(last.increment, np.zeros(3))
-    D = last.covariance[pair] @ last.gain
+    increment = _best_hypothesis(common)
+    for weight_of, iterations in ((_cauchy_weight, CAUCHY_ITERATIONS),
+                                  (_gate_weight, GATE_ITERATIONS)):
+        for _ in range(iterations):
+            linear = common.linearized(increment)
+            weight = weight_of(linear.squared)
+            gain = linear.J_delta.mT @ linear.information * weight[:, None, None]
+            step, covariance = _solved(common, linear, gain)
+            increment = increment + step
+            if np.nanmax(np.abs(step), initial=0) <= INCREMENT_STEP_TOLERANCE:
+                break
+    increment[:, 2] = se2.wrap(increment[:, 2])
+    usable = covariance[:, 2, 2] < MAX_HEADING_SIGMA**2
+    D = covariance[pair] @ gain
     return MarkerIncrements(
-        pair=pair, first=first, second=second, accepted=(last.weight > 0) & usable[pair],
-        J_first=D, J_second=-D @ last.J_second, covariance=last.covariance, usable=usable,
-        increment=np.where(usable[:, None], wrapped, np.nan))
+        pair=pair, first=first, second=second, accepted=(weight > 0) & usable[pair],
+        J_first=D, J_second=-D @ linear.J_second, covariance=covariance, usable=usable,
+        increment=np.where(usable[:, None], increment, np.nan))
 
 
 def _cauchy_weight(squared):
     return 1 / (1 + squared / GATE)
 
 
-def _within_gate(squared):
-    return np.where(squared < GATE, 1.0, 0.0)
+def _gate_weight(squared):
+    return squared < GATE
 
 
-def _gauss_newton(common, increment, weight_of, iterations):
-    """The last _Iteration, of increments (l, 3) with weights by the squared distances."""
-    for _ in range(iterations):
-        last = _iteration(common, increment, weight_of)
-        increment = last.increment
-        if np.nanmax(np.abs(last.step), initial=0) <= INCREMENT_STEP_TOLERANCE:
-            break
-    return last
+def _solved(common, linear, gain):
+    """The step (l, 3) C_Delta sum_j J_j^T W_j^-1 r_j, and C_Delta; NaN where undetermined.
 
-
-def _iteration(common, increment, weight_of):
-    """The _Iteration from increments (l, 3)."""
-    linear = common.linearized(increment)
-    weight = weight_of(linear.squared)
-    gain = linear.J_delta.mT @ linear.information * weight[:, None, None]
+    `gain` (p, 3, 3) are the weighted J_j^T W_j^-1.
+    """
     terms = gain @ np.concatenate([linear.J_delta, linear.r[..., None]], axis=2)
     total = np.zeros((common.count, 3, 4))
     np.add.at(total, common.pair, terms)
@@ -198,8 +184,7 @@ def _iteration(common, increment, weight_of):
     determined = se2.regular(information)
     covariance = np.full_like(information, np.nan)
     covariance[determined] = np.linalg.inv(information[determined])
-    step = (covariance @ total[..., 3:])[..., 0]
-    return _Iteration(increment + step, step, covariance, gain, weight, linear.J_second)
+    return (covariance @ total[..., 3:])[..., 0], covariance
 
 
 def _best_hypothesis(common):
@@ -229,8 +214,9 @@ def _hypotheses(common):
     pair = common.pair[oriented]
     by_one = se2.compose(common.z1[oriented], se2.inverse(common.z2[oriented]))
     i, j = _two_of_each(common.pair, np.setdiff1d(common.pair, pair))
-    p, q = common.z1[:, :2], common.z2[:, :2]
-    by_two = _increment_of_two_points(p[i], p[j], q[i], q[j])
+    earlier = common.z1[:, :2]
+    later = common.z2[:, :2]
+    by_two = _increment_of_two_points(earlier[i], earlier[j], later[i], later[j])
     return np.append(pair, common.pair[i]), np.concatenate([by_one, by_two])
 
 
@@ -296,13 +282,12 @@ def returns(dataset: Dataset) -> Returns:
     frame = s.frame[::every]
     sighting = s.table()[::every]
     seen = sighting >= 0
-    ds, _, _, _ = odometry.steps(dataset.ticks, dataset.vehicle)
+    ds = odometry.steps(dataset.ticks, dataset.vehicle)[0]
     travelled = odometry.cumulative(np.abs(ds))
     earlier, later = _returning(seen, travelled[frame])
     pair, marker = np.nonzero(seen[earlier] & seen[later])
-    first = sighting[earlier[pair], marker]
-    second = sighting[later[pair], marker]
-    found = robust_increments(s.z, s.C, pair, first, second, len(later))
+    found = robust_increments(s.z, s.C, pair, sighting[earlier[pair], marker],
+                              sighting[later[pair], marker], len(later))
     agreeing = np.bincount(pair, found.accepted, len(later))
     ok = found.usable & (agreeing >= MIN_COMMON_MARKERS)
     return Returns(start=frame[earlier[ok]], end=frame[later[ok]], motion=found.increment[ok],

@@ -105,11 +105,10 @@ def moving_increments(dataset: Dataset) -> tuple[np.ndarray, np.ndarray, np.ndar
     path = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")[s.frame]
     span = _span(path)
     wheels = se2.between(path[:-span], path[span:])
-    pair, first, second = common_sightings(s.row, s.marker, span)
-    found = robust_increments(s.z, s.C, pair, first, second, len(wheels))
+    common = common_sightings(s.row, s.marker, span)
+    found = robust_increments(s.z, s.C, *common, len(wheels))
     mirror = np.diag([1.0, 1.0, -1.0])
-    mirrored = robust_increments(s.z @ mirror, mirror @ s.C @ mirror, pair, first, second,
-                                 len(wheels))
+    mirrored = robust_increments(s.z @ mirror, mirror @ s.C @ mirror, *common, len(wheels))
     sigma = distance_and_turn_sigmas(found.covariance)
     size = np.maximum(distance_and_turn(found.increment), distance_and_turn(wheels))
     moving = found.usable & (size > MIN_MOTION_SIGMAS * sigma).any(axis=1)
