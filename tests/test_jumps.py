@@ -122,9 +122,9 @@ def test_suspects_by_hand():
     """Of the pairs of each step only those at its two frames are asked, if there are any."""
     first, second = np.array([0, 1, 1, 2, 3, 3, 1]), np.array([1, 2, 2, 4, 5, 5, 3])
     squared = np.array([1.0, 99, 1, 99, 1, 1, 99])
-    suspects, rank = jumps._suspects(jumps._Pairs(first, second, squared, 5))
-    assert suspects.tolist() == [1, 2]
-    assert rank.tolist() == [-np.inf, -np.inf, -2, -1, 0]
+    pairs = jumps._Pairs(first, second, squared, 5)
+    assert jumps._suspects(pairs).tolist() == [1, 2]
+    assert jumps._rank(pairs).tolist() == [-np.inf, -np.inf, -2, -1, 0]
 
 
 @pytest.mark.parametrize("contradicted, dead", [
@@ -144,11 +144,9 @@ def test_where_no_marker_tells_a_jump_is_as_long_as_motions_are(breaks, dead, si
     drive = jumps._Drive.without_jumps(poses, TABLE_2.wheelbase)
     unknown = dict.fromkeys(dead, 2 * jumps._usual(drive)) | dict.fromkeys(
         breaks, jumps.UNKNOWN_SIGMA)
-    found, _ = jumps._bridged(sightings_by_frame(None), drive, [3], np.zeros(11), unknown)
-    if sigma is None:
-        assert not found
-    else:
-        jump, = found
+    jump, = jumps._bridged(sightings_by_frame(None), drive, [3], np.zeros(11), unknown)
+    assert jump.found == (sigma is not None)
+    if jump.found:
         np.testing.assert_allclose(jump.sigma, sigma, rtol=1e-2)
         np.testing.assert_allclose(jump.by_odometry, se2.between(poses[3], poses[4]))
         assert jump.step == 3 and (jump.increment == jump.by_odometry).all()

@@ -122,9 +122,9 @@ def common_sightings(row: np.ndarray, marker: np.ndarray, span: int = 1) -> tupl
 
     `row` and `marker` (s,) are frame and marker id of every sighting, sorted by both.
     """
-    markers, label = np.unique(marker, return_inverse=True)
-    key = row * len(markers) + label
-    later_key = (row + span) * len(markers) + label
+    label = np.unique(marker, return_inverse=True)[1]
+    key = row * len(marker) + label
+    later_key = (row + span) * len(marker) + label
     _, first, second = np.intersect1d(later_key, key, assume_unique=True, return_indices=True)
     return row[first], first, second
 
@@ -165,10 +165,12 @@ def robust_increments(z: np.ndarray, C: np.ndarray, pair: np.ndarray, first: np.
 
 
 def _cauchy_weight(squared):
+    """Weights (p,) of the Cauchy kernel, by squared Mahalanobis distances (p,)."""
     return 1 / (1 + squared / GATE)
 
 
 def _gate_weight(squared):
+    """True (p,) within the gate, by squared Mahalanobis distances (p,)."""
     return squared < GATE
 
 

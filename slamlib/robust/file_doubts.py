@@ -155,10 +155,10 @@ def _explanations(k, reverse):
                           "and at the signs of the counts)")
     mirrors = np.linalg.det(AXES[k]) < 0
     what = "camera-mirrored" if mirrors or reverse else "camera-turned"
-    x, y = AXES[k].T
-    theta = "-theta" if mirrors != reverse else "theta"
-    possible[what] = (f"sightings with [{_axis(x)}, {_axis(y)}, {theta}] in place of "
-                      "[x, y, theta] in ArucoReading.txt")
+    axes = [_axis(direction) for direction in AXES[k].T]
+    axes.append("-theta" if mirrors != reverse else "theta")
+    possible[what] = (f"sightings with [{', '.join(axes)}] in place of [x, y, theta] in "
+                      "ArucoReading.txt")
     return possible
 
 
@@ -213,9 +213,9 @@ def range_units(dataset: Dataset) -> Iterator[Doubt]:
         own = heard.select(heard.antenna == antenna)
         if len(own.range) >= MIN_RANGES_PER_ANTENNA:
             count += len(own.range)
-            low, middle, high = np.percentile(own.range, [25, 50, 75])
+            quartiles = np.percentile(own.range, [25, 75])
             distances = np.linalg.norm(path[own.pose] - guess, axis=1)
-            sizes.append([high - low, middle, np.median(distances)])
+            sizes.append([np.ptp(quartiles), np.median(own.range), np.median(distances)])
     if count < MIN_COUNT or not path.any():
         return
     spread, typical, distance = np.median(sizes, axis=0)

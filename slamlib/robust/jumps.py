@@ -188,15 +188,16 @@ def _found(ticks, s, drive):
     pairs = _compared(s, drive)
     scale = _covariance_scale(s, drive)
     pairs = replace(pairs, squared=pairs.squared / scale)
-    suspects, rank = _suspects(pairs)
+    suspects = _suspects(pairs)
+    rank = _rank(pairs)
     unknown = dict.fromkeys(_breaks(s, drive.poses, pairs), UNKNOWN_SIGMA)
     s = replace(s, C=scale * s.C)
-    found, contradicted = _bridged(s, drive, suspects, rank, unknown)
-    dead = _dead(ticks, s.frame, contradicted)
+    tried = _bridged(s, drive, suspects, rank, unknown)
+    dead = _dead(ticks, s.frame, [jump.step for jump in tried if jump.gain > MIN_GAIN])
     if len(dead):
         unknown = dict.fromkeys(dead, 2 * _usual(drive)) | unknown
-        found, _ = _bridged(s, drive, suspects, rank, unknown)
-    return found
+        tried = _bridged(s, drive, suspects, rank, unknown)
+    return [jump for jump in tried if jump.found]
 
 
 def _covariance_scale(s, drive):
@@ -209,8 +210,9 @@ def _covariance_scale(s, drive):
 def _usual(drive):
     """Motion (3,) of a step, m, m, rad, that few steps exceed."""
     moves = np.abs(se2.between(drive.poses[:-1], drive.poses[1:]))
-    x, _, turn = np.quantile(moves, USUAL, axis=0)
-    return np.maximum([x, x, turn], MIN_JUMP)
+    usual = np.quantile(moves, USUAL, axis=0)
+    usual[1] = usual[0]                                  # a jump may be to the side
+    return np.maximum(usual, MIN_JUMP)
 
 
 @dataclass(frozen=True)
@@ -242,6 +244,7 @@ class _Drive:
 
     @classmethod
     def without_jumps(cls, poses, wheelbase):
+        """The _Drive of poses (f, 3), with odometry's usual noise alone."""
         way = odometry.cumulative(np.hypot(*np.diff(poses[:, :2], axis=0).T))
         return cls(poses, way, np.zeros((len(poses) - 1, 2)), wheelbase)
 
@@ -287,7 +290,13 @@ class _Pairs:
 
     @property
     def span(self):
+        """Numbers (m,) of steps from the earlier to the later frame."""
         return self.second - self.first
+
+    @property
+    def wrong(self):
+        """True (m,) where the pair contradicts odometry."""
+        return self.squared > SUSPECT
 
     def over(self, chosen):
         """Numbers (f-1,) of the `chosen` pairs, a mask (m,), over each step."""
@@ -307,18 +316,22 @@ def _compared(s, drive):
 def _suspects(pairs):
     """Steps that half of the pairs of sightings contradict.
 
-    Only sightings at these two frames are asked, if there are any; else all pairs over it. Also the
-    rank (f-1,) of each step: those with such sightings come first, then those under most
-    contradicting pairs. A pair over a long way does not tell where on it a jump was.
+    Only sightings at these two frames are asked, if there are any; else all pairs over it.
     """
-    wrong = pairs.squared > SUSPECT
     close = pairs.span == 1
     all_close = pairs.over(close)
-    all_wrong = pairs.over(wrong)
-    asked = np.where(all_close, all_close, pairs.over(pairs.span > 0))
-    contradicting = np.where(all_close, pairs.over(close & wrong), all_wrong)
-    suspects = np.flatnonzero((contradicting > 0) & (2 * contradicting >= asked))
-    return suspects, np.where(all_close, -np.inf, -all_wrong)
+    asked = np.where(all_close, all_close, pairs.over(np.ones_like(close)))
+    wrong = np.where(all_close, pairs.over(close & pairs.wrong), pairs.over(pairs.wrong))
+    return np.flatnonzero((wrong > 0) & (2 * wrong >= asked))
+
+
+def _rank(pairs):
+    """Rank (f-1,) of each step: which of them is asked first for a jump.
+
+    Those with sightings at both frames come first, then those under most pairs that contradict
+    odometry. A pair over a long way does not tell where on it a jump was.
+    """
+    return np.where(pairs.over(pairs.span == 1), -np.inf, -pairs.over(pairs.wrong))
 
 
 def _breaks(s, poses, pairs):
@@ -386,45 +399,49 @@ class _Jump:
     motion: np.ndarray       # (3,) J
     variance: np.ndarray     # (2,) of J, m^2 and rad^2
     sigma: np.ndarray        # (3,) of J without these sightings
-    gain: float = 0.0        # by J instead of the identity
-    told: bool = False       # also without the pair of sightings that gains most
+    gain: float              # by J instead of the identity
+    found: bool              # so also without the pair of sightings that gains most
 
     @property
     def increment(self):
+        """J O, (3,), the increment by the sightings."""
         return se2.compose(self.motion, self.by_odometry)
 
 
 def _bridged(s, drive, suspects, rank, unknown):
-    """List of each _Jump, and list of the steps that any pair contradicts.
+    """List of the _Jump of each suspect, by their `rank` (f-1,), as if those before it were right.
 
-    Suspects are taken by their `rank` (f-1,). Steps in `unknown` are jumps even if the markers do
-    not tell how long they are; their standard deviations (3,) are then those in it.
+    Steps in `unknown` are jumps even if the markers do not tell how long they are; their standard
+    deviations (3,) are then those in it.
     """
     steps = np.union1d(suspects, list(unknown)).astype(int)
     steps = steps[np.argsort(rank[steps], kind="stable")]
     usual = _usual(drive)
     drive = drive.with_variance(steps, UNKNOWN_SIGMA[1:]**2)
-    found = []
-    contradicted = []
+    tried = []
     for i, k in enumerate(steps):
         if rank[k] > -np.inf:                    # all pairs that tell of it may be over others, too
-            drive = drive.with_variance(steps[i:], _variance(usual))
+            drive = drive.with_variance(steps[i:], _place_and_turn(usual**2))
         without = drive.with_variance(k, 0.0)
-        jump = _told(s, without, k, unknown.get(k, UNKNOWN_SIGMA))
-        if jump.gain > MIN_GAIN:
-            contradicted.append(k)
-        if jump.told or k in unknown:
-            found.append(jump)
+        jump = _tried(s, without, k, unknown.get(k))
+        tried.append(jump)
+        if jump.found:
             drive = without.with_jump(jump)
         elif jump.gain <= MIN_GAIN:              # else one pair, maybe a wrong label
             drive = without
-    return found, contradicted
+    return tried
 
 
-def _told(s, drive, step, unknown):
-    """The _Jump that sightings tell in a step; else none, with the sigma `unknown` (3,)."""
+def _tried(s, drive, step, unknown):
+    """The _Jump in a step by Sightings, which is found if they tell it.
+
+    Where they do not, the motion is that of odometry, with the sigma `unknown` (3,). The jump is
+    then found if this is given.
+    """
     move = drive.motions([step], [step + 1])
-    nothing = _Jump(step, move.mean[0], np.zeros(3), _variance(unknown), unknown)
+    sigma = UNKNOWN_SIGMA if unknown is None else unknown
+    untold = _Jump(step, move.mean[0], motion=np.zeros(3), variance=_place_and_turn(sigma**2),
+                   sigma=sigma, gain=0.0, found=unknown is not None)
     before, after = _around(s, step)
     seen = drive.seen_from(step, s, before)
     exact = replace(move, covariance=np.zeros((1, 3, 3)))
@@ -434,9 +451,9 @@ def _told(s, drive, step, unknown):
         np.concatenate([seen.mean, later.mean]),
         np.concatenate([seen.covariance, later.covariance]),
         np.zeros_like(first), first, first + len(first), 1)
-    x, y, heading = np.diagonal(found.covariance[0])
-    if not found.usable[0] or x + y > MAX_VARIANCE:
-        return nothing
+    variance = _place_and_turn(np.diagonal(found.covariance[0]))
+    if not found.usable[0] or variance[0] > MAX_VARIANCE:
+        return untold
 
     def cost(motion):
         expected = replace(move, mean=motion).then(later)
@@ -444,29 +461,27 @@ def _told(s, drive, step, unknown):
 
     motion = found.increment[0]
     gain = cost(np.zeros(3)) - cost(motion)
-    return replace(nothing, motion=motion, variance=[x + y, heading], sigma=_sigma_of(motion),
-                   gain=gain.sum(), told=gain.sum() - gain.max() > MIN_GAIN)
+    others = gain.sum() - gain.max()
+    return replace(untold, motion=motion, variance=variance, sigma=_sigma_of(motion),
+                   gain=gain.sum(), found=untold.found or others > MIN_GAIN)
 
 
-def _variance(sigma):
-    """Variances (2,) of place and turn, m^2 and rad^2."""
-    x, y, turn = sigma**2
-    return np.array([x + y, turn])
+def _place_and_turn(variance):
+    """Variances (2,) of place and turn, by those of x, y and heading (3,)."""
+    return np.array([variance[0] + variance[1], variance[2]])
 
 
 def _around(s, step):
-    """Rows of sightings before a step, and of others of the same markers after it, each (m,).
+    """Rows (2, m) of sightings before a step, and of others of the same markers after it.
 
     Of each marker the last PAIRS before it and the first ones after it; in all the NEAREST.
     """
     spans = (s.row[:-1] <= step) & (step < s.row[1:])
     last = np.flatnonzero(spans & (s.marker[:-1] == s.marker[1:]))
-    further = np.arange(PAIRS)[:, None]
-    before = (last - further).ravel()
-    after = (last + 1 + further).ravel()
-    exist = (before >= 0) & (after < len(s.row))
-    before, after = before[exist], after[exist]
-    same = s.marker[before] == s.marker[after]
-    before, after = before[same], after[same]
-    nearest = np.argsort(s.row[after] - s.row[before], kind="stable")[:NEAREST]
-    return before[nearest], after[nearest]
+    pairs = np.concatenate([[last - i, last + 1 + i] for i in range(PAIRS)], axis=1)
+    exists = (pairs[0] >= 0) & (pairs[1] < len(s.row))
+    pairs = pairs[:, exists]
+    same = s.marker[pairs[0]] == s.marker[pairs[1]]
+    pairs = pairs[:, same]
+    span = s.row[pairs[1]] - s.row[pairs[0]]
+    return pairs[:, np.argsort(span, kind="stable")[:NEAREST]]
