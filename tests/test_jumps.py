@@ -75,10 +75,11 @@ def test_each_jump_that_is_found_is_logged_with_its_numbers(caplog):
     with caplog.at_level(logging.INFO, "slamlib.robust.jumps"):
         jumps.find_jumps(seen(poses))
     record, = caplog.records
-    line, gain = record.message.split(", gain ")
+    line, gain, sigma = record.message.rsplit(", ", 2)
     assert line == ("jump between poses 4 and 5: markers and odometry differ by 0.500 m and "
                     "0.500 rad")
-    assert float(gain) > jumps.MIN_GAIN and record.levelno == logging.INFO
+    assert float(gain.removeprefix("gain ")) > jumps.MIN_GAIN and sigma == "sigma 0.5 m"
+    assert record.levelno == logging.INFO
     caplog.clear()
     with caplog.at_level(logging.INFO, "slamlib.robust.jumps"):
         jumps.find_jumps(seen(np.zeros((12, 3))))

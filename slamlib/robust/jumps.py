@@ -155,7 +155,8 @@ def find_jumps(dataset: Dataset) -> Jumps:
         start = s.frame[jump.step]
         end = s.frame[jump.step + 1]
         log.info("jump between poses %d and %d: markers and odometry differ by %.3f m and %.3f "
-                 "rad, gain %.1f", start + 1, end + 1, *distance_and_turn(jump.motion), jump.gain)
+                 "rad, gain %.1f, sigma %.1f m", start + 1, end + 1,
+                 *distance_and_turn(jump.motion), jump.gain, jump.sigma[0])
         jumps = jumps._with(start, end, jump.increment, jump.by_odometry, jump.sigma)
     return replace(jumps, chance=_chance(dataset.ticks)) if found else jumps
 
