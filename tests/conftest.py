@@ -27,7 +27,7 @@ ROOT = Path(__file__).parents[1]
 STUDY_SEEDS = "2"            # in pages that tests build: their claims are tested on more drives
 # The longest come first, and those that mostly wait beside those that start further processes.
 FIRST = ("test_pages", "test_concurrency", "test_lab", "test_slam", "test_flaws", "test_memory",
-         "test_uwb", "test_localization", "test_odometry_gate", "test_calibration", "test_docs",
+         "test_uwb", "test_localization", "test_jumps", "test_calibration", "test_docs",
          "test_properties", "test_numbers", "test_report", "test_studies", "test_library")
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 

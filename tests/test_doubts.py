@@ -226,11 +226,12 @@ def test_units_are_named_from_a_factor_of_five_on_and_odometry_if_most_disagrees
     """Standard deviations of 1 cm and 1 mrad: from five of them on, motion is compared."""
     doubts = list(files.wrong_sizes(moved_by(*markers) + [0, 0, 2 * np.pi], moved_by(*wheels),
                                     np.tile([1e-2, 1e-3], (20, 1)), np.arange(20) >= disagree))
-    assert [what for what, _ in doubts] == ["odometry" if disagree else "units"] * bool(said)
-    for _, sentence in doubts:
-        assert said in sentence
+    kinds = [doubt.what for doubt in doubts]
+    assert kinds == ["odometry" if disagree else "units"] * bool(said)
+    for doubt in doubts:
+        assert said in doubt.sentence
         assert ("moves by {:.4g} m and turns by {:.4g} rad by the markers, and by {:.4g} m and "
-                "{:.4g} rad by the wheels").format(*markers, *wheels) in sentence
+                "{:.4g} rad by the wheels").format(*markers, *wheels) in doubt.sentence
 
 
 def ranges_on_a_circle(factor=1.0, guess=1.0, count=200):
@@ -254,13 +255,13 @@ def test_units_of_ranges_are_judged_by_their_spread_and_by_the_guesses(factor, g
     """The quartiles of 2 m sin(t) are 2 sqrt(2) m apart; the path has the sigma 2 m."""
     doubts = list(files.range_units(ranges_on_a_circle(factor, guess)))
     assert len(doubts) == bool(named)
-    for _, sentence in doubts:
-        numbers = [float(number) for number in re.findall(r"[\d.]+(?= m\b)", sentence)]
+    for doubt in doubts:
+        numbers = [float(number) for number in re.findall(r"[\d.]+(?= m\b)", doubt.sentence)]
         middle = np.array([0.0, 2.0])
         np.testing.assert_allclose(numbers, [
             factor * np.hypot(*(middle - [6, 10])), factor * 2 * np.sqrt(2), 2.0,
             np.hypot(*(middle - guess * np.array([6, 10])))], rtol=0.03)
-        assert ("UwbReading.txt" if named == "spread" else "UwbAntennaGuess.txt") in sentence
+        assert ("UwbReading.txt" if named == "spread" else "UwbAntennaGuess.txt") in doubt.sentence
 
 
 def test_units_of_few_ranges_and_of_a_vehicle_that_stands_are_not_judged():
@@ -312,7 +313,7 @@ def test_scatter_is_that_of_the_noise_where_the_vehicle_stands(larger, doubted):
                          np.full(count, 0.1 * larger))
     doubts = list(files.sigma_units(replace(simulated("short", 0)[0], aruco=None, uwb=ranges)))
     assert len(doubts) == doubted
-    assert all("scatter by 0.101 at most" in sentence for _, sentence in doubts)
+    assert all("scatter by 0.101 at most" in doubt.sentence for doubt in doubts)
 
 
 def test_ranges_exchanged_with_their_sigmas_are_doubted():

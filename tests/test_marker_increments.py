@@ -5,6 +5,7 @@ from slamlib.core import se2
 from slamlib.core.evaluation import nees, nees_band
 from slamlib.core.marker_increments import (
     _best_hypothesis,
+    _Common,
     common_sightings,
     consecutive_increments,
     distance_and_turn,
@@ -66,7 +67,8 @@ def test_the_best_hypothesis_is_the_increment_itself(count, wrong, sigma):
     if sigma > 0.1:
         z1[:, 2] = rng.uniform(-3, 3, 2 * count)
     covariance = np.tile(np.diag([1e-4, 1e-4, sigma**2]), (2 * count, 1, 1))
-    found = _best_hypothesis(z1, covariance, z2, covariance, np.repeat([0, 2], count), 3)
+    pair = np.repeat([0, 2], count)
+    found = _best_hypothesis(_Common(pair, z1, covariance, z2, covariance, 3))
     np.testing.assert_allclose(se2.difference(found, deltas), 0, atol=1e-12)
 
 

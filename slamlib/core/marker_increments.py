@@ -12,9 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slamlib.core import odometry, se2
-from slamlib.core.sightings import GATE, MAX_HEADING_SIGMA, sightings_by_frame
+from slamlib.core.records import Dataset
+from slamlib.core.sightings import GATE, MAX_HEADING_SIGMA, Sightings, sightings_by_frame
 
-INCREMENT_ITERATIONS = 8, 6   # numbers of Gauss-Newton iterations: Cauchy weights, then the gate
+CAUCHY_ITERATIONS = 8         # Gauss-Newton iterations with Cauchy weights, at most
+GATE_ITERATIONS = 6           # iterations after these, with the sightings within GATE, at most
 INCREMENT_STEP_TOLERANCE = 1e-10  # m and rad; iterations end after a smaller step
 SPEED_RATIO = 3.0             # ratio of the largest plausible speed to the usual speed
 POINT_PAIRS = 60              # pairs of points that give hypotheses, of every pair of frames
@@ -39,7 +41,43 @@ class MarkerIncrements:
     usable: np.ndarray       # (l,) bool, the increment is determined and plausible
 
 
-def consecutive_increments(sightings):
+@dataclass(frozen=True)
+class _Linearized:
+    """Residuals of p common sightings by some increments, with their derivatives."""
+
+    r: np.ndarray            # (p, 3)
+    J_delta: np.ndarray      # (p, 3, 3) derivative of Delta Z' by Delta
+    J_second: np.ndarray     # (p, 3, 3) derivative of Delta Z' by Z'
+    information: np.ndarray  # (p, 3, 3) W^-1
+    squared: np.ndarray      # (p,) r^T W^-1 r
+
+
+@dataclass(frozen=True)
+class _Common:
+    """The p common sightings of l pairs of frames, sorted by pair."""
+
+    pair: np.ndarray         # (p,)
+    z1: np.ndarray           # (p, 3) from the earlier frame
+    C1: np.ndarray           # (p, 3, 3)
+    z2: np.ndarray           # (p, 3) from the later frame
+    C2: np.ndarray           # (p, 3, 3)
+    count: int               # l
+
+    def linearized(self, increment):
+        """The _Linearized of increments (l, 3)."""
+        delta = increment[self.pair]
+        J_delta, J_second = se2.compose_jacobians(delta, self.z2)
+        r = se2.difference(self.z1, se2.compose(delta, self.z2))
+        information = np.linalg.inv(self.C1 + J_second @ self.C2 @ J_second.mT)
+        squared = np.einsum("ni,nij,nj->n", r, information, r)
+        return _Linearized(r, J_delta, J_second, information, squared)
+
+    def cost(self, increment):
+        """Cauchy cost (l,) of increments (l, 3), each by the sightings of its pair."""
+        squared = self.linearized(increment).squared
+        return np.bincount(self.pair, np.log1p(squared / GATE), self.count)
+
+def consecutive_increments(sightings: Sightings) -> MarkerIncrements:
     """MarkerIncrements from every frame of Sightings to the next, usable if plausibly slow.
 
     With a single common marker there is no redundancy to reject a wrong label. The usual speed is
@@ -49,36 +87,50 @@ def consecutive_increments(sightings):
     and the next one. Speeds are in m and rad per encoder step, the difference of `sightings.frame`.
     """
     steps = np.diff(sightings.frame)[:, None]
-    pair, first, second = common_sightings(sightings.row, sightings.marker)
-    found = robust_increments(sightings.z, sightings.C, pair, first, second, len(steps))
-    agreed = found.usable & (np.bincount(pair[found.accepted], minlength=len(steps)) > 1)
-    if not agreed.any():
+    common = common_sightings(sightings.row, sightings.marker)
+    found = robust_increments(sightings.z, sightings.C, *common, len(steps))
+    agreeing = np.bincount(found.pair, found.accepted, len(steps))
+    redundant = found.usable & (agreeing > 1)
+    if not redundant.any():
         return found
     velocity = found.increment / steps
     speed = distance_and_turn(velocity)
-    bound = SPEED_RATIO * np.maximum(
-        np.percentile(speed[agreed], 99, axis=0),
-        np.percentile(speed[found.usable], 90, axis=0, method="lower"))
-    fast = (speed > bound + 3 * distance_and_turn_sigmas(found.covariance) / steps).any(axis=1)
-    change = distance_and_turn(np.diff(velocity, axis=0))   # less than half the larger velocity?
-    similar = (change < np.maximum(speed[:-1], speed[1:]) / 2 + [0, MIN_TURN_RATE]).all(axis=1)
-    similar = np.r_[False, similar, False]
-    usable = found.usable & ~(fast & ~(similar[:-1] | similar[1:]))
-    return replace(found, usable=usable, accepted=found.accepted & usable[pair])
+    usual = np.maximum(np.percentile(speed[redundant], 99, axis=0),
+                       np.percentile(speed[found.usable], 90, axis=0, method="lower"))
+    sigma = distance_and_turn_sigmas(found.covariance) / steps
+    fast = (speed > SPEED_RATIO * usual + 3 * sigma).any(axis=1)
+    usable = found.usable & ~(fast & _differs_from_neighbours(velocity))
+    return replace(found, usable=usable, accepted=found.accepted & usable[found.pair])
 
 
-def common_sightings(row, marker, span=1):
+def _differs_from_neighbours(velocity):
+    """True (n,) where a velocity (n, 3) differs from the previous and from the next one.
+
+    Two velocities differ if their difference is at least half as large as the larger one.
+    """
+    speed = distance_and_turn(velocity)
+    larger = np.maximum(speed[:-1], speed[1:])
+    change = distance_and_turn(np.diff(velocity, axis=0))
+    similar = (change < larger / 2 + [0, MIN_TURN_RATE]).all(axis=1)
+    like_previous = np.append(False, similar)
+    like_next = np.append(similar, False)
+    return ~(like_previous | like_next)
+
+
+def common_sightings(row: np.ndarray, marker: np.ndarray, span: int = 1) -> tuple:
     """pair, first and second of `MarkerIncrements`, for pairs of frames that are `span` apart.
 
     `row` and `marker` (s,) are frame and marker id of every sighting, sorted by both.
     """
-    markers, label = np.unique(marker, return_inverse=True)
-    key, later_key = row * len(markers) + label, (row + span) * len(markers) + label
+    label = np.unique(marker, return_inverse=True)[1]
+    key = row * len(marker) + label
+    later_key = (row + span) * len(marker) + label
     _, first, second = np.intersect1d(later_key, key, assume_unique=True, return_indices=True)
     return row[first], first, second
 
 
-def robust_increments(z, C, pair, first, second, count):
+def robust_increments(z: np.ndarray, C: np.ndarray, pair: np.ndarray, first: np.ndarray,
+                      second: np.ndarray, count: int) -> MarkerIncrements:
     """MarkerIncrements of `count` pairs of frames, robust against wrong labels.
 
     The best of several hypotheses (`_best_hypothesis`) is refined by Gauss-Newton with Cauchy
@@ -91,84 +143,120 @@ def robust_increments(z, C, pair, first, second, count):
     MAX_HEADING_SIGMA. `z` (s, 3), m and rad, and `C` (s, 3, 3) are sightings and their covariances,
     `pair`, `first` and `second` (p,) those of MarkerIncrements, sorted by pair.
     """
-    z1, C1, z2, C2 = z[first], C[first], z[second], C[second]
-    increment = _best_hypothesis(z1, C1, z2, C2, pair, count)
-    for gated, iterations in enumerate(INCREMENT_ITERATIONS):
+    common = _Common(pair, z[first], C[first], z[second], C[second], count)
+    increment = _best_hypothesis(common)
+    for weight_of, iterations in ((_cauchy_weight, CAUCHY_ITERATIONS),
+                                  (_gate_weight, GATE_ITERATIONS)):
         for _ in range(iterations):
-            r, J_delta, J_second, information, squared = _residuals(
-                increment[pair], z1, C1, z2, C2)
-            weight = squared < GATE if gated else 1 / (1 + squared / GATE)
-            gain = J_delta.mT @ information * weight[:, None, None]
-            total = np.zeros((count, 3, 4))
-            np.add.at(total, pair, gain @ np.concatenate([J_delta, r[..., None]], axis=2))
-            regular, covariance = se2.regular(total[..., :3]), np.full((count, 3, 3), np.nan)
-            covariance[regular] = np.linalg.inv(total[regular, :, :3])
-            step = (covariance @ total[..., 3:])[..., 0]
+            linear = common.linearized(increment)
+            weight = weight_of(linear.squared)
+            gain = linear.J_delta.mT @ linear.information * weight[:, None, None]
+            step, covariance = _solved(common, linear, gain)
             increment = increment + step
-            if not np.nanmax(np.abs(step), initial=0) > INCREMENT_STEP_TOLERANCE:
+            if np.nanmax(np.abs(step), initial=0) <= INCREMENT_STEP_TOLERANCE:
                 break
     increment[:, 2] = se2.wrap(increment[:, 2])
     usable = covariance[:, 2, 2] < MAX_HEADING_SIGMA**2
     D = covariance[pair] @ gain
     return MarkerIncrements(
         pair=pair, first=first, second=second, accepted=(weight > 0) & usable[pair],
-        J_first=D, J_second=-D @ J_second, usable=usable, covariance=covariance,
+        J_first=D, J_second=-D @ linear.J_second, covariance=covariance, usable=usable,
         increment=np.where(usable[:, None], increment, np.nan))
 
 
-def _residuals(increment, z1, C1, z2, C2):
-    """r, J, J', W^-1 and r^T W^-1 r of each common sighting."""
-    J_delta, J_second = se2.compose_jacobians(increment, z2)
-    r = se2.difference(z1, se2.compose(increment, z2))
-    information = np.linalg.inv(C1 + J_second @ C2 @ J_second.mT)
-    return r, J_delta, J_second, information, np.einsum("ni,nij,nj->n", r, information, r)
+def _cauchy_weight(squared):
+    """Weights (p,) of the Cauchy kernel, by squared Mahalanobis distances (p,)."""
+    return 1 / (1 + squared / GATE)
 
 
-def _best_hypothesis(z1, C1, z2, C2, pair, count):
-    """The hypothesis with the smallest Cauchy cost for every pair, (count, 3).
+def _gate_weight(squared):
+    """True (p,) within the gate, by squared Mahalanobis distances (p,)."""
+    return squared < GATE
+
+
+def _solved(common, linear, gain):
+    """The step (l, 3) C_Delta sum_j J_j^T W_j^-1 r_j, and C_Delta; NaN where undetermined.
+
+    `gain` (p, 3, 3) are the weighted J_j^T W_j^-1.
+    """
+    terms = gain @ np.concatenate([linear.J_delta, linear.r[..., None]], axis=2)
+    total = np.zeros((common.count, 3, 4))
+    np.add.at(total, common.pair, terms)
+    information = total[..., :3]
+    determined = se2.regular(information)
+    covariance = np.full_like(information, np.nan)
+    covariance[determined] = np.linalg.inv(information[determined])
+    return (covariance @ total[..., 3:])[..., 0], covariance
+
+
+def _best_hypothesis(common):
+    """The hypothesis with the smallest Cauchy cost for every pair, (l, 3).
 
     Hypotheses are no motion, the increment from each marker with a heading, and, in pairs without
-    such a marker, the increment from two positions, of which at most POINT_PAIRS are tried.
+    such a marker, the increment from two positions, of which at most POINT_PAIRS are tried. All
+    pairs try their first hypothesis at once, then their second, and so on.
     """
-    oriented = (C1[:, 2, 2] + C2[:, 2, 2]) < MAX_HEADING_SIGMA**2
-    points = [np.zeros((2, 0), int)]
-    for k in np.setdiff1d(pair, pair[oriented]):
-        two = np.searchsorted(pair, k) + np.array(np.triu_indices(np.sum(pair == k), 1))
-        points.append(two[:, ::two.shape[1] // (POINT_PAIRS + 1) + 1])
-    i, j = np.concatenate(points, axis=1)
-    hypothesis = np.concatenate([
-        se2.compose(z1[oriented], se2.inverse(z2[oriented])),
-        _increment_of_two_points(z1[i, :2], z1[j, :2], z2[i, :2], z2[j, :2])])
-    pair_of = np.concatenate([pair[oriented], pair[i]])        # those of a pair follow each other
-    _, first, which = np.unique(pair_of, return_index=True, return_inverse=True)
-    number = np.arange(len(pair_of)) - first[which]
-    best, least = np.zeros((count, 3)), np.full(count, np.inf)
-    for k in range(-1, number.max(initial=-1) + 1):
+    pair, hypothesis = _hypotheses(common)
+    _, begin, which = np.unique(pair, return_index=True, return_inverse=True)
+    number = np.arange(len(pair)) - begin[which]        # those of a pair follow each other
+    best = np.zeros((common.count, 3))
+    least = common.cost(best)
+    for k in range(number.max(initial=-1) + 1):
         tried = best.copy()
-        tried[pair_of[number == k]] = hypothesis[number == k]
-        *_, squared = _residuals(tried[pair], z1, C1, z2, C2)
-        cost = np.bincount(pair, np.log1p(squared / GATE), count)
-        best, least = np.where((cost < least)[:, None], tried, best), np.minimum(cost, least)
+        tried[pair[number == k]] = hypothesis[number == k]
+        cost = common.cost(tried)
+        best = np.where((cost < least)[:, None], tried, best)
+        least = np.minimum(cost, least)
     return best
+
+
+def _hypotheses(common):
+    """Pairs (h,) and their increments (h, 3), from one marker or from two positions."""
+    oriented = common.C1[:, 2, 2] + common.C2[:, 2, 2] < MAX_HEADING_SIGMA**2
+    pair = common.pair[oriented]
+    by_one = se2.compose(common.z1[oriented], se2.inverse(common.z2[oriented]))
+    i, j = _two_of_each(common.pair, np.setdiff1d(common.pair, pair))
+    earlier = common.z1[:, :2]
+    later = common.z2[:, :2]
+    by_two = _increment_of_two_points(earlier[i], earlier[j], later[i], later[j])
+    return np.append(pair, common.pair[i]), np.concatenate([by_one, by_two])
+
+
+def _two_of_each(pair, chosen):
+    """Rows (2, h) of two sightings of a `chosen` pair, POINT_PAIRS of each pair at most."""
+    rows = [np.zeros((2, 0), int)]
+    for k in chosen:
+        own = np.flatnonzero(pair == k)
+        two = own[np.array(np.triu_indices(len(own), 1))]
+        every = two.shape[1] // (POINT_PAIRS + 1) + 1
+        rows.append(two[:, ::every])
+    return np.concatenate(rows, axis=1)
 
 
 def _increment_of_two_points(p1, q1, p2, q2):
     """Delta from the positions (n, 2) of two markers: direction p to q and midpoint coincide."""
-    d1, d2 = q1 - p1, q2 - p2
-    turn = np.arctan2(d1[:, 1], d1[:, 0]) - np.arctan2(d2[:, 1], d2[:, 0])
-    shift = (p1 + q1) / 2 - np.einsum("nij,nj->ni", se2.rotation(turn), (p2 + q2) / 2)
-    return np.column_stack([shift, turn])
+    turn = _direction(p1, q1) - _direction(p2, q2)
+    turned = np.einsum("nij,nj->ni", se2.rotation(turn), (p2 + q2) / 2)
+    return np.column_stack([(p1 + q1) / 2 - turned, turn])
 
 
-def distance_and_turn(increment):
+def _direction(p, q):
+    """Angles (n,) of the directions from points p to q (n, 2)."""
+    d = q - p
+    return np.arctan2(d[:, 1], d[:, 0])
+
+
+def distance_and_turn(increment: np.ndarray) -> np.ndarray:
     """Distance in m and size of the turn in rad, (..., 2), of increments (..., 3)."""
-    return np.stack([np.linalg.norm(increment[..., :2], axis=-1),
-                     np.abs(se2.wrap(increment[..., 2]))], axis=-1)
+    distance = np.linalg.norm(increment[..., :2], axis=-1)
+    turn = np.abs(se2.wrap(increment[..., 2]))
+    return np.stack([distance, turn], axis=-1)
 
 
-def distance_and_turn_sigmas(covariance):
+def distance_and_turn_sigmas(covariance: np.ndarray) -> np.ndarray:
     """Standard deviations (n, 2) of them, in m and rad, by covariances (n, 3, 3)."""
-    return np.sqrt(np.diagonal(covariance, axis1=1, axis2=2) @ [[1, 0], [1, 0], [0, 1]])
+    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    return np.sqrt(variance @ [[1, 0], [1, 0], [0, 1]])
 
 
 @dataclass(frozen=True)
@@ -180,29 +268,44 @@ class Returns:
     motion: np.ndarray       # (m, 3) later in earlier frame, by these markers, m and rad
     covariance: np.ndarray   # (m, 3, 3) of the motion, by the covariances of the sightings
 
-    def discrepancies(self, poses):
+    def discrepancies(self, poses: np.ndarray) -> np.ndarray:
         """Motions (m, 3) by poses (n, 3) minus these, in the axes of the earlier frames."""
         return se2.difference(se2.between(poses[self.start], poses[self.end]), self.motion)
 
 
-def returns(dataset):
+def returns(dataset: Dataset) -> Returns:
     """The Returns of a Dataset after at least MIN_GAP of driving; none without markers.
 
-    They show the error of every method without loop closures, without truth. A frame returns to the
-    earlier frame with which it has most markers in common. Errors of returns are correlated: they
-    share sections of odometry, and sightings.
+    They show the error of every method without loop closures, without truth. Errors of returns are
+    correlated: they share sections of odometry, and sightings.
     """
     s = sightings_by_frame(dataset.sightings)
-    travelled = odometry.cumulative(np.abs(odometry.steps(dataset.ticks, dataset.vehicle)[0]))
     every = len(s.frame) // MAX_RETURN_FRAMES + 1
-    sighting, frame = s.table()[::every], s.frame[::every]
-    seen, distance = (sighting >= 0).astype(int), travelled[frame]
-    common = (seen @ seen.T) * (distance[:, None] - distance >= MIN_GAP)  # later, earlier frames
-    later = np.flatnonzero((common >= MIN_COMMON_MARKERS).any(axis=1))
-    earlier = common[later].argmax(axis=1) if len(later) else later
-    pair, which = np.nonzero(seen[earlier] & seen[later])
-    found = robust_increments(s.z, s.C, pair, sighting[earlier[pair], which],
-                              sighting[later[pair], which], len(later))
-    ok = found.usable & (np.bincount(pair, found.accepted, len(later)) >= MIN_COMMON_MARKERS)
+    frame = s.frame[::every]
+    sighting = s.table()[::every]
+    seen = sighting >= 0
+    ds = odometry.steps(dataset.ticks, dataset.vehicle)[0]
+    travelled = odometry.cumulative(np.abs(ds))
+    earlier, later = _returning(seen, travelled[frame])
+    pair, marker = np.nonzero(seen[earlier] & seen[later])
+    found = robust_increments(s.z, s.C, pair, sighting[earlier[pair], marker],
+                              sighting[later[pair], marker], len(later))
+    agreeing = np.bincount(pair, found.accepted, len(later))
+    ok = found.usable & (agreeing >= MIN_COMMON_MARKERS)
     return Returns(start=frame[earlier[ok]], end=frame[later[ok]], motion=found.increment[ok],
                    covariance=found.covariance[ok])
+
+
+def _returning(seen, travelled):
+    """Earlier and later frames (l,) of returns, by the markers (f, k) that are `seen` at frames.
+
+    A frame returns to the earlier frame with which it has most markers in common, among those from
+    which the vehicle has `travelled` (f,) MIN_GAP since.
+    """
+    markers = seen.astype(int)
+    far = travelled[:, None] - travelled >= MIN_GAP
+    common = np.where(far, markers @ markers.T, 0)
+    later = np.flatnonzero((common >= MIN_COMMON_MARKERS).any(axis=1))
+    if not len(later):
+        return later, later
+    return common[later].argmax(axis=1), later

@@ -33,7 +33,7 @@ class Sightings:
     frame: np.ndarray        # (f,) pose index from 0 of every frame, ascending
     contradicting: int = 0   # number of repeated sightings that contradict each other
 
-    def table(self):
+    def table(self) -> np.ndarray:
         """Row (f, k) of the sighting of each marker, in ascending id, at each frame, or -1."""
         markers, label = np.unique(self.marker, return_inverse=True)
         table = np.full((len(self.frame), len(markers)), -1, np.int32)
@@ -41,61 +41,75 @@ class Sightings:
         return table
 
 
-def sightings_by_frame(aruco, extra_frames=()):
+NO_READINGS = ArucoReadings(
+    pose=np.zeros(0, int), marker=np.zeros(0, int), marker_in_vehicle=np.zeros((0, 3)),
+    covariance=np.zeros((0, 3, 3)))
+
+
+def sightings_by_frame(aruco: ArucoReadings | None, extra_frames=()) -> Sightings:
     """Sightings of ArucoReadings, or of None if there are no markers, merged by `merge_repeated`.
 
     `extra_frames` are pose indices from 0 that are frames even if no marker is seen there.
     """
-    aruco = aruco or ArucoReadings(*np.zeros((2, 0), int), np.zeros((0, 3)), np.zeros((0, 3, 3)))
-    index, z, C, contradicting = merge_repeated(replace(
-        aruco, covariance=regular(aruco.covariance)))
-    frame = np.union1d(aruco.pose[index], extra_frames).astype(int)
-    return Sightings(index=index, row=np.searchsorted(frame, aruco.pose[index]),
-                     marker=aruco.marker[index], z=z, C=C, frame=frame,
-                     contradicting=contradicting)
+    aruco = aruco or NO_READINGS
+    aruco = replace(aruco, covariance=regular(aruco.covariance))
+    index, z, C, contradicting = merge_repeated(aruco)
+    pose = aruco.pose[index]
+    frame = np.union1d(pose, extra_frames).astype(int)
+    return Sightings(index=index, row=np.searchsorted(frame, pose), marker=aruco.marker[index],
+                     z=z, C=C, frame=frame, contradicting=contradicting)
 
 
-def regular(covariance):
+def regular(covariance: np.ndarray) -> np.ndarray:
     """Covariances (m, 3, 3), increased where float64 could not invert or add their information.
 
     Where the standard deviation of x, y or heading, given the other two, is below
     MIN_MEASUREMENT_SIGMA, as of fully correlated coordinates, the variance is increased by its
     square. For x and y the bound is at least MIN_SIGMA_RATIO of the larger standard deviation.
     """
-    sigma, information = sigmas(covariance), np.linalg.inv(correlations(covariance))
-    conditional = sigma**2 / np.diagonal(information, axis1=1, axis2=2)
+    sigma = sigmas(covariance)
+    information = np.linalg.inv(correlations(covariance))
+    conditional_variance = sigma**2 / np.diagonal(information, axis1=1, axis2=2)
+    larger = sigma[:, :2].max(axis=1, keepdims=True)
     bound = np.full_like(sigma, MIN_MEASUREMENT_SIGMA)
-    bound[:, :2] = np.maximum(
-        MIN_MEASUREMENT_SIGMA, MIN_SIGMA_RATIO * sigma[:, :2].max(axis=1, keepdims=True))
-    added = np.where(conditional < bound**2, bound**2, 0.0)
+    bound[:, :2] = np.maximum(MIN_MEASUREMENT_SIGMA, MIN_SIGMA_RATIO * larger)
+    added = np.where(conditional_variance < bound**2, bound**2, 0.0)
     return covariance + added[:, :, None] * np.eye(3)
 
 
-def merge_repeated(aruco):
+def merge_repeated(aruco: ArucoReadings) -> tuple:
     """`index`, `z`, `C` and `contradicting` of Sightings, with one row for each pose and marker.
 
     Repeated sightings in ArucoReadings of a marker at one pose are averaged, weighted by their
     information matrices, if all of them lie within GATE of the mean. Otherwise all are rejected.
     """
     order = np.lexsort((aruco.marker, aruco.pose))
-    key = np.stack([aruco.pose[order], aruco.marker[order]], -1)
+    sorted_by_frame = aruco.select(order)
+    z = sorted_by_frame.marker_in_vehicle
+    C = sorted_by_frame.covariance
+    key = np.stack([sorted_by_frame.pose, sorted_by_frame.marker], -1)
     _, begins, count = np.unique(key, axis=0, return_index=True, return_counts=True)
-    z, C = aruco.marker_in_vehicle[order], aruco.covariance[order]
     agrees = np.ones(len(begins), bool)
     for i in np.flatnonzero(count > 1):
-        same = slice(begins[i], begins[i] + count[i])
-        information = np.linalg.inv(C[same])
-        r = se2.difference(z[same], z[begins[i]])
-        mean_covariance = np.linalg.inv(information.sum(0))
-        mean = mean_covariance @ np.einsum("nij,nj->i", information, r)
-        agrees[i] = np.all(np.einsum("ni,nij,nj->n", r - mean, information, r - mean) < GATE)
-        z[begins[i]] += mean
-        C[begins[i]] = mean_covariance
-    begins, contradicting = begins[agrees], int(count[~agrees].sum())
-    return order[begins], z[begins], C[begins], contradicting
+        first = begins[i]
+        same = slice(first, first + count[i])
+        z[first], C[first], agrees[i] = _mean(z[same], C[same])
+    kept = begins[agrees]
+    return order[kept], z[kept], C[kept], int(count[~agrees].sum())
 
 
-def consensus(marker, in_world, covariance, maximum=200):
+def _mean(z, C):
+    """Weighted mean (3,) of sightings (n, 3), its covariance, and whether all are within GATE."""
+    information = np.linalg.inv(C)
+    r = se2.difference(z, z[0])
+    covariance = np.linalg.inv(information.sum(0))
+    mean = covariance @ np.einsum("nij,nj->i", information, r)
+    squared = np.einsum("ni,nij,nj->n", r - mean, information, r - mean)
+    return z[0] + mean, covariance, np.all(squared < GATE)
+
+
+def consensus(marker: np.ndarray, in_world: np.ndarray, covariance: np.ndarray,
+              maximum: int = 200) -> np.ndarray:
     """Rows (k,) of one sighting of each marker, well supported and certain, in ascending id.
 
     The support of a sighting is the number of sightings of its marker within GATE of it. Of those
@@ -104,13 +118,28 @@ def consensus(marker, in_world, covariance, maximum=200):
     poses of these markers in world axes by each sighting. Of a marker with more than `maximum`
     sightings, so many evenly chosen ones are compared: the cost is quadratic.
     """
-    order, best = np.argsort(marker, kind="stable"), []
-    log_determinant = np.linalg.slogdet(covariance)[1]
-    for same in np.split(order, np.flatnonzero(np.diff(marker[order])) + 1) if len(order) else ():
-        k, few = np.arange(len(same)), min(len(same), maximum)
-        same = same[k * few // len(same) != (k - 1) * few // len(same)]
-        squared = se2.squared_distances(in_world[same, None], in_world[same],
-                                        covariance[same, None] + covariance[same])
-        support = np.count_nonzero(squared < GATE, axis=1)
-        best.append(min(same[support >= support.max() / 2], key=log_determinant.__getitem__))
+    order = np.argsort(marker, kind="stable")
+    begins = np.flatnonzero(np.diff(marker[order])) + 1
+    best = []
+    for same in np.split(order, begins):
+        if len(same):                                   # there is no marker, if not
+            chosen = _evenly(same, maximum)
+            k = _supported_and_certain(in_world[chosen], covariance[chosen])
+            best.append(chosen[k])
     return np.array(best, int)
+
+
+def _evenly(rows, maximum):
+    """Of rows (n,), `maximum` evenly chosen ones if there are more."""
+    few = min(len(rows), maximum)
+    number = np.arange(len(rows)) * few // len(rows)
+    return rows[np.diff(number, prepend=-1) > 0]
+
+
+def _supported_and_certain(in_world, covariance):
+    """Number of the most certain pose of one marker, of those with half the maximum support."""
+    squared = se2.squared_distances(in_world[:, None], in_world, covariance[:, None] + covariance)
+    support = np.count_nonzero(squared < GATE, axis=1)
+    log_determinant = np.linalg.slogdet(covariance)[1]
+    supported = support >= support.max() / 2
+    return np.where(supported, log_determinant, np.inf).argmin()

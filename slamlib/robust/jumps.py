@@ -11,21 +11,26 @@ with a generous slip transports them to the nearer of the two frames. First, eac
 compared with the next one of its marker. Frames between which most of these pairs disagree are
 suspects. In the order of the drive, J is estimated by `robust_increments` between suspects, and
 kept if it is decidedly more likely than the identity (data snooping: Baarda 1968). Later poses move
-with it. Where all markers change at once and none of them is known, the motion is unknown.
+with it. Where all markers change at once and none of them is known, the motion is unknown. A step
+is from a frame to the next one, and has the number of the earlier one.
 """
 
+import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from slamlib.core import odometry, se2
-from slamlib.core.marker_increments import robust_increments
+from slamlib.core.marker_increments import distance_and_turn, robust_increments
+from slamlib.core.records import Dataset
 from slamlib.core.sightings import GATE, sightings_by_frame
+
+log = logging.getLogger(__name__)
 
 # Noise of odometry, generous
 SLIP = 0.03                  # sqrt(m), of a wheel after one metre
 FLOOR = 3e-3                 # m and rad, of an increment
-LAGS = np.arange(-12, 13, 2)         # poses, by which all sightings may be late
+LAGS = range(-12, 13, 2)     # poses, by which all sightings may be late
 LEVER = 0.12                 # m, by which the camera may be elsewhere than stated
 # Decisions; gains are of twice the log likelihood
 SUSPECT = 7.8                # 95 % quantile of chi-squared with three degrees of freedom
@@ -36,7 +41,8 @@ MAX_LAG_COST = 0.8           # of that without it; with slip a wrong lag costs 0
 PAIRS = 2                    # of sightings of each marker that tell of a jump: one may be wrong
 NEAREST = 24                 # number of these pairs, by the frames between them
 MAX_VARIANCE = 1.0           # m^2, of the place after a jump
-WELL_INSIDE = 0.15, 0.85      # quantiles of x and of y at which markers are seen
+WELL_INSIDE = 0.15, 0.85     # quantiles of x and of y at which markers are seen
+SOON = 1, 2, 3               # frames later or earlier, at which these should be seen again
 MIN_MISSED = 6               # number of sightings that should be there, and are not
 # Jumps in odometry
 USUAL = 0.9                  # probability of the quantile of motions that is a usual one
@@ -60,143 +66,171 @@ class Jumps:
     lag: int = 0             # poses, by which all sightings seem later than stated
 
     @property
-    def are_few(self):
+    def are_few(self) -> bool:
         """Whether there are jumps, but few that no spike of the counts supports."""
-        supported = self.chance[self.end] - self.chance[self.start] >= SPIKE_CHANCE
-        return len(self.start) > 0 and np.sum(~supported) <= MAX_UNSUPPORTED
+        unsupported = np.sum(self._chances() < SPIKE_CHANCE)
+        return len(self.start) > 0 and unsupported <= MAX_UNSUPPORTED
 
-    def share(self, start, end):
+    def _chances(self):
+        """Chances (g,) of each whole jump."""
+        return self.chance[self.end] - self.chance[self.start]
+
+    def share(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
         """Probabilities (m, g) that the jumps are in increments between encoder poses (m,)."""
-        begin, end = np.maximum(start[:, None], self.start), np.minimum(end[:, None], self.end)
-        return np.where(begin < end, self.chance[end] - self.chance[begin], 0.0) \
-            / (self.chance[self.end] - self.chance[self.start])
+        common_start = np.maximum(start[:, None], self.start)
+        common_end = np.minimum(end[:, None], self.end)
+        chance = self.chance[common_end] - self.chance[common_start]
+        return np.where(common_start < common_end, chance, 0.0) / self._chances()
 
-    def added(self, start, end):
+    def added(self, start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Motions (m, 3) to add to such increments, in the axes of their ends, and covariances."""
         share = self.share(start, end)
-        return (share @ se2.between(self.by_odometry, self.increment),
-                (share @ self.sigma**2)[:, :, None] * np.eye(3))
+        motion = share @ se2.between(self.by_odometry, self.increment)
+        variance = share @ self.sigma**2
+        return motion, variance[:, :, None] * np.eye(3)
 
-    def joined_by(self, start, end, increment, by_odometry, count):
+    def joined_by(self, start: int, end: int, increment: np.ndarray, by_odometry: np.ndarray,
+                  count: int) -> "Jumps":
         """The Jumps and one more, of `count` encoder poses."""
-        k = np.searchsorted(self.start, start)
-        sigma = _sigma_of(se2.compose(increment, se2.inverse(by_odometry)))
-        chance = self.chance if len(self.start) else np.arange(float(count))
-        return replace(self, chance=chance, **{
-            name: np.insert(getattr(self, name), k, each, axis=0) for name, each in (
-                ("start", start), ("end", end), ("increment", increment),
-                ("by_odometry", by_odometry), ("sigma", sigma))})
+        jump = se2.compose(increment, se2.inverse(by_odometry))
+        joined = self._with(start, end, increment, by_odometry, _sigma_of(jump))
+        return joined if len(self.start) else replace(joined, chance=np.arange(float(count)))
 
-    def mended(self, pose, poses, begin=0):
+    def _with(self, start, end, increment, by_odometry, sigma):
+        """The Jumps and one more."""
+        k = np.searchsorted(self.start, start)
+        return replace(
+            self, start=np.insert(self.start, k, start), end=np.insert(self.end, k, end),
+            increment=np.insert(self.increment, k, increment, axis=0),
+            by_odometry=np.insert(self.by_odometry, k, by_odometry, axis=0),
+            sigma=np.insert(self.sigma, k, sigma, axis=0))
+
+    def mended(self, pose: np.ndarray, poses: np.ndarray, begin: int = 0) -> np.ndarray:
         """Poses (f, 3) of the encoder poses (f,), with these increments instead of odometry's.
 
         Jumps up to the encoder pose `begin` are mended already.
         """
         for start, end, increment in zip(self.start, self.end, self.increment):
             if begin < end <= pose[-1]:
-                i, k = np.searchsorted(pose, [start, end])
-                poses = _moved(poses, k, se2.compose(poses[i], increment))
+                before = np.searchsorted(pose, start)
+                after = np.searchsorted(pose, end)
+                poses = _moved(poses, after, se2.compose(poses[before], increment))
         return poses
 
 
-NO_JUMPS = Jumps(*np.zeros((2, 0), int), *np.zeros((3, 0, 3)), chance=np.zeros(1))   # none at all
+NO_JUMPS = Jumps(start=np.zeros(0, int), end=np.zeros(0, int), increment=np.zeros((0, 3)),
+                 by_odometry=np.zeros((0, 3)), sigma=np.zeros((0, 3)), chance=np.zeros(1))
 
 
 def _sigma_of(jump):
     """Standard deviations (3,) of a motion that may be as large as the jump (3,)."""
-    return np.maximum(np.r_[[np.hypot(*jump[:2])] * 2, abs(jump[2])], MIN_JUMP)
+    distance = np.hypot(jump[0], jump[1])
+    return np.maximum([distance, distance, np.abs(jump[2])], MIN_JUMP)
 
 
-def find_jumps(dataset):
+def _moved(poses, k, pose):
+    """Poses (f, 3) of which pose k and the later ones have moved with pose k to `pose` (3,)."""
+    return np.concatenate([poses[:k], se2.compose(pose, se2.between(poses[k], poses[k:]))])
+
+
+def find_jumps(dataset: Dataset) -> Jumps:
     """The Jumps of a Dataset, by its sightings as the stated camera has them."""
     s = sightings_by_frame(dataset.sightings)
     if len(s.frame) < 2:
         return NO_JUMPS
     order = np.lexsort((s.row, s.marker))
-    s = replace(s, **{name: getattr(s, name)[order] for name in ("row", "marker", "z", "C")})
-    # Sightings that are late contradict odometry wherever the speed changes.
-    path = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")
-    late = [s.frame - round(dataset.vehicle.sighting_lag) - lag for lag in LAGS]
-    drives = [_Drive.without_jumps(path[np.clip(each, 0, len(path) - 1)], dataset.vehicle.wheelbase)
-              for each in late]
-    cost = [_cost(_compared(s, each)[2]).sum() for each in drives]
-    stated, best = len(LAGS) // 2, int(np.argmin(cost))
-    best = best if cost[best] < min(
-        cost[stated] - MIN_LAG_GAIN, MAX_LAG_COST * cost[stated]) else stated
-    found = (_jumps(dataset, s, drives[each]) for each in sorted({stated, best}))
-    return replace(min(found, key=lambda jumps: len(jumps.start)), lag=LAGS[best])
+    s = replace(s, row=s.row[order], marker=s.marker[order], z=s.z[order], C=s.C[order])
+    vehicle = dataset.vehicle
+    path = odometry.dead_reckoning(dataset.ticks, vehicle, model="arc")
+    drives = {}
+    for lag in LAGS:
+        taken = s.frame - round(vehicle.sighting_lag) - lag
+        poses = path[np.clip(taken, 0, len(path) - 1)]
+        drives[lag] = _Drive.without_jumps(poses, vehicle.wheelbase)
+    lag = _chosen_lag(s, drives)
+    candidates = [_found(dataset.ticks, s, drives[each]) for each in sorted({0, lag})]
+    found = min(candidates, key=len)
+    jumps = replace(NO_JUMPS, lag=lag)
+    for jump in found:
+        start = s.frame[jump.step]
+        end = s.frame[jump.step + 1]
+        log.info("jump between poses %d and %d: markers and odometry differ by %.3f m and %.3f "
+                 "rad, gain %.1f, sigma %.1f m", start + 1, end + 1,
+                 *distance_and_turn(jump.motion), jump.gain, jump.sigma[0])
+        jumps = jumps._with(start, end, jump.increment, jump.by_odometry, jump.sigma)
+    return replace(jumps, chance=_chance(dataset.ticks)) if found else jumps
 
 
-def _jumps(dataset, s, drive):
-    """The Jumps by a _Drive, and sightings sorted by marker, then frame."""
-    first, second, squared = _compared(s, drive)
-    close = _compared(s, drive, slip=0.0)[2][second - first == 1]
-    scale = max(1.0, np.median(close) / MEDIAN_SQUARED) if len(close) else 1.0
-    suspects, rank = _suspects(first, second, squared / scale, len(drive.way) - 1)
-    agreeing = (second - first < 4) & (squared < GATE * scale)
-    breaks = _breaks(s, drive.poses, first[agreeing], second[agreeing])
-    scaled = replace(s, C=scale * s.C)
-    found, contradicted = _bridged(scaled, drive, suspects, breaks, rank)
-    dead = _dead(dataset.ticks, s.frame, contradicted)
-    if len(dead):
-        found, _ = _bridged(scaled, drive, np.union1d(suspects, dead), breaks, rank, dead)
-    if not found:
-        return NO_JUMPS
-    k, increment, by_odometry, sigma = map(np.array, zip(*found))
-    counts = np.abs(dataset.ticks).max(axis=1)
+def _chance(ticks):
+    """Chance (n,) of a jump in the steps up to each pose: large in spikes of the counts."""
+    counts = np.abs(ticks).max(axis=1)
     spike = counts > SPIKE * np.quantile(counts, 0.99)
-    return Jumps(start=s.frame[k], end=s.frame[k + 1], increment=increment, by_odometry=by_odometry,
-                 sigma=sigma, chance=np.cumsum(np.where(spike, SPIKE_CHANCE, 1.0)))
+    return np.cumsum(np.where(spike, SPIKE_CHANCE, 1.0))
 
 
-def _bridged(s, drive, suspects, breaks, rank, dead=()):
-    """Ascending list of step, increment, that by odometry, and sigma of each jump.
+def _chosen_lag(s, drives):
+    """The lag whose _Drive agrees best with the sightings, if decidedly better than that of 0."""
+    cost = {lag: _cost(_compared(s, drive).squared).sum() for lag, drive in drives.items()}
+    best = min(cost, key=cost.get)
+    if cost[best] >= min(cost[0] - MIN_LAG_GAIN, MAX_LAG_COST * cost[0]):
+        return 0
+    log.info("sightings seem %d poses later than stated: cost %.1f, as stated %.1f",
+             best, cost[best], cost[0])
+    return best
 
-    Also a list of the steps that any pair contradicts. Steps are taken by their `rank` (f-1,).
-    Those in `breaks` and `dead` are jumps, also if the markers do not tell how long they are.
-    """
-    found, contradicted, steps = [], [], np.union1d(suspects, breaks).astype(int)
+
+def _cost(squared):
+    """Cauchy cost, twice a negative log likelihood, of squared Mahalanobis distances (m,)."""
+    return GATE * np.log1p(squared / GATE)
+
+
+def _found(ticks, s, drive):
+    """List of each _Jump in a _Drive, by Sightings sorted by marker, then by frame."""
+    pairs = _compared(s, drive)
+    scale = _covariance_scale(s, drive)
+    pairs = replace(pairs, squared=pairs.squared / scale)
+    suspects = _suspects(pairs)
+    rank = _rank(pairs)
+    unknown = dict.fromkeys(_breaks(s, drive.poses, pairs), UNKNOWN_SIGMA)
+    s = replace(s, C=scale * s.C)
+    tried = _bridged(s, drive, suspects, rank, unknown)
+    dead = _dead(ticks, s.frame, [jump.step for jump in tried if jump.gain > MIN_GAIN])
+    if len(dead):
+        unknown = dict.fromkeys(dead, 2 * _usual(drive)) | unknown
+        tried = _bridged(s, drive, suspects, rank, unknown)
+    return [jump for jump in tried if jump.found]
+
+
+def _covariance_scale(s, drive):
+    """Factor of the covariances, 1 or more, with which sightings of neighbouring frames agree."""
+    pairs = _compared(s, replace(drive, slip=0.0))
+    squared = pairs.squared[pairs.span == 1]
+    return max(1.0, np.median(squared) / MEDIAN_SQUARED) if len(squared) else 1.0
+
+
+def _usual(drive):
+    """Motion (3,) of a step, m, m, rad, that few steps exceed."""
     moves = np.abs(se2.between(drive.poses[:-1], drive.poses[1:]))
-    usual = np.maximum(np.quantile(moves, USUAL, axis=0)[[0, 0, 2]], MIN_JUMP)
-    drive = drive.with_variance(steps, *UNKNOWN_SIGMA[1:]**2)
-    steps = steps[np.argsort(rank[steps], kind="stable")]
-    for i, k in enumerate(steps.tolist()):
-        if rank[k] > -np.inf:                    # all pairs that tell of it may span others, too
-            drive = drive.with_variance(steps[i:], 2 * usual[0]**2, usual[2]**2)
-        known = drive.with_variance(k, 0.0, 0.0)
-        jump, covariance, gain, told = _jump(s, known, k)
-        contradicted += [k] if gain > MIN_GAIN else []
-        if not told and k not in breaks and k not in dead:
-            drive = drive if gain > MIN_GAIN else known        # one pair, maybe a wrong label
-            continue
-        drive = known
-        sigma = _sigma_of(jump)
-        if covariance is None:
-            sigma = UNKNOWN_SIGMA if k in breaks else 2 * usual
-            covariance = np.diag(sigma**2)
-        by_odometry = se2.between(drive.poses[k], drive.poses[k + 1])
-        increment = se2.compose(jump, by_odometry)
-        found.append((k, increment, by_odometry, sigma))
-        drive = drive.with_variance(k, np.trace(covariance[:2, :2]), covariance[2, 2])
-        drive = replace(drive, poses=_moved(
-            drive.poses, k + 1, se2.compose(drive.poses[k], increment)))
-    return sorted(found, key=lambda jump: jump[0]), contradicted
+    usual = np.quantile(moves, USUAL, axis=0)
+    usual[1] = usual[0]                                  # a jump may be to the side
+    return np.maximum(usual, MIN_JUMP)
 
 
-def _dead(ticks, frame, contradicted):
-    """Steps from frame to frame in which a wheel is dead.
+@dataclass(frozen=True)
+class _Motions:
+    """Motions, or poses of markers, with covariances."""
 
-    It counts nothing there, in a run of zeros in which half of the steps are in `contradicted`.
-    """
-    dead, told = np.zeros(len(ticks), bool), np.isin(np.arange(len(frame) - 1), contradicted)
-    for zero in (ticks == 0).T:
-        run, total = np.cumsum(~zero), odometry.cumulative(zero)     # a run has one number
-        silent = total[frame[1:] + 1] - total[frame[:-1] + 1] == np.diff(frame)
-        steps, wrong = (np.bincount(run[frame[1:]], some, len(ticks) + 1)
-                        for some in (silent, silent & told))
-        dead |= zero & (wrong > 0)[run] & (2 * wrong >= steps)[run]
-    total = odometry.cumulative(dead)
-    return np.flatnonzero(total[frame[1:] + 1] > total[frame[:-1] + 1])
+    mean: np.ndarray         # (m, 3)
+    covariance: np.ndarray   # (m, 3, 3)
+
+    def then(self, other):
+        """These _Motions, followed by others, with independent errors."""
+        return _Motions(*se2.compose_uncertain(
+            self.mean, self.covariance, other.mean, other.covariance))
+
+    def squared_distances(self, other):
+        """Squared Mahalanobis distances (m,) to others."""
+        return se2.squared_distances(self.mean, other.mean, self.covariance + other.covariance)
 
 
 @dataclass(frozen=True)
@@ -207,111 +241,248 @@ class _Drive:
     way: np.ndarray          # (f,) m, travelled so far
     variance: np.ndarray     # (f-1, 2) of a jump in each step, m^2 and rad^2
     wheelbase: float         # m
+    slip: float = SLIP       # sqrt(m)
 
     @classmethod
     def without_jumps(cls, poses, wheelbase):
+        """The _Drive of poses (f, 3), with odometry's usual noise alone."""
         way = odometry.cumulative(np.hypot(*np.diff(poses[:, :2], axis=0).T))
         return cls(poses, way, np.zeros((len(poses) - 1, 2)), wheelbase)
 
-    def with_variance(self, steps, place, turn):
-        """The _Drive with jumps of these variances, m^2 and rad^2, in `steps`, (m,) or one."""
-        variance = self.variance.copy()
-        variance[steps] = place, turn
-        return replace(self, variance=variance)
+    def with_variance(self, steps, variance):
+        """The _Drive with jumps of this variance (2,), m^2 and rad^2, in `steps`, (m,) or one."""
+        variances = self.variance.copy()
+        variances[steps] = variance
+        return replace(self, variance=variances)
 
-    def motions(self, start, end, slip=SLIP):
-        """Motions (m, 3) between frames (m,), and their covariances (m, 3, 3), roughly."""
-        move, way = se2.between(self.poses[start], self.poses[end]), self.way[end] - self.way[start]
+    def with_jump(self, jump):
+        """The _Drive with a _Jump in its step; later poses move with it."""
+        k = jump.step
+        end = se2.compose(self.poses[k], jump.increment)
+        moved = replace(self, poses=_moved(self.poses, k + 1, end))
+        return moved.with_variance(k, jump.variance)
+
+    def motions(self, start, end):
+        """_Motions between frames, each (m,) or one, roughly."""
+        move = se2.between(self.poses[start], self.poses[end])
+        way = np.abs(self.way[end] - self.way[start])
         total = odometry.cumulative(self.variance)
-        place, turn = np.abs(total[end] - total[start]).T
-        turn = turn + 2 * np.abs(way) * (slip / self.wheelbase)**2 + FLOOR**2
-        place = place + turn * np.sum(move[:, :2]**2, axis=1) / 3 + FLOOR**2 \
-            + (2 * LEVER * np.sin(se2.wrap(move[:, 2]) / 2))**2
-        along = place + np.abs(way) * slip**2 / 2
-        return move, np.stack([along, place, turn], -1)[:, None] * np.eye(3)
+        jumps = np.abs(total[end] - total[start])
+        turn = jumps[:, 1] + 2 * way * (self.slip / self.wheelbase)**2 + FLOOR**2
+        by_turn = turn * np.sum(move[:, :2]**2, axis=1) / 3
+        by_lever = 2 * LEVER * np.sin(se2.wrap(move[:, 2]) / 2)
+        place = jumps[:, 0] + by_turn + FLOOR**2 + by_lever**2
+        along = place + way * self.slip**2 / 2
+        return _Motions(move, np.stack([along, place, turn], -1)[:, None] * np.eye(3))
+
+    def seen_from(self, frame, s, rows):
+        """Markers of the sightings in `rows` as _Motions from frames, (m,) or one, by odometry."""
+        return self.motions(frame, s.row[rows]).then(_Motions(s.z[rows], s.C[rows]))
 
 
-def _moved(poses, k, pose):
-    """Poses (f, 3) of which pose k and the later ones have moved with pose k to `pose` (3,)."""
-    return np.concatenate([poses[:k], se2.compose(pose, se2.between(poses[k], poses[k:]))])
+@dataclass(frozen=True)
+class _Pairs:
+    """Pairs of a sighting and the next one of its marker."""
+
+    first: np.ndarray        # (m,) frame of the earlier sighting
+    second: np.ndarray       # (m,) frame of the later one
+    squared: np.ndarray      # (m,) Mahalanobis distance between them, by odometry
+    steps: int               # number of all steps
+
+    @property
+    def span(self):
+        """Numbers (m,) of steps from the earlier to the later frame."""
+        return self.second - self.first
+
+    @property
+    def wrong(self):
+        """True (m,) where the pair contradicts odometry."""
+        return self.squared > SUSPECT
+
+    def over(self, chosen):
+        """Numbers (f-1,) of the `chosen` pairs, a mask (m,), over each step."""
+        begin = np.bincount(self.first[chosen], minlength=self.steps + 1)
+        end = np.bincount(self.second[chosen], minlength=self.steps + 1)
+        return np.cumsum(begin - end)[:-1]
 
 
-def _compared(s, drive, slip=SLIP):
-    """Frames (m,) of each sighting and of the next one of its marker, and their chi-squared."""
+def _compared(s, drive):
+    """The _Pairs of Sightings that are sorted by marker, then by frame."""
     k = np.flatnonzero(s.marker[:-1] == s.marker[1:])
-    first, second = s.row[k], s.row[k + 1]
-    z, C = se2.compose_uncertain(*drive.motions(first, second, slip), s.z[k + 1], s.C[k + 1])
-    return first, second, se2.squared_distances(s.z[k], z, s.C[k] + C)
+    expected = drive.seen_from(s.row[k], s, k + 1)
+    squared = _Motions(s.z[k], s.C[k]).squared_distances(expected)
+    return _Pairs(s.row[k], s.row[k + 1], squared, len(s.frame) - 1)
 
 
-def _cost(squared):
-    """Cauchy cost, twice a negative log likelihood, of squared Mahalanobis distances (m,)."""
-    return GATE * np.log1p(squared / GATE)
+def _suspects(pairs):
+    """Steps that half of the pairs of sightings contradict.
 
-
-def _spanning(first, second, count):
-    """Numbers (count,) of the pairs of frames, `first` and `second` (m,), that span each step."""
-    return np.cumsum(np.bincount(first, minlength=count + 1)
-                     - np.bincount(second, minlength=count + 1))[:count]
-
-
-def _suspects(first, second, squared, count):
-    """Steps, of `count` from frame to frame, that half of the pairs of sightings contradict.
-
-    Only sightings at these two frames are asked, if there are any; else all pairs that span it.
-    Also the rank (count,) of each step: those with such sightings come first, then those that most
-    contradicting pairs span. A pair over a long way does not tell where on it a jump was.
+    Only sightings at these two frames are asked, if there are any; else all pairs over it.
     """
-    close, wrong = second - first == 1, squared > SUSPECT
-    of_close, all_of, wrong_of_close, all_wrong = (
-        _spanning(first[some], second[some], count)
-        for some in (close, close | True, close & wrong, wrong))
-    all_of, wrong_of = np.where(of_close, [of_close, wrong_of_close], [all_of, all_wrong])
-    return (np.flatnonzero((wrong_of > 0) & (2 * wrong_of >= all_of)),
-            np.where(of_close > 0, -np.inf, -all_wrong))
+    close = pairs.span == 1
+    all_close = pairs.over(close)
+    asked = np.where(all_close, all_close, pairs.over(np.ones_like(close)))
+    wrong = np.where(all_close, pairs.over(close & pairs.wrong), pairs.over(pairs.wrong))
+    return np.flatnonzero((wrong > 0) & (2 * wrong >= asked))
 
 
-def _breaks(s, poses, first, second):
-    """Steps from frame to frame in which all markers change, although odometry hardly moves.
+def _rank(pairs):
+    """Rank (f-1,) of each step: which of them is asked first for a jump.
+
+    Those with sightings at both frames come first, then those under most pairs that contradict
+    odometry. A pair over a long way does not tell where on it a jump was.
+    """
+    return np.where(pairs.over(pairs.span == 1), -np.inf, -pairs.over(pairs.wrong))
+
+
+def _breaks(s, poses, pairs):
+    """Steps in which all markers change, although odometry hardly moves.
 
     Markers well inside the field of view should be seen again in the next few frames. At least
-    MIN_MISSED such sightings are missed, on both sides, and no pair of sightings of frames `first`
-    and `second` (m,), which agree with odometry, spans the step.
+    MIN_MISSED such sightings are missed, on both sides, and no short one of the _Pairs that agrees
+    with odometry is over the step.
     """
-    count, (low, high) = len(poses) - 1, np.quantile(s.z[:, :2], WELL_INSIDE, axis=0)
-    missed = np.zeros((2, count), int)
-    for step in (1, 2, 3, -1, -2, -3):
-        rows = np.flatnonzero((s.row + step >= 0) & (s.row + step <= count))
-        there = se2.compose(se2.between(poses[s.row[rows] + step], poses[s.row[rows]]), s.z[rows])
-        inside = rows[((low < there[:, :2]) & (there[:, :2] < high)).all(axis=1)]
-        crossed = s.row[inside] + np.arange(min(step, 0), max(step, 0))[:, None]
-        missed[int(step < 0)] += np.bincount(crossed.ravel(), minlength=count)
-    return np.flatnonzero((_spanning(first, second, count) == 0) & (missed.min(axis=0) > 1)
-                          & (missed.sum(axis=0) >= MIN_MISSED))
+    agreeing = (pairs.span <= max(SOON)) & (pairs.squared < GATE)
+    later = sum(_due(s, poses, offset) for offset in SOON)
+    earlier = sum(_due(s, poses, -offset) for offset in SOON)
+    missed = (np.minimum(later, earlier) > 1) & (later + earlier >= MIN_MISSED)
+    return np.flatnonzero(missed & (pairs.over(agreeing) == 0))
 
 
-def _jump(s, drive, k):
-    """The jump (3,) between the frames k and k + 1, its covariance or None, its gain.
+def _due(s, poses, offset):
+    """Numbers (f-1,) of sightings that are due again `offset` frames later, over each step.
 
-    Also whether it is told: without the pair that gains most.
+    They are due if their markers are then well inside the field of view.
     """
-    before = np.flatnonzero((s.row[:-1] <= k) & (k < s.row[1:]) & (s.marker[:-1] == s.marker[1:]))
-    rows = np.concatenate([[before - i, before + 1 + i] for i in range(PAIRS)], axis=1)
-    rows = rows[:, (rows[0] >= 0) & (rows[1] < len(s.row))]
-    rows = rows[:, s.marker[rows[0]] == s.marker[rows[1]]]
-    rows = rows[:, np.argsort(s.row[rows[1]] - s.row[rows[0]], kind="stable")[:NEAREST]]
-    if not rows.size:
-        return np.zeros(3), None, 0.0, False
-    move, Q = drive.motions([k], [k + 1])
-    (z, C), later = (se2.compose_uncertain(
-        *drive.motions(np.full(len(each), end), s.row[each]), s.z[each], s.C[each])
-        for each, end in zip(rows, (k, k + 1)))
-    later, first = se2.compose_uncertain(move, 0 * Q, *later), np.arange(rows.shape[1])
-    found = robust_increments(*map(np.concatenate, zip((z, C), later)), 0 * first, first,
-                              first + len(first), 1)
-    jump, covariance = found.increment[0], found.covariance[0]
-    expected = [se2.compose_uncertain(each, Q, *later) for each in (np.zeros(3), jump)]
-    gain = np.subtract(*(_cost(se2.squared_distances(z, each, C + W)) for each, W in expected))
-    if not found.usable[0] or np.trace(covariance[:2, :2]) > MAX_VARIANCE:
-        return np.zeros(3), None, 0.0, False
-    return jump, covariance, gain.sum(), gain.sum() - gain.max() > MIN_GAIN
+    low, high = np.quantile(s.z[:, :2], WELL_INSIDE, axis=0)
+    count = len(poses) - 1
+    frame = np.clip(s.row + offset, 0, count)
+    place = se2.compose(se2.between(poses[frame], poses[s.row]), s.z)[:, :2]
+    inside = ((low < place) & (place < high)).all(axis=1)
+    due = inside & (frame == s.row + offset)
+    begin = np.minimum(s.row, frame)[due]
+    steps = begin + np.arange(abs(offset))[:, None]
+    return np.bincount(steps.ravel(), minlength=count)
+
+
+def _dead(ticks, frame, contradicted):
+    """Steps in which a wheel is dead.
+
+    It counts nothing there, in a run of zeros in which half of the steps are in `contradicted`.
+    """
+    dead = [_in_dead_run(count == 0, frame, contradicted) for count in ticks.T]
+    return np.flatnonzero(_rows_in_steps(np.any(dead, axis=0), frame) > 0)
+
+
+def _in_dead_run(zero, frame, contradicted):
+    """True (n,) in the runs of `zero` (n,) that the markers contradict in half of their steps."""
+    run = np.cumsum(~zero)                                  # a run has one number
+    silent = _rows_in_steps(zero, frame) == np.diff(frame)
+    wrong = silent & np.isin(np.arange(len(silent)), contradicted)
+    run_of_step = run[frame[1:]]
+    silent_steps = np.bincount(run_of_step, silent, len(zero) + 1)
+    wrong_steps = np.bincount(run_of_step, wrong, len(zero) + 1)
+    dead = (wrong_steps > 0) & (2 * wrong_steps >= silent_steps)
+    return zero & dead[run]
+
+
+def _rows_in_steps(rows, frame):
+    """Number (f-1,) of encoder rows in each step of which a mask (n,) is true."""
+    return np.diff(odometry.cumulative(rows)[frame + 1])
+
+
+@dataclass(frozen=True)
+class _Jump:
+    """What sightings tell of a jump in a step."""
+
+    step: int
+    by_odometry: np.ndarray  # (3,) increment
+    motion: np.ndarray       # (3,) J
+    variance: np.ndarray     # (2,) of J, m^2 and rad^2
+    sigma: np.ndarray        # (3,) of J without these sightings
+    gain: float              # by J instead of the identity
+    found: bool              # so also without the pair of sightings that gains most
+
+    @property
+    def increment(self):
+        """J O, (3,), the increment by the sightings."""
+        return se2.compose(self.motion, self.by_odometry)
+
+
+def _bridged(s, drive, suspects, rank, unknown):
+    """List of the _Jump of each suspect, by their `rank` (f-1,), as if those before it were right.
+
+    Steps in `unknown` are jumps even if the markers do not tell how long they are; their standard
+    deviations (3,) are then those in it.
+    """
+    steps = np.union1d(suspects, list(unknown)).astype(int)
+    steps = steps[np.argsort(rank[steps], kind="stable")]
+    usual = _usual(drive)
+    drive = drive.with_variance(steps, UNKNOWN_SIGMA[1:]**2)
+    tried = []
+    for i, k in enumerate(steps):
+        if rank[k] > -np.inf:                    # all pairs that tell of it may be over others, too
+            drive = drive.with_variance(steps[i:], _place_and_turn(usual**2))
+        without = drive.with_variance(k, 0.0)
+        jump = _tried(s, without, k, unknown.get(k))
+        tried.append(jump)
+        if jump.found:
+            drive = without.with_jump(jump)
+        elif jump.gain <= MIN_GAIN:              # else one pair, maybe a wrong label
+            drive = without
+    return tried
+
+
+def _tried(s, drive, step, unknown):
+    """The _Jump in a step by Sightings, which is found if they tell it.
+
+    Where they do not, the motion is that of odometry, with the sigma `unknown` (3,). The jump is
+    then found if this is given.
+    """
+    move = drive.motions([step], [step + 1])
+    sigma = UNKNOWN_SIGMA if unknown is None else unknown
+    untold = _Jump(step, move.mean[0], motion=np.zeros(3), variance=_place_and_turn(sigma**2),
+                   sigma=sigma, gain=0.0, found=unknown is not None)
+    before, after = _around(s, step)
+    seen = drive.seen_from(step, s, before)
+    exact = replace(move, covariance=np.zeros((1, 3, 3)))
+    later = exact.then(drive.seen_from(step + 1, s, after))
+    first = np.arange(len(before))
+    found = robust_increments(
+        np.concatenate([seen.mean, later.mean]),
+        np.concatenate([seen.covariance, later.covariance]),
+        np.zeros_like(first), first, first + len(first), 1)
+    variance = _place_and_turn(np.diagonal(found.covariance[0]))
+    if not found.usable[0] or variance[0] > MAX_VARIANCE:
+        return untold
+
+    def cost(motion):
+        expected = replace(move, mean=motion).then(later)
+        return _cost(seen.squared_distances(expected))
+
+    motion = found.increment[0]
+    gain = cost(np.zeros(3)) - cost(motion)
+    others = gain.sum() - gain.max()
+    return replace(untold, motion=motion, variance=variance, sigma=_sigma_of(motion),
+                   gain=gain.sum(), found=untold.found or others > MIN_GAIN)
+
+
+def _place_and_turn(variance):
+    """Variances (2,) of place and turn, by those of x, y and heading (3,)."""
+    return np.array([variance[0] + variance[1], variance[2]])
+
+
+def _around(s, step):
+    """Rows (2, m) of sightings before a step, and of others of the same markers after it.
+
+    Of each marker the last PAIRS before it and the first ones after it; in all the NEAREST.
+    """
+    spans = (s.row[:-1] <= step) & (step < s.row[1:])
+    last = np.flatnonzero(spans & (s.marker[:-1] == s.marker[1:]))
+    pairs = np.concatenate([[last - i, last + 1 + i] for i in range(PAIRS)], axis=1)
+    exists = (pairs[0] >= 0) & (pairs[1] < len(s.row))
+    pairs = pairs[:, exists]
+    same = s.marker[pairs[0]] == s.marker[pairs[1]]
+    pairs = pairs[:, same]
+    span = s.row[pairs[1]] - s.row[pairs[0]]
+    return pairs[:, np.argsort(span, kind="stable")[:NEAREST]]

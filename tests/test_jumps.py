@@ -1,5 +1,6 @@
 """Increments of odometry that contradict the markers: found, freed, bridged and told."""
 
+import logging
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from slamlib.core.evaluation import ate, nees
 from slamlib.core.odometry import dead_reckoning
 from slamlib.core.records import ArucoReadings, Dataset
 from slamlib.core.sightings import sightings_by_frame
-from slamlib.robust import jumps as gate
+from slamlib.robust import jumps
 from slamlib.robust.fused import fuse
 from slamlib.robust.solution_doubts import _of_encoder, solution_doubts
 from slamlib.studies.simulation import TABLE_2, manoeuvre, simulate
@@ -36,21 +37,21 @@ def test_the_score_of_two_sightings_by_hand():
     """A marker 1 m ahead seems 0.1 m nearer; turns of the vehicle do not move it along x."""
     dataset = seen(np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]), MARKERS[:1])
     s = sightings_by_frame(dataset.aruco)
-    drive = gate._Drive.without_jumps(np.zeros((2, 3)), TABLE_2.wheelbase)
-    first, second, squared = gate._compared(s, drive)
-    assert (first, second) == (0, 1)
-    np.testing.assert_allclose(squared, 0.1**2 / (2 * 1e-4 + gate.FLOOR**2), rtol=1e-9)
+    drive = jumps._Drive.without_jumps(np.zeros((2, 3)), TABLE_2.wheelbase)
+    pairs = jumps._compared(s, drive)
+    assert (pairs.first, pairs.second) == (0, 1)
+    np.testing.assert_allclose(pairs.squared, 0.1**2 / (2 * 1e-4 + jumps.FLOOR**2), rtol=1e-9)
 
 
 def test_the_noise_of_motions_by_hand():
     """Half a metre straight on, and 60 degrees on the spot, whose lever arm is that of a camera."""
     path = np.array([[0, 0, 0], [0.3, 0.4, 0], [0.3, 0.4, np.pi / 3]])
-    drive = gate._Drive.without_jumps(path, 0.4)
-    (straight, spot), floor = drive.motions([0, 1], [1, 2])[1], gate.FLOOR**2
-    turn = 2 * 0.5 * (gate.SLIP / 0.4)**2 + floor
+    drive = jumps._Drive.without_jumps(path, 0.4)
+    (straight, spot), floor = drive.motions([0, 1], [1, 2]).covariance, jumps.FLOOR**2
+    turn = 2 * 0.5 * (jumps.SLIP / 0.4)**2 + floor
     across = turn * 0.5**2 / 3 + floor
-    np.testing.assert_allclose(straight, np.diag([across + 0.5 * gate.SLIP**2 / 2, across, turn]))
-    np.testing.assert_allclose(spot, np.diag([gate.LEVER**2 + floor] * 2 + [floor]))
+    np.testing.assert_allclose(straight, np.diag([across + 0.5 * jumps.SLIP**2 / 2, across, turn]))
+    np.testing.assert_allclose(spot, np.diag([jumps.LEVER**2 + floor] * 2 + [floor]))
 
 
 def test_a_jump_of_a_vehicle_that_stands_is_found_where_it_is():
@@ -58,13 +59,31 @@ def test_a_jump_of_a_vehicle_that_stands_is_found_where_it_is():
     poses = np.zeros((12, 3))
     poses[4:] = [0.4, 0.3, 0.5]
     poses[9:] = [-0.2, 0.3, 0.5]
-    found = gate.find_jumps(seen(poses))
+    found = jumps.find_jumps(seen(poses))
     assert found.start.tolist() == [3, 8] and found.end.tolist() == [4, 9]
     np.testing.assert_allclose(
         found.increment, se2.between(poses[[3, 8]], poses[[4, 9]]), atol=1e-6)
     np.testing.assert_allclose(found.by_odometry, 0)
     np.testing.assert_allclose(found.sigma, [[0.5, 0.5, 0.5], [0.6, 0.6, 0.1]], atol=1e-6)
     np.testing.assert_allclose(found.mended(np.arange(12), np.zeros((12, 3))), poses, atol=1e-6)
+
+
+def test_each_jump_that_is_found_is_logged_with_its_numbers(caplog):
+    """In one line, with poses as the files count them."""
+    poses = np.zeros((12, 3))
+    poses[4:] = [0.4, 0.3, -0.5]
+    with caplog.at_level(logging.INFO, "slamlib.robust.jumps"):
+        jumps.find_jumps(seen(poses))
+    record, = caplog.records
+    line, gain, sigma = record.message.rsplit(", ", 2)
+    assert line == ("jump between poses 4 and 5: markers and odometry differ by 0.500 m and "
+                    "0.500 rad")
+    assert float(gain.removeprefix("gain ")) > jumps.MIN_GAIN and sigma == "sigma 0.5 m"
+    assert record.levelno == logging.INFO
+    caplog.clear()
+    with caplog.at_level(logging.INFO, "slamlib.robust.jumps"):
+        jumps.find_jumps(seen(np.zeros((12, 3))))
+    assert not caplog.records
 
 
 def test_a_jump_is_where_most_contradicting_pairs_span_it():
@@ -74,7 +93,7 @@ def test_a_jump_is_where_most_contradicting_pairs_span_it():
     dataset = seen(poses, markers)
     a = dataset.aruco
     in_room = a.pose // 10 % 2 == a.marker // 3
-    found = gate.find_jumps(replace(dataset, aruco=replace(a, **{
+    found = jumps.find_jumps(replace(dataset, aruco=replace(a, **{
         name: getattr(a, name)[in_room] for name in (
             "pose", "marker", "marker_in_vehicle", "covariance")})))
     np.testing.assert_allclose(found.mended(np.arange(40), np.zeros((40, 3))), poses, atol=1e-6)
@@ -83,29 +102,30 @@ def test_a_jump_is_where_most_contradicting_pairs_span_it():
 def test_shares_of_a_jump_by_hand():
     """A jump in one of four steps; of the steps 3, 4, 5 and 6 the second has a spike."""
     jump = np.array([[0.4, 0.0, 0.2]])
-    jumps = gate.Jumps(start=np.array([2]), end=np.array([6]), increment=jump,
-                  by_odometry=np.zeros((1, 3)), sigma=np.array([[0.4, 0.4, 0.2]]),
-                  chance=np.arange(9.0))
+    found = jumps.Jumps(start=np.array([2]), end=np.array([6]), increment=jump,
+                        by_odometry=np.zeros((1, 3)), sigma=np.array([[0.4, 0.4, 0.2]]),
+                        chance=np.arange(9.0))
     start, end = np.array([0, 2, 3, 0, 6]), np.array([2, 3, 6, 8, 8])
-    np.testing.assert_allclose(jumps.share(start, end)[:, 0], [0, 0.25, 0.75, 1, 0])
-    motion, covariance = jumps.added(start[1:2], end[1:2])
+    np.testing.assert_allclose(found.share(start, end)[:, 0], [0, 0.25, 0.75, 1, 0])
+    motion, covariance = found.added(start[1:2], end[1:2])
     np.testing.assert_allclose(motion, jump / 4)
     np.testing.assert_allclose(covariance, np.diag([0.04, 0.04, 0.01])[None])
-    spike = replace(jumps, chance=np.cumsum([1, 1, 1, 1, 1e6, 1, 1, 1, 1]))
+    spike = replace(found, chance=np.cumsum([1, 1, 1, 1, 1e6, 1, 1, 1, 1]))
     np.testing.assert_allclose(spike.share(start, end)[:, 0], [0, 0, 1, 1, 0], atol=1e-5)
-    assert not gate.NO_JUMPS.added(start, end)[1].any() and not gate.NO_JUMPS.are_few
+    assert not jumps.NO_JUMPS.added(start, end)[1].any() and not jumps.NO_JUMPS.are_few
     steps, every = np.arange(3), {"increment": jump[[0] * 3], "by_odometry": 0 * jump[[0] * 3]}
-    three = replace(jumps, start=steps, end=steps + 1, sigma=jump[[0] * 3], **every)
+    three = replace(found, start=steps, end=steps + 1, sigma=jump[[0] * 3], **every)
     assert not three.are_few                 # as by a poor sensor, unless each is at a spike
-    assert replace(three, chance=gate.SPIKE_CHANCE * np.arange(9.0)).are_few
+    assert replace(three, chance=jumps.SPIKE_CHANCE * np.arange(9.0)).are_few
 
 
 def test_suspects_by_hand():
     """Of the pairs of each step only those at its two frames are asked, if there are any."""
     first, second = np.array([0, 1, 1, 2, 3, 3, 1]), np.array([1, 2, 2, 4, 5, 5, 3])
-    suspects, rank = gate._suspects(first, second, np.array([1.0, 99, 1, 99, 1, 1, 99]), 5)
-    assert suspects.tolist() == [1, 2]
-    assert rank.tolist() == [-np.inf, -np.inf, -2, -1, 0]
+    squared = np.array([1.0, 99, 1, 99, 1, 1, 99])
+    pairs = jumps._Pairs(first, second, squared, 5)
+    assert jumps._suspects(pairs).tolist() == [1, 2]
+    assert jumps._rank(pairs).tolist() == [-np.inf, -np.inf, -2, -1, 0]
 
 
 @pytest.mark.parametrize("contradicted, dead", [
@@ -114,28 +134,28 @@ def test_a_dead_wheel_by_hand(contradicted, dead):
     """Zeros from row 10 to 26; of the other wheel from 35 on: steps 2 to 4 and 7 are silent."""
     ticks, frame = np.ones((41, 2), int), np.arange(0, 41, 5)
     ticks[10:27, 0] = ticks[35:, 1] = 0
-    assert gate._dead(ticks, frame, contradicted).tolist() == dead
+    assert jumps._dead(ticks, frame, contradicted).tolist() == dead
 
 
 @pytest.mark.parametrize("breaks, dead, sigma", [
-    ([3], [], gate.UNKNOWN_SIGMA), ([], [3], [0.4, 0.4, 0.3]), ([], [], None)])
+    ([3], [], jumps.UNKNOWN_SIGMA), ([], [3], [0.4, 0.4, 0.3]), ([], [], None)])
 def test_where_no_marker_tells_a_jump_is_as_long_as_motions_are(breaks, dead, sigma):
     """Steps of 0.2 m and 0.15 rad, the last one longer; without a reason there is no jump."""
     poses = dead_reckoning(manoeuvre([(2.2, 1.65)]), TABLE_2, model="arc")[np.r_[:201:20, 220]]
-    drive = gate._Drive.without_jumps(poses, TABLE_2.wheelbase)
-    found, _ = gate._bridged(sightings_by_frame(None), drive, [3], breaks, np.zeros(11), dead)
-    if sigma is None:
-        assert not found
-    else:
-        (k, increment, by_odometry, found_sigma), = found
-        np.testing.assert_allclose(found_sigma, sigma, rtol=1e-2)
-        np.testing.assert_allclose(by_odometry, se2.between(poses[3], poses[4]))
-        assert k == 3 and (increment == by_odometry).all()
+    drive = jumps._Drive.without_jumps(poses, TABLE_2.wheelbase)
+    unknown = dict.fromkeys(dead, 2 * jumps._usual(drive)) | dict.fromkeys(
+        breaks, jumps.UNKNOWN_SIGMA)
+    jump, = jumps._bridged(sightings_by_frame(None), drive, [3], np.zeros(11), unknown)
+    assert jump.found == (sigma is not None)
+    if jump.found:
+        np.testing.assert_allclose(jump.sigma, sigma, rtol=1e-2)
+        np.testing.assert_allclose(jump.by_odometry, se2.between(poses[3], poses[4]))
+        assert jump.step == 3 and (jump.increment == jump.by_odometry).all()
 
 
 def test_one_frame_or_none_has_no_jump():
     for frames in (0, 1, 2):
-        assert not len(gate.find_jumps(seen(np.zeros((frames, 3)))).start)
+        assert not len(jumps.find_jumps(seen(np.zeros((frames, 3)))).start)
 
 
 def errors(result, truth):
@@ -209,14 +229,14 @@ def test_where_all_markers_change_the_later_covariance_is_that_of_not_knowing(cl
     dataset = replace(dataset, aruco=replace(
         aruco, marker=aruco.marker + 1000 * (aruco.pose > BREAK)))
     result = estimate(dataset.without("uwb"))
-    assert (result.jumps.sigma == gate.UNKNOWN_SIGMA).all() and len(result.jumps.start) == 1
+    assert (result.jumps.sigma == jumps.UNKNOWN_SIGMA).all() and len(result.jumps.start) == 1
     sigma = np.sqrt(result.covariances[:, 0, 0])
     assert sigma[BREAK] < 0.1 and sigma[BREAK + 20] > 5
     assert any("all markers change at once" in doubt.sentence for doubt in solution_doubts(result))
 
 
 @pytest.mark.parametrize("stated", [0, 4, 14])
-def test_sightings_that_are_late_are_no_jumps_and_start_at_their_delay(stated):
+def test_sightings_that_are_late_are_no_jumps_and_start_at_their_delay(stated, caplog):
     """Ten poses, on lanes 1.5 m long with sharp turns between them, at which most are wrong."""
     rng, vehicle = np.random.default_rng(0), replace(TABLE_2, sighting_lag=stated)
     turn = np.repeat([0, 1, 0, -1] * 3, [150, 40] * 6)[:, None] * [1, -1]
@@ -231,8 +251,11 @@ def test_sightings_that_are_late_are_no_jumps_and_start_at_their_delay(stated):
     aruco = ArucoReadings(frame[row], marker, z[near] + 0.01 * rng.standard_normal((near.sum(), 3)),
                           np.tile(1e-4 * np.eye(3), (near.sum(), 1, 1)))
     drive = Dataset("lanes", vehicle, ticks, aruco, None, None)
-    jumps = gate.find_jumps(drive)
-    assert jumps.lag == 10 - stated and not len(jumps.start)
+    with caplog.at_level(logging.INFO, "slamlib.robust.jumps"):
+        before = jumps.find_jumps(drive)
+    assert before.lag == 10 - stated and not len(before.start)
+    told = [record.message.partition(":")[0] for record in caplog.records]
+    assert told == [f"sightings seem {before.lag} poses later than stated"]
     found = estimate(drive)
     lag, = (row for row in found.calibration_table if row["name"] == "sighting_lag")
     assert found.released == {"time-offset"} and abs(lag["estimate"] - 10) < 4 * lag["sigma"] < 0.5
@@ -250,7 +273,7 @@ def test_no_jump_in_clean_drives(path, seeds, options):
         late = replace(a, pose=np.minimum(a.pose + 8, len(dataset.ticks) - 1))
         points = (as_points(a, slice(None)),) * ("mislabelled" not in options)
         for aruco in (a, replace(a, covariance=a.covariance / 16), late, *points):
-            assert not len(gate.find_jumps(replace(dataset, aruco=aruco)).start)
+            assert not len(jumps.find_jumps(replace(dataset, aruco=aruco)).start)
 
 
 def test_turns_on_the_spot_under_a_camera_that_looks_ahead_are_no_breaks():
@@ -264,15 +287,15 @@ def test_turns_on_the_spot_under_a_camera_that_looks_ahead_are_no_breaks():
         (0.2 < z[..., 0]) & (z[..., 0] < 1.9) & (np.abs(z[..., 1]) < 0.4 + 0.4 * z[..., 0]))
     aruco = ArucoReadings(pose[row], marker, z[row, marker], np.tile(
         1e-4 * np.eye(3), (len(row), 1, 1)))
-    assert not len(gate.find_jumps(Dataset("turns", TABLE_2, ticks, aruco, None, None)).start)
+    assert not len(jumps.find_jumps(Dataset("turns", TABLE_2, ticks, aruco, None, None)).start)
 
 
 def test_the_doubt_names_three_stretches_and_counts_the_others():
     poses = np.zeros((300, 3))
     poses[:, 0] = 0.3 * (np.arange(300) // 50 % 2)
-    result = type("result", (), {"jumps": gate.find_jumps(seen(poses))})
+    result = type("result", (), {"jumps": jumps.find_jumps(seen(poses))})
     sentence, = (sentence for _, sentence in _of_encoder(result))
     assert "between poses 50 and 51 the vehicle moved by 0.00 m and 0 degrees, but the markers " \
         "say 0.30 m and 0 degrees, which ends 0.30 m" in sentence
     assert sentence.count("between") == 3 and "and 2 more times" in sentence
-    assert not list(_of_encoder(type("result", (), {"jumps": gate.NO_JUMPS})))
+    assert not list(_of_encoder(type("result", (), {"jumps": jumps.NO_JUMPS})))
