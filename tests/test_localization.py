@@ -5,7 +5,7 @@ import pytest
 from numeric import as_points, central_differences, decided, map_nees, wheel_nees
 
 from slamlib import fuse, fuse_increments, localize, studies
-from slamlib.core import odometry, se2
+from slamlib.core import increments, odometry, se2
 from slamlib.core.evaluation import anees, ate, nees, nees_band
 from slamlib.core.odometry import dead_reckoning
 from slamlib.core.records import ArucoReadings, Dataset
@@ -212,6 +212,32 @@ def test_without_markers_it_is_the_first_order_propagation():
     np.testing.assert_allclose(fused.covariances, covariances, atol=1e-5 * covariances[-1].max())
 
 
+@pytest.mark.parametrize("slip", [None, 2e-3])
+def test_a_dataset_without_markers_is_fused_to_odometry(slip):
+    """Arcs from the first frame on, and the first-order propagation with the noise of slip."""
+    dataset = simulate("short", seed=5)[0].without("aruco")
+    ticks, vehicle = dataset.ticks, dataset.vehicle
+    poses, covariances = odometry.first_order(ticks, vehicle, model="arc")
+    fused, pose = fuse(dataset, slip), np.arange(len(ticks))
+    np.testing.assert_allclose(fused.poses, poses, atol=1e-9)
+    rounding, slipping = increments.noise_in_drive(ticks, vehicle, 0 * pose, pose)
+    expected = covariances + rounding + fused.slip**2 * slipping
+    np.testing.assert_allclose(fused.covariances, expected, atol=1e-12)
+    assert fused.rejected == 0 and np.isclose(fused.slip, slip or increments.TYPICAL_SLIP)
+    np.testing.assert_array_equal(fused.wheel, vehicle.wheel)
+    np.testing.assert_allclose(fused.wheel_covariance, np.diag(vehicle.sigma_wheel**2))
+
+
+@pytest.mark.parametrize("propagation", [odometry.equation2, odometry.first_order])
+def test_the_hint_without_markers_is_the_propagation_of_the_whole_drive(propagation):
+    dataset = simulate("short", seed=5)[0].without("aruco")
+    poses, covariances = propagation(dataset.ticks, dataset.vehicle)
+    hint = fuse_increments(dataset, propagation)
+    np.testing.assert_array_equal(hint.poses, poses)
+    np.testing.assert_array_equal(hint.covariances, covariances)
+    assert hint.rejected == 0
+
+
 @pytest.mark.slow
 def test_slip_is_learned_although_the_encoder_is_coarse():
     """500 counts a revolution, a frame every 10 cm: rounding is as large as slip between frames.
@@ -254,7 +280,7 @@ def test_the_likelihood_of_the_innovations_by_hand():
         z[1] += off
         aruco = ArucoReadings(np.array([0, 5]), np.array([7, 7]), z, C)
         dataset = Dataset("still", TABLE_2, np.zeros((6, 2), int), aruco, None, None)
-        state = fused._filter(fused._filter_input(dataset, TABLE_2), 1e-3)[2]
+        state = fused._filter(fused._filter_input(dataset, TABLE_2), 1e-3)[-1]
         v = np.array([*off[:2], se2.wrap(off[2])])
         squared = min(v @ np.linalg.solve(S, v), GATE)
         assert np.isclose(state.log_likelihood, -(squared + np.linalg.slogdet(S)[1]) / 2)
@@ -267,7 +293,7 @@ def test_the_slip_that_is_learned_has_the_greatest_density(slip):
     dataset, _ = simulate("short", seed=3, slip=slip)
     given = fused._filter_input(dataset, dataset.vehicle)
     found = fused._likeliest_slip(given)
-    log_density = [fused._filter(given, each)[2].log_likelihood
+    log_density = [fused._filter(given, each)[-1].log_likelihood
                    - (np.log(each / 1e-3) / np.log(3))**2 / 2
                    for each in (0.8 * found, found, 1.2 * found)]
     assert np.argmax(log_density) == 1

@@ -5,14 +5,16 @@ class DatasetError(ValueError):
     """A dataset does not follow the format; one sentence names file, line and expectation."""
 
 
-def require(ok, source, expected, found=None):
+def require(ok: bool, source: str, expected: str, found: object = None) -> None:
     """Raise DatasetError about a source, a file with its line or an argument, unless it is `ok`."""
     if not ok:
         told = "" if found is None else f", found {quoted(found)}"
         raise DatasetError(f"{source}: expected {expected}{told}")
 
 
-def quoted(value):
+def quoted(value: object) -> str:
     """The first 60 characters (str) of a value, in quotes."""
     text = str(value)
-    return repr(text if len(text) <= 60 else text[:60] + "...")
+    if len(text) > 60:
+        text = text[:60] + "..."
+    return repr(text)

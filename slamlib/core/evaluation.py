@@ -17,25 +17,30 @@ from slamlib.core.se2 import sigmas
 REACH_95 = float(np.sqrt(-2 * np.log(0.05)))    # sigmas, of the 95 % ellipse of a planar Gaussian
 
 
-def path_length(poses):
+def path_length(poses: np.ndarray) -> float:
     """Sum in m of the distances between consecutive known poses (n, >= 2)."""
-    known = poses[np.isfinite(poses[:, 0]), :2]
-    return float(np.hypot(*np.diff(known, axis=0).T).sum())
+    known = np.isfinite(poses[:, 0])
+    steps = np.diff(poses[known, :2], axis=0)
+    return float(np.linalg.norm(steps, axis=1).sum())
 
 
-def align(poses, truth):
+def align(poses: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """Motion T (3,) of SE(2) for which compose(T, poses) is closest to the truth.
 
     Least squares of the positions, Horn's problem in the plane (J. Opt. Soc. Am. A 4(4), 1987): the
     cross and dot products of the centred positions give the rotation. Both are (n, >= 2), finite.
     """
-    mean, true_mean = poses[:, :2].mean(0), truth[:, :2].mean(0)
-    p, q = poses[:, :2] - mean, truth[:, :2] - true_mean
-    turn = np.arctan2(np.sum(p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]), np.sum(p * q))
-    return np.append(true_mean - se2.rotation(turn) @ mean, turn)
+    mean = poses[:, :2].mean(axis=0)
+    true_mean = truth[:, :2].mean(axis=0)
+    p = poses[:, :2] - mean
+    q = truth[:, :2] - true_mean
+    cross = p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
+    turn = np.arctan2(np.sum(cross), np.sum(p * q))
+    shift = true_mean - se2.rotation(turn) @ mean
+    return np.append(shift, turn)
 
 
-def ate(poses, truth, aligned=False):
+def ate(poses: np.ndarray, truth: np.ndarray, aligned: bool = False) -> float:
     """Absolute trajectory error: root mean square in m of the position errors.
 
     Poses that are NaN are left out; the result is NaN if all are. With `aligned` the poses are
@@ -45,35 +50,39 @@ def ate(poses, truth, aligned=False):
     >>> round(ate(poses, truth), 3)
     3.536
     """
-    poses, truth = np.asarray([poses, truth], dtype=float)
     known = np.isfinite(poses).all(axis=1)
-    poses, truth = poses[known], truth[known]
+    poses = poses[known]
+    truth = truth[known]
     if not len(poses):
         return np.nan
     if aligned:
         poses = se2.compose(align(poses, truth), poses)
-    return float(np.sqrt(np.mean(np.sum((poses[:, :2] - truth[:, :2])**2, axis=1))))
+    error = poses[:, :2] - truth[:, :2]
+    squared = np.sum(error**2, axis=1)
+    return float(np.sqrt(np.mean(squared)))
 
 
-def nees(poses, covariances, truth):
+def nees(poses: np.ndarray, covariances: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """Normalized estimation error squared e^T C^-1 e of every pose, (n,).
 
     It is chi-squared with 3 degrees of freedom, so 3 on average, if the errors are Gaussian with
     covariance C. It is NaN where C is singular, as for a known pose, and without an estimate.
     """
-    poses, truth = np.asarray([poses, truth], dtype=float)
-    result, ok = np.full(len(poses), np.nan), se2.regular(covariances)
+    ok = se2.regular(covariances)
+    result = np.full(len(poses), np.nan)
     result[ok] = se2.squared_distances(poses[ok], truth[ok], covariances[ok])
     return result
 
 
-def anees(poses, covariances, truth):
+def anees(poses: np.ndarray, covariances: np.ndarray, truth: np.ndarray) -> float:
     """Average NEES over the poses that have one; NaN if none has."""
     values = nees(poses, covariances, truth)
-    return float(np.nanmean(values)) if np.isfinite(values).any() else np.nan
+    if not np.isfinite(values).any():
+        return np.nan
+    return float(np.nanmean(values))
 
 
-def nees_band(count, dof=3, probability=0.95):
+def nees_band(count: int, dof: int = 3, probability: float = 0.95) -> tuple[float, float]:
     """Two-sided band (low, high) that contains the mean of `count` independent NEES.
 
     The sum of the NEES is chi-squared with count * dof degrees of freedom; the mean lies in the
@@ -83,9 +92,11 @@ def nees_band(count, dof=3, probability=0.95):
     array([1.55, 4.92])
     """
     tail = (1 - probability) / 2
-    return tuple(chdtri(dof * count, [1 - tail, tail]) / count)
+    low = chdtri(dof * count, 1 - tail)
+    high = chdtri(dof * count, tail)
+    return low / count, high / count
 
 
-def position_sigmas(covariances):
+def position_sigmas(covariances: np.ndarray) -> np.ndarray:
     """The larger standard deviation of x and y (n,), of covariances (n, >= 2, >= 2)."""
     return sigmas(covariances)[:, :2].max(axis=1)

@@ -10,8 +10,8 @@ all increments, consecutive marker increments share sightings, and equation 2 ha
 `robust.fused` counts shared errors once and learns the slip.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
@@ -34,27 +34,40 @@ class Fusion:
     wheel_covariance: np.ndarray | None = None  # (3, 3) m^2
 
 
-def fuse_increments(dataset, propagation=odometry.equation2):
+def fuse_increments(dataset: Dataset, propagation: Callable = odometry.equation2) -> Fusion:
     """Fusion for problem 2 as the assignment suggests: equation 2 restarts at every fused frame.
 
-    Where markers give no increment, odometry alone is used. `propagation` is `odometry.equation2`,
-    or `odometry.first_order` with all correlations between two frames.
+    Where markers give no increment, odometry alone is used; without markers that is the propagation
+    of the whole drive. `propagation` is `odometry.equation2`, or `odometry.first_order` with all
+    correlations between two frames.
     """
     require(isinstance(dataset, Dataset), "fuse_increments", "a Dataset", dataset)
-    ticks, vehicle = dataset.ticks, dataset.vehicle
+    ticks = dataset.ticks
+    vehicle = dataset.vehicle
     sightings = sightings_by_frame(dataset.sightings, extra_frames=[0])
     found = consecutive_increments(sightings)
-    poses, covariances = np.zeros((len(ticks), 3)), np.zeros((len(ticks), 3, 3))
+    edge = np.append(sightings.frame, len(ticks) - 1)
+    usable = np.append(found.usable, False)                  # no frame follows the last one
+    poses = np.zeros((len(ticks), 3))
+    covariances = np.zeros((len(ticks), 3, 3))
     covariances[0, 2, 2] = vehicle.sigma_heading**2
-    for k, (start, end) in enumerate(pairwise([*sightings.frame, len(ticks) - 1])):
-        part, pose, C = slice(start, end + 1), poses[start], covariances[start]
+    for k, start in enumerate(sightings.frame):
+        end = edge[k + 1]
+        part = slice(start, end + 1)
+        pose = poses[start]
+        C = covariances[start]
         poses[part], covariances[part] = propagation(ticks[part], vehicle, pose, C)
-        if k < len(found.usable) and found.usable[k]:
+        if usable[k]:
             deltas, C_deltas = propagation(ticks[part], vehicle, np.zeros(3), np.zeros((3, 3)))
-            gain = C_deltas[-1] @ np.linalg.inv(C_deltas[-1] + found.covariance[k])
+            C_m = found.covariance[k]
+            gain = C_deltas[-1] @ np.linalg.inv(C_deltas[-1] + C_m)
             delta = deltas[-1] + gain @ se2.difference(found.increment[k], deltas[-1])
-            poses[end], covariances[end] = se2.compose_uncertain(
-                pose, C, delta, gain @ found.covariance[k])
-    used = np.union1d(*(r[found.accepted] for r in (found.first, found.second)))
-    return Fusion(poses=poses, covariances=covariances,
-                  rejected=len(dataset.aruco.pose) - len(used))
+            poses[end], covariances[end] = se2.compose_uncertain(pose, C, delta, gain @ C_m)
+    common = np.stack([found.first, found.second])
+    used = np.unique(common[:, found.accepted])
+    return Fusion(poses, covariances, rejected=sighting_count(dataset) - len(used))
+
+
+def sighting_count(dataset: Dataset) -> int:
+    """Number of sightings of a Dataset, 0 without markers."""
+    return 0 if dataset.aruco is None else len(dataset.aruco.pose)

@@ -10,6 +10,7 @@ in the frame of the pose `start`; both are arrays (m,) of indices from 0. The `t
 import numpy as np
 
 from slamlib.core import odometry, se2
+from slamlib.core.vehicle import Vehicle
 
 SLIP_BOUNDS = (1e-5, 3e-2)  # sqrt(m), interval in which the slip is searched
 MINIMUM_SLIP = 1e-4         # sqrt(m), skid of an increment's end along either axis
@@ -17,16 +18,18 @@ TYPICAL_SLIP = 1e-3         # sqrt(m), median of the prior
 SLIP_FACTOR = 3.0           # its logarithm is the standard deviation of the prior of log slip
 
 
-def between_poses(ticks, vehicle, start, end, model="euler"):
+def between_poses(ticks: np.ndarray, vehicle: Vehicle, start: np.ndarray, end: np.ndarray,
+                  model: str = "euler") -> tuple[np.ndarray, np.ndarray]:
     """Increments (m, 3) by odometry, m and rad, and derivatives (m, 3, 3) by [R_R, R_L, b]."""
     poses = odometry.dead_reckoning(ticks, vehicle, model=model)
     by_w = odometry.wheel_jacobian(ticks, vehicle, model=model)
     by_start, by_end = se2.between_jacobians(poses[start], poses[end])
-    return (se2.between(poses[start], poses[end]),
-            by_start @ by_w[start] + by_end @ by_w[end])
+    increment_by_w = by_start @ by_w[start] + by_end @ by_w[end]
+    return se2.between(poses[start], poses[end]), increment_by_w
 
 
-def rounding_and_slipping(ticks, vehicle, start, end):
+def rounding_and_slipping(ticks: np.ndarray, vehicle: Vehicle, start: np.ndarray,
+                          end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Covariances of single increments by encoder rounding, and by a slip of 1 sqrt(m).
 
     Both are (m, 3, 3), of [x, y, heading] in the axes of pose `start`; no `end` may be before its
@@ -40,33 +43,66 @@ def rounding_and_slipping(ticks, vehicle, start, end):
     its differences would lose all digits some ten kilometres away. A block is as long as the
     longest increment, so that an increment lies in two blocks at most.
     """
+    start = np.asarray(start)
+    end = np.asarray(end)
     poses = odometry.dead_reckoning(ticks, vehicle, model="arc")
-    ds, dtheta, _, _ = (each[..., None] for each in odometry.steps(ticks, vehicle))
-    direction = poses[:-1, 2:] + dtheta / 2
-    start, end = np.asarray(start), np.asarray(end)
-    length = np.max(end - start, initial=1)
-    origin = poses[:max(1, len(ds)):length]
-    middle = (poses[:-1] + poses[1:]) / 2 - origin[np.arange(len(ds)) // length]
-    sides = vehicle.wheelbase / np.array([2, -2])
-    turn = 1 / (2 * sides)                                             # by e_R, by e_L
-    by_wheel = np.stack([
-        np.cos(direction) / 2 + middle[:, 1:2] * turn, np.sin(direction) / 2 - middle[:, :1] * turn,
-        np.broadcast_to(turn, (len(ds), 2))], 1)[:, None]        # d(end - S p_e turn, turn)/de
+    length = np.max(end - start, initial=1)                       # of a block, in steps
+    block = np.arange(len(poses) - 1) // length
+    origin = poses[block * length]
+    middle = (poses[:-1] + poses[1:]) / 2
+    middle[:, :2] -= origin[:, :2]
+    by_wheel = _origin_by_wheel_errors(middle, vehicle.wheelbase)
+    variance = _wheel_variances(ticks, vehicle)
+    noise = (by_wheel * variance) @ by_wheel.mT                   # (n-1, 2, 3, 3), at the origins
+    total = odometry.cumulative(noise)
+
+    def in_block(first):
+        """Noise (m, 2, 3, 3), in world axes, by steps in the blocks that begin at `first` (m,)."""
+        begin = np.clip(first, start, end)
+        stop = np.clip(first + length, start, end)
+        at_origin = total[stop] - total[begin]
+        lever = poses[end] - poses[np.minimum(first, len(poses) - 1)]
+        to_end = se2.compose_jacobians(np.zeros(3), lever[:, None])[0]       # I + [0, 0, S lever]
+        return to_end @ at_origin @ to_end.mT
+
+    first = start // length * length
+    in_world = in_block(first) + in_block(first + length)
+    in_start = se2.rotate_covariance(in_world, -poses[start, 2:])
+    count = np.maximum(end - start, 1)
+    rounding = in_start[:, 0] / count[:, None, None]
+    return rounding, in_start[:, 1]
+
+
+def _origin_by_wheel_errors(middle, wheelbase):
+    """Derivatives (s, 1, 3, 2) of a pose at the origin by e_R and e_L in steps before it.
+
+    `middle` (s, 3) are the poses in the middle of the steps.
+    """
+    x = middle[:, None, :1]
+    y = middle[:, None, 1:2]
+    heading = middle[:, None, 2:]
+    turn = np.array([1, -1]) / wheelbase
+    derivative = np.empty((len(middle), 1, 3, 2))
+    derivative[:, :, 0] = np.cos(heading) / 2 + y * turn
+    derivative[:, :, 1] = np.sin(heading) / 2 - x * turn
+    derivative[:, :, 2] = turn
+    return derivative
+
+
+def _wheel_variances(ticks, vehicle):
+    """Variances (n-1, 2, 1, 2) in m^2 of e_R and e_L, by rounding and by a slip of 1 sqrt(m)."""
+    step = odometry.steps(ticks, vehicle)
+    around = vehicle.wheelbase / 2 * step.dtheta
     metres_per_count = 2 * np.pi * vehicle.wheel[:2] / vehicle.ticks_per_revolution
-    slipped = np.abs(ds + sides * dtheta)
-    variance = np.stack([np.broadcast_to(metres_per_count**2 / 6, slipped.shape), slipped], 1)
-    total = odometry.cumulative((by_wheel * variance[:, :, None]) @ by_wheel.mT)
-    in_world = np.zeros((len(start), 2, 3, 3))
-    for block in (start // length, start // length + 1):
-        begins, ends = (np.clip(edge * length, start, end) for edge in (block, block + 1))
-        lever = poses[end] - [1, 1, 0] * origin[np.minimum(block, len(origin) - 1)]
-        to_end, _ = se2.compose_jacobians(np.zeros(3), lever[:, None])      # I + [0, 0, S lever]
-        in_world += to_end @ (total[ends] - total[begins]) @ to_end.mT
-    in_world[:, 0] /= np.maximum(end - start, 1)[:, None, None]
-    return tuple(np.moveaxis(se2.rotate_covariance(in_world, -poses[start, 2:]), 1, 0))
+    variance = np.empty((len(around), 2, 1, 2))
+    variance[:, 0, 0] = metres_per_count**2 / 6
+    variance[:, 1, 0, 0] = np.abs(step.ds + around)
+    variance[:, 1, 0, 1] = np.abs(step.ds - around)
+    return variance
 
 
-def noise_in_drive(ticks, vehicle, start, end):
+def noise_in_drive(ticks: np.ndarray, vehicle: Vehicle, start: np.ndarray,
+                   end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Noise of increments of one drive by encoder rounding, and by a slip of 1 sqrt(m).
 
     The rounding at a pose enters the increment before it and, with the opposite sign, the one after
@@ -88,10 +124,10 @@ def noise_in_drive(ticks, vehicle, start, end):
     rounding, slipping : (m, 3, 3) covariances in the axes of the increments' starts, the skid in
         `rounding`. The noise for a slip in sqrt(m) is rounding + slip^2 slipping.
     """
-    start, end = np.asarray(start), np.asarray(end)
     rounding, slipping = rounding_and_slipping(ticks, vehicle, start, end)
-    rounding *= ((end - start) / max(1, len(ticks) - 1))[:, None, None]
-    travelled = odometry.cumulative(np.abs(odometry.steps(ticks, vehicle)[0]))
+    share = np.subtract(end, start) / max(1, len(ticks) - 1)
+    travelled = odometry.cumulative(np.abs(odometry.steps(ticks, vehicle).ds))
     skid = MINIMUM_SLIP**2 * (travelled[end] - travelled[start])
-    rounding[:, [0, 1], [0, 1]] += skid[:, None]
+    along_both_axes = np.diag([1, 1, 0])
+    rounding = share[:, None, None] * rounding + skid[:, None, None] * along_both_axes
     return rounding, slipping

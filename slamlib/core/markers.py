@@ -42,7 +42,16 @@ class Localization:
     marker_covariance: np.ndarray   # (k, 3, 3) of [x, y, heading] in world axes
 
 
-def localize(aruco, shared_errors=True):
+@dataclass(frozen=True)
+class _Path:
+    """Poses of f frames, NaN where unknown, and the errors that they share with s sightings."""
+
+    poses: np.ndarray               # (f, 3)
+    covariances: np.ndarray         # (f, 3, 3)
+    H: np.ndarray                   # (s, 3, 3)
+
+
+def localize(aruco: ArucoReadings, shared_errors: bool = True) -> Localization:
     """Localization for problem 2: incremental, from the ArucoReadings alone.
 
     A frame is localized against its parent: the previous frame if the increment from it is usable,
@@ -64,42 +73,52 @@ def localize(aruco, shared_errors=True):
                            "marker at the same pose")
     increments = consecutive_increments(sightings)
     common = np.stack([increments.first, increments.second])
-    paired, confirmed = (np.isin(np.arange(len(sightings.row)), rows)
-                         for rows in (common, common[:, increments.accepted]))
-    poses, covariances, H = _composed(sightings, increments, confirmed, shared_errors)
-    used = np.flatnonzero(confirmed & np.isfinite(poses[sightings.row, 0]))
-    marker, in_world, marker_covariance = _map_markers(sightings, used, poses, covariances, H)
-    rejected, unused = np.ones(len(aruco.pose), bool), np.zeros(len(aruco.pose), bool)
-    rejected[sightings.index], unused[sightings.index] = paired & ~confirmed, ~paired
+    rows = np.arange(len(sightings.row))
+    paired = np.isin(rows, common)
+    confirmed = np.isin(rows, common[:, increments.accepted])
+    path = _composed(sightings, increments, confirmed, shared_errors)
+    known = np.isfinite(path.poses[sightings.row, 0])
+    rejected = np.ones(len(aruco.pose), bool)
+    rejected[sightings.index] = paired & ~confirmed
+    unused = np.zeros(len(aruco.pose), bool)
+    unused[sightings.index] = ~paired
+    mapped = _map_markers(sightings, confirmed & known, path)
     return Localization(
-        frame=sightings.frame, poses=poses, covariances=covariances,
-        rejected=rejected, unused=unused, marker=marker, marker_in_world=in_world,
-        marker_covariance=marker_covariance)
+        sightings.frame, path.poses, path.covariances, rejected, unused, *mapped)
 
 
 def _composed(sightings, increments, confirmed, shared_errors):
-    """Poses (f, 3) and covariances (f, 3, 3), NaN where unknown, and H (s, 3, 3) of sightings."""
-    count, table = len(sightings.frame), sightings.table()
-    poses, covariances = np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan)
+    """The _Path by MarkerIncrements from frame to frame; a lost frame is relocalized."""
+    count = len(sightings.frame)
+    table = sightings.table()
+    poses = np.full((count, 3), np.nan)
+    covariances = np.full((count, 3, 3), np.nan)
     H = np.zeros((len(sightings.row), 3, 3))
-    root = int(np.argmax([*increments.usable, False]))
-    poses[root], covariances[root] = 0.0, 0.0
+    root = int(np.argmax(increments.usable)) if len(increments.usable) else 0
+    poses[root] = 0.0
+    covariances[root] = 0.0
     for f in range(root + 1, count):
-        p, found, pair = f - 1, increments, f - 1
-        if not increments.usable[p] or np.isnan(poses[p, 0]):
-            p, found, pair = *_relocalize(sightings, confirmed, table, poses, f), 0
+        found = increments
+        parent = f - 1
+        pair = f - 1
+        if not increments.usable[pair] or np.isnan(poses[parent, 0]):
+            parent, found = _relocalize(sightings, confirmed, table, poses, f)
+            pair = 0
         if found is None:
             continue
-        A, B = se2.compose_jacobians(poses[p], found.increment[pair])
-        poses[f] = se2.compose(poses[p], found.increment[pair])
-        covariances[f] = A @ covariances[p] @ A.T + B @ found.covariance[pair] @ B.T
+        A, B = se2.compose_jacobians(poses[parent], found.increment[pair])
+        poses[f] = se2.compose(poses[parent], found.increment[pair])
+        by_parent = A @ covariances[parent] @ A.T
+        covariances[f] = by_parent + B @ found.covariance[pair] @ B.T
         if shared_errors:
-            rows = slice(*np.searchsorted(found.pair, (pair, pair + 1)))
-            first, second = found.first[rows], found.second[rows]
-            S = A @ np.sum(H[first] @ (B @ found.J_first[rows]).mT, axis=0)
+            rows = slice(*np.searchsorted(found.pair, [pair, pair + 1]))
+            first = found.first[rows]
+            second = found.second[rows]
+            D = found.J_first[rows]
+            S = A @ np.sum(H[first] @ (B @ D).mT, axis=0)
             covariances[f] += S + S.T
             H[second] = B @ found.J_second[rows] @ sightings.C[second]
-    return poses, covariances, H
+    return _Path(poses, covariances, H)
 
 
 def _relocalize(sightings, confirmed, table, poses, frame):
@@ -108,28 +127,36 @@ def _relocalize(sightings, confirmed, table, poses, frame):
     Candidates are the frames with known `poses` and the most common markers, the latest first. A
     parent requires two accepted markers, or one whose two sightings adjacent frames confirm.
     """
-    common = (table[:frame] >= 0) & (table[frame] >= 0) & np.isfinite(poses[:frame, :1])
-    shared = common.sum(axis=1)
-    for f in np.lexsort((np.arange(frame), shared))[:-MAX_CANDIDATES - 1:-1]:
-        first, second = table[f, common[f]], table[frame, common[f]]
-        found = robust_increments(sightings.z, sightings.C, 0 * first, first, second, 1)
+    seen = table[:frame + 1] >= 0
+    known = np.isfinite(poses[:frame, :1])
+    common = seen[:frame] & seen[frame] & known
+    by_common_markers = np.lexsort((np.arange(frame), common.sum(axis=1)))
+    for parent in by_common_markers[::-1][:MAX_CANDIDATES]:
+        first = table[parent, common[parent]]
+        second = table[frame, common[parent]]
+        one_pair = np.zeros_like(first)
+        found = robust_increments(sightings.z, sightings.C, one_pair, first, second, 1)
         sure = found.accepted & confirmed[first] & confirmed[second]
-        if found.usable[0] and (found.accepted.sum() > 1 or sure.any()):
-            return f, found
+        if found.usable[0] and (np.sum(found.accepted) > 1 or sure.any()):
+            return parent, found
     return None, None
 
 
-def _map_markers(sightings, used, poses, covariances, H):
+def _map_markers(sightings, used, path):
     """Ids (k,), poses (k, 3) and covariances (k, 3, 3) of markers, each from one used sighting.
 
     Sightings of a marker are correlated through the poses, so an average would be overconfident.
     """
-    row, marker, z, C = (values[used] for values in (
-        sightings.row, sightings.marker, sightings.z, sightings.C))
-    E, F = se2.compose_jacobians(poses[row], z)
-    T = E @ H[used] @ F.mT
-    covariance = E @ covariances[row] @ E.mT + F @ C @ F.mT + T + T.mT
-    in_world = se2.compose(poses[row], z)
+    row = sightings.row[used]
+    marker = sightings.marker[used]
+    X = path.poses[row]
+    Z = sightings.z[used]
+    E, F = se2.compose_jacobians(X, Z)
+    T = E @ path.H[used] @ F.mT
+    by_pose = E @ path.covariances[row] @ E.mT
+    by_sighting = F @ sightings.C[used] @ F.mT
+    covariance = by_pose + by_sighting + T + T.mT
+    in_world = se2.compose(X, Z)
     in_world[:, 2] = se2.wrap(in_world[:, 2])
     best = consensus(marker, in_world, covariance)
     return marker[best], in_world[best], covariance[best]

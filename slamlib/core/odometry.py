@@ -19,29 +19,44 @@ in m and rad, with continuous headings; their covariances are in world axes. A `
 in MODELS raises ValueError.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from slamlib.core import se2
+from slamlib.core.vehicle import Vehicle
 
 MODELS = ("euler", "arc")
+ORIGIN = (0.0, 0.0, 0.0)         # pose 1
 
 
-def steps(ticks, vehicle):
-    """Length ds and turn dtheta of every step in equation 1, with their derivatives.
+class Steps(NamedTuple):
+    """Every step by equation 1: its length `ds` (n-1,) in m and its turn `dtheta` (n-1,) in rad.
 
-    Returns ds (n-1,) in m, dtheta (n-1,) in rad, and their derivatives by the wheel parameters
-    [R_R, R_L, b] in m: ds_by_w (n-1, 3) without unit, dtheta_by_w (n-1, 3) in rad/m.
+    `ds_by_w` (n-1, 3), without unit, and `dtheta_by_w` (n-1, 3), in rad/m, are their derivatives by
+    the wheel parameters [R_R, R_L, b] in m.
     """
+
+    ds: np.ndarray
+    dtheta: np.ndarray
+    ds_by_w: np.ndarray
+    dtheta_by_w: np.ndarray
+
+
+def steps(ticks: np.ndarray, vehicle: Vehicle) -> Steps:
+    """The Steps by equation 1: lengths, turns, and their derivatives by the wheel parameters."""
     counts = np.asarray(ticks, dtype=float)[1:]
-    ds_by_w = np.pi / vehicle.ticks_per_revolution * np.insert(counts, 2, 0.0, axis=1)  # b: zero
-    right, left = ds_by_w[:, 0] * vehicle.right_radius, ds_by_w[:, 1] * vehicle.left_radius
+    ds_by_radius = np.pi / vehicle.ticks_per_revolution * counts
+    right = ds_by_radius[:, 0] * vehicle.right_radius
+    left = ds_by_radius[:, 1] * vehicle.left_radius
     dtheta = 2 * (right - left) / vehicle.wheelbase
-    dtheta_by_w = 2 / vehicle.wheelbase * np.stack(
-        [ds_by_w[:, 0], -ds_by_w[:, 1], -dtheta / 2], -1)
-    return right + left, dtheta, ds_by_w, dtheta_by_w
+    ds_by_w = np.insert(ds_by_radius, 2, 0.0, axis=1)                       # b: zero
+    dtheta_by_w = np.column_stack([2 * ds_by_radius * [1, -1], -dtheta]) / vehicle.wheelbase
+    return Steps(right + left, dtheta, ds_by_w, dtheta_by_w)
 
 
-def dead_reckoning(ticks, vehicle, initial_pose=(0.0, 0.0, 0.0), model="euler"):
+def dead_reckoning(ticks: np.ndarray, vehicle: Vehicle, initial_pose: np.ndarray = ORIGIN,
+                   model: str = "euler") -> np.ndarray:
     """Poses (n, 3) from `initial_pose` (3,) by equation 1 or, with model "arc", by exact arcs.
 
     One revolution of both wheels, whose radii are 0.1 m:
@@ -51,16 +66,18 @@ def dead_reckoning(ticks, vehicle, initial_pose=(0.0, 0.0, 0.0), model="euler"):
     array([[0.   , 0.   , 0.   ],
            [0.628, 0.   , 0.   ]])
     """
-    ds, dtheta, _, _ = steps(ticks, vehicle)
-    heading = cumulative(dtheta, initial_pose[2])
-    chord, _, bend = _chord(dtheta, model)
-    length, direction = ds * chord, heading[:-1] + bend * dtheta
-    return np.stack([cumulative(length * np.cos(direction), initial_pose[0]),
-                     cumulative(length * np.sin(direction), initial_pose[1]),
-                     heading], -1)
+    step = steps(ticks, vehicle)
+    heading = cumulative(step.dtheta, initial_pose[2])
+    bend = _bend(model) * step.dtheta
+    direction = heading[:-1] + bend
+    length = step.ds * np.sinc(bend / np.pi)
+    x = cumulative(length * np.cos(direction), initial_pose[0])
+    y = cumulative(length * np.sin(direction), initial_pose[1])
+    return np.stack([x, y, heading], axis=-1)
 
 
-def equation2(ticks, vehicle, initial_pose=(0.0, 0.0, 0.0), initial_covariance=None):
+def equation2(ticks: np.ndarray, vehicle: Vehicle, initial_pose: np.ndarray = ORIGIN,
+              initial_covariance: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Poses (n, 3) by equation 1 and covariances (n, 3, 3) by equation 2 and equation 3.
 
     Equation 2 adds J C_w J^T + J S I^T + I S J^T = (I + J S)(I + J S)^T - I I^T at every step, and
@@ -79,50 +96,64 @@ def equation2(ticks, vehicle, initial_pose=(0.0, 0.0, 0.0), initial_covariance=N
     array([0.444, 0.063, 2.224])
     """
     if initial_covariance is None:
-        initial_covariance = np.diag([0.0, 0.0, vehicle.sigma_heading**2])
+        initial_covariance = _initial_covariance(vehicle)
     poses = dead_reckoning(ticks, vehicle, initial_pose)
     J = step_jacobian(ticks, vehicle, poses[:-1, 2])
-    integral = np.zeros((len(poses), 3, 4))                                 # I_k of equation 3
-    integral[1:, :, :3] = np.cumsum(J[:, :, :3] * vehicle.sigma_wheel, axis=0)
-    sigma_heading = np.sqrt(initial_covariance[2, 2] + np.sum(integral[:-1, 2, :3]**2, axis=-1))
-    integral[1:, :, 3] = np.cumsum(J[:, :, 3] * sigma_heading[:, None], axis=0)
+    by_wheel = cumulative(J[:, :, :3] * vehicle.sigma_wheel)
+    variance_heading = initial_covariance[2, 2] + np.sum(by_wheel[:-1, 2]**2, axis=1)
+    sigma_heading = np.sqrt(variance_heading)
+    by_heading = cumulative(J[:, :, 3] * sigma_heading[:, None])
+    integral = np.concatenate([by_wheel, by_heading[:, :, None]], axis=2)       # I_k of equation 3
     return poses, initial_covariance + integral @ integral.mT
 
 
-def step_jacobian(ticks, vehicle, heading):
+def step_jacobian(ticks: np.ndarray, vehicle: Vehicle, heading: np.ndarray) -> np.ndarray:
     """Jacobians J_k of equation 2 and equation 3, (n-1, 3, 4).
 
     J_k = d(X_{k+1} - X_k) / d w_k with w_k = [R_R, R_L, b, heading_k]. `heading` (n-1,) is that at
     the start of each Euler step, in rad.
     """
-    ds, _, ds_by_w, dtheta_by_w = steps(ticks, vehicle)
-    c, s = np.cos(heading)[:, None], np.sin(heading)[:, None]
-    by_wheels = np.stack([c * ds_by_w, s * ds_by_w, dtheta_by_w], axis=1)
-    by_heading = np.hstack([-s, c, 0 * c]) * ds[:, None]
-    return np.concatenate([by_wheels, by_heading[..., None]], axis=2)
+    step = steps(ticks, vehicle)
+    c = np.cos(heading)
+    s = np.sin(heading)
+    J = np.zeros((len(heading), 3, 4))
+    J[:, 0, :3] = c[:, None] * step.ds_by_w
+    J[:, 1, :3] = s[:, None] * step.ds_by_w
+    J[:, 2, :3] = step.dtheta_by_w
+    J[:, 0, 3] = -s * step.ds
+    J[:, 1, 3] = c * step.ds
+    return J
 
 
-def wheel_jacobian(ticks, vehicle, initial_heading=0.0, model="euler"):
+def wheel_jacobian(ticks: np.ndarray, vehicle: Vehicle, initial_heading: float = 0.0,
+                   model: str = "euler") -> np.ndarray:
     """Derivatives (n, 3, 3) of the poses of `dead_reckoning` by [R_R, R_L, b], with pose 1 fixed.
 
     A wheel-parameter error is constant. It acts in every step and, through the heading, on all
     later steps: the derivatives accumulate, not the variances. `initial_heading` is in rad.
     """
-    ds, dtheta, ds_by_w, dtheta_by_w = steps(ticks, vehicle)
+    step = steps(ticks, vehicle)
+    ds = step.ds[:, None]
+    dtheta = step.dtheta[:, None]
     heading = cumulative(dtheta, initial_heading)
-    heading_by_w = cumulative(dtheta_by_w)
-    chord, chord_slope, bend = _chord(dtheta, model)
-    length, direction = (ds * chord)[:, None], (heading[:-1] + bend * dtheta)[:, None]
-    length_by_w = chord[:, None] * ds_by_w + (ds * chord_slope)[:, None] * dtheta_by_w
-    direction_by_w = heading_by_w[:-1] + bend * dtheta_by_w
-    c, s = np.cos(direction), np.sin(direction)
-    return np.stack([cumulative(c * length_by_w - s * length * direction_by_w),
-                     cumulative(s * length_by_w + c * length * direction_by_w),
-                     heading_by_w], axis=1)
+    heading_by_w = cumulative(step.dtheta_by_w)
+    bend = _bend(model) * dtheta
+    bend_by_w = _bend(model) * step.dtheta_by_w
+    direction = heading[:-1] + bend
+    direction_by_w = heading_by_w[:-1] + bend_by_w
+    chord = np.sinc(bend / np.pi)
+    length_by_w = chord * step.ds_by_w + ds * _chord_slope(bend) * bend_by_w
+    sideways = ds * chord * direction_by_w
+    c = np.cos(direction)
+    s = np.sin(direction)
+    x_by_w = cumulative(c * length_by_w - s * sideways)
+    y_by_w = cumulative(s * length_by_w + c * sideways)
+    return np.stack([x_by_w, y_by_w, heading_by_w], axis=1)
 
 
-def first_order(ticks, vehicle, initial_pose=(0.0, 0.0, 0.0), initial_covariance=None,
-                model="euler"):
+def first_order(ticks: np.ndarray, vehicle: Vehicle, initial_pose: np.ndarray = ORIGIN,
+                initial_covariance: np.ndarray | None = None,
+                model: str = "euler") -> tuple[np.ndarray, np.ndarray]:
     """Poses (n, 3) and their exact first-order covariances (n, 3, 3).
 
     With G_k = d X_k / d [R_R, R_L, b] and A_k = d X_k / d X_1,
@@ -133,30 +164,37 @@ def first_order(ticks, vehicle, initial_pose=(0.0, 0.0, 0.0), initial_covariance
     propagate a heading error to all later positions. Shapes and defaults are those of `equation2`.
     """
     if initial_covariance is None:
-        initial_covariance = np.diag([0.0, 0.0, vehicle.sigma_heading**2])
+        initial_covariance = _initial_covariance(vehicle)
     poses = dead_reckoning(ticks, vehicle, initial_pose, model)
     G = wheel_jacobian(ticks, vehicle, initial_pose[2], model) * vehicle.sigma_wheel
-    A, _ = se2.compose_jacobians(poses[0], se2.between(poses[0], poses))
+    from_first = se2.between(poses[0], poses)
+    A = se2.compose_jacobians(poses[0], from_first)[0]
     return poses, A @ initial_covariance @ A.mT + G @ G.mT
 
 
-def cumulative(increments, initial=0.0):
+def cumulative(increments: np.ndarray, initial: float = 0.0) -> np.ndarray:
     """Cumulative sums (n+1, ...) of increments (n, ...) over the first axis, after `initial`."""
     return np.cumulative_sum(increments, axis=0, include_initial=True) + initial
 
 
-def _chord(dtheta, model):
-    """Chord of a step of unit length that turns by dtheta (n,) rad.
+def _initial_covariance(vehicle):
+    """Covariance (3, 3) of pose 1."""
+    return np.diag([0.0, 0.0, vehicle.sigma_heading**2])
 
-    Returns its length (n,), the derivative of the length by dtheta (n,), and the fraction of dtheta
-    between the heading at the start and the chord: 0 for Euler steps, 1/2 for arcs.
+
+def _bend(model):
+    """Angle between a step's start and its chord, as a fraction of dtheta.
+
+    The chord of a step of unit length is sin(bend) / bend long, by both models.
     """
-    if model == "euler":
-        return np.ones_like(dtheta), np.zeros_like(dtheta), 0.0
-    if model != "arc":
+    if model not in MODELS:
         raise ValueError(f"model must be one of {MODELS}, not {model!r}")
-    half = dtheta / 2
-    small = np.abs(half) < 1e-4                    # the quotient cancels there: use its series
-    safe = np.where(small, 1.0, half)
-    slope = np.where(small, -half / 3, (np.cos(safe) - np.sin(safe) / safe) / safe)
-    return np.sinc(half / np.pi), slope / 2, 0.5
+    return 0.5 if model == "arc" else 0.0
+
+
+def _chord_slope(bend):
+    """Derivative of sin(bend) / bend, of any shape."""
+    small = np.abs(bend) < 1e-4                    # the quotient cancels there: use its series
+    safe = np.where(small, 1.0, bend)
+    quotient = (np.cos(safe) - np.sin(safe) / safe) / safe
+    return np.where(small, -bend / 3, quotient)

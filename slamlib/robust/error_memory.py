@@ -19,6 +19,7 @@ After a break the sensor sees the landmark from elsewhere, with another error.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -40,48 +41,73 @@ class Memory:
     share: np.ndarray            # (m,) that each measurement keeps, 1 if errors are independent
 
 
-def runs(landmark, pose, max_pause):
+class _Pairs(NamedTuple):
+    """Pairs of measurements in the same run, with a lag of up to MAX_LAG."""
+
+    first: np.ndarray            # (p,) rows of the earlier ones
+    second: np.ndarray           # (p,) rows of the later ones
+    lag: np.ndarray              # (p,) int, typical intervals between them
+
+
+def runs(landmark: np.ndarray, pose: np.ndarray, max_pause: float) -> tuple[float, np.ndarray]:
     """Typical interval between measurements of a landmark, and number (m,) of the run of each one.
 
     `landmark` (m,) and then `pose` (m,) ascend. A pause of more than `max_pause` intervals ends a
     run. At least one landmark is measured twice.
     """
-    interval, same = np.diff(pose), landmark[1:] == landmark[:-1]
+    interval = np.diff(pose)
+    same = landmark[1:] == landmark[:-1]
     typical = np.median(interval[same])
-    return typical, np.cumsum(np.r_[False, ~same | (interval > max_pause * typical)])
+    begins = ~same | (interval > max_pause * typical)
+    return typical, np.cumulative_sum(begins, include_initial=True)
 
 
-def error_memory(landmark, pose, u, used):
+def error_memory(landmark: np.ndarray, pose: np.ndarray, u: np.ndarray,
+                 used: np.ndarray) -> Memory:
     """The Memory of measurements of `landmark` (m,), rows or ids, at encoder poses (m,).
 
     u (m, d) are residuals in standard deviations of the errors; those not `used` (m,) do not count.
     """
-    rows, share = np.flatnonzero(used), np.ones(len(used))
+    rows = np.flatnonzero(used)
     rows = rows[np.lexsort((pose[rows], landmark[rows]))]
-    landmark, pose, u = landmark[rows], pose[rows], u[rows]
-    variance = np.mean(u**2) if len(np.unique(landmark)) < len(rows) else 0.0
+    u = u[rows]
+    share = np.ones(len(used))
+    landmark_count = len(np.unique(landmark[rows]))
+    variance = np.mean(u**2) if landmark_count < len(rows) else 0.0
     if variance < MIN_VARIANCE:
         return Memory(correlation=0.0, sigma=1.0, share=share)
+    pairs = _pairs(landmark[rows], pose[rows])
+    product = np.mean(u[pairs.first] * u[pairs.second], axis=1)
+    count = np.bincount(pairs.lag, minlength=MAX_LAG + 1)
+    covariance = np.bincount(pairs.lag, product, MAX_LAG + 1) / np.maximum(count, 1)
+    correlation = covariance[1] / variance
+    correlation += (1 - correlation) * landmark_count / len(rows)
+    neighbours = count[1] * u.shape[1]
+    sigma = 1 / np.sqrt(max(neighbours, 1))
+    if correlation >= max(MIN_CORRELATION, MIN_SIGNIFICANCE * sigma):
+        rho = covariance + max(0.0, 1 - variance)
+        remembered = (rho >= MIN_RHO) & (count >= MIN_PAIRS)
+        remembered[0] = True                         # pairs of less than half an interval
+        rho[~np.logical_and.accumulate(remembered)] = 0.0
+        rho_of_pair = rho[pairs.lag]
+        with_later = np.bincount(pairs.first, rho_of_pair, len(rows))
+        with_earlier = np.bincount(pairs.second, rho_of_pair, len(rows))
+        share[rows] = 1 / (1 + with_later + with_earlier)
+    return Memory(correlation, sigma, share)
+
+
+def _pairs(landmark, pose):
+    """The _Pairs of measurements sorted by `landmark` (m,), then by `pose` (m,)."""
     interval, run = runs(landmark, pose, MAX_PAUSE)
-    pairs = []
-    for step in range(1, min(MAX_LAG, len(rows) - 1) + 1):
-        i = np.flatnonzero(run[step:] == run[:-step])
-        lag = np.rint((pose[i + step] - pose[i]) / interval).astype(int)
+    found = []
+    for step in range(1, min(MAX_LAG, len(run) - 1) + 1):
+        first = np.flatnonzero(run[step:] == run[:-step])
+        second = first + step
+        distance = pose[second] - pose[first]
+        lag = np.rint(distance / interval).astype(int)
+        pairs = np.stack([first, second, lag])
         close = lag <= MAX_LAG
         if not close.any():
             break
-        pairs.append(np.stack([i, i + step, lag])[:, close])
-    i, j, lag = np.concatenate(pairs, axis=1)
-    count = np.bincount(lag, minlength=MAX_LAG + 1)
-    product = np.bincount(lag, np.mean(u[i] * u[j], axis=1), MAX_LAG + 1) / np.maximum(count, 1)
-    correlation = product[1] / variance
-    correlation += (1 - correlation) * len(np.unique(landmark)) / len(rows)
-    sigma = 1 / np.sqrt(max(count[1] * u.shape[1], 1))
-    if correlation < max(MIN_CORRELATION, MIN_SIGNIFICANCE * sigma):
-        return Memory(correlation=correlation, sigma=sigma, share=share)
-    rho = product + max(0.0, 1 - variance)
-    ends = (rho < MIN_RHO) | (count < MIN_PAIRS)
-    ends[0] = False
-    rho[np.argmax(ends) if ends.any() else len(rho):] = 0
-    share[rows] = 1 / (1 + np.bincount(np.r_[i, j], rho[np.r_[lag, lag]], len(rows)))
-    return Memory(correlation=correlation, sigma=sigma, share=share)
+        found.append(pairs[:, close])
+    return _Pairs(*np.concatenate(found, axis=1))

@@ -21,10 +21,11 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.polynomial import Polynomial
 
 from slamlib.core import increments, se2
 from slamlib.core.errors import require
-from slamlib.core.hint import Fusion
+from slamlib.core.hint import Fusion, sighting_count
 from slamlib.core.increments import SLIP_BOUNDS, SLIP_FACTOR, TYPICAL_SLIP
 from slamlib.core.records import Dataset
 from slamlib.core.sightings import GATE, Sightings, sightings_by_frame
@@ -40,6 +41,20 @@ LOG_SLIP_TOLERANCE = 0.05    # of the natural logarithm of the slip
 
 
 @dataclass(frozen=True)
+class _Odometry:
+    """Increments by odometry between m pairs of poses."""
+
+    increment: np.ndarray        # (m, 3) Delta(w_0)
+    by_w: np.ndarray             # (m, 3, 3) dDelta/dw
+    rounding: np.ndarray         # (m, 3, 3) Q without slip
+    slipping: np.ndarray         # (m, 3, 3) what a slip of 1 sqrt(m) adds to Q
+
+    def noise(self, slip):
+        """Q (m, 3, 3)."""
+        return self.rounding + slip**2 * self.slipping
+
+
+@dataclass(frozen=True)
 class _FilterInput:
     """The data of the filter, the same for all values of slip."""
 
@@ -47,29 +62,31 @@ class _FilterInput:
     vehicle: Vehicle             # with the wheel parameters w_0 at which Delta is linearised
     jumps: Jumps                 # where odometry contradicts the markers
     sightings: Sightings         # of f frames, pose 0 among them
-    odometry: tuple              # of f-1 increments between them, see `_odometry`
+    odometry: _Odometry          # of f-1 increments between them
 
 
-class _State(NamedTuple):        # two are made at a frame: faster than frozen dataclasses
-    """The filter after a frame, and how k markers of the frame before were seen in it."""
+class _State(NamedTuple):        # three are made at a frame: faster than frozen dataclasses
+    """The filter after a frame, and k sightings in it of markers of the frame before."""
 
-    x: np.ndarray                # (6,) pose X and w - w_0
+    X: np.ndarray                # (3,) pose
+    w: np.ndarray                # (3,) m, wheel parameters, less w_0
     marker: np.ndarray           # (m,) ids of the markers in the state, not of rejected ones
     M: np.ndarray                # (m, 3) these markers in the frame
-    P: np.ndarray                # (6 + 3m, 6 + 3m) covariance of x and M
+    P: np.ndarray                # (6 + 3m, 6 + 3m) covariance of X, w and M
     log_likelihood: float = 0.0  # of the innovations so far, up to a constant
     rejected: int = 0            # number of sightings so far beyond the gate
-    new: np.ndarray | None = None        # (k,) their rows in the frame
-    v: np.ndarray | None = None  # (k, 3) their innovations
+    row: np.ndarray | None = None           # (k,) of these in Sightings
+    innovation: np.ndarray | None = None    # (k, 3) theirs
 
 
-def fuse(dataset, slip=None):
+def fuse(dataset: Dataset, slip: float | None = None) -> Fusion:
     """Fusion of a Dataset's odometry and markers for problem 2, with correct shared errors.
 
     `slip` in sqrt(m) is the standard deviation of the slip of one wheel after 1 m; None takes that
     of the dataset's Vehicle or, if it has none, the maximum of the posterior density by the
     innovations and the prior of `increments`. A marker_noise_factor of the Vehicle multiplies the
-    standard deviations of the sightings. Increments are exact arcs.
+    standard deviations of the sightings. Increments are exact arcs. Without markers the result is
+    the first-order propagation of odometry with the noise of slip.
 
     >>> from slamlib.studies.simulation import simulate
     >>> dataset, truth = simulate("short", seed=1)
@@ -77,172 +94,213 @@ def fuse(dataset, slip=None):
     (2000, 3)
     """
     require(isinstance(dataset, Dataset), "fuse", "a Dataset", dataset)
-    slip = dataset.vehicle.slip if slip is None else slip
-    vehicle, jumps = dataset.vehicle, find_jumps(dataset)
-    if len(jumps.start):
-        without, gain = (_filter(_filter_input(dataset, vehicle, each), slip or TYPICAL_SLIP)[2]
-                         .log_likelihood for each in (NO_JUMPS, jumps))
-        least = MIN_JUMP_GAIN * len(jumps.start)
-        if gain - without < (-least if jumps.are_few else least):
-            jumps = NO_JUMPS
+    vehicle = dataset.vehicle
+    if slip is None:
+        slip = vehicle.slip
+    jumps = _believed_jumps(dataset, slip or TYPICAL_SLIP)
     given = _filter_input(dataset, vehicle, jumps)
-    slip = _likeliest_slip(given) if slip is None else slip
-    wheel = vehicle.wheel + _filter(given, slip, WHEEL_FRAMES)[0][-1, 3:]
-    given = _filter_input(dataset, vehicle.with_wheel(wheel), jumps)
-    x, covariances, state, *innovations = _filter(given, slip)
-    C = _with_memory(given.sightings, *innovations)
-    if (C != given.sightings.C).any():
-        given = replace(given, sightings=replace(given.sightings, C=C))
-        x, covariances, state, *_ = _filter(given, slip)
-    poses, pose_covariances = _poses_from_frames(given, slip, x, covariances)
-    repeated = len(dataset.aruco.pose) - len(given.sightings.row)
+    if slip is None:
+        slip = _likeliest_slip(given)
+    w_0 = vehicle.wheel + _filter(given, slip, WHEEL_FRAMES)[-1].w
+    given = _filter_input(dataset, vehicle.with_wheel(w_0), jumps)
+    states = _filter(given, slip)
+    share = _shares(given.sightings, states)
+    if (share < 1).any():
+        larger = given.sightings.C / share[:, None, None]
+        given = replace(given, sightings=replace(given.sightings, C=larger))
+        states = _filter(given, slip)
+    poses, covariances = _poses_from_frames(given, slip, states)
+    repeated = sighting_count(dataset) - len(given.sightings.row)
+    last = states[-1]
     return Fusion(
-        poses=poses, covariances=pose_covariances, slip=slip,
-        rejected=state.rejected + repeated, wheel=wheel + x[-1, 3:],
-        wheel_covariance=covariances[-1, 3:, 3:])
+        poses=poses, covariances=covariances, slip=slip, rejected=last.rejected + repeated,
+        wheel=w_0 + last.w, wheel_covariance=last.P[3:6, 3:6])
+
+
+def _believed_jumps(dataset, slip):
+    """The Jumps of a Dataset, or NO_JUMPS if these are likelier."""
+    found = find_jumps(dataset)
+    if not len(found.start):
+        return NO_JUMPS
+
+    def log_likelihood(jumps):
+        given = _filter_input(dataset, dataset.vehicle, jumps)
+        return _filter(given, slip)[-1].log_likelihood
+
+    gain = log_likelihood(found) - log_likelihood(NO_JUMPS)
+    least = MIN_JUMP_GAIN * len(found.start)
+    if found.are_few:
+        least = -least
+    return found if gain >= least else NO_JUMPS
 
 
 def _likeliest_slip(given):
     """Slip in sqrt(m) of maximum posterior density, by parabolas over the logarithm of slip.
 
     The first three points are the median of the prior and one standard deviation to both sides.
+    Each parabola needs one more filter; `scipy.optimize` would need twice as many in all.
     """
-    middle, step = np.log([TYPICAL_SLIP, SLIP_FACTOR])
+    median = np.log(TYPICAL_SLIP)
+    sigma = np.log(SLIP_FACTOR)
 
     def log_density(log_slip):
-        return _filter(given, np.exp(log_slip), SLIP_FRAMES)[2].log_likelihood \
-            - ((log_slip - middle) / step)**2 / 2
+        last = _filter(given, np.exp(log_slip), SLIP_FRAMES)[-1]
+        return last.log_likelihood - ((log_slip - median) / sigma)**2 / 2
 
-    points = {point: log_density(point) for point in middle + step * np.arange(-1, 2)}
+    x = median + sigma * np.arange(-1, 2)
+    y = np.array([log_density(each) for each in x])
     for _ in range(MAX_SLIP_STEPS):
-        best = max(points, key=points.get)
-        below = max((point for point in points if point < best), default=None)
-        above = min((point for point in points if point > best), default=None)
-        if below is None or above is None:                     # the maximum is further outside
-            vertex = np.clip(best + (step if above is None else -step), *np.log(SLIP_BOUNDS))
+        best = np.argmax(y)
+        if best == 0:
+            log_slip = x[0] - sigma
+        elif best == len(x) - 1:
+            log_slip = x[-1] + sigma
         else:
-            slopes = [(points[point] - points[best]) / (point - best) for point in (below, above)]
-            vertex = (below + best) / 2 - slopes[0] * (above - below) / 2 / (slopes[1] - slopes[0])
-        if not abs(vertex - best) >= LOG_SLIP_TOLERANCE:                # or not finite: no parabola
+            around = slice(best - 1, best + 2)
+            parabola = Polynomial.fit(x[around], y[around], deg=2)
+            log_slip = parabola.deriv().roots()[0]
+        log_slip = np.clip(log_slip, *np.log(SLIP_BOUNDS))
+        if abs(log_slip - x[best]) < LOG_SLIP_TOLERANCE:
             break
-        points[vertex] = log_density(vertex)
-    return float(np.exp(vertex if np.isfinite(vertex) else best))
+        place = np.searchsorted(x, log_slip)
+        x = np.insert(x, place, log_slip)
+        y = np.insert(y, place, log_density(log_slip))
+    return float(np.exp(log_slip))
 
 
 def _filter_input(dataset, vehicle, jumps=NO_JUMPS):
     """The _FilterInput with odometry linearised at the wheel parameters of `vehicle`."""
     s = sightings_by_frame(dataset.sightings, extra_frames=[0])
+    noise_factor = vehicle.marker_noise_factor or 1.0
     return _FilterInput(
         dataset=dataset, vehicle=vehicle, jumps=jumps,
-        sightings=replace(s, C=(vehicle.marker_noise_factor or 1.0)**2 * s.C),
+        sightings=replace(s, C=noise_factor**2 * s.C),
         odometry=_odometry(dataset.ticks, vehicle, jumps, s.frame[:-1], s.frame[1:]))
 
 
 def _odometry(ticks, vehicle, jumps, start, end):
-    """Delta(w_0) (m, 3), dDelta/dw, Q without slip, and what a slip of 1 sqrt(m) adds to Q."""
+    """The _Odometry from poses `start` to poses `end`, (m,)."""
     increment, by_w = increments.between_poses(ticks, vehicle, start, end, "arc")
     rounding, slipping = increments.noise_in_drive(ticks, vehicle, start, end)
     jump, unknown = jumps.added(start, end)
-    return se2.compose(increment, jump), by_w, rounding + unknown, slipping
+    return _Odometry(se2.compose(increment, jump), by_w, rounding + unknown, slipping)
 
 
 def _filter(given, slip, frames=None):
-    """x (f, 6) and its covariances (f, 6, 6) after every frame, and the last _State.
-
-    Also rows (u,) of the sightings of a marker that the state has, and their innovations (u, 3).
-    `frames` is the number of frames, the first ones; None takes all.
-    """
-    vehicle, s = given.dataset.vehicle, given.sightings
-    increment, by_w, Q, slipping = given.odometry
-    Q, x, covariances, rows, v = Q + slip**2 * slipping, [], [], [], []
-    state = _State(x=np.append(np.zeros(3), vehicle.wheel - given.vehicle.wheel),
-                   marker=np.zeros(0, int), M=np.zeros((0, 3)),
-                   P=np.diag([0.0, 0.0, vehicle.sigma_heading, *vehicle.sigma_wheel])**2)
-    begins = np.searchsorted(s.row, np.arange(len(s.frame) + 1))
-    for k, (begin, end) in enumerate(zip(begins[:frames], begins[1:])):
+    """The _State after each of the first `frames` frames; None takes all."""
+    vehicle = given.dataset.vehicle
+    s = given.sightings
+    Q = given.odometry.noise(slip)
+    sigma = np.append([0.0, 0.0, vehicle.sigma_heading], vehicle.sigma_wheel)
+    state = _State(
+        X=np.zeros(3), w=vehicle.wheel - given.vehicle.wheel, marker=np.zeros(0, int),
+        M=np.zeros((0, 3)), P=np.diag(sigma**2))
+    begin = np.searchsorted(s.row, np.arange(1, len(s.frame)))
+    rows_by_frame = np.split(np.arange(len(s.row)), begin)
+    states = []
+    for k, rows in enumerate(rows_by_frame[:frames]):
         if k > 0:
-            state = _predicted(state, increment[k - 1], by_w[k - 1], Q[k - 1])
-        state = _updated(state, s.marker[begin:end], s.z[begin:end], s.C[begin:end])
-        x.append(state.x)
-        covariances.append(state.P[:6, :6])
-        rows.append(begin + state.new)
-        v.append(state.v)
-    return np.array(x), np.array(covariances), state, np.concatenate(rows), np.concatenate(v)
+            state = _predicted(state, given.odometry, Q, k - 1)
+        state = _updated(state, s, rows)
+        states.append(state)
+    return states
 
 
-def _with_memory(s, rows, v):
-    """Covariances (s, 3, 3) of Sightings, larger where errors have memory, by innovations `v`.
+def _shares(s, states):
+    """Shares (s,) of their information that Sightings keep where errors have memory.
 
-    A covariance is divided by the share that its sighting keeps (`slamlib.robust.error_memory`).
+    See `slamlib.robust.error_memory`.
     """
-    u = np.linalg.solve(np.linalg.cholesky(s.C[rows]), v[..., None])[..., 0]
-    used, share = np.sum(u**2, axis=1) < GATE, np.ones(len(s.C))
-    share[rows] = error_memory(s.marker[rows], s.frame[s.row[rows]], u, used).share
-    return s.C / share[:, None, None]
+    row = np.concatenate([each.row for each in states])
+    innovation = np.concatenate([each.innovation for each in states])
+    root = np.linalg.cholesky(s.C[row])
+    u = np.linalg.solve(root, innovation[..., None])[..., 0]
+    used = np.sum(u**2, axis=1) < GATE
+    share = np.ones(len(s.C))
+    share[row] = error_memory(s.marker[row], s.frame[s.row[row]], u, used).share
+    return share
 
 
-def _predicted(state, increment, by_w, Q):
-    """The _State after one odometry increment."""
-    delta = increment + by_w @ state.x[3:]
-    by_pose, by_delta = se2.compose_jacobians(state.x[:3], delta)
+def _predicted(state, odometry, Q, k):
+    """The _State after increment k by _Odometry, with noise Q[k]."""
+    by_w = odometry.by_w[k]
+    delta = odometry.increment[k] + by_w @ state.w
+    by_pose, by_delta = se2.compose_jacobians(state.X, delta)
     M_by_delta, M_by_M = se2.between_jacobians(delta, state.M)
     L = np.concatenate([by_delta, np.zeros((3, 3)), M_by_delta.reshape(-1, 3)])
     F = _joined(np.eye(6), M_by_M)
     F[:3, :3] = by_pose
     F[:, 3:6] += L @ by_w
-    return state._replace(
-        x=np.append(se2.compose(state.x[:3], delta), state.x[3:]), M=se2.between(delta, state.M),
-        P=F @ state.P @ F.T + L @ Q @ L.T)
+    P = F @ state.P @ F.T + L @ Q[k] @ L.T
+    return state._replace(X=se2.compose(state.X, delta), M=se2.between(delta, state.M), P=P)
 
 
-def _updated(state, marker, z, C):
-    """The _State after a frame's sightings of markers (m,), z (m, 3) with C (m, 3, 3)."""
-    known = state.marker[:, None] == marker
-    old, new = known.nonzero()
-    v = se2.difference(z[new], state.M[old])
-    rows, each = (6 + 3 * old[:, None] + np.arange(3)).ravel(), np.arange(len(new))
-    S = state.P[rows[:, None], rows]
-    blocks = S.reshape(2 * (len(new), 3))                               # of the same memory
-    S_each = blocks[each, :, each] = blocks[each, :, each] + C[new]
-    accepted = (v * np.linalg.solve(S_each, v[..., None])[..., 0]).sum(axis=1) < GATE
+def _updated(state, s, sighted):
+    """The _State after a frame, with the rows `sighted` of Sightings."""
+    known = state.marker[:, None] == s.marker[sighted]
+    old, seen = known.nonzero()
+    row = sighted[seen]
+    v = se2.difference(s.z[row], state.M[old])
+    H = _measured_rows(old)
+    S = state.P[H[:, :, None], H[:, None]] + s.C[row]                  # of each sighting alone
+    accepted = se2.squared_norms(v, S) < GATE
+    corrected = _corrected(state, old[accepted], v[accepted], s.C[row[accepted]])
     # A rejected sighting has the density at the gate, so that rejections do not favour a slip.
-    rejected = GATE + np.linalg.slogdet(S_each[~accepted])[1]
-    used = np.repeat(accepted, 3)
-    rows, S, u = rows[used], S[used][:, used], v[accepted].ravel()
-    HP = state.P[rows]
-    solved = np.linalg.solve(S, np.column_stack([HP, u]))
-    change, P = HP.T @ solved[:, -1], state.P - HP.T @ solved[:, :-1]
-    kept, added = np.concatenate([np.arange(6), rows]), ~known.any(axis=0)
-    M = (state.M + change[6:].reshape(-1, 3))[old[accepted]]
-    return _State(
-        x=state.x + change[:6], M=np.concatenate([M, z[added]]),
-        marker=np.concatenate([marker[new[accepted]], marker[added]]),
-        P=_joined((P + P.T)[kept[:, None], kept] / 2, C[added]),
-        log_likelihood=state.log_likelihood - (
-            rejected.sum() + u @ solved[:, -1] + np.linalg.slogdet(S)[1]) / 2,
-        rejected=state.rejected + len(rejected), new=new, v=v)
+    squared = GATE + np.linalg.slogdet(S[~accepted])[1]
+    added = sighted[~known.any(axis=0)]
+    return corrected._replace(
+        marker=np.append(corrected.marker, s.marker[added]),
+        M=np.append(corrected.M, s.z[added], axis=0), P=_joined(corrected.P, s.C[added]),
+        log_likelihood=corrected.log_likelihood - np.sum(squared) / 2,
+        rejected=state.rejected + len(squared), row=row, innovation=v)
+
+
+def _corrected(state, old, v, C):
+    """The _State of only the markers `old` (k,) after an update by their innovations v (k, 3)."""
+    v = v.ravel()
+    H = _measured_rows(old).ravel()
+    HP = state.P[H]
+    S = HP[:, H] + _joined(np.zeros((0, 0)), C)
+    weighted = np.linalg.solve(S, np.column_stack([HP, v]))            # S^-1 [H P', v]
+    K = weighted[:, :-1].T
+    change = K @ v
+    P = state.P - K @ HP
+    P = (P + P.T) / 2
+    kept = np.append(np.arange(6), H)
+    M = state.M + change[6:].reshape(-1, 3)
+    squared = v @ weighted[:, -1] + np.linalg.slogdet(S)[1]
+    return state._replace(
+        X=state.X + change[:3], w=state.w + change[3:6], marker=state.marker[old], M=M[old],
+        P=P[kept[:, None], kept], log_likelihood=state.log_likelihood - squared / 2)
+
+
+def _measured_rows(old):
+    """Rows (k, 3) of P that H selects, of markers in rows (k,) of M."""
+    return 6 + 3 * old[:, None] + np.arange(3)
 
 
 def _joined(P, C):
     """The block-diagonal matrix (n + 3k, n + 3k) of P (n, n) and C (k, 3, 3)."""
-    rows = len(P) + np.arange(3 * len(C)).reshape(-1, 3)
-    joined = np.zeros(2 * [len(P) + rows.size])
-    joined[:len(P), :len(P)] = P
-    joined[rows[:, :, None], rows[:, None, :]] = C
+    n = len(P)
+    rows = n + np.arange(3 * len(C)).reshape(-1, 3)
+    joined = np.zeros((n + rows.size, n + rows.size))
+    joined[:n, :n] = P
+    joined[rows[:, :, None], rows[:, None]] = C
     return joined
 
 
-def _poses_from_frames(given, slip, x, covariances):
-    """All poses (n, 3) and covariances, by odometry from the last frame before each.
-
-    `x` and `covariances` are those of `_filter`.
-    """
-    pose, frame = np.arange(len(given.dataset.ticks)), given.sightings.frame
+def _poses_from_frames(given, slip, states):
+    """All poses (n, 3) and covariances, by odometry from the last frame before each."""
+    pose = np.arange(len(given.dataset.ticks))
+    frame = given.sightings.frame
     last = np.searchsorted(frame, pose, side="right") - 1
-    increment, by_w, Q, slipping = _odometry(
-        given.dataset.ticks, given.vehicle, given.jumps, frame[last], pose)
-    delta = increment + (by_w @ x[last, 3:, None])[..., 0]
-    A, B = se2.compose_jacobians(x[last, :3], delta)
-    F = np.concatenate([A, B @ by_w], axis=2)
-    return (se2.compose(x[last, :3], delta),
-            F @ covariances[last] @ F.mT + B @ (Q + slip**2 * slipping) @ B.mT)
+    odometry = _odometry(given.dataset.ticks, given.vehicle, given.jumps, frame[last], pose)
+    X = np.array([each.X for each in states])[last]
+    w = np.array([each.w for each in states])[last]
+    P = np.array([each.P[:6, :6] for each in states])[last]
+    delta = odometry.increment + np.matvec(odometry.by_w, w)
+    A, B = se2.compose_jacobians(X, delta)
+    F = np.concatenate([A, B @ odometry.by_w], axis=2)
+    by_frame = F @ P @ F.mT
+    by_odometry = B @ odometry.noise(slip) @ B.mT
+    return se2.compose(X, delta), by_frame + by_odometry
