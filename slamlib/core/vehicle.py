@@ -94,54 +94,41 @@ class Limit:
         return inside
 
 
-_PLACE = Limit(-10, 10, "m")
-_PLACE_SIGMA = Limit(0, 10, "m")
-_TURN = 6.3                              # rad
 _RADIUS = Limit(1e-3, 2.5, "m")
-_RADIUS_SIGMA = Limit(1e-9, 2.5, "m")
 _NOISE_FACTOR = Limit(0.01, 100)
+_PLACE = Limit(-10, 10, "m")
 _RATIO = Limit(0.5, 2)
-_RATIO_SIGMA = Limit(0, 2)
 _LAG = Limit(-1000, 1000)
-_LAG_SIGMA = Limit(0, 1000)
-_UP_TO_100_M = Limit(0, 100, "m")
+_WHEELS = {"right_radius": _RADIUS, "left_radius": _RADIUS, "wheelbase": Limit(1e-3, 20, "m")}
+_SENSORS = {
+    "camera_x": _PLACE,
+    "camera_y": _PLACE,
+    "camera_turn": Limit(-6.3, 6.3, "rad"),
+    "marker_size": _RATIO,
+    "sighting_lag": _LAG,
+    "tag_x": _PLACE,
+    "tag_y": _PLACE,
+    "antenna_height": Limit(0, 100, "m"),
+    "range_offset": Limit(-100, 100, "m"),
+    "range_scale": _RATIO,
+    "range_lag": _LAG,
+}
+
+
+def _sigmas(limits, minimum):
+    """Limits of standard deviations, up to the largest value of the entry."""
+    return {f"sigma_{name}": replace(limit, minimum=minimum) for name, limit in limits.items()}
+
+
 # What each field of a Vehicle may be: a number within a Limit, or one of several values.
-VEHICLE_LIMITS = {
-    "right_radius": _RADIUS,
-    "left_radius": _RADIUS,
-    "wheelbase": Limit(1e-3, 20, "m"),
+VEHICLE_LIMITS = _WHEELS | _SENSORS | _sigmas(_WHEELS, 1e-9) | _sigmas(_SENSORS, 0) | {
     "ticks_per_revolution": Limit(1, 1e10),
-    "sigma_right_radius": _RADIUS_SIGMA,
-    "sigma_left_radius": _RADIUS_SIGMA,
-    "sigma_wheelbase": Limit(1e-9, 20, "m"),
     "sigma_heading": Limit(1e-9, 10, "rad"),
     "slip": Limit(0, 0.1, "sqrt(m)"),
     "marker_noise_factor": _NOISE_FACTOR,
     "range_noise_factor": _NOISE_FACTOR,
     "kernel": tuple(KERNELS),
     "gate": (True, False),
-    "camera_x": _PLACE,
-    "camera_y": _PLACE,
-    "camera_turn": Limit(-_TURN, _TURN, "rad"),
-    "marker_size": _RATIO,
-    "sighting_lag": _LAG,
-    "tag_x": _PLACE,
-    "tag_y": _PLACE,
-    "antenna_height": _UP_TO_100_M,
-    "range_offset": Limit(-100, 100, "m"),
-    "range_scale": _RATIO,
-    "range_lag": _LAG,
-    "sigma_camera_x": _PLACE_SIGMA,
-    "sigma_camera_y": _PLACE_SIGMA,
-    "sigma_camera_turn": Limit(0, _TURN, "rad"),
-    "sigma_marker_size": _RATIO_SIGMA,
-    "sigma_sighting_lag": _LAG_SIGMA,
-    "sigma_tag_x": _PLACE_SIGMA,
-    "sigma_tag_y": _PLACE_SIGMA,
-    "sigma_antenna_height": _UP_TO_100_M,
-    "sigma_range_offset": _UP_TO_100_M,
-    "sigma_range_scale": _RATIO_SIGMA,
-    "sigma_range_lag": _LAG_SIGMA,
 }
 
 

@@ -84,36 +84,32 @@ def _dataset(files, vehicle, name, notes=()):
     sightings = read_table(files.get(ARUCO), ARUCO, len(ticks))
     ranges = read_table(files.get(UWB), UWB, len(ticks))
     guesses = read_table(files.get(GUESS), GUESS)
-    ranges.require_rows(Check(
+    ranges.require_rows([Check(
         np.isin(ranges.numbers[:, 1], guesses.numbers[:, 0]), "an antenna id that the guesses "
-        "have, which ranges need: UwbAntennaGuess.txt in the same folder, or guess"))
-    seen = _in_order(sightings.numbers)
-    aruco = ArucoReadings(pose=_ids(seen, 0) - 1, marker=_ids(seen, 1),
-                          marker_in_vehicle=seen[:, 2:5], covariance=seen[:, COVARIANCE])
-    heard = _in_order(ranges.numbers)
-    uwb = UwbReadings(pose=_ids(heard, 0) - 1, antenna=_ids(heard, 1), range=heard[:, 2],
-                      sigma=heard[:, 3])
-    guess = _by_id(guesses.numbers)
-    antenna_guess = AntennaGuess(antenna=_ids(guess, 0), position=guess[:, 1:])
+        "have, which ranges need: UwbAntennaGuess.txt in the same folder, or guess")])
+    pose, marker, seen = _in_order(sightings)
+    aruco = ArucoReadings(pose, marker, seen[:, 2:5], seen[:, COVARIANCE])
+    pose, antenna, heard = _in_order(ranges)
+    uwb = UwbReadings(pose, antenna, heard[:, 2], heard[:, 3])
+    guess = AntennaGuess(*_by_id(guesses))
     return Dataset(
-        name=name, vehicle=vehicle, ticks=ticks, aruco=aruco if len(seen) else None,
-        uwb=uwb if len(heard) else None, antenna_guess=antenna_guess if len(guess) else None,
+        name=name, vehicle=vehicle, ticks=ticks, aruco=aruco if len(aruco.pose) else None,
+        uwb=uwb if len(uwb.pose) else None, antenna_guess=guess if len(guess.antenna) else None,
         notes=notes + encoders.notes + sightings.notes + ranges.notes + guesses.notes)
 
 
-def _in_order(rows):
-    """Rows (m, c) in ascending order of pose, else as they are; repeated rows once."""
-    _, first = np.unique(rows, axis=0, return_index=True)
-    once = rows[np.sort(first)]
-    return once[np.argsort(once[:, 0], kind="stable")]
+def _in_order(readings):
+    """Poses from 0, ids (m,) and rows (m, c), in ascending order of pose; repeated rows once."""
+    _, first = np.unique(readings.numbers, axis=0, return_index=True)
+    rows = readings.numbers[np.sort(first)]
+    rows = rows[np.argsort(rows[:, 0], kind="stable")]
+    return rows[:, 0].astype(np.int64) - 1, rows[:, 1].astype(np.int64), rows
 
 
-def _by_id(rows):
-    return rows[np.argsort(rows[:, 0])]
-
-
-def _ids(rows, column):
-    return rows[:, column].astype(np.int64)
+def _by_id(landmarks):
+    """Ids (k,), ascending, and places (k, d)."""
+    rows = landmarks.numbers[np.argsort(landmarks.numbers[:, 0])]
+    return rows[:, 0].astype(np.int64), rows[:, 1:]
 
 
 def read_truth(folder: Path | str) -> Truth | None:
@@ -134,14 +130,12 @@ def read_truth(folder: Path | str) -> Truth | None:
     count = len(read_table(drive[ENCODER], ENCODER).numbers)
     require(len(path.numbers) == count, path.source,
             f"{count} poses (encoder file), found {len(path.numbers)}")
-    marker = _by_id(markers.numbers)
-    antenna = _by_id(antennas.numbers)
+    marker, marker_in_world = _by_id(markers)
+    antenna, antenna_in_world = _by_id(antennas)
     poses = path.numbers[:, 1:].copy()
     poses[:, 2] = np.unwrap(np.r_[0, poses[:, 2]])[1:]
-    truth = Truth(
-        poses=poses, marker=_ids(marker, 0), marker_in_world=marker[:, 1:],
-        antenna=_ids(antenna, 0), antenna_in_world=antenna[:, 1:],
-        vehicle=read_vehicle(files.get(VEHICLE), read_vehicle(drive.get(VEHICLE))))
+    vehicle = read_vehicle(files.get(VEHICLE), read_vehicle(drive.get(VEHICLE)))
+    truth = Truth(poses, marker, marker_in_world, antenna, antenna_in_world, vehicle)
     x, y, heading = poses[0]
     if max(abs(x), abs(y), abs(heading)) > ORIGIN_TOLERANCE:
         truth = _in_the_frame_of(poses[0], truth)

@@ -52,60 +52,62 @@ LIMITS = {
 
 @dataclass(frozen=True)
 class Check:
-    """Which rows of a table are right, and what is expected of them."""
+    """Which rows of a table are right, and what is expected of them, or of one of their columns."""
 
-    ok: np.ndarray  # (m,) bool, of rows; or (m, c), of their numbers
-    expected: str | list[str]  # of all; or of each of the c columns
-
-
-def given(numbers: np.ndarray, columns: list[str]) -> Check:
-    """The Check that no number (m, c) is missing: none is NaN, and no range is 0."""
-    ok = ~np.isnan(numbers)
-    expected = [f"{column}, a number" for column in columns]
-    if "range" in columns:
-        k = columns.index("range")
-        ok[:, k] &= numbers[:, k] != 0
-        expected[k] += " (0 is no reception)"
-    return Check(ok, expected)
+    ok: np.ndarray  # (m,) bool
+    expected: str
+    column: int | None = None
 
 
-def within(numbers: np.ndarray, limits: dict[str, Limit]) -> Check:
-    """The Check that numbers (m, c) hold the limits of their columns."""
-    ok = np.ones(numbers.shape, dtype=bool)
-    expected = []
+def given(numbers: np.ndarray, columns) -> list[Check]:
+    """Checks that no number (m, c) is missing: none is NaN, and no range is 0."""
+    checks = []
+    for k, column in enumerate(columns):
+        ok = ~np.isnan(numbers[:, k])
+        expected = f"{column}, a number"
+        if column == "range":
+            ok &= numbers[:, k] != 0
+            expected += " (0 is no reception)"
+        checks.append(Check(ok, expected, k))
+    return checks
+
+
+def within(numbers: np.ndarray, limits: dict[str, Limit]) -> list[Check]:
+    """Checks that numbers (m, c) are within the limits of their columns."""
+    checks = []
     for k, (column, limit) in enumerate(limits.items()):
-        ok[:, k] = limit.holds(numbers[:, k])
         kind = "whole" if limit.whole else "finite"
-        expected.append(f"{column}, a {kind} number {limit}")
-    return Check(ok, expected)
+        expected = f"{column}, a {kind} number {limit}"
+        checks.append(Check(limit.holds(numbers[:, k]), expected, k))
+    return checks
 
 
 def _counted(numbers):
     rows = np.arange(1, len(numbers) + 1)
-    return Check(numbers[:, 0] == rows, "pose ids 1, 2, 3, ... in order")
+    return [Check(numbers[:, 0] == rows, "pose ids 1, 2, 3, ... in order")]
 
 
 def _unique(numbers):
     _, first = np.unique(numbers[:, 0], return_index=True)
-    return Check(np.isin(np.arange(len(numbers)), first), "each id only once")
+    return [Check(np.isin(np.arange(len(numbers)), first), "each id only once")]
 
 
 def _positive_definite(numbers):
     """Judged as a correlation matrix: s_thetatheta may be 1e4 rad^2 where s_xx is 1e-4 m^2."""
     correlations = se2.correlations(numbers[:, COVARIANCE])
     smallest = np.linalg.eigvalsh(correlations)[:, 0]
-    return Check(smallest > MIN_EIGENVALUE, "a positive definite covariance (smallest eigenvalue "
-                 f"of its correlation matrix above {MIN_EIGENVALUE:g})")
+    return [Check(smallest > MIN_EIGENVALUE, "a positive definite covariance (smallest eigenvalue "
+                  f"of its correlation matrix above {MIN_EIGENVALUE:g})")]
 
 
 def _hardly_negative(numbers):
     distance = numbers[:, 2]
     sigma = numbers[:, 3]
-    return Check(distance >= -MAX_NEGATIVE_SIGMAS * sigma,
-                 f"a range that is not below -{MAX_NEGATIVE_SIGMAS:g} sigma")
+    return [Check(distance >= -MAX_NEGATIVE_SIGMAS * sigma,
+                  f"a range that is not below -{MAX_NEGATIVE_SIGMAS:g} sigma")]
 
 
-# What the numbers (m, c) of a file must be together: functions that return a Check.
+# What the numbers (m, c) of a row must be together: functions that return Checks.
 CHECKS = {
     ENCODER: _counted, ARUCO: _positive_definite, UWB: _hardly_negative, GUESS: _unique,
     TRUE_POSES: _counted, TRUE_MARKERS: _unique, TRUE_ANTENNAS: _unique}

@@ -44,42 +44,39 @@ class Table:
         kind = "line" if isinstance(self.source, Path) else "row"
         return f"{kind} {self.lines[row]}"
 
-    def require_rows(self, check: Check):
-        """Raise DatasetError about the first row that a Check does not find right."""
-        if not check.ok.all():
-            raise DatasetError(f"{self.source}, {self._fault(check)}")
+    def require_rows(self, checks: list[Check]):
+        """Raise DatasetError about the first row that is not right by all checks."""
+        if not _right(checks).all():
+            raise DatasetError(f"{self.source}, {self._fault(checks)}")
 
-    def drop_rows(self, check: Check, most: float = np.inf) -> "Table":
-        """The Table of the rows that a Check finds right, with a note on the others.
+    def drop_rows(self, checks: list[Check], most: float = np.inf) -> "Table":
+        """The Table of the rows that are right by all checks, with a note on the others.
 
         Raises DatasetError for the first of the others if they are more than `most`.
         """
-        ok = _right_rows(check)
+        ok = _right(checks)
         dropped = np.count_nonzero(~ok)
         if dropped == 0:
             return self
         if dropped > most:
-            self.require_rows(check)
+            self.require_rows(checks)
         kept = replace(self, numbers=self.numbers[ok], lines=self.lines[ok])
         return kept.noted(
-            f": {dropped} of {len(ok)} rows left out, the first in {self._fault(check)}")
+            f": {dropped} of {len(ok)} rows left out, the first in {self._fault(checks)}")
 
-    def _fault(self, check):
+    def _fault(self, checks):
         """Place, expectation and finding (str) in the first row that is not right."""
-        row = int(np.argmin(_right_rows(check)))
-        expected = check.expected
+        row = int(np.argmin(_right(checks)))
+        failed = next(check for check in checks if not check.ok[row])
         found = self.numbers[row]
-        if check.ok.ndim == 2:
-            column = int(np.argmin(check.ok[row]))
-            expected = expected[column]
-            found = found[[column]]
+        if failed.column is not None:
+            found = found[[failed.column]]
         found = " ".join(f"{number:.12g}" for number in found)
-        return f"{self.place(row)}: expected {expected}, found '{found}'"
+        return f"{self.place(row)}: expected {failed.expected}, found '{found}'"
 
 
-def _right_rows(check):
-    """The rows (m,) bool that a Check finds right in all columns."""
-    return check.ok if check.ok.ndim == 1 else check.ok.all(axis=1)
+def _right(checks):
+    return np.all([check.ok for check in checks], axis=0)
 
 
 def read_table(source: Path | Table | None, name: str, pose_count: int | None = None) -> Table:
@@ -89,13 +86,14 @@ def read_table(source: Path | Table | None, name: str, pose_count: int | None = 
     has readings of a sensor, and some rows may be left out. Raises DatasetError for any other row
     that does not pass, as one with words.
     """
+    limits = LIMITS[name]
     if source is None:
-        return _empty(name, name)
-    table = _table_of_text(source, name) if isinstance(source, Path) else source
+        return _empty(name, limits)
+    table = _table_of_text(source, list(limits)) if isinstance(source, Path) else source
     if pose_count is not None:
         return _right_readings(table, name, pose_count)
-    table.require_rows(given(table.numbers, list(LIMITS[name])))
-    table.require_rows(within(table.numbers, LIMITS[name]))
+    table.require_rows(given(table.numbers, limits))
+    table.require_rows(within(table.numbers, limits))
     table.require_rows(CHECKS[name](table.numbers))
     return table
 
@@ -106,17 +104,16 @@ def _right_readings(table, name, pose_count):
     Rows with NaN and without a range are left out, and up to MAX_BAD_SHARE of others.
     """
     limits = LIMITS[name] | {"pose id": Limit(1, pose_count, whole=True)}
-    table = table.drop_rows(given(table.numbers, list(limits)))
-    table.require_rows(Check(table.numbers[:, 0] != 0, "pose ids from 1 on"))
+    table = table.drop_rows(given(table.numbers, limits))
+    table.require_rows([Check(table.numbers[:, 0] != 0, "pose ids from 1 on")])
     most = MAX_BAD_SHARE * len(table.numbers)
     possible = table.drop_rows(within(table.numbers, limits), most)
     most -= len(table.numbers) - len(possible.numbers)
     return possible.drop_rows(CHECKS[name](possible.numbers), most)
 
 
-def _empty(source, name):
-    """The Table of a source without rows."""
-    return Table(source, np.empty((0, len(LIMITS[name]))))
+def _empty(source, columns):
+    return Table(source, np.empty((0, len(columns))))
 
 
 def table_of_array(source: str, value, name: str, counted: bool = False) -> Table:
@@ -133,7 +130,7 @@ def table_of_array(source: str, value, name: str, counted: bool = False) -> Tabl
     except (TypeError, ValueError):
         array = np.asarray(value, dtype=object)
     if value is None or array.size == 0:
-        return _empty(source, name)
+        return _empty(source, LIMITS[name])
     fits = array.dtype == float and array.ndim == 2 and array.shape[1] == len(columns)
     require(fits, source, f"a matrix of real numbers with {len(columns)} columns "
             f"({', '.join(columns)}), found {array.dtype} of shape {array.shape}")
@@ -143,28 +140,27 @@ def table_of_array(source: str, value, name: str, counted: bool = False) -> Tabl
     return Table(source, array, rows)
 
 
-def _table_of_text(source, name):
-    """The Table of a text file (Path), with NaN for empty cells."""
-    columns = list(LIMITS[name])
-    table = _empty(source, name)
+def _table_of_text(source, columns):
+    """The Table of a text file (Path) with these columns, with NaN for empty cells."""
+    table = _empty(source, columns)
     rows = read_rows(source)
     lines = list(rows)
-    if rows and is_header(rows[lines[0]]):
-        table = table.noted(f": the header {quoted(rows[lines[0]])} was left out; columns were "
-                            f"read as {', '.join(columns)}")
-        lines = lines[1:]
+    if lines and is_header(rows[lines[0]]):
+        header = quoted(rows[lines.pop(0)])
+        table = table.noted(
+            f": the header {header} was left out; columns were read as {', '.join(columns)}")
     if not lines:
         return table
     cells = split_rows([rows[line] for line in lines], len(columns))
     if len(cells) < len(lines):
-        line = lines[len(cells)]
-        require(False, f"{source}, line {line}",
-                f"{len(columns)} numbers ({', '.join(columns)})", rows[line])
+        wrong = lines[len(cells)]
+        require(False, f"{source}, line {wrong}",
+                f"{len(columns)} numbers ({', '.join(columns)})", rows[wrong])
     text = np.array(cells)
-    with_points = np.strings.replace(text, ",", ".")
-    if (with_points != text).any():
+    numbers = np.strings.replace(text, ",", ".")
+    if (numbers != text).any():
         table = table.noted(" was read with decimal commas")
-    return replace(table, numbers=with_points.astype(float), lines=np.array(lines))
+    return replace(table, numbers=numbers.astype(float), lines=np.array(lines))
 
 
 def contents(folder: Path | str, expected: tuple[str, ...] = DATASET_FILES,
