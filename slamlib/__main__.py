@@ -228,11 +228,11 @@ def _solve(options):
     truth = read_truth(options.folder)
     stated = {"kernel": options.kernel, "slip": options.slip}
     dataset = replace(dataset, vehicle=changed(dataset.vehicle, stated, "slamlib solve"))
+    print("\n".join(inventory_lines(dataset, truth)), file=sys.stderr)
     problems = sorted(f"problem{each}" for each in options.problem)
     for problem in problems:
         require(allows(dataset, problem), options.folder,
                 f"the measurements of {problem} ({title(problem, dataset)})")
-    print("\n".join(inventory_lines(dataset, truth)), file=sys.stderr)
     summary = solve_to_folder(dataset, truth, options.out, problems or list(PROBLEMS), options.csv)
     print(summary_table(summary))
     print(f"results: {options.out.resolve()}", file=sys.stderr)

@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 
 from slamlib.core import se2
-from slamlib.core.errors import DatasetError as DatasetError
 from slamlib.core.errors import require
 from slamlib.core.records import AntennaGuess, ArucoReadings, Dataset, Truth, UwbReadings
 from slamlib.core.vehicle import TABLE_2, Vehicle, changed
@@ -31,14 +30,14 @@ from slamlib.io.formats import (
     VEHICLE,
     Check,
 )
-from slamlib.io.tables import contents, read_table, table_of_array
+from slamlib.io.tables import Table, contents, listed, read_table, table_of_array
 from slamlib.io.vehicle import incremental_counts, read_vehicle
 
 ORIGIN_TOLERANCE = 1e-3  # m and rad; a first true pose within it is taken as the origin
 
 
 def read_dataset(folder: Path | str) -> Dataset:
-    """Measurements of one drive; sensors without a file or without rows are None.
+    """Measurements of one drive; sensors without a file or without usable rows are None.
 
     `Dataset.notes` state what was mended, left out or not read. Raises DatasetError if a file does
     not have the format.
@@ -58,7 +57,7 @@ def dataset_from_arrays(ticks, aruco=None, uwb=None, guess=None, vehicle: Vehicl
     aruco : (m, 11) pose id from 1 to n, marker id, x, y, heading of the marker in the vehicle,
         and their covariances xx, xy, x heading, yy, y heading, heading heading; or None.
     uwb : (r, 4) pose id from 1 to n, antenna id, range, standard deviation; or None.
-    guess : (a, 3) antenna id, x, y, of at least the antennas in `uwb`; or None.
+    guess : (a, 3) antenna id, x, y; or None. Ranges to other antennas are left out.
     vehicle : Vehicle
 
     Rows are checked, and bad ones left out with a note, as those of files. Raises DatasetError,
@@ -84,9 +83,7 @@ def _dataset(files, vehicle, name, notes=()):
     sightings = read_table(files.get(ARUCO), ARUCO, len(ticks))
     ranges = read_table(files.get(UWB), UWB, len(ticks))
     guesses = read_table(files.get(GUESS), GUESS)
-    ranges.require_rows([Check(
-        np.isin(ranges.numbers[:, 1], guesses.numbers[:, 0]), "an antenna id that the guesses "
-        "have, which ranges need: UwbAntennaGuess.txt in the same folder, or guess")])
+    ranges = _of_guessed_antennas(ranges, guesses)
     pose, marker, seen = _in_order(sightings)
     aruco = ArucoReadings(pose, marker, seen[:, 2:5], seen[:, COVARIANCE])
     pose, antenna, heard = _in_order(ranges)
@@ -96,6 +93,19 @@ def _dataset(files, vehicle, name, notes=()):
         name=name, vehicle=vehicle, ticks=ticks, aruco=aruco if len(aruco.pose) else None,
         uwb=uwb if len(uwb.pose) else None, antenna_guess=guess if len(guess.antenna) else None,
         notes=notes + encoders.notes + sightings.notes + ranges.notes + guesses.notes)
+
+
+def _of_guessed_antennas(ranges, guesses):
+    """The ranges of antennas that have a guess, with a note on the others."""
+    antenna = ranges.numbers[:, 1]
+    known = np.isin(antenna, guesses.numbers[:, 0])
+    if len(antenna) and len(guesses.numbers) == 0:
+        lack = "is missing" if guesses.source == GUESS else "has no rows"
+        note = f"{guesses.name} {lack}: problem 4 is left out."
+        return Table(ranges.source, ranges.numbers[:0], notes=(*ranges.notes, note))
+    unknown = listed([f"{each:.0f}" for each in np.unique(antenna[~known])])
+    return ranges.drop_rows([Check(
+        known, f"an antenna id of {guesses.name}, which lacks {unknown}", column=1)])
 
 
 def _in_order(readings):
@@ -163,12 +173,12 @@ def all_notes(dataset: Dataset, truth: Truth | None) -> tuple[str, ...]:
 def inventory_lines(dataset: Dataset, truth: Truth | None) -> list[str]:
     """Lines on what was read of a Dataset and its Truth, with all notes."""
     aruco = dataset.aruco
-    markers = "none, no ArucoReading.txt with rows"
+    markers = "none, no ArucoReading.txt with usable rows"
     if aruco is not None:
         markers = (f"{len(aruco.pose)} sightings of {_distinct(aruco.marker)} markers at "
                    f"{_distinct(aruco.pose)} poses")
     uwb = dataset.uwb
-    ranges = "none, no UwbReading.txt with rows"
+    ranges = "none, no UwbReading.txt with usable rows"
     if uwb is not None:
         ranges = (f"{len(uwb.pose)} ranges to {_distinct(uwb.antenna)} antennas at "
                   f"{_distinct(uwb.pose)} poses")

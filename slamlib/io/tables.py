@@ -14,7 +14,17 @@ from scipy.io import loadmat
 
 from slamlib.core.errors import DatasetError, quoted, require
 from slamlib.core.vehicle import Limit
-from slamlib.io.formats import CHECKS, DATASET_FILES, ENCODER, LIMITS, TABLES, Check, given, within
+from slamlib.io.formats import (
+    CHECKS,
+    DATASET_FILES,
+    ENCODER,
+    GUESS,
+    LIMITS,
+    TABLES,
+    Check,
+    given,
+    within,
+)
 from slamlib.io.textfile import is_header, read_rows, split_rows
 
 MAX_BAD_SHARE = 0.1  # of the rows of a sensor, which are left out; with more a file is refused
@@ -34,10 +44,14 @@ class Table:
     lines: np.ndarray = ()  # (m,) of the rows, from 1
     notes: tuple[str, ...] = ()  # sentences on what was mended or left out
 
+    @property
+    def name(self) -> str:
+        """Name of the file without its folder, or of the argument."""
+        return Path(str(self.source)).name
+
     def noted(self, note: str) -> "Table":
         """The Table with one more note, a clause about its file."""
-        name = Path(str(self.source)).name
-        return replace(self, notes=(*self.notes, f"{name}{note}."))
+        return replace(self, notes=(*self.notes, f"{self.name}{note}."))
 
     def place(self, row: int) -> str:
         """What messages call a row."""
@@ -89,7 +103,7 @@ def read_table(source: Path | Table | None, name: str, pose_count: int | None = 
     limits = LIMITS[name]
     if source is None:
         return _empty(name, limits)
-    table = _table_of_text(source, list(limits)) if isinstance(source, Path) else source
+    table = _table_of_text(source, name) if isinstance(source, Path) else source
     if pose_count is not None:
         return _right_readings(table, name, pose_count)
     table.require_rows(given(table.numbers, limits))
@@ -140,8 +154,9 @@ def table_of_array(source: str, value, name: str, counted: bool = False) -> Tabl
     return Table(source, array, rows)
 
 
-def _table_of_text(source, columns):
-    """The Table of a text file (Path) with these columns, with NaN for empty cells."""
+def _table_of_text(source, name):
+    """The Table of a text file (Path), with NaN for empty cells and without heights of antennas."""
+    columns = list(LIMITS[name])
     table = _empty(source, columns)
     rows = read_rows(source)
     lines = list(rows)
@@ -151,14 +166,20 @@ def _table_of_text(source, columns):
             f": the header {header} was left out; columns were read as {', '.join(columns)}")
     if not lines:
         return table
-    cells = split_rows([rows[line] for line in lines], len(columns))
-    if len(cells) < len(lines):
-        wrong = lines[len(cells)]
-        require(False, f"{source}, line {wrong}",
-                f"{len(columns)} numbers ({', '.join(columns)})", rows[wrong])
-    text = np.array(cells)
-    numbers = np.strings.replace(text, ",", ".")
-    if (numbers != text).any():
+    texts = [rows[line] for line in lines]
+    cells = split_rows(texts, len(columns))
+    if name == GUESS and len(cells) < len(texts):
+        with_heights = split_rows(texts, 4)
+        if len(with_heights) == len(texts):
+            cells = [row[:3] for row in with_heights]
+            table = table.noted(": the last of 4 columns was taken as z and left out")
+    if len(cells) < len(texts):
+        k = len(cells)
+        require(False, f"{source}, line {lines[k]}",
+                f"{len(columns)} numbers ({', '.join(columns)})", texts[k])
+    with_commas = np.array(cells)
+    numbers = np.strings.replace(with_commas, ",", ".")
+    if (numbers != with_commas).any():
         table = table.noted(" was read with decimal commas")
     return replace(table, numbers=numbers.astype(float), lines=np.array(lines))
 
