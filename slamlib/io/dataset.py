@@ -22,15 +22,13 @@ from slamlib.io.formats import (
     COVARIANCE,
     ENCODER,
     GUESS,
-    TRUE_ANTENNAS,
-    TRUE_MARKERS,
-    TRUE_POSES,
     TRUTH_FILES,
+    TRUTH_TABLES,
     UWB,
     VEHICLE,
     Check,
 )
-from slamlib.io.tables import Table, contents, listed, read_table, table_of_array
+from slamlib.io.tables import contents, listed, read_table, table_of_array
 from slamlib.io.vehicle import incremental_counts, read_vehicle
 
 ORIGIN_TOLERANCE = 1e-3  # m and rad; a first true pose within it is taken as the origin
@@ -99,10 +97,10 @@ def _of_guessed_antennas(ranges, guesses):
     """The ranges of antennas that have a guess, with a note on the others."""
     antenna = ranges.numbers[:, 1]
     known = np.isin(antenna, guesses.numbers[:, 0])
-    if len(antenna) and len(guesses.numbers) == 0:
+    if len(antenna) > 0 and len(guesses.numbers) == 0:
         lack = "is missing" if guesses.source == GUESS else "has no rows"
         note = f"{guesses.name} {lack}: problem 4 is left out."
-        return Table(ranges.source, ranges.numbers[:0], notes=(*ranges.notes, note))
+        return replace(ranges, numbers=ranges.numbers[:0], notes=(*ranges.notes, note))
     unknown = listed([f"{each:.0f}" for each in np.unique(antenna[~known])])
     return ranges.drop_rows([Check(
         known, f"an antenna id of {guesses.name}, which lacks {unknown}", column=1)])
@@ -133,10 +131,8 @@ def read_truth(folder: Path | str) -> Truth | None:
     drive, _ = contents(folder, required=ENCODER)
     if "truth" not in drive:
         return None
-    files, notes = contents(drive["truth"], TRUTH_FILES, required=TRUE_POSES)
-    path = read_table(files[TRUE_POSES], TRUE_POSES)
-    markers = read_table(files.get(TRUE_MARKERS), TRUE_MARKERS)
-    antennas = read_table(files.get(TRUE_ANTENNAS), TRUE_ANTENNAS)
+    files, notes = contents(drive["truth"], TRUTH_FILES, required="vehiclePose.txt")
+    path, markers, antennas = [read_table(files.get(name), name) for name in TRUTH_TABLES]
     count = len(read_table(drive[ENCODER], ENCODER).numbers)
     require(len(path.numbers) == count, path.source,
             f"{count} poses (encoder file), found {len(path.numbers)}")

@@ -15,13 +15,11 @@ ENCODER = "encoderReading.txt"
 ARUCO = "ArucoReading.txt"
 UWB = "UwbReading.txt"
 GUESS = "UwbAntennaGuess.txt"
-TRUE_POSES = "vehiclePose.txt"
-TRUE_MARKERS = "ArucoMap.txt"
-TRUE_ANTENNAS = "UwbMap.txt"
+TABLES = (ENCODER, ARUCO, UWB, GUESS)
+TRUTH_TABLES = ("vehiclePose.txt", "ArucoMap.txt", "UwbMap.txt")
 VEHICLE = "vehicle.toml"
-TABLES = (ENCODER, ARUCO, UWB, GUESS)                     # of a drive
 DATASET_FILES = (*TABLES, VEHICLE, "truth")
-TRUTH_FILES = (TRUE_POSES, TRUE_MARKERS, TRUE_ANTENNAS, VEHICLE)
+TRUTH_FILES = (*TRUTH_TABLES, VEHICLE)
 
 MIN_EIGENVALUE = 1e-12  # of a correlation matrix; with a smaller one it counts as singular
 MAX_NEGATIVE_SIGMAS = 5.0  # sigmas, by which noise may make a range negative
@@ -45,9 +43,9 @@ LIMITS = {
     UWB: {"pose id": _WHOLE, "antenna id": _WHOLE, "range": Limit(-5e4, 1e5, "m"),
           "sigma": Limit(1e-9, 1e4, "m")},
     GUESS: {"antenna id": _WHOLE, "x": _GUESS, "y": _GUESS},
-    TRUE_POSES: {"pose id": _WHOLE, "x": _TRUE, "y": _TRUE, "theta": _TRUE_ANGLE},
-    TRUE_MARKERS: {"marker id": _WHOLE, "x": _TRUE, "y": _TRUE, "theta": _TRUE_ANGLE},
-    TRUE_ANTENNAS: {"antenna id": _WHOLE, "x": _TRUE, "y": _TRUE}}
+    "vehiclePose.txt": {"pose id": _WHOLE, "x": _TRUE, "y": _TRUE, "theta": _TRUE_ANGLE},
+    "ArucoMap.txt": {"marker id": _WHOLE, "x": _TRUE, "y": _TRUE, "theta": _TRUE_ANGLE},
+    "UwbMap.txt": {"antenna id": _WHOLE, "x": _TRUE, "y": _TRUE}}
 
 
 @dataclass(frozen=True)
@@ -110,4 +108,4 @@ def _hardly_negative(numbers):
 # What the numbers (m, c) of a row must be together: functions that return Checks.
 CHECKS = {
     ENCODER: _counted, ARUCO: _positive_definite, UWB: _hardly_negative, GUESS: _unique,
-    TRUE_POSES: _counted, TRUE_MARKERS: _unique, TRUE_ANTENNAS: _unique}
+    "vehiclePose.txt": _counted, "ArucoMap.txt": _unique, "UwbMap.txt": _unique}

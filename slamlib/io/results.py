@@ -84,14 +84,16 @@ def write_structs(folder: Path | str, name: str, ids: np.ndarray | None, places:
     array's size and number of columns are set (MAT-File Format, version 5).
     """
     count, d = np.shape(places)
-    zeros, numbers, layout = {}, {}, []
+    zeros = {}
+    numbers = {}
+    entries = []
     for field, values, shape in zip(
             FIELDS[name], (places, covariances, ids), ((1, d), (d, d), (1, 1))):
         zeros[field] = np.zeros(shape)
         numbers[field] = np.reshape(values, (count,) + shape)
-        layout.append((f"header of {field}", FIELD_HEADER))
-        layout.append((field, "=f8", shape[::-1]))
-    layout = np.dtype(layout)
+        entries.append((f"header of {field}", FIELD_HEADER))
+        entries.append((field, "=f8", shape[::-1]))            # by columns
+    layout = np.dtype(entries)
     buffer = BytesIO()
     savemat(buffer, {name: zeros})
     content = bytearray(buffer.getvalue())

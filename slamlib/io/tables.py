@@ -192,7 +192,9 @@ def contents(folder: Path | str, expected: tuple[str, ...] = DATASET_FILES,
     have one of the names `expected`.
     """
     folder = Path(folder)
-    files, notes, others = {}, [], []
+    files = {}
+    notes = []
+    others = []
     for path in _listed(folder):
         name = _expected_name(path, expected)
         if name is None:
@@ -232,12 +234,13 @@ def _expected_name(path, expected):
 
 def _matrices(path, names):
     """Tables (dict) of the matrices of a .mat file with the stems of `names`, and notes."""
-    tables, notes = {}, []
+    tables = {}
+    notes = []
     if path.suffix.lower() != ".mat" or not path.is_file() or not names:
         return tables, notes
     try:
         variables = loadmat(path)
-    except Exception:               # scipy raises many kinds about other versions and bytes
+    except Exception:  # scipy raises many kinds about other versions and bytes
         return tables, notes
     by_stem = {Path(name).stem.lower(): name for name in names}
     for key, value in variables.items():
