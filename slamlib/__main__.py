@@ -17,11 +17,12 @@ from slamlib.core.vehicle import changed  # noqa: E402
 from slamlib.io.dataset import read_dataset, read_truth  # noqa: E402
 
 EXECUTED_NOTEBOOKS = Path("build", "executed")  # folder in which executed notebooks are kept
+HAND_IN_PAGES = Path("build", "hand-in")  # folder of the report that is handed in
 END_SIGNALS = {signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)}  # Windows has no SIGHUP
 
 
-def main(arguments=None):
-    """Run one command of `arguments` (list of str, or None for the command line's).
+def main(arguments: list[str] | None = None) -> int:
+    """Run one command of `arguments`, or of the command line.
 
     Returns the exit code: 0, 1 if a notebook failed, 2 for invalid input, 3 if a problem could not
     be solved, 130 if ended by a signal.
@@ -32,17 +33,22 @@ def main(arguments=None):
             if signal.getsignal(each) == signal.SIG_DFL:     # nohup's handler stays
                 signal.signal(each, signal.default_int_handler)      # as by Ctrl-C
     parser = _parser()
-    options, options.others = parser.parse_known_args(arguments)
-    if options.others and options.run is not _lab:
-        parser.error(f"unrecognized arguments: {' '.join(options.others)}")
+    options, others = parser.parse_known_args(arguments)
+    options.others = others
+    if others and options.run is not _lab:
+        parser.error(f"unrecognized arguments: {' '.join(others)}")
     try:
         return options.run(options)
     except DatasetError as error:
-        reason, code = error, 2
+        return _ended(2, error)
     except OSError as error:
-        reason, code = f"cannot be read or written: {error}", 2
+        return _ended(2, f"cannot be read or written: {error}")
     except KeyboardInterrupt:
-        reason, code = "ended by a signal", 130
+        return _ended(130, "ended by a signal")
+
+
+def _ended(code, reason):
+    """The exit code, after the reason was printed."""
     with suppress(OSError):  # the terminal may be gone
         print(f"slamlib: {reason}", file=sys.stderr)
     return code
@@ -55,39 +61,55 @@ def _parser():
     whole.add_argument("--version", action="version", version=f"slamlib {__version__}")
     commands = whole.add_subparsers(required=True, metavar="COMMAND")
 
-    def command(name, run, help, *paths, **options):
-        """Add a command with (option, default, help) of its paths."""
-        parser = commands.add_parser(name, help=help, **options)
-        parser.set_defaults(run=run)
-        for option, default, help in paths:
-            parser.add_argument(option, type=Path, default=default,
-                                help=help + " (default %(default)s)" * bool(default))
-        return parser.add_argument
+    report = commands.add_parser("report", help="execute the notebooks and build the report")
+    report.set_defaults(run=_build, out=None)
+    _add_options_of_a_build(report)
+    _add_path(report, "--report", "folder for the pages", "report")
 
-    data = "--data", "data", "folder of the datasets"
-    notebooks = ("--notebooks", None, "folder of the notebooks (default: the folder notebooks "
-                 "where there is one, else those of the installation)")
-    made = data, notebooks, ("--results", "results", "folder for the .mat files")
-    for add in (command("report", _build, "execute the notebooks and build the report", *made,
-                        ("--report", "report", "folder for the pages")),
-                command("hand-in", _build, "build the report, and zip it with the result files",
-                        *made, ("--out", "hand-in.zip", "the file to write"))):
-        add("datasets", nargs="*", metavar="DATASET",
-            help="names of folders in data/ (all of them when none is named)")
-        add("--jobs", type=int, default=2, help="notebooks executed at a time")
-        add("--fresh", action="store_true",
-            help="execute all notebooks and studies, also where nothing changed")
+    hand_in = commands.add_parser(
+        "hand-in", help="build the report, and zip it with the result files")
+    hand_in.set_defaults(run=_build, report=HAND_IN_PAGES)
+    _add_options_of_a_build(hand_in)
+    _add_path(hand_in, "--out", "the file to write", "hand-in.zip")
 
-    _add_solve_and_simulate(command)
-    command("lab", _lab, "open JupyterLab on the notebooks; it is given all other arguments, as "
-            "--no-browser", data, notebooks, allow_abbrev=False)
+    _add_solve(commands)
+    _add_simulate(commands)
+    lab = commands.add_parser("lab", allow_abbrev=False, help="open JupyterLab on the notebooks; "
+                              "it is given all other arguments, as --no-browser")
+    lab.set_defaults(run=_lab)
+    _add_data_and_notebooks(lab)
     return whole
 
 
-def _add_solve_and_simulate(command):
-    add = command("solve", _solve, "solve problems without notebooks",
-                  ("folder", None, "the dataset's folder"),
-                  ("--plot", None, "write a picture of map and errors: a .png, .pdf or .svg file"))
+def _add_path(command, name, help, default=None):
+    if default is not None:
+        help += " (default %(default)s)"
+    command.add_argument(name, type=Path, default=default, help=help)
+
+
+def _add_data_and_notebooks(command):
+    _add_path(command, "--data", "folder of the datasets", "data")
+    _add_path(command, "--notebooks", "folder of the notebooks (default: the folder notebooks "
+              "where there is one, else those of the installation)")
+
+
+def _add_options_of_a_build(command):
+    _add_data_and_notebooks(command)
+    _add_path(command, "--results", "folder for the .mat files", "results")
+    add = command.add_argument
+    add("datasets", nargs="*", metavar="DATASET",
+        help="names of folders in data/ (all of them when none is named)")
+    add("--jobs", type=int, default=2, help="notebooks executed at a time")
+    add("--fresh", action="store_true",
+        help="execute all notebooks and studies, also where nothing changed")
+
+
+def _add_solve(commands):
+    command = commands.add_parser("solve", help="solve problems without notebooks")
+    command.set_defaults(run=_solve)
+    _add_path(command, "folder", "the dataset's folder")
+    _add_path(command, "--plot", "write a picture of map and errors: a .png, .pdf or .svg file")
+    add = command.add_argument
     add("--out", type=Path, required=True, help="folder for the results")
     add("--problem", action="append", default=[], metavar="NAME",
         type=lambda text: text.removeprefix("problem"),
@@ -99,8 +121,12 @@ def _add_solve_and_simulate(command):
     add("--csv", action="store_true", help="write poses and maps as text, too: CSV with "
         "covariances, and trajectories as TUM files for evo")
 
-    add = command("simulate", _simulate, "make a dataset with its truth",
-                  ("folder", None, "a new or empty folder"))
+
+def _add_simulate(commands):
+    command = commands.add_parser("simulate", help="make a dataset with its truth")
+    command.set_defaults(run=_simulate)
+    _add_path(command, "folder", "a new or empty folder")
+    add = command.add_argument
     add("--path", choices=("short", "long"), default="short")
     add("--rounds", type=int, default=1,
         help="how often the path is driven; 44 long ones are a million rows")
@@ -114,65 +140,79 @@ def _add_solve_and_simulate(command):
 
 
 def _build(options):
-    """Build the report, and write the zip to hand in where `out` is one of the options."""
+    """Build the report, and write the zip to hand in where `out` is given."""
     from slamlib.report import NotebookError, build_report, handin
     from slamlib.report.notebooks import notebooks_folder, read_options
-    from slamlib.solve import summarize
-    shown, omitted, out = read_options("report.toml"), (), vars(options).get("out")
-    pages = Path("build", "hand-in") if out else options.report
+    shown = read_options("report.toml")
     notebooks = options.notebooks or notebooks_folder()
-    datasets = [Path(each).name if Path(each).resolve().parent == options.data.resolve() else each
-                for each in options.datasets] or None            # names, or paths in data/
-    for folder, other in ((pages, options.results), (options.results, pages)):
-        _require_elsewhere(folder, options.data, notebooks, other)
-    if out:
-        require(not out.is_dir(), out, "a file to write, found a folder")
+    _require_elsewhere(options.report, options.data, notebooks, options.results)
+    _require_elsewhere(options.results, options.data, notebooks, options.report)
+    datasets = [_name_in(options.data, each) for each in options.datasets] or None
+    omitted = ()
+    if options.out:
+        require(not options.out.is_dir(), options.out, "a file to write, found a folder")
         shown = handin.hand_in_options(shown)
         datasets, omitted = handin.selection(options.data, datasets)
     try:
         report = build_report(
-            notebooks, options.data, pages, options.results, datasets=datasets, options=shown,
-            jobs=options.jobs, kept=EXECUTED_NOTEBOOKS, fresh=options.fresh)
+            notebooks, options.data, options.report, options.results, datasets=datasets,
+            options=shown, jobs=options.jobs, kept=EXECUTED_NOTEBOOKS, fresh=options.fresh)
     except NotebookError as error:
-        print(f"slamlib: {error}", file=sys.stderr)
-        return 1
+        return _ended(1, error)
     if not shown.author:
         print("report.toml names no author: the PDF's title page has none", file=sys.stderr)
     for drive in report.drives:
-        rows = {each.problem: summarize(each, drive.truth) for each in drive.solutions} | {
-            each.problem: {"failed": each.reason} for each in drive.failures}
-        print(summary_table({"dataset": drive.name, "poses": len(drive.dataset.ticks),
-                             "problems": rows, "doubts": map(vars, drive.doubts)}), file=sys.stderr)
-    if out:
-        handin.write_zip(out, report, options.results, shown, omitted)
-        print(f"hand-in: {out.resolve()}", file=sys.stderr)
+        print(summary_table(_summary(drive)), file=sys.stderr)
+    if options.out:
+        handin.write_zip(options.out, report, options.results, shown, omitted)
+        print(f"hand-in: {options.out.resolve()}", file=sys.stderr)
     else:
         print(f"report: {report.files[0]} and {report.files[-1]}", file=sys.stderr)
     return 3 if any(drive.failures for drive in report.drives) else 0
 
 
-def summary_table(summary):
-    """The summary as a table (str), a line for each problem, and sentences on doubts below it."""
+def _name_in(data, dataset):
+    """The name of a dataset (str), which may be given as its path in the folder `data`."""
+    path = Path(dataset)
+    return path.name if path.resolve().parent == data.resolve() else dataset
+
+
+def _summary(drive):
+    """The summary of a SolvedDrive, as `solve_to_folder` returns it, as far as a table needs it."""
+    from slamlib.solve import summarize
+    rows = {each.problem: summarize(each, drive.truth) for each in drive.solutions}
+    rows |= {each.problem: {"failed": each.reason} for each in drive.failures}
+    return {"dataset": drive.name, "poses": len(drive.dataset.ticks), "problems": rows,
+            "doubts": [vars(doubt) for doubt in drive.doubts]}
+
+
+def summary_table(summary: dict) -> str:
+    """The summary as a table, a line for each problem, and sentences on doubts below it."""
     lines = [f"{summary['dataset']}: {summary['poses']} poses",
              f"problem{'estimates':>18}{'last x, y, heading':>29}{'their sigmas':>28}{'ATE':>11}"]
     for name, row in summary["problems"].items():
         if "failed" in row:
             lines.append(f"{name:15}could not be solved: {row['failed']}")
             continue
-        numbers = "{:10}{:8.3f} m {:8.3f} m {:7.4f}  {:7.4f} m {:7.4f} m {:6.4f}".format(
-            row["estimated_poses"], *row["last_pose"], *row["last_sigma"])
-        error = f"{row['ate_m']:.4f} m" if "ate_m" in row else "-"
-        lines.append(f"{name:15}{numbers}{error:>11}")
-        if once := ", ".join(map(str, row.get("unconfirmed", ()))):
+        x, y, heading = row["last_pose"]
+        sigma_x, sigma_y, sigma_heading = row["last_sigma"]
+        ate = f"{row['ate_m']:.4f} m" if "ate_m" in row else "-"
+        lines.append(
+            f"{name:15}{row['estimated_poses']:10}{x:8.3f} m {y:8.3f} m {heading:7.4f}  "
+            f"{sigma_x:7.4f} m {sigma_y:7.4f} m {sigma_heading:6.4f}{ate:>11}")
+        if row.get("unconfirmed"):
+            once = ", ".join(map(str, row["unconfirmed"]))
             lines.append(
                 f"{'':15}nothing confirms markers {once}: seen once, or where another one is")
-    lines += [f"doubt ({doubt['what']}): {doubt['sentence']}" for doubt in summary["doubts"]]
+    for doubt in summary["doubts"]:
+        lines.append(f"doubt ({doubt['what']}): {doubt['sentence']}")
     return "\n".join(lines)
 
 
 def _require_elsewhere(out, *folders):
     """Raise DatasetError if a folder that a run replaces is or holds the current one or others."""
-    for folder in map(Path.resolve, (Path(), *folders)):
+    for folder in (Path(), *folders):
+        folder = folder.resolve()
         require(not folder.is_relative_to(out.resolve()), out, "another folder to write to: this "
                 f"one, which is replaced, is or holds {folder}")
 
@@ -181,31 +221,35 @@ def _solve(options):
     from slamlib.io.dataset import inventory_lines
     from slamlib.solve import PROBLEMS, allows, solve_to_folder, title
     _require_elsewhere(options.out, options.folder, options.folder / "truth")
-    require(not options.plot or options.plot.suffix.lower() in (".png", ".pdf", ".svg"), "--plot",
-            "a .png, .pdf or .svg file", options.plot)
-    dataset, truth = read_dataset(options.folder), read_truth(options.folder)
-    dataset = replace(dataset, vehicle=changed(
-        dataset.vehicle, {"kernel": options.kernel, "slip": options.slip}, "slamlib solve"))
-    problems = sorted(f"problem{each}" for each in options.problem) or [*PROBLEMS]
-    for each in problems if options.problem else ():
-        require(allows(dataset, each), options.folder,
-                f"the measurements of {each} ({title(each, dataset)})")
+    if options.plot:
+        require(options.plot.suffix.lower() in (".png", ".pdf", ".svg"), "--plot",
+                "a .png, .pdf or .svg file", options.plot)
+    dataset = read_dataset(options.folder)
+    truth = read_truth(options.folder)
+    stated = {"kernel": options.kernel, "slip": options.slip}
+    dataset = replace(dataset, vehicle=changed(dataset.vehicle, stated, "slamlib solve"))
     print("\n".join(inventory_lines(dataset, truth)), file=sys.stderr)
-    summary = solve_to_folder(dataset, truth, options.out, problems, options.csv)
+    problems = sorted(f"problem{each}" for each in options.problem)
+    for problem in problems:
+        require(allows(dataset, problem), options.folder,
+                f"the measurements of {problem} ({title(problem, dataset)})")
+    summary = solve_to_folder(dataset, truth, options.out, problems or list(PROBLEMS), options.csv)
     print(summary_table(summary))
     print(f"results: {options.out.resolve()}", file=sys.stderr)
-    if options.plot and any("failed" not in row for row in summary["problems"].values()):
+    failed = ["failed" in row for row in summary["problems"].values()]
+    if options.plot and not all(failed):
         from slamlib.report.overview import result_picture
         result_picture(dataset, truth, options.out, options.plot)
         print(f"picture: {options.plot.resolve()}", file=sys.stderr)
-    return 3 if any("failed" in row for row in summary["problems"].values()) else 0
+    return 3 if any(failed) else 0
 
 
 def _simulate(options):
     from slamlib.studies.simulation import simulate, write_dataset
-    write_dataset(options.folder, *simulate(
+    dataset, truth = simulate(
         options.path, options.seed, slip=options.slip, late_ranges=options.nlos,
-        mislabelled=options.mislabel, rounds=options.rounds))
+        mislabelled=options.mislabel, rounds=options.rounds)
+    write_dataset(options.folder, dataset, truth)
     return 0
 
 

@@ -215,7 +215,6 @@ THIRD_ROWS = {  # rows by what is said of them
             "3 infinity 6", "3 -infinity 5", "3 1e999 5", "3 -2e15 5", "3 5.5 6"],
         "at most 10 wheel revolutions (80000 ticks)": ["3 5 80001", "3 -80001 5"],
         "in order": ["4 5 6", "2 5 6"], "pose id, a whole number": ["2.5 5 6"]},
-    "UwbReading.txt": {"an antenna id that the guesses have": ["1 4 1 1"]},
     "UwbAntennaGuess.txt": {"each id only once": ["900 1 2"], "x, a finite number": ["9 inf 2"]},
     "truth/vehiclePose.txt": {"4 numbers (pose id, x, y, theta)": ["3 0 0"],
                               "in order": ["4 0 0 0"]},
@@ -318,10 +317,6 @@ def test_the_limits_that_a_user_reads_are_those_of_the_reader():
 
 
 def test_missing_files(folder):
-    (folder / "UwbAntennaGuess.txt").unlink()
-    assert error_of(read_dataset, folder) == (
-        f"{folder / 'UwbReading.txt'}, line 1: expected an antenna id that the guesses have, which "
-        "ranges need: UwbAntennaGuess.txt in the same folder, or guess, found '4 900 2.5 0.1'")
     for read, name in ((read_truth, "truth/vehiclePose.txt"), (read_dataset, "encoderReading.txt")):
         (folder / name).unlink()
         assert error_of(read, folder) == f"{folder / name}: expected this file, found none"

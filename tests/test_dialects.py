@@ -1,5 +1,6 @@
 """Files as they come: the same numbers with a note, named as not read, or refused."""
 
+import dataclasses
 import os
 import shutil
 from pathlib import Path
@@ -135,6 +136,53 @@ def test_bad_rows_of_all_kinds_together_are_a_tenth_at_most(tmp_path):
     assert "a range that is not below -5 sigma" in error_of(read_dataset, tmp_path)
 
 
+# Ranges need guesses, and other problems need none.
+
+
+def test_ranges_of_antennas_without_a_guess_are_left_out_and_named(folder):
+    clean = read_dataset(folder)
+    write(folder / "UwbReading.txt", "1 7 1 1\n" + FILES["UwbReading.txt"] + "2 -5 9 1\n3 7 2 1\n")
+    assert_same(
+        read_dataset(folder), clean, "UwbReading.txt: 3 of 5 rows left out, the first in line 1: "
+        "expected an antenna id of UwbAntennaGuess.txt, which lacks -5, 7, found '7'.")
+    write(folder / "UwbReading.txt", "\n".join(f"1 {k} 1 1" for k in range(50, 42, -1)))
+    assert_same(
+        read_dataset(folder), clean.without("uwb"), "UwbReading.txt: 8 of 8 rows left out, the "
+        "first in line 1: expected an antenna id of UwbAntennaGuess.txt, which lacks 43, 44, 45, "
+        "46, 47 and 3 more, found '50'.")
+    arrays = dataset_from_arrays(ARRAYS["ticks"], uwb=[[1, 3, 1, 1], [1, 4, 1, 1]],
+                                 guess=[[3, 0, 0]])
+    assert arrays.uwb.antenna.tolist() == [3]
+    assert arrays.notes == ("uwb: 1 of 2 rows left out, the first in row 2: expected an antenna id "
+                            "of guess, which lacks 4, found '4'.",)
+
+
+@pytest.mark.parametrize("content, lack", [(None, "is missing"), ("# none\n", "has no rows")])
+def test_without_guesses_problem_4_is_left_out_with_a_note(folder, content, lack):
+    clean = dataclasses.replace(read_dataset(folder), uwb=None, antenna_guess=None)
+    (folder / "UwbAntennaGuess.txt").unlink()
+    if content is not None:
+        write(folder / "UwbAntennaGuess.txt", content)
+    found = read_dataset(folder)
+    assert_same(found, clean, f"UwbAntennaGuess.txt {lack}: problem 4 is left out.")
+    assert "drive: ranges: none, no UwbReading.txt with usable rows" in inventory_lines(found, None)
+    write(folder / "UwbReading.txt", "1 3 nan 1\n# none\n")
+    assert "problem 4" not in str(read_dataset(folder).notes)
+    assert dataset_from_arrays(ARRAYS["ticks"], uwb=ARRAYS["uwb"]).notes == (
+        "guess has no rows: problem 4 is left out.",)
+
+
+@pytest.mark.parametrize("text", [
+    "900 1 2 2.5\n3 -4 5.5 nan\n", "900,1,2,\n3,-4,5.5,0\n", "900;1;2;-1,5\n3;-4;5,5;3\n"])
+def test_heights_of_antennas_are_left_out_with_a_note(folder, text):
+    clean = read_dataset(folder)
+    write(folder / "UwbAntennaGuess.txt", text)
+    notes = ["UwbAntennaGuess.txt: the last of 4 columns was taken as z and left out."]
+    if "1,5" in text:
+        notes.append("UwbAntennaGuess.txt was read with decimal commas.")
+    assert_same(read_dataset(folder), clean, *notes)
+
+
 # Files of MATLAB.
 
 
@@ -214,7 +262,6 @@ def test_arrays_are_the_dataset_of_their_files(folder):
     ("aruco", (2, 0), 5, ", row 3: expected pose id, a whole number from 1 to 4"),
     ("ticks", (2, 0), 80_001, ", row 3: expected at most 10 wheel revolutions (80000 ticks) since "
      "the pose before, not since the start, and none in the first row, found '80001'"),
-    ("uwb", (1, 1), 4, ", row 2: expected an antenna id that the guesses have"),
     ("guess", (1, 0), 900, ", row 2: expected each id only once"),
     ("vehicle", None, "tractor", ": expected a Vehicle, found 'tractor'"),
     ("vehicle", None, Vehicle(sigma_wheelbase=-1.0), ": expected a number from 1e-09 to 20 m for "
@@ -324,6 +371,6 @@ def test_what_was_found_is_said(folder):
         (folder / name).unlink()
     write(folder / "UwbReading.txt", "# none\n")
     assert inventory_lines(read_dataset(folder), None) == [
-        wheels, "drive: markers: none, no ArucoReading.txt with rows",
-        "drive: ranges: none, no UwbReading.txt with rows",
+        wheels, "drive: markers: none, no ArucoReading.txt with usable rows",
+        "drive: ranges: none, no UwbReading.txt with usable rows",
         "drive: vehicle.toml: none, or as the assignment's table 2", "drive: truth: no"]

@@ -176,6 +176,19 @@ def test_notes_and_doubts_are_said_and_in_the_summary(tmp_path, capsys, drive):
     assert told.err.splitlines()[-4:-1] == [f"drive: note: {note}" for note in summary["notes"]]
 
 
+def test_without_guesses_problems_1_to_3_are_solved_and_it_is_said(tmp_path, capsys, drive):
+    write_dataset(tmp_path / "drive", drive[0])
+    (tmp_path / "drive" / "UwbAntennaGuess.txt").unlink()
+    note = "UwbAntennaGuess.txt is missing: problem 4 is left out."
+    summary = solved(tmp_path)
+    assert [*summary["problems"]] == [*solve.PROBLEMS][:-1] and summary["notes"] == [note]
+    assert f"drive: note: {note}\n" in capsys.readouterr().err
+    assert main(["solve", str(tmp_path / "drive"), "--out", str(tmp_path / "out"),
+                 "--problem", "4"]) == 2
+    *_, told, reason = capsys.readouterr().err.splitlines()
+    assert told == f"drive: note: {note}" and "expected the measurements of problem4" in reason
+
+
 def test_a_problem_that_fails_costs_the_others_nothing(tmp_path, capsys, drive):
     """Every marker is seen twice at a pose, at two places, and neither is confirmed."""
     write_dataset(tmp_path / "drive", replace(drive[0], aruco=contradicted(drive[0].aruco)))

@@ -17,7 +17,8 @@ class _Readings:
 
     def select(self, keep: np.ndarray):
         """The readings that `keep` selects: a mask (m,) of bool or an array of row indices."""
-        return replace(self, **{name: values[keep] for name, values in vars(self).items()})
+        selected = {name: values[keep] for name, values in vars(self).items()}
+        return replace(self, **selected)
 
 
 @dataclass(frozen=True)
@@ -65,12 +66,15 @@ class Dataset:
         """The ArucoReadings, or None, as the vehicle's origin sees them by stated camera, size."""
         if self.aruco is None:
             return None
-        v, a = self.vehicle, self.aruco
-        scale = np.array([v.marker_size, v.marker_size, 1])
-        camera = [v.camera_x, v.camera_y, v.camera_turn]
+        stated = self.vehicle
+        camera_in_vehicle = [stated.camera_x, stated.camera_y, stated.camera_turn]
+        scale = np.array([stated.marker_size, stated.marker_size, 1])
+        marker_in_camera = scale * self.aruco.marker_in_vehicle
+        covariance = scale[:, None] * self.aruco.covariance * scale
         return replace(
-            a, marker_in_vehicle=se2.compose(camera, scale * a.marker_in_vehicle),
-            covariance=se2.rotate_covariance(scale[:, None] * a.covariance * scale, v.camera_turn))
+            self.aruco,
+            marker_in_vehicle=se2.compose(camera_in_vehicle, marker_in_camera),
+            covariance=se2.rotate_covariance(covariance, stated.camera_turn))
 
     def without(self, sensor: str) -> "Dataset":
         """The Dataset without a sensor, "aruco" or "uwb"."""
@@ -78,12 +82,16 @@ class Dataset:
 
     def first(self, count: int) -> "Dataset":
         """The Dataset of the first `count` poses; sensors without readings are None."""
-        early = {"aruco": None, "uwb": None}
-        for sensor in early:
-            readings = getattr(self, sensor)
-            if readings is not None and (readings.pose < count).any():
-                early[sensor] = readings.select(readings.pose < count)
-        return replace(self, ticks=self.ticks[:count], **early)
+        return replace(self, ticks=self.ticks[:count], aruco=_until(self.aruco, count),
+                       uwb=_until(self.uwb, count))
+
+
+def _until(readings, count):
+    """The readings at the first `count` poses, or None if there are none."""
+    if readings is None:
+        return None
+    early = readings.pose < count
+    return readings.select(early) if early.any() else None
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 import json
 from dataclasses import dataclass, replace
 from numbers import Real
+from pathlib import Path
 
 import numpy as np
 
@@ -87,70 +88,67 @@ class Limit:
 
     def holds(self, x):
         """True where numbers are in the interval, and whole if they must be."""
-        return (self.minimum <= x) & (x <= self.maximum) & (not self.whole or x == np.rint(x))
+        inside = (self.minimum <= x) & (x <= self.maximum)
+        if self.whole:
+            return inside & (x == np.rint(x))
+        return inside
 
 
-def _limits():
-    """What each entry of vehicle.toml may be: a Limit(minimum, maximum, unit), or values."""
-    metres, sigma_metres = Limit(-10, 10, "m"), Limit(0, 10, "m")
-    radius, factor = Limit(1e-3, 2.5, "m"), Limit(0.01, 100)
-    ratio, sigma_ratio = Limit(0.5, 2), Limit(0, 2)
-    lag, sigma_lag = Limit(-1000, 1000), Limit(0, 1000)
-    return {
-        "right_radius": radius,
-        "left_radius": radius,
-        "wheelbase": Limit(1e-3, 20, "m"),
-        "ticks_per_revolution": Limit(1, 1e10),
-        "sigma_right_radius": Limit(1e-9, 2.5, "m"),
-        "sigma_left_radius": Limit(1e-9, 2.5, "m"),
-        "sigma_wheelbase": Limit(1e-9, 20, "m"),
-        "sigma_heading": Limit(1e-9, 10, "rad"),
-        "slip": Limit(0, 0.1, "sqrt(m)"),
-        "marker_noise_factor": factor,
-        "range_noise_factor": factor,
-        "kernel": tuple(KERNELS),
-        "gate": (True, False),
-        "camera_x": metres,
-        "camera_y": metres,
-        "camera_turn": Limit(-6.3, 6.3, "rad"),
-        "marker_size": ratio,
-        "sighting_lag": lag,
-        "tag_x": metres,
-        "tag_y": metres,
-        "antenna_height": Limit(0, 100, "m"),
-        "range_offset": Limit(-100, 100, "m"),
-        "range_scale": ratio,
-        "range_lag": lag,
-        "sigma_camera_x": sigma_metres,
-        "sigma_camera_y": sigma_metres,
-        "sigma_camera_turn": Limit(0, 6.3, "rad"),
-        "sigma_marker_size": sigma_ratio,
-        "sigma_sighting_lag": sigma_lag,
-        "sigma_tag_x": sigma_metres,
-        "sigma_tag_y": sigma_metres,
-        "sigma_antenna_height": Limit(0, 100, "m"),
-        "sigma_range_offset": Limit(0, 100, "m"),
-        "sigma_range_scale": sigma_ratio,
-        "sigma_range_lag": sigma_lag,
-    }
+_RADIUS = Limit(1e-3, 2.5, "m")
+_NOISE_FACTOR = Limit(0.01, 100)
+_PLACE = Limit(-10, 10, "m")
+_RATIO = Limit(0.5, 2)
+_LAG = Limit(-1000, 1000)
+_WHEELS = {"right_radius": _RADIUS, "left_radius": _RADIUS, "wheelbase": Limit(1e-3, 20, "m")}
+_SENSORS = {
+    "camera_x": _PLACE,
+    "camera_y": _PLACE,
+    "camera_turn": Limit(-6.3, 6.3, "rad"),
+    "marker_size": _RATIO,
+    "sighting_lag": _LAG,
+    "tag_x": _PLACE,
+    "tag_y": _PLACE,
+    "antenna_height": Limit(0, 100, "m"),
+    "range_offset": Limit(-100, 100, "m"),
+    "range_scale": _RATIO,
+    "range_lag": _LAG,
+}
 
 
-VEHICLE_LIMITS = _limits()
+def _sigmas(limits, minimum):
+    """Limits of standard deviations, up to the largest value of the entry."""
+    return {f"sigma_{name}": replace(limit, minimum=minimum) for name, limit in limits.items()}
 
 
-def changed(vehicle, entries, source):
+# What each field of a Vehicle may be: a number within a Limit, or one of several values.
+VEHICLE_LIMITS = _WHEELS | _SENSORS | _sigmas(_WHEELS, 1e-9) | _sigmas(_SENSORS, 0) | {
+    "ticks_per_revolution": Limit(1, 1e10),
+    "sigma_heading": Limit(1e-9, 10, "rad"),
+    "slip": Limit(0, 0.1, "sqrt(m)"),
+    "marker_noise_factor": _NOISE_FACTOR,
+    "range_noise_factor": _NOISE_FACTOR,
+    "kernel": tuple(KERNELS),
+    "gate": (True, False),
+}
+
+
+def changed(vehicle: Vehicle, entries: dict, source: Path | str | None) -> Vehicle:
     """The Vehicle with `entries`, values by the names of its fields; None leaves one as it is.
 
     Raises DatasetError, which names the `source`, for a value that is not within its Limit.
     """
+    stated = {}
     for key, value in entries.items():
+        if value is None:
+            continue
         limit = VEHICLE_LIMITS[key]
         if isinstance(limit, Limit):
-            ok = isinstance(value, Real) and type(value) is not bool and limit.holds(value)
-            expected = f"a number {limit}"
+            is_number = isinstance(value, Real) and not isinstance(value, bool)
+            require(is_number and limit.holds(value), source, f"a number {limit} for {key}", value)
+            stated[key] = float(value)
         else:
-            ok = type(value) is type(limit[0]) and value in limit
-            expected = " or ".join(map(json.dumps, limit))
-        require(ok or value is None, source, f"{expected} for {key}", value)
-    return replace(vehicle, **{key: value if isinstance(value, bool | str) else float(value)
-                               for key, value in entries.items() if value is not None})
+            is_listed = type(value) is type(limit[0]) and value in limit
+            listed = " or ".join(map(json.dumps, limit))
+            require(is_listed, source, f"{listed} for {key}", value)
+            stated[key] = value
+    return replace(vehicle, **stated)

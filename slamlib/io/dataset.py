@@ -7,35 +7,46 @@ count from 1 in the files and from 0 in the arrays; marker and antenna ids stay 
 """
 
 import json
+from dataclasses import replace
 from os.path import abspath
 from pathlib import Path
 
 import numpy as np
 
 from slamlib.core import se2
-from slamlib.core.errors import DatasetError as DatasetError
 from slamlib.core.errors import require
 from slamlib.core.records import AntennaGuess, ArucoReadings, Dataset, Truth, UwbReadings
 from slamlib.core.vehicle import TABLE_2, Vehicle, changed
-from slamlib.io import tables
-from slamlib.io.tables import ENCODER, TABLES, TRUTH_FILES, contents, read_table
+from slamlib.io.formats import (
+    ARUCO,
+    COVARIANCE,
+    ENCODER,
+    GUESS,
+    TRUTH_FILES,
+    TRUTH_TABLES,
+    UWB,
+    VEHICLE,
+    Check,
+)
+from slamlib.io.tables import contents, listed, read_table, table_of_array
 from slamlib.io.vehicle import incremental_counts, read_vehicle
 
 ORIGIN_TOLERANCE = 1e-3  # m and rad; a first true pose within it is taken as the origin
 
 
-def read_dataset(folder):
-    """Measurements of one drive, a Dataset; sensors without a file or without rows are None.
+def read_dataset(folder: Path | str) -> Dataset:
+    """Measurements of one drive; sensors without a file or without usable rows are None.
 
     `Dataset.notes` state what was mended, left out or not read. Raises DatasetError if a file does
     not have the format.
     """
     files, notes = contents(folder, required=ENCODER)
-    vehicle = read_vehicle(files.get("vehicle.toml"))
+    vehicle = read_vehicle(files.get(VEHICLE))
     return _dataset(files, vehicle, Path(abspath(folder)).name, notes)
 
 
-def dataset_from_arrays(ticks, aruco=None, uwb=None, guess=None, vehicle=TABLE_2, name="arrays"):
+def dataset_from_arrays(ticks, aruco=None, uwb=None, guess=None, vehicle: Vehicle = TABLE_2,
+                        name: str = "arrays") -> Dataset:
     """The Dataset of arrays with the columns of the files (data/README.md), in m and rad.
 
     Parameters
@@ -44,7 +55,7 @@ def dataset_from_arrays(ticks, aruco=None, uwb=None, guess=None, vehicle=TABLE_2
     aruco : (m, 11) pose id from 1 to n, marker id, x, y, heading of the marker in the vehicle,
         and their covariances xx, xy, x heading, yy, y heading, heading heading; or None.
     uwb : (r, 4) pose id from 1 to n, antenna id, range, standard deviation; or None.
-    guess : (a, 3) antenna id, x, y, of at least the antennas in `uwb`; or None.
+    guess : (a, 3) antenna id, x, y; or None. Ranges to other antennas are left out.
     vehicle : Vehicle
 
     Rows are checked, and bad ones left out with a note, as those of files. Raises DatasetError,
@@ -56,93 +67,127 @@ def dataset_from_arrays(ticks, aruco=None, uwb=None, guess=None, vehicle=TABLE_2
     (2, [7])
     """
     require(isinstance(vehicle, Vehicle), "vehicle", "a Vehicle", vehicle)
-    arguments = ("ticks", ticks), ("aruco", aruco), ("uwb", uwb), ("guess", guess)
-    files = {file: tables.table_of_array(key, value, file, counted=key == "ticks")
-             for file, (key, value) in zip(TABLES, arguments)}
+    files = {
+        ENCODER: table_of_array("ticks", ticks, ENCODER, counted=True),
+        ARUCO: table_of_array("aruco", aruco, ARUCO),
+        UWB: table_of_array("uwb", uwb, UWB),
+        GUESS: table_of_array("guess", guess, GUESS)}
     return _dataset(files, changed(TABLE_2, vars(vehicle), "vehicle"), name)
 
 
 def _dataset(files, vehicle, name, notes=()):
     """The Dataset by its Vehicle and the sources (dict) of its tables by name."""
     encoders, ticks = incremental_counts(read_table(files[ENCODER], ENCODER), vehicle)
-    seen, heard = (read_table(files.get(each), each, len(ticks)) for each in TABLES[1:3])
-    guess = read_table(files.get(TABLES[3]), TABLES[3])
-    heard.kept(np.isin(heard.numbers[:, 1], guess.numbers[:, 0]), "an antenna id that the guesses "
-               "have, which ranges need: UwbAntennaGuess.txt in the same folder, or guess")
-    (*sighting, rows), (*measured, ranges) = map(_in_order, (seen.numbers, heard.numbers))
+    sightings = read_table(files.get(ARUCO), ARUCO, len(ticks))
+    ranges = read_table(files.get(UWB), UWB, len(ticks))
+    guesses = read_table(files.get(GUESS), GUESS)
+    ranges = _of_guessed_antennas(ranges, guesses)
+    pose, marker, seen = _in_order(sightings)
+    aruco = ArucoReadings(pose, marker, seen[:, 2:5], seen[:, COVARIANCE])
+    pose, antenna, heard = _in_order(ranges)
+    uwb = UwbReadings(pose, antenna, heard[:, 2], heard[:, 3])
+    guess = AntennaGuess(*_by_id(guesses))
     return Dataset(
-        name=name, vehicle=vehicle, ticks=ticks,
-        aruco=ArucoReadings(*sighting, rows[:, 2:5], rows[:, tables.COVARIANCE]
-                            ) if len(rows) else None,
-        uwb=UwbReadings(*measured, *ranges[:, 2:].T) if len(ranges) else None,
-        antenna_guess=AntennaGuess(*_by_id(guess)) if len(guess.numbers) else None,
-        notes=(*notes, *encoders.notes, *seen.notes, *heard.notes, *guess.notes))
+        name=name, vehicle=vehicle, ticks=ticks, aruco=aruco if len(aruco.pose) else None,
+        uwb=uwb if len(uwb.pose) else None, antenna_guess=guess if len(guess.antenna) else None,
+        notes=notes + encoders.notes + sightings.notes + ranges.notes + guesses.notes)
 
 
-def read_truth(folder):
-    """Truth of one drive, from the sub-folder `truth` of its folder, or None without it.
-
-    Maps without a file have length 0. Wheel parameters that `truth/vehicle.toml` does not give are
-    those of the dataset. Truth whose first pose T_w1 is not the origin is moved there, T_1v =
-    inverse(T_w1) T_wv, with a note. Raises DatasetError if a file does not have the format or the
-    number of poses is not that of the drive.
-    """
-    drive, _ = contents(folder, required=ENCODER)
-    if "truth" not in drive:
-        return None
-    files, notes = contents(drive["truth"], TRUTH_FILES, "vehiclePose.txt")
-    path, *maps = (read_table(files.get(name), name) for name in TRUTH_FILES[:3])
-    poses, count = path.numbers[:, 1:], len(read_table(drive[ENCODER], ENCODER).numbers)
-    require(len(poses) == count, path.source,
-            f"{count} poses (encoder file), found {len(poses)}")
-    turns = 2 * np.pi * np.rint(poses[0, 2] / (2 * np.pi))
-    poses = np.column_stack([poses[:, :2], np.unwrap(poses[:, 2]) - turns])
-    (marker, marker_in_world), (antenna, antenna_in_world) = map(_by_id, maps)
-    if (abs(first := poses[0]) > ORIGIN_TOLERANCE).any():
-        poses = se2.between(first, poses)
-        marker_in_world = se2.difference(se2.between(first, marker_in_world), np.zeros(3))
-        antenna_in_world = se2.between(first, np.pad(antenna_in_world, ((0, 0), (0, 1))))[:, :2]
-        path = path.noted((
-            " begins at ({:.3f} m, {:.3f} m, {:.4f} rad): poses and maps were moved into the frame "
-            "of its first pose, in which the estimates are").format(*first))
-    return Truth(
-        poses, marker, marker_in_world, antenna, antenna_in_world,
-        read_vehicle(files.get("vehicle.toml"), read_vehicle(drive.get("vehicle.toml"))),
-        tuple(f"In truth: {note}" for note in sum((e.notes for e in (path, *maps)), (*notes,))))
+def _of_guessed_antennas(ranges, guesses):
+    """The ranges of antennas that have a guess, with a note on the others."""
+    antenna = ranges.numbers[:, 1]
+    known = np.isin(antenna, guesses.numbers[:, 0])
+    if len(antenna) > 0 and len(guesses.numbers) == 0:
+        lack = "is missing" if guesses.source == GUESS else "has no rows"
+        note = f"{guesses.name} {lack}: problem 4 is left out."
+        return replace(ranges, numbers=ranges.numbers[:0], notes=(*ranges.notes, note))
+    unknown = listed([f"{each:.0f}" for each in np.unique(antenna[~known])])
+    return ranges.drop_rows([Check(
+        known, f"an antenna id of {guesses.name}, which lacks {unknown}", column=1)])
 
 
-def _by_id(table):
-    """Landmark ids (k,), ascending, and the further columns (k, c - 1)."""
-    rows = table.numbers[np.argsort(table.numbers[:, 0])]
-    return rows[:, 0].astype(np.int64), rows[:, 1:]
-
-
-def _in_order(rows):
-    """Poses from 0, ids (m,) int64, rows (m, c), in ascending order of pose; repeated rows once."""
-    rows = rows[np.sort(np.unique(rows, axis=0, return_index=True)[1])]
+def _in_order(readings):
+    """Poses from 0, ids (m,) and rows (m, c), in ascending order of pose; repeated rows once."""
+    _, first = np.unique(readings.numbers, axis=0, return_index=True)
+    rows = readings.numbers[np.sort(first)]
     rows = rows[np.argsort(rows[:, 0], kind="stable")]
     return rows[:, 0].astype(np.int64) - 1, rows[:, 1].astype(np.int64), rows
 
 
-def all_notes(dataset, truth):
-    """Notes (tuple of str) on what was mended or left out of a Dataset and its Truth or None."""
-    return dataset.notes + (truth.notes if truth else ())
+def _by_id(landmarks):
+    """Ids (k,), ascending, and places (k, d)."""
+    rows = landmarks.numbers[np.argsort(landmarks.numbers[:, 0])]
+    return rows[:, 0].astype(np.int64), rows[:, 1:]
 
 
-def inventory_lines(dataset, truth):
-    """Lines (list of str) on what was read of a Dataset and its Truth or None, with all notes."""
-    aruco, uwb = dataset.aruco, dataset.uwb
+def read_truth(folder: Path | str) -> Truth | None:
+    """Truth of one drive, from the sub-folder `truth` of its folder, or None without it.
+
+    Maps without a file have length 0. Wheel parameters that `truth/vehicle.toml` does not give are
+    those of the dataset. Truth whose first pose is not the origin is moved there, with a note.
+    Raises DatasetError if a file does not have the format or the number of poses is not that of the
+    drive.
+    """
+    drive, _ = contents(folder, required=ENCODER)
+    if "truth" not in drive:
+        return None
+    files, notes = contents(drive["truth"], TRUTH_FILES, required="vehiclePose.txt")
+    path, markers, antennas = [read_table(files.get(name), name) for name in TRUTH_TABLES]
+    count = len(read_table(drive[ENCODER], ENCODER).numbers)
+    require(len(path.numbers) == count, path.source,
+            f"{count} poses (encoder file), found {len(path.numbers)}")
+    marker, marker_in_world = _by_id(markers)
+    antenna, antenna_in_world = _by_id(antennas)
+    poses = path.numbers[:, 1:].copy()
+    poses[:, 2] = np.unwrap(np.r_[0, poses[:, 2]])[1:]
+    vehicle = read_vehicle(files.get(VEHICLE), read_vehicle(drive.get(VEHICLE)))
+    truth = Truth(poses, marker, marker_in_world, antenna, antenna_in_world, vehicle)
+    x, y, heading = poses[0]
+    if max(abs(x), abs(y), abs(heading)) > ORIGIN_TOLERANCE:
+        truth = _in_the_frame_of(poses[0], truth)
+        path = path.noted(
+            f" begins at ({x:.3f} m, {y:.3f} m, {heading:.4f} rad): poses and maps were moved into "
+            "the frame of its first pose, in which the estimates are")
+    notes += path.notes + markers.notes + antennas.notes
+    return replace(truth, notes=tuple(f"In truth: {note}" for note in notes))
+
+
+def _in_the_frame_of(pose, truth):
+    """The Truth in the frame of a pose T_wp: poses T_pv = inverse(T_wp) T_wv, maps as well."""
+    markers = se2.between(pose, truth.marker_in_world)
+    markers[:, 2] = se2.wrap(markers[:, 2])
+    antennas = (truth.antenna_in_world - pose[:2]) @ se2.rotation(pose[2])
+    return replace(truth, poses=se2.between(pose, truth.poses), marker_in_world=markers,
+                   antenna_in_world=antennas)
+
+
+def all_notes(dataset: Dataset, truth: Truth | None) -> tuple[str, ...]:
+    """Notes on what was mended or left out of a Dataset and its Truth."""
+    return dataset.notes if truth is None else dataset.notes + truth.notes
+
+
+def inventory_lines(dataset: Dataset, truth: Truth | None) -> list[str]:
+    """Lines on what was read of a Dataset and its Truth, with all notes."""
+    aruco = dataset.aruco
+    markers = "none, no ArucoReading.txt with usable rows"
+    if aruco is not None:
+        markers = (f"{len(aruco.pose)} sightings of {_distinct(aruco.marker)} markers at "
+                   f"{_distinct(aruco.pose)} poses")
+    uwb = dataset.uwb
+    ranges = "none, no UwbReading.txt with usable rows"
+    if uwb is not None:
+        ranges = (f"{len(uwb.pose)} ranges to {_distinct(uwb.antenna)} antennas at "
+                  f"{_distinct(uwb.pose)} poses")
     stated = [f"{key} = {json.dumps(value)}" for key, value in vars(dataset.vehicle).items()
               if value != getattr(TABLE_2, key)]
+    vehicle = ", ".join(stated) or "none, or as the assignment's table 2"
     right, left = abs(dataset.ticks).sum(axis=0)
-    return [f"{dataset.name}: {line}" for line in (
-        f"encoders: {len(dataset.ticks)} poses, {right} ticks right and {left} left",
-        "markers: none, no ArucoReading.txt with rows" if aruco is None else
-        f"markers: {len(aruco.pose)} sightings of {len(np.unique(aruco.marker))} markers at "
-        f"{len(np.unique(aruco.pose))} poses",
-        "ranges: none, no UwbReading.txt with rows" if uwb is None else
-        f"ranges: {len(uwb.pose)} ranges to {len(np.unique(uwb.antenna))} antennas at "
-        f"{len(np.unique(uwb.pose))} poses",
-        "vehicle.toml: " + (", ".join(stated) or "none, or as the assignment's table 2"),
-        f"truth: {'no' if truth is None else 'yes'}",
-        *(f"note: {note}" for note in all_notes(dataset, truth)))]
+    lines = [f"encoders: {len(dataset.ticks)} poses, {right} ticks right and {left} left",
+             f"markers: {markers}", f"ranges: {ranges}", f"vehicle.toml: {vehicle}",
+             f"truth: {'no' if truth is None else 'yes'}"]
+    lines += [f"note: {note}" for note in all_notes(dataset, truth)]
+    return [f"{dataset.name}: {line}" for line in lines]
+
+
+def _distinct(ids):
+    return len(np.unique(ids))

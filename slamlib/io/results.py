@@ -14,35 +14,44 @@ from scipy.io import loadmat, savemat
 
 from slamlib.io import swap
 
-_HEADER = b"MATLAB 5.0 MAT-file, written by slamlib".ljust(116)  # scipy's contains the date
-SIZE_OFFSET, COUNT_OFFSET = 132, 164  # bytes, to the array's size and its number of columns
+SUMMARY = "summary.json"
 # Fields of the structs in each file: places, covariances and, of maps, ids.
 FIELDS = {"vehiclePose": ("pose", "covari"), "ArucoMap": ("pose", "covari", "id"),
           "UwbMap": ("position", "covariance", "id")}
 RESULT_FILES = tuple(f"{name}.mat" for name in FIELDS)  # of a problem's folder
-SUMMARY = "summary.json"
+_HEADER = b"MATLAB 5.0 MAT-file, written by slamlib".ljust(116)  # scipy's contains the date
+FIELD_HEADER = "V56"  # bytes before the numbers of a field of a struct
+SIZE_OFFSET = 132  # bytes, to the size of the array of structs
+COUNT_OFFSET = 164  # bytes, to its number of columns
 
 
-def write_solution(folder, solution, text=False):
-    """Write the .mat files of a Solution into folder/<problem>/; returns the Path of that folder.
+def write_solution(folder: Path | str, solution, text: bool = False) -> Path:
+    """Write the .mat files of a Solution into folder/<problem>/; returns that folder.
 
     With `text` it writes CSV files beside them, too, and folder/<problem>.tum. A summary in
     `folder` is removed, because it belongs to other files.
     """
-    (Path(folder) / SUMMARY).unlink(missing_ok=True)
-    own = Path(folder) / solution.problem
-    poses = np.arange(1, len(solution.poses) + 1), solution.poses, solution.covariances
+    folder = Path(folder)
+    (folder / SUMMARY).unlink(missing_ok=True)
+    own = folder / solution.problem
+    poses = (_pose_ids(solution.poses), solution.poses, solution.covariances)
     for name, each in zip(FIELDS, (poses, solution.aruco_map, solution.uwb_map)):
-        if each is not None:
-            write_structs(own, name, *each)
-            if text:
-                write_csv(own / f"{name}.csv", *each)
+        if each is None:
+            continue
+        ids, places, covariances = each
+        write_structs(own, name, ids, places, covariances)
+        if text:
+            write_csv(own / f"{name}.csv", ids, places, covariances)
     if text:
         write_tum(own.with_suffix(".tum"), solution.poses)
     return own
 
 
-def read_structs(folder, name):
+def _pose_ids(poses):
+    return np.arange(1, len(poses) + 1)
+
+
+def read_structs(folder: Path | str, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Ids (n,), poses (n, 3) or positions (n, 2), and covariances of a file in a folder.
 
     `name` is a key of FIELDS. The ids of vehicle poses are 1 to n.
@@ -52,14 +61,18 @@ def read_structs(folder, name):
     >>> ids.tolist(), poses.shape, covariances.shape
     ([1, 2], (2, 3), (2, 3, 3))
     """
-    structs, d = loadmat(Path(folder) / f"{name}.mat")[name], 2 if name == "UwbMap" else 3
-    rows = [np.reshape([*structs[field].ravel()], (-1, *shape))
-            for field, shape in zip(FIELDS[name], ((d,), (d, d), ()))]
-    ids = rows[2].astype(int) if len(rows) > 2 else np.arange(1, len(rows[0]) + 1)
-    return ids, rows[0], rows[1]
+    structs = loadmat(Path(folder) / f"{name}.mat")[name]
+    values = [np.array(structs[field].ravel().tolist()) for field in FIELDS[name]]
+    d = 2 if name == "UwbMap" else 3
+    places = values[0].reshape(-1, d)
+    covariances = values[1].reshape(-1, d, d)
+    if "id" in FIELDS[name]:
+        return values[2].ravel().astype(int), places, covariances
+    return _pose_ids(places), places, covariances
 
 
-def write_structs(folder, name, ids, places, covariances):
+def write_structs(folder: Path | str, name: str, ids: np.ndarray | None, places: np.ndarray,
+                  covariances: np.ndarray):
     """Write folder/name.mat with one (1, n) struct array; equal input gives equal bytes.
 
     `name` is a key of FIELDS. The ids (n,) of maps ascend, those of vehicle poses are not written;
@@ -70,24 +83,33 @@ def write_structs(folder, name, ids, places, covariances):
     repeated with the numbers: each field is a header of 56 bytes and its numbers by columns. The
     array's size and number of columns are set (MAT-File Format, version 5).
     """
-    buffer, (count, d) = BytesIO(), np.shape(places)
-    columns = zip(FIELDS[name], (places, covariances, ids), ((1, d), (d, d), (1, 1)))
-    rows = {field: np.reshape(values, (count, *shape)).astype(float)
-            for field, values, shape in columns}
-    savemat(buffer, {name: {field: np.zeros(values.shape[1:]) for field, values in rows.items()}})
-    content = bytearray(_HEADER + buffer.getvalue()[len(_HEADER):])
-    layout = np.dtype([entry for field, values in rows.items() for entry in (
-        (f"header of {field}", "V56"), (field, "=f8", values.shape[:0:-1]))])
+    count, d = np.shape(places)
+    zeros = {}
+    numbers = {}
+    entries = []
+    for field, values, shape in zip(
+            FIELDS[name], (places, covariances, ids), ((1, d), (d, d), (1, 1))):
+        zeros[field] = np.zeros(shape)
+        numbers[field] = np.reshape(values, (count,) + shape)
+        entries.append((f"header of {field}", FIELD_HEADER))
+        entries.append((field, "=f8", shape[::-1]))            # by columns
+    layout = np.dtype(entries)
+    buffer = BytesIO()
+    savemat(buffer, {name: zeros})
+    content = bytearray(buffer.getvalue())
+    content[:len(_HEADER)] = _HEADER
     structs = np.repeat(np.frombuffer(content[-layout.itemsize:], layout), count)
-    for field, values in rows.items():
+    for field, values in numbers.items():
         structs[field] = np.swapaxes(values, 1, 2)
-    np.frombuffer(content, "=i4", 1, SIZE_OFFSET)[0] += (count - 1) * layout.itemsize
-    np.frombuffer(content, "=i4", 1, COUNT_OFFSET)[0] = count
-    swap.write_atomically(Path(folder) / f"{name}.mat",
-                          content[:-layout.itemsize] + structs.tobytes())
+    size = np.frombuffer(content, "=i4", 1, SIZE_OFFSET)
+    size += (count - 1) * layout.itemsize
+    columns = np.frombuffer(content, "=i4", 1, COUNT_OFFSET)
+    columns[:] = count
+    before = content[:-layout.itemsize]
+    swap.write_atomically(Path(folder) / f"{name}.mat", before + structs.tobytes())
 
 
-def write_tum(path, poses):
+def write_tum(path: Path | str, poses: np.ndarray):
     """Write poses (n, 3), which are NaN without an estimate, as a TUM file; z is 0.
 
     >>> write_tum("line.tum", np.array([[0, 0, 0], [np.nan, np.nan, np.nan], [2.5, 0, 0]]))
@@ -95,25 +117,29 @@ def write_tum(path, poses):
     1 0 0 0 0 0 0 1
     3 2.5 0 0 0 0 0 1
     """
-    x, y, heading = np.transpose(poses)
-    zero = np.zeros(len(poses))
-    _write_text(path, np.arange(1, len(poses) + 1), [
-        x, y, zero, zero, zero, np.sin(heading / 2), np.cos(heading / 2)], " ")
+    half = poses[:, 2] / 2
+    zero = np.zeros((len(poses), 3))                    # of z, qx and qy
+    numbers = np.column_stack([poses[:, :2], zero, np.sin(half), np.cos(half)])
+    _write_text(path, _pose_ids(poses), numbers, " ")
 
 
-def write_csv(path, ids, places, covariances):
+def write_csv(path: Path | str, ids: np.ndarray, places: np.ndarray, covariances: np.ndarray):
     """Write ids (n,), poses (n, 3) or positions (n, 2), NaN if unknown, and covariances as CSV.
 
     The columns are id, x, y, theta and the upper triangle of the covariance in world axes.
     """
-    names, upper = ("x", "y", "theta")[:places.shape[1]], np.triu_indices(places.shape[1])
-    header = ["id", *names, *(f"s_{names[i]}{names[j]}" for i, j in zip(*upper))]
-    _write_text(path, ids, [*places.T, *covariances[:, *upper].T], ",", ",".join(header))
+    names = ["x", "y", "theta"][:places.shape[1]]
+    rows, columns = np.triu_indices(len(names))
+    upper = [f"s_{names[i]}{names[j]}" for i, j in zip(rows, columns)]
+    numbers = np.column_stack([places, covariances[:, rows, columns]])
+    _write_text(path, ids, numbers, ",", ",".join(["id"] + names + upper))
 
 
-def _write_text(path, ids, columns, delimiter, header=""):
-    """Write ids (n,) and columns, numbers (n,) with all their digits, without rows of NaN."""
-    text, known = BytesIO(), np.isfinite(columns[0])
-    np.savetxt(text, np.column_stack([ids, *columns])[known], header=header, comments="",
-               delimiter=delimiter, fmt=["%d"] + ["%.17g"] * len(columns))
+def _write_text(path, ids, numbers, delimiter, header=""):
+    """Write ids (n,) and numbers (n, c) with all their digits, without rows that begin with NaN."""
+    rows = np.column_stack([ids, numbers])
+    known = np.isfinite(numbers[:, 0])
+    text = BytesIO()
+    np.savetxt(text, rows[known], header=header, comments="", delimiter=delimiter,
+               fmt=["%d"] + numbers.shape[1] * ["%.17g"])
     swap.write_atomically(Path(path), text.getvalue())

@@ -17,14 +17,14 @@ from filelock import FileLock, Timeout
 FILE_LIST = ".slamlib.json"  # names the files of a run in their folder; all others are the user's
 
 
-def beside(path, what):
-    """The hidden Path of a kind (str) beside a Path."""
+def beside(path: Path, what: str) -> Path:
+    """The hidden path of a kind, such as "lock", beside a path."""
     return path.with_name(f".{path.name}.{what}")
 
 
 @contextmanager
-def locked(folder):
-    """Hold the lock of a folder (Path); a process that waits for it says so.
+def locked(folder: Path):
+    """Hold the lock of a folder; a process that waits for it says so.
 
     The system releases it when the process that holds it ends.
     """
@@ -44,8 +44,8 @@ def locked(folder):
         lock.release()
 
 
-def write_atomically(path, content):
-    """Write bytes to a Path; a reader finds the old file or the whole new one, never a part."""
+def write_atomically(path: Path, content: bytes):
+    """Write a file; a reader finds the old file or the whole new one, never a part."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = beside(path, "part")
     try:
@@ -56,7 +56,7 @@ def write_atomically(path, content):
 
 
 @contextmanager
-def staging(folder):
+def staging(folder: Path | str):
     """Yield a new empty folder (Path) beside `folder`, which is removed at the end.
 
     One run at a time has it, and another one waits. Raises OSError if `folder` is a file.
@@ -74,13 +74,13 @@ def staging(folder):
             shutil.rmtree(stage, ignore_errors=True)
 
 
-def file_names(folder):
-    """Sorted names (list of str) of all files in a folder (Path), relative to it."""
+def file_names(folder: Path) -> list[str]:
+    """Sorted names of all files in a folder, relative to it."""
     return [file.relative_to(folder).as_posix()
             for file in sorted(folder.rglob("*")) if file.is_symlink() or not file.is_dir()]
 
 
-def publish(made, ours=()):
+def publish(made: dict, ours=()):
     """Put new folders in the place of those of earlier runs, all as one; the user's files stay.
 
     All that needs space on the disk is written before the first folder is moved.
@@ -113,15 +113,23 @@ def publish(made, ours=()):
 def _add_the_users_files(folder, new, ours):
     """Copy the files that no run wrote from a folder, and of a killed run's, to the new one."""
     new.mkdir(exist_ok=True)
-    names = file_names(new)
-    for source in filter(Path.exists, (beside(folder, "old"), folder)):
-        listed = []
-        with suppress(OSError, ValueError, TypeError):      # there is none, or it is damaged
-            listed = [*json.loads((source / FILE_LIST).read_bytes())]
-        for name in {*file_names(source)} - {FILE_LIST, *ours, *names, *listed}:
-            if not (name.endswith(".part") and Path(name).name.startswith(".")):
-                (new / name).parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(source / name, new / name, follow_symlinks=False)
-                shutil.copystat(source / name, new / name, follow_symlinks=False)
-    if names:
-        (new / FILE_LIST).write_text(json.dumps(names))
+    made = file_names(new)
+    for source in (beside(folder, "old"), folder):
+        if not source.exists():
+            continue
+        for name in set(file_names(source)).difference([FILE_LIST], ours, made, _listed(source)):
+            if name.endswith(".part") and Path(name).name.startswith("."):
+                continue                                # of a killed `write_atomically`
+            (new / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(source / name, new / name, follow_symlinks=False)
+            shutil.copystat(source / name, new / name, follow_symlinks=False)
+    if made:
+        (new / FILE_LIST).write_text(json.dumps(made))
+
+
+def _listed(folder):
+    """Names (set) in the FILE_LIST of a folder, none if there is no list or it is damaged."""
+    try:
+        return set(json.loads((folder / FILE_LIST).read_bytes()))
+    except (OSError, ValueError, TypeError):
+        return set()
