@@ -46,10 +46,10 @@ def with_hidden_errors(noise: Noise, remember: Sequence[bool], vehicle: Vehicle)
     The factors of sightings and of ranges, where their errors `remember` (2,), are at least 1, but
     at most HIDDEN_RATIO times the learned ones. Those that a Vehicle gives stay.
     """
-    learned = np.array([noise.sightings, noise.ranges])
+    learned = np.array(noise[1:])
     enlarged = np.maximum(learned, np.minimum(1.0, HIDDEN_RATIO * learned))
-    sightings, ranges = np.where(remember, enlarged, learned).tolist()
-    return with_known(Noise(noise.slip, sightings, ranges), vehicle)
+    factors = np.where(remember, enlarged, learned)
+    return with_known(Noise(noise.slip, *factors.tolist()), vehicle)
 
 
 @dataclass(frozen=True)
