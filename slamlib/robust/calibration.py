@@ -104,11 +104,15 @@ def calibration_table(calibration: Calibration, c: np.ndarray, covariance: np.nd
     estimated = _with_height(c, np.sqrt(np.diag(covariance)))
     table = []
     for k, entry in enumerate(_entries(len(c) - len(ENTRIES))):
-        row = {"name": calibration.names[k], "unit": entry.unit, "group": entry.group}
-        row["released"] = entry.group in released
-        row["stated"], row["stated_sigma"] = stated[:, k].tolist()
-        row["estimate"], row["sigma"] = estimated[:, k].tolist()
-        table.append(row)
+        table.append({
+            "name": calibration.names[k],
+            "unit": entry.unit,
+            "group": entry.group,
+            "released": entry.group in released,
+            "stated": float(stated[0, k]),
+            "stated_sigma": float(stated[1, k]),
+            "estimate": float(estimated[0, k]),
+            "sigma": float(estimated[1, k])})
     return table
 
 
@@ -120,8 +124,8 @@ def _entries(antenna_count):
 def _with_height(values, sigma):
     """Values and standard deviations (2, p) with the height, m, in place of half its square."""
     table = np.stack([values, sigma])
-    half_square, spread = table[:, HEIGHT]
-    height = np.sqrt(2 * max(half_square, 0.0))
+    height = np.sqrt(2 * max(table[0, HEIGHT], 0.0))
+    spread = table[1, HEIGHT]
     table[0, HEIGHT] = height
     if spread:
         table[1, HEIGHT] = spread / max(height, np.sqrt(spread / 2))
@@ -131,7 +135,8 @@ def _with_height(values, sigma):
 def stated_calibration(vehicle: Vehicle, antennas: Sequence[int]) -> Calibration:
     """The Calibration that a Vehicle states, for `antennas` (a,), ids."""
     entries = _entries(len(antennas))
-    stated, sigma = np.zeros((2, len(entries)))       # 0 and known: the offsets of the antennas
+    stated = np.zeros(len(entries))                   # offsets of antennas are 0, and known
+    sigma = np.zeros(len(entries))
     for k, entry in enumerate(ENTRIES):
         stated[k] = getattr(vehicle, entry.name)
         sigma[k] = getattr(vehicle, f"sigma_{entry.name}")

@@ -78,8 +78,7 @@ def better_model(fit: Fit) -> Fit:
 
 
 def _log_evidence_at(state, problem):
-    _, log_evidence = laplace_approximation(NormalEquations(problem, state), problem.noise)
-    return log_evidence
+    return laplace_approximation(NormalEquations(problem, state), problem.noise)[1]
 
 
 def calibrated(fit: Fit) -> Fit:
@@ -140,23 +139,25 @@ def _proposal(fit):
     L, h = _likelihood(fit)
     informed = np.diag(L) > 0
     doubtful = informed & (calibration.wide > calibration.sigma)
-    price = {group: _price(calibration, group)
-             for group in np.unique(calibration.group[doubtful]).tolist()}
-    sets = [frozenset(some) for count in range(len(price) + 1)
-            for some in combinations(price, count)]
-    prices = np.array([sum(price[group] for group in some) for some in sets])
+    groups = np.unique(calibration.group[doubtful]).tolist()
+    price = {group: _price(calibration, group) for group in groups}
+    sets = [frozenset(some) for count in range(len(groups) + 1)
+            for some in combinations(groups, count)]
+    price_of_set = np.array([sum(price[group] for group in some) for some in sets])
     for width in (1.0, GROSS):
         sigma = np.array([calibration.sigma_without(some, width) for some in sets])
         evidence, furthest = _log_evidence(L, h, sigma / calibration.wide * informed)
-        merit = evidence - prices
-        best = int(merit.argmax())
-        if not sets[best] or furthest[best] < MAX_WIDE_SIGMAS:
+        merit = evidence - price_of_set
+        k = int(merit.argmax())
+        best = sets[k]
+        if not best or furthest[k] < MAX_WIDE_SIGMAS:
             break
-    close = [sets[k] for k in np.flatnonzero(merit > merit[best] - AMBIGUOUS)]
-    explanations = tuple(some for some in close if not (some < sets[best] or some > sets[best]))
+    close = [sets[k] for k in np.flatnonzero(merit > merit.max() - AMBIGUOUS)]
+    explanations = tuple(some for some in close if not (some < best or some > best))
     certain = frozenset().union(*explanations)
-    more = max((k for k, some in enumerate(sets) if certain <= some), key=evidence.__getitem__)
-    present, _ = _log_evidence(L, h, fit.problem.sigma / calibration.wide * informed)
+    sufficient = [k for k, some in enumerate(sets) if certain <= some]
+    more = max(sufficient, key=evidence.__getitem__)
+    present = _log_evidence(L, h, fit.problem.sigma / calibration.wide * informed)[0]
     return _Proposal(explanations, sets[more], sigma[more], evidence[more] - present)
 
 
@@ -177,7 +178,7 @@ def _log_evidence(L, h, sigma):
     information = np.eye(len(h)) + sigma[..., :, None] * L * sigma[..., None, :]
     gradient = sigma * h
     mean = np.linalg.solve(information, gradient[..., None])[..., 0]
-    _, log_determinant = np.linalg.slogdet(information)
+    log_determinant = np.linalg.slogdet(information).logabsdet
     evidence = np.sum(gradient * mean, axis=-1) / 2 - log_determinant / 2
     return evidence, np.abs(mean).max(axis=-1)
 
@@ -284,7 +285,7 @@ def visits(aruco: ArucoReadings) -> np.ndarray:
     marker = aruco.marker[order]
     number = np.arange(len(order))
     if (marker[1:] == marker[:-1]).any():
-        _, number = runs(marker, aruco.pose[order], VISIT_GAP)
+        number = runs(marker, aruco.pose[order], VISIT_GAP)[1]
     return number[np.argsort(order)]
 
 
@@ -384,11 +385,11 @@ def _squared_distance(result, first, second, pose, later):
     from a pose of covariance P_1 to one of P_2 adds A P_2 A^T - B P_1 B^T to the covariance of a
     place that A and B move with these poses.
     """
-    first, second = result.marker_in_world[np.searchsorted(result.marker, [first, second])]
+    place = result.marker_in_world[np.searchsorted(result.marker, [first, second])]
     poses = result.poses[[pose, later]]
     P = result.covariances[[pose, later]]
-    A, _ = se2.compose_jacobians(poses, se2.between(poses, second))
-    start, end = A @ P @ A.mT
-    variance, axes = np.linalg.eigh(end - start)
-    off = axes.T @ se2.difference(second, first)
+    A, _ = se2.compose_jacobians(poses, se2.between(poses, place[1]))
+    C = A @ P @ A.mT
+    variance, axes = np.linalg.eigh(C[1] - C[0])
+    off = axes.T @ se2.difference(place[1], place[0])
     return float(np.sum(off**2 / np.maximum(variance, MIN_SIGMA**2)))

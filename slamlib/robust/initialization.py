@@ -116,10 +116,8 @@ def consensus_markers(measurements: Measurements, in_world: np.ndarray,
 def trilaterated_antennas(measurements: Measurements, poses: np.ndarray, covariances: np.ndarray,
                           c: np.ndarray) -> np.ndarray:
     """(a, 2) positions of the antennas, m, by the best minimum of their trilateration."""
-    antennas = np.zeros_like(measurements.guess)
-    for k, ranges in enumerate(ranges_by_antenna(measurements, poses, covariances, c)):
-        antennas[k] = trilaterate(ranges).places[0]
-    return antennas
+    by_antenna = ranges_by_antenna(measurements, poses, covariances, c)
+    return np.reshape([trilaterate(ranges).places[0] for ranges in by_antenna], (-1, 2))
 
 
 def state_from_poses(measurements: Measurements, poses: np.ndarray, covariances: np.ndarray,
@@ -134,7 +132,7 @@ def state_from_poses(measurements: Measurements, poses: np.ndarray, covariances:
         c = measurements.calibration.stated.copy()
         c[SIGHTING_LAG] += measurements.jumps.lag
     sightings = measurements.sightings
-    camera, _ = sensor_poses(measurements, poses, c)
+    camera = sensor_poses(measurements, poses, c)[0]
     z = sightings.z * [c[SIZE], c[SIZE], 1]
     in_world, of_markers = se2.compose_uncertain(
         camera, covariances[sightings.row], z, sightings.C)
@@ -167,7 +165,7 @@ def ranges_by_antenna(measurements: Measurements, poses: np.ndarray, covariances
                       c: np.ndarray, factor: float = 1.0) -> list[AntennaRanges]:
     """The AntennaRanges of every antenna, sigmas times `factor`; as `state_from_poses`."""
     r = measurements.ranges
-    _, tag = sensor_poses(measurements, poses, c)
+    tag = sensor_poses(measurements, poses, c)[1][:, :2]
     slant = (r.distance - c[OFFSET] - c[ANTENNAS][r.antenna]) / c[SCALE]
     plane = slant
     if c[HEIGHT]:
@@ -179,7 +177,7 @@ def ranges_by_antenna(measurements: Measurements, poses: np.ndarray, covariances
     by_antenna = []
     for k, guess in enumerate(measurements.guess):
         rows = np.flatnonzero(r.antenna == k)
-        by_antenna.append(AntennaRanges(tag[rows, :2], plane[rows], sigma[rows], guess))
+        by_antenna.append(AntennaRanges(tag[rows], plane[rows], sigma[rows], guess))
     return by_antenna
 
 
@@ -270,6 +268,6 @@ def other_antenna(ranges: AntennaRanges, estimate: np.ndarray, weight: np.ndarra
     count = np.count_nonzero(fitting)
     if count < max(MIN_OTHERS, MIN_FITTING * len(fitting)):
         return None
-    x, y = place
-    return (f"{count} of its {len(weight)} ranges fit another place, ({x:.1f}, {y:.1f}), as if two "
-            "antennas had this id, or it was moved, or hidden by a wall in a part of the drive")
+    return (f"{count} of its {len(weight)} ranges fit another place, ({place[0]:.1f}, "
+            f"{place[1]:.1f}), as if two antennas had this id, or it was moved, or hidden by a "
+            "wall in a part of the drive")

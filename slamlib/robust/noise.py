@@ -46,7 +46,7 @@ def with_hidden_errors(noise: Noise, remember: Sequence[bool], vehicle: Vehicle)
     The factors of sightings and of ranges, where their errors `remember` (2,), are at least 1, but
     at most HIDDEN_RATIO times the learned ones. Those that a Vehicle gives stay.
     """
-    learned = np.array(noise[1:])
+    learned = np.array([noise.sightings, noise.ranges])
     enlarged = np.maximum(learned, np.minimum(1.0, HIDDEN_RATIO * learned))
     factors = np.where(remember, enlarged, learned)
     return with_known(Noise(noise.slip, *factors.tolist()), vehicle)
@@ -69,7 +69,7 @@ def learn_noise(equations: NormalEquations) -> NoisePosterior:
     free = np.flatnonzero(measurements.learned)
 
     def log_posterior(logarithms):
-        _, evidence = laplace_approximation(equations, _noise_of(logarithms))
+        evidence = laplace_approximation(equations, _noise_of(logarithms))[1]
         off = (logarithms - np.log(MEDIAN)) / PRIOR_SIGMA
         return max(evidence, SINGULAR) - np.sum(off[free]**2) / 2
 
