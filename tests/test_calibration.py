@@ -1,20 +1,23 @@
 """What sensors share: derivatives, posterior, decision, and drives whose files are wrong there."""
 
+import re
 from dataclasses import replace
 from functools import cache
+from itertools import cycle
 from pathlib import Path
 from types import SimpleNamespace
 
 import gtsam
 import numpy as np
 import pytest
-from numeric import aruco, as_points, central_differences, changed, uwb, vehicle
+from numeric import aruco, as_points, carried, central_differences, changed, counts, uwb, vehicle
 
 from slamlib import estimate, fuse, fuse_increments, localize
 from slamlib.core import se2
 from slamlib.core.evaluation import align, anees, ate
 from slamlib.core.kernels import KERNELS, ONE_SIDED
 from slamlib.core.odometry import dead_reckoning
+from slamlib.core.records import ArucoReadings
 from slamlib.core.vehicle import Vehicle
 from slamlib.io.dataset import read_dataset, read_truth
 from slamlib.robust import calibration, choices
@@ -235,6 +238,61 @@ ALONE = [*FAULTS][-3:] + ["wheels of 0.101 m"]    # no other doubt, and none bef
 @cache
 def drive(seed):
     return simulate("short", seed)
+
+
+def logged(caplog, start):
+    """Messages that begin like this, in a line each."""
+    messages = [record.getMessage() for record in caplog.records]
+    assert not any("\n" in message for message in messages)
+    return [message for message in messages if message.startswith(start)]
+
+
+def test_steps_noise_and_calibration_are_logged_with_their_numbers(caplog):
+    """Of a camera that is not where it should be: proposals, the last of which is what is used."""
+    caplog.set_level("INFO", "slamlib")
+    dataset = drive(1)[0].without("uwb").first(600)
+    found = estimate(seen_from(dataset, (0.1, 0.05, 0.03)))
+    steps = logged(caplog, "model of the steps")
+    assert steps[-1].endswith(f": {found.model}")
+    assert all(re.fullmatch(r"model of the steps: log evidence -\S+ of \w+, -\S+ of \w+: \w+", each)
+               for each in steps)
+    proposals = logged(caplog, "calibration")
+    assert all(re.search(r" released, log evidence [+-]\S+ \(predicted [+-]\S+\): (kept|refused)$",
+                         each) for each in proposals)
+    kept = [each for each in proposals if each.endswith("kept")]
+    assert "camera-offset" in found.released
+    assert kept[-1].startswith(f"calibration: {', '.join(sorted(found.released))} released")
+    noises = logged(caplog, "noise")
+    assert noises and all(re.match(
+        r"noise: slip \S+ mm after 1 m, factors \S+ of sightings and \S+ of ranges", each)
+        for each in noises)
+
+
+def test_jumps_are_logged_with_the_sightings_that_they_spare(caplog):
+    """Of a vehicle that was carried, with a spike and a dead wheel in its counts."""
+    caplog.set_level("INFO", "slamlib")
+    spike = counts([600], lambda t: t + [1500, 0])
+    dead = counts(slice(900, 950), lambda t: t * [0, 1])
+    dataset = dead(spike(carried(simulate("short", 8)[0].first(1200), 300, 306)))
+    found = estimate(dataset.without("uwb"))
+    compared, believed = logged(caplog, "jumps")
+    still, without = re.fullmatch(
+        r"jumps: (\d+) sightings are rejected, (\d+) without: believed", compared).groups()
+    assert int(still) == found.rejected.sum() < int(without) / 2
+    count = len(found.jumps.start)
+    assert believed == f"jumps: {count} of {count} are believed"
+
+
+def test_places_of_ids_are_logged(caplog, monkeypatch):
+    """Of markers of which every second visit is said to be elsewhere."""
+    caplog.set_level("INFO", "slamlib")
+    monkeypatch.setattr(choices, "slam_result", lambda solved: solved)
+    monkeypatch.setattr(choices, "_places_of_visits", lambda _, numbers: zip(
+        np.unique(numbers), cycle([0, 1])))
+    aruco = ArucoReadings(np.tile([0, 10, 1000, 1010], 2), np.repeat([7, 12], 4), None, None)
+    choices.places_of_ids(aruco, lambda places: None)
+    assert logged(caplog, "places") == [
+        f"places: marker {marker} is seen at 2" for marker in (7, 12)]
 
 
 @cache

@@ -15,7 +15,7 @@ from slamlib.core.kernels import KERNELS, ONE_SIDED
 from slamlib.core.records import AntennaGuess, ArucoReadings, Dataset, UwbReadings
 from slamlib.core.vehicle import Vehicle
 from slamlib.robust import factors
-from slamlib.robust.choices import DECISIVE_LEAD, better_model
+from slamlib.robust.choices import DECISIVE_LEAD, better_model, ids_of_places
 from slamlib.robust.covariances import marginal_covariances, posterior_moments
 from slamlib.robust.fit import accepted_measurements
 from slamlib.robust.initialization import GROWTH, odometry_state, part_lengths
@@ -299,6 +299,17 @@ def test_the_gate_rejects_wrong_labels_and_hardly_any_others():
     numbers = kernels.compare(6, "sightings", ("quadratic", "gate"), mislabelled=0.03)
     assert numbers["gate wrong rejected"] == 1 and numbers["gate good lost"] < 0.005
     assert numbers["quadratic wrong rejected"] == numbers["quadratic good lost"] == 0
+
+
+@pytest.mark.parametrize("marker, place, expected", [
+    ([12, 12, 12, 7, 7], [0, 1, 2, 0, 1], [12, 112, 212, 7, 107]),
+    ([12, 999, 12], [0, 0, 1], [12, 999, 1012]),
+    ([-7, 93, -7, 0, 0], [0, 0, 1, 0, 1], [-7, 93, -107, 0, 100]),      # 93 is -7 + 100
+    ([-12, 2, 2], [0, 0, 1], [-12, 2, 102])])
+def test_a_second_place_gets_a_readable_id_that_the_drive_does_not_have(marker, place, expected):
+    found = ids_of_places(np.array(marker), np.array(place))
+    np.testing.assert_array_equal(found, expected)
+    assert len({*found}) == len({*zip(marker, place)})
 
 
 OPEN_PATHS = {                                            # legs of (metres, radians)

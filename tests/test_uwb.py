@@ -1,5 +1,6 @@
 """Problem 4: range factors, kernels, start values and covariances of the antennas."""
 
+import re
 from dataclasses import replace
 
 import gtsam
@@ -18,7 +19,14 @@ from slamlib.core.se2 import compose
 from slamlib.core.vehicle import Vehicle
 from slamlib.robust import factors, initialization, result
 from slamlib.robust.calibration import OFFSET, RANGES, SCALE, SIGHTINGS, stated_calibration
-from slamlib.robust.initialization import AntennaRanges, odometry_state, second_moment, trilaterate
+from slamlib.robust.initialization import (
+    AntennaRanges,
+    odometry_state,
+    other_antenna,
+    ranges_by_antenna,
+    second_moment,
+    trilaterate,
+)
 from slamlib.robust.linear import NormalEquations, consistency_factor
 from slamlib.robust.measurements import measure
 from slamlib.robust.optimize import optimize
@@ -311,6 +319,64 @@ def test_an_antenna_is_doubted_if_most_of_its_ranges_disagree(weight, said):
     if said is None:                           # in the worst direction above 2.5 % of 5 m
         for each in coarse, narrow:
             assert "too few or come from too few" in result._doubt(each, place, weight, *found)
+
+
+@pytest.mark.parametrize("other, late, count, said", [
+    ((-2.5, 0.5), 0.0, 30, "30 of its 60 ranges fit another place, (-2.5, 0.5)"),
+    ((-2.5, 0.5), 0.0, 11, "11 of its 41 ranges fit another place, (-2.5, 0.5)"),
+    ((-2.5, 0.5), 0.0, 9, None),                     # may be wrong for any reason
+    ((-2.5, 0.5), 1.0, 30, None),                    # fit nothing
+    ((3.0, 4.0), 0.5, 30, None)])                    # too long: without line of sight
+def test_another_antenna_with_the_same_id_by_hand(other, late, count, said):
+    """Ranges from a circle to (3, 4), and `count` to another place, late by up to twice `late`."""
+    angle = np.r_[np.linspace(0, 5, 30), np.linspace(0.5, 6, count)]
+    path = 2 * np.column_stack([np.cos(angle), np.sin(angle)])
+    contradicts = np.arange(len(path)) >= 30
+    place = np.where(contradicts[:, None], other, [3.0, 4.0])
+    distance = np.hypot(*(path - place).T) + contradicts * late * (1 + np.sin(37 * angle))
+    ranges = AntennaRanges(path, distance, np.full(len(path), 0.05), np.array([3.5, 3.5]))
+    found = other_antenna(ranges, np.array([3.0, 4.0]), np.where(contradicts, 0.1, 1.0))
+    assert found is None if said is None else found.startswith(said)
+
+
+def others_of(found):
+    """`other_antenna` of all antennas of a SlamResult, of those for which it is not None, by id."""
+    m, c = found.fit.problem.measurements, found.fit.state.c
+    by_antenna = ranges_by_antenna(m, found.poses[m.frame], found.covariances[m.frame], c,
+                                   found.noise.ranges)
+    said = {}
+    for k, (antenna, ranges) in enumerate(zip(found.antenna.tolist(), by_antenna)):
+        weight = found.range_weight[m.ranges.antenna == k]
+        said[antenna] = other_antenna(ranges, found.antenna_in_world[k], weight)
+    return {antenna: each for antenna, each in said.items() if each is not None}
+
+
+def test_two_antennas_with_one_id_are_told():
+    """Half of the ranges of the first antenna are to the second; the solution takes one of both.
+
+    Problem 4 is as accurate as ever, so nothing else tells of it.
+    """
+    dataset, truth = simulate("short", seed=0)
+    first, second = dataset.antenna_guess.antenna[:2].tolist()
+    antenna = np.where(dataset.uwb.antenna == second, first, dataset.uwb.antenna)
+    found = estimate(replace(dataset, uwb=replace(dataset.uwb, antenna=antenna)))
+    assert ate(found.poses, truth.poses, aligned=True) < 0.005
+    said = others_of(found)
+    assert [*said] == [first] and "as if two antennas had this id" in said[first]
+    place = [float(each) for each in re.search(r"\((.+), (.+)\)", said[first]).groups()]
+    for each in found.antenna_in_world[0], place:
+        assert np.hypot(*(truth.antenna_in_world[:2] - each).T).min() < 0.15
+    assert np.hypot(*(found.antenna_in_world[0] - place)) > 5
+
+
+@pytest.mark.parametrize("options, wall", [
+    ({}, 0.0), ({"late_ranges": 0.3}, 0.0), ({}, 0.5)], ids=["clean", "late", "a wall"])
+def test_no_false_alarm_of_two_antennas_with_one_id(options, wall):
+    dataset, _ = simulate("short", seed=1, **options)
+    behind = dataset.uwb.antenna == dataset.antenna_guess.antenna[0]
+    found = estimate(replace(dataset, uwb=replace(
+        dataset.uwb, range=dataset.uwb.range + wall * behind)))
+    assert not others_of(found)
 
 
 def test_a_kernel_takes_a_known_part_of_the_variance():

@@ -14,17 +14,28 @@ D(lag) during the last `lag` encoder steps, D = X^-1 X(lag steps earlier), the m
 with the pose L of the marker and the positions A of the antenna and t of the tag. The entry for the
 height is half its square, in which the squared distance is linear. This model and its derivatives
 are `factors.sighting_error` and `range_error`; `choices.calibrated` decides what is wrong, and
-`checks.solution` tells it. Before the graph, `Dataset.sightings` applies what is stated.
+`solution_doubts` says so. Before the graph, `Dataset.sightings` applies what is stated.
 (Kuemmerle, Grisetti, Burgard, Simultaneous Calibration, Localization, and Mapping, IROS 2011.)
 """
 
-from collections import namedtuple
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-# The group is also the kind of the doubt. Of a wheel the wide sigma is relative.
-Entry = namedtuple("Entry", "name unit group wide")
+from slamlib.core.vehicle import Vehicle
+
+
+class Entry(NamedTuple):
+    """A row of the table of the calibration."""
+
+    name: str
+    unit: str
+    group: str               # with which it leaves its stated value; also the kind of the doubt
+    wide: float              # standard deviation then, in the unit; of a wheel relative
+
+
 ENTRIES = (
     Entry("right_radius", "m", "wheel-parameters", 0.05),
     Entry("left_radius", "m", "wheel-parameters", 0.05),
@@ -41,70 +52,106 @@ ENTRIES = (
     Entry("range_scale", "", "range-offset", 0.05),
     Entry("range_lag", "poses", "range-delay", 30.0))
 ANTENNA_OFFSETS = Entry("offset of antenna", "m", "antenna-offsets", 0.15)
+
 # Columns of the vector by kind of measurement, then by entry.
-WHEELS, SIGHTINGS, RANGES = slice(0, 3), slice(3, 8), slice(8, None)
-CAMERA, SIZE, SIGHTING_LAG = slice(3, 6), 6, 7               # columns of sightings
-TAG_PLACE, HEIGHT, OFFSET, SCALE = slice(8, 10), 10, 11, 12  # columns of ranges
-RANGE_LAG, ANTENNAS = 13, slice(14, None)                    # columns of ranges
+WHEELS = slice(0, 3)
+SIGHTINGS = slice(3, 8)
+RANGES = slice(8, None)
+
+CAMERA = slice(3, 6)         # of sightings, with the next two
+SIZE = 6
+SIGHTING_LAG = 7
+
+TAG_PLACE = slice(8, 10)     # of ranges, with all that follow
+HEIGHT = 10
+OFFSET = 11
+SCALE = 12
+RANGE_LAG = 13
+ANTENNAS = slice(14, None)
 
 
 @dataclass(frozen=True)
 class Calibration:
     """What a Vehicle states of the p entries for the a antennas of a drive."""
 
-    names: tuple             # p of str
+    names: tuple[str, ...]   # p of them
     group: np.ndarray        # (p,) of str
     stated: np.ndarray       # (p,)
     sigma: np.ndarray        # (p,) as stated, 0 if known
     wide: np.ndarray         # (p,) if the statement is wrong
 
-    def sigma_without(self, groups, width=1.0):
+    def sigma_without(self, groups: Collection[str], width: float = 1.0) -> np.ndarray:
         """Standard deviations (p,), of `groups` the wide ones times `width`, else as stated."""
-        return np.where(np.isin(self.group, list(groups)),
-                        np.maximum(width * self.wide, self.sigma), self.sigma)
+        released = np.isin(self.group, list(groups))
+        return np.where(released, np.maximum(width * self.wide, self.sigma), self.sigma)
 
-    def taken_from(self, other, values, default):
+    def taken_from(
+            self, other: "Calibration", values: np.ndarray, default: np.ndarray) -> np.ndarray:
         """Values (p,): another drive's Calibration's where it has the entry, or `default`."""
         known = dict(zip(other.names, values))
         return np.array([known.get(name, value) for name, value in zip(self.names, default)])
 
 
-def calibration_table(calibration, c, covariance, released):
-    """List of a dict for each entry of a Calibration, with lengths and angles as in `vehicle.toml`.
+def calibration_table(calibration: Calibration, c: np.ndarray, covariance: np.ndarray,
+                      released: Collection[str]) -> list[dict]:
+    """A dict for each entry of a Calibration, with lengths and angles as in `vehicle.toml`.
 
     "name", "unit", "group", "stated" and "stated_sigma", "estimate" and "sigma" by the values c
     (p,) and their covariance (p, p), and whether its group is in `released`. The height is 0 where
     half its square, which is estimated, is negative.
     """
-    entries = ENTRIES + (len(c) - len(ENTRIES)) * (ANTENNA_OFFSETS,)
-    numbers = np.stack([calibration.stated, calibration.sigma, c, np.sqrt(np.diag(covariance))])
-    numbers[:2, HEIGHT], numbers[2:, HEIGHT] = (
-        _height(*numbers[:2, HEIGHT]), _height(*numbers[2:, HEIGHT]))
-    return [{"name": name, "unit": entry.unit, "group": entry.group,
-             "released": entry.group in released} | dict(zip(
-                ("stated", "stated_sigma", "estimate", "sigma"), column.tolist()))
-            for name, entry, column in zip(calibration.names, entries, numbers.T)]
+    stated = _with_height(calibration.stated, calibration.sigma)
+    estimated = _with_height(c, np.sqrt(np.diag(covariance)))
+    table = []
+    for k, entry in enumerate(_entries(len(c) - len(ENTRIES))):
+        table.append({
+            "name": calibration.names[k],
+            "unit": entry.unit,
+            "group": entry.group,
+            "released": entry.group in released,
+            "stated": float(stated[0, k]),
+            "stated_sigma": float(stated[1, k]),
+            "estimate": float(estimated[0, k]),
+            "sigma": float(estimated[1, k])})
+    return table
 
 
-def _height(half_square, sigma):
-    """A height and its standard deviation in m, from those of half its square."""
-    height = np.sqrt(2 * max(half_square, 0.0))
-    return height, sigma / max(height, np.sqrt(sigma / 2)) if sigma else 0.0
+def _entries(antenna_count):
+    """The p entries of the vector for so many antennas."""
+    return ENTRIES + antenna_count * (ANTENNA_OFFSETS,)
 
 
-def stated_calibration(vehicle, antennas):
+def _with_height(values, sigma):
+    """Values and standard deviations (2, p) with the height, m, in place of half its square."""
+    table = np.stack([values, sigma])
+    height = np.sqrt(2 * max(table[0, HEIGHT], 0.0))
+    spread = table[1, HEIGHT]
+    table[0, HEIGHT] = height
+    if spread:
+        table[1, HEIGHT] = spread / max(height, np.sqrt(spread / 2))
+    return table
+
+
+def stated_calibration(vehicle: Vehicle, antennas: Sequence[int]) -> Calibration:
     """The Calibration that a Vehicle states, for `antennas` (a,), ids."""
-    entries = ENTRIES + len(antennas) * (ANTENNA_OFFSETS,)
-    values = np.array([getattr(vehicle, entry.name) for entry in ENTRIES])
-    sigma = np.array([getattr(vehicle, f"sigma_{entry.name}") for entry in ENTRIES])
+    entries = _entries(len(antennas))
+    stated = np.zeros(len(entries))                   # offsets of antennas are 0, and known
+    sigma = np.zeros(len(entries))
+    for k, entry in enumerate(ENTRIES):
+        stated[k] = getattr(vehicle, entry.name)
+        sigma[k] = getattr(vehicle, f"sigma_{entry.name}")
     wide = np.array([entry.wide for entry in entries])
-    wide[WHEELS] *= values[WHEELS]
-    height, spread = values[HEIGHT], sigma[HEIGHT]
-    values[HEIGHT], sigma[HEIGHT] = height**2 / 2, np.hypot(height, spread / 2) * spread
-    wide[HEIGHT] = np.hypot(height, wide[HEIGHT] / 2) * wide[HEIGHT]
-    return Calibration(
-        names=(*(entry.name for entry in ENTRIES),
-               *(f"{ANTENNA_OFFSETS.name} {antenna}" for antenna in antennas)),
-        group=np.array([entry.group for entry in entries]),
-        stated=np.pad(values, (0, len(antennas))), sigma=np.pad(sigma, (0, len(antennas))),
-        wide=wide)
+    wide[WHEELS] *= stated[WHEELS]
+    height = stated[HEIGHT]
+    stated[HEIGHT] = height**2 / 2
+    sigma[HEIGHT] = _sigma_of_half_square(height, sigma[HEIGHT])
+    wide[HEIGHT] = _sigma_of_half_square(height, wide[HEIGHT])
+    names = [entry.name for entry in ENTRIES]
+    names += [f"{ANTENNA_OFFSETS.name} {antenna}" for antenna in antennas]
+    return Calibration(names=tuple(names), group=np.array([entry.group for entry in entries]),
+                       stated=stated, sigma=sigma, wide=wide)
+
+
+def _sigma_of_half_square(height, sigma):
+    """Standard deviation of h^2 / 2, in m^2, for a height h and its standard deviation in m."""
+    return np.hypot(height, sigma / 2) * sigma

@@ -17,23 +17,27 @@ between them ties visits together. A visit whose landmark is further from all ea
 id than this path explains is another place (`places_of_ids`).
 """
 
-from collections import namedtuple
+import logging
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 
 from slamlib.core import se2
 from slamlib.core.errors import DatasetError
-from slamlib.core.odometry import MODELS
+from slamlib.core.records import ArucoReadings, Dataset
 from slamlib.core.sightings import GATE
 from slamlib.robust.calibration import WHEELS
 from slamlib.robust.error_memory import runs
 from slamlib.robust.factors import odometry_error, preintegrate_odometry
-from slamlib.robust.fit import accepted_measurements, refine, residuals
-from slamlib.robust.jumps import NO_JUMPS, find_jumps
+from slamlib.robust.fit import Fit, accepted_measurements, refine, residuals
+from slamlib.robust.jumps import NO_JUMPS, Jumps, find_jumps
 from slamlib.robust.linear import NormalEquations, laplace_approximation, linear_solution
 from slamlib.robust.result import slam_result
+
+log = logging.getLogger(__name__)
 
 DECISIVE_LEAD = 3.0          # log evidence by which another model of the steps replaces the default
 DECISIVE_RELEASE = 6.0       # log evidence by which a group is told to be wrong
@@ -54,84 +58,115 @@ PLACE_GATE = 60.0            # squared distance of x, y, heading in sigmas, beyo
 MIN_SIGMA = 0.02             # m or rad, of the path between two visits
 
 
-def better_model(fit):
+def better_model(fit: Fit) -> Fit:
     """The Fit by Euler's steps if their evidence leads that of arcs by DECISIVE_LEAD, or arcs."""
-    current = replace(fit.problem, accepted=_with_fixed_weights(fit))
-    other, = {*MODELS} - {current.odometry.model}
+    present = replace(fit.problem, accepted=_with_fixed_weights(fit))
+    model = present.odometry.model
+    other = "arc" if model == "euler" else "euler"
     odometry = replace(preintegrate_odometry(
-        current.measurements, other, current.odometry.wheel), in_counts=True)
-    of_current, of_other = (laplace_approximation(
-        NormalEquations(each, fit.state), current.noise)[1]
-        for each in (current, replace(current, odometry=odometry)))
-    if of_other - of_current <= (DECISIVE_LEAD if other == "euler" else -DECISIVE_LEAD):
+        present.measurements, other, present.odometry.wheel), in_counts=True)
+    of_present = _log_evidence_at(fit.state, present)
+    of_other = _log_evidence_at(fit.state, replace(present, odometry=odometry))
+    needed_lead = DECISIVE_LEAD if other == "euler" else -DECISIVE_LEAD
+    is_better = of_other - of_present > needed_lead
+    log.info("model of the steps: log evidence %.1f of %s, %.1f of %s: %s", of_present, model,
+             of_other, other, other if is_better else model)
+    if not is_better:
         return fit
-    return replace(refine(replace(fit.problem, odometry=odometry), fit.state, accept=None),
-                   explanations=fit.explanations)
+    better = refine(replace(fit.problem, odometry=odometry), fit.state, accept=None)
+    return replace(better, explanations=fit.explanations)
 
 
-def calibrated(fit):
+def _log_evidence_at(state, problem):
+    return laplace_approximation(NormalEquations(problem, state), problem.noise)[1]
+
+
+def calibrated(fit: Fit) -> Fit:
     """The Fit in which groups of the calibration have left their stated values."""
-    tried, stated = [], fit.problem.measurements.calibration.stated
+    tried = []
     for _ in range(MAX_PROPOSALS):
-        problem, proposal = fit.problem, _proposal(fit)
-        if np.array_equal(proposal.sigma, problem.sigma):
-            fit = replace(fit, explanations=proposal.explanations)
-            break
+        proposal = _proposal(fit)
+        if np.array_equal(proposal.sigma, fit.problem.sigma):
+            return replace(fit, explanations=proposal.explanations)
         if proposal.groups in tried:
             break
         tried.append(proposal.groups)
-        state = replace(fit.state, c=np.where(proposal.sigma > 0, fit.state.c, stated))
-        try:
-            proposed = refine(
-                replace(problem, sigma=proposal.sigma, released=proposal.groups), state)
-            lead = _lead(proposed, fit)
-        except (DatasetError, np.linalg.LinAlgError):
+        proposed = _released(fit, proposal)
+        if proposed is None:
             break
-        if lead < (0.0 if proposal.lead >= 0 else proposal.lead - DECISIVE_RELEASE):
-            break
-        fit = replace(proposed, explanations=proposal.explanations)
+        fit = proposed
     return fit
 
 
-_Proposal = namedtuple("_Proposal", "explanations groups sigma lead")
+class _Proposal(NamedTuple):
+    """Which groups of the calibration are to leave their stated values."""
+
+    explanations: tuple      # of frozensets of groups, each of which explains the drive
+    groups: frozenset        # to be released
+    sigma: np.ndarray        # (p,) of the prior of the calibration then
+    lead: float              # log evidence over that of the prior as it is
+
+
+def _released(fit, proposal):
+    """The Fit with a _Proposal, or None if its evidence does not lead, or it has no solution."""
+    stated = fit.problem.measurements.calibration.stated
+    c = np.where(proposal.sigma > 0, fit.state.c, stated)
+    problem = replace(fit.problem, sigma=proposal.sigma, released=proposal.groups)
+    names = ", ".join(sorted(proposal.groups)) or "nothing"
+    try:
+        proposed = refine(problem, replace(fit.state, c=c))
+        lead = _lead(proposed, fit)
+    except (DatasetError, np.linalg.LinAlgError):
+        log.info("calibration: %s released, no solution: refused", names)
+        return None
+    needed = 0.0 if proposal.lead >= 0 else proposal.lead - DECISIVE_RELEASE
+    is_kept = not lead < needed
+    log.info("calibration: %s released, log evidence %+.1f (predicted %+.1f): %s", names, lead,
+             proposal.lead, "kept" if is_kept else "refused")
+    return replace(proposed, explanations=proposal.explanations) if is_kept else None
 
 
 def _proposal(fit):
-    """Which groups of the calibration of a Fit the evidence wants to be released: a _Proposal.
+    """The _Proposal of the groups of the calibration of a Fit that the evidence wants released.
 
-    `explanations`, frozensets of groups, are the best set and others that come within AMBIGUOUS of
-    it, neither part of it nor more: the drive cannot tell them apart. Each of their groups must
-    raise the log evidence by its prior odds: DECISIVE_RELEASE, FURTHER_ENTRY more for each of its
-    entries but one, and STATED more if its standard deviations are stated. `groups` are all of
-    theirs, and what else raises the evidence: not certain enough to be told, but the covariances
-    have to include it. `lead` is the log evidence over that of the prior as it is. Of `sigma` (p,)
-    the wide ones are multiplied by GROSS if an entry would be further off than MAX_WIDE_SIGMAS.
+    `explanations` are the best set of groups and others that come within AMBIGUOUS of it, neither
+    part of it nor more: the drive cannot tell them apart. Each of their groups must raise the log
+    evidence by its `_price`. `groups` are all of theirs, and what else raises the evidence: not
+    certain enough to be told, but the covariances have to include it. Wide standard deviations are
+    multiplied by GROSS if an entry would be further off than MAX_WIDE_SIGMAS.
     """
     calibration = fit.problem.measurements.calibration
     L, h = _likelihood(fit)
     informed = np.diag(L) > 0
     doubtful = informed & (calibration.wide > calibration.sigma)
-    candidates = sorted({*calibration.group[doubtful].tolist()})
-    stated = frozenset(calibration.group[calibration.sigma > 0].tolist())
-    entries = {each: np.count_nonzero(calibration.group == each) for each in candidates}
-    sets = [frozenset(some) for count in range(len(candidates) + 1)
-            for some in combinations(candidates, count)]
+    groups = np.unique(calibration.group[doubtful]).tolist()
+    price = {group: _price(calibration, group) for group in groups}
+    sets = [frozenset(some) for count in range(len(groups) + 1)
+            for some in combinations(groups, count)]
+    price_of_set = np.array([sum(price[group] for group in some) for some in sets])
     for width in (1.0, GROSS):
-        found = _log_evidence(L, h, informed / calibration.wide * [
-            calibration.sigma_without(some, width) for some in sets])
-        evidence, largest = (dict(zip(sets, each.tolist())) for each in found)
-        merit = {some: evidence[some] - DECISIVE_RELEASE * len(some) - STATED * len(some & stated)
-                 - FURTHER_ENTRY * sum(entries[each] - 1 for each in some) for some in sets}
-        best = max(merit, key=merit.get)
-        if not best or largest[best] < MAX_WIDE_SIGMAS:
+        sigma = np.array([calibration.sigma_without(some, width) for some in sets])
+        evidence, furthest = _log_evidence(L, h, sigma / calibration.wide * informed)
+        merit = evidence - price_of_set
+        k = int(merit.argmax())
+        best = sets[k]
+        if not best or furthest[k] < MAX_WIDE_SIGMAS:
             break
-    explanations = tuple(some for some in merit if some == best or (
-        merit[some] > merit[best] - AMBIGUOUS and not some < best and not some > best))
+    close = [sets[k] for k in np.flatnonzero(merit > merit.max() - AMBIGUOUS)]
+    explanations = tuple(some for some in close if not (some < best or some > best))
     certain = frozenset().union(*explanations)
-    more = max((some for some in evidence if certain <= some), key=evidence.get)
-    present, _ = _log_evidence(L, h, fit.problem.sigma / calibration.wide * informed)
-    return _Proposal(explanations, more, calibration.sigma_without(more, width),
-                     evidence[more] - present)
+    sufficient = [k for k, some in enumerate(sets) if certain <= some]
+    more = max(sufficient, key=evidence.__getitem__)
+    present = _log_evidence(L, h, fit.problem.sigma / calibration.wide * informed)[0]
+    return _Proposal(explanations, sets[more], sigma[more], evidence[more] - present)
+
+
+def _price(calibration, group):
+    """Log evidence by which a group must raise that of the rest to be told: its prior odds."""
+    entries = calibration.group == group
+    price = DECISIVE_RELEASE + FURTHER_ENTRY * (np.count_nonzero(entries) - 1)
+    is_stated = calibration.sigma[entries].any()
+    return price + STATED if is_stated else price
 
 
 def _log_evidence(L, h, sigma):
@@ -140,10 +175,12 @@ def _log_evidence(L, h, sigma):
     From the information L (p, p) and h (p,) of the likelihood. Also the largest posterior mean of
     an entry, (...), in its standard deviations, in which the equations are solved.
     """
-    posterior = np.eye(len(h)) + sigma[..., :, None] * L * sigma[..., None, :]
-    mean = np.linalg.solve(posterior, (sigma * h)[..., None])[..., 0]
-    return (np.sum(sigma * h * mean, axis=-1) / 2 - np.linalg.slogdet(posterior)[1] / 2,
-            np.abs(mean).max(axis=-1))
+    information = np.eye(len(h)) + sigma[..., :, None] * L * sigma[..., None, :]
+    gradient = sigma * h
+    mean = np.linalg.solve(information, gradient[..., None])[..., 0]
+    log_determinant = np.linalg.slogdet(information).logabsdet
+    evidence = np.sum(gradient * mean, axis=-1) / 2 - log_determinant / 2
+    return evidence, np.abs(mean).max(axis=-1)
 
 
 def _likelihood(fit):
@@ -153,34 +190,39 @@ def _likelihood(fit):
     H, border, *_ = equations.sums(fit.problem.noise, consistent=True)
     solution = linear_solution(equations.structure, H, border)
     u = (fit.state.c - calibration.stated) / calibration.wide
-    L, h = np.zeros((len(u), len(u))), np.zeros(len(u))
+    L = np.zeros((len(u), len(u)))
     if solution is None:
-        return L, h
-    information = solution.S - np.eye(len(u))              # without the prior
-    some = np.diag(information) > MIN_INFORMATION
-    values, axes = np.linalg.eigh(information[np.ix_(some, some)])
-    information = axes * np.maximum(values, 0) @ axes.T
-    L[np.ix_(some, some)] = information
-    h[some] = information @ u[some] - (solution.gradient - u)[some]
-    return L, h
+        return L, np.zeros(len(u))
+    without_prior = solution.S - np.eye(len(u))
+    gradient = solution.gradient - u                      # without the prior, too
+    known = np.diag(without_prior) > MIN_INFORMATION
+    block = np.ix_(known, known)
+    values, axes = np.linalg.eigh(without_prior[block])
+    L[block] = axes * np.maximum(values, 0) @ axes.T
+    return L, np.where(known, L @ u - gradient, 0.0)
 
 
 def _lead(proposed, present):
     """Log evidence of a Fit minus that of another, on the weights of `proposed`, noise learned."""
-    fixed = _with_fixed_weights(proposed)
-    first, second = (refine(replace(proposed.problem, accepted=fixed, sigma=each.problem.sigma),
-                            each.state, accept=None) for each in (proposed, present))
-    return first.log_density - second.log_density
+    weighted = replace(proposed.problem, accepted=_with_fixed_weights(proposed))
+
+    def log_density(fit):
+        problem = replace(weighted, sigma=fit.problem.sigma)
+        return refine(problem, fit.state, accept=None).log_density
+
+    return log_density(proposed) - log_density(present)
 
 
 def _with_fixed_weights(fit):
     """AcceptedMeasurements in which weights replace the kernel of the ranges."""
-    accepted, (_, late) = fit.problem.accepted, residuals(fit.problem, fit.state)
-    return accepted._replace(ranges=replace(
-        accepted.ranges, weight=accepted.ranges.kept(late), kernel=None))
+    accepted = fit.problem.accepted
+    _, late = residuals(fit.problem, fit.state)
+    weight = accepted.ranges.kept(late)
+    return accepted._replace(ranges=replace(accepted.ranges, weight=weight, kernel=None))
 
 
-def most_consistent(dataset, solve):
+def most_consistent(
+        dataset: Dataset, solve: Callable[..., Fit]) -> tuple[Fit, np.ndarray | None]:
     """The Fit that rejects few sightings, and `SlamResult.places`, None if each id is one place.
 
     `solve` makes the Fit of Jumps and of places. Jumps of odometry, or else places of ids, are
@@ -189,100 +231,149 @@ def most_consistent(dataset, solve):
     all over a way without markers, one more jump is believed if the evidence leads decisively.
     """
     jumps = find_jumps(dataset)
-    fit = solve(jumps if jumps.are_few else replace(NO_JUMPS, lag=jumps.lag))
-    if len(jumps.start) and not jumps.are_few:
+    are_doubtful = len(jumps.start) > 0 and not jumps.are_few
+    fit = solve(replace(NO_JUMPS, lag=jumps.lag) if are_doubtful else jumps)
+    if are_doubtful:
         other = solve(jumps)
-        fit = other if spares_sightings(other, fit) else fit
+        if spares_sightings(other, fit, "jumps"):
+            fit = other
+    log.info("jumps: %d of %d are believed", len(fit.problem.measurements.jumps.start),
+             len(jumps.start))
     if has_rejected_visits(fit):
         places = places_of_ids(dataset.aruco, solve)
-        if places is not None and spares_sightings(other := solve(places=places), fit):
-            return other, places
+        if places is not None:
+            other = solve(places=places)
+            if spares_sightings(other, fit, "places of ids"):
+                return other, places
     jumps = with_stretched(fit)
-    if jumps and (other := solve(jumps)).log_density > fit.log_density + MIN_JUMP_LEAD:
-        return other, None
+    if jumps is not None:
+        other = solve(jumps)
+        lead = other.log_density - fit.log_density
+        log.info("jumps: one more, log evidence %+.1f", lead)
+        if lead > MIN_JUMP_LEAD:
+            return other, None
     return fit, None
 
 
-def with_stretched(fit):
+def with_stretched(fit: Fit) -> Jumps | None:
     """The Jumps of a Fit and the step that contradicts odometry most, None if that is within GATE.
 
     Data snooping (Baarda 1968) with the slip that is learned. There is no such step where it is
-    given, and none beside factors of one's own, which may be what is wrong.
+    given.
     """
-    m, odometry, poses = fit.problem.measurements, fit.problem.odometry, fit.state.poses
+    m = fit.problem.measurements
     if not m.learned[0] or not len(m.marker_row) or len(m.frame) < 2:
         return None
+    odometry = fit.problem.odometry
+    poses = fit.state.poses
     e, *_ = odometry_error(odometry, poses, fit.state.c[WHEELS])
-    C = odometry.covariance(fit.problem.noise.slip)
-    squared = np.einsum("ni,nij,nj->n", e, np.linalg.inv(C), e)
+    information = np.linalg.inv(odometry.covariance(fit.problem.noise.slip))
+    squared = np.einsum("ni,nij,nj->n", e, information, e)
     k = int(squared.argmax())
-    return m.jumps.joined_by(
-        m.frame[k], m.frame[k + 1], se2.between(poses[k], poses[k + 1]), odometry.increment[k],
-        len(m.dataset.ticks)) if squared[k] > GATE else None
+    if squared[k] > GATE:
+        return m.jumps.joined_by(
+            m.frame[k], m.frame[k + 1], se2.between(poses[k], poses[k + 1]),
+            odometry.increment[k], len(m.dataset.ticks))
+    return None
 
 
-def visits(aruco):
+def visits(aruco: ArucoReadings) -> np.ndarray:
     """Number (m,) of the visit of every one of ArucoReadings, from 0, by id, then by time."""
     order = np.lexsort((aruco.pose, aruco.marker))
-    marker, number = aruco.marker[order], np.arange(len(order))
+    marker = aruco.marker[order]
+    number = np.arange(len(order))
     if (marker[1:] == marker[:-1]).any():
-        _, number = runs(marker, aruco.pose[order], VISIT_GAP)
+        number = runs(marker, aruco.pose[order], VISIT_GAP)[1]
     return number[np.argsort(order)]
 
 
-def contradicted(fit, factor):
+def contradicted(fit: Fit, factor: float) -> np.ndarray:
     """Which sightings (s,), bool, a Fit rejects at this noise factor."""
     problem = replace(fit.problem, noise=fit.problem.noise._replace(sightings=factor))
     return accepted_measurements(problem, fit.state).sightings.weight == 0
 
 
-def has_rejected_visits(fit):
+def has_rejected_visits(fit: Fit) -> bool:
     """Whether a Fit rejects most sightings of any visit.
 
     A marker that was moved looks like errors with memory, and the factor learned would hide it.
     """
-    m, factor = fit.problem.measurements, fit.problem.noise.sightings
+    m = fit.problem.measurements
     if not len(m.marker_row):
         return False
-    factor = factor if (fit.problem.accepted.share == 1).all() else min(factor, 1.0)
+    factor = fit.problem.noise.sightings
+    if (fit.problem.accepted.share < 1).any():
+        factor = min(factor, 1.0)
     number = visits(m.dataset.aruco)[m.sightings.index]
-    count, lost = np.bincount(number), np.bincount(number, contradicted(fit, factor))
-    return bool(((count >= MIN_VISIT) & (lost > MAX_REJECTED_SHARE * count)).any())
+    count = np.bincount(number)
+    rejected = np.bincount(number, contradicted(fit, factor))
+    most_rejected = (count >= MIN_VISIT) & (rejected > MAX_REJECTED_SHARE * count)
+    return bool(most_rejected.any())
 
 
-def spares_sightings(fit, other):
+def spares_sightings(fit: Fit, other: Fit, explanation: str) -> bool:
     """Whether a Fit rejects less than MAX_STILL_REJECTED of the sightings that another rejects."""
-    factor = min(each.problem.noise.sightings for each in (fit, other))
-    count, most = (contradicted(each, factor).sum() for each in (fit, other))
-    return bool(count < MAX_STILL_REJECTED * most)
+    factor = min(fit.problem.noise.sightings, other.problem.noise.sightings)
+    still = np.count_nonzero(contradicted(fit, factor))
+    without = np.count_nonzero(contradicted(other, factor))
+    is_believed = still < MAX_STILL_REJECTED * without
+    log.info("%s: %d sightings are rejected, %d without: %s", explanation, still, without,
+             "believed" if is_believed else "not believed")
+    return is_believed
 
 
-def places_of_ids(aruco, solve):
-    """`SlamResult.places` of ArucoReadings, None if each id is one place; `solve` as above.
-
-    The second place of id 12 gets the number 112 where ids have up to two digits, then 212.
-    """
-    marker, number = aruco.marker, visits(aruco)
+def places_of_ids(aruco: ArucoReadings, solve: Callable[..., Fit]) -> np.ndarray | None:
+    """`SlamResult.places` of ArucoReadings, None if each id is one place; `solve` as above."""
+    marker = aruco.marker
+    number = visits(aruco)
     try:
         result = slam_result(solve(places=np.stack([marker, number], axis=1)))
     except (DatasetError, np.linalg.LinAlgError):
         return None
-    ids, digits = marker.copy(), 10**len(str(marker.max()))
-    accepted = np.flatnonzero(~result.rejected)
-    seen = result.sightings.marker[accepted]
-    frame = result.sightings.frame[result.sightings.row[accepted]]
+    place = np.zeros_like(marker)
     for each in np.unique(marker):
-        last = []                                 # of each place the last visit
-        for visit in np.intersect1d(number[marker == each], result.marker):
-            if np.count_nonzero(seen == visit) < MIN_VISIT:
-                continue
-            squared = [_squared_distance(result, other, visit, frame[seen == other][-1],
-                                         frame[seen == visit][0]) for other in last]
-            place = int(np.argmin(squared)) if min(squared, default=np.inf) < PLACE_GATE \
-                else len(last)
-            last[place:place + 1] = [visit]
-            ids[number == visit] += place * digits
-    return None if (ids == marker).all() else np.stack([marker, ids], axis=1)
+        of_id = marker == each
+        for visit, its_place in _places_of_visits(result, number[of_id]):
+            place[number == visit] = its_place
+        if place[of_id].any():
+            log.info("places: marker %d is seen at %d", each, 1 + place[of_id].max())
+    if not place.any():
+        return None
+    return np.stack([marker, ids_of_places(marker, place)], axis=1)
+
+
+def _places_of_visits(result, numbers):
+    """Each visit of an id that is compared, in the order of time, and its place, from 0.
+
+    By a SlamResult with a landmark for every visit, with its number as id. It is at the place whose
+    last visit is nearest, or at another one if all of them are beyond PLACE_GATE.
+    """
+    accepted = ~result.rejected
+    seen = result.sightings.marker[accepted]
+    pose = result.sightings.frame[result.sightings.row[accepted]]
+    last = {}                                     # visit of each place
+    for visit in np.intersect1d(numbers, result.marker):
+        poses = pose[seen == visit]
+        if len(poses) < MIN_VISIT:
+            continue
+        squared = [_squared_distance(result, other, visit, pose[seen == other][-1], poses[0])
+                   for other in last.values()]
+        place = len(last)
+        if min(squared, default=np.inf) < PLACE_GATE:
+            place = int(np.argmin(squared))
+        last[place] = visit
+        yield visit, place
+
+
+def ids_of_places(marker: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Ids (m,) of markers (m,) at places (m,), from 0: where ids have two digits 12, 112, 212.
+
+    The number of the place stands before the digits of the longest id, behind the sign if there is
+    one. So no new id is one of the drive.
+    """
+    digits = len(str(np.abs(marker).max()))
+    away_from_zero = np.where(marker < 0, -1, 1)
+    return marker + away_from_zero * place * 10**digits
 
 
 def _squared_distance(result, first, second, pose, later):
@@ -292,10 +383,11 @@ def _squared_distance(result, first, second, pose, later):
     from a pose of covariance P_1 to one of P_2 adds A P_2 A^T - B P_1 B^T to the covariance of a
     place that A and B move with these poses.
     """
-    first, second = result.marker_in_world[np.searchsorted(result.marker, [first, second])]
-    poses, P = result.poses[[pose, later]], result.covariances[[pose, later]]
-    A, _ = se2.compose_jacobians(poses, se2.between(poses, second))
-    start, end = A @ P @ A.mT
-    values, axes = np.linalg.eigh(end - start)
-    off = axes.T @ se2.difference(second, first)
-    return float(np.sum(off**2 / np.maximum(values, MIN_SIGMA**2)))
+    place = result.marker_in_world[np.searchsorted(result.marker, [first, second])]
+    poses = result.poses[[pose, later]]
+    P = result.covariances[[pose, later]]
+    A, _ = se2.compose_jacobians(poses, se2.between(poses, place[1]))
+    C = A @ P @ A.mT
+    variance, axes = np.linalg.eigh(C[1] - C[0])
+    off = axes.T @ se2.difference(place[1], place[0])
+    return float(np.sum(off**2 / np.maximum(variance, MIN_SIGMA**2)))

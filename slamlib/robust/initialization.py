@@ -5,19 +5,23 @@ of stage 5. Odometry with the wheels that this part calibrated then predicts the
 part, and so on. Stage 7 uses trilateration again for the antennas in doubt.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from operator import attrgetter
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
 
 from slamlib.core import odometry, se2
 from slamlib.core.graph import GUESS_PRIOR_SIGMA
+from slamlib.core.records import Dataset
 from slamlib.core.sightings import consensus
 from slamlib.robust.calibration import ANTENNAS, HEIGHT, OFFSET, SCALE, SIGHTING_LAG, SIZE, WHEELS
 from slamlib.robust.factors import MIN_DISTANCE, sensor_poses
 from slamlib.robust.fit import narrow_kernels
-from slamlib.robust.linear import build_problem, state_from_arrays
-from slamlib.robust.measurements import measure
+from slamlib.robust.linear import State, build_problem, state_from_arrays
+from slamlib.robust.measurements import Measurements, measure
 
 MAX_ODOMETRY_SIGMA = 0.5     # rad, of odometry's heading at the end of a drive's first part
 MAX_FIRST_PART = 1.5         # length of the first part over that which odometry can predict
@@ -30,63 +34,79 @@ KERNEL_SCALE = 2.0           # sigmas, scale of the Cauchy kernel
 START_DIRECTIONS = 3         # number of starts on a circle about the path
 TOLERANCE = 1e-4             # relative, of cost and position, at which the search ends
 
+FITTING = 3.0                # sigmas, error of a range that fits a position
+MIN_OTHERS = 10              # number of ranges that fit the position of another antenna
+MIN_TOO_SHORT = 0.2          # share of contradicting ranges; without line of sight they are long
+MIN_FITTING = 0.5            # share of contradicting ranges that fit one other position
 
-def initial_state(measurements, model):
+
+def initial_state(measurements: Measurements, model: str) -> State:
     """The State from which a drive is solved, by odometry of the model "arc" or "euler".
 
     Raises DatasetError as `optimize`, for the first part of a long drive.
     """
-    part, state = None, None
-    *counts, _ = part_lengths(measurements.dataset)
+    dataset = measurements.dataset
     frame = measurements.frame
-    for count in counts:
-        earlier, part = part, measure(
-            measurements.dataset.first(count), frame[frame < count], measurements.jumps)
-        state = odometry_state(part, model, earlier, state)
-        state = narrow_kernels(build_problem(part, model), state)
+    part = None
+    state = None
+    for count in part_lengths(dataset)[:-1]:
+        longer = measure(dataset.first(count), frame[frame < count], measurements.jumps)
+        state = odometry_state(longer, model, part, state)
+        state = narrow_kernels(build_problem(longer, model), state)
+        part = longer
     return odometry_state(measurements, model, part, state)
 
 
-def part_lengths(dataset):
-    """List of the numbers of encoder poses of the parts of a drive, which all start at pose 1.
+def part_lengths(dataset: Dataset) -> list[int]:
+    """Numbers of encoder poses of the parts of a drive, which all start at pose 1.
 
     Each part is at most GROWTH times as long as the one before; the last one is the whole drive.
     """
     _, covariances = odometry.first_order(
         dataset.ticks, dataset.vehicle, initial_covariance=np.zeros((3, 3)))
     lost = np.flatnonzero(covariances[:, 2, 2] > MAX_ODOMETRY_SIGMA**2)
-    ends = [len(dataset.ticks)]
-    first = max(lost[0], 2) if len(lost) else ends[0]
-    while ends[0] > MAX_FIRST_PART * first:
-        ends.insert(0, max(first, -(-ends[0] // GROWTH)))
-    return ends
+    length = len(dataset.ticks)
+    lengths = [length]
+    if not len(lost):
+        return lengths
+    first = max(lost[0], 2)
+    while length > MAX_FIRST_PART * first:
+        length = max(first, -(-length // GROWTH))        # rounded up
+        lengths.insert(0, length)
+    return lengths
 
 
-def odometry_state(measurements, model, part=None, solved=None, **landmarks):
+def odometry_state(measurements: Measurements, model: str, part: Measurements | None = None,
+                   solved: State | None = None, **landmarks: Callable) -> State:
     """The State with poses by odometry of the model "arc" or "euler".
 
     Of Measurements of which a first `part` has the State `solved`, the later poses are those of
     odometry from the last pose of the part, with its wheels. `landmarks` are the keywords `markers`
     and `antennas` of `state_from_poses`.
     """
-    d, frame, jumps = measurements.dataset, measurements.frame, measurements.jumps
+    dataset = measurements.dataset
+    frame = measurements.frame
+    jumps = measurements.jumps
     if part is None:
-        poses, covariances = odometry.first_order(d.ticks, d.vehicle, model=model)
-        return state_from_poses(measurements, jumps.mended(frame, poses[frame]),
-                                covariances[frame], **landmarks)
-    last, stated = part.frame[-1], measurements.calibration.stated
-    poses, covariances = odometry.first_order(
-        d.ticks[last:], d.vehicle.with_wheel(solved.c[WHEELS]), solved.poses[-1], np.zeros((3, 3)),
-        model=model)
-    old, new = np.searchsorted(part.frame, frame[frame <= last]), frame[frame > last] - last
-    poses = np.concatenate([solved.poses[old], poses[new]])
-    return state_from_poses(
-        measurements, jumps.mended(frame, poses, last),
-        np.concatenate([np.zeros((len(old), 3, 3)), covariances[new]]),
-        measurements.calibration.taken_from(part.calibration, solved.c, stated), **landmarks)
+        poses, covariances = odometry.first_order(dataset.ticks, dataset.vehicle, model=model)
+        poses = jumps.mended(frame, poses[frame])
+        return state_from_poses(measurements, poses, covariances[frame], **landmarks)
+    last = part.frame[-1]
+    later, growth = odometry.first_order(
+        dataset.ticks[last:], dataset.vehicle.with_wheel(solved.c[WHEELS]), solved.poses[-1],
+        np.zeros((3, 3)), model=model)
+    old = np.searchsorted(part.frame, frame[frame <= last])
+    new = frame[frame > last] - last
+    poses = np.concatenate([solved.poses[old], later[new]])
+    covariances = np.concatenate([np.zeros((len(old), 3, 3)), growth[new]])
+    calibration = measurements.calibration
+    c = calibration.taken_from(part.calibration, solved.c, calibration.stated)
+    poses = jumps.mended(frame, poses, last)
+    return state_from_poses(measurements, poses, covariances, c, **landmarks)
 
 
-def consensus_markers(measurements, in_world, covariances):
+def consensus_markers(measurements: Measurements, in_world: np.ndarray,
+                      covariances: np.ndarray) -> np.ndarray:
     """(k, 3) poses of the markers, each by one of its sightings (`sightings.consensus`).
 
     `in_world` (s, 3) and `covariances` (s, 3, 3) are the marker poses by each sighting.
@@ -94,27 +114,32 @@ def consensus_markers(measurements, in_world, covariances):
     return in_world[consensus(measurements.marker_row, in_world, covariances, MAX_VOTES)]
 
 
-def trilaterated_antennas(measurements, poses, covariances, c):
+def trilaterated_antennas(measurements: Measurements, poses: np.ndarray, covariances: np.ndarray,
+                          c: np.ndarray) -> np.ndarray:
     """(a, 2) positions of the antennas, m, by the best minimum of their trilateration."""
     by_antenna = ranges_by_antenna(measurements, poses, covariances, c)
-    return np.reshape([trilaterate(ranges)[0][0] for ranges in by_antenna], (-1, 2))
+    return np.reshape([trilaterate(ranges).places[0] for ranges in by_antenna], (-1, 2))
 
 
-def state_from_poses(measurements, poses, covariances, c=None, markers=consensus_markers,
-                     antennas=trilaterated_antennas):
+def state_from_poses(measurements: Measurements, poses: np.ndarray, covariances: np.ndarray,
+                     c: np.ndarray | None = None, markers: Callable = consensus_markers,
+                     antennas: Callable = trilaterated_antennas) -> State:
     """The State with these poses of the frames, and landmarks by their measurements from there.
 
     Poses (f, 3) and covariances (f, 3, 3) are in world axes, c (p,) is the calibration, None
     as stated. The functions `markers` and `antennas` initialise the landmarks; studies pass others.
     """
-    s = measurements.sightings
     if c is None:
         c = measurements.calibration.stated.copy()
         c[SIGHTING_LAG] += measurements.jumps.lag
-    camera, z = sensor_poses(measurements, poses, c)[0], s.z * [c[SIZE], c[SIZE], 1]
-    in_world = se2.compose_uncertain(camera, covariances[s.row], z, s.C)
-    return state_from_arrays(measurements, poses, markers(measurements, *in_world),
-                             antennas(measurements, poses, covariances, c), c)
+    sightings = measurements.sightings
+    camera = sensor_poses(measurements, poses, c)[0]
+    z = sightings.z * [c[SIZE], c[SIZE], 1]
+    in_world, of_markers = se2.compose_uncertain(
+        camera, covariances[sightings.row], z, sightings.C)
+    return state_from_arrays(
+        measurements, poses, markers(measurements, in_world, of_markers),
+        antennas(measurements, poses, covariances, c), c)
 
 
 @dataclass(frozen=True)
@@ -126,70 +151,124 @@ class AntennaRanges:
     sigma: np.ndarray        # (m,) m, including that of the vehicle's position
     guess: np.ndarray        # (2,) m, guessed position of the antenna
 
+    def select(self, rows: np.ndarray) -> "AntennaRanges":
+        """Those of some rows, indices or a mask."""
+        return AntennaRanges(
+            self.positions[rows], self.distance[rows], self.sigma[rows], self.guess)
 
-def ranges_by_antenna(measurements, poses, covariances, c, factor=1.0):
-    """List of the AntennaRanges of every antenna, sigmas times `factor`; as `state_from_poses`."""
-    r, by_antenna = measurements.ranges, []
-    positions = sensor_poses(measurements, poses, c)[1][:, :2]
+    def errors(self, place: np.ndarray) -> np.ndarray:
+        """(m,) expected minus measured ranges, in sigmas, to an antenna at `place` (2,), m."""
+        expected = np.linalg.norm(place - self.positions, axis=1)
+        return (expected - self.distance) / self.sigma
+
+
+def ranges_by_antenna(measurements: Measurements, poses: np.ndarray, covariances: np.ndarray,
+                      c: np.ndarray, factor: float = 1.0) -> list[AntennaRanges]:
+    """The AntennaRanges of every antenna, sigmas times `factor`; as `state_from_poses`."""
+    r = measurements.ranges
+    tag = sensor_poses(measurements, poses, c)[1][:, :2]
     slant = (r.distance - c[OFFSET] - c[ANTENNAS][r.antenna]) / c[SCALE]
-    plane = np.sqrt(np.maximum(slant * np.abs(slant) - 2 * c[HEIGHT], 0)) \
-        if c[HEIGHT] else slant
-    sigma = factor * r.sigma / c[SCALE] * np.maximum(slant / np.maximum(plane, r.sigma), 1)
+    plane = slant
+    if c[HEIGHT]:
+        plane = np.sqrt(np.maximum(slant * np.abs(slant) - 2 * c[HEIGHT], 0))
+    steepness = np.maximum(slant / np.maximum(plane, r.sigma), 1)      # d plane / d slant
+    range_sigma = factor * r.sigma / c[SCALE] * steepness
     position_sigma = np.sqrt(np.trace(covariances[:, :2, :2], axis1=1, axis2=2) / 2)
+    sigma = np.hypot(range_sigma, position_sigma[r.row])
+    by_antenna = []
     for k, guess in enumerate(measurements.guess):
         rows = np.flatnonzero(r.antenna == k)
-        by_antenna.append(AntennaRanges(
-            positions[rows], plane[rows],
-            np.hypot(sigma[rows], position_sigma[r.row[rows]]), guess))
+        by_antenna.append(AntennaRanges(tag[rows], plane[rows], sigma[rows], guess))
     return by_antenna
 
 
-def trilaterate(ranges):
-    """Possible positions of an antenna with these AntennaRanges: minima of a Cauchy cost.
+class Trilateration(NamedTuple):
+    """Possible positions of an antenna, p minima of a cost, the best one first."""
 
-    The guess counts as two more measurements. The search starts there, and at START_DIRECTIONS
-    points of a circle about the centre of the path, with the median range as radius: three are on
-    both sides of any line through this centre.
+    places: np.ndarray       # (p, 2) m, with distances above SAME_PLACE
+    costs: np.ndarray        # (p,) negative log posterior, minus that of the first position
+    covariances: np.ndarray  # (p, 2, 2) m^2, about each position, from the curvature there
 
-    Returns
-    -------
-    places : (p, 2) m, with distances above SAME_PLACE, in the order of their costs.
-    costs : (p,) negative log posterior, minus that of the first position.
-    covariances : (p, 2, 2) m^2, of the position about each of them, from the curvature there.
+
+def trilaterate(ranges: AntennaRanges) -> Trilateration:
+    """The Trilateration of an antenna by its AntennaRanges: minima of a Cauchy cost.
+
+    The guess counts as two more measurements.
     """
-    guess, centre, radius = ranges.guess, ranges.positions.mean(0), np.median(ranges.distance)
-    angle = np.arange(START_DIRECTIONS) * 2 * np.pi / START_DIRECTIONS
-    circle = centre + radius * np.stack([np.cos(angle), np.sin(angle)], -1)
     used = np.unique(np.linspace(0, len(ranges.distance) - 1, MAX_RANGES).astype(int))
-    positions, distance, sigma = ranges.positions[used], ranges.distance[used], ranges.sigma[used]
+    some = ranges.select(used)
+    radius = np.median(ranges.distance)
+    starts = _starts(ranges.guess, ranges.positions.mean(axis=0), radius)
+    minima = sorted((_minimum(some, start) for start in starts), key=attrgetter("cost"))
+    distinct = []
+    for minimum in minima:
+        apart = [np.linalg.norm(minimum.x - other.x) for other in distinct]
+        if min(apart, default=np.inf) > SAME_PLACE * radius:
+            distinct.append(minimum)
+    prior = np.eye(2) / GUESS_PRIOR_SIGMA**2
+    by_place = [minimum.jac[:-2] for minimum in distinct]        # of the ranges, weighted
+    return Trilateration(
+        places=np.array([minimum.x for minimum in distinct]),
+        costs=np.array([minimum.cost - minima[0].cost for minimum in distinct]),
+        covariances=np.linalg.inv([J.T @ J + prior for J in by_place]))
 
+
+def _starts(guess, centre, radius):
+    """(1 + START_DIRECTIONS, 2) positions from which an antenna is searched, m.
+
+    The guess, and points of a circle about the centre of the path, with the median range as radius:
+    three are on both sides of any line through this centre.
+    """
+    angle = np.arange(START_DIRECTIONS) * 2 * np.pi / START_DIRECTIONS
+    direction = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    return np.vstack([guess, centre + radius * direction])
+
+
+def _minimum(ranges, start):
+    """The minimum next to a start (2,), of the Cauchy cost of AntennaRanges and their guess."""
     def errors(place):
-        return np.r_[(np.hypot(*(place - positions).T) - distance) / sigma,
-                     (place - guess) / GUESS_PRIOR_SIGMA]
+        return np.concatenate([ranges.errors(place), (place - ranges.guess) / GUESS_PRIOR_SIGMA])
 
     def derivatives(place):
-        difference = place - positions
-        slope = np.maximum(np.hypot(*difference.T), MIN_DISTANCE) * sigma
-        return np.r_[difference / slope[:, None], np.eye(2) / GUESS_PRIOR_SIGMA]
+        difference = place - ranges.positions
+        distance = np.maximum(np.linalg.norm(difference, axis=1), MIN_DISTANCE)
+        direction = difference / distance[:, None]
+        return np.concatenate([direction / ranges.sigma[:, None], np.eye(2) / GUESS_PRIOR_SIGMA])
 
-    minima = sorted((least_squares(errors, start, derivatives, loss="cauchy", f_scale=KERNEL_SCALE,
-                                   ftol=TOLERANCE, xtol=TOLERANCE)
-                     for start in (guess, *circle)), key=lambda each: each.cost)
-    distinct = []
-    for each in minima:
-        if all(np.hypot(*(each.x - other.x)) > SAME_PLACE * radius for other in distinct):
-            distinct.append(each)
-    return (np.array([each.x for each in distinct]),
-            np.array([each.cost - minima[0].cost for each in distinct]),
-            np.linalg.inv([each.jac[:-2].T @ each.jac[:-2] + np.eye(2) / GUESS_PRIOR_SIGMA**2
-                           for each in distinct]))
+    return least_squares(errors, start, derivatives, loss="cauchy", f_scale=KERNEL_SCALE,
+                         ftol=TOLERANCE, xtol=TOLERANCE)
 
 
-def second_moment(places, costs, covariances, estimate):
+def second_moment(places: np.ndarray, costs: np.ndarray, covariances: np.ndarray,
+                  estimate: np.ndarray) -> np.ndarray:
     """Second moment (2, 2), m^2, of an antenna's position about its estimate (2,).
 
-    From what `trilaterate` returns: a mixture of Gaussians, each with the mass of its minimum.
+    Of a Trilateration: a mixture of Gaussians, each with the mass of its minimum.
     """
     mass = np.exp(-costs) * np.sqrt(np.linalg.det(covariances))
     off = places - estimate
-    return np.tensordot(mass / mass.sum(), covariances + off[:, :, None] * off[:, None], 1)
+    about_estimate = covariances + off[:, :, None] * off[:, None]
+    return np.tensordot(mass / mass.sum(), about_estimate, 1)
+
+
+def other_antenna(ranges: AntennaRanges, estimate: np.ndarray, weight: np.ndarray) -> str | None:
+    """The reason to doubt an antenna if some of its ranges are to another place, or None.
+
+    Ranges of AntennaRanges with less than half of their weights (m,) contradict the estimate (2,),
+    m. Without line of sight all of them are too long, and fit no place. Those to another antenna
+    fit one other place, and many are too short; so do direct ones where a wall had the majority.
+    """
+    others = ranges.select(weight < 0.5)
+    if len(others.distance) < MIN_OTHERS:
+        return None
+    too_short = others.errors(estimate) > FITTING
+    if np.mean(too_short) < MIN_TOO_SHORT:
+        return None
+    place = trilaterate(others).places[0]
+    fitting = np.abs(others.errors(place)) < FITTING
+    count = np.count_nonzero(fitting)
+    if count < max(MIN_OTHERS, MIN_FITTING * len(fitting)):
+        return None
+    return (f"{count} of its {len(weight)} ranges fit another place, ({place[0]:.1f}, "
+            f"{place[1]:.1f}), as if two antennas had this id, or it was moved, or hidden by a "
+            "wall in a part of the drive")

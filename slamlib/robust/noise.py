@@ -8,13 +8,19 @@ Rue, Martino and Chopin, J. R. Stat. Soc. B 71(2), 2009), so that the covariance
 slip is uncertain.
 """
 
+import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
 from slamlib.core.increments import SLIP_FACTOR, TYPICAL_SLIP
-from slamlib.robust.linear import laplace_approximation
+from slamlib.core.vehicle import Vehicle
+from slamlib.robust.linear import NormalEquations, laplace_approximation
 from slamlib.robust.measurements import Noise, with_known
+
+log = logging.getLogger(__name__)
 
 MEDIAN = np.array([TYPICAL_SLIP, 1.0, 1.0])        # sqrt(m), 1, 1: of the prior
 PRIOR_SIGMA = np.log([SLIP_FACTOR, 2.0, 2.0])      # (3,) standard deviations of the logarithms
@@ -34,16 +40,16 @@ SINGULAR = -1e12             # log evidence of noise for which the equations are
 HIDDEN_RATIO = 2.0           # largest ratio of errors with memory to what residuals show of them
 
 
-def with_hidden_errors(noise, remember, vehicle):
+def with_hidden_errors(noise: Noise, remember: Sequence[bool], vehicle: Vehicle) -> Noise:
     """The Noise with larger factors for errors with memory, of which residuals show only a part.
 
     The factors of sightings and of ranges, where their errors `remember` (2,), are at least 1, but
     at most HIDDEN_RATIO times the learned ones. Those that a Vehicle gives stay.
     """
-    sightings, ranges = (
-        max(factor, min(1.0, HIDDEN_RATIO * factor)) if remembers else factor
-        for factor, remembers in zip(noise[1:], remember))
-    return with_known(Noise(noise.slip, sightings, ranges), vehicle)
+    learned = np.array([noise.sightings, noise.ranges])
+    enlarged = np.maximum(learned, np.minimum(1.0, HIDDEN_RATIO * learned))
+    factors = np.where(remember, enlarged, learned)
+    return with_known(Noise(noise.slip, *factors.tolist()), vehicle)
 
 
 @dataclass(frozen=True)
@@ -56,27 +62,38 @@ class NoisePosterior:
     points: tuple                # of (probability, Noise), over which estimates are averaged
 
 
-def learn_noise(equations):
+def learn_noise(equations: NormalEquations) -> NoisePosterior:
     """The NoisePosterior by NormalEquations near the solution, from the noise of their problem."""
-    noise, m = equations.problem.noise, equations.problem.measurements
-    free = np.flatnonzero(m.learned)
+    noise = equations.problem.noise
+    measurements = equations.problem.measurements
+    free = np.flatnonzero(measurements.learned)
 
     def log_posterior(logarithms):
-        _, evidence = laplace_approximation(equations, Noise(*np.exp(logarithms)))
-        prior = -((logarithms - np.log(MEDIAN)) / PRIOR_SIGMA)[free]**2 / 2
-        return max(evidence, SINGULAR) + np.sum(prior)
+        evidence = laplace_approximation(equations, _noise_of(logarithms))[1]
+        off = (logarithms - np.log(MEDIAN)) / PRIOR_SIGMA
+        return max(evidence, SINGULAR) - np.sum(off[free]**2) / 2
 
     start = np.log(noise)
     value = log_posterior(start)
     if value < SINGULAR / 2:                             # nothing can be learned
         return NoisePosterior(noise, np.zeros((3, 3)), SINGULAR, ((1.0, noise),))
-    smallest = 1 / np.sqrt(2 * np.maximum([3 * len(m.frame), *equations.counts()], 1))
-    mode, value, covariance = _mode(log_posterior, start, value, free, smallest[free])
-    return NoisePosterior(Noise(*np.exp(mode)), covariance, value,
-                          _points(log_posterior, mode, value, covariance))
+    sightings, ranges = equations.counts()
+    count = np.maximum([3 * len(measurements.frame), sightings, ranges], 1)
+    sigma = 1 / np.sqrt(2 * count)                       # of the logarithm of a scatter
+    mode, value, covariance = _mode(log_posterior, start, value, free, sigma[free])
+    learned = _noise_of(mode)
+    log.info("noise: slip %.3g mm after 1 m, factors %.3g of sightings and %.3g of ranges, "
+             "log posterior %.1f", 1e3 * learned.slip, learned.sightings, learned.ranges, value)
+    points = _points(log_posterior, mode, value, covariance)
+    return NoisePosterior(learned, covariance, value, points)
 
 
-def _mode(function, x, value, free, steps):
+def _noise_of(logarithms):
+    """The Noise with these logarithms (3,)."""
+    return Noise(*np.exp(logarithms))
+
+
+def _mode(log_density, x, value, free, steps):
     """Argument, value and covariance (3, 3) of the maximum of a log density, by Newton's method.
 
     From `x` (3,) with its `value`. Derivatives by the components `free` (p,) are differences over
@@ -88,33 +105,56 @@ def _mode(function, x, value, free, steps):
         """x with `step` (p,) added to the free components, within BOUNDS."""
         stepped = x.copy()
         stepped[free] += step
-        return np.clip(stepped, *BOUNDS)
+        return np.clip(stepped, BOUNDS[0], BOUNDS[1])
+
+    def density_at(step):
+        return log_density(moved(step))
 
     for _ in range(MAX_NEWTON_STEPS):
-        unit, pairs = np.diag(steps), np.triu_indices(len(free), 1)
-        offsets = np.concatenate([unit, -unit, unit[pairs[0]] + unit[pairs[1]]])
-        up, down, both = np.split(
-            np.array([function(moved(offset)) for offset in offsets]) - value,
-            [len(free), 2 * len(free)])
-        gradient, hessian = (up - down) / (2 * steps), np.diag((up + down) / steps**2)
-        mixed = (both - up[pairs[0]] - up[pairs[1]]) / (steps[pairs[0]] * steps[pairs[1]])
-        hessian[pairs] = hessian.T[pairs] = mixed
-        curvature, axes = np.linalg.eigh(-hessian)
-        covariance = axes / np.maximum(curvature, PRIOR_SIGMA.max()**-2) @ axes.T
+        gradient, hessian = _derivatives(density_at, value, steps)
+        covariance = _inverse_curvature(-hessian)
         sigma = np.clip(np.sqrt(np.diag(covariance)), MIN_DIFFERENCE, MAX_DIFFERENCE)
-        coarse, steps = (steps > 2 * sigma).any(), sigma
         step = covariance @ gradient
         step *= MAX_STEP / max(MAX_STEP, np.abs(step).max())
-        while (new := function(moved(step))) < value and np.abs(step / sigma).max() > SHORTEST_STEP:
+        new = density_at(step)
+        while new < value and np.abs(step / sigma).max() > SHORTEST_STEP:
             step = step / 2
+            new = density_at(step)
         gain = new - value
+        predicted = gradient @ step / 2
         if gain > 0:
-            x, value = moved(step), new
-        if min(gain, abs(gain - gradient @ step / 2)) < CONVERGED_GAIN and not coarse:
+            x = moved(step)
+            value = new
+        too_coarse = (steps > 2 * sigma).any()
+        if min(gain, abs(gain - predicted)) < CONVERGED_GAIN and not too_coarse:
             break
-    full = np.zeros((len(x), len(x)))
-    full[np.ix_(free, free)] = covariance
-    return x, value, full
+        steps = sigma
+    of_all = np.zeros((len(x), len(x)))
+    of_all[np.ix_(free, free)] = covariance
+    return x, value, of_all
+
+
+def _derivatives(density_at, value, steps):
+    """Gradient (p,) and Hessian (p, p) at 0, by differences over `steps` (p,).
+
+    `density_at` is a function of (p,) with this `value` at 0. A mixed derivative needs one point
+    more, at which both components step.
+    """
+    offsets = np.diag(steps)
+    up = np.array([density_at(offset) for offset in offsets]) - value
+    down = np.array([density_at(-offset) for offset in offsets]) - value
+    hessian = np.diag((up + down) / steps**2)
+    for i, j in combinations(range(len(steps)), 2):
+        both = density_at(offsets[i] + offsets[j]) - value
+        hessian[i, j] = (both - up[i] - up[j]) / (steps[i] * steps[j])
+        hessian[j, i] = hessian[i, j]
+    return (up - down) / (2 * steps), hessian
+
+
+def _inverse_curvature(curvature):
+    """Inverse (p, p) of a symmetric matrix, in no direction above the widest prior's variance."""
+    values, axes = np.linalg.eigh(curvature)
+    return axes / np.maximum(values, PRIOR_SIGMA.max()**-2) @ axes.T
 
 
 def _points(log_posterior, mode, value, covariance):
@@ -124,15 +164,18 @@ def _points(log_posterior, mode, value, covariance):
     `mode` (3,), with its `value`, and `covariance` (3, 3) are of the logarithms.
     """
     sigma = np.sqrt(covariance[0, 0])
-    direction = covariance[0] / (sigma or 1)     # (3,) for one sigma of log slip; 0 if it is known
-    if sigma < SINGLE_POINT_SIGMA:
-        remaining, offsets, weights = covariance, [0.0], np.ones(1)
-    else:
-        remaining, offsets = covariance - np.outer(direction, direction), POINT_OFFSETS
-        logs = np.array([log_posterior(mode + offset * direction) if offset else value
-                         for offset in offsets])
-        weights = np.exp(logs - logs.max())
+    if sigma < SINGLE_POINT_SIGMA:                       # 0 where the slip is known
+        return ((1.0, _noise_of(mode + np.diag(covariance))),)
+    direction = covariance[0] / sigma                    # (3,) for one sigma of log slip
+    log_density = np.full(len(POINT_OFFSETS), value)
+    for k in np.flatnonzero(POINT_OFFSETS):
+        log_density[k] = log_posterior(mode + POINT_OFFSETS[k] * direction)
+    weight = np.exp(log_density - log_density.max())
+    weight /= weight.sum()
+    remaining = covariance - np.outer(direction, direction)      # given the slip
     variance = np.maximum(np.diag(remaining), 0)
-    return tuple((float(weight), Noise(*np.exp(mode + offset * direction + variance)))
-                 for weight, offset in zip(weights / weights.sum(), offsets)
-                 if weight > MIN_POINT_WEIGHT)
+    points = []
+    for offset, probability in zip(POINT_OFFSETS, weight.tolist()):
+        if probability > MIN_POINT_WEIGHT:
+            points.append((probability, _noise_of(mode + offset * direction + variance)))
+    return tuple(points)
