@@ -15,7 +15,7 @@ from slamlib.core.records import Dataset, Truth
 from slamlib.core.sightings import sightings_by_frame
 from slamlib.robust.fit import refine
 from slamlib.robust.result import slam_result
-from slamlib.studies.simulation import simulate
+from slamlib.studies.simulation import distances, simulate
 
 PROBLEM2_METHODS = {
     "odometry": lambda dataset: odometry.dead_reckoning(dataset.ticks, dataset.vehicle),
@@ -84,9 +84,8 @@ def ranges_added(seed: int, share: float = 1.0, **options) -> dict:
         numbers[f"ate {name}"] = ate(found.poses, truth.poses)
         numbers[f"aligned {name}"] = ate(found.poses, truth.poses, aligned=True)
         numbers[f"sigma {name}"] = np.median(position_sigmas(found.covariances[1:]))
-    difference = added.poses[1:, :2] - without.poses[1:, :2]
-    distance = np.linalg.norm(difference, axis=1)
-    numbers["moved"] = np.median(distance / position_sigmas(without.covariances[1:]))
+    moved = distances(added.poses[1:], without.poses[1:])
+    numbers["moved"] = np.median(moved / position_sigmas(without.covariances[1:]))
     return numbers
 
 
@@ -138,7 +137,8 @@ def known_shares(measurements, correlation: float) -> np.ndarray:
 def antenna_error(found, truth: Truth) -> tuple[np.ndarray, np.ndarray]:
     """Distances (a,) in m of a SlamResult's antennas from the truth, and their NEES (a,)."""
     row = np.searchsorted(truth.antenna, found.antenna)
-    error = found.antenna_in_world - truth.antenna_in_world[row]
+    true = truth.antenna_in_world[row]
+    error = found.antenna_in_world - true
     information = np.linalg.inv(found.antenna_covariance)
     nees = np.einsum("ni,nij,nj->n", error, information, error)
-    return np.linalg.norm(error, axis=1), nees
+    return distances(found.antenna_in_world, true), nees

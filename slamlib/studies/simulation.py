@@ -25,9 +25,9 @@ from slamlib.core.vehicle import TABLE_2, Vehicle
 class Layout:
     """A closed path, a sum of rotating vectors, with its markers, antennas and rates."""
 
-    turns: tuple[int, ...]       # of each vector in one round
-    radii: tuple[float, ...]     # m, lengths of the vectors
-    phases: tuple[float, ...]    # rad
+    turns: tuple                 # of each vector in one round
+    radii: tuple                 # m, lengths of the vectors
+    phases: tuple                # rad
     poses: int                   # in one round
     aruco_every: int             # poses from one camera frame to the next
     marker_spacing: float        # m
@@ -98,16 +98,14 @@ def simulate(path: str = "short", seed: int = 0, *, slip: float = 1e-3, late_ran
 
     marker, marker_in_world = _place_markers(layout, poses, rng)
     antenna, antenna_in_world = _place_antennas(layout.antennas, poses, rng)
-    truth = Truth(poses=poses, marker=marker, marker_in_world=marker_in_world, antenna=antenna,
-                  antenna_in_world=antenna_in_world, vehicle=true_vehicle)
+    truth = Truth(poses, marker, marker_in_world, antenna, antenna_in_world, true_vehicle)
 
     aruco = _camera(truth, layout.aruco_every, mislabelled, memory, noise_scale, rng)
     uwb = _uwb(truth, layout.uwb_every, late_ranges, noise_scale, rng)
     guess_error = SIMULATED_GUESS_SIGMA * rng.standard_normal(antenna_in_world.shape)
     guess = AntennaGuess(antenna, antenna_in_world + noise_scale * guess_error)
-    dataset = Dataset(name=path, vehicle=vehicle, ticks=whole_counts if noise else counts,
-                      aruco=aruco, uwb=uwb, antenna_guess=guess)
-    return dataset, truth
+    ticks = whole_counts if noise else counts
+    return Dataset(path, vehicle, ticks, aruco, uwb, guess), truth
 
 
 def misguess(dataset: Dataset, position: np.ndarray, error: float, seed: int) -> Dataset:
@@ -151,8 +149,9 @@ def write_dataset(folder: str | Path, dataset: Dataset, truth: Truth | None = No
     require(empty or not folder.exists(), folder, "a new or empty folder to write the dataset to")
     folder.mkdir(parents=True, exist_ok=True)
     if dataset.vehicle != TABLE_2:
-        _write_vehicle(folder / "vehicle.toml", dataset.vehicle)
-    _write_table(folder / "encoderReading.txt", "%d %d %d", _numbers(dataset.ticks), dataset.ticks)
+        _write_vehicle(folder, dataset.vehicle)
+    number = np.arange(1, len(dataset.ticks) + 1)
+    _write_table(folder / "encoderReading.txt", "%d %d %d", number, dataset.ticks)
     aruco = dataset.aruco
     if aruco is not None:
         row, column = np.triu_indices(3)
@@ -166,22 +165,13 @@ def write_dataset(folder: str | Path, dataset: Dataset, truth: Truth | None = No
                      uwb.pose + 1, uwb.antenna, uwb.range, uwb.sigma)
         _write_table(folder / "UwbAntennaGuess.txt", "%d %.3f %.3f", guess.antenna, guess.position)
     if truth is not None:
-        _write_truth(folder / "truth", truth)
-
-
-def _write_truth(folder, truth):
-    """Write a Truth to a new folder."""
-    folder.mkdir()
-    _write_vehicle(folder / "vehicle.toml", truth.vehicle)
-    pose = "%d %.6f %.6f %.6f"
-    _write_table(folder / "vehiclePose.txt", pose, _numbers(truth.poses), truth.poses)
-    _write_table(folder / "ArucoMap.txt", pose, truth.marker, truth.marker_in_world)
-    _write_table(folder / "UwbMap.txt", "%d %.6f %.6f", truth.antenna, truth.antenna_in_world)
-
-
-def _numbers(rows):
-    """Numbers (n,) from 1 on of the rows of an array."""
-    return np.arange(1, len(rows) + 1)
+        folder = folder / "truth"
+        folder.mkdir()
+        _write_vehicle(folder, truth.vehicle)
+        pose = "%d %.6f %.6f %.6f"
+        _write_table(folder / "vehiclePose.txt", pose, number, truth.poses)
+        _write_table(folder / "ArucoMap.txt", pose, truth.marker, truth.marker_in_world)
+        _write_table(folder / "UwbMap.txt", "%d %.6f %.6f", truth.antenna, truth.antenna_in_world)
 
 
 def _write_table(path, row_format, *columns):
@@ -190,15 +180,15 @@ def _write_table(path, row_format, *columns):
         np.savetxt(file, np.column_stack(columns), fmt=row_format)
 
 
-def _write_vehicle(path, vehicle):
-    """Write the eight entries of the wheels, and of all others those that differ from table 2."""
+def _write_vehicle(folder, vehicle):
+    """Write vehicle.toml: eight entries of the wheels, and others where they are not of table 2."""
     entries = vars(vehicle)
     of_wheels = list(entries)[:8]
     text = ""
     for name, value in entries.items():
         if name in of_wheels or value != getattr(TABLE_2, name):
             text += f"{name} = {json.dumps(value)}\n"
-    path.write_text(text, encoding="utf-8", newline="\n")
+    (folder / "vehicle.toml").write_text(text, encoding="utf-8", newline="\n")
 
 
 def _driven_arcs(layout, rounds):
@@ -260,9 +250,9 @@ def _place_markers(layout, poses, rng):
     place = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     place += spacing * rng.uniform(-0.35, 0.35, place.shape)
 
-    visible = [_distance(path[::10], each).min() < CAMERA_REACH for each in place]
+    visible = [distances(path[::10], each).min() < CAMERA_REACH for each in place]
     gap = path[int(layout.gap_place * len(path))]
-    outside_gap = _distance(place, gap) > layout.gap_radius
+    outside_gap = distances(place, gap) > layout.gap_radius
     place = place[visible & outside_gap]
 
     count = len(place)
@@ -332,7 +322,7 @@ def _relabelled(label, count, fraction, rng):
 def _uwb(truth, every, late_ranges, noise_scale, rng):
     """Ranges to all antennas within UWB_REACH of every `every`-th pose, some of them late."""
     frames = np.arange(every // 2, len(truth.poses), every)
-    distance = _distance(truth.poses[frames, None, :2], truth.antenna_in_world)
+    distance = distances(truth.poses[frames, None], truth.antenna_in_world)
     frame, antenna = np.nonzero(distance < UWB_REACH)
     true_range = distance[frame, antenna]
     count = len(true_range)
@@ -344,9 +334,9 @@ def _uwb(truth, every, late_ranges, noise_scale, rng):
     return UwbReadings(frames[frame], truth.antenna[antenna], measured, sigma)
 
 
-def _distance(first, second):
-    """Distances (...) between points (..., 2)."""
-    offset = first - second
+def distances(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Distances (...) in the plane between points or poses (..., >= 2)."""
+    offset = first[..., :2] - second[..., :2]
     return np.hypot(offset[..., 0], offset[..., 1])
 
 

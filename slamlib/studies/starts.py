@@ -18,7 +18,7 @@ from slamlib.robust.optimize import optimize
 from slamlib.robust.result import slam_result
 from slamlib.studies.kernels import measure_with_known_noise, rounds, solve_with
 from slamlib.studies.montecarlo import antenna_error, drive
-from slamlib.studies.simulation import misguess
+from slamlib.studies.simulation import distances, misguess
 
 MAX_ANTENNA_ERROR = 0.5      # m, error below which an antenna is right
 MAX_MARKER_ERROR = 0.1       # m, distance from the right optimum above which a marker is off
@@ -126,11 +126,11 @@ def _from_each_start(problem, right, kernel, starts):
     numbers = {}
     for name in starts:
         state = odometry_state(m, problem.odometry.model, markers=LANDMARKS[name])
-        initial_error = _distances(state.markers, best.state.markers)
+        initial_error = distances(state.markers, best.state.markers)
         if kernel == "graduated":
             state = narrow_kernels(problem, state, CAUCHY_SCALES[:-1])
         end = optimize(last, state)
-        error = _distances(end.state.markers, best.state.markers)
+        error = distances(end.state.markers, best.state.markers)
         cost = end.equations.error
         numbers[f"{name} cost"] = cost
         numbers[f"{name} off"] = np.mean(error > MAX_MARKER_ERROR)
@@ -157,7 +157,7 @@ def guesses(seed: int, error: float, markers: bool = True, **options) -> dict:
     measurements = measure_with_known_noise(dataset)
     fit = solve_with(measurements, rounds(measurements))
     from_guess = solve_with(measurements, rounds(measurements, guessed_antennas))
-    guess_error = _distances(from_guess.state.antennas, truth.antenna_in_world)
+    guess_error = distances(from_guess.state.antennas, truth.antenna_in_world)
     found = slam_result(fit)
     distance, nees = antenna_error(found, truth)
     right = distance < MAX_ANTENNA_ERROR
@@ -166,8 +166,3 @@ def guesses(seed: int, error: float, markers: bool = True, **options) -> dict:
     return {"right": right.mean(), "in doubt": in_doubt.mean(),
             "silently wrong": silently_wrong.mean(),
             "from the guess": np.mean(guess_error < MAX_ANTENNA_ERROR)}
-
-
-def _distances(first, second):
-    """Distances (k,) in m between places (k, >= 2)."""
-    return np.linalg.norm((first - second)[:, :2], axis=1)
