@@ -40,7 +40,8 @@ def whole_map(drive, result) -> Figure:
     if guess is not None:
         guess = plotting.places_by_id(guess.antenna, guess.position, result.antenna)
         shown.append(guess)
-    extent = _extent(np.concatenate(shown))
+    shown = np.concatenate(shown)
+    extent = np.maximum(np.nanmax(shown, axis=0) - np.nanmin(shown, axis=0), 0.1)
     height = np.clip((MAP_WIDTH - 0.7) * extent[1] / extent[0], MIN_HEIGHT, MAX_HEIGHT)
     fig, axes = plotting.panels(1, width=MAP_WIDTH, height=height + 1.1)
     ax = axes[0, 0]
@@ -54,9 +55,8 @@ def whole_map(drive, result) -> Figure:
         _draw_headings(ax, result, TICK_LENGTH * extent.max())
         plotting.draw_markers(ax, result.marker_in_world, result.marker_covariance, enlarged)
         if truth is not None and len(truth.marker):
-            x, y, _ = truth.marker_in_world.T
-            ax.plot(x, y, "+", color="black", markersize=4.5, markeredgewidth=0.6, zorder=5,
-                    label="markers: truth")
+            ax.plot(truth.marker_in_world[:, 0], truth.marker_in_world[:, 1], "+", color="black",
+                    markersize=4.5, markeredgewidth=0.6, zorder=5, label="markers: truth")
     if len(result.antenna):
         true_antennas = None if truth is None else truth.antenna_in_world
         plotting.draw_antennas(ax, result.antenna_in_world, result.antenna_covariance, guess,
@@ -68,12 +68,6 @@ def whole_map(drive, result) -> Figure:
     plotting.legend_below(fig)
     _name_landmarks(ax, result, in_doubt, enlarged)
     return fig
-
-
-def _extent(places):
-    """Width and height in m of places (m, 2), at least 0.1 m."""
-    size = np.nanmax(places, axis=0) - np.nanmin(places, axis=0)
-    return np.maximum(size, 0.1)
 
 
 def _draw_vehicle(ax, result, enlarged):
@@ -146,7 +140,8 @@ def _covering_cost(corners, taken, covered, weight, frame):
     That is other names at `taken` (n, 2, 2), NaN where there is none, points `covered` (m, 2) of
     this weight (m,), and what is around the frame of the axes.
     """
-    low, high = corners[:, 0], corners[:, 1]
+    low = corners[:, 0]
+    high = corners[:, 1]
     on_names = (low[:, None] < taken[:, 1]) & (high[:, None] > taken[:, 0])
     on_points = (covered > low[:, None]) & (covered < high[:, None])
     outside = (low < frame.min) | (high > frame.max)

@@ -8,7 +8,7 @@ planar Gaussian with probability 1 - exp(-k^2 / 2), so that 95 % needs k = 2.447
 """
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -31,29 +31,36 @@ class _Roles(dict):
         raise ValueError(f"expected a role, one of {', '.join(self)}; found {role!r}")
 
 
+def _line(color, width, dashes=None, zorder=3):
+    """The look of a path; `dashes` are the lengths of strokes and gaps in line widths."""
+    style = (0, dashes) if dashes else "-"
+    return {"color": color, "linewidth": width, "linestyle": style, "zorder": zorder}
+
+
+def _sign(color, marker, size, zorder):
+    """The look of landmarks."""
+    return {"color": color, "linestyle": "none", "marker": marker, "markersize": size,
+            "zorder": zorder}
+
+
 # Colours of Okabe and Ito and of Tol, distinct for the colour-blind; line styles differ in grey.
 ROLES = _Roles({
-    "truth": {"color": "black", "linestyle": (0, (4, 2)), "linewidth": 1.1, "zorder": 4},
-    "odometry": {"color": "#D55E00", "linewidth": 1.5, "zorder": 3},
-    "exact": {"color": "#332288", "linewidth": 1.5, "zorder": 3},
-    "sample": {"color": "#999999", "linewidth": 1.0, "zorder": 1},
-    "aruco": {"color": "#CC79A7", "linestyle": (0, (1.2, 0.8)), "linewidth": 1.7, "zorder": 3},
-    "fused": {"color": "#009E73", "linestyle": (0, (4.5, 1.6)), "linewidth": 1.8, "zorder": 3},
-    "hint": {"color": "#E69F00", "linestyle": (0, (5, 1, 1, 1)), "linewidth": 1.5, "zorder": 3},
-    "marker": {"color": "#333333", "linestyle": "none", "marker": "s", "markersize": 3,
-               "zorder": 3},
-    "slam": {"color": "#0072B2", "linewidth": 2.0, "zorder": 3},
-    "slam_uwb": {"color": "#56B4E9", "linestyle": (0, (6, 1.5)), "linewidth": 2.2, "zorder": 3.2},
-    "arc": {"color": "#333333", "linewidth": 1.7, "zorder": 3},
-    "euler": {"color": "#888888", "linestyle": (0, (3, 1.5)), "linewidth": 1.7, "zorder": 3},
-    "alternative": {"color": "#882255", "linestyle": (0, (5, 1, 1, 1)), "linewidth": 1.5,
-                    "zorder": 3},
-    "antenna": {"color": "#222222", "linestyle": "none", "marker": "^", "markersize": 6,
-                "zorder": 5},
-    "guess": {"color": "#222222", "linestyle": "none", "marker": "^", "markersize": 7, "zorder": 4,
-              "markerfacecolor": "none"},
-    "true antenna": {"color": "black", "linestyle": "none", "marker": "+", "markersize": 9,
-                     "zorder": 6},
+    "truth": _line("black", 1.1, (4, 2), zorder=4),
+    "odometry": _line("#D55E00", 1.5),
+    "exact": _line("#332288", 1.5),
+    "sample": _line("#999999", 1.0, zorder=1),
+    "aruco": _line("#CC79A7", 1.7, (1.2, 0.8)),
+    "fused": _line("#009E73", 1.8, (4.5, 1.6)),
+    "hint": _line("#E69F00", 1.5, (5, 1, 1, 1)),
+    "marker": _sign("#333333", "s", 3, zorder=3),
+    "slam": _line("#0072B2", 2.0),
+    "slam_uwb": _line("#56B4E9", 2.2, (6, 1.5), zorder=3.2),
+    "arc": _line("#333333", 1.7),
+    "euler": _line("#888888", 1.7, (3, 1.5)),
+    "alternative": _line("#882255", 1.5, (5, 1, 1, 1)),
+    "antenna": _sign("#222222", "^", 6, zorder=5),
+    "guess": _sign("#222222", "^", 7, zorder=4) | {"markerfacecolor": "none"},
+    "true antenna": _sign("black", "+", 9, zorder=6),
 })
 STYLE = Path(__file__).with_name("slamlib.mplstyle")  # for matplotlib.style
 MAX_SEMI_AXIS = 0.08         # of enlarged 95 % ellipses, in the larger extent of the path
@@ -92,7 +99,7 @@ def each_drive(drives: Iterable, rows: int = 1, **size) -> Iterator[tuple]:
     """
     drives = list(drives)
     fig, axes = panels(max(1, len(drives)), rows, **size)
-    for drive, column in zip(drives, axes, strict=False):
+    for drive, column in zip(drives, axes):
         column[0].set_title(getattr(drive, "name", drive))
         yield drive, column if rows > 1 else column[0]
     if any(ax.get_legend_handles_labels()[0] for ax in fig.axes):
@@ -100,7 +107,7 @@ def each_drive(drives: Iterable, rows: int = 1, **size) -> Iterator[tuple]:
 
 
 def estimates(result, drive) -> Estimates:
-    """Indices (m,), poses (m, 3), covariances (m, 3, 3) and true poses of what is estimated.
+    """The Estimates of a Drive: the poses that a result has, and the truth of these poses.
 
     `result` is (poses, covariances), or has these attributes: a Solution, Localization, Fusion or
     SlamResult. The truth, None where the Drive has none, is in the world frame of the result.
@@ -141,8 +148,8 @@ def with_ellipses(ax: Axes, poses: np.ndarray, covariances: np.ndarray, role: st
     return ax
 
 
-def errors(axes: Iterable[Axes], result, drive, role: str = "slam",
-           label: str | None = None) -> Iterable[Axes]:
+def errors(axes: Sequence[Axes], result, drive, role: str = "slam",
+           label: str | None = None) -> Sequence[Axes]:
     """Draw errors of a result along the path in two axes: of position, and of the heading.
 
     The bands are the longest semi-axis of the 95 % ellipse and ±2 sigma of the heading; without
@@ -275,7 +282,7 @@ def equidistant(poses: np.ndarray, count: int = 14) -> np.ndarray:
     return known[np.unique(np.minimum(row, len(known) - 1))]
 
 
-def name_rows(axes: Iterable[Axes], names: Iterable[str]) -> None:
+def name_rows(axes: Sequence[Axes], names: Sequence[str]) -> None:
     """Set the labels of the vertical axes of one panel; the last axes show the pose id."""
     for ax, name in zip(axes, names, strict=True):
         ax.set(ylabel=name, xlabel=None)
@@ -287,7 +294,7 @@ def legend_below(fig: Figure) -> None:
     entries = {}
     for ax in fig.axes:
         handles, labels = ax.get_legend_handles_labels()
-        for handle, label in zip(handles, labels, strict=True):
+        for handle, label in zip(handles, labels):
             entries.setdefault(label, handle)
     for most in (4, 3, 2, 1):
         fig.legends.clear()
@@ -318,7 +325,7 @@ def slam_graph(ax: Axes, poses: int, sightings: list[tuple[int, int]]) -> Axes:
     wheels = np.array([poses / 2 - 0.5, -0.8])
     ids = sorted({marker for _, marker in sightings})
     across = np.linspace(-0.7, poses - 0.3, len(ids) + 2)[1:-1]
-    markers = {marker: np.array([x, 1.3]) for marker, x in zip(ids, across, strict=True)}
+    markers = {marker: np.array([x, 1.3]) for marker, x in zip(ids, across)}
 
     for i, marker in sightings:
         middle = 0.6 * path[i] + 0.4 * markers[marker]           # no squares at crossings

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterable, Iterator
+from itertools import pairwise
 
 import numpy as np
 from IPython.display import Markdown
@@ -29,17 +30,17 @@ def table(rows: Iterable[dict], caption: str | None = None) -> Markdown:
     are left out. Of consecutive rows with the same first cell only the first shows it. `caption`
     (str) stands below.
     """
-    rules, columns = [], []
-    texts = _columns(rows)
-    for column in texts.values():
-        numeric = all(map(NUMERIC.match, column))
-        if numeric:
-            column = [MINUS.sub("−", text) for text in column]
+    columns = _columns(rows)
+    rules = []
+    for name, texts in columns.items():
+        numeric = all(map(NUMERIC.match, texts))
         rules.append("---:" if numeric else "---")
-        columns.append(column)
-    if len(columns) > 1:
-        columns[0] = _without_repeats(columns[0])
-    lines = [texts, rules, *zip(*columns)]
+        if numeric:
+            columns[name] = [MINUS.sub("−", text) for text in texts]
+    first, *others = columns.values()
+    if others:
+        first = ["" if text == above else text for above, text in pairwise([None, *first])]
+    lines = [columns, rules, *zip(first, *others)]
     text = "\n".join("| " + " | ".join(line) + " |" for line in lines)
     return Markdown(f"{text}\n\n{caption}" if caption else text)
 
@@ -54,11 +55,6 @@ def _columns(rows):
         if set(column) != {DASH}:
             columns[name] = column
     return columns or {DASH: [DASH]}
-
-
-def _without_repeats(texts):
-    """The texts (list of str) with nothing in place of those that equal the one before."""
-    return ["" if text == before else text for before, text in zip([None, *texts], texts)]
 
 
 def cell(value) -> str:
@@ -96,11 +92,11 @@ def _decimals(value, digits, at_most):
 def _over_drives(values):
     """Mean ± standard error and median of values (s,), one a drive."""
     error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else 0.0
-    mean, median = values.mean(), np.median(values)
-    if not error > 0:
-        return f"{number(mean)} ({number(median)})"
-    decimals = _decimals(error, 2, at_most=3)
-    return f"{number(mean, decimals)} ± {number(error, decimals)} ({number(median, decimals)})"
+    decimals = _decimals(error, 2, at_most=3) if error > 0 else None
+    text = number(values.mean(), decimals)
+    if error > 0:
+        text += f" ± {number(error, decimals)}"
+    return f"{text} ({number(np.median(values), decimals)})"
 
 
 def dataset_row(drive) -> dict:
@@ -121,7 +117,7 @@ def vehicle_row(drive) -> dict:
     vehicle = drive.dataset.vehicle
     row = {"dataset": drive.name}
     names = ("$R_R$ (m)", "$R_L$ (m)", "$b$ (m)")
-    for name, mean, sigma in zip(names, vehicle.wheel, vehicle.sigma_wheel, strict=True):
+    for name, mean, sigma in zip(names, vehicle.wheel, vehicle.sigma_wheel):
         row[name] = f"{mean:g} ± {sigma:g}"
     row["$n_0$"] = f"{vehicle.ticks_per_revolution:g}"
     row[r"$\sigma_\delta$ (rad)"] = f"{vehicle.sigma_heading:g}"
@@ -143,8 +139,9 @@ def accuracy(result, drive) -> dict:
         nees = nees[np.isfinite(nees)]
         row["ATE (mm)"] = 1e3 * evaluation.ate(found.poses, found.true)
         row["aligned (mm)"] = 1e3 * evaluation.ate(found.poses, found.true, aligned=True)
-        row["NEES, mean"] = nees.mean() if len(nees) else None
-        row["NEES, median"] = np.median(nees) if len(nees) else None
+        if len(nees):
+            row["NEES, mean"] = nees.mean()
+            row["NEES, median"] = np.median(nees)
     return row
 
 
@@ -178,11 +175,8 @@ def calibration_rows(result, drive) -> Iterator[dict]:
     row; offsets of single antennas, which are stated as zero, have one where they are estimated.
     The last one is the factor on the standard deviations of the ranges.
     """
-    entries = result.calibration_table
     has_ranges = len(result.antenna) > 0
-    if not has_ranges:
-        entries = entries[:RANGES.start]
-    for entry in entries:
+    for entry in result.calibration_table[:None if has_ranges else RANGES.start]:
         true = None
         if entry["group"] == "wheel-parameters" and drive.origin == "simulated":
             true = getattr(drive.truth.vehicle, entry["name"])
@@ -232,22 +226,25 @@ def antenna_rows(result, drive) -> Iterator[dict]:
     ids = result.antenna
     if not len(ids):
         return
-    dataset, truth = drive.dataset, drive.truth
-    guess = places_by_id(dataset.antenna_guess.antenna, dataset.antenna_guess.position, ids)
+    uwb = drive.dataset.uwb
+    truth = drive.truth
+    guess = drive.dataset.antenna_guess
+    guess = places_by_id(guess.antenna, guess.position, ids)
     true = np.full_like(guess, np.nan)
     if truth is not None:
         true = places_by_id(truth.antenna, truth.antenna_in_world, ids)
     for k, antenna in enumerate(ids.tolist()):
-        place, C = result.antenna_in_world[k], result.antenna_covariance[k]
-        sigma_x, sigma_y = evaluation.sigmas(C)
+        place = result.antenna_in_world[k]
+        C = result.antenna_covariance[k]
+        sigma = 1e3 * evaluation.sigmas(C)
         error = place - true[k]
-        own = dataset.uwb.antenna == antenna
+        own = uwb.antenna == antenna
         weight = result.range_weight[own]
-        shift = _shift_by_range_offset(result.poses, dataset.uwb.select(own), weight, place)
+        shift = _shift_by_range_offset(result.poses, uwb.select(own), weight, place)
         yield {"dataset": drive.name,
                "antenna": f"{antenna}?" if antenna in result.doubts else f"{antenna}",
                "x (m)": f"{place[0]:.3f}", "y (m)": f"{place[1]:.3f}",
-               "σ of x (mm)": 1e3 * sigma_x, "σ of y (mm)": 1e3 * sigma_y,
+               "σ of x (mm)": sigma[0], "σ of y (mm)": sigma[1],
                "from the guess (mm)": 1e3 * np.linalg.norm(place - guess[k]),
                "error (mm)": 1e3 * np.linalg.norm(error),
                "d²": error @ np.linalg.solve(C, error),

@@ -43,10 +43,9 @@ def run(trial: Callable, seeds: Iterable[int], **options) -> pd.DataFrame:
     if name.startswith(f"{__package__}.") and code_digest() == CODE_DIGEST:    # not edited since
         folder = os.environ.get("SLAMLIB_STUDIES")
     memory = Memory(folder, verbose=0, compress=True)
-    recalled = memory.cache(_rows, ignore=["trial"])
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Exception while loading results")    # computed again
-        rows = recalled(trial, name, seeds, options, CODE_DIGEST)
+        rows = memory.cache(_rows, ignore=["trial"])(trial, name, seeds, options, CODE_DIGEST)
     memory.reduce_size(items_limit=KEPT)
     return pd.DataFrame(rows, index=pd.Index(seeds, name="seed"))
 
@@ -72,13 +71,9 @@ def code_digest() -> str:
 
 def modules(*without: str) -> list[Path]:
     """Paths of slamlib's modules and styles, except __main__ and the packages `without` (str)."""
-    found = []
-    for file in sorted(SLAMLIB.rglob("*")):
-        package = file.relative_to(SLAMLIB).parts[0]
-        is_code = file.suffix in (".py", ".mplstyle") and file.name != "__main__.py"
-        if is_code and package not in without:
-            found.append(file)
-    return found
+    return sorted(file for file in SLAMLIB.rglob("*")
+                  if file.suffix in (".py", ".mplstyle") and file.name != "__main__.py"
+                  and file.relative_to(SLAMLIB).parts[0] not in without)
 
 
 def digest(content: bytes) -> str:

@@ -81,10 +81,10 @@ def simulate(path: str = "short", seed: int = 0, *, slip: float = 1e-3, late_ran
     >>> dataset.ticks.shape, truth.poses.shape
     ((2000, 2), (2000, 3))
     """
-    shares_allowed = all(0 <= share <= 1 for share in (slip, late_ranges, mislabelled))
-    require(path in PATHS and seed >= 0 and rounds >= 1 and shares_allowed,
-            "simulate", f"one of the paths {', '.join(PATHS)}, a seed from 0 on, rounds from 1 on, "
-            "slip and shares from 0 to 1")
+    shares_hold = all(0 <= share <= 1 for share in (slip, late_ranges, mislabelled))
+    require(path in PATHS and seed >= 0 and rounds >= 1 and shares_hold, "simulate",
+            f"one of the paths {', '.join(PATHS)}, a seed from 0 on, rounds from 1 on, slip and "
+            "shares from 0 to 1")
     layout = PATHS[path]
     rng = np.random.default_rng(seed)
     noise_scale = 1.0 if noise else 0.0
@@ -133,7 +133,7 @@ def manoeuvre(legs: list[tuple[float, float]], vehicle: Vehicle = TABLE_2) -> np
     step is at most 1 cm long, or turns a wheel by as much about the middle. Row 0 is zero.
     """
     legs = np.asarray(legs, dtype=float)
-    travel = np.abs(legs * [1, vehicle.wheelbase / 2])         # m, of the middle, by the turn
+    travel = np.abs(legs * [1, vehicle.wheelbase / 2])     # m, of the middle; of a wheel about it
     steps = np.ceil(travel.max(axis=1) / 0.01).astype(int)
     arcs = np.repeat(legs / steps[:, None], steps, axis=0)
     return _counts(arcs[:, 0], arcs[:, 1], vehicle)
@@ -197,9 +197,7 @@ def _driven_arcs(layout, rounds):
     With s the angle that parametrises a round, the path is the sum of r exp(i (t s + p)) over the
     vectors with turns t, radii r and phases p.
     """
-    turns = np.array(layout.turns)[:, None]
-    radii = np.array(layout.radii)[:, None]
-    phases = np.array(layout.phases)[:, None]
+    turns, radii, phases = np.array([layout.turns, layout.radii, layout.phases])[:, :, None]
     amplitudes = 1j * radii * turns
 
     def velocity(s):

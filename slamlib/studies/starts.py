@@ -1,6 +1,5 @@
 """Comparison of start values of the markers and the antennas in the SLAM graph."""
 
-from collections.abc import Iterable
 from dataclasses import replace
 
 import gtsam
@@ -28,8 +27,12 @@ COST_TOLERANCE = 1.0         # cost above that of the right optimum: a residual 
 def first_sighting(measurements: Measurements, in_world: np.ndarray,
                    covariances: np.ndarray) -> np.ndarray:
     """(k, 3) markers at their first sightings; parameters as of `consensus_markers`."""
-    _, first = np.unique(measurements.marker_row, return_index=True)
-    return in_world[first]
+    return in_world[_first_rows(measurements.marker_row)]
+
+
+def _first_rows(labels):
+    """Row at which each label occurs first, in ascending order of the labels."""
+    return np.unique(labels, return_index=True)[1]
 
 
 def mean_by_information(measurements: Measurements, in_world: np.ndarray,
@@ -40,10 +43,8 @@ def mean_by_information(measurements: Measurements, in_world: np.ndarray,
     """
     marker = measurements.marker_row
     count = len(measurements.marker)
-    _, log_determinant = np.linalg.slogdet(covariances)
-    by_certainty = np.lexsort((log_determinant, marker))
-    _, first = np.unique(marker[by_certainty], return_index=True)
-    most_certain = in_world[by_certainty[first]]
+    by_certainty = np.lexsort((np.linalg.slogdet(covariances).logabsdet, marker))
+    most_certain = in_world[by_certainty[_first_rows(marker[by_certainty])]]
     difference = se2.difference(in_world, most_certain[marker])
     information = np.linalg.inv(covariances)
     weighted = (information @ difference[..., None])[..., 0]
@@ -80,7 +81,7 @@ def guessed_antennas(measurements: Measurements, poses: np.ndarray, covariances:
     return measurements.guess
 
 
-def landmarks(seed: int, kernel: str = "graduated", starts: Iterable[str] = tuple(LANDMARKS),
+def landmarks(seed: int, kernel: str = "graduated", starts: tuple = tuple(LANDMARKS),
               **options) -> dict:
     """LANDMARKS, starts of the markers, on one `drive` with the typical slip known.
 
@@ -105,7 +106,7 @@ def landmarks(seed: int, kernel: str = "graduated", starts: Iterable[str] = tupl
 
 
 def landmarks_of_drive(dataset: Dataset, found, kernel: str = "last",
-                       starts: Iterable[str] = tuple(LANDMARKS)) -> dict:
+                       starts: tuple = tuple(LANDMARKS)) -> dict:
     """The numbers of `landmarks` on a Dataset, given the SlamResult `found` of problem 3.
 
     Model and noise are those of the result, which replaces the truth.
