@@ -75,9 +75,8 @@ def compare(seed: int, kind: str, methods: tuple, markers: bool = True, **option
             numbers[f"{method} antenna error"] = np.sqrt(np.mean(error**2))
             numbers[f"{method} antenna nees"] = nees.mean()
         else:
-            residual, _ = residuals(fit.problem, fit.state)
-            size = np.linalg.norm(residual, axis=1)
-            lost = fit.problem.accepted.sightings.kept(size) < 0.5
+            distance = _mahalanobis(fit.problem, fit.state)
+            lost = fit.problem.accepted.sightings.kept(distance) < 0.5
             numbers[f"{method} wrong rejected"] = lost[wrong].mean() if wrong.any() else np.nan
             numbers[f"{method} good lost"] = lost[~wrong].mean()
     return numbers
@@ -95,5 +94,10 @@ def mislabelled(measurements: Measurements, truth: Truth) -> np.ndarray:
     markers[known] = truth.marker_in_world[row]
     antennas = np.zeros((len(m.antenna), 2))
     state = state_from_arrays(m, truth.poses[m.frame], markers, antennas, m.calibration.stated)
-    residual, _ = residuals(build_problem(m, "arc"), state)
-    return np.sum(residual**2, axis=1) > MIN_MISLABELLED_SQUARED
+    return _mahalanobis(build_problem(m, "arc"), state)**2 > MIN_MISLABELLED_SQUARED
+
+
+def _mahalanobis(problem, state):
+    """Distances (s,) of the sightings from those of a State, in their standard deviations."""
+    of_sightings, _ = residuals(problem, state)
+    return np.linalg.norm(of_sightings, axis=1)
