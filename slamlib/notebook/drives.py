@@ -8,6 +8,7 @@ to hand in and nothing else, and a cached notebook keeps its records.
 import os
 import re
 import unicodedata
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field
 from itertools import product
 from pathlib import Path
@@ -40,7 +41,7 @@ class Drive:
     made_up: bool = False  # True for a simulated drive that replaces datasets without a sensor
 
     @property
-    def origin(self):
+    def origin(self) -> str:
         """Origin of the data, a str; only simulations have other true wheel parameters."""
         if self.truth is None:
             return "recorded"
@@ -48,7 +49,7 @@ class Drive:
         return "recorded, truth known" if same else "simulated"
 
 
-def start(sensor=None):
+def start(sensor: str | None = None) -> list[Drive]:
     """List of the drives with a sensor, "aruco" or "uwb", the one with the fewest poses first.
 
     A simulated drive replaces them if there is none. The environment variable SLAMLIB_DATA names
@@ -62,19 +63,22 @@ def start(sensor=None):
     selected = os.environ.get("SLAMLIB_DATASETS")
     names, _ = datasets_in(data, selected.split("\n") if selected else None)
     drives = [Drive(name, read_dataset(data / name), read_truth(data / name)) for name in names]
-    return _or_simulated([drive for drive in sorted(drives, key=lambda d: len(d.dataset.ticks))
-                          if not sensor or getattr(drive.dataset, sensor) is not None])
+    if sensor:
+        drives = [drive for drive in drives if getattr(drive.dataset, sensor) is not None]
+    return _or_simulated(sorted(drives, key=lambda drive: len(drive.dataset.ticks)))
 
 
 def _or_simulated(drives):
     """The drives, or a simulated short one and a notice if there is none."""
-    if not drives:
-        display(Markdown("*No dataset is left for this chapter: it runs on a simulated drive "
-                         "instead and writes no results.*"))
-    return drives or [Drive("simulated", *simulate("short", seed=1), made_up=True)]
+    if drives:
+        return drives
+    display(Markdown("*No dataset is left for this chapter: it runs on a simulated drive "
+                     "instead and writes no results.*"))
+    dataset, truth = simulate("short", seed=1)
+    return [Drive("simulated", dataset, truth, made_up=True)]
 
 
-def solved(drives, **solvers):
+def solved(drives: Iterable[Drive], **solvers: Callable) -> dict | list[dict]:
     """Results of solvers by problem, as {Drive: result} of the drives on which all succeed.
 
     Every result is written into the results folder, also of drives on which another problem fails;
@@ -93,10 +97,10 @@ def solved(drives, **solvers):
     -------
     dict of results by Drive, or a list of such dicts if there are several solvers.
     """
-    drives = _or_simulated([drive for drive in drives if all(
-        solve.allows(drive.dataset, problem) for problem in solvers)])
+    drives = _or_simulated([
+        drive for drive in drives
+        if all(solve.allows(drive.dataset, problem) for problem in solvers)])
     found = {drive: {} for drive in drives}
-    results = Path(os.environ.get("SLAMLIB_RESULTS") or _data_folder().parent / "results")
     for drive, problem in product(drives, solvers):
         try:
             result = solvers[problem](drive)
@@ -107,32 +111,43 @@ def solved(drives, **solvers):
             failure = solve.failure(problem, drive.dataset, error)
             _notice(drive, f"The problem “{failure.title}” could not be solved: "
                            f"{failure.reason}.", failure=failure)
-            continue
-        found[drive][problem] = result
-        if not drive.made_up and _writes(results / drive.name / problem):
-            write_solution(results / drive.name, solution)
-            show_doubts(drive, solution.doubts)
-        elif not drive.made_up:
-            _notice(drive, f"the files of {problem} stay those of the first call of solved in this "
-                           "notebook; for comparisons there is attempted.")
+        else:
+            found[drive][problem] = result
+            if not drive.made_up:
+                _write(drive, solution)
     left = [drive for drive in drives if len(found[drive]) == len(solvers)]
     if not left:
-        return solved(_or_simulated([]), **solvers)
+        return solved([], **solvers)
     by_problem = [{drive: found[drive][problem] for drive in left} for problem in solvers]
     return by_problem if len(solvers) > 1 else by_problem[0]
+
+
+def _write(drive, solution):
+    """Write a Solution of a Drive and show its doubts, or say why its files stay as they are."""
+    results = Path(os.environ.get("SLAMLIB_RESULTS") or _data_folder().parent / "results")
+    folder = results / drive.name
+    if _writes(folder / solution.problem):
+        write_solution(folder, solution)
+        show_doubts(drive, solution.doubts)
+    else:
+        _notice(drive, f"the files of {solution.problem} stay those of the first call of solved in "
+                       "this notebook; for comparisons there is attempted.")
 
 
 def _writes(folder):
     """True for the first call that writes a folder, and where JupyterLab runs its cell again."""
     request = getattr(get_ipython(), "parent_header", {})
-    this = request.get("metadata", {}).get("cellId"), request.get("header", {}).get("msg_id")
-    cell, execution = _WRITTEN.setdefault(folder, this)
-    if this[0] and cell == this[0] and execution != this[1]:
-        _WRITTEN[folder] = this
-    return _WRITTEN[folder] is this
+    cell = request.get("metadata", {}).get("cellId")
+    execution = request.get("header", {}).get("msg_id")
+    if folder in _WRITTEN:
+        first_cell, last_execution = _WRITTEN[folder]
+        if not cell or cell != first_cell or execution == last_execution:
+            return False
+    _WRITTEN[folder] = cell, execution
+    return True
 
 
-def attempted(drives, function):
+def attempted(drives: Iterable[Drive], function: Callable) -> dict:
     """{Drive: function(Drive)} of the drives on which it can be solved; shows why on others not."""
     found = {}
     for drive in drives:
@@ -143,20 +158,22 @@ def attempted(drives, function):
     return found
 
 
-def show_doubts(drive, doubts):
+def show_doubts(drive: Drive, doubts: Iterable[solve.Doubt]) -> None:
     """Show each Doubt of a list about a Drive."""
     for doubt in doubts:
         _notice(drive, doubt.sentence, doubt=doubt)
 
 
-def _notice(drive, text, **record):
-    """Show a text about a Drive, with a record for `notices`."""
-    entry = {KEY: {"dataset": drive.name, **{kind: asdict(each) for kind, each in record.items()}}}
-    display(Markdown(f"**{plain(drive.name)}**: {plain(text)}"),
-            metadata=entry if record and not drive.made_up else {})
+def _notice(drive, text, **records):
+    """Show a text about a Drive, with a record by its key in RECORDS for `notices`."""
+    metadata = {}
+    if records and not drive.made_up:
+        entry = {kind: asdict(record) for kind, record in records.items()}
+        metadata = {KEY: {"dataset": drive.name} | entry}
+    display(Markdown(f"**{plain(drive.name)}**: {plain(text)}"), metadata=metadata)
 
 
-def plain(text):
+def plain(text: str) -> str:
     """Text (str) with the characters escaped that Markdown or HTML would interpret.
 
     Names from folders and files pass it. A space replaces a control character.
@@ -166,17 +183,21 @@ def plain(text):
                   lambda sign: f"&#{ord(sign[0])};", seen)
 
 
-def notices(books):
+def notices(books: Iterable) -> dict[str, list]:
     """Records in executed notebooks, by dataset: {name: list of Doubt and Failure}, each once."""
     found = {}
     for cell in (cell for book in books for cell in book.cells):
-        for entry in (each.get("metadata", {}).get(KEY, {}) for each in cell.get("outputs", ())):
+        for output in cell.get("outputs", ()):
+            entry = output.get("metadata", {}).get(KEY, {})
             for kind in RECORDS.keys() & entry.keys():
-                found.setdefault(entry["dataset"], {})[RECORDS[kind](**entry[kind])] = True
-    return {name: [*records] for name, records in found.items()}
+                record = RECORDS[kind](**entry[kind])
+                found.setdefault(entry["dataset"], {})[record] = True
+    return {name: list(records) for name, records in found.items()}
 
 
 def _data_folder():
+    """The folder that SLAMLIB_DATA names, or the nearest `data` in this folder or above it."""
+    stated = os.environ.get("SLAMLIB_DATA")
     here = Path.cwd()
-    near = (each / "data" for each in (here, *here.parents) if (each / "data").is_dir())
-    return Path(os.environ.get("SLAMLIB_DATA") or next(near, here / "data"))
+    near = (folder / "data" for folder in (here, *here.parents))
+    return Path(stated or next(filter(Path.is_dir, near), here / "data"))

@@ -7,13 +7,19 @@ text in the legend. Ellipses state a probability: {p : (p - m)^T C^-1 (p - m) <=
 planar Gaussian with probability 1 - exp(-k^2 / 2), so that 95 % needs k = 2.4477.
 """
 
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
 from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
 
 from slamlib.core import se2
 from slamlib.core.evaluation import REACH_95
@@ -25,41 +31,67 @@ class _Roles(dict):
         raise ValueError(f"expected a role, one of {', '.join(self)}; found {role!r}")
 
 
+def _line(color, width, dashes=None, zorder=3):
+    """The look of a path; `dashes` are the lengths of strokes and gaps in line widths."""
+    style = (0, dashes) if dashes else "-"
+    return {"color": color, "linewidth": width, "linestyle": style, "zorder": zorder}
+
+
+def _sign(color, marker, size, zorder):
+    """The look of landmarks."""
+    return {"color": color, "linestyle": "none", "marker": marker, "markersize": size,
+            "zorder": zorder}
+
+
 # Colours of Okabe and Ito and of Tol, distinct for the colour-blind; line styles differ in grey.
 ROLES = _Roles({
-    "truth": dict(color="black", linestyle=(0, (4, 2)), linewidth=1.1, zorder=4),
-    "odometry": dict(color="#D55E00", linewidth=1.5, zorder=3),
-    "exact": dict(color="#332288", linewidth=1.5, zorder=3),
-    "sample": dict(color="#999999", linewidth=1.0, zorder=1),
-    "aruco": dict(color="#CC79A7", linestyle=(0, (1.2, 0.8)), linewidth=1.7, zorder=3),
-    "fused": dict(color="#009E73", linestyle=(0, (4.5, 1.6)), linewidth=1.8, zorder=3),
-    "hint": dict(color="#E69F00", linestyle=(0, (5, 1, 1, 1)), linewidth=1.5, zorder=3),
-    "marker": dict(color="#333333", linestyle="none", marker="s", markersize=3, zorder=3),
-    "slam": dict(color="#0072B2", linewidth=2.0, zorder=3),
-    "slam_uwb": dict(color="#56B4E9", linestyle=(0, (6, 1.5)), linewidth=2.2, zorder=3.2),
-    "arc": dict(color="#333333", linewidth=1.7, zorder=3),
-    "euler": dict(color="#888888", linestyle=(0, (3, 1.5)), linewidth=1.7, zorder=3),
-    "alternative": dict(color="#882255", linestyle=(0, (5, 1, 1, 1)), linewidth=1.5, zorder=3),
-    "antenna": dict(color="#222222", linestyle="none", marker="^", markersize=6, zorder=5),
-    "guess": dict(color="#222222", linestyle="none", marker="^", markersize=7, zorder=4,
-                  markerfacecolor="none"),
-    "true antenna": dict(color="black", linestyle="none", marker="+", markersize=9, zorder=6),
+    "truth": _line("black", 1.1, (4, 2), zorder=4),
+    "odometry": _line("#D55E00", 1.5),
+    "exact": _line("#332288", 1.5),
+    "sample": _line("#999999", 1.0, zorder=1),
+    "aruco": _line("#CC79A7", 1.7, (1.2, 0.8)),
+    "fused": _line("#009E73", 1.8, (4.5, 1.6)),
+    "hint": _line("#E69F00", 1.5, (5, 1, 1, 1)),
+    "marker": _sign("#333333", "s", 3, zorder=3),
+    "slam": _line("#0072B2", 2.0),
+    "slam_uwb": _line("#56B4E9", 2.2, (6, 1.5), zorder=3.2),
+    "arc": _line("#333333", 1.7),
+    "euler": _line("#888888", 1.7, (3, 1.5)),
+    "alternative": _line("#882255", 1.5, (5, 1, 1, 1)),
+    "antenna": _sign("#222222", "^", 6, zorder=5),
+    "guess": _sign("#222222", "^", 7, zorder=4) | {"markerfacecolor": "none"},
+    "true antenna": _sign("black", "+", 9, zorder=6),
 })
 STYLE = Path(__file__).with_name("slamlib.mplstyle")  # for matplotlib.style
 MAX_SEMI_AXIS = 0.08         # of enlarged 95 % ellipses, in the larger extent of the path
+ENLARGEMENTS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
+MAX_BANDS = 800              # poses at which the bands of errors are drawn
 
 
-def panels(count, rows=1, height=3.4, width=3.7, columns=2):
+class Estimates(NamedTuple):
+    """What a solver estimated, and the truth in the same world frame, where it is known."""
+
+    frame: np.ndarray            # (m,) indices of the poses that have an estimate
+    poses: np.ndarray            # (m, 3)
+    covariances: np.ndarray      # (m, 3, 3)
+    true: np.ndarray | None      # (m, 3) poses
+
+
+def panels(count: int, rows: int = 1, height: float = 3.4, width: float = 3.7,
+           columns: int = 2) -> tuple[Figure, np.ndarray]:
     """A figure and its axes (count, rows): `columns` panels side by side, sizes in inches each."""
     columns = min(columns, count)
-    lines = -(-count // columns)
+    lines = math.ceil(count / columns)
     fig = plt.figure(figsize=(max(width * columns, 5.0), height * lines))
     grid = fig.add_gridspec(lines * rows, columns)
-    return fig, np.array([[fig.add_subplot(grid[panel // columns * rows + row, panel % columns])
-                           for row in range(rows)] for panel in range(count)])
+    axes = np.empty((count, rows), dtype=object)
+    for panel, row in np.ndindex(count, rows):
+        line, column = divmod(panel, columns)
+        axes[panel, row] = fig.add_subplot(grid[line * rows + row, column])
+    return fig, axes
 
 
-def each_drive(drives, rows=1, **size):
+def each_drive(drives: Iterable, rows: int = 1, **size) -> Iterator[tuple]:
     """Yield each Drive with its axes, or with `rows` axes as a list; a legend ends the figure.
 
     `drives` (iterable of Drive or of names, such as a dict by Drive) are the panels, with their
@@ -67,30 +99,39 @@ def each_drive(drives, rows=1, **size):
     """
     drives = list(drives)
     fig, axes = panels(max(1, len(drives)), rows, **size)
-    for drive, column in zip(drives, axes, strict=False):
+    for drive, column in zip(drives, axes):
         column[0].set_title(getattr(drive, "name", drive))
         yield drive, column if rows > 1 else column[0]
     if any(ax.get_legend_handles_labels()[0] for ax in fig.axes):
         legend_below(fig)
 
 
-def estimates(result, drive):
-    """Indices (m,), poses (m, 3), covariances (m, 3, 3) and true poses of what is estimated.
+def estimates(result, drive) -> Estimates:
+    """The Estimates of a Drive: the poses that a result has, and the truth of these poses.
 
     `result` is (poses, covariances), or has these attributes: a Solution, Localization, Fusion or
     SlamResult. The truth, None where the Drive has none, is in the world frame of the result.
     """
     poses, covariances = result if isinstance(result, tuple) else (result.poses, result.covariances)
     known = np.isfinite(poses[:, 0])
-    frame = getattr(result, "frame", np.arange(len(poses)))[known]
-    true = None if drive.truth is None else drive.truth.poses
-    world = getattr(result, "world", frame[0] if hasattr(result, "frame") else 0)
-    if true is not None:
-        true = (se2.between(true[world], true) if world else true)[frame]
-    return frame, poses[known], covariances[known], true
+    if hasattr(result, "frame"):
+        frame = result.frame[known]
+        world = frame[0]                     # index of the pose in whose frame the result is
+    else:
+        frame = np.flatnonzero(known)
+        world = getattr(result, "world", 0)
+    true = None
+    if drive.truth is not None:
+        true = drive.truth.poses
+        if world:
+            true = se2.between(true[world], true)
+        true = true[frame]
+    return Estimates(frame, poses[known], covariances[known], true)
 
 
-def with_ellipses(ax, poses, covariances, role, label=None, count=12, enlarged=None, **look):
+def with_ellipses(ax: Axes, poses: np.ndarray, covariances: np.ndarray, role: str,
+                  label: str | None = None, count: int = 12, enlarged: float | None = None,
+                  **look) -> Axes:
     """Draw a path with `count` filled 95 % ellipses at equal distances along it.
 
     Ellipses are `enlarged` by this factor, by default by that of `enlargement`, which is added to
@@ -100,49 +141,59 @@ def with_ellipses(ax, poses, covariances, role, label=None, count=12, enlarged=N
     some = equidistant(poses, count)
     trajectory(ax, poses, role, label, **{"linewidth": 1.2, "alpha": 0.8, **look})
     ellipses(ax, poses[some], covariances[some], ROLES[role]["color"], fill=0.5, enlarged=enlarged)
-    if "ellipses" not in ax.get_title("left"):
-        factor = f" × {enlarged}" * (enlarged > 1)
-        ax.set_title(f"{ax.get_title('left')} (95 % ellipses{factor})")
+    title = ax.get_title("left")
+    if "ellipses" not in title:
+        factor = f" × {enlarged}" if enlarged > 1 else ""
+        ax.set_title(f"{title} (95 % ellipses{factor})")
     return ax
 
 
-def errors(axes, result, drive, role="slam", label=None):
+def errors(axes: Sequence[Axes], result, drive, role: str = "slam",
+           label: str | None = None) -> Sequence[Axes]:
     """Draw errors of a result along the path in two axes: of position, and of the heading.
 
     The bands are the longest semi-axis of the 95 % ellipse and ±2 sigma of the heading; without
     truth they stand alone. `result` as of `estimates`. `label`, by default the role of all but the
     first result on these axes, precedes its entries in the legend.
     """
-    (top, bottom), color = axes, ROLES[role]["color"]
-    of = f"{label or role}: " if label or top.collections else ""
-    frame, poses, C, true = estimates(result, drive)
-    some = np.unique(np.linspace(0, len(frame) - 1, 800).astype(int))
-    frame, C = frame[some], C[some]
-    reach = 1e3 * REACH_95 * np.sqrt(np.maximum(np.linalg.eigvalsh(C[:, :2, :2])[:, 1], 0))
-    turn = 2e3 * np.sqrt(C[:, 2, 2])
-    for ax, low, high in ((top, 0 * reach, reach), (bottom, -turn, turn)):
-        ax.fill_between(frame + 1, low, high, color=color, alpha=0.18, linewidth=0,
-                        label=f"{of}95 % by the covariance")
-    if true is not None:
-        off = 1e3 * (poses - true)[some]
-        curve(top, np.hypot(*off[:, :2].T), role, frame, f"{of}error", linewidth=1.2)
-        curve(bottom, off[:, 2], role, frame, f"{of}error", linewidth=0.8)
+    top, bottom = axes
+    if not label and top.collections:
+        label = role
+    prefix = f"{label}: " if label else ""
+    found = estimates(result, drive)
+    shown = np.unique(np.linspace(0, len(found.frame) - 1, MAX_BANDS).astype(int))
+    frame = found.frame[shown]
+    covariances = found.covariances[shown]
+    semi_axis = 1e3 * longest_semi_axes(covariances)                     # mm
+    two_sigma = 2e3 * np.sqrt(covariances[:, 2, 2])                      # mrad
+    band = {"color": ROLES[role]["color"], "alpha": 0.18, "linewidth": 0,
+            "label": f"{prefix}95 % by the covariance"}
+    top.fill_between(frame + 1, 0, semi_axis, **band)
+    bottom.fill_between(frame + 1, -two_sigma, two_sigma, **band)
+    if found.true is not None:
+        error = 1e3 * (found.poses - found.true)[shown]
+        distance = np.linalg.norm(error[:, :2], axis=1)
+        curve(top, distance, role, frame, f"{prefix}error", linewidth=1.2)
+        curve(bottom, error[:, 2], role, frame, f"{prefix}error", linewidth=0.8)
     name_rows(axes, ("position (mm)", "δ (mrad)"))
     top.set_ylim(0, None)
     return axes
 
 
-def trajectory(ax, poses, role, label=None, **look):
+def trajectory(ax: Axes, poses: np.ndarray, role: str, label: str | None = None, **look) -> Axes:
     """Draw the path of poses (n, >= 2) with a dot at its start and equal axes."""
     line, = ax.plot(poses[:, 0], poses[:, 1], label=label or role, **ROLES[role] | look)
-    ax.plot(*poses[np.isfinite(poses[:, 0])][:1, :2].T, "o", color=line.get_color(), markersize=4)
+    known = np.isfinite(poses[:, 0])
+    start = poses[known][:1]
+    ax.plot(start[:, 0], start[:, 1], "o", color=line.get_color(), markersize=4)
     ax.set_aspect("equal", adjustable="datalim")
     ax.set(xlabel="x (m)", ylabel="y (m)")
     return ax
 
 
-def ellipses(ax, positions, covariances, color, probability=0.95, label=None, fill=0.12,
-             enlarged=1):
+def ellipses(ax: Axes, positions: np.ndarray, covariances: np.ndarray, color: str,
+             probability: float = 0.95, label: str | None = None, fill: float = 0.12,
+             enlarged: float | np.ndarray = 1) -> Axes:
     """Draw ellipses of a probability at positions (m, >= 2) with covariances (m, >= 2, >= 2).
 
     `fill` is the opacity. `enlarged`, a number or (m,), scales the ellipses, which the figure must
@@ -150,16 +201,19 @@ def ellipses(ax, positions, covariances, color, probability=0.95, label=None, fi
     """
     k = np.sqrt(-2 * np.log(1 - probability)) * np.reshape(enlarged, (-1, 1))
     centre = np.asarray(positions)[:, :2]
-    variances, axes = np.linalg.eigh(np.asarray(covariances)[:, :2, :2])
+    C = np.asarray(covariances)[:, :2, :2]
+    variances, directions = np.linalg.eigh(C)
     widths = 2 * k * np.sqrt(np.maximum(variances, 0))
-    angles = np.degrees(np.arctan2(axes[:, 1, 1], axes[:, 0, 1]))
+    longest = directions[:, :, 1]
+    angles = np.degrees(np.arctan2(longest[:, 1], longest[:, 0]))
     rgb = np.array(to_rgb(color))
-    face, edge = (*rgb, fill), tuple(0.6 * rgb)           # darker than the path below them
+    face = (*rgb, fill)
+    edge = tuple(0.6 * rgb)                               # darker than the path below them
     ax.add_collection(EllipseCollection(
         widths[:, 1], widths[:, 0], angles, units="xy", offsets=centre,
         offset_transform=ax.transData, facecolors=face, edgecolors=edge, linewidths=0.9,
         zorder=3.5))
-    reach = k * np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)[:, :2])
+    reach = k * se2.sigmas(C)
     ax.update_datalim(np.concatenate([centre - reach, centre + reach]))
     if label:
         ax.plot([], [], "o", markersize=9, markerfacecolor=face, markeredgecolor=edge, label=label)
@@ -167,104 +221,141 @@ def ellipses(ax, positions, covariances, color, probability=0.95, label=None, fi
     return ax
 
 
-def draw_markers(ax, in_world, covariances, enlarged=1):
+def draw_markers(ax: Axes, in_world: np.ndarray, covariances: np.ndarray,
+                 enlarged: float = 1) -> Axes:
     """Draw markers in_world (k, 3) as squares with their 95 % ellipses."""
     ellipses(ax, in_world, covariances, ROLES["aruco"]["color"], fill=0.3, enlarged=enlarged)
-    ax.plot(*in_world[:, :2].T, label="markers", **ROLES["marker"])
-    return ax
+    return _landmarks(ax, in_world, "marker", "markers")
 
 
-def draw_antennas(ax, positions, covariances, guess=None, truth=None, enlarged=1):
+def draw_antennas(ax: Axes, positions: np.ndarray, covariances: np.ndarray,
+                  guess: np.ndarray | None = None, truth: np.ndarray | None = None,
+                  enlarged: float | np.ndarray = 1) -> Axes:
     """Draw antennas (a, 2) with 95 % ellipses, lines from their guesses (a, 2), and truth (t, 2).
 
     `enlarged`, the factor on the ellipses, may be (a,).
     """
     ellipses(ax, positions, covariances, "#44AA99", fill=0.3, enlarged=enlarged)
     if guess is not None:
-        ax.plot(*np.stack([guess, positions]).transpose(2, 0, 1), color="#999999", linewidth=0.8,
-                zorder=2)
-        ax.plot(*guess.T, label="antennas: guess", **ROLES["guess"])
-    ax.plot(*positions.T, label="antennas: estimate", **ROLES["antenna"])
+        ax.plot([guess[:, 0], positions[:, 0]], [guess[:, 1], positions[:, 1]], color="#999999",
+                linewidth=0.8, zorder=2)
+        _landmarks(ax, guess, "guess", "antennas: guess")
+    _landmarks(ax, positions, "antenna", "antennas: estimate")
     if truth is not None and len(truth):
-        ax.plot(*truth.T, label="antennas: truth", **ROLES["true antenna"])
+        _landmarks(ax, truth, "true antenna", "antennas: truth")
     return ax
 
 
-def places_by_id(ids, places, wanted):
+def _landmarks(ax, places, role, label):
+    """Draw the signs of landmarks at places (k, >= 2)."""
+    ax.plot(places[:, 0], places[:, 1], label=label, **ROLES[role])
+    return ax
+
+
+def places_by_id(ids: np.ndarray, places: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """Places (m, c) of the wanted ids (m,) out of ids (k,) with places (k, c), NaN if missing."""
     return pd.DataFrame(places, index=ids).reindex(wanted).to_numpy()
 
 
-def enlargement(poses, covariances):
-    """The largest factor 1, 2, 5, 10, ..., 5000 on 95 % ellipses that fit MAX_SEMI_AXIS, or 1."""
+def longest_semi_axes(covariances: np.ndarray) -> np.ndarray:
+    """The longest semi-axis (m,) in m of each 95 % ellipse, of covariances (m, >= 2, >= 2)."""
+    variances = np.linalg.eigvalsh(covariances[:, :2, :2])
+    return REACH_95 * np.sqrt(np.maximum(variances[:, 1], 0))
+
+
+def enlargement(poses: np.ndarray, covariances: np.ndarray) -> int:
+    """The largest of ENLARGEMENTS with which the 95 % ellipses fit MAX_SEMI_AXIS, or 1."""
     known = np.isfinite(poses[:, 0])
-    limit = MAX_SEMI_AXIS * np.ptp(poses[known, :2], axis=0).max()
-    largest = REACH_95 * np.sqrt(np.linalg.eigvalsh(covariances[known, :2, :2])[:, 1].max())
-    factors = np.outer(10 ** np.arange(4), [1, 2, 5]).ravel()
-    return int(max(factors[factors * largest <= limit], default=1)) if largest > 0 else 1
+    extent = np.ptp(poses[known, :2], axis=0).max()
+    largest = longest_semi_axes(covariances[known]).max()
+    fitting = [each for each in ENLARGEMENTS if each * largest <= MAX_SEMI_AXIS * extent]
+    return max(fitting, default=1) if largest > 0 else 1
 
 
-def equidistant(poses, count=14):
+def equidistant(poses: np.ndarray, count: int = 14) -> np.ndarray:
     """Indices of about `count` known poses at equal distances along the path."""
     known = np.flatnonzero(np.isfinite(poses[:, 0]))
-    travelled = cumulative(np.hypot(*np.diff(poses[known, :2], axis=0).T))
+    steps = np.diff(poses[known, :2], axis=0)
+    travelled = cumulative(np.linalg.norm(steps, axis=1))
     wanted = np.linspace(0, travelled[-1], count + 1)[1:]
-    return known[np.unique(np.minimum(np.searchsorted(travelled, wanted), len(known) - 1))]
+    row = np.searchsorted(travelled, wanted)
+    return known[np.unique(np.minimum(row, len(known) - 1))]
 
 
-def name_rows(axes, names):
+def name_rows(axes: Sequence[Axes], names: Sequence[str]) -> None:
     """Set the labels of the vertical axes of one panel; the last axes show the pose id."""
     for ax, name in zip(axes, names, strict=True):
         ax.set(ylabel=name, xlabel=None)
     axes[-1].set(xlabel="pose id")
 
 
-def legend_below(fig):
+def legend_below(fig: Figure) -> None:
     """Draw one legend below all axes of a figure: each label once, in as few lines as fit."""
     entries = {}
     for ax in fig.axes:
         handles, labels = ax.get_legend_handles_labels()
-        entries |= {label: handle for handle, label in zip(handles, labels, strict=True)
-                    if label not in entries}
-    for columns in range(4, 0, -1):
+        for handle, label in zip(handles, labels):
+            entries.setdefault(label, handle)
+    for most in (4, 3, 2, 1):
         fig.legends.clear()
-        lines = -(-len(entries) // columns)
+        lines = math.ceil(len(entries) / most)
+        columns = math.ceil(len(entries) / lines)
         legend = fig.legend(entries.values(), entries.keys(), loc="outside lower center",
-                            ncols=-(-len(entries) // lines))
+                            ncols=columns)
         if legend.get_window_extent().width <= fig.bbox.width:
             break
 
 
-def curve(ax, values, role, frame=None, label=None, **look):
+def curve(ax: Axes, values: np.ndarray, role: str, frame: np.ndarray | None = None,
+          label: str | None = None, **look) -> Axes:
     """Draw values (n,) over the pose id; `frame` (n,) are the indices from 0 of their poses."""
-    frame = np.arange(len(values)) if frame is None else frame
+    if frame is None:
+        frame = np.arange(len(values))
     ax.plot(frame + 1, values, label=label or role, **ROLES[role] | look)
     ax.set(xlabel="pose id")
     return ax
 
 
-def slam_graph(ax, poses, sightings):
+def slam_graph(ax: Axes, poses: int, sightings: list[tuple[int, int]]) -> Axes:
     """Draw a scheme of problem 3's graph: poses in a row, markers above, wheel parameters w below.
 
     `poses` is their number; `sightings` are pairs of a pose from 0 and a marker from 1.
     """
-    markers = sorted({marker for _, marker in sightings})
-    places = {f"$X_{i + 1}$": (i, 0.0) for i in range(poses)} | {"$w$": (poses / 2 - 0.5, -0.8)} | {
-        f"$L_{{{marker}}}$": (x, 1.3) for marker, x in zip(
-            markers, np.linspace(-0.7, poses - 0.3, len(markers) + 2)[1:-1], strict=True)}
-    factors = [("aruco", f"$X_{i + 1}$", f"$L_{{{marker}}}$") for i, marker in sightings]
-    factors += [("odometry", f"$X_{i}$", f"$X_{i + 1}$", "$w$") for i in range(1, poses)]
-    for role, *names in factors + [("truth", "$X_1$"), ("truth", "$w$")]:
-        ends = np.array([places[name] for name in names])
-        middle = np.average(ends, axis=0, weights=[0.6, 0.4] if len(ends) == 2 else None) - [
-            0.3 * (len(names) == 1), 0.0]         # priors stand beside; no squares at crossings
-        for end in ends:
-            ax.plot(*np.stack([end, middle]).T, color=ROLES[role]["color"], linewidth=0.9, zorder=1)
-        ax.plot(*middle, "s", color=ROLES[role]["color"], markersize=4.5, zorder=2)
-    for name, place in places.items():
-        color = {"L": "#dddddd", "w": "#ffe0b0"}.get(name[1], "white")
-        ax.text(*place, name, ha="center", va="center", fontsize=11, zorder=4,
-                bbox=dict(boxstyle="circle,pad=0.25", facecolor=color, edgecolor="black"))
+    path = np.column_stack([np.arange(poses), np.zeros(poses)])
+    wheels = np.array([poses / 2 - 0.5, -0.8])
+    ids = sorted({marker for _, marker in sightings})
+    across = np.linspace(-0.7, poses - 0.3, len(ids) + 2)[1:-1]
+    markers = {marker: np.array([x, 1.3]) for marker, x in zip(ids, across)}
+
+    for i, marker in sightings:
+        middle = 0.6 * path[i] + 0.4 * markers[marker]           # no squares at crossings
+        _factor(ax, "aruco", middle, [path[i], markers[marker]])
+    for before, after in pairwise(path):
+        ends = [before, after, wheels]
+        _factor(ax, "odometry", np.mean(ends, axis=0), ends)
+    for known in (path[0], wheels):
+        beside = known - [0.3, 0.0]
+        _factor(ax, "truth", beside, [known])
+
+    for i, place in enumerate(path, start=1):
+        _variable(ax, place, f"$X_{i}$", "white")
+    _variable(ax, wheels, "$w$", "#ffe0b0")
+    for marker, place in markers.items():
+        _variable(ax, place, f"$L_{{{marker}}}$", "#dddddd")
     ax.set(xlim=(-0.8, poses - 0.2), ylim=(-1.3, 1.8))
     ax.axis("off")
     return ax
+
+
+def _factor(ax, role, place, ends):
+    """Draw a factor, a square at a place (2,), with lines to the ends, places of its variables."""
+    color = ROLES[role]["color"]
+    for end in ends:
+        ax.plot([end[0], place[0]], [end[1], place[1]], color=color, linewidth=0.9, zorder=1)
+    ax.plot(place[0], place[1], "s", color=color, markersize=4.5, zorder=2)
+
+
+def _variable(ax, place, name, color):
+    """Draw a variable, a circle with its name."""
+    circle = {"boxstyle": "circle,pad=0.25", "facecolor": color, "edgecolor": "black"}
+    ax.text(place[0], place[1], name, ha="center", va="center", fontsize=11, zorder=4, bbox=circle)

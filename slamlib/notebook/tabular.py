@@ -1,6 +1,8 @@
 """Tables of notebooks: rows are dicts of data; what is missing is a dash or an absent column."""
 
 import re
+from collections.abc import Iterable, Iterator
+from itertools import pairwise
 
 import numpy as np
 from IPython.display import Markdown
@@ -20,7 +22,7 @@ MINUS = re.compile(r"(?<![\w.])-(?=\d)")
 MAX_NUMBER = 1e6             # larger numbers are not shown, because the method failed
 
 
-def table(rows, caption=None):
+def table(rows: Iterable[dict], caption: str | None = None) -> Markdown:
     """Table in Markdown, an object that Jupyter shows, of rows (iterable of dict from header).
 
     Values are str, numbers (three significant digits), or arrays (s,) over drives: mean ± standard
@@ -28,161 +30,235 @@ def table(rows, caption=None):
     are left out. Of consecutive rows with the same first cell only the first shows it. `caption`
     (str) stands below.
     """
+    columns = _columns(rows)
+    rules = []
+    for name, texts in columns.items():
+        numeric = all(map(NUMERIC.match, texts))
+        rules.append("---:" if numeric else "---")
+        if numeric:
+            columns[name] = [MINUS.sub("−", text) for text in texts]
+    first, *others = columns.values()
+    if others:
+        first = ["" if text == above else text for above, text in pairwise([None, *first])]
+    lines = [columns, rules, *zip(first, *others)]
+    text = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return Markdown(f"{text}\n\n{caption}" if caption else text)
+
+
+def _columns(rows):
+    """The texts of a table's columns, {header: list of str}, or one dash if there are none."""
     rows = [{name: cell(value).replace(" ± ", "\u00a0±\u00a0") for name, value in row.items()}
             for row in rows]
-    columns = {name: [row.get(name, DASH) for row in rows] for row in rows for name in row}
-    columns = {name: column for name, column in columns.items()
-               if set(column) != {DASH}} or {DASH: [DASH]}
-    numeric = [all(map(NUMERIC.match, column)) for column in columns.values()]
-    first, *others = ([MINUS.sub("−", text) if each else text for text in column]
-                      for each, column in zip(numeric, columns.values()))
-    if others:
-        first = [text * (text != above) for above, text in zip([None, *first], first)]
-    lines = [columns, ["---:" if each else "---" for each in numeric], *zip(first, *others)]
-    text = "\n".join("| " + " | ".join(line) + " |" for line in lines)
-    return Markdown(text + (f"\n\n{caption}" if caption else ""))
+    columns = {}
+    for name in dict.fromkeys(name for row in rows for name in row):
+        column = [row.get(name, DASH) for row in rows]
+        if set(column) != {DASH}:
+            columns[name] = column
+    return columns or {DASH: [DASH]}
 
 
-def cell(value):
+def cell(value) -> str:
     """Text (str) of a value of `table`."""
     if isinstance(value, str):
         return value
-    if value is None or np.ndim(value) == 0 and np.isnan(value):
+    if value is None:
+        return DASH
+    if np.ndim(value):
+        return _over_drives(np.asarray(value, float))
+    if np.isnan(value):
         return DASH
     if isinstance(value, bool | np.bool_):
         return "yes" if value else "no"
     if isinstance(value, int | np.integer):
         return f"{value:,}".replace("-", "−")
-    return number(value) if np.ndim(value) == 0 else _over_drives(np.asarray(value, float))
+    return number(value)
 
 
-def number(value, decimals=None):
+def number(value: float, decimals: int | None = None) -> str:
     """A value with three significant digits, or this number of decimals (str)."""
     if abs(value) > MAX_NUMBER:
         return "> 10⁶"
     if decimals is None:
-        decimals = int(np.clip(2 - np.floor(np.log10(abs(value))), 0, 6)) if value else 0
+        decimals = _decimals(value, 3, at_most=6) if value else 0
     return f"{value:z,.{decimals}f}".replace("-", "−")
+
+
+def _decimals(value, digits, at_most):
+    """Number (int) of decimals that show this number of significant digits of a value."""
+    exponent = np.floor(np.log10(abs(value)))
+    return int(np.clip(digits - 1 - exponent, 0, at_most))
 
 
 def _over_drives(values):
     """Mean ± standard error and median of values (s,), one a drive."""
     error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else 0.0
-    decimals = int(np.clip(1 - np.floor(np.log10(error)), 0, 3)) if error > 0 else None
-    text = number(values.mean(), decimals) + (f" ± {number(error, decimals)}" if error > 0 else "")
+    decimals = _decimals(error, 2, at_most=3) if error > 0 else None
+    text = number(values.mean(), decimals)
+    if error > 0:
+        text += f" ± {number(error, decimals)}"
     return f"{text} ({number(np.median(values), decimals)})"
 
 
-def dataset_row(drive):
+def dataset_row(drive) -> dict:
     """Row of `table` on what a Drive has: poses, length of the path, counts of measurements."""
-    d = drive.dataset
-    return {"dataset": drive.name, "origin": drive.origin, "encoder poses": len(d.ticks),
-            "path by odometry (m)": evaluation.path_length(dead_reckoning(d.ticks, d.vehicle)),
-            **{name: f"{len(each.pose):,} at {len(np.unique(each.pose)):,} poses"
-               for name, each in (("marker sightings", d.aruco), ("UWB ranges", d.uwb)) if each}}
+    dataset = drive.dataset
+    path = dead_reckoning(dataset.ticks, dataset.vehicle)
+    row = {"dataset": drive.name, "origin": drive.origin, "encoder poses": len(dataset.ticks),
+           "path by odometry (m)": evaluation.path_length(path)}
+    for name, readings in (("marker sightings", dataset.aruco), ("UWB ranges", dataset.uwb)):
+        if readings is not None:
+            poses = np.unique(readings.pose)
+            row[name] = f"{len(readings.pose):,} at {len(poses):,} poses"
+    return row
 
 
-def vehicle_row(drive):
+def vehicle_row(drive) -> dict:
     """Row of `table` on what is stated of a Drive's vehicle and noise."""
-    v = drive.dataset.vehicle
-    wheel = {name: f"{mean:g} ± {sigma:g}" for name, mean, sigma in zip(
-        ("$R_R$ (m)", "$R_L$ (m)", "$b$ (m)"), v.wheel, v.sigma_wheel, strict=True)}
-    return {"dataset": drive.name, **wheel, "$n_0$": f"{v.ticks_per_revolution:g}",
-            r"$\sigma_\delta$ (rad)": f"{v.sigma_heading:g}",
-            **{f"`{key}`": getattr(v, key) for key in NOISE_KEYS}}
+    vehicle = drive.dataset.vehicle
+    row = {"dataset": drive.name}
+    names = ("$R_R$ (m)", "$R_L$ (m)", "$b$ (m)")
+    for name, mean, sigma in zip(names, vehicle.wheel, vehicle.sigma_wheel):
+        row[name] = f"{mean:g} ± {sigma:g}"
+    row["$n_0$"] = f"{vehicle.ticks_per_revolution:g}"
+    row[r"$\sigma_\delta$ (rad)"] = f"{vehicle.sigma_heading:g}"
+    return row | {f"`{key}`": getattr(vehicle, key) for key in NOISE_KEYS}
 
 
-def accuracy(result, drive):
+def accuracy(result, drive) -> dict:
     """Row of `table` on what a solver found of a Drive: median sigmas, errors where truth is known.
 
     `result` as of `plotting.estimates`. The sigma of position is the larger of x and y.
     """
-    _, poses, covariances, true = estimates(result, drive)
-    row = {"dataset": drive.name,
-           "σ (mm)": 1e3 * np.median(evaluation.position_sigmas(covariances)),
-           "σ of δ (mrad)": 1e3 * np.median(evaluation.sigmas(covariances)[:, 2])}
-    if true is None:
-        return row
-    nees = evaluation.nees(poses, covariances, true)
-    nees = nees[np.isfinite(nees)]
-    return row | {"ATE (mm)": 1e3 * evaluation.ate(poses, true),
-                  "aligned (mm)": 1e3 * evaluation.ate(poses, true, aligned=True),
-                  "NEES, mean": nees.mean() if len(nees) else None,
-                  "NEES, median": np.median(nees) if len(nees) else None}
+    found = estimates(result, drive)
+    position_sigma = evaluation.position_sigmas(found.covariances)
+    heading_sigma = evaluation.sigmas(found.covariances)[:, 2]
+    row = {"dataset": drive.name, "σ (mm)": 1e3 * np.median(position_sigma),
+           "σ of δ (mrad)": 1e3 * np.median(heading_sigma)}
+    if found.true is not None:
+        nees = evaluation.nees(found.poses, found.covariances, found.true)
+        nees = nees[np.isfinite(nees)]
+        row["ATE (mm)"] = 1e3 * evaluation.ate(found.poses, found.true)
+        row["aligned (mm)"] = 1e3 * evaluation.ate(found.poses, found.true, aligned=True)
+        if len(nees):
+            row["NEES, mean"] = nees.mean()
+            row["NEES, median"] = np.median(nees)
+    return row
 
 
-def learned_row(result, drive):
+def learned_row(result, drive) -> dict:
     """Row of `table` on what a SlamResult learned of a Drive's noise and rejected.
 
     The truth of a simulated Drive says how many wrong labels are rejected. A kernel for ranges
     alone is absent, because sightings then count in full within the gate.
     """
-    vehicle = result.fit.problem.measurements.dataset.vehicle
-    factor, sigma = result.noise.sightings, result.noise_sigma
+    measurements = result.fit.problem.measurements
+    vehicle = measurements.dataset.vehicle
+    slip = 1e3 * result.slip
+    factor = result.noise.sightings
+    slip_sigma, factor_sigma, _ = result.noise_sigma
     row = {"dataset": drive.name, "gate": vehicle.gate,
            "kernel": None if vehicle.kernel in ONE_SIDED else vehicle.kernel,
-           "slip (mm)": f"{1e3 * result.slip:.2f} ± {1e3 * result.slip * sigma[0]:.2f}",
-           "factor": f"{factor:.2f} ± {factor * sigma[1]:.2f}", "step": result.model,
+           "slip (mm)": f"{slip:.2f} ± {slip * slip_sigma:.2f}",
+           "factor": f"{factor:.2f} ± {factor * factor_sigma:.2f}", "step": result.model,
            "sightings": len(result.rejected), "rejected": result.rejected.sum()}
     if drive.origin == "simulated":
-        wrong = mislabelled(result.fit.problem.measurements, drive.truth)
-        row["of wrong labels"] = f"{(wrong & result.rejected).sum()} of {wrong.sum()}"
+        wrong = mislabelled(measurements, drive.truth)
+        found = wrong & result.rejected
+        row["of wrong labels"] = f"{found.sum()} of {wrong.sum()}"
     return row
 
 
-def calibration_rows(result, drive):
+def calibration_rows(result, drive) -> Iterator[dict]:
     """Rows of `table` on the entries of a SlamResult's calibration: stated, estimated, true, used.
 
     The true value is that of the wheels of a simulated Drive. Without ranges their entries have no
     row; offsets of single antennas, which are stated as zero, have one where they are estimated.
     The last one is the factor on the standard deviations of the ranges.
     """
-    own = slice(None) if len(result.antenna) else slice(RANGES.start)
-    for entry in result.calibration_table[own]:
-        sigma, stated_sigma = entry["sigma"], entry["stated_sigma"]
-        if not sigma and entry["group"] == "antenna-offsets":
-            continue
-        digits = f".{np.clip(1 - np.floor(np.log10(sigma)), 0, 7):.0f}f" if sigma else "g"
-        true = getattr(drive.truth.vehicle, entry["name"]) if (
-            drive.origin == "simulated" and entry["group"] == "wheel-parameters") else None
-        yield {"dataset": drive.name, "entry": f"`{entry['name']}`", "unit": entry["unit"] or DASH,
-               "stated": f"{entry['stated']:g}" + f" ± {stated_sigma:.3g}" * (stated_sigma > 0),
-               "estimated": f"{entry['estimate']:{digits}} ± {sigma:{digits}}" if sigma else None,
-               "true": None if true is None else f"{true:{digits}}",
-               "used": "statement" if not sigma else "estimate" if entry["released"] else "both"}
-    if len(result.antenna):
-        given, factor = drive.dataset.vehicle.range_noise_factor, result.noise.ranges
-        sigma = factor * result.noise_sigma[2]
-        yield {"dataset": drive.name, "entry": "`range_noise_factor`", "unit": DASH,
-               "stated": given, "estimated": None if given else f"{factor:.2f} ± {sigma:.2f}",
-               "used": "statement" if given else "estimate"}
+    has_ranges = len(result.antenna) > 0
+    for entry in result.calibration_table[:None if has_ranges else RANGES.start]:
+        true = None
+        if entry["group"] == "wheel-parameters" and drive.origin == "simulated":
+            true = getattr(drive.truth.vehicle, entry["name"])
+        if entry["sigma"] or entry["group"] != "antenna-offsets":
+            yield {"dataset": drive.name} | _calibration_row(entry, true)
+    if has_ranges:
+        stated = drive.dataset.vehicle.range_noise_factor
+        yield {"dataset": drive.name} | _range_noise_row(result, stated)
 
 
-def antenna_rows(result, drive):
+def _calibration_row(entry, true):
+    """Row on one entry of a calibration; the true value is None where it is not known."""
+    sigma = entry["sigma"]
+    stated = f"{entry['stated']:g}"
+    if entry["stated_sigma"]:
+        stated += f" ± {entry['stated_sigma']:.3g}"
+    row = {"entry": f"`{entry['name']}`", "unit": entry["unit"] or DASH, "stated": stated,
+           "estimated": None, "true": None, "used": "statement"}
+    digits = "g"
+    if sigma:
+        digits = f".{_decimals(sigma, 2, at_most=7)}f"
+        row["estimated"] = f"{entry['estimate']:{digits}} ± {sigma:{digits}}"
+        row["used"] = "estimate" if entry["released"] else "both"
+    if true is not None:
+        row["true"] = f"{true:{digits}}"
+    return row
+
+
+def _range_noise_row(result, stated):
+    """Row on the factor on the standard deviations of the ranges, None where it is not stated."""
+    row = {"entry": "`range_noise_factor`", "unit": DASH, "stated": stated, "estimated": None,
+           "used": "statement"}
+    if not stated:
+        factor = result.noise.ranges
+        row["estimated"] = f"{factor:.2f} ± {factor * result.noise_sigma[2]:.2f}"
+        row["used"] = "estimate"
+    return row
+
+
+def antenna_rows(result, drive) -> Iterator[dict]:
     """Rows of `table` on the antennas of a SlamResult: position, sigmas, distances in mm.
 
     `d²` is the squared error in units of the covariance, `down-weighted` the percentage of the
     ranges that keep less than half of their weight, `by 0.1 m` how far an antenna would be
     elsewhere, on the same path, if all its ranges were 0.1 m too long.
     """
-    if not len(result.antenna):
+    ids = result.antenna
+    if not len(ids):
         return
-    place, C, uwb = result.antenna_in_world, result.antenna_covariance, drive.dataset.uwb
-    guess, truth = drive.dataset.antenna_guess, drive.truth
-    moved = place - places_by_id(guess.antenna, guess.position, result.antenna)
-    off = np.full_like(place, np.nan) if truth is None else place - places_by_id(
-        truth.antenna, truth.antenna_in_world, result.antenna)
-    for k, antenna in enumerate(result.antenna.tolist()):
+    uwb = drive.dataset.uwb
+    truth = drive.truth
+    guess = drive.dataset.antenna_guess
+    guess = places_by_id(guess.antenna, guess.position, ids)
+    true = np.full_like(guess, np.nan)
+    if truth is not None:
+        true = places_by_id(truth.antenna, truth.antenna_in_world, ids)
+    for k, antenna in enumerate(ids.tolist()):
+        place = result.antenna_in_world[k]
+        C = result.antenna_covariance[k]
+        sigma = 1e3 * evaluation.sigmas(C)
+        error = place - true[k]
         own = uwb.antenna == antenna
-        away = place[k] - result.poses[uwb.pose[own], :2]
-        root = np.sqrt(result.range_weight[own]) / uwb.sigma[own]
-        direction = away / np.maximum(np.hypot(*away.T), 1e-9)[:, None]
-        shift = np.linalg.lstsq(root[:, None] * direction, 0.1 * root)[0]
-        yield {"dataset": drive.name, "antenna": f"{antenna}{'?' * (antenna in result.doubts)}",
-               "x (m)": f"{place[k, 0]:.3f}", "y (m)": f"{place[k, 1]:.3f}",
-               "σ of x (mm)": 1e3 * np.sqrt(C[k, 0, 0]), "σ of y (mm)": 1e3 * np.sqrt(C[k, 1, 1]),
-               "from the guess (mm)": 1e3 * np.hypot(*moved[k]),
-               "error (mm)": 1e3 * np.hypot(*off[k]),
-               "d²": off[k] @ np.linalg.solve(C[k], off[k]),
-               "down-weighted (%)": 100 * np.mean(result.range_weight[own] < 0.5),
-               "by 0.1 m (mm)": 1e3 * np.hypot(*shift)}
+        weight = result.range_weight[own]
+        shift = _shift_by_range_offset(result.poses, uwb.select(own), weight, place)
+        yield {"dataset": drive.name,
+               "antenna": f"{antenna}?" if antenna in result.doubts else f"{antenna}",
+               "x (m)": f"{place[0]:.3f}", "y (m)": f"{place[1]:.3f}",
+               "σ of x (mm)": sigma[0], "σ of y (mm)": sigma[1],
+               "from the guess (mm)": 1e3 * np.linalg.norm(place - guess[k]),
+               "error (mm)": 1e3 * np.linalg.norm(error),
+               "d²": error @ np.linalg.solve(C, error),
+               "down-weighted (%)": 100 * np.mean(weight < 0.5),
+               "by 0.1 m (mm)": 1e3 * np.linalg.norm(shift)}
+
+
+def _shift_by_range_offset(poses, ranges, weight, antenna, offset=0.1):
+    """How far (2,) in m an antenna moves if all its ranges (r,) are too long by the offset.
+
+    Weighted least squares of the ranges, linearised at the place of the antenna (2,).
+    """
+    ray = antenna - poses[ranges.pose, :2]
+    length = np.linalg.norm(ray, axis=1)
+    direction = ray / np.maximum(length, 1e-9)[:, None]
+    root_weight = np.sqrt(weight) / ranges.sigma
+    return np.linalg.lstsq(root_weight[:, None] * direction, root_weight * offset)[0]

@@ -5,40 +5,48 @@ from functools import partial
 
 import numpy as np
 
-from slamlib.core.evaluation import anees, ate
 from slamlib.core.increments import TYPICAL_SLIP
-from slamlib.robust import fit as stages
+from slamlib.core.kernels import KERNELS, ONE_SIDED
+from slamlib.core.records import Dataset, Truth
+from slamlib.robust.fit import Fit, accepted_measurements, narrow_kernels, refine, residuals
 from slamlib.robust.initialization import odometry_state, trilaterated_antennas
-from slamlib.robust.linear import build_problem, state_from_arrays
-from slamlib.robust.measurements import measure
+from slamlib.robust.linear import State, build_problem, state_from_arrays
+from slamlib.robust.measurements import Measurements, measure
 from slamlib.robust.result import slam_result
-from slamlib.studies.montecarlo import antenna_error, drive
+from slamlib.studies.montecarlo import antenna_error, drive, judged
 
 # Kernel and gate of every method.
-METHODS = {name: (name, name in stages.ONE_SIDED) for name in stages.KERNELS} | {
-    "gate": ("quadratic", True)}
+METHODS = {name: (name, name in ONE_SIDED) for name in KERNELS} | {"gate": ("quadratic", True)}
 MIN_MISLABELLED_SQUARED = 50.0   # Mahalanobis; a right label reaches it once in 10^10 sightings
 
 
-def rounds(measurements, antennas=trilaterated_antennas):
+def measure_with_known_noise(dataset: Dataset) -> Measurements:
+    """The Measurements of a Dataset with the typical slip and the sigmas of the files."""
+    vehicle = replace(dataset.vehicle, slip=TYPICAL_SLIP, marker_noise_factor=1.0,
+                      range_noise_factor=1.0)
+    return measure(replace(dataset, vehicle=vehicle))
+
+
+def rounds(measurements: Measurements, antennas=trilaterated_antennas) -> State:
     """The State after the rounds of narrowing kernels, from odometry by arcs.
 
     `antennas` as of `initialization.state_from_poses`.
     """
     state = odometry_state(measurements, "arc", antennas=antennas)
-    return stages.narrow_kernels(build_problem(measurements, "arc"), state)
+    return narrow_kernels(build_problem(measurements, "arc"), state)
 
 
-def solve_with(measurements, start, sightings="gate", ranges="asymmetric Tukey"):
+def solve_with(measurements: Measurements, start: State, sightings: str = "gate",
+               ranges: str = "asymmetric Tukey") -> Fit:
     """The Fit from a State, as of `rounds`, by METHODS; the defaults are those of `estimate`.
 
     The noise of the measurements is known.
     """
-    return stages.refine(build_problem(measurements, "arc"), start, partial(
-        stages.accepted_measurements, sightings=METHODS[sightings], ranges=METHODS[ranges]))
+    accept = partial(accepted_measurements, sightings=METHODS[sightings], ranges=METHODS[ranges])
+    return refine(build_problem(measurements, "arc"), start, accept)
 
 
-def compare(seed, kind, methods, markers=True, **options):
+def compare(seed: int, kind: str, methods: tuple, markers: bool = True, **options) -> dict:
     """METHODS for a `kind`, "sightings" or "ranges", on one `drive`, the slip and the arcs given.
 
     Ranges are compared with or without `markers`, sightings without ranges.
@@ -50,37 +58,46 @@ def compare(seed, kind, methods, markers=True, **options):
     any) and "good lost" of the others that keep less than half of their weight.
     """
     dataset, truth = drive(seed, **options)
-    dataset = dataset if markers else dataset.without("aruco")
-    dataset, numbers = dataset if kind == "ranges" else dataset.without("uwb"), {}
-    measurements = measure(replace(dataset, vehicle=replace(
-        dataset.vehicle, slip=TYPICAL_SLIP, marker_noise_factor=1.0, range_noise_factor=1.0)))
-    wrong, start = mislabelled(measurements, truth), rounds(measurements)
+    if not markers:
+        dataset = dataset.without("aruco")
+    if kind == "sightings":
+        dataset = dataset.without("uwb")
+    measurements = measure_with_known_noise(dataset)
+    wrong = mislabelled(measurements, truth)
+    start = rounds(measurements)
+    numbers = {}
     for method in methods:
         fit = solve_with(measurements, start, **{kind: method})
         found = slam_result(fit)
-        numbers |= {f"{method} ate": ate(found.poses, truth.poses),
-                    f"{method} nees": anees(found.poses, found.covariances, truth.poses)}
+        numbers |= judged(method, found.poses, found.covariances, truth.poses)
         if kind == "ranges":
-            error, squared = antenna_error(found, truth)
-            numbers |= {f"{method} antenna error": np.sqrt(np.mean(error**2)),
-                        f"{method} antenna nees": np.mean(squared)}
+            error, nees = antenna_error(found, truth)
+            numbers[f"{method} antenna error"] = np.sqrt(np.mean(error**2))
+            numbers[f"{method} antenna nees"] = nees.mean()
         else:
-            size = np.linalg.norm(stages.residuals(fit.problem, fit.state)[0], axis=1)
-            lost = fit.problem.accepted.sightings.kept(size) < 0.5
-            numbers |= {f"{method} wrong rejected": lost[wrong].mean() if wrong.any() else np.nan,
-                        f"{method} good lost": lost[~wrong].mean()}
+            distance = _mahalanobis(fit.problem, fit.state)
+            lost = fit.problem.accepted.sightings.kept(distance) < 0.5
+            numbers[f"{method} wrong rejected"] = lost[wrong].mean() if wrong.any() else np.nan
+            numbers[f"{method} good lost"] = lost[~wrong].mean()
     return numbers
 
 
-def mislabelled(measurements, truth):
+def mislabelled(measurements: Measurements, truth: Truth) -> np.ndarray:
     """(s,) bool, sightings of a simulated drive that have another marker's label, by its Truth.
 
     False where the Truth does not have the marker.
     """
-    m, known = measurements, np.isin(measurements.marker, truth.marker)
-    true_map = np.full((len(m.marker), 3), np.nan)
-    true_map[known] = truth.marker_in_world[np.searchsorted(truth.marker, m.marker[known])]
-    state = state_from_arrays(m, truth.poses[m.frame], true_map,
-                              np.zeros((len(m.antenna), 2)), m.calibration.stated)
-    residual, _ = stages.residuals(build_problem(m, "arc"), state)
-    return np.sum(residual**2, axis=1) > MIN_MISLABELLED_SQUARED
+    m = measurements
+    known = np.isin(m.marker, truth.marker)
+    row = np.searchsorted(truth.marker, m.marker[known])
+    markers = np.full((len(m.marker), 3), np.nan)
+    markers[known] = truth.marker_in_world[row]
+    antennas = np.zeros((len(m.antenna), 2))
+    state = state_from_arrays(m, truth.poses[m.frame], markers, antennas, m.calibration.stated)
+    return _mahalanobis(build_problem(m, "arc"), state)**2 > MIN_MISLABELLED_SQUARED
+
+
+def _mahalanobis(problem, state):
+    """Distances (s,) of the sightings from those of a State, in their standard deviations."""
+    of_sightings, _ = residuals(problem, state)
+    return np.linalg.norm(of_sightings, axis=1)

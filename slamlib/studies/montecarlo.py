@@ -11,10 +11,11 @@ import numpy as np
 from slamlib import estimate, fuse, fuse_increments, localize
 from slamlib.core import odometry
 from slamlib.core.evaluation import anees, ate, position_sigmas
+from slamlib.core.records import Dataset, Truth
 from slamlib.core.sightings import sightings_by_frame
 from slamlib.robust.fit import refine
 from slamlib.robust.result import slam_result
-from slamlib.studies.simulation import simulate
+from slamlib.studies.simulation import distances, simulate
 
 PROBLEM2_METHODS = {
     "odometry": lambda dataset: odometry.dead_reckoning(dataset.ticks, dataset.vehicle),
@@ -26,13 +27,22 @@ PROBLEM2_METHODS = {
 MEMORY_METHODS = ("markers", "problem 3", "problem 4", "known", "independent")
 
 
-def drive(seed, poses=None, **options):
+def drive(seed: int, poses: int | None = None, **options) -> tuple[Dataset, Truth]:
     """The Dataset and Truth of a simulated drive of the short path, or of its first `poses`."""
     dataset, truth = simulate("short", seed, **options)
-    return (dataset.first(poses or len(dataset.ticks)), replace(truth, poses=truth.poses[:poses]))
+    if poses is None:
+        return dataset, truth
+    return dataset.first(poses), replace(truth, poses=truth.poses[:poses])
 
 
-def problem2_trial(seed, methods=tuple(PROBLEM2_METHODS), **options):
+def judged(name: str, poses: np.ndarray, covariances: np.ndarray, true: np.ndarray,
+           aligned: bool = False) -> dict:
+    """Numbers "nees", the mean, and "ate" in m of poses (n, 3), with a name before each key."""
+    return {f"{name} nees": anees(poses, covariances, true),
+            f"{name} ate": ate(poses, true, aligned)}
+
+
+def problem2_trial(seed: int, methods: tuple = tuple(PROBLEM2_METHODS), **options) -> dict:
     """Methods of problem 2 on one `drive`.
 
     Returns
@@ -41,20 +51,21 @@ def problem2_trial(seed, methods=tuple(PROBLEM2_METHODS), **options):
     (of odometry the ATE only).
     """
     dataset, truth = drive(seed, **options)
-    frame, numbers = sightings_by_frame(dataset.aruco).frame, {}
+    frame = sightings_by_frame(dataset.aruco).frame
+    true = truth.poses[frame]
+    numbers = {}
     for method in methods:
         found = PROBLEM2_METHODS[method](dataset)
         if method == "odometry":
-            numbers["odometry ate"] = ate(found[frame], truth.poses[frame])
-            continue
-        measured = slice(None) if len(found.poses) == len(frame) else frame
-        poses, covariances = found.poses[measured], found.covariances[measured]
-        numbers |= {f"{method} nees": anees(poses, covariances, truth.poses[frame]),
-                    f"{method} ate": ate(poses, truth.poses[frame])}
+            numbers["odometry ate"] = ate(found[frame], true)
+        elif len(found.poses) == len(frame):
+            numbers |= judged(method, found.poses, found.covariances, true)
+        else:
+            numbers |= judged(method, found.poses[frame], found.covariances[frame], true)
     return numbers
 
 
-def ranges_added(seed, share=1.0, **options):
+def ranges_added(seed: int, share: float = 1.0, **options) -> dict:
     """Problems 3 and 4 on one `drive`, with markers over the first `share` of the drive only.
 
     Returns
@@ -64,18 +75,21 @@ def ranges_added(seed, share=1.0, **options):
     "moved", the median distance between the positions of both, over this sigma of each pose.
     """
     dataset, truth = drive(seed, **options)
-    dataset = replace(dataset, aruco=dataset.first(round(share * len(dataset.ticks))).aruco)
+    marker_poses = round(share * len(dataset.ticks))
+    dataset = replace(dataset, aruco=dataset.first(marker_poses).aruco)
     without = estimate(dataset.without("uwb"))
-    solved, numbers = {"without": without, "with": estimate(dataset, previous=without)}, {}
-    for name, found in solved.items():
-        numbers |= {f"ate {name}": ate(found.poses, truth.poses),
-                    f"aligned {name}": ate(found.poses, truth.poses, aligned=True),
-                    f"sigma {name}": np.median(position_sigmas(found.covariances[1:]))}
-    distance = np.hypot(*(solved["with"].poses - without.poses)[1:, :2].T)
-    return numbers | {"moved": np.median(distance / position_sigmas(without.covariances[1:]))}
+    added = estimate(dataset, previous=without)
+    numbers = {}
+    for name, found in (("without", without), ("with", added)):
+        numbers[f"ate {name}"] = ate(found.poses, truth.poses)
+        numbers[f"aligned {name}"] = ate(found.poses, truth.poses, aligned=True)
+        numbers[f"sigma {name}"] = np.median(position_sigmas(found.covariances[1:]))
+    moved = distances(added.poses[1:], without.poses[1:])
+    numbers["moved"] = np.median(moved / position_sigmas(without.covariances[1:]))
+    return numbers
 
 
-def correlated_errors(seed, correlation, **options):
+def correlated_errors(seed: int, correlation: float, **options) -> dict:
     """Problems 2 to 4 on one `drive`; `correlation` is the `memory` of `simulate`.
 
     Returns
@@ -86,36 +100,45 @@ def correlated_errors(seed, correlation, **options):
     of neighbours.
     """
     dataset, truth = drive(seed, memory=correlation, **options)
-    markers, problem3 = localize(dataset.aruco), estimate(dataset.without("uwb"))
-    problem4, numbers = estimate(dataset, previous=problem3), {}
-    problem = problem3.fit.problem
-    known = known_shares(problem.measurements, correlation)
-    known, independent = (slam_result(refine(replace(problem, accepted=problem.accepted.with_shares(
-        [share, np.ones(0)])), problem3.fit.state, accept=None)) for share in (known, known**0))
-    for name, found in zip(MEMORY_METHODS, (markers, problem3, problem4, known, independent)):
-        true = truth.poses[getattr(found, "frame", slice(None))]
-        numbers |= {f"{name} nees": anees(found.poses, found.covariances, true),
-                    f"{name} ate": ate(found.poses, true, aligned=True)}
-    return numbers | {"share": problem3.share.mean(), "residuals": problem3.correlation[0]}
+    markers = localize(dataset.aruco)
+    problem3 = estimate(dataset.without("uwb"))
+    known = known_shares(problem3.fit.problem.measurements, correlation)
+    results = (markers, problem3, estimate(dataset, previous=problem3),
+               _with_shares(problem3.fit, known), _with_shares(problem3.fit, np.ones_like(known)))
+    numbers = {"share": problem3.share.mean(), "residuals": problem3.correlation[0]}
+    for name, found in zip(MEMORY_METHODS, results, strict=True):
+        true = truth.poses[markers.frame] if found is markers else truth.poses
+        numbers |= judged(name, found.poses, found.covariances, true, aligned=True)
+    return numbers
 
 
-def known_shares(measurements, correlation):
+def _with_shares(fit, shares):
+    """The SlamResult where sightings keep these shares (s,) of information, with a Fit's noise."""
+    accepted = fit.problem.accepted.with_shares([shares, np.ones(0)])
+    return slam_result(refine(replace(fit.problem, accepted=accepted), fit.state, accept=None))
+
+
+def known_shares(measurements, correlation: float) -> np.ndarray:
     """Shares (s,) of its information that a sighting keeps, by the true correlation of errors.
 
     The design effect, as in slamlib.robust.error_memory: 1 / (1 + sum of the correlations with the
     errors of all other sightings of its marker), which is `correlation` to the power of the number
     of camera frames between them.
     """
-    g, label = measurements.sightings, measurements.marker_row
-    pose = measurements.frame[g.row]
-    lag = np.abs(pose[:, None] - pose) / np.median(np.diff(np.unique(pose)))
-    same = label[:, None] == label
-    return 1 / np.sum(same * np.where(lag > 0, correlation**lag, 1.0), axis=1)
+    marker = measurements.marker_row
+    pose = measurements.frame[measurements.sightings.row]
+    interval = np.median(np.diff(np.unique(pose)))
+    lag = np.abs(pose[:, None] - pose) / interval
+    same_marker = marker[:, None] == marker
+    correlations = np.where(same_marker, correlation**lag, 0.0)           # 1 with itself
+    return 1 / correlations.sum(axis=1)
 
 
-def antenna_error(found, truth):
+def antenna_error(found, truth: Truth) -> tuple[np.ndarray, np.ndarray]:
     """Distances (a,) in m of a SlamResult's antennas from the truth, and their NEES (a,)."""
-    error = found.antenna_in_world - truth.antenna_in_world[
-        np.searchsorted(truth.antenna, found.antenna)]
-    return np.hypot(*error.T), np.einsum(
-        "ni,nij,nj->n", error, np.linalg.inv(found.antenna_covariance), error)
+    row = np.searchsorted(truth.antenna, found.antenna)
+    true = truth.antenna_in_world[row]
+    error = found.antenna_in_world - true
+    information = np.linalg.inv(found.antenna_covariance)
+    nees = np.einsum("ni,nij,nj->n", error, information, error)
+    return distances(found.antenna_in_world, true), nees

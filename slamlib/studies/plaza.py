@@ -15,77 +15,92 @@ GPS. Some differences from the assignment are resolved as follows:
 
 import gtsam
 import numpy as np
+import pandas as pd
 from scipy.io import loadmat
 
 from slamlib.core import se2
+from slamlib.core.odometry import cumulative
 from slamlib.core.records import AntennaGuess, Dataset, Truth, UwbReadings
 from slamlib.core.vehicle import Vehicle
+from slamlib.studies.simulation import distances
 
 COUNT = 1e-4                # m, travel of a wheel in one count
-RADIUS, BASE = 0.2, 0.8     # m, nominal wheel radius and wheelbase
+RADIUS = 0.2                # m, nominal
+BASE = 0.8                  # m, nominal wheelbase
 WHEEL_SIGMA = 0.02          # standard deviation of the wheel parameters, relative to their value
 STANDING = 0.2              # m, what odometry travels while the mower stands
 BEACON_GUESS_SIGMA = 2.0    # m, standard deviation of the guessed beacons on each axis
 
 
-def read_plaza2(seed=0):
+def read_plaza2(seed: int = 0) -> tuple[Dataset, Truth]:
     """Plaza 2 as a Dataset with ranges and without markers, and its Truth.
 
     The Truth is in the frame of pose 1. The log has no antenna guess; `seed` is of its errors.
     """
-    _, sigma = ranges_over_distances(1)
     path, increments, ranges, beacons = _load(2)
-    begin = np.argmax(np.cumsum(np.abs(increments[:, 1])) > STANDING)
-    path, increments = path[begin:], increments[begin:]
-    ranges = ranges[ranges[:, 0] >= path[0, 0]]
-    travel, turn = increments[:, 1], increments[:, 2]
-    wheels = np.stack([travel + BASE / 2 * turn, travel - BASE / 2 * turn], -1)
-    total = np.cumsum(np.concatenate([np.zeros((1, 2)), wheels]), axis=0)
-    ticks = np.diff(np.rint(total / COUNT).astype(int), axis=0, prepend=np.zeros((1, 2), int))
+    begin = np.argmax(increments.travel.abs().cumsum() > STANDING)
+    path = path[begin:]
+    ranges = ranges[ranges.time >= path.time.iloc[0]]
     vehicle = Vehicle(
         right_radius=RADIUS, left_radius=RADIUS, wheelbase=BASE,
         ticks_per_revolution=2 * np.pi * RADIUS / COUNT, sigma_right_radius=WHEEL_SIGMA * RADIUS,
         sigma_left_radius=WHEEL_SIGMA * RADIUS, sigma_wheelbase=WHEEL_SIGMA * BASE)
 
-    pose = _nearest(path[:, 0], ranges[:, 0])
-    uwb = UwbReadings(pose, ranges[:, 2].astype(int), ranges[:, 3],
-                      np.full(len(ranges), sigma)).select(np.argsort(pose, kind="stable"))
-    poses = path[:, 1:4] + [0, 0, np.pi]
-    beacons = beacons[np.argsort(beacons[:, 0])]
-    antenna = beacons[:, 0].astype(int)
-    place = se2.between(poses[0], beacons[:, 1:3] @ np.eye(2, 3))[:, :2]
-    guess = place + BEACON_GUESS_SIGMA * np.random.default_rng(seed).standard_normal(place.shape)
-    poses = se2.between(poses[0], poses)
+    pose = _nearest(path, ranges)
+    _, sigma = ranges_over_distances(1)
+    uwb = UwbReadings(pose, ranges.beacon.to_numpy(int), ranges.range.to_numpy(),
+                      np.full(len(ranges), sigma))
+    uwb = uwb.select(np.argsort(pose, kind="stable"))
+
+    antenna = beacons.index.to_numpy(int)
+    poses = path[["x", "y", "heading"]] + [0, 0, np.pi]
+    world = poses.iloc[0]
+    poses = se2.between(world, poses)
     poses[:, 2] = np.unwrap(poses[:, 2])
-    return (Dataset(name="Plaza 2", vehicle=vehicle, ticks=ticks, aruco=None, uwb=uwb,
-                    antenna_guess=AntennaGuess(antenna, guess)),
-            Truth(poses=poses, marker=np.zeros(0, int), marker_in_world=np.zeros((0, 3)),
-                  antenna=antenna, antenna_in_world=place, vehicle=vehicle))
+    place = se2.between(world, np.pad(beacons, ((0, 0), (0, 1))))[:, :2]
+    error = BEACON_GUESS_SIGMA * np.random.default_rng(seed).standard_normal(place.shape)
+    dataset = Dataset("Plaza 2", vehicle, _ticks(increments[begin:]), aruco=None, uwb=uwb,
+                      antenna_guess=AntennaGuess(antenna, place + error))
+    truth = Truth(poses, marker=np.zeros(0, int), marker_in_world=np.zeros((0, 3)),
+                  antenna=antenna, antenna_in_world=place, vehicle=vehicle)
+    return dataset, truth
 
 
-def ranges_over_distances(number):
+def _ticks(increments):
+    """Counts (n, 2) of the right and left wheel, from increments of distance and heading."""
+    half_turn = BASE / 2 * increments.turn
+    right = increments.travel + half_turn
+    left = increments.travel - half_turn
+    travelled = cumulative(np.column_stack([right, left]))
+    total = np.rint(travelled / COUNT).astype(int)
+    return np.diff(total, axis=0, prepend=total[:1])
+
+
+def ranges_over_distances(number: int) -> tuple[float, float]:
     """Factor of measured over true ranges and their standard deviation in m, of a log, by medians.
 
     From the truth of Plaza 1 or 2.
     """
     path, _, ranges, beacons = _load(number)
-    place = np.array([beacons[beacons[:, 0] == beacon, 1:3][0] for beacon in ranges[:, 2]])
-    distance = np.hypot(*(path[_nearest(path[:, 0], ranges[:, 0]), 1:3] - place).T)
-    scale = np.median(ranges[:, 3] / distance)
-    off = ranges[:, 3] - scale * distance
-    return scale, 1.4826 * np.median(np.abs(off - np.median(off)))
+    position = path[["x", "y"]].to_numpy()[_nearest(path, ranges)]
+    distance = distances(position, beacons.loc[ranges.beacon].to_numpy())
+    scale = np.median(ranges.range / distance)
+    residual = ranges.range - scale * distance
+    deviation = np.abs(residual - np.median(residual))
+    return scale, 1.4826 * np.median(deviation)
 
 
 def _load(number):
-    """The arrays of a log, with a row for each reading; lengths in m, angles in rad, times in s.
-
-    Path [t, x, y, heading], increments [t, travel, turn], ranges [t, -, beacon, range] and beacons
-    [id, x, y].
-    """
+    """The tables of a log, with a row for each reading; lengths in m, angles in rad, times in s."""
     content = loadmat(gtsam.findExampleDataFile(f"Plaza{number}_.mat"))
-    return content["GT"], content["DR"], content["TD"], content["TL"]
+    path = pd.DataFrame(content["GT"], columns=["time", "x", "y", "heading"])
+    increments = pd.DataFrame(content["DR"], columns=["time", "travel", "turn"])
+    ranges = pd.DataFrame(content["TD"], columns=["time", "tag", "beacon", "range"])
+    beacons = pd.DataFrame(content["TL"], columns=["beacon", "x", "y"])
+    return path, increments, ranges, beacons.set_index("beacon").sort_index()
 
 
-def _nearest(times, wanted):
-    """Indices (m,) of the ascending times (n,) nearest to the wanted ones (m,)."""
-    return np.searchsorted((times[1:] + times[:-1]) / 2, wanted)
+def _nearest(path, ranges):
+    """Rows (m,) of the path that are nearest in time to each of the ranges."""
+    time = path.time.to_numpy()
+    return np.searchsorted((time[1:] + time[:-1]) / 2, ranges.time)

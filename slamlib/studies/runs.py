@@ -11,6 +11,7 @@ import hashlib
 import os
 import platform
 import warnings
+from collections.abc import Callable, Iterable
 from importlib.metadata import version
 from pathlib import Path
 
@@ -27,7 +28,7 @@ KEPT = 200                                 # number of studies that are kept, th
 BAR_AFTER = 5.0                            # s, duration of a study from which on it shows a bar
 
 
-def run(trial, seeds, **options):
+def run(trial: Callable, seeds: Iterable[int], **options) -> pd.DataFrame:
     """DataFrame of what trial(seed, **options) returns, a dict, with one row for each seed.
 
     Parameters
@@ -35,10 +36,13 @@ def run(trial, seeds, **options):
     trial : function; if it is of a module in slamlib.studies, the study is kept.
     seeds : iterable of int.
     """
-    seeds = list(seeds)[:int(os.environ.get("SLAMLIB_SEEDS", 0)) or None]
+    most = int(os.environ.get("SLAMLIB_SEEDS", 0)) or None
+    seeds = list(seeds)[:most]
     name = f"{trial.__module__}.{trial.__name__}"
-    kept = name.startswith(f"{__package__}.") and code_digest() == CODE_DIGEST  # not edited since
-    memory = Memory(os.environ.get("SLAMLIB_STUDIES") if kept else None, verbose=0, compress=True)
+    folder = None
+    if name.startswith(f"{__package__}.") and code_digest() == CODE_DIGEST:    # not edited since
+        folder = os.environ.get("SLAMLIB_STUDIES")
+    memory = Memory(folder, verbose=0, compress=True)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Exception while loading results")    # computed again
         rows = memory.cache(_rows, ignore=["trial"])(trial, name, seeds, options, CODE_DIGEST)
@@ -51,27 +55,28 @@ def _rows(trial, name, seeds, options, code):
     # A build executes several notebooks at a time, and kills their kernels, after which further
     # processes would wait for minutes.
     in_build = "SLAMLIB_RESULTS" in os.environ
+    processes = Parallel(1 if in_build else -1)
     bar = tqdm(seeds, desc=trial.__name__, leave=False, delay=BAR_AFTER, disable=in_build)
-    return Parallel(1 if in_build else -1)(delayed(trial)(seed, **options) for seed in bar)
+    return processes(delayed(trial)(seed, **options) for seed in bar)
 
 
-def code_digest():
+def code_digest() -> str:
     """Digest (str) of what all studies depend on: the current slamlib, Python and packages."""
-    return digest(repr([
-        platform.python_version(), platform.platform(),
-        [version(package) for package in NUMERIC_PACKAGES],
-        [(str(file.relative_to(SLAMLIB)), digest(file.read_bytes()))
-         for file in modules(*PAGE_PACKAGES)]]).encode())
+    packages = [version(package) for package in NUMERIC_PACKAGES]
+    files = [(str(file.relative_to(SLAMLIB)), digest(file.read_bytes()))
+             for file in modules(*PAGE_PACKAGES)]
+    state = [platform.python_version(), platform.platform(), packages, files]
+    return digest(repr(state).encode())
 
 
-def modules(*without):
+def modules(*without: str) -> list[Path]:
     """Paths of slamlib's modules and styles, except __main__ and the packages `without` (str)."""
     return sorted(file for file in SLAMLIB.rglob("*")
                   if file.suffix in (".py", ".mplstyle") and file.name != "__main__.py"
                   and file.relative_to(SLAMLIB).parts[0] not in without)
 
 
-def digest(content):
+def digest(content: bytes) -> str:
     """The SHA-256 of bytes, in hexadecimal digits."""
     return hashlib.sha256(content).hexdigest()
 

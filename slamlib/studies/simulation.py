@@ -8,9 +8,9 @@ ranges to the antennas within reach. Both have a lower rate than the encoders.
 """
 
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 
@@ -18,26 +18,46 @@ from slamlib.core import se2
 from slamlib.core.errors import require
 from slamlib.core.odometry import cumulative, dead_reckoning
 from slamlib.core.records import AntennaGuess, ArucoReadings, Dataset, Truth, UwbReadings
-from slamlib.core.vehicle import TABLE_2
+from slamlib.core.vehicle import TABLE_2, Vehicle
 
-# A path is a sum of rotating vectors (turns per round, radius in m, phase in rad). `marker_spacing`
-# is in m; no markers are in a disc with its centre at a fraction of the path and its radius in m.
+
+@dataclass(frozen=True)
+class Layout:
+    """A closed path, a sum of rotating vectors, with its markers, antennas and rates."""
+
+    turns: tuple                 # of each vector in one round
+    radii: tuple                 # m, lengths of the vectors
+    phases: tuple                # rad
+    poses: int                   # in one round
+    aruco_every: int             # poses from one camera frame to the next
+    marker_spacing: float        # m
+    gap_place: float             # fraction of the path, centre of a disc without markers
+    gap_radius: float            # m, of this disc
+    uwb_every: int               # poses from one set of ranges to the next
+    antennas: int
+
+
 PATHS = {
-    "short": SimpleNamespace(
-        vectors=((1, 2.9, 0.0), (-1, 0.9, 0.3), (2, 0.7, 2.0), (3, 0.2, 1.0)), poses=2000,
-        aruco_every=10, marker_spacing=1.5, markers_missing=(0.0, 0.0), uwb_every=20, antennas=4),
-    "long": SimpleNamespace(
-        vectors=((4, 8.9, 0.0), (-3, 3.9, 0.5), (1, 3.3, 1.0)), poses=23000,
-        aruco_every=12, marker_spacing=1.9, markers_missing=(0.42, 3.5), uwb_every=25, antennas=8),
+    "short": Layout(
+        turns=(1, -1, 2, 3), radii=(2.9, 0.9, 0.7, 0.2), phases=(0.0, 0.3, 2.0, 1.0), poses=2000,
+        aruco_every=10, marker_spacing=1.5, gap_place=0.0, gap_radius=0.0, uwb_every=20,
+        antennas=4),
+    "long": Layout(
+        turns=(4, -3, 1), radii=(8.9, 3.9, 3.3), phases=(0.0, 0.5, 1.0), poses=23000,
+        aruco_every=12, marker_spacing=1.9, gap_place=0.42, gap_radius=3.5, uwb_every=25,
+        antennas=8),
 }
 CAMERA_REACH = 1.8      # m, largest distance in the plane at which a marker is in the image
 UWB_REACH = 15.0        # m, largest distance to an antenna that is measured
 LATE_RANGE_MEAN = 0.8   # m, mean of the exponential excess of late ranges
 SIMULATED_GUESS_SIGMA = 0.35   # m per axis, standard deviation of the antenna guesses
+SPEED_SWING = 0.15      # largest deviation of the speed from its mean, over the mean
+SPEED_PERIODS = 5       # of the speed, in the whole drive
 
 
-def simulate(path="short", seed=0, *, slip=1e-3, late_ranges=0.0, mislabelled=0.0, memory=0.0,
-             rounds=1, noise=True, vehicle=TABLE_2):
+def simulate(path: str = "short", seed: int = 0, *, slip: float = 1e-3, late_ranges: float = 0.0,
+             mislabelled: float = 0.0, memory: float = 0.0, rounds: int = 1, noise: bool = True,
+             vehicle: Vehicle = TABLE_2) -> tuple[Dataset, Truth]:
     """A simulated dataset and its truth.
 
     Parameters
@@ -61,187 +81,263 @@ def simulate(path="short", seed=0, *, slip=1e-3, late_ranges=0.0, mislabelled=0.
     >>> dataset.ticks.shape, truth.poses.shape
     ((2000, 2), (2000, 3))
     """
-    shares = slip, late_ranges, mislabelled
-    require(path in PATHS and seed >= 0 and rounds >= 1 and all(0 <= each <= 1 for each in shares),
-            "simulate", f"one of the paths {', '.join(PATHS)}, a seed from 0 on, rounds from 1 on, "
-            "slip and shares from 0 to 1")
+    shares_hold = all(0 <= share <= 1 for share in (slip, late_ranges, mislabelled))
+    require(path in PATHS and seed >= 0 and rounds >= 1 and shares_hold, "simulate",
+            f"one of the paths {', '.join(PATHS)}, a seed from 0 on, rounds from 1 on, slip and "
+            "shares from 0 to 1")
     layout = PATHS[path]
     rng = np.random.default_rng(seed)
-    true_vehicle = vehicle.with_wheel(vehicle.wheel + noise * rng.normal(0, vehicle.sigma_wheel))
-    counts = _counts(*_driven_arcs(layout, rounds), true_vehicle)
+    noise_scale = 1.0 if noise else 0.0
+
+    wheel_error = noise_scale * rng.normal(0, vehicle.sigma_wheel)
+    true_vehicle = vehicle.with_wheel(vehicle.wheel + wheel_error)
+    ds, dtheta = _driven_arcs(layout, rounds)
+    counts = _counts(ds, dtheta, true_vehicle)
     poses = dead_reckoning(counts, true_vehicle, model="arc")
-    whole = _encoder(counts, true_vehicle, slip, rng)
+    whole_counts = _encoder(counts, true_vehicle, slip, rng)
+
     marker, marker_in_world = _place_markers(layout, poses, rng)
-    antenna, antenna_in_world = _place_antennas(layout, poses, rng)
-    aruco = _camera(poses, marker, marker_in_world, layout.aruco_every, mislabelled, memory,
-                    noise, rng)
-    uwb = _uwb(poses, antenna, antenna_in_world, layout.uwb_every, late_ranges, noise, rng)
-    offset = SIMULATED_GUESS_SIGMA * rng.standard_normal(antenna_in_world.shape)
-    guess = AntennaGuess(antenna, antenna_in_world + noise * offset)
-    return (Dataset(name=path, vehicle=vehicle, ticks=whole if noise else counts, aruco=aruco,
-                    uwb=uwb, antenna_guess=guess),
-            Truth(poses=poses, marker=marker, marker_in_world=marker_in_world, antenna=antenna,
-                  antenna_in_world=antenna_in_world, vehicle=true_vehicle))
+    antenna, antenna_in_world = _place_antennas(layout.antennas, poses, rng)
+    truth = Truth(poses, marker, marker_in_world, antenna, antenna_in_world, true_vehicle)
+
+    aruco = _camera(truth, layout.aruco_every, mislabelled, memory, noise_scale, rng)
+    uwb = _uwb(truth, layout.uwb_every, late_ranges, noise_scale, rng)
+    guess_error = SIMULATED_GUESS_SIGMA * rng.standard_normal(antenna_in_world.shape)
+    guess = AntennaGuess(antenna, antenna_in_world + noise_scale * guess_error)
+    ticks = whole_counts if noise else counts
+    return Dataset(path, vehicle, ticks, aruco, uwb, guess), truth
 
 
-def misguess(dataset, position, error, seed):
+def misguess(dataset: Dataset, position: np.ndarray, error: float, seed: int) -> Dataset:
     """The Dataset with antenna guesses `error` m from `position` (a, 2), in random directions.
 
     `position` has the antennas of the guesses in the same order. `seed` is of the random generator.
     """
-    angle = np.random.default_rng(seed).uniform(-np.pi, np.pi, len(position))
-    off = error * np.stack([np.cos(angle), np.sin(angle)], -1)
-    return replace(dataset, antenna_guess=replace(dataset.antenna_guess, position=position + off))
+    rng = np.random.default_rng(seed)
+    angle = rng.uniform(-np.pi, np.pi, len(position))
+    guess = replace(dataset.antenna_guess, position=position + error * _direction(angle))
+    return replace(dataset, antenna_guess=guess)
 
 
-def mislabel(dataset, fraction, seed):
+def mislabel(dataset: Dataset, fraction: float, seed: int) -> Dataset:
     """The Dataset with another marker's id at a fraction of its sightings; `seed` as above."""
     ids, label = np.unique(dataset.aruco.marker, return_inverse=True)
-    label = _relabelled(label, len(ids), fraction, np.random.default_rng(seed))
-    return replace(dataset, aruco=replace(dataset.aruco, marker=ids[label]))
+    read_as = _relabelled(label, len(ids), fraction, np.random.default_rng(seed))
+    return replace(dataset, aruco=replace(dataset.aruco, marker=ids[read_as]))
 
 
-def manoeuvre(legs, vehicle=TABLE_2):
+def manoeuvre(legs: list[tuple[float, float]], vehicle: Vehicle = TABLE_2) -> np.ndarray:
     """Counts (n, 2) of the right and left wheel in a drive in arcs, with fractions, without noise.
 
     `legs` lists (m, rad), length and turn of each arc; negative lengths are driven backwards. A
     step is at most 1 cm long, or turns a wheel by as much about the middle. Row 0 is zero.
     """
     legs = np.asarray(legs, dtype=float)
-    steps = np.ceil(np.abs(legs * [1, vehicle.wheelbase / 2]).max(axis=1) / 0.01).astype(int)
-    return _counts(*np.repeat(legs / steps[:, None], steps, axis=0).T, vehicle)
+    travel = np.abs(legs * [1, vehicle.wheelbase / 2])     # m, of the middle; of a wheel about it
+    steps = np.ceil(travel.max(axis=1) / 0.01).astype(int)
+    arcs = np.repeat(legs / steps[:, None], steps, axis=0)
+    return _counts(arcs[:, 0], arcs[:, 1], vehicle)
 
 
-def write_dataset(folder, dataset, truth=None):
+def write_dataset(folder: str | Path, dataset: Dataset, truth: Truth | None = None) -> None:
     """Write a Dataset, and its Truth if given, as the assignment's text files.
 
     Raises DatasetError if the folder exists and is not empty.
     """
     folder = Path(folder)
-    require(not folder.exists() or folder.is_dir() and not any(folder.iterdir()), folder,
-            "a new or empty folder to write the dataset to")
-    a, u, guess = dataset.aruco, dataset.uwb, dataset.antenna_guess
-    number = np.arange(1, len(dataset.ticks) + 1)
-    tables = {"encoderReading": ("%d %d %d", number, *dataset.ticks.T)}
-    if a is not None:
-        tables["ArucoReading"] = ("%d %d %.5f %.5f %.5f" + 6 * " %.4e", a.pose + 1, a.marker,
-                                  *a.marker_in_vehicle.T, *a.covariance[:, *np.triu_indices(3)].T)
-    if u is not None:
-        tables["UwbReading"] = "%d %d %.4f %.4f", u.pose + 1, u.antenna, u.range, u.sigma
-        tables["UwbAntennaGuess"] = "%d %.3f %.3f", guess.antenna, *guess.position.T
-    if truth is not None:
-        pose = "%d %.6f %.6f %.6f"
-        tables |= {"truth/vehiclePose": (pose, number, *truth.poses.T),
-                   "truth/ArucoMap": (pose, truth.marker, *truth.marker_in_world.T),
-                   "truth/UwbMap": ("%d %.6f %.6f", truth.antenna, *truth.antenna_in_world.T)}
-    (folder if truth is None else folder / "truth").mkdir(parents=True, exist_ok=True)
+    empty = folder.is_dir() and not any(folder.iterdir())
+    require(empty or not folder.exists(), folder, "a new or empty folder to write the dataset to")
+    folder.mkdir(parents=True, exist_ok=True)
     if dataset.vehicle != TABLE_2:
-        _write_vehicle(folder / "vehicle.toml", dataset.vehicle)
+        _write_vehicle(folder, dataset.vehicle)
+    number = np.arange(1, len(dataset.ticks) + 1)
+    _write_table(folder / "encoderReading.txt", "%d %d %d", number, dataset.ticks)
+    aruco = dataset.aruco
+    if aruco is not None:
+        row, column = np.triu_indices(3)
+        _write_table(folder / "ArucoReading.txt", "%d %d %.5f %.5f %.5f" + 6 * " %.4e",
+                     aruco.pose + 1, aruco.marker, aruco.marker_in_vehicle,
+                     aruco.covariance[:, row, column])
+    uwb = dataset.uwb
+    if uwb is not None:
+        guess = dataset.antenna_guess
+        _write_table(folder / "UwbReading.txt", "%d %d %.4f %.4f",
+                     uwb.pose + 1, uwb.antenna, uwb.range, uwb.sigma)
+        _write_table(folder / "UwbAntennaGuess.txt", "%d %.3f %.3f", guess.antenna, guess.position)
     if truth is not None:
-        _write_vehicle(folder / "truth" / "vehicle.toml", truth.vehicle)
-    for name, (fmt, *columns) in tables.items():
-        with open(folder / f"{name}.txt", "wb") as file:        # the same line ends everywhere
-            np.savetxt(file, np.column_stack(columns), fmt=fmt)
+        folder = folder / "truth"
+        folder.mkdir()
+        _write_vehicle(folder, truth.vehicle)
+        pose = "%d %.6f %.6f %.6f"
+        _write_table(folder / "vehiclePose.txt", pose, number, truth.poses)
+        _write_table(folder / "ArucoMap.txt", pose, truth.marker, truth.marker_in_world)
+        _write_table(folder / "UwbMap.txt", "%d %.6f %.6f", truth.antenna, truth.antenna_in_world)
 
 
-def _write_vehicle(path, vehicle):
-    """Write the eight entries of the wheels, and of all others those that differ from table 2."""
-    lines = [f"{name} = {json.dumps(value)}\n" for row, (name, value) in enumerate(
-        vars(vehicle).items()) if row < 8 or value != getattr(TABLE_2, name)]
-    path.write_text("".join(lines), encoding="utf-8", newline="\n")
+def _write_table(path, row_format, *columns):
+    """Write columns, arrays (n,) or (n, c), with line ends that are the same on all systems."""
+    with open(path, "wb") as file:
+        np.savetxt(file, np.column_stack(columns), fmt=row_format)
+
+
+def _write_vehicle(folder, vehicle):
+    """Write vehicle.toml: eight entries of the wheels, and others where they are not of table 2."""
+    entries = vars(vehicle)
+    of_wheels = list(entries)[:8]
+    text = ""
+    for name, value in entries.items():
+        if name in of_wheels or value != getattr(TABLE_2, name):
+            text += f"{name} = {json.dumps(value)}\n"
+    (folder / "vehicle.toml").write_text(text, encoding="utf-8", newline="\n")
 
 
 def _driven_arcs(layout, rounds):
-    """Lengths (n-1,) in m and turns (n-1,) in rad of the arcs of the path, at varying speed."""
-    turns, radius, phase = np.array(layout.vectors).T[:, :, None]
+    """Lengths (n-1,) in m and turns (n-1,) in rad of the arcs of the path, at varying speed.
 
-    def velocity(u):
-        return np.sum(1j * radius * turns * np.exp(1j * (turns * u + phase)), axis=0)
+    With s the angle that parametrises a round, the path is the sum of r exp(i (t s + p)) over the
+    vectors with turns t, radii r and phases p.
+    """
+    turns, radii, phases = np.array([layout.turns, layout.radii, layout.phases])[:, :, None]
+    amplitudes = 1j * radii * turns
 
-    fine = np.linspace(0, 2 * np.pi * rounds, 200 * layout.poses // 20 * rounds + 1)
-    speed, middle = abs(velocity(fine)), abs(velocity((fine[1:] + fine[:-1]) / 2))
-    length = cumulative((speed[1:] + 4 * middle + speed[:-1]) / 6) * fine[1]         # Simpson
+    def velocity(s):
+        return np.sum(amplitudes * np.exp(1j * (turns * s + phases)), axis=0)
+
+    fine = np.linspace(0, 2 * np.pi * rounds, 10 * layout.poses * rounds + 1)
+    middle = (fine[1:] + fine[:-1]) / 2
+    speed = np.abs(velocity(fine))
+    middle_speed = np.abs(velocity(middle))
+    simpson = (speed[1:] + 4 * middle_speed + speed[:-1]) / 6
+    length = cumulative(simpson) * fine[1]
+
     time = np.linspace(0, 1, layout.poses * rounds)
-    travelled = length[-1] * (time - 0.15 * np.sin(2 * np.pi * 5 * time) / (2 * np.pi * 5))
-    direction = np.angle(velocity(np.interp(travelled, length, fine)))
-    return np.diff(travelled), np.diff(np.unwrap(direction))
+    frequency = 2 * np.pi * SPEED_PERIODS
+    travelled = length[-1] * (time - SPEED_SWING * np.sin(frequency * time) / frequency)
+    s = np.interp(travelled, length, fine)
+    heading = np.unwrap(np.angle(velocity(s)))
+    return np.diff(travelled), np.diff(heading)
 
 
 def _counts(ds, dtheta, vehicle):
     """Counts (n, 2), right and left, with fractions, on arcs of length ds and turn dtheta."""
     half_turn = vehicle.wheelbase * dtheta / 2
-    travel = np.pad(np.stack([ds + half_turn, ds - half_turn], -1), ((1, 0), (0, 0)))
+    steps = np.stack([ds + half_turn, ds - half_turn], axis=-1)
+    travel = np.pad(steps, ((1, 0), (0, 0)))
     return travel * vehicle.ticks_per_revolution / (2 * np.pi * vehicle.wheel[:2])
 
 
 def _encoder(counts, vehicle, slip, rng):
     """Whole counts (n, 2) of an encoder on wheels that slip, of counts with fractions."""
-    length = 2 * np.pi * vehicle.wheel[:2] / vehicle.ticks_per_revolution      # m, of a count
-    slipped = counts[1:] + slip * np.sqrt(abs(counts[1:]) / length) * rng.standard_normal(
-        counts[1:].shape)
-    total = np.floor(np.cumsum(slipped, axis=0) + rng.uniform(size=2)).astype(np.int64)
-    return np.diff(total, axis=0, prepend=[[0, 0], [0, 0]])
+    steps = counts[1:]
+    count_length = 2 * np.pi * vehicle.wheel[:2] / vehicle.ticks_per_revolution     # m
+    sigma = slip * np.sqrt(np.abs(steps) / count_length)                        # of the counts
+    slipped = steps + sigma * rng.standard_normal(steps.shape)
+    first_fraction = rng.uniform(size=2)
+    total = np.floor(np.cumsum(slipped, axis=0) + first_fraction).astype(np.int64)
+    return np.diff(total, axis=0, prepend=np.zeros((2, 2), np.int64))
 
 
 def _place_markers(layout, poses, rng):
     """Ids (k,) and poses (k, 3) of markers on a jittered grid over the driven area."""
-    low, high = poses[:, :2].min(0) - CAMERA_REACH, poses[:, :2].max(0) + CAMERA_REACH
-    axes = (np.arange(*ends, layout.marker_spacing) for ends in zip(low, high))
-    grid = np.stack(np.meshgrid(*axes), -1).reshape(-1, 2)
-    grid += layout.marker_spacing * rng.uniform(-0.35, 0.35, grid.shape)
-    visible = np.array([np.hypot(*(poses[::10, :2] - p).T).min() < CAMERA_REACH for p in grid])
-    fraction, radius = layout.markers_missing
-    centre = poses[int(fraction * len(poses)), :2]
-    grid = grid[visible & (np.hypot(*(grid - centre).T) > radius)]
-    ids = np.sort(rng.choice(np.arange(1, max(250, len(grid) + 1)), len(grid), replace=False))
-    order = rng.permutation(len(grid))
-    return ids, np.column_stack([grid[order], rng.uniform(-np.pi, np.pi, len(grid))])
+    spacing = layout.marker_spacing
+    path = poses[:, :2]
+    low = path.min(axis=0) - CAMERA_REACH
+    high = path.max(axis=0) + CAMERA_REACH
+    x = np.arange(low[0], high[0], spacing)
+    y = np.arange(low[1], high[1], spacing)
+    place = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    place += spacing * rng.uniform(-0.35, 0.35, place.shape)
+
+    visible = [distances(path[::10], each).min() < CAMERA_REACH for each in place]
+    gap = path[int(layout.gap_place * len(path))]
+    outside_gap = distances(place, gap) > layout.gap_radius
+    place = place[visible & outside_gap]
+
+    count = len(place)
+    ids = np.sort(rng.choice(np.arange(1, max(250, count + 1)), count, replace=False))
+    order = rng.permutation(count)
+    heading = rng.uniform(-np.pi, np.pi, count)
+    return ids, np.column_stack([place[order], heading])
 
 
-def _place_antennas(layout, poses, rng):
+def _place_antennas(count, poses, rng):
     """Ids (a,) and positions (a, 2) of antennas on an ellipse around the driven area."""
-    low, high, count = poses[:, :2].min(0), poses[:, :2].max(0), layout.antennas
-    angle = 2 * np.pi * (np.arange(count) + rng.uniform(-0.2, 0.2, count)) / count + np.pi / 4
-    direction = np.stack([np.cos(angle), np.sin(angle)], -1)
-    position = (low + high) / 2 + (0.6 * (high - low) + 1.0) * direction
+    low = poses[:, :2].min(axis=0)
+    high = poses[:, :2].max(axis=0)
+    sector = np.arange(count) + rng.uniform(-0.2, 0.2, count)
+    angle = 2 * np.pi * sector / count + np.pi / 4
+    half_axes = 0.6 * (high - low) + 1.0
+    position = (low + high) / 2 + half_axes * _direction(angle)
     ids = np.sort(rng.choice(np.arange(1, 60), count, replace=False))
     return ids, position[rng.permutation(count)]
 
 
-def _camera(poses, marker, marker_in_world, every, mislabelled, memory, noise, rng):
+def _camera(truth, every, mislabelled, memory, noise_scale, rng):
     """Sightings of all markers in the disc of CAMERA_REACH around every `every`-th pose."""
-    frames = np.arange(0, len(poses), every)
-    in_vehicle = se2.between(poses[frames, None], marker_in_world)
+    frames = np.arange(0, len(truth.poses), every)
+    in_vehicle = se2.between(truth.poses[frames, None], truth.marker_in_world)
     distance = np.hypot(in_vehicle[..., 0], in_vehicle[..., 1])
-    frame, which = np.nonzero(distance < CAMERA_REACH)
-    z, correlation = in_vehicle[frame, which], [[1, 0, 0], [0, 1, 0.4], [0, 0.4, 1]]
-    sigma = [4e-3, 3e-3, 4e-3] + distance[frame, which, None] * [5e-3, 3e-3, 3e-3]
-    covariance = se2.rotate_covariance(                     # most along the line of sight
-        sigma[:, :, None] * correlation * sigma[:, None], np.arctan2(z[:, 1], z[:, 0]))
-    error = rng.standard_normal(z.shape)
-    order = np.lexsort((frame, which))
-    for last, k in zip(order, order[1:]):
-        kept = memory**(frame[k] - frame[last]) if which[k] == which[last] else 0.0
-        error[k] = kept * error[last] + np.sqrt(1 - kept**2) * error[k]
-    z = z + noise * (np.linalg.cholesky(covariance) @ error[..., None])[..., 0]
+    frame, marker = np.nonzero(distance < CAMERA_REACH)
+    true_z = in_vehicle[frame, marker]
+    covariance = _sighting_covariance(true_z, distance[frame, marker])
+    unit_error = _correlated(rng.standard_normal(true_z.shape), frame, marker, memory)
+    error = np.linalg.cholesky(covariance) @ unit_error[..., None]
+    z = true_z + noise_scale * error[..., 0]
     z[:, 2] = se2.wrap(z[:, 2])
-    marker = marker[_relabelled(which, len(marker), mislabelled, rng)]
-    return ArucoReadings(frames[frame], marker, z, covariance)
+    read_as = _relabelled(marker, len(truth.marker), mislabelled, rng)
+    return ArucoReadings(frames[frame], truth.marker[read_as], z, covariance)
+
+
+def _sighting_covariance(z, distance):
+    """Covariances (m, 3, 3) of sightings z (m, 3), which err most along the line of sight."""
+    correlation = [[1, 0, 0], [0, 1, 0.4], [0, 0.4, 1]]
+    sigma = [4e-3, 3e-3, 4e-3] + distance[:, None] * [5e-3, 3e-3, 3e-3]
+    along_sight = sigma[:, :, None] * correlation * sigma[:, None]
+    return se2.rotate_covariance(along_sight, np.arctan2(z[:, 1], z[:, 0]))
+
+
+def _correlated(error, frame, marker, memory):
+    """Errors (m, 3) of unit variance, those of a marker correlated by `memory` a camera frame.
+
+    A Gauss-Markov process made of independent errors (m, 3): e' = rho e + sqrt(1 - rho^2) error.
+    """
+    found = error.copy()
+    order = np.lexsort((frame, marker))
+    for last, k in pairwise(order):
+        if marker[k] == marker[last]:
+            rho = memory**(frame[k] - frame[last])
+            found[k] = rho * found[last] + np.sqrt(1 - rho**2) * error[k]
+    return found
 
 
 def _relabelled(label, count, fraction, rng):
     """The labels (m,), numbers below `count`, with another one at a fraction of them."""
     wrong = rng.uniform(size=len(label)) < fraction
-    return np.where(wrong, (label + rng.integers(1, max(2, count), len(label))) % count, label)
+    shift = rng.integers(1, max(2, count), len(label))
+    return np.where(wrong, (label + shift) % count, label)
 
 
-def _uwb(poses, antenna, antenna_in_world, every, late_ranges, noise, rng):
+def _uwb(truth, every, late_ranges, noise_scale, rng):
     """Ranges to all antennas within UWB_REACH of every `every`-th pose, some of them late."""
-    frames = np.arange(every // 2, len(poses), every)
-    distance = np.hypot(*(poses[frames, None, :2] - antenna_in_world).transpose(2, 0, 1))
-    frame, which = np.nonzero(distance < UWB_REACH)
-    r = distance[frame, which]
-    sigma, late = 0.05 + 0.004 * r, rng.uniform(size=len(r)) < late_ranges
-    excess = rng.exponential(LATE_RANGE_MEAN, len(r)) * late
-    measured = r + noise * sigma * rng.standard_normal(len(r)) + excess
-    return UwbReadings(frames[frame], antenna[which], np.maximum(measured, 1e-3), sigma)
+    frames = np.arange(every // 2, len(truth.poses), every)
+    distance = distances(truth.poses[frames, None], truth.antenna_in_world)
+    frame, antenna = np.nonzero(distance < UWB_REACH)
+    true_range = distance[frame, antenna]
+    count = len(true_range)
+    sigma = 0.05 + 0.004 * true_range
+    late = rng.uniform(size=count) < late_ranges
+    excess = np.where(late, rng.exponential(LATE_RANGE_MEAN, count), 0.0)
+    error = noise_scale * sigma * rng.standard_normal(count)
+    measured = np.maximum(true_range + error + excess, 1e-3)
+    return UwbReadings(frames[frame], truth.antenna[antenna], measured, sigma)
+
+
+def distances(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Distances (...) in the plane between points or poses (..., >= 2)."""
+    offset = first[..., :2] - second[..., :2]
+    return np.hypot(offset[..., 0], offset[..., 1])
+
+
+def _direction(angle):
+    """Unit vectors (..., 2) at angles (...) in rad."""
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)

@@ -7,45 +7,57 @@ import numpy as np
 
 from slamlib import localize
 from slamlib.core import se2
-from slamlib.core.increments import TYPICAL_SLIP
+from slamlib.core.records import Dataset
 from slamlib.core.sightings import POINT_GATE
 from slamlib.robust.fit import CAUCHY_SCALES, narrow_kernels
 from slamlib.robust.initialization import consensus_markers, odometry_state, state_from_poses
 from slamlib.robust.linear import build_problem, state_from_arrays
-from slamlib.robust.measurements import accept_all, measure
+from slamlib.robust.measurements import Measurements, accept_all, measure
 from slamlib.robust.optimize import optimize
 from slamlib.robust.result import slam_result
-from slamlib.studies.kernels import rounds, solve_with
+from slamlib.studies.kernels import measure_with_known_noise, rounds, solve_with
 from slamlib.studies.montecarlo import antenna_error, drive
-from slamlib.studies.simulation import misguess
+from slamlib.studies.simulation import distances, misguess
 
 MAX_ANTENNA_ERROR = 0.5      # m, error below which an antenna is right
 MAX_MARKER_ERROR = 0.1       # m, distance from the right optimum above which a marker is off
 COST_TOLERANCE = 1.0         # cost above that of the right optimum: a residual of 1.4 sigmas
 
 
-def first_sighting(measurements, in_world, covariances):
+def first_sighting(measurements: Measurements, in_world: np.ndarray,
+                   covariances: np.ndarray) -> np.ndarray:
     """(k, 3) markers at their first sightings; parameters as of `consensus_markers`."""
-    return in_world[np.unique(measurements.marker_row, return_index=True)[1]]
+    return in_world[_first_rows(measurements.marker_row)]
 
 
-def mean_by_information(measurements, in_world, covariances):
+def _first_rows(labels):
+    """Row at which each label occurs first, in ascending order of the labels."""
+    return np.unique(labels, return_index=True)[1]
+
+
+def mean_by_information(measurements: Measurements, in_world: np.ndarray,
+                        covariances: np.ndarray) -> np.ndarray:
     """(k, 3) markers at the mean of their sightings, weighted by information.
 
     Parameters as of `consensus_markers`. Angles are averaged about the most certain sighting's.
     """
-    m = measurements
-    order = np.lexsort((np.linalg.slogdet(covariances)[1], m.marker_row))
-    middle = in_world[order[np.unique(m.marker_row[order], return_index=True)[1]]]
-    difference = se2.difference(in_world, middle[m.marker_row])
+    marker = measurements.marker_row
+    count = len(measurements.marker)
+    by_certainty = np.lexsort((np.linalg.slogdet(covariances).logabsdet, marker))
+    most_certain = in_world[by_certainty[_first_rows(marker[by_certainty])]]
+    difference = se2.difference(in_world, most_certain[marker])
     information = np.linalg.inv(covariances)
-    total, moment = np.zeros((len(m.marker), 3, 3)), np.zeros((len(m.marker), 3))
-    np.add.at(total, m.marker_row, information)
-    np.add.at(moment, m.marker_row, (information @ difference[..., None])[..., 0])
-    return middle + np.linalg.solve(total, moment[..., None])[..., 0]
+    weighted = (information @ difference[..., None])[..., 0]
+    total_information = np.zeros((count, 3, 3))
+    total = np.zeros((count, 3))
+    np.add.at(total_information, marker, information)
+    np.add.at(total, marker, weighted)
+    mean = np.linalg.solve(total_information, total[..., None])[..., 0]
+    return most_certain + mean
 
 
-def map_of_problem_2(measurements, in_world, covariances):
+def map_of_problem_2(measurements: Measurements, in_world: np.ndarray,
+                     covariances: np.ndarray) -> np.ndarray:
     """(k, 3) markers of problem 2's map, by consensus where it has none.
 
     Parameters as of `consensus_markers`.
@@ -54,8 +66,8 @@ def map_of_problem_2(measurements, in_world, covariances):
     found = localize(measurements.dataset.sightings)
     if found.frame[0] == 0 and np.isfinite(found.poses[0, 0]):          # the same world
         mapped = np.isin(measurements.marker, found.marker)
-        markers[mapped] = found.marker_in_world[
-            np.searchsorted(found.marker, measurements.marker[mapped])]
+        row = np.searchsorted(found.marker, measurements.marker[mapped])
+        markers[mapped] = found.marker_in_world[row]
     return markers
 
 
@@ -63,12 +75,14 @@ LANDMARKS = {"first sighting": first_sighting, "mean by information": mean_by_in
              "consensus": consensus_markers, "problem 2's map": map_of_problem_2}
 
 
-def guessed_antennas(measurements, poses, covariances, c):
+def guessed_antennas(measurements: Measurements, poses: np.ndarray, covariances: np.ndarray,
+                     c: np.ndarray) -> np.ndarray:
     """(a, 2) antennas at their guesses; parameters as of `initialization.trilaterated_antennas`."""
     return measurements.guess
 
 
-def landmarks(seed, kernel="graduated", starts=tuple(LANDMARKS), **options):
+def landmarks(seed: int, kernel: str = "graduated", starts: tuple = tuple(LANDMARKS),
+              **options) -> dict:
     """LANDMARKS, starts of the markers, on one `drive` with the typical slip known.
 
     Parameters
@@ -85,44 +99,48 @@ def landmarks(seed, kernel="graduated", starts=tuple(LANDMARKS), **options):
     """
     dataset, truth = drive(seed, **options)
     m = measure(dataset.without("uwb"))
-    true_map = truth.marker_in_world[np.searchsorted(truth.marker, m.marker)]
-    right = state_from_arrays(
-        m, truth.poses[m.frame], true_map, np.zeros((0, 2)), m.calibration.stated)
+    row = np.searchsorted(truth.marker, m.marker)
+    right = state_from_arrays(m, truth.poses[m.frame], truth.marker_in_world[row],
+                              np.zeros((0, 2)), m.calibration.stated)
     return _from_each_start(build_problem(m, "arc"), right, kernel, starts)
 
 
-def landmarks_of_drive(dataset, found, kernel="last", starts=tuple(LANDMARKS)):
+def landmarks_of_drive(dataset: Dataset, found, kernel: str = "last",
+                       starts: tuple = tuple(LANDMARKS)) -> dict:
     """The numbers of `landmarks` on a Dataset, given the SlamResult `found` of problem 3.
 
     Model and noise are those of the result, which replaces the truth.
     """
     m = measure(dataset.without("uwb"))
-    problem = replace(build_problem(m, found.model, found.noise), sigma=found.fit.problem.sigma)
+    problem = build_problem(m, found.model, found.noise)
+    problem = replace(problem, sigma=found.fit.problem.sigma)
     right = state_from_poses(m, found.poses[m.frame], found.covariances[m.frame], found.c)
     return _from_each_start(problem, right, kernel, starts)
 
 
 def _from_each_start(problem, right, kernel, starts):
     """The numbers of `landmarks`; from the State `right` the optimum is the right one."""
-    m, numbers = problem.measurements, {}
+    m = problem.measurements
     cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(CAUCHY_SCALES[-1])
     last = replace(problem, accepted=accept_all(m, cauchy))
     best = optimize(last, right)
+    numbers = {}
     for name in starts:
         state = odometry_state(m, problem.odometry.model, markers=LANDMARKS[name])
-        start = state.markers
+        initial_error = distances(state.markers, best.state.markers)
         if kernel == "graduated":
             state = narrow_kernels(problem, state, CAUCHY_SCALES[:-1])
         end = optimize(last, state)
-        cost, (first, off) = end.equations.error, (
-            np.hypot(*(each - best.state.markers)[:, :2].T) for each in (start, end.state.markers))
-        numbers |= {f"{name} cost": cost, f"{name} off": np.mean(off > MAX_MARKER_ERROR),
-                    f"{name} right": cost < best.equations.error + COST_TOLERANCE,
-                    f"{name} initial error": np.sqrt(np.mean(first**2))}
+        error = distances(end.state.markers, best.state.markers)
+        cost = end.equations.error
+        numbers[f"{name} cost"] = cost
+        numbers[f"{name} off"] = np.mean(error > MAX_MARKER_ERROR)
+        numbers[f"{name} right"] = cost < best.equations.error + COST_TOLERANCE
+        numbers[f"{name} initial error"] = np.sqrt(np.mean(initial_error**2))
     return numbers
 
 
-def guesses(seed, error, markers=True, **options):
+def guesses(seed: int, error: float, markers: bool = True, **options) -> dict:
     """Antenna guesses that are wrong by `error` m in random directions, on one `drive`.
 
     Without the markers if `markers` is False.
@@ -134,15 +152,18 @@ def guesses(seed, error, markers=True, **options):
     outside their 99.9 % ellipse.
     """
     dataset, truth = drive(seed, **options)
-    dataset = misguess(dataset if markers else dataset.without("aruco"), truth.antenna_in_world,
-                       error, seed)
-    measurements = measure(replace(dataset, vehicle=replace(
-        dataset.vehicle, slip=TYPICAL_SLIP, marker_noise_factor=1.0, range_noise_factor=1.0)))
-    found = slam_result(solve_with(measurements, rounds(measurements)))
-    untrilaterated = solve_with(measurements, rounds(measurements, guessed_antennas)).state.antennas
-    from_guess = np.hypot(*(untrilaterated - truth.antenna_in_world).T)
-    miss, squared = antenna_error(found, truth)
-    right, doubt = miss < MAX_ANTENNA_ERROR, np.isin(found.antenna, list(found.doubts))
-    return {"right": right.mean(), "in doubt": doubt.mean(),
-            "silently wrong": np.mean(~right & (squared > POINT_GATE) & ~doubt),
-            "from the guess": np.mean(from_guess < MAX_ANTENNA_ERROR)}
+    if not markers:
+        dataset = dataset.without("aruco")
+    dataset = misguess(dataset, truth.antenna_in_world, error, seed)
+    measurements = measure_with_known_noise(dataset)
+    fit = solve_with(measurements, rounds(measurements))
+    from_guess = solve_with(measurements, rounds(measurements, guessed_antennas))
+    guess_error = distances(from_guess.state.antennas, truth.antenna_in_world)
+    found = slam_result(fit)
+    distance, nees = antenna_error(found, truth)
+    right = distance < MAX_ANTENNA_ERROR
+    in_doubt = np.isin(found.antenna, list(found.doubts))
+    silently_wrong = ~right & ~in_doubt & (nees > POINT_GATE)
+    return {"right": right.mean(), "in doubt": in_doubt.mean(),
+            "silently wrong": silently_wrong.mean(),
+            "from the guess": np.mean(guess_error < MAX_ANTENNA_ERROR)}
