@@ -17,7 +17,7 @@ from nbformat import NotebookNode
 
 from slamlib.core.errors import DatasetError, require
 from slamlib.io.textfile import read_text, read_toml
-from slamlib.report.execution import NotebookError
+from slamlib.report.execution import Books, NotebookError
 
 FOLDER = "notebooks"  # name of the notebooks' folder
 CODE_SHOWN = ("none", "method", "all")  # what code is shown: none, all that is not hidden, or all
@@ -54,9 +54,9 @@ class Chapter:
     lead: str  # the first paragraph, or ""
 
     @property
-    def letter(self) -> str:
-        """Return the letter of an appendix, or ""."""
-        return self.number if self.number.isalpha() else ""
+    def is_appendix(self) -> bool:
+        """Return whether its number is a letter."""
+        return self.number.isalpha()
 
 
 def read_options(path: str | Path) -> Options:
@@ -64,10 +64,11 @@ def read_options(path: str | Path) -> Options:
 
     DatasetError if the file is not TOML, has an unknown key, or a value is not as it must be.
     """
-    if not Path(path).exists():
+    path = Path(path)
+    if not path.exists():
         return Options()
     keys = [option.name for option in fields(Options)]
-    entries = read_toml(Path(path), 'author = "Ada Lovelace"', keys)
+    entries = read_toml(path, 'author = "Ada Lovelace"', keys)
     return Options(**{key: _checked(key, value, str(path)) for key, value in entries.items()})
 
 
@@ -75,19 +76,17 @@ def _checked(key, value, place):
     """Return the value of a key as Options have it; DatasetError, which begins with `place`."""
     if key in CHOICES:
         choices = CHOICES[key]
-        same_type = type(value) is type(choices[0])  # 1 is not true
+        ok = type(value) is type(choices[0]) and value in choices  # 1 is not true
         expected = f"one of {json.dumps(choices)[1:-1]}"
-        require(same_type and value in choices, place, f"{expected} for {key}", value)
-        return value
-    if key == "leave_out":
-        are_texts = isinstance(value, list) and all(isinstance(entry, str) for entry in value)
+    elif key == "leave_out":
+        ok = isinstance(value, list) and all(isinstance(entry, str) for entry in value)
         expected = 'a list of numbers and titles in quotes, such as ["B", "3.5", "References"],'
-        require(are_texts, place, f"{expected} for {key}", value)
-        return dict.fromkeys(value, place)
-    text = str(value)
-    is_line = type(value) in (str, int) and re.fullmatch(r"[^\n\ufffd]*", text)
-    require(is_line, place, f"a line of UTF-8 text in quotes for {key}", text)
-    return text
+    else:
+        ok = type(value) in (str, int) and re.fullmatch(r"[^\n\ufffd]*", str(value))
+        expected = "a line of UTF-8 text in quotes"
+        value = str(value)
+    require(ok, place, f"{expected} for {key}", value)
+    return dict.fromkeys(value, place) if key == "leave_out" else value
 
 
 def notebooks_folder() -> Path:
@@ -125,7 +124,7 @@ def read_notebook(source: Path) -> NotebookNode:
     return cleared
 
 
-def to_execute(folder: Path, options: Options) -> dict[Path, NotebookNode]:
+def to_execute(folder: Path, options: Options) -> Books:
     """Return the notebooks in a folder that are executed, in order.
 
     These are all chapters, because they write results, by the names of their files, and then the
@@ -133,32 +132,29 @@ def to_execute(folder: Path, options: Options) -> dict[Path, NotebookNode]:
     """
     books = {source: read_notebook(source) for source in sorted(folder.glob("*.ipynb"))}
     about = {source: chapter_of(source, book) for source, book in books.items()}
-    _require_known(options.leave_out, [chapter.number for chapter in about.values()])
-    chapters = [source for source in books if not about[source].letter]
-    appendices = []
+    _require_known(options.leave_out, {chapter.number for chapter in about.values()})
+    executed = [source for source in books if not about[source].is_appendix]
     if options.appendix is not False:
-        appendices = [source for source in shown(books, options) if about[source].letter]
-    appendices.sort(key=lambda source: about[source].letter)
-    require(chapters or appendices, folder,
-            "notebooks (*.ipynb) that are not left out, found no notebooks")
-    return {source: books[source] for source in chapters + appendices}
+        appendices = [source for source in shown(books, options) if about[source].is_appendix]
+        executed += sorted(appendices, key=lambda source: about[source].number)
+    require(executed, folder, "notebooks (*.ipynb) that are not left out, found no notebooks")
+    return {source: books[source] for source in executed}
 
 
 def _require_known(leave_out, numbers):
-    """Raise DatasetError if a chapter is to be left out that has none of the numbers (list)."""
-    known = sorted(set(filter(None, numbers)))
+    """Raise DatasetError if a chapter is to be left out that has none of the numbers (set)."""
+    known = sorted(numbers - {""})
     for entry, place in leave_out.items():
-        names_a_chapter = place and re.fullmatch(r"\d+|[A-Za-z]", entry)
-        require(not names_a_chapter or entry.upper() in known, place,
+        is_title = not re.fullmatch(r"\d+|[A-Za-z]", entry)
+        require(is_title or entry.upper() in known, place,
                 f"to leave out a chapter ({', '.join(known)}) or a section", entry)
 
 
-def shown(books: dict, options: Options) -> dict[Path, NotebookNode]:
-    """Return the books (dict from Path to NotebookNode) without the chapters that are left out."""
-    left_out = {entry.strip().removesuffix(".").casefold() for entry in options.leave_out}
-    left_out.discard("")  # no number
+def shown(books: Books, options: Options) -> Books:
+    """Return the books without the chapters that are left out."""
+    left_out = {entry.strip().removesuffix(".").upper() for entry in options.leave_out} - {""}
     return {source: book for source, book in books.items()
-            if chapter_of(source, book).number.casefold() not in left_out}
+            if chapter_of(source, book).number not in left_out}
 
 
 def chapter_of(source: Path, book: NotebookNode) -> Chapter:
