@@ -63,10 +63,9 @@ def build_report(notebooks: Path, data: Path, report: Path, results: Path,
     has = _measured(read)
     books = _with_what_they_need(books, has)
     chapters = shown(books, options)
-    # Paths of sockets must be short.
-    with TemporaryDirectory(dir="/tmp" if TRANSPORT == "ipc" else None, prefix="slamlib-",
-                            ignore_cleanup_errors=True) as temporary:
-        kept = Path(kept or Path(temporary, "kept")).resolve()
+    short = "/tmp" if TRANSPORT == "ipc" else None  # because paths of sockets must be
+    with TemporaryDirectory(dir=short, prefix="slamlib-", ignore_cleanup_errors=True) as temporary:
+        kept = (kept or Path(temporary, "kept")).resolve()
         environment = kernel_environment(Path(temporary), data, datasets, kept / STUDIES)
         folders = [data / dataset.name for dataset, _ in read]
         keys = partial(cache.keys, books, folders, environment | {"SLAMLIB_RESULTS": str(results)})
@@ -112,15 +111,14 @@ def _measured(read):
 
 def _with_what_they_need(books, has):
     """Return the notebooks whose measurements the datasets have, or all if there is none."""
-    needs = {source: book.metadata.get("slamlib", {}).get("needs")
-             for source, book in books.items()}
-    served = [source for source in books if needs[source] is None or needs[source] in has]
+    served = {source: book for source, book in books.items()
+              if book.metadata.get("slamlib", {}).get("needs") in has | {None}}
     if not served:
         return books
     for source in books:
         if source not in served:
             print(f"{source.stem}: left out, no dataset has the measurements", file=sys.stderr)
-    return {source: books[source] for source in served}
+    return served
 
 
 def _executed(books, keys, check, environment, jobs, stage, kept, fresh):

@@ -23,7 +23,6 @@ from slamlib.studies import runs as memory
 from slamlib.studies.runs import digest
 
 VARIABLES = "SLAMLIB_"  # begins the environment variables that are heeded
-IGNORED = "SLAMLIB_STUDIES"  # but this one
 UNSEEN = re.compile(r"(^|/)(\.|__pycache__/)|^(build|report|results)/|\.ipynb$")  # paths
 HEEDED_TAGS = {"raises-exception", LAB_ONLY}  # the tags of cells that nbclient heeds
 VERSIONS = 4  # of each notebook, the last used
@@ -36,12 +35,13 @@ def keys(books: Books, datasets: list[Path], environment: dict[str, str]) -> dic
     the kernels. Where slamlib's code is does not matter.
     """
     notebooks = next(iter(books)).parent
+    # The names of their folders have the versions; to read what is in them takes long.
     packages = {path.name for folder in sys.path for path in Path(folder).glob("*.dist-info")
-                if not path.name.startswith("slamlib-")}  # reading them takes long
-    heeded = sorted((name, value) for name, value in environment.items()
-                    if name.startswith(VARIABLES) and name != IGNORED)
-    common = [platform.python_implementation(), platform.python_version(), platform.platform(),
-              sorted(packages), _digests(notebooks, datasets), heeded]
+                if not path.name.startswith("slamlib-")}
+    heeded = {name: environment[name] for name in sorted(environment)
+              if name.startswith(VARIABLES)}
+    common = [sys.version, platform.platform(), sorted(packages), heeded,
+              _digests(notebooks, datasets)]
     found = {}
     for source, book in books.items():
         code = [(cell.source, sorted(HEEDED_TAGS.intersection(tags_of(cell))))

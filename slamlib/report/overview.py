@@ -30,6 +30,7 @@ from slamlib.robust.file_doubts import Doubt, doubts_before_solving, merged
 from slamlib.solve import PROBLEMS, SENSORS, Failure, Solution, title, truth_in_world
 
 TEXT = Path(__file__).with_name("overview.md")
+ALT = "Trajectories, and standard deviations of position"  # of the picture
 ON_SCREEN = ("pdf", "chapters")  # blocks of the text that the PDF leaves out
 CURVE_POINTS = 1500  # of a curve, at most
 HIDDEN_TRAJECTORIES = ("problem2", "problem2_hint", "problem3")  # they would lie below others
@@ -49,7 +50,7 @@ class SolvedDrive(Drive):
     solutions: tuple[Solution, ...] = ()  # in the order of PROBLEMS
     doubts: tuple[Doubt, ...] = ()  # first about the drive, then by problem
     failures: tuple[Failure, ...] = ()  # in the order of PROBLEMS
-    files: tuple[str, ...] = ()  # its files to hand in, as `problem1/vehiclePose.mat`
+    files: tuple[str, ...] = ()  # its results, as `problem1/vehiclePose.mat`
 
     def solution(self, problem: str) -> Solution | None:
         """Return the Solution of a problem, or None."""
@@ -66,8 +67,7 @@ def read_drives(read: list, results: Path, written: list[str], notices: dict) ->
     drives = []
     for dataset, truth in sorted(read, key=lambda drive: len(drive[0].ticks)):
         folder = f"{dataset.name}/"
-        files = [name.removeprefix(folder) for name in sorted(written)
-                 if name.startswith(folder) and name.endswith(".mat")]
+        files = [name.removeprefix(folder) for name in written if name.startswith(folder)]
         told = notices.get(dataset.name, [])
         drives.append(_solved_drive(dataset, truth, results / dataset.name, files, told))
     return drives
@@ -127,19 +127,13 @@ def opening(drives: list[SolvedDrive], chapters: Books | None = None) -> Noteboo
     cells = []
     for name, block in template.blocks.items():
         if name == "caption" and longest:
-            cells.append(_picture_cell(trajectories(longest)))
+            picture = new_output("display_data", {"image/svg+xml": trajectories(longest)})
+            cells.append(new_code_cell(id="picture", metadata={"alt": ALT}, outputs=[picture]))
         text = "".join(block(context)).strip()
         if text:
             tags = ["html-only"] if name in ON_SCREEN else []
             cells.append(new_markdown_cell(text, id=name, metadata={"tags": tags}))
     return new_notebook(cells=cells)
-
-
-def _picture_cell(picture):
-    """Return a cell that shows an SVG (str)."""
-    alt = "Trajectories, and standard deviations of position"
-    output = new_output("display_data", {"image/svg+xml": picture})
-    return new_code_cell(id="picture", metadata={"alt": alt}, outputs=[output])
 
 
 def _facts(drives, chapters):
@@ -155,7 +149,7 @@ def _facts(drives, chapters):
     facts["compared"] = [_compared(drive) for drive in compared]
     facts["simulated"] = [_name(drive) for drive in drives if drive.origin == "simulated"]
     facts["results"] = table(rows).data if solved else ""
-    facts["known"] = bool(with_truth)
+    facts["known"] = with_truth
     facts["dashes"] = len(with_truth) < len(drives)
     facts["sensors"] = [sensor for sensor in SENSORS
                         if not all(_without(drive, sensor) for drive in drives)]
