@@ -16,8 +16,8 @@ def problem():
 
 def without_wheel():
     """A sentence that says why there is no wheel of gtsam for this Python, or None."""
-    version = tuple(sys.version_info[:2])
-    system, machine = platform.system(), platform.machine().lower()
+    system = platform.system()
+    machine = platform.machine().lower()
     if system == "Windows":
         return ("gtsam has no wheel for Windows: run this inside WSL2, or in conda's environment "
                 "of environment.yml, which was not tried on Windows (see environment.md).")
@@ -27,10 +27,12 @@ def without_wheel():
     if system == "Linux" and platform.libc_ver()[0] != "glibc":
         return ("gtsam's Linux wheel needs glibc, which this Python does not use "
                 "(see environment.md).")
-    if platform.python_implementation() != "CPython" or not (3, 11) <= version <= (3, 14):
+    version = tuple(sys.version_info[:2])
+    implementation = platform.python_implementation()
+    if implementation != "CPython" or not (3, 11) <= version <= (3, 14):
         return ("Python 3.11 to 3.14 (CPython) is needed, and %s is %s %d.%d: install one and say "
                 "`make PYTHON=python3.12 ...` (see environment.md)."
-                % (sys.executable, platform.python_implementation(), version[0], version[1]))
+                % (sys.executable, implementation, version[0], version[1]))
     return None
 
 

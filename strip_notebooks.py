@@ -19,36 +19,40 @@ KERNEL = {
     "language_info": {"name": "python"}}
 
 
-def restored(content):
-    """Return a notebook (bytes) in its committed form; ValueError if it is not a notebook."""
+def restored(content: bytes) -> bytes:
+    """Return a notebook in its committed form; ValueError if it is not a notebook."""
     try:
         book = json.loads(content)
         book["metadata"] = KERNEL | _only(NOTEBOOK_KEYS, book["metadata"])
         for cell in book["cells"]:
-            cell["metadata"] = _only(CELL_KEYS, cell["metadata"])
-            if "hide-input" in cell["metadata"].get("tags", ()):
-                cell["metadata"]["jupyter"] = {"source_hidden": True}
+            metadata = _only(CELL_KEYS, cell["metadata"])
+            if "hide-input" in metadata.get("tags", ()):
+                metadata["jupyter"] = {"source_hidden": True}
+            cell["metadata"] = metadata
             cell["source"] = "".join(cell["source"]).splitlines(keepends=True)
             if cell["cell_type"] == "code":
-                cell |= {"execution_count": None, "outputs": []}
+                cell["execution_count"] = None
+                cell["outputs"] = []
             elif not cell.get("attachments"):
                 cell.pop("attachments", None)
     except (KeyError, TypeError, AttributeError):
         raise ValueError("expected a notebook with cells and metadata") from None
-    return json.dumps(book, indent=1, sort_keys=True, ensure_ascii=False).encode() + b"\n"
+    text = json.dumps(book, indent=1, sort_keys=True, ensure_ascii=False)
+    return f"{text}\n".encode()
 
 
 def _only(keys, metadata):
     return {key: metadata[key] for key in keys if metadata.get(key)}
 
 
-def main(names):
-    """Restore the files with these names, or standard input; return 0, or a sentence (str)."""
+def main(names: list[str]) -> int | str:
+    """Restore the files with these names, or standard input; return 0, or a sentence on failure."""
     try:
         for name in names:
             with open(name, "rb") as file:
                 content = file.read()
-            if (new := restored(content)) != content:
+            new = restored(content)
+            if new != content:
                 with open(f"{name}.new", "wb") as file:
                     file.write(new)
                 os.replace(f"{name}.new", name)

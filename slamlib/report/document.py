@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
@@ -19,8 +20,8 @@ from nbformat import NotebookNode
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_raw_cell
 
 from slamlib.core.errors import DatasetError
-from slamlib.report.execution import LAB_ONLY, NotebookError
-from slamlib.report.notebooks import chapter_of
+from slamlib.report.execution import LAB_ONLY, Books, NotebookError
+from slamlib.report.notebooks import Options, chapter_of, tags_of
 
 HERE = Path(__file__).parent
 TEMPLATES = {"html": "page.html", "typst": "report.typ"}
@@ -28,65 +29,74 @@ SHOWN = ("image/svg+xml", "image/png", "image/jpeg", "text/markdown", "text/late
          "text/plain")  # kinds of outputs, the first is preferred
 
 
-def render(books, options, has=(), picture="", check=False):
-    """Return the files of a report, {name: bytes}: a page for each book, and report.pdf.
+def render(books: Books, options: Options, has: Iterable[str] = (), picture: str = "",
+           check: bool = False) -> dict[str, bytes]:
+    """Return the files of a report by their names: a page for each book, and report.pdf.
 
     NotebookError if something would be lost: a formula, or what a caption, a reference, a link or a
     picture points to; DatasetError if no section has a number or title that is to be left out.
 
     Parameters
     ----------
-    books : dict from Path to NotebookNode, executed; links name them by their file names.
-    options : Options of the title page, and of what is shown of the books.
-    has : set of str, what the datasets have; sections that need other data are left out.
-    picture : str, an SVG for the title page, or "".
+    books : executed notebooks; links name them by their file names.
+    options : of the title page, and of what is shown of the books.
+    has : what the datasets have; sections that need other data are left out.
+    picture : an SVG for the title page, or "".
     check : True where the books have no outputs yet: nothing is said of what these may hold.
     """
-    settings = asdict(options) | {"has": " ".join(has), "check": check, "beside": str(
-        [*books][-1].parent), "picture": "title.svg" if picture else ""}
+    settings = asdict(options) | {
+        "has": " ".join(has), "check": check, "beside": str(list(books)[-1].parent),
+        "picture": "title.svg" if picture else ""}
     text = json.dumps(_merged(books)).encode()
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor() as pool:
         pages = pool.submit(_pandoc, text, "html", folder, settings)
         Path(folder, "title.svg").write_text(picture, encoding="utf-8")
-        main = Path(folder, "main.typ")
-        main.write_bytes(_pandoc(text, "typst", folder, settings))
-        try:
-            pdf = typst.compile(main, root=folder, ignore_system_fonts=True, timestamp=0)
-        except typst.TypstError as error:
-            raise NotebookError(f"Typst cannot set the PDF: {error.message}: "
-                                f"{error.diagnostic.strip()}") from None
+        pdf = _pdf(_pandoc(text, "typst", folder, settings), folder)
         pages.result()
-        return {f"{source.stem}.html": Path(folder, f"{source.stem}.html").read_bytes()
-                for source in books} | {"report.pdf": pdf}
+        names = [f"{source.stem}.html" for source in books]
+        return {name: Path(folder, name).read_bytes() for name in names} | {"report.pdf": pdf}
+
+
+def _pdf(document, folder):
+    """Return the PDF of a document for Typst (bytes), whose pictures are in a folder."""
+    main = Path(folder, "main.typ")
+    main.write_bytes(document)
+    try:
+        return typst.compile(main, root=folder, ignore_system_fonts=True, timestamp=0)
+    except typst.TypstError as error:
+        raise NotebookError(f"Typst cannot set the PDF: {error.message}: "
+                            f"{error.diagnostic.strip()}") from None
 
 
 def _pandoc(text, kind, folder, settings):
     """Return what pandoc writes of a notebook (bytes); prints what the filter says."""
-    done = subprocess.run(
-        [pypandoc.get_pandoc_path(), "--from=ipynb-autolink_bare_uris", "--ipynb-output=all",
-         f"--to={kind}", f"--template={HERE / TEMPLATES[kind]}",
-         f"--lua-filter={HERE / 'report.lua'}", "--mathml", "--toc", "--wrap=none",
-         f"--resource-path={settings['beside']}",
-         f"--metadata=options={json.dumps(settings | {'folder': folder})}"],
-        input=text, capture_output=True)
+    options = json.dumps(settings | {"folder": folder})
+    command = [
+        pypandoc.get_pandoc_path(), "--from=ipynb-autolink_bare_uris", "--ipynb-output=all",
+        f"--to={kind}", f"--template={HERE / TEMPLATES[kind]}",
+        f"--lua-filter={HERE / 'report.lua'}", "--mathml", "--toc", "--wrap=none",
+        f"--resource-path={settings['beside']}", f"--metadata=options={options}"]
+    done = subprocess.run(command, input=text, capture_output=True)
     told, refused, reason = done.stderr.decode(errors="replace").partition("refused: ")
     if done.returncode:
-        asked = any(place and reason.startswith(place) for place in settings["leave_out"].values())
-        raise (DatasetError if asked else NotebookError)(
-            reason.strip() if refused else f"pandoc cannot make the report: {told}")
+        if not refused:
+            raise NotebookError(f"pandoc cannot make the report: {told}")
+        places = filter(None, settings["leave_out"].values())
+        error = DatasetError if reason.startswith(tuple(places)) else NotebookError
+        raise error(reason.strip())
     print(told, file=sys.stderr, end="")
     return done.stdout
 
 
 def _merged(books):
     """Return one notebook of all books; a cell with the name of each precedes its own."""
-    letters = "".join(chapter_of(*each)["letter"] for each in books.items())
+    numbers = "".join(chapter_of(source, book).number for source, book in books.items())
     cells = []
     for source, book in books.items():
         cells.append(new_markdown_cell(metadata={"chapter": source.stem}))
-        cells += [NotebookNode(part | {"source": _without_absent(part.source, letters)})
-                  if part.cell_type == "markdown" else part for cell in book.cells
-                  if LAB_ONLY not in cell.metadata.get("tags", ()) for part in _parts(cell)]
+        for cell in book.cells:
+            if LAB_ONLY not in tags_of(cell):
+                cells += [_without_absent(part, numbers) for part in _parts(cell)]
     return {"cells": cells, "metadata": {}, "nbformat": 4, "nbformat_minor": 5}
 
 
@@ -94,9 +104,9 @@ def _parts(cell):
     """Return the code and each output of a cell as cells; code that is folded comes last."""
     if cell.cell_type != "code":
         return [cell]
-    code = new_code_cell(cell.source, metadata=cell.metadata)
+    code = [new_code_cell(cell.source, metadata=cell.metadata)]
     outputs = [_shown(output, cell.metadata) for output in cell.outputs]
-    return [*outputs, code] if "hide-input" in cell.metadata.get("tags", ()) else [code, *outputs]
+    return outputs + code if "hide-input" in tags_of(cell) else code + outputs
 
 
 def _shown(output, metadata):
@@ -112,11 +122,15 @@ def _shown(output, metadata):
     return new_code_cell(metadata=metadata, outputs=[output])
 
 
-def _without_absent(text, letters):
-    """Return Markdown without "(table A.3)" and sentences that begin so, but for these letters."""
-    absent = f"(?![{letters} ])[A-Z]"
+def _without_absent(cell, numbers):
+    """Return a cell without "(table A.3)" and sentences that begin so, unless A is in `numbers`."""
+    if cell.cell_type != "markdown":
+        return cell
+    absent = f"(?![{numbers} ])[A-Z]"
     label = rf"(?:(?i:figure|table)s?\s+{absent}\.\d+|(?i:appendix)\s+{absent}\b(?!\s+of\b))"
     sentence = rf"(?=[A-Z]){label}(?:(?!\n\n).)*?[.?!]"
-    return re.sub(rf"\s*\({label}\)|(?:\A|(?<=\n\n)){sentence}(?:[^\S\n]+|(?=\n|\Z))"
-                  rf"|(?<=[.?!])(?:[^\S\n]+|\n(?=\S)){sentence}(?=\s|\Z)", "", text,
-                  flags=re.DOTALL)
+    in_brackets = rf"\s*\({label}\)"
+    first = rf"(?:\A|(?<=\n\n)){sentence}(?:[^\S\n]+|(?=\n|\Z))"  # of a paragraph
+    later = rf"(?<=[.?!])(?:[^\S\n]+|\n(?=\S)){sentence}(?=\s|\Z)"
+    text = re.sub(f"{in_brackets}|{first}|{later}", "", cell.source, flags=re.DOTALL)
+    return NotebookNode(cell | {"source": text})

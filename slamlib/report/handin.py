@@ -3,6 +3,7 @@
 import platform
 import re
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from importlib.metadata import version
 from io import BytesIO
@@ -17,49 +18,54 @@ from slamlib.io.dataset import all_notes, read_dataset, read_truth
 from slamlib.io.results import RESULT_FILES
 from slamlib.io.tables import datasets_in
 from slamlib.notebook import Drive
-from slamlib.report.notebooks import PROBLEM2_FOLDERS
-from slamlib.report.overview import listed, why_missing
+from slamlib.report.build import Report
+from slamlib.report.notebooks import PROBLEM2_FOLDERS, Options
+from slamlib.report.overview import SolvedDrive, listed, why_missing
 from slamlib.solve import title
 
 LINE_WIDTH = 100  # characters in a line of README.txt
 README = Path(__file__).with_name("readme.txt")  # a template of Jinja
 LEFT_OUT = ("Explore", "Files")  # titles of sections that are for screens, or on other folders
+PACKAGES = ("slamlib", "numpy", "scipy", "gtsam")  # whose versions README.txt names
+MAP_ALONE = "problem2/ArucoMap.mat"  # the map by markers alone
 
 
-def selection(data, names=None):
+def selection(data: Path, names: list[str] | None = None) -> tuple:
     """Return the datasets of the hand-in, as of `build_report`, and the names of those left out.
 
-    These are simulated, where no `names` are given and `data` (Path) has recorded ones, too.
+    These are simulated, where no `names` are given and the folder `data` has recorded ones, too.
     """
     if names is not None:
         return names, []
-    origins = {name: Drive(name, read_dataset(data / name), read_truth(data / name)).origin
-               for name in datasets_in(data)[0]}
-    simulated = [name for name, origin in origins.items() if origin == "simulated"]
-    if not simulated or len(simulated) == len(origins):
+    drives = [Drive(name, read_dataset(data / name), read_truth(data / name))
+              for name in datasets_in(data)[0]]
+    simulated = [drive.name for drive in drives if drive.origin == "simulated"]
+    others = [drive.name for drive in drives if drive.name not in simulated]
+    if not simulated or not others:
         return None, []
     print(f"hand-in: without {listed(simulated)}, which are simulated (name all datasets to "
           "hand in, if these are to be among them)", file=sys.stderr)
-    return [name for name in origins if name not in simulated], simulated
+    return others, simulated
 
 
-def hand_in_options(options):
+def hand_in_options(options: Options) -> Options:
     """Return Options by which the hand-in leaves out the appendices, unless they are asked for."""
-    return replace(options, appendix=bool(options.appendix),
-                   leave_out=dict.fromkeys(LEFT_OUT, "") | options.leave_out)
+    leave_out = dict.fromkeys(LEFT_OUT, "") | options.leave_out
+    return replace(options, appendix=bool(options.appendix), leave_out=leave_out)
 
 
-def write_zip(path, report, results, options, omitted=()):
-    """Write the zip of a Report to `path` (Path); equal input gives equal bytes.
+def write_zip(path: Path, report: Report, results: Path, options: Options,
+              omitted: Sequence[str] = ()):
+    """Write the zip of a Report to `path`; equal input gives equal bytes.
 
-    `results` (Path) is the folder of its files, `omitted` (list of str) what `selection` left out.
+    `results` is the folder of its files, `omitted` what `selection` left out.
     """
     contents = {"report.pdf": report.files[-1].read_bytes(),
                 "README.txt": readme(report.drives, options, omitted).encode()}
     with swap.staging(results):                         # no build replaces them meanwhile
         for drive in report.drives:
-            contents |= {f"{drive.name}/{name}": Path(results, drive.name, file).read_bytes()
-                         for name, file in handed_in(drive, options.problem2).items()}
+            for name, file in handed_in(drive, options.problem2).items():
+                contents[f"{drive.name}/{name}"] = (results / drive.name / file).read_bytes()
     archive = BytesIO()
     with ZipFile(archive, "w") as file:
         for name, content in sorted(contents.items()):
@@ -69,47 +75,55 @@ def write_zip(path, report, results, options, omitted=()):
     swap.write_atomically(path, archive.getvalue())
 
 
-def handed_in(drive, problem2):
-    """Return the files of a SolvedDrive, a dict from names in the hand-in to names in its results.
+def handed_in(drive: SolvedDrive, problem2: str) -> dict[str, str]:
+    """Return the names in its results of the files of a drive, by their names in the hand-in.
 
     Those of `problem2`, a key of PROBLEM2_FOLDERS, have the map by markers alone if none is theirs.
     """
-    estimate = PROBLEM2_FOLDERS[problem2]
-    files = {f"{problem[:8]}/{name}": f"{problem}/{name}"
-             for problem in ("problem1", estimate, "problem3", "problem4") for name in RESULT_FILES
-             if f"{problem}/{name}" in drive.files}
-    alone = "problem2/ArucoMap.mat"
-    if "problem2/vehiclePose.mat" in files and alone in drive.files:
-        files.setdefault(alone, alone)
+    files = {}
+    for folder, problem in _folders(problem2).items():
+        for name in RESULT_FILES:
+            if f"{problem}/{name}" in drive.files:
+                files[f"{folder}/{name}"] = f"{problem}/{name}"
+    if "problem2/vehiclePose.mat" in files and MAP_ALONE in drive.files:
+        files.setdefault(MAP_ALONE, MAP_ALONE)
     return files
 
 
-def readme(drives, options, omitted=()):
-    """Return README.txt (str); parameters as of `write_zip`, with a list of SolvedDrive."""
-    text = Template(README.read_text(encoding="utf-8"), trim_blocks=True).render(
+def _folders(problem2):
+    """Return the results folders that are handed in (dict of str), by their names there."""
+    return {"problem1": "problem1", "problem2": PROBLEM2_FOLDERS[problem2],
+            "problem3": "problem3", "problem4": "problem4"}
+
+
+def readme(drives: list[SolvedDrive], options: Options, omitted: Sequence[str] = ()) -> str:
+    """Return README.txt; parameters as of `write_zip`."""
+    versions = [f"Python {platform.python_version()}"]
+    versions += [f"{name} {version(name)}" for name in PACKAGES]
+    template = Template(README.read_text(encoding="utf-8"), trim_blocks=True)
+    text = template.render(
         cover=options, estimate=PROBLEM2_FOLDERS[options.problem2], omitted=listed(omitted),
         width=LINE_WIDTH, drives=[_told(drive, options.problem2) for drive in drives],
-        versions=", ".join([f"Python {platform.python_version()}",
-                            *(f"{name} {version(name)}"
-                              for name in ("slamlib", "numpy", "scipy", "gtsam"))]))
+        versions=", ".join(versions))
     return re.sub("\n{3,}", "\n\n", text.strip()) + "\n"
 
 
 def _told(drive, problem2):
     """Return what README.txt tells of a SolvedDrive, a dict."""
-    files, estimate, folders = handed_in(drive, problem2), PROBLEM2_FOLDERS[problem2], {}
-    for name, file in files.items():
-        solution = drive.solution(file.split("/")[0])
-        folders.setdefault(name.split("/")[0], (solution, []))[1].append(name.split("/")[1])
+    files = handed_in(drive, problem2)
+    estimate = PROBLEM2_FOLDERS[problem2]
     world = {solution.problem: solution.world + 1 for solution in drive.solutions}
-    return {
-        "name": drive.name, "doubts": drive.doubts, "world": world.get(estimate, 1),
-        "notes": all_notes(drive.dataset, drive.truth),
-        "folders": {name: (listed(each), solution.title, np.isfinite(solution.poses[:, 0]).sum(),
-                           len(solution.poses)) for name, (solution, each) in folders.items()},
-        "map_frame": files.get("problem2/ArucoMap.mat") not in (None, f"{estimate}/ArucoMap.mat")
-        and world.get("problem2", 1),
-        "missing": [
-            f"{problem[:8]} ({title(problem, drive.dataset)}): {why_missing(drive, problem)}."
-            for problem in ("problem1", estimate, "problem3", "problem4")
-            if f"{problem[:8]}/vehiclePose.mat" not in files]}
+    told = {"name": drive.name, "doubts": drive.doubts, "world": world.get(estimate, 1),
+            "notes": all_notes(drive.dataset, drive.truth), "folders": {}, "missing": []}
+    if MAP_ALONE in files.values() and estimate != "problem2":
+        told["map_frame"] = world.get("problem2", 1)
+    for folder, problem in _folders(problem2).items():
+        if f"{folder}/vehiclePose.mat" in files:
+            names = [name.split("/")[1] for name in files if name.startswith(folder)]
+            solution = drive.solution(problem)
+            known = np.isfinite(solution.poses[:, 0]).sum()
+            told["folders"][folder] = listed(names), solution.title, known, len(solution.poses)
+        else:
+            reason = why_missing(drive, problem)
+            told["missing"].append(f"{folder} ({title(problem, drive.dataset)}): {reason}.")
+    return told

@@ -13,15 +13,22 @@ from pathlib import Path
 
 import nbformat
 from nbconvert.preprocessors import ClearOutputPreprocessor
+from nbformat import NotebookNode
 
 from slamlib.core.errors import DatasetError, require
 from slamlib.io.textfile import read_text, read_toml
-from slamlib.report.execution import NotebookError
+from slamlib.report.execution import Books, NotebookError
 
 FOLDER = "notebooks"  # name of the notebooks' folder
 CODE_SHOWN = ("none", "method", "all")  # what code is shown: none, all that is not hidden, or all
 # Folder of the results of each estimate that may be handed in as problem 2.
 PROBLEM2_FOLDERS = {"aruco": "problem2", "fused": "problem2_fused", "hint": "problem2_hint"}
+# Options that have one of several values.
+CHOICES = {"code": CODE_SHOWN, "problem2": tuple(PROBLEM2_FOLDERS), "appendix": (True, False)}
+TITLE = re.compile(r"^#\s+(.+)", re.MULTILINE)
+NUMBER = re.compile(r"(\d+|[A-Z])\.")  # begins the title of a chapter or an appendix
+# Neither heading, table, quotation, code, formula nor list.
+PARAGRAPH = re.compile(r"^(?!\s|[#|<>`]|\$\$|[-*+]\s).+(?:\n.+)*", re.MULTILINE)
 
 
 @dataclass(frozen=True)
@@ -38,44 +45,60 @@ class Options:
     problem2: str = "aruco"  # which is handed in, of PROBLEM2_FOLDERS; required is markers alone
 
 
-def read_options(path):
-    """Return the Options that the file `path` (str or Path) describes; without it, the defaults.
+@dataclass(frozen=True)
+class Chapter:
+    """What a notebook says of itself."""
+
+    title: str
+    number: str  # that of a chapter, the letter of an appendix, or ""
+    lead: str  # the first paragraph, or ""
+
+    @property
+    def is_appendix(self) -> bool:
+        """Return whether its number is a letter."""
+        return self.number.isalpha()
+
+
+def read_options(path: str | Path) -> Options:
+    """Return the Options that a file describes; without it, the defaults.
 
     DatasetError if the file is not TOML, has an unknown key, or a value is not as it must be.
     """
-    if not Path(path).exists():
+    path = Path(path)
+    if not path.exists():
         return Options()
     keys = [option.name for option in fields(Options)]
-    entries = read_toml(Path(path), 'author = "Ada Lovelace"', keys)
+    entries = read_toml(path, 'author = "Ada Lovelace"', keys)
     return Options(**{key: _checked(key, value, str(path)) for key, value in entries.items()})
 
 
 def _checked(key, value, place):
     """Return the value of a key as Options have it; DatasetError, which begins with `place`."""
-    choices = {"code": CODE_SHOWN, "problem2": [*PROBLEM2_FOLDERS], "appendix": [True, False]}
-    if key in choices:
-        ok = type(value) is type(choices[key][0]) and value in choices[key]
-        expected = f"one of {json.dumps(choices[key])[1:-1]}"
+    if key in CHOICES:
+        choices = CHOICES[key]
+        ok = type(value) is type(choices[0]) and value in choices  # 1 is not true
+        expected = f"one of {json.dumps(choices)[1:-1]}"
     elif key == "leave_out":
-        ok = type(value) is list and all(type(entry) is str for entry in value)
+        ok = isinstance(value, list) and all(isinstance(entry, str) for entry in value)
         expected = 'a list of numbers and titles in quotes, such as ["B", "3.5", "References"],'
     else:
-        ok = type(value) in (str, int) and re.fullmatch(r"[^\n\ufffd]*", value := str(value))
+        ok = type(value) in (str, int) and re.fullmatch(r"[^\n\ufffd]*", str(value))
         expected = "a line of UTF-8 text in quotes"
+        value = str(value)
     require(ok, place, f"{expected} for {key}", value)
     return dict.fromkeys(value, place) if key == "leave_out" else value
 
 
-def notebooks_folder():
-    """Return the Path `notebooks` if it is there, else that of the installed notebooks.
+def notebooks_folder() -> Path:
+    """Return the folder `notebooks` if it is there, else that of the installed notebooks.
 
     DatasetError where neither is there.
     """
-    root = Path(__file__).parents[2]
     if Path(FOLDER).is_dir():
         return Path(FOLDER)
-    if (root / "pyproject.toml").is_file():  # slamlib runs from its repository
-        return root / FOLDER
+    repository = Path(__file__).parents[2]
+    if (repository / "pyproject.toml").is_file():  # slamlib is not installed elsewhere
+        return repository / FOLDER
     with suppress(PackageNotFoundError):
         for file in files("slamlib") or ():
             if file.suffix == ".ipynb":
@@ -84,8 +107,8 @@ def notebooks_folder():
                        "notebooks; found none")
 
 
-def read_notebook(source):
-    """Return the NotebookNode in a file (Path), without outputs that an editor saved.
+def read_notebook(source: Path) -> NotebookNode:
+    """Return the notebook in a file, without outputs that an editor saved.
 
     NotebookError if the file is not a notebook, DatasetError if it is no file that can be read.
     """
@@ -94,49 +117,56 @@ def read_notebook(source):
         if "\ufffd" in text:  # which stands for bytes that are not UTF-8
             raise ValueError("expected UTF-8 text")
         book = nbformat.reads(text, as_version=4)
-        return ClearOutputPreprocessor().preprocess(book, {})[0]
+        cleared, _ = ClearOutputPreprocessor().preprocess(book, {})
     except Exception as error:  # on other JSON nbformat fails in many ways
         reason = str(error).partition("\n")[0]
         raise NotebookError(f"{source.name} is not a notebook: {reason}") from None
+    return cleared
 
 
-def to_execute(folder, options):
-    """Return the notebooks in a folder (Path) that are executed, as {Path: NotebookNode} in order.
+def to_execute(folder: Path, options: Options) -> Books:
+    """Return the notebooks in a folder that are executed, in order.
 
     These are all chapters, because they write results, by the names of their files, and then the
-    appendices that `options` (Options) show. DatasetError if there is none.
+    appendices that `options` show, by their letters. DatasetError if there is none.
     """
     books = {source: read_notebook(source) for source in sorted(folder.glob("*.ipynb"))}
     about = {source: chapter_of(source, book) for source, book in books.items()}
-    numbers = {each["number"] for each in about.values()} - {None}
-    for entry, place in options.leave_out.items():
-        known = entry.upper() in numbers or not re.fullmatch(r"\d+|[A-Za-z]", entry)
-        require(known or not place, place,
-                f"to leave out a chapter ({', '.join(sorted(numbers))}) or a section", entry)
-    chapters = {source: book for source, book in books.items() if not about[source]["letter"]}
-    appendices = sorted((about[source]["letter"], source) for source in shown(books, options)
-                        if source not in chapters and options.appendix is not False)
-    require(chapters or appendices, folder,
-            "notebooks (*.ipynb) that are not left out, found no notebooks")
-    return chapters | {source: books[source] for _, source in appendices}
+    _require_known(options.leave_out, {chapter.number for chapter in about.values()})
+    executed = [source for source in books if not about[source].is_appendix]
+    if options.appendix is not False:
+        appendices = [source for source in shown(books, options) if about[source].is_appendix]
+        executed += sorted(appendices, key=lambda source: about[source].number)
+    require(executed, folder, "notebooks (*.ipynb) that are not left out, found no notebooks")
+    return {source: books[source] for source in executed}
 
 
-def shown(books, options):
-    """Return the books (dict from Path to NotebookNode) without the chapters that are left out."""
-    left_out = {entry.strip().removesuffix(".").casefold() for entry in options.leave_out}
+def _require_known(leave_out, numbers):
+    """Raise DatasetError if a chapter is to be left out that has none of the numbers (set)."""
+    known = sorted(numbers - {""})
+    for entry, place in leave_out.items():
+        is_title = not re.fullmatch(r"\d+|[A-Za-z]", entry)
+        require(is_title or entry.upper() in known, place,
+                f"to leave out a chapter ({', '.join(known)}) or a section", entry)
+
+
+def shown(books: Books, options: Options) -> Books:
+    """Return the books without the chapters that are left out."""
+    left_out = {entry.strip().removesuffix(".").upper() for entry in options.leave_out} - {""}
     return {source: book for source, book in books.items()
-            if (chapter_of(source, book)["number"] or "-").casefold() not in left_out}
+            if chapter_of(source, book).number not in left_out}
 
 
-def chapter_of(source, book):
-    """Return title, number (or None), lead and letter of a chapter, a dict of str.
-
-    The lead is the first paragraph, the letter that of an appendix or "".
-    """
+def chapter_of(source: Path, book: NotebookNode) -> Chapter:
+    """Return the Chapter that a notebook is."""
     text = "\n\n".join(cell.source for cell in book.cells if cell.cell_type == "markdown")
-    title = re.search(r"^#\s+(.+)", text, re.MULTILINE)
-    lead = re.search(r"^(?!\s|[#|<>`]|\$\$|[-*+]\s).+(?:\n.+)*", text, re.MULTILINE)
-    title = re.sub("[*_`]", "", title[1]).strip() if title else source.stem
-    number = re.match(r"(\d+|([A-Z]))\.", title)
-    return {"title": title, "lead": lead[0] if lead else "", "number": number and number[1],
-            "letter": number and number[2] or ""}
+    heading = TITLE.search(text)
+    title = re.sub("[*_`]", "", heading[1]).strip() if heading else source.stem
+    number = NUMBER.match(title)
+    lead = PARAGRAPH.search(text)
+    return Chapter(title, number[1] if number else "", lead[0] if lead else "")
+
+
+def tags_of(cell: NotebookNode) -> list[str]:
+    """Return the tags of a cell."""
+    return cell.metadata.get("tags", [])
