@@ -16,7 +16,13 @@ from slamlib.robust.calibration import WHEELS, calibration_table
 from slamlib.robust.covariances import posterior_moments
 from slamlib.robust.factors import MIN_DISTANCE
 from slamlib.robust.fit import Fit, error_memories, residuals
-from slamlib.robust.initialization import SAME_PLACE, ranges_by_antenna, second_moment, trilaterate
+from slamlib.robust.initialization import (
+    SAME_PLACE,
+    other_antenna,
+    ranges_by_antenna,
+    second_moment,
+    trilaterate,
+)
 from slamlib.robust.solution import GtsamSolution, graph_and_values
 
 MIN_ACCEPTED_RANGES = 5      # number of accepted ranges of an antenna that is not in doubt
@@ -189,25 +195,37 @@ def antenna_doubts(problem, state, frame_covariances, covariances, range_weight)
 def _doubt(ranges, estimate, weight, places, costs):
     """The reason why an antenna is in doubt whose ranges have the weights (m,), or None.
 
-    It may be at `places` (p, 2) of `costs` (p,). Its standard deviation in the worst direction is
-    by its ranges alone: the covariance in the world also includes the uncertain heading of pose 1.
+    It may be at `places` (p, 2) of `costs` (p,).
     """
-    distance, count = np.median(ranges.distance), np.count_nonzero(weight > 0.5)
-    elsewhere = np.hypot(*(places - estimate).T) > SAME_PLACE * distance
-    possible = places[elsewhere & (costs < MAX_LOG_ODDS)]
-    difference = estimate - ranges.positions
-    direction = difference / np.maximum(np.hypot(*difference.T), MIN_DISTANCE)[:, None]
-    information = direction.T @ (direction * (weight / ranges.sigma**2)[:, None])
-    sigma = 1 / np.sqrt(max(np.linalg.eigvalsh(information)[0], GUESS_PRIOR_SIGMA**-2))
+    distance = np.median(ranges.distance)
+    count, total = np.count_nonzero(weight > 0.5), len(ranges.distance)
     if count < MIN_ACCEPTED_RANGES:
-        return f"only {count} of its {len(ranges.distance)} ranges agree"
-    if len(possible):
-        return "its ranges fit as well at " + " and ".join(dict.fromkeys(
-            "({:.1f}, {:.1f})".format(*place) for place in possible))
-    if count < len(ranges.distance) / 2:
-        return f"{len(ranges.distance) - count} of its {len(ranges.distance)} ranges disagree"
-    if sigma > MAX_RELATIVE_SIGMA * distance:
+        return f"only {count} of its {total} ranges agree"
+    elsewhere = np.linalg.norm(places - estimate, axis=1) > SAME_PLACE * distance
+    possible = [f"({x:.1f}, {y:.1f})" for x, y in places[elsewhere & (costs < MAX_LOG_ODDS)]]
+    if possible:
+        listed = " and ".join(dict.fromkeys(possible))
+        return f"its ranges fit as well at {listed}, which its covariance includes"
+    other = other_antenna(ranges, estimate, weight)
+    if other is not None:
+        return other
+    if count < total / 2:
+        return f"{total - count} of its {total} ranges disagree"
+    if worst_sigma(ranges, estimate, weight) > MAX_RELATIVE_SIGMA * distance:
         return "its ranges are too few or come from too few directions"
+    return None
+
+
+def worst_sigma(ranges, estimate, weight):
+    """Standard deviation in m of an antenna in the worst direction, by its ranges alone.
+
+    Its covariance in the world also includes the uncertain heading of pose 1.
+    """
+    difference = estimate - ranges.positions
+    direction = difference / np.maximum(np.linalg.norm(difference, axis=1), MIN_DISTANCE)[:, None]
+    weighted = direction * (weight / ranges.sigma**2)[:, None]
+    information = np.linalg.eigvalsh(direction.T @ weighted)[0]
+    return 1 / np.sqrt(max(information, GUESS_PRIOR_SIGMA**-2))
 
 
 def interpolate(problem, state, pairs):

@@ -45,8 +45,8 @@ def solution_doubts(result):
     return tuple(Doubt(*each) for each in chain(
         _of_encoder(result), _of_calibration(result), _of_noise(result),
         _of_sightings(result), _of_the_path(result), _of_agreement(result),
-        (("antenna", f"Antenna {antenna} is in doubt: {reason}. Its covariance includes this; look "
-          "at its rows in UwbReading.txt.") for antenna, reason in result.doubts.items())))
+        (("antenna", f"Antenna {antenna} is in doubt: {reason}. Look at its rows in UwbReading.txt.")
+         for antenna, reason in result.doubts.items())))
 
 
 def _of_calibration(result):
