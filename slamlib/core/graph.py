@@ -133,15 +133,17 @@ def odometry_error(increments: OdometryIncrements, k: int, sigma_wheel: np.ndarr
     scale.
     """
     increment, J_wheel = increments.increment[k], increments.J_wheel[k]
-    stated, linearised = increments.stated, increments.wheel
+    stated = increments.stated
+    stated_radius = (stated[0] + stated[1]) / 2
+    off_stated = stated - increments.wheel               # from the value of linearisation
 
     def error(factor, values, jacobians):
         first, second, wheels = factor.keys()
-        wheel = stated + sigma_wheel * values.atVector(wheels)
-        measured = gtsam.Pose2(*(increment + J_wheel @ (wheel - linearised)))
-        radius = wheel[:2].mean()
-        scale = np.full(3, stated[:2].mean() / radius)
-        scale[2] *= wheel[2] / stated[2]
+        change = sigma_wheel * values.atVector(wheels)
+        radius = stated_radius + (change[0] + change[1]) / 2
+        wheelbase = stated[2] + change[2]
+        scale = np.array([1.0, 1.0, wheelbase / stated[2]]) * (stated_radius / radius)
+        measured = gtsam.Pose2(*(increment + J_wheel @ (off_stated + change)))
         X_i, X_k = values.atPose2(first), values.atPose2(second)
         if jacobians is None:
             return scale * gtsam.Pose2.Logmap(measured.between(X_i.between(X_k)))
@@ -152,11 +154,11 @@ def odometry_error(increments: OdometryIncrements, k: int, sigma_wheel: np.ndarr
         unscaled = gtsam.Pose2.Logmap(difference, by_difference)
         scaled_by_expected = scale[:, None] * (by_difference @ by_expected)
         by_wheel = by_difference @ by_measured @ in_own_axes(measured) @ J_wheel
-        by_scale = np.array([[-1, -1, 0], [-1, -1, 0], [-1, -1, 0]]) / (2 * radius)
-        by_scale[2, 2] = 1 / wheel[2]
+        by_wheel[:, :2] -= unscaled[:, None] / (2 * radius)
+        by_wheel[2, 2] += unscaled[2] / wheelbase
         jacobians[0] = scaled_by_expected @ by_first
         jacobians[1] = scaled_by_expected @ by_second
-        jacobians[2] = scale[:, None] * (by_wheel + unscaled[:, None] * by_scale) * sigma_wheel
+        jacobians[2] = scale[:, None] * by_wheel * sigma_wheel
         return scale * unscaled
 
     return error
@@ -164,9 +166,8 @@ def odometry_error(increments: OdometryIncrements, k: int, sigma_wheel: np.ndarr
 
 def in_own_axes(pose: gtsam.Pose2) -> np.ndarray:
     """Derivative (3, 3) of GTSAM's tangent vector at a pose by its coordinates [x, y, heading]."""
-    by_coordinates = np.eye(3)
-    by_coordinates[:2, :2] = pose.rotation().matrix().T
-    return by_coordinates
+    c, s = np.cos(pose.theta()), np.sin(pose.theta())
+    return np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
 
 
 def noise_model(covariance: np.ndarray, kernel: str, share: float) -> gtsam.noiseModel.Base:

@@ -96,6 +96,7 @@ class GaussNewton:
     error: float             # half the sum of squared whitened errors, or kernels' losses
     steps: int               # number of steps
     converged: bool          # whether the error had stopped to fall
+    marginals: Marginals     # where the last step was linearised
 
 
 def solve_graph(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> GraphSolution:
@@ -104,7 +105,6 @@ def solve_graph(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> Grap
     Raises DatasetError, which names a variable, if the factors do not determine every one.
     """
     found = gauss_newton(graph, values)
-    marginals = Marginals(eliminated(graph.linearize(found.values)))
     worst = contradiction(graph, found.values)
     if worst:
         LOG.warning(worst)
@@ -112,9 +112,9 @@ def solve_graph(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> Grap
         LOG.warning("the error still falls after %d steps, to %.4g: is a factor far from the rest, "
                     "or an initial value?", found.steps, found.error)
     return GraphSolution(
-        graph=graph, values=found.values, marginals=marginals, steps=found.steps,
+        graph=graph, values=found.values, marginals=found.marginals, steps=found.steps,
         error=found.error, converged=found.converged and not worst, contradiction=worst,
-        **places(found.values, marginals.covariance))
+        **places(found.values, found.marginals.covariance))
 
 
 def gauss_newton(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> GaussNewton:
@@ -124,13 +124,13 @@ def gauss_newton(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> Gau
     """
     error = graph.error(values)
     for steps in range(1, MAX_STEPS + 1):
-        step = eliminated(graph.linearize(values)).optimize()
+        tree = eliminated(graph.linearize(values))
         before = error
-        values, error = descended(graph, values, step, error)
+        values, error = descended(graph, values, tree.optimize(), error)
         LOG.debug("Gauss-Newton step %d: error %.6g", steps, error)
         if before - error <= CONVERGED * (1 + before):
-            return GaussNewton(values, error, steps, converged=True)
-    return GaussNewton(values, error, MAX_STEPS, converged=False)
+            return GaussNewton(values, error, steps, True, Marginals(tree))
+    return GaussNewton(values, error, MAX_STEPS, False, Marginals(tree))
 
 
 def descended(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, step: gtsam.VectorValues,

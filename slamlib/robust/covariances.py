@@ -114,7 +114,7 @@ def posterior_moments(fit):
     weights = np.array(weights) / sum(weights)
     slip = np.sqrt(weights @ np.square([point.slip for point in noises]))
     conditional = [marginal_covariances(equations, point) for point in noises]
-    if len(noises) == 1:
+    if noises == (problem.noise,):
         return fit.state, conditional[0], slip
     x = np.stack([laplace_approximation(equations, point)[0] for point in noises])
     x -= laplace_approximation(equations, problem.noise)[0]

@@ -334,8 +334,9 @@ def solve_by_gtsam(fit: Fit) -> GtsamSolution:
 
     Raises DatasetError where the measurements do not determine every variable.
     """
-    problem = fit.problem
-    graph, decided = graph_and_values(problem, fit.state)
+    problem, points = fit.problem, noise_points(fit)
+    graph = graph_of(problem, points[0][1] if len(points) == 1 else problem.noise)
+    decided = values_of(problem, fit.state, graph)
     odometry = odometry_state(problem.measurements, problem.odometry.model)
     found, start = gauss_newton(graph, values_of(problem, odometry, graph)), FROM_ODOMETRY
     limit = graph.error(decided)
@@ -344,20 +345,23 @@ def solve_by_gtsam(fit: Fit) -> GtsamSolution:
     return averaged(fit, graph, found, start)
 
 
+def noise_points(fit: Fit) -> tuple[tuple[float, Noise], ...]:
+    """Probability and Noise of each point over which a Fit is averaged, one if it is known."""
+    return fit.posterior.points if fit.posterior else ((1.0, fit.problem.noise),)
+
+
 def averaged(fit: Fit, graph: gtsam.NonlinearFactorGraph, found: GaussNewton,
              start: str) -> GtsamSolution:
     """The GtsamSolution by the moments over the noise's posterior at the solution of a graph."""
-    problem, values = fit.problem, found.values
-    points = fit.posterior.points if fit.posterior else ((1.0, problem.noise),)
+    problem, values, points = fit.problem, found.values, noise_points(fit)
     weights = np.array([weight for weight, _ in points])
     weights /= weights.sum()
     keys = gtsam.KeyVector(list(values.keys()))
-    graphs = [graph if noise == problem.noise else graph_of(problem, noise)
-              for _, noise in points]
-    trees = [eliminated(each.linearize(values)) for each in graphs]
-    marginals = [Marginals(tree) for tree in trees]
-    steps = np.zeros((len(points), values.dim()))
+    marginals, steps = [found.marginals], np.zeros((1, values.dim()))
     if len(points) > 1:
+        graphs = [graph_of(problem, noise) for _, noise in points]
+        trees = [eliminated(each.linearize(values)) for each in graphs]
+        marginals = [Marginals(tree) for tree in trees]
         at_mode = eliminated(graph.linearize(values)).optimize().vector(keys)
         steps = np.array([tree.optimize().vector(keys) for tree in trees]) - at_mode
     mean = weights @ steps
