@@ -45,16 +45,19 @@ class Decisions:
     ranges: UwbReadings | None           # those that count, with their standard deviations
     guess: AntennaGuess | None
     points: np.ndarray                   # ids of the markers whose heading no sighting knows
-    sighting_share: np.ndarray | None = None     # (s,) of information that each keeps; None: all
-    range_share: np.ndarray | None = None        # (r,)
-    sighting_kernel: str = "quadratic"
-    range_kernel: str = "quadratic"
+    sighting_share: np.ndarray           # (s,) of its information that each sighting keeps
+    range_share: np.ndarray              # (r,)
+    sighting_kernel: str                 # name in `kernels.KERNELS`
+    range_kernel: str
 
 
 def frames_of(dataset: Dataset, extra: np.ndarray = ()) -> np.ndarray:
     """Encoder poses (f,) that are variables: the first, the last, with a measurement, `extra`."""
-    measured = [readings.pose for readings in (dataset.aruco, dataset.uwb) if readings is not None]
-    return np.unique(np.concatenate([[0, len(dataset.ticks) - 1], *measured, extra]).astype(int))
+    frames = [0, len(dataset.ticks) - 1]
+    for readings in (dataset.aruco, dataset.uwb):
+        if readings is not None:
+            frames = np.union1d(frames, readings.pose)
+    return np.union1d(frames, extra).astype(int)
 
 
 def count_everything(dataset: Dataset, kernel: str = "Cauchy", slip: float = TYPICAL_SLIP,
@@ -64,15 +67,18 @@ def count_everything(dataset: Dataset, kernel: str = "Cauchy", slip: float = TYP
     `kernel` is a name in `kernels.KERNELS`, of sightings and ranges, `slip` is in sqrt(m), and
     `extra` are further encoder poses that are variables.
     """
+    sightings, ranges = dataset.sightings, dataset.uwb
     return Decisions(
         odometry=preintegrate(dataset, frames_of(dataset, extra)),
         slip=slip,
         sigma_heading=dataset.vehicle.sigma_heading,
         sigma_wheel=dataset.vehicle.sigma_wheel,
-        sightings=dataset.sightings,
-        ranges=dataset.uwb,
+        sightings=sightings,
+        ranges=ranges,
         guess=dataset.antenna_guess,
-        points=markers_without_heading(dataset.sightings),
+        points=markers_without_heading(sightings),
+        sighting_share=np.ones(0 if sightings is None else len(sightings.pose)),
+        range_share=np.ones(0 if ranges is None else len(ranges.pose)),
         sighting_kernel="quadratic" if kernel in ONE_SIDED else kernel,
         range_kernel=kernel)
 
@@ -109,19 +115,26 @@ def add_antenna_priors(graph: gtsam.NonlinearFactorGraph, guess: AntennaGuess,
 
 def guessed(guess: AntennaGuess, antennas: np.ndarray) -> dict[int, np.ndarray]:
     """The guessed position (2,) in m of each of these antennas, by the index of its symbol."""
-    used = np.isin(guess.antenna, antennas)
-    return dict(zip((guess.antenna[used] % INDICES).tolist(), guess.position[used]))
+    positions = {}
+    for antenna, position in zip(guess.antenna, guess.position):
+        if antenna in antennas:
+            positions[index_of(antenna)] = position
+    return positions
+
+
+def index_of(landmark: int) -> int:
+    """The index of the symbol of a marker or antenna by its id, which may be negative."""
+    return int(landmark) % INDICES
 
 
 def add_odometry(graph: gtsam.NonlinearFactorGraph, decisions: Decisions):
     """Add a factor between successive frames, which all depend on the same wheel parameters."""
     increments = decisions.odometry
-    covariances = increments.covariance(decisions.slip)
-    for k, covariance in enumerate(covariances):
-        graph.add(gtsam.CustomFactor(
-            gtsam.noiseModel.Gaussian.Covariance(covariance),
-            [X(int(increments.frame[k])), X(int(increments.frame[k + 1])), W(0)],
-            odometry_error(increments, k, decisions.sigma_wheel)))
+    poses = [X(i) for i in increments.frame.tolist()]
+    for k, covariance in enumerate(increments.covariance(decisions.slip)):
+        noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
+        error = odometry_error(increments, k, decisions.sigma_wheel)
+        graph.add(gtsam.CustomFactor(noise, [poses[k], poses[k + 1], W(0)], error))
 
 
 def odometry_error(increments: OdometryIncrements, k: int, sigma_wheel: np.ndarray):
@@ -195,40 +208,41 @@ def add_sightings(graph: gtsam.NonlinearFactorGraph, decisions: Decisions):
     The files give the covariance C of Z in the axes of the vehicle; the error of a marker's pose
     lives in those of the measured pose, R(heading)^T C R(heading) (equation 3.1).
     """
-    sightings = decisions.sightings
-    shares = np.ones(len(sightings.pose)) if decisions.sighting_share is None \
-        else decisions.sighting_share
-    markers = (sightings.marker % INDICES).tolist()
-    poses = sightings.pose.tolist()
-    is_point = np.isin(sightings.marker, decisions.points)
+    sightings, kernel = decisions.sightings, decisions.sighting_kernel
+    points = set(decisions.points.tolist())
+    in_axes_of_marker = se2.rotate_covariance(
+        sightings.covariance, -sightings.marker_in_vehicle[:, 2])
     for k, z in enumerate(sightings.marker_in_vehicle):
-        C = sightings.covariance[k]
-        if is_point[k]:
-            distance = np.hypot(z[0], z[1])
-            bearing = gtsam.Rot2(np.arctan2(z[1], z[0]))
-            polar = np.array([[-z[1] / distance**2, z[0] / distance**2],
-                              [z[0] / distance, z[1] / distance]])       # by x and y
-            noise = noise_model(
-                polar @ C[:2, :2] @ polar.T, decisions.sighting_kernel, shares[k])
+        pose, share = X(int(sightings.pose[k])), decisions.sighting_share[k]
+        marker = int(sightings.marker[k])
+        if marker in points:
+            bearing, distance, C = polar(z, sightings.covariance[k])
+            noise = noise_model(C, kernel, share)
             graph.add(gtsam.BearingRangeFactor2D(
-                X(poses[k]), P(markers[k]), bearing, distance, noise))
+                pose, P(index_of(marker)), bearing, distance, noise))
         else:
-            noise = noise_model(
-                se2.rotate_covariance(C, -z[2]), decisions.sighting_kernel, shares[k])
+            noise = noise_model(in_axes_of_marker[k], kernel, share)
             graph.add(gtsam.BetweenFactorPose2(
-                X(poses[k]), L(markers[k]), gtsam.Pose2(*z), noise))
+                pose, L(index_of(marker)), gtsam.Pose2(*z), noise))
+
+
+def polar(z: np.ndarray, C: np.ndarray) -> tuple[gtsam.Rot2, float, np.ndarray]:
+    """Bearing and distance of a sighting z (3,), and their covariance (2, 2) by C (3, 3)."""
+    x, y, _ = z
+    distance = np.hypot(x, y)
+    by_position = np.array([[-y / distance**2, x / distance**2], [x / distance, y / distance]])
+    covariance = by_position @ C[:2, :2] @ by_position.T
+    return gtsam.Rot2(np.arctan2(y, x)), distance, covariance
 
 
 def add_ranges(graph: gtsam.NonlinearFactorGraph, decisions: Decisions):
     """Add a factor for each range, which is compared with the bias of a one-sided kernel."""
-    ranges = decisions.ranges
-    shares = np.ones(len(ranges.pose)) if decisions.range_share is None else decisions.range_share
-    measured = ranges.range - ONE_SIDED.get(decisions.range_kernel, 0.0) * ranges.sigma
-    antennas = (ranges.antenna % INDICES).tolist()
-    poses = ranges.pose.tolist()
+    ranges, kernel = decisions.ranges, decisions.range_kernel
+    measured = ranges.range - ONE_SIDED.get(kernel, 0.0) * ranges.sigma
     for k, sigma in enumerate(ranges.sigma):
-        noise = noise_model(np.array([[sigma**2]]), decisions.range_kernel, shares[k])
-        graph.add(gtsam.RangeFactor2D(X(poses[k]), A(antennas[k]), measured[k], noise))
+        pose, antenna = X(int(ranges.pose[k])), A(index_of(ranges.antenna[k]))
+        noise = noise_model(np.array([[sigma**2]]), kernel, decisions.range_share[k])
+        graph.add(gtsam.RangeFactor2D(pose, antenna, measured[k], noise))
 
 
 def initial_values(dataset: Dataset, decisions: Decisions) -> gtsam.Values:
@@ -240,18 +254,24 @@ def initial_values(dataset: Dataset, decisions: Decisions) -> gtsam.Values:
     for i in decisions.odometry.frame.tolist():
         values.insert(X(i), gtsam.Pose2(*poses[i]))
     if decisions.sightings is not None:
-        sightings = decisions.sightings
-        i = sightings.pose
-        in_world, C = se2.compose_uncertain(
-            poses[i], covariances[i], sightings.marker_in_vehicle, sightings.covariance)
-        for k in consensus(sightings.marker, in_world, C):
-            marker = int(sightings.marker[k] % INDICES)
-            if sightings.marker[k] in decisions.points:
-                values.insert(P(marker), in_world[k, :2])
-            else:
-                values.insert(L(marker), gtsam.Pose2(*in_world[k]))
+        insert_markers(values, decisions, poses, covariances)
     if decisions.ranges is not None:
         at_guesses = guessed(decisions.guess, decisions.ranges.antenna)
         for antenna, position in at_guesses.items():
             values.insert(A(antenna), position)
     return values
+
+
+def insert_markers(values: gtsam.Values, decisions: Decisions, poses: np.ndarray,
+                   covariances: np.ndarray):
+    """Insert each marker where the consensus of its sightings is from poses (n, 3)."""
+    sightings = decisions.sightings
+    i = sightings.pose
+    in_world, C = se2.compose_uncertain(
+        poses[i], covariances[i], sightings.marker_in_vehicle, sightings.covariance)
+    for k in consensus(sightings.marker, in_world, C):
+        marker = index_of(sightings.marker[k])
+        if sightings.marker[k] in decisions.points:
+            values.insert(P(marker), in_world[k, :2])
+        else:
+            values.insert(L(marker), gtsam.Pose2(*in_world[k]))
