@@ -38,14 +38,16 @@ def test_the_example_of_the_readme_runs(tmp_path, monkeypatch, capsys):
     text = (ROOT / "README.md").read_text()
     _, section = text.split("## As a library\n")
     examples = re.findall(r"(?:^    .*\n|^\n(?=    ))+", section, re.MULTILINE)
-    lines, arrays = ([line.removeprefix("    ") for line in each.strip("\n").splitlines()]
-                     for each in examples[:2])
+    lines, arrays, plain = ([line.removeprefix("    ") for line in each.strip("\n").splitlines()]
+                            for each in examples[:3])
     assert 8 <= len(lines) <= 16 and len(arrays) == 3
     (tmp_path / "data").symlink_to(ROOT / "data")
     monkeypatch.chdir(tmp_path)
     names = {}
     exec("\n".join(lines), names)  # noqa: S102
     exec("\n".join(arrays), names)  # noqa: S102
+    exec("\n".join(plain), names)  # noqa: S102
+    assert names["plain"].converged and names["plain"].poses.shape == (201, 3)
     np.testing.assert_array_equal(names["found"].poses, names["same"].poses)
     assert names["found"].poses.shape == (2000, 3) and len(capsys.readouterr().out) > 20
     rows = np.loadtxt(tmp_path / "build" / "short.tum")
