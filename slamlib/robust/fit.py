@@ -28,7 +28,7 @@ from slamlib.robust.measurements import (
     with_known,
 )
 from slamlib.robust.noise import NoisePosterior, learn_noise, with_hidden_errors
-from slamlib.robust.optimize import Optimum, optimize
+from slamlib.robust.optimize import optimize
 
 log = logging.getLogger(__name__)
 
@@ -44,8 +44,6 @@ MAX_ROUNDS = 6               # number of rounds of wheels, noise and accepted me
 NEGLIGIBLE_MOVE = 3e-3       # relative, of a wheel parameter since odometry was linearised
 SETTLED_MOVE = 1e-4          # the same, at the solution that is handed in
 NEGLIGIBLE_CHANGE = 1e-3     # share of the measurements whose weight may change at the same noise
-
-Accept = Callable[[Problem, State], AcceptedMeasurements]
 
 
 def accepted_measurements(
@@ -166,7 +164,7 @@ class Fit:
 
 
 def refine(problem: Problem, state: State,
-           accept: Accept | None = accepted_measurements) -> Fit:
+           accept: Callable[..., AcceptedMeasurements] | None = accepted_measurements) -> Fit:
     """The Fit in which wheels, noise and accepted measurements agree with each other.
 
     They depend on each other, so each is updated in turn until the accepted measurements no longer
@@ -179,21 +177,20 @@ def refine(problem: Problem, state: State,
         shares = [kind.share for kind in problem.accepted]
         given = problem.accepted.with_shares(map(np.ones_like, shares))
         accept = lambda *_: given
-        problem, optimum, posterior = settle(problem, state, accept)
+        problem, optimum, posterior = _settle(problem, state, accept)
     else:
         problem = replace(problem, noise=noise_of_scatter(problem, state))
-        problem, optimum, posterior = settle(problem, state, accept)
-        shares = shares_of_memory(problem, optimum.state, accept)
+        problem, optimum, posterior = _settle(problem, state, accept)
+        shares = _shares_of_memory(problem, optimum.state, accept)
     if any((share < 1).any() for share in shares):
-        problem, posterior = apply_memory(problem, optimum.state, posterior, shares, accept)
+        problem, posterior = _apply_memory(problem, optimum.state, posterior, shares, accept)
         optimum = optimize(problem, optimum.state)
     _, log_evidence = laplace_approximation(optimum.equations, problem.noise)
     return Fit(problem=problem, state=optimum.state, log_evidence=log_evidence, posterior=posterior,
                converged=optimum.converged)
 
 
-def settle(problem: Problem, state: State,
-           accept: Accept) -> tuple[Problem, Optimum, NoisePosterior | None]:
+def _settle(problem, state, accept):
     """The Problem and its Optimum after rounds of wheels, noise and accepted measurements.
 
     Also the last posterior of the noise. The Problem has the measurements that `accept` made before
@@ -204,10 +201,10 @@ def settle(problem: Problem, state: State,
     accepted = accept(problem, state)
     changed = np.inf
     for number in range(1, MAX_ROUNDS + 1):
-        problem = relinearized(replace(problem, accepted=accepted), state)
+        problem = _relinearized(replace(problem, accepted=accepted), state)
         if m.learned.any() and changed > NEGLIGIBLE_CHANGE * len(accepted.share):
-            problem, state, posterior = settle_noise(problem, state)
-        problem = with_errors_in_counts(problem)
+            problem, state, posterior = _settle_noise(problem, state)
+        problem = _with_errors_in_counts(problem)
         optimum = optimize(problem, state)
         state = optimum.state
         accepted = accept(problem, state)
@@ -218,29 +215,29 @@ def settle(problem: Problem, state: State,
                  "sightings, %d of %d ranges, %d changed", number, 1e3 * problem.noise.slip,
                  problem.noise.sightings, problem.noise.ranges, sightings, len(m.marker_row),
                  ranges, len(m.ranges.row), changed)
-        if changed == 0 and wheel_move(problem, state) < NEGLIGIBLE_MOVE:
+        if changed == 0 and _wheel_move(problem, state) < NEGLIGIBLE_MOVE:
             break
     return problem, optimum, posterior
 
 
-def relinearized(problem: Problem, state: State) -> Problem:
+def _relinearized(problem, state):
     """The Problem with odometry linearised at the wheels of a State, with errors in metres."""
     odometry = preintegrate_odometry(
         problem.measurements, problem.odometry.model, state.c[WHEELS])
     return replace(problem, odometry=odometry)
 
 
-def with_errors_in_counts(problem: Problem) -> Problem:
+def _with_errors_in_counts(problem):
     """The Problem with odometry's errors in counts, which is right once the slip is known."""
     return replace(problem, odometry=replace(problem.odometry, in_counts=True))
 
 
-def wheel_move(problem: Problem, state: State) -> float:
+def _wheel_move(problem, state):
     """Largest relative difference of a wheel parameter from where odometry was linearised."""
     return np.abs(state.c[WHEELS] / problem.odometry.wheel - 1).max()
 
 
-def settle_noise(problem: Problem, state: State) -> tuple[Problem, State, NoisePosterior]:
+def _settle_noise(problem, state):
     """The Problem with the noise learned after two steps from a State, and its posterior."""
     optimum = optimize(problem, state, max_steps=2)
     posterior = learn_noise(optimum.equations)
@@ -254,15 +251,15 @@ def settled(fit: Fit) -> Fit:
     Rounds that end by their number leave it elsewhere, where the increments have other scales.
     """
     for _ in range(MAX_ROUNDS):
-        if wheel_move(fit.problem, fit.state) < SETTLED_MOVE:
+        if _wheel_move(fit.problem, fit.state) < SETTLED_MOVE:
             break
-        problem = with_errors_in_counts(relinearized(fit.problem, fit.state))
+        problem = _with_errors_in_counts(_relinearized(fit.problem, fit.state))
         optimum = optimize(problem, fit.state)
         fit = replace(fit, problem=problem, state=optimum.state, converged=optimum.converged)
     return fit
 
 
-def shares_of_memory(problem: Problem, state: State, accept: Accept) -> list[np.ndarray]:
+def _shares_of_memory(problem, state, accept):
     """Shares (s,) and (r,) that memory leaves of the information of sightings and of ranges.
 
     At a solution, for standard deviations that include what residuals do not show.
@@ -273,9 +270,7 @@ def shares_of_memory(problem: Problem, state: State, accept: Accept) -> list[np.
     return [memory.share for memory in error_memories(hidden, state)]
 
 
-def apply_memory(problem: Problem, state: State, posterior: NoisePosterior | None,
-                 shares: Sequence[np.ndarray],
-                 accept: Accept) -> tuple[Problem, NoisePosterior | None]:
+def _apply_memory(problem, state, posterior, shares, accept):
     """The Problem with shares (s,) and (r,) of errors with memory, and its noise's posterior."""
     vehicle = problem.measurements.dataset.vehicle
     remember = [(share < 1).any() for share in shares]

@@ -26,7 +26,6 @@ from slamlib.robust.initialization import (
     trilaterate,
 )
 from slamlib.robust.linear import Problem, State
-from slamlib.robust.measurements import Measurements
 from slamlib.robust.solution import GtsamSolution, graph_and_values
 
 MIN_ACCEPTED_RANGES = 5      # number of accepted ranges of an antenna that is not in doubt
@@ -131,7 +130,7 @@ def slam_result(fit: Fit, by_gtsam: GtsamSolution | None = None) -> SlamResult:
     c_covariance = marginal.c
     agreement = 0.0, 0.0
     if by_gtsam is not None:
-        frames = of_frames(marginal.pairs, m)
+        frames = _of_frames(marginal.pairs, m)
         agreement = agreement_of(by_gtsam, state, frames, marginal.landmarks)
         state = by_gtsam.state
         landmarks = by_gtsam.landmarks
@@ -142,11 +141,11 @@ def slam_result(fit: Fit, by_gtsam: GtsamSolution | None = None) -> SlamResult:
         covariances[m.frame] = se2.rotate_covariance(by_gtsam.frames, state.poses[:, 2])
 
     rejected = problem.accepted.sightings.weight == 0
-    mapped = mostly_accepted(m, rejected)
+    mapped = _mostly_accepted(m, rejected)
     markers = state.markers[mapped]
     markers[:, 2] = se2.wrap(markers[:, 2])
     of_markers, of_antennas = np.split(landmarks, [len(m.marker)])
-    of_markers = with_sighted_headings(m, of_markers)[mapped]
+    of_markers = _with_sighted_headings(m, of_markers)[mapped]
 
     _, range_residual = residuals(problem, state)
     range_weight = problem.accepted.ranges.kept(range_residual)
@@ -168,13 +167,13 @@ def slam_result(fit: Fit, by_gtsam: GtsamSolution | None = None) -> SlamResult:
         turn_sigma=turn_sigma(problem), fit=fit, gtsam=by_gtsam, agreement=agreement)
 
 
-def mostly_accepted(measurements: Measurements, rejected: np.ndarray) -> np.ndarray:
+def _mostly_accepted(measurements, rejected):
     """True (k,) for markers with more accepted than `rejected` (s,) sightings."""
     vote = np.where(rejected, -1, 1)
     return np.bincount(measurements.marker_row, vote, len(measurements.marker)) > 0
 
 
-def with_sighted_headings(measurements: Measurements, covariances: np.ndarray) -> np.ndarray:
+def _with_sighted_headings(measurements, covariances):
     """Covariances (k, 3, 3) of markers in which points have the heading of their best sighting."""
     m = measurements
     best = np.full(len(m.marker), np.inf)
@@ -184,7 +183,7 @@ def with_sighted_headings(measurements: Measurements, covariances: np.ndarray) -
     return covariances
 
 
-def of_frames(pairs: np.ndarray, measurements: Measurements) -> np.ndarray:
+def _of_frames(pairs, measurements):
     """Covariances (f, 3, 3) of the frames by those of pairs (f-1, 9, 9); of one alone its prior."""
     if not len(pairs):
         return np.diag(measurements.origin_sigma**2)[None]
@@ -296,8 +295,7 @@ class _Side:
     jump: np.ndarray         # (m, 1, 1) share of a jump in these steps
 
 
-def from_frame(problem: Problem, state: State, row: np.ndarray, pose: np.ndarray,
-               is_after: bool) -> _Side:
+def _from_frame(problem, state, row, pose, is_after):
     """The estimates of encoder poses (m,) by odometry from the frames in rows (m,) of a State.
 
     All frames are before the poses, or all after them.
@@ -334,16 +332,16 @@ def interpolate(problem: Problem, state: State,
     `pairs` (f-1, 9, 9) as in `Covariances`, at the State that solves the Problem.
     """
     m = problem.measurements
-    joint = pairs_in_world(pairs, state.poses[:, 2])
+    joint = _pairs_in_world(pairs, state.poses[:, 2])
     pose = np.arange(len(m.dataset.ticks))
     last = np.searchsorted(m.frame, pose, side="right") - 1      # frame at each pose or before it
     poses = state.poses[last]
-    covariances = of_frames(joint, m)[last]
+    covariances = _of_frames(joint, m)[last]
 
     inner = np.setdiff1d(pose, m.frame)
     a = last[inner]
-    before = from_frame(problem, state, a, inner, is_after=False)
-    after = from_frame(problem, state, a + 1, inner, is_after=True)
+    before = _from_frame(problem, state, a, inner, is_after=False)
+    after = _from_frame(problem, state, a + 1, inner, is_after=True)
     difference = se2.difference(after.pose, before.pose)
     squared = difference[:, :, None] * difference[:, None]
     jump = squared / np.maximum(before.jump + after.jump, MIN_SHARE)
@@ -359,7 +357,7 @@ def interpolate(problem: Problem, state: State,
     return poses, (covariances + covariances.mT) / 2
 
 
-def pairs_in_world(pairs: np.ndarray, heading: np.ndarray) -> np.ndarray:
+def _pairs_in_world(pairs, heading):
     """Covariances (f-1, 9, 9) of pairs of frames with headings (f,) and wheels, in world axes."""
     R = se2.rotation(heading)
     turn = np.tile(np.eye(9), (len(pairs), 1, 1))

@@ -1,6 +1,5 @@
 """Doubts where the solution of problem 3 or 4, a SlamResult, contradicts what the files state."""
 
-from collections.abc import Iterator
 from functools import reduce
 from typing import NamedTuple
 
@@ -47,8 +46,8 @@ GROUPS = {
 def solution_doubts(result: SlamResult) -> tuple[Doubt, ...]:
     """Tuple of Doubt where a SlamResult contradicts the files of its drive."""
     doubts = []
-    for check in (encoder_doubts, calibration_doubts, noise_doubts, place_doubts, rejection_doubts,
-                  path_doubts, agreement_doubts):
+    for check in (_encoder_doubts, _calibration_doubts, _noise_doubts, _place_doubts,
+                  _rejection_doubts, _path_doubts, _agreement_doubts):
         doubts += check(result)
     for antenna, reason in result.doubts.items():
         doubts.append(Doubt("antenna", (
@@ -56,7 +55,7 @@ def solution_doubts(result: SlamResult) -> tuple[Doubt, ...]:
     return tuple(doubts)
 
 
-def calibration_doubts(result: SlamResult) -> Iterator[Doubt]:
+def _calibration_doubts(result):
     """A Doubt on each group of the calibration that decidedly left its stated values.
 
     Of groups that the drive cannot tell apart, on that which is furthest from what is stated.
@@ -93,7 +92,7 @@ def _estimated_and_stated(row):
     return f"{estimated.rstrip()} (stated: {stated})"
 
 
-def encoder_doubts(result: SlamResult) -> Iterator[Doubt]:
+def _encoder_doubts(result):
     """A Doubt if the markers contradict the counts, by stretches of the drive."""
     jumps = result.jumps
     if not len(jumps.start):
@@ -143,7 +142,7 @@ SIGHTINGS = _Kind("marker", "sightings", "ArucoReading.txt", 1)
 RANGES = _Kind("range", "ranges", "UwbReading.txt", 2)
 
 
-def noise_doubts(result: SlamResult) -> Iterator[Doubt]:
+def _noise_doubts(result):
     """Doubts on errors with memory, and on learned factors that are not 1."""
     shares = np.split(result.share, [len(result.rejected)])
     for kind, share in zip((SIGHTINGS, RANGES), shares):
@@ -188,7 +187,7 @@ def _factor_doubt(result, kind):
         f"use the scatter that was found, the others the file's. {reason}"))
 
 
-def place_doubts(result: SlamResult) -> Iterator[Doubt]:
+def _place_doubts(result):
     """A Doubt on ids of markers that stand for several places."""
     if result.places is None:
         return
@@ -205,7 +204,7 @@ def _listed(ids):
     return ", ".join(map(str, np.unique(ids)))
 
 
-def rejection_doubts(result: SlamResult) -> Iterator[Doubt]:
+def _rejection_doubts(result):
     """A Doubt on sightings that are rejected, if these are many or most of one marker."""
     rejected = result.rejected
     repeated = result.sightings.contradicting
@@ -229,7 +228,7 @@ def rejection_doubts(result: SlamResult) -> Iterator[Doubt]:
         "twice, and for lost counts in encoderReading.txt."))
 
 
-def path_doubts(result: SlamResult) -> Iterator[Doubt]:
+def _path_doubts(result):
     """Doubts on slip, turns between frames, and a solution that still changed."""
     if result.slip > MAX_SLIP and result.noise_sigma[0]:
         yield Doubt("wheel-slip", (
@@ -250,7 +249,7 @@ def path_doubts(result: SlamResult) -> Iterator[Doubt]:
             "may be far from where the measurements want them."))
 
 
-def agreement_doubts(result: SlamResult) -> Iterator[Doubt]:
+def _agreement_doubts(result):
     """A Doubt if GTSAM's solution is not that by which the engine decided."""
     off, ratio = result.agreement
     if max(off, ratio) > MAX_DISAGREEMENT:
