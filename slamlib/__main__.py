@@ -1,6 +1,7 @@
 """The command line, `slamlib` or `python -m slamlib`: its options, commands and exit codes."""
 
 import argparse
+import logging
 import os
 import signal
 import sys
@@ -120,6 +121,9 @@ def _add_solve(commands):
     add("--slip", type=float, help="instead of that of vehicle.toml")
     add("--csv", action="store_true", help="write poses and maps as text, too: CSV with "
         "covariances, and trajectories as TUM files for evo")
+    add("-v", "--verbose", action="store_true", help="print to stderr what is decided on the way: "
+        "kernels, noise, accepted measurements, calibration, and GTSAM's solution; without it, one "
+        "line for each problem that takes longer than two seconds")
 
 
 def _add_simulate(commands):
@@ -219,7 +223,10 @@ def _require_elsewhere(out, *folders):
 
 def _solve(options):
     from slamlib.io.dataset import inventory_lines
-    from slamlib.solve import PROBLEMS, allows, solve_to_folder, title
+    from slamlib.solve import PROBLEMS, allows, log_if_slow, solve_to_folder, title
+    logging.basicConfig(format="%(message)s")
+    printed = logging.getLogger("slamlib") if options.verbose else log_if_slow
+    printed.setLevel(logging.INFO)
     _require_elsewhere(options.out, options.folder, options.folder / "truth")
     if options.plot:
         require(options.plot.suffix.lower() in (".png", ".pdf", ".svg"), "--plot",

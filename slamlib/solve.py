@@ -6,29 +6,45 @@ files, with a summary of plain numbers.
 """
 
 import json
+import logging
 import signal
 import sys
 import time
-from collections import namedtuple
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from multiprocessing import Pipe, get_context
+from pathlib import Path
+from threading import Timer
+from typing import NamedTuple
 
 import numpy as np
 
 from slamlib import estimate, fuse, fuse_increments, localize
 from slamlib.core import evaluation, odometry, se2
 from slamlib.core.errors import DatasetError
+from slamlib.core.records import Dataset, Truth
 from slamlib.io import results, swap
 from slamlib.io.dataset import all_notes
 from slamlib.robust.file_doubts import Doubt, doubts_before_solving, merged
 from slamlib.robust.solution_doubts import solution_doubts
 
+log = logging.getLogger(__name__)
+log_if_slow = log.getChild("slow")                  # what the command line always prints
+
+SLOW = 2.0                                          # s, after which a problem is told to be slow
 UNSOLVABLE = (DatasetError, np.linalg.LinAlgError)  # what `find` raises where there is no solution
 
-# Every problem in the order of solution, by the name of its results folder: its title, the sensors
-# that it needs (attributes of Dataset), and its role in figures (`notebook.plotting.ROLES`).
-Task = namedtuple("Task", "title sensors role")
+
+class Task(NamedTuple):
+    """What a problem is called, and what it needs."""
+
+    title: str
+    sensors: tuple[str, ...]     # attributes of Dataset
+    role: str                    # in figures (`notebook.plotting.ROLES`)
+
+
+# Every problem in the order of solution, by the name of its results folder.
 PROBLEMS = {
     "problem1": Task("odometry", (), "odometry"),
     "problem2": Task("ArUco", ("aruco",), "aruco"),
@@ -44,10 +60,12 @@ RESULT_NAMES = frozenset([  # relative paths of all files that a drive's results
                        for file in results.RESULT_FILES)])
 
 
-def title(problem, dataset):
+def title(problem: str, dataset: Dataset) -> str:
     """Title of a problem for a Dataset; that of problem 4 tells whether markers take part."""
     name = PROBLEMS[problem].title
-    return name if dataset.aruco is not None else name.replace(" + ArUco + UWB", " + UWB")
+    if dataset.aruco is None:
+        return name.replace(" + ArUco + UWB", " + UWB")
+    return name
 
 
 @dataclass(frozen=True)
@@ -74,12 +92,12 @@ class Failure:
     reason: str                    # a sentence
 
 
-def allows(dataset, problem):
+def allows(dataset: Dataset, problem: str) -> bool:
     """True if the dataset has the sensors that a problem needs."""
     return all(getattr(dataset, sensor) is not None for sensor in PROBLEMS[problem].sensors)
 
 
-def failure(problem, dataset, error):
+def failure(problem: str, dataset: Dataset, error: Exception) -> Failure:
     """The Failure by an exception of UNSOLVABLE; its reason does not name the dataset."""
     reason = str(error).removeprefix(f"{dataset.name}: ")
     if isinstance(error, np.linalg.LinAlgError):
@@ -88,23 +106,24 @@ def failure(problem, dataset, error):
     return Failure(problem, title(problem, dataset), reason)
 
 
-def find(problem, dataset, found=None):
+def find(problem: str, dataset: Dataset, found: dict | None = None):
     """The result of a problem's solver: (poses, covariances), Localization, Fusion or SlamResult.
 
     `found` are such results of other problems (dict by problem): problem 4 starts from problem 3
     where there is one. Raises UNSOLVABLE where the measurements determine no solution.
     """
+    before = (found or {}).get("problem3")
     solvers = {
         "problem1": lambda: odometry.equation2(dataset.ticks, dataset.vehicle),
         "problem2": lambda: localize(dataset.sightings),
         "problem2_hint": lambda: fuse_increments(dataset),
         "problem2_fused": lambda: fuse(dataset),
         "problem3": lambda: estimate(dataset.without("uwb")),
-        "problem4": lambda: estimate(dataset, previous=(found or {}).get("problem3"))}
+        "problem4": lambda: estimate(dataset, previous=before)}
     return solvers[problem]()
 
 
-def problem_solution(problem, dataset, found=None):
+def problem_solution(problem: str, dataset: Dataset, found=None) -> Solution:
     """The Solution of a problem, from what `find` returned for it or, with None, solved here.
 
     Problem 1 is odometry, equation 1 with the covariance of equation 2. Problem 2 is incremental
@@ -113,23 +132,22 @@ def problem_solution(problem, dataset, found=None):
     markers, problem 4 with ranges, too. Raises UNSOLVABLE, also where a covariance is lost by
     rounding.
     """
-    found = find(problem, dataset) if found is None else found
-    poses, covariances = found if isinstance(found, tuple) else (found.poses, found.covariances)
-    others = (getattr(found, f"{kind}_covariance", None) for kind in ("marker", "antenna", "wheel"))
-    variances = np.concatenate([
-        np.diagonal(C, axis1=-2, axis2=-1).ravel()
-        for C in (covariances[np.isfinite(poses[:, 0])], *others) if C is not None])
-    if not ((0 <= variances) & (variances < np.inf)).all() \
-            or not np.isfinite(getattr(getattr(found, "fit", None), "log_evidence", 0.0)):
-        raise np.linalg.LinAlgError("a variance is negative or not finite")
+    if found is None:
+        found = find(problem, dataset)
+    if isinstance(found, tuple):
+        poses, covariances = found
+    else:
+        poses = found.poses
+        covariances = found.covariances
+    _require_variances(found, covariances[np.isfinite(poses[:, 0])])
     fields = {"poses": poses, "covariances": covariances}
     if problem == "problem2":
         fields = _localization_fields(dataset, found)
     elif problem == "problem2_fused":
         fields["facts"] = _noise_facts(found)
     elif problem in ("problem3", "problem4"):
-        fields |= {"facts": _slam_facts(dataset, found),
-                   "doubts": (*_option_doubts(problem, dataset, found), *solution_doubts(found))}
+        fields["facts"] = _slam_facts(dataset, found)
+        fields["doubts"] = (*_option_doubts(problem, dataset, found), *solution_doubts(found))
         if dataset.aruco is not None:
             fields["aruco_map"] = found.marker, found.marker_in_world, found.marker_covariance
         if problem == "problem4":
@@ -137,24 +155,40 @@ def problem_solution(problem, dataset, found=None):
     return Solution(problem=problem, title=title(problem, dataset), **fields)
 
 
+def _require_variances(found, covariances):
+    """Raise LinAlgError if a variance of poses (m, 3, 3), map or wheels was lost by rounding."""
+    blocks = [covariances]
+    for kind in ("marker", "antenna", "wheel"):
+        block = getattr(found, f"{kind}_covariance", None)
+        if block is not None:
+            blocks.append(block)
+    variances = np.concatenate([np.diagonal(C, axis1=-2, axis2=-1).ravel() for C in blocks])
+    valid = (variances >= 0) & (variances < np.inf)
+    fit = getattr(found, "fit", None)
+    evidence = 0.0 if fit is None else fit.log_evidence
+    if not (valid.all() and np.isfinite(evidence)):
+        raise np.linalg.LinAlgError("a variance is negative or not finite")
+
+
 def _localization_fields(dataset, found):
     """Fields of problem 2's Solution by a Localization; the first localized pose is the world."""
     poses = np.full((len(dataset.ticks), 3), np.nan)
     covariances = np.full((len(dataset.ticks), 3, 3), np.nan)
-    poses[found.frame], covariances[found.frame] = found.poses, found.covariances
-    known = np.isfinite(found.poses[:, 0])
-    poses[found.frame[known], 2] = np.unwrap(found.poses[known, 2])
-    return {"poses": poses, "covariances": covariances, "world": int(found.frame[known][0]),
-            "aruco_map": (found.marker, found.marker_in_world, found.marker_covariance),
-            "facts": {"sightings": len(dataset.aruco.pose), "outliers": int(found.rejected.sum()),
-                      "unused_sightings": int(found.unused.sum())}}
+    covariances[found.frame] = found.covariances
+    poses[found.frame] = found.poses
+    known = found.frame[np.isfinite(found.poses[:, 0])]
+    poses[known, 2] = np.unwrap(poses[known, 2])
+    facts = {"sightings": len(dataset.aruco.pose), "outliers": int(found.rejected.sum()),
+             "unused_sightings": int(found.unused.sum())}
+    return {"poses": poses, "covariances": covariances, "world": int(known[0]), "facts": facts,
+            "aruco_map": (found.marker, found.marker_in_world, found.marker_covariance)}
 
 
 def _option_doubts(problem, dataset, found):
     """A Doubt if a SlamResult has options that the Vehicle of its Dataset does not state."""
+    stated = vars(dataset.vehicle)
     used = vars(found.fit.problem.measurements.dataset.vehicle)
-    said = [f"{key} = {value}" for key, value in used.items()
-            if value != getattr(dataset.vehicle, key)]
+    said = [f"{key} = {value}" for key, value in used.items() if value != stated[key]]
     if said:
         yield Doubt("options", f"The files of {problem} are solved with {', '.join(said)}, unlike "
                     "other chapters and `slamlib solve`: state it in vehicle.toml, which all heed.")
@@ -169,53 +203,67 @@ def _noise_facts(found):
 
 def _slam_facts(dataset, found):
     """Noise, calibration and doubtful landmarks of a SlamResult."""
-    facts = _noise_facts(found) | {
-        "gtsam": _gtsam_facts(found), "increments": found.model,
-        "unconfirmed": found.unconfirmed.tolist(),
-        "calibration": [row for row in found.calibration_table if row["sigma"]]}
+    facts = _noise_facts(found)
+    facts["gtsam"] = _gtsam_facts(found)
+    facts["increments"] = found.model
+    facts["unconfirmed"] = found.unconfirmed.tolist()
+    facts["calibration"] = [row for row in found.calibration_table if row["sigma"]]
     if len(found.rejected):
         facts["marker_noise_factor"] = found.noise.sightings
     if len(found.antenna):
         weak = dataset.uwb.antenna[found.range_weight < 0.5].tolist()
-        facts |= {"range_noise_factor": found.noise.ranges, "ranges": len(dataset.uwb.pose),
-                  "antennas_in_doubt": found.doubts, "ranges_down_weighted_by_antenna": {
-                      each: weak.count(each) for each in found.antenna.tolist()}}
+        facts["range_noise_factor"] = found.noise.ranges
+        facts["ranges"] = len(dataset.uwb.pose)
+        facts["antennas_in_doubt"] = found.doubts
+        facts["ranges_down_weighted_by_antenna"] = {
+            antenna: weak.count(antenna) for antenna in found.antenna.tolist()}
     return facts
 
 
 def _gtsam_facts(found):
     """What GTSAM solved, and how far it is from the engine that decided, of a SlamResult."""
     by_gtsam = found.gtsam
+    off, ratio = found.agreement
     return {"factors": by_gtsam.factors, "variables": by_gtsam.variables,
             "steps": by_gtsam.steps, "start": by_gtsam.start,
-            "largest_difference_in_sigmas": found.agreement[0],
-            "largest_relative_difference_of_sigmas": found.agreement[1]}
+            "largest_difference_in_sigmas": off, "largest_relative_difference_of_sigmas": ratio}
 
 
-def solutions(dataset, problems=tuple(PROBLEMS)):
+def solutions(dataset: Dataset,
+              problems: Sequence[str] = tuple(PROBLEMS)) -> Iterator[Solution | Failure]:
     """Yield the Solution of each of `problems` that the dataset's sensors allow, in order.
 
     A problem that cannot be solved yields a Failure. Facts include the seconds that it took.
     """
     found = {}
-    for problem in (each for each in problems if allows(dataset, each)):
+    for problem in problems:
+        if not allows(dataset, problem):
+            continue
         start = time.perf_counter()
+        timer = Timer(SLOW, log_if_slow.info, (
+            "%s: %s takes longer than %g s", dataset.name, problem, SLOW))
+        timer.start()
         try:
             result = find(problem, dataset, found)
             solution = problem_solution(problem, dataset, result)
-            found[problem] = result
-            seconds = time.perf_counter() - start
-            yield replace(solution, facts=solution.facts | {"seconds": seconds})
         except UNSOLVABLE as error:
             yield failure(problem, dataset, error)
+            continue
+        finally:
+            timer.cancel()
+        found[problem] = result
+        seconds = time.perf_counter() - start
+        log.info("%s: %s solved in %.1f s", dataset.name, problem, seconds)
+        yield replace(solution, facts=solution.facts | {"seconds": seconds})
 
 
-def truth_in_world(solution, truth):
+def truth_in_world(solution: Solution, truth: Truth) -> np.ndarray:
     """The true poses (n, 3) in the world frame of a Solution."""
     return se2.between(truth.poses[solution.world], truth.poses)
 
 
-def solve_to_folder(dataset, truth, out, problems=tuple(PROBLEMS), csv=False):
+def solve_to_folder(dataset: Dataset, truth: Truth | None, out: Path,
+                    problems: Sequence[str] = tuple(PROBLEMS), csv: bool = False) -> dict:
     """Solve problems of a Dataset and write their files to the folder `out`.
 
     When all files are written they replace those of an earlier run, by `swap.publish`. On Linux,
@@ -256,44 +304,46 @@ def solve_to_folder(dataset, truth, out, problems=tuple(PROBLEMS), csv=False):
     return summary
 
 
-def _in_two_processes(*arguments):
-    """What `_solved` returns of all problems, in order; the second process solves INDEPENDENT."""
-    receiver, sender = pipe = Pipe(duplex=False)
+def _in_two_processes(dataset, problems):
+    """What `_independent` returns, and then the solutions of the other problems, in order."""
+    receiver, sender = Pipe(duplex=False)
     if sys.platform == "linux":
-        get_context("fork").Process(target=_send, args=(pipe, *arguments), daemon=True).start()
+        second = get_context("fork").Process(
+            target=_send, args=(receiver, sender, dataset, problems), daemon=True)
+        second.start()
     sender.close()
-    _, late = _solved(False, *arguments)
+    others = [problem for problem in problems if problem not in INDEPENDENT]
+    late = list(solutions(dataset, others))
     try:
         doubts, early = receiver.recv()
     except (EOFError, OSError):            # no child, or it was killed, or failed: here it is told
-        doubts, early = _solved(True, *arguments)
+        doubts, early = _independent(dataset, problems)
     return doubts, early + late
 
 
-def _send(pipe, *arguments):
-    """Send what `_solved` returns from a process that Ctrl-C does not end."""
-    pipe[0].close()                        # so that the pipe breaks when the other one is killed
+def _send(receiver, sender, dataset, problems):
+    """Send what `_independent` returns from a process that Ctrl-C does not end."""
+    receiver.close()                       # so that the pipe breaks when the other one is killed
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    with pipe[1], suppress(BaseException):
-        pipe[1].send(_solved(True, *arguments))
+    with sender, suppress(BaseException):
+        sender.send(_independent(dataset, problems))
 
 
-def _solved(independent, dataset, problems):
-    """Doubts before solving and `solutions` of problems INDEPENDENT, or none and of the others."""
-    problems = [problem for problem in problems if (problem in INDEPENDENT) == independent]
-    return (doubts_before_solving(dataset) if independent else [],
-            [*solutions(dataset, problems)])
+def _independent(dataset, problems):
+    """Doubts before solving, and the list of `solutions` of those `problems` in INDEPENDENT."""
+    chosen = [problem for problem in problems if problem in INDEPENDENT]
+    return doubts_before_solving(dataset), list(solutions(dataset, chosen))
 
 
-def summarize(solution, truth):
+def summarize(solution: Solution, truth: Truth | None) -> dict:
     """Last estimate with its sigmas and, where there is truth, errors: a dict of plain numbers."""
     known = np.flatnonzero(np.isfinite(solution.poses[:, 0]))
     last = known[-1]
     summary = {"path_length_m": evaluation.path_length(solution.poses),
                "estimated_poses": len(known), "world_is_pose": solution.world + 1,
                "last_pose_number": int(last) + 1, "last_pose": solution.poses[last].tolist(),
-               "last_sigma": evaluation.sigmas(solution.covariances[last]).tolist(),
-               **solution.facts}
+               "last_sigma": evaluation.sigmas(solution.covariances[last]).tolist()}
+    summary |= solution.facts
     if truth is not None:
         true_poses = truth_in_world(solution, truth)
         summary["ate_m"] = evaluation.ate(solution.poses, true_poses)

@@ -15,7 +15,7 @@ from slamlib.core.records import ArucoReadings, Dataset
 from slamlib.core.sightings import sightings_by_frame
 from slamlib.robust import jumps
 from slamlib.robust.fused import fuse
-from slamlib.robust.solution_doubts import _of_encoder, solution_doubts
+from slamlib.robust.solution_doubts import _encoder_doubts, solution_doubts
 from slamlib.studies.simulation import TABLE_2, manoeuvre, simulate
 
 MARKERS = np.array([[1.0, 0.0, 0.3], [0.5, 0.8, -2.0], [0.0, -1.0, 1.0]])
@@ -294,8 +294,8 @@ def test_the_doubt_names_three_stretches_and_counts_the_others():
     poses = np.zeros((300, 3))
     poses[:, 0] = 0.3 * (np.arange(300) // 50 % 2)
     result = type("result", (), {"jumps": jumps.find_jumps(seen(poses))})
-    sentence, = (sentence for _, sentence in _of_encoder(result))
+    sentence, = (doubt.sentence for doubt in _encoder_doubts(result))
     assert "between poses 50 and 51 the vehicle moved by 0.00 m and 0 degrees, but the markers " \
         "say 0.30 m and 0 degrees, which ends 0.30 m" in sentence
     assert sentence.count("between") == 3 and "and 2 more times" in sentence
-    assert not list(_of_encoder(type("result", (), {"jumps": jumps.NO_JUMPS})))
+    assert not list(_encoder_doubts(type("result", (), {"jumps": jumps.NO_JUMPS})))

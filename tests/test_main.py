@@ -1,8 +1,10 @@
 """The command line: its exit codes, and one sentence for what a user must change."""
 
 import json
+import re
 import subprocess
 import sys
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -82,6 +84,39 @@ def test_options_of_solve_are_heeded_and_said(tmp_path, capsys, drive):
     assert [line[-2:] for line in table.splitlines()[1:4]] == ["TE", " -", " -"]       # no truth
     solved(tmp_path, "--problem", "problem1")
     assert file_names(out) == [".slamlib.json", "problem1/vehiclePose.mat", "summary.json"]
+
+
+def test_verbose_prints_decisions_of_both_processes_and_leaves_stdout(tmp_path, drive):
+    write_dataset(tmp_path / "drive", drive[0])
+    plain = run("solve", "drive", "--out", "out", cwd=tmp_path)
+    told = run("solve", "drive", "--out", "out", "-v", cwd=tmp_path)
+    assert (told.returncode, told.stdout) == (0, plain.stdout) and "GTSAM" not in plain.stderr
+    slip = json.loads((tmp_path / "out" / "summary.json").read_text())[
+        "problems"]["problem3"]["slip_sqrt_m"]
+    assert f"round 1: slip {1e3 * slip:.3g} mm after 1 m, factors " in told.stderr
+    for pattern in (r"Cauchy kernel of 3 sigmas: error [\d.]+ after \d+ steps",
+                    r"accepted \d+ of \d+ sightings, \d+ of \d+ ranges, \d+ changed",
+                    r"GTSAM: \d+ factors, \d+ variables, \d+ steps from odometry, differs by up to",
+                    r"estimate of drive: 100 poses", r"estimate of drive: \d+\.\d s"):
+        assert re.search(f"^.*{pattern}", told.stderr, re.MULTILINE), pattern
+    for problem in solve.PROBLEMS:
+        assert f"drive: {problem} solved in " in told.stderr
+
+
+def test_a_problem_that_takes_its_time_is_told_once(tmp_path, monkeypatch, caplog, drive):
+    write_dataset(tmp_path / "drive", drive[0])
+    find = solve.find
+
+    def slow(*arguments):
+        time.sleep(0.2)
+        return find(*arguments)
+
+    monkeypatch.setattr(solve, "find", slow)
+    for seconds, expected in ((0.05, ["drive: problem3 takes longer than 0.05 s"]), (60, [])):
+        monkeypatch.setattr(solve, "SLOW", seconds)
+        caplog.clear()
+        solved(tmp_path, "--problem", 3)
+        assert caplog.messages == expected
 
 
 def test_results_never_replace_the_dataset_or_the_current_folder(tmp_path, monkeypatch, capsys):

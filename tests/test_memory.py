@@ -14,7 +14,7 @@ from slamlib.core.records import ArucoReadings
 from slamlib.robust import choices
 from slamlib.robust.choices import _squared_distance, has_rejected_visits, places_of_ids, visits
 from slamlib.robust.error_memory import error_memory
-from slamlib.robust.fit import _with_shares
+from slamlib.robust.fit import _apply_memory
 from slamlib.robust.linear import NormalEquations
 from slamlib.robust.measurements import Noise, measure
 from slamlib.robust.optimize import gtsam_step
@@ -88,7 +88,7 @@ def test_the_same_step_by_gtsam(remembering):
         rng.uniform(0.1, 1, len(each.share)) for each in accepted))
     low, shares = replace(problem, noise=Noise(1e-3, 0.3, 0.3)), [
         np.full(len(each.share), share) for each, share in zip(accepted, (0.5, 1.0))]
-    found, _ = _with_shares(low, fit.state, None, shares, lambda problem, _: problem.accepted)
+    found, _ = _apply_memory(low, fit.state, None, shares, lambda problem, _: problem.accepted)
     assert found.noise == (1e-3, 0.6, 0.3)               # twice as large for errors with memory
     state = replace(fit.state, antennas=fit.state.antennas + 0.01)
     equations = NormalEquations(problem, state)

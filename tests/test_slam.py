@@ -495,3 +495,12 @@ def test_headings_are_continuous_where_frames_are_rounds_apart():
     assert abs(truth.poses[-1, 2]) > 18
     np.testing.assert_allclose(found.poses[:, 2], truth.poses[:, 2], atol=0.3)
     assert np.abs(np.diff(found.poses[:, 2])).max() < 0.1
+
+
+def test_a_drive_of_one_pose_has_its_prior():
+    dataset = simulate("short", seed=8)[0].first(1)
+    found = estimate(dataset)
+    sigma = np.array([1e-5, 1e-5, dataset.vehicle.sigma_heading])
+    np.testing.assert_allclose(found.covariances, [np.diag(sigma**2)], atol=1e-18)
+    assert not found.poses.any() and len(found.marker) == len(dataset.aruco.pose) > 0
+    assert max(found.agreement) < 1e-6

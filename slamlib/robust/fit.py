@@ -7,8 +7,9 @@ one-sided kernel: without the line of sight a range is too long. Where residuals
 have memory, measurements keep a share of their information (`slamlib.robust.error_memory`).
 """
 
+import logging
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from gtsam import noiseModel
@@ -16,7 +17,7 @@ from gtsam import noiseModel
 from slamlib.core.kernels import KERNELS, ONE_SIDED
 from slamlib.core.sightings import GATE, POINT_GATE
 from slamlib.robust.calibration import WHEELS
-from slamlib.robust.error_memory import error_memory
+from slamlib.robust.error_memory import Memory, error_memory
 from slamlib.robust.factors import linearize_measurements, preintegrate_odometry
 from slamlib.robust.linear import Problem, State, laplace_approximation
 from slamlib.robust.measurements import (
@@ -28,6 +29,8 @@ from slamlib.robust.measurements import (
 )
 from slamlib.robust.noise import NoisePosterior, learn_noise, with_hidden_errors
 from slamlib.robust.optimize import optimize
+
+log = logging.getLogger(__name__)
 
 RANGE_GATE = 3.3             # sigmas; a range that is shorter than expected by more is rejected
 MAX_DIRECT = 3.3             # sigmas, of a range's residual; longer ones are echoes
@@ -43,7 +46,9 @@ SETTLED_MOVE = 1e-4          # the same, at the solution that is handed in
 NEGLIGIBLE_CHANGE = 1e-3     # share of the measurements whose weight may change at the same noise
 
 
-def accepted_measurements(problem, state, sightings=None, ranges=None):
+def accepted_measurements(
+        problem: Problem, state: State, sightings: tuple[str, bool] | None = None,
+        ranges: tuple[str, bool] | None = None) -> AcceptedMeasurements:
     """The AcceptedMeasurements at a State, by kernel and gate of sightings and of ranges.
 
     `sightings` and `ranges` are a name in KERNELS and whether what contradicts the State is
@@ -51,20 +56,28 @@ def accepted_measurements(problem, state, sightings=None, ranges=None):
     quantile of chi-squared with 3 degrees of freedom, or 2 for a point. A one-sided kernel is that
     of the ranges only, and replaces their gate for late ones.
     """
-    m, vehicle = problem.measurements, problem.measurements.dataset.vehicle
-    (kernel, gated), (range_kernel, range_gated) = (
-        each or (vehicle.kernel, vehicle.gate) for each in (sightings, ranges))
+    m = problem.measurements
+    stated = m.dataset.vehicle.kernel, m.dataset.vehicle.gate
+    kernel, gated = sightings or stated
+    range_kernel, ranges_gated = ranges or stated
     residual, late = residuals(problem, state)
-    far = np.sum(residual**2, axis=1) >= np.where(m.as_pose, GATE, POINT_GATE)
-    wrong = (late <= -RANGE_GATE) | (late >= RANGE_GATE) & (range_kernel not in ONE_SIDED)
+    squared = np.sum(residual**2, axis=1)
+    far = squared >= np.where(m.as_pose, GATE, POINT_GATE)
+    wrong = late <= -RANGE_GATE
+    if range_kernel not in ONE_SIDED:
+        wrong |= late >= RANGE_GATE
     return AcceptedMeasurements(
-        Accepted(1.0 - (gated & far), np.ones(len(far)),
-                 None if kernel in ONE_SIDED else KERNELS[kernel]),
-        Accepted(1.0 - (range_gated & wrong), np.ones(len(wrong)), KERNELS[range_kernel],
-                 ONE_SIDED.get(range_kernel, 0.0)))
+        _unless(gated & far, None if kernel in ONE_SIDED else KERNELS[kernel]),
+        _unless(ranges_gated & wrong, KERNELS[range_kernel], ONE_SIDED.get(range_kernel, 0.0)))
 
 
-def residuals(problem, state):
+def _unless(rejected, kernel, bias=0.0):
+    """The Accepted of measurements that count in full unless `rejected` (m,)."""
+    ones = np.ones(len(rejected))
+    return Accepted(np.where(rejected, 0.0, ones), ones, kernel, bias)
+
+
+def residuals(problem: Problem, state: State) -> tuple[np.ndarray, np.ndarray]:
     """Whitened residuals, measured minus expected, of all measurements, without kernels.
 
     Returns
@@ -78,16 +91,21 @@ def residuals(problem, state):
     return -sightings.e, -ranges.e[:, 0]
 
 
-def error_memories(problem, state):
+def error_memories(problem: Problem, state: State) -> tuple[Memory, Memory]:
     """The Memory of the errors of sightings, and that of ranges but echoes, at a solution."""
-    m, (sightings, ranges) = problem.measurements, problem.accepted
+    m = problem.measurements
+    sightings, ranges = problem.accepted
     residual, late = residuals(problem, state)
-    direct = (ranges.weight > 0) & (np.abs(late) < MAX_DIRECT)
-    return (error_memory(m.marker_row, m.frame[m.sightings.row], residual, sightings.weight > 0),
-            error_memory(m.ranges.antenna, m.frame[m.ranges.row], late[:, None], direct))
+    is_direct = np.abs(late) < MAX_DIRECT
+    of_sightings = error_memory(
+        m.marker_row, m.frame[m.sightings.row], residual, sightings.weight > 0)
+    of_ranges = error_memory(
+        m.ranges.antenna, m.frame[m.ranges.row], late[:, None], is_direct & (ranges.weight > 0))
+    return of_sightings, of_ranges
 
 
-def narrow_kernels(problem, state, scales=CAUCHY_SCALES):
+def narrow_kernels(
+        problem: Problem, state: State, scales: Sequence[float] = CAUCHY_SCALES) -> State:
     """The State after one solution for each scale of the Cauchy kernel, with all measurements.
 
     The scales are in sigmas. The scatter of the residuals of each solution gives the noise of the
@@ -98,23 +116,33 @@ def narrow_kernels(problem, state, scales=CAUCHY_SCALES):
             problem = replace(problem, noise=noise_of_scatter(problem, state))
         cauchy = noiseModel.mEstimator.Cauchy.Create(scale)
         accepted = accept_all(problem.measurements, cauchy)
-        state = optimize(replace(problem, accepted=accepted), state, tolerance=ROUGH).state
+        optimum = optimize(replace(problem, accepted=accepted), state, tolerance=ROUGH)
+        state = optimum.state
+        log.info("Cauchy kernel of %g sigmas: error %.6g after %d steps",
+                 scale, optimum.equations.error, optimum.steps)
     return state
 
 
-def noise_of_scatter(problem, state):
+def noise_of_scatter(problem: Problem, state: State) -> Noise:
     """The Noise with the slip of a Problem, and factors from the medians of the residuals, >= 1.
 
     Without these factors, covariances that are far too small would have most measurements rejected
     before a factor is learned. Known noise parameters are kept.
     """
-    measurements = problem.measurements
+    m = problem.measurements
     sightings, ranges = residuals(replace(problem, noise=Noise()), state)
-    squared = (np.sum(sightings**2, axis=1) / np.where(
-        measurements.as_pose, MEDIAN_CHI2[3], MEDIAN_CHI2[2]), ranges**2 / MEDIAN_CHI2[1])
-    return with_known(Noise(problem.noise.slip, *(
-        max(1.0, float(np.sqrt(np.median(each)))) if len(each) >= MIN_RESIDUALS else 1.0
-        for each in squared)), measurements.dataset.vehicle)
+    squared = np.sum(sightings**2, axis=1)
+    median = np.where(m.as_pose, MEDIAN_CHI2[3], MEDIAN_CHI2[2])
+    of_sightings = _scatter(squared / median)
+    of_ranges = _scatter(ranges**2 / MEDIAN_CHI2[1])
+    return with_known(Noise(problem.noise.slip, of_sightings, of_ranges), m.dataset.vehicle)
+
+
+def _scatter(squared):
+    """Factor on standard deviations, >= 1, by squared residuals (m,) over their expected median."""
+    if len(squared) < MIN_RESIDUALS:
+        return 1.0
+    return max(1.0, float(np.sqrt(np.median(squared))))
 
 
 @dataclass(frozen=True)
@@ -126,16 +154,17 @@ class Fit:
     log_evidence: float                  # Laplace, up to a constant
     posterior: NoisePosterior | None     # None if all noise parameters are known
     converged: bool              # whether the last iterations ended before their number did
-    explanations: tuple = (frozenset(),)     # sets of groups, each of which explains the drive
+    explanations: tuple[frozenset, ...] = (frozenset(),)     # each set of groups explains the drive
 
     @property
-    def log_density(self):
+    def log_density(self) -> float:
         """Log posterior density of the noise, or log evidence if all of it is known."""
         learned = self.posterior is not None and (self.problem.accepted.share == 1).all()
         return self.posterior.log_density if learned else self.log_evidence
 
 
-def refine(problem, state, accept=accepted_measurements):
+def refine(problem: Problem, state: State,
+           accept: Callable[..., AcceptedMeasurements] | None = accepted_measurements) -> Fit:
     """The Fit in which wheels, noise and accepted measurements agree with each other.
 
     They depend on each other, so each is updated in turn until the accepted measurements no longer
@@ -144,65 +173,114 @@ def refine(problem, state, accept=accepted_measurements):
     Problem and State; None keeps those of the problem. Raises DatasetError as `optimize`, and
     numpy.linalg.LinAlgError if odometry's covariance is singular.
     """
-    m, model, posterior = problem.measurements, problem.odometry.model, None
-    shares, fixed, changed = [kind.share for kind in problem.accepted], accept is None, np.inf
-    if fixed:
+    if accept is None:
+        shares = [kind.share for kind in problem.accepted]
         given = problem.accepted.with_shares(map(np.ones_like, shares))
         accept = lambda *_: given
+        problem, optimum, posterior = _settle(problem, state, accept)
     else:
         problem = replace(problem, noise=noise_of_scatter(problem, state))
-    accepted = accept(problem, state)
-    for _ in range(MAX_ROUNDS):
-        problem = replace(problem, accepted=accepted,
-                          odometry=preintegrate_odometry(m, model, state.c[WHEELS]))
-        if m.learned.any() and changed > NEGLIGIBLE_CHANGE * len(accepted.share):
-            optimum = optimize(problem, state, max_steps=2)
-            state, posterior = optimum.state, learn_noise(optimum.equations)
-            problem = replace(problem, noise=with_known(posterior.noise, m.dataset.vehicle))
-        problem = replace(problem, odometry=replace(problem.odometry, in_counts=True))
-        optimum = optimize(problem, state)
-        state = optimum.state
-        accepted = accept(problem, state)
-        changed = sum(np.count_nonzero(new.weight != old.weight)
-                      for new, old in zip(accepted, problem.accepted))
-        moved = np.abs(state.c[WHEELS] / problem.odometry.wheel - 1).max()
-        if not changed and moved < NEGLIGIBLE_MOVE:
-            break
-    if not fixed:
-        hidden = replace(problem, noise=with_hidden_errors(
-            problem.noise, (True, True), m.dataset.vehicle))
-        shares = [memory.share for memory in error_memories(
-            replace(hidden, accepted=accept(hidden, state)), state)]
+        problem, optimum, posterior = _settle(problem, state, accept)
+        shares = _shares_of_memory(problem, optimum.state, accept)
     if any((share < 1).any() for share in shares):
-        problem, posterior = _with_shares(problem, state, posterior, shares, accept)
-        optimum = optimize(problem, state)
+        problem, posterior = _apply_memory(problem, optimum.state, posterior, shares, accept)
+        optimum = optimize(problem, optimum.state)
     _, log_evidence = laplace_approximation(optimum.equations, problem.noise)
     return Fit(problem=problem, state=optimum.state, log_evidence=log_evidence, posterior=posterior,
                converged=optimum.converged)
 
 
-def settled(fit):
+def _settle(problem, state, accept):
+    """The Problem and its Optimum after rounds of wheels, noise and accepted measurements.
+
+    Also the last posterior of the noise. The Problem has the measurements that `accept` made before
+    the last solution.
+    """
+    m = problem.measurements
+    posterior = None
+    accepted = accept(problem, state)
+    changed = np.inf
+    for number in range(1, MAX_ROUNDS + 1):
+        problem = _relinearized(replace(problem, accepted=accepted), state)
+        if m.learned.any() and changed > NEGLIGIBLE_CHANGE * len(accepted.share):
+            problem, state, posterior = _settle_noise(problem, state)
+        problem = _with_errors_in_counts(problem)
+        optimum = optimize(problem, state)
+        state = optimum.state
+        accepted = accept(problem, state)
+        changed = sum(np.count_nonzero(new.weight != old.weight)
+                      for new, old in zip(accepted, problem.accepted))
+        sightings, ranges = (np.count_nonzero(kind.weight) for kind in accepted)
+        log.info("round %d: slip %.3g mm after 1 m, factors %.3g and %.3g; accepted %d of %d "
+                 "sightings, %d of %d ranges, %d changed", number, 1e3 * problem.noise.slip,
+                 problem.noise.sightings, problem.noise.ranges, sightings, len(m.marker_row),
+                 ranges, len(m.ranges.row), changed)
+        if changed == 0 and _wheel_move(problem, state) < NEGLIGIBLE_MOVE:
+            break
+    return problem, optimum, posterior
+
+
+def _relinearized(problem, state):
+    """The Problem with odometry linearised at the wheels of a State, with errors in metres."""
+    odometry = preintegrate_odometry(
+        problem.measurements, problem.odometry.model, state.c[WHEELS])
+    return replace(problem, odometry=odometry)
+
+
+def _with_errors_in_counts(problem):
+    """The Problem with odometry's errors in counts, which is right once the slip is known."""
+    return replace(problem, odometry=replace(problem.odometry, in_counts=True))
+
+
+def _wheel_move(problem, state):
+    """Largest relative difference of a wheel parameter from where odometry was linearised."""
+    return np.abs(state.c[WHEELS] / problem.odometry.wheel - 1).max()
+
+
+def _settle_noise(problem, state):
+    """The Problem with the noise learned after two steps from a State, and its posterior."""
+    optimum = optimize(problem, state, max_steps=2)
+    posterior = learn_noise(optimum.equations)
+    noise = with_known(posterior.noise, problem.measurements.dataset.vehicle)
+    return replace(problem, noise=noise), optimum.state, posterior
+
+
+def settled(fit: Fit) -> Fit:
     """The Fit with odometry linearised at its own wheels, for the same measurements and noise.
 
     Rounds that end by their number leave it elsewhere, where the increments have other scales.
     """
-    problem, state, converged = fit.problem, fit.state, fit.converged
     for _ in range(MAX_ROUNDS):
-        if np.abs(state.c[WHEELS] / problem.odometry.wheel - 1).max() < SETTLED_MOVE:
+        if _wheel_move(fit.problem, fit.state) < SETTLED_MOVE:
             break
-        odometry = preintegrate_odometry(
-            problem.measurements, problem.odometry.model, state.c[WHEELS])
-        problem = replace(problem, odometry=replace(odometry, in_counts=True))
-        optimum = optimize(problem, state)
-        state, converged = optimum.state, optimum.converged
-    return replace(fit, problem=problem, state=state, converged=converged)
+        problem = _with_errors_in_counts(_relinearized(fit.problem, fit.state))
+        optimum = optimize(problem, fit.state)
+        fit = replace(fit, problem=problem, state=optimum.state, converged=optimum.converged)
+    return fit
 
 
-def _with_shares(problem, state, posterior, shares, accept):
+def _shares_of_memory(problem, state, accept):
+    """Shares (s,) and (r,) that memory leaves of the information of sightings and of ranges.
+
+    At a solution, for standard deviations that include what residuals do not show.
+    """
+    noise = with_hidden_errors(problem.noise, (True, True), problem.measurements.dataset.vehicle)
+    hidden = replace(problem, noise=noise)
+    hidden = replace(hidden, accepted=accept(hidden, state))
+    return [memory.share for memory in error_memories(hidden, state)]
+
+
+def _apply_memory(problem, state, posterior, shares, accept):
     """The Problem with shares (s,) and (r,) of errors with memory, and its noise's posterior."""
-    hidden = partial(with_hidden_errors, vehicle=problem.measurements.dataset.vehicle, remember=[
-        (share < 1).any() for share in shares])
+    vehicle = problem.measurements.dataset.vehicle
+    remember = [(share < 1).any() for share in shares]
+
+    def hidden(noise):
+        return with_hidden_errors(noise, remember, vehicle)
+
     problem = replace(problem, noise=hidden(problem.noise))
     problem = replace(problem, accepted=accept(problem, state).with_shares(shares))
-    return problem, posterior and replace(posterior, noise=problem.noise, points=tuple(
-        (weight, hidden(noise)) for weight, noise in posterior.points))
+    if posterior is not None:
+        points = tuple((weight, hidden(noise)) for weight, noise in posterior.points)
+        posterior = replace(posterior, noise=problem.noise, points=points)
+    return problem, posterior

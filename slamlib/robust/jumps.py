@@ -93,17 +93,19 @@ class Jumps:
                   count: int) -> "Jumps":
         """The Jumps and one more, of `count` encoder poses."""
         jump = se2.compose(increment, se2.inverse(by_odometry))
-        joined = self._with(start, end, increment, by_odometry, _sigma_of(jump))
-        return joined if len(self.start) else replace(joined, chance=np.arange(float(count)))
+        chance = self.chance
+        if not len(self.start):
+            chance = np.arange(float(count))
+        return replace(self, chance=chance)._with(
+            start=start, end=end, increment=increment, by_odometry=by_odometry,
+            sigma=_sigma_of(jump))
 
-    def _with(self, start, end, increment, by_odometry, sigma):
-        """The Jumps and one more."""
-        k = np.searchsorted(self.start, start)
-        return replace(
-            self, start=np.insert(self.start, k, start), end=np.insert(self.end, k, end),
-            increment=np.insert(self.increment, k, increment, axis=0),
-            by_odometry=np.insert(self.by_odometry, k, by_odometry, axis=0),
-            sigma=np.insert(self.sigma, k, sigma, axis=0))
+    def _with(self, **jump):
+        """The Jumps and one more, of which all fields with a row for each are given."""
+        k = np.searchsorted(self.start, jump["start"])
+        joined = {name: np.insert(getattr(self, name), k, value, axis=0)
+                  for name, value in jump.items()}
+        return replace(self, **joined)
 
     def mended(self, pose: np.ndarray, poses: np.ndarray, begin: int = 0) -> np.ndarray:
         """Poses (f, 3) of the encoder poses (f,), with these increments instead of odometry's.
@@ -118,8 +120,9 @@ class Jumps:
         return poses
 
 
-NO_JUMPS = Jumps(start=np.zeros(0, int), end=np.zeros(0, int), increment=np.zeros((0, 3)),
-                 by_odometry=np.zeros((0, 3)), sigma=np.zeros((0, 3)), chance=np.zeros(1))
+_NO_ROWS = np.zeros((0, 3))
+NO_JUMPS = Jumps(start=np.zeros(0, int), end=np.zeros(0, int), increment=_NO_ROWS,
+                 by_odometry=_NO_ROWS, sigma=_NO_ROWS, chance=np.zeros(1))
 
 
 def _sigma_of(jump):
@@ -130,7 +133,8 @@ def _sigma_of(jump):
 
 def _moved(poses, k, pose):
     """Poses (f, 3) of which pose k and the later ones have moved with pose k to `pose` (3,)."""
-    return np.concatenate([poses[:k], se2.compose(pose, se2.between(poses[k], poses[k:]))])
+    later = se2.between(poses[k], poses[k:])
+    return np.concatenate([poses[:k], se2.compose(pose, later)])
 
 
 def find_jumps(dataset: Dataset) -> Jumps:
@@ -154,10 +158,12 @@ def find_jumps(dataset: Dataset) -> Jumps:
     for jump in found:
         start = s.frame[jump.step]
         end = s.frame[jump.step + 1]
+        distance, turn = distance_and_turn(jump.motion)
         log.info("jump between poses %d and %d: markers and odometry differ by %.3f m and %.3f "
-                 "rad, gain %.1f, sigma %.1f m", start + 1, end + 1,
-                 *distance_and_turn(jump.motion), jump.gain, jump.sigma[0])
-        jumps = jumps._with(start, end, jump.increment, jump.by_odometry, jump.sigma)
+                 "rad, gain %.1f, sigma %.1f m", start + 1, end + 1, distance, turn, jump.gain,
+                 jump.sigma[0])
+        jumps = jumps._with(start=start, end=end, increment=jump.increment,
+                            by_odometry=jump.by_odometry, sigma=jump.sigma)
     return replace(jumps, chance=_chance(dataset.ticks)) if found else jumps
 
 
@@ -170,7 +176,10 @@ def _chance(ticks):
 
 def _chosen_lag(s, drives):
     """The lag whose _Drive agrees best with the sightings, if decidedly better than that of 0."""
-    cost = {lag: _cost(_compared(s, drive).squared).sum() for lag, drive in drives.items()}
+    cost = {}
+    for lag, drive in drives.items():
+        pairs = _compared(s, drive)
+        cost[lag] = _cost(pairs.squared).sum()
     best = min(cost, key=cost.get)
     if cost[best] >= min(cost[0] - MIN_LAG_GAIN, MAX_LAG_COST * cost[0]):
         return 0
@@ -205,7 +214,9 @@ def _covariance_scale(s, drive):
     """Factor of the covariances, 1 or more, with which sightings of neighbouring frames agree."""
     pairs = _compared(s, replace(drive, slip=0.0))
     squared = pairs.squared[pairs.span == 1]
-    return max(1.0, np.median(squared) / MEDIAN_SQUARED) if len(squared) else 1.0
+    if not len(squared):
+        return 1.0
+    return max(1.0, np.median(squared) / MEDIAN_SQUARED)
 
 
 def _usual(drive):
@@ -267,17 +278,20 @@ class _Drive:
         move = se2.between(self.poses[start], self.poses[end])
         way = np.abs(self.way[end] - self.way[start])
         total = odometry.cumulative(self.variance)
-        jumps = np.abs(total[end] - total[start])
-        turn = jumps[:, 1] + 2 * way * (self.slip / self.wheelbase)**2 + FLOOR**2
-        by_turn = turn * np.sum(move[:, :2]**2, axis=1) / 3
-        by_lever = 2 * LEVER * np.sin(se2.wrap(move[:, 2]) / 2)
-        place = jumps[:, 0] + by_turn + FLOOR**2 + by_lever**2
+        place, turn = np.abs(total[end] - total[start]).T        # variances, first by jumps alone
+        turn = turn + 2 * way * (self.slip / self.wheelbase)**2 + FLOOR**2
+        squared_distance = np.sum(move[:, :2]**2, axis=1)
+        half_turn = se2.wrap(move[:, 2]) / 2
+        by_lever = 2 * LEVER * np.sin(half_turn)
+        place = place + turn * squared_distance / 3 + FLOOR**2 + by_lever**2
         along = place + way * self.slip**2 / 2
-        return _Motions(move, np.stack([along, place, turn], -1)[:, None] * np.eye(3))
+        variance = np.stack([along, place, turn], axis=-1)
+        return _Motions(move, variance[:, None] * np.eye(3))
 
     def seen_from(self, frame, s, rows):
         """Markers of the sightings in `rows` as _Motions from frames, (m,) or one, by odometry."""
-        return self.motions(frame, s.row[rows]).then(_Motions(s.z[rows], s.C[rows]))
+        seen = _Motions(s.z[rows], s.C[rows])
+        return self.motions(frame, s.row[rows]).then(seen)
 
 
 @dataclass(frozen=True)
@@ -308,10 +322,17 @@ class _Pairs:
 
 def _compared(s, drive):
     """The _Pairs of Sightings that are sorted by marker, then by frame."""
-    k = np.flatnonzero(s.marker[:-1] == s.marker[1:])
-    expected = drive.seen_from(s.row[k], s, k + 1)
-    squared = _Motions(s.z[k], s.C[k]).squared_distances(expected)
-    return _Pairs(s.row[k], s.row[k + 1], squared, len(s.frame) - 1)
+    k = _followed(s)
+    first = s.row[k]
+    second = s.row[k + 1]
+    seen = _Motions(s.z[k], s.C[k])
+    squared = seen.squared_distances(drive.seen_from(first, s, k + 1))
+    return _Pairs(first, second, squared, len(s.frame) - 1)
+
+
+def _followed(s):
+    """Rows (m,) of such Sightings before another one of the same marker."""
+    return np.flatnonzero(s.marker[:-1] == s.marker[1:])
 
 
 def _suspects(pairs):
@@ -323,7 +344,12 @@ def _suspects(pairs):
     all_close = pairs.over(close)
     asked = np.where(all_close, all_close, pairs.over(np.ones_like(close)))
     wrong = np.where(all_close, pairs.over(close & pairs.wrong), pairs.over(pairs.wrong))
-    return np.flatnonzero((wrong > 0) & (2 * wrong >= asked))
+    return np.flatnonzero(_is_majority(wrong, asked))
+
+
+def _is_majority(wrong, asked):
+    """Where (n,) at least one and half of so many that are `asked` (n,) are `wrong` (n,)."""
+    return (wrong > 0) & (2 * wrong >= asked)
 
 
 def _rank(pairs):
@@ -332,7 +358,8 @@ def _rank(pairs):
     Those with sightings at both frames come first, then those under most pairs that contradict
     odometry. A pair over a long way does not tell where on it a jump was.
     """
-    return np.where(pairs.over(pairs.span == 1), -np.inf, -pairs.over(pairs.wrong))
+    all_close = pairs.over(pairs.span == 1)
+    return np.where(all_close, -np.inf, -pairs.over(pairs.wrong))
 
 
 def _breaks(s, poses, pairs):
@@ -342,11 +369,13 @@ def _breaks(s, poses, pairs):
     MIN_MISSED such sightings are missed, on both sides, and no short one of the _Pairs that agrees
     with odometry is over the step.
     """
-    agreeing = (pairs.span <= max(SOON)) & (pairs.squared < GATE)
+    short = pairs.span <= max(SOON)
+    agreeing = pairs.over(short & (pairs.squared < GATE))
     later = sum(_due(s, poses, offset) for offset in SOON)
     earlier = sum(_due(s, poses, -offset) for offset in SOON)
-    missed = (np.minimum(later, earlier) > 1) & (later + earlier >= MIN_MISSED)
-    return np.flatnonzero(missed & (pairs.over(agreeing) == 0))
+    on_both_sides = np.minimum(later, earlier) > 1
+    missed = on_both_sides & (later + earlier >= MIN_MISSED)
+    return np.flatnonzero(missed & (agreeing == 0))
 
 
 def _due(s, poses, offset):
@@ -356,10 +385,12 @@ def _due(s, poses, offset):
     """
     low, high = np.quantile(s.z[:, :2], WELL_INSIDE, axis=0)
     count = len(poses) - 1
-    frame = np.clip(s.row + offset, 0, count)
-    place = se2.compose(se2.between(poses[frame], poses[s.row]), s.z)[:, :2]
-    inside = ((low < place) & (place < high)).all(axis=1)
-    due = inside & (frame == s.row + offset)
+    wanted = s.row + offset
+    frame = np.clip(wanted, 0, count)
+    motion = se2.between(poses[frame], poses[s.row])
+    place = se2.compose(motion, s.z)[:, :2]
+    inside = (low < place) & (place < high)
+    due = inside.all(axis=1) & (frame == wanted)
     begin = np.minimum(s.row, frame)[due]
     steps = begin + np.arange(abs(offset))[:, None]
     return np.bincount(steps.ravel(), minlength=count)
@@ -370,25 +401,28 @@ def _dead(ticks, frame, contradicted):
 
     It counts nothing there, in a run of zeros in which half of the steps are in `contradicted`.
     """
-    dead = [_in_dead_run(count == 0, frame, contradicted) for count in ticks.T]
-    return np.flatnonzero(_rows_in_steps(np.any(dead, axis=0), frame) > 0)
+    right, left = [_in_dead_run(count == 0, frame, contradicted) for count in ticks.T]
+    return np.flatnonzero(_rows_in_steps(right | left, frame))
 
 
 def _in_dead_run(zero, frame, contradicted):
     """True (n,) in the runs of `zero` (n,) that the markers contradict in half of their steps."""
     run = np.cumsum(~zero)                                  # a run has one number
     silent = _rows_in_steps(zero, frame) == np.diff(frame)
-    wrong = silent & np.isin(np.arange(len(silent)), contradicted)
+    is_contradicted = np.zeros_like(silent)
+    is_contradicted[contradicted] = True
+    wrong = silent & is_contradicted
     run_of_step = run[frame[1:]]
     silent_steps = np.bincount(run_of_step, silent, len(zero) + 1)
     wrong_steps = np.bincount(run_of_step, wrong, len(zero) + 1)
-    dead = (wrong_steps > 0) & (2 * wrong_steps >= silent_steps)
-    return zero & dead[run]
+    is_dead = _is_majority(wrong_steps, silent_steps)
+    return zero & is_dead[run]
 
 
 def _rows_in_steps(rows, frame):
     """Number (f-1,) of encoder rows in each step of which a mask (n,) is true."""
-    return np.diff(odometry.cumulative(rows)[frame + 1])
+    count = odometry.cumulative(rows)
+    return np.diff(count[frame + 1])
 
 
 @dataclass(frozen=True)
@@ -447,11 +481,11 @@ def _tried(s, drive, step, unknown):
     seen = drive.seen_from(step, s, before)
     exact = replace(move, covariance=np.zeros((1, 3, 3)))
     later = exact.then(drive.seen_from(step + 1, s, after))
+    mean = np.concatenate([seen.mean, later.mean])
+    covariance = np.concatenate([seen.covariance, later.covariance])
     first = np.arange(len(before))
     found = robust_increments(
-        np.concatenate([seen.mean, later.mean]),
-        np.concatenate([seen.covariance, later.covariance]),
-        np.zeros_like(first), first, first + len(first), 1)
+        mean, covariance, np.zeros_like(first), first, first + len(first), count=1)
     variance = _place_and_turn(np.diagonal(found.covariance[0]))
     if not found.usable[0] or variance[0] > MAX_VARIANCE:
         return untold
@@ -477,12 +511,14 @@ def _around(s, step):
 
     Of each marker the last PAIRS before it and the first ones after it; in all the NEAREST.
     """
-    spans = (s.row[:-1] <= step) & (step < s.row[1:])
-    last = np.flatnonzero(spans & (s.marker[:-1] == s.marker[1:]))
-    pairs = np.concatenate([[last - i, last + 1 + i] for i in range(PAIRS)], axis=1)
-    exists = (pairs[0] >= 0) & (pairs[1] < len(s.row))
-    pairs = pairs[:, exists]
-    same = s.marker[pairs[0]] == s.marker[pairs[1]]
-    pairs = pairs[:, same]
-    span = s.row[pairs[1]] - s.row[pairs[0]]
-    return pairs[:, np.argsort(span, kind="stable")[:NEAREST]]
+    k = _followed(s)
+    last = k[(s.row[k] <= step) & (step < s.row[k + 1])]
+    first = np.concatenate([last - i for i in range(PAIRS)])
+    second = np.concatenate([last + 1 + i for i in range(PAIRS)])
+    exists = (first >= 0) & (second < len(s.row))
+    pairs = np.stack([first, second])[:, exists]
+    first, second = s.marker[pairs]
+    pairs = pairs[:, first == second]
+    first, second = s.row[pairs]
+    nearest = np.argsort(second - first, kind="stable")[:NEAREST]
+    return pairs[:, nearest]

@@ -4,6 +4,9 @@ Each stage is a function from one frozen record to the next. Comments number the
 does. Problem 4 starts from the poses of problem 3 (`fit_from_previous`).
 """
 
+import logging
+import time
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,17 +16,21 @@ from slamlib.core.odometry import MODELS
 from slamlib.core.records import Dataset
 from slamlib.core.vehicle import changed
 from slamlib.robust.choices import better_model, calibrated, most_consistent
-from slamlib.robust.fit import CAUCHY_SCALES, narrow_kernels, refine, settled
+from slamlib.robust.fit import CAUCHY_SCALES, Fit, narrow_kernels, refine, settled
 from slamlib.robust.initialization import initial_state, state_from_poses
 from slamlib.robust.jumps import NO_JUMPS
 from slamlib.robust.linear import build_problem
-from slamlib.robust.measurements import Noise, measure
+from slamlib.robust.measurements import Measurements, Noise, measure
 from slamlib.robust.result import SlamResult, slam_result
 from slamlib.robust.solution import solve_by_gtsam
 
+log = logging.getLogger(__name__)
 
-def estimate(dataset, slip=None, model=None, previous=None, *, marker_noise_factor=None,
-             range_noise_factor=None, kernel=None, gate=None, poses=()):
+
+def estimate(dataset: Dataset, slip: float | None = None, model: str | None = None,
+             previous: SlamResult | None = None, *, marker_noise_factor: float | None = None,
+             range_noise_factor: float | None = None, kernel: str | None = None,
+             gate: bool | None = None, poses: Sequence[int] = ()) -> SlamResult:
     """SLAM on odometry and on the markers and ranges that the dataset has.
 
     Parameters
@@ -59,6 +66,7 @@ def estimate(dataset, slip=None, model=None, previous=None, *, marker_noise_fact
     >>> result.poses.shape, result.antenna.tolist(), result.noise.slip
     ((200, 3), [5, 13, 36, 46], 0.001)
     """
+    started = time.perf_counter()
     require(isinstance(dataset, Dataset), "estimate", "a Dataset", dataset)
     require_poses(dataset, poses)
     require_same_drive(dataset, previous)
@@ -66,34 +74,47 @@ def estimate(dataset, slip=None, model=None, previous=None, *, marker_noise_fact
     options = {"slip": slip, "marker_noise_factor": marker_noise_factor,
                "range_noise_factor": range_noise_factor, "kernel": kernel, "gate": gate}
     dataset = replace(dataset, vehicle=changed(dataset.vehicle, options, "estimate"))
+    log.info("estimate of %s: %d poses", dataset.name, len(dataset.ticks))
 
     def solve(jumps=NO_JUMPS, places=None):
-        aruco = dataset.aruco if places is None else replace(dataset.aruco, marker=places[:, 1])
+        aruco = dataset.aruco
+        if places is not None:
+            aruco = replace(aruco, marker=places[:, 1])
         measurements = measure(replace(dataset, aruco=aruco), poses, jumps)           # 1
         if previous is not None:
             return calibrated(fit_from_previous(measurements, previous, model))
         fit = fit_from_odometry(measurements, model or "arc")                         # 2 to 6
-        fit = calibrated(fit if model else better_model(fit))
+        if model is not None:
+            return calibrated(fit)
+        fit = calibrated(better_model(fit))
         # Wrong statements may look like other steps, and these like other statements.
-        other = better_model(fit) if fit.problem.released and not model else fit
+        other = better_model(fit) if fit.problem.released else fit
         return fit if other is fit else calibrated(other)
 
     if previous is not None and len(previous.rejected):
-        fit, places = solve(previous.jumps, previous.places), previous.places
+        fit = solve(previous.jumps, previous.places)
+        places = previous.places
     else:
         fit, places = most_consistent(dataset, solve)
     fit = settled(fit)
-    return replace(slam_result(fit, solve_by_gtsam(fit)), places=places)              # 7
+    by_gtsam = solve_by_gtsam(fit)
+    result = replace(slam_result(fit, by_gtsam), places=places)                       # 7
+    log.info("GTSAM: %d factors, %d variables, %d steps from %s, differs by up to %.2g sigmas",
+             by_gtsam.factors, by_gtsam.variables, by_gtsam.steps, by_gtsam.start,
+             result.agreement[0])
+    log.info("estimate of %s: %.1f s", dataset.name, time.perf_counter() - started)
+    return result
 
 
-def require_poses(dataset, poses):
+def require_poses(dataset: Dataset, poses: Sequence[int]):
     """Raise DatasetError unless `poses` are rows of the ticks of a Dataset."""
+    count = len(dataset.ticks)
     for pose in poses:
-        ok = isinstance(pose, int | np.integer) and 0 <= pose < len(dataset.ticks)
-        require(ok, "estimate", f"rows from 0 to {len(dataset.ticks) - 1} for poses", pose)
+        is_row = isinstance(pose, int | np.integer) and 0 <= pose < count
+        require(is_row, "estimate", f"rows from 0 to {count - 1} for poses", pose)
 
 
-def require_same_drive(dataset, previous):
+def require_same_drive(dataset: Dataset, previous: SlamResult | None):
     """Raise DatasetError unless `previous` is None or a SlamResult of the drive of a Dataset."""
     if previous is None:
         return
@@ -104,21 +125,22 @@ def require_same_drive(dataset, previous):
             f"counts, found one of {len(ticks)} poses")
 
 
-def fit_from_odometry(measurements, model="arc"):
+def fit_from_odometry(measurements: Measurements, model: str = "arc") -> Fit:
     """The Fit of Measurements with start values by odometry; raises DatasetError as `estimate`."""
     problem = build_problem(measurements, model)                                      # 2
     state = narrow_kernels(problem, initial_state(measurements, model))               # 4, 5
     return refine(problem, state)                                                     # 6
 
 
-def fit_from_previous(measurements, previous, model=None):
+def fit_from_previous(measurements: Measurements, previous: SlamResult,
+                      model: str | None = None) -> Fit:
     """The Fit of Measurements from a SlamResult, with another `model` if not None."""
-    frame, calibration = measurements.frame, measurements.calibration
-    sigma, c = (calibration.taken_from(previous.calibration, *values) for values in (
-        (previous.fit.problem.sigma, calibration.sigma), (previous.c, calibration.stated)))
-    problem = replace(
-        build_problem(measurements, model or previous.model, Noise(previous.slip), previous.wheel),
-        sigma=sigma, released=previous.released)
-    state = state_from_poses(measurements, previous.poses[frame], previous.covariances[frame], c)
+    m = measurements
+    before = previous.calibration
+    problem = build_problem(m, model or previous.model, Noise(previous.slip), previous.wheel)
+    sigma = m.calibration.taken_from(before, previous.fit.problem.sigma, m.calibration.sigma)
+    problem = replace(problem, sigma=sigma, released=previous.released)
+    c = m.calibration.taken_from(before, previous.c, m.calibration.stated)
+    state = state_from_poses(m, previous.poses[m.frame], previous.covariances[m.frame], c)
     state = narrow_kernels(problem, state, CAUCHY_SCALES[-1:])
     return replace(refine(problem, state), explanations=previous.explanations)

@@ -7,6 +7,7 @@ Antennas whose position the ranges do not determine are in doubt, and their cova
 from dataclasses import dataclass, replace
 from operator import attrgetter
 
+import gtsam
 import numpy as np
 
 from slamlib.core import increments, se2
@@ -18,11 +19,13 @@ from slamlib.robust.factors import MIN_DISTANCE
 from slamlib.robust.fit import Fit, error_memories, residuals
 from slamlib.robust.initialization import (
     SAME_PLACE,
+    AntennaRanges,
     other_antenna,
     ranges_by_antenna,
     second_moment,
     trilaterate,
 )
+from slamlib.robust.linear import Problem, State
 from slamlib.robust.solution import GtsamSolution, graph_and_values
 
 MIN_ACCEPTED_RANGES = 5      # number of accepted ranges of an antenna that is not in doubt
@@ -44,7 +47,7 @@ class SlamResult:
     antenna: np.ndarray             # (a,) ids, ascending, of antennas with ranges
     antenna_in_world: np.ndarray    # (a, 2)
     antenna_covariance: np.ndarray  # (a, 2, 2)
-    doubts: dict                    # antenna id: reason, for antennas in doubt
+    doubts: dict[int, str]          # antenna id: reason, for antennas in doubt
     c: np.ndarray                   # (p,) estimates of the entries of `calibration`
     c_covariance: np.ndarray        # (p, p), 0 where the stated value is known
     noise_sigma: np.ndarray         # (3,) of the logarithms of `noise`, 0 where not learned
@@ -68,22 +71,31 @@ class SlamResult:
     share = property(attrgetter("fit.problem.accepted.share"))   # (s + r,) of memory, `Accepted`
     sightings = property(attrgetter("fit.problem.measurements.sightings"))      # s of the graph
     jumps = property(attrgetter("fit.problem.measurements.jumps"))     # odometry against markers
-    converged = property(lambda self: self.gtsam.converged if self.gtsam else self.fit.converged)
-    calibration_table = property(lambda self: calibration_table(           # list of p dicts
-        self.calibration, self.c, self.c_covariance, self.released))
     wheel = property(lambda self: self.c[WHEELS])                # (3,) m: R_R, R_L, b
     wheel_covariance = property(lambda self: self.c_covariance[WHEELS, WHEELS])      # (3, 3) m^2
 
+    @property
+    def converged(self) -> bool:
+        """Whether the error had stopped to fall where the last iterations ended."""
+        return (self.gtsam or self.fit).converged
+
+    @property
+    def calibration_table(self) -> list[dict]:
+        """The dicts (p) of `calibration.calibration_table`."""
+        return calibration_table(self.calibration, self.c, self.c_covariance, self.released)
+
     def __repr__(self):
-        sigma = 1e3 * np.sqrt(np.trace(self.covariances[:, :2, :2], axis1=1, axis2=2) / 2).mean()
+        variance = np.trace(self.covariances[:, :2, :2], axis1=1, axis2=2) / 2
+        sigma = 1e3 * np.sqrt(variance).mean()
+        released = ", ".join(sorted(self.released)) or "nothing"
         return (f"SlamResult of {len(self.poses)} poses, mean sigma {sigma:.2g} mm per axis\n"
                 f"  {len(self.marker)} markers, {self.rejected.sum()} of {len(self.rejected)} "
                 f"sightings rejected\n  {len(self.antenna)} antennas, {len(self.doubts)} in doubt, "
                 f"{len(self.range_weight)} ranges\n  steps: {self.model}, slip {self.slip:.2g} "
                 f"sqrt(m), noise factors {self.noise.sightings:.2g} and {self.noise.ranges:.2g}\n"
-                f"  released from vehicle.toml: {', '.join(sorted(self.released)) or 'nothing'}")
+                f"  released from vehicle.toml: {released}")
 
-    def graph(self):
+    def graph(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
         """The gtsam.NonlinearFactorGraph that was decided, and gtsam.Values at its solution.
 
         For factors of one's own, and GTSAM's own tools; `core.graph` has the keys. Nothing is
@@ -92,104 +104,146 @@ class SlamResult:
         return graph_and_values(self.fit.problem, self.fit.state)
 
     @property
-    def unconfirmed(self):
+    def unconfirmed(self) -> np.ndarray:
         """Ids of markers with one accepted sighting, or at the place of a marker seen more often.
 
         Wrong labels make the latter. Antennas like them are in doubt.
         """
         marker, count = np.unique(self.sightings.marker[~self.rejected], return_counts=True)
-        count, place = count[np.isin(marker, self.marker)], self.marker_in_world[:, :2]
-        distance = np.hypot(*(place[:, None] - place).transpose(2, 0, 1))
-        other = (distance < SAME_MARKER) & (count > count[:, None])
-        return self.marker[(count == 1) | other.any(axis=1)]
+        count = count[np.isin(marker, self.marker)]
+        place = self.marker_in_world[:, :2]
+        distance = np.linalg.norm(place[:, None] - place, axis=2)
+        doubled = (distance < SAME_MARKER) & (count > count[:, None])
+        return self.marker[(count == 1) | doubled.any(axis=1)]
 
 
-def slam_result(fit, by_gtsam=None):
+def slam_result(fit: Fit, by_gtsam: GtsamSolution | None = None) -> SlamResult:
     """The SlamResult of a Fit, with the GtsamSolution of its graph or, without one, the engine's.
 
     Cross-covariances of neighbouring frames, by which encoder poses between them follow, are the
     engine's. Raises LinAlgError as `marginal_covariances`.
     """
-    problem, m = fit.problem, fit.problem.measurements
+    problem = fit.problem
+    m = problem.measurements
     state, marginal, slip = posterior_moments(fit)
-    agreement, landmarks, c_covariance = (0.0, 0.0), marginal.landmarks, marginal.c
+    landmarks = marginal.landmarks
+    c_covariance = marginal.c
+    agreement = 0.0, 0.0
     if by_gtsam is not None:
-        agreement = agreement_of(by_gtsam, state, marginal)
-        state, landmarks, c_covariance = by_gtsam.state, by_gtsam.landmarks, by_gtsam.c
-    poses, pose_covariances = interpolate(
-        replace(problem, noise=problem.noise._replace(slip=slip)), state, marginal.pairs)
+        frames = _of_frames(marginal.pairs, m)
+        agreement = agreement_of(by_gtsam, state, frames, marginal.landmarks)
+        state = by_gtsam.state
+        landmarks = by_gtsam.landmarks
+        c_covariance = by_gtsam.c
+    averaged = replace(problem, noise=problem.noise._replace(slip=slip))
+    poses, covariances = interpolate(averaged, state, marginal.pairs)
     if by_gtsam is not None:
-        pose_covariances[m.frame] = se2.rotate_covariance(
-            by_gtsam.frames, state.poses[:, 2])
-    range_residual, rejected = residuals(problem, state)[1], problem.accepted.sightings.weight == 0
+        covariances[m.frame] = se2.rotate_covariance(by_gtsam.frames, state.poses[:, 2])
+
+    rejected = problem.accepted.sightings.weight == 0
+    mapped = _mostly_accepted(m, rejected)
+    markers = state.markers[mapped]
+    markers[:, 2] = se2.wrap(markers[:, 2])
+    of_markers, of_antennas = np.split(landmarks, [len(m.marker)])
+    of_markers = _with_sighted_headings(m, of_markers)[mapped]
+
+    _, range_residual = residuals(problem, state)
     range_weight = problem.accepted.ranges.kept(range_residual)
-    markers, antennas = np.split(landmarks.copy(), [len(m.marker)])
-    best = np.full(len(m.marker), np.inf)         # a point has the heading of its best sighting
-    np.minimum.at(best, m.marker_row, m.sightings.C[:, 2, 2])
-    markers[~m.oriented, 2, 2] = best[~m.oriented]
-    balance = np.bincount(m.marker_row, np.where(rejected, -1, 1), len(m.marker))
-    mapped = balance > 0                          # markers with more accepted than rejected ones
-    place = np.c_[state.markers[mapped, :2], se2.wrap(state.markers[mapped, 2])]
-    sentences, antenna_covariances = antenna_doubts(
-        problem, state, pose_covariances[m.frame], antennas[:, :2, :2], range_weight)
+    doubts, of_antennas = antenna_doubts(
+        problem, state, covariances[m.frame], of_antennas[:, :2, :2], range_weight)
+
+    noise_sigma = np.zeros(3)
+    if fit.posterior is not None:
+        noise_sigma = np.sqrt(np.diag(fit.posterior.covariance))
+    memories = error_memories(problem, state)
     return SlamResult(
-        poses=poses, covariances=pose_covariances,
-        marker=m.marker[mapped], marker_in_world=place,
-        marker_covariance=se2.rotate_covariance(markers[mapped], place[:, 2]),
-        antenna=m.antenna, antenna_in_world=state.antennas,
-        antenna_covariance=antenna_covariances, doubts=sentences,
-        c=state.c, c_covariance=c_covariance, noise_sigma=np.zeros(3) if fit.posterior is None
-        else np.sqrt(np.diag(fit.posterior.covariance)),
+        poses=poses, covariances=covariances,
+        marker=m.marker[mapped], marker_in_world=markers,
+        marker_covariance=se2.rotate_covariance(of_markers, markers[:, 2]),
+        antenna=m.antenna, antenna_in_world=state.antennas, antenna_covariance=of_antennas,
+        doubts=doubts, c=state.c, c_covariance=c_covariance, noise_sigma=noise_sigma,
         rejected=rejected, range_weight=range_weight, range_residual=range_residual,
-        correlation=tuple(each.correlation for each in error_memories(problem, state)),
-        gtsam=by_gtsam, agreement=agreement,
-        turn_sigma=turn_sigma(problem), fit=fit)
+        correlation=tuple(memory.correlation for memory in memories),
+        turn_sigma=turn_sigma(problem), fit=fit, gtsam=by_gtsam, agreement=agreement)
 
 
-def agreement_of(by_gtsam, state, marginal):
+def _mostly_accepted(measurements, rejected):
+    """True (k,) for markers with more accepted than `rejected` (s,) sightings."""
+    vote = np.where(rejected, -1, 1)
+    return np.bincount(measurements.marker_row, vote, len(measurements.marker)) > 0
+
+
+def _with_sighted_headings(measurements, covariances):
+    """Covariances (k, 3, 3) of markers in which points have the heading of their best sighting."""
+    m = measurements
+    best = np.full(len(m.marker), np.inf)
+    np.minimum.at(best, m.marker_row, m.sightings.C[:, 2, 2])
+    covariances = covariances.copy()
+    covariances[~m.oriented, 2, 2] = best[~m.oriented]
+    return covariances
+
+
+def _of_frames(pairs, measurements):
+    """Covariances (f, 3, 3) of the frames by those of pairs (f-1, 9, 9); of one alone its prior."""
+    if not len(pairs):
+        return np.diag(measurements.origin_sigma**2)[None]
+    return np.concatenate([pairs[:, :3, :3], pairs[-1:, 3:6, 3:6]])
+
+
+def agreement_of(by_gtsam: GtsamSolution, state: State, frames: np.ndarray,
+                 landmarks: np.ndarray) -> tuple[float, float]:
     """Largest difference of GTSAM's poses and markers from the engine's, in its sigmas.
 
-    Also the largest relative difference of their sigmas. From the engine's mean State and
-    Covariances.
+    Also the largest relative difference of their sigmas. From the engine's mean State, and
+    covariances (f, 3, 3) of frames and (k + a, 3, 3) of landmarks.
     """
+    marker_count = len(state.markers)
     found = np.concatenate([by_gtsam.state.poses, by_gtsam.state.markers])
     engine = np.concatenate([state.poses, state.markers])
-    frames = np.concatenate([marginal.pairs[:1, :3, :3], marginal.pairs[:, 3:6, 3:6]])
-    landmarks = marginal.landmarks[:len(state.markers)]
-    of_engine = np.concatenate([frames, landmarks])
-    of_gtsam = np.concatenate([by_gtsam.frames, by_gtsam.landmarks[:len(state.markers)]])
+    difference = se2.difference(se2.between(engine, found), np.zeros(3))
+    of_gtsam = np.concatenate([by_gtsam.frames, by_gtsam.landmarks[:marker_count]])
+    of_engine = np.concatenate([frames, landmarks[:marker_count]])
     in_both = np.diagonal(of_gtsam, axis1=1, axis2=2) > 0
-    sigma = se2.sigmas(np.where(in_both[:, :, None], of_engine, 1.0))
-    off = np.abs(se2.difference(se2.between(engine, found), np.zeros(3))) / sigma
-    ratio = np.abs(se2.sigmas(np.where(in_both[:, :, None], of_gtsam, 1.0)) / sigma - 1)
-    return float(off[in_both].max(initial=0.0)), float(ratio[in_both].max(initial=0.0))
+    sigma = np.sqrt(np.diagonal(of_engine, axis1=1, axis2=2)[in_both])
+    off = np.abs(difference[in_both]) / sigma
+    ratio = np.abs(se2.sigmas(of_gtsam)[in_both] / sigma - 1)
+    return float(off.max(initial=0.0)), float(ratio.max(initial=0.0))
 
 
-def turn_sigma(problem):
+def turn_sigma(problem: Problem) -> np.ndarray:
     """Standard deviations (f-1,), rad, of the turns between frames by odometry of stated wheels."""
-    m, odometry = problem.measurements, problem.odometry
-    known = ~m.jumps.share(m.frame[:-1], m.frame[1:]).any(axis=1)        # else by markers
-    variance = np.sum((odometry.J_wheel[:, 2] * m.dataset.vehicle.sigma_wheel)**2, axis=1)
-    return known * np.sqrt(variance + odometry.covariance(problem.noise.slip)[:, 2, 2])
+    m = problem.measurements
+    odometry = problem.odometry
+    by_wheels = odometry.J_wheel[:, 2] * m.dataset.vehicle.sigma_wheel
+    of_wheels = np.sum(by_wheels**2, axis=1)
+    of_slip = odometry.covariance(problem.noise.slip)[:, 2, 2]
+    by_markers = m.jumps.share(m.frame[:-1], m.frame[1:]).any(axis=1)
+    return np.where(by_markers, 0.0, np.sqrt(of_wheels + of_slip))
 
 
-def antenna_doubts(problem, state, frame_covariances, covariances, range_weight):
+def antenna_doubts(problem: Problem, state: State, frame_covariances: np.ndarray,
+                   covariances: np.ndarray,
+                   range_weight: np.ndarray) -> tuple[dict[int, str], np.ndarray]:
     """Reasons to doubt antennas, and covariances that include the doubt, at a Problem's solution.
 
     From covariances (f, 3, 3) of the frames and (a, 2, 2) of the antennas, in world axes, and the
     share `range_weight` (r,) of its information that each range keeps. Reasons are a dict by id; in
     doubt the second moment of the position is added to a covariance.
     """
-    m, sentences, covariances = problem.measurements, {}, covariances.copy()
+    m = problem.measurements
     by_antenna = ranges_by_antenna(
         m, state.poses, frame_covariances, state.c, problem.noise.ranges)
-    for k, (place, ranges) in enumerate(zip(state.antennas, by_antenna)):
+    reasons = {}
+    covariances = covariances.copy()
+    for k, ranges in enumerate(by_antenna):
+        place = state.antennas[k]
         found = trilaterate(ranges)
-        sentence = _doubt(ranges, place, range_weight[m.ranges.antenna == k], *found[:2])
-        if sentence is not None:
-            sentences[int(m.antenna[k])] = sentence
+        weight = range_weight[m.ranges.antenna == k]
+        reason = _doubt(ranges, place, weight, found.places, found.costs)
+        if reason is not None:
+            reasons[int(m.antenna[k])] = reason
             covariances[k] += second_moment(*found, place)
-    return sentences, covariances
+    return reasons, covariances
 
 
 def _doubt(ranges, estimate, weight, places, costs):
@@ -198,14 +252,15 @@ def _doubt(ranges, estimate, weight, places, costs):
     It may be at `places` (p, 2) of `costs` (p,).
     """
     distance = np.median(ranges.distance)
-    count, total = np.count_nonzero(weight > 0.5), len(ranges.distance)
+    total = len(ranges.distance)
+    count = np.count_nonzero(weight > 0.5)
     if count < MIN_ACCEPTED_RANGES:
         return f"only {count} of its {total} ranges agree"
     elsewhere = np.linalg.norm(places - estimate, axis=1) > SAME_PLACE * distance
-    possible = [f"({x:.1f}, {y:.1f})" for x, y in places[elsewhere & (costs < MAX_LOG_ODDS)]]
-    if possible:
-        listed = " and ".join(dict.fromkeys(possible))
-        return f"its ranges fit as well at {listed}, which its covariance includes"
+    possible = places[elsewhere & (costs < MAX_LOG_ODDS)]
+    if len(possible):
+        named = dict.fromkeys(f"({x:.1f}, {y:.1f})" for x, y in possible)
+        return f"its ranges fit as well at {' and '.join(named)}, which its covariance includes"
     other = other_antenna(ranges, estimate, weight)
     if other is not None:
         return other
@@ -216,19 +271,58 @@ def _doubt(ranges, estimate, weight, places, costs):
     return None
 
 
-def worst_sigma(ranges, estimate, weight):
+def worst_sigma(ranges: AntennaRanges, estimate: np.ndarray, weight: np.ndarray) -> float:
     """Standard deviation in m of an antenna in the worst direction, by its ranges alone.
 
     Its covariance in the world also includes the uncertain heading of pose 1.
     """
     difference = estimate - ranges.positions
-    direction = difference / np.maximum(np.linalg.norm(difference, axis=1), MIN_DISTANCE)[:, None]
+    distance = np.maximum(np.linalg.norm(difference, axis=1), MIN_DISTANCE)
+    direction = difference / distance[:, None]
     weighted = direction * (weight / ranges.sigma**2)[:, None]
     information = np.linalg.eigvalsh(direction.T @ weighted)[0]
     return 1 / np.sqrt(max(information, GUESS_PRIOR_SIGMA**-2))
 
 
-def interpolate(problem, state, pairs):
+@dataclass(frozen=True)
+class _Side:
+    """Estimates of m encoder poses from the frames before them, or from those after them."""
+
+    pose: np.ndarray         # (m, 3)
+    by_frame: np.ndarray     # (m, 3, 3) derivative by the pose of the frame
+    by_wheel: np.ndarray     # (m, 3, 3) by the wheel parameters
+    noise: np.ndarray        # (m, 3, 3) covariance by the encoder steps between both
+    jump: np.ndarray         # (m, 1, 1) share of a jump in these steps
+
+
+def _from_frame(problem, state, row, pose, is_after):
+    """The estimates of encoder poses (m,) by odometry from the frames in rows (m,) of a State.
+
+    All frames are before the poses, or all after them.
+    """
+    m = problem.measurements
+    ticks = m.dataset.ticks
+    vehicle = m.dataset.vehicle.with_wheel(state.c[WHEELS])
+    X = state.poses[row]
+    frame = m.frame[row]
+    start, end = (pose, frame) if is_after else (frame, pose)
+    motion, motion_by_wheel = increments.between_poses(
+        ticks, vehicle, frame, pose, problem.odometry.model)
+    by_frame, by_motion = se2.compose_jacobians(X, motion)
+    quantization, slipping = odometry_noise(ticks, vehicle, start, end)
+    Q = quantization + problem.noise.slip**2 * slipping          # in the axes of `start`
+    by_increment = by_motion
+    if is_after:
+        increment = se2.inverse(motion)
+        by_increment = by_motion @ se2.between_jacobians(increment, np.zeros(3))[0]
+    return _Side(
+        pose=se2.compose(X, motion), by_frame=by_frame, by_wheel=by_motion @ motion_by_wheel,
+        noise=by_increment @ Q @ by_increment.mT,
+        jump=m.jumps.share(start, end).sum(axis=1)[:, None, None])
+
+
+def interpolate(problem: Problem, state: State,
+                pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Every encoder pose (n, 3) and its covariance (n, 3, 3) in world axes, given the frames.
 
     A pose k between the frames a and b depends only on them and on the wheels w. X_a Delta_ak(w)
@@ -237,38 +331,36 @@ def interpolate(problem, state, pairs):
 
     `pairs` (f-1, 9, 9) as in `Covariances`, at the State that solves the Problem.
     """
-    m, poses, frame = problem.measurements, state.poses, problem.measurements.frame
-    if not len(pairs):                                       # pose 1 alone: the world's origin
-        return poses.copy(), np.diag(m.origin_sigma)[None]**2
-    turned, R = np.tile(np.eye(9), (len(pairs), 1, 1)), se2.rotation(poses[:, 2])
-    turned[:, :2, :2], turned[:, 3:5, 3:5] = R[:-1], R[1:]
-    joint = turned @ pairs @ turned.mT                       # the poses in world axes
+    m = problem.measurements
+    joint = _pairs_in_world(pairs, state.poses[:, 2])
     pose = np.arange(len(m.dataset.ticks))
-    last, inner = np.searchsorted(frame, pose, side="right") - 1, np.setdiff1d(pose, frame)
-    all_poses = poses[last]
-    covariances = np.concatenate([joint[:, :3, :3], joint[-1:, 3:6, 3:6]])[last]
-    a, b = last[inner], last[inner] + 1
-    vehicle, ticks = m.dataset.vehicle.with_wheel(state.c[WHEELS]), m.dataset.ticks
-    ends = np.r_[frame[a], inner], np.r_[inner, frame[b]]
-    quantization, slipping = odometry_noise(ticks, vehicle, *ends)
-    (delta_a, delta_b), (a_by_wheel, b_by_wheel), (Q_a, Q_b), (jump_a, jump_b) = (
-        np.split(each, 2) for each in (
-            *increments.between_poses(ticks, vehicle, *ends, problem.odometry.model),
-            quantization + problem.noise.slip**2 * slipping,
-            m.jumps.share(*ends).sum(axis=1)[:, None, None]))
-    back = se2.inverse(delta_b)
-    A_a, B_a = se2.compose_jacobians(poses[a], delta_a)
-    A_b, B_b = se2.compose_jacobians(poses[b], back)
-    B_b = B_b @ se2.between_jacobians(delta_b, np.zeros(3))[0]       # of the inverse
+    last = np.searchsorted(m.frame, pose, side="right") - 1      # frame at each pose or before it
+    poses = state.poses[last]
+    covariances = _of_frames(joint, m)[last]
 
-    from_a, from_b = se2.compose(poses[a], delta_a), se2.compose(poses[b], back)
-    difference = se2.difference(from_b, from_a)
-    jump = difference[:, :, None] * difference[:, None] / np.maximum(jump_a + jump_b, MIN_SHARE)
-    N_a, N_b = B_a @ Q_a @ B_a.mT + jump_a * jump, B_b @ Q_b @ B_b.mT + jump_b * jump
+    inner = np.setdiff1d(pose, m.frame)
+    a = last[inner]
+    before = _from_frame(problem, state, a, inner, is_after=False)
+    after = _from_frame(problem, state, a + 1, inner, is_after=True)
+    difference = se2.difference(after.pose, before.pose)
+    squared = difference[:, :, None] * difference[:, None]
+    jump = squared / np.maximum(before.jump + after.jump, MIN_SHARE)
+    N_a = before.noise + before.jump * jump
+    N_b = after.noise + after.jump * jump
     gain_b = N_a @ np.linalg.inv(N_a + N_b)
     gain_a = np.eye(3) - gain_b
-    F = np.concatenate([gain_a @ A_a, gain_b @ A_b,
-                        gain_a @ B_a @ a_by_wheel + gain_b @ B_b @ b_by_wheel], axis=2)
-    all_poses[inner] = from_a + np.einsum("nij,nj->ni", gain_b, difference)
-    covariances[inner] = F @ joint[a] @ F.mT + gain_a @ N_a
-    return all_poses, (covariances + covariances.mT) / 2
+    by_pair = np.concatenate([
+        gain_a @ before.by_frame, gain_b @ after.by_frame,
+        gain_a @ before.by_wheel + gain_b @ after.by_wheel], axis=2)
+    poses[inner] = before.pose + np.einsum("nij,nj->ni", gain_b, difference)
+    covariances[inner] = by_pair @ joint[a] @ by_pair.mT + gain_a @ N_a
+    return poses, (covariances + covariances.mT) / 2
+
+
+def _pairs_in_world(pairs, heading):
+    """Covariances (f-1, 9, 9) of pairs of frames with headings (f,) and wheels, in world axes."""
+    R = se2.rotation(heading)
+    turn = np.tile(np.eye(9), (len(pairs), 1, 1))
+    turn[:, :2, :2] = R[:-1]
+    turn[:, 3:5, 3:5] = R[1:]
+    return turn @ pairs @ turn.mT

@@ -1,7 +1,7 @@
 """Doubts where the solution of problem 3 or 4, a SlamResult, contradicts what the files state."""
 
 from functools import reduce
-from itertools import chain
+from typing import NamedTuple
 
 import numpy as np
 
@@ -9,6 +9,7 @@ from slamlib.core import se2
 from slamlib.robust.file_doubts import Doubt
 from slamlib.robust.jumps import UNKNOWN_SIGMA
 from slamlib.robust.noise import BOUNDS
+from slamlib.robust.result import SlamResult
 
 MAX_TURN_SIGMA = np.pi / 3   # rad, between two frames; half a turn is three sigmas
 MAX_GAP = 30                 # poses, between contradictions that are told as one
@@ -17,8 +18,10 @@ MAX_LATE_SHARE = 0.1         # share of the ranges that keep less than half of t
 MAX_NOISE_FACTOR = 1.5       # on a sigma, or its inverse; beyond it the factor is reported
 MIN_FACTOR_SIGMAS = 4.0      # sigmas of the logarithm of a factor that is reported
 MAX_REJECTED = 0.1           # share of the sightings that are rejected
-MIN_REJECTED_OF_MARKER, MAX_REJECTED_OF_MARKER = 5, 0.2      # number, and share of its sightings
+MIN_REJECTED_OF_MARKER = 5   # number of its sightings, from which a marker is named
+MAX_REJECTED_OF_MARKER = 0.2     # share of its sightings, the same
 MAX_MARKERS_NAMED = 8        # of those with most rejected sightings
+MAX_STRETCHES_NAMED = 3      # of the drive, where counts and markers contradict each other
 MAX_DISAGREEMENT = 0.1       # sigmas of a pose, and relative of a sigma, by engine and GTSAM
 # By group of the calibration: its name in a sentence, and what to look at.
 GROUPS = {
@@ -40,141 +43,217 @@ GROUPS = {
                         "before them.")}
 
 
-def solution_doubts(result):
+def solution_doubts(result: SlamResult) -> tuple[Doubt, ...]:
     """Tuple of Doubt where a SlamResult contradicts the files of its drive."""
-    return tuple(Doubt(*each) for each in chain(
-        _of_encoder(result), _of_calibration(result), _of_noise(result),
-        _of_sightings(result), _of_the_path(result), _of_agreement(result),
-        (("antenna", f"Antenna {antenna} is in doubt: {reason}. Look at its rows in UwbReading.txt.")
-         for antenna, reason in result.doubts.items())))
+    doubts = []
+    for check in (_encoder_doubts, _calibration_doubts, _noise_doubts, _place_doubts,
+                  _rejection_doubts, _path_doubts, _agreement_doubts):
+        doubts += check(result)
+    for antenna, reason in result.doubts.items():
+        doubts.append(Doubt("antenna", (
+            f"Antenna {antenna} is in doubt: {reason}. Look at its rows in UwbReading.txt.")))
+    return tuple(doubts)
 
 
-def _of_calibration(result):
-    """Kind and sentence on each group of the calibration that decidedly left its stated values.
+def _calibration_doubts(result):
+    """A Doubt on each group of the calibration that decidedly left its stated values.
 
     Of groups that the drive cannot tell apart, on that which is furthest from what is stated.
     """
     common = frozenset.intersection(*result.explanations)
     either = frozenset().union(*result.explanations) - common
-    rows = [row for row in result.calibration_table if row["group"] in common | either]
-    distance = {group: max(abs(row["estimate"] - row["stated"]) / row["sigma"]
-                           for row in rows if row["group"] == group) for group in either}
-    furthest = max(distance, key=distance.get, default=None)
-    for group in (group for group in GROUPS if group in common | {furthest}):
-        numbers = " and ".join(
-            f"{row['name']} = {row['estimate']:.4g} ± {row['sigma']:.2g} {row['unit']}".rstrip()
-            + f" (stated: {row['stated']:.4g}"
-            + (f" ± {row['stated_sigma']:.2g})" if row["stated_sigma"] else ")")
-            for row in rows if row["group"] == group)
-        others = " or ".join(GROUPS[other][0] for other in GROUPS if other in either - {group})
-        instead = f" It may instead be {others}: the drive cannot tell, and the covariances " \
-            "include it." if group == furthest else ""
-        yield group, (f"By the drive {numbers}; problem {3 + bool(len(result.antenna))} uses this."
-                      f"{instead} {GROUPS[group][1]}")
+    rows = {group: [] for group in GROUPS}
+    for row in result.calibration_table:
+        rows[row["group"]].append(row)
+
+    def distance(group):
+        return max(abs(row["estimate"] - row["stated"]) / row["sigma"] for row in rows[group])
+
+    furthest = max(either, key=distance, default=None)
+    problem = "problem 4" if len(result.antenna) else "problem 3"
+    for group, (_, look) in GROUPS.items():
+        if group not in common and group != furthest:
+            continue
+        numbers = " and ".join(map(_estimated_and_stated, rows[group]))
+        sentence = f"By the drive {numbers}; {problem} uses this."
+        if group == furthest:
+            others = [name for other, (name, _) in GROUPS.items() if other in either - {group}]
+            sentence += (f" It may instead be {' or '.join(others)}: the drive cannot tell, and "
+                         "the covariances include it.")
+        yield Doubt(group, f"{sentence} {look}")
 
 
-def _of_encoder(result):
-    """Kind and sentence if the markers contradict the counts, by stretches of the drive."""
-    jumps, sentences = result.jumps, []
+def _estimated_and_stated(row):
+    """An entry of the calibration in words, by its row of `calibration_table`."""
+    estimated = f"{row['name']} = {row['estimate']:.4g} ± {row['sigma']:.2g} {row['unit']}"
+    stated = f"{row['stated']:.4g}"
+    if row["stated_sigma"]:
+        stated += f" ± {row['stated_sigma']:.2g}"
+    return f"{estimated.rstrip()} (stated: {stated})"
+
+
+def _encoder_doubts(result):
+    """A Doubt if the markers contradict the counts, by stretches of the drive."""
+    jumps = result.jumps
     if not len(jumps.start):
         return
     gaps = jumps.start[1:] - jumps.end[:-1]
-    for group in np.split(np.arange(len(gaps) + 1), np.flatnonzero(gaps > MAX_GAP) + 1):
-        ends = [reduce(se2.compose, each[group]) for each in (jumps.increment, jumps.by_odometry)]
-        by_markers, by_counts, off = (
-            f"{np.hypot(*end[:2]):.2f} m and {abs(np.degrees(se2.wrap(end[2]))):.0f} degrees"
-            for end in (*ends, se2.between(*ends)))
-        told = f"the markers say {by_markers}, which ends {off} from there" \
-            if (jumps.sigma[group] < UNKNOWN_SIGMA).all() else "all markers change at once"
-        sentences.append(f"between poses {jumps.start[group[0]] + 1} and "
-                         f"{jumps.end[group[-1]] + 1} the vehicle moved by {by_counts}, but {told}")
-    more = f"; and {len(sentences) - 3} more times" if len(sentences) > 3 else ""
-    yield "encoder", "In encoderReading.txt, " + "; ".join(sentences[:3]) + more + (
-        ". Problem 2's fusion and problems 3 and 4 do without these counts. Look at the rows, and "
-        "whether the vehicle was pushed or carried.")
+    begins = np.flatnonzero(gaps > MAX_GAP) + 1
+    stretches = np.split(np.arange(len(jumps.start)), begins)
+    told = "; ".join(_stretch(jumps, rows) for rows in stretches[:MAX_STRETCHES_NAMED])
+    more = len(stretches) - MAX_STRETCHES_NAMED
+    if more > 0:
+        told += f"; and {more} more times"
+    yield Doubt("encoder", (
+        f"In encoderReading.txt, {told}. Problem 2's fusion and problems 3 and 4 do without these "
+        "counts. Look at the rows, and whether the vehicle was pushed or carried."))
 
 
-def _of_noise(result):
-    """Kinds and sentences on errors with memory, and on learned factors that are not 1."""
-    late_share = np.mean(result.range_weight < 0.5) if len(result.range_weight) else 0.0
-    for column, what, name, file in ((1, "marker-noise", "sightings", "ArucoReading.txt"),
-                                     (2, "range-noise", "ranges", "UwbReading.txt")):
-        factor, sigma = getattr(result.noise, name), result.noise_sigma[column]
-        share = np.split(result.share, [len(result.rejected)])[column - 1]
+def _stretch(jumps, rows):
+    """What counts and markers say of the motion over all `rows` (m,) of Jumps, in words."""
+    by_counts = reduce(se2.compose, jumps.by_odometry[rows])
+    told = "all markers change at once"
+    if (jumps.sigma[rows] < UNKNOWN_SIGMA).all():
+        by_markers = reduce(se2.compose, jumps.increment[rows])
+        off = se2.between(by_markers, by_counts)
+        told = f"the markers say {_motion(by_markers)}, which ends {_motion(off)} from there"
+    first, last = rows[[0, -1]]
+    return (f"between poses {jumps.start[first] + 1} and {jumps.end[last] + 1} the vehicle moved "
+            f"by {_motion(by_counts)}, but {told}")
+
+
+def _motion(increment):
+    """Distance and turn of an increment (3,), in words."""
+    distance = np.hypot(increment[0], increment[1])
+    turn = np.degrees(np.abs(se2.wrap(increment[2])))
+    return f"{distance:.2f} m and {turn:.0f} degrees"
+
+
+class _Kind(NamedTuple):
+    """A kind of measurements."""
+
+    doubt: str               # first word of the kinds of its doubts
+    name: str                # in sentences
+    file: str
+    column: int              # of its factor among the noise parameters
+
+
+SIGHTINGS = _Kind("marker", "sightings", "ArucoReading.txt", 1)
+RANGES = _Kind("range", "ranges", "UwbReading.txt", 2)
+
+
+def _noise_doubts(result):
+    """Doubts on errors with memory, and on learned factors that are not 1."""
+    shares = np.split(result.share, [len(result.rejected)])
+    for kind, share in zip((SIGHTINGS, RANGES), shares):
         if (share < 1).any():
-            yield what.replace("noise", "memory"), (
-                f"Errors of successive {name} are alike: the correlation of their residuals is "
-                f"{result.correlation[column - 1]:.2f}. So problems 3 and 4 count {len(share)} "
-                f"{name} as {share.sum():.0f}, with {factor:.2g} times the standard deviations in "
-                f"{file}, because residuals do not show all of such errors. Look at the "
-                "calibration of the sensor, and for what blurs, hides or reflects.")
-            continue
-        if not sigma or abs(np.log(factor)) <= max(
-                np.log(MAX_NOISE_FACTOR), MIN_FACTOR_SIGMAS * sigma):
-            continue
-        outside = (np.log(result.noise)[column] - BOUNDS[:, column]) * [1, -1] < sigma
-        number = f"at most {factor:.2g}" if outside[0] else \
-            f"at least {factor:.3g}" if outside[1] else f"{factor:.2f} ± {factor * sigma:.2f}"
-        reason = (f"{late_share:.0%} of them are far too long, as without line of sight."
-                  if name == "ranges" and late_share > MAX_LATE_SHARE else
-                  "Look at how the sensor's covariances were obtained.")
-        yield what, (f"The {name} scatter {number} times as much as {file} states: problems 3 and "
-                     f"4 use the scatter that was found, the others the file's. {reason}")
+            yield _memory_doubt(result, kind, share)
+        else:
+            yield from _factor_doubt(result, kind)
 
 
-def _of_sightings(result):
-    """Kinds and sentences on ids of several places, and on sightings that are rejected."""
-    if result.places is not None:
-        ids, places = result.places[result.places[:, 0] != result.places[:, 1]].T
-        yield "places", (
-            f"By the path between their sightings, markers {', '.join(map(str, np.unique(ids)))} "
-            "were seen at more than one place: problems 3 and 4 have the others as markers "
-            f"{', '.join(map(str, np.unique(places)))}. Look for ids that are used twice, for "
-            "markers that were moved, and whether the vehicle was carried where it saw none.")
-    rejected, repeated = result.rejected, result.sightings.contradicting
-    left_out, count = rejected.sum() + repeated, len(rejected) + repeated
+def _memory_doubt(result, kind, share):
+    """The Doubt on errors with memory, of which measurements keep the shares (m,)."""
+    correlation = result.correlation[kind.column - 1]
+    return Doubt(f"{kind.doubt}-memory", (
+        f"Errors of successive {kind.name} are alike: the correlation of their residuals is "
+        f"{correlation:.2f}. So problems 3 and 4 count {len(share)} {kind.name} as "
+        f"{share.sum():.0f}, with {result.noise[kind.column]:.2g} times the standard deviations in "
+        f"{kind.file}, because residuals do not show all of such errors. Look at the calibration "
+        "of the sensor, and for what blurs, hides or reflects."))
+
+
+def _factor_doubt(result, kind):
+    """A Doubt if the learned noise factor of a kind is decidedly not 1."""
+    factor = result.noise[kind.column]
+    sigma = result.noise_sigma[kind.column]
+    logarithm = np.log(factor)
+    least = max(np.log(MAX_NOISE_FACTOR), MIN_FACTOR_SIGMAS * sigma)
+    if sigma == 0 or abs(logarithm) <= least:
+        return
+    low, high = BOUNDS[:, kind.column]
+    number = f"{factor:.2f} ± {factor * sigma:.2f}"
+    if logarithm - low < sigma:
+        number = f"at most {factor:.2g}"
+    elif high - logarithm < sigma:
+        number = f"at least {factor:.3g}"
+    reason = "Look at how the sensor's covariances were obtained."
+    if kind == RANGES:
+        late = np.mean(result.range_weight < 0.5)
+        if late > MAX_LATE_SHARE:
+            reason = f"{late:.0%} of them are far too long, as without line of sight."
+    yield Doubt(f"{kind.doubt}-noise", (
+        f"The {kind.name} scatter {number} times as much as {kind.file} states: problems 3 and 4 "
+        f"use the scatter that was found, the others the file's. {reason}"))
+
+
+def _place_doubts(result):
+    """A Doubt on ids of markers that stand for several places."""
+    if result.places is None:
+        return
+    ids, places = result.places[result.places[:, 0] != result.places[:, 1]].T
+    yield Doubt("places", (
+        f"By the path between their sightings, markers {_listed(ids)} were seen at more than one "
+        f"place: problems 3 and 4 have the others as markers {_listed(places)}. Look for ids that "
+        "are used twice, for markers that were moved, and whether the vehicle was carried where it "
+        "saw none."))
+
+
+def _listed(ids):
+    """Ids (m,), each once, in words."""
+    return ", ".join(map(str, np.unique(ids)))
+
+
+def _rejection_doubts(result):
+    """A Doubt on sightings that are rejected, if these are many or most of one marker."""
+    rejected = result.rejected
+    repeated = result.sightings.contradicting
+    left_out = rejected.sum() + repeated
+    count = len(rejected) + repeated
     marker, row, seen = np.unique(
         result.sightings.marker, return_inverse=True, return_counts=True)
     wrong = np.bincount(row, rejected, len(marker)).astype(int)
-    named = np.flatnonzero((wrong >= MIN_REJECTED_OF_MARKER)
-                           & (wrong > MAX_REJECTED_OF_MARKER * seen))
+    share = wrong / seen
+    named = np.flatnonzero((wrong >= MIN_REJECTED_OF_MARKER) & (share > MAX_REJECTED_OF_MARKER))
     if left_out <= MAX_REJECTED * count and not len(named):
         return
-    worst = named[np.argsort(-wrong[named] / seen[named], kind="stable")][:MAX_MARKERS_NAMED]
-    yield "sightings-rejected", (
-        f"{left_out} of {count} sightings contradict the rest and are left out"
-        + "".join(f", of marker {marker[k]} {wrong[k]} of {seen[k]}" for k in sorted(worst))
-        + f", {repeated} by another one of the same marker at the same pose" * bool(repeated)
-        + ": look at the marker ids in ArucoReading.txt, for markers that were moved or are there "
-        "twice, and for lost counts in encoderReading.txt.")
+    sentence = f"{left_out} of {count} sightings contradict the rest and are left out"
+    worst = named[np.argsort(-share[named], kind="stable")][:MAX_MARKERS_NAMED]
+    for k in np.sort(worst):
+        sentence += f", of marker {marker[k]} {wrong[k]} of {seen[k]}"
+    if repeated:
+        sentence += f", {repeated} by another one of the same marker at the same pose"
+    yield Doubt("sightings-rejected", sentence + (
+        ": look at the marker ids in ArucoReading.txt, for markers that were moved or are there "
+        "twice, and for lost counts in encoderReading.txt."))
 
 
-def _of_the_path(result):
-    """Kinds and sentences on slip, turns between frames, and a solution that still changed."""
+def _path_doubts(result):
+    """Doubts on slip, turns between frames, and a solution that still changed."""
     if result.slip > MAX_SLIP and result.noise_sigma[0]:
-        yield "wheel-slip", (
+        yield Doubt("wheel-slip", (
             f"By the other sensors each wheel slips by {1e3 * result.slip:.0f} mm (one standard "
             "deviation) after one metre, far more than wheels do: look whether encoderReading.txt "
-            "is of the same drive as the other files, with the same pose ids.")
-    frame, sigma = result.sightings.frame, result.turn_sigma
+            "is of the same drive as the other files, with the same pose ids."))
+    sigma = result.turn_sigma
     if sigma.max(initial=0) >= MAX_TURN_SIGMA:
-        k = int(sigma.argmax())
-        yield "turns", (
-            f"Between poses {frame[k] + 1} and {frame[k + 1] + 1} only the wheels were measured, "
-            f"and they know the turn between them to {sigma[k]:.1f} rad (one standard deviation): "
-            "whole turns may be missing in the solution, and with them the path between these "
-            "poses is wrong.")
+        k = sigma.argmax()
+        first, second = result.sightings.frame[[k, k + 1]] + 1
+        yield Doubt("turns", (
+            f"Between poses {first} and {second} only the wheels were measured, and they know the "
+            f"turn between them to {sigma[k]:.1f} rad (one standard deviation): whole turns may be "
+            "missing in the solution, and with them the path between these poses is wrong."))
     if not result.converged:
-        yield "not-converged", (
+        yield Doubt("not-converged", (
             "The solution still changed when its number of steps ended: some poses or landmarks "
-            "may be far from where the measurements want them.")
+            "may be far from where the measurements want them."))
 
 
-def _of_agreement(result):
-    """Kind and sentence if GTSAM's solution is not that by which the engine decided."""
+def _agreement_doubts(result):
+    """A Doubt if GTSAM's solution is not that by which the engine decided."""
     off, ratio = result.agreement
     if max(off, ratio) > MAX_DISAGREEMENT:
-        yield "agreement", (
+        yield Doubt("agreement", (
             f"GTSAM's solution differs by up to {off:.2g} standard deviations from that by which "
             f"noise and outliers were decided, and its standard deviations by up to {ratio:.0%}: "
-            "what was decided may not fit it.")
+            "what was decided may not fit it."))
