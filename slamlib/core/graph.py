@@ -67,7 +67,8 @@ def count_everything(dataset: Dataset, kernel: str = "Cauchy", slip: float = TYP
     `kernel` is a name in `kernels.KERNELS`, of sightings and ranges, `slip` is in sqrt(m), and
     `extra` are further encoder poses that are variables.
     """
-    sightings, ranges = dataset.sightings, dataset.uwb
+    sightings = dataset.sightings
+    ranges = dataset.uwb
     return Decisions(
         odometry=preintegrate(dataset, frames_of(dataset, extra)),
         slip=slip,
@@ -145,7 +146,8 @@ def odometry_error(increments: OdometryIncrements, k: int, sigma_wheel: np.ndarr
     with the wheels. Otherwise all lengths would be estimated too small where nothing else gives the
     scale.
     """
-    increment, J_wheel = increments.increment[k], increments.J_wheel[k]
+    increment = increments.increment[k]
+    J_wheel = increments.J_wheel[k]
     stated = increments.stated
     stated_radius = (stated[0] + stated[1]) / 2
     off_stated = stated - increments.wheel               # from the value of linearisation
@@ -157,7 +159,8 @@ def odometry_error(increments: OdometryIncrements, k: int, sigma_wheel: np.ndarr
         wheelbase = stated[2] + change[2]
         scale = np.array([1.0, 1.0, wheelbase / stated[2]]) * (stated_radius / radius)
         measured = gtsam.Pose2(*(increment + J_wheel @ (off_stated + change)))
-        X_i, X_k = values.atPose2(first), values.atPose2(second)
+        X_i = values.atPose2(first)
+        X_k = values.atPose2(second)
         if jacobians is None:
             return scale * gtsam.Pose2.Logmap(measured.between(X_i.between(X_k)))
         by_first, by_second, by_measured, by_expected, by_difference = np.zeros(
@@ -179,7 +182,8 @@ def odometry_error(increments: OdometryIncrements, k: int, sigma_wheel: np.ndarr
 
 def in_own_axes(pose: gtsam.Pose2) -> np.ndarray:
     """Derivative (3, 3) of GTSAM's tangent vector at a pose by its coordinates [x, y, heading]."""
-    c, s = np.cos(pose.theta()), np.sin(pose.theta())
+    c = np.cos(pose.theta())
+    s = np.sin(pose.theta())
     return np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
 
 
@@ -208,39 +212,42 @@ def add_sightings(graph: gtsam.NonlinearFactorGraph, decisions: Decisions):
     The files give the covariance C of Z in the axes of the vehicle; the error of a marker's pose
     lives in those of the measured pose, R(heading)^T C R(heading) (equation 3.1).
     """
-    sightings, kernel = decisions.sightings, decisions.sighting_kernel
+    sightings = decisions.sightings
     points = set(decisions.points.tolist())
     in_axes_of_marker = se2.rotate_covariance(
         sightings.covariance, -sightings.marker_in_vehicle[:, 2])
     for k, z in enumerate(sightings.marker_in_vehicle):
-        pose, share = X(int(sightings.pose[k])), decisions.sighting_share[k]
+        pose = X(int(sightings.pose[k]))
+        share = decisions.sighting_share[k]
         marker = int(sightings.marker[k])
         if marker in points:
             bearing, distance, C = polar(z, sightings.covariance[k])
-            noise = noise_model(C, kernel, share)
+            noise = noise_model(C, decisions.sighting_kernel, share)
             graph.add(gtsam.BearingRangeFactor2D(
                 pose, P(index_of(marker)), bearing, distance, noise))
         else:
-            noise = noise_model(in_axes_of_marker[k], kernel, share)
+            noise = noise_model(in_axes_of_marker[k], decisions.sighting_kernel, share)
             graph.add(gtsam.BetweenFactorPose2(
                 pose, L(index_of(marker)), gtsam.Pose2(*z), noise))
 
 
 def polar(z: np.ndarray, C: np.ndarray) -> tuple[gtsam.Rot2, float, np.ndarray]:
     """Bearing and distance of a sighting z (3,), and their covariance (2, 2) by C (3, 3)."""
-    x, y, _ = z
+    x, y = z[:2]
     distance = np.hypot(x, y)
+    bearing = np.arctan2(y, x)
     by_position = np.array([[-y / distance**2, x / distance**2], [x / distance, y / distance]])
-    covariance = by_position @ C[:2, :2] @ by_position.T
-    return gtsam.Rot2(np.arctan2(y, x)), distance, covariance
+    return gtsam.Rot2(bearing), distance, by_position @ C[:2, :2] @ by_position.T
 
 
 def add_ranges(graph: gtsam.NonlinearFactorGraph, decisions: Decisions):
     """Add a factor for each range, which is compared with the bias of a one-sided kernel."""
-    ranges, kernel = decisions.ranges, decisions.range_kernel
+    ranges = decisions.ranges
+    kernel = decisions.range_kernel
     measured = ranges.range - ONE_SIDED.get(kernel, 0.0) * ranges.sigma
     for k, sigma in enumerate(ranges.sigma):
-        pose, antenna = X(int(ranges.pose[k])), A(index_of(ranges.antenna[k]))
+        pose = X(int(ranges.pose[k]))
+        antenna = A(index_of(ranges.antenna[k]))
         noise = noise_model(np.array([[sigma**2]]), kernel, decisions.range_share[k])
         graph.add(gtsam.RangeFactor2D(pose, antenna, measured[k], noise))
 

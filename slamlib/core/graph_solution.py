@@ -170,12 +170,14 @@ def contradiction(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> st
 
     Factors with a robust noise model may contradict the rest.
     """
-    largest, worst = 0.0, None
+    largest = 0.0
+    worst = None
     for k in range(graph.size()):
         factor = graph.at(k)
         size = np.sqrt(2 * factor.error(values))
         if size > largest and not is_robust(factor):
-            largest, worst = size, k
+            largest = size
+            worst = k
     if largest <= MAX_CONTRADICTION:
         return ""
     keys = ", ".join(gtsam.DefaultKeyFormatter(key) for key in graph.at(worst).keys())
@@ -207,7 +209,8 @@ def places(values: gtsam.Values, covariance_of: Callable[[int], np.ndarray]) -> 
     marker_covariance = np.concatenate([
         marker_covariances, np.pad(point_covariances, ((0, 0), (0, 1), (0, 1)),
                                    constant_values=np.nan)])
-    by_id, antenna = np.argsort(marker), ids_of(keys["a"])
+    by_id = np.argsort(marker)
+    antenna = ids_of(keys["a"])
     by_antenna = np.argsort(antenna)
     return {"pose": ids_of(keys["x"]), "poses": poses, "covariances": covariances,
             "marker": marker[by_id], "marker_in_world": marker_in_world[by_id],
@@ -224,7 +227,8 @@ def ids_of(keys: list[int]) -> np.ndarray:
 
 def poses_in_world(values: gtsam.Values, keys: list[int], covariance_of: Callable):
     """Poses (n, 3) of these keys, and their covariances (n, 3, 3) in world axes."""
-    poses, covariances = np.zeros((len(keys), 3)), np.zeros((len(keys), 3, 3))
+    poses = np.zeros((len(keys), 3))
+    covariances = np.zeros((len(keys), 3, 3))
     for k, key in enumerate(keys):
         pose = values.atPose2(key)
         poses[k] = pose.x(), pose.y(), pose.theta()
@@ -234,7 +238,8 @@ def poses_in_world(values: gtsam.Values, keys: list[int], covariance_of: Callabl
 
 def points_in_world(values: gtsam.Values, keys: list[int], covariance_of: Callable):
     """Positions (n, 2) of these keys, and their covariances (n, 2, 2)."""
-    points, covariances = np.zeros((len(keys), 2)), np.zeros((len(keys), 2, 2))
+    points = np.zeros((len(keys), 2))
+    covariances = np.zeros((len(keys), 2, 2))
     for k, key in enumerate(keys):
         points[k] = values.atPoint2(key)
         covariances[k] = covariance_of(key)

@@ -47,7 +47,8 @@ def preintegrate(dataset: Dataset, frame: np.ndarray, model: str = "arc",
     """
     stated = dataset.vehicle
     vehicle = stated if wheel is None else stated.with_wheel(wheel)
-    start, end = frame[:-1], frame[1:]
+    start = frame[:-1]
+    end = frame[1:]
     increment, J_wheel = increments.between_poses(dataset.ticks, vehicle, start, end, model)
     quantization, slipping = odometry_noise(dataset.ticks, stated, start, end)
     return OdometryIncrements(

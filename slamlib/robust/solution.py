@@ -114,9 +114,9 @@ def ranges_are_native(problem: Problem) -> bool:
 
 def decisions_of(problem: Problem, noise: Noise) -> Decisions:
     """The Decisions of a Problem for a Noise, without what custom factors measure."""
-    m, vehicle = problem.measurements, problem.measurements.dataset.vehicle
+    m = problem.measurements
+    vehicle = m.dataset.vehicle
     sightings, ranges = problem.accepted
-    counted, heard = sightings.weight > 0, ranges.weight > 0
     return Decisions(
         odometry=problem.odometry,
         slip=noise.slip,
@@ -126,18 +126,19 @@ def decisions_of(problem: Problem, noise: Noise) -> Decisions:
         ranges=calibrated_ranges(problem, noise) if ranges_are_native(problem) else None,
         guess=m.dataset.antenna_guess,
         points=m.marker[~m.oriented],
-        sighting_share=sightings.share[counted],
-        range_share=ranges.share[heard],
+        sighting_share=sightings.share[sightings.weight > 0],
+        range_share=ranges.share[ranges.weight > 0],
         sighting_kernel=sighting_kernel(problem),
         range_kernel=vehicle.kernel)
 
 
 def sightings_in_vehicle(problem: Problem, noise: Noise) -> ArucoReadings | None:
     """The accepted sightings as the vehicle sees them by the stated camera and size."""
-    m, counted = problem.measurements, problem.accepted.sightings.weight > 0
+    m = problem.measurements
+    s = m.sightings
+    counted = problem.accepted.sightings.weight > 0
     if not counted.any():
         return None
-    s = m.sightings
     by_camera = ArucoReadings(
         pose=m.frame[s.row[counted]], marker=s.marker[counted], marker_in_vehicle=s.z[counted],
         covariance=noise.sightings**2 * s.C[counted])
@@ -146,10 +147,12 @@ def sightings_in_vehicle(problem: Problem, noise: Noise) -> ArucoReadings | None
 
 def calibrated_ranges(problem: Problem, noise: Noise) -> UwbReadings | None:
     """The accepted ranges without the stated offset and scale."""
-    m, heard = problem.measurements, problem.accepted.ranges.weight > 0
+    m = problem.measurements
+    r = m.ranges
+    stated = m.calibration.stated
+    heard = problem.accepted.ranges.weight > 0
     if not heard.any():
         return None
-    r, stated = m.ranges, m.calibration.stated
     return UwbReadings(
         pose=m.frame[r.row[heard]], antenna=m.antenna[r.antenna[heard]],
         range=(r.distance[heard] - stated[OFFSET]) / stated[SCALE],
@@ -169,7 +172,9 @@ class CalibratedFactors:
 
         `calibration` is the key of the unknown entries among these `columns` of c.
         """
-        self.problem, self.keys, self.calibration = problem, keys, calibration
+        self.problem = problem
+        self.keys = keys
+        self.calibration = calibration
         self.linearised = linearised
         self.active = problem.active[columns]
         self.sigma = problem.sigma[columns][self.active]
@@ -221,8 +226,10 @@ class CalibratedFactors:
 
 def add_calibrated_sightings(graph: gtsam.NonlinearFactorGraph, problem: Problem, noise: Noise):
     """Add the accepted sightings with the unknown entries of their calibration, S(0)."""
-    m, accepted = problem.measurements, problem.accepted.sightings
-    s, counted = m.sightings, np.flatnonzero(accepted.weight)
+    m = problem.measurements
+    s = m.sightings
+    accepted = problem.accepted.sightings
+    counted = np.flatnonzero(accepted.weight)
     is_known = not problem.active[SIGHTING_LAG]
     frames = [X(i) for i in m.frame.tolist()]
     markers = marker_keys(problem)
@@ -245,8 +252,10 @@ def add_calibrated_sightings(graph: gtsam.NonlinearFactorGraph, problem: Problem
 
 def add_calibrated_ranges(graph: gtsam.NonlinearFactorGraph, problem: Problem, noise: Noise):
     """Add the accepted ranges with the unknown entries of their calibration, R(0)."""
-    m, accepted = problem.measurements, problem.accepted.ranges
-    r, counted = m.ranges, np.flatnonzero(accepted.weight)
+    m = problem.measurements
+    r = m.ranges
+    accepted = problem.accepted.ranges
+    counted = np.flatnonzero(accepted.weight)
     is_known = not problem.active[RANGE_LAG]
     kernel = m.dataset.vehicle.kernel
     sigma = noise.ranges * r.sigma
@@ -311,7 +320,8 @@ def variable_keys(problem: Problem) -> list[int]:
 
 def values_of(problem: Problem, state: State, graph: gtsam.NonlinearFactorGraph) -> gtsam.Values:
     """GTSAM's values of a State, of the variables of a graph."""
-    used, values = set(graph.keyVector()), gtsam.Values()
+    used = set(graph.keyVector())
+    values = gtsam.Values()
     rows = np.concatenate([
         state.poses, state.markers, np.pad(state.antennas, ((0, 0), (0, 1)))])
     for key, row in zip(variable_keys(problem), rows):
@@ -334,14 +344,17 @@ def solve_by_gtsam(fit: Fit) -> GtsamSolution:
 
     Raises DatasetError where the measurements do not determine every variable.
     """
-    problem, points = fit.problem, noise_points(fit)
+    problem = fit.problem
+    points = noise_points(fit)
     graph = graph_of(problem, points[0][1] if len(points) == 1 else problem.noise)
     decided = values_of(problem, fit.state, graph)
     odometry = odometry_state(problem.measurements, problem.odometry.model)
-    found, start = gauss_newton(graph, values_of(problem, odometry, graph)), FROM_ODOMETRY
+    found = gauss_newton(graph, values_of(problem, odometry, graph))
+    start = FROM_ODOMETRY
     limit = graph.error(decided)
     if not found.converged or found.error > limit + SAME_ERROR * (1 + limit):
-        found, start = gauss_newton(graph, decided), FROM_ENGINE
+        found = gauss_newton(graph, decided)
+        start = FROM_ENGINE
     return averaged(fit, graph, found, start)
 
 
@@ -353,11 +366,14 @@ def noise_points(fit: Fit) -> tuple[tuple[float, Noise], ...]:
 def averaged(fit: Fit, graph: gtsam.NonlinearFactorGraph, found: GaussNewton,
              start: str) -> GtsamSolution:
     """The GtsamSolution by the moments over the noise's posterior at the solution of a graph."""
-    problem, values, points = fit.problem, found.values, noise_points(fit)
+    problem = fit.problem
+    values = found.values
+    points = noise_points(fit)
     weights = np.array([weight for weight, _ in points])
     weights /= weights.sum()
     keys = gtsam.KeyVector(list(values.keys()))
-    marginals, steps = [found.marginals], np.zeros((1, values.dim()))
+    marginals = [found.marginals]
+    steps = np.zeros((1, values.dim()))
     if len(points) > 1:
         graphs = [graph_of(problem, noise) for _, noise in points]
         trees = [eliminated(each.linearize(values)) for each in graphs]
@@ -413,9 +429,9 @@ def as_arrays(fit: Fit, values: gtsam.Values, covariance) -> tuple[State, np.nda
     blocks = np.zeros((len(rows), 3, 3))
     for k, key in enumerate(variable_keys(fit.problem)):
         if values.exists(key):
-            place, C = array_of(values, key), covariance(key)
+            C = covariance(key)
             size = len(C)
-            rows[k, :size] = place[:size]
+            rows[k, :size] = array_of(values, key)[:size]
             blocks[k, :size, :size] = C
     poses, markers, antennas = np.split(rows, np.cumsum([len(m.frame), len(m.marker)]))
     state = state_from_arrays(
