@@ -7,6 +7,7 @@ with factors and variables of one's own.
 """
 
 import logging
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -159,8 +160,8 @@ def eliminated(linear: gtsam.GaussianFactorGraph) -> gtsam.GaussianBayesTree:
         ordering = gtsam.Ordering.ColamdGaussianFactorGraph(linear)
         return linear.eliminateMultifrontal(ordering, gtsam.EliminateQR)
     except RuntimeError as failure:                      # GTSAM's, with much advice
-        _, _, rest = str(failure).partition("Symbol: ")
-        near = f", near {rest.partition(')')[0]}" if rest else ""
+        symbol = re.search(r"Symbol: ([a-z]\d+)", str(failure))
+        near = f", near {symbol[1]}" if symbol else ""
         raise DatasetError("expected measurements that determine every pose and landmark, found "
                            f"some that do not{near}") from None
 
