@@ -220,10 +220,10 @@ def _slam_facts(dataset, found):
 def _gtsam_facts(found):
     """What GTSAM solved, and how far it is from the engine that decided, of a SlamResult."""
     by_gtsam = found.gtsam
-    off, ratio = found.agreement
     return {"factors": by_gtsam.factors, "variables": by_gtsam.variables,
             "steps": by_gtsam.steps, "start": by_gtsam.start,
-            "largest_difference_in_sigmas": off, "largest_relative_difference_of_sigmas": ratio}
+            "largest_difference_in_sigmas": found.agreement[0],
+            "largest_relative_difference_of_sigmas": found.agreement[1]}
 
 
 def solutions(dataset: Dataset,

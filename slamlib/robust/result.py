@@ -199,22 +199,25 @@ def _agreement(solution, engine):
 
     Also the largest relative difference of their sigmas.
     """
-    expected, expected_variances = _places(engine)
-    found, variances = _places(solution)
+    variances = _variances(solution)
     in_both = variances > 0
-    sigma = np.sqrt(expected_variances[in_both])
-    difference = se2.difference(se2.between(expected, found), np.zeros(3))
+    sigma = np.sqrt(_variances(engine)[in_both])
+    difference = se2.between(_places(engine), _places(solution))
+    difference[:, 2] = se2.wrap(difference[:, 2])
     off = np.abs(difference[in_both]) / sigma
     ratio = np.abs(np.sqrt(variances[in_both]) / sigma - 1)
     return float(off.max(initial=0.0)), float(ratio.max(initial=0.0))
 
 
 def _places(solution):
-    """Poses and markers (f + k, 3) of a solution, and their variances (f + k, 3)."""
-    markers = solution.state.markers
-    covariances = np.concatenate([solution.frames, solution.landmarks[:len(markers)]])
-    places = np.concatenate([solution.state.poses, markers])
-    return places, np.diagonal(covariances, axis1=1, axis2=2)
+    """Poses and markers (f + k, 3) of a solution."""
+    return np.concatenate([solution.state.poses, solution.state.markers])
+
+
+def _variances(solution):
+    """Variances (f + k, 3) of poses and markers of a solution, in their own axes."""
+    markers = solution.landmarks[:len(solution.state.markers)]
+    return np.diagonal(np.concatenate([solution.frames, markers]), axis1=1, axis2=2)
 
 
 def turn_sigma(problem: Problem) -> np.ndarray:
