@@ -157,16 +157,13 @@ def problem_solution(problem: str, dataset: Dataset, found=None) -> Solution:
 
 def _require_variances(found, covariances):
     """Raise LinAlgError if a variance of poses (m, 3, 3), map or wheels was lost by rounding."""
-    blocks = [covariances]
-    for kind in ("marker", "antenna", "wheel"):
-        block = getattr(found, f"{kind}_covariance", None)
-        if block is not None:
-            blocks.append(block)
-    variances = np.concatenate([np.diagonal(C, axis1=-2, axis2=-1).ravel() for C in blocks])
-    valid = (variances >= 0) & (variances < np.inf)
+    others = [getattr(found, f"{kind}_covariance", None) for kind in ("marker", "antenna", "wheel")]
+    variances = np.concatenate([np.diagonal(block, axis1=-2, axis2=-1).ravel()
+                                for block in (covariances, *others) if block is not None])
+    is_valid = (variances >= 0) & (variances < np.inf)
     fit = getattr(found, "fit", None)
-    evidence = 0.0 if fit is None else fit.log_evidence
-    if not (valid.all() and np.isfinite(evidence)):
+    is_lost = fit is not None and not np.isfinite(fit.log_evidence)
+    if is_lost or not is_valid.all():
         raise np.linalg.LinAlgError("a variance is negative or not finite")
 
 
@@ -223,10 +220,10 @@ def _slam_facts(dataset, found):
 def _gtsam_facts(found):
     """What GTSAM solved, and how far it is from the engine that decided, of a SlamResult."""
     by_gtsam = found.gtsam
-    off, ratio = found.agreement
     return {"factors": by_gtsam.factors, "variables": by_gtsam.variables,
             "steps": by_gtsam.steps, "start": by_gtsam.start,
-            "largest_difference_in_sigmas": off, "largest_relative_difference_of_sigmas": ratio}
+            "largest_difference_in_sigmas": found.agreement[0],
+            "largest_relative_difference_of_sigmas": found.agreement[1]}
 
 
 def solutions(dataset: Dataset,

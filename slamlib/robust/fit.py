@@ -133,9 +133,9 @@ def noise_of_scatter(problem: Problem, state: State) -> Noise:
     sightings, ranges = residuals(replace(problem, noise=Noise()), state)
     squared = np.sum(sightings**2, axis=1)
     median = np.where(m.as_pose, MEDIAN_CHI2[3], MEDIAN_CHI2[2])
-    of_sightings = _scatter(squared / median)
-    of_ranges = _scatter(ranges**2 / MEDIAN_CHI2[1])
-    return with_known(Noise(problem.noise.slip, of_sightings, of_ranges), m.dataset.vehicle)
+    noise = problem.noise._replace(
+        sightings=_scatter(squared / median), ranges=_scatter(ranges**2 / MEDIAN_CHI2[1]))
+    return with_known(noise, m.dataset.vehicle)
 
 
 def _scatter(squared):
@@ -173,14 +173,15 @@ def refine(problem: Problem, state: State,
     Problem and State; None keeps those of the problem. Raises DatasetError as `optimize`, and
     numpy.linalg.LinAlgError if odometry's covariance is singular.
     """
-    if accept is None:
-        shares = [kind.share for kind in problem.accepted]
+    is_given = accept is None
+    shares = [kind.share for kind in problem.accepted]
+    if is_given:
         given = problem.accepted.with_shares(map(np.ones_like, shares))
         accept = lambda *_: given
-        problem, optimum, posterior = _settle(problem, state, accept)
     else:
         problem = replace(problem, noise=noise_of_scatter(problem, state))
-        problem, optimum, posterior = _settle(problem, state, accept)
+    problem, optimum, posterior = _settle(problem, state, accept)
+    if not is_given:
         shares = _shares_of_memory(problem, optimum.state, accept)
     if any((share < 1).any() for share in shares):
         problem, posterior = _apply_memory(problem, optimum.state, posterior, shares, accept)
@@ -210,11 +211,11 @@ def _settle(problem, state, accept):
         accepted = accept(problem, state)
         changed = sum(np.count_nonzero(new.weight != old.weight)
                       for new, old in zip(accepted, problem.accepted))
-        sightings, ranges = (np.count_nonzero(kind.weight) for kind in accepted)
         log.info("round %d: slip %.3g mm after 1 m, factors %.3g and %.3g; accepted %d of %d "
                  "sightings, %d of %d ranges, %d changed", number, 1e3 * problem.noise.slip,
-                 problem.noise.sightings, problem.noise.ranges, sightings, len(m.marker_row),
-                 ranges, len(m.ranges.row), changed)
+                 problem.noise.sightings, problem.noise.ranges,
+                 np.count_nonzero(accepted.sightings.weight), len(accepted.sightings.weight),
+                 np.count_nonzero(accepted.ranges.weight), len(accepted.ranges.weight), changed)
         if changed == 0 and _wheel_move(problem, state) < NEGLIGIBLE_MOVE:
             break
     return problem, optimum, posterior

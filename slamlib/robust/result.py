@@ -6,6 +6,7 @@ Antennas whose position the ranges do not determine are in doubt, and their cova
 
 from dataclasses import dataclass, replace
 from operator import attrgetter
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -117,6 +118,15 @@ class SlamResult:
         return self.marker[(count == 1) | doubled.any(axis=1)]
 
 
+class _Engine(NamedTuple):
+    """The engine's solution, with the fields of a GtsamSolution that a result needs."""
+
+    state: State
+    frames: np.ndarray           # (f, 3, 3)
+    landmarks: np.ndarray        # (k + a, 3, 3)
+    c: np.ndarray                # (p, p)
+
+
 def slam_result(fit: Fit, by_gtsam: GtsamSolution | None = None) -> SlamResult:
     """The SlamResult of a Fit, with the GtsamSolution of its graph or, without one, the engine's.
 
@@ -126,25 +136,18 @@ def slam_result(fit: Fit, by_gtsam: GtsamSolution | None = None) -> SlamResult:
     problem = fit.problem
     m = problem.measurements
     state, marginal, slip = posterior_moments(fit)
-    landmarks = marginal.landmarks
-    c_covariance = marginal.c
-    agreement = 0.0, 0.0
-    if by_gtsam is not None:
-        frames = _of_frames(marginal.pairs, m)
-        agreement = agreement_of(by_gtsam, state, frames, marginal.landmarks)
-        state = by_gtsam.state
-        landmarks = by_gtsam.landmarks
-        c_covariance = by_gtsam.c
+    engine = _Engine(state, _of_frames(marginal.pairs, m), marginal.landmarks, marginal.c)
+    solution = by_gtsam or engine
+    state = solution.state
     averaged = replace(problem, noise=problem.noise._replace(slip=slip))
     poses, covariances = interpolate(averaged, state, marginal.pairs)
-    if by_gtsam is not None:
-        covariances[m.frame] = se2.rotate_covariance(by_gtsam.frames, state.poses[:, 2])
+    covariances[m.frame] = se2.rotate_covariance(solution.frames, state.poses[:, 2])
 
     rejected = problem.accepted.sightings.weight == 0
     mapped = _mostly_accepted(m, rejected)
     markers = state.markers[mapped]
     markers[:, 2] = se2.wrap(markers[:, 2])
-    of_markers, of_antennas = np.split(landmarks, [len(m.marker)])
+    of_markers, of_antennas = np.split(solution.landmarks, [len(m.marker)])
     of_markers = _with_sighted_headings(m, of_markers)[mapped]
 
     _, range_residual = residuals(problem, state)
@@ -161,10 +164,11 @@ def slam_result(fit: Fit, by_gtsam: GtsamSolution | None = None) -> SlamResult:
         marker=m.marker[mapped], marker_in_world=markers,
         marker_covariance=se2.rotate_covariance(of_markers, markers[:, 2]),
         antenna=m.antenna, antenna_in_world=state.antennas, antenna_covariance=of_antennas,
-        doubts=doubts, c=state.c, c_covariance=c_covariance, noise_sigma=noise_sigma,
+        doubts=doubts, c=state.c, c_covariance=solution.c, noise_sigma=noise_sigma,
         rejected=rejected, range_weight=range_weight, range_residual=range_residual,
         correlation=tuple(memory.correlation for memory in memories),
-        turn_sigma=turn_sigma(problem), fit=fit, gtsam=by_gtsam, agreement=agreement)
+        turn_sigma=turn_sigma(problem), fit=fit, gtsam=by_gtsam,
+        agreement=_agreement(solution, engine))
 
 
 def _mostly_accepted(measurements, rejected):
@@ -190,24 +194,30 @@ def _of_frames(pairs, measurements):
     return np.concatenate([pairs[:, :3, :3], pairs[-1:, 3:6, 3:6]])
 
 
-def agreement_of(by_gtsam: GtsamSolution, state: State, frames: np.ndarray,
-                 landmarks: np.ndarray) -> tuple[float, float]:
-    """Largest difference of GTSAM's poses and markers from the engine's, in its sigmas.
+def _agreement(solution, engine):
+    """Largest difference of poses and markers of a solution from the engine's, in its sigmas.
 
-    Also the largest relative difference of their sigmas. From the engine's mean State, and
-    covariances (f, 3, 3) of frames and (k + a, 3, 3) of landmarks.
+    Also the largest relative difference of their sigmas.
     """
-    marker_count = len(state.markers)
-    found = np.concatenate([by_gtsam.state.poses, by_gtsam.state.markers])
-    engine = np.concatenate([state.poses, state.markers])
-    difference = se2.difference(se2.between(engine, found), np.zeros(3))
-    of_gtsam = np.concatenate([by_gtsam.frames, by_gtsam.landmarks[:marker_count]])
-    of_engine = np.concatenate([frames, landmarks[:marker_count]])
-    in_both = np.diagonal(of_gtsam, axis1=1, axis2=2) > 0
-    sigma = np.sqrt(np.diagonal(of_engine, axis1=1, axis2=2)[in_both])
+    variances = _variances(solution)
+    in_both = variances > 0
+    sigma = np.sqrt(_variances(engine)[in_both])
+    difference = se2.between(_places(engine), _places(solution))
+    difference[:, 2] = se2.wrap(difference[:, 2])
     off = np.abs(difference[in_both]) / sigma
-    ratio = np.abs(se2.sigmas(of_gtsam)[in_both] / sigma - 1)
+    ratio = np.abs(np.sqrt(variances[in_both]) / sigma - 1)
     return float(off.max(initial=0.0)), float(ratio.max(initial=0.0))
+
+
+def _places(solution):
+    """Poses and markers (f + k, 3) of a solution."""
+    return np.concatenate([solution.state.poses, solution.state.markers])
+
+
+def _variances(solution):
+    """Variances (f + k, 3) of poses and markers of a solution, in their own axes."""
+    markers = solution.landmarks[:len(solution.state.markers)]
+    return np.diagonal(np.concatenate([solution.frames, markers]), axis1=1, axis2=2)
 
 
 def turn_sigma(problem: Problem) -> np.ndarray:
