@@ -150,9 +150,10 @@ def test_the_graph_is_the_one_by_which_the_engine_decides(groups, kernel):
     equations = NormalEquations(problem, state)
     graph, values = solution.graph_and_values(problem, state)
     assert np.isclose(graph.error(values), equations.error, rtol=1e-9)
-    data, border, *_ = equations.sums(problem.noise)
-    n, rows = len(m.structure.diagonal), m.structure.unknowns
-    whole = np.block([[m.structure.matrix(data).toarray(), border[:n, :-1]], [border[:, :-1].T]])
+    sums = equations.sums(problem.noise)
+    H, border = m.structure.matrix(sums.H).toarray(), sums.border
+    n, rows = len(H), m.structure.unknowns
+    whole = np.block([[H, border[:n, :-1]], [border[:, :-1].T]])
     rows = np.append(rows, np.arange(n, len(whole)))
     ordering = gtsam.Ordering()
     calibration = [key for key, _ in solution.CALIBRATION_KEYS if values.exists(key)]

@@ -39,7 +39,7 @@ def test_markers_without_accepted_sightings_have_a_weak_prior_and_move_nothing_e
         accepted.sightings, weight=1.0 - np.isin(m.marker_row, [point, first, first + 1]))))
     state = odometry_state(m, "arc")
     equations, left = NormalEquations(problem, state), []
-    H = equations.structure.matrix(equations.sums(problem.noise)[0]).toarray()
+    H = equations.structure.matrix(equations.sums(problem.noise).H).toarray()
     for j in (point, first, first + 1):
         own = equations.structure.rows([len(m.frame) + j], 2 + m.oriented[j])[0]
         np.testing.assert_allclose(H[np.ix_(own, own)], np.eye(len(own)) / WEAK_SIGMA**2)
@@ -59,12 +59,12 @@ def test_selected_blocks_are_those_of_the_dense_inverse(poses):
         dataset, aruco=as_points(dataset.aruco, points)).first(poses)), Noise(2e-3, 1.5, 0.7)
     problem = released(build_problem(m, "arc"), {"range-offset"} if poses > 1 else ())
     equations = NormalEquations(problem, odometry_state(m, "arc"))
-    found, (data, border, *_) = marginal_covariances(equations, given), equations.sums(given)
-    H, active = equations.structure.matrix(data).toarray(), problem.active
+    found, sums = marginal_covariances(equations, given), equations.sums(given)
+    H, active = equations.structure.matrix(sums.H).toarray(), problem.active
     n, rows = len(H), equations.structure.rows(slice(None))
     np.testing.assert_allclose(H, H.T, rtol=1e-9, atol=1e-6)
     unit = np.r_[np.ones(n), problem.sigma[active]]
-    expected = np.linalg.inv(np.block([[H, border[:n, :-1]], [border[:, :-1].T]])) \
+    expected = np.linalg.inv(np.block([[H, sums.border[:n, :-1]], [sums.border[:, :-1].T]])) \
         * np.outer(unit, unit)
     sigma = np.sqrt(np.diag(expected))
     wheels = np.broadcast_to(np.arange(n, n + 3), (len(found.pairs), 3))

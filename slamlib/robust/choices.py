@@ -187,8 +187,8 @@ def _likelihood(fit):
     """Information L (p, p) and h (p,) about the calibration, in wide sigmas from what is stated."""
     calibration = fit.problem.measurements.calibration
     equations = NormalEquations(replace(fit.problem, sigma=calibration.wide), fit.state)
-    H, border, *_ = equations.sums(fit.problem.noise, consistent=True)
-    solution = linear_solution(equations.structure, H, border)
+    sums = equations.sums(fit.problem.noise, consistent=True)
+    solution = linear_solution(equations.structure, sums)
     u = (fit.state.c - calibration.stated) / calibration.wide
     L = np.zeros((len(u), len(u)))
     if solution is None:

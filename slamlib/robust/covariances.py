@@ -44,8 +44,9 @@ def marginal_covariances(equations, noise):
     Raises numpy.linalg.LinAlgError if the equations are singular.
     """
     problem, structure, active = equations.problem, equations.structure, equations.problem.active
-    data, border, *_ = equations.sums(noise)
-    H, n, q = structure.matrix(data), len(structure.diagonal), active.sum()
+    sums = equations.sums(noise)
+    border = sums.border
+    H, n, q = structure.matrix(sums.H), len(structure.diagonal), active.sum()
     B, D = csc_array(border[:n, :-1]), csc_array(border[n:, :-1])
     rows = structure.rows(slice(None)).ravel()
     frames, others = np.split(np.r_[rows, n:n + q], [3 * len(problem.measurements.frame)])

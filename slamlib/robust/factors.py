@@ -16,7 +16,7 @@ from slamlib.core import odometry, se2
 from slamlib.core.preintegration import preintegrate
 from slamlib.robust import calibration
 from slamlib.robust.calibration import RANGES, SIGHTINGS, WHEELS
-from slamlib.robust.measurements import square_root_information
+from slamlib.robust.measurements import Connections, square_root_information
 
 MIN_DISTANCE = 1e-9          # m, below which a range has no direction
 SMOOTHED_STEPS = 11          # encoder steps over which velocities are averaged
@@ -67,7 +67,7 @@ def odometry_error(factors, poses, wheel):
 class LinearizedFactors:
     """The m factors of one kind, linearised at a state, with d errors each."""
 
-    index: np.ndarray        # (m,) row among all of the kind, of which some may be rejected
+    connections: Connections     # with these variables, those of rejected measurements left out
     e: np.ndarray            # (m, d) whitened errors, expected minus measured
     J: np.ndarray            # (m, d, 6) whitened derivatives by the unknowns of both variables
     J_c: np.ndarray          # (m, d, u) whitened, by u active entries of c, per sigma
@@ -84,7 +84,7 @@ def linearize_odometry(problem, state, slip):
     log_determinant = -2 * float(np.sum(np.log(np.diagonal(U, axis1=1, axis2=2))))
     e, J_c = (U @ e[..., None])[..., 0], J_c[:, :, active] * problem.sigma[WHEELS][active]
     return LinearizedFactors(
-        index=np.arange(len(e)), e=e, J=U @ J, J_c=U @ J_c,
+        connections=problem.measurements.structure.odometry, e=e, J=U @ J, J_c=U @ J_c,
         columns=np.arange(active.sum())), log_determinant
 
 
@@ -229,7 +229,7 @@ def _whitened(problem, kind, rows, U, e, by_pose, by_landmark, by_c):
     J = np.zeros((*e.shape, 6))
     J[:, :, :3 + by_landmark.shape[2]] = U @ np.concatenate([by_pose, by_landmark], axis=2)
     return LinearizedFactors(
-        index=rows, e=e * np.sqrt(kept)[:, None], J=J,
+        connections=(problem.measurements.structure.sightings, problem.measurements.structure.ranges)[kind].select(rows), e=e * np.sqrt(kept)[:, None], J=J,
         J_c=U @ (by_c[:, :, active] * problem.sigma[columns][active]),
         columns=np.cumsum(problem.active)[columns][active] - 1, weight=weight * kept,
         error=float(np.sum(share * loss)))

@@ -14,8 +14,8 @@ noise factors. Each value of the noise then costs one decomposition, which gives
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from operator import attrgetter
-from typing import NamedTuple
 
+import gtsam
 import numpy as np
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
@@ -24,6 +24,7 @@ from slamlib.core import odometry, se2
 from slamlib.core.graph import GUESS_PRIOR_SIGMA
 from slamlib.core.preintegration import OdometryIncrements
 from slamlib.robust.factors import (
+    LinearizedFactors,
     linearize_measurements,
     linearize_odometry,
     preintegrate_odometry,
@@ -33,9 +34,12 @@ from slamlib.robust.measurements import (
     AcceptedMeasurements,
     Measurements,
     Noise,
+    Structure,
     accept_all,
     with_known,
 )
+
+KEPT_SLIPS = 3               # number of values for which the sums of odometry are kept
 
 
 @dataclass(frozen=True)
@@ -48,32 +52,20 @@ class State:
     c: np.ndarray            # (p,) of the calibration, in the units of its entries
 
 
-def state_from_arrays(measurements, poses, markers, antennas, c):
+def state_from_arrays(measurements: Measurements, poses: np.ndarray, markers: np.ndarray,
+                      antennas: np.ndarray, c: np.ndarray) -> State:
     """The State of poses (f, 3), markers (k, 3), antennas (a, 2) and calibration c (p,).
 
     Headings become continuous: between two frames they turn by odometry's angle, up to half a turn.
     """
-    turn, poses = np.diff(measurements.path[measurements.frame, 2]), np.array(poses, dtype=float)
+    poses = np.array(poses, dtype=float)
+    turn = np.diff(measurements.path[measurements.frame, 2])
     correction = se2.wrap(np.diff(poses[:, 2]) - turn)
     poses[:, 2] = odometry.cumulative(turn + correction, se2.wrap(poses[0, 2]))
     markers = np.array(markers, dtype=float)
     markers[~measurements.oriented, 2] = 0
     return State(poses=poses, markers=markers, antennas=np.asarray(antennas, dtype=float),
                  c=np.asarray(c, dtype=float))
-
-
-def retract(problem, state, delta):
-    """The State after a step delta (n + q,) in m and rad, and in sigmas of the q unknowns of c.
-
-    Poses and markers move in their own axes: X becomes X delta.
-    """
-    m, structure, c = problem.measurements, problem.measurements.structure, state.c.copy()
-    c[problem.active] += problem.sigma[problem.active] * delta[len(structure.diagonal):]
-    poses, markers, antennas = np.split(
-        delta[structure.rows(slice(None))], np.cumsum([len(m.frame), len(m.marker)]))
-    return state_from_arrays(
-        m, se2.compose(state.poses, poses), se2.compose(state.markers, markers),
-        state.antennas + antennas[:, :2], c)
 
 
 @dataclass(frozen=True)
@@ -86,17 +78,24 @@ class Problem:
     noise: Noise
     sigma: np.ndarray        # (p,) of the prior of the calibration, 0 of what is known
     released: frozenset = frozenset()    # groups of the calibration beyond their stated sigmas
-    active = property(lambda self: self.sigma > 0)      # (p,) bool, entries among the q unknowns
+
+    @property
+    def active(self) -> np.ndarray:
+        """(p,) bool, entries of the calibration among the q unknowns."""
+        return self.sigma > 0
 
 
-def build_problem(measurements, model, noise=None, wheel=None):
+def build_problem(measurements: Measurements, model: str, noise: Noise | None = None,
+                  wheel: np.ndarray | None = None) -> Problem:
     """The Problem of all Measurements with weight 1, without kernels, and of a Noise.
 
     Without a Noise it is the typical one. Parameters that the Vehicle gives replace its own.
     Odometry is of the `model` "arc" or "euler", linearised at `wheel` (3,) m, None for the stated
     one. The calibration is as stated, but for the delay of sightings that are late.
     """
-    late = frozenset({"time-offset"} if measurements.jumps.lag else ())
+    late = frozenset()
+    if measurements.jumps.lag:
+        late = frozenset({"time-offset"})
     return Problem(
         measurements=measurements, odometry=preintegrate_odometry(measurements, model, wheel),
         accepted=accept_all(measurements),
@@ -104,12 +103,36 @@ def build_problem(measurements, model, noise=None, wheel=None):
         sigma=measurements.calibration.sigma_without(late), released=late)
 
 
-class Group(NamedTuple):
-    """Sums over a group of factors of n unknowns and q entries of the calibration."""
+def retract(problem: Problem, state: State, delta: np.ndarray) -> State:
+    """The State after a step delta (n + q,) in m and rad, and in sigmas of the q unknowns of c.
 
-    H: np.ndarray            # data of `Structure.matrix`; of the priors the diagonal (n,)
+    Poses and markers move in their own axes: X becomes X delta.
+    """
+    m = problem.measurements
+    by_variable = delta[m.structure.rows(slice(None))]
+    of_frames, of_markers, of_antennas = np.split(
+        by_variable, np.cumsum([len(m.frame), len(m.marker)]))
+    c = state.c.copy()
+    c[problem.active] += problem.sigma[problem.active] * delta[by_variable.size:]
+    return state_from_arrays(
+        m, se2.compose(state.poses, of_frames), se2.compose(state.markers, of_markers),
+        state.antennas + of_antennas[:, :2], c)
+
+
+@dataclass(frozen=True)
+class Sums:
+    """Sums over factors of n unknowns and q entries of the calibration."""
+
+    H: np.ndarray            # data of `Structure.matrix`
     border: np.ndarray       # (n + q, q + 1), [[B, g], [D, g_c]]
     squared: float           # sum of squared whitened errors
+    log_determinant: float = 0.0     # sum log|Q| of the noise Q of odometry
+
+    def plus(self, other: "Sums", weight: float = 1.0) -> "Sums":
+        """The Sums with those of other factors, without odometry, of this weight."""
+        return Sums(H=self.H + weight * other.H, border=self.border + weight * other.border,
+                    squared=self.squared + weight * other.squared,
+                    log_determinant=self.log_determinant)
 
 
 @dataclass(frozen=True)
@@ -132,128 +155,153 @@ class NormalEquations:
     structure = property(attrgetter("problem.measurements.structure"))      # of H
 
     @cached_property
-    def error(self):
+    def error(self) -> float:
         """Half the sum of squared whitened errors, kernels applied."""
-        odometry, _ = self._odometry(self.problem.noise.slip)
-        return float(odometry.squared + self.priors.squared) / 2 \
-            + sum(kind.error for kind in self.linearized)
+        odometry = self._odometry(self.problem.noise.slip)
+        sightings, ranges = self.linearized
+        return (odometry.squared + self.priors.squared) / 2 + (sightings.error + ranges.error)
 
     @cached_property
-    def linearized(self):
+    def linearized(self) -> tuple[LinearizedFactors, LinearizedFactors]:
         """The LinearizedFactors of sightings and of ranges."""
         return linearize_measurements(self.problem, self.state)
 
-    def step(self):
+    def step(self) -> np.ndarray | None:
         """The Gauss-Newton step delta (n + q,), or None where H is singular to rounding."""
-        H, border, *_ = self.sums(self.problem.noise)
-        solution = linear_solution(self.structure, H, border)
-        return solution.delta if solution is not None and solution.decrease >= 0 else None
+        solution = linear_solution(self.structure, self.sums(self.problem.noise))
+        if solution is None or not solution.decrease >= 0:
+            return None
+        return solution.delta
 
-    def sums(self, noise, consistent=False):
-        """Data of H, border, squared error at the state, and sum log|Q| of the odometry noise Q.
+    def sums(self, noise: Noise, consistent: bool = False) -> Sums:
+        """The Sums over all factors for a Noise.
 
         If `consistent`, measurements count over the `consistency_factor` of their robust kernel.
         """
-        odometry, log_determinant = self._odometry(noise.slip)
-        total = odometry.H.copy(), odometry.border + self.priors.border, \
-            odometry.squared + self.priors.squared
-        total[0][self.structure.diagonal] += self.priors.H
-        sizes = 2 + self.problem.measurements.oriented.any(), 1
-        shares = [(given / wanted)**2 / (consistency_factor(kind.kernel, size) if consistent else 1)
-                  for kind, size, given, wanted in zip(
-                      self.problem.accepted, sizes, self.problem.noise[1:], noise[1:])]
-        for group, share in zip(self._measurement_groups, shares):
-            if group is not None:
-                total = [each + share * part for each, part in zip(total, group)]
-        return *total, log_determinant
+        given = self.problem.noise
+        accepted = self.problem.accepted
+        of_sightings = (given.sightings / noise.sightings)**2
+        of_ranges = (given.ranges / noise.ranges)**2
+        if consistent:
+            size = 2 + self.problem.measurements.oriented.any()
+            of_sightings /= consistency_factor(accepted.sightings.kernel, size)
+            of_ranges /= consistency_factor(accepted.ranges.kernel)
+        sightings, ranges = self._measured
+        total = self._odometry(noise.slip).plus(self.priors)
+        return total.plus(sightings, of_sightings).plus(ranges, of_ranges)
 
-    def counts(self):
+    def counts(self) -> tuple[float, float]:
         """Numbers of accepted errors of sightings and of ranges."""
         sightings, ranges = self.linearized
-        size = 2 + self.problem.measurements.as_pose[sightings.index]
+        counted = self.problem.accepted.sightings.weight > 0
+        size = 2 + self.problem.measurements.as_pose[counted]
         return np.sum(size * sightings.weight), np.sum(ranges.weight)
 
     @cached_property
-    def priors(self):
-        """The Group of the priors, whose H and D are diagonal."""
-        problem, m, state = self.problem, self.problem.measurements, self.state
-        f, active, n = len(m.frame), problem.active, len(self.structure.diagonal)
-        weak = np.bincount(m.marker_row, problem.accepted.sightings.weight, len(m.marker)) == 0
-        parts = [([0], se2.log(state.poses[:1]), m.origin_sigma),
-                 (slice(f + len(m.marker), None), state.antennas - m.guess, GUESS_PRIOR_SIGMA),
-                 (f + np.flatnonzero(weak), state.markers[weak], WEAK_SIGMA)]
-        H, e = np.zeros((2, n))
-        for variables, difference, sigma in parts:
-            rows = self.structure.rows(variables, difference.shape[1])
-            H[rows], e[rows] = np.broadcast_to(sigma, difference.shape)**-2.0, difference
-        H[self.structure.rows(~self.structure.is_pose)[:, 2]] = 1       # what points do not have
-        e_c = ((state.c - m.calibration.stated)[active] / problem.sigma[active])
+    def priors(self) -> Sums:
+        """The Sums of the priors, whose H and D are diagonal."""
+        problem = self.problem
+        m = problem.measurements
+        structure = self.structure
+        n = len(structure.diagonal)
+        precision = np.zeros(n)
+        e = np.zeros(n)
+
+        def add(variables, difference, sigma):
+            rows = structure.rows(variables, difference.shape[1])
+            precision[rows] = sigma**-2.0
+            e[rows] = difference
+
+        count = np.bincount(m.marker_row, problem.accepted.sightings.weight, len(m.marker))
+        weak = np.flatnonzero(count == 0)
+        antenna = np.arange(len(m.frame) + len(m.marker), len(structure.is_pose))
+        add([0], se2.log(self.state.poses[:1]), m.origin_sigma)
+        add(antenna, self.state.antennas - m.guess, GUESS_PRIOR_SIGMA)
+        add(len(m.frame) + weak, self.state.markers[weak], WEAK_SIGMA)
+        precision[structure.rows(~structure.is_pose)[:, 2]] = 1      # what points do not have
+        active = problem.active
+        e_c = (self.state.c - m.calibration.stated)[active] / problem.sigma[active]
         border = np.zeros((n + len(e_c), len(e_c) + 1))
-        border[:n, -1], border[n:, -1] = H * e, e_c
+        border[:n, -1] = precision * e
+        border[n:, -1] = e_c
         border[n:, :-1] = np.eye(len(e_c))
-        return Group(H, border, float(np.sum(H * e**2) + e_c @ e_c))
+        H = np.zeros(structure.places.nnz)
+        H[structure.diagonal] = precision
+        return Sums(H, border, float(np.sum(precision * e**2) + e_c @ e_c))
 
     @cached_property
-    def _measurement_groups(self):
-        """The Group of each kind of `linearized`, None where there are no factors."""
-        return [self._group(kind, factors) if len(factors.e) else None
-                for kind, factors in enumerate(self.linearized, start=1)]
+    def _measured(self):
+        """The Sums of sightings and of ranges."""
+        return [self._summed(factors) for factors in self.linearized]
 
-    @cached_property
-    def _odometry(self):
-        """Function from a slip to the Group of the odometry and sum log|Q|."""
-        def odometry(slip):
+    def _odometry(self, slip):
+        """The Sums of odometry with a slip in sqrt(m)."""
+        recent = self._recent_odometry
+        if slip not in recent:
+            if len(recent) == KEPT_SLIPS:
+                del recent[next(iter(recent))]                         # the oldest
             factors, log_determinant = linearize_odometry(self.problem, self.state, slip)
-            return self._group(0, factors), log_determinant
+            recent[slip] = self._summed(factors, log_determinant)
+        return recent[slip]
 
-        return lru_cache(maxsize=3)(odometry)
+    @cached_property
+    def _recent_odometry(self):
+        """The last Sums of odometry by their slip."""
+        return {}
 
-    def _group(self, kind, factors):
-        """The Group of LinearizedFactors of the kind with this number in `structure.factors`."""
-        structure, q = self.structure, self.problem.active.sum()
-        n, e, J, J_c = len(structure.diagonal), factors.e, factors.J, factors.J_c
-        J_t, last = np.swapaxes(J, 1, 2), np.concatenate([J_c, e[..., None]], axis=2)
-        squares = (J_t @ J).reshape(-1, 2, 3, 2, 3).swapaxes(2, 3).reshape(-1, 9)
-        H = _summed(structure.blocks[kind][factors.index], squares, structure.places.nnz // 9)
-        border, columns = np.zeros((n + q, q + 1)), np.r_[factors.columns, q]
-        border[:n, columns] = _summed(
-            structure.position[structure.factors[kind][factors.index]],
-            (J_t @ last).reshape(-1, 3 * len(columns)), n // 3).reshape(n, -1)
-        border[n + columns[:-1, None], columns] = np.tensordot(J_c, last, ([0, 1], [0, 1]))
-        return Group(H.ravel(), border, float(np.sum(e**2)))
+    def _summed(self, factors, log_determinant=0.0):
+        """The Sums of LinearizedFactors."""
+        structure = self.structure
+        n = len(structure.diagonal)
+        q = self.problem.active.sum()
+        position = structure.position[factors.connections.variables]
+        J_t = factors.J.mT
+        H_blocks = (J_t @ factors.J).reshape(-1, 2, 3, 2, 3).swapaxes(2, 3).reshape(-1, 9)
+        H = _summed_by(factors.connections.blocks, H_blocks, structure.places.nnz // 9)
+        last = np.concatenate([factors.J_c, factors.e[..., None]], axis=2)
+        columns = np.append(factors.columns, q)
+        by_variable = (J_t @ last).reshape(-1, 3 * len(columns))
+        border = np.zeros((n + q, q + 1))
+        border[:n, columns] = _summed_by(position, by_variable, n // 3).reshape(n, -1)
+        border[n + factors.columns[:, None], columns] = np.tensordot(
+            factors.J_c, last, ([0, 1], [0, 1]))
+        return Sums(H.ravel(), border, float(np.sum(factors.e**2)), log_determinant)
 
 
-def _summed(number, values, size):
+def _summed_by(number, values, size):
     """(size, w) sums of the rows of values (m j, w) with each `number` (m, j)."""
     return csc_array((np.ones(number.size), number.ravel(), np.arange(number.size + 1)),
                      (size, number.size)) @ values
 
 
-def linear_solution(structure, H, border):
-    """The LinearSolution by data of H and `border`, None where they are singular to rounding."""
+def linear_solution(structure: Structure, sums: Sums) -> LinearSolution | None:
+    """The LinearSolution by Sums over all factors, None where they are singular to rounding."""
     n = len(structure.diagonal)
     try:                                                 # H is ordered for elimination
-        lu = splu(structure.matrix(H), permc_spec="NATURAL", diag_pivot_thresh=0.0, relax=1,
+        lu = splu(structure.matrix(sums.H), permc_spec="NATURAL", diag_pivot_thresh=0.0, relax=1,
                   panel_size=1, options={"SymmetricMode": True})
     except RuntimeError:
         return None
     pivots = lu.U.diagonal()
     if not (pivots > 0).all():                           # H is not positive definite
         return None
-    solved = lu.solve(border[:n])
-    reduced = border[n:] - border[:n, :-1].T @ solved
-    S, gradient = (reduced[:, :-1] + reduced[:, :-1].T) / 2, reduced[:, -1]
+    B_g = sums.border[:n]
+    solved = lu.solve(B_g)                               # H^-1 [B, g]
+    reduced = sums.border[n:] - B_g[:, :-1].T @ solved
+    S = (reduced[:, :-1] + reduced[:, :-1].T) / 2
+    gradient = reduced[:, -1]
     sign, log_determinant = np.linalg.slogdet(S)
     if not sign > 0 or (np.diag(S) <= 0).any():
         return None
-    c = -np.linalg.solve(S, gradient)
-    delta = np.concatenate([-solved[:, -1] - solved[:, :-1] @ c, c])
-    return LinearSolution(delta=delta, S=S, gradient=gradient,
-                          log_determinant=log_determinant + np.sum(np.log(pivots)),
-                          decrease=-float(border[:, -1] @ delta) / 2)
+    delta_c = -np.linalg.solve(S, gradient)
+    delta = np.append(-solved[:, -1] - solved[:, :-1] @ delta_c, delta_c)
+    return LinearSolution(
+        delta=delta, S=S, gradient=gradient,
+        log_determinant=log_determinant + np.sum(np.log(pivots)),
+        decrease=-float(sums.border[:, -1] @ delta) / 2)
 
 
-def laplace_approximation(equations, noise):
+def laplace_approximation(equations: NormalEquations, noise: Noise) -> tuple[np.ndarray, float]:
     """Solution delta (n + q,) of NormalEquations for a Noise, and log evidence up to a constant.
 
     With the whitened errors e at the solution, the noise factors l_s and l_r of S errors of
@@ -265,18 +313,21 @@ def laplace_approximation(equations, noise):
     weights: only problems on the same accepted measurements can be compared. The log evidence is
     minus infinity where the equations are singular to rounding.
     """
-    H, border, squared, log_determinant = equations.sums(noise, consistent=True)
-    solution = linear_solution(equations.structure, H, border)
-    sightings, ranges = equations.counts()
+    sums = equations.sums(noise, consistent=True)
+    solution = linear_solution(equations.structure, sums)
     if solution is None:
-        return np.full(len(border), np.nan), -np.inf
-    return solution.delta, -squared / 2 + solution.decrease - log_determinant / 2 \
-        - solution.log_determinant / 2 \
-        - sightings * np.log(noise.sightings) - ranges * np.log(noise.ranges)
+        return np.full(len(sums.border), np.nan), -np.inf
+    S, R = equations.counts()
+    log_evidence = solution.decrease - sums.squared / 2      # the squared error at the solution
+    log_evidence -= sums.log_determinant / 2
+    log_evidence -= solution.log_determinant / 2
+    log_evidence -= S * np.log(noise.sightings)
+    log_evidence -= R * np.log(noise.ranges)
+    return solution.delta, log_evidence
 
 
 @lru_cache(maxsize=8)
-def consistency_factor(kernel, size=1):
+def consistency_factor(kernel: gtsam.noiseModel.mEstimator.Base | None, size: int = 1) -> float:
     """Mean of the squares of standard normal residuals of `size` components, weighted by a kernel.
 
     The kernel weighs a residual by its norm, or by its signed value if `size` is 1. It removes part
@@ -286,5 +337,6 @@ def consistency_factor(kernel, size=1):
     if kernel is None:
         return 1.0
     r = np.linspace(-6 if size == 1 else 0, 6, 241)
-    density = r**(size - 1) * np.exp(-r**2 / 2) * np.array([kernel.weight(x) for x in r])
+    weight = np.array([kernel.weight(x) for x in r])
+    density = r**(size - 1) * np.exp(-r**2 / 2) * weight
     return float(np.sum(r**2 * density) / np.sum(density)) / size

@@ -10,6 +10,7 @@ the third unknown of a point has no derivatives. The Structure of H is the same 
 kernels and values of the noise.
 """
 
+from collections.abc import Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -30,6 +31,7 @@ from slamlib.core.sightings import (
     Sightings,
     sightings_by_frame,
 )
+from slamlib.core.vehicle import Vehicle
 from slamlib.robust.calibration import Calibration, stated_calibration
 from slamlib.robust.jumps import NO_JUMPS, Jumps
 
@@ -47,16 +49,30 @@ class Noise(NamedTuple):
     ranges: float = 1.0            # factor on the sigmas in UwbReading.txt
 
 
-def with_known(noise, vehicle):
+def with_known(noise: Noise, vehicle: Vehicle) -> Noise:
     """The Noise with the parameters that a Vehicle gives; the slip is at least 1e-5 sqrt(m)."""
-    given = [getattr(vehicle, key) for key in NOISE_KEYS]
-    slip, *factors = (own if known is None else known for own, known in zip(noise, given))
-    return Noise(max(slip, SLIP_BOUNDS[0]), *factors)
+    parameters = []
+    for own, key in zip(noise, NOISE_KEYS):
+        known = getattr(vehicle, key)
+        parameters.append(own if known is None else known)
+    parameters[0] = max(parameters[0], SLIP_BOUNDS[0])
+    return Noise._make(parameters)
 
 
-def square_root_information(covariance):
+def square_root_information(covariance: np.ndarray) -> np.ndarray:
     """Upper triangular U (..., d, d) with U^T U = C^-1, from covariances C: U e is whitened."""
-    return np.swapaxes(np.linalg.cholesky(np.linalg.inv(covariance)), -1, -2)
+    return np.linalg.cholesky(np.linalg.inv(covariance)).mT
+
+
+class Connections(NamedTuple):
+    """The variables of the m factors of a kind, and the blocks of H to which a factor adds."""
+
+    variables: np.ndarray    # (m, 2) numbers of i and j
+    blocks: np.ndarray       # (m, 4) numbers of the blocks (i, i), (i, j), (j, i), (j, j)
+
+    def select(self, rows: np.ndarray) -> "Connections":
+        """Those of some rows."""
+        return Connections(self.variables[rows], self.blocks[rows])
 
 
 @dataclass(frozen=True)
@@ -66,20 +82,21 @@ class Structure:
     is_pose: np.ndarray      # (v,) bool, the others are points
     position: np.ndarray     # (v,) of every variable in the elimination
     places: sparse.csc_array     # the matrix with the place of each entry in the data (9 b,)
-    factors: list            # of (m, 2) variables of each kind of factor
-    blocks: list             # of (m, 4) numbers of their blocks
+    odometry: Connections
+    sightings: Connections
+    ranges: Connections
     diagonal: np.ndarray     # (n,) places of the diagonal in the data of blocks
 
-    def rows(self, variables, width=3):
+    def rows(self, variables: np.ndarray | slice, width: int = 3) -> np.ndarray:
         """Rows (m, width) of the unknowns of `variables` (m,)."""
         return 3 * self.position[variables][:, None] + np.arange(width)
 
     @property
-    def unknowns(self):
+    def unknowns(self) -> np.ndarray:
         """Rows of the unknowns of all variables, in the order of their numbers."""
         return self.rows(slice(None))[np.arange(3) < 2 + self.is_pose[:, None]]
 
-    def matrix(self, data):
+    def matrix(self, data: np.ndarray) -> sparse.csc_array:
         """The sparse matrix (n, n), which is symmetric, with the data (9 b,) of its blocks."""
         matrix = copy(self.places)                       # its indices are checked only once
         matrix.data = data[matrix.data]
@@ -112,80 +129,132 @@ class Measurements:
     guess: np.ndarray        # (a, 2) m, their guessed positions
     calibration: Calibration     # what the Vehicle states of what measurements share
     jumps: Jumps             # where odometry contradicts the markers
-    as_pose = property(lambda self: self.oriented[self.marker_row])    # (s,) bool, with a heading
 
     @property
-    def origin_sigma(self):
+    def as_pose(self) -> np.ndarray:
+        """(s,) bool, sightings of markers with a heading."""
+        return self.oriented[self.marker_row]
+
+    @property
+    def origin_sigma(self) -> np.ndarray:
         """(3,) standard deviations of pose 1: m, m, rad."""
         return np.array([ORIGIN_SIGMA, ORIGIN_SIGMA, self.dataset.vehicle.sigma_heading])
 
     @property
-    def learned(self):
+    def learned(self) -> np.ndarray:
         """(3,) bool, noise parameters that are learned: unknown ones with measurements."""
-        counts = 1, len(self.marker_row), len(self.ranges.row)
-        return np.array([getattr(self.dataset.vehicle, key) is None and count > 0
-                         for key, count in zip(NOISE_KEYS, counts)])
+        unknown = [getattr(self.dataset.vehicle, key) is None for key in NOISE_KEYS]
+        measured = [True, len(self.marker_row) > 0, len(self.ranges.row) > 0]
+        return np.logical_and(unknown, measured)
 
     @cached_property
-    def sighting_roots(self):
+    def sighting_roots(self) -> np.ndarray:
         """Square root informations (s, 3, 3) of the sightings; of points (2, 2) of them, else 0.
 
         `ArucoReading.txt` gives the covariance C in the axes of the vehicle. The error of a marker
         with a heading lives in the axes of the measured pose z: R(heading)^T C R(heading).
         """
-        s, points = self.sightings, ~self.as_pose
+        s = self.sightings
         U = square_root_information(se2.rotate_covariance(s.C, -s.z[:, 2]))
+        points = ~self.as_pose
         U[points] = 0
         U[points, :2, :2] = square_root_information(s.C[points, :2, :2])
         return U
 
     @cached_property
-    def structure(self):
-        """The Structure of the information matrix, eliminated in the order of minimum degree."""
-        f, k, s, r = len(self.frame), len(self.marker), self.sightings, self.ranges
-        is_pose = np.r_[np.ones(f, bool), self.oriented, np.zeros(len(self.antenna), bool)]
-        factors = [np.arange(f - 1)[:, None] + [0, 1], np.stack([s.row, f + self.marker_row], -1),
-                   np.stack([r.row, f + k + r.antenna], -1)]
-        count, ends = len(is_pose), np.cumsum([len(is_pose), *(4 * len(each) for each in factors)])
-        row, column = np.concatenate([np.repeat(np.arange(count), 2).reshape(-1, 2), *(
-            each[:, [[0, 0], [0, 1], [1, 0], [1, 1]]].reshape(-1, 2) for each in factors)]).T
-        neighbours = sparse.csc_array((np.where(row == column, count, 0.5), (row, column)))
-        position = splu(neighbours, permc_spec="MMD_AT_PLUS_A").perm_c
-        block, number = np.unique(position[row] * count + position[column], return_inverse=True)
-        by_rows = sparse.bsr_array((
-            np.arange(9 * len(block)).reshape(-1, 3, 3), block % count,
-            np.searchsorted(block, count * np.arange(count + 1)))).tocsr()
-        places = sparse.csc_array((by_rows.data, by_rows.indices, by_rows.indptr), by_rows.shape)
-        return Structure(
-            is_pose=is_pose, position=position, places=places, diagonal=places.diagonal(),
-            factors=factors, blocks=[each.reshape(-1, 4) for each in np.split(number, ends)[1:-1]])
+    def structure(self) -> Structure:
+        """The Structure of the information matrix."""
+        s = self.sightings
+        r = self.ranges
+        frame = np.arange(len(self.frame))
+        first_marker = len(frame)
+        first_antenna = first_marker + len(self.marker)
+        frames_are_poses = np.ones(len(frame), bool)
+        antennas_are_poses = np.zeros(len(self.antenna), bool)
+        return _structure(
+            is_pose=np.concatenate([frames_are_poses, self.oriented, antennas_are_poses]),
+            odometry=np.stack([frame[:-1], frame[1:]], axis=1),
+            sightings=np.stack([s.row, first_marker + self.marker_row], axis=1),
+            ranges=np.stack([r.row, first_antenna + r.antenna], axis=1))
 
 
-def measure(dataset, extra_poses=(), jumps=NO_JUMPS):
+def _structure(is_pose, odometry, sightings, ranges):
+    """The Structure of v variables, of which `is_pose` (v,), and factors of pairs (m, 2) of them.
+
+    The information matrix has a block for each pair and, for the priors, one for each variable.
+    """
+    count = len(is_pose)
+    variable = np.arange(count)
+    itself = np.stack([variable, variable], axis=1)
+    pairs = np.concatenate([itself, odometry, sightings, ranges])
+    position = _minimum_degree(pairs)
+
+    def in_matrix(pairs):
+        """Numbers (m, 4) of the blocks of pairs (m, 2) among all blocks, row after row."""
+        at = position[pairs]
+        return count * at[:, [0, 0, 1, 1]] + at[:, [0, 1, 0, 1]]
+
+    block = np.unique(in_matrix(pairs))
+
+    def connections(pairs):
+        return Connections(pairs, np.searchsorted(block, in_matrix(pairs)))
+
+    data = np.arange(9 * len(block)).reshape(-1, 3, 3)
+    row_starts = np.searchsorted(block, count * np.arange(count + 1))
+    by_rows = sparse.bsr_array((data, block % count, row_starts)).tocsr()
+    places = by_rows.T                                   # by columns; the matrix is symmetric
+    return Structure(
+        is_pose=is_pose, position=position, places=places, diagonal=places.diagonal(),
+        odometry=connections(odometry), sightings=connections(sightings),
+        ranges=connections(ranges))
+
+
+def _minimum_degree(pairs):
+    """Position (v,) of each variable in an elimination by minimum degree, by their pairs (m, 2)."""
+    factor = np.repeat(np.arange(len(pairs)), 2)
+    J = sparse.csc_array((np.ones(pairs.size), (factor, pairs.ravel())))
+    information = (J.T @ J).tocsc()                      # only where it is not 0 counts
+    return splu(information, permc_spec="MMD_AT_PLUS_A").perm_c
+
+
+NO_RANGES = UwbReadings(
+    pose=np.zeros(0, int), antenna=np.zeros(0, int), range=np.zeros(0), sigma=np.zeros(0))
+
+
+def measure(dataset: Dataset, extra_poses: Sequence[int] = (),
+            jumps: Jumps = NO_JUMPS) -> Measurements:
     """The Measurements of a Dataset.
 
     `extra_poses`, encoder poses from 0, are frames without a measurement. `jumps` are those of
     odometry.
     """
-    uwb = dataset.uwb or UwbReadings(*np.zeros((2, 0), int), *np.zeros((2, 0)))
-    extra = np.asarray(extra_poses, dtype=int)
-    sightings = sightings_by_frame(
-        dataset.aruco, np.concatenate([[0, len(dataset.ticks) - 1], extra, uwb.pose]))
+    uwb = dataset.uwb or NO_RANGES
+    ends = [0, len(dataset.ticks) - 1]
+    sightings = sightings_by_frame(dataset.aruco, np.concatenate([ends, extra_poses, uwb.pose]))
     marker, marker_row = np.unique(sightings.marker, return_inverse=True)
     has_heading = sightings.C[:, 2, 2] < MAX_HEADING_SIGMA**2
-    antenna, guess = np.unique(uwb.antenna), dataset.antenna_guess
+    antenna = np.unique(uwb.antenna)
+    guess = np.zeros((0, 2))
+    if len(antenna):
+        guesses = dataset.antenna_guess
+        guess = guesses.position[np.searchsorted(guesses.antenna, antenna)]
     ranges = Ranges(
         row=np.searchsorted(sightings.frame, uwb.pose),
-        antenna=np.searchsorted(antenna, uwb.antenna), distance=uwb.range,
+        antenna=np.searchsorted(antenna, uwb.antenna),
+        distance=uwb.range,
         sigma=np.maximum(uwb.sigma, MIN_MEASUREMENT_SIGMA))
     return Measurements(
-        dataset=dataset, frame=sightings.frame,
+        dataset=dataset,
+        frame=sightings.frame,
         path=odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc"),
-        sightings=sightings, marker_row=marker_row, marker=marker,
+        sightings=sightings,
+        marker_row=marker_row,
+        marker=marker,
         oriented=np.bincount(marker_row, has_heading, len(marker)) > 0,
-        ranges=ranges, antenna=antenna,
-        guess=guess.position[np.searchsorted(guess.antenna, antenna)] if len(antenna)
-        else np.zeros((0, 2)), calibration=stated_calibration(dataset.vehicle, antenna),
+        ranges=ranges,
+        antenna=antenna,
+        guess=guess,
+        calibration=stated_calibration(dataset.vehicle, antenna),
         jumps=jumps)
 
 
@@ -198,10 +267,11 @@ class Accepted:
     kernel: gtsam.noiseModel.mEstimator.Base | None = None      # None: quadratic
     bias: float = 0.0        # sigmas, of the kernel (`fit.ONE_SIDED`)
 
-    def kept(self, residual):
+    def kept(self, residual: np.ndarray) -> np.ndarray:
         """(m,) weights, including the kernel's, by signed or absolute whitened residuals (m,)."""
-        return self.weight * ([self.kernel.weight(x) for x in residual - self.bias]
-                              if self.kernel else 1.0)
+        if self.kernel is None:
+            return self.weight
+        return self.weight * [self.kernel.weight(x) for x in residual - self.bias]
 
 
 class AcceptedMeasurements(NamedTuple):
@@ -209,15 +279,24 @@ class AcceptedMeasurements(NamedTuple):
 
     sightings: Accepted
     ranges: Accepted
-    share = property(lambda self: np.concatenate([kind.share for kind in self]))      # (s + r,)
 
-    def with_shares(self, shares):
+    @property
+    def share(self) -> np.ndarray:
+        """(s + r,) shares of the sightings, then of the ranges."""
+        return np.concatenate([self.sightings.share, self.ranges.share])
+
+    def with_shares(self, shares: Iterable[np.ndarray]) -> "AcceptedMeasurements":
         """The same with other shares, (s,) of the sightings and (r,) of the ranges."""
-        return AcceptedMeasurements(*(
-            replace(accepted, share=share) for accepted, share in zip(self, shares)))
+        of_sightings, of_ranges = shares
+        return AcceptedMeasurements(
+            replace(self.sightings, share=of_sightings), replace(self.ranges, share=of_ranges))
 
 
-def accept_all(measurements, kernel=None):
+def accept_all(measurements: Measurements,
+               kernel: gtsam.noiseModel.mEstimator.Base | None = None) -> AcceptedMeasurements:
     """The AcceptedMeasurements that count all of Measurements in full, by one kernel or none."""
-    return AcceptedMeasurements(*(Accepted(*np.ones((2, len(kind.row))), kernel) for kind in (
-        measurements.sightings, measurements.ranges)))
+    def all_of(kind):
+        full = np.ones(len(kind.row))
+        return Accepted(weight=full, share=full, kernel=kernel)
+
+    return AcceptedMeasurements(all_of(measurements.sightings), all_of(measurements.ranges))

@@ -77,14 +77,14 @@ def gtsam_step(problem: Problem, equations: NormalEquations) -> np.ndarray:
 
 def linearize(problem: Problem, equations: NormalEquations) -> gtsam.GaussianFactorGraph:
     """The gtsam.GaussianFactorGraph of NormalEquations; keys number the variables, c is last."""
-    graph, structure = gtsam.GaussianFactorGraph(), equations.structure
-    q, calibration = problem.active.sum(), len(structure.is_pose)
-    width = 2 + structure.is_pose
+    graph, is_pose = gtsam.GaussianFactorGraph(), equations.structure.is_pose
+    q, calibration = problem.active.sum(), len(is_pose)
+    width = 2 + is_pose
     odometry, _ = linearize_odometry(problem, equations.state, problem.noise.slip)
-    for pairs, factors in zip(structure.factors, (odometry, *equations.linearized)):
+    for factors in (odometry, *equations.linearized):
         by_c = np.zeros((*factors.e.shape, q))
         by_c[:, :, factors.columns] = factors.J_c
-        for k, (i, j) in enumerate(pairs[factors.index].tolist()):
+        for k, (i, j) in enumerate(factors.connections.variables.tolist()):
             J = factors.J[k]
             terms = [i, J[:, :width[i]], j, J[:, 3:3 + width[j]]]
             if q:
@@ -98,7 +98,7 @@ def add_priors(graph: gtsam.GaussianFactorGraph, equations: NormalEquations, wid
                q: int):
     """Add the priors of the variables, each of this width (v,), and of q unknowns of c."""
     structure, priors = equations.structure, equations.priors
-    root = np.sqrt(np.append(priors.H, np.ones(q)))
+    root = np.sqrt(np.append(priors.H[structure.diagonal], np.ones(q)))
     e = priors.border[:, -1] / np.maximum(root, 1 / WEAK_SIGMA)
     first = structure.rows(slice(None))[:, 0]
     for variable, (start, size) in enumerate(zip(first, width)):
