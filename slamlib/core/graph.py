@@ -22,8 +22,9 @@ import numpy as np
 from gtsam.symbol_shorthand import A, L, P, W, X
 
 from slamlib.core import odometry, se2
+from slamlib.core.errors import require
 from slamlib.core.increments import TYPICAL_SLIP
-from slamlib.core.kernels import ONE_SIDED, kernel_of
+from slamlib.core.kernels import KERNELS, ONE_SIDED, kernel_of
 from slamlib.core.preintegration import OdometryIncrements, preintegrate
 from slamlib.core.records import AntennaGuess, ArucoReadings, Dataset, UwbReadings
 from slamlib.core.sightings import MAX_HEADING_SIGMA, consensus
@@ -51,8 +52,18 @@ class Decisions:
     range_kernel: str
 
 
+def require_rows(dataset: Dataset, poses: np.ndarray, source: str):
+    """Raise DatasetError, which names the source, unless poses are rows of a Dataset's ticks."""
+    count = len(dataset.ticks)
+    for pose in poses:
+        is_whole = isinstance(pose, int | np.integer) and not isinstance(pose, bool)
+        require(is_whole and 0 <= pose < count, source, f"rows from 0 to {count - 1} for poses",
+                pose)
+
+
 def frames_of(dataset: Dataset, extra: np.ndarray = ()) -> np.ndarray:
     """Encoder poses (f,) that are variables: the first, the last, with a measurement, `extra`."""
+    require_rows(dataset, extra, "count_everything")
     frames = [0, len(dataset.ticks) - 1]
     for readings in (dataset.aruco, dataset.uwb):
         if readings is not None:
@@ -65,10 +76,15 @@ def count_everything(dataset: Dataset, kernel: str = "Cauchy", slip: float = TYP
     """The Decisions by which all measurements of a Dataset count as its files state them.
 
     `kernel` is a name in `kernels.KERNELS`, of sightings and ranges, `slip` is in sqrt(m), and
-    `extra` are further encoder poses that are variables.
+    `extra` are further encoder poses that are variables. Of the calibration, camera, size of the
+    markers, offset and scale of the ranges are as stated; the tag is at the vehicle's origin.
+    Raises DatasetError for another kernel, slip or pose.
     """
+    known = ", ".join(KERNELS)
+    require(kernel in KERNELS, "count_everything", f"one of {known} for kernel", kernel)
+    require(0 < slip < np.inf, "count_everything", "a slip above 0", slip)
     sightings = dataset.sightings
-    ranges = dataset.uwb
+    ranges = dataset.ranges
     return Decisions(
         odometry=preintegrate(dataset, frames_of(dataset, extra)),
         slip=slip,
@@ -116,6 +132,8 @@ def add_antenna_priors(graph: gtsam.NonlinearFactorGraph, guess: AntennaGuess,
 
 def guessed(guess: AntennaGuess, antennas: np.ndarray) -> dict[int, np.ndarray]:
     """The guessed position (2,) in m of each of these antennas, by the index of its symbol."""
+    missing = np.setdiff1d(antennas, [] if guess is None else guess.antenna)
+    require(not len(missing), "antenna_guess", "a guess of each antenna with ranges", missing)
     positions = {}
     for antenna, position in zip(guess.antenna, guess.position):
         if antenna in antennas:

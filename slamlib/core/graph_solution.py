@@ -57,7 +57,8 @@ class GraphSolution:
 class Marginals:
     """Covariances of variables by the Bayes tree of a linear graph, in GTSAM's axes.
 
-    As `eliminated`, by QR decomposition where Cholesky's fails.
+    Where Cholesky's decomposition of a marginal fails, QR decomposition gives it. Raises
+    DatasetError where the factors do not determine a variable.
     """
 
     tree: gtsam.GaussianBayesTree
@@ -68,7 +69,7 @@ class Marginals:
             return self.tree.marginalCovariance(key)
         except RuntimeError:
             root, _ = self.tree.marginalFactor(key, gtsam.EliminateQR).jacobian()
-            return covariance_of_root(root)
+            return covariance_of_root(root, key)
 
     def joint(self, first: int, second: int) -> np.ndarray:
         """The covariance (d, e) between two variables."""
@@ -80,13 +81,26 @@ class Marginals:
             ordering.push_back(second)
             root, _ = self.tree.joint(first, second, gtsam.EliminateQR).jacobian(ordering)
             size = len(self.covariance(first))
-            return covariance_of_root(np.linalg.qr(root, mode="r"))[:size, size:]
+            return covariance_of_root(np.linalg.qr(root, mode="r"), first)[:size, size:]
 
 
-def covariance_of_root(root: np.ndarray) -> np.ndarray:
-    """The covariance (d, d) by the upper triangular square root (d, d) of the information."""
-    inverse = np.linalg.inv(root)
+def covariance_of_root(root: np.ndarray, key: int) -> np.ndarray:
+    """The covariance (d, d) of a variable by the upper triangular root (d, d) of its information.
+
+    Raises DatasetError where it is singular.
+    """
+    try:
+        inverse = np.linalg.inv(root)
+    except np.linalg.LinAlgError:
+        raise undetermined(gtsam.DefaultKeyFormatter(key)) from None
     return inverse @ inverse.T
+
+
+def undetermined(near: str = "") -> DatasetError:
+    """The DatasetError for factors that do not determine every variable, `near` one of them."""
+    where = f", near {near}" if near else ""
+    return DatasetError("expected measurements that determine every pose and landmark, found some "
+                        f"that do not{where}")
 
 
 @dataclass(frozen=True)
@@ -103,19 +117,42 @@ class GaussNewton:
 def solve_graph(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> GraphSolution:
     """The GraphSolution of a graph from initial values.
 
-    Raises DatasetError, which names a variable, if the factors do not determine every one.
+    Raises DatasetError if graph and values do not fit each other, or, with a variable, if the
+    factors do not determine every one.
     """
-    found = gauss_newton(graph, values)
-    worst = contradiction(graph, found.values)
+    require_values(graph, values)
+    try:
+        found = gauss_newton(graph, values)
+        found_places = places(found.values, found.marginals.covariance)
+        worst = contradiction(graph, found.values)
+    except RuntimeError as failure:                      # GTSAM's, on types and numbers
+        reason = str(failure).strip().partition("\n")[0]
+        raise DatasetError("solve_graph: expected finite numbers, and values of the types that the "
+                           f"factors have: gtsam.Pose2 or Point2, found: {reason}") from None
     if worst:
         LOG.warning(worst)
     if not found.converged:
-        LOG.warning("the error still falls after %d steps, to %.4g: is a factor far from the rest, "
-                    "or an initial value?", found.steps, found.error)
+        LOG.warning("the error still falls after %d steps, to %.4g, or no step lowers it: is a "
+                    "factor far from the rest, a derivative wrong, or an initial value?",
+                    found.steps, found.error)
     return GraphSolution(
         graph=graph, values=found.values, marginals=found.marginals, steps=found.steps,
         error=found.error, converged=found.converged and not worst, contradiction=worst,
-        **places(found.values, found.marginals.covariance))
+        **found_places)
+
+
+def require_values(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values):
+    """Raise DatasetError unless the values are those of the variables of the graph."""
+    if not isinstance(graph, gtsam.NonlinearFactorGraph) or not isinstance(values, gtsam.Values):
+        raise DatasetError("solve_graph: expected a gtsam.NonlinearFactorGraph and gtsam.Values")
+    variables, given = set(graph.keyVector()), set(values.keys())
+    if not variables:
+        raise DatasetError("solve_graph: expected factors, found none")
+    for key in sorted(variables ^ given):
+        name = gtsam.DefaultKeyFormatter(key)
+        missing = "an initial value" if key in variables else "a factor"
+        raise DatasetError(f"solve_graph: expected {missing} of every variable, found none of "
+                           f"{name}")
 
 
 def gauss_newton(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> GaussNewton:
@@ -125,12 +162,16 @@ def gauss_newton(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> Gau
     """
     error = graph.error(values)
     for steps in range(1, MAX_STEPS + 1):
-        tree = eliminated(graph.linearize(values))
-        before = error
-        values, error = descended(graph, values, tree.optimize(), error)
-        LOG.debug("Gauss-Newton step %d: error %.6g", steps, error)
-        if before - error <= CONVERGED * (1 + before):
-            return GaussNewton(values, error, steps, True, Marginals(tree))
+        linear = graph.linearize(values)
+        tree, step = eliminated(linear)
+        moved, new = descended(graph, values, step, error)
+        LOG.debug("Gauss-Newton step %d: error %.6g", steps, new)
+        negligible = CONVERGED * (1 + error)
+        promised = linear.error(values.zeroVectors()) - linear.error(step)
+        stuck = new >= error and promised > negligible
+        if error - new <= negligible:
+            return GaussNewton(moved, new, steps, not stuck, Marginals(tree))
+        values, error = moved, new
     return GaussNewton(values, error, MAX_STEPS, False, Marginals(tree))
 
 
@@ -145,38 +186,41 @@ def descended(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, step: gts
     return values, error
 
 
-def eliminated(linear: gtsam.GaussianFactorGraph) -> gtsam.GaussianBayesTree:
-    """The Bayes tree of a linear graph.
+def eliminated(linear: gtsam.GaussianFactorGraph) -> tuple[
+        gtsam.GaussianBayesTree, gtsam.VectorValues]:
+    """The Bayes tree of a linear graph, and its solution.
 
     Cholesky decomposition is fast, but fails where the information is ill-conditioned. There QR
     decomposition decides whether the factors determine every variable. Raises DatasetError if they
     do not.
     """
     try:
-        return linear.eliminateMultifrontal()
+        tree = linear.eliminateMultifrontal()
+        return tree, tree.optimize()
     except RuntimeError:
         pass
     try:
         ordering = gtsam.Ordering.ColamdGaussianFactorGraph(linear)
-        return linear.eliminateMultifrontal(ordering, gtsam.EliminateQR)
+        tree = linear.eliminateMultifrontal(ordering, gtsam.EliminateQR)
+        return tree, tree.optimize()
     except RuntimeError as failure:                      # GTSAM's, with much advice
         symbol = re.search(r"Symbol: ([a-z]\d+)", str(failure))
-        near = f", near {symbol[1]}" if symbol else ""
-        raise DatasetError("expected measurements that determine every pose and landmark, found "
-                           f"some that do not{near}") from None
+        raise undetermined(symbol[1] if symbol else "") from None
 
 
 def contradiction(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> str:
     """A sentence on the factor of largest error if this exceeds MAX_CONTRADICTION, or "".
 
-    Factors with a robust noise model may contradict the rest.
+    Factors with a robust noise model may contradict the rest, and so may a guess of an antenna.
     """
     largest = 0.0
     worst = None
     for k in range(graph.size()):
         factor = graph.at(k)
+        if factor is None or is_robust(factor) or is_guess(factor):
+            continue
         size = np.sqrt(2 * factor.error(values))
-        if size > largest and not is_robust(factor):
+        if size > largest:
             largest = size
             worst = k
     if largest <= MAX_CONTRADICTION:
@@ -191,6 +235,12 @@ def is_robust(factor: gtsam.NonlinearFactor) -> bool:
     """Whether the noise model of a factor has a robust kernel."""
     return isinstance(factor, gtsam.NoiseModelFactor) and isinstance(
         factor.noiseModel(), gtsam.noiseModel.Robust)
+
+
+def is_guess(factor: gtsam.NonlinearFactor) -> bool:
+    """Whether a factor is the prior of an antenna about its guess."""
+    return isinstance(factor, gtsam.PriorFactorPoint2) and gtsam.symbolChr(
+        factor.keys()[0]) == ord("a")
 
 
 def places(values: gtsam.Values, covariance_of: Callable[[int], np.ndarray]) -> dict:

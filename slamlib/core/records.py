@@ -76,6 +76,15 @@ class Dataset:
             marker_in_vehicle=se2.compose(camera_in_vehicle, marker_in_camera),
             covariance=se2.rotate_covariance(covariance, stated.camera_turn))
 
+    @property
+    def ranges(self) -> UwbReadings | None:
+        """The UwbReadings, or None, without the stated offset and scale."""
+        if self.uwb is None:
+            return None
+        v = self.vehicle
+        return replace(self.uwb, range=(self.uwb.range - v.range_offset) / v.range_scale,
+                       sigma=self.uwb.sigma / v.range_scale)
+
     def without(self, sensor: str) -> "Dataset":
         """The Dataset without a sensor, "aruco" or "uwb"."""
         return replace(self, **{sensor: None})

@@ -67,7 +67,7 @@ def gtsam_step(problem: Problem, equations: NormalEquations) -> np.ndarray:
     Raises DatasetError if the measurements do not determine every variable.
     """
     structure = problem.measurements.structure
-    solution = eliminated(linearize(problem, equations)).optimize()
+    _, solution = eliminated(linearize(problem, equations))
     n, q = len(structure.diagonal), problem.active.sum()
     step = np.zeros(n + q)
     keys = list(range(len(structure.is_pose) + bool(q)))

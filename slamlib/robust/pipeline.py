@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from slamlib.core.errors import require
+from slamlib.core.graph import require_rows
 from slamlib.core.odometry import MODELS
 from slamlib.core.records import Dataset
 from slamlib.core.vehicle import changed
@@ -43,7 +44,7 @@ def estimate(dataset: Dataset, slip: float | None = None, model: str | None = No
     previous : SlamResult of the same drive with fewer sensors, from which the solution starts.
     marker_noise_factor, range_noise_factor : known factors on the standard deviations in the files;
         None as for `slip`.
-    kernel : name in `fit.KERNELS`, the robust kernel of sightings and ranges; that of the
+    kernel : name in `core.kernels.KERNELS`, the robust kernel of sightings and ranges; that of the
         ranges only if its name begins with "asymmetric". None takes that of the Vehicle.
     gate : bool, whether measurements that contradict the solution are rejected; None as for
         `kernel`.
@@ -68,7 +69,7 @@ def estimate(dataset: Dataset, slip: float | None = None, model: str | None = No
     """
     started = time.perf_counter()
     require(isinstance(dataset, Dataset), "estimate", "a Dataset", dataset)
-    require_poses(dataset, poses)
+    require_rows(dataset, poses, "estimate")
     require_same_drive(dataset, previous)
     require(model in (None, *MODELS), "estimate", f"{' or '.join(MODELS)} for model", model)
     options = {"slip": slip, "marker_noise_factor": marker_noise_factor,
@@ -104,14 +105,6 @@ def estimate(dataset: Dataset, slip: float | None = None, model: str | None = No
              result.agreement[0])
     log.info("estimate of %s: %.1f s", dataset.name, time.perf_counter() - started)
     return result
-
-
-def require_poses(dataset: Dataset, poses: Sequence[int]):
-    """Raise DatasetError unless `poses` are rows of the ticks of a Dataset."""
-    count = len(dataset.ticks)
-    for pose in poses:
-        is_row = isinstance(pose, int | np.integer) and 0 <= pose < count
-        require(is_row, "estimate", f"rows from 0 to {count - 1} for poses", pose)
 
 
 def require_same_drive(dataset: Dataset, previous: SlamResult | None):

@@ -27,7 +27,7 @@ from slamlib.robust.initialization import (
     trilaterate,
 )
 from slamlib.robust.linear import Problem, State
-from slamlib.robust.solution import GtsamSolution, graph_and_values
+from slamlib.robust.solution import GtsamSolution, graph_of, solved_noise, values_of
 
 MIN_ACCEPTED_RANGES = 5      # number of accepted ranges of an antenna that is not in doubt
 SAME_MARKER = 0.05           # m, distance of two markers that must be one
@@ -102,7 +102,9 @@ class SlamResult:
         For factors of one's own, and GTSAM's own tools; `core.graph` has the keys. Nothing is
         averaged over the noise. `core.graph_solution.solve_graph` solves it.
         """
-        return graph_and_values(self.fit.problem, self.fit.state)
+        graph = graph_of(self.fit.problem, solved_noise(self.fit))
+        mode = self.fit.state if self.gtsam is None else self.gtsam.mode
+        return graph, values_of(self.fit.problem, mode, graph)
 
     @property
     def unconfirmed(self) -> np.ndarray:
@@ -195,7 +197,7 @@ def _of_frames(pairs, measurements):
 
 
 def _agreement(solution, engine):
-    """Largest difference of poses and markers of a solution from the engine's, in its sigmas.
+    """Largest difference of poses and landmarks of a solution from the engine's, in its sigmas.
 
     Also the largest relative difference of their sigmas.
     """
@@ -210,14 +212,16 @@ def _agreement(solution, engine):
 
 
 def _places(solution):
-    """Poses and markers (f + k, 3) of a solution."""
-    return np.concatenate([solution.state.poses, solution.state.markers])
+    """Poses, markers and antennas (f + k + a, 3) of a solution, antennas with heading 0."""
+    state = solution.state
+    antennas = np.pad(state.antennas, ((0, 0), (0, 1)))
+    return np.concatenate([state.poses, state.markers, antennas])
 
 
 def _variances(solution):
-    """Variances (f + k, 3) of poses and markers of a solution, in their own axes."""
-    markers = solution.landmarks[:len(solution.state.markers)]
-    return np.diagonal(np.concatenate([solution.frames, markers]), axis1=1, axis2=2)
+    """Variances (f + k + a, 3) of the same, of poses and markers in their own axes."""
+    blocks = np.concatenate([solution.frames, solution.landmarks])
+    return np.diagonal(blocks, axis1=1, axis2=2)
 
 
 def turn_sigma(problem: Problem) -> np.ndarray:

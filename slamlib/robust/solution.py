@@ -40,10 +40,8 @@ from slamlib.core.kernels import ONE_SIDED
 from slamlib.core.records import ArucoReadings, UwbReadings
 from slamlib.robust.calibration import (
     HEIGHT,
-    OFFSET,
     RANGE_LAG,
     RANGES,
-    SCALE,
     SIGHTING_LAG,
     SIGHTINGS,
     TAG_PLACE,
@@ -66,7 +64,8 @@ CALIBRATION_KEYS = ((W(0), WHEELS), (S(0), SIGHTINGS), (R(0), RANGES))
 class GtsamSolution:
     """GTSAM's solution, as arrays; covariances of poses and markers in their own axes."""
 
-    state: State
+    state: State                 # averaged over the noise
+    mode: State                  # of least error
     frames: np.ndarray           # (f, 3, 3)
     landmarks: np.ndarray        # (k + a, 3, 3); of a point (2, 2) counts
     c: np.ndarray                # (p, p) of the calibration, 0 where it is known
@@ -75,13 +74,6 @@ class GtsamSolution:
     steps: int                   # number of steps of Gauss-Newton
     start: str                   # FROM_ODOMETRY or FROM_ENGINE
     converged: bool
-
-
-def graph_and_values(problem: Problem,
-                     state: State) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    """The graph of a Problem, and the values of a State."""
-    graph = graph_of(problem, problem.noise)
-    return graph, values_of(problem, state, graph)
 
 
 def graph_of(problem: Problem, noise: Noise) -> gtsam.NonlinearFactorGraph:
@@ -149,14 +141,13 @@ def calibrated_ranges(problem: Problem, noise: Noise) -> UwbReadings | None:
     """The accepted ranges without the stated offset and scale."""
     m = problem.measurements
     r = m.ranges
-    stated = m.calibration.stated
     heard = problem.accepted.ranges.weight > 0
     if not heard.any():
         return None
-    return UwbReadings(
-        pose=m.frame[r.row[heard]], antenna=m.antenna[r.antenna[heard]],
-        range=(r.distance[heard] - stated[OFFSET]) / stated[SCALE],
-        sigma=noise.ranges * r.sigma[heard] / stated[SCALE])
+    measured = UwbReadings(
+        pose=m.frame[r.row[heard]], antenna=m.antenna[r.antenna[heard]], range=r.distance[heard],
+        sigma=noise.ranges * r.sigma[heard])
+    return replace(m.dataset, uwb=measured).ranges
 
 
 class CalibratedFactors:
@@ -345,8 +336,7 @@ def solve_by_gtsam(fit: Fit) -> GtsamSolution:
     Raises DatasetError where the measurements do not determine every variable.
     """
     problem = fit.problem
-    points = noise_points(fit)
-    graph = graph_of(problem, points[0][1] if len(points) == 1 else problem.noise)
+    graph = graph_of(problem, solved_noise(fit))
     decided = values_of(problem, fit.state, graph)
     odometry = odometry_state(problem.measurements, problem.odometry.model)
     found = gauss_newton(graph, values_of(problem, odometry, graph))
@@ -363,6 +353,12 @@ def noise_points(fit: Fit) -> tuple[tuple[float, Noise], ...]:
     return fit.posterior.points if fit.posterior else ((1.0, fit.problem.noise),)
 
 
+def solved_noise(fit: Fit) -> Noise:
+    """The Noise of the graph that is solved: that of the only point, or the most probable one."""
+    points = noise_points(fit)
+    return points[0][1] if len(points) == 1 else fit.problem.noise
+
+
 def averaged(fit: Fit, graph: gtsam.NonlinearFactorGraph, found: GaussNewton,
              start: str) -> GtsamSolution:
     """The GtsamSolution by the moments over the noise's posterior at the solution of a graph."""
@@ -376,10 +372,10 @@ def averaged(fit: Fit, graph: gtsam.NonlinearFactorGraph, found: GaussNewton,
     steps = np.zeros((1, values.dim()))
     if len(points) > 1:
         graphs = [graph_of(problem, noise) for _, noise in points]
-        trees = [eliminated(each.linearize(values)) for each in graphs]
-        marginals = [Marginals(tree) for tree in trees]
-        at_mode = eliminated(graph.linearize(values)).optimize().vector(keys)
-        steps = np.array([tree.optimize().vector(keys) for tree in trees]) - at_mode
+        solved = [eliminated(each.linearize(values)) for each in graphs]
+        marginals = [Marginals(tree) for tree, _ in solved]
+        _, at_mode = eliminated(graph.linearize(values))
+        steps = np.array([step.subtract(at_mode).vector(keys) for _, step in solved])
     mean = weights @ steps
     places = dict(zip(keys, places_of(values, keys)))
 
@@ -393,10 +389,11 @@ def averaged(fit: Fit, graph: gtsam.NonlinearFactorGraph, found: GaussNewton,
         return total
 
     moved = values if len(points) == 1 else values.retract(vector_values(mean, places))
-    state, blocks = as_arrays(fit, moved, covariance)
+    blocks = blocks_of(problem, values, covariance)
     f = len(problem.measurements.frame)
     return GtsamSolution(
-        state=state, frames=blocks[:f], landmarks=blocks[f:],
+        state=state_at(fit, moved), mode=state_at(fit, values),
+        frames=blocks[:f], landmarks=blocks[f:],
         c=calibration_covariance(problem, values, covariance),
         factors=graph.size(), variables=values.size(), steps=found.steps, start=start,
         converged=found.converged)
@@ -417,26 +414,31 @@ def vector_values(step: np.ndarray, places: dict) -> gtsam.VectorValues:
     return moved
 
 
-def as_arrays(fit: Fit, values: gtsam.Values, covariance) -> tuple[State, np.ndarray]:
-    """State and covariances (f + k + a, 3, 3) of all variables at GTSAM's values.
-
-    Of variables that are not in the graph, as markers without accepted sightings, those of a Fit
-    and zero.
-    """
+def state_at(fit: Fit, values: gtsam.Values) -> State:
+    """The State at GTSAM's values; what is not in the graph is where a Fit has it."""
     m = fit.problem.measurements
-    rows = np.concatenate([fit.state.poses, fit.state.markers,
-                           np.pad(fit.state.antennas, ((0, 0), (0, 1)))])
-    blocks = np.zeros((len(rows), 3, 3))
+    antennas = np.pad(fit.state.antennas, ((0, 0), (0, 1)))
+    rows = np.concatenate([fit.state.poses, fit.state.markers, antennas])
     for k, key in enumerate(variable_keys(fit.problem)):
         if values.exists(key):
-            C = covariance(key)
-            size = len(C)
-            rows[k, :size] = array_of(values, key)[:size]
-            blocks[k, :size, :size] = C
+            rows[k] = array_of(values, key)
     poses, markers, antennas = np.split(rows, np.cumsum([len(m.frame), len(m.marker)]))
-    state = state_from_arrays(
+    return state_from_arrays(
         m, poses, markers, antennas[:, :2], calibration_at(fit.problem, values))
-    return state, blocks
+
+
+def blocks_of(problem: Problem, values: gtsam.Values, covariance: Callable) -> np.ndarray:
+    """Covariances (f + k + a, 3, 3) of all variables, zero of those that are not in the graph.
+
+    Such are markers without accepted sightings. `covariance` gives that of a key.
+    """
+    keys = variable_keys(problem)
+    blocks = np.zeros((len(keys), 3, 3))
+    for k, key in enumerate(keys):
+        if values.exists(key):
+            C = covariance(key)
+            blocks[k, :len(C), :len(C)] = C
+    return blocks
 
 
 def calibration_covariance(problem: Problem, values: gtsam.Values, covariance) -> np.ndarray:
