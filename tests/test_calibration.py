@@ -86,7 +86,7 @@ def test_derivatives_by_every_entry(vehicle):
         numeric[..., delays] = central_differences(errors, np.zeros(q), steps)[..., delays]
         J = np.zeros_like(numeric)
         J[..., f.columns] = f.J_c
-        frame = m.frame[f.connections.variables[:, 0]]
+        frame = m.frame[m.structure.variables[f.index, 0]]
         inside = (frame > 20) & (frame < m.frame[-1] - 20)
         J, numeric = J[inside], numeric[inside]
         scale = np.abs(numeric).max(axis=(0, 1)) + 1e-9

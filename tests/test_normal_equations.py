@@ -41,7 +41,7 @@ def test_markers_without_accepted_sightings_have_a_weak_prior_and_move_nothing_e
     equations, left = NormalEquations(problem, state), []
     H = equations.structure.matrix(equations.sums(problem.noise).H).toarray()
     for j in (point, first, first + 1):
-        own = equations.structure.rows([len(m.frame) + j], 2 + m.oriented[j])[0]
+        own = equations.structure.rows[len(m.frame) + j, :2 + m.oriented[j]]
         np.testing.assert_allclose(H[np.ix_(own, own)], np.eye(len(own)) / WEAK_SIGMA**2)
         assert np.count_nonzero(H[own]) == len(own)
         left.extend(own)
@@ -61,7 +61,7 @@ def test_selected_blocks_are_those_of_the_dense_inverse(poses):
     equations = NormalEquations(problem, odometry_state(m, "arc"))
     found, sums = marginal_covariances(equations, given), equations.sums(given)
     H, active = equations.structure.matrix(sums.H).toarray(), problem.active
-    n, rows = len(H), equations.structure.rows(slice(None))
+    n, rows = len(H), equations.structure.rows
     np.testing.assert_allclose(H, H.T, rtol=1e-9, atol=1e-6)
     unit = np.r_[np.ones(n), problem.sigma[active]]
     expected = np.linalg.inv(np.block([[H, sums.border[:n, :-1]], [sums.border[:, :-1].T]])) \

@@ -177,7 +177,7 @@ def test_averages_over_the_noise_are_moments_of_a_mixture():
     x[:, n:] *= fit.problem.sigma[active]
     mean, (state, mixed, slip) = weights @ x, posterior_moments(fit)
     each, rows = [marginal_covariances(equations, noise) for noise in noises], \
-        equations.structure.rows(slice(None))
+        equations.structure.rows
     frames, landmarks = np.split(rows, [len(m.frame)])
     for at, block in (
             (np.r_[frames[20], frames[21], n:n + 3], lambda C: C.pairs[20]),

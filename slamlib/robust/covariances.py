@@ -20,11 +20,13 @@ in the tangent space at the state that solves the problem of greatest posterior 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cholesky_banded, solve_triangular
-from scipy.sparse import block_array, csc_array
+from scipy.linalg import cho_solve_banded, cholesky_banded, solve_triangular
+from scipy.sparse import csc_array, hstack, vstack
 
 from slamlib.robust.calibration import WHEELS
-from slamlib.robust.linear import NormalEquations, laplace_approximation, retract
+from slamlib.robust.fit import Fit
+from slamlib.robust.linear import NormalEquations, State, laplace_approximation, retract
+from slamlib.robust.measurements import Noise
 
 COLUMNS_AT_ONCE = 256        # columns of M that are held in memory
 
@@ -38,102 +40,108 @@ class Covariances:
     c: np.ndarray            # (p, p) of the calibration, 0 where it is known
 
 
-def marginal_covariances(equations, noise):
+def marginal_covariances(equations: NormalEquations, noise: Noise) -> Covariances:
     """The Covariances for a Noise by NormalEquations at the State that solves the problem.
 
     Raises numpy.linalg.LinAlgError if the equations are singular.
     """
-    problem, structure, active = equations.problem, equations.structure, equations.problem.active
+    problem = equations.problem
+    structure = equations.structure
     sums = equations.sums(noise)
-    border = sums.border
-    H, n, q = structure.matrix(sums.H), len(structure.diagonal), active.sum()
-    B, D = csc_array(border[:n, :-1]), csc_array(border[n:, :-1])
-    rows = structure.rows(slice(None)).ravel()
-    frames, others = np.split(np.r_[rows, n:n + q], [3 * len(problem.measurements.frame)])
-    of_others = block_array([[H, B], [B.T, D]], format="csc")[:, others]
-    E, F = of_others[frames], of_others[others].toarray()
-    solve, own, joint = _chain_inverse(H[frames][:, frames])
+    n = len(structure.diagonal)
+    H = structure.matrix(sums.H)
+    border = csc_array(sums.border[:, :-1])
+    information = hstack([vstack([H, border[:n].T]), border], format="csc")
+    rows = np.append(structure.rows, np.arange(n, len(sums.border)))
+    frames, others = np.split(rows, [3 * len(problem.measurements.frame)])
+    of_others = information[:, others]
+    E = of_others[frames]
+    F = of_others[others].toarray()
+    chain = _chain_cholesky(information[frames][:, frames])
     chunks = [slice(i, i + COLUMNS_AT_ONCE) for i in range(0, len(F), COLUMNS_AT_ONCE)]
     for chunk in chunks:
-        F[:, chunk] -= E.T @ solve(E[:, chunk].toarray())
+        F[:, chunk] -= E.T @ cho_solve_banded(chain, E[:, chunk].toarray())
     C = solve_triangular(np.linalg.cholesky(F), np.eye(len(F)), lower=True).T
-    of_landmarks, of_c = np.split(C, [len(F) - q])
-    by_c, wheels = np.zeros((len(active), len(F))), np.zeros_like(own)
-    by_c[active] = problem.sigma[active, None] * of_c
+    of_landmarks, of_active = np.split(C, [len(others) - problem.active.sum()])
+    of_c = np.zeros((len(problem.sigma), len(F)))
+    of_c[problem.active] = problem.sigma[problem.active, None] * of_active
+    own, joint = _chain_inverse(chain)
+    wheels = np.zeros_like(own)
     for chunk in chunks:
-        M = solve(E @ C[:, chunk]).reshape(own.shape[:2] + (-1,))
+        M = cho_solve_banded(chain, E @ C[:, chunk]).reshape(len(own), 3, -1)
         own += M @ M.mT
         joint += M[:-1] @ M[1:].mT
-        wheels -= M @ by_c[WHEELS, chunk].T
-    c, of_landmarks = by_c @ by_c.T, of_landmarks.reshape(-1, 3, len(F))
+        wheels -= M @ of_c[WHEELS, chunk].T
+    c = of_c @ of_c.T
+    of_landmarks = of_landmarks.reshape(-1, 3, len(F))
     of_wheels = np.broadcast_to(c[WHEELS, WHEELS], joint.shape)
     pairs = np.block([[own[:-1], joint, wheels[:-1]], [joint.mT, own[1:], wheels[1:]],
                       [wheels[:-1].mT, wheels[1:].mT, of_wheels]])
     return Covariances(pairs=pairs, landmarks=of_landmarks @ of_landmarks.mT, c=c)
 
 
-def _chain_inverse(T):
-    """Function from b (3 f, w) to T^-1 b; blocks of T^-1 (f, 3, 3), and (f-1, 3, 3) above these.
+def _chain_cholesky(T):
+    """The Cholesky factor of T (3 f, 3 f), block tridiagonal, as `cho_solve_banded` takes it."""
+    bands = [np.pad(T.diagonal(-k), (0, k))[:T.shape[0]] for k in range(6)]
+    return cholesky_banded(bands, lower=True), True
 
-    T (3 f, 3 f) is block tridiagonal. With its Cholesky factor L and W = L_{i+1,i} L_ii^-1 it is
-    eliminated and substituted back block by block. The blocks are
+
+def _chain_inverse(chain):
+    """Blocks (f, 3, 3) of T^-1 on the diagonal, and (f-1, 3, 3) above it, by `_chain_cholesky`.
+
+    With the Cholesky factor L of T and W = L_{i+1,i} L_ii^-1 they are, from the last one on,
 
         Z_ii = L_ii^-T L_ii^-1 + W^T Z_{i+1,i+1} W,    Z_{i,i+1} = -W^T Z_{i+1,i+1}
 
     (Takahashi, Fagan and Chin, Formation of a sparse bus impedance matrix, PICA 1973).
     """
-    bands = [np.pad(T.diagonal(-k), (0, k))[:T.shape[0]] for k in range(6)]
-    L = cholesky_banded(bands, lower=True)
+    bands = chain[0].reshape(6, -1, 3)
     i, j = np.indices((3, 3))
-    blocks = L.reshape(6, -1, 3)
-    inverse = np.linalg.inv(np.tril(blocks[np.maximum(i - j, 0), :, j].transpose(2, 0, 1)))
-    W = (blocks[3 + i - j, :, j].transpose(2, 0, 1) @ inverse)[:-1]
+    diagonal = np.tril(bands[np.abs(i - j), :, j].transpose(2, 0, 1))
+    below = bands[3 + i - j, :, j].transpose(2, 0, 1)
+    inverse = np.linalg.inv(diagonal)
+    W = (below @ inverse)[:-1]
     Z = inverse.mT @ inverse
     for k in reversed(range(len(W))):
         Z[k] += W[k].T @ Z[k + 1] @ W[k]
     Z = (Z + Z.mT) / 2
-
-    def solve(b):
-        x = b.reshape(len(inverse), 3, -1).copy()
-        for k, step in enumerate(W):
-            x[k + 1] -= step @ x[k]
-        x = inverse.mT @ (inverse @ x)
-        for k in reversed(range(len(W))):
-            x[k] -= W[k].T @ x[k + 1]
-        return x.reshape(b.shape)
-
-    return solve, Z, -W.mT @ Z[1:]
+    return Z, -W.mT @ Z[1:]
 
 
-def posterior_moments(fit):
+def posterior_moments(fit: Fit) -> tuple[State, Covariances, float]:
     """Mean State, Covariances, and root mean square of the slip in sqrt(m), of a Fit.
 
     Raises LinAlgError as `marginal_covariances`.
     """
-    problem, equations = fit.problem, NormalEquations(fit.problem, fit.state)
-    weights, noises = zip(*fit.posterior.points) if fit.posterior else ((1.0,), (problem.noise,))
-    weights = np.array(weights) / sum(weights)
-    slip = np.sqrt(weights @ np.square([point.slip for point in noises]))
-    conditional = [marginal_covariances(equations, point) for point in noises]
-    if noises == (problem.noise,):
+    problem = fit.problem
+    equations = NormalEquations(problem, fit.state)
+    points = fit.posterior.points if fit.posterior else [(1.0, problem.noise)]
+    weights = [weight for weight, _ in points]
+    slips = np.array([noise.slip for _, noise in points])
+    slip = np.sqrt(np.average(slips**2, weights=weights))
+    conditional = [marginal_covariances(equations, noise) for _, noise in points]
+    if len(points) == 1 and points[0][1] == problem.noise:
         return fit.state, conditional[0], slip
-    x = np.stack([laplace_approximation(equations, point)[0] for point in noises])
-    x -= laplace_approximation(equations, problem.noise)[0]
-    mean, structure, n = weights @ x, equations.structure, len(equations.structure.diagonal)
-    off = np.zeros((len(x), n + len(problem.sigma)))         # from the mean; 0 of what is known
-    off[:, np.r_[:n, n + np.flatnonzero(problem.active)]] = x - mean
-    off[:, n:] *= problem.sigma
+    delta = np.stack([laplace_approximation(equations, noise)[0] for _, noise in points])
+    delta -= laplace_approximation(equations, problem.noise)[0]
+    mean = np.average(delta, axis=0, weights=weights)
+    rows = equations.structure.rows
+    is_unknown = np.append(np.ones(rows.size, bool), problem.active)
+    off = np.zeros((len(points), len(is_unknown)))           # x_k - x; 0 of what is known
+    off[:, is_unknown] = delta - mean
+    off[:, rows.size:] *= problem.sigma
 
-    def averaged(blocks, rows):
-        """sum p_k (C_k + x_k x_k^T) of blocks p of (..., d, d) at rows (..., d)."""
-        x_k = off[:, rows]
-        return np.einsum("p,p...->...", weights,
-                         np.stack(blocks) + x_k[..., :, None] * x_k[..., None, :])
+    def averaged(field, rows):
+        """A field of the Covariances, C (..., d, d) of the unknowns at rows (..., d)."""
+        x = off[:, rows]
+        C = [getattr(covariances, field) for covariances in conditional]
+        return np.average(C + x[..., :, None] * x[..., None, :], axis=0, weights=weights)
 
-    c = n + np.arange(len(problem.sigma))
-    frames, landmarks = np.split(structure.rows(slice(None)), [len(problem.measurements.frame)])
-    pairs = [frames[:-1], frames[1:], np.broadcast_to(c[WHEELS], frames[1:].shape)]
-    return retract(problem, fit.state, mean), Covariances(
-        pairs=averaged([C.pairs for C in conditional], np.concatenate(pairs, axis=1)),
-        landmarks=averaged([C.landmarks for C in conditional], landmarks),
-        c=averaged([C.c for C in conditional], c)), slip
+    c = np.arange(rows.size, len(is_unknown))
+    frames, landmarks = np.split(rows, [len(problem.measurements.frame)])
+    wheels = np.broadcast_to(c[WHEELS], frames[1:].shape)
+    pairs = np.concatenate([frames[:-1], frames[1:], wheels], axis=1)
+    covariances = Covariances(
+        pairs=averaged("pairs", pairs), landmarks=averaged("landmarks", landmarks),
+        c=averaged("c", c))
+    return retract(problem, fit.state, mean), covariances, slip

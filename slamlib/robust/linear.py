@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from operator import attrgetter
 
-import gtsam
 import numpy as np
+from gtsam.noiseModel import mEstimator
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
@@ -64,8 +64,7 @@ def state_from_arrays(measurements: Measurements, poses: np.ndarray, markers: np
     poses[:, 2] = odometry.cumulative(turn + correction, se2.wrap(poses[0, 2]))
     markers = np.array(markers, dtype=float)
     markers[~measurements.oriented, 2] = 0
-    return State(poses=poses, markers=markers, antennas=np.asarray(antennas, dtype=float),
-                 c=np.asarray(c, dtype=float))
+    return State(poses=poses, markers=markers, antennas=np.asarray(antennas), c=c)
 
 
 @dataclass(frozen=True)
@@ -93,9 +92,7 @@ def build_problem(measurements: Measurements, model: str, noise: Noise | None = 
     Odometry is of the `model` "arc" or "euler", linearised at `wheel` (3,) m, None for the stated
     one. The calibration is as stated, but for the delay of sightings that are late.
     """
-    late = frozenset()
-    if measurements.jumps.lag:
-        late = frozenset({"time-offset"})
+    late = frozenset({"time-offset"} if measurements.jumps.lag else ())
     return Problem(
         measurements=measurements, odometry=preintegrate_odometry(measurements, model, wheel),
         accepted=accept_all(measurements),
@@ -109,7 +106,7 @@ def retract(problem: Problem, state: State, delta: np.ndarray) -> State:
     Poses and markers move in their own axes: X becomes X delta.
     """
     m = problem.measurements
-    by_variable = delta[m.structure.rows(slice(None))]
+    by_variable = delta[m.structure.rows]
     of_frames, of_markers, of_antennas = np.split(
         by_variable, np.cumsum([len(m.frame), len(m.marker)]))
     c = state.c.copy()
@@ -126,13 +123,7 @@ class Sums:
     H: np.ndarray            # data of `Structure.matrix`
     border: np.ndarray       # (n + q, q + 1), [[B, g], [D, g_c]]
     squared: float           # sum of squared whitened errors
-    log_determinant: float = 0.0     # sum log|Q| of the noise Q of odometry
-
-    def plus(self, other: "Sums", weight: float = 1.0) -> "Sums":
-        """The Sums with those of other factors, without odometry, of this weight."""
-        return Sums(H=self.H + weight * other.H, border=self.border + weight * other.border,
-                    squared=self.squared + weight * other.squared,
-                    log_determinant=self.log_determinant)
+    log_determinant: float   # sum log|Q| of the noise Q of odometry
 
 
 @dataclass(frozen=True)
@@ -158,8 +149,8 @@ class NormalEquations:
     def error(self) -> float:
         """Half the sum of squared whitened errors, kernels applied."""
         odometry = self._odometry(self.problem.noise.slip)
-        sightings, ranges = self.linearized
-        return (odometry.squared + self.priors.squared) / 2 + (sightings.error + ranges.error)
+        of_measurements = sum(factors.error for factors in self.linearized)
+        return (odometry.squared + self.priors.squared) / 2 + of_measurements
 
     @cached_property
     def linearized(self) -> tuple[LinearizedFactors, LinearizedFactors]:
@@ -187,47 +178,46 @@ class NormalEquations:
             of_sightings /= consistency_factor(accepted.sightings.kernel, size)
             of_ranges /= consistency_factor(accepted.ranges.kernel)
         sightings, ranges = self._measured
-        total = self._odometry(noise.slip).plus(self.priors)
-        return total.plus(sightings, of_sightings).plus(ranges, of_ranges)
+        odometry = self._odometry(noise.slip)
+        parts = [(1, odometry), (1, self.priors), (of_sightings, sightings), (of_ranges, ranges)]
+        return Sums(
+            H=sum(weight * part.H for weight, part in parts),
+            border=sum(weight * part.border for weight, part in parts),
+            squared=sum(weight * part.squared for weight, part in parts),
+            log_determinant=odometry.log_determinant)
 
-    def counts(self) -> tuple[float, float]:
+    def counts(self) -> list[float]:
         """Numbers of accepted errors of sightings and of ranges."""
-        sightings, ranges = self.linearized
-        counted = self.problem.accepted.sightings.weight > 0
-        size = 2 + self.problem.measurements.as_pose[counted]
-        return np.sum(size * sightings.weight), np.sum(ranges.weight)
+        return [factors.count for factors in self.linearized]
 
     @cached_property
     def priors(self) -> Sums:
         """The Sums of the priors, whose H and D are diagonal."""
-        problem = self.problem
-        m = problem.measurements
+        m = self.problem.measurements
+        state = self.state
         structure = self.structure
-        n = len(structure.diagonal)
-        precision = np.zeros(n)
-        e = np.zeros(n)
-
-        def add(variables, difference, sigma):
-            rows = structure.rows(variables, difference.shape[1])
-            precision[rows] = sigma**-2.0
-            e[rows] = difference
-
-        count = np.bincount(m.marker_row, problem.accepted.sightings.weight, len(m.marker))
-        weak = np.flatnonzero(count == 0)
-        antenna = np.arange(len(m.frame) + len(m.marker), len(structure.is_pose))
-        add([0], se2.log(self.state.poses[:1]), m.origin_sigma)
-        add(antenna, self.state.antennas - m.guess, GUESS_PRIOR_SIGMA)
-        add(len(m.frame) + weak, self.state.markers[weak], WEAK_SIGMA)
-        precision[structure.rows(~structure.is_pose)[:, 2]] = 1      # what points do not have
-        active = problem.active
-        e_c = (self.state.c - m.calibration.stated)[active] / problem.sigma[active]
-        border = np.zeros((n + len(e_c), len(e_c) + 1))
-        border[:n, -1] = precision * e
-        border[n:, -1] = e_c
-        border[n:, :-1] = np.eye(len(e_c))
+        e = np.zeros((len(structure.is_pose), 3))
+        sigma = np.full_like(e, np.inf)
+        e[0] = se2.log(state.poses[0])
+        sigma[0] = m.origin_sigma
+        counted = m.marker_row[self.problem.accepted.sightings.weight > 0]
+        weak = np.setdiff1d(np.arange(len(m.marker)), counted)
+        e[len(m.frame) + weak] = state.markers[weak]
+        sigma[len(m.frame) + weak] = WEAK_SIGMA
+        antenna = slice(len(m.frame) + len(m.marker), None)
+        e[antenna, :2] = state.antennas - m.guess
+        sigma[antenna, :2] = GUESS_PRIOR_SIGMA
+        sigma[~structure.is_pose, 2] = 1                 # what points do not have
+        precision = sigma**-2
+        active = self.problem.active
+        e_c = (state.c - m.calibration.stated)[active] / self.problem.sigma[active]
+        q = len(e_c)
+        border = np.zeros((e.size + q, 1 + q))
+        border[structure.rows, -1] = precision * e
+        border[e.size:] = np.column_stack([np.eye(q), e_c])
         H = np.zeros(structure.places.nnz)
-        H[structure.diagonal] = precision
-        return Sums(H, border, float(np.sum(precision * e**2) + e_c @ e_c))
+        H[structure.diagonal[structure.rows]] = precision
+        return Sums(H, border, np.sum(precision * e**2) + e_c @ e_c, 0.0)
 
     @cached_property
     def _measured(self):
@@ -239,9 +229,8 @@ class NormalEquations:
         recent = self._recent_odometry
         if slip not in recent:
             if len(recent) == KEPT_SLIPS:
-                del recent[next(iter(recent))]                         # the oldest
-            factors, log_determinant = linearize_odometry(self.problem, self.state, slip)
-            recent[slip] = self._summed(factors, log_determinant)
+                recent.clear()
+            recent[slip] = self._summed(linearize_odometry(self.problem, self.state, slip))
         return recent[slip]
 
     @cached_property
@@ -249,29 +238,34 @@ class NormalEquations:
         """The last Sums of odometry by their slip."""
         return {}
 
-    def _summed(self, factors, log_determinant=0.0):
+    def _summed(self, factors):
         """The Sums of LinearizedFactors."""
         structure = self.structure
         n = len(structure.diagonal)
         q = self.problem.active.sum()
-        position = structure.position[factors.connections.variables]
         J_t = factors.J.mT
-        H_blocks = (J_t @ factors.J).reshape(-1, 2, 3, 2, 3).swapaxes(2, 3).reshape(-1, 9)
-        H = _summed_by(factors.connections.blocks, H_blocks, structure.places.nnz // 9)
-        last = np.concatenate([factors.J_c, factors.e[..., None]], axis=2)
+        J_c_e = np.concatenate([factors.J_c, factors.e[:, :, None]], axis=2)
+        in_blocks = (J_t @ factors.J).reshape(-1, 2, 3, 2, 3).swapaxes(2, 3)
+        H = _summed_by(structure.blocks[factors.index], in_blocks.reshape(-1, 9),
+                       structure.places.nnz // 9)
         columns = np.append(factors.columns, q)
-        by_variable = (J_t @ last).reshape(-1, 3 * len(columns))
         border = np.zeros((n + q, q + 1))
-        border[:n, columns] = _summed_by(position, by_variable, n // 3).reshape(n, -1)
+        border[:n, columns] = _summed_by(
+            structure.rows[structure.variables[factors.index]],
+            (J_t @ J_c_e).reshape(-1, len(columns)), n)
         border[n + factors.columns[:, None], columns] = np.tensordot(
-            factors.J_c, last, ([0, 1], [0, 1]))
-        return Sums(H.ravel(), border, float(np.sum(factors.e**2)), log_determinant)
+            factors.J_c, J_c_e, ([0, 1], [0, 1]))
+        return Sums(H.ravel(), border, np.sum(factors.e**2), factors.log_determinant)
 
 
-def _summed_by(number, values, size):
-    """(size, w) sums of the rows of values (m j, w) with each `number` (m, j)."""
-    return csc_array((np.ones(number.size), number.ravel(), np.arange(number.size + 1)),
-                     (size, number.size)) @ values
+def _summed_by(number, values, count):
+    """(count, w) sums of those rows of values (m, w) that have the same number (m,), of any shape.
+
+    As a product with a matrix that has a 1 in each column.
+    """
+    columns = np.arange(number.size + 1)
+    return csc_array((np.ones(number.size), number.ravel(), columns),
+                     (count, number.size)) @ values
 
 
 def linear_solution(structure: Structure, sums: Sums) -> LinearSolution | None:
@@ -290,15 +284,15 @@ def linear_solution(structure: Structure, sums: Sums) -> LinearSolution | None:
     reduced = sums.border[n:] - B_g[:, :-1].T @ solved
     S = (reduced[:, :-1] + reduced[:, :-1].T) / 2
     gradient = reduced[:, -1]
-    sign, log_determinant = np.linalg.slogdet(S)
-    if not sign > 0 or (np.diag(S) <= 0).any():
+    determinant = np.linalg.slogdet(S)
+    if not determinant.sign > 0 or (np.diag(S) <= 0).any():
         return None
     delta_c = -np.linalg.solve(S, gradient)
     delta = np.append(-solved[:, -1] - solved[:, :-1] @ delta_c, delta_c)
     return LinearSolution(
         delta=delta, S=S, gradient=gradient,
-        log_determinant=log_determinant + np.sum(np.log(pivots)),
-        decrease=-float(sums.border[:, -1] @ delta) / 2)
+        log_determinant=determinant.logabsdet + np.sum(np.log(pivots)),
+        decrease=-(sums.border[:, -1] @ delta) / 2)
 
 
 def laplace_approximation(equations: NormalEquations, noise: Noise) -> tuple[np.ndarray, float]:
@@ -317,17 +311,14 @@ def laplace_approximation(equations: NormalEquations, noise: Noise) -> tuple[np.
     solution = linear_solution(equations.structure, sums)
     if solution is None:
         return np.full(len(sums.border), np.nan), -np.inf
-    S, R = equations.counts()
-    log_evidence = solution.decrease - sums.squared / 2      # the squared error at the solution
-    log_evidence -= sums.log_determinant / 2
-    log_evidence -= solution.log_determinant / 2
-    log_evidence -= S * np.log(noise.sightings)
-    log_evidence -= R * np.log(noise.ranges)
-    return solution.delta, log_evidence
+    squared = sums.squared - 2 * solution.decrease           # |e|^2
+    log_determinants = sums.log_determinant + solution.log_determinant
+    log_factors = np.log([noise.sightings, noise.ranges]) @ equations.counts()
+    return solution.delta, -(squared + log_determinants) / 2 - log_factors
 
 
 @lru_cache(maxsize=8)
-def consistency_factor(kernel: gtsam.noiseModel.mEstimator.Base | None, size: int = 1) -> float:
+def consistency_factor(kernel: mEstimator.Base | None, size: int = 1) -> float:
     """Mean of the squares of standard normal residuals of `size` components, weighted by a kernel.
 
     The kernel weighs a residual by its norm, or by its signed value if `size` is 1. It removes part

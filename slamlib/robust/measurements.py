@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
-import gtsam
 import numpy as np
+from gtsam.noiseModel import mEstimator
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
@@ -37,8 +37,9 @@ from slamlib.robust.jumps import NO_JUMPS, Jumps
 
 NOISE_KEYS = ("slip", "marker_noise_factor", "range_noise_factor")      # of a Vehicle, as in Noise
 
-# Standard deviations of the priors of variables
-WEAK_SIGMA = 1e5             # m and rad, of a marker without accepted sightings
+WEAK_SIGMA = 1e5             # m and rad, of the prior of a marker without accepted sightings
+NO_RANGES = UwbReadings(
+    pose=np.zeros(0, int), antenna=np.zeros(0, int), range=np.zeros(0), sigma=np.zeros(0))
 
 
 class Noise(NamedTuple):
@@ -64,37 +65,21 @@ def square_root_information(covariance: np.ndarray) -> np.ndarray:
     return np.linalg.cholesky(np.linalg.inv(covariance)).mT
 
 
-class Connections(NamedTuple):
-    """The variables of the m factors of a kind, and the blocks of H to which a factor adds."""
-
-    variables: np.ndarray    # (m, 2) numbers of i and j
-    blocks: np.ndarray       # (m, 4) numbers of the blocks (i, i), (i, j), (j, i), (j, j)
-
-    def select(self, rows: np.ndarray) -> "Connections":
-        """Those of some rows."""
-        return Connections(self.variables[rows], self.blocks[rows])
-
-
 @dataclass(frozen=True)
 class Structure:
     """Places of v variables and of the b blocks that connect them in a matrix (3 v, 3 v)."""
 
     is_pose: np.ndarray      # (v,) bool, the others are points
-    position: np.ndarray     # (v,) of every variable in the elimination
+    rows: np.ndarray         # (v, 3) of the unknowns of every variable
     places: sparse.csc_array     # the matrix with the place of each entry in the data (9 b,)
-    odometry: Connections
-    sightings: Connections
-    ranges: Connections
     diagonal: np.ndarray     # (n,) places of the diagonal in the data of blocks
-
-    def rows(self, variables: np.ndarray | slice, width: int = 3) -> np.ndarray:
-        """Rows (m, width) of the unknowns of `variables` (m,)."""
-        return 3 * self.position[variables][:, None] + np.arange(width)
+    variables: np.ndarray    # (m, 2) i and j of the factors: odometry, then sightings, then ranges
+    blocks: np.ndarray       # (m, 4) numbers of their blocks (i, i), (i, j), (j, i), (j, j)
 
     @property
     def unknowns(self) -> np.ndarray:
         """Rows of the unknowns of all variables, in the order of their numbers."""
-        return self.rows(slice(None))[np.arange(3) < 2 + self.is_pose[:, None]]
+        return self.rows[np.arange(3) < 2 + self.is_pose[:, None]]
 
     def matrix(self, data: np.ndarray) -> sparse.csc_array:
         """The sparse matrix (n, n), which is symmetric, with the data (9 b,) of its blocks."""
@@ -144,8 +129,8 @@ class Measurements:
     def learned(self) -> np.ndarray:
         """(3,) bool, noise parameters that are learned: unknown ones with measurements."""
         unknown = [getattr(self.dataset.vehicle, key) is None for key in NOISE_KEYS]
-        measured = [True, len(self.marker_row) > 0, len(self.ranges.row) > 0]
-        return np.logical_and(unknown, measured)
+        count = [1, len(self.marker_row), len(self.ranges.row)]
+        return np.logical_and(unknown, count)
 
     @cached_property
     def sighting_roots(self) -> np.ndarray:
@@ -167,58 +152,43 @@ class Measurements:
         s = self.sightings
         r = self.ranges
         frame = np.arange(len(self.frame))
-        first_marker = len(frame)
-        first_antenna = first_marker + len(self.marker)
+        marker = len(frame) + self.marker_row
+        antenna = len(frame) + len(self.marker) + r.antenna
+        first = np.concatenate([frame[:-1], s.row, r.row])
+        second = np.concatenate([frame[1:], marker, antenna])
         frames_are_poses = np.ones(len(frame), bool)
         antennas_are_poses = np.zeros(len(self.antenna), bool)
-        return _structure(
-            is_pose=np.concatenate([frames_are_poses, self.oriented, antennas_are_poses]),
-            odometry=np.stack([frame[:-1], frame[1:]], axis=1),
-            sightings=np.stack([s.row, first_marker + self.marker_row], axis=1),
-            ranges=np.stack([r.row, first_antenna + r.antenna], axis=1))
+        is_pose = np.concatenate([frames_are_poses, self.oriented, antennas_are_poses])
+        return _structure(is_pose, np.stack([first, second], axis=1))
 
 
-def _structure(is_pose, odometry, sightings, ranges):
-    """The Structure of v variables, of which `is_pose` (v,), and factors of pairs (m, 2) of them.
+def _structure(is_pose, variables):
+    """The Structure of v variables, of which `is_pose` (v,), and m factors of two `variables` each.
 
-    The information matrix has a block for each pair and, for the priors, one for each variable.
+    The information matrix has blocks for each factor and, for the priors, one for each variable.
     """
     count = len(is_pose)
-    variable = np.arange(count)
-    itself = np.stack([variable, variable], axis=1)
-    pairs = np.concatenate([itself, odometry, sightings, ranges])
+    itself = np.repeat(np.arange(count), 2).reshape(-1, 2)
+    pairs = np.concatenate([variables, itself])
     position = _minimum_degree(pairs)
-
-    def in_matrix(pairs):
-        """Numbers (m, 4) of the blocks of pairs (m, 2) among all blocks, row after row."""
-        at = position[pairs]
-        return count * at[:, [0, 0, 1, 1]] + at[:, [0, 1, 0, 1]]
-
-    block = np.unique(in_matrix(pairs))
-
-    def connections(pairs):
-        return Connections(pairs, np.searchsorted(block, in_matrix(pairs)))
-
+    at = position[pairs]
+    in_matrix = count * at[:, [0, 0, 1, 1]] + at[:, [0, 1, 0, 1]]    # row after row
+    block, number = np.unique(in_matrix, return_inverse=True)
     data = np.arange(9 * len(block)).reshape(-1, 3, 3)
     row_starts = np.searchsorted(block, count * np.arange(count + 1))
     by_rows = sparse.bsr_array((data, block % count, row_starts)).tocsr()
     places = by_rows.T                                   # by columns; the matrix is symmetric
     return Structure(
-        is_pose=is_pose, position=position, places=places, diagonal=places.diagonal(),
-        odometry=connections(odometry), sightings=connections(sightings),
-        ranges=connections(ranges))
+        is_pose=is_pose, rows=3 * position[:, None] + np.arange(3), places=places,
+        diagonal=places.diagonal(), variables=variables, blocks=number[:len(variables)])
 
 
 def _minimum_degree(pairs):
-    """Position (v,) of each variable in an elimination by minimum degree, by their pairs (m, 2)."""
+    """Positions (v,) of variables in the elimination by minimum degree, by pairs (m, 2) of them."""
     factor = np.repeat(np.arange(len(pairs)), 2)
     J = sparse.csc_array((np.ones(pairs.size), (factor, pairs.ravel())))
     information = (J.T @ J).tocsc()                      # only where it is not 0 counts
     return splu(information, permc_spec="MMD_AT_PLUS_A").perm_c
-
-
-NO_RANGES = UwbReadings(
-    pose=np.zeros(0, int), antenna=np.zeros(0, int), range=np.zeros(0), sigma=np.zeros(0))
 
 
 def measure(dataset: Dataset, extra_poses: Sequence[int] = (),
@@ -264,7 +234,7 @@ class Accepted:
 
     weight: np.ndarray       # (m,) of its information, 0 if it is rejected
     share: np.ndarray        # (m,) of it that its neighbours leave each (`memory`)
-    kernel: gtsam.noiseModel.mEstimator.Base | None = None      # None: quadratic
+    kernel: mEstimator.Base | None = None      # None: quadratic
     bias: float = 0.0        # sigmas, of the kernel (`fit.ONE_SIDED`)
 
     def kept(self, residual: np.ndarray) -> np.ndarray:
@@ -293,10 +263,10 @@ class AcceptedMeasurements(NamedTuple):
 
 
 def accept_all(measurements: Measurements,
-               kernel: gtsam.noiseModel.mEstimator.Base | None = None) -> AcceptedMeasurements:
+               kernel: mEstimator.Base | None = None) -> AcceptedMeasurements:
     """The AcceptedMeasurements that count all of Measurements in full, by one kernel or none."""
     def all_of(kind):
         full = np.ones(len(kind.row))
-        return Accepted(weight=full, share=full, kernel=kernel)
+        return Accepted(full, full, kernel)
 
     return AcceptedMeasurements(all_of(measurements.sightings), all_of(measurements.ranges))

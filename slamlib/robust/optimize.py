@@ -80,11 +80,12 @@ def linearize(problem: Problem, equations: NormalEquations) -> gtsam.GaussianFac
     graph, is_pose = gtsam.GaussianFactorGraph(), equations.structure.is_pose
     q, calibration = problem.active.sum(), len(is_pose)
     width = 2 + is_pose
-    odometry, _ = linearize_odometry(problem, equations.state, problem.noise.slip)
+    variables = equations.structure.variables
+    odometry = linearize_odometry(problem, equations.state, problem.noise.slip)
     for factors in (odometry, *equations.linearized):
         by_c = np.zeros((*factors.e.shape, q))
         by_c[:, :, factors.columns] = factors.J_c
-        for k, (i, j) in enumerate(factors.connections.variables.tolist()):
+        for k, (i, j) in enumerate(variables[factors.index].tolist()):
             J = factors.J[k]
             terms = [i, J[:, :width[i]], j, J[:, 3:3 + width[j]]]
             if q:
@@ -100,7 +101,7 @@ def add_priors(graph: gtsam.GaussianFactorGraph, equations: NormalEquations, wid
     structure, priors = equations.structure, equations.priors
     root = np.sqrt(np.append(priors.H[structure.diagonal], np.ones(q)))
     e = priors.border[:, -1] / np.maximum(root, 1 / WEAK_SIGMA)
-    first = structure.rows(slice(None))[:, 0]
+    first = structure.rows[:, 0]
     for variable, (start, size) in enumerate(zip(first, width)):
         rows = slice(start, start + size)
         if root[start]:
