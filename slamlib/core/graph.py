@@ -159,10 +159,10 @@ def add_odometry(graph: gtsam.NonlinearFactorGraph, decisions: Decisions):
 def odometry_error(increments: OdometryIncrements, k: int, sigma_wheel: np.ndarray):
     """The error function of the increment k, for gtsam.CustomFactor.
 
-    With the scale s of the stated wheels over w, in heading times the ratio of the wheelbases, the
-    error is s log(Delta(w)^-1 X_i^-1 X_k): encoders measure counts, and an error of a count grows
-    with the wheels. Otherwise all lengths would be estimated too small where nothing else gives the
-    scale.
+    The error is s log(Delta(w)^-1 X_i^-1 X_k). The scale s of x and y is the mean stated radius
+    over that of w, and s of the heading is this times the wheelbase of w over the stated one:
+    encoders measure counts, and the error of a count in metres grows with the wheels. Without this
+    scale smaller wheels would fit better where nothing else gives the scale.
     """
     increment = increments.increment[k]
     J_wheel = increments.J_wheel[k]
@@ -208,8 +208,8 @@ def in_own_axes(pose: gtsam.Pose2) -> np.ndarray:
 def noise_model(covariance: np.ndarray, kernel: str, share: float) -> gtsam.noiseModel.Base:
     """GTSAM's noise of a measurement that keeps a share of its information, with a kernel.
 
-    The share multiplies the loss. It divides the covariance, and the kernel, whose argument it
-    changed so, becomes wider by its root.
+    The share multiplies the loss. The covariance is divided by it, which makes the argument of the
+    kernel smaller by its root, so the kernel is made narrower by the same root.
     """
     gaussian = gtsam.noiseModel.Gaussian.Covariance(covariance / share)
     robust = kernel_of(kernel, width=share**0.5)

@@ -145,7 +145,8 @@ def require_values(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values):
     """Raise DatasetError unless the values are those of the variables of the graph."""
     if not isinstance(graph, gtsam.NonlinearFactorGraph) or not isinstance(values, gtsam.Values):
         raise DatasetError("solve_graph: expected a gtsam.NonlinearFactorGraph and gtsam.Values")
-    variables, given = set(graph.keyVector()), set(values.keys())
+    variables = set(graph.keyVector())
+    given = set(values.keys())
     if not variables:
         raise DatasetError("solve_graph: expected factors, found none")
     for key in sorted(variables ^ given):
@@ -171,7 +172,8 @@ def gauss_newton(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> Gau
         stuck = new >= error and promised > negligible
         if error - new <= negligible:
             return GaussNewton(moved, new, steps, not stuck, Marginals(tree))
-        values, error = moved, new
+        values = moved
+        error = new
     return GaussNewton(values, error, MAX_STEPS, False, Marginals(tree))
 
 

@@ -39,7 +39,8 @@ def optimize(problem: Problem, state: State, max_steps: int = MAX_STEPS,
     if the measurements do not determine every variable.
     """
     equations = NormalEquations(problem, state)
-    steps, ended = 0, False
+    steps = 0
+    ended = False
     while steps < max_steps and not ended:
         steps += 1
         error = equations.error
@@ -53,7 +54,8 @@ def optimize(problem: Problem, state: State, max_steps: int = MAX_STEPS,
 
 def descended(equations: NormalEquations, step: np.ndarray) -> NormalEquations:
     """The NormalEquations after a step, halved until the error does not grow."""
-    problem, state = equations.problem, equations.state
+    problem = equations.problem
+    state = equations.state
     for halving in range(MAX_HALVINGS):
         moved = NormalEquations(problem, retract(problem, state, 0.5**halving * step))
         if moved.error <= (1 + ROUNDING) * equations.error:
@@ -68,7 +70,8 @@ def gtsam_step(problem: Problem, equations: NormalEquations) -> np.ndarray:
     """
     structure = problem.measurements.structure
     _, solution = eliminated(linearize(problem, equations))
-    n, q = len(structure.diagonal), problem.active.sum()
+    n = len(structure.diagonal)
+    q = problem.active.sum()
     step = np.zeros(n + q)
     keys = list(range(len(structure.is_pose) + bool(q)))
     step[np.concatenate([structure.unknowns, np.arange(n, n + q)])] = solution.vector(keys)
@@ -77,8 +80,10 @@ def gtsam_step(problem: Problem, equations: NormalEquations) -> np.ndarray:
 
 def linearize(problem: Problem, equations: NormalEquations) -> gtsam.GaussianFactorGraph:
     """The gtsam.GaussianFactorGraph of NormalEquations; keys number the variables, c is last."""
-    graph, is_pose = gtsam.GaussianFactorGraph(), equations.structure.is_pose
-    q, calibration = problem.active.sum(), len(is_pose)
+    graph = gtsam.GaussianFactorGraph()
+    is_pose = equations.structure.is_pose
+    q = problem.active.sum()
+    calibration = len(is_pose)
     width = 2 + is_pose
     variables = equations.structure.variables
     odometry = linearize_odometry(problem, equations.state, problem.noise.slip)
@@ -98,7 +103,8 @@ def linearize(problem: Problem, equations: NormalEquations) -> gtsam.GaussianFac
 def add_priors(graph: gtsam.GaussianFactorGraph, equations: NormalEquations, width: np.ndarray,
                q: int):
     """Add the priors of the variables, each of this width (v,), and of q unknowns of c."""
-    structure, priors = equations.structure, equations.priors
+    structure = equations.structure
+    priors = equations.priors
     root = np.sqrt(np.append(priors.H[structure.diagonal], np.ones(q)))
     e = priors.border[:, -1] / np.maximum(root, 1 / WEAK_SIGMA)
     first = structure.rows[:, 0]

@@ -1,10 +1,10 @@
 """Stage 7: what is handed in, GTSAM's solution of the graph that was decided.
 
 `decisions_of` states what the Fit of the deciding engine found, and `core.graph` builds the graph
-of it. What depends on unknown entries of the calibration besides the wheels, sightings or ranges
-whose group left its stated values, are custom factors, whose unknown entries are S(0) and R(0), in
-standard deviations from what is stated. Gauss-Newton starts from problem 1's odometry or, where
-this leads to a larger error than the engine's solution has, from this solution.
+of it. Sightings are custom factors where entries of their calibration are unknown; these entries
+are the variable S(0), in standard deviations from what is stated. Those of the ranges are R(0).
+Gauss-Newton starts from problem 1's odometry. Where it does not converge from there, or ends at a
+larger error than that of the engine's solution, it starts again from this solution.
 
 With probability p_k of point k of the noise's posterior, x_k its solution and C_k its covariance,
 poses and landmarks have the moments (equation 3.4)
@@ -153,15 +153,15 @@ def calibrated_ranges(problem: Problem, noise: Noise) -> UwbReadings | None:
 class CalibratedFactors:
     """Measurements of a kind as custom factors, which are linearised all at once.
 
-    A factor asks for the variables that it has. Where these are not those of the last
-    linearisation, all measurements whose variables the values have are linearised again.
+    Each factor keeps the values of its variables at the last linearisation. If it is asked at other
+    values, all measurements are linearised there: one call of numpy in place of thousands.
     """
 
     def __init__(self, problem: Problem, keys: list, calibration: int, columns: slice,
                  linearised: Callable):
-        """`keys` (m, 2) are of poses and landmarks; `linearised` makes errors and derivatives.
+        """Factors on `keys` (m, 2) of poses and landmarks.
 
-        `calibration` is the key of the unknown entries among these `columns` of c.
+        The function `linearised` returns errors and derivatives. `calibration` is the key of the unknown entries among these `columns` of c.
         """
         self.problem = problem
         self.keys = keys
