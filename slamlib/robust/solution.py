@@ -161,7 +161,8 @@ class CalibratedFactors:
                  linearised: Callable):
         """Factors on `keys` (m, 2) of poses and landmarks.
 
-        The function `linearised` returns errors and derivatives. `calibration` is the key of the unknown entries among these `columns` of c.
+        The function `linearised` returns errors and derivatives. `calibration` is the key of the
+        unknown entries among these `columns` of c.
         """
         self.problem = problem
         self.keys = keys
