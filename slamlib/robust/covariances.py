@@ -20,7 +20,7 @@ in the tangent space at the state that solves the problem of greatest posterior 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_solve_banded, cholesky_banded, solve_triangular
+from scipy.linalg import cholesky_banded, solve_triangular
 from scipy.sparse import csc_array, hstack, vstack
 
 from slamlib.robust.calibration import WHEELS
@@ -57,55 +57,72 @@ def marginal_covariances(equations: NormalEquations, noise: Noise) -> Covariance
     of_others = information[:, others]
     E = of_others[frames]
     F = of_others[others].toarray()
-    chain = _chain_cholesky(information[frames][:, frames])
+    chain = _decomposed(information[frames][:, frames])
     chunks = [slice(i, i + COLUMNS_AT_ONCE) for i in range(0, len(F), COLUMNS_AT_ONCE)]
     for chunk in chunks:
-        F[:, chunk] -= E.T @ cho_solve_banded(chain, E[:, chunk].toarray())
+        F[:, chunk] -= E.T @ chain.solve(E[:, chunk].toarray())
     C = solve_triangular(np.linalg.cholesky(F), np.eye(len(F)), lower=True).T
-    of_landmarks, of_active = np.split(C, [len(others) - problem.active.sum()])
+    size = len(F) - problem.active.sum()                 # of the landmarks
+    of_landmarks = C[:size].reshape(-1, 3, len(F))
     of_c = np.zeros((len(problem.sigma), len(F)))
-    of_c[problem.active] = problem.sigma[problem.active, None] * of_active
-    own, joint = _chain_inverse(chain)
+    of_c[problem.active] = problem.sigma[problem.active, None] * C[size:]
+    own, joint = chain.blocks()
     wheels = np.zeros_like(own)
     for chunk in chunks:
-        M = cho_solve_banded(chain, E @ C[:, chunk]).reshape(len(own), 3, -1)
+        M = chain.solve(E @ C[:, chunk]).reshape(len(own), 3, -1)
         own += M @ M.mT
         joint += M[:-1] @ M[1:].mT
         wheels -= M @ of_c[WHEELS, chunk].T
     c = of_c @ of_c.T
-    of_landmarks = of_landmarks.reshape(-1, 3, len(F))
     of_wheels = np.broadcast_to(c[WHEELS, WHEELS], joint.shape)
     pairs = np.block([[own[:-1], joint, wheels[:-1]], [joint.mT, own[1:], wheels[1:]],
                       [wheels[:-1].mT, wheels[1:].mT, of_wheels]])
     return Covariances(pairs=pairs, landmarks=of_landmarks @ of_landmarks.mT, c=c)
 
 
-def _chain_cholesky(T):
-    """The Cholesky factor of T (3 f, 3 f), block tridiagonal, as `cho_solve_banded` takes it."""
+@dataclass(frozen=True)
+class _Chain:
+    """The Cholesky decomposition L L^T of T (3 f, 3 f), block tridiagonal, with blocks (3, 3)."""
+
+    inverse: np.ndarray      # (f, 3, 3) L_ii^-1
+    W: np.ndarray            # (f-1, 3, 3) L_{i+1,i} L_ii^-1
+
+    def solve(self, b):
+        """T^-1 b of b (3 f, w): eliminated and substituted back block by block."""
+        x = b.reshape(len(self.inverse), 3, -1).copy()
+        for k, W in enumerate(self.W):
+            x[k + 1] -= W @ x[k]
+        x = self.inverse.mT @ (self.inverse @ x)
+        for k in reversed(range(len(self.W))):
+            x[k] -= self.W[k].T @ x[k + 1]
+        return x.reshape(b.shape)
+
+    def blocks(self):
+        """Blocks of T^-1, (f, 3, 3) on the diagonal and (f-1, 3, 3) above it.
+
+        From the last one on they are
+
+            Z_ii = L_ii^-T L_ii^-1 + W^T Z_{i+1,i+1} W,    Z_{i,i+1} = -W^T Z_{i+1,i+1}
+
+        (Takahashi, Fagan and Chin, Formation of a sparse bus impedance matrix, PICA 1973).
+        """
+        Z = self.inverse.mT @ self.inverse
+        for k in reversed(range(len(self.W))):
+            Z[k] += self.W[k].T @ Z[k + 1] @ self.W[k]
+        Z = (Z + Z.mT) / 2
+        return Z, -self.W.mT @ Z[1:]
+
+
+def _decomposed(T):
+    """The _Chain of T (3 f, 3 f)."""
     bands = [np.pad(T.diagonal(-k), (0, k))[:T.shape[0]] for k in range(6)]
-    return cholesky_banded(bands, lower=True), True
-
-
-def _chain_inverse(chain):
-    """Blocks (f, 3, 3) of T^-1 on the diagonal, and (f-1, 3, 3) above it, by `_chain_cholesky`.
-
-    With the Cholesky factor L of T and W = L_{i+1,i} L_ii^-1 they are, from the last one on,
-
-        Z_ii = L_ii^-T L_ii^-1 + W^T Z_{i+1,i+1} W,    Z_{i,i+1} = -W^T Z_{i+1,i+1}
-
-    (Takahashi, Fagan and Chin, Formation of a sparse bus impedance matrix, PICA 1973).
-    """
-    bands = chain[0].reshape(6, -1, 3)
-    i, j = np.indices((3, 3))
-    diagonal = np.tril(bands[np.abs(i - j), :, j].transpose(2, 0, 1))
-    below = bands[3 + i - j, :, j].transpose(2, 0, 1)
+    L = cholesky_banded(bands, lower=True).reshape(6, -1, 3)
+    column = np.tile(np.arange(3), (3, 1))
+    offset = column.T - column                           # of the row from the column
+    diagonal = np.tril(L[np.abs(offset), :, column].transpose(2, 0, 1))
+    below = L[3 + offset, :, column].transpose(2, 0, 1)
     inverse = np.linalg.inv(diagonal)
-    W = (below @ inverse)[:-1]
-    Z = inverse.mT @ inverse
-    for k in reversed(range(len(W))):
-        Z[k] += W[k].T @ Z[k + 1] @ W[k]
-    Z = (Z + Z.mT) / 2
-    return Z, -W.mT @ Z[1:]
+    return _Chain(inverse, (below @ inverse)[:-1])
 
 
 def posterior_moments(fit: Fit) -> tuple[State, Covariances, float]:

@@ -56,17 +56,17 @@ def odometry_error(
     Also their derivatives (f-1, 3, 6) by X_i and X_{i+1}, and (f-1, 3, 3) by the columns WHEELS of
     the calibration. The errors are not whitened.
 
-    With `in_counts` they are those of the counts, which have the noise Q. Q is in metres and
-    radians by the stated wheels. A count is worth a way proportional to the mean radius R, and a
-    turn proportional to R over the wheelbase b. The errors e(w) in metres and radians by the wheels
-    w, which are smaller for smaller wheels, are therefore scaled to the stated wheels:
+    With `in_counts` they are scaled to the stated wheels. Encoders measure counts, and Q is the
+    noise of the counts, in metres and radians by the stated wheels. With the mean radius R and the
+    wheelbase b of the wheels w, a count is a distance proportional to R and a turn proportional to
+    R / b. So the errors e(w) shrink with R while Q does not, and all lengths would be estimated too
+    small where nothing else gives the scale. The errors by the stated wheels do not shrink:
 
-        s(w) e(w),    s = R_stated / R [1, 1, b / b_stated].
+        s(w) e(w),    s(w) = R_stated / R [1, 1, b / b_stated].
 
-    Otherwise all lengths would be estimated too small where nothing else gives the scale. With
-    r = d log s / dw, the product is linearised at the wheels w_0 of the increments,
+    To first order about the wheels w_0, at which the increments are linearised, they are
 
-        s(w) e(w) = s(w_0) (e(w) + r (w - w_0) e(w_0)).
+        s(w) e(w) = s(w_0) (e(w) + r (w - w_0) e(w_0)),    r = d log s / dw.
     """
     change = wheel - factors.wheel
     measured = factors.increment + factors.J_wheel @ change
@@ -88,8 +88,10 @@ def odometry_error(
     r[2, 2] = 1 / factors.wheel[2]
     growth = r @ change
     e_0 = e - by_wheel @ change
-    return (s * (e + growth * e_0), (s * (1 + growth))[:, None] * by_poses,
-            s[:, None] * (by_wheel + r * e_0[:, :, None]))
+    e = s * (e + growth * e_0)
+    by_poses = (s * (1 + growth))[:, None] * by_poses
+    by_wheel = s[:, None] * (by_wheel + r * e_0[:, :, None])
+    return e, by_poses, by_wheel
 
 
 @dataclass(frozen=True)
@@ -145,8 +147,8 @@ def _linearized_ranges(problem, state):
     e, by_pose, by_antenna, by_c = range_error(
         m.ranges.distance[rows], state.poses[frame], motion, velocity, state.antennas,
         m.ranges.antenna[rows], state.c)
-    by_heading = np.zeros_like(e)                        # antennas have none
-    J = np.concatenate([by_pose, by_antenna, by_heading[:, :, None]], axis=2)
+    by_heading = np.zeros((len(e), 1, 1))                # antennas have none
+    J = np.concatenate([by_pose, by_antenna, by_heading], axis=2)
     index = len(m.frame) - 1 + len(m.marker_row) + rows
     U = 1 / m.ranges.sigma[rows, None, None]
     factors = _whitened(problem, index, RANGES, U, e, J, by_c)
@@ -236,8 +238,8 @@ def range_error(
     distance = np.sqrt(np.maximum(squared, MIN_DISTANCE**2))
     slope = np.where(squared > MIN_DISTANCE**2, c[SCALE] / distance, 0.0)
     by_antenna = (slope[:, None] * difference)[:, None]              # in the world
-    by_Y = np.zeros((len(r), 1, 3))
-    by_Y[:, :, :2] = -by_antenna @ se2.rotation(Y[:, 2])
+    by_place = -by_antenna @ se2.rotation(Y[:, 2])
+    by_Y = np.pad(by_place, ((0, 0), (0, 0), (0, 1)))
     by_pose, by_tag, by_lag = _by_sensor(by_Y, mounted, tag, velocity)
     by_offset = np.eye(len(antennas))[antenna]
     by_c = np.column_stack([by_tag[:, 0, :2], slope, np.ones(len(r)), distance, by_lag[:, 0],

@@ -64,7 +64,7 @@ def state_from_arrays(measurements: Measurements, poses: np.ndarray, markers: np
     poses[:, 2] = odometry.cumulative(turn + correction, se2.wrap(poses[0, 2]))
     markers = np.array(markers, dtype=float)
     markers[~measurements.oriented, 2] = 0
-    return State(poses=poses, markers=markers, antennas=np.asarray(antennas), c=c)
+    return State(poses, markers, np.asarray(antennas), c)
 
 
 @dataclass(frozen=True)
@@ -208,7 +208,7 @@ class NormalEquations:
         e[antenna, :2] = state.antennas - m.guess
         sigma[antenna, :2] = GUESS_PRIOR_SIGMA
         sigma[~structure.is_pose, 2] = 1                 # what points do not have
-        precision = sigma**-2
+        precision = 1 / sigma**2
         active = self.problem.active
         e_c = (state.c - m.calibration.stated)[active] / self.problem.sigma[active]
         q = len(e_c)
@@ -246,13 +246,13 @@ class NormalEquations:
         J_t = factors.J.mT
         J_c_e = np.concatenate([factors.J_c, factors.e[:, :, None]], axis=2)
         in_blocks = (J_t @ factors.J).reshape(-1, 2, 3, 2, 3).swapaxes(2, 3)
-        H = _summed_by(structure.blocks[factors.index], in_blocks.reshape(-1, 9),
-                       structure.places.nnz // 9)
+        blocks = structure.blocks[factors.index]
+        H = _summed_by(blocks, in_blocks.reshape(-1, 9), structure.places.nnz // 9)
+        rows = structure.rows[structure.variables[factors.index]]
         columns = np.append(factors.columns, q)
+        in_rows = (J_t @ J_c_e).reshape(-1, len(columns))
         border = np.zeros((n + q, q + 1))
-        border[:n, columns] = _summed_by(
-            structure.rows[structure.variables[factors.index]],
-            (J_t @ J_c_e).reshape(-1, len(columns)), n)
+        border[:n, columns] = _summed_by(rows, in_rows, n)
         border[n + factors.columns[:, None], columns] = np.tensordot(
             factors.J_c, J_c_e, ([0, 1], [0, 1]))
         return Sums(H.ravel(), border, np.sum(factors.e**2), factors.log_determinant)
@@ -263,9 +263,9 @@ def _summed_by(number, values, count):
 
     As a product with a matrix that has a 1 in each column.
     """
-    columns = np.arange(number.size + 1)
-    return csc_array((np.ones(number.size), number.ravel(), columns),
-                     (count, number.size)) @ values
+    starts = np.arange(number.size + 1)                  # of the columns
+    ones = csc_array((np.ones(number.size), number.ravel(), starts), (count, number.size))
+    return ones @ values
 
 
 def linear_solution(structure: Structure, sums: Sums) -> LinearSolution | None:
@@ -328,6 +328,6 @@ def consistency_factor(kernel: mEstimator.Base | None, size: int = 1) -> float:
     if kernel is None:
         return 1.0
     r = np.linspace(-6 if size == 1 else 0, 6, 241)
-    weight = np.array([kernel.weight(x) for x in r])
-    density = r**(size - 1) * np.exp(-r**2 / 2) * weight
-    return float(np.sum(r**2 * density) / np.sum(density)) / size
+    normal = r**(size - 1) * np.exp(-r**2 / 2)
+    weighted = normal * [kernel.weight(x) for x in r]
+    return np.sum(r**2 * weighted) / np.sum(weighted) / size
