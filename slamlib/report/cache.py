@@ -23,6 +23,7 @@ from slamlib.studies import runs as memory
 from slamlib.studies.runs import digest
 
 VARIABLES = "SLAMLIB_"  # begins the environment variables that are heeded
+IGNORED = "SLAMLIB_STUDIES"  # where studies are kept does not matter
 UNSEEN = re.compile(r"(^|/)(\.|__pycache__/)|^(build|report|results)/|\.ipynb$")  # paths
 HEEDED_TAGS = {"raises-exception", LAB_ONLY}  # the tags of cells that nbclient heeds
 VERSIONS = 4  # of each notebook, the last used
@@ -39,7 +40,7 @@ def keys(books: Books, datasets: list[Path], environment: dict[str, str]) -> dic
     packages = {path.name for folder in sys.path for path in Path(folder).glob("*.dist-info")
                 if not path.name.startswith("slamlib-")}
     heeded = {name: environment[name] for name in sorted(environment)
-              if name.startswith(VARIABLES)}
+              if name.startswith(VARIABLES) and name != IGNORED}
     common = [sys.version, platform.platform(), sorted(packages), heeded,
               _digests(notebooks, datasets)]
     found = {}
