@@ -10,15 +10,12 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from slamlib.core.graph_solution import eliminated
+from slamlib.core.graph_solution import CONVERGED, MAX_HALVINGS, ROUNDING, eliminated
 from slamlib.robust.factors import linearize_odometry
 from slamlib.robust.linear import NormalEquations, Problem, State, retract
 from slamlib.robust.measurements import WEAK_SIGMA
 
-CONVERGED = 1e-6             # decrease, over 1 + error, at which iterations end
-ROUNDING = 1e-12             # relative increase of the error that is due to float rounding
 MAX_STEPS = 40               # number of steps of Gauss-Newton
-MAX_HALVINGS = 8             # number of halvings of one step
 
 
 @dataclass(frozen=True)
