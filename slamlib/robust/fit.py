@@ -44,6 +44,7 @@ MAX_ROUNDS = 6               # number of rounds of wheels, noise and accepted me
 NEGLIGIBLE_MOVE = 3e-3       # relative, of a wheel parameter since odometry was linearised
 SETTLED_MOVE = 1e-4          # the same, at the solution that is handed in
 NEGLIGIBLE_CHANGE = 1e-3     # share of the measurements whose weight may change at the same noise
+SIMILAR_SHARE = 0.1          # relative change of a share of memory that is none
 
 
 def accepted_measurements(
@@ -159,8 +160,7 @@ class Fit:
     @property
     def log_density(self) -> float:
         """Log posterior density of the noise, or log evidence if all of it is known."""
-        learned = self.posterior is not None and (self.problem.accepted.share == 1).all()
-        return self.posterior.log_density if learned else self.log_evidence
+        return self.log_evidence if self.posterior is None else self.posterior.log_density
 
 
 def refine(problem: Problem, state: State,
@@ -168,34 +168,37 @@ def refine(problem: Problem, state: State,
     """The Fit in which wheels, noise and accepted measurements agree with each other.
 
     They depend on each other, so each is updated in turn until the accepted measurements no longer
-    change. The share that memory leaves of their information is found at the end, with the noise as
-    it is. From a Problem and a State near its solution. `accept` makes AcceptedMeasurements from
-    Problem and State; None keeps those of the problem. Raises DatasetError as `optimize`, and
-    numpy.linalg.LinAlgError if odometry's covariance is singular.
+    change. From a Problem and a State near its solution. `accept` makes AcceptedMeasurements from
+    Problem and State; None keeps those of the problem, with their shares. Raises DatasetError as
+    `optimize`, and numpy.linalg.LinAlgError if odometry's covariance is singular.
+
+    Slow errors of sensors and slip explain the same residuals. If `problem.memory_first`, the share
+    that memory leaves of a measurement's information is found together with the noise, from its
+    start values on; else at the end, for the noise as it was learned without.
     """
-    is_given = accept is None
-    shares = [kind.share for kind in problem.accepted]
-    if is_given:
-        given = problem.accepted.with_shares(map(np.ones_like, shares))
-        accept = lambda *_: given
-    else:
-        problem = replace(problem, noise=noise_of_scatter(problem, state))
-    problem, optimum, posterior = _settle(problem, state, accept)
-    if not is_given:
-        shares = _shares_of_memory(problem, optimum.state, accept)
-    if any((share < 1).any() for share in shares):
-        problem, posterior = _apply_memory(problem, optimum.state, posterior, shares, accept)
-        optimum = optimize(problem, optimum.state)
-    _, log_evidence = laplace_approximation(optimum.equations, problem.noise)
-    return Fit(problem=problem, state=optimum.state, log_evidence=log_evidence, posterior=posterior,
-               converged=optimum.converged)
+    if accept is None:
+        given = problem.accepted
+        return _settled_fit(problem, state, lambda *_: given)
+    problem = replace(problem, noise=noise_of_scatter(problem, state))
+
+    def with_memory(problem, state):
+        return _accepted_with_memory(problem, state, accept)
+
+    if problem.memory_first:
+        return _settled_fit(problem, state, with_memory)
+    fit = _settled_fit(problem, state, accept)
+    accepted = with_memory(fit.problem, fit.state)
+    if not (accepted.share < 1).any():
+        return fit
+    problem, posterior = _with_hidden_errors(
+        replace(fit.problem, accepted=accepted), fit.posterior)
+    return _fit(problem, optimize(problem, fit.state), posterior)
 
 
-def _settle(problem, state, accept):
-    """The Problem and its Optimum after rounds of wheels, noise and accepted measurements.
+def _settled_fit(problem, state, accept):
+    """The Fit after rounds of wheels, noise and accepted measurements.
 
-    Also the last posterior of the noise. The Problem has the measurements that `accept` made before
-    the last solution.
+    The Problem has the measurements that `accept` made before the last solution.
     """
     m = problem.measurements
     posterior = None
@@ -205,11 +208,12 @@ def _settle(problem, state, accept):
         problem = _relinearized(replace(problem, accepted=accepted), state)
         if m.learned.any() and changed > NEGLIGIBLE_CHANGE * len(accepted.share):
             problem, state, posterior = _settle_noise(problem, state)
+        problem, posterior = _with_hidden_errors(problem, posterior)
         problem = _with_errors_in_counts(problem)
         optimum = optimize(problem, state)
         state = optimum.state
         accepted = accept(problem, state)
-        changed = sum(np.count_nonzero(new.weight != old.weight)
+        changed = sum(np.count_nonzero(_has_changed(new, old))
                       for new, old in zip(accepted, problem.accepted))
         log.info("round %d: slip %.3g mm after 1 m, factors %.3g and %.3g; accepted %d of %d "
                  "sightings, %d of %d ranges, %d changed", number, 1e3 * problem.noise.slip,
@@ -218,7 +222,19 @@ def _settle(problem, state, accept):
                  np.count_nonzero(accepted.ranges.weight), len(accepted.ranges.weight), changed)
         if changed == 0 and _wheel_move(problem, state) < NEGLIGIBLE_MOVE:
             break
-    return problem, optimum, posterior
+    return _fit(problem, optimum, posterior)
+
+
+def _has_changed(new, old):
+    """Which measurements (m,) are Accepted otherwise, or with another share of memory."""
+    return (new.weight != old.weight) | (np.abs(new.share / old.share - 1) > SIMILAR_SHARE)
+
+
+def _fit(problem, optimum, posterior):
+    """The Fit of a Problem with its Optimum."""
+    _, log_evidence = laplace_approximation(optimum.equations, problem.noise)
+    return Fit(problem=problem, state=optimum.state, log_evidence=log_evidence, posterior=posterior,
+               converged=optimum.converged)
 
 
 def _relinearized(problem, state):
@@ -260,27 +276,35 @@ def settled(fit: Fit) -> Fit:
     return fit
 
 
-def _shares_of_memory(problem, state, accept):
-    """Shares (s,) and (r,) that memory leaves of the information of sightings and of ranges.
+def _accepted_with_memory(problem, state, accept):
+    """The AcceptedMeasurements with the shares that memory leaves of their information.
 
-    At a solution, for standard deviations that include what residuals do not show.
+    For standard deviations that include what residuals do not show.
     """
     noise = with_hidden_errors(problem.noise, (True, True), problem.measurements.dataset.vehicle)
     hidden = replace(problem, noise=noise)
     hidden = replace(hidden, accepted=accept(hidden, state))
-    return [memory.share for memory in error_memories(hidden, state)]
+    shares = [memory.share for memory in error_memories(hidden, state)]
+    remember = _remember(shares)
+    if any(remember):
+        noise = with_hidden_errors(problem.noise, remember, problem.measurements.dataset.vehicle)
+    return accept(replace(problem, noise=noise), state).with_shares(shares)
 
 
-def _apply_memory(problem, state, posterior, shares, accept):
-    """The Problem with shares (s,) and (r,) of errors with memory, and its noise's posterior."""
+def _remember(shares):
+    """Whether the errors of sightings, and those of ranges, have memory, by shares (s,), (r,)."""
+    return [bool((share < 1).any()) for share in shares]
+
+
+def _with_hidden_errors(problem, posterior):
+    """The Problem whose noise includes hidden errors of what has memory, and its posterior."""
+    remember = _remember([kind.share for kind in problem.accepted])
     vehicle = problem.measurements.dataset.vehicle
-    remember = [(share < 1).any() for share in shares]
 
     def hidden(noise):
         return with_hidden_errors(noise, remember, vehicle)
 
     problem = replace(problem, noise=hidden(problem.noise))
-    problem = replace(problem, accepted=accept(problem, state).with_shares(shares))
     if posterior is not None:
         points = tuple((weight, hidden(noise)) for weight, noise in posterior.points)
         posterior = replace(posterior, noise=problem.noise, points=points)

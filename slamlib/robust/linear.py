@@ -77,6 +77,7 @@ class Problem:
     noise: Noise
     sigma: np.ndarray        # (p,) of the prior of the calibration, 0 of what is known
     released: frozenset = frozenset()    # groups of the calibration beyond their stated sigmas
+    memory_first: bool = True    # whether slow errors are sought before the noise is learned
 
     @property
     def active(self) -> np.ndarray:
