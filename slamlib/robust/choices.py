@@ -34,7 +34,13 @@ from slamlib.robust.error_memory import runs
 from slamlib.robust.factors import odometry_error, preintegrate_odometry
 from slamlib.robust.fit import Fit, accepted_measurements, refine, residuals
 from slamlib.robust.jumps import NO_JUMPS, Jumps, find_jumps
-from slamlib.robust.linear import NormalEquations, laplace_approximation, linear_solution
+from slamlib.robust.linear import (
+    NormalEquations,
+    Problem,
+    State,
+    laplace_approximation,
+    linear_solution,
+)
 from slamlib.robust.result import slam_result
 
 log = logging.getLogger(__name__)
@@ -50,12 +56,42 @@ MIN_INFORMATION = 1e-3       # about an entry, in wide sigmas, below which it is
 MAX_PROPOSALS = 5            # number of sets that are solved
 MIN_JUMP_LEAD = 10.0         # log evidence by which a jump found at the solution is believed
 
+PLAUSIBLE_FACTOR = 2.0       # on standard deviations, beyond which a sensor is not believed slow
+MAX_CONTRADICTING = 0.01     # share of the measurements, by which a small slip may contradict more
+
 VISIT_GAP = 30               # typical intervals between sightings of a marker, that end a visit
 MIN_VISIT = 3                # number of accepted sightings of a visit that is compared
 MAX_REJECTED_SHARE = 0.5     # of the sightings of a visit
 MAX_STILL_REJECTED = 0.5     # of the rejected sightings, by an explanation that is believed
 PLACE_GATE = 60.0            # squared distance of x, y, heading in sigmas, beyond it another place
 MIN_SIGMA = 0.02             # m or rad, of the path between two visits
+
+
+def memory_or_slip(problem: Problem, state: State) -> Fit:
+    """The Fit of a Problem, near its solution, in which slow errors are memory or else slip.
+
+    Slow errors of sensors bend the path as a large slip does. A small slip is more probable, so
+    memory is sought first, unless measurements then contradict the path even if their standard
+    deviations were PLAUSIBLE_FACTOR times those in the files, where with a larger slip they do not.
+    """
+    fit = refine(problem, state)
+    if not (fit.problem.accepted.share < 1).any():
+        return fit
+    other = refine(replace(problem, memory_first=False), state)
+    by_memory = _contradicting_share(fit)
+    by_slip = _contradicting_share(other)
+    is_slip = by_memory > MAX_CONTRADICTING + by_slip / MAX_STILL_REJECTED
+    log.info("memory first: slip %.3g mm after 1 m, %.1f %% contradict; slip first: %.3g mm, %.1f "
+             "%%: %s", 1e3 * fit.problem.noise.slip, 100 * by_memory,
+             1e3 * other.problem.noise.slip, 100 * by_slip, "slip" if is_slip else "memory")
+    return other if is_slip else fit
+
+
+def _contradicting_share(fit):
+    """Share of all measurements that a Fit rejects at PLAUSIBLE_FACTOR."""
+    noise = fit.problem.noise._replace(sightings=PLAUSIBLE_FACTOR, ranges=PLAUSIBLE_FACTOR)
+    accepted = accepted_measurements(replace(fit.problem, noise=noise), fit.state)
+    return np.mean(np.concatenate([kind.weight for kind in accepted]) == 0)
 
 
 def better_model(fit: Fit) -> Fit:

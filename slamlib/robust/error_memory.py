@@ -6,11 +6,13 @@ as one. With the correlation rho of the errors of two measurements of a landmark
 share 1 / (1 + sum of rho with all others) of its information (the design effect: Kish, Survey
 Sampling, 1965, section 5.4).
 
-The landmark takes over what all its errors have in common, and this mean has the variance that the
+A marker takes over what all its errors have in common, and this mean has the variance that the
 residuals lack. So it is added: at each lag, for residuals u in the standard deviations of the
 errors,
 
     rho = mean of u u' + 1 - mean of u^2.
+
+Nothing is added for an antenna: what its ranges have in common is an entry of the calibration.
 
 The residuals of n independent errors of a landmark correlate by -1/n without their mean, so (1 -
 correlation) / n is added to the correlation of neighbours, by which memory is recognised.
@@ -63,10 +65,11 @@ def runs(landmark: np.ndarray, pose: np.ndarray, max_pause: float) -> tuple[floa
 
 
 def error_memory(landmark: np.ndarray, pose: np.ndarray, u: np.ndarray,
-                 used: np.ndarray) -> Memory:
+                 used: np.ndarray, hides_mean: bool) -> Memory:
     """The Memory of measurements of `landmark` (m,), rows or ids, at encoder poses (m,).
 
     u (m, d) are residuals in standard deviations of the errors; those not `used` (m,) do not count.
+    `hides_mean` is whether the landmark takes over the mean of its errors.
     """
     rows = np.flatnonzero(used)
     rows = rows[np.lexsort((pose[rows], landmark[rows]))]
@@ -85,7 +88,7 @@ def error_memory(landmark: np.ndarray, pose: np.ndarray, u: np.ndarray,
     neighbours = count[1] * u.shape[1]
     sigma = 1 / np.sqrt(max(neighbours, 1))
     if correlation >= max(MIN_CORRELATION, MIN_SIGNIFICANCE * sigma):
-        rho = covariance + max(0.0, 1 - variance)
+        rho = covariance + hides_mean * max(0.0, 1 - variance)
         remembered = (rho >= MIN_RHO) & (count >= MIN_PAIRS)
         remembered[0] = True                         # pairs of less than half an interval
         rho[~np.logical_and.accumulate(remembered)] = 0.0

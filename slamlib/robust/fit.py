@@ -99,9 +99,10 @@ def error_memories(problem: Problem, state: State) -> tuple[Memory, Memory]:
     residual, late = residuals(problem, state)
     is_direct = np.abs(late) < MAX_DIRECT
     of_sightings = error_memory(
-        m.marker_row, m.frame[m.sightings.row], residual, sightings.weight > 0)
+        m.marker_row, m.frame[m.sightings.row], residual, sightings.weight > 0, hides_mean=True)
     of_ranges = error_memory(
-        m.ranges.antenna, m.frame[m.ranges.row], late[:, None], is_direct & (ranges.weight > 0))
+        m.ranges.antenna, m.frame[m.ranges.row], late[:, None], is_direct & (ranges.weight > 0),
+        hides_mean=False)
     return of_sightings, of_ranges
 
 

@@ -16,7 +16,7 @@ from slamlib.core.graph import require_rows
 from slamlib.core.odometry import MODELS
 from slamlib.core.records import Dataset
 from slamlib.core.vehicle import changed
-from slamlib.robust.choices import better_model, calibrated, most_consistent
+from slamlib.robust.choices import better_model, calibrated, memory_or_slip, most_consistent
 from slamlib.robust.fit import CAUCHY_SCALES, Fit, narrow_kernels, refine, settled
 from slamlib.robust.initialization import initial_state, state_from_poses
 from slamlib.robust.jumps import NO_JUMPS
@@ -122,22 +122,7 @@ def fit_from_odometry(measurements: Measurements, model: str = "arc") -> Fit:
     """The Fit of Measurements with start values by odometry; raises DatasetError as `estimate`."""
     problem = build_problem(measurements, model)                                      # 2
     state = narrow_kernels(problem, initial_state(measurements, model))               # 4, 5
-    fit = refine(problem, state)                                                      # 6
-    import os
-    if os.environ.get("ONLY") and (fit.problem.accepted.share < 1).any() or os.environ.get("ONLY") == "now":
-        return fit if os.environ.get("ONLY") == "slow" else refine(replace(problem, memory_first=False), state)
-    if (fit.problem.accepted.share < 1).any():
-        other = refine(replace(problem, memory_first=False), state)
-        if rejects_less(other, fit):
-            return other
-    return fit
-
-
-def rejects_less(fit, other):
-    def rejected(fit):
-        return np.mean(fit.problem.accepted.sightings.weight == 0) if len(fit.problem.accepted.sightings.weight) else 0.0
-    log.info("memory at the end: %.4f rejected; memory first %.4f; slip %.3g %.3g", rejected(fit), rejected(other), 1e3*fit.problem.noise.slip, 1e3*other.problem.noise.slip)
-    return rejected(other) > 2 * rejected(fit) + 0.01
+    return memory_or_slip(problem, state)                                             # 6
 
 
 def fit_from_previous(measurements: Measurements, previous: SlamResult,
