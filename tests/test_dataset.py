@@ -184,12 +184,6 @@ def test_ids_may_be_negative_or_huge(folder):
     assert data.antenna_guess.antenna.tolist() == [-huge, huge]
 
 
-def test_covariances_may_be_of_a_marker_whose_orientation_is_not_seen(folder):
-    write(folder / "ArucoReading.txt", "1 40 0 0 0 1e-17 0 5e-8 1e-17 0 1e4\n")
-    np.testing.assert_array_equal(read_dataset(folder).aruco.covariance[0],
-                                  array("1e-17 0 5e-8; 0 1e-17 0; 5e-8 0 1e4"))
-
-
 def test_rows_are_in_the_order_of_poses_and_at_a_pose_in_that_of_the_file(folder):
     rows = [f"{2 - i % 2} {i} 0 0 0 1 0 0 1 0 1" for i in range(300)]
     write(folder / "ArucoReading.txt", "\n".join(rows))
@@ -207,17 +201,11 @@ def test_rows_that_repeat_count_once_with_a_note(folder):
 # Limits; test_dialects.py has numbers beyond them.
 
 
-def test_a_limit_is_a_closed_interval():
-    limit = Limit(-2, 3)
-    assert limit.holds(np.array([-2, 3])).all()
-    assert not limit.holds(np.nextafter([-2, 3, 0], [-3, 4, np.nan])).any()
-
-
 @pytest.mark.parametrize("name", LIMITS)
 def test_rows_at_the_limits_are_right_and_beyond_them_wrong(name):
     for k, limit in enumerate(LIMITS[name].values()):
         rows = np.zeros((4, len(LIMITS[name])))
-        rows[:, k] = limit.minimum, limit.maximum, 1.001 * limit.maximum, np.nan
+        rows[:, k] = limit.minimum, limit.maximum, np.nextafter(limit.maximum, np.inf), np.nan
         right = list(within(rows, LIMITS[name]).values())[k]
         assert right.tolist() == [True, True, False, False]
 
@@ -252,12 +240,6 @@ def test_what_is_no_folder_is_named(folder, name, read):
     assert error_of(read, folder / name) == f"{folder / name}: expected a folder that can be read"
 
 
-def test_truth_that_is_no_folder_is_named(folder):
-    (folder / "truth").rename(folder / "true")
-    write(folder / "truth", "1 0 0 0\n")
-    assert "truth: expected a folder" in error_of(read_truth, folder)
-
-
 @pytest.mark.parametrize("target", ["nothing", "/dev/zero", "pipe", "secret"])
 @pytest.mark.parametrize("name", ["ArucoReading.txt", "vehicle.toml"])
 def test_files_that_cannot_be_read_are_refused_and_not_waited_for(folder, name, target,
@@ -288,7 +270,7 @@ def write_counts(folder, ticks):
 
 
 DRIVES = {
-    "at constant speed": np.full((100, 2), 132), "not at all": np.zeros((100, 2)),
+    "not at all": np.zeros((100, 2)),
     "with one wheel still": np.tile([0, 132], (100, 1)),
     "after a rest": np.repeat([[0, 0], [132, 90]], 50, axis=0),
     "to and fro": np.repeat([[132, 132], [-132, -132]], 50, axis=0),

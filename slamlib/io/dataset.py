@@ -23,8 +23,7 @@ from slamlib.io.formats import (
     ENCODER,
     GUESS,
     LIMITS,
-    TRUE_ANTENNAS,
-    TRUE_MARKERS,
+    TRUE_MAPS,
     TRUE_POSES,
     TRUTH_FILES,
     UWB,
@@ -85,8 +84,7 @@ def _dataset(files, vehicle, name, notes=()):
     if UWB in files and GUESS not in files:
         del files[UWB]
         notes += (f"{GUESS} is missing: problem 4 is left out.",)
-    encoders = read_table(files[ENCODER], ENCODER)
-    encoders, ticks = _incremental_counts(encoders, vehicle)
+    encoders, ticks = _incremental_counts(read_table(files[ENCODER], ENCODER), vehicle)
     sightings = read_table(files.get(ARUCO), ARUCO, len(ticks))
     guesses = read_table(files.get(GUESS), GUESS)
     ranges = read_table(files.get(UWB), UWB, len(ticks))
@@ -160,8 +158,7 @@ def read_truth(folder: Path | str) -> Truth | None:
         return None
     files, notes = contents(drive["truth"], TRUTH_FILES, required=TRUE_POSES)
     path = read_table(files[TRUE_POSES], TRUE_POSES)
-    markers = read_table(files.get(TRUE_MARKERS), TRUE_MARKERS)
-    antennas = read_table(files.get(TRUE_ANTENNAS), TRUE_ANTENNAS)
+    markers, antennas = [read_table(files.get(name), name) for name in TRUE_MAPS]
     count = len(read_table(drive[ENCODER], ENCODER).numbers)
     poses = path.numbers[:, 1:]
     require(len(poses) == count, path.source, f"{count} poses (encoder file), found {len(poses)}")

@@ -171,9 +171,8 @@ def contents(folder: Path | str, expected: tuple[str, ...] = DATASET_FILES,
                 require(name not in files, path, f"only one {name}", files.get(name, path).name)
                 files[name] = path
     for path in paths:
-        for name, table in _matrices(path).items():
-            if name in expected and name not in files:
-                files[name] = table
+        missing = [name for name in LIMITS if name in expected and name not in files]
+        files |= _matrices(path, missing)
     notes = [f"{source.name} was read as {name}." for name, source in files.items()
              if source.name.lower() != name.lower()]
     used = [source.name.split(",")[0] for source in files.values()]
@@ -184,8 +183,8 @@ def contents(folder: Path | str, expected: tuple[str, ...] = DATASET_FILES,
     return files, tuple(notes + not_read)
 
 
-def _matrices(path):
-    """Tables of the matrices of a .mat file that are called as files are, by name (dict)."""
+def _matrices(path, names):
+    """Tables (dict by name) of the matrices of a .mat file that have the stems of `names`."""
     tables = {}
     if path.suffix.lower() != ".mat" or not path.is_file():
         return tables
@@ -194,9 +193,10 @@ def _matrices(path):
     except Exception:  # scipy raises many kinds about other versions and bytes
         return tables
     for variable, value in variables.items():
-        for name, columns in LIMITS.items():
+        for name in names:
             if variable.lower() == Path(name).stem.lower():
-                tables[name] = table_of_array(f"{path}, variable {variable}", value, columns)
+                source = f"{path}, variable {variable}"
+                tables[name] = table_of_array(source, value, LIMITS[name])
     return tables
 
 
