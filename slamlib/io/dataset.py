@@ -92,15 +92,13 @@ def _dataset(files, vehicle, name, notes=()):
     ranges = ranges.drop_rows({f"an antenna id of {guesses.name}": is_guessed})
     guess = None
     if len(guesses.numbers) > 0:
-        guess = AntennaGuess(guesses.numbers[:, 0].astype(int), guesses.numbers[:, 1:])
+        guess = AntennaGuess(guesses.ids(0), guesses.numbers[:, 1:])
     seen = sightings.numbers
     heard = ranges.numbers
     dataset = Dataset(
         name, vehicle, ticks,
-        ArucoReadings(seen[:, 0].astype(int) - 1, seen[:, 1].astype(int), seen[:, 2:5],
-                      seen[:, COVARIANCE]),
-        UwbReadings(heard[:, 0].astype(int) - 1, heard[:, 1].astype(int), heard[:, 2],
-                    heard[:, 3]),
+        ArucoReadings(sightings.ids(0) - 1, sightings.ids(1), seen[:, 2:5], seen[:, COVARIANCE]),
+        UwbReadings(ranges.ids(0) - 1, ranges.ids(1), heard[:, 2], heard[:, 3]),
         guess, notes + encoders.notes + sightings.notes + ranges.notes + guesses.notes)
     return dataset.first(len(ticks))  # in which a sensor without readings is None
 
@@ -176,10 +174,8 @@ def read_truth(folder: Path | str) -> Truth | None:
             "of its first pose, in which the estimates are".format(*origin))
     vehicle = _read_vehicle(files.get(VEHICLE), _read_vehicle(drive.get(VEHICLE), TABLE_2))
     notes += path.notes + markers.notes + antennas.notes
-    return Truth(
-        poses, markers.numbers[:, 0].astype(int), marker_in_world,
-        antennas.numbers[:, 0].astype(int), antenna_in_world, vehicle,
-        tuple(f"In truth: {note}" for note in notes))
+    return Truth(poses, markers.ids(0), marker_in_world, antennas.ids(0), antenna_in_world,
+                 vehicle, tuple(f"In truth: {note}" for note in notes))
 
 
 def all_notes(dataset: Dataset, truth: Truth | None) -> tuple[str, ...]:

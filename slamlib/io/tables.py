@@ -71,6 +71,10 @@ class Table:
             raise DatasetError(f"{self.source}, {fault}")
         return self.rows(ok).noted(f": {dropped} of {len(ok)} rows left out, the first in {fault}")
 
+    def ids(self, column: int) -> np.ndarray:
+        """The whole numbers of a column, (m,) int64."""
+        return self.numbers[:, column].astype(np.int64)
+
     def rows(self, which: np.ndarray) -> "Table":
         """The Table of rows by a mask or indices."""
         return replace(self, numbers=self.numbers[which], lines=self.lines[which])
