@@ -13,7 +13,7 @@ from pathlib import Path
 from slamlib.core.errors import DatasetError, require
 
 _COMMENT_OR_QUOTE = r'(#|%|//).*|"'
-_BLANKS_AT_SEPARATOR = r"(?<=[,;])[^\S\n]+|[^\S\n]+(?=[,;])"
+_BLANKS_AT_SEPARATOR = r"(?<=[,;])[^\S\n]+|(?<!\s)[^\S\n]+(?=[,;])"
 
 
 def read_toml(path: Path, example: str, known) -> dict:
