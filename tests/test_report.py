@@ -177,7 +177,7 @@ solved(start(), problem2=lambda drive: find("problem2", drive.dataset),
 
 
 @pytest.mark.parametrize("text, expected", [
-    ('author = "A"\nautor = "B"', "expected an entry such as author, "),
+    ('author = "A"\nautor = "B"', "expected entries such as 'author = "),
     ("\nauthor = Ada", "Invalid value (at line 2, column 10)"),
     ('author = """a\nb"""', "expected a line of UTF-8 text in quotes for author"),
     ("title = true", "expected a line of UTF-8 text in quotes for title, found 'True'"),

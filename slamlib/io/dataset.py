@@ -16,21 +16,25 @@ import numpy as np
 from slamlib.core import se2
 from slamlib.core.errors import require
 from slamlib.core.records import AntennaGuess, ArucoReadings, Dataset, Truth, UwbReadings
-from slamlib.core.vehicle import TABLE_2, Vehicle, changed
+from slamlib.core.vehicle import TABLE_2, VEHICLE_LIMITS, Vehicle, changed
 from slamlib.io.formats import (
     ARUCO,
     COVARIANCE,
     ENCODER,
     GUESS,
+    LIMITS,
+    TRUE_MAPS,
+    TRUE_POSES,
     TRUTH_FILES,
-    TRUTH_TABLES,
     UWB,
     VEHICLE,
-    Check,
 )
-from slamlib.io.tables import contents, listed, read_table, table_of_array
-from slamlib.io.vehicle import incremental_counts, read_vehicle
+from slamlib.io.tables import contents, read_table, table_of_array
+from slamlib.io.textfile import read_toml
 
+MAX_REVOLUTIONS = 10.0  # revolutions of a wheel in one step
+MODULI = (2**16, 2**15)  # numbers of values of counters that wrap around
+MIN_MODULUS_RATIO = 32.0  # ratio of a modulus to a large step of the drive, for a decision
 ORIGIN_TOLERANCE = 1e-3  # m and rad; a first true pose within it is taken as the origin
 
 
@@ -41,7 +45,7 @@ def read_dataset(folder: Path | str) -> Dataset:
     not have the format.
     """
     files, notes = contents(folder, required=ENCODER)
-    vehicle = read_vehicle(files.get(VEHICLE))
+    vehicle = _read_vehicle(files.get(VEHICLE), TABLE_2)
     return _dataset(files, vehicle, Path(abspath(folder)).name, notes)
 
 
@@ -66,58 +70,77 @@ def dataset_from_arrays(ticks, aruco=None, uwb=None, guess=None, vehicle: Vehicl
     >>> len(dataset.ticks), dataset.uwb.antenna.tolist()
     (2, [7])
     """
-    require(isinstance(vehicle, Vehicle), "vehicle", "a Vehicle", vehicle)
+    counts = table_of_array("ticks", ticks, ["right ticks", "left ticks"])
     files = {
-        ENCODER: table_of_array("ticks", ticks, ENCODER, counted=True),
-        ARUCO: table_of_array("aruco", aruco, ARUCO),
-        UWB: table_of_array("uwb", uwb, UWB),
-        GUESS: table_of_array("guess", guess, GUESS)}
+        ENCODER: replace(counts, numbers=np.column_stack([counts.lines, counts.numbers])),
+        ARUCO: table_of_array("aruco", aruco, LIMITS[ARUCO]),
+        UWB: table_of_array("uwb", uwb, LIMITS[UWB]),
+        GUESS: table_of_array("guess", guess, LIMITS[GUESS])}
     return _dataset(files, changed(TABLE_2, vars(vehicle), "vehicle"), name)
 
 
 def _dataset(files, vehicle, name, notes=()):
     """The Dataset by its Vehicle and the sources (dict) of its tables by name."""
-    encoders, ticks = incremental_counts(read_table(files[ENCODER], ENCODER), vehicle)
+    if UWB in files and GUESS not in files:
+        del files[UWB]
+        notes += (f"{GUESS} is missing: problem 4 is left out.",)
+    encoders, ticks = _incremental_counts(read_table(files[ENCODER], ENCODER), vehicle)
     sightings = read_table(files.get(ARUCO), ARUCO, len(ticks))
-    ranges = read_table(files.get(UWB), UWB, len(ticks))
     guesses = read_table(files.get(GUESS), GUESS)
-    ranges = _of_guessed_antennas(ranges, guesses)
-    pose, marker, seen = _in_order(sightings)
-    aruco = ArucoReadings(pose, marker, seen[:, 2:5], seen[:, COVARIANCE])
-    pose, antenna, heard = _in_order(ranges)
-    uwb = UwbReadings(pose, antenna, heard[:, 2], heard[:, 3])
-    guess = AntennaGuess(*_by_id(guesses))
-    return Dataset(
-        name=name, vehicle=vehicle, ticks=ticks, aruco=aruco if len(aruco.pose) else None,
-        uwb=uwb if len(uwb.pose) else None, antenna_guess=guess if len(guess.antenna) else None,
-        notes=notes + encoders.notes + sightings.notes + ranges.notes + guesses.notes)
+    ranges = read_table(files.get(UWB), UWB, len(ticks))
+    is_guessed = np.isin(ranges.numbers[:, 1], guesses.numbers[:, 0])
+    ranges = ranges.drop_rows({f"an antenna id of {guesses.name}": is_guessed})
+    guess = None
+    if len(guesses.numbers) > 0:
+        guess = AntennaGuess(guesses.ids(0), guesses.numbers[:, 1:])
+    seen = sightings.numbers
+    heard = ranges.numbers
+    dataset = Dataset(
+        name, vehicle, ticks,
+        ArucoReadings(sightings.ids(0) - 1, sightings.ids(1), seen[:, 2:5], seen[:, COVARIANCE]),
+        UwbReadings(ranges.ids(0) - 1, ranges.ids(1), heard[:, 2], heard[:, 3]),
+        guess, notes + encoders.notes + sightings.notes + ranges.notes + guesses.notes)
+    return dataset.first(len(ticks))  # in which a sensor without readings is None
 
 
-def _of_guessed_antennas(ranges, guesses):
-    """The ranges of antennas that have a guess, with a note on the others."""
-    antenna = ranges.numbers[:, 1]
-    known = np.isin(antenna, guesses.numbers[:, 0])
-    if len(antenna) > 0 and len(guesses.numbers) == 0:
-        lack = "is missing" if guesses.source == GUESS else "has no rows"
-        note = f"{guesses.name} {lack}: problem 4 is left out."
-        return replace(ranges, numbers=ranges.numbers[:0], notes=(*ranges.notes, note))
-    unknown = listed([f"{each:.0f}" for each in np.unique(antenna[~known])])
-    return ranges.drop_rows([Check(
-        known, f"an antenna id of {guesses.name}, which lacks {unknown}", column=1)])
+def _read_vehicle(path, default):
+    """The Vehicle of a `vehicle.toml`, whose entries replace those of a default."""
+    if path is None:
+        return default
+    return changed(default, read_toml(path, "wheelbase = 0.4", VEHICLE_LIMITS), path)
 
 
-def _in_order(readings):
-    """Poses from 0, ids (m,) and rows (m, c), in ascending order of pose; repeated rows once."""
-    _, first = np.unique(readings.numbers, axis=0, return_index=True)
-    rows = readings.numbers[np.sort(first)]
-    rows = rows[np.argsort(rows[:, 0], kind="stable")]
-    return rows[:, 0].astype(np.int64) - 1, rows[:, 1].astype(np.int64), rows
+def _incremental_counts(table, vehicle):
+    """The Table of the encoders, and its counts since the previous pose, (n, 2) int64.
+
+    Those of a counter that wraps around are mended. Raises DatasetError if there is no row, the
+    first is not 0, or a step exceeds MAX_REVOLUTIONS.
+    """
+    read = table.numbers[:, 1:]
+    require(len(read), table.source, "at least the row '1 0 0', found no rows")
+    counts = read
+    for modulus in MODULI:
+        counts = _unwrapped(counts, modulus)
+    mended = np.flatnonzero((counts != read).any(axis=1))
+    if len(mended):
+        table = table.noted(
+            f": {len(mended)} rows were mended whose counts are 2^15 or 2^16 off, as of a counter "
+            f"that wraps around, first {table.kind} {table.lines[mended[0]]}")
+    limit = MAX_REVOLUTIONS * vehicle.ticks_per_revolution
+    ok = abs(counts) <= limit
+    ok[0] = counts[0] == 0
+    expected = (f"at most {MAX_REVOLUTIONS:g} wheel revolutions ({limit:g} ticks) since the pose "
+                "before, not since the start, and none in the first row")
+    table.drop_rows({expected: ok.all(axis=1)}, most=0)
+    return table, counts.astype(np.int64)
 
 
-def _by_id(landmarks):
-    """Ids (k,), ascending, and places (k, d)."""
-    rows = landmarks.numbers[np.argsort(landmarks.numbers[:, 0])]
-    return rows[:, 0].astype(np.int64), rows[:, 1:]
+def _unwrapped(counts, modulus):
+    """Counts (n, 2) less a modulus, where that makes them as small as most others."""
+    large = np.quantile(abs(counts), 0.9)
+    less = counts - np.sign(counts) * modulus
+    is_wrapped = (abs(less) <= 2 * large) & (MIN_MODULUS_RATIO * large < modulus)
+    return np.where(is_wrapped, less, counts)
 
 
 def read_truth(folder: Path | str) -> Truth | None:
@@ -131,34 +154,28 @@ def read_truth(folder: Path | str) -> Truth | None:
     drive, _ = contents(folder, required=ENCODER)
     if "truth" not in drive:
         return None
-    files, notes = contents(drive["truth"], TRUTH_FILES, required="vehiclePose.txt")
-    path, markers, antennas = [read_table(files.get(name), name) for name in TRUTH_TABLES]
+    files, notes = contents(drive["truth"], TRUTH_FILES, required=TRUE_POSES)
+    path = read_table(files[TRUE_POSES], TRUE_POSES)
+    markers, antennas = [read_table(files.get(name), name) for name in TRUE_MAPS]
     count = len(read_table(drive[ENCODER], ENCODER).numbers)
-    require(len(path.numbers) == count, path.source,
-            f"{count} poses (encoder file), found {len(path.numbers)}")
-    marker, marker_in_world = _by_id(markers)
-    antenna, antenna_in_world = _by_id(antennas)
-    poses = path.numbers[:, 1:].copy()
-    poses[:, 2] = np.unwrap(np.r_[0, poses[:, 2]])[1:]
-    vehicle = read_vehicle(files.get(VEHICLE), read_vehicle(drive.get(VEHICLE)))
-    truth = Truth(poses, marker, marker_in_world, antenna, antenna_in_world, vehicle)
-    x, y, heading = poses[0]
-    if max(abs(x), abs(y), abs(heading)) > ORIGIN_TOLERANCE:
-        truth = _in_the_frame_of(poses[0], truth)
+    poses = path.numbers[:, 1:]
+    require(len(poses) == count, path.source, f"{count} poses (encoder file), found {len(poses)}")
+    poses[:, 2] = np.unwrap(np.append(0, poses[:, 2]))[1:]
+    marker_in_world = markers.numbers[:, 1:]
+    antenna_in_world = antennas.numbers[:, 1:]
+    origin = poses[0].copy()
+    if abs(origin).max() > ORIGIN_TOLERANCE:
+        poses = se2.between(origin, poses)
+        marker_in_world = se2.between(origin, marker_in_world)
+        marker_in_world[:, 2] = se2.wrap(marker_in_world[:, 2])
+        antenna_in_world = (antenna_in_world - origin[:2]) @ se2.rotation(origin[2])
         path = path.noted(
-            f" begins at ({x:.3f} m, {y:.3f} m, {heading:.4f} rad): poses and maps were moved into "
-            "the frame of its first pose, in which the estimates are")
+            " begins at ({:.3f} m, {:.3f} m, {:.4f} rad): poses and maps were moved into the frame "
+            "of its first pose, in which the estimates are".format(*origin))
+    vehicle = _read_vehicle(files.get(VEHICLE), _read_vehicle(drive.get(VEHICLE), TABLE_2))
     notes += path.notes + markers.notes + antennas.notes
-    return replace(truth, notes=tuple(f"In truth: {note}" for note in notes))
-
-
-def _in_the_frame_of(pose, truth):
-    """The Truth in the frame of a pose T_wp: poses T_pv = inverse(T_wp) T_wv, maps as well."""
-    markers = se2.between(pose, truth.marker_in_world)
-    markers[:, 2] = se2.wrap(markers[:, 2])
-    antennas = (truth.antenna_in_world - pose[:2]) @ se2.rotation(pose[2])
-    return replace(truth, poses=se2.between(pose, truth.poses), marker_in_world=markers,
-                   antenna_in_world=antennas)
+    return Truth(poses, markers.ids(0), marker_in_world, antennas.ids(0), antenna_in_world,
+                 vehicle, tuple(f"In truth: {note}" for note in notes))
 
 
 def all_notes(dataset: Dataset, truth: Truth | None) -> tuple[str, ...]:
@@ -168,26 +185,22 @@ def all_notes(dataset: Dataset, truth: Truth | None) -> tuple[str, ...]:
 
 def inventory_lines(dataset: Dataset, truth: Truth | None) -> list[str]:
     """Lines on what was read of a Dataset and its Truth, with all notes."""
+    right, left = abs(dataset.ticks).sum(axis=0)
     aruco = dataset.aruco
-    markers = "none, no ArucoReading.txt with usable rows"
-    if aruco is not None:
-        markers = (f"{len(aruco.pose)} sightings of {_distinct(aruco.marker)} markers at "
-                   f"{_distinct(aruco.pose)} poses")
     uwb = dataset.uwb
+    markers = "none, no ArucoReading.txt with usable rows"
     ranges = "none, no UwbReading.txt with usable rows"
+    if aruco is not None:
+        markers = (f"{len(aruco.pose)} sightings of {len(set(aruco.marker))} markers at "
+                   f"{len(set(aruco.pose))} poses")
     if uwb is not None:
-        ranges = (f"{len(uwb.pose)} ranges to {_distinct(uwb.antenna)} antennas at "
-                  f"{_distinct(uwb.pose)} poses")
+        ranges = (f"{len(uwb.pose)} ranges to {len(set(uwb.antenna))} antennas at "
+                  f"{len(set(uwb.pose))} poses")
     stated = [f"{key} = {json.dumps(value)}" for key, value in vars(dataset.vehicle).items()
               if value != getattr(TABLE_2, key)]
-    vehicle = ", ".join(stated) or "none, or as the assignment's table 2"
-    right, left = abs(dataset.ticks).sum(axis=0)
     lines = [f"encoders: {len(dataset.ticks)} poses, {right} ticks right and {left} left",
-             f"markers: {markers}", f"ranges: {ranges}", f"vehicle.toml: {vehicle}",
+             f"markers: {markers}", f"ranges: {ranges}",
+             f"vehicle.toml: {', '.join(stated) or 'none, or as in table 2'}",
              f"truth: {'no' if truth is None else 'yes'}"]
     lines += [f"note: {note}" for note in all_notes(dataset, truth)]
     return [f"{dataset.name}: {line}" for line in lines]
-
-
-def _distinct(ids):
-    return len(np.unique(ids))

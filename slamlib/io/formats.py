@@ -4,8 +4,6 @@ The limits are far wider than vehicles, cameras and antennas need: a number beyo
 unit, or float64 loses digits beside it. data/README.md lists them.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from slamlib.core import se2
@@ -15,23 +13,23 @@ ENCODER = "encoderReading.txt"
 ARUCO = "ArucoReading.txt"
 UWB = "UwbReading.txt"
 GUESS = "UwbAntennaGuess.txt"
-TABLES = (ENCODER, ARUCO, UWB, GUESS)
-TRUTH_TABLES = ("vehiclePose.txt", "ArucoMap.txt", "UwbMap.txt")
 VEHICLE = "vehicle.toml"
-DATASET_FILES = (*TABLES, VEHICLE, "truth")
-TRUTH_FILES = (*TRUTH_TABLES, VEHICLE)
+DATASET_FILES = (ENCODER, ARUCO, UWB, GUESS, VEHICLE, "truth")
+TRUE_POSES = "vehiclePose.txt"
+TRUE_MAPS = ("ArucoMap.txt", "UwbMap.txt")
+TRUTH_FILES = (TRUE_POSES, *TRUE_MAPS, VEHICLE)
 
 MIN_EIGENVALUE = 1e-12  # of a correlation matrix; with a smaller one it counts as singular
 MAX_NEGATIVE_SIGMAS = 5.0  # sigmas, by which noise may make a range negative
 COVARIANCE = [[5, 6, 7], [6, 8, 9], [7, 9, 10]]  # columns of the covariance of a sighting
 
-_ANY = Limit(-1e15, 1e15)               # float64 represents whole numbers up to there exactly
-_WHOLE = Limit(-1e15, 1e15, whole=True)  # ids and counts
+_WHOLE = Limit(-1e15, 1e15, whole=True)  # float64 represents whole numbers up to there exactly
+_ANY = Limit(-1e15, 1e15)
 _VARIANCE = Limit(1e-18, 1e8, "m^2")
 _IN_VEHICLE = Limit(-1e4, 1e4, "m")
-_GUESS = Limit(-1e6, 1e6, "m")
-_TRUE = Limit(-1e9, 1e9, "m")
-_TRUE_ANGLE = Limit(-1e9, 1e9, "rad")
+_IN_WORLD = Limit(-1e7, 1e7, "m")
+_POSE = {"x": _IN_WORLD, "y": _IN_WORLD, "theta": Limit(-1e9, 1e9, "rad")}
+_ANTENNA = {"antenna id": _WHOLE, "x": _IN_WORLD, "y": _IN_WORLD}
 # Limits by the name of a file and by its column, in the order of the file.
 LIMITS = {
     ENCODER: {"pose id": _WHOLE, "right ticks": _WHOLE, "left ticks": _WHOLE},
@@ -42,70 +40,39 @@ LIMITS = {
         "s_yy": _VARIANCE, "s_ytheta": _ANY, "s_thetatheta": Limit(1e-18, 1e14, "rad^2")},
     UWB: {"pose id": _WHOLE, "antenna id": _WHOLE, "range": Limit(-5e4, 1e5, "m"),
           "sigma": Limit(1e-9, 1e4, "m")},
-    GUESS: {"antenna id": _WHOLE, "x": _GUESS, "y": _GUESS},
-    "vehiclePose.txt": {"pose id": _WHOLE, "x": _TRUE, "y": _TRUE, "theta": _TRUE_ANGLE},
-    "ArucoMap.txt": {"marker id": _WHOLE, "x": _TRUE, "y": _TRUE, "theta": _TRUE_ANGLE},
-    "UwbMap.txt": {"antenna id": _WHOLE, "x": _TRUE, "y": _TRUE}}
+    GUESS: _ANTENNA,
+    TRUE_POSES: {"pose id": _WHOLE} | _POSE,
+    "ArucoMap.txt": {"marker id": _WHOLE} | _POSE,
+    "UwbMap.txt": _ANTENNA}
 
 
-@dataclass(frozen=True)
-class Check:
-    """Which rows of a table are right, and what is expected of them, or of one of their columns."""
-
-    ok: np.ndarray  # (m,) bool
-    expected: str
-    column: int | None = None
-
-
-def given(numbers: np.ndarray, columns) -> list[Check]:
-    """Checks that no number (m, c) is missing: none is NaN, and no range is 0."""
-    checks = []
-    for k, column in enumerate(columns):
-        ok = ~np.isnan(numbers[:, k])
-        expected = f"{column}, a number"
-        if column == "range":
-            ok &= numbers[:, k] != 0
-            expected += " (0 is no reception)"
-        checks.append(Check(ok, expected, k))
-    return checks
-
-
-def within(numbers: np.ndarray, limits: dict[str, Limit]) -> list[Check]:
-    """Checks that numbers (m, c) are within the limits of their columns."""
-    checks = []
-    for k, (column, limit) in enumerate(limits.items()):
+def within(numbers: np.ndarray, limits: dict[str, Limit]) -> dict[str, np.ndarray]:
+    """Which rows (m,) of numbers (m, c) are within the limits of a column, by what is expected."""
+    checks = {}
+    for column, limit, values in zip(limits, limits.values(), numbers.T):
         kind = "whole" if limit.whole else "finite"
-        expected = f"{column}, a {kind} number {limit}"
-        checks.append(Check(limit.holds(numbers[:, k]), expected, k))
+        checks[f"{column}, a {kind} number {limit}"] = limit.holds(values)
     return checks
 
 
-def _counted(numbers):
-    rows = np.arange(1, len(numbers) + 1)
-    return [Check(numbers[:, 0] == rows, "pose ids 1, 2, 3, ... in order")]
+def together(numbers: np.ndarray, name: str) -> dict[str, np.ndarray]:
+    """Which rows (m,) of numbers (m, c) are right as a whole, by what is expected in a file."""
+    if name == ARUCO:
+        # s_thetatheta may be 1e4 rad^2 where s_xx is 1e-4 m^2, so the correlations are judged.
+        smallest = np.linalg.eigvalsh(se2.correlations(numbers[:, COVARIANCE]))[:, 0]
+        return {"a positive definite covariance (smallest eigenvalue of its correlation matrix "
+                f"above {MIN_EIGENVALUE:g})": smallest > MIN_EIGENVALUE}
+    if name == UWB:
+        lowest = -MAX_NEGATIVE_SIGMAS * numbers[:, 3]
+        return {f"a range that is not below -{MAX_NEGATIVE_SIGMAS:g} sigma":
+                numbers[:, 2] >= lowest}
+    if name in (ENCODER, TRUE_POSES):
+        poses = np.arange(1, len(numbers) + 1)
+        return {"pose ids 1, 2, 3, ... in order": numbers[:, 0] == poses}
+    return {"each id only once": unrepeated(numbers[:, :1])}
 
 
-def _unique(numbers):
-    _, first = np.unique(numbers[:, 0], return_index=True)
-    return [Check(np.isin(np.arange(len(numbers)), first), "each id only once")]
-
-
-def _positive_definite(numbers):
-    """Judged as a correlation matrix: s_thetatheta may be 1e4 rad^2 where s_xx is 1e-4 m^2."""
-    correlations = se2.correlations(numbers[:, COVARIANCE])
-    smallest = np.linalg.eigvalsh(correlations)[:, 0]
-    return [Check(smallest > MIN_EIGENVALUE, "a positive definite covariance (smallest eigenvalue "
-                  f"of its correlation matrix above {MIN_EIGENVALUE:g})")]
-
-
-def _hardly_negative(numbers):
-    distance = numbers[:, 2]
-    sigma = numbers[:, 3]
-    return [Check(distance >= -MAX_NEGATIVE_SIGMAS * sigma,
-                  f"a range that is not below -{MAX_NEGATIVE_SIGMAS:g} sigma")]
-
-
-# What the numbers (m, c) of a row must be together: functions that return Checks.
-CHECKS = {
-    ENCODER: _counted, ARUCO: _positive_definite, UWB: _hardly_negative, GUESS: _unique,
-    "vehiclePose.txt": _counted, "ArucoMap.txt": _unique, "UwbMap.txt": _unique}
+def unrepeated(rows: np.ndarray) -> np.ndarray:
+    """True of the rows (m, c) that no row before them equals, (m,) bool."""
+    _, first = np.unique(rows, axis=0, return_index=True)
+    return np.isin(np.arange(len(rows)), first)
