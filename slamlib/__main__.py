@@ -185,7 +185,7 @@ def _name_in(data, dataset):
 def summary_lines(summaries: list[dict]) -> list[str]:
     """The summaries of drives as lines: a table, then what failed, is not confirmed or in doubt."""
     from slamlib.solve import drive_table
-    table = drive_table(summaries).drop(columns="failed").dropna(axis=1, how="all")
+    table = drive_table(summaries).drop(columns=["seconds", "failed"]).dropna(axis=1, how="all")
     lines = table.to_string(index=False, na_rep="-", float_format="{:.4g}".format).splitlines()
     for summary in summaries:
         told = []

@@ -432,7 +432,7 @@ def solve_folders(folders: Sequence[Path | str], out: Path | str, jobs: int | No
     """Solve each of several datasets into out/<name>, and write the table out/drives.csv.
 
     One that cannot be read or written does not stop the others: its summary has the entry "error",
-    a sentence, and no problems.
+    a sentence, and no problems. Files among the folders, as data/* names them, are left out.
 
     Parameters
     ----------
@@ -445,9 +445,10 @@ def solve_folders(folders: Sequence[Path | str], out: Path | str, jobs: int | No
     The summaries of the datasets, in their order.
     """
     out = Path(out)
-    names = [Path(folder).absolute().name for folder in folders]
-    require(len(set(names)) == len(names), out, "datasets in folders of different names, because "
-            f"results have these names, found {', '.join(names)}")
+    folders = [folder for folder in map(Path, folders) if not folder.is_file()]
+    names = [folder.absolute().name for folder in folders]
+    require(len(set(names)) == len(names), out, "datasets in folders of different names, as which "
+            f"their results are written, found {', '.join(names)}")
     with files.locked(out):
         solve = delayed(_summary_or_error)
         summaries = Parallel(n_jobs=jobs)(

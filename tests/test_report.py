@@ -162,9 +162,10 @@ solved(start(), problem2=lambda drive: find("problem2", drive.dataset),
     for _ in range(2):                                                 # executed, then recalled
         assert main(["report", "--jobs", "1"]) == 3
         told = capsys.readouterr().err.splitlines()
-        good, bad = told.index("good: 50 poses"), told.index("bad: 50 poses")
-        assert "ATE" in told[good + 1] and told[good + 2].startswith("problem2  ")
-        assert told[bad + 2].startswith("problem2       could not be solved: expected sightings")
+        header, = (line for line in told if "ate_m" in line)
+        assert told[told.index(header) + 3].split()[:2] == ["good", "problem2"]
+        failed, = (line for line in told if "could not be solved" in line)
+        assert failed.startswith("bad: problem2 could not be solved: expected sightings")
     assert "nothing changed" in " ".join(told)
     text = html.unescape((tmp_path / "report" / "index.html").read_text(encoding="utf-8"))
     assert re.search(r"Notes on the files of <em>bad</em>:.*\(7\.000 m, 0\.000 m, 0\.0000 rad\)",
