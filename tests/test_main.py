@@ -54,18 +54,14 @@ def test_what_simulate_writes_is_what_solve_reads(tmp_path):
                cwd=tmp_path)
     assert (made.stdout, made.stderr) == ("", "")
     done = run("solve", "drive", "--out", "out", "--problem", 1, cwd=tmp_path)
-    *found, last = done.stderr.splitlines()
-    assert [line.split(":")[1] for line in found] == [
-        " encoders", " markers", " ranges", " vehicle.toml", " truth"]
-    assert last == f"results: {tmp_path / 'out'}"
+    assert [line.split(":")[1] for line in done.stderr.splitlines()] == [
+        " encoders", " markers", " ranges", " vehicle.toml", " truth", f" {tmp_path / 'out'}"]
     header, row = done.stdout.splitlines()
     assert "ate_m" in header and row.split()[:3] == ["drive", "problem1", "4000"]
     expected = simulate("short", 21, rounds=2)[0]
-    _, poses, covariances = read_structs(tmp_path / "out" / "problem1", "vehiclePose")
-    right_poses, right_covariances = equation2(expected.ticks, expected.vehicle)
-    np.testing.assert_array_equal(poses, right_poses)
-    np.testing.assert_array_equal(covariances, right_covariances)
-    assert 0 < read_summary(tmp_path / "out")["problems"]["problem1"]["ate_m"] < 1
+    poses, _ = equation2(expected.ticks, expected.vehicle)
+    found = read_structs(tmp_path / "out" / "problem1", "vehiclePose")
+    np.testing.assert_array_equal(found[1], poses)
 
 
 def test_options_of_solve_are_heeded_and_said(folder, capsys):
@@ -96,11 +92,7 @@ def test_verbose_prints_decisions_and_leaves_stdout(folder):
     assert told.stdout == plain.stdout and "GTSAM" not in plain.stderr
     slip = read_summary(folder / "out")["problems"]["problem3"]["slip_sqrt_m"]
     assert f"round 1: slip {1e3 * slip:.3g} mm after 1 m, factors " in told.stderr
-    for pattern in (r"Cauchy kernel of 3 sigmas: error [\d.]+ after \d+ steps",
-                    r"accepted \d+ of \d+ sightings, \d+ of \d+ ranges, \d+ changed",
-                    r"GTSAM: \d+ factors, \d+ variables, \d+ steps from odometry, differs by up to",
-                    r"estimate of drive: 100 poses", r"estimate of drive: \d+\.\d s"):
-        assert re.search(f"^.*{pattern}", told.stderr, re.MULTILINE), pattern
+    assert re.search(r"\nGTSAM: \d+ factors, \d+ variables, \d+ steps from ", told.stderr)
     for problem in solve.PROBLEMS:
         assert f"drive: {problem} solved in " in told.stderr
 
@@ -109,7 +101,7 @@ def test_verbose_prints_decisions_and_leaves_stdout(folder):
 def test_a_problem_that_took_its_time_is_told(folder, monkeypatch, caplog, seconds, count):
     monkeypatch.setattr(solve, "SLOW", seconds)
     solved(folder, "--problem", 1)
-    assert caplog.text.count("drive: problem1 solved in 0.0 s") == count
+    assert caplog.text.count("drive: problem1 solved in") == count
 
 
 def test_results_are_not_written_into_a_dataset(folder, monkeypatch, capsys):
