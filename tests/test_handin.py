@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 from zipfile import ZipFile
 
 import numpy as np
@@ -10,6 +11,7 @@ from test_document import text_of
 from test_report import write
 
 from slamlib.__main__ import main
+from slamlib.core.errors import DatasetError
 from slamlib.report import handin
 from slamlib.report.notebooks import Options
 from slamlib.report.overview import SolvedDrive
@@ -169,3 +171,14 @@ def test_doubts_and_failures_are_in_the_readme_and_empty_headings_are_not():
     assert "d: A header was left out." in handin.readme([noted], Options())
     text = handin.readme([replace(drive, doubts=())], Options())
     assert "Doubts" not in text and "Notes" not in text
+
+
+def test_results_of_a_run_that_was_killed_are_not_handed_in(tmp_path):
+    drive = solved_drive("problem1", files=("problem1/vehiclePose.mat",))
+    pdf = tmp_path / "report.pdf"
+    pdf.write_bytes(b"")
+    report = SimpleNamespace(files=[pdf], drives=[drive], omitted=[])
+    (tmp_path / "d" / "problem1").mkdir(parents=True)
+    (tmp_path / "d" / "problem1" / "vehiclePose.mat").write_bytes(b"half")
+    with pytest.raises(DatasetError, match="summary.json: .* solve the dataset again"):
+        handin.write_zip(tmp_path / "hand-in.zip", report, tmp_path, Options())
