@@ -11,7 +11,6 @@ from test_project import save_as_lab
 from test_report import make_data, write
 
 from slamlib.report import build, build_report, cache
-from slamlib.studies import runs as memory
 
 
 def execute_without_kernel(books, environment, results, jobs, finish):
@@ -161,10 +160,10 @@ def test_slamlib_and_the_packages_are_among_what_matters(monkeypatch, tmp_path):
     found.append(key())
     (tmp_path / "site" / "other.egg-info").mkdir()          # beside the sources, and of no version
     (tmp_path / "site" / "slamlib-9.dist-info").mkdir()
-    copied = shutil.copytree(memory.SLAMLIB, tmp_path / "elsewhere")
-    monkeypatch.setattr(memory, "SLAMLIB", copied)                            # as by pip install
+    copied = shutil.copytree(cache.SLAMLIB, tmp_path / "elsewhere")
+    monkeypatch.setattr(cache, "SLAMLIB", copied)                            # as by pip install
     assert key() == found[-1]
-    monkeypatch.setattr(memory, "SLAMLIB", tmp_path)
+    monkeypatch.setattr(cache, "SLAMLIB", tmp_path)
     assert len({*found, key()}) == 4
 
 

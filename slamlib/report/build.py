@@ -1,7 +1,6 @@
 """Builds the report: executes the notebooks, which become pages and the chapters of a PDF."""
 
 import re
-import shutil
 import sys
 import time
 from contextlib import suppress
@@ -18,7 +17,7 @@ from slamlib.io.tables import datasets_in
 from slamlib.notebook import notices
 from slamlib.report import cache
 from slamlib.report.document import render
-from slamlib.report.execution import STUDIES, TRANSPORT, execute, kernel_environment
+from slamlib.report.execution import TRANSPORT, execute, kernel_environment
 from slamlib.report.notebooks import Options, shown, to_execute
 from slamlib.report.overview import SolvedDrive, opening, read_drives, title_picture
 from slamlib.solve import SENSORS, clear_results, summary_of, summary_row
@@ -53,7 +52,7 @@ def build_report(notebooks: Path, data: Path, report: Path, results: Path,
     datasets : names of the selected datasets, or None for all.
     options : the title page and what is shown.
     jobs : notebooks executed at a time.
-    kept : folder that caches executed notebooks and their studies, or None for one that is removed.
+    kept : folder that caches executed notebooks, or None for one that is removed.
     fresh : True executes everything although it is cached.
     """
     start = time.monotonic()
@@ -68,7 +67,7 @@ def build_report(notebooks: Path, data: Path, report: Path, results: Path,
     short = "/tmp" if TRANSPORT == "ipc" else None  # because paths of sockets must be
     with TemporaryDirectory(dir=short, prefix="slamlib-", ignore_cleanup_errors=True) as temporary:
         kept = (kept or Path(temporary, "kept")).resolve()
-        environment = kernel_environment(Path(temporary), data, datasets, kept / STUDIES)
+        environment = kernel_environment(Path(temporary), data, datasets)
         folders = [data / dataset.name for dataset, _ in read]
         keys = partial(cache.keys, books, folders, environment | {"SLAMLIB_RESULTS": str(results)})
         check = partial(render, chapters, options, check=True)
@@ -141,8 +140,6 @@ def _executed(books, keys, check, environment, jobs, stage, kept, fresh):
 
     if left:
         check()
-    if fresh:
-        shutil.rmtree(kept / STUDIES, ignore_errors=True)
     execute(left, environment, stage, max(1, jobs), finish)
     return sorted(written)
 

@@ -6,6 +6,7 @@ there, or one of slamlib's environment variables changed; not when its text, its
 that an editor saved in it did.
 """
 
+import hashlib
 import json
 import platform
 import re
@@ -19,11 +20,9 @@ from nbformat import NotebookNode
 from slamlib.io.files import write_file
 from slamlib.report.execution import LAB_ONLY, Books
 from slamlib.report.notebooks import tags_of
-from slamlib.studies import runs as memory
-from slamlib.studies.runs import digest
 
 VARIABLES = "SLAMLIB_"  # begins the environment variables that are heeded
-IGNORED = "SLAMLIB_STUDIES"  # where studies are kept does not matter
+SLAMLIB = Path(__file__).parents[1]
 UNSEEN = re.compile(r"(^|/)(\.|__pycache__/)|^(build|report|results)/|\.ipynb$")  # paths
 HEEDED_TAGS = {"raises-exception", LAB_ONLY}  # the tags of cells that nbclient heeds
 VERSIONS = 4  # of each notebook, the last used
@@ -40,7 +39,7 @@ def keys(books: Books, datasets: list[Path], environment: dict[str, str]) -> dic
     packages = {path.name for folder in sys.path for path in Path(folder).glob("*.dist-info")
                 if not path.name.startswith("slamlib-")}
     heeded = {name: environment[name] for name in sorted(environment)
-              if name.startswith(VARIABLES) and name != IGNORED}
+              if name.startswith(VARIABLES)}
     common = [sys.version, platform.platform(), sorted(packages), heeded,
               _digests(notebooks, datasets)]
     found = {}
@@ -53,7 +52,9 @@ def keys(books: Books, datasets: list[Path], environment: dict[str, str]) -> dic
 
 def _digests(notebooks, datasets):
     """Return names and digests of the files that matter, of slamlib, datasets and notebooks."""
-    files = [(memory.SLAMLIB, file) for file in memory.modules("report")]
+    files = [(SLAMLIB, file) for file in sorted(SLAMLIB.rglob("*"))
+             if file.suffix in (".py", ".mplstyle") and file.name != "__main__.py"
+             and file.relative_to(SLAMLIB).parts[0] != "report"]
     files.append((Path(__file__).parent, Path(__file__)))  # for the format of the cache
     for folder in datasets:
         files += [(folder.parent, file) for file in sorted(folder.rglob("*"))]
@@ -61,6 +62,11 @@ def _digests(notebooks, datasets):
               if not UNSEEN.search(file.relative_to(notebooks).as_posix())]
     return [(file.relative_to(folder).as_posix(), digest(file.read_bytes()))
             for folder, file in files if file.is_file()]
+
+
+def digest(content: bytes) -> str:
+    """Return the SHA-256 of bytes, in hexadecimal digits."""
+    return hashlib.sha256(content).hexdigest()
 
 
 def _code_cells(book):

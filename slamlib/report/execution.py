@@ -1,6 +1,6 @@
 """Executes notebooks without a display, each in its own kernel, a limited number at a time.
 
-JupyterLab starts with the same settings and the same kept studies.
+JupyterLab starts with the same settings.
 """
 
 import asyncio
@@ -26,15 +26,16 @@ from tqdm import tqdm
 
 from slamlib.core.errors import require
 from slamlib.io.files import file_names
-from slamlib.studies.runs import ONE_THREAD
 
 CELL_TIMEOUT = 1800  # s, in which a cell must end
 TRANSPORT = "ipc" if hasattr(socket, "AF_UNIX") else "tcp"  # Windows has no Unix sockets
 LAB_ONLY = "lab-only"  # tag of cells that are not executed, and not shown on pages or in the PDF
-STUDIES = "studies"  # in the cache, besides executed notebooks
-SETTINGS = "settings"  # there, too: of kernels, and JupyterLab's where the user has no others
+# Folder in the cache, of the settings of kernels, and of JupyterLab where the user has no others.
+SETTINGS = "settings"
 OVERRIDES = {"@jupyterlab/apputils-extension:notification": {
     "fetchNews": "false", "checkForUpdates": False}}  # without a question when it opens
+# The matrices are small: more threads cost time.
+ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 Books = dict[Path, NotebookNode]  # notebooks by their files, in the order of the report
 
 
@@ -49,12 +50,12 @@ class _Loop(asyncio.SelectorEventLoop):
         raise RuntimeError("notebooks install no signal handlers")
 
 
-def kernel_environment(settings: Path, data: Path, datasets: list[str] | None,
-                       studies: Path) -> dict[str, str]:
+def kernel_environment(settings: Path, data: Path,
+                       datasets: list[str] | None) -> dict[str, str]:
     """Return the kernels' environment variables without settings that change pages.
 
-    `settings`, `data` and `studies` are the folders of the kernels' own settings, of the datasets
-    and of the studies that are kept, `datasets` the selected names, or None for all.
+    `settings` and `data` are the folders of the kernels' own settings and of the datasets,
+    `datasets` the selected names, or None for all.
     """
     matplotlibrc = settings / "matplotlibrc"
     matplotlibrc.write_text("svg.hashsalt: slamlib\n")
@@ -62,7 +63,6 @@ def kernel_environment(settings: Path, data: Path, datasets: list[str] | None,
     return defaults | os.environ | {
         "SLAMLIB_DATA": str(data),
         "SLAMLIB_DATASETS": "\n".join(datasets or []),
-        "SLAMLIB_STUDIES": str(studies.resolve()),
         "IPYTHONDIR": str(settings),
         "MATPLOTLIBRC": str(matplotlibrc),
         "MPLBACKEND": "module://matplotlib_inline.backend_inline"}
@@ -176,5 +176,5 @@ def start_lab(notebooks: Path, data: Path, kept: Path, arguments: list[str]):
         command.append("--allow-root")
     command += arguments + [str(notebooks)]
     selected = os.environ.get("SLAMLIB_DATASETS", "").split("\n")
-    environment = kernel_environment(settings, data.resolve(), selected, kept / STUDIES)
+    environment = kernel_environment(settings, data.resolve(), selected)
     os.execve(sys.executable, command, environment)
