@@ -19,6 +19,7 @@ from slamlib import (
 )
 from slamlib.core import graph as core_graph
 from slamlib.core import graph_solution, se2
+from slamlib.core.batch import Batch
 from slamlib.core.errors import DatasetError
 from slamlib.core.evaluation import anees, ate, nees_band
 from slamlib.core.kernels import KERNELS, ONE_SIDED
@@ -49,44 +50,33 @@ def plain(dataset, **options):
 # Factors.
 
 
-def test_odometry_factors_have_the_derivatives_of_their_errors(drive):
-    """Central differences on all of their variables, far from the optimum."""
-    decisions = count_everything(drive[0])
-    rng = np.random.default_rng(0)
-    sigma = 100 * decisions.sigma_wheel
-    for k in range(0, 30, 5):
-        error = core_graph.odometry_error(decisions.odometry, k, sigma)
-        factor = gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(3), [X(0), X(1), W(0)], error)
-        values = gtsam.Values()
-        values.insert(X(0), gtsam.Pose2(*rng.normal(size=3)))
-        values.insert(X(1), gtsam.Pose2(*rng.normal(size=3)))
-        values.insert(W(0), rng.normal(size=3))
-        derivatives, _ = factor.linearize(values).jacobian()
-        for column in range(9):
-            ends = []
-            for step in (1e-6, -1e-6):
-                moved = gtsam.VectorValues()
-                off = step * (np.arange(9) == column)
-                for i, key in enumerate((X(0), X(1), W(0))):
-                    moved.insert(key, off[3 * i:3 * i + 3])
-                ends.append(error(factor, values.retract(moved), None))
-            np.testing.assert_allclose(
-                derivatives[:, column], (ends[0] - ends[1]) / 2e-6, atol=1e-7)
+def test_factors_of_a_batch_are_linearised_at_once_wherever_they_are_asked():
+    """Once at the values of a graph; anew if a value is changed in place, or one is added."""
+    calls = []
 
+    def linearised(points, poses):
+        calls.append(points)
+        turned = np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], axis=1)
+        by_heading = np.stack([turned[:, 1], -turned[:, 0]], axis=1)
+        by_pose = np.concatenate([np.zeros((2, 2, 2)), by_heading[:, :, None]], axis=2)
+        return points - turned, [np.tile(np.eye(2), (2, 1, 1)), by_pose]
 
-def test_odometry_factors_are_gtsams_between_factors_for_the_stated_wheels(drive):
-    increments = count_everything(drive[0]).odometry
-    values, unit = gtsam.Values(), gtsam.noiseModel.Unit.Create(3)
-    for key, pose in ((X(0), (0.3, 0.1, 0.2)), (X(1), (0.5, -0.1, 3.0))):
-        values.insert(key, gtsam.Pose2(*pose))
-    values.insert(W(0), np.zeros(3))
-    error = core_graph.odometry_error(increments, 4, np.full(3, 1e-4))
-    own = gtsam.CustomFactor(unit, [X(0), X(1), W(0)], error)
-    native = gtsam.BetweenFactorPose2(X(0), X(1), gtsam.Pose2(*increments.increment[4]), unit)
-    J, b = own.linearize(values).jacobian()
-    expected_J, expected_b = native.linearize(values).jacobian()
-    np.testing.assert_allclose(J[:, :6], expected_J, atol=1e-9)
-    np.testing.assert_allclose(b, expected_b, atol=1e-9)
+    factors = Batch([[A(1), A(2)], [X(0), X(0)]], linearised)
+    graph = gtsam.NonlinearFactorGraph()
+    for k in range(2):
+        graph.add(factors.factor(k, SIGMA(2, 1.0)))
+    values = gtsam.Values()
+    values.insert(X(0), gtsam.Pose2(0, 0, 0.5))
+    values.insert(A(1), np.array([np.cos(0.5), np.sin(0.5) + 2]))
+    assert np.isclose(graph.at(0).error(values), 2) and np.isnan(calls[0][1]).all()
+    values.insert(A(2), np.zeros(2))
+    assert np.isclose(graph.error(values), 2.5)
+    J, b = graph.linearize(values).at(1).jacobian()
+    np.testing.assert_allclose(J, [[1, 0, 0, 0, np.sin(0.5)], [0, 1, 0, 0, -np.cos(0.5)]])
+    np.testing.assert_allclose(b, [np.cos(0.5), np.sin(0.5)])
+    assert len(calls) == 2
+    values.update(A(2), np.array([np.cos(0.5), np.sin(0.5)]))
+    assert np.isclose(graph.error(values), 2) and len(calls) == 3
 
 
 @pytest.mark.parametrize("share", [1.0, 0.25])

@@ -165,7 +165,7 @@ def gauss_newton(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> Gau
     for steps in range(1, MAX_STEPS + 1):
         linear = graph.linearize(values)
         tree, step = eliminated(linear)
-        moved, new = descended(graph, values, step, error)
+        moved, new = after_step(graph, values, step, error)
         LOG.debug("Gauss-Newton step %d: error %.6g", steps, new)
         negligible = CONVERGED * (1 + error)
         promised = linear.error(values.zeroVectors()) - linear.error(step)
@@ -177,15 +177,27 @@ def gauss_newton(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> Gau
     return GaussNewton(values, error, MAX_STEPS, False, Marginals(tree))
 
 
-def descended(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, step: gtsam.VectorValues,
-              error: float) -> tuple[gtsam.Values, float]:
-    """Values after a step, halved until the error does not grow, and their error."""
+def after_step(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, step: gtsam.VectorValues,
+               error: float) -> tuple[gtsam.Values, float]:
+    """Values after a step, halved until the error of the graph does not grow, and their error."""
+    def moved(fraction):
+        there = values.retract(step.scale(fraction))
+        return there, graph.error(there)
+
+    return descended(moved, values, error)
+
+
+def descended(moved: Callable[[float], tuple], start: object,
+              error: float) -> tuple[object, float]:
+    """The point after a step, halved until the error does not grow, and its error.
+
+    The function `moved` returns both for a fraction of the step from the point `start`.
+    """
     for halving in range(MAX_HALVINGS):
-        moved = values.retract(step.scale(0.5**halving))
-        new = graph.error(moved)
+        point, new = moved(0.5**halving)
         if new <= (1 + ROUNDING) * error:
-            return moved, new
-    return values, error
+            return point, new
+    return start, error
 
 
 def eliminated(linear: gtsam.GaussianFactorGraph) -> tuple[

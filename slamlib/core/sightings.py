@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slamlib.core import se2
-from slamlib.core.records import ArucoReadings
+from slamlib.core.records import NO_SIGHTINGS, ArucoReadings
 from slamlib.core.se2 import correlations, sigmas
 
 GATE = 16.26623619623813         # dimensionless, for residuals of [x, y, heading]
@@ -41,17 +41,12 @@ class Sightings:
         return table
 
 
-NO_READINGS = ArucoReadings(
-    pose=np.zeros(0, int), marker=np.zeros(0, int), marker_in_vehicle=np.zeros((0, 3)),
-    covariance=np.zeros((0, 3, 3)))
-
-
 def sightings_by_frame(aruco: ArucoReadings | None, extra_frames=()) -> Sightings:
     """Sightings of ArucoReadings, or of None if there are no markers, merged by `merge_repeated`.
 
     `extra_frames` are pose indices from 0 that are frames even if no marker is seen there.
     """
-    aruco = aruco or NO_READINGS
+    aruco = aruco or NO_SIGHTINGS
     aruco = replace(aruco, covariance=regular(aruco.covariance))
     index, z, C, contradicting = merge_repeated(aruco)
     pose = aruco.pose[index]

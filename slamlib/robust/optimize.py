@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from slamlib.core.graph_solution import CONVERGED, MAX_HALVINGS, ROUNDING, eliminated
+from slamlib.core.graph_solution import CONVERGED, descended, eliminated
 from slamlib.robust.factors import linearize_odometry
 from slamlib.robust.linear import NormalEquations, Problem, State, retract
 from slamlib.robust.measurements import WEAK_SIGMA
@@ -44,20 +44,20 @@ def optimize(problem: Problem, state: State, max_steps: int = MAX_STEPS,
         step = equations.step()
         if step is None:
             step = gtsam_step(problem, equations)
-        equations = descended(equations, step)
+        equations = after_step(equations, step)
         ended = error - equations.error <= tolerance * (1 + error)
     return Optimum(equations=equations, state=equations.state, steps=steps, converged=ended)
 
 
-def descended(equations: NormalEquations, step: np.ndarray) -> NormalEquations:
+def after_step(equations: NormalEquations, step: np.ndarray) -> NormalEquations:
     """The NormalEquations after a step, halved until the error does not grow."""
     problem = equations.problem
-    state = equations.state
-    for halving in range(MAX_HALVINGS):
-        moved = NormalEquations(problem, retract(problem, state, 0.5**halving * step))
-        if moved.error <= (1 + ROUNDING) * equations.error:
-            return moved
-    return NormalEquations(problem, state)
+
+    def moved(fraction):
+        there = NormalEquations(problem, retract(problem, equations.state, fraction * step))
+        return there, there.error
+
+    return descended(moved, equations, equations.error)[0]
 
 
 def gtsam_step(problem: Problem, equations: NormalEquations) -> np.ndarray:
