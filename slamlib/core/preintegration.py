@@ -40,17 +40,19 @@ class OdometryIncrements:
 
 
 def preintegrate(dataset: Dataset, frame: np.ndarray, model: str = "arc",
-                 wheel: np.ndarray | None = None) -> OdometryIncrements:
+                 wheel: np.ndarray | None = None,
+                 noise: tuple[np.ndarray, np.ndarray] | None = None) -> OdometryIncrements:
     """The OdometryIncrements between frames (f,), linearised at `wheel` (3,) m, None if stated.
 
-    `model` is "arc" or "euler".
+    `model` is "arc" or "euler". `noise` is that of `odometry_noise`, where it is known already: it
+    depends on frames and stated wheels only.
     """
     stated = dataset.vehicle
     vehicle = stated if wheel is None else stated.with_wheel(wheel)
     start = frame[:-1]
     end = frame[1:]
     increment, J_wheel = increments.between_poses(dataset.ticks, vehicle, start, end, model)
-    quantization, slipping = odometry_noise(dataset.ticks, stated, start, end)
+    quantization, slipping = noise or odometry_noise(dataset.ticks, stated, start, end)
     return OdometryIncrements(
         frame=frame, model=model, stated=stated.wheel, wheel=vehicle.wheel,
         increment=increment, J_wheel=J_wheel,

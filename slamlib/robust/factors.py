@@ -41,7 +41,8 @@ def preintegrate_odometry(measurements: Measurements, model: str,
     `model` is "arc" or "euler". Jumps are added where there are some.
     """
     frame = measurements.frame
-    increments = preintegrate(measurements.dataset, frame, model, wheel)
+    increments = preintegrate(
+        measurements.dataset, frame, model, wheel, measurements.odometry_noise)
     jump, jump_covariance = measurements.jumps.added(frame[:-1], frame[1:])
     return replace(
         increments, in_counts=False, increment=se2.compose(increments.increment, jump),

@@ -11,7 +11,6 @@ from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from slamlib.core import odometry, se2
 from slamlib.core.graph import GUESS_PRIOR_SIGMA
@@ -226,6 +225,8 @@ def _starts(guess, centre, radius):
 
 def _minimum(ranges, start):
     """The minimum next to a start (2,), of the Cauchy cost of AntennaRanges and their guess."""
+    from scipy.optimize import least_squares  # here, because it takes long to import
+
     def errors(place):
         return np.concatenate([ranges.errors(place), (place - ranges.guess) / GUESS_PRIOR_SIGMA])
 

@@ -24,6 +24,7 @@ from scipy.sparse.linalg import splu
 from slamlib.core import odometry, se2
 from slamlib.core.graph import ORIGIN_SIGMA
 from slamlib.core.increments import SLIP_BOUNDS, TYPICAL_SLIP
+from slamlib.core.preintegration import odometry_noise
 from slamlib.core.records import NO_RANGES, Dataset
 from slamlib.core.sightings import (
     MAX_HEADING_SIGMA,
@@ -129,6 +130,12 @@ class Measurements:
         unknown = [getattr(self.dataset.vehicle, key) is None for key in NOISE_KEYS]
         count = [1, len(self.marker_row), len(self.ranges.row)]
         return np.logical_and(unknown, count)
+
+    @cached_property
+    def odometry_noise(self) -> tuple[np.ndarray, np.ndarray]:
+        """Covariances (f-1, 3, 3) of odometry between the frames, as of `odometry_noise`."""
+        return odometry_noise(
+            self.dataset.ticks, self.dataset.vehicle, self.frame[:-1], self.frame[1:])
 
     @property
     def sighting_covariances(self) -> np.ndarray:
