@@ -133,8 +133,12 @@ def _evenly(rows, maximum):
 
 def _supported_and_certain(in_world, covariance):
     """Number of the most certain pose of one marker, of those with half the maximum support."""
-    squared = se2.squared_distances(in_world[:, None], in_world, covariance[:, None] + covariance)
-    support = np.count_nonzero(squared < GATE, axis=1)
+    first, second = np.triu_indices(len(in_world), 1)
+    squared = se2.squared_distances(
+        in_world[first], in_world[second], covariance[first] + covariance[second])
+    close = squared < GATE
+    confirmed = np.append(first[close], second[close])
+    support = 1 + np.bincount(confirmed, minlength=len(in_world))        # with itself
     log_determinant = np.linalg.slogdet(covariance)[1]
     supported = support >= support.max() / 2
     return np.where(supported, log_determinant, np.inf).argmin()
