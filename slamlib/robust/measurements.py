@@ -75,11 +75,6 @@ class Structure:
     variables: np.ndarray    # (m, 2) i and j of the factors: odometry, then sightings, then ranges
     blocks: np.ndarray       # (m, 4) numbers of their blocks (i, i), (i, j), (j, i), (j, j)
 
-    @property
-    def unknowns(self) -> np.ndarray:
-        """Rows of the unknowns of all variables, in the order of their numbers."""
-        return self.rows[np.arange(3) < 2 + self.is_pose[:, None]]
-
     def matrix(self, data: np.ndarray) -> sparse.csc_array:
         """The sparse matrix (n, n), which is symmetric, with the data (9 b,) of its blocks."""
         matrix = copy(self.places)                       # its indices are checked only once
