@@ -21,15 +21,12 @@ from slamlib.robust import factors, initialization, result
 from slamlib.robust.calibration import OFFSET, RANGES, SCALE, SIGHTINGS, stated_calibration
 from slamlib.robust.initialization import (
     AntennaRanges,
-    odometry_state,
     other_antenna,
     second_moment,
     trilaterate,
 )
-from slamlib.robust.linear import NormalEquations, consistency_factor
+from slamlib.robust.linear import consistency_factor
 from slamlib.robust.measurements import measure
-from slamlib.robust.optimize import optimize
-from slamlib.robust.pipeline import fit_from_previous
 from slamlib.robust.solution_doubts import solution_doubts
 from slamlib.solve import problem_solution
 from slamlib.studies import kernels, montecarlo, plaza, starts
@@ -413,19 +410,6 @@ def test_plaza_2_is_solved():
     assert "range-offset" in doubts and doubts <= {"range-offset", "tag-offset"}
     assert np.hypot(*(beacons - truth.antenna_in_world).T).max() < 0.5      # 1 % of 50 m
     assert not found.doubts and dataset.ticks.shape == (3881, 2)
-
-
-def test_one_optimum_is_reached_from_two_starts():
-    """The assignment starts at odometry and the guesses, slamlib at problem 3 and trilateration."""
-    dataset = simulate("short", seed=3, late_ranges=0.1)[0].first(600)
-    fit = fit_from_previous(measure(dataset), estimate(dataset.without("uwb")))
-    first = odometry_state(fit.problem.measurements, "arc", antennas=starts.guessed_antennas)
-    assert NormalEquations(fit.problem, first).error > 1.5 * NormalEquations(
-        fit.problem, fit.state).error
-    assert 1 <= optimize(fit.problem, fit.state).steps <= 3           # it is there already
-    end = optimize(fit.problem, first)
-    np.testing.assert_allclose(end.state.poses, fit.state.poses, rtol=0, atol=1e-4)
-    np.testing.assert_allclose(end.state.antennas, fit.state.antennas, rtol=0, atol=1e-3)
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ import gtsam
 import numpy as np
 
 from slamlib.core import se2
-from slamlib.core.batch import numbers
+from slamlib.core.batch import FixedValues, numbers
 from slamlib.core.errors import DatasetError
 from slamlib.core.graph import INDICES
 
@@ -169,6 +169,7 @@ def gauss_newton(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> Gau
 
     Raises DatasetError, which names a variable, if the factors do not determine every one.
     """
+    values = FixedValues(values)
     error = graph.error(values)
     for steps in range(1, MAX_STEPS + 1):
         linear = graph.linearize(values)
@@ -179,17 +180,17 @@ def gauss_newton(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> Gau
         promised = linear.error(values.zeroVectors()) - linear.error(step)
         stuck = new >= error and promised > negligible
         if error - new <= negligible:
-            return GaussNewton(moved, new, steps, not stuck, Marginals(tree))
+            return GaussNewton(gtsam.Values(moved), new, steps, not stuck, Marginals(tree))
         values = moved
         error = new
-    return GaussNewton(values, error, MAX_STEPS, False, Marginals(tree))
+    return GaussNewton(gtsam.Values(values), error, MAX_STEPS, False, Marginals(tree))
 
 
 def after_step(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, step: gtsam.VectorValues,
                error: float) -> tuple[gtsam.Values, float]:
     """Values after a step, halved until the error of the graph does not grow, and their error."""
     def moved(fraction):
-        there = values.retract(step.scale(fraction))
+        there = FixedValues(values.retract(step.scale(fraction)))
         return there, graph.error(there)
 
     return descended(moved, values, error)

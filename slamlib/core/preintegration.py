@@ -20,7 +20,7 @@ from slamlib.core.vehicle import Vehicle
 MINIMUM_SIGMA = 1e-5         # m, standard deviation of an increment's end along x and y
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class OdometryIncrements:
     """Increments between f consecutive frames, for every value of the slip."""
 

@@ -9,6 +9,7 @@ poses are by GTSAM's tangent vectors: X moves as X exp(xi), in its own axes.
 """
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -66,9 +67,15 @@ class LinearizedFactors:
 def linearize_odometry(problem, state, slip: float) -> LinearizedFactors:
     """The LinearizedFactors of odometry with a slip in sqrt(m), of a Problem at a State."""
     e, J, by_wheel = odometry_error(problem.odometry, state.poses, state.c[WHEELS])
-    U = square_root_information(problem.odometry.covariance(slip))
+    U = _odometry_roots(problem.odometry, slip)
     factors = _whitened(problem, np.arange(len(e)), WHEELS, U, e, J, by_wheel)
     return replace(factors, log_determinant=-2 * np.sum(np.log(np.linalg.diagonal(U))))
+
+
+@lru_cache(maxsize=4)
+def _odometry_roots(increments, slip):
+    """Square root informations (f-1, 3, 3) of OdometryIncrements for a slip in sqrt(m)."""
+    return square_root_information(increments.covariance(slip))
 
 
 def linearize_measurements(problem, state) -> tuple[LinearizedFactors, LinearizedFactors]:
