@@ -1,10 +1,12 @@
 """Stage 3: Gauss-Newton with step halving, by which the engine decides.
 
 A step solves the normal equations in numpy and scipy. What is handed in GTSAM solves itself
-(`robust.solution`).
+(`robust.solution`). `cauchy_minimum` is for a few unknowns.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -54,3 +56,37 @@ def after_step(equations: NormalEquations, step: np.ndarray) -> NormalEquations:
         return there, there.error
 
     return descended(moved, equations, equations.error)[0]
+
+
+class Minimum(NamedTuple):
+    """A minimum of a Cauchy cost of m errors."""
+
+    x: np.ndarray            # (p,)
+    cost: float
+    jac: np.ndarray          # (m, p), whose square is the curvature of the cost
+
+
+def cauchy_minimum(errors: Callable, start: np.ndarray, derivatives: Callable, scale: float,
+                   tolerance: float) -> Minimum:
+    """The Minimum of scale^2 / 2 sum log(1 + (r / scale)^2) next to a start (p,).
+
+    By reweighted Gauss-Newton steps. The functions return the errors r (m,) and their derivatives
+    (m, p). It ends where a step lowers the cost by at most `tolerance` times itself.
+    """
+    def at(x):
+        return x, scale**2 / 2 * np.sum(np.log1p((errors(x) / scale)**2))
+
+    x, cost = at(start)
+    for _ in range(MAX_STEPS):
+        r = errors(x)
+        J = derivatives(x)
+        weight = 1 / (1 + (r / scale)**2)
+        weighted = weight * J.T
+        step = -np.linalg.solve(weighted @ J, weighted @ r)
+        old = cost
+        x, cost = descended(lambda part, x=x, step=step: at(x + part * step), x, old)
+        if old - cost <= tolerance * old:
+            break
+    z = (errors(x) / scale)**2
+    curvature = np.maximum((1 - z) / (1 + z)**2, np.finfo(float).eps)
+    return Minimum(x, cost, np.sqrt(curvature)[:, None] * derivatives(x))
