@@ -10,6 +10,7 @@ from scipy.special import chdtri
 from slamlib.core import sightings
 from slamlib.core.errors import DatasetError
 from slamlib.core.graph_solution import eliminated
+from slamlib.core.kernels import KERNELS
 from slamlib.robust import linear, noise, solution
 from slamlib.robust.calibration import ENTRIES
 from slamlib.robust.covariances import marginal_covariances
@@ -149,17 +150,21 @@ def test_singular_normal_equations_are_told(monkeypatch):
         optimize(build_problem(m, "arc"), odometry_state(m, "arc"))
 
 
+@pytest.mark.parametrize("kernel", [None, KERNELS["Cauchy"]], ids=["quadratic", "Cauchy"])
 @pytest.mark.parametrize("groups", [(), GROUPS], ids=len)
-def test_solution_and_evidence_are_those_of_dense_normal_equations(groups):
-    """For the noise of the problem and for another one."""
+def test_solution_and_evidence_are_those_of_dense_normal_equations(groups, kernel):
+    """For the noise of the problem and for another one; a kernel takes part of the variance."""
     dataset = simulate("short", seed=4, mislabelled=0.02, late_ranges=0.2)[0].first(300)
     m = measure(known_noise(dataset, 1e-3))
-    problem = released(build_problem(m, "arc", Noise(1e-3)), groups)
-    state = odometry_state(m, "arc")
+    problem = replace(released(build_problem(m, "arc", Noise(1e-3)), groups),
+                      accepted=accept_all(m, kernel))
+    equations = NormalEquations(problem, odometry_state(m, "arc"))
+    count = equations.counts()
+    if kernel is None:
+        assert count == [3 * len(m.marker_row), len(m.ranges.row)]
     for other in (problem.noise, Noise(2e-3, 1.5, 0.7)):
-        delta, found = laplace_approximation(NormalEquations(problem, state), other)
-        changed = NormalEquations(replace(problem, noise=other), state)
-        sums = changed.sums(other)
+        delta, found = laplace_approximation(equations, other)
+        sums = equations.sums(other, consistent=True)
         n = len(m.structure.diagonal)
         H = m.structure.matrix(sums.H).toarray()
         information = np.block([[H, sums.border[:n, :-1]], [sums.border[:, :-1].T]])
@@ -167,10 +172,9 @@ def test_solution_and_evidence_are_those_of_dense_normal_equations(groups):
         scaled = unit[:, None] * information * unit
         expected = -unit * np.linalg.solve(scaled, unit * sums.border[:, -1])
         np.testing.assert_allclose(delta, expected, rtol=1e-5, atol=1e-8)
-        error = changed.error + sums.border[:, -1] @ expected / 2
+        squared = sums.squared + sums.border[:, -1] @ expected
         determinant = np.linalg.slogdet(scaled)[1] - 2 * np.sum(np.log(unit))
         of_odometry = np.sum(np.linalg.slogdet(problem.odometry.covariance(other.slip))[1])
-        log_factors = 3 * len(m.marker_row) * np.log(other.sightings) \
-            + len(m.ranges.row) * np.log(other.ranges)
+        log_factors = np.log([other.sightings, other.ranges]) @ count
         assert np.isclose(
-            found, -error - (determinant + of_odometry) / 2 - log_factors, atol=1e-5)
+            found, -(squared + determinant + of_odometry) / 2 - log_factors, atol=1e-5)
