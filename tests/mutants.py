@@ -36,7 +36,7 @@ ROOT = Path(__file__).parents[1]
 FOLDERS = ("core/", "robust/", "io/")
 FILES = [f"test_{name}.py" for name in (
     "se2", "odometry", "results", "dataset", "dialects", "marker_increments", "localization",
-    "jumps", "memory", "doubts", "calibration", "normal_equations", "slam", "uwb",
+    "jumps", "memory", "doubts", "calibration", "normal_equations", "graph", "slam", "uwb",
     "library", "numbers", "flaws", "overview")]
 ENOUGH = 40                            # seconds, of the tests of one mutant
 MEMORY = 8 << 30                       # bytes, of a mutant's process

@@ -7,7 +7,6 @@ from itertools import cycle
 from pathlib import Path
 from types import SimpleNamespace
 
-import gtsam
 import numpy as np
 import pytest
 from numeric import aruco, as_points, carried, central_differences, changed, counts, uwb, vehicle
@@ -21,12 +20,11 @@ from slamlib.core.records import ArucoReadings
 from slamlib.core.vehicle import Vehicle
 from slamlib.io.dataset import read_dataset, read_truth
 from slamlib.robust import calibration, choices
-from slamlib.robust import optimize as graph
 from slamlib.robust.calibration import ANTENNAS, ENTRIES, HEIGHT, RANGE_LAG, SIGHTING_LAG, SIZE
 from slamlib.robust.factors import SMOOTHED_STEPS, sensor_poses
 from slamlib.robust.file_doubts import doubts_before_solving
 from slamlib.robust.initialization import odometry_state
-from slamlib.robust.linear import NormalEquations, build_problem, linear_solution, retract
+from slamlib.robust.linear import NormalEquations, build_problem, retract
 from slamlib.robust.measurements import Noise, measure
 from slamlib.robust.solution_doubts import GROUPS, solution_doubts
 from slamlib.studies.montecarlo import antenna_error
@@ -106,23 +104,6 @@ def test_sensors_are_where_the_vehicle_was_by_their_delay():
         later = m.frame[row] >= late
         expected = se2.compose(path[m.frame[row[later]] - late], place)
         np.testing.assert_allclose(found[later], expected, atol=1e-9)
-
-
-def test_the_posterior_is_that_of_gtsam():
-    """Mean and covariance of the whole vector by the dense inverse of GTSAM's Hessian."""
-    equations = equations_of(replace(MOUNTED, **DOUBTFUL), count=150)
-    problem, q = equations.problem, equations.problem.active.sum()
-    ordering, structure = gtsam.Ordering(), equations.structure
-    for key in range(len(structure.is_pose) + 1):
-        ordering.push_back(key)
-    matrix, vector = graph.linearize(problem, equations).hessian(ordering)
-    scale = 1 / np.sqrt(np.diag(matrix))
-    inverse = np.linalg.inv(matrix * scale[:, None] * scale) * scale[:, None] * scale
-    solution = linear_solution(structure, equations.sums(problem.noise))
-    np.testing.assert_allclose(np.linalg.inv(solution.S), inverse[-q:, -q:], rtol=1e-5, atol=1e-9)
-    expected, n = np.zeros(len(solution.delta)), len(structure.diagonal)
-    expected[np.r_[structure.unknowns, n:n + q]] = inverse @ vector
-    np.testing.assert_allclose(solution.delta, expected, atol=1e-6 * np.abs(expected).max())
 
 
 def test_evidence_of_one_entry_by_hand():

@@ -135,6 +135,7 @@ def seen_in(*frames):
     ([[1, 2], [2], [3], [1], [1]], 2 * [True] + 3 * [False]),
     ([[1, 2], [2], [3], [1, 2]], 2 * [True] + [False, True]),
     ([[1, 2], [1, 2], [3, 4], [3, 4], [3, 4], [2, 1], [1]], 2 * [True] + 3 * [False] + 2 * [True]),
+    ([[1, 2], [1, 2, 3, 4], [3, 4], [1, 2]], 4 * [True]),
     ([[9], [1, 2], [1, 2]], [False, True, True])])
 def test_frames_are_known_by_two_markers_or_one_that_adjacent_frames_confirm(frames, known):
     """In the frame of the first one that is tied to the next; of others nothing is known.

@@ -4,12 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numeric import as_points, known_noise
+from numeric import as_points, known_noise, vehicle
 from scipy.special import chdtri
 
 from slamlib.core import sightings
-from slamlib.robust import linear, noise
-from slamlib.robust import optimize as graph
+from slamlib.core.errors import DatasetError
+from slamlib.core.graph_solution import eliminated
+from slamlib.core.kernels import KERNELS
+from slamlib.robust import linear, noise, solution
 from slamlib.robust.calibration import ENTRIES
 from slamlib.robust.covariances import marginal_covariances
 from slamlib.robust.initialization import odometry_state
@@ -29,7 +31,7 @@ def released(problem, groups):
 
 def test_markers_without_accepted_sightings_have_a_weak_prior_and_move_nothing_else():
     """Two markers with a heading, of consecutive ids, and a point; GTSAM takes the same step."""
-    dataset, _ = simulate("short", seed=4)
+    dataset = vehicle(kernel="quadratic")(simulate("short", seed=4)[0])
     points = dataset.aruco.marker == dataset.aruco.marker[0]
     m = measure(replace(dataset, aruco=as_points(dataset.aruco, points, 4.0)).first(500))
     point, = np.flatnonzero(~m.oriented)
@@ -38,16 +40,20 @@ def test_markers_without_accepted_sightings_have_a_weak_prior_and_move_nothing_e
     problem = replace(problem, accepted=accepted._replace(sightings=replace(
         accepted.sightings, weight=1.0 - np.isin(m.marker_row, [point, first, first + 1]))))
     state = odometry_state(m, "arc")
-    equations, left = NormalEquations(problem, state), []
+    equations = NormalEquations(problem, state)
     H = equations.structure.matrix(equations.sums(problem.noise).H).toarray()
     for j in (point, first, first + 1):
         own = equations.structure.rows[len(m.frame) + j, :2 + m.oriented[j]]
         np.testing.assert_allclose(H[np.ix_(own, own)], np.eye(len(own)) / WEAK_SIGMA**2)
         assert np.count_nonzero(H[own]) == len(own)
-        left.extend(own)
-    step, expected = (np.delete(each, left) for each in (
-        equations.step(), graph.gtsam_step(problem, equations)))
-    np.testing.assert_allclose(step, expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
+    graph, row = solution.graph_of(problem, problem.noise), equations.structure.rows
+    values = solution.values_of(problem, state, graph)
+    _, step = eliminated(graph.linearize(values))
+    found = equations.step()
+    for key, own in zip(solution.variable_keys(problem), row):
+        if values.exists(key):
+            expected = step.at(key)
+            np.testing.assert_allclose(found[own[:len(expected)]], expected, rtol=1e-4, atol=1e-8)
 
 
 @pytest.mark.parametrize("poses", [1, 15, 400])
@@ -137,29 +143,38 @@ def test_gates_are_quantiles_of_chi_squared():
     assert np.allclose([sightings.GATE, sightings.POINT_GATE], chdtri([3, 2], 1e-3), rtol=1e-12)
 
 
-def test_where_the_normal_equations_are_singular_gtsam_takes_the_same_step(monkeypatch):
-    m = measure(known_noise(simulate("short", seed=4)[0].without("uwb").first(400), 1e-3))
-    problem, start = build_problem(m, "arc"), odometry_state(m, "arc")
-    expected = optimize(problem, start).state
+def test_singular_normal_equations_are_told(monkeypatch):
+    m = measure(simulate("short", seed=4)[0].first(100))
     monkeypatch.setattr(linear, "linear_solution", lambda *_: None)
-    np.testing.assert_allclose(optimize(problem, start).state.poses, expected.poses, atol=1e-8)
+    with pytest.raises(DatasetError, match="measurements that determine every pose and landmark"):
+        optimize(build_problem(m, "arc"), odometry_state(m, "arc"))
 
 
-def test_the_normal_equations_are_those_of_gtsams_linear_graph():
-    """Solution and log determinant, for the noise of the problem and for another one."""
-    dataset = simulate("short", seed=4, mislabelled=0.02, late_ranges=0.2)[0].first(600)
+@pytest.mark.parametrize("kernel", [None, KERNELS["Cauchy"]], ids=["quadratic", "Cauchy"])
+@pytest.mark.parametrize("groups", [(), GROUPS], ids=len)
+def test_solution_and_evidence_are_those_of_dense_normal_equations(groups, kernel):
+    """For the noise of the problem and for another one; a kernel takes part of the variance."""
+    dataset = simulate("short", seed=4, mislabelled=0.02, late_ranges=0.2)[0].first(300)
     m = measure(known_noise(dataset, 1e-3))
-    problem, state = build_problem(m, "arc", Noise(1e-3)), odometry_state(m, "arc")
-    other = Noise(2e-3, 1.5, 0.7)
-    delta, found = laplace_approximation(NormalEquations(problem, state), other)
-    changed = NormalEquations(replace(problem, noise=other), state)
-    linear = graph.linearize(changed.problem, changed)
-    tree = linear.eliminateMultifrontal()
-    solution = tree.optimize().vector(range(len(m.structure.is_pose) + 1))
-    unknowns = np.append(m.structure.unknowns, np.arange(len(delta) - 3, len(delta)))
-    np.testing.assert_allclose(delta[unknowns], solution, rtol=1e-5,
-                               atol=1e-8)                 # both square the condition number
-    expected = -linear.error(tree.optimize()) - tree.logDeterminant() \
-        - np.sum(np.linalg.slogdet(problem.odometry.covariance(2e-3))[1]) / 2 \
-        - 3 * len(m.marker_row) * np.log(1.5) - len(m.ranges.row) * np.log(0.7)
-    assert np.isclose(found, expected, atol=1e-6)
+    problem = replace(released(build_problem(m, "arc", Noise(1e-3)), groups),
+                      accepted=accept_all(m, kernel))
+    equations = NormalEquations(problem, odometry_state(m, "arc"))
+    count = equations.counts()
+    if kernel is None:
+        assert count == [3 * len(m.marker_row), len(m.ranges.row)]
+    for other in (problem.noise, Noise(2e-3, 1.5, 0.7)):
+        delta, found = laplace_approximation(equations, other)
+        sums = equations.sums(other, consistent=True)
+        n = len(m.structure.diagonal)
+        H = m.structure.matrix(sums.H).toarray()
+        information = np.block([[H, sums.border[:n, :-1]], [sums.border[:, :-1].T]])
+        unit = 1 / np.sqrt(np.diag(information))
+        scaled = unit[:, None] * information * unit
+        expected = -unit * np.linalg.solve(scaled, unit * sums.border[:, -1])
+        np.testing.assert_allclose(delta, expected, rtol=1e-5, atol=1e-8)
+        squared = sums.squared + sums.border[:, -1] @ expected
+        determinant = np.linalg.slogdet(scaled)[1] - 2 * np.sum(np.log(unit))
+        of_odometry = np.sum(np.linalg.slogdet(problem.odometry.covariance(other.slip))[1])
+        log_factors = np.log([other.sightings, other.ranges]) @ count
+        assert np.isclose(
+            found, -(squared + determinant + of_odometry) / 2 - log_factors, atol=1e-5)

@@ -19,7 +19,6 @@ from slamlib import estimate, read_dataset, solve
 from slamlib.__main__ import main
 from slamlib.core.errors import DatasetError
 from slamlib.io import results
-from slamlib.io.vehicle import read_vehicle
 from slamlib.studies.simulation import simulate, write_dataset
 
 ABSENT = [np.nan] * 3
@@ -150,15 +149,14 @@ def test_the_vehicle_as_estimated_can_be_taken_over(tmp_path):
     dataset = replace(dataset, aruco=replace(dataset.aruco, marker_in_vehicle=seen)).without("uwb")
     write_dataset(tmp_path / "drive", dataset)
     assert main(["solve", str(tmp_path / "drive"), "--out", str(tmp_path), "--problem", "3"]) == 0
-    vehicle = read_vehicle(tmp_path / "vehicle.toml")
+    (tmp_path / "vehicle.toml").rename(tmp_path / "drive" / "vehicle.toml")
+    vehicle = read_dataset(tmp_path / "drive").vehicle
     row = results.read_summary(tmp_path)["problems"]["problem3"]
     camera, = (entry for entry in row["calibration"] if entry["name"] == "camera_x")
     assert (vehicle.camera_x, vehicle.sigma_camera_x) == (camera["estimate"], camera["sigma"])
     assert abs(vehicle.camera_x - 0.1) < 0.02
     assert vehicle.slip == row["slip_sqrt_m"]
     assert (vehicle.wheelbase, vehicle.range_noise_factor) == (0.4, None)
-    (tmp_path / "vehicle.toml").rename(tmp_path / "drive" / "vehicle.toml")
-    assert read_dataset(tmp_path / "drive").vehicle == vehicle
 
 
 def test_where_all_is_stated_no_vehicle_is_written(tmp_path, drive):

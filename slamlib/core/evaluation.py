@@ -8,7 +8,6 @@ follows Bar-Shalom, Li and Kirubarajan, *Estimation with Applications to Trackin
 """
 
 import numpy as np
-from scipy.special import chdtri
 
 from slamlib.core import se2
 from slamlib.core.se2 import correlations as correlations
@@ -91,6 +90,8 @@ def nees_band(count: int, dof: int = 3, probability: float = 0.95) -> tuple[floa
     >>> np.round(nees_band(8), 2)
     array([1.55, 4.92])
     """
+    from scipy.special import chdtri  # here, because it takes long to import
+
     tail = (1 - probability) / 2
     low = chdtri(dof * count, 1 - tail)
     high = chdtri(dof * count, tail)

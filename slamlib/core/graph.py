@@ -5,7 +5,7 @@ L(id), the pose of a marker, or P(id), its position where no sighting has a head
 position of an antenna; and W(0), the wheel parameters [R_R, R_L, b] in standard deviations from
 what is stated. Poses are gtsam.Pose2, positions gtsam.Point2, all in the frame of pose 1.
 
-    odometry    log(Delta(w)^-1 X_i^-1 X_k)        a custom factor: all increments share w
+    odometry    log(Delta(w)^-1 X_i^-1 X_k)        a custom factor (`batch`): all share w
     sighting    log(Z^-1 X^-1 L)                   BetweenFactorPose2, or BearingRangeFactor2D
     range       |A - p| - r                        RangeFactor2D, with a robust kernel
 
@@ -22,11 +22,19 @@ import numpy as np
 from gtsam.symbol_shorthand import A, L, P, W, X
 
 from slamlib.core import odometry, se2
+from slamlib.core.batch import Batch
 from slamlib.core.errors import require
 from slamlib.core.increments import TYPICAL_SLIP
-from slamlib.core.kernels import KERNELS, ONE_SIDED, kernel_of
-from slamlib.core.preintegration import OdometryIncrements, preintegrate
-from slamlib.core.records import AntennaGuess, ArucoReadings, Dataset, UwbReadings
+from slamlib.core.kernels import KERNELS, ONE_SIDED, kernel_of, symmetric
+from slamlib.core.preintegration import OdometryIncrements, odometry_error, preintegrate
+from slamlib.core.records import (
+    NO_RANGES,
+    NO_SIGHTINGS,
+    AntennaGuess,
+    ArucoReadings,
+    Dataset,
+    UwbReadings,
+)
 from slamlib.core.sightings import MAX_HEADING_SIGMA, consensus
 
 ORIGIN_SIGMA = 1e-5          # m, of the position of pose 1, which is zero by definition
@@ -42,14 +50,13 @@ class Decisions:
     slip: float                          # sqrt(m), sigma of a wheel's slip after one metre
     sigma_heading: float                 # rad, of pose 1
     sigma_wheel: np.ndarray              # (3,) m, of the prior of the wheel parameters
-    sightings: ArucoReadings | None      # those that count, in the vehicle, with their covariances
-    ranges: UwbReadings | None           # those that count, with their standard deviations
+    sightings: ArucoReadings             # those that count, in the vehicle, with their covariances
+    ranges: UwbReadings                  # those that count, with their standard deviations
     guess: AntennaGuess | None
     points: np.ndarray                   # ids of the markers whose heading no sighting knows
     sighting_share: np.ndarray           # (s,) of its information that each sighting keeps
     range_share: np.ndarray              # (r,)
-    sighting_kernel: str                 # name in `kernels.KERNELS`
-    range_kernel: str
+    kernel: str                          # name in `kernels.KERNELS`; of ranges alone if asymmetric
 
 
 def require_rows(dataset: Dataset, poses: np.ndarray, source: str):
@@ -59,16 +66,6 @@ def require_rows(dataset: Dataset, poses: np.ndarray, source: str):
         is_whole = isinstance(pose, int | np.integer) and not isinstance(pose, bool)
         require(is_whole and 0 <= pose < count, source, f"rows from 0 to {count - 1} for poses",
                 pose)
-
-
-def frames_of(dataset: Dataset, extra: np.ndarray = ()) -> np.ndarray:
-    """Encoder poses (f,) that are variables: the first, the last, with a measurement, `extra`."""
-    require_rows(dataset, extra, "count_everything")
-    frames = [0, len(dataset.ticks) - 1]
-    for readings in (dataset.aruco, dataset.uwb):
-        if readings is not None:
-            frames = np.union1d(frames, readings.pose)
-    return np.union1d(frames, extra).astype(int)
 
 
 def count_everything(dataset: Dataset, kernel: str = "Cauchy", slip: float = TYPICAL_SLIP,
@@ -83,10 +80,13 @@ def count_everything(dataset: Dataset, kernel: str = "Cauchy", slip: float = TYP
     known = ", ".join(KERNELS)
     require(kernel in KERNELS, "count_everything", f"one of {known} for kernel", kernel)
     require(0 < slip < np.inf, "count_everything", "a slip above 0", slip)
-    sightings = dataset.sightings
-    ranges = dataset.ranges
+    require_rows(dataset, extra, "count_everything")
+    sightings = dataset.sightings or NO_SIGHTINGS
+    ranges = dataset.ranges or NO_RANGES
+    ends = [0, len(dataset.ticks) - 1]
+    frames = np.unique(np.concatenate([ends, sightings.pose, ranges.pose, extra]).astype(int))
     return Decisions(
-        odometry=preintegrate(dataset, frames_of(dataset, extra)),
+        odometry=preintegrate(dataset, frames),
         slip=slip,
         sigma_heading=dataset.vehicle.sigma_heading,
         sigma_wheel=dataset.vehicle.sigma_wheel,
@@ -94,10 +94,9 @@ def count_everything(dataset: Dataset, kernel: str = "Cauchy", slip: float = TYP
         ranges=ranges,
         guess=dataset.antenna_guess,
         points=markers_without_heading(sightings),
-        sighting_share=np.ones(0 if sightings is None else len(sightings.pose)),
-        range_share=np.ones(0 if ranges is None else len(ranges.pose)),
-        sighting_kernel="quadratic" if kernel in ONE_SIDED else kernel,
-        range_kernel=kernel)
+        sighting_share=np.ones(len(sightings.pose)),
+        range_share=np.ones(len(ranges.pose)),
+        kernel=kernel)
 
 
 def build_graph(decisions: Decisions) -> gtsam.NonlinearFactorGraph:
@@ -105,10 +104,8 @@ def build_graph(decisions: Decisions) -> gtsam.NonlinearFactorGraph:
     graph = gtsam.NonlinearFactorGraph()
     add_priors(graph, decisions)
     add_odometry(graph, decisions)
-    if decisions.sightings is not None:
-        add_sightings(graph, decisions)
-    if decisions.ranges is not None:
-        add_ranges(graph, decisions)
+    add_sightings(graph, decisions)
+    add_ranges(graph, decisions)
     return graph
 
 
@@ -118,11 +115,10 @@ def add_priors(graph: gtsam.NonlinearFactorGraph, decisions: Decisions):
     origin = noise.Diagonal.Sigmas([ORIGIN_SIGMA, ORIGIN_SIGMA, decisions.sigma_heading])
     graph.add(gtsam.PriorFactorPose2(X(0), gtsam.Pose2(), origin))
     graph.add(gtsam.PriorFactorVector(W(0), np.zeros(3), noise.Unit.Create(3)))
-    if decisions.ranges is not None:
-        add_antenna_priors(graph, decisions.guess, decisions.ranges.antenna)
+    add_antenna_priors(graph, decisions.guess, decisions.ranges.antenna)
 
 
-def add_antenna_priors(graph: gtsam.NonlinearFactorGraph, guess: AntennaGuess,
+def add_antenna_priors(graph: gtsam.NonlinearFactorGraph, guess: AntennaGuess | None,
                        antennas: np.ndarray):
     """Add the prior of each of these antennas, ids (r,), about its guess."""
     noise = gtsam.noiseModel.Isotropic.Sigma(2, GUESS_PRIOR_SIGMA)
@@ -130,15 +126,13 @@ def add_antenna_priors(graph: gtsam.NonlinearFactorGraph, guess: AntennaGuess,
         graph.add(gtsam.PriorFactorPoint2(A(antenna), position, noise))
 
 
-def guessed(guess: AntennaGuess, antennas: np.ndarray) -> dict[int, np.ndarray]:
+def guessed(guess: AntennaGuess | None, antennas: np.ndarray) -> dict[int, np.ndarray]:
     """The guessed position (2,) in m of each of these antennas, by the index of its symbol."""
-    missing = np.setdiff1d(antennas, [] if guess is None else guess.antenna)
-    require(not len(missing), "antenna_guess", "a guess of each antenna with ranges", missing)
-    positions = {}
-    for antenna, position in zip(guess.antenna, guess.position):
-        if antenna in antennas:
-            positions[index_of(antenna)] = position
-    return positions
+    known = {} if guess is None else dict(zip(guess.antenna.tolist(), guess.position))
+    heard = np.unique(antennas).tolist()
+    missing = [antenna for antenna in heard if antenna not in known]
+    require(not missing, "antenna_guess", "a guess of each antenna with ranges", missing)
+    return {index_of(antenna): known[antenna] for antenna in heard}
 
 
 def index_of(landmark: int) -> int:
@@ -149,60 +143,20 @@ def index_of(landmark: int) -> int:
 def add_odometry(graph: gtsam.NonlinearFactorGraph, decisions: Decisions):
     """Add a factor between successive frames, which all depend on the same wheel parameters."""
     increments = decisions.odometry
+    sigma = decisions.sigma_wheel
     poses = [X(i) for i in increments.frame.tolist()]
+    first = poses[:-1]
+    second = poses[1:]
+
+    def linearised(from_pose, to_pose, off):
+        poses = np.concatenate([from_pose, to_pose[-1:]])
+        e, by_poses, by_wheel = odometry_error(
+            increments, poses, increments.stated + sigma * off[0])
+        return e, [by_poses[:, :, :3], by_poses[:, :, 3:], by_wheel * sigma]
+
+    batch = Batch([first, second, len(first) * [W(0)]], linearised)
     for k, covariance in enumerate(increments.covariance(decisions.slip)):
-        noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
-        error = odometry_error(increments, k, decisions.sigma_wheel)
-        graph.add(gtsam.CustomFactor(noise, [poses[k], poses[k + 1], W(0)], error))
-
-
-def odometry_error(increments: OdometryIncrements, k: int, sigma_wheel: np.ndarray):
-    """The error function of the increment k, for gtsam.CustomFactor.
-
-    The error is s log(Delta(w)^-1 X_i^-1 X_k). The scale s of x and y is the mean stated radius
-    over that of w, and s of the heading is this times the wheelbase of w over the stated one:
-    encoders measure counts, and the error of a count in metres grows with the wheels. Without this
-    scale smaller wheels would fit better where nothing else gives the scale.
-    """
-    increment = increments.increment[k]
-    J_wheel = increments.J_wheel[k]
-    stated = increments.stated
-    stated_radius = (stated[0] + stated[1]) / 2
-    off_stated = stated - increments.wheel               # from the value of linearisation
-
-    def error(factor, values, jacobians):
-        first, second, wheels = factor.keys()
-        change = sigma_wheel * values.atVector(wheels)
-        radius = stated_radius + (change[0] + change[1]) / 2
-        wheelbase = stated[2] + change[2]
-        scale = np.array([1.0, 1.0, wheelbase / stated[2]]) * (stated_radius / radius)
-        measured = gtsam.Pose2(*(increment + J_wheel @ (off_stated + change)))
-        X_i = values.atPose2(first)
-        X_k = values.atPose2(second)
-        if jacobians is None:
-            return scale * gtsam.Pose2.Logmap(measured.between(X_i.between(X_k)))
-        by_first, by_second, by_measured, by_expected, by_difference = np.zeros(
-            (5, 3, 3)).transpose(0, 2, 1)                    # columns first, as GTSAM wants
-        expected = X_i.between(X_k, by_first, by_second)
-        difference = measured.between(expected, by_measured, by_expected)
-        unscaled = gtsam.Pose2.Logmap(difference, by_difference)
-        scaled_by_expected = scale[:, None] * (by_difference @ by_expected)
-        by_wheel = by_difference @ by_measured @ in_own_axes(measured) @ J_wheel
-        by_wheel[:, :2] -= unscaled[:, None] / (2 * radius)
-        by_wheel[2, 2] += unscaled[2] / wheelbase
-        jacobians[0] = scaled_by_expected @ by_first
-        jacobians[1] = scaled_by_expected @ by_second
-        jacobians[2] = scale[:, None] * by_wheel * sigma_wheel
-        return scale * unscaled
-
-    return error
-
-
-def in_own_axes(pose: gtsam.Pose2) -> np.ndarray:
-    """Derivative (3, 3) of GTSAM's tangent vector at a pose by its coordinates [x, y, heading]."""
-    c = np.cos(pose.theta())
-    s = np.sin(pose.theta())
-    return np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+        graph.add(batch.factor(k, gtsam.noiseModel.Gaussian.Covariance(covariance)))
 
 
 def noise_model(covariance: np.ndarray, kernel: str, share: float) -> gtsam.noiseModel.Base:
@@ -216,10 +170,8 @@ def noise_model(covariance: np.ndarray, kernel: str, share: float) -> gtsam.nois
     return gaussian if robust is None else gtsam.noiseModel.Robust.Create(robust, gaussian)
 
 
-def markers_without_heading(sightings: ArucoReadings | None) -> np.ndarray:
+def markers_without_heading(sightings: ArucoReadings) -> np.ndarray:
     """Ids (k,) of the markers of which no sighting knows the heading."""
-    if sightings is None:
-        return np.zeros(0, int)
     known = sightings.covariance[:, 2, 2] < MAX_HEADING_SIGMA**2
     return np.setdiff1d(sightings.marker, sightings.marker[known])
 
@@ -231,6 +183,7 @@ def add_sightings(graph: gtsam.NonlinearFactorGraph, decisions: Decisions):
     lives in those of the measured pose, R(heading)^T C R(heading) (equation 3.1).
     """
     sightings = decisions.sightings
+    kernel = symmetric(decisions.kernel)
     points = set(decisions.points.tolist())
     in_axes_of_marker = se2.rotate_covariance(
         sightings.covariance, -sightings.marker_in_vehicle[:, 2])
@@ -240,11 +193,11 @@ def add_sightings(graph: gtsam.NonlinearFactorGraph, decisions: Decisions):
         marker = int(sightings.marker[k])
         if marker in points:
             bearing, distance, C = polar(z, sightings.covariance[k])
-            noise = noise_model(C, decisions.sighting_kernel, share)
+            noise = noise_model(C, kernel, share)
             graph.add(gtsam.BearingRangeFactor2D(
                 pose, P(index_of(marker)), bearing, distance, noise))
         else:
-            noise = noise_model(in_axes_of_marker[k], decisions.sighting_kernel, share)
+            noise = noise_model(in_axes_of_marker[k], kernel, share)
             graph.add(gtsam.BetweenFactorPose2(
                 pose, L(index_of(marker)), gtsam.Pose2(*z), noise))
 
@@ -261,7 +214,7 @@ def polar(z: np.ndarray, C: np.ndarray) -> tuple[gtsam.Rot2, float, np.ndarray]:
 def add_ranges(graph: gtsam.NonlinearFactorGraph, decisions: Decisions):
     """Add a factor for each range, which is compared with the bias of a one-sided kernel."""
     ranges = decisions.ranges
-    kernel = decisions.range_kernel
+    kernel = decisions.kernel
     measured = ranges.range - ONE_SIDED.get(kernel, 0.0) * ranges.sigma
     for k, sigma in enumerate(ranges.sigma):
         pose = X(int(ranges.pose[k]))
@@ -278,12 +231,9 @@ def initial_values(dataset: Dataset, decisions: Decisions) -> gtsam.Values:
         dataset.ticks, dataset.vehicle, model=decisions.odometry.model)
     for i in decisions.odometry.frame.tolist():
         values.insert(X(i), gtsam.Pose2(*poses[i]))
-    if decisions.sightings is not None:
-        insert_markers(values, decisions, poses, covariances)
-    if decisions.ranges is not None:
-        at_guesses = guessed(decisions.guess, decisions.ranges.antenna)
-        for antenna, position in at_guesses.items():
-            values.insert(A(antenna), position)
+    insert_markers(values, decisions, poses, covariances)
+    for antenna, position in guessed(decisions.guess, decisions.ranges.antenna).items():
+        values.insert(A(antenna), position)
     return values
 
 

@@ -15,6 +15,7 @@ import gtsam
 import numpy as np
 
 from slamlib.core import se2
+from slamlib.core.batch import FixedValues, numbers
 from slamlib.core.errors import DatasetError
 from slamlib.core.graph import INDICES
 
@@ -123,7 +124,10 @@ def solve_graph(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> Grap
     require_values(graph, values)
     try:
         found = gauss_newton(graph, values)
-        found_places = places(found.values, found.marginals.covariance)
+        covariance_of = found.marginals.covariance
+        pose, poses, covariances = in_world(found.values, "x", covariance_of)
+        marker, marker_in_world, marker_covariance = in_world(found.values, "lp", covariance_of)
+        antenna, antennas, antenna_covariance = in_world(found.values, "a", covariance_of)
         worst = contradiction(graph, found.values)
     except RuntimeError as failure:                      # GTSAM's, on types and numbers
         reason = str(failure).strip().partition("\n")[0]
@@ -136,9 +140,13 @@ def solve_graph(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> Grap
                     "factor far from the rest, a derivative wrong, or an initial value?",
                     found.steps, found.error)
     return GraphSolution(
-        graph=graph, values=found.values, marginals=found.marginals, steps=found.steps,
-        error=found.error, converged=found.converged and not worst, contradiction=worst,
-        **found_places)
+        graph=graph, values=found.values, marginals=found.marginals,
+        pose=pose, poses=poses, covariances=covariances,
+        marker=marker, marker_in_world=marker_in_world, marker_covariance=marker_covariance,
+        antenna=antenna, antenna_in_world=antennas[:, :2],
+        antenna_covariance=antenna_covariance[:, :2, :2],
+        steps=found.steps, error=found.error, converged=found.converged and not worst,
+        contradiction=worst)
 
 
 def require_values(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values):
@@ -161,31 +169,44 @@ def gauss_newton(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> Gau
 
     Raises DatasetError, which names a variable, if the factors do not determine every one.
     """
+    values = FixedValues(values)
     error = graph.error(values)
     for steps in range(1, MAX_STEPS + 1):
         linear = graph.linearize(values)
         tree, step = eliminated(linear)
-        moved, new = descended(graph, values, step, error)
+        moved, new = after_step(graph, values, step, error)
         LOG.debug("Gauss-Newton step %d: error %.6g", steps, new)
         negligible = CONVERGED * (1 + error)
         promised = linear.error(values.zeroVectors()) - linear.error(step)
         stuck = new >= error and promised > negligible
         if error - new <= negligible:
-            return GaussNewton(moved, new, steps, not stuck, Marginals(tree))
+            return GaussNewton(gtsam.Values(moved), new, steps, not stuck, Marginals(tree))
         values = moved
         error = new
-    return GaussNewton(values, error, MAX_STEPS, False, Marginals(tree))
+    return GaussNewton(gtsam.Values(values), error, MAX_STEPS, False, Marginals(tree))
 
 
-def descended(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, step: gtsam.VectorValues,
-              error: float) -> tuple[gtsam.Values, float]:
-    """Values after a step, halved until the error does not grow, and their error."""
+def after_step(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, step: gtsam.VectorValues,
+               error: float) -> tuple[gtsam.Values, float]:
+    """Values after a step, halved until the error of the graph does not grow, and their error."""
+    def moved(fraction):
+        there = FixedValues(values.retract(step.scale(fraction)))
+        return there, graph.error(there)
+
+    return descended(moved, values, error)
+
+
+def descended(moved: Callable[[float], tuple], start: object,
+              error: float) -> tuple[object, float]:
+    """The point after a step, halved until the error does not grow, and its error.
+
+    The function `moved` returns both for a fraction of the step from the point `start`.
+    """
     for halving in range(MAX_HALVINGS):
-        moved = values.retract(step.scale(0.5**halving))
-        new = graph.error(moved)
+        point, new = moved(0.5**halving)
         if new <= (1 + ROUNDING) * error:
-            return moved, new
-    return values, error
+            return point, new
+    return start, error
 
 
 def eliminated(linear: gtsam.GaussianFactorGraph) -> tuple[
@@ -245,55 +266,27 @@ def is_guess(factor: gtsam.NonlinearFactor) -> bool:
         factor.keys()[0]) == ord("a")
 
 
-def places(values: gtsam.Values, covariance_of: Callable[[int], np.ndarray]) -> dict:
-    """Fields of a GraphSolution by values, and covariances by key in GTSAM's axes."""
-    keys = {symbol: [] for symbol in "xlpa"}
-    for key in values.keys():
-        symbol = chr(gtsam.symbolChr(key)) if gtsam.symbolChr(key) else ""
-        if symbol in keys:
-            keys[symbol].append(key)
-    poses, covariances = poses_in_world(values, keys["x"], covariance_of)
-    marker_poses, marker_covariances = poses_in_world(values, keys["l"], covariance_of)
-    points, point_covariances = points_in_world(values, keys["p"], covariance_of)
-    antennas, antenna_covariances = points_in_world(values, keys["a"], covariance_of)
-    marker = ids_of(keys["l"] + keys["p"])
-    marker_in_world = np.concatenate([
-        marker_poses, np.pad(points, ((0, 0), (0, 1)), constant_values=np.nan)])
-    marker_covariance = np.concatenate([
-        marker_covariances, np.pad(point_covariances, ((0, 0), (0, 1), (0, 1)),
-                                   constant_values=np.nan)])
-    by_id = np.argsort(marker)
-    antenna = ids_of(keys["a"])
-    by_antenna = np.argsort(antenna)
-    return {"pose": ids_of(keys["x"]), "poses": poses, "covariances": covariances,
-            "marker": marker[by_id], "marker_in_world": marker_in_world[by_id],
-            "marker_covariance": marker_covariance[by_id],
-            "antenna": antenna[by_antenna], "antenna_in_world": antennas[by_antenna],
-            "antenna_covariance": antenna_covariances[by_antenna]}
+def in_world(values: gtsam.Values, symbols: str, covariance_of: Callable[[int], np.ndarray]):
+    """Ids (n,), ascending, places (n, 3) and covariances (n, 3, 3) in world axes.
 
-
-def ids_of(keys: list[int]) -> np.ndarray:
-    """Ids (n,), which may be negative, by GTSAM's keys."""
-    index = np.array([gtsam.symbolIndex(key) for key in keys], dtype=np.int64)
-    return np.where(index < INDICES // 2, index, index - INDICES)
-
-
-def poses_in_world(values: gtsam.Values, keys: list[int], covariance_of: Callable):
-    """Poses (n, 3) of these keys, and their covariances (n, 3, 3) in world axes."""
-    poses = np.zeros((len(keys), 3))
-    covariances = np.zeros((len(keys), 3, 3))
+    Of all variables with one of these symbols; the heading of a position is NaN. `covariance_of`
+    gives the covariance of a key in GTSAM's axes.
+    """
+    keys = [key for key in values.keys() if chr(gtsam.symbolChr(key)) in symbols]
+    keys.sort(key=id_of)
+    places = np.full((len(keys), 3), np.nan)
+    covariances = np.full((len(keys), 3, 3), np.nan)
     for k, key in enumerate(keys):
-        pose = values.atPose2(key)
-        poses[k] = pose.x(), pose.y(), pose.theta()
-        covariances[k] = covariance_of(key)
-    return poses, se2.rotate_covariance(covariances, poses[:, 2])
+        place = numbers(values, key)
+        size = len(place)
+        places[k, :size] = place
+        covariances[k, :size, :size] = covariance_of(key)
+    is_pose = np.isfinite(places[:, 2])
+    covariances[is_pose] = se2.rotate_covariance(covariances[is_pose], places[is_pose, 2])
+    return np.array([id_of(key) for key in keys], int), places, covariances
 
 
-def points_in_world(values: gtsam.Values, keys: list[int], covariance_of: Callable):
-    """Positions (n, 2) of these keys, and their covariances (n, 2, 2)."""
-    points = np.zeros((len(keys), 2))
-    covariances = np.zeros((len(keys), 2, 2))
-    for k, key in enumerate(keys):
-        points[k] = values.atPoint2(key)
-        covariances[k] = covariance_of(key)
-    return points, covariances
+def id_of(key: int) -> int:
+    """The id, which may be negative, by GTSAM's key."""
+    index = gtsam.symbolIndex(key)
+    return index if index < INDICES // 2 else index - INDICES

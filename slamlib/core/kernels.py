@@ -18,6 +18,11 @@ SCALES = {
 ONE_SIDED = {"asymmetric Cauchy": -0.10555, "asymmetric Tukey": -0.07581}
 
 
+def symmetric(name: str) -> str:
+    """The name of the kernel of sightings: this one, unless it is one-sided, for ranges only."""
+    return "quadratic" if name in ONE_SIDED else name
+
+
 def kernel_of(name: str, width: float = 1.0) -> mEstimator.Base | None:
     """The kernel of this name with its scale times `width`, None for "quadratic".
 

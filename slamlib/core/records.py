@@ -41,6 +41,13 @@ class UwbReadings(_Readings):
     sigma: np.ndarray                # (m,) m, standard deviation of the range
 
 
+NO_SIGHTINGS = ArucoReadings(
+    pose=np.zeros(0, int), marker=np.zeros(0, int), marker_in_vehicle=np.zeros((0, 3)),
+    covariance=np.zeros((0, 3, 3)))
+NO_RANGES = UwbReadings(
+    pose=np.zeros(0, int), antenna=np.zeros(0, int), range=np.zeros(0), sigma=np.zeros(0))
+
+
 @dataclass(frozen=True)
 class AntennaGuess:
     """Guessed positions of the antennas, in ascending order of id."""

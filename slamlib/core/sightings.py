@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from slamlib.core import se2
-from slamlib.core.records import ArucoReadings
+from slamlib.core.records import NO_SIGHTINGS, ArucoReadings
 from slamlib.core.se2 import correlations, sigmas
 
 GATE = 16.26623619623813         # dimensionless, for residuals of [x, y, heading]
@@ -41,17 +41,12 @@ class Sightings:
         return table
 
 
-NO_READINGS = ArucoReadings(
-    pose=np.zeros(0, int), marker=np.zeros(0, int), marker_in_vehicle=np.zeros((0, 3)),
-    covariance=np.zeros((0, 3, 3)))
-
-
 def sightings_by_frame(aruco: ArucoReadings | None, extra_frames=()) -> Sightings:
     """Sightings of ArucoReadings, or of None if there are no markers, merged by `merge_repeated`.
 
     `extra_frames` are pose indices from 0 that are frames even if no marker is seen there.
     """
-    aruco = aruco or NO_READINGS
+    aruco = aruco or NO_SIGHTINGS
     aruco = replace(aruco, covariance=regular(aruco.covariance))
     index, z, C, contradicting = merge_repeated(aruco)
     pose = aruco.pose[index]
@@ -138,8 +133,12 @@ def _evenly(rows, maximum):
 
 def _supported_and_certain(in_world, covariance):
     """Number of the most certain pose of one marker, of those with half the maximum support."""
-    squared = se2.squared_distances(in_world[:, None], in_world, covariance[:, None] + covariance)
-    support = np.count_nonzero(squared < GATE, axis=1)
+    first, second = np.triu_indices(len(in_world), 1)
+    squared = se2.squared_distances(
+        in_world[first], in_world[second], covariance[first] + covariance[second])
+    close = squared < GATE
+    confirmed = np.append(first[close], second[close])
+    support = 1 + np.bincount(confirmed, minlength=len(in_world))        # with itself
     log_determinant = np.linalg.slogdet(covariance)[1]
     supported = support >= support.max() / 2
     return np.where(supported, log_determinant, np.inf).argmin()

@@ -65,7 +65,7 @@ def runs(landmark: np.ndarray, pose: np.ndarray, max_pause: float) -> tuple[floa
 
 
 def error_memory(landmark: np.ndarray, pose: np.ndarray, u: np.ndarray,
-                 used: np.ndarray, hides_mean: bool) -> Memory:
+                 used: np.ndarray, hides_mean: bool = True) -> Memory:
     """The Memory of measurements of `landmark` (m,), rows or ids, at encoder poses (m,).
 
     u (m, d) are residuals in standard deviations of the errors; those not `used` (m,) do not count.

@@ -9,11 +9,12 @@ poses are by GTSAM's tangent vectors: X moves as X exp(xi), in its own axes.
 """
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
 from slamlib.core import odometry, se2
-from slamlib.core.preintegration import OdometryIncrements, preintegrate
+from slamlib.core.preintegration import OdometryIncrements, odometry_error, preintegrate
 from slamlib.robust.calibration import (
     ANTENNAS,
     CAMERA,
@@ -41,57 +42,12 @@ def preintegrate_odometry(measurements: Measurements, model: str,
     `model` is "arc" or "euler". Jumps are added where there are some.
     """
     frame = measurements.frame
-    increments = preintegrate(measurements.dataset, frame, model, wheel)
+    increments = preintegrate(
+        measurements.dataset, frame, model, wheel, measurements.odometry_noise)
     jump, jump_covariance = measurements.jumps.added(frame[:-1], frame[1:])
     return replace(
         increments, in_counts=False, increment=se2.compose(increments.increment, jump),
         quantization=increments.quantization + jump_covariance)
-
-
-def odometry_error(
-        factors: OdometryIncrements, poses: np.ndarray,
-        wheel: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Errors (f-1, 3) of OdometryIncrements at poses (f, 3) of the frames and `wheel` (3,) m.
-
-    Also their derivatives (f-1, 3, 6) by X_i and X_{i+1}, and (f-1, 3, 3) by the columns WHEELS of
-    the calibration. The errors are not whitened.
-
-    With `in_counts` they are scaled to the stated wheels. Encoders measure counts, and Q is the
-    noise of the counts, in metres and radians by the stated wheels. With the mean radius R and the
-    wheelbase b of the wheels w, a count is a distance proportional to R and a turn proportional to
-    R / b. So the errors e(w) shrink with R while Q does not, and all lengths would be estimated too
-    small where nothing else gives the scale. The errors by the stated wheels do not shrink:
-
-        s(w) e(w),    s(w) = R_stated / R [1, 1, b / b_stated].
-
-    To first order about the wheels w_0, at which the increments are linearised, they are
-
-        s(w) e(w) = s(w_0) (e(w) + r (w - w_0) e(w_0)),    r = d log s / dw.
-    """
-    change = wheel - factors.wheel
-    measured = factors.increment + factors.J_wheel @ change
-    expected = se2.between(poses[:-1], poses[1:])
-    by_measured, by_expected = se2.between_jacobians(measured, expected)
-    difference = se2.between(measured, expected)
-    e = se2.log(difference)
-    J = se2.log_jacobian(difference)
-    by_first = -J @ by_expected @ _moved_by(expected)
-    by_second = J @ se2.compose_jacobians(difference, np.zeros(3))[1]         # by X' xi
-    by_poses = np.concatenate([by_first, by_second], axis=2)
-    by_wheel = J @ by_measured @ factors.J_wheel
-    if not factors.in_counts:
-        return e, by_poses, by_wheel
-    radius = factors.wheel[:2].mean()
-    s = np.full(3, factors.stated[:2].mean() / radius)
-    s[2] *= factors.wheel[2] / factors.stated[2]
-    r = np.tile([-0.5 / radius, -0.5 / radius, 0], (3, 1))
-    r[2, 2] = 1 / factors.wheel[2]
-    growth = r @ change
-    e_0 = e - by_wheel @ change
-    e = s * (e + growth * e_0)
-    by_poses = (s * (1 + growth))[:, None] * by_poses
-    by_wheel = s[:, None] * (by_wheel + r * e_0[:, :, None])
-    return e, by_poses, by_wheel
 
 
 @dataclass(frozen=True)
@@ -111,9 +67,15 @@ class LinearizedFactors:
 def linearize_odometry(problem, state, slip: float) -> LinearizedFactors:
     """The LinearizedFactors of odometry with a slip in sqrt(m), of a Problem at a State."""
     e, J, by_wheel = odometry_error(problem.odometry, state.poses, state.c[WHEELS])
-    U = square_root_information(problem.odometry.covariance(slip))
+    U = _odometry_roots(problem.odometry, slip)
     factors = _whitened(problem, np.arange(len(e)), WHEELS, U, e, J, by_wheel)
     return replace(factors, log_determinant=-2 * np.sum(np.log(np.linalg.diagonal(U))))
+
+
+@lru_cache(maxsize=4)
+def _odometry_roots(increments, slip):
+    """Square root informations (f-1, 3, 3) of OdometryIncrements for a slip in sqrt(m)."""
+    return square_root_information(increments.covariance(slip))
 
 
 def linearize_measurements(problem, state) -> tuple[LinearizedFactors, LinearizedFactors]:
@@ -217,7 +179,8 @@ def sighting_error(
     by_marker = by_seen.copy()
     marker_in_camera = np.where(as_pose, seen[:, 2], -Y[:, 2])       # a point moves in the world
     by_marker[:, :, :2] @= se2.rotation(marker_in_camera)
-    by_pose, by_camera, by_lag = _by_sensor(-by_seen @ _moved_by(seen), mounted, camera, velocity)
+    by_Y = -by_seen @ se2.moved_by(seen)
+    by_pose, by_camera, by_lag = _by_sensor(by_Y, mounted, camera, velocity)
     by_size = -by_seen[:, :, :2] @ h[:, :2, None]
     return e, by_pose, by_marker, np.concatenate([by_camera, by_size, by_lag], axis=2)
 
@@ -267,12 +230,7 @@ def _by_sensor(by_Y, mounted, place, velocity):
 
 def inverse_adjoint(motion: np.ndarray) -> np.ndarray:
     """Derivatives (..., 3, 3) of xi' by xi where exp(xi) M = M exp(xi'), of motions M (..., 3)."""
-    return se2.between_jacobians(motion, motion)[1] @ _moved_by(motion)
-
-
-def _moved_by(h):
-    """Derivatives (..., 3, 3) of exp(xi) h by xi, at 0, of poses h (..., 3)."""
-    return se2.compose_jacobians(np.zeros(3), h)[0]
+    return se2.between_jacobians(motion, motion)[1] @ se2.moved_by(motion)
 
 
 def sensor_poses(measurements: Measurements, poses: np.ndarray,

@@ -99,7 +99,7 @@ def error_memories(problem: Problem, state: State) -> tuple[Memory, Memory]:
     residual, late = residuals(problem, state)
     is_direct = np.abs(late) < MAX_DIRECT
     of_sightings = error_memory(
-        m.marker_row, m.frame[m.sightings.row], residual, sightings.weight > 0, hides_mean=True)
+        m.marker_row, m.frame[m.sightings.row], residual, sightings.weight > 0)
     of_ranges = error_memory(
         m.ranges.antenna, m.frame[m.ranges.row], late[:, None], is_direct & (ranges.weight > 0),
         hides_mean=False)

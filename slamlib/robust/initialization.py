@@ -11,7 +11,6 @@ from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from slamlib.core import odometry, se2
 from slamlib.core.graph import GUESS_PRIOR_SIGMA
@@ -22,6 +21,7 @@ from slamlib.robust.factors import MIN_DISTANCE, sensor_poses
 from slamlib.robust.fit import narrow_kernels
 from slamlib.robust.linear import State, build_problem, state_from_arrays
 from slamlib.robust.measurements import Measurements, measure
+from slamlib.robust.optimize import cauchy_minimum
 
 MAX_ODOMETRY_SIGMA = 0.5     # rad, of odometry's heading at the end of a drive's first part
 MAX_FIRST_PART = 1.5         # length of the first part over that which odometry can predict
@@ -32,7 +32,7 @@ MAX_RANGES = 150             # maximum number of ranges used per antenna, evenly
 SAME_PLACE = 0.03            # of the median range: positions closer than this are one
 KERNEL_SCALE = 2.0           # sigmas, scale of the Cauchy kernel
 START_DIRECTIONS = 3         # number of starts on a circle about the path
-TOLERANCE = 1e-4             # relative, of cost and position, at which the search ends
+TOLERANCE = 1e-6             # relative, of cost, at which the search ends
 
 FITTING = 3.0                # sigmas, error of a range that fits a position
 MIN_OTHERS = 10              # number of ranges that fit the position of another antenna
@@ -235,8 +235,7 @@ def _minimum(ranges, start):
         direction = difference / distance[:, None]
         return np.concatenate([direction / ranges.sigma[:, None], np.eye(2) / GUESS_PRIOR_SIGMA])
 
-    return least_squares(errors, start, derivatives, loss="cauchy", f_scale=KERNEL_SCALE,
-                         ftol=TOLERANCE, xtol=TOLERANCE)
+    return cauchy_minimum(errors, start, derivatives, KERNEL_SCALE, TOLERANCE)
 
 
 def second_moment(places: np.ndarray, costs: np.ndarray, covariances: np.ndarray,

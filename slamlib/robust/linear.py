@@ -161,9 +161,7 @@ class NormalEquations:
     def step(self) -> np.ndarray | None:
         """The Gauss-Newton step delta (n + q,), or None where H is singular to rounding."""
         solution = linear_solution(self.structure, self.sums(self.problem.noise))
-        if solution is None or not solution.decrease >= 0:
-            return None
-        return solution.delta
+        return None if solution is None else solution.delta
 
     def sums(self, noise: Noise, consistent: bool = False) -> Sums:
         """The Sums over all factors for a Noise.

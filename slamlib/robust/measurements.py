@@ -24,7 +24,8 @@ from scipy.sparse.linalg import splu
 from slamlib.core import odometry, se2
 from slamlib.core.graph import ORIGIN_SIGMA
 from slamlib.core.increments import SLIP_BOUNDS, TYPICAL_SLIP
-from slamlib.core.records import Dataset, UwbReadings
+from slamlib.core.preintegration import odometry_noise
+from slamlib.core.records import NO_RANGES, Dataset
 from slamlib.core.sightings import (
     MAX_HEADING_SIGMA,
     MIN_MEASUREMENT_SIGMA,
@@ -38,8 +39,6 @@ from slamlib.robust.jumps import NO_JUMPS, Jumps
 NOISE_KEYS = ("slip", "marker_noise_factor", "range_noise_factor")      # of a Vehicle, as in Noise
 
 WEAK_SIGMA = 1e5             # m and rad, of the prior of a marker without accepted sightings
-NO_RANGES = UwbReadings(
-    pose=np.zeros(0, int), antenna=np.zeros(0, int), range=np.zeros(0), sigma=np.zeros(0))
 
 
 class Noise(NamedTuple):
@@ -75,11 +74,6 @@ class Structure:
     diagonal: np.ndarray     # (n,) places of the diagonal in the data of blocks
     variables: np.ndarray    # (m, 2) i and j of the factors: odometry, then sightings, then ranges
     blocks: np.ndarray       # (m, 4) numbers of their blocks (i, i), (i, j), (j, i), (j, j)
-
-    @property
-    def unknowns(self) -> np.ndarray:
-        """Rows of the unknowns of all variables, in the order of their numbers."""
-        return self.rows[np.arange(3) < 2 + self.is_pose[:, None]]
 
     def matrix(self, data: np.ndarray) -> sparse.csc_array:
         """The sparse matrix (n, n), which is symmetric, with the data (9 b,) of its blocks."""
@@ -133,17 +127,30 @@ class Measurements:
         return np.logical_and(unknown, count)
 
     @cached_property
-    def sighting_roots(self) -> np.ndarray:
-        """Square root informations (s, 3, 3) of the sightings; of points (2, 2) of them, else 0.
+    def odometry_noise(self) -> tuple[np.ndarray, np.ndarray]:
+        """Covariances (f-1, 3, 3) of odometry between the frames, as of `odometry_noise`."""
+        return odometry_noise(
+            self.dataset.ticks, self.dataset.vehicle, self.frame[:-1], self.frame[1:])
+
+    @property
+    def sighting_covariances(self) -> np.ndarray:
+        """Covariances (s, 3, 3) of the errors of sightings; of a point (2, 2) counts.
 
         `ArucoReading.txt` gives the covariance C in the axes of the vehicle. The error of a marker
         with a heading lives in the axes of the measured pose z: R(heading)^T C R(heading).
         """
         s = self.sightings
-        U = square_root_information(se2.rotate_covariance(s.C, -s.z[:, 2]))
+        heading = np.where(self.as_pose, s.z[:, 2], 0.0)
+        return se2.rotate_covariance(s.C, -heading)
+
+    @cached_property
+    def sighting_roots(self) -> np.ndarray:
+        """Square root informations (s, 3, 3) of the sightings; of points (2, 2) of them, else 0."""
+        C = self.sighting_covariances
+        U = square_root_information(C)
         points = ~self.as_pose
         U[points] = 0
-        U[points, :2, :2] = square_root_information(s.C[points, :2, :2])
+        U[points, :2, :2] = square_root_information(C[points, :2, :2])
         return U
 
     @cached_property

@@ -22,11 +22,12 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import A, L, P, R, S, W, X
 
+from slamlib.core.batch import Batch, numbers
 from slamlib.core.graph import (
-    INDICES,
     Decisions,
     add_antenna_priors,
     build_graph,
+    index_of,
     noise_model,
 )
 from slamlib.core.graph_solution import (
@@ -36,8 +37,8 @@ from slamlib.core.graph_solution import (
     eliminated,
     gauss_newton,
 )
-from slamlib.core.kernels import ONE_SIDED
-from slamlib.core.records import ArucoReadings, UwbReadings
+from slamlib.core.kernels import ONE_SIDED, symmetric
+from slamlib.core.records import NO_RANGES, NO_SIGHTINGS, ArucoReadings, Dataset, UwbReadings
 from slamlib.robust.calibration import (
     HEIGHT,
     RANGE_LAG,
@@ -80,14 +81,15 @@ def graph_of(problem: Problem, noise: Noise) -> gtsam.NonlinearFactorGraph:
     """The graph of a Problem for a Noise."""
     graph = build_graph(decisions_of(problem, noise))
     if not sightings_are_native(problem):
-        add_calibrated_sightings(graph, problem, noise)
+        for as_pose in (True, False):
+            add_calibrated_sightings(graph, problem, noise, as_pose)
     if not ranges_are_native(problem):
         add_calibrated_ranges(graph, problem, noise)
     for key, columns in CALIBRATION_KEYS[1:]:
-        unknown = np.count_nonzero(problem.active[columns])
-        if unknown:
+        count = len(unknown_of(problem, columns))
+        if count:
             graph.add(gtsam.PriorFactorVector(
-                key, np.zeros(unknown), gtsam.noiseModel.Unit.Create(unknown)))
+                key, np.zeros(count), gtsam.noiseModel.Unit.Create(count)))
     return graph
 
 
@@ -108,174 +110,125 @@ def decisions_of(problem: Problem, noise: Noise) -> Decisions:
     """The Decisions of a Problem for a Noise, without what custom factors measure."""
     m = problem.measurements
     vehicle = m.dataset.vehicle
+    accepted = accepted_dataset(problem, noise)
     sightings, ranges = problem.accepted
     return Decisions(
         odometry=problem.odometry,
         slip=noise.slip,
         sigma_heading=vehicle.sigma_heading,
         sigma_wheel=problem.sigma[WHEELS],
-        sightings=sightings_in_vehicle(problem, noise) if sightings_are_native(problem) else None,
-        ranges=calibrated_ranges(problem, noise) if ranges_are_native(problem) else None,
+        sightings=accepted.sightings if sightings_are_native(problem) else NO_SIGHTINGS,
+        ranges=accepted.ranges if ranges_are_native(problem) else NO_RANGES,
         guess=m.dataset.antenna_guess,
         points=m.marker[~m.oriented],
         sighting_share=sightings.share[sightings.weight > 0],
         range_share=ranges.share[ranges.weight > 0],
-        sighting_kernel=sighting_kernel(problem),
-        range_kernel=vehicle.kernel)
+        kernel=vehicle.kernel)
 
 
-def sightings_in_vehicle(problem: Problem, noise: Noise) -> ArucoReadings | None:
-    """The accepted sightings as the vehicle sees them by the stated camera and size."""
+def accepted_dataset(problem: Problem, noise: Noise) -> Dataset:
+    """The Dataset of the accepted measurements with the sigmas of a Noise."""
     m = problem.measurements
     s = m.sightings
-    counted = problem.accepted.sightings.weight > 0
-    if not counted.any():
-        return None
-    by_camera = ArucoReadings(
-        pose=m.frame[s.row[counted]], marker=s.marker[counted], marker_in_vehicle=s.z[counted],
-        covariance=noise.sightings**2 * s.C[counted])
-    return replace(m.dataset, aruco=by_camera).sightings
-
-
-def calibrated_ranges(problem: Problem, noise: Noise) -> UwbReadings | None:
-    """The accepted ranges without the stated offset and scale."""
-    m = problem.measurements
     r = m.ranges
-    heard = problem.accepted.ranges.weight > 0
-    if not heard.any():
-        return None
+    sightings, ranges = problem.accepted
+    by_camera = ArucoReadings(
+        pose=m.frame[s.row], marker=s.marker, marker_in_vehicle=s.z,
+        covariance=noise.sightings**2 * s.C)
     measured = UwbReadings(
-        pose=m.frame[r.row[heard]], antenna=m.antenna[r.antenna[heard]], range=r.distance[heard],
-        sigma=noise.ranges * r.sigma[heard])
-    return replace(m.dataset, uwb=measured).ranges
+        pose=m.frame[r.row], antenna=m.antenna[r.antenna], range=r.distance,
+        sigma=noise.ranges * r.sigma)
+    return replace(m.dataset, aruco=by_camera.select(sightings.weight > 0),
+                   uwb=measured.select(ranges.weight > 0))
 
 
-class CalibratedFactors:
-    """Measurements of a kind as custom factors, which are linearised all at once.
-
-    Each factor keeps the values of its variables at the last linearisation. If it is asked at other
-    values, all measurements are linearised there: one call of numpy in place of thousands.
-    """
-
-    def __init__(self, problem: Problem, keys: list, calibration: int, columns: slice,
-                 linearised: Callable):
-        """Factors on `keys` (m, 2) of poses and landmarks.
-
-        The function `linearised` returns errors and derivatives. `calibration` is the key of the
-        unknown entries among these `columns` of c.
-        """
-        self.problem = problem
-        self.keys = keys
-        self.calibration = calibration
-        self.linearised = linearised
-        self.active = problem.active[columns]
-        self.sigma = problem.sigma[columns][self.active]
-        self.inputs = [None] * len(keys)
-        self.rows = {}
-
-    def keys_of(self, k: int) -> list[int]:
-        """All keys of measurement k."""
-        return [*self.keys[k], self.calibration] if self.active.any() else self.keys[k]
-
-    def error_of(self, k: int, size: int) -> Callable:
-        """The error function of measurement k with so many errors, for gtsam.CustomFactor."""
-        def error(factor, values, jacobians):
-            if self.inputs[k] is None or self.inputs[k] != self.input_of(k, values):
-                self.linearise(values)
-            row = self.rows[k]
-            if jacobians is not None:
-                width = 3 if self.is_pose(k) else 2
-                jacobians[0] = self.by_pose[row, :size]
-                jacobians[1] = self.by_landmark[row, :size, :width]
-                if self.active.any():
-                    jacobians[2] = self.by_c[row, :size][:, self.active] * self.sigma
-            return self.e[row, :size]
-
-        return error
-
-    def is_pose(self, k: int) -> bool:
-        """Whether the landmark of measurement k is a pose."""
-        return chr(gtsam.symbolChr(self.keys[k][1])) == "l"
-
-    def input_of(self, k: int, values: gtsam.Values) -> tuple:
-        """All numbers at GTSAM's values on which measurement k depends."""
-        pose, landmark = self.keys[k]
-        unknown = values.atVector(self.calibration) if self.active.any() else ()
-        return (*array_of(values, pose), *array_of(values, landmark), *unknown)
-
-    def linearise(self, values: gtsam.Values):
-        """Keep errors and derivatives of all measurements at GTSAM's values."""
-        there = [k for k, keys in enumerate(self.keys) if all(map(values.exists, keys))]
-        inputs = [self.input_of(k, values) for k in there]
-        self.inputs = [None] * len(self.keys)
-        for k, numbers in zip(there, inputs):
-            self.inputs[k] = numbers
-        self.rows = {k: row for row, k in enumerate(there)}
-        places = np.array(inputs)
-        self.e, self.by_pose, self.by_landmark, self.by_c = self.linearised(
-            np.array(there), places[:, :3], places[:, 3:6], calibration_at(self.problem, values))
-
-
-def add_calibrated_sightings(graph: gtsam.NonlinearFactorGraph, problem: Problem, noise: Noise):
-    """Add the accepted sightings with the unknown entries of their calibration, S(0)."""
+def add_calibrated_sightings(graph: gtsam.NonlinearFactorGraph, problem: Problem, noise: Noise,
+                             as_pose: bool):
+    """Add the accepted sightings of markers with a heading, or of points, by their calibration."""
     m = problem.measurements
-    s = m.sightings
     accepted = problem.accepted.sightings
-    counted = np.flatnonzero(accepted.weight)
+    rows = np.flatnonzero((accepted.weight > 0) & (m.as_pose == as_pose))
+    size = 3 if as_pose else 2
+    frame = m.sightings.row[rows]
     is_known = not problem.active[SIGHTING_LAG]
-    frames = [X(i) for i in m.frame.tolist()]
+
+    def errors(poses, markers, c):
+        motion, velocity = delayed(m, frame, c[SIGHTING_LAG], is_known)
+        e, by_pose, by_marker, by_c = sighting_error(
+            m.sightings.z[rows], poses, motion, velocity, as_places(markers), c, m.as_pose[rows])
+        return e[:, :size], by_pose[:, :size], by_marker[:, :size, :size], by_c[:, :size]
+
     markers = marker_keys(problem)
-
-    def linearised(some, poses, landmarks, c):
-        rows = counted[some]
-        motion, velocity = delayed(m, s.row[rows], c[SIGHTING_LAG], is_known)
-        return sighting_error(s.z[rows], poses, motion, velocity, landmarks, c, m.as_pose[rows])
-
-    keys = [[frames[s.row[k]], markers[m.marker_row[k]]] for k in counted]
-    factors = CalibratedFactors(problem, keys, S(0), SIGHTINGS, linearised)
-    for number, k in enumerate(counted):
-        size = 3 if m.as_pose[k] else 2
-        root = m.sighting_roots[k, :size, :size] / noise.sightings
-        model = noise_model(
-            np.linalg.inv(root.T @ root), sighting_kernel(problem), accepted.share[k])
-        graph.add(gtsam.CustomFactor(
-            model, factors.keys_of(number), factors.error_of(number, size)))
+    landmarks = [markers[k] for k in m.marker_row[rows]]
+    covariances = noise.sightings**2 * m.sighting_covariances[rows, :size, :size]
+    kernel = symmetric(m.dataset.vehicle.kernel)
+    add_calibrated(graph, problem, errors, frame, landmarks, (S(0), SIGHTINGS), covariances, kernel,
+                   accepted.share[rows])
 
 
 def add_calibrated_ranges(graph: gtsam.NonlinearFactorGraph, problem: Problem, noise: Noise):
-    """Add the accepted ranges with the unknown entries of their calibration, R(0)."""
+    """Add the accepted ranges by their calibration."""
     m = problem.measurements
-    r = m.ranges
     accepted = problem.accepted.ranges
-    counted = np.flatnonzero(accepted.weight)
+    rows = np.flatnonzero(accepted.weight)
+    frame = m.ranges.row[rows]
+    antenna = m.ranges.antenna[rows]
     is_known = not problem.active[RANGE_LAG]
     kernel = m.dataset.vehicle.kernel
-    sigma = noise.ranges * r.sigma
+    sigma = noise.ranges * m.ranges.sigma[rows, None]
+    measured = m.ranges.distance[rows]
     bias = ONE_SIDED.get(kernel, 0.0) * sigma
 
-    def linearised(some, poses, landmarks, c):
-        rows = counted[some]
-        motion, velocity = delayed(m, r.row[rows], c[RANGE_LAG], is_known)
+    def errors(poses, places, c):
+        motion, velocity = delayed(m, frame, c[RANGE_LAG], is_known)
         antennas = np.zeros((len(m.antenna), 2))
-        antennas[r.antenna[rows]] = landmarks[:, :2]
-        e, by_pose, by_antenna, by_c = range_error(
-            r.distance[rows], poses, motion, velocity, antennas, r.antenna[rows], c)
-        return e + bias[rows, None], by_pose, by_antenna, by_c
+        antennas[antenna] = places
+        e, *derivatives = range_error(measured, poses, motion, velocity, antennas, antenna, c)
+        return e + bias, *derivatives
 
-    antennas = (m.antenna % INDICES).tolist()
-    keys = [[X(int(m.frame[r.row[k]])), A(antennas[r.antenna[k]])] for k in counted]
-    factors = CalibratedFactors(problem, keys, R(0), RANGES, linearised)
-    add_antenna_priors(graph, m.dataset.antenna_guess, m.antenna[r.antenna[counted]])
-    for number, k in enumerate(counted):
-        model = noise_model(np.array([[sigma[k]**2]]), kernel, accepted.share[k])
-        graph.add(gtsam.CustomFactor(
-            model, factors.keys_of(number), factors.error_of(number, 1)))
+    landmarks = [A(index_of(k)) for k in m.antenna[antenna]]
+    add_antenna_priors(graph, m.dataset.antenna_guess, m.antenna[antenna])
+    add_calibrated(graph, problem, errors, frame, landmarks, (R(0), RANGES),
+                   sigma[:, :, None]**2, kernel, accepted.share[rows])
 
 
-def sighting_kernel(problem: Problem) -> str:
-    """Name of the kernel of the sightings: that of the Vehicle, unless it is for ranges only."""
-    kernel = problem.measurements.dataset.vehicle.kernel
-    return "quadratic" if kernel in ONE_SIDED else kernel
+def add_calibrated(graph: gtsam.NonlinearFactorGraph, problem: Problem, errors: Callable,
+                   frame: np.ndarray, landmarks: list[int], calibration: tuple[int, slice],
+                   covariances: np.ndarray, kernel: str, shares: np.ndarray):
+    """Add measurements of a kind from the rows `frame` (m,) to landmarks, keys.
+
+    Where entries of their calibration are unknown, these are a variable of all: its key and the
+    columns of c are `calibration`. The function `errors` returns the errors at poses (m, 3), places
+    of landmarks and c, and their derivatives by each of them, by c of these columns.
+    """
+    key, columns = calibration
+    keys = [[X(i) for i in problem.measurements.frame[frame].tolist()], landmarks]
+    unknown = unknown_of(problem, columns)
+    sigma = problem.sigma[unknown]
+    if len(unknown):
+        keys.append(len(landmarks) * [key])
+
+    def linearised(poses, places, *off):
+        c = problem.measurements.calibration.stated.copy()
+        if off:
+            c[unknown] += sigma * off[0][0]
+        e, by_pose, by_landmark, by_c = errors(poses, places, c)
+        by_unknown = by_c[:, :, unknown - columns.start] * sigma
+        return e, [by_pose, by_landmark, by_unknown][:len(keys)]
+
+    batch = Batch(keys, linearised)
+    for k, (covariance, share) in enumerate(zip(covariances, shares)):
+        graph.add(batch.factor(k, noise_model(covariance, kernel, share)))
+
+
+def as_places(places: np.ndarray) -> np.ndarray:
+    """Poses (m, 3) of landmarks (m, 3) or (m, 2), heading 0 of points."""
+    return np.pad(places, ((0, 0), (0, 3 - places.shape[1])))
+
+
+def unknown_of(problem: Problem, columns: slice) -> np.ndarray:
+    """Those of these columns of the calibration that are unknown."""
+    return np.flatnonzero(problem.active[columns]) + columns.start
 
 
 def calibration_at(problem: Problem, values: gtsam.Values) -> np.ndarray:
@@ -283,52 +236,60 @@ def calibration_at(problem: Problem, values: gtsam.Values) -> np.ndarray:
     c = problem.measurements.calibration.stated.copy()
     for key, columns in CALIBRATION_KEYS:
         if values.exists(key):
-            unknown = np.flatnonzero(problem.active[columns]) + columns.start
+            unknown = unknown_of(problem, columns)
             c[unknown] += problem.sigma[unknown] * values.atVector(key)
     return c
-
-
-def array_of(values: gtsam.Values, key: int) -> np.ndarray:
-    """A pose (3,) at GTSAM's values; of a position heading 0."""
-    if chr(gtsam.symbolChr(key)) in "pa":
-        return np.append(values.atPoint2(key), 0.0)
-    pose = values.atPose2(key)
-    return np.array([pose.x(), pose.y(), pose.theta()])
 
 
 def marker_keys(problem: Problem) -> list[int]:
     """GTSAM's keys of all k markers, L of a pose and P of a position."""
     m = problem.measurements
-    return [L(marker) if is_pose else P(marker)
-            for marker, is_pose in zip((m.marker % INDICES).tolist(), m.oriented)]
+    return [L(index_of(marker)) if is_pose else P(index_of(marker))
+            for marker, is_pose in zip(m.marker, m.oriented)]
 
 
 def variable_keys(problem: Problem) -> list[int]:
     """GTSAM's keys of frames, markers and antennas, in the order of their numbers."""
     m = problem.measurements
     frames = [X(i) for i in m.frame.tolist()]
-    return frames + marker_keys(problem) + [A(k) for k in (m.antenna % INDICES).tolist()]
+    return frames + marker_keys(problem) + [A(index_of(antenna)) for antenna in m.antenna]
+
+
+def places_of(state: State) -> np.ndarray:
+    """Poses (v, 3) of frames, markers and antennas of a State, heading 0 of positions."""
+    return np.concatenate([state.poses, state.markers, as_places(state.antennas)])
 
 
 def values_of(problem: Problem, state: State, graph: gtsam.NonlinearFactorGraph) -> gtsam.Values:
     """GTSAM's values of a State, of the variables of a graph."""
     used = set(graph.keyVector())
     values = gtsam.Values()
-    rows = np.concatenate([
-        state.poses, state.markers, np.pad(state.antennas, ((0, 0), (0, 1)))])
-    for key, row in zip(variable_keys(problem), rows):
+    for key, place in zip(variable_keys(problem), places_of(state)):
         if key not in used:
             continue
         if chr(gtsam.symbolChr(key)) in "pa":
-            values.insert(key, row[:2])
+            values.insert(key, place[:2])
         else:
-            values.insert(key, gtsam.Pose2(*row))
+            values.insert(key, gtsam.Pose2(*place))
+    off = state.c - problem.measurements.calibration.stated
     for key, columns in CALIBRATION_KEYS:
-        unknown = np.flatnonzero(problem.active[columns]) + columns.start
+        unknown = unknown_of(problem, columns)
         if len(unknown):
-            off = state.c[unknown] - problem.measurements.calibration.stated[unknown]
-            values.insert(key, off / problem.sigma[unknown])
+            values.insert(key, off[unknown] / problem.sigma[unknown])
     return values
+
+
+def state_at(fit: Fit, values: gtsam.Values) -> State:
+    """The State at GTSAM's values; what is not in the graph is where a Fit has it."""
+    m = fit.problem.measurements
+    places = places_of(fit.state)
+    for place, key in zip(places, variable_keys(fit.problem)):
+        if values.exists(key):
+            there = numbers(values, key)
+            place[:len(there)] = there
+    poses, markers, antennas = np.split(places, np.cumsum([len(m.frame), len(m.marker)]))
+    return state_from_arrays(
+        m, poses, markers, antennas[:, :2], calibration_at(fit.problem, values))
 
 
 def solve_by_gtsam(fit: Fit) -> GtsamSolution:
@@ -368,28 +329,29 @@ def averaged(fit: Fit, graph: gtsam.NonlinearFactorGraph, found: GaussNewton,
     points = noise_points(fit)
     weights = np.array([weight for weight, _ in points])
     weights /= weights.sum()
-    keys = gtsam.KeyVector(list(values.keys()))
     marginals = [found.marginals]
-    steps = np.zeros((1, values.dim()))
+    off = [values.zeroVectors()]
+    moved = values
     if len(points) > 1:
-        graphs = [graph_of(problem, noise) for _, noise in points]
-        solved = [eliminated(each.linearize(values)) for each in graphs]
+        linear = [graph_of(problem, noise).linearize(values) for _, noise in points]
+        solved = [eliminated(each) for each in linear]
         marginals = [Marginals(tree) for tree, _ in solved]
+        mean = values.zeroVectors()
+        for weight, (_, step) in zip(weights, solved):
+            mean = mean.add(step.scale(weight))
+        off = [step.subtract(mean) for _, step in solved]
         _, at_mode = eliminated(graph.linearize(values))
-        steps = np.array([step.subtract(at_mode).vector(keys) for _, step in solved])
-    mean = weights @ steps
-    places = dict(zip(keys, places_of(values, keys)))
+        moved = values.retract(mean.subtract(at_mode))
 
     def covariance(key, other=None):
         """Block (d, e) of the averaged covariance of one or two variables."""
         total = 0.0
-        for weight, marginal, step in zip(weights, marginals, steps - mean):
-            spread = np.outer(step[places[key]], step[places[other or key]])
+        for weight, marginal, step in zip(weights, marginals, off):
+            spread = np.outer(step.at(key), step.at(other or key))
             block = marginal.joint(key, other) if other else marginal.covariance(key)
             total = total + weight * (block + spread)
         return total
 
-    moved = values if len(points) == 1 else values.retract(vector_values(mean, places))
     blocks = blocks_of(problem, values, covariance)
     f = len(problem.measurements.frame)
     return GtsamSolution(
@@ -398,34 +360,6 @@ def averaged(fit: Fit, graph: gtsam.NonlinearFactorGraph, found: GaussNewton,
         c=calibration_covariance(problem, values, covariance),
         factors=graph.size(), variables=values.size(), steps=found.steps, start=start,
         converged=found.converged)
-
-
-def places_of(values: gtsam.Values, keys: list[int]) -> list[slice]:
-    """Slice of each variable in a vector of all unknowns."""
-    zero = values.zeroVectors()
-    ends = np.cumsum([zero.at(key).size for key in keys])
-    return [slice(end - zero.at(key).size, end) for key, end in zip(keys, ends)]
-
-
-def vector_values(step: np.ndarray, places: dict) -> gtsam.VectorValues:
-    """GTSAM's VectorValues of a step (n,) of all unknowns."""
-    moved = gtsam.VectorValues()
-    for key, place in places.items():
-        moved.insert(key, step[place])
-    return moved
-
-
-def state_at(fit: Fit, values: gtsam.Values) -> State:
-    """The State at GTSAM's values; what is not in the graph is where a Fit has it."""
-    m = fit.problem.measurements
-    antennas = np.pad(fit.state.antennas, ((0, 0), (0, 1)))
-    rows = np.concatenate([fit.state.poses, fit.state.markers, antennas])
-    for k, key in enumerate(variable_keys(fit.problem)):
-        if values.exists(key):
-            rows[k] = array_of(values, key)
-    poses, markers, antennas = np.split(rows, np.cumsum([len(m.frame), len(m.marker)]))
-    return state_from_arrays(
-        m, poses, markers, antennas[:, :2], calibration_at(fit.problem, values))
 
 
 def blocks_of(problem: Problem, values: gtsam.Values, covariance: Callable) -> np.ndarray:
@@ -445,7 +379,7 @@ def blocks_of(problem: Problem, values: gtsam.Values, covariance: Callable) -> n
 def calibration_covariance(problem: Problem, values: gtsam.Values, covariance) -> np.ndarray:
     """Covariance (p, p) of the calibration, 0 where it is known."""
     c = np.zeros((len(problem.sigma), len(problem.sigma)))
-    there = [(key, np.flatnonzero(problem.active[columns]) + columns.start)
+    there = [(key, unknown_of(problem, columns))
              for key, columns in CALIBRATION_KEYS if values.exists(key)]
     for key, rows in there:
         for other, columns in there:
