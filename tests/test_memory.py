@@ -73,7 +73,8 @@ def remembering():
 def test_memory_is_told_and_counted(remembering):
     dataset, _, result = remembering
     assert result.correlation[0] > 0.4 and result.correlation[1] == 0
-    assert result.share.sum() < len(dataset.aruco.pose) / 3 and result.noise.sightings == 1
+    assert result.share.sum() < len(dataset.aruco.pose) / 3
+    assert 1 <= result.noise.sightings < 1.2
     sentence, = (doubt.sentence for doubt in solution_doubts(result)
                  if doubt.what == "marker-memory")
     assert f"count {len(result.share)} sightings as {result.share.sum():.0f}" in sentence
