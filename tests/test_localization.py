@@ -1,4 +1,5 @@
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -6,10 +7,11 @@ from numeric import as_points, central_differences, decided, map_nees, wheel_nee
 
 from slamlib import fuse, fuse_increments, localize, studies
 from slamlib.core import increments, odometry, se2
-from slamlib.core.evaluation import anees, ate, nees, nees_band
+from slamlib.core.evaluation import align, anees, ate, nees, nees_band
 from slamlib.core.odometry import dead_reckoning
 from slamlib.core.records import ArucoReadings, Dataset
 from slamlib.core.sightings import GATE
+from slamlib.io.dataset import read_dataset, read_truth
 from slamlib.robust import fused
 from slamlib.studies.simulation import TABLE_2, simulate
 
@@ -405,6 +407,26 @@ def test_wheels_far_from_nominal_are_learned():
         assert abs(fused.wheel[0] - truth.vehicle.right_radius) < 5e-4
         assert ate(fused.poses, truth.poses) < 0.08
     assert np.mean(ratios) < 6
+
+
+REAL_LOGS = Path(__file__).parents[2] / "shared" / "real_logs"      # where they are present
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not REAL_LOGS.is_dir(), reason="the public robot logs are not here")
+@pytest.mark.parametrize("log, most", [
+    ("enmt", 1.0), ("starloc_b", 0.3), ("walker3", 0.3), ("litw", 1.3)])
+def test_on_public_logs_the_errors_are_below_those_of_odometry_or_covered(log, most):
+    """ATE over that of odometry; litw stands first, and its laser errs slowly and is turned."""
+    dataset, truth = read_dataset(REAL_LOGS / log), read_truth(REAL_LOGS / log).poses
+    fused = fuse(dataset)
+    by_odometry = dead_reckoning(dataset.ticks, dataset.vehicle)
+    assert ate(fused.poses, truth, aligned=True) < most * ate(by_odometry, truth, aligned=True)
+    aligned = se2.compose(align(fused.poses, truth), fused.poses)
+    squared = np.sum((aligned - truth)[:, :2]**2, axis=1)
+    variance = fused.covariances[:, 0, 0] + fused.covariances[:, 1, 1]
+    assert np.median(squared[1:] / variance[1:]) < 3
+    assert fused.rejected < 0.05 * len(dataset.aruco.pose)
 
 
 def test_the_slip_and_the_factor_that_a_vehicle_gives_are_taken():
