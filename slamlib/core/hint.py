@@ -32,6 +32,8 @@ class Fusion:
     slip: float | None = None    # sqrt(m), given or learned
     wheel: np.ndarray | None = None             # (3,) m, R_R, R_L, b estimated at the last frame
     wheel_covariance: np.ndarray | None = None  # (3, 3) m^2
+    memory: float | None = None  # correlation of the errors of a marker in successive frames
+    camera: np.ndarray | None = None            # (3,) m and rad, x, y, turn at the last frame
 
 
 def fuse_increments(dataset: Dataset, propagation: Callable = odometry.equation2) -> Fusion:
