@@ -19,6 +19,7 @@ from slamlib.core.batch import FixedValues, numbers
 from slamlib.core.errors import DatasetError
 from slamlib.core.graph import INDICES
 
+MAX_VARIANCE = 1e12          # m^2 and rad^2, above which a variable is not determined
 CONVERGED = 1e-6             # decrease of the error, over 1 + error, at which steps end
 ROUNDING = 1e-12             # relative increase of the error that is due to float rounding
 MAX_STEPS = 30               # number of steps of Gauss-Newton
@@ -67,10 +68,13 @@ class Marginals:
     def covariance(self, key: int) -> np.ndarray:
         """The covariance (d, d) of a variable."""
         try:
-            return self.tree.marginalCovariance(key)
+            covariance = self.tree.marginalCovariance(key)
         except RuntimeError:
             root, _ = self.tree.marginalFactor(key, gtsam.EliminateQR).jacobian()
-            return covariance_of_root(root, key)
+            covariance = covariance_of_root(root, key)
+        if covariance.max() > MAX_VARIANCE:              # determined by rounding alone
+            raise undetermined(gtsam.DefaultKeyFormatter(key))
+        return covariance
 
     def joint(self, first: int, second: int) -> np.ndarray:
         """The covariance (d, e) between two variables."""
