@@ -57,14 +57,15 @@ class Batch:
 
     def linearise(self, values: gtsam.Values, keys: list[int]):
         """Linearise all factors at GTSAM's values, which have those of `keys`, of one factor."""
-        self.values = values
-        self.place = {key: numbers(values, key)
-                      for key in set().union(*self.keys) if values.exists(key)}
+        there = {key: numbers(values, key)
+                 for key in set().union(*self.keys) if values.exists(key)}
         places = []
         for key, column in zip(keys, self.keys):
-            absent = [np.nan] * len(self.place[key])
-            places.append(np.array([self.place.get(other, absent) for other in column]))
+            absent = [np.nan] * len(there[key])
+            places.append(np.array([there.get(other, absent) for other in column]))
         self.errors, self.derivatives = self.linearised(*places)
+        self.values = values
+        self.place = there
 
 
 def numbers(values: gtsam.Values, key: int) -> list[float]:
