@@ -161,6 +161,7 @@ def slam_result(fit: Fit, by_gtsam: GtsamSolution | None = None) -> SlamResult:
     if fit.posterior is not None:
         noise_sigma = np.sqrt(np.diag(fit.posterior.covariance))
     memories = error_memories(problem, state)
+    few_ranges = np.bincount(m.ranges.antenna) < MIN_ACCEPTED_RANGES
     return SlamResult(
         poses=poses, covariances=covariances,
         marker=m.marker[mapped], marker_in_world=markers,
@@ -170,7 +171,7 @@ def slam_result(fit: Fit, by_gtsam: GtsamSolution | None = None) -> SlamResult:
         rejected=rejected, range_weight=range_weight, range_residual=range_residual,
         correlation=tuple(memory.correlation for memory in memories),
         turn_sigma=turn_sigma(problem), fit=fit, gtsam=by_gtsam,
-        agreement=_agreement(solution, engine))
+        agreement=_agreement(solution, engine, few_ranges))
 
 
 def _mostly_accepted(measurements, rejected):
@@ -196,13 +197,16 @@ def _of_frames(pairs, measurements):
     return np.concatenate([pairs[:, :3, :3], pairs[-1:, 3:6, 3:6]])
 
 
-def _agreement(solution, engine):
+def _agreement(solution, engine, few_ranges):
     """Largest difference of poses and landmarks of a solution from the engine's, in its sigmas.
 
-    Also the largest relative difference of their sigmas.
+    Also the largest relative difference of their sigmas. Antennas with `few_ranges` (a,) are left
+    out: these hardly determine them.
     """
     variances = _variances(solution)
     in_both = variances > 0
+    of_antennas = in_both[len(in_both) - len(few_ranges):]
+    of_antennas[few_ranges] = False
     sigma = np.sqrt(_variances(engine)[in_both])
     difference = se2.between(_places(engine), _places(solution))
     difference[:, 2] = se2.wrap(difference[:, 2])
