@@ -39,8 +39,7 @@ def handed(tmp_path_factory):
     write_dataset(folder / "data" / "stand_in", simulated.first(30),
                   replace(truth, poses=truth.poses[:30]))
     write(folder / "notebooks", "A_more", "# A. More\n\nOnly if asked for.")
-    write(folder / "notebooks", "1_all", "# 1. All", (SOLVE,), "## Middle\n\nRead this.",
-          "## Files\n\nOf another folder.", "## Explore\n\nMove the slider.")
+    write(folder / "notebooks", "1_all", "# 1. All", (SOLVE,), "## 1.1 Middle\n\nRead this.")
     (folder / "report.toml").write_text('author = "Ada"\nproblem2 = "fused"\n')
     (folder / "report").mkdir()
     (folder / "report" / "index.html").write_text("the pages of the usual build")
@@ -70,7 +69,7 @@ def test_the_pdf_is_without_what_is_for_screens_and_the_usual_pages_stay(handed)
     folder, archive = handed
     text = re.sub(r"\s+", " ", text_of(archive.read("report.pdf"), folder))
     assert "1.1 Middle" in text and "Read this." in text and "Ada" in text
-    assert not re.search("Explore|slider|another folder|is handed in|asked for|stand_in", text)
+    assert not re.search("is handed in|asked for|stand_in", text)
     assert [file.name for file in (folder / "report").iterdir()] == ["index.html"]
 
 
@@ -104,11 +103,9 @@ def test_equal_input_gives_equal_bytes_and_the_date_is_fixed(handed, monkeypatch
     assert [file.name for file in (folder / "new").iterdir()] == ["second.zip"]
 
 
-def test_appendices_and_sections_for_screens_are_left_out_unless_they_are_asked_for():
-    options = handin.hand_in_options(Options(leave_out={"B": "here"}))
-    assert options.appendix is False
-    assert options.leave_out == {"Explore": "", "Files": "", "B": "here"}
-    assert handin.hand_in_options(Options(appendix=True)).appendix is True
+def test_appendices_are_left_out_unless_report_toml_names_its_chapters():
+    assert handin.hand_in_options(Options()).chapters == ("[0-9]*",)
+    assert handin.hand_in_options(Options(chapters=("1*", "B*"))).chapters == ("1*", "B*")
 
 
 def test_simulated_datasets_are_left_out_where_there_are_recorded_ones_only(tmp_path):

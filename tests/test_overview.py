@@ -180,7 +180,7 @@ def test_without_truth_the_abstract_compares_at_returns(project):
 @pytest.mark.parametrize("name", NAMES)
 def test_the_opening_of_any_one_drive_fits_on_a_page(project, tmp_path, name):
     drive, = (drive for drive in project.drives if drive.name == name)
-    files = render({Path("index"): overview.opening([drive])}, Options(title="T"), (),
+    files = render({Path("index"): overview.opening([drive])}, Options(title="T"),
                    title_picture(drive))
     text = text_of(files["report.pdf"], tmp_path)
     _, page = text.rstrip("\f\n").split("\f")                     # after the cover

@@ -18,7 +18,7 @@ from slamlib.notebook import notices
 from slamlib.report import cache
 from slamlib.report.document import render
 from slamlib.report.execution import STUDIES, TRANSPORT, execute, kernel_environment
-from slamlib.report.notebooks import Options, shown, to_execute
+from slamlib.report.notebooks import Options, chapter_of, read_books
 from slamlib.report.overview import SolvedDrive, opening, read_drives, title_picture
 from slamlib.solve import RESULT_NAMES, SENSORS
 
@@ -41,7 +41,7 @@ def build_report(notebooks: Path, data: Path, report: Path, results: Path,
     Kernels read the absolute paths of data and results, and the selection, from SLAMLIB_DATA,
     SLAMLIB_RESULTS and SLAMLIB_DATASETS (one name per line). One build at a time works in a results
     folder or with a cache; another one waits for it. DatasetError if there is no notebook or
-    dataset, a dataset is malformed, or what is to be left out is unknown; NotebookError if a cell
+    dataset, a dataset is malformed, or a chapter that is chosen is unknown; NotebookError if a cell
     failed or a page cannot be set. Then report and results are unchanged.
 
     Parameters
@@ -58,23 +58,20 @@ def build_report(notebooks: Path, data: Path, report: Path, results: Path,
     data = data.resolve()
     report = report.resolve()
     results = results.resolve()
-    books = to_execute(notebooks.resolve(), options)
+    books = read_books(notebooks.resolve(), options.chapters)
     read = _read_datasets(data, datasets)
-    has = _measured(read)
-    books = _with_what_they_need(books, has)
-    chapters = shown(books, options)
+    books = _with_what_they_need(books, read)
     short = "/tmp" if TRANSPORT == "ipc" else None  # because paths of sockets must be
     with TemporaryDirectory(dir=short, prefix="slamlib-", ignore_cleanup_errors=True) as temporary:
         kept = (kept or Path(temporary, "kept")).resolve()
         environment = kernel_environment(Path(temporary), data, datasets, kept / STUDIES)
         folders = [data / dataset.name for dataset, _ in read]
         keys = partial(cache.keys, books, folders, environment | {"SLAMLIB_RESULTS": str(results)})
-        check = partial(render, chapters, options, check=True)
         with (swap.locked(kept), swap.staging(results) as stage, swap.staging(report) as pages):
-            written = _executed(books, keys, check, environment, jobs, stage, kept, fresh)
+            written = _executed(books, keys, environment, jobs, stage, kept, fresh)
             print("setting the pages and the PDF", file=sys.stderr)
             drives = read_drives(read, stage, written, notices(books.values()))
-            made = _rendered(drives, chapters, options, has)
+            made = _rendered(drives, books, options)
             for name, content in made.items():
                 swap.write_atomically(pages / name, content)
             of_datasets = {dataset.name for dataset, _ in read}
@@ -100,32 +97,23 @@ def _read_datasets(data, selected):
     return read
 
 
-def _measured(read):
-    """Return what datasets have (set of str): sensors, and "truth"."""
+def _with_what_they_need(books, read):
+    """Return the notebooks whose measurements the datasets have, or all if there is none."""
     has = {sensor for sensor in SENSORS for dataset, _ in read
            if getattr(dataset, sensor) is not None}
-    if any(truth for _, truth in read):
-        has.add("truth")
-    return has
-
-
-def _with_what_they_need(books, has):
-    """Return the notebooks whose measurements the datasets have, or all if there is none."""
-    served = {source: book for source, book in books.items()
-              if book.metadata.get("slamlib", {}).get("needs") in has | {None}}
+    needs = {source: chapter_of(source, book).needs for source, book in books.items()}
+    served = {source: book for source, book in books.items() if needs[source] in has | {None}}
     if not served:
         return books
-    for source in books:
-        if source not in served:
-            print(f"{source.stem}: left out, no dataset has the measurements", file=sys.stderr)
+    for source in books.keys() - served.keys():
+        print(f"{source.stem}: left out, no dataset has {SENSORS[needs[source]]}", file=sys.stderr)
     return served
 
 
-def _executed(books, keys, check, environment, jobs, stage, kept, fresh):
+def _executed(books, keys, environment, jobs, stage, kept, fresh):
     """Execute books in place, or recall their outputs; return the sorted names of their files.
 
-    `keys` returns `cache.keys` as they are now, `check` refuses bad text before a kernel starts,
-    `stage` is the folder of the files.
+    `keys` returns `cache.keys` as they are now, `stage` is the folder of the files.
     """
     written = set()
     left = {}
@@ -143,17 +131,14 @@ def _executed(books, keys, check, environment, jobs, stage, kept, fresh):
         if keys() == begun:  # nothing was edited meanwhile
             cache.keep(kept, source, begun[source], book, stage, names)
 
-    if left:
-        check()
     if fresh:
         shutil.rmtree(kept / STUDIES, ignore_errors=True)
     execute(left, environment, stage, max(1, jobs), finish)
     return sorted(written)
 
 
-def _rendered(drives, chapters, options, has):
+def _rendered(drives, books, options):
     """Return the files of the report, {name: bytes}."""
     solved = [drive for drive in drives if drive.solutions]
     picture = title_picture(solved[-1]) if solved else ""
-    books = {Path("index"): opening(drives, chapters)} | chapters
-    return render(books, options, has, picture)
+    return render({Path("index"): opening(drives, books)} | books, options, picture)

@@ -25,7 +25,7 @@ from slamlib.solve import title
 
 LINE_WIDTH = 100  # characters in a line of README.txt
 README = Path(__file__).with_name("readme.txt")  # a template of Jinja
-LEFT_OUT = ("Explore", "Files")  # titles of sections that are for screens, or on other folders
+CHAPTERS = ("[0-9]*",)  # notebooks whose names begin with a number, so no appendix
 PACKAGES = ("slamlib", "numpy", "scipy", "gtsam")  # whose versions README.txt names
 MAP_ALONE = "problem2/ArucoMap.mat"  # the map by markers alone
 
@@ -49,9 +49,8 @@ def selection(data: Path, names: list[str] | None = None) -> tuple:
 
 
 def hand_in_options(options: Options) -> Options:
-    """Return Options by which the hand-in leaves out the appendices, unless they are asked for."""
-    leave_out = dict.fromkeys(LEFT_OUT, "") | options.leave_out
-    return replace(options, appendix=bool(options.appendix), leave_out=leave_out)
+    """Return Options of a hand-in: without appendices, unless report.toml names its chapters."""
+    return replace(options, chapters=options.chapters or CHAPTERS)
 
 
 def write_zip(path: Path, report: Report, results: Path, options: Options,

@@ -31,7 +31,7 @@ from slamlib.solve import PROBLEMS, SENSORS, Failure, Solution, title, truth_in_
 
 TEXT = Path(__file__).with_name("overview.md")
 ALT = "Trajectories, and standard deviations of position"  # of the picture
-ON_SCREEN = ("pdf", "chapters")  # blocks of the text that the PDF leaves out
+ON_SCREEN = ("pdf", "files", "chapters")  # blocks of the text that the PDF leaves out
 CURVE_POINTS = 1500  # of a curve, at most
 HIDDEN_TRAJECTORIES = ("problem2", "problem2_hint", "problem3")  # they would lie below others
 LOOKS = {"problem3": dict(linewidth=4.0), "problem4": dict(linestyle="-", linewidth=1.4)}
