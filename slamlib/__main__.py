@@ -1,12 +1,10 @@
 """The command line, `slamlib` or `python -m slamlib`: its options, commands and exit codes."""
 
 import argparse
-import logging
 import os
 import signal
 import sys
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 
 # Set before numpy is imported: the matrices are so small that more threads are slower.
@@ -14,8 +12,6 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from slamlib import __version__  # noqa: E402
 from slamlib.core.errors import DatasetError, require  # noqa: E402
-from slamlib.core.vehicle import changed  # noqa: E402
-from slamlib.io.dataset import read_dataset, read_truth  # noqa: E402
 
 EXECUTED_NOTEBOOKS = Path("build", "executed")  # folder in which executed notebooks are kept
 HAND_IN_PAGES = Path("build", "hand-in")  # folder of the report that is handed in
@@ -108,10 +104,14 @@ def _add_options_of_a_build(command):
 def _add_solve(commands):
     command = commands.add_parser("solve", help="solve problems without notebooks")
     command.set_defaults(run=_solve)
-    _add_path(command, "folder", "the dataset's folder")
-    _add_path(command, "--plot", "write a picture of map and errors: a .png, .pdf or .svg file")
     add = command.add_argument
+    add("folders", nargs="+", type=Path, metavar="FOLDER", help="a dataset's folder; each of "
+        "several has its results in the folder of its name in OUT, and drives.csv is the table "
+        "over all")
     add("--out", type=Path, required=True, help="folder for the results")
+    add("-j", "--jobs", type=int, default=1, help="datasets solved at a time (default 1)")
+    _add_path(command, "--plot", "write a picture of map and errors of the only dataset: a .png, "
+              ".pdf or .svg file")
     add("--problem", action="append", default=[], metavar="NAME",
         type=lambda text: text.removeprefix("problem"),
         choices=("1", "2", "2_hint", "2_fused", "3", "4"),
@@ -122,8 +122,7 @@ def _add_solve(commands):
     add("--csv", action="store_true", help="write poses and maps as text, too: CSV with "
         "covariances, and trajectories as TUM files for evo")
     add("-v", "--verbose", action="store_true", help="print to stderr what is decided on the way: "
-        "kernels, noise, accepted measurements, calibration, and GTSAM's solution; without it, one "
-        "line for each problem that takes longer than two seconds")
+        "kernels, noise, accepted measurements, calibration, and GTSAM's solution")
 
 
 def _add_simulate(commands):
@@ -145,12 +144,14 @@ def _add_simulate(commands):
 
 def _build(options):
     """Build the report, and write the zip to hand in where `out` is given."""
+    from slamlib.io.results import read_summary
     from slamlib.report import NotebookError, build_report, handin
     from slamlib.report.notebooks import notebooks_folder, read_options
     shown = read_options("report.toml")
     notebooks = options.notebooks or notebooks_folder()
-    _require_elsewhere(options.report, options.data, notebooks, options.results)
-    _require_elsewhere(options.results, options.data, notebooks, options.report)
+    for other in (options.data, options.report):
+        require(options.results.resolve() != other.resolve(), options.results,
+                "another folder for the results: this one is for the datasets or the pages")
     datasets = [_name_in(options.data, each) for each in options.datasets] or None
     omitted = ()
     if options.out:
@@ -166,7 +167,7 @@ def _build(options):
     if not shown.author:
         print("report.toml names no author: the PDF's title page has none", file=sys.stderr)
     for drive in report.drives:
-        print(summary_table(_summary(drive)), file=sys.stderr)
+        print(summary_table(read_summary(options.results / drive.name)), file=sys.stderr)
     if options.out:
         handin.write_zip(options.out, report, options.results, shown, omitted)
         print(f"hand-in: {options.out.resolve()}", file=sys.stderr)
@@ -179,15 +180,6 @@ def _name_in(data, dataset):
     """The name of a dataset (str), which may be given as its path in the folder `data`."""
     path = Path(dataset)
     return path.name if path.resolve().parent == data.resolve() else dataset
-
-
-def _summary(drive):
-    """The summary of a SolvedDrive, as `solve_to_folder` returns it, as far as a table needs it."""
-    from slamlib.solve import summarize
-    rows = {each.problem: summarize(each, drive.truth) for each in drive.solutions}
-    rows |= {each.problem: {"failed": each.reason} for each in drive.failures}
-    return {"dataset": drive.name, "poses": len(drive.dataset.ticks), "problems": rows,
-            "doubts": [vars(doubt) for doubt in drive.doubts]}
 
 
 def summary_table(summary: dict) -> str:
@@ -213,41 +205,38 @@ def summary_table(summary: dict) -> str:
     return "\n".join(lines)
 
 
-def _require_elsewhere(out, *folders):
-    """Raise DatasetError if a folder that a run replaces is or holds the current one or others."""
-    for folder in (Path(), *folders):
-        folder = folder.resolve()
-        require(not folder.is_relative_to(out.resolve()), out, "another folder to write to: this "
-                f"one, which is replaced, is or holds {folder}")
-
-
 def _solve(options):
-    from slamlib.io.dataset import inventory_lines
-    from slamlib.solve import PROBLEMS, allows, log_if_slow, solve_to_folder, title
-    logging.basicConfig(format="%(message)s")
-    printed = logging.getLogger("slamlib") if options.verbose else log_if_slow
-    printed.setLevel(logging.INFO)
-    _require_elsewhere(options.out, options.folder, options.folder / "truth")
+    """Solve the problems of one dataset or several, and print a table of each."""
+    from slamlib.solve import solve_folder, solve_folders
+    several = len(options.folders) > 1
     if options.plot:
-        require(options.plot.suffix.lower() in (".png", ".pdf", ".svg"), "--plot",
-                "a .png, .pdf or .svg file", options.plot)
-    dataset = read_dataset(options.folder)
-    truth = read_truth(options.folder)
-    stated = {"kernel": options.kernel, "slip": options.slip}
-    dataset = replace(dataset, vehicle=changed(dataset.vehicle, stated, "slamlib solve"))
-    print("\n".join(inventory_lines(dataset, truth)), file=sys.stderr)
-    problems = sorted(f"problem{each}" for each in options.problem)
-    for problem in problems:
-        require(allows(dataset, problem), options.folder,
-                f"the measurements of {problem} ({title(problem, dataset)})")
-    summary = solve_to_folder(dataset, truth, options.out, problems or list(PROBLEMS), options.csv)
-    print(summary_table(summary))
+        is_picture = options.plot.suffix.lower() in (".png", ".pdf", ".svg")
+        require(is_picture and not several, "--plot",
+                "a .png, .pdf or .svg file, of one dataset", options.plot)
+    how = {"problems": [f"problem{each}" for each in options.problem],
+           "text": options.csv, "verbose": options.verbose,
+           "stated": {"kernel": options.kernel, "slip": options.slip}}
+    if several:
+        summaries = solve_folders(options.folders, options.out, options.jobs, **how)
+    else:
+        summaries = [solve_folder(options.folders[0], options.out, **how)]
+    codes = [_told(summary) for summary in summaries]
     print(f"results: {options.out.resolve()}", file=sys.stderr)
-    failed = ["failed" in row for row in summary["problems"].values()]
-    if options.plot and not all(failed):
+    if options.plot and any("failed" not in row for row in summaries[0]["problems"].values()):
+        from slamlib.io.dataset import read_dataset, read_truth
         from slamlib.report.overview import result_picture
-        result_picture(dataset, truth, options.out, options.plot)
+        drive = options.folders[0]
+        result_picture(read_dataset(drive), read_truth(drive), options.out, options.plot)
         print(f"picture: {options.plot.resolve()}", file=sys.stderr)
+    return 2 if 2 in codes else max(codes)
+
+
+def _told(summary):
+    """The exit code of a summary, after its table or the error was printed."""
+    if "error" in summary:
+        return _ended(2, summary["error"])
+    print(summary_table(summary))
+    failed = ["failed" in row for row in summary["problems"].values()]
     return 3 if any(failed) else 0
 
 

@@ -1,38 +1,37 @@
 """The assignment's problems: which of them a dataset allows, their solutions and files.
 
-`find` runs the solver of a problem; `problem_solution` makes a Solution of its result, with what
-the files and figures of every problem need; `solve_to_folder` solves all problems and writes their
-files, with a summary of plain numbers.
+`find` runs the solver of a problem, and `write_results` writes what it found, with a summary of
+plain numbers. `solve_to_folder` does so for all problems of a dataset, `solve_folders` for many
+datasets.
 """
 
+import csv
 import json
 import logging
-import signal
 import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
-from multiprocessing import Pipe, get_context
+from io import StringIO
 from pathlib import Path
-from threading import Timer
 from typing import NamedTuple
 
 import numpy as np
+from joblib import Parallel, delayed
 
 from slamlib import estimate, fuse, fuse_increments, localize
 from slamlib.core import evaluation, odometry, se2
-from slamlib.core.errors import DatasetError
+from slamlib.core.errors import DatasetError, require
 from slamlib.core.records import Dataset, Truth
-from slamlib.io import results, swap
-from slamlib.io.dataset import all_notes
+from slamlib.core.vehicle import TABLE_2, VEHICLE_LIMITS, changed
+from slamlib.io import files, results
+from slamlib.io.dataset import all_notes, inventory_lines, read_dataset, read_truth
 from slamlib.robust.file_doubts import Doubt, doubts_before_solving, merged
 from slamlib.robust.solution_doubts import solution_doubts
 
 log = logging.getLogger(__name__)
-log_if_slow = log.getChild("slow")                  # what the command line always prints
-
-SLOW = 2.0                                          # s, after which a problem is told to be slow
+SLOW = 2.0                                          # s, after which a problem is told to be solved
 UNSOLVABLE = (DatasetError, np.linalg.LinAlgError)  # what `find` raises where there is no solution
 
 
@@ -53,11 +52,14 @@ PROBLEMS = {
     "problem3": Task("SLAM: odometry + ArUco", ("aruco",), "slam"),
     "problem4": Task("SLAM: odometry + ArUco + UWB", ("uwb",), "slam_uwb"),
 }
-INDEPENDENT = ("problem1", "problem2", "problem2_hint", "problem2_fused")  # no other needs them
 SENSORS = {"aruco": "markers", "uwb": "UWB ranges"}
-RESULT_NAMES = frozenset([  # relative paths of all files that a drive's results may have
-    results.SUMMARY, *(f"{problem}/{file}" for problem in PROBLEMS
-                       for file in results.RESULT_FILES)])
+VEHICLE_ESTIMATED = "vehicle.toml"                  # in the results: what the drive says of it
+TRUTH = "truth.tum"
+NOISE = {"slip": "slip_sqrt_m", "marker_noise_factor": "marker_noise_factor",
+         "range_noise_factor": "range_noise_factor"}    # entries of vehicle.toml, keys of facts
+DRIVES = "drives.csv"                               # the table over all drives, and its columns
+COLUMNS = ("dataset", "problem", "poses", "ate_m", "ate_aligned_m", "nees", "last_sigma_m",
+           "slip_sqrt_m", "doubts", "seconds", "failed")
 
 
 def title(problem: str, dataset: Dataset) -> str:
@@ -237,20 +239,15 @@ def solutions(dataset: Dataset,
         if not allows(dataset, problem):
             continue
         start = time.perf_counter()
-        timer = Timer(SLOW, log_if_slow.info, (
-            "%s: %s takes longer than %g s", dataset.name, problem, SLOW))
-        timer.start()
         try:
-            result = find(problem, dataset, found)
-            solution = problem_solution(problem, dataset, result)
+            found[problem] = find(problem, dataset, found)
+            solution = problem_solution(problem, dataset, found[problem])
         except UNSOLVABLE as error:
             yield failure(problem, dataset, error)
             continue
-        finally:
-            timer.cancel()
-        found[problem] = result
         seconds = time.perf_counter() - start
-        log.info("%s: %s solved in %.1f s", dataset.name, problem, seconds)
+        level = logging.WARNING if seconds > SLOW else logging.INFO
+        log.log(level, "%s: %s solved in %.1f s", dataset.name, problem, seconds)
         yield replace(solution, facts=solution.facts | {"seconds": seconds})
 
 
@@ -259,18 +256,55 @@ def truth_in_world(solution: Solution, truth: Truth) -> np.ndarray:
     return se2.between(truth.poses[solution.world], truth.poses)
 
 
-def solve_to_folder(dataset: Dataset, truth: Truth | None, out: Path,
-                    problems: Sequence[str] = tuple(PROBLEMS), csv: bool = False) -> dict:
-    """Solve problems of a Dataset and write their files to the folder `out`.
+def write_results(out: Path | str, problem: str, found, dataset: Dataset,
+                  truth: Truth | None = None, text: bool = False) -> Solution | Failure:
+    """Write what a solver found of one problem to the results folder `out` of a drive.
 
-    When all files are written they replace those of an earlier run, by `swap.publish`. On Linux,
-    where a fork is safe, a second process solves problems 1 and 2.
+    The .mat files come first, summary.json last: a folder without it is unfinished. What it lists
+    of other problems stays; files of problems that it does not list are removed.
 
     Parameters
     ----------
-    truth : Truth, to report errors, never to estimate; or None.
-    problems : keys of `PROBLEMS`; those for which there are sensors are solved.
-    csv : bool; True writes each .mat file also as CSV, and trajectories and truth as TUM files.
+    problem : key of `PROBLEMS`.
+    found : what `find` returns for the problem, or the exception, of UNSOLVABLE, that it raised.
+    truth : Truth, to report errors, or None.
+    text : bool; True writes each .mat file also as CSV, and trajectories and truth as TUM files.
+
+    Returns
+    -------
+    The Solution that is written, whose `doubts` say what contradicts the files, or a Failure.
+
+    >>> from slamlib.studies.simulation import simulate
+    >>> dataset, truth = simulate("short", seed=1)
+    >>> found = odometry.equation2(dataset.ticks, dataset.vehicle)
+    >>> write_results("results/short", "problem1", found, dataset, truth).title
+    'odometry'
+    >>> results.read_summary("results/short")["problems"]["problem1"]["estimated_poses"]
+    2000
+    """
+    out = Path(out)
+    try:
+        if isinstance(found, Exception):
+            raise found
+        solved = problem_solution(problem, dataset, found)
+    except UNSOLVABLE as error:
+        solved = failure(problem, dataset, error)
+    with files.locked(out):
+        rows = {}
+        with suppress(DatasetError):
+            rows = results.read_summary(out)["problems"]
+        rows.pop(problem, None)
+        _write(out, dataset, truth, [solved], rows, text)
+    return solved
+
+
+def solve_to_folder(dataset: Dataset, truth: Truth | None, out: Path,
+                    problems: Sequence[str] = tuple(PROBLEMS), text: bool = False) -> dict:
+    """Solve `problems` of a Dataset, then write their files to the folder `out`.
+
+    Files of an earlier run are replaced, or removed if they belong to other problems; all other
+    files in the folder stay. Raises DatasetError, before anything is solved, if nothing can be
+    written there. `truth` and `text` as of `write_results`.
 
     Returns
     -------
@@ -279,57 +313,177 @@ def solve_to_folder(dataset: Dataset, truth: Truth | None, out: Path,
     drive first, then by problem. "notes" lists what was mended or left out while the files were
     read.
     """
-    with swap.staging(out) as stage:
-        doubts, solved = _in_two_processes(dataset, problems)
-        rows = {}
-        for solution in solved:
-            if isinstance(solution, Failure):
-                row = {"failed": solution.reason}
-            else:
-                row = summarize(solution, truth)
-                doubts += solution.doubts
-                results.write_solution(stage, solution, csv)
-            rows[solution.problem] = {"title": solution.title, **row}
-        summary = {"dataset": dataset.name, "poses": len(dataset.ticks),
-                   "kernel": dataset.vehicle.kernel, "doubts": [*map(asdict, merged(doubts))],
-                   "notes": all_notes(dataset, truth), "problems": rows}
-        text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-        swap.write_atomically(stage / results.SUMMARY, text.encode(errors="backslashreplace"))
-        if csv and truth is not None:
-            results.write_tum(stage / "truth.tum", truth.poses)
-        swap.publish({out: stage}, ours=RESULT_NAMES)
+    with files.locked(out):
+        solved = list(solutions(dataset, problems))
+        return _write(out, dataset, truth, solved, {}, text)
+
+
+def _write(out, dataset, truth, solved, others, text):
+    """Write solved problems to a folder; return its summary, with the rows of `others`, too."""
+    rows = dict(others)
+    for each in solved:
+        rows[each.problem] = summary_row(each, truth)
+    summary = summary_of(dataset, truth, rows, doubts_before_solving(dataset))
+    clear_results(out, keep=others)
+    for each in solved:
+        if isinstance(each, Solution):
+            results.write_solution(out, each, text)
+    if text and truth is not None:
+        results.write_tum(out / TRUTH, truth.poses)
+    write_estimated_vehicle(out / VEHICLE_ESTIMATED, dataset, rows)
+    results.write_summary(out, summary)
     return summary
 
 
-def _in_two_processes(dataset, problems):
-    """What `_independent` returns, and then the solutions of the other problems, in order."""
-    receiver, sender = Pipe(duplex=False)
-    if sys.platform == "linux":
-        second = get_context("fork").Process(
-            target=_send, args=(receiver, sender, dataset, problems), daemon=True)
-        second.start()
-    sender.close()
-    others = [problem for problem in problems if problem not in INDEPENDENT]
-    late = list(solutions(dataset, others))
+def clear_results(out: Path, keep: Sequence[str] = ()):
+    """Remove the files of earlier runs from a results folder, but those of the problems `keep`.
+
+    The summary is the first to go. No other file is touched, and folders stay.
+    """
+    names = [results.SUMMARY, VEHICLE_ESTIMATED, TRUTH]
+    for problem in PROBLEMS:
+        if problem not in keep:
+            names += results.file_names(problem)
+    for name in names:
+        if (out / name).exists():
+            (out / name).unlink()
+
+
+def summary_of(dataset: Dataset, truth: Truth | None, rows: dict, doubts: list[Doubt]) -> dict:
+    """The summary of a drive, by the rows (dict) of its problems and doubts about its files."""
+    doubts = list(doubts)
+    problems = {problem: rows[problem] for problem in PROBLEMS if problem in rows}
+    for row in problems.values():
+        doubts += [Doubt(**doubt) for doubt in row["doubts"]]
+    return {"dataset": dataset.name, "poses": len(dataset.ticks), "kernel": dataset.vehicle.kernel,
+            "doubts": [asdict(doubt) for doubt in merged(doubts)],
+            "notes": all_notes(dataset, truth), "problems": problems}
+
+
+def summary_row(solved: Solution | Failure, truth: Truth | None) -> dict:
+    """The row of a problem in the summary, a dict of plain numbers and its doubts."""
+    row = {"title": solved.title, "doubts": []}
+    if isinstance(solved, Failure):
+        return row | {"failed": solved.reason}
+    row["doubts"] = [asdict(doubt) for doubt in solved.doubts]
+    return row | summarize(solved, truth)
+
+
+def write_estimated_vehicle(path: Path, dataset: Dataset, rows: dict):
+    """Write what a drive says of its vehicle as a vehicle.toml, if that is not what is stated.
+
+    It has all that is stated, the calibration that was released from it and the noise that was
+    learned, of the last problem in the `rows` of a summary that estimates them.
+    """
+    solved = [row for row in rows.values() if "calibration" in row]
+    if not solved:
+        return
+    estimated = {}
+    for entry in solved[-1]["calibration"]:
+        if entry["released"]:
+            estimated[entry["name"]] = entry["estimate"]
+            estimated[f"sigma_{entry['name']}"] = entry["sigma"]
+    for name, fact in NOISE.items():
+        if getattr(dataset.vehicle, name) is None:
+            estimated[name] = solved[-1].get(fact)
+    estimated = {name: value for name, value in estimated.items()
+                 if value is not None and name in VEHICLE_LIMITS}
+    vehicle = changed(dataset.vehicle, estimated, path)
+    lines = [f"# The vehicle of {json.dumps(dataset.name)} as this drive says: in the folder of "
+             "the dataset it is taken as stated."]
+    for name, value in vars(vehicle).items():
+        if value != getattr(TABLE_2, name):
+            told_by = "  # estimated" if name in estimated else ""
+            lines.append(f"{name} = {json.dumps(value)}{told_by}")
+    if estimated:
+        text = "\n".join(lines)
+        files.write_file(path, f"{text}\n".encode())
+
+
+def solve_folder(folder: Path | str, out: Path | str, problems: Sequence[str] = (),
+                 text: bool = False, verbose: bool = False, stated: dict | None = None) -> dict:
+    """Read the dataset in a folder, solve it into the folder `out`; returns the summary.
+
+    What was read is printed to stderr.
+
+    Parameters
+    ----------
+    problems : keys of `PROBLEMS`, or none for all that the sensors allow.
+    text : as of `write_results`.
+    verbose : True prints to stderr what is decided on the way.
+    stated : entries of a Vehicle that replace those of the dataset's vehicle.toml.
+
+    Raises DatasetError if the dataset is malformed or does not allow a problem.
+    """
+    folder = Path(folder)
+    out = Path(out)
+    if verbose:
+        logging.basicConfig(format="%(message)s")
+        logging.getLogger("slamlib").setLevel(logging.INFO)
+    require(out.resolve() not in (folder.resolve(), folder.resolve() / "truth"), out,
+            "another folder for the results: this one is the dataset's")
+    dataset = read_dataset(folder)
+    truth = read_truth(folder)
+    dataset = replace(dataset, vehicle=changed(dataset.vehicle, stated or {}, "slamlib solve"))
+    print("\n".join(inventory_lines(dataset, truth)), file=sys.stderr)
+    for problem in problems:
+        require(allows(dataset, problem), folder,
+                f"the measurements of {problem} ({title(problem, dataset)})")
+    return solve_to_folder(dataset, truth, out, sorted(problems) or tuple(PROBLEMS), text)
+
+
+def solve_folders(folders: Sequence[Path | str], out: Path | str, jobs: int | None = None,
+                  **options) -> list[dict]:
+    """Solve each of several datasets into out/<name>, and write the table out/drives.csv.
+
+    One that cannot be read or written does not stop the others: its summary has the entry "error",
+    a sentence, and no problems.
+
+    Parameters
+    ----------
+    jobs : datasets at a time, in as many processes; None for what joblib's `parallel_config` says,
+        by default 1.
+    options : of `solve_folder`.
+
+    Returns
+    -------
+    The summaries of the datasets, in their order.
+    """
+    out = Path(out)
+    names = [Path(folder).absolute().name for folder in folders]
+    require(len(set(names)) == len(names), out, "datasets in folders of different names, because "
+            f"results have these names, found {', '.join(names)}")
+    with files.locked(out):
+        solve = delayed(_summary_or_error)
+        summaries = Parallel(n_jobs=jobs)(
+            solve(folder, out / name, options) for folder, name in zip(folders, names))
+        table = StringIO()
+        writer = csv.DictWriter(table, COLUMNS, extrasaction="ignore", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(row for summary in summaries for row in drive_rows(summary))
+        files.write_file(out / DRIVES, table.getvalue().encode())
+    return summaries
+
+
+def _summary_or_error(folder, out, options):
+    """What `solve_folder` returns, or a summary that has an error."""
     try:
-        doubts, early = receiver.recv()
-    except (EOFError, OSError):            # no child, or it was killed, or failed: here it is told
-        doubts, early = _independent(dataset, problems)
-    return doubts, early + late
+        return solve_folder(folder, out, **options)
+    except (DatasetError, OSError) as error:
+        return {"dataset": out.name, "error": str(error), "doubts": [], "problems": {}}
 
 
-def _send(receiver, sender, dataset, problems):
-    """Send what `_independent` returns from a process that Ctrl-C does not end."""
-    receiver.close()                       # so that the pipe breaks when the other one is killed
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    with sender, suppress(BaseException):
-        sender.send(_independent(dataset, problems))
-
-
-def _independent(dataset, problems):
-    """Doubts before solving, and the list of `solutions` of those `problems` in INDEPENDENT."""
-    chosen = [problem for problem in problems if problem in INDEPENDENT]
-    return doubts_before_solving(dataset), list(solutions(dataset, chosen))
+def drive_rows(summary: dict) -> Iterator[dict]:
+    """Rows of the table over all drives of a summary, one for each problem (dict by COLUMNS)."""
+    drive = {"dataset": summary["dataset"]}
+    if "error" in summary:
+        yield drive | {"failed": summary["error"]}
+    for problem, row in summary["problems"].items():
+        found = drive | row | {"problem": problem, "doubts": len(row["doubts"])}
+        if "last_sigma" in row:
+            found["poses"] = row["estimated_poses"]
+            found["last_sigma_m"] = max(row["last_sigma"][:2])
+        yield found
 
 
 def summarize(solution: Solution, truth: Truth | None) -> dict:
@@ -345,4 +499,7 @@ def summarize(solution: Solution, truth: Truth | None) -> dict:
         true_poses = truth_in_world(solution, truth)
         summary["ate_m"] = evaluation.ate(solution.poses, true_poses)
         summary["ate_aligned_m"] = evaluation.ate(solution.poses, true_poses, aligned=True)
+        nees = evaluation.anees(solution.poses, solution.covariances, true_poses)
+        if np.isfinite(nees):                           # not where every pose is known
+            summary["nees"] = nees
     return summary

@@ -3,23 +3,22 @@
 import errno
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 
-import psutil
 import pytest
 from conftest import ROOT, is_running
 from test_report import build, make_data, write
 
 from slamlib import solve
 from slamlib.__main__ import END_SIGNALS, main
-from slamlib.io import results, swap
+from slamlib.core.errors import DatasetError
+from slamlib.io import files, results
 from slamlib.report import NotebookError
-from slamlib.solve import problem_solution, solve_to_folder
+from slamlib.solve import solve_to_folder
 from slamlib.studies.simulation import simulate, write_dataset
 
 RESULT = """import os, time
@@ -30,8 +29,6 @@ poses = None, np.zeros((2, 3)), np.zeros((2, 3, 3))
 write_structs(Path(os.environ["SLAMLIB_RESULTS"], "short", "problem1"), "vehiclePose", *poses)
 """
 
-
-PROCESSES = 1 + (sys.platform == "linux")        # of solve
 
 
 def start(folder, *arguments, code=None, **options):
@@ -56,8 +53,8 @@ def wait_for(found, process, seconds=300):
 
 
 def hidden(folder):
-    """Names in a folder that begin with a dot, but for the list of a set's files."""
-    return [str(path) for path in folder.rglob(".*") if path.name != swap.FILE_LIST]
+    """Names in a folder that begin with a dot, but for the list of a report's pages."""
+    return [str(path) for path in folder.rglob(".*") if path.name != ".pages"]
 
 
 @pytest.fixture
@@ -67,23 +64,15 @@ def drive():
 
 
 @pytest.mark.slow
-def test_a_second_build_waits_and_says_so_and_neither_loses_results(tmp_path):
+def test_of_two_builds_at_once_the_second_waits_and_neither_loses_results(tmp_path):
     make_data(tmp_path)
-    write(tmp_path / "notebooks", "1_slow", "# Slow", (RESULT,), (
-        f"while not Path({str(tmp_path / 'go')!r}).exists(): time.sleep(0.1)",))
-    first = start(tmp_path, "report", "short")
-    wait_for(lambda: [*tmp_path.rglob("vehiclePose.mat")], first)
-    with open(tmp_path / "told", "w+") as told:
-        second = start(tmp_path, "report", "short", stderr=told)
-        wait_for(lambda: "waits for" in (tmp_path / "told").read_text(), second)
-        (tmp_path / "go").touch()
-        assert "waits for" not in first.communicate(timeout=300)[1] and first.returncode == 0
-        second.communicate(timeout=300)
-        assert second.returncode == 0
-    found, told = (tmp_path / "told").read_text().split("slamlib: waits for another run, which ")
-    assert found.startswith("short: encoders: ")
-    assert "nothing changed, not executed again" in told.splitlines()[1]
+    write(tmp_path / "notebooks", "1_slow", "# Slow", (RESULT,))
+    builds = [start(tmp_path, "report", "short") for _ in range(2)]
+    told = [process.communicate(timeout=300)[1] for process in builds]
+    assert [process.returncode for process in builds] == [0, 0], told
+    assert sum("nothing changed, not executed again" in each for each in told) == 1
     assert (tmp_path / "results" / "short" / "problem1" / "vehiclePose.mat").is_file()
+    assert results.read_summary(tmp_path / "results" / "short")["problems"].keys() == {"problem1"}
     assert (tmp_path / "report" / "index.html").is_file()
     assert hidden(tmp_path) == []
 
@@ -92,7 +81,7 @@ def test_a_lock_has_one_holder_at_a_time_although_its_file_is_removed(tmp_path):
     held, most = [], []
 
     def work(_):
-        with swap.locked(tmp_path / "out"):
+        with files.locked(tmp_path / "out"):
             held.append(1)
             most.append(len(held))
             time.sleep(0)
@@ -103,80 +92,81 @@ def test_a_lock_has_one_holder_at_a_time_although_its_file_is_removed(tmp_path):
     assert len(most) == 200 and max(most) == 1 and hidden(tmp_path) == []
 
 
-def test_a_dataset_with_fewer_sensors_leaves_no_problem_of_another(tmp_path, drive):
-    """What the user put there stays, also in a folder of a problem; so without a list of files."""
-    mine = ["notes.txt", "movie.part", "mine/problem2.mat", "problem2/notes.txt",
-            "problem4/mine/a.mat"]
-    tmp_path /= "out"
-    for listed in (True, False):
-        solve_to_folder(drive, None, tmp_path)
-        assert (tmp_path / "problem4" / "UwbMap.mat").exists()
-        for name in mine:
-            (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-            (tmp_path / name).write_text(name)
-        (tmp_path / "problem3" / ".vehiclePose.mat.part").write_text("of a killed run")
-        if not listed:  # damaged, or written by an earlier version
-            (tmp_path / swap.FILE_LIST).write_text("5")
-            (old := swap.beside(tmp_path, "old")).mkdir()        # a run was killed
-            shutil.move(tmp_path / "mine", old)
-        solve_to_folder(drive.without("uwb").without("aruco"), None, tmp_path)
-        assert swap.file_names(tmp_path) == sorted([
-            swap.FILE_LIST, *mine, "problem1/vehiclePose.mat", "summary.json"])
-        assert all((tmp_path / name).read_text() == name for name in mine)
-        assert not (tmp_path / "problem3").exists() and (tmp_path / "problem2").exists()
-    results.write_solution(tmp_path, problem_solution("problem1", drive.first(9)))
-    assert not (tmp_path / "summary.json").exists()                 # which is of other files
+def test_a_lock_that_another_run_keeps_is_told_after_a_while(tmp_path, monkeypatch):
+    monkeypatch.setattr(files, "LOCK_TIME", 0.1)
+    with files.locked(tmp_path), pytest.raises(DatasetError, match="try again when it has ended"):
+        with files.locked(tmp_path):
+            pass
+
+
+def test_a_run_with_fewer_sensors_removes_files_of_other_problems_and_no_other_file(
+        tmp_path, drive):
+    mine = ["notes.txt", "mine/problem2.mat", "problem2/notes.txt", "problem4/mine/a.mat"]
+    out = tmp_path / "out"
+    solve_to_folder(drive, None, out, text=True)
+    for name in mine:
+        files.write_file(out / name, b"mine")
+    (out / "empty").mkdir()
+    (out / "problem1").chmod(0o700)
+    solve_to_folder(drive.without("uwb").without("aruco"), None, out)
+    assert files.file_names(out) == sorted([
+        *mine, "problem1/vehiclePose.mat", "summary.json"])
+    assert all((out / name).read_bytes() == b"mine" for name in mine)
+    assert sorted(path.name for path in out.iterdir() if path.is_dir()) == [
+        "empty", "mine", *sorted(solve.PROBLEMS)]
+    assert (out / "problem1").stat().st_mode & 0o777 == 0o700
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(sys.platform != "linux", reason="only Linux forks safely")
-def test_a_kill_before_any_step_mixes_nothing_and_the_next_run_cleans_up():
-    """Exhaustive: of solve, and of two folders that are swapped as one."""
-    done = subprocess.run([sys.executable, ROOT / "tests" / "kills.py"], text=True,
-                          capture_output=True, timeout=900,
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="runs are forks")
+def test_a_kill_at_any_moment_leaves_the_results_of_one_run_or_no_summary(tmp_path):
+    done = subprocess.run([sys.executable, ROOT / "tests" / "kills.py", tmp_path / "out"],
+                          text=True, capture_output=True, timeout=300,
                           env=os.environ | {"PYTHONPATH": str(ROOT)})
     assert done.returncode == 0, done.stderr
-    lines = [*map(json.loads, done.stdout.splitlines())]
-    assert len(lines) == 2
-    for counts in lines:
-        assert counts["MIXED"] == counts["LEFT"] == 0, done.stderr
-        assert counts["killed"] == counts["A"] + counts["B"] + counts["unfinished"] - 1 > 25
-        assert counts["A"] > 5 < counts["B"] and counts["unfinished"] and counts["runs after"] > 8
+    counts, last = json.loads(done.stdout)
+    assert last == "A" and counts.keys() <= {"A", "B", "unfinished"}
+    assert counts["unfinished"] > 5 and counts["A"] + counts.get("B", 0) > 5
+    assert (tmp_path / "out" / "problem4" / "notes.txt").read_bytes() == b"of the user"
+    assert hidden(tmp_path) == []
 
 
 @pytest.mark.slow
-def test_a_full_disk_is_told_and_leaves_the_old_results(tmp_path, drive):
+def test_a_full_disk_is_told_and_the_results_are_to_be_solved_again(tmp_path, drive):
     """A limit on the size of files fails like a full disk."""
     write_dataset(tmp_path / "drive", drive)
-    out = tmp_path / "out"
-    solve_to_folder(drive, None, out)
-    before = {name: (out / name).read_bytes() for name in swap.file_names(out)}
-    limit = len(before["problem3/vehiclePose.mat"]) - 1
     process = start(tmp_path, "solve", "drive", "--out", "out", code=(
-        f"import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, {limit}));"
+        "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096));"
         "from slamlib.__main__ import main; sys.exit(main())"))
     told = process.communicate(timeout=300)[1]
     assert process.returncode == 2 and told.count("slamlib: ") == 1
     assert os.strerror(errno.EFBIG) in told
-    assert {name: (out / name).read_bytes() for name in swap.file_names(out)} == before
+    with pytest.raises(DatasetError, match="summary.json: .* solve the dataset again"):
+        results.read_summary(tmp_path / "out")
 
 
-@pytest.mark.parametrize("spoil, reason", [
-    (lambda folder: (folder / "problem1").write_text("a file of the user"), "problem1"),
-    (lambda folder: swap.write_atomically(folder / "problem1" / "vehiclePose.mat" / "mine", b""),
-     "problem1/vehiclePose.mat"),
-])
-def test_what_cannot_be_put_in_its_place_is_told_before_anything_changes(
-        tmp_path, drive, capsys, spoil, reason):
+def test_where_nothing_can_be_written_is_told_before_anything_is_solved(
+        tmp_path, drive, monkeypatch, capsys):
+    write_dataset(tmp_path / "drive", drive)
+    (tmp_path / "file").write_text("mine")
+    os.mkfifo(tmp_path / "fifo")
+    monkeypatch.setattr(solve, "find", None)
+    for out in (tmp_path / "file", tmp_path / "fifo", tmp_path / "file" / "x", "/proc/x", "/proc"):
+        assert main(["solve", str(tmp_path / "drive"), "--out", str(out)]) == 2
+        told = capsys.readouterr().err.splitlines()[-1]
+        assert told.startswith(f"slamlib: {out}: expected a folder to write to")
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_what_stands_in_the_place_of_a_result_is_told_and_stays(tmp_path, drive, capsys):
     write_dataset(tmp_path / "drive", drive.without("uwb").without("aruco"))
-    (tmp_path / "out").mkdir()
-    spoil(tmp_path / "out")
-    (tmp_path / "out" / "summary.json").write_text("old")
-    assert main(["solve", str(tmp_path / "drive"), "--out", str(tmp_path / "out")]) == 2
-    told = capsys.readouterr().err
-    assert told.count("slamlib: ") == 1 and reason in told.splitlines()[-1]
-    assert (tmp_path / "out" / "summary.json").read_text() == "old"
-    assert hidden(tmp_path) == []
+    for name in ("problem1", "problem1/vehiclePose.mat"):
+        out = tmp_path / f"out of {name.count('/')}"
+        files.write_file(out / f"{name}/mine" if "/" in name else out / name, b"mine")
+        assert main(["solve", str(tmp_path / "drive"), "--out", str(out)]) == 2
+        told = capsys.readouterr().err
+        assert told.count("slamlib: ") == 1 and name in told.splitlines()[-1]
+        assert not (out / "summary.json").exists() and hidden(tmp_path) == []
 
 
 @pytest.mark.slow
@@ -185,30 +175,30 @@ def test_a_build_that_fails_changes_nothing_and_the_next_removes_what_is_no_long
     """What the user put there stays, and what was executed before the failure is kept."""
     make_data(tmp_path)
     options = {"datasets": ["short"], "kept": tmp_path / "kept", "jobs": 1}
-    write(tmp_path / "notebooks", "1_goes", "# Goes", (RESULT.replace("problem1", "other"),))
+    write(tmp_path / "notebooks", "1_goes", "# Goes", (RESULT.replace("problem1", "problem2"),))
     write(tmp_path / "notebooks", "2_stays", "# Stays", (RESULT,))
     build(tmp_path, **options)
     for name in ("report/notes.html", "results/short/notes.txt", "results/mine/vehiclePose.mat"):
-        swap.write_atomically(tmp_path / name, b"mine")
-    before = [swap.file_names(tmp_path / name) for name in ("report", "results")]
-    assert "short/other/vehiclePose.mat" in before[1]
+        files.write_file(tmp_path / name, b"mine")
+    before = [files.file_names(tmp_path / name) for name in ("report", "results")]
+    assert "short/problem2/vehiclePose.mat" in before[1]
     write(tmp_path / "notebooks", "1_goes", "# Goes", ("1 / 0",))  # one at a time, the last first
     write(tmp_path / "notebooks", "2_stays", "# Stays", (RESULT + "1 + 1",))
     old = tmp_path / "results" / "short" / "problem1" / "vehiclePose.mat"
     old.write_text("old")
     with pytest.raises(NotebookError):
         build(tmp_path, **options)
-    assert before == [swap.file_names(tmp_path / name) for name in ("report", "results")]
+    assert before == [files.file_names(tmp_path / name) for name in ("report", "results")]
     assert old.read_text() == "old" and hidden(tmp_path) == []
     (tmp_path / "notebooks" / "1_goes.ipynb").unlink()
     capsys.readouterr()
     build(tmp_path, **options)
     assert "2_stays: nothing changed" in capsys.readouterr().err
     assert len(results.read_structs(old.parent, "vehiclePose")[0]) == 2
-    assert [*map(swap.file_names, (tmp_path / "report", tmp_path / "results"))] == [
-        [swap.FILE_LIST, "2_stays.html", "index.html", "notes.html", "report.pdf"],
-        ["mine/vehiclePose.mat", "short/.slamlib.json", "short/notes.txt",
-         "short/problem1/vehiclePose.mat"]]
+    assert [*map(files.file_names, (tmp_path / "report", tmp_path / "results"))] == [
+        [".pages", "2_stays.html", "index.html", "notes.html", "report.pdf"],
+        ["mine/vehiclePose.mat", "short/notes.txt", "short/problem1/vehiclePose.mat",
+         "short/summary.json"]]
 
 
 @pytest.mark.slow
@@ -224,63 +214,24 @@ time.sleep(1000)""",))
     told = process.communicate(timeout=300)[1]
     assert process.returncode == 130
     assert told.splitlines()[-1] == "slamlib: ended by a signal" and "Traceback" not in told
-    assert swap.file_names(tmp_path / "results") == [] and hidden(tmp_path) == []
+    assert files.file_names(tmp_path / "results") == [] and hidden(tmp_path) == []
     assert not is_running(int(kernel.read_text()))
 
 
 @pytest.mark.parametrize("number", END_SIGNALS)
 def test_a_signal_ends_a_solve_in_order(tmp_path, drive, number):
-    """Both of its processes, while each solves a problem."""
     write_dataset(tmp_path / "drive", drive)
-    process = start(tmp_path, "solve", "drive", "--out", "out", code="""import os, sys, time
+    process = start(tmp_path, "solve", "drive", "--out", "out", code="""import sys, time
 from pathlib import Path
 from slamlib import solve
 from slamlib.__main__ import main
 def find(*_):
-    Path(f"of {os.getpid()}").touch()
+    Path("solves").touch()
     time.sleep(1000)
 solve.find = find
 sys.exit(main())""")
-    found = wait_for(lambda: len(of := [*tmp_path.glob("of *")]) == PROCESSES and of, process)
+    wait_for((tmp_path / "solves").exists, process)
     process.send_signal(number)
     out, told = process.communicate(timeout=300)
-    *lines, last = told.splitlines()
-    assert out == "" and last == "slamlib: ended by a signal"
-    assert all(line.startswith("drive: ") for line in lines)
-    assert process.returncode == 130 and not (tmp_path / "out").exists()
-    assert hidden(tmp_path) == []
-    assert not any(is_running(int(file.name.split()[1])) for file in found)
-
-
-@pytest.mark.skipif(PROCESSES < 2, reason="elsewhere one process solves all problems")
-def test_a_killed_solve_leaves_no_process_behind(tmp_path):
-    """Of the second one, whose results do not fit into the pipe to the first."""
-    write_dataset(tmp_path / "drive", simulate("short", seed=3)[0])
-    process = start(tmp_path, "solve", "drive", "--out", "out", code="""import os, sys, time
-from slamlib import solve
-from slamlib.__main__ import main
-find, first = solve.find, os.getpid()
-solve.find = lambda *given: time.sleep(1000) if os.getpid() == first else find(*given)
-sys.exit(main())""")
-    second = wait_for(psutil.Process(process.pid).children, process)
-    process.kill()
-    assert psutil.wait_procs(second, timeout=60)[1] == []
-    process.communicate()
-
-
-@pytest.mark.skipif(PROCESSES < 2, reason="elsewhere one process solves all problems")
-@pytest.mark.parametrize("fails", [
-    lambda *_: 1 / 0, lambda *_: os.kill(os.getpid(), signal.SIGKILL)])
-def test_a_process_takes_over_the_problems_of_one_that_fails(
-        tmp_path, drive, monkeypatch, capfd, fails):
-    expected = solve_to_folder(drive, None, tmp_path / "expected")
-    parent, find = os.getpid(), solve.find
-    monkeypatch.setattr(solve, "find", lambda *arguments: (
-        find if os.getpid() == parent else fails)(*arguments))
-    found = solve_to_folder(drive, None, tmp_path / "found")
-    for summary in (expected, found):
-        assert all(row.pop("seconds") >= 0 for row in summary["problems"].values())
-    assert found == expected and capfd.readouterr() == ("", "")
-    for name in swap.file_names(tmp_path / "expected"):
-        assert name.endswith(".json") or (tmp_path / "found" / name).read_bytes() \
-            == (tmp_path / "expected" / name).read_bytes()
+    assert out == "" and told.splitlines()[-1] == "slamlib: ended by a signal"
+    assert process.returncode == 130 and [*(tmp_path / "out").iterdir()] == []

@@ -15,7 +15,7 @@ from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 from slamlib.__main__ import main
 from slamlib.core.errors import DatasetError
 from slamlib.core.se2 import compose
-from slamlib.io import swap
+from slamlib.io.files import file_names, write_file
 from slamlib.report import NotebookError, build_report
 from slamlib.report.notebooks import Options, read_options
 from slamlib.studies.simulation import simulate, write_dataset
@@ -69,7 +69,7 @@ def built(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("JUPYTER_PATH", str(root))
         patch.setenv("MPLBACKEND", "agg")
-        swap.write_atomically(root / "results" / "short" / "old.mat", b"of an earlier run")
+        write_file(root / "results" / "short" / "old.mat", b"of an earlier run")
         return root, build(root, datasets=["short"])
 
 
@@ -83,21 +83,21 @@ def test_files_are_index_chapters_in_order_and_the_pdf(built):
     assert [page.name for page in pages] == ["index.html", "1_odometry.html", "2_other.html",
                                              "report.pdf"]
     assert sorted((root / "report").iterdir()) == sorted(
-        [*pages, root / "report" / swap.FILE_LIST])
+        [*pages, root / "report" / ".pages"])
     index = pages[0].read_text(encoding="utf-8")
     assert {"1_odometry.html", "2_other.html", "report.pdf"} <= {
         *re.findall(r'<a\s[^>]*href="([^"]*)"', index)}
     assert "<math" in index and "<title>1. Odometry</title>" in pages[1].read_text("utf-8")
-    assert swap.file_names(root / "results") == [
-        "long/.slamlib.json", "long/own/ArucoMap.mat", "short/.slamlib.json", "short/old.mat",
-        "short/own/ArucoMap.mat"]                                     # also if not selected
+    assert file_names(root / "results") == [
+        "long/own/ArucoMap.mat", "short/old.mat", "short/own/ArucoMap.mat",
+        "short/summary.json"]                                     # also if not selected
 
 
 def test_kernels_see_the_folders_and_what_is_printed_in_a_row_is_one_output(built):
     """However long it takes. Kernels run this interpreter."""
     root, pages = built
     text = pages[2].read_text(encoding="utf-8")
-    for value in (root / "data", root / ".results.new", sys.executable):
+    for value in (root / "data", sys.executable):
         assert str(value) in text
     assert '<pre class="stderr"><code>stderr is shown' in text
     assert re.search(r"\nshort\n?</code></pre>", text)
@@ -164,7 +164,7 @@ solved(start(), problem2=lambda drive: find("problem2", drive.dataset),
         told = capsys.readouterr().err.splitlines()
         good, bad = told.index("good: 50 poses"), told.index("bad: 50 poses")
         assert "ATE" in told[good + 1] and told[good + 2].startswith("problem2  ")
-        assert told[bad + 3].startswith("problem2       could not be solved: expected sightings")
+        assert told[bad + 2].startswith("problem2       could not be solved: expected sightings")
     assert "nothing changed" in " ".join(told)
     text = html.unescape((tmp_path / "report" / "index.html").read_text(encoding="utf-8"))
     assert re.search(r"Notes on the files of <em>bad</em>:.*\(7\.000 m, 0\.000 m, 0\.0000 rad\)",

@@ -10,11 +10,15 @@ from io import BytesIO
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.io import loadmat, savemat
 
+from slamlib import estimate, read_dataset, solve
 from slamlib.__main__ import main
+from slamlib.core.errors import DatasetError
 from slamlib.io import results
+from slamlib.io.vehicle import read_vehicle
 from slamlib.studies.simulation import simulate, write_dataset
 
 ABSENT = [np.nan] * 3
@@ -95,3 +99,92 @@ def test_evo_finds_the_errors_of_the_summary_in_what_solve_writes_as_text(tmp_pa
             found, = (float(line.split()[1]) for line in told.stdout.splitlines()
                       if line.split()[:1] == ["rmse"])
             assert np.isclose(found, rows[problem][key], rtol=0, atol=1e-6)  # evo: six digits
+
+
+@pytest.fixture(scope="module")
+def drive():
+    """A simulated drive of 100 poses, and its truth."""
+    dataset, truth = simulate("short", seed=3)
+    return dataset.first(100), replace(truth, poses=truth.poses[:100])
+
+
+def test_problems_that_are_written_one_by_one_have_one_summary(tmp_path, drive):
+    dataset, truth = drive
+    lost = DatasetError(f"{dataset.name}: expected more")
+    for problem, found in (("problem3", estimate(dataset.without("uwb"))), ("problem2", lost),
+                           ("problem1", solve.find("problem1", dataset))):
+        solve.write_results(tmp_path, problem, found, dataset, truth)
+    summary = results.read_summary(tmp_path)
+    assert [*summary["problems"]] == ["problem1", "problem2", "problem3"]
+    assert summary["problems"]["problem2"]["failed"] == "expected more"
+    expected = solve.solve_to_folder(dataset, truth, tmp_path / "all")["problems"]["problem3"]
+    expected.pop("seconds")
+    assert summary["problems"]["problem3"] == expected
+    for name in ("vehiclePose.mat", "ArucoMap.mat"):
+        assert (tmp_path / "problem3" / name).read_bytes() == (
+            tmp_path / "all" / "problem3" / name).read_bytes()
+
+
+def test_what_a_killed_run_left_is_removed_by_the_next_problem_that_is_written(tmp_path, drive):
+    solve.solve_to_folder(drive[0], None, tmp_path)
+    (tmp_path / "summary.json").unlink()
+    with pytest.raises(DatasetError, match="summary.json: .* solve the dataset again"):
+        results.read_summary(tmp_path)
+    solve.write_results(tmp_path, "problem1", solve.find("problem1", drive[0]), drive[0])
+    assert [path.parent.name for path in tmp_path.rglob("*.mat")] == ["problem1"]
+
+
+def test_doubts_of_a_solution_are_returned_and_in_the_summary(tmp_path, drive):
+    found = estimate(drive[0].without("uwb"), kernel="Huber")
+    written = solve.write_results(tmp_path, "problem3", found, drive[0])
+    options, = (doubt for doubt in written.doubts if doubt.what == "options")
+    told = results.read_summary(tmp_path)["doubts"]
+    assert {"what": "options", "sentence": options.sentence} in told
+
+
+def test_the_vehicle_as_estimated_can_be_taken_over(tmp_path):
+    """The camera is 10 cm ahead, and the file says 0."""
+    dataset, _ = simulate("short", seed=3)
+    seen = dataset.aruco.marker_in_vehicle - [0.1, 0, 0]
+    dataset = replace(dataset, aruco=replace(dataset.aruco, marker_in_vehicle=seen)).without("uwb")
+    write_dataset(tmp_path / "drive", dataset)
+    assert main(["solve", str(tmp_path / "drive"), "--out", str(tmp_path), "--problem", "3"]) == 0
+    vehicle = read_vehicle(tmp_path / "vehicle.toml")
+    row = results.read_summary(tmp_path)["problems"]["problem3"]
+    camera, = (entry for entry in row["calibration"] if entry["name"] == "camera_x")
+    assert (vehicle.camera_x, vehicle.sigma_camera_x) == (camera["estimate"], camera["sigma"])
+    assert abs(vehicle.camera_x - 0.1) < 0.02
+    assert vehicle.slip == row["slip_sqrt_m"]
+    assert (vehicle.wheelbase, vehicle.range_noise_factor) == (0.4, None)
+    (tmp_path / "vehicle.toml").rename(tmp_path / "drive" / "vehicle.toml")
+    assert read_dataset(tmp_path / "drive").vehicle == vehicle
+
+
+def test_where_all_is_stated_no_vehicle_is_written(tmp_path, drive):
+    known = replace(drive[0].vehicle, slip=1e-3, marker_noise_factor=1.0, range_noise_factor=1.0)
+    solve.solve_to_folder(replace(drive[0], vehicle=known), None, tmp_path, ["problem4"])
+    assert not (tmp_path / "vehicle.toml").exists()
+
+
+def test_several_drives_have_a_table_and_one_that_fails_does_not_stop_them(
+        tmp_path, drive, capfd):
+    for name, truth in (("with truth", drive[1]), ("without", None)):
+        write_dataset(tmp_path / name, drive[0], truth)
+    folders = [str(tmp_path / name) for name in ("with truth", "nowhere", "without")]
+    out = tmp_path / "out"
+    assert main(["solve", *folders, "--out", str(out), "-j", "2", "--problem", "3"]) == 2
+    told = capfd.readouterr()
+    assert "nowhere: expected a folder that can be read" in told.err
+    assert "with truth: 100 poses" in told.out and "without: 100 poses" in told.out
+    table = pd.read_csv(out / "drives.csv").set_index("dataset")
+    assert [*table.index] == ["with truth", "nowhere", "without"]
+    row = results.read_summary(out / "with truth")["problems"]["problem3"]
+    assert table.ate_m["with truth"] == row["ate_m"] and np.isnan(table.ate_m["without"])
+    assert table.nees["with truth"] == row["nees"] and table.seconds["without"] > 0
+    assert table.last_sigma_m["without"] == max(row["last_sigma"][:2])
+    assert table.failed.notna().tolist() == [False, True, False]
+
+
+def test_several_drives_of_the_same_name_are_refused(tmp_path, capsys):
+    assert main(["solve", "a/drive", "b/drive", "--out", str(tmp_path)]) == 2
+    assert "expected datasets in folders of different names" in capsys.readouterr().err

@@ -6,34 +6,34 @@ RGB-D benchmark that evo and others read. The measurements have no times, so the
 pose ids, from 1. Text files leave out poses without an estimate.
 """
 
+import json
 from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 from scipy.io import loadmat, savemat
 
-from slamlib.io import swap
+from slamlib.core.errors import DatasetError
+from slamlib.io.files import write_file
 
 SUMMARY = "summary.json"
 # Fields of the structs in each file: places, covariances and, of maps, ids.
 FIELDS = {"vehiclePose": ("pose", "covari"), "ArucoMap": ("pose", "covari", "id"),
           "UwbMap": ("position", "covariance", "id")}
 RESULT_FILES = tuple(f"{name}.mat" for name in FIELDS)  # of a problem's folder
+TEXT_FILES = tuple(f"{name}.csv" for name in FIELDS)
 _HEADER = b"MATLAB 5.0 MAT-file, written by slamlib".ljust(116)  # scipy's contains the date
 FIELD_HEADER = "V56"  # bytes before the numbers of a field of a struct
 SIZE_OFFSET = 132  # bytes, to the size of the array of structs
 COUNT_OFFSET = 164  # bytes, to its number of columns
 
 
-def write_solution(folder: Path | str, solution, text: bool = False) -> Path:
-    """Write the .mat files of a Solution into folder/<problem>/; returns that folder.
+def write_solution(folder: Path | str, solution, text: bool = False):
+    """Write the .mat files of a Solution into folder/<problem>/.
 
-    With `text` it writes CSV files beside them, too, and folder/<problem>.tum. A summary in
-    `folder` is removed, because it belongs to other files.
+    With `text` it writes CSV files beside them, too, and folder/<problem>.tum.
     """
-    folder = Path(folder)
-    (folder / SUMMARY).unlink(missing_ok=True)
-    own = folder / solution.problem
+    own = Path(folder) / solution.problem
     poses = (_pose_ids(solution.poses), solution.poses, solution.covariances)
     for name, each in zip(FIELDS, (poses, solution.aruco_map, solution.uwb_map)):
         if each is None:
@@ -44,7 +44,30 @@ def write_solution(folder: Path | str, solution, text: bool = False) -> Path:
             write_csv(own / f"{name}.csv", ids, places, covariances)
     if text:
         write_tum(own.with_suffix(".tum"), solution.poses)
-    return own
+
+
+def file_names(problem: str) -> list[str]:
+    """Names of all files that a problem may have in a results folder."""
+    return [f"{problem}.tum"] + [f"{problem}/{name}" for name in RESULT_FILES + TEXT_FILES]
+
+
+def write_summary(folder: Path | str, summary: dict):
+    """Write the summary of a results folder, which is whole from then on."""
+    text = json.dumps(summary, indent=2, ensure_ascii=False, allow_nan=False)
+    write_file(Path(folder) / SUMMARY, f"{text}\n".encode(errors="backslashreplace"))
+
+
+def read_summary(folder: Path | str) -> dict:
+    """Return the summary of a results folder.
+
+    Raises DatasetError if there is none, as of a run that was killed or has not ended.
+    """
+    path = Path(folder) / SUMMARY
+    try:
+        return json.loads(path.read_bytes())
+    except (OSError, ValueError):
+        raise DatasetError(f"{path}: expected this file, which ends a run, found none that can be "
+                           "read: solve the dataset again") from None
 
 
 def _pose_ids(poses):
@@ -106,7 +129,7 @@ def write_structs(folder: Path | str, name: str, ids: np.ndarray | None, places:
     columns = np.frombuffer(content, "=i4", 1, COUNT_OFFSET)
     columns[:] = count
     before = content[:-layout.itemsize]
-    swap.write_atomically(Path(folder) / f"{name}.mat", before + structs.tobytes())
+    write_file(Path(folder) / f"{name}.mat", before + structs.tobytes())
 
 
 def write_tum(path: Path | str, poses: np.ndarray):
@@ -142,4 +165,4 @@ def _write_text(path, ids, numbers, delimiter, header=""):
     text = BytesIO()
     np.savetxt(text, rows[known], header=header, comments="", delimiter=delimiter,
                fmt=["%d"] + numbers.shape[1] * ["%.17g"])
-    swap.write_atomically(Path(path), text.getvalue())
+    write_file(Path(path), text.getvalue())

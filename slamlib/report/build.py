@@ -1,18 +1,19 @@
 """Builds the report: executes the notebooks, which become pages and the chapters of a PDF."""
 
-import os
 import re
 import shutil
 import sys
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from slamlib.core.errors import require
-from slamlib.io import swap
+from slamlib.io import files
 from slamlib.io.dataset import inventory_lines, read_dataset, read_truth
+from slamlib.io.results import write_summary
 from slamlib.io.tables import datasets_in
 from slamlib.notebook import notices
 from slamlib.report import cache
@@ -20,8 +21,9 @@ from slamlib.report.document import render
 from slamlib.report.execution import STUDIES, TRANSPORT, execute, kernel_environment
 from slamlib.report.notebooks import Options, chapter_of, read_books
 from slamlib.report.overview import SolvedDrive, opening, read_drives, title_picture
-from slamlib.solve import RESULT_NAMES, SENSORS
+from slamlib.solve import SENSORS, clear_results, summary_of, summary_row
 
+PAGES = ".pages"  # name of the file in a report that lists its files; all others are the user's
 DATASET_NAME = re.compile("[A-Za-z0-9 ._-]+")  # nothing that Markdown, HTML or Typst interprets
 
 
@@ -67,20 +69,14 @@ def build_report(notebooks: Path, data: Path, report: Path, results: Path,
         environment = kernel_environment(Path(temporary), data, datasets, kept / STUDIES)
         folders = [data / dataset.name for dataset, _ in read]
         keys = partial(cache.keys, books, folders, environment | {"SLAMLIB_RESULTS": str(results)})
-        with (swap.locked(kept), swap.staging(results) as stage, swap.staging(report) as pages):
+        stage = Path(temporary, "results")
+        with files.locked(kept), files.locked(results), files.locked(report):
             written = _executed(books, keys, environment, jobs, stage, kept, fresh)
             print("setting the pages and the PDF", file=sys.stderr)
             drives = read_drives(read, stage, written, notices(books.values()))
             made = _rendered(drives, books, options)
-            for name, content in made.items():
-                swap.write_atomically(pages / name, content)
-            of_datasets = {dataset.name for dataset, _ in read}
-            of_datasets |= {name.split("/")[0] for name in written if "/" in name}
-            new = {results / name: stage / name for name in of_datasets}
-            swap.publish({report: pages} | new, ours=RESULT_NAMES)
-            for name in written:
-                if "/" not in name:  # of no dataset
-                    os.replace(stage / name, results / name)
+            _write_results(drives, stage, written, results)
+            _write_pages(made, report)
     print(f"built in {time.monotonic() - start:.1f} s", file=sys.stderr)
     return Report([report / name for name in made], drives)
 
@@ -135,6 +131,41 @@ def _executed(books, keys, environment, jobs, stage, kept, fresh):
         shutil.rmtree(kept / STUDIES, ignore_errors=True)
     execute(left, environment, stage, max(1, jobs), finish)
     return sorted(written)
+
+
+def _write_results(drives, stage, written, results):
+    """Write files from the folder `stage` to the results, and the summary of each SolvedDrive."""
+    for drive in drives:
+        folder = results / drive.name
+        rows = {each.problem: summary_row(each, drive.truth)
+                for each in drive.solutions + drive.failures}
+        with files.locked(folder):
+            clear_results(folder)
+            for name in drive.files:
+                _copy(f"{drive.name}/{name}", stage, results)
+            summary = summary_of(drive.dataset, drive.truth, rows, drive.doubts)
+            write_summary(folder, summary)
+    names = {drive.name for drive in drives}
+    for name in written:
+        if name.split("/")[0] not in names:
+            _copy(name, stage, results)
+
+
+def _copy(name, source, target):
+    files.write_file(target / name, (source / name).read_bytes())
+
+
+def _write_pages(made, report):
+    """Write pages, {name: bytes}, and remove those of an earlier build that are not made now."""
+    listed = report / PAGES
+    earlier = set()
+    with suppress(OSError):
+        earlier = set(listed.read_text(encoding="utf-8").splitlines())
+    for name, content in made.items():
+        files.write_file(report / name, content)
+    for name in earlier - made.keys():
+        (report / name).unlink(missing_ok=True)
+    files.write_file(listed, "\n".join(made).encode())
 
 
 def _rendered(drives, books, options):

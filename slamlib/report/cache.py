@@ -16,7 +16,7 @@ from pathlib import Path
 import joblib
 from nbformat import NotebookNode
 
-from slamlib.io import swap
+from slamlib.io.files import write_file
 from slamlib.report.execution import LAB_ONLY, Books
 from slamlib.report.notebooks import tags_of
 from slamlib.studies import runs as memory
@@ -82,7 +82,7 @@ def recall(folder: Path, source: Path, key: str, book: NotebookNode, results: Pa
         cell.outputs = outputs
         cell.execution_count = count
     for name, content in contents.items():
-        swap.write_atomically(results / name, content)
+        write_file(results / name, content)
     path.touch()
     return list(contents)
 
@@ -96,7 +96,7 @@ def keep(folder: Path, source: Path, key: str, book: NotebookNode, results: Path
     contents = {name: (results / name).read_bytes() for name in names}
     file = BytesIO()
     joblib.dump([executed, contents], file, compress=1)  # with a checksum
-    swap.write_atomically(folder / f"{source.stem}.{key}.executed", file.getvalue())
+    write_file(folder / f"{source.stem}.{key}.executed", file.getvalue())
     versions = [path for path in folder.glob("*.executed")
                 if path.name.rsplit(".", 2)[0] == source.stem]
     versions.sort(key=lambda path: path.stat().st_mtime_ns)

@@ -25,7 +25,7 @@ from nbformat import NotebookNode
 from tqdm import tqdm
 
 from slamlib.core.errors import require
-from slamlib.io import swap
+from slamlib.io.files import file_names
 from slamlib.studies.runs import ONE_THREAD
 
 CELL_TIMEOUT = 1800  # s, in which a cell must end
@@ -107,7 +107,7 @@ async def _execute_all(books, environment, results, jobs, finish):
 
 def _moved(stage, results):
     """Move all files from a folder to another one; return their names (list of str)."""
-    names = swap.file_names(stage)
+    names = file_names(stage)
     for name in names:
         (results / name).parent.mkdir(parents=True, exist_ok=True)
         os.replace(stage / name, results / name)

@@ -13,9 +13,9 @@ from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 import numpy as np
 from jinja2 import Template
 
-from slamlib.io import swap
+from slamlib.io import files
 from slamlib.io.dataset import all_notes, read_dataset, read_truth
-from slamlib.io.results import RESULT_FILES
+from slamlib.io.results import RESULT_FILES, read_summary
 from slamlib.io.tables import datasets_in
 from slamlib.notebook import Drive
 from slamlib.report.build import Report
@@ -57,21 +57,24 @@ def write_zip(path: Path, report: Report, results: Path, options: Options,
               omitted: Sequence[str] = ()):
     """Write the zip of a Report to `path`; equal input gives equal bytes.
 
-    `results` is the folder of its files, `omitted` what `selection` left out.
+    `results` is the folder of its files, `omitted` what `selection` left out. Raises DatasetError
+    if the results of a drive have no summary.json: the run that wrote there did not end.
     """
     contents = {"report.pdf": report.files[-1].read_bytes(),
                 "README.txt": readme(report.drives, options, omitted).encode()}
-    with swap.staging(results):                         # no build replaces them meanwhile
-        for drive in report.drives:
+    for drive in report.drives:
+        folder = results / drive.name
+        with files.locked(folder):                      # no other run replaces them meanwhile
+            read_summary(folder)
             for name, file in handed_in(drive, options.problem2).items():
-                contents[f"{drive.name}/{name}"] = (results / drive.name / file).read_bytes()
+                contents[f"{drive.name}/{name}"] = (folder / file).read_bytes()
     archive = BytesIO()
     with ZipFile(archive, "w") as file:
         for name, content in sorted(contents.items()):
             entry = ZipInfo(name)  # of 1980, which begins time in a zip: equal bytes on every day
             entry.external_attr = 0o644 << 16
             file.writestr(entry, content, ZIP_DEFLATED)
-    swap.write_atomically(path, archive.getvalue())
+    files.write_file(path, archive.getvalue())
 
 
 def handed_in(drive: SolvedDrive, problem2: str) -> dict[str, str]:

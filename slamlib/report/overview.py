@@ -20,8 +20,8 @@ from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_outp
 from slamlib.core import evaluation, marker_increments
 from slamlib.core.records import Dataset, Truth
 from slamlib.io.dataset import all_notes
+from slamlib.io.files import file_names
 from slamlib.io.results import read_structs
-from slamlib.io.swap import file_names
 from slamlib.notebook import Drive, accuracy, plotting, table
 from slamlib.notebook.drives import plain
 from slamlib.report.execution import Books, NotebookError

@@ -1,0 +1,58 @@
+"""Files of results and pages: each is written whole, by one process at a time in a folder."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from slamlib.core.errors import DatasetError
+
+LOCK = ".slamlib.lock"  # name of the file in a folder whose holder writes there
+LOCK_TIME = 60.0  # s, after which a process no longer waits for another one
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Hold the lock of a folder, which is made if there is none.
+
+    Raises DatasetError if nothing can be written there, or another process holds the lock for
+    LOCK_TIME. The system releases it when the process that holds it ends.
+    """
+    file = folder / LOCK
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        file.touch()
+    except OSError as error:
+        reason = error.strerror
+        raise DatasetError(f"{folder}: expected a folder to write to ({reason})") from None
+    lock = FileLock(file)
+    try:
+        lock.acquire(timeout=LOCK_TIME)
+    except Timeout:
+        raise DatasetError(f"{folder}: expected no other run that writes here, and one did for "
+                           f"{LOCK_TIME:g} s: try again when it has ended") from None
+    try:
+        yield
+    finally:
+        with suppress(OSError):  # Windows removes no open file
+            file.unlink()
+        lock.release()
+
+
+def write_file(path: Path, content: bytes):
+    """Write a file; a reader finds the old file or the whole new one, never a part."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.name}.part")
+    try:
+        part.write_bytes(content)
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def file_names(folder: Path) -> list[str]:
+    """Sorted names of all files in a folder, relative to it."""
+    paths = [path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir()]
+    return sorted(path.relative_to(folder).as_posix() for path in paths)
