@@ -166,8 +166,8 @@ def _build(options):
         return _ended(1, error)
     if not shown.author:
         print("report.toml names no author: the PDF's title page has none", file=sys.stderr)
-    for drive in report.drives:
-        print(summary_table(read_summary(options.results / drive.name)), file=sys.stderr)
+    summaries = [read_summary(options.results / drive.name) for drive in report.drives]
+    print("\n".join(summary_lines(summaries)), file=sys.stderr)
     if options.out:
         handin.write_zip(options.out, report, options.results, shown, omitted)
         print(f"hand-in: {options.out.resolve()}", file=sys.stderr)
@@ -182,27 +182,23 @@ def _name_in(data, dataset):
     return path.name if path.resolve().parent == data.resolve() else dataset
 
 
-def summary_table(summary: dict) -> str:
-    """The summary as a table, a line for each problem, and sentences on doubts below it."""
-    lines = [f"{summary['dataset']}: {summary['poses']} poses",
-             f"problem{'estimates':>18}{'last x, y, heading':>29}{'their sigmas':>28}{'ATE':>11}"]
-    for name, row in summary["problems"].items():
-        if "failed" in row:
-            lines.append(f"{name:15}could not be solved: {row['failed']}")
-            continue
-        x, y, heading = row["last_pose"]
-        sigma_x, sigma_y, sigma_heading = row["last_sigma"]
-        ate = f"{row['ate_m']:.4f} m" if "ate_m" in row else "-"
-        lines.append(
-            f"{name:15}{row['estimated_poses']:10}{x:8.3f} m {y:8.3f} m {heading:7.4f}  "
-            f"{sigma_x:7.4f} m {sigma_y:7.4f} m {sigma_heading:6.4f}{ate:>11}")
-        if row.get("unconfirmed"):
-            once = ", ".join(map(str, row["unconfirmed"]))
-            lines.append(
-                f"{'':15}nothing confirms markers {once}: seen once, or where another one is")
-    for doubt in summary["doubts"]:
-        lines.append(f"doubt ({doubt['what']}): {doubt['sentence']}")
-    return "\n".join(lines)
+def summary_lines(summaries: list[dict]) -> list[str]:
+    """The summaries of drives as lines: a table, then what failed, is not confirmed or in doubt."""
+    from slamlib.solve import drive_table
+    table = drive_table(summaries).drop(columns="failed").dropna(axis=1, how="all")
+    lines = table.to_string(index=False, na_rep="-", float_format="{:.4g}".format).splitlines()
+    for summary in summaries:
+        told = []
+        for problem, row in summary["problems"].items():
+            if "failed" in row:
+                told.append(f"{problem} could not be solved: {row['failed']}")
+            if row.get("unconfirmed"):
+                once = ", ".join(map(str, row["unconfirmed"]))
+                told.append(f"{problem}: nothing confirms markers {once}: seen once, or where "
+                            "another one is")
+        told += [f"doubt ({doubt['what']}): {doubt['sentence']}" for doubt in summary["doubts"]]
+        lines += [f"{summary['dataset']}: {each}" for each in told]
+    return lines
 
 
 def _solve(options):
@@ -220,23 +216,18 @@ def _solve(options):
         summaries = solve_folders(options.folders, options.out, options.jobs, **how)
     else:
         summaries = [solve_folder(options.folders[0], options.out, **how)]
-    codes = [_told(summary) for summary in summaries]
+    print("\n".join(summary_lines(summaries)))
+    errors = [_ended(2, summary["error"]) for summary in summaries if "error" in summary]
     print(f"results: {options.out.resolve()}", file=sys.stderr)
-    if options.plot and any("failed" not in row for row in summaries[0]["problems"].values()):
+    failed = ["failed" in row for summary in summaries for row in summary["problems"].values()]
+    if options.plot and not all(failed):
         from slamlib.io.dataset import read_dataset, read_truth
         from slamlib.report.overview import result_picture
         drive = options.folders[0]
         result_picture(read_dataset(drive), read_truth(drive), options.out, options.plot)
         print(f"picture: {options.plot.resolve()}", file=sys.stderr)
-    return 2 if 2 in codes else max(codes)
-
-
-def _told(summary):
-    """The exit code of a summary, after its table or the error was printed."""
-    if "error" in summary:
-        return _ended(2, summary["error"])
-    print(summary_table(summary))
-    failed = ["failed" in row for row in summary["problems"].values()]
+    if errors:
+        return 2
     return 3 if any(failed) else 0
 
 

@@ -5,7 +5,6 @@ plain numbers. `solve_to_folder` does so for all problems of a dataset, `solve_f
 datasets.
 """
 
-import csv
 import json
 import logging
 import sys
@@ -13,18 +12,18 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
-from io import StringIO
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 from joblib import Parallel, delayed
 
 from slamlib import estimate, fuse, fuse_increments, localize
 from slamlib.core import evaluation, odometry, se2
 from slamlib.core.errors import DatasetError, require
 from slamlib.core.records import Dataset, Truth
-from slamlib.core.vehicle import TABLE_2, VEHICLE_LIMITS, changed
+from slamlib.core.vehicle import TABLE_2, Vehicle, changed
 from slamlib.io import files, results
 from slamlib.io.dataset import all_notes, inventory_lines, read_dataset, read_truth
 from slamlib.robust.file_doubts import Doubt, doubts_before_solving, merged
@@ -58,8 +57,8 @@ TRUTH = "truth.tum"
 NOISE = {"slip": "slip_sqrt_m", "marker_noise_factor": "marker_noise_factor",
          "range_noise_factor": "range_noise_factor"}    # entries of vehicle.toml, keys of facts
 DRIVES = "drives.csv"                               # the table over all drives, and its columns
-COLUMNS = ("dataset", "problem", "poses", "ate_m", "ate_aligned_m", "nees", "last_sigma_m",
-           "slip_sqrt_m", "doubts", "seconds", "failed")
+COLUMNS = ["dataset", "problem", "poses", "ate_m", "ate_aligned_m", "nees", "last_sigma_m",
+           "slip_sqrt_m", "doubts", "seconds", "failed"]
 
 
 def title(problem: str, dataset: Dataset) -> str:
@@ -330,7 +329,7 @@ def _write(out, dataset, truth, solved, others, text):
             results.write_solution(out, each, text)
     if text and truth is not None:
         results.write_tum(out / TRUTH, truth.poses)
-    write_estimated_vehicle(out / VEHICLE_ESTIMATED, dataset, rows)
+    write_estimated_vehicle(out / VEHICLE_ESTIMATED, dataset.vehicle, rows)
     results.write_summary(out, summary)
     return summary
 
@@ -369,35 +368,31 @@ def summary_row(solved: Solution | Failure, truth: Truth | None) -> dict:
     return row | summarize(solved, truth)
 
 
-def write_estimated_vehicle(path: Path, dataset: Dataset, rows: dict):
-    """Write what a drive says of its vehicle as a vehicle.toml, if that is not what is stated.
+def write_estimated_vehicle(path: Path, vehicle: Vehicle, rows: dict):
+    """Write what a drive says of its Vehicle as a vehicle.toml, if that is not what is stated.
 
     It has all that is stated, the calibration that was released from it and the noise that was
     learned, of the last problem in the `rows` of a summary that estimates them.
     """
-    solved = [row for row in rows.values() if "calibration" in row]
-    if not solved:
-        return
     estimated = {}
-    for entry in solved[-1]["calibration"]:
-        if entry["released"]:
-            estimated[entry["name"]] = entry["estimate"]
-            estimated[f"sigma_{entry['name']}"] = entry["sigma"]
-    for name, fact in NOISE.items():
-        if getattr(dataset.vehicle, name) is None:
-            estimated[name] = solved[-1].get(fact)
-    estimated = {name: value for name, value in estimated.items()
-                 if value is not None and name in VEHICLE_LIMITS}
-    vehicle = changed(dataset.vehicle, estimated, path)
-    lines = [f"# The vehicle of {json.dumps(dataset.name)} as this drive says: in the folder of "
-             "the dataset it is taken as stated."]
-    for name, value in vars(vehicle).items():
+    for row in rows.values():
+        for entry in row.get("calibration", ()):
+            name = entry["name"]
+            if entry["released"] and hasattr(vehicle, name):
+                estimated[name] = entry["estimate"]
+                estimated[f"sigma_{name}"] = entry["sigma"]
+        if "calibration" in row:
+            estimated |= {name: row[fact] for name, fact in NOISE.items()
+                          if fact in row and getattr(vehicle, name) is None}
+    if not estimated:
+        return
+    lines = ["# Of the vehicle: what is stated, and what this drive says, which is taken as "
+             "stated in the dataset's folder."]
+    for name, value in (vars(vehicle) | estimated).items():
         if value != getattr(TABLE_2, name):
-            told_by = "  # estimated" if name in estimated else ""
-            lines.append(f"{name} = {json.dumps(value)}{told_by}")
-    if estimated:
-        text = "\n".join(lines)
-        files.write_file(path, f"{text}\n".encode())
+            lines.append(f"{name} = {json.dumps(value)}")
+    text = "\n".join(lines)
+    files.write_file(path, f"{text}\n".encode())
 
 
 def solve_folder(folder: Path | str, out: Path | str, problems: Sequence[str] = (),
@@ -457,11 +452,7 @@ def solve_folders(folders: Sequence[Path | str], out: Path | str, jobs: int | No
         solve = delayed(_summary_or_error)
         summaries = Parallel(n_jobs=jobs)(
             solve(folder, out / name, options) for folder, name in zip(folders, names))
-        table = StringIO()
-        writer = csv.DictWriter(table, COLUMNS, extrasaction="ignore", lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(row for summary in summaries for row in drive_rows(summary))
-        files.write_file(out / DRIVES, table.getvalue().encode())
+        files.write_file(out / DRIVES, drive_table(summaries).to_csv(index=False).encode())
     return summaries
 
 
@@ -473,17 +464,23 @@ def _summary_or_error(folder, out, options):
         return {"dataset": out.name, "error": str(error), "doubts": [], "problems": {}}
 
 
-def drive_rows(summary: dict) -> Iterator[dict]:
-    """Rows of the table over all drives of a summary, one for each problem (dict by COLUMNS)."""
-    drive = {"dataset": summary["dataset"]}
-    if "error" in summary:
-        yield drive | {"failed": summary["error"]}
-    for problem, row in summary["problems"].items():
-        found = drive | row | {"problem": problem, "doubts": len(row["doubts"])}
-        if "last_sigma" in row:
-            found["poses"] = row["estimated_poses"]
-            found["last_sigma_m"] = max(row["last_sigma"][:2])
-        yield found
+def drive_table(summaries: Sequence[dict]) -> pd.DataFrame:
+    """The table over all drives, of `solve_folders`: a row for each problem, with COLUMNS.
+
+    A problem or a drive that failed has a sentence; what is not known is NaN.
+    """
+    rows = []
+    for summary in summaries:
+        dataset = summary["dataset"]
+        if "error" in summary:
+            rows.append({"dataset": dataset, "failed": summary["error"]})
+        for problem, row in summary["problems"].items():
+            found = {"dataset": dataset, "problem": problem, "doubts": len(row["doubts"])}
+            if "last_sigma" in row:
+                found["poses"] = row["estimated_poses"]
+                found["last_sigma_m"] = max(row["last_sigma"][:2])
+            rows.append(row | found)
+    return pd.DataFrame(rows, columns=COLUMNS)
 
 
 def summarize(solution: Solution, truth: Truth | None) -> dict:

@@ -28,8 +28,8 @@ SIZE_OFFSET = 132  # bytes, to the size of the array of structs
 COUNT_OFFSET = 164  # bytes, to its number of columns
 
 
-def write_solution(folder: Path | str, solution, text: bool = False):
-    """Write the .mat files of a Solution into folder/<problem>/.
+def write_solution(folder: Path | str, solution, text: bool = False) -> Path:
+    """Write the .mat files of a Solution into folder/<problem>/; returns that folder.
 
     With `text` it writes CSV files beside them, too, and folder/<problem>.tum.
     """
@@ -44,6 +44,7 @@ def write_solution(folder: Path | str, solution, text: bool = False):
             write_csv(own / f"{name}.csv", ids, places, covariances)
     if text:
         write_tum(own.with_suffix(".tum"), solution.poses)
+    return own
 
 
 def file_names(problem: str) -> list[str]:
