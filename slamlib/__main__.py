@@ -95,7 +95,8 @@ def _add_options_of_a_build(command):
     _add_path(command, "--results", "folder for the .mat files", "results")
     add = command.add_argument
     add("datasets", nargs="*", metavar="DATASET",
-        help="names of folders in data/ (all of them when none is named)")
+        help="names of folders in data/ (all of them when none is named, but simulated ones where "
+        "there are others)")
     add("--jobs", type=int, default=2, help="notebooks executed at a time")
     add("--fresh", action="store_true",
         help="execute all notebooks and studies, also where nothing changed")
@@ -153,11 +154,9 @@ def _build(options):
         require(options.results.resolve() != other.resolve(), options.results,
                 "another folder for the results: this one is for the datasets or the pages")
     datasets = [_name_in(options.data, each) for each in options.datasets] or None
-    omitted = ()
     if options.out:
         require(not options.out.is_dir(), options.out, "a file to write, found a folder")
         shown = handin.hand_in_options(shown)
-        datasets, omitted = handin.selection(options.data, datasets)
     try:
         report = build_report(
             notebooks, options.data, options.report, options.results, datasets=datasets,
@@ -169,7 +168,7 @@ def _build(options):
     summaries = [read_summary(options.results / drive.name) for drive in report.drives]
     print("\n".join(summary_lines(summaries)), file=sys.stderr)
     if options.out:
-        handin.write_zip(options.out, report, options.results, shown, omitted)
+        handin.write_zip(options.out, report, options.results, shown)
         print(f"hand-in: {options.out.resolve()}", file=sys.stderr)
     else:
         print(f"report: {report.files[0]} and {report.files[-1]}", file=sys.stderr)
@@ -185,7 +184,7 @@ def _name_in(data, dataset):
 def summary_lines(summaries: list[dict]) -> list[str]:
     """The summaries of drives as lines: a table, then what failed, is not confirmed or in doubt."""
     from slamlib.solve import drive_table
-    table = drive_table(summaries).drop(columns="failed").dropna(axis=1, how="all")
+    table = drive_table(summaries).drop(columns=["seconds", "failed"]).dropna(axis=1, how="all")
     lines = table.to_string(index=False, na_rep="-", float_format="{:.4g}".format).splitlines()
     for summary in summaries:
         told = []

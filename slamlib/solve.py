@@ -329,7 +329,7 @@ def _write(out, dataset, truth, solved, others, text):
             results.write_solution(out, each, text)
     if text and truth is not None:
         results.write_tum(out / TRUTH, truth.poses)
-    write_estimated_vehicle(out / VEHICLE_ESTIMATED, dataset.vehicle, rows)
+    write_estimated_vehicle(out / VEHICLE_ESTIMATED, dataset.vehicle, summary["problems"])
     results.write_summary(out, summary)
     return summary
 
@@ -353,7 +353,7 @@ def summary_of(dataset: Dataset, truth: Truth | None, rows: dict, doubts: list[D
     doubts = list(doubts)
     problems = {problem: rows[problem] for problem in PROBLEMS if problem in rows}
     for row in problems.values():
-        doubts += [Doubt(**doubt) for doubt in row["doubts"]]
+        doubts += [Doubt(**doubt) for doubt in row.get("doubts", ())]
     return {"dataset": dataset.name, "poses": len(dataset.ticks), "kernel": dataset.vehicle.kernel,
             "doubts": [asdict(doubt) for doubt in merged(doubts)],
             "notes": all_notes(dataset, truth), "problems": problems}
@@ -374,16 +374,19 @@ def write_estimated_vehicle(path: Path, vehicle: Vehicle, rows: dict):
     It has all that is stated, the calibration that was released from it and the noise that was
     learned, of the last problem in the `rows` of a summary that estimates them.
     """
-    estimated = {}
+    learned = {}
     for row in rows.values():
-        for entry in row.get("calibration", ()):
-            name = entry["name"]
-            if entry["released"] and hasattr(vehicle, name):
-                estimated[name] = entry["estimate"]
-                estimated[f"sigma_{name}"] = entry["sigma"]
         if "calibration" in row:
-            estimated |= {name: row[fact] for name, fact in NOISE.items()
-                          if fact in row and getattr(vehicle, name) is None}
+            learned = row
+    estimated = {}
+    for entry in learned.get("calibration", ()):
+        name = entry["name"]
+        if entry["released"] and hasattr(vehicle, name):
+            estimated[name] = entry["estimate"]
+            estimated[f"sigma_{name}"] = entry["sigma"]
+    for name, fact in NOISE.items():
+        if fact in learned and getattr(vehicle, name) is None:
+            estimated[name] = learned[fact]
     if not estimated:
         return
     lines = ["# Of the vehicle: what is stated, and what this drive says, which is taken as "
@@ -432,7 +435,7 @@ def solve_folders(folders: Sequence[Path | str], out: Path | str, jobs: int | No
     """Solve each of several datasets into out/<name>, and write the table out/drives.csv.
 
     One that cannot be read or written does not stop the others: its summary has the entry "error",
-    a sentence, and no problems.
+    a sentence, and no problems. Files among the folders, as data/* names them, are left out.
 
     Parameters
     ----------
@@ -445,9 +448,10 @@ def solve_folders(folders: Sequence[Path | str], out: Path | str, jobs: int | No
     The summaries of the datasets, in their order.
     """
     out = Path(out)
-    names = [Path(folder).absolute().name for folder in folders]
-    require(len(set(names)) == len(names), out, "datasets in folders of different names, because "
-            f"results have these names, found {', '.join(names)}")
+    folders = [folder for folder in map(Path, folders) if not folder.is_file()]
+    names = [folder.absolute().name for folder in folders]
+    require(len(set(names)) == len(names), out, "datasets in folders of different names, as which "
+            f"their results are written, found {', '.join(names)}")
     with files.locked(out):
         solve = delayed(_summary_or_error)
         summaries = Parallel(n_jobs=jobs)(

@@ -163,5 +163,6 @@ def report_on_all(tmp_path_factory, kept):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SLAMLIB_SEEDS", STUDY_SEEDS)
         built_elsewhere(folder / "notebooks", data, folder / "report", folder / "results",
+                        datasets=[each.name for each in data.iterdir() if each.is_dir()],
                         kept=kept)
     return folder

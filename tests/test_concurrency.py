@@ -1,6 +1,5 @@
 """Runs that meet, are killed, or find a full disk: results are those of one run, or say so."""
 
-import errno
 import json
 import os
 import signal
@@ -8,6 +7,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 
 import pytest
 from conftest import ROOT, is_running
@@ -131,20 +131,6 @@ def test_a_kill_at_any_moment_leaves_the_results_of_one_run_or_no_summary(tmp_pa
     assert hidden(tmp_path) == []
 
 
-@pytest.mark.slow
-def test_a_full_disk_is_told_and_the_results_are_to_be_solved_again(tmp_path, drive):
-    """A limit on the size of files fails like a full disk."""
-    write_dataset(tmp_path / "drive", drive)
-    process = start(tmp_path, "solve", "drive", "--out", "out", code=(
-        "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096));"
-        "from slamlib.__main__ import main; sys.exit(main())"))
-    told = process.communicate(timeout=300)[1]
-    assert process.returncode == 2 and told.count("slamlib: ") == 1
-    assert os.strerror(errno.EFBIG) in told
-    with pytest.raises(DatasetError, match="summary.json: .* solve the dataset again"):
-        results.read_summary(tmp_path / "out")
-
-
 def test_where_nothing_can_be_written_is_told_before_anything_is_solved(
         tmp_path, drive, monkeypatch, capsys):
     write_dataset(tmp_path / "drive", drive)
@@ -160,45 +146,51 @@ def test_where_nothing_can_be_written_is_told_before_anything_is_solved(
 
 def test_what_stands_in_the_place_of_a_result_is_told_and_stays(tmp_path, drive, capsys):
     write_dataset(tmp_path / "drive", drive.without("uwb").without("aruco"))
-    for name in ("problem1", "problem1/vehiclePose.mat"):
-        out = tmp_path / f"out of {name.count('/')}"
-        files.write_file(out / f"{name}/mine" if "/" in name else out / name, b"mine")
-        assert main(["solve", str(tmp_path / "drive"), "--out", str(out)]) == 2
-        told = capsys.readouterr().err
-        assert told.count("slamlib: ") == 1 and name in told.splitlines()[-1]
-        assert not (out / "summary.json").exists() and hidden(tmp_path) == []
+    mine = tmp_path / "out" / "problem1" / "vehiclePose.mat" / "mine"
+    files.write_file(mine, b"mine")
+    assert main(["solve", str(tmp_path / "drive"), "--out", str(tmp_path / "out")]) == 2
+    told = capsys.readouterr().err
+    assert told.count("slamlib: ") == 1 and "problem1/vehiclePose.mat" in told.splitlines()[-1]
+    assert files.file_names(tmp_path / "out") == ["problem1/vehiclePose.mat/mine"]
+    with pytest.raises(DatasetError, match="summary.json: .* solve the dataset again"):
+        results.read_summary(tmp_path / "out")
+
+
+@pytest.fixture
+def rebuilt(tmp_path):
+    """A folder with a report on two notebooks and files of the user, and what builds it again."""
+    make_data(tmp_path)
+    write(tmp_path / "notebooks", "1_goes", "# Goes", (RESULT.replace("problem1", "problem2"),))
+    write(tmp_path / "notebooks", "2_stays", "# Stays", (RESULT,))
+    again = partial(build, tmp_path, datasets=["short"], kept=tmp_path / "kept", jobs=1)
+    again()
+    for name in ("report/notes.html", "results/short/notes.txt", "results/mine/vehiclePose.mat"):
+        files.write_file(tmp_path / name, b"mine")
+    return tmp_path, again
 
 
 @pytest.mark.slow
-def test_a_build_that_fails_changes_nothing_and_the_next_removes_what_is_no_longer_made(
-        tmp_path, capsys):
-    """What the user put there stays, and what was executed before the failure is kept."""
-    make_data(tmp_path)
-    options = {"datasets": ["short"], "kept": tmp_path / "kept", "jobs": 1}
-    write(tmp_path / "notebooks", "1_goes", "# Goes", (RESULT.replace("problem1", "problem2"),))
-    write(tmp_path / "notebooks", "2_stays", "# Stays", (RESULT,))
-    build(tmp_path, **options)
-    for name in ("report/notes.html", "results/short/notes.txt", "results/mine/vehiclePose.mat"):
-        files.write_file(tmp_path / name, b"mine")
-    before = [files.file_names(tmp_path / name) for name in ("report", "results")]
-    assert "short/problem2/vehiclePose.mat" in before[1]
-    write(tmp_path / "notebooks", "1_goes", "# Goes", ("1 / 0",))  # one at a time, the last first
-    write(tmp_path / "notebooks", "2_stays", "# Stays", (RESULT + "1 + 1",))
-    old = tmp_path / "results" / "short" / "problem1" / "vehiclePose.mat"
-    old.write_text("old")
+def test_a_build_that_fails_changes_nothing(rebuilt):
+    folder, again = rebuilt
+    write(folder / "notebooks", "1_goes", "# Goes", ("1 / 0",))
+    before = {path: path.read_bytes() for name in ("report", "results")
+              for path in (folder / name).rglob("*.*") if path.is_file()}
     with pytest.raises(NotebookError):
-        build(tmp_path, **options)
-    assert before == [files.file_names(tmp_path / name) for name in ("report", "results")]
-    assert old.read_text() == "old" and hidden(tmp_path) == []
-    (tmp_path / "notebooks" / "1_goes.ipynb").unlink()
-    capsys.readouterr()
-    build(tmp_path, **options)
-    assert "2_stays: nothing changed" in capsys.readouterr().err
-    assert len(results.read_structs(old.parent, "vehiclePose")[0]) == 2
-    assert [*map(files.file_names, (tmp_path / "report", tmp_path / "results"))] == [
-        [".pages", "2_stays.html", "index.html", "notes.html", "report.pdf"],
-        ["mine/vehiclePose.mat", "short/notes.txt", "short/problem1/vehiclePose.mat",
-         "short/summary.json"]]
+        again()
+    assert len(before) > 8 and hidden(folder) == []
+    assert all(path.read_bytes() == content for path, content in before.items())
+
+
+@pytest.mark.slow
+def test_a_build_removes_what_is_no_longer_made_and_no_file_of_the_user(rebuilt):
+    folder, again = rebuilt
+    (folder / "notebooks" / "1_goes.ipynb").unlink()
+    again()
+    assert files.file_names(folder / "report") == [
+        ".pages", "2_stays.html", "index.html", "notes.html", "report.pdf"]
+    assert files.file_names(folder / "results") == [
+        "mine/vehiclePose.mat", "short/notes.txt", "short/problem1/vehiclePose.mat",
+        "short/summary.json"]
 
 
 @pytest.mark.slow

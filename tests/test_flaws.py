@@ -10,7 +10,7 @@ from conftest import ROOT
 from numeric import aruco, known_noise, uwb, vehicle
 
 from slamlib import estimate, solve
-from slamlib.__main__ import summary_table
+from slamlib.__main__ import summary_lines
 from slamlib.core import se2
 from slamlib.core.evaluation import nees_band
 from slamlib.core.vehicle import Vehicle
@@ -292,9 +292,9 @@ def test_a_marker_with_a_single_accepted_sighting_is_unconfirmed():
     assert found.unconfirmed.tolist() == [label[count.argmax()]]
     assert not solution_doubts(found)
     row = solve.problem_solution("problem3", dataset.without("uwb"), found)
-    text = summary_table({"dataset": "short", "poses": 600, "doubts": [],
-                          "problems": {"problem3": solve.summarize(row, None)}})
-    assert f"confirms markers {label[count.argmax()]}: seen once, or" in text
+    lines = summary_lines([solve.summary_of(
+        dataset, None, {"problem3": solve.summary_row(row, None)}, [])])
+    assert f"confirms markers {label[count.argmax()]}: seen once, or" in lines[-1]
 
 
 @pytest.mark.slow

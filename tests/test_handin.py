@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 from zipfile import ZipFile
 
 import numpy as np
@@ -10,6 +11,7 @@ from test_document import text_of
 from test_report import write
 
 from slamlib.__main__ import main
+from slamlib.core.errors import DatasetError
 from slamlib.report import handin
 from slamlib.report.notebooks import Options
 from slamlib.report.overview import SolvedDrive
@@ -19,8 +21,10 @@ from slamlib.studies.simulation import simulate, write_dataset
 
 SOLVE = """from slamlib.notebook import *
 from slamlib.solve import PROBLEMS, find
-for problem in PROBLEMS:
-    solved(start(), **{problem: lambda drive: find(problem, drive.dataset)})"""
+for drive in start():
+    for problem in PROBLEMS:
+        with attempt(drive, problem):
+            write_results(drive, problem, find(problem, drive.dataset))"""
 
 
 def drive_of(name="mine", first=40):
@@ -97,8 +101,8 @@ def test_equal_input_gives_equal_bytes_and_the_date_is_fixed(handed, monkeypatch
     assert (folder / "new" / "second.zip").read_bytes() == before
     assert {entry.date_time for entry in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
     told = capsys.readouterr().err
-    assert "1_all: nothing changed, not executed again" in told
-    assert "hand-in: without stand_in, which are simulated" in told
+    assert "1 of 1: 1_all, nothing changed" in told
+    assert "left out, because simulated: stand_in" in told
     assert f"hand-in: {(folder / 'new' / 'second.zip').resolve()}\n" in told
     assert [file.name for file in (folder / "new").iterdir()] == ["second.zip"]
 
@@ -106,18 +110,6 @@ def test_equal_input_gives_equal_bytes_and_the_date_is_fixed(handed, monkeypatch
 def test_appendices_are_left_out_unless_report_toml_names_its_chapters():
     assert handin.hand_in_options(Options()).chapters == ("[0-9]*",)
     assert handin.hand_in_options(Options(chapters=("1*", "B*"))).chapters == ("1*", "B*")
-
-
-def test_simulated_datasets_are_left_out_where_there_are_recorded_ones_only(tmp_path):
-    simulated, truth = simulate("short", seed=4)
-    simulated, truth = simulated.first(30), replace(truth, poses=truth.poses[:30])
-    write_dataset(tmp_path / "short", simulated, truth)
-    assert handin.selection(tmp_path) == (None, [])  # as of a report on all: nothing is executed
-    write_dataset(tmp_path / "mine", simulated, None)
-    assert handin.selection(tmp_path) == (["mine"], ["short"])
-    assert handin.selection(tmp_path, ["short"]) == (["short"], [])
-    write_dataset(tmp_path / "short" / "never", simulated, None)
-    assert handin.selection(tmp_path) == (["mine"], ["short"])
 
 
 def solved_drive(*problems, **others):
@@ -166,3 +158,14 @@ def test_doubts_and_failures_are_in_the_readme_and_empty_headings_are_not():
     assert "d: A header was left out." in handin.readme([noted], Options())
     text = handin.readme([replace(drive, doubts=())], Options())
     assert "Doubts" not in text and "Notes" not in text
+
+
+def test_results_of_a_run_that_was_killed_are_not_handed_in(tmp_path):
+    drive = solved_drive("problem1", files=("problem1/vehiclePose.mat",))
+    pdf = tmp_path / "report.pdf"
+    pdf.write_bytes(b"")
+    report = SimpleNamespace(files=[pdf], drives=[drive], omitted=[])
+    (tmp_path / "d" / "problem1").mkdir(parents=True)
+    (tmp_path / "d" / "problem1" / "vehiclePose.mat").write_bytes(b"half")
+    with pytest.raises(DatasetError, match="summary.json: .* solve the dataset again"):
+        handin.write_zip(tmp_path / "hand-in.zip", report, tmp_path, Options())

@@ -76,8 +76,7 @@ def test_jupyterlab_replaces_the_command_and_kernels_have_the_environment_of_the
     assert command[-4:] == ["--no-browser", "--port", "9999", "notebooks"]
     assert [each for each in as_root if each not in command] == ["--allow-root"]
     kept = tmp_path / "build" / "executed"
-    assert environment == kernel_environment(kept / "settings", tmp_path / "data", ["short"],
-                                             kept / "studies")
+    assert environment == kernel_environment(kept / "settings", tmp_path / "data", ["short"])
     assert environment["OMP_NUM_THREADS"] == environment["OPENBLAS_NUM_THREADS"] == "1"
     assert "SLAMLIB_RESULTS" not in environment
     monkeypatch.setattr(execution, "find_spec", lambda _: None)

@@ -1,10 +1,8 @@
 """The command line: its exit codes, and one sentence for what a user must change."""
 
-import json
 import re
 import subprocess
 import sys
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +15,7 @@ from slamlib.core import se2
 from slamlib.core.odometry import equation2
 from slamlib.io.dataset import read_dataset
 from slamlib.io.files import file_names
-from slamlib.io.results import read_structs
+from slamlib.io.results import read_structs, read_summary
 from slamlib.studies.simulation import simulate, write_dataset
 
 
@@ -28,52 +26,54 @@ def drive():
     return dataset.first(100), replace(truth, poses=truth.poses[:100])
 
 
-def run(*arguments, cwd=ROOT):
-    return subprocess.run([sys.executable, "-m", "slamlib", *map(str, arguments)], cwd=cwd,
+@pytest.fixture
+def folder(tmp_path, drive):
+    """A folder with the dataset of the drive, without truth, in `drive`."""
+    write_dataset(tmp_path / "drive", drive[0])
+    return tmp_path
+
+
+def run(*arguments, cwd):
+    done = subprocess.run([sys.executable, "-m", "slamlib", *map(str, arguments)], cwd=cwd,
                           text=True, capture_output=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return done
 
 
 def solved(folder, *options, code=0):
     """The summary of `solve` on folder/drive into folder/out."""
-    assert main(["solve", str(folder / "drive"), "--out", str(folder / "out"),
-                 *map(str, options)]) == code
-    return json.loads((folder / "out" / "summary.json").read_text())
+    out = folder / "out"
+    assert main(["solve", str(folder / "drive"), "--out", str(out), *map(str, options)]) == code
+    return read_summary(out)
 
 
 @pytest.mark.slow
-def test_simulate_then_solve(tmp_path):
+def test_what_simulate_writes_is_what_solve_reads(tmp_path):
     """In processes of their own; a path is driven twice."""
     made = run("simulate", "drive", "--path", "short", "--seed", 21, "--nlos", 0.15, "--rounds", 2,
                cwd=tmp_path)
-    assert (made.returncode, made.stdout, made.stderr) == (0, "", "")
+    assert (made.stdout, made.stderr) == ("", "")
     done = run("solve", "drive", "--out", "out", "--problem", 1, cwd=tmp_path)
-    assert done.returncode == 0
-    *found, last = done.stderr.splitlines()
-    assert [line.split(":")[1] for line in found] == [
-        " encoders", " markers", " ranges", " vehicle.toml", " truth"]
-    assert last == f"results: {tmp_path / 'out'}"
-    lines = done.stdout.splitlines()
-    assert lines[0] == "drive: 4000 poses" and lines[2].startswith("problem1 ")
-    assert max(map(len, lines)) <= 100
-    dataset, expected = read_dataset(tmp_path / "drive"), simulate("short", 21, rounds=2)[0]
-    np.testing.assert_array_equal(dataset.ticks, expected.ticks)
-    _, *found = read_structs(tmp_path / "out" / "problem1", "vehiclePose")
-    for got, expected in zip(found, equation2(dataset.ticks, dataset.vehicle), strict=True):
-        np.testing.assert_array_equal(got, expected)
-    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert summary["dataset"] == "drive" and 0 < summary["problems"]["problem1"]["ate_m"] < 1
+    assert [line.split(":")[1] for line in done.stderr.splitlines()] == [
+        " encoders", " markers", " ranges", " vehicle.toml", " truth", f" {tmp_path / 'out'}"]
+    header, row = done.stdout.splitlines()
+    assert "ate_m" in header and row.split()[:3] == ["drive", "problem1", "4000"]
+    expected = simulate("short", 21, rounds=2)[0]
+    poses, _ = equation2(expected.ticks, expected.vehicle)
+    found = read_structs(tmp_path / "out" / "problem1", "vehiclePose")
+    np.testing.assert_array_equal(found[1], poses)
 
 
-def test_options_of_solve_are_heeded_and_said(tmp_path, capsys, drive):
+def test_options_of_solve_are_heeded_and_said(folder, capsys):
     """Problem 4 alone with a known slip and another kernel, beside odometry, as CSV and picture."""
-    write_dataset(tmp_path / "drive", drive[0])
-    (tmp_path / "drive" / "vehicle.toml").write_text('kernel = "Cauchy"\n')
-    out, picture = tmp_path / "out", tmp_path / "new" / "map.PNG"
-    summary = solved(tmp_path, "--problem", 4, "--slip", 2e-3, "--problem", 1, "--kernel", "Huber",
+    (folder / "drive" / "vehicle.toml").write_text('kernel = "Cauchy"\n')
+    out = folder / "out"
+    picture = folder / "new" / "map.PNG"
+    summary = solved(folder, "--problem", 4, "--slip", 2e-3, "--problem", 1, "--kernel", "Huber",
                      "--csv", "--plot", picture)
     assert summary["kernel"] == "Huber" and [*summary["problems"]] == ["problem1", "problem4"]
     assert summary["problems"]["problem4"]["slip_sqrt_m"] == 2e-3
-    expected = estimate(read_dataset(tmp_path / "drive"), slip=2e-3, kernel="Huber")
+    expected = estimate(read_dataset(folder / "drive"), slip=2e-3, kernel="Huber")
     np.testing.assert_array_equal(read_structs(out / "problem4", "vehiclePose")[1], expected.poses)
     assert {path.with_suffix(".csv") for path in out.rglob("*.mat")} == {*out.rglob("*.csv")}
     assert {path.name for path in out.rglob("*.tum")} == {"problem1.tum", "problem4.tum"}
@@ -81,56 +81,40 @@ def test_options_of_solve_are_heeded_and_said(tmp_path, capsys, drive):
     table, told = capsys.readouterr()
     assert "slip = 0.002" in told and 'kernel = "Huber"' in told and "Cauchy" not in told
     assert told.splitlines()[-2:] == [f"results: {out}", f"picture: {picture}"]
-    assert [line[-2:] for line in table.splitlines()[1:4]] == ["TE", " -", " -"]       # no truth
-    solved(tmp_path, "--problem", "problem1")
+    assert "ate_m" not in table                                             # without truth
+    solved(folder, "--problem", "problem1")
     assert file_names(out) == ["problem1/vehiclePose.mat", "summary.json"]
 
 
-def test_verbose_prints_decisions_of_both_processes_and_leaves_stdout(tmp_path, drive):
-    write_dataset(tmp_path / "drive", drive[0])
-    plain = run("solve", "drive", "--out", "out", cwd=tmp_path)
-    told = run("solve", "drive", "--out", "out", "-v", cwd=tmp_path)
-    assert (told.returncode, told.stdout) == (0, plain.stdout) and "GTSAM" not in plain.stderr
-    slip = json.loads((tmp_path / "out" / "summary.json").read_text())[
-        "problems"]["problem3"]["slip_sqrt_m"]
+def test_verbose_prints_decisions_and_leaves_stdout(folder):
+    plain = run("solve", "drive", "--out", "out", cwd=folder)
+    told = run("solve", "drive", "--out", "out", "-v", cwd=folder)
+    assert told.stdout == plain.stdout and "GTSAM" not in plain.stderr
+    slip = read_summary(folder / "out")["problems"]["problem3"]["slip_sqrt_m"]
     assert f"round 1: slip {1e3 * slip:.3g} mm after 1 m, factors " in told.stderr
-    for pattern in (r"Cauchy kernel of 3 sigmas: error [\d.]+ after \d+ steps",
-                    r"accepted \d+ of \d+ sightings, \d+ of \d+ ranges, \d+ changed",
-                    r"GTSAM: \d+ factors, \d+ variables, \d+ steps from odometry, differs by up to",
-                    r"estimate of drive: 100 poses", r"estimate of drive: \d+\.\d s"):
-        assert re.search(f"^.*{pattern}", told.stderr, re.MULTILINE), pattern
+    assert re.search(r"\nGTSAM: \d+ factors, \d+ variables, \d+ steps from ", told.stderr)
     for problem in solve.PROBLEMS:
         assert f"drive: {problem} solved in " in told.stderr
 
 
-def test_a_problem_that_takes_its_time_is_told_once(tmp_path, monkeypatch, caplog, drive):
-    write_dataset(tmp_path / "drive", drive[0])
-    find = solve.find
-
-    def slow(*arguments):
-        time.sleep(0.2)
-        return find(*arguments)
-
-    monkeypatch.setattr(solve, "find", slow)
-    for seconds, count in ((0.05, 1), (60, 0)):
-        monkeypatch.setattr(solve, "SLOW", seconds)
-        caplog.clear()
-        solved(tmp_path, "--problem", 3)
-        told = [message.split(" in ")[0] for message in caplog.messages]
-        assert told == count * ["drive: problem3 solved"]
+@pytest.mark.parametrize("seconds, count", [(0, 1), (60, 0)])
+def test_a_problem_that_took_its_time_is_told(folder, monkeypatch, caplog, seconds, count):
+    monkeypatch.setattr(solve, "SLOW", seconds)
+    solved(folder, "--problem", 1)
+    assert caplog.text.count("drive: problem1 solved in") == count
 
 
-def test_results_are_not_written_into_a_dataset(tmp_path, capsys):
-    (tmp_path / "drive").mkdir()
-    (tmp_path / "drive" / "encoderReading.txt").write_text("1 0 0\n")
+def test_results_are_not_written_into_a_dataset(folder, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    before = file_names(folder)
     for command in (["solve", "drive", "--out", "drive"],
                     ["solve", "drive", "--out", "drive/truth"],
                     ["solve", "drive", "nowhere", "--out", "."],
                     ["report", "--data", ".", "--results", "."]):
-        done = run(*command, cwd=tmp_path)
-        assert done.returncode == 2 and "expected another folder for the results" in done.stderr
-    assert file_names(tmp_path / "drive") == ["encoderReading.txt"]
-    assert main(["solve", str(tmp_path / "drive"), "--out", str(tmp_path), "--problem", "1"]) == 0
+        assert main(command) == 2
+        assert "expected another folder for the results" in capsys.readouterr().err
+    assert set(file_names(folder)) - {*before} <= {"drives.csv"}
+    assert main(["solve", "drive", "--out", ".", "--problem", "1"]) == 0
 
 
 SOLVE = ["solve", "good", "--out", "out"]
@@ -185,13 +169,12 @@ def test_notes_and_doubts_are_said_and_in_the_summary(tmp_path, capsys, drive):
     first = dataset.uwb.antenna[0]
     two = np.flatnonzero(dataset.uwb.antenna == first)[:2]
     dataset = replace(dataset, uwb=dataset.uwb.select(two))
-    truth = replace(truth, poses=se2.compose([1, 2, 0.5], truth.poses), **{
-        name: getattr(truth, name)[:0]
-        for name in ("marker", "marker_in_world", "antenna", "antenna_in_world")})
+    maps = ("marker", "marker_in_world", "antenna", "antenna_in_world")
+    truth = replace(truth, poses=se2.compose([1, 2, 0.5], truth.poses),
+                    **{name: getattr(truth, name)[:0] for name in maps})
     folder = tmp_path / "drive"
     write_dataset(folder, dataset, truth)
     (folder / "ArucoReading.txt").rename(folder / "ArucoReading.txt.txt")
-    (folder / "truth" / "ArucoMap.txt").rename(folder / "truth" / "ArucoMap.csv")
     summary = solved(tmp_path)
     antenna, = summary["doubts"]
     assert set(antenna) == {"what", "sentence"} and antenna["what"] == "antenna"
@@ -199,25 +182,20 @@ def test_notes_and_doubts_are_said_and_in_the_summary(tmp_path, capsys, drive):
     assert list(summary["problems"]["problem4"]["antennas_in_doubt"]) == [str(first)]
     assert summary["problems"]["problem3"]["ate_m"] < 0.05          # in the frame of the estimate
     told = capsys.readouterr()
-    assert told.out.splitlines()[-1] == f"doubt (antenna): {antenna['sentence']}"
-    *notes, frame = summary["notes"]
-    assert notes == ["ArucoReading.txt.txt was read as ArucoReading.txt.",
-                     "In truth: ArucoMap.csv was read as ArucoMap.txt."]
-    assert frame.startswith("In truth: vehiclePose.txt begins at (1.000 m, 2.000 m, 0.5000 rad):")
-    assert told.err.splitlines()[-4:-1] == [f"drive: note: {note}" for note in summary["notes"]]
+    assert told.out.splitlines()[-1] == f"drive: doubt (antenna): {antenna['sentence']}"
+    assert summary["notes"][0] == "ArucoReading.txt.txt was read as ArucoReading.txt."
+    for note in summary["notes"]:
+        assert f"drive: note: {note}\n" in told.err
 
 
-def test_without_guesses_problems_1_to_3_are_solved_and_it_is_said(tmp_path, capsys, drive):
-    write_dataset(tmp_path / "drive", drive[0])
-    (tmp_path / "drive" / "UwbAntennaGuess.txt").unlink()
+def test_without_guesses_problems_1_to_3_are_solved_and_it_is_said(folder, capsys):
+    (folder / "drive" / "UwbAntennaGuess.txt").unlink()
     note = "UwbAntennaGuess.txt is missing: problem 4 is left out."
-    summary = solved(tmp_path)
+    summary = solved(folder)
     assert [*summary["problems"]] == [*solve.PROBLEMS][:-1] and summary["notes"] == [note]
     assert f"drive: note: {note}\n" in capsys.readouterr().err
-    assert main(["solve", str(tmp_path / "drive"), "--out", str(tmp_path / "out"),
-                 "--problem", "4"]) == 2
-    *_, told, reason = capsys.readouterr().err.splitlines()
-    assert told == f"drive: note: {note}" and "expected the measurements of problem4" in reason
+    solved(folder, "--problem", "4", code=2)
+    assert "expected the measurements of problem4" in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_a_problem_that_fails_costs_the_others_nothing(tmp_path, capsys, drive):
@@ -227,6 +205,6 @@ def test_a_problem_that_fails_costs_the_others_nothing(tmp_path, capsys, drive):
     failed, = (name for name, row in problems.items() if "failed" in row)
     assert failed == "problem2" and [*problems] == list(solve.PROBLEMS)
     assert {path.name for path in tmp_path.glob("out/problem*")} == problems.keys() - {failed}
-    assert problems[failed]["failed"].startswith("expected sightings")
-    assert f"problem2       could not be solved: {problems[failed]['failed']}\n" \
-        in capsys.readouterr().out
+    reason = problems[failed]["failed"]
+    assert reason.startswith("expected sightings")
+    assert f"drive: problem2 could not be solved: {reason}\n" in capsys.readouterr().out

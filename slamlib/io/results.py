@@ -7,13 +7,14 @@ pose ids, from 1. Text files leave out poses without an estimate.
 """
 
 import json
+from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 from scipy.io import loadmat, savemat
 
-from slamlib.core.errors import DatasetError
+from slamlib.core.errors import require
 from slamlib.io.files import write_file
 
 SUMMARY = "summary.json"
@@ -64,11 +65,12 @@ def read_summary(folder: Path | str) -> dict:
     Raises DatasetError if there is none, as of a run that was killed or has not ended.
     """
     path = Path(folder) / SUMMARY
-    try:
-        return json.loads(path.read_bytes())
-    except (OSError, ValueError):
-        raise DatasetError(f"{path}: expected this file, which ends a run, found none that can be "
-                           "read: solve the dataset again") from None
+    summary = None
+    with suppress(OSError, ValueError):
+        summary = json.loads(path.read_bytes())
+    require(isinstance(summary, dict) and "problems" in summary, path, "this file, which a run "
+            "writes last, found none that is whole: solve the dataset again")
+    return summary
 
 
 def _pose_ids(poses):

@@ -20,6 +20,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib_inline.backend_inline import set_matplotlib_formats
 
 from slamlib.core import se2
 from slamlib.core.evaluation import REACH_95
@@ -75,6 +76,12 @@ class Estimates(NamedTuple):
     poses: np.ndarray            # (m, 3)
     covariances: np.ndarray      # (m, 3, 3)
     true: np.ndarray | None      # (m, 3) poses
+
+
+def use_style() -> None:
+    """Set the style of a notebook's figures."""
+    plt.style.use(STYLE)
+    set_matplotlib_formats("svg", metadata={"Date": None})
 
 
 def panels(count: int, rows: int = 1, height: float = 3.4, width: float = 3.7,
