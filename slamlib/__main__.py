@@ -111,7 +111,7 @@ def _add_solve(commands):
         "over all")
     add("--out", type=Path, required=True, help="folder for the results")
     add("-j", "--jobs", type=int, default=1, help="datasets solved at a time (default 1)")
-    _add_path(command, "--plot", "write a picture of map and errors of the only dataset: a .png, "
+    _add_path(command, "--plot", "write a picture of map and sigmas of the only dataset: a .png, "
               ".pdf or .svg file")
     add("--problem", action="append", default=[], metavar="NAME",
         type=lambda text: text.removeprefix("problem"),

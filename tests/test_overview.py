@@ -79,15 +79,18 @@ def test_titles_and_numbers_of_the_table_are_those_of_the_solver(project):
         for shown, wanted in ((position, np.median(evaluation.position_sigmas(C))),
                               (heading, np.median(np.sqrt(C[:, 2, 2]))),
                               (ate, expected["ate_m"]), (aligned, expected["ate_aligned_m"])):
-            assert metres(shown) == pytest.approx(wanted, rel=5e-3)
+            assert 1e-3 * float(shown.replace(",", "")) == pytest.approx(wanted, rel=6e-3)
 
 
 def test_the_abstract_of_a_simulated_drive_has_the_errors_of_odometry_and_slam(project):
     opened = overview.opening(project.drives[:1])
-    rows, text = result_rows(opened)
+    text = opened.cells[0].source
     solved = project.solved
-    errors = [rows["all", solved[number].title][0] for number in (0, -1)]
-    assert f"{errors[0]} and {errors[1]} on" in text
+    odometry, slam = (summarize(solved[number], project.drives[0].truth)["ate_m"]
+                      for number in (0, -1))
+    found = re.search(r"by SLAM is (\S+) and (\S+) on \*all", text.replace("\u00a0mm", ""))
+    assert [1e-3 * float(each) for each in found.groups()] == pytest.approx(
+        [odometry, slam], rel=5e-3)
     assert f"{len(solved[-1].aruco_map[0])} markers and 4 antennas on *all*" in text
     assert "*all* is a simulated stand-in" in text
 
@@ -144,7 +147,7 @@ def test_the_world_is_the_first_pose_with_an_estimate():
     solution = Solution("problem2", "ArUco", poses, np.zeros((len(poses), 3, 3)), 40)
     solved = overview.SolvedDrive("x", *drive, solutions=(solution,))
     row = overview.result_row(solved, "problem2")
-    assert metres(row["ATE"]) == pytest.approx(0, abs=1e-9)
+    assert row["ATE (mm)"] == pytest.approx(0, abs=1e-6)
     assert evaluation.ate(poses, truth.poses) > 0.1  # in the wrong frame
 
 

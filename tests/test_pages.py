@@ -131,7 +131,7 @@ def test_a_drive_that_fails_is_left_out_of_its_chapter_and_costs_the_others_noth
     failed = {drive.name: [failure.problem for failure in drive.failures]
               for drive in report.drives}
     assert failed == {"bad": ["problem2", "problem3"], "good": [], "told": []}
-    written = {name: {each.name for each in (folder / "results" / name).glob("[!.]*")}
+    written = {name: {each.name for each in (folder / "results" / name).glob("problem*")}
                for name in failed}
     assert written["good"] - written["bad"] == {"problem2", "problem3"}
     assert len(written["good"]) == len(written["told"]) == len(PROBLEMS)

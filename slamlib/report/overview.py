@@ -27,7 +27,7 @@ from slamlib.notebook.drives import plain, without_stand_ins
 from slamlib.report.execution import Books, NotebookError
 from slamlib.report.notebooks import chapter_of
 from slamlib.robust.file_doubts import Doubt
-from slamlib.solve import PROBLEMS, SENSORS, Failure, Solution, title, truth_in_world
+from slamlib.solve import PROBLEMS, SENSORS, Failure, Solution, title
 
 TEXT = Path(__file__).with_name("overview.md")
 ALT = "Trajectories, and standard deviations of position"  # of the picture
@@ -38,9 +38,8 @@ LOOKS = {"problem3": dict(linewidth=4.0), "problem4": dict(linestyle="-", linewi
 MAX_NAMED = 3  # drives that the abstract names one by one; else the shortest and the longest
 CAMERA = ("camera_x", "camera_y", "camera_turn", "marker_size")  # entries of a calibration
 MAPS = {"aruco_map": "ArucoMap", "uwb_map": "UwbMap"}  # fields of a Solution, names of their files
-# Columns of the table of results: their keys in `notebook.accuracy`, and units.
-ACCURACY = {"ATE": ("ATE (mm)", "m"), "ATE, aligned": ("aligned (mm)", "m"),
-            "σ of position": ("σ (mm)", "m"), "σ of heading": ("σ of δ (mrad)", "rad")}
+# Columns of the table of results, of `notebook.accuracy`.
+ACCURACY = ("ATE (mm)", "aligned (mm)", "σ (mm)", "σ of δ (mrad)")
 in_our_style = plt.style.context(plotting.STYLE, after_reset=True)  # decorates what draws
 
 
@@ -118,7 +117,7 @@ def opening(drives: list[SolvedDrive], chapters: Books | None = None) -> Noteboo
     cells = []
     for name, block in template.blocks.items():
         if name == "caption" and facts["longest"]:
-            drawn = trajectories(facts["longest"])
+            drawn = _as_svg(trajectories(facts["longest"]))
             picture = new_output("display_data", {"image/svg+xml": drawn})
             cells.append(new_code_cell(id="picture", metadata={"alt": ALT}, outputs=[picture]))
         text = "".join(block(context)).strip()
@@ -141,15 +140,13 @@ def _facts(drives, chapters):
     compared = subjects if len(subjects) <= MAX_NAMED else [subjects[0], subjects[-1]]
     attempted = {each.problem for drive in drives for each in drive.solutions + drive.failures}
     problems = [problem for problem in PROBLEMS if problem in attempted]
-    with_truth = [drive for drive in drives if drive.truth]
     rows = [result_row(drive, problem) for drive in drives for problem in problems]
     facts = {"name": _name, "listed": listed, "results_of": problems}
     facts["longest"] = longest(drives)
     facts["compared"] = [_compared(drive) for drive in compared]
     facts["simulated"] = [_name(drive) for drive in drives if drive.origin == "simulated"]
     facts["results"] = table(rows).data if solved else ""
-    facts["known"] = with_truth
-    facts["dashes"] = len(with_truth) < len(drives)
+    facts["known"] = [drive for drive in drives if drive.truth]
     facts["sensors"] = [sensor for sensor in SENSORS
                         if not all(_without(drive, sensor) for drive in drives)]
     facts["without"] = {name: [plain(drive.name) for drive in drives if _without(drive, sensor)]
@@ -219,66 +216,48 @@ def result_row(drive: SolvedDrive, problem: str) -> dict:
     number = problem.removeprefix("problem")[0]
     row = {"dataset": plain(drive.name),
            "problem": f"{number}. {plain(title(problem, drive.dataset))}"}
-    row |= dict.fromkeys(ACCURACY)
     solution = drive.solution(problem)
     if solution is None:
         reason = re.sub("(?<=solved):.*", "", why_missing(drive, problem))
-        return row | {"σ of position": f"*{reason}*"}
+        return row | dict.fromkeys(ACCURACY) | {"σ (mm)": f"*{reason}*"}
     found = accuracy(solution, drive)
-    for name, (key, unit) in ACCURACY.items():
-        if key in found:
-            row[name] = with_unit(found[key], unit)
-    row["poses"] = int(np.isfinite(solution.poses[:, 0]).sum())
-    return row
+    row |= {name: found.get(name) for name in ACCURACY}
+    return row | {"poses": int(np.isfinite(solution.poses[:, 0]).sum())}
 
 
 @in_our_style
-def trajectories(drive: SolvedDrive) -> str:
-    """Return the figure of a drive's trajectories and sigmas as SVG."""
-    shown = [each.problem for each in drive.solutions if each.problem not in HIDDEN_TRAJECTORIES]
-    shown.append(drive.solutions[-1].problem)
-    fig = Figure(figsize=(7.2, 2.7))  # inches
-    _draw(fig, drive.solutions, drive.truth, shown)
-    plotting.legend_below(fig)
-    return print_figure(fig, "svg", metadata={"Date": None})
-
-
-@in_our_style
-def result_picture(dataset: Dataset, truth: Truth | None, results: Path, path: Path):
-    """Write a picture of the map and the errors of the results in a folder to `path`.
-
-    Its ending is .png, .pdf or .svg. Errors are distances to the truth, or sigmas where it is None.
-    """
-    solutions = [read_solution(file.parent, dataset)
-                 for file in sorted(results.glob("problem*/vehiclePose.mat"))]
-    fig = Figure(figsize=(11, 5.5))
-    _draw(fig, solutions, truth, PROBLEMS, errors=truth is not None)
-    _draw_landmarks(fig.axes[0], solutions[-1])
-    plotting.legend_below(fig)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    fig.savefig(path, dpi=150)
-
-
-def _draw(fig, solutions, truth, shown, errors=False):
-    """Draw trajectories of the problems `shown`, and errors or sigmas of all Solutions."""
+def trajectories(drive: SolvedDrive, size: tuple[float, float] = (7.2, 2.7)) -> Figure:
+    """Return the figure of a drive's trajectories, its last map and sigmas; the size in inches."""
+    fig = Figure(figsize=size)
     left, right = fig.subplots(1, 2)
-    for solution in solutions:
+    last = drive.solutions[-1]
+    for solution in drive.solutions:
         role = PROBLEMS[solution.problem].role
         look = LOOKS.get(solution.problem, {})
-        if solution.problem in shown:
+        if solution.problem not in HIDDEN_TRAJECTORIES or solution is last:
             plotting.trajectory(left, _few(solution.poses), role, solution.title, **look)
-        if errors:
-            off = solution.poses - truth_in_world(solution, truth)
-            values = np.hypot(off[:, 0], off[:, 1])
-        else:
-            values = evaluation.position_sigmas(solution.covariances)
-        values[:len(values) // 50] = np.nan  # nearly zero, on a logarithmic axis
-        known = _few(np.flatnonzero(values > 0))
-        plotting.curve(right, values[known], role, known, solution.title, **look)
-    if truth is not None:
-        plotting.trajectory(left, _few(truth.poses), "truth")
-    quantity = "error" if errors else "σ"
-    right.set(yscale="log", ylabel=f"{quantity} of position (m)")
+        sigmas = evaluation.position_sigmas(solution.covariances)
+        sigmas[:len(sigmas) // 50] = np.nan  # nearly zero, on a logarithmic axis
+        known = _few(np.flatnonzero(sigmas > 0))
+        plotting.curve(right, sigmas[known], role, known, solution.title, **look)
+    if drive.truth is not None:
+        plotting.trajectory(left, _few(drive.truth.poses), "truth")
+    _draw_landmarks(left, last)
+    right.set(yscale="log", ylabel="σ of position (m)")
+    plotting.legend_below(fig)
+    return fig
+
+
+def result_picture(dataset: Dataset, truth: Truth | None, results: Path, path: Path):
+    """Write the figure of `trajectories` of a folder of results as a .png, .pdf or .svg file."""
+    drive = solved_drive(Drive(dataset.name, dataset, truth), results)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    trajectories(drive, (11, 5.5)).savefig(path, dpi=150)
+
+
+@in_our_style
+def _as_svg(fig):
+    return print_figure(fig, "svg", metadata={"Date": None})
 
 
 @in_our_style
@@ -294,7 +273,7 @@ def title_picture(drives: list[SolvedDrive]) -> str:
     plotting.trajectory(ax, _few(solution.poses), role, linestyle="-", linewidth=1.2)
     _draw_landmarks(ax, solution)
     ax.axis("off")
-    return print_figure(fig, "svg", metadata={"Date": None})
+    return _as_svg(fig)
 
 
 def _draw_landmarks(ax, solution):
