@@ -7,7 +7,6 @@ of the document for Typst, which begins with report.typ.
 
 import base64
 import json
-import os
 import re
 import subprocess
 import tempfile
@@ -25,7 +24,7 @@ from slamlib.report.notebooks import Options, chapter_of, tags_of
 
 HERE = Path(__file__).parent
 DIALECT = "gfm-alerts-autolink_bare_uris-emoji-yaml_metadata_block+raw_attribute"
-PICTURES = {"image/svg+xml": "svg", "image/png": "png", "image/jpeg": "jpg"}  # and their endings
+PICTURES = ("image/svg+xml", "image/png", "image/jpeg")
 SHOWN = (*PICTURES, "text/markdown", "text/latex", "text/html", "text/plain")  # the first is best
 FENCE = "~~~~~~~~"
 ALT = "Figure of this chapter, described in the text"
@@ -46,9 +45,9 @@ def render(books: Books, options: Options, picture: str = "") -> dict[str, bytes
     """
     with tempfile.TemporaryDirectory() as temporary, ThreadPoolExecutor() as pool:
         folder = Path(temporary)
-        screen = {source: _markdown(source, book, options.code, folder, on_paper=False)
+        screen = {source: _markdown(book, options.code, on_paper=False)
                   for source, book in books.items()}
-        paper = {source: _markdown(source, book, options.code, folder, on_paper=True)
+        paper = {source: _markdown(book, options.code, on_paper=True)
                  for source, book in books.items()}
         targets = _targets(books, screen)
         parts = [pool.submit(_pandoc, text, "typst", _settings(books, source, targets, folder))
@@ -61,23 +60,22 @@ def render(books: Books, options: Options, picture: str = "") -> dict[str, bytes
         return {name: page.result() for name, page in pages.items()} | {"report.pdf": pdf}
 
 
-def _markdown(source, book, code, folder, on_paper):
-    """Return a notebook with its outputs as Markdown, whose pictures are written to a folder."""
+def _markdown(book, code, on_paper):
+    """Return a notebook with its outputs and pictures as Markdown."""
     parts = []
     for cell in book.cells:
         tags = tags_of(cell)
         if LAB_ONLY in tags or on_paper and "html-only" in tags:
             continue
-        pictures = _Pictures(folder, f"{source.stem}-{len(parts)}", cell.metadata.get("alt", ALT))
         if cell.cell_type == "markdown":
-            parts.append(pictures.attached(cell))
+            parts.append(_with_attachments(cell))
         elif cell.cell_type == "code":
             is_folded = code == "method" and "hide-input" in tags
             if code != "none" and cell.source and not (is_folded and on_paper):
                 parts.append(_code(cell.source, is_folded))
             for output in cell.outputs:
                 if code != "none" or not _is_printed(output):
-                    parts.append(_shown(output, pictures))
+                    parts.append(_shown(output, cell.metadata.get("alt", ALT)))
     return "\n\n".join(parts)
 
 
@@ -88,31 +86,21 @@ def _code(text, is_folded):
     return block
 
 
-class _Pictures:
-    """Writes the pictures of a cell, files of a folder whose names begin alike."""
+def _address(kind, data):
+    """Return the address of a picture of a kind such as "image/png", which holds its data."""
+    if kind == "image/svg+xml":
+        data = base64.b64encode(data.encode()).decode()
+    content = "".join(data.split())
+    return f"data:{kind};base64,{content}"
 
-    def __init__(self, folder, name, alt):
-        self.folder = folder
-        self.name = name.replace(" ", "-")
-        self.alt = alt
-        self.count = 0
 
-    def write(self, kind, data):
-        """Write a picture of a kind such as "image/png"; return the name of its file."""
-        self.count += 1
-        name = f"{self.name}-{self.count}.{PICTURES[kind]}"
-        is_text = kind == "image/svg+xml"
-        content = "".join(data).encode() if is_text else base64.b64decode("".join(data))
-        (self.folder / name).write_bytes(content)
-        return name
-
-    def attached(self, cell):
-        """Return the text of a Markdown cell, in which its attachments have names of files."""
-        text = cell.source
-        for name, data in cell.get("attachments", {}).items():
-            for kind, content in data.items():
-                text = text.replace(f"attachment:{name}", self.write(kind, content))
-        return text
+def _with_attachments(cell):
+    """Return the text of a Markdown cell, in which its attachments are pictures."""
+    text = cell.source
+    for name, data in cell.get("attachments", {}).items():
+        for kind, content in data.items():
+            text = text.replace(f"attachment:{name}", _address(kind, content))
+    return text
 
 
 def _best(output):
@@ -124,7 +112,7 @@ def _is_printed(output):
     return _best(output) in (None, "text/plain")
 
 
-def _shown(output, pictures):
+def _shown(output, alt):
     """Return an output as Markdown, by the best kind that it has."""
     kind = _best(output)
     if kind is None:
@@ -132,7 +120,7 @@ def _shown(output, pictures):
         return f"{FENCE}{name}\n{strip_ansi(output.get('text', ''))}\n{FENCE}"
     data = output.data[kind]
     if kind in PICTURES:
-        return f"![{pictures.alt}]({pictures.write(kind, data)})"
+        return f"![{alt}]({_address(kind, data)})"
     if kind == "text/html":
         return f"{FENCE}{{=html}}\n{data}\n{FENCE}"
     if kind == "text/plain":
@@ -177,7 +165,7 @@ def _pandoc(text, kind, settings):
     command = [
         pypandoc.get_pandoc_path(), f"--from={DIALECT}", f"--to={kind}", "--mathml", "--toc",
         "--wrap=none", f"--lua-filter={HERE / 'report.lua'}",
-        f"--resource-path={settings['folder']}{os.pathsep}{settings['beside']}",
+        f"--resource-path={settings['beside']}",
         f"--metadata=options={json.dumps(settings)}"]
     if kind == "html":
         command.append(f"--template={HERE / 'page.html'}")

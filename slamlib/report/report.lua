@@ -40,14 +40,14 @@ local function attributes(id, classes) return pandoc.Attr(label(options.here, id
 
 local function picture(image)
   local found, kind, content = pcall(pandoc.mediabag.fetch, image.src)
-  if not found or image.src:find "^%a+:" then
+  if not found or image.src:find "^%a+:" and not image.src:find "^data:" then
     refuse(("expected a picture of the notebook or a file beside it, found '%s'"):format(image.src))
   end
   if not typst then
     image.src = pandoc.mediabag.make_data_uri(kind, content)
     return image
   end
-  local name = image.src:gsub("[^%w.]", "-")
+  local name = pandoc.utils.sha1(content) .. "." .. kind:match "%a+/(%a+)"
   assert(io.open(options.folder .. "/" .. name, "wb")):write(content):close()
   return pandoc.RawInline("typst", ("#picture(%s, %s)"):format(
     pandoc.json.encode(name), pandoc.json.encode(stringify(image.caption))))
