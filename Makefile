@@ -88,5 +88,5 @@ bench: $(READY)
 	@$(BIN)/python tests/benchmarks/speed.py
 
 clean:
-	rm -rf $(VENV) report results .report.* .results.* build slamlib.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) report results build slamlib.egg-info .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -57,8 +57,8 @@ TRUTH = "truth.tum"
 NOISE = {"slip": "slip_sqrt_m", "marker_noise_factor": "marker_noise_factor",
          "range_noise_factor": "range_noise_factor"}    # entries of vehicle.toml, keys of facts
 DRIVES = "drives.csv"                               # the table over all drives, and its columns
-COLUMNS = ["dataset", "problem", "poses", "ate_m", "ate_aligned_m", "nees", "last_sigma_m",
-           "slip_sqrt_m", "doubts", "seconds", "failed"]
+COLUMNS = ["dataset", "problem", "estimated_poses", "ate_m", "ate_aligned_m", "nees",
+           "last_sigma_m", "slip_sqrt_m", "doubts", "seconds", "failed"]
 
 
 def title(problem: str, dataset: Dataset) -> str:
@@ -475,15 +475,11 @@ def drive_table(summaries: Sequence[dict]) -> pd.DataFrame:
     """
     rows = []
     for summary in summaries:
-        dataset = summary["dataset"]
-        if "error" in summary:
-            rows.append({"dataset": dataset, "failed": summary["error"]})
+        drive = {"dataset": summary["dataset"], "failed": summary.get("error")}
         for problem, row in summary["problems"].items():
-            found = {"dataset": dataset, "problem": problem, "doubts": len(row["doubts"])}
-            if "last_sigma" in row:
-                found["poses"] = row["estimated_poses"]
-                found["last_sigma_m"] = max(row["last_sigma"][:2])
-            rows.append(row | found)
+            rows.append(drive | row | {"problem": problem, "doubts": len(row["doubts"])})
+        if not summary["problems"]:
+            rows.append(drive)
     return pd.DataFrame(rows, columns=COLUMNS)
 
 
@@ -491,10 +487,11 @@ def summarize(solution: Solution, truth: Truth | None) -> dict:
     """Last estimate with its sigmas and, where there is truth, errors: a dict of plain numbers."""
     known = np.flatnonzero(np.isfinite(solution.poses[:, 0]))
     last = known[-1]
+    sigmas = evaluation.sigmas(solution.covariances[last])
     summary = {"path_length_m": evaluation.path_length(solution.poses),
                "estimated_poses": len(known), "world_is_pose": solution.world + 1,
                "last_pose_number": int(last) + 1, "last_pose": solution.poses[last].tolist(),
-               "last_sigma": evaluation.sigmas(solution.covariances[last]).tolist()}
+               "last_sigma": sigmas.tolist(), "last_sigma_m": float(max(sigmas[:2]))}
     summary |= solution.facts
     if truth is not None:
         true_poses = truth_in_world(solution, truth)

@@ -87,13 +87,14 @@ def test_options_of_solve_are_heeded_and_said(folder, capsys):
 
 
 def test_verbose_prints_decisions_and_leaves_stdout(folder):
-    plain = run("solve", "drive", "--out", "out", cwd=folder)
-    told = run("solve", "drive", "--out", "out", "-v", cwd=folder)
+    command = ["solve", "drive", "--out", "out", "--problem", 1, "--problem", 3]
+    plain = run(*command, cwd=folder)
+    told = run(*command, "-v", cwd=folder)
     assert told.stdout == plain.stdout and "GTSAM" not in plain.stderr
     slip = read_summary(folder / "out")["problems"]["problem3"]["slip_sqrt_m"]
     assert f"round 1: slip {1e3 * slip:.3g} mm after 1 m, factors " in told.stderr
     assert re.search(r"\nGTSAM: \d+ factors, \d+ variables, \d+ steps from ", told.stderr)
-    for problem in solve.PROBLEMS:
+    for problem in ("problem1", "problem3"):
         assert f"drive: {problem} solved in " in told.stderr
 
 
@@ -126,11 +127,9 @@ SOLVE = ["solve", "good", "--out", "out"]
     (["solve", "good", "--out", "good/encoderReading.txt"], "to write to (File exists)"),
     (["solve", ".", "--out", "out"], "encoderReading.txt: expected this file, found none. Not"),
     (["simulate", "drive", "--slip", "nan"], "from 0 to 1"),
-    (["simulate", "drive", "--nlos", "some"], "invalid float value: 'some'"),
     (["simulate", "drive", "--seed", "-1"], "a seed from 0 on"),
     (["simulate", "drive", "--rounds", "0"], "rounds from 1 on"),
     (["solve", "good"], "--out"),
-    ([*SOLVE, "--problem", "5"], "invalid choice: '5'"),
     ([*SOLVE, "--problem", "3"], "expected the measurements of problem3"),
     ([*SOLVE, "--kernel", "L2"], "for kernel, found 'L2'"),
     ([*SOLVE, "--slip", "1"], "from 0 to 0.1 sqrt(m) for slip, found '1.0'"),
