@@ -2,6 +2,8 @@
 # make hand-in  builds the report and writes hand-in.zip: the PDF and the .mat files to hand in
 # make test     checks the style, and runs all tests
 # make quick    runs the tests that take less than a minute in all
+# make studies  computes the rows of all studies anew, notebooks/studies/*.csv, or those of the
+#               notebooks that CHAPTERS names
 # make mutants  prints which small defects of the numerics no test notices
 # make lab      opens JupyterLab on the notebooks, with ARGS="--no-browser --port 9999" or others
 # make docs     writes pages of slamlib's functions to build/api
@@ -24,7 +26,7 @@ ifneq ($(shell $(BIN)/python -c 'print("runs")' 2>/dev/null),runs)
 $(shell rm -f $(READY))
 endif
 
-.PHONY: setup report hand-in test quick mutants lab docs strip bench clean
+.PHONY: setup report hand-in test quick studies mutants lab docs strip bench clean
 .DEFAULT_GOAL := report
 
 # What editors and kernels write into notebooks, besides outputs, is not committed.
@@ -68,6 +70,16 @@ test: $(READY)
 
 quick: $(READY)
 	$(BIN)/python -m pytest $(PARALLEL) -m "not slow"
+
+# The notebooks run on a simulated drive, and write nothing else.
+studies: STUDIES := $(CURDIR)/build/studies
+studies: CHAPTERS ?= notebooks/[1-4A]*.ipynb
+studies: $(READY)
+	@rm -rf "$(STUDIES)"
+	@$(BIN)/python -m slamlib simulate "$(STUDIES)/data/short"
+	SLAMLIB_STUDIES=write SLAMLIB_DATA="$(STUDIES)/data" SLAMLIB_RESULTS="$(STUDIES)/results" \
+		OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m nbconvert --execute \
+		--to notebook --output-dir "$(STUDIES)" $(CHAPTERS)
 
 mutants: $(READY)
 	$(BIN)/python tests/mutants.py $(ARGS)

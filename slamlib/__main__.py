@@ -99,7 +99,7 @@ def _add_options_of_a_build(command):
         "there are others)")
     add("--jobs", type=int, default=2, help="notebooks executed at a time")
     add("--fresh", action="store_true",
-        help="execute all notebooks and studies, also where nothing changed")
+        help="execute all notebooks, also where nothing changed")
 
 
 def _add_solve(commands):

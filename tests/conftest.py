@@ -1,7 +1,4 @@
-"""Before numpy is imported: matrices are small, and more threads only wait for each other.
-
-No study is recalled that was kept before the tests.
-"""
+"""Before numpy is imported: matrices are small, and more threads only wait for each other."""
 
 import os
 import shutil
@@ -16,7 +13,6 @@ from hypothesis import settings
 
 for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):  # as notebooks have it
     os.environ.setdefault(name, "1")
-os.environ.pop("SLAMLIB_STUDIES", None)
 
 settings.register_profile("short", derandomize=True, deadline=None, database=None, max_examples=40)
 settings.register_profile("long", deadline=None, database=None, max_examples=1000,
@@ -24,7 +20,6 @@ settings.register_profile("long", deadline=None, database=None, max_examples=100
 settings.load_profile("short")           # another one by `pytest --hypothesis-profile=NAME`
 
 ROOT = Path(__file__).parents[1]
-STUDY_SEEDS = "2"            # in pages that tests build: their claims are tested on more drives
 # The longest come first, and those that mostly wait beside those that start further processes.
 FIRST = ("test_pages", "test_concurrency", "test_lab", "test_slam", "test_flaws", "test_memory",
          "test_uwb", "test_localization", "test_jumps", "test_calibration", "test_docs",
@@ -36,6 +31,16 @@ def pytest_collection_modifyitems(items):
     """The files that take longest come first, so that both processes end at about the same time."""
     items.sort(key=lambda item: FIRST.index(item.path.stem) if item.path.stem in FIRST
                else len(FIRST))
+
+
+def pytest_terminal_summary(terminalreporter):
+    """Tells which studies were computed by older code, or other packages, than are here."""
+    from slamlib.studies.runs import made_by
+    old = [file.stem for file in sorted((ROOT / "notebooks" / "studies").glob("*.csv"))
+           if not file.read_text(encoding="utf-8").startswith(made_by())]
+    if old:
+        terminalreporter.write_line(
+            f"Studies of other code or packages, which 'make studies' renews: {', '.join(old)}.")
 
 
 @pytest.fixture(scope="module")
@@ -76,17 +81,15 @@ BROUGHT = ("new seed", "no_truth", "wheels_only", "waits", "one_pose", "backs_up
 def copied(target, chapters, first=None):
     """Write notebooks to a folder, by a pattern of their names.
 
-    A code cell `first` (str) stands before all others. Studies run on the short path only, and what
-    cells simulate by themselves on few drives.
+    A code cell `first` (str) stands before all others. What stands beside them comes along.
     """
     import nbformat
-    target.mkdir()
+    shutil.copytree(ROOT / "notebooks" / "studies", target / "studies")
+    shutil.copy(ROOT / "notebooks" / "graph.svg", target)
     for source in sorted((ROOT / "notebooks").glob(chapters)):
         book = nbformat.read(source, as_version=4)
         if first:
             book.cells.insert(1, nbformat.v4.new_code_cell(first, id="first"))
-        for cell in book.cells:
-            cell.source = cell.source.replace('path="long", ', '').replace("range(100)", "range(9)")
         nbformat.write(book, target / source.name)
 
 
@@ -108,7 +111,7 @@ def is_running(number):
 
 @pytest.fixture(scope="session")
 def kept(tmp_path_factory):
-    """The folder of executed notebooks and studies that the builds of these tests keep."""
+    """The folder of executed notebooks that the builds of these tests keep."""
     return tmp_path_factory.mktemp("kept")
 
 
@@ -120,12 +123,6 @@ def built_elsewhere(*arguments, **options):
     from slamlib.report import build_report
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
         return process.submit(build_report, *arguments, **options).result()
-
-
-@pytest.fixture
-def few_seeds(monkeypatch):
-    """Studies in the pages that a test builds run on few seeds."""
-    monkeypatch.setenv("SLAMLIB_SEEDS", STUDY_SEEDS)
 
 
 @pytest.fixture(scope="session")
@@ -160,9 +157,6 @@ def report_on_all(tmp_path_factory, kept):
         shutil.copytree(data / "new seed", data / name)
         np.savetxt(data / name / "ArucoReading.txt", rows, fmt="%d %d" + 9 * " %.6g")
     copied(folder / "notebooks", "*.ipynb")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("SLAMLIB_SEEDS", STUDY_SEEDS)
-        built_elsewhere(folder / "notebooks", data, folder / "report", folder / "results",
-                        datasets=[each.name for each in data.iterdir() if each.is_dir()],
-                        kept=kept)
+    built_elsewhere(folder / "notebooks", data, folder / "report", folder / "results",
+                    datasets=[each.name for each in data.iterdir() if each.is_dir()], kept=kept)
     return folder

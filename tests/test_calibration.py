@@ -30,7 +30,7 @@ from slamlib.robust.linear import NormalEquations, build_problem, linear_solutio
 from slamlib.robust.measurements import Noise, measure
 from slamlib.robust.solution_doubts import GROUPS, solution_doubts
 from slamlib.studies.montecarlo import antenna_error
-from slamlib.studies.simulation import mislabel, simulate
+from slamlib.studies.simulation import simulate
 
 REAL_LOGS = Path(__file__).parents[2] / "shared" / "real_logs"      # where they are present
 # Sensors of which every entry differs from its default.
@@ -391,9 +391,8 @@ def test_no_doubt_about_clean_drives():
     """Of all slips, with late ranges and wrong labels too; a long one is in test_uwb."""
     doubts = []
     for seed, slip in enumerate([0.0, 3e-4, 1e-3, 3e-3, 1e-2] * 2):
-        dataset, _ = simulate("short", 100 + seed, slip=slip, late_ranges=0.1 * (seed % 2))
-        if seed % 3 == 2:
-            dataset = mislabel(dataset, 0.02, seed)
+        dataset, _ = simulate("short", 100 + seed, slip=slip, late_ranges=0.1 * (seed % 2),
+                              mislabelled=0.02 * (seed % 3 == 2))
         markers = estimate(dataset.without("uwb"))
         both = estimate(dataset, previous=markers)
         doubts += [doubt.what for found in (markers, both) for doubt in solution_doubts(found)]

@@ -10,7 +10,7 @@ from numeric import central_differences, decided, known_noise, slam_trial
 from scipy.integrate import quad
 
 from slamlib import estimate, studies
-from slamlib.core.evaluation import align, ate, nees_band
+from slamlib.core.evaluation import ate, nees_band
 from slamlib.core.graph import GUESS_PRIOR_SIGMA
 from slamlib.core.kernels import KERNELS, ONE_SIDED
 from slamlib.core.odometry import dead_reckoning
@@ -33,7 +33,7 @@ from slamlib.robust.optimize import optimize
 from slamlib.robust.pipeline import fit_from_previous
 from slamlib.robust.solution_doubts import solution_doubts
 from slamlib.solve import problem_solution
-from slamlib.studies import kernels, montecarlo, plaza, starts
+from slamlib.studies import kernels, montecarlo, starts
 from slamlib.studies.simulation import manoeuvre, simulate
 
 # A vehicle of exact odometry, so that only the geometry of the ranges matters.
@@ -416,21 +416,6 @@ def test_ranges_calibrate_themselves(offset, scale, long_drive):
         assert doubts == ["range-offset"] and (sigma < [0.1, 0.01]).all()
     error, squared = montecarlo.antenna_error(found, truth)
     assert squared.mean() < 6 and error.max() < 0.2
-
-
-@pytest.mark.slow
-def test_plaza_2_is_solved():
-    dataset, truth = plaza.read_plaza2()
-    found = estimate(dataset)
-    motion = align(found.poses, truth.poses)
-    beacons = compose(motion, np.column_stack([found.antenna_in_world, np.zeros(4)]))[:, :2]
-    assert ate(found.poses, truth.poses, aligned=True) < 0.35
-    scale, sigma = found.c[SCALE], np.sqrt(found.c_covariance[SCALE, SCALE])
-    assert abs(scale - plaza.ranges_over_distances(2)[0]) < 2 * sigma < 0.04
-    doubts = {doubt.what for doubt in solution_doubts(found)}
-    assert "range-offset" in doubts and doubts <= {"range-offset", "tag-offset"}
-    assert np.hypot(*(beacons - truth.antenna_in_world).T).max() < 0.5      # 1 % of 50 m
-    assert not found.doubts and dataset.ticks.shape == (3881, 2)
 
 
 def test_one_optimum_is_reached_from_two_starts():

@@ -162,7 +162,7 @@ def learned_row(result, drive) -> dict:
            "factor": f"{factor:.2f} ± {factor * factor_sigma:.2f}", "step": result.model,
            "sightings": len(result.rejected), "rejected": result.rejected.sum()}
     if drive.origin == "simulated":
-        wrong = mislabelled(measurements, drive.truth)
+        wrong = mislabelled(measurements.dataset, drive.truth)
         found = wrong & result.rejected
         row["of wrong labels"] = f"{found.sum()} of {wrong.sum()}"
     return row

@@ -1,5 +1,8 @@
-"""Studies that justify choices: Monte Carlo trials, comparisons, a real log; `run` runs a trial."""
+"""Studies that justify choices: simulated drives, Monte Carlo trials, comparisons.
 
-from slamlib.studies.runs import run
+`rows` are those of a study that a notebook shows; `run` runs a trial.
+"""
 
-__all__ = ["run"]
+from slamlib.studies.runs import rows, run
+
+__all__ = ["rows", "run"]

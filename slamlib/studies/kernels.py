@@ -5,12 +5,14 @@ from functools import partial
 
 import numpy as np
 
+from slamlib.core import se2
 from slamlib.core.increments import TYPICAL_SLIP
 from slamlib.core.kernels import KERNELS, ONE_SIDED
 from slamlib.core.records import Dataset, Truth
+from slamlib.core.sightings import sightings_by_frame
 from slamlib.robust.fit import Fit, accepted_measurements, narrow_kernels, refine, residuals
 from slamlib.robust.initialization import odometry_state, trilaterated_antennas
-from slamlib.robust.linear import State, build_problem, state_from_arrays
+from slamlib.robust.linear import State, build_problem
 from slamlib.robust.measurements import Measurements, measure
 from slamlib.robust.result import slam_result
 from slamlib.studies.montecarlo import antenna_error, drive, judged
@@ -63,7 +65,6 @@ def compare(seed: int, kind: str, methods: tuple, markers: bool = True, **option
     if kind == "sightings":
         dataset = dataset.without("uwb")
     measurements = measure_with_known_noise(dataset)
-    wrong = mislabelled(measurements, truth)
     start = rounds(measurements)
     numbers = {}
     for method in methods:
@@ -75,29 +76,25 @@ def compare(seed: int, kind: str, methods: tuple, markers: bool = True, **option
             numbers[f"{method} antenna error"] = np.sqrt(np.mean(error**2))
             numbers[f"{method} antenna nees"] = nees.mean()
         else:
-            distance = _mahalanobis(fit.problem, fit.state)
+            wrong = mislabelled(dataset, truth)
+            of_sightings, _ = residuals(fit.problem, fit.state)
+            distance = np.linalg.norm(of_sightings, axis=1)
             lost = fit.problem.accepted.sightings.kept(distance) < 0.5
             numbers[f"{method} wrong rejected"] = lost[wrong].mean() if wrong.any() else np.nan
             numbers[f"{method} good lost"] = lost[~wrong].mean()
     return numbers
 
 
-def mislabelled(measurements: Measurements, truth: Truth) -> np.ndarray:
-    """(s,) bool, sightings of a simulated drive that have another marker's label, by its Truth.
+def mislabelled(dataset: Dataset, truth: Truth) -> np.ndarray:
+    """(s,) bool, `Sightings` of a simulated drive that have another marker's label, by its Truth.
 
     False where the Truth does not have the marker.
     """
-    m = measurements
-    known = np.isin(m.marker, truth.marker)
-    row = np.searchsorted(truth.marker, m.marker[known])
-    markers = np.full((len(m.marker), 3), np.nan)
-    markers[known] = truth.marker_in_world[row]
-    antennas = np.zeros((len(m.antenna), 2))
-    state = state_from_arrays(m, truth.poses[m.frame], markers, antennas, m.calibration.stated)
-    return _mahalanobis(build_problem(m, "arc"), state)**2 > MIN_MISLABELLED_SQUARED
-
-
-def _mahalanobis(problem, state):
-    """Distances (s,) of the sightings from those of a State, in their standard deviations."""
-    of_sightings, _ = residuals(problem, state)
-    return np.linalg.norm(of_sightings, axis=1)
+    seen = sightings_by_frame(dataset.sightings)
+    known = np.isin(seen.marker, truth.marker)
+    marker = truth.marker_in_world[np.searchsorted(truth.marker, seen.marker[known])]
+    pose = truth.poses[seen.frame[seen.row[known]]]
+    distance = se2.squared_distances(seen.z[known], se2.between(pose, marker), seen.C[known])
+    wrong = np.zeros(len(known), bool)
+    wrong[known] = distance > MIN_MISLABELLED_SQUARED
+    return wrong

@@ -1,6 +1,6 @@
 """Trials of the methods of problems 2 to 4: one simulated drive, judged against its truth.
 
-A trial is a function of a seed and of options that returns a dict of numbers. `memory.run` runs it
+A trial is a function of a seed and of options that returns a dict of numbers. `studies.run` runs it
 over many seeds. Options that a trial does not name are those of `simulation.simulate`.
 """
 
@@ -9,8 +9,9 @@ from dataclasses import replace
 import numpy as np
 
 from slamlib import estimate, fuse, fuse_increments, localize
-from slamlib.core import odometry
+from slamlib.core import odometry, se2
 from slamlib.core.evaluation import anees, ate, position_sigmas
+from slamlib.core.hint import Fusion
 from slamlib.core.records import Dataset, Truth
 from slamlib.core.sightings import sightings_by_frame
 from slamlib.robust.fit import refine
@@ -18,13 +19,14 @@ from slamlib.robust.result import slam_result
 from slamlib.studies.simulation import distances, simulate
 
 PROBLEM2_METHODS = {
-    "odometry": lambda dataset: odometry.dead_reckoning(dataset.ticks, dataset.vehicle),
+    "odometry": lambda dataset: Fusion(
+        *odometry.equation2(dataset.ticks, dataset.vehicle), rejected=0),
     "ArUco": lambda dataset: localize(dataset.aruco),
     "naive": lambda dataset: localize(dataset.aruco, shared_errors=False),
     "hint": fuse_increments,
     "exact hint": lambda dataset: fuse_increments(dataset, odometry.first_order),
     "fused": fuse}
-MEMORY_METHODS = ("markers", "problem 3", "problem 4", "known", "independent")
+MEMORY_METHODS = ("markers", "problem 3", "problem 4", "independent")
 
 
 def drive(seed: int, poses: int | None = None, **options) -> tuple[Dataset, Truth]:
@@ -47,21 +49,15 @@ def problem2_trial(seed: int, methods: tuple = tuple(PROBLEM2_METHODS), **option
 
     Returns
     -------
-    dict of numbers for each of `methods`: "nees", the mean over the measured poses, and "ate" in m
-    (of odometry the ATE only).
+    dict of numbers for each of `methods`: "nees", the mean over the measured poses, and "ate" in m.
     """
     dataset, truth = drive(seed, **options)
     frame = sightings_by_frame(dataset.aruco).frame
-    true = truth.poses[frame]
     numbers = {}
     for method in methods:
         found = PROBLEM2_METHODS[method](dataset)
-        if method == "odometry":
-            numbers["odometry ate"] = ate(found[frame], true)
-        elif len(found.poses) == len(frame):
-            numbers |= judged(method, found.poses, found.covariances, true)
-        else:
-            numbers |= judged(method, found.poses[frame], found.covariances[frame], true)
+        rows = slice(None) if len(found.poses) == len(frame) else frame
+        numbers |= judged(method, found.poses[rows], found.covariances[rows], truth.poses[frame])
     return numbers
 
 
@@ -94,17 +90,15 @@ def correlated_errors(seed: int, correlation: float, **options) -> dict:
 
     Returns
     -------
-    dict of "nees" and aligned "ate" in m of MEMORY_METHODS, as "markers nees"; "known" is problem 3
-    with the `known_shares` of information, "independent" with all of it. Also of problem 3 the mean
-    "share" of its information that a sighting keeps, and the "residuals", the correlation of those
-    of neighbours.
+    dict of "nees" and aligned "ate" in m of MEMORY_METHODS, as "markers nees"; "independent" is
+    problem 3 with every sighting counted in full. Also of problem 3 the mean "share" of its
+    information that a sighting keeps, and the "residuals", the correlation of those of neighbours.
     """
     dataset, truth = drive(seed, memory=correlation, **options)
     markers = localize(dataset.aruco)
     problem3 = estimate(dataset.without("uwb"))
-    known = known_shares(problem3.fit.problem.measurements, correlation)
-    results = (markers, problem3, estimate(dataset, previous=problem3),
-               _with_shares(problem3.fit, known), _with_shares(problem3.fit, np.ones_like(known)))
+    problem4 = estimate(dataset, previous=problem3)
+    results = (markers, problem3, problem4, _counted_in_full(problem3.fit))
     numbers = {"share": problem3.share.mean(), "residuals": problem3.correlation[0]}
     for name, found in zip(MEMORY_METHODS, results, strict=True):
         true = truth.poses[markers.frame] if found is markers else truth.poses
@@ -112,33 +106,15 @@ def correlated_errors(seed: int, correlation: float, **options) -> dict:
     return numbers
 
 
-def _with_shares(fit, shares):
-    """The SlamResult where sightings keep these shares (s,) of information, with a Fit's noise."""
-    accepted = fit.problem.accepted.with_shares([shares, np.ones(0)])
-    return slam_result(refine(replace(fit.problem, accepted=accepted), fit.state, accept=None))
-
-
-def known_shares(measurements, correlation: float) -> np.ndarray:
-    """Shares (s,) of its information that a sighting keeps, by the true correlation of errors.
-
-    The design effect, as in slamlib.robust.error_memory: 1 / (1 + sum of the correlations with the
-    errors of all other sightings of its marker), which is `correlation` to the power of the number
-    of camera frames between them.
-    """
-    marker = measurements.marker_row
-    pose = measurements.frame[measurements.sightings.row]
-    interval = np.median(np.diff(np.unique(pose)))
-    lag = np.abs(pose[:, None] - pose) / interval
-    same_marker = marker[:, None] == marker
-    correlations = np.where(same_marker, correlation**lag, 0.0)           # 1 with itself
-    return 1 / correlations.sum(axis=1)
+def _counted_in_full(fit):
+    """The SlamResult with the noise of a Fit, where every sighting keeps all its information."""
+    accepted = fit.problem.accepted
+    in_full = accepted.with_shares(np.ones_like(each.share) for each in accepted)
+    return slam_result(refine(replace(fit.problem, accepted=in_full), fit.state, accept=None))
 
 
 def antenna_error(found, truth: Truth) -> tuple[np.ndarray, np.ndarray]:
     """Distances (a,) in m of a SlamResult's antennas from the truth, and their NEES (a,)."""
     row = np.searchsorted(truth.antenna, found.antenna)
-    true = truth.antenna_in_world[row]
-    error = found.antenna_in_world - true
-    information = np.linalg.inv(found.antenna_covariance)
-    nees = np.einsum("ni,nij,nj->n", error, information, error)
-    return distances(found.antenna_in_world, true), nees
+    error = found.antenna_in_world - truth.antenna_in_world[row]
+    return np.linalg.norm(error, axis=1), se2.squared_norms(error, found.antenna_covariance)

@@ -13,10 +13,11 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+from scipy.integrate import cumulative_simpson
 
 from slamlib.core import se2
 from slamlib.core.errors import require
-from slamlib.core.odometry import cumulative, dead_reckoning
+from slamlib.core.odometry import dead_reckoning
 from slamlib.core.records import AntennaGuess, ArucoReadings, Dataset, Truth, UwbReadings
 from slamlib.core.vehicle import TABLE_2, Vehicle
 
@@ -119,13 +120,6 @@ def misguess(dataset: Dataset, position: np.ndarray, error: float, seed: int) ->
     return replace(dataset, antenna_guess=guess)
 
 
-def mislabel(dataset: Dataset, fraction: float, seed: int) -> Dataset:
-    """The Dataset with another marker's id at a fraction of its sightings; `seed` as above."""
-    ids, label = np.unique(dataset.aruco.marker, return_inverse=True)
-    read_as = _relabelled(label, len(ids), fraction, np.random.default_rng(seed))
-    return replace(dataset, aruco=replace(dataset.aruco, marker=ids[read_as]))
-
-
 def manoeuvre(legs: list[tuple[float, float]], vehicle: Vehicle = TABLE_2) -> np.ndarray:
     """Counts (n, 2) of the right and left wheel in a drive in arcs, with fractions, without noise.
 
@@ -204,12 +198,7 @@ def _driven_arcs(layout, rounds):
         return np.sum(amplitudes * np.exp(1j * (turns * s + phases)), axis=0)
 
     fine = np.linspace(0, 2 * np.pi * rounds, 10 * layout.poses * rounds + 1)
-    middle = (fine[1:] + fine[:-1]) / 2
-    speed = np.abs(velocity(fine))
-    middle_speed = np.abs(velocity(middle))
-    simpson = (speed[1:] + 4 * middle_speed + speed[:-1]) / 6
-    length = cumulative(simpson) * fine[1]
-
+    length = cumulative_simpson(np.abs(velocity(fine)), x=fine, initial=0.0)
     time = np.linspace(0, 1, layout.poses * rounds)
     frequency = 2 * np.pi * SPEED_PERIODS
     travelled = length[-1] * (time - SPEED_SWING * np.sin(frequency * time) / frequency)

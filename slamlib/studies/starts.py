@@ -27,12 +27,8 @@ COST_TOLERANCE = 1.0         # cost above that of the right optimum: a residual 
 def first_sighting(measurements: Measurements, in_world: np.ndarray,
                    covariances: np.ndarray) -> np.ndarray:
     """(k, 3) markers at their first sightings; parameters as of `consensus_markers`."""
-    return in_world[_first_rows(measurements.marker_row)]
-
-
-def _first_rows(labels):
-    """Row at which each label occurs first, in ascending order of the labels."""
-    return np.unique(labels, return_index=True)[1]
+    _, first = np.unique(measurements.marker_row, return_index=True)
+    return in_world[first]
 
 
 def mean_by_information(measurements: Measurements, in_world: np.ndarray,
@@ -41,19 +37,16 @@ def mean_by_information(measurements: Measurements, in_world: np.ndarray,
 
     Parameters as of `consensus_markers`. Angles are averaged about the most certain sighting's.
     """
-    marker = measurements.marker_row
-    count = len(measurements.marker)
-    by_certainty = np.lexsort((np.linalg.slogdet(covariances).logabsdet, marker))
-    most_certain = in_world[by_certainty[_first_rows(marker[by_certainty])]]
-    difference = se2.difference(in_world, most_certain[marker])
+    certainty = -np.linalg.slogdet(covariances).logabsdet
     information = np.linalg.inv(covariances)
-    weighted = (information @ difference[..., None])[..., 0]
-    total_information = np.zeros((count, 3, 3))
-    total = np.zeros((count, 3))
-    np.add.at(total_information, marker, information)
-    np.add.at(total, marker, weighted)
-    mean = np.linalg.solve(total_information, total[..., None])[..., 0]
-    return most_certain + mean
+    markers = np.zeros((len(measurements.marker), 3))
+    for j in range(len(markers)):
+        rows = np.flatnonzero(measurements.marker_row == j)
+        most_certain = in_world[rows[certainty[rows].argmax()]]
+        difference = se2.difference(in_world[rows], most_certain)
+        weighted = np.einsum("nij,nj->i", information[rows], difference)
+        markers[j] = most_certain + np.linalg.solve(information[rows].sum(axis=0), weighted)
+    return markers
 
 
 def map_of_problem_2(measurements: Measurements, in_world: np.ndarray,
