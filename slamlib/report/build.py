@@ -1,5 +1,6 @@
 """Builds the report: executes the notebooks, which become pages and the chapters of a PDF."""
 
+import hashlib
 import re
 import shutil
 import sys
@@ -8,6 +9,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+
+import nbformat
 
 from slamlib.core.errors import DatasetError, require
 from slamlib.io import files
@@ -23,7 +26,8 @@ from slamlib.report.overview import SolvedDrive, opening, solved_drive, title_pi
 from slamlib.robust.file_doubts import doubts_before_solving
 from slamlib.solve import SENSORS, clear_results, summary_of
 
-PAGES = ".pages"  # name of the file in a report that lists its files; all others are the user's
+# Name of the file in a report that has a digest and lists its files; all others are the user's.
+PAGES = ".pages"
 DATASET_NAME = re.compile("[A-Za-z0-9 ._-]+")  # nothing that Markdown, HTML or Typst interprets
 
 
@@ -70,15 +74,13 @@ def build_report(notebooks: Path, data: Path, report: Path, results: Path,
         with files.locked(kept):
             stages = _executed(books, drives, data, environment, jobs, kept, fresh)
             with files.locked(results), files.locked(report):
-                _say("setting the pages and the PDF")
                 for drive in drives:
                     _write_results(drive, stages, results / drive.name)
                 solved = [solved_drive(drive, results / drive.name) for drive in drives]
-                index = {Path("index"): opening(solved, books)}
-                made = render(index | books, options, title_picture(solved))
-                _write_pages(made, report)
+                shown = {Path("index"): opening(solved, books)} | books
+                names = _write_pages(shown, options, title_picture(solved), report)
     _say(f"built in {time.monotonic() - start:.1f} s")
-    return Report([report / name for name in made], solved, omitted)
+    return Report([report / name for name in names], solved, omitted)
 
 
 def _say(line):
@@ -160,14 +162,38 @@ def _write_results(drive, stages, folder):
         write_summary(folder, summary_of(drive.dataset, drive.truth, rows, doubts))
 
 
-def _write_pages(made, report):
-    """Write pages, {name: bytes}, and remove those of an earlier build that are not made now."""
+def _write_pages(books, options, picture, report):
+    """Set books as pages and a PDF in a report, unless they are there; return their names.
+
+    Those of an earlier build that are not made now are removed.
+    """
     listed = report / PAGES
-    earlier = set()
+    key = _key_of_pages(books, options, picture)
+    earlier_key = ""
+    earlier = []
     with suppress(OSError):
-        earlier = set(listed.read_text(encoding="utf-8").splitlines())
+        earlier_key, *earlier = listed.read_text(encoding="utf-8").splitlines()
+    if earlier_key == key and all((report / name).is_file() for name in earlier):
+        return earlier
+    _say("setting the pages and the PDF")
+    made = render(books, options, picture)
+    listed.unlink(missing_ok=True)
     for name, content in made.items():
         files.write_file(report / name, content)
-    for name in earlier - made.keys():
+    for name in set(earlier) - made.keys():
         (report / name).unlink(missing_ok=True)
-    files.write_file(listed, "\n".join(made).encode())
+    files.write_file(listed, "\n".join([key, *made]).encode())
+    return list(made)
+
+
+def _key_of_pages(books, options, picture):
+    """Return a digest of all that pages show: notebooks, what is beside them, and their look."""
+    state = hashlib.sha256(repr([options, picture]).encode())
+    beside = [file for source in books for file in source.parent.iterdir()
+              if file.suffix in (".svg", ".png", ".jpg")]
+    look = [file for file in Path(__file__).parent.iterdir() if file.is_file()]
+    for file in sorted(beside + look):
+        state.update(file.read_bytes())
+    for source, book in books.items():
+        state.update(f"{source}{nbformat.writes(book)}".encode())
+    return state.hexdigest()
