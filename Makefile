@@ -13,8 +13,9 @@
 
 VENV := .venv
 CANDIDATES := python3 python3.14 python3.13 python3.12 python3.11
+FITS := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))
 PYTHON ?= $(shell for p in $(CANDIDATES); do \
-	"$$p" check_python.py >/dev/null 2>&1 && echo "$$p" && exit; done; echo python3)
+	"$$p" -c '$(FITS)' >/dev/null 2>&1 && echo "$$p" && exit; done; echo python3)
 BIN := $(VENV)/bin
 # Two processes, each of which takes file after file.
 PARALLEL := --numprocesses 2 --dist loadfile --no-loadscope-reorder
@@ -28,18 +29,20 @@ endif
 .PHONY: setup report hand-in test quick studies mutants lab docs strip bench clean
 .DEFAULT_GOAL := report
 
+# What editors and kernels write into notebooks, besides outputs, is not committed.
+STRIP := -m nbstripout --keep-id --extra-keys "metadata.language_info cell.metadata.editable \
+	cell.metadata.slideshow cell.metadata.trusted"
+
 # In a git checkout, also configures the filter that .gitattributes names: git stores notebooks as
 # `make strip` leaves them.
 setup: $(READY)
 	@! git ls-files --error-unmatch .gitattributes >/dev/null 2>&1 || git config --local \
-		filter.slamlib-notebooks.clean "cd \"./$$(git rev-parse --show-prefix)\" && if \
-	[ -x $(BIN)/python ]; then $(BIN)/python strip_notebooks.py; else cat; fi" \
+		filter.nbstripout.clean '"$(CURDIR)/$(BIN)/python" $(STRIP)' \
 		2>/dev/null || echo "git's configuration cannot be written: strip notebooks by 'make strip'." >&2
 
-$(READY): requirements.txt pyproject.toml check_python.py
-	@command -v "$(PYTHON)" >/dev/null || { \
-		echo "There is no $(PYTHON): install Python 3.11 to 3.14 (see environment.md)." >&2; exit 1; }
-	@"$(PYTHON)" check_python.py
+$(READY): requirements.txt pyproject.toml
+	@"$(PYTHON)" -c '$(FITS)' || { echo "Expected CPython 3.11 to 3.14, which gtsam has wheels for \
+	on Linux (glibc) and macOS, found $(PYTHON): see environment.md." >&2; exit 1; }
 	@"$(PYTHON)" -c 'import ensurepip, venv' 2>/dev/null || { \
 		echo "$(PYTHON) lacks venv: install it (on Debian and Ubuntu: apt install python3-venv)." >&2; \
 		exit 1; }
@@ -60,7 +63,7 @@ hand-in: $(READY)
 	@$(BIN)/python -m slamlib hand-in $(ARGS)
 
 test: $(READY)
-	@$(BIN)/python -m nbstripout --verify --keep-id notebooks/*.ipynb >/dev/null || { \
+	@$(BIN)/python $(STRIP) --verify notebooks/*.ipynb >/dev/null || { \
 		echo "There are outputs in the notebooks: remove them with 'make strip'." >&2; exit 1; }
 	@$(BIN)/python -m ruff check .
 	$(BIN)/python -m pytest $(PARALLEL)
@@ -85,10 +88,13 @@ lab: setup
 	$(BIN)/python -m slamlib lab $(ARGS)
 
 docs: $(READY)
-	@$(BIN)/python api_pages.py build/api
+	@PDOC_ALLOW_EXEC=1 $(BIN)/python -m pdoc --docformat markdown --template-directory docs/api \
+		--output-directory build/api slamlib slamlib.core slamlib.robust slamlib.io slamlib.solve \
+		$(subst /,.,$(basename $(wildcard slamlib/notebook/[!_]*.py slamlib/studies/[!_]*.py)))
+	@echo "Pages of all functions: build/api/index.html"
 
 strip: $(READY)
-	@$(BIN)/python strip_notebooks.py notebooks/*.ipynb
+	@$(BIN)/python $(STRIP) notebooks/*.ipynb
 
 bench: $(READY)
 	@$(BIN)/python tests/benchmarks/speed.py

@@ -1,8 +1,25 @@
 """Vehicle SLAM from wheel encoders, ceiling markers and UWB ranges: the numerics of the report.
 
-`core` holds what the chapters derive, `robust` what real drives need beyond it, `io` reads and
-writes files. docs/code.md lists the modules and says where each equation is. The names below are
-the ones that a user needs first; each is imported when it is asked for.
+`slamlib.core` holds what the chapters derive, `slamlib.robust` what real drives need beyond it,
+`slamlib.io` reads and writes files. docs/code.md says where each equation is.
+
+Where to begin:
+
+* read a drive: `slamlib.read_dataset`; take it from arrays: `slamlib.dataset_from_arrays`
+* problem 1, odometry: `slamlib.core.odometry.equation2`
+* problem 2: `slamlib.localize` by the markers alone, `slamlib.fuse_increments` and `slamlib.fuse`
+  with odometry
+* problems 3 and 4, SLAM: `slamlib.estimate`, which returns a `slamlib.SlamResult`
+* a graph in GTSAM in which nothing is decided: `slamlib.count_everything`, `slamlib.build_graph`,
+  `slamlib.initial_values`, `slamlib.solve_graph`
+* what contradicts the files: `slamlib.robust.file_doubts.doubts_before_solving`,
+  `slamlib.robust.solution_doubts.solution_doubts`
+* write what is found: `slamlib.solve.write_results`; solve folders: `slamlib.solve.solve_folders`
+* judge by the truth: `slamlib.read_truth`, `slamlib.core.evaluation`
+* draw: `slamlib.notebook.plotting`, `slamlib.notebook.maps`
+* simulate a drive: `slamlib.studies.simulation.simulate`
+
+The names of `slamlib` itself are imported when they are asked for.
 """
 
 from importlib import import_module

@@ -95,7 +95,8 @@ def _add_options_of_a_build(command):
     _add_path(command, "--results", "folder for the .mat files", "results")
     add = command.add_argument
     add("datasets", nargs="*", metavar="DATASET",
-        help="names of folders in data/ (all of them when none is named)")
+        help="names of folders in data/ (all of them when none is named, but simulated ones where "
+        "there are others)")
     add("--jobs", type=int, default=2, help="notebooks executed at a time")
     add("--fresh", action="store_true",
         help="execute all notebooks, also where nothing changed")
@@ -110,7 +111,7 @@ def _add_solve(commands):
         "over all")
     add("--out", type=Path, required=True, help="folder for the results")
     add("-j", "--jobs", type=int, default=1, help="datasets solved at a time (default 1)")
-    _add_path(command, "--plot", "write a picture of map and errors of the only dataset: a .png, "
+    _add_path(command, "--plot", "write a picture of map and sigmas of the only dataset: a .png, "
               ".pdf or .svg file")
     add("--problem", action="append", default=[], metavar="NAME",
         type=lambda text: text.removeprefix("problem"),
@@ -153,11 +154,9 @@ def _build(options):
         require(options.results.resolve() != other.resolve(), options.results,
                 "another folder for the results: this one is for the datasets or the pages")
     datasets = [_name_in(options.data, each) for each in options.datasets] or None
-    omitted = ()
     if options.out:
         require(not options.out.is_dir(), options.out, "a file to write, found a folder")
         shown = handin.hand_in_options(shown)
-        datasets, omitted = handin.selection(options.data, datasets)
     try:
         report = build_report(
             notebooks, options.data, options.report, options.results, datasets=datasets,
@@ -169,7 +168,7 @@ def _build(options):
     summaries = [read_summary(options.results / drive.name) for drive in report.drives]
     print("\n".join(summary_lines(summaries)), file=sys.stderr)
     if options.out:
-        handin.write_zip(options.out, report, options.results, shown, omitted)
+        handin.write_zip(options.out, report, options.results, shown)
         print(f"hand-in: {options.out.resolve()}", file=sys.stderr)
     else:
         print(f"report: {report.files[0]} and {report.files[-1]}", file=sys.stderr)

@@ -81,10 +81,11 @@ BROUGHT = ("new seed", "no_truth", "wheels_only", "waits", "one_pose", "backs_up
 def copied(target, chapters, first=None):
     """Write notebooks to a folder, by a pattern of their names.
 
-    A code cell `first` (str) stands before all others. The rows of the studies come along.
+    A code cell `first` (str) stands before all others. What stands beside them comes along.
     """
     import nbformat
     shutil.copytree(ROOT / "notebooks" / "studies", target / "studies")
+    shutil.copy(ROOT / "notebooks" / "graph.svg", target)
     for source in sorted((ROOT / "notebooks").glob(chapters)):
         book = nbformat.read(source, as_version=4)
         if first:
@@ -156,5 +157,6 @@ def report_on_all(tmp_path_factory, kept):
         shutil.copytree(data / "new seed", data / name)
         np.savetxt(data / name / "ArucoReading.txt", rows, fmt="%d %d" + 9 * " %.6g")
     copied(folder / "notebooks", "*.ipynb")
-    built_elsewhere(folder / "notebooks", data, folder / "report", folder / "results", kept=kept)
+    built_elsewhere(folder / "notebooks", data, folder / "report", folder / "results",
+                    datasets=[each.name for each in data.iterdir() if each.is_dir()], kept=kept)
     return folder

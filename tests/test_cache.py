@@ -1,13 +1,8 @@
 """A notebook is executed again when something changed that it depends on, and only then."""
 
-import os
-import shutil
-
-import joblib
 import nbformat
 import pytest
 from nbformat.v4 import new_code_cell
-from test_project import save_as_lab
 from test_report import make_data, write
 
 from slamlib.report import build, build_report, cache
@@ -18,87 +13,63 @@ def execute_without_kernel(books, environment, results, jobs, finish):
     for source, book in books.items():
         with open(source.parents[1] / f"count_{source.stem}", "a") as count:
             count.write("x")
-        (results / "short").mkdir(parents=True, exist_ok=True)
-        (results / "short" / f"{source.stem}.mat").write_text("result")
+        (results[source] / "short").mkdir()
+        (results[source] / "short" / f"{source.stem}.mat").write_text("result")
         for cell in book.cells:
             if cell.cell_type == "code":
                 cell.outputs = [nbformat.v4.new_output("stream", text="executed")]
-        finish(source, book, [f"short/{source.stem}.mat"])
+        finish(source, 0.0)
 
 
 @pytest.fixture
 def project(tmp_path, monkeypatch):
     """A folder with two notebooks a and b, whose executions are counted; pages take no time."""
     monkeypatch.setattr(build, "execute", execute_without_kernel)
-    monkeypatch.setattr(build, "render", lambda books, *_, **__: {
+    monkeypatch.setattr(build, "render", lambda books, *_: {
         f"{source.stem}.html": nbformat.writes(book).encode() for source, book in books.items()})
     make_data(tmp_path)
     for name in "ab":
-        write(tmp_path / "notebooks", name, f"# {name}", ("1 + 1",))
+        write(tmp_path / "notebooks", name, f"# {name}", ("1 + 1",), ("3 + 3",))
     return tmp_path
 
 
 def executions(folder, **options):
-    """Build the report; return how often each notebook has been executed so far."""
+    """Build the report on `short`; return how often each notebook has been executed so far."""
     build_report(folder / "notebooks", folder / "data", folder / "report", folder / "results",
-                 kept=folder / "kept", **options)
+                 datasets=["short"], kept=folder / "kept", **options)
     return tuple(len((folder / f"count_{name}").read_text()) for name in "ab")
 
 
-def pages(folder):
-    return [(folder / "report" / f"{name}.html").read_bytes() for name in "ab"]
-
-
-def test_without_a_change_nothing_is_executed_and_results_that_are_gone_are_written_again(
-        project, capsys):
+def test_without_a_change_nothing_is_executed_and_lost_results_are_written_again(project, capsys):
     assert executions(project) == (1, 1)
-    before = pages(project)
-    capsys.readouterr()
-    assert executions(project) == (1, 1)
-    told = capsys.readouterr().err
-    assert told.count("nothing changed, not executed again") == 2 and "built in" in told
-    assert pages(project) == before
-    a, b = (project / "results" / "short" / name for name in ("a.mat", "b.mat"))
+    pages = [(project / "report" / f"{name}.html").read_bytes() for name in "ab"]
+    a, b = (project / "results" / "short" / f"{name}.mat" for name in "ab")
     a.write_text("changed")
     b.unlink()
+    capsys.readouterr()
     assert executions(project) == (1, 1)
+    assert "2 of 2: b, nothing changed" in capsys.readouterr().err
+    assert [(project / "report" / f"{name}.html").read_bytes() for name in "ab"] == pages
     assert a.read_text() == b.read_text() == "result"
 
 
-def test_a_changed_dataset_executes_all_and_fresh_does_so_without_a_change(project):
-    """Another selection and back executes each notebook once for each."""
-    assert executions(project, datasets=["short"]) == (1, 1)
-    (project / "data" / "long" / "encoderReading.txt").write_text("1 0 0\n2 3 3\n")
-    assert executions(project, datasets=["short"]) == (1, 1)  # not selected
-    assert executions(project) == (2, 2)
-    assert executions(project, datasets=["short"]) == executions(project) == (2, 2)
-    (project / "data" / "short" / "encoderReading.txt").write_text("1 0 0\n2 3 3\n")
-    assert executions(project, datasets=["short"]) == (3, 3)
-    assert executions(project, datasets=["short"], fresh=True) == (4, 4)
-    assert executions(project, datasets=["short"]) == (4, 4)
+@pytest.mark.parametrize("change, is_set", [
+    (lambda folder: None, False),
+    (lambda folder: (folder / "report" / "a.html").unlink(), True),
+    (lambda folder: (folder / "notebooks" / "picture.svg").write_text("<svg/>"), True)])
+def test_pages_are_set_again_only_where_one_is_lost_or_shows_something_else(
+        project, capsys, change, is_set):
+    executions(project)
+    change(project)
+    capsys.readouterr()
+    executions(project)
+    assert ("setting the pages" in capsys.readouterr().err) == is_set
+    assert (project / "report" / "a.html").is_file()
 
 
-def test_the_versions_used_last_are_kept_and_other_notebooks_are_left_alone(tmp_path):
-    kept, book = tmp_path / "kept", nbformat.v4.new_notebook()
-    sources = [tmp_path / name for name in ("a.ipynb", "a.b.ipynb", "[a].ipynb")]
-    for source in sources:
-        cache.keep(kept, source, "0", book, tmp_path, [])
-
-    def is_kept(source, key):
-        return cache.recall(kept, source, key, book, tmp_path) is not None
-
-    for key in "1234":
-        assert is_kept(sources[0], "0")  # used, so it stays
-        cache.keep(kept, sources[0], key, book, tmp_path, [])
-    assert [key for key in "01234" if is_kept(sources[0], key)] == list("0234")
-    assert all(is_kept(source, "0") for source in sources[1:])
-    assert len(list(kept.iterdir())) == cache.VERSIONS + 2
-
-
-def executed(folder):
-    """The executed notebook a that is kept."""
-    file, = (folder / "kept").glob("a.*.executed")
-    return file
+def test_fresh_executes_all_without_a_change(project):
+    assert executions(project) == (1, 1)
+    assert executions(project, fresh=True) == (2, 2)
 
 
 def add(folder, name):
@@ -109,7 +80,7 @@ def add(folder, name):
 
 
 def cells_changed(change):
-    """What changes the list of cells of notebook a: its text and a code cell, and another one."""
+    """What changes the list of cells of notebook a: its text and two code cells."""
     def changed(folder):
         book = nbformat.read(folder / "notebooks" / "a.ipynb", as_version=4)
         change(book.cells)
@@ -117,68 +88,58 @@ def cells_changed(change):
     return changed
 
 
+def kept(folder):
+    return folder / "kept" / "a" / cache.EXECUTED
+
+
 @pytest.mark.parametrize("change, counts", [
-    (lambda folder: executed(folder).unlink(), (2, 1)),
-    (lambda folder: executed(folder).write_bytes(executed(folder).read_bytes()[:-9]), (2, 1)),
-    (lambda folder: joblib.dump([1, 2, 3], executed(folder)), (2, 1)),
+    (lambda folder: kept(folder).unlink(), (2, 1)),
+    (lambda folder: kept(folder).write_bytes(kept(folder).read_bytes()[:-9]), (2, 1)),
     (cells_changed(lambda cells: cells[1].update(source="1 + 2")), (2, 1)),
     (cells_changed(lambda cells: cells.append(new_code_cell("2 + 2"))), (2, 1)),
     (cells_changed(lambda cells: cells.pop()), (2, 1)),
-    (cells_changed(lambda cells: cells.insert(0, cells.pop())), (2, 1)),
+    (cells_changed(lambda cells: cells.insert(1, cells.pop())), (2, 1)),
     (cells_changed(lambda cells: cells[1].metadata.update(tags=["lab-only"])), (2, 1)),
-    (cells_changed(lambda cells: cells[1].metadata.update(tags=["raises-exception"])), (2, 1)),
-    (cells_changed(lambda cells: cells[1].metadata.update(tags=["hide-input"])), (1, 1)),
+    (cells_changed(lambda cells: cells[0].update(source="# a, changed")), (1, 1)),
+    (cells_changed(lambda cells: cells[1].update(
+        outputs=[nbformat.v4.new_output("stream", text="saved")], execution_count=7)), (1, 1)),
     (lambda folder: add(folder, "data/short/new.txt"), (2, 2)),
+    (lambda folder: add(folder, "data/long/new.txt"), (1, 1)),
     (lambda folder: add(folder, "notebooks/helper.py"), (2, 2)),
-    (lambda folder: add(folder, "notebooks/a/report/c.py"), (2, 2)),
-    (lambda folder: add(folder, "notebooks/helpers/__pycache__/c.pyc"), (1, 1)),
-    (lambda folder: add(folder, "notebooks/.ipynb_checkpoints/a.ipynb"), (1, 1)),
-    (lambda folder: add(folder, "notebooks/results/a/b.mat"), (1, 1)),
-    (lambda folder: add(folder, "notebooks/helpers/d.ipynb"), (1, 1)),
-    (lambda folder: os.environ.update(SLAMLIB_OWN="x"), (2, 2)),
-    (lambda folder: os.environ.update(OWN="x", PYTHON="python3"), (1, 1))])
-def test_what_a_notebook_depends_on_and_damage_count_and_nothing_else(
-        project, monkeypatch, change, counts):
-    for name in ("SLAMLIB_OWN", "OWN", "PYTHON"):
-        monkeypatch.setenv(name, "")                     # undone at the end
-    cells_changed(lambda cells: cells.append(new_code_cell("3 + 3")))(project)
-    assert executions(project) == executions(project) == (1, 1)
+    (lambda folder: add(folder, "notebooks/studies/rows.csv"), (2, 2)),
+    (lambda folder: add(folder, "notebooks/__pycache__/c.pyc"), (1, 1)),
+    (lambda folder: add(folder, "notebooks/.ipynb_checkpoints/a.ipynb"), (1, 1))])
+def test_what_a_notebook_depends_on_and_damage_count_and_nothing_else(project, change, counts):
+    assert executions(project) == (1, 1)
     change(project)
     assert executions(project) == executions(project) == counts
 
 
-def test_slamlib_and_the_packages_are_among_what_matters(monkeypatch, tmp_path):
+def test_changed_prose_is_shown_with_the_outputs_that_were_kept(project):
+    executions(project)
+    write(project / "notebooks", "a", "New prose.", "# a", ("1 + 1",), "More.", ("3 + 3",))
+    executions(project)
+    page = (project / "report" / "a.html").read_text()
+    order = [page.index(text) for text in ("New prose.", "executed", "More.")]
+    assert order == sorted(order)
+
+
+@pytest.mark.parametrize("name, is_seen", [("core/a.py", True), ("notebook/a.mplstyle", True),
+                                           ("report/a.py", False)])
+def test_slamlib_s_code_counts_but_for_the_report(monkeypatch, tmp_path, name, is_seen):
     def key():
         source = tmp_path / "notebooks" / "a.ipynb"
-        return cache.keys({source: nbformat.v4.new_notebook()}, [], {})[source]
+        return cache.keys({source: nbformat.v4.new_notebook()}, [])[source]
 
-    found = [key()]
-    (tmp_path / "site" / "package-1.0.dist-info").mkdir(parents=True)
-    monkeypatch.syspath_prepend(tmp_path / "site")
-    found.append(key())
-    (tmp_path / "site" / "package-1.0.dist-info").rename(tmp_path / "site/package-1.1.dist-info")
-    found.append(key())
-    (tmp_path / "site" / "other.egg-info").mkdir()          # beside the sources, and of no version
-    (tmp_path / "site" / "slamlib-9.dist-info").mkdir()
-    copied = shutil.copytree(cache.SLAMLIB, tmp_path / "elsewhere")
-    monkeypatch.setattr(cache, "SLAMLIB", copied)                            # as by pip install
-    assert key() == found[-1]
-    monkeypatch.setattr(cache, "SLAMLIB", tmp_path)
-    assert len({*found, key()}) == 4
+    add(tmp_path / "slamlib", "core/b.py")
+    monkeypatch.setattr(cache, "SLAMLIB", tmp_path / "slamlib")
+    before = key()
+    add(tmp_path / "slamlib", name)
+    assert (key() != before) == is_seen
 
 
-def test_saved_outputs_and_changed_prose_cost_no_execution(project, capsys):
-    executions(project)
-    before = pages(project)
-    for name in "ab":
-        save_as_lab(project / "notebooks" / f"{name}.ipynb")
-    assert executions(project) == (1, 1)
-    assert capsys.readouterr().err.count("nothing changed, not executed again") == 2
-    outputs = [[cell.get("outputs") for cell in nbformat.reads(page.decode(), 4).cells]
-               for page in (*before, *pages(project))]
-    assert outputs[:2] == outputs[2:] and "executed" in str(outputs)
-    write(project / "notebooks", "a", "New prose.", "# a, changed", "More.", ("1 + 1",), "An end.")
-    assert executions(project) == (1, 1)
-    page = pages(project)[0].decode()
-    order = [page.index(text) for text in ("New prose.", "More.", "executed", "An end.")]
-    assert order == sorted(order)
+def test_the_packages_count(monkeypatch, tmp_path):
+    books = {tmp_path / "a.ipynb": nbformat.v4.new_notebook()}
+    before = cache.keys(books, [])
+    monkeypatch.setattr(cache, "version", lambda package: "99")
+    assert cache.keys(books, []) != before

@@ -21,8 +21,10 @@ from slamlib.studies.simulation import simulate, write_dataset
 
 SOLVE = """from slamlib.notebook import *
 from slamlib.solve import PROBLEMS, find
-for problem in PROBLEMS:
-    solved(start(), **{problem: lambda drive: find(problem, drive.dataset)})"""
+for drive in start():
+    for problem in PROBLEMS:
+        with attempt(drive, problem):
+            write_results(drive, problem, find(problem, drive.dataset))"""
 
 
 def drive_of(name="mine", first=40):
@@ -41,8 +43,7 @@ def handed(tmp_path_factory):
     write_dataset(folder / "data" / "stand_in", simulated.first(30),
                   replace(truth, poses=truth.poses[:30]))
     write(folder / "notebooks", "A_more", "# A. More\n\nOnly if asked for.")
-    write(folder / "notebooks", "1_all", "# 1. All", (SOLVE,), "## Middle\n\nRead this.",
-          "## Files\n\nOf another folder.", "## Explore\n\nMove the slider.")
+    write(folder / "notebooks", "1_all", "# 1. All", (SOLVE,), "## 1.1 Middle\n\nRead this.")
     (folder / "report.toml").write_text('author = "Ada"\nproblem2 = "fused"\n')
     (folder / "report").mkdir()
     (folder / "report" / "index.html").write_text("the pages of the usual build")
@@ -72,7 +73,7 @@ def test_the_pdf_is_without_what_is_for_screens_and_the_usual_pages_stay(handed)
     folder, archive = handed
     text = re.sub(r"\s+", " ", text_of(archive.read("report.pdf"), folder))
     assert "1.1 Middle" in text and "Read this." in text and "Ada" in text
-    assert not re.search("Explore|slider|another folder|is handed in|asked for|stand_in", text)
+    assert not re.search("is handed in|asked for|stand_in", text)
     assert [file.name for file in (folder / "report").iterdir()] == ["index.html"]
 
 
@@ -100,29 +101,15 @@ def test_equal_input_gives_equal_bytes_and_the_date_is_fixed(handed, monkeypatch
     assert (folder / "new" / "second.zip").read_bytes() == before
     assert {entry.date_time for entry in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
     told = capsys.readouterr().err
-    assert "1_all: nothing changed, not executed again" in told
-    assert "hand-in: without stand_in, which are simulated" in told
+    assert "1 of 1: 1_all, nothing changed" in told
+    assert "left out, because simulated: stand_in" in told
     assert f"hand-in: {(folder / 'new' / 'second.zip').resolve()}\n" in told
     assert [file.name for file in (folder / "new").iterdir()] == ["second.zip"]
 
 
-def test_appendices_and_sections_for_screens_are_left_out_unless_they_are_asked_for():
-    options = handin.hand_in_options(Options(leave_out={"B": "here"}))
-    assert options.appendix is False
-    assert options.leave_out == {"Explore": "", "Files": "", "B": "here"}
-    assert handin.hand_in_options(Options(appendix=True)).appendix is True
-
-
-def test_simulated_datasets_are_left_out_where_there_are_recorded_ones_only(tmp_path):
-    simulated, truth = simulate("short", seed=4)
-    simulated, truth = simulated.first(30), replace(truth, poses=truth.poses[:30])
-    write_dataset(tmp_path / "short", simulated, truth)
-    assert handin.selection(tmp_path) == (None, [])  # as of a report on all: nothing is executed
-    write_dataset(tmp_path / "mine", simulated, None)
-    assert handin.selection(tmp_path) == (["mine"], ["short"])
-    assert handin.selection(tmp_path, ["short"]) == (["short"], [])
-    write_dataset(tmp_path / "short" / "never", simulated, None)
-    assert handin.selection(tmp_path) == (["mine"], ["short"])
+def test_appendices_are_left_out_unless_report_toml_names_its_chapters():
+    assert handin.hand_in_options(Options()).chapters == ("[0-9]*",)
+    assert handin.hand_in_options(Options(chapters=("1*", "B*"))).chapters == ("1*", "B*")
 
 
 def solved_drive(*problems, **others):

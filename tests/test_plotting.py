@@ -151,7 +151,7 @@ def test_errors_are_in_mm_and_without_truth_the_bands_stand_alone(truth, world):
         assert band.max() == pytest.approx(reach)
 
 
-def test_a_second_result_on_the_same_axes_has_labels_and_an_unknown_role_is_told():
+def test_a_second_result_on_the_same_axes_has_labels():
     result, drive = drive_with()
     for _, axes in plotting.each_drive([drive], rows=2):
         for role, label in (("slam", None), ("fused", None), ("hint", "my hint")):
@@ -159,6 +159,3 @@ def test_a_second_result_on_the_same_axes_has_labels_and_an_unknown_role_is_told
     of = ("", "fused: ", "my hint: ")
     assert {text.get_text() for text in axes[0].figure.legends[0].get_texts()} == {
         f"{each}{entry}" for each in of for entry in ("error", "95 % by the covariance")}
-    for draw in (plotting.trajectory, plotting.curve):
-        with pytest.raises(ValueError, match="role, one of truth, odometry, .*; found 'mine'"):
-            draw(axes[0], np.zeros((2, 3)), "mine")

@@ -1,15 +1,14 @@
 """The project: imports run downwards, installations are complete, notebooks are stripped."""
 
 import ast
-import json
 import re
+import shlex
 import subprocess
 import sys
 import tomllib
 from graphlib import TopologicalSorter
 from importlib.metadata import packages_distributions, requires
 from pathlib import Path
-from types import SimpleNamespace
 
 import nbformat
 import pytest
@@ -18,11 +17,8 @@ from conftest import ROOT
 
 from slamlib.report import notebooks
 
-sys.path.insert(0, str(ROOT))
-import check_python  # noqa: E402
-from strip_notebooks import main, restored  # noqa: E402
-
-PACKAGE, STRIP = ROOT / "slamlib", ROOT / "strip_notebooks.py"
+PACKAGE = ROOT / "slamlib"
+MAKEFILE = (ROOT / "Makefile").read_text()
 FILES = sorted(PACKAGE.rglob("*.py"))
 
 
@@ -126,35 +122,6 @@ def test_what_slamlib_imports_is_a_dependency_or_comes_with_one():
     assert {packages_distributions()[name][0].lower().replace("_", "-") for name in found} <= there
 
 
-def test_the_version_that_check_python_asks_for_is_the_one_that_is_pinned():
-    assert check_python.installed() == check_python.GTSAM
-    asked = (ROOT / "requirements.in").read_text()
-    assert f"gtsam=={'.'.join(check_python.GTSAM)}." in asked
-
-
-RIGHT = {"system": "Linux", "machine": "x86_64", "libc": "glibc", "version": (3, 12, 0)}
-
-
-@pytest.mark.parametrize("wrong, gtsam, said", [
-    ({}, None, None), ({"machine": "riscv64"}, None, "riscv64"), ({"libc": ""}, None, "glibc"),
-    ({"version": (3, 10, 9)}, None, "Python 3.11 to 3.14"),
-    ({"version": (3, 15, 0)}, None, "Python 3.11 to 3.14"),
-    ({"system": "Windows"}, None, "environment.yml"), ({"system": "Windows"}, "4.3", None),
-    ({"system": "Windows"}, "4.2", "WSL2"),
-    ({"system": "Windows", "version": (3, 10, 9)}, "4.3", "WSL2")])
-def test_wrong_python_or_platform_is_one_sentence(monkeypatch, wrong, gtsam, said):
-    """Unless the gtsam of conda is there."""
-    here = SimpleNamespace(**RIGHT | wrong)
-    monkeypatch.setattr(check_python, "installed", lambda: gtsam and gtsam.split("."))
-    monkeypatch.setattr(check_python, "sys", SimpleNamespace(
-        version_info=here.version, executable="python"))
-    monkeypatch.setattr(check_python, "platform", SimpleNamespace(
-        system=lambda: here.system, machine=lambda: here.machine,
-        libc_ver=lambda: (here.libc, ""), python_implementation=lambda: "CPython"))
-    found = check_python.problem()
-    assert found is None if said is None else said in found and "\n" not in found
-
-
 def test_notebooks_are_those_of_the_folder_else_those_beside_the_sources(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert notebooks.notebooks_folder() == ROOT / "notebooks"
@@ -164,67 +131,40 @@ def test_notebooks_are_those_of_the_folder_else_those_beside_the_sources(tmp_pat
 
 # Notebooks as JupyterLab saves them go back to the committed bytes.
 
-NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
-
 
 def save_as_lab(file):
     """Save a notebook as JupyterLab does after a run: with outputs, counts and its metadata."""
     book = nbformat.read(file, as_version=4)
     for number, cell in enumerate(book.cells):
-        cell.metadata |= {"editable": True, "slideshow": {"slide_type": ""},
-                          "tags": cell.metadata.get("tags", [])}
+        cell.metadata |= {"editable": True, "slideshow": {"slide_type": ""}, "trusted": True}
         if cell.cell_type == "code":
             cell.metadata |= {"execution": {"iopub.execute_input": "2026-01-01T00:00:00.0Z"},
-                              "jupyter": {"source_hidden": True}, "collapsed": True,
-                              "scrolled": True, "trusted": True}
+                              "collapsed": True, "scrolled": True}
             cell.outputs = [nbformat.v4.new_output("stream", text="of JupyterLab: \u00e9")]
             cell.execution_count = number
-        else:
-            cell.attachments = {}
     book.metadata |= {
-        "kernelspec": {"display_name": ".venv (3.99)", "language": "python", "name": "python3"},
-        "language_info": {"name": "python", "version": "3.99", "pygments_lexer": "ipython3",
-                          "codemirror_mode": {"name": "ipython", "version": 3}},
+        "language_info": {"name": "python", "version": "3.99", "pygments_lexer": "ipython3"},
         "widgets": {"application/vnd.jupyter.widget-state+json": {"state": {}}}}
     nbformat.write(book, file)
 
 
-def strip(*files, content=b""):
-    return subprocess.run([sys.executable, STRIP, *files], input=content, capture_output=True,
-                          timeout=300)
+def test_what_jupyterlab_saves_is_restored_to_the_byte_by_make_strip(tmp_path):
+    options = re.search(r"^STRIP := ((?:.*\\\n)*.*)$", MAKEFILE, re.MULTILINE)[1]
+    command = [sys.executable, *shlex.split(options.replace("\\\n", " "))]
+    for source in sorted((ROOT / "notebooks").glob("*.ipynb")):
+        saved = tmp_path / source.name
+        saved.write_bytes(source.read_bytes())
+        save_as_lab(saved)
+        assert saved.read_bytes() != source.read_bytes()
+        subprocess.run([*command, saved], check=True, timeout=300)
+        assert saved.read_bytes() == source.read_bytes()
 
 
-def test_what_jupyterlab_saves_is_restored_to_the_byte(tmp_path):
-    saved, committed = [], [restored(source.read_bytes()) for source in NOTEBOOKS]
-    for source, content in zip(NOTEBOOKS, committed):      # the files may hold outputs here
-        saved += [tmp_path / source.name, tmp_path / f"other {source.name}"]
-        saved[-2].write_bytes(content)
-        save_as_lab(saved[-2])
-        saved[-1].write_text(json.dumps(json.loads(content), indent=4), encoding="utf-8")
-        assert content not in (file.read_bytes() for file in saved[-2:])
-    assert strip(content=saved[0].read_bytes()).stdout == committed[0]
-    assert strip(*saved).returncode == 0
-    for number, file in enumerate(saved):
-        assert file.read_bytes() == committed[number // 2]
-        nbformat.validate(nbformat.read(file, as_version=4))
-
-
-def test_what_the_report_reads_stays():
-    cell = nbformat.v4.new_code_cell("1", id="a", metadata={"tags": ["html-only"], "alt": "A dot"})
-    text = nbformat.v4.new_markdown_cell("![](attachment:a.png)", id="b", attachments={
-        "a.png": {"image/png": "AA=="}})
-    book = nbformat.v4.new_notebook(cells=[cell, text], metadata={"slamlib": {"needs": "uwb"}})
-    found = nbformat.reads(restored(nbformat.writes(book).encode()).decode(), 4)
-    assert found.metadata.slamlib == {"needs": "uwb"}
-    assert found.cells == book.cells
-
-
-def test_what_is_no_notebook_is_told_and_left_as_it_is(tmp_path):
-    file = tmp_path / "a.ipynb"
-    for content in (b"not JSON", b"[]", b"{}", b'{"cells": [5], "metadata": {}}', b"\xff",
-                    b'{"cells": [{}], "metadata": {}}'):
-        file.write_bytes(content)
-        assert "a.ipynb is not a notebook: " in main([str(file)])
-        assert file.read_bytes() == content
-    done = strip(content=b"[]")
-    assert done.returncode == 1 and done.stdout == b"" and done.stderr.count(b"\n") == 1
+def test_the_makefile_asks_for_the_python_that_the_project_requires():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert project["requires-python"] == ">=3.11,<3.15"
+    fits = re.search(r"^FITS := (.*)$", MAKEFILE, re.MULTILINE)[1]
+    for version, code in (((3, 10), 1), ((3, 11), 0), ((3, 14), 0), ((3, 15), 1)):
+        with pytest.raises(SystemExit) as ended:
+            exec(fits.replace("sys.version_info[:2]", str(version)))  # noqa: S102
+        assert int(ended.value.code) == code

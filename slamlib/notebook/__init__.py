@@ -1,6 +1,6 @@
 """What cells call: drives and their results, tables of data, figures, the map."""
 
-from slamlib.notebook.drives import Drive, attempted, notices, show_doubts, solved, start
+from slamlib.notebook.drives import Drive, attempt, show_doubts, start, write_results
 from slamlib.notebook.tabular import (
            accuracy,
            antenna_rows,
@@ -11,5 +11,5 @@ from slamlib.notebook.tabular import (
            vehicle_row,
 )
 
-__all__ = ["Drive", "accuracy", "antenna_rows", "attempted", "calibration_rows", "dataset_row",
-           "learned_row", "notices", "show_doubts", "solved", "start", "table", "vehicle_row"]
+__all__ = ["Drive", "accuracy", "antenna_rows", "attempt", "calibration_rows", "dataset_row",
+           "learned_row", "show_doubts", "start", "table", "vehicle_row", "write_results"]

@@ -1,34 +1,26 @@
-"""Drives of a notebook, their results by problem, and notices of what failed or is doubted.
+"""Drives of a notebook: their datasets, the files of their results, and what is said of them.
 
-A notice carries its record in the metadata of the notebook's output. The report's first page
-collects the records from the executed notebooks by `notices`, so the results folders hold the files
-to hand in and nothing else, and a cached notebook keeps its records.
+What fails or is doubted stands in a sentence in the chapter, and in the drive's `summary.json`,
+from which the report's first page has it.
 """
 
 import os
 import re
 import unicodedata
-from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, field
-from itertools import product
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 
-from IPython import get_ipython
 from IPython.display import Markdown, display
-from matplotlib import style
-from matplotlib_inline.backend_inline import set_matplotlib_formats
 
 from slamlib import solve
+from slamlib.core.errors import DatasetError
 from slamlib.core.records import Dataset, Truth
 from slamlib.io.dataset import read_dataset, read_truth
-from slamlib.io.results import write_solution
 from slamlib.io.tables import datasets_in
 from slamlib.notebook import plotting
 from slamlib.studies.simulation import simulate
-
-KEY = "slamlib"  # of records in the metadata of outputs
-RECORDS = {"doubt": solve.Doubt, "failure": solve.Failure}  # types of records by their key
-_WRITTEN = {}  # by the folder of files that this kernel wrote: the cell that did, and its execution
 
 
 @dataclass(frozen=True, eq=False)          # compared by identity, because arrays have no hash
@@ -38,7 +30,6 @@ class Drive:
     name: str
     dataset: Dataset = field(repr=False)
     truth: Truth | None = field(repr=False)
-    made_up: bool = False  # True for a simulated drive that replaces datasets without a sensor
 
     @property
     def origin(self) -> str:
@@ -49,128 +40,88 @@ class Drive:
         return "recorded, truth known" if same else "simulated"
 
 
-def start(sensor: str | None = None) -> list[Drive]:
-    """List of the drives with a sensor, "aruco" or "uwb", the one with the fewest poses first.
+def read_drives(data: Path, names: Iterable[str]) -> list[Drive]:
+    """List of the Drives with these names in a data folder, recorded ones first, then by length.
 
-    A simulated drive replaces them if there is none. The environment variable SLAMLIB_DATA names
-    the data folder; by default it is the nearest `data` in this folder or above it.
-    SLAMLIB_DATASETS selects datasets by name, one a line. Also sets the style of the figures.
-    Raises DatasetError if a dataset does not follow the format, or there is none.
+    Raises DatasetError if a dataset does not follow the format.
     """
-    style.use(plotting.STYLE)
-    set_matplotlib_formats("svg", metadata={"Date": None})
+    drives = [Drive(name, read_dataset(data / name), read_truth(data / name)) for name in names]
+    return sorted(drives, key=lambda drive: (drive.origin == "simulated", len(drive.dataset.ticks)))
+
+
+def without_stand_ins(drives: list[Drive]) -> list[Drive]:
+    """The recorded ones of some Drives, or all where none is recorded."""
+    return [drive for drive in drives if drive.origin != "simulated"] or drives
+
+
+def start(sensor: str | None = None) -> list[Drive]:
+    """List of the drives with a sensor, "aruco" or "uwb", as `read_drives` sorts them.
+
+    Simulated drives are left out where there are recorded ones. If no drive has the sensor, a
+    simulated one stands for them. The environment variable SLAMLIB_DATA names the data folder; by
+    default it is the nearest `data` in this folder or above it. SLAMLIB_DATASETS selects datasets
+    by name, one a line. Also sets the style of the figures. Raises DatasetError if a dataset does
+    not follow the format, or there is none.
+    """
+    plotting.use_style()
     data = _data_folder()
     selected = os.environ.get("SLAMLIB_DATASETS")
     names, _ = datasets_in(data, selected.split("\n") if selected else None)
-    drives = [Drive(name, read_dataset(data / name), read_truth(data / name)) for name in names]
+    drives = read_drives(data, names)
+    if not selected:
+        drives = without_stand_ins(drives)
     if sensor:
         drives = [drive for drive in drives if getattr(drive.dataset, sensor) is not None]
-    return _or_simulated(sorted(drives, key=lambda drive: len(drive.dataset.ticks)))
+    if not drives:
+        display(Markdown(f"*No dataset has {solve.SENSORS[sensor]}: a simulated drive stands for "
+                         "them.*"))
+        drives = [Drive("simulated", *simulate("short", seed=1))]
+    return drives
 
 
-def _or_simulated(drives):
-    """The drives, or a simulated short one and a notice if there is none."""
-    if drives:
-        return drives
-    display(Markdown("*No dataset is left for this chapter: it runs on a simulated drive "
-                     "instead and writes no results.*"))
-    dataset, truth = simulate("short", seed=1)
-    return [Drive("simulated", dataset, truth, made_up=True)]
+def write_results(drive: Drive, problem: str, found) -> None:
+    """Write what a solver found of a problem to the results of a Drive, and say what is doubted.
 
-
-def solved(drives: Iterable[Drive], **solvers: Callable) -> dict | list[dict]:
-    """Results of solvers by problem, as {Drive: result} of the drives on which all succeed.
-
-    Every result is written into the results folder, also of drives on which another problem fails;
-    what fails and what is doubted is shown, there and on the report's first page. A second call for
-    a problem of a drive writes nothing and says so, unless its cell is run again. If no drive is
-    left, a simulated short one replaces them, of which nothing is written. The environment variable
-    SLAMLIB_RESULTS names the results folder; by default it is `results` beside the data folder.
-
-    Parameters
-    ----------
-    drives : iterable of Drive; those without a sensor that a problem needs are left out.
-    solvers : functions of a Drive by problem, names of `solve.PROBLEMS`, that return what
-        `solve.find` returns, such as `problem3=lambda drive: estimate(drive.dataset)`.
-
-    Returns
-    -------
-    dict of results by Drive, or a list of such dicts if there are several solvers.
+    `problem` is a key of `solve.PROBLEMS`, `found` as `solve.find` returns it. The environment
+    variable SLAMLIB_RESULTS names the folder of results; by default it is `results` beside the
+    data folder. Raises DatasetError, which `attempt` tells, if `found` is no solution.
     """
-    drives = _or_simulated([
-        drive for drive in drives
-        if all(solve.allows(drive.dataset, problem) for problem in solvers)])
-    found = {drive: {} for drive in drives}
-    for drive, problem in product(drives, solvers):
-        try:
-            result = solvers[problem](drive)
-            solution = solve.problem_solution(problem, drive.dataset, result)
-        except solve.UNSOLVABLE as error:
-            if drive.made_up:
-                raise
-            failure = solve.failure(problem, drive.dataset, error)
-            _notice(drive, f"The problem “{failure.title}” could not be solved: "
-                           f"{failure.reason}.", failure=failure)
+    solved = _written(drive, problem, found)
+    if isinstance(solved, solve.Failure):
+        raise DatasetError(solved.reason)
+    show_doubts(drive, solved.doubts)
+
+
+@contextmanager
+def attempt(drive: Drive, problem: str | None = None) -> Iterator[None]:
+    """Say in a sentence why a block fails on a Drive, and go on behind it.
+
+    Where the block solves a problem, a key of `solve.PROBLEMS`, its failure is in the results, too.
+    """
+    try:
+        yield
+    except solve.UNSOLVABLE as error:
+        if problem is None:
+            _say(drive, f"left out here: {error}.")
         else:
-            found[drive][problem] = result
-            if not drive.made_up:
-                _write(drive, solution)
-    left = [drive for drive in drives if len(found[drive]) == len(solvers)]
-    if not left:
-        return solved([], **solvers)
-    by_problem = [{drive: found[drive][problem] for drive in left} for problem in solvers]
-    return by_problem if len(solvers) > 1 else by_problem[0]
+            failure = _written(drive, problem, error)
+            _say(drive, f"The problem “{failure.title}” could not be solved: {failure.reason}.")
 
 
-def _write(drive, solution):
-    """Write a Solution of a Drive and show its doubts, or say why its files stay as they are."""
+def _written(drive, problem, found):
+    """The Solution or the Failure that is written of what a solver found, or raised."""
     results = Path(os.environ.get("SLAMLIB_RESULTS") or _data_folder().parent / "results")
-    folder = results / drive.name
-    if _writes(folder / solution.problem):
-        write_solution(folder, solution)
-        show_doubts(drive, solution.doubts)
-    else:
-        _notice(drive, f"the files of {solution.problem} stay those of the first call of solved in "
-                       "this notebook; for comparisons there is attempted.")
-
-
-def _writes(folder):
-    """True for the first call that writes a folder, and where JupyterLab runs its cell again."""
-    request = getattr(get_ipython(), "parent_header", {})
-    cell = request.get("metadata", {}).get("cellId")
-    execution = request.get("header", {}).get("msg_id")
-    if folder in _WRITTEN:
-        first_cell, last_execution = _WRITTEN[folder]
-        if not cell or cell != first_cell or execution == last_execution:
-            return False
-    _WRITTEN[folder] = cell, execution
-    return True
-
-
-def attempted(drives: Iterable[Drive], function: Callable) -> dict:
-    """{Drive: function(Drive)} of the drives on which it can be solved; shows why on others not."""
-    found = {}
-    for drive in drives:
-        try:
-            found[drive] = function(drive)
-        except solve.UNSOLVABLE as error:
-            _notice(drive, f"left out here: {error}.")
-    return found
+    return solve.write_results(results / drive.name, problem, found, drive.dataset, drive.truth)
 
 
 def show_doubts(drive: Drive, doubts: Iterable[solve.Doubt]) -> None:
     """Show each Doubt of a list about a Drive."""
     for doubt in doubts:
-        _notice(drive, doubt.sentence, doubt=doubt)
+        _say(drive, doubt.sentence)
 
 
-def _notice(drive, text, **records):
-    """Show a text about a Drive, with a record by its key in RECORDS for `notices`."""
-    metadata = {}
-    if records and not drive.made_up:
-        entry = {kind: asdict(record) for kind, record in records.items()}
-        metadata = {KEY: {"dataset": drive.name} | entry}
-    display(Markdown(f"**{plain(drive.name)}**: {plain(text)}"), metadata=metadata)
+def _say(drive, sentence):
+    display(Markdown(f"**{plain(drive.name)}**: {plain(sentence)}"))
 
 
 def plain(text: str) -> str:
@@ -181,18 +132,6 @@ def plain(text: str) -> str:
     seen = "".join(" " if unicodedata.category(sign)[0] == "C" else sign for sign in text)
     return re.sub(r"[^\w\s.,:;/+-]|(?<![^\W_])_|_(?![^\W_])",
                   lambda sign: f"&#{ord(sign[0])};", seen)
-
-
-def notices(books: Iterable) -> dict[str, list]:
-    """Records in executed notebooks, by dataset: {name: list of Doubt and Failure}, each once."""
-    found = {}
-    for cell in (cell for book in books for cell in book.cells):
-        for output in cell.get("outputs", ()):
-            entry = output.get("metadata", {}).get(KEY, {})
-            for kind in RECORDS.keys() & entry.keys():
-                record = RECORDS[kind](**entry[kind])
-                found.setdefault(entry["dataset"], {})[record] = True
-    return {name: list(records) for name, records in found.items()}
 
 
 def _data_folder():

@@ -2,8 +2,8 @@
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 
-from slamlib.core import evaluation
 from slamlib.notebook import plotting
 
 MAP_WIDTH = 7.4                    # inches, the whole width of the page
@@ -12,18 +12,13 @@ MAX_HEIGHT = 4.6
 MIN_POINT_VARIANCE = 1.0       # rad^2, variance of the heading of a marker without orientation
 TICK_LENGTH = 0.022            # of a marker's heading tick, in the map's extent
 ELLIPSE_COUNT = 24             # ellipses of the vehicle, at equal distances along the path
-OUTLINE = np.linspace(0, 2 * np.pi, 12, endpoint=False)    # rad, points of ellipses to leave free
 NAME = 7.0                         # points, font size of the names of markers
 ANTENNA_NAME = 10.5                # points, of those of antennas
-MARGIN = 0.8                       # points, left free around a name
-# Places of a name around its landmark, tried in this order: all directions at each distance.
+# Directions of a name from its landmark, tried in this order at each distance from it.
 NAME_DIRECTIONS = np.radians([40, 140, -40, -140, 90, -90, 0, 180, 65, 115, -65, -115, 20, 160])
-NAME_DISTANCES = 4.0, 6.0, 9.0, 13.0       # points, from a landmark to its name's box
-OVERLAP = 100.0                # cost of a name on another one, or not within the axes
-LANDMARK = 30.0                # of each landmark that a name covers
-PATH = 2.0                     # of each point of the path and of its ellipses
-FAR = 0.6                      # of each point of distance between landmark and name
-MAX_COST = 12.0                # of a marker's name, which else is left out
+NAME_DISTANCES = 1.5, 1.9, 2.4, 3.0        # in font sizes
+MAX_COVERED = 8                # points of the path that a marker's name covers, else it is left out
+HALO = withStroke(linewidth=1.5, foreground="white")       # so that a name on the path can be read
 
 
 def whole_map(drive, result) -> Figure:
@@ -66,7 +61,7 @@ def whole_map(drive, result) -> Figure:
         factor += ", in doubt (?) × 1"
     ax.set_title(f"{drive.name} (95 % ellipses{factor})")
     plotting.legend_below(fig)
-    _name_landmarks(ax, result, in_doubt, enlarged)
+    _name_landmarks(ax, result, in_doubt)
     return fig
 
 
@@ -89,74 +84,57 @@ def _draw_headings(ax, result, length):
     ax.plot([x, end_x], [y, end_y], color="#555555", linewidth=0.9, zorder=4)
 
 
-def _name_landmarks(ax, result, in_doubt, enlarged):
+def _name_landmarks(ax, result, in_doubt):
     """Write the names of landmarks where they cover least, once the figure has its legend.
 
-    Of a SlamResult; `in_doubt` (a,) bool is of the antennas. A marker's name that costs more than
-    MAX_COST is left out.
+    Of a SlamResult; `in_doubt` (a,) bool is of the antennas. A marker's name that finds no place is
+    left out.
     """
-    ids = np.concatenate([result.antenna, result.marker])
     unconfirmed = np.isin(result.marker, result.unconfirmed)
-    unsure = np.concatenate([in_doubt, unconfirmed])
     places = np.concatenate([result.antenna_in_world, result.marker_in_world[:, :2]])
+    ids = np.concatenate([result.antenna, result.marker])
+    unsure = np.concatenate([in_doubt, unconfirmed])
     ax.figure.draw_without_rendering()                            # fixes the axes
     landmarks = ax.transData.transform(places)
-    path = ax.transData.transform(_path_and_ellipses(result, enlarged))
-    covered = np.concatenate([landmarks, path])
-    weight = np.repeat([LANDMARK, PATH], [len(landmarks), len(path)])
-    taken = np.full((len(places), 2, 2), np.nan)      # the corners of each name, low and high
-
-    angle = np.tile(NAME_DIRECTIONS, len(NAME_DISTANCES))
-    direction = np.column_stack([np.cos(angle), np.sin(angle)])
-    distance = np.repeat(NAME_DISTANCES, len(NAME_DIRECTIONS))
-    point = ax.figure.dpi / 72                                    # in pixels, as all below
+    path = ax.transData.transform(result.poses[::10, :2])
+    taken = []
     for k, place in enumerate(places):
         is_antenna = k < len(result.antenna)
         size = ANTENNA_NAME if is_antenna else NAME
-        name = f"{ids[k]}?" if unsure[k] else f"{ids[k]}"
-        text = ax.annotate(name, place, (0, 0), ha="center", va="center", fontsize=size,
-                           fontweight="bold" if is_antenna else "normal", zorder=7,
-                           textcoords="offset points", annotation_clip=False)
+        text = ax.annotate(f"{ids[k]}?" if unsure[k] else f"{ids[k]}", place, (0, 0), ha="center",
+                           va="center", fontsize=size, zorder=7, textcoords="offset points",
+                           fontweight="bold" if is_antenna else "normal", annotation_clip=False,
+                           path_effects=[HALO])
         text.set_in_layout(False)
-        box = np.array([text.get_window_extent().width, 0.8 * size * point])
-        half = box / 2 + MARGIN * point
-        to_edge = np.min(half / np.maximum(np.abs(direction), 1e-9), axis=1)
-        reach = to_edge + distance * point * size / NAME
-        offset = direction * reach[:, None]
-        centre = landmarks[k] + offset
-        corners = np.stack([centre - half, centre + half], axis=1)
-        cost = _covering_cost(corners, taken, covered, weight, ax.bbox) + FAR * distance
-        best = np.argmin(cost)
-        if is_antenna or cost[best] <= MAX_COST:
-            text.set_position(offset[best] / point)
-            taken[k] = corners[best]
+        box = text.get_window_extent()
+        offset, cost = _freest(box, size * ax.figure.dpi / 72, taken, landmarks, path, ax.bbox)
+        if is_antenna or cost <= MAX_COVERED:
+            text.set_position(offset * 72 / ax.figure.dpi)
+            taken.append(box.translated(*offset))
         else:
             text.remove()
 
 
-def _covering_cost(corners, taken, covered, weight, frame):
-    """Cost (c,) of what names with these corners (c, 2, 2), low and high, would cover.
+def _freest(box, size, taken, landmarks, path, frame):
+    """Offset (2,) of a name's box where it covers least, and the number of points that it covers.
 
-    That is other names at `taken` (n, 2, 2), NaN where there is none, points `covered` (m, 2) of
-    this weight (m,), and what is around the frame of the axes.
+    A landmark (l, 2), another name in `taken`, and what is around the frame count as many points
+    of the path (p, 2). All are in pixels, also the font `size`.
     """
-    low = corners[:, 0]
-    high = corners[:, 1]
-    on_names = (low[:, None] < taken[:, 1]) & (high[:, None] > taken[:, 0])
-    on_points = (covered > low[:, None]) & (covered < high[:, None])
-    outside = (low < frame.min) | (high > frame.max)
-    overlaps = on_names.all(axis=2).sum(axis=1) + outside.any(axis=1)
-    return OVERLAP * overlaps + on_points.all(axis=2) @ weight
+    best = np.zeros(2), np.inf
+    for distance in NAME_DISTANCES:
+        for angle in NAME_DIRECTIONS:
+            reach = distance * size + 0.5 * (box.width - size) * abs(np.cos(angle))
+            offset = reach * np.array([np.cos(angle), np.sin(angle)])
+            at = box.translated(*offset)
+            is_outside = not (frame.contains(*at.min) and frame.contains(*at.max))
+            cost = (_count(at, path) + 20 * _count(at, landmarks)
+                    + 100 * (at.count_overlaps(taken) + is_outside))
+            if cost < best[1]:
+                best = offset, cost
+    return best
 
 
-def _path_and_ellipses(result, enlarged):
-    """Points (m, 2) in the world on the path and on the ellipses of markers and vehicle."""
-    path = result.poses[::10, :2]
-    some = plotting.equidistant(result.poses, ELLIPSE_COUNT)
-    centres = np.concatenate([result.marker_in_world, result.poses[some]])[:, :2]
-    covariances = np.concatenate([result.marker_covariance, result.covariances[some]])
-    variances, axes = np.linalg.eigh(covariances[:, :2, :2])
-    semi_axes = enlarged * evaluation.REACH_95 * np.sqrt(np.maximum(variances, 0))
-    circle = [np.cos(OUTLINE), np.sin(OUTLINE)]
-    outlines = centres[:, :, None] + axes * semi_axes[:, None] @ circle
-    return np.concatenate([path, outlines.mT.reshape(-1, 2)])
+def _count(box, points):
+    """Number of points (n, 2) in a box."""
+    return np.sum(np.all((points > box.min) & (points < box.max), axis=1))

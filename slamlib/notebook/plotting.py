@@ -9,7 +9,6 @@ planar Gaussian with probability 1 - exp(-k^2 / 2), so that 95 % needs k = 2.447
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,15 +19,11 @@ from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib_inline.backend_inline import set_matplotlib_formats
 
 from slamlib.core import se2
 from slamlib.core.evaluation import REACH_95
 from slamlib.core.odometry import cumulative
-
-
-class _Roles(dict):
-    def __missing__(self, role):
-        raise ValueError(f"expected a role, one of {', '.join(self)}; found {role!r}")
 
 
 def _line(color, width, dashes=None, zorder=3):
@@ -44,7 +39,7 @@ def _sign(color, marker, size, zorder):
 
 
 # Colours of Okabe and Ito and of Tol, distinct for the colour-blind; line styles differ in grey.
-ROLES = _Roles({
+ROLES = {
     "truth": _line("black", 1.1, (4, 2), zorder=4),
     "odometry": _line("#D55E00", 1.5),
     "exact": _line("#332288", 1.5),
@@ -61,7 +56,7 @@ ROLES = _Roles({
     "antenna": _sign("#222222", "^", 6, zorder=5),
     "guess": _sign("#222222", "^", 7, zorder=4) | {"markerfacecolor": "none"},
     "true antenna": _sign("black", "+", 9, zorder=6),
-})
+}
 STYLE = Path(__file__).with_name("slamlib.mplstyle")  # for matplotlib.style
 MAX_SEMI_AXIS = 0.08         # of enlarged 95 % ellipses, in the larger extent of the path
 ENLARGEMENTS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
@@ -75,6 +70,12 @@ class Estimates(NamedTuple):
     poses: np.ndarray            # (m, 3)
     covariances: np.ndarray      # (m, 3, 3)
     true: np.ndarray | None      # (m, 3) poses
+
+
+def use_style() -> None:
+    """Set the style of a notebook's figures."""
+    plt.style.use(STYLE)
+    set_matplotlib_formats("svg", metadata={"Date": None})
 
 
 def panels(count: int, rows: int = 1, height: float = 3.4, width: float = 3.7,
@@ -314,48 +315,3 @@ def curve(ax: Axes, values: np.ndarray, role: str, frame: np.ndarray | None = No
     ax.plot(frame + 1, values, label=label or role, **ROLES[role] | look)
     ax.set(xlabel="pose id")
     return ax
-
-
-def slam_graph(ax: Axes, poses: int, sightings: list[tuple[int, int]]) -> Axes:
-    """Draw a scheme of problem 3's graph: poses in a row, markers above, wheel parameters w below.
-
-    `poses` is their number; `sightings` are pairs of a pose from 0 and a marker from 1.
-    """
-    path = np.column_stack([np.arange(poses), np.zeros(poses)])
-    wheels = np.array([poses / 2 - 0.5, -0.8])
-    ids = sorted({marker for _, marker in sightings})
-    across = np.linspace(-0.7, poses - 0.3, len(ids) + 2)[1:-1]
-    markers = {marker: np.array([x, 1.3]) for marker, x in zip(ids, across)}
-
-    for i, marker in sightings:
-        middle = 0.6 * path[i] + 0.4 * markers[marker]           # no squares at crossings
-        _factor(ax, "aruco", middle, [path[i], markers[marker]])
-    for before, after in pairwise(path):
-        ends = [before, after, wheels]
-        _factor(ax, "odometry", np.mean(ends, axis=0), ends)
-    for known in (path[0], wheels):
-        beside = known - [0.3, 0.0]
-        _factor(ax, "truth", beside, [known])
-
-    for i, place in enumerate(path, start=1):
-        _variable(ax, place, f"$X_{i}$", "white")
-    _variable(ax, wheels, "$w$", "#ffe0b0")
-    for marker, place in markers.items():
-        _variable(ax, place, f"$L_{{{marker}}}$", "#dddddd")
-    ax.set(xlim=(-0.8, poses - 0.2), ylim=(-1.3, 1.8))
-    ax.axis("off")
-    return ax
-
-
-def _factor(ax, role, place, ends):
-    """Draw a factor, a square at a place (2,), with lines to the ends, places of its variables."""
-    color = ROLES[role]["color"]
-    for end in ends:
-        ax.plot([end[0], place[0]], [end[1], place[1]], color=color, linewidth=0.9, zorder=1)
-    ax.plot(place[0], place[1], "s", color=color, markersize=4.5, zorder=2)
-
-
-def _variable(ax, place, name, color):
-    """Draw a variable, a circle with its name."""
-    circle = {"boxstyle": "circle,pad=0.25", "facecolor": color, "edgecolor": "black"}
-    ax.text(place[0], place[1], name, ha="center", va="center", fontsize=11, zorder=4, bbox=circle)

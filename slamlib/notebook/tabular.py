@@ -243,13 +243,18 @@ def antenna_rows(result, drive) -> Iterator[dict]:
         shift = _shift_by_range_offset(result.poses, uwb.select(own), weight, place)
         yield {"dataset": drive.name,
                "antenna": f"{antenna}?" if antenna in result.doubts else f"{antenna}",
-               "x (m)": f"{place[0]:.3f}", "y (m)": f"{place[1]:.3f}",
+               "x (m)": _as_sure_as(place[0], sigma[0]), "y (m)": _as_sure_as(place[1], sigma[1]),
                "σ of x (mm)": sigma[0], "σ of y (mm)": sigma[1],
                "from the guess (mm)": 1e3 * np.linalg.norm(place - guess[k]),
                "error (mm)": 1e3 * np.linalg.norm(error),
                "d²": error @ np.linalg.solve(C, error),
                "down-weighted (%)": 100 * np.mean(weight < 0.5),
                "by 0.1 m (mm)": 1e3 * np.linalg.norm(shift)}
+
+
+def _as_sure_as(value, sigma):
+    """Text of a value in m with two digits of its sigma in mm."""
+    return f"{value:.{_decimals(1e-3 * sigma, 2, at_most=4)}f}"
 
 
 def _shift_by_range_offset(poses, ranges, weight, antenna, offset=0.1):

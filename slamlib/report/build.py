@@ -1,28 +1,33 @@
 """Builds the report: executes the notebooks, which become pages and the chapters of a PDF."""
 
+import hashlib
 import re
+import shutil
 import sys
 import time
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from slamlib.core.errors import require
+import nbformat
+
+from slamlib.core.errors import DatasetError, require
 from slamlib.io import files
-from slamlib.io.dataset import inventory_lines, read_dataset, read_truth
-from slamlib.io.results import write_summary
+from slamlib.io.dataset import inventory_lines
+from slamlib.io.results import SUMMARY, read_summary, write_summary
 from slamlib.io.tables import datasets_in
-from slamlib.notebook import notices
+from slamlib.notebook.drives import read_drives, without_stand_ins
 from slamlib.report import cache
 from slamlib.report.document import render
 from slamlib.report.execution import TRANSPORT, execute, kernel_environment
-from slamlib.report.notebooks import Options, shown, to_execute
-from slamlib.report.overview import SolvedDrive, opening, read_drives, title_picture
-from slamlib.solve import SENSORS, clear_results, summary_of, summary_row
+from slamlib.report.notebooks import Options, chapter_of, read_books
+from slamlib.report.overview import SolvedDrive, opening, solved_drive, title_picture
+from slamlib.robust.file_doubts import doubts_before_solving
+from slamlib.solve import SENSORS, clear_results, summary_of
 
-PAGES = ".pages"  # name of the file in a report that lists its files; all others are the user's
+# Name of the file in a report that has a digest and lists its files; all others are the user's.
+PAGES = ".pages"
 DATASET_NAME = re.compile("[A-Za-z0-9 ._-]+")  # nothing that Markdown, HTML or Typst interprets
 
 
@@ -32,24 +37,25 @@ class Report:
 
     files: list[Path]  # `index.html` first, `report.pdf` last
     drives: list[SolvedDrive]
+    omitted: list[str]  # names of simulated datasets that are left out
 
 
 def build_report(notebooks: Path, data: Path, report: Path, results: Path,
                  datasets: list[str] | None = None, options: Options = Options(), jobs: int = 2,
                  kept: Path | None = None, fresh: bool = False) -> Report:
-    """Execute all notebooks, write pages and PDF; return the Report.
+    """Execute all notebooks, write results, pages and PDF; return the Report.
 
     Kernels read the absolute paths of data and results, and the selection, from SLAMLIB_DATA,
-    SLAMLIB_RESULTS and SLAMLIB_DATASETS (one name per line). One build at a time works in a results
-    folder or with a cache; another one waits for it. DatasetError if there is no notebook or
-    dataset, a dataset is malformed, or what is to be left out is unknown; NotebookError if a cell
-    failed or a page cannot be set. Then report and results are unchanged.
+    SLAMLIB_RESULTS and SLAMLIB_DATASETS (one name per line). One build at a time works with a
+    folder. DatasetError if there is no notebook or dataset, a dataset is malformed, or a chapter
+    that is chosen is unknown; NotebookError if a cell failed or a page cannot be set. If a cell
+    failed, report and results are unchanged.
 
     Parameters
     ----------
     notebooks, data : folders of the `*.ipynb` files and of the datasets, one sub-folder each.
     report, results : folders of the pages and of the result files; created if absent.
-    datasets : names of the selected datasets, or None for all.
+    datasets : names of the selected datasets; None for all, without simulated ones if others are.
     options : the title page and what is shown.
     jobs : notebooks executed at a time.
     kept : folder that caches executed notebooks, or None for one that is removed.
@@ -57,131 +63,137 @@ def build_report(notebooks: Path, data: Path, report: Path, results: Path,
     """
     start = time.monotonic()
     data = data.resolve()
-    report = report.resolve()
-    results = results.resolve()
-    books = to_execute(notebooks.resolve(), options)
-    read = _read_datasets(data, datasets)
-    has = _measured(read)
-    books = _with_what_they_need(books, has)
-    chapters = shown(books, options)
+    books = read_books(notebooks.resolve(), options.chapters)
+    drives, omitted = _read(data, datasets)
+    books = _with_what_they_need(books, drives)
     short = "/tmp" if TRANSPORT == "ipc" else None  # because paths of sockets must be
     with TemporaryDirectory(dir=short, prefix="slamlib-", ignore_cleanup_errors=True) as temporary:
         kept = (kept or Path(temporary, "kept")).resolve()
-        environment = kernel_environment(Path(temporary), data, datasets)
-        folders = [data / dataset.name for dataset, _ in read]
-        keys = partial(cache.keys, books, folders, environment | {"SLAMLIB_RESULTS": str(results)})
-        check = partial(render, chapters, options, check=True)
-        stage = Path(temporary, "results")
-        with files.locked(kept), files.locked(results), files.locked(report):
-            written = _executed(books, keys, check, environment, jobs, stage, kept, fresh)
-            print("setting the pages and the PDF", file=sys.stderr)
-            drives = read_drives(read, stage, written, notices(books.values()))
-            made = _rendered(drives, chapters, options, has)
-            _write_results(drives, stage, written, results)
-            _write_pages(made, report)
-    print(f"built in {time.monotonic() - start:.1f} s", file=sys.stderr)
-    return Report([report / name for name in made], drives)
+        names = [drive.name for drive in drives]
+        environment = kernel_environment(Path(temporary), data, names)
+        with files.locked(kept):
+            stages = _executed(books, drives, data, environment, jobs, kept, fresh)
+            with files.locked(results), files.locked(report):
+                for drive in drives:
+                    _write_results(drive, stages, results / drive.name)
+                solved = [solved_drive(drive, results / drive.name) for drive in drives]
+                shown = {Path("index"): opening(solved, books)} | books
+                names = _write_pages(shown, options, title_picture(solved), report)
+    _say(f"built in {time.monotonic() - start:.1f} s")
+    return Report([report / name for name in names], solved, omitted)
 
 
-def _read_datasets(data, selected):
-    """Return the datasets in a folder with their truth, list of (Dataset, Truth or None)."""
+def _say(line):
+    print(line, file=sys.stderr)
+
+
+def _read(data, selected):
+    """Return the Drives of a build, and the names of the simulated ones that are left out."""
     names, unread = datasets_in(data, selected)
     for name in names:
         require(DATASET_NAME.fullmatch(name), data / name, "letters from a to z, digits, spaces, "
                 "dots, dashes and underscores in its name: rename this folder")
-    read = [(read_dataset(data / name), read_truth(data / name)) for name in names]
-    lines = [line for dataset, truth in read for line in inventory_lines(dataset, truth)]
-    print("\n".join(lines + unread), file=sys.stderr)
-    return read
-
-
-def _measured(read):
-    """Return what datasets have (set of str): sensors, and "truth"."""
-    has = {sensor for sensor in SENSORS for dataset, _ in read
-           if getattr(dataset, sensor) is not None}
-    if any(truth for _, truth in read):
-        has.add("truth")
-    return has
-
-
-def _with_what_they_need(books, has):
-    """Return the notebooks whose measurements the datasets have, or all if there is none."""
-    served = {source: book for source, book in books.items()
-              if book.metadata.get("slamlib", {}).get("needs") in has | {None}}
-    if not served:
-        return books
-    for source in books:
-        if source not in served:
-            print(f"{source.stem}: left out, no dataset has the measurements", file=sys.stderr)
-    return served
-
-
-def _executed(books, keys, check, environment, jobs, stage, kept, fresh):
-    """Execute books in place, or recall their outputs; return the sorted names of their files.
-
-    `keys` returns `cache.keys` as they are now, `check` refuses bad text before a kernel starts,
-    `stage` is the folder of the files.
-    """
-    written = set()
-    left = {}
-    begun = keys()
-    for source, book in books.items():
-        names = None if fresh else cache.recall(kept, source, begun[source], book, stage)
-        if names is None:
-            left[source] = book
-        else:
-            written.update(names)
-            print(f"{source.stem}: nothing changed, not executed again", file=sys.stderr)
-
-    def finish(source, book, names):
-        written.update(names)
-        if keys() == begun:  # nothing was edited meanwhile
-            cache.keep(kept, source, begun[source], book, stage, names)
-
-    if left:
-        check()
-    execute(left, environment, stage, max(1, jobs), finish)
-    return sorted(written)
-
-
-def _write_results(drives, stage, written, results):
-    """Write files from the folder `stage` to the results, and the summary of each SolvedDrive."""
+    found = read_drives(data, names)
+    drives = found if selected else without_stand_ins(found)
     for drive in drives:
-        folder = results / drive.name
-        rows = {each.problem: summary_row(each, drive.truth)
-                for each in drive.solutions + drive.failures}
-        with files.locked(folder):
-            clear_results(folder)
-            for name in drive.files:
-                _copy(f"{drive.name}/{name}", stage, results)
-            summary = summary_of(drive.dataset, drive.truth, rows, drive.doubts)
-            write_summary(folder, summary)
-    names = {drive.name for drive in drives}
-    for name in written:
-        if name.split("/")[0] not in names:
-            _copy(name, stage, results)
+        _say("\n".join(inventory_lines(drive.dataset, drive.truth)))
+    omitted = [drive.name for drive in found if drive not in drives]
+    if omitted:
+        _say(f"left out, because simulated: {', '.join(omitted)} (name all datasets to have "
+             "them)")
+    _say("\n".join(unread))
+    return drives, omitted
 
 
-def _copy(name, source, target):
-    files.write_file(target / name, (source / name).read_bytes())
+def _with_what_they_need(books, drives):
+    """Return the notebooks whose measurements the drives have, or all if there is none."""
+    has = {sensor for sensor in SENSORS for drive in drives
+           if getattr(drive.dataset, sensor) is not None}
+    needs = {source: chapter_of(source, book).needs for source, book in books.items()}
+    served = {source: book for source, book in books.items() if needs[source] in has | {None}}
+    for source in books:
+        if served and source not in served:
+            _say(f"{source.stem}: left out, no dataset has {SENSORS[needs[source]]}")
+    return served or books
 
 
-def _write_pages(made, report):
-    """Write pages, {name: bytes}, and remove those of an earlier build that are not made now."""
+def _executed(books, drives, data, environment, jobs, kept, fresh):
+    """Execute books in place, or recall their outputs; return the folders of their files."""
+    folders = {source: cache.folder_of(kept, source) for source in books}
+    stages = {source: folders[source] / cache.RESULTS for source in books}
+    datasets = [data / drive.name for drive in drives]
+    begun = cache.keys(books, datasets)
+    left = {}
+    done = []
+
+    def finish(source, told):
+        done.append(source)
+        _say(f"{len(done)} of {len(books)}: {source.stem}, {told}")
+
+    def keep(source, seconds):
+        if cache.keys(books, datasets) == begun:  # nothing was edited meanwhile
+            cache.keep(folders[source], begun[source], books[source])
+        finish(source, f"executed in {seconds:.1f} s")
+
+    for source, book in books.items():
+        if not fresh and cache.recall(folders[source], begun[source], book):
+            finish(source, "nothing changed")
+        else:
+            left[source] = book
+            shutil.rmtree(folders[source], ignore_errors=True)
+            stages[source].mkdir(parents=True)
+    execute(left, environment, stages, max(1, jobs), keep)
+    return list(stages.values())
+
+
+def _write_results(drive, stages, folder):
+    """Write the files of a Drive that notebooks wrote to `stages` into its results."""
+    rows = {}
+    with files.locked(folder):
+        clear_results(folder)
+        for stage in stages:
+            own = stage / drive.name
+            with suppress(DatasetError):  # this notebook solves nothing
+                rows |= read_summary(own)["problems"]
+            for name in files.file_names(own):
+                if name != SUMMARY:
+                    files.write_file(folder / name, (own / name).read_bytes())
+        doubts = doubts_before_solving(drive.dataset)
+        write_summary(folder, summary_of(drive.dataset, drive.truth, rows, doubts))
+
+
+def _write_pages(books, options, picture, report):
+    """Set books as pages and a PDF in a report, unless they are there; return their names.
+
+    Those of an earlier build that are not made now are removed.
+    """
     listed = report / PAGES
-    earlier = set()
+    key = _key_of_pages(books, options, picture)
+    earlier_key = ""
+    earlier = []
     with suppress(OSError):
-        earlier = set(listed.read_text(encoding="utf-8").splitlines())
+        earlier_key, *earlier = listed.read_text(encoding="utf-8").splitlines()
+    if earlier_key == key and all((report / name).is_file() for name in earlier):
+        return earlier
+    _say("setting the pages and the PDF")
+    made = render(books, options, picture)
+    listed.unlink(missing_ok=True)
     for name, content in made.items():
         files.write_file(report / name, content)
-    for name in earlier - made.keys():
+    for name in set(earlier) - made.keys():
         (report / name).unlink(missing_ok=True)
-    files.write_file(listed, "\n".join(made).encode())
+    files.write_file(listed, "\n".join([key, *made]).encode())
+    return list(made)
 
 
-def _rendered(drives, chapters, options, has):
-    """Return the files of the report, {name: bytes}."""
-    solved = [drive for drive in drives if drive.solutions]
-    picture = title_picture(solved[-1]) if solved else ""
-    books = {Path("index"): opening(drives, chapters)} | chapters
-    return render(books, options, has, picture)
+def _key_of_pages(books, options, picture):
+    """Return a digest of all that pages show: notebooks, what is beside them, and their look."""
+    state = hashlib.sha256(repr([options, picture]).encode())
+    beside = [file for source in books for file in source.parent.iterdir()
+              if file.suffix in (".svg", ".png", ".jpg")]
+    look = [file for file in Path(__file__).parent.iterdir() if file.is_file()]
+    for file in sorted(beside + look):
+        state.update(file.read_bytes())
+    for source, book in books.items():
+        state.update(f"{source}{nbformat.writes(book)}".encode())
+    return state.hexdigest()

@@ -1,110 +1,81 @@
-"""A cache of executed notebooks with the result files that they wrote, a few versions of each.
+"""Executed notebooks with the files that they wrote, kept until something changes.
 
-A notebook is executed again when its code cells, slamlib's code (without the package `report`), an
-installed package, a file of the selected datasets, another file beside the notebook or in a folder
-there, or one of slamlib's environment variables changed; not when its text, its metadata or outputs
-that an editor saved in it did.
+A notebook is executed again when its code cells changed or what `keys` says of slamlib, Python,
+packages, datasets and the files beside the notebooks; not when its text did. `folder_of` a notebook
+holds what is kept: executed.ipynb, written last, and `results`.
 """
 
 import hashlib
 import json
-import platform
-import re
 import sys
-from io import BytesIO
+from collections.abc import Iterable
+from importlib.metadata import version
 from pathlib import Path
 
-import joblib
+import nbformat
 from nbformat import NotebookNode
 
 from slamlib.io.files import write_file
-from slamlib.report.execution import LAB_ONLY, Books
+from slamlib.report.execution import Books
 from slamlib.report.notebooks import tags_of
 
-VARIABLES = "SLAMLIB_"  # begins the environment variables that are heeded
 SLAMLIB = Path(__file__).parents[1]
-UNSEEN = re.compile(r"(^|/)(\.|__pycache__/)|^(build|report|results)/|\.ipynb$")  # paths
-HEEDED_TAGS = {"raises-exception", LAB_ONLY}  # the tags of cells that nbclient heeds
-VERSIONS = 4  # of each notebook, the last used
+PACKAGES = ("numpy", "scipy", "gtsam", "pandas", "matplotlib")
+EXECUTED = "executed.ipynb"
+RESULTS = "results"  # name of the folder of the files that a notebook wrote
+KEY = "slamlib_key"  # in the metadata of an executed notebook
 
 
-def keys(books: Books, datasets: list[Path], environment: dict[str, str]) -> dict[Path, str]:
-    """Return the keys of books, digests of what they need.
-
-    `datasets` are the folders of the selected datasets, `environment` the environment variables of
-    the kernels. Where slamlib's code is does not matter.
-    """
+def keys(books: Books, datasets: Iterable[Path]) -> dict[Path, str]:
+    """Return the keys of books, digests of what they need; `datasets` are folders."""
     notebooks = next(iter(books)).parent
-    # The names of their folders have the versions; to read what is in them takes long.
-    packages = {path.name for folder in sys.path for path in Path(folder).glob("*.dist-info")
-                if not path.name.startswith("slamlib-")}
-    heeded = {name: environment[name] for name in sorted(environment)
-              if name.startswith(VARIABLES)}
-    common = [sys.version, platform.platform(), sorted(packages), heeded,
-              _digests(notebooks, datasets)]
+    state = hashlib.sha256(sys.version.encode())
+    state.update(repr([version(package) for package in PACKAGES]).encode())
+    for root in (SLAMLIB, notebooks, *datasets):
+        for file in sorted(root.rglob("*")):
+            name = file.relative_to(root)
+            if file.is_file() and not _is_unseen(name, root):
+                state.update(f"{root.name}/{name}\n".encode())
+                state.update(hashlib.sha256(file.read_bytes()).digest())
     found = {}
     for source, book in books.items():
-        code = [(cell.source, sorted(HEEDED_TAGS.intersection(tags_of(cell))))
-                for cell in _code_cells(book)]
-        found[source] = digest(json.dumps([common, source.name, code]).encode())
+        code = [(cell.source, tags_of(cell)) for cell in _code_cells(book)]
+        own = state.copy()
+        own.update(json.dumps(code).encode())
+        found[source] = own.hexdigest()
     return found
 
 
-def _digests(notebooks, datasets):
-    """Return names and digests of the files that matter, of slamlib, datasets and notebooks."""
-    files = [(SLAMLIB, file) for file in sorted(SLAMLIB.rglob("*"))
-             if file.suffix in (".py", ".mplstyle") and file.name != "__main__.py"
-             and file.relative_to(SLAMLIB).parts[0] != "report"]
-    files.append((Path(__file__).parent, Path(__file__)))  # for the format of the cache
-    for folder in datasets:
-        files += [(folder.parent, file) for file in sorted(folder.rglob("*"))]
-    files += [(notebooks, file) for file in sorted(notebooks.rglob("*"))
-              if not UNSEEN.search(file.relative_to(notebooks).as_posix())]
-    return [(file.relative_to(folder).as_posix(), digest(file.read_bytes()))
-            for folder, file in files if file.is_file()]
-
-
-def digest(content: bytes) -> str:
-    """Return the SHA-256 of bytes, in hexadecimal digits."""
-    return hashlib.sha256(content).hexdigest()
+def _is_unseen(name, root):
+    """Return whether no cell sees a file: of the report, a notebook, hidden, or made of others."""
+    is_page = root == SLAMLIB and name.parts[0] == "report"
+    is_hidden = any(part.startswith(".") or part == "__pycache__" for part in name.parts)
+    return is_page or is_hidden or name.suffix == ".ipynb"
 
 
 def _code_cells(book):
     return [cell for cell in book.cells if cell.cell_type == "code"]
 
 
-def recall(folder: Path, source: Path, key: str, book: NotebookNode, results: Path) -> list | None:
-    """Return the names of a notebook's results, or None if it must be executed.
+def folder_of(kept: Path, source: Path) -> Path:
+    """Return the folder of a notebook in that of what is kept."""
+    return kept / source.stem
 
-    Its result files are written below `results`, and its outputs into `book`, the notebook as it
-    is now. `folder` is that of the cache.
-    """
-    path = folder / f"{source.stem}.{key}.executed"
+
+def recall(folder: Path, key: str, book: NotebookNode) -> bool:
+    """Put the kept outputs into a book; return whether there are any of this key."""
     try:
-        executed, contents = joblib.load(path)
+        executed = nbformat.read(folder / EXECUTED, as_version=4)
     except Exception:  # it is absent or damaged
-        return None
-    for cell, (outputs, count) in zip(_code_cells(book), executed, strict=True):
-        cell.outputs = outputs
-        cell.execution_count = count
-    for name, content in contents.items():
-        write_file(results / name, content)
-    path.touch()
-    return list(contents)
+        return False
+    if executed.metadata.get(KEY) != key:
+        return False
+    for cell, old in zip(_code_cells(book), _code_cells(executed), strict=True):
+        cell.outputs = old.outputs
+    return True
 
 
-def keep(folder: Path, source: Path, key: str, book: NotebookNode, results: Path, names: list):
-    """Write an executed notebook with its result files `names` to the cache, as for `recall`.
-
-    Its oldest versions are removed.
-    """
-    executed = [(cell.outputs, cell.execution_count) for cell in _code_cells(book)]
-    contents = {name: (results / name).read_bytes() for name in names}
-    file = BytesIO()
-    joblib.dump([executed, contents], file, compress=1)  # with a checksum
-    write_file(folder / f"{source.stem}.{key}.executed", file.getvalue())
-    versions = [path for path in folder.glob("*.executed")
-                if path.name.rsplit(".", 2)[0] == source.stem]
-    versions.sort(key=lambda path: path.stat().st_mtime_ns)
-    for old in versions[:-VERSIONS]:
-        old.unlink()
+def keep(folder: Path, key: str, book: NotebookNode):
+    """Keep an executed notebook, whose results are in its folder."""
+    executed = NotebookNode(book | {"metadata": book.metadata | {KEY: key}})
+    write_file(folder / EXECUTED, nbformat.writes(executed).encode())

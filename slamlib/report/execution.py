@@ -7,7 +7,6 @@ import asyncio
 import json
 import os
 import re
-import shutil
 import socket
 import sys
 import time
@@ -22,20 +21,17 @@ from nbclient.exceptions import CellExecutionError
 from nbconvert.filters import strip_ansi
 from nbconvert.preprocessors import CoalesceStreamsPreprocessor
 from nbformat import NotebookNode
-from tqdm import tqdm
 
 from slamlib.core.errors import require
-from slamlib.io.files import file_names
 
 CELL_TIMEOUT = 1800  # s, in which a cell must end
 TRANSPORT = "ipc" if hasattr(socket, "AF_UNIX") else "tcp"  # Windows has no Unix sockets
 LAB_ONLY = "lab-only"  # tag of cells that are not executed, and not shown on pages or in the PDF
-# Folder in the cache, of the settings of kernels, and of JupyterLab where the user has no others.
-SETTINGS = "settings"
-OVERRIDES = {"@jupyterlab/apputils-extension:notification": {
-    "fetchNews": "false", "checkForUpdates": False}}  # without a question when it opens
+SETTINGS = "settings"  # folder of JupyterLab's settings where the user has no others
 # The matrices are small: more threads cost time.
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+OVERRIDES = {"@jupyterlab/apputils-extension:notification": {
+    "fetchNews": "false", "checkForUpdates": False}}  # without a question when it opens
 Books = dict[Path, NotebookNode]  # notebooks by their files, in the order of the report
 
 
@@ -50,30 +46,29 @@ class _Loop(asyncio.SelectorEventLoop):
         raise RuntimeError("notebooks install no signal handlers")
 
 
-def kernel_environment(settings: Path, data: Path,
-                       datasets: list[str] | None) -> dict[str, str]:
+def kernel_environment(settings: Path, data: Path, datasets: list[str]) -> dict[str, str]:
     """Return the kernels' environment variables without settings that change pages.
 
     `settings` and `data` are the folders of the kernels' own settings and of the datasets,
-    `datasets` the selected names, or None for all.
+    `datasets` the selected names, or none for those that `notebook.start` selects.
     """
     matplotlibrc = settings / "matplotlibrc"
     matplotlibrc.write_text("svg.hashsalt: slamlib\n")
     defaults = {"SOURCE_DATE_EPOCH": "0", "PYTHONHASHSEED": "0"} | ONE_THREAD
     return defaults | os.environ | {
         "SLAMLIB_DATA": str(data),
-        "SLAMLIB_DATASETS": "\n".join(datasets or []),
+        "SLAMLIB_DATASETS": "\n".join(datasets),
         "IPYTHONDIR": str(settings),
         "MATPLOTLIBRC": str(matplotlibrc),
         "MPLBACKEND": "module://matplotlib_inline.backend_inline"}
 
 
-def execute(books: Books, environment: dict[str, str], results: Path, jobs: int, finish: Callable):
+def execute(books: Books, environment: dict[str, str], results: dict[Path, Path], jobs: int,
+            finish: Callable):
     """Execute notebooks in place, at most `jobs` at a time; the first failure stops the others.
 
-    Each writes to its own folder, SLAMLIB_RESULTS. When it ended without error, its files are moved
-    to `results`, a folder of this build alone, and finish(Path, NotebookNode, names of the files)
-    is called. NotebookError if a cell failed.
+    Each writes its files to its own folder, SLAMLIB_RESULTS, of `results`. When one has ended,
+    finish(Path, seconds) is called. NotebookError if a cell failed.
     """
     try:
         with asyncio.Runner(loop_factory=_Loop) as runner:
@@ -87,39 +82,22 @@ async def _execute_all(books, environment, results, jobs, finish):
     slots = asyncio.Semaphore(jobs)
 
     async def run(number, source):
-        book = books[source]
-        stage = results / f".{source.stem}"
-        own = environment | {"SLAMLIB_RESULTS": str(stage)}
-        stage.mkdir(parents=True)
-        try:
-            async with slots:
-                await _execute(source, book, own, settings / f"{number}.json", bar)
-            finish(source, book, _moved(stage, results))
-        finally:
-            shutil.rmtree(stage, ignore_errors=True)
+        own = environment | {"SLAMLIB_RESULTS": str(results[source])}
+        async with slots:
+            start = time.monotonic()
+            await _execute(source, books[source], own, settings / f"{number}.json")
+            finish(source, time.monotonic() - start)
 
-    cells = sum(cell.cell_type == "code" for book in books.values() for cell in book.cells)
-    with tqdm(total=cells, unit="cell", leave=False, disable=None) as bar:  # on a terminal only
-        async with asyncio.TaskGroup() as group:
-            for number, source in enumerate(reversed(books)):       # later chapters take longer
-                group.create_task(run(number, source))
+    async with asyncio.TaskGroup() as group:
+        for number, source in enumerate(reversed(books)):       # later chapters take longer
+            group.create_task(run(number, source))
 
 
-def _moved(stage, results):
-    """Move all files from a folder to another one; return their names (list of str)."""
-    names = file_names(stage)
-    for name in names:
-        (results / name).parent.mkdir(parents=True, exist_ok=True)
-        os.replace(stage / name, results / name)
-    return names
-
-
-async def _execute(source, book, environment, connection, bar):
+async def _execute(source, book, environment, connection):
     """Execute one notebook in place with this interpreter.
 
     The kernel listens at sockets beside the file `connection` (Path): nobody else can take them.
     """
-    start = time.monotonic()
     begun = []  # cells; the last one has failed if any has
     manager = AsyncKernelManager(
         kernel_name="python3", connection_file=str(connection), transport=TRANSPORT,
@@ -129,8 +107,7 @@ async def _execute(source, book, environment, connection, bar):
         timeout=CELL_TIMEOUT, iopub_timeout=60, raise_on_iopub_timeout=True,
         record_timing=False, store_widget_state=False, skip_cells_with_tag=LAB_ONLY,
         shutdown_kernel="immediate", extra_arguments=["--IPKernelApp.log_level=ERROR"],
-        on_cell_execute=lambda cell, **_: begun.append(cell),
-        on_cell_executed=lambda **_: bar.update())
+        on_cell_execute=lambda cell, **_: begun.append(cell))
     try:
         await client.async_execute(env=environment, cleanup_kc=True)
     except (CellExecutionError, TimeoutError, RuntimeError) as error:
@@ -141,7 +118,6 @@ async def _execute(source, book, environment, connection, bar):
         if manager.has_kernel:
             await manager.shutdown_kernel(now=True)
     CoalesceStreamsPreprocessor().preprocess(book, {})  # kernels divide them by time
-    tqdm.write(f"{source.stem}: executed in {time.monotonic() - start:.1f} s", file=sys.stderr)
 
 
 def _failure(source, begun, error):

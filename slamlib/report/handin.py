@@ -2,7 +2,6 @@
 
 import platform
 import re
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from importlib.metadata import version
@@ -14,10 +13,8 @@ import numpy as np
 from jinja2 import Template
 
 from slamlib.io import files
-from slamlib.io.dataset import all_notes, read_dataset, read_truth
+from slamlib.io.dataset import all_notes
 from slamlib.io.results import RESULT_FILES, read_summary
-from slamlib.io.tables import datasets_in
-from slamlib.notebook import Drive
 from slamlib.report.build import Report
 from slamlib.report.notebooks import PROBLEM2_FOLDERS, Options
 from slamlib.report.overview import SolvedDrive, listed, why_missing
@@ -25,44 +22,24 @@ from slamlib.solve import title
 
 LINE_WIDTH = 100  # characters in a line of README.txt
 README = Path(__file__).with_name("readme.txt")  # a template of Jinja
-LEFT_OUT = ("Explore", "Files")  # titles of sections that are for screens, or on other folders
+CHAPTERS = ("[0-9]*",)  # notebooks whose names begin with a number, so no appendix
 PACKAGES = ("slamlib", "numpy", "scipy", "gtsam")  # whose versions README.txt names
 MAP_ALONE = "problem2/ArucoMap.mat"  # the map by markers alone
 
 
-def selection(data: Path, names: list[str] | None = None) -> tuple:
-    """Return the datasets of the hand-in, as of `build_report`, and the names of those left out.
-
-    These are simulated, where no `names` are given and the folder `data` has recorded ones, too.
-    """
-    if names is not None:
-        return names, []
-    drives = [Drive(name, read_dataset(data / name), read_truth(data / name))
-              for name in datasets_in(data)[0]]
-    simulated = [drive.name for drive in drives if drive.origin == "simulated"]
-    others = [drive.name for drive in drives if drive.name not in simulated]
-    if not simulated or not others:
-        return None, []
-    print(f"hand-in: without {listed(simulated)}, which are simulated (name all datasets to "
-          "hand in, if these are to be among them)", file=sys.stderr)
-    return others, simulated
-
-
 def hand_in_options(options: Options) -> Options:
-    """Return Options by which the hand-in leaves out the appendices, unless they are asked for."""
-    leave_out = dict.fromkeys(LEFT_OUT, "") | options.leave_out
-    return replace(options, appendix=bool(options.appendix), leave_out=leave_out)
+    """Return Options of a hand-in: without appendices, unless report.toml names its chapters."""
+    return replace(options, chapters=options.chapters or CHAPTERS)
 
 
-def write_zip(path: Path, report: Report, results: Path, options: Options,
-              omitted: Sequence[str] = ()):
+def write_zip(path: Path, report: Report, results: Path, options: Options):
     """Write the zip of a Report to `path`; equal input gives equal bytes.
 
-    `results` is the folder of its files, `omitted` what `selection` left out. Raises DatasetError
-    if the results of a drive have no summary.json: the run that wrote there did not end.
+    `results` is the folder of its files. Raises DatasetError if the results of a drive have no
+    summary.json: the run that wrote there did not end.
     """
     contents = {"report.pdf": report.files[-1].read_bytes(),
-                "README.txt": readme(report.drives, options, omitted).encode()}
+                "README.txt": readme(report.drives, options, report.omitted).encode()}
     for drive in report.drives:
         folder = results / drive.name
         with files.locked(folder):                      # no other run replaces them meanwhile
@@ -100,7 +77,7 @@ def _folders(problem2):
 
 
 def readme(drives: list[SolvedDrive], options: Options, omitted: Sequence[str] = ()) -> str:
-    """Return README.txt; parameters as of `write_zip`."""
+    """Return README.txt of some drives; `omitted` are the names of datasets that are left out."""
     versions = [f"Python {platform.python_version()}"]
     versions += [f"{name} {version(name)}" for name in PACKAGES]
     template = Template(README.read_text(encoding="utf-8"), trim_blocks=True)

@@ -1,13 +1,14 @@
-"""Reads the notebooks of a report and report.toml: what is executed and shown, in which order.
+"""Reads the notebooks of a report and report.toml: which chapters it has, in which order.
 
-A title `# 2. Name` makes a chapter, `# A. Name` an appendix. The metadata of a notebook, or of a
-cell that begins with a heading, may say what it needs, as `"slamlib": {"needs": "truth"}`.
+A title `# 2. Name` makes a chapter, `# A. Name` an appendix. The metadata of a notebook may say
+which measurements it needs, as `"slamlib": {"needs": "uwb"}`.
 """
 
 import json
 import re
 from contextlib import suppress
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
+from fnmatch import fnmatchcase
 from importlib.metadata import PackageNotFoundError, files
 from pathlib import Path
 
@@ -20,11 +21,10 @@ from slamlib.io.textfile import read_text, read_toml
 from slamlib.report.execution import Books, NotebookError
 
 FOLDER = "notebooks"  # name of the notebooks' folder
-CODE_SHOWN = ("none", "method", "all")  # what code is shown: none, all that is not hidden, or all
 # Folder of the results of each estimate that may be handed in as problem 2.
 PROBLEM2_FOLDERS = {"aruco": "problem2", "fused": "problem2_fused", "hint": "problem2_hint"}
-# Options that have one of several values.
-CHOICES = {"code": CODE_SHOWN, "problem2": tuple(PROBLEM2_FOLDERS), "appendix": (True, False)}
+# Options that have one of several values. Code that is shown: none, all that is not hidden, or all.
+CHOICES = {"code": ("none", "method", "all"), "problem2": tuple(PROBLEM2_FOLDERS)}
 TITLE = re.compile(r"^#\s+(.+)", re.MULTILINE)
 NUMBER = re.compile(r"(\d+|[A-Z])\.")  # begins the title of a chapter or an appendix
 # Neither heading, table, quotation, code, formula nor list.
@@ -39,9 +39,8 @@ class Options:
     author: str = ""
     student_number: str = ""
     course: str = ""
-    leave_out: dict = field(default_factory=dict)  # from numbers and titles to their file
-    appendix: bool | None = None  # None: the report has it, the hand-in has not
-    code: str = "method"  # one of CODE_SHOWN
+    chapters: tuple[str, ...] = ()  # names of notebooks, also as "[1-4]*"; empty: all
+    code: str = "method"
     problem2: str = "aruco"  # which is handed in, of PROBLEM2_FOLDERS; required is markers alone
 
 
@@ -52,11 +51,7 @@ class Chapter:
     title: str
     number: str  # that of a chapter, the letter of an appendix, or ""
     lead: str  # the first paragraph, or ""
-
-    @property
-    def is_appendix(self) -> bool:
-        """Return whether its number is a letter."""
-        return self.number.isalpha()
+    needs: str | None  # the sensor without which it has nothing to say
 
 
 def read_options(path: str | Path) -> Options:
@@ -75,18 +70,18 @@ def read_options(path: str | Path) -> Options:
 def _checked(key, value, place):
     """Return the value of a key as Options have it; DatasetError, which begins with `place`."""
     if key in CHOICES:
-        choices = CHOICES[key]
-        ok = type(value) is type(choices[0]) and value in choices  # 1 is not true
-        expected = f"one of {json.dumps(choices)[1:-1]}"
-    elif key == "leave_out":
-        ok = isinstance(value, list) and all(isinstance(entry, str) for entry in value)
-        expected = 'a list of numbers and titles in quotes, such as ["B", "3.5", "References"],'
-    else:
-        ok = type(value) in (str, int) and re.fullmatch(r"[^\n\ufffd]*", str(value))
-        expected = "a line of UTF-8 text in quotes"
-        value = str(value)
-    require(ok, place, f"{expected} for {key}", value)
-    return dict.fromkeys(value, place) if key == "leave_out" else value
+        require(value in CHOICES[key], place,
+                f"one of {json.dumps(CHOICES[key])[1:-1]} for {key}", value)
+        return value
+    if key == "chapters":
+        is_list = isinstance(value, list) and all(isinstance(name, str) for name in value)
+        require(is_list, place,
+                'a list of notebooks in quotes, such as ["1_odometry", "A_studies"], for chapters',
+                value)
+        return tuple(value)
+    is_line = type(value) in (str, int) and re.fullmatch(r"[^\n\ufffd]*", str(value))
+    require(is_line, place, f"a line of UTF-8 text in quotes for {key}", value)
+    return str(value)
 
 
 def notebooks_folder() -> Path:
@@ -107,6 +102,22 @@ def notebooks_folder() -> Path:
                        "notebooks; found none")
 
 
+def read_books(folder: Path, chapters: tuple[str, ...] = ()) -> Books:
+    """Return the notebooks in a folder by the names of their files, or those that are chosen.
+
+    DatasetError if there is none, or none of a name.
+    """
+    sources = sorted(folder.glob("*.ipynb"))
+    require(sources, folder, "notebooks (*.ipynb), found no notebooks")
+    names = [source.stem for source in sources]
+    for pattern in chapters:
+        require(any(fnmatchcase(name, pattern) for name in names), "report.toml",
+                f"chapters among {', '.join(names)}", pattern)
+    chosen = chapters or ("*",)
+    return {source: read_notebook(source) for source in sources
+            if any(fnmatchcase(source.stem, pattern) for pattern in chosen)}
+
+
 def read_notebook(source: Path) -> NotebookNode:
     """Return the notebook in a file, without outputs that an editor saved.
 
@@ -124,39 +135,6 @@ def read_notebook(source: Path) -> NotebookNode:
     return cleared
 
 
-def to_execute(folder: Path, options: Options) -> Books:
-    """Return the notebooks in a folder that are executed, in order.
-
-    These are all chapters, because they write results, by the names of their files, and then the
-    appendices that `options` show, by their letters. DatasetError if there is none.
-    """
-    books = {source: read_notebook(source) for source in sorted(folder.glob("*.ipynb"))}
-    about = {source: chapter_of(source, book) for source, book in books.items()}
-    _require_known(options.leave_out, {chapter.number for chapter in about.values()})
-    executed = [source for source in books if not about[source].is_appendix]
-    if options.appendix is not False:
-        appendices = [source for source in shown(books, options) if about[source].is_appendix]
-        executed += sorted(appendices, key=lambda source: about[source].number)
-    require(executed, folder, "notebooks (*.ipynb) that are not left out, found no notebooks")
-    return {source: books[source] for source in executed}
-
-
-def _require_known(leave_out, numbers):
-    """Raise DatasetError if a chapter is to be left out that has none of the numbers (set)."""
-    known = sorted(numbers - {""})
-    for entry, place in leave_out.items():
-        is_title = not re.fullmatch(r"\d+|[A-Za-z]", entry)
-        require(is_title or entry.upper() in known, place,
-                f"to leave out a chapter ({', '.join(known)}) or a section", entry)
-
-
-def shown(books: Books, options: Options) -> Books:
-    """Return the books without the chapters that are left out."""
-    left_out = {entry.strip().removesuffix(".").upper() for entry in options.leave_out} - {""}
-    return {source: book for source, book in books.items()
-            if chapter_of(source, book).number not in left_out}
-
-
 def chapter_of(source: Path, book: NotebookNode) -> Chapter:
     """Return the Chapter that a notebook is."""
     text = "\n\n".join(cell.source for cell in book.cells if cell.cell_type == "markdown")
@@ -164,7 +142,8 @@ def chapter_of(source: Path, book: NotebookNode) -> Chapter:
     title = re.sub("[*_`]", "", heading[1]).strip() if heading else source.stem
     number = NUMBER.match(title)
     lead = PARAGRAPH.search(text)
-    return Chapter(title, number[1] if number else "", lead[0] if lead else "")
+    return Chapter(title, number[1] if number else "", lead[0] if lead else "",
+                   book.metadata.get("slamlib", {}).get("needs"))
 
 
 def tags_of(cell: NotebookNode) -> list[str]:

@@ -1,11 +1,11 @@
 """The summary that opens the report: an abstract, all results, pictures.
 
-The text is in the template overview.md. All numbers are computed from the files to hand in of this
-build, which `read_drives` reads, and, where it is known, the truth.
+The text is in the template overview.md. All numbers are computed from the results of this build,
+their files and `summary.json`, and, where it is known, the truth.
 """
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from urllib.parse import quote
 
@@ -21,25 +21,25 @@ from slamlib.core import evaluation, marker_increments
 from slamlib.core.records import Dataset, Truth
 from slamlib.io.dataset import all_notes
 from slamlib.io.files import file_names
-from slamlib.io.results import read_structs
+from slamlib.io.results import read_structs, read_summary
 from slamlib.notebook import Drive, accuracy, plotting, table
-from slamlib.notebook.drives import plain
+from slamlib.notebook.drives import plain, without_stand_ins
 from slamlib.report.execution import Books, NotebookError
 from slamlib.report.notebooks import chapter_of
-from slamlib.robust.file_doubts import Doubt, doubts_before_solving, merged
-from slamlib.solve import PROBLEMS, SENSORS, Failure, Solution, title, truth_in_world
+from slamlib.robust.file_doubts import Doubt
+from slamlib.solve import PROBLEMS, SENSORS, Failure, Solution, title
 
 TEXT = Path(__file__).with_name("overview.md")
 ALT = "Trajectories, and standard deviations of position"  # of the picture
-ON_SCREEN = ("pdf", "chapters")  # blocks of the text that the PDF leaves out
+ON_SCREEN = ("pdf", "files", "chapters")  # blocks of the text that the PDF leaves out
 CURVE_POINTS = 1500  # of a curve, at most
 HIDDEN_TRAJECTORIES = ("problem2", "problem2_hint", "problem3")  # they would lie below others
 LOOKS = {"problem3": dict(linewidth=4.0), "problem4": dict(linestyle="-", linewidth=1.4)}
 MAX_NAMED = 3  # drives that the abstract names one by one; else the shortest and the longest
+CAMERA = ("camera_x", "camera_y", "camera_turn", "marker_size")  # entries of a calibration
 MAPS = {"aruco_map": "ArucoMap", "uwb_map": "UwbMap"}  # fields of a Solution, names of their files
-# Columns of the table of results: their keys in `notebook.accuracy`, and units.
-ACCURACY = {"ATE": ("ATE (mm)", "m"), "ATE, aligned": ("aligned (mm)", "m"),
-            "σ of position": ("σ (mm)", "m"), "σ of heading": ("σ of δ (mrad)", "rad")}
+# Columns of the table of results, of `notebook.accuracy`.
+ACCURACY = ("ATE (mm)", "aligned (mm)", "σ (mm)", "σ of δ (mrad)")
 in_our_style = plt.style.context(plotting.STYLE, after_reset=True)  # decorates what draws
 
 
@@ -51,38 +51,29 @@ class SolvedDrive(Drive):
     doubts: tuple[Doubt, ...] = ()  # first about the drive, then by problem
     failures: tuple[Failure, ...] = ()  # in the order of PROBLEMS
     files: tuple[str, ...] = ()  # its results, as `problem1/vehiclePose.mat`
+    summary: dict = field(default_factory=dict, repr=False)  # as summary.json has it
 
     def solution(self, problem: str) -> Solution | None:
         """Return the Solution of a problem, or None."""
         return next((known for known in self.solutions if known.problem == problem), None)
 
 
-def read_drives(read: list, results: Path, written: list[str], notices: dict) -> list[SolvedDrive]:
-    """Return the datasets with their solutions, the shortest first.
+def solved_drive(drive: Drive, results: Path) -> SolvedDrive:
+    """Return a Drive with what is in its folder of results.
 
-    `read` is a list of (Dataset, Truth or None), `results` the folder of this build's files,
-    `written` their names, as `short/problem1/vehiclePose.mat`, and `notices` as by
-    `notebook.notices`. NotebookError if a file cannot be read, or has another number of poses.
+    NotebookError if a file cannot be read, or has another number of poses.
     """
-    drives = []
-    for dataset, truth in sorted(read, key=lambda drive: len(drive[0].ticks)):
-        folder = f"{dataset.name}/"
-        files = [name.removeprefix(folder) for name in written if name.startswith(folder)]
-        told = notices.get(dataset.name, [])
-        drives.append(_solved_drive(dataset, truth, results / dataset.name, files, told))
-    return drives
-
-
-def _solved_drive(dataset, truth, folder, files, told):
-    """Return a SolvedDrive with its `files` in a folder; `told` are its Doubts and Failures."""
-    solutions = [read_solution(folder / problem, dataset, files)
-                 for problem in PROBLEMS if f"{problem}/vehiclePose.mat" in files]
-    doubts = list(doubts_before_solving(dataset))
-    doubts += [each for each in told if isinstance(each, Doubt)]
-    failures = [each for each in told if isinstance(each, Failure)]
-    failures.sort(key=lambda failure: list(PROBLEMS).index(failure.problem))
-    return SolvedDrive(dataset.name, dataset, truth, solutions=tuple(solutions),
-                       doubts=tuple(merged(doubts)), failures=tuple(failures), files=tuple(files))
+    summary = read_summary(results)
+    solutions = []
+    failures = []
+    for problem, row in summary["problems"].items():
+        if "failed" in row:
+            failures.append(Failure(problem, row["title"], row["failed"]))
+        else:
+            solutions.append(read_solution(results / problem, drive.dataset))
+    doubts = tuple(Doubt(**doubt) for doubt in summary["doubts"])
+    return SolvedDrive(drive.name, drive.dataset, drive.truth, tuple(solutions), doubts,
+                       tuple(failures), tuple(file_names(results)), summary)
 
 
 def why_missing(drive: SolvedDrive, problem: str) -> str:
@@ -100,13 +91,13 @@ def _without(drive, sensor):
     return getattr(drive.dataset, sensor) is None
 
 
-def read_solution(folder: Path, dataset: Dataset, files: list[str]) -> Solution:
+def read_solution(folder: Path, dataset: Dataset) -> Solution:
     """Return the Solution in a results folder; its world frame is the first pose estimated."""
     place = f"{folder.parent.name}/{folder.name}, which a notebook wrote,"
     try:
         _, poses, covariances = read_structs(folder, "vehiclePose")
         maps = {field: read_structs(folder, name) for field, name in MAPS.items()
-                if f"{folder.name}/{name}.mat" in files}
+                if (folder / f"{name}.mat").exists()}
     except Exception as error:  # scipy and numpy raise many kinds
         raise NotebookError(f"{place} cannot be read: {error}") from None
     count = len(dataset.ticks)
@@ -122,12 +113,12 @@ def opening(drives: list[SolvedDrive], chapters: Books | None = None) -> Noteboo
     """Return the opening of the report, an executed notebook that leads to `chapters`."""
     template = Template(TEXT.read_text(encoding="utf-8"), trim_blocks=True, lstrip_blocks=True)
     facts = _facts(drives, chapters or {})
-    longest = facts["longest"]
     context = template.new_context(facts)
     cells = []
     for name, block in template.blocks.items():
-        if name == "caption" and longest:
-            picture = new_output("display_data", {"image/svg+xml": trajectories(longest)})
+        if name == "caption" and facts["longest"]:
+            drawn = _as_svg(trajectories(facts["longest"]))
+            picture = new_output("display_data", {"image/svg+xml": drawn})
             cells.append(new_code_cell(id="picture", metadata={"alt": ALT}, outputs=[picture]))
         text = "".join(block(context)).strip()
         if text:
@@ -136,21 +127,26 @@ def opening(drives: list[SolvedDrive], chapters: Books | None = None) -> Noteboo
     return new_notebook(cells=cells)
 
 
+def longest(drives: list[SolvedDrive]) -> SolvedDrive | None:
+    """Return the longest drive that has a solution, a recorded one if any is."""
+    solved = [drive for drive in drives if drive.solutions]
+    return max(without_stand_ins(solved), default=None, key=lambda drive: len(drive.dataset.ticks))
+
+
 def _facts(drives, chapters):
     """Return what the template tells, a dict."""
     solved = [drive for drive in drives if drive.solutions]
-    compared = solved if len(solved) <= MAX_NAMED else [solved[0], solved[-1]]
+    subjects = without_stand_ins(solved)
+    compared = subjects if len(subjects) <= MAX_NAMED else [subjects[0], subjects[-1]]
     attempted = {each.problem for drive in drives for each in drive.solutions + drive.failures}
     problems = [problem for problem in PROBLEMS if problem in attempted]
-    with_truth = [drive for drive in drives if drive.truth]
     rows = [result_row(drive, problem) for drive in drives for problem in problems]
     facts = {"name": _name, "listed": listed, "results_of": problems}
-    facts["longest"] = max(solved, default=None, key=lambda drive: len(drive.dataset.ticks))
+    facts["longest"] = longest(drives)
     facts["compared"] = [_compared(drive) for drive in compared]
     facts["simulated"] = [_name(drive) for drive in drives if drive.origin == "simulated"]
     facts["results"] = table(rows).data if solved else ""
-    facts["known"] = with_truth
-    facts["dashes"] = len(with_truth) < len(drives)
+    facts["known"] = [drive for drive in drives if drive.truth]
     facts["sensors"] = [sensor for sensor in SENSORS
                         if not all(_without(drive, sensor) for drive in drives)]
     facts["without"] = {name: [plain(drive.name) for drive in drives if _without(drive, sensor)]
@@ -197,12 +193,22 @@ def _landmarks(solution):
 
 
 def _at_returns(solutions, drive):
-    """Return the differences of Solutions from what returns measure, root mean squares (str)."""
-    returns = marker_increments.returns(drive.dataset)
+    """Return differences of Solutions from what returns measure, root mean squares (list of str).
+
+    The last one is what the noise of the sightings alone gives. Sightings are those by the camera
+    that the last solution estimated.
+    """
+    row = drive.summary["problems"].get(solutions[-1].problem, {})
+    calibration = {entry["name"]: entry["estimate"] for entry in row.get("calibration", ())}
+    camera = {name: calibration[name] for name in CAMERA if name in calibration}
+    vehicle = replace(drive.dataset.vehicle, **camera)
+    returns = marker_increments.returns(replace(drive.dataset, vehicle=vehicle))
     if len(returns.start) == 0:
         return []
-    off = [returns.discrepancies(solution.poses)[:, :2] for solution in solutions]
-    return [with_unit(1e3 * np.sqrt(np.mean(np.sum(each**2, axis=1))), "m") for each in off]
+    squares = [np.sum(returns.discrepancies(each.poses)[:, :2]**2, axis=1) for each in solutions]
+    variances = np.trace(returns.covariance[:, :2, :2], axis1=1, axis2=2)
+    squares.append(row.get("marker_noise_factor", 1)**2 * variances)
+    return [with_unit(1e3 * np.sqrt(np.mean(each)), "m") for each in squares]
 
 
 def result_row(drive: SolvedDrive, problem: str) -> dict:
@@ -210,72 +216,56 @@ def result_row(drive: SolvedDrive, problem: str) -> dict:
     number = problem.removeprefix("problem")[0]
     row = {"dataset": plain(drive.name),
            "problem": f"{number}. {plain(title(problem, drive.dataset))}"}
-    row |= dict.fromkeys(ACCURACY)
     solution = drive.solution(problem)
     if solution is None:
         reason = re.sub("(?<=solved):.*", "", why_missing(drive, problem))
-        return row | {"σ of position": f"*{reason}*"}
+        return row | dict.fromkeys(ACCURACY) | {"σ (mm)": f"*{reason}*"}
     found = accuracy(solution, drive)
-    for name, (key, unit) in ACCURACY.items():
-        if key in found:
-            row[name] = with_unit(found[key], unit)
-    row["poses"] = int(np.isfinite(solution.poses[:, 0]).sum())
-    return row
+    row |= {name: found.get(name) for name in ACCURACY}
+    return row | {"poses": int(np.isfinite(solution.poses[:, 0]).sum())}
 
 
 @in_our_style
-def trajectories(drive: SolvedDrive) -> str:
-    """Return the figure of a drive's trajectories and sigmas as SVG."""
-    shown = [each.problem for each in drive.solutions if each.problem not in HIDDEN_TRAJECTORIES]
-    shown.append(drive.solutions[-1].problem)
-    fig = Figure(figsize=(7.2, 2.7))  # inches
-    _draw(fig, drive.solutions, drive.truth, shown)
+def trajectories(drive: SolvedDrive, size: tuple[float, float] = (7.2, 2.7)) -> Figure:
+    """Return the figure of a drive's trajectories, its last map and sigmas; the size in inches."""
+    fig = Figure(figsize=size)
+    left, right = fig.subplots(1, 2)
+    last = drive.solutions[-1]
+    for solution in drive.solutions:
+        role = PROBLEMS[solution.problem].role
+        look = LOOKS.get(solution.problem, {})
+        if solution.problem not in HIDDEN_TRAJECTORIES or solution is last:
+            plotting.trajectory(left, _few(solution.poses), role, solution.title, **look)
+        sigmas = evaluation.position_sigmas(solution.covariances)
+        sigmas[:len(sigmas) // 50] = np.nan  # nearly zero, on a logarithmic axis
+        known = _few(np.flatnonzero(sigmas > 0))
+        plotting.curve(right, sigmas[known], role, known, solution.title, **look)
+    if drive.truth is not None:
+        plotting.trajectory(left, _few(drive.truth.poses), "truth")
+    _draw_landmarks(left, last)
+    right.set(yscale="log", ylabel="σ of position (m)")
     plotting.legend_below(fig)
+    return fig
+
+
+def result_picture(dataset: Dataset, truth: Truth | None, results: Path, path: Path):
+    """Write the figure of `trajectories` of a folder of results as a .png, .pdf or .svg file."""
+    drive = solved_drive(Drive(dataset.name, dataset, truth), results)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    trajectories(drive, (11, 5.5)).savefig(path, dpi=150)
+
+
+@in_our_style
+def _as_svg(fig):
     return print_figure(fig, "svg", metadata={"Date": None})
 
 
 @in_our_style
-def result_picture(dataset: Dataset, truth: Truth | None, results: Path, path: Path):
-    """Write a picture of the map and the errors of the results in a folder to `path`.
-
-    Its ending is .png, .pdf or .svg. Errors are distances to the truth, or sigmas where it is None.
-    """
-    names = file_names(results)
-    solutions = [read_solution(file.parent, dataset, names)
-                 for file in sorted(results.glob("problem*/vehiclePose.mat"))]
-    fig = Figure(figsize=(11, 5.5))
-    _draw(fig, solutions, truth, PROBLEMS, errors=truth is not None)
-    _draw_landmarks(fig.axes[0], solutions[-1])
-    plotting.legend_below(fig)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    fig.savefig(path, dpi=150)
-
-
-def _draw(fig, solutions, truth, shown, errors=False):
-    """Draw trajectories of the problems `shown`, and errors or sigmas of all Solutions."""
-    left, right = fig.subplots(1, 2)
-    for solution in solutions:
-        role = PROBLEMS[solution.problem].role
-        look = LOOKS.get(solution.problem, {})
-        if solution.problem in shown:
-            plotting.trajectory(left, _few(solution.poses), role, solution.title, **look)
-        if errors:
-            off = solution.poses - truth_in_world(solution, truth)
-            values = np.hypot(off[:, 0], off[:, 1])
-        else:
-            values = evaluation.position_sigmas(solution.covariances)
-        values[:len(values) // 50] = np.nan  # nearly zero, on a logarithmic axis
-        known = _few(np.flatnonzero(values > 0))
-        plotting.curve(right, values[known], role, known, solution.title, **look)
-    if truth is not None:
-        plotting.trajectory(left, _few(truth.poses), "truth")
-    quantity = "error" if errors else "σ"
-    right.set(yscale="log", ylabel=f"{quantity} of position (m)")
-
-
-@in_our_style
-def title_picture(drive: SolvedDrive) -> str:
-    """Return a drive's last trajectory with its landmarks, without axes, as SVG."""
+def title_picture(drives: list[SolvedDrive]) -> str:
+    """Return the last trajectory of the longest drive with its landmarks as SVG, or ""."""
+    drive = longest(drives)
+    if drive is None:
+        return ""
     fig = Figure(figsize=(6.3, 4.6))  # inches
     ax = fig.add_subplot()
     solution = drive.solutions[-1]
@@ -283,7 +273,7 @@ def title_picture(drive: SolvedDrive) -> str:
     plotting.trajectory(ax, _few(solution.poses), role, linestyle="-", linewidth=1.2)
     _draw_landmarks(ax, solution)
     ax.axis("off")
-    return print_figure(fig, "svg", metadata={"Date": None})
+    return _as_svg(fig)
 
 
 def _draw_landmarks(ax, solution):
