@@ -440,6 +440,13 @@ def test_with_a_calibration_that_is_stated_or_unknown_both_agree(drive, change):
     assert (gtsam.RangeFactor2D in kinds) != is_custom["range"]
 
 
+def test_markers_without_heading_are_no_disagreement():
+    """The engine has their coordinates, GTSAM bearing and distance."""
+    dataset, _ = simulate("short", seed=15)
+    points = replace(dataset, aruco=as_points(dataset.aruco, slice(None))).without("uwb")
+    assert "agreement" not in {doubt.what for doubt in solution_doubts(estimate(points))}
+
+
 def test_a_disagreement_of_engine_and_gtsam_is_a_doubt(drive):
     found = estimate(known_noise(drive[0].first(200), 1e-3))
     assert "agreement" not in {doubt.what for doubt in solution_doubts(found)}

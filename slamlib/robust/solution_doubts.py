@@ -22,7 +22,9 @@ MIN_REJECTED_OF_MARKER = 5   # number of its sightings, from which a marker is n
 MAX_REJECTED_OF_MARKER = 0.2     # share of its sightings, the same
 MAX_MARKERS_NAMED = 8        # of those with most rejected sightings
 MAX_STRETCHES_NAMED = 3      # of the drive, where counts and markers contradict each other
-MAX_DISAGREEMENT = 0.1       # sigmas of a pose, and relative of a sigma, by engine and GTSAM
+# Sigmas of a pose, and relative of a sigma, by engine and GTSAM. Sightings of points are
+# coordinates in one, bearing and distance in the other: up to 0.11 on clean drives.
+MAX_DISAGREEMENT = 0.25
 # By group of the calibration: its name in a sentence, and what to look at.
 GROUPS = {
     "wheel-parameters": ("the wheels", "Measure them, or state larger sigmas in vehicle.toml."),
