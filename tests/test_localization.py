@@ -13,6 +13,7 @@ from slamlib.core.records import ArucoReadings, Dataset
 from slamlib.core.sightings import GATE
 from slamlib.io.dataset import read_dataset, read_truth
 from slamlib.robust import fused
+from slamlib.robust.jumps import NO_JUMPS
 from slamlib.studies.simulation import TABLE_2, simulate
 
 
@@ -302,14 +303,15 @@ def test_the_likelihood_of_the_innovations_by_hand():
         z[1] += off
         aruco = ArucoReadings(np.array([0, 5]), np.array([7, 7]), z, C)
         dataset = Dataset("still", TABLE_2, np.zeros((6, 2), int), aruco, None, None)
-        models = np.array([[1e-3, 0.0, False]])
-        state = fused._filter(fused._filter_input(dataset, TABLE_2), models)[-1]
+        models = fused._all_models([1e-3], [0.0], [False])
+        drive = fused._Drive(dataset, NO_JUMPS, TABLE_2.wheel)
+        state = fused._filter(drive, fused._sightings(dataset), models)[-1]
         v = np.array([*off[:2], se2.wrap(off[2])])
         squared = v @ np.linalg.solve(S, v)
         wrong = squared > GATE
         expected = squared + np.linalg.slogdet(S)[1]
         if wrong:
-            expected = GATE + np.linalg.slogdet(C[1])[1]
+            expected = GATE + np.linalg.slogdet(S)[1]
         assert np.isclose(state.log_density, -expected / 2)
         assert state.rejected == wrong
 
