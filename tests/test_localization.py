@@ -304,8 +304,7 @@ def test_the_likelihood_of_the_innovations_by_hand():
         aruco = ArucoReadings(np.array([0, 5]), np.array([7, 7]), z, C)
         dataset = Dataset("still", TABLE_2, np.zeros((6, 2), int), aruco, None, None)
         models = fused._all_models([1e-3], [0.0], [False])
-        drive = fused._Drive(dataset, NO_JUMPS, TABLE_2.wheel)
-        state = fused._filter(drive, fused._sightings(dataset), models)[-1]
+        state = fused._filter(dataset, NO_JUMPS, models)[-1]
         v = np.array([*off[:2], se2.wrap(off[2])])
         squared = v @ np.linalg.solve(S, v)
         wrong = squared > GATE

@@ -60,22 +60,17 @@ MARKERS = slice(9, None)
 
 
 @dataclass(frozen=True)
-class _Drive:
-    """A drive with what is settled of its odometry."""
-
-    dataset: Dataset
-    jumps: Jumps                 # where odometry contradicts the markers
-    w_0: np.ndarray              # (3,) m, wheel parameters at which Delta is linearised
-
-
-@dataclass(frozen=True)
 class _Odometry:
     """Increments by odometry between m pairs of poses."""
 
-    increment: np.ndarray        # (m, 3) Delta(w_0)
+    increment: np.ndarray        # (m, 3) Delta by the stated wheels
     by_w: np.ndarray             # (m, 3, 3) dDelta/dw
     rounding: np.ndarray         # (m, 3, 3) Q without slip
     slipping: np.ndarray         # (m, 3, 3) what a slip of 1 sqrt(m) adds to Q
+
+    def delta(self, k, w):
+        """Delta (..., 3) of increments k by wheels that are off by w (..., 3)."""
+        return self.increment[k] + np.matvec(self.by_w[k], w)
 
     def noise(self, k, slip):
         """Q (..., 3, 3) of increments k by slips (...) in sqrt(m)."""
@@ -90,11 +85,21 @@ class _Models(NamedTuple):
     memory: np.ndarray           # (h,) correlation of successive errors of a marker
     elsewhere: np.ndarray        # (h,) True if the camera may be elsewhere than stated
 
+    def log_prior(self):
+        """Logarithm (h,) of their prior density, up to a constant."""
+        slip = np.maximum(self.slip, SLIP_BOUNDS[0])
+        off = np.log(slip / TYPICAL_SLIP) / np.log(SLIP_FACTOR)
+        surprises = self.elsewhere + (self.memory > 0)
+        return -off**2 / 2 - PRICE * surprises
 
-class _State(NamedTuple):        # two are made at a frame: faster than frozen dataclasses
-    """h filters at a frame, and the m markers that they keep."""
 
-    x: np.ndarray                # (h, 3 + m, 3) X, w, c, M; once predicted also what is expected
+class _State(NamedTuple):        # four are made at a frame: faster than frozen dataclasses
+    """h filters at a frame, and the m markers that they keep.
+
+    A predicted state has, below the markers, the expected sightings of all of them.
+    """
+
+    x: np.ndarray                # (h, 3 + m, 3) X, w, c and M
     P: np.ndarray                # (h, 9 + 3m, 9 + 3m) covariance of x
     marker: np.ndarray           # (m,) ids of the markers
     z: np.ndarray                # (m, 3) their last sightings
@@ -124,56 +129,53 @@ def fuse(dataset: Dataset, slip: float | None = None) -> Fusion:
     require(isinstance(dataset, Dataset), "fuse", "a Dataset", dataset)
     if slip is None:
         slip = dataset.vehicle.slip
-    drive = _settled_jumps(dataset, slip or TYPICAL_SLIP)
-    models, w_0 = _learned(drive, slip)
-    drive = replace(drive, w_0=w_0)
-    sightings = _sightings(dataset)
-    states = _filter(drive, sightings, models)
+    jumps = _believed_jumps(dataset, slip or TYPICAL_SLIP)
+    models = _learned_models(dataset, jumps, slip)
+    states = _filter(dataset, jumps, models)
     last = states[-1]
     best = last.likeliest
     slip = models.slip[best]
-    poses, covariances = _poses_from_frames(drive, sightings.frame, slip, states, best)
+    x = np.array([state.x[best, :3] for state in states])
+    P = np.array([state.P[best, :9, :9] for state in states])
+    sightings = _sightings(dataset)
+    poses, covariances = _poses_from_frames(dataset, jumps, sightings.frame, slip, x, P)
     repeated = sighting_count(dataset) - len(sightings.row)
     return Fusion(
         poses=poses,
         covariances=covariances,
         rejected=last.rejected + repeated,
         slip=float(slip),
-        wheel=last.x[best, 1],
-        wheel_covariance=last.P[best, WHEELS, WHEELS],
+        wheel=dataset.vehicle.wheel + x[-1, 1],
+        wheel_covariance=P[-1, WHEELS, WHEELS],
         memory=float(models.memory[best]),
-        camera=last.x[best, 2])
+        camera=x[-1, 2])
 
 
-def _settled_jumps(dataset, slip):
-    """The _Drive of a Dataset with its jumps, or without them if that is likelier."""
-    without = _Drive(dataset, NO_JUMPS, dataset.vehicle.wheel)
+def _believed_jumps(dataset, slip):
+    """The Jumps of a Dataset, or NO_JUMPS if these are likelier."""
     found = find_jumps(dataset)
     count = len(found.start)
     if count == 0:
-        return without
-    drive = replace(without, jumps=found)
-    sightings = _sightings(dataset)
+        return NO_JUMPS
     models = _all_models([slip], [0.0], [False])
-    last, last_without = [_filter(each, sightings, models)[-1] for each in (drive, without)]
-    gain = last.log_density - last_without.log_density
+    with_jumps = _filter(dataset, found, models)[-1]
+    without = _filter(dataset, NO_JUMPS, models)[-1]
+    gain = with_jumps.log_density - without.log_density
     least = MIN_JUMP_GAIN * count
     if found.are_few:
         least = -least
-    return drive if gain >= least else without
+    return found if gain >= least else NO_JUMPS
 
 
-def _learned(drive, slip):
-    """The _Models of the last filters, by the likeliest one in stretches of the _Drive, and w_0."""
+def _learned_models(dataset, jumps, slip):
+    """The _Models of the last filters, by the likeliest one in stretches of the drive."""
     slips = SLIPS if slip is None else [slip]
-    first = _all_models(slips, MEMORIES, [False, True])
-    sightings = _sightings(_stretches(drive.dataset))
-    last = _filter(drive, sightings, first)[-1]
+    models = _all_models(slips, MEMORIES, [False, True])
+    last = _filter(_stretches(dataset), jumps, models)[-1]
     best = last.likeliest
     if slip is None:
-        slips = np.minimum(first.slip[best] * FINE_STEPS, SLIP_BOUNDS[1])
-    models = _all_models(slips, [first.memory[best]], [first.elsewhere[best]])
-    return models, last.x[best, 1]
+        slips = np.minimum(models.slip[best] * FINE_STEPS, SLIP_BOUNDS[1])
+    return _all_models(slips, [models.memory[best]], [models.elsewhere[best]])
 
 
 def _all_models(slips, memories, elsewhere):
@@ -212,14 +214,14 @@ def _sightings(dataset):
     return replace(s, z=scale * s.z, C=sigma_scale[:, None] * s.C * sigma_scale)
 
 
-def _odometry(drive, start, end):
+def _odometry(dataset, jumps, start, end):
     """The _Odometry from poses `start` to poses `end`, (m,).
 
     A vehicle that crawls may as well stand, while its counts creep: then they say nothing of the
     wheels, and the whole increment may be an error.
     """
-    ticks = drive.dataset.ticks
-    vehicle = drive.dataset.vehicle.with_wheel(drive.w_0)
+    ticks = dataset.ticks
+    vehicle = dataset.vehicle
     increment, by_w = increments.between_poses(ticks, vehicle, start, end, "arc")
     rounding, slipping = increments.noise_in_drive(ticks, vehicle, start, end)
     travelled = _travelled(ticks)
@@ -228,58 +230,60 @@ def _odometry(drive, start, end):
     crawls = speed * travel.sum() < CRAWL * (speed @ travel)
     by_w[crawls] = 0.0
     rounding[crawls] += increment[crawls, :, None] * increment[crawls, None]
-    jump, unknown = drive.jumps.added(start, end)
-    return _Odometry(se2.compose(increment, jump), by_w, rounding + unknown, slipping)
+    jump, unknown = jumps.added(start, end)
+    increment = se2.compose(increment, jump)
+    return _Odometry(increment, by_w, rounding + unknown, slipping)
 
 
-def _filter(drive, sightings, models):
-    """The _State of filters with these _Models after each frame of Sightings."""
+def _filter(dataset, jumps, models):
+    """The _State of filters with these _Models after each frame."""
+    sightings = _sightings(dataset)
     frame = sightings.frame
-    odometry = _odometry(drive, frame[:-1], frame[1:])
+    odometry = _odometry(dataset, jumps, frame[:-1], frame[1:])
     interval = np.diff(frame)
     usual = np.median(interval) if len(interval) else 1
-    begin = np.searchsorted(sightings.row, np.arange(1, len(frame)))
-    rows = np.split(np.arange(len(sightings.row)), begin)
-    start = _start(drive.dataset.vehicle, models)
-    states = [_updated(start, sightings, rows[0], models.memory)]
+    memory = models.memory[:, None, None]
+    state = _start(dataset.vehicle, models)
+    state = _updated(state, sightings, 0, memory)
+    states = [state]
     for k, length in enumerate(interval):
-        memory = models.memory ** (length / usual)
+        memory_left = memory ** (length / usual)
         Q = odometry.noise(k, models.slip)
-        w = states[-1].x[:, 1]
-        delta = odometry.increment[k] + (w - drive.w_0) @ odometry.by_w[k].T
-        predicted = _predicted(states[-1], delta, odometry.by_w[k], Q, memory)
-        states.append(_updated(predicted, sightings, rows[k + 1], memory))
+        state = _predicted(state, odometry, k, Q, memory_left)
+        state = _updated(state, sightings, k + 1, memory_left)
+        states.append(state)
     return states
 
 
 def _start(vehicle, models):
-    """The _State of filters with these _Models at pose 0, with the prior of each."""
+    """The _State of filters with these _Models at pose 0."""
     calibration = stated_calibration(vehicle, ())
     released = calibration.sigma_without(["camera-offset"])
-    sigma = np.where(models.elsewhere[:, None], released, calibration.sigma)
-    x = np.zeros((len(sigma), 3, 3))
-    x[:, 1:] = calibration.stated[:6].reshape(2, 3)
-    P = np.zeros((len(sigma), 9, 9))
-    P[:, 2, 2] = vehicle.sigma_heading**2
-    P[:, 3:, 3:] = sigma[:, :6, None]**2 * np.eye(6)
-    slip = np.maximum(models.slip, SLIP_BOUNDS[0])
-    off = np.log(slip / TYPICAL_SLIP) / np.log(SLIP_FACTOR)
-    surprises = models.elsewhere + (models.memory > 0)
-    return _State(x, P, marker=np.zeros(0, int), z=np.zeros((0, 3)),
-                  log_density=-off**2 / 2 - PRICE * surprises)
+    shared = np.where(models.elsewhere[:, None], released, calibration.sigma)
+    count = len(shared)
+    sigma = np.zeros((count, 9))
+    sigma[:, 2] = vehicle.sigma_heading
+    sigma[:, 3:] = shared[:, :6]                                     # of wheels and camera
+    x = np.zeros((count, 3, 3))
+    x[:, 2] = calibration.stated[calibration.group == "camera-offset"]
+    return _State(
+        x=x,
+        P=sigma[:, :, None]**2 * np.eye(9),
+        marker=np.zeros(0, int),
+        z=np.zeros((0, 3)),
+        log_density=models.log_prior())
 
 
-def _predicted(state, delta, by_w, Q, memory):
-    """The _State after increments delta (h, 3) with derivatives by w and noise Q (h, 3, 3).
+def _predicted(state, odometry, k, Q, memory):
+    """The _State after increment k by _Odometry, with noise Q (h, 3, 3).
 
-    Below M its rows are the expected sightings M' + memory (z - M).
+    Its last rows are the expected sightings M' + memory (z - M).
     """
     X = state.x[:, 0]
-    camera = state.x[:, 2]
     M = state.x[:, 3:]
-    memory = memory[:, None, None]
+    delta = odometry.delta(k, state.x[:, 1])
+    D, D_by_delta, D_by_camera = _in_camera(delta, state.x[:, 2])
     by_X, by_delta = se2.compose_jacobians(X, delta)
-    D, D_by_delta, D_by_camera = _in_camera(delta, camera)
     M_by_D, M_by_M = se2.between_jacobians(D[:, None], M)
     M_by_D = M_by_D.reshape(len(D), -1, 3)
     L = np.zeros(state.P.shape[:2] + (3,))
@@ -288,16 +292,16 @@ def _predicted(state, delta, by_w, Q, memory):
     identity = np.tile(np.eye(9), (len(D), 1, 1))
     F = _block_diagonal(identity, M_by_M)
     F[:, POSE, POSE] = by_X
-    F[:, :, WHEELS] += L @ by_w
+    F[:, :, WHEELS] += L @ odometry.by_w[k]
     F[:, MARKERS, CAMERA] += M_by_D @ D_by_camera
     M_before = np.eye(F.shape[1])[MARKERS]
     F = np.concatenate([F, F[:, MARKERS] - memory * M_before], axis=1)
     L = np.concatenate([L, L[:, MARKERS]], axis=1)
-    M_now = se2.between(D[:, None], M)
-    expected = M_now + memory * se2.difference(state.z, M)
     x = state.x.copy()
     x[:, 0] = se2.compose(X, delta)
-    x[:, 3:] = M_now
+    x[:, 3:] = se2.between(D[:, None], M)
+    error = se2.difference(state.z, M)
+    expected = x[:, 3:] + memory * error
     return state._replace(
         x=np.concatenate([x, expected], axis=1),
         P=F @ state.P @ F.mT + L @ Q @ L.mT)
@@ -312,58 +316,71 @@ def _in_camera(delta, camera):
     return se2.between(camera, moved), D_by_moved @ moved_by_delta, by_camera
 
 
-def _updated(state, sightings, rows, memory):
-    """The _State after a frame, by `rows` of Sightings: with the markers seen there only."""
-    is_known = state.marker[:, None] == sightings.marker[rows]
+def _updated(state, sightings, row, memory):
+    """The _State after the frame in this row of Sightings: with the markers seen there only."""
+    seen = np.flatnonzero(sightings.row == row)
+    is_known = state.marker[:, None] == sightings.marker[seen]
     known, again = is_known.nonzero()
-    row = rows[again]
-    expected = 3 + len(state.marker) + known
-    innovation = se2.difference(sightings.z[row], state.x[:, expected])
-    C = (1 - memory[:, None, None, None]**2) * sightings.C[row]      # of the new part of errors
-    H = _rows(expected)
-    S = state.P[:, H[:, :, None], H[:, None]] + C                    # of each sighting alone
-    squared = se2.squared_norms(innovation, S)
+    state = _selected(state, known)
+    again = seen[again]
+    innovation = se2.difference(sightings.z[again], state.x[:, 3 + len(known):])
+    C = (1 - memory[..., None]**2) * sightings.C[again]              # of the new part of errors
+    S = _diagonal_blocks(state.P[:, 9 + 3 * len(known):, 9 + 3 * len(known):]) + C
+    squared = se2.squared_norms(innovation, S)                       # of each sighting alone
     accepted = squared[state.likeliest] < GATE
-    corrected = _corrected(
-        state, 3 + known[accepted], expected[accepted], innovation[:, accepted], C[:, accepted])
-    # No filter gains by a rejection, but one that predicts the sighting nevertheless.
+    # No filter gains by a rejection, but one that expects the sighting nevertheless.
     cost = np.minimum(squared, GATE) + np.linalg.slogdet(S)[1]
     loss = cost[:, ~accepted]
-    new = rows[~is_known.any(axis=0)]
-    z_new = np.broadcast_to(sightings.z[new], (len(loss), len(new), 3))
-    seen = np.append(row[accepted], new)
+    state = _selected(state, np.flatnonzero(accepted))
+    state = _corrected(state, innovation[:, accepted], C[:, accepted])
+    new = seen[~is_known.any(axis=0)]
+    used = np.append(again[accepted], new)
+    z_new = np.tile(sightings.z[new], (len(loss), 1, 1))
     return _State(
-        x=np.concatenate([corrected.x, z_new], axis=1),
-        P=_block_diagonal(corrected.P, sightings.C[new]),
-        marker=sightings.marker[seen],
-        z=sightings.z[seen],
-        log_density=corrected.log_density - loss.sum(axis=1) / 2,
+        x=np.concatenate([state.x, z_new], axis=1),
+        P=_block_diagonal(state.P, sightings.C[new]),
+        marker=sightings.marker[used],
+        z=sightings.z[used],
+        log_density=state.log_density - loss.sum(axis=1) / 2,
         rejected=state.rejected + loss.shape[1])
 
 
-def _corrected(state, markers, expected, innovation, C):
-    """The _State with only these `markers` (k,) of x, by their innovations (h, k, 3)."""
-    kept = np.append([0, 1, 2], markers)
-    rows = _rows(kept).ravel()
-    H = _rows(expected).ravel()
-    v = innovation.reshape(len(innovation), -1, 1)
-    HP = state.P[:, H[:, None], rows]
-    S = _block_diagonal(np.zeros((len(v), 0, 0)), C) + state.P[:, H[:, None], H]
+def _selected(state, markers):
+    """The predicted _State with only some markers, by their numbers (k,)."""
+    expected = 3 + len(state.marker) + markers
+    index = np.concatenate([[0, 1, 2], 3 + markers, expected])
+    rows = 3 * index[:, None] + np.arange(3)
+    rows = rows.ravel()
+    return state._replace(
+        x=state.x[:, index],
+        P=state.P[:, rows[:, None], rows],
+        marker=state.marker[markers])
+
+
+def _corrected(state, innovation, C):
+    """The _State after the update by innovations (h, m, 3), without expected sightings."""
+    count, m = C.shape[:2]
+    end = 9 + 3 * m
+    v = innovation.reshape(count, -1, 1)
+    HP = state.P[:, end:, :end]
+    noise = _block_diagonal(np.zeros((count, 0, 0)), C)
+    S = state.P[:, end:, end:] + noise
     gain = np.linalg.solve(S, HP).mT
     change = gain @ v
-    x = state.x[:, kept]
-    P = state.P[:, rows[:, None], rows] - gain @ HP
+    P = state.P[:, :end, :end] - gain @ HP
     squared = v.mT @ np.linalg.solve(S, v)
     cost = squared[:, 0, 0] + np.linalg.slogdet(S)[1]
     return state._replace(
-        x=x + change.reshape(x.shape),
+        x=state.x[:, :3 + m] + change.reshape(count, -1, 3),
         P=(P + P.mT) / 2,
         log_density=state.log_density - cost / 2)
 
 
-def _rows(index):
-    """Rows (k, 3) of P of rows (k,) of x."""
-    return 3 * index[:, None] + np.arange(3)
+def _diagonal_blocks(P):
+    """The blocks (h, m, 3, 3) on the diagonal of P (h, 3m, 3m)."""
+    m = P.shape[1] // 3
+    blocks = P.reshape(len(P), m, 3, m, 3)
+    return np.einsum("hmimj->hmij", blocks)
 
 
 def _block_diagonal(P, C):
@@ -377,20 +394,18 @@ def _block_diagonal(P, C):
     return blocks
 
 
-def _poses_from_frames(drive, frame, slip, states, best):
+def _poses_from_frames(dataset, jumps, frame, slip, x, P):
     """All poses (n, 3) and covariances, by odometry from the last frame before each.
 
-    `states` are those after each `frame`, of which the filter `best` counts.
+    x (f, 3, 3) and P (f, 9, 9) are those after each `frame`.
     """
-    x = np.array([state.x[best, :2] for state in states])
-    P = np.array([state.P[best, :6, :6] for state in states])
-    pose = np.arange(len(drive.dataset.ticks))
+    pose = np.arange(len(dataset.ticks))
     last = np.searchsorted(frame, pose, side="right") - 1
-    odometry = _odometry(drive, frame[last], pose)
-    X, w = x[last].swapaxes(0, 1)
-    delta = odometry.increment + np.matvec(odometry.by_w, w - drive.w_0)
+    odometry = _odometry(dataset, jumps, frame[last], pose)
+    X = x[last, 0]
+    delta = odometry.delta(pose, x[last, 1])
     by_X, by_delta = se2.compose_jacobians(X, delta)
     F = np.concatenate([by_X, by_delta @ odometry.by_w], axis=2)
     Q = odometry.noise(pose, slip)
-    covariances = F @ P[last] @ F.mT + by_delta @ Q @ by_delta.mT
+    covariances = F @ P[last, :6, :6] @ F.mT + by_delta @ Q @ by_delta.mT
     return se2.compose(X, delta), covariances
