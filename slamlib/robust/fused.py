@@ -318,69 +318,54 @@ def _in_camera(delta, camera):
 
 def _updated(state, sightings, row, memory):
     """The _State after the frame in this row of Sightings: with the markers seen there only."""
-    seen = np.flatnonzero(sightings.row == row)
-    is_known = state.marker[:, None] == sightings.marker[seen]
-    known, again = is_known.nonzero()
-    state = _selected(state, known)
-    again = seen[again]
-    innovation = se2.difference(sightings.z[again], state.x[:, 3 + len(known):])
-    C = (1 - memory[..., None]**2) * sightings.C[again]              # of the new part of errors
-    S = _diagonal_blocks(state.P[:, 9 + 3 * len(known):, 9 + 3 * len(known):]) + C
-    squared = se2.squared_norms(innovation, S)                       # of each sighting alone
-    accepted = squared[state.likeliest] < GATE
-    # No filter gains by a rejection, but one that expects the sighting nevertheless.
-    cost = np.minimum(squared, GATE) + np.linalg.slogdet(S)[1]
-    loss = cost[:, ~accepted]
-    state = _selected(state, np.flatnonzero(accepted))
-    state = _corrected(state, innovation[:, accepted], C[:, accepted])
-    new = seen[~is_known.any(axis=0)]
-    used = np.append(again[accepted], new)
-    z_new = np.tile(sightings.z[new], (len(loss), 1, 1))
-    return _State(
-        x=np.concatenate([state.x, z_new], axis=1),
-        P=_block_diagonal(state.P, sightings.C[new]),
-        marker=sightings.marker[used],
-        z=sightings.z[used],
-        log_density=state.log_density - loss.sum(axis=1) / 2,
-        rejected=state.rejected + loss.shape[1])
-
-
-def _selected(state, markers):
-    """The predicted _State with only some markers, by their numbers (k,)."""
-    expected = 3 + len(state.marker) + markers
-    index = np.concatenate([[0, 1, 2], 3 + markers, expected])
+    new_part = 1 - memory**2                                # of the variance of errors
+    kept = []
+    used = []
+    new = []
+    for k in np.flatnonzero(sightings.row == row):
+        number = np.flatnonzero(state.marker == sightings.marker[k])
+        if not len(number):
+            new.append(k)
+            continue
+        before = state.rejected
+        state = _measured(state, number[0], sightings.z[k], new_part * sightings.C[k])
+        if state.rejected == before:
+            kept.append(number[0])
+            used.append(k)
+    index = np.append([0, 1, 2], 3 + np.array(kept, int))
     rows = 3 * index[:, None] + np.arange(3)
     rows = rows.ravel()
+    used = np.array(used + new, int)
+    z_new = np.tile(sightings.z[new], (len(memory), 1, 1))
     return state._replace(
-        x=state.x[:, index],
-        P=state.P[:, rows[:, None], rows],
-        marker=state.marker[markers])
+        x=np.concatenate([state.x[:, index], z_new], axis=1),
+        P=_block_diagonal(state.P[:, rows[:, None], rows], sightings.C[new]),
+        marker=sightings.marker[used],
+        z=sightings.z[used])
 
 
-def _corrected(state, innovation, C):
-    """The _State after the update by innovations (h, m, 3), without expected sightings."""
-    count, m = C.shape[:2]
-    end = 9 + 3 * m
-    v = innovation.reshape(count, -1, 1)
-    HP = state.P[:, end:, :end]
-    noise = _block_diagonal(np.zeros((count, 0, 0)), C)
-    S = state.P[:, end:, end:] + noise
+def _measured(state, number, z, C):
+    """The predicted _State after a sighting z (3,) of a marker, unless it is beyond the gate.
+
+    No filter gains by a rejection, but one that expects the sighting nevertheless.
+    """
+    expected = 3 + len(state.marker) + number
+    H = slice(3 * expected, 3 * expected + 3)
+    innovation = se2.difference(z, state.x[:, expected])
+    HP = state.P[:, H]
+    S = HP[:, :, H] + C
+    squared = se2.squared_norms(innovation, S)
+    accepted = squared[state.likeliest] < GATE
+    if not accepted:
+        squared = np.minimum(squared, GATE)
+    cost = squared + np.linalg.slogdet(S)[1]
+    state = state._replace(log_density=state.log_density - cost / 2)
+    if not accepted:
+        return state._replace(rejected=state.rejected + 1)
     gain = np.linalg.solve(S, HP).mT
-    change = gain @ v
-    P = state.P[:, :end, :end] - gain @ HP
-    squared = v.mT @ np.linalg.solve(S, v)
-    cost = squared[:, 0, 0] + np.linalg.slogdet(S)[1]
-    return state._replace(
-        x=state.x[:, :3 + m] + change.reshape(count, -1, 3),
-        P=(P + P.mT) / 2,
-        log_density=state.log_density - cost / 2)
-
-
-def _diagonal_blocks(P):
-    """The blocks (h, m, 3, 3) on the diagonal of P (h, 3m, 3m)."""
-    m = P.shape[1] // 3
-    blocks = P.reshape(len(P), m, 3, m, 3)
-    return np.einsum("hmimj->hmij", blocks)
+    change = np.matvec(gain, innovation)
+    P = state.P - gain @ HP
+    return state._replace(x=state.x + change.reshape(state.x.shape), P=(P + P.mT) / 2)
 
 
 def _block_diagonal(P, C):
