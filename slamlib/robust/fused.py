@@ -1,32 +1,32 @@
 """Problem 2, odometry and markers fused by Kalman filters whose state contains the shared errors.
 
-The state contains the pose X, the shared parameters s (wheels w = [R_R, R_L, b], camera c, size of
-the markers) and the markers M_j of the last frame, in the camera, with covariance P (Smith, Self
-and Cheeseman, Estimating Uncertain Spatial Relationships in Robotics, 1990). Odometry predicts
+The state contains the pose X, the shared parameters (how far the wheels w = [R_R, R_L, b] are off
+the stated ones, and the camera c) and the markers M_j of the last frame, in the camera, with
+covariance P (Smith, Self and Cheeseman, Estimating Uncertain Spatial Relationships in Robotics,
+1990). Odometry predicts
 
-    X' = X Delta(w),    M'_j = D^-1 M_j,    D = c^-1 Delta(w) c,    s' = s,
+    X' = X Delta(w),    M'_j = D^-1 M_j,    D = c^-1 Delta(w) c,    w' = w,    c' = c,
     P' = F P F^T + L Q L^T,
 
-with Delta(w) = Delta(w_0) + dDelta/dw (w - w_0), lengths in D over the size, F and L the
-derivatives of the new state by the old one and by Delta, and Q the noise of Delta
-(`increments.noise_in_drive`). The sightings Z_j of the new frame, with covariances C_j, measure the
-markers M' = H state and update
+with Delta(w) = Delta(0) + dDelta/dw w, F and L the derivatives of the new state by the old one and
+by Delta, and Q the noise of Delta (`increments.noise_in_drive`). Each sighting Z_j of the new
+frame, with covariance C_j, measures a marker, M'_j = H state, and updates
 
-    state <- state + K (Z - M'),    P <- (I - K H) P',    K = P' H^T S^-1,    S = H P' H^T + C,
+    state <- state + K (Z_j - M'_j),    P <- P' - K H P',    K = P' H^T S^-1,    S = H P' H^T + C_j.
 
-with C block-diagonal. Sightings beyond GATE are rejected. Then the filter removes rejected markers
-and those out of view, and adds new ones with covariance C_j. Without markers the result is the
-first-order propagation of odometry; with uninformative odometry and one marker it is `localize`.
+Sightings beyond GATE are rejected. Then the filter removes rejected markers and those out of view,
+and adds new ones with covariance C_j. Without markers the result is the first-order propagation of
+odometry; with uninformative odometry and one marker it is `localize`.
 
 Errors of a marker in successive frames are alike, with the correlation `memory`. The last sighting
 tells the last error, so what is expected and measured is Z = M' + memory (Z_last - M), with the
 covariance (1 - memory^2) C of the new part of the error (Bryson and Henrikson, Estimation using
 sampled data containing sequentially correlated noise, 1968).
 
-Nobody states the slip. So several filters run side by side, each with its slip, and their mean is
-taken with their probabilities by the innovations so far (multiple models: Bar-Shalom, Li and
-Kirubarajan 2001, section 11.6). Stretches of the drive tell in advance which slips are tried, the
-memory, and whether the camera is elsewhere than stated.
+Nobody states the slip. So several filters run side by side, each with its slip, and the likeliest
+by its innovations is taken (multiple models: Bar-Shalom, Li and Kirubarajan 2001, section 11.6).
+Stretches of the drive tell in advance which slips are tried, the memory, and whether the camera is
+elsewhere than stated. The size of the markers is as stated.
 """
 
 from dataclasses import dataclass, replace
@@ -42,7 +42,7 @@ from slamlib.core.odometry import cumulative
 from slamlib.core.records import Dataset
 from slamlib.core.sightings import GATE, sightings_by_frame
 from slamlib.robust.calibration import stated_calibration
-from slamlib.robust.jumps import NO_JUMPS, Jumps, find_jumps
+from slamlib.robust.jumps import NO_JUMPS, find_jumps
 
 SLIPS = TYPICAL_SLIP * SLIP_FACTOR ** np.arange(-1.0, 4.0)     # sqrt(m), of the first filters
 FINE_STEPS = 1.4 ** np.arange(-2.0, 3.0)     # slips of the last filters, over the likeliest one
@@ -185,23 +185,15 @@ def _all_models(slips, memories, elsewhere):
 
 
 def _stretches(dataset):
-    """The Dataset with sightings in some stretches only, which begin after equal distances.
-
-    So many frames at a stand count as one stretch.
-    """
+    """The Dataset with sightings in some stretches only, which begin after equally many frames."""
     aruco = dataset.aruco
     if aruco is None:
         return dataset
     frame = np.unique(aruco.pose)
     period = max(STRETCH_FRAMES, len(frame) // STRETCHES)
     number = np.searchsorted(frame, aruco.pose)
-    return replace(dataset, aruco=aruco.select(number % period < STRETCH_FRAMES))
-
-
-def _travelled(ticks):
-    """Sum of the counts of both wheels (n,) up to each pose."""
-    counts = np.abs(ticks[1:])
-    return cumulative(counts.sum(axis=1))
+    in_stretch = number % period < STRETCH_FRAMES
+    return replace(dataset, aruco=aruco.select(in_stretch))
 
 
 def _sightings(dataset):
@@ -224,12 +216,14 @@ def _odometry(dataset, jumps, start, end):
     vehicle = dataset.vehicle
     increment, by_w = increments.between_poses(ticks, vehicle, start, end, "arc")
     rounding, slipping = increments.noise_in_drive(ticks, vehicle, start, end)
-    travelled = _travelled(ticks)
+    counts = np.abs(ticks[1:])
+    travelled = cumulative(counts.sum(axis=1))        # by both wheels
     travel = travelled[end] - travelled[start]
     speed = travel / np.maximum(end - start, 1)
     crawls = speed * travel.sum() < CRAWL * (speed @ travel)
     by_w[crawls] = 0.0
-    rounding[crawls] += increment[crawls, :, None] * increment[crawls, None]
+    creep = increment[crawls]
+    rounding[crawls] += creep[:, :, None] * creep[:, None]
     jump, unknown = jumps.added(start, end)
     increment = se2.compose(increment, jump)
     return _Odometry(increment, by_w, rounding + unknown, slipping)
@@ -319,27 +313,29 @@ def _in_camera(delta, camera):
 def _updated(state, sightings, row, memory):
     """The _State after the frame in this row of Sightings: with the markers seen there only."""
     new_part = 1 - memory**2                                # of the variance of errors
-    kept = []
-    used = []
+    kept = []                                               # numbers of markers
+    used = []                                               # their rows
     new = []
     for k in np.flatnonzero(sightings.row == row):
         number = np.flatnonzero(state.marker == sightings.marker[k])
         if not len(number):
             new.append(k)
             continue
-        before = state.rejected
-        state = _measured(state, number[0], sightings.z[k], new_part * sightings.C[k])
-        if state.rejected == before:
+        C = new_part * sightings.C[k]
+        rejected = state.rejected
+        state = _measured(state, number[0], sightings.z[k], C)
+        if state.rejected == rejected:
             kept.append(number[0])
             used.append(k)
     index = np.append([0, 1, 2], 3 + np.array(kept, int))
     rows = 3 * index[:, None] + np.arange(3)
     rows = rows.ravel()
-    used = np.array(used + new, int)
+    P = state.P[:, rows[:, None], rows]
     z_new = np.tile(sightings.z[new], (len(memory), 1, 1))
+    used = np.array(used + new, int)
     return state._replace(
         x=np.concatenate([state.x[:, index], z_new], axis=1),
-        P=_block_diagonal(state.P[:, rows[:, None], rows], sightings.C[new]),
+        P=_block_diagonal(P, sightings.C[new]),
         marker=sightings.marker[used],
         z=sightings.z[used])
 
@@ -365,7 +361,8 @@ def _measured(state, number, z, C):
     gain = np.linalg.solve(S, HP).mT
     change = np.matvec(gain, innovation)
     P = state.P - gain @ HP
-    return state._replace(x=state.x + change.reshape(state.x.shape), P=(P + P.mT) / 2)
+    x = state.x + change.reshape(state.x.shape)
+    return state._replace(x=x, P=(P + P.mT) / 2)
 
 
 def _block_diagonal(P, C):
@@ -392,5 +389,6 @@ def _poses_from_frames(dataset, jumps, frame, slip, x, P):
     by_X, by_delta = se2.compose_jacobians(X, delta)
     F = np.concatenate([by_X, by_delta @ odometry.by_w], axis=2)
     Q = odometry.noise(pose, slip)
-    covariances = F @ P[last, :6, :6] @ F.mT + by_delta @ Q @ by_delta.mT
-    return se2.compose(X, delta), covariances
+    by_frame = F @ P[last, :6, :6] @ F.mT
+    by_odometry = by_delta @ Q @ by_delta.mT
+    return se2.compose(X, delta), by_frame + by_odometry
