@@ -56,7 +56,7 @@ def test_without_a_change_nothing_is_executed_and_lost_results_are_written_again
 @pytest.mark.parametrize("change, is_set", [
     (lambda folder: None, False),
     (lambda folder: (folder / "report" / "a.html").unlink(), True),
-    (lambda folder: (folder / "notebooks" / "picture.svg").write_text("<svg/>"), True)])
+    (lambda folder: add(folder, "notebooks/picture.svg"), True)])
 def test_pages_are_set_again_only_where_one_is_lost_or_shows_something_else(
         project, capsys, change, is_set):
     executions(project)
@@ -68,7 +68,7 @@ def test_pages_are_set_again_only_where_one_is_lost_or_shows_something_else(
 
 
 def test_fresh_executes_all_without_a_change(project):
-    assert executions(project) == (1, 1)
+    executions(project)
     assert executions(project, fresh=True) == (2, 2)
 
 

@@ -132,11 +132,12 @@ def test_where_nothing_can_be_written_is_told_before_anything_is_solved(
     write_dataset(tmp_path / "drive", drive)
     (tmp_path / "file").write_text("mine")
     os.mkfifo(tmp_path / "fifo")
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(solve, "find", None)
-    for out in (tmp_path / "file", tmp_path / "fifo", tmp_path / "file" / "x", "/proc/x"):
-        assert main(["solve", str(tmp_path / "drive"), "--out", str(out)]) == 2
+    for out in ("file", "fifo", "file/x", "/proc/x"):
+        assert main(["solve", "drive", "--out", out]) == 2
         told = capsys.readouterr().err.splitlines()[-1]
-        assert told.startswith(f"slamlib: {out}: expected a folder to write to")
+        assert "expected a folder to write to" in told and out in told
     assert (tmp_path / "file").read_text() == "mine"
 
 
