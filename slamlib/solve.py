@@ -321,7 +321,7 @@ def _write(out, dataset, truth, solved, others, text):
     """Write solved problems to a folder; return its summary, with the rows of `others`, too."""
     rows = dict(others)
     for each in solved:
-        rows[each.problem] = summary_row(each, truth)
+        rows[each.problem] = summarize(each, truth)
     summary = summary_of(dataset, truth, rows, doubts_before_solving(dataset))
     clear_results(out, keep=others)
     for each in solved:
@@ -359,13 +359,31 @@ def summary_of(dataset: Dataset, truth: Truth | None, rows: dict, doubts: list[D
             "notes": all_notes(dataset, truth), "problems": problems}
 
 
-def summary_row(solved: Solution | Failure, truth: Truth | None) -> dict:
-    """The row of a problem in the summary, a dict of plain numbers and its doubts."""
-    row = {"title": solved.title, "doubts": []}
+def summarize(solved: Solution | Failure, truth: Truth | None) -> dict:
+    """The row of a problem in the summary: plain numbers, of errors where there is truth."""
     if isinstance(solved, Failure):
-        return row | {"failed": solved.reason}
-    row["doubts"] = [asdict(doubt) for doubt in solved.doubts]
-    return row | summarize(solved, truth)
+        return {"title": solved.title, "doubts": [], "failed": solved.reason}
+    known = np.flatnonzero(np.isfinite(solved.poses[:, 0]))
+    covariances = solved.covariances[known]
+    last = known[-1]
+    sigmas = evaluation.sigmas(covariances)
+    position_sigmas = evaluation.position_sigmas(covariances)
+    row = {"title": solved.title, "doubts": [asdict(doubt) for doubt in solved.doubts],
+           "path_length_m": evaluation.path_length(solved.poses), "estimated_poses": len(known),
+           "world_is_pose": solved.world + 1, "last_pose_number": int(last) + 1,
+           "last_pose": solved.poses[last].tolist(), "last_sigma": sigmas[-1].tolist(),
+           "last_sigma_m": float(position_sigmas[-1]),
+           "median_sigma_m": float(np.median(position_sigmas)),
+           "median_sigma_heading_rad": float(np.median(sigmas[:, 2]))}
+    row |= solved.facts
+    if truth is not None:
+        true_poses = truth_in_world(solved, truth)
+        row["ate_m"] = evaluation.ate(solved.poses, true_poses)
+        row["ate_aligned_m"] = evaluation.ate(solved.poses, true_poses, aligned=True)
+        nees = evaluation.anees(solved.poses, solved.covariances, true_poses)
+        if np.isfinite(nees):                           # not where every pose is known
+            row["nees"] = nees
+    return row
 
 
 def write_estimated_vehicle(path: Path, vehicle: Vehicle, rows: dict):
@@ -481,23 +499,3 @@ def drive_table(summaries: Sequence[dict]) -> pd.DataFrame:
         if not summary["problems"]:
             rows.append(drive)
     return pd.DataFrame(rows, columns=COLUMNS)
-
-
-def summarize(solution: Solution, truth: Truth | None) -> dict:
-    """Last estimate with its sigmas and, where there is truth, errors: a dict of plain numbers."""
-    known = np.flatnonzero(np.isfinite(solution.poses[:, 0]))
-    last = known[-1]
-    sigmas = evaluation.sigmas(solution.covariances[last])
-    summary = {"path_length_m": evaluation.path_length(solution.poses),
-               "estimated_poses": len(known), "world_is_pose": solution.world + 1,
-               "last_pose_number": int(last) + 1, "last_pose": solution.poses[last].tolist(),
-               "last_sigma": sigmas.tolist(), "last_sigma_m": float(max(sigmas[:2]))}
-    summary |= solution.facts
-    if truth is not None:
-        true_poses = truth_in_world(solution, truth)
-        summary["ate_m"] = evaluation.ate(solution.poses, true_poses)
-        summary["ate_aligned_m"] = evaluation.ate(solution.poses, true_poses, aligned=True)
-        nees = evaluation.anees(solution.poses, solution.covariances, true_poses)
-        if np.isfinite(nees):                           # not where every pose is known
-            summary["nees"] = nees
-    return summary

@@ -14,9 +14,7 @@ from slamlib.__main__ import main
 from slamlib.core.errors import DatasetError
 from slamlib.report import handin
 from slamlib.report.notebooks import Options
-from slamlib.report.overview import SolvedDrive
-from slamlib.robust.file_doubts import Doubt
-from slamlib.solve import Failure, Solution
+from slamlib.solve import Solution, summarize
 from slamlib.studies.simulation import simulate, write_dataset
 
 SOLVE = """from slamlib.notebook import *
@@ -81,8 +79,8 @@ def test_the_pdf_is_without_what_is_for_screens_and_the_usual_pages_stay(handed)
 def test_the_readme_is_true_of_the_files(handed):
     text = handed[1].read("README.txt").decode()
     one_line = re.sub(r"\s+", " ", text)
-    for part in ("Ada", "mine/problem2: vehiclePose.mat and ArucoMap.mat odometry + ArUco; 40 of "
-                 "40 poses have an estimate", "mine/problem4: vehiclePose.mat, ArucoMap.mat and "
+    for part in ("Ada", "mine/problem2: vehiclePose.mat, ArucoMap.mat odometry + ArUco; 40 of "
+                 "40 poses have an estimate", "mine/problem4: vehiclePose.mat, ArucoMap.mat, "
                  "UwbMap.mat SLAM: odometry + ArUco + UWB; 40 of 40", "fused with odometry",
                  "problem2/ArucoMap.mat is the map by the ArUco measurements alone, because "
                  "the fusion has no map of its own. Its world frame is the frame of pose 11.",
@@ -112,59 +110,59 @@ def test_appendices_are_left_out_unless_report_toml_names_its_chapters():
     assert handin.hand_in_options(Options(chapters=("1*", "B*"))).chapters == ("1*", "B*")
 
 
-def solved_drive(*problems, **others):
-    """A SolvedDrive of two poses, the first of which has no estimate by markers alone."""
-    dataset = drive_of("d", 2)
+def summary_of(*problems, **others):
+    """A summary of two poses, the first of which has no estimate by markers alone."""
     poses = np.zeros((2, 3))
-    solutions = [Solution(problem, problem, poses, np.zeros((2, 3, 3)),
-                          world=int(problem == "problem2")) for problem in problems]
-    return SolvedDrive("d", dataset, None, solutions=tuple(solutions), **others)
+    covariances = np.tile(np.eye(3), (2, 1, 1))
+    rows = {problem: summarize(Solution(problem, problem, poses, covariances,
+                                        world=int(problem == "problem2")), None)
+            for problem in problems}
+    return {"dataset": "d", "poses": 2, "doubts": [], "notes": [], "problems": rows} | others
 
 
 @pytest.mark.parametrize("problem2, folder, aruco_map", [
     ("aruco", "problem2", "problem2"), ("fused", "problem2_fused", "problem2"),
     ("hint", "problem2_hint", "problem2_hint")])
 def test_the_map_of_problem_2_is_that_of_its_estimate_if_it_has_one(problem2, folder, aruco_map):
-    files = ("notes.mat", "problem1/other.mat", "problem2/ArucoMap.mat", "problem2/vehiclePose.mat",
+    names = ("notes.mat", "problem1/other.mat", "problem2/ArucoMap.mat", "problem2/vehiclePose.mat",
              "problem2_fused/vehiclePose.mat", "problem2_hint/ArucoMap.mat",
              "problem2_hint/vehiclePose.mat")
-    drive = solved_drive("problem2", "problem2_fused", "problem2_hint", files=files)
-    assert handin.handed_in(drive, problem2) == {
-        "problem2/vehiclePose.mat": f"{folder}/vehiclePose.mat",
-        "problem2/ArucoMap.mat": f"{aruco_map}/ArucoMap.mat"}
-    text = handin.readme([drive], Options(problem2=problem2))
+    handed = handin.handed_in(names, problem2)
+    assert handed == {"problem2/vehiclePose.mat": f"{folder}/vehiclePose.mat",
+                      "problem2/ArucoMap.mat": f"{aruco_map}/ArucoMap.mat"}
+    summary = summary_of("problem2", "problem2_fused", "problem2_hint")
+    summary["problems"] |= dict.fromkeys(("problem1", "problem3", "problem4"), {"failed": "no"})
+    text = handin.readme([(summary, handed)], Options(problem2=problem2))
     assert ("no map of its own" in text) == (problem2 == "fused")
     assert ("In d/problem2 it is the frame of the vehicle at pose 2" in text) == (
         problem2 == "aruco")
-    files = files[:3]  # no poses of the chosen estimate: the map alone is not handed in
-    if problem2 != "aruco":
-        assert handin.handed_in(replace(drive, files=files), problem2) == {}
+    if problem2 != "aruco":     # no poses of the chosen estimate: the map alone is not handed in
+        assert handin.handed_in(names[:3], problem2) == {}
 
 
 def test_doubts_and_failures_are_in_the_readme_and_empty_headings_are_not():
-    drive = solved_drive("problem1", files=("problem1/vehiclePose.mat",), doubts=(
-        Doubt("units", "Lengths may be in millimetres."),), failures=(
-        Failure("problem3", "SLAM", "no landmark"), Failure("problem2_hint", "hint", "not told")))
-    drive = replace(drive, dataset=drive.dataset.without("uwb"))
-    text = handin.readme([drive], Options(author="A", course="C"), ["x", "y"])
+    summary = summary_of("problem1", doubts=[{"what": "units", "sentence": "Lengths are in mm."}])
+    for problem, reason in (("problem3", "no landmark"), ("problem2_hint", "not told")):
+        summary["problems"][problem] = {"title": problem, "failed": reason}
+    handed = {"problem1/vehiclePose.mat": "problem1/vehiclePose.mat"}
+    text = handin.readme([(summary, handed)], Options(author="A", course="C"), ["x", "y"])
     one_line = " ".join(text.split())
-    assert "d: Lengths may be in millimetres." in text and "not told" not in text
-    assert "d/problem2 (ArUco): no result." in one_line
+    assert "d: Lengths are in mm." in text and "not told" not in text
+    assert "d/problem2 (ArUco): left out: it needs markers." in one_line
     assert "d/problem3 (SLAM: odometry + ArUco): could not be solved: no landmark." in one_line
-    assert "/problem4 (SLAM: odometry + ArUco + UWB): left out: no UWB ranges." in one_line
-    assert "Simulated and left out: x and y." in text
+    assert "/problem4 (SLAM: odometry + ArUco + UWB): left out: it needs UWB ranges." in one_line
+    assert "Simulated and left out: x, y." in text
     assert text.startswith(f"{Options().title}\nA\nC\n")
-    noted = replace(drive, dataset=replace(drive.dataset, notes=("A header was left out.",)))
-    assert "d: A header was left out." in handin.readme([noted], Options())
-    text = handin.readme([replace(drive, doubts=())], Options())
+    noted = summary_of("problem1", notes=["A header was left out."])
+    assert "d: A header was left out." in handin.readme([(noted, handed)], Options())
+    text = handin.readme([(summary_of("problem1"), handed)], Options())
     assert "Doubts" not in text and "Notes" not in text
 
 
 def test_results_of_a_run_that_was_killed_are_not_handed_in(tmp_path):
-    drive = solved_drive("problem1", files=("problem1/vehiclePose.mat",))
     pdf = tmp_path / "report.pdf"
     pdf.write_bytes(b"")
-    report = SimpleNamespace(files=[pdf], drives=[drive], omitted=[])
+    report = SimpleNamespace(files=[pdf], summaries=[summary_of("problem1")], omitted=[])
     (tmp_path / "d" / "problem1").mkdir(parents=True)
     (tmp_path / "d" / "problem1" / "vehiclePose.mat").write_bytes(b"half")
     with pytest.raises(DatasetError, match="summary.json: .* solve the dataset again"):

@@ -22,7 +22,7 @@ from slamlib.report import cache
 from slamlib.report.document import render
 from slamlib.report.execution import TRANSPORT, execute, kernel_environment
 from slamlib.report.notebooks import Options, chapter_of, read_books
-from slamlib.report.overview import SolvedDrive, opening, solved_drive, title_picture
+from slamlib.report.overview import opening, solved_drive, title_picture
 from slamlib.robust.file_doubts import doubts_before_solving
 from slamlib.solve import SENSORS, clear_results, summary_of
 
@@ -36,7 +36,7 @@ class Report:
     """The files of a report and what was found."""
 
     files: list[Path]  # `index.html` first, `report.pdf` last
-    drives: list[SolvedDrive]
+    summaries: list[dict]  # of the drives, as their summary.json has them
     omitted: list[str]  # names of simulated datasets that are left out
 
 
@@ -80,7 +80,8 @@ def build_report(notebooks: Path, data: Path, report: Path, results: Path,
                 shown = {Path("index"): opening(solved, books)} | books
                 names = _write_pages(shown, options, title_picture(solved), report)
     _say(f"built in {time.monotonic() - start:.1f} s")
-    return Report([report / name for name in names], solved, omitted)
+    summaries = [drive.summary for drive in solved]
+    return Report([report / name for name in names], summaries, omitted)
 
 
 def _say(line):
