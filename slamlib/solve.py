@@ -365,16 +365,13 @@ def summarize(solved: Solution | Failure, truth: Truth | None) -> dict:
         return {"title": solved.title, "doubts": [], "failed": solved.reason}
     known = np.flatnonzero(np.isfinite(solved.poses[:, 0]))
     covariances = solved.covariances[known]
-    last = known[-1]
-    sigmas = evaluation.sigmas(covariances)
+    heading_sigmas = evaluation.sigmas(covariances)[:, 2]
     position_sigmas = evaluation.position_sigmas(covariances)
     row = {"title": solved.title, "doubts": [asdict(doubt) for doubt in solved.doubts],
-           "path_length_m": evaluation.path_length(solved.poses), "estimated_poses": len(known),
-           "world_is_pose": solved.world + 1, "last_pose_number": int(last) + 1,
-           "last_pose": solved.poses[last].tolist(), "last_sigma": sigmas[-1].tolist(),
+           "estimated_poses": len(known), "world_is_pose": solved.world + 1,
            "last_sigma_m": float(position_sigmas[-1]),
            "median_sigma_m": float(np.median(position_sigmas)),
-           "median_sigma_heading_rad": float(np.median(sigmas[:, 2]))}
+           "median_sigma_heading_rad": float(np.median(heading_sigmas))}
     row |= solved.facts
     if truth is not None:
         true_poses = truth_in_world(solved, truth)

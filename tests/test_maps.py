@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from itertools import combinations
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ from test_plotting import elongated, require_contours
 from slamlib import estimate, fuse, localize
 from slamlib.core import odometry
 from slamlib.core.evaluation import REACH_95, ate
-from slamlib.core.records import AntennaGuess, UwbReadings
 from slamlib.notebook import Drive, accuracy, antenna_rows, calibration_rows, maps, table
 from slamlib.notebook.tabular import cell
 from slamlib.solve import problem_solution
@@ -99,20 +97,6 @@ def test_names_cover_neither_each_other_nor_what_is_around_axes_of_equal_scales(
     (across, up), = np.diff(ax.transData.transform([[0, 0], [1, 1]]), axis=0)
     assert across == pytest.approx(up, rel=1e-3)
     assert ax.bbox.width > 0.75 * fig.bbox.width
-
-
-@pytest.mark.parametrize("angles, millimetres", [
-    ((0.0, 0.0), 100.0), ((0.0, np.pi / 2), 100 * np.sqrt(2)), (np.arange(8) * np.pi / 4, 0.0)])
-def test_an_offset_of_all_ranges_moves_an_antenna_that_is_seen_from_one_side(angles, millimetres):
-    """From a circle around it not at all; from two sides by 0.1 m along both."""
-    path = 3 * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(len(angles))])
-    ids, ones = np.full(len(path), 7), np.ones(len(path))
-    dataset = SimpleNamespace(uwb=UwbReadings(np.arange(len(path)), ids, 3 * ones, 0.1 * ones),
-                              antenna_guess=AntennaGuess(ids[:1], np.zeros((1, 2))))
-    result = SimpleNamespace(antenna=ids[:1], antenna_in_world=np.zeros((1, 2)), poses=path,
-                             antenna_covariance=np.eye(2)[None], range_weight=ones, doubts={})
-    row, = antenna_rows(result, SimpleNamespace(name="drive", dataset=dataset, truth=None))
-    assert row["by 0.1 m (mm)"] == pytest.approx(millimetres, abs=1e-9)
 
 
 def test_rows_hold_every_antenna_and_its_errors(solved):

@@ -100,7 +100,7 @@ def test_ellipses_are_lines_of_equal_mahalanobis_distance(enlarged):
     """(p - m)^T C^-1 (p - m) = k^2 holds on the boundary, with k^2 = -2 ln(1 - 0.95)."""
     means, covariances = np.arange(12.0).reshape(4, 3), elongated(4, 2.0, 0.5)
     _, ((ax,),) = plotting.panels(1)                                 # scales of x and y differ
-    plotting.ellipses(ax, means, covariances, "#0072B2", probability=0.95, enlarged=enlarged)
+    plotting.ellipses(ax, means, covariances, "#0072B2", enlarged=enlarged)
     k = np.resize(enlarged, 4)
     half = 2.4477 * k[:, None] * np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)[:, :2])
     patches, = ax.collections
@@ -149,13 +149,3 @@ def test_errors_are_in_mm_and_without_truth_the_bands_stand_alone(truth, world):
         assert [line.get_ydata() for line in ax.lines] == ([pytest.approx(error)] if truth else [])
         band = ax.collections[0].get_paths()[0].vertices[:, 1]
         assert band.max() == pytest.approx(reach)
-
-
-def test_a_second_result_on_the_same_axes_has_labels():
-    result, drive = drive_with()
-    for _, axes in plotting.each_drive([drive], rows=2):
-        for role, label in (("slam", None), ("fused", None), ("hint", "my hint")):
-            plotting.errors(axes, result, drive, role, label=label)
-    of = ("", "fused: ", "my hint: ")
-    assert {text.get_text() for text in axes[0].figure.legends[0].get_texts()} == {
-        f"{each}{entry}" for each in of for entry in ("error", "95 % by the covariance")}
