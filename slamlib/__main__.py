@@ -98,8 +98,6 @@ def _add_options_of_a_build(command):
         help="names of folders in data/ (all of them when none is named, but simulated ones where "
         "there are others)")
     add("--jobs", type=int, default=2, help="notebooks executed at a time")
-    add("--fresh", action="store_true",
-        help="execute all notebooks, also where nothing changed")
 
 
 def _add_solve(commands):
@@ -157,7 +155,7 @@ def _build(options):
     try:
         report = build_report(
             notebooks, options.data, options.report, options.results, datasets=datasets,
-            options=shown, jobs=options.jobs, kept=EXECUTED_NOTEBOOKS, fresh=options.fresh)
+            options=shown, jobs=options.jobs, kept=EXECUTED_NOTEBOOKS)
     except NotebookError as error:
         return _ended(1, error)
     if not shown.author:

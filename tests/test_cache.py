@@ -67,11 +67,6 @@ def test_pages_are_set_again_only_where_one_is_lost_or_shows_something_else(
     assert (project / "report" / "a.html").is_file()
 
 
-def test_fresh_executes_all_without_a_change(project):
-    assert executions(project) == (1, 1)
-    assert executions(project, fresh=True) == (2, 2)
-
-
 def add(folder, name):
     """A file of this name in a folder that is made for it."""
     file = folder / name

@@ -42,7 +42,7 @@ class Report:
 
 def build_report(notebooks: Path, data: Path, report: Path, results: Path,
                  datasets: list[str] | None = None, options: Options = Options(), jobs: int = 2,
-                 kept: Path | None = None, fresh: bool = False) -> Report:
+                 kept: Path | None = None) -> Report:
     """Execute all notebooks, write results, pages and PDF; return the Report.
 
     Kernels read the absolute paths of data and results, and the selection, from SLAMLIB_DATA,
@@ -59,7 +59,6 @@ def build_report(notebooks: Path, data: Path, report: Path, results: Path,
     options : the title page and what is shown.
     jobs : notebooks executed at a time.
     kept : folder that caches executed notebooks, or None for one that is removed.
-    fresh : True executes everything although it is cached.
     """
     start = time.monotonic()
     data = data.resolve()
@@ -72,7 +71,7 @@ def build_report(notebooks: Path, data: Path, report: Path, results: Path,
         names = [drive.name for drive in drives]
         environment = kernel_environment(Path(temporary), data, names)
         with files.locked(kept):
-            stages = _executed(books, drives, data, environment, jobs, kept, fresh)
+            stages = _executed(books, drives, data, environment, jobs, kept)
             with files.locked(results), files.locked(report):
                 for drive in drives:
                     _write_results(drive, stages, results / drive.name)
@@ -118,7 +117,7 @@ def _with_what_they_need(books, drives):
     return served or books
 
 
-def _executed(books, drives, data, environment, jobs, kept, fresh):
+def _executed(books, drives, data, environment, jobs, kept):
     """Execute books in place, or recall their outputs; return the folders of their files."""
     folders = {source: cache.folder_of(kept, source) for source in books}
     stages = {source: folders[source] / cache.RESULTS for source in books}
@@ -137,7 +136,7 @@ def _executed(books, drives, data, environment, jobs, kept, fresh):
         finish(source, f"executed in {seconds:.1f} s")
 
     for source, book in books.items():
-        if not fresh and cache.recall(folders[source], begun[source], book):
+        if cache.recall(folders[source], begun[source], book):
             finish(source, "nothing changed")
         else:
             left[source] = book
