@@ -256,7 +256,7 @@ def truth_in_world(solution: Solution, truth: Truth) -> np.ndarray:
 
 
 def write_results(out: Path | str, problem: str, found, dataset: Dataset,
-                  truth: Truth | None = None, text: bool = False) -> Solution | Failure:
+                  truth: Truth | None = None) -> Solution | Failure:
     """Write what a solver found of one problem to the results folder `out` of a drive.
 
     The .mat files come first, summary.json last: a folder without it is unfinished. What it lists
@@ -267,7 +267,6 @@ def write_results(out: Path | str, problem: str, found, dataset: Dataset,
     problem : key of `PROBLEMS`.
     found : what `find` returns for the problem, or the exception, of UNSOLVABLE, that it raised.
     truth : Truth, to report errors, or None.
-    text : bool; True writes each .mat file also as CSV, and trajectories and truth as TUM files.
 
     Returns
     -------
@@ -293,7 +292,7 @@ def write_results(out: Path | str, problem: str, found, dataset: Dataset,
         with suppress(DatasetError):
             rows = results.read_summary(out)["problems"]
         rows.pop(problem, None)
-        _write(out, dataset, truth, [solved], rows, text)
+        _write(out, dataset, truth, [solved], rows)
     return solved
 
 
@@ -303,7 +302,8 @@ def solve_to_folder(dataset: Dataset, truth: Truth | None, out: Path,
 
     Files of an earlier run are replaced, or removed if they belong to other problems; all other
     files in the folder stay. Raises DatasetError, before anything is solved, if nothing can be
-    written there. `truth` and `text` as of `write_results`.
+    written there. `truth` serves to report errors; with `text` each .mat file is written as CSV,
+    too, and trajectories and truth as TUM files.
 
     Returns
     -------
@@ -317,7 +317,7 @@ def solve_to_folder(dataset: Dataset, truth: Truth | None, out: Path,
         return _write(out, dataset, truth, solved, {}, text)
 
 
-def _write(out, dataset, truth, solved, others, text):
+def _write(out, dataset, truth, solved, others, text=False):
     """Write solved problems to a folder; return its summary, with the rows of `others`, too."""
     rows = dict(others)
     for each in solved:
@@ -422,7 +422,7 @@ def solve_folder(folder: Path | str, out: Path | str, problems: Sequence[str] = 
     Parameters
     ----------
     problems : keys of `PROBLEMS`, or none for all that the sensors allow.
-    text : as of `write_results`.
+    text : as of `solve_to_folder`.
     verbose : True prints to stderr what is decided on the way.
     stated : entries of a Vehicle that replace those of the dataset's vehicle.toml.
 

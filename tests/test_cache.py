@@ -33,10 +33,10 @@ def project(tmp_path, monkeypatch):
     return tmp_path
 
 
-def executions(folder, **options):
+def executions(folder):
     """Build the report on `short`; return how often each notebook has been executed so far."""
     build_report(folder / "notebooks", folder / "data", folder / "report", folder / "results",
-                 datasets=["short"], kept=folder / "kept", **options)
+                 datasets=["short"], kept=folder / "kept")
     return tuple(len((folder / f"count_{name}").read_text()) for name in "ab")
 
 

@@ -84,7 +84,7 @@ def test_the_readme_is_true_of_the_files(handed):
                  "UwbMap.mat SLAM: odometry + ArUco + UWB; 40 of 40", "fused with odometry",
                  "problem2/ArucoMap.mat is the map by the ArUco measurements alone, because "
                  "the fusion has no map of its own. Its world frame is the frame of pose 11.",
-                 "Simulated and left out: stand_in.", "gtsam 4.3", "are NaN",
+                 "gtsam 4.3", "are NaN",
                  "problem2_fused of the report is problem2 here"):
         assert part in one_line
     assert max(map(len, text.split("\n"))) <= handin.LINE_WIDTH and text.endswith("\n")
@@ -145,13 +145,12 @@ def test_doubts_and_failures_are_in_the_readme_and_empty_headings_are_not():
     for problem, reason in (("problem3", "no landmark"), ("problem2_hint", "not told")):
         summary["problems"][problem] = {"title": problem, "failed": reason}
     handed = {"problem1/vehiclePose.mat": "problem1/vehiclePose.mat"}
-    text = handin.readme([(summary, handed)], Options(author="A", course="C"), ["x", "y"])
+    text = handin.readme([(summary, handed)], Options(author="A", course="C"))
     one_line = " ".join(text.split())
     assert "d: Lengths are in mm." in text and "not told" not in text
     assert "d/problem2 (ArUco): left out: it needs markers." in one_line
     assert "d/problem3 (SLAM: odometry + ArUco): could not be solved: no landmark." in one_line
     assert "/problem4 (SLAM: odometry + ArUco + UWB): left out: it needs UWB ranges." in one_line
-    assert "Simulated and left out: x, y." in text
     assert text.startswith(f"{Options().title}\nA\nC\n")
     noted = summary_of("problem1", notes=["A header was left out."])
     assert "d: A header was left out." in handin.readme([(noted, handed)], Options())
@@ -162,7 +161,7 @@ def test_doubts_and_failures_are_in_the_readme_and_empty_headings_are_not():
 def test_results_of_a_run_that_was_killed_are_not_handed_in(tmp_path):
     pdf = tmp_path / "report.pdf"
     pdf.write_bytes(b"")
-    report = SimpleNamespace(files=[pdf], summaries=[summary_of("problem1")], omitted=[])
+    report = SimpleNamespace(files=[pdf], summaries=[summary_of("problem1")])
     (tmp_path / "d" / "problem1").mkdir(parents=True)
     (tmp_path / "d" / "problem1" / "vehiclePose.mat").write_bytes(b"half")
     with pytest.raises(DatasetError, match="summary.json: .* solve the dataset again"):

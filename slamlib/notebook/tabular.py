@@ -13,7 +13,6 @@ from slamlib.core.odometry import dead_reckoning
 from slamlib.notebook.plotting import estimates, places_by_id
 from slamlib.robust.calibration import RANGES
 from slamlib.robust.measurements import NOISE_KEYS
-from slamlib.studies.kernels import mislabelled
 
 DASH = "–"
 # What begins a cell of a column of numbers, or is an italic remark in it.
@@ -148,24 +147,17 @@ def accuracy(result, drive) -> dict:
 def learned_row(result, drive) -> dict:
     """Row of `table` on what a SlamResult learned of a Drive's noise and rejected.
 
-    The truth of a simulated Drive says how many wrong labels are rejected. A kernel for ranges
-    alone is absent, because sightings then count in full within the gate.
+    A kernel for ranges alone is absent, because sightings then count in full within the gate.
     """
-    measurements = result.fit.problem.measurements
-    vehicle = measurements.dataset.vehicle
+    vehicle = result.fit.problem.measurements.dataset.vehicle
     slip = 1e3 * result.slip
     factor = result.noise.sightings
     slip_sigma, factor_sigma, _ = result.noise_sigma
-    row = {"dataset": drive.name, "gate": vehicle.gate,
+    return {"dataset": drive.name, "gate": vehicle.gate,
            "kernel": None if vehicle.kernel in ONE_SIDED else vehicle.kernel,
            "slip (mm)": f"{slip:.2f} ± {slip * slip_sigma:.2f}",
            "factor": f"{factor:.2f} ± {factor * factor_sigma:.2f}", "step": result.model,
            "sightings": len(result.rejected), "rejected": result.rejected.sum()}
-    if drive.origin == "simulated":
-        wrong = mislabelled(measurements.dataset, drive.truth)
-        found = wrong & result.rejected
-        row["of wrong labels"] = f"{found.sum()} of {wrong.sum()}"
-    return row
 
 
 def calibration_rows(result, drive) -> Iterator[dict]:

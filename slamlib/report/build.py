@@ -37,7 +37,6 @@ class Report:
 
     files: list[Path]  # `index.html` first, `report.pdf` last
     summaries: list[dict]  # of the drives, as their summary.json has them
-    omitted: list[str]  # names of simulated datasets that are left out
 
 
 def build_report(notebooks: Path, data: Path, report: Path, results: Path,
@@ -63,7 +62,7 @@ def build_report(notebooks: Path, data: Path, report: Path, results: Path,
     start = time.monotonic()
     data = data.resolve()
     books = read_books(notebooks.resolve(), options.chapters)
-    drives, omitted = _read(data, datasets)
+    drives = _read(data, datasets)
     books = _with_what_they_need(books, drives)
     short = "/tmp" if TRANSPORT == "ipc" else None  # because paths of sockets must be
     with TemporaryDirectory(dir=short, prefix="slamlib-", ignore_cleanup_errors=True) as temporary:
@@ -80,7 +79,7 @@ def build_report(notebooks: Path, data: Path, report: Path, results: Path,
                 names = _write_pages(shown, options, title_picture(solved), report)
     _say(f"built in {time.monotonic() - start:.1f} s")
     summaries = [drive.summary for drive in solved]
-    return Report([report / name for name in names], summaries, omitted)
+    return Report([report / name for name in names], summaries)
 
 
 def _say(line):
@@ -88,7 +87,7 @@ def _say(line):
 
 
 def _read(data, selected):
-    """Return the Drives of a build, and the names of the simulated ones that are left out."""
+    """Return the Drives of a build, without simulated ones if others are there."""
     names, unread = datasets_in(data, selected)
     for name in names:
         require(DATASET_NAME.fullmatch(name), data / name, "letters from a to z, digits, spaces, "
@@ -102,7 +101,7 @@ def _read(data, selected):
         _say(f"left out, because simulated: {', '.join(omitted)} (name all datasets to have "
              "them)")
     _say("\n".join(unread))
-    return drives, omitted
+    return drives
 
 
 def _with_what_they_need(books, drives):
@@ -119,7 +118,7 @@ def _with_what_they_need(books, drives):
 
 def _executed(books, drives, data, environment, jobs, kept):
     """Execute books in place, or recall their outputs; return the folders of their files."""
-    folders = {source: cache.folder_of(kept, source) for source in books}
+    folders = {source: kept / source.stem for source in books}
     stages = {source: folders[source] / cache.RESULTS for source in books}
     datasets = [data / drive.name for drive in drives]
     begun = cache.keys(books, datasets)

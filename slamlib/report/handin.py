@@ -46,7 +46,7 @@ def write_zip(path: Path, report: Report, results: Path, options: Options):
             drives.append((summary, handed))
             for own, file in handed.items():
                 contents[f"{name}/{own}"] = (folder / file).read_bytes()
-    contents["README.txt"] = readme(drives, options, report.omitted).encode()
+    contents["README.txt"] = readme(drives, options).encode()
     archive = BytesIO()
     with ZipFile(archive, "w") as file:
         for name, content in sorted(contents.items()):
@@ -77,18 +77,14 @@ def _folders(problem2):
             "problem3": "problem3", "problem4": "problem4"}
 
 
-def readme(drives: Sequence[tuple[dict, dict]], options: Options,
-           omitted: Sequence[str] = ()) -> str:
-    """Return README.txt of drives, each with its summary and what `handed_in` says of it.
-
-    `omitted` are the names of datasets that are left out.
-    """
+def readme(drives: Sequence[tuple[dict, dict]], options: Options) -> str:
+    """Return README.txt of drives, each with its summary and what `handed_in` says of it."""
     versions = [f"Python {platform.python_version()}"]
     versions += [f"{name} {version(name)}" for name in PACKAGES]
     template = Template(README.read_text(encoding="utf-8"), trim_blocks=True)
     text = template.render(
-        cover=options, estimate=PROBLEM2_FOLDERS[options.problem2], omitted=", ".join(omitted),
-        width=LINE_WIDTH, drives=[_told(*drive, options.problem2) for drive in drives],
+        cover=options, estimate=PROBLEM2_FOLDERS[options.problem2], width=LINE_WIDTH,
+        drives=[_told(*drive, options.problem2) for drive in drives],
         versions=", ".join(versions))
     return re.sub("\n{3,}", "\n\n", text.strip()) + "\n"
 
