@@ -98,8 +98,6 @@ def _add_options_of_a_build(command):
         help="names of folders in data/ (all of them when none is named, but simulated ones where "
         "there are others)")
     add("--jobs", type=int, default=2, help="notebooks executed at a time")
-    add("--fresh", action="store_true",
-        help="execute all notebooks, also where nothing changed")
 
 
 def _add_solve(commands):
@@ -111,8 +109,6 @@ def _add_solve(commands):
         "over all")
     add("--out", type=Path, required=True, help="folder for the results")
     add("-j", "--jobs", type=int, default=1, help="datasets solved at a time (default 1)")
-    _add_path(command, "--plot", "write a picture of map and sigmas of the only dataset: a .png, "
-              ".pdf or .svg file")
     add("--problem", action="append", default=[], metavar="NAME",
         type=lambda text: text.removeprefix("problem"),
         choices=("1", "2", "2_hint", "2_fused", "3", "4"),
@@ -145,7 +141,6 @@ def _add_simulate(commands):
 
 def _build(options):
     """Build the report, and write the zip to hand in where `out` is given."""
-    from slamlib.io.results import read_summary
     from slamlib.report import NotebookError, build_report, handin
     from slamlib.report.notebooks import notebooks_folder, read_options
     shown = read_options("report.toml")
@@ -160,19 +155,24 @@ def _build(options):
     try:
         report = build_report(
             notebooks, options.data, options.report, options.results, datasets=datasets,
-            options=shown, jobs=options.jobs, kept=EXECUTED_NOTEBOOKS, fresh=options.fresh)
+            options=shown, jobs=options.jobs, kept=EXECUTED_NOTEBOOKS)
     except NotebookError as error:
         return _ended(1, error)
     if not shown.author:
         print("report.toml names no author: the PDF's title page has none", file=sys.stderr)
-    summaries = [read_summary(options.results / drive.name) for drive in report.drives]
-    print("\n".join(summary_lines(summaries)), file=sys.stderr)
+    print("\n".join(summary_lines(report.summaries)), file=sys.stderr)
     if options.out:
         handin.write_zip(options.out, report, options.results, shown)
         print(f"hand-in: {options.out.resolve()}", file=sys.stderr)
     else:
         print(f"report: {report.files[0]} and {report.files[-1]}", file=sys.stderr)
-    return 3 if any(drive.failures for drive in report.drives) else 0
+    return _code_of(report.summaries)
+
+
+def _code_of(summaries):
+    """The exit code by the summaries of drives: 3 if a problem failed, else 0."""
+    failed = ["failed" in row for summary in summaries for row in summary["problems"].values()]
+    return 3 if any(failed) else 0
 
 
 def _name_in(data, dataset):
@@ -204,10 +204,6 @@ def _solve(options):
     """Solve the problems of one dataset or several, and print a table of each."""
     from slamlib.solve import solve_folder, solve_folders
     several = len(options.folders) > 1
-    if options.plot:
-        is_picture = options.plot.suffix.lower() in (".png", ".pdf", ".svg")
-        require(is_picture and not several, "--plot",
-                "a .png, .pdf or .svg file, of one dataset", options.plot)
     how = {"problems": [f"problem{each}" for each in options.problem],
            "text": options.csv, "verbose": options.verbose,
            "stated": {"kernel": options.kernel, "slip": options.slip}}
@@ -218,16 +214,7 @@ def _solve(options):
     print("\n".join(summary_lines(summaries)))
     errors = [_ended(2, summary["error"]) for summary in summaries if "error" in summary]
     print(f"results: {options.out.resolve()}", file=sys.stderr)
-    failed = ["failed" in row for summary in summaries for row in summary["problems"].values()]
-    if options.plot and not all(failed):
-        from slamlib.io.dataset import read_dataset, read_truth
-        from slamlib.report.overview import result_picture
-        drive = options.folders[0]
-        result_picture(read_dataset(drive), read_truth(drive), options.out, options.plot)
-        print(f"picture: {options.plot.resolve()}", file=sys.stderr)
-    if errors:
-        return 2
-    return 3 if any(failed) else 0
+    return 2 if errors else _code_of(summaries)
 
 
 def _simulate(options):

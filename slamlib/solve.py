@@ -257,7 +257,7 @@ def truth_in_world(solution: Solution, truth: Truth) -> np.ndarray:
 
 
 def write_results(out: Path | str, problem: str, found, dataset: Dataset,
-                  truth: Truth | None = None, text: bool = False) -> Solution | Failure:
+                  truth: Truth | None = None) -> Solution | Failure:
     """Write what a solver found of one problem to the results folder `out` of a drive.
 
     The .mat files come first, summary.json last: a folder without it is unfinished. What it lists
@@ -268,7 +268,6 @@ def write_results(out: Path | str, problem: str, found, dataset: Dataset,
     problem : key of `PROBLEMS`.
     found : what `find` returns for the problem, or the exception, of UNSOLVABLE, that it raised.
     truth : Truth, to report errors, or None.
-    text : bool; True writes each .mat file also as CSV, and trajectories and truth as TUM files.
 
     Returns
     -------
@@ -294,7 +293,7 @@ def write_results(out: Path | str, problem: str, found, dataset: Dataset,
         with suppress(DatasetError):
             rows = results.read_summary(out)["problems"]
         rows.pop(problem, None)
-        _write(out, dataset, truth, [solved], rows, text)
+        _write(out, dataset, truth, [solved], rows)
     return solved
 
 
@@ -304,7 +303,8 @@ def solve_to_folder(dataset: Dataset, truth: Truth | None, out: Path,
 
     Files of an earlier run are replaced, or removed if they belong to other problems; all other
     files in the folder stay. Raises DatasetError, before anything is solved, if nothing can be
-    written there. `truth` and `text` as of `write_results`.
+    written there. `truth` serves to report errors; with `text` each .mat file is written as CSV,
+    too, and trajectories and truth as TUM files.
 
     Returns
     -------
@@ -318,11 +318,11 @@ def solve_to_folder(dataset: Dataset, truth: Truth | None, out: Path,
         return _write(out, dataset, truth, solved, {}, text)
 
 
-def _write(out, dataset, truth, solved, others, text):
+def _write(out, dataset, truth, solved, others, text=False):
     """Write solved problems to a folder; return its summary, with the rows of `others`, too."""
     rows = dict(others)
     for each in solved:
-        rows[each.problem] = summary_row(each, truth)
+        rows[each.problem] = summarize(each, truth)
     summary = summary_of(dataset, truth, rows, doubts_before_solving(dataset))
     clear_results(out, keep=others)
     for each in solved:
@@ -360,13 +360,28 @@ def summary_of(dataset: Dataset, truth: Truth | None, rows: dict, doubts: list[D
             "notes": all_notes(dataset, truth), "problems": problems}
 
 
-def summary_row(solved: Solution | Failure, truth: Truth | None) -> dict:
-    """The row of a problem in the summary, a dict of plain numbers and its doubts."""
-    row = {"title": solved.title, "doubts": []}
+def summarize(solved: Solution | Failure, truth: Truth | None) -> dict:
+    """The row of a problem in the summary: plain numbers, of errors where there is truth."""
     if isinstance(solved, Failure):
-        return row | {"failed": solved.reason}
-    row["doubts"] = [asdict(doubt) for doubt in solved.doubts]
-    return row | summarize(solved, truth)
+        return {"title": solved.title, "doubts": [], "failed": solved.reason}
+    known = np.flatnonzero(np.isfinite(solved.poses[:, 0]))
+    covariances = solved.covariances[known]
+    heading_sigmas = evaluation.sigmas(covariances)[:, 2]
+    position_sigmas = evaluation.position_sigmas(covariances)
+    row = {"title": solved.title, "doubts": [asdict(doubt) for doubt in solved.doubts],
+           "estimated_poses": len(known), "world_is_pose": solved.world + 1,
+           "last_sigma_m": float(position_sigmas[-1]),
+           "median_sigma_m": float(np.median(position_sigmas)),
+           "median_sigma_heading_rad": float(np.median(heading_sigmas))}
+    row |= solved.facts
+    if truth is not None:
+        true_poses = truth_in_world(solved, truth)
+        row["ate_m"] = evaluation.ate(solved.poses, true_poses)
+        row["ate_aligned_m"] = evaluation.ate(solved.poses, true_poses, aligned=True)
+        nees = evaluation.anees(solved.poses, solved.covariances, true_poses)
+        if np.isfinite(nees):                           # not where every pose is known
+            row["nees"] = nees
+    return row
 
 
 def write_estimated_vehicle(path: Path, vehicle: Vehicle, rows: dict):
@@ -408,7 +423,7 @@ def solve_folder(folder: Path | str, out: Path | str, problems: Sequence[str] = 
     Parameters
     ----------
     problems : keys of `PROBLEMS`, or none for all that the sensors allow.
-    text : as of `write_results`.
+    text : as of `solve_to_folder`.
     verbose : True prints to stderr what is decided on the way.
     stated : entries of a Vehicle that replace those of the dataset's vehicle.toml.
 
@@ -482,23 +497,3 @@ def drive_table(summaries: Sequence[dict]) -> pd.DataFrame:
         if not summary["problems"]:
             rows.append(drive)
     return pd.DataFrame(rows, columns=COLUMNS)
-
-
-def summarize(solution: Solution, truth: Truth | None) -> dict:
-    """Last estimate with its sigmas and, where there is truth, errors: a dict of plain numbers."""
-    known = np.flatnonzero(np.isfinite(solution.poses[:, 0]))
-    last = known[-1]
-    sigmas = evaluation.sigmas(solution.covariances[last])
-    summary = {"path_length_m": evaluation.path_length(solution.poses),
-               "estimated_poses": len(known), "world_is_pose": solution.world + 1,
-               "last_pose_number": int(last) + 1, "last_pose": solution.poses[last].tolist(),
-               "last_sigma": sigmas.tolist(), "last_sigma_m": float(max(sigmas[:2]))}
-    summary |= solution.facts
-    if truth is not None:
-        true_poses = truth_in_world(solution, truth)
-        summary["ate_m"] = evaluation.ate(solution.poses, true_poses)
-        summary["ate_aligned_m"] = evaluation.ate(solution.poses, true_poses, aligned=True)
-        nees = evaluation.anees(solution.poses, solution.covariances, true_poses)
-        if np.isfinite(nees):                           # not where every pose is known
-            summary["nees"] = nees
-    return summary

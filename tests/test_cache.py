@@ -33,10 +33,10 @@ def project(tmp_path, monkeypatch):
     return tmp_path
 
 
-def executions(folder, **options):
+def executions(folder):
     """Build the report on `short`; return how often each notebook has been executed so far."""
     build_report(folder / "notebooks", folder / "data", folder / "report", folder / "results",
-                 datasets=["short"], kept=folder / "kept", **options)
+                 datasets=["short"], kept=folder / "kept")
     return tuple(len((folder / f"count_{name}").read_text()) for name in "ab")
 
 
@@ -65,11 +65,6 @@ def test_pages_are_set_again_only_where_one_is_lost_or_shows_something_else(
     executions(project)
     assert ("setting the pages" in capsys.readouterr().err) == is_set
     assert (project / "report" / "a.html").is_file()
-
-
-def test_fresh_executes_all_without_a_change(project):
-    executions(project)
-    assert executions(project, fresh=True) == (2, 2)
 
 
 def add(folder, name):

@@ -293,7 +293,7 @@ def test_a_marker_with_a_single_accepted_sighting_is_unconfirmed():
     assert not solution_doubts(found)
     row = solve.problem_solution("problem3", dataset.without("uwb"), found)
     lines = summary_lines([solve.summary_of(
-        dataset, None, {"problem3": solve.summary_row(row, None)}, [])])
+        dataset, None, {"problem3": solve.summarize(row, None)}, [])])
     assert f"confirms markers {label[count.argmax()]}: seen once, or" in lines[-1]
 
 

@@ -10,7 +10,6 @@ from test_plotting import elongated, require_contours
 from slamlib import estimate, localize
 from slamlib.core import odometry, se2
 from slamlib.core.evaluation import REACH_95, ate
-from slamlib.core.records import UwbReadings
 from slamlib.notebook import Drive, accuracy, antenna_rows, calibration_rows, maps, table
 from slamlib.notebook.tabular import cell
 from slamlib.solve import problem_solution
@@ -86,21 +85,6 @@ def test_names_cover_neither_each_other_nor_what_is_around_axes_of_equal_scales(
     assert all(ax.bbox.x0 <= box.x0 and box.x1 <= ax.bbox.x1 for box in boxes)
     across, up = ax.transData.transform([1, 1]) - ax.transData.transform([0, 0])
     assert across == pytest.approx(up, rel=1e-3)
-
-
-@pytest.mark.parametrize("angles, millimetres", [
-    ((0.0, 0.0), 100.0), ((0.0, np.pi / 2), 100 * np.sqrt(2)), (np.arange(8) * np.pi / 4, 0.0)])
-def test_an_offset_of_all_ranges_moves_an_antenna_that_is_seen_from_one_side(
-        solved, angles, millimetres):
-    """From a circle around it not at all; from two sides by 0.1 m along both."""
-    drive, result = solved
-    ones = np.ones(len(angles))
-    ids = np.full(len(angles), result.antenna[0])
-    poses = result.antenna_in_world[0] + 3 * np.column_stack([np.cos(angles), np.sin(angles)])
-    uwb = UwbReadings(np.arange(len(angles)), ids, 3 * ones, 0.1 * ones)
-    drive = replace(drive, dataset=replace(drive.dataset, uwb=uwb))
-    row = next(antenna_rows(replace(result, poses=poses, range_weight=ones), drive))
-    assert row["by 0.1 m (mm)"] == pytest.approx(millimetres, abs=1e-9)
 
 
 def test_rows_hold_every_antenna_and_its_errors(solved):

@@ -88,13 +88,17 @@ def test_ellipses_are_lines_of_equal_mahalanobis_distance(enlarged):
     means = np.arange(12.0).reshape(4, 3)
     covariances = elongated(4, 2.0, 0.5)
     _, ((ax,),) = plotting.panels(1)                                 # scales of x and y differ
-    plotting.ellipses(ax, means, covariances, "#0072B2", probability=0.95, enlarged=enlarged)
-    k = np.broadcast_to(enlarged, 4)[:, None]
-    require_contours(ax.collections[0], means, covariances * k[:, None]**2,
-                     np.sqrt(-2 * np.log(0.05)))
-    half = 2.4477 * k * np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)[:, :2])
-    low, high = np.transpose([ax.get_xlim(), ax.get_ylim()])
-    assert (low < means[:, :2] - half).all() and (means[:, :2] + half < high).all()
+    plotting.ellipses(ax, means, covariances, "#0072B2", enlarged=enlarged)
+    k = np.resize(enlarged, 4)
+    half = 2.4477 * k[:, None] * np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)[:, :2])
+    patches, = ax.collections
+    require_contours(patches, means, covariances * k[:, None, None]**2, np.sqrt(-2 * np.log(0.05)))
+    for points, m, reach in zip(boundaries(patches), means, half, strict=True):
+        offset = points - m[:2]
+        np.testing.assert_allclose([offset.min(0), offset.max(0)], [-reach, reach], rtol=0.01)
+    (x_low, x_high), (y_low, y_high) = ax.get_xlim(), ax.get_ylim()
+    corners = np.array([(means[:, :2] - half).min(0), (means[:, :2] + half).max(0)])
+    assert ([x_low, y_low] < corners[0]).all() and (corners[1] < [x_high, y_high]).all()
 
 
 def drive_with(truth=True):
@@ -137,13 +141,3 @@ def test_errors_of_some_poses_are_in_the_frame_of_the_first_of_them():
     plotting.errors(axes, some, drive)
     for ax, error in zip(axes, (10, 2)):
         assert ax.lines[0].get_ydata() == pytest.approx(error)
-
-
-def test_a_second_result_on_the_same_axes_has_labels():
-    result, drive = drive_with()
-    for _, axes in plotting.each_drive([drive], rows=2):
-        for role, label in (("slam", None), ("fused", None), ("hint", "my hint")):
-            plotting.errors(axes, result, drive, role, label=label)
-    texts = {text.get_text() for text in axes[0].figure.legends[0].get_texts()}
-    assert {"error", "fused: error", "my hint: error"} <= texts
-    assert "my hint: 95 % by the covariance" in texts and len(texts) == 6

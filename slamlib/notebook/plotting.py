@@ -131,16 +131,15 @@ def estimates(result, drive) -> Estimates:
 
 
 def with_ellipses(ax: Axes, poses: np.ndarray, covariances: np.ndarray, role: str,
-                  label: str | None = None, count: int = 12, enlarged: float | None = None,
-                  **look) -> Axes:
-    """Draw a path with `count` filled 95 % ellipses at equal distances along it.
+                  label: str | None = None, enlarged: float | None = None) -> Axes:
+    """Draw a path with filled 95 % ellipses at equal distances along it.
 
     Ellipses are `enlarged` by this factor, by default by that of `enlargement`, which is added to
     the axes' title.
     """
     enlarged = enlarged or enlargement(poses, covariances)
-    some = equidistant(poses, count)
-    trajectory(ax, poses, role, label, **{"linewidth": 1.2, "alpha": 0.8, **look})
+    some = equidistant(poses)
+    trajectory(ax, poses, role, label, linewidth=1.2, alpha=0.8)
     ellipses(ax, poses[some], covariances[some], ROLES[role]["color"], fill=0.5, enlarged=enlarged)
     title = ax.get_title("left")
     if "ellipses" not in title:
@@ -149,18 +148,13 @@ def with_ellipses(ax: Axes, poses: np.ndarray, covariances: np.ndarray, role: st
     return ax
 
 
-def errors(axes: Sequence[Axes], result, drive, role: str = "slam",
-           label: str | None = None) -> Sequence[Axes]:
+def errors(axes: Sequence[Axes], result, drive, role: str = "slam") -> Sequence[Axes]:
     """Draw errors of a result along the path in two axes: of position, and of the heading.
 
     The bands are the longest semi-axis of the 95 % ellipse and ±2 sigma of the heading; without
-    truth they stand alone. `result` as of `estimates`. `label`, by default the role of all but the
-    first result on these axes, precedes its entries in the legend.
+    truth they stand alone. `result` as of `estimates`.
     """
     top, bottom = axes
-    if not label and top.collections:
-        label = role
-    prefix = f"{label}: " if label else ""
     found = estimates(result, drive)
     shown = np.unique(np.linspace(0, len(found.frame) - 1, MAX_BANDS).astype(int))
     frame = found.frame[shown]
@@ -168,14 +162,14 @@ def errors(axes: Sequence[Axes], result, drive, role: str = "slam",
     semi_axis = 1e3 * longest_semi_axes(covariances)                     # mm
     two_sigma = 2e3 * np.sqrt(covariances[:, 2, 2])                      # mrad
     band = {"color": ROLES[role]["color"], "alpha": 0.18, "linewidth": 0,
-            "label": f"{prefix}95 % by the covariance"}
+            "label": "95 % by the covariance"}
     top.fill_between(frame + 1, 0, semi_axis, **band)
     bottom.fill_between(frame + 1, -two_sigma, two_sigma, **band)
     if found.true is not None:
         error = 1e3 * (found.poses - found.true)[shown]
         distance = np.linalg.norm(error[:, :2], axis=1)
-        curve(top, distance, role, frame, f"{prefix}error", linewidth=1.2)
-        curve(bottom, error[:, 2], role, frame, f"{prefix}error", linewidth=0.8)
+        curve(top, distance, role, frame, "error", linewidth=1.2)
+        curve(bottom, error[:, 2], role, frame, "error", linewidth=0.8)
     name_rows(axes, ("position (mm)", "δ (mrad)"))
     top.set_ylim(0, None)
     return axes
@@ -193,16 +187,16 @@ def trajectory(ax: Axes, poses: np.ndarray, role: str, label: str | None = None,
 
 
 def ellipses(ax: Axes, positions: np.ndarray, covariances: np.ndarray, color: str,
-             probability: float = 0.95, label: str | None = None, fill: float = 0.12,
+             label: str | None = None, fill: float = 0.12,
              enlarged: float | np.ndarray = 1) -> Axes:
-    """Draw ellipses of a probability at positions (m, >= 2) with covariances (m, >= 2, >= 2).
+    """Draw 95 % ellipses at positions (m, >= 2) with covariances (m, >= 2, >= 2).
 
     `fill` is the opacity. `enlarged`, a number or (m,), scales the ellipses, which the figure must
     state. The axes are extended to contain them.
     """
-    k = np.sqrt(-2 * np.log(1 - probability)) * np.reshape(enlarged, (-1, 1))
-    centre = np.asarray(positions)[:, :2]
-    C = np.asarray(covariances)[:, :2, :2]
+    k = REACH_95 * np.reshape(enlarged, (-1, 1))
+    centre = positions[:, :2]
+    C = covariances[:, :2, :2]
     variances, directions = np.linalg.eigh(C)
     widths = 2 * k * np.sqrt(np.maximum(variances, 0))
     longest = directions[:, :, 1]
@@ -273,7 +267,7 @@ def enlargement(poses: np.ndarray, covariances: np.ndarray) -> int:
     return max(fitting, default=1) if largest > 0 else 1
 
 
-def equidistant(poses: np.ndarray, count: int = 14) -> np.ndarray:
+def equidistant(poses: np.ndarray, count: int = 12) -> np.ndarray:
     """Indices of about `count` known poses at equal distances along the path."""
     known = np.flatnonzero(np.isfinite(poses[:, 0]))
     steps = np.diff(poses[known, :2], axis=0)

@@ -13,7 +13,6 @@ from slamlib.core.odometry import dead_reckoning
 from slamlib.notebook.plotting import estimates, places_by_id
 from slamlib.robust.calibration import RANGES
 from slamlib.robust.measurements import NOISE_KEYS
-from slamlib.studies.kernels import mislabelled
 
 DASH = "–"
 # What begins a cell of a column of numbers, or is an italic remark in it.
@@ -148,24 +147,17 @@ def accuracy(result, drive) -> dict:
 def learned_row(result, drive) -> dict:
     """Row of `table` on what a SlamResult learned of a Drive's noise and rejected.
 
-    The truth of a simulated Drive says how many wrong labels are rejected. A kernel for ranges
-    alone is absent, because sightings then count in full within the gate.
+    A kernel for ranges alone is absent, because sightings then count in full within the gate.
     """
-    measurements = result.fit.problem.measurements
-    vehicle = measurements.dataset.vehicle
+    vehicle = result.fit.problem.measurements.dataset.vehicle
     slip = 1e3 * result.slip
     factor = result.noise.sightings
     slip_sigma, factor_sigma, _ = result.noise_sigma
-    row = {"dataset": drive.name, "gate": vehicle.gate,
+    return {"dataset": drive.name, "gate": vehicle.gate,
            "kernel": None if vehicle.kernel in ONE_SIDED else vehicle.kernel,
            "slip (mm)": f"{slip:.2f} ± {slip * slip_sigma:.2f}",
            "factor": f"{factor:.2f} ± {factor * factor_sigma:.2f}", "step": result.model,
            "sightings": len(result.rejected), "rejected": result.rejected.sum()}
-    if drive.origin == "simulated":
-        wrong = mislabelled(measurements.dataset, drive.truth)
-        found = wrong & result.rejected
-        row["of wrong labels"] = f"{found.sum()} of {wrong.sum()}"
-    return row
 
 
 def calibration_rows(result, drive) -> Iterator[dict]:
@@ -220,8 +212,7 @@ def antenna_rows(result, drive) -> Iterator[dict]:
     """Rows of `table` on the antennas of a SlamResult: position, sigmas, distances in mm.
 
     `d²` is the squared error in units of the covariance, `down-weighted` the percentage of the
-    ranges that keep less than half of their weight, `by 0.1 m` how far an antenna would be
-    elsewhere, on the same path, if all its ranges were 0.1 m too long.
+    ranges that keep less than half of their weight.
     """
     ids = result.antenna
     if not len(ids):
@@ -239,8 +230,6 @@ def antenna_rows(result, drive) -> Iterator[dict]:
         sigma = 1e3 * evaluation.sigmas(C)
         error = place - true[k]
         own = uwb.antenna == antenna
-        weight = result.range_weight[own]
-        shift = _shift_by_range_offset(result.poses, uwb.select(own), weight, place)
         yield {"dataset": drive.name,
                "antenna": f"{antenna}?" if antenna in result.doubts else f"{antenna}",
                "x (m)": _as_sure_as(place[0], sigma[0]), "y (m)": _as_sure_as(place[1], sigma[1]),
@@ -248,22 +237,9 @@ def antenna_rows(result, drive) -> Iterator[dict]:
                "from the guess (mm)": 1e3 * np.linalg.norm(place - guess[k]),
                "error (mm)": 1e3 * np.linalg.norm(error),
                "d²": error @ np.linalg.solve(C, error),
-               "down-weighted (%)": 100 * np.mean(weight < 0.5),
-               "by 0.1 m (mm)": 1e3 * np.linalg.norm(shift)}
+               "down-weighted (%)": 100 * np.mean(result.range_weight[own] < 0.5)}
 
 
 def _as_sure_as(value, sigma):
     """Text of a value in m with two digits of its sigma in mm."""
     return f"{value:.{_decimals(1e-3 * sigma, 2, at_most=4)}f}"
-
-
-def _shift_by_range_offset(poses, ranges, weight, antenna, offset=0.1):
-    """How far (2,) in m an antenna moves if all its ranges (r,) are too long by the offset.
-
-    Weighted least squares of the ranges, linearised at the place of the antenna (2,).
-    """
-    ray = antenna - poses[ranges.pose, :2]
-    length = np.linalg.norm(ray, axis=1)
-    direction = ray / np.maximum(length, 1e-9)[:, None]
-    root_weight = np.sqrt(weight) / ranges.sigma
-    return np.linalg.lstsq(root_weight[:, None] * direction, root_weight * offset)[0]

@@ -22,7 +22,7 @@ from slamlib.report import cache
 from slamlib.report.document import render
 from slamlib.report.execution import TRANSPORT, execute, kernel_environment
 from slamlib.report.notebooks import Options, chapter_of, read_books
-from slamlib.report.overview import SolvedDrive, opening, solved_drive, title_picture
+from slamlib.report.overview import opening, solved_drive, title_picture
 from slamlib.robust.file_doubts import doubts_before_solving
 from slamlib.solve import SENSORS, clear_results, summary_of
 
@@ -36,13 +36,12 @@ class Report:
     """The files of a report and what was found."""
 
     files: list[Path]  # `index.html` first, `report.pdf` last
-    drives: list[SolvedDrive]
-    omitted: list[str]  # names of simulated datasets that are left out
+    summaries: list[dict]  # of the drives, as their summary.json has them
 
 
 def build_report(notebooks: Path, data: Path, report: Path, results: Path,
                  datasets: list[str] | None = None, options: Options = Options(), jobs: int = 2,
-                 kept: Path | None = None, fresh: bool = False) -> Report:
+                 kept: Path | None = None) -> Report:
     """Execute all notebooks, write results, pages and PDF; return the Report.
 
     Kernels read the absolute paths of data and results, and the selection, from SLAMLIB_DATA,
@@ -59,12 +58,11 @@ def build_report(notebooks: Path, data: Path, report: Path, results: Path,
     options : the title page and what is shown.
     jobs : notebooks executed at a time.
     kept : folder that caches executed notebooks, or None for one that is removed.
-    fresh : True executes everything although it is cached.
     """
     start = time.monotonic()
     data = data.resolve()
     books = read_books(notebooks.resolve(), options.chapters)
-    drives, omitted = _read(data, datasets)
+    drives = _read(data, datasets)
     books = _with_what_they_need(books, drives)
     short = "/tmp" if TRANSPORT == "ipc" else None  # because paths of sockets must be
     with TemporaryDirectory(dir=short, prefix="slamlib-", ignore_cleanup_errors=True) as temporary:
@@ -72,7 +70,7 @@ def build_report(notebooks: Path, data: Path, report: Path, results: Path,
         names = [drive.name for drive in drives]
         environment = kernel_environment(Path(temporary), data, names)
         with files.locked(kept):
-            stages = _executed(books, drives, data, environment, jobs, kept, fresh)
+            stages = _executed(books, drives, data, environment, jobs, kept)
             with files.locked(results), files.locked(report):
                 for drive in drives:
                     _write_results(drive, stages, results / drive.name)
@@ -80,7 +78,8 @@ def build_report(notebooks: Path, data: Path, report: Path, results: Path,
                 shown = {Path("index"): opening(solved, books)} | books
                 names = _write_pages(shown, options, title_picture(solved), report)
     _say(f"built in {time.monotonic() - start:.1f} s")
-    return Report([report / name for name in names], solved, omitted)
+    summaries = [drive.summary for drive in solved]
+    return Report([report / name for name in names], summaries)
 
 
 def _say(line):
@@ -88,7 +87,7 @@ def _say(line):
 
 
 def _read(data, selected):
-    """Return the Drives of a build, and the names of the simulated ones that are left out."""
+    """Return the Drives of a build, without simulated ones if others are there."""
     names, unread = datasets_in(data, selected)
     for name in names:
         require(DATASET_NAME.fullmatch(name), data / name, "letters from a to z, digits, spaces, "
@@ -102,7 +101,7 @@ def _read(data, selected):
         _say(f"left out, because simulated: {', '.join(omitted)} (name all datasets to have "
              "them)")
     _say("\n".join(unread))
-    return drives, omitted
+    return drives
 
 
 def _with_what_they_need(books, drives):
@@ -117,9 +116,9 @@ def _with_what_they_need(books, drives):
     return served or books
 
 
-def _executed(books, drives, data, environment, jobs, kept, fresh):
+def _executed(books, drives, data, environment, jobs, kept):
     """Execute books in place, or recall their outputs; return the folders of their files."""
-    folders = {source: cache.folder_of(kept, source) for source in books}
+    folders = {source: kept / source.stem for source in books}
     stages = {source: folders[source] / cache.RESULTS for source in books}
     datasets = [data / drive.name for drive in drives]
     begun = cache.keys(books, datasets)
@@ -136,7 +135,7 @@ def _executed(books, drives, data, environment, jobs, kept, fresh):
         finish(source, f"executed in {seconds:.1f} s")
 
     for source, book in books.items():
-        if not fresh and cache.recall(folders[source], begun[source], book):
+        if cache.recall(folders[source], begun[source], book):
             finish(source, "nothing changed")
         else:
             left[source] = book

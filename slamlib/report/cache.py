@@ -1,8 +1,8 @@
 """Executed notebooks with the files that they wrote, kept until something changes.
 
 A notebook is executed again when its code cells changed or what `keys` says of slamlib, Python,
-packages, datasets and the files beside the notebooks; not when its text did. `folder_of` a notebook
-holds what is kept: executed.ipynb, written last, and `results`.
+packages, datasets and the files beside the notebooks; not when its text did. What is kept of a
+notebook is in a folder of its name: executed.ipynb, written last, and `results`.
 """
 
 import hashlib
@@ -55,11 +55,6 @@ def _is_unseen(name, root):
 
 def _code_cells(book):
     return [cell for cell in book.cells if cell.cell_type == "code"]
-
-
-def folder_of(kept: Path, source: Path) -> Path:
-    """Return the folder of a notebook in that of what is kept."""
-    return kept / source.stem
 
 
 def recall(folder: Path, key: str, book: NotebookNode) -> bool:

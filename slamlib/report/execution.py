@@ -6,7 +6,6 @@ JupyterLab starts with the same settings.
 import asyncio
 import json
 import os
-import re
 import socket
 import sys
 import time
@@ -36,7 +35,7 @@ Books = dict[Path, NotebookNode]  # notebooks by their files, in the order of th
 
 
 class NotebookError(RuntimeError):
-    """A notebook failed; the message names the notebook, the position in it and the reason."""
+    """A notebook failed; the message names the notebook, and has the cell and its traceback."""
 
 
 class _Loop(asyncio.SelectorEventLoop):
@@ -98,7 +97,6 @@ async def _execute(source, book, environment, connection):
 
     The kernel listens at sockets beside the file `connection` (Path): nobody else can take them.
     """
-    begun = []  # cells; the last one has failed if any has
     manager = AsyncKernelManager(
         kernel_name="python3", connection_file=str(connection), transport=TRANSPORT,
         kernel_spec_manager=KernelSpecManager(kernel_dirs=[]))  # no kernels of the user are found
@@ -106,37 +104,17 @@ async def _execute(source, book, environment, connection):
         book, km=manager, resources={"metadata": {"path": str(source.parent)}},
         timeout=CELL_TIMEOUT, iopub_timeout=60, raise_on_iopub_timeout=True,
         record_timing=False, store_widget_state=False, skip_cells_with_tag=LAB_ONLY,
-        shutdown_kernel="immediate", extra_arguments=["--IPKernelApp.log_level=ERROR"],
-        on_cell_execute=lambda cell, **_: begun.append(cell))
+        shutdown_kernel="immediate", extra_arguments=["--IPKernelApp.log_level=ERROR"])
     try:
         await client.async_execute(env=environment, cleanup_kc=True)
     except (CellExecutionError, TimeoutError, RuntimeError) as error:
         if asyncio.current_task().cancelling():  # nbclient reports a cancellation as a dead kernel
             raise asyncio.CancelledError from None
-        raise NotebookError(_failure(source, begun, error)) from None
+        raise NotebookError(f"{source.name}: {strip_ansi(str(error)).strip()}") from None
     finally:
         if manager.has_kernel:
             await manager.shutdown_kernel(now=True)
     CoalesceStreamsPreprocessor().preprocess(book, {})  # kernels divide them by time
-
-
-def _failure(source, begun, error):
-    """Return the notebook, cell, line and reason of a failure, without colours."""
-    place = source.name
-    lines = []
-    reason = f"{type(error).__name__}: {error}".splitlines()[0]
-    if begun:
-        place += f", cell {len(begun)}"
-        lines = begun[-1].source.splitlines()
-    if isinstance(error, CellExecutionError):
-        reason = f"{error.ename}: {error.evalue}"
-        frame = re.search(r"Cell In\s?\[\d+\], line (\d+)", strip_ansi(error.traceback))
-        number = int(frame[1]) if frame else 0
-        if 0 < number <= len(lines):
-            place += f", line {number}"
-            lines = [lines[number - 1].strip()]
-    shown = "\n    ".join([f"{place}:"] + lines[:5])
-    return strip_ansi(f"{shown}\n{reason}")
 
 
 def start_lab(notebooks: Path, data: Path, kept: Path, arguments: list[str]):

@@ -9,16 +9,13 @@ from io import BytesIO
 from pathlib import Path
 from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 
-import numpy as np
 from jinja2 import Template
 
 from slamlib.io import files
-from slamlib.io.dataset import all_notes
 from slamlib.io.results import RESULT_FILES, read_summary
 from slamlib.report.build import Report
 from slamlib.report.notebooks import PROBLEM2_FOLDERS, Options
-from slamlib.report.overview import SolvedDrive, listed, why_missing
-from slamlib.solve import title
+from slamlib.solve import PROBLEMS, SENSORS
 
 LINE_WIDTH = 100  # characters in a line of README.txt
 README = Path(__file__).with_name("readme.txt")  # a template of Jinja
@@ -38,14 +35,18 @@ def write_zip(path: Path, report: Report, results: Path, options: Options):
     `results` is the folder of its files. Raises DatasetError if the results of a drive have no
     summary.json: the run that wrote there did not end.
     """
-    contents = {"report.pdf": report.files[-1].read_bytes(),
-                "README.txt": readme(report.drives, options, report.omitted).encode()}
-    for drive in report.drives:
-        folder = results / drive.name
+    contents = {"report.pdf": report.files[-1].read_bytes()}
+    drives = []
+    for summary in report.summaries:
+        name = summary["dataset"]
+        folder = results / name
         with files.locked(folder):                      # no other run replaces them meanwhile
             read_summary(folder)
-            for name, file in handed_in(drive, options.problem2).items():
-                contents[f"{drive.name}/{name}"] = (folder / file).read_bytes()
+            handed = handed_in(files.file_names(folder), options.problem2)
+            drives.append((summary, handed))
+            for own, file in handed.items():
+                contents[f"{name}/{own}"] = (folder / file).read_bytes()
+    contents["README.txt"] = readme(drives, options).encode()
     archive = BytesIO()
     with ZipFile(archive, "w") as file:
         for name, content in sorted(contents.items()):
@@ -55,19 +56,19 @@ def write_zip(path: Path, report: Report, results: Path, options: Options):
     files.write_file(path, archive.getvalue())
 
 
-def handed_in(drive: SolvedDrive, problem2: str) -> dict[str, str]:
-    """Return the names in its results of the files of a drive, by their names in the hand-in.
+def handed_in(names: Sequence[str], problem2: str) -> dict[str, str]:
+    """Return which of the files `names` of results are handed in, by their names in the hand-in.
 
     Those of `problem2`, a key of PROBLEM2_FOLDERS, have the map by markers alone if none is theirs.
     """
-    files = {}
+    handed = {}
     for folder, problem in _folders(problem2).items():
         for name in RESULT_FILES:
-            if f"{problem}/{name}" in drive.files:
-                files[f"{folder}/{name}"] = f"{problem}/{name}"
-    if "problem2/vehiclePose.mat" in files and MAP_ALONE in drive.files:
-        files.setdefault(MAP_ALONE, MAP_ALONE)
-    return files
+            if f"{problem}/{name}" in names:
+                handed[f"{folder}/{name}"] = f"{problem}/{name}"
+    if "problem2/vehiclePose.mat" in handed and MAP_ALONE in names:
+        handed.setdefault(MAP_ALONE, MAP_ALONE)
+    return handed
 
 
 def _folders(problem2):
@@ -76,34 +77,34 @@ def _folders(problem2):
             "problem3": "problem3", "problem4": "problem4"}
 
 
-def readme(drives: list[SolvedDrive], options: Options, omitted: Sequence[str] = ()) -> str:
-    """Return README.txt of some drives; `omitted` are the names of datasets that are left out."""
+def readme(drives: Sequence[tuple[dict, dict]], options: Options) -> str:
+    """Return README.txt of drives, each with its summary and what `handed_in` says of it."""
     versions = [f"Python {platform.python_version()}"]
     versions += [f"{name} {version(name)}" for name in PACKAGES]
     template = Template(README.read_text(encoding="utf-8"), trim_blocks=True)
     text = template.render(
-        cover=options, estimate=PROBLEM2_FOLDERS[options.problem2], omitted=listed(omitted),
-        width=LINE_WIDTH, drives=[_told(drive, options.problem2) for drive in drives],
+        cover=options, estimate=PROBLEM2_FOLDERS[options.problem2], width=LINE_WIDTH,
+        drives=[_told(*drive, options.problem2) for drive in drives],
         versions=", ".join(versions))
     return re.sub("\n{3,}", "\n\n", text.strip()) + "\n"
 
 
-def _told(drive, problem2):
-    """Return what README.txt tells of a SolvedDrive, a dict."""
-    files = handed_in(drive, problem2)
+def _told(summary, handed, problem2):
+    """Return what README.txt tells of a drive, a dict."""
+    rows = summary["problems"]
     estimate = PROBLEM2_FOLDERS[problem2]
-    world = {solution.problem: solution.world + 1 for solution in drive.solutions}
-    told = {"name": drive.name, "doubts": drive.doubts, "world": world.get(estimate, 1),
-            "notes": all_notes(drive.dataset, drive.truth), "folders": {}, "missing": []}
-    if MAP_ALONE in files.values() and estimate != "problem2":
-        told["map_frame"] = world.get("problem2", 1)
+    world = {problem: row.get("world_is_pose") for problem, row in rows.items()}
+    told = summary | {"world": world.get(estimate), "folders": {}, "missing": []}
+    if MAP_ALONE in handed.values() and estimate != "problem2":
+        told["map_frame"] = world.get("problem2")
     for folder, problem in _folders(problem2).items():
-        if f"{folder}/vehiclePose.mat" in files:
-            names = [name.split("/")[1] for name in files if name.startswith(folder)]
-            solution = drive.solution(problem)
-            known = np.isfinite(solution.poses[:, 0]).sum()
-            told["folders"][folder] = listed(names), solution.title, known, len(solution.poses)
+        if f"{folder}/vehiclePose.mat" in handed:
+            names = [name.split("/")[1] for name in handed if name.startswith(folder)]
+            told["folders"][folder] = ", ".join(names), rows[problem]
         else:
-            reason = why_missing(drive, problem)
-            told["missing"].append(f"{folder} ({title(problem, drive.dataset)}): {reason}.")
+            needed = " and ".join(SENSORS[sensor] for sensor in PROBLEMS[problem].sensors)
+            reason = f"left out: it needs {needed}"
+            if problem in rows:
+                reason = f"could not be solved: {rows[problem]['failed']}"
+            told["missing"].append(f"{folder} ({PROBLEMS[problem].title}): {reason}.")
     return told
