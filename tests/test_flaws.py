@@ -53,7 +53,7 @@ LEGAL = {                                      # within the limits, and far from
     "very certain wheels": vehicle(
         sigma_right_radius=1e-9, sigma_left_radius=1e-9, sigma_wheelbase=1e-9),
     "unknown wheels": vehicle(sigma_right_radius=0.1, sigma_left_radius=0.1, sigma_wheelbase=0.4),
-    "the most certain range": range_sigmas(1e-9, rows=60),
+    "the most certain range": range_sigmas(1e-9, rows=30),
     "the most uncertain ranges": range_sigmas(1e4),
     "the most certain sighting": one_sighting(1e-18, 1e-18, 1e-18),
     "the most uncertain sightings": sightings_of([1e8, 1e8, 1e14]),
