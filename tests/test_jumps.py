@@ -132,7 +132,7 @@ def test_a_push_that_no_marker_saw_is_found_at_the_solution():
     """In 200 poses without markers, which a second round bridges; else slip seems tenfold."""
     dataset, truth = simulate("short", seed=2, rounds=2, slip=3e-4)
     truth = replace(truth, poses=np.delete(truth.poses, slice(1103, 1109), axis=0))
-    dataset = carried(dataset.without("uwb"), 1103, 1109)
+    dataset = carried(dataset, 1103, 1109).without("uwb")
     unseen = np.abs(dataset.aruco.pose - 1140) <= 100
     found = estimate(replace(dataset, aruco=dataset.aruco.select(~unseen)))
     assert [doubt.what for doubt in solution_doubts(found)] == ["encoder"]

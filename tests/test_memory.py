@@ -124,7 +124,14 @@ def test_antennas_with_echoes_that_stay_are_as_far_off_as_their_covariances_say(
     squared = []
     for seed in range(3):
         dataset, truth = simulate("short", seed=seed)
-        slow = 0.28 * np.sin(dataset.uwb.pose / 500 + 2 * dataset.uwb.antenna + seed)
+        rng, slow = np.random.default_rng(seed), np.zeros(len(dataset.uwb.pose))
+        for antenna in np.unique(dataset.uwb.antenna):
+            rows = np.flatnonzero(dataset.uwb.antenna == antenna)
+            kept = np.exp(-np.diff(dataset.uwb.pose[rows]) / 500)
+            value = slow[rows[0]] = 0.2 * rng.standard_normal()
+            for row, share in zip(rows[1:], kept):
+                value = share * value + 0.2 * np.sqrt(1 - share**2) * rng.standard_normal()
+                slow[row] = value
         result = estimate(uwb(dataset, range=dataset.uwb.range + slow))
         squared.append(antenna_error(result, truth)[1])
         assert result.released <= {"range-delay"}
