@@ -27,7 +27,7 @@ from slamlib.core.vehicle import TABLE_2, Vehicle, changed
 from slamlib.io import files, results
 from slamlib.io.dataset import all_notes, inventory_lines, read_dataset, read_truth
 from slamlib.robust.file_doubts import Doubt, doubts_before_solving, merged
-from slamlib.robust.solution_doubts import solution_doubts
+from slamlib.robust.solution_doubts import fusion_doubts, solution_doubts
 
 log = logging.getLogger(__name__)
 SLOW = 2.0                                          # s, after which a problem is told to be solved
@@ -146,6 +146,7 @@ def problem_solution(problem: str, dataset: Dataset, found=None) -> Solution:
         fields = _localization_fields(dataset, found)
     elif problem == "problem2_fused":
         fields["facts"] = _noise_facts(found)
+        fields["doubts"] = fusion_doubts(found, dataset.vehicle)
     elif problem in ("problem3", "problem4"):
         fields["facts"] = _slam_facts(dataset, found)
         fields["doubts"] = (*_option_doubts(problem, dataset, found), *solution_doubts(found))

@@ -32,11 +32,12 @@ def contents(folder):
 
 def state(found, expected):
     """What files are: "A" or "B", the run that a summary says they are of, "unfinished", or bad."""
-    if "summary.json" not in found:
-        known = [[run.get(name) for run in expected.values()] for name in found]
-        whole = [content in each for content, each in zip(found.values(), known)]
-        return "unfinished" if all(whole) else "HALF"
-    return next((name for name, run in expected.items() if run == found), "MIXED")
+    if "summary.json" in found:
+        return next((name for name, run in expected.items() if run == found), "MIXED")
+    for name, content in found.items():
+        if content not in [run.get(name) for run in expected.values()]:
+            return "HALF"
+    return "unfinished"
 
 
 def main(out):

@@ -11,6 +11,7 @@ from functools import partial
 
 import pytest
 from conftest import ROOT, is_running
+from kills import contents
 from test_report import build, make_data, write
 
 from slamlib import solve
@@ -30,26 +31,23 @@ for drive in start():
 """
 
 
-
-def start(folder, *arguments, code=None, **options):
+def start(folder, *arguments, code=None):
     """The command in a process of its own, which heeds SIGHUP also where these tests ignore it."""
-    return subprocess.Popen([sys.executable, *(["-c", code] if code else ["-m", "slamlib"]),
-                             *map(str, arguments)], cwd=folder,
-                            text=True, **({"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-                                          | options),
+    program = ["-c", code] if code else ["-m", "slamlib"]
+    return subprocess.Popen([sys.executable, *program, *arguments], cwd=folder, text=True,
+                            stdout=subprocess.PIPE, stderr=subprocess.PIPE,
                             preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL),
                             env=os.environ | {"PYTHONPATH": str(ROOT)})
 
 
-def wait_for(found, process, seconds=300):
-    """Wait until a function returns something true, which is returned, while a process runs."""
+def wait_for(file, process, seconds=300):
+    """Wait until a file is there, while a process runs."""
     until = time.monotonic() + seconds
-    while not (value := found()):
+    while not file.exists():
         if process.poll() is not None or time.monotonic() > until:
             process.kill()
             raise AssertionError(process.communicate())
         time.sleep(0.02)
-    return value
 
 
 def hidden(folder):
@@ -71,25 +69,25 @@ def test_of_two_builds_at_once_the_second_waits_and_neither_loses_results(tmp_pa
     told = [process.communicate(timeout=300)[1] for process in builds]
     assert [process.returncode for process in builds] == [0, 0], told
     assert sum("1_slow, nothing changed" in each for each in told) == 1
-    assert (tmp_path / "results" / "short" / "problem1" / "vehiclePose.mat").is_file()
     assert results.read_summary(tmp_path / "results" / "short")["problems"].keys() == {"problem1"}
     assert (tmp_path / "report" / "index.html").is_file()
     assert hidden(tmp_path) == []
 
 
 def test_a_lock_has_one_holder_at_a_time_although_its_file_is_removed(tmp_path):
-    held, most = [], []
+    held = []
 
     def work(_):
         with files.locked(tmp_path / "out"):
             held.append(1)
-            most.append(len(held))
             time.sleep(0)
+            count = len(held)
             held.pop()
+        return count
 
     with ThreadPoolExecutor(4) as threads:
-        assert [*threads.map(work, range(200))] == [None] * 200
-    assert len(most) == 200 and max(most) == 1 and hidden(tmp_path) == []
+        assert [*threads.map(work, range(200))] == [1] * 200
+    assert hidden(tmp_path) == []
 
 
 def test_a_lock_that_another_run_keeps_is_told_after_a_while(tmp_path, monkeypatch):
@@ -101,33 +99,31 @@ def test_a_lock_that_another_run_keeps_is_told_after_a_while(tmp_path, monkeypat
 
 def test_a_run_with_fewer_sensors_removes_files_of_other_problems_and_no_other_file(
         tmp_path, drive):
-    mine = ["notes.txt", "mine/problem2.mat", "problem2/notes.txt", "problem4/mine/a.mat"]
-    out = tmp_path / "out"
-    solve_to_folder(drive, None, out, text=True)
+    mine = ["mine/problem2.mat", "problem2/notes.txt", "problem4/mine/a.mat"]
+    solve_to_folder(drive, None, tmp_path, text=True)
     for name in mine:
-        files.write_file(out / name, b"mine")
-    (out / "empty").mkdir()
-    (out / "problem1").chmod(0o700)
-    solve_to_folder(drive.without("uwb").without("aruco"), None, out)
-    assert files.file_names(out) == sorted([
-        *mine, "problem1/vehiclePose.mat", "summary.json"])
-    assert all((out / name).read_bytes() == b"mine" for name in mine)
-    assert sorted(path.name for path in out.iterdir() if path.is_dir()) == [
-        "empty", "mine", *sorted(solve.PROBLEMS)]
-    assert (out / "problem1").stat().st_mode & 0o777 == 0o700
+        files.write_file(tmp_path / name, b"mine")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "problem1").chmod(0o700)
+    solve_to_folder(drive.without("uwb").without("aruco"), None, tmp_path)
+    assert files.file_names(tmp_path) == [
+        *mine[:1], "problem1/vehiclePose.mat", *mine[1:], "summary.json"]
+    assert all((tmp_path / name).read_bytes() == b"mine" for name in mine)
+    assert (tmp_path / "empty").is_dir()
+    assert (tmp_path / "problem1").stat().st_mode & 0o777 == 0o700
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="runs are forks")
 def test_a_kill_at_any_moment_leaves_the_results_of_one_run_or_no_summary(tmp_path):
-    done = subprocess.run([sys.executable, ROOT / "tests" / "kills.py", tmp_path / "out"],
+    done = subprocess.run([sys.executable, ROOT / "tests" / "kills.py", tmp_path],
                           text=True, capture_output=True, timeout=300,
                           env=os.environ | {"PYTHONPATH": str(ROOT)})
     assert done.returncode == 0, done.stderr
     counts, last = json.loads(done.stdout)
     assert last == "A" and counts.keys() <= {"A", "B", "unfinished"}
     assert counts["unfinished"] > 5 and counts["A"] + counts.get("B", 0) > 5
-    assert (tmp_path / "out" / "problem4" / "notes.txt").read_bytes() == b"of the user"
+    assert (tmp_path / "problem4" / "notes.txt").read_bytes() == b"of the user"
     assert hidden(tmp_path) == []
 
 
@@ -136,24 +132,22 @@ def test_where_nothing_can_be_written_is_told_before_anything_is_solved(
     write_dataset(tmp_path / "drive", drive)
     (tmp_path / "file").write_text("mine")
     os.mkfifo(tmp_path / "fifo")
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(solve, "find", None)
-    for out in (tmp_path / "file", tmp_path / "fifo", tmp_path / "file" / "x", "/proc/x", "/proc"):
-        assert main(["solve", str(tmp_path / "drive"), "--out", str(out)]) == 2
+    for out in ("file", "fifo", "file/x", "/proc/x"):
+        assert main(["solve", "drive", "--out", out]) == 2
         told = capsys.readouterr().err.splitlines()[-1]
-        assert told.startswith(f"slamlib: {out}: expected a folder to write to")
+        assert "expected a folder to write to" in told and out in told
     assert (tmp_path / "file").read_text() == "mine"
 
 
 def test_what_stands_in_the_place_of_a_result_is_told_and_stays(tmp_path, drive, capsys):
     write_dataset(tmp_path / "drive", drive.without("uwb").without("aruco"))
-    mine = tmp_path / "out" / "problem1" / "vehiclePose.mat" / "mine"
-    files.write_file(mine, b"mine")
-    assert main(["solve", str(tmp_path / "drive"), "--out", str(tmp_path / "out")]) == 2
-    told = capsys.readouterr().err
-    assert told.count("slamlib: ") == 1 and "problem1/vehiclePose.mat" in told.splitlines()[-1]
-    assert files.file_names(tmp_path / "out") == ["problem1/vehiclePose.mat/mine"]
-    with pytest.raises(DatasetError, match="summary.json: .* solve the dataset again"):
-        results.read_summary(tmp_path / "out")
+    out = tmp_path / "out"
+    files.write_file(out / "problem1" / "vehiclePose.mat" / "mine", b"mine")
+    assert main(["solve", str(tmp_path / "drive"), "--out", str(out)]) == 2
+    assert "problem1/vehiclePose.mat" in capsys.readouterr().err.splitlines()[-1]
+    assert files.file_names(out) == ["problem1/vehiclePose.mat/mine"]      # and no summary
 
 
 @pytest.fixture
@@ -174,12 +168,11 @@ def rebuilt(tmp_path):
 def test_a_build_that_fails_changes_nothing(rebuilt):
     folder, again = rebuilt
     write(folder / "notebooks", "1_goes", "# Goes", ("1 / 0",))
-    before = {path: path.read_bytes() for name in ("report", "results")
-              for path in (folder / name).rglob("*.*") if path.is_file()}
+    before = contents(folder / "report"), contents(folder / "results")
     with pytest.raises(NotebookError):
         again()
-    assert len(before) > 8 and hidden(folder) == []
-    assert all(path.read_bytes() == content for path, content in before.items())
+    assert (contents(folder / "report"), contents(folder / "results")) == before
+    assert hidden(folder) == []
 
 
 @pytest.mark.slow
@@ -202,7 +195,7 @@ Path("part").write_text(str(os.getpid()))
 Path("part").rename("kernel")
 time.sleep(1000)""",))
     process, kernel = start(tmp_path, "report", "short"), tmp_path / "notebooks" / "kernel"
-    wait_for(kernel.is_file, process)
+    wait_for(kernel, process)
     process.send_signal(signal.SIGTERM)
     told = process.communicate(timeout=300)[1]
     assert process.returncode == 130
@@ -223,7 +216,7 @@ def find(*_):
     time.sleep(1000)
 solve.find = find
 sys.exit(main())""")
-    wait_for((tmp_path / "solves").exists, process)
+    wait_for(tmp_path / "solves", process)
     process.send_signal(number)
     out, told = process.communicate(timeout=300)
     assert out == "" and told.splitlines()[-1] == "slamlib: ended by a signal"

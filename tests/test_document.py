@@ -7,7 +7,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_output, new_raw_cell
+from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_output
 
 from slamlib.notebook.drives import plain
 from slamlib.report import NotebookError
@@ -74,13 +74,13 @@ def links(text):
 
 def test_figures_and_tables_have_their_captions_and_a_figure_may_have_two_pictures(tmp_path):
     found, content = page(
-        "## 1.1 First", figure(), figure(), "Figure 1.1. One, not figure 1.2.",
-        figure("Figure 1.2. Two."), f"{TABLE}Table 1.1. A table.", "Figure 1.3. Not drawn.")
+        figure(), figure(), "Figure 1.1. One, not figure 1.2.", figure("Figure 1.2. Two."),
+        f"{TABLE}Table 1.1. A table.", "Figure 1.3. Not drawn.")
     assert re.findall(r'<figure id="([^"]*)"', found) == ["figure-1.1", "figure-1.2", "table-1.1"]
     assert [part.count("<img") for part in found.split("<figcaption")] == [2, 1, 0, 0]
     assert links(found) == [("#figure-1.2", "1.2")] and 'id="figure-1.3"' in found
     text = text_of(content, tmp_path)
-    for line in ("1.1 First", "Figure 1.1. One", "Figure 1.2. Two.", "Table 1.1. A table.",
+    for line in ("Figure 1.1. One", "Figure 1.2. Two.", "Table 1.1. A table.",
                  "Figure 1.3. Not drawn."):
         assert line in text
 
@@ -121,41 +121,41 @@ def test_links_lead_to_other_chapters_by_their_file_and_anchor():
     (["$$ a \\tag{3} $$ and $$ b \\tag{3} $$"], "equation 3 occurs twice"),
     (["![](https://example.org/p.png)"], "expected a picture of the notebook or a file beside it"),
     (["![](absent.png)"], "expected a picture of the notebook or a file beside it"),
-    (["So $x$ and $\\nonsense{x}$"],
-     r"pandoc cannot convert this formula:\n    \\nonsense{x}"),
     (["$$ a \\tag{1} \\tag{2} $$"], r"pandoc would lose \\tag in this formula"),
-    (["$\\begin{array}{c|c} a & b \\end{array}$"], "pandoc would lose {array}{c| in this formula"),
-    (["\\begin{equation} x \\end{equation}"], "a formula stands outside of \\$\\$"),
+    (["$\\begin{array}{c|c} a & b \\end{array}$"], r"pandoc would lose \{array}\{c\| in this"),
+    (["\\begin{equation} x \\end{equation}"], r"a formula stands outside of \$\$"),
     (["[text](#Nowhere)"], "Typst cannot set the PDF: label .*Nowhere")])
 def test_what_would_be_lost_or_leads_nowhere_is_refused(cells, reason):
-    with pytest.raises(NotebookError, match=reason.replace("{", "[{]")):
+    with pytest.raises(NotebookError, match=reason):
         page(*cells)
 
 
 FORMULAS = [  # what authors write, and a part of what can be set
-    (r"\bigl\lVert r \bigr\rVert", "‖𝑟‖"), (r"a\!b", "𝑎𝑏"), (r"\|x\|", "‖𝑥‖"),
-    (r"\lvert Q \rvert", "|𝑄|"), (r"\big( a \big)^2", "𝑎"), (r"\tfrac12 \dfrac{a}{b}", "𝑎"),
-    (r"\underbrace{x}_{\text{d}}", "d"), (r"\arg\min_x f", "min"),
-    (r"\begin{bmatrix}3\end{bmatrix}", "3")]
+    (r"\bigl\lVert r \bigr\rVert", "‖𝑟‖"), (r"a\!b", "𝑎𝑏"), (r"\lvert Q \rvert", "|𝑄|"),
+    (r"\big( a \big)^2", "𝑎"), (r"\tfrac12 \dfrac{a}{b}", "𝑎"), (r"\underbrace{x}_{\text{d}}", "d"),
+    (r"\arg\min_x f", "min"), (r"\begin{bmatrix}3\end{bmatrix}", "3")]
+
+
+@pytest.mark.parametrize("tex, part", FORMULAS)
+def test_what_authors_write_in_formulas_can_be_set(tmp_path, tex, part):
+    found, content = page(f"$$ {tex} $$")
+    assert found.count("<math") == 1
+    assert part in text_of(content, tmp_path).replace(" ", "")
 
 
 def test_every_formula_arrives_with_its_number(tmp_path):
     cells = [r"Norms $\lVert r \rVert^2$ and $$ \begin{aligned} x &= \frac{a}{b}\,\cos\delta_k \\ "
              r"y &= \left\lVert r \right\rVert \end{aligned} \tag{1.1} $$.",
              "| $a < b$ | 2 |\n| --- | --- |\n| $$ \\sqrt2 \\tag{7} $$ | `$code$` |",
-             new_code_cell(outputs=[shown(text_latex="$\\hat\\theta$", text_plain="no")]),
-             *(f"Now: $$ {tex} $$" for tex, _ in FORMULAS)]
+             new_code_cell(outputs=[shown(text_latex="$\\hat\\theta$", text_plain="no")])]
     found, content = pages({ONE: titled("1. Of $x$", "## And $y$", *cells)})
-    assert found["1"].count("<math") == 7 + len(FORMULAS) and "<code>$code$</code>" in found["1"]
+    assert found["1"].count("<math") == 7 and "<code>$code$</code>" in found["1"]
     assert re.findall(r'class="number">\(([\d.]+)\)', found["1"]) == ["1.1", "7"]
-    assert {"equation-1.1", "equation-7"} <= set(re.findall(r'id="([^"]+)"', found["1"]))
+    assert 'id="equation-1.1"' in found["1"] and 'id="equation-7"' in found["1"]
     left = re.sub(r"(?s)<math.*?</math>|<code>.*?</code>", "", found["1"])
     assert "$" not in left and "\\" not in left
     text = text_of(content, tmp_path)
     assert re.search(r"\s\(1\.1\)\s", text) and re.search(r"\s\(7\)\s", text)
-    _, *said = text.replace(" ", "").split("Now:")
-    for each, (_, expected) in zip(said, FORMULAS, strict=True):
-        assert expected in each
 
 
 def test_wide_formulas_shrink_and_long_tables_break(tmp_path):
@@ -185,13 +185,12 @@ def test_outputs_are_shown_by_the_best_kind_and_html_tables_are_tables(tmp_path)
     found, content = page(new_code_cell(outputs=[
         shown(image_png="iVBORw0KGgo=", text_plain="no", **{"image_svg+xml": SVG}),
         shown(text_html=table, text_plain="no"), shown(text_markdown="Table 1.1. Frames."),
-        shown(text_plain="last"), new_output("stream", name="stderr", text="\x1b[31mtold\n")]),
-        new_raw_cell("raw"))
+        new_output("stream", name="stderr", text="\x1b[31mtold\n")]))
     assert found.count("<img") == 1 and 'src="data:image/svg+xml;base64' in found
     assert 'id="table-1.1"' in found and "<style" not in found
-    assert "last" in found and re.search('<pre class="stderr"><code>told', found)
+    assert re.search('<pre class="stderr"><code>told', found)
     text = text_of(content, tmp_path)
-    assert "cell" in text and "last" in text and "told" in text
+    assert "cell" in text and "told" in text
     assert not re.search(r"\bno\b", text)
 
 
@@ -204,16 +203,15 @@ def test_pictures_beside_the_notebook_and_attachments_are_embedded(tmp_path):
 
 
 @pytest.mark.parametrize("code, folded, printed", [
-    ("method", 1, "open()"), ("all", 0, "open()folded()"), ("none", 0, "")])
+    ("method", 1, ["open()"]), ("all", 0, ["open()", "folded()"]), ("none", 0, [])])
 def test_code_is_folded_on_the_page_and_left_out_of_the_pdf(tmp_path, code, folded, printed):
     told = [new_output("stream", text="told\n")]
     found, content = page(new_code_cell("open()", outputs=told),
                           figure("Figure 1.1. F.", code="folded()", **HIDDEN), code=code)
-    assert found.count("<details>") == found.count("</details>") == folded
-    assert found.count("told") == (code != "none") and found.count("<figcaption>") == 1
+    assert found.count("<details>") == folded and found.count("<figcaption>") == 1
     text = text_of(content, tmp_path)
-    assert "".join(re.findall(r"(?:open|folded)\(\)", text)) == printed
-    assert text.count("told") == (code != "none")
+    assert re.findall(r"(?:open|folded)\(\)", text) == printed
+    assert ("told" in found) == ("told" in text) == (code != "none")
 
 
 @pytest.mark.parametrize("name", [
@@ -222,9 +220,8 @@ def test_code_is_folded_on_the_page_and_left_out_of_the_pdf(tmp_path, code, fold
 def test_a_name_stays_the_same_text_in_markdown(name):
     found, _ = page(f"x {plain(name)}\n\n| a |\n|--|\n| x {plain(name)} |")
     assert "<script" not in found and "<svg onload" not in found
-    said = [words(html.unescape(re.sub("<[^>]*>", "", each)).replace("<", "&lt;"))
-            for each in re.findall(r"<(?:p|td)[^>]*>(x .*?)</(?:p|td)>", found, re.DOTALL)]
-    assert said == 2 * [words(f"x {name}".replace("<", "&lt;"))]
+    said = re.findall(r"<(?:p|td)[^>]*>(x .*?)</(?:p|td)>", found, re.DOTALL)
+    assert [html.unescape(" ".join(each.split())) for each in said] == 2 * [f"x {name}"]
 
 
 def test_cells_for_the_screen_are_not_printed(tmp_path):
@@ -239,9 +236,9 @@ def test_a_report_has_contents_a_title_page_and_equal_bytes(tmp_path):
     files = render(books, options, SVG)
     assert files == render(books, options, SVG)
     assert [*files] == ["1_one.html", "2_two.html", "report.pdf"]
-    text = text_of(files["report.pdf"], tmp_path)
-    for line in ('A "title" *and* #x', "A. Author", "4711", "1.1 First", "2. “Two” #x"):
-        assert line.replace("“", '"').replace("”", '"') in text.replace("“", '"').replace("”", '"')
+    text = text_of(files["report.pdf"], tmp_path).replace("“", '"').replace("”", '"')
+    for line in ('A "title" *and* #x', "A. Author", "4711", "1.1 First", '2. "Two" #x'):
+        assert line in text
     found = files["2_two.html"].decode()
     assert '<a href="1_one.html">1. One</a>' in found and 'href="#Second"' in found
     assert "<script" not in found and "default-src 'none'" in found

@@ -37,16 +37,6 @@ def bad(good):
     return Drive("b*d", replace(good.dataset, aruco=contradicted(good.dataset.aruco)), None)
 
 
-def test_what_is_found_is_written_with_its_summary_and_nothing_is_said(said, good, tmp_path):
-    with attempt(good, "problem2"):
-        write_results(good, "problem2", localize(good.dataset.sightings))
-    folder = tmp_path / "results" / "good"
-    assert {file.name for file in (folder / "problem2").iterdir()} == {
-        "vehiclePose.mat", "ArucoMap.mat"}
-    assert read_summary(folder)["problems"]["problem2"]["sightings"] > 10
-    assert said == []
-
-
 def test_a_problem_that_fails_is_said_and_in_the_summary_and_the_others_are_written(
         said, bad, tmp_path):
     with attempt(bad, "problem2"):

@@ -12,6 +12,7 @@ from test_report import write
 
 from slamlib.__main__ import main
 from slamlib.core.errors import DatasetError
+from slamlib.io.files import write_file
 from slamlib.report import handin
 from slamlib.report.notebooks import Options
 from slamlib.report.overview import SolvedDrive
@@ -56,15 +57,13 @@ def handed(tmp_path_factory):
 @pytest.mark.slow
 def test_the_names_are_the_assignment_s_and_the_files_are_the_results(handed):
     folder, archive = handed
-    files = {"problem1/vehiclePose.mat": "problem1/vehiclePose.mat",
-             "problem2/ArucoMap.mat": "problem2/ArucoMap.mat",
-             "problem2/vehiclePose.mat": "problem2_fused/vehiclePose.mat",
-             **{f"problem{n}/{name}.mat": f"problem{n}/{name}.mat"
-                for n in (3, 4) for name in ("ArucoMap", "vehiclePose")},
-             "problem4/UwbMap.mat": "problem4/UwbMap.mat"}
-    assert archive.namelist() == sorted(
-        ["README.txt", "report.pdf", *(f"mine/{name}" for name in files)])
-    for name, result in files.items():
+    files = ["problem1/vehiclePose.mat", "problem2/ArucoMap.mat", "problem2/vehiclePose.mat",
+             "problem3/ArucoMap.mat", "problem3/vehiclePose.mat", "problem4/ArucoMap.mat",
+             "problem4/UwbMap.mat", "problem4/vehiclePose.mat"]
+    assert archive.namelist() == [
+        "README.txt", *(f"mine/{name}" for name in files), "report.pdf"]
+    for name in files:
+        result = name.replace("problem2/vehicle", "problem2_fused/vehicle")
         assert archive.read(f"mine/{name}") == (folder / "results/mine" / result).read_bytes()
 
 
@@ -79,8 +78,7 @@ def test_the_pdf_is_without_what_is_for_screens_and_the_usual_pages_stay(handed)
 
 @pytest.mark.slow
 def test_the_readme_is_true_of_the_files(handed):
-    text = handed[1].read("README.txt").decode()
-    one_line = re.sub(r"\s+", " ", text)
+    text = " ".join(handed[1].read("README.txt").decode().split())
     for part in ("Ada", "mine/problem2: vehiclePose.mat and ArucoMap.mat odometry + ArUco; 40 of "
                  "40 poses have an estimate", "mine/problem4: vehiclePose.mat, ArucoMap.mat and "
                  "UwbMap.mat SLAM: odometry + ArUco + UWB; 40 of 40", "fused with odometry",
@@ -88,23 +86,20 @@ def test_the_readme_is_true_of_the_files(handed):
                  "the fusion has no map of its own. Its world frame is the frame of pose 11.",
                  "Simulated and left out: stand_in.", "gtsam 4.3", "are NaN",
                  "problem2_fused of the report is problem2 here"):
-        assert part in one_line
-    assert max(map(len, text.split("\n"))) <= handin.LINE_WIDTH and text.endswith("\n")
+        assert part in text
 
 
 @pytest.mark.slow
 def test_equal_input_gives_equal_bytes_and_the_date_is_fixed(handed, monkeypatch, capsys):
     folder, archive = handed
-    before = (folder / "hand-in.zip").read_bytes()
     monkeypatch.chdir(folder)
     assert main(["hand-in", "--out", "new/second.zip"]) == 0
-    assert (folder / "new" / "second.zip").read_bytes() == before
+    second = folder / "new" / "second.zip"
+    assert second.read_bytes() == (folder / "hand-in.zip").read_bytes()
     assert {entry.date_time for entry in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
     told = capsys.readouterr().err
-    assert "1 of 1: 1_all, nothing changed" in told
     assert "left out, because simulated: stand_in" in told
-    assert f"hand-in: {(folder / 'new' / 'second.zip').resolve()}\n" in told
-    assert [file.name for file in (folder / "new").iterdir()] == ["second.zip"]
+    assert f"hand-in: {second.resolve()}\n" in told
 
 
 def test_appendices_are_left_out_unless_report_toml_names_its_chapters():
@@ -136,36 +131,39 @@ def test_the_map_of_problem_2_is_that_of_its_estimate_if_it_has_one(problem2, fo
     assert ("no map of its own" in text) == (problem2 == "fused")
     assert ("In d/problem2 it is the frame of the vehicle at pose 2" in text) == (
         problem2 == "aruco")
-    files = files[:3]  # no poses of the chosen estimate: the map alone is not handed in
-    if problem2 != "aruco":
-        assert handin.handed_in(replace(drive, files=files), problem2) == {}
 
 
-def test_doubts_and_failures_are_in_the_readme_and_empty_headings_are_not():
-    drive = solved_drive("problem1", files=("problem1/vehiclePose.mat",), doubts=(
-        Doubt("units", "Lengths may be in millimetres."),), failures=(
-        Failure("problem3", "SLAM", "no landmark"), Failure("problem2_hint", "hint", "not told")))
-    drive = replace(drive, dataset=drive.dataset.without("uwb"))
-    text = handin.readme([drive], Options(author="A", course="C"), ["x", "y"])
-    one_line = " ".join(text.split())
-    assert "d: Lengths may be in millimetres." in text and "not told" not in text
-    assert "d/problem2 (ArUco): no result." in one_line
-    assert "d/problem3 (SLAM: odometry + ArUco): could not be solved: no landmark." in one_line
-    assert "/problem4 (SLAM: odometry + ArUco + UWB): left out: no UWB ranges." in one_line
-    assert "Simulated and left out: x and y." in text
-    assert text.startswith(f"{Options().title}\nA\nC\n")
-    noted = replace(drive, dataset=replace(drive.dataset, notes=("A header was left out.",)))
-    assert "d: A header was left out." in handin.readme([noted], Options())
-    text = handin.readme([replace(drive, doubts=())], Options())
+def test_without_poses_of_the_chosen_estimate_the_map_alone_is_not_handed_in():
+    drive = solved_drive("problem2", files=("problem2/ArucoMap.mat", "problem2/vehiclePose.mat"))
+    assert handin.handed_in(drive, "fused") == {}
+
+
+def test_doubts_failures_and_notes_are_in_the_readme():
+    drive = solved_drive(
+        "problem1", files=("problem1/vehiclePose.mat",),
+        doubts=(Doubt("units", "Lengths may be in millimetres."),),
+        failures=(Failure("problem3", "SLAM", "no landmark"),
+                  Failure("problem2_hint", "hint", "not told")))
+    drive = replace(drive, dataset=replace(drive.dataset.without("uwb"), notes=("A header.",)))
+    text = " ".join(handin.readme([drive], Options(), ["x", "y"]).split())
+    for part in ("d: Lengths may be in millimetres.", "d: A header.",
+                 "d/problem2 (ArUco): no result.",
+                 "d/problem3 (SLAM: odometry + ArUco): could not be solved: no landmark.",
+                 "/problem4 (SLAM: odometry + ArUco + UWB): left out: no UWB ranges.",
+                 "Simulated and left out: x and y."):
+        assert part in text
+    assert "not told" not in text
+
+
+def test_without_doubts_and_notes_their_headings_are_absent():
+    text = handin.readme([solved_drive("problem1")], Options())
     assert "Doubts" not in text and "Notes" not in text
 
 
 def test_results_of_a_run_that_was_killed_are_not_handed_in(tmp_path):
     drive = solved_drive("problem1", files=("problem1/vehiclePose.mat",))
-    pdf = tmp_path / "report.pdf"
-    pdf.write_bytes(b"")
-    report = SimpleNamespace(files=[pdf], drives=[drive], omitted=[])
-    (tmp_path / "d" / "problem1").mkdir(parents=True)
-    (tmp_path / "d" / "problem1" / "vehiclePose.mat").write_bytes(b"half")
+    report = SimpleNamespace(files=[tmp_path / "report.pdf"], drives=[drive], omitted=[])
+    for name in ("report.pdf", "d/problem1/vehiclePose.mat"):
+        write_file(tmp_path / name, b"half")
     with pytest.raises(DatasetError, match="summary.json: .* solve the dataset again"):
         handin.write_zip(tmp_path / "hand-in.zip", report, tmp_path, Options())

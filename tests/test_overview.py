@@ -18,7 +18,7 @@ from slamlib.report.execution import NotebookError
 from slamlib.report.notebooks import Options
 from slamlib.report.overview import title_picture
 from slamlib.robust.file_doubts import Doubt
-from slamlib.solve import Failure, Solution, solutions, solve_to_folder, summarize, title
+from slamlib.solve import Failure, Solution, solve_to_folder, summarize, title
 from slamlib.studies.simulation import simulate
 
 NAMES = ("all", "no_truth", "wheels_only")
@@ -29,14 +29,14 @@ def project(tmp_path_factory):
     """Three drives, two of which lack something, with results; the solutions of the first drive."""
     folder = tmp_path_factory.mktemp("overview")
     dataset, truth = simulate("short", seed=5)
-    dataset = replace(dataset, name="all").first(1000)
+    dataset = dataset.first(1000)
     truth = replace(truth, poses=truth.poses[:1000])
-    bare = replace(dataset.without("uwb").without("aruco"), name="wheels_only")
-    given = [Drive("all", dataset, truth), Drive("no_truth", dataset, None),
-             Drive("wheels_only", bare, None)]
-    for drive in given:
-        solve_to_folder(drive.dataset, drive.truth, folder / drive.name)
-    drives = [overview.solved_drive(drive, folder / drive.name) for drive in given]
+    wheels = dataset.without("uwb").without("aruco")
+    drives = []
+    for name, each, known in zip(NAMES, (dataset, dataset, wheels), (truth, None, None)):
+        drive = Drive(name, replace(each, name=name), known)
+        solve_to_folder(drive.dataset, known, folder / name)
+        drives.append(overview.solved_drive(drive, folder / name))
     return SimpleNamespace(drives=drives, solved=drives[0].solutions,
                            summary=overview.opening(drives))
 
@@ -67,31 +67,25 @@ def metres(text):
 def test_titles_and_numbers_of_the_table_are_those_of_the_solver(project):
     rows, _ = result_rows(project.summary)
     drive = project.drives[0]
-    without_markers = drive.dataset.without("aruco")
-    for solution in solutions(without_markers, ("problem1", "problem4")):
-        assert title(solution.problem, without_markers) == solution.title
     for solution in project.solved:
         assert title(solution.problem, drive.dataset) == solution.title
         expected = summarize(solution, drive.truth)
-        ate, aligned, position, heading, poses = rows["all", solution.title]
-        assert int(poses.replace(",", "")) == expected["estimated_poses"]
+        *shown, poses = [cell.replace(",", "") for cell in rows["all", solution.title]]
+        assert int(poses) == expected["estimated_poses"]
         C = solution.covariances[np.isfinite(solution.poses[:, 0])]
-        for shown, wanted in ((position, np.median(evaluation.position_sigmas(C))),
-                              (heading, np.median(np.sqrt(C[:, 2, 2]))),
-                              (ate, expected["ate_m"]), (aligned, expected["ate_aligned_m"])):
-            assert 1e-3 * float(shown.replace(",", "")) == pytest.approx(wanted, rel=6e-3)
+        wanted = (expected["ate_m"], expected["ate_aligned_m"],
+                  np.median(evaluation.position_sigmas(C)), np.median(np.sqrt(C[:, 2, 2])))
+        assert [1e-3 * float(cell) for cell in shown] == pytest.approx(wanted, rel=6e-3)
 
 
 def test_the_abstract_of_a_simulated_drive_has_the_errors_of_odometry_and_slam(project):
-    opened = overview.opening(project.drives[:1])
-    text = opened.cells[0].source
-    solved = project.solved
-    odometry, slam = (summarize(solved[number], project.drives[0].truth)["ate_m"]
-                      for number in (0, -1))
-    found = re.search(r"by SLAM is (\S+) and (\S+) on \*all", text.replace("\u00a0mm", ""))
-    assert [1e-3 * float(each) for each in found.groups()] == pytest.approx(
-        [odometry, slam], rel=5e-3)
-    assert f"{len(solved[-1].aruco_map[0])} markers and 4 antennas on *all*" in text
+    text = overview.opening(project.drives[:1]).cells[0].source
+    odometry, slam = re.search(
+        r"by SLAM is (\S+) and (\S+) on \*all", text.replace("\u00a0mm", "")).groups()
+    for found, solution in ((odometry, project.solved[0]), (slam, project.solved[-1])):
+        ate = summarize(solution, project.drives[0].truth)["ate_m"]
+        assert 1e-3 * float(found) == pytest.approx(ate, rel=5e-3)
+    assert f"{len(project.solved[-1].aruco_map[0])} markers and 4 antennas on *all*" in text
     assert "*all* is a simulated stand-in" in text
 
 
@@ -99,14 +93,9 @@ def test_what_is_left_out_is_told_with_its_reason(project):
     rows, text = result_rows(project.summary)
     assert rows["no_truth", "odometry"][:2] == ["–", "–"]
     assert "A dash stands where no truth is known." in text
-    assert rows["wheels_only", "ArUco"] == [*"––", "*left out: no markers*", *"––"]
+    assert rows["wheels_only", "ArUco"][2] == "*left out: no markers*"
     assert rows["wheels_only", "SLAM: odometry + UWB"][2] == "*left out: no UWB ranges*"
-    assert "| --- | --- | ---: | ---: | ---: | ---: | ---: |" in text
-    assert rows["wheels_only", "odometry"][-1] == "1,000"
     assert "There are no markers in wheels_only" in text
-    assert "There are no UWB ranges in wheels_only" in text
-    known = [drive for drive in project.drives if drive.truth is not None]
-    assert "A dash stands" not in result_rows(overview.opening(known))[1]
 
 
 def test_nothing_is_said_of_doubts_failures_and_notes_where_there_are_none(project):
@@ -116,14 +105,14 @@ def test_nothing_is_said_of_doubts_failures_and_notes_where_there_are_none(proje
 def test_doubts_failures_and_notes_stand_on_the_first_page(project):
     drive = project.drives[1]
     failed = Failure("problem3", "SLAM: odometry + ArUco", "expected | more")
-    noted = replace(drive.dataset, notes=("X*.txt is not read.", "Y holds no rows."))
+    dataset = replace(drive.dataset, notes=("X*.txt is not read.", "Y holds no rows."))
     opened = overview.opening([replace(
-        drive, dataset=noted, failures=(failed,), doubts=(Doubt("units", "Lengths are *mm*."),),
+        drive, dataset=dataset, failures=(failed,), doubts=(Doubt("units", "Lengths are *mm*."),),
         solutions=drive.solutions[:4])])
     assert result_rows(opened)[0]["no_truth", failed.title] == ["*could not be solved*", "–", "–"]
     cells = {cell.id: cell.source for cell in opened.cells}
-    assert cells["doubts"].splitlines() == [
-        "## Doubts about the data", "", "no_truth:", "",
+    assert cells["doubts"].splitlines()[2:] == [
+        "no_truth:", "",
         "- The problem &#8220;SLAM: odometry + ArUco&#8221; could not be solved: "
         "expected &#124; more.",
         "- Lengths are &#42;mm&#42;."]
@@ -134,32 +123,27 @@ def test_recorded_drives_are_the_subject_beside_longer_simulated_ones(project):
     simulated, recorded = project.drives[:2]
     short = replace(recorded, name="mine", dataset=recorded.dataset.first(999))
     assert overview.longest([short, simulated]) is short
-    assert overview.longest([simulated]) is simulated
     abstract = overview.opening([short, simulated]).cells[0].source
     assert "markers and 4 antennas on *mine*." in abstract
 
 
 def test_the_world_is_the_first_pose_with_an_estimate():
-    drive = simulate("short", seed=6)
-    truth = drive[1]
+    dataset, truth = simulate("short", seed=6)
     poses = np.full_like(truth.poses, np.nan)
     poses[40:] = se2.between(truth.poses[40], truth.poses[40:])
     solution = Solution("problem2", "ArUco", poses, np.zeros((len(poses), 3, 3)), 40)
-    solved = overview.SolvedDrive("x", *drive, solutions=(solution,))
-    row = overview.result_row(solved, "problem2")
-    assert row["ATE (mm)"] == pytest.approx(0, abs=1e-6)
-    assert evaluation.ate(poses, truth.poses) > 0.1  # in the wrong frame
+    solved = overview.SolvedDrive("x", dataset, truth, solutions=(solution,))
+    assert overview.result_row(solved, "problem2")["ATE (mm)"] == pytest.approx(0, abs=1e-6)
 
 
-def test_the_pictures_are_the_same_every_time_and_need_no_display(project):
+def test_the_pictures_are_the_same_every_time_and_show_roles_and_map(project):
     text = picture_of(project.summary)
-    assert text == picture_of(overview.opening(project.drives)) and text.count("<path") > 10
-    assert not re.search(r"<dc:date|/tmp/|http://(?!www.w3.org|purl.org|creativecommons)", text)
+    assert text == picture_of(overview.opening(project.drives))
     for role in ("slam_uwb", "fused", "hint"):
         assert plotting.ROLES[role]["color"].lower() in text
-    last = project.solved[-1]
     picture = title_picture(project.drives[:1])
     assert picture == title_picture(project.drives[:1])
+    last = project.solved[-1]
     assert picture.count("<use ") >= len(last.aruco_map[0]) + len(last.uwb_map[0])
 
 
@@ -173,36 +157,39 @@ def test_without_truth_the_abstract_has_no_errors(project):
 @pytest.mark.slow
 def test_at_returns_slam_is_compared_by_the_camera_that_it_estimated(tmp_path):
     """A camera 10 cm ahead, of which vehicle.toml says nothing, and the noise of sightings."""
-    dataset, truth = simulate("short", seed=5)
+    dataset, _ = simulate("short", seed=5)
     moved = replace(dataset.vehicle, camera_x=-0.1)
     dataset = replace(dataset, aruco=replace(dataset, vehicle=moved).sightings)
     solve_to_folder(dataset, None, tmp_path, ("problem1", "problem3"))
     drive = overview.solved_drive(Drive("x", dataset, None), tmp_path)
     abstract = overview.opening([drive]).cells[0].source
-    odometry, slam, noise = (metres(value) for value in re.search(
-        r"these sightings, ([\d.]+\s\w+) and ([\d.]+\s\w+) on \*x\*, where the noise of the "
-        r"sightings alone gives ([\d.]+\s\w+)\. ", abstract).groups())
+    found = re.search(r"these sightings, (\S+\s\w+) and (\S+\s\w+) on \*x\*, where the noise of "
+                      r"the sightings alone gives (\S+\s\w+)\. ", abstract)
+    odometry, slam, noise = map(metres, found.groups())
     assert slam < 1.5 * noise < odometry
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", NAMES)
-def test_the_opening_of_any_one_drive_fits_on_a_page(project, tmp_path, name):
-    drive, = (drive for drive in project.drives if drive.name == name)
-    files = render({Path("index"): overview.opening([drive])}, Options(title="T"),
-                   title_picture([drive]))
+@pytest.mark.parametrize("number", [0, 1, 2], ids=NAMES)
+def test_the_opening_of_any_one_drive_fits_on_a_page(project, tmp_path, number):
+    drives = project.drives[number:number + 1]
+    files = render({Path("index"): overview.opening(drives)}, Options(title="T"),
+                   title_picture(drives))
     text = text_of(files["report.pdf"], tmp_path)
     _, page = text.rstrip("\f\n").split("\f")                     # after the cover
     assert "Figure 1." in page and "The datasets" not in text
-    assert ("ATE" in text) == (name == "all") == ("stand-in" in text)
+    assert ("ATE" in text) == ("stand-in" in text) == (number == 0)
 
 
 @pytest.mark.parametrize("poses, reason", [
-    (None, "cannot be read"), (np.zeros((7, 3)), "must hold .* found [(]7, 3[)]"),
-    (np.full((1000, 3), np.nan), "must hold")])
+    (np.zeros((7, 3)), "must hold .* found [(]7, 3[)]"), (np.full((1000, 3), np.nan), "must hold")])
 def test_a_result_that_is_no_solution_is_told(project, tmp_path, poses, reason):
     broken = tmp_path / "all" / "problem2"
-    if poses is not None:
-        write_structs(broken, "vehiclePose", None, poses, np.zeros((len(poses), 3, 3)))
+    write_structs(broken, "vehiclePose", None, poses, np.zeros((len(poses), 3, 3)))
     with pytest.raises(NotebookError, match=f"all/problem2, which a notebook wrote, {reason}"):
         overview.read_solution(broken, project.drives[0].dataset)
+
+
+def test_a_result_whose_file_is_missing_is_told(project, tmp_path):
+    with pytest.raises(NotebookError, match="problem2, which a notebook wrote, cannot be read"):
+        overview.read_solution(tmp_path / "problem2", project.drives[0].dataset)

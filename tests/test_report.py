@@ -2,7 +2,6 @@
 
 import html
 import json
-import os
 import re
 import sys
 from dataclasses import replace
@@ -95,11 +94,9 @@ def test_kernels_see_the_folders_and_what_is_printed_in_a_row_is_one_output(buil
     """However long it takes. Kernels run this interpreter."""
     root, pages = built
     text = pages[2].read_text(encoding="utf-8")
-    for value in (root / "data", sys.executable):
-        assert str(value) in text
+    assert str(root / "data") in text and sys.executable in text
     assert '<pre class="stderr"><code>stderr is shown' in text
     assert re.search(r"\nshort\n?</code></pre>", text)
-    assert "SLAMLIB_DATA" not in os.environ
     outputs = re.findall(r'<pre class="std[^>]*><code>(.*?)\s*</code>', text, re.DOTALL)
     assert [html.unescape(part).strip("'") for part in outputs[-5:]] == [
         "one\ntwo", "three", "a picture", "and another", "four"]
@@ -114,33 +111,32 @@ def test_a_notebook_that_fails_is_named_and_leaves_the_old_report(tmp_path, good
     make_data(tmp_path)
     write(tmp_path / "notebooks", "1_good", "# Good", (good,))
     write(tmp_path / "notebooks", "2_bad", *bad)
-    (tmp_path / "report").mkdir()
-    (tmp_path / "report" / "1_good.html").write_text("old")
+    write_file(tmp_path / "report" / "1_good.html", b"old")
     with pytest.raises(NotebookError) as caught:
         build(tmp_path)
     assert str(caught.value) == told
-    assert [path.name for path in (tmp_path / "report").iterdir()] == ["1_good.html"]
+    assert file_names(tmp_path / "report") == ["1_good.html"]
     assert (tmp_path / "report" / "1_good.html").read_text() == "old"
 
 
-def test_bad_data_and_bad_notebooks_are_told_before_a_kernel_starts(tmp_path):
+def test_bad_data_is_told_before_a_kernel_starts(tmp_path):
     make_data(tmp_path)
     write(tmp_path / "notebooks", "1_text", "# Text", ("raise SystemExit('never reached')",))
     (tmp_path / "data" / "long" / "encoderReading.txt").write_text("1 0 0\n2 1\n")
     with pytest.raises(DatasetError, match="encoderReading.txt, line 2: expected 3 numbers"):
         build(tmp_path)
-    broken = tmp_path / "notebooks" / "2_broken.ipynb"
-    for content, reason in (
-            (b"not json", "Notebook does not appear to be JSON"),
-            (b'{"nbformat": 99}', "Unsupported nbformat version 99"),
-            (b"[]", "'list' object "), (b'{"nbformat": 4,\n"caf\xe9": 1}', "expected UTF-8 text")):
-        broken.write_bytes(content)
-        with pytest.raises(NotebookError, match=f"^2_broken.ipynb is not a notebook: {reason}"):
-            build(tmp_path, datasets=["short"])
-    broken.unlink()
-    os.mkfifo(broken)
-    with pytest.raises(DatasetError, match="2_broken.ipynb: expected a file that can be read$"):
-        build(tmp_path, datasets=["short"])
+
+
+@pytest.mark.parametrize("content, reason", [
+    (b"not json", "Notebook does not appear to be JSON"),
+    (b'{"nbformat": 99}', "Unsupported nbformat version 99"), (b"[]", "'list' object "),
+    (b'{"nbformat": 4,\n"caf\xe9": 1}', "expected UTF-8 text")])
+def test_what_is_no_notebook_is_told_before_a_kernel_starts(tmp_path, content, reason):
+    make_data(tmp_path)
+    write(tmp_path / "notebooks", "1_text", "# Text", ("raise SystemExit('never reached')",))
+    write_file(tmp_path / "notebooks" / "2_broken.ipynb", content)
+    with pytest.raises(NotebookError, match=f"^2_broken.ipynb is not a notebook: {reason}"):
+        build(tmp_path)
     assert not (tmp_path / "report").exists()
 
 
@@ -156,7 +152,8 @@ for drive in start():
 def test_a_problem_that_fails_costs_one_problem_and_exit_code_3(tmp_path, monkeypatch, capsys):
     """One of two drives contradicts itself, and its truth begins in another frame."""
     dataset, truth = simulate("short", seed=3)
-    dataset, poses = dataset.first(50).without("uwb"), truth.poses[:50]
+    dataset = dataset.first(50).without("uwb")
+    poses = truth.poses[:50]
     write_dataset(tmp_path / "data" / "good", dataset, replace(truth, poses=poses))
     write_dataset(tmp_path / "data" / "bad", replace(dataset, aruco=contradicted(dataset.aruco)),
                   replace(truth, poses=compose([7, 0, 0], poses)))
@@ -167,12 +164,10 @@ def test_a_problem_that_fails_costs_one_problem_and_exit_code_3(tmp_path, monkey
         told = capsys.readouterr().err
         assert f"1 of 1: 1_solve, {progress}" in told
         assert "bad: problem2 could not be solved: expected sightings" in told
-        assert re.search(r"\n *good +problem2 +\d+ ", told)
     text = html.unescape((tmp_path / "report" / "index.html").read_text(encoding="utf-8"))
     assert re.search(r"Notes on the files of <em>bad</em>:.*\(7\.000 m, 0\.000 m, 0\.0000 rad\)",
                      text, re.DOTALL)
     assert "The problem “ArUco” could not be solved: expected sightings" in text
-    assert "good:</p>" not in text
 
 
 # report.toml
@@ -187,14 +182,14 @@ def test_a_problem_that_fails_costs_one_problem_and_exit_code_3(tmp_path, monkey
      'expected one of "aruco", "fused", "hint" for problem2, found \'odometry\''),
     ('chapters = "B"', "expected a list of notebooks in quotes, such as ["),
     ("chapters = [3]", "for chapters, found '[3]'"),
-    ('author = "Löwe"'.encode("latin-1"), "expected a line of UTF-8 text")])
+    ('author = "Löwe"', "expected a line of UTF-8 text")])
 def test_a_mistake_is_told_and_nothing_is_written(tmp_path, monkeypatch, capsys, text, expected):
-    (tmp_path / "report.toml").write_bytes(text if isinstance(text, bytes) else text.encode())
+    (tmp_path / "report.toml").write_bytes(text.encode("latin-1"))
     monkeypatch.chdir(tmp_path)
     assert main(["report"]) == 2
     told = capsys.readouterr().err
     assert "report.toml: " in told and expected in told and told.count("\n") == 1
-    assert [path.name for path in tmp_path.iterdir()] == ["report.toml"]
+    assert file_names(tmp_path) == ["report.toml"]
 
 
 @pytest.mark.parametrize("name, chapters, told", [
@@ -228,5 +223,5 @@ def test_the_committed_file_has_the_defaults_also_where_its_examples_are_read(tm
     examples = re.sub(r"^# (?=\w+ = )", "", text, flags=re.MULTILINE)
     (tmp_path / "report.toml").write_text(examples)
     read = read_options(tmp_path / "report.toml")
-    assert (read.code, read.problem2, read.title) == ("method", "aruco", Options().title)
+    assert (read.code, read.problem2) == ("method", "aruco")
     assert read.chapters == ("1_odometry", "2_aruco_localization", "3*", "4*")

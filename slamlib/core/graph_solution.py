@@ -21,6 +21,7 @@ from slamlib.core.graph import INDICES
 
 MAX_VARIANCE = 1e12          # m^2 and rad^2, above which a variable is not determined
 CONVERGED = 1e-6             # decrease of the error, over 1 + error, at which steps end
+STUCK = 1e-3                 # the same, that a step promised and did not bring
 ROUNDING = 1e-12             # relative increase of the error that is due to float rounding
 MAX_STEPS = 30               # number of steps of Gauss-Newton
 MAX_HALVINGS = 8             # number of halvings of one step
@@ -182,7 +183,7 @@ def gauss_newton(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> Gau
         LOG.debug("Gauss-Newton step %d: error %.6g", steps, new)
         negligible = CONVERGED * (1 + error)
         promised = linear.error(values.zeroVectors()) - linear.error(step)
-        stuck = new >= error and promised > negligible
+        stuck = new >= error and promised > STUCK * (1 + error)
         if error - new <= negligible:
             return GaussNewton(gtsam.Values(moved), new, steps, not stuck, Marginals(tree))
         values = moved

@@ -1,36 +1,35 @@
 """Problem 2, odometry and markers fused by Kalman filters whose state contains the shared errors.
 
-The state contains the pose X, the shared parameters s (wheels w = [R_R, R_L, b], camera c, size of
-the markers) and the markers M_j of the last frame, in the camera, with covariance P (Smith, Self
-and Cheeseman, Estimating Uncertain Spatial Relationships in Robotics, 1990). Odometry predicts
+The state contains the pose X, the shared parameters (how far the wheels w = [R_R, R_L, b] are off
+the stated ones, and the camera c) and the markers M_j of the last frame, in the camera, with
+covariance P (Smith, Self and Cheeseman, Estimating Uncertain Spatial Relationships in Robotics,
+1990). Odometry predicts
 
-    X' = X Delta(w),    M'_j = D^-1 M_j,    D = c^-1 Delta(w) c,    s' = s,
+    X' = X Delta(w),    M'_j = D^-1 M_j,    D = c^-1 Delta(w) c,    w' = w,    c' = c,
     P' = F P F^T + L Q L^T,
 
-with Delta(w) = Delta(w_0) + dDelta/dw (w - w_0), lengths in D over the size, F and L the
-derivatives of the new state by the old one and by Delta, and Q the noise of Delta
-(`increments.noise_in_drive`). The sightings Z_j of the new frame, with covariances C_j, measure the
-markers M' = H state and update
+with Delta(w) = Delta(0) + dDelta/dw w, F and L the derivatives of the new state by the old one and
+by Delta, and Q the noise of Delta (`increments.noise_in_drive`). Each sighting Z_j of the new
+frame, with covariance C_j, measures a marker, M'_j = H state, and updates
 
-    state <- state + K (Z - M'),    P <- (I - K H) P',    K = P' H^T S^-1,    S = H P' H^T + C,
+    state <- state + K (Z_j - M'_j),    P <- P' - K H P',    K = P' H^T S^-1,    S = H P' H^T + C_j.
 
-with C block-diagonal. Sightings beyond GATE are rejected. Then the filter removes rejected markers
-and those out of view, and adds new ones with covariance C_j. Without markers the result is the
-first-order propagation of odometry; with uninformative odometry and one marker it is `localize`.
+Sightings beyond GATE are rejected. Then the filter removes rejected markers and those out of view,
+and adds new ones with covariance C_j. Without markers the result is the first-order propagation of
+odometry; with uninformative odometry and one marker it is `localize`.
 
 Errors of a marker in successive frames are alike, with the correlation `memory`. The last sighting
 tells the last error, so what is expected and measured is Z = M' + memory (Z_last - M), with the
 covariance (1 - memory^2) C of the new part of the error (Bryson and Henrikson, Estimation using
 sampled data containing sequentially correlated noise, 1968).
 
-Nobody states the slip. So several filters run side by side, each with its slip, and their mean is
-taken with their probabilities by the innovations so far (multiple models: Bar-Shalom, Li and
-Kirubarajan 2001, section 11.6). Stretches of the drive tell in advance which slips are tried, the
-memory, and whether the camera is elsewhere than stated.
+Nobody states the slip. So several filters run side by side, each with its slip, and the likeliest
+by its innovations is taken (multiple models: Bar-Shalom, Li and Kirubarajan 2001, section 11.6).
+Stretches of the drive tell in advance which slips are tried, the memory, and whether the camera is
+elsewhere than stated. The size of the markers is as stated.
 """
 
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -41,68 +40,76 @@ from slamlib.core.hint import Fusion, sighting_count
 from slamlib.core.increments import SLIP_BOUNDS, SLIP_FACTOR, TYPICAL_SLIP
 from slamlib.core.odometry import cumulative
 from slamlib.core.records import Dataset
-from slamlib.core.sightings import GATE, Sightings, sightings_by_frame
-from slamlib.core.vehicle import Vehicle
-from slamlib.robust.calibration import CAMERA, SIZE, WHEELS, stated_calibration
-from slamlib.robust.jumps import NO_JUMPS, Jumps, find_jumps
+from slamlib.core.sightings import GATE, sightings_by_frame
+from slamlib.robust.calibration import stated_calibration
+from slamlib.robust.jumps import NO_JUMPS, find_jumps
 
 SLIPS = TYPICAL_SLIP * SLIP_FACTOR ** np.arange(-1.0, 4.0)     # sqrt(m), of the first filters
-MEMORIES = (0.0, 0.6, 0.9, 0.95)            # correlations of successive errors of a marker
 FINE_STEPS = 1.4 ** np.arange(-2.0, 3.0)     # slips of the last filters, over the likeliest one
+MEMORIES = (0.0, 0.6, 0.9, 0.95)            # correlations of successive errors of a marker
 STRETCHES = 10               # of the drive, in which the first filters run
 STRETCH_FRAMES = 20          # at most, of each
 CRAWL = 0.1                  # of the typical speed, below which counts may creep
 PRICE = 6.0                  # log density by which errors have memory, and by which the camera errs
 MIN_JUMP_GAIN = 10.0         # log likelihood by each of many jumps; the loss by each of a few
-SHARED = slice(3, 10)        # of the state
-FIXED = 10                   # rows of the state before those of the markers
+# Rows of covariances; those of the markers follow
+POSE = slice(0, 3)
+WHEELS = slice(3, 6)
+CAMERA = slice(6, 9)
+MARKERS = slice(9, None)
 
 
 @dataclass(frozen=True)
 class _Odometry:
     """Increments by odometry between m pairs of poses."""
 
-    increment: np.ndarray        # (m, 3) Delta(w_0)
+    increment: np.ndarray        # (m, 3) Delta by the stated wheels
     by_w: np.ndarray             # (m, 3, 3) dDelta/dw
     rounding: np.ndarray         # (m, 3, 3) Q without slip
     slipping: np.ndarray         # (m, 3, 3) what a slip of 1 sqrt(m) adds to Q
 
-    def noise(self, slip):
-        """Q (m, k, 3, 3) by slips (k,) or (m, k)."""
+    def delta(self, k, w):
+        """Delta (..., 3) of increments k by wheels that are off by w (..., 3)."""
+        return self.increment[k] + np.matvec(self.by_w[k], w)
+
+    def noise(self, k, slip):
+        """Q (..., 3, 3) of increments k by slips (...) in sqrt(m)."""
         variance = np.square(slip)[..., None, None]
-        return self.rounding[:, None] + variance * self.slipping[:, None]
+        return self.rounding[k] + variance * self.slipping[k]
 
 
-@dataclass(frozen=True)
-class _FilterInput:
-    """The data of the filters."""
+class _Models(NamedTuple):
+    """What h filters assume."""
 
-    dataset: Dataset
-    vehicle: Vehicle             # with the wheel parameters w_0 at which Delta is linearised
-    jumps: Jumps                 # where odometry contradicts the markers
-    sightings: Sightings         # of f frames, pose 0 among them
-    odometry: _Odometry          # of f-1 increments between them
+    slip: np.ndarray             # (h,) sqrt(m)
+    memory: np.ndarray           # (h,) correlation of successive errors of a marker
+    elsewhere: np.ndarray        # (h,) True if the camera may be elsewhere than stated
+
+    def log_prior(self):
+        """Logarithm (h,) of their prior density, up to a constant."""
+        slip = np.maximum(self.slip, SLIP_BOUNDS[0])
+        off = np.log(slip / TYPICAL_SLIP) / np.log(SLIP_FACTOR)
+        surprises = self.elsewhere + (self.memory > 0)
+        return -off**2 / 2 - PRICE * surprises
 
 
-class _State(NamedTuple):        # three are made at a frame: faster than frozen dataclasses
-    """h filters after a frame, and k sightings in it of markers of the frame before."""
+class _State(NamedTuple):        # four are made at a frame: faster than frozen dataclasses
+    """h filters at a frame, and the m markers that they keep.
 
-    X: np.ndarray                # (h, 3) pose
-    s: np.ndarray                # (h, 7) wheels, camera, size of the markers
-    marker: np.ndarray           # (m,) ids of the markers in the state, not of rejected ones
-    z: np.ndarray                # (m, 3) their sightings in the frame
-    M: np.ndarray                # (h, m, 3) these markers in the camera
-    expected: np.ndarray         # (h, m, 3) predicted sightings, with the errors of the last ones
-    memory: np.ndarray           # (h,) correlation of these errors
-    P: np.ndarray                # (h, 10 + 3m, 10 + 3m) covariance of X, s and M
+    A predicted state has, below the markers, the expected sightings of all of them.
+    """
+
+    x: np.ndarray                # (h, 3 + m, 3) X, w, c and M
+    P: np.ndarray                # (h, 9 + 3m, 9 + 3m) covariance of x
+    marker: np.ndarray           # (m,) ids of the markers
+    z: np.ndarray                # (m, 3) their last sightings
     log_density: np.ndarray      # (h,) of the innovations so far and the prior, up to a constant
     rejected: int = 0            # number of sightings so far beyond the gate
 
     @property
-    def weight(self):
-        """Probabilities (h,) of the filters."""
-        density = np.exp(self.log_density - self.log_density.max())
-        return density / density.sum()
+    def likeliest(self):
+        """Number of the likeliest filter."""
+        return np.argmax(self.log_density)
 
 
 def fuse(dataset: Dataset, slip: float | None = None) -> Fusion:
@@ -120,260 +127,268 @@ def fuse(dataset: Dataset, slip: float | None = None) -> Fusion:
     (2000, 3)
     """
     require(isinstance(dataset, Dataset), "fuse", "a Dataset", dataset)
-    vehicle = dataset.vehicle
     if slip is None:
-        slip = vehicle.slip
+        slip = dataset.vehicle.slip
     jumps = _believed_jumps(dataset, slip or TYPICAL_SLIP)
-    models, w_0 = _learned(dataset, slip, jumps)
-    given = _filter_input(dataset, vehicle.with_wheel(w_0), jumps)
-    states = _filter(given, models)
-    X, s, P, slips = _mixed(states, models[:, 0])
-    poses, covariances = _poses_from_frames(given, slips, X, s, P)
-    repeated = sighting_count(dataset) - len(given.sightings.row)
+    models = _learned_models(dataset, jumps, slip)
+    states = _filter(dataset, jumps, models)
+    last = states[-1]
+    best = last.likeliest
+    slip = models.slip[best]
+    x = np.array([state.x[best, :3] for state in states])
+    P = np.array([state.P[best, :9, :9] for state in states])
+    sightings = _sightings(dataset)
+    poses, covariances = _poses_from_frames(dataset, jumps, sightings.frame, slip, x, P)
+    repeated = sighting_count(dataset) - len(sightings.row)
     return Fusion(
-        poses=poses, covariances=covariances, slip=float(slips[-1]),
-        rejected=states[-1].rejected + repeated, wheel=s[-1, WHEELS],
-        wheel_covariance=P[-1, 3:6, 3:6], memory=float(models[0, 1]), camera=s[-1, CAMERA])
-
-
-def _learned(dataset, slip, jumps):
-    """Models (h, 3) [slip, memory, camera is elsewhere], by their density in stretches, and w_0."""
-    slips = SLIPS if slip is None else [slip]
-    models = np.array(list(product(slips, MEMORIES, (False, True))))
-    given = _filter_input(_stretches(dataset), dataset.vehicle, jumps)
-    last = _filter(given, models)[-1]
-    best = models[np.argmax(last.log_density)]
-    if slip is None:
-        slips = best[0] * FINE_STEPS
-    w_0 = last.weight @ last.s[:, WHEELS]
-    return np.array([[each, *best[1:]] for each in slips]), w_0
-
-
-def _stretches(dataset):
-    """The Dataset with sightings in some stretches only, which begin after equal distances.
-
-    So many frames at a stand count as one stretch.
-    """
-    aruco = dataset.aruco
-    if aruco is None:
-        return dataset
-    frame = np.unique(aruco.pose)
-    travelled = _travelled(dataset.ticks)[frame]
-    begin = np.linspace(travelled[0], travelled[-1], STRETCHES, endpoint=False)
-    row = np.searchsorted(travelled, begin)[:, None] + np.arange(STRETCH_FRAMES)
-    chosen = frame[row[row < len(frame)]]
-    return replace(dataset, aruco=aruco.select(np.isin(aruco.pose, chosen)))
-
-
-def _travelled(ticks):
-    """Sum of the counts of both wheels (n,) up to each pose."""
-    return cumulative(np.abs(ticks[1:]).sum(axis=1))
-
-
-def _mixed(states, slips):
-    """Means (f, 3) of X and (f, 7) of s, their covariance (f, 10, 10), and slips (f,)."""
-    weight = np.array([each.weight for each in states])
-    y = np.array([np.concatenate([each.X, each.s], axis=1) for each in states])
-    P = np.array([each.P[:, :FIXED, :FIXED] for each in states])
-    mean = np.einsum("fh,fhi->fi", weight, y)
-    off = y - mean[:, None]
-    spread = off[..., :, None] * off[..., None, :]
-    covariance = np.einsum("fh,fhij->fij", weight, P + spread)
-    return mean[:, :3], mean[:, SHARED], covariance, np.sqrt(weight @ slips**2)
+        poses=poses,
+        covariances=covariances,
+        rejected=last.rejected + repeated,
+        slip=float(slip),
+        wheel=dataset.vehicle.wheel + x[-1, 1],
+        wheel_covariance=P[-1, WHEELS, WHEELS],
+        memory=float(models.memory[best]),
+        camera=x[-1, 2])
 
 
 def _believed_jumps(dataset, slip):
     """The Jumps of a Dataset, or NO_JUMPS if these are likelier."""
     found = find_jumps(dataset)
-    if not len(found.start):
+    count = len(found.start)
+    if count == 0:
         return NO_JUMPS
-
-    models = np.array([[slip, 0.0, False]])
-
-    def log_density(jumps):
-        given = _filter_input(dataset, dataset.vehicle, jumps)
-        return _filter(given, models)[-1].log_density[0]
-
-    gain = log_density(found) - log_density(NO_JUMPS)
-    least = MIN_JUMP_GAIN * len(found.start)
+    models = _all_models([slip], [0.0], [False])
+    with_jumps = _filter(dataset, found, models)[-1]
+    without = _filter(dataset, NO_JUMPS, models)[-1]
+    gain = with_jumps.log_density - without.log_density
+    least = MIN_JUMP_GAIN * count
     if found.are_few:
         least = -least
     return found if gain >= least else NO_JUMPS
 
 
-def _filter_input(dataset, vehicle, jumps=NO_JUMPS):
-    """The _FilterInput with odometry linearised at the wheel parameters of `vehicle`."""
+def _learned_models(dataset, jumps, slip):
+    """The _Models of the last filters, by the likeliest one in stretches of the drive."""
+    slips = SLIPS if slip is None else [slip]
+    models = _all_models(slips, MEMORIES, [False, True])
+    last = _filter(_stretches(dataset), jumps, models)[-1]
+    best = last.likeliest
+    if slip is None:
+        slips = np.minimum(models.slip[best] * FINE_STEPS, SLIP_BOUNDS[1])
+    return _all_models(slips, [models.memory[best]], [models.elsewhere[best]])
+
+
+def _all_models(slips, memories, elsewhere):
+    """_Models of all combinations of these, each a sequence."""
+    combinations = np.meshgrid(slips, memories, elsewhere)
+    return _Models(*[each.ravel() for each in combinations])
+
+
+def _stretches(dataset):
+    """The Dataset with sightings in some stretches only, which begin after equally many frames."""
+    aruco = dataset.aruco
+    if aruco is None:
+        return dataset
+    frame = np.unique(aruco.pose)
+    period = max(STRETCH_FRAMES, len(frame) // STRETCHES)
+    number = np.searchsorted(frame, aruco.pose)
+    in_stretch = number % period < STRETCH_FRAMES
+    return replace(dataset, aruco=aruco.select(in_stretch))
+
+
+def _sightings(dataset):
+    """Sightings of a Dataset, pose 0 among their frames, by the stated size and noise."""
+    vehicle = dataset.vehicle
     s = sightings_by_frame(dataset.aruco, extra_frames=[0])
-    noise_factor = vehicle.marker_noise_factor or 1.0
-    return _FilterInput(
-        dataset=dataset, vehicle=vehicle, jumps=jumps,
-        sightings=replace(s, C=noise_factor**2 * s.C),
-        odometry=_odometry(dataset.ticks, vehicle, jumps, s.frame[:-1], s.frame[1:]))
+    length = vehicle.marker_size
+    scale = np.array([length, length, 1.0])
+    sigma_scale = scale * (vehicle.marker_noise_factor or 1.0)
+    return replace(s, z=scale * s.z, C=sigma_scale[:, None] * s.C * sigma_scale)
 
 
-def _odometry(ticks, vehicle, jumps, start, end):
+def _odometry(dataset, jumps, start, end):
     """The _Odometry from poses `start` to poses `end`, (m,).
 
-    A vehicle that crawls may as well stand, while its counts creep.
+    A vehicle that crawls may as well stand, while its counts creep: then they say nothing of the
+    wheels, and the whole increment may be an error.
     """
+    ticks = dataset.ticks
+    vehicle = dataset.vehicle
     increment, by_w = increments.between_poses(ticks, vehicle, start, end, "arc")
     rounding, slipping = increments.noise_in_drive(ticks, vehicle, start, end)
-    jump, unknown = jumps.added(start, end)
-    travelled = _travelled(ticks)
+    counts = np.abs(ticks[1:])
+    travelled = cumulative(counts.sum(axis=1))        # by both wheels
     travel = travelled[end] - travelled[start]
     speed = travel / np.maximum(end - start, 1)
     crawls = speed * travel.sum() < CRAWL * (speed @ travel)
     by_w[crawls] = 0.0
-    rounding[crawls] += increment[crawls, :, None] * increment[crawls, None]
-    return _Odometry(se2.compose(increment, jump), by_w, rounding + unknown, slipping)
+    creep = increment[crawls]
+    rounding[crawls] += creep[:, :, None] * creep[:, None]
+    jump, unknown = jumps.added(start, end)
+    increment = se2.compose(increment, jump)
+    return _Odometry(increment, by_w, rounding + unknown, slipping)
 
 
-def _filter(given, models):
-    """The _State after each frame of filters with models (h, 3)."""
-    vehicle = given.dataset.vehicle
-    sightings = given.sightings
-    slip, memory, elsewhere = models.T
-    Q = given.odometry.noise(slip)
-    calibration = stated_calibration(vehicle, ())
-    released = calibration.sigma_without(["camera-offset"])
-    sigma = np.zeros((len(models), FIXED))
-    sigma[:, 2] = vehicle.sigma_heading
-    sigma[:, SHARED] = np.where(elsewhere[:, None], released, calibration.sigma)[:, :SIZE + 1]
-    off = np.log(np.maximum(slip, SLIP_BOUNDS[0]) / TYPICAL_SLIP) / np.log(SLIP_FACTOR)
-    nothing = np.zeros((len(models), 0, 3))
-    state = _State(
-        X=np.zeros((len(models), 3)), s=np.tile(calibration.stated[:SIZE + 1], (len(models), 1)),
-        marker=np.zeros(0, int), z=nothing[0], M=nothing, expected=nothing, memory=memory,
-        P=sigma[:, None]**2 * np.eye(FIXED),
-        log_density=-off**2 / 2 - PRICE * (elsewhere + (memory > 0)))
-    interval = np.diff(sightings.frame)
-    typical = np.median(interval) if len(interval) else 1
-    begin = np.searchsorted(sightings.row, np.arange(1, len(sightings.frame)))
-    rows_by_frame = np.split(np.arange(len(sightings.row)), begin)
-    states = []
-    for k, rows in enumerate(rows_by_frame):
-        if k > 0:
-            over_interval = memory ** (interval[k - 1] / typical)
-            state = _predicted(state, given, Q, k - 1, over_interval)
-        state = _updated(state, sightings, rows)
+def _filter(dataset, jumps, models):
+    """The _State of filters with these _Models after each frame."""
+    sightings = _sightings(dataset)
+    frame = sightings.frame
+    odometry = _odometry(dataset, jumps, frame[:-1], frame[1:])
+    interval = np.diff(frame)
+    usual = np.median(interval) if len(interval) else 1
+    memory = models.memory[:, None, None]
+    state = _start(dataset.vehicle, models)
+    state = _updated(state, sightings, 0, memory)
+    states = [state]
+    for k, length in enumerate(interval):
+        memory_left = memory ** (length / usual)
+        Q = odometry.noise(k, models.slip)
+        state = _predicted(state, odometry, k, Q, memory_left)
+        state = _updated(state, sightings, k + 1, memory_left)
         states.append(state)
     return states
 
 
-def _predicted(state, given, Q, k, memory):
-    """The _State after increment k by _Odometry, with noise Q[k].
+def _start(vehicle, models):
+    """The _State of filters with these _Models at pose 0."""
+    calibration = stated_calibration(vehicle, ())
+    released = calibration.sigma_without(["camera-offset"])
+    shared = np.where(models.elsewhere[:, None], released, calibration.sigma)
+    count = len(shared)
+    sigma = np.zeros((count, 9))
+    sigma[:, 2] = vehicle.sigma_heading
+    sigma[:, 3:] = shared[:, :6]                                     # of wheels and camera
+    x = np.zeros((count, 3, 3))
+    x[:, 2] = calibration.stated[calibration.group == "camera-offset"]
+    return _State(
+        x=x,
+        P=sigma[:, :, None]**2 * np.eye(9),
+        marker=np.zeros(0, int),
+        z=np.zeros((0, 3)),
+        log_density=models.log_prior())
 
-    Below M the covariance has rows of the expected sightings M' - memory M.
+
+def _predicted(state, odometry, k, Q, memory):
+    """The _State after increment k by _Odometry, with noise Q (h, 3, 3).
+
+    Its last rows are the expected sightings M' + memory (z - M).
     """
-    by_w = given.odometry.by_w[k]
-    delta = given.odometry.increment[k] + (state.s[:, WHEELS] - given.vehicle.wheel) @ by_w.T
-    by_pose, by_delta = se2.compose_jacobians(state.X, delta)
-    D, D_by_delta, D_by_s = _of_camera(delta, state.s)
-    M_by_D, M_by_M = se2.between_jacobians(D[:, None], state.M)
+    X = state.x[:, 0]
+    M = state.x[:, 3:]
+    delta = odometry.delta(k, state.x[:, 1])
+    D, D_by_delta, D_by_camera = _in_camera(delta, state.x[:, 2])
+    by_X, by_delta = se2.compose_jacobians(X, delta)
+    M_by_D, M_by_M = se2.between_jacobians(D[:, None], M)
     M_by_D = M_by_D.reshape(len(D), -1, 3)
     L = np.zeros(state.P.shape[:2] + (3,))
-    L[:, :3] = by_delta
-    L[:, FIXED:] = M_by_D @ D_by_delta
-    F = _joined(np.zeros((len(D), FIXED, FIXED)) + np.eye(FIXED), M_by_M)
-    F[:, :3, :3] = by_pose
-    F[:, :, 3:6] += L @ by_w
-    F[:, FIXED:, 6:FIXED] += M_by_D @ D_by_s
-    M_now = F[:, FIXED:]
-    M_before = np.eye(F.shape[1])[FIXED:]
-    F = np.concatenate([F, M_now - memory[:, None, None] * M_before], axis=1)
-    L = np.concatenate([L, L[:, FIXED:]], axis=1)
-    M = se2.between(D[:, None], state.M)
-    error = se2.difference(state.z, state.M)
+    L[:, POSE] = by_delta
+    L[:, MARKERS] = M_by_D @ D_by_delta
+    identity = np.tile(np.eye(9), (len(D), 1, 1))
+    F = _block_diagonal(identity, M_by_M)
+    F[:, POSE, POSE] = by_X
+    F[:, :, WHEELS] += L @ odometry.by_w[k]
+    F[:, MARKERS, CAMERA] += M_by_D @ D_by_camera
+    M_before = np.eye(F.shape[1])[MARKERS]
+    F = np.concatenate([F, F[:, MARKERS] - memory * M_before], axis=1)
+    L = np.concatenate([L, L[:, MARKERS]], axis=1)
+    x = state.x.copy()
+    x[:, 0] = se2.compose(X, delta)
+    x[:, 3:] = se2.between(D[:, None], M)
+    error = se2.difference(state.z, M)
+    expected = x[:, 3:] + memory * error
     return state._replace(
-        X=se2.compose(state.X, delta), M=M, expected=M + memory[:, None, None] * error,
-        memory=memory, P=F @ state.P @ F.mT + L @ Q[k] @ L.mT)
+        x=np.concatenate([x, expected], axis=1),
+        P=F @ state.P @ F.mT + L @ Q @ L.mT)
 
 
-def _of_camera(delta, s):
-    """Motion D (h, 3) of the camera in its own axes, and derivatives by Delta and by [c, size]."""
-    camera = s[:, CAMERA]
-    size = s[:, SIZE:, None]
+def _in_camera(delta, camera):
+    """D = c^-1 Delta c (h, 3), the motion of the camera, and its derivatives by Delta and c."""
     moved = se2.compose(delta, camera)
-    D = se2.between(camera, moved)
     moved_by_delta, moved_by_camera = se2.compose_jacobians(delta, camera)
     D_by_camera, D_by_moved = se2.between_jacobians(camera, moved)
     by_camera = D_by_camera + D_by_moved @ moved_by_camera
-    by_size = -D[..., None] / size
-    scale = np.concatenate([1 / size, 1 / size, np.ones_like(size)], axis=1)
-    by_size[:, 2] = 0.0
-    by_s = scale * np.concatenate([by_camera, by_size], axis=2)
-    return D * scale[..., 0], scale * (D_by_moved @ moved_by_delta), by_s
+    return se2.between(camera, moved), D_by_moved @ moved_by_delta, by_camera
 
 
-def _updated(state, s, sighted):
-    """The _State after a frame, with the rows `sighted` of Sightings."""
-    known = state.marker[:, None] == s.marker[sighted]
-    old, seen = known.nonzero()
-    row = sighted[seen]
-    v = se2.difference(s.z[row], state.expected[:, old])
-    H = _rows(old + len(state.marker))
-    C = (1 - state.memory[:, None, None, None]**2) * s.C[row]         # of the new part of errors
-    S = state.P[:, H[:, :, None], H[:, None]] + C                     # of each sighting alone
-    squared = se2.squared_norms(v, S)
-    accepted = state.weight @ (squared < GATE) >= 0.5
-    corrected = _corrected(state, old[accepted], v[:, accepted], C[:, accepted])
-    # No filter gains by a rejection, but one that predicts the sighting nevertheless.
-    density = squared + np.linalg.slogdet(S)[1]
-    wrong = GATE + np.linalg.slogdet(s.C[row])[1]
-    loss = np.minimum(density, wrong)[:, ~accepted]
-    added = sighted[~known.any(axis=0)]
-    sightings = np.append(row[accepted], added)
-    new = np.broadcast_to(s.z[added], (len(v), len(added), 3))
-    return corrected._replace(
-        marker=s.marker[sightings], z=s.z[sightings],
-        M=np.concatenate([corrected.M, new], axis=1), P=_joined(corrected.P, s.C[added]),
-        log_density=corrected.log_density - np.sum(loss, axis=1) / 2,
-        rejected=state.rejected + loss.shape[1])
-
-
-def _corrected(state, old, v, C):
-    """The _State of only the markers `old` (k,) after an update by their innovations (h, k, 3)."""
-    v = v.reshape(len(v), -1, 1)
-    H = _rows(old + len(state.marker)).ravel()
-    kept = np.append(np.arange(FIXED), _rows(old))
-    HP = state.P[:, H[:, None], kept]
-    S = state.P[:, H[:, None], H] + _joined(np.zeros((len(v), 0, 0)), C)
-    weighted = np.linalg.solve(S, np.concatenate([HP, v], axis=2))    # S^-1 [H P', v]
-    K = weighted[..., :-1].mT
-    change = (K @ v)[..., 0]
-    P = state.P[:, kept[:, None], kept] - K @ HP
-    squared = np.sum(v * weighted[..., -1:], axis=(1, 2)) + np.linalg.slogdet(S)[1]
+def _updated(state, sightings, row, memory):
+    """The _State after the frame in this row of Sightings: with the markers seen there only."""
+    new_part = 1 - memory**2                                # of the variance of errors
+    kept = []                                               # numbers of markers
+    used = []                                               # their rows
+    new = []
+    for k in np.flatnonzero(sightings.row == row):
+        number = np.flatnonzero(state.marker == sightings.marker[k])
+        if not len(number):
+            new.append(k)
+            continue
+        C = new_part * sightings.C[k]
+        rejected = state.rejected
+        state = _measured(state, number[0], sightings.z[k], C)
+        if state.rejected == rejected:
+            kept.append(number[0])
+            used.append(k)
+    index = np.append([0, 1, 2], 3 + np.array(kept, int))
+    rows = 3 * index[:, None] + np.arange(3)
+    rows = rows.ravel()
+    P = state.P[:, rows[:, None], rows]
+    z_new = np.tile(sightings.z[new], (len(memory), 1, 1))
+    used = np.array(used + new, int)
     return state._replace(
-        X=state.X + change[:, :3], s=state.s + change[:, SHARED],
-        M=state.M[:, old] + change[:, FIXED:].reshape(len(v), -1, 3), P=(P + P.mT) / 2,
-        log_density=state.log_density - squared / 2)
+        x=np.concatenate([state.x[:, index], z_new], axis=1),
+        P=_block_diagonal(P, sightings.C[new]),
+        marker=sightings.marker[used],
+        z=sightings.z[used])
 
 
-def _rows(marker):
-    """Rows (k, 3) of P of markers, the first ones of M, then those of the expected sightings."""
-    return FIXED + 3 * marker[:, None] + np.arange(3)
+def _measured(state, number, z, C):
+    """The predicted _State after a sighting z (3,) of a marker, unless it is beyond the gate.
+
+    No filter gains by a rejection, but one that expects the sighting nevertheless.
+    """
+    expected = 3 + len(state.marker) + number
+    H = slice(3 * expected, 3 * expected + 3)
+    innovation = se2.difference(z, state.x[:, expected])
+    HP = state.P[:, H]
+    S = HP[:, :, H] + C
+    squared = se2.squared_norms(innovation, S)
+    accepted = squared[state.likeliest] < GATE
+    if not accepted:
+        squared = np.minimum(squared, GATE)
+    cost = squared + np.linalg.slogdet(S)[1]
+    state = state._replace(log_density=state.log_density - cost / 2)
+    if not accepted:
+        return state._replace(rejected=state.rejected + 1)
+    gain = np.linalg.solve(S, HP).mT
+    change = np.matvec(gain, innovation)
+    P = state.P - gain @ HP
+    x = state.x + change.reshape(state.x.shape)
+    return state._replace(x=x, P=(P + P.mT) / 2)
 
 
-def _joined(P, C):
+def _block_diagonal(P, C):
     """The block-diagonal matrices (h, n + 3k, n + 3k) of P (h, n, n) and C (..., k, 3, 3)."""
     count, n = P.shape[:2]
     rows = n + np.arange(3 * C.shape[-3]).reshape(-1, 3)
-    joined = np.zeros((count, n + rows.size, n + rows.size))
-    joined[:, :n, :n] = P
-    joined[:, rows[:, :, None], rows[:, None]] = C
-    return joined
+    size = n + rows.size
+    blocks = np.zeros((count, size, size))
+    blocks[:, :n, :n] = P
+    blocks[:, rows[:, :, None], rows[:, None]] = C
+    return blocks
 
 
-def _poses_from_frames(given, slip, X, s, P):
-    """All poses (n, 3) and covariances, by odometry from the last frame before each."""
-    pose = np.arange(len(given.dataset.ticks))
-    frame = given.sightings.frame
+def _poses_from_frames(dataset, jumps, frame, slip, x, P):
+    """All poses (n, 3) and covariances, by odometry from the last frame before each.
+
+    x (f, 3, 3) and P (f, 9, 9) are those after each `frame`.
+    """
+    pose = np.arange(len(dataset.ticks))
     last = np.searchsorted(frame, pose, side="right") - 1
-    odometry = _odometry(given.dataset.ticks, given.vehicle, given.jumps, frame[last], pose)
-    w = s[last, WHEELS] - given.vehicle.wheel
-    delta = odometry.increment + np.matvec(odometry.by_w, w)
-    A, B = se2.compose_jacobians(X[last], delta)
-    F = np.concatenate([A, B @ odometry.by_w], axis=2)
+    odometry = _odometry(dataset, jumps, frame[last], pose)
+    X = x[last, 0]
+    delta = odometry.delta(pose, x[last, 1])
+    by_X, by_delta = se2.compose_jacobians(X, delta)
+    F = np.concatenate([by_X, by_delta @ odometry.by_w], axis=2)
+    Q = odometry.noise(pose, slip)
     by_frame = F @ P[last, :6, :6] @ F.mT
-    by_odometry = B @ odometry.noise(slip[last, None])[:, 0] @ B.mT
-    return se2.compose(X[last], delta), by_frame + by_odometry
+    by_odometry = by_delta @ Q @ by_delta.mT
+    return se2.compose(X, delta), by_frame + by_odometry

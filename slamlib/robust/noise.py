@@ -41,15 +41,18 @@ HIDDEN_RATIO = 2.0           # largest ratio of errors with memory to what resid
 
 
 def with_hidden_errors(noise: Noise, remember: Sequence[bool], vehicle: Vehicle) -> Noise:
-    """The Noise with larger factors for errors with memory, of which residuals show only a part.
+    """The Noise with what residuals do not show of errors with memory.
 
     The factors of sightings and of ranges, where their errors `remember` (2,), are at least 1, but
-    at most HIDDEN_RATIO times the learned ones. Those that a Vehicle gives stay.
+    at most HIDDEN_RATIO times the learned ones. Slow errors are smoother than the shares of their
+    information say, which makes the slip look small: then it is at least the typical one. What a
+    Vehicle gives stays.
     """
     learned = np.array([noise.sightings, noise.ranges])
     enlarged = np.maximum(learned, np.minimum(1.0, HIDDEN_RATIO * learned))
     factors = np.where(remember, enlarged, learned)
-    return with_known(Noise(noise.slip, *factors.tolist()), vehicle)
+    slip = max(noise.slip, TYPICAL_SLIP) if any(remember) else noise.slip
+    return with_known(Noise(slip, *factors.tolist()), vehicle)
 
 
 @dataclass(frozen=True)
