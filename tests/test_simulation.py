@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from conftest import ROOT
@@ -43,10 +41,10 @@ def range_errors(dataset, truth):
 def test_perfect_data_agrees_with_its_truth():
     dataset, truth = simulate("short", seed=4, noise=False)
     poses = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")
-    np.testing.assert_allclose(poses, truth.poses, atol=1e-10)
-    np.testing.assert_allclose(sighting_errors(dataset, truth), 0, atol=1e-10)
-    np.testing.assert_allclose(range_errors(dataset, truth), 0, atol=1e-10)
-    np.testing.assert_array_equal(dataset.antenna_guess.position, truth.antenna_in_world)
+    for error in (poses - truth.poses, sighting_errors(dataset, truth),
+                  range_errors(dataset, truth),
+                  dataset.antenna_guess.position - truth.antenna_in_world):
+        np.testing.assert_allclose(error, 0, atol=1e-10)
 
 
 def test_noise_has_the_covariances_that_the_files_state():
@@ -60,14 +58,6 @@ def test_noise_has_the_covariances_that_the_files_state():
     assert abs(z.mean()) < 4 / np.sqrt(len(z))
     guess_error = distances(dataset.antenna_guess.position, truth.antenna_in_world)
     assert 0.2 < np.sqrt(np.mean(guess_error**2)) < 0.8
-
-
-def test_the_sigmas_of_a_sighting_grow_with_its_distance_and_its_errors_are_correlated():
-    aruco = simulate("short", seed=6)[0].aruco
-    distance = np.linalg.norm(aruco.marker_in_vehicle[:, :2], axis=1)
-    sigma = np.sqrt(np.trace(aruco.covariance, axis1=1, axis2=2))
-    assert np.corrcoef(distance, sigma)[0, 1] > 0.99
-    assert np.all(aruco.covariance[:, 0, 2] != 0)
 
 
 def encoder_errors(dataset, truth):
@@ -97,8 +87,7 @@ def test_encoder_error_is_a_random_walk_with_the_variance_of_slip(slip):
 
 def test_outliers_come_at_the_asked_rates_and_late_ranges_are_too_long():
     clean, truth = simulate("long", seed=8)
-    dirty, same_truth = simulate("long", seed=8, late_ranges=0.15, mislabelled=0.03)
-    np.testing.assert_array_equal(truth.poses, same_truth.poses)
+    dirty, _ = simulate("long", seed=8, late_ranges=0.15, mislabelled=0.03)
     np.testing.assert_array_equal(clean.ticks, dirty.ticks)
     wrong = dirty.aruco.marker != clean.aruco.marker
     assert abs(wrong.mean() - 0.03) < 0.01
@@ -110,17 +99,15 @@ def test_outliers_come_at_the_asked_rates_and_late_ranges_are_too_long():
 
 
 def test_files_round_trip_through_the_reader(tmp_path):
-    vehicle = replace(Vehicle(), right_radius=0.12, ticks_per_revolution=4096.0)
+    vehicle = Vehicle(right_radius=0.12, ticks_per_revolution=4096.0)
     dataset, truth = simulate("short", seed=9, vehicle=vehicle)
     write_dataset(tmp_path / "drive", dataset, truth)
-    again = read_dataset(tmp_path / "drive")
-    true_again = read_truth(tmp_path / "drive")
-    assert again.vehicle == vehicle
-    assert true_again.vehicle == truth.vehicle
+    again, true_again = read_dataset(tmp_path / "drive"), read_truth(tmp_path / "drive")
+    assert again.vehicle == vehicle and true_again.vehicle == truth.vehicle
     np.testing.assert_array_equal(again.ticks, dataset.ticks)
     for sensor in ("aruco", "uwb", "antenna_guess"):
-        for name, values in vars(getattr(dataset, sensor)).items():
-            found = getattr(getattr(again, sensor), name)
-            np.testing.assert_allclose(found, values, rtol=1e-4, atol=6e-4)
+        found, written = vars(getattr(again, sensor)), vars(getattr(dataset, sensor))
+        for name in written:
+            np.testing.assert_allclose(found[name], written[name], rtol=1e-4, atol=6e-4)
     for name in ("poses", "marker", "marker_in_world", "antenna", "antenna_in_world"):
         np.testing.assert_allclose(getattr(true_again, name), getattr(truth, name), atol=6e-7)
