@@ -25,8 +25,9 @@ sampled data containing sequentially correlated noise, 1968).
 
 Nobody states the slip. So several filters run side by side, each with its slip, and the likeliest
 by its innovations is taken (multiple models: Bar-Shalom, Li and Kirubarajan 2001, section 11.6).
-Stretches of the drive tell in advance which slips are tried, the memory, and whether the camera is
-elsewhere than stated. The size of the markers is as stated.
+Stretches of the drive tell in advance which slips are tried, the memory, the factor on the standard
+deviations of the sightings, and whether the camera is elsewhere than stated. The size of the
+markers is as stated.
 """
 
 from dataclasses import dataclass, replace
@@ -47,6 +48,7 @@ from slamlib.robust.jumps import NO_JUMPS, find_jumps
 SLIPS = TYPICAL_SLIP * SLIP_FACTOR ** np.arange(-1.0, 4.0)     # sqrt(m), of the first filters
 FINE_STEPS = 1.4 ** np.arange(-2.0, 3.0)     # slips of the last filters, over the likeliest one
 MEMORIES = (0.0, 0.6, 0.9, 0.95)            # correlations of successive errors of a marker
+FACTORS = (1.0, 3.0, 9.0)    # on the standard deviations of the sightings
 STRETCHES = 10               # of the drive, in which the first filters run
 STRETCH_FRAMES = 20          # at most, of each
 CRAWL = 0.1                  # of the typical speed, below which counts may creep
@@ -84,13 +86,14 @@ class _Models(NamedTuple):
     slip: np.ndarray             # (h,) sqrt(m)
     memory: np.ndarray           # (h,) correlation of successive errors of a marker
     elsewhere: np.ndarray        # (h,) True if the camera may be elsewhere than stated
+    factor: np.ndarray           # (h,) on the standard deviations of the sightings
 
     def log_prior(self):
         """Logarithm (h,) of their prior density, up to a constant."""
         slip = np.maximum(self.slip, SLIP_BOUNDS[0])
         off = np.log(slip / TYPICAL_SLIP) / np.log(SLIP_FACTOR)
         surprises = self.elsewhere + (self.memory > 0)
-        return -off**2 / 2 - PRICE * surprises
+        return -(off**2 + np.log2(self.factor)**2) / 2 - PRICE * surprises
 
 
 class _State(NamedTuple):        # four are made at a frame: faster than frozen dataclasses
@@ -157,7 +160,7 @@ def _believed_jumps(dataset, slip):
     count = len(found.start)
     if count == 0:
         return NO_JUMPS
-    models = _all_models([slip], [0.0], [False])
+    models = _all_models([slip], [0.0], [False], [1.0])
     with_jumps = _filter(dataset, found, models)[-1]
     without = _filter(dataset, NO_JUMPS, models)[-1]
     gain = with_jumps.log_density - without.log_density
@@ -170,17 +173,19 @@ def _believed_jumps(dataset, slip):
 def _learned_models(dataset, jumps, slip):
     """The _Models of the last filters, by the likeliest one in stretches of the drive."""
     slips = SLIPS if slip is None else [slip]
-    models = _all_models(slips, MEMORIES, [False, True])
+    factors = FACTORS if dataset.vehicle.marker_noise_factor is None else [1.0]
+    models = _all_models(slips, MEMORIES, [False, True], factors)
     last = _filter(_stretches(dataset), jumps, models)[-1]
     best = last.likeliest
     if slip is None:
         slips = np.minimum(models.slip[best] * FINE_STEPS, SLIP_BOUNDS[1])
-    return _all_models(slips, [models.memory[best]], [models.elsewhere[best]])
+    return _all_models(
+        slips, [models.memory[best]], [models.elsewhere[best]], [models.factor[best]])
 
 
-def _all_models(slips, memories, elsewhere):
+def _all_models(slips, memories, elsewhere, factors):
     """_Models of all combinations of these, each a sequence."""
-    combinations = np.meshgrid(slips, memories, elsewhere)
+    combinations = np.meshgrid(slips, memories, elsewhere, factors)
     return _Models(*[each.ravel() for each in combinations])
 
 
@@ -237,14 +242,15 @@ def _filter(dataset, jumps, models):
     interval = np.diff(frame)
     usual = np.median(interval) if len(interval) else 1
     memory = models.memory[:, None, None]
+    variance = models.factor[:, None, None]**2
     state = _start(dataset.vehicle, models)
-    state = _updated(state, sightings, 0, memory)
+    state = _updated(state, sightings, 0, memory, variance)
     states = [state]
     for k, length in enumerate(interval):
         memory_left = memory ** (length / usual)
         Q = odometry.noise(k, models.slip)
         state = _predicted(state, odometry, k, Q, memory_left)
-        state = _updated(state, sightings, k + 1, memory_left)
+        state = _updated(state, sightings, k + 1, memory_left, variance)
         states.append(state)
     return states
 
@@ -310,9 +316,12 @@ def _in_camera(delta, camera):
     return se2.between(camera, moved), D_by_moved @ moved_by_delta, by_camera
 
 
-def _updated(state, sightings, row, memory):
-    """The _State after the frame in this row of Sightings: with the markers seen there only."""
-    new_part = 1 - memory**2                                # of the variance of errors
+def _updated(state, sightings, row, memory, variance):
+    """The _State after the frame in this row of Sightings: with the markers seen there only.
+
+    `variance` (h, 1, 1) is over that of the sightings.
+    """
+    new_part = variance * (1 - memory**2)
     kept = []                                               # numbers of markers
     used = []                                               # their rows
     new = []
@@ -335,7 +344,7 @@ def _updated(state, sightings, row, memory):
     used = np.array(used + new, int)
     return state._replace(
         x=np.concatenate([state.x[:, index], z_new], axis=1),
-        P=_block_diagonal(P, sightings.C[new]),
+        P=_block_diagonal(P, variance[:, None] * sightings.C[new]),
         marker=sightings.marker[used],
         z=sightings.z[used])
 
@@ -343,7 +352,7 @@ def _updated(state, sightings, row, memory):
 def _measured(state, number, z, C):
     """The predicted _State after a sighting z (3,) of a marker, unless it is beyond the gate.
 
-    No filter gains by a rejection, but one that expects the sighting nevertheless.
+    A wrong sighting is equally likely by all filters: as one at the gate by the least certain.
     """
     expected = 3 + len(state.marker) + number
     H = slice(3 * expected, 3 * expected + 3)
@@ -352,9 +361,10 @@ def _measured(state, number, z, C):
     S = HP[:, :, H] + C
     squared = se2.squared_norms(innovation, S)
     accepted = squared[state.likeliest] < GATE
+    log_determinant = np.linalg.slogdet(S)[1]
+    cost = squared + log_determinant
     if not accepted:
-        squared = np.minimum(squared, GATE)
-    cost = squared + np.linalg.slogdet(S)[1]
+        cost = np.minimum(cost, GATE + log_determinant.max())
     state = state._replace(log_density=state.log_density - cost / 2)
     if not accepted:
         return state._replace(rejected=state.rejected + 1)
