@@ -13,11 +13,9 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import pandas as pd
-from joblib import Parallel, delayed
 
 from slamlib import estimate, fuse, fuse_increments, localize
 from slamlib.core import evaluation, odometry, se2
@@ -28,6 +26,9 @@ from slamlib.io import files, results
 from slamlib.io.dataset import all_notes, inventory_lines, read_dataset, read_truth
 from slamlib.robust.file_doubts import Doubt, doubts_before_solving, merged
 from slamlib.robust.solution_doubts import fusion_doubts, solution_doubts
+
+if TYPE_CHECKING:
+    import pandas
 
 log = logging.getLogger(__name__)
 SLOW = 2.0                                          # s, after which a problem is told to be solved
@@ -463,6 +464,8 @@ def solve_folders(folders: Sequence[Path | str], out: Path | str, jobs: int | No
     -------
     The summaries of the datasets, in their order.
     """
+    from joblib import Parallel, delayed  # here, because one drive needs none of it
+
     out = Path(out)
     folders = [folder for folder in map(Path, folders) if not folder.is_file()]
     names = [folder.absolute().name for folder in folders]
@@ -484,11 +487,13 @@ def _summary_or_error(folder, out, options):
         return {"dataset": out.name, "error": str(error), "doubts": [], "problems": {}}
 
 
-def drive_table(summaries: Sequence[dict]) -> pd.DataFrame:
+def drive_table(summaries: Sequence[dict]) -> "pandas.DataFrame":
     """The table over all drives, of `solve_folders`: a row for each problem, with COLUMNS.
 
     A problem or a drive that failed has a sentence; what is not known is NaN.
     """
+    import pandas  # here, because it is the slowest import of all
+
     rows = []
     for summary in summaries:
         drive = {"dataset": summary["dataset"], "failed": summary.get("error")}
@@ -496,4 +501,4 @@ def drive_table(summaries: Sequence[dict]) -> pd.DataFrame:
             rows.append(drive | row | {"problem": problem, "doubts": len(row["doubts"])})
         if not summary["problems"]:
             rows.append(drive)
-    return pd.DataFrame(rows, columns=COLUMNS)
+    return pandas.DataFrame(rows, columns=COLUMNS)

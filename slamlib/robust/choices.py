@@ -1,4 +1,6 @@
-"""Stage 6: what the drive decides: arcs or Euler's steps, wrong statements, ids of several places.
+"""Stage 6: what the drive decides.
+
+Memory of errors or slip, arcs or Euler's steps, wrong statements, ids of several places.
 
 Groups of entries of the calibration may leave their stated values (`calibrated`): they get the wide
 standard deviations of `calibration.ENTRIES`. The normal equations with columns for all entries give
@@ -80,7 +82,7 @@ def memory_or_slip(problem: Problem, state: State) -> Fit:
     other = refine(replace(problem, memory_first=False), state)
     by_memory = _contradicting_share(fit)
     by_slip = _contradicting_share(other)
-    is_slip = by_memory > MAX_CONTRADICTING + by_slip / MAX_STILL_REJECTED
+    is_slip = by_slip < MAX_STILL_REJECTED * (by_memory - MAX_CONTRADICTING)
     log.info("memory first: slip %.3g mm after 1 m, %.1f %% contradict; slip first: %.3g mm, %.1f "
              "%%: %s", 1e3 * fit.problem.noise.slip, 100 * by_memory,
              1e3 * other.problem.noise.slip, 100 * by_slip, "slip" if is_slip else "memory")
