@@ -159,8 +159,8 @@ def test_every_group_is_named_with_its_entries_and_no_others(found, group):
     doubt, = solution_doubts(explained(found, [group]))
     assert doubt.what == group and doubt.sentence.endswith(GROUPS[group][1])
     assert "problem 4 uses this" in doubt.sentence and "cannot tell" not in doubt.sentence
-    for name, of in zip(found.calibration.names, found.calibration.group):
-        assert (f"{name} = " in doubt.sentence) == (of == group)
+    for name, is_named in zip(found.calibration.names, found.calibration.of_group(group)):
+        assert (f"{name} = " in doubt.sentence) == is_named
 
 
 def test_numbers_are_given_with_standard_deviations_and_units(found):
@@ -171,14 +171,14 @@ def test_numbers_are_given_with_standard_deviations_and_units(found):
 
 def test_explanations_that_exclude_each_other_are_all_named(found):
     """In the sentence of the one that is furthest off; what they have in common has its own."""
-    wheels, size, tag = "wheel-parameters", "marker-size", "tag-offset"
+    wheels, size, tag = "wheel-scale", "marker-size", "tag-offset"
     of_size, of_tag = solution_doubts(
         explained(found, [wheels, tag], [size, tag], by="marker_size"))
     assert (of_size.what, of_tag.what) == (size, tag)
-    assert "It may instead be the wheels: the drive cannot tell" in of_size.sentence
+    assert "It may instead be one factor on both wheels: the drive cannot tell" in of_size.sentence
     assert "instead" not in of_tag.sentence
     doubt, = solution_doubts(explained(found, [wheels], [size], [tag], by="marker_size"))
-    assert "instead be the wheels or the place of the UWB tag" in doubt.sentence
+    assert "instead be one factor on both wheels or the place of the UWB tag" in doubt.sentence
 
 
 @pytest.mark.parametrize("column, name, file", [

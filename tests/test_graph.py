@@ -25,7 +25,7 @@ from slamlib.core.errors import DatasetError
 from slamlib.core.evaluation import anees, ate, nees_band
 from slamlib.core.kernels import KERNELS, ONE_SIDED
 from slamlib.robust import pipeline, solution
-from slamlib.robust.calibration import ENTRIES, WHEELS
+from slamlib.robust.calibration import ENTRIES, WHEEL_SCALE, WHEELS
 from slamlib.robust.factors import preintegrate_odometry
 from slamlib.robust.initialization import odometry_state
 from slamlib.robust.linear import NormalEquations, build_problem
@@ -86,7 +86,7 @@ def test_odometry_of_the_plain_graph_is_gtsams_between_factor_in_counts(drive):
     values = gtsam.Values()
     values.insert(X(int(increments.frame[4])), first)
     values.insert(X(int(increments.frame[5])), second)
-    values.insert(W(0), larger / decisions.sigma_wheel)
+    values.insert(W(0), np.linalg.solve(decisions.root_wheel, larger))
     measured = gtsam.Pose2(*(increments.increment[4] + increments.J_wheel[4] @ larger))
     expected = gtsam.Pose2.Logmap(measured.between(first.between(second)))
     factor = build_graph(decisions).at(2 + 4)                        # after two priors
@@ -124,7 +124,7 @@ def test_a_sighting_off_by_one_sigma_along_each_axis_of_the_vehicle_costs_one_ha
     assert np.isclose(graph.error(values), 0.5e-8, rtol=1e-3)
 
 
-GROUPS = [(), ("camera-offset",), ("marker-size", "time-offset"), ("range-offset", "tag-offset"),
+GROUPS = [(), ("camera-offset", WHEEL_SCALE), ("marker-size", "time-offset"), ("range-offset", "tag-offset"),
           tuple({entry.group for entry in ENTRIES} | {"antenna-offsets"})]
 
 
@@ -136,12 +136,12 @@ def test_the_graph_is_the_one_by_which_the_engine_decides(groups, kernel):
     rng = np.random.default_rng(1)
     m = measure(dataset)
     state = odometry_state(m, "arc")
-    sigma = m.calibration.sigma_without(groups)
+    prior = m.calibration.prior(groups)
     off = 2e-3 * rng.normal(size=state.poses.shape)
     off[0] = 0                            # the engine's prior of pose 1 has the derivative 1
     state = replace(
         state, poses=state.poses + off,
-        c=state.c + 0.05 * sigma * rng.normal(size=len(sigma)))
+        c=state.c + 0.05 * prior.root @ rng.normal(size=len(state.c)))
 
     def accepted(count, kernel, bias=0.0):
         weight = (rng.uniform(size=count) < 0.9) * 1.0
@@ -149,7 +149,7 @@ def test_the_graph_is_the_one_by_which_the_engine_decides(groups, kernel):
 
     of_sightings = None if kernel in ONE_SIDED else KERNELS[kernel]
     problem = replace(
-        build_problem(m, "arc", Noise(2e-3, 1.5, 0.7)), sigma=sigma,
+        build_problem(m, "arc", Noise(2e-3, 1.5, 0.7)), prior=prior,
         accepted=AcceptedMeasurements(
             accepted(len(m.marker_row), of_sightings),
             accepted(len(m.ranges.row), KERNELS[kernel], ONE_SIDED.get(kernel, 0.0))),

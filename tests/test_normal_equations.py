@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numeric import as_points, known_noise
+from scipy.linalg import block_diag
 from scipy.special import chdtri
 
 from slamlib.core import sightings
 from slamlib.core.errors import DatasetError
 from slamlib.core.kernels import KERNELS
 from slamlib.robust import linear, noise
-from slamlib.robust.calibration import ENTRIES
+from slamlib.robust.calibration import ENTRIES, WHEEL_SCALE
 from slamlib.robust.covariances import marginal_covariances
 from slamlib.robust.initialization import odometry_state
 from slamlib.robust.linear import NormalEquations, build_problem, laplace_approximation
@@ -31,8 +32,7 @@ def dense_information(structure, sums):
 
 def released(problem, groups):
     """The Problem in which groups of the calibration are hardly known."""
-    sigma = problem.measurements.calibration.sigma_without(groups)
-    return replace(problem, sigma=sigma, released=frozenset(groups))
+    return replace(problem, prior=problem.measurements.calibration.prior(groups))
 
 
 def test_markers_without_accepted_sightings_have_a_weak_prior_and_nothing_else():
@@ -61,15 +61,15 @@ def test_selected_blocks_are_those_of_the_dense_inverse(poses):
     points = dataset.aruco.marker == dataset.aruco.marker[0]
     m = measure(replace(dataset, aruco=as_points(dataset.aruco, points)))
     given = Noise(2e-3, 1.5, 0.7)
-    problem = released(build_problem(m, "arc"), {"range-offset"} if poses > 1 else ())
+    problem = released(build_problem(m, "arc"), {"range-offset", WHEEL_SCALE} if poses > 1 else ())
     equations = NormalEquations(problem, odometry_state(m, "arc"))
     found = marginal_covariances(equations, given)
     information = dense_information(m.structure, equations.sums(given))
     active = problem.active
     n = len(information) - np.count_nonzero(active)
     np.testing.assert_allclose(information, information.T, rtol=1e-9, atol=1e-6)
-    unit = np.append(np.ones(n), problem.sigma[active])
-    expected = np.linalg.inv(information) * np.outer(unit, unit)
+    unit = block_diag(np.eye(n), problem.prior.of(slice(None))[active])
+    expected = unit @ np.linalg.inv(information) @ unit.T
     sigma = np.sqrt(np.diag(expected))
     assert not found.c[~active].any() and not found.c[:, ~active].any()
 

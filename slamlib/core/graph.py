@@ -49,7 +49,7 @@ class Decisions:
     odometry: OdometryIncrements
     slip: float                          # sqrt(m), sigma of a wheel's slip after one metre
     sigma_heading: float                 # rad, of pose 1
-    sigma_wheel: np.ndarray              # (3,) m, of the prior of the wheel parameters
+    root_wheel: np.ndarray               # (3, 3) m: its square is the wheels' prior covariance
     sightings: ArucoReadings             # those that count, in the vehicle, with their covariances
     ranges: UwbReadings                  # those that count, with their standard deviations
     guess: AntennaGuess | None
@@ -89,7 +89,7 @@ def count_everything(dataset: Dataset, kernel: str = "Cauchy", slip: float = TYP
         odometry=preintegrate(dataset, frames),
         slip=slip,
         sigma_heading=dataset.vehicle.sigma_heading,
-        sigma_wheel=dataset.vehicle.sigma_wheel,
+        root_wheel=np.diag(dataset.vehicle.sigma_wheel),
         sightings=sightings,
         ranges=ranges,
         guess=dataset.antenna_guess,
@@ -143,7 +143,7 @@ def index_of(landmark: int) -> int:
 def add_odometry(graph: gtsam.NonlinearFactorGraph, decisions: Decisions):
     """Add a factor between successive frames, which all depend on the same wheel parameters."""
     increments = decisions.odometry
-    sigma = decisions.sigma_wheel
+    root = decisions.root_wheel
     poses = [X(i) for i in increments.frame.tolist()]
     first = poses[:-1]
     second = poses[1:]
@@ -151,8 +151,8 @@ def add_odometry(graph: gtsam.NonlinearFactorGraph, decisions: Decisions):
     def linearised(from_pose, to_pose, off):
         poses = np.concatenate([from_pose, to_pose[-1:]])
         e, by_poses, by_wheel = odometry_error(
-            increments, poses, increments.stated + sigma * off[0])
-        return e, [by_poses[:, :, :3], by_poses[:, :, 3:], by_wheel * sigma]
+            increments, poses, increments.stated + root @ off[0])
+        return e, [by_poses[:, :, :3], by_poses[:, :, 3:], by_wheel @ root]
 
     batch = Batch([first, second, len(first) * [W(0)]], linearised)
     for k, covariance in enumerate(increments.covariance(decisions.slip)):

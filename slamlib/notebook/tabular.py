@@ -11,7 +11,7 @@ from slamlib.core import evaluation
 from slamlib.core.kernels import ONE_SIDED
 from slamlib.core.odometry import dead_reckoning
 from slamlib.notebook.plotting import estimates, places_by_id
-from slamlib.robust.calibration import RANGES
+from slamlib.robust.calibration import RANGES, WHEELS
 from slamlib.robust.measurements import NOISE_KEYS
 
 DASH = "–"
@@ -168,9 +168,9 @@ def calibration_rows(result, drive) -> Iterator[dict]:
     The last one is the factor on the standard deviations of the ranges.
     """
     has_ranges = len(result.antenna) > 0
-    for entry in result.calibration_table[:None if has_ranges else RANGES.start]:
+    for k, entry in enumerate(result.calibration_table[:None if has_ranges else RANGES.start]):
         true = None
-        if entry["group"] == "wheel-parameters" and drive.origin == "simulated":
+        if k < WHEELS.stop and drive.origin == "simulated":
             true = getattr(drive.truth.vehicle, entry["name"])
         if entry["sigma"] or entry["group"] != "antenna-offsets":
             yield {"dataset": drive.name} | _calibration_row(entry, true)

@@ -3,7 +3,8 @@
 ENTRIES is its table: for each entry the name, which is also that in `vehicle.toml`, the unit, the
 group with which it leaves its stated value, and the wide standard deviation that it has then. An
 entry whose stated standard deviation is 0 is known unless its group leaves its stated values. After
-ENTRIES the vector has an offset for each antenna. With the pose X of the vehicle and its motion
+ENTRIES the vector has an offset for each antenna. The group WHEEL_SCALE has no entry of its own: one
+factor on both radii (load, pressure, counts lost or doubled), which correlates them. With the pose X of the vehicle and its motion
 D(lag) during the last `lag` encoder steps, D = X^-1 X(lag steps earlier), the measurements are
 
     increment   Delta(right_radius, left_radius, wheelbase)
@@ -37,9 +38,9 @@ class Entry(NamedTuple):
 
 
 ENTRIES = (
-    Entry("right_radius", "m", "wheel-parameters", 0.05),
-    Entry("left_radius", "m", "wheel-parameters", 0.05),
-    Entry("wheelbase", "m", "wheel-parameters", 0.05),
+    Entry("right_radius", "m", "wheel-radii", 0.05),
+    Entry("left_radius", "m", "wheel-radii", 0.05),
+    Entry("wheelbase", "m", "wheelbase", 0.05),
     Entry("camera_x", "m", "camera-offset", 0.2),
     Entry("camera_y", "m", "camera-offset", 0.2),
     Entry("camera_turn", "rad", "camera-offset", 0.2),
@@ -52,9 +53,12 @@ ENTRIES = (
     Entry("range_scale", "", "range-offset", 0.05),
     Entry("range_lag", "poses", "range-delay", 30.0))
 ANTENNA_OFFSETS = Entry("offset of antenna", "m", "antenna-offsets", 0.15)
+WHEEL_SCALE = "wheel-scale"
+WIDE_SCALE = 0.05            # relative, of both radii together
 
 # Columns of the vector by kind of measurement, then by entry.
 WHEELS = slice(0, 3)
+RADII = slice(0, 2)
 SIGHTINGS = slice(3, 8)
 RANGES = slice(8, None)
 
@@ -80,16 +84,54 @@ class Calibration:
     sigma: np.ndarray        # (p,) as stated, 0 if known
     wide: np.ndarray         # (p,) if the statement is wrong
 
-    def sigma_without(self, groups: Collection[str], width: float = 1.0) -> np.ndarray:
-        """Standard deviations (p,), of `groups` the wide ones times `width`, else as stated."""
+    def of_group(self, group: str) -> np.ndarray:
+        """(p,) bool, the entries that leave their stated values with a group."""
+        if group == WHEEL_SCALE:
+            return np.arange(len(self.names)) < RADII.stop
+        return self.group == group
+
+    def prior(self, groups: Collection[str] = (), width: float = 1.0) -> "Prior":
+        """The Prior, of `groups` with the wide standard deviations times `width`."""
         released = np.isin(self.group, list(groups))
-        return np.where(released, np.maximum(width * self.wide, self.sigma), self.sigma)
+        sigma = np.where(released, np.maximum(width * self.wide, self.sigma), self.sigma)
+        root = np.diag(sigma)
+        if WHEEL_SCALE in groups:
+            common = width * WIDE_SCALE * self.stated[RADII]
+            covariance = np.diag(sigma[RADII]**2) + np.outer(common, common)
+            root[RADII, RADII] = np.linalg.cholesky(covariance)
+        return Prior(groups=frozenset(groups), width=width, root=root)
 
     def taken_from(
             self, other: "Calibration", values: np.ndarray, default: np.ndarray) -> np.ndarray:
         """Values (p,): another drive's Calibration's where it has the entry, or `default`."""
         known = dict(zip(other.names, values))
         return np.array([known.get(name, value) for name, value in zip(self.names, default)])
+
+
+@dataclass(frozen=True)
+class Prior:
+    """The Gaussian prior of the p entries about what is stated.
+
+    They are c = stated + root u, with standard normal u; q of these are unknown.
+    """
+
+    groups: frozenset        # that leave their stated values
+    width: float             # of their wide standard deviations
+    root: np.ndarray         # (p, p) lower triangular, 0 in rows and columns of what is known
+
+    @property
+    def active(self) -> np.ndarray:
+        """(p,) bool, entries among the unknowns."""
+        return np.diag(self.root) > 0
+
+    def of(self, columns: slice) -> np.ndarray:
+        """Derivatives of these entries by their unknowns."""
+        return self.root[columns, columns][:, self.active[columns]]
+
+    def unknowns(self, off: np.ndarray) -> np.ndarray:
+        """u (q,) of entries that are `off` (p,) what is stated."""
+        active = self.active
+        return np.linalg.solve(self.root[np.ix_(active, active)], off[active])
 
 
 def calibration_table(calibration: Calibration, c: np.ndarray, covariance: np.ndarray,
@@ -108,7 +150,7 @@ def calibration_table(calibration: Calibration, c: np.ndarray, covariance: np.nd
             "name": calibration.names[k],
             "unit": entry.unit,
             "group": entry.group,
-            "released": entry.group in released,
+            "released": any(calibration.of_group(group)[k] for group in released),
             "stated": float(stated[0, k]),
             "stated_sigma": float(stated[1, k]),
             "estimate": float(estimated[0, k]),

@@ -31,7 +31,7 @@ from slamlib.core import se2
 from slamlib.core.errors import DatasetError
 from slamlib.core.records import ArucoReadings, Dataset
 from slamlib.core.sightings import GATE
-from slamlib.robust.calibration import WHEELS
+from slamlib.robust.calibration import RADII, WHEEL_SCALE, WHEELS, Prior
 from slamlib.robust.error_memory import runs
 from slamlib.robust.factors import odometry_error, preintegrate_odometry
 from slamlib.robust.fit import Fit, accepted_measurements, refine, residuals
@@ -52,6 +52,7 @@ DECISIVE_RELEASE = 6.0       # log evidence by which a group is told to be wrong
 FURTHER_ENTRY = 0.5          # log evidence beside it, for each entry of a group but the first
 STATED = 3.0                 # log evidence beside it, if standard deviations are stated
 AMBIGUOUS = 3.0              # log evidence within which explanations cannot be told apart
+MAX_GROUPS = 5               # number of groups that are wrong at once
 MAX_WIDE_SIGMAS = 4.0        # wide sigmas, of an entry; beyond them a statement is grossly wrong
 GROSS = 10.0                 # factor on the wide sigmas then
 MIN_INFORMATION = 1e-3       # about an entry, in wide sigmas, below which it is not considered
@@ -124,11 +125,11 @@ def calibrated(fit: Fit) -> Fit:
     tried = []
     for _ in range(MAX_PROPOSALS):
         proposal = _proposal(fit)
-        if np.array_equal(proposal.sigma, fit.problem.sigma):
+        if np.array_equal(proposal.prior.root, fit.problem.prior.root):
             return replace(fit, explanations=proposal.explanations)
-        if proposal.groups in tried:
+        if proposal.prior.groups in tried:
             break
-        tried.append(proposal.groups)
+        tried.append(proposal.prior.groups)
         proposed = _released(fit, proposal)
         if proposed is None:
             break
@@ -140,17 +141,16 @@ class _Proposal(NamedTuple):
     """Which groups of the calibration are to leave their stated values."""
 
     explanations: tuple      # of frozensets of groups, each of which explains the drive
-    groups: frozenset        # to be released
-    sigma: np.ndarray        # (p,) of the prior of the calibration then
+    prior: Prior             # of the calibration, with the groups that are to be released
     lead: float              # log evidence over that of the prior as it is
 
 
 def _released(fit, proposal):
     """The Fit with a _Proposal, or None if its evidence does not lead, or it has no solution."""
     stated = fit.problem.measurements.calibration.stated
-    c = np.where(proposal.sigma > 0, fit.state.c, stated)
-    problem = replace(fit.problem, sigma=proposal.sigma, released=proposal.groups)
-    names = ", ".join(sorted(proposal.groups)) or "nothing"
+    c = np.where(proposal.prior.active, fit.state.c, stated)
+    problem = replace(fit.problem, prior=proposal.prior)
+    names = ", ".join(sorted(proposal.prior.groups)) or "nothing"
     try:
         proposed = refine(problem, replace(fit.state, c=c))
         lead = _lead(proposed, fit)
@@ -169,22 +169,27 @@ def _proposal(fit):
 
     `explanations` are the best set of groups and others that come within AMBIGUOUS of it, neither
     part of it nor more: the drive cannot tell them apart. Each of their groups must raise the log
-    evidence by its `_price`. `groups` are all of theirs, and what else raises the evidence: not
-    certain enough to be told, but the covariances have to include it. Wide standard deviations are
-    multiplied by GROSS if an entry would be further off than MAX_WIDE_SIGMAS.
+    evidence by its `_price`. The prior releases all groups of the sets that come so close, and what
+    else raises the evidence: not certain enough to be told, but the covariances include it. Wide
+    standard deviations are multiplied by GROSS if an entry would be further off than
+    MAX_WIDE_SIGMAS.
     """
     calibration = fit.problem.measurements.calibration
     L, h = _likelihood(fit)
     informed = np.diag(L) > 0
     doubtful = informed & (calibration.wide > calibration.sigma)
     groups = np.unique(calibration.group[doubtful]).tolist()
+    if doubtful[RADII].all():
+        groups.append(WHEEL_SCALE)
     price = {group: _price(calibration, group) for group in groups}
-    sets = [frozenset(some) for count in range(len(groups) + 1)
+    sets = [frozenset(some) for count in range(MAX_GROUPS + 1)
             for some in combinations(groups, count)]
     price_of_set = np.array([sum(price[group] for group in some) for some in sets])
+    scale = informed / calibration.wide[:, None]         # to wide sigmas, of what is informed
     for width in (1.0, GROSS):
-        sigma = np.array([calibration.sigma_without(some, width) for some in sets])
-        evidence, furthest = _log_evidence(L, h, sigma / calibration.wide * informed)
+        priors = [calibration.prior(some, width) for some in sets]
+        roots = np.array([prior.root for prior in priors])
+        evidence, furthest = _log_evidence(L, h, roots * scale)
         merit = evidence - price_of_set
         k = int(merit.argmax())
         best = sets[k]
@@ -192,29 +197,30 @@ def _proposal(fit):
             break
     close = [sets[k] for k in np.flatnonzero(merit > merit.max() - AMBIGUOUS)]
     explanations = tuple(some for some in close if not (some < best or some > best))
-    certain = frozenset().union(*explanations)
+    certain = frozenset().union(*close)
     sufficient = [k for k, some in enumerate(sets) if certain <= some]
     more = max(sufficient, key=evidence.__getitem__)
-    present = _log_evidence(L, h, fit.problem.sigma / calibration.wide * informed)[0]
-    return _Proposal(explanations, sets[more], sigma[more], evidence[more] - present)
+    present = _log_evidence(L, h, fit.problem.prior.root * scale)[0]
+    return _Proposal(explanations, priors[more], evidence[more] - present)
 
 
 def _price(calibration, group):
     """Log evidence by which a group must raise that of the rest to be told: its prior odds."""
-    entries = calibration.group == group
-    price = DECISIVE_RELEASE + FURTHER_ENTRY * (np.count_nonzero(entries) - 1)
+    entries = calibration.of_group(group)
+    count = 1 if group == WHEEL_SCALE else np.count_nonzero(entries)
+    price = DECISIVE_RELEASE + FURTHER_ENTRY * (count - 1)
     is_stated = calibration.sigma[entries].any()
     return price + STATED if is_stated else price
 
 
-def _log_evidence(L, h, sigma):
-    """Log evidences (...) of priors with standard deviations (..., p), 0 where an entry is known.
+def _log_evidence(L, h, root):
+    """Log evidences (...) of priors with roots (..., p, p), as of a Prior.
 
     From the information L (p, p) and h (p,) of the likelihood. Also the largest posterior mean of
-    an entry, (...), in its standard deviations, in which the equations are solved.
+    an unknown, (...), in its standard deviations, in which the equations are solved.
     """
-    information = np.eye(len(h)) + sigma[..., :, None] * L * sigma[..., None, :]
-    gradient = sigma * h
+    information = np.eye(len(h)) + root.mT @ L @ root
+    gradient = h @ root
     mean = np.linalg.solve(information, gradient[..., None])[..., 0]
     log_determinant = np.linalg.slogdet(information).logabsdet
     evidence = np.sum(gradient * mean, axis=-1) / 2 - log_determinant / 2
@@ -224,7 +230,8 @@ def _log_evidence(L, h, sigma):
 def _likelihood(fit):
     """Information L (p, p) and h (p,) about the calibration, in wide sigmas from what is stated."""
     calibration = fit.problem.measurements.calibration
-    equations = NormalEquations(replace(fit.problem, sigma=calibration.wide), fit.state)
+    wide = Prior(frozenset(), 1.0, np.diag(calibration.wide))
+    equations = NormalEquations(replace(fit.problem, prior=wide), fit.state)
     sums = equations.sums(fit.problem.noise, consistent=True)
     solution = linear_solution(equations.structure, sums)
     u = (fit.state.c - calibration.stated) / calibration.wide
@@ -245,7 +252,7 @@ def _lead(proposed, present):
     weighted = replace(proposed.problem, accepted=_with_fixed_weights(proposed))
 
     def log_density(fit):
-        problem = replace(weighted, sigma=fit.problem.sigma)
+        problem = replace(weighted, prior=fit.problem.prior)
         return refine(problem, fit.state, accept=None).log_density
 
     return log_density(proposed) - log_density(present)

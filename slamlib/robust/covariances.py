@@ -64,8 +64,7 @@ def marginal_covariances(equations: NormalEquations, noise: Noise) -> Covariance
     C = solve_triangular(np.linalg.cholesky(F), np.eye(len(F)), lower=True).T
     size = len(F) - problem.active.sum()                 # of the landmarks
     of_landmarks = C[:size].reshape(-1, 3, len(F))
-    of_c = np.zeros((len(problem.sigma), len(F)))
-    of_c[problem.active] = problem.sigma[problem.active, None] * C[size:]
+    of_c = problem.prior.of(slice(None)) @ C[size:]
     own, joint = chain.blocks()
     wheels = np.zeros_like(own)
     for chunk in chunks:
@@ -146,7 +145,7 @@ def posterior_moments(fit: Fit) -> tuple[State, Covariances, float]:
     is_unknown = np.append(np.ones(rows.size, bool), problem.active)
     off = np.zeros((len(points), len(is_unknown)))           # x_k - x; 0 of what is known
     off[:, is_unknown] = delta - mean
-    off[:, rows.size:] *= problem.sigma
+    off[:, rows.size:] = off[:, rows.size:] @ problem.prior.root.T
 
     def averaged(field, rows):
         """A field of the Covariances, C (..., d, d) of the unknowns at rows (..., d)."""

@@ -122,11 +122,11 @@ def _whitened(problem, index, columns, U, e, J, by_c):
 
     Their derivatives are J (m, d, 6), and `by_c` (m, d, w) by these w `columns` of the calibration.
     """
-    active = problem.active[columns]
-    number = np.cumsum(problem.active) - 1
-    J_c = by_c[:, :, active] * problem.sigma[columns][active]
+    active = problem.active
+    number = np.cumsum(active) - 1
+    J_c = by_c @ problem.prior.of(columns)
     return LinearizedFactors(index=index, e=(U @ e[:, :, None])[:, :, 0], J=U @ J, J_c=U @ J_c,
-                             columns=number[columns][active])
+                             columns=number[columns][active[columns]])
 
 
 def _weighted(factors, accepted, rows, noise, size):

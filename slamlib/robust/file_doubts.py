@@ -62,7 +62,7 @@ class Doubt:
 def doubts_before_solving(dataset: Dataset) -> list[Doubt]:
     """List of Doubts about the files of a Dataset, where enough is known."""
     doubts = []
-    for check in (motion_doubts, range_units, sigma_units):
+    for check in (motion_doubts, range_units, sigma_units, cut_counts):
         with suppress(np.linalg.LinAlgError):              # where increments have no covariance
             doubts += list(check(dataset))
     return doubts
@@ -236,6 +236,22 @@ def _certain_path(dataset):
     poses, covariances = odometry.first_order(dataset.ticks, dataset.vehicle, model="arc")
     uncertain = covariances[:, 2, 2] > MAX_ODOMETRY_HEADING_SIGMA**2
     return poses[np.cumsum(uncertain) == 0, :2]
+
+
+def cut_counts(dataset: Dataset) -> Iterator[Doubt]:
+    """Doubt, if counts have a common divisor."""
+    divisor = common_divisor(dataset.ticks)
+    if divisor > 1:
+        yield Doubt("encoder-counts", (
+            f"All counts of encoderReading.txt are multiples of {divisor}. If the rest of each row "
+            "was cut off, every distance by the wheels is too short, by an unknown factor: look at "
+            "how the counts were read, and at ticks_per_revolution in vehicle.toml."))
+
+
+def common_divisor(ticks: np.ndarray) -> int:
+    """Greatest common divisor of counts (n, 2), 0 if all are 0; fractions have the divisor 1."""
+    whole = np.rint(ticks).astype(int)
+    return int(np.gcd.reduce(whole, axis=None)) if np.array_equal(whole, ticks) else 1
 
 
 def sigma_units(dataset: Dataset) -> Iterator[Doubt]:

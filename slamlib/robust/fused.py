@@ -258,8 +258,8 @@ def _filter(dataset, jumps, models):
 def _start(vehicle, models):
     """The _State of filters with these _Models at pose 0."""
     calibration = stated_calibration(vehicle, ())
-    released = calibration.sigma_without(["camera-offset"])
-    shared = np.where(models.elsewhere[:, None], released, calibration.sigma)
+    released = calibration.prior(["camera-offset"]).root
+    shared = np.where(models.elsewhere[:, None], np.diag(released), calibration.sigma)
     count = len(shared)
     sigma = np.zeros((count, 9))
     sigma[:, 2] = vehicle.sigma_heading

@@ -23,6 +23,7 @@ from scipy.sparse.linalg import splu
 from slamlib.core import odometry, se2
 from slamlib.core.graph import GUESS_PRIOR_SIGMA
 from slamlib.core.preintegration import OdometryIncrements
+from slamlib.robust.calibration import Prior
 from slamlib.robust.factors import (
     LinearizedFactors,
     linearize_measurements,
@@ -75,14 +76,13 @@ class Problem:
     odometry: OdometryIncrements
     accepted: AcceptedMeasurements
     noise: Noise
-    sigma: np.ndarray        # (p,) of the prior of the calibration, 0 of what is known
-    released: frozenset = frozenset()    # groups of the calibration beyond their stated sigmas
+    prior: Prior             # of the calibration
     memory_first: bool = True    # whether slow errors are sought before the noise is learned
 
     @property
     def active(self) -> np.ndarray:
         """(p,) bool, entries of the calibration among the q unknowns."""
-        return self.sigma > 0
+        return self.prior.active
 
 
 def build_problem(measurements: Measurements, model: str, noise: Noise | None = None,
@@ -98,7 +98,7 @@ def build_problem(measurements: Measurements, model: str, noise: Noise | None = 
         measurements=measurements, odometry=preintegrate_odometry(measurements, model, wheel),
         accepted=accept_all(measurements),
         noise=with_known(noise or Noise(), measurements.dataset.vehicle),
-        sigma=measurements.calibration.sigma_without(late), released=late)
+        prior=measurements.calibration.prior(late))
 
 
 def retract(problem: Problem, state: State, delta: np.ndarray) -> State:
@@ -110,8 +110,7 @@ def retract(problem: Problem, state: State, delta: np.ndarray) -> State:
     by_variable = delta[m.structure.rows]
     of_frames, of_markers, of_antennas = np.split(
         by_variable, np.cumsum([len(m.frame), len(m.marker)]))
-    c = state.c.copy()
-    c[problem.active] += problem.sigma[problem.active] * delta[by_variable.size:]
+    c = state.c + problem.prior.of(slice(None)) @ delta[by_variable.size:]
     return state_from_arrays(
         m, se2.compose(state.poses, of_frames), se2.compose(state.markers, of_markers),
         state.antennas + of_antennas[:, :2], c)
@@ -208,8 +207,7 @@ class NormalEquations:
         sigma[antenna, :2] = GUESS_PRIOR_SIGMA
         sigma[~structure.is_pose, 2] = 1                 # what points do not have
         precision = 1 / sigma**2
-        active = self.problem.active
-        e_c = (state.c - m.calibration.stated)[active] / self.problem.sigma[active]
+        e_c = self.problem.prior.unknowns(state.c - m.calibration.stated)
         q = len(e_c)
         border = np.zeros((e.size + q, 1 + q))
         border[structure.rows, -1] = precision * e

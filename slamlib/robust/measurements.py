@@ -34,6 +34,7 @@ from slamlib.core.sightings import (
 )
 from slamlib.core.vehicle import Vehicle
 from slamlib.robust.calibration import Calibration, stated_calibration
+from slamlib.robust.file_doubts import common_divisor
 from slamlib.robust.jumps import NO_JUMPS, Jumps
 
 NOISE_KEYS = ("slip", "marker_noise_factor", "range_noise_factor")      # of a Vehicle, as in Noise
@@ -231,8 +232,24 @@ def measure(dataset: Dataset, extra_poses: Sequence[int] = (),
         ranges=ranges,
         antenna=antenna,
         guess=guess,
-        calibration=stated_calibration(dataset.vehicle, antenna),
+        calibration=stated_calibration(with_cut_counts(dataset), antenna),
         jumps=jumps)
+
+
+def with_cut_counts(dataset: Dataset) -> Vehicle:
+    """The Vehicle of a Dataset, whose wheels are as uncertain as its counts.
+
+    If all counts are multiples of d > 1, up to d - 1 counts of each row may have been cut off.
+    """
+    vehicle = dataset.vehicle
+    divisor = common_divisor(dataset.ticks)
+    if divisor < 2:
+        return vehicle
+    typical = np.median(np.abs(dataset.ticks[dataset.ticks != 0]))
+    sigma = np.maximum(vehicle.sigma_wheel, vehicle.wheel * (divisor - 1) / 2 / typical)
+    right, left, base = sigma.tolist()
+    return replace(
+        vehicle, sigma_right_radius=right, sigma_left_radius=left, sigma_wheelbase=base)
 
 
 @dataclass(frozen=True)

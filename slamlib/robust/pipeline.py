@@ -89,7 +89,7 @@ def estimate(dataset: Dataset, slip: float | None = None, model: str | None = No
             return calibrated(fit)
         fit = calibrated(better_model(fit))
         # Wrong statements may look like other steps, and these like other statements.
-        other = better_model(fit) if fit.problem.released else fit
+        other = better_model(fit) if fit.problem.prior.groups else fit
         return fit if other is fit else calibrated(other)
 
     if previous is not None and len(previous.rejected):
@@ -131,9 +131,9 @@ def fit_from_previous(measurements: Measurements, previous: SlamResult,
     m = measurements
     before = previous.calibration
     problem = build_problem(m, model or previous.model, Noise(previous.slip), previous.wheel)
-    sigma = m.calibration.taken_from(before, previous.fit.problem.sigma, m.calibration.sigma)
-    problem = replace(problem, sigma=sigma, released=previous.released,
-                      memory_first=previous.fit.problem.memory_first)
+    decided = previous.fit.problem
+    prior = m.calibration.prior(decided.prior.groups, decided.prior.width)
+    problem = replace(problem, prior=prior, memory_first=decided.memory_first)
     c = m.calibration.taken_from(before, previous.c, m.calibration.stated)
     state = state_from_poses(m, previous.poses[m.frame], previous.covariances[m.frame], c)
     state = narrow_kernels(problem, state, CAUCHY_SCALES[-1:])

@@ -64,7 +64,7 @@ class SlamResult:
 
     # Parts of the fit
     calibration = property(attrgetter("fit.problem.measurements.calibration"))   # p stated entries
-    released = property(attrgetter("fit.problem.released"))      # groups that left what is stated
+    released = property(attrgetter("fit.problem.prior.groups"))  # groups that left what is stated
     explanations = property(attrgetter("fit.explanations"))      # sets of groups: each explains it
     noise = property(attrgetter("fit.problem.noise"))            # as given or learned
     slip = property(attrgetter("noise.slip"))                    # sqrt(m), of a wheel after 1 m

@@ -116,7 +116,7 @@ def decisions_of(problem: Problem, noise: Noise) -> Decisions:
         odometry=problem.odometry,
         slip=noise.slip,
         sigma_heading=vehicle.sigma_heading,
-        sigma_wheel=problem.sigma[WHEELS],
+        root_wheel=problem.prior.of(WHEELS),
         sightings=accepted.sightings if sightings_are_native(problem) else NO_SIGHTINGS,
         ranges=accepted.ranges if ranges_are_native(problem) else NO_RANGES,
         guess=m.dataset.antenna_guess,
@@ -203,18 +203,16 @@ def add_calibrated(graph: gtsam.NonlinearFactorGraph, problem: Problem, errors: 
     """
     key, columns = calibration
     keys = [[X(i) for i in problem.measurements.frame[frame].tolist()], landmarks]
-    unknown = unknown_of(problem, columns)
-    sigma = problem.sigma[unknown]
-    if len(unknown):
+    root = problem.prior.of(columns)
+    if root.size:
         keys.append(len(landmarks) * [key])
 
     def linearised(poses, places, *off):
         c = problem.measurements.calibration.stated.copy()
         if off:
-            c[unknown] += sigma * off[0][0]
+            c[columns] += root @ off[0][0]
         e, by_pose, by_landmark, by_c = errors(poses, places, c)
-        by_unknown = by_c[:, :, unknown - columns.start] * sigma
-        return e, [by_pose, by_landmark, by_unknown][:len(keys)]
+        return e, [by_pose, by_landmark, by_c @ root][:len(keys)]
 
     batch = Batch(keys, linearised)
     for k, (covariance, share) in enumerate(zip(covariances, shares)):
@@ -236,8 +234,7 @@ def calibration_at(problem: Problem, values: gtsam.Values) -> np.ndarray:
     c = problem.measurements.calibration.stated.copy()
     for key, columns in CALIBRATION_KEYS:
         if values.exists(key):
-            unknown = unknown_of(problem, columns)
-            c[unknown] += problem.sigma[unknown] * values.atVector(key)
+            c[columns] += problem.prior.of(columns) @ values.atVector(key)
     return c
 
 
@@ -271,11 +268,13 @@ def values_of(problem: Problem, state: State, graph: gtsam.NonlinearFactorGraph)
             values.insert(key, place[:2])
         else:
             values.insert(key, gtsam.Pose2(*place))
-    off = state.c - problem.measurements.calibration.stated
+    off = np.zeros(len(state.c))
+    off[problem.active] = problem.prior.unknowns(
+        state.c - problem.measurements.calibration.stated)
     for key, columns in CALIBRATION_KEYS:
         unknown = unknown_of(problem, columns)
         if len(unknown):
-            values.insert(key, off[unknown] / problem.sigma[unknown])
+            values.insert(key, off[unknown])
     return values
 
 
@@ -378,12 +377,12 @@ def blocks_of(problem: Problem, values: gtsam.Values, covariance: Callable) -> n
 
 def calibration_covariance(problem: Problem, values: gtsam.Values, covariance) -> np.ndarray:
     """Covariance (p, p) of the calibration, 0 where it is known."""
-    c = np.zeros((len(problem.sigma), len(problem.sigma)))
+    of_unknowns = np.zeros_like(problem.prior.root)
     there = [(key, unknown_of(problem, columns))
              for key, columns in CALIBRATION_KEYS if values.exists(key)]
     for key, rows in there:
         for other, columns in there:
             block = covariance(key) if key == other else covariance(key, other)
-            scale = np.outer(problem.sigma[rows], problem.sigma[columns])
-            c[np.ix_(rows, columns)] = scale * block
-    return c
+            of_unknowns[np.ix_(rows, columns)] = block
+    root = problem.prior.root
+    return root @ of_unknowns @ root.T

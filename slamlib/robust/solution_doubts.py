@@ -29,7 +29,12 @@ MAX_STRETCHES_NAMED = 3      # of the drive, where counts and markers contradict
 MAX_DISAGREEMENT = 0.25
 # By group of the calibration: its name in a sentence, and what to look at.
 GROUPS = {
-    "wheel-parameters": ("the wheels", "Measure them, or state larger sigmas in vehicle.toml."),
+    "wheel-scale": ("one factor on both wheels", "Measure the wheels under load, and look for "
+                    "counts that are lost, doubled or cut off."),
+    "wheel-radii": ("the radii of the wheels", "Measure them, or state larger sigmas in "
+                    "vehicle.toml."),
+    "wheelbase": ("the wheelbase", "Measure it where the wheels touch the ground, or state a larger "
+                  "sigma in vehicle.toml."),
     "camera-offset": ("the place of the camera", "Measure it from midway between the wheels, and "
                       "state it in vehicle.toml."),
     "marker-size": ("the size of the markers", "Measure a printed marker, and state its size in "
@@ -66,9 +71,11 @@ def _calibration_doubts(result):
     """
     common = frozenset.intersection(*result.explanations)
     either = frozenset().union(*result.explanations) - common
-    rows = {group: [] for group in GROUPS}
-    for row in result.calibration_table:
-        rows[row["group"]].append(row)
+    table = result.calibration_table
+    rows = {}
+    for group in GROUPS:
+        entries = np.flatnonzero(result.calibration.of_group(group))
+        rows[group] = [table[k] for k in entries]
 
     def distance(group):
         return max(abs(row["estimate"] - row["stated"]) / row["sigma"] for row in rows[group])

@@ -106,7 +106,7 @@ def landmarks_of_drive(dataset: Dataset, found, kernel: str = "last",
     """
     m = measure(dataset.without("uwb"))
     problem = build_problem(m, found.model, found.noise)
-    problem = replace(problem, sigma=found.fit.problem.sigma)
+    problem = replace(problem, prior=found.fit.problem.prior)
     right = state_from_poses(m, found.poses[m.frame], found.covariances[m.frame], found.c)
     return _from_each_start(problem, right, kernel, starts)
 
