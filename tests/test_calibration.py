@@ -274,9 +274,9 @@ def some_rows(dataset, seed=1):
     return np.random.default_rng(seed).random((len(dataset.ticks), 1)) < 0.02
 
 
-# What makes both wheels wrong by one factor, and the aligned ATE in m and the NEES that are allowed.
-# Rows that are lost or doubled are so many small jumps, too; taken for markers of another size they
-# cost 0.09 m, with a NEES of 200.
+# What makes both wheels wrong by one factor; aligned ATE in m and NEES that are allowed. Rows that
+# are lost or doubled are so many small jumps, too; taken for markers of another size they cost
+# 0.09 m, with a NEES of 200.
 SCALE = {
     "both wheels 3 % off": (lambda d: counted(d, 1.03), 0.002, 6),
     "2 % of the rows lost": (lambda d: counted(d, ~some_rows(d)), 0.03, 15),

@@ -124,7 +124,8 @@ def test_a_sighting_off_by_one_sigma_along_each_axis_of_the_vehicle_costs_one_ha
     assert np.isclose(graph.error(values), 0.5e-8, rtol=1e-3)
 
 
-GROUPS = [(), ("camera-offset", WHEEL_SCALE), ("marker-size", "time-offset"), ("range-offset", "tag-offset"),
+GROUPS = [(), ("camera-offset", WHEEL_SCALE), ("marker-size", "time-offset"),
+          ("range-offset", "tag-offset"),
           tuple({entry.group for entry in ENTRIES} | {"antenna-offsets"})]
 
 

@@ -3,9 +3,10 @@
 ENTRIES is its table: for each entry the name, which is also that in `vehicle.toml`, the unit, the
 group with which it leaves its stated value, and the wide standard deviation that it has then. An
 entry whose stated standard deviation is 0 is known unless its group leaves its stated values. After
-ENTRIES the vector has an offset for each antenna. The group WHEEL_SCALE has no entry of its own: one
-factor on both radii (load, pressure, counts lost or doubled), which correlates them. With the pose X of the vehicle and its motion
-D(lag) during the last `lag` encoder steps, D = X^-1 X(lag steps earlier), the measurements are
+ENTRIES the vector has an offset for each antenna. The group WHEEL_SCALE has no entry of its own:
+one factor on both radii (load, pressure, counts lost or doubled), which correlates them. With the
+pose X of the vehicle and its motion D(lag) during the last `lag` encoder steps, D = X^-1 X(lag
+steps earlier), the measurements are
 
     increment   Delta(right_radius, left_radius, wheelbase)
     sighting    Y^-1 L,   positions over marker_size,   Y = X D(sighting_lag) camera

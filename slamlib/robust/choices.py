@@ -199,7 +199,8 @@ def _proposal(fit):
     explanations = tuple(some for some in close if not (some < best or some > best))
     certain = frozenset().union(*close)
     sufficient = [k for k, some in enumerate(sets) if certain <= some]
-    more = max(sufficient, key=evidence.__getitem__)
+    surprise = price_of_set - DECISIVE_RELEASE * np.array([len(some) for some in sets])
+    more = max(sufficient, key=(evidence - surprise).__getitem__)
     present = _log_evidence(L, h, fit.problem.prior.root * scale)[0]
     return _Proposal(explanations, priors[more], evidence[more] - present)
 

@@ -33,8 +33,8 @@ GROUPS = {
                     "counts that are lost, doubled or cut off."),
     "wheel-radii": ("the radii of the wheels", "Measure them, or state larger sigmas in "
                     "vehicle.toml."),
-    "wheelbase": ("the wheelbase", "Measure it where the wheels touch the ground, or state a larger "
-                  "sigma in vehicle.toml."),
+    "wheelbase": ("the wheelbase", "Measure it where the wheels touch the ground, or state a "
+                  "larger sigma in vehicle.toml."),
     "camera-offset": ("the place of the camera", "Measure it from midway between the wheels, and "
                       "state it in vehicle.toml."),
     "marker-size": ("the size of the markers", "Measure a printed marker, and state its size in "
