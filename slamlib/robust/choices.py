@@ -54,6 +54,7 @@ STATED = 3.0                 # log evidence beside it, if standard deviations ar
 AMBIGUOUS = 3.0              # log evidence within which explanations cannot be told apart
 MAX_GROUPS = 5               # number of groups that are wrong at once
 MAX_WIDE_SIGMAS = 4.0        # wide sigmas, of an entry; beyond them a statement is grossly wrong
+MAX_UNTOLD_SIGMA = 0.5       # wide sigmas, of an entry that is released without being told
 GROSS = 10.0                 # factor on the wide sigmas then
 MIN_INFORMATION = 1e-3       # about an entry, in wide sigmas, below which it is not considered
 MAX_PROPOSALS = 5            # number of sets that are solved
@@ -113,7 +114,7 @@ def better_model(fit: Fit) -> Fit:
     if not is_better:
         return fit
     better = refine(replace(fit.problem, odometry=odometry), fit.state, accept=None)
-    return replace(better, explanations=fit.explanations)
+    return replace(better, explanations=fit.explanations, lead=fit.lead)
 
 
 def _log_evidence_at(state, problem):
@@ -126,7 +127,7 @@ def calibrated(fit: Fit) -> Fit:
     for _ in range(MAX_PROPOSALS):
         proposal = _proposal(fit)
         if np.array_equal(proposal.prior.root, fit.problem.prior.root):
-            return replace(fit, explanations=proposal.explanations)
+            return replace(fit, explanations=_confirmed(proposal.explanations, fit))
         if proposal.prior.groups in tried:
             break
         tried.append(proposal.prior.groups)
@@ -135,6 +136,14 @@ def calibrated(fit: Fit) -> Fit:
             break
         fit = proposed
     return fit
+
+
+def _confirmed(explanations, fit):
+    """Those explanations that also the solutions of a Fit with and without its groups confirm."""
+    calibration = fit.problem.measurements.calibration
+    confirmed = [some for some in explanations
+                 if sum(_price(calibration, group) for group in some) <= fit.lead]
+    return tuple(confirmed) or (frozenset(),)
 
 
 class _Proposal(NamedTuple):
@@ -161,7 +170,10 @@ def _released(fit, proposal):
     is_kept = not lead < needed
     log.info("calibration: %s released, log evidence %+.1f (predicted %+.1f): %s", names, lead,
              proposal.lead, "kept" if is_kept else "refused")
-    return replace(proposed, explanations=proposal.explanations) if is_kept else None
+    if not is_kept:
+        return None
+    proposed = replace(proposed, lead=fit.lead + lead)
+    return replace(proposed, explanations=_confirmed(proposal.explanations, proposed))
 
 
 def _proposal(fit):
@@ -170,9 +182,9 @@ def _proposal(fit):
     `explanations` are the best set of groups and others that come within AMBIGUOUS of it, neither
     part of it nor more: the drive cannot tell them apart. Each of their groups must raise the log
     evidence by its `_price`. The prior releases all groups of the sets that come so close, and what
-    else raises the evidence: not certain enough to be told, but the covariances include it. Wide
-    standard deviations are multiplied by GROSS if an entry would be further off than
-    MAX_WIDE_SIGMAS.
+    else raises the evidence and is determined by the drive: not certain enough to be told, but the
+    covariances include it. Wide standard deviations are multiplied by GROSS if an entry would be
+    further off than MAX_WIDE_SIGMAS.
     """
     calibration = fit.problem.measurements.calibration
     L, h = _likelihood(fit)
@@ -198,11 +210,22 @@ def _proposal(fit):
     close = [sets[k] for k in np.flatnonzero(merit > merit.max() - AMBIGUOUS)]
     explanations = tuple(some for some in close if not (some < best or some > best))
     certain = frozenset().union(*close)
-    sufficient = [k for k, some in enumerate(sets) if certain <= some]
     surprise = price_of_set - DECISIVE_RELEASE * np.array([len(some) for some in sets])
-    more = max(sufficient, key=(evidence - surprise).__getitem__)
+    more = k
+    for j in np.argsort(surprise - evidence):            # the most probable set first
+        untold = [calibration.of_group(group) for group in sets[j] - certain]
+        if certain <= sets[j] and _are_determined(L, roots[j] * scale, untold):
+            more = j
+            break
     present = _log_evidence(L, h, fit.problem.prior.root * scale)[0]
     return _Proposal(explanations, priors[more], evidence[more] - present)
+
+
+def _are_determined(L, root, groups):
+    """Whether the likelihood L (p, p) tells entries of groups, masks (p,), beside a root (p, p)."""
+    information = np.eye(len(L)) + root.T @ L @ root
+    variance = np.diag(root @ np.linalg.solve(information, root.T))
+    return all((variance[entries] < MAX_UNTOLD_SIGMA**2).all() for entries in groups)
 
 
 def _price(calibration, group):

@@ -39,15 +39,20 @@ def preintegrate_odometry(measurements: Measurements, model: str,
                           wheel: np.ndarray | None = None) -> OdometryIncrements:
     """The OdometryIncrements of Measurements, linearised at `wheel` (3,) m, None for that stated.
 
-    `model` is "arc" or "euler". Jumps are added where there are some.
+    `model` is "arc" or "euler". Jumps are added where there are some. Where the vehicle crawls the
+    increment is uncertain by itself.
     """
     frame = measurements.frame
     increments = preintegrate(
         measurements.dataset, frame, model, wheel, measurements.odometry_noise)
     jump, jump_covariance = measurements.jumps.added(frame[:-1], frame[1:])
+    moves = ~measurements.crawls[:, None]
+    creep = np.where(moves, 0.0, increments.increment)
+    uncertain = jump_covariance + creep[:, :, None] * creep[:, None]
     return replace(
         increments, in_counts=False, increment=se2.compose(increments.increment, jump),
-        quantization=increments.quantization + jump_covariance)
+        J_wheel=moves[:, None] * increments.J_wheel,
+        quantization=increments.quantization + uncertain)
 
 
 @dataclass(frozen=True)

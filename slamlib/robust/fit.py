@@ -157,6 +157,7 @@ class Fit:
     posterior: NoisePosterior | None     # None if all noise parameters are known
     converged: bool              # whether the last iterations ended before their number did
     explanations: tuple[frozenset, ...] = (frozenset(),)     # each set of groups explains the drive
+    lead: float = 0.0            # log evidence by the groups that left their stated values
 
     @property
     def log_density(self) -> float:

@@ -39,11 +39,10 @@ from slamlib.core import increments, se2
 from slamlib.core.errors import require
 from slamlib.core.hint import Fusion, sighting_count
 from slamlib.core.increments import SLIP_BOUNDS, SLIP_FACTOR, TYPICAL_SLIP
-from slamlib.core.odometry import cumulative
 from slamlib.core.records import Dataset
 from slamlib.core.sightings import GATE, sightings_by_frame
 from slamlib.robust.calibration import stated_calibration
-from slamlib.robust.jumps import NO_JUMPS, find_jumps
+from slamlib.robust.jumps import NO_JUMPS, crawls, find_jumps
 
 SLIPS = TYPICAL_SLIP * SLIP_FACTOR ** np.arange(-1.0, 4.0)     # sqrt(m), of the first filters
 FINE_STEPS = 1.4 ** np.arange(-2.0, 3.0)     # slips of the last filters, over the likeliest one
@@ -51,7 +50,6 @@ MEMORIES = (0.0, 0.6, 0.9, 0.95)            # correlations of successive errors 
 FACTORS = (1.0, 3.0, 9.0)    # on the standard deviations of the sightings
 STRETCHES = 10               # of the drive, in which the first filters run
 STRETCH_FRAMES = 20          # at most, of each
-CRAWL = 0.1                  # of the typical speed, below which counts may creep
 PRICE = 6.0                  # log density by which errors have memory, and by which the camera errs
 MIN_JUMP_GAIN = 10.0         # log likelihood by each of many jumps; the loss by each of a few
 # Rows of covariances; those of the markers follow
@@ -212,23 +210,15 @@ def _sightings(dataset):
 
 
 def _odometry(dataset, jumps, start, end):
-    """The _Odometry from poses `start` to poses `end`, (m,).
-
-    A vehicle that crawls may as well stand, while its counts creep: then they say nothing of the
-    wheels, and the whole increment may be an error.
-    """
+    """The _Odometry from poses `start` to `end`, (m,), which is uncertain where it crawls."""
     ticks = dataset.ticks
     vehicle = dataset.vehicle
     increment, by_w = increments.between_poses(ticks, vehicle, start, end, "arc")
     rounding, slipping = increments.noise_in_drive(ticks, vehicle, start, end)
-    counts = np.abs(ticks[1:])
-    travelled = cumulative(counts.sum(axis=1))        # by both wheels
-    travel = travelled[end] - travelled[start]
-    speed = travel / np.maximum(end - start, 1)
-    crawls = speed * travel.sum() < CRAWL * (speed @ travel)
-    by_w[crawls] = 0.0
-    creep = increment[crawls]
-    rounding[crawls] += creep[:, :, None] * creep[:, None]
+    creeping = crawls(ticks, start, end)
+    by_w[creeping] = 0.0
+    creep = increment[creeping]
+    rounding[creeping] += creep[:, :, None] * creep[:, None]
     jump, unknown = jumps.added(start, end)
     increment = se2.compose(increment, jump)
     return _Odometry(increment, by_w, rounding + unknown, slipping)

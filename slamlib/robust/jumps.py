@@ -27,6 +27,7 @@ from slamlib.core.sightings import GATE, sightings_by_frame
 
 log = logging.getLogger(__name__)
 
+CRAWL = 0.1                  # of the typical speed, below which counts may creep
 # Noise of odometry, generous
 SLIP = 0.03                  # sqrt(m), of a wheel after one metre
 FLOOR = 3e-3                 # m and rad, of an increment
@@ -135,6 +136,20 @@ def _moved(poses, k, pose):
     """Poses (f, 3) of which pose k and the later ones have moved with pose k to `pose` (3,)."""
     later = se2.between(poses[k], poses[k:])
     return np.concatenate([poses[:k], se2.compose(pose, later)])
+
+
+def crawls(ticks: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Whether the vehicle crawls, (m,) bool, from encoder poses `start` to `end`, each (m,).
+
+    A vehicle that crawls may as well stand, while its counts (n, 2) creep: then they say nothing of
+    the wheels, and the whole increment may be an error. It crawls below CRAWL of the mean speed,
+    each speed weighted by its way.
+    """
+    counts = np.abs(ticks[1:])
+    travelled = odometry.cumulative(counts.sum(axis=1))        # by both wheels
+    travel = travelled[end] - travelled[start]
+    speed = travel / np.maximum(end - start, 1)
+    return speed * travel.sum() < CRAWL * (speed @ travel)
 
 
 def find_jumps(dataset: Dataset) -> Jumps:

@@ -35,7 +35,7 @@ from slamlib.core.sightings import (
 from slamlib.core.vehicle import Vehicle
 from slamlib.robust.calibration import Calibration, stated_calibration
 from slamlib.robust.file_doubts import common_divisor
-from slamlib.robust.jumps import NO_JUMPS, Jumps
+from slamlib.robust.jumps import NO_JUMPS, Jumps, crawls
 
 NOISE_KEYS = ("slip", "marker_noise_factor", "range_noise_factor")      # of a Vehicle, as in Noise
 
@@ -132,6 +132,11 @@ class Measurements:
         """Covariances (f-1, 3, 3) of odometry between the frames, as of `odometry_noise`."""
         return odometry_noise(
             self.dataset.ticks, self.dataset.vehicle, self.frame[:-1], self.frame[1:])
+
+    @cached_property
+    def crawls(self) -> np.ndarray:
+        """(f-1,) bool, intervals between frames in which counts may creep."""
+        return crawls(self.dataset.ticks, self.frame[:-1], self.frame[1:])
 
     @property
     def sighting_covariances(self) -> np.ndarray:

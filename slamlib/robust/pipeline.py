@@ -137,4 +137,5 @@ def fit_from_previous(measurements: Measurements, previous: SlamResult,
     c = m.calibration.taken_from(before, previous.c, m.calibration.stated)
     state = state_from_poses(m, previous.poses[m.frame], previous.covariances[m.frame], c)
     state = narrow_kernels(problem, state, CAUCHY_SCALES[-1:])
-    return replace(refine(problem, state), explanations=previous.explanations)
+    return replace(refine(problem, state), explanations=previous.explanations,
+                   lead=previous.fit.lead)
