@@ -328,6 +328,17 @@ def test_counts_that_were_cut_off_say_so_and_leave_the_metre_to_the_markers():
     assert_right(found, truth, 0.004)
 
 
+@pytest.mark.parametrize("spoil, is_recognised", [
+    (lambda C: np.sqrt(C), True), (lambda C: C / 100, False)], ids=["sigmas", "too small"])
+def test_standard_deviations_in_the_columns_of_variances_are_recognised(spoil, is_recognised):
+    dataset = drive(11)[0].without("uwb")
+    variance = np.diagonal(dataset.aruco.covariance, axis1=1, axis2=2)
+    spoilt = aruco(dataset, covariance=spoil(variance)[:, :, None] * np.eye(3))
+    doubt, = solution_doubts(estimate(spoilt))
+    assert doubt.what == "marker-noise"
+    assert ("held standard deviations" in doubt.sentence) == is_recognised
+
+
 def test_a_factor_on_both_radii_correlates_them():
     stated = calibration.stated_calibration(Vehicle(), [])
     prior = stated.prior(["wheel-scale"], width=2.0)

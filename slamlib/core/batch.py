@@ -7,6 +7,7 @@ Of FixedValues it needs not look at each variable.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -18,8 +19,27 @@ class FixedValues(gtsam.Values):
     """Values that nobody changes."""
 
 
+@dataclass(frozen=True)
+class Linearization:
+    """The m factors of a kind, linearised at one place."""
+
+    values: gtsam.Values             # there
+    place: dict                      # numbers of each variable there, by its key
+    errors: np.ndarray               # (m, e)
+    derivatives: list[np.ndarray]    # (m, e, d) by the tangent vector of each variable
+
+    def is_at(self, values: gtsam.Values, keys: list[int]) -> bool:
+        """Whether the variables with these keys have the same values."""
+        if isinstance(values, FixedValues) and values is self.values:
+            return True
+        return all(numbers(values, key) == self.place.get(key) for key in keys)
+
+
+NOWHERE = Linearization(gtsam.Values(), {}, np.zeros((0, 0)), [])
+
+
 class Batch:
-    """Custom factors of one kind.
+    """Custom factors of one kind, and where they were linearised last.
 
     `keys` has a list of m keys for each variable of the m factors. The function `linearised` takes
     an array (m, d) of each variable's values, a pose as [x, y, heading], and returns the errors
@@ -30,42 +50,32 @@ class Batch:
     def __init__(self, keys: list[list[int]], linearised: Callable):
         self.keys = keys
         self.linearised = linearised
-        self.values = None       # where all were linearised last
-        self.place = {}          # numbers of each variable there
-        self.errors = None
-        self.derivatives = None
+        self.last = NOWHERE
 
     def factor(self, k: int, noise: gtsam.noiseModel.Base) -> gtsam.CustomFactor:
         """The factor k with a noise model."""
         keys = [column[k] for column in self.keys]
 
         def error(factor, values, jacobians):
-            if not self.is_linearised(values, keys):
-                self.linearise(values, keys)
+            if not self.last.is_at(values, keys):
+                self.last = self.linearise(values, keys)
             if jacobians is not None:
-                for number, derivative in enumerate(self.derivatives):
+                for number, derivative in enumerate(self.last.derivatives):
                     jacobians[number] = derivative[k]
-            return self.errors[k]
+            return self.last.errors[k]
 
         return gtsam.CustomFactor(noise, keys, error)
 
-    def is_linearised(self, values: gtsam.Values, keys: list[int]) -> bool:
-        """Whether the factor on `keys` is linearised at GTSAM's values."""
-        if isinstance(values, FixedValues) and values is self.values:
-            return True
-        return all(numbers(values, key) == self.place.get(key) for key in keys)
-
-    def linearise(self, values: gtsam.Values, keys: list[int]):
-        """Linearise all factors at GTSAM's values, which have those of `keys`, of one factor."""
-        there = {key: numbers(values, key)
+    def linearise(self, values: gtsam.Values, keys: list[int]) -> Linearization:
+        """All factors linearised at GTSAM's values, which have those of `keys`, of one factor."""
+        place = {key: numbers(values, key)
                  for key in set().union(*self.keys) if values.exists(key)}
-        places = []
+        columns = []
         for key, column in zip(keys, self.keys):
-            absent = [np.nan] * len(there[key])
-            places.append(np.array([there.get(other, absent) for other in column]))
-        self.errors, self.derivatives = self.linearised(*places)
-        self.values = values
-        self.place = there
+            absent = [np.nan] * len(place[key])
+            columns.append(np.array([place.get(other, absent) for other in column]))
+        errors, derivatives = self.linearised(*columns)
+        return Linearization(values, place, errors, derivatives)
 
 
 def numbers(values: gtsam.Values, key: int) -> list[float]:

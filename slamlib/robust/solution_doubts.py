@@ -189,6 +189,8 @@ def _factor_doubt(result, kind):
     elif high - logarithm < sigma:
         number = f"at least {factor:.3g}"
     reason = "Look at how the sensor's covariances were obtained."
+    if kind == SIGHTINGS and _are_sigmas(result, factor):
+        reason = "So they would if its columns of variances held standard deviations."
     if kind == RANGES:
         late = np.mean(result.range_weight < 0.5)
         if late > MAX_LATE_SHARE:
@@ -196,6 +198,15 @@ def _factor_doubt(result, kind):
     yield Doubt(f"{kind.doubt}-noise", (
         f"The {kind.name} scatter {number} times as much as {kind.file} states: problems 3 and 4 "
         f"use the scatter that was found, the others the file's. {reason}"))
+
+
+def _are_sigmas(result, factor):
+    """Whether a noise factor is that of standard deviations s in the columns of variances: root s.
+
+    It is then the standard deviation that these columns state.
+    """
+    stated = np.median(se2.sigmas(result.sightings.C)[:, :2])
+    return stated / MAX_NOISE_FACTOR < factor < stated * MAX_NOISE_FACTOR
 
 
 def _place_doubts(result):
