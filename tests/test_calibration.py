@@ -19,7 +19,7 @@ from slamlib.io.dataset import read_dataset, read_truth
 from slamlib.robust import calibration, choices
 from slamlib.robust.calibration import ENTRIES, HEIGHT, RANGE_LAG, SIGHTING_LAG, SIZE
 from slamlib.robust.factors import SMOOTHED_STEPS, sensor_poses
-from slamlib.robust.file_doubts import doubts_before_solving
+from slamlib.robust.file_doubts import common_divisor, doubts_before_solving
 from slamlib.robust.initialization import odometry_state
 from slamlib.robust.linear import NormalEquations, build_problem
 from slamlib.robust.measurements import Noise, measure
@@ -326,6 +326,12 @@ def test_counts_that_were_cut_off_say_so_and_leave_the_metre_to_the_markers():
     np.testing.assert_allclose(sigma, 3.5 / 127, rtol=0.1)
     assert not named(found)
     assert_right(found, truth, 0.004)
+
+
+def test_few_different_counts_are_no_counts_that_were_cut_off():
+    assert common_divisor(np.array([[0, 0], [127, 127], [254, 0], [-127, 127]])) == 1
+    assert common_divisor(6 * np.arange(16).reshape(8, 2)) == 6
+    assert common_divisor(6.5 * np.arange(16).reshape(8, 2)) == 1
 
 
 @pytest.mark.parametrize("spoil, is_recognised", [

@@ -54,7 +54,8 @@ STATED = 3.0                 # log evidence beside it, if standard deviations ar
 AMBIGUOUS = 3.0              # log evidence within which explanations cannot be told apart
 MAX_GROUPS = 5               # number of groups that are wrong at once
 MAX_WIDE_SIGMAS = 4.0        # wide sigmas, of an entry; beyond them a statement is grossly wrong
-MAX_UNTOLD_SIGMA = 0.5       # wide sigmas, of an entry that is released without being told
+MAX_UNTOLD = 1.5             # wide sigmas, by which an entry is off that is released untold,
+MAX_UNTOLD_SIGMA = 0.5       # unless its standard deviation is so small
 GROSS = 10.0                 # factor on the wide sigmas then
 MIN_INFORMATION = 1e-3       # about an entry, in wide sigmas, below which it is not considered
 MAX_PROPOSALS = 5            # number of sets that are solved
@@ -182,8 +183,8 @@ def _proposal(fit):
     `explanations` are the best set of groups and others that come within AMBIGUOUS of it, neither
     part of it nor more: the drive cannot tell them apart. Each of their groups must raise the log
     evidence by its `_price`. The prior releases all groups of the sets that come so close, and what
-    else raises the evidence and is determined by the drive: not certain enough to be told, but the
-    covariances include it. Wide standard deviations are multiplied by GROSS if an entry would be
+    else raises the evidence and is plausible: not certain enough to be told, but the covariances
+    include it. Wide standard deviations are multiplied by GROSS if an entry would be
     further off than MAX_WIDE_SIGMAS.
     """
     calibration = fit.problem.measurements.calibration
@@ -214,18 +215,23 @@ def _proposal(fit):
     more = k
     for j in np.argsort(surprise - evidence):            # the most probable set first
         untold = [calibration.of_group(group) for group in sets[j] - certain]
-        if certain <= sets[j] and _are_determined(L, roots[j] * scale, untold):
+        if certain <= sets[j] and _are_plausible(L, h, roots[j] * scale, untold):
             more = j
             break
     present = _log_evidence(L, h, fit.problem.prior.root * scale)[0]
     return _Proposal(explanations, priors[more], evidence[more] - present)
 
 
-def _are_determined(L, root, groups):
-    """Whether the likelihood L (p, p) tells entries of groups, masks (p,), beside a root (p, p)."""
+def _are_plausible(L, h, root, groups):
+    """Whether all entries of groups, masks (p,), are near what is stated or told by the drive.
+
+    By the likelihood of L (p, p) and h (p,) and a prior with this root (p, p).
+    """
     information = np.eye(len(L)) + root.T @ L @ root
-    variance = np.diag(root @ np.linalg.solve(information, root.T))
-    return all((variance[entries] < MAX_UNTOLD_SIGMA**2).all() for entries in groups)
+    covariance = root @ np.linalg.solve(information, root.T)
+    is_near = np.abs(covariance @ h) < MAX_UNTOLD
+    is_told = np.diag(covariance) < MAX_UNTOLD_SIGMA**2
+    return all((is_near | is_told)[entries].all() for entries in groups)
 
 
 def _price(calibration, group):

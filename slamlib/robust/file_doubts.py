@@ -39,6 +39,7 @@ MAX_ODOMETRY_HEADING_SIGMA = 0.1   # rad, at the end of the path that is compare
 MIN_SPREAD = 0.027
 MAX_SPREAD = 4.7
 SECOND_DIFFERENCE = 0.6745 * 6**0.5      # median size, of independent errors of sigma 1
+MIN_DIFFERENT_COUNTS = 8  # from which on a common divisor says that counts were cut off
 # The matrices A, and by their number kind and change of the counts with the same effect.
 AXES = np.array([np.diag(signs) @ order for order in (np.eye(2), np.eye(2)[::-1])
                  for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1))])
@@ -249,9 +250,12 @@ def cut_counts(dataset: Dataset) -> Iterator[Doubt]:
 
 
 def common_divisor(ticks: np.ndarray) -> int:
-    """Greatest common divisor of counts (n, 2), 0 if all are 0; fractions have the divisor 1."""
-    whole = np.rint(ticks).astype(int)
-    return int(np.gcd.reduce(whole, axis=None)) if np.array_equal(whole, ticks) else 1
+    """Greatest common divisor of counts (n, 2), of fractions or a few different counts 1."""
+    counts = np.unique(np.abs(ticks))
+    whole = np.rint(counts).astype(int)
+    if len(counts) < MIN_DIFFERENT_COUNTS or not np.array_equal(whole, counts):
+        return 1
+    return int(np.gcd.reduce(whole))
 
 
 def sigma_units(dataset: Dataset) -> Iterator[Doubt]:
