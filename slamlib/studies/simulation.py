@@ -127,8 +127,8 @@ def confuse_labels(dataset: Dataset, kind: str, seed: int) -> Dataset:
     """The Dataset with wrong labels of a kind, drawn with a seed.
 
     "random": 15 % of the sightings have the label of any other marker. "in frame": about 10 %
-    have exchanged labels with another sighting of the same image. "twins": every fifth marker is read as
-    one certain other marker, its twin, in 60 % of its sightings. "none": all are right.
+    have exchanged labels with another sighting of the same image. "twins": every fifth marker is
+    read as one certain other marker, its twin, in 60 % of its sightings. "none": all are right.
     """
     kinds = {"none": _right, "random": _any_other, "in frame": _exchanged, "twins": _as_twin}
     aruco = dataset.aruco
