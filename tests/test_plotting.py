@@ -127,6 +127,19 @@ def test_errors_are_in_mm_and_without_truth_the_bands_stand_alone(truth):
         assert ax.collections[0].get_paths()[0].vertices[:, 1].max() == pytest.approx(reach)
 
 
+@pytest.mark.parametrize("truth", [True, False])
+def test_the_error_of_the_position_alone_is_that_of_both(truth):
+    _, axes = plt.subplots(3)
+    result, drive = drive_with(truth)
+    plotting.errors(axes[:2], result, drive)
+    assert plotting.position_error(axes[2], result, drive) is axes[2]
+    both = axes[0].get_lines()
+    alone = axes[2].get_lines()
+    assert len(alone) == len(both)
+    for one, other in zip(alone, both):
+        np.testing.assert_allclose(one.get_ydata(), other.get_ydata())
+
+
 def test_errors_of_some_poses_are_in_the_frame_of_the_first_of_them():
     result, drive = drive_with()
     true = drive.truth.poses

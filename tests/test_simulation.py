@@ -5,7 +5,7 @@ from conftest import ROOT
 from slamlib.core import odometry, se2
 from slamlib.core.vehicle import Vehicle
 from slamlib.io.dataset import read_dataset, read_truth
-from slamlib.studies.simulation import distances, simulate, write_dataset
+from slamlib.studies.simulation import confuse_labels, distances, simulate, write_dataset
 
 DATA = ROOT / "data"
 RECIPES = {"short": dict(path="short", seed=1),
@@ -111,3 +111,24 @@ def test_files_round_trip_through_the_reader(tmp_path):
             np.testing.assert_allclose(found[name], written[name], rtol=1e-4, atol=6e-4)
     for name in ("poses", "marker", "marker_in_world", "antenna", "antenna_in_world"):
         np.testing.assert_allclose(getattr(true_again, name), getattr(truth, name), atol=6e-7)
+
+
+@pytest.mark.parametrize("kind, low, high", [
+    ("none", 0.0, 0.0), ("random", 0.12, 0.18), ("in frame", 0.07, 0.13), ("twins", 0.08, 0.16)])
+def test_confused_labels_are_as_many_as_stated_and_those_in_a_frame_are_exchanged(kind, low, high):
+    right = simulate("short", seed=1)[0].aruco
+    dataset = confuse_labels(simulate("short", seed=1)[0], kind, seed=3)
+    label = dataset.aruco.marker
+    assert low <= np.mean(label != right.marker) <= high
+    assert np.isin(label, right.marker).all()
+    same = [np.array_equal(np.sort(label[right.pose == pose]), np.sort(
+        right.marker[right.pose == pose])) for pose in np.unique(right.pose)]
+    assert all(same) == (kind in ("none", "in frame"))
+
+
+def test_a_twin_is_one_certain_other_marker():
+    right = simulate("short", seed=1)[0].aruco.marker
+    label = confuse_labels(simulate("short", seed=1)[0], "twins", seed=3).aruco.marker
+    for marker in np.unique(right[label != right]):
+        read_as = label[right == marker]
+        assert len(np.unique(read_as)) == 2 and 0.3 < np.mean(read_as != marker) < 0.9

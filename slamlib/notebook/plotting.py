@@ -175,6 +175,22 @@ def errors(axes: Sequence[Axes], result, drive, role: str = "slam") -> Sequence[
     return axes
 
 
+def position_error(ax: Axes, result, drive, role: str = "slam") -> Axes:
+    """Draw the error of the position along the path, and the longest semi-axis of its 95 % ellipse.
+
+    The first of the two axes of `errors`, for a result with few poses; parameters as there.
+    """
+    found = estimates(result, drive)
+    color = ROLES[role]["color"]
+    ax.fill_between(found.frame + 1, 0, 1e3 * longest_semi_axes(found.covariances), color=color,
+                    alpha=0.18, linewidth=0, label="95 % by the covariance")
+    if found.true is not None:
+        distance = 1e3 * np.linalg.norm((found.poses - found.true)[:, :2], axis=1)
+        curve(ax, distance, role, found.frame, "error", linewidth=1.2)
+    ax.set(xlabel="pose id", ylabel="position (mm)", ylim=(0, None))
+    return ax
+
+
 def trajectory(ax: Axes, poses: np.ndarray, role: str, label: str | None = None, **look) -> Axes:
     """Draw the path of poses (n, >= 2) with a dot at its start and equal axes."""
     line, = ax.plot(poses[:, 0], poses[:, 1], label=label or role, **ROLES[role] | look)

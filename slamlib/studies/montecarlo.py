@@ -8,10 +8,21 @@ from dataclasses import replace
 
 import numpy as np
 
-from slamlib import estimate, fuse, fuse_increments, localize
+from slamlib import (
+    build_graph,
+    count_everything,
+    estimate,
+    fuse,
+    fuse_increments,
+    initial_values,
+    localize,
+    solve_graph,
+)
 from slamlib.core import odometry, se2
 from slamlib.core.evaluation import anees, ate, position_sigmas
+from slamlib.core.graph_solution import GraphSolution
 from slamlib.core.hint import Fusion
+from slamlib.core.increments import TYPICAL_SLIP
 from slamlib.core.records import Dataset, Truth
 from slamlib.core.sightings import sightings_by_frame
 from slamlib.robust.fit import refine
@@ -29,9 +40,10 @@ PROBLEM2_METHODS = {
 MEMORY_METHODS = ("markers", "problem 3", "problem 4", "independent")
 
 
-def drive(seed: int, poses: int | None = None, **options) -> tuple[Dataset, Truth]:
-    """The Dataset and Truth of a simulated drive of the short path, or of its first `poses`."""
-    dataset, truth = simulate("short", seed, **options)
+def drive(seed: int, poses: int | None = None, path: str = "short",
+          **options) -> tuple[Dataset, Truth]:
+    """The Dataset and Truth of a simulated drive, or of its first `poses`."""
+    dataset, truth = simulate(path, seed, **options)
     if poses is None:
         return dataset, truth
     return dataset.first(poses), replace(truth, poses=truth.poses[:poses])
@@ -83,6 +95,39 @@ def ranges_added(seed: int, share: float = 1.0, **options) -> dict:
     moved = distances(added.poses[1:], without.poses[1:])
     numbers["moved"] = np.median(moved / position_sigmas(without.covariances[1:]))
     return numbers
+
+
+def plain_and_delivered(seed: int, **options) -> dict:
+    """The plain graph and `estimate`, problems 3 and 4, on one `drive`.
+
+    Returns
+    -------
+    dict of numbers, as "plain 3 ate" and "delivered 4 ate": the ATE and the aligned ATE in m, the
+    mean "nees", and the median "sigma" in m, the larger one of x and y; of the poses with a
+    measurement.
+    """
+    dataset, truth = drive(seed, **options)
+    without = dataset.without("uwb")
+    problem3 = estimate(without)
+    problem4 = estimate(dataset, previous=problem3)
+    numbers = {}
+    for problem, given, result in ((3, without, problem3), (4, dataset, problem4)):
+        plain = plain_graph(given)
+        at = plain.pose
+        for name, poses, covariances in (
+                ("plain", plain.poses, plain.covariances),
+                ("delivered", result.poses[at], result.covariances[at])):
+            key = f"{name} {problem}"
+            numbers |= judged(key, poses, covariances, truth.poses[at])
+            numbers[f"{key} aligned"] = ate(poses, truth.poses[at], aligned=True)
+            numbers[f"{key} sigma"] = np.median(position_sigmas(covariances[1:]))
+    return numbers
+
+
+def plain_graph(dataset: Dataset, slip: float = TYPICAL_SLIP) -> GraphSolution:
+    """The GraphSolution of a Dataset by the graph in which all measurements count."""
+    decisions = count_everything(dataset, slip=slip)
+    return solve_graph(build_graph(decisions), initial_values(dataset, decisions))
 
 
 def correlated_errors(seed: int, correlation: float, **options) -> dict:

@@ -52,6 +52,9 @@ CAMERA_REACH = 1.8      # m, largest distance in the plane at which a marker is 
 UWB_REACH = 15.0        # m, largest distance to an antenna that is measured
 LATE_RANGE_MEAN = 0.8   # m, mean of the exponential excess of late ranges
 SIMULATED_GUESS_SIGMA = 0.35   # m per axis, standard deviation of the antenna guesses
+CONFUSED = 0.15         # share of the sightings whose labels `confuse_labels` makes wrong
+TWIN_EVERY = 5          # markers, of which one is read as its twin
+TWIN_MISREAD = 0.6      # of its sightings
 SPEED_SWING = 0.15      # largest deviation of the speed from its mean, over the mean
 SPEED_PERIODS = 5       # of the speed, in the whole drive
 
@@ -118,6 +121,50 @@ def misguess(dataset: Dataset, position: np.ndarray, error: float, seed: int) ->
     angle = rng.uniform(-np.pi, np.pi, len(position))
     guess = replace(dataset.antenna_guess, position=position + error * _direction(angle))
     return replace(dataset, antenna_guess=guess)
+
+
+def confuse_labels(dataset: Dataset, kind: str, seed: int) -> Dataset:
+    """The Dataset with wrong labels of a kind, drawn with a seed.
+
+    "random": 15 % of the sightings have the label of any other marker. "in frame": about 10 %
+    have exchanged labels with another sighting of the same image. "twins": every fifth marker is
+    read as one certain other marker, its twin, in 60 % of its sightings. "none": all are right.
+    """
+    kinds = {"none": _right, "random": _any_other, "in frame": _exchanged, "twins": _as_twin}
+    aruco = dataset.aruco
+    rng = np.random.default_rng(seed)
+    return replace(dataset, aruco=replace(aruco, marker=kinds[kind](aruco, rng)))
+
+
+def _right(aruco, rng):
+    """The labels (s,) as they are."""
+    return aruco.marker
+
+
+def _any_other(aruco, rng):
+    """Labels (s,), some of which are those of any other marker."""
+    ids, label = np.unique(aruco.marker, return_inverse=True)
+    return ids[_relabelled(label, len(ids), CONFUSED, rng)]
+
+
+def _exchanged(aruco, rng):
+    """Labels (s,), some of which are exchanged within a frame."""
+    label = aruco.marker.copy()
+    for first in np.flatnonzero(rng.uniform(size=len(label)) < CONFUSED / 2):
+        same_frame = np.flatnonzero(aruco.pose == aruco.pose[first])
+        second = rng.choice(same_frame)
+        swapped = label[[second, first]]
+        label[[first, second]] = swapped
+    return label
+
+
+def _as_twin(aruco, rng):
+    """Labels (s,), some of which are those of a marker's twin."""
+    ids = rng.permutation(np.unique(aruco.marker))
+    twin = dict(zip(ids[::TWIN_EVERY].tolist(), ids[1::TWIN_EVERY].tolist()))
+    misread = rng.uniform(size=len(aruco.marker)) < TWIN_MISREAD
+    return np.array([twin.get(marker, marker) if wrong else marker
+                     for marker, wrong in zip(aruco.marker.tolist(), misread)])
 
 
 def manoeuvre(legs: list[tuple[float, float]], vehicle: Vehicle = TABLE_2) -> np.ndarray:

@@ -7,17 +7,16 @@ import numpy as np
 
 from slamlib import localize
 from slamlib.core import se2
-from slamlib.core.records import Dataset
 from slamlib.core.sightings import POINT_GATE
 from slamlib.robust.fit import CAUCHY_SCALES, narrow_kernels
-from slamlib.robust.initialization import consensus_markers, odometry_state, state_from_poses
+from slamlib.robust.initialization import consensus_markers, odometry_state
 from slamlib.robust.linear import build_problem, state_from_arrays
 from slamlib.robust.measurements import Measurements, accept_all, measure
 from slamlib.robust.optimize import optimize
 from slamlib.robust.result import slam_result
 from slamlib.studies.kernels import measure_with_known_noise, rounds, solve_with
 from slamlib.studies.montecarlo import antenna_error, drive
-from slamlib.studies.simulation import distances, misguess
+from slamlib.studies.simulation import confuse_labels, distances, misguess
 
 MAX_ANTENNA_ERROR = 0.5      # m, error below which an antenna is right
 MAX_MARKER_ERROR = 0.1       # m, distance from the right optimum above which a marker is off
@@ -29,6 +28,29 @@ def first_sighting(measurements: Measurements, in_world: np.ndarray,
     """(k, 3) markers at their first sightings; parameters as of `consensus_markers`."""
     _, first = np.unique(measurements.marker_row, return_index=True)
     return in_world[first]
+
+
+def most_certain(measurements: Measurements, in_world: np.ndarray,
+                 covariances: np.ndarray) -> np.ndarray:
+    """(k, 3) markers at their most certain sightings; parameters as of `consensus_markers`."""
+    certainty = -np.linalg.slogdet(covariances).logabsdet
+    rows = np.arange(len(certainty))
+    order = np.lexsort((rows, -certainty, measurements.marker_row))
+    _, first = np.unique(measurements.marker_row[order], return_index=True)
+    return in_world[order[first]]
+
+
+def median_of_sightings(measurements: Measurements, in_world: np.ndarray,
+                        covariances: np.ndarray) -> np.ndarray:
+    """(k, 3) markers at the medians of x, of y and of the heading of their sightings.
+
+    Parameters as of `consensus_markers`. The heading's is about that of the most certain sighting.
+    """
+    markers = most_certain(measurements, in_world, covariances)
+    for j in range(len(markers)):
+        own = measurements.marker_row == j
+        markers[j] += np.median(se2.difference(in_world[own], markers[j]), axis=0)
+    return markers
 
 
 def mean_by_information(measurements: Measurements, in_world: np.ndarray,
@@ -64,8 +86,10 @@ def map_of_problem_2(measurements: Measurements, in_world: np.ndarray,
     return markers
 
 
-LANDMARKS = {"first sighting": first_sighting, "mean by information": mean_by_information,
+LANDMARKS = {"first sighting": first_sighting, "most certain": most_certain,
+             "median": median_of_sightings, "mean by information": mean_by_information,
              "consensus": consensus_markers, "problem 2's map": map_of_problem_2}
+CONFUSIONS = "none", "random", "in frame", "twins"        # of `simulation.confuse_labels`
 
 
 def guessed_antennas(measurements: Measurements, poses: np.ndarray, covariances: np.ndarray,
@@ -75,13 +99,14 @@ def guessed_antennas(measurements: Measurements, poses: np.ndarray, covariances:
 
 
 def landmarks(seed: int, kernel: str = "graduated", starts: tuple = tuple(LANDMARKS),
-              **options) -> dict:
+              confusion: str = "none", **options) -> dict:
     """LANDMARKS, starts of the markers, on one `drive` with the typical slip known.
 
     Parameters
     ----------
     kernel : "graduated", all scales of the Cauchy kernel, or "last", only the last one.
     starts : names in LANDMARKS.
+    confusion : kind of wrong labels, of `simulation.confuse_labels`.
 
     Returns
     -------
@@ -91,24 +116,28 @@ def landmarks(seed: int, kernel: str = "graduated", starts: tuple = tuple(LANDMA
     in m.
     """
     dataset, truth = drive(seed, **options)
-    m = measure(dataset.without("uwb"))
+    m = measure(confuse_labels(dataset, confusion, seed).without("uwb"))
     row = np.searchsorted(truth.marker, m.marker)
     right = state_from_arrays(m, truth.poses[m.frame], truth.marker_in_world[row],
                               np.zeros((0, 2)), m.calibration.stated)
     return _from_each_start(build_problem(m, "arc"), right, kernel, starts)
 
 
-def landmarks_of_drive(dataset: Dataset, found, kernel: str = "last",
-                       starts: tuple = tuple(LANDMARKS)) -> dict:
-    """The numbers of `landmarks` on a Dataset, given the SlamResult `found` of problem 3.
+def confusions(seed: int, **options) -> dict:
+    """`landmarks` with each of CONFUSIONS, by one kernel and by all rounds, on one `drive`.
 
-    Model and noise are those of the result, which replaces the truth.
+    Returns
+    -------
+    dict of numbers, as "twins, last, consensus off" and "twins, consensus initial error".
     """
-    m = measure(dataset.without("uwb"))
-    problem = build_problem(m, found.model, found.noise)
-    problem = replace(problem, prior=found.fit.problem.prior)
-    right = state_from_poses(m, found.poses[m.frame], found.covariances[m.frame], found.c)
-    return _from_each_start(problem, right, kernel, starts)
+    numbers = {}
+    for kind in CONFUSIONS:
+        for kernel in ("last", "graduated"):
+            found = landmarks(seed, kernel, confusion=kind, **options)
+            for name in LANDMARKS:
+                numbers[f"{kind}, {kernel}, {name} off"] = found[f"{name} off"]
+                numbers[f"{kind}, {name} initial error"] = found[f"{name} initial error"]
+    return numbers
 
 
 def _from_each_start(problem, right, kernel, starts):
