@@ -211,7 +211,8 @@ def _proposal(fit):
     close = [sets[k] for k in np.flatnonzero(merit > merit.max() - AMBIGUOUS)]
     explanations = tuple(some for some in close if not (some < best or some > best))
     certain = frozenset().union(*close)
-    surprise = price_of_set - DECISIVE_RELEASE * np.array([len(some) for some in sets])
+    is_stated = {group: calibration.sigma[calibration.of_group(group)].all() for group in groups}
+    surprise = np.array([STATED * sum(is_stated[group] for group in some) for some in sets])
     more = k
     for j in np.argsort(surprise - evidence):            # the most probable set first
         untold = [calibration.of_group(group) for group in sets[j] - certain]

@@ -184,13 +184,13 @@ def _factor_doubt(result, kind):
         return
     low, high = BOUNDS[:, kind.column]
     number = f"{factor:.2f} ± {factor * sigma:.2f}"
+    reason = "Look at how the sensor's covariances were obtained."
+    if kind == SIGHTINGS and _are_sigmas(result, factor):
+        reason = "So they would if its columns of variances held standard deviations."
     if logarithm - low < sigma:
         number = f"at most {factor:.2g}"
     elif high - logarithm < sigma:
         number = f"at least {factor:.3g}"
-    reason = "Look at how the sensor's covariances were obtained."
-    if kind == SIGHTINGS and _are_sigmas(result, factor):
-        reason = "So they would if its columns of variances held standard deviations."
     if kind == RANGES:
         late = np.mean(result.range_weight < 0.5)
         if late > MAX_LATE_SHARE:
@@ -205,6 +205,8 @@ def _are_sigmas(result, factor):
 
     It is then the standard deviation that these columns state.
     """
+    if factor < 2 * np.exp(BOUNDS[0, SIGHTINGS.column]):       # which may be any smaller one
+        return False
     stated = np.median(se2.sigmas(result.sightings.C)[:, :2])
     return stated / MAX_NOISE_FACTOR < factor < stated * MAX_NOISE_FACTOR
 
