@@ -11,10 +11,11 @@ from scipy.stats import t
 from slamlib import estimate
 from slamlib.core.evaluation import ate, nees
 from slamlib.core.records import ArucoReadings
+from slamlib.studies import montecarlo
 from slamlib.studies.montecarlo import antenna_error
-from slamlib.studies.simulation import simulate
 
 REAL_LOGS = Path(__file__).parents[2] / "shared" / "real_logs"      # where they are present
+short = montecarlo.drive           # a simulated drive of the short path, or its first poses
 on_real_logs = pytest.mark.skipif(
     not REAL_LOGS.is_dir(), reason="the public robot logs are not here")
 
@@ -34,14 +35,6 @@ def decided(differences):
     """True where the mean of paired differences (s,) is above zero in a t test of 2.5 %."""
     error = differences.std(ddof=1) / np.sqrt(len(differences))
     return differences.mean() > t.ppf(0.975, len(differences) - 1) * error
-
-
-def short(seed, poses=None, **options):
-    """A simulated drive of the short path and its Truth, or the first poses of both."""
-    dataset, truth = simulate("short", seed, **options)
-    if poses is None:
-        return dataset, truth
-    return dataset.first(poses), replace(truth, poses=truth.poses[:poses])
 
 
 def sightings(pose, marker, z, covariance):

@@ -1,13 +1,21 @@
 """What sensors share: derivatives, posterior, decision, and drives whose files are wrong there."""
 
 from dataclasses import replace
-from functools import cache, partial
-from pathlib import Path
+from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from numeric import aruco, as_points, central_differences, changed, uwb, vehicle
+from numeric import (
+    REAL_LOGS,
+    aruco,
+    as_points,
+    central_differences,
+    on_real_logs,
+    short,
+    uwb,
+    vehicle,
+)
 
 from slamlib import estimate, fuse, fuse_increments, localize
 from slamlib.core import se2
@@ -25,9 +33,7 @@ from slamlib.robust.linear import NormalEquations, build_problem
 from slamlib.robust.measurements import Noise, measure
 from slamlib.robust.solution_doubts import solution_doubts
 from slamlib.studies.montecarlo import antenna_error
-from slamlib.studies.simulation import simulate
 
-REAL_LOGS = Path(__file__).parents[2] / "shared" / "real_logs"      # where they are present
 # Sensors of which every entry differs from its default.
 MOUNTED = Vehicle(camera_x=0.15, camera_y=-0.08, camera_turn=0.3, marker_size=1.03,
                   sighting_lag=3.4, tag_x=0.2, tag_y=-0.1, antenna_height=2.0, range_offset=0.1,
@@ -39,10 +45,10 @@ DOUBTFUL = {f"sigma_{entry.name}": 0.01 for entry in ENTRIES}
                          ids=["mounted", "in the origin"])
 def test_derivatives_by_delays_are_averaged_over_encoder_steps(vehicle):
     """Because counts are whole numbers; so are the differences. Three markers are points."""
-    dataset, _ = simulate("short", 4)
+    dataset, _ = short(4, 400)
     points = np.isin(dataset.aruco.marker, dataset.aruco.marker[:3])
     dataset = replace(dataset, vehicle=vehicle, aruco=as_points(dataset.aruco, points, 4.0))
-    problem = build_problem(measure(dataset.first(400)), "arc", Noise(2e-3, 1.5, 0.7))
+    problem = build_problem(measure(dataset), "arc", Noise(2e-3, 1.5, 0.7))
     m = problem.measurements
     state = odometry_state(m, "arc")
     linearized = NormalEquations(problem, state).linearized
@@ -64,7 +70,7 @@ def test_derivatives_by_delays_are_averaged_over_encoder_steps(vehicle):
 
 def test_sensors_are_where_the_vehicle_was_by_their_delay():
     """On the path of odometry, a camera that is four and a tag that is seven encoder steps late."""
-    m = measure(simulate("short", 4)[0].first(400))
+    m = measure(short(4, 400)[0])
     path = dead_reckoning(m.dataset.ticks, m.dataset.vehicle, model="arc")
     c = calibration.stated_calibration(MOUNTED, []).stated
     c[[SIGHTING_LAG, RANGE_LAG]] = 4, 7
@@ -144,8 +150,8 @@ def seen_from(dataset, camera=(0.0, 0.0, 0.0), size=1.0):
     z = se2.between(np.array(camera), dataset.aruco.marker_in_vehicle)
     covariance = se2.rotate_covariance(dataset.aruco.covariance, -camera[2])
     scale = np.array([size, size, 1])
-    return changed(dataset, "aruco", marker_in_vehicle=z / scale,
-                   covariance=covariance / np.outer(scale, scale))
+    return aruco(dataset, marker_in_vehicle=z / scale,
+                 covariance=covariance / np.outer(scale, scale))
 
 
 def ranged_from(dataset, truth, tag=(0.0, 0.0), height=0.0, offsets=0.0, late=0):
@@ -178,7 +184,7 @@ SCATTER = {
     "range-offset": lambda d: uwb(d, range=d.uwb.range * 1.015)}
 
 
-drive = cache(partial(simulate, "short"))
+drive = cache(short)
 
 
 @cache
@@ -266,8 +272,8 @@ def test_slightly_wrong_wheels_are_named_alone():
 @pytest.mark.parametrize("seed", [0, 2])
 def test_the_model_of_a_step_that_a_wrong_size_made_does_not_blame_the_wheels(seed):
     """A camera 0.2 m ahead, as stated, and larger markers look like Euler's steps at first."""
-    dataset = seen_from(simulate("short", seed)[0].without("uwb"), (0.2, 0.0, 0.0), size=1.04)
-    found = estimate(replace(dataset, vehicle=replace(dataset.vehicle, camera_x=0.2)))
+    dataset = seen_from(drive(seed)[0].without("uwb"), (0.2, 0.0, 0.0), size=1.04)
+    found = estimate(vehicle(camera_x=0.2)(dataset))
     assert found.model == "arc" and found.released == {"marker-size"}
     assert [doubt.what for doubt in solution_doubts(found)] == ["marker-size"]
     assert found.c[SIZE] == pytest.approx(1.04, abs=0.004)
@@ -289,9 +295,8 @@ def test_what_is_stated_is_used():
     dataset, truth = drive(1)
     spoilt = ranged_from(seen_from(dataset, (0.15, -0.05, 0.1), size=1.03), truth, tag=(0.3, 0.1),
                          height=2.0)
-    stated = replace(spoilt, vehicle=replace(
-        dataset.vehicle, camera_x=0.15, camera_y=-0.05, camera_turn=0.1, marker_size=1.03,
-        tag_x=0.3, tag_y=0.1, antenna_height=2.0))
+    stated = vehicle(camera_x=0.15, camera_y=-0.05, camera_turn=0.1, marker_size=1.03, tag_x=0.3,
+                     tag_y=0.1, antenna_height=2.0)(spoilt)
     found, right = estimate(stated), estimate(dataset)
     assert not solution_doubts(found) and not found.released
     assert np.abs(found.poses - right.poses)[:, :2].max() < 2e-3
@@ -300,12 +305,10 @@ def test_what_is_stated_is_used():
 
 def test_problem_2_and_the_checks_of_files_see_by_the_stated_camera():
     """A camera turned by a right angle is no flaw of the files if vehicle.toml says so."""
-    dataset, _ = drive(1)
-    dataset = dataset.without("uwb").first(500)
-    camera = (0.15, -0.05, np.pi / 2)
-    spoilt = seen_from(dataset, camera, size=1.5)
-    stated = replace(spoilt, vehicle=replace(
-        dataset.vehicle, camera_x=0.15, camera_y=-0.05, camera_turn=np.pi / 2, marker_size=1.5))
+    dataset = drive(1, 500)[0].without("uwb")
+    spoilt = seen_from(dataset, (0.15, -0.05, np.pi / 2), size=1.5)
+    stated = vehicle(
+        camera_x=0.15, camera_y=-0.05, camera_turn=np.pi / 2, marker_size=1.5)(spoilt)
     assert doubts_before_solving(spoilt) and not doubts_before_solving(stated)
     for solve in (lambda d: localize(d.sightings), fuse, fuse_increments):
         np.testing.assert_allclose(solve(stated).poses, solve(dataset).poses, atol=1e-9)
@@ -316,32 +319,25 @@ def test_problem_2_and_the_checks_of_files_see_by_the_stated_camera():
 def test_no_doubt_about_clean_drives(seed):
     """Of all slips, with late ranges and wrong labels too; a long one is in test_uwb."""
     slip = [0.0, 3e-4, 1e-3, 3e-3, 1e-2][seed % 5]
-    dataset, _ = simulate("short", 100 + seed, slip=slip, late_ranges=0.1 * (seed % 2),
-                          mislabelled=0.02 * (seed % 3 == 2))
+    dataset, _ = short(100 + seed, slip=slip, late_ranges=0.1 * (seed % 2),
+                       mislabelled=0.02 * (seed % 3 == 2))
     markers, both = both_problems(dataset)
     assert not named(markers) and not named(both)
 
 
-def aligned_judgement(found, truth):
-    """ATE in m and mean NEES of positions (2 is right) after alignment, without the first tenth."""
-    T = align(found.poses, truth.poses)
-    poses, covariances = se2.compose(T, found.poses), se2.rotate_covariance(found.covariances, T[2])
-    later = slice(len(poses) // 10, None)
-    off, C = (poses - truth.poses)[later, :2], covariances[later, :2, :2]
-    squared = np.einsum("ni,nij,nj->n", off, np.linalg.inv(C), off)
-    return ate(found.poses, truth.poses, aligned=True), squared.mean()
-
-
 @pytest.mark.slow
-@pytest.mark.skipif(not REAL_LOGS.is_dir(), reason="the public robot logs are not here")
+@on_real_logs
 @pytest.mark.parametrize("log, largest, what", [
     ("starloc_b", 0.015, "marker-size"), ("mrclam_b", 0.100, "camera-offset")])
 def test_public_logs(log, largest, what):
     """AprilTags with ranges, printed too large; barcodes by a camera that stands elsewhere."""
-    dataset, truth = read_dataset(REAL_LOGS / log).first(6500), read_truth(REAL_LOGS / log)
-    truth = replace(truth, poses=truth.poses[:6500])
-    found = estimate(dataset.without("uwb"))
-    for result in (found, *([estimate(dataset, previous=found)] if dataset.uwb else [])):
-        assert what in result.released
-        error, squared = aligned_judgement(result, truth)
-        assert error < largest and squared < 4
+    dataset = read_dataset(REAL_LOGS / log).first(6500)
+    truth = read_truth(REAL_LOGS / log).poses[:6500]
+    for found in both_problems(dataset)[:1 + (dataset.uwb is not None)]:
+        assert what in found.released
+        assert ate(found.poses, truth, aligned=True) < largest
+        T = align(found.poses, truth)
+        later = slice(len(truth) // 10, None)
+        off = (se2.compose(T, found.poses) - truth)[later, :2]
+        C = se2.rotate_covariance(found.covariances, T[2])[later, :2, :2]
+        assert se2.squared_norms(off, C).mean() < 4
