@@ -16,6 +16,7 @@ from numeric import (
     uwb,
     vehicle,
 )
+from numpy.testing import assert_allclose, assert_array_equal
 
 from slamlib import estimate, fuse, fuse_increments, localize
 from slamlib.core import se2
@@ -64,7 +65,7 @@ def test_derivatives_by_delays_are_averaged_over_encoder_steps(vehicle):
         numeric = central_differences(error, np.zeros(1), SMOOTHED_STEPS / 2)[..., 0]
         frame = m.frame[m.structure.variables[factors.index, 0]]
         inside = (frame > 20) & (frame < m.frame[-1] - 20)
-        np.testing.assert_allclose(J[inside], numeric[inside], atol=0.1 * np.abs(numeric).max())
+        assert_allclose(J[inside], numeric[inside], atol=0.1 * np.abs(numeric).max())
         assert np.abs(J[inside]).max() > 0
 
 
@@ -79,7 +80,7 @@ def test_sensors_are_where_the_vehicle_was_by_their_delay():
                                     (tag, m.ranges.row, 7, np.append(c[calibration.TAG_PLACE], 0))):
         seen = m.frame[row]
         expected = se2.compose(path[seen[seen >= late] - late], place)
-        np.testing.assert_allclose(found[seen >= late], expected, atol=1e-9)
+        assert_allclose(found[seen >= late], expected, atol=1e-9)
 
 
 def test_evidence_of_one_entry_by_hand():
@@ -106,8 +107,8 @@ def test_what_is_stated_is_what_the_table_says(height, sigma):
     assert [row["name"] for row in rows if row["released"]] == ["tag_x", "tag_y"]
     for row in rows[:14]:
         of_vehicle = [getattr(vehicle, row["name"]), getattr(vehicle, f"sigma_{row['name']}")]
-        np.testing.assert_allclose([row["stated"], row["stated_sigma"]], of_vehicle, rtol=1e-6)
-        np.testing.assert_allclose([row["estimate"], row["sigma"]], of_vehicle, rtol=1e-6)
+        assert_allclose([row["stated"], row["stated_sigma"]], of_vehicle, rtol=1e-6)
+        assert_allclose([row["estimate"], row["sigma"]], of_vehicle, rtol=1e-6)
 
 
 @pytest.mark.parametrize("off, sigma, named", [
@@ -126,7 +127,7 @@ def test_what_a_drive_cannot_tell_apart_by_hand(monkeypatch, off, sigma, named):
     assert frozenset().union(*found.explanations) == named
     assert all(len(each) == 1 for each in found.explanations) or not named
     chosen = np.isin(stated.group, [*found.groups])
-    np.testing.assert_array_equal(found.sigma, np.where(chosen, stated.wide, stated.sigma))
+    assert_array_equal(found.sigma, np.where(chosen, stated.wide, stated.sigma))
     if sigma == 0 and named:
         assert found.lead == pytest.approx(2500 / 201 - np.log(201) / 2)
 
@@ -239,7 +240,7 @@ def test_wrong_wheels_are_named_and_mended_and_not_taken_for_slip(fault):
     assert named(markers) & {"wheel-parameters", "marker-size"}
     first = solution_doubts(both)[0]
     assert first.what == "wheel-parameters" and "By the drive right_radius" in first.sentence
-    np.testing.assert_allclose(both.wheel, [0.1, 0.1, 0.4], rtol=0.01)
+    assert_allclose(both.wheel, [0.1, 0.1, 0.4], rtol=0.01)
     assert markers.slip < 2e-3 and both.slip < 2e-3
     assert_right(both, truth, 1.3 * right_ates(501)[1])
     assert antenna_error(both, truth)[1].mean() < 8
@@ -311,7 +312,7 @@ def test_problem_2_and_the_checks_of_files_see_by_the_stated_camera():
         camera_x=0.15, camera_y=-0.05, camera_turn=np.pi / 2, marker_size=1.5)(spoilt)
     assert doubts_before_solving(spoilt) and not doubts_before_solving(stated)
     for solve in (lambda d: localize(d.sightings), fuse, fuse_increments):
-        np.testing.assert_allclose(solve(stated).poses, solve(dataset).poses, atol=1e-9)
+        assert_allclose(solve(stated).poses, solve(dataset).poses, atol=1e-9)
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import ROOT
+from numpy.testing import assert_allclose, assert_array_equal
 
 from slamlib.core import se2
 from slamlib.core.errors import DatasetError
@@ -103,7 +104,7 @@ def test_truth_in_another_frame_is_moved_to_its_first_pose_with_a_note(folder):
     write_rows(folder / "truth/UwbMap.txt", clean.antenna, antennas[:, :2])
     found = read_truth(folder)
     for name in ("poses", "marker_in_world", "antenna_in_world"):
-        np.testing.assert_allclose(getattr(found, name), getattr(clean, name), atol=1e-12)
+        assert_allclose(getattr(found, name), getattr(clean, name), atol=1e-12)
     assert found.notes == (
         "In truth: vehiclePose.txt begins at (12.500 m, -3.250 m, 2.8000 rad): poses and maps were "
         "moved into the frame of its first pose, in which the estimates are.",)
@@ -115,7 +116,7 @@ def test_truth_that_begins_at_the_origin_but_for_rounding_or_full_turns_stays(fo
     write(folder / "truth/vehiclePose.txt", moved)
     found = read_truth(folder)
     assert found.notes == ()
-    np.testing.assert_array_equal(found.marker_in_world, array("3 4 -0.3; 1 2 0.3"))
+    assert_array_equal(found.marker_in_world, array("3 4 -0.3; 1 2 0.3"))
 
 
 def write_rows(path, ids, values):
@@ -274,7 +275,7 @@ def assert_taken_as_such(folder, increments):
     ticks = np.concatenate([np.zeros((1, 2)), increments]).astype(int)
     write_counts(folder, ticks)
     found = read_dataset(folder)
-    np.testing.assert_array_equal(found.ticks, ticks)
+    assert_array_equal(found.ticks, ticks)
     assert found.notes == () and doubts_before_solving(found) == []
 
 
@@ -308,7 +309,7 @@ def test_counters_that_wrap_around_are_mended(modulus, begin, lowest, sign, tmp_
     wraps = np.flatnonzero((steps != ticks).any(axis=1))
     write_counts(tmp_path, steps)
     found = read_dataset(tmp_path)
-    np.testing.assert_array_equal(found.ticks, ticks)
+    assert_array_equal(found.ticks, ticks)
     assert found.notes == (
         f"encoderReading.txt: {len(wraps)} rows were mended whose counts are 2^15 or 2^16 off, as "
         f"of a counter that wraps around, first line {wraps[0] + 1}.",)

@@ -7,6 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 from numeric import aruco, as_points, uwb, vehicle
+from numpy.testing import assert_allclose
 
 from slamlib.core.errors import DatasetError
 from slamlib.core.records import AntennaGuess, Dataset, UwbReadings
@@ -260,7 +261,7 @@ def test_units_of_ranges_are_judged_by_their_spread_and_by_the_guesses(factor, g
         assert named in doubt.sentence
         numbers = re.findall(r"[\d.]+(?= m\b)", doubt.sentence)
         expected = [factor * 10, factor * 2 * np.sqrt(2), 2, np.hypot(6 * guess, 10 * guess - 2)]
-        np.testing.assert_allclose(np.array(numbers, float), expected, rtol=0.03)
+        assert_allclose(np.array(numbers, float), expected, rtol=0.03)
 
 
 def test_units_of_few_ranges_and_of_a_vehicle_that_stands_are_not_judged():

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from conftest import ROOT
 from numeric import aruco, known_noise, uwb, vehicle
+from numpy.testing import assert_allclose, assert_array_equal
 
 from slamlib import estimate, solve
 from slamlib.__main__ import summary_lines
@@ -72,8 +73,8 @@ def test_without_sightings_nothing_is_known_of_the_camera():
     stated = vehicle(camera_x=0.1, sigma_camera_x=0.02, marker_size=1.01, sighting_lag=2.0)
     for drive in (dataset, stated(dataset)):
         found = estimate(drive, model="arc")
-        np.testing.assert_array_equal(found.c[SIGHTINGS], found.calibration.stated[SIGHTINGS])
-        np.testing.assert_allclose(found.c_covariance[SIGHTINGS, SIGHTINGS],
+        assert_array_equal(found.c[SIGHTINGS], found.calibration.stated[SIGHTINGS])
+        assert_allclose(found.c_covariance[SIGHTINGS, SIGHTINGS],
                                    np.diag(found.calibration.sigma[SIGHTINGS]**2), atol=1e-15)
         assert not found.released & set(found.calibration.group[SIGHTINGS])
 
@@ -250,7 +251,7 @@ def test_a_turn_between_frames_is_known_as_well_as_wheelbase_and_slip(slip, sigm
     """Ten radians on an arc of 1 m, with a wheelbase known to 5 %: wheels run 3 m and 1 m."""
     ticks = np.rint(manoeuvre([(1.0, 10.0)]))
     drive = Dataset("turn", Vehicle(sigma_wheelbase=0.02), ticks, None, None, None)
-    np.testing.assert_allclose(estimate(drive, slip=slip).turn_sigma, [sigma], rtol=0.02)
+    assert_allclose(estimate(drive, slip=slip).turn_sigma, [sigma], rtol=0.02)
 
 
 def test_a_marker_at_the_place_of_another_is_unconfirmed():

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import A, L, W, X
 from numeric import aruco, as_points, known_noise, short, sightings, true_markers, uwb, vehicle
+from numpy.testing import assert_allclose, assert_array_equal
 from test_normal_equations import dense_information
 
 from slamlib import (
@@ -80,8 +81,8 @@ def test_factors_of_a_batch_are_linearised_at_once_and_anew_where_a_value_change
     values.insert(A(2), np.array([2.0, 0]))
     assert np.isclose(graph.error(values), 0.5 + 8)
     J, b = graph.linearize(values).at(1).jacobian()
-    np.testing.assert_allclose(J, np.diag([4.0, 0]))
-    np.testing.assert_allclose(b, [-4, 0])
+    assert_allclose(J, np.diag([4.0, 0]))
+    assert_allclose(b, [-4, 0])
     assert len(calls) == 2
     values.update(A(2), np.zeros(2))
     assert np.isclose(graph.error(values), 0.5)
@@ -99,7 +100,7 @@ def test_odometry_of_the_plain_graph_is_gtsams_between_factor_in_counts(drive):
     measured = gtsam.Pose2(*(increments.increment[4] + increments.J_wheel[4] @ larger))
     expected = gtsam.Pose2.Logmap(measured.between(first.between(second)))
     factor = build_graph(decisions).at(2 + 4)                        # after two priors
-    np.testing.assert_allclose(factor.unwhitenedError(values), expected / 1.1, atol=1e-9)
+    assert_allclose(factor.unwhitenedError(values), expected / 1.1, atol=1e-9)
 
 
 @pytest.mark.parametrize("share", [1.0, 0.25])
@@ -174,8 +175,8 @@ def test_the_graph_is_the_one_by_which_the_engine_decides(groups, kernel):
     expected = whole[np.ix_(rows, rows)]
     unit = 1 / np.sqrt(np.diag(expected))
     scale = np.outer(unit, unit)          # of small angles GTSAM's logarithm is rounded
-    np.testing.assert_allclose(scale * information, scale * expected, atol=5e-6)
-    np.testing.assert_allclose(
+    assert_allclose(scale * information, scale * expected, atol=5e-6)
+    assert_allclose(
         -gradient * unit, sums.border[rows, -1] * unit, atol=1e-6 * np.abs(gradient * unit).max())
 
 
@@ -196,7 +197,7 @@ def test_without_noise_the_plain_solver_finds_the_truth(drive):
     for places, expected in (
             (found.poses, poses[found.pose]), (found.antenna_in_world, truth.antenna_in_world),
             (found.marker_in_world, true_markers(truth, found.marker))):
-        np.testing.assert_allclose(places[:, :2], expected[:, :2], atol=1e-9)
+        assert_allclose(places[:, :2], expected[:, :2], atol=1e-9)
 
 
 def test_the_plain_solver_is_consistent():
@@ -218,7 +219,7 @@ def test_points_are_mapped_as_positions(drive):
     is_point = np.isnan(found.marker_in_world[:, 2])
     assert set(found.marker[is_point]) == set(drive[0].aruco.marker[points])
     expected = true_markers(drive[1], found.marker)
-    np.testing.assert_allclose(found.marker_in_world[:, :2], expected[:, :2], atol=0.05)
+    assert_allclose(found.marker_in_world[:, :2], expected[:, :2], atol=0.05)
 
 
 def test_where_cholesky_fails_qr_gives_the_same_solution_and_marginals(drive, monkeypatch):
@@ -237,11 +238,11 @@ def test_where_cholesky_fails_qr_gives_the_same_solution_and_marginals(drive, mo
     for name in ("marginalCovariance", "jointMarginalCovariance"):
         monkeypatch.setattr(gtsam.GaussianBayesTree, name, fails)
     found = solve_graph(graph, values)
-    np.testing.assert_allclose(found.poses, expected.poses, atol=1e-7)
+    assert_allclose(found.poses, expected.poses, atol=1e-7)
     for C, by_cholesky in zip(found.covariances, expected.covariances):
-        np.testing.assert_allclose(C, by_cholesky, rtol=1e-6, atol=1e-6 * by_cholesky.max())
+        assert_allclose(C, by_cholesky, rtol=1e-6, atol=1e-6 * by_cholesky.max())
     for pair, joint in zip(pairs, joints):
-        np.testing.assert_allclose(found.marginals.joint(*pair), joint, rtol=1e-5,
+        assert_allclose(found.marginals.joint(*pair), joint, rtol=1e-5,
                                    atol=1e-6 * np.abs(joint).max())
 
 
@@ -300,7 +301,7 @@ def test_the_plain_graph_heeds_stated_offset_and_scale_of_the_ranges(drive):
     measured = uwb(drive[0], range=1.02 * drive[0].uwb.range + 0.5)
     expected = solve_graph(*plain(drive[0]))
     found = solve_graph(*plain(vehicle(range_offset=0.5, range_scale=1.02)(measured)))
-    np.testing.assert_allclose(found.antenna_in_world, expected.antenna_in_world, atol=0.01)
+    assert_allclose(found.antenna_in_world, expected.antenna_in_world, atol=0.01)
 
 
 # What is handed in.
@@ -312,12 +313,12 @@ def test_what_is_handed_in_is_gtsams_from_problem_1s_odometry(drive):
     assert found.gtsam.start == solution.FROM_ODOMETRY and 2 <= found.gtsam.steps <= 10
     assert found.converged and max(found.agreement) < 1e-3
     again = solve_graph(*found.graph())
-    np.testing.assert_allclose(found.poses[again.pose, :2], again.poses[:, :2], atol=1e-5)
+    assert_allclose(found.poses[again.pose, :2], again.poses[:, :2], atol=1e-5)
     sure = ~np.isin(found.antenna, [*found.doubts])
     for C, expected in ((found.covariances[again.pose], again.covariances),
                         (found.marker_covariance, again.marker_covariance),
                         (found.antenna_covariance[sure], again.antenna_covariance[sure])):
-        np.testing.assert_allclose(C, expected, rtol=1e-3, atol=1e-3 * expected.max())
+        assert_allclose(C, expected, rtol=1e-3, atol=1e-3 * expected.max())
 
 
 def gtsam_elsewhere(monkeypatch, **moved):
@@ -342,11 +343,11 @@ def test_poses_maps_and_covariances_are_those_of_gtsam(small, monkeypatch):
     found = estimate(small)
     for name, distance in (("poses", 1), ("marker_in_world", 2), ("antenna_in_world", 3)):
         off = getattr(found, name)[:, 0] - getattr(expected, name)[:, 0]
-        np.testing.assert_allclose(off, distance, atol=1e-6)
+        assert_allclose(off, distance, atol=1e-6)
     frames = found.sightings.frame
-    np.testing.assert_allclose(found.covariances[frames], 4 * expected.covariances[frames])
+    assert_allclose(found.covariances[frames], 4 * expected.covariances[frames])
     for name in ("marker_covariance", "wheel_covariance"):
-        np.testing.assert_allclose(getattr(found, name), 4 * getattr(expected, name))
+        assert_allclose(getattr(found, name), 4 * getattr(expected, name))
     assert found.agreement[0] > 10 and found.agreement[1] > 0.9
 
 
@@ -368,7 +369,7 @@ def test_from_odometry_alone_a_wrong_minimum_is_left_for_the_engines_solution(dr
     monkeypatch.setattr(solution, "odometry_state", astray)
     found = estimate(dataset)
     assert found.gtsam.start == solution.FROM_ENGINE
-    np.testing.assert_allclose(found.antenna_in_world, expected.antenna_in_world, atol=1e-3)
+    assert_allclose(found.antenna_in_world, expected.antenna_in_world, atol=1e-3)
 
 
 def test_the_average_over_the_slip_is_that_of_the_engine():
@@ -434,7 +435,7 @@ def test_poses_between_measurements_are_variables_where_they_are_asked_for(drive
     graph, values = solved.graph()
     assert values.exists(X(33)) and not values.exists(X(34))
     again = solve_graph(graph, values)
-    np.testing.assert_allclose(again.poses[again.pose == 33], solved.poses[[33]], atol=1e-5)
+    assert_allclose(again.poses[again.pose == 33], solved.poses[[33]], atol=1e-5)
     for pose in (-1, 700, 2.5):
         with pytest.raises(DatasetError, match="estimate: expected rows from 0 to 699 for poses"):
             estimate(drive[0], poses=[pose])
@@ -486,6 +487,6 @@ def test_negative_ids_are_those_of_the_files(drive):
     renamed = replace(renamed, antenna_guess=guess)
     expected = solve_graph(*plain(dataset))
     found = solve_graph(*plain(renamed))
-    np.testing.assert_array_equal(found.marker, -expected.marker[::-1])
-    np.testing.assert_array_equal(found.antenna, -expected.antenna[::-1])
-    np.testing.assert_allclose(found.antenna_in_world, expected.antenna_in_world[::-1], atol=1e-5)
+    assert_array_equal(found.marker, -expected.marker[::-1])
+    assert_array_equal(found.antenna, -expected.antenna[::-1])
+    assert_allclose(found.antenna_in_world, expected.antenna_in_world[::-1], atol=1e-5)

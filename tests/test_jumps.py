@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from numeric import aruco, as_points, carried, counts, vehicle
+from numpy.testing import assert_allclose
 
 from slamlib import estimate
 from slamlib.core import se2
@@ -37,7 +38,7 @@ def test_the_score_of_two_sightings_by_hand():
     drive = jumps._Drive.without_jumps(np.zeros((2, 3)), TABLE_2.wheelbase)
     pairs = jumps._compared(s, drive)
     assert (pairs.first, pairs.second) == (0, 1)
-    np.testing.assert_allclose(pairs.squared, 0.1**2 / (2 * 1e-4 + jumps.FLOOR**2), rtol=1e-9)
+    assert_allclose(pairs.squared, 0.1**2 / (2 * 1e-4 + jumps.FLOOR**2), rtol=1e-9)
 
 
 def test_a_jump_of_a_vehicle_that_stands_is_found_where_it_is():
@@ -47,11 +48,11 @@ def test_a_jump_of_a_vehicle_that_stands_is_found_where_it_is():
     poses[9:] = [-0.2, 0.3, 0.5]
     found = jumps.find_jumps(seen(poses))
     assert found.start.tolist() == [3, 8] and found.end.tolist() == [4, 9]
-    np.testing.assert_allclose(
+    assert_allclose(
         found.increment, se2.between(poses[[3, 8]], poses[[4, 9]]), atol=1e-6)
-    np.testing.assert_allclose(found.by_odometry, 0)
-    np.testing.assert_allclose(found.sigma, [[0.5, 0.5, 0.5], [0.6, 0.6, 0.1]], atol=1e-6)
-    np.testing.assert_allclose(found.mended(np.arange(12), np.zeros((12, 3))), poses, atol=1e-6)
+    assert_allclose(found.by_odometry, 0)
+    assert_allclose(found.sigma, [[0.5, 0.5, 0.5], [0.6, 0.6, 0.1]], atol=1e-6)
+    assert_allclose(found.mended(np.arange(12), np.zeros((12, 3))), poses, atol=1e-6)
 
 
 @pytest.mark.parametrize("contradicted, dead", [
@@ -70,7 +71,7 @@ def test_a_jump_is_where_most_contradicting_pairs_span_it():
     dataset = seen(poses, np.tile(MARKERS, (2, 1)))
     in_room = dataset.aruco.pose // 10 % 2 == dataset.aruco.marker // 3
     found = jumps.find_jumps(replace(dataset, aruco=dataset.aruco.select(in_room)))
-    np.testing.assert_allclose(found.mended(np.arange(40), np.zeros((40, 3))), poses, atol=1e-6)
+    assert_allclose(found.mended(np.arange(40), np.zeros((40, 3))), poses, atol=1e-6)
 
 
 def test_shares_of_a_jump_by_hand():
@@ -80,12 +81,12 @@ def test_shares_of_a_jump_by_hand():
                         by_odometry=0 * jump, sigma=np.array([[0.4, 0.4, 0.2]]),
                         chance=np.arange(9.0))
     start, end = np.array([0, 2, 3, 0, 6]), np.array([2, 3, 6, 8, 8])
-    np.testing.assert_allclose(found.share(start, end)[:, 0], [0, 0.25, 0.75, 1, 0])
+    assert_allclose(found.share(start, end)[:, 0], [0, 0.25, 0.75, 1, 0])
     motion, covariance = found.added(start[1:2], end[1:2])
-    np.testing.assert_allclose(motion, jump / 4)
-    np.testing.assert_allclose(covariance, [np.diag([0.04, 0.04, 0.01])])
+    assert_allclose(motion, jump / 4)
+    assert_allclose(covariance, [np.diag([0.04, 0.04, 0.01])])
     spike = replace(found, chance=np.cumsum([1, 1, 1, 1, 1e6, 1, 1, 1, 1]))
-    np.testing.assert_allclose(spike.share(start, end)[:, 0], [0, 0, 1, 1, 0], atol=1e-5)
+    assert_allclose(spike.share(start, end)[:, 0], [0, 0, 1, 1, 0], atol=1e-5)
 
 
 def errors(result, truth):

@@ -19,6 +19,7 @@ from numeric import (
     wheel_nees,
     without_headings,
 )
+from numpy.testing import assert_allclose, assert_array_equal
 
 from slamlib import fuse, fuse_increments, localize, studies
 from slamlib.core import increments, odometry, se2
@@ -32,12 +33,12 @@ from slamlib.studies.simulation import TABLE_2
 def test_perfect_data_give_the_exact_poses_map_and_wheels():
     dataset, truth = short(1, noise=False)
     for each in (fuse(dataset, slip=1e-3), fuse(dataset)):
-        np.testing.assert_allclose(each.poses, truth.poses, atol=1e-9)
-        np.testing.assert_allclose(each.wheel, [0.1, 0.1, 0.4], atol=1e-9)
+        assert_allclose(each.poses, truth.poses, atol=1e-9)
+        assert_allclose(each.wheel, [0.1, 0.1, 0.4], atol=1e-9)
     found = localize(dataset.aruco)
     error = se2.difference(found.poses, truth.poses[found.frame])
-    np.testing.assert_allclose(error, 0, atol=1e-9)
-    np.testing.assert_allclose(
+    assert_allclose(error, 0, atol=1e-9)
+    assert_allclose(
         found.marker_in_world, true_markers(truth, found.marker), atol=1e-9)
 
 
@@ -53,10 +54,10 @@ def test_two_increments_by_hand():
                          np.diag([s**2, s**2, 1e-16]))
     found = localize(readings)
     naive = localize(readings, shared_errors=False)
-    np.testing.assert_allclose(found.poses[:, 0], [0, 0.1, 0.2], atol=1e-12)
-    np.testing.assert_allclose(found.covariances[:, 0, 0] / s**2, [0, 2, 2], atol=1e-9)
-    np.testing.assert_allclose(naive.covariances[:, 0, 0] / s**2, [0, 2, 4], atol=1e-9)
-    np.testing.assert_allclose(found.marker_covariance[0, 0, 0] / s**2, 1, atol=1e-9)
+    assert_allclose(found.poses[:, 0], [0, 0.1, 0.2], atol=1e-12)
+    assert_allclose(found.covariances[:, 0, 0] / s**2, [0, 2, 2], atol=1e-9)
+    assert_allclose(naive.covariances[:, 0, 0] / s**2, [0, 2, 4], atol=1e-9)
+    assert_allclose(found.marker_covariance[0, 0, 0] / s**2, 1, atol=1e-9)
 
 
 def test_covariances_are_those_of_all_sightings_through_numerical_derivatives():
@@ -87,8 +88,8 @@ def test_covariances_are_those_of_all_sightings_through_numerical_derivatives():
         expected_poses += C[:4]
         expected_map += C[4:]
     scale = np.abs(expected_poses).max()
-    np.testing.assert_allclose(found.covariances, expected_poses, atol=1e-5 * scale)
-    np.testing.assert_allclose(found.marker_covariance, expected_map, atol=1e-5 * scale)
+    assert_allclose(found.covariances, expected_poses, atol=1e-5 * scale)
+    assert_allclose(found.marker_covariance, expected_map, atol=1e-5 * scale)
 
 
 def trial(seed, poses, **options):
@@ -153,9 +154,9 @@ def test_frames_are_known_by_two_markers_or_one_that_adjacent_frames_confirm(fra
     A known marker that returns relocalizes only if adjacent frames confirm both sightings.
     """
     found, known = localize(seen_in(*frames)), np.array(known)
-    np.testing.assert_array_equal(np.isfinite(found.poses[:, 0]), known)
-    np.testing.assert_array_equal(np.isfinite(found.covariances[:, 0, 0]), known)
-    np.testing.assert_allclose(
+    assert_array_equal(np.isfinite(found.poses[:, 0]), known)
+    assert_array_equal(np.isfinite(found.covariances[:, 0, 0]), known)
+    assert_allclose(
         found.poses[known, 0], 0.1 * (np.flatnonzero(known) - known.argmax()), atol=1e-12)
     assert not found.rejected.any() and (found.unused[0] or frames[0] != [9])
 
@@ -164,17 +165,17 @@ def test_the_map_has_markers_that_are_confirmed_and_seen_from_known_poses():
     """Marker 5 is seen once; 3 and 4 twice, but from poses that nothing connects to the world."""
     readings = seen_in([1, 2], [1, 2, 5], [3, 4], [3, 4], [1, 2])
     found = localize(readings)
-    np.testing.assert_array_equal(np.isfinite(found.poses[:, 0]), [True, True, False, False, True])
-    np.testing.assert_array_equal(found.marker, [1, 2])
-    np.testing.assert_allclose(found.marker_in_world[:, :2], [[1, -0.5], [2, -1]], atol=1e-12)
-    np.testing.assert_array_equal(readings.marker[found.unused], [5, 1, 2])
+    assert_array_equal(np.isfinite(found.poses[:, 0]), [True, True, False, False, True])
+    assert_array_equal(found.marker, [1, 2])
+    assert_allclose(found.marker_in_world[:, :2], [[1, -0.5], [2, -1]], atol=1e-12)
+    assert_array_equal(readings.marker[found.unused], [5, 1, 2])
     assert not found.rejected.any()
 
 
 def test_a_single_frame_is_the_origin_of_a_map_without_markers():
     """Nothing confirms a marker that is seen once."""
     found = localize(seen_in([1, 2]))
-    np.testing.assert_array_equal(found.poses, [[0, 0, 0]])
+    assert_array_equal(found.poses, [[0, 0, 0]])
     assert len(found.marker) == 0
 
 
@@ -208,8 +209,8 @@ def test_without_odometry_it_is_the_localization_from_markers():
     fused = fuse(quiet, slip=1.0)
     assert len(alone.frame) > 8 and not alone.rejected.any()
     difference = se2.difference(fused.poses[alone.frame], alone.poses)
-    np.testing.assert_allclose(difference, 0, atol=1e-6)
-    np.testing.assert_allclose(fused.covariances[alone.frame], alone.covariances,
+    assert_allclose(difference, 0, atol=1e-6)
+    assert_allclose(fused.covariances[alone.frame], alone.covariances,
                                atol=1e-3 * alone.covariances.max())
 
 
@@ -221,13 +222,13 @@ def test_a_dataset_without_markers_is_fused_to_odometry(slip):
     poses, covariances = odometry.first_order(ticks, vehicle, model="arc")
     fused = fuse(dataset, slip)
     pose = np.arange(len(ticks))
-    np.testing.assert_allclose(fused.poses, poses, atol=1e-9)
+    assert_allclose(fused.poses, poses, atol=1e-9)
     rounding, slipping = increments.noise_in_drive(ticks, vehicle, 0 * pose, pose)
     expected = covariances + rounding + fused.slip**2 * slipping
-    np.testing.assert_allclose(fused.covariances, expected, atol=1e-12)
+    assert_allclose(fused.covariances, expected, atol=1e-12)
     assert fused.rejected == 0 and 1e-3 <= fused.slip < 2.1e-3
-    np.testing.assert_array_equal(fused.wheel, vehicle.wheel)
-    np.testing.assert_allclose(fused.wheel_covariance, np.diag(vehicle.sigma_wheel**2))
+    assert_array_equal(fused.wheel, vehicle.wheel)
+    assert_allclose(fused.wheel_covariance, np.diag(vehicle.sigma_wheel**2))
 
 
 @pytest.mark.parametrize("propagation", [odometry.equation2, odometry.first_order])
@@ -235,8 +236,8 @@ def test_the_hint_without_markers_is_the_propagation_of_the_whole_drive(propagat
     dataset = short(5)[0].without("aruco")
     poses, covariances = propagation(dataset.ticks, dataset.vehicle)
     hint = fuse_increments(dataset, propagation)
-    np.testing.assert_array_equal(hint.poses, poses)
-    np.testing.assert_array_equal(hint.covariances, covariances)
+    assert_array_equal(hint.poses, poses)
+    assert_array_equal(hint.covariances, covariances)
     assert hint.rejected == 0
 
 
@@ -297,7 +298,7 @@ def test_wheels_are_not_learned_from_counts_that_creep():
     unsure = vehicle(sigma_right_radius=0.01, sigma_left_radius=0.01)
     dataset, truth = short(3)
     fused = fuse(unsure(after_a_stand(dataset, truth)))
-    np.testing.assert_allclose(fused.wheel[:2], truth.vehicle.wheel[:2], rtol=0.01)
+    assert_allclose(fused.wheel[:2], truth.vehicle.wheel[:2], rtol=0.01)
     driven = slice(-len(truth.poses), None)
     assert ate(fused.poses[driven], truth.poses) < 0.1
     assert anees(fused.poses[driven], fused.covariances[driven], truth.poses) < 6
@@ -322,9 +323,9 @@ def test_a_camera_that_is_turned_is_found():
     dataset, truth = short(3)
     fused = fuse(aruco(dataset, marker_in_vehicle=se2.compose(
         [0, 0, -0.08], dataset.aruco.marker_in_vehicle)))
-    np.testing.assert_allclose(fused.camera[2], 0.08, atol=0.005)
+    assert_allclose(fused.camera[2], 0.08, atol=0.005)
     assert anees(fused.poses, fused.covariances, truth.poses) < 6
-    np.testing.assert_array_equal(fuse(dataset).camera, [0, 0, 0])
+    assert_array_equal(fuse(dataset).camera, [0, 0, 0])
 
 
 @pytest.mark.parametrize("propagation", [odometry.equation2, odometry.first_order])
@@ -339,13 +340,13 @@ def test_the_hint_fuses_by_information(propagation):
     information = [np.linalg.inv(covariances[-1]), np.linalg.inv(marker.covariances[1])]
     C = np.linalg.inv(sum(information))
     delta = C @ (information[0] @ poses[-1] + information[1] @ marker.poses[1])
-    np.testing.assert_allclose(fused.poses[10], delta, atol=1e-9)
-    np.testing.assert_allclose(fused.covariances[10], C, atol=1e-6 * np.abs(C).max())
+    assert_allclose(fused.poses[10], delta, atol=1e-9)
+    assert_allclose(fused.covariances[10], C, atol=1e-6 * np.abs(C).max())
     # From there on odometry goes on alone, restarted.
     expected, expected_covariances = propagation(
         dataset.ticks[10:], sure, fused.poses[10], fused.covariances[10])
-    np.testing.assert_allclose(fused.poses[10:], expected, atol=1e-12)
-    np.testing.assert_allclose(fused.covariances[10:], expected_covariances, atol=1e-15)
+    assert_allclose(fused.poses[10:], expected, atol=1e-12)
+    assert_allclose(fused.covariances[10:], expected_covariances, atol=1e-15)
 
 
 @pytest.mark.parametrize("keep", [
@@ -420,9 +421,9 @@ def test_the_slip_and_the_factor_that_a_vehicle_gives_are_taken():
     known = vehicle(slip=3e-3)(dataset)
     plain, given, option = fuse(dataset), fuse(known), fuse(dataset, slip=3e-3)
     assert given.slip == option.slip == 3e-3 and fuse(known, slip=1e-3).slip == 1e-3
-    np.testing.assert_array_equal(given.poses, option.poses)
+    assert_array_equal(given.poses, option.poses)
     assert np.abs(given.poses - plain.poses).max() > 1e-6
     doubled = aruco(dataset, covariance=4 * dataset.aruco.covariance)
     halved = fuse(vehicle(marker_noise_factor=0.5)(doubled))
-    np.testing.assert_allclose(halved.poses, plain.poses, rtol=0, atol=1e-12)
+    assert_allclose(halved.poses, plain.poses, rtol=0, atol=1e-12)
     assert np.abs(fuse(doubled).poses - plain.poses).max() > 1e-6

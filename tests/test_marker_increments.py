@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from slamlib.core import se2
 from slamlib.core.evaluation import nees, nees_band
@@ -39,7 +40,7 @@ def sightings(delta=DELTA, markers=MARKERS, covariance=C, rng=None):
 def test_exact_sightings_give_the_exact_increment(delta, count, covariance):
     """One marker determines it, or two without heading."""
     found = robust_increments(*sightings(delta, MARKERS[:count], covariance), 1)
-    np.testing.assert_allclose(se2.difference(found.increment[0], delta), 0, atol=1e-8)
+    assert_allclose(se2.difference(found.increment[0], delta), 0, atol=1e-8)
     assert found.accepted.all() and found.usable.all() and found.covariance[0, 2, 2] < 0.02**2
 
 
@@ -53,7 +54,7 @@ def test_covariance_by_hand():
     z = np.array([[d, 0, 0.5], [-d, 0, -1.5]])
     args = sightings(np.zeros(3), z, np.diag([s**2, s**2, t**2]))
     expected = np.diag([s**2, s**2, 1 / (d**2 / s**2 + 1 / t**2)])
-    np.testing.assert_allclose(robust_increments(*args, 1).covariance[0], expected, atol=1e-18)
+    assert_allclose(robust_increments(*args, 1).covariance[0], expected, atol=1e-18)
 
 
 @pytest.mark.parametrize("count, wrong, sigma", [
@@ -69,13 +70,13 @@ def test_the_best_hypothesis_is_the_increment_itself(count, wrong, sigma):
     covariance = np.tile(np.diag([1e-4, 1e-4, sigma**2]), (2 * count, 1, 1))
     pair = np.repeat([0, 2], count)
     found = _best_hypothesis(_Common(pair, z1, covariance, z2, covariance, 3))
-    np.testing.assert_allclose(se2.difference(found, deltas), 0, atol=1e-12)
+    assert_allclose(se2.difference(found, deltas), 0, atol=1e-12)
 
 
 def test_distance_and_turn_by_hand():
     motion, C = np.array([[3.0, -4.0, 2 * np.pi - 0.1]]), np.diag([9.0, 16.0, 4.0])
-    np.testing.assert_allclose(distance_and_turn(motion), [[5, 0.1]])
-    np.testing.assert_allclose(distance_and_turn_sigmas(C[None]), [[5, 2]])
+    assert_allclose(distance_and_turn(motion), [[5, 0.1]])
+    assert_allclose(distance_and_turn_sigmas(C[None]), [[5, 2]])
 
 
 def test_many_increments_are_consistent():
@@ -87,7 +88,7 @@ def test_many_increments_are_consistent():
     pair = np.repeat(np.arange(count), m)
     found = robust_increments(z, covariances, pair, first, first + m, count)
     image = sum(D @ C @ np.swapaxes(D, 1, 2) for D in (found.J_first, found.J_second))
-    np.testing.assert_allclose(image.reshape(count, m, 3, 3).sum(1), found.covariance, atol=1e-9)
+    assert_allclose(image.reshape(count, m, 3, 3).sum(1), found.covariance, atol=1e-9)
     low, high = nees_band(count)
     errors = found.increment - DELTA
     assert low < nees(errors, found.covariance, np.zeros_like(errors)).mean() < high
@@ -106,8 +107,8 @@ def test_wrong_labels_are_rejected(count, wrong, oriented):
         z[second[:wrong], :2] += rng.choice([-1, 1], (wrong, 2)) * rng.uniform(0.8, 2, (wrong, 2))
         z[second[:wrong], 2] = rng.uniform(-np.pi, np.pi, wrong)
         found = robust_increments(z, covariances, pair, first, second, 1)
-        np.testing.assert_array_equal(found.accepted, np.arange(count) >= wrong)
-        np.testing.assert_allclose(found.increment[0], DELTA, atol=0.1)
+        assert_array_equal(found.accepted, np.arange(count) >= wrong)
+        assert_allclose(found.increment[0], DELTA, atol=0.1)
 
 
 def test_what_determines_no_increment_is_not_usable():
@@ -155,8 +156,8 @@ def test_an_implausible_speed_makes_an_increment_unusable(way, turn, start):
         row[order := np.lexsort((marker, row))], marker[order]), 80)
     found = consecutive(z, covariances, row, marker)
     assert alone.usable.all()                               # the test of the speed rejects them
-    np.testing.assert_array_equal(np.flatnonzero(~found.usable), [0, 40, 41, 79])
-    np.testing.assert_array_equal(found.accepted, found.usable[found.pair])
+    assert_array_equal(np.flatnonzero(~found.usable), [0, 40, 41, 79])
+    assert_array_equal(found.accepted, found.usable[found.pair])
 
 
 def test_repeated_sightings_are_averaged_or_dropped():
@@ -168,11 +169,11 @@ def test_repeated_sightings_are_averaged_or_dropped():
                             + [np.diag([1e-2, 1e-2, 1e-2])] * 2))
     before = readings.marker_in_vehicle.copy()
     index, z, covariance, contradicting = merge_repeated(readings)
-    np.testing.assert_array_equal(index, [1, 0])                # the two of pose 4 disagree
+    assert_array_equal(index, [1, 0])                # the two of pose 4 disagree
     assert contradicting == 2
-    np.testing.assert_allclose(z, [[0, 2, 0], [1.02, 1, np.pi]], atol=1e-12)
-    np.testing.assert_allclose(covariance[1], np.diag([5e-3, 5e-3, 7.5e-3]))
-    np.testing.assert_array_equal(readings.marker_in_vehicle, before)
+    assert_allclose(z, [[0, 2, 0], [1.02, 1, np.pi]], atol=1e-12)
+    assert_allclose(covariance[1], np.diag([5e-3, 5e-3, 7.5e-3]))
+    assert_array_equal(readings.marker_in_vehicle, before)
 
 
 def test_covariances_that_are_nearly_singular_are_increased_by_hand():
@@ -182,9 +183,9 @@ def test_covariances_that_are_nearly_singular_are_increased_by_hand():
     C[:, [0, 1], [0, 1]], C[:, 0, 1] = sigma[:, None]**2, rho * sigma**2
     C[:, 1, 0] = C[:, 0, 1]
     added = np.array([0, 1e-12, 0])[:, None, None] * np.diag([1, 1, 0])
-    np.testing.assert_allclose(regular(C) - C, added, rtol=1e-3, atol=1e-18)
+    assert_allclose(regular(C) - C, added, rtol=1e-3, atol=1e-18)
     far = np.array([np.diag([1e8, 1e-18, 1e-4]), np.diag([1e-18, 1e8, 1e-4])])   # a millionth
-    np.testing.assert_allclose(regular(far) - far, [np.diag([0, 1e-4, 0]), np.diag([1e-4, 0, 0])])
+    assert_allclose(regular(far) - far, [np.diag([0, 1e-4, 0]), np.diag([1e-4, 0, 0])])
 
 
 def test_consensus_takes_the_most_certain_sighting_among_the_supported():
@@ -192,7 +193,7 @@ def test_consensus_takes_the_most_certain_sighting_among_the_supported():
     in_world = np.array([[0, 0, 3.1], [1, 0, 3.1], [0.01, 0, -3.13], [0, 0.01, 3.1], [5, 5, 0]])
     variance = np.array([4, 1, 3, 2, 9]) * 1e-4
     rows = consensus(np.array([4, 4, 4, 4, 2]), in_world, variance[:, None, None] * np.eye(3))
-    np.testing.assert_array_equal(rows, [4, 3])
+    assert_array_equal(rows, [4, 3])
     covariance = variance[[0, 1, 3, 2, 1], None, None] * np.eye(3)
     assert consensus(np.zeros(5, int), np.zeros((5, 3)), covariance, 2) == 3       # or 0, of two
 
@@ -204,7 +205,7 @@ def test_returns_measure_the_true_motion(wrong):
     found = returns(dataset)
     assert len(found.start) > 5 and (found.end - found.start > 450).all()          # poses, of 5 m
     assert np.diff(found.end).min() == 10                                  # every frame is asked
-    np.testing.assert_allclose(found.discrepancies(truth.poses), 0, atol=1e-8)
+    assert_allclose(found.discrepancies(truth.poses), 0, atol=1e-8)
 
 
 def test_a_drive_without_markers_or_that_goes_nowhere_again_has_no_returns():

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from numeric import changed, uwb
+from numpy.testing import assert_allclose, assert_array_equal
 
 from slamlib import estimate, studies
 from slamlib.core import evaluation, se2
@@ -44,7 +45,7 @@ def test_equal_errors_count_once(part):
     error = np.random.default_rng(1).standard_normal((LANDMARKS, 1, 3))
     error *= np.sqrt((1 - part / 2) / np.mean(error**2))
     found = error_memory(*tracks(np.repeat(error, EACH, axis=1)))
-    np.testing.assert_allclose(found.share, 1 / EACH)
+    assert_allclose(found.share, 1 / EACH)
     assert found.correlation == pytest.approx(1)
 
 
@@ -58,9 +59,9 @@ def test_shares_by_hand():
     rho = np.array(rho) + max(0, 1 - np.mean(u[used]**2))
     assert rho[0] > 0.3 and rho[1] < 0.05
     share = error_memory(landmark, pose, u, used).share.reshape(LANDMARKS, EACH)
-    np.testing.assert_allclose(share[:, 0], 1)
-    np.testing.assert_allclose(share[:, [1, -1]], 1 / (1 + rho[0]))
-    np.testing.assert_allclose(share[:, 2:-1], 1 / (1 + 2 * rho[0]))
+    assert_allclose(share[:, 0], 1)
+    assert_allclose(share[:, [1, -1]], 1 / (1 + rho[0]))
+    assert_allclose(share[:, 2:-1], 1 / (1 + 2 * rho[0]))
 
 
 @pytest.fixture(scope="module")
@@ -156,7 +157,7 @@ def test_visits_end_with_a_long_break():
     order = np.argsort(pose, kind="stable")
     aruco = ArucoReadings(pose[order], marker[order], None, None)
     expected = np.repeat([0, 0, 1, 2], [5, 4, 3, 3])[order]
-    np.testing.assert_array_equal(visits(aruco), expected)
+    assert_array_equal(visits(aruco), expected)
 
 
 @pytest.mark.parametrize("off, P_1, P_2, squared", [
@@ -172,7 +173,7 @@ def test_the_distance_of_two_visits_by_hand(off, P_1, P_2, squared):
     C = 0.01 * np.array([P_1, P_2])[:, None, None] * np.eye(3)
     result = SimpleNamespace(marker=np.array([4, 6]), marker_in_world=np.array([first, second]),
                              poses=np.zeros((2, 3)), covariances=C)
-    np.testing.assert_allclose(_squared_distance(result, 4, 6, 0, 1), squared)
+    assert_allclose(_squared_distance(result, 4, 6, 0, 1), squared)
 
 
 @pytest.fixture(scope="module")
@@ -207,7 +208,7 @@ def test_moved_markers_are_landmarks_of_their_own(moved):
     assert all(str(each) in told["places"] for each in set(places))
     assert clean.places is None
     both = estimate(dataset, previous=result)
-    np.testing.assert_array_equal(both.places, result.places)
+    assert_array_equal(both.places, result.places)
     assert evaluation.ate(both.poses, truth.poses, aligned=True) < 0.01
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numeric import as_points, known_noise
+from numpy.testing import assert_allclose
 from scipy.special import chdtri
 
 from slamlib.core import sightings
@@ -50,7 +51,7 @@ def test_markers_without_accepted_sightings_have_a_weak_prior_and_nothing_else()
     H = m.structure.matrix(equations.sums(problem.noise).H).toarray()
     for j in markers:
         own = m.structure.rows[len(m.frame) + j, :2 + m.oriented[j]]
-        np.testing.assert_allclose(H[np.ix_(own, own)], np.eye(len(own)) / WEAK_SIGMA**2)
+        assert_allclose(H[np.ix_(own, own)], np.eye(len(own)) / WEAK_SIGMA**2)
         assert np.count_nonzero(H[own]) == len(own)
 
 
@@ -67,7 +68,7 @@ def test_selected_blocks_are_those_of_the_dense_inverse(poses):
     information = dense_information(m.structure, equations.sums(given))
     active = problem.active
     n = len(information) - np.count_nonzero(active)
-    np.testing.assert_allclose(information, information.T, rtol=1e-9, atol=1e-6)
+    assert_allclose(information, information.T, rtol=1e-9, atol=1e-6)
     unit = np.append(np.ones(n), problem.sigma[active])
     expected = np.linalg.inv(information) * np.outer(unit, unit)
     sigma = np.sqrt(np.diag(expected))
@@ -75,7 +76,7 @@ def test_selected_blocks_are_those_of_the_dense_inverse(poses):
 
     def check(at, blocks):
         scale = sigma[at][:, :, None] * sigma[at][:, None]
-        np.testing.assert_allclose(
+        assert_allclose(
             blocks / scale, expected[at[:, :, None], at[:, None]] / scale, atol=1e-6)
 
     frames, landmarks = np.split(m.structure.rows, [len(m.frame)])
@@ -103,16 +104,16 @@ def test_points_of_the_posterior_have_its_moments():
     weights, logs = posterior_points(BROAD)
     assert len(weights) == 5 and np.isclose(sum(weights), 1)
     rest = np.diag(BROAD) - BROAD[0]**2 / BROAD[0, 0]           # given the slip
-    np.testing.assert_allclose(weights @ logs, CENTRE + rest, atol=1e-6)
+    assert_allclose(weights @ logs, CENTRE + rest, atol=1e-6)
     spread = logs - CENTRE - rest
-    np.testing.assert_allclose((weights * spread.T) @ spread,
+    assert_allclose((weights * spread.T) @ spread,
                                np.outer(BROAD[0], BROAD[0]) / BROAD[0, 0], rtol=0.02, atol=1e-12)
 
 
 def test_a_narrow_posterior_is_one_point():
     weights, logs = posterior_points(0.01 * BROAD)
     assert weights.tolist() == [1]
-    np.testing.assert_allclose(logs[0], CENTRE + 0.01 * np.diag(BROAD), rtol=1e-12)
+    assert_allclose(logs[0], CENTRE + 0.01 * np.diag(BROAD), rtol=1e-12)
 
 
 @pytest.mark.parametrize("free", [[0, 1, 2], [0, 2]], ids=str)
@@ -136,7 +137,7 @@ def test_newton_finds_the_mode_of_a_log_density_and_its_covariance(free, skew, s
     assert value == log_density(x)
     expected = np.zeros((3, 3))
     expected[np.ix_(free, free)] = C
-    np.testing.assert_allclose(covariance, expected, atol=1e-6 + 0.1 * skew * C.max())
+    assert_allclose(covariance, expected, atol=1e-6 + 0.1 * skew * C.max())
 
 
 def test_gates_are_quantiles_of_chi_squared():
@@ -171,7 +172,7 @@ def test_solution_and_evidence_are_those_of_dense_normal_equations(groups, kerne
         unit = 1 / np.sqrt(np.diag(information))
         scaled = np.outer(unit, unit) * information
         expected = -unit * np.linalg.solve(scaled, unit * gradient)
-        np.testing.assert_allclose(delta, expected, rtol=1e-5, atol=1e-8)
+        assert_allclose(delta, expected, rtol=1e-5, atol=1e-8)
         squared = sums.squared + gradient @ expected
         determinant = np.linalg.slogdet(scaled)[1] - 2 * np.sum(np.log(unit))
         of_odometry = np.sum(np.linalg.slogdet(problem.odometry.covariance(other.slip))[1])

@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numeric import central_differences
+from numpy.testing import assert_allclose, assert_array_equal
 
 from slamlib.core import increments, odometry, se2
 from slamlib.core.se2 import correlations
@@ -66,9 +67,9 @@ ELSEWHERE = [3.0, -1.0, 2.5], np.array(
 def test_closed_form_is_the_literal_recursion(ticks, start):
     poses, covariances = odometry.equation2(ticks, VEHICLE, *(start if start is ELSEWHERE else ()))
     expected_poses, expected = literal_recursion(ticks, VEHICLE, *start)
-    np.testing.assert_allclose(poses, expected_poses, rtol=1e-12, atol=1e-11)
+    assert_allclose(poses, expected_poses, rtol=1e-12, atol=1e-11)
     assert relative_difference(covariances, expected) < 1e-12
-    np.testing.assert_array_equal(covariances[0], start[1])
+    assert_array_equal(covariances[0], start[1])
 
 
 @pytest.mark.parametrize("model, expected", [
@@ -80,7 +81,7 @@ def test_one_step_by_hand(model, expected):
     They describe a circle of radius ds / dtheta = 0.6 through 45 degrees.
     """
     poses = odometry.dead_reckoning([[0, 0], [8000, 4000]], VEHICLE, (1.0, 2.0, np.pi / 2), model)
-    np.testing.assert_allclose(poses, [[1, 2, np.pi / 2], expected], atol=1e-15)
+    assert_allclose(poses, [[1, 2, np.pi / 2], expected], atol=1e-15)
 
 
 @BOTH
@@ -92,7 +93,7 @@ def test_wheel_jacobian_against_central_differences(model, ticks):
         lambda w: odometry.dead_reckoning(ticks, VEHICLE.with_wheel(w), (0, 0, 0.4), model),
         VEHICLE.wheel, step=1e-7 if len(ticks) > 3 else 1e-6)
     analytic = odometry.wheel_jacobian(ticks, VEHICLE, 0.4, model)
-    np.testing.assert_allclose(analytic, numeric, atol=max(1e-9, 1e-6 * np.abs(numeric[3:]).max(
+    assert_allclose(analytic, numeric, atol=max(1e-9, 1e-6 * np.abs(numeric[3:]).max(
         initial=0)))
 
 
@@ -127,9 +128,9 @@ def test_both_covariances_against_monte_carlo(legs, equation2_holds):
     equation2 = odometry.equation2(ticks, VEHICLE)[1]
 
     scale = np.array([sigma[:2].max(), sigma[:2].max(), sigma[2]])
-    np.testing.assert_allclose(np.sqrt(np.diag(exact[-1])) / scale, sigma / scale, atol=0.05)
-    np.testing.assert_allclose(correlations(exact[-1]), correlations(sampled), atol=0.06)
-    np.testing.assert_allclose(np.sqrt(equation2[-1, 2, 2]), sigma[2], rtol=0.05)
+    assert_allclose(np.sqrt(np.diag(exact[-1])) / scale, sigma / scale, atol=0.05)
+    assert_allclose(correlations(exact[-1]), correlations(sampled), atol=0.06)
+    assert_allclose(np.sqrt(equation2[-1, 2, 2]), sigma[2], rtol=0.05)
     assert np.abs(correlations(sampled)[:2, 2]).max() > 0.9
     assert np.abs(correlations(equation2[-1])[:2, 2]).max() < 0.2
     difference = np.abs(np.sqrt(np.diag(equation2[-1])) - sigma)[:2].max() / sigma[:2].max()
@@ -145,15 +146,15 @@ def test_first_order_is_exact_for_the_initial_pose(model):
     C1 = np.array([[4e-4, 1e-4, 2e-4], [1e-4, 9e-4, -1e-4], [2e-4, -1e-4, 1e-3]])
     poses, covariances = odometry.first_order(ticks, sure, start, C1, model)
     A = central_differences(lambda p: odometry.dead_reckoning(ticks, VEHICLE, p, model)[-1], start)
-    np.testing.assert_allclose(covariances[-1], A @ C1 @ A.T, atol=1e-9)
-    np.testing.assert_allclose(poses, odometry.dead_reckoning(ticks, VEHICLE, start, model))
+    assert_allclose(covariances[-1], A @ C1 @ A.T, atol=1e-9)
+    assert_allclose(poses, odometry.dead_reckoning(ticks, VEHICLE, start, model))
 
 
 def test_a_single_pose_has_the_initial_covariance():
     for function in (odometry.equation2, odometry.first_order):
         poses, covariances = function(np.zeros((1, 2), int), VEHICLE)
-        np.testing.assert_array_equal(poses, [[0, 0, 0]])
-        np.testing.assert_array_equal(covariances, [np.diag([0, 0, 1e-8])])
+        assert_array_equal(poses, [[0, 0, 0]])
+        assert_array_equal(covariances, [np.diag([0, 0, 1e-8])])
 
 
 # Increments between any two poses, and their noise.
@@ -165,15 +166,15 @@ def test_increments_between_any_two_poses(model):
     start, end = np.array([0, 10, 35, 299, 120, 7]), np.array([299, 11, 190, 0, 120, 90])
     increment, by_w = increments.between_poses(ticks, VEHICLE, start, end, model)
     poses = odometry.dead_reckoning(ticks, VEHICLE, (2.0, 1.0, -0.7), model)
-    np.testing.assert_allclose(se2.compose(poses[start], increment), poses[end], atol=1e-12)
+    assert_allclose(se2.compose(poses[start], increment), poses[end], atol=1e-12)
     numeric = central_differences(
         lambda w: increments.between_poses(ticks, VEHICLE.with_wheel(w), start, end, model)[0],
         VEHICLE.wheel, step=1e-7)
-    np.testing.assert_allclose(by_w, numeric, atol=1e-6 * np.abs(numeric).max())
+    assert_allclose(by_w, numeric, atol=1e-6 * np.abs(numeric).max())
     # An increment depends on its own counts only.
     alone, alone_by_w = increments.between_poses(ticks[9:12], VEHICLE, [1], [2], model)
-    np.testing.assert_allclose(increment[1], alone[0], atol=1e-13)
-    np.testing.assert_allclose(by_w[1], alone_by_w[0], atol=1e-11)
+    assert_allclose(increment[1], alone[0], atol=1e-13)
+    assert_allclose(by_w[1], alone_by_w[0], atol=1e-11)
 
 
 def literal_noise(ticks, vehicle, start, end, slip):
@@ -207,14 +208,14 @@ def test_noise_is_the_sum_over_steps():
     got = noise_alone(ticks, VEHICLE, start, end, 2e-3)
     for s, e, noise in zip(start, end, got, strict=True):
         expected = literal_noise(ticks, VEHICLE, s, e, 2e-3)
-        np.testing.assert_allclose(noise, expected, atol=1e-9 * np.abs(expected).max())
+        assert_allclose(noise, expected, atol=1e-9 * np.abs(expected).max())
 
 
 def test_noise_keeps_its_digits_far_from_the_origin():
     """Steps of 157 m: the last one, 300 km away, has the noise of the first."""
     ticks, vehicle = np.full((2001, 2), 80_000), Vehicle(right_radius=2.5, left_radius=2.5)
     for part in increments.rounding_and_slipping(ticks, vehicle, [0, 1999], [1, 2000]):
-        np.testing.assert_allclose(part[1], part[0], rtol=1e-9, atol=1e-9 * part[0, 2, 2])
+        assert_allclose(part[1], part[0], rtol=1e-9, atol=1e-9 * part[0, 2, 2])
 
 
 def test_noise_in_drive_does_not_depend_on_how_the_drive_is_cut():
@@ -226,18 +227,18 @@ def test_noise_in_drive_does_not_depend_on_how_the_drive_is_cut():
         pose = np.arange(0, 2001, every)
         rounding, slipping = increments.noise_in_drive(ticks, VEHICLE, pose[:-1], pose[1:])
         expected = np.diag(whole)[[0, 2]] + [increments.MINIMUM_SLIP**2 * travelled, 0.0]
-        np.testing.assert_allclose(np.diag(rounding.sum(axis=0))[[0, 2]], expected, rtol=1e-6)
+        assert_allclose(np.diag(rounding.sum(axis=0))[[0, 2]], expected, rtol=1e-6)
         if every == 1:                                        # no lever arm: the skid alone
             skid = expected[0] - whole[0, 0]
-            np.testing.assert_allclose(rounding[:, 1, 1].sum(), skid, rtol=1e-4)
-            np.testing.assert_allclose(rounding[:, 0, 1], 0, atol=1e-6 * rounding[0, 1, 1])
+            assert_allclose(rounding[:, 1, 1].sum(), skid, rtol=1e-4)
+            assert_allclose(rounding[:, 0, 1], 0, atol=1e-6 * rounding[0, 1, 1])
         by_slip = travelled * np.array([1 / 2, 2 / VEHICLE.wheelbase**2])
-        np.testing.assert_allclose(np.diag(slipping.sum(axis=0))[[0, 2]], by_slip, rtol=1e-6)
+        assert_allclose(np.diag(slipping.sum(axis=0))[[0, 2]], by_slip, rtol=1e-6)
     one, _ = increments.noise_in_drive(ticks[:2], VEHICLE, [0], [1])             # a single step
     difference = one[0] - noise_alone(ticks[:2], VEHICLE, [0], [1], 0.0)[0]
     skid = increments.MINIMUM_SLIP**2 * travelled / 2000
-    np.testing.assert_allclose(difference, np.diag([skid, skid, 0.0]), rtol=1e-9, atol=1e-20)
+    assert_allclose(difference, np.diag([skid, skid, 0.0]), rtol=1e-9, atol=1e-20)
     for part in increments.noise_in_drive(ticks, VEHICLE, [0, 700], [0, 700]):
-        np.testing.assert_array_equal(part, 0)
+        assert_array_equal(part, 0)
     for part in increments.noise_in_drive(ticks[:1], VEHICLE, [0], [0]):    # a single pose
-        np.testing.assert_array_equal(part, 0)
+        assert_array_equal(part, 0)

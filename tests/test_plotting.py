@@ -6,6 +6,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from matplotlib.transforms import Affine2D
+from numpy.testing import assert_allclose
 
 from slamlib.core import se2
 from slamlib.core.evaluation import REACH_95
@@ -71,7 +72,7 @@ def require_contours(patches, means, covariances, k):
     for points, m, C in zip(boundaries(patches), means, covariances, strict=True):
         offset = points - m[:2]
         squared = np.sum(offset * np.linalg.solve(C[:2, :2], offset.T).T, axis=1)
-        np.testing.assert_allclose(squared, k**2, rtol=0.01)
+        assert_allclose(squared, k**2, rtol=0.01)
 
 
 def elongated(count, major, minor):

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numeric import errors_of, short, sigmas
+from numpy.testing import assert_allclose, assert_array_equal
 from test_dataset import FILES, write
 
 from slamlib.core import odometry, se2
@@ -168,7 +169,7 @@ def assert_positive(covariances, least, problem):
     assert np.isfinite(covariances).all(), problem
     sigma = np.maximum(sigmas(covariances), 1e-15)
     correlation = covariances / (sigma[:, :, None] * sigma[:, None])
-    np.testing.assert_allclose(correlation, correlation.mT, 0, 1e-9)
+    assert_allclose(correlation, correlation.mT, 0, 1e-9)
     if len(covariances):
         assert np.linalg.eigvalsh(correlation)[:, 0].min() > least, problem
 
@@ -224,9 +225,9 @@ def test_ids_the_order_of_rows_and_the_side_are_names_only():
         others = estimates(dataset_from_arrays(ticks, **tables, vehicle=dataset.vehicle))
         for (name, expected, x, C), (_, found, other, other_C) in zip(
                 estimates(dataset, **changes), others, strict=True):
-            np.testing.assert_array_equal(found, expected, err_msg=name)
+            assert_array_equal(found, expected, err_msg=name)
             off = other - x
             off[:, 2:] = se2.wrap(off[:, 2:])
             sigma = sigmas(C) + SMALLEST
             for share in (off / sigma, (other_C - C) / (sigma[:, :, None] * sigma[:, None])):
-                np.testing.assert_allclose(share, 0 * share, 0, LEARNED, err_msg=name)
+                assert_allclose(share, 0 * share, 0, LEARNED, err_msg=name)

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 from conftest import ROOT
+from numpy.testing import assert_allclose, assert_array_equal
 
 from slamlib.core import odometry, se2
 from slamlib.core.vehicle import Vehicle
@@ -44,7 +45,7 @@ def test_perfect_data_agrees_with_its_truth():
     for error in (poses - truth.poses, sighting_errors(dataset, truth),
                   range_errors(dataset, truth),
                   dataset.antenna_guess.position - truth.antenna_in_world):
-        np.testing.assert_allclose(error, 0, atol=1e-10)
+        assert_allclose(error, 0, atol=1e-10)
 
 
 def test_noise_has_the_covariances_that_the_files_state():
@@ -88,7 +89,7 @@ def test_encoder_error_is_a_random_walk_with_the_variance_of_slip(slip):
 def test_outliers_come_at_the_asked_rates_and_late_ranges_are_too_long():
     clean, truth = simulate("long", seed=8)
     dirty, _ = simulate("long", seed=8, late_ranges=0.15, mislabelled=0.03)
-    np.testing.assert_array_equal(clean.ticks, dirty.ticks)
+    assert_array_equal(clean.ticks, dirty.ticks)
     wrong = dirty.aruco.marker != clean.aruco.marker
     assert abs(wrong.mean() - 0.03) < 0.01
     assert np.isin(dirty.aruco.marker, truth.marker).all()
@@ -104,10 +105,10 @@ def test_files_round_trip_through_the_reader(tmp_path):
     write_dataset(tmp_path / "drive", dataset, truth)
     again, true_again = read_dataset(tmp_path / "drive"), read_truth(tmp_path / "drive")
     assert again.vehicle == vehicle and true_again.vehicle == truth.vehicle
-    np.testing.assert_array_equal(again.ticks, dataset.ticks)
+    assert_array_equal(again.ticks, dataset.ticks)
     for sensor in ("aruco", "uwb", "antenna_guess"):
         found, written = vars(getattr(again, sensor)), vars(getattr(dataset, sensor))
         for name in written:
-            np.testing.assert_allclose(found[name], written[name], rtol=1e-4, atol=6e-4)
+            assert_allclose(found[name], written[name], rtol=1e-4, atol=6e-4)
     for name in ("poses", "marker", "marker_in_world", "antenna", "antenna_in_world"):
-        np.testing.assert_allclose(getattr(true_again, name), getattr(truth, name), atol=6e-7)
+        assert_allclose(getattr(true_again, name), getattr(truth, name), atol=6e-7)

@@ -17,6 +17,7 @@ from numeric import (
     vehicle,
     without_headings,
 )
+from numpy.testing import assert_allclose, assert_array_equal
 
 from slamlib import estimate, studies
 from slamlib.core import odometry, se2
@@ -61,7 +62,7 @@ def test_odometry_derivatives_against_central_differences(in_counts):
 
     _, J, by_wheel = factors.odometry_error(odometry, poses, wheel)
     numeric = central_differences(error, np.zeros(9))
-    np.testing.assert_allclose(np.hstack([J[0], by_wheel[0]]), numeric, atol=1e-6)
+    assert_allclose(np.hstack([J[0], by_wheel[0]]), numeric, atol=1e-6)
 
 
 def learned_noise(seed, slip):
@@ -99,8 +100,8 @@ def test_a_slip_that_is_not_known_widens_the_covariance(slip, drives, ratio):
         low, high = nees_band(drives, probability=0.999)
         assert low < runs["learned nees"].mean() < high and runs["arc"].mean() > 0.8
     if slip == 3e-3:
-        np.testing.assert_allclose(runs["slip"], slip, rtol=0.3)
-        np.testing.assert_allclose(runs["learned nees"], runs["known nees"], rtol=0.3)
+        assert_allclose(runs["slip"], slip, rtol=0.3)
+        assert_allclose(runs["learned nees"], runs["known nees"], rtol=0.3)
 
 
 def test_wrong_covariances_of_sightings_are_scaled():
@@ -112,7 +113,7 @@ def test_wrong_covariances_of_sightings_are_scaled():
     assert 0.005 < found.noise_sigma[1] < 0.03               # about 2700 errors: 1 / sqrt(2 * 2700)
     off = (found.poses - expected.poses)[1:] / sigmas(expected.covariances)[1:]
     assert np.abs(off).max() < 0.5
-    np.testing.assert_allclose(found.covariances[-1], expected.covariances[-1], rtol=0.2,
+    assert_allclose(found.covariances[-1], expected.covariances[-1], rtol=0.2,
                                atol=0.1 * expected.covariances[-1].max())
 
 
@@ -158,8 +159,8 @@ def test_two_poses_and_one_marker_by_hand():
     found = estimate(known_noise(dataset, slip), model="arc")
     q = slip**2 * o / 2
     expected = (2 * r * o + q * (s_1 - s_2)) / (2 * r + q)
-    np.testing.assert_allclose(found.poses[100, 0], expected, atol=1e-5)
-    np.testing.assert_allclose(
+    assert_allclose(found.poses[100, 0], expected, atol=1e-5)
+    assert_allclose(
         [found.covariances[100, 0, 0], found.marker_covariance[0, 0, 0]],
         [2 * r * q / (2 * r + q), r * (r + q) / (2 * r + q)], rtol=1e-3)
 
@@ -175,7 +176,7 @@ def test_interpolated_poses_equal_those_of_a_graph_with_all_poses(every, sigma):
     expected = sigmas(dense.covariances)
     # The difference is of second order.
     assert (np.abs(sparse.poses - dense.poses) < 0.01 * expected + 2e-5).all()
-    np.testing.assert_allclose(sigmas(sparse.covariances), expected, rtol=0.02, atol=2e-5)
+    assert_allclose(sigmas(sparse.covariances), expected, rtol=0.02, atol=2e-5)
 
 
 @pytest.mark.slow
@@ -217,7 +218,7 @@ def test_markers_of_unknown_heading_are_mapped_as_points():
     found = estimate(replace(dataset, uwb=None, aruco=without_headings(dataset.aruco)))
     assert ate(found.poses, truth.poses) < 0.03 and found.rejected.mean() < 0.01
     assert anees(found.poses, found.covariances, truth.poses) < nees_band(1, probability=0.999)[1]
-    np.testing.assert_allclose(found.marker_covariance[:, 2, 2], 1e4)
+    assert_allclose(found.marker_covariance[:, 2, 2], 1e4)
     off = found.marker_in_world - true_markers(truth, found.marker)
     assert np.abs(off)[:, :2].max() < 0.05
     assert (found.marker_covariance[:, [0, 1], [0, 1]] < 0.05**2).all()
@@ -236,7 +237,7 @@ def test_the_gate_rejects_wrong_labels_and_hardly_any_others():
     ([-12, 2, 2], [0, 0, 1], [-12, 2, 102])])
 def test_a_second_place_gets_a_readable_id_that_the_drive_does_not_have(marker, place, expected):
     found = ids_of_places(np.array(marker), np.array(place))
-    np.testing.assert_array_equal(found, expected)
+    assert_array_equal(found, expected)
     assert len({*found}) == len({*zip(marker, place)})
 
 
@@ -294,14 +295,14 @@ def test_noise_that_is_known_is_not_learned_and_the_rest_is(known):
     dataset, _ = short(4, 400)
     found = estimate(dataset, **known)
     by_vehicle = estimate(vehicle(**known)(dataset))
-    np.testing.assert_array_equal(found.poses, by_vehicle.poses)
+    assert_array_equal(found.poses, by_vehicle.poses)
     given = np.array([name in known for name in NOISE_KEYS])
     for each in (found, estimate(dataset, previous=estimate(dataset.without("uwb")), **known)):
         values = np.array(each.noise)
-        np.testing.assert_array_equal(each.noise_sigma == 0, given)
-        np.testing.assert_allclose(values[given], list(known.values()), rtol=1e-12)
+        assert_array_equal(each.noise_sigma == 0, given)
+        assert_allclose(values[given], list(known.values()), rtol=1e-12)
         assert (values != [1e-3, 1, 1]).all()
-        np.testing.assert_allclose(values[1:][~given[1:]], 1, atol=0.2)
+        assert_allclose(values[1:][~given[1:]], 1, atol=0.2)
     assert np.abs(found.poses[-1] - estimate(dataset).poses[-1]).max() > 1e-6
 
 
@@ -330,7 +331,7 @@ def test_every_kernel_solves_a_drive_with_wrong_labels_and_late_ranges(kernel):
     dataset, truth = short(4, 800, mislabelled=0.01, late_ranges=0.05)
     gated = estimate(dataset, kernel=kernel, model="arc")
     assert gated.rejected.any() and ate(gated.poses, truth.poses) < 0.02
-    np.testing.assert_allclose(gated.noise.sightings, 1, atol=0.05)
+    assert_allclose(gated.noise.sightings, 1, atol=0.05)
     assert (gated.range_weight < 1).any()
     if kernel not in ONE_SIDED:                     # those leave the errors of sightings quadratic
         found = estimate(dataset, kernel=kernel, model="arc", gate=False)
@@ -355,7 +356,7 @@ def test_gates_of_poses_points_and_ranges(noise, gates, weights):
         AntennaGuess(at[:1], place)))
     state = state_from_arrays(m, np.zeros((1, 3)), 0 * z, place, m.calibration.stated)
     found = accepted_measurements(replace(build_problem(m, "arc"), noise=noise), state, *gates)
-    np.testing.assert_array_equal(np.r_[found.sightings.weight, found.ranges.weight], weights)
+    assert_array_equal(np.r_[found.sightings.weight, found.ranges.weight], weights)
 
 
 @pytest.mark.parametrize("true, other", [("arc", "euler"), ("euler", "arc")])
@@ -373,7 +374,7 @@ def test_the_evidence_chooses_the_steps_that_the_vehicle_drives(true, other):
     assert found.problem.odometry.model == true
     assert found.log_evidence > wrong.log_evidence + DECISIVE_LEAD
     for ours, theirs in zip(found.problem.accepted, wrong.problem.accepted):
-        np.testing.assert_array_equal(ours.weight, theirs.weight)
+        assert_array_equal(ours.weight, theirs.weight)
 
 
 def test_headings_are_continuous_where_frames_are_rounds_apart():
@@ -383,7 +384,7 @@ def test_headings_are_continuous_where_frames_are_rounds_apart():
     ends = (dataset.aruco.pose < 50) | (dataset.aruco.pose > last - 50)
     found = estimate(replace(dataset, uwb=None, aruco=dataset.aruco.select(ends)))
     assert abs(truth.poses[-1, 2]) > 18
-    np.testing.assert_allclose(found.poses[:, 2], truth.poses[:, 2], atol=0.3)
+    assert_allclose(found.poses[:, 2], truth.poses[:, 2], atol=0.3)
     assert np.abs(np.diff(found.poses[:, 2])).max() < 0.1
 
 
@@ -391,6 +392,6 @@ def test_a_drive_of_one_pose_has_its_prior():
     dataset, _ = short(8, 1)
     found = estimate(dataset)
     sigma = np.array([1e-5, 1e-5, dataset.vehicle.sigma_heading])
-    np.testing.assert_allclose(found.covariances, [np.diag(sigma**2)], atol=1e-18)
+    assert_allclose(found.covariances, [np.diag(sigma**2)], atol=1e-18)
     assert not found.poses.any() and len(found.marker) == len(dataset.aruco.pose) > 0
     assert max(found.agreement) < 1e-6

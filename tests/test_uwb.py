@@ -17,6 +17,7 @@ from numeric import (
     uwb,
     vehicle,
 )
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import quad
 
 from slamlib import estimate, studies
@@ -98,10 +99,10 @@ def test_derivatives_against_central_differences(error, kind, size):
 
     _, by_pose, by_place, _ = error(z, pose, place, c, motion, velocity)
     numeric = central_differences(moved, np.zeros(3 + size))
-    np.testing.assert_allclose(np.concatenate([by_pose, by_place], axis=2), numeric, atol=1e-7)
+    assert_allclose(np.concatenate([by_pose, by_place], axis=2), numeric, atol=1e-7)
     by_c = error(z, pose, place, c, motion, still)[3]         # a delay moves nothing that stands
     numeric = central_differences(lambda c: error(z, pose, place, c, motion, still)[0], c)
-    np.testing.assert_allclose(by_c, numeric[..., kind], atol=1e-7)
+    assert_allclose(by_c, numeric[..., kind], atol=1e-7)
 
 
 def test_antenna_from_known_poses_by_hand():
@@ -112,8 +113,8 @@ def test_antenna_from_known_poses_by_hand():
     u = place - poses[dataset.uwb.pose, :2]
     u /= np.hypot(*u.T)[:, None]
     expected = np.linalg.inv(u.T @ u / 0.05**2 + np.eye(2) / 5.0**2)
-    np.testing.assert_allclose(found.antenna_in_world[0], place, atol=2e-5)  # biased by the guess
-    np.testing.assert_allclose(found.antenna_covariance[0], expected, rtol=1e-2,
+    assert_allclose(found.antenna_in_world[0], place, atol=2e-5)  # biased by the guess
+    assert_allclose(found.antenna_covariance[0], expected, rtol=1e-2,
                                atol=1e-2 * expected.max())
     assert not found.doubts and (found.range_weight > 0.999).all()
 
@@ -130,7 +131,7 @@ def test_perfect_data_gives_the_exact_answer(without, tolerance):
             (found.poses, truth.poses), (found.wheel, [0.1, 0.1, 0.4]),
             (found.marker_in_world, true_markers(truth, found.marker)),
             (found.antenna_in_world, truth.antenna_in_world[:len(found.antenna)])):
-        np.testing.assert_allclose(values, expected, atol=tolerance)
+        assert_allclose(values, expected, atol=tolerance)
     assert not found.rejected.any()
 
 
@@ -147,7 +148,7 @@ def test_problem_4_from_problem_3_is_that_from_odometry(late):
     after = estimate(dataset, previous=estimate(dataset.without("uwb")))
     off = np.abs(after.poses - alone.poses)
     assert (off < 0.05 * sigmas(alone.covariances) + 1e-6).all()
-    np.testing.assert_allclose(after.antenna_in_world, alone.antenna_in_world, atol=1e-3)
+    assert_allclose(after.antenna_in_world, alone.antenna_in_world, atol=1e-3)
 
 
 def test_late_ranges_only_are_down_weighted_and_counted(late):
@@ -219,10 +220,10 @@ def test_a_mirrored_place_is_corrected_on_a_curved_path_and_told_on_a_straight_o
     dataset, _ = drive([(3.0, 0.0), (2.0, turn), (3.0, 0.0)], place, (2.5, 3.0 * side))
     found = estimate(known_noise(located(dataset), 1e-5), model="arc")
     if turn:
-        np.testing.assert_allclose(found.antenna_in_world[0], place, atol=1e-2)
+        assert_allclose(found.antenna_in_world[0], place, atol=1e-2)
         assert not found.doubts
     else:
-        np.testing.assert_allclose(found.antenna_in_world[0], place * [1, side], atol=1e-2)
+        assert_allclose(found.antenna_in_world[0], place * [1, side], atol=1e-2)
         assert "as well at" in found.doubts[7] and f"{-side * 4.0:.1f}" in found.doubts[7]
 
 
@@ -251,9 +252,9 @@ def test_ranges_in_the_plane_by_hand():
     poses, C = np.zeros((len(m.frame), 3)), np.diag([0.09, 0.03, 0.5])
     found, = initialization.ranges_by_antenna(
         m, poses, np.tile(C, (len(poses), 1, 1)), m.calibration.stated, 3.0)
-    np.testing.assert_allclose(found.distance, 1.5)
-    np.testing.assert_allclose(found.sigma, np.hypot(3 * 0.05 / 1.02 * 2.5 / 1.5, np.sqrt(0.06)))
-    np.testing.assert_array_equal(found.guess, [2.5, 4.0])
+    assert_allclose(found.distance, 1.5)
+    assert_allclose(found.sigma, np.hypot(3 * 0.05 / 1.02 * 2.5 / 1.5, np.sqrt(0.06)))
+    assert_array_equal(found.guess, [2.5, 4.0])
 
 
 def exact_ranges(path, sigma=0.05, guess=(3.2, 4.2)):
@@ -267,13 +268,13 @@ def test_second_moment_is_that_of_a_mixture_of_both_mirror_images():
     path = np.outer(np.linspace(0, 6, 50), [1, 0])
     estimate = np.array([3.0, 4.0])
     places, costs, covariances = trilaterate(exact_ranges(path, guess=(3.0, 0.0)))
-    np.testing.assert_allclose(np.sort(places[:2, 1]), [-4, 4], atol=1e-3)
+    assert_allclose(np.sort(places[:2, 1]), [-4, 4], atol=1e-3)
     assert abs(costs[1]) < 1e-6
     J = path - estimate
     J /= np.hypot(*J.T)[:, None] * 0.05
     C = np.linalg.inv(J.T @ J + np.eye(2) / GUESS_PRIOR_SIGMA**2)
-    np.testing.assert_allclose(covariances[np.argmax(places[:2, 1])], C, rtol=1e-2, atol=1e-7)
-    np.testing.assert_allclose(second_moment(places, costs, covariances, estimate),
+    assert_allclose(covariances[np.argmax(places[:2, 1])], C, rtol=1e-2, atol=1e-7)
+    assert_allclose(second_moment(places, costs, covariances, estimate),
                                C + [[0, 0], [0, 64 / 2]], rtol=1e-2, atol=1e-3)
 
 
