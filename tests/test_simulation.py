@@ -1,6 +1,8 @@
 import numpy as np
 import pytest
 from conftest import ROOT
+from kills import contents
+from numeric import short, true_markers
 from numpy.testing import assert_allclose, assert_array_equal
 
 from slamlib.core import odometry, se2
@@ -18,18 +20,17 @@ def test_committed_stand_ins_are_regenerated_to_the_byte(name, tmp_path):
     if not (DATA / name / "truth").exists():
         pytest.skip(f"data/{name} has no truth: it has been replaced by a real log")
     write_dataset(tmp_path / name, *simulate(**RECIPES[name]))
-    made = {f.relative_to(tmp_path): f.read_bytes() for f in tmp_path.rglob("*") if f.is_file()}
-    committed = {f.relative_to(DATA): f.read_bytes()
-                 for f in (DATA / name).rglob("*") if f.is_file()}
+    made = contents(tmp_path / name)
+    committed = contents(DATA / name)
     assert made.keys() == committed.keys()
-    assert [f for f in made if made[f] != committed[f]] == []
+    assert [file for file in made if made[file] != committed[file]] == []
 
 
 def sighting_errors(dataset, truth):
     """Errors (m, 3) of the sightings."""
     aruco = dataset.aruco
-    marker = truth.marker_in_world[np.searchsorted(truth.marker, aruco.marker)]
-    return se2.difference(aruco.marker_in_vehicle, se2.between(truth.poses[aruco.pose], marker))
+    exact = se2.between(truth.poses[aruco.pose], true_markers(truth, aruco.marker))
+    return se2.difference(aruco.marker_in_vehicle, exact)
 
 
 def range_errors(dataset, truth):
@@ -40,7 +41,7 @@ def range_errors(dataset, truth):
 
 
 def test_perfect_data_agrees_with_its_truth():
-    dataset, truth = simulate("short", seed=4, noise=False)
+    dataset, truth = short(4, noise=False)
     poses = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")
     for error in (poses - truth.poses, sighting_errors(dataset, truth),
                   range_errors(dataset, truth),
@@ -101,14 +102,14 @@ def test_outliers_come_at_the_asked_rates_and_late_ranges_are_too_long():
 
 def test_files_round_trip_through_the_reader(tmp_path):
     vehicle = Vehicle(right_radius=0.12, ticks_per_revolution=4096.0)
-    dataset, truth = simulate("short", seed=9, vehicle=vehicle)
+    dataset, truth = short(9, vehicle=vehicle)
     write_dataset(tmp_path / "drive", dataset, truth)
     again, true_again = read_dataset(tmp_path / "drive"), read_truth(tmp_path / "drive")
     assert again.vehicle == vehicle and true_again.vehicle == truth.vehicle
     assert_array_equal(again.ticks, dataset.ticks)
     for sensor in ("aruco", "uwb", "antenna_guess"):
-        found, written = vars(getattr(again, sensor)), vars(getattr(dataset, sensor))
-        for name in written:
-            assert_allclose(found[name], written[name], rtol=1e-4, atol=6e-4)
+        found = vars(getattr(again, sensor))
+        for name, written in vars(getattr(dataset, sensor)).items():
+            assert_allclose(found[name], written, rtol=1e-4, atol=6e-4)
     for name in ("poses", "marker", "marker_in_world", "antenna", "antenna_in_world"):
         assert_allclose(getattr(true_again, name), getattr(truth, name), atol=6e-7)
