@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import t
 
 from slamlib import estimate
-from slamlib.core.evaluation import ate, nees
+from slamlib.core.evaluation import anees, ate, nees, nees_band
 from slamlib.core.records import ArucoReadings
 from slamlib.studies import montecarlo
 from slamlib.studies.montecarlo import antenna_error
@@ -56,6 +56,22 @@ def sigmas(covariances):
 def errors_of(covariances, rng):
     """Random errors (m, 3) with these covariances (m, 3, 3)."""
     return (np.linalg.cholesky(covariances) @ rng.normal(size=(len(covariances), 3, 1)))[..., 0]
+
+
+def mean_nees(found, truth):
+    """Mean NEES of the poses of a result; 3 is right."""
+    return anees(found.poses, found.covariances, truth.poses)
+
+
+def aligned_ate(found, truth):
+    """ATE in m of a result, after alignment."""
+    return ate(found.poses, truth.poses, aligned=True)
+
+
+def assert_consistent(values, dof=3, probability=0.95):
+    """The mean of independent NEES is in its two-sided band."""
+    low, high = nees_band(len(values), dof, probability)
+    assert low < np.mean(values) < high
 
 
 def changed(dataset, sensor, **fields):

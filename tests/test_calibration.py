@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from numeric import (
     REAL_LOGS,
+    aligned_ate,
     aruco,
     as_points,
     central_differences,
+    mean_nees,
     on_real_logs,
     short,
     uwb,
@@ -20,7 +22,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from slamlib import estimate, fuse, fuse_increments, localize
 from slamlib.core import se2
-from slamlib.core.evaluation import align, anees, ate
+from slamlib.core.evaluation import align, ate
 from slamlib.core.kernels import KERNELS, ONE_SIDED
 from slamlib.core.odometry import dead_reckoning
 from slamlib.core.vehicle import Vehicle
@@ -194,7 +196,7 @@ def right_ates(seed):
     dataset, truth = drive(seed)
     both = both_problems(dataset)
     assert not named(both[0]) and not named(both[1])
-    return [ate(found.poses, truth.poses, aligned=True) for found in both]
+    return [aligned_ate(found, truth) for found in both]
 
 
 def both_problems(dataset):
@@ -209,8 +211,8 @@ def named(found):
 
 def assert_right(found, truth, largest):
     """The covariances hold, and the aligned ATE is below the largest in m."""
-    assert ate(found.poses, truth.poses, aligned=True) < largest
-    assert anees(found.poses, found.covariances, truth.poses) < 6
+    assert aligned_ate(found, truth) < largest
+    assert mean_nees(found, truth) < 6
 
 
 @pytest.mark.slow
@@ -286,8 +288,8 @@ def test_four_wrong_statements_at_once_are_all_found():
     spoilt = ranged_from(seen_from(dataset, (0.08, 0, 0), size=1.02), truth, (0.2, 0), height=1.5)
     found = estimate(spoilt, previous=estimate(spoilt.without("uwb")))
     assert found.released == {"camera-offset", "marker-size", "tag-offset", "antenna-height"}
-    assert ate(found.poses, truth.poses, aligned=True) < 0.005
-    assert anees(found.poses, found.covariances, truth.poses) < 6
+    assert aligned_ate(found, truth) < 0.005
+    assert mean_nees(found, truth) < 6
 
 
 @pytest.mark.slow

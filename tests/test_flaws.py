@@ -7,13 +7,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from conftest import ROOT
-from numeric import aruco, known_noise, short, sigmas, uwb, vehicle
+from numeric import aruco, assert_consistent, known_noise, short, sigmas, uwb, vehicle
 from numpy.testing import assert_allclose, assert_array_equal
 
 from slamlib import estimate, solve
 from slamlib.__main__ import summary_lines
 from slamlib.core import se2
-from slamlib.core.evaluation import nees_band
 from slamlib.core.records import Dataset
 from slamlib.core.vehicle import Vehicle
 from slamlib.io.dataset import read_dataset, read_truth
@@ -88,8 +87,7 @@ def test_offsets_of_the_camera_have_the_standard_deviations_that_they_state():
         off = found.c[CAMERA]
         place.append(off @ np.linalg.solve(found.c_covariance[CAMERA, CAMERA], off))
     for squared, dof in ((time, 1), (place, 3)):
-        low, high = nees_band(8, dof, probability=0.99)
-        assert low < np.mean(squared) < high, (dof, squared)
+        assert_consistent(squared, dof, probability=0.99)
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from numeric import aruco, as_points, carried, counts, short, sightings, vehicle
+from numeric import aligned_ate, aruco, as_points, carried, counts, short, sightings, vehicle
 from numpy.testing import assert_allclose
 
 from slamlib import estimate
@@ -88,7 +88,7 @@ def test_shares_of_a_jump_by_hand():
 
 def errors(result, truth):
     """Aligned ATE in m, and NEES."""
-    return (ate(result.poses, truth.poses, aligned=True),
+    return (aligned_ate(result, truth),
             anees(result.poses[5:], result.covariances[5:], truth.poses[5:]))
 
 

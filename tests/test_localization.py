@@ -7,10 +7,12 @@ import pytest
 from numeric import (
     REAL_LOGS,
     aruco,
+    assert_consistent,
     central_differences,
     decided,
     errors_of,
     map_nees,
+    mean_nees,
     on_real_logs,
     short,
     sightings,
@@ -23,7 +25,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from slamlib import fuse, fuse_increments, localize, studies
 from slamlib.core import increments, odometry, se2
-from slamlib.core.evaluation import align, anees, ate, nees, nees_band
+from slamlib.core.evaluation import align, anees, ate, nees
 from slamlib.core.odometry import dead_reckoning
 from slamlib.io.dataset import read_dataset, read_truth
 from slamlib.solve import problem_solution
@@ -120,10 +122,9 @@ def test_monte_carlo_is_consistent(options, poses):
     The ATE is below 0.6 of that of odometry, and the learned slip is near the truth.
     """
     runs = studies.run(trial, range(200, 224), poses=poses, **options)
-    low, high = nees_band(24, probability=1 - 0.05 / 12)
     for name in ("ArUco nees", "ArUco last nees", "map nees", "fused nees", "fused last nees",
                  "wheel nees"):
-        assert low < runs[name].mean() < high, name
+        assert_consistent(runs[name], probability=1 - 0.05 / 12)
     for method in ("ArUco", "fused"):
         assert np.median(runs[f"{method} ate"] / runs["odometry ate"]) < 0.6
         assert decided(0.6**2 * runs["odometry ate"]**2 - runs[f"{method} ate"]**2)
@@ -288,7 +289,7 @@ def test_slow_errors_of_the_sightings_are_counted_once():
             fused = fuse(dataset)
             assert fused.memory == memory
             off.append(ate(fused.poses, truth.poses))
-            ratio.append(anees(fused.poses, fused.covariances, truth.poses))
+            ratio.append(mean_nees(fused, truth))
         assert np.sqrt(np.mean(np.square(off))) < most
         assert 1.5 < np.mean(ratio) < 5
 
@@ -299,7 +300,7 @@ def test_a_camera_that_is_turned_is_found():
     fused = fuse(aruco(dataset, marker_in_vehicle=se2.compose(
         [0, 0, -0.08], dataset.aruco.marker_in_vehicle)))
     assert_allclose(fused.camera[2], 0.08, atol=0.005)
-    assert anees(fused.poses, fused.covariances, truth.poses) < 6
+    assert mean_nees(fused, truth) < 6
     assert_array_equal(fuse(dataset).camera, [0, 0, 0])
 
 
@@ -337,8 +338,7 @@ def test_without_information_on_the_slip_the_prior_decides(keep):
         fused = fuse(only(dataset, keep(dataset.aruco)))
         assert 1e-4 < fused.slip < 1e-2
         last.append((fused.poses[-1, 2] - truth.poses[-1, 2])**2 / fused.covariances[-1, 2, 2])
-    low, high = nees_band(len(last), dof=1, probability=0.999)
-    assert low < np.mean(last) < high
+    assert_consistent(last, dof=1, probability=0.999)
 
 
 @pytest.mark.slow
@@ -349,7 +349,7 @@ def test_wheels_far_from_nominal_are_learned():
         dataset, truth = short(seed)
         fused = fuse(vehicle(right_radius=0.103, left_radius=0.097, sigma_right_radius=5e-3,
                              sigma_left_radius=5e-3)(dataset))
-        ratios.append(anees(fused.poses, fused.covariances, truth.poses))
+        ratios.append(mean_nees(fused, truth))
         assert abs(fused.wheel[0] - truth.vehicle.right_radius) < 5e-4
         assert ate(fused.poses, truth.poses) < 0.08
     assert np.mean(ratios) < 6
@@ -361,7 +361,7 @@ def test_standard_deviations_of_sightings_that_are_too_small_are_learned(times):
     fused = fuse(aruco(dataset, covariance=dataset.aruco.covariance / times**2))
     assert fused.rejected == 0 and fused.slip == pytest.approx(5e-3, rel=0.3)
     assert ate(fused.poses, truth.poses) < 0.015
-    assert anees(fused.poses, fused.covariances, truth.poses) < 5
+    assert mean_nees(fused, truth) < 5
 
 
 @pytest.mark.slow

@@ -5,11 +5,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from numeric import aruco, short, sightings, uwb
+from numeric import aligned_ate, aruco, mean_nees, short, sightings, uwb
 from numpy.testing import assert_allclose, assert_array_equal
 
 from slamlib import estimate, studies
-from slamlib.core import evaluation
 from slamlib.core.evaluation import nees_band
 from slamlib.core.vehicle import TABLE_2
 from slamlib.robust.choices import _squared_distance, has_rejected_visits, visits
@@ -97,7 +96,7 @@ def test_slow_errors_of_a_sensor_are_no_slip():
     tilted = dataset.aruco.marker_in_vehicle * (1 + 0.01 * across * [1, 1, 0])
     found = estimate(aruco(dataset.without("uwb"), marker_in_vehicle=tilted))
     assert found.fit.problem.memory_first and found.slip < 2e-3
-    assert evaluation.ate(found.poses, truth.poses, aligned=True) < 0.012     # 0.026 by slip
+    assert aligned_ate(found, truth) < 0.012     # 0.026 by slip
 
 
 def test_a_large_slip_is_no_slow_error_of_a_sensor():
@@ -105,7 +104,7 @@ def test_a_large_slip_is_no_slow_error_of_a_sensor():
     found = estimate(dataset.without("uwb"))
     assert found.noise.sightings == pytest.approx(1, abs=0.1)
     assert found.slip == pytest.approx(0.03, rel=0.2)
-    assert evaluation.ate(found.poses, truth.poses, aligned=True) < 0.008     # 0.08 by memory
+    assert aligned_ate(found, truth) < 0.008     # 0.08 by memory
 
 
 @pytest.mark.slow
@@ -198,15 +197,15 @@ def test_moved_markers_are_landmarks_of_their_own(moved):
     ids, places = result.places[result.places[:, 0] != result.places[:, 1]].T
     assert set(ids) == set(marker) and set(places - ids) == {10**len(str(truth.marker.max()))}
     assert np.isin(places, result.marker).all()
-    possible = evaluation.ate(clean.poses, truth.poses, aligned=True)
-    assert evaluation.ate(result.poses, truth.poses, aligned=True) < 2 * possible
-    assert evaluation.anees(result.poses, result.covariances, truth.poses) < 8
+    possible = aligned_ate(clean, truth)
+    assert aligned_ate(result, truth) < 2 * possible
+    assert mean_nees(result, truth) < 8
     told = {doubt.what: doubt.sentence for doubt in solution_doubts(result)}
     assert all(str(each) in told["places"] for each in set(places))
     assert clean.places is None
     both = estimate(dataset, previous=result)
     assert_array_equal(both.places, result.places)
-    assert evaluation.ate(both.poses, truth.poses, aligned=True) < 0.01
+    assert aligned_ate(both, truth) < 0.01
 
 
 @pytest.mark.slow

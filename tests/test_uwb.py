@@ -7,6 +7,8 @@ import gtsam
 import numpy as np
 import pytest
 from numeric import (
+    aligned_ate,
+    assert_consistent,
     central_differences,
     decided,
     known_noise,
@@ -21,7 +23,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import quad
 
 from slamlib import estimate, studies
-from slamlib.core.evaluation import ate, nees_band
+from slamlib.core.evaluation import nees_band
 from slamlib.core.graph import GUESS_PRIOR_SIGMA
 from slamlib.core.kernels import KERNELS, ONE_SIDED
 from slamlib.core.odometry import dead_reckoning
@@ -175,10 +177,8 @@ def test_monte_carlo_is_consistent(first, options, names):
     runs = studies.run(slam_trial, range(first, first + 12), **options)
     probability = 1 - 0.05 / (len(names) + 2)
     for name in [*names, "wheel nees"]:
-        low, high = nees_band(12, 3, probability)
-        assert low < runs[name].mean() < high, name
-    low, high = nees_band(12, 2, probability)
-    assert low < runs["antenna nees"].mean() < high
+        assert_consistent(runs[name], 3, probability)
+    assert_consistent(runs["antenna nees"], 2, probability)
     assert np.sqrt(np.mean(runs["ate"]**2)) < 0.06
     if "map nees" in names:
         assert runs["ate"].max() < 0.05 and runs["antenna error"].max() < 0.15
@@ -196,9 +196,8 @@ def test_the_default_kernel_has_smaller_antenna_errors_than_others(drives, other
     squared = runs["asymmetric Tukey antenna error"]**2
     for other in others:
         assert decided(runs[f"{other} antenna error"]**2 - squared)
-    low, high = nees_band(drives, 2, 0.999)
-    assert low < runs["asymmetric Tukey antenna nees"].mean() < high
-    assert high < runs["Huber antenna nees"].mean()
+    assert_consistent(runs["asymmetric Tukey antenna nees"], 2, 0.999)
+    assert nees_band(drives, 2, 0.999)[1] < runs["Huber antenna nees"].mean()
     assert runs["asymmetric Tukey nees"].mean() < 6
 
 
@@ -304,7 +303,7 @@ def test_two_antennas_with_one_id_are_told():
     first, second = dataset.antenna_guess.antenna[:2].tolist()
     antenna = np.where(dataset.uwb.antenna == second, first, dataset.uwb.antenna)
     found = estimate(uwb(dataset, antenna=antenna))
-    assert ate(found.poses, truth.poses, aligned=True) < 0.005
+    assert aligned_ate(found, truth) < 0.005
     assert [*found.doubts] == [first] and "as if two antennas had this id" in found.doubts[first]
     other = re.search(r"\((.+), (.+)\)", found.doubts[first]).groups()
     places = np.array([found.antenna_in_world[0], other], float)
