@@ -19,6 +19,7 @@ from numeric import (
     vehicle,
 )
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.stats import norm
 
 from slamlib import estimate, fuse, fuse_increments, localize
 from slamlib.core import se2
@@ -57,8 +58,7 @@ def test_derivatives_by_delays_are_averaged_over_encoder_steps(vehicle):
     linearized = NormalEquations(problem, state).linearized
     for kind, entry in enumerate([SIGHTING_LAG, RANGE_LAG]):
         def error(lag, kind=kind, entry=entry):
-            c = state.c.copy()
-            c[entry] += lag[0]
+            c = state.c + lag * (np.arange(len(state.c)) == entry)
             return NormalEquations(problem, replace(state, c=c)).linearized[kind].e
 
         factors = linearized[kind]
@@ -75,11 +75,11 @@ def test_sensors_are_where_the_vehicle_was_by_their_delay():
     """On the path of odometry, a camera that is four and a tag that is seven encoder steps late."""
     m = measure(short(4, 400)[0])
     path = dead_reckoning(m.dataset.ticks, m.dataset.vehicle, model="arc")
-    c = calibration.stated_calibration(MOUNTED, []).stated
-    c[[SIGHTING_LAG, RANGE_LAG]] = 4, 7
+    c = calibration.stated_calibration(
+        replace(MOUNTED, sighting_lag=4, range_lag=7), []).stated
     camera, tag = sensor_poses(m, path[m.frame], c)
-    for found, row, late, place in ((camera, m.sightings.row, 4, c[calibration.CAMERA]),
-                                    (tag, m.ranges.row, 7, np.append(c[calibration.TAG_PLACE], 0))):
+    for found, row, late, place in ((camera, m.sightings.row, 4, [0.15, -0.08, 0.3]),
+                                    (tag, m.ranges.row, 7, [0.2, -0.1, 0])):
         seen = m.frame[row]
         expected = se2.compose(path[seen[seen >= late] - late], place)
         assert_allclose(found[seen >= late], expected, atol=1e-9)
@@ -87,13 +87,14 @@ def test_sensors_are_where_the_vehicle_was_by_their_delay():
 
 def test_evidence_of_one_entry_by_hand():
     """Likelihood exp(-L u^2 / 2 + h u), prior N(0, s^2): evidence by quadrature."""
-    L, h, s = 4.0, 6.0, 0.7
+    L, h, s = np.array([[4.0]]), np.array([6.0]), np.array([0.7])
     u = np.linspace(-10, 10, 200_001)
-    density = np.exp(-L * u**2 / 2 + h * u) * np.exp(-u**2 / 2 / s**2) / s / np.sqrt(2 * np.pi)
-    found, largest = choices._log_evidence(np.array([[L]]), np.array([h]), np.array([s]))
-    assert np.isclose(found, np.log(np.trapezoid(density, u)), atol=1e-9)
-    assert np.isclose(largest, np.trapezoid(u * density, u) / np.trapezoid(density, u) / s)
-    assert choices._log_evidence(np.array([[L]]), np.array([h]), np.zeros(1)) == (0, 0)
+    density = np.exp(-L[0] * u**2 / 2 + h * u) * norm.pdf(u, scale=s)
+    evidence = np.trapezoid(density, u)
+    found, largest = choices._log_evidence(L, h, s)
+    assert np.isclose(found, np.log(evidence), atol=1e-9)
+    assert np.isclose(largest, np.trapezoid(u * density, u) / evidence / s)
+    assert choices._log_evidence(L, h, 0 * s) == (0, 0)
 
 
 @pytest.mark.parametrize("height, sigma", [(0.0, 0.5), (2.0, 1e-3), (0.0, 0.0)])

@@ -82,20 +82,17 @@ def test_factors_of_a_batch_are_linearised_at_once_and_anew_where_a_value_change
         return points**2, [2 * points[:, :, None] * np.eye(2)]
 
     factors = Batch([[A(1), A(2)]], linearised)
-    graph = gtsam.NonlinearFactorGraph()
-    for k in range(2):
-        graph.add(factors.factor(k, SIGMA(2, 1.0)))
+    first, second = (factors.factor(k, SIGMA(2, 1.0)) for k in range(2))
     values = values_of({A(1): np.array([1.0, 0])})
-    assert np.isclose(graph.at(0).error(values), 0.5)
+    assert first.error(values) == 0.5
     assert np.isnan(calls[0][1]).all()
     values.insert(A(2), np.array([2.0, 0]))
-    assert np.isclose(graph.error(values), 0.5 + 8)
-    J, b = graph.linearize(values).at(1).jacobian()
-    assert_allclose(J, np.diag([4.0, 0]))
-    assert_allclose(b, [-4, 0])
+    assert second.error(values) == 8 and first.error(values) == 0.5
+    J, b = second.linearize(values).jacobian()
+    assert (J.tolist(), b.tolist()) == ([[4, 0], [0, 0]], [-4, 0])
     assert len(calls) == 2
     values.update(A(2), np.zeros(2))
-    assert np.isclose(graph.error(values), 0.5)
+    assert second.error(values) == 0
 
 
 def test_odometry_of_the_plain_graph_is_gtsams_between_factor_in_counts(drive):
@@ -255,10 +252,9 @@ def test_where_cholesky_fails_qr_gives_the_same_solution_and_marginals(drive, mo
                                    atol=1e-6 * np.abs(joint).max())
 
 
-def two_ranges(graph, values):
+def one_range(graph, values):
     values.insert(A(9), np.ones(2))
-    for _ in range(2):
-        graph.add(gtsam.RangeFactor2D(X(30), A(9), 1.0, SIGMA(1, 1.0)))
+    graph.add(gtsam.RangeFactor2D(X(30), A(9), 1.0, SIGMA(1, 1.0)))
 
 
 @pytest.mark.parametrize("change, told", [
@@ -268,7 +264,7 @@ def two_ranges(graph, values):
      "a factor of every variable, found none of x33"),
     (lambda graph, values: graph.add(gtsam.PriorFactorPoint2(X(0), np.zeros(2), SIGMA(2, 1.0))),
      "finite numbers, and values of the types"),
-    (two_ranges, "determine every pose and landmark.*near a9$")])
+    (one_range, "determine every pose and landmark.*near a9$")])
 def test_graphs_and_values_that_do_not_fit_are_told_in_a_sentence(drive, change, told):
     graph, values = plain(drive[0].first(100))
     change(graph, values)

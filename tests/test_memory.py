@@ -51,9 +51,9 @@ def test_shares_by_hand():
     error = np.repeat(np.random.default_rng(2).standard_normal((LANDMARKS, 5, 3)), 2, axis=1)
     landmark, pose, u, used = tracks(error / np.sqrt(np.mean(error**2)))
     used[::EACH] = False                     # the first of each landmark stays alone
-    rho = [np.mean([np.sum(u[k] * u[k + lag]) / 3 for k in np.flatnonzero(used)
-                    if k + lag < len(u) and landmark[k + lag] == landmark[k]]) for lag in (1, 2)]
-    rho = np.array(rho) + max(0, 1 - np.mean(u[used]**2))
+    of = u.reshape(LANDMARKS, EACH, 3)[:, 1:]
+    rho = np.array([np.mean(of[:, lag:] * of[:, :-lag]) for lag in (1, 2)])
+    rho += max(0, 1 - np.mean(of**2))
     assert rho[0] > 0.3 and rho[1] < 0.05
     share = error_memory(landmark, pose, u, used).share.reshape(LANDMARKS, EACH)
     assert_allclose(share[:, 0], 1)

@@ -235,7 +235,6 @@ def test_the_gate_rejects_wrong_labels_and_hardly_any_others():
 
 @pytest.mark.parametrize("marker, place, expected", [
     ([12, 12, 12, 7, 7], [0, 1, 2, 0, 1], [12, 112, 212, 7, 107]),
-    ([12, 999, 12], [0, 0, 1], [12, 999, 1012]),
     ([-7, 93, -7, 0, 0], [0, 0, 1, 0, 1], [-7, 93, -107, 0, 100]),      # 93 is -7 + 100
     ([-12, 2, 2], [0, 0, 1], [-12, 2, 102])])
 def test_a_second_place_gets_a_readable_id_that_the_drive_does_not_have(marker, place, expected):
@@ -380,8 +379,7 @@ def test_the_evidence_chooses_the_steps_that_the_vehicle_drives(true, other):
 def test_headings_are_continuous_where_frames_are_rounds_apart():
     """Markers at both ends of three rounds only: between two frames the vehicle turns by 6 pi."""
     dataset, truth = short(5, rounds=3)
-    last = len(dataset.ticks) - 1
-    ends = (dataset.aruco.pose < 50) | (dataset.aruco.pose > last - 50)
+    ends = np.abs(dataset.aruco.pose - len(dataset.ticks) / 2) > len(dataset.ticks) / 2 - 50
     found = estimate(replace(dataset, uwb=None, aruco=dataset.aruco.select(ends)))
     assert abs(truth.poses[-1, 2]) > 18
     assert_allclose(found.poses[:, 2], truth.poses[:, 2], atol=0.3)
