@@ -44,7 +44,7 @@ from slamlib.robust.measurements import NOISE_KEYS, Noise, measure
 from slamlib.robust.noise import learn_noise
 from slamlib.robust.pipeline import fit_from_odometry
 from slamlib.robust.result import slam_result
-from slamlib.studies import kernels, montecarlo, simulation, starts
+from slamlib.studies import kernels, montecarlo, simulation
 from slamlib.studies.simulation import simulate
 
 COUNT = 2 * np.pi * 0.1 / 8000                            # m
@@ -198,21 +198,6 @@ def test_monte_carlo_is_consistent():
     assert 0.95 < runs["factor"].mean() < 1.03
     assert runs["arc"].mean() > 0.9                      # the evidence selects the true model
     assert runs["map worst"].max() < 0.2                 # m: no marker is in a wrong minimum
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("options", [
-    dict(mislabelled=0.05), dict(mislabelled=0.01, vehicle=Vehicle(
-        sigma_right_radius=5e-4, sigma_left_radius=5e-4, sigma_wheelbase=5e-4))])
-def test_initialisation_by_consensus_finds_the_right_minimum_despite_wrong_labels(options):
-    """With the last kernel alone, markers at their first sightings end in a wrong minimum."""
-    runs = studies.run(starts.landmarks, range(10), kernel="last",
-                       starts=("first sighting", "consensus"), **options)
-    assert runs["consensus right"].all() and not runs["first sighting right"].any()
-    assert runs["consensus initial error"].mean() < 0.5 * runs[
-        "first sighting initial error"].mean()
-    graduated = studies.run(starts.landmarks, range(3), starts=("consensus",), **options)
-    assert graduated["consensus right"].all()
 
 
 def test_markers_of_unknown_heading_are_mapped_as_points():

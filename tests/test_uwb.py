@@ -355,13 +355,3 @@ def test_ranges_calibrate_themselves(offset, scale, long_drive):
         assert doubts == ["range-offset"] and (sigma < [0.1, 0.01]).all()
     error, squared = montecarlo.antenna_error(found, truth)
     assert squared.mean() < 6 and error.max() < 0.2
-
-
-@pytest.mark.slow
-def test_ranges_hardly_move_a_drive_full_of_markers_and_bound_one_without():
-    full = studies.run(montecarlo.ranges_added, range(4))
-    assert full["moved"].max() < 0.3                   # the noise is learned anew with ranges:
-    assert full["sigma with"].mean() < full["sigma without"].mean()     # of one drive up to 0.1 %
-    few = studies.run(montecarlo.ranges_added, range(16), share=0.1)
-    assert decided(few["ate without"] - 2 * few["ate with"])            # less than half on average
-    assert (few["sigma with"] < 0.6 * few["sigma without"]).all()
