@@ -129,14 +129,17 @@ def slam_trial(seed, ranges=True, markers=True, **options):
     "nees" is that of the measured poses, "nees between" that of the others.
     """
     dataset, truth = short(seed, **options)
-    found = estimate(dataset.without("uwb")) if markers else None
-    dataset = dataset if markers else dataset.without("aruco")
-    dataset = dataset if ranges else dataset.without("uwb")
-    found = estimate(dataset, previous=found) if ranges else found
-    measured = [sensor.pose for sensor in (dataset.aruco, dataset.uwb) if sensor is not None]
-    frames = np.isin(np.arange(len(truth.poses)), np.concatenate(measured))
+    found = None
+    if markers:
+        found = estimate(dataset.without("uwb"))
+    else:
+        dataset = dataset.without("aruco")
+    if ranges:
+        found = estimate(dataset, previous=found)
+    frame = found.fit.problem.measurements.frame
     values = nees(found.poses, found.covariances, truth.poses)
-    numbers = {"nees": np.nanmean(values[frames]), "nees between": np.nanmean(values[~frames]),
+    numbers = {"nees": np.nanmean(values[frame]),
+               "nees between": np.nanmean(np.delete(values, frame)),
                "last nees": values[-1], "wheel nees": wheel_nees(found, truth),
                "ate": ate(found.poses, truth.poses), "slip": found.slip,
                "factor": found.noise.sightings, "arc": float(found.model == "arc")}
