@@ -9,6 +9,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from slamlib.core import se2
 from slamlib.core.evaluation import nees
 from slamlib.core.marker_increments import (
+    _best_hypothesis,
+    _Common,
     consecutive_increments,
     distance_and_turn,
     distance_and_turn_sigmas,
@@ -54,6 +56,24 @@ def test_covariance_by_hand():
     args = sightings(np.zeros(3), z, np.diag([s**2, s**2, t**2]))
     expected = np.diag([s**2, s**2, 1 / (d**2 / s**2 + 1 / t**2)])
     assert_allclose(robust_increments(*args, 1).covariance[0], expected, atol=1e-18)
+
+
+@pytest.mark.parametrize("count, wrong, sigma", [
+    (1, 0, 0.01), (2, 0, 0.4), (4, 1, 0.4), (4, 1, 0.01), (12, 5, 100)])
+def test_the_best_hypothesis_is_the_increment_itself(count, wrong, sigma):
+    """Of three pairs, the second without markers; headings are wrong if their sigma says so."""
+    rng = np.random.default_rng(count)
+    deltas = np.array([[0.5, 0.4, 2.9], [0, 0, 0], DELTA])
+    markers = np.c_[rng.uniform(-1, 1, (count, 2)), rng.uniform(-3, 3, count)]
+    z1 = np.tile(markers, (2, 1))
+    z2 = se2.between(deltas[::2, None], markers).reshape(-1, 3)
+    z2[count:count + wrong] += rng.uniform(1, 2, (wrong, 3))
+    if sigma > 0.1:
+        z1[:, 2] = rng.uniform(-3, 3, 2 * count)
+    covariance = np.tile(np.diag([1e-4, 1e-4, sigma**2]), (2 * count, 1, 1))
+    pair = np.repeat([0, 2], count)
+    found = _best_hypothesis(_Common(pair, z1, covariance, z2, covariance, 3))
+    assert_allclose(se2.difference(found, deltas), 0, atol=1e-12)
 
 
 def test_distance_and_turn_by_hand():
