@@ -13,6 +13,7 @@ from slamlib.core import se2
 from slamlib.core.evaluation import anees, ate
 from slamlib.core.odometry import dead_reckoning
 from slamlib.core.records import Dataset
+from slamlib.core.sightings import sightings_by_frame
 from slamlib.robust import jumps
 from slamlib.robust.fused import fuse
 from slamlib.robust.solution_doubts import _encoder_doubts, solution_doubts
@@ -35,6 +36,16 @@ def looking(ticks, frame, poses, markers, sees=np.isfinite):
     row, marker = np.nonzero(np.all(sees(z), axis=-1))
     readings = sightings(frame[row], marker, z[row, marker], 1e-4 * np.eye(3))
     return Dataset("looks", TABLE_2, ticks, readings, None, None)
+
+
+def test_the_score_of_two_sightings_by_hand():
+    """A marker 1 m ahead seems 0.1 m nearer; turns of the vehicle do not move it along x."""
+    dataset = seen(np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]), MARKERS[:1])
+    s = sightings_by_frame(dataset.aruco)
+    drive = jumps._Drive.without_jumps(np.zeros((2, 3)), TABLE_2.wheelbase)
+    pairs = jumps._compared(s, drive)
+    assert (pairs.first, pairs.second) == (0, 1)
+    assert_allclose(pairs.squared, 0.1**2 / (2 * 1e-4 + jumps.FLOOR**2), rtol=1e-9)
 
 
 def test_a_jump_of_a_vehicle_that_stands_is_found_where_it_is():
