@@ -30,7 +30,7 @@ from slamlib.core.evaluation import ate, nees_band
 from slamlib.core.kernels import KERNELS, ONE_SIDED
 from slamlib.core.records import AntennaGuess, Dataset, UwbReadings
 from slamlib.core.vehicle import Vehicle
-from slamlib.robust import factors
+from slamlib.robust import factors, initialization
 from slamlib.robust.choices import DECISIVE_LEAD, better_model, ids_of_places
 from slamlib.robust.fit import accepted_measurements
 from slamlib.robust.initialization import GROWTH, part_lengths
@@ -272,6 +272,20 @@ def test_parts_of_a_drive_grow_at_most_fourfold_from_where_the_heading_is_lost()
     assert part_lengths(replace(drive, vehicle=sure)) == [len(ticks)]
     blind = replace(drive.vehicle, sigma_heading=1.0)  # the same error at all poses loses no turn
     assert part_lengths(replace(drive, vehicle=blind)) == ends
+
+
+def test_all_parts_of_a_drive_are_solved_one_after_the_other(monkeypatch):
+    """The last one is the whole drive, whose rounds follow."""
+    solved = []
+
+    def narrow_kernels(problem, state):
+        solved.append(len(problem.measurements.dataset.ticks))
+        return state
+
+    monkeypatch.setattr(initialization, "part_lengths", lambda _: [200, 400, 600])
+    monkeypatch.setattr(initialization, "narrow_kernels", narrow_kernels)
+    initialization.initial_state(measure(short(4, 600)[0]), "arc")
+    assert solved == [200, 400]
 
 
 @pytest.mark.slow
