@@ -1,6 +1,7 @@
 """Drives that are not as their files say: the estimate holds, or a doubt names what is wrong."""
 
 import itertools
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -212,6 +213,15 @@ def test_slip_that_no_wheel_has_is_named_unless_it_was_given(found, slip, sigma,
     assert all("slips by 30 mm" in doubt.sentence for doubt in doubts)
 
 
+def said_of_rejected(count, wrong, repeated=0):
+    """Sentences if of `count` sightings of markers from 11 on so many are wrong."""
+    rejected = np.concatenate([np.arange(n) < k for n, k in zip(count, wrong)])
+    marker = np.repeat(11 + np.arange(len(count)), count)
+    result = SimpleNamespace(rejected=rejected, sightings=SimpleNamespace(
+        contradicting=repeated, marker=marker))
+    return [doubt.sentence for doubt in _rejection_doubts(result)]
+
+
 @pytest.mark.parametrize("wrong, repeated, said", [
     ([4, 0, 0], 0, None), ([0, 4, 1], 0, None), ([0, 0, 5], 0, None),
     ([5, 0, 0], 0, "5 of 54 sightings contradict the rest and are left out, of marker 11 5 of 10:"),
@@ -220,13 +230,15 @@ def test_slip_that_no_wheel_has_is_named_unless_it_was_given(found, slip, sigma,
     ([1, 0, 0], 6, "7 of 60 sightings contradict the rest and are left out, 6 by another one")])
 def test_many_rejected_sightings_are_named_of_all_and_of_single_markers(wrong, repeated, said):
     """Sightings of markers 11, 12 and 13: ten, four and forty."""
-    count = [10, 4, 40]
-    rejected = np.concatenate([np.arange(n) < k for n, k in zip(count, wrong)])
-    seen = SimpleNamespace(contradicting=repeated, marker=np.repeat([11, 12, 13], count))
-    sentences = [doubt.sentence for doubt in _rejection_doubts(
-        SimpleNamespace(rejected=rejected, sightings=seen))]
+    sentences = said_of_rejected([10, 4, 40], wrong, repeated)
     assert len(sentences) == (said is not None)
     assert all(said in sentence for sentence in sentences)
+
+
+def test_of_nine_markers_the_one_with_the_smallest_share_is_not_named():
+    """Five sightings are rejected of each: of ten of marker 11, of eighteen of marker 19."""
+    sentence, = said_of_rejected(range(10, 19), 9 * [5])
+    assert re.findall("of marker ([0-9]+) ", sentence) == [str(each) for each in range(11, 19)]
 
 
 def test_a_turn_that_the_wheels_hardly_know_is_named_where_it_is(found):
