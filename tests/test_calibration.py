@@ -135,6 +135,12 @@ def test_what_a_drive_cannot_tell_apart_by_hand(monkeypatch, off, sigma, named):
         assert found.lead == pytest.approx(2500 / 201 - np.log(201) / 2)
 
 
+@pytest.mark.parametrize("group, more", [("marker-size", 0), ("camera-offset", 2)])
+def test_a_group_costs_more_for_each_entry_but_the_first(group, more):
+    price = choices._price(calibration.stated_calibration(Vehicle(), []), group)
+    assert price == choices.DECISIVE_RELEASE + more * choices.FURTHER_ENTRY
+
+
 @pytest.mark.parametrize("name", ["asymmetric Tukey", "asymmetric Cauchy"])
 def test_ranges_without_late_ones_have_no_bias(name):
     """E[weight(r - b) (r - b)] of standard normal r is zero where the bias b is counted."""
