@@ -134,28 +134,26 @@ def report_on_all(tmp_path_factory, kept):
     import numpy as np
 
     from slamlib.io.dataset import read_dataset, read_truth
-    from slamlib.studies.simulation import manoeuvre, simulate, write_dataset
+    from slamlib.studies import montecarlo
+    from slamlib.studies.simulation import manoeuvre, write_dataset
     folder = tmp_path_factory.mktemp("built")
     data = folder / "data"
-    shutil.copytree(ROOT / "data", data, ignore=lambda *_: ["long"])
     long = ROOT / "data" / "long"
-    for name, poses, drive in (
-            ("long", 900, (read_dataset(long), read_truth(long))),
-            ("new seed", 300, simulate("short", seed=77, late_ranges=0.15))):
-        dataset, truth = drive[0].first(poses), drive[1]
-        write_dataset(data / name, dataset, replace(truth, poses=truth.poses[:poses]))
-    shutil.copytree(data / "new seed", data / "no_truth", ignore=lambda *_: ["truth"])
-    waiting = np.concatenate([np.zeros((100, 2), int), simulate("short", seed=78)[0].ticks[:200]])
-    for name, ticks in (("wheels_only", dataset.ticks), ("waits", waiting),
-                        ("one_pose", [[0, 0]]),
-                        ("backs_up", np.rint(manoeuvre([(2, 1.0), (-2, 0.5)])))):
-        (data / name).mkdir()
-        np.savetxt(data / name / "encoderReading.txt",
-                   np.column_stack([np.arange(1, len(ticks) + 1), ticks]), fmt="%d")
-    seen = np.loadtxt(data / "new seed" / "ArucoReading.txt")
-    for name, rows in (("one_sighting", seen[:1]), ("sparse", seen[seen[:, 0] % 150 == 1])):
-        shutil.copytree(data / "new seed", data / name)
-        np.savetxt(data / name / "ArucoReading.txt", rows, fmt="%d %d" + 9 * " %.6g")
+    shutil.copytree(ROOT / "data", data, ignore=lambda *_: ["long"])
+    truth = read_truth(long)
+    write_dataset(data / "long", read_dataset(long).first(900),
+                  replace(truth, poses=truth.poses[:900]))
+    new, truth = montecarlo.drive(77, 300, late_ranges=0.15)
+    bare = new.without("aruco").without("uwb")
+    sparse = new.aruco.pose % 150 == 0
+    for name, dataset, true in (
+            ("new seed", new, truth), ("no_truth", new, None), ("wheels_only", bare, None),
+            ("waits", replace(bare, ticks=np.r_[np.zeros((100, 2)), bare.ticks[:200]]), None),
+            ("one_pose", bare.first(1), None),
+            ("backs_up", replace(bare, ticks=np.rint(manoeuvre([(2, 1.0), (-2, 0.5)]))), None),
+            ("one_sighting", replace(new, aruco=new.aruco.select([0])), truth),
+            ("sparse", replace(new, aruco=new.aruco.select(sparse)), truth)):
+        write_dataset(data / name, dataset, true)
     copied(folder / "notebooks", "*.ipynb")
     built_elsewhere(folder / "notebooks", data, folder / "report", folder / "results",
                     datasets=[each.name for each in data.iterdir() if each.is_dir()], kept=kept)

@@ -6,13 +6,12 @@ drawn at random, the tests that enter its function run until one fails; without 
 mutant survives. Every survivor is a missing test, dead code, or equivalent: no input tells it from
 the original. `make mutants` runs this; `make mutants ARGS="--only robust --count 50"` a part of it.
 
-Numbers that a module names in capital letters are left out: a threshold of 21 is as good as one of
-20. What mutants say in messages is left out, too.
+Left out are the values of names in capital letters, since a threshold of 21 is as good as one of
+20, and messages.
 """
 
 import argparse
 import ast
-import compileall
 import os
 import pickle
 import random
@@ -33,39 +32,26 @@ import scipy.sparse.linalg  # noqa: E402, F401
 import scipy.stats  # noqa: E402, F401
 
 ROOT = Path(__file__).parents[1]
-FOLDERS = ("core/", "robust/", "io/")
+FOLDERS = ("core", "robust", "io")
 FILES = [f"test_{name}.py" for name in (
     "se2", "odometry", "results", "dataset", "dialects", "marker_increments", "localization",
     "jumps", "memory", "doubts", "calibration", "normal_equations", "graph", "slam", "uwb",
     "library", "numbers", "flaws", "overview")]
 ENOUGH = 40                            # seconds, of the tests of one mutant
-MEMORY = 8 << 30                       # bytes, of a mutant's process
-PATIENCE = 3                           # times as long as without a mutant, and START seconds
-START = 10
+LIMITS = {resource.RLIMIT_AS: 8 << 30, resource.RLIMIT_CPU: 10 + 3 * ENOUGH}   # bytes, seconds
 SWAPS = {ast.Add: ast.Sub, ast.Mult: ast.Div, ast.BitAnd: ast.BitOr, ast.And: ast.Or,
          ast.Lt: ast.Gt, ast.LtE: ast.GtE, ast.Eq: ast.NotEq, ast.Is: ast.IsNot, ast.In: ast.NotIn}
 SWAPS |= {other: one for one, other in SWAPS.items()} | {ast.Pow: ast.Mult, ast.FloorDiv: ast.Mult}
 DROPPED = {"wrap", "unwrap", "swapaxes", "transpose", "abs", "sqrt"}
 SYMMETRIC = {"maximum", "minimum", "max", "min", "hypot", "union1d", "isclose", "allclose",
-             "isinstance", "getattr", "array_equal", "squared_distances", "clip"}
-AXES = {"reshape", "stack", "moveaxis", "axis", "assume_unique"}    # where -1 or False is as good
-FIRST_ONLY = {"require", "_number"}
+             "isinstance", "getattr", "array_equal", "squared_distances", "clip", "require"}
+LAYOUT = {"reshape", "stack", "moveaxis", "axis", "assume_unique"}   # where -1 or False is as good
 
 
-def is_text(node):
-    """True of an expression with text, for which operators mean something else."""
-    return bool({"'", '"'} & {*ast.unparse(node)})
-
-
-def is_message(node):
-    """True of an expression of text: it may be left out, but nothing in it is changed."""
-    return isinstance(node, ast.Raise | ast.JoinedStr) or isinstance(node, ast.Call) and isinstance(
-        node.func, ast.Attribute) and isinstance(node.func.value, ast.Constant)
-
-
-def name_of(function):
-    """Name of a function in a call, or nothing."""
-    return getattr(function, "attr", getattr(function, "id", ""))
+def name_of(node):
+    """Name of what is called or given by keyword, or nothing."""
+    function = getattr(node, "func", node)
+    return getattr(function, "attr", getattr(function, "id", getattr(function, "arg", "")))
 
 
 def changed(node, **fields):
@@ -74,80 +60,55 @@ def changed(node, **fields):
 
 def changes(node):
     """What may replace a node of the syntax tree: a list of nodes."""
-    found = []
-    if isinstance(node, (ast.BinOp, ast.AugAssign)) and not is_text(node):
-        if type(node.op) in SWAPS:
-            found.append(changed(node, op=SWAPS[type(node.op)]()))
-        elif isinstance(node.op, ast.MatMult) and isinstance(node, ast.BinOp):
-            found.append(changed(node, left=node.right, right=node.left))
-    elif isinstance(node, ast.BoolOp) and not any(
-            is_text(each) for each in node.values if not isinstance(each, ast.Compare)):
-        found.append(changed(node, op=SWAPS[type(node.op)]()))
-    elif isinstance(node, ast.Compare) and type(node.ops[0]) in SWAPS:
-        found.append(changed(node, ops=[SWAPS[type(node.ops[0])](), *node.ops[1:]]))
-    elif isinstance(node, ast.UnaryOp):
-        found.append(node.operand)
-    elif isinstance(node, ast.Attribute) and node.attr == "T":
-        found.append(node.value)
-    elif isinstance(node, ast.Constant) and isinstance(node.value, bool):
-        found.append(ast.Constant(not node.value))
-    elif isinstance(node, ast.Constant) and isinstance(node.value, (int, float)):
-        found += [ast.Constant(node.value + 1), ast.Constant(node.value - 1)]
-    elif isinstance(node, ast.Return) and isinstance(node.value, ast.BinOp) and not is_text(node):
-        found.append(changed(node, value=ast.UnaryOp(ast.USub(), node.value)))
-    elif isinstance(node, ast.Call):
-        name = name_of(node.func)
-        if name in DROPPED and node.args:
-            found.append(node.args[0])
-        elif name not in SYMMETRIC and len(node.args) > 1 and not any(
-                isinstance(each, (ast.Constant, ast.UnaryOp, ast.List, ast.Tuple, ast.Starred))
-                or is_text(each) for each in node.args[:2]):
-            found.append(changed(node, args=[*node.args[1::-1], *node.args[2:]]))
-    return [new for new in found if ast.unparse(new) != ast.unparse(node)]
+    match node:
+        case ast.BinOp(op=ast.MatMult()):
+            return [changed(node, left=node.right, right=node.left)]
+        case ast.BinOp(op=op) | ast.AugAssign(op=op) | ast.BoolOp(op=op) if type(op) in SWAPS:
+            return [changed(node, op=SWAPS[type(op)]())]
+        case ast.Compare(ops=[op, *rest]) if type(op) in SWAPS:
+            return [changed(node, ops=[SWAPS[type(op)](), *rest])]
+        case ast.UnaryOp(operand=inner) | ast.Attribute(attr="T" | "mT", value=inner):
+            return [inner]
+        case ast.Constant(value=bool(value)):
+            return [ast.Constant(not value)]
+        case ast.Constant(value=int(value) | float(value)):
+            return [ast.Constant(value + 1), ast.Constant(value - 1)]
+        case ast.Call(args=[inner, *_]) if name_of(node) in DROPPED:
+            return [inner]
+        case ast.Call(args=[ast.Name() as first, ast.Name() as second, *rest]):
+            return [changed(node, args=[second, first, *rest])] * (name_of(node) not in SYMMETRIC)
+    return []
 
 
-def places(node):
-    """Nodes of a syntax tree that may be changed, without annotations, decorators and messages.
+def places(node, function=None):
+    """(node, line of the function around it) for all nodes of a syntax tree that may be changed.
 
-    Arguments of FIRST_ONLY but the first are a message or limits.
+    The line is None outside of functions, and in those with decorators, which may be cached: then
+    not all tests that need them enter them.
     """
-    if is_message(node):
-        return
-    if changes(node):
-        yield node
+    text = isinstance(node, ast.Raise | ast.JoinedStr) or {"'", '"'} & {*ast.unparse(node)}
+    if isinstance(node, ast.FunctionDef):
+        function = None if node.decorator_list else node.lineno
+    elif isinstance(node, ast.expr | ast.AugAssign) and not text and changes(node):
+        yield node, function
     for field, value in ast.iter_fields(node):
-        if field in ("annotation", "returns", "decorator_list", "format_spec"):
-            continue
-        name = name_of(node.func) if isinstance(node, ast.Call) else getattr(node, "arg", "")
-        children = value if isinstance(value, list) else [value]
-        for child in children[:1] if name in FIRST_ONLY else children:
+        for child in value if isinstance(value, list) else [value]:
             threshold = isinstance(node, ast.Module) and isinstance(child, ast.Assign)
-            axis = name in AXES and isinstance(child, (ast.UnaryOp, ast.Constant))
-            if isinstance(child, ast.AST) and not threshold and not axis:
-                yield from places(child)
+            layout = name_of(node) in LAYOUT and not isinstance(child, ast.Name | ast.Call)
+            if isinstance(child, ast.AST) and not threshold and not layout and field not in (
+                    "annotation", "returns", "decorator_list", "format_spec", "exc"):
+                yield from places(child, function)
 
 
 def mutated(text, node, new):
     """A module's text with one node replaced."""
-    lines = [line.encode() for line in text.splitlines(keepends=True)]
-    begin, end = (sum(map(len, lines[:line - 1])) + column for line, column in (
-        (node.lineno, node.col_offset), (node.end_lineno, node.end_col_offset)))
-    whole, own = b"".join(lines), ast.unparse(new)
+    lines = text.encode().splitlines(keepends=True)
+    begin = len(b"".join(lines[:node.lineno - 1])) + node.col_offset
+    end = len(b"".join(lines[:node.end_lineno - 1])) + node.end_col_offset
+    whole = b"".join(lines)
+    own = ast.unparse(new)
     own = own if isinstance(node, ast.stmt) else f"({own})"
     return (whole[:begin] + own.encode() + whole[end:]).decode()
-
-
-def module_of(file, root):
-    """The numerical module of a file in this package's folder, "robust/fit", or None."""
-    if not file.startswith(f"{root}/slamlib/") or not file.endswith(".py"):
-        return None
-    module = file.removeprefix(f"{root}/slamlib/").removesuffix(".py")
-    return module if module.startswith(FOLDERS) else None
-
-
-def file_of(test):
-    """Name of the file of a test, "tests/test_x.py::test_y"."""
-    return test.partition("::")[0].rpartition("/")[2]
 
 
 class Watch:
@@ -157,42 +118,43 @@ class Watch:
     """
 
     def __init__(self, package):
-        self.package, self.entered, self.seconds, self.by_fixtures = package, {}, {}, {}
+        self.package, self.tests, self.by_fixtures = package, [], {}
 
-    def _watch(self, entered):
+    def _traced(self, entered):
+        """The set `entered`, to which all code is added that is entered from now on."""
         def trace(frame, *_):
             entered.add(frame.f_code)
         sys.settrace(trace)
+        return entered
 
-    def _functions(self, codes):
-        each = ((module_of(code.co_filename, self.package), code.co_firstlineno) for code in codes)
-        return {function for function in each if function[0]}
-
-    @pytest.hookimpl(hookwrapper=True)
+    @pytest.hookimpl(wrapper=True)
     def pytest_runtest_setup(self, item):
         """Watch the fixtures."""
-        self._watch(self.by_fixtures.setdefault(item.path.name, set()))
+        self._traced(self.by_fixtures.setdefault(item.path.name, set()))
         yield
         sys.settrace(None)
 
-    @pytest.hookimpl(hookwrapper=True)
+    @pytest.hookimpl(wrapper=True)
     def pytest_runtest_call(self, item):
         """Watch the test."""
-        self._watch(self.entered.setdefault(item.nodeid, set()))
+        entered = self._traced(set())
         begin = time.process_time()
         yield
         sys.settrace(None)
-        self.seconds[item.nodeid] = time.process_time() - begin
+        self.tests.append((time.process_time() - begin, item.path.name, item.nodeid, entered))
 
     def pytest_sessionfinish(self):
-        """Keep (seconds, name, functions), the fastest test first."""
-        tests = sorted((self.seconds[name], name, self._functions(entered | self.by_fixtures[
-            file_of(name)])) for name, entered in self.entered.items())
-        (Path(self.package) / "tests.pickle").write_bytes(pickle.dumps(tests))
+        """Keep (seconds, file, name, {(module, line) of functions}), the fastest test first."""
+        self.tests.sort(key=lambda test: test[0])
+        tests = [(seconds, file, name, {
+            (code.co_filename.removeprefix(f"{self.package}/slamlib/"), code.co_firstlineno)
+            for code in entered | self.by_fixtures[file]})
+            for seconds, file, name, entered in self.tests]
+        Path(self.package, "tests").write_bytes(pickle.dumps(tests))
 
 
 class Only:
-    """A plugin of pytest that runs some tests, in their order."""
+    """A plugin of pytest that runs the tests of these names, in their order."""
 
     def __init__(self, names):
         self.names = names
@@ -204,56 +166,38 @@ class Only:
         items[:] = [by_name[name] for name in self.names]
 
 
-def passes(package, files, seconds, plugin):
-    """True if the tests in these files pass in time, with the package in this folder.
+def passes(package, files, plugin, limits):
+    """True if the tests in these files pass within limits, with the package in this folder.
 
     In a process of its own, which has no memory of other mutants.
     """
     pid = os.fork()
     if pid:
-        return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
+        return os.waitpid(pid, 0)[1] == 0
     silence = os.open(os.devnull, os.O_WRONLY)
     os.dup2(silence, 1)
     os.dup2(silence, 2)
-    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-    resource.setrlimit(resource.RLIMIT_CPU, 2 * (int(seconds),))        # which ends the process
+    for limit, value in limits.items():
+        resource.setrlimit(limit, (value, value))              # which ends the process
     sys.path.insert(0, package)
     sys.dont_write_bytecode = True
     os.chdir(package)
-    os._exit(int(pytest.main(
-        ["-x", "-q", "-p", "no:cacheprovider", "-m", "not slow", "-c", str(ROOT / "pyproject.toml"),
-         *(str(ROOT / "tests" / file) for file in files)], plugins=[plugin])))
+    os._exit(pytest.main(
+        ["-x", "-p", "no:cacheprovider", "-m", "not slow", "-c", str(ROOT / "pyproject.toml"),
+         *(str(ROOT / "tests" / file) for file in files)], plugins=[plugin]))
 
 
-def all_places(only):
-    """(module, text, node, function) for all places in modules whose names begin with `only`.
+def survives(package, tests):
+    """True if no test notices the mutant in this folder; `tests` are those that enter its function.
 
-    `function` is the first line of that around the node. It is None outside of functions, and in
-    those with decorators, which may be cached: then not all tests that need them enter them.
+    The fastest run, for ENOUGH seconds.
     """
-    found = []
-    for file in sorted((ROOT / "slamlib").rglob("*.py")):
-        module, text = module_of(str(file), ROOT), file.read_text(encoding="utf-8")
-        if module and module.startswith(only):
-            tree = ast.parse(text)
-            functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
-            for node in places(tree):
-                around = [each.lineno for each in functions if not each.decorator_list
-                          and each.body[0].lineno <= node.lineno <= each.end_lineno]
-                found.append((module, text, node, max(around, default=None)))
-    return found
-
-
-def tests_of(tests, module, function):
-    """Names of the tests that enter a function, or a module if it is None, for ENOUGH seconds."""
-    own = [(seconds, name) for seconds, name, entered in tests if (
-        (module, function) in entered if function else any(module == each for each, _ in entered))]
-    total, chosen = 0.0, []
-    for seconds, name in own:
+    total, chosen = 0.0, {}
+    for seconds, file, name, _ in tests:
         total += seconds
         if total < ENOUGH:
-            chosen.append(name)
-    return chosen, total
+            chosen[name] = file
+    return not chosen or passes(package, {*chosen.values()}, Only(chosen), LIMITS)
 
 
 def main():
@@ -263,29 +207,30 @@ def main():
     parser.add_argument("--seed", type=int, default=0, help="of the draw (default 0)")
     parser.add_argument("--only", default="", help="modules whose name begins so: core, robust/fit")
     given = parser.parse_args()
-    rng, found = random.Random(given.seed), all_places(given.only)
-    drawn = rng.sample(range(len(found)), min(given.count, len(found)))
+    rng = random.Random(given.seed)
+    modules = {str(path.relative_to(ROOT / "slamlib")): path.read_text(encoding="utf-8")
+               for folder in FOLDERS for path in sorted((ROOT / "slamlib" / folder).glob("*.py"))}
+    found = [(module, *place) for module, text in modules.items() if module.startswith(given.only)
+             for place in places(ast.parse(text))]
+    drawn = rng.sample(found, min(given.count, len(found)))
     print(f"{len(drawn)} mutants at {len(found)} places", flush=True)
     survivors = 0
     with tempfile.TemporaryDirectory() as package:
-        shutil.copytree(ROOT / "slamlib", f"{package}/slamlib",
-                        ignore=shutil.ignore_patterns("__pycache__"))
-        compileall.compile_dir(package, quiet=1)
-        if not passes(package, FILES, 3600, Watch(package)):
+        shutil.copytree(ROOT / "slamlib", f"{package}/slamlib")
+        if not passes(package, FILES, Watch(package), {}):
             sys.exit("A test fails without a mutant.")
-        tests = pickle.loads(Path(package, "tests.pickle").read_bytes())
-        for number, k in enumerate(drawn, 1):
-            module, text, node, function = found[k]
+        tests = pickle.loads(Path(package, "tests").read_bytes())
+        for number, (module, node, function) in enumerate(drawn, 1):
             new = rng.choice(changes(node))
-            names, seconds = tests_of(tests, module, function)
-            file = f"slamlib/{module}.py"
-            Path(package, file).write_text(mutated(text, node, new), encoding="utf-8")
-            files = {*map(file_of, names)}
-            if not names or passes(package, files, START + PATIENCE * seconds, Only(names)):
+            file = Path(package, "slamlib", module)
+            file.write_text(mutated(modules[module], node, new), encoding="utf-8")
+            own = [test for test in tests if any(
+                module == each and function in (line, None) for each, line in test[3])]
+            if survives(package, own):
                 survivors += 1
-                print(f"{number:4} {file}:{node.lineno}: {ast.unparse(node)}   ->   "
+                print(f"{number:4} {module}:{node.lineno}: {ast.unparse(node)}   ->   "
                       f"{ast.unparse(new)}", flush=True)
-            shutil.copy2(ROOT / file, Path(package, file))
+            file.write_text(modules[module], encoding="utf-8")
     print(f"{1 - survivors / len(drawn):.0%} are noticed")
 
 

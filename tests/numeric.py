@@ -1,15 +1,23 @@
-"""Numerical derivatives, standard errors, changed drives and trials, shared by the tests."""
+"""Numerical derivatives, standard errors, drives, changes of drives and trials, for all tests."""
 
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
+import pytest
 from scipy.stats import t
 
 from slamlib import estimate
-from slamlib.core.evaluation import ate, nees
+from slamlib.core.evaluation import anees, ate, nees, nees_band
+from slamlib.core.records import ArucoReadings
+from slamlib.studies import montecarlo
 from slamlib.studies.montecarlo import antenna_error
-from slamlib.studies.simulation import simulate
+
+REAL_LOGS = Path(__file__).parents[2] / "shared" / "real_logs"      # where they are present
+short = montecarlo.drive           # a simulated drive of the short path, or its first poses
+on_real_logs = pytest.mark.skipif(
+    not REAL_LOGS.is_dir(), reason="the public robot logs are not here")
 
 
 def central_differences(function, x, step=1e-6):
@@ -27,6 +35,43 @@ def decided(differences):
     """True where the mean of paired differences (s,) is above zero in a t test of 2.5 %."""
     error = differences.std(ddof=1) / np.sqrt(len(differences))
     return differences.mean() > t.ppf(0.975, len(differences) - 1) * error
+
+
+def sightings(pose, marker, z, covariance):
+    """ArucoReadings of markers at z (m, 3), with one covariance (3, 3) or one of each."""
+    return ArucoReadings(np.array(pose), np.array(marker), np.array(z, float),
+                         np.broadcast_to(covariance, (len(z), 3, 3)))
+
+
+def true_markers(truth, marker):
+    """True places (m, 3) of markers with these ids (m,)."""
+    return truth.marker_in_world[np.searchsorted(truth.marker, marker)]
+
+
+def sigmas(covariances):
+    """Standard deviations (..., d) of covariances (..., d, d)."""
+    return np.sqrt(np.diagonal(covariances, axis1=-2, axis2=-1))
+
+
+def errors_of(covariances, rng):
+    """Random errors (m, 3) with these covariances (m, 3, 3)."""
+    return (np.linalg.cholesky(covariances) @ rng.normal(size=(len(covariances), 3, 1)))[..., 0]
+
+
+def mean_nees(found, truth):
+    """Mean NEES of the poses of a result; 3 is right."""
+    return anees(found.poses, found.covariances, truth.poses)
+
+
+def aligned_ate(found, truth):
+    """ATE in m of a result, after alignment."""
+    return ate(found.poses, truth.poses, aligned=True)
+
+
+def assert_consistent(values, dof=3, probability=0.95):
+    """The mean of independent NEES is in its two-sided band."""
+    low, high = nees_band(len(values), dof, probability)
+    assert low < np.mean(values) < high
 
 
 def changed(dataset, sensor, **fields):
@@ -69,8 +114,7 @@ def known_noise(dataset, slip):
 
 def map_nees(found, truth):
     """NEES (k,) of the markers of a SlamResult or a Localization."""
-    true_map = truth.marker_in_world[np.searchsorted(truth.marker, found.marker)]
-    return nees(found.marker_in_world, found.marker_covariance, true_map)
+    return nees(found.marker_in_world, found.marker_covariance, true_markers(truth, found.marker))
 
 
 def wheel_nees(found, truth):
@@ -84,22 +128,25 @@ def slam_trial(seed, ranges=True, markers=True, **options):
 
     "nees" is that of the measured poses, "nees between" that of the others.
     """
-    dataset, truth = simulate("short", seed, **options)
-    found = estimate(dataset.without("uwb")) if markers else None
-    dataset = dataset if markers else dataset.without("aruco")
-    dataset = dataset if ranges else dataset.without("uwb")
-    found = estimate(dataset, previous=found) if ranges else found
-    measured = [sensor.pose for sensor in (dataset.aruco, dataset.uwb) if sensor is not None]
-    frames = np.isin(np.arange(len(truth.poses)), np.concatenate(measured))
+    dataset, truth = short(seed, **options)
+    found = None
+    if markers:
+        found = estimate(dataset.without("uwb"))
+    else:
+        dataset = dataset.without("aruco")
+    if ranges:
+        found = estimate(dataset, previous=found)
+    frame = found.fit.problem.measurements.frame
     values = nees(found.poses, found.covariances, truth.poses)
-    numbers = {"nees": np.nanmean(values[frames]), "nees between": np.nanmean(values[~frames]),
+    numbers = {"nees": np.nanmean(values[frame]),
+               "nees between": np.nanmean(np.delete(values, frame)),
                "last nees": values[-1], "wheel nees": wheel_nees(found, truth),
                "ate": ate(found.poses, truth.poses), "slip": found.slip,
                "factor": found.noise.sightings, "arc": float(found.model == "arc")}
     if markers:
-        true_map = truth.marker_in_world[np.searchsorted(truth.marker, found.marker)]
+        off = found.marker_in_world - true_markers(truth, found.marker)
         numbers |= {"map nees": map_nees(found, truth).mean(),
-                    "map worst": np.abs(found.marker_in_world - true_map)[:, :2].max()}
+                    "map worst": np.abs(off)[:, :2].max()}
     if ranges:
         error, squared = antenna_error(found, truth)
         numbers |= {"antenna nees": np.mean(squared), "antenna error": np.sqrt(np.mean(error**2)),
@@ -112,3 +159,10 @@ def as_points(aruco, rows, variance=1e4):
     covariance = aruco.covariance.copy()
     covariance[rows, 2] = covariance[rows, :, 2] = [0, 0, variance]
     return replace(aruco, covariance=covariance)
+
+
+def without_headings(aruco, rows=slice(None)):
+    """ArucoReadings of which some rows have random headings, as their variances say."""
+    z = aruco.marker_in_vehicle.copy()
+    z[rows, 2] = np.random.default_rng(0).uniform(-np.pi, np.pi, len(z[rows]))
+    return replace(as_points(aruco, rows), marker_in_vehicle=z)

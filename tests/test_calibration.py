@@ -1,17 +1,29 @@
 """What sensors share: derivatives, posterior, decision, and drives whose files are wrong there."""
 
 from dataclasses import replace
-from functools import cache, partial
-from pathlib import Path
+from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from numeric import aruco, as_points, central_differences, changed, uwb, vehicle
+from numeric import (
+    REAL_LOGS,
+    aligned_ate,
+    aruco,
+    as_points,
+    central_differences,
+    mean_nees,
+    on_real_logs,
+    short,
+    uwb,
+    vehicle,
+)
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.stats import norm
 
 from slamlib import estimate, fuse, fuse_increments, localize
 from slamlib.core import se2
-from slamlib.core.evaluation import align, anees, ate
+from slamlib.core.evaluation import align, ate
 from slamlib.core.kernels import KERNELS, ONE_SIDED
 from slamlib.core.odometry import dead_reckoning
 from slamlib.core.vehicle import Vehicle
@@ -25,9 +37,7 @@ from slamlib.robust.linear import NormalEquations, build_problem
 from slamlib.robust.measurements import Noise, measure
 from slamlib.robust.solution_doubts import solution_doubts
 from slamlib.studies.montecarlo import antenna_error
-from slamlib.studies.simulation import simulate
 
-REAL_LOGS = Path(__file__).parents[2] / "shared" / "real_logs"      # where they are present
 # Sensors of which every entry differs from its default.
 MOUNTED = Vehicle(camera_x=0.15, camera_y=-0.08, camera_turn=0.3, marker_size=1.03,
                   sighting_lag=3.4, tag_x=0.2, tag_y=-0.1, antenna_height=2.0, range_offset=0.1,
@@ -39,17 +49,16 @@ DOUBTFUL = {f"sigma_{entry.name}": 0.01 for entry in ENTRIES}
                          ids=["mounted", "in the origin"])
 def test_derivatives_by_delays_are_averaged_over_encoder_steps(vehicle):
     """Because counts are whole numbers; so are the differences. Three markers are points."""
-    dataset, _ = simulate("short", 4)
+    dataset, _ = short(4, 400)
     points = np.isin(dataset.aruco.marker, dataset.aruco.marker[:3])
     dataset = replace(dataset, vehicle=vehicle, aruco=as_points(dataset.aruco, points, 4.0))
-    problem = build_problem(measure(dataset.first(400)), "arc", Noise(2e-3, 1.5, 0.7))
+    problem = build_problem(measure(dataset), "arc", Noise(2e-3, 1.5, 0.7))
     m = problem.measurements
     state = odometry_state(m, "arc")
     linearized = NormalEquations(problem, state).linearized
     for kind, entry in enumerate([SIGHTING_LAG, RANGE_LAG]):
         def error(lag, kind=kind, entry=entry):
-            c = state.c.copy()
-            c[entry] += lag[0]
+            c = state.c + lag * (np.arange(len(state.c)) == entry)
             return NormalEquations(problem, replace(state, c=c)).linearized[kind].e
 
         factors = linearized[kind]
@@ -58,33 +67,34 @@ def test_derivatives_by_delays_are_averaged_over_encoder_steps(vehicle):
         numeric = central_differences(error, np.zeros(1), SMOOTHED_STEPS / 2)[..., 0]
         frame = m.frame[m.structure.variables[factors.index, 0]]
         inside = (frame > 20) & (frame < m.frame[-1] - 20)
-        np.testing.assert_allclose(J[inside], numeric[inside], atol=0.1 * np.abs(numeric).max())
+        assert_allclose(J[inside], numeric[inside], atol=0.1 * np.abs(numeric).max())
         assert np.abs(J[inside]).max() > 0
 
 
 def test_sensors_are_where_the_vehicle_was_by_their_delay():
     """On the path of odometry, a camera that is four and a tag that is seven encoder steps late."""
-    m = measure(simulate("short", 4)[0].first(400))
+    m = measure(short(4, 400)[0])
     path = dead_reckoning(m.dataset.ticks, m.dataset.vehicle, model="arc")
-    c = calibration.stated_calibration(MOUNTED, []).stated
-    c[[SIGHTING_LAG, RANGE_LAG]] = 4, 7
+    c = calibration.stated_calibration(
+        replace(MOUNTED, sighting_lag=4, range_lag=7), []).stated
     camera, tag = sensor_poses(m, path[m.frame], c)
-    for found, row, late, place in ((camera, m.sightings.row, 4, c[calibration.CAMERA]),
-                                    (tag, m.ranges.row, 7, np.append(c[calibration.TAG_PLACE], 0))):
+    for found, row, late, place in ((camera, m.sightings.row, 4, [0.15, -0.08, 0.3]),
+                                    (tag, m.ranges.row, 7, [0.2, -0.1, 0])):
         seen = m.frame[row]
         expected = se2.compose(path[seen[seen >= late] - late], place)
-        np.testing.assert_allclose(found[seen >= late], expected, atol=1e-9)
+        assert_allclose(found[seen >= late], expected, atol=1e-9)
 
 
 def test_evidence_of_one_entry_by_hand():
     """Likelihood exp(-L u^2 / 2 + h u), prior N(0, s^2): evidence by quadrature."""
-    L, h, s = 4.0, 6.0, 0.7
+    L, h, s = np.array([[4.0]]), np.array([6.0]), np.array([0.7])
     u = np.linspace(-10, 10, 200_001)
-    density = np.exp(-L * u**2 / 2 + h * u) * np.exp(-u**2 / 2 / s**2) / s / np.sqrt(2 * np.pi)
-    found, largest = choices._log_evidence(np.array([[L]]), np.array([h]), np.array([[s]]))
-    assert np.isclose(found, np.log(np.trapezoid(density, u)), atol=1e-9)
-    assert np.isclose(largest, np.trapezoid(u * density, u) / np.trapezoid(density, u) / s)
-    assert choices._log_evidence(np.array([[L]]), np.array([h]), np.zeros((1, 1))) == (0, 0)
+    density = np.exp(-L[0] * u**2 / 2 + h * u) * norm.pdf(u, scale=s)
+    evidence = np.trapezoid(density, u)
+    found, largest = choices._log_evidence(L, h, np.diag(s))
+    assert np.isclose(found, np.log(evidence), atol=1e-9)
+    assert np.isclose(largest, np.trapezoid(u * density, u) / evidence / s)
+    assert choices._log_evidence(L, h, 0 * L) == (0, 0)
 
 
 @pytest.mark.parametrize("height, sigma", [(0.0, 0.5), (2.0, 1e-3), (0.0, 0.0)])
@@ -100,8 +110,8 @@ def test_what_is_stated_is_what_the_table_says(height, sigma):
     assert [row["name"] for row in rows if row["released"]] == ["tag_x", "tag_y"]
     for row in rows[:14]:
         of_vehicle = [getattr(vehicle, row["name"]), getattr(vehicle, f"sigma_{row['name']}")]
-        np.testing.assert_allclose([row["stated"], row["stated_sigma"]], of_vehicle, rtol=1e-6)
-        np.testing.assert_allclose([row["estimate"], row["sigma"]], of_vehicle, rtol=1e-6)
+        assert_allclose([row["stated"], row["stated_sigma"]], of_vehicle, rtol=1e-6)
+        assert_allclose([row["estimate"], row["sigma"]], of_vehicle, rtol=1e-6)
 
 
 @pytest.mark.parametrize("off, sigma, named", [
@@ -121,10 +131,15 @@ def test_what_a_drive_cannot_tell_apart_by_hand(monkeypatch, off, sigma, named):
     assert frozenset().union(*found.explanations) == named
     assert all(len(each) == 1 for each in found.explanations) or not named
     chosen = np.isin(stated.group, [*found.prior.groups])
-    np.testing.assert_array_equal(
-        np.diag(found.prior.root), np.where(chosen, stated.wide, stated.sigma))
+    assert_array_equal(np.diag(found.prior.root), np.where(chosen, stated.wide, stated.sigma))
     if sigma == 0 and named:
         assert found.lead == pytest.approx(2500 / 201 - np.log(201) / 2)
+
+
+@pytest.mark.parametrize("group, more", [("marker-size", 0), ("camera-offset", 2)])
+def test_a_group_costs_more_for_each_entry_but_the_first(group, more):
+    price = choices._price(calibration.stated_calibration(Vehicle(), []), group)
+    assert price == choices.DECISIVE_RELEASE + more * choices.FURTHER_ENTRY
 
 
 @pytest.mark.parametrize("name", ["asymmetric Tukey", "asymmetric Cauchy"])
@@ -146,8 +161,8 @@ def seen_from(dataset, camera=(0.0, 0.0, 0.0), size=1.0):
     z = se2.between(np.array(camera), dataset.aruco.marker_in_vehicle)
     covariance = se2.rotate_covariance(dataset.aruco.covariance, -camera[2])
     scale = np.array([size, size, 1])
-    return changed(dataset, "aruco", marker_in_vehicle=z / scale,
-                   covariance=covariance / np.outer(scale, scale))
+    return aruco(dataset, marker_in_vehicle=z / scale,
+                 covariance=covariance / np.outer(scale, scale))
 
 
 def ranged_from(dataset, truth, tag=(0.0, 0.0), height=0.0, offsets=0.0, late=0):
@@ -180,7 +195,7 @@ SCATTER = {
     "range-offset": lambda d: uwb(d, range=d.uwb.range * 1.015)}
 
 
-drive = cache(partial(simulate, "short"))
+drive = cache(short)
 
 
 @cache
@@ -189,7 +204,7 @@ def right_ates(seed):
     dataset, truth = drive(seed)
     both = both_problems(dataset)
     assert not named(both[0]) and not named(both[1])
-    return [ate(found.poses, truth.poses, aligned=True) for found in both]
+    return [aligned_ate(found, truth) for found in both]
 
 
 def both_problems(dataset):
@@ -204,8 +219,8 @@ def named(found):
 
 def assert_right(found, truth, largest):
     """The covariances hold, and the aligned ATE is below the largest in m."""
-    assert ate(found.poses, truth.poses, aligned=True) < largest
-    assert anees(found.poses, found.covariances, truth.poses) < 6
+    assert aligned_ate(found, truth) < largest
+    assert mean_nees(found, truth) < 6
 
 
 @pytest.mark.slow
@@ -235,7 +250,7 @@ def test_wrong_wheels_are_named_and_mended_and_not_taken_for_slip(fault):
     assert named(markers) & {"wheelbase", "wheel-scale", "marker-size"}
     first = solution_doubts(both)[0]
     assert first.what in ("wheelbase", "wheel-scale")
-    np.testing.assert_allclose(both.wheel, [0.1, 0.1, 0.4], rtol=0.01)
+    assert_allclose(both.wheel, [0.1, 0.1, 0.4], rtol=0.01)
     assert markers.slip < 2e-3 and both.slip < 2e-3
     assert_right(both, truth, 1.3 * right_ates(501)[1])
     assert antenna_error(both, truth)[1].mean() < 8
@@ -291,19 +306,19 @@ def test_one_factor_on_both_wheels_is_named_and_mended(fault):
     dataset, truth = drive(11)
     for found in both_problems(spoil(dataset)):
         assert "wheel-scale" in named(found)
-        assert ate(found.poses, truth.poses, aligned=True) < largest
-        assert anees(found.poses, found.covariances, truth.poses) < largest_nees
+        assert aligned_ate(found, truth) < largest
+        assert mean_nees(found, truth) < largest_nees
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [11, 12])
 def test_wheels_that_only_ranges_contradict_are_told_from_the_scale_of_ranges(seed):
     """The offset and scale of the ranges are two entries that nobody stated; turns tell them."""
-    dataset, truth = simulate("short", seed)
+    dataset, truth = drive(seed)
     dataset = dataset.without("aruco")
     found = estimate(counted(dataset, 1.03))
     assert named(found) <= {"wheel-scale", "wheel-radii"} and named(found)
-    assert_right(found, truth, 1.5 * ate(estimate(dataset).poses, truth.poses, aligned=True))
+    assert_right(found, truth, 1.5 * aligned_ate(estimate(dataset), truth))
 
 
 @pytest.mark.slow
@@ -323,7 +338,7 @@ def test_counts_that_were_cut_off_say_so_and_leave_the_metre_to_the_markers():
     assert doubt.what == "encoder-counts" and "multiples of 8" in doubt.sentence
     found = estimate(cut.without("uwb"))
     sigma = found.calibration.sigma[calibration.WHEELS] / [0.1, 0.1, 0.4]
-    np.testing.assert_allclose(sigma, 3.5 / 127, rtol=0.1)
+    assert_allclose(sigma, 3.5 / 127, rtol=0.1)
     assert not named(found)
     assert_right(found, truth, 0.004)
 
@@ -349,18 +364,18 @@ def test_a_factor_on_both_radii_correlates_them():
     stated = calibration.stated_calibration(Vehicle(), [])
     prior = stated.prior(["wheel-scale"], width=2.0)
     expected = np.diag([1e-8, 1e-8]) + 0.1**2 * 0.1**2
-    np.testing.assert_allclose((prior.root @ prior.root.T)[:2, :2], expected)
-    np.testing.assert_array_equal(np.diag(prior.root)[2:], stated.sigma[2:])
+    assert_allclose((prior.root @ prior.root.T)[:2, :2], expected)
+    assert_array_equal(np.diag(prior.root)[2:], stated.sigma[2:])
     u = np.array([0.3, -0.2, 0.5])
-    np.testing.assert_allclose(prior.unknowns(prior.of(slice(None)) @ u), u)
+    assert_allclose(prior.unknowns(prior.of(slice(None)) @ u), u)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 2])
 def test_the_model_of_a_step_that_a_wrong_size_made_does_not_blame_the_wheels(seed):
     """A camera 0.2 m ahead, as stated, and larger markers look like Euler's steps at first."""
-    dataset = seen_from(simulate("short", seed)[0].without("uwb"), (0.2, 0.0, 0.0), size=1.04)
-    found = estimate(replace(dataset, vehicle=replace(dataset.vehicle, camera_x=0.2)))
+    dataset = seen_from(drive(seed)[0].without("uwb"), (0.2, 0.0, 0.0), size=1.04)
+    found = estimate(vehicle(camera_x=0.2)(dataset))
     assert found.model == "arc" and found.released == {"marker-size"}
     assert [doubt.what for doubt in solution_doubts(found)] == ["marker-size"]
     assert found.c[SIZE] == pytest.approx(1.04, abs=0.004)
@@ -372,8 +387,8 @@ def test_four_wrong_statements_at_once_are_all_found():
     spoilt = ranged_from(seen_from(dataset, (0.08, 0, 0), size=1.02), truth, (0.2, 0), height=1.5)
     found = estimate(spoilt, previous=estimate(spoilt.without("uwb")))
     assert found.released == {"camera-offset", "marker-size", "tag-offset", "antenna-height"}
-    assert ate(found.poses, truth.poses, aligned=True) < 0.005
-    assert anees(found.poses, found.covariances, truth.poses) < 6
+    assert aligned_ate(found, truth) < 0.005
+    assert mean_nees(found, truth) < 6
 
 
 @pytest.mark.slow
@@ -382,9 +397,8 @@ def test_what_is_stated_is_used():
     dataset, truth = drive(1)
     spoilt = ranged_from(seen_from(dataset, (0.15, -0.05, 0.1), size=1.03), truth, tag=(0.3, 0.1),
                          height=2.0)
-    stated = replace(spoilt, vehicle=replace(
-        dataset.vehicle, camera_x=0.15, camera_y=-0.05, camera_turn=0.1, marker_size=1.03,
-        tag_x=0.3, tag_y=0.1, antenna_height=2.0))
+    stated = vehicle(camera_x=0.15, camera_y=-0.05, camera_turn=0.1, marker_size=1.03, tag_x=0.3,
+                     tag_y=0.1, antenna_height=2.0)(spoilt)
     found, right = estimate(stated), estimate(dataset)
     assert not solution_doubts(found) and not found.released
     assert np.abs(found.poses - right.poses)[:, :2].max() < 2e-3
@@ -393,15 +407,13 @@ def test_what_is_stated_is_used():
 
 def test_problem_2_and_the_checks_of_files_see_by_the_stated_camera():
     """A camera turned by a right angle is no flaw of the files if vehicle.toml says so."""
-    dataset, _ = drive(1)
-    dataset = dataset.without("uwb").first(500)
-    camera = (0.15, -0.05, np.pi / 2)
-    spoilt = seen_from(dataset, camera, size=1.5)
-    stated = replace(spoilt, vehicle=replace(
-        dataset.vehicle, camera_x=0.15, camera_y=-0.05, camera_turn=np.pi / 2, marker_size=1.5))
+    dataset = drive(1, 500)[0].without("uwb")
+    spoilt = seen_from(dataset, (0.15, -0.05, np.pi / 2), size=1.5)
+    stated = vehicle(
+        camera_x=0.15, camera_y=-0.05, camera_turn=np.pi / 2, marker_size=1.5)(spoilt)
     assert doubts_before_solving(spoilt) and not doubts_before_solving(stated)
     for solve in (lambda d: localize(d.sightings), fuse, fuse_increments):
-        np.testing.assert_allclose(solve(stated).poses, solve(dataset).poses, atol=1e-9)
+        assert_allclose(solve(stated).poses, solve(dataset).poses, atol=1e-9)
 
 
 @pytest.mark.slow
@@ -409,32 +421,25 @@ def test_problem_2_and_the_checks_of_files_see_by_the_stated_camera():
 def test_no_doubt_about_clean_drives(seed):
     """Of all slips, with late ranges and wrong labels too; a long one is in test_uwb."""
     slip = [0.0, 3e-4, 1e-3, 3e-3, 1e-2][seed % 5]
-    dataset, _ = simulate("short", 100 + seed, slip=slip, late_ranges=0.1 * (seed % 2),
-                          mislabelled=0.02 * (seed % 3 == 2))
+    dataset, _ = short(100 + seed, slip=slip, late_ranges=0.1 * (seed % 2),
+                       mislabelled=0.02 * (seed % 3 == 2))
     markers, both = both_problems(dataset)
     assert not named(markers) and not named(both)
 
 
-def aligned_judgement(found, truth):
-    """ATE in m and mean NEES of positions (2 is right) after alignment, without the first tenth."""
-    T = align(found.poses, truth.poses)
-    poses, covariances = se2.compose(T, found.poses), se2.rotate_covariance(found.covariances, T[2])
-    later = slice(len(poses) // 10, None)
-    off, C = (poses - truth.poses)[later, :2], covariances[later, :2, :2]
-    squared = np.einsum("ni,nij,nj->n", off, np.linalg.inv(C), off)
-    return ate(found.poses, truth.poses, aligned=True), squared.mean()
-
-
 @pytest.mark.slow
-@pytest.mark.skipif(not REAL_LOGS.is_dir(), reason="the public robot logs are not here")
+@on_real_logs
 @pytest.mark.parametrize("log, largest, what", [
     ("starloc_b", 0.015, "marker-size"), ("mrclam_b", 0.100, "camera-offset")])
 def test_public_logs(log, largest, what):
     """AprilTags with ranges, printed too large; barcodes by a camera that stands elsewhere."""
-    dataset, truth = read_dataset(REAL_LOGS / log).first(6500), read_truth(REAL_LOGS / log)
-    truth = replace(truth, poses=truth.poses[:6500])
-    found = estimate(dataset.without("uwb"))
-    for result in (found, *([estimate(dataset, previous=found)] if dataset.uwb else [])):
-        assert what in result.released
-        error, squared = aligned_judgement(result, truth)
-        assert error < largest and squared < 4
+    dataset = read_dataset(REAL_LOGS / log).first(6500)
+    truth = read_truth(REAL_LOGS / log).poses[:6500]
+    for found in both_problems(dataset)[:1 + (dataset.uwb is not None)]:
+        assert what in found.released
+        assert ate(found.poses, truth, aligned=True) < largest
+        T = align(found.poses, truth)
+        later = slice(len(truth) // 10, None)
+        off = (se2.compose(T, found.poses) - truth)[later, :2]
+        C = se2.rotate_covariance(found.covariances, T[2])[later, :2, :2]
+        assert se2.squared_norms(off, C).mean() < 4

@@ -12,6 +12,7 @@ from functools import partial
 import pytest
 from conftest import ROOT, is_running
 from kills import contents
+from numeric import short
 from test_report import build, make_data, write
 
 from slamlib import solve
@@ -20,7 +21,7 @@ from slamlib.core.errors import DatasetError
 from slamlib.io import files, results
 from slamlib.report import NotebookError
 from slamlib.solve import solve_to_folder
-from slamlib.studies.simulation import simulate, write_dataset
+from slamlib.studies.simulation import write_dataset
 
 RESULT = """import os, time
 from pathlib import Path
@@ -58,7 +59,7 @@ def hidden(folder):
 @pytest.fixture
 def drive():
     """A simulated drive of 40 poses with all sensors."""
-    return simulate("short", seed=3)[0].first(40)
+    return short(3, 40)[0]
 
 
 @pytest.mark.slow

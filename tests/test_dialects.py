@@ -7,13 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import test_dataset
+from numeric import short
 from scipy.io import savemat
 from test_dataset import FILES, VEHICLE, assert_same, error_of, write
 
 from slamlib.core.vehicle import Vehicle
 from slamlib.io.dataset import dataset_from_arrays, inventory_lines, read_dataset, read_truth
 from slamlib.io.tables import datasets_in
-from slamlib.studies.simulation import simulate, write_dataset
+from slamlib.studies.simulation import write_dataset
 
 folder = test_dataset.folder
 
@@ -192,7 +193,7 @@ UwbReading.txt | 1 3.5 1 1 | antenna id, a whole number from -1e+15 to 1e+15, fo
 
 @pytest.mark.parametrize("name, row, said", BAD_ROWS)
 def test_a_bad_row_costs_a_row_up_to_a_tenth_of_the_file(tmp_path, name, row, said):
-    write_dataset(tmp_path, simulate("short", 1)[0].first(300))
+    write_dataset(tmp_path, short(1, 300)[0])
     clean = read_dataset(tmp_path)
     lines = (tmp_path / name).read_text().splitlines()
     most = len(lines) // 9                            # rows that are a tenth of the file
@@ -207,7 +208,7 @@ def test_a_bad_row_costs_a_row_up_to_a_tenth_of_the_file(tmp_path, name, row, sa
 
 
 def test_bad_rows_of_all_kinds_together_are_a_tenth_at_most(tmp_path):
-    write_dataset(tmp_path, simulate("short", 1)[0].first(300))
+    write_dataset(tmp_path, short(1, 300)[0])
     lines = (tmp_path / "UwbReading.txt").read_text().splitlines()
     bad = ["1 5 -9 1", "999 5 1 1"] * (len(lines) // 18 + 1)
     write(tmp_path / "UwbReading.txt", "\n".join(lines + bad))

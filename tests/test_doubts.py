@@ -6,9 +6,11 @@ from functools import cache
 
 import numpy as np
 import pytest
-from numeric import aruco, as_points, uwb, vehicle
+from numeric import aruco, errors_of, short, uwb, vehicle, without_headings
+from numpy.testing import assert_allclose
 
 from slamlib.core.errors import DatasetError
+from slamlib.core.odometry import dead_reckoning
 from slamlib.core.records import AntennaGuess, Dataset, UwbReadings
 from slamlib.core.vehicle import Vehicle
 from slamlib.io.dataset import read_dataset
@@ -16,26 +18,22 @@ from slamlib.robust import file_doubts as files
 from slamlib.robust.file_doubts import doubts_before_solving
 from slamlib.studies.simulation import manoeuvre, simulate, write_dataset
 
-SEEDS = (0, 1)
-simulated = cache(simulate)
-
-
-def whats(dataset):
-    return [doubt.what for doubt in doubts_before_solving(dataset)]
+drive = cache(short)
+long_drive = cache(lambda: simulate("long", 0)[0])
 
 
 def wheels(matrix):
     """A flaw: the counts (right, left) are mixed by a 2 x 2 matrix."""
-    return lambda dataset: replace(dataset, ticks=dataset.ticks @ np.array(matrix))
+    return lambda d: replace(d, ticks=d.ticks @ np.array(matrix))
 
 
 def covariances(factor):
-    return lambda dataset: aruco(dataset, covariance=factor * dataset.aruco.covariance)
+    return lambda d: aruco(d, covariance=factor * d.aruco.covariance)
 
 
-def another_drive(dataset):
+def another_drive(d):
     """The sightings are those of a long drive."""
-    return replace(dataset, aruco=simulated("long", 0)[0].first(len(dataset.ticks)).aruco)
+    return replace(d, aruco=long_drive().first(len(d.ticks)).aruco)
 
 
 def camera(*matrix):
@@ -49,9 +47,8 @@ def camera(*matrix):
 
 def sightings_in(factor, factor_of_sigmas):
     """A flaw: x and y, and their standard deviations, are in other units than metres."""
-    place = np.array([factor, factor, 1.0])
     sigmas = np.array([factor_of_sigmas, factor_of_sigmas, 1.0])
-    return lambda d: aruco(d, marker_in_vehicle=place * d.aruco.marker_in_vehicle,
+    return lambda d: aruco(d, marker_in_vehicle=[factor, factor, 1] * d.aruco.marker_in_vehicle,
                            covariance=d.aruco.covariance * np.outer(sigmas, sigmas))
 
 
@@ -73,10 +70,7 @@ FLAWS = {                                           # how, kinds of doubts, and 
     "both": (wheels(BACKWARDS), "wheels-reversed camera-turned",
              "signs reversed and the columns exchanged"),
     "y and theta": (camera(1, -1, -1), "wheels-swapped camera-mirrored", "with [x, -y, -theta]"),
-    "x and theta": (camera(-1, 1, -1), "wheels-reversed camera-mirrored", "with [-x, y, -theta]"),
     "y": (camera(1, -1, 1), "camera-mirrored", "with [x, -y, theta]"),
-    "x": (camera(-1, 1, 1), "camera-mirrored", "with [-x, y, theta]"),
-    "theta": (camera(1, 1, -1), "camera-mirrored", "with [x, y, -theta]"),
     "all": (camera(-1, -1, -1), "camera-mirrored", "with [-x, -y, -theta]"),
     "x and y": (camera(-1, -1, 1), "wheels-reversed camera-turned", "with [-x, -y, theta]"),
     "axes exchanged": (camera([0, 1, 0], [1, 0, 0], [0, 0, 1]), "camera-mirrored",
@@ -104,7 +98,7 @@ def test_a_flaw_is_named(flaw, options):
     """
     spoil, what, said = FLAWS[flaw]
     for seed, factor in ((0, 1.0), (1, 1.0), (1, 0.25), (1, 4.0)):
-        spoilt = covariances(factor)(spoil(simulated("short", seed, **options)[0]))
+        spoilt = covariances(factor)(spoil(drive(seed, **options)[0]))
         doubts = doubts_before_solving(spoilt)
         assert [doubt.what for doubt in doubts] == what.split()
         sentences = " ".join(doubt.sentence for doubt in doubts)
@@ -117,16 +111,12 @@ def test_a_flaw_is_named(flaw, options):
 def wheels_off(factor, base=1.0):
     """Wheels and wheelbase that are not as stated."""
     wrong = Vehicle(right_radius=0.1 * factor, wheelbase=0.4 * base)
-    return lambda d, rng: replace(simulated("short", 1, vehicle=wrong)[0], vehicle=Vehicle())
+    return lambda d, rng: replace(drive(1, vehicle=wrong)[0], vehicle=Vehicle())
 
 
 def headings_unknown(rows):
     """Sightings without a heading, as its sigma of 100 rad says."""
-    def change(d, rng):
-        z = d.aruco.marker_in_vehicle.copy()
-        z[rows, 2] = rng.uniform(-np.pi, np.pi, len(z[rows]))
-        return replace(d, aruco=replace(as_points(d.aruco, rows), marker_in_vehicle=z))
-    return change
+    return lambda d, rng: replace(d, aruco=without_headings(d.aruco, rows))
 
 
 def overconfident(factor, sigma):
@@ -139,11 +129,10 @@ def overconfident(factor, sigma):
 
 def standing(d, rng):
     """Ten sightings from each pose, of what pose 1 sees, with their noise."""
-    first = d.aruco.select(d.aruco.pose == 0)
-    seen = first.select(np.tile(np.arange(len(first.pose)), 200))
-    noise = np.linalg.cholesky(seen.covariance) @ rng.standard_normal((len(seen.pose), 3, 1))
-    seen = replace(seen, pose=np.repeat(np.arange(0, 2000, 10), len(first.pose)),
-                   marker_in_vehicle=seen.marker_in_vehicle + noise[..., 0])
+    first = np.flatnonzero(d.aruco.pose == 0)
+    seen = d.aruco.select(np.tile(first, 200))
+    seen = replace(seen, pose=np.repeat(np.arange(0, 2000, 10), len(first)),
+                   marker_in_vehicle=seen.marker_in_vehicle + errors_of(seen.covariance, rng))
     return replace(d, ticks=0 * d.ticks, aruco=seen, uwb=None)
 
 
@@ -162,27 +151,21 @@ RIGHT = {
     "too small": overconfident(1e-2, 0.03)}
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("case", RIGHT)
 def test_nothing_is_doubted(case, seed):
-    drive = RIGHT[case](simulated("short", seed)[0], np.random.default_rng(seed))
-    assert doubts_before_solving(drive) == []
+    dataset = RIGHT[case](drive(seed)[0], np.random.default_rng(seed))
+    assert doubts_before_solving(dataset) == []
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("factor", [1e-4, 0.25, 1.0, 4.0])
 @pytest.mark.parametrize("options", [
     {}, {"slip": 0.0}, {"slip": 1e-2}, {"mislabelled": 0.01, "late_ranges": 0.15}], ids=str)
-def test_a_clean_drive_gives_no_doubt(options, factor, seed):
-    dataset = simulated("short", seed, **options)[0]
-    assert doubts_before_solving(covariances(factor)(dataset)) == []
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("options", [
-    {}, {"slip": 0.0}, {"slip": 1e-2}, {"mislabelled": 0.01, "late_ranges": 0.15}], ids=str)
-def test_a_long_clean_drive_gives_no_doubt(options):
-    assert doubts_before_solving(simulated("long", 0, **options)[0]) == []
+@pytest.mark.parametrize("path, seed", [
+    ("short", 0), ("short", 1), pytest.param("long", 0, marks=pytest.mark.slow)])
+def test_a_clean_drive_gives_no_doubt(path, seed, options):
+    dataset, _ = simulate(path, seed, **options)
+    for factor in (1e-4, 0.25, 1.0, 4.0) if path == "short" else (1.0,):
+        assert doubts_before_solving(covariances(factor)(dataset)) == []
 
 
 @pytest.mark.parametrize("change", [
@@ -191,7 +174,7 @@ def test_a_long_clean_drive_gives_no_doubt(options):
     lambda d: replace(d, aruco=d.aruco.select(d.aruco.pose < 40)),
     lambda d: replace(d, aruco=d.aruco.select(d.aruco.pose % 500 == 0))])
 def test_too_little_to_decide_gives_no_doubt(change):
-    little = change(simulated("short", 0)[0])
+    little = change(drive(0)[0])
     assert doubts_before_solving(little) == []
     assert doubts_before_solving(wheels(SWAPPED)(little)) == []
 
@@ -212,14 +195,13 @@ def moved_by(length, turn, count=20):
 
 
 @pytest.mark.parametrize("markers, wheels, disagree, said", [
-    ((0.2, 0.1), (0.2, 0.1), 0, None), ((0.2, 0.1), (0.9, 0.45), 0, None),
-    ((0.9, 0.45), (0.2, 0.1), 0, None),
+    ((0.2, 0.1), (0.9, 0.45), 0, None), ((0.9, 0.45), (0.2, 0.1), 0, None),
     ((1.1, 0.1), (0.2, 0.1), 0, "x and y in ArucoReading.txt"),
     ((0.2, 0.1), (1.1, 0.1), 0, "x and y in ArucoReading.txt"),
     ((0.2, 0.01), (0.2, 0.06), 0, "wheelbase in vehicle.toml"),
     ((0.2, 0.06), (0.2, 0.01), 0, "wheelbase in vehicle.toml"),
     ((0.02, 0.01), (0.2, 0.1), 0, "radii (metres) and ticks_per_revolution"),
-    ((0.02, 0.1), (0.0, 0.1), 0, None), ((0.02, 0.1), (0.005, 0.1), 0, None),
+    ((0.02, 0.1), (0.0, 0.1), 0, None),
     ((0.2, 0.004), (0.2, 0.0005), 0, None), ((0.3, 0.15), (0.2, 0.1), 9, None),
     ((0.3, 0.15), (0.2, 0.1), 12, "they agree at 40% of 20 places")])
 def test_units_are_named_from_a_factor_of_five_on_and_odometry_if_most_disagrees(
@@ -238,14 +220,13 @@ def test_units_are_named_from_a_factor_of_five_on_and_odometry_if_most_disagrees
 def ranges_on_a_circle(factor=1.0, guess=1.0, count=200):
     """A drive on a circle of 2 m with ranges to an antenna 10 m away, times a factor."""
     ticks = np.rint(manoeuvre([(4 * np.pi, 2 * np.pi)]))
-    path = np.column_stack([2 * np.sin(np.linspace(0, 2 * np.pi, len(ticks))),
-                            2 - 2 * np.cos(np.linspace(0, 2 * np.pi, len(ticks)))])
+    path = dead_reckoning(ticks, Vehicle(), model="arc")[:, :2]
     at = np.linspace(0, len(ticks) - 1, count).astype(int)
     place = np.array([6.0, 10.0])
-    r = factor * np.hypot(*(path[at] - place).T)
-    return Dataset("circle", Vehicle(), ticks, None,
-                   UwbReadings(at, np.full(count, 3), r, np.full(count, 0.1)),
-                   AntennaGuess(np.array([3]), guess * place[None]))
+    ranges = UwbReadings(at, np.full(count, 3), factor * np.hypot(*(path[at] - place).T),
+                         np.full(count, 0.1))
+    guesses = AntennaGuess(np.array([3]), guess * place[None])
+    return Dataset("circle", Vehicle(), ticks, None, ranges, guesses)
 
 
 @pytest.mark.parametrize("factor, guess, named", [
@@ -260,15 +241,15 @@ def test_units_of_ranges_are_judged_by_their_spread_and_by_the_guesses(factor, g
         assert named in doubt.sentence
         numbers = re.findall(r"[\d.]+(?= m\b)", doubt.sentence)
         expected = [factor * 10, factor * 2 * np.sqrt(2), 2, np.hypot(6 * guess, 10 * guess - 2)]
-        np.testing.assert_allclose(np.array(numbers, float), expected, rtol=0.03)
+        assert_allclose(np.array(numbers, float), expected, rtol=0.03)
 
 
 def test_units_of_few_ranges_and_of_a_vehicle_that_stands_are_not_judged():
-    drive = ranges_on_a_circle(1e3)
-    for few, count in ((drive, 1), (ranges_on_a_circle(1e3, count=10), 1),
-                       (ranges_on_a_circle(1e3, count=9), 0),
-                       (replace(drive, ticks=0 * drive.ticks), 0), (drive.without("uwb"), 0)):
-        assert len(list(files.range_units(few))) == count
+    few = ranges_on_a_circle(1e3, count=10)
+    assert len(list(files.range_units(few))) == 1
+    for each in (ranges_on_a_circle(1e3, count=9), replace(few, ticks=0 * few.ticks),
+                 few.without("uwb")):
+        assert not list(files.range_units(each))
 
 
 @pytest.mark.parametrize("spoil", [
@@ -279,12 +260,13 @@ def test_units_of_few_ranges_and_of_a_vehicle_that_stands_are_not_judged():
 @pytest.mark.parametrize("count", [150, 2000])
 def test_lengths_in_centimetres_are_doubted(spoil, count):
     """Of short drives of 1.5 m and 20 m."""
-    assert set(whats(spoil(simulated("short", 0)[0].first(count)))) == {"units"}
+    doubts = doubts_before_solving(spoil(drive(0, count)[0]))
+    assert {doubt.what for doubt in doubts} == {"units"}
 
 
 @pytest.mark.parametrize("sizes", [{"wheelbase": 400.0}, {"right_radius": 100.0}])
 def test_wheels_in_millimetres_are_refused(sizes, tmp_path):
-    write_dataset(tmp_path / "drive", vehicle(**sizes)(simulated("short", 0)[0].first(150)))
+    write_dataset(tmp_path / "drive", vehicle(**sizes)(drive(0, 150)[0]))
     with pytest.raises(DatasetError, match="vehicle.toml: expected a number from "):
         read_dataset(tmp_path / "drive")
 
@@ -292,18 +274,19 @@ def test_wheels_in_millimetres_are_refused(sizes, tmp_path):
 @pytest.mark.parametrize("factor", [1.0, 3.0])
 def test_variances_of_headings_in_square_degrees_are_named(factor):
     """Headings of 0.5 and 1.5 degrees; in radians nobody would state the latter as known."""
-    dataset, rng = simulated("short", 0)[0], np.random.default_rng(0)
-    C, z = dataset.aruco.covariance, dataset.aruco.marker_in_vehicle.copy()
-    z[:, 2] += np.sqrt((factor**2 - 1) * C[:, 2, 2]) * rng.normal(size=len(z))
-    scale = np.array([1.0, 1.0, factor * np.degrees(1)])
+    dataset, _ = drive(0)
+    C = dataset.aruco.covariance
+    added = (factor**2 - 1) * C * np.diag([0, 0, 1]) + 1e-20 * np.eye(3)
+    z = dataset.aruco.marker_in_vehicle + errors_of(added, np.random.default_rng(0))
+    scale = np.diag([1.0, 1.0, factor * np.degrees(1)])
     doubt, = doubts_before_solving(aruco(
-        dataset, marker_in_vehicle=z, covariance=C * np.outer(scale, scale)))
+        dataset, marker_in_vehicle=z, covariance=scale @ C @ scale))
     assert doubt.what == "units" and "s_thetatheta" in doubt.sentence
 
 
 @pytest.mark.parametrize("count", [150, 2000])
 def test_ranges_exchanged_with_their_sigmas_are_doubted(count):
-    dataset = simulated("short", 0)[0].first(count)
+    dataset, _ = drive(0, count)
     exchanged = uwb(dataset, range=dataset.uwb.sigma, sigma=dataset.uwb.range)
     doubts = doubts_before_solving(exchanged)
     assert {doubt.what for doubt in doubts} == {"units"}

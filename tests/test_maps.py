@@ -5,6 +5,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from numeric import short
 from test_plotting import elongated, require_contours
 
 from slamlib import estimate, localize
@@ -13,7 +14,6 @@ from slamlib.core.evaluation import REACH_95, ate
 from slamlib.notebook import Drive, accuracy, antenna_rows, calibration_rows, maps, table
 from slamlib.notebook.tabular import cell
 from slamlib.solve import problem_solution
-from slamlib.studies.simulation import simulate
 
 pytestmark = pytest.mark.usefixtures("look")
 
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("look")
 @pytest.fixture(scope="module")
 def solved():
     """A simulated Drive and its SlamResult with markers and antennas."""
-    drive = Drive("short", *simulate("short", seed=4))
+    drive = Drive("short", *short(4))
     return drive, estimate(drive.dataset)
 
 

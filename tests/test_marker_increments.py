@@ -1,21 +1,23 @@
+"""Increments from markers that two frames share: exact, robust, consistent, and their inputs."""
+
 import numpy as np
 import pytest
+from numeric import assert_consistent, short
+from numeric import sightings as readings
+from numpy.testing import assert_allclose, assert_array_equal
 
 from slamlib.core import se2
-from slamlib.core.evaluation import nees, nees_band
+from slamlib.core.evaluation import nees
 from slamlib.core.marker_increments import (
     _best_hypothesis,
     _Common,
-    common_sightings,
     consecutive_increments,
     distance_and_turn,
     distance_and_turn_sigmas,
     returns,
     robust_increments,
 )
-from slamlib.core.records import ArucoReadings
 from slamlib.core.sightings import Sightings, consensus, merge_repeated, regular
-from slamlib.studies.simulation import simulate
 
 DELTA = np.array([0.12, -0.03, 0.2])
 MARKERS = np.array([[1.2, 0.4, 0.3], [-0.7, 1.1, -2.9], [0.2, -1.3, 3.1], [-1.0, -0.8, 1.0]])
@@ -39,7 +41,7 @@ def sightings(delta=DELTA, markers=MARKERS, covariance=C, rng=None):
 def test_exact_sightings_give_the_exact_increment(delta, count, covariance):
     """One marker determines it, or two without heading."""
     found = robust_increments(*sightings(delta, MARKERS[:count], covariance), 1)
-    np.testing.assert_allclose(se2.difference(found.increment[0], delta), 0, atol=1e-8)
+    assert_allclose(se2.difference(found.increment[0], delta), 0, atol=1e-8)
     assert found.accepted.all() and found.usable.all() and found.covariance[0, 2, 2] < 0.02**2
 
 
@@ -53,82 +55,73 @@ def test_covariance_by_hand():
     z = np.array([[d, 0, 0.5], [-d, 0, -1.5]])
     args = sightings(np.zeros(3), z, np.diag([s**2, s**2, t**2]))
     expected = np.diag([s**2, s**2, 1 / (d**2 / s**2 + 1 / t**2)])
-    np.testing.assert_allclose(robust_increments(*args, 1).covariance[0], expected, atol=1e-18)
+    assert_allclose(robust_increments(*args, 1).covariance[0], expected, atol=1e-18)
 
 
 @pytest.mark.parametrize("count, wrong, sigma", [
     (1, 0, 0.01), (2, 0, 0.4), (4, 1, 0.4), (4, 1, 0.01), (12, 5, 100)])
 def test_the_best_hypothesis_is_the_increment_itself(count, wrong, sigma):
     """Of three pairs, the second without markers; headings are wrong if their sigma says so."""
-    rng, deltas = np.random.default_rng(count), np.array([[0.5, 0.4, 2.9], [0, 0, 0], DELTA])
+    rng = np.random.default_rng(count)
+    deltas = np.array([[0.5, 0.4, 2.9], [0, 0, 0], DELTA])
     markers = np.c_[rng.uniform(-1, 1, (count, 2)), rng.uniform(-3, 3, count)]
-    z1, z2 = np.tile(markers, (2, 1)), se2.between(deltas[::2, None], markers).reshape(-1, 3)
+    z1 = np.tile(markers, (2, 1))
+    z2 = se2.between(deltas[::2, None], markers).reshape(-1, 3)
     z2[count:count + wrong] += rng.uniform(1, 2, (wrong, 3))
     if sigma > 0.1:
         z1[:, 2] = rng.uniform(-3, 3, 2 * count)
     covariance = np.tile(np.diag([1e-4, 1e-4, sigma**2]), (2 * count, 1, 1))
     pair = np.repeat([0, 2], count)
     found = _best_hypothesis(_Common(pair, z1, covariance, z2, covariance, 3))
-    np.testing.assert_allclose(se2.difference(found, deltas), 0, atol=1e-12)
+    assert_allclose(se2.difference(found, deltas), 0, atol=1e-12)
 
 
 def test_distance_and_turn_by_hand():
-    motion, C = np.array([[3.0, -4.0, 2 * np.pi - 0.1]]), np.diag([9.0, 16.0, 4.0])
-    np.testing.assert_allclose(distance_and_turn(motion), [[5, 0.1]])
-    np.testing.assert_allclose(distance_and_turn_sigmas(C[None]), [[5, 2]])
+    assert_allclose(distance_and_turn(np.array([[3.0, -4.0, 2 * np.pi - 0.1]])), [[5, 0.1]])
+    assert_allclose(distance_and_turn_sigmas(np.diag([9.0, 16.0, 4.0])[None]), [[5, 2]])
 
 
 def test_many_increments_are_consistent():
     """NEES of 400 increments is in its band; C_Delta = sum_j D_j C_j D_j^T + D'_j C'_j D'_j^T."""
-    rng, count, m = np.random.default_rng(5), 400, len(MARKERS)
-    z, covariances = (np.concatenate(each) for each in zip(
-        *(sightings(rng=rng)[:2] for _ in range(count)), strict=True))
+    rng = np.random.default_rng(5)
+    count = 400
+    m = len(MARKERS)
+    z = np.concatenate([sightings(rng=rng)[0] for _ in range(count)])
     first = (2 * m * np.arange(count)[:, None] + np.arange(m)).ravel()
     pair = np.repeat(np.arange(count), m)
-    found = robust_increments(z, covariances, pair, first, first + m, count)
-    image = sum(D @ C @ np.swapaxes(D, 1, 2) for D in (found.J_first, found.J_second))
-    np.testing.assert_allclose(image.reshape(count, m, 3, 3).sum(1), found.covariance, atol=1e-9)
-    low, high = nees_band(count)
+    found = robust_increments(
+        z, np.tile(C, (len(z), 1, 1)), pair, first, first + m, count)
+    image = sum(D @ C @ D.mT for D in (found.J_first, found.J_second))
+    assert_allclose(image.reshape(count, m, 3, 3).sum(1), found.covariance, atol=1e-9)
     errors = found.increment - DELTA
-    assert low < nees(errors, found.covariance, np.zeros_like(errors)).mean() < high
+    assert_consistent(nees(errors, found.covariance, 0 * errors))
 
 
-@pytest.mark.parametrize("count, wrong, oriented", [
-    (3, 1, True), (4, 1, True), (4, 2, True), (3, 1, False), (4, 1, False)])
-def test_wrong_labels_are_rejected(count, wrong, oriented):
+@pytest.mark.parametrize("count, wrong, covariance, heading_noise", [
+    (3, 1, C, 0.01), (4, 2, C, 0.01), (3, 1, 4 * POINT, 3.0), (4, 1, 4 * POINT, 3.0)])
+def test_wrong_labels_are_rejected(count, wrong, covariance, heading_noise):
     rng = np.random.default_rng(6)
-    covariance = C if oriented else np.diag([4e-4, 4e-4, 1e4])
     for _ in range(30):
-        noise = np.diag([1e-4, 1e-4, 1e-4 if oriented else 9.0])
-        z, covariances, pair, first, second = sightings(markers=MARKERS[:count])
-        z += rng.multivariate_normal(np.zeros(3), noise, len(z))
-        covariances[:] = covariance
+        z, covariances, pair, first, second = sightings(
+            markers=MARKERS[:count], covariance=covariance)
+        z += rng.normal(0, [0.01, 0.01, heading_noise], z.shape)
         z[second[:wrong], :2] += rng.choice([-1, 1], (wrong, 2)) * rng.uniform(0.8, 2, (wrong, 2))
         z[second[:wrong], 2] = rng.uniform(-np.pi, np.pi, wrong)
         found = robust_increments(z, covariances, pair, first, second, 1)
-        np.testing.assert_array_equal(found.accepted, np.arange(count) >= wrong)
-        np.testing.assert_allclose(found.increment[0], DELTA, atol=0.1)
+        assert_array_equal(found.accepted, np.arange(count) >= wrong)
+        assert_allclose(found.increment[0], DELTA, atol=0.1)
 
 
 def test_what_determines_no_increment_is_not_usable():
     """One point or uncertain heading; no common marker; two sightings seven sigmas apart."""
-    apart = np.array([[1.0, 0, 0], [-1.0, 0, 0], [1.07, 0, 0], [-1.07, 0, 0]])
-    pairs, none = (np.zeros(2, int), np.arange(2), np.arange(2, 4)), 3 * [np.zeros(0, int)]
+    apart = sightings(np.zeros(3), np.array([[1.0, 0, 0], [-1.0, 0, 0]]), 1e-4 * np.eye(3))
+    apart[0][2:] *= 1.07
     for arguments in (sightings(markers=MARKERS[:1], covariance=POINT),
                       sightings(markers=MARKERS[:1], covariance=np.diag([1e-4, 1e-4, 0.16])),
-                      (*sightings()[:2], *none),
-                      (apart, np.broadcast_to(1e-4 * np.eye(3), (4, 3, 3)), *pairs)):
+                      sightings(markers=MARKERS[:0]), apart):
         found = robust_increments(*arguments, 1)
         assert not found.usable.any() and not found.accepted.any()
         assert np.isnan(found.increment).all()
-
-
-def consecutive(z, covariances, row, marker, steps=10):
-    """consecutive_increments of these sightings, frames being `steps` encoder steps apart."""
-    order = np.lexsort((marker, row))
-    return consecutive_increments(Sightings(
-        index=order, row=row[order], marker=marker[order], z=z[order], C=covariances[order],
-        frame=steps * np.arange(row.max() + 1)))
 
 
 @pytest.mark.parametrize("way, turn", [(1, 0), (0, 1)])
@@ -144,47 +137,42 @@ def test_an_implausible_speed_makes_an_increment_unusable(way, turn, start):
     motion = np.where(np.arange(80) < start, 0.0, 0.1)
     motion[[*fast]] = [*fast.values()]
     single = {*fast, *range(start, 80 * (start > 0))}
-    z, row, marker = [], [], []
-    for k, each in enumerate(motion):              # the markers of an increment have its own ids
+    seen = []                                      # the markers of an increment have its own ids
+    for k, each in enumerate(motion):
+        moved = [each if way else 0.1, 0, turn * each]
         for j, place in enumerate(MARKERS[:1 if k in single else 2] * [0.1, 0.1, 1]):
-            z += [place, se2.between([each if way else 0.1, 0, turn * each], place)]
-            row, marker = [*row, k, k + 1], [*marker, 2 * k + j, 2 * k + j]
-    z, row, marker = map(np.array, (z, row, marker))
-    covariances = np.tile(1e-6 * np.eye(3), (len(z), 1, 1))
-    alone = robust_increments(z, covariances, *common_sightings(
-        row[order := np.lexsort((marker, row))], marker[order]), 80)
-    found = consecutive(z, covariances, row, marker)
-    assert alone.usable.all()                               # the test of the speed rejects them
-    np.testing.assert_array_equal(np.flatnonzero(~found.usable), [0, 40, 41, 79])
-    np.testing.assert_array_equal(found.accepted, found.usable[found.pair])
+            seen += [(k, 2 * k + j, *place), (k + 1, 2 * k + j, *se2.between(moved, place))]
+    seen = np.array(sorted(seen))
+    row, marker = seen[:, :2].T.astype(int)
+    found = consecutive_increments(Sightings(
+        index=np.arange(len(seen)), row=row, marker=marker, z=seen[:, 2:],
+        C=np.tile(1e-6 * np.eye(3), (len(seen), 1, 1)), frame=10 * np.arange(81)))
+    assert_array_equal(np.flatnonzero(~found.usable), [0, 40, 41, 79])
+    assert_array_equal(found.accepted, found.usable[found.pair])
 
 
 def test_repeated_sightings_are_averaged_or_dropped():
-    readings = ArucoReadings(
-        pose=np.array([0, 0, 0, 4, 4]), marker=np.array([7, 2, 7, 2, 2]),
-        marker_in_vehicle=np.array([[1, 1, np.pi - 0.01], [0, 2, 0], [1.04, 1, -np.pi + 0.03],
-                                    [1, 1, 0], [3, 1, 0]]),
-        covariance=np.array([np.diag([1e-2, 1e-2, 1e-2])] * 2 + [np.diag([1e-2, 1e-2, 3e-2])]
-                            + [np.diag([1e-2, 1e-2, 1e-2])] * 2))
-    before = readings.marker_in_vehicle.copy()
-    index, z, covariance, contradicting = merge_repeated(readings)
-    np.testing.assert_array_equal(index, [1, 0])                # the two of pose 4 disagree
+    z = [[1, 1, np.pi - 0.01], [0, 2, 0], [1.04, 1, -np.pi + 0.03], [1, 1, 0], [3, 1, 0]]
+    covariance = np.tile(1e-2 * np.eye(3), (5, 1, 1))
+    covariance[2, 2, 2] = 3e-2
+    given = readings([0, 0, 0, 4, 4], [7, 2, 7, 2, 2], z, covariance)
+    index, merged, C, contradicting = merge_repeated(given)
+    assert_array_equal(index, [1, 0])                # the two of pose 4 disagree
     assert contradicting == 2
-    np.testing.assert_allclose(z, [[0, 2, 0], [1.02, 1, np.pi]], atol=1e-12)
-    np.testing.assert_allclose(covariance[1], np.diag([5e-3, 5e-3, 7.5e-3]))
-    np.testing.assert_array_equal(readings.marker_in_vehicle, before)
+    assert_allclose(merged, [[0, 2, 0], [1.02, 1, np.pi]], atol=1e-12)
+    assert_allclose(C[1], np.diag([5e-3, 5e-3, 7.5e-3]))
+    assert_array_equal(given.marker_in_vehicle, z)
 
 
 def test_covariances_that_are_nearly_singular_are_increased_by_hand():
     """Given y, the standard deviation of x is sigma sqrt(1 - rho^2): 1.4e-5, 1.4e-7 and 0.14 m."""
-    rho, sigma = 1 - np.array([1e-6, 1e-10, 1e-10]), np.array([0.01, 0.01, 1e4])
-    C = np.tile(np.diag([0.0, 0.0, 1e-4]), (3, 1, 1))
-    C[:, [0, 1], [0, 1]], C[:, 0, 1] = sigma[:, None]**2, rho * sigma**2
-    C[:, 1, 0] = C[:, 0, 1]
-    added = np.array([0, 1e-12, 0])[:, None, None] * np.diag([1, 1, 0])
-    np.testing.assert_allclose(regular(C) - C, added, rtol=1e-3, atol=1e-18)
+    for lack, sigma, added in ((1e-6, 0.01, 0), (1e-10, 0.01, 1e-12), (1e-10, 1e4, 0)):
+        C = np.diag([sigma**2, sigma**2, 1e-4])
+        C[0, 1] = C[1, 0] = (1 - lack) * sigma**2
+        difference = regular(C[None])[0] - C
+        assert_allclose(difference, np.diag([added, added, 0]), rtol=1e-3, atol=1e-18)
     far = np.array([np.diag([1e8, 1e-18, 1e-4]), np.diag([1e-18, 1e8, 1e-4])])   # a millionth
-    np.testing.assert_allclose(regular(far) - far, [np.diag([0, 1e-4, 0]), np.diag([1e-4, 0, 0])])
+    assert_allclose(regular(far) - far, [np.diag([0, 1e-4, 0]), np.diag([1e-4, 0, 0])])
 
 
 def test_consensus_takes_the_most_certain_sighting_among_the_supported():
@@ -192,7 +180,7 @@ def test_consensus_takes_the_most_certain_sighting_among_the_supported():
     in_world = np.array([[0, 0, 3.1], [1, 0, 3.1], [0.01, 0, -3.13], [0, 0.01, 3.1], [5, 5, 0]])
     variance = np.array([4, 1, 3, 2, 9]) * 1e-4
     rows = consensus(np.array([4, 4, 4, 4, 2]), in_world, variance[:, None, None] * np.eye(3))
-    np.testing.assert_array_equal(rows, [4, 3])
+    assert_array_equal(rows, [4, 3])
     covariance = variance[[0, 1, 3, 2, 1], None, None] * np.eye(3)
     assert consensus(np.zeros(5, int), np.zeros((5, 3)), covariance, 2) == 3       # or 0, of two
 
@@ -200,15 +188,15 @@ def test_consensus_takes_the_most_certain_sighting_among_the_supported():
 @pytest.mark.parametrize("wrong", [0.0, 0.05])
 def test_returns_measure_the_true_motion(wrong):
     """Without noise the markers give it exactly, also where some labels are wrong."""
-    dataset, truth = simulate("short", 3, noise=False, mislabelled=wrong)
+    dataset, truth = short(3, noise=False, mislabelled=wrong)
     found = returns(dataset)
     assert len(found.start) > 5 and (found.end - found.start > 450).all()          # poses, of 5 m
     assert np.diff(found.end).min() == 10                                  # every frame is asked
-    np.testing.assert_allclose(found.discrepancies(truth.poses), 0, atol=1e-8)
+    assert_allclose(found.discrepancies(truth.poses), 0, atol=1e-8)
 
 
 def test_a_drive_without_markers_or_that_goes_nowhere_again_has_no_returns():
-    dataset, truth = simulate("short", 3)
+    dataset, truth = short(3)
     for each in (dataset.without("aruco"), dataset.first(700), dataset.first(1)):
         found = returns(each)
         assert found.discrepancies(truth.poses).shape == (0, 3)
@@ -217,8 +205,10 @@ def test_a_drive_without_markers_or_that_goes_nowhere_again_has_no_returns():
 
 def test_the_covariance_of_returns_is_consistent():
     """The last return of each of 30 drives, so that they are independent."""
-    drives = [simulate("short", seed, slip=3e-3) for seed in range(30)]
-    found = [(each.discrepancies(truth.poses), each.covariance)
-             for each, truth in ((returns(dataset), truth) for dataset, truth in drives)]
-    low, high = nees_band(len(found))
-    assert low < np.mean([nees(off, C, 0 * off)[-1] for off, C in found]) < high
+    values = []
+    for seed in range(30):
+        dataset, truth = short(seed, slip=3e-3)
+        found = returns(dataset)
+        off = found.discrepancies(truth.poses)
+        values.append(nees(off, found.covariance, 0 * off)[-1])
+    assert_consistent(values)

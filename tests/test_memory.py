@@ -5,12 +5,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from numeric import changed, uwb
+from numeric import aligned_ate, aruco, mean_nees, short, sightings, uwb
+from numpy.testing import assert_allclose, assert_array_equal
 
 from slamlib import estimate, studies
-from slamlib.core import evaluation, se2
 from slamlib.core.evaluation import nees_band
-from slamlib.core.records import ArucoReadings
 from slamlib.core.vehicle import TABLE_2
 from slamlib.robust.choices import _squared_distance, has_rejected_visits, visits
 from slamlib.robust.error_memory import error_memory
@@ -19,7 +18,6 @@ from slamlib.robust.noise import with_hidden_errors
 from slamlib.robust.pipeline import fit_from_odometry
 from slamlib.robust.solution_doubts import solution_doubts
 from slamlib.studies.montecarlo import antenna_error, correlated_errors
-from slamlib.studies.simulation import simulate
 
 LANDMARKS, EACH = 40, 10
 
@@ -44,7 +42,7 @@ def test_equal_errors_count_once(part):
     error = np.random.default_rng(1).standard_normal((LANDMARKS, 1, 3))
     error *= np.sqrt((1 - part / 2) / np.mean(error**2))
     found = error_memory(*tracks(np.repeat(error, EACH, axis=1)))
-    np.testing.assert_allclose(found.share, 1 / EACH)
+    assert_allclose(found.share, 1 / EACH)
     assert found.correlation == pytest.approx(1)
 
 
@@ -53,24 +51,24 @@ def test_shares_by_hand():
     error = np.repeat(np.random.default_rng(2).standard_normal((LANDMARKS, 5, 3)), 2, axis=1)
     landmark, pose, u, used = tracks(error / np.sqrt(np.mean(error**2)))
     used[::EACH] = False                     # the first of each landmark stays alone
-    rho = [np.mean([np.sum(u[k] * u[k + lag]) / 3 for k in np.flatnonzero(used)
-                    if k + lag < len(u) and landmark[k + lag] == landmark[k]]) for lag in (1, 2)]
-    rho = np.array(rho) + max(0, 1 - np.mean(u[used]**2))
+    of = u.reshape(LANDMARKS, EACH, 3)[:, 1:]
+    rho = np.array([np.mean(of[:, lag:] * of[:, :-lag]) for lag in (1, 2)])
+    rho += max(0, 1 - np.mean(of**2))
     assert rho[0] > 0.3 and rho[1] < 0.05
     share = error_memory(landmark, pose, u, used).share.reshape(LANDMARKS, EACH)
-    np.testing.assert_allclose(share[:, 0], 1)
-    np.testing.assert_allclose(share[:, [1, -1]], 1 / (1 + rho[0]))
-    np.testing.assert_allclose(share[:, 2:-1], 1 / (1 + 2 * rho[0]))
+    assert_allclose(share[:, 0], 1)
+    assert_allclose(share[:, [1, -1]], 1 / (1 + rho[0]))
+    assert_allclose(share[:, 2:-1], 1 / (1 + 2 * rho[0]))
 
 
 @pytest.fixture(scope="module")
 def remembering():
-    dataset, truth = simulate("short", seed=3, memory=0.9)
-    return dataset, truth, estimate(replace(dataset, uwb=None))
+    dataset = short(3, memory=0.9)[0].without("uwb")
+    return dataset, estimate(dataset)
 
 
 def test_memory_is_told_and_counted(remembering):
-    dataset, _, result = remembering
+    dataset, result = remembering
     assert result.correlation[0] > 0.4 and result.correlation[1] == 0
     assert result.share.sum() < len(dataset.aruco.pose) / 3
     assert 1 <= result.noise.sightings < 1.2
@@ -93,22 +91,20 @@ def test_beside_slow_errors_no_slip_below_the_typical_one_is_believed():
 
 def test_slow_errors_of_a_sensor_are_no_slip():
     """Sightings whose distances are off by 1 % a metre across the room: a tilted ceiling."""
-    dataset, truth = simulate("short", seed=1)
-    aruco = dataset.aruco
-    across = truth.poses[aruco.pose, 0] - truth.poses[:, 0].mean()
-    tilted = aruco.marker_in_vehicle.copy()
-    tilted[:, :2] *= 1 + 0.01 * across[:, None]
-    found = estimate(changed(dataset.without("uwb"), "aruco", marker_in_vehicle=tilted))
+    dataset, truth = short(1)
+    across = truth.poses[dataset.aruco.pose, :1] - truth.poses[:, 0].mean()
+    tilted = dataset.aruco.marker_in_vehicle * (1 + 0.01 * across * [1, 1, 0])
+    found = estimate(aruco(dataset.without("uwb"), marker_in_vehicle=tilted))
     assert found.fit.problem.memory_first and found.slip < 2e-3
-    assert evaluation.ate(found.poses, truth.poses, aligned=True) < 0.012     # 0.026 by slip
+    assert aligned_ate(found, truth) < 0.012     # 0.026 by slip
 
 
 def test_a_large_slip_is_no_slow_error_of_a_sensor():
-    dataset, truth = simulate("short", seed=1, slip=0.03)
+    dataset, truth = short(1, slip=0.03)
     found = estimate(dataset.without("uwb"))
     assert found.noise.sightings == pytest.approx(1, abs=0.1)
     assert found.slip == pytest.approx(0.03, rel=0.2)
-    assert evaluation.ate(found.poses, truth.poses, aligned=True) < 0.008     # 0.08 by memory
+    assert aligned_ate(found, truth) < 0.008     # 0.08 by memory
 
 
 @pytest.mark.slow
@@ -131,13 +127,14 @@ def test_antennas_with_echoes_that_stay_are_as_far_off_as_their_covariances_say(
     """Their errors have a mean in a drive of four times their length, which is an offset."""
     squared = []
     for seed in range(3):
-        dataset, truth = simulate("short", seed=seed)
-        rng, slow = np.random.default_rng(seed), np.zeros(len(dataset.uwb.pose))
+        dataset, truth = short(seed)
+        rng = np.random.default_rng(seed)
+        slow = np.zeros(len(dataset.uwb.pose))
         for antenna in np.unique(dataset.uwb.antenna):
             rows = np.flatnonzero(dataset.uwb.antenna == antenna)
-            kept = np.exp(-np.diff(dataset.uwb.pose[rows]) / 500)
-            value = slow[rows[0]] = 0.2 * rng.standard_normal()
-            for row, share in zip(rows[1:], kept):
+            kept = np.exp(-np.diff(dataset.uwb.pose[rows], prepend=-np.inf) / 500)
+            value = 0.0
+            for row, share in zip(rows, kept):
                 value = share * value + 0.2 * np.sqrt(1 - share**2) * rng.standard_normal()
                 slow[row] = value
         result = estimate(uwb(dataset, range=dataset.uwb.range + slow))
@@ -152,11 +149,10 @@ def test_antennas_with_echoes_that_stay_are_as_far_off_as_their_covariances_say(
 def test_visits_end_with_a_long_break():
     """Sightings every 10 poses; breaks of 40 poses stay within a visit, of 1,000 they end it."""
     pose = np.r_[0:50:10, 80:120:10, 1120:1150:10, 5:35:10]
-    marker = np.repeat([3, 3, 3, 8], [5, 4, 3, 3])
     order = np.argsort(pose, kind="stable")
-    aruco = ArucoReadings(pose[order], marker[order], None, None)
-    expected = np.repeat([0, 0, 1, 2], [5, 4, 3, 3])[order]
-    np.testing.assert_array_equal(visits(aruco), expected)
+    marker, expected = np.repeat([[3, 3, 3, 8], [0, 0, 1, 2]], [5, 4, 3, 3], axis=1)[:, order]
+    found = visits(sightings(pose[order], marker, np.zeros((15, 3)), np.eye(3)))
+    assert_array_equal(found, expected)
 
 
 @pytest.mark.parametrize("off, P_1, P_2, squared", [
@@ -172,7 +168,7 @@ def test_the_distance_of_two_visits_by_hand(off, P_1, P_2, squared):
     C = 0.01 * np.array([P_1, P_2])[:, None, None] * np.eye(3)
     result = SimpleNamespace(marker=np.array([4, 6]), marker_in_world=np.array([first, second]),
                              poses=np.zeros((2, 3)), covariances=C)
-    np.testing.assert_allclose(_squared_distance(result, 4, 6, 0, 1), squared)
+    assert_allclose(_squared_distance(result, 4, 6, 0, 1), squared)
 
 
 @pytest.fixture(scope="module")
@@ -181,14 +177,15 @@ def moved():
 
     Returns that drive, the one without moved markers, its truth, and the moved markers.
     """
-    dataset, truth = simulate("short", seed=5, rounds=3)
-    rng, aruco = np.random.default_rng(0), dataset.aruco
+    dataset, truth = short(5, rounds=3)
+    rng = np.random.default_rng(0)
+    seen = dataset.aruco
     marker = rng.permutation(truth.marker)[:len(truth.marker) * 3 // 4]
-    angle = rng.uniform(-np.pi, np.pi, truth.marker.max() + 1)[aruco.marker]
-    later = np.isin(aruco.marker, marker) & (aruco.pose >= len(dataset.ticks) * 2 // 3)
-    step = 0.5 * later[:, None] * np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1)
-    step[:, :2] = se2.compose(-truth.poses[aruco.pose] * [0, 0, 1], step)[:, :2]
-    spoilt = changed(dataset, "aruco", marker_in_vehicle=aruco.marker_in_vehicle + step)
+    angle = rng.uniform(-np.pi, np.pi, truth.marker.max() + 1)[seen.marker]
+    angle -= truth.poses[seen.pose, 2]
+    later = np.isin(seen.marker, marker) & (seen.pose >= len(dataset.ticks) * 2 // 3)
+    step = 0.5 * later * np.array([np.cos(angle), np.sin(angle), 0 * angle])
+    spoilt = aruco(dataset, marker_in_vehicle=seen.marker_in_vehicle + step.T)
     return spoilt, dataset.without("uwb"), truth, marker
 
 
@@ -200,22 +197,22 @@ def test_moved_markers_are_landmarks_of_their_own(moved):
     ids, places = result.places[result.places[:, 0] != result.places[:, 1]].T
     assert set(ids) == set(marker) and set(places - ids) == {10**len(str(truth.marker.max()))}
     assert np.isin(places, result.marker).all()
-    possible = evaluation.ate(clean.poses, truth.poses, aligned=True)
-    assert evaluation.ate(result.poses, truth.poses, aligned=True) < 2 * possible
-    assert evaluation.anees(result.poses, result.covariances, truth.poses) < 8
+    possible = aligned_ate(clean, truth)
+    assert aligned_ate(result, truth) < 2 * possible
+    assert mean_nees(result, truth) < 8
     told = {doubt.what: doubt.sentence for doubt in solution_doubts(result)}
     assert all(str(each) in told["places"] for each in set(places))
     assert clean.places is None
     both = estimate(dataset, previous=result)
-    np.testing.assert_array_equal(both.places, result.places)
-    assert evaluation.ate(both.poses, truth.poses, aligned=True) < 0.01
+    assert_array_equal(both.places, result.places)
+    assert aligned_ate(both, truth) < 0.01
 
 
 @pytest.mark.slow
 def test_noise_that_memory_learns_does_not_hide_a_moved_marker(moved):
     """Covariances that are too small are no sign of one: their errors have no memory."""
     dataset, before, _, _ = moved
-    small = changed(before, "aruco", covariance=before.aruco.covariance / 16)
+    small = aruco(before, covariance=before.aruco.covariance / 16)
     for drive, share, hidden in (
             (dataset, 0.05, True), (before, 0.05, False), (small, 1, False)):
         fit = fit_from_odometry(measure(drive.without("uwb")))

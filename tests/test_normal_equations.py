@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numeric import as_points, known_noise
+from numeric import as_points, known_noise, short, sigmas
+from numpy.testing import assert_allclose
 from scipy.linalg import block_diag
 from scipy.special import chdtri
 
@@ -18,7 +19,6 @@ from slamlib.robust.initialization import odometry_state
 from slamlib.robust.linear import NormalEquations, build_problem, laplace_approximation
 from slamlib.robust.measurements import WEAK_SIGMA, Noise, accept_all, measure
 from slamlib.robust.optimize import optimize
-from slamlib.studies.simulation import simulate
 
 GROUPS = frozenset(entry.group for entry in ENTRIES) | {"antenna-offsets"}
 
@@ -35,11 +35,16 @@ def released(problem, groups):
     return replace(problem, prior=problem.measurements.calibration.prior(groups))
 
 
+def with_a_point(poses):
+    """A drive of which the first marker is a point."""
+    dataset, _ = short(4, poses)
+    points = dataset.aruco.marker == dataset.aruco.marker[0]
+    return replace(dataset, aruco=as_points(dataset.aruco, points))
+
+
 def test_markers_without_accepted_sightings_have_a_weak_prior_and_nothing_else():
     """Two markers with a heading, of consecutive ids, and a point."""
-    dataset = simulate("short", seed=4)[0].first(500)
-    points = dataset.aruco.marker == dataset.aruco.marker[0]
-    m = measure(replace(dataset, aruco=as_points(dataset.aruco, points)))
+    m = measure(with_a_point(500))
     point, = np.flatnonzero(~m.oriented)
     first = np.flatnonzero(m.oriented[1:] & m.oriented[:-1])[0]
     markers = [point, first, first + 1]
@@ -50,16 +55,14 @@ def test_markers_without_accepted_sightings_have_a_weak_prior_and_nothing_else()
     H = m.structure.matrix(equations.sums(problem.noise).H).toarray()
     for j in markers:
         own = m.structure.rows[len(m.frame) + j, :2 + m.oriented[j]]
-        np.testing.assert_allclose(H[np.ix_(own, own)], np.eye(len(own)) / WEAK_SIGMA**2)
+        assert_allclose(H[np.ix_(own, own)], np.eye(len(own)) / WEAK_SIGMA**2)
         assert np.count_nonzero(H[own]) == len(own)
 
 
 @pytest.mark.parametrize("poses", [1, 15, 400])
 def test_selected_blocks_are_those_of_the_dense_inverse(poses):
     """Of one frame, of two, and of many; there also a point, and free offsets of the ranges."""
-    dataset = simulate("short", seed=4)[0].first(poses)
-    points = dataset.aruco.marker == dataset.aruco.marker[0]
-    m = measure(replace(dataset, aruco=as_points(dataset.aruco, points)))
+    m = measure(with_a_point(poses))
     given = Noise(2e-3, 1.5, 0.7)
     problem = released(build_problem(m, "arc"), {"range-offset", WHEEL_SCALE} if poses > 1 else ())
     equations = NormalEquations(problem, odometry_state(m, "arc"))
@@ -67,19 +70,19 @@ def test_selected_blocks_are_those_of_the_dense_inverse(poses):
     information = dense_information(m.structure, equations.sums(given))
     active = problem.active
     n = len(information) - np.count_nonzero(active)
-    np.testing.assert_allclose(information, information.T, rtol=1e-9, atol=1e-6)
+    assert_allclose(information, information.T, rtol=1e-9, atol=1e-6)
     unit = block_diag(np.eye(n), problem.prior.of(slice(None))[active])
     expected = unit @ np.linalg.inv(information) @ unit.T
-    sigma = np.sqrt(np.diag(expected))
+    sigma = sigmas(expected)
     assert not found.c[~active].any() and not found.c[:, ~active].any()
 
     def check(at, blocks):
         scale = sigma[at][:, :, None] * sigma[at][:, None]
-        np.testing.assert_allclose(
+        assert_allclose(
             blocks / scale, expected[at[:, :, None], at[:, None]] / scale, atol=1e-6)
 
     frames, landmarks = np.split(m.structure.rows, [len(m.frame)])
-    wheels = np.broadcast_to(np.arange(n, n + 3), (len(found.pairs), 3))
+    wheels = np.tile(np.arange(n, n + 3), (len(found.pairs), 1))
     check(np.concatenate([frames[:-1], frames[1:], wheels], axis=1), found.pairs)
     check(landmarks, found.landmarks)
     check(np.arange(n, len(unit))[None], found.c[np.ix_(active, active)][None])
@@ -103,40 +106,39 @@ def test_points_of_the_posterior_have_its_moments():
     weights, logs = posterior_points(BROAD)
     assert len(weights) == 5 and np.isclose(sum(weights), 1)
     rest = np.diag(BROAD) - BROAD[0]**2 / BROAD[0, 0]           # given the slip
-    np.testing.assert_allclose(weights @ logs, CENTRE + rest, atol=1e-6)
+    assert_allclose(weights @ logs, CENTRE + rest, atol=1e-6)
     spread = logs - CENTRE - rest
-    np.testing.assert_allclose((weights * spread.T) @ spread,
+    assert_allclose((weights * spread.T) @ spread,
                                np.outer(BROAD[0], BROAD[0]) / BROAD[0, 0], rtol=0.02, atol=1e-12)
 
 
 def test_a_narrow_posterior_is_one_point():
     weights, logs = posterior_points(0.01 * BROAD)
     assert weights.tolist() == [1]
-    np.testing.assert_allclose(logs[0], CENTRE + 0.01 * np.diag(BROAD), rtol=1e-12)
+    assert_allclose(logs[0], CENTRE + 0.01 * np.diag(BROAD), rtol=1e-12)
 
 
 @pytest.mark.parametrize("free", [[0, 1, 2], [0, 2]], ids=str)
 @pytest.mark.parametrize("skew, steps", [(0.0, 0.1), (0.0, 1e-6), (0.0, 5.0), (0.5, 0.1)])
 def test_newton_finds_the_mode_of_a_log_density_and_its_covariance(free, skew, steps):
-    C = np.diag([0.04, 0.01, 0.0025])
-    C[0, 1:] = C[1:, 0] = [0.01, 0.005]
+    C = np.array([[0.04, 0.01, 0.005], [0.01, 0.01, 0], [0.005, 0, 0.0025]])
     C = C[np.ix_(free, free)]
-    information = np.linalg.inv(C)
+    sigma = sigmas(C)
 
     def log_density(x):
         off = (x - CENTRE)[free]
-        u = off[0] / np.sqrt(C[0, 0])
-        return -off @ information @ off / 2 + skew * (1 + u + u**2 / 2 - np.exp(u))   # not at 0
+        u = off[0] / sigma[0]
+        return -off @ np.linalg.solve(C, off) / 2 + skew * (1 + u + u**2 / 2 - np.exp(u))
 
     start = CENTRE.copy()
-    start[free] += 3 * np.sqrt(np.diag(C))
+    start[free] += 3 * sigma
     x, value, covariance = noise._mode(
         log_density, start, log_density(start), np.array(free), np.full(len(free), steps))
-    assert np.abs((x - CENTRE)[free] / np.sqrt(np.diag(C))).max() < 0.1
+    assert np.abs((x - CENTRE)[free] / sigma).max() < 0.1
     assert value == log_density(x)
     expected = np.zeros((3, 3))
     expected[np.ix_(free, free)] = C
-    np.testing.assert_allclose(covariance, expected, atol=1e-6 + 0.1 * skew * C.max())
+    assert_allclose(covariance, expected, atol=1e-6 + 0.1 * skew * C.max())
 
 
 def test_gates_are_quantiles_of_chi_squared():
@@ -145,7 +147,7 @@ def test_gates_are_quantiles_of_chi_squared():
 
 
 def test_singular_normal_equations_are_told(monkeypatch):
-    m = measure(simulate("short", seed=4)[0].first(100))
+    m = measure(short(4, 100)[0])
     monkeypatch.setattr(linear, "linear_solution", lambda *_: None)
     with pytest.raises(DatasetError, match="measurements that determine every pose and landmark"):
         optimize(build_problem(m, "arc"), odometry_state(m, "arc"))
@@ -155,7 +157,7 @@ def test_singular_normal_equations_are_told(monkeypatch):
 @pytest.mark.parametrize("groups", [(), GROUPS], ids=len)
 def test_solution_and_evidence_are_those_of_dense_normal_equations(groups, kernel):
     """For the noise of the problem and for another one; a kernel takes part of the variance."""
-    dataset = simulate("short", seed=4, mislabelled=0.02, late_ranges=0.2)[0].first(300)
+    dataset, _ = short(4, 300, mislabelled=0.02, late_ranges=0.2)
     m = measure(known_noise(dataset, 1e-3))
     problem = replace(released(build_problem(m, "arc", Noise(1e-3)), groups),
                       accepted=accept_all(m, kernel))
@@ -171,7 +173,7 @@ def test_solution_and_evidence_are_those_of_dense_normal_equations(groups, kerne
         unit = 1 / np.sqrt(np.diag(information))
         scaled = np.outer(unit, unit) * information
         expected = -unit * np.linalg.solve(scaled, unit * gradient)
-        np.testing.assert_allclose(delta, expected, rtol=1e-5, atol=1e-8)
+        assert_allclose(delta, expected, rtol=1e-5, atol=1e-8)
         squared = sums.squared + gradient @ expected
         determinant = np.linalg.slogdet(scaled)[1] - 2 * np.sum(np.log(unit))
         of_odometry = np.sum(np.linalg.slogdet(problem.odometry.covariance(other.slip))[1])

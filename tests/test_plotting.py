@@ -6,11 +6,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from matplotlib.transforms import Affine2D
+from numpy.testing import assert_allclose
 
 from slamlib.core import se2
 from slamlib.core.evaluation import REACH_95
-from slamlib.core.se2 import rotation
-from slamlib.notebook import plotting
+from slamlib.core.se2 import rotate_covariance
+from slamlib.notebook import Drive, plotting
 
 pytestmark = pytest.mark.usefixtures("look")
 
@@ -71,15 +72,13 @@ def require_contours(patches, means, covariances, k):
     for points, m, C in zip(boundaries(patches), means, covariances, strict=True):
         offset = points - m[:2]
         squared = np.sum(offset * np.linalg.solve(C[:2, :2], offset.T).T, axis=1)
-        np.testing.assert_allclose(squared, k**2, rtol=0.01)
+        assert_allclose(squared, k**2, rtol=0.01)
 
 
 def elongated(count, major, minor):
     """Covariances (count, 3, 3) whose ellipses point into every quadrant; heading sigma 0.1 rad."""
-    R, C = rotation(0.4 + 0.7 * np.arange(count)), np.zeros((count, 3, 3))
-    C[:, :2, :2] = R @ np.diag([major**2, minor**2]) @ np.swapaxes(R, 1, 2)
-    C[:, 2, 2] = 0.1**2
-    return C
+    C = np.tile(np.diag([major**2, minor**2, 0.1**2]), (count, 1, 1))
+    return rotate_covariance(C, 0.4 + 0.7 * np.arange(count))
 
 
 @pytest.mark.parametrize("enlarged", [1, np.arange(1, 5)], ids=str)
@@ -101,9 +100,9 @@ def drive_with(truth=True):
     """Results as solvers give them, and their Drive: 50 poses on a circle, errors of 1 cm."""
     turn = np.linspace(0, 5, 50)
     poses = np.column_stack([np.cos(turn), np.sin(turn), turn])
-    covariances = elongated(50, 0.02, 0.01)
-    return SimpleNamespace(poses=poses + [0.01, 0, 0.002], covariances=covariances), \
-        SimpleNamespace(name="a", truth=SimpleNamespace(poses=poses) if truth else None)
+    result = SimpleNamespace(
+        poses=poses + [0.01, 0, 0.002], covariances=elongated(50, 0.02, 0.01))
+    return result, Drive("a", None, SimpleNamespace(poses=poses) if truth else None)
 
 
 def test_each_drive_has_its_panels_a_title_and_one_legend():

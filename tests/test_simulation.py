@@ -1,6 +1,9 @@
 import numpy as np
 import pytest
 from conftest import ROOT
+from kills import contents
+from numeric import short, true_markers
+from numpy.testing import assert_allclose, assert_array_equal
 
 from slamlib.core import odometry, se2
 from slamlib.core.vehicle import Vehicle
@@ -17,18 +20,17 @@ def test_committed_stand_ins_are_regenerated_to_the_byte(name, tmp_path):
     if not (DATA / name / "truth").exists():
         pytest.skip(f"data/{name} has no truth: it has been replaced by a real log")
     write_dataset(tmp_path / name, *simulate(**RECIPES[name]))
-    made = {f.relative_to(tmp_path): f.read_bytes() for f in tmp_path.rglob("*") if f.is_file()}
-    committed = {f.relative_to(DATA): f.read_bytes()
-                 for f in (DATA / name).rglob("*") if f.is_file()}
+    made = contents(tmp_path / name)
+    committed = contents(DATA / name)
     assert made.keys() == committed.keys()
-    assert [f for f in made if made[f] != committed[f]] == []
+    assert [file for file in made if made[file] != committed[file]] == []
 
 
 def sighting_errors(dataset, truth):
     """Errors (m, 3) of the sightings."""
     aruco = dataset.aruco
-    marker = truth.marker_in_world[np.searchsorted(truth.marker, aruco.marker)]
-    return se2.difference(aruco.marker_in_vehicle, se2.between(truth.poses[aruco.pose], marker))
+    exact = se2.between(truth.poses[aruco.pose], true_markers(truth, aruco.marker))
+    return se2.difference(aruco.marker_in_vehicle, exact)
 
 
 def range_errors(dataset, truth):
@@ -39,12 +41,12 @@ def range_errors(dataset, truth):
 
 
 def test_perfect_data_agrees_with_its_truth():
-    dataset, truth = simulate("short", seed=4, noise=False)
+    dataset, truth = short(4, noise=False)
     poses = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")
     for error in (poses - truth.poses, sighting_errors(dataset, truth),
                   range_errors(dataset, truth),
                   dataset.antenna_guess.position - truth.antenna_in_world):
-        np.testing.assert_allclose(error, 0, atol=1e-10)
+        assert_allclose(error, 0, atol=1e-10)
 
 
 def test_noise_has_the_covariances_that_the_files_state():
@@ -88,7 +90,7 @@ def test_encoder_error_is_a_random_walk_with_the_variance_of_slip(slip):
 def test_outliers_come_at_the_asked_rates_and_late_ranges_are_too_long():
     clean, truth = simulate("long", seed=8)
     dirty, _ = simulate("long", seed=8, late_ranges=0.15, mislabelled=0.03)
-    np.testing.assert_array_equal(clean.ticks, dirty.ticks)
+    assert_array_equal(clean.ticks, dirty.ticks)
     wrong = dirty.aruco.marker != clean.aruco.marker
     assert abs(wrong.mean() - 0.03) < 0.01
     assert np.isin(dirty.aruco.marker, truth.marker).all()
@@ -100,17 +102,17 @@ def test_outliers_come_at_the_asked_rates_and_late_ranges_are_too_long():
 
 def test_files_round_trip_through_the_reader(tmp_path):
     vehicle = Vehicle(right_radius=0.12, ticks_per_revolution=4096.0)
-    dataset, truth = simulate("short", seed=9, vehicle=vehicle)
+    dataset, truth = short(9, vehicle=vehicle)
     write_dataset(tmp_path / "drive", dataset, truth)
     again, true_again = read_dataset(tmp_path / "drive"), read_truth(tmp_path / "drive")
     assert again.vehicle == vehicle and true_again.vehicle == truth.vehicle
-    np.testing.assert_array_equal(again.ticks, dataset.ticks)
+    assert_array_equal(again.ticks, dataset.ticks)
     for sensor in ("aruco", "uwb", "antenna_guess"):
-        found, written = vars(getattr(again, sensor)), vars(getattr(dataset, sensor))
-        for name in written:
-            np.testing.assert_allclose(found[name], written[name], rtol=1e-4, atol=6e-4)
+        found = vars(getattr(again, sensor))
+        for name, written in vars(getattr(dataset, sensor)).items():
+            assert_allclose(found[name], written, rtol=1e-4, atol=6e-4)
     for name in ("poses", "marker", "marker_in_world", "antenna", "antenna_in_world"):
-        np.testing.assert_allclose(getattr(true_again, name), getattr(truth, name), atol=6e-7)
+        assert_allclose(getattr(true_again, name), getattr(truth, name), atol=6e-7)
 
 
 @pytest.mark.parametrize("kind, low, high", [
