@@ -8,7 +8,6 @@ from base64 import b64encode
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from urllib.parse import quote
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -22,8 +21,6 @@ from slamlib.core import evaluation, marker_increments
 from slamlib.io.results import read_structs, read_summary
 from slamlib.notebook import Drive, plotting, table
 from slamlib.notebook.drives import plain, without_stand_ins
-from slamlib.report.execution import Books
-from slamlib.report.notebooks import chapter_of
 from slamlib.solve import PROBLEMS, SENSORS, Solution
 
 TEXT = Path(__file__).with_name("overview.md")
@@ -51,12 +48,6 @@ class SolvedDrive(Drive):
         """The Solution of the last problem that is solved."""
         return list(self.solutions.values())[-1]
 
-    @property
-    def failed(self) -> dict[str, dict]:
-        """The rows of the summary of problems that could not be solved, by problem."""
-        rows = self.summary["problems"]
-        return {problem: row for problem, row in rows.items() if "failed" in row}
-
 
 def solved_drive(drive: Drive, results: Path) -> SolvedDrive:
     """Return a Drive with what is in its folder of results."""
@@ -73,21 +64,19 @@ def solved_drive(drive: Drive, results: Path) -> SolvedDrive:
     return SolvedDrive(drive.name, drive.dataset, drive.truth, solutions, summary)
 
 
-def opening(drives: list[SolvedDrive], chapters: Books | None = None) -> NotebookNode:
-    """Return the opening of the report, an executed notebook that leads to `chapters`."""
+def opening(drives: list[SolvedDrive]) -> NotebookNode:
+    """Return the opening of the report, an executed notebook."""
     shown = longest(drives)
     drawn = _as_svg(trajectories(shown)) if shown else ""
     template = Template(TEXT.read_text(encoding="utf-8"), trim_blocks=True, lstrip_blocks=True)
     text = template.render(
         drives=drives, longest=shown, plain=plain, sensors=SENSORS,
         picture=f"data:image/svg+xml;base64,{b64encode(drawn.encode()).decode()}",
-        results=table(row for drive in drives for row in result_rows(drive)).data,
-        chapters={quote(source.name): chapter_of(source, book)
-                  for source, book in (chapters or {}).items()})
+        results=table(row for drive in drives for row in result_rows(drive)).data)
     printed, on_screen = text.split(SCREEN_ONLY)
     return new_notebook(cells=[
         new_markdown_cell(printed, id="summary"),
-        new_markdown_cell(on_screen, id="chapters", metadata={"tags": ["html-only"]})])
+        new_markdown_cell(on_screen, id="files", metadata={"tags": ["html-only"]})])
 
 
 def longest(drives: list[SolvedDrive]) -> SolvedDrive | None:
