@@ -17,6 +17,7 @@ from slamlib.core import se2
 from slamlib.core.errors import require
 from slamlib.core.records import AntennaGuess, ArucoReadings, Dataset, Truth, UwbReadings
 from slamlib.core.vehicle import TABLE_2, VEHICLE_LIMITS, Vehicle, changed
+from slamlib.io.files import write_file
 from slamlib.io.formats import (
     ARUCO,
     COVARIANCE,
@@ -108,6 +109,17 @@ def _read_vehicle(path, default):
     if path is None:
         return default
     return changed(default, read_toml(path, "wheelbase = 0.4", VEHICLE_LIMITS), path)
+
+
+def write_vehicle(path: Path, vehicle: Vehicle):
+    """Write a vehicle.toml: eight entries of the wheels, and others that are not of table 2."""
+    entries = vars(vehicle)
+    of_wheels = list(entries)[:8]
+    text = ""
+    for name, value in entries.items():
+        if name in of_wheels or value != getattr(TABLE_2, name):
+            text += f"{name} = {json.dumps(value)}\n"
+    write_file(path, text.encode())
 
 
 def _incremental_counts(table, vehicle):

@@ -10,6 +10,7 @@ import unicodedata
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 from IPython.display import Markdown, display
@@ -20,6 +21,7 @@ from slamlib.core.records import Dataset, Truth
 from slamlib.io.dataset import read_dataset, read_truth
 from slamlib.io.tables import datasets_in
 from slamlib.notebook import plotting
+from slamlib.robust.file_doubts import doubts_before_solving
 from slamlib.studies.simulation import simulate
 
 
@@ -38,6 +40,11 @@ class Drive:
             return "recorded"
         same = self.truth.vehicle == self.dataset.vehicle
         return "recorded, truth known" if same else "simulated"
+
+    @cached_property
+    def doubts(self) -> list[solve.Doubt]:
+        """Doubts about its files, before anything is solved."""
+        return doubts_before_solving(self.dataset)
 
 
 def read_drives(data: Path, names: Iterable[str]) -> list[Drive]:
@@ -111,7 +118,8 @@ def attempt(drive: Drive, problem: str | None = None) -> Iterator[None]:
 def _written(drive, problem, found):
     """The Solution or the Failure that is written of what a solver found, or raised."""
     results = Path(os.environ.get("SLAMLIB_RESULTS") or _data_folder().parent / "results")
-    return solve.write_results(results / drive.name, problem, found, drive.dataset, drive.truth)
+    return solve.write_results(
+        results / drive.name, problem, found, drive.dataset, drive.truth, drive.doubts)
 
 
 def show_doubts(drive: Drive, doubts: Iterable[solve.Doubt]) -> None:
