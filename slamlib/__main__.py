@@ -179,7 +179,7 @@ def _name_in(data, dataset):
 
 
 def summary_lines(summaries: list[dict]) -> list[str]:
-    """The summaries of drives as lines: a table, then what failed, is not confirmed or in doubt."""
+    """The summaries of drives as lines: a table, then what failed or is in doubt."""
     from slamlib.solve import drive_table
     table = drive_table(summaries).drop(columns=["seconds", "failed"]).dropna(axis=1, how="all")
     lines = table.to_string(index=False, na_rep="-", float_format="{:.4g}".format).splitlines()
@@ -188,10 +188,6 @@ def summary_lines(summaries: list[dict]) -> list[str]:
         for problem, row in summary["problems"].items():
             if "failed" in row:
                 told.append(f"{problem} could not be solved: {row['failed']}")
-            if row.get("unconfirmed"):
-                once = ", ".join(map(str, row["unconfirmed"]))
-                told.append(f"{problem}: nothing confirms markers {once}: seen once, or where "
-                            "another one is")
         told += [f"doubt ({doubt['what']}): {doubt['sentence']}" for doubt in summary["doubts"]]
         lines += [f"{summary['dataset']}: {each}" for each in told]
     return lines
@@ -224,8 +220,7 @@ def _simulate(options):
 def _lab(options):
     from slamlib.report.execution import start_lab
     from slamlib.report.notebooks import notebooks_folder
-    start_lab(options.notebooks or notebooks_folder(), options.data, EXECUTED_NOTEBOOKS,
-              options.others)
+    start_lab(options.notebooks or notebooks_folder(), options.data, options.others)
 
 
 if __name__ == "__main__":

@@ -1,17 +1,12 @@
-"""Executes notebooks without a display, each in its own kernel, a limited number at a time.
-
-JupyterLab starts with the same settings.
-"""
+"""Executes notebooks without a display, each in its own kernel, a limited number at a time."""
 
 import asyncio
-import json
 import os
 import socket
 import sys
 import time
 from collections.abc import Callable
 from copy import deepcopy
-from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -22,16 +17,15 @@ from nbclient.exceptions import CellExecutionError
 from nbconvert.filters import strip_ansi
 from nbconvert.preprocessors import CoalesceStreamsPreprocessor
 
-from slamlib.core.errors import require
 from slamlib.report.notebooks import LAB_ONLY, Books, NotebookError
 
 CELL_TIMEOUT = 1800  # s, in which a cell must end
 TRANSPORT = "ipc" if hasattr(socket, "AF_UNIX") else "tcp"  # Windows has no Unix sockets
-SETTINGS = "settings"  # folder of JupyterLab's settings where the user has no others
 # The matrices are small: more threads cost time.
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-OVERRIDES = {"@jupyterlab/apputils-extension:notification": {
-    "fetchNews": "false", "checkForUpdates": False}}  # without a question when it opens
+# Without a question when it opens; as root, as in containers: it listens to this machine alone.
+LAB_OPTIONS = ("--LabApp.news_url=None", "--allow-root",
+               "--LabApp.check_for_updates_class=jupyterlab.NeverCheckForUpdate")
 
 
 class _Loop(asyncio.SelectorEventLoop):
@@ -118,18 +112,8 @@ async def _execute(source, book, environment):
     CoalesceStreamsPreprocessor().preprocess(book, {})  # kernels divide them by time
 
 
-def start_lab(notebooks: Path, data: Path, kept: Path, arguments: list[str]):
-    """Replace this process by JupyterLab with its `arguments`; folders as of `build_report`."""
-    require(find_spec("jupyterlab"), "lab", "JupyterLab, as by pip install jupyterlab", "none")
-    settings = kept.resolve() / SETTINGS
-    settings.mkdir(parents=True, exist_ok=True)
-    (settings / "overrides.json").write_text(json.dumps(OVERRIDES))
-    command = [sys.executable, "-m", "jupyterlab", f"--LabApp.app_settings_dir={settings}",
-               "--LabApp.check_for_updates_class=jupyterlab.NeverCheckForUpdate"]
-    # As in containers; JupyterLab listens to this machine alone. Windows has no such numbers.
-    if hasattr(os, "geteuid") and os.geteuid() == 0:
-        command.append("--allow-root")
-    command += arguments + [str(notebooks)]
-    selected = os.environ.get("SLAMLIB_DATASETS", "").split("\n")
-    environment = kernel_environment(settings, data.resolve(), selected)
+def start_lab(notebooks: Path, data: Path, arguments: list[str]):
+    """Replace this process by JupyterLab on the notebooks, with its `arguments`."""
+    command = [sys.executable, "-m", "jupyterlab", *LAB_OPTIONS, *arguments, str(notebooks)]
+    environment = ONE_THREAD | os.environ | {"SLAMLIB_DATA": str(data.resolve())}
     os.execve(sys.executable, command, environment)
