@@ -112,8 +112,7 @@ def test_selected_drives_are_shown_the_recorded_ones_first(data, monkeypatch):
         start()
 
 
-def test_a_simulated_drive_stands_where_no_drive_has_the_sensor(data, said, monkeypatch):
+def test_where_no_drive_has_the_sensor_it_is_said(data, monkeypatch):
     monkeypatch.setenv("SLAMLIB_DATASETS", "wheels")
-    drive, = start("uwb")
-    assert drive.origin == "simulated" and drive.dataset.uwb is not None
-    assert said == ["*No dataset has UWB ranges: a simulated drive stands for them.*"]
+    with pytest.raises(DatasetError, match="expected a dataset with UWB ranges, found none"):
+        start("uwb")

@@ -11,7 +11,7 @@ MIN_HEIGHT = 2.6                   # inches, of the axes
 MAX_HEIGHT = 4.6
 MIN_POINT_VARIANCE = 1.0       # rad^2, variance of the heading of a marker without orientation
 TICK_LENGTH = 0.022            # of a marker's heading tick, in the map's extent
-ELLIPSE_COUNT = 24             # ellipses of the vehicle, at equal distances along the path
+ELLIPSE_COUNT = 24             # ellipses of the vehicle
 NAME = 7.0                         # points, font size of the names of markers
 ANTENNA_NAME = 10.5                # points, of those of antennas
 # Places of a name relative to its landmark, in font sizes, in the order in which they are tried.

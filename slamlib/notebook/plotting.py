@@ -23,7 +23,6 @@ from matplotlib_inline.backend_inline import set_matplotlib_formats
 
 from slamlib.core import se2
 from slamlib.core.evaluation import REACH_95
-from slamlib.core.odometry import cumulative
 
 
 def _line(color, width, dashes=None, zorder=3):
@@ -102,8 +101,7 @@ def each_drive(drives: Iterable, rows: int = 1, **size) -> Iterator[tuple]:
     for drive, column in zip(drives, axes):
         column[0].set_title(getattr(drive, "name", drive))
         yield drive, column if rows > 1 else column[0]
-    if any(ax.get_legend_handles_labels()[0] for ax in fig.axes):
-        legend_below(fig)
+    legend_below(fig)
 
 
 def estimates(result, drive) -> Estimates:
@@ -132,13 +130,14 @@ def estimates(result, drive) -> Estimates:
 def with_ellipses(ax: Axes, poses: np.ndarray, covariances: np.ndarray, role: str,
                   label: str | None = None, enlarged: float | None = None,
                   count: int = 12) -> Axes:
-    """Draw a path with about `count` filled 95 % ellipses at equal distances along it.
+    """Draw a path with `count` filled 95 % ellipses, at equal numbers of poses along it.
 
     Ellipses are `enlarged` by this factor, by default by that of `enlargement`, which is added to
     the axes' title.
     """
     enlarged = enlarged or enlargement(poses, covariances)
-    some = equidistant(poses, count)
+    known = np.flatnonzero(np.isfinite(poses[:, 0]))
+    some = evenly(known, count)
     trajectory(ax, poses, role, label, linewidth=1.2, alpha=0.8)
     ellipses(ax, poses[some], covariances[some], ROLES[role]["color"], fill=0.5, enlarged=enlarged)
     title = ax.get_title("left")
@@ -156,7 +155,7 @@ def errors(axes: Sequence[Axes], result, drive, role: str = "slam") -> Sequence[
     """
     top, bottom = axes
     found = estimates(result, drive)
-    shown = np.unique(np.linspace(0, len(found.frame) - 1, MAX_BANDS).astype(int))
+    shown = evenly(np.arange(len(found.frame)), MAX_BANDS)
     frame = found.frame[shown]
     covariances = found.covariances[shown]
     semi_axis = 1e3 * longest_semi_axes(covariances)                     # mm
@@ -265,14 +264,11 @@ def enlargement(poses: np.ndarray, covariances: np.ndarray) -> int:
     return factor // digits * digits
 
 
-def equidistant(poses: np.ndarray, count: int = 12) -> np.ndarray:
-    """Indices of about `count` known poses at equal distances along the path."""
-    known = np.flatnonzero(np.isfinite(poses[:, 0]))
-    steps = np.diff(poses[known, :2], axis=0)
-    travelled = cumulative(np.linalg.norm(steps, axis=1))
-    wanted = np.linspace(0, travelled[-1], count + 1)[1:]
-    row = np.searchsorted(travelled, wanted)
-    return known[np.unique(np.minimum(row, len(known) - 1))]
+def evenly(rows: np.ndarray, count: int) -> np.ndarray:
+    """At most `count` of the rows (n, ...) at equal distances, the last one included."""
+    if len(rows) <= count:
+        return rows
+    return rows[np.linspace(-1, len(rows) - 1, count + 1).astype(int)[1:]]
 
 
 def name_rows(axes: Sequence[Axes], names: Sequence[str]) -> None:
@@ -289,10 +285,8 @@ def legend_below(fig: Figure) -> None:
         handles, labels = ax.get_legend_handles_labels()
         for handle, label in zip(handles, labels):
             entries.setdefault(label, handle)
-    for most in (4, 3, 2, 1):
+    for columns in (4, 3, 2, 1) if entries else ():
         fig.legends.clear()
-        lines = math.ceil(len(entries) / most)
-        columns = math.ceil(len(entries) / lines)
         legend = fig.legend(entries.values(), entries.keys(), loc="outside lower center",
                             ncols=columns)
         if legend.get_window_extent().width <= fig.bbox.width:

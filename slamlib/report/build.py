@@ -97,7 +97,7 @@ def _read(data, selected):
 
 
 def _with_what_they_need(books, drives):
-    """Return the notebooks whose measurements the drives have, or all if there is none."""
+    """Return the notebooks whose measurements the drives have."""
     served = {}
     for source, book in books.items():
         sensor = needs_of(book)
@@ -105,7 +105,8 @@ def _with_what_they_need(books, drives):
             _say(f"{source.stem}: left out, no dataset has {SENSORS[sensor]}")
         else:
             served[source] = book
-    return served or books
+    require(served, "report.toml", "a chapter whose measurements a dataset has, found none")
+    return served
 
 
 def _execute(books, drives, data, jobs, kept):
