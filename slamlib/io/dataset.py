@@ -105,8 +105,8 @@ def _dataset(files, vehicle, name, notes=()):
 
 
 def read_vehicle(path: Path | None, default: Vehicle) -> Vehicle:
-    """The Vehicle of a `vehicle.toml`, if it is there, whose entries replace those of a default."""
-    if path is None or not path.exists():
+    """The Vehicle of a `vehicle.toml` or None, whose entries replace those of a default."""
+    if path is None:
         return default
     return changed(default, read_toml(path, "wheelbase = 0.4", VEHICLE_LIMITS), path)
 

@@ -61,7 +61,8 @@ def solved_drive(drive: Drive, results: Path) -> SolvedDrive:
             _, poses, covariances = read_structs(own, "vehiclePose")
             solutions[problem] = Solution(problem, row["title"], poses, covariances,
                                           row["world_is_pose"] - 1, **maps)
-    vehicle = read_vehicle(results / VEHICLE_ESTIMATED, drive.dataset.vehicle)
+    estimated = results / VEHICLE_ESTIMATED
+    vehicle = read_vehicle(estimated if estimated.exists() else None, drive.dataset.vehicle)
     return SolvedDrive(drive.name, drive.dataset, drive.truth, solutions, summary, vehicle)
 
 
