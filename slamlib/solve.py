@@ -140,25 +140,21 @@ def problem_solution(problem: str, dataset: Dataset, found=None) -> Solution:
     """
     if found is None:
         found = find(problem, dataset)
-    if isinstance(found, tuple):
-        poses, covariances = found
-    else:
-        poses = found.poses
-        covariances = found.covariances
+    poses, covariances = found if isinstance(found, tuple) else (found.poses, found.covariances)
     _require_variances(found, covariances[np.isfinite(poses[:, 0])])
     fields = {"poses": poses, "covariances": covariances}
     if problem == "problem2":
-        fields = _localization_fields(dataset, found)
-    elif problem == "problem2_fused":
-        fields["facts"] = _noise_facts(found)
+        fields = _at_all_poses(found, len(dataset.ticks))
+    if problem == "problem2_fused":
         fields["doubts"] = fusion_doubts(found, dataset.vehicle)
-    elif problem in ("problem3", "problem4"):
-        fields["facts"] = _slam_facts(found)
+    if problem in ("problem3", "problem4"):
         fields["doubts"] = solution_doubts(found)
-        if dataset.aruco is not None:
-            fields["aruco_map"] = found.marker, found.marker_in_world, found.marker_covariance
-        if problem == "problem4":
-            fields["uwb_map"] = found.antenna, found.antenna_in_world, found.antenna_covariance
+    if problem != "problem1":
+        fields["facts"] = _facts(found)
+    if len(getattr(found, "marker", ())):
+        fields["aruco_map"] = found.marker, found.marker_in_world, found.marker_covariance
+    if len(getattr(found, "antenna", ())):
+        fields["uwb_map"] = found.antenna, found.antenna_in_world, found.antenna_covariance
     return Solution(problem=problem, title=title(problem, dataset), **fields)
 
 
@@ -174,29 +170,24 @@ def _require_variances(found, covariances):
         raise np.linalg.LinAlgError("a variance is negative or not finite")
 
 
-def _localization_fields(dataset, found):
-    """Fields of problem 2's Solution by a Localization; the first localized pose is the world."""
-    poses = np.full((len(dataset.ticks), 3), np.nan)
-    covariances = np.full((len(dataset.ticks), 3, 3), np.nan)
+def _at_all_poses(found, count):
+    """Fields of a Solution by a Localization; the first localized pose is the world."""
+    poses = np.full((count, 3), np.nan)
+    covariances = np.full((count, 3, 3), np.nan)
     covariances[found.frame] = found.covariances
     poses[found.frame] = found.poses
     known = found.frame[np.isfinite(found.poses[:, 0])]
     poses[known, 2] = np.unwrap(poses[known, 2])
-    facts = {"sightings": len(dataset.aruco.pose), "outliers": int(found.rejected.sum())}
-    return {"poses": poses, "covariances": covariances, "world": int(known[0]), "facts": facts,
-            "aruco_map": (found.marker, found.marker_in_world, found.marker_covariance)}
+    return {"poses": poses, "covariances": covariances, "world": int(known[0])}
 
 
-def _noise_facts(found):
-    """Slip, wheel parameters and number of rejected sightings of a Fusion or SlamResult."""
-    return {"slip_sqrt_m": found.slip, "outliers": int(np.sum(found.rejected)),
-            "wheel_parameters_m": found.wheel.tolist(),
-            "wheel_parameter_sigmas_m": np.sqrt(np.diag(found.wheel_covariance)).tolist()}
-
-
-def _slam_facts(found):
-    """Noise, calibration and doubtful landmarks of a SlamResult."""
-    facts = _noise_facts(found)
+def _facts(found):
+    """Rejected sightings, slip, noise, calibration and doubtful landmarks of a result."""
+    facts = {"outliers": int(np.sum(found.rejected))}
+    if getattr(found, "slip", None) is not None:
+        facts["slip_sqrt_m"] = found.slip
+    if not hasattr(found, "fit"):
+        return facts
     facts["unconfirmed"] = found.unconfirmed.tolist()
     facts["calibration"] = [row for row in found.calibration_table if row["sigma"]]
     if len(found.rejected):
