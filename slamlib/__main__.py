@@ -108,14 +108,13 @@ def _add_solve(commands):
         "several has its results in the folder of its name in OUT, and drives.csv is the table "
         "over all")
     add("--out", type=Path, required=True, help="folder for the results")
-    add("-j", "--jobs", type=int, default=1, help="datasets solved at a time (default 1)")
+    add("-j", "--jobs", type=int, default=1, help="datasets solved at a time (default 1); of a "
+        "single one, problems 3 and 4 beside the others")
     add("--problem", action="append", default=[], metavar="NAME",
         type=lambda text: text.removeprefix("problem"),
         choices=("1", "2", "2_hint", "2_fused", "3", "4"),
         help="one of %(choices)s, of which 2 is markers alone; may be repeated (default: all); 4 "
              "starts from 3 where both are solved")
-    add("--kernel", help="instead of that of vehicle.toml")
-    add("--slip", type=float, help="instead of that of vehicle.toml")
     add("--csv", action="store_true", help="write poses and maps as text, too: CSV with "
         "covariances, and trajectories as TUM files for evo")
     add("-v", "--verbose", action="store_true", help="print to stderr what is decided on the way: "
@@ -128,15 +127,13 @@ def _add_simulate(commands):
     _add_path(command, "folder", "a new or empty folder")
     add = command.add_argument
     add("--path", choices=("short", "long"), default="short")
-    add("--rounds", type=int, default=1,
-        help="how often the path is driven; 44 long ones are a million rows")
-    add("--seed", type=int, default=0)
-    add("--slip", type=float, default=1e-3,
-        help="wheel slip: sigma after one metre, in m (default %(default)s)")
-    add("--nlos", type=float, default=0.0,
-        help="share of UWB ranges without line of sight, which are too long")
-    add("--mislabel", type=float, default=0.0,
-        help="share of marker sightings that carry another marker's id")
+    for name, default, what in (
+            ("rounds", 1, "how often the path is driven; 44 long ones are a million rows"),
+            ("seed", 0, "of the random generator"),
+            ("slip", 1e-3, "wheel slip: sigma after one metre, in m"),
+            ("nlos", 0.0, "share of UWB ranges without line of sight, which are too long"),
+            ("mislabel", 0.0, "share of marker sightings that carry another marker's id")):
+        add(f"--{name}", type=type(default), default=default, help=f"{what} (default %(default)s)")
 
 
 def _build(options):
@@ -182,7 +179,7 @@ def _name_in(data, dataset):
 
 
 def summary_lines(summaries: list[dict]) -> list[str]:
-    """The summaries of drives as lines: a table, then what failed, is not confirmed or in doubt."""
+    """The summaries of drives as lines: a table, then what failed or is in doubt."""
     from slamlib.solve import drive_table
     table = drive_table(summaries).drop(columns=["seconds", "failed"]).dropna(axis=1, how="all")
     lines = table.to_string(index=False, na_rep="-", float_format="{:.4g}".format).splitlines()
@@ -191,10 +188,6 @@ def summary_lines(summaries: list[dict]) -> list[str]:
         for problem, row in summary["problems"].items():
             if "failed" in row:
                 told.append(f"{problem} could not be solved: {row['failed']}")
-            if row.get("unconfirmed"):
-                once = ", ".join(map(str, row["unconfirmed"]))
-                told.append(f"{problem}: nothing confirms markers {once}: seen once, or where "
-                            "another one is")
         told += [f"doubt ({doubt['what']}): {doubt['sentence']}" for doubt in summary["doubts"]]
         lines += [f"{summary['dataset']}: {each}" for each in told]
     return lines
@@ -203,14 +196,12 @@ def summary_lines(summaries: list[dict]) -> list[str]:
 def _solve(options):
     """Solve the problems of one dataset or several, and print a table of each."""
     from slamlib.solve import solve_folder, solve_folders
-    several = len(options.folders) > 1
     how = {"problems": [f"problem{each}" for each in options.problem],
-           "text": options.csv, "verbose": options.verbose,
-           "stated": {"kernel": options.kernel, "slip": options.slip}}
-    if several:
+           "text": options.csv, "verbose": options.verbose}
+    if len(options.folders) > 1:
         summaries = solve_folders(options.folders, options.out, options.jobs, **how)
     else:
-        summaries = [solve_folder(options.folders[0], options.out, **how)]
+        summaries = [solve_folder(options.folders[0], options.out, jobs=options.jobs, **how)]
     print("\n".join(summary_lines(summaries)))
     errors = [_ended(2, summary["error"]) for summary in summaries if "error" in summary]
     print(f"results: {options.out.resolve()}", file=sys.stderr)
@@ -229,8 +220,7 @@ def _simulate(options):
 def _lab(options):
     from slamlib.report.execution import start_lab
     from slamlib.report.notebooks import notebooks_folder
-    start_lab(options.notebooks or notebooks_folder(), options.data, EXECUTED_NOTEBOOKS,
-              options.others)
+    start_lab(options.notebooks or notebooks_folder(), options.data, options.others)
 
 
 if __name__ == "__main__":

@@ -5,11 +5,10 @@ plain numbers. `solve_to_folder` does so for all problems of a dataset, `solve_f
 datasets.
 """
 
-import json
 import logging
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -21,9 +20,14 @@ from slamlib import estimate, fuse, fuse_increments, localize
 from slamlib.core import evaluation, odometry, se2
 from slamlib.core.errors import DatasetError, require
 from slamlib.core.records import Dataset, Truth
-from slamlib.core.vehicle import TABLE_2, Vehicle, changed
 from slamlib.io import files, results
-from slamlib.io.dataset import all_notes, inventory_lines, read_dataset, read_truth
+from slamlib.io.dataset import (
+    all_notes,
+    inventory_lines,
+    read_dataset,
+    read_truth,
+    write_vehicle,
+)
 from slamlib.robust.file_doubts import Doubt, doubts_before_solving, merged
 from slamlib.robust.solution_doubts import fusion_doubts, solution_doubts
 
@@ -136,25 +140,21 @@ def problem_solution(problem: str, dataset: Dataset, found=None) -> Solution:
     """
     if found is None:
         found = find(problem, dataset)
-    if isinstance(found, tuple):
-        poses, covariances = found
-    else:
-        poses = found.poses
-        covariances = found.covariances
+    poses, covariances = found if isinstance(found, tuple) else (found.poses, found.covariances)
     _require_variances(found, covariances[np.isfinite(poses[:, 0])])
     fields = {"poses": poses, "covariances": covariances}
     if problem == "problem2":
-        fields = _localization_fields(dataset, found)
-    elif problem == "problem2_fused":
-        fields["facts"] = _noise_facts(found)
+        fields = _at_all_poses(found, len(dataset.ticks))
+    if problem == "problem2_fused":
         fields["doubts"] = fusion_doubts(found, dataset.vehicle)
-    elif problem in ("problem3", "problem4"):
-        fields["facts"] = _slam_facts(dataset, found)
-        fields["doubts"] = (*_option_doubts(problem, dataset, found), *solution_doubts(found))
-        if dataset.aruco is not None:
-            fields["aruco_map"] = found.marker, found.marker_in_world, found.marker_covariance
-        if problem == "problem4":
-            fields["uwb_map"] = found.antenna, found.antenna_in_world, found.antenna_covariance
+    if problem in ("problem3", "problem4"):
+        fields["doubts"] = solution_doubts(found)
+    if problem != "problem1":
+        fields["facts"] = _facts(found)
+    if len(getattr(found, "marker", ())):
+        fields["aruco_map"] = found.marker, found.marker_in_world, found.marker_covariance
+    if len(getattr(found, "antenna", ())):
+        fields["uwb_map"] = found.antenna, found.antenna_in_world, found.antenna_covariance
     return Solution(problem=problem, title=title(problem, dataset), **fields)
 
 
@@ -170,86 +170,72 @@ def _require_variances(found, covariances):
         raise np.linalg.LinAlgError("a variance is negative or not finite")
 
 
-def _localization_fields(dataset, found):
-    """Fields of problem 2's Solution by a Localization; the first localized pose is the world."""
-    poses = np.full((len(dataset.ticks), 3), np.nan)
-    covariances = np.full((len(dataset.ticks), 3, 3), np.nan)
+def _at_all_poses(found, count):
+    """Fields of a Solution by a Localization; the first localized pose is the world."""
+    poses = np.full((count, 3), np.nan)
+    covariances = np.full((count, 3, 3), np.nan)
     covariances[found.frame] = found.covariances
     poses[found.frame] = found.poses
     known = found.frame[np.isfinite(found.poses[:, 0])]
     poses[known, 2] = np.unwrap(poses[known, 2])
-    facts = {"sightings": len(dataset.aruco.pose), "outliers": int(found.rejected.sum()),
-             "unused_sightings": int(found.unused.sum())}
-    return {"poses": poses, "covariances": covariances, "world": int(known[0]), "facts": facts,
-            "aruco_map": (found.marker, found.marker_in_world, found.marker_covariance)}
+    return {"poses": poses, "covariances": covariances, "world": int(known[0])}
 
 
-def _option_doubts(problem, dataset, found):
-    """A Doubt if a SlamResult has options that the Vehicle of its Dataset does not state."""
-    stated = vars(dataset.vehicle)
-    used = vars(found.fit.problem.measurements.dataset.vehicle)
-    said = [f"{key} = {value}" for key, value in used.items() if value != stated[key]]
-    if said:
-        yield Doubt("options", f"The files of {problem} are solved with {', '.join(said)}, unlike "
-                    "other chapters and `slamlib solve`: state it in vehicle.toml, which all heed.")
-
-
-def _noise_facts(found):
-    """Slip, wheel parameters and number of rejected sightings of a Fusion or SlamResult."""
-    return {"slip_sqrt_m": found.slip, "outliers": int(np.sum(found.rejected)),
-            "wheel_parameters_m": found.wheel.tolist(),
-            "wheel_parameter_sigmas_m": np.sqrt(np.diag(found.wheel_covariance)).tolist()}
-
-
-def _slam_facts(dataset, found):
-    """Noise, calibration and doubtful landmarks of a SlamResult."""
-    facts = _noise_facts(found)
-    facts["gtsam"] = _gtsam_facts(found)
-    facts["increments"] = found.model
+def _facts(found):
+    """Rejected sightings, slip, noise, calibration and doubtful landmarks of a result."""
+    facts = {"outliers": int(np.sum(found.rejected))}
+    if getattr(found, "slip", None) is not None:
+        facts["slip_sqrt_m"] = found.slip
+    if not hasattr(found, "fit"):
+        return facts
     facts["unconfirmed"] = found.unconfirmed.tolist()
     facts["calibration"] = [row for row in found.calibration_table if row["sigma"]]
     if len(found.rejected):
         facts["marker_noise_factor"] = found.noise.sightings
     if len(found.antenna):
-        weak = dataset.uwb.antenna[found.range_weight < 0.5].tolist()
         facts["range_noise_factor"] = found.noise.ranges
-        facts["ranges"] = len(dataset.uwb.pose)
+        facts["ranges"] = len(found.range_weight)
+        facts["ranges_down_weighted"] = int(np.sum(found.range_weight < 0.5))
         facts["antennas_in_doubt"] = found.doubts
-        facts["ranges_down_weighted_by_antenna"] = {
-            antenna: weak.count(antenna) for antenna in found.antenna.tolist()}
     return facts
 
 
-def _gtsam_facts(found):
-    """What GTSAM solved, and how far it is from the engine that decided, of a SlamResult."""
-    by_gtsam = found.gtsam
-    return {"factors": by_gtsam.factors, "variables": by_gtsam.variables,
-            "steps": by_gtsam.steps, "start": by_gtsam.start,
-            "largest_difference_in_sigmas": found.agreement[0],
-            "largest_relative_difference_of_sigmas": found.agreement[1]}
+def solutions(dataset: Dataset, problems: Sequence[str] = tuple(PROBLEMS),
+              jobs: int = 1) -> list[Solution | Failure]:
+    """The Solution of each of `problems` that the dataset's sensors allow, in order.
 
-
-def solutions(dataset: Dataset,
-              problems: Sequence[str] = tuple(PROBLEMS)) -> Iterator[Solution | Failure]:
-    """Yield the Solution of each of `problems` that the dataset's sensors allow, in order.
-
-    A problem that cannot be solved yields a Failure. Facts include the seconds that it took.
+    A problem that cannot be solved has a Failure. Facts include the seconds that it took. With more
+    than one of `jobs`, problems 3 and 4 are solved beside the others, in a process of their own.
     """
+    allowed = [problem for problem in problems if allows(dataset, problem)]
+    if jobs == 1:
+        return _in_order(dataset, allowed)
+    from joblib import Parallel, delayed  # here and below, because one job needs none of it
+
+    slam = [problem for problem in allowed if problem in ("problem3", "problem4")]
+    others = [problem for problem in allowed if problem not in slam]
+    in_order = delayed(_in_order)
+    found = Parallel(n_jobs=2)(in_order(dataset, each) for each in (slam, others))
+    return found[1] + found[0]
+
+
+def _in_order(dataset, problems):
+    """The Solutions or Failures of problems, of which one starts from those before it."""
     found = {}
+    solved = []
     for problem in problems:
-        if not allows(dataset, problem):
-            continue
         start = time.perf_counter()
         try:
             found[problem] = find(problem, dataset, found)
             solution = problem_solution(problem, dataset, found[problem])
         except UNSOLVABLE as error:
-            yield failure(problem, dataset, error)
+            solved.append(failure(problem, dataset, error))
             continue
         seconds = time.perf_counter() - start
         level = logging.WARNING if seconds > SLOW else logging.INFO
         log.log(level, "%s: %s solved in %.1f s", dataset.name, problem, seconds)
-        yield replace(solution, facts=solution.facts | {"seconds": seconds})
+        solved.append(replace(solution, facts=solution.facts | {"seconds": seconds}))
+    return solved
 
 
 def truth_in_world(solution: Solution, truth: Truth) -> np.ndarray:
@@ -258,7 +244,8 @@ def truth_in_world(solution: Solution, truth: Truth) -> np.ndarray:
 
 
 def write_results(out: Path | str, problem: str, found, dataset: Dataset,
-                  truth: Truth | None = None) -> Solution | Failure:
+                  truth: Truth | None = None, doubts: list[Doubt] | None = None
+                  ) -> Solution | Failure:
     """Write what a solver found of one problem to the results folder `out` of a drive.
 
     The .mat files come first, summary.json last: a folder without it is unfinished. What it lists
@@ -269,6 +256,7 @@ def write_results(out: Path | str, problem: str, found, dataset: Dataset,
     problem : key of `PROBLEMS`.
     found : what `find` returns for the problem, or the exception, of UNSOLVABLE, that it raised.
     truth : Truth, to report errors, or None.
+    doubts : those about the files, or None to look for them.
 
     Returns
     -------
@@ -294,18 +282,19 @@ def write_results(out: Path | str, problem: str, found, dataset: Dataset,
         with suppress(DatasetError):
             rows = results.read_summary(out)["problems"]
         rows.pop(problem, None)
-        _write(out, dataset, truth, [solved], rows)
+        _write(out, dataset, truth, [solved], rows, doubts=doubts)
     return solved
 
 
 def solve_to_folder(dataset: Dataset, truth: Truth | None, out: Path,
-                    problems: Sequence[str] = tuple(PROBLEMS), text: bool = False) -> dict:
+                    problems: Sequence[str] = tuple(PROBLEMS), text: bool = False,
+                    jobs: int = 1) -> dict:
     """Solve `problems` of a Dataset, then write their files to the folder `out`.
 
     Files of an earlier run are replaced, or removed if they belong to other problems; all other
     files in the folder stay. Raises DatasetError, before anything is solved, if nothing can be
     written there. `truth` serves to report errors; with `text` each .mat file is written as CSV,
-    too, and trajectories and truth as TUM files.
+    too, and trajectories and truth as TUM files. `jobs` as of `solutions`.
 
     Returns
     -------
@@ -315,23 +304,25 @@ def solve_to_folder(dataset: Dataset, truth: Truth | None, out: Path,
     read.
     """
     with files.locked(out):
-        solved = list(solutions(dataset, problems))
+        solved = solutions(dataset, problems, jobs)
         return _write(out, dataset, truth, solved, {}, text)
 
 
-def _write(out, dataset, truth, solved, others, text=False):
+def _write(out, dataset, truth, solved, others, text=False, doubts=None):
     """Write solved problems to a folder; return its summary, with the rows of `others`, too."""
     rows = dict(others)
     for each in solved:
         rows[each.problem] = summarize(each, truth)
-    summary = summary_of(dataset, truth, rows, doubts_before_solving(dataset))
+    if doubts is None:
+        doubts = doubts_before_solving(dataset)
+    summary = summary_of(dataset, truth, rows, doubts)
     clear_results(out, keep=others)
     for each in solved:
         if isinstance(each, Solution):
             results.write_solution(out, each, text)
     if text and truth is not None:
         results.write_tum(out / TRUTH, truth.poses)
-    write_estimated_vehicle(out / VEHICLE_ESTIMATED, dataset.vehicle, summary["problems"])
+    _write_estimated_vehicle(out / VEHICLE_ESTIMATED, dataset.vehicle, summary["problems"])
     results.write_summary(out, summary)
     return summary
 
@@ -385,10 +376,10 @@ def summarize(solved: Solution | Failure, truth: Truth | None) -> dict:
     return row
 
 
-def write_estimated_vehicle(path: Path, vehicle: Vehicle, rows: dict):
+def _write_estimated_vehicle(path, vehicle, rows):
     """Write what a drive says of its Vehicle as a vehicle.toml, if that is not what is stated.
 
-    It has all that is stated, the calibration that was released from it and the noise that was
+    It has what is stated, the calibration that was released from it and the noise that was
     learned, of the last problem in the `rows` of a summary that estimates them.
     """
     learned = {}
@@ -404,19 +395,12 @@ def write_estimated_vehicle(path: Path, vehicle: Vehicle, rows: dict):
     for name, fact in NOISE.items():
         if fact in learned and getattr(vehicle, name) is None:
             estimated[name] = learned[fact]
-    if not estimated:
-        return
-    lines = ["# Of the vehicle: what is stated, and what this drive says, which is taken as "
-             "stated in the dataset's folder."]
-    for name, value in (vars(vehicle) | estimated).items():
-        if value != getattr(TABLE_2, name):
-            lines.append(f"{name} = {json.dumps(value)}")
-    text = "\n".join(lines)
-    files.write_file(path, f"{text}\n".encode())
+    if estimated:
+        write_vehicle(path, replace(vehicle, **estimated))
 
 
 def solve_folder(folder: Path | str, out: Path | str, problems: Sequence[str] = (),
-                 text: bool = False, verbose: bool = False, stated: dict | None = None) -> dict:
+                 text: bool = False, verbose: bool = False, jobs: int = 1) -> dict:
     """Read the dataset in a folder, solve it into the folder `out`; returns the summary.
 
     What was read is printed to stderr.
@@ -426,7 +410,7 @@ def solve_folder(folder: Path | str, out: Path | str, problems: Sequence[str] = 
     problems : keys of `PROBLEMS`, or none for all that the sensors allow.
     text : as of `solve_to_folder`.
     verbose : True prints to stderr what is decided on the way.
-    stated : entries of a Vehicle that replace those of the dataset's vehicle.toml.
+    jobs : as of `solutions`.
 
     Raises DatasetError if the dataset is malformed or does not allow a problem.
     """
@@ -439,12 +423,11 @@ def solve_folder(folder: Path | str, out: Path | str, problems: Sequence[str] = 
             "another folder for the results: this one is the dataset's")
     dataset = read_dataset(folder)
     truth = read_truth(folder)
-    dataset = replace(dataset, vehicle=changed(dataset.vehicle, stated or {}, "slamlib solve"))
     print("\n".join(inventory_lines(dataset, truth)), file=sys.stderr)
     for problem in problems:
         require(allows(dataset, problem), folder,
                 f"the measurements of {problem} ({title(problem, dataset)})")
-    return solve_to_folder(dataset, truth, out, sorted(problems) or tuple(PROBLEMS), text)
+    return solve_to_folder(dataset, truth, out, sorted(problems) or tuple(PROBLEMS), text, jobs)
 
 
 def solve_folders(folders: Sequence[Path | str], out: Path | str, jobs: int | None = None,
@@ -464,7 +447,7 @@ def solve_folders(folders: Sequence[Path | str], out: Path | str, jobs: int | No
     -------
     The summaries of the datasets, in their order.
     """
-    from joblib import Parallel, delayed  # here, because one drive needs none of it
+    from joblib import Parallel, delayed
 
     out = Path(out)
     folders = [folder for folder in map(Path, folders) if not folder.is_file()]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from conftest import contradicted
 
-from slamlib import estimate, fuse, localize
+from slamlib import fuse, localize
 from slamlib.core.errors import DatasetError
 from slamlib.io.results import read_structs, read_summary
 from slamlib.notebook import Drive, attempt, drives, show_doubts, start, write_results
@@ -68,14 +68,6 @@ def test_a_second_result_of_a_problem_replaces_the_first(said, good, tmp_path):
     assert poses[0, 0] == 2.0
 
 
-def test_options_that_vehicle_toml_does_not_state_are_a_doubt(said, good, tmp_path):
-    write_results(good, "problem3", estimate(good.dataset, kernel="Huber"))
-    doubts = read_summary(tmp_path / "results" / "good")["doubts"]
-    sentence, = (doubt["sentence"] for doubt in doubts if doubt["what"] == "options")
-    assert "problem3 are solved with kernel = Huber, unlike" in sentence
-    assert any("kernel" in text for text in said)
-
-
 def test_a_comparison_that_fails_is_said_and_no_failure_of_a_problem(said, bad, tmp_path):
     with attempt(bad):
         localize(bad.dataset.sightings)
@@ -120,8 +112,7 @@ def test_selected_drives_are_shown_the_recorded_ones_first(data, monkeypatch):
         start()
 
 
-def test_a_simulated_drive_stands_where_no_drive_has_the_sensor(data, said, monkeypatch):
+def test_where_no_drive_has_the_sensor_it_is_said(data, monkeypatch):
     monkeypatch.setenv("SLAMLIB_DATASETS", "wheels")
-    drive, = start("uwb")
-    assert drive.origin == "simulated" and drive.dataset.uwb is not None
-    assert said == ["*No dataset has UWB ranges: a simulated drive stands for them.*"]
+    with pytest.raises(DatasetError, match="expected a dataset with UWB ranges, found none"):
+        start("uwb")

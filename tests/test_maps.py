@@ -37,7 +37,7 @@ def labels(fig):
 def test_a_map_shows_path_markers_antennas_guess_truth_and_states_the_enlargement(solved):
     drive, result = solved
     fig = maps.whole_map(drive, result)
-    assert labels(fig) == {"vehicle", "its ellipses", "truth", "markers", "markers: truth",
+    assert labels(fig) == {"vehicle", "truth", "markers", "markers: truth",
                            "antennas: guess", "antennas: estimate", "antennas: truth"}
     ax, = fig.axes
     assert ax.get_title("left").startswith("short (95 % ellipses × ")
@@ -68,7 +68,7 @@ def test_what_a_drive_lacks_is_absent_from_map_and_tables(solved):
                for kind in ("marker", "antenna") for what in ("", "_in_world", "_covariance")}
     result = replace(result, **nothing)
     fig = maps.whole_map(drive, result)
-    assert labels(fig) == {"vehicle", "its ellipses"}
+    assert labels(fig) == {"vehicle"}
     fig.draw_without_rendering()
     assert [*antenna_rows(result, drive)] == []
 

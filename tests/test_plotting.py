@@ -28,18 +28,18 @@ def drawn(count, rows, columns=2, labels=LABELS):
     return fig, axes
 
 
-def boxes(fig):
+def boxes(fig, axes):
     """The extents of axes with all that belongs to them, in inches, and that of the legend."""
     fig.draw_without_rendering()
     return [thing.get_tightbbox().transformed(fig.dpi_scale_trans.inverted())
-            for thing in (*fig.axes, fig.legends[0])]
+            for thing in (*axes.flat, fig.legends[0])]
 
 
 @pytest.mark.parametrize("count, rows, columns", [(1, 1, 2), (2, 3, 2), (3, 3, 3)])
 def test_panels_are_side_by_side_and_within_the_figure(count, rows, columns):
     fig, axes = drawn(count, rows, columns)
     assert axes.shape == (count, rows)
-    *wide, legend = boxes(fig)
+    *wide, legend = boxes(fig, axes)
     if count > 1:
         assert wide[rows].x0 > wide[0].x1
     for box in (*wide, legend):
@@ -111,7 +111,7 @@ def test_each_drive_has_its_panels_a_title_and_one_legend():
         assert len(axes) == 2
         plotting.curve(axes[0], np.arange(3.0), "slam")
     fig = axes[0].figure
-    assert [ax.get_title("left") for ax in fig.axes] == ["a", "", "two", ""]
+    assert [ax.get_title("left") for ax in fig.axes] == ["a", "two", "", ""]
     assert len(fig.legends) == 1
     assert list(plotting.each_drive([])) == [] and len(plt.gcf().axes) == 1
 

@@ -17,6 +17,7 @@ from slamlib.core import se2
 from slamlib.core.errors import require
 from slamlib.core.records import AntennaGuess, ArucoReadings, Dataset, Truth, UwbReadings
 from slamlib.core.vehicle import TABLE_2, VEHICLE_LIMITS, Vehicle, changed
+from slamlib.io.files import write_file
 from slamlib.io.formats import (
     ARUCO,
     COVARIANCE,
@@ -45,7 +46,7 @@ def read_dataset(folder: Path | str) -> Dataset:
     not have the format.
     """
     files, notes = contents(folder, required=ENCODER)
-    vehicle = _read_vehicle(files.get(VEHICLE), TABLE_2)
+    vehicle = read_vehicle(files.get(VEHICLE), TABLE_2)
     return _dataset(files, vehicle, Path(abspath(folder)).name, notes)
 
 
@@ -103,11 +104,22 @@ def _dataset(files, vehicle, name, notes=()):
     return dataset.first(len(ticks))  # in which a sensor without readings is None
 
 
-def _read_vehicle(path, default):
-    """The Vehicle of a `vehicle.toml`, whose entries replace those of a default."""
+def read_vehicle(path: Path | None, default: Vehicle) -> Vehicle:
+    """The Vehicle of a `vehicle.toml` or None, whose entries replace those of a default."""
     if path is None:
         return default
     return changed(default, read_toml(path, "wheelbase = 0.4", VEHICLE_LIMITS), path)
+
+
+def write_vehicle(path: Path, vehicle: Vehicle):
+    """Write a vehicle.toml: eight entries of the wheels, and others that are not of table 2."""
+    entries = vars(vehicle)
+    of_wheels = list(entries)[:8]
+    text = ""
+    for name, value in entries.items():
+        if name in of_wheels or value != getattr(TABLE_2, name):
+            text += f"{name} = {json.dumps(value)}\n"
+    write_file(path, text.encode())
 
 
 def _incremental_counts(table, vehicle):
@@ -172,7 +184,7 @@ def read_truth(folder: Path | str) -> Truth | None:
         path = path.noted(
             " begins at ({:.3f} m, {:.3f} m, {:.4f} rad): poses and maps were moved into the frame "
             "of its first pose, in which the estimates are".format(*origin))
-    vehicle = _read_vehicle(files.get(VEHICLE), _read_vehicle(drive.get(VEHICLE), TABLE_2))
+    vehicle = read_vehicle(files.get(VEHICLE), read_vehicle(drive.get(VEHICLE), TABLE_2))
     notes += path.notes + markers.notes + antennas.notes
     return Truth(poses, markers.ids(0), marker_in_world, antennas.ids(0), antenna_in_world,
                  vehicle, tuple(f"In truth: {note}" for note in notes))

@@ -144,9 +144,9 @@ def write_tum(path: Path | str, poses: np.ndarray):
     3 2.5 0 0 0 0 0 1
     """
     half = poses[:, 2] / 2
-    zero = np.zeros((len(poses), 3))                    # of z, qx and qy
-    numbers = np.column_stack([poses[:, :2], zero, np.sin(half), np.cos(half)])
-    _write_text(path, _pose_ids(poses), numbers, " ")
+    columns = {"x": poses[:, 0], "y": poses[:, 1], "z": 0, "qx": 0, "qy": 0, "qz": np.sin(half),
+               "qw": np.cos(half)}
+    _write_text(path, _pose_ids(poses), columns, sep=" ", header=False)
 
 
 def write_csv(path: Path | str, ids: np.ndarray, places: np.ndarray, covariances: np.ndarray):
@@ -155,17 +155,15 @@ def write_csv(path: Path | str, ids: np.ndarray, places: np.ndarray, covariances
     The columns are id, x, y, theta and the upper triangle of the covariance in world axes.
     """
     names = ["x", "y", "theta"][:places.shape[1]]
-    rows, columns = np.triu_indices(len(names))
-    upper = [f"s_{names[i]}{names[j]}" for i, j in zip(rows, columns)]
-    numbers = np.column_stack([places, covariances[:, rows, columns]])
-    _write_text(path, ids, numbers, ",", ",".join(["id"] + names + upper))
+    columns = dict(zip(names, places.T))
+    for i, j in zip(*np.triu_indices(len(names))):
+        columns[f"s_{names[i]}{names[j]}"] = covariances[:, i, j]
+    _write_text(path, ids, columns, index_label="id")
 
 
-def _write_text(path, ids, numbers, delimiter, header=""):
-    """Write ids (n,) and numbers (n, c) with all their digits, without rows that begin with NaN."""
-    rows = np.column_stack([ids, numbers])
-    known = np.isfinite(numbers[:, 0])
-    text = BytesIO()
-    np.savetxt(text, rows[known], header=header, comments="", delimiter=delimiter,
-               fmt=["%d"] + numbers.shape[1] * ["%.17g"])
-    write_file(Path(path), text.getvalue())
+def _write_text(path, ids, columns, **form):
+    """Write ids (n,) and columns (dict) with all their digits, without rows that have NaN."""
+    from pandas import DataFrame  # here, because it is the slowest import of all
+    rows = DataFrame(columns, index=ids).dropna()
+    text = rows.to_csv(float_format="%.17g", lineterminator="\n", **form)
+    write_file(Path(path), text.encode())

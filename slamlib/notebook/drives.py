@@ -10,17 +10,18 @@ import unicodedata
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 from IPython.display import Markdown, display
 
 from slamlib import solve
-from slamlib.core.errors import DatasetError
+from slamlib.core.errors import DatasetError, require
 from slamlib.core.records import Dataset, Truth
 from slamlib.io.dataset import read_dataset, read_truth
 from slamlib.io.tables import datasets_in
 from slamlib.notebook import plotting
-from slamlib.studies.simulation import simulate
+from slamlib.robust.file_doubts import doubts_before_solving
 
 
 @dataclass(frozen=True, eq=False)          # compared by identity, because arrays have no hash
@@ -38,6 +39,11 @@ class Drive:
             return "recorded"
         same = self.truth.vehicle == self.dataset.vehicle
         return "recorded, truth known" if same else "simulated"
+
+    @cached_property
+    def doubts(self) -> list[solve.Doubt]:
+        """Doubts about its files, before anything is solved."""
+        return doubts_before_solving(self.dataset)
 
 
 def read_drives(data: Path, names: Iterable[str]) -> list[Drive]:
@@ -57,11 +63,10 @@ def without_stand_ins(drives: list[Drive]) -> list[Drive]:
 def start(sensor: str | None = None) -> list[Drive]:
     """List of the drives with a sensor, "aruco" or "uwb", as `read_drives` sorts them.
 
-    Simulated drives are left out where there are recorded ones. If no drive has the sensor, a
-    simulated one stands for them. The environment variable SLAMLIB_DATA names the data folder; by
-    default it is the nearest `data` in this folder or above it. SLAMLIB_DATASETS selects datasets
-    by name, one a line. Also sets the style of the figures. Raises DatasetError if a dataset does
-    not follow the format, or there is none.
+    Simulated drives are left out where there are recorded ones. The environment variable
+    SLAMLIB_DATA names the data folder; by default it is the nearest `data` in this folder or above
+    it. SLAMLIB_DATASETS selects datasets by name, one a line. Also sets the style of the figures.
+    Raises DatasetError if a dataset does not follow the format, or none has the sensor.
     """
     plotting.use_style()
     data = _data_folder()
@@ -72,10 +77,7 @@ def start(sensor: str | None = None) -> list[Drive]:
         drives = without_stand_ins(drives)
     if sensor:
         drives = [drive for drive in drives if getattr(drive.dataset, sensor) is not None]
-    if not drives:
-        display(Markdown(f"*No dataset has {solve.SENSORS[sensor]}: a simulated drive stands for "
-                         "them.*"))
-        drives = [Drive("simulated", *simulate("short", seed=1))]
+    require(drives, data, f"a dataset with {solve.SENSORS.get(sensor)}, found none")
     return drives
 
 
@@ -111,7 +113,8 @@ def attempt(drive: Drive, problem: str | None = None) -> Iterator[None]:
 def _written(drive, problem, found):
     """The Solution or the Failure that is written of what a solver found, or raised."""
     results = Path(os.environ.get("SLAMLIB_RESULTS") or _data_folder().parent / "results")
-    return solve.write_results(results / drive.name, problem, found, drive.dataset, drive.truth)
+    return solve.write_results(
+        results / drive.name, problem, found, drive.dataset, drive.truth, drive.doubts)
 
 
 def show_doubts(drive: Drive, doubts: Iterable[solve.Doubt]) -> None:

@@ -23,7 +23,6 @@ from matplotlib_inline.backend_inline import set_matplotlib_formats
 
 from slamlib.core import se2
 from slamlib.core.evaluation import REACH_95
-from slamlib.core.odometry import cumulative
 
 
 def _line(color, width, dashes=None, zorder=3):
@@ -56,10 +55,10 @@ ROLES = {
     "antenna": _sign("#222222", "^", 6, zorder=5),
     "guess": _sign("#222222", "^", 7, zorder=4) | {"markerfacecolor": "none"},
     "true antenna": _sign("black", "+", 9, zorder=6),
+    "true marker": _sign("black", "+", 4.5, zorder=5) | {"markeredgewidth": 0.6},
 }
 STYLE = Path(__file__).with_name("slamlib.mplstyle")  # for matplotlib.style
 MAX_SEMI_AXIS = 0.08         # of enlarged 95 % ellipses, in the larger extent of the path
-ENLARGEMENTS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 MAX_BANDS = 800              # poses at which the bands of errors are drawn
 
 
@@ -84,12 +83,11 @@ def panels(count: int, rows: int = 1, height: float = 3.4, width: float = 3.7,
     columns = min(columns, count)
     lines = math.ceil(count / columns)
     fig = plt.figure(figsize=(max(width * columns, 5.0), height * lines))
-    grid = fig.add_gridspec(lines * rows, columns)
-    axes = np.empty((count, rows), dtype=object)
-    for panel, row in np.ndindex(count, rows):
-        line, column = divmod(panel, columns)
-        axes[panel, row] = fig.add_subplot(grid[line * rows + row, column])
-    return fig, axes
+    grid = fig.subplots(lines * rows, columns, squeeze=False)
+    axes = grid.reshape(lines, rows, columns).swapaxes(1, 2).reshape(-1, rows)
+    for ax in axes[count:].flat:
+        ax.remove()
+    return fig, axes[:count]
 
 
 def each_drive(drives: Iterable, rows: int = 1, **size) -> Iterator[tuple]:
@@ -103,8 +101,7 @@ def each_drive(drives: Iterable, rows: int = 1, **size) -> Iterator[tuple]:
     for drive, column in zip(drives, axes):
         column[0].set_title(getattr(drive, "name", drive))
         yield drive, column if rows > 1 else column[0]
-    if any(ax.get_legend_handles_labels()[0] for ax in fig.axes):
-        legend_below(fig)
+    legend_below(fig)
 
 
 def estimates(result, drive) -> Estimates:
@@ -131,14 +128,16 @@ def estimates(result, drive) -> Estimates:
 
 
 def with_ellipses(ax: Axes, poses: np.ndarray, covariances: np.ndarray, role: str,
-                  label: str | None = None, enlarged: float | None = None) -> Axes:
-    """Draw a path with filled 95 % ellipses at equal distances along it.
+                  label: str | None = None, enlarged: float | None = None,
+                  count: int = 12) -> Axes:
+    """Draw a path with `count` filled 95 % ellipses, at equal numbers of poses along it.
 
     Ellipses are `enlarged` by this factor, by default by that of `enlargement`, which is added to
     the axes' title.
     """
     enlarged = enlarged or enlargement(poses, covariances)
-    some = equidistant(poses)
+    known = np.flatnonzero(np.isfinite(poses[:, 0]))
+    some = evenly(known, count)
     trajectory(ax, poses, role, label, linewidth=1.2, alpha=0.8)
     ellipses(ax, poses[some], covariances[some], ROLES[role]["color"], fill=0.5, enlarged=enlarged)
     title = ax.get_title("left")
@@ -156,7 +155,7 @@ def errors(axes: Sequence[Axes], result, drive, role: str = "slam") -> Sequence[
     """
     top, bottom = axes
     found = estimates(result, drive)
-    shown = np.unique(np.linspace(0, len(found.frame) - 1, MAX_BANDS).astype(int))
+    shown = evenly(np.arange(len(found.frame)), MAX_BANDS)
     frame = found.frame[shown]
     covariances = found.covariances[shown]
     semi_axis = 1e3 * longest_semi_axes(covariances)                     # mm
@@ -203,8 +202,7 @@ def trajectory(ax: Axes, poses: np.ndarray, role: str, label: str | None = None,
 
 
 def ellipses(ax: Axes, positions: np.ndarray, covariances: np.ndarray, color: str,
-             label: str | None = None, fill: float = 0.12,
-             enlarged: float | np.ndarray = 1) -> Axes:
+             fill: float = 0.3, enlarged: float | np.ndarray = 1) -> Axes:
     """Draw 95 % ellipses at positions (m, >= 2) with covariances (m, >= 2, >= 2).
 
     `fill` is the opacity. `enlarged`, a number or (m,), scales the ellipses, which the figure must
@@ -217,17 +215,13 @@ def ellipses(ax: Axes, positions: np.ndarray, covariances: np.ndarray, color: st
     widths = 2 * k * np.sqrt(np.maximum(variances, 0))
     longest = directions[:, :, 1]
     angles = np.degrees(np.arctan2(longest[:, 1], longest[:, 0]))
-    rgb = np.array(to_rgb(color))
-    face = (*rgb, fill)
-    edge = tuple(0.6 * rgb)                               # darker than the path below them
+    edge = 0.6 * np.array(to_rgb(color))                  # darker than the path below them
     ax.add_collection(EllipseCollection(
         widths[:, 1], widths[:, 0], angles, units="xy", offsets=centre,
-        offset_transform=ax.transData, facecolors=face, edgecolors=edge, linewidths=0.9,
+        offset_transform=ax.transData, facecolors=(color, fill), edgecolors=edge, linewidths=0.9,
         zorder=3.5))
     reach = k * se2.sigmas(C)
     ax.update_datalim(np.concatenate([centre - reach, centre + reach]))
-    if label:
-        ax.plot([], [], "o", markersize=9, markerfacecolor=face, markeredgecolor=edge, label=label)
     ax.autoscale_view()
     return ax
 
@@ -235,8 +229,8 @@ def ellipses(ax: Axes, positions: np.ndarray, covariances: np.ndarray, color: st
 def draw_markers(ax: Axes, in_world: np.ndarray, covariances: np.ndarray,
                  enlarged: float = 1) -> Axes:
     """Draw markers in_world (k, 3) as squares with their 95 % ellipses."""
-    ellipses(ax, in_world, covariances, ROLES["aruco"]["color"], fill=0.3, enlarged=enlarged)
-    return _landmarks(ax, in_world, "marker", "markers")
+    ellipses(ax, in_world, covariances, ROLES["aruco"]["color"], enlarged=enlarged)
+    return landmarks(ax, in_world, "marker", "markers")
 
 
 def draw_antennas(ax: Axes, positions: np.ndarray, covariances: np.ndarray,
@@ -246,18 +240,18 @@ def draw_antennas(ax: Axes, positions: np.ndarray, covariances: np.ndarray,
 
     `enlarged`, the factor on the ellipses, may be (a,).
     """
-    ellipses(ax, positions, covariances, "#44AA99", fill=0.3, enlarged=enlarged)
+    ellipses(ax, positions, covariances, "#44AA99", enlarged=enlarged)
     if guess is not None:
         ax.plot([guess[:, 0], positions[:, 0]], [guess[:, 1], positions[:, 1]], color="#999999",
                 linewidth=0.8, zorder=2)
-        _landmarks(ax, guess, "guess", "antennas: guess")
-    _landmarks(ax, positions, "antenna", "antennas: estimate")
+        landmarks(ax, guess, "guess", "antennas: guess")
+    landmarks(ax, positions, "antenna", "antennas: estimate")
     if truth is not None and len(truth):
-        _landmarks(ax, truth, "true antenna", "antennas: truth")
+        landmarks(ax, truth, "true antenna", "antennas: truth")
     return ax
 
 
-def _landmarks(ax, places, role, label):
+def landmarks(ax: Axes, places: np.ndarray, role: str, label: str) -> Axes:
     """Draw the signs of landmarks at places (k, >= 2)."""
     ax.plot(places[:, 0], places[:, 1], label=label, **ROLES[role])
     return ax
@@ -275,22 +269,22 @@ def longest_semi_axes(covariances: np.ndarray) -> np.ndarray:
 
 
 def enlargement(poses: np.ndarray, covariances: np.ndarray) -> int:
-    """The largest of ENLARGEMENTS with which the 95 % ellipses fit MAX_SEMI_AXIS, or 1."""
+    """The factor with one digit with which the largest 95 % ellipse has MAX_SEMI_AXIS, or 1."""
     known = np.isfinite(poses[:, 0])
     extent = np.ptp(poses[known, :2], axis=0).max()
     largest = longest_semi_axes(covariances[known]).max()
-    fitting = [each for each in ENLARGEMENTS if each * largest <= MAX_SEMI_AXIS * extent]
-    return max(fitting, default=1) if largest > 0 else 1
+    if MAX_SEMI_AXIS * extent < largest or largest == 0:
+        return 1
+    factor = int(MAX_SEMI_AXIS * extent / largest)
+    digits = 10 ** (len(str(factor)) - 1)
+    return factor // digits * digits
 
 
-def equidistant(poses: np.ndarray, count: int = 12) -> np.ndarray:
-    """Indices of about `count` known poses at equal distances along the path."""
-    known = np.flatnonzero(np.isfinite(poses[:, 0]))
-    steps = np.diff(poses[known, :2], axis=0)
-    travelled = cumulative(np.linalg.norm(steps, axis=1))
-    wanted = np.linspace(0, travelled[-1], count + 1)[1:]
-    row = np.searchsorted(travelled, wanted)
-    return known[np.unique(np.minimum(row, len(known) - 1))]
+def evenly(rows: np.ndarray, count: int) -> np.ndarray:
+    """At most `count` of the rows (n, ...) at equal distances, the last one included."""
+    if len(rows) <= count:
+        return rows
+    return rows[np.linspace(-1, len(rows) - 1, count + 1).astype(int)[1:]]
 
 
 def name_rows(axes: Sequence[Axes], names: Sequence[str]) -> None:
@@ -307,10 +301,8 @@ def legend_below(fig: Figure) -> None:
         handles, labels = ax.get_legend_handles_labels()
         for handle, label in zip(handles, labels):
             entries.setdefault(label, handle)
-    for most in (4, 3, 2, 1):
+    for columns in (4, 3, 2, 1) if entries else ():
         fig.legends.clear()
-        lines = math.ceil(len(entries) / most)
-        columns = math.ceil(len(entries) / lines)
         legend = fig.legend(entries.values(), entries.keys(), loc="outside lower center",
                             ncols=columns)
         if legend.get_window_extent().width <= fig.bbox.width:

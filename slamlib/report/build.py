@@ -1,6 +1,5 @@
 """Builds the report: executes the notebooks, which become pages and the chapters of a PDF."""
 
-import hashlib
 import re
 import shutil
 import sys
@@ -19,11 +18,8 @@ from slamlib.io.results import SUMMARY, read_summary, write_summary
 from slamlib.io.tables import datasets_in
 from slamlib.notebook.drives import read_drives, without_stand_ins
 from slamlib.report import cache
-from slamlib.report.document import render
-from slamlib.report.execution import TRANSPORT, execute, kernel_environment
-from slamlib.report.notebooks import Options, chapter_of, read_books
-from slamlib.report.overview import opening, solved_drive, title_picture
-from slamlib.robust.file_doubts import doubts_before_solving
+from slamlib.report.notebooks import Options, needs_of, read_books
+from slamlib.robust.file_doubts import Doubt
 from slamlib.solve import SENSORS, clear_results, summary_of
 
 # Name of the file in a report that has a digest and lists its files; all others are the user's.
@@ -64,21 +60,16 @@ def build_report(notebooks: Path, data: Path, report: Path, results: Path,
     books = read_books(notebooks.resolve(), options.chapters)
     drives = _read(data, datasets)
     books = _with_what_they_need(books, drives)
-    short = "/tmp" if TRANSPORT == "ipc" else None  # because paths of sockets must be
-    with TemporaryDirectory(dir=short, prefix="slamlib-", ignore_cleanup_errors=True) as temporary:
-        kept = (kept or Path(temporary, "kept")).resolve()
-        names = [drive.name for drive in drives]
-        environment = kernel_environment(Path(temporary), data, names)
+    with TemporaryDirectory() as temporary:
+        kept = (kept or Path(temporary)).resolve()
         with files.locked(kept):
-            stages = _executed(books, drives, data, environment, jobs, kept)
-            with files.locked(results), files.locked(report):
-                for drive in drives:
-                    _write_results(drive, stages, results / drive.name)
-                solved = [solved_drive(drive, results / drive.name) for drive in drives]
-                shown = {Path("index"): opening(solved, books)} | books
-                names = _write_pages(shown, options, title_picture(solved), report)
+            keys = _execute(books, drives, data, jobs, kept)
+            stages = [kept / source.stem / cache.RESULTS for source in books]
+            with files.locked(report):
+                summaries = [_write_results(drive, stages, results / drive.name)
+                             for drive in drives]
+                names = _write_pages(books, keys, drives, summaries, options, results, report)
     _say(f"built in {time.monotonic() - start:.1f} s")
-    summaries = [drive.summary for drive in solved]
     return Report([report / name for name in names], summaries)
 
 
@@ -100,74 +91,85 @@ def _read(data, selected):
     if omitted:
         _say(f"left out, because simulated: {', '.join(omitted)} (name all datasets to have "
              "them)")
-    _say("\n".join(unread))
+    for line in unread:
+        _say(line)
     return drives
 
 
 def _with_what_they_need(books, drives):
-    """Return the notebooks whose measurements the drives have, or all if there is none."""
-    has = {sensor for sensor in SENSORS for drive in drives
-           if getattr(drive.dataset, sensor) is not None}
-    needs = {source: chapter_of(source, book).needs for source, book in books.items()}
-    served = {source: book for source, book in books.items() if needs[source] in has | {None}}
-    for source in books:
-        if served and source not in served:
-            _say(f"{source.stem}: left out, no dataset has {SENSORS[needs[source]]}")
-    return served or books
+    """Return the notebooks whose measurements the drives have."""
+    served = {}
+    for source, book in books.items():
+        sensor = needs_of(book)
+        if sensor and all(getattr(drive.dataset, sensor) is None for drive in drives):
+            _say(f"{source.stem}: left out, no dataset has {SENSORS[sensor]}")
+        else:
+            served[source] = book
+    require(served, "report.toml", "a chapter whose measurements a dataset has, found none")
+    return served
 
 
-def _executed(books, drives, data, environment, jobs, kept):
-    """Execute books in place, or recall their outputs; return the folders of their files."""
-    folders = {source: kept / source.stem for source in books}
-    stages = {source: folders[source] / cache.RESULTS for source in books}
+def _execute(books, drives, data, jobs, kept):
+    """Execute books, or recall their outputs, into which they are put; return their keys."""
     datasets = [data / drive.name for drive in drives]
-    begun = cache.keys(books, datasets)
+    keys = cache.keys(books, datasets)
     left = {}
     done = []
 
-    def finish(source, told):
+    def say(source, told):
         done.append(source)
         _say(f"{len(done)} of {len(books)}: {source.stem}, {told}")
 
-    def keep(source, seconds):
-        if cache.keys(books, datasets) == begun:  # nothing was edited meanwhile
-            cache.keep(folders[source], begun[source], books[source])
-        finish(source, f"executed in {seconds:.1f} s")
+    def finish(source, executed, seconds):
+        cache.put_outputs(books[source], executed)
+        if cache.keys(books, datasets) == keys:  # nothing was edited meanwhile
+            cache.keep(kept / source.stem, keys[source], executed)
+        say(source, f"executed in {seconds:.1f} s")
 
     for source, book in books.items():
-        if cache.recall(folders[source], begun[source], book):
-            finish(source, "nothing changed")
+        folder = kept / source.stem
+        if cache.recall(folder, keys[source], book):
+            say(source, "nothing changed")
         else:
-            left[source] = book
-            shutil.rmtree(folders[source], ignore_errors=True)
-            stages[source].mkdir(parents=True)
-    execute(left, environment, stages, max(1, jobs), keep)
-    return list(stages.values())
+            left[source] = folder / cache.RESULTS
+            shutil.rmtree(folder, ignore_errors=True)
+            left[source].mkdir(parents=True)
+    if left:
+        from slamlib.report.execution import execute  # here and below: what is slow to import
+        names = [drive.name for drive in drives]
+        execute({source: books[source] for source in left}, data, names, left, max(1, jobs), finish)
+    return keys
 
 
 def _write_results(drive, stages, folder):
-    """Write the files of a Drive that notebooks wrote to `stages` into its results."""
+    """Write the files of a Drive that notebooks wrote to `stages`; return the summary."""
     rows = {}
+    doubts = []
     with files.locked(folder):
         clear_results(folder)
         for stage in stages:
             own = stage / drive.name
             with suppress(DatasetError):  # this notebook solves nothing
-                rows |= read_summary(own)["problems"]
+                summary = read_summary(own)
+                rows |= summary["problems"]
+                doubts += [Doubt(**doubt) for doubt in summary["doubts"]]
             for name in files.file_names(own):
                 if name != SUMMARY:
                     files.write_file(folder / name, (own / name).read_bytes())
-        doubts = doubts_before_solving(drive.dataset)
-        write_summary(folder, summary_of(drive.dataset, drive.truth, rows, doubts))
+        summary = summary_of(drive.dataset, drive.truth, rows, doubts)
+        write_summary(folder, summary)
+    return summary
 
 
-def _write_pages(books, options, picture, report):
+def _write_pages(books, keys, drives, summaries, options, results, report):
     """Set books as pages and a PDF in a report, unless they are there; return their names.
 
     Those of an earlier build that are not made now are removed.
     """
+    look = sorted(file for file in Path(__file__).parent.iterdir() if file.is_file())
+    key = cache.digest(options, keys, summaries, [nbformat.writes(book) for book in books.values()],
+                       [file.read_bytes() for file in look])
     listed = report / PAGES
-    key = _key_of_pages(books, options, picture)
     earlier_key = ""
     earlier = []
     with suppress(OSError):
@@ -175,7 +177,11 @@ def _write_pages(books, options, picture, report):
     if earlier_key == key and all((report / name).is_file() for name in earlier):
         return earlier
     _say("setting the pages and the PDF")
-    made = render(books, options, picture)
+    from slamlib.report import overview
+    from slamlib.report.document import render
+    solved = [overview.solved_drive(drive, results / drive.name) for drive in drives]
+    shown = {Path("index"): overview.opening(solved)} | books
+    made = render(shown, options, overview.title_picture(solved))
     listed.unlink(missing_ok=True)
     for name, content in made.items():
         files.write_file(report / name, content)
@@ -183,16 +189,3 @@ def _write_pages(books, options, picture, report):
         (report / name).unlink(missing_ok=True)
     files.write_file(listed, "\n".join([key, *made]).encode())
     return list(made)
-
-
-def _key_of_pages(books, options, picture):
-    """Return a digest of all that pages show: notebooks, what is beside them, and their look."""
-    state = hashlib.sha256(repr([options, picture]).encode())
-    beside = [file for source in books for file in source.parent.iterdir()
-              if file.suffix in (".svg", ".png", ".jpg")]
-    look = [file for file in Path(__file__).parent.iterdir() if file.is_file()]
-    for file in sorted(beside + look):
-        state.update(file.read_bytes())
-    for source, book in books.items():
-        state.update(f"{source}{nbformat.writes(book)}".encode())
-    return state.hexdigest()

@@ -1,17 +1,14 @@
-"""Executes notebooks without a display, each in its own kernel, a limited number at a time.
-
-JupyterLab starts with the same settings.
-"""
+"""Executes notebooks without a display, each in its own kernel, a limited number at a time."""
 
 import asyncio
-import json
 import os
 import socket
 import sys
 import time
 from collections.abc import Callable
-from importlib.util import find_spec
+from copy import deepcopy
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from jupyter_client import AsyncKernelManager
 from jupyter_client.kernelspec import KernelSpecManager
@@ -19,23 +16,16 @@ from nbclient import NotebookClient
 from nbclient.exceptions import CellExecutionError
 from nbconvert.filters import strip_ansi
 from nbconvert.preprocessors import CoalesceStreamsPreprocessor
-from nbformat import NotebookNode
 
-from slamlib.core.errors import require
+from slamlib.report.notebooks import LAB_ONLY, Books, NotebookError
 
 CELL_TIMEOUT = 1800  # s, in which a cell must end
 TRANSPORT = "ipc" if hasattr(socket, "AF_UNIX") else "tcp"  # Windows has no Unix sockets
-LAB_ONLY = "lab-only"  # tag of cells that are not executed, and not shown on pages or in the PDF
-SETTINGS = "settings"  # folder of JupyterLab's settings where the user has no others
 # The matrices are small: more threads cost time.
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-OVERRIDES = {"@jupyterlab/apputils-extension:notification": {
-    "fetchNews": "false", "checkForUpdates": False}}  # without a question when it opens
-Books = dict[Path, NotebookNode]  # notebooks by their files, in the order of the report
-
-
-class NotebookError(RuntimeError):
-    """A notebook failed; the message names the notebook, and has the cell and its traceback."""
+# Without a question when it opens; as root, as in containers: it listens to this machine alone.
+LAB_OPTIONS = ("--LabApp.news_url=None", "--allow-root",
+               "--LabApp.check_for_updates_class=jupyterlab.NeverCheckForUpdate")
 
 
 class _Loop(asyncio.SelectorEventLoop):
@@ -62,41 +52,46 @@ def kernel_environment(settings: Path, data: Path, datasets: list[str]) -> dict[
         "MPLBACKEND": "module://matplotlib_inline.backend_inline"}
 
 
-def execute(books: Books, environment: dict[str, str], results: dict[Path, Path], jobs: int,
+def execute(books: Books, data: Path, datasets: list[str], results: dict[Path, Path], jobs: int,
             finish: Callable):
-    """Execute notebooks in place, at most `jobs` at a time; the first failure stops the others.
+    """Execute notebooks, at most `jobs` at a time; the first failure stops the others.
 
-    Each writes its files to its own folder, SLAMLIB_RESULTS, of `results`. When one has ended,
-    finish(Path, seconds) is called. NotebookError if a cell failed.
+    `data` and `datasets` as of `kernel_environment`. Each notebook writes its files to its own
+    folder, SLAMLIB_RESULTS, of `results`. When one has ended, finish(Path, the executed notebook,
+    seconds) is called. NotebookError if a cell failed.
     """
-    try:
-        with asyncio.Runner(loop_factory=_Loop) as runner:
-            runner.run(_execute_all(books, environment, results, jobs, finish))
-    except ExceptionGroup as group:
-        raise group.exceptions[0] from None
+    short = "/tmp" if TRANSPORT == "ipc" else None  # because paths of sockets must be
+    with TemporaryDirectory(dir=short, prefix="slamlib-", ignore_cleanup_errors=True) as temporary:
+        environment = kernel_environment(Path(temporary), data, datasets)
+        try:
+            with asyncio.Runner(loop_factory=_Loop) as runner:
+                runner.run(_execute_all(books, environment, results, jobs, finish))
+        except ExceptionGroup as group:
+            raise group.exceptions[0] from None
 
 
 async def _execute_all(books, environment, results, jobs, finish):
-    settings = Path(environment["IPYTHONDIR"])
     slots = asyncio.Semaphore(jobs)
 
-    async def run(number, source):
+    async def run(source):
+        executed = deepcopy(books[source])
         own = environment | {"SLAMLIB_RESULTS": str(results[source])}
         async with slots:
             start = time.monotonic()
-            await _execute(source, books[source], own, settings / f"{number}.json")
-            finish(source, time.monotonic() - start)
+            await _execute(source, executed, own)
+            finish(source, executed, time.monotonic() - start)
 
     async with asyncio.TaskGroup() as group:
-        for number, source in enumerate(reversed(books)):       # later chapters take longer
-            group.create_task(run(number, source))
+        for source in reversed(books):                           # later chapters take longer
+            group.create_task(run(source))
 
 
-async def _execute(source, book, environment, connection):
+async def _execute(source, book, environment):
     """Execute one notebook in place with this interpreter.
 
-    The kernel listens at sockets beside the file `connection` (Path): nobody else can take them.
+    The kernel listens at sockets in its folder of settings: nobody else can take them.
     """
+    connection = Path(environment["IPYTHONDIR"], f"{id(book)}.json")
     manager = AsyncKernelManager(
         kernel_name="python3", connection_file=str(connection), transport=TRANSPORT,
         kernel_spec_manager=KernelSpecManager(kernel_dirs=[]))  # no kernels of the user are found
@@ -117,18 +112,8 @@ async def _execute(source, book, environment, connection):
     CoalesceStreamsPreprocessor().preprocess(book, {})  # kernels divide them by time
 
 
-def start_lab(notebooks: Path, data: Path, kept: Path, arguments: list[str]):
-    """Replace this process by JupyterLab with its `arguments`; folders as of `build_report`."""
-    require(find_spec("jupyterlab"), "lab", "JupyterLab, as by pip install jupyterlab", "none")
-    settings = kept.resolve() / SETTINGS
-    settings.mkdir(parents=True, exist_ok=True)
-    (settings / "overrides.json").write_text(json.dumps(OVERRIDES))
-    command = [sys.executable, "-m", "jupyterlab", f"--LabApp.app_settings_dir={settings}",
-               "--LabApp.check_for_updates_class=jupyterlab.NeverCheckForUpdate"]
-    # As in containers; JupyterLab listens to this machine alone. Windows has no such numbers.
-    if hasattr(os, "geteuid") and os.geteuid() == 0:
-        command.append("--allow-root")
-    command += arguments + [str(notebooks)]
-    selected = os.environ.get("SLAMLIB_DATASETS", "").split("\n")
-    environment = kernel_environment(settings, data.resolve(), selected)
+def start_lab(notebooks: Path, data: Path, arguments: list[str]):
+    """Replace this process by JupyterLab on the notebooks, with its `arguments`."""
+    command = [sys.executable, "-m", "jupyterlab", *LAB_OPTIONS, *arguments, str(notebooks)]
+    environment = ONE_THREAD | os.environ | {"SLAMLIB_DATA": str(data.resolve())}
     os.execve(sys.executable, command, environment)

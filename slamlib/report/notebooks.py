@@ -4,31 +4,27 @@ A title `# 2. Name` makes a chapter, `# A. Name` an appendix. The metadata of a 
 which measurements it needs, as `"slamlib": {"needs": "uwb"}`.
 """
 
-import json
 import re
-from contextlib import suppress
+import sysconfig
 from dataclasses import dataclass, fields
 from fnmatch import fnmatchcase
-from importlib.metadata import PackageNotFoundError, files
 from pathlib import Path
 
 import nbformat
-from nbconvert.preprocessors import ClearOutputPreprocessor
 from nbformat import NotebookNode
 
-from slamlib.core.errors import DatasetError, require
+from slamlib.core.errors import require
 from slamlib.io.textfile import read_text, read_toml
-from slamlib.report.execution import Books, NotebookError
 
 FOLDER = "notebooks"  # name of the notebooks' folder
-# Folder of the results of each estimate that may be handed in as problem 2.
-PROBLEM2_FOLDERS = {"aruco": "problem2", "fused": "problem2_fused", "hint": "problem2_hint"}
-# Options that have one of several values. Code that is shown: none, all that is not hidden, or all.
-CHOICES = {"code": ("none", "method", "all"), "problem2": tuple(PROBLEM2_FOLDERS)}
+CODE = ("none", "method", "all")  # code that is shown: none, all that is not hidden, or all
 TITLE = re.compile(r"^#\s+(.+)", re.MULTILINE)
-NUMBER = re.compile(r"(\d+|[A-Z])\.")  # begins the title of a chapter or an appendix
-# Neither heading, table, quotation, code, formula nor list.
-PARAGRAPH = re.compile(r"^(?!\s|[#|<>`]|\$\$|[-*+]\s).+(?:\n.+)*", re.MULTILINE)
+LAB_ONLY = "lab-only"  # tag of cells that are not executed, and not shown on pages or in the PDF
+Books = dict[Path, NotebookNode]  # notebooks by their files, in the order of the report
+
+
+class NotebookError(RuntimeError):
+    """A notebook failed; the message names the notebook, and has the cell and its traceback."""
 
 
 @dataclass(frozen=True)
@@ -41,17 +37,6 @@ class Options:
     course: str = ""
     chapters: tuple[str, ...] = ()  # names of notebooks, also as "[1-4]*"; empty: all
     code: str = "method"
-    problem2: str = "aruco"  # which is handed in, of PROBLEM2_FOLDERS; required is markers alone
-
-
-@dataclass(frozen=True)
-class Chapter:
-    """What a notebook says of itself."""
-
-    title: str
-    number: str  # that of a chapter, the letter of an appendix, or ""
-    lead: str  # the first paragraph, or ""
-    needs: str | None  # the sensor without which it has nothing to say
 
 
 def read_options(path: str | Path) -> Options:
@@ -64,42 +49,29 @@ def read_options(path: str | Path) -> Options:
         return Options()
     keys = [option.name for option in fields(Options)]
     entries = read_toml(path, 'author = "Ada Lovelace"', keys)
-    return Options(**{key: _checked(key, value, str(path)) for key, value in entries.items()})
+    return Options(**{key: _checked(key, value, path) for key, value in entries.items()})
 
 
-def _checked(key, value, place):
-    """Return the value of a key as Options have it; DatasetError, which begins with `place`."""
-    if key in CHOICES:
-        require(value in CHOICES[key], place,
-                f"one of {json.dumps(CHOICES[key])[1:-1]} for {key}", value)
-        return value
+def _checked(key, value, path):
+    """Return the value of a key of a file as Options have it."""
     if key == "chapters":
         is_list = isinstance(value, list) and all(isinstance(name, str) for name in value)
-        require(is_list, place,
+        require(is_list, path,
                 'a list of notebooks in quotes, such as ["1_odometry", "A_studies"], for chapters',
                 value)
         return tuple(value)
     is_line = type(value) in (str, int) and re.fullmatch(r"[^\n\ufffd]*", str(value))
-    require(is_line, place, f"a line of UTF-8 text in quotes for {key}", value)
+    require(is_line, path, f"a line of UTF-8 text in quotes for {key}", value)
+    require(key != "code" or value in CODE, path, f"one of {', '.join(CODE)} for code", value)
     return str(value)
 
 
 def notebooks_folder() -> Path:
-    """Return the folder `notebooks` if it is there, else that of the installed notebooks.
-
-    DatasetError where neither is there.
-    """
-    if Path(FOLDER).is_dir():
-        return Path(FOLDER)
-    repository = Path(__file__).parents[2]
-    if (repository / "pyproject.toml").is_file():  # slamlib is not installed elsewhere
-        return repository / FOLDER
-    with suppress(PackageNotFoundError):
-        for file in files("slamlib") or ():
-            if file.suffix == ".ipynb":
-                return Path(file.locate()).resolve().parent
-    raise DatasetError(f"{FOLDER}: expected this folder, because slamlib was installed without its "
-                       "notebooks; found none")
+    """Return the folder `notebooks` if it is there, else that of the repository or installation."""
+    repository = Path(__file__).parents[2] / FOLDER
+    installed = Path(sysconfig.get_path("data"), "share", "slamlib", FOLDER)
+    folders = (Path(FOLDER), repository, installed)
+    return next(filter(Path.is_dir, folders), Path(FOLDER))
 
 
 def read_books(folder: Path, chapters: tuple[str, ...] = ()) -> Books:
@@ -128,24 +100,26 @@ def read_notebook(source: Path) -> NotebookNode:
         if "\ufffd" in text:  # which stands for bytes that are not UTF-8
             raise ValueError("expected UTF-8 text")
         book = nbformat.reads(text, as_version=4)
-        cleared, _ = ClearOutputPreprocessor().preprocess(book, {})
+        for cell in code_cells(book):
+            cell.update(outputs=[], execution_count=None)
     except Exception as error:  # on other JSON nbformat fails in many ways
         reason = str(error).partition("\n")[0]
         raise NotebookError(f"{source.name} is not a notebook: {reason}") from None
-    return cleared
+    return book
 
 
-def chapter_of(source: Path, book: NotebookNode) -> Chapter:
-    """Return the Chapter that a notebook is."""
+def title_of(source: Path, book: NotebookNode) -> str:
+    """Return the title of the chapter that a notebook is."""
     text = "\n\n".join(cell.source for cell in book.cells if cell.cell_type == "markdown")
     heading = TITLE.search(text)
-    title = re.sub("[*_`]", "", heading[1]).strip() if heading else source.stem
-    number = NUMBER.match(title)
-    lead = PARAGRAPH.search(text)
-    return Chapter(title, number[1] if number else "", lead[0] if lead else "",
-                   book.metadata.get("slamlib", {}).get("needs"))
+    return re.sub("[*_`]", "", heading[1]).strip() if heading else source.stem
 
 
-def tags_of(cell: NotebookNode) -> list[str]:
-    """Return the tags of a cell."""
-    return cell.metadata.get("tags", [])
+def needs_of(book: NotebookNode) -> str | None:
+    """Return the sensor without which a notebook has nothing to say."""
+    return book.metadata.get("slamlib", {}).get("needs")
+
+
+def code_cells(book: NotebookNode) -> list[NotebookNode]:
+    """Return the code cells of a notebook."""
+    return [cell for cell in book.cells if cell.cell_type == "code"]

@@ -8,7 +8,6 @@ from base64 import b64encode
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from urllib.parse import quote
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -19,19 +18,16 @@ from nbformat import NotebookNode
 from nbformat.v4 import new_markdown_cell, new_notebook
 
 from slamlib.core import evaluation, marker_increments
+from slamlib.core.vehicle import Vehicle
+from slamlib.io.dataset import read_vehicle
 from slamlib.io.results import read_structs, read_summary
 from slamlib.notebook import Drive, plotting, table
 from slamlib.notebook.drives import plain, without_stand_ins
-from slamlib.report.execution import Books
-from slamlib.report.notebooks import chapter_of
-from slamlib.solve import PROBLEMS, SENSORS, Solution
+from slamlib.solve import PROBLEMS, SENSORS, VEHICLE_ESTIMATED, Solution
 
 TEXT = Path(__file__).with_name("overview.md")
 SCREEN_ONLY = "<!-- on screens only -->"  # in the text, before what the PDF leaves out
-CURVE_POINTS = 1500  # of a curve, at most
-HIDDEN_TRAJECTORIES = ("problem2", "problem2_hint", "problem3")  # they would lie below others
 LOOKS = {"problem3": dict(linewidth=4.0), "problem4": dict(linestyle="-", linewidth=1.4)}
-CAMERA = ("camera_x", "camera_y", "camera_turn", "marker_size")  # entries of a calibration
 MAPS = {"aruco_map": "ArucoMap", "uwb_map": "UwbMap"}  # fields of a Solution, names of their files
 # Columns of the table of results, in thousandths of these entries of a summary.
 COLUMNS = {"ATE (mm)": "ate_m", "aligned (mm)": "ate_aligned_m", "at returns (mm)": "at_returns_m",
@@ -45,17 +41,12 @@ class SolvedDrive(Drive):
 
     solutions: dict[str, Solution] = field(default_factory=dict)  # by problem, in order
     summary: dict = field(default_factory=dict, repr=False)  # as summary.json has it
+    vehicle: Vehicle | None = None                          # as estimated
 
     @property
     def last(self) -> Solution:
         """The Solution of the last problem that is solved."""
         return list(self.solutions.values())[-1]
-
-    @property
-    def failed(self) -> dict[str, dict]:
-        """The rows of the summary of problems that could not be solved, by problem."""
-        rows = self.summary["problems"]
-        return {problem: row for problem, row in rows.items() if "failed" in row}
 
 
 def solved_drive(drive: Drive, results: Path) -> SolvedDrive:
@@ -70,24 +61,24 @@ def solved_drive(drive: Drive, results: Path) -> SolvedDrive:
             _, poses, covariances = read_structs(own, "vehiclePose")
             solutions[problem] = Solution(problem, row["title"], poses, covariances,
                                           row["world_is_pose"] - 1, **maps)
-    return SolvedDrive(drive.name, drive.dataset, drive.truth, solutions, summary)
+    estimated = results / VEHICLE_ESTIMATED
+    vehicle = read_vehicle(estimated if estimated.exists() else None, drive.dataset.vehicle)
+    return SolvedDrive(drive.name, drive.dataset, drive.truth, solutions, summary, vehicle)
 
 
-def opening(drives: list[SolvedDrive], chapters: Books | None = None) -> NotebookNode:
-    """Return the opening of the report, an executed notebook that leads to `chapters`."""
+def opening(drives: list[SolvedDrive]) -> NotebookNode:
+    """Return the opening of the report, an executed notebook."""
     shown = longest(drives)
     drawn = _as_svg(trajectories(shown)) if shown else ""
     template = Template(TEXT.read_text(encoding="utf-8"), trim_blocks=True, lstrip_blocks=True)
     text = template.render(
         drives=drives, longest=shown, plain=plain, sensors=SENSORS,
         picture=f"data:image/svg+xml;base64,{b64encode(drawn.encode()).decode()}",
-        results=table(row for drive in drives for row in result_rows(drive)).data,
-        chapters={quote(source.name): chapter_of(source, book)
-                  for source, book in (chapters or {}).items()})
+        results=table(row for drive in drives for row in result_rows(drive)).data)
     printed, on_screen = text.split(SCREEN_ONLY)
     return new_notebook(cells=[
         new_markdown_cell(printed, id="summary"),
-        new_markdown_cell(on_screen, id="chapters", metadata={"tags": ["html-only"]})])
+        new_markdown_cell(on_screen, id="files", metadata={"tags": ["html-only"]})])
 
 
 def longest(drives: list[SolvedDrive]) -> SolvedDrive | None:
@@ -124,23 +115,19 @@ def differences_at_returns(drive: SolvedDrive) -> dict[str, float]:
     """Return root mean square differences of solutions from what returns measure, in m.
 
     By problem; "noise" is what the noise of the sightings alone gives. Sightings are those by the
-    camera that the last solution estimated. None if the drive never returns.
+    camera as it was estimated. None if the drive never returns.
     """
-    row = drive.summary["problems"][drive.last.problem]
-    calibration = {entry["name"]: entry["estimate"] for entry in row.get("calibration", ())}
-    camera = {name: calibration[name] for name in CAMERA if name in calibration}
-    vehicle = replace(drive.dataset.vehicle, **camera)
-    returns = marker_increments.returns(replace(drive.dataset, vehicle=vehicle))
+    returns = marker_increments.returns(replace(drive.dataset, vehicle=drive.vehicle))
     if len(returns.start) == 0:
         return {}
-    found = {}
+    variances = np.trace(returns.covariance[:, :2, :2], axis1=1, axis2=2)
+    factor = drive.vehicle.marker_noise_factor or 1
+    found = {"noise": factor * np.sqrt(np.mean(variances))}
     for problem, solution in drive.solutions.items():
         off = returns.discrepancies(solution.poses)[:, :2]
         known = np.isfinite(off[:, 0])
         if known.any():
             found[problem] = np.sqrt(np.mean(np.sum(off[known]**2, axis=1)))
-    variances = np.trace(returns.covariance[:, :2, :2], axis1=1, axis2=2)
-    found["noise"] = row.get("marker_noise_factor", 1) * np.sqrt(np.mean(variances))
     return found
 
 
@@ -151,24 +138,29 @@ def trajectories(drive: SolvedDrive) -> Figure:
     left, right = fig.subplots(1, 2)
     for problem, solution in drive.solutions.items():
         role = PROBLEMS[problem].role
-        look = LOOKS.get(problem, {})
-        if problem not in HIDDEN_TRAJECTORIES or solution is drive.last:
-            plotting.trajectory(left, _few(solution.poses), role, solution.title, **look)
+        if problem in ("problem1", "problem2_fused") and solution is not drive.last:
+            plotting.trajectory(left, solution.poses, role, solution.title)
         sigmas = evaluation.position_sigmas(solution.covariances)
         sigmas[:len(sigmas) // 50] = np.nan  # nearly zero, on a logarithmic axis
-        known = _few(np.flatnonzero(sigmas > 0))
+        known = np.flatnonzero(sigmas > 0)
+        look = LOOKS.get(problem, {})
         plotting.curve(right, sigmas[known], role, known, solution.title, **look)
+    _draw_map(left, drive.last)
     if drive.truth is not None:
-        plotting.trajectory(left, _few(drive.truth.poses), "truth")
-    _draw_landmarks(left, drive.last)
+        plotting.trajectory(left, drive.truth.poses, "truth")
     right.set(yscale="log", ylabel="σ of position (m)")
     plotting.legend_below(fig)
     return fig
 
 
-@in_our_style
-def _as_svg(fig):
-    return print_figure(fig, "svg", metadata={"Date": None})
+def _draw_map(ax, solution):
+    """Draw the trajectory and the landmarks of a Solution."""
+    role = PROBLEMS[solution.problem].role
+    plotting.trajectory(ax, solution.poses, role, solution.title, linestyle="-", linewidth=1.2)
+    if solution.aruco_map is not None:
+        plotting.draw_markers(ax, *solution.aruco_map[1:])
+    if solution.uwb_map is not None:
+        plotting.draw_antennas(ax, *solution.uwb_map[1:])
 
 
 @in_our_style
@@ -179,22 +171,11 @@ def title_picture(drives: list[SolvedDrive]) -> str:
         return ""
     fig = Figure(figsize=(6.3, 4.6))  # inches
     ax = fig.add_subplot()
-    role = PROBLEMS[drive.last.problem].role
-    plotting.trajectory(ax, _few(drive.last.poses), role, linestyle="-", linewidth=1.2)
-    _draw_landmarks(ax, drive.last)
+    _draw_map(ax, drive.last)
     ax.axis("off")
     return _as_svg(fig)
 
 
-def _draw_landmarks(ax, solution):
-    if solution.aruco_map is not None:
-        plotting.draw_markers(ax, *solution.aruco_map[1:])
-    if solution.uwb_map is not None:
-        plotting.draw_antennas(ax, *solution.uwb_map[1:])
-
-
-def _few(rows):
-    """Return at most CURVE_POINTS of the rows (n, ...), first and last included."""
-    if len(rows) == 0:
-        return rows
-    return rows[np.unique(np.linspace(0, len(rows) - 1, CURVE_POINTS).astype(int))]
+@in_our_style
+def _as_svg(fig):
+    return print_figure(fig, "svg", metadata={"Date": None})

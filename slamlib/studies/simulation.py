@@ -7,7 +7,6 @@ down to whole counts. The camera sees the markers in a disc around the vehicle; 
 ranges to the antennas within reach. Both have a lower rate than the encoders.
 """
 
-import json
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -20,6 +19,8 @@ from slamlib.core.errors import require
 from slamlib.core.odometry import dead_reckoning
 from slamlib.core.records import AntennaGuess, ArucoReadings, Dataset, Truth, UwbReadings
 from slamlib.core.vehicle import TABLE_2, Vehicle
+from slamlib.io.dataset import write_vehicle
+from slamlib.io.formats import VEHICLE
 
 
 @dataclass(frozen=True)
@@ -190,7 +191,7 @@ def write_dataset(folder: str | Path, dataset: Dataset, truth: Truth | None = No
     require(empty or not folder.exists(), folder, "a new or empty folder to write the dataset to")
     folder.mkdir(parents=True, exist_ok=True)
     if dataset.vehicle != TABLE_2:
-        _write_vehicle(folder, dataset.vehicle)
+        write_vehicle(folder / VEHICLE, dataset.vehicle)
     number = np.arange(1, len(dataset.ticks) + 1)
     _write_table(folder / "encoderReading.txt", "%d %d %d", number, dataset.ticks)
     aruco = dataset.aruco
@@ -208,7 +209,7 @@ def write_dataset(folder: str | Path, dataset: Dataset, truth: Truth | None = No
     if truth is not None:
         folder = folder / "truth"
         folder.mkdir()
-        _write_vehicle(folder, truth.vehicle)
+        write_vehicle(folder / VEHICLE, truth.vehicle)
         pose = "%d %.6f %.6f %.6f"
         _write_table(folder / "vehiclePose.txt", pose, number, truth.poses)
         _write_table(folder / "ArucoMap.txt", pose, truth.marker, truth.marker_in_world)
@@ -219,17 +220,6 @@ def _write_table(path, row_format, *columns):
     """Write columns, arrays (n,) or (n, c), with line ends that are the same on all systems."""
     with open(path, "wb") as file:
         np.savetxt(file, np.column_stack(columns), fmt=row_format)
-
-
-def _write_vehicle(folder, vehicle):
-    """Write vehicle.toml: eight entries of the wheels, and others where they are not of table 2."""
-    entries = vars(vehicle)
-    of_wheels = list(entries)[:8]
-    text = ""
-    for name, value in entries.items():
-        if name in of_wheels or value != getattr(TABLE_2, name):
-            text += f"{name} = {json.dumps(value)}\n"
-    (folder / "vehicle.toml").write_text(text, encoding="utf-8", newline="\n")
 
 
 def _driven_arcs(layout, rounds):
