@@ -196,6 +196,7 @@ def own_axes(ax: Axes, covariance: np.ndarray, role: str, dots: np.ndarray | Non
         y, x = 1e3 * (cross[:2] @ directions)
         ax.plot(x, y, label="truth", **ROLES["true antenna"])
     ax.set(xlabel="along the ellipse (mm)", ylabel="across (mm)")
+    ax.locator_params(nbins=5)
     return ax
 
 
