@@ -111,7 +111,7 @@ def test_two_steps_of_the_filter_of_chapter_2_are_those_of_fuse():
     delta, by_w = increments.between_poses(ticks, v, start, ends, "arc")
     rounding, slipping = increments.noise_in_drive(ticks, v, start, ends)
     P = block_diag(np.diag([0, 0, v.sigma_heading, *v.sigma_wheel])**2, *g.C[first])
-    X, w, P = known["filter_step"](
+    X, w, _, P = known["filter_step"](
         np.zeros(3), np.zeros(3), g.z[first], P, delta[0], by_w[0],
         rounding[0] + slip**2 * slipping[0], g.z[second], g.C[second])
     seen = dataset.aruco.select(np.isin(np.arange(len(dataset.aruco.pose)),

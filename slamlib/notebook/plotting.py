@@ -190,6 +190,44 @@ def position_error(ax: Axes, result, drive, role: str = "slam") -> Axes:
     return ax
 
 
+def own_axes(ax: Axes, covariance: np.ndarray, role: str, dots: np.ndarray | None = None,
+             cross: np.ndarray | None = None) -> Axes:
+    """Draw the 95 % ellipse of a covariance (>= 2, >= 2) about zero along its own axes, in mm.
+
+    Each axis has its own scale, so that a needle becomes an ellipse. `dots` (m, >= 2) and `cross`
+    (>= 2,) are positions relative to its centre in m, in the axes of the covariance: random draws,
+    and the truth.
+    """
+    variances, directions = np.linalg.eigh(covariance[:2, :2])
+    short, long = 1e3 * REACH_95 * np.sqrt(np.maximum(variances, 0))
+    angle = np.linspace(0, 2 * np.pi, 200)
+    color = ROLES[role]["color"]
+    ax.fill(long * np.cos(angle), short * np.sin(angle), facecolor=(color, 0.3), edgecolor=color,
+            label="95 % ellipse")
+    if dots is not None:
+        y, x = 1e3 * (dots[:, :2] @ directions).T
+        ax.plot(x, y, ".", color="#555555", markersize=2.5, zorder=1)
+    if cross is not None:
+        y, x = 1e3 * (cross[:2] @ directions)
+        ax.plot(x, y, label="truth", **ROLES["true antenna"])
+    ax.set(xlabel="along the ellipse (mm)", ylabel="across (mm)")
+    ax.locator_params(nbins=5)
+    return ax
+
+
+def shade_gaps(axes: Sequence[Axes], frame: np.ndarray) -> Sequence[Axes]:
+    """Cover what is drawn between estimated poses that are far apart, as grey.
+
+    `frame` (m,) are their indices from 0, ascending. A gap is five times as long as usual.
+    """
+    steps = np.diff(frame)
+    if len(steps):
+        for k in np.flatnonzero(steps > 5 * np.median(steps)):
+            for ax in axes:
+                ax.axvspan(frame[k] + 1, frame[k + 1] + 1, color="#eeeeee", zorder=3.5)
+    return axes
+
+
 def trajectory(ax: Axes, poses: np.ndarray, role: str, label: str | None = None, **look) -> Axes:
     """Draw the path of poses (n, >= 2) with a dot at its start and equal axes."""
     line, = ax.plot(poses[:, 0], poses[:, 1], label=label or role, **ROLES[role] | look)
