@@ -23,6 +23,7 @@ from matplotlib_inline.backend_inline import set_matplotlib_formats
 
 from slamlib.core import se2
 from slamlib.core.evaluation import REACH_95
+from slamlib.core.odometry import cumulative
 
 
 def _line(color, width, dashes=None, zorder=3):
@@ -130,14 +131,13 @@ def estimates(result, drive) -> Estimates:
 def with_ellipses(ax: Axes, poses: np.ndarray, covariances: np.ndarray, role: str,
                   label: str | None = None, enlarged: float | None = None,
                   count: int = 12) -> Axes:
-    """Draw a path with `count` filled 95 % ellipses, at equal numbers of poses along it.
+    """Draw a path with `count` filled 95 % ellipses, at equal distances along it.
 
     Ellipses are `enlarged` by this factor, by default by that of `enlargement`, which is added to
     the axes' title.
     """
     enlarged = enlarged or enlargement(poses, covariances)
-    known = np.flatnonzero(np.isfinite(poses[:, 0]))
-    some = evenly(known, count)
+    some = equidistant(poses, count)
     trajectory(ax, poses, role, label, linewidth=1.2, alpha=0.8)
     ellipses(ax, poses[some], covariances[some], ROLES[role]["color"], fill=0.5, enlarged=enlarged)
     title = ax.get_title("left")
@@ -316,6 +316,16 @@ def enlargement(poses: np.ndarray, covariances: np.ndarray) -> int:
     factor = int(MAX_SEMI_AXIS * extent / largest)
     digits = 10 ** (len(str(factor)) - 1)
     return factor // digits * digits
+
+
+def equidistant(poses: np.ndarray, count: int) -> np.ndarray:
+    """Indices of about `count` known poses at equal distances along the path."""
+    known = np.flatnonzero(np.isfinite(poses[:, 0]))
+    steps = np.diff(poses[known, :2], axis=0)
+    travelled = cumulative(np.linalg.norm(steps, axis=1))
+    wanted = np.linspace(0, travelled[-1], count + 1)[1:]
+    row = np.searchsorted(travelled, wanted)
+    return known[np.unique(np.minimum(row, len(known) - 1))]
 
 
 def evenly(rows: np.ndarray, count: int) -> np.ndarray:
