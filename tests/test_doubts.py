@@ -179,13 +179,25 @@ def test_too_little_to_decide_gives_no_doubt(change):
     assert doubts_before_solving(wheels(SWAPPED)(little)) == []
 
 
-def test_doubts_about_files_erase_no_others():
-    """Each kind is told once; of antennas and units, each sentence."""
-    kinds = ["units", "odometry", "marker-noise", "antenna", "places", "antenna", "units"]
-    doubts = [files.Doubt(kind, f"Sentence {k}.") for k, kind in enumerate(kinds)]
+def doubts_of(*kinds):
+    """A Doubt of each kind, with a sentence of its own."""
+    return [files.Doubt(kind, f"Sentence {k}.") for k, kind in enumerate(kinds)]
+
+
+def test_each_kind_is_told_once_and_of_antennas_each_sentence():
+    doubts = doubts_of("encoder", "marker-noise", "antenna", "places", "antenna")
     assert files.merged(doubts) == doubts
-    again = files.Doubt("odometry", "Again.")
-    assert files.merged([*doubts, again, doubts[0]]) == [doubts[0], again, *doubts[2:]]
+    again = files.Doubt("places", "Again.")
+    assert files.merged([*doubts, again, doubts[0]]) == [*doubts[:3], again, doubts[4]]
+
+
+def test_files_that_contradict_each_other_are_told_with_all_that_may_follow_from_it():
+    doubts = doubts_of("units", "marker-noise", "odometry", "antenna", "units", "antenna")
+    causes = doubts[::2]
+    assert files.merged(causes) == causes
+    *first, consequences = files.merged(doubts)
+    assert first == causes and consequences.what == "consequences"
+    assert "may follow from this: marker-noise, antenna. Mend" in consequences.sentence
 
 
 def moved_by(length, turn, count=20):

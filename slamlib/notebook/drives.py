@@ -21,7 +21,7 @@ from slamlib.core.records import Dataset, Truth
 from slamlib.io.dataset import read_dataset, read_truth
 from slamlib.io.tables import datasets_in
 from slamlib.notebook import plotting
-from slamlib.robust.file_doubts import doubts_before_solving
+from slamlib.robust.file_doubts import doubts_before_solving, merged
 
 
 @dataclass(frozen=True, eq=False)          # compared by identity, because arrays have no hash
@@ -91,7 +91,8 @@ def write_results(drive: Drive, problem: str, found) -> None:
     solved = _written(drive, problem, found)
     if isinstance(solved, solve.Failure):
         raise DatasetError(solved.reason)
-    show_doubts(drive, solved.doubts)
+    told = merged([*drive.doubts, *solved.doubts])
+    show_doubts(drive, [doubt for doubt in told if doubt not in drive.doubts])
 
 
 @contextmanager

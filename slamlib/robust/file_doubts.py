@@ -40,6 +40,9 @@ MIN_SPREAD = 0.027
 MAX_SPREAD = 4.7
 SECOND_DIFFERENCE = 0.6745 * 6**0.5      # median size, of independent errors of sigma 1
 MIN_DIFFERENT_COUNTS = 8  # from which on a common divisor says that counts were cut off
+# Kinds of doubts from which most others follow
+DECISIVE = ("wheels-swapped", "wheels-reversed", "camera-mirrored", "camera-turned", "odometry",
+            "units")
 # The matrices A, and by their number kind and change of the counts with the same effect.
 AXES = np.array([np.diag(signs) @ order for order in (np.eye(2), np.eye(2)[::-1])
                  for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1))])
@@ -70,12 +73,23 @@ def doubts_before_solving(dataset: Dataset) -> list[Doubt]:
 
 
 def merged(doubts: Iterable[Doubt]) -> list[Doubt]:
-    """List of Doubt, each kind once with its last sentence; antennas and units by sentence."""
+    """List of Doubt, each kind once with its last sentence; antennas and units by sentence.
+
+    Where files contradict each other decisively, all else is named in one Doubt, as what may follow
+    from it.
+    """
     last = {}
     for doubt in doubts:
         key = doubt.sentence if doubt.what in ("antenna", "units") else doubt.what
         last[key] = doubt
-    return list(last.values())
+    causes = [doubt for doubt in last.values() if doubt.what in DECISIVE]
+    others = [doubt for doubt in last.values() if doubt.what not in DECISIVE]
+    if not causes or not others:
+        return causes + others
+    named = ", ".join(dict.fromkeys(doubt.what for doubt in others))
+    return [*causes, Doubt("consequences", (
+        f"What else contradicts the solutions may follow from this: {named}. Mend the files "
+        "first."))]
 
 
 def motion_doubts(dataset: Dataset) -> list[Doubt]:

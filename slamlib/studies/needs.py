@@ -85,7 +85,7 @@ def wheels(seed: int, slip: float) -> dict:
     add_priors(chain, decisions)
     add_sightings(chain, decisions)
     increments = decisions.odometry
-    by_sigma = increments.J_wheel * decisions.sigma_wheel
+    by_sigma = increments.J_wheel @ decisions.root_wheel
     C = increments.covariance(slip) + se2.rotate_covariance(
         by_sigma @ by_sigma.mT, -increments.increment[:, 2])
     frames = increments.frame.tolist()
