@@ -8,7 +8,7 @@ from slamlib.notebook import plotting
 
 MAP_WIDTH = 7.4                    # inches, the whole width of the page
 MIN_HEIGHT = 2.6                   # inches, of the axes
-MAX_HEIGHT = 3.9
+MAX_HEIGHT = 3.4
 MIN_POINT_VARIANCE = 1.0       # rad^2, variance of the heading of a marker without orientation
 TICK_LENGTH = 0.022            # of a marker's heading tick, in the map's extent
 ELLIPSE_COUNT = 24             # ellipses of the vehicle
