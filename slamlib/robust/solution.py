@@ -7,7 +7,7 @@ Gauss-Newton starts from problem 1's odometry. Where it does not converge from t
 larger error than that of the engine's solution, it starts again from this solution.
 
 With probability p_k of point k of the noise's posterior, x_k its solution and C_k its covariance,
-poses and landmarks have the moments (equation 3.4)
+poses and landmarks have the moments (equation 3.8)
 
     x = sum p_k x_k,    C = sum p_k (C_k + (x_k - x) (x_k - x)^T),
 
