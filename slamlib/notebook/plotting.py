@@ -165,7 +165,7 @@ def errors(axes: Sequence[Axes], result, drive, role: str = "slam") -> Sequence[
     top.fill_between(frame + 1, 0, semi_axis, **band)
     bottom.fill_between(frame + 1, -two_sigma, two_sigma, **band)
     if found.true is not None:
-        error = 1e3 * (found.poses - found.true)[shown]
+        error = 1e3 * se2.difference(found.poses, found.true)[shown]
         distance = np.linalg.norm(error[:, :2], axis=1)
         curve(top, distance, role, frame, "error", linewidth=1.2)
         curve(bottom, error[:, 2], role, frame, "error", linewidth=0.8)
