@@ -188,6 +188,7 @@ def test_sightings_that_are_late_are_no_jumps_and_start_at_their_delay(stated):
     found = estimate(drive)
     lag, = (row for row in found.calibration_table if row["name"] == "sighting_lag")
     assert found.released == {"time-offset"} and abs(lag["estimate"] - 10) < 4 * lag["sigma"] < 0.5
+    assert found.explanations == (frozenset({"time-offset"}),)
     assert ate(found.poses, path) < 3e-3 and found.rejected.mean() < 0.01
 
 

@@ -140,10 +140,14 @@ def calibrated(fit: Fit) -> Fit:
 
 
 def _confirmed(explanations, fit):
-    """Those explanations that also the solutions of a Fit with and without its groups confirm."""
-    calibration = fit.problem.measurements.calibration
-    confirmed = [some for some in explanations
-                 if sum(_price(calibration, group) for group in some) <= fit.lead]
+    """Those explanations that also the solutions of a Fit with and without its groups confirm.
+
+    A delay that `find_jumps` found is confirmed already.
+    """
+    m = fit.problem.measurements
+    found_before = {"time-offset"} if m.jumps.lag else frozenset()
+    confirmed = [some for some in explanations if fit.lead >= sum(
+        _price(m.calibration, group) for group in some - found_before)]
     return tuple(confirmed) or (frozenset(),)
 
 
