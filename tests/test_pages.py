@@ -135,15 +135,21 @@ def test_a_drive_that_fails_is_left_out_of_its_chapter_and_costs_the_others_noth
 
 
 def test_a_chapter_all_of_whose_drives_fail_says_so_and_has_empty_tables(tmp_path, kept):
-    """Also without a figure of any map, whose caption stays."""
+    """Also without a figure of any map, whose caption stays. Simulated examples are solved."""
     dataset = simulate("short", seed=3)[0].first(60)
     write_dataset(tmp_path / "data" / "bad", dataset)
     copied(tmp_path / "notebooks", "[234]*.ipynb", first=FAILING.replace(
         " and dataset.uwb is None", "").replace("slamlib.estimate =", """
-def lost(*_):
-    raise np.linalg.LinAlgError("Singular matrix")
+def lost(solver):
+    def solve(drive, *arguments, **options):
+        if len(getattr(drive, "aruco", drive).pose) < 100:
+            raise np.linalg.LinAlgError("Singular matrix")
+        return solver(drive, *arguments, **options)
+    return solve
 
-slamlib.localize = slamlib.fuse = slamlib.fuse_increments = lost
+slamlib.localize = lost(slamlib.localize)
+slamlib.fuse = lost(slamlib.fuse)
+slamlib.fuse_increments = lost(slamlib.fuse_increments)
 slamlib.estimate ="""))
     report = built_elsewhere(tmp_path / "notebooks", tmp_path / "data", tmp_path / "report",
                              tmp_path / "results", kept=kept)

@@ -23,8 +23,9 @@ CELL_TIMEOUT = 1800  # s, in which a cell must end
 TRANSPORT = "ipc" if hasattr(socket, "AF_UNIX") else "tcp"  # Windows has no Unix sockets
 # The matrices are small: more threads cost time.
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-# Without a question when it opens; as root, as in containers: it listens to this machine alone.
-LAB_OPTIONS = ("--LabApp.news_url=None", "--allow-root",
+LAB_SETTINGS = Path(__file__).parent / "lab"       # overrides.json: no question when it opens
+# As root, as in containers: it listens to this machine alone.
+LAB_OPTIONS = (f"--LabApp.app_settings_dir={LAB_SETTINGS}", "--allow-root",
                "--LabApp.check_for_updates_class=jupyterlab.NeverCheckForUpdate")
 
 
