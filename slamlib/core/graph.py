@@ -162,8 +162,8 @@ def add_odometry(graph: gtsam.NonlinearFactorGraph, decisions: Decisions):
 def noise_model(covariance: np.ndarray, kernel: str, share: float) -> gtsam.noiseModel.Base:
     """GTSAM's noise of a measurement that keeps a share of its information, with a kernel.
 
-    The share multiplies the loss. The covariance is divided by it, which makes the argument of the
-    kernel smaller by its root, so the kernel is made narrower by the same root.
+    The share multiplies the loss. A covariance divided by the share multiplies whitened errors by
+    the root of the share, so the scale of the kernel is multiplied by this root, too.
     """
     gaussian = gtsam.noiseModel.Gaussian.Covariance(covariance / share)
     robust = kernel_of(kernel, width=share**0.5)

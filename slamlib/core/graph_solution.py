@@ -21,7 +21,7 @@ from slamlib.core.graph import INDICES
 
 MAX_VARIANCE = 1e12          # m^2 and rad^2, above which a variable is not determined
 CONVERGED = 1e-6             # decrease of the error, over 1 + error, at which steps end
-STUCK = 1e-3                 # the same, that a step promised and did not bring
+STUCK = 1e-3                 # the same, promised by a step that brings none: steps are stuck
 ROUNDING = 1e-12             # relative increase of the error that is due to float rounding
 MAX_STEPS = 30               # number of steps of Gauss-Newton
 MAX_HALVINGS = 8             # number of halvings of one step
@@ -52,7 +52,7 @@ class GraphSolution:
     antenna_covariance: np.ndarray  # (a, 2, 2)
     steps: int                      # of Gauss-Newton
     error: float                    # half the sum of squared whitened errors, or kernels' losses
-    converged: bool                 # whether the error stopped to fall, and no factor contradicts
+    converged: bool                 # whether the error stopped falling, and no factor contradicts
     contradiction: str              # a sentence on the factor that contradicts most, or ""
 
 
@@ -116,7 +116,7 @@ class GaussNewton:
     values: gtsam.Values
     error: float             # half the sum of squared whitened errors, or kernels' losses
     steps: int               # number of steps
-    converged: bool          # whether the error had stopped to fall
+    converged: bool          # whether the error had stopped falling
     marginals: Marginals     # where the last step was linearised
 
 

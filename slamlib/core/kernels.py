@@ -13,8 +13,9 @@ SCALES = {
     "Geman-McClure": (mEstimator.GemanMcClure, 3.0),
     "Tukey": (mEstimator.Tukey, 4.685),
 }
-# Location b, in sigmas, for which a one-sided kernel weighs standard normal residuals r to
-# E[weight(r - b) (r - b)] = 0: it makes their mean too small. Ranges are compared with it.
+# Location b, in sigmas, for which a one-sided kernel weighs standard normal residuals r, measured
+# minus expected, to E[weight(r - b) (r - b)] = 0. Only r > 0, a late range, loses weight, so the
+# weighted mean of r is below 0: b sigmas are subtracted from each range.
 ONE_SIDED = {"asymmetric Cauchy": -0.10555, "asymmetric Tukey": -0.07581}
 
 

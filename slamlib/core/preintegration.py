@@ -32,7 +32,7 @@ class OdometryIncrements:
     J_wheel: np.ndarray      # (f-1, 3, 3) dDelta/dwheel, per m
     quantization: np.ndarray     # (f-1, 3, 3) covariance without slip, in the axes of the end
     slipping: np.ndarray     # (f-1, 3, 3) covariance of slip 1 sqrt(m), in the same axes
-    in_counts: bool = True   # of the engine: whether errors are scaled as `core.graph` scales them
+    in_counts: bool = True   # whether `odometry_error` scales them; the engine may set False
 
     def covariance(self, slip: float) -> np.ndarray:
         """Q (f-1, 3, 3) for a slip in sqrt(m)."""

@@ -27,8 +27,9 @@ class ArucoReadings(_Readings):
 
     pose: np.ndarray                 # (m,) int64, row of `Dataset.ticks`
     marker: np.ndarray               # (m,) int64, marker id
-    marker_in_vehicle: np.ndarray    # (m, 3) [x, y, heading]; as a camera at its origin sees it
-    covariance: np.ndarray           # (m, 3, 3) of [x, y, heading] in the axes of the vehicle
+    marker_in_vehicle: np.ndarray    # (m, 3) [x, y, heading]; of a file in the camera's axes, which
+                                     # are the vehicle's unless its place is stated (`sightings`)
+    covariance: np.ndarray           # (m, 3, 3) of [x, y, heading] in the same axes
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,7 @@ class Dataset:
 
     @property
     def sightings(self) -> ArucoReadings | None:
-        """The ArucoReadings, or None, as the vehicle's origin sees them by stated camera, size."""
+        """The ArucoReadings in the vehicle, by the stated camera and size; None without markers."""
         if self.aruco is None:
             return None
         stated = self.vehicle

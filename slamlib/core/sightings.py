@@ -117,7 +117,7 @@ def consensus(marker: np.ndarray, in_world: np.ndarray, covariance: np.ndarray,
     begins = np.flatnonzero(np.diff(marker[order])) + 1
     best = []
     for same in np.split(order, begins):
-        if len(same):                                   # there is no marker, if not
+        if len(same):                                   # one empty group without sightings
             chosen = _evenly(same, maximum)
             k = _supported_and_certain(in_world[chosen], covariance[chosen])
             best.append(chosen[k])

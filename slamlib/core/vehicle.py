@@ -30,12 +30,12 @@ class Vehicle:
     slip: float | None = None                     # sqrt(m), sigma after 1 m; None: learned
     marker_noise_factor: float | None = None      # of the sigmas in ArucoReading.txt
     range_noise_factor: float | None = None       # of the sigmas in UwbReading.txt
-    kernel: str = "asymmetric Tukey"     # of sightings and ranges; of ranges alone if asymmetric
+    kernel: str = "asymmetric Tukey"     # an asymmetric one: of ranges only
     gate: bool = True                    # whether what contradicts the solution is rejected
     camera_x: float = 0.0                # m, place of the camera in the vehicle
     camera_y: float = 0.0                # m
     camera_turn: float = 0.0             # rad, heading of the camera in the vehicle
-    marker_size: float = 1.0             # of markers, over that which the detector was told
+    marker_size: float = 1.0             # true size over that which the detector was told
     sighting_lag: float = 0.0            # encoder steps by which sightings are late
     tag_x: float = 0.0                   # m, place of the UWB tag in the vehicle
     tag_y: float = 0.0                   # m

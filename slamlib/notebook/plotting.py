@@ -329,7 +329,7 @@ def equidistant(poses: np.ndarray, count: int) -> np.ndarray:
 
 
 def evenly(rows: np.ndarray, count: int) -> np.ndarray:
-    """At most `count` of the rows (n, ...) at equal distances, the last one included."""
+    """At most `count` of the rows (n, ...) at equal numbers of rows, the last one included."""
     if len(rows) <= count:
         return rows
     return rows[np.linspace(-1, len(rows) - 1, count + 1).astype(int)[1:]]

@@ -64,7 +64,7 @@ SIGHTINGS = slice(3, 8)
 RANGES = slice(8, None)
 
 CAMERA = slice(3, 6)         # of sightings, with the next two
-SIZE = 6
+SIZE = 6                     # of marker_size, in `factors.sighting_error`
 SIGHTING_LAG = 7
 
 TAG_PLACE = slice(8, 10)     # of ranges, with all that follow
