@@ -12,6 +12,7 @@ from test_report import make_data
 
 from slamlib.__main__ import main
 from slamlib.io.dataset import read_dataset
+from slamlib.report import execution
 from slamlib.studies.simulation import write_dataset
 
 SECONDS = 300
@@ -66,6 +67,13 @@ def test_jupyterlab_replaces_the_command_and_kernels_see_the_data(tmp_path, monk
     assert command[-4:] == ["--no-browser", "--port", "9999", "notebooks"]
     assert environment["SLAMLIB_DATA"] == str(tmp_path / "data")
     assert environment["SLAMLIB_DATASETS"] == "short" and "SLAMLIB_RESULTS" not in environment
+
+
+def test_where_there_is_no_jupyterlab_it_is_said_how_to_install_it(tmp_path, monkeypatch, capsys):
+    (tmp_path / "notebooks").mkdir()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(execution, "find_spec", lambda _: None)
+    assert main(["lab"]) == 2 and "JupyterLab, as by pip install" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable
 from copy import deepcopy
+from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -17,6 +18,7 @@ from nbclient.exceptions import CellExecutionError
 from nbconvert.filters import strip_ansi
 from nbconvert.preprocessors import CoalesceStreamsPreprocessor
 
+from slamlib.core.errors import require
 from slamlib.report.notebooks import LAB_ONLY, Books, NotebookError
 
 CELL_TIMEOUT = 1800  # s, in which a cell must end
@@ -115,6 +117,7 @@ async def _execute(source, book, environment):
 
 def start_lab(notebooks: Path, data: Path, arguments: list[str]):
     """Replace this process by JupyterLab on the notebooks, with its `arguments`."""
+    require(find_spec("jupyterlab"), "lab", "JupyterLab, as by pip install jupyterlab", "none")
     command = [sys.executable, "-m", "jupyterlab", *LAB_OPTIONS, *arguments, str(notebooks)]
     environment = ONE_THREAD | os.environ | {"SLAMLIB_DATA": str(data.resolve())}
     os.execve(sys.executable, command, environment)

@@ -128,7 +128,8 @@ def calibrated(fit: Fit) -> Fit:
     for _ in range(MAX_PROPOSALS):
         proposal = _proposal(fit)
         if np.array_equal(proposal.prior.root, fit.problem.prior.root):
-            return replace(fit, explanations=_confirmed(proposal.explanations, fit))
+            fit = replace(fit, explanations=proposal.explanations)
+            break
         if proposal.prior.groups in tried:
             break
         tried.append(proposal.prior.groups)
@@ -136,18 +137,21 @@ def calibrated(fit: Fit) -> Fit:
         if proposed is None:
             break
         fit = proposed
-    return fit
+    return replace(fit, explanations=_confirmed(fit))
 
 
-def _confirmed(explanations, fit):
-    """Those explanations that also the solutions of a Fit with and without its groups confirm.
+def _confirmed(fit):
+    """The explanations of a Fit that its solutions with and without their groups confirm.
 
     A delay that `find_jumps` found is confirmed already.
     """
     m = fit.problem.measurements
     found_before = {"time-offset"} if m.jumps.lag else frozenset()
-    confirmed = [some for some in explanations if fit.lead >= sum(
-        _price(m.calibration, group) for group in some - found_before)]
+    confirmed = []
+    for some in fit.explanations:
+        needed = sum(_price(m.calibration, group) for group in some - found_before)
+        if fit.lead >= needed:
+            confirmed.append(some)
     return tuple(confirmed) or (frozenset(),)
 
 
@@ -177,8 +181,7 @@ def _released(fit, proposal):
              proposal.lead, "kept" if is_kept else "refused")
     if not is_kept:
         return None
-    proposed = replace(proposed, lead=fit.lead + lead)
-    return replace(proposed, explanations=_confirmed(proposal.explanations, proposed))
+    return replace(proposed, explanations=proposal.explanations, lead=fit.lead + lead)
 
 
 def _proposal(fit):
@@ -188,8 +191,8 @@ def _proposal(fit):
     part of it nor more: the drive cannot tell them apart. Each of their groups must raise the log
     evidence by its `_price`. The prior releases all groups of the sets that come so close, and what
     else raises the evidence and is plausible: not certain enough to be told, but the covariances
-    include it. Wide standard deviations are multiplied by GROSS if an entry would be
-    further off than MAX_WIDE_SIGMAS.
+    include it. Wide standard deviations are multiplied by GROSS if an entry would be further off
+    than MAX_WIDE_SIGMAS.
     """
     calibration = fit.problem.measurements.calibration
     L, h = _likelihood(fit)
@@ -217,14 +220,16 @@ def _proposal(fit):
     certain = frozenset().union(*close)
     is_stated = {group: calibration.sigma[calibration.of_group(group)].all() for group in groups}
     surprise = np.array([STATED * sum(is_stated[group] for group in some) for some in sets])
-    more = k
+    released = k
     for j in np.argsort(surprise - evidence):            # the most probable set first
+        if not certain <= sets[j]:
+            continue
         untold = [calibration.of_group(group) for group in sets[j] - certain]
-        if certain <= sets[j] and _are_plausible(L, h, roots[j] * scale, untold):
-            more = j
+        if _are_plausible(L, h, roots[j] * scale, untold):
+            released = j
             break
     present = _log_evidence(L, h, fit.problem.prior.root * scale)[0]
-    return _Proposal(explanations, priors[more], evidence[more] - present)
+    return _Proposal(explanations, priors[released], evidence[released] - present)
 
 
 def _are_plausible(L, h, root, groups):

@@ -29,6 +29,7 @@ from slamlib.robust.calibration import (
     TAG_PLACE,
     WHEELS,
 )
+from slamlib.robust.jumps import creep_covariance
 from slamlib.robust.measurements import Measurements, square_root_information
 
 MIN_DISTANCE = 1e-9          # m, below which a range has no direction
@@ -46,12 +47,12 @@ def preintegrate_odometry(measurements: Measurements, model: str,
     increments = preintegrate(
         measurements.dataset, frame, model, wheel, measurements.odometry_noise)
     jump, jump_covariance = measurements.jumps.added(frame[:-1], frame[1:])
-    moves = ~measurements.crawls[:, None]
-    creep = np.where(moves, 0.0, increments.increment)
-    uncertain = jump_covariance + creep[:, :, None] * creep[:, None]
+    moves = ~measurements.crawls
+    creep = creep_covariance(increments.increment, measurements.crawls)
+    uncertain = jump_covariance + se2.rotate_covariance(creep, -increments.increment[:, 2])
     return replace(
         increments, in_counts=False, increment=se2.compose(increments.increment, jump),
-        J_wheel=moves[:, None] * increments.J_wheel,
+        J_wheel=moves[:, None, None] * increments.J_wheel,
         quantization=increments.quantization + uncertain)
 
 

@@ -265,11 +265,13 @@ def cut_counts(dataset: Dataset) -> Iterator[Doubt]:
 
 def common_divisor(ticks: np.ndarray) -> int:
     """Greatest common divisor of counts (n, 2), of fractions or a few different counts 1."""
-    counts = np.unique(np.abs(ticks))
-    whole = np.rint(counts).astype(int)
-    if len(counts) < MIN_DIFFERENT_COUNTS or not np.array_equal(whole, counts):
+    whole = np.rint(ticks).astype(int)
+    if not np.array_equal(whole, ticks):
         return 1
-    return int(np.gcd.reduce(whole))
+    divisor = int(np.gcd.reduce(whole, axis=None))
+    if divisor > 1 and len(np.unique(np.abs(whole))) < MIN_DIFFERENT_COUNTS:
+        return 1
+    return divisor
 
 
 def sigma_units(dataset: Dataset) -> Iterator[Doubt]:

@@ -42,7 +42,7 @@ from slamlib.core.increments import SLIP_BOUNDS, SLIP_FACTOR, TYPICAL_SLIP
 from slamlib.core.records import Dataset
 from slamlib.core.sightings import GATE, sightings_by_frame
 from slamlib.robust.calibration import stated_calibration
-from slamlib.robust.jumps import NO_JUMPS, crawls, find_jumps
+from slamlib.robust.jumps import NO_JUMPS, crawls, creep_covariance, find_jumps
 
 SLIPS = TYPICAL_SLIP * SLIP_FACTOR ** np.arange(-1.0, 4.0)     # sqrt(m), of the first filters
 FINE_STEPS = 1.4 ** np.arange(-2.0, 3.0)     # slips of the last filters, over the likeliest one
@@ -215,13 +215,12 @@ def _odometry(dataset, jumps, start, end):
     vehicle = dataset.vehicle
     increment, by_w = increments.between_poses(ticks, vehicle, start, end, "arc")
     rounding, slipping = increments.noise_in_drive(ticks, vehicle, start, end)
-    creeping = crawls(ticks, start, end)
-    by_w[creeping] = 0.0
-    creep = increment[creeping]
-    rounding[creeping] += creep[:, :, None] * creep[:, None]
+    crawling = crawls(ticks, start, end)
+    by_w[crawling] = 0.0
+    uncertain = rounding + creep_covariance(increment, crawling)
     jump, unknown = jumps.added(start, end)
     increment = se2.compose(increment, jump)
-    return _Odometry(increment, by_w, rounding + unknown, slipping)
+    return _Odometry(increment, by_w, uncertain + unknown, slipping)
 
 
 def _filter(dataset, jumps, models):

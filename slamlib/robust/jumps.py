@@ -152,6 +152,12 @@ def crawls(ticks: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
     return speed * travel.sum() < CRAWL * (speed @ travel)
 
 
+def creep_covariance(increment: np.ndarray, crawling: np.ndarray) -> np.ndarray:
+    """Covariances (m, 3, 3) by which increments (m, 3) may be errors: all where it crawls (m,)."""
+    creep = np.where(crawling[:, None], increment, 0.0)
+    return creep[:, :, None] * creep[:, None]
+
+
 def find_jumps(dataset: Dataset) -> Jumps:
     """The Jumps of a Dataset, by its sightings as the stated camera has them."""
     s = sightings_by_frame(dataset.sightings)
