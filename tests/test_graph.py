@@ -382,7 +382,7 @@ def test_from_odometry_alone_a_wrong_minimum_is_left_for_the_engines_solution(dr
 def test_the_average_over_the_slip_is_that_of_the_engine():
     """A short drive, whose slip is uncertain: five solutions and their covariances."""
     found = estimate(short(8, 600)[0].without("uwb"))
-    assert len(found.fit.posterior.points) > 1
+    assert len(found.fit.noise_points) > 1
     assert max(found.agreement) < 1e-3
 
 

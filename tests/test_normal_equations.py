@@ -88,12 +88,13 @@ def test_selected_blocks_are_those_of_the_dense_inverse(poses):
     check(np.arange(n, len(unit))[None], found.c[np.ix_(active, active)][None])
 
 
-def posterior_points(C):
+def posterior_points(monkeypatch, C):
     """Weights (p,) and logarithms (p, 3) of the points of a normal posterior about CENTRE."""
     information = np.linalg.inv(C)
-    points = noise._points(
-        lambda x: -(x - CENTRE) @ information @ (x - CENTRE) / 2, CENTRE, 0.0, C)
-    weights, noises = zip(*points)
+    monkeypatch.setattr(noise, "_log_posterior",
+                        lambda _, x: -(x - CENTRE) @ information @ (x - CENTRE) / 2)
+    posterior = noise.NoisePosterior(Noise(*np.exp(CENTRE)), C, 0.0)
+    weights, noises = zip(*noise.points_of(None, posterior))
     return np.array(weights), np.log(noises)
 
 
@@ -101,9 +102,9 @@ CENTRE = np.log([2e-3, 1.3, 0.8])
 BROAD = np.array([[0.25, 0.06, 0.0], [0.06, 0.04, 0.01], [0.0, 0.01, 0.09]])
 
 
-def test_points_of_the_posterior_have_its_moments():
+def test_points_of_the_posterior_have_its_moments(monkeypatch):
     """Along the slip by points, across by a wider noise: log-normal root mean squares."""
-    weights, logs = posterior_points(BROAD)
+    weights, logs = posterior_points(monkeypatch, BROAD)
     assert len(weights) == 5 and np.isclose(sum(weights), 1)
     rest = np.diag(BROAD) - BROAD[0]**2 / BROAD[0, 0]           # given the slip
     assert_allclose(weights @ logs, CENTRE + rest, atol=1e-6)
@@ -112,8 +113,8 @@ def test_points_of_the_posterior_have_its_moments():
                                np.outer(BROAD[0], BROAD[0]) / BROAD[0, 0], rtol=0.02, atol=1e-12)
 
 
-def test_a_narrow_posterior_is_one_point():
-    weights, logs = posterior_points(0.01 * BROAD)
+def test_a_narrow_posterior_is_one_point(monkeypatch):
+    weights, logs = posterior_points(monkeypatch, 0.01 * BROAD)
     assert weights.tolist() == [1]
     assert_allclose(logs[0], CENTRE + 0.01 * np.diag(BROAD), rtol=1e-12)
 

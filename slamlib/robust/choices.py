@@ -22,6 +22,7 @@ id than this path explains is another place (`places_of_ids`).
 import logging
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from itertools import combinations
 from typing import NamedTuple
 
@@ -80,10 +81,10 @@ def memory_or_slip(problem: Problem, state: State) -> Fit:
     deviations were PLAUSIBLE_FACTOR times those in the files, where with a larger slip they do not.
     """
     fit = refine(problem, state)
-    if not (fit.problem.accepted.share < 1).any():
+    by_memory = _contradicting_share(fit)
+    if by_memory <= MAX_CONTRADICTING or not (fit.problem.accepted.share < 1).any():
         return fit
     other = refine(replace(problem, memory_first=False), state)
-    by_memory = _contradicting_share(fit)
     by_slip = _contradicting_share(other)
     is_slip = by_slip < MAX_STILL_REJECTED * (by_memory - MAX_CONTRADICTING)
     log.info("memory first: slip %.3g mm after 1 m, %.1f %% contradict; slip first: %.3g mm, %.1f "
@@ -307,36 +308,35 @@ def _with_fixed_weights(fit):
 
 
 def most_consistent(
-        dataset: Dataset, solve: Callable[..., Fit]) -> tuple[Fit, np.ndarray | None]:
+        dataset: Dataset, start: Callable[..., Fit],
+        decide: Callable[[Fit], Fit]) -> tuple[Fit, np.ndarray | None]:
     """The Fit that rejects few sightings, and `SlamResult.places`, None if each id is one place.
 
-    `solve` makes the Fit of Jumps and of places. Jumps of odometry, or else places of ids, are
-    believed where they spare most of the sightings that are rejected without them. A few jumps need
-    no such support. Where a solution stretches odometry beyond the slip that it learned, most of
-    all over a way without markers, one more jump is believed if the evidence leads decisively.
+    `start` makes the Fit of Jumps and of places, undecided or with the decisions that another Fit
+    is `like`, and `decide` decides. Jumps of odometry, or else places of ids, are believed where
+    they spare most of the sightings that are rejected without them, with the same decisions. A few
+    jumps need no such support. Where a solution stretches odometry beyond the slip that it learned,
+    most of all over a way without markers, one more jump is believed if the evidence leads
+    decisively.
     """
     jumps = find_jumps(dataset)
     are_doubtful = len(jumps.start) > 0 and not jumps.are_few
-    fit = solve(replace(NO_JUMPS, lag=jumps.lag) if are_doubtful else jumps)
-    if are_doubtful:
-        other = solve(jumps)
-        if spares_sightings(other, fit, "jumps"):
-            fit = other
+    fit = decide(start(replace(NO_JUMPS, lag=jumps.lag) if are_doubtful else jumps))
+    if are_doubtful and spares_sightings(start(jumps, like=fit), fit, "jumps"):
+        fit = decide(start(jumps))
     log.info("jumps: %d of %d are believed", len(fit.problem.measurements.jumps.start),
              len(jumps.start))
     if has_rejected_visits(fit):
-        places = places_of_ids(dataset.aruco, solve)
-        if places is not None:
-            other = solve(places=places)
-            if spares_sightings(other, fit, "places of ids"):
-                return other, places
+        places = places_of_ids(dataset.aruco, partial(start, like=fit))
+        if places is not None and spares_sightings(
+                start(places=places, like=fit), fit, "places of ids"):
+            return decide(start(places=places)), places
     jumps = with_stretched(fit)
     if jumps is not None:
-        other = solve(jumps)
-        lead = other.log_density - fit.log_density
+        lead = start(jumps, like=fit).log_density - fit.log_density
         log.info("jumps: one more, log evidence %+.1f", lead)
         if lead > MIN_JUMP_LEAD:
-            return other, None
+            return decide(start(jumps)), None
     return fit, None
 
 
@@ -407,12 +407,12 @@ def spares_sightings(fit: Fit, other: Fit, explanation: str) -> bool:
     return is_believed
 
 
-def places_of_ids(aruco: ArucoReadings, solve: Callable[..., Fit]) -> np.ndarray | None:
-    """`SlamResult.places` of ArucoReadings, None if each id is one place; `solve` as above."""
+def places_of_ids(aruco: ArucoReadings, start: Callable[..., Fit]) -> np.ndarray | None:
+    """`SlamResult.places` of ArucoReadings, None if each id is one place; `start` as above."""
     marker = aruco.marker
     number = visits(aruco)
     try:
-        result = slam_result(solve(places=np.stack([marker, number], axis=1)))
+        result = slam_result(start(places=np.stack([marker, number], axis=1)))
     except (DatasetError, np.linalg.LinAlgError):
         return None
     place = np.zeros_like(marker)

@@ -131,7 +131,7 @@ def posterior_moments(fit: Fit) -> tuple[State, Covariances, float]:
     """
     problem = fit.problem
     equations = NormalEquations(problem, fit.state)
-    points = fit.posterior.points if fit.posterior else [(1.0, problem.noise)]
+    points = fit.noise_points
     weights = [weight for weight, _ in points]
     slips = np.array([noise.slip for _, noise in points])
     slip = np.sqrt(np.average(slips**2, weights=weights))

@@ -10,6 +10,7 @@ have memory, measurements keep a share of their information (`slamlib.robust.err
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from gtsam import noiseModel
@@ -19,7 +20,7 @@ from slamlib.core.sightings import GATE, POINT_GATE
 from slamlib.robust.calibration import WHEELS
 from slamlib.robust.error_memory import Memory, error_memory
 from slamlib.robust.factors import linearize_measurements, preintegrate_odometry
-from slamlib.robust.linear import Problem, State, laplace_approximation
+from slamlib.robust.linear import NormalEquations, Problem, State, laplace_approximation
 from slamlib.robust.measurements import (
     Accepted,
     AcceptedMeasurements,
@@ -27,7 +28,7 @@ from slamlib.robust.measurements import (
     accept_all,
     with_known,
 )
-from slamlib.robust.noise import NoisePosterior, learn_noise, with_hidden_errors
+from slamlib.robust.noise import NoisePosterior, learn_noise, points_of, with_hidden_errors
 from slamlib.robust.optimize import optimize
 
 log = logging.getLogger(__name__)
@@ -37,6 +38,7 @@ MAX_DIRECT = 3.3             # sigmas, of a range's residual; longer ones are ec
 
 CAUCHY_SCALES = (100.0, 30.0, 10.0, 3.0)     # sigmas, scale of the kernel in each round
 ROUGH = 1e-4                 # relative decrease of the error at which a round ends
+ROUGH_STEPS = 15             # number of steps at which it ends in any case
 MIN_RESIDUALS = 20           # number of measurements from which their scatter gives a factor
 MEDIAN_CHI2 = {3: 2.366, 2: 1.386, 1: 0.455}         # medians by degrees of freedom
 
@@ -118,7 +120,8 @@ def narrow_kernels(
             problem = replace(problem, noise=noise_of_scatter(problem, state))
         cauchy = noiseModel.mEstimator.Cauchy.Create(scale)
         accepted = accept_all(problem.measurements, cauchy)
-        optimum = optimize(replace(problem, accepted=accepted), state, tolerance=ROUGH)
+        optimum = optimize(
+            replace(problem, accepted=accepted), state, max_steps=ROUGH_STEPS, tolerance=ROUGH)
         state = optimum.state
         log.info("Cauchy kernel of %g sigmas: error %.6g after %d steps",
                  scale, optimum.equations.error, optimum.steps)
@@ -164,6 +167,15 @@ class Fit:
         """Log posterior density of the noise, or log evidence if all of it is known."""
         return self.log_evidence if self.posterior is None else self.posterior.log_density
 
+    @cached_property
+    def noise_points(self) -> tuple[tuple[float, Noise], ...]:
+        """Probability and Noise of each point over which estimates are averaged."""
+        if self.posterior is None:
+            return ((1.0, self.problem.noise),)
+        equations = NormalEquations(self.problem, self.state)
+        return tuple((probability, _with_hidden(self.problem, noise))
+                     for probability, noise in points_of(equations, self.posterior))
+
 
 def refine(problem: Problem, state: State,
            accept: Callable[..., AcceptedMeasurements] | None = accepted_measurements) -> Fit:
@@ -192,9 +204,8 @@ def refine(problem: Problem, state: State,
     accepted = with_memory(fit.problem, fit.state)
     if not (accepted.share < 1).any():
         return fit
-    problem, posterior = _with_hidden_errors(
-        replace(fit.problem, accepted=accepted), fit.posterior)
-    return _fit(problem, optimize(problem, fit.state), posterior)
+    problem = _with_hidden_errors(replace(fit.problem, accepted=accepted))
+    return _fit(problem, optimize(problem, fit.state), fit.posterior)
 
 
 def _settled_fit(problem, state, accept):
@@ -210,8 +221,7 @@ def _settled_fit(problem, state, accept):
         problem = _relinearized(replace(problem, accepted=accepted), state)
         if m.learned.any() and changed > NEGLIGIBLE_CHANGE * len(accepted.share):
             problem, state, posterior = _settle_noise(problem, state)
-        problem, posterior = _with_hidden_errors(problem, posterior)
-        problem = _with_errors_in_counts(problem)
+        problem = _with_errors_in_counts(_with_hidden_errors(problem))
         optimum = optimize(problem, state)
         state = optimum.state
         accepted = accept(problem, state)
@@ -298,16 +308,12 @@ def _remember(shares):
     return [bool((share < 1).any()) for share in shares]
 
 
-def _with_hidden_errors(problem, posterior):
-    """The Problem whose noise includes hidden errors of what has memory, and its posterior."""
+def _with_hidden_errors(problem):
+    """The Problem whose noise includes hidden errors of what has memory."""
+    return replace(problem, noise=_with_hidden(problem, problem.noise))
+
+
+def _with_hidden(problem, noise):
+    """A Noise with hidden errors of what has memory in a Problem."""
     remember = _remember([kind.share for kind in problem.accepted])
-    vehicle = problem.measurements.dataset.vehicle
-
-    def hidden(noise):
-        return with_hidden_errors(noise, remember, vehicle)
-
-    problem = replace(problem, noise=hidden(problem.noise))
-    if posterior is not None:
-        points = tuple((weight, hidden(noise)) for weight, noise in posterior.points)
-        posterior = replace(posterior, noise=problem.noise, points=points)
-    return problem, posterior
+    return with_hidden_errors(noise, remember, problem.measurements.dataset.vehicle)

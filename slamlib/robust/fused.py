@@ -9,10 +9,10 @@ covariance P (Smith, Self and Cheeseman, Estimating Uncertain Spatial Relationsh
     P' = F P F^T + L Q L^T,
 
 with Delta(w) = Delta(0) + dDelta/dw w, F and L the derivatives of the new state by the old one and
-by Delta, and Q the noise of Delta (`increments.noise_in_drive`). Each sighting Z_j of the new
-frame, with covariance C_j, measures a marker, M'_j = H state, and updates
+by Delta, and Q the noise of Delta (`increments.noise_in_drive`). The sightings Z of the new frame,
+with covariance C, measure these markers, M' = H state, and update
 
-    state <- state + K (Z_j - M'_j),    P <- P' - K H P',    K = P' H^T S^-1,    S = H P' H^T + C_j.
+    state <- state + K (Z - M'),    P <- P' - K H P',    K = P' H^T S^-1,    S = H P' H^T + C.
 
 Sightings beyond GATE are rejected. Then the filter removes rejected markers and those out of view,
 and adds new ones with covariance C_j. Without markers the result is the first-order propagation of
@@ -310,27 +310,19 @@ def _updated(state, sightings, row, memory, variance):
 
     `variance` (h, 1, 1) is over that of the sightings.
     """
+    seen = np.flatnonzero(sightings.row == row)
+    is_known = np.isin(sightings.marker[seen], state.marker)
+    known = seen[is_known]
+    new = seen[~is_known]
+    number = np.nonzero(sightings.marker[known, None] == state.marker)[1]
     new_part = variance * (1 - memory**2)
-    kept = []                                               # numbers of markers
-    used = []                                               # their rows
-    new = []
-    for k in np.flatnonzero(sightings.row == row):
-        number = np.flatnonzero(state.marker == sightings.marker[k])
-        if not len(number):
-            new.append(k)
-            continue
-        C = new_part * sightings.C[k]
-        rejected = state.rejected
-        state = _measured(state, number[0], sightings.z[k], C)
-        if state.rejected == rejected:
-            kept.append(number[0])
-            used.append(k)
-    index = np.append([0, 1, 2], 3 + np.array(kept, int))
-    rows = 3 * index[:, None] + np.arange(3)
-    rows = rows.ravel()
+    C = new_part[:, None] * sightings.C[known]
+    state, accepted = _measured(state, number, sightings.z[known], C)
+    index = np.append([0, 1, 2], 3 + number[accepted])
+    rows = _rows(index).ravel()
     P = state.P[:, rows[:, None], rows]
     z_new = np.tile(sightings.z[new], (len(memory), 1, 1))
-    used = np.array(used + new, int)
+    used = np.append(known[accepted], new)
     return state._replace(
         x=np.concatenate([state.x[:, index], z_new], axis=1),
         P=_block_diagonal(P, variance[:, None] * sightings.C[new]),
@@ -339,29 +331,40 @@ def _updated(state, sightings, row, memory, variance):
 
 
 def _measured(state, number, z, C):
-    """The predicted _State after a sighting z (3,) of a marker, unless it is beyond the gate.
+    """The predicted _State after sightings z (m, 3) of markers, and which of them it accepts, (m,).
 
-    A wrong sighting is equally likely by all filters: as one at the gate by the least certain.
+    With covariances C (h, m, 3, 3). A sighting beyond the gate of the likeliest filter is wrong. It
+    is equally likely by all filters: as one at the gate by the least certain.
     """
     expected = 3 + len(state.marker) + number
-    H = slice(3 * expected, 3 * expected + 3)
+    rows = _rows(expected)
     innovation = se2.difference(z, state.x[:, expected])
-    HP = state.P[:, H]
-    S = HP[:, :, H] + C
+    S = state.P[:, rows[:, :, None], rows[:, None]] + C
     squared = se2.squared_norms(innovation, S)
     accepted = squared[state.likeliest] < GATE
     log_determinant = np.linalg.slogdet(S)[1]
-    cost = squared + log_determinant
-    if not accepted:
-        cost = np.minimum(cost, GATE + log_determinant.max())
-    state = state._replace(log_density=state.log_density - cost / 2)
-    if not accepted:
-        return state._replace(rejected=state.rejected + 1)
+    by_certain = squared + log_determinant
+    cost_of_wrong = np.minimum(by_certain, GATE + log_determinant.max(axis=0))
+    cost = cost_of_wrong[:, ~accepted].sum(axis=1)
+
+    H = rows[accepted].ravel()
+    HP = state.P[:, H]
+    S = HP[:, :, H] + _block_diagonal(np.zeros((len(C), 0, 0)), C[:, accepted])
+    innovation = innovation[:, accepted].reshape(len(C), -1)
+    cost += se2.squared_norms(innovation, S) + np.linalg.slogdet(S)[1]
     gain = np.linalg.solve(S, HP).mT
     change = np.matvec(gain, innovation)
     P = state.P - gain @ HP
-    x = state.x + change.reshape(state.x.shape)
-    return state._replace(x=x, P=(P + P.mT) / 2)
+    return state._replace(
+        x=state.x + change.reshape(state.x.shape),
+        P=(P + P.mT) / 2,
+        log_density=state.log_density - cost / 2,
+        rejected=state.rejected + np.count_nonzero(~accepted)), accepted
+
+
+def _rows(index):
+    """Rows (m, 3) of a covariance by numbers (m,) of poses and markers."""
+    return 3 * index[:, None] + np.arange(3)
 
 
 def _block_diagonal(P, C):

@@ -11,6 +11,7 @@ slip is uncertain.
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -62,7 +63,6 @@ class NoisePosterior:
     noise: Noise                 # the mode
     covariance: np.ndarray       # (3, 3) of its logarithms, 0 for parameters that are not learned
     log_density: float           # log posterior at the mode, up to a constant
-    points: tuple                # of (probability, Noise), over which estimates are averaged
 
 
 def learn_noise(equations: NormalEquations) -> NoisePosterior:
@@ -70,16 +70,11 @@ def learn_noise(equations: NormalEquations) -> NoisePosterior:
     noise = equations.problem.noise
     measurements = equations.problem.measurements
     free = np.flatnonzero(measurements.learned)
-
-    def log_posterior(logarithms):
-        evidence = laplace_approximation(equations, _noise_of(logarithms))[1]
-        off = (logarithms - np.log(MEDIAN)) / PRIOR_SIGMA
-        return max(evidence, SINGULAR) - np.sum(off[free]**2) / 2
-
+    log_posterior = partial(_log_posterior, equations)
     start = np.log(noise)
     value = log_posterior(start)
     if value < SINGULAR / 2:                             # nothing can be learned
-        return NoisePosterior(noise, np.zeros((3, 3)), SINGULAR, ((1.0, noise),))
+        return NoisePosterior(noise, np.zeros((3, 3)), SINGULAR)
     sightings, ranges = equations.counts()
     count = np.maximum([3 * len(measurements.frame), sightings, ranges], 1)
     sigma = 1 / np.sqrt(2 * count)                       # of the logarithm of a scatter
@@ -87,8 +82,15 @@ def learn_noise(equations: NormalEquations) -> NoisePosterior:
     learned = _noise_of(mode)
     log.info("noise: slip %.3g mm after 1 m, factors %.3g of sightings and %.3g of ranges, "
              "log posterior %.1f", 1e3 * learned.slip, learned.sightings, learned.ranges, value)
-    points = _points(log_posterior, mode, value, covariance)
-    return NoisePosterior(learned, covariance, value, points)
+    return NoisePosterior(learned, covariance, value)
+
+
+def _log_posterior(equations, logarithms):
+    """Log posterior density, up to a constant, of these logarithms (3,) of the noise."""
+    evidence = laplace_approximation(equations, _noise_of(logarithms))[1]
+    off = (logarithms - np.log(MEDIAN)) / PRIOR_SIGMA
+    is_free = equations.problem.measurements.learned
+    return max(evidence, SINGULAR) - np.sum(off[is_free]**2) / 2
 
 
 def _noise_of(logarithms):
@@ -160,25 +162,25 @@ def _inverse_curvature(curvature):
     return axes / np.maximum(values, PRIOR_SIGMA.max()**-2) @ axes.T
 
 
-def _points(log_posterior, mode, value, covariance):
-    """Tuple of (probability, Noise) along the slip, each with the most probable factors.
+def points_of(equations: NormalEquations,
+              posterior: NoisePosterior) -> tuple[tuple[float, Noise], ...]:
+    """Probability and Noise of each point of a NoisePosterior over which estimates are averaged.
 
-    Each point has the root mean square exp(mu + s^2) of its log-normal noise parameters.
-    `mode` (3,), with its `value`, and `covariance` (3, 3) are of the logarithms.
+    They lie along the slip, each with the most probable factors, by NormalEquations at the
+    solution. Each point has the root mean square exp(mu + s^2) of its log-normal noise parameters.
     """
+    mode = np.log(posterior.noise)
+    covariance = posterior.covariance
     sigma = np.sqrt(covariance[0, 0])
     if sigma < SINGLE_POINT_SIGMA:                       # 0 where the slip is known
         return ((1.0, _noise_of(mode + np.diag(covariance))),)
     direction = covariance[0] / sigma                    # (3,) for one sigma of log slip
-    log_density = np.full(len(POINT_OFFSETS), value)
-    for k in np.flatnonzero(POINT_OFFSETS):
-        log_density[k] = log_posterior(mode + POINT_OFFSETS[k] * direction)
+    log_density = np.array([_log_posterior(equations, mode + offset * direction)
+                            for offset in POINT_OFFSETS])
     weight = np.exp(log_density - log_density.max())
     weight /= weight.sum()
     remaining = covariance - np.outer(direction, direction)      # given the slip
     variance = np.maximum(np.diag(remaining), 0)
-    points = []
-    for offset, probability in zip(POINT_OFFSETS, weight.tolist()):
-        if probability > MIN_POINT_WEIGHT:
-            points.append((probability, _noise_of(mode + offset * direction + variance)))
-    return tuple(points)
+    return tuple((probability, _noise_of(mode + offset * direction + variance))
+                 for offset, probability in zip(POINT_OFFSETS, weight.tolist())
+                 if probability > MIN_POINT_WEIGHT)

@@ -77,14 +77,18 @@ def estimate(dataset: Dataset, slip: float | None = None, model: str | None = No
     dataset = replace(dataset, vehicle=changed(dataset.vehicle, options, "estimate"))
     log.info("estimate of %s: %d poses", dataset.name, len(dataset.ticks))
 
-    def solve(jumps=NO_JUMPS, places=None):
+    def start(jumps=NO_JUMPS, places=None, like=None):
         aruco = dataset.aruco
         if places is not None:
             aruco = replace(aruco, marker=places[:, 1])
         measurements = measure(replace(dataset, aruco=aruco), poses, jumps)           # 1
         if previous is not None:
-            return calibrated(fit_from_previous(measurements, previous, model))
-        fit = fit_from_odometry(measurements, model or "arc")                         # 2 to 6
+            return fit_from_previous(measurements, previous, model)
+        return fit_from_odometry(measurements, model or "arc", like)                  # 2 to 6
+
+    def decide(fit):                                                                  # 6
+        if previous is not None:
+            return calibrated(fit)
         if model is not None:
             return calibrated(fit)
         fit = calibrated(better_model(fit))
@@ -93,10 +97,10 @@ def estimate(dataset: Dataset, slip: float | None = None, model: str | None = No
         return fit if other is fit else calibrated(other)
 
     if previous is not None and len(previous.rejected):
-        fit = solve(previous.jumps, previous.places)
+        fit = decide(start(previous.jumps, previous.places))
         places = previous.places
     else:
-        fit, places = most_consistent(dataset, solve)
+        fit, places = most_consistent(dataset, start, decide)
     fit = settled(fit)
     by_gtsam = solve_by_gtsam(fit)
     result = replace(slam_result(fit, by_gtsam), places=places)                       # 7
@@ -118,11 +122,21 @@ def require_same_drive(dataset: Dataset, previous: SlamResult | None):
             f"counts, found one of {len(ticks)} poses")
 
 
-def fit_from_odometry(measurements: Measurements, model: str = "arc") -> Fit:
-    """The Fit of Measurements with start values by odometry; raises DatasetError as `estimate`."""
+def fit_from_odometry(measurements: Measurements, model: str = "arc",
+                      like: Fit | None = None) -> Fit:
+    """The Fit of Measurements with start values by odometry; raises DatasetError as `estimate`.
+
+    `like` is a Fit whose model of the steps, released groups and order of memory it takes over.
+    """
+    if like is not None:
+        model = like.problem.odometry.model
     problem = build_problem(measurements, model)                                      # 2
     state = narrow_kernels(problem, initial_state(measurements, model))               # 4, 5
-    return memory_or_slip(problem, state)                                             # 6
+    if like is None:
+        return memory_or_slip(problem, state)                                         # 6
+    decided = like.problem
+    problem = replace(problem, prior=decided.prior, memory_first=decided.memory_first)
+    return refine(problem, replace(state, c=like.state.c))
 
 
 def fit_from_previous(measurements: Measurements, previous: SlamResult,

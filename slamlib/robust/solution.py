@@ -309,14 +309,9 @@ def solve_by_gtsam(fit: Fit) -> GtsamSolution:
     return averaged(fit, graph, found, start)
 
 
-def noise_points(fit: Fit) -> tuple[tuple[float, Noise], ...]:
-    """Probability and Noise of each point over which a Fit is averaged, one if it is known."""
-    return fit.posterior.points if fit.posterior else ((1.0, fit.problem.noise),)
-
-
 def solved_noise(fit: Fit) -> Noise:
     """The Noise of the graph that is solved: that of the only point, or the most probable one."""
-    points = noise_points(fit)
+    points = fit.noise_points
     return points[0][1] if len(points) == 1 else fit.problem.noise
 
 
@@ -325,7 +320,7 @@ def averaged(fit: Fit, graph: gtsam.NonlinearFactorGraph, found: GaussNewton,
     """The GtsamSolution by the moments over the noise's posterior at the solution of a graph."""
     problem = fit.problem
     values = found.values
-    points = noise_points(fit)
+    points = fit.noise_points
     weights = np.array([weight for weight, _ in points])
     weights /= weights.sum()
     marginals = [found.marginals]
