@@ -36,7 +36,7 @@ from slamlib.robust.calibration import RADII, WHEEL_SCALE, WHEELS, Prior
 from slamlib.robust.error_memory import runs
 from slamlib.robust.factors import odometry_error, preintegrate_odometry
 from slamlib.robust.fit import Fit, accepted_measurements, refine, residuals
-from slamlib.robust.jumps import NO_JUMPS, Jumps, find_jumps
+from slamlib.robust.jumps import NO_JUMPS, UNKNOWN_SIGMA, Jumps, find_jumps
 from slamlib.robust.linear import (
     NormalEquations,
     Problem,
@@ -315,17 +315,20 @@ def most_consistent(
     `start` makes the Fit of Jumps and of places, undecided or with the decisions that another Fit
     is `like`, and `decide` decides. Jumps of odometry, or else places of ids, are believed where
     they spare most of the sightings that are rejected without them, with the same decisions. A few
-    jumps need no such support. Where a solution stretches odometry beyond the slip that it learned,
-    most of all over a way without markers, one more jump is believed if the evidence leads
-    decisively.
+    jumps are also believed if the evidence leads, or no marker tells them. Where a solution
+    stretches odometry beyond the slip that it learned, most of all over a way without markers, one
+    more jump is believed if the evidence leads decisively.
     """
     jumps = find_jumps(dataset)
-    are_doubtful = len(jumps.start) > 0 and not jumps.are_few
-    fit = decide(start(replace(NO_JUMPS, lag=jumps.lag) if are_doubtful else jumps))
-    if are_doubtful and spares_sightings(start(jumps, like=fit), fit, "jumps"):
+    found = len(jumps.start)
+    no_jumps = replace(NO_JUMPS, lag=jumps.lag)
+    fit = decide(start(jumps if jumps.are_few else no_jumps))
+    if jumps.are_few:
+        without = start(no_jumps, like=fit)
+        fit = without if _are_needless(fit, without) else fit
+    elif found and spares_sightings(start(jumps, like=fit), fit, "jumps"):
         fit = decide(start(jumps))
-    log.info("jumps: %d of %d are believed", len(fit.problem.measurements.jumps.start),
-             len(jumps.start))
+    log.info("jumps: %d of %d are believed", len(fit.problem.measurements.jumps.start), found)
     if has_rejected_visits(fit):
         places = places_of_ids(dataset.aruco, partial(start, like=fit))
         if places is not None and spares_sightings(
@@ -338,6 +341,16 @@ def most_consistent(
         if lead > MIN_JUMP_LEAD:
             return decide(start(jumps)), None
     return fit, None
+
+
+def _are_needless(fit, without):
+    """Whether the jumps of a Fit, told by markers, explain no more than one without them."""
+    jumps = fit.problem.measurements.jumps
+    if (jumps.sigma >= UNKNOWN_SIGMA).any():
+        return False
+    lead = fit.log_density - without.log_density
+    log.info("jumps: log evidence %+.1f", lead)
+    return lead < MIN_JUMP_LEAD and not spares_sightings(fit, without, "jumps")
 
 
 def with_stretched(fit: Fit) -> Jumps | None:

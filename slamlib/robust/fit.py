@@ -38,7 +38,6 @@ MAX_DIRECT = 3.3             # sigmas, of a range's residual; longer ones are ec
 
 CAUCHY_SCALES = (100.0, 30.0, 10.0, 3.0)     # sigmas, scale of the kernel in each round
 ROUGH = 1e-4                 # relative decrease of the error at which a round ends
-ROUGH_STEPS = 15             # number of steps at which it ends in any case
 MIN_RESIDUALS = 20           # number of measurements from which their scatter gives a factor
 MEDIAN_CHI2 = {3: 2.366, 2: 1.386, 1: 0.455}         # medians by degrees of freedom
 
@@ -120,8 +119,7 @@ def narrow_kernels(
             problem = replace(problem, noise=noise_of_scatter(problem, state))
         cauchy = noiseModel.mEstimator.Cauchy.Create(scale)
         accepted = accept_all(problem.measurements, cauchy)
-        optimum = optimize(
-            replace(problem, accepted=accepted), state, max_steps=ROUGH_STEPS, tolerance=ROUGH)
+        optimum = optimize(replace(problem, accepted=accepted), state, tolerance=ROUGH)
         state = optimum.state
         log.info("Cauchy kernel of %g sigmas: error %.6g after %d steps",
                  scale, optimum.equations.error, optimum.steps)

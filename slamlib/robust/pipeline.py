@@ -18,7 +18,7 @@ from slamlib.core.records import Dataset
 from slamlib.core.vehicle import changed
 from slamlib.robust.choices import better_model, calibrated, memory_or_slip, most_consistent
 from slamlib.robust.fit import CAUCHY_SCALES, Fit, narrow_kernels, refine, settled
-from slamlib.robust.initialization import initial_state, state_from_poses
+from slamlib.robust.initialization import initial_state, state_from_poses, with_consensus
 from slamlib.robust.jumps import NO_JUMPS
 from slamlib.robust.linear import build_problem
 from slamlib.robust.measurements import Measurements, Noise, measure
@@ -126,17 +126,20 @@ def fit_from_odometry(measurements: Measurements, model: str = "arc",
                       like: Fit | None = None) -> Fit:
     """The Fit of Measurements with start values by odometry; raises DatasetError as `estimate`.
 
-    `like` is a Fit whose model of the steps, released groups and order of memory it takes over.
+    `like` is a Fit whose decisions it takes over: the model of the steps, groups of the calibration
+    with their explanations, and the order of memory.
     """
     if like is not None:
         model = like.problem.odometry.model
     problem = build_problem(measurements, model)                                      # 2
     state = narrow_kernels(problem, initial_state(measurements, model))               # 4, 5
+    state = with_consensus(problem, state)
     if like is None:
         return memory_or_slip(problem, state)                                         # 6
     decided = like.problem
     problem = replace(problem, prior=decided.prior, memory_first=decided.memory_first)
-    return refine(problem, replace(state, c=like.state.c))
+    fit = refine(problem, replace(state, c=like.state.c))
+    return replace(fit, explanations=like.explanations, lead=like.lead)
 
 
 def fit_from_previous(measurements: Measurements, previous: SlamResult,
