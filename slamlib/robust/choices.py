@@ -185,6 +185,17 @@ def _released(fit, proposal):
     return replace(proposed, explanations=proposal.explanations, lead=fit.lead + lead)
 
 
+class _Sets(NamedTuple):
+    """s sets of groups that may leave what is stated, by the likelihood of the calibration."""
+
+    groups: list[frozenset]      # (s,)
+    priors: list[Prior]          # (s,)
+    roots: np.ndarray            # (s, p, p) of the priors, in wide sigmas
+    evidence: np.ndarray         # (s,) log evidence
+    merit: np.ndarray            # (s,) log evidence less the prices of the groups
+    furthest: np.ndarray         # (s,) largest posterior mean of an unknown, in its sigmas
+
+
 def _proposal(fit):
     """The _Proposal of the groups of the calibration of a Fit that the evidence wants released.
 
@@ -197,40 +208,57 @@ def _proposal(fit):
     """
     calibration = fit.problem.measurements.calibration
     L, h = _likelihood(fit)
-    informed = np.diag(L) > 0
-    doubtful = informed & (calibration.wide > calibration.sigma)
+    for width in (1.0, GROSS):
+        sets = _sets(calibration, L, h, width)
+        k = int(sets.merit.argmax())
+        best = sets.groups[k]
+        if not best or sets.furthest[k] < MAX_WIDE_SIGMAS:
+            break
+    close = np.flatnonzero(sets.merit > sets.merit[k] - AMBIGUOUS)
+    told = [sets.groups[each] for each in close]
+    explanations = tuple(some for some in told if not (some < best or some > best))
+    k = _released_set(calibration, L, h, sets, certain=frozenset().union(*told), default=k)
+    present = _log_evidence(L, h, _in_wide_sigmas(calibration, L, fit.problem.prior.root))[0]
+    return _Proposal(explanations, sets.priors[k], sets.evidence[k] - present)
+
+
+def _sets(calibration, L, h, width):
+    """The _Sets of up to MAX_GROUPS groups of which the likelihood of L (p, p), h (p,) tells.
+
+    Their wide standard deviations are multiplied by a width.
+    """
+    doubtful = (np.diag(L) > 0) & (calibration.wide > calibration.sigma)
     groups = np.unique(calibration.group[doubtful]).tolist()
     if doubtful[RADII].all():
         groups.append(WHEEL_SCALE)
     price = {group: _price(calibration, group) for group in groups}
     sets = [frozenset(some) for count in range(MAX_GROUPS + 1)
             for some in combinations(groups, count)]
-    price_of_set = np.array([sum(price[group] for group in some) for some in sets])
-    scale = informed / calibration.wide[:, None]         # to wide sigmas, of what is informed
-    for width in (1.0, GROSS):
-        priors = [calibration.prior(some, width) for some in sets]
-        roots = np.array([prior.root for prior in priors])
-        evidence, furthest = _log_evidence(L, h, roots * scale)
-        merit = evidence - price_of_set
-        k = int(merit.argmax())
-        best = sets[k]
-        if not best or furthest[k] < MAX_WIDE_SIGMAS:
-            break
-    close = [sets[k] for k in np.flatnonzero(merit > merit.max() - AMBIGUOUS)]
-    explanations = tuple(some for some in close if not (some < best or some > best))
-    certain = frozenset().union(*close)
-    is_stated = {group: calibration.sigma[calibration.of_group(group)].all() for group in groups}
-    surprise = np.array([STATED * sum(is_stated[group] for group in some) for some in sets])
-    released = k
-    for j in np.argsort(surprise - evidence):            # the most probable set first
-        if not certain <= sets[j]:
-            continue
-        untold = [calibration.of_group(group) for group in sets[j] - certain]
-        if _are_plausible(L, h, roots[j] * scale, untold):
-            released = j
-            break
-    present = _log_evidence(L, h, fit.problem.prior.root * scale)[0]
-    return _Proposal(explanations, priors[released], evidence[released] - present)
+    priors = [calibration.prior(some, width) for some in sets]
+    roots = _in_wide_sigmas(calibration, L, np.array([prior.root for prior in priors]))
+    evidence, furthest = _log_evidence(L, h, roots)
+    prices = np.array([sum(price[group] for group in some) for some in sets])
+    return _Sets(sets, priors, roots, evidence, evidence - prices, furthest)
+
+
+def _in_wide_sigmas(calibration, L, roots):
+    """Roots (..., p, p) of priors in wide sigmas, 0 of entries that L (p, p) does not inform."""
+    return (np.diag(L) > 0)[:, None] / calibration.wide[:, None] * roots
+
+
+def _released_set(calibration, L, h, sets, certain, default):
+    """Number of the most probable of the _Sets that holds `certain`, and else what is plausible.
+
+    Fully stated groups are less probable by STATED each. It is the `default` if there is none.
+    """
+    stated = {group: calibration.sigma[calibration.of_group(group)].all()
+              for group in frozenset().union(*sets.groups)}
+    surprise = STATED * np.array([sum(stated[group] for group in some) for some in sets.groups])
+    for k in np.argsort(surprise - sets.evidence):
+        untold = [calibration.of_group(group) for group in sets.groups[k] - certain]
+        if certain <= sets.groups[k] and _are_plausible(L, h, sets.roots[k], untold):
+            return k
+    return default
 
 
 def _are_plausible(L, h, root, groups):
