@@ -311,10 +311,9 @@ def _updated(state, sightings, row, memory, variance):
     `variance` (h, 1, 1) is over that of the sightings.
     """
     seen = np.flatnonzero(sightings.row == row)
-    is_known = np.isin(sightings.marker[seen], state.marker)
-    known = seen[is_known]
-    new = seen[~is_known]
-    number = np.nonzero(sightings.marker[known, None] == state.marker)[1]
+    place, number = np.nonzero(sightings.marker[seen, None] == state.marker)
+    known = seen[place]
+    new = np.delete(seen, place)
     new_part = variance * (1 - memory**2)
     C = new_part[:, None] * sightings.C[known]
     state, accepted = _measured(state, number, sightings.z[known], C)
