@@ -13,7 +13,7 @@ from numeric import (
     counts,
     short,
     sightings,
-    true_markers,
+    standing,
     vehicle,
 )
 from numpy.testing import assert_allclose
@@ -239,29 +239,10 @@ def test_the_doubt_names_three_stretches_and_counts_the_others():
     assert sentence.count("between") == 3 and "and 2 more times" in sentence
 
 
-def creeping(dataset, truth, at, rows, count):
-    """A drive that stands for so many rows at a pose where it sees markers, while counts creep."""
-    seen = dataset.aruco
-    again = seen.select(seen.pose == at)
-    rng = np.random.default_rng(0)
-    frames = [replace(seen, pose=np.where(seen.pose > at, seen.pose + rows, seen.pose))]
-    for later in range(10, rows, 10):
-        error = [rng.multivariate_normal(np.zeros(3), C) for C in again.covariance]
-        z = se2.between(truth.poses[at], true_markers(truth, again.marker)) + error
-        frames.append(replace(again, pose=again.pose + later, marker_in_vehicle=z))
-    joined = {name: np.concatenate([vars(frame)[name] for frame in frames])
-              for name in vars(seen)}
-    order = np.argsort(joined["pose"], kind="stable")
-    ticks = np.insert(dataset.ticks, at + 1, np.full((rows, 2), count), axis=0)
-    standing = np.repeat(truth.poses[at:at + 1], rows, axis=0)
-    return (replace(dataset, ticks=ticks, aruco=replace(seen, **joined).select(order), uwb=None),
-            np.insert(truth.poses, at + 1, standing, axis=0))
-
-
 @pytest.mark.parametrize("count", [2, 10])
 def test_counts_that_creep_while_the_vehicle_stands_say_nothing(count):
     """10 of 127 usual counts a row: half a metre in 600 rows. Believed, they cost 0.15 m."""
-    dataset, poses = creeping(*simulate("short", seed=1), at=600, rows=600, count=count)
+    dataset, poses = standing(*short(1), rows=600, count=count, at=600, every=10)
     found = estimate(dataset)
     assert ate(found.poses, poses, aligned=True) < 4e-3
     assert anees(found.poses, found.covariances, poses) < 5
