@@ -61,6 +61,14 @@ def test_a_jump_of_a_vehicle_that_stands_is_found_where_it_is():
     assert_allclose(found.mended(np.arange(12), np.zeros((12, 3))), poses, atol=1e-6)
 
 
+@pytest.mark.parametrize("contradicted, dead", [([3], []), ([2, 3, 7], [1, 2, 3, 4, 5, 6, 7])])
+def test_a_dead_wheel_by_hand(contradicted, dead):
+    """Zeros from row 10 to 26; of the other wheel from 35 on: steps 2 to 4 and 7 are silent."""
+    ticks, frame = np.ones((41, 2), int), np.arange(0, 41, 5)
+    ticks[10:27, 0] = ticks[35:, 1] = 0
+    assert jumps._dead(ticks, frame, contradicted).tolist() == dead
+
+
 def test_a_jump_is_where_most_contradicting_pairs_span_it():
     """Rooms A, B, again A, B; carried from B to A. No marker is seen from two rooms."""
     poses = np.zeros((40, 3))

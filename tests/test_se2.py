@@ -77,6 +77,11 @@ def test_ate_and_path_length_by_hand():
     assert np.isnan(evaluation.ate(np.full_like(truth, np.nan), truth))
 
 
+def test_an_aligned_path_has_no_error():
+    truth = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0]])
+    assert evaluation.ate(se2.compose([3, -1, 0.7], truth), truth, aligned=True) < 1e-12
+
+
 def test_nees_by_hand_and_across_the_cut_of_the_heading():
     """Whole turns are no error; a known pose has none."""
     C = np.array([[4, 1, 0.01], [4, 1, 0.01], [1e-4, 1e-4, 1e4], [0, 0, 1e-8]])[:, None] * np.eye(3)
