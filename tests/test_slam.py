@@ -84,28 +84,25 @@ def learned_noise(seed, slip):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("slip, drives, ratio", [(0.0, 8, 1.3), (3e-3, 6, 1.05), (1e-2, 8, 1.3)])
-def test_a_slip_that_is_not_known_widens_the_covariance(slip, drives, ratio):
+@pytest.mark.parametrize("slip", [0.0, 1e-2])
+def test_a_slip_that_is_not_known_widens_the_covariance(slip):
     """No overconfidence, and nearly the accuracy of the graph that knows the slip.
 
     A usual slip is in `test_monte_carlo_is_consistent`. The mean NEES is at most 1.35 times that
     with the slip known or 3.6, whichever is larger, and no drive is above 16. With correct labels
     few sightings are rejected, and a large slip is learned from the typical one.
     """
-    runs = studies.run(learned_noise, range(3000, 3000 + drives), slip=slip)
+    runs = studies.run(learned_noise, range(3000, 3008), slip=slip)
     most = max(1.35 * runs["known nees"].mean(), 3.6)
     for problem in ("learned nees", "both nees"):
         assert runs[problem].mean() < most and runs[problem].max() < 16
     squared = (runs[["learned ate", "known ate"]]**2).mean()
-    assert squared["learned ate"] < ratio**2 * squared["known ate"]
+    assert squared["learned ate"] < 1.3**2 * squared["known ate"]
     if slip:
         assert runs["rejected"].mean() < 6                       # gate: 0.1 % of about 900
         assert 0.85 < np.exp(np.log(runs["slip"] / slip).mean()) < 1.15
         assert_consistent(runs["learned nees"], probability=0.999)
         assert runs["arc"].mean() > 0.8
-    if slip == 3e-3:
-        assert_allclose(runs["slip"], slip, rtol=0.3)
-        assert_allclose(runs["learned nees"], runs["known nees"], rtol=0.3)
 
 
 def test_wrong_covariances_of_sightings_are_scaled():
@@ -218,19 +215,14 @@ def test_the_gate_rejects_wrong_labels_and_hardly_any_others():
     assert numbers["quadratic wrong rejected"] == numbers["quadratic good lost"] == 0
 
 
-@pytest.mark.parametrize("marker, place, expected", [
-    ([12, 12, 12, 7, 7], [0, 1, 2, 0, 1], [12, 112, 212, 7, 107]),
-    ([-7, 93, -7, 0, 0], [0, 0, 1, 0, 1], [-7, 93, -107, 0, 100]),      # 93 is -7 + 100
-    ([-12, 2, 2], [0, 0, 1], [-12, 2, 102])])
-def test_a_second_place_gets_a_readable_id_that_the_drive_does_not_have(marker, place, expected):
-    found = ids_of_places(np.array(marker), np.array(place))
-    assert_array_equal(found, expected)
-    assert len({*found}) == len({*zip(marker, place)})
+def test_a_second_place_gets_a_readable_id_that_the_drive_does_not_have():
+    """Marker 93 is -7 + 100."""
+    found = ids_of_places(np.array([-7, 93, -7, 0, 0, 12, 12]), np.array([0, 0, 1, 0, 1, 0, 2]))
+    assert_array_equal(found, [-7, 93, -107, 0, 100, 12, 212])
 
 
 OPEN_PATHS = {                                            # legs of (metres, radians)
     "straight": [(25, 0)],
-    "building": [(9, 0), (0.8, np.pi / 2), (7, 0), (0.8, -np.pi / 2), (10, 0)],
     "spiral": [(2 + 0.8 * k, np.pi / 2) for k in range(6)]}
 
 
