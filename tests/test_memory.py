@@ -36,16 +36,6 @@ def test_independent_errors_keep_all_their_information():
     assert found.sigma == pytest.approx(1 / np.sqrt(LANDMARKS * (EACH - 1) * 3))
 
 
-@pytest.mark.parametrize("part", [0, 1])
-def test_equal_errors_count_once(part):
-    """Equal errors of unit variance; also where the landmark takes over a part of all of them."""
-    error = np.random.default_rng(1).standard_normal((LANDMARKS, 1, 3))
-    error *= np.sqrt((1 - part / 2) / np.mean(error**2))
-    found = error_memory(*tracks(np.repeat(error, EACH, axis=1)))
-    assert_allclose(found.share, 1 / EACH)
-    assert found.correlation == pytest.approx(1)
-
-
 def test_shares_by_hand():
     """Pairs of equal errors: neighbours correlate by 1, the fourth of four with two others not."""
     error = np.repeat(np.random.default_rng(2).standard_normal((LANDMARKS, 5, 3)), 2, axis=1)
