@@ -107,12 +107,13 @@ def test_wrong_covariances_of_sightings_are_scaled():
     dataset = short(61)[0].without("uwb")
     expected = estimate(dataset)
     found = estimate(aruco(dataset, covariance=dataset.aruco.covariance / 16))
-    assert abs(np.log(found.noise.sightings / 4)) < 4 * found.noise_sigma[1]
-    assert 0.005 < found.noise_sigma[1] < 0.03               # about 2700 errors: 1 / sqrt(2 * 2700)
+    sigma = found.noise_sigma[1]
+    assert abs(np.log(found.noise.sightings / 4)) < 4 * sigma
+    assert 0.005 < sigma < 0.03                              # about 2700 errors: 1 / sqrt(2 * 2700)
     off = (found.poses - expected.poses)[1:] / sigmas(expected.covariances)[1:]
     assert np.abs(off).max() < 0.5
-    assert_allclose(found.covariances[-1], expected.covariances[-1], rtol=0.2,
-                               atol=0.1 * expected.covariances[-1].max())
+    C = expected.covariances[-1]
+    assert_allclose(found.covariances[-1], C, rtol=0.2, atol=0.1 * C.max())
 
 
 @pytest.mark.parametrize("poses, slip", [(2000, 1e-3), (300, 0.0)])
