@@ -107,6 +107,15 @@ def carried(d, begin, end):
     return replace(d, ticks=np.delete(d.ticks, slice(begin, end), axis=0), **readings)
 
 
+def seen_from(dataset, camera=(0.0, 0.0, 0.0), size=1.0):
+    """The dataset of a camera elsewhere, of larger markers."""
+    z = se2.between(np.array(camera), dataset.aruco.marker_in_vehicle)
+    covariance = se2.rotate_covariance(dataset.aruco.covariance, -camera[2])
+    scale = np.array([size, size, 1])
+    return aruco(dataset, marker_in_vehicle=z / scale,
+                 covariance=covariance / np.outer(scale, scale))
+
+
 def standing(dataset, truth, rows, count, at=0, every=1):
     """The Dataset of a drive that stands for some rows at pose `at`, and its poses.
 

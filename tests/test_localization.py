@@ -13,6 +13,7 @@ from numeric import (
     map_nees,
     mean_nees,
     on_real_logs,
+    seen_from,
     short,
     sightings,
     standing,
@@ -250,8 +251,7 @@ def test_slow_errors_of_the_sightings_are_counted_once(memory, most):
 def test_a_camera_that_is_turned_is_found():
     """By 0.08 rad, as vehicle.toml does not state it; nothing is found where it is as stated."""
     dataset, truth = short(3, 1000)
-    fused = fuse(aruco(dataset, marker_in_vehicle=se2.compose(
-        [0, 0, -0.08], dataset.aruco.marker_in_vehicle)))
+    fused = fuse(seen_from(dataset, (0.0, 0.0, 0.08)))
     assert_allclose(fused.camera[2], 0.08, atol=0.005)
     assert mean_nees(fused, truth) < 6
     assert_array_equal(fuse(dataset).camera, [0, 0, 0])
