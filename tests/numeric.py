@@ -9,6 +9,7 @@ import pytest
 from scipy.stats import t
 
 from slamlib import estimate
+from slamlib.core import se2
 from slamlib.core.evaluation import anees, ate, nees, nees_band
 from slamlib.core.records import ArucoReadings
 from slamlib.studies import montecarlo
@@ -104,6 +105,36 @@ def carried(d, begin, end):
         each = each.select((each.pose < begin) | (each.pose >= end))
         readings[name] = replace(each, pose=each.pose - (end - begin) * (each.pose >= end))
     return replace(d, ticks=np.delete(d.ticks, slice(begin, end), axis=0), **readings)
+
+
+def seen_from(dataset, camera=(0.0, 0.0, 0.0), size=1.0):
+    """The dataset of a camera elsewhere, of larger markers."""
+    z = se2.between(np.array(camera), dataset.aruco.marker_in_vehicle)
+    covariance = se2.rotate_covariance(dataset.aruco.covariance, -camera[2])
+    scale = np.array([size, size, 1])
+    return aruco(dataset, marker_in_vehicle=z / scale,
+                 covariance=covariance / np.outer(scale, scale))
+
+
+def standing(dataset, truth, rows, count, at=0, every=1):
+    """The Dataset of a drive that stands for some rows at pose `at`, and its poses.
+
+    It sees its markers there every few rows, while the counts creep by `count` a row.
+    """
+    seen = dataset.aruco
+    here = np.flatnonzero(seen.pose == at)
+    row = np.repeat(np.arange(every, rows + 1, every), len(here))
+    again = np.tile(here, rows // every)
+    errors = errors_of(seen.covariance[again], np.random.default_rng(0))
+    z = se2.between(truth.poses[at], true_markers(truth, seen.marker[again])) + errors
+    pose = np.append(np.where(seen.pose > at, seen.pose + rows, seen.pose), at + row)
+    order = np.argsort(pose, kind="stable")
+    longer = replace(
+        seen.select(np.append(np.arange(len(seen.pose)), again)[order]), pose=pose[order],
+        marker_in_vehicle=np.append(seen.marker_in_vehicle, z, axis=0)[order])
+    ticks = np.insert(dataset.ticks, at + 1, np.full((rows, 2), count), axis=0)
+    poses = np.insert(truth.poses, at + 1, np.tile(truth.poses[at], (rows, 1)), axis=0)
+    return replace(dataset, ticks=ticks, aruco=longer, uwb=None), poses
 
 
 def known_noise(dataset, slip):

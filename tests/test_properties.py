@@ -5,6 +5,7 @@
 
 import json
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from test_dataset import FILES, write
 
 from slamlib.core import odometry, se2
 from slamlib.core.errors import DatasetError
+from slamlib.core.records import AntennaGuess
 from slamlib.core.vehicle import Vehicle
 from slamlib.io.dataset import dataset_from_arrays, read_dataset, read_truth
 from slamlib.robust.file_doubts import doubts_before_solving
@@ -183,51 +185,43 @@ SMALLEST = 1e-9            # m and rad, sigma of what has none: position of pose
 LEARNED = 0.05
 
 
-def estimates(dataset, numbers=None, factor=(1, 1, 1)):
-    """Ids (m,), values (m, d) and covariances (m, d, d) of poses and maps, sorted by id.
-
-    Ids become `numbers` (dict), and values [x, y, heading] are multiplied by `factor`.
-    """
+def estimates(dataset):
+    """Name, ids (m,), values (m, d) and covariances (m, d, d) of poses and maps."""
     for found in solutions(dataset):
-        poses = np.arange(len(found.poses)), found.poses, found.covariances
-        for kind, each in (("poses", poses), ("markers", found.aruco_map),
-                           ("antennas", found.uwb_map)):
+        yield f"{found.problem} poses", np.zeros(0), found.poses, found.covariances
+        for each in (found.aruco_map, found.uwb_map):
             if each is not None:
-                ids, x, C = each
-                if numbers and kind != "poses":
-                    ids = np.array([numbers[i] for i in ids.tolist()])
-                order = np.argsort(ids)
-                by = np.array(factor[:x.shape[1]])
-                C = C * np.outer(by, by)
-                yield f"{found.problem} {kind}", ids[order], by * x[order], C[order]
+                yield f"{found.problem} map", *each
+
+
+def backwards(readings):
+    """Readings in the opposite order at each pose."""
+    return readings.select(np.lexsort((-np.arange(len(readings.pose)), readings.pose)))
 
 
 @pytest.mark.slow
 def test_ids_the_order_of_rows_and_the_side_are_names_only():
-    """Other ids in tables in the opposite order; and the same drive in a mirror."""
+    """Negative ids, and rows in the opposite order; and the same drive in a mirror."""
     dataset, _ = short(7, 1000, late_ranges=0.1, mislabelled=0.02)
-    a, u, guess = dataset.aruco, dataset.uwb, dataset.antenna_guess
-    C = a.covariance[:, *np.triu_indices(3)]
-    rows = {"aruco": np.column_stack([a.pose + 1, a.marker, a.marker_in_vehicle, C]),
-            "uwb": np.column_stack([u.pose + 1, u.antenna, u.range, u.sigma]),
-            "guess": np.column_stack([guess.antenna, guess.position])}
-    ids = np.unique(np.r_[a.marker, guess.antenna])
-    new = np.random.default_rng(0).permutation(ids)
-    renamed = {name: table[::-1].copy() for name, table in rows.items()}
-    for name, column in (("aruco", 1), ("uwb", 1), ("guess", 0)):
-        renamed[name][:, column] = new[np.searchsorted(ids, renamed[name][:, column])]
-    side = {"aruco": [1, 1, 1, -1, -1, 1, -1, -1, 1, 1, 1], "uwb": 1, "guess": [1, 1, -1]}
-    mirrored = {name: table * side[name] for name, table in rows.items()}
-    numbers = dict(zip(ids.tolist(), new.tolist()))
-    for ticks, tables, changes in (
-            (dataset.ticks, renamed, {"numbers": numbers}),
-            (dataset.ticks[:, ::-1], mirrored, {"factor": (1, -1, -1)})):
-        others = estimates(dataset_from_arrays(ticks, **tables, vehicle=dataset.vehicle))
-        for (name, expected, x, C), (_, found, other, other_C) in zip(
-                estimates(dataset, **changes), others, strict=True):
-            assert_array_equal(found, expected, err_msg=name)
-            off = other - x
+    a = backwards(dataset.aruco)
+    u = backwards(dataset.uwb)
+    guess = dataset.antenna_guess
+    straight = [*estimates(dataset)]
+    for sign, side in ((-1, 1), (1, -1)):
+        mirror = np.array([1, side, side])
+        other = replace(
+            dataset, ticks=dataset.ticks[:, ::side], uwb=replace(u, antenna=sign * u.antenna),
+            aruco=replace(a, marker=sign * a.marker, covariance=np.outer(mirror, mirror) *
+                          a.covariance, marker_in_vehicle=mirror * a.marker_in_vehicle),
+            antenna_guess=AntennaGuess(sign * guess.antenna[::sign],
+                                       mirror[:2] * guess.position[::sign]))
+        for (name, ids, x, C), (_, found, y, C_y) in zip(straight, estimates(other), strict=True):
+            assert_array_equal(found, sign * ids[::sign], err_msg=name)
+            order = sign if len(ids) else 1
+            by = mirror[:x.shape[1]]
+            off = y - by * x[::order]
             off[:, 2:] = se2.wrap(off[:, 2:])
-            sigma = sigmas(C) + SMALLEST
-            for share in (off / sigma, (other_C - C) / (sigma[:, :, None] * sigma[:, None])):
+            change = C_y - np.outer(by, by) * C[::order]
+            sigma = sigmas(C_y) + SMALLEST
+            for share in (off / sigma, change / (sigma[:, :, None] * sigma[:, None])):
                 assert_allclose(share, 0 * share, 0, LEARNED, err_msg=name)

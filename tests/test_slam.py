@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numeric import (
-    aligned_ate,
     aruco,
     as_points,
     assert_consistent,
@@ -33,19 +32,17 @@ from slamlib.core.vehicle import Vehicle
 from slamlib.robust import factors, initialization
 from slamlib.robust.choices import DECISIVE_LEAD, better_model, ids_of_places
 from slamlib.robust.fit import accepted_measurements
-from slamlib.robust.initialization import GROWTH, part_lengths
+from slamlib.robust.initialization import GROWTH, odometry_state, part_lengths
 from slamlib.robust.linear import (
     NormalEquations,
     build_problem,
     laplace_approximation,
-    state_from_arrays,
 )
 from slamlib.robust.measurements import NOISE_KEYS, Noise, measure
 from slamlib.robust.noise import learn_noise
 from slamlib.robust.pipeline import fit_from_odometry
 from slamlib.robust.result import slam_result
 from slamlib.studies import kernels, montecarlo, simulation
-from slamlib.studies.simulation import simulate
 
 COUNT = 2 * np.pi * 0.1 / 8000                            # m
 
@@ -84,28 +81,25 @@ def learned_noise(seed, slip):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("slip, drives, ratio", [(0.0, 8, 1.3), (3e-3, 6, 1.05), (1e-2, 8, 1.3)])
-def test_a_slip_that_is_not_known_widens_the_covariance(slip, drives, ratio):
+@pytest.mark.parametrize("slip", [0.0, 1e-2])
+def test_a_slip_that_is_not_known_widens_the_covariance(slip):
     """No overconfidence, and nearly the accuracy of the graph that knows the slip.
 
     A usual slip is in `test_monte_carlo_is_consistent`. The mean NEES is at most 1.35 times that
     with the slip known or 3.6, whichever is larger, and no drive is above 16. With correct labels
     few sightings are rejected, and a large slip is learned from the typical one.
     """
-    runs = studies.run(learned_noise, range(3000, 3000 + drives), slip=slip)
+    runs = studies.run(learned_noise, range(3000, 3008), slip=slip)
     most = max(1.35 * runs["known nees"].mean(), 3.6)
     for problem in ("learned nees", "both nees"):
         assert runs[problem].mean() < most and runs[problem].max() < 16
     squared = (runs[["learned ate", "known ate"]]**2).mean()
-    assert squared["learned ate"] < ratio**2 * squared["known ate"]
+    assert squared["learned ate"] < 1.3**2 * squared["known ate"]
     if slip:
         assert runs["rejected"].mean() < 6                       # gate: 0.1 % of about 900
         assert 0.85 < np.exp(np.log(runs["slip"] / slip).mean()) < 1.15
         assert_consistent(runs["learned nees"], probability=0.999)
         assert runs["arc"].mean() > 0.8
-    if slip == 3e-3:
-        assert_allclose(runs["slip"], slip, rtol=0.3)
-        assert_allclose(runs["learned nees"], runs["known nees"], rtol=0.3)
 
 
 def test_wrong_covariances_of_sightings_are_scaled():
@@ -113,12 +107,13 @@ def test_wrong_covariances_of_sightings_are_scaled():
     dataset = short(61)[0].without("uwb")
     expected = estimate(dataset)
     found = estimate(aruco(dataset, covariance=dataset.aruco.covariance / 16))
-    assert abs(np.log(found.noise.sightings / 4)) < 4 * found.noise_sigma[1]
-    assert 0.005 < found.noise_sigma[1] < 0.03               # about 2700 errors: 1 / sqrt(2 * 2700)
+    sigma = found.noise_sigma[1]
+    assert abs(np.log(found.noise.sightings / 4)) < 4 * sigma
+    assert 0.005 < sigma < 0.03                              # about 2700 errors: 1 / sqrt(2 * 2700)
     off = (found.poses - expected.poses)[1:] / sigmas(expected.covariances)[1:]
     assert np.abs(off).max() < 0.5
-    assert_allclose(found.covariances[-1], expected.covariances[-1], rtol=0.2,
-                               atol=0.1 * expected.covariances[-1].max())
+    C = expected.covariances[-1]
+    assert_allclose(found.covariances[-1], C, rtol=0.2, atol=0.1 * C.max())
 
 
 @pytest.mark.parametrize("poses, slip", [(2000, 1e-3), (300, 0.0)])
@@ -218,46 +213,10 @@ def test_the_gate_rejects_wrong_labels_and_hardly_any_others():
     assert numbers["quadratic wrong rejected"] == numbers["quadratic good lost"] == 0
 
 
-@pytest.mark.parametrize("marker, place, expected", [
-    ([12, 12, 12, 7, 7], [0, 1, 2, 0, 1], [12, 112, 212, 7, 107]),
-    ([-7, 93, -7, 0, 0], [0, 0, 1, 0, 1], [-7, 93, -107, 0, 100]),      # 93 is -7 + 100
-    ([-12, 2, 2], [0, 0, 1], [-12, 2, 102])])
-def test_a_second_place_gets_a_readable_id_that_the_drive_does_not_have(marker, place, expected):
-    found = ids_of_places(np.array(marker), np.array(place))
-    assert_array_equal(found, expected)
-    assert len({*found}) == len({*zip(marker, place)})
-
-
-OPEN_PATHS = {                                            # legs of (metres, radians)
-    "straight": [(25, 0)],
-    "building": [(9, 0), (0.8, np.pi / 2), (7, 0), (0.8, -np.pi / 2), (10, 0)],
-    "spiral": [(2 + 0.8 * k, np.pi / 2) for k in range(6)]}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("shape", OPEN_PATHS)
-def test_open_paths_are_solved(shape, monkeypatch):
-    """A marker every 2 m, no loop closure: three drives each, against the graph of known noise.
-
-    On a single drive a learned slip makes the error larger or smaller by chance; their
-    rms is compared.
-    """
-    right, left = COUNT * simulation.manoeuvre(OPEN_PATHS[shape])[1:].T
-    arcs = (right + left) / 2, (right - left) / 0.4
-    layout = replace(simulation.PATHS["short"], marker_spacing=2)
-    monkeypatch.setitem(simulation.PATHS, "open", layout)
-    monkeypatch.setattr(simulation, "_driven_arcs", lambda *_: arcs)
-    values, learned, possible = [], [], []
-    for seed in range(3):
-        dataset, truth = simulate("open", seed)
-        found = estimate(dataset.without("uwb"))
-        known = estimate(known_noise(dataset.without("uwb"), 1e-3), model="arc")
-        learned.append(aligned_ate(found, truth))
-        possible.append(aligned_ate(known, truth))
-        assert found.rejected.mean() < 0.01
-        values.append(mean_nees(found, truth))
-    assert np.linalg.norm(learned) < 1.1 * np.linalg.norm(possible)
-    assert np.mean(values) < nees_band(3, probability=0.999)[1]
+def test_a_second_place_gets_a_readable_id_that_the_drive_does_not_have():
+    """Marker 93 is -7 + 100."""
+    found = ids_of_places(np.array([-7, 93, -7, 0, 0, 12, 12]), np.array([0, 0, 1, 0, 1, 0, 2]))
+    assert_array_equal(found, [-7, 93, -107, 0, 100, 12, 212])
 
 
 def test_parts_of_a_drive_grow_at_most_fourfold_from_where_the_heading_is_lost():
@@ -270,8 +229,6 @@ def test_parts_of_a_drive_grow_at_most_fourfold_from_where_the_heading_is_lost()
     assert all(later <= GROWTH * end + 1 for end, later in zip(ends, ends[1:]))
     sure = Vehicle(sigma_wheelbase=1e-6, sigma_right_radius=1e-6, sigma_left_radius=1e-6)
     assert part_lengths(replace(drive, vehicle=sure)) == [len(ticks)]
-    blind = replace(drive.vehicle, sigma_heading=1.0)  # the same error at all poses loses no turn
-    assert part_lengths(replace(drive, vehicle=blind)) == ends
 
 
 def test_all_parts_of_a_drive_are_solved_one_after_the_other(monkeypatch):
@@ -295,15 +252,15 @@ def test_noise_that_is_known_is_not_learned_and_the_rest_is(known):
     """By an option and by the vehicle alike, from odometry and from a result; sigmas say which."""
     dataset, _ = short(4, 400)
     found = estimate(dataset, **known)
-    by_vehicle = estimate(vehicle(**known)(dataset))
-    assert_array_equal(found.poses, by_vehicle.poses)
-    given = np.array([name in known for name in NOISE_KEYS])
-    for each in (found, estimate(dataset, previous=estimate(dataset.without("uwb")), **known)):
+    assert_array_equal(found.poses, estimate(vehicle(**known)(dataset)).poses)
+    after = estimate(dataset, previous=estimate(dataset.without("uwb")), **known)
+    is_known = np.isin(NOISE_KEYS, [*known])
+    for each in (found, after):
+        assert_array_equal(each.noise_sigma == 0, is_known)
         values = np.array(each.noise)
-        assert_array_equal(each.noise_sigma == 0, given)
-        assert_allclose(values[given], list(known.values()), rtol=1e-12)
+        assert_allclose(values[is_known], [*known.values()], rtol=1e-12)
         assert (values != [1e-3, 1, 1]).all()
-        assert_allclose(values[1:][~given[1:]], 1, atol=0.2)
+        assert_allclose(values[1:][~is_known[1:]], 1, atol=0.2)
     assert np.abs(found.poses[-1] - estimate(dataset).poses[-1]).max() > 1e-6
 
 
@@ -348,12 +305,13 @@ def test_gates_of_poses_points_and_ranges(noise, gates, weights):
     z = 0.01 * np.outer(np.sqrt([16.2, 16.3, 13.8, 13.9]), [1, 0, 0])
     readings = as_points(sightings(4 * [0], range(4), z, 1e-4 * np.eye(3)), slice(2, None))
     at = np.zeros(3, int)
-    ranges = UwbReadings(at, at, 5 + np.array([-0.32, -0.34, 5]), np.full(3, 0.1))
+    ranges = UwbReadings(at, at, np.array([4.68, 4.66, 10]), np.full(3, 0.1))
     place = np.array([[3.0, 4.0]])
     m = measure(Dataset("still", Vehicle(), np.zeros((1, 2), int), readings, ranges,
                         AntennaGuess(at[:1], place)))
-    state = state_from_arrays(m, np.zeros((1, 3)), 0 * z, place, m.calibration.stated)
-    found = accepted_measurements(build_problem(m, "arc", noise), state, *gates)
+    problem = build_problem(m, "arc", noise)
+    there = replace(odometry_state(m, "arc"), markers=0 * z, antennas=place)
+    found = accepted_measurements(problem, there, *gates)
     assert_array_equal(np.r_[found.sightings.weight, found.ranges.weight], weights)
 
 

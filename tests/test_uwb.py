@@ -25,7 +25,6 @@ from scipy.integrate import quad
 
 from slamlib import estimate, studies
 from slamlib.core.evaluation import nees_band
-from slamlib.core.graph import GUESS_PRIOR_SIGMA
 from slamlib.core.kernels import KERNELS, ONE_SIDED
 from slamlib.core.odometry import dead_reckoning
 from slamlib.core.records import AntennaGuess, Dataset, UwbReadings
@@ -164,7 +163,6 @@ def test_late_ranges_only_are_down_weighted_and_counted(late):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("first, options, names", [
-    (700, {}, ["nees", "nees between", "map nees"]),
     (700, {"late_ranges": 0.15}, ["nees", "nees between", "map nees"]),
     (800, {"late_ranges": 0.15, "markers": False}, ["nees", "last nees"])])
 def test_monte_carlo_is_consistent(first, options, names):
@@ -184,16 +182,14 @@ def test_monte_carlo_is_consistent(first, options, names):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("drives, others, options", [
-    (24, ["Huber", "Cauchy"], {"late_ranges": 0.3}),
-    (12, ["Huber"], {"late_ranges": 0.15, "markers": False})])
-def test_the_default_kernel_has_smaller_antenna_errors_than_others(drives, others, options):
+@pytest.mark.parametrize("drives, options", [
+    (24, {"late_ranges": 0.3}), (12, {"late_ranges": 0.15, "markers": False})])
+def test_the_default_kernel_has_smaller_antenna_errors_than_hubers(drives, options):
     """With many late ranges and markers, and without markers; its NEES is in the band."""
     runs = studies.run(kernels.compare, range(drives), kind="ranges",
-                       methods=(*others, "asymmetric Tukey"), **options)
+                       methods=("Huber", "asymmetric Tukey"), **options)
     squared = runs["asymmetric Tukey antenna error"]**2
-    for other in others:
-        assert decided(runs[f"{other} antenna error"]**2 - squared)
+    assert decided(runs["Huber antenna error"]**2 - squared)
     assert_consistent(runs["asymmetric Tukey antenna nees"], 2, 0.999)
     assert nees_band(drives, 2, 0.999)[1] < runs["Huber antenna nees"].mean()
     assert runs["asymmetric Tukey nees"].mean() < 6
@@ -222,18 +218,18 @@ def test_a_mirrored_place_is_corrected_on_a_curved_path_and_told_on_a_straight_o
     else:
         assert_allclose(found.antenna_in_world[0], place * [1, side], atol=1e-2)
         assert "as well at" in found.doubts[7] and f"{-side * 4.0:.1f}" in found.doubts[7]
+        assert found.antenna_covariance[0, 1, 1] > 4**2
 
 
-@pytest.mark.parametrize("count, reason", [(1, "only 1 of"), (2, "only 2 of"), (4, "only 4 of")])
-def test_few_ranges_give_a_large_covariance_and_a_doubt(count, reason):
+@pytest.mark.parametrize("count, least", [(1, 2.0), (4, 0.15)])
+def test_few_ranges_give_a_large_covariance_and_a_doubt(count, least):
     place = np.array([2.0, 5.0])
     dataset, _ = drive([(4.0, 2.0), (3.0, -1.0)], place, (2.5, 4.5))
     few = np.linspace(0, len(dataset.uwb.pose) - 1, count).astype(int)
-    dataset = replace(dataset, uwb=dataset.uwb.select(few))
-    found = estimate(known_noise(dataset, 1e-5), model="arc")
-    assert reason in found.doubts[7]
-    largest = np.sqrt(np.linalg.eigvalsh(found.antenna_covariance[0])[-1])
-    assert largest > (2 if count == 1 else 0.15)
+    few_ranges = replace(dataset, uwb=dataset.uwb.select(few))
+    found = estimate(known_noise(few_ranges, 1e-5), model="arc")
+    assert f"only {count} of" in found.doubts[7]
+    assert np.linalg.eigvalsh(found.antenna_covariance[0])[-1] > least**2
     error = found.antenna_in_world[0] - place
     assert error @ np.linalg.solve(found.antenna_covariance[0], error) < 9.2      # 99 %
 
@@ -261,18 +257,11 @@ def exact_ranges(path, sigma=0.05, guess=(3.2, 4.2)):
 
 
 def test_second_moment_is_that_of_a_mixture_of_both_mirror_images():
-    """Exact ranges from a straight path: (3, 4) and (3, -4), from which the guess is as far."""
-    path = np.outer(np.linspace(0, 6, 50), [1, 0])
-    estimate = np.array([3.0, 4.0])
-    places, costs, covariances = trilaterate(exact_ranges(path, guess=(3.0, 0.0)))
-    assert_allclose(np.sort(places[:2, 1]), [-4, 4], atol=1e-3)
-    assert abs(costs[1]) < 1e-6
-    ranges = exact_ranges(path)
-    J = (path - estimate) / ranges.distance[:, None] / 0.05
-    C = np.linalg.inv(J.T @ J + np.eye(2) / GUESS_PRIOR_SIGMA**2)
-    assert_allclose(covariances[np.argmax(places[:2, 1])], C, rtol=1e-2, atol=1e-7)
-    assert_allclose(second_moment(places, costs, covariances, estimate),
-                               C + [[0, 0], [0, 64 / 2]], rtol=1e-2, atol=1e-3)
+    """Of which the other one, 8 m away, is a third as likely."""
+    places = np.array([[3.0, 4.0], [3.0, -4.0]])
+    C = np.diag([0.01, 0.04])
+    found = second_moment(places, np.log([1, 12]), np.stack([C, 4 * C]), places[0])
+    assert_allclose(found, 1.75 * C + np.diag([0, 64 / 4]))
 
 
 @pytest.mark.parametrize("agree, weight, radius, sigma, said", [
@@ -329,27 +318,16 @@ def test_a_kernel_takes_a_known_part_of_the_variance():
         assert np.isclose(consistency_factor(kernel), above / below, rtol=1e-4)
 
 
-@pytest.fixture(scope="module")
-def long_drive():
-    """The first 8000 poses of a long drive, its Truth, and the SlamResult of its right ranges."""
+@pytest.mark.slow
+def test_ranges_calibrate_themselves():
+    """On the first 8000 poses of a long drive."""
     dataset, truth = simulate("long", seed=61)
     dataset = dataset.first(8000)
-    return dataset, truth, estimate(dataset)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("offset, scale", [(0.4, 1.0), (-0.3, 0.97)])
-def test_ranges_calibrate_themselves(offset, scale, long_drive):
-    dataset, truth, right = long_drive
-    found = estimate(uwb(dataset, range=offset + scale * dataset.uwb.range))
-    assert not solution_doubts(right)
-    off = found.c[[OFFSET, SCALE]] - [offset, scale]
+    assert not solution_doubts(estimate(dataset))
+    found = estimate(uwb(dataset, range=0.97 * dataset.uwb.range - 0.3))
+    off = found.c[[OFFSET, SCALE]] - [-0.3, 0.97]
     sigma = sigmas(found.c_covariance)[[OFFSET, SCALE]]
-    assert (np.abs(off) < 4 * sigma).all()
-    doubts = [doubt.what for doubt in solution_doubts(found)]
-    if doubts == ["range-offset", "antenna-offsets"]:    # offsets of antennas may be the same, too
-        assert sigma[0] < 0.15 and scale == 1
-    else:
-        assert doubts == ["range-offset"] and (sigma < [0.1, 0.01]).all()
+    assert (np.abs(off) < 4 * sigma).all() and (sigma < [0.1, 0.01]).all()
+    assert [doubt.what for doubt in solution_doubts(found)] == ["range-offset"]
     error, squared = montecarlo.antenna_error(found, truth)
     assert squared.mean() < 6 and error.max() < 0.2
