@@ -36,6 +36,7 @@ from slamlib.io.textfile import read_toml
 MAX_REVOLUTIONS = 10.0  # revolutions of a wheel in one step
 MODULI = (2**16, 2**15)  # numbers of values of counters that wrap around
 MIN_MODULUS_RATIO = 32.0  # ratio of a modulus to a large step of the drive, for a decision
+WHEEL_ENTRIES = 8  # number of fields of a Vehicle that table 2 has
 ORIGIN_TOLERANCE = 1e-3  # m and rad; a first true pose within it is taken as the origin
 
 
@@ -85,23 +86,30 @@ def _dataset(files, vehicle, name, notes=()):
     if UWB in files and GUESS not in files:
         del files[UWB]
         notes += (f"{GUESS} is missing: problem 4 is left out.",)
-    encoders, ticks = _incremental_counts(read_table(files[ENCODER], ENCODER), vehicle)
-    sightings = read_table(files.get(ARUCO), ARUCO, len(ticks))
+    encoders = read_table(files[ENCODER], ENCODER)
+    encoders, ticks = _incremental_counts(encoders, vehicle)
+    count = len(ticks)
+    sightings = read_table(files.get(ARUCO), ARUCO, count)
     guesses = read_table(files.get(GUESS), GUESS)
-    ranges = read_table(files.get(UWB), UWB, len(ticks))
+    ranges = read_table(files.get(UWB), UWB, count)
     is_guessed = np.isin(ranges.numbers[:, 1], guesses.numbers[:, 0])
     ranges = ranges.drop_rows({f"an antenna id of {guesses.name}": is_guessed})
     guess = None
     if len(guesses.numbers) > 0:
         guess = AntennaGuess(guesses.ids(0), guesses.numbers[:, 1:])
-    seen = sightings.numbers
-    heard = ranges.numbers
-    dataset = Dataset(
-        name, vehicle, ticks,
-        ArucoReadings(sightings.ids(0) - 1, sightings.ids(1), seen[:, 2:5], seen[:, COVARIANCE]),
-        UwbReadings(ranges.ids(0) - 1, ranges.ids(1), heard[:, 2], heard[:, 3]),
-        guess, notes + encoders.notes + sightings.notes + ranges.notes + guesses.notes)
-    return dataset.first(len(ticks))  # in which a sensor without readings is None
+    aruco = ArucoReadings(
+        pose=sightings.ids(0) - 1,
+        marker=sightings.ids(1),
+        marker_in_vehicle=sightings.numbers[:, 2:5],
+        covariance=sightings.numbers[:, COVARIANCE])
+    uwb = UwbReadings(
+        pose=ranges.ids(0) - 1,
+        antenna=ranges.ids(1),
+        range=ranges.numbers[:, 2],
+        sigma=ranges.numbers[:, 3])
+    notes += encoders.notes + sightings.notes + ranges.notes + guesses.notes
+    dataset = Dataset(name, vehicle, ticks, aruco, uwb, guess, notes)
+    return dataset.first(count)  # in which a sensor without readings is None
 
 
 def read_vehicle(path: Path | None, default: Vehicle) -> Vehicle:
@@ -113,11 +121,9 @@ def read_vehicle(path: Path | None, default: Vehicle) -> Vehicle:
 
 def write_vehicle(path: Path, vehicle: Vehicle):
     """Write a vehicle.toml: eight entries of the wheels, and others that are not of table 2."""
-    entries = vars(vehicle)
-    of_wheels = list(entries)[:8]
     text = ""
-    for name, value in entries.items():
-        if name in of_wheels or value != getattr(TABLE_2, name):
+    for number, (name, value) in enumerate(vars(vehicle).items()):
+        if number < WHEEL_ENTRIES or value != getattr(TABLE_2, name):
             text += f"{name} = {json.dumps(value)}\n"
     write_file(path, text.encode())
 
@@ -200,19 +206,22 @@ def inventory_lines(dataset: Dataset, truth: Truth | None) -> list[str]:
     right, left = abs(dataset.ticks).sum(axis=0)
     aruco = dataset.aruco
     uwb = dataset.uwb
-    markers = "none, no ArucoReading.txt with usable rows"
-    ranges = "none, no UwbReading.txt with usable rows"
-    if aruco is not None:
-        markers = (f"{len(aruco.pose)} sightings of {len(set(aruco.marker))} markers at "
-                   f"{len(set(aruco.pose))} poses")
-    if uwb is not None:
-        ranges = (f"{len(uwb.pose)} ranges to {len(set(uwb.antenna))} antennas at "
-                  f"{len(set(uwb.pose))} poses")
-    stated = [f"{key} = {json.dumps(value)}" for key, value in vars(dataset.vehicle).items()
-              if value != getattr(TABLE_2, key)]
-    lines = [f"encoders: {len(dataset.ticks)} poses, {right} ticks right and {left} left",
-             f"markers: {markers}", f"ranges: {ranges}",
-             f"vehicle.toml: {', '.join(stated) or 'none, or as in table 2'}",
-             f"truth: {'no' if truth is None else 'yes'}"]
+    lines = [f"encoders: {len(dataset.ticks)} poses, {right} ticks right and {left} left"]
+    if aruco is None:
+        lines.append("markers: none, no ArucoReading.txt with usable rows")
+    else:
+        lines.append(f"markers: {len(aruco.pose)} sightings of {len(set(aruco.marker))} markers at "
+                     f"{len(set(aruco.pose))} poses")
+    if uwb is None:
+        lines.append("ranges: none, no UwbReading.txt with usable rows")
+    else:
+        lines.append(f"ranges: {len(uwb.pose)} ranges to {len(set(uwb.antenna))} antennas at "
+                     f"{len(set(uwb.pose))} poses")
+    stated = []
+    for key, value in vars(dataset.vehicle).items():
+        if value != getattr(TABLE_2, key):
+            stated.append(f"{key} = {json.dumps(value)}")
+    lines.append(f"vehicle.toml: {', '.join(stated) or 'none, or as in table 2'}")
+    lines.append("truth: yes" if truth is not None else "truth: no")
     lines += [f"note: {note}" for note in all_notes(dataset, truth)]
     return [f"{dataset.name}: {line}" for line in lines]
