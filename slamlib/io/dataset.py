@@ -24,7 +24,8 @@ from slamlib.io.formats import (
     ENCODER,
     GUESS,
     LIMITS,
-    TRUE_MAPS,
+    TRUE_ANTENNAS,
+    TRUE_MARKERS,
     TRUE_POSES,
     TRUTH_FILES,
     UWB,
@@ -139,11 +140,12 @@ def _incremental_counts(table, vehicle):
     counts = read
     for modulus in MODULI:
         counts = _unwrapped(counts, modulus)
-    mended = np.flatnonzero((counts != read).any(axis=1))
+    is_mended = (counts != read).any(axis=1)
+    mended = table.lines[is_mended]
     if len(mended):
         table = table.noted(
             f": {len(mended)} rows were mended whose counts are 2^15 or 2^16 off, as of a counter "
-            f"that wraps around, first {table.kind} {table.lines[mended[0]]}")
+            f"that wraps around, first {table.kind} {mended[0]}")
     limit = MAX_REVOLUTIONS * vehicle.ticks_per_revolution
     ok = abs(counts) <= limit
     ok[0] = counts[0] == 0
@@ -156,8 +158,10 @@ def _incremental_counts(table, vehicle):
 def _unwrapped(counts, modulus):
     """Counts (n, 2) less a modulus, where that makes them as small as most others."""
     large = np.quantile(abs(counts), 0.9)
+    if MIN_MODULUS_RATIO * large >= modulus:
+        return counts
     less = counts - np.sign(counts) * modulus
-    is_wrapped = (abs(less) <= 2 * large) & (MIN_MODULUS_RATIO * large < modulus)
+    is_wrapped = abs(less) <= 2 * large
     return np.where(is_wrapped, less, counts)
 
 
@@ -174,11 +178,14 @@ def read_truth(folder: Path | str) -> Truth | None:
         return None
     files, notes = contents(drive["truth"], TRUTH_FILES, required=TRUE_POSES)
     path = read_table(files[TRUE_POSES], TRUE_POSES)
-    markers, antennas = [read_table(files.get(name), name) for name in TRUE_MAPS]
-    count = len(read_table(drive[ENCODER], ENCODER).numbers)
+    markers = read_table(files.get(TRUE_MARKERS), TRUE_MARKERS)
+    antennas = read_table(files.get(TRUE_ANTENNAS), TRUE_ANTENNAS)
+    encoders = read_table(drive[ENCODER], ENCODER)
+    count = len(encoders.numbers)
     poses = path.numbers[:, 1:]
     require(len(poses) == count, path.source, f"{count} poses (encoder file), found {len(poses)}")
-    poses[:, 2] = np.unwrap(np.append(0, poses[:, 2]))[1:]
+    headings = np.append(0, poses[:, 2])
+    poses[:, 2] = np.unwrap(headings)[1:]
     marker_in_world = markers.numbers[:, 1:]
     antenna_in_world = antennas.numbers[:, 1:]
     origin = poses[0].copy()
@@ -190,10 +197,12 @@ def read_truth(folder: Path | str) -> Truth | None:
         path = path.noted(
             " begins at ({:.3f} m, {:.3f} m, {:.4f} rad): poses and maps were moved into the frame "
             "of its first pose, in which the estimates are".format(*origin))
-    vehicle = read_vehicle(files.get(VEHICLE), read_vehicle(drive.get(VEHICLE), TABLE_2))
+    stated = read_vehicle(drive.get(VEHICLE), TABLE_2)
+    vehicle = read_vehicle(files.get(VEHICLE), stated)
     notes += path.notes + markers.notes + antennas.notes
+    notes = tuple(f"In truth: {note}" for note in notes)
     return Truth(poses, markers.ids(0), marker_in_world, antennas.ids(0), antenna_in_world,
-                 vehicle, tuple(f"In truth: {note}" for note in notes))
+                 vehicle, notes)
 
 
 def all_notes(dataset: Dataset, truth: Truth | None) -> tuple[str, ...]:
@@ -203,25 +212,18 @@ def all_notes(dataset: Dataset, truth: Truth | None) -> tuple[str, ...]:
 
 def inventory_lines(dataset: Dataset, truth: Truth | None) -> list[str]:
     """Lines on what was read of a Dataset and its Truth, with all notes."""
-    right, left = abs(dataset.ticks).sum(axis=0)
-    aruco = dataset.aruco
-    uwb = dataset.uwb
-    lines = [f"encoders: {len(dataset.ticks)} poses, {right} ticks right and {left} left"]
-    if aruco is None:
-        lines.append("markers: none, no ArucoReading.txt with usable rows")
-    else:
-        lines.append(f"markers: {len(aruco.pose)} sightings of {len(set(aruco.marker))} markers at "
-                     f"{len(set(aruco.pose))} poses")
-    if uwb is None:
-        lines.append("ranges: none, no UwbReading.txt with usable rows")
-    else:
-        lines.append(f"ranges: {len(uwb.pose)} ranges to {len(set(uwb.antenna))} antennas at "
-                     f"{len(set(uwb.pose))} poses")
-    stated = []
-    for key, value in vars(dataset.vehicle).items():
-        if value != getattr(TABLE_2, key):
-            stated.append(f"{key} = {json.dumps(value)}")
-    lines.append(f"vehicle.toml: {', '.join(stated) or 'none, or as in table 2'}")
-    lines.append("truth: yes" if truth is not None else "truth: no")
-    lines += [f"note: {note}" for note in all_notes(dataset, truth)]
-    return [f"{dataset.name}: {line}" for line in lines]
+    found = {"encoders": f"{len(dataset.ticks)} poses",
+             "markers": f"none, no {ARUCO} with usable rows",
+             "ranges": f"none, no {UWB} with usable rows",
+             "truth": "no" if truth is None else "yes"}
+    if dataset.aruco is not None:
+        found["markers"] = _counts(dataset.aruco.pose, "sightings", dataset.aruco.marker, "markers")
+    if dataset.uwb is not None:
+        found["ranges"] = _counts(dataset.uwb.pose, "ranges", dataset.uwb.antenna, "antennas")
+    lines = [f"{dataset.name}: {sensor}: {what}" for sensor, what in found.items()]
+    return lines + [f"{dataset.name}: note: {note}" for note in all_notes(dataset, truth)]
+
+
+def _counts(pose, readings, landmark, landmarks):
+    """Numbers of readings, landmarks and poses in words, by the pose and landmark of each."""
+    return f"{len(pose)} {readings} of {len(set(landmark))} {landmarks} at {len(set(pose))} poses"
