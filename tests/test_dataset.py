@@ -246,31 +246,17 @@ def write_counts(folder, ticks):
     np.savetxt(folder / "encoderReading.txt", np.c_[1:len(ticks) + 1, ticks], fmt="%d")
 
 
-DRIVES = {
-    "not at all": np.zeros((100, 2)),
-    "after a rest": np.repeat([[0, 0], [132, 90]], 50, axis=0),
-    "to and fro": np.repeat([[132, 132], [-132, -132]], 50, axis=0),
-    "fast": np.full((100, 2), 31_999)}
-
-
-def assert_taken_as_such(folder, increments):
-    ticks = np.r_[[[0, 0]], increments].astype(int)
-    write_counts(folder, ticks)
-    found = read_dataset(folder)
+@pytest.mark.parametrize("first, second, wrong", [
+    (0, 0, 0), (0, 132, 132), (132, -132, 132), (31_999, 31_999, 31_999), (132, 132, 3000),
+    (132, 132, -16_000), (132, 132, 31_999), (132, 132, 40_000), (132, 132, 62_000),
+    (132, 132, 70_000)])
+def test_increments_of_any_drive_are_taken_as_such(first, second, wrong, tmp_path):
+    """Fifty of one kind, fifty of another, and one in between that may be wrong."""
+    ticks = np.repeat([[0, 0], [first, first], [wrong, 90], [second, second]], [1, 50, 1, 50], 0)
+    write_counts(tmp_path, ticks)
+    found = read_dataset(tmp_path)
     assert_array_equal(found.ticks, ticks)
     assert found.notes == () and doubts_before_solving(found) == []
-
-
-@pytest.mark.parametrize("drive", DRIVES)
-def test_increments_of_any_drive_are_taken_as_such(drive, tmp_path):
-    assert_taken_as_such(tmp_path, DRIVES[drive])
-
-
-@pytest.mark.parametrize("wrong", [3000, -16_000, 31_999, 40_000, 62_000, 70_000])
-def test_a_single_wrong_increment_is_taken_as_such(wrong, tmp_path):
-    increments = np.full((100, 2), 132)
-    increments[50, 0] = wrong
-    assert_taken_as_such(tmp_path, increments)
 
 
 @pytest.mark.parametrize("begin", [[123456, -7], [0, 0]])

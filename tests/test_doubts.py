@@ -9,14 +9,12 @@ import pytest
 from numeric import aruco, errors_of, short, uwb, vehicle, without_headings
 from numpy.testing import assert_allclose
 
-from slamlib.core.errors import DatasetError
 from slamlib.core.odometry import dead_reckoning
 from slamlib.core.records import AntennaGuess, Dataset, UwbReadings
 from slamlib.core.vehicle import Vehicle
-from slamlib.io.dataset import read_dataset
 from slamlib.robust import file_doubts as files
 from slamlib.robust.file_doubts import doubts_before_solving
-from slamlib.studies.simulation import manoeuvre, simulate, write_dataset
+from slamlib.studies.simulation import manoeuvre, simulate
 
 drive = cache(short)
 long_drive = cache(lambda: simulate("long", 0)[0])
@@ -144,8 +142,7 @@ RIGHT = {
     "standing": standing, "waiting": waiting, "a wheel": wheels_off(1.01),
     "the base": wheels_off(1.0, 1.01), "no headings": headings_unknown(slice(None)),
     "every second heading": headings_unknown(slice(0, None, 2)),
-    "small covariances": overconfident(1e-4, 0.0), "far too small": overconfident(1e-4, 0.03),
-    "too small": overconfident(1e-2, 0.03)}
+    "far too small": overconfident(1e-4, 0.03), "too small": overconfident(1e-2, 0.03)}
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -206,9 +203,7 @@ def moved_by(length, turn, count=20):
 @pytest.mark.parametrize("markers, wheels, disagree, said", [
     ((0.2, 0.1), (0.9, 0.45), 0, None), ((0.9, 0.45), (0.2, 0.1), 0, None),
     ((1.1, 0.1), (0.2, 0.1), 0, "x and y in ArucoReading.txt"),
-    ((0.2, 0.1), (1.1, 0.1), 0, "x and y in ArucoReading.txt"),
     ((0.2, 0.01), (0.2, 0.06), 0, "wheelbase in vehicle.toml"),
-    ((0.2, 0.06), (0.2, 0.01), 0, "wheelbase in vehicle.toml"),
     ((0.02, 0.01), (0.2, 0.1), 0, "radii (metres) and ticks_per_revolution"),
     ((0.02, 0.1), (0.0, 0.1), 0, None),
     ((0.2, 0.004), (0.2, 0.0005), 0, None), ((0.3, 0.15), (0.2, 0.1), 9, None),
@@ -262,22 +257,13 @@ def test_units_of_few_ranges_and_of_a_vehicle_that_stands_are_not_judged():
 
 
 @pytest.mark.parametrize("spoil", [
-    sightings_in(100, 100), sightings_in(100, 1), sightings_in(1, 100),
-    lambda d: sightings_in(100, 100)(d).without("uwb"),
-    lambda d: ranges_in(100, 100, 100)(d).without("aruco"), ranges_in(100, 1), ranges_in(100, 100),
-    ranges_in(100, 1, 100), lambda d: sightings_in(100, 100)(ranges_in(100, 100)(d))])
+    sightings_in(100, 100), sightings_in(100, 1), sightings_in(1, 100), ranges_in(100, 100),
+    ranges_in(100, 1, 100), lambda d: ranges_in(100, 100, 100)(d).without("aruco")])
 @pytest.mark.parametrize("count", [150, 2000])
 def test_lengths_in_centimetres_are_doubted(spoil, count):
     """Of short drives of 1.5 m and 20 m."""
     doubts = doubts_before_solving(spoil(drive(0, count)[0]))
     assert {doubt.what for doubt in doubts} == {"units"}
-
-
-@pytest.mark.parametrize("sizes", [{"wheelbase": 400.0}, {"right_radius": 100.0}])
-def test_wheels_in_millimetres_are_refused(sizes, tmp_path):
-    write_dataset(tmp_path / "drive", vehicle(**sizes)(drive(0, 150)[0]))
-    with pytest.raises(DatasetError, match="vehicle.toml: expected a number from "):
-        read_dataset(tmp_path / "drive")
 
 
 @pytest.mark.parametrize("factor", [1.0, 3.0])

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import ROOT, contradicted
+from numeric import short
 
 from slamlib import estimate, solve
 from slamlib.__main__ import main
@@ -20,8 +21,7 @@ from slamlib.studies.simulation import simulate, write_dataset
 @pytest.fixture
 def drive():
     """A simulated drive of 100 poses, and its truth."""
-    dataset, truth = simulate("short", seed=3)
-    return dataset.first(100), replace(truth, poses=truth.poses[:100])
+    return short(3, 100)
 
 
 @pytest.fixture

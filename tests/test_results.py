@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from joblib import parallel_config
-from numeric import aruco
+from numeric import aruco, short
 from scipy.io import loadmat, savemat
 
 from slamlib import estimate, read_dataset, solve
@@ -98,8 +98,7 @@ def test_evo_finds_the_errors_of_the_summary_in_tum_files(tmp_path, drive, probl
 @pytest.fixture(scope="module")
 def drive():
     """A simulated drive of 100 poses, and its truth."""
-    dataset, truth = simulate("short", seed=3)
-    return dataset.first(100), replace(truth, poses=truth.poses[:100])
+    return short(3, 100)
 
 
 def test_problems_that_are_written_one_by_one_have_one_summary(tmp_path, drive):
