@@ -49,7 +49,8 @@ def read_dataset(folder: Path | str) -> Dataset:
     """
     files, notes = contents(folder, required=ENCODER)
     vehicle = read_vehicle(files.get(VEHICLE), TABLE_2)
-    return _dataset(files, vehicle, Path(abspath(folder)).name, notes)
+    name = Path(abspath(folder)).name
+    return _dataset(files, vehicle, name, notes)
 
 
 def dataset_from_arrays(ticks, aruco=None, uwb=None, guess=None, vehicle: Vehicle = TABLE_2,
@@ -74,12 +75,13 @@ def dataset_from_arrays(ticks, aruco=None, uwb=None, guess=None, vehicle: Vehicl
     (2, [7])
     """
     counts = table_of_array("ticks", ticks, ["right ticks", "left ticks"])
-    files = {
-        ENCODER: replace(counts, numbers=np.column_stack([counts.lines, counts.numbers])),
-        ARUCO: table_of_array("aruco", aruco, LIMITS[ARUCO]),
-        UWB: table_of_array("uwb", uwb, LIMITS[UWB]),
-        GUESS: table_of_array("guess", guess, LIMITS[GUESS])}
-    return _dataset(files, changed(TABLE_2, vars(vehicle), "vehicle"), name)
+    numbered = np.column_stack([counts.lines, counts.numbers])
+    files = {ENCODER: replace(counts, numbers=numbered)}
+    files[ARUCO] = table_of_array("aruco", aruco, LIMITS[ARUCO])
+    files[UWB] = table_of_array("uwb", uwb, LIMITS[UWB])
+    files[GUESS] = table_of_array("guess", guess, LIMITS[GUESS])
+    stated = changed(TABLE_2, vars(vehicle), "vehicle")
+    return _dataset(files, stated, name)
 
 
 def _dataset(files, vehicle, name, notes=()):

@@ -208,16 +208,14 @@ def range_units(dataset: Dataset) -> Iterator[Doubt]:
         return
     path = _certain_path(dataset)
     heard = dataset.uwb.select(dataset.uwb.pose < len(path))
-    count = 0
     sizes = []
     for antenna, guess in zip(guesses.antenna, guesses.position):
         own = heard.select(heard.antenna == antenna)
         if len(own.range) >= MIN_RANGES_PER_ANTENNA:
-            count += len(own.range)
-            quartiles = np.percentile(own.range, [25, 75])
+            lower, typical, upper = np.percentile(own.range, [25, 50, 75])
             distances = np.linalg.norm(path[own.pose] - guess, axis=1)
-            sizes.append([np.ptp(quartiles), np.median(own.range), np.median(distances)])
-    if count < MIN_COUNT or not path.any():
+            sizes.append([upper - lower, typical, np.median(distances)])
+    if len(heard.range) < MIN_COUNT or not sizes or not path.any():
         return
     spread, typical, distance = np.median(sizes, axis=0)
     extent = np.linalg.norm(path.std(axis=0))
