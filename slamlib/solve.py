@@ -138,20 +138,21 @@ def problem_solution(problem: str, dataset: Dataset, found=None) -> Solution:
         found = find(problem, dataset)
     if problem == "problem1":
         poses, covariances = found
-        solution = Solution(problem, title(problem, dataset), poses, covariances)
     else:
-        solution = Solution(problem, title(problem, dataset), found.poses, found.covariances)
-    is_known = np.isfinite(solution.poses[:, 0])
-    _require_variances(solution.covariances[is_known])
+        poses = found.poses
+        covariances = found.covariances
+    is_known = np.isfinite(poses[:, 0])
+    _require_variances(covariances[is_known])
+    solution = Solution(problem, title(problem, dataset), poses, covariances)
+    if problem == "problem1":
+        return solution
     if problem == "problem2":
         solution = _at_all_poses(solution, found.frame, len(dataset.ticks))
     if problem == "problem2_fused":
         solution = replace(solution, doubts=fusion_doubts(found, dataset.vehicle))
     if problem in ("problem3", "problem4"):
         solution = _with_maps(solution, found)
-    if problem != "problem1":
-        solution = replace(solution, facts=_facts(found))
-    return solution
+    return replace(solution, facts=_facts(found))
 
 
 def _with_maps(solution, found):

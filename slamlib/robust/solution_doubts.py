@@ -183,9 +183,10 @@ def _factor_doubt(result, kind):
                 "the file's.")
     if kind == SIGHTINGS and _are_sigmas(result, factor):
         sentence += " So they would if its columns of variances held standard deviations."
-    late = np.mean(result.range_weight < 0.5)
-    if kind == RANGES and late > MAX_LATE_SHARE:
-        sentence += f" {late:.0%} of them are far too long, as without line of sight."
+    if kind == RANGES:
+        late = np.mean(result.range_weight < 0.5)
+        if late > MAX_LATE_SHARE:
+            sentence += f" {late:.0%} of them are far too long, as without line of sight."
     yield Doubt(f"{kind.doubt}-noise", sentence,
                 "Look at how the sensor's covariances were obtained.")
 
