@@ -108,20 +108,19 @@ def failure(problem: str, dataset: Dataset, error: Exception) -> Failure:
     return Failure(problem, title(problem, dataset), reason)
 
 
-def find(problem: str, dataset: Dataset, found: dict | None = None):
+def find(problem: str, dataset: Dataset, previous: SlamResult | None = None):
     """The result of a problem's solver: (poses, covariances), Localization, Fusion or SlamResult.
 
-    `found` are such results of other problems (dict by problem): problem 4 starts from problem 3
-    where there is one. Raises UNSOLVABLE where the measurements determine no solution.
+    Problem 4 starts from `previous`, problem 3's. Raises UNSOLVABLE where the measurements
+    determine no solution.
     """
-    before = (found or {}).get("problem3")
     solvers = {
         "problem1": lambda: odometry.equation2(dataset.ticks, dataset.vehicle),
         "problem2": lambda: localize(dataset.sightings),
         "problem2_hint": lambda: fuse_increments(dataset),
         "problem2_fused": lambda: fuse(dataset),
         "problem3": lambda: estimate(dataset.without("uwb")),
-        "problem4": lambda: estimate(dataset, previous=before)}
+        "problem4": lambda: estimate(dataset, previous=previous)}
     return solvers[problem]()
 
 
@@ -212,15 +211,17 @@ def solutions(dataset: Dataset, problems: Sequence[str] = tuple(PROBLEMS)
 
     A problem that cannot be solved has a Failure. Facts include the seconds that it took.
     """
-    found = {}
+    previous = None
     solved = []
     for problem in problems:
         if not allows(dataset, problem):
             continue
         start = time.perf_counter()
         try:
-            found[problem] = find(problem, dataset, found)
-            solution = problem_solution(problem, dataset, found[problem])
+            found = find(problem, dataset, previous)
+            if problem == "problem3":
+                previous = found
+            solution = problem_solution(problem, dataset, found)
         except UNSOLVABLE as error:
             solved.append(failure(problem, dataset, error))
             continue

@@ -96,6 +96,8 @@ def test_a_flaw_is_named(flaw, options):
         spoilt = covariances(factor)(spoil(drive(seed, **options)[0]))
         doubts = doubts_before_solving(spoilt)
         assert [doubt.what for doubt in doubts] == what.split()
+        assert all(doubt.advice.startswith("Look ") for doubt in doubts)
+        assert all("look" not in doubt.sentence.lower() for doubt in doubts)
         told = " ".join(f"{doubt.sentence} {doubt.advice}" for doubt in doubts)
         assert said in told
         assert (", or as well with sightings" in told) == what.startswith("wheels-")

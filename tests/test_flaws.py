@@ -186,7 +186,10 @@ def test_scatter_that_is_decidedly_not_as_stated_is_named(
     """By more than a factor of 1.5 and four standard deviations."""
     noise = [1e-3, 1.0, 1.0]
     noise[column] = factor
-    sentences = [doubt.sentence for doubt in solution_doubts(with_noise(found, noise, sigma))]
+    result = with_noise(found, noise, sigma)
+    if name == "sightings":
+        result = replace(result, range_weight=np.zeros(0))                # as without ranges
+    sentences = [doubt.sentence for doubt in solution_doubts(result)]
     assert len(sentences) == (said is not None)
     for sentence in sentences:
         assert f"The {name} {said} as much as {file} states" in sentence
