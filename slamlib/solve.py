@@ -149,22 +149,22 @@ def problem_solution(problem: str, dataset: Dataset, found=None) -> Solution:
         solution = _at_all_poses(solution, found.frame, len(dataset.ticks))
     if problem == "problem2_fused":
         solution = replace(solution, doubts=fusion_doubts(found, dataset.vehicle))
+    if problem in ("problem2", "problem3", "problem4"):
+        markers = _map(found.marker, found.marker_in_world, found.marker_covariance)
+        solution = replace(solution, aruco_map=markers)
     if problem in ("problem3", "problem4"):
-        solution = _with_maps(solution, found)
+        _require_variances(found.c_covariance)
+        antennas = _map(found.antenna, found.antenna_in_world, found.antenna_covariance)
+        solution = replace(solution, uwb_map=antennas, doubts=solution_doubts(found))
     return replace(solution, facts=_facts(found))
 
 
-def _with_maps(solution, found):
-    """The Solution with maps and doubts of a SlamResult."""
-    for covariances in (found.c_covariance, found.marker_covariance, found.antenna_covariance):
-        _require_variances(covariances)
-    aruco_map = (found.marker, found.marker_in_world, found.marker_covariance)
-    uwb_map = (found.antenna, found.antenna_in_world, found.antenna_covariance)
-    return replace(
-        solution,
-        aruco_map=aruco_map if len(found.marker) else None,
-        uwb_map=uwb_map if len(found.antenna) else None,
-        doubts=solution_doubts(found))
+def _map(ids, places, covariances):
+    """The map of a Solution by ids (k,), places (k, d), covariances (k, d, d); None without ids."""
+    _require_variances(covariances)
+    if len(ids) == 0:
+        return None
+    return ids, places, covariances
 
 
 def _require_variances(covariances):

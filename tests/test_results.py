@@ -144,6 +144,16 @@ def test_the_vehicle_as_estimated_can_be_taken_over(tmp_path):
     assert (vehicle.wheelbase, vehicle.range_noise_factor) == (0.4, None)
 
 
+def test_every_problem_has_its_trajectory_and_the_maps_that_it_estimates(tmp_path, drive):
+    solve.solve_to_folder(*drive, tmp_path)
+    written = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.mat"))
+    assert written == [
+        "problem1/vehiclePose.mat", "problem2/ArucoMap.mat", "problem2/vehiclePose.mat",
+        "problem2_fused/vehiclePose.mat", "problem2_hint/vehiclePose.mat", "problem3/ArucoMap.mat",
+        "problem3/vehiclePose.mat", "problem4/ArucoMap.mat", "problem4/UwbMap.mat",
+        "problem4/vehiclePose.mat"]
+
+
 def test_where_all_is_stated_no_vehicle_is_written(tmp_path, drive):
     known = replace(drive[0].vehicle, slip=1e-3, marker_noise_factor=1.0, range_noise_factor=1.0)
     solve.solve_to_folder(replace(drive[0], vehicle=known), None, tmp_path, ["problem4"])
