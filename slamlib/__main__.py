@@ -4,7 +4,6 @@ import argparse
 import os
 import signal
 import sys
-from contextlib import suppress
 from pathlib import Path
 
 # Set before numpy is imported: the matrices are so small that more threads are slower.
@@ -15,7 +14,6 @@ from slamlib.core.errors import DatasetError, require  # noqa: E402
 
 EXECUTED_NOTEBOOKS = Path("build", "executed")  # folder in which executed notebooks are kept
 HAND_IN_PAGES = Path("build", "hand-in")  # folder of the report that is handed in
-END_SIGNALS = {signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)}  # Windows has no SIGHUP
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -26,9 +24,7 @@ def main(arguments: list[str] | None = None) -> int:
     """
     if arguments is None:
         sys.stdout.reconfigure(errors="backslashreplace")  # as stderr, for names in other letters
-        for each in END_SIGNALS:
-            if signal.getsignal(each) == signal.SIG_DFL:     # nohup's handler stays
-                signal.signal(each, signal.default_int_handler)      # as by Ctrl-C
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C
     parser = _parser()
     options, others = parser.parse_known_args(arguments)
     options.others = others
@@ -46,8 +42,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _ended(code, reason):
     """The exit code, after the reason was printed."""
-    with suppress(OSError):  # the terminal may be gone
-        print(f"slamlib: {reason}", file=sys.stderr)
+    print(f"slamlib: {reason}", file=sys.stderr)
     return code
 
 
@@ -58,82 +53,67 @@ def _parser():
     whole.add_argument("--version", action="version", version=f"slamlib {__version__}")
     commands = whole.add_subparsers(required=True, metavar="COMMAND")
 
-    report = commands.add_parser("report", help="execute the notebooks and build the report")
-    report.set_defaults(run=_build, out=None)
-    _add_options_of_a_build(report)
-    _add_path(report, "--report", "folder for the pages", "report")
+    def add_command(name, run, help, **options):
+        command = commands.add_parser(name, help=help, **options)
+        command.set_defaults(run=run)
+        return command.add_argument
 
-    hand_in = commands.add_parser(
-        "hand-in", help="build the report, and zip it with the result files")
-    hand_in.set_defaults(run=_build, report=HAND_IN_PAGES)
-    _add_options_of_a_build(hand_in)
-    _add_path(hand_in, "--out", "the file to write", "hand-in.zip")
+    add = add_command("report", _build, "execute the notebooks and build the report")
+    _add_options_of_a_build(add)
+    add("--report", type=Path, default="report", help="folder for the pages (default %(default)s)")
 
-    _add_solve(commands)
-    _add_simulate(commands)
-    lab = commands.add_parser("lab", allow_abbrev=False, help="open JupyterLab on the notebooks; "
-                              "it is given all other arguments, as --no-browser")
-    lab.set_defaults(run=_lab)
-    _add_data_and_notebooks(lab)
-    return whole
+    add = add_command("hand-in", _build, "build the report, and zip it with the result files")
+    _add_options_of_a_build(add)
+    add("--out", type=Path, default="hand-in.zip", help="the file to write (default %(default)s)")
 
-
-def _add_path(command, name, help, default=None):
-    if default is not None:
-        help += " (default %(default)s)"
-    command.add_argument(name, type=Path, default=default, help=help)
-
-
-def _add_data_and_notebooks(command):
-    _add_path(command, "--data", "folder of the datasets", "data")
-    _add_path(command, "--notebooks", "folder of the notebooks (default: the folder notebooks "
-              "where there is one, else those of the installation)")
-
-
-def _add_options_of_a_build(command):
-    _add_data_and_notebooks(command)
-    _add_path(command, "--results", "folder for the .mat files", "results")
-    add = command.add_argument
-    add("datasets", nargs="*", metavar="DATASET",
-        help="names of folders in data/ (all of them when none is named, but simulated ones where "
-        "there are others)")
-    add("--jobs", type=int, default=2, help="notebooks executed at a time")
-
-
-def _add_solve(commands):
-    command = commands.add_parser("solve", help="solve problems without notebooks")
-    command.set_defaults(run=_solve)
-    add = command.add_argument
+    add = add_command("solve", _solve, "solve problems without notebooks")
     add("folders", nargs="+", type=Path, metavar="FOLDER", help="a dataset's folder; each of "
         "several has its results in the folder of its name in OUT, and drives.csv is the table "
         "over all")
     add("--out", type=Path, required=True, help="folder for the results")
-    add("-j", "--jobs", type=int, default=1, help="datasets solved at a time (default 1); of a "
-        "single one, problems 3 and 4 beside the others")
+    add("-j", "--jobs", type=int, default=1, help="datasets solved at a time (default 1)")
     add("--problem", action="append", default=[], metavar="NAME",
         type=lambda text: text.removeprefix("problem"),
         choices=("1", "2", "2_hint", "2_fused", "3", "4"),
         help="one of %(choices)s, of which 2 is markers alone; may be repeated (default: all); 4 "
-             "starts from 3 where both are solved")
-    add("--csv", action="store_true", help="write poses and maps as text, too: CSV with "
-        "covariances, and trajectories as TUM files for evo")
+        "starts from 3 where both are solved")
     add("-v", "--verbose", action="store_true", help="print to stderr what is decided on the way: "
         "kernels, noise, accepted measurements, calibration, and GTSAM's solution")
 
+    add = add_command("simulate", _simulate, "make a dataset with its truth")
+    add("folder", type=Path, help="a new or empty folder")
+    add("--path", choices=("short", "long"), default="short",
+        help="the path that is driven (default short)")
+    add("--rounds", type=int, default=1,
+        help="how often the path is driven; 44 long ones are a million rows (default 1)")
+    add("--seed", type=int, default=0, help="of the random generator (default 0)")
+    add("--slip", type=float, default=1e-3,
+        help="wheel slip: sigma after one metre, in m (default %(default)s)")
+    add("--nlos", type=float, default=0.0,
+        help="share of UWB ranges without line of sight, which are too long (default 0)")
+    add("--mislabel", type=float, default=0.0,
+        help="share of marker sightings that carry another marker's id (default 0)")
 
-def _add_simulate(commands):
-    command = commands.add_parser("simulate", help="make a dataset with its truth")
-    command.set_defaults(run=_simulate)
-    _add_path(command, "folder", "a new or empty folder")
-    add = command.add_argument
-    add("--path", choices=("short", "long"), default="short")
-    for name, default, what in (
-            ("rounds", 1, "how often the path is driven; 44 long ones are a million rows"),
-            ("seed", 0, "of the random generator"),
-            ("slip", 1e-3, "wheel slip: sigma after one metre, in m"),
-            ("nlos", 0.0, "share of UWB ranges without line of sight, which are too long"),
-            ("mislabel", 0.0, "share of marker sightings that carry another marker's id")):
-        add(f"--{name}", type=type(default), default=default, help=f"{what} (default %(default)s)")
+    add = add_command("lab", _lab, "open JupyterLab on the notebooks; it is given all other "
+                      "arguments, as --no-browser", allow_abbrev=False)
+    _add_data_and_notebooks(add)
+    return whole
+
+
+def _add_data_and_notebooks(add):
+    add("--data", type=Path, default="data", help="folder of the datasets (default data)")
+    add("--notebooks", type=Path, help="folder of the notebooks (default: the folder notebooks "
+        "where there is one, else those of the installation)")
+
+
+def _add_options_of_a_build(add):
+    _add_data_and_notebooks(add)
+    add("--results", type=Path, default="results",
+        help="folder for the .mat files (default results)")
+    add("datasets", nargs="*", metavar="DATASET",
+        help="names of folders in data/ (all of them when none is named, but simulated ones where "
+        "there are others)")
+    add("--jobs", type=int, default=2, help="notebooks executed at a time (default 2)")
 
 
 def _build(options):
@@ -142,25 +122,26 @@ def _build(options):
     from slamlib.report.notebooks import notebooks_folder, read_options
     shown = read_options("report.toml")
     notebooks = options.notebooks or notebooks_folder()
-    for other in (options.data, options.report):
-        require(options.results.resolve() != other.resolve(), options.results,
-                "another folder for the results: this one is for the datasets or the pages")
-    datasets = [_name_in(options.data, each) for each in options.datasets] or None
-    if options.out:
-        require(not options.out.is_dir(), options.out, "a file to write, found a folder")
+    out = getattr(options, "out", None)
+    pages = getattr(options, "report", HAND_IN_PAGES)
+    taken = [options.data.resolve(), pages.resolve()]
+    require(options.results.resolve() not in taken, options.results,
+            "another folder for the results: this one is for the datasets or the pages")
+    if out:
+        require(not out.is_dir(), out, "a file to write, found a folder")
         shown = handin.hand_in_options(shown)
     try:
         report = build_report(
-            notebooks, options.data, options.report, options.results, datasets=datasets,
-            options=shown, jobs=options.jobs, kept=EXECUTED_NOTEBOOKS)
+            notebooks, options.data, pages, options.results, options.datasets or None, shown,
+            options.jobs, EXECUTED_NOTEBOOKS)
     except NotebookError as error:
         return _ended(1, error)
     if not shown.author:
         print("report.toml names no author: the PDF's title page has none", file=sys.stderr)
     print("\n".join(summary_lines(report.summaries)), file=sys.stderr)
-    if options.out:
-        handin.write_zip(options.out, report, options.results, shown)
-        print(f"hand-in: {options.out.resolve()}", file=sys.stderr)
+    if out:
+        handin.write_zip(out, report, options.results, shown)
+        print(f"hand-in: {out.resolve()}", file=sys.stderr)
     else:
         print(f"report: {report.files[0]} and {report.files[-1]}", file=sys.stderr)
     return _code_of(report.summaries)
@@ -172,36 +153,31 @@ def _code_of(summaries):
     return 3 if any(failed) else 0
 
 
-def _name_in(data, dataset):
-    """The name of a dataset (str), which may be given as its path in the folder `data`."""
-    path = Path(dataset)
-    return path.name if path.resolve().parent == data.resolve() else dataset
-
-
 def summary_lines(summaries: list[dict]) -> list[str]:
     """The summaries of drives as lines: a table, then what failed or is in doubt."""
     from slamlib.solve import drive_table
     table = drive_table(summaries).drop(columns=["seconds", "failed"]).dropna(axis=1, how="all")
-    lines = table.to_string(index=False, na_rep="-", float_format="{:.4g}".format).splitlines()
+    lines = [table.to_string(index=False, na_rep="-", float_format="{:.4g}".format)]
     for summary in summaries:
-        told = []
+        name = summary["dataset"]
         for problem, row in summary["problems"].items():
             if "failed" in row:
-                told.append(f"{problem} could not be solved: {row['failed']}")
-        told += [f"doubt ({doubt['what']}): {doubt['sentence']}" for doubt in summary["doubts"]]
-        lines += [f"{summary['dataset']}: {each}" for each in told]
+                lines.append(f"{name}: {problem} could not be solved: {row['failed']}")
+        for doubt in summary["doubts"]:
+            told = f"{name}: doubt ({doubt['what']}): {doubt['sentence']} {doubt['advice']}"
+            lines.append(told.rstrip())
     return lines
 
 
 def _solve(options):
     """Solve the problems of one dataset or several, and print a table of each."""
     from slamlib.solve import solve_folder, solve_folders
-    how = {"problems": [f"problem{each}" for each in options.problem],
-           "text": options.csv, "verbose": options.verbose}
+    problems = [f"problem{each}" for each in options.problem]
+    how = {"problems": problems, "verbose": options.verbose}
     if len(options.folders) > 1:
         summaries = solve_folders(options.folders, options.out, options.jobs, **how)
     else:
-        summaries = [solve_folder(options.folders[0], options.out, jobs=options.jobs, **how)]
+        summaries = [solve_folder(options.folders[0], options.out, **how)]
     print("\n".join(summary_lines(summaries)))
     errors = [_ended(2, summary["error"]) for summary in summaries if "error" in summary]
     print(f"results: {options.out.resolve()}", file=sys.stderr)

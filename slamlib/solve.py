@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,13 +29,10 @@ from slamlib.io.dataset import (
     write_vehicle,
 )
 from slamlib.robust.file_doubts import Doubt, doubts_before_solving, merged
+from slamlib.robust.result import SlamResult
 from slamlib.robust.solution_doubts import fusion_doubts, solution_doubts
 
-if TYPE_CHECKING:
-    import pandas
-
 log = logging.getLogger(__name__)
-SLOW = 2.0                                          # s, after which a problem is told to be solved
 UNSOLVABLE = (DatasetError, np.linalg.LinAlgError)  # what `find` raises where there is no solution
 
 
@@ -58,7 +55,6 @@ PROBLEMS = {
 }
 SENSORS = {"aruco": "markers", "uwb": "UWB ranges"}
 VEHICLE_ESTIMATED = "vehicle.toml"                  # in the results: what the drive says of it
-TRUTH = "truth.tum"
 NOISE = {"slip": "slip_sqrt_m", "marker_noise_factor": "marker_noise_factor",
          "range_noise_factor": "range_noise_factor"}    # entries of vehicle.toml, keys of facts
 DRIVES = "drives.csv"                               # the table over all drives, and its columns
@@ -112,20 +108,19 @@ def failure(problem: str, dataset: Dataset, error: Exception) -> Failure:
     return Failure(problem, title(problem, dataset), reason)
 
 
-def find(problem: str, dataset: Dataset, found: dict | None = None):
+def find(problem: str, dataset: Dataset, previous: SlamResult | None = None):
     """The result of a problem's solver: (poses, covariances), Localization, Fusion or SlamResult.
 
-    `found` are such results of other problems (dict by problem): problem 4 starts from problem 3
-    where there is one. Raises UNSOLVABLE where the measurements determine no solution.
+    Problem 4 starts from `previous`, problem 3's. Raises UNSOLVABLE where the measurements
+    determine no solution.
     """
-    before = (found or {}).get("problem3")
     solvers = {
         "problem1": lambda: odometry.equation2(dataset.ticks, dataset.vehicle),
         "problem2": lambda: localize(dataset.sightings),
         "problem2_hint": lambda: fuse_increments(dataset),
         "problem2_fused": lambda: fuse(dataset),
         "problem3": lambda: estimate(dataset.without("uwb")),
-        "problem4": lambda: estimate(dataset, previous=before)}
+        "problem4": lambda: estimate(dataset, previous=previous)}
     return solvers[problem]()
 
 
@@ -140,45 +135,55 @@ def problem_solution(problem: str, dataset: Dataset, found=None) -> Solution:
     """
     if found is None:
         found = find(problem, dataset)
-    poses, covariances = found if isinstance(found, tuple) else (found.poses, found.covariances)
-    _require_variances(found, covariances[np.isfinite(poses[:, 0])])
-    fields = {"poses": poses, "covariances": covariances}
+    if problem == "problem1":
+        poses, covariances = found
+    else:
+        poses = found.poses
+        covariances = found.covariances
+    is_known = np.isfinite(poses[:, 0])
+    _require_variances(covariances[is_known])
+    solution = Solution(problem, title(problem, dataset), poses, covariances)
+    if problem == "problem1":
+        return solution
     if problem == "problem2":
-        fields = _at_all_poses(found, len(dataset.ticks))
+        solution = _at_all_poses(solution, found.frame, len(dataset.ticks))
     if problem == "problem2_fused":
-        fields["doubts"] = fusion_doubts(found, dataset.vehicle)
+        solution = replace(solution, doubts=fusion_doubts(found, dataset.vehicle))
+    if problem in ("problem2", "problem3", "problem4"):
+        markers = _map(found.marker, found.marker_in_world, found.marker_covariance)
+        solution = replace(solution, aruco_map=markers)
     if problem in ("problem3", "problem4"):
-        fields["doubts"] = solution_doubts(found)
-    if problem != "problem1":
-        fields["facts"] = _facts(found)
-    if len(getattr(found, "marker", ())):
-        fields["aruco_map"] = found.marker, found.marker_in_world, found.marker_covariance
-    if len(getattr(found, "antenna", ())):
-        fields["uwb_map"] = found.antenna, found.antenna_in_world, found.antenna_covariance
-    return Solution(problem=problem, title=title(problem, dataset), **fields)
+        _require_variances(found.c_covariance)
+        antennas = _map(found.antenna, found.antenna_in_world, found.antenna_covariance)
+        solution = replace(solution, uwb_map=antennas, doubts=solution_doubts(found))
+    return replace(solution, facts=_facts(found))
 
 
-def _require_variances(found, covariances):
-    """Raise LinAlgError if a variance of poses (m, 3, 3), map or wheels was lost by rounding."""
-    others = [getattr(found, f"{kind}_covariance", None) for kind in ("marker", "antenna", "wheel")]
-    variances = np.concatenate([np.diagonal(block, axis1=-2, axis2=-1).ravel()
-                                for block in (covariances, *others) if block is not None])
+def _map(ids, places, covariances):
+    """The map of a Solution by ids (k,), places (k, d), covariances (k, d, d); None without ids."""
+    _require_variances(covariances)
+    if len(ids) == 0:
+        return None
+    return ids, places, covariances
+
+
+def _require_variances(covariances):
+    """Raise LinAlgError if a variance of covariances (..., d, d) was lost by rounding."""
+    variances = np.diagonal(covariances, axis1=-2, axis2=-1)
     is_valid = (variances >= 0) & (variances < np.inf)
-    fit = getattr(found, "fit", None)
-    is_lost = fit is not None and not np.isfinite(fit.log_evidence)
-    if is_lost or not is_valid.all():
+    if not is_valid.all():
         raise np.linalg.LinAlgError("a variance is negative or not finite")
 
 
-def _at_all_poses(found, count):
-    """Fields of a Solution by a Localization; the first localized pose is the world."""
+def _at_all_poses(solution, frame, count):
+    """The Solution at frames (f,) as one of all poses; the first localized pose is the world."""
     poses = np.full((count, 3), np.nan)
     covariances = np.full((count, 3, 3), np.nan)
-    covariances[found.frame] = found.covariances
-    poses[found.frame] = found.poses
-    known = found.frame[np.isfinite(found.poses[:, 0])]
+    poses[frame] = solution.poses
+    covariances[frame] = solution.covariances
+    known = np.flatnonzero(np.isfinite(poses[:, 0]))
     poses[known, 2] = np.unwrap(poses[known, 2])
-    return {"poses": poses, "covariances": covariances, "world": int(known[0])}
+    return replace(solution, poses=poses, covariances=covariances, world=int(known[0]))
 
 
 def _facts(found):
@@ -186,54 +191,42 @@ def _facts(found):
     facts = {"outliers": int(np.sum(found.rejected))}
     if getattr(found, "slip", None) is not None:
         facts["slip_sqrt_m"] = found.slip
-    if not hasattr(found, "fit"):
+    if not isinstance(found, SlamResult):
         return facts
     facts["unconfirmed"] = found.unconfirmed.tolist()
     facts["calibration"] = [row for row in found.calibration_table if row["sigma"]]
     if len(found.rejected):
         facts["marker_noise_factor"] = found.noise.sightings
     if len(found.antenna):
+        is_down_weighted = found.range_weight < 0.5
         facts["range_noise_factor"] = found.noise.ranges
-        facts["ranges"] = len(found.range_weight)
-        facts["ranges_down_weighted"] = int(np.sum(found.range_weight < 0.5))
-        facts["antennas_in_doubt"] = found.doubts
+        facts["ranges"] = len(is_down_weighted)
+        facts["ranges_down_weighted"] = int(np.sum(is_down_weighted))
     return facts
 
 
-def solutions(dataset: Dataset, problems: Sequence[str] = tuple(PROBLEMS),
-              jobs: int = 1) -> list[Solution | Failure]:
+def solutions(dataset: Dataset, problems: Sequence[str] = tuple(PROBLEMS)
+              ) -> list[Solution | Failure]:
     """The Solution of each of `problems` that the dataset's sensors allow, in order.
 
-    A problem that cannot be solved has a Failure. Facts include the seconds that it took. With more
-    than one of `jobs`, problems 3 and 4 are solved beside the others, in a process of their own.
+    A problem that cannot be solved has a Failure. Facts include the seconds that it took.
     """
-    allowed = [problem for problem in problems if allows(dataset, problem)]
-    if jobs == 1:
-        return _in_order(dataset, allowed)
-    from joblib import Parallel, delayed  # here and below, because one job needs none of it
-
-    slam = [problem for problem in allowed if problem in ("problem3", "problem4")]
-    others = [problem for problem in allowed if problem not in slam]
-    in_order = delayed(_in_order)
-    found = Parallel(n_jobs=2)(in_order(dataset, each) for each in (slam, others))
-    return found[1] + found[0]
-
-
-def _in_order(dataset, problems):
-    """The Solutions or Failures of problems, of which one starts from those before it."""
-    found = {}
+    previous = None
     solved = []
     for problem in problems:
+        if not allows(dataset, problem):
+            continue
         start = time.perf_counter()
         try:
-            found[problem] = find(problem, dataset, found)
-            solution = problem_solution(problem, dataset, found[problem])
+            found = find(problem, dataset, previous)
+            if problem == "problem3":
+                previous = found
+            solution = problem_solution(problem, dataset, found)
         except UNSOLVABLE as error:
             solved.append(failure(problem, dataset, error))
             continue
         seconds = time.perf_counter() - start
-        level = logging.WARNING if seconds > SLOW else logging.INFO
-        log.log(level, "%s: %s solved in %.1f s", dataset.name, problem, seconds)
+        log.info("%s: %s solved in %.1f s", dataset.name, problem, seconds)
         solved.append(replace(solution, facts=solution.facts | {"seconds": seconds}))
     return solved
 
@@ -277,51 +270,47 @@ def write_results(out: Path | str, problem: str, found, dataset: Dataset,
         solved = problem_solution(problem, dataset, found)
     except UNSOLVABLE as error:
         solved = failure(problem, dataset, error)
+    if doubts is None:
+        doubts = doubts_before_solving(dataset)
     with files.locked(out):
-        rows = {}
+        others = {}
         with suppress(DatasetError):
-            rows = results.read_summary(out)["problems"]
-        rows.pop(problem, None)
-        _write(out, dataset, truth, [solved], rows, doubts=doubts)
+            others = results.read_summary(out)["problems"]
+        others.pop(problem, None)
+        _write(out, dataset, truth, [solved], others, doubts)
     return solved
 
 
 def solve_to_folder(dataset: Dataset, truth: Truth | None, out: Path,
-                    problems: Sequence[str] = tuple(PROBLEMS), text: bool = False,
-                    jobs: int = 1) -> dict:
+                    problems: Sequence[str] = tuple(PROBLEMS)) -> dict:
     """Solve `problems` of a Dataset, then write their files to the folder `out`.
 
     Files of an earlier run are replaced, or removed if they belong to other problems; all other
     files in the folder stay. Raises DatasetError, before anything is solved, if nothing can be
-    written there. `truth` serves to report errors; with `text` each .mat file is written as CSV,
-    too, and trajectories and truth as TUM files. `jobs` as of `solutions`.
+    written there. `truth` serves to report errors.
 
     Returns
     -------
     The summary, the dict that is written to summary.json. A problem that could not be solved has
-    the entry "failed", a sentence. The list "doubts", of "what" and "sentence", has those about the
-    drive first, then by problem. "notes" lists what was mended or left out while the files were
-    read.
+    the entry "failed", a sentence. The list "doubts", of "what", "sentence" and "advice", has those
+    about the drive first, then by problem. "notes" lists what was mended or left out while the
+    files were read.
     """
     with files.locked(out):
-        solved = solutions(dataset, problems, jobs)
-        return _write(out, dataset, truth, solved, {}, text)
+        doubts = doubts_before_solving(dataset)
+        return _write(out, dataset, truth, solutions(dataset, problems), {}, doubts)
 
 
-def _write(out, dataset, truth, solved, others, text=False, doubts=None):
+def _write(out, dataset, truth, solved, others, doubts):
     """Write solved problems to a folder; return its summary, with the rows of `others`, too."""
     rows = dict(others)
     for each in solved:
         rows[each.problem] = summarize(each, truth)
-    if doubts is None:
-        doubts = doubts_before_solving(dataset)
     summary = summary_of(dataset, truth, rows, doubts)
     clear_results(out, keep=others)
     for each in solved:
         if isinstance(each, Solution):
-            results.write_solution(out, each, text)
-    if text and truth is not None:
-        results.write_tum(out / TRUTH, truth.poses)
+            results.write_solution(out, each)
     _write_estimated_vehicle(out / VEHICLE_ESTIMATED, dataset.vehicle, summary["problems"])
     results.write_summary(out, summary)
     return summary
@@ -332,13 +321,12 @@ def clear_results(out: Path, keep: Sequence[str] = ()):
 
     The summary is the first to go. No other file is touched, and folders stay.
     """
-    names = [results.SUMMARY, VEHICLE_ESTIMATED, TRUTH]
+    (out / results.SUMMARY).unlink(missing_ok=True)
+    (out / VEHICLE_ESTIMATED).unlink(missing_ok=True)
     for problem in PROBLEMS:
-        if problem not in keep:
-            names += results.file_names(problem)
-    for name in names:
-        if (out / name).exists():
-            (out / name).unlink()
+        for name in results.RESULT_FILES:
+            if problem not in keep:
+                (out / problem / name).unlink(missing_ok=True)
 
 
 def summary_of(dataset: Dataset, truth: Truth | None, rows: dict, doubts: list[Doubt]) -> dict:
@@ -347,7 +335,7 @@ def summary_of(dataset: Dataset, truth: Truth | None, rows: dict, doubts: list[D
     problems = {problem: rows[problem] for problem in PROBLEMS if problem in rows}
     for row in problems.values():
         doubts += [Doubt(**doubt) for doubt in row.get("doubts", ())]
-    return {"dataset": dataset.name, "poses": len(dataset.ticks), "kernel": dataset.vehicle.kernel,
+    return {"dataset": dataset.name, "poses": len(dataset.ticks),
             "doubts": [asdict(doubt) for doubt in merged(doubts)],
             "notes": all_notes(dataset, truth), "problems": problems}
 
@@ -400,7 +388,7 @@ def _write_estimated_vehicle(path, vehicle, rows):
 
 
 def solve_folder(folder: Path | str, out: Path | str, problems: Sequence[str] = (),
-                 text: bool = False, verbose: bool = False, jobs: int = 1) -> dict:
+                 verbose: bool = False) -> dict:
     """Read the dataset in a folder, solve it into the folder `out`; returns the summary.
 
     What was read is printed to stderr.
@@ -408,9 +396,7 @@ def solve_folder(folder: Path | str, out: Path | str, problems: Sequence[str] = 
     Parameters
     ----------
     problems : keys of `PROBLEMS`, or none for all that the sensors allow.
-    text : as of `solve_to_folder`.
     verbose : True prints to stderr what is decided on the way.
-    jobs : as of `solutions`.
 
     Raises DatasetError if the dataset is malformed or does not allow a problem.
     """
@@ -419,7 +405,8 @@ def solve_folder(folder: Path | str, out: Path | str, problems: Sequence[str] = 
     if verbose:
         logging.basicConfig(format="%(message)s")
         logging.getLogger("slamlib").setLevel(logging.INFO)
-    require(out.resolve() not in (folder.resolve(), folder.resolve() / "truth"), out,
+    own_folders = (folder.resolve(), folder.resolve() / "truth")
+    require(out.resolve() not in own_folders, out,
             "another folder for the results: this one is the dataset's")
     dataset = read_dataset(folder)
     truth = read_truth(folder)
@@ -427,7 +414,7 @@ def solve_folder(folder: Path | str, out: Path | str, problems: Sequence[str] = 
     for problem in problems:
         require(allows(dataset, problem), folder,
                 f"the measurements of {problem} ({title(problem, dataset)})")
-    return solve_to_folder(dataset, truth, out, sorted(problems) or tuple(PROBLEMS), text, jobs)
+    return solve_to_folder(dataset, truth, out, sorted(problems) or tuple(PROBLEMS))
 
 
 def solve_folders(folders: Sequence[Path | str], out: Path | str, jobs: int | None = None,
@@ -454,24 +441,24 @@ def solve_folders(folders: Sequence[Path | str], out: Path | str, jobs: int | No
     names = [folder.absolute().name for folder in folders]
     require(len(set(names)) == len(names), out, "datasets in folders of different names, as which "
             f"their results are written, found {', '.join(names)}")
-    with files.locked(out):
-        solve = delayed(_summary_or_error)
-        summaries = Parallel(n_jobs=jobs)(
-            solve(folder, out / name, options) for folder, name in zip(folders, names))
-        files.write_file(out / DRIVES, drive_table(summaries).to_csv(index=False).encode())
+    solve = delayed(_summary_or_error)
+    summaries = Parallel(n_jobs=jobs)(solve(folder, out, options) for folder in folders)
+    table = drive_table(summaries).to_csv(index=False)
+    files.write_file(out / DRIVES, table.encode())
     return summaries
 
 
 def _summary_or_error(folder, out, options):
-    """What `solve_folder` returns, or a summary that has an error."""
+    """What `solve_folder` into the folder of its name in `out` returns, or one with an error."""
+    name = folder.absolute().name
     try:
-        return solve_folder(folder, out, **options)
+        return solve_folder(folder, out / name, **options)
     except (DatasetError, OSError) as error:
-        return {"dataset": out.name, "error": str(error), "doubts": [], "problems": {}}
+        return {"dataset": name, "error": str(error), "doubts": [], "problems": {}}
 
 
-def drive_table(summaries: Sequence[dict]) -> "pandas.DataFrame":
-    """The table over all drives, of `solve_folders`: a row for each problem, with COLUMNS.
+def drive_table(summaries: Sequence[dict]):
+    """The DataFrame over all drives, of `solve_folders`: a row for each problem, with COLUMNS.
 
     A problem or a drive that failed has a sentence; what is not known is NaN.
     """

@@ -9,14 +9,12 @@ import pytest
 from numeric import aruco, errors_of, short, uwb, vehicle, without_headings
 from numpy.testing import assert_allclose
 
-from slamlib.core.errors import DatasetError
 from slamlib.core.odometry import dead_reckoning
 from slamlib.core.records import AntennaGuess, Dataset, UwbReadings
 from slamlib.core.vehicle import Vehicle
-from slamlib.io.dataset import read_dataset
 from slamlib.robust import file_doubts as files
 from slamlib.robust.file_doubts import doubts_before_solving
-from slamlib.studies.simulation import manoeuvre, simulate, write_dataset
+from slamlib.studies.simulation import manoeuvre, simulate
 
 drive = cache(short)
 long_drive = cache(lambda: simulate("long", 0)[0])
@@ -63,16 +61,13 @@ def ranges_in(factor, factor_of_sigmas, factor_of_guesses=1.0):
 
 SWAPPED, REVERSED, BACKWARDS = [[0, 1], [1, 0]], [[-1, 0], [0, -1]], [[0, -1], [-1, 0]]
 FLAWS = {                                           # how, kinds of doubts, and what is said
-    "columns of counts": (wheels(SWAPPED), "wheels-swapped camera-mirrored",
-                          "right and left"),
-    "signs of counts": (wheels(REVERSED), "wheels-reversed camera-mirrored",
-                        "signs of the counts"),
-    "both": (wheels(BACKWARDS), "wheels-reversed camera-turned",
-             "signs reversed and the columns exchanged"),
-    "y and theta": (camera(1, -1, -1), "wheels-swapped camera-mirrored", "with [x, -y, -theta]"),
+    "columns of counts": (wheels(SWAPPED), "wheels-swapped", "the columns exchanged"),
+    "signs of counts": (wheels(REVERSED), "wheels-reversed", "both signs reversed"),
+    "both": (wheels(BACKWARDS), "wheels-reversed", "signs reversed and the columns exchanged"),
+    "y and theta": (camera(1, -1, -1), "wheels-swapped", "with [x, -y, -theta]"),
     "y": (camera(1, -1, 1), "camera-mirrored", "with [x, -y, theta]"),
     "all": (camera(-1, -1, -1), "camera-mirrored", "with [-x, -y, -theta]"),
-    "x and y": (camera(-1, -1, 1), "wheels-reversed camera-turned", "with [-x, -y, theta]"),
+    "x and y": (camera(-1, -1, 1), "wheels-reversed", "with [-x, -y, theta]"),
     "axes exchanged": (camera([0, 1, 0], [1, 0, 0], [0, 0, 1]), "camera-mirrored",
                        "with [y, x, theta]"),
     "right angle": (camera([0, -1, 0], [1, 0, 0], [0, 0, 1]), "camera-turned",
@@ -94,16 +89,18 @@ FLAWS = {                                           # how, kinds of doubts, and 
 def test_a_flaw_is_named(flaw, options):
     """With right covariances, and with sigmas of sightings that are half or twice as large.
 
-    Increments cannot tell a path from its mirror image: both explanations are named.
+    Increments cannot tell a path from its mirror image: both explanations are in one doubt.
     """
     spoil, what, said = FLAWS[flaw]
     for seed, factor in ((0, 1.0), (1, 1.0), (1, 0.25), (1, 4.0)):
         spoilt = covariances(factor)(spoil(drive(seed, **options)[0]))
         doubts = doubts_before_solving(spoilt)
         assert [doubt.what for doubt in doubts] == what.split()
-        sentences = " ".join(doubt.sentence for doubt in doubts)
-        assert said in sentences
-        assert ("Equally possible: " in sentences) == what.startswith("wheels-")
+        assert all(doubt.advice.startswith("Look ") for doubt in doubts)
+        assert all("look" not in doubt.sentence.lower() for doubt in doubts)
+        told = " ".join(f"{doubt.sentence} {doubt.advice}" for doubt in doubts)
+        assert said in told
+        assert (", or as well with sightings" in told) == what.startswith("wheels-")
 
 
 # Drives with nothing to doubt: functions of a simulated drive and a random generator.
@@ -147,8 +144,7 @@ RIGHT = {
     "standing": standing, "waiting": waiting, "a wheel": wheels_off(1.01),
     "the base": wheels_off(1.0, 1.01), "no headings": headings_unknown(slice(None)),
     "every second heading": headings_unknown(slice(0, None, 2)),
-    "small covariances": overconfident(1e-4, 0.0), "far too small": overconfident(1e-4, 0.03),
-    "too small": overconfident(1e-2, 0.03)}
+    "far too small": overconfident(1e-4, 0.03), "too small": overconfident(1e-2, 0.03)}
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -197,7 +193,7 @@ def test_files_that_contradict_each_other_are_told_with_all_that_may_follow_from
     assert files.merged(causes) == causes
     *first, consequences = files.merged(doubts)
     assert first == causes and consequences.what == "consequences"
-    assert "may follow from this: marker-noise, antenna. Mend" in consequences.sentence
+    assert consequences.sentence.endswith("may follow from this: marker-noise, antenna.")
 
 
 def moved_by(length, turn, count=20):
@@ -209,9 +205,7 @@ def moved_by(length, turn, count=20):
 @pytest.mark.parametrize("markers, wheels, disagree, said", [
     ((0.2, 0.1), (0.9, 0.45), 0, None), ((0.9, 0.45), (0.2, 0.1), 0, None),
     ((1.1, 0.1), (0.2, 0.1), 0, "x and y in ArucoReading.txt"),
-    ((0.2, 0.1), (1.1, 0.1), 0, "x and y in ArucoReading.txt"),
     ((0.2, 0.01), (0.2, 0.06), 0, "wheelbase in vehicle.toml"),
-    ((0.2, 0.06), (0.2, 0.01), 0, "wheelbase in vehicle.toml"),
     ((0.02, 0.01), (0.2, 0.1), 0, "radii (metres) and ticks_per_revolution"),
     ((0.02, 0.1), (0.0, 0.1), 0, None),
     ((0.2, 0.004), (0.2, 0.0005), 0, None), ((0.3, 0.15), (0.2, 0.1), 9, None),
@@ -224,7 +218,7 @@ def test_units_are_named_from_a_factor_of_five_on_and_odometry_if_most_disagrees
     kinds = [doubt.what for doubt in doubts]
     assert kinds == ["odometry" if disagree else "units"] * bool(said)
     for doubt in doubts:
-        assert said in doubt.sentence
+        assert said in f"{doubt.sentence} {doubt.advice}"
         assert ("moves by {:.4g} m and turns by {:.4g} rad by the markers, and by {:.4g} m and "
                 "{:.4g} rad by the wheels").format(*markers, *wheels) in doubt.sentence
 
@@ -250,7 +244,7 @@ def test_units_of_ranges_are_judged_by_their_spread_and_by_the_guesses(factor, g
     doubts = list(files.range_units(ranges_on_a_circle(factor, guess)))
     assert len(doubts) == bool(named)
     for doubt in doubts:
-        assert named in doubt.sentence
+        assert named in doubt.advice
         numbers = re.findall(r"[\d.]+(?= m\b)", doubt.sentence)
         expected = [factor * 10, factor * 2 * np.sqrt(2), 2, np.hypot(6 * guess, 10 * guess - 2)]
         assert_allclose(np.array(numbers, float), expected, rtol=0.03)
@@ -265,22 +259,13 @@ def test_units_of_few_ranges_and_of_a_vehicle_that_stands_are_not_judged():
 
 
 @pytest.mark.parametrize("spoil", [
-    sightings_in(100, 100), sightings_in(100, 1), sightings_in(1, 100),
-    lambda d: sightings_in(100, 100)(d).without("uwb"),
-    lambda d: ranges_in(100, 100, 100)(d).without("aruco"), ranges_in(100, 1), ranges_in(100, 100),
-    ranges_in(100, 1, 100), lambda d: sightings_in(100, 100)(ranges_in(100, 100)(d))])
+    sightings_in(100, 100), sightings_in(100, 1), sightings_in(1, 100), ranges_in(100, 100),
+    ranges_in(100, 1, 100), lambda d: ranges_in(100, 100, 100)(d).without("aruco")])
 @pytest.mark.parametrize("count", [150, 2000])
 def test_lengths_in_centimetres_are_doubted(spoil, count):
     """Of short drives of 1.5 m and 20 m."""
     doubts = doubts_before_solving(spoil(drive(0, count)[0]))
     assert {doubt.what for doubt in doubts} == {"units"}
-
-
-@pytest.mark.parametrize("sizes", [{"wheelbase": 400.0}, {"right_radius": 100.0}])
-def test_wheels_in_millimetres_are_refused(sizes, tmp_path):
-    write_dataset(tmp_path / "drive", vehicle(**sizes)(drive(0, 150)[0]))
-    with pytest.raises(DatasetError, match="vehicle.toml: expected a number from "):
-        read_dataset(tmp_path / "drive")
 
 
 @pytest.mark.parametrize("factor", [1.0, 3.0])
@@ -302,4 +287,4 @@ def test_ranges_exchanged_with_their_sigmas_are_doubted(count):
     exchanged = uwb(dataset, range=dataset.uwb.sigma, sigma=dataset.uwb.range)
     doubts = doubts_before_solving(exchanged)
     assert {doubt.what for doubt in doubts} == {"units"}
-    assert all("UwbReading.txt" in doubt.sentence for doubt in doubts)
+    assert all("UwbReading.txt" in doubt.advice for doubt in doubts)

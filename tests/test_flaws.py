@@ -1,7 +1,6 @@
 """Drives that are not as their files say: the estimate holds, or a doubt names what is wrong."""
 
 import itertools
-import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -152,7 +151,7 @@ def test_an_antenna_in_doubt_is_named_with_the_reason(found):
 @pytest.mark.parametrize("group", GROUPS)
 def test_every_group_is_named_with_its_entries_and_no_others(found, group):
     doubt, = solution_doubts(explained(found, [group]))
-    assert doubt.what == group and doubt.sentence.endswith(GROUPS[group][1])
+    assert doubt.what == group and doubt.advice == GROUPS[group][1]
     assert "problem 4 uses this" in doubt.sentence and "cannot tell" not in doubt.sentence
     for name, is_named in zip(found.calibration.names, found.calibration.of_group(group)):
         assert (f"{name} = " in doubt.sentence) == is_named
@@ -181,28 +180,29 @@ def test_explanations_that_exclude_each_other_are_all_named(found):
 @pytest.mark.parametrize("factor, sigma, said", [
     (1.45, 0.02, None), (1 / 1.45, 0.02, None), (1.6, 0.13, None),
     (1.6, 0.02, "scatter 1.60 ± 0.03 times"), (0.5, 0.02, "scatter 0.50 ± 0.01 times"),
-    (1.6, 0.0, None),                                        # as given, not learned
-    (100.0, 0.02, "scatter at least 100 times"), (0.01, 0.02, "scatter at most 0.01 times")])
+    (1.6, 0.0, None)])                                       # as given, not learned
 def test_scatter_that_is_decidedly_not_as_stated_is_named(
         found, column, name, file, factor, sigma, said):
-    """By more than a factor of 1.5 and four standard deviations; at a bound the bound is said."""
+    """By more than a factor of 1.5 and four standard deviations."""
     noise = [1e-3, 1.0, 1.0]
     noise[column] = factor
-    sentences = [doubt.sentence for doubt in solution_doubts(with_noise(found, noise, sigma))]
+    result = with_noise(found, noise, sigma)
+    if name == "sightings":
+        result = replace(result, range_weight=np.zeros(0))                # as without ranges
+    sentences = [doubt.sentence for doubt in solution_doubts(result)]
     assert len(sentences) == (said is not None)
     for sentence in sentences:
         assert f"The {name} {said} as much as {file} states" in sentence
-        assert "covariances were obtained" in sentence
 
 
-@pytest.mark.parametrize("late, reason", [
-    (0.08, "covariances were obtained"), (0.15, "15% of them are far too long")])
-def test_late_ranges_are_the_reason_for_their_scatter_if_they_are_more_than_a_tenth(
-        found, late, reason):
+@pytest.mark.parametrize("late, is_told", [(0.08, False), (0.15, True)])
+def test_late_ranges_are_told_with_their_scatter_if_they_are_more_than_a_tenth(
+        found, late, is_told):
     weight = np.where(np.arange(100) < 100 * late, 0.4, 0.6)
     doubt, = solution_doubts(replace(
         with_noise(found, [1e-3, 1.0, 2.0], 0.02), range_weight=weight))
-    assert doubt.what == "range-noise" and reason in doubt.sentence
+    assert doubt.what == "range-noise"
+    assert ("15% of them are far too long" in doubt.sentence) == is_told
 
 
 @pytest.mark.parametrize("slip, sigma, count", [(0.03, 0.1, 1), (0.02, 0.1, 0), (0.03, 0.0, 0)])
@@ -223,21 +223,15 @@ def said_of_rejected(count, wrong, repeated=0):
 
 @pytest.mark.parametrize("wrong, repeated, said", [
     ([4, 0, 0], 0, None), ([0, 4, 1], 0, None), ([0, 0, 5], 0, None),
-    ([5, 0, 0], 0, "5 of 54 sightings contradict the rest and are left out, of marker 11 5 of 10:"),
-    ([0, 4, 2], 0, "6 of 54 sightings contradict the rest and are left out:"),
-    ([5, 4, 21], 0, "left out, of marker 11 5 of 10, of marker 13 21 of 40:"),
+    ([5, 0, 0], 0, "5 of 54 sightings contradict the rest and are left out, of marker 11 5 of 10."),
+    ([0, 4, 2], 0, "6 of 54 sightings contradict the rest and are left out."),
+    ([5, 4, 21], 0, "left out, of marker 11 5 of 10, of marker 13 21 of 40."),
     ([1, 0, 0], 6, "7 of 60 sightings contradict the rest and are left out, 6 by another one")])
 def test_many_rejected_sightings_are_named_of_all_and_of_single_markers(wrong, repeated, said):
     """Sightings of markers 11, 12 and 13: ten, four and forty."""
     sentences = said_of_rejected([10, 4, 40], wrong, repeated)
     assert len(sentences) == (said is not None)
     assert all(said in sentence for sentence in sentences)
-
-
-def test_of_nine_markers_the_one_with_the_smallest_share_is_not_named():
-    """Five sightings are rejected of each: of ten of marker 11, of eighteen of marker 19."""
-    sentence, = said_of_rejected(range(10, 19), 9 * [5])
-    assert re.findall("of marker ([0-9]+) ", sentence) == [str(each) for each in range(11, 19)]
 
 
 def test_a_turn_that_the_wheels_hardly_know_is_named_where_it_is(found):

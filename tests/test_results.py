@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from joblib import parallel_config
-from numeric import aruco
+from numeric import aruco, short
 from scipy.io import loadmat, savemat
 
 from slamlib import estimate, read_dataset, solve
@@ -78,23 +78,14 @@ def test_tum_files_keep_every_digit_of_the_poses_that_are_known(tmp_path):
     np.testing.assert_allclose(rows[:, 7], np.cos(half), atol=1e-15)
 
 
-@pytest.mark.parametrize("d, header, row", [
-    (3, "id,x,y,theta,s_xx,s_xy,s_xtheta,s_yy,s_ytheta,s_thetatheta",
-     [9, 1 / 3, -1e-9, 7, 1 / 7, 2, 3, 4, 5, 6]),
-    (2, "id,x,y,s_xx,s_xy,s_yy", [9, 1 / 3, -1e-9, 1 / 7, 2, 4])])
-def test_csv_files_name_their_columns_and_keep_every_digit(tmp_path, d, header, row):
-    C = np.array([[[1 / 7, 2, 3], [2, 4, 5], [3, 5, 6]]] * 3)
-    results.write_csv(tmp_path / "a.csv", np.array([7, 8, 9]), POSES[:, :d], C[:, :d, :d])
-    first, *_, last = (tmp_path / "a.csv").read_text().splitlines()
-    assert first == header and [*map(float, last.split(","))] == row
-
-
 @pytest.mark.parametrize("problem, options, key", [
     ("problem4", [], "ate_m"), ("problem2", ["--align"], "ate_aligned_m")])
-def test_evo_finds_the_errors_of_the_summary_in_what_solve_writes_as_text(
-        tmp_path, drive, problem, options, key):
+def test_evo_finds_the_errors_of_the_summary_in_tum_files(tmp_path, drive, problem, options, key):
     """By evo's own command line, as it is and aligned; problem 2 has a tenth of the poses."""
-    solve.solve_to_folder(*drive, tmp_path, [problem], text=True)
+    solve.solve_to_folder(*drive, tmp_path, [problem])
+    _, poses, _ = results.read_structs(tmp_path / problem, "vehiclePose")
+    results.write_tum(tmp_path / f"{problem}.tum", poses)
+    results.write_tum(tmp_path / "truth.tum", drive[1].poses)
     told = subprocess.run(
         [Path(sys.executable).with_name("evo_ape"), "tum", "truth.tum", f"{problem}.tum",
          *options], cwd=tmp_path, check=True, text=True, stdout=subprocess.PIPE, timeout=300,
@@ -107,8 +98,7 @@ def test_evo_finds_the_errors_of_the_summary_in_what_solve_writes_as_text(
 @pytest.fixture(scope="module")
 def drive():
     """A simulated drive of 100 poses, and its truth."""
-    dataset, truth = simulate("short", seed=3)
-    return dataset.first(100), replace(truth, poses=truth.poses[:100])
+    return short(3, 100)
 
 
 def test_problems_that_are_written_one_by_one_have_one_summary(tmp_path, drive):
@@ -152,6 +142,16 @@ def test_the_vehicle_as_estimated_can_be_taken_over(tmp_path):
     assert abs(vehicle.camera_x - 0.1) < 0.02
     assert vehicle.slip == row["slip_sqrt_m"]
     assert (vehicle.wheelbase, vehicle.range_noise_factor) == (0.4, None)
+
+
+def test_every_problem_has_its_trajectory_and_the_maps_that_it_estimates(tmp_path, drive):
+    solve.solve_to_folder(*drive, tmp_path)
+    written = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.mat"))
+    assert written == [
+        "problem1/vehiclePose.mat", "problem2/ArucoMap.mat", "problem2/vehiclePose.mat",
+        "problem2_fused/vehiclePose.mat", "problem2_hint/vehiclePose.mat", "problem3/ArucoMap.mat",
+        "problem3/vehiclePose.mat", "problem4/ArucoMap.mat", "problem4/UwbMap.mat",
+        "problem4/vehiclePose.mat"]
 
 
 def test_where_all_is_stated_no_vehicle_is_written(tmp_path, drive):

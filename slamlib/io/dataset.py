@@ -24,7 +24,8 @@ from slamlib.io.formats import (
     ENCODER,
     GUESS,
     LIMITS,
-    TRUE_MAPS,
+    TRUE_ANTENNAS,
+    TRUE_MARKERS,
     TRUE_POSES,
     TRUTH_FILES,
     UWB,
@@ -36,6 +37,7 @@ from slamlib.io.textfile import read_toml
 MAX_REVOLUTIONS = 10.0  # revolutions of a wheel in one step
 MODULI = (2**16, 2**15)  # numbers of values of counters that wrap around
 MIN_MODULUS_RATIO = 32.0  # ratio of a modulus to a large step of the drive, for a decision
+WHEEL_ENTRIES = 8  # number of fields of a Vehicle that table 2 has
 ORIGIN_TOLERANCE = 1e-3  # m and rad; a first true pose within it is taken as the origin
 
 
@@ -47,7 +49,8 @@ def read_dataset(folder: Path | str) -> Dataset:
     """
     files, notes = contents(folder, required=ENCODER)
     vehicle = read_vehicle(files.get(VEHICLE), TABLE_2)
-    return _dataset(files, vehicle, Path(abspath(folder)).name, notes)
+    name = Path(abspath(folder)).name
+    return _dataset(files, vehicle, name, notes)
 
 
 def dataset_from_arrays(ticks, aruco=None, uwb=None, guess=None, vehicle: Vehicle = TABLE_2,
@@ -72,12 +75,13 @@ def dataset_from_arrays(ticks, aruco=None, uwb=None, guess=None, vehicle: Vehicl
     (2, [7])
     """
     counts = table_of_array("ticks", ticks, ["right ticks", "left ticks"])
-    files = {
-        ENCODER: replace(counts, numbers=np.column_stack([counts.lines, counts.numbers])),
-        ARUCO: table_of_array("aruco", aruco, LIMITS[ARUCO]),
-        UWB: table_of_array("uwb", uwb, LIMITS[UWB]),
-        GUESS: table_of_array("guess", guess, LIMITS[GUESS])}
-    return _dataset(files, changed(TABLE_2, vars(vehicle), "vehicle"), name)
+    numbered = np.column_stack([counts.lines, counts.numbers])
+    files = {ENCODER: replace(counts, numbers=numbered)}
+    files[ARUCO] = table_of_array("aruco", aruco, LIMITS[ARUCO])
+    files[UWB] = table_of_array("uwb", uwb, LIMITS[UWB])
+    files[GUESS] = table_of_array("guess", guess, LIMITS[GUESS])
+    stated = changed(TABLE_2, vars(vehicle), "vehicle")
+    return _dataset(files, stated, name)
 
 
 def _dataset(files, vehicle, name, notes=()):
@@ -85,23 +89,30 @@ def _dataset(files, vehicle, name, notes=()):
     if UWB in files and GUESS not in files:
         del files[UWB]
         notes += (f"{GUESS} is missing: problem 4 is left out.",)
-    encoders, ticks = _incremental_counts(read_table(files[ENCODER], ENCODER), vehicle)
-    sightings = read_table(files.get(ARUCO), ARUCO, len(ticks))
+    encoders = read_table(files[ENCODER], ENCODER)
+    encoders, ticks = _incremental_counts(encoders, vehicle)
+    count = len(ticks)
+    sightings = read_table(files.get(ARUCO), ARUCO, count)
     guesses = read_table(files.get(GUESS), GUESS)
-    ranges = read_table(files.get(UWB), UWB, len(ticks))
+    ranges = read_table(files.get(UWB), UWB, count)
     is_guessed = np.isin(ranges.numbers[:, 1], guesses.numbers[:, 0])
     ranges = ranges.drop_rows({f"an antenna id of {guesses.name}": is_guessed})
     guess = None
     if len(guesses.numbers) > 0:
         guess = AntennaGuess(guesses.ids(0), guesses.numbers[:, 1:])
-    seen = sightings.numbers
-    heard = ranges.numbers
-    dataset = Dataset(
-        name, vehicle, ticks,
-        ArucoReadings(sightings.ids(0) - 1, sightings.ids(1), seen[:, 2:5], seen[:, COVARIANCE]),
-        UwbReadings(ranges.ids(0) - 1, ranges.ids(1), heard[:, 2], heard[:, 3]),
-        guess, notes + encoders.notes + sightings.notes + ranges.notes + guesses.notes)
-    return dataset.first(len(ticks))  # in which a sensor without readings is None
+    aruco = ArucoReadings(
+        pose=sightings.ids(0) - 1,
+        marker=sightings.ids(1),
+        marker_in_vehicle=sightings.numbers[:, 2:5],
+        covariance=sightings.numbers[:, COVARIANCE])
+    uwb = UwbReadings(
+        pose=ranges.ids(0) - 1,
+        antenna=ranges.ids(1),
+        range=ranges.numbers[:, 2],
+        sigma=ranges.numbers[:, 3])
+    notes += encoders.notes + sightings.notes + ranges.notes + guesses.notes
+    dataset = Dataset(name, vehicle, ticks, aruco, uwb, guess, notes)
+    return dataset.first(count)  # in which a sensor without readings is None
 
 
 def read_vehicle(path: Path | None, default: Vehicle) -> Vehicle:
@@ -113,11 +124,9 @@ def read_vehicle(path: Path | None, default: Vehicle) -> Vehicle:
 
 def write_vehicle(path: Path, vehicle: Vehicle):
     """Write a vehicle.toml: eight entries of the wheels, and others that are not of table 2."""
-    entries = vars(vehicle)
-    of_wheels = list(entries)[:8]
     text = ""
-    for name, value in entries.items():
-        if name in of_wheels or value != getattr(TABLE_2, name):
+    for number, (name, value) in enumerate(vars(vehicle).items()):
+        if number < WHEEL_ENTRIES or value != getattr(TABLE_2, name):
             text += f"{name} = {json.dumps(value)}\n"
     write_file(path, text.encode())
 
@@ -133,11 +142,12 @@ def _incremental_counts(table, vehicle):
     counts = read
     for modulus in MODULI:
         counts = _unwrapped(counts, modulus)
-    mended = np.flatnonzero((counts != read).any(axis=1))
+    is_mended = (counts != read).any(axis=1)
+    mended = table.lines[is_mended]
     if len(mended):
         table = table.noted(
             f": {len(mended)} rows were mended whose counts are 2^15 or 2^16 off, as of a counter "
-            f"that wraps around, first {table.kind} {table.lines[mended[0]]}")
+            f"that wraps around, first {table.kind} {mended[0]}")
     limit = MAX_REVOLUTIONS * vehicle.ticks_per_revolution
     ok = abs(counts) <= limit
     ok[0] = counts[0] == 0
@@ -150,8 +160,10 @@ def _incremental_counts(table, vehicle):
 def _unwrapped(counts, modulus):
     """Counts (n, 2) less a modulus, where that makes them as small as most others."""
     large = np.quantile(abs(counts), 0.9)
+    if MIN_MODULUS_RATIO * large >= modulus:
+        return counts
     less = counts - np.sign(counts) * modulus
-    is_wrapped = (abs(less) <= 2 * large) & (MIN_MODULUS_RATIO * large < modulus)
+    is_wrapped = abs(less) <= 2 * large
     return np.where(is_wrapped, less, counts)
 
 
@@ -168,11 +180,14 @@ def read_truth(folder: Path | str) -> Truth | None:
         return None
     files, notes = contents(drive["truth"], TRUTH_FILES, required=TRUE_POSES)
     path = read_table(files[TRUE_POSES], TRUE_POSES)
-    markers, antennas = [read_table(files.get(name), name) for name in TRUE_MAPS]
-    count = len(read_table(drive[ENCODER], ENCODER).numbers)
+    markers = read_table(files.get(TRUE_MARKERS), TRUE_MARKERS)
+    antennas = read_table(files.get(TRUE_ANTENNAS), TRUE_ANTENNAS)
+    encoders = read_table(drive[ENCODER], ENCODER)
+    count = len(encoders.numbers)
     poses = path.numbers[:, 1:]
     require(len(poses) == count, path.source, f"{count} poses (encoder file), found {len(poses)}")
-    poses[:, 2] = np.unwrap(np.append(0, poses[:, 2]))[1:]
+    headings = np.append(0, poses[:, 2])
+    poses[:, 2] = np.unwrap(headings)[1:]
     marker_in_world = markers.numbers[:, 1:]
     antenna_in_world = antennas.numbers[:, 1:]
     origin = poses[0].copy()
@@ -184,10 +199,12 @@ def read_truth(folder: Path | str) -> Truth | None:
         path = path.noted(
             " begins at ({:.3f} m, {:.3f} m, {:.4f} rad): poses and maps were moved into the frame "
             "of its first pose, in which the estimates are".format(*origin))
-    vehicle = read_vehicle(files.get(VEHICLE), read_vehicle(drive.get(VEHICLE), TABLE_2))
+    stated = read_vehicle(drive.get(VEHICLE), TABLE_2)
+    vehicle = read_vehicle(files.get(VEHICLE), stated)
     notes += path.notes + markers.notes + antennas.notes
+    notes = tuple(f"In truth: {note}" for note in notes)
     return Truth(poses, markers.ids(0), marker_in_world, antennas.ids(0), antenna_in_world,
-                 vehicle, tuple(f"In truth: {note}" for note in notes))
+                 vehicle, notes)
 
 
 def all_notes(dataset: Dataset, truth: Truth | None) -> tuple[str, ...]:
@@ -197,22 +214,18 @@ def all_notes(dataset: Dataset, truth: Truth | None) -> tuple[str, ...]:
 
 def inventory_lines(dataset: Dataset, truth: Truth | None) -> list[str]:
     """Lines on what was read of a Dataset and its Truth, with all notes."""
-    right, left = abs(dataset.ticks).sum(axis=0)
-    aruco = dataset.aruco
-    uwb = dataset.uwb
-    markers = "none, no ArucoReading.txt with usable rows"
-    ranges = "none, no UwbReading.txt with usable rows"
-    if aruco is not None:
-        markers = (f"{len(aruco.pose)} sightings of {len(set(aruco.marker))} markers at "
-                   f"{len(set(aruco.pose))} poses")
-    if uwb is not None:
-        ranges = (f"{len(uwb.pose)} ranges to {len(set(uwb.antenna))} antennas at "
-                  f"{len(set(uwb.pose))} poses")
-    stated = [f"{key} = {json.dumps(value)}" for key, value in vars(dataset.vehicle).items()
-              if value != getattr(TABLE_2, key)]
-    lines = [f"encoders: {len(dataset.ticks)} poses, {right} ticks right and {left} left",
-             f"markers: {markers}", f"ranges: {ranges}",
-             f"vehicle.toml: {', '.join(stated) or 'none, or as in table 2'}",
-             f"truth: {'no' if truth is None else 'yes'}"]
-    lines += [f"note: {note}" for note in all_notes(dataset, truth)]
-    return [f"{dataset.name}: {line}" for line in lines]
+    found = {"encoders": f"{len(dataset.ticks)} poses",
+             "markers": f"none, no {ARUCO} with usable rows",
+             "ranges": f"none, no {UWB} with usable rows",
+             "truth": "no" if truth is None else "yes"}
+    if dataset.aruco is not None:
+        found["markers"] = _counts(dataset.aruco.pose, "sightings", dataset.aruco.marker, "markers")
+    if dataset.uwb is not None:
+        found["ranges"] = _counts(dataset.uwb.pose, "ranges", dataset.uwb.antenna, "antennas")
+    lines = [f"{dataset.name}: {sensor}: {what}" for sensor, what in found.items()]
+    return lines + [f"{dataset.name}: note: {note}" for note in all_notes(dataset, truth)]
+
+
+def _counts(pose, readings, landmark, landmarks):
+    """Numbers of readings, landmarks and poses in words, by the pose and landmark of each."""
+    return f"{len(pose)} {readings} of {len(set(landmark))} {landmarks} at {len(set(pose))} poses"

@@ -16,8 +16,9 @@ GUESS = "UwbAntennaGuess.txt"
 VEHICLE = "vehicle.toml"
 DATASET_FILES = (ENCODER, ARUCO, UWB, GUESS, VEHICLE, "truth")
 TRUE_POSES = "vehiclePose.txt"
-TRUE_MAPS = ("ArucoMap.txt", "UwbMap.txt")
-TRUTH_FILES = (TRUE_POSES, *TRUE_MAPS, VEHICLE)
+TRUE_MARKERS = "ArucoMap.txt"
+TRUE_ANTENNAS = "UwbMap.txt"
+TRUTH_FILES = (TRUE_POSES, TRUE_MARKERS, TRUE_ANTENNAS, VEHICLE)
 
 MIN_EIGENVALUE = 1e-12  # of a correlation matrix; with a smaller one it counts as singular
 MAX_NEGATIVE_SIGMAS = 5.0  # sigmas, by which noise may make a range negative
@@ -42,8 +43,8 @@ LIMITS = {
           "sigma": Limit(1e-9, 1e4, "m")},
     GUESS: _ANTENNA,
     TRUE_POSES: {"pose id": _WHOLE} | _POSE,
-    "ArucoMap.txt": {"marker id": _WHOLE} | _POSE,
-    "UwbMap.txt": _ANTENNA}
+    TRUE_MARKERS: {"marker id": _WHOLE} | _POSE,
+    TRUE_ANTENNAS: _ANTENNA}
 
 
 def within(numbers: np.ndarray, limits: dict[str, Limit]) -> dict[str, np.ndarray]:

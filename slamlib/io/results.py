@@ -1,9 +1,8 @@
-"""The files to hand in: MATLAB struct arrays with the assignment's field names; the same as text.
+"""The files to hand in: MATLAB struct arrays with the assignment's field names; TUM files for evo.
 
 Poses are [x, y, heading] and positions [x, y] in world axes, in m and rad. Covariances belong to
 the same coordinates. A line of a TUM file is `timestamp x y z qx qy qz qw`, the format of the TUM
-RGB-D benchmark that evo and others read. The measurements have no times, so the time stamps are
-pose ids, from 1. Text files leave out poses without an estimate.
+RGB-D benchmark. The measurements have no times, so the time stamps are pose ids, from 1.
 """
 
 import json
@@ -22,35 +21,20 @@ SUMMARY = "summary.json"
 FIELDS = {"vehiclePose": ("pose", "covari"), "ArucoMap": ("pose", "covari", "id"),
           "UwbMap": ("position", "covariance", "id")}
 RESULT_FILES = tuple(f"{name}.mat" for name in FIELDS)  # of a problem's folder
-TEXT_FILES = tuple(f"{name}.csv" for name in FIELDS)
 _HEADER = b"MATLAB 5.0 MAT-file, written by slamlib".ljust(116)  # scipy's contains the date
 FIELD_HEADER = "V56"  # bytes before the numbers of a field of a struct
 SIZE_OFFSET = 132  # bytes, to the size of the array of structs
 COUNT_OFFSET = 164  # bytes, to its number of columns
 
 
-def write_solution(folder: Path | str, solution, text: bool = False) -> Path:
-    """Write the .mat files of a Solution into folder/<problem>/; returns that folder.
-
-    With `text` it writes CSV files beside them, too, and folder/<problem>.tum.
-    """
+def write_solution(folder: Path | str, solution):
+    """Write the .mat files of a Solution into folder/<problem>/."""
     own = Path(folder) / solution.problem
-    poses = (_pose_ids(solution.poses), solution.poses, solution.covariances)
-    for name, each in zip(FIELDS, (poses, solution.aruco_map, solution.uwb_map)):
-        if each is None:
-            continue
-        ids, places, covariances = each
-        write_structs(own, name, ids, places, covariances)
-        if text:
-            write_csv(own / f"{name}.csv", ids, places, covariances)
-    if text:
-        write_tum(own.with_suffix(".tum"), solution.poses)
-    return own
-
-
-def file_names(problem: str) -> list[str]:
-    """Names of all files that a problem may have in a results folder."""
-    return [f"{problem}.tum"] + [f"{problem}/{name}" for name in RESULT_FILES + TEXT_FILES]
+    write_structs(own, "vehiclePose", None, solution.poses, solution.covariances)
+    if solution.aruco_map is not None:
+        write_structs(own, "ArucoMap", *solution.aruco_map)
+    if solution.uwb_map is not None:
+        write_structs(own, "UwbMap", *solution.uwb_map)
 
 
 def write_summary(folder: Path | str, summary: dict):
@@ -136,34 +120,18 @@ def write_structs(folder: Path | str, name: str, ids: np.ndarray | None, places:
 
 
 def write_tum(path: Path | str, poses: np.ndarray):
-    """Write poses (n, 3), which are NaN without an estimate, as a TUM file; z is 0.
+    """Write poses (n, 3), of which those with NaN are left out, as a TUM file; z is 0.
 
     >>> write_tum("line.tum", np.array([[0, 0, 0], [np.nan, np.nan, np.nan], [2.5, 0, 0]]))
     >>> print(Path("line.tum").read_text(), end="")
     1 0 0 0 0 0 0 1
     3 2.5 0 0 0 0 0 1
     """
-    half = poses[:, 2] / 2
-    columns = {"x": poses[:, 0], "y": poses[:, 1], "z": 0, "qx": 0, "qy": 0, "qz": np.sin(half),
-               "qw": np.cos(half)}
-    _write_text(path, _pose_ids(poses), columns, sep=" ", header=False)
-
-
-def write_csv(path: Path | str, ids: np.ndarray, places: np.ndarray, covariances: np.ndarray):
-    """Write ids (n,), poses (n, 3) or positions (n, 2), NaN if unknown, and covariances as CSV.
-
-    The columns are id, x, y, theta and the upper triangle of the covariance in world axes.
-    """
-    names = ["x", "y", "theta"][:places.shape[1]]
-    columns = dict(zip(names, places.T))
-    for i, j in zip(*np.triu_indices(len(names))):
-        columns[f"s_{names[i]}{names[j]}"] = covariances[:, i, j]
-    _write_text(path, ids, columns, index_label="id")
-
-
-def _write_text(path, ids, columns, **form):
-    """Write ids (n,) and columns (dict) with all their digits, without rows that have NaN."""
-    from pandas import DataFrame  # here, because it is the slowest import of all
-    rows = DataFrame(columns, index=ids).dropna()
-    text = rows.to_csv(float_format="%.17g", lineterminator="\n", **form)
-    write_file(Path(path), text.encode())
+    x, y, heading = poses.T
+    zero = np.zeros(len(poses))
+    qz = np.sin(heading / 2)
+    qw = np.cos(heading / 2)
+    rows = np.column_stack([_pose_ids(poses), x, y, zero, zero, zero, qz, qw])
+    text = BytesIO()
+    np.savetxt(text, rows[np.isfinite(x)], fmt="%.17g")
+    write_file(Path(path), text.getvalue())

@@ -4,7 +4,6 @@ Rows of numbers have blanks between columns, decimal points, and comments that b
 or `//`. Commas or semicolons between columns, decimal commas and a header line are read, too.
 """
 
-import os
 import re
 import tomllib
 from json import detect_encoding
@@ -35,11 +34,10 @@ def read_toml(path: Path, example: str, known) -> dict:
 def read_text(path: Path) -> str:
     """Text of a file in UTF-8 or UTF-16, with line ends '\\n'.
 
-    Bytes that are invalid in it become '\\ufffd'. Raises DatasetError if the file cannot be read,
-    or may not end, as a pipe or a device.
+    Bytes that are invalid in it become '\\ufffd'. Raises DatasetError if there is no file, or what
+    may not end, as a pipe or a device.
     """
-    is_readable = path.is_file() and os.access(path, os.R_OK)
-    require(is_readable, path, "a file that can be read")
+    require(path.is_file(), path, "a file that can be read")
     encoding = detect_encoding(path.read_bytes())
     return path.read_text(encoding, errors="replace")
 

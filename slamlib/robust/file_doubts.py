@@ -43,9 +43,11 @@ MIN_DIFFERENT_COUNTS = 8  # from which on a common divisor says that counts were
 # Kinds of doubts from which most others follow
 DECISIVE = ("wheels-swapped", "wheels-reversed", "camera-mirrored", "camera-turned", "odometry",
             "units")
-# The matrices A, and by their number kind and change of the counts with the same effect.
+# The matrices A, what [x, y] is with each, and by their number the kind of doubt and the change of
+# the counts with the same effect.
 AXES = np.array([np.diag(signs) @ order for order in (np.eye(2), np.eye(2)[::-1])
                  for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1))])
+AXES_NAMES = ("x, y", "x, -y", "-x, y", "-x, -y", "y, x", "-y, x", "y, -x", "-y, -x")
 COUNTS = {1: ("wheels-swapped", "the columns exchanged"),
           2: ("wheels-reversed", "both signs reversed"),
           3: ("wheels-reversed", "both signs reversed and the columns exchanged")}
@@ -53,14 +55,11 @@ COUNTS = {1: ("wheels-swapped", "the columns exchanged"),
 
 @dataclass(frozen=True)
 class Doubt:
-    """A possible error in the files of a drive, for the user to check.
+    """A possible error in the files of a drive, for the user to check."""
 
-    `what` is its kind in kebab case ("wheels-swapped"), for programs. `sentence` states the
-    evidence and what to check in which file.
-    """
-
-    what: str
-    sentence: str
+    what: str           # its kind in kebab case ("wheels-swapped"), for programs
+    sentence: str       # the finding, with its evidence
+    advice: str = ""    # what to check, in which file
 
 
 def doubts_before_solving(dataset: Dataset) -> list[Doubt]:
@@ -82,14 +81,17 @@ def merged(doubts: Iterable[Doubt]) -> list[Doubt]:
     for doubt in doubts:
         key = doubt.sentence if doubt.what in ("antenna", "units") else doubt.what
         last[key] = doubt
-    causes = [doubt for doubt in last.values() if doubt.what in DECISIVE]
-    others = [doubt for doubt in last.values() if doubt.what not in DECISIVE]
+    causes = []
+    others = []
+    for doubt in last.values():
+        same = causes if doubt.what in DECISIVE else others
+        same.append(doubt)
     if not causes or not others:
         return causes + others
     named = ", ".join(dict.fromkeys(doubt.what for doubt in others))
-    return [*causes, Doubt("consequences", (
-        f"What else contradicts the solutions may follow from this: {named}. Mend the files "
-        "first."))]
+    return [*causes, Doubt(
+        "consequences", f"What else contradicts the solutions may follow from this: {named}.",
+        "Mend the files first.")]
 
 
 def motion_doubts(dataset: Dataset) -> list[Doubt]:
@@ -141,46 +143,30 @@ def _span(path):
 
 
 def wrong_axes(agree: np.ndarray) -> Iterator[Doubt]:
-    """Doubts, if with other axes or signs significantly more increments agree.
+    """Doubt, if with other axes or signs significantly more increments agree.
 
     `agree` (8, 2, n) tells it by AXES, for theta as stated and reversed.
     """
-    k, reverse = np.unravel_index(agree.sum(axis=2).argmax(), agree.shape[:2])
+    k, is_reversed = np.unravel_index(agree.sum(axis=2).argmax(), agree.shape[:2])
     stated = agree[0, 0]
-    found = agree[k, reverse]
+    found = agree[k, is_reversed]
     gain = found.sum() - stated.sum()
     gain_sigma = np.sum(found != stated)**0.5
     if found.mean() < MIN_AGREEING_SHARE or gain <= MIN_GAIN_SIGMAS * gain_sigma:
         return
-    possible = _explanations(k, reverse)
-    for what, change in possible.items():
-        others = [f" Equally possible: {each}." for each in possible.values() if each != change]
-        yield Doubt(what, (
-            "Increments of the vehicle by markers and by wheels agree at "
-            f"{stated.mean():.0%} of {len(stated)} places, and at {found.mean():.0%} with "
-            f"{change}.{''.join(others)}"))
-
-
-def _explanations(k, reverse):
-    """Changes of a file, by kind, that make AXES[k] right, where theta is reversed or not."""
-    possible = {}
-    if k in COUNTS and not reverse:
-        what, change = COUNTS[k]
-        possible[what] = (f"{change} in encoderReading.txt (look at the order of right and left, "
-                          "and at the signs of the counts)")
-    mirrors = np.linalg.det(AXES[k]) < 0
-    what = "camera-mirrored" if mirrors or reverse else "camera-turned"
-    axes = [_axis(direction) for direction in AXES[k].T]
-    axes.append("-theta" if mirrors != reverse else "theta")
-    possible[what] = (f"sightings with [{', '.join(axes)}] in place of [x, y, theta] in "
-                      "ArucoReading.txt")
-    return possible
-
-
-def _axis(direction):
-    """Name and sign of the axis in a direction (2,)."""
-    name = "x" if direction[0] else "y"
-    return name if direction.sum() > 0 else "-" + name
+    is_mirror = np.linalg.det(AXES[k]) < 0
+    heading = "-theta" if is_mirror != is_reversed else "theta"
+    change = (f"sightings with [{AXES_NAMES[k]}, {heading}] in place of [x, y, theta] in "
+              "ArucoReading.txt")
+    what = "camera-mirrored" if is_mirror or is_reversed else "camera-turned"
+    if k in COUNTS and not is_reversed:
+        what, change_of_counts = COUNTS[k]
+        change = f"{change_of_counts} in encoderReading.txt, or as well with {change}"
+    yield Doubt(what, (
+        f"Increments of the vehicle by markers and by wheels agree at {stated.mean():.0%} of "
+        f"{len(stated)} places, and at {found.mean():.0%} with {change}."), (
+        "Look at the order of right and left and at the signs in encoderReading.txt, and at the "
+        "axes of the camera."))
 
 
 def wrong_sizes(markers: np.ndarray, wheels: np.ndarray, sigma: np.ndarray,
@@ -195,21 +181,21 @@ def wrong_sizes(markers: np.ndarray, wheels: np.ndarray, sigma: np.ndarray,
     least = np.maximum(MAX_FACTOR * np.minimum(by_markers, by_wheels),
                        MIN_MOTION_SIGMAS * np.median(sigma, axis=0))
     differ = np.maximum(by_markers, by_wheels) > least
+    what = "odometry"
+    advice = ("Look whether encoderReading.txt and ArucoReading.txt are of the same drive and "
+              "count the same poses.")
     if (differ & (by_wheels > 0)).any():
         what = "units"
-        look = ("at the units of x and y in ArucoReading.txt (metres), of the radii (metres) and "
-                "ticks_per_revolution, and of the wheelbase in vehicle.toml (metres)")
-    elif agree.mean() <= 0.5:
-        what = "odometry"
-        look = ("whether encoderReading.txt and ArucoReading.txt are of the same drive and count "
-                "the same poses")
-    else:
+        advice = ("Look at the units of x and y in ArucoReading.txt (metres), of the radii "
+                  "(metres) and ticks_per_revolution, and of the wheelbase in vehicle.toml "
+                  "(metres).")
+    elif agree.mean() > 0.5:
         return
     yield Doubt(what, (
         f"Between the same poses the vehicle moves by {by_markers[0]:.4g} m and turns by "
         f"{by_markers[1]:.4g} rad by the markers, and by {by_wheels[0]:.4g} m and "
         f"{by_wheels[1]:.4g} rad by the wheels (medians); they agree at {agree.mean():.0%} of "
-        f"{len(agree)} places: look {look}."))
+        f"{len(agree)} places."), advice)
 
 
 def range_units(dataset: Dataset) -> Iterator[Doubt]:
@@ -222,16 +208,14 @@ def range_units(dataset: Dataset) -> Iterator[Doubt]:
         return
     path = _certain_path(dataset)
     heard = dataset.uwb.select(dataset.uwb.pose < len(path))
-    count = 0
     sizes = []
     for antenna, guess in zip(guesses.antenna, guesses.position):
         own = heard.select(heard.antenna == antenna)
         if len(own.range) >= MIN_RANGES_PER_ANTENNA:
-            count += len(own.range)
-            quartiles = np.percentile(own.range, [25, 75])
+            lower, typical, upper = np.percentile(own.range, [25, 50, 75])
             distances = np.linalg.norm(path[own.pose] - guess, axis=1)
-            sizes.append([np.ptp(quartiles), np.median(own.range), np.median(distances)])
-    if count < MIN_COUNT or not path.any():
+            sizes.append([upper - lower, typical, np.median(distances)])
+    if len(heard.range) < MIN_COUNT or not sizes or not path.any():
         return
     spread, typical, distance = np.median(sizes, axis=0)
     extent = np.linalg.norm(path.std(axis=0))
@@ -241,9 +225,9 @@ def range_units(dataset: Dataset) -> Iterator[Doubt]:
         yield Doubt("units", (
             f"The ranges to an antenna have the median {typical:.4g} m and quartiles "
             f"{spread:.4g} m apart; the path by the wheels spreads by {extent:.4g} m, and its "
-            f"median distance to the guess is {distance:.4g} m: look at the units of "
-            "UwbReading.txt, UwbAntennaGuess.txt and of the radii in vehicle.toml (metres), and at "
-            "the columns of UwbReading.txt."))
+            f"median distance to the guess is {distance:.4g} m."), (
+            "Look at the units of UwbReading.txt, UwbAntennaGuess.txt and of the radii in "
+            "vehicle.toml (metres), and at the columns of UwbReading.txt."))
 
 
 def _certain_path(dataset):
@@ -259,8 +243,8 @@ def cut_counts(dataset: Dataset) -> Iterator[Doubt]:
     if divisor > 1:
         yield Doubt("encoder-counts", (
             f"All counts of encoderReading.txt are multiples of {divisor}. If the rest of each row "
-            "was cut off, every distance by the wheels is too short, by an unknown factor: look at "
-            "how the counts were read, and at ticks_per_revolution in vehicle.toml."))
+            "was cut off, every distance by the wheels is too short, by an unknown factor."), (
+            "Look at how the counts were read, and at ticks_per_revolution in vehicle.toml."))
 
 
 def common_divisor(ticks: np.ndarray) -> int:
@@ -279,16 +263,17 @@ def sigma_units(dataset: Dataset) -> Iterator[Doubt]:
     seen = dataset.aruco
     heard = dataset.uwb
     if seen is not None:
+        columns = {"s_xx (m^2)": 0, "s_yy (m^2)": 1, "s_thetatheta (rad^2)": 2}
         sigma = se2.sigmas(seen.covariance)
-        for k, name in enumerate(("s_xx (m^2)", "s_yy (m^2)", "s_thetatheta (rad^2)")):
+        for name, k in columns.items():
             yield from _sigma_unit(seen.pose, seen.marker, seen.marker_in_vehicle[:, k],
-                                   sigma[:, k], f"{name} in ArucoReading.txt", heading=k == 2)
+                                   sigma[:, k], f"{name} in ArucoReading.txt")
     if heard is not None:
         yield from _sigma_unit(heard.pose, heard.antenna, heard.range, heard.sigma,
                                "sigma (m) in UwbReading.txt")
 
 
-def _sigma_unit(pose, landmark, values, sigma, column, heading=False):
+def _sigma_unit(pose, landmark, values, sigma, column):
     """Doubt about the sigmas (m,) in a column of a file, by measured `values` (m,) of landmarks.
 
     Second differences of successive measurements show the scatter; motion only increases it. A
@@ -297,15 +282,15 @@ def _sigma_unit(pose, landmark, values, sigma, column, heading=False):
     order = np.lexsort([pose, landmark])
     landmark = landmark[order]
     second = np.diff(values[order], 2)[landmark[2:] == landmark[:-2]]
+    stated = np.median(sigma)
+    if "theta" in column:
+        second = se2.wrap(second)
+        if stated >= np.pi:
+            return
     if len(second) < MIN_COUNT:
         return
-    if heading:
-        second = se2.wrap(second)
     scatter = np.median(np.abs(second)) / SECOND_DIFFERENCE
-    stated = np.median(sigma)
-    if heading and stated >= np.pi:
-        return
     if 0 < MAX_SIGMA_RATIO * scatter < stated:
         yield Doubt("units", (
-            f"Successive measurements scatter by {scatter:.3g} at most, but their stated "
-            f"standard deviation is {stated:.3g} (medians): look at the unit of {column}."))
+            f"Successive measurements scatter by {scatter:.3g} at most, but the standard deviation "
+            f"that {column} states is {stated:.3g} (medians)."), f"Look at the unit of {column}.")

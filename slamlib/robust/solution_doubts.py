@@ -22,7 +22,7 @@ MIN_FACTOR_SIGMAS = 4.0      # sigmas of the logarithm of a factor that is repor
 MAX_REJECTED = 0.1           # share of the sightings that are rejected
 MIN_REJECTED_OF_MARKER = 5   # number of its sightings, from which a marker is named
 MAX_REJECTED_OF_MARKER = 0.2     # share of its sightings, the same
-MAX_MARKERS_NAMED = 8        # of those with most rejected sightings
+MAX_MARKERS_NAMED = 8        # of those, in one sentence
 MAX_STRETCHES_NAMED = 3      # of the drive, where counts and markers contradict each other
 # Sigmas of a pose, and relative of a sigma, by engine and GTSAM. Sightings of points are
 # coordinates in one, bearing and distance in the other: up to 0.11 on clean drives.
@@ -59,8 +59,8 @@ def solution_doubts(result: SlamResult) -> tuple[Doubt, ...]:
                   _rejection_doubts, _path_doubts, _agreement_doubts):
         doubts += check(result)
     for antenna, reason in result.doubts.items():
-        doubts.append(Doubt("antenna", (
-            f"Antenna {antenna} is in doubt: {reason}. Look at its rows in UwbReading.txt.")))
+        doubts.append(Doubt("antenna", f"Antenna {antenna} is in doubt: {reason}.",
+                            "Look at its rows in UwbReading.txt."))
     return tuple(doubts)
 
 
@@ -71,18 +71,15 @@ def _calibration_doubts(result):
     """
     common = frozenset.intersection(*result.explanations)
     either = frozenset().union(*result.explanations) - common
-    table = result.calibration_table
-    rows = {}
-    for group in GROUPS:
-        entries = np.flatnonzero(result.calibration.of_group(group))
-        rows[group] = [table[k] for k in entries]
+    table = np.array(result.calibration_table)
+    rows = {group: table[result.calibration.of_group(group)] for group in GROUPS}
 
     def distance(group):
         return max(abs(row["estimate"] - row["stated"]) / row["sigma"] for row in rows[group])
 
     furthest = max(either, key=distance, default=None)
     problem = "problem 4" if len(result.antenna) else "problem 3"
-    for group, (_, look) in GROUPS.items():
+    for group, (_, advice) in GROUPS.items():
         if group not in common and group != furthest:
             continue
         numbers = " and ".join(map(_estimated_and_stated, rows[group]))
@@ -91,7 +88,7 @@ def _calibration_doubts(result):
             others = [name for other, (name, _) in GROUPS.items() if other in either - {group}]
             sentence += (f" It may instead be {' or '.join(others)}: the drive cannot tell, and "
                          "the covariances include it.")
-        yield Doubt(group, f"{sentence} {look}")
+        yield Doubt(group, sentence, advice)
 
 
 def _estimated_and_stated(row):
@@ -117,7 +114,7 @@ def _encoder_doubts(result):
         told += f"; and {more} more times"
     yield Doubt("encoder", (
         f"In encoderReading.txt, {told}. Problem 2's fusion and problems 3 and 4 do without these "
-        "counts. Look at the rows, and whether the vehicle was pushed or carried."))
+        "counts."), "Look at the rows, and whether the vehicle was pushed or carried.")
 
 
 def _stretch(jumps, rows):
@@ -170,34 +167,28 @@ def _memory_doubt(result, kind, share):
         f"Errors of successive {kind.name} are alike: the correlation of their residuals is "
         f"{correlation:.2f}. So problems 3 and 4 count {len(share)} {kind.name} as "
         f"{share.sum():.0f}, with {result.noise[kind.column]:.2g} times the standard deviations in "
-        f"{kind.file}, because residuals do not show all of such errors. Look at the calibration "
-        "of the sensor, and for what blurs, hides or reflects."))
+        f"{kind.file}, because residuals do not show all of such errors."), (
+        "Look at the calibration of the sensor, and for what blurs, hides or reflects."))
 
 
 def _factor_doubt(result, kind):
     """A Doubt if the learned noise factor of a kind is decidedly not 1."""
     factor = result.noise[kind.column]
     sigma = result.noise_sigma[kind.column]
-    logarithm = np.log(factor)
     least = max(np.log(MAX_NOISE_FACTOR), MIN_FACTOR_SIGMAS * sigma)
-    if sigma == 0 or abs(logarithm) <= least:
+    if sigma == 0 or abs(np.log(factor)) <= least:
         return
-    low, high = BOUNDS[:, kind.column]
-    number = f"{factor:.2f} ± {factor * sigma:.2f}"
-    reason = "Look at how the sensor's covariances were obtained."
+    sentence = (f"The {kind.name} scatter {factor:.2f} ± {factor * sigma:.2f} times as much as "
+                f"{kind.file} states: problems 3 and 4 use the scatter that was found, the others "
+                "the file's.")
     if kind == SIGHTINGS and _are_sigmas(result, factor):
-        reason = "So they would if its columns of variances held standard deviations."
-    if logarithm - low < sigma:
-        number = f"at most {factor:.2g}"
-    elif high - logarithm < sigma:
-        number = f"at least {factor:.3g}"
+        sentence += " So they would if its columns of variances held standard deviations."
     if kind == RANGES:
         late = np.mean(result.range_weight < 0.5)
         if late > MAX_LATE_SHARE:
-            reason = f"{late:.0%} of them are far too long, as without line of sight."
-    yield Doubt(f"{kind.doubt}-noise", (
-        f"The {kind.name} scatter {number} times as much as {kind.file} states: problems 3 and 4 "
-        f"use the scatter that was found, the others the file's. {reason}"))
+            sentence += f" {late:.0%} of them are far too long, as without line of sight."
+    yield Doubt(f"{kind.doubt}-noise", sentence,
+                "Look at how the sensor's covariances were obtained.")
 
 
 def _are_sigmas(result, factor):
@@ -218,9 +209,9 @@ def _place_doubts(result):
     ids, places = result.places[result.places[:, 0] != result.places[:, 1]].T
     yield Doubt("places", (
         f"By the path between their sightings, markers {_listed(ids)} were seen at more than one "
-        f"place: problems 3 and 4 have the others as markers {_listed(places)}. Look for ids that "
-        "are used twice, for markers that were moved, and whether the vehicle was carried where it "
-        "saw none."))
+        f"place: problems 3 and 4 have the others as markers {_listed(places)}."), (
+        "Look for ids that are used twice, for markers that were moved, and whether the vehicle "
+        "was carried where it saw none."))
 
 
 def _listed(ids):
@@ -230,49 +221,48 @@ def _listed(ids):
 
 def _rejection_doubts(result):
     """A Doubt on sightings that are rejected, if these are many or most of one marker."""
-    rejected = result.rejected
     repeated = result.sightings.contradicting
-    left_out = rejected.sum() + repeated
-    count = len(rejected) + repeated
+    left_out = result.rejected.sum() + repeated
+    count = len(result.rejected) + repeated
     marker, row, seen = np.unique(
         result.sightings.marker, return_inverse=True, return_counts=True)
-    wrong = np.bincount(row, rejected, len(marker)).astype(int)
-    share = wrong / seen
-    named = np.flatnonzero((wrong >= MIN_REJECTED_OF_MARKER) & (share > MAX_REJECTED_OF_MARKER))
+    wrong = np.bincount(row, result.rejected, len(marker)).astype(int)
+    named = np.flatnonzero((wrong >= MIN_REJECTED_OF_MARKER)
+                           & (wrong > MAX_REJECTED_OF_MARKER * seen))
     if left_out <= MAX_REJECTED * count and not len(named):
         return
     sentence = f"{left_out} of {count} sightings contradict the rest and are left out"
-    worst = named[np.argsort(-share[named], kind="stable")][:MAX_MARKERS_NAMED]
-    for k in np.sort(worst):
+    for k in named[:MAX_MARKERS_NAMED]:
         sentence += f", of marker {marker[k]} {wrong[k]} of {seen[k]}"
     if repeated:
         sentence += f", {repeated} by another one of the same marker at the same pose"
-    yield Doubt("sightings-rejected", sentence + (
-        ": look at the marker ids in ArucoReading.txt, for markers that were moved or are there "
+    yield Doubt("sightings-rejected", f"{sentence}.", (
+        "Look at the marker ids in ArucoReading.txt, for markers that were moved or are there "
         "twice, and for lost counts in encoderReading.txt."))
 
 
 def fusion_doubts(fusion: Fusion, vehicle: Vehicle) -> tuple[Doubt, ...]:
     """Tuple of a Doubt if a Fusion learned a slip that no wheel has; a stated one is believed."""
-    if vehicle.slip is not None or fusion.slip <= MAX_SLIP:
+    if vehicle.slip is not None:
         return ()
-    return (_slip_doubt(fusion.slip, (
-        "problem 2's fusion may follow errors of the sightings, with too small covariances. Look "
-        "at their standard deviations in ArucoReading.txt, and")),)
+    return tuple(_slip_doubt(fusion.slip))
 
 
-def _slip_doubt(slip, look):
-    """The Doubt on a learned slip, sqrt(m), with what to `look` at before the encoder."""
-    return Doubt("wheel-slip", (
-        f"By the other sensors each wheel slips by {1e3 * slip:.0f} mm (one standard deviation) "
-        f"after one metre, far more than wheels do: {look} whether encoderReading.txt is of the "
-        "same drive as the other files, with the same pose ids."))
+def _slip_doubt(slip):
+    """A Doubt if a learned slip, sqrt(m), is one that no wheel has."""
+    if slip > MAX_SLIP:
+        yield Doubt("wheel-slip", (
+            f"By the other sensors each wheel slips by {1e3 * slip:.0f} mm (one standard "
+            "deviation) after one metre, far more than wheels do: problem 2's fusion may follow "
+            "errors of the sightings, with too small covariances."), (
+            "Look whether encoderReading.txt is of the same drive as the other files, with the "
+            "same pose ids, and at the standard deviations in ArucoReading.txt."))
 
 
 def _path_doubts(result):
     """Doubts on slip, turns between frames, and a solution that still changed."""
-    if result.slip > MAX_SLIP and result.noise_sigma[0]:
-        yield _slip_doubt(result.slip, "look")
+    if result.noise_sigma[0]:
+        yield from _slip_doubt(result.slip)
     sigma = result.turn_sigma
     if sigma.max(initial=0) >= MAX_TURN_SIGMA:
         k = sigma.argmax()
