@@ -32,6 +32,7 @@ AGREEMENT_RATIO = 0.1     # of an increment
 AGREEMENT_SIGMAS = 3.0    # sigmas of the increment by markers
 MIN_AGREEING_SHARE = 0.7  # of the increments with an accepted A
 MIN_GAIN_SIGMAS = 4.0     # sigmas of the number of increments that agree in addition
+MIN_SPANS = 3.0           # of increments, that a stretch is longer; one jump spoils two
 MAX_FACTOR = 5.0          # ratio of lengths from which on the unit is in doubt
 MAX_SIGMA_RATIO = 15.0    # of a stated standard deviation to the scatter; in degrees it is 57
 MAX_ODOMETRY_HEADING_SIGMA = 0.1   # rad, at the end of the path that is compared with ranges
@@ -96,7 +97,7 @@ def merged(doubts: Iterable[Doubt]) -> list[Doubt]:
 
 def motion_doubts(dataset: Dataset) -> list[Doubt]:
     """List of Doubts about axes, else about units or drives."""
-    markers, wheels, sigma = moving_increments(dataset)
+    markers, wheels, sigma, poses = moving_increments(dataset)
     if len(wheels) < MIN_COUNT:
         return []
     turned = np.concatenate([wheels[:, :2] @ AXES.mT,
@@ -104,7 +105,8 @@ def motion_doubts(dataset: Dataset) -> list[Doubt]:
     size = np.maximum(_size(markers[0]), _size(wheels))
     tolerance = AGREEMENT_RATIO * size + AGREEMENT_SIGMAS * np.linalg.norm(sigma, axis=1)
     agree = _size(markers - turned[:, None]) < tolerance                # (8, 2, n)
-    return list(wrong_axes(agree)) or list(wrong_sizes(markers[0], wheels, sigma, agree[0, 0]))
+    doubts = list(wrong_axes(agree, poses))
+    return doubts or list(wrong_sizes(markers[0], wheels, sigma, agree[0, 0]))
 
 
 def _size(increment):
@@ -112,11 +114,13 @@ def _size(increment):
     return np.linalg.norm(distance_and_turn(increment), axis=-1)
 
 
-def moving_increments(dataset: Dataset) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def moving_increments(
+        dataset: Dataset) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Increments of the moving vehicle between n pairs of frames about SPAN apart.
 
-    Returns those by markers (2, n, 3), with theta as stated and reversed, by wheels (n, 3), and the
-    standard deviations of distance and turn by markers (n, 2).
+    Returns those by markers (2, n, 3), with theta as stated and reversed, by wheels (n, 3), the
+    standard deviations of distance and turn by markers (n, 2), and the encoder poses of each pair
+    of frames (n, 2), from 0.
     """
     s = sightings_by_frame(dataset.sightings)
     path = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")[s.frame]
@@ -130,7 +134,8 @@ def moving_increments(dataset: Dataset) -> tuple[np.ndarray, np.ndarray, np.ndar
     size = np.maximum(distance_and_turn(found.increment), distance_and_turn(wheels))
     moving = found.usable & (size > MIN_MOTION_SIGMAS * sigma).any(axis=1)
     markers = np.stack([found.increment, mirrored.increment])
-    return markers[:, moving], wheels[moving], sigma[moving]
+    poses = np.column_stack([s.frame[:-span], s.frame[span:]])
+    return markers[:, moving], wheels[moving], sigma[moving], poses[moving]
 
 
 def _span(path):
@@ -142,18 +147,27 @@ def _span(path):
     return max(1, min(int(frames + 0.5), len(path) // 4))
 
 
-def wrong_axes(agree: np.ndarray) -> Iterator[Doubt]:
-    """Doubt, if with other axes or signs significantly more increments agree.
+def wrong_axes(agree: np.ndarray, poses: np.ndarray) -> Iterator[Doubt]:
+    """Doubt, if with other axes or signs significantly more increments agree, in a stretch or all.
 
-    `agree` (8, 2, n) tells it by AXES, for theta as stated and reversed.
+    `agree` (8, 2, n) tells it by AXES, for theta as stated and reversed, of the increments between
+    these encoder poses (n, 2). The stretch is the one in which most agree in addition.
     """
-    k, is_reversed = np.unravel_index(agree.sum(axis=2).argmax(), agree.shape[:2])
-    stated = agree[0, 0]
-    found = agree[k, is_reversed]
+    gained = agree.astype(int) - agree[0, 0]
+    total = np.insert(np.cumsum(gained, axis=2), 0, 0, axis=2)
+    rise = total - np.minimum.accumulate(total, axis=2)
+    k, is_reversed, end = np.unravel_index(rise.argmax(), rise.shape)
+    begin = total[k, is_reversed, :end + 1].argmin()
+    if end == 0 or np.ptp(poses[begin:end]) <= MIN_SPANS * np.median(np.diff(poses)):
+        return
+    stated = agree[0, 0, begin:end]
+    found = agree[k, is_reversed, begin:end]
     gain = found.sum() - stated.sum()
     gain_sigma = np.sum(found != stated)**0.5
     if found.mean() < MIN_AGREEING_SHARE or gain <= MIN_GAIN_SIGMAS * gain_sigma:
         return
+    first = poses[begin, 0] + 1
+    last = poses[end - 1, 1] + 1
     is_mirror = np.linalg.det(AXES[k]) < 0
     heading = "-theta" if is_mirror != is_reversed else "theta"
     change = (f"sightings with [{AXES_NAMES[k]}, {heading}] in place of [x, y, theta] in "
@@ -163,8 +177,9 @@ def wrong_axes(agree: np.ndarray) -> Iterator[Doubt]:
         what, change_of_counts = COUNTS[k]
         change = f"{change_of_counts} in encoderReading.txt, or as well with {change}"
     yield Doubt(what, (
-        f"Increments of the vehicle by markers and by wheels agree at {stated.mean():.0%} of "
-        f"{len(stated)} places, and at {found.mean():.0%} with {change}."), (
+        f"Between poses {first} and {last}, increments of the vehicle by markers and by wheels "
+        f"agree at {stated.mean():.0%} of {len(stated)} places, and at {found.mean():.0%} with "
+        f"{change}."), (
         "Look at the order of right and left and at the signs in encoderReading.txt, and at the "
         "axes of the camera."))
 
