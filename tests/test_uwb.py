@@ -189,7 +189,7 @@ def test_monte_carlo_is_consistent(first, options, names):
     (12, ["Huber"], {"late_ranges": 0.15, "markers": False})])
 def test_the_default_kernel_has_smaller_antenna_errors_than_others(drives, others, options):
     """With many late ranges and markers, and without markers; its NEES is in the band."""
-    runs = studies.run(kernels.compare, range(drives), kind="ranges",
+    runs = studies.run(kernels.compare, range(drives),
                        methods=(*others, "asymmetric Tukey"), **options)
     squared = runs["asymmetric Tukey antenna error"]**2
     for other in others:
