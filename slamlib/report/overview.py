@@ -148,7 +148,7 @@ def trajectories(drive: SolvedDrive) -> Figure:
     _draw_map(left, drive.last)
     if drive.truth is not None:
         plotting.trajectory(left, drive.truth.poses, "truth")
-    right.set(yscale="log", ylabel="σ of position (m)")
+    right.set(xlabel="pose id", yscale="log", ylabel="σ of position (m)")
     plotting.legend_below(fig)
     return fig
 
