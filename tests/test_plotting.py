@@ -19,36 +19,36 @@ LABELS = ("truth", "odometry and markers", "SLAM", "hint", "fused")
 
 
 def drawn(count, rows, columns=2, labels=LABELS):
-    fig, axes = plotting.panels(count, rows=rows, columns=columns, height=4.0)
-    for ax in axes.flat:
-        for label in labels:
-            plotting.curve(ax, np.arange(9.0), "slam", label=label)
-    plotting.legend_below(fig)
-    return fig, axes
+    for _, axes in plotting.each_drive("abc"[:count], rows, 4.0, columns=columns):
+        for ax in np.atleast_1d(axes):
+            for label in labels:
+                plotting.curve(ax, np.arange(9.0), "slam", label=label)
+    return plt.gcf()
 
 
-def boxes(fig, axes):
+def boxes(fig):
     """The extents of axes with all that belongs to them, in inches, and that of the legend."""
     fig.draw_without_rendering()
     return [thing.get_tightbbox().transformed(fig.dpi_scale_trans.inverted())
-            for thing in (*axes.flat, fig.legends[0])]
+            for thing in (*fig.axes, fig.legends[0])]
 
 
 @pytest.mark.parametrize("count, rows, columns", [(1, 1, 2), (2, 3, 2), (3, 3, 3)])
 def test_panels_are_side_by_side_and_within_the_figure(count, rows, columns):
-    fig, axes = drawn(count, rows, columns)
-    assert axes.shape == (count, rows)
-    *wide, legend = boxes(fig, axes)
+    fig = drawn(count, rows, columns)
+    assert len(fig.axes) == count * rows
+    *wide, legend = boxes(fig)
     if count > 1:
         assert wide[rows].x0 > wide[0].x1
     for box in (*wide, legend):
         assert -0.01 <= box.x0 and box.x1 <= fig.get_figwidth() + 0.01
         assert -0.01 <= box.y0 and box.y1 <= fig.get_figheight() + 0.01
+    assert legend.y1 < min(box.y0 for box in wide) + 0.01
 
 
 @pytest.mark.parametrize("labels", ["abcd", [*(3 * c for c in "abc"), "d" * 60]])
 def test_a_legend_has_each_label_once_and_fits(labels):
-    fig, _ = drawn(2, 2, labels=labels)
+    fig = drawn(2, 2, labels=labels)
     fig.set_size_inches(3.9, 9.0)
     plotting.legend_below(fig)
     assert len(fig.legends) == 1
@@ -74,7 +74,7 @@ def test_ellipses_are_lines_of_equal_mahalanobis_distance(enlarged):
     """(p - m)^T C^-1 (p - m) = k^2 holds on the boundary, with k^2 = -2 ln(1 - 0.95)."""
     means = np.arange(12.0).reshape(4, 3)
     covariances = elongated(4, 2.0, 0.5)
-    _, ((ax,),) = plotting.panels(1)                                 # scales of x and y differ
+    _, ax = plt.subplots()                                           # scales of x and y differ
     plotting.ellipses(ax, means, covariances, "#0072B2", enlarged=enlarged)
     require_contours(ax.collections[0], means, covariances * enlarged**2,
                      np.sqrt(-2 * np.log(0.05)))
@@ -97,10 +97,10 @@ def test_each_drive_has_its_panels_a_title_and_one_legend():
     for _, axes in plotting.each_drive([drive, "two"], rows=2):
         assert len(axes) == 2
         plotting.curve(axes[0], np.arange(3.0), "slam")
-    fig = axes[0].figure
-    assert [ax.get_title("left") for ax in fig.axes] == ["a", "two", "", ""]
+    fig = plt.gcf()
+    assert [ax.get_title("left") for ax in fig.axes] == ["a", "", "two", ""]
     assert len(fig.legends) == 1
-    assert list(plotting.each_drive([])) == [] and len(plt.gcf().axes) == 1
+    assert list(plotting.each_drive([])) == [] and plt.gcf().axes == []
 
 
 @pytest.mark.parametrize("truth", [True, False])

@@ -1,5 +1,6 @@
 """Draws the whole map of one drive with the names of its landmarks, which avoid each other."""
 
+import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
@@ -23,8 +24,7 @@ def whole_map(drive, result) -> Figure:
     doubt, which have no ellipse because it may be as large as the map, and of markers that nothing
     confirms. A marker's name without a free place is left out.
     """
-    fig, axes = plotting.panels(1, width=WIDTH, height=HEIGHT)
-    ax = axes[0, 0]
+    fig, ax = plt.subplots(figsize=(WIDTH, HEIGHT))
     ax.set_title(drive.name)
     truth = drive.truth
     role = "slam_uwb" if len(result.antenna) else "slam"

@@ -76,30 +76,22 @@ def use_style() -> None:
     set_matplotlib_formats("svg", metadata={"Date": None})
 
 
-def panels(count: int, rows: int = 1, height: float = 3.4, width: float = 3.7,
-           columns: int = 2) -> tuple[Figure, np.ndarray]:
-    """A figure and its axes (count, rows): `columns` panels side by side, sizes in inches each."""
-    columns = min(columns, count)
-    lines = math.ceil(count / columns)
-    fig = plt.figure(figsize=(max(width * columns, 5.0), height * lines))
-    grid = fig.subplots(lines * rows, columns, squeeze=False)
-    axes = grid.reshape(lines, rows, columns).swapaxes(1, 2).reshape(-1, rows)
-    for ax in axes[count:].flat:
-        ax.remove()
-    return fig, axes[:count]
-
-
-def each_drive(drives: Iterable, rows: int = 1, **size) -> Iterator[tuple]:
+def each_drive(drives: Iterable, rows: int = 1, height: float = 3.4, width: float = 3.7,
+               columns: int = 2) -> Iterator[tuple]:
     """Yield each Drive with its axes, or with `rows` axes as a list; a legend ends the figure.
 
-    `drives` (iterable of Drive or of names, such as a dict by Drive) are the panels, with their
-    names as titles; `size` as of `panels`. Without a drive the figure has one empty panel.
+    `drives` (iterable of Drive or of names, such as a dict by Drive) are the panels, `columns` side
+    by side, with their names as titles; height and width of one in inches.
     """
     drives = list(drives)
-    fig, axes = panels(max(1, len(drives)), rows, **size)
-    for drive, column in zip(drives, axes):
-        column[0].set_title(getattr(drive, "name", drive))
-        yield drive, column if rows > 1 else column[0]
+    columns = max(1, min(columns, len(drives)))
+    lines = max(1, math.ceil(len(drives) / columns))
+    fig = plt.figure(figsize=(max(width * columns, 5.0), height * lines))
+    parts = fig.subfigures(lines, columns, squeeze=False)
+    for drive, part in zip(drives, parts.flat):
+        axes = part.subplots(rows, squeeze=False)[:, 0]
+        axes[0].set_title(getattr(drive, "name", drive))
+        yield drive, axes if rows > 1 else axes[0]
     legend_below(fig)
 
 

@@ -83,6 +83,12 @@ def _decimals(value, digits, at_most):
     return int(np.clip(digits - 1 - exponent, 0, at_most))
 
 
+def estimate(value: float, sigma: float) -> str:
+    """Text (str) of a value ± its standard deviation, which has two digits."""
+    decimals = _decimals(sigma, 2, at_most=7)
+    return f"{value:.{decimals}f} ± {sigma:.{decimals}f}"
+
+
 def _over_drives(values):
     """Mean ± standard error and median of values (s,), one a drive."""
     error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else 0.0
@@ -134,19 +140,18 @@ def accuracy(result, drive) -> dict:
         row["ATE (mm)"] = 1e3 * evaluation.ate(found.poses, found.true)
         row["aligned (mm)"] = 1e3 * evaluation.ate(found.poses, found.true, aligned=True)
         if len(nees):
-            row["NEES, mean"] = nees.mean()
-            row["NEES, median"] = np.median(nees)
+            row["NEES"] = nees.mean()
     return row
 
 
 def learned_row(result, drive) -> dict:
     """Row of `table` on what a SlamResult learned of a Drive's noise and rejected."""
+    slip_sigma, factor_sigma, _ = result.noise_sigma
     slip = 1e3 * result.slip
     factor = result.noise.sightings
-    slip_sigma, factor_sigma, _ = result.noise_sigma
-    return {"dataset": drive.name, "slip (mm)": f"{slip:.2f} ± {slip * slip_sigma:.2f}",
-           "factor": f"{factor:.2f} ± {factor * factor_sigma:.2f}", "step": result.model,
-           "sightings": len(result.rejected), "rejected": result.rejected.sum()}
+    return {"dataset": drive.name, "slip (mm)": estimate(slip, slip * slip_sigma),
+            "factor": estimate(factor, factor * factor_sigma), "step": result.model,
+            "sightings": len(result.rejected), "rejected": result.rejected.sum()}
 
 
 def calibration_rows(result, drive) -> Iterator[dict]:
@@ -157,23 +162,20 @@ def calibration_rows(result, drive) -> Iterator[dict]:
     """
     has_ranges = len(result.antenna) > 0
     for k, entry in enumerate(result.calibration_table[:None if has_ranges else RANGES.start]):
-        sigma = entry["sigma"]
-        if not sigma:
-            continue
-        digits = f".{_decimals(sigma, 2, at_most=7)}f"
-        stated = f"{entry['stated']:g}"
-        if entry["stated_sigma"]:
-            stated += f" ± {entry['stated_sigma']:.3g}"
-        row = {"dataset": drive.name, "entry": f"`{entry['name']}`", "unit": entry["unit"] or DASH,
-               "stated": stated, "estimated": f"{entry['estimate']:{digits}} ± {sigma:{digits}}"}
-        if k < WHEELS.stop and drive.origin == "simulated":
-            row["true"] = f"{getattr(drive.truth.vehicle, entry['name']):{digits}}"
-        yield row | {"used": "estimate" if entry["released"] else "both"}
+        if entry["sigma"]:
+            stated = f"{entry['stated']:g}"
+            if entry["stated_sigma"]:
+                stated += f" ± {entry['stated_sigma']:.3g}"
+            row = {"dataset": drive.name, "entry": f"`{entry['name']}`",
+                   "unit": entry["unit"] or DASH, "stated": stated,
+                   "estimated": estimate(entry["estimate"], entry["sigma"])}
+            if k < WHEELS.stop and drive.origin == "simulated":
+                row["true"] = f"{getattr(drive.truth.vehicle, entry['name']):.6g}"
+            yield row | {"used": "estimate" if entry["released"] else "both"}
     if has_ranges and not drive.dataset.vehicle.range_noise_factor:
         factor = result.noise.ranges
         yield {"dataset": drive.name, "entry": "`range_noise_factor`", "unit": DASH,
-               "estimated": f"{factor:.2f} ± {factor * result.noise_sigma[2]:.2f}",
-               "used": "estimate"}
+               "estimated": estimate(factor, factor * result.noise_sigma[2]), "used": "estimate"}
 
 
 def antenna_rows(result, drive) -> Iterator[dict]:
@@ -195,19 +197,13 @@ def antenna_rows(result, drive) -> Iterator[dict]:
     for k, antenna in enumerate(ids.tolist()):
         place = result.antenna_in_world[k]
         C = result.antenna_covariance[k]
-        sigma = 1e3 * evaluation.sigmas(C)
+        sigma = evaluation.sigmas(C)
         error = place - true[k]
         own = uwb.antenna == antenna
         yield {"dataset": drive.name,
                "antenna": f"{antenna}?" if antenna in result.doubts else f"{antenna}",
-               "x (m)": _as_sure_as(place[0], sigma[0]), "y (m)": _as_sure_as(place[1], sigma[1]),
-               "σ of x (mm)": sigma[0], "σ of y (mm)": sigma[1],
+               "x (m)": estimate(place[0], sigma[0]), "y (m)": estimate(place[1], sigma[1]),
                "from the guess (mm)": 1e3 * np.linalg.norm(place - guess[k]),
                "error (mm)": 1e3 * np.linalg.norm(error),
                "d²": error @ np.linalg.solve(C, error),
                "down-weighted (%)": 100 * np.mean(result.range_weight[own] < 0.5)}
-
-
-def _as_sure_as(value, sigma):
-    """Text of a value in m with two digits of its sigma in mm."""
-    return f"{value:.{_decimals(1e-3 * sigma, 2, at_most=4)}f}"
