@@ -85,7 +85,7 @@ def _decimals(value, digits, at_most):
 
 def estimate(value: float, sigma: float) -> str:
     """Text (str) of a value ± its standard deviation, which has two digits."""
-    decimals = _decimals(sigma, 2, at_most=7)
+    decimals = _decimals(sigma, 2, at_most=7) if sigma else 2
     return f"{value:.{decimals}f} ± {sigma:.{decimals}f}"
 
 
