@@ -15,12 +15,10 @@ from jupyter_client.kernelspec import KernelSpecManager
 from nbclient import NotebookClient
 from nbclient.exceptions import CellExecutionError
 from nbconvert.filters import strip_ansi
-from nbconvert.preprocessors import CoalesceStreamsPreprocessor
 
 from slamlib.core.errors import require
 from slamlib.report.notebooks import LAB_ONLY, Books, NotebookError
 
-CELL_TIMEOUT = 1800  # s, in which a cell must end
 # The matrices are small: more threads cost time.
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 LAB_SETTINGS = Path(__file__).parent / "lab"       # overrides.json: no question when it opens
@@ -90,8 +88,8 @@ async def _execute(source, book, environment):
         kernel_spec_manager=KernelSpecManager(kernel_dirs=[]))  # no kernels of the user are found
     client = NotebookClient(
         book, km=manager, resources={"metadata": {"path": str(source.parent)}},
-        timeout=CELL_TIMEOUT, iopub_timeout=60, raise_on_iopub_timeout=True,
-        record_timing=False, store_widget_state=False, skip_cells_with_tag=LAB_ONLY,
+        iopub_timeout=60, raise_on_iopub_timeout=True, record_timing=False,
+        coalesce_streams=True, skip_cells_with_tag=LAB_ONLY,  # kernels divide streams by time
         shutdown_kernel="immediate", extra_arguments=["--IPKernelApp.log_level=ERROR"])
     try:
         await client.async_execute(env=environment, cleanup_kc=True)
@@ -102,7 +100,6 @@ async def _execute(source, book, environment):
     finally:
         if manager.has_kernel:
             await manager.shutdown_kernel(now=True)
-    CoalesceStreamsPreprocessor().preprocess(book, {})  # kernels divide them by time
 
 
 def start_lab(notebooks: Path, data: Path, arguments: list[str]):
