@@ -15,6 +15,7 @@ from jupyter_client.kernelspec import KernelSpecManager
 from nbclient import NotebookClient
 from nbclient.exceptions import CellExecutionError
 from nbconvert.filters import strip_ansi
+from nbconvert.preprocessors import CoalesceStreamsPreprocessor
 
 from slamlib.core.errors import require
 from slamlib.report.notebooks import LAB_ONLY, Books, NotebookError
@@ -89,7 +90,7 @@ async def _execute(source, book, environment):
     client = NotebookClient(
         book, km=manager, resources={"metadata": {"path": str(source.parent)}},
         iopub_timeout=60, raise_on_iopub_timeout=True, record_timing=False,
-        coalesce_streams=True, skip_cells_with_tag=LAB_ONLY,  # kernels divide streams by time
+        skip_cells_with_tag=LAB_ONLY,
         shutdown_kernel="immediate", extra_arguments=["--IPKernelApp.log_level=ERROR"])
     try:
         await client.async_execute(env=environment, cleanup_kc=True)
@@ -100,6 +101,7 @@ async def _execute(source, book, environment):
     finally:
         if manager.has_kernel:
             await manager.shutdown_kernel(now=True)
+    CoalesceStreamsPreprocessor().preprocess(book, {})  # kernels divide them by time
 
 
 def start_lab(notebooks: Path, data: Path, arguments: list[str]):
