@@ -5,6 +5,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
+from slamlib.core.evaluation import position_sigmas
 from slamlib.notebook import plotting
 
 WIDTH, HEIGHT = 7.4, 4.3           # inches, the whole width of the page
@@ -22,7 +23,7 @@ def whole_map(drive, result) -> Figure:
     `result` is a SlamResult. Ellipses hold 95 %; the title states how much they are enlarged, which
     is `plotting.enlargement` of the vehicle's. A question mark stands at the names of antennas in
     doubt, which have no ellipse because it may be as large as the map, and of markers that nothing
-    confirms. A marker's name without a free place is left out.
+    confirms. A marker's name without a free place is left out; pages tell it under the pointer.
     """
     fig, ax = plt.subplots(figsize=(WIDTH, HEIGHT))
     ax.set_title(drive.name)
@@ -54,7 +55,23 @@ def whole_map(drive, result) -> Figure:
     for place, marker in zip(result.marker_in_world[:, :2], result.marker):
         mark = "?" if marker in result.unconfirmed else ""
         _write_name(ax, place, f"{marker}{mark}", NAME, taken)
+    seen = result.sightings.marker[~result.rejected]
+    _add_tips(ax, "marker", result.marker, result.marker_in_world, result.marker_covariance, seen)
+    _add_tips(ax, "antenna", result.antenna, result.antenna_in_world, result.antenna_covariance,
+              drive.dataset.uwb.antenna if len(result.antenna) else None)
     return fig
+
+
+def _add_tips(ax, kind, ids, places, covariances, measured):
+    """Add what pages tell of landmarks (k) under the pointer; `measured` are ids of measurements.
+
+    It is the name of an invisible disc, from which report.lua makes the title of its place.
+    """
+    sigmas = 1e3 * position_sigmas(covariances)
+    for each, place, sigma in zip(ids, places, sigmas):
+        count = np.sum(measured == each)
+        ax.plot(*place[:2], "o", alpha=0, markersize=9, zorder=9,
+                gid=f"tip: {kind} {each}, σ {sigma:.2g} mm, {count} measurements")
 
 
 def _write_name(ax, place, name, size, taken, **look):

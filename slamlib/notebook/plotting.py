@@ -156,7 +156,7 @@ def errors(axes: Sequence[Axes], result, drive, role: str = "slam") -> Sequence[
     return axes
 
 
-def own_axes(ax: Axes, covariance: np.ndarray, role: str, points: np.ndarray) -> Axes:
+def own_axes(ax: Axes, covariance: np.ndarray, role: str, points: np.ndarray, **look) -> Axes:
     """Draw the 95 % ellipse of a covariance (>= 2, >= 2) about zero along its own axes, in mm.
 
     Each axis has its own scale, so that a needle becomes an ellipse. Crosses are `points` (m, >= 2)
@@ -166,7 +166,7 @@ def own_axes(ax: Axes, covariance: np.ndarray, role: str, points: np.ndarray) ->
     along_and_across = np.diag(1e6 * variances[::-1])                    # mm^2
     ellipses(ax, np.zeros((1, 2)), along_and_across[None], ROLES[role]["color"])
     x, y = 1e3 * directions.T[::-1] @ points[:, :2].T
-    ax.plot(x, y, "+", color="#333333", markersize=5)
+    ax.plot(x, y, **ROLES["true antenna"] | look)
     ax.set(xlabel="along the ellipse (mm)", ylabel="across (mm)")
     ax.locator_params(nbins=5)
     return ax

@@ -138,7 +138,7 @@ def trajectories(drive: SolvedDrive) -> str:
     for problem, solution in drive.solutions.items():
         role = PROBLEMS[problem].role
         if problem in DRAWN or solution is drive.last:
-            plotting.trajectory(left, solution.poses, role, solution.title)
+            plotting.trajectory(left, solution.poses, role, solution.title, linewidth=1.2)
         sigmas = evaluation.position_sigmas(solution.covariances)
         sigmas[:len(sigmas) // 50] = np.nan  # nearly zero, on a logarithmic axis
         known = np.flatnonzero(sigmas > 0)
