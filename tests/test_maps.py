@@ -5,6 +5,8 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from matplotlib.collections import PolyCollection
+from matplotlib.quiver import Quiver
 from numeric import short
 from test_plotting import elongated, require_contours
 
@@ -53,9 +55,11 @@ def test_ellipses_of_poses_markers_and_antennas_are_contours_of_their_own_covari
                      antenna_covariance=elongated(len(result.antenna), 0.025, 0.005)[:, :2, :2])
     ax, = maps.whole_map(drive, result).axes
     k = REACH_95 * int(ax.get_title("left").split("× ")[1].rstrip(")"))
-    of_poses, of_markers, of_antennas = ax.collections
-    rows = [np.argmin(np.linalg.norm(result.poses[:, :2] - place, axis=1))
-            for place in of_poses.get_offsets()]
+    of_poses, of_markers, of_antennas = (
+        each for each in ax.collections if isinstance(each, PolyCollection)
+        and not isinstance(each, Quiver))
+    rows = [np.argmin(np.linalg.norm(result.poses[:, :2] - path.vertices[:-1].mean(axis=0), axis=1))
+            for path in of_poses.get_paths()]
     require_contours(of_poses, result.poses[rows], result.covariances[rows], k)
     require_contours(of_markers, result.marker_in_world, result.marker_covariance, k)
     require_contours(of_antennas, result.antenna_in_world, result.antenna_covariance, k)
@@ -99,17 +103,15 @@ def test_rows_hold_every_antenna_and_its_errors(solved):
         se2.squared_norms(off, result.antenna_covariance))
 
 
-def test_an_antenna_in_doubt_is_called_so_and_drawn_in_its_true_size(solved):
+def test_an_antenna_in_doubt_is_called_so_and_has_no_ellipse(solved):
+    """Which may be as large as the map."""
     drive, result = solved
     first = int(result.antenna[0])
-    covariances = result.antenna_covariance.copy()
-    covariances[0] = np.diag([9.0, 4.0])
-    doubted = replace(result, doubts={first: "It may be elsewhere."},
-                      antenna_covariance=covariances)
+    doubted = replace(result, doubts={first: "It may be elsewhere."})
     ax, = maps.whole_map(drive, doubted).axes
-    assert ax.get_title("left").endswith(", in doubt (?) × 1)")
-    widest = max(ellipses.get_widths().max() for ellipses in ax.collections)
-    assert widest == pytest.approx(2 * 2.4477 * 3, rel=1e-3)
+    first_ellipse, other = ax.collections[-1].get_paths()[:2]
+    assert np.ptp(first_ellipse.vertices, axis=0).max() == 0 < np.ptp(other.vertices)
+    assert f"{first}?" in {text.get_text() for text in ax.texts}
     assert next(antenna_rows(doubted, drive))["antenna"] == f"{first}?"
 
 
@@ -129,7 +131,7 @@ THREE = np.array([1.0, 2.0, 6.0])      # mean 3, median 2, standard error 1.53
 
 @pytest.mark.parametrize("value, text", [
     (12345.6, "12,346"), (12.345, "12.3"), (0.1234, "0.123"), (-12.34, "−12.3"), (0.0, "0"),
-    (2e6, "> 10⁶"), (12345, "12,345"), (-5, "−5"), (np.False_, "no"), (None, "–"), (np.nan, "–"),
+    (2e6, "> 10⁶"), (12345, "12,345"), (-5, "−5"), (None, "–"), (np.nan, "–"),
     ("a-1", "a-1"), (THREE, "3.0 ± 1.5 (2.0)"), (1e3 * THREE, "3,000 ± 1,528 (2,000)"),
     (THREE[:1], "1.00 (1.00)")])
 def test_a_cell_has_three_digits_or_those_that_its_standard_error_leaves(value, text):
@@ -138,10 +140,10 @@ def test_a_cell_has_three_digits_or_those_that_its_standard_error_leaves(value, 
 
 def test_what_is_missing_is_a_dash_and_a_column_of_it_is_absent():
     lines = table([{"name": "a", "x": 1, "none": None, "y": 2.0},
-                   {"name": "a", "x": np.nan, "none": np.nan}, {"name": "b", "z": "-3 m"}],
-                  "Table 1.1. Text.").data.split("\n")
+                   {"name": "a", "x": np.nan, "none": np.nan},
+                   {"name": "b", "z": "-3 m"}]).data.split("\n")
     assert lines == ["| name | x | y | z |", "| --- | ---: | ---: | ---: |", "| a | 1 | 2.00 | – |",
-                     "|  | – | – | – |", "| b | – | – | −3 m |", "", "Table 1.1. Text."]
+                     "|  | – | – | – |", "| b | – | – | −3 m |"]
     assert table([]).data == "| – |\n| ---: |\n| – |"
 
 
@@ -168,4 +170,4 @@ def test_calibration_rows_state_and_estimate_and_know_the_wheels_of_simulated_dr
     assert true == pytest.approx(drive.truth.vehicle.right_radius, abs=1e-6)
     value, sigma = map(float, wheel["estimated"].split(" ± "))
     assert abs(value - true) < 5 * sigma
-    assert rows["`camera_x`"]["estimated"] is None and rows["`camera_x`"]["used"] == "statement"
+    assert "`camera_x`" not in rows

@@ -179,7 +179,6 @@ def test_a_problem_that_fails_costs_one_problem_and_exit_code_3(tmp_path, monkey
     ("\nauthor = Ada", "Invalid value (at line 2, column 10)"),
     ('author = """a\nb"""', "expected a line of UTF-8 text in quotes for author"),
     ("title = true", "expected a line of UTF-8 text in quotes for title, found 'True'"),
-    ('\ncode = "some"', "expected one of none, method, all for code, found 'some'"),
     ('chapters = "B"', "expected a list of notebooks in quotes, such as ["),
     ("chapters = [3]", "for chapters, found '[3]'"),
     ('author = "Löwe"', "expected a line of UTF-8 text")])
@@ -210,10 +209,10 @@ def test_what_no_report_can_show_is_told_before_a_kernel_starts(
 def test_every_entry_is_read(tmp_path):
     path = tmp_path / "report.toml"
     assert read_options(path) == Options() and Options().title and not Options().author
-    path.write_text('author = "Ada Löwe"\nstudent_number = 123456\ncode = "none"\n'
+    path.write_text('author = "Ada Löwe"\nstudent_number = 123456\n'
                     'chapters = ["1*", "B_real_log"]\n', "utf-8")
     assert read_options(path) == Options(
-        author="Ada Löwe", student_number="123456", chapters=("1*", "B_real_log"), code="none")
+        author="Ada Löwe", student_number="123456", chapters=("1*", "B_real_log"))
 
 
 def test_the_committed_file_has_the_defaults_also_where_its_examples_are_read(tmp_path):
@@ -222,5 +221,4 @@ def test_the_committed_file_has_the_defaults_also_where_its_examples_are_read(tm
     examples = re.sub(r"^# (?=\w+ = )", "", text, flags=re.MULTILINE)
     (tmp_path / "report.toml").write_text(examples)
     read = read_options(tmp_path / "report.toml")
-    assert read.code == "method"
     assert read.chapters == ("1_odometry", "2_aruco_localization", "3*", "4*")

@@ -28,6 +28,7 @@ from slamlib.core.errors import DatasetError
 from slamlib.core.evaluation import ate, nees_band
 from slamlib.core.kernels import KERNELS, ONE_SIDED
 from slamlib.core.records import AntennaGuess, Dataset, UwbReadings
+from slamlib.core.sightings import sightings_by_frame
 from slamlib.core.vehicle import Vehicle
 from slamlib.robust import factors, initialization
 from slamlib.robust.choices import DECISIVE_LEAD, better_model, ids_of_places
@@ -42,7 +43,7 @@ from slamlib.robust.measurements import NOISE_KEYS, Noise, measure
 from slamlib.robust.noise import learn_noise
 from slamlib.robust.pipeline import fit_from_odometry
 from slamlib.robust.result import slam_result
-from slamlib.studies import kernels, montecarlo, simulation
+from slamlib.studies import montecarlo, simulation
 
 COUNT = 2 * np.pi * 0.1 / 8000                            # m
 
@@ -208,9 +209,12 @@ def test_markers_of_unknown_heading_are_mapped_as_points():
 
 
 def test_the_gate_rejects_wrong_labels_and_hardly_any_others():
-    numbers = kernels.compare(6, "sightings", ("quadratic", "gate"), mislabelled=0.03)
-    assert numbers["gate wrong rejected"] == 1 and numbers["gate good lost"] < 0.005
-    assert numbers["quadratic wrong rejected"] == numbers["quadratic good lost"] == 0
+    dataset, _ = short(6, mislabelled=0.03)
+    wrong = dataset.aruco.marker != short(6)[0].aruco.marker
+    wrong = wrong[sightings_by_frame(dataset.aruco).index]
+    found = estimate(dataset.without("uwb"))
+    assert found.rejected[wrong].all() and found.rejected[~wrong].mean() < 0.005
+    assert not estimate(dataset.without("uwb"), gate=False).rejected.any()
 
 
 def test_a_second_place_gets_a_readable_id_that_the_drive_does_not_have():

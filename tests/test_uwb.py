@@ -186,7 +186,7 @@ def test_monte_carlo_is_consistent(first, options, names):
     (24, {"late_ranges": 0.3}), (12, {"late_ranges": 0.15, "markers": False})])
 def test_the_default_kernel_has_smaller_antenna_errors_than_hubers(drives, options):
     """With many late ranges and markers, and without markers; its NEES is in the band."""
-    runs = studies.run(kernels.compare, range(drives), kind="ranges",
+    runs = studies.run(kernels.compare, range(drives),
                        methods=("Huber", "asymmetric Tukey"), **options)
     squared = runs["asymmetric Tukey antenna error"]**2
     assert decided(runs["Huber antenna error"]**2 - squared)

@@ -139,8 +139,7 @@ def plain(text: str) -> str:
 
 
 def _data_folder():
-    """The folder that SLAMLIB_DATA names, or the nearest `data` in this folder or above it."""
+    """The folder that SLAMLIB_DATA names, or `data`, here or beside the folder of notebooks."""
+    here = Path("data").resolve()
     stated = os.environ.get("SLAMLIB_DATA")
-    here = Path.cwd()
-    near = (folder / "data" for folder in (here, *here.parents))
-    return Path(stated or next(filter(Path.is_dir, near), here / "data"))
+    return Path(stated) if stated else here if here.is_dir() else here.parents[1] / "data"

@@ -8,7 +8,6 @@ import numpy as np
 from IPython.display import Markdown
 
 from slamlib.core import evaluation
-from slamlib.core.kernels import ONE_SIDED
 from slamlib.core.odometry import dead_reckoning
 from slamlib.notebook.plotting import estimates, places_by_id
 from slamlib.robust.calibration import RANGES, WHEELS
@@ -21,13 +20,12 @@ MINUS = re.compile(r"(?<![\w.])-(?=\d)")
 MAX_NUMBER = 1e6             # larger numbers are not shown, because the method failed
 
 
-def table(rows: Iterable[dict], caption: str | None = None) -> Markdown:
+def table(rows: Iterable[dict]) -> Markdown:
     """Table in Markdown, an object that Jupyter shows, of rows (iterable of dict from header).
 
     Values are str, numbers (three significant digits), or arrays (s,) over drives: mean ± standard
     error, and the median in brackets. None, NaN and absent keys are dashes; columns of nothing else
-    are left out. Of consecutive rows with the same first cell only the first shows it. `caption`
-    (str) stands below.
+    are left out. Of consecutive rows with the same first cell only the first shows it.
     """
     columns = _columns(rows)
     rules = []
@@ -40,8 +38,7 @@ def table(rows: Iterable[dict], caption: str | None = None) -> Markdown:
     if others:
         first = ["" if text == above else text for above, text in pairwise([None, *first])]
     lines = [columns, rules, *zip(first, *others)]
-    text = "\n".join("| " + " | ".join(line) + " |" for line in lines)
-    return Markdown(f"{text}\n\n{caption}" if caption else text)
+    return Markdown("\n".join("| " + " | ".join(line) + " |" for line in lines))
 
 
 def _columns(rows):
@@ -66,8 +63,6 @@ def cell(value) -> str:
         return _over_drives(np.asarray(value, float))
     if np.isnan(value):
         return DASH
-    if isinstance(value, bool | np.bool_):
-        return "yes" if value else "no"
     if isinstance(value, int | np.integer):
         return f"{value:,}".replace("-", "−")
     return number(value)
@@ -86,6 +81,12 @@ def _decimals(value, digits, at_most):
     """Number (int) of decimals that show this number of significant digits of a value."""
     exponent = np.floor(np.log10(abs(value)))
     return int(np.clip(digits - 1 - exponent, 0, at_most))
+
+
+def estimate(value: float, sigma: float) -> str:
+    """Text (str) of a value ± its standard deviation, which has two digits."""
+    decimals = _decimals(sigma, 2, at_most=7) if sigma else 2
+    return f"{value:.{decimals}f} ± {sigma:.{decimals}f}"
 
 
 def _over_drives(values):
@@ -139,73 +140,42 @@ def accuracy(result, drive) -> dict:
         row["ATE (mm)"] = 1e3 * evaluation.ate(found.poses, found.true)
         row["aligned (mm)"] = 1e3 * evaluation.ate(found.poses, found.true, aligned=True)
         if len(nees):
-            row["NEES, mean"] = nees.mean()
-            row["NEES, median"] = np.median(nees)
+            row["NEES"] = nees.mean()
     return row
 
 
 def learned_row(result, drive) -> dict:
-    """Row of `table` on what a SlamResult learned of a Drive's noise and rejected.
-
-    A kernel for ranges alone is absent, because sightings then count in full within the gate.
-    """
-    vehicle = result.fit.problem.measurements.dataset.vehicle
+    """Row of `table` on what a SlamResult learned of a Drive's noise and rejected."""
+    slip_sigma, factor_sigma, _ = result.noise_sigma
     slip = 1e3 * result.slip
     factor = result.noise.sightings
-    slip_sigma, factor_sigma, _ = result.noise_sigma
-    return {"dataset": drive.name, "gate": vehicle.gate,
-           "kernel": None if vehicle.kernel in ONE_SIDED else vehicle.kernel,
-           "slip (mm)": f"{slip:.2f} ± {slip * slip_sigma:.2f}",
-           "factor": f"{factor:.2f} ± {factor * factor_sigma:.2f}", "step": result.model,
-           "sightings": len(result.rejected), "rejected": result.rejected.sum()}
+    return {"dataset": drive.name, "slip (mm)": estimate(slip, slip * slip_sigma),
+            "factor": estimate(factor, factor * factor_sigma), "step": result.model,
+            "sightings": len(result.rejected), "rejected": result.rejected.sum()}
 
 
 def calibration_rows(result, drive) -> Iterator[dict]:
-    """Rows of `table` on the entries of a SlamResult's calibration: stated, estimated, true, used.
+    """Rows of `table` on what a SlamResult estimates of its calibration: stated, estimated, true.
 
-    The true value is that of the wheels of a simulated Drive. Without ranges their entries have no
-    row; offsets of single antennas, which are stated as zero, have one where they are estimated.
-    The last one is the factor on the standard deviations of the ranges.
+    The true value is that of the wheels of a simulated Drive. The last row is the factor on the
+    standard deviations of the ranges, if it is learned.
     """
     has_ranges = len(result.antenna) > 0
     for k, entry in enumerate(result.calibration_table[:None if has_ranges else RANGES.start]):
-        true = None
-        if k < WHEELS.stop and drive.origin == "simulated":
-            true = getattr(drive.truth.vehicle, entry["name"])
-        if entry["sigma"] or entry["group"] != "antenna-offsets":
-            yield {"dataset": drive.name} | _calibration_row(entry, true)
-    if has_ranges:
-        stated = drive.dataset.vehicle.range_noise_factor
-        yield {"dataset": drive.name} | _range_noise_row(result, stated)
-
-
-def _calibration_row(entry, true):
-    """Row on one entry of a calibration; the true value is None where it is not known."""
-    sigma = entry["sigma"]
-    stated = f"{entry['stated']:g}"
-    if entry["stated_sigma"]:
-        stated += f" ± {entry['stated_sigma']:.3g}"
-    row = {"entry": f"`{entry['name']}`", "unit": entry["unit"] or DASH, "stated": stated,
-           "estimated": None, "true": None, "used": "statement"}
-    digits = "g"
-    if sigma:
-        digits = f".{_decimals(sigma, 2, at_most=7)}f"
-        row["estimated"] = f"{entry['estimate']:{digits}} ± {sigma:{digits}}"
-        row["used"] = "estimate" if entry["released"] else "both"
-    if true is not None:
-        row["true"] = f"{true:{digits}}"
-    return row
-
-
-def _range_noise_row(result, stated):
-    """Row on the factor on the standard deviations of the ranges, None where it is not stated."""
-    row = {"entry": "`range_noise_factor`", "unit": DASH, "stated": stated, "estimated": None,
-           "used": "statement"}
-    if not stated:
+        if entry["sigma"]:
+            stated = f"{entry['stated']:g}"
+            if entry["stated_sigma"]:
+                stated += f" ± {entry['stated_sigma']:.3g}"
+            row = {"dataset": drive.name, "entry": f"`{entry['name']}`",
+                   "unit": entry["unit"] or DASH, "stated": stated,
+                   "estimated": estimate(entry["estimate"], entry["sigma"])}
+            if k < WHEELS.stop and drive.origin == "simulated":
+                row["true"] = f"{getattr(drive.truth.vehicle, entry['name']):.6g}"
+            yield row | {"used": "estimate" if entry["released"] else "both"}
+    if has_ranges and not drive.dataset.vehicle.range_noise_factor:
         factor = result.noise.ranges
-        row["estimated"] = f"{factor:.2f} ± {factor * result.noise_sigma[2]:.2f}"
-        row["used"] = "estimate"
-    return row
+        yield {"dataset": drive.name, "entry": "`range_noise_factor`", "unit": DASH,
+               "estimated": estimate(factor, factor * result.noise_sigma[2]), "used": "estimate"}
 
 
 def antenna_rows(result, drive) -> Iterator[dict]:
@@ -227,19 +197,13 @@ def antenna_rows(result, drive) -> Iterator[dict]:
     for k, antenna in enumerate(ids.tolist()):
         place = result.antenna_in_world[k]
         C = result.antenna_covariance[k]
-        sigma = 1e3 * evaluation.sigmas(C)
+        sigma = evaluation.sigmas(C)
         error = place - true[k]
         own = uwb.antenna == antenna
         yield {"dataset": drive.name,
                "antenna": f"{antenna}?" if antenna in result.doubts else f"{antenna}",
-               "x (m)": _as_sure_as(place[0], sigma[0]), "y (m)": _as_sure_as(place[1], sigma[1]),
-               "σ of x (mm)": sigma[0], "σ of y (mm)": sigma[1],
+               "x (m)": estimate(place[0], sigma[0]), "y (m)": estimate(place[1], sigma[1]),
                "from the guess (mm)": 1e3 * np.linalg.norm(place - guess[k]),
                "error (mm)": 1e3 * np.linalg.norm(error),
                "d²": error @ np.linalg.solve(C, error),
                "down-weighted (%)": 100 * np.mean(result.range_weight[own] < 0.5)}
-
-
-def _as_sure_as(value, sigma):
-    """Text of a value in m with two digits of its sigma in mm."""
-    return f"{value:.{_decimals(1e-3 * sigma, 2, at_most=4)}f}"

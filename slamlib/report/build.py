@@ -181,7 +181,7 @@ def _write_pages(books, keys, drives, summaries, options, results, report):
     from slamlib.report.document import render
     solved = [overview.solved_drive(drive, results / drive.name) for drive in drives]
     shown = {Path("index"): overview.opening(solved)} | books
-    made = render(shown, options, overview.title_picture(solved))
+    made = render(shown, options)
     listed.unlink(missing_ok=True)
     for name, content in made.items():
         files.write_file(report / name, content)

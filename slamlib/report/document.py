@@ -30,7 +30,7 @@ NUMBERED = re.compile(r"\\tag\*?\s*{([^{}]*)}")
 APPENDIX = re.compile(r"([A-Z])\.")  # begins the title of an appendix
 
 
-def render(books: Books, options: Options, picture: str = "") -> dict[str, bytes]:
+def render(books: Books, options: Options) -> dict[str, bytes]:
     """Return the files of a report by their names: a page for each book, and report.pdf.
 
     NotebookError if a formula or a picture would be lost.
@@ -38,33 +38,30 @@ def render(books: Books, options: Options, picture: str = "") -> dict[str, bytes
     Parameters
     ----------
     books : executed notebooks; links name them by their file names.
-    options : of the title page, and of the code that is shown.
-    picture : an SVG for the title page, or "".
+    options : of the title page.
     """
     with tempfile.TemporaryDirectory() as temporary, ThreadPoolExecutor() as pool:
         folder = Path(temporary)
-        (folder / "title.svg").write_text(picture, encoding="utf-8")
-        screen = {source: markdown(book, options.code) for source, book in books.items()}
+        screen = {source: markdown(book) for source, book in books.items()}
         targets = _targets(books, screen)
         parts = []
         pages = {}
         for source, book in books.items():
             settings = _settings(books, source, targets, folder)
-            paper = markdown(book, options.code, on_paper=True)
+            paper = markdown(book, on_paper=True)
             parts.append(pool.submit(_pandoc, paper, "typst", settings))
             pages[source] = pool.submit(_pandoc, screen[source], "html", settings)
-        pdf = _pdf([part.result() for part in parts], options, bool(picture), folder)
+        pdf = _pdf([part.result() for part in parts], options, folder)
         files = {f"{source.stem}.html": page.result() for source, page in pages.items()}
         return files | {"report.pdf": pdf}
 
 
-def markdown(book, code: str, on_paper: bool = False) -> str:
-    """Return a notebook with its outputs and pictures as Markdown; `code` as of Options."""
+def markdown(book, on_paper: bool = False) -> str:
+    """Return a notebook with its outputs and pictures as Markdown."""
     environment = Environment(trim_blocks=True, lstrip_blocks=True)
     environment.filters["strip_ansi"] = strip_ansi
     template = environment.from_string((HERE / "notebook.md").read_text(encoding="utf-8"))
-    return template.render(book=book, code=code, on_paper=on_paper, alt=ALT, address=_address,
-                           embedded=_embedded)
+    return template.render(book=book, on_paper=on_paper, alt=ALT, address=_address)
 
 
 def _address(kind, data):
@@ -73,15 +70,6 @@ def _address(kind, data):
         data = b64encode(data.encode()).decode()
     content = "".join(data.split())
     return f"data:{kind};base64,{content}"
-
-
-def _embedded(cell):
-    """Return the text of a Markdown cell, in which its attachments are pictures."""
-    text = cell.source
-    for name, data in cell.get("attachments", {}).items():
-        for kind, content in data.items():
-            text = text.replace(f"attachment:{name}", _address(kind, content))
-    return text
 
 
 def _targets(books, texts):
@@ -133,13 +121,12 @@ def _pandoc(text, kind, settings):
     return done.stdout
 
 
-def _pdf(parts, options, has_picture, folder):
+def _pdf(parts, options, folder):
     """Return the PDF of the parts of a document for Typst, whose pictures are in a folder."""
     scopes = b"\n".join(b"#[\n" + part + b"\n]" for part in parts)
     main = folder / "main.typ"
     main.write_bytes((HERE / "report.typ").read_bytes() + scopes)
     shown = {name: str(value) for name, value in asdict(options).items()}
-    shown["picture"] = "title.svg" if has_picture else ""
     try:
         return typst.compile(main, root=folder, ignore_system_fonts=True, timestamp=0,
                              sys_inputs=shown)

@@ -2,7 +2,6 @@
 
 import asyncio
 import os
-import socket
 import sys
 import time
 from collections.abc import Callable
@@ -21,8 +20,6 @@ from nbconvert.preprocessors import CoalesceStreamsPreprocessor
 from slamlib.core.errors import require
 from slamlib.report.notebooks import LAB_ONLY, Books, NotebookError
 
-CELL_TIMEOUT = 1800  # s, in which a cell must end
-TRANSPORT = "ipc" if hasattr(socket, "AF_UNIX") else "tcp"  # Windows has no Unix sockets
 # The matrices are small: more threads cost time.
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 LAB_SETTINGS = Path(__file__).parent / "lab"       # overrides.json: no question when it opens
@@ -44,14 +41,11 @@ def kernel_environment(settings: Path, data: Path, datasets: list[str]) -> dict[
     `settings` and `data` are the folders of the kernels' own settings and of the datasets,
     `datasets` the selected names, or none for those that `notebook.start` selects.
     """
-    matplotlibrc = settings / "matplotlibrc"
-    matplotlibrc.write_text("svg.hashsalt: slamlib\n")
     defaults = {"SOURCE_DATE_EPOCH": "0", "PYTHONHASHSEED": "0"} | ONE_THREAD
     return defaults | os.environ | {
         "SLAMLIB_DATA": str(data),
         "SLAMLIB_DATASETS": "\n".join(datasets),
         "IPYTHONDIR": str(settings),
-        "MATPLOTLIBRC": str(matplotlibrc),
         "MPLBACKEND": "module://matplotlib_inline.backend_inline"}
 
 
@@ -63,8 +57,7 @@ def execute(books: Books, data: Path, datasets: list[str], results: dict[Path, P
     folder, SLAMLIB_RESULTS, of `results`. When one has ended, finish(Path, the executed notebook,
     seconds) is called. NotebookError if a cell failed.
     """
-    short = "/tmp" if TRANSPORT == "ipc" else None  # because paths of sockets must be
-    with TemporaryDirectory(dir=short, prefix="slamlib-", ignore_cleanup_errors=True) as temporary:
+    with TemporaryDirectory(prefix="slamlib-", ignore_cleanup_errors=True) as temporary:
         environment = kernel_environment(Path(temporary), data, datasets)
         try:
             with asyncio.Runner(loop_factory=_Loop) as runner:
@@ -90,18 +83,14 @@ async def _execute_all(books, environment, results, jobs, finish):
 
 
 async def _execute(source, book, environment):
-    """Execute one notebook in place with this interpreter.
-
-    The kernel listens at sockets in its folder of settings: nobody else can take them.
-    """
-    connection = Path(environment["IPYTHONDIR"], f"{id(book)}.json")
+    """Execute one notebook in place with this interpreter."""
     manager = AsyncKernelManager(
-        kernel_name="python3", connection_file=str(connection), transport=TRANSPORT,
+        kernel_name="python3",
         kernel_spec_manager=KernelSpecManager(kernel_dirs=[]))  # no kernels of the user are found
     client = NotebookClient(
         book, km=manager, resources={"metadata": {"path": str(source.parent)}},
-        timeout=CELL_TIMEOUT, iopub_timeout=60, raise_on_iopub_timeout=True,
-        record_timing=False, store_widget_state=False, skip_cells_with_tag=LAB_ONLY,
+        iopub_timeout=60, raise_on_iopub_timeout=True, record_timing=False,
+        skip_cells_with_tag=LAB_ONLY,
         shutdown_kernel="immediate", extra_arguments=["--IPKernelApp.log_level=ERROR"])
     try:
         await client.async_execute(env=environment, cleanup_kc=True)

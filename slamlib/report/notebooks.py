@@ -17,7 +17,6 @@ from slamlib.core.errors import require
 from slamlib.io.textfile import read_text, read_toml
 
 FOLDER = "notebooks"  # name of the notebooks' folder
-CODE = ("none", "method", "all")  # code that is shown: none, all that is not hidden, or all
 TITLE = re.compile(r"^#\s+(.+)", re.MULTILINE)
 LAB_ONLY = "lab-only"  # tag of cells that are not executed, and not shown on pages or in the PDF
 Books = dict[Path, NotebookNode]  # notebooks by their files, in the order of the report
@@ -36,7 +35,6 @@ class Options:
     student_number: str = ""
     course: str = ""
     chapters: tuple[str, ...] = ()  # names of notebooks, also as "[1-4]*"; empty: all
-    code: str = "method"
 
 
 def read_options(path: str | Path) -> Options:
@@ -62,7 +60,6 @@ def _checked(key, value, path):
         return tuple(value)
     is_line = type(value) in (str, int) and re.fullmatch(r"[^\n\ufffd]*", str(value))
     require(is_line, path, f"a line of UTF-8 text in quotes for {key}", value)
-    require(key != "code" or value in CODE, path, f"one of {', '.join(CODE)} for code", value)
     return str(value)
 
 

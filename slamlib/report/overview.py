@@ -27,12 +27,11 @@ from slamlib.solve import PROBLEMS, SENSORS, VEHICLE_ESTIMATED, Solution
 
 TEXT = Path(__file__).with_name("overview.md")
 SCREEN_ONLY = "<!-- on screens only -->"  # in the text, before what the PDF leaves out
-LOOKS = {"problem3": dict(linewidth=4.0), "problem4": dict(linestyle="-", linewidth=1.4)}
+DRAWN = "problem1", "problem2_fused"  # whose trajectories figure 1 has, beside the last one
 MAPS = {"aruco_map": "ArucoMap", "uwb_map": "UwbMap"}  # fields of a Solution, names of their files
 # Columns of the table of results, in thousandths of these entries of a summary.
 COLUMNS = {"ATE (mm)": "ate_m", "aligned (mm)": "ate_aligned_m", "at returns (mm)": "at_returns_m",
            "σ (mm)": "median_sigma_m", "σ of δ (mrad)": "median_sigma_heading_rad"}
-in_our_style = plt.style.context(plotting.STYLE, after_reset=True)  # decorates what draws
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +68,7 @@ def solved_drive(drive: Drive, results: Path) -> SolvedDrive:
 def opening(drives: list[SolvedDrive]) -> NotebookNode:
     """Return the opening of the report, an executed notebook."""
     shown = longest(drives)
-    drawn = _as_svg(trajectories(shown)) if shown else ""
+    drawn = trajectories(shown) if shown else ""
     template = Template(TEXT.read_text(encoding="utf-8"), trim_blocks=True, lstrip_blocks=True)
     text = template.render(
         drives=drives, longest=shown, plain=plain, sensors=SENSORS,
@@ -131,51 +130,25 @@ def differences_at_returns(drive: SolvedDrive) -> dict[str, float]:
     return found
 
 
-@in_our_style
-def trajectories(drive: SolvedDrive) -> Figure:
-    """Return the figure of a drive's trajectories, its last map and sigmas."""
+@plt.style.context(plotting.STYLE, after_reset=True)
+def trajectories(drive: SolvedDrive) -> str:
+    """Return the figure of a drive's trajectories, its last map and sigmas, as SVG."""
     fig = Figure(figsize=(7.2, 2.7))  # inches
     left, right = fig.subplots(1, 2)
     for problem, solution in drive.solutions.items():
         role = PROBLEMS[problem].role
-        if problem in ("problem1", "problem2_fused") and solution is not drive.last:
-            plotting.trajectory(left, solution.poses, role, solution.title)
+        if problem in DRAWN or solution is drive.last:
+            plotting.trajectory(left, solution.poses, role, solution.title, linewidth=1.2)
         sigmas = evaluation.position_sigmas(solution.covariances)
         sigmas[:len(sigmas) // 50] = np.nan  # nearly zero, on a logarithmic axis
         known = np.flatnonzero(sigmas > 0)
-        look = LOOKS.get(problem, {})
-        plotting.curve(right, sigmas[known], role, known, solution.title, **look)
-    _draw_map(left, drive.last)
+        plotting.curve(right, sigmas[known], role, known, solution.title)
+    if drive.last.aruco_map is not None:
+        plotting.draw_markers(left, *drive.last.aruco_map[1:])
+    if drive.last.uwb_map is not None:
+        plotting.draw_antennas(left, *drive.last.uwb_map[1:])
     if drive.truth is not None:
         plotting.trajectory(left, drive.truth.poses, "truth")
-    right.set(yscale="log", ylabel="σ of position (m)")
+    right.set(xlabel="pose id", yscale="log", ylabel="σ of position (m)")
     plotting.legend_below(fig)
-    return fig
-
-
-def _draw_map(ax, solution):
-    """Draw the trajectory and the landmarks of a Solution."""
-    role = PROBLEMS[solution.problem].role
-    plotting.trajectory(ax, solution.poses, role, solution.title, linestyle="-", linewidth=1.2)
-    if solution.aruco_map is not None:
-        plotting.draw_markers(ax, *solution.aruco_map[1:])
-    if solution.uwb_map is not None:
-        plotting.draw_antennas(ax, *solution.uwb_map[1:])
-
-
-@in_our_style
-def title_picture(drives: list[SolvedDrive]) -> str:
-    """Return the last trajectory of the longest drive with its landmarks as SVG, or ""."""
-    drive = longest(drives)
-    if drive is None:
-        return ""
-    fig = Figure(figsize=(6.3, 4.6))  # inches
-    ax = fig.add_subplot()
-    _draw_map(ax, drive.last)
-    ax.axis("off")
-    return _as_svg(fig)
-
-
-@in_our_style
-def _as_svg(fig):
     return print_figure(fig, "svg", metadata={"Date": None})

@@ -36,14 +36,16 @@ end
 
 local function attributes(id, classes) return pandoc.Attr(label(options.here, id), classes or {}) end
 
--- Pictures, captions, formulas and tables.
-
 local function picture(image)
   local found, kind, content = pcall(pandoc.mediabag.fetch, image.src)
   if not found or image.src:find "^%a+:" and not image.src:find "^data:" then
     refuse(("expected a picture of the notebook or a file beside it, found '%s'"):format(image.src))
   end
   if not typst then
+    if content:find 'id="tip: ' then -- a map whose landmarks can be asked
+      local svg = content:match "<svg.*":gsub('<g id="tip: ([^"]*)">', "<g><title>%1</title>")
+      return pandoc.RawInline("html", svg)
+    end
     image.src = pandoc.mediabag.make_data_uri(kind, content)
     return image
   end
@@ -209,8 +211,6 @@ local function resolved(link)
   end
   return (id or typst and not link.target:find "^%a+:") and link.content or link
 end
-
--- The document.
 
 local function with_captions(blocks)
   local result = pandoc.Blocks{}

@@ -4,6 +4,7 @@ A trial is a function of a seed and of options that returns a dict of numbers. `
 over many seeds. Options that a trial does not name are those of `simulation.simulate`.
 """
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -20,13 +21,12 @@ from slamlib import (
 )
 from slamlib.core import odometry, se2
 from slamlib.core.evaluation import anees, ate, position_sigmas
-from slamlib.core.graph_solution import GraphSolution
 from slamlib.core.hint import Fusion
 from slamlib.core.increments import TYPICAL_SLIP
 from slamlib.core.records import Dataset, Truth
 from slamlib.core.sightings import sightings_by_frame
 from slamlib.robust.fit import refine
-from slamlib.robust.result import slam_result
+from slamlib.robust.result import SlamResult, slam_result
 from slamlib.studies.simulation import distances, simulate
 
 PROBLEM2_METHODS = {
@@ -56,20 +56,20 @@ def judged(name: str, poses: np.ndarray, covariances: np.ndarray, true: np.ndarr
             f"{name} ate": ate(poses, true, aligned)}
 
 
-def problem2_trial(seed: int, methods: tuple = tuple(PROBLEM2_METHODS), **options) -> dict:
-    """Methods of problem 2 on one `drive`.
+def problem2_trial(seed: int, **options) -> dict:
+    """PROBLEM2_METHODS on one `drive`.
 
     Returns
     -------
-    dict of numbers for each of `methods`: "nees", the mean over the measured poses, and "ate" in m.
+    dict of numbers for each method: "nees", the mean over the measured poses, and "ate" in m.
     """
     dataset, truth = drive(seed, **options)
     frame = sightings_by_frame(dataset.aruco).frame
     numbers = {}
-    for method in methods:
-        found = PROBLEM2_METHODS[method](dataset)
+    for name, method in PROBLEM2_METHODS.items():
+        found = method(dataset)
         rows = slice(None) if len(found.poses) == len(frame) else frame
-        numbers |= judged(method, found.poses[rows], found.covariances[rows], truth.poses[frame])
+        numbers |= judged(name, found.poses[rows], found.covariances[rows], truth.poses[frame])
     return numbers
 
 
@@ -112,11 +112,7 @@ def plain_and_delivered(seed: int, **options) -> dict:
     problem4 = estimate(dataset, previous=problem3)
     numbers = {}
     for problem, given, result in ((3, without, problem3), (4, dataset, problem4)):
-        plain = plain_graph(given)
-        at = plain.pose
-        for name, poses, covariances in (
-                ("plain", plain.poses, plain.covariances),
-                ("delivered", result.poses[at], result.covariances[at])):
+        for name, at, poses, covariances in both_graphs(given, result):
             key = f"{name} {problem}"
             numbers |= judged(key, poses, covariances, truth.poses[at])
             numbers[f"{key} aligned"] = ate(poses, truth.poses[at], aligned=True)
@@ -124,10 +120,17 @@ def plain_and_delivered(seed: int, **options) -> dict:
     return numbers
 
 
-def plain_graph(dataset: Dataset, slip: float = TYPICAL_SLIP) -> GraphSolution:
-    """The GraphSolution of a Dataset by the graph in which all measurements count."""
-    decisions = count_everything(dataset, slip=slip)
-    return solve_graph(build_graph(decisions), initial_values(dataset, decisions))
+def both_graphs(dataset: Dataset, result: SlamResult) -> Iterator[tuple]:
+    """Yield "plain" and "delivered", each with the indices of its poses, them, and covariances.
+
+    The plain graph of a Dataset counts all measurements, its slip is typical. Of the `result` of
+    `estimate` the poses are those that the plain graph has.
+    """
+    decisions = count_everything(dataset, slip=TYPICAL_SLIP)
+    plain = solve_graph(build_graph(decisions), initial_values(dataset, decisions))
+    at = plain.pose
+    yield "plain", at, plain.poses, plain.covariances
+    yield "delivered", at, result.poses[at], result.covariances[at]
 
 
 def correlated_errors(seed: int, correlation: float, **options) -> dict:

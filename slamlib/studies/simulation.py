@@ -131,41 +131,23 @@ def confuse_labels(dataset: Dataset, kind: str, seed: int) -> Dataset:
     have exchanged labels with another sighting of the same image. "twins": every fifth marker is
     read as one certain other marker, its twin, in 60 % of its sightings. "none": all are right.
     """
-    kinds = {"none": _right, "random": _any_other, "in frame": _exchanged, "twins": _as_twin}
     aruco = dataset.aruco
     rng = np.random.default_rng(seed)
-    return replace(dataset, aruco=replace(aruco, marker=kinds[kind](aruco, rng)))
-
-
-def _right(aruco, rng):
-    """The labels (s,) as they are."""
-    return aruco.marker
-
-
-def _any_other(aruco, rng):
-    """Labels (s,), some of which are those of any other marker."""
-    ids, label = np.unique(aruco.marker, return_inverse=True)
-    return ids[_relabelled(label, len(ids), CONFUSED, rng)]
-
-
-def _exchanged(aruco, rng):
-    """Labels (s,), some of which are exchanged within a frame."""
     label = aruco.marker.copy()
-    for first in np.flatnonzero(rng.uniform(size=len(label)) < CONFUSED / 2):
-        same_frame = np.flatnonzero(aruco.pose == aruco.pose[first])
-        second = rng.choice(same_frame)
-        swapped = label[[second, first]]
-        label[[first, second]] = swapped
-    return label
-
-
-def _as_twin(aruco, rng):
-    """Labels (s,), some of which are those of a marker's twin."""
-    ids = rng.permutation(np.unique(aruco.marker))
-    twin = dict(zip(ids[::TWIN_EVERY].tolist(), ids[1::TWIN_EVERY].tolist()))
-    misread = rng.uniform(size=len(aruco.marker)) < TWIN_MISREAD
-    return np.array([twin.get(marker, marker) if wrong else marker
-                     for marker, wrong in zip(aruco.marker.tolist(), misread)])
+    ids = np.unique(label)
+    if kind == "random":
+        number = np.searchsorted(ids, label)
+        label = ids[_relabelled(number, len(ids), CONFUSED, rng)]
+    elif kind == "in frame":
+        for first in np.flatnonzero(rng.uniform(size=len(label)) < CONFUSED / 2):
+            second = rng.choice(np.flatnonzero(aruco.pose == aruco.pose[first]))
+            label[[first, second]] = label[[second, first]]
+    elif kind == "twins":
+        ids = rng.permutation(ids)
+        misread = rng.uniform(size=len(label)) < TWIN_MISREAD
+        for marker, twin in zip(ids[::TWIN_EVERY], ids[1::TWIN_EVERY]):
+            label[misread & (aruco.marker == marker)] = twin
+    return replace(dataset, aruco=replace(aruco, marker=label))
 
 
 def manoeuvre(legs: list[tuple[float, float]], vehicle: Vehicle = TABLE_2) -> np.ndarray:

@@ -20,7 +20,6 @@ from slamlib.studies.simulation import confuse_labels, distances, misguess
 
 MAX_ANTENNA_ERROR = 0.5      # m, error below which an antenna is right
 MAX_MARKER_ERROR = 0.1       # m, distance from the right optimum above which a marker is off
-COST_TOLERANCE = 1.0         # cost above that of the right optimum: a residual of 1.4 sigmas
 
 
 def first_sighting(measurements: Measurements, in_world: np.ndarray,
@@ -33,9 +32,8 @@ def first_sighting(measurements: Measurements, in_world: np.ndarray,
 def most_certain(measurements: Measurements, in_world: np.ndarray,
                  covariances: np.ndarray) -> np.ndarray:
     """(k, 3) markers at their most certain sightings; parameters as of `consensus_markers`."""
-    certainty = -np.linalg.slogdet(covariances).logabsdet
-    rows = np.arange(len(certainty))
-    order = np.lexsort((rows, -certainty, measurements.marker_row))
+    uncertainty = np.linalg.slogdet(covariances).logabsdet
+    order = np.lexsort((uncertainty, measurements.marker_row))
     _, first = np.unique(measurements.marker_row[order], return_index=True)
     return in_world[order[first]]
 
@@ -59,16 +57,15 @@ def mean_by_information(measurements: Measurements, in_world: np.ndarray,
 
     Parameters as of `consensus_markers`. Angles are averaged about the most certain sighting's.
     """
-    certainty = -np.linalg.slogdet(covariances).logabsdet
+    row = measurements.marker_row
+    markers = most_certain(measurements, in_world, covariances)
     information = np.linalg.inv(covariances)
-    markers = np.zeros((len(measurements.marker), 3))
-    for j in range(len(markers)):
-        rows = np.flatnonzero(measurements.marker_row == j)
-        most_certain = in_world[rows[certainty[rows].argmax()]]
-        difference = se2.difference(in_world[rows], most_certain)
-        weighted = np.einsum("nij,nj->i", information[rows], difference)
-        markers[j] = most_certain + np.linalg.solve(information[rows].sum(axis=0), weighted)
-    return markers
+    difference = se2.difference(in_world, markers[row])[..., None]
+    total = np.zeros((len(markers), 3, 3))
+    weighted = np.zeros((len(markers), 3, 1))
+    np.add.at(total, row, information)
+    np.add.at(weighted, row, information @ difference)
+    return markers + np.linalg.solve(total, weighted)[..., 0]
 
 
 def map_of_problem_2(measurements: Measurements, in_world: np.ndarray,
@@ -98,67 +95,38 @@ def guessed_antennas(measurements: Measurements, poses: np.ndarray, covariances:
     return measurements.guess
 
 
-def landmarks(seed: int, kernel: str = "graduated", starts: tuple = tuple(LANDMARKS),
-              confusion: str = "none", **options) -> dict:
-    """LANDMARKS, starts of the markers, on one `drive` with the typical slip known.
+def confusions(seed: int, **options) -> dict:
+    """LANDMARKS, starts of the markers, with each of CONFUSIONS, on one `drive`, its slip typical.
 
-    Parameters
-    ----------
-    kernel : "graduated", all scales of the Cauchy kernel, or "last", only the last one.
-    starts : names in LANDMARKS.
-    confusion : kind of wrong labels, of `simulation.confuse_labels`.
+    From each start the graph is solved with the "last" Cauchy kernel, and with the "graduated"
+    ones, all rounds. The right optimum is that reached from the true map and poses.
 
     Returns
     -------
-    dict of numbers for each start: the final "cost", the graph's error; "right", 1 where it is that
-    reached from the true map and poses, to within COST_TOLERANCE; "off", share of the markers that
-    end farther than MAX_MARKER_ERROR from there; "initial error", their rms distance at the start,
-    in m.
+    dict of numbers, as "twins, last, consensus off", the share of the markers that end farther than
+    MAX_MARKER_ERROR from the right optimum, and "twins, consensus initial error", their rms
+    distance from there at the start, in m.
     """
     dataset, truth = drive(seed, **options)
-    m = measure(confuse_labels(dataset, confusion, seed).without("uwb"))
-    row = np.searchsorted(truth.marker, m.marker)
-    right = state_from_arrays(m, truth.poses[m.frame], truth.marker_in_world[row],
-                              np.zeros((0, 2)), m.calibration.stated)
-    return _from_each_start(build_problem(m, "arc"), right, kernel, starts)
-
-
-def confusions(seed: int, **options) -> dict:
-    """`landmarks` with each of CONFUSIONS, by one kernel and by all rounds, on one `drive`.
-
-    Returns
-    -------
-    dict of numbers, as "twins, last, consensus off" and "twins, consensus initial error".
-    """
     numbers = {}
     for kind in CONFUSIONS:
+        m = measure(confuse_labels(dataset, kind, seed).without("uwb"))
+        problem = build_problem(m, "arc")
+        cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(CAUCHY_SCALES[-1])
+        last = replace(problem, accepted=accept_all(m, cauchy))
+        row = np.searchsorted(truth.marker, m.marker)
+        true = state_from_arrays(m, truth.poses[m.frame], truth.marker_in_world[row],
+                                 np.zeros((0, 2)), m.calibration.stated)
+        right = optimize(last, true).state.markers
         for kernel in ("last", "graduated"):
-            found = landmarks(seed, kernel, confusion=kind, **options)
-            for name in LANDMARKS:
-                numbers[f"{kind}, {kernel}, {name} off"] = found[f"{name} off"]
-                numbers[f"{kind}, {name} initial error"] = found[f"{name} initial error"]
-    return numbers
-
-
-def _from_each_start(problem, right, kernel, starts):
-    """The numbers of `landmarks`; from the State `right` the optimum is the right one."""
-    m = problem.measurements
-    cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(CAUCHY_SCALES[-1])
-    last = replace(problem, accepted=accept_all(m, cauchy))
-    best = optimize(last, right)
-    numbers = {}
-    for name in starts:
-        state = odometry_state(m, problem.odometry.model, markers=LANDMARKS[name])
-        initial_error = distances(state.markers, best.state.markers)
-        if kernel == "graduated":
-            state = narrow_kernels(problem, state, CAUCHY_SCALES[:-1])
-        end = optimize(last, state)
-        error = distances(end.state.markers, best.state.markers)
-        cost = end.equations.error
-        numbers[f"{name} cost"] = cost
-        numbers[f"{name} off"] = np.mean(error > MAX_MARKER_ERROR)
-        numbers[f"{name} right"] = cost < best.equations.error + COST_TOLERANCE
-        numbers[f"{name} initial error"] = np.sqrt(np.mean(initial_error**2))
+            for name, place in LANDMARKS.items():
+                state = odometry_state(m, "arc", markers=place)
+                initial_error = distances(state.markers, right)
+                if kernel == "graduated":
+                    state = narrow_kernels(problem, state, CAUCHY_SCALES[:-1])
+                error = distances(optimize(last, state).state.markers, right)
+                numbers[f"{kind}, {kernel}, {name} off"] = np.mean(error > MAX_MARKER_ERROR)
+                numbers[f"{kind}, {name} initial error"] = np.sqrt(np.mean(initial_error**2))
     return numbers
 
 
