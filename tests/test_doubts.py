@@ -103,6 +103,19 @@ def test_a_flaw_is_named(flaw, options):
         assert (", or as well with sightings" in told) == what.startswith("wheels-")
 
 
+@pytest.mark.parametrize("matrix, what", [
+    (SWAPPED, "wheels-swapped"), (BACKWARDS, "wheels-reversed")])
+def test_wheels_that_are_wrong_for_a_third_of_the_drive_are_doubted_there(matrix, what):
+    clean, _ = drive(3)
+    third = slice(700, 1300)
+    ticks = clean.ticks.copy()
+    ticks[third] = ticks[third] @ matrix
+    doubt, = doubts_before_solving(replace(clean, ticks=ticks))
+    assert doubt.what == what
+    first, last = map(int, re.search(r"poses (\d+) and (\d+)", doubt.sentence).groups())
+    assert_allclose([first, last], [third.start, third.stop], atol=100)       # of 1 m
+
+
 # Drives with nothing to doubt: functions of a simulated drive and a random generator.
 
 def wheels_off(factor, base=1.0):

@@ -234,6 +234,20 @@ def test_counts_that_creep_while_the_vehicle_stands_say_nothing(count):
     assert not solution_doubts(found)
 
 
+def test_sightings_that_are_noisier_far_away_are_no_jump():
+    """Beyond 1.2 m by five stated standard deviations: some neighbours disagree with odometry."""
+    clean = short(11)[0].without("uwb")
+    z = clean.aruco.marker_in_vehicle
+    errors = np.random.default_rng(5).normal(size=z.shape)
+    far = np.hypot(z[:, 0], z[:, 1]) > 1.2
+    noisy = z + 5 * far[:, None] * errors * se2.sigmas(clean.aruco.covariance)
+    spoilt = aruco(clean, marker_in_vehicle=noisy)
+    assert len(jumps.find_jumps(spoilt).start)
+    found = estimate(spoilt)
+    assert not len(found.jumps.start)
+    assert "encoder" not in [doubt.what for doubt in solution_doubts(found)]
+
+
 def test_a_vehicle_crawls_below_a_tenth_of_its_usual_speed():
     ticks = np.array([[0, 0], [100, 100], [100, 100], [9, 0], [0, -21], [0, 0]])
     found = jumps.crawls(ticks, np.arange(5), np.arange(1, 6))

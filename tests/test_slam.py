@@ -43,6 +43,7 @@ from slamlib.robust.measurements import NOISE_KEYS, Noise, measure
 from slamlib.robust.noise import learn_noise
 from slamlib.robust.pipeline import fit_from_odometry
 from slamlib.robust.result import slam_result
+from slamlib.robust.solution_doubts import solution_doubts
 from slamlib.studies import montecarlo, simulation
 
 COUNT = 2 * np.pi * 0.1 / 8000                            # m
@@ -223,6 +224,19 @@ def test_a_second_place_gets_a_readable_id_that_the_drive_does_not_have():
     assert_array_equal(found, [-7, 93, -107, 0, 100, 12, 212])
 
 
+@pytest.mark.parametrize("legs", [[(60, 0)], [(30, 0), (0.8, np.pi / 2), (30, 0)]], ids=str)
+def test_nothing_is_released_in_a_clean_corridor(legs, monkeypatch):
+    """Without a loop only what is stated gives the metre: released wheels would run away."""
+    right, left = COUNT * simulation.manoeuvre(legs)[1:].T
+    monkeypatch.setattr(simulation, "_driven_arcs",
+                        lambda *_: ((right + left) / 2, (right - left) / 0.4))
+    for seed in (0, 1):
+        dataset, truth = simulation.simulate("short", seed, slip=3e-3)
+        found = estimate(dataset.without("uwb"))
+        assert not found.released and not solution_doubts(found)
+        assert mean_nees(found, truth) < 8
+
+
 def test_parts_of_a_drive_grow_at_most_fourfold_from_where_the_heading_is_lost():
     """A turn of one rad a metre: a wheelbase known to 5 % loses 0.5 rad after ten metres."""
     ticks = np.rint(simulation.manoeuvre(300 * [(1.0, 1.0)]))
@@ -335,6 +349,18 @@ def test_the_evidence_chooses_the_steps_that_the_vehicle_drives(true, other):
     assert found.log_evidence > wrong.log_evidence + DECISIVE_LEAD
     for ours, theirs in zip(found.problem.accepted, wrong.problem.accepted):
         assert_array_equal(ours.weight, theirs.weight)
+
+
+def test_a_marker_that_its_sightings_contradict_starts_where_these_agree():
+    """Seven of its sightings may hold it metres away; the others tell where it is."""
+    m = measure(short(7, 800)[0].without("uwb"))
+    fit = fit_from_odometry(m)
+    lost = fit.state.markers.copy()
+    lost[0] += [3.0, -2.0, 1.0]
+    found = initialization.with_consensus(fit.problem, replace(fit.state, markers=lost))
+    assert_allclose(found.markers[0], fit.state.markers[0], atol=0.05)
+    assert_array_equal(found.markers[1:], lost[1:])
+    assert initialization.with_consensus(fit.problem, fit.state) is fit.state
 
 
 def test_headings_are_continuous_where_frames_are_rounds_apart():
