@@ -81,8 +81,10 @@ def memory_or_slip(problem: Problem, state: State) -> Fit:
     deviations were PLAUSIBLE_FACTOR times those in the files, where with a larger slip they do not.
     """
     fit = refine(problem, state)
+    if not (fit.problem.accepted.share < 1).any():
+        return fit
     by_memory = _contradicting_share(fit)
-    if by_memory <= MAX_CONTRADICTING or not (fit.problem.accepted.share < 1).any():
+    if by_memory <= MAX_CONTRADICTING:
         return fit
     other = refine(replace(problem, memory_first=False), state)
     by_slip = _contradicting_share(other)
