@@ -15,7 +15,7 @@ from slamlib.core.marker_increments import (
     returns,
     robust_increments,
 )
-from slamlib.core.sightings import Sightings, consensus, merge_repeated, regular
+from slamlib.core.sightings import Sightings, consensus, merge_repeated, regularized
 
 DELTA = np.array([0.12, -0.03, 0.2])
 MARKERS = np.array([[1.2, 0.4, 0.3], [-0.7, 1.1, -2.9], [0.2, -1.3, 3.1], [-1.0, -0.8, 1.0]])
@@ -139,10 +139,10 @@ def test_covariances_that_are_nearly_singular_are_increased_by_hand():
     for lack, sigma, added in ((1e-6, 0.01, 0), (1e-10, 0.01, 1e-12), (1e-10, 1e4, 0)):
         C = np.diag([sigma**2, sigma**2, 1e-4])
         C[0, 1] = C[1, 0] = (1 - lack) * sigma**2
-        difference = regular(C[None])[0] - C
+        difference = regularized(C[None])[0] - C
         assert_allclose(difference, np.diag([added, added, 0]), rtol=1e-3, atol=1e-18)
     far = np.array([np.diag([1e8, 1e-18, 1e-4]), np.diag([1e-18, 1e8, 1e-4])])   # a millionth
-    assert_allclose(regular(far) - far, [np.diag([0, 1e-4, 0]), np.diag([1e-4, 0, 0])])
+    assert_allclose(regularized(far) - far, [np.diag([0, 1e-4, 0]), np.diag([1e-4, 0, 0])])
 
 
 def test_consensus_takes_the_most_certain_sighting_among_the_supported():

@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.linalg import block_diag
 
 from slamlib.core import increments, odometry, se2
-from slamlib.core.preintegration import preintegrate
+from slamlib.core.increments import preintegrate
 from slamlib.core.records import Dataset
 from slamlib.core.se2 import correlations
 from slamlib.core.vehicle import Vehicle
@@ -207,5 +207,5 @@ def test_noise_of_wheels_moves_the_end_of_an_increment_across_its_own_direction(
     ticks = manoeuvre([(0.5, np.pi / 4), (5.0, 0.0)])
     drive = Dataset("turn", VEHICLE, ticks, None, None, None)
     found = preintegrate(drive, np.array([0, len(ticks) - 1]))
-    for Q in (found.quantization[0], found.slipping[0]):
+    for Q in (found.rounding[0], found.slipping[0]):
         assert Q[1, 1] > 3 * Q[0, 0]

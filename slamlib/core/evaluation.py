@@ -67,7 +67,7 @@ def nees(poses: np.ndarray, covariances: np.ndarray, truth: np.ndarray) -> np.nd
     It is chi-squared with 3 degrees of freedom, so 3 on average, if the errors are Gaussian with
     covariance C. It is NaN where C is singular, as for a known pose, and without an estimate.
     """
-    ok = se2.regular(covariances)
+    ok = se2.are_regular(covariances)
     result = np.full(len(poses), np.nan)
     result[ok] = se2.squared_distances(poses[ok], truth[ok], covariances[ok])
     return result

@@ -24,9 +24,8 @@ from gtsam.symbol_shorthand import A, L, P, W, X
 from slamlib.core import odometry, se2
 from slamlib.core.batch import Batch
 from slamlib.core.errors import require
-from slamlib.core.increments import TYPICAL_SLIP
+from slamlib.core.increments import TYPICAL_SLIP, OdometryIncrements, odometry_error, preintegrate
 from slamlib.core.kernels import KERNELS, ONE_SIDED, kernel_of, symmetric
-from slamlib.core.preintegration import OdometryIncrements, odometry_error, preintegrate
 from slamlib.core.records import (
     NO_RANGES,
     NO_SIGHTINGS,

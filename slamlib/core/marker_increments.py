@@ -183,7 +183,7 @@ def _solved(common, linear, gain):
     total = np.zeros((common.count, 3, 4))
     np.add.at(total, common.pair, terms)
     information = total[..., :3]
-    determined = se2.regular(information)
+    determined = se2.are_regular(information)
     covariance = np.full_like(information, np.nan)
     covariance[determined] = np.linalg.inv(information[determined])
     return (covariance @ total[..., 3:])[..., 0], covariance

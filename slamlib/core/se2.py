@@ -173,7 +173,7 @@ def correlations(covariances: np.ndarray) -> np.ndarray:
     return np.divide(covariances, scale, out=unknown, where=scale > 0)
 
 
-def regular(covariances: np.ndarray) -> np.ndarray:
+def are_regular(covariances: np.ndarray) -> np.ndarray:
     """True (n,) where covariances (n, d, d) are finite and, as correlations, not singular."""
     rho = correlations(covariances)
     found = np.isfinite(rho).all(axis=(1, 2))

@@ -47,7 +47,7 @@ def sightings_by_frame(aruco: ArucoReadings | None, extra_frames=()) -> Sighting
     `extra_frames` are pose indices from 0 that are frames even if no marker is seen there.
     """
     aruco = aruco or NO_SIGHTINGS
-    aruco = replace(aruco, covariance=regular(aruco.covariance))
+    aruco = replace(aruco, covariance=regularized(aruco.covariance))
     index, z, C, contradicting = merge_repeated(aruco)
     pose = aruco.pose[index]
     frame = np.union1d(pose, extra_frames).astype(int)
@@ -55,7 +55,7 @@ def sightings_by_frame(aruco: ArucoReadings | None, extra_frames=()) -> Sighting
                      z=z, C=C, frame=frame, contradicting=contradicting)
 
 
-def regular(covariance: np.ndarray) -> np.ndarray:
+def regularized(covariance: np.ndarray) -> np.ndarray:
     """Covariances (m, 3, 3), increased where float64 could not invert or add their information.
 
     Where the standard deviation of x, y or heading, given the other two, is below

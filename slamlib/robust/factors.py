@@ -14,7 +14,7 @@ from functools import lru_cache
 import numpy as np
 
 from slamlib.core import odometry, se2
-from slamlib.core.preintegration import OdometryIncrements, odometry_error, preintegrate
+from slamlib.core.increments import OdometryIncrements, odometry_error, preintegrate
 from slamlib.robust.calibration import (
     ANTENNAS,
     CAMERA,
@@ -53,7 +53,7 @@ def preintegrate_odometry(measurements: Measurements, model: str,
     return replace(
         increments, in_counts=False, increment=se2.compose(increments.increment, jump),
         J_wheel=moves[:, None, None] * increments.J_wheel,
-        quantization=increments.quantization + uncertain)
+        rounding=increments.rounding + uncertain)
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from scipy.sparse.linalg import splu
 
 from slamlib.core import odometry, se2
 from slamlib.core.graph import GUESS_PRIOR_SIGMA
-from slamlib.core.preintegration import OdometryIncrements
+from slamlib.core.increments import OdometryIncrements
 from slamlib.robust.calibration import Prior
 from slamlib.robust.factors import (
     LinearizedFactors,

@@ -23,8 +23,7 @@ from scipy.sparse.linalg import splu
 
 from slamlib.core import odometry, se2
 from slamlib.core.graph import ORIGIN_SIGMA
-from slamlib.core.increments import SLIP_BOUNDS, TYPICAL_SLIP
-from slamlib.core.preintegration import odometry_noise
+from slamlib.core.increments import SLIP_BOUNDS, TYPICAL_SLIP, odometry_noise
 from slamlib.core.records import NO_RANGES, Dataset
 from slamlib.core.sightings import (
     MAX_HEADING_SIGMA,

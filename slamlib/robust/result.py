@@ -13,7 +13,7 @@ import numpy as np
 
 from slamlib.core import increments, se2
 from slamlib.core.graph import GUESS_PRIOR_SIGMA
-from slamlib.core.preintegration import odometry_noise
+from slamlib.core.increments import odometry_noise
 from slamlib.robust.calibration import WHEELS, calibration_table
 from slamlib.robust.covariances import posterior_moments
 from slamlib.robust.factors import MIN_DISTANCE
@@ -327,8 +327,8 @@ def _from_frame(problem, state, row, pose, is_after):
     motion, motion_by_wheel = increments.between_poses(
         ticks, vehicle, frame, pose, problem.odometry.model)
     by_frame, by_motion = se2.compose_jacobians(X, motion)
-    quantization, slipping = odometry_noise(ticks, vehicle, start, end)
-    Q = quantization + problem.noise.slip**2 * slipping          # in the axes of `start`
+    rounding, slipping = odometry_noise(ticks, vehicle, start, end)
+    Q = rounding + problem.noise.slip**2 * slipping          # in the axes of `start`
     by_increment = by_motion
     if is_after:
         increment = se2.inverse(motion)
