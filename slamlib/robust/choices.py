@@ -349,38 +349,50 @@ def most_consistent(
     stretches odometry beyond the slip that it learned, most of all over a way without markers, one
     more jump is believed if the evidence leads decisively.
     """
+    def alternative(*change, **places):
+        """The Fit with the decisions of the present one, or None if it has no solution."""
+        try:
+            return start(*change, **places, like=fit)
+        except (DatasetError, np.linalg.LinAlgError):
+            return None
+
     jumps = find_jumps(dataset)
     found = len(jumps.start)
     no_jumps = replace(NO_JUMPS, lag=jumps.lag)
     fit = decide(start(jumps if jumps.are_few else no_jumps))
     if jumps.are_few:
-        without = start(no_jumps, like=fit)
+        without = alternative(no_jumps)
         fit = without if _are_needless(fit, without) else fit
-    elif found and spares_sightings(start(jumps, like=fit), fit, "jumps"):
+    elif found and spares_sightings(alternative(jumps), fit, "jumps"):
         fit = decide(start(jumps))
     log.info("jumps: %d of %d are believed", len(fit.problem.measurements.jumps.start), found)
     if has_rejected_visits(fit):
         places = places_of_ids(dataset.aruco, partial(start, like=fit))
         if places is not None and spares_sightings(
-                start(places=places, like=fit), fit, "places of ids"):
+                alternative(places=places), fit, "places of ids"):
             return decide(start(places=places)), places
     jumps = with_stretched(fit)
-    if jumps is not None:
-        lead = start(jumps, like=fit).log_density - fit.log_density
-        log.info("jumps: one more, log evidence %+.1f", lead)
-        if lead > MIN_JUMP_LEAD:
-            return decide(start(jumps)), None
+    if jumps is not None and _lead_of_jumps(alternative(jumps), fit) > MIN_JUMP_LEAD:
+        return decide(start(jumps)), None
     return fit, None
+
+
+def _lead_of_jumps(fit, other):
+    """Log evidence of a Fit with more jumps over that of another, none if there is no solution."""
+    if fit is None:
+        return -np.inf
+    lead = fit.log_density - other.log_density
+    log.info("jumps: log evidence %+.1f", lead)
+    return lead
 
 
 def _are_needless(fit, without):
     """Whether the jumps of a Fit, told by markers, explain no more than one without them."""
-    jumps = fit.problem.measurements.jumps
-    if (jumps.sigma >= UNKNOWN_SIGMA).any():
+    are_unknown = (fit.problem.measurements.jumps.sigma >= UNKNOWN_SIGMA).any()
+    if without is None or are_unknown:
         return False
-    lead = fit.log_density - without.log_density
-    log.info("jumps: log evidence %+.1f", lead)
-    return lead < MIN_JUMP_LEAD and not spares_sightings(fit, without, "jumps")
+    is_led = _lead_of_jumps(fit, without) < MIN_JUMP_LEAD
+    return is_led and not spares_sightings(fit, without, "jumps")
 
 
 def with_stretched(fit: Fit) -> Jumps | None:
@@ -439,8 +451,10 @@ def has_rejected_visits(fit: Fit) -> bool:
     return bool(most_rejected.any())
 
 
-def spares_sightings(fit: Fit, other: Fit, explanation: str) -> bool:
+def spares_sightings(fit: Fit | None, other: Fit, explanation: str) -> bool:
     """Whether a Fit rejects less than MAX_STILL_REJECTED of the sightings that another rejects."""
+    if fit is None:
+        return False
     factor = min(fit.problem.noise.sightings, other.problem.noise.sightings)
     still = np.count_nonzero(contradicted(fit, factor))
     without = np.count_nonzero(contradicted(other, factor))
