@@ -1,21 +1,30 @@
-"""Time and memory of `slamlib solve`, beside a plain script, and by the length of a drive."""
+"""Time and memory of `slamlib solve`, beside a plain script, and by length, shape and density."""
 
 import json
+import math
 import os
+import resource
 import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from slamlib import estimate
 from slamlib.solve import PROBLEMS
 from slamlib.studies import simulation
 
 HERE, LONG = Path(__file__).parent, Path(__file__).parents[2] / "data" / "long"
 PAIRS = 5                    # runs of `solve` and of the plain script, in turn
 ROUNDS = (1, 4, 44)          # of the long path: 23,000, 92,000 and 1,012,000 rows
+ROWS = (1_000, 10_000, 100_000)
+# Legs of (metres, radians) that are driven again and again; None is the long path, a loop.
+SHAPES = {"loop": None, "corridor": [(100, 0)],
+          "building": [(9, 0), (0.8, np.pi / 2), (7, 0), (0.8, -np.pi / 2)]}
+SPACINGS = {"loop": (4.0, 1.9, 0.9), "corridor": (1.9,), "building": (1.9,)}     # m, of markers
 PLAIN = """
 import sys, time
 sys.path.insert(0, sys.argv[1])
@@ -59,8 +68,7 @@ def pairs(count=PAIRS):
         ratios.append(ours / theirs)
         print(f"{load:6.2f}{ours:12.2f}{theirs:12.2f}{ours / theirs:8.2f}", flush=True)
     print(f"median ratio {np.median(ratios):.2f}; of the last run: " + ", ".join(
-        f"{name} {seconds:.2f} s" for name, seconds in parts.items())
-        + " (problems 1 and 2 in a second process, where there is a second core)")
+        f"{name} {seconds:.2f} s" for name, seconds in parts.items()))
 
 
 def growth(folder):
@@ -78,14 +86,59 @@ def growth(folder):
               + f"{seconds:9.1f}{1e6 * seconds / rows:10.0f}{memory:7.0f}", flush=True)
 
 
+def drive(shape, rows, spacing):
+    """A simulated Dataset of a shape with this many rows, without ranges."""
+    simulation.PATHS["shape"] = replace(simulation.PATHS["long"], marker_spacing=spacing)
+    rounds = math.ceil(rows / simulation.PATHS["long"].poses)
+    if SHAPES[shape]:
+        once = simulation.manoeuvre(SHAPES[shape])[1:]
+        counts = np.tile(once, (math.ceil(rows / len(once)), 1))
+        right, left = 2 * np.pi * 0.1 / 8000 * counts.T
+        simulation._driven_arcs = lambda *_: ((right + left) / 2, (right - left) / 0.4)
+    dataset, _ = simulation.simulate("shape", seed=3, slip=3e-3, rounds=rounds)
+    return dataset.first(rows).without("uwb")
+
+
+def estimate_once(shape, rows, spacing):
+    """Print the seconds of problem 3, the peak memory in MB, and the number of markers."""
+    dataset = drive(shape, int(rows), float(spacing))
+    start = time.perf_counter()
+    result = estimate(dataset)
+    seconds = time.perf_counter() - start
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(seconds, memory, len(result.marker))
+
+
+def shapes():
+    """Print the cost of problem 3 by shape and density, with its exponent in the rows."""
+    print("\nProblem 3 by the shape of the drive and the spacing of the markers (m)")
+    print(f"{'shape':>10}{'spacing':>9}{'rows':>9}{'markers':>9}{'s':>9}{'MB':>7}{'exponent':>10}")
+    for shape in SHAPES:
+        for spacing in SPACINGS[shape]:
+            last = None
+            for rows in ROWS:
+                told = subprocess.run(
+                    [sys.executable, __file__, shape, str(rows), str(spacing)], check=True,
+                    capture_output=True, text=True).stdout
+                seconds, memory, markers = map(float, told.split())
+                exponent = f"{math.log10(seconds / last):.2f}" if last else "-"
+                print(f"{shape:>10}{spacing:9.1f}{rows:9,}{markers:9.0f}{seconds:9.2f}{memory:7.0f}"
+                      f"{exponent:>10}", flush=True)
+                last = seconds
+
+
 def main():
     print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.2f} before")
     if LONG.exists():
         pairs()
     with tempfile.TemporaryDirectory() as folder:
         growth(Path(folder))
+    shapes()
     print(f"load {os.getloadavg()[0]:.2f} after")
 
 
 if __name__ == "__main__":
-    main()
+    if sys.argv[1:]:
+        estimate_once(*sys.argv[1:])
+    else:
+        main()
