@@ -176,7 +176,7 @@ def literal_noise(ticks, vehicle, start, end, slip):
             effect = np.array([np.cos(middle[2]) / 2 - lever[1] * turn,
                                np.sin(middle[2]) / 2 + lever[0] * turn, turn])
             total += v * np.outer(effect, effect)
-        total += increments.MINIMUM_SLIP**2 * np.abs(travelled.mean()) * np.diag([1, 1, 0])
+        total += increments.MINIMUM_SKID**2 * np.abs(travelled.mean()) * np.diag([1, 1, 0])
     return se2.rotate_covariance(total, -poses[start, 2])
 
 

@@ -24,6 +24,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import quad
 
 from slamlib import estimate, studies
+from slamlib.core.errors import DatasetError
 from slamlib.core.evaluation import nees_band
 from slamlib.core.kernels import KERNELS, ONE_SIDED
 from slamlib.core.odometry import dead_reckoning
@@ -179,6 +180,14 @@ def test_monte_carlo_is_consistent(first, options, names):
     if "map nees" in names:
         assert runs["ate"].max() < 0.05 and runs["antenna error"].max() < 0.15
         assert runs["doubts"].sum() == 0
+
+
+def test_an_antenna_without_a_guess_is_told():
+    dataset, _ = short(1, 400)
+    guess = dataset.antenna_guess
+    fewer = replace(guess, antenna=guess.antenna[1:], position=guess.position[1:])
+    with pytest.raises(DatasetError, match=rf"a guess of each antenna.*\[{guess.antenna[0]}\]"):
+        estimate(replace(dataset, antenna_guess=fewer))
 
 
 @pytest.mark.slow

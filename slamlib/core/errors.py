@@ -6,7 +6,7 @@ class DatasetError(ValueError):
 
 
 def require(ok: bool, source: str, expected: str, found: object = None) -> None:
-    """Raise DatasetError about a source, a file with its line or an argument, unless it is `ok`."""
+    """Raise DatasetError unless `ok`; the `source` is a file with its line, or an argument."""
     if not ok:
         told = "" if found is None else f", found {quoted(found)}"
         raise DatasetError(f"{source}: expected {expected}{told}")

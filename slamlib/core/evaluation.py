@@ -10,7 +10,6 @@ follows Bar-Shalom, Li and Kirubarajan, *Estimation with Applications to Trackin
 import numpy as np
 
 from slamlib.core import se2
-from slamlib.core.se2 import correlations as correlations
 from slamlib.core.se2 import sigmas
 
 REACH_95 = float(np.sqrt(-2 * np.log(0.05)))    # sigmas, of the 95 % ellipse of a planar Gaussian

@@ -48,7 +48,7 @@ class Decisions:
     odometry: OdometryIncrements
     slip: float                          # sqrt(m), sigma of a wheel's slip after one metre
     sigma_heading: float                 # rad, of pose 1
-    root_wheel: np.ndarray               # (3, 3) m: its square is the wheels' prior covariance
+    root_wheel: np.ndarray               # (3, 3) m: root root^T is the wheels' prior covariance
     sightings: ArucoReadings             # those that count, in the vehicle, with their covariances
     ranges: UwbReadings                  # those that count, with their standard deviations
     guess: AntennaGuess | None
@@ -72,9 +72,9 @@ def count_everything(dataset: Dataset, kernel: str = "Cauchy", slip: float = TYP
     """The Decisions by which all measurements of a Dataset count as its files state them.
 
     `kernel` is a name in `kernels.KERNELS`, of sightings and ranges, `slip` is in sqrt(m), and
-    `extra` are further encoder poses that are variables. Of the calibration, camera, size of the
-    markers, offset and scale of the ranges are as stated; the tag is at the vehicle's origin.
-    Raises DatasetError for another kernel, slip or pose.
+    `extra` are further encoder poses that are variables. Camera, size of the markers, offset and
+    scale of the ranges are as stated; delays and the height of the antennas are ignored, and the
+    tag is at the vehicle's origin. Raises DatasetError for another kernel, slip or pose.
     """
     known = ", ".join(KERNELS)
     require(kernel in KERNELS, "count_everything", f"one of {known} for kernel", kernel)
@@ -148,9 +148,9 @@ def add_odometry(graph: gtsam.NonlinearFactorGraph, decisions: Decisions):
     second = poses[1:]
 
     def linearised(from_pose, to_pose, off):
-        poses = np.concatenate([from_pose, to_pose[-1:]])
+        there = np.concatenate([from_pose, to_pose[-1:]])
         e, by_poses, by_wheel = odometry_error(
-            increments, poses, increments.stated + root @ off[0])
+            increments, there, increments.stated + root @ off[0])
         return e, [by_poses[:, :, :3], by_poses[:, :, 3:], by_wheel @ root]
 
     batch = Batch([first, second, len(first) * [W(0)]], linearised)
@@ -183,14 +183,13 @@ def add_sightings(graph: gtsam.NonlinearFactorGraph, decisions: Decisions):
     """
     sightings = decisions.sightings
     kernel = symmetric(decisions.kernel)
-    points = set(decisions.points.tolist())
     in_axes_of_marker = se2.rotate_covariance(
         sightings.covariance, -sightings.marker_in_vehicle[:, 2])
     for k, z in enumerate(sightings.marker_in_vehicle):
-        pose = X(int(sightings.pose[k]))
+        pose = X(sightings.pose[k])
         share = decisions.sighting_share[k]
-        marker = int(sightings.marker[k])
-        if marker in points:
+        marker = sightings.marker[k]
+        if marker in decisions.points:
             bearing, distance, C = polar(z, sightings.covariance[k])
             noise = noise_model(C, kernel, share)
             graph.add(gtsam.BearingRangeFactor2D(
@@ -211,12 +210,12 @@ def polar(z: np.ndarray, C: np.ndarray) -> tuple[gtsam.Rot2, float, np.ndarray]:
 
 
 def add_ranges(graph: gtsam.NonlinearFactorGraph, decisions: Decisions):
-    """Add a factor for each range, which is compared with the bias of a one-sided kernel."""
+    """Add a factor for each range, less the bias of a one-sided kernel."""
     ranges = decisions.ranges
     kernel = decisions.kernel
     measured = ranges.range - ONE_SIDED.get(kernel, 0.0) * ranges.sigma
     for k, sigma in enumerate(ranges.sigma):
-        pose = X(int(ranges.pose[k]))
+        pose = X(ranges.pose[k])
         antenna = A(index_of(ranges.antenna[k]))
         noise = noise_model(np.array([[sigma**2]]), kernel, decisions.range_share[k])
         graph.add(gtsam.RangeFactor2D(pose, antenna, measured[k], noise))
@@ -238,7 +237,7 @@ def initial_values(dataset: Dataset, decisions: Decisions) -> gtsam.Values:
 
 def insert_markers(values: gtsam.Values, decisions: Decisions, poses: np.ndarray,
                    covariances: np.ndarray):
-    """Insert each marker where the consensus of its sightings is from poses (n, 3)."""
+    """Insert each marker at the consensus of its sightings, seen from poses (n, 3)."""
     sightings = decisions.sightings
     i = sightings.pose
     in_world, C = se2.compose_uncertain(

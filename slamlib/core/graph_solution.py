@@ -52,7 +52,7 @@ class GraphSolution:
     antenna_covariance: np.ndarray  # (a, 2, 2)
     steps: int                      # of Gauss-Newton
     error: float                    # half the sum of squared whitened errors, or kernels' losses
-    converged: bool                 # whether the error stopped falling, and no factor contradicts
+    converged: bool                 # whether it is a minimum, and no factor contradicts it
     contradiction: str              # a sentence on the factor that contradicts most, or ""
 
 
@@ -116,7 +116,7 @@ class GaussNewton:
     values: gtsam.Values
     error: float             # half the sum of squared whitened errors, or kernels' losses
     steps: int               # number of steps
-    converged: bool          # whether the error had stopped falling
+    converged: bool          # whether the error had stopped falling, at a minimum
     marginals: Marginals     # where the last step was linearised
 
 
@@ -266,7 +266,7 @@ def is_robust(factor: gtsam.NonlinearFactor) -> bool:
 
 
 def is_guess(factor: gtsam.NonlinearFactor) -> bool:
-    """Whether a factor is the prior of an antenna about its guess."""
+    """Whether a factor is a prior of an antenna's position, as that about its guess."""
     return isinstance(factor, gtsam.PriorFactorPoint2) and gtsam.symbolChr(
         factor.keys()[0]) == ord("a")
 

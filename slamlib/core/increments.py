@@ -25,7 +25,7 @@ from slamlib.core.records import Dataset
 from slamlib.core.vehicle import Vehicle
 
 SLIP_BOUNDS = (1e-5, 3e-2)  # sqrt(m), interval in which the slip is searched
-MINIMUM_SLIP = 1e-4         # sqrt(m), skid of an increment's end along either axis
+MINIMUM_SKID = 1e-4         # sqrt(m), skid of an increment's end along either axis
 MINIMUM_SIGMA = 1e-5        # m, standard deviation of an increment's end along x and y
 TYPICAL_SLIP = 1e-3         # sqrt(m), median of the prior
 SLIP_FACTOR = 3.0           # its logarithm is the standard deviation of the prior of log slip
@@ -46,11 +46,11 @@ def rounding_and_slipping(ticks: np.ndarray, vehicle: Vehicle, start: np.ndarray
     """Covariances of single increments by encoder rounding, and by a slip of 1 sqrt(m).
 
     Both are (m, 3, 3), of [x, y, heading] in the axes of pose `start`; no `end` may be before its
-    `start`. Rounding at both ends of an increment has a variance of one sixth of a squared count,
-    spread over its steps. Wheel errors e_R, e_L in the step at p along the unit vector u lengthen
-    the step by (e_R + e_L) / 2. They turn the later path by (e_R - e_L) / b, which moves its end
-    p_e by this angle times S (p_e - p), S = [[0, -1], [1, 0]]. The effect of a step is linear in
-    p_e, so one cumulative sum over the steps serves all increments.
+    `start`. Rounding counts one sixth of a squared count in every step: divided by the number of
+    steps, it is that of both ends. Wheel errors e_R, e_L in the step at p along the unit vector u
+    lengthen the step by (e_R + e_L) / 2. They turn the later path by (e_R - e_L) / b, which moves
+    its end p_e by this angle times S (p_e - p), S = [[0, -1], [1, 0]]. The effect of a step is
+    linear in p_e, so one cumulative sum over the steps serves all increments.
 
     The sum is over positions relative to the beginning of a block of steps. Relative to pose 1,
     its differences would lose all digits some ten kilometres away. A block is as long as the
@@ -75,15 +75,13 @@ def rounding_and_slipping(ticks: np.ndarray, vehicle: Vehicle, start: np.ndarray
         stop = np.clip(first + length, start, end)
         at_origin = total[stop] - total[begin]
         lever = poses[end] - poses[np.minimum(first, len(poses) - 1)]
-        to_end = se2.compose_jacobians(np.zeros(3), lever[:, None])[0]       # I + [0, 0, S lever]
+        to_end = se2.moved_by(lever[:, None])                        # I + [0, 0, S lever]
         return to_end @ at_origin @ to_end.mT
 
     first = start // length * length
     in_world = in_block(first) + in_block(first + length)
     in_start = se2.rotate_covariance(in_world, -poses[start, 2:])
-    count = np.maximum(end - start, 1)
-    rounding = in_start[:, 0] / count[:, None, None]
-    return rounding, in_start[:, 1]
+    return in_start[:, 0], in_start[:, 1]
 
 
 def _origin_by_wheel_errors(middle, wheelbase):
@@ -125,7 +123,7 @@ def noise_in_drive(ticks: np.ndarray, vehicle: Vehicle, start: np.ndarray,
     neglects the rounding at single poses, at most half a count.
 
     A single step has hardly any lateral noise. The end of an increment therefore also has a skid of
-    variance MINIMUM_SLIP^2 per metre along both axes. Shares and skid are proportional to the
+    variance MINIMUM_SKID^2 per metre along both axes. Shares and skid are proportional to the
     steps, so their sum does not depend on the choice of the poses.
 
     Parameters
@@ -138,12 +136,11 @@ def noise_in_drive(ticks: np.ndarray, vehicle: Vehicle, start: np.ndarray,
         `rounding`. The noise for a slip in sqrt(m) is rounding + slip^2 slipping.
     """
     rounding, slipping = rounding_and_slipping(ticks, vehicle, start, end)
-    share = np.subtract(end, start) / max(1, len(ticks) - 1)
+    steps = max(1, len(ticks) - 1)
     travelled = odometry.cumulative(np.abs(odometry.steps(ticks, vehicle).ds))
-    skid = MINIMUM_SLIP**2 * (travelled[end] - travelled[start])
+    skid = MINIMUM_SKID**2 * (travelled[end] - travelled[start])
     along_both_axes = np.diag([1, 1, 0])
-    rounding = share[:, None, None] * rounding + skid[:, None, None] * along_both_axes
-    return rounding, slipping
+    return rounding / steps + skid[:, None, None] * along_both_axes, slipping
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +155,7 @@ class OdometryIncrements:
     J_wheel: np.ndarray      # (f-1, 3, 3) dDelta/dwheel, per m
     rounding: np.ndarray     # (f-1, 3, 3) covariance without slip, in the axes of the end
     slipping: np.ndarray     # (f-1, 3, 3) covariance of slip 1 sqrt(m), in the same axes
-    in_counts: bool = True   # whether `odometry_error` scales them; the engine may set False
+    in_counts: bool = True   # whether `odometry_error` scales errors to the stated wheels
 
     def covariance(self, slip: float) -> np.ndarray:
         """Q (f-1, 3, 3) for a slip in sqrt(m)."""
@@ -168,7 +165,7 @@ class OdometryIncrements:
 def preintegrate(dataset: Dataset, frame: np.ndarray, model: str = "arc",
                  wheel: np.ndarray | None = None,
                  noise: tuple[np.ndarray, np.ndarray] | None = None) -> OdometryIncrements:
-    """The OdometryIncrements between frames (f,), linearised at `wheel` (3,) m, None if stated.
+    """The OdometryIncrements between frames (f,), linearised at `wheel` (3,) m, None for stated.
 
     `model` is "arc" or "euler". `noise` is that of `odometry_noise`, where it is known already: it
     depends on frames and stated wheels only.

@@ -19,7 +19,7 @@ CAUCHY_ITERATIONS = 8         # Gauss-Newton iterations with Cauchy weights, at 
 GATE_ITERATIONS = 6           # iterations after these, with the sightings within GATE, at most
 INCREMENT_STEP_TOLERANCE = 1e-10  # m and rad; iterations end after a smaller step
 SPEED_RATIO = 3.0             # ratio of the largest plausible speed to the usual speed
-POINT_PAIRS = 60              # pairs of points that give hypotheses, of every pair of frames
+POINT_PAIRS = 60              # pairs of points, about, that give hypotheses, of each pair of frames
 MIN_TURN_RATE = 1e-3          # rad per encoder step; smaller differences of turn rates are ignored
 MIN_GAP = 5.0                 # m, driven between two sightings of the markers of a return
 MAX_RETURN_FRAMES = 400       # frames, evenly chosen, among which returns are sought
@@ -106,7 +106,8 @@ def consecutive_increments(sightings: Sightings) -> MarkerIncrements:
 def _differs_from_neighbours(velocity):
     """True (n,) where a velocity (n, 3) differs from the previous and from the next one.
 
-    Two velocities differ if their difference is at least half as large as the larger one.
+    Two velocities are alike if distance and turn each differ by less than half the larger one, and
+    the turn by MIN_TURN_RATE more.
     """
     speed = distance_and_turn(velocity)
     larger = np.maximum(speed[:-1], speed[1:])
@@ -193,7 +194,7 @@ def _best_hypothesis(common):
     """The hypothesis with the smallest Cauchy cost for every pair, (l, 3).
 
     Hypotheses are no motion, the increment from each marker with a heading, and, in pairs without
-    such a marker, the increment from two positions, of which at most POINT_PAIRS are tried. All
+    such a marker, the increment from two positions, of which about POINT_PAIRS are tried. All
     pairs try their first hypothesis at once, then their second, and so on.
     """
     pair, hypothesis = _hypotheses(common)
@@ -223,7 +224,7 @@ def _hypotheses(common):
 
 
 def _two_of_each(pair, chosen):
-    """Rows (2, h) of two sightings of a `chosen` pair, POINT_PAIRS of each pair at most."""
+    """Rows (2, h) of two sightings of a `chosen` pair, about POINT_PAIRS of each pair."""
     rows = [np.zeros((2, 0), int)]
     for k in chosen:
         own = np.flatnonzero(pair == k)
@@ -235,14 +236,13 @@ def _two_of_each(pair, chosen):
 
 def _increment_of_two_points(p1, q1, p2, q2):
     """Delta from the positions (n, 2) of two markers: direction p to q and midpoint coincide."""
-    turn = _direction(p1, q1) - _direction(p2, q2)
+    turn = _direction(q1 - p1) - _direction(q2 - p2)
     turned = np.einsum("nij,nj->ni", se2.rotation(turn), (p2 + q2) / 2)
     return np.column_stack([(p1 + q1) / 2 - turned, turn])
 
 
-def _direction(p, q):
-    """Angles (n,) of the directions from points p to q (n, 2)."""
-    d = q - p
+def _direction(d):
+    """Angles (n,) of vectors d (n, 2)."""
     return np.arctan2(d[:, 1], d[:, 0])
 
 
@@ -276,7 +276,7 @@ class Returns:
 def returns(dataset: Dataset) -> Returns:
     """The Returns of a Dataset after at least MIN_GAP of driving; none without markers.
 
-    They show the error of every method without loop closures, without truth. Errors of returns are
+    They show the drift of methods that close no loops, and need no truth. Errors of returns are
     correlated: they share sections of odometry, and sightings.
     """
     s = sightings_by_frame(dataset.sightings)
@@ -284,8 +284,8 @@ def returns(dataset: Dataset) -> Returns:
     frame = s.frame[::every]
     sighting = s.table()[::every]
     seen = sighting >= 0
-    ds = odometry.steps(dataset.ticks, dataset.vehicle)[0]
-    travelled = odometry.cumulative(np.abs(ds))
+    steps = odometry.steps(dataset.ticks, dataset.vehicle)
+    travelled = odometry.cumulative(np.abs(steps.ds))
     earlier, later = _returning(seen, travelled[frame])
     pair, marker = np.nonzero(seen[earlier] & seen[later])
     found = robust_increments(s.z, s.C, pair, sighting[earlier[pair], marker],

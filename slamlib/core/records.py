@@ -27,8 +27,8 @@ class ArucoReadings(_Readings):
 
     pose: np.ndarray                 # (m,) int64, row of `Dataset.ticks`
     marker: np.ndarray               # (m,) int64, marker id
-    marker_in_vehicle: np.ndarray    # (m, 3) [x, y, heading]; of a file in the camera's axes, which
-                                     # are the vehicle's unless its place is stated (`sightings`)
+    marker_in_vehicle: np.ndarray    # (m, 3) [x, y, heading]; of a file in the camera's axes, the
+                                     # vehicle's unless the camera's place is stated (`sightings`)
     covariance: np.ndarray           # (m, 3, 3) of [x, y, heading] in the same axes
 
 
@@ -63,7 +63,7 @@ class Dataset:
 
     name: str                        # of the folder
     vehicle: Vehicle
-    ticks: np.ndarray                # (n, 2) int64 [right, left], counts to each pose; row 0 is 0
+    ticks: np.ndarray                # (n, 2) int64 [right, left], in the step to each; row 0 is 0
     aruco: ArucoReadings | None
     uwb: UwbReadings | None
     antenna_guess: AntennaGuess | None
@@ -86,7 +86,7 @@ class Dataset:
 
     @property
     def ranges(self) -> UwbReadings | None:
-        """The UwbReadings, or None, without the stated offset and scale."""
+        """The UwbReadings corrected for the stated offset and scale, or None."""
         if self.uwb is None:
             return None
         v = self.vehicle

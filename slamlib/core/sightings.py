@@ -12,7 +12,6 @@ import numpy as np
 
 from slamlib.core import se2
 from slamlib.core.records import NO_SIGHTINGS, ArucoReadings
-from slamlib.core.se2 import correlations, sigmas
 
 GATE = 16.26623619623813         # dimensionless, for residuals of [x, y, heading]
 POINT_GATE = 13.815510557964274  # dimensionless, for residuals of [x, y]
@@ -59,11 +58,11 @@ def regularized(covariance: np.ndarray) -> np.ndarray:
     """Covariances (m, 3, 3), increased where float64 could not invert or add their information.
 
     Where the standard deviation of x, y or heading, given the other two, is below
-    MIN_MEASUREMENT_SIGMA, as of fully correlated coordinates, the variance is increased by its
-    square. For x and y the bound is at least MIN_SIGMA_RATIO of the larger standard deviation.
+    MIN_MEASUREMENT_SIGMA, as of nearly fully correlated coordinates, the variance is increased by
+    its square. For x and y the bound is at least MIN_SIGMA_RATIO of the larger standard deviation.
     """
-    sigma = sigmas(covariance)
-    information = np.linalg.inv(correlations(covariance))
+    sigma = se2.sigmas(covariance)
+    information = np.linalg.inv(se2.correlations(covariance))
     conditional_variance = sigma**2 / np.diagonal(information, axis1=1, axis2=2)
     larger = sigma[:, :2].max(axis=1, keepdims=True)
     bound = np.full_like(sigma, MIN_MEASUREMENT_SIGMA)
@@ -107,11 +106,11 @@ def consensus(marker: np.ndarray, in_world: np.ndarray, covariance: np.ndarray,
               maximum: int = 200) -> np.ndarray:
     """Rows (k,) of one sighting of each marker, well supported and certain, in ascending id.
 
-    The support of a sighting is the number of sightings of its marker within GATE of it. Of those
-    with at least half the maximum support, the most certain one has the smallest determinant of its
-    covariance. `marker` (s,) are ids, `in_world` (s, 3), m and rad, and `covariance` (s, 3, 3) the
-    poses of these markers in world axes by each sighting. Of a marker with more than `maximum`
-    sightings, so many evenly chosen ones are compared: the cost is quadratic.
+    The support of a sighting is the number of sightings of its marker within GATE of it. Among
+    those with at least half the maximum support, the one with the smallest determinant of its
+    covariance is taken. `marker` (s,) are ids, `in_world` (s, 3), m and rad, and `covariance`
+    (s, 3, 3) the poses of these markers in world axes by each sighting. Of a marker with more than
+    `maximum` sightings, so many evenly chosen ones are compared: the cost is quadratic.
     """
     order = np.argsort(marker, kind="stable")
     begins = np.flatnonzero(np.diff(marker[order])) + 1
@@ -127,8 +126,7 @@ def consensus(marker: np.ndarray, in_world: np.ndarray, covariance: np.ndarray,
 def _evenly(rows, maximum):
     """Of rows (n,), `maximum` evenly chosen ones if there are more."""
     few = min(len(rows), maximum)
-    number = np.arange(len(rows)) * few // len(rows)
-    return rows[np.diff(number, prepend=-1) > 0]
+    return rows[-(-np.arange(few) * len(rows) // few)]                # rounded up
 
 
 def _supported_and_certain(in_world, covariance):

@@ -102,11 +102,10 @@ class Calibration:
             root[RADII, RADII] = np.linalg.cholesky(covariance)
         return Prior(groups=frozenset(groups), width=width, root=root)
 
-    def taken_from(
-            self, other: "Calibration", values: np.ndarray, default: np.ndarray) -> np.ndarray:
-        """Values (p,): another drive's Calibration's where it has the entry, or `default`."""
+    def taken_from(self, other: "Calibration", values: np.ndarray) -> np.ndarray:
+        """Values (p,) of another drive's Calibration where it has the entry, else as stated."""
         known = dict(zip(other.names, values))
-        return np.array([known.get(name, value) for name, value in zip(self.names, default)])
+        return np.array([known.get(name, value) for name, value in zip(self.names, self.stated)])
 
 
 @dataclass(frozen=True)

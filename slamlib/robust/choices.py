@@ -10,8 +10,8 @@ wide sigmas. For a prior of precisions P on the entries that are not known, the 
     h^T (L + P)^-1 h / 2 - log|L + P| / 2 + log|P| / 2,
 
 so that one linearisation ranks all sets of groups (score tests: Rao, Proc. Camb. Phil. Soc. 44(1),
-1948). What leads decisively is told; what leads at all is solved as well, and the covariances
-include it, if its evidence still leads on the same measurements with the same weights.
+1948). A group that leads decisively is told. One that leads less is released, too, so that the
+covariances include it, if its evidence still leads on the same measurements and weights.
 
 A visit is a run of sightings of an id without a long break. Where a solution rejects most sightings
 of a visit, the drive is solved once more with a landmark for every visit, so that only the path
@@ -55,9 +55,9 @@ STATED = 3.0                 # log evidence beside it, if standard deviations ar
 AMBIGUOUS = 3.0              # log evidence within which explanations cannot be told apart
 MAX_GROUPS = 5               # number of groups that are wrong at once
 MAX_WIDE_SIGMAS = 4.0        # wide sigmas, of an entry; beyond them a statement is grossly wrong
-MAX_UNTOLD = 1.5             # wide sigmas, by which an entry is off that is released untold,
-MAX_UNTOLD_SIGMA = 0.5       # unless its standard deviation is so small
-GROSS = 10.0                 # factor on the wide sigmas then
+MAX_UNTOLD = 1.5             # wide sigmas; an entry further off is not released untold,
+MAX_UNTOLD_SIGMA = 0.5       # wide sigmas; unless its standard deviation is below this
+GROSS = 10.0                 # factor on the wide sigmas beyond MAX_WIDE_SIGMAS
 MIN_INFORMATION = 1e-3       # about an entry, in wide sigmas, below which it is not considered
 MAX_PROPOSALS = 5            # number of sets that are solved
 MIN_JUMP_LEAD = 10.0         # log evidence by which a jump found at the solution is believed
@@ -74,7 +74,7 @@ MIN_SIGMA = 0.02             # m or rad, of the path between two visits
 
 
 def memory_or_slip(problem: Problem, state: State) -> Fit:
-    """The Fit of a Problem, near its solution, in which slow errors are memory or else slip.
+    """The Fit of a Problem, near its solution, that explains slow errors by memory, or by slip.
 
     Slow errors of sensors bend the path as a large slip does. A small slip is more probable, so
     memory is sought first, unless measurements then contradict the path even if their standard
@@ -349,10 +349,10 @@ def most_consistent(
     stretches odometry beyond the slip that it learned, most of all over a way without markers, one
     more jump is believed if the evidence leads decisively.
     """
-    def alternative(*change, **places):
+    def alternative(jumps=NO_JUMPS, places=None):
         """The Fit with the decisions of the present one, or None if it has no solution."""
         try:
-            return start(*change, **places, like=fit)
+            return start(jumps, places, fit)
         except (DatasetError, np.linalg.LinAlgError):
             return None
 
@@ -362,7 +362,8 @@ def most_consistent(
     fit = decide(start(jumps if jumps.are_few else no_jumps))
     if jumps.are_few:
         without = alternative(no_jumps)
-        fit = without if _are_needless(fit, without) else fit
+        if _are_needless(fit, without):
+            fit = without
     elif found and spares_sightings(alternative(jumps), fit, "jumps"):
         fit = decide(start(jumps))
     log.info("jumps: %d of %d are believed", len(fit.problem.measurements.jumps.start), found)
@@ -387,7 +388,7 @@ def _lead_of_jumps(fit, other):
 
 
 def _are_needless(fit, without):
-    """Whether the jumps of a Fit, told by markers, explain no more than one without them."""
+    """Whether the jumps of a Fit, told by markers, explain no more than a Fit without them."""
     are_unknown = (fit.problem.measurements.jumps.sigma >= UNKNOWN_SIGMA).any()
     if without is None or are_unknown:
         return False
@@ -406,9 +407,8 @@ def with_stretched(fit: Fit) -> Jumps | None:
         return None
     odometry = fit.problem.odometry
     poses = fit.state.poses
-    e, *_ = odometry_error(odometry, poses, fit.state.c[WHEELS])
-    information = np.linalg.inv(odometry.covariance(fit.problem.noise.slip))
-    squared = np.einsum("ni,nij,nj->n", e, information, e)
+    e = odometry_error(odometry, poses, fit.state.c[WHEELS])[0]
+    squared = se2.squared_norms(e, odometry.covariance(fit.problem.noise.slip))
     k = int(squared.argmax())
     if squared[k] > GATE:
         return m.jumps.joined_by(
@@ -465,7 +465,10 @@ def spares_sightings(fit: Fit | None, other: Fit, explanation: str) -> bool:
 
 
 def places_of_ids(aruco: ArucoReadings, start: Callable[..., Fit]) -> np.ndarray | None:
-    """`SlamResult.places` of ArucoReadings, None if each id is one place; `start` as above."""
+    """`SlamResult.places` of ArucoReadings, None if each id is one place.
+
+    `start` makes the Fit of given places.
+    """
     marker = aruco.marker
     number = visits(aruco)
     try:

@@ -76,7 +76,7 @@ def accepted_measurements(
 def _unless(rejected, kernel, bias=0.0):
     """The Accepted of measurements that count in full unless `rejected` (m,)."""
     ones = np.ones(len(rejected))
-    return Accepted(np.where(rejected, 0.0, ones), ones, kernel, bias)
+    return Accepted(ones - rejected, ones, kernel, bias)
 
 
 def residuals(problem: Problem, state: State) -> tuple[np.ndarray, np.ndarray]:
@@ -275,7 +275,8 @@ def _settle_noise(problem, state):
 def settled(fit: Fit) -> Fit:
     """The Fit with odometry linearised at its own wheels, for the same measurements and noise.
 
-    Rounds that end by their number leave it elsewhere, where the increments have other scales.
+    Rounds that end after MAX_ROUNDS leave it linearised elsewhere, where increments have other
+    scales.
     """
     for _ in range(MAX_ROUNDS):
         if _wheel_move(fit.problem, fit.state) < SETTLED_MOVE:

@@ -99,8 +99,7 @@ def odometry_state(measurements: Measurements, model: str, part: Measurements | 
     new = frame[frame > last] - last
     poses = np.concatenate([solved.poses[old], later[new]])
     covariances = np.concatenate([np.zeros((len(old), 3, 3)), growth[new]])
-    calibration = measurements.calibration
-    c = calibration.taken_from(part.calibration, solved.c, calibration.stated)
+    c = measurements.calibration.taken_from(part.calibration, solved.c)
     poses = jumps.mended(frame, poses, last)
     return state_from_poses(measurements, poses, covariances, c, **landmarks)
 

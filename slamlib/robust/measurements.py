@@ -22,7 +22,7 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 
 from slamlib.core import odometry, se2
-from slamlib.core.graph import ORIGIN_SIGMA
+from slamlib.core.graph import ORIGIN_SIGMA, guessed
 from slamlib.core.increments import SLIP_BOUNDS, TYPICAL_SLIP, odometry_noise
 from slamlib.core.records import NO_RANGES, Dataset
 from slamlib.core.sightings import (
@@ -208,7 +208,7 @@ def measure(dataset: Dataset, extra_poses: Sequence[int] = (),
     """The Measurements of a Dataset.
 
     `extra_poses`, encoder poses from 0, are frames without a measurement. `jumps` are those of
-    odometry.
+    odometry. Raises DatasetError for an antenna with ranges but without a guess.
     """
     uwb = dataset.uwb or NO_RANGES
     ends = [0, len(dataset.ticks) - 1]
@@ -216,10 +216,7 @@ def measure(dataset: Dataset, extra_poses: Sequence[int] = (),
     marker, marker_row = np.unique(sightings.marker, return_inverse=True)
     has_heading = sightings.C[:, 2, 2] < MAX_HEADING_SIGMA**2
     antenna = np.unique(uwb.antenna)
-    guess = np.zeros((0, 2))
-    if len(antenna):
-        guesses = dataset.antenna_guess
-        guess = guesses.position[np.searchsorted(guesses.antenna, antenna)]
+    guess = guessed(dataset.antenna_guess, antenna)
     ranges = Ranges(
         row=np.searchsorted(sightings.frame, uwb.pose),
         antenna=np.searchsorted(antenna, uwb.antenna),
@@ -235,7 +232,7 @@ def measure(dataset: Dataset, extra_poses: Sequence[int] = (),
         oriented=np.bincount(marker_row, has_heading, len(marker)) > 0,
         ranges=ranges,
         antenna=antenna,
-        guess=guess,
+        guess=np.reshape(list(guess.values()), (-1, 2)),
         calibration=stated_calibration(with_cut_counts(dataset), antenna),
         jumps=jumps)
 

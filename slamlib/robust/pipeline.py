@@ -57,8 +57,9 @@ def estimate(dataset: Dataset, slip: float | None = None, model: str | None = No
 
     Raises
     ------
-    DatasetError : the measurements do not determine every pose and landmark, or an option has no
-        such name, or is not within the limits of vehicle.toml.
+    DatasetError : the measurements do not determine every pose and landmark; an option has no such
+        name, or is not within the limits of vehicle.toml; `dataset` is no Dataset, `previous` of
+        another drive, or `poses` are not rows.
     numpy.linalg.LinAlgError : a covariance is singular to rounding.
 
     >>> from slamlib.studies.simulation import simulate
@@ -82,14 +83,12 @@ def estimate(dataset: Dataset, slip: float | None = None, model: str | None = No
         if places is not None:
             aruco = replace(aruco, marker=places[:, 1])
         measurements = measure(replace(dataset, aruco=aruco), poses, jumps)           # 1
-        if previous is not None:
+        if previous is not None and like is None:
             return fit_from_previous(measurements, previous, model)
         return fit_from_odometry(measurements, model or "arc", like)                  # 2 to 6
 
     def decide(fit):                                                                  # 6
-        if previous is not None:
-            return calibrated(fit)
-        if model is not None:
+        if previous is not None or model is not None:
             return calibrated(fit)
         fit = calibrated(better_model(fit))
         # Wrong statements may look like other steps, and these like other statements.
@@ -146,12 +145,11 @@ def fit_from_previous(measurements: Measurements, previous: SlamResult,
                       model: str | None = None) -> Fit:
     """The Fit of Measurements from a SlamResult, with another `model` if not None."""
     m = measurements
-    before = previous.calibration
     problem = build_problem(m, model or previous.model, Noise(previous.slip), previous.wheel)
     decided = previous.fit.problem
     prior = m.calibration.prior(decided.prior.groups, decided.prior.width)
     problem = replace(problem, prior=prior, memory_first=decided.memory_first)
-    c = m.calibration.taken_from(before, previous.c, m.calibration.stated)
+    c = m.calibration.taken_from(previous.calibration, previous.c)
     state = state_from_poses(m, previous.poses[m.frame], previous.covariances[m.frame], c)
     state = narrow_kernels(problem, state, CAUCHY_SCALES[-1:])
     return replace(refine(problem, state), explanations=previous.explanations,
