@@ -169,14 +169,15 @@ def require_values(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values):
                            f"{name}")
 
 
-def gauss_newton(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> GaussNewton:
+def gauss_newton(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values,
+                 max_steps: int = MAX_STEPS) -> GaussNewton:
     """The end of Gauss-Newton on a graph from initial values.
 
     Raises DatasetError, which names a variable, if the factors do not determine every one.
     """
     values = FixedValues(values)
     error = graph.error(values)
-    for steps in range(1, MAX_STEPS + 1):
+    for steps in range(1, max_steps + 1):
         linear = graph.linearize(values)
         tree, step = eliminated(linear)
         moved, new = after_step(graph, values, step, error)
@@ -188,7 +189,7 @@ def gauss_newton(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> Gau
             return GaussNewton(gtsam.Values(moved), new, steps, not stuck, Marginals(tree))
         values = moved
         error = new
-    return GaussNewton(gtsam.Values(values), error, MAX_STEPS, False, Marginals(tree))
+    return GaussNewton(gtsam.Values(values), error, max_steps, False, Marginals(tree))
 
 
 def after_step(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, step: gtsam.VectorValues,

@@ -3,8 +3,8 @@
 `decisions_of` states what the Fit of the deciding engine found, and `core.graph` builds the graph
 of it. Sightings are custom factors where entries of their calibration are unknown; these entries
 are the variable S(0), in standard deviations from what is stated. Those of the ranges are R(0).
-Gauss-Newton starts from problem 1's odometry. Where it does not converge from there, or ends at a
-larger error than that of the engine's solution, it starts again from this solution.
+Gauss-Newton starts from problem 1's odometry. Where it does not converge from there in a few steps,
+or ends at a larger error than that of the engine's solution, it starts again from this solution.
 
 With probability p_k of point k of the noise's posterior, x_k its solution and C_k its covariance,
 poses and landmarks have the moments (equation 3.8)
@@ -54,6 +54,7 @@ from slamlib.robust.initialization import odometry_state
 from slamlib.robust.linear import Problem, State, state_from_arrays
 from slamlib.robust.measurements import Noise
 
+ODOMETRY_STEPS = 8               # number of steps from odometry; on a long drive each is dear
 SAME_ERROR = 10 * CONVERGED      # relative difference of errors of one minimum
 FROM_ODOMETRY = "odometry"
 FROM_ENGINE = "the deciding engine's solution"
@@ -300,7 +301,7 @@ def solve_by_gtsam(fit: Fit) -> GtsamSolution:
     graph = graph_of(problem, solved_noise(fit))
     decided = values_of(problem, fit.state, graph)
     odometry = odometry_state(problem.measurements, problem.odometry.model)
-    found = gauss_newton(graph, values_of(problem, odometry, graph))
+    found = gauss_newton(graph, values_of(problem, odometry, graph), ODOMETRY_STEPS)
     start = FROM_ODOMETRY
     limit = graph.error(decided)
     if not found.converged or found.error > limit + SAME_ERROR * (1 + limit):
