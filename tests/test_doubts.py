@@ -7,13 +7,15 @@ from functools import cache
 import numpy as np
 import pytest
 from numeric import aruco, errors_of, short, uwb, vehicle, without_headings
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
+from slamlib import estimate, fuse
+from slamlib.core.evaluation import ate
 from slamlib.core.odometry import dead_reckoning
 from slamlib.core.records import AntennaGuess, Dataset, UwbReadings
 from slamlib.core.vehicle import Vehicle
 from slamlib.robust import file_doubts as files
-from slamlib.robust.file_doubts import doubts_before_solving
+from slamlib.robust.file_doubts import doubts_before_solving, with_wheels_mended
 from slamlib.studies.simulation import manoeuvre, simulate
 
 drive = cache(short)
@@ -104,16 +106,45 @@ def test_a_flaw_is_named(flaw, options):
 
 
 @pytest.mark.parametrize("matrix, what", [
-    (SWAPPED, "wheels-swapped"), (BACKWARDS, "wheels-reversed")])
-def test_wheels_that_are_wrong_for_a_third_of_the_drive_are_doubted_there(matrix, what):
+    (SWAPPED, "wheels-swapped"), (REVERSED, "wheels-reversed"), (BACKWARDS, "wheels-reversed")])
+@pytest.mark.parametrize("begin, end", [(0, 600), (700, 1300), (1650, 2000)])
+def test_wheels_that_are_wrong_for_a_part_of_the_drive_are_doubted_there_and_mended(
+        matrix, what, begin, end):
     clean, _ = drive(3)
-    third = slice(700, 1300)
     ticks = clean.ticks.copy()
-    ticks[third] = ticks[third] @ matrix
-    doubt, = doubts_before_solving(replace(clean, ticks=ticks))
+    ticks[begin:end] = ticks[begin:end] @ matrix
+    spoilt = replace(clean, ticks=ticks)
+    doubt, = doubts_before_solving(spoilt)
     assert doubt.what == what
+    assert "use the counts changed so" in doubt.sentence
     first, last = map(int, re.search(r"poses (\d+) and (\d+)", doubt.sentence).groups())
-    assert_allclose([first, last], [third.start, third.stop], atol=100)       # of 1 m
+    assert_allclose([first, last], [begin, end], atol=100)       # of 1 m
+    assert_allclose(path(with_wheels_mended(spoilt)), path(clean), atol=0.1)
+    assert ate(path(spoilt), path(clean)) > 0.3
+
+
+def path(dataset):
+    return dead_reckoning(dataset.ticks, dataset.vehicle)[:, :2]
+
+
+def test_problems_2_and_3_use_mended_counts():
+    clean, truth = drive(3)
+    ticks = clean.ticks.copy()
+    ticks[700:1300] = ticks[700:1300] @ SWAPPED
+    spoilt = replace(clean, ticks=ticks)
+    for solve in (fuse, estimate):
+        error = ate(solve(spoilt).poses, truth.poses)
+        assert error < 1.2 * ate(solve(clean).poses, truth.poses) + 1e-3
+
+
+def test_wheels_that_are_wrong_for_most_of_the_drive_are_doubted_and_left():
+    clean, _ = drive(3)
+    ticks = clean.ticks.copy()
+    ticks[300:] = ticks[300:] @ SWAPPED
+    doubt, = doubts_before_solving(replace(clean, ticks=ticks))
+    assert doubt.what == "wheels-swapped"
+    assert "use the counts" not in doubt.sentence
+    assert_array_equal(with_wheels_mended(replace(clean, ticks=ticks)).ticks, ticks)
 
 
 # Drives with nothing to doubt: functions of a simulated drive and a random generator.

@@ -42,6 +42,7 @@ from slamlib.core.increments import SLIP_BOUNDS, SLIP_FACTOR, TYPICAL_SLIP
 from slamlib.core.records import Dataset
 from slamlib.core.sightings import GATE, sightings_by_frame
 from slamlib.robust.calibration import stated_calibration
+from slamlib.robust.file_doubts import with_wheels_mended
 from slamlib.robust.jumps import NO_JUMPS, crawls, creep_covariance, find_jumps
 
 SLIPS = TYPICAL_SLIP * SLIP_FACTOR ** np.arange(-1.0, 4.0)     # sqrt(m), of the first filters
@@ -128,6 +129,7 @@ def fuse(dataset: Dataset, slip: float | None = None) -> Fusion:
     (2000, 3)
     """
     require(isinstance(dataset, Dataset), "fuse", "a Dataset", dataset)
+    dataset = with_wheels_mended(dataset)
     if slip is None:
         slip = dataset.vehicle.slip
     jumps = _believed_jumps(dataset, slip or TYPICAL_SLIP)

@@ -17,6 +17,7 @@ from slamlib.core.odometry import MODELS
 from slamlib.core.records import Dataset
 from slamlib.core.vehicle import changed
 from slamlib.robust.choices import better_model, calibrated, memory_or_slip, most_consistent
+from slamlib.robust.file_doubts import with_wheels_mended
 from slamlib.robust.fit import CAUCHY_SCALES, Fit, narrow_kernels, refine, settled
 from slamlib.robust.initialization import initial_state, state_from_poses, with_consensus
 from slamlib.robust.jumps import NO_JUMPS
@@ -71,6 +72,7 @@ def estimate(dataset: Dataset, slip: float | None = None, model: str | None = No
     started = time.perf_counter()
     require(isinstance(dataset, Dataset), "estimate", "a Dataset", dataset)
     require_rows(dataset, poses, "estimate")
+    dataset = with_wheels_mended(dataset)
     require_same_drive(dataset, previous)
     require(model in (None, *MODELS), "estimate", f"{' or '.join(MODELS)} for model", model)
     options = {"slip": slip, "marker_noise_factor": marker_noise_factor,
