@@ -15,7 +15,8 @@ from slamlib.core.odometry import dead_reckoning
 from slamlib.core.records import AntennaGuess, Dataset, UwbReadings
 from slamlib.core.vehicle import Vehicle
 from slamlib.robust import file_doubts as files
-from slamlib.robust.file_doubts import doubts_before_solving, with_wheels_mended
+from slamlib.robust.file_doubts import doubts_before_solving
+from slamlib.robust.part_faults import with_wheels_mended
 from slamlib.studies.simulation import manoeuvre, simulate
 
 drive = cache(short)

@@ -80,8 +80,13 @@ def range_derivatives(z, pose, place, c, motion, velocity):
 
 
 def sighting_derivatives(z, pose, place, c, motion, velocity):
-    """Errors (50, 3) of sightings, every second one of a point, and their derivatives."""
-    return factors.sighting_error(z, pose, motion, velocity, place, c, np.arange(50) % 2 == 0)
+    """Errors (50, 3) of sightings, every second one of a point, and their derivatives.
+
+    The later half is by a camera that was moved.
+    """
+    number = np.arange(50)
+    return factors.sighting_error(
+        z, pose, motion, velocity, place, c, number % 2 == 0, number >= 25)
 
 
 @pytest.mark.parametrize("error, kind, size", [

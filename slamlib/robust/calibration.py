@@ -2,14 +2,15 @@
 
 ENTRIES is its table: for each entry the name, which is also that in `vehicle.toml`, the unit, the
 group with which it leaves its stated value, and the wide standard deviation that it has then. An
-entry whose stated standard deviation is 0 is known unless its group leaves its stated values. After
+entry whose stated standard deviation is 0 is known unless its group leaves its stated values. The
+bump is how far something moved the camera during the drive; it counts from that moment on. After
 ENTRIES the vector has an offset for each antenna. The group WHEEL_SCALE has no entry of its own:
 one factor on both radii (load, pressure, counts lost or doubled), which correlates them. With the
 pose X of the vehicle and its motion D(lag) during the last `lag` encoder steps, D = X^-1 X(lag
 steps earlier), the measurements are
 
     increment   Delta(right_radius, left_radius, wheelbase)
-    sighting    Y^-1 L,   positions over marker_size,   Y = X D(sighting_lag) camera
+    sighting    Y^-1 L,   positions over marker_size,   Y = X D(sighting_lag) (camera + bump)
     range       range_offset + offset of the antenna
                 + range_scale sqrt(|A - t|^2 + antenna_height^2),   t = X D(range_lag) tag
 
@@ -47,6 +48,9 @@ ENTRIES = (
     Entry("camera_turn", "rad", "camera-offset", 0.2),
     Entry("marker_size", "", "marker-size", 0.05),
     Entry("sighting_lag", "poses", "time-offset", 10.0),
+    Entry("bump_x", "m", "camera-bump", 0.2),
+    Entry("bump_y", "m", "camera-bump", 0.2),
+    Entry("bump_turn", "rad", "camera-bump", 0.2),
     Entry("tag_x", "m", "tag-offset", 0.3),
     Entry("tag_y", "m", "tag-offset", 0.3),
     Entry("antenna_height", "m", "antenna-height", 2.5),
@@ -60,19 +64,20 @@ WIDE_SCALE = 0.05            # relative, of both radii together
 # Columns of the vector by kind of measurement, then by entry.
 WHEELS = slice(0, 3)
 RADII = slice(0, 2)
-SIGHTINGS = slice(3, 8)
-RANGES = slice(8, None)
+SIGHTINGS = slice(3, 11)
+RANGES = slice(11, None)
 
-CAMERA = slice(3, 6)         # of sightings, with the next two
+CAMERA = slice(3, 6)         # of sightings, with the next three
 SIZE = 6                     # of marker_size, in `factors.sighting_error`
 SIGHTING_LAG = 7
+BUMP = slice(8, 11)          # added to CAMERA from `Jumps.bump` on
 
-TAG_PLACE = slice(8, 10)     # of ranges, with all that follow
-HEIGHT = 10
-OFFSET = 11
-SCALE = 12
-RANGE_LAG = 13
-ANTENNAS = slice(14, None)
+TAG_PLACE = slice(11, 13)    # of ranges, with all that follow
+HEIGHT = 13
+OFFSET = 14
+SCALE = 15
+RANGE_LAG = 16
+ANTENNAS = slice(17, None)
 
 
 @dataclass(frozen=True)
@@ -177,11 +182,12 @@ def _with_height(values, sigma):
 def stated_calibration(vehicle: Vehicle, antennas: Sequence[int]) -> Calibration:
     """The Calibration that a Vehicle states, for `antennas` (a,), ids."""
     entries = _entries(len(antennas))
-    stated = np.zeros(len(entries))                   # offsets of antennas are 0, and known
+    stated = np.zeros(len(entries))         # offsets of antennas, and a bump, are 0, and known
     sigma = np.zeros(len(entries))
     for k, entry in enumerate(ENTRIES):
-        stated[k] = getattr(vehicle, entry.name)
-        sigma[k] = getattr(vehicle, f"sigma_{entry.name}")
+        if entry.group != "camera-bump":
+            stated[k] = getattr(vehicle, entry.name)
+            sigma[k] = getattr(vehicle, f"sigma_{entry.name}")
     wide = np.array([entry.wide for entry in entries])
     wide[WHEELS] *= stated[WHEELS]
     height = stated[HEIGHT]

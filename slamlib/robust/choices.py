@@ -36,7 +36,7 @@ from slamlib.robust.calibration import RADII, WHEEL_SCALE, WHEELS, Prior
 from slamlib.robust.error_memory import runs
 from slamlib.robust.factors import odometry_error, preintegrate_odometry
 from slamlib.robust.fit import Fit, accepted_measurements, refine, residuals
-from slamlib.robust.jumps import NO_JUMPS, UNKNOWN_SIGMA, Jumps, find_jumps
+from slamlib.robust.jumps import UNKNOWN_SIGMA, Jumps, find_jumps
 from slamlib.robust.linear import (
     NormalEquations,
     Problem,
@@ -44,6 +44,8 @@ from slamlib.robust.linear import (
     laplace_approximation,
     linear_solution,
 )
+from slamlib.robust.measurements import AcceptedMeasurements
+from slamlib.robust.part_faults import camera_bump
 from slamlib.robust.result import slam_result
 
 log = logging.getLogger(__name__)
@@ -146,13 +148,12 @@ def calibrated(fit: Fit) -> Fit:
 def _confirmed(fit):
     """The explanations of a Fit that its solutions with and without their groups confirm.
 
-    A delay that `find_jumps` found is confirmed already.
+    What the Jumps say of the camera is confirmed already.
     """
     m = fit.problem.measurements
-    found_before = {"time-offset"} if m.jumps.lag else frozenset()
     confirmed = []
     for some in fit.explanations:
-        needed = sum(_price(m.calibration, group) for group in some - found_before)
+        needed = sum(_price(m.calibration, group) for group in some - m.jumps.groups)
         if fit.lead >= needed:
             confirmed.append(some)
     return tuple(confirmed) or (frozenset(),)
@@ -319,11 +320,16 @@ def _likelihood(fit):
 
 
 def _lead(proposed, present):
-    """Log evidence of a Fit minus that of another, on the weights of `proposed`, noise learned."""
-    weighted = replace(proposed.problem, accepted=_with_fixed_weights(proposed))
+    """Log evidence of a Fit minus that of another, by what both accept, noise learned.
+
+    With the shares of `proposed`.
+    """
+    accepted = _with_fixed_weights(proposed)
+    in_both = [replace(kind, weight=kind.weight * (other.weight > 0))
+               for kind, other in zip(accepted, present.problem.accepted)]
 
     def log_density(fit):
-        problem = replace(weighted, prior=fit.problem.prior)
+        problem = replace(fit.problem, accepted=AcceptedMeasurements(*in_both))
         return refine(problem, fit.state, accept=None).log_density
 
     return log_density(proposed) - log_density(present)
@@ -345,44 +351,57 @@ def most_consistent(
     `start` makes the Fit of Jumps and of places, undecided or with the decisions that another Fit
     is `like`, and `decide` decides. Jumps of odometry, or else places of ids, are believed where
     they spare most of the sightings that are rejected without them, with the same decisions. A few
-    jumps are also believed if the evidence leads, or no marker tells them. Where a solution
-    stretches odometry beyond the slip that it learned, most of all over a way without markers, one
-    more jump is believed if the evidence leads decisively.
+    jumps are also believed if the evidence leads, or no marker tells them; a camera that was moved,
+    if the evidence leads. Where a solution stretches odometry beyond the slip that it learned, most
+    of all over a way without markers, one more jump is believed if the evidence leads decisively.
     """
-    def alternative(jumps=NO_JUMPS, places=None):
-        """The Fit with the decisions of the present one, or None if it has no solution."""
-        try:
-            return start(jumps, places, fit)
-        except (DatasetError, np.linalg.LinAlgError):
-            return None
-
-    jumps = find_jumps(dataset)
-    found = len(jumps.start)
-    no_jumps = replace(NO_JUMPS, lag=jumps.lag)
-    fit = decide(start(jumps if jumps.are_few else no_jumps))
-    if jumps.are_few:
-        without = alternative(no_jumps)
-        if _are_needless(fit, without):
-            fit = without
-    elif found and spares_sightings(alternative(jumps), fit, "jumps"):
-        fit = decide(start(jumps))
-    log.info("jumps: %d of %d are believed", len(fit.problem.measurements.jumps.start), found)
+    bump = camera_bump(dataset)
+    fit = _with_jumps(dataset, start, decide, bump)
+    if bump is not None:
+        without = _alternative(start, fit, find_jumps(dataset))
+        if without is not None and _lead_of_jumps(fit, without) < MIN_JUMP_LEAD:
+            fit = _with_jumps(dataset, start, decide, None)
     if has_rejected_visits(fit):
-        places = places_of_ids(dataset.aruco, partial(start, like=fit))
+        no_jumps = fit.problem.measurements.jumps.none()
+        places = places_of_ids(dataset.aruco, partial(start, no_jumps, like=fit))
         if places is not None and spares_sightings(
-                alternative(places=places), fit, "places of ids"):
-            return decide(start(places=places)), places
+                _alternative(start, fit, no_jumps, places), fit, "places of ids"):
+            return decide(start(no_jumps, places)), places
     jumps = with_stretched(fit)
-    if jumps is not None and _lead_of_jumps(alternative(jumps), fit) > MIN_JUMP_LEAD:
+    if jumps is not None and _lead_of_jumps(_alternative(start, fit, jumps), fit) > MIN_JUMP_LEAD:
         return decide(start(jumps)), None
     return fit, None
+
+
+def _alternative(start, fit, jumps, places=None):
+    """The Fit of Jumps and places with the decisions of a Fit, or None if it has no solution."""
+    try:
+        return start(jumps, places, fit)
+    except (DatasetError, np.linalg.LinAlgError):
+        return None
+
+
+def _with_jumps(dataset, start, decide, bump):
+    """The Fit with those Jumps of a Dataset that are believed, and a CameraBump or None."""
+    jumps = find_jumps(dataset, bump)
+    found = len(jumps.start)
+    no_jumps = jumps.none()
+    fit = decide(start(jumps if jumps.are_few else no_jumps))
+    if jumps.are_few:
+        without = _alternative(start, fit, no_jumps)
+        if _are_needless(fit, without):
+            fit = without
+    elif found and spares_sightings(_alternative(start, fit, jumps), fit, "jumps"):
+        fit = decide(start(jumps))
+    log.info("jumps: %d of %d are believed", len(fit.problem.measurements.jumps.start), found)
+    return fit
 
 
 def _lead_of_jumps(fit, other):
     """Log evidence of a Fit with more jumps over that of another, none if there is no solution."""
     if fit is None:
         return -np.inf
-    lead = fit.log_density - other.log_density
+    lead = _lead(fit, other)
     log.info("jumps: log evidence %+.1f", lead)
     return lead
 

@@ -17,6 +17,7 @@ from slamlib.core import odometry, se2
 from slamlib.core.increments import OdometryIncrements, odometry_error, preintegrate
 from slamlib.robust.calibration import (
     ANTENNAS,
+    BUMP,
     CAMERA,
     HEIGHT,
     OFFSET,
@@ -98,7 +99,7 @@ def _linearized_sightings(problem, state):
         m, frame, state.c[SIGHTING_LAG], not problem.active[SIGHTING_LAG])
     e, by_pose, by_marker, by_c = sighting_error(
         m.sightings.z[rows], state.poses[frame], motion, velocity,
-        state.markers[m.marker_row[rows]], state.c, m.as_pose[rows])
+        state.markers[m.marker_row[rows]], state.c, m.as_pose[rows], m.is_bumped[rows])
     J = np.concatenate([by_pose, by_marker], axis=2)
     index = len(m.frame) - 1 + rows                      # after odometry
     factors = _whitened(problem, index, SIGHTINGS, m.sighting_roots[rows], e, J, by_c)
@@ -161,15 +162,18 @@ def _weighted(factors, accepted, rows, noise, size):
 
 def sighting_error(
         z: np.ndarray, poses: np.ndarray, motion: np.ndarray, velocity: np.ndarray,
-        markers: np.ndarray, c: np.ndarray, as_pose: np.ndarray) -> tuple[np.ndarray, ...]:
+        markers: np.ndarray, c: np.ndarray, as_pose: np.ndarray,
+        is_bumped: np.ndarray) -> tuple[np.ndarray, ...]:
     """Errors of sightings z (m, 3), and derivatives by pose, marker and the columns SIGHTINGS of c.
 
     From poses (m, 3) of the vehicle, its `motion` to where it was when the camera saw, and its
     `velocity` per encoder step there (`delayed`), each (m, 3) or (3,). Of markers with a heading,
     `as_pose` (m,), the errors (m, 3) are log(z^-1 h) of the expected sighting h, of points h - z
-    and 0. The derivatives are (m, 3, 3), (m, 3, 3) and (m, 3, 5). GTSAM: BetweenFactorPose2.
+    and 0. `is_bumped` (m,) is where the camera is elsewhere. The derivatives are (m, 3, 3),
+    (m, 3, 3) and (m, 3, 8). GTSAM: BetweenFactorPose2.
     """
-    camera = c[CAMERA]
+    after = is_bumped[:, None]
+    camera = c[CAMERA] + after * c[BUMP]
     unit = [c[SIZE], c[SIZE], 1]
     mounted = se2.compose(motion, camera)                # camera in vehicle
     Y = se2.compose(poses, mounted)
@@ -188,7 +192,8 @@ def sighting_error(
     by_Y = -by_seen @ se2.moved_by(seen)
     by_pose, by_camera, by_lag = _by_sensor(by_Y, mounted, camera, velocity)
     by_size = -by_seen[:, :, :2] @ h[:, :2, None]
-    return e, by_pose, by_marker, np.concatenate([by_camera, by_size, by_lag], axis=2)
+    by_bump = after[:, None] * by_camera
+    return e, by_pose, by_marker, np.concatenate([by_camera, by_size, by_lag, by_bump], axis=2)
 
 
 def range_error(
@@ -225,8 +230,8 @@ def _tag_in_vehicle(c):
 def _by_sensor(by_Y, mounted, place, velocity):
     """Derivatives by the vehicle's pose and a sensor's place, (m, d, 3), and its lag (m, d, 1).
 
-    From those by the pose Y of the sensor, in its axes (m, d, 3). Its `place` (3,) in the vehicle
-    is `mounted` with the motion since; `velocity` is the vehicle's, both (m, 3) or (3,).
+    From those by the pose Y of the sensor, in its axes (m, d, 3). Its `place` in the vehicle is
+    `mounted` with the motion since; `velocity` is the vehicle's, all (m, 3) or (3,).
     """
     by_pose = by_Y @ inverse_adjoint(mounted)
     by_place = by_Y @ inverse_adjoint(place * [0, 0, 1])
@@ -249,7 +254,8 @@ def sensor_poses(measurements: Measurements, poses: np.ndarray,
         motion = delayed(measurements, row, lag)[0]
         return se2.compose(poses[row], se2.compose(motion, place))
 
-    camera = in_world(measurements.sightings.row, c[SIGHTING_LAG], c[CAMERA])
+    cameras = c[CAMERA] + measurements.is_bumped[:, None] * c[BUMP]
+    camera = in_world(measurements.sightings.row, c[SIGHTING_LAG], cameras)
     tag = in_world(measurements.ranges.row, c[RANGE_LAG], _tag_in_vehicle(c))
     return camera, tag
 

@@ -6,37 +6,26 @@ Exchanged wheels and a camera mirrored in y and theta have the same A. Wrong uni
 lengths, and of stated standard deviations to the scatter of measurements.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 
 from slamlib.core import odometry, se2
-from slamlib.core.marker_increments import (
-    common_sightings,
-    distance_and_turn,
-    distance_and_turn_sigmas,
-    robust_increments,
-)
+from slamlib.core.marker_increments import distance_and_turn
 from slamlib.core.records import Dataset
-from slamlib.core.sightings import sightings_by_frame
+from slamlib.robust.part_faults import (
+    AXES,
+    MIN_COUNT,
+    MIN_MOTION_SIGMAS,
+    MOTIONS,
+    contradictions,
+    moving_increments,
+    other_axes,
+)
 
-MIN_COUNT = 10            # measurements for a decision
 MIN_RANGES_PER_ANTENNA = 4
-SPAN = 1.0                # m, over which increments are compared
-OVERLAP = 4               # number of increments at each place, at least
-MAX_FRAMES = 20           # over which increments are compared
-MIN_MOTION_SIGMAS = 5.0   # sigmas by markers of distance or turn, from which on the vehicle moves
-# Markers and wheels agree within the sum of these
-AGREEMENT_RATIO = 0.1     # of an increment
-AGREEMENT_SIGMAS = 3.0    # sigmas of the increment by markers
-MIN_AGREEING_SHARE = 0.7  # of the increments with an accepted A
-MIN_GAIN_SIGMAS = 2.5     # sigmas of the number of increments that agree in addition
-MIN_SPANS = 3.0           # of increments, that a stretch is longer; one jump spoils two
-FINER = 20                # times, in which the search for the ends of a stretch becomes finer
-MAX_STRETCH = 0.5         # of the drive, in which wheels are exchanged; else the camera may be
 MAX_FACTOR = 5.0          # ratio of lengths from which on the unit is in doubt
 MAX_SIGMA_RATIO = 15.0    # of a stated standard deviation to the scatter; in degrees it is 57
 MAX_ODOMETRY_HEADING_SIGMA = 0.1   # rad, at the end of the path that is compared with ranges
@@ -48,20 +37,12 @@ MIN_DIFFERENT_COUNTS = 8  # from which on a common divisor says that counts were
 # Kinds of doubts from which most others follow
 DECISIVE = ("wheels-swapped", "wheels-reversed", "camera-mirrored", "camera-turned", "odometry",
             "units")
-# The matrices A, what [x, y] is with each, and by their number the kind of doubt and the change of
-# the counts with the same effect.
-AXES = np.array([np.diag(signs) @ order for order in (np.eye(2), np.eye(2)[::-1])
-                 for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1))])
+# What [x, y] is with each of AXES, and by their number the kind of doubt and the change of the
+# counts with the same effect.
 AXES_NAMES = ("x, y", "x, -y", "-x, y", "-x, -y", "y, x", "-y, x", "y, -x", "-y, -x")
 COUNTS = {1: ("wheels-swapped", "the columns exchanged"),
           2: ("wheels-reversed", "both signs reversed"),
           3: ("wheels-reversed", "both signs reversed and the columns exchanged")}
-# By number of AXES: increments (n, 3) by wheels @ MOTIONS are (8, 1, n, 3) with these axes.
-MOTIONS = np.zeros((8, 1, 3, 3))
-MOTIONS[:, 0, :2, :2] = AXES.mT
-MOTIONS[:, 0, 2, 2] = np.linalg.det(AXES)
-EXCHANGED = (1, 3)
-REVERSED = (2, 3)
 
 
 @dataclass(frozen=True)
@@ -115,146 +96,6 @@ def motion_doubts(dataset: Dataset) -> list[Doubt]:
     if stretch is not None:
         return [_axes_doubt(stretch, stretch.is_mended(len(dataset.ticks)))]
     return list(wrong_sizes(markers[0], wheels, sigma, off[0, 0] < 1))
-
-
-def with_wheels_mended(dataset: Dataset) -> Dataset:
-    """The Dataset with its counts mended in a stretch in which wheels are exchanged or reversed.
-
-    It is as it was where that is most of the drive: then the camera may as well have other axes. Of
-    all ends of the stretch nearby, the increments agree best with the one that is chosen.
-    """
-    markers, wheels, sigma, poses = moving_increments(dataset, signs=[1])
-    if len(wheels) < MIN_COUNT:
-        return dataset
-    stretch = other_axes(contradictions(markers, wheels @ MOTIONS, sigma), poses)
-    if stretch is None or not stretch.is_mended(len(dataset.ticks)):
-        return dataset
-
-    def cost(mended):
-        """What still contradicts the markers."""
-        path = odometry.dead_reckoning(mended.ticks, mended.vehicle, model="arc")
-        by_wheels = se2.between(path[poses[:, 0]], path[poses[:, 1]])
-        return _limited(contradictions(markers[0], by_wheels, sigma)).sum()
-
-    first = stretch.first
-    last = stretch.last
-    reach = 2 * int(np.median(np.diff(poses)))
-    for _ in range(2):
-        near = np.arange(-reach, reach + 1, max(1, reach // FINER))
-        first = min(first + near, key=lambda pose: cost(stretch.mended(dataset, pose, last)))
-        later = last + near[::-1]                # of equal ones the last: nothing tells at the end
-        last = min(later, key=lambda pose: cost(stretch.mended(dataset, first, pose)))
-        reach //= FINER
-    return stretch.mended(dataset, first, last)
-
-
-def contradictions(markers: np.ndarray, wheels: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """Differences (..., n) of increments (..., n, 3) by markers and by wheels; they agree below 1.
-
-    `sigma` (n, 2) is that of distance and turn by markers.
-    """
-    size = np.maximum(_size(markers), _size(wheels))
-    tolerance = AGREEMENT_RATIO * size + AGREEMENT_SIGMAS * np.linalg.norm(sigma, axis=1)
-    return _size(markers - wheels) / tolerance
-
-
-def _limited(off):
-    """The `contradictions`, at most 1, as where markers tell no increment."""
-    return np.where(off < 1, off, 1.0)
-
-
-def _size(increment):
-    """Root of the squares of distance in m and turn in rad, (...), of increments (..., 3)."""
-    return np.linalg.norm(distance_and_turn(increment), axis=-1)
-
-
-def moving_increments(
-        dataset: Dataset, signs: Sequence[int] = (1, -1)
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Increments of the moving vehicle between n pairs of frames about SPAN apart.
-
-    Returns those by markers (len(signs), n, 3), with theta multiplied by each of the `signs`, by
-    wheels (n, 3), the standard deviations of distance and turn by markers (n, 2), and the encoder
-    poses of each pair of frames (n, 2), from 0.
-    """
-    s = sightings_by_frame(dataset.sightings)
-    path = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")[s.frame]
-    span = _span(path)
-    wheels = se2.between(path[:-span], path[span:])
-    common = np.array(common_sightings(s.row, s.marker, span))
-    overlapping = common[:, common[0] % max(1, span // OVERLAP) == 0]
-    by_markers = []
-    for sign in signs:
-        mirror = np.diag([1.0, 1.0, sign])
-        by_markers.append(robust_increments(
-            s.z @ mirror, mirror @ s.C @ mirror, *overlapping, len(wheels)))
-    stated = by_markers[0]
-    sigma = distance_and_turn_sigmas(stated.covariance)
-    size = np.maximum(distance_and_turn(stated.increment), distance_and_turn(wheels))
-    moving = stated.usable & (size > MIN_MOTION_SIGMAS * sigma).any(axis=1)
-    markers = np.stack([found.increment for found in by_markers])
-    poses = np.column_stack([s.frame[:-span], s.frame[span:]])
-    return markers[:, moving], wheels[moving], sigma[moving], poses[moving]
-
-
-def _span(path):
-    """Number of frames over SPAN by the path (f, 3): MAX_FRAMES or a quarter of all at most."""
-    if len(path) < 2:
-        return 1
-    step = np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1)
-    frames = SPAN / max(np.median(step), SPAN / MAX_FRAMES)
-    return max(1, min(int(frames + 0.5), len(path) // 4))
-
-
-class OtherAxes(NamedTuple):
-    """A stretch of a drive in which markers and wheels agree with other axes or signs."""
-
-    axes: int                # row of AXES
-    is_reversed: bool        # whether theta is, too
-    first: int               # encoder pose, from 0, at which it begins
-    last: int                # at which it ends
-    stated: np.ndarray       # (m,) bool, which increments agree as stated
-    agreeing: np.ndarray     # (m,) bool, which agree with these axes
-
-    def is_mended(self, count: int) -> bool:
-        """Whether counts have the same effect, in less than half of the `count` poses."""
-        is_by_counts = self.axes in COUNTS and not self.is_reversed
-        return is_by_counts and self.last - self.first < MAX_STRETCH * count
-
-    def mended(self, dataset: Dataset, first: int, last: int) -> Dataset:
-        """The Dataset with counts of these axes from the pose `first` to the pose `last`."""
-        ticks = dataset.ticks.copy()
-        rows = slice(max(first, 0) + 1, last + 1)
-        if self.axes in EXCHANGED:
-            ticks[rows] = ticks[rows, ::-1]
-        if self.axes in REVERSED:
-            ticks[rows] = -ticks[rows]
-        return replace(dataset, ticks=ticks)
-
-
-def other_axes(off: np.ndarray, poses: np.ndarray) -> OtherAxes | None:
-    """OtherAxes, if significantly more increments agree with them; the stretch may be the drive.
-
-    `off` (8, k, n) are the `contradictions` by AXES, for theta as stated and then reversed, of
-    increments between these encoder poses (n, 2). In the stretch they are less by most in all.
-    """
-    agree = off < 1
-    limited = _limited(off)
-    gained = limited[0, 0] - limited
-    total = np.insert(np.cumsum(gained, axis=2), 0, 0, axis=2)
-    rise = total - np.minimum.accumulate(total, axis=2)
-    k, is_reversed, end = np.unravel_index(rise.argmax(), rise.shape)
-    begin = total[k, is_reversed, :end + 1].argmin()
-    if end == 0 or np.ptp(poses[begin:end]) <= MIN_SPANS * np.median(np.diff(poses)):
-        return None
-    stated = agree[0, 0, begin:end]
-    agreeing = agree[k, is_reversed, begin:end]
-    gain = agreeing.sum() - stated.sum()
-    gain_sigma = np.sum(agreeing != stated)**0.5
-    if agreeing.mean() < MIN_AGREEING_SHARE or gain <= MIN_GAIN_SIGMAS * gain_sigma:
-        return None
-    return OtherAxes(int(k), bool(is_reversed), poses[begin, 0], poses[end - 1, 1], stated,
-                     agreeing)
 
 
 def _axes_doubt(stretch, is_mended):

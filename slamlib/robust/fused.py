@@ -42,8 +42,8 @@ from slamlib.core.increments import SLIP_BOUNDS, SLIP_FACTOR, TYPICAL_SLIP
 from slamlib.core.records import Dataset
 from slamlib.core.sightings import GATE, sightings_by_frame
 from slamlib.robust.calibration import stated_calibration
-from slamlib.robust.file_doubts import with_wheels_mended
 from slamlib.robust.jumps import NO_JUMPS, crawls, creep_covariance, find_jumps
+from slamlib.robust.part_faults import camera_bump, with_wheels_mended
 
 SLIPS = TYPICAL_SLIP * SLIP_FACTOR ** np.arange(-1.0, 4.0)     # sqrt(m), of the first filters
 FINE_STEPS = 1.4 ** np.arange(-2.0, 3.0)     # slips of the last filters, over the likeliest one
@@ -132,6 +132,7 @@ def fuse(dataset: Dataset, slip: float | None = None) -> Fusion:
     dataset = with_wheels_mended(dataset)
     if slip is None:
         slip = dataset.vehicle.slip
+    dataset = _with_camera_mended(dataset, slip or TYPICAL_SLIP)
     jumps = _believed_jumps(dataset, slip or TYPICAL_SLIP)
     models = _learned_models(dataset, jumps, slip)
     states = _filter(dataset, jumps, models)
@@ -160,14 +161,28 @@ def _believed_jumps(dataset, slip):
     count = len(found.start)
     if count == 0:
         return NO_JUMPS
-    models = _all_models([slip], [0.0], [False], [1.0])
-    with_jumps = _filter(dataset, found, models)[-1]
-    without = _filter(dataset, NO_JUMPS, models)[-1]
-    gain = with_jumps.log_density - without.log_density
+    gain = _log_density(dataset, found, slip) - _log_density(dataset, NO_JUMPS, slip)
     least = MIN_JUMP_GAIN * count
     if found.are_few:
         least = -least
     return found if gain >= least else NO_JUMPS
+
+
+def _with_camera_mended(dataset, slip):
+    """The Dataset with its sightings as of a camera that nothing moved, if that is likelier."""
+    bump = camera_bump(dataset)
+    if bump is None:
+        return dataset
+    there = bump.mended(dataset)
+    gain = _log_density(there, find_jumps(there), slip) - _log_density(
+        dataset, find_jumps(dataset), slip)
+    return there if gain >= MIN_JUMP_GAIN else dataset
+
+
+def _log_density(dataset, jumps, slip):
+    """Log density of all innovations of a filter with a slip, up to a constant."""
+    models = _all_models([slip], [0.0], [False], [1.0])
+    return _filter(dataset, jumps, models)[-1].log_density[0]
 
 
 def _learned_models(dataset, jumps, slip):

@@ -24,6 +24,7 @@ from slamlib.core import odometry, se2
 from slamlib.core.marker_increments import distance_and_turn, robust_increments
 from slamlib.core.records import Dataset
 from slamlib.core.sightings import GATE, sightings_by_frame
+from slamlib.robust.part_faults import CameraBump
 
 log = logging.getLogger(__name__)
 
@@ -65,6 +66,21 @@ class Jumps:
     sigma: np.ndarray        # (g, 3) of the increment without these markers
     chance: np.ndarray       # (n,) of a jump in the steps up to each pose, up to a factor
     lag: int = 0             # poses, by which all sightings seem later than stated
+    bump: float = np.inf     # encoder pose from which on the camera is elsewhere
+
+    @property
+    def groups(self) -> frozenset:
+        """Groups of the calibration that they release."""
+        found = set()
+        if self.lag:
+            found.add("time-offset")
+        if self.bump < np.inf:
+            found.add("camera-bump")
+        return frozenset(found)
+
+    def none(self) -> "Jumps":
+        """No Jumps of the vehicle, with what these say of the camera."""
+        return replace(NO_JUMPS, lag=self.lag, bump=self.bump)
 
     @property
     def are_few(self) -> bool:
@@ -158,8 +174,13 @@ def creep_covariance(increment: np.ndarray, crawling: np.ndarray) -> np.ndarray:
     return creep[:, :, None] * creep[:, None]
 
 
-def find_jumps(dataset: Dataset) -> Jumps:
-    """The Jumps of a Dataset, by its sightings as the stated camera has them."""
+def find_jumps(dataset: Dataset, bump: CameraBump | None = None) -> Jumps:
+    """The Jumps of a Dataset, by its sightings as the stated camera has them.
+
+    After a CameraBump, as the camera would have them at its old place.
+    """
+    if bump is not None:
+        dataset = bump.mended(dataset)
     s = sightings_by_frame(dataset.sightings)
     if len(s.frame) < 2:
         return NO_JUMPS
@@ -176,6 +197,8 @@ def find_jumps(dataset: Dataset) -> Jumps:
     candidates = [_found(dataset.ticks, s, drives[each]) for each in sorted({0, lag})]
     found = min(candidates, key=len)
     jumps = replace(NO_JUMPS, lag=lag)
+    if bump is not None:
+        jumps = replace(jumps, bump=bump.pose)
     for jump in found:
         start = s.frame[jump.step]
         end = s.frame[jump.step + 1]

@@ -91,14 +91,13 @@ def build_problem(measurements: Measurements, model: str, noise: Noise | None = 
 
     Without a Noise it is the typical one. Parameters that the Vehicle gives replace its own.
     Odometry is of the `model` "arc" or "euler", linearised at `wheel` (3,) m, None for the stated
-    one. The calibration is as stated, but for the delay of sightings that are late.
+    one. The calibration is as stated, but for what the Jumps say of the camera.
     """
-    late = frozenset({"time-offset"} if measurements.jumps.lag else ())
     return Problem(
         measurements=measurements, odometry=preintegrate_odometry(measurements, model, wheel),
         accepted=accept_all(measurements),
         noise=with_known(noise or Noise(), measurements.dataset.vehicle),
-        prior=measurements.calibration.prior(late))
+        prior=measurements.calibration.prior(measurements.jumps.groups))
 
 
 def retract(problem: Problem, state: State, delta: np.ndarray) -> State:

@@ -115,6 +115,11 @@ class Measurements:
         return self.oriented[self.marker_row]
 
     @property
+    def is_bumped(self) -> np.ndarray:
+        """(s,) bool, sightings since something moved the camera."""
+        return self.frame[self.sightings.row] >= self.jumps.bump
+
+    @property
     def origin_sigma(self) -> np.ndarray:
         """(3,) standard deviations of pose 1: m, m, rad."""
         return np.array([ORIGIN_SIGMA, ORIGIN_SIGMA, self.dataset.vehicle.sigma_heading])

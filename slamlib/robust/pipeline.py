@@ -17,12 +17,12 @@ from slamlib.core.odometry import MODELS
 from slamlib.core.records import Dataset
 from slamlib.core.vehicle import changed
 from slamlib.robust.choices import better_model, calibrated, memory_or_slip, most_consistent
-from slamlib.robust.file_doubts import with_wheels_mended
 from slamlib.robust.fit import CAUCHY_SCALES, Fit, narrow_kernels, refine, settled
 from slamlib.robust.initialization import initial_state, state_from_poses, with_consensus
 from slamlib.robust.jumps import NO_JUMPS
 from slamlib.robust.linear import build_problem
 from slamlib.robust.measurements import Measurements, Noise, measure
+from slamlib.robust.part_faults import with_wheels_mended
 from slamlib.robust.result import SlamResult, slam_result
 from slamlib.robust.solution import solve_by_gtsam
 

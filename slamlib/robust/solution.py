@@ -156,7 +156,8 @@ def add_calibrated_sightings(graph: gtsam.NonlinearFactorGraph, problem: Problem
     def errors(poses, markers, c):
         motion, velocity = delayed(m, frame, c[SIGHTING_LAG], is_known)
         e, by_pose, by_marker, by_c = sighting_error(
-            m.sightings.z[rows], poses, motion, velocity, as_places(markers), c, m.as_pose[rows])
+            m.sightings.z[rows], poses, motion, velocity, as_places(markers), c, m.as_pose[rows],
+            m.is_bumped[rows])
         return e[:, :size], by_pose[:, :size], by_marker[:, :size, :size], by_c[:, :size]
 
     markers = marker_keys(problem)

@@ -37,6 +37,8 @@ GROUPS = {
                   "larger sigma in vehicle.toml."),
     "camera-offset": ("the place of the camera", "Measure it from midway between the wheels, and "
                       "state it in vehicle.toml."),
+    "camera-bump": ("a camera that was moved during the drive", "Fasten it, and measure its place "
+                    "again."),
     "marker-size": ("the size of the markers", "Measure a printed marker, and state its size in "
                     "vehicle.toml. Wheels that are all off by one factor look the same."),
     "time-offset": ("a delay of the sightings", "Look at the pose ids of ArucoReading.txt, and "
@@ -84,6 +86,8 @@ def _calibration_doubts(result):
             continue
         numbers = " and ".join(map(_estimated_and_stated, rows[group]))
         sentence = f"By the drive {numbers}; {problem} uses this."
+        if group == "camera-bump":
+            sentence = f"From pose {result.jumps.bump + 1} on the camera is elsewhere. {sentence}"
         if group == furthest:
             others = [name for other, (name, _) in GROUPS.items() if other in either - {group}]
             sentence += (f" It may instead be {' or '.join(others)}: the drive cannot tell, and "

@@ -1,0 +1,298 @@
+"""Faults of a part of a drive, by increments of the vehicle that markers and wheels measure.
+
+Wheels may be exchanged or reversed for a while: then increments by markers and by wheels agree with
+other axes. Increments [x, y, heading] with other axes or signs are [A (x, y), det(A) heading], A
+one of the eight symmetries of a square. The stretch is the one in which they contradict each other
+less by most in all. Such counts are mended.
+
+Something may move the camera: from then on, it is elsewhere in the vehicle than stated. A camera
+that is off by c = [x, y, turn] changes the position of an increment [p, h] by
+
+    e = (R(h) - 1) [x, y] - turn R(90 degrees) p.
+
+For each moment, weighted least squares tell c before and after it, and how much smaller the squared
+residuals are than with one c (generalised likelihood ratio: Basseville and Nikiforov,
+Detection of Abrupt Changes, 1993, section 2.4).
+"""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from slamlib.core import odometry, se2
+from slamlib.core.marker_increments import (
+    common_sightings,
+    distance_and_turn,
+    distance_and_turn_sigmas,
+    robust_increments,
+)
+from slamlib.core.records import Dataset
+from slamlib.core.sightings import GATE, sightings_by_frame
+
+log = logging.getLogger(__name__)
+
+MIN_COUNT = 10            # increments for a decision
+SPAN = 1.0                # m, over which increments are compared
+OVERLAP = 4               # number of increments at each place, at least
+MAX_FRAMES = 20           # over which increments are compared
+MIN_MOTION_SIGMAS = 5.0   # sigmas by markers of distance or turn, from which on the vehicle moves
+# Markers and wheels agree within the sum of these
+AGREEMENT_RATIO = 0.1     # of an increment
+AGREEMENT_SIGMAS = 3.0    # sigmas of the increment by markers
+MIN_AGREEING_SHARE = 0.7  # of the increments with an accepted A
+MIN_GAIN_SIGMAS = 2.5     # sigmas of the number of increments that agree in addition
+MIN_SPANS = 3.0           # of increments, that a stretch is longer; one jump spoils two
+FINER = 20                # times, in which the search for the ends of a stretch becomes finer
+MAX_STRETCH = 0.5         # of the drive, in which wheels are exchanged; else the camera may be
+MIN_BUMP_GAIN = 35.0      # of squared residuals, by a camera that was moved
+MAX_BUMP = 0.3            # m and rad, of a motion of the camera
+BUMP_SIGMA = 0.2          # m and rad, of a camera about its stated place, before and after
+MEDIAN_SQUARED = 1.386    # of chi-squared with two degrees of freedom
+REWEIGHTED = 4            # times, by the residuals
+# The matrices A, and by their number the changes of the counts with the same effect.
+AXES = np.array([np.diag(signs) @ order for order in (np.eye(2), np.eye(2)[::-1])
+                 for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1))])
+# By number of AXES: increments (n, 3) by wheels @ MOTIONS are (8, 1, n, 3) with these axes.
+MOTIONS = np.zeros((8, 1, 3, 3))
+MOTIONS[:, 0, :2, :2] = AXES.mT
+MOTIONS[:, 0, 2, 2] = np.linalg.det(AXES)
+EXCHANGED = (1, 3)
+REVERSED = (2, 3)
+
+
+def moving_increments(
+        dataset: Dataset, signs: Sequence[int] = (1, -1)
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Increments of the moving vehicle between n pairs of frames about SPAN apart.
+
+    Returns those by markers (len(signs), n, 3), with theta multiplied by each of the `signs`, by
+    wheels (n, 3), the standard deviations of distance and turn by markers (n, 2), and the encoder
+    poses of each pair of frames (n, 2), from 0.
+    """
+    s = sightings_by_frame(dataset.sightings)
+    path = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")[s.frame]
+    span = _span(path)
+    wheels = se2.between(path[:-span], path[span:])
+    common = np.array(common_sightings(s.row, s.marker, span))
+    overlapping = common[:, common[0] % max(1, span // OVERLAP) == 0]
+    by_markers = []
+    for sign in signs:
+        mirror = np.diag([1.0, 1.0, sign])
+        by_markers.append(robust_increments(
+            s.z @ mirror, mirror @ s.C @ mirror, *overlapping, len(wheels)))
+    stated = by_markers[0]
+    sigma = distance_and_turn_sigmas(stated.covariance)
+    size = np.maximum(distance_and_turn(stated.increment), distance_and_turn(wheels))
+    moving = stated.usable & (size > MIN_MOTION_SIGMAS * sigma).any(axis=1)
+    markers = np.stack([found.increment for found in by_markers])
+    poses = np.column_stack([s.frame[:-span], s.frame[span:]])
+    return markers[:, moving], wheels[moving], sigma[moving], poses[moving]
+
+
+def with_wheels_mended(dataset: Dataset) -> Dataset:
+    """The Dataset with its counts mended in a stretch in which wheels are exchanged or reversed.
+
+    It is as it was where that is most of the drive: then the camera may as well have other axes. Of
+    all ends of the stretch nearby, the increments agree best with the one that is chosen.
+    """
+    markers, wheels, sigma, poses = moving_increments(dataset, signs=[1])
+    if len(wheels) < MIN_COUNT:
+        return dataset
+    stretch = other_axes(contradictions(markers, wheels @ MOTIONS, sigma), poses)
+    if stretch is None or not stretch.is_mended(len(dataset.ticks)):
+        return dataset
+
+    def cost(changed):
+        """What still contradicts the markers."""
+        path = odometry.dead_reckoning(changed.ticks, changed.vehicle, model="arc")
+        by_wheels = se2.between(path[poses[:, 0]], path[poses[:, 1]])
+        return _limited(contradictions(markers[0], by_wheels, sigma)).sum()
+
+    first = stretch.first
+    last = stretch.last
+    reach = 2 * int(np.median(np.diff(poses)))
+    for _ in range(2):
+        near = np.arange(-reach, reach + 1, max(1, reach // FINER))
+        first = min(first + near, key=lambda pose: cost(stretch.mended(dataset, pose, last)))
+        later = last + near[::-1]                # of equal ones the last: nothing tells at the end
+        last = min(later, key=lambda pose: cost(stretch.mended(dataset, first, pose)))
+        reach //= FINER
+    log.info("wheels: wrong from pose %d to %d, mended", first + 1, last + 1)
+    return stretch.mended(dataset, first, last)
+
+
+def contradictions(markers: np.ndarray, wheels: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    """Differences (..., n) of increments (..., n, 3) by markers and by wheels; they agree below 1.
+
+    `sigma` (n, 2) is that of distance and turn by markers.
+    """
+    size = np.maximum(_size(markers), _size(wheels))
+    tolerance = AGREEMENT_RATIO * size + AGREEMENT_SIGMAS * np.linalg.norm(sigma, axis=1)
+    return _size(markers - wheels) / tolerance
+
+
+def _limited(off):
+    """The `contradictions`, at most 1, as where markers tell no increment."""
+    return np.where(off < 1, off, 1.0)
+
+
+def _size(increment):
+    """Root of the squares of distance in m and turn in rad, (...), of increments (..., 3)."""
+    return np.linalg.norm(distance_and_turn(increment), axis=-1)
+
+
+def _span(path):
+    """Number of frames over SPAN by the path (f, 3): MAX_FRAMES or a quarter of all at most."""
+    if len(path) < 2:
+        return 1
+    step = np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1)
+    frames = SPAN / max(np.median(step), SPAN / MAX_FRAMES)
+    return max(1, min(int(frames + 0.5), len(path) // 4))
+
+
+class OtherAxes(NamedTuple):
+    """A stretch of a drive in which markers and wheels agree with other axes or signs."""
+
+    axes: int                # row of AXES
+    is_reversed: bool        # whether theta is, too
+    first: int               # encoder pose, from 0, at which it begins
+    last: int                # at which it ends
+    stated: np.ndarray       # (m,) bool, which increments agree as stated
+    agreeing: np.ndarray     # (m,) bool, which agree with these axes
+
+    def is_mended(self, count: int) -> bool:
+        """Whether counts have the same effect, in less than half of the `count` poses."""
+        is_by_counts = self.axes in EXCHANGED + REVERSED and not self.is_reversed
+        return is_by_counts and self.last - self.first < MAX_STRETCH * count
+
+    def mended(self, dataset: Dataset, first: int, last: int) -> Dataset:
+        """The Dataset with counts of these axes from the pose `first` to the pose `last`."""
+        ticks = dataset.ticks.copy()
+        rows = slice(max(first, 0) + 1, last + 1)
+        if self.axes in EXCHANGED:
+            ticks[rows] = ticks[rows, ::-1]
+        if self.axes in REVERSED:
+            ticks[rows] = -ticks[rows]
+        return replace(dataset, ticks=ticks)
+
+
+def other_axes(off: np.ndarray, poses: np.ndarray) -> OtherAxes | None:
+    """OtherAxes, if significantly more increments agree with them; the stretch may be the drive.
+
+    `off` (8, k, n) are the `contradictions` by AXES, for theta as stated and then reversed, of
+    increments between these encoder poses (n, 2). In the stretch they are less by most in all.
+    """
+    agree = off < 1
+    limited = _limited(off)
+    gained = limited[0, 0] - limited
+    total = np.insert(np.cumsum(gained, axis=2), 0, 0, axis=2)
+    rise = total - np.minimum.accumulate(total, axis=2)
+    k, is_reversed, end = np.unravel_index(rise.argmax(), rise.shape)
+    begin = total[k, is_reversed, :end + 1].argmin()
+    if end == 0 or np.ptp(poses[begin:end]) <= MIN_SPANS * np.median(np.diff(poses)):
+        return None
+    stated = agree[0, 0, begin:end]
+    agreeing = agree[k, is_reversed, begin:end]
+    gain = agreeing.sum() - stated.sum()
+    gain_sigma = np.sum(agreeing != stated)**0.5
+    if agreeing.mean() < MIN_AGREEING_SHARE or gain <= MIN_GAIN_SIGMAS * gain_sigma:
+        return None
+    return OtherAxes(int(k), bool(is_reversed), poses[begin, 0], poses[end - 1, 1], stated,
+                     agreeing)
+
+
+class CameraBump(NamedTuple):
+    """What moved the camera during a drive."""
+
+    pose: int                # encoder pose, from 0, of the first frame after it
+    motion: np.ndarray       # (3,) of the camera, in the axes of the vehicle
+
+    def mended(self, dataset: Dataset) -> Dataset:
+        """The Dataset with its later sightings as the camera would have them at its old place."""
+        aruco = dataset.aruco
+        vehicle = dataset.vehicle
+        camera = np.array([vehicle.camera_x, vehicle.camera_y, vehicle.camera_turn])
+        scale = np.array([vehicle.marker_size, vehicle.marker_size, 1.0])
+        in_vehicle = se2.compose(self.motion, dataset.sightings.marker_in_vehicle)
+        in_camera = se2.between(camera, in_vehicle) / scale
+        covariance = se2.rotate_covariance(aruco.covariance, self.motion[2])
+        later = aruco.pose >= self.pose
+        return replace(dataset, aruco=replace(
+            aruco,
+            marker_in_vehicle=np.where(later[:, None], in_camera, aruco.marker_in_vehicle),
+            covariance=np.where(later[:, None, None], covariance, aruco.covariance)))
+
+
+def camera_bump(dataset: Dataset) -> CameraBump | None:
+    """A possible CameraBump of a Dataset, or None if one place of the camera explains it as well.
+
+    The moment is that step in the neighbourhood in which markers move most as the camera does.
+    """
+    markers, wheels, sigma, poses = moving_increments(dataset, signs=[1])
+    if len(wheels) <= 2 * MIN_COUNT:
+        return None
+    k, motion, gain = _moved_camera(markers[0], wheels, sigma)
+    if gain < MIN_BUMP_GAIN or np.abs(motion).max() > MAX_BUMP:
+        return None
+    s = sightings_by_frame(dataset.sightings)
+    path = odometry.dead_reckoning(dataset.ticks, dataset.vehicle, model="arc")[s.frame]
+    steps = se2.between(path[:-1], path[1:])
+    common = np.array(common_sightings(s.row, s.marker))
+    window = np.searchsorted(s.frame, [poses[k - 1, 0], poses[k, 1]])
+    near = common[:, (window[0] <= common[0]) & (common[0] < window[1])]
+    found = robust_increments(s.z, s.C, *near, len(steps))
+    usable = np.flatnonzero(found.usable)
+    if not len(usable):
+        return None
+    off = se2.between(steps[usable], found.increment[usable])
+    covariance = found.covariance[usable]
+    gains = se2.squared_norms(off, covariance) - se2.squared_norms(off - motion, covariance)
+    bump = CameraBump(int(s.frame[1 + usable[gains.argmax()]]), motion)
+    log.info("camera: moved before pose %d, by %s", bump.pose + 1, np.round(motion, 3))
+    return bump
+
+
+def _moved_camera(markers, wheels, sigma):
+    """Number of the first increment after the camera moved, its motion (3,), and the gain.
+
+    By increments (n, 3) of markers and wheels, and sigmas (n, 2) of distance and turn by markers.
+    Wheels may be off by one factor all the time. The gain is that of squared residuals, in the
+    variance that the residuals show.
+    """
+    e = se2.difference(markers, wheels)[:, :2, None]
+    turned = se2.rotation(wheels[:, 2]) - np.eye(2)
+    across = np.stack([wheels[:, 1], -wheels[:, 0]], axis=1)
+    along = wheels[:, :2]
+    J = np.concatenate([turned, across[:, :, None], along[:, :, None]], axis=2)
+    variance = sigma[:, 0]**2 / 2
+    weight = 1 / variance
+    for _ in range(REWEIGHTED):
+        weighted = weight[:, None, None] * J.mT
+        common, _ = _least_squares(np.sum(weighted @ J, axis=0), np.sum(weighted @ e, axis=0))
+        left = e - J[:, :, 3:] * common[3]
+        by_camera = J[:, :, :3]
+        weighted = weighted[:, :3]
+        information = np.cumsum(weighted @ by_camera, axis=0)
+        right = np.cumsum(weighted @ left, axis=0)
+        before, saved_before = _least_squares(information, right)
+        after, saved_after = _least_squares(information[-1] - information, right[-1] - right)
+        gain = saved_before + saved_after - saved_before[-1]
+        k = MIN_COUNT + int(gain[MIN_COUNT:-MIN_COUNT].argmax())
+        camera = np.where((np.arange(len(e)) <= k)[:, None, None], before[k], after[k])
+        squared = np.sum((left - by_camera @ camera)**2, axis=(1, 2)) / variance
+        scale = max(1.0, np.median(squared) / MEDIAN_SQUARED)
+        weight = 1 / (scale + squared / GATE) / variance
+    return k + 1, (after[k] - before[k])[:, 0], gain[k] / OVERLAP
+
+
+def _least_squares(information, right):
+    """Least squares (..., q, 1) about 0, sigmas BUMP_SIGMA, and the squared residuals they save.
+
+    By information (..., q, q) and right-hand sides (..., q, 1) without this prior.
+    """
+    prior = np.eye(information.shape[-1]) / BUMP_SIGMA**2
+    found = np.linalg.solve(information + prior, right)
+    return found, np.sum(right * found, axis=(-2, -1))

@@ -1,0 +1,84 @@
+"""A camera that something moves during a drive is found, told and mended; else nothing is."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numeric import aruco, short, without_headings
+from numpy.testing import assert_allclose
+
+from slamlib import estimate, fuse
+from slamlib.core import se2
+from slamlib.core.evaluation import ate
+from slamlib.core.vehicle import Vehicle
+from slamlib.robust.part_faults import camera_bump
+from slamlib.robust.solution_doubts import solution_doubts
+from slamlib.studies.simulation import simulate
+
+BUMP = np.array([0.05, -0.03, 0.06])
+MOUNTED = Vehicle(camera_x=0.1, camera_y=0.05, camera_turn=0.4, marker_size=1.1)
+
+
+def with_moved_camera(dataset, pose, stated=None):
+    """The sightings of a camera that is as stated until a pose, then elsewhere by BUMP."""
+    stated = stated or Vehicle()
+    camera = np.array([stated.camera_x, stated.camera_y, stated.camera_turn])
+    scale = np.array([stated.marker_size, stated.marker_size, 1.0])
+    later = dataset.aruco.pose >= pose
+    moved = se2.compose(BUMP, camera)
+    place = np.where(later[:, None], moved, camera)
+    z = se2.between(place, dataset.aruco.marker_in_vehicle) / scale
+    C = se2.rotate_covariance(dataset.aruco.covariance, -place[:, 2])
+    C = C / scale / scale[:, None]
+    return replace(aruco(dataset, marker_in_vehicle=z, covariance=C), vehicle=stated)
+
+
+@pytest.mark.parametrize("stated", [Vehicle(), MOUNTED], ids=["in the origin", "mounted"])
+@pytest.mark.parametrize("pose", [600, 1500])
+def test_a_camera_that_was_moved_is_found_and_its_sightings_are_mended(pose, stated):
+    clean, _ = short(2)
+    bump = camera_bump(with_moved_camera(clean, pose, stated))
+    assert bump.pose == pose
+    assert_allclose(bump.motion, BUMP, atol=0.035)
+    known = bump._replace(motion=BUMP)
+    mended = known.mended(with_moved_camera(clean, pose, stated)).aruco
+    expected = with_moved_camera(clean, 10**6, stated).aruco
+    assert_allclose(mended.marker_in_vehicle, expected.marker_in_vehicle, atol=1e-12)
+    assert_allclose(mended.covariance, expected.covariance, atol=1e-12)
+
+
+@pytest.mark.parametrize("spoil", [
+    lambda d: d, lambda d: replace(d, aruco=None), lambda d: d.first(60),
+    lambda d: replace(d, aruco=without_headings(d.aruco, d.aruco.marker > 0)),
+    lambda d: with_moved_camera(d, 0)], ids=["clean", "no markers", "short", "points", "elsewhere"])
+def test_a_camera_that_nothing_moved_is_left(spoil):
+    for slip in (1e-3, 1e-2):
+        assert camera_bump(spoil(short(3, slip=slip)[0])) is None
+
+
+def test_a_moved_camera_is_told_and_costs_problems_2_and_3_nothing():
+    clean, truth = short(4)
+    clean = clean.without("uwb")
+    spoilt = with_moved_camera(clean, 900)
+    found = estimate(spoilt)
+    doubt, = solution_doubts(found)
+    assert doubt.what == "camera-bump"
+    assert doubt.sentence.startswith("From pose 901 on the camera is elsewhere.")
+    bump = found.calibration.of_group("camera-bump")
+    off = se2.difference(found.c[bump], BUMP)
+    assert off @ np.linalg.solve(found.c_covariance[np.ix_(bump, bump)], off) < 16.3
+    for solution, alone in ((found, estimate(clean)), (fuse(spoilt), fuse(clean))):
+        error = ate(solution.poses, truth.poses, aligned=True)
+        assert error < 1.5 * ate(alone.poses, truth.poses, aligned=True) + 2e-3
+
+
+def test_markers_that_were_moved_are_not_taken_for_a_moved_camera():
+    dataset, truth = simulate("short", seed=8, rounds=2)
+    dataset = dataset.first(1400).without("uwb")
+    poses = truth.poses[dataset.aruco.pose]
+    there = se2.compose(poses, dataset.aruco.marker_in_vehicle) + [0.25, 0.1, 0.1]
+    moved = (dataset.aruco.pose > 900) & (dataset.aruco.marker % 2 == 1)
+    z = np.where(moved[:, None], se2.between(poses, there), dataset.aruco.marker_in_vehicle)
+    found = estimate(aruco(dataset, marker_in_vehicle=z))
+    assert not found.released
+    assert ate(found.poses, truth.poses[:1400]) < 0.03
