@@ -134,7 +134,7 @@ def differences_at_returns(drive: SolvedDrive) -> dict[str, float]:
 def trajectories(drive: SolvedDrive) -> str:
     """Return the figure of a drive's trajectories, its last map and sigmas, as SVG."""
     fig = Figure(figsize=(7.2, 2.7))  # inches
-    left, right = fig.subplots(1, 2)
+    left, right = fig.subplots(1, 2, width_ratios=(2, 3))
     for problem, solution in drive.solutions.items():
         role = PROBLEMS[problem].role
         if problem in DRAWN or solution is drive.last:
