@@ -74,7 +74,7 @@ def test_titles_and_numbers_of_the_table_are_those_of_the_solver(project):
 
 
 def test_simulated_drives_are_named_as_such(project):
-    assert "so that the truth is known: *all*." in overview.opening(
+    assert "Simulated drives stand in for the course's logs: *all*." in overview.opening(
         project.drives[:1]).cells[0].source
     assert "Simulated" not in overview.opening(project.drives[1:]).cells[0].source
 
