@@ -68,17 +68,6 @@ def test_gtsam_solves_the_drives_within_the_first_600_words(source):
     assert words <= 600
 
 
-@pytest.mark.parametrize("source", CHAPTERS, ids=lambda path: path.stem)
-def test_the_first_result_is_within_600_words_without_displayed_formulas(source):
-    words = 0
-    for cell in nbformat.read(source, as_version=4).cells:
-        if re.search(r"\bwrite_results\(|\bsolve_graph\(", cell.source):
-            break
-        if cell.cell_type == "markdown":
-            words += len(re.sub(r"(?s)\$\$.*?\$\$", "", cell.source).split())
-    assert words <= 600
-
-
 def names_of(source):
     """Global names that code binds and uses, in its functions too: two sets."""
     whole = symtable.symtable(source, "cell", "exec")
