@@ -74,7 +74,7 @@ def test_titles_and_numbers_of_the_table_are_those_of_the_solver(project):
 
 
 def test_simulated_drives_are_named_as_such(project):
-    assert "so that the truth is known: *all*." in overview.opening(
+    assert "Simulated drives stand in for the course's logs: *all*." in overview.opening(
         project.drives[:1]).cells[0].source
     assert "Simulated" not in overview.opening(project.drives[1:]).cells[0].source
 
@@ -165,10 +165,10 @@ def test_at_returns_slam_is_compared_by_the_camera_that_it_estimated(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
-def test_the_opening_of_any_one_drive_fits_on_a_page(project, tmp_path, name):
+def test_the_opening_of_any_one_drive_fits_on_the_title_page(project, tmp_path, name):
     drive, = (drive for drive in project.drives if drive.name == name)
     files = render({Path("index"): overview.opening([drive])}, Options(title="T"))
     text = text_of(files["report.pdf"], tmp_path)
-    _, page = text.rstrip("\f\n").split("\f")                     # after the cover
+    page, = text.rstrip("\f\n").split("\f")
     assert "Figure 1." in page and "The datasets" not in text
     assert ("ATE" in text) == (name == "all") == ("Simulated" in text)

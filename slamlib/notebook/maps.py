@@ -8,7 +8,9 @@ from matplotlib.patheffects import withStroke
 from slamlib.core.evaluation import position_sigmas
 from slamlib.notebook import plotting
 
-WIDTH, HEIGHT = 7.4, 4.3           # inches, the whole width of the page
+HALF_WIDTH, WIDTH = 4.08, 7.4      # inches: half the width of the page, and all of it
+FLAT = 0.55                        # height of a map over its width, below which it needs all of it
+LABELS = 0.6, 1.3                  # inches beside and below the axes
 ELLIPSE_COUNT = 24                 # ellipses of the vehicle
 NAME = 7.0                         # points, font size of the names of markers
 ANTENNA_NAME = 10.5                # points, of those of antennas
@@ -25,7 +27,7 @@ def whole_map(drive, result) -> Figure:
     doubt, which have no ellipse because it may be as large as the map, and of markers that nothing
     confirms. A marker's name without a free place is left out; pages tell it under the pointer.
     """
-    fig, ax = plt.subplots(figsize=(WIDTH, HEIGHT))
+    fig, ax = plt.subplots(figsize=_size(result))
     ax.set_title(drive.name)
     truth = drive.truth
     role = "slam_uwb" if len(result.antenna) else "slam"
@@ -60,6 +62,16 @@ def whole_map(drive, result) -> Figure:
     _add_tips(ax, "antenna", result.antenna, result.antenna_in_world, result.antenna_covariance,
               drive.dataset.uwb.antenna if len(result.antenna) else None)
     return fig
+
+
+def _size(result):
+    """Width and height in inches of a map of a SlamResult that leaves little white beside it."""
+    points = np.concatenate([result.poses[:, :2], result.marker_in_world[:, :2],
+                             result.antenna_in_world])
+    across, up = np.nanmax(points, axis=0) - np.nanmin(points, axis=0)
+    shape = np.clip(up / max(across, 1e-9), 0.25, 1.0)
+    width = WIDTH if shape < FLAT else HALF_WIDTH
+    return width, (width - LABELS[0]) * shape + LABELS[1]
 
 
 def _add_tips(ax, kind, ids, places, covariances, measured):

@@ -133,8 +133,8 @@ def differences_at_returns(drive: SolvedDrive) -> dict[str, float]:
 @plt.style.context(plotting.STYLE, after_reset=True)
 def trajectories(drive: SolvedDrive) -> str:
     """Return the figure of a drive's trajectories, its last map and sigmas, as SVG."""
-    fig = Figure(figsize=(7.2, 2.7))  # inches
-    left, right = fig.subplots(1, 2)
+    fig = Figure(figsize=(7.2, 3.1))  # inches
+    left, right = fig.subplots(1, 2, width_ratios=(2, 3))
     for problem, solution in drive.solutions.items():
         role = PROBLEMS[problem].role
         if problem in DRAWN or solution is drive.last:
@@ -144,7 +144,8 @@ def trajectories(drive: SolvedDrive) -> str:
         known = np.flatnonzero(sigmas > 0)
         plotting.curve(right, sigmas[known], role, known, solution.title)
     if drive.last.aruco_map is not None:
-        plotting.draw_markers(left, *drive.last.aruco_map[1:])
+        left.plot(*drive.last.aruco_map[1].T[:2], label="markers",
+                  **plotting.ROLES["marker"] | {"markersize": 1.5})
     if drive.last.uwb_map is not None:
         plotting.draw_antennas(left, *drive.last.uwb_map[1:])
     if drive.truth is not None:

@@ -81,6 +81,11 @@ local function captioned(blocks, caption, kind, number)
   local text = caption.content:walk{Link = to_itself}
   if #above == 0 then return pandoc.Div({pandoc.Para(text)}, attr) end
   local below = {long = {pandoc.Plain(text)}}
+  if kind == "figure" and typst then -- pictures that are narrow enough stand side by side
+    local beside = pandoc.Inlines{}
+    for _, block in ipairs(above) do beside:extend(block.content) end
+    above = {pandoc.Para(beside)}
+  end
   if kind == "figure" or not typst then return pandoc.Figure(above, below, attr) end
   above[1].caption, above[1].attr = below, attr
   return above[1]
