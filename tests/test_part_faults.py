@@ -1,4 +1,4 @@
-"""A camera that something moves during a drive is found, told and mended; else nothing is."""
+"""A camera that something moves, or wheels that slip, in a part of a drive cost little else."""
 
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ from slamlib import estimate, fuse
 from slamlib.core import se2
 from slamlib.core.evaluation import ate
 from slamlib.core.vehicle import Vehicle
-from slamlib.robust.part_faults import camera_bump
+from slamlib.robust.part_faults import camera_bump, slipping_rows
 from slamlib.robust.solution_doubts import solution_doubts
 from slamlib.studies.simulation import simulate
 
@@ -82,3 +82,35 @@ def test_markers_that_were_moved_are_not_taken_for_a_moved_camera():
     found = estimate(aruco(dataset, marker_in_vehicle=z))
     assert not found.released
     assert ate(found.poses, truth.poses[:1400]) < 0.03
+
+
+def with_counts(dataset, begin, end, change):
+    """The Dataset with the counts of some rows changed."""
+    ticks = dataset.ticks.copy()
+    ticks[begin:end] = np.rint(change(ticks[begin:end]))
+    return replace(dataset, ticks=ticks)
+
+
+PATCHES = {"carpet": lambda ticks: 1.06 * ticks, "frozen": lambda ticks: 0 * ticks + ticks[0]}
+
+
+@pytest.mark.parametrize("patch", PATCHES)
+def test_counts_of_a_stretch_in_which_wheels_slip_or_counts_are_frozen_are_not_used(patch):
+    clean, truth = short(21)
+    clean = clean.without("uwb")
+    spoilt = with_counts(clean, 900, 1200, PATCHES[patch])
+    rows = np.flatnonzero(slipping_rows(spoilt))
+    assert rows[0] < 950 and rows[-1] > 1150
+    assert rows[0] > 700 and rows[-1] < 1400
+    found = estimate(spoilt)
+    assert [doubt.what for doubt in solution_doubts(found)] == ["encoder"]
+    for solution in (found, fuse(spoilt)):
+        assert ate(solution.poses, truth.poses, aligned=True) < 0.02
+    assert ate(found.poses, truth.poses, aligned=True) < 2 * ate(
+        estimate(clean).poses, truth.poses, aligned=True) + 2e-3
+
+
+@pytest.mark.parametrize("seed, slip", [(1, 3e-4), (2, 3e-3), (3, 1e-2), (4, 3e-2)])
+def test_wheels_that_slip_everywhere_alike_are_used(seed, slip):
+    assert not slipping_rows(short(seed, slip=slip)[0]).any()
+    assert not slipping_rows(short(seed, 60, slip=slip)[0]).any()

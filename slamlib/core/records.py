@@ -57,7 +57,7 @@ class AntennaGuess:
     position: np.ndarray             # (a, 2) [x, y] in m
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)        # of arrays, so that only the same one is equal
 class Dataset:
     """All measurements of one drive."""
 

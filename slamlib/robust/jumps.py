@@ -24,7 +24,7 @@ from slamlib.core import odometry, se2
 from slamlib.core.marker_increments import distance_and_turn, robust_increments
 from slamlib.core.records import Dataset
 from slamlib.core.sightings import GATE, sightings_by_frame
-from slamlib.robust.part_faults import CameraBump
+from slamlib.robust.part_faults import CameraBump, slipping_rows
 
 log = logging.getLogger(__name__)
 
@@ -194,7 +194,8 @@ def find_jumps(dataset: Dataset, bump: CameraBump | None = None) -> Jumps:
         poses = path[np.clip(taken, 0, len(path) - 1)]
         drives[lag] = _Drive.without_jumps(poses, vehicle.wheelbase)
     lag = _chosen_lag(s, drives)
-    candidates = [_found(dataset.ticks, s, drives[each]) for each in sorted({0, lag})]
+    slipping = slipping_rows(dataset)
+    candidates = [_found(dataset.ticks, s, drives[each], slipping) for each in sorted({0, lag})]
     found = min(candidates, key=len)
     jumps = replace(NO_JUMPS, lag=lag)
     if bump is not None:
@@ -208,14 +209,17 @@ def find_jumps(dataset: Dataset, bump: CameraBump | None = None) -> Jumps:
                  jump.sigma[0])
         jumps = jumps._with(start=start, end=end, increment=jump.increment,
                             by_odometry=jump.by_odometry, sigma=jump.sigma)
-    return replace(jumps, chance=_chance(dataset.ticks)) if found else jumps
+    return replace(jumps, chance=_chance(dataset.ticks, slipping)) if found else jumps
 
 
-def _chance(ticks):
-    """Chance (n,) of a jump in the steps up to each pose: large in spikes of the counts."""
+def _chance(ticks, slipping):
+    """Chance (n,) of a jump in the steps up to each pose.
+
+    It is large in spikes of the counts, and in rows in which the wheels are `slipping` (n,).
+    """
     counts = np.abs(ticks).max(axis=1)
     spike = counts > SPIKE * np.quantile(counts, 0.99)
-    return np.cumsum(np.where(spike, SPIKE_CHANCE, 1.0))
+    return np.cumsum(np.where(spike | slipping, SPIKE_CHANCE, 1.0))
 
 
 def _chosen_lag(s, drives):
@@ -237,8 +241,11 @@ def _cost(squared):
     return GATE * np.log1p(squared / GATE)
 
 
-def _found(ticks, s, drive):
-    """List of each _Jump in a _Drive, by Sightings sorted by marker, then by frame."""
+def _found(ticks, s, drive, slipping):
+    """List of each _Jump in a _Drive, by Sightings sorted by marker, then by frame.
+
+    All steps in which the wheels are `slipping`, a mask (n,) of the counts, are jumps.
+    """
     pairs = _compared(s, drive)
     scale = _covariance_scale(s, drive)
     pairs = replace(pairs, squared=pairs.squared / scale)
@@ -248,7 +255,8 @@ def _found(ticks, s, drive):
     s = replace(s, C=scale * s.C)
     tried = _bridged(s, drive, suspects, rank, unknown)
     dead = _dead(ticks, s.frame, [jump.step for jump in tried if jump.gain > MIN_GAIN])
-    if len(dead):
+    dead = np.union1d(dead, np.flatnonzero(_rows_in_steps(slipping, s.frame))).tolist()
+    if dead:
         unknown = dict.fromkeys(dead, 2 * _usual(drive)) | unknown
         tried = _bridged(s, drive, suspects, rank, unknown)
     return [jump for jump in tried if jump.found]

@@ -13,16 +13,20 @@ that is off by c = [x, y, turn] changes the position of an increment [p, h] by
 For each moment, weighted least squares tell c before and after it, and how much smaller the squared
 residuals are than with one c (generalised likelihood ratio: Basseville and Nikiforov,
 Detection of Abrupt Changes, 1993, section 2.4).
+
+Where wheels slip on a patch of the ground, or counts are frozen for a while, both wheels seem to
+have other radii there. The stretch is the one with the greatest likelihood ratio, and its counts
+are not used.
 """
 
 import logging
-from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
-from slamlib.core import odometry, se2
+from slamlib.core import increments, odometry, se2
 from slamlib.core.marker_increments import (
     common_sightings,
     distance_and_turn,
@@ -50,8 +54,13 @@ MAX_STRETCH = 0.5         # of the drive, in which wheels are exchanged; else th
 MIN_BUMP_GAIN = 35.0      # of squared residuals, by a camera that was moved
 MAX_BUMP = 0.3            # m and rad, of a motion of the camera
 BUMP_SIGMA = 0.2          # m and rad, of a camera about its stated place, before and after
-MEDIAN_SQUARED = 1.386    # of chi-squared with two degrees of freedom
+MEDIAN_SQUARED = {2: 1.386, 3: 2.366}    # of chi-squared, by degrees of freedom
 REWEIGHTED = 4            # times, by the residuals
+MIN_WHEELS_GAIN = 40.0    # of squared residuals, by other wheels in a stretch
+STRETCH_LENGTHS = 30      # number of lengths that are tried
+MAX_WHEELS_STRETCH = 0.3  # of the increments, longest such stretch
+WHEELS_SIGMA = 0.05       # relative, of the distances by the wheels there
+MAX_SCALE = 5.0           # of the squared residuals; beyond it wheels slip everywhere
 # The matrices A, and by their number the changes of the counts with the same effect.
 AXES = np.array([np.diag(signs) @ order for order in (np.eye(2), np.eye(2)[::-1])
                  for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1))])
@@ -63,8 +72,9 @@ EXCHANGED = (1, 3)
 REVERSED = (2, 3)
 
 
+@lru_cache(maxsize=1)
 def moving_increments(
-        dataset: Dataset, signs: Sequence[int] = (1, -1)
+        dataset: Dataset, signs: tuple[int, ...] = (1, -1)
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Increments of the moving vehicle between n pairs of frames about SPAN apart.
 
@@ -98,7 +108,7 @@ def with_wheels_mended(dataset: Dataset) -> Dataset:
     It is as it was where that is most of the drive: then the camera may as well have other axes. Of
     all ends of the stretch nearby, the increments agree best with the one that is chosen.
     """
-    markers, wheels, sigma, poses = moving_increments(dataset, signs=[1])
+    markers, wheels, sigma, poses = moving_increments(dataset, signs=(1,))
     if len(wheels) < MIN_COUNT:
         return dataset
     stretch = other_axes(contradictions(markers, wheels @ MOTIONS, sigma), poses)
@@ -231,7 +241,7 @@ def camera_bump(dataset: Dataset) -> CameraBump | None:
 
     The moment is that step in the neighbourhood in which markers move most as the camera does.
     """
-    markers, wheels, sigma, poses = moving_increments(dataset, signs=[1])
+    markers, wheels, sigma, poses = moving_increments(dataset, signs=(1,))
     if len(wheels) <= 2 * MIN_COUNT:
         return None
     k, motion, gain = _moved_camera(markers[0], wheels, sigma)
@@ -283,16 +293,55 @@ def _moved_camera(markers, wheels, sigma):
         k = MIN_COUNT + int(gain[MIN_COUNT:-MIN_COUNT].argmax())
         camera = np.where((np.arange(len(e)) <= k)[:, None, None], before[k], after[k])
         squared = np.sum((left - by_camera @ camera)**2, axis=(1, 2)) / variance
-        scale = max(1.0, np.median(squared) / MEDIAN_SQUARED)
+        scale = max(1.0, np.median(squared) / MEDIAN_SQUARED[2])
         weight = 1 / (scale + squared / GATE) / variance
     return k + 1, (after[k] - before[k])[:, 0], gain[k] / OVERLAP
 
 
-def _least_squares(information, right):
-    """Least squares (..., q, 1) about 0, sigmas BUMP_SIGMA, and the squared residuals they save.
+def _least_squares(information, right, sigma=BUMP_SIGMA):
+    """Least squares (..., q, 1) about 0 with a prior sigma, and the squared residuals they save.
 
     By information (..., q, q) and right-hand sides (..., q, 1) without this prior.
     """
-    prior = np.eye(information.shape[-1]) / BUMP_SIGMA**2
+    prior = np.eye(information.shape[-1]) / sigma**2
     found = np.linalg.solve(information + prior, right)
     return found, np.sum(right * found, axis=(-2, -1))
+
+
+def slipping_rows(dataset: Dataset) -> np.ndarray:
+    """Rows of counts (n,), bool, in a stretch in which both wheels seem to have other radii."""
+    rows = np.zeros(len(dataset.ticks), bool)
+    markers, wheels, sigma, poses = moving_increments(dataset, signs=(1,))
+    if len(wheels) <= 2 * MIN_COUNT:
+        return rows
+    vehicle = dataset.vehicle
+    _, by_wheel = increments.between_poses(dataset.ticks, vehicle, *poses.T, "arc")
+    J = by_wheel[:, :, :2] * vehicle.wheel[:2]
+    e = se2.difference(markers[0], wheels)[:, :, None]
+    variance = sigma[:, [0, 0, 1]]**2 / [2, 2, 1]
+    weighted = (J / variance[:, :, None]).mT
+    kept = np.ones((len(e), 1, 1))
+    for _ in range(REWEIGHTED):
+        common, _ = _least_squares(np.sum(kept * weighted @ J, axis=0),
+                                   np.sum(kept * weighted @ e, axis=0), WHEELS_SIGMA)
+        left = e - J @ common
+        squared = np.sum(left[:, :, 0]**2 / variance, axis=1)
+        scale = max(1.0, np.median(squared) / MEDIAN_SQUARED[3])
+        kept[:, 0, 0] = 1 / (scale + squared / GATE)
+    if scale > MAX_SCALE:
+        return rows
+    information = odometry.cumulative(weighted @ J / scale)
+    right = odometry.cumulative(weighted @ left / scale)
+    best = 0.0
+    longest = max(MIN_COUNT, int(MAX_WHEELS_STRETCH * len(e)))
+    for length in np.unique(np.geomspace(MIN_COUNT, longest, STRETCH_LENGTHS).astype(int)):
+        _, gain = _least_squares(information[length:] - information[:-length],
+                                 right[length:] - right[:-length], WHEELS_SIGMA)
+        if gain.max() > best:
+            best = gain.max()
+            first = gain.argmax()
+            last = first + length - 1
+    if best > MIN_WHEELS_GAIN * OVERLAP:
+        rows[poses[first, 0] + 1:poses[last, 1] + 1] = True
+        log.info("wheels: slip from pose %d to %d", poses[first, 0] + 1, poses[last, 1] + 1)
+    return rows
