@@ -14,9 +14,8 @@ For each moment, weighted least squares tell c before and after it, and how much
 residuals are than with one c (generalised likelihood ratio: Basseville and Nikiforov,
 Detection of Abrupt Changes, 1993, section 2.4).
 
-Where wheels slip on a patch of the ground, or counts are frozen for a while, both wheels seem to
-have other radii there. The stretch is the one with the greatest likelihood ratio, and its counts
-are not used.
+Where wheels slip on a patch of the ground, both seem to have other radii there. The stretch is the
+one with the greatest likelihood ratio, and its counts are not used.
 """
 
 import logging
@@ -56,7 +55,7 @@ MAX_BUMP = 0.3            # m and rad, of a motion of the camera
 BUMP_SIGMA = 0.2          # m and rad, of a camera about its stated place, before and after
 MEDIAN_SQUARED = {2: 1.386, 3: 2.366}    # of chi-squared, by degrees of freedom
 REWEIGHTED = 4            # times, by the residuals
-MIN_WHEELS_GAIN = 40.0    # of squared residuals, by other wheels in a stretch
+MIN_WHEELS_GAIN = 25.0    # of squared residuals, by other wheels in a stretch
 STRETCH_LENGTHS = 30      # number of lengths that are tried
 MAX_WHEELS_STRETCH = 0.3  # of the increments, longest such stretch
 WHEELS_SIGMA = 0.05       # relative, of the distances by the wheels there
@@ -330,8 +329,8 @@ def slipping_rows(dataset: Dataset) -> np.ndarray:
         kept[:, 0, 0] = 1 / (scale + squared / GATE)
     if scale > MAX_SCALE:
         return rows
-    information = odometry.cumulative(weighted @ J / scale)
-    right = odometry.cumulative(weighted @ left / scale)
+    information = odometry.cumulative(kept * weighted @ J)
+    right = odometry.cumulative(kept * weighted @ left)
     best = 0.0
     longest = max(MIN_COUNT, int(MAX_WHEELS_STRETCH * len(e)))
     for length in np.unique(np.geomspace(MIN_COUNT, longest, STRETCH_LENGTHS).astype(int)):
