@@ -31,10 +31,8 @@ def write_solution(folder: Path | str, solution):
     """Write the .mat files of a Solution into folder/<problem>/."""
     own = Path(folder) / solution.problem
     write_structs(own, "vehiclePose", None, solution.poses, solution.covariances)
-    if solution.aruco_map is not None:
-        write_structs(own, "ArucoMap", *solution.aruco_map)
-    if solution.uwb_map is not None:
-        write_structs(own, "UwbMap", *solution.uwb_map)
+    for name, values in solution.maps.items():
+        write_structs(own, name, *values)
 
 
 def write_summary(folder: Path | str, summary: dict):

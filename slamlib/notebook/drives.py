@@ -108,7 +108,8 @@ def attempt(drive: Drive, problem: str | None = None) -> Iterator[None]:
             _say(drive, f"left out here: {error}.")
         else:
             failure = _written(drive, problem, error)
-            _say(drive, f"The problem “{failure.title}” could not be solved: {failure.reason}.")
+            title = solve.PROBLEMS[problem].title
+            _say(drive, f"The problem “{title}” could not be solved: {failure.reason}.")
 
 
 def _written(drive, problem, found):

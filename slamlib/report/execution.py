@@ -2,11 +2,9 @@
 
 import asyncio
 import os
-import sys
 import time
 from collections.abc import Callable
 from copy import deepcopy
-from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -17,15 +15,10 @@ from nbclient.exceptions import CellExecutionError
 from nbconvert.filters import strip_ansi
 from nbconvert.preprocessors import CoalesceStreamsPreprocessor
 
-from slamlib.core.errors import require
 from slamlib.report.notebooks import LAB_ONLY, Books, NotebookError
 
 # The matrices are small: more threads cost time.
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-LAB_SETTINGS = Path(__file__).parent / "lab"       # overrides.json: no question when it opens
-# As root, as in containers: it listens to this machine alone.
-LAB_OPTIONS = (f"--LabApp.app_settings_dir={LAB_SETTINGS}", "--allow-root",
-               "--LabApp.check_for_updates_class=jupyterlab.NeverCheckForUpdate")
 
 
 class _Loop(asyncio.SelectorEventLoop):
@@ -102,11 +95,3 @@ async def _execute(source, book, environment):
         if manager.has_kernel:
             await manager.shutdown_kernel(now=True)
     CoalesceStreamsPreprocessor().preprocess(book, {})  # kernels divide them by time
-
-
-def start_lab(notebooks: Path, data: Path, arguments: list[str]):
-    """Replace this process by JupyterLab on the notebooks, with its `arguments`."""
-    require(find_spec("jupyterlab"), "lab", "JupyterLab, as by pip install jupyterlab", "none")
-    command = [sys.executable, "-m", "jupyterlab", *LAB_OPTIONS, *arguments, str(notebooks)]
-    environment = ONE_THREAD | os.environ | {"SLAMLIB_DATA": str(data.resolve())}
-    os.execve(sys.executable, command, environment)
