@@ -90,7 +90,7 @@ def _build(options):
             "another folder of the datasets: this one is for the results")
     try:
         report = build_report(notebooks_folder(), options.data, pages, RESULTS,
-                              options.datasets or None, shown, kept=EXECUTED_NOTEBOOKS)
+                              EXECUTED_NOTEBOOKS, options.datasets or None, shown)
     except NotebookError as error:
         return _ended(1, error)
     if not shown.author:
