@@ -47,7 +47,7 @@ class Table:
     @property
     def name(self) -> str:
         """Name of the file without its folder, or of the argument."""
-        return Path(str(self.source)).name
+        return Path(self.source).name
 
     def noted(self, note: str) -> "Table":
         """The Table with one more note, a clause about its file."""
@@ -111,14 +111,14 @@ def read_table(source: Path | Table | None, name: str, pose_count: int | None = 
 
 
 def table_of_array(source: str, value, columns) -> Table:
-    """The Table of a `value` with these columns, without rows if it is empty or None.
+    """The Table of a `value` with these columns, without rows if it is empty.
 
     Raises DatasetError, which names the `source`, if it is no matrix of numbers.
     """
     count = len(columns)
     expected = f"a matrix of numbers with {count} columns ({', '.join(columns)})"
     try:
-        array = np.asarray([] if value is None else value, float)
+        array = np.asarray(value, float)
     except (TypeError, ValueError):
         require(False, source, expected, value)
     if array.size == 0:
@@ -190,11 +190,11 @@ def contents(folder: Path | str, expected: tuple[str, ...] = DATASET_FILES,
 def _matrices(path, names):
     """Tables (dict by name) of the matrices of a .mat file that have the stems of `names`."""
     tables = {}
-    if path.suffix.lower() != ".mat" or not path.is_file():
+    if path.suffix.lower() != ".mat":
         return tables
     try:
         variables = loadmat(path)
-    except Exception:  # scipy raises many kinds about other versions and bytes
+    except Exception:  # scipy raises many kinds about folders, other versions and bytes
         return tables
     for variable, value in variables.items():
         for name in names:

@@ -20,7 +20,7 @@ from slamlib.report.notebooks import LAB_ONLY, Books, NotebookError
 JOBS = 2      # notebooks at a time
 # Pages are equal every time. The matrices are small: more threads cost time.
 DEFAULTS = {"SOURCE_DATE_EPOCH": "0", "PYTHONHASHSEED": "0", "OPENBLAS_NUM_THREADS": "1",
-            "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+            "OMP_NUM_THREADS": "1"}
 
 
 class _Loop(asyncio.SelectorEventLoop):
