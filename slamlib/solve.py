@@ -57,7 +57,7 @@ SENSORS = {"aruco": "markers", "uwb": "UWB ranges"}
 VEHICLE_ESTIMATED = "vehicle.toml"                  # in the results: what the drive says of it
 NOISE = {"slip": "slip_sqrt_m", "marker_noise_factor": "marker_noise_factor",
          "range_noise_factor": "range_noise_factor"}    # entries of vehicle.toml, keys of facts
-DRIVES = "drives.csv"                               # the table over all drives, and its columns
+# Columns of the table over all drives.
 COLUMNS = ["dataset", "problem", "estimated_poses", "ate_m", "ate_aligned_m", "nees",
            "last_sigma_m", "slip_sqrt_m", "doubts", "seconds", "failed"]
 
@@ -371,7 +371,7 @@ def solve_folder(folder: Path | str, out: Path | str, problems: Collection[str] 
     if verbose:
         logging.basicConfig(format="%(message)s")
         logging.getLogger("slamlib").setLevel(logging.INFO)
-    require(not out.resolve().is_relative_to(folder.resolve()), out,
+    require(out.resolve() not in (folder.resolve(), folder.resolve() / "truth"), out,
             "another folder for the results: this one is the dataset's")
     dataset = read_dataset(folder)
     truth = read_truth(folder)
@@ -410,7 +410,7 @@ def solve_folders(folders: Sequence[Path | str], out: Path | str, jobs: int | No
     summaries = Parallel(n_jobs=jobs)(
         solve(folder, out / name, **options) for name, folder in by_name.items())
     table = drive_table(summaries).to_csv(index=False)
-    files.write_file(out / DRIVES, table.encode())
+    files.write_file(out / "drives.csv", table.encode())
     return summaries
 
 

@@ -12,13 +12,17 @@ from slamlib import estimate
 from slamlib.core import se2
 from slamlib.core.evaluation import anees, ate, nees, nees_band
 from slamlib.core.records import ArucoReadings
-from slamlib.studies import montecarlo
 from slamlib.studies.montecarlo import antenna_error
+from slamlib.studies.simulation import simulate
 
 REAL_LOGS = Path(__file__).parents[2] / "shared" / "real_logs"      # where they are present
-short = montecarlo.drive           # a simulated drive of the short path, or its first poses
 on_real_logs = pytest.mark.skipif(
     not REAL_LOGS.is_dir(), reason="the public robot logs are not here")
+
+
+def short(seed, poses=None, path="short", **options):
+    """A simulated drive, or its first poses."""
+    return simulate(path, seed, poses=poses, **options)
 
 
 def central_differences(function, x, step=1e-6):

@@ -28,7 +28,6 @@ from slamlib.io.formats import (
 from slamlib.io.textfile import cells_of, read_rows
 
 MAX_BAD_SHARE = 0.1  # of the rows of a sensor, which are left out; with more a file is refused
-LISTED_LENGTH = 100  # letters, of the names in one sentence
 NUMBER = r"(?i)(^|[\s,;])\W*(\d|nan\b|inf\b)"  # in a row that is no header
 # What may stand after a name without its ending, as browsers and Windows leave it.
 ENDING = r"( ?\(\d+\))?(\.(txt|csv|tsv|dat|toml))*"
@@ -190,11 +189,11 @@ def contents(folder: Path | str, expected: tuple[str, ...] = DATASET_FILES,
 def _matrices(path, names):
     """Tables (dict by name) of the matrices of a .mat file that have the stems of `names`."""
     tables = {}
-    if path.suffix.lower() != ".mat":
+    if path.suffix.lower() != ".mat" or not path.is_file():
         return tables
     try:
         variables = loadmat(path)
-    except Exception:  # scipy raises many kinds about folders, other versions and bytes
+    except Exception:  # scipy raises many kinds about other versions and bytes
         return tables
     for variable, value in variables.items():
         for name in names:
@@ -235,4 +234,4 @@ def _not_read(paths):
     if not paths:
         return []
     names = ", ".join(repr(path.name) for path in paths)
-    return [f"Not read: {shorten(names, LISTED_LENGTH, placeholder=' ...')}."]
+    return [f"Not read: {shorten(names, 100, placeholder=' ...')}."]

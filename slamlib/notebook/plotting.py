@@ -54,7 +54,6 @@ ROLES = {
 }
 STYLE = Path(__file__).with_name("slamlib.mplstyle")  # for matplotlib.style
 MAX_SEMI_AXIS = 0.08         # of enlarged 95 % ellipses, in the larger extent of the path
-LABEL_WIDTH = 1.8            # inches, of a label in a legend
 MAX_BANDS = 800              # poses at which errors are drawn
 MIN_POINT_VARIANCE = 1.0     # rad^2, variance of the heading of a marker without orientation
 
@@ -259,7 +258,7 @@ def legend_below(fig: Figure) -> None:
     fig.legends.clear()
     if entries:
         fig.legend(entries.values(), entries.keys(), loc="outside lower center",
-                   ncols=int(fig.get_figwidth() / LABEL_WIDTH))
+                   ncols=int(fig.get_figwidth() / 1.8))        # inches, of a label
 
 
 def curve(ax: Axes, values: np.ndarray, role: str, frame: np.ndarray | None = None,
