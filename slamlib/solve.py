@@ -233,8 +233,8 @@ def write_results(out: Path | str, problem: str, found, dataset: Dataset,
     >>> from slamlib.studies.simulation import simulate
     >>> dataset, truth = simulate("short", seed=1)
     >>> found = odometry.equation2(dataset.ticks, dataset.vehicle)
-    >>> write_results("results/short", "problem1", found, dataset, truth).title
-    'odometry'
+    >>> write_results("results/short", "problem1", found, dataset, truth).problem
+    'problem1'
     >>> results.read_summary("results/short")["problems"]["problem1"]["estimated_poses"]
     2000
     """

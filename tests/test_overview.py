@@ -130,8 +130,8 @@ def test_errors_are_those_in_the_frame_of_the_first_pose_with_an_estimate():
 
 
 def test_the_pictures_are_the_same_every_time_and_need_no_display(project):
-    text = picture_of(project.summary)
-    assert text == picture_of(overview.opening(project.drives)) and text.count("<path") > 10
+    text = picture_of(overview.opening(project.drives[:2]))
+    assert text == picture_of(overview.opening(project.drives[:2])) and text.count("<path") > 10
     assert not re.search(r"<dc:date|/tmp/|http://(?!www.w3.org|purl.org|creativecommons)", text)
     for role in ("slam_uwb", "fused", "hint"):
         assert plotting.ROLES[role]["color"].lower() in text

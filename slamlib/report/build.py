@@ -56,10 +56,10 @@ def build_report(notebooks: Path, data: Path, report: Path, results: Path, kept:
     drives = _read(data, datasets)
     books = _with_what_they_need(books, drives)
     with files.locked(kept):
-        _execute(books, drives, data, kept)
+        keys = _execute(books, drives, data, kept)
         stages = [kept / source.stem / cache.RESULTS for source in books]
         summaries = [_write_results(drive, stages, results / drive.name) for drive in drives]
-        names = _write_pages(books, drives, summaries, options, results, report)
+        names = _write_pages(books, keys, drives, summaries, options, results, report)
     return Report([report / name for name in names], summaries)
 
 
@@ -100,7 +100,7 @@ def _with_what_they_need(books, drives):
 
 
 def _execute(books, drives, data, kept):
-    """Execute books, or recall their outputs, which are put into them."""
+    """Execute books, or recall their outputs, which are put into them; return their keys."""
     names = [drive.name for drive in drives]
     keys = cache.keys(books, [data / name for name in names])
     results = {}
@@ -127,6 +127,7 @@ def _execute(books, drives, data, kept):
     if results:
         from slamlib.report.execution import execute  # here and below: what is slow to import
         execute(books, data, names, results, finish)
+    return keys
 
 
 def _write_results(drive, stages, folder):
@@ -146,13 +147,13 @@ def _write_results(drive, stages, folder):
     return summary
 
 
-def _write_pages(books, drives, summaries, options, results, report):
+def _write_pages(books, keys, drives, summaries, options, results, report):
     """Set books as pages and a PDF in a report, unless they are there; return their names.
 
     Those of an earlier build that are not made now are removed.
     """
     look = sorted(Path(__file__).parent.glob("*.*"))
-    key = joblib.hash([options, summaries, [*books.values()], [file.read_bytes() for file in look]])
+    key = joblib.hash([options, keys, summaries, books, [file.read_bytes() for file in look]])
     listed = report / PAGES
     earlier = []
     if listed.exists():

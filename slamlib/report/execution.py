@@ -38,7 +38,7 @@ def execute(books: Books, data: Path, datasets: list[str], results: dict[Path, P
     notebook writes its files to its own folder, SLAMLIB_RESULTS, of `results`. When one has ended,
     finish(Path, the executed notebook, seconds) is called. NotebookError if a cell failed.
     """
-    with TemporaryDirectory(prefix="slamlib-", ignore_cleanup_errors=True) as settings:
+    with TemporaryDirectory(ignore_cleanup_errors=True) as settings:
         environment = DEFAULTS | os.environ | {
             "SLAMLIB_DATA": str(data),
             "SLAMLIB_DATASETS": "\n".join(datasets),
