@@ -411,7 +411,7 @@ def test_datasets_are_the_folders_with_any_file_of_one_and_all_others_are_named(
 def test_what_was_found_is_said(folder):
     assert inventory_lines(read_dataset(folder), read_truth(folder)) == [
         "drive: encoders: 4 poses",
-        "drive: markers: 3 at 2 poses", "drive: ranges: 2 at 2 poses", "drive: truth: yes"]
+        "drive: sightings: 3 at 2 poses", "drive: ranges: 2 at 2 poses", "drive: truth: yes"]
 
 
 def test_what_was_not_found_is_said(folder):
@@ -419,4 +419,4 @@ def test_what_was_not_found_is_said(folder):
         (folder / name).unlink()
     write(folder / "UwbReading.txt", "# none\n")
     assert inventory_lines(read_dataset(folder), None)[1:] == [
-        "drive: markers: none", "drive: ranges: none", "drive: truth: no"]
+        "drive: sightings: none", "drive: ranges: none", "drive: truth: no"]

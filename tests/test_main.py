@@ -50,7 +50,7 @@ def test_what_simulate_writes_is_what_solve_reads(tmp_path):
     write_dataset(tmp_path / "drive", expected, truth)
     done = run("solve", "drive", "--out", "out", "--problem", 1, cwd=tmp_path)
     assert [line.split(":")[1] for line in done.stderr.splitlines()] == [
-        " encoders", " markers", " ranges", " truth", f" {tmp_path / 'out'}"]
+        " encoders", " sightings", " ranges", " truth", f" {tmp_path / 'out'}"]
     header, row = done.stdout.splitlines()
     assert "ate_m" in header and row.split()[:3] == ["drive", "problem1", "2000"]
     found = read_dataset(tmp_path / "drive")

@@ -132,7 +132,7 @@ THREE = np.array([1.0, 2.0, 6.0])      # mean 3, median 2, standard error 1.53
 
 @pytest.mark.parametrize("value, text", [
     (12345.6, "12,346"), (12.345, "12.3"), (0.1234, "0.123"), (-12.34, "−12.3"), (0.0, "0"),
-    (12345, "12,345"), (None, "–"), (np.nan, "–"),
+    (2e6, "> 10⁶"), (12345, "12,345"), (None, "–"), (np.nan, "–"),
     ("a-1", "a-1"), (THREE, "3.0 ± 1.5 (2.0)"), (1e3 * THREE, "3,000 ± 1,528 (2,000)"),
     (THREE[:1], "1.00 (1.00)")])
 def test_a_cell_has_three_digits_or_those_that_its_standard_error_leaves(value, text):

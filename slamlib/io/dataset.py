@@ -214,7 +214,7 @@ def all_notes(dataset: Dataset, truth: Truth | None) -> tuple[str, ...]:
 def inventory_lines(dataset: Dataset, truth: Truth | None) -> list[str]:
     """Lines on what was read of a Dataset and its Truth, with all notes."""
     lines = [f"encoders: {len(dataset.ticks)} poses"]
-    for name, readings in (("markers", dataset.aruco), ("ranges", dataset.uwb)):
+    for name, readings in (("sightings", dataset.aruco), ("ranges", dataset.uwb)):
         if readings is None:
             lines.append(f"{name}: none")
         else:

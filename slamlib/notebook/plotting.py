@@ -41,7 +41,6 @@ def _sign(color, marker, size, zorder):
 ROLES = {
     "truth": _line("black", 1.1, (4, 2)),
     "odometry": _line("#D55E00", 1.5),
-    "exact": _line("#332288", 1.5),
     "aruco": _line("#CC79A7", 1.7, (1.2, 0.8)),
     "fused": _line("#009E73", 1.8, (4.5, 1.6)),
     "hint": _line("#E69F00", 1.5, (5, 1, 1, 1)),
@@ -153,15 +152,15 @@ def errors(axes: Sequence[Axes], result, drive, role: str = "slam") -> Sequence[
     return axes
 
 
-def own_axes(ax: Axes, covariance: np.ndarray, role: str, points: np.ndarray, **look) -> Axes:
-    """Draw the 95 % ellipse of a covariance (>= 2, >= 2) about zero along its own axes, in mm.
+def own_axes(ax: Axes, covariance: np.ndarray, points: np.ndarray, **look) -> Axes:
+    """Draw the 95 % ellipse of a covariance (>= 2, >= 2) by odometry along its own axes, in mm.
 
     Each axis has its own scale, so that a needle becomes an ellipse. Crosses are `points` (m, >= 2)
     relative to its centre, in m, in the axes of the covariance.
     """
     variances, directions = np.linalg.eigh(covariance[:2, :2])
     along_and_across = np.diag(1e6 * variances[::-1])                    # mm^2
-    ellipses(ax, np.zeros((1, 2)), along_and_across[None], ROLES[role]["color"])
+    ellipses(ax, np.zeros((1, 2)), along_and_across[None], ROLES["odometry"]["color"])
     x, y = 1e3 * directions.T[::-1] @ points[:, :2].T
     ax.plot(x, y, **ROLES["true place"] | look)
     ax.set(xlabel="along the ellipse (mm)", ylabel="across (mm)")

@@ -64,6 +64,8 @@ def cell(value) -> str:
 
 def number(value: float, decimals: int | None = None) -> str:
     """A value with three significant digits, or this number of decimals (str)."""
+    if abs(value) > 1e6:                       # the method failed
+        return "> 10⁶"
     if decimals is None:
         decimals = _decimals(value, 3, at_most=6) if value else 0
     return f"{value:z,.{decimals}f}".replace("-", "−")
