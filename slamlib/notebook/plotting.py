@@ -49,7 +49,7 @@ ROLES = {
     "slam_uwb": _line("#56B4E9", 2.2, (6, 1.5)),
     "antenna": _sign("#222222", "^", 6, zorder=5),
     "guess": _sign("#222222", "^", 7, zorder=4) | {"markerfacecolor": "none"},
-    "true place": _sign("black", "+", 6, zorder=6),
+    "true place": _sign("black", "+", 5, zorder=6),
 }
 STYLE = Path(__file__).with_name("slamlib.mplstyle")  # for matplotlib.style
 MAX_SEMI_AXIS = 0.08         # of enlarged 95 % ellipses, in the larger extent of the path
