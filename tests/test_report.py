@@ -162,7 +162,7 @@ def test_a_problem_that_fails_costs_one_problem_and_exit_code_3(tmp_path, monkey
     monkeypatch.chdir(tmp_path)
     for progress in "executed in", "nothing changed":
         assert main(["report"]) == 3
-        told = capsys.readouterr().err
+        told = "".join(capsys.readouterr())
         assert f"1 of 1: 1_solve, {progress}" in told
         assert "bad: problem2 could not be solved: expected sightings" in told
     text = html.unescape((tmp_path / "report" / "index.html").read_text(encoding="utf-8"))
