@@ -12,7 +12,6 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from slamlib.core.errors import DatasetError, require  # noqa: E402
 
 RESULTS = Path("results")  # folder of the .mat files of a build
-PAGES = Path("report")  # that of the pages
 EXECUTED_NOTEBOOKS = Path("build", "executed")  # folder in which executed notebooks are kept
 HAND_IN = Path("hand-in.zip")
 HAND_IN_PAGES = Path("build", "hand-in")  # folder of the report that is handed in
@@ -82,7 +81,7 @@ def _build(options):
     from slamlib.report import NotebookError, build_report, handin
     from slamlib.report.notebooks import notebooks_folder, read_options
     shown = read_options("report.toml")
-    pages = PAGES
+    pages = Path("report")
     if options.command == "hand-in":
         shown = handin.hand_in_options(shown)
         pages = HAND_IN_PAGES

@@ -116,34 +116,31 @@ def problem_solution(problem: str, dataset: Dataset, found) -> Solution:
     """
     if problem == "problem1":
         found = Fusion(*found, rejected=0)
+    maps = {}
+    if hasattr(found, "marker"):
+        maps["ArucoMap"] = found.marker, found.marker_in_world, found.marker_covariance
+    if hasattr(found, "antenna"):
+        maps["UwbMap"] = found.antenna, found.antenna_in_world, found.antenna_covariance
     is_known = np.isfinite(found.poses[:, 0])
     covariances = [found.covariances[is_known]]
-    maps = {}
-    doubts = ()
-    if problem in ("problem2", "problem3", "problem4"):
-        maps["ArucoMap"] = found.marker, found.marker_in_world, found.marker_covariance
-    if problem in ("problem3", "problem4"):
-        maps["UwbMap"] = found.antenna, found.antenna_in_world, found.antenna_covariance
+    covariances += [each for _, _, each in maps.values()]
+    if isinstance(found, SlamResult):
         covariances.append(found.c_covariance)
-        doubts = solution_doubts(found)
+    for each in covariances:
+        variances = np.diagonal(each, axis1=-2, axis2=-1)
+        if not np.all((variances >= 0) & (variances < np.inf)):
+            raise np.linalg.LinAlgError("a variance is negative or not finite")
+    doubts = ()
     if problem == "problem2_fused":
         doubts = fusion_doubts(found, dataset.vehicle)
-    covariances += [each for _, _, each in maps.values()]
-    _require_variances(covariances)
+    if isinstance(found, SlamResult):
+        doubts = solution_doubts(found)
     maps = {name: values for name, values in maps.items() if len(values[0])}
     solution = Solution(problem, found.poses, found.covariances, maps=maps, facts=_facts(found),
                         doubts=doubts)
     if problem == "problem2":
         return _at_all_poses(solution, found.frame, len(dataset.ticks))
     return solution
-
-
-def _require_variances(all_covariances):
-    """Raise LinAlgError if a variance of several covariances (..., d, d) was lost by rounding."""
-    for covariances in all_covariances:
-        variances = np.diagonal(covariances, axis1=-2, axis2=-1)
-        if not np.all((variances >= 0) & (variances < np.inf)):
-            raise np.linalg.LinAlgError("a variance is negative or not finite")
 
 
 def _at_all_poses(solution, frame, count):
