@@ -8,7 +8,7 @@ datasets.
 import logging
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -19,6 +19,7 @@ import numpy as np
 from slamlib import estimate, fuse, fuse_increments, localize
 from slamlib.core import evaluation, odometry, se2
 from slamlib.core.errors import DatasetError, require
+from slamlib.core.hint import Fusion
 from slamlib.core.records import Dataset, Truth
 from slamlib.io import files, results
 from slamlib.io.dataset import (
@@ -32,7 +33,6 @@ from slamlib.robust.file_doubts import Doubt, doubts_before_solving, merged
 from slamlib.robust.result import SlamResult
 from slamlib.robust.solution_doubts import fusion_doubts, solution_doubts
 
-log = logging.getLogger(__name__)
 UNSOLVABLE = (DatasetError, np.linalg.LinAlgError)  # what `find` raises where there is no solution
 
 
@@ -40,47 +40,37 @@ class Task(NamedTuple):
     """What a problem is called, and what it needs."""
 
     title: str
-    sensors: tuple[str, ...]     # attributes of Dataset
+    sensor: str | None           # attribute of Dataset
     role: str                    # in figures (`notebook.plotting.ROLES`)
 
 
 # Every problem in the order of solution, by the name of its results folder.
 PROBLEMS = {
-    "problem1": Task("odometry", (), "odometry"),
-    "problem2": Task("ArUco", ("aruco",), "aruco"),
-    "problem2_hint": Task("odometry + ArUco, hint", ("aruco",), "hint"),
-    "problem2_fused": Task("odometry + ArUco", ("aruco",), "fused"),
-    "problem3": Task("SLAM: odometry + ArUco", ("aruco",), "slam"),
-    "problem4": Task("SLAM: odometry + ArUco + UWB", ("uwb",), "slam_uwb"),
+    "problem1": Task("odometry", None, "odometry"),
+    "problem2": Task("ArUco", "aruco", "aruco"),
+    "problem2_hint": Task("odometry + ArUco, hint", "aruco", "hint"),
+    "problem2_fused": Task("odometry + ArUco", "aruco", "fused"),
+    "problem3": Task("SLAM: odometry + ArUco", "aruco", "slam"),
+    "problem4": Task("SLAM with UWB ranges", "uwb", "slam_uwb"),
 }
 SENSORS = {"aruco": "markers", "uwb": "UWB ranges"}
 VEHICLE_ESTIMATED = "vehicle.toml"                  # in the results: what the drive says of it
 NOISE = {"slip": "slip_sqrt_m", "marker_noise_factor": "marker_noise_factor",
          "range_noise_factor": "range_noise_factor"}    # entries of vehicle.toml, keys of facts
-DRIVES = "drives.csv"                               # the table over all drives, and its columns
+# Columns of the table over all drives.
 COLUMNS = ["dataset", "problem", "estimated_poses", "ate_m", "ate_aligned_m", "nees",
            "last_sigma_m", "slip_sqrt_m", "doubts", "seconds", "failed"]
-
-
-def title(problem: str, dataset: Dataset) -> str:
-    """Title of a problem for a Dataset; that of problem 4 tells whether markers take part."""
-    name = PROBLEMS[problem].title
-    if dataset.aruco is None:
-        return name.replace(" + ArUco + UWB", " + UWB")
-    return name
 
 
 @dataclass(frozen=True)
 class Solution:
     """Poses, maps and facts of one problem; it has every pose of the encoder file."""
 
-    problem: str                   # folder of the results
-    title: str
+    problem: str                   # key of PROBLEMS
     poses: np.ndarray              # (n, 3) in the world frame; NaN where there is no estimate
     covariances: np.ndarray        # (n, 3, 3) of [x, y, heading] in world axes
     world: int = 0                 # index from 0 of the pose whose frame is the world frame
-    aruco_map: tuple | None = None         # marker ids (k,), poses (k, 3), covariances (k, 3, 3)
-    uwb_map: tuple | None = None           # antenna ids (a,), positions (a, 2), cov. (a, 2, 2)
+    maps: dict = field(default_factory=dict)    # ids, places and covariances by name of the file
     facts: dict = field(default_factory=dict)       # plain numbers for the summary
     doubts: tuple[Doubt, ...] = ()
 
@@ -90,22 +80,13 @@ class Failure:
     """A problem that could not be solved."""
 
     problem: str
-    title: str
     reason: str                    # a sentence
 
 
 def allows(dataset: Dataset, problem: str) -> bool:
-    """True if the dataset has the sensors that a problem needs."""
-    return all(getattr(dataset, sensor) is not None for sensor in PROBLEMS[problem].sensors)
-
-
-def failure(problem: str, dataset: Dataset, error: Exception) -> Failure:
-    """The Failure by an exception of UNSOLVABLE; its reason does not name the dataset."""
-    reason = str(error).removeprefix(f"{dataset.name}: ")
-    if isinstance(error, np.linalg.LinAlgError):
-        reason = ("expected lengths and standard deviations that float64 can hold together; some "
-                  f"are so far from the others that matrices lose their digits ({reason})")
-    return Failure(problem, title(problem, dataset), reason)
+    """True if the dataset has the sensor that a problem needs."""
+    sensor = PROBLEMS[problem].sensor
+    return sensor is None or getattr(dataset, sensor) is not None
 
 
 def find(problem: str, dataset: Dataset, previous: SlamResult | None = None):
@@ -124,8 +105,8 @@ def find(problem: str, dataset: Dataset, previous: SlamResult | None = None):
     return solvers[problem]()
 
 
-def problem_solution(problem: str, dataset: Dataset, found=None) -> Solution:
-    """The Solution of a problem, from what `find` returned for it or, with None, solved here.
+def problem_solution(problem: str, dataset: Dataset, found) -> Solution:
+    """The Solution of a problem, from what `find` returned for it.
 
     Problem 1 is odometry, equation 1 with the covariance of equation 2. Problem 2 is incremental
     localization: "problem2" from the markers alone, "problem2_hint" fused as the assignment
@@ -133,46 +114,33 @@ def problem_solution(problem: str, dataset: Dataset, found=None) -> Solution:
     markers, problem 4 with ranges, too. Raises UNSOLVABLE, also where a covariance is lost by
     rounding.
     """
-    if found is None:
-        found = find(problem, dataset)
     if problem == "problem1":
-        poses, covariances = found
-    else:
-        poses = found.poses
-        covariances = found.covariances
-    is_known = np.isfinite(poses[:, 0])
-    _require_variances(covariances[is_known])
-    solution = Solution(problem, title(problem, dataset), poses, covariances)
-    if problem == "problem1":
-        return solution
-    if problem == "problem2":
-        solution = _at_all_poses(solution, found.frame, len(dataset.ticks))
+        found = Fusion(*found, rejected=0)
+    maps = {}
+    if hasattr(found, "marker"):
+        maps["ArucoMap"] = found.marker, found.marker_in_world, found.marker_covariance
+    if hasattr(found, "antenna"):
+        maps["UwbMap"] = found.antenna, found.antenna_in_world, found.antenna_covariance
+    is_known = np.isfinite(found.poses[:, 0])
+    covariances = [found.covariances[is_known]]
+    covariances += [each for _, _, each in maps.values()]
+    if isinstance(found, SlamResult):
+        covariances.append(found.c_covariance)
+    for each in covariances:
+        variances = np.diagonal(each, axis1=-2, axis2=-1)
+        if not np.all((variances >= 0) & (variances < np.inf)):
+            raise np.linalg.LinAlgError("a variance is negative or not finite")
+    doubts = ()
     if problem == "problem2_fused":
-        solution = replace(solution, doubts=fusion_doubts(found, dataset.vehicle))
-    if problem in ("problem2", "problem3", "problem4"):
-        markers = _map(found.marker, found.marker_in_world, found.marker_covariance)
-        solution = replace(solution, aruco_map=markers)
-    if problem in ("problem3", "problem4"):
-        _require_variances(found.c_covariance)
-        antennas = _map(found.antenna, found.antenna_in_world, found.antenna_covariance)
-        solution = replace(solution, uwb_map=antennas, doubts=solution_doubts(found))
-    return replace(solution, facts=_facts(found))
-
-
-def _map(ids, places, covariances):
-    """The map of a Solution by ids (k,), places (k, d), covariances (k, d, d); None without ids."""
-    _require_variances(covariances)
-    if len(ids) == 0:
-        return None
-    return ids, places, covariances
-
-
-def _require_variances(covariances):
-    """Raise LinAlgError if a variance of covariances (..., d, d) was lost by rounding."""
-    variances = np.diagonal(covariances, axis1=-2, axis2=-1)
-    is_valid = (variances >= 0) & (variances < np.inf)
-    if not is_valid.all():
-        raise np.linalg.LinAlgError("a variance is negative or not finite")
+        doubts = fusion_doubts(found, dataset.vehicle)
+    if isinstance(found, SlamResult):
+        doubts = solution_doubts(found)
+    maps = {name: values for name, values in maps.items() if len(values[0])}
+    solution = Solution(problem, found.poses, found.covariances, maps=maps, facts=_facts(found),
+                        doubts=doubts)
+    if problem == "problem2":
+        return _at_all_poses(solution, found.frame, len(dataset.ticks))
+    return solution
 
 
 def _at_all_poses(solution, frame, count):
@@ -187,8 +155,8 @@ def _at_all_poses(solution, frame, count):
 
 
 def _facts(found):
-    """Rejected sightings, slip, noise, calibration and doubtful landmarks of a result."""
-    facts = {"outliers": int(np.sum(found.rejected))}
+    """Slip, noise, calibration and doubtful landmarks of a result."""
+    facts = {}
     if getattr(found, "slip", None) is not None:
         facts["slip_sqrt_m"] = found.slip
     if not isinstance(found, SlamResult):
@@ -198,42 +166,46 @@ def _facts(found):
     if len(found.rejected):
         facts["marker_noise_factor"] = found.noise.sightings
     if len(found.antenna):
-        is_down_weighted = found.range_weight < 0.5
         facts["range_noise_factor"] = found.noise.ranges
-        facts["ranges"] = len(is_down_weighted)
-        facts["ranges_down_weighted"] = int(np.sum(is_down_weighted))
     return facts
 
 
-def solutions(dataset: Dataset, problems: Sequence[str] = tuple(PROBLEMS)
-              ) -> list[Solution | Failure]:
-    """The Solution of each of `problems` that the dataset's sensors allow, in order.
+def solved(problem: str, dataset: Dataset, found) -> Solution | Failure:
+    """The Solution from what `find` returned, or the Failure by what it raised, of UNSOLVABLE."""
+    try:
+        if isinstance(found, Exception):
+            raise found
+        return problem_solution(problem, dataset, found)
+    except UNSOLVABLE as error:
+        reason = str(error).removeprefix(f"{dataset.name}: ")
+        if isinstance(error, np.linalg.LinAlgError):
+            reason = ("expected lengths and standard deviations that float64 can hold together; "
+                      f"some are so far from the others that matrices lose their digits ({reason})")
+        return Failure(problem, reason)
+
+
+def solutions(dataset: Dataset, problems: Collection[str] = PROBLEMS) -> list[Solution | Failure]:
+    """The Solution of each of `problems` that the dataset's sensors allow, in their order.
 
     A problem that cannot be solved has a Failure. Facts include the seconds that it took.
     """
     previous = None
-    solved = []
-    for problem in problems:
-        if not allows(dataset, problem):
+    every = []
+    for problem in PROBLEMS:
+        if problem not in problems or not allows(dataset, problem):
             continue
         start = time.perf_counter()
         try:
             found = find(problem, dataset, previous)
-            if problem == "problem3":
-                previous = found
-            solution = problem_solution(problem, dataset, found)
         except UNSOLVABLE as error:
-            solved.append(failure(problem, dataset, error))
-            continue
-        seconds = time.perf_counter() - start
-        log.info("%s: %s solved in %.1f s", dataset.name, problem, seconds)
-        solved.append(replace(solution, facts=solution.facts | {"seconds": seconds}))
-    return solved
-
-
-def truth_in_world(solution: Solution, truth: Truth) -> np.ndarray:
-    """The true poses (n, 3) in the world frame of a Solution."""
-    return se2.between(truth.poses[solution.world], truth.poses)
+            found = error
+        if problem == "problem3" and isinstance(found, SlamResult):
+            previous = found
+        solution = solved(problem, dataset, found)
+        if isinstance(solution, Solution):
+            solution.facts["seconds"] = time.perf_counter() - start
+        every.append(solution)
+    return every
 
 
 def write_results(out: Path | str, problem: str, found, dataset: Dataset,
@@ -258,18 +230,13 @@ def write_results(out: Path | str, problem: str, found, dataset: Dataset,
     >>> from slamlib.studies.simulation import simulate
     >>> dataset, truth = simulate("short", seed=1)
     >>> found = odometry.equation2(dataset.ticks, dataset.vehicle)
-    >>> write_results("results/short", "problem1", found, dataset, truth).title
-    'odometry'
+    >>> write_results("results/short", "problem1", found, dataset, truth).problem
+    'problem1'
     >>> results.read_summary("results/short")["problems"]["problem1"]["estimated_poses"]
     2000
     """
     out = Path(out)
-    try:
-        if isinstance(found, Exception):
-            raise found
-        solved = problem_solution(problem, dataset, found)
-    except UNSOLVABLE as error:
-        solved = failure(problem, dataset, error)
+    solution = solved(problem, dataset, found)
     if doubts is None:
         doubts = doubts_before_solving(dataset)
     with files.locked(out):
@@ -277,12 +244,12 @@ def write_results(out: Path | str, problem: str, found, dataset: Dataset,
         with suppress(DatasetError):
             others = results.read_summary(out)["problems"]
         others.pop(problem, None)
-        _write(out, dataset, truth, [solved], others, doubts)
-    return solved
+        _write(out, dataset, truth, [solution], others, doubts)
+    return solution
 
 
 def solve_to_folder(dataset: Dataset, truth: Truth | None, out: Path,
-                    problems: Sequence[str] = tuple(PROBLEMS)) -> dict:
+                    problems: Collection[str] = PROBLEMS) -> dict:
     """Solve `problems` of a Dataset, then write their files to the folder `out`.
 
     Files of an earlier run are replaced, or removed if they belong to other problems; all other
@@ -301,14 +268,12 @@ def solve_to_folder(dataset: Dataset, truth: Truth | None, out: Path,
         return _write(out, dataset, truth, solutions(dataset, problems), {}, doubts)
 
 
-def _write(out, dataset, truth, solved, others, doubts):
-    """Write solved problems to a folder; return its summary, with the rows of `others`, too."""
-    rows = dict(others)
-    for each in solved:
-        rows[each.problem] = summarize(each, truth)
+def _write(out, dataset, truth, found, others, doubts):
+    """Write Solutions to a folder; return its summary, with the rows of `others`, too."""
+    rows = others | {each.problem: summarize(each, truth) for each in found}
     summary = summary_of(dataset, truth, rows, doubts)
     clear_results(out, keep=others)
-    for each in solved:
+    for each in found:
         if isinstance(each, Solution):
             results.write_solution(out, each)
     _write_estimated_vehicle(out / VEHICLE_ESTIMATED, dataset.vehicle, summary["problems"])
@@ -316,17 +281,16 @@ def _write(out, dataset, truth, solved, others, doubts):
     return summary
 
 
-def clear_results(out: Path, keep: Sequence[str] = ()):
+def clear_results(out: Path, keep: Iterable[str] = ()):
     """Remove the files of earlier runs from a results folder, but those of the problems `keep`.
 
     The summary is the first to go. No other file is touched, and folders stay.
     """
     (out / results.SUMMARY).unlink(missing_ok=True)
     (out / VEHICLE_ESTIMATED).unlink(missing_ok=True)
-    for problem in PROBLEMS:
+    for problem in PROBLEMS.keys() - keep:
         for name in results.RESULT_FILES:
-            if problem not in keep:
-                (out / problem / name).unlink(missing_ok=True)
+            (out / problem / name).unlink(missing_ok=True)
 
 
 def summary_of(dataset: Dataset, truth: Truth | None, rows: dict, doubts: list[Doubt]) -> dict:
@@ -334,7 +298,7 @@ def summary_of(dataset: Dataset, truth: Truth | None, rows: dict, doubts: list[D
     doubts = list(doubts)
     problems = {problem: rows[problem] for problem in PROBLEMS if problem in rows}
     for row in problems.values():
-        doubts += [Doubt(**doubt) for doubt in row.get("doubts", ())]
+        doubts += [Doubt(**doubt) for doubt in row["doubts"]]
     return {"dataset": dataset.name, "poses": len(dataset.ticks),
             "doubts": [asdict(doubt) for doubt in merged(doubts)],
             "notes": all_notes(dataset, truth), "problems": problems}
@@ -342,23 +306,22 @@ def summary_of(dataset: Dataset, truth: Truth | None, rows: dict, doubts: list[D
 
 def summarize(solved: Solution | Failure, truth: Truth | None) -> dict:
     """The row of a problem in the summary: plain numbers, of errors where there is truth."""
+    title = PROBLEMS[solved.problem].title
     if isinstance(solved, Failure):
-        return {"title": solved.title, "doubts": [], "failed": solved.reason}
-    known = np.flatnonzero(np.isfinite(solved.poses[:, 0]))
-    covariances = solved.covariances[known]
-    heading_sigmas = evaluation.sigmas(covariances)[:, 2]
-    position_sigmas = evaluation.position_sigmas(covariances)
-    row = {"title": solved.title, "doubts": [asdict(doubt) for doubt in solved.doubts],
-           "estimated_poses": len(known), "world_is_pose": solved.world + 1,
-           "last_sigma_m": float(position_sigmas[-1]),
-           "median_sigma_m": float(np.median(position_sigmas)),
-           "median_sigma_heading_rad": float(np.median(heading_sigmas))}
+        return {"title": title, "doubts": [], "failed": solved.reason}
+    is_known = np.isfinite(solved.poses[:, 0])
+    sigmas = evaluation.sigmas(solved.covariances[is_known])
+    position_sigmas = sigmas[:, :2].max(axis=1)
+    row = {"title": title, "doubts": [asdict(doubt) for doubt in solved.doubts],
+           "estimated_poses": len(sigmas), "world_is_pose": solved.world + 1,
+           "last_sigma_m": position_sigmas[-1], "median_sigma_m": np.median(position_sigmas),
+           "median_sigma_heading_rad": np.median(sigmas[:, 2])}
     row |= solved.facts
     if truth is not None:
-        true_poses = truth_in_world(solved, truth)
-        row["ate_m"] = evaluation.ate(solved.poses, true_poses)
-        row["ate_aligned_m"] = evaluation.ate(solved.poses, true_poses, aligned=True)
-        nees = evaluation.anees(solved.poses, solved.covariances, true_poses)
+        true = se2.between(truth.poses[solved.world], truth.poses)
+        row["ate_m"] = evaluation.ate(solved.poses, true)
+        row["ate_aligned_m"] = evaluation.ate(solved.poses, true, aligned=True)
+        nees = evaluation.anees(solved.poses, solved.covariances, true)
         if np.isfinite(nees):                           # not where every pose is known
             row["nees"] = nees
     return row
@@ -387,7 +350,7 @@ def _write_estimated_vehicle(path, vehicle, rows):
         write_vehicle(path, replace(vehicle, **estimated))
 
 
-def solve_folder(folder: Path | str, out: Path | str, problems: Sequence[str] = (),
+def solve_folder(folder: Path | str, out: Path | str, problems: Collection[str] = (),
                  verbose: bool = False) -> dict:
     """Read the dataset in a folder, solve it into the folder `out`; returns the summary.
 
@@ -405,16 +368,15 @@ def solve_folder(folder: Path | str, out: Path | str, problems: Sequence[str] = 
     if verbose:
         logging.basicConfig(format="%(message)s")
         logging.getLogger("slamlib").setLevel(logging.INFO)
-    own_folders = (folder.resolve(), folder.resolve() / "truth")
-    require(out.resolve() not in own_folders, out,
+    require(out.resolve() not in (folder.resolve(), folder.resolve() / "truth"), out,
             "another folder for the results: this one is the dataset's")
     dataset = read_dataset(folder)
     truth = read_truth(folder)
     print("\n".join(inventory_lines(dataset, truth)), file=sys.stderr)
     for problem in problems:
         require(allows(dataset, problem), folder,
-                f"the measurements of {problem} ({title(problem, dataset)})")
-    return solve_to_folder(dataset, truth, out, sorted(problems) or tuple(PROBLEMS))
+                f"the measurements of {problem} ({PROBLEMS[problem].title})")
+    return solve_to_folder(dataset, truth, out, problems or PROBLEMS)
 
 
 def solve_folders(folders: Sequence[Path | str], out: Path | str, jobs: int | None = None,
@@ -438,23 +400,23 @@ def solve_folders(folders: Sequence[Path | str], out: Path | str, jobs: int | No
 
     out = Path(out)
     folders = [folder for folder in map(Path, folders) if not folder.is_file()]
-    names = [folder.absolute().name for folder in folders]
-    require(len(set(names)) == len(names), out, "datasets in folders of different names, as which "
-            f"their results are written, found {', '.join(names)}")
+    by_name = {folder.absolute().name: folder for folder in folders}
+    require(len(by_name) == len(folders), out,
+            "datasets in folders of different names, as which their results are written")
     solve = delayed(_summary_or_error)
-    summaries = Parallel(n_jobs=jobs)(solve(folder, out, options) for folder in folders)
+    summaries = Parallel(n_jobs=jobs)(
+        solve(folder, out / name, **options) for name, folder in by_name.items())
     table = drive_table(summaries).to_csv(index=False)
-    files.write_file(out / DRIVES, table.encode())
+    files.write_file(out / "drives.csv", table.encode())
     return summaries
 
 
-def _summary_or_error(folder, out, options):
-    """What `solve_folder` into the folder of its name in `out` returns, or one with an error."""
-    name = folder.absolute().name
+def _summary_or_error(folder, out, **options):
+    """What `solve_folder` returns, or a summary with an error."""
     try:
-        return solve_folder(folder, out / name, **options)
+        return solve_folder(folder, out, **options)
     except (DatasetError, OSError) as error:
-        return {"dataset": name, "error": str(error), "doubts": [], "problems": {}}
+        return {"dataset": out.name, "error": str(error), "doubts": [], "problems": {}}
 
 
 def drive_table(summaries: Sequence[dict]):

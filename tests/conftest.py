@@ -101,6 +101,12 @@ def contradicted(aruco):
     return replace(twice, marker_in_vehicle=twice.marker_in_vehicle + off)
 
 
+def file_names(folder):
+    """Sorted names of all files in a folder, relative to it."""
+    paths = [path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir()]
+    return sorted(path.relative_to(folder).as_posix() for path in paths)
+
+
 def is_running(number):
     """True unless the process with this id is gone, or waits to be buried."""
     try:
@@ -134,8 +140,7 @@ def report_on_all(tmp_path_factory, kept):
     import numpy as np
 
     from slamlib.io.dataset import read_dataset, read_truth
-    from slamlib.studies import montecarlo
-    from slamlib.studies.simulation import manoeuvre, write_dataset
+    from slamlib.studies.simulation import manoeuvre, simulate, write_dataset
     folder = tmp_path_factory.mktemp("built")
     data = folder / "data"
     long = ROOT / "data" / "long"
@@ -143,7 +148,7 @@ def report_on_all(tmp_path_factory, kept):
     truth = read_truth(long)
     write_dataset(data / "long", read_dataset(long).first(900),
                   replace(truth, poses=truth.poses[:900]))
-    new, truth = montecarlo.drive(77, 300, late_ranges=0.15)
+    new, truth = simulate("short", 77, poses=300, late_ranges=0.15)
     bare = new.without("aruco").without("uwb")
     sparse = new.aruco.pose % 150 == 0
     for name, dataset, true in (
@@ -156,5 +161,5 @@ def report_on_all(tmp_path_factory, kept):
         write_dataset(data / name, dataset, true)
     copied(folder / "notebooks", "*.ipynb")
     built_elsewhere(folder / "notebooks", data, folder / "report", folder / "results",
-                    datasets=[each.name for each in data.iterdir() if each.is_dir()], kept=kept)
+                    kept, [each.name for each in data.iterdir() if each.is_dir()])
     return folder

@@ -14,6 +14,7 @@ from itertools import cycle
 from pathlib import Path
 
 import numpy as np
+from conftest import file_names
 
 from slamlib import solve
 from slamlib.io import files
@@ -26,7 +27,7 @@ LONGEST = 0.25  # s, before a kill
 
 def contents(folder):
     """Bytes of the files in a folder by name, without hidden ones."""
-    return {name: (folder / name).read_bytes() for name in files.file_names(folder)
+    return {name: (folder / name).read_bytes() for name in file_names(folder)
             if not Path(name).name.startswith(".")}
 
 

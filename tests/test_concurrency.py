@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import pytest
-from conftest import ROOT, is_running
+from conftest import ROOT, file_names, is_running
 from kills import contents
 from numeric import short
 from test_report import build, make_data, write
@@ -106,7 +106,7 @@ def test_a_run_with_fewer_sensors_removes_files_of_other_problems_and_no_other_f
     (tmp_path / "empty").mkdir()
     (tmp_path / "problem1").chmod(0o700)
     solve_to_folder(drive.without("uwb").without("aruco"), None, tmp_path)
-    assert files.file_names(tmp_path) == [
+    assert file_names(tmp_path) == [
         *mine[:1], "problem1/vehiclePose.mat", *mine[1:], "summary.json"]
     assert all((tmp_path / name).read_bytes() == b"mine" for name in mine)
     assert (tmp_path / "empty").is_dir()
@@ -147,7 +147,7 @@ def test_what_stands_in_the_place_of_a_result_is_told_and_stays(tmp_path, drive,
     files.write_file(out / "problem1" / "vehiclePose.mat" / "mine", b"mine")
     assert main(["solve", str(tmp_path / "drive"), "--out", str(out)]) == 2
     assert "problem1/vehiclePose.mat" in capsys.readouterr().err.splitlines()[-1]
-    assert files.file_names(out) == ["problem1/vehiclePose.mat/mine"]      # and no summary
+    assert file_names(out) == ["problem1/vehiclePose.mat/mine"]      # and no summary
 
 
 @pytest.fixture
@@ -159,7 +159,7 @@ def rebuilt(tmp_path):
                           "fuse_increments(drive.dataset)").replace("equation2", "fuse_increments")
     write(tmp_path / "notebooks", "1_goes", "# Goes", (other,))
     write(tmp_path / "notebooks", "2_stays", "# Stays", (RESULT,))
-    again = partial(build, tmp_path, datasets=["short"], kept=tmp_path / "kept", jobs=1)
+    again = partial(build, tmp_path, datasets=["short"], kept=tmp_path / "kept")
     again()
     for name in ("report/notes.html", "results/short/notes.txt", "results/mine/vehiclePose.mat"):
         files.write_file(tmp_path / name, b"mine")
@@ -182,9 +182,9 @@ def test_a_build_removes_what_is_no_longer_made_and_no_file_of_the_user(rebuilt)
     folder, again = rebuilt
     (folder / "notebooks" / "1_goes.ipynb").unlink()
     again()
-    assert files.file_names(folder / "report") == [
+    assert file_names(folder / "report") == [
         ".pages", "2_stays.html", "index.html", "notes.html", "report.pdf"]
-    assert files.file_names(folder / "results") == [
+    assert file_names(folder / "results") == [
         "mine/vehiclePose.mat", "short/notes.txt", "short/problem1/vehiclePose.mat",
         "short/summary.json"]
 
@@ -202,7 +202,7 @@ time.sleep(1000)""",))
     told = process.communicate(timeout=300)[1]
     assert process.returncode == 130
     assert told.splitlines()[-1] == "slamlib: ended by a signal" and "Traceback" not in told
-    assert files.file_names(tmp_path / "results") == [] and hidden(tmp_path) == []
+    assert file_names(tmp_path / "results") == [] and hidden(tmp_path) == []
     assert not is_running(int(kernel.read_text()))
 
 

@@ -20,7 +20,6 @@ MORE = Path("A_more.ipynb")
 SVG = '<svg xmlns="http://www.w3.org/2000/svg" width="20" height="9"><path d="M0 0L9 9"/></svg>'
 TABLE = "| a | b |\n| --- | ---: |\n| 1 | 2 |\n\n"
 HIDDEN = {"tags": ["hide-input"]}
-ON_SCREEN = {"tags": ["html-only"]}
 
 
 def titled(title, *cells):
@@ -219,12 +218,6 @@ def test_a_name_stays_the_same_text_in_markdown(name):
     assert "<script" not in found and "<svg onload" not in found
     said = re.findall(r"<(?:p|td)[^>]*>(x .*?)</(?:p|td)>", found, re.DOTALL)
     assert [html.unescape(" ".join(each.split())) for each in said] == 2 * [f"x {name}"]
-
-
-def test_cells_for_the_screen_are_not_printed(tmp_path):
-    found, content = page(new_markdown_cell("Moves.", metadata=ON_SCREEN), "Stands.")
-    text = text_of(content, tmp_path)
-    assert "Moves" in found and "Moves" not in text and "Stands" in text
 
 
 def test_a_report_has_contents_a_title_page_and_equal_bytes(tmp_path):

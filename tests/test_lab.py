@@ -2,17 +2,16 @@
 
 import json
 import os
+import re
+import shlex
 import subprocess
 import sys
 import time
 
 import pytest
 from conftest import ROOT, copied
-from test_report import make_data
 
-from slamlib.__main__ import main
 from slamlib.io.dataset import read_dataset
-from slamlib.report import execution
 from slamlib.studies.simulation import write_dataset
 
 SECONDS = 300
@@ -30,11 +29,13 @@ def lab(tmp_path_factory):
     for name in ("HOME", "IPYTHONDIR", "JUPYTER_CONFIG_DIR", "JUPYTER_DATA_DIR",
                  "JUPYTER_RUNTIME_DIR", "JUPYTERLAB_SETTINGS_DIR", "JUPYTERLAB_WORKSPACES_DIR"):
         environment[name] = str(folder / name.lower())
+    recipe = subprocess.run(
+        ["make", "-n", "lab", "ARGS=--no-browser --ip 127.0.0.1 --port 0"], cwd=ROOT, check=True,
+        text=True, capture_output=True).stdout.replace("\\\n", " ")
+    options = shlex.split(re.search("-m jupyterlab (.*)", recipe)[1])
     with open(folder / "log", "w") as log:
-        server = subprocess.Popen(
-            [sys.executable, "-m", "slamlib", "lab", "--no-browser", "--ip", "127.0.0.1",
-             "--port", "0"],
-            cwd=folder, env=environment, stdout=log, stderr=subprocess.STDOUT)
+        server = subprocess.Popen([sys.executable, "-m", "jupyterlab", *options], cwd=folder,
+                                  env=environment, stdout=log, stderr=subprocess.STDOUT)
     try:
         yield _started(server, folder)
     finally:
@@ -51,29 +52,6 @@ def _started(server, folder):
                 return json.loads(text)
         time.sleep(0.1)
     pytest.fail("JupyterLab did not start:\n" + (folder / "log").read_text()[-2000:])
-
-
-def test_jupyterlab_replaces_the_command_and_kernels_see_the_data(tmp_path, monkeypatch):
-    """But no SLAMLIB_RESULTS, by which a cell knows that it is in a build."""
-    make_data(tmp_path)
-    (tmp_path / "notebooks").mkdir()
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("SLAMLIB_DATASETS", "short")
-    made = []
-    monkeypatch.setattr(os, "execve", lambda *arguments: made.append(arguments))
-    main(["lab", "--no-browser", "--port", "9999"])
-    (program, command, environment), = made
-    assert program == sys.executable and command[1:3] == ["-m", "jupyterlab"]
-    assert command[-4:] == ["--no-browser", "--port", "9999", "notebooks"]
-    assert environment["SLAMLIB_DATA"] == str(tmp_path / "data")
-    assert environment["SLAMLIB_DATASETS"] == "short" and "SLAMLIB_RESULTS" not in environment
-
-
-def test_where_there_is_no_jupyterlab_it_is_said_how_to_install_it(tmp_path, monkeypatch, capsys):
-    (tmp_path / "notebooks").mkdir()
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(execution, "find_spec", lambda _: None)
-    assert main(["lab"]) == 2 and "JupyterLab, as by pip install" in capsys.readouterr().err
 
 
 @pytest.mark.slow

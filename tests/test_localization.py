@@ -334,10 +334,10 @@ def test_on_public_logs_the_errors_are_below_those_of_odometry_and_covered(log, 
 def test_a_learned_slip_that_no_wheel_has_is_doubted():
     """4 cm after one metre; not a usual one, nor one that the vehicle states."""
     far = short(5, 800, slip=0.04)[0]
-    doubt, = problem_solution("problem2_fused", far).doubts
+    doubt, = problem_solution("problem2_fused", far, fuse(far)).doubts
     assert doubt.what == "wheel-slip" and "problem 2's fusion" in doubt.sentence
     for dataset in (vehicle(slip=0.04)(far), short(5, 800)[0]):
-        assert not problem_solution("problem2_fused", dataset).doubts
+        assert not problem_solution("problem2_fused", dataset, fuse(dataset)).doubts
 
 
 def test_the_slip_and_the_factor_that_a_vehicle_gives_are_taken():

@@ -7,13 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import ROOT, contradicted
+from conftest import contradicted, file_names
 from numeric import short
 
 from slamlib import estimate, solve
 from slamlib.__main__ import main
 from slamlib.io.dataset import read_dataset
-from slamlib.io.files import file_names
 from slamlib.io.results import read_structs, read_summary
 from slamlib.studies.simulation import simulate, write_dataset
 
@@ -47,16 +46,13 @@ def solved(folder, *options, code=0):
 
 @pytest.mark.slow
 def test_what_simulate_writes_is_what_solve_reads(tmp_path):
-    """In processes of their own; a path is driven twice."""
-    made = run("simulate", "drive", "--path", "short", "--seed", 21, "--nlos", 0.15, "--rounds", 2,
-               cwd=tmp_path)
-    assert (made.stdout, made.stderr) == ("", "")
+    expected, truth = simulate("short", 21, late_ranges=0.15)
+    write_dataset(tmp_path / "drive", expected, truth)
     done = run("solve", "drive", "--out", "out", "--problem", 1, cwd=tmp_path)
     assert [line.split(":")[1] for line in done.stderr.splitlines()] == [
-        " encoders", " markers", " ranges", " truth", f" {tmp_path / 'out'}"]
+        " encoders", " sightings", " ranges", " truth", f" {tmp_path / 'out'}"]
     header, row = done.stdout.splitlines()
-    assert "ate_m" in header and row.split()[:3] == ["drive", "problem1", "4000"]
-    expected, _ = simulate("short", 21, late_ranges=0.15, rounds=2)
+    assert "ate_m" in header and row.split()[:3] == ["drive", "problem1", "2000"]
     found = read_dataset(tmp_path / "drive")
     np.testing.assert_array_equal(found.ticks, expected.ticks)
     np.testing.assert_allclose(found.uwb.range, expected.uwb.range, atol=1e-4)
@@ -80,7 +76,6 @@ def test_verbose_prints_decisions(folder):
     slip = read_summary(folder / "out")["problems"]["problem3"]["slip_sqrt_m"]
     assert f"round 1: slip {1e3 * slip:.3g} mm after 1 m, factors " in told
     assert re.search(r"\nGTSAM: \d+ factors, \d+ variables, \d+ steps from ", told)
-    assert "drive: problem3 solved in " in told
 
 
 def test_results_are_not_written_into_a_dataset(folder, monkeypatch, capsys):
@@ -89,9 +84,9 @@ def test_results_are_not_written_into_a_dataset(folder, monkeypatch, capsys):
     for command in (["solve", "drive", "--out", "drive"],
                     ["solve", "drive", "--out", "drive/truth"],
                     ["solve", "drive", "nowhere", "--out", "."],
-                    ["report", "--data", ".", "--results", "."]):
+                    ["report", "--data", "results"]):
         assert main(command) == 2
-        assert "expected another folder for the results" in capsys.readouterr().err
+        assert "expected another folder" in capsys.readouterr().err
     assert set(file_names(folder)) - {*before} <= {"drives.csv"}
 
 
@@ -102,15 +97,11 @@ SOLVE = ["solve", "good", "--out", "out"]
     (["solve", "nowhere", "--out", "out"], "nowhere"),
     (["solve", "bad", "--out", "out"], "bad/encoderReading.txt, line 2: expected "),
     (["solve", ".", "--out", "out"], "encoderReading.txt: expected this file, found none. Not"),
-    (["simulate", "drive", "--slip", "nan"], "from 0 to 1"),
     (["solve", "good"], "--out"),
     ([*SOLVE, "--problem", "3"], "expected the measurements of problem3"),
     ([*SOLVE, "more"], "unrecognized arguments: more"),
-    (["simulate", ".", "--seed", "1"], "new or empty folder"),
-    (["report", "--notebooks", ".", "--data", "."], "found no notebooks"),
-    (["report", "medium", "good", "--notebooks", ROOT / "notebooks", "--data", "."],
-     ": expected one of bad, good, found 'medium'"),
-    (["hand-in", "--out", "."], "expected a file to write, found a folder"),
+    (["report", "medium", "good", "--data", "."], ": expected one of bad, good, found 'medium'"),
+    (["report", "--out", "."], "unrecognized arguments: --out"),
 ])
 def test_bad_arguments_give_exit_code_2_and_one_sentence(tmp_path, monkeypatch, capsys, arguments,
                                                          word):

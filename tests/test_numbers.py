@@ -10,10 +10,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from numeric import aruco, as_points, counts, uwb, vehicle
+from numeric import aruco, as_points, counts, short, uwb, vehicle
 
 from slamlib import solve
-from slamlib.studies.simulation import simulate
 
 NUMBERS = Path(__file__).with_name("numbers.csv")
 PROBLEMS = ("problem2", "problem2_fused", "problem3", "problem4")
@@ -71,7 +70,7 @@ DRIVES = {
 def numbers(drive):
     """The rows of a drive, one for each problem, as a DataFrame."""
     options, poses, change = DRIVES[drive]
-    dataset, truth = simulate("short", seed=8, **options)
+    dataset, truth = short(8, **options)
     truth = replace(truth, poses=truth.poses[:poses])
     rows = []
     for solution in solve.solutions(change(dataset.first(poses)), PROBLEMS):

@@ -83,7 +83,7 @@ def test_a_chapter_whose_sensor_no_dataset_has_is_left_out(tmp_path):
             nbformat.v4.new_markdown_cell(f"# {name[0]}. {name[2:]}\n\nText.")])
         nbformat.write(book, tmp_path / "notebooks" / f"{name}.ipynb")
     pages = build_report(tmp_path / "notebooks", tmp_path / "data", tmp_path / "report",
-                         tmp_path / "results").files
+                         tmp_path / "results", tmp_path / "kept").files
     assert [page.name for page in pages] == ["index.html", "1_all.html", "report.pdf"]
     text = pages[0].read_text(encoding="utf-8")
     assert "There are no markers in wheels" in text

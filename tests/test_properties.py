@@ -160,8 +160,7 @@ def test_every_small_drive_is_solved(drive):
         assert known.any() and (known.all() or solution.problem == "problem2")
         assert np.isnan(solution.covariances[~known]).all()
         least = 0 if solution.problem in ("problem3", "problem4") else -1e-9
-        for C in (solution.covariances[known], *(
-                each[2] for each in (solution.aruco_map, solution.uwb_map) if each is not None)):
+        for C in (solution.covariances[known], *(each[2] for each in solution.maps.values())):
             assert_positive(C, least, solution.problem)
     for doubt in doubts_before_solving(dataset):
         assert doubt.sentence.endswith(".") and "nan" not in doubt.sentence
@@ -189,9 +188,8 @@ def estimates(dataset):
     """Name, ids (m,), values (m, d) and covariances (m, d, d) of poses and maps."""
     for found in solutions(dataset):
         yield f"{found.problem} poses", np.zeros(0), found.poses, found.covariances
-        for each in (found.aruco_map, found.uwb_map):
-            if each is not None:
-                yield f"{found.problem} map", *each
+        for each in found.maps.values():
+            yield f"{found.problem} map", *each
 
 
 def backwards(readings):

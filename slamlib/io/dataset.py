@@ -35,8 +35,8 @@ from slamlib.io.tables import contents, read_table, table_of_array
 from slamlib.io.textfile import read_toml
 
 MAX_REVOLUTIONS = 10.0  # revolutions of a wheel in one step
-MODULI = (2**16, 2**15)  # numbers of values of counters that wrap around
-MIN_MODULUS_RATIO = 32.0  # ratio of a modulus to a large step of the drive, for a decision
+MODULUS = 2**16  # number of values of counters that wrap around
+MIN_MODULUS_RATIO = 32.0  # ratio of the modulus to a large step of the drive, for a decision
 WHEEL_ENTRIES = 8  # number of fields of a Vehicle that table 2 has
 ORIGIN_TOLERANCE = 1e-3  # m and rad; a first true pose within it is taken as the origin
 
@@ -77,9 +77,10 @@ def dataset_from_arrays(ticks, aruco=None, uwb=None, guess=None, vehicle: Vehicl
     counts = table_of_array("ticks", ticks, ["right ticks", "left ticks"])
     numbered = np.column_stack([counts.lines, counts.numbers])
     files = {ENCODER: replace(counts, numbers=numbered)}
-    files[ARUCO] = table_of_array("aruco", aruco, LIMITS[ARUCO])
-    files[UWB] = table_of_array("uwb", uwb, LIMITS[UWB])
-    files[GUESS] = table_of_array("guess", guess, LIMITS[GUESS])
+    for argument, rows, file in (
+            ("aruco", aruco, ARUCO), ("uwb", uwb, UWB), ("guess", guess, GUESS)):
+        if rows is not None:
+            files[file] = table_of_array(argument, rows, LIMITS[file])
     stated = changed(TABLE_2, vars(vehicle), "vehicle")
     return _dataset(files, stated, name)
 
@@ -139,15 +140,13 @@ def _incremental_counts(table, vehicle):
     """
     read = table.numbers[:, 1:]
     require(len(read), table.source, "at least the row '1 0 0', found no rows")
-    counts = read
-    for modulus in MODULI:
-        counts = _unwrapped(counts, modulus)
+    counts = _unwrapped(read)
     is_mended = (counts != read).any(axis=1)
     mended = table.lines[is_mended]
     if len(mended):
         table = table.noted(
-            f": {len(mended)} rows were mended whose counts are 2^15 or 2^16 off, as of a counter "
-            f"that wraps around, first {table.kind} {mended[0]}")
+            f": {len(mended)} rows were mended whose counts are 2^16 off, as of a counter that "
+            f"wraps around, first {table.kind} {mended[0]}")
     limit = MAX_REVOLUTIONS * vehicle.ticks_per_revolution
     ok = abs(counts) <= limit
     ok[0] = counts[0] == 0
@@ -157,12 +156,12 @@ def _incremental_counts(table, vehicle):
     return table, counts.astype(np.int64)
 
 
-def _unwrapped(counts, modulus):
-    """Counts (n, 2) less a modulus, where that makes them as small as most others."""
+def _unwrapped(counts):
+    """Counts (n, 2) less the modulus, where that makes them as small as most others."""
     large = np.quantile(abs(counts), 0.9)
-    if MIN_MODULUS_RATIO * large >= modulus:
+    if MIN_MODULUS_RATIO * large >= MODULUS:
         return counts
-    less = counts - np.sign(counts) * modulus
+    less = counts - np.sign(counts) * MODULUS
     is_wrapped = abs(less) <= 2 * large
     return np.where(is_wrapped, less, counts)
 
@@ -214,18 +213,12 @@ def all_notes(dataset: Dataset, truth: Truth | None) -> tuple[str, ...]:
 
 def inventory_lines(dataset: Dataset, truth: Truth | None) -> list[str]:
     """Lines on what was read of a Dataset and its Truth, with all notes."""
-    found = {"encoders": f"{len(dataset.ticks)} poses",
-             "markers": f"none, no {ARUCO} with usable rows",
-             "ranges": f"none, no {UWB} with usable rows",
-             "truth": "no" if truth is None else "yes"}
-    if dataset.aruco is not None:
-        found["markers"] = _counts(dataset.aruco.pose, "sightings", dataset.aruco.marker, "markers")
-    if dataset.uwb is not None:
-        found["ranges"] = _counts(dataset.uwb.pose, "ranges", dataset.uwb.antenna, "antennas")
-    lines = [f"{dataset.name}: {sensor}: {what}" for sensor, what in found.items()]
-    return lines + [f"{dataset.name}: note: {note}" for note in all_notes(dataset, truth)]
-
-
-def _counts(pose, readings, landmark, landmarks):
-    """Numbers of readings, landmarks and poses in words, by the pose and landmark of each."""
-    return f"{len(pose)} {readings} of {len(set(landmark))} {landmarks} at {len(set(pose))} poses"
+    lines = [f"encoders: {len(dataset.ticks)} poses"]
+    for name, readings in (("sightings", dataset.aruco), ("ranges", dataset.uwb)):
+        if readings is None:
+            lines.append(f"{name}: none")
+        else:
+            lines.append(f"{name}: {len(readings.pose)} at {len(set(readings.pose))} poses")
+    lines.append("truth: no" if truth is None else "truth: yes")
+    lines += [f"note: {note}" for note in all_notes(dataset, truth)]
+    return [f"{dataset.name}: {line}" for line in lines]

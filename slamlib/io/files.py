@@ -25,8 +25,8 @@ def locked(folder: Path) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
         file.touch()
     except OSError as error:
-        reason = error.strerror
-        raise DatasetError(f"{folder}: expected a folder to write to ({reason})") from None
+        raise DatasetError(
+            f"{folder}: expected a folder to write to ({error.strerror})") from None
     lock = FileLock(file)
     try:
         lock.acquire(timeout=LOCK_TIME)
@@ -49,9 +49,3 @@ def write_file(path: Path, content: bytes):
         os.replace(part, path)
     finally:
         part.unlink(missing_ok=True)
-
-
-def file_names(folder: Path) -> list[str]:
-    """Sorted names of all files in a folder, relative to it."""
-    paths = [path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir()]
-    return sorted(path.relative_to(folder).as_posix() for path in paths)

@@ -50,7 +50,7 @@ LIMITS = {
 def within(numbers: np.ndarray, limits: dict[str, Limit]) -> dict[str, np.ndarray]:
     """Which rows (m,) of numbers (m, c) are within the limits of a column, by what is expected."""
     checks = {}
-    for column, limit, values in zip(limits, limits.values(), numbers.T):
+    for (column, limit), values in zip(limits.items(), numbers.T):
         kind = "whole" if limit.whole else "finite"
         checks[f"{column}, a {kind} number {limit}"] = limit.holds(values)
     return checks

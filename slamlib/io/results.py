@@ -23,18 +23,16 @@ FIELDS = {"vehiclePose": ("pose", "covari"), "ArucoMap": ("pose", "covari", "id"
 RESULT_FILES = tuple(f"{name}.mat" for name in FIELDS)  # of a problem's folder
 _HEADER = b"MATLAB 5.0 MAT-file, written by slamlib".ljust(116)  # scipy's contains the date
 FIELD_HEADER = "V56"  # bytes before the numbers of a field of a struct
-SIZE_OFFSET = 132  # bytes, to the size of the array of structs
-COUNT_OFFSET = 164  # bytes, to its number of columns
+SIZE_WORD = 33  # of 4 bytes: the size of the array of structs
+COUNT_WORD = 41  # its number of columns
 
 
 def write_solution(folder: Path | str, solution):
     """Write the .mat files of a Solution into folder/<problem>/."""
     own = Path(folder) / solution.problem
     write_structs(own, "vehiclePose", None, solution.poses, solution.covariances)
-    if solution.aruco_map is not None:
-        write_structs(own, "ArucoMap", *solution.aruco_map)
-    if solution.uwb_map is not None:
-        write_structs(own, "UwbMap", *solution.uwb_map)
+    for name, values in solution.maps.items():
+        write_structs(own, name, *values)
 
 
 def write_summary(folder: Path | str, summary: dict):
@@ -57,10 +55,6 @@ def read_summary(folder: Path | str) -> dict:
     return summary
 
 
-def _pose_ids(poses):
-    return np.arange(1, len(poses) + 1)
-
-
 def read_structs(folder: Path | str, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Ids (n,), poses (n, 3) or positions (n, 2), and covariances of a file in a folder.
 
@@ -78,7 +72,7 @@ def read_structs(folder: Path | str, name: str) -> tuple[np.ndarray, np.ndarray,
     covariances = values[1].reshape(-1, d, d)
     if "id" in FIELDS[name]:
         return values[2].ravel().astype(int), places, covariances
-    return _pose_ids(places), places, covariances
+    return np.arange(1, len(places) + 1), places, covariances
 
 
 def write_structs(folder: Path | str, name: str, ids: np.ndarray | None, places: np.ndarray,
@@ -100,9 +94,8 @@ def write_structs(folder: Path | str, name: str, ids: np.ndarray | None, places:
     for field, values, shape in zip(
             FIELDS[name], (places, covariances, ids), ((1, d), (d, d), (1, 1))):
         zeros[field] = np.zeros(shape)
-        numbers[field] = np.reshape(values, (count,) + shape)
-        entries.append((f"header of {field}", FIELD_HEADER))
-        entries.append((field, "=f8", shape[::-1]))            # by columns
+        numbers[field] = np.reshape(values, (count, *shape))
+        entries += [(f"header of {field}", FIELD_HEADER), (field, "=f8", shape[::-1])]  # by columns
     layout = np.dtype(entries)
     buffer = BytesIO()
     savemat(buffer, {name: zeros})
@@ -111,12 +104,10 @@ def write_structs(folder: Path | str, name: str, ids: np.ndarray | None, places:
     structs = np.repeat(np.frombuffer(content[-layout.itemsize:], layout), count)
     for field, values in numbers.items():
         structs[field] = np.swapaxes(values, 1, 2)
-    size = np.frombuffer(content, "=i4", 1, SIZE_OFFSET)
-    size += (count - 1) * layout.itemsize
-    columns = np.frombuffer(content, "=i4", 1, COUNT_OFFSET)
-    columns[:] = count
-    before = content[:-layout.itemsize]
-    write_file(Path(folder) / f"{name}.mat", before + structs.tobytes())
+    words = np.frombuffer(content, "=i4", COUNT_WORD + 1)
+    words[SIZE_WORD] += (count - 1) * layout.itemsize
+    words[COUNT_WORD] = count
+    write_file(Path(folder) / f"{name}.mat", content[:-layout.itemsize] + structs.tobytes())
 
 
 def write_tum(path: Path | str, poses: np.ndarray):
@@ -128,10 +119,11 @@ def write_tum(path: Path | str, poses: np.ndarray):
     3 2.5 0 0 0 0 0 1
     """
     x, y, heading = poses.T
+    ids = np.arange(1, len(poses) + 1)
     zero = np.zeros(len(poses))
     qz = np.sin(heading / 2)
     qw = np.cos(heading / 2)
-    rows = np.column_stack([_pose_ids(poses), x, y, zero, zero, zero, qz, qw])
+    rows = np.column_stack([ids, x, y, zero, zero, zero, qz, qw])
     text = BytesIO()
     np.savetxt(text, rows[np.isfinite(x)], fmt="%.17g")
     write_file(Path(path), text.getvalue())

@@ -28,7 +28,6 @@ from slamlib.io.formats import (
 from slamlib.io.textfile import cells_of, read_rows
 
 MAX_BAD_SHARE = 0.1  # of the rows of a sensor, which are left out; with more a file is refused
-LISTED_LENGTH = 100  # letters, of the names in one sentence
 NUMBER = r"(?i)(^|[\s,;])\W*(\d|nan\b|inf\b)"  # in a row that is no header
 # What may stand after a name without its ending, as browsers and Windows leave it.
 ENDING = r"( ?\(\d+\))?(\.(txt|csv|tsv|dat|toml))*"
@@ -47,7 +46,7 @@ class Table:
     @property
     def name(self) -> str:
         """Name of the file without its folder, or of the argument."""
-        return Path(str(self.source)).name
+        return Path(self.source).name
 
     def noted(self, note: str) -> "Table":
         """The Table with one more note, a clause about its file."""
@@ -111,14 +110,14 @@ def read_table(source: Path | Table | None, name: str, pose_count: int | None = 
 
 
 def table_of_array(source: str, value, columns) -> Table:
-    """The Table of a `value` with these columns, without rows if it is empty or None.
+    """The Table of a `value` with these columns, without rows if it is empty.
 
     Raises DatasetError, which names the `source`, if it is no matrix of numbers.
     """
     count = len(columns)
     expected = f"a matrix of numbers with {count} columns ({', '.join(columns)})"
     try:
-        array = np.asarray([] if value is None else value, float)
+        array = np.asarray(value, float)
     except (TypeError, ValueError):
         require(False, source, expected, value)
     if array.size == 0:
@@ -235,4 +234,4 @@ def _not_read(paths):
     if not paths:
         return []
     names = ", ".join(repr(path.name) for path in paths)
-    return [f"Not read: {shorten(names, LISTED_LENGTH, placeholder=' ...')}."]
+    return [f"Not read: {shorten(names, 100, placeholder=' ...')}."]

@@ -2,14 +2,12 @@
 
 from slamlib.notebook.drives import Drive, attempt, show_doubts, start, write_results
 from slamlib.notebook.tabular import (
-           accuracy,
-           antenna_rows,
-           calibration_rows,
-           dataset_row,
-           learned_row,
-           table,
-           vehicle_row,
+    accuracy,
+    antenna_rows,
+    calibration_rows,
+    learned_row,
+    table,
 )
 
-__all__ = ["Drive", "accuracy", "antenna_rows", "attempt", "calibration_rows", "dataset_row",
-           "learned_row", "show_doubts", "start", "table", "vehicle_row", "write_results"]
+__all__ = ["Drive", "accuracy", "antenna_rows", "attempt", "calibration_rows", "learned_row",
+           "show_doubts", "start", "table", "write_results"]

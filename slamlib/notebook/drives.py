@@ -6,7 +6,6 @@ from which the report's first page has it.
 
 import os
 import re
-import unicodedata
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -108,7 +107,8 @@ def attempt(drive: Drive, problem: str | None = None) -> Iterator[None]:
             _say(drive, f"left out here: {error}.")
         else:
             failure = _written(drive, problem, error)
-            _say(drive, f"The problem “{failure.title}” could not be solved: {failure.reason}.")
+            title = solve.PROBLEMS[problem].title
+            _say(drive, f"The problem “{title}” could not be solved: {failure.reason}.")
 
 
 def _written(drive, problem, found):
@@ -131,15 +131,17 @@ def _say(drive, sentence):
 def plain(text: str) -> str:
     """Text (str) with the characters escaped that Markdown or HTML would interpret.
 
-    Names from folders and files pass it. A space replaces a control character.
+    Names from folders and files pass it.
     """
-    seen = "".join(" " if unicodedata.category(sign)[0] == "C" else sign for sign in text)
     return re.sub(r"[^\w\s.,:;/+-]|(?<![^\W_])_|_(?![^\W_])",
-                  lambda sign: f"&#{ord(sign[0])};", seen)
+                  lambda sign: f"&#{ord(sign[0])};", text)
 
 
 def _data_folder():
     """The folder that SLAMLIB_DATA names, or `data`, here or beside the folder of notebooks."""
-    here = Path("data").resolve()
     stated = os.environ.get("SLAMLIB_DATA")
-    return Path(stated) if stated else here if here.is_dir() else here.parents[1] / "data"
+    if stated:
+        return Path(stated)
+    if Path("data").is_dir():
+        return Path("data")
+    return Path("..", "data")

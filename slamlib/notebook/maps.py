@@ -11,11 +11,8 @@ from slamlib.notebook import plotting
 HALF_WIDTH, WIDTH = 4.08, 7.4      # inches: half the width of the page, and all of it
 FLAT = 0.55                        # height of a map over its width, below which it needs all of it
 LABELS = 0.6, 1.3                  # inches beside and below the axes
-ELLIPSE_COUNT = 24                 # ellipses of the vehicle
-NAME = 7.0                         # points, font size of the names of markers
-ANTENNA_NAME = 10.5                # points, of those of antennas
 # Places of a name relative to its landmark, in font sizes, in the order in which they are tried.
-NAME_OFFSETS = (1, 0.9), (-1, 0.9), (1, -0.9), (-1, -0.9), (0, 1.4), (0, -1.4), (1.8, 0), (-1.8, 0)
+NAME_OFFSETS = (1, 0.9), (-1, 0.9), (1, -0.9), (-1, -0.9), (0, 1.4), (0, -1.4)
 HALO = withStroke(linewidth=1.5, foreground="white")       # so that a name on the path can be read
 
 
@@ -33,34 +30,42 @@ def whole_map(drive, result) -> Figure:
     role = "slam_uwb" if len(result.antenna) else "slam"
     enlarged = plotting.enlargement(result.poses, result.covariances)
     plotting.with_ellipses(ax, result.poses, result.covariances, role, "vehicle", enlarged,
-                           ELLIPSE_COUNT)
+                           count=24)
     if truth is not None:
         plotting.trajectory(ax, truth.poses, "truth", linewidth=0.7)
     if len(result.marker):
         plotting.draw_markers(ax, result.marker_in_world, result.marker_covariance, enlarged)
         if truth is not None:
-            plotting.landmarks(ax, truth.marker_in_world, "true marker", "markers: truth")
+            plotting.landmarks(ax, truth.marker_in_world, "true place", "markers: truth")
+    ranged = None
     if len(result.antenna):
+        ranged = drive.dataset.uwb.antenna
         guess = drive.dataset.antenna_guess
         guess = plotting.places_by_id(guess.antenna, guess.position, result.antenna)
         in_doubt = np.isin(result.antenna, list(result.doubts))
         sure = np.where(in_doubt[:, None, None], 0, result.antenna_covariance)
         plotting.draw_antennas(ax, result.antenna_in_world, sure, guess, enlarged)
         if truth is not None:
-            plotting.landmarks(ax, truth.antenna_in_world, "true antenna", "antennas: truth")
+            plotting.landmarks(ax, truth.antenna_in_world, "true place", "antennas: truth")
     plotting.legend_below(fig)
     fig.draw_without_rendering()                                  # fixes the axes for the names
-    taken = []
-    for place, antenna in zip(result.antenna_in_world, result.antenna):
-        mark = "?" if antenna in result.doubts else ""
-        _write_name(ax, place, f"{antenna}{mark}", ANTENNA_NAME, taken, fontweight="bold")
-    for place, marker in zip(result.marker_in_world[:, :2], result.marker):
-        mark = "?" if marker in result.unconfirmed else ""
-        _write_name(ax, place, f"{marker}{mark}", NAME, taken)
     seen = result.sightings.marker[~result.rejected]
-    _add_tips(ax, "marker", result.marker, result.marker_in_world, result.marker_covariance, seen)
-    _add_tips(ax, "antenna", result.antenna, result.antenna_in_world, result.antenna_covariance,
-              drive.dataset.uwb.antenna if len(result.antenna) else None)
+    taken = []
+    for kind, size, doubtful, measured in (
+            ("antenna", 10.5, result.doubts, ranged),
+            ("marker", 7.0, result.unconfirmed, seen)):
+        ids = getattr(result, kind)
+        places = getattr(result, f"{kind}_in_world")[:, :2]
+        sigmas = 1e3 * position_sigmas(getattr(result, f"{kind}_covariance"))
+        for each, place, sigma in zip(ids, places, sigmas):
+            name = f"{each}"
+            if each in doubtful:
+                name += "?"
+            _write_name(ax, place, name, size, taken)
+            # Pages tell the name of this invisible disc: report.lua makes a title of it.
+            count = np.sum(measured == each)
+            ax.plot(*place, "o", alpha=0, markersize=9, zorder=9,
+                    gid=f"tip: {kind} {each}, σ {sigma:.2g} mm, {count} measurements")
     return fig
 
 
@@ -74,31 +79,18 @@ def _size(result):
     return width, (width - LABELS[0]) * shape + LABELS[1]
 
 
-def _add_tips(ax, kind, ids, places, covariances, measured):
-    """Add what pages tell of landmarks (k) under the pointer; `measured` are ids of measurements.
-
-    It is the name of an invisible disc, from which report.lua makes the title of its place.
-    """
-    sigmas = 1e3 * position_sigmas(covariances)
-    for each, place, sigma in zip(ids, places, sigmas):
-        count = np.sum(measured == each)
-        ax.plot(*place[:2], "o", alpha=0, markersize=9, zorder=9,
-                gid=f"tip: {kind} {each}, σ {sigma:.2g} mm, {count} measurements")
-
-
-def _write_name(ax, place, name, size, taken, **look):
+def _write_name(ax, place, name, size, taken):
     """Write a name beside its place (2,) in m, where it covers none of the boxes `taken`.
 
     Its own box joins them. Without a free place within the axes there is no name.
     """
-    text = ax.annotate(name, place, (0, 0), textcoords="offset points", ha="center", va="center",
-                       fontsize=size, zorder=7, path_effects=[HALO], **look)
-    text.set_in_layout(False)
     for offset in NAME_OFFSETS:
-        text.set_position(size * np.array(offset))
+        text = ax.annotate(name, place, size * np.array(offset), textcoords="offset points",
+                           ha="center", va="center", fontsize=size, zorder=7, in_layout=False,
+                           path_effects=[HALO])
         box = text.get_window_extent()
         is_inside = ax.bbox.contains(*box.min) and ax.bbox.contains(*box.max)
         if is_inside and not box.count_overlaps(taken):
             taken.append(box)
             return
-    text.remove()
+        text.remove()

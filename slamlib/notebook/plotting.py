@@ -25,10 +25,10 @@ from slamlib.core import se2
 from slamlib.core.evaluation import REACH_95
 
 
-def _line(color, width, dashes=None, zorder=3):
+def _line(color, width, dashes=None):
     """The look of a path; `dashes` are the lengths of strokes and gaps in line widths."""
     style = (0, dashes) if dashes else "-"
-    return {"color": color, "linewidth": width, "linestyle": style, "zorder": zorder}
+    return {"color": color, "linewidth": width, "linestyle": style, "zorder": 3}
 
 
 def _sign(color, marker, size, zorder):
@@ -39,21 +39,17 @@ def _sign(color, marker, size, zorder):
 
 # Colours of Okabe and Ito and of Tol, distinct for the colour-blind; line styles differ in grey.
 ROLES = {
-    "truth": _line("black", 1.1, (4, 2), zorder=4),
+    "truth": _line("black", 1.1, (4, 2)),
     "odometry": _line("#D55E00", 1.5),
-    "exact": _line("#332288", 1.5),
     "aruco": _line("#CC79A7", 1.7, (1.2, 0.8)),
     "fused": _line("#009E73", 1.8, (4.5, 1.6)),
     "hint": _line("#E69F00", 1.5, (5, 1, 1, 1)),
     "marker": _sign("#333333", "s", 3, zorder=3),
     "slam": _line("#0072B2", 2.0),
-    "slam_uwb": _line("#56B4E9", 2.2, (6, 1.5), zorder=3.2),
-    "arc": _line("#333333", 1.7),
-    "euler": _line("#888888", 1.7, (3, 1.5)),
+    "slam_uwb": _line("#56B4E9", 2.2, (6, 1.5)),
     "antenna": _sign("#222222", "^", 6, zorder=5),
     "guess": _sign("#222222", "^", 7, zorder=4) | {"markerfacecolor": "none"},
-    "true antenna": _sign("black", "+", 9, zorder=6),
-    "true marker": _sign("black", "+", 4.5, zorder=5) | {"markeredgewidth": 0.6},
+    "true place": _sign("black", "+", 5, zorder=6),
 }
 STYLE = Path(__file__).with_name("slamlib.mplstyle")  # for matplotlib.style
 MAX_SEMI_AXIS = 0.08         # of enlarged 95 % ellipses, in the larger extent of the path
@@ -81,11 +77,14 @@ def each_drive(drives: Iterable, rows: int = 1, height: float = 3.4, width: floa
     """Yield each Drive with its axes, or with `rows` axes as a list; a legend ends the figure.
 
     `drives` (iterable of Drive or of names, such as a dict by Drive) are the panels, `columns` side
-    by side, with their names as titles; height and width of one in inches.
+    by side, with their names as titles; height and width of one in inches. Without any there is no
+    figure.
     """
     drives = list(drives)
-    columns = max(1, min(columns, len(drives)))
-    lines = max(1, math.ceil(len(drives) / columns))
+    if not drives:
+        return
+    columns = min(columns, len(drives))
+    lines = math.ceil(len(drives) / columns)
     fig = plt.figure(figsize=(max(width * columns, 5.0), height * lines))
     parts = fig.subfigures(lines, columns, squeeze=False)
     for drive, part in zip(drives, parts.flat):
@@ -99,33 +98,30 @@ def estimates(result, drive) -> Estimates:
     """The Estimates of a Drive: the poses that a result has, and the truth of these poses.
 
     `result` is (poses, covariances), or has these attributes: a Solution, Localization, Fusion or
-    SlamResult. The truth, None where the Drive has none, is in the world frame of the result.
+    SlamResult. The truth, None where the Drive has none, is in the frame of the first of the poses,
+    in which the result is.
     """
-    poses, covariances = result if isinstance(result, tuple) else (result.poses, result.covariances)
-    known = np.isfinite(poses[:, 0])
-    if hasattr(result, "frame"):
-        frame = result.frame[known]
-        world = frame[0]                     # index of the pose in whose frame the result is
+    if isinstance(result, tuple):
+        poses, covariances = result
     else:
-        frame = np.flatnonzero(known)
-        world = getattr(result, "world", 0)
+        poses = result.poses
+        covariances = result.covariances
+    known = np.isfinite(poses[:, 0])
+    frame = getattr(result, "frame", np.arange(len(poses)))[known]
     true = None
     if drive.truth is not None:
-        true = drive.truth.poses
-        if world:
-            true = se2.between(true[world], true)
-        true = true[frame]
+        true = drive.truth.poses[frame]
+        true = se2.between(true[0], true)
     return Estimates(frame, poses[known], covariances[known], true)
 
 
 def with_ellipses(ax: Axes, poses: np.ndarray, covariances: np.ndarray, role: str,
                   label: str, enlarged: float, count: int = 12) -> Axes:
-    """Draw a path with at most `count` filled 95 % ellipses, enlarged as the axes' title says."""
+    """Draw a path with at most `count` filled 95 % ellipses, enlarged as a title says."""
     some = evenly(poses, count)
     trajectory(ax, poses, role, label, linewidth=1.2, alpha=0.8)
     ellipses(ax, poses[some], covariances[some], ROLES[role]["color"], fill=0.5, enlarged=enlarged)
-    title = ax.get_title("left").partition(" (")[0]
-    ax.set_title(f"{title} (95 % ellipses × {enlarged})")
+    ax.set_title(f"95 % ellipses × {enlarged}", loc="right", fontweight="normal")
     return ax
 
 
@@ -142,7 +138,7 @@ def errors(axes: Sequence[Axes], result, drive, role: str = "slam") -> Sequence[
     semi_axis = 1e3 * longest_semi_axes(C)                               # mm
     two_sigma = 2e3 * np.sqrt(C[:, 2, 2])                                # mrad
     for ax, name, low, high in zip(axes, ("position (mm)", "δ (mrad)"),
-                                   (0 * semi_axis, -two_sigma), (semi_axis, two_sigma)):
+                                   (0, -two_sigma), (semi_axis, two_sigma)):
         ax.fill_between(frame + 1, low, high, color=ROLES[role]["color"], alpha=0.18, linewidth=0,
                         label="95 % by the covariance")
         ax.set(ylabel=name)
@@ -156,19 +152,18 @@ def errors(axes: Sequence[Axes], result, drive, role: str = "slam") -> Sequence[
     return axes
 
 
-def own_axes(ax: Axes, covariance: np.ndarray, role: str, points: np.ndarray, **look) -> Axes:
-    """Draw the 95 % ellipse of a covariance (>= 2, >= 2) about zero along its own axes, in mm.
+def own_axes(ax: Axes, covariance: np.ndarray, points: np.ndarray, **look) -> Axes:
+    """Draw the 95 % ellipse of a covariance (>= 2, >= 2) by odometry along its own axes, in mm.
 
     Each axis has its own scale, so that a needle becomes an ellipse. Crosses are `points` (m, >= 2)
     relative to its centre, in m, in the axes of the covariance.
     """
     variances, directions = np.linalg.eigh(covariance[:2, :2])
     along_and_across = np.diag(1e6 * variances[::-1])                    # mm^2
-    ellipses(ax, np.zeros((1, 2)), along_and_across[None], ROLES[role]["color"])
+    ellipses(ax, np.zeros((1, 2)), along_and_across[None], ROLES["odometry"]["color"])
     x, y = 1e3 * directions.T[::-1] @ points[:, :2].T
-    ax.plot(x, y, **ROLES["true antenna"] | look)
+    ax.plot(x, y, **ROLES["true place"] | look)
     ax.set(xlabel="along the ellipse (mm)", ylabel="across (mm)")
-    ax.locator_params(nbins=5)
     return ax
 
 
@@ -251,20 +246,18 @@ def enlargement(poses: np.ndarray, covariances: np.ndarray) -> int:
 def evenly(poses: np.ndarray, count: int) -> np.ndarray:
     """Indices of at most `count` known poses at equal intervals, the last one included."""
     known = np.flatnonzero(np.isfinite(poses[:, 0]))
-    rows = np.linspace(-1, len(known) - 1, count + 1)[1:]
-    return known[np.unique(rows.astype(int))]
+    step = math.ceil(len(known) / count) or 1
+    return known[::-step]
 
 
 def legend_below(fig: Figure) -> None:
-    """Draw one legend below all axes of a figure: each label once, in as few lines as fit."""
+    """Draw one legend below all axes of a figure: each label once."""
     entries = {label: handle for ax in fig.axes
                for handle, label in zip(*ax.get_legend_handles_labels())}
-    for columns in (4, 3, 2, 1) if entries else ():
-        fig.legends.clear()
-        legend = fig.legend(entries.values(), entries.keys(), loc="outside lower center",
-                            ncols=columns)
-        if legend.get_window_extent().width <= fig.bbox.width:
-            break
+    fig.legends.clear()
+    if entries:
+        fig.legend(entries.values(), entries.keys(), loc="outside lower center",
+                   ncols=int(fig.get_figwidth() / 1.8))        # inches, of a label
 
 
 def curve(ax: Axes, values: np.ndarray, role: str, frame: np.ndarray | None = None,

@@ -7,17 +7,13 @@ from itertools import pairwise
 import numpy as np
 from IPython.display import Markdown
 
-from slamlib.core import evaluation
-from slamlib.core.odometry import dead_reckoning
+from slamlib.core import evaluation, se2
 from slamlib.notebook.plotting import estimates, places_by_id
 from slamlib.robust.calibration import RANGES, WHEELS
-from slamlib.robust.measurements import NOISE_KEYS
 
 DASH = "–"
 # What begins a cell of a column of numbers, or is an italic remark in it.
 NUMERIC = re.compile(rf"[-+−>]? ?\d(?!\. )|{DASH}|\*[^*]+\*$")
-MINUS = re.compile(r"(?<![\w.])-(?=\d)")
-MAX_NUMBER = 1e6             # larger numbers are not shown, because the method failed
 
 
 def table(rows: Iterable[dict]) -> Markdown:
@@ -29,11 +25,9 @@ def table(rows: Iterable[dict]) -> Markdown:
     """
     columns = _columns(rows)
     rules = []
-    for name, texts in columns.items():
+    for texts in columns.values():
         numeric = all(map(NUMERIC.match, texts))
         rules.append("---:" if numeric else "---")
-        if numeric:
-            columns[name] = [MINUS.sub("−", text) for text in texts]
     first, *others = columns.values()
     if others:
         first = ["" if text == above else text for above, text in pairwise([None, *first])]
@@ -64,13 +58,13 @@ def cell(value) -> str:
     if np.isnan(value):
         return DASH
     if isinstance(value, int | np.integer):
-        return f"{value:,}".replace("-", "−")
+        return f"{value:,}"
     return number(value)
 
 
 def number(value: float, decimals: int | None = None) -> str:
     """A value with three significant digits, or this number of decimals (str)."""
-    if abs(value) > MAX_NUMBER:
+    if abs(value) > 1e6:                       # the method failed
         return "> 10⁶"
     if decimals is None:
         decimals = _decimals(value, 3, at_most=6) if value else 0
@@ -86,42 +80,19 @@ def _decimals(value, digits, at_most):
 def estimate(value: float, sigma: float) -> str:
     """Text (str) of a value ± its standard deviation, which has two digits."""
     decimals = _decimals(sigma, 2, at_most=7) if sigma else 2
-    return f"{value:.{decimals}f} ± {sigma:.{decimals}f}"
+    return f"{value:.{decimals}f} ± {sigma:.{decimals}f}".replace("-", "−")
 
 
 def _over_drives(values):
     """Mean ± standard error and median of values (s,), one a drive."""
-    error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else 0.0
+    error = 0.0
+    if len(values) > 1:
+        error = values.std(ddof=1) / np.sqrt(len(values))
     decimals = _decimals(error, 2, at_most=3) if error > 0 else None
     text = number(values.mean(), decimals)
     if error > 0:
         text += f" ± {number(error, decimals)}"
     return f"{text} ({number(np.median(values), decimals)})"
-
-
-def dataset_row(drive) -> dict:
-    """Row of `table` on what a Drive has: poses, length of the path, counts of measurements."""
-    dataset = drive.dataset
-    path = dead_reckoning(dataset.ticks, dataset.vehicle)
-    row = {"dataset": drive.name, "origin": drive.origin, "encoder poses": len(dataset.ticks),
-           "path by odometry (m)": evaluation.path_length(path)}
-    for name, readings in (("marker sightings", dataset.aruco), ("UWB ranges", dataset.uwb)):
-        if readings is not None:
-            poses = np.unique(readings.pose)
-            row[name] = f"{len(readings.pose):,} at {len(poses):,} poses"
-    return row
-
-
-def vehicle_row(drive) -> dict:
-    """Row of `table` on what is stated of a Drive's vehicle and noise."""
-    vehicle = drive.dataset.vehicle
-    row = {"dataset": drive.name}
-    names = ("$R_R$ (m)", "$R_L$ (m)", "$b$ (m)")
-    for name, mean, sigma in zip(names, vehicle.wheel, vehicle.sigma_wheel):
-        row[name] = f"{mean:g} ± {sigma:g}"
-    row["$n_0$"] = f"{vehicle.ticks_per_revolution:g}"
-    row[r"$\sigma_\delta$ (rad)"] = f"{vehicle.sigma_heading:g}"
-    return row | {f"`{key}`": getattr(vehicle, key) for key in NOISE_KEYS}
 
 
 def accuracy(result, drive) -> dict:
@@ -135,12 +106,9 @@ def accuracy(result, drive) -> dict:
     row = {"dataset": drive.name, "σ (mm)": 1e3 * np.median(position_sigma),
            "σ of δ (mrad)": 1e3 * np.median(heading_sigma)}
     if found.true is not None:
-        nees = evaluation.nees(found.poses, found.covariances, found.true)
-        nees = nees[np.isfinite(nees)]
         row["ATE (mm)"] = 1e3 * evaluation.ate(found.poses, found.true)
         row["aligned (mm)"] = 1e3 * evaluation.ate(found.poses, found.true, aligned=True)
-        if len(nees):
-            row["NEES"] = nees.mean()
+        row["NEES"] = evaluation.anees(found.poses, found.covariances, found.true)
     return row
 
 
@@ -185,25 +153,23 @@ def antenna_rows(result, drive) -> Iterator[dict]:
     ranges that keep less than half of their weight.
     """
     ids = result.antenna
-    if not len(ids):
-        return
-    uwb = drive.dataset.uwb
     truth = drive.truth
     guess = drive.dataset.antenna_guess
     guess = places_by_id(guess.antenna, guess.position, ids)
-    true = np.full_like(guess, np.nan)
+    moved = np.linalg.norm(result.antenna_in_world - guess, axis=1)
+    true = np.full_like(result.antenna_in_world, np.nan)
     if truth is not None:
         true = places_by_id(truth.antenna, truth.antenna_in_world, ids)
+    error = result.antenna_in_world - true
+    squared = se2.squared_norms(error, result.antenna_covariance)
+    sigmas = evaluation.sigmas(result.antenna_covariance)
     for k, antenna in enumerate(ids.tolist()):
-        place = result.antenna_in_world[k]
-        C = result.antenna_covariance[k]
-        sigma = evaluation.sigmas(C)
-        error = place - true[k]
-        own = uwb.antenna == antenna
-        yield {"dataset": drive.name,
-               "antenna": f"{antenna}?" if antenna in result.doubts else f"{antenna}",
-               "x (m)": estimate(place[0], sigma[0]), "y (m)": estimate(place[1], sigma[1]),
-               "from the guess (mm)": 1e3 * np.linalg.norm(place - guess[k]),
-               "error (mm)": 1e3 * np.linalg.norm(error),
-               "d²": error @ np.linalg.solve(C, error),
+        name = f"{antenna}"
+        if antenna in result.doubts:
+            name += "?"
+        x, y = map(estimate, result.antenna_in_world[k], sigmas[k])
+        own = drive.dataset.uwb.antenna == antenna
+        yield {"dataset": drive.name, "antenna": name, "x (m)": x, "y (m)": y,
+               "from the guess (mm)": 1e3 * moved[k],
+               "error (mm)": 1e3 * np.linalg.norm(error[k]), "d²": squared[k],
                "down-weighted (%)": 100 * np.mean(result.range_weight[own] < 0.5)}

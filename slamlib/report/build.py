@@ -3,13 +3,11 @@
 import re
 import shutil
 import sys
-import time
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
-import nbformat
+import joblib
 
 from slamlib.core.errors import DatasetError, require
 from slamlib.io import files
@@ -18,8 +16,7 @@ from slamlib.io.results import SUMMARY, read_summary, write_summary
 from slamlib.io.tables import datasets_in
 from slamlib.notebook.drives import read_drives, without_stand_ins
 from slamlib.report import cache
-from slamlib.report.notebooks import Options, needs_of, read_books
-from slamlib.robust.file_doubts import Doubt
+from slamlib.report.notebooks import Options, read_books
 from slamlib.solve import SENSORS, clear_results, summary_of
 
 # Name of the file in a report that has a digest and lists its files; all others are the user's.
@@ -35,41 +32,34 @@ class Report:
     summaries: list[dict]  # of the drives, as their summary.json has them
 
 
-def build_report(notebooks: Path, data: Path, report: Path, results: Path,
-                 datasets: list[str] | None = None, options: Options = Options(), jobs: int = 2,
-                 kept: Path | None = None) -> Report:
+def build_report(notebooks: Path, data: Path, report: Path, results: Path, kept: Path,
+                 datasets: list[str] | None = None, options: Options = Options()) -> Report:
     """Execute all notebooks, write results, pages and PDF; return the Report.
 
     Kernels read the absolute paths of data and results, and the selection, from SLAMLIB_DATA,
-    SLAMLIB_RESULTS and SLAMLIB_DATASETS (one name per line). One build at a time works with a
-    folder. DatasetError if there is no notebook or dataset, a dataset is malformed, or a chapter
-    that is chosen is unknown; NotebookError if a cell failed or a page cannot be set. If a cell
-    failed, report and results are unchanged.
+    SLAMLIB_RESULTS and SLAMLIB_DATASETS (one name per line). One build at a time works with the
+    folder `kept`. DatasetError if there is no notebook or dataset, a dataset is malformed, or a
+    chapter that is chosen is unknown; NotebookError if a cell failed or a page cannot be set. If a
+    cell failed, report and results are unchanged.
 
     Parameters
     ----------
     notebooks, data : folders of the `*.ipynb` files and of the datasets, one sub-folder each.
     report, results : folders of the pages and of the result files; created if absent.
+    kept : folder that caches executed notebooks.
     datasets : names of the selected datasets; None for all, without simulated ones if others are.
     options : the title page and what is shown.
-    jobs : notebooks executed at a time.
-    kept : folder that caches executed notebooks, or None for one that is removed.
     """
-    start = time.monotonic()
     data = data.resolve()
+    kept = kept.resolve()
     books = read_books(notebooks.resolve(), options.chapters)
     drives = _read(data, datasets)
     books = _with_what_they_need(books, drives)
-    with TemporaryDirectory() as temporary:
-        kept = (kept or Path(temporary)).resolve()
-        with files.locked(kept):
-            keys = _execute(books, drives, data, jobs, kept)
-            stages = [kept / source.stem / cache.RESULTS for source in books]
-            with files.locked(report):
-                summaries = [_write_results(drive, stages, results / drive.name)
-                             for drive in drives]
-                names = _write_pages(books, keys, drives, summaries, options, results, report)
-    _say(f"built in {time.monotonic() - start:.1f} s")
+    with files.locked(kept):
+        keys = _execute(books, drives, data, kept)
+        stages = [kept / source.stem / cache.RESULTS for source in books]
+        summaries = [_write_results(drive, stages, results / drive.name) for drive in drives]
+        names = _write_pages(books, keys, drives, summaries, options, results, report)
     return Report([report / name for name in names], summaries)
 
 
@@ -85,14 +75,14 @@ def _read(data, selected):
                 "dots, dashes and underscores in its name: rename this folder")
     found = read_drives(data, names)
     drives = found if selected else without_stand_ins(found)
+    lines = []
     for drive in drives:
-        _say("\n".join(inventory_lines(drive.dataset, drive.truth)))
+        lines += inventory_lines(drive.dataset, drive.truth)
     omitted = [drive.name for drive in found if drive not in drives]
     if omitted:
-        _say(f"left out, because simulated: {', '.join(omitted)} (name all datasets to have "
-             "them)")
-    for line in unread:
-        _say(line)
+        lines.append(f"left out, because simulated: {', '.join(omitted)} (name all datasets to "
+                     "have them)")
+    _say("\n".join(lines + unread))
     return drives
 
 
@@ -100,7 +90,7 @@ def _with_what_they_need(books, drives):
     """Return the notebooks whose measurements the drives have."""
     served = {}
     for source, book in books.items():
-        sensor = needs_of(book)
+        sensor = book.metadata.get("slamlib", {}).get("needs")
         if sensor and all(getattr(drive.dataset, sensor) is None for drive in drives):
             _say(f"{source.stem}: left out, no dataset has {SENSORS[sensor]}")
         else:
@@ -109,11 +99,11 @@ def _with_what_they_need(books, drives):
     return served
 
 
-def _execute(books, drives, data, jobs, kept):
-    """Execute books, or recall their outputs, into which they are put; return their keys."""
-    datasets = [data / drive.name for drive in drives]
-    keys = cache.keys(books, datasets)
-    left = {}
+def _execute(books, drives, data, kept):
+    """Execute books, or recall their outputs, which are put into them; return their keys."""
+    names = [drive.name for drive in drives]
+    keys = cache.keys(books, [data / name for name in names])
+    results = {}
     done = []
 
     def say(source, told):
@@ -121,9 +111,9 @@ def _execute(books, drives, data, jobs, kept):
         _say(f"{len(done)} of {len(books)}: {source.stem}, {told}")
 
     def finish(source, executed, seconds):
-        cache.put_outputs(books[source], executed)
-        if cache.keys(books, datasets) == keys:  # nothing was edited meanwhile
-            cache.keep(kept / source.stem, keys[source], executed)
+        folder = kept / source.stem
+        cache.keep(folder, keys[source], executed)
+        cache.recall(folder, keys[source], books[source])
         say(source, f"executed in {seconds:.1f} s")
 
     for source, book in books.items():
@@ -131,32 +121,28 @@ def _execute(books, drives, data, jobs, kept):
         if cache.recall(folder, keys[source], book):
             say(source, "nothing changed")
         else:
-            left[source] = folder / cache.RESULTS
             shutil.rmtree(folder, ignore_errors=True)
-            left[source].mkdir(parents=True)
-    if left:
+            results[source] = folder / cache.RESULTS
+            results[source].mkdir(parents=True)
+    if results:
         from slamlib.report.execution import execute  # here and below: what is slow to import
-        names = [drive.name for drive in drives]
-        execute({source: books[source] for source in left}, data, names, left, max(1, jobs), finish)
+        execute(books, data, names, results, finish)
     return keys
 
 
 def _write_results(drive, stages, folder):
     """Write the files of a Drive that notebooks wrote to `stages`; return the summary."""
     rows = {}
-    doubts = []
     with files.locked(folder):
         clear_results(folder)
         for stage in stages:
             own = stage / drive.name
             with suppress(DatasetError):  # this notebook solves nothing
-                summary = read_summary(own)
-                rows |= summary["problems"]
-                doubts += [Doubt(**doubt) for doubt in summary["doubts"]]
-            for name in files.file_names(own):
-                if name != SUMMARY:
-                    files.write_file(folder / name, (own / name).read_bytes())
-        summary = summary_of(drive.dataset, drive.truth, rows, doubts)
+                rows |= read_summary(own)["problems"]
+            for file in own.rglob("*"):
+                if file.is_file() and file.name != SUMMARY:
+                    files.write_file(folder / file.relative_to(own), file.read_bytes())
+        summary = summary_of(drive.dataset, drive.truth, rows, drive.doubts)
         write_summary(folder, summary)
     return summary
 
@@ -166,16 +152,15 @@ def _write_pages(books, keys, drives, summaries, options, results, report):
 
     Those of an earlier build that are not made now are removed.
     """
-    look = sorted(file for file in Path(__file__).parent.iterdir() if file.is_file())
-    key = cache.digest(options, keys, summaries, [nbformat.writes(book) for book in books.values()],
-                       [file.read_bytes() for file in look])
+    look = sorted(Path(__file__).parent.glob("*.*"))
+    key = joblib.hash([options, keys, summaries, books, [file.read_bytes() for file in look]])
     listed = report / PAGES
-    earlier_key = ""
     earlier = []
-    with suppress(OSError):
-        earlier_key, *earlier = listed.read_text(encoding="utf-8").splitlines()
-    if earlier_key == key and all((report / name).is_file() for name in earlier):
-        return earlier
+    if listed.exists():
+        earlier = listed.read_text(encoding="utf-8").splitlines()
+    names = earlier[1:]
+    if earlier[:1] == [key] and all((report / name).is_file() for name in names):
+        return names
     _say("setting the pages and the PDF")
     from slamlib.report import overview
     from slamlib.report.document import render
@@ -185,7 +170,7 @@ def _write_pages(books, keys, drives, summaries, options, results, report):
     listed.unlink(missing_ok=True)
     for name, content in made.items():
         files.write_file(report / name, content)
-    for name in set(earlier) - made.keys():
+    for name in set(names) - made.keys():
         (report / name).unlink(missing_ok=True)
     files.write_file(listed, "\n".join([key, *made]).encode())
     return list(made)

@@ -12,19 +12,19 @@ import tempfile
 from base64 import b64encode
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from urllib.parse import quote
 
 import pypandoc
 import typst
-from jinja2 import Environment
+from jinja2 import Template
 from nbconvert.filters import strip_ansi
 
 from slamlib.report.notebooks import Books, NotebookError, Options, title_of
 
 HERE = Path(__file__).parent
 DIALECT = "gfm-alerts-autolink_bare_uris-emoji-yaml_metadata_block+raw_attribute"
-ALT = "Figure of this chapter, described in the text"
 CAPTION = re.compile(r"^(Figure|Table) ([\dA-Z]+\.?\d*)\.\s", re.MULTILINE)
 NUMBERED = re.compile(r"\\tag\*?\s*{([^{}]*)}")
 APPENDIX = re.compile(r"([A-Z])\.")  # begins the title of an appendix
@@ -40,31 +40,26 @@ def render(books: Books, options: Options) -> dict[str, bytes]:
     books : executed notebooks; links name them by their file names.
     options : of the title page.
     """
+    screen = {source: markdown(book) for source, book in books.items()}
+    paper = [markdown(book, on_paper=True) for book in books.values()]
+    targets = _targets(books, screen)
     with tempfile.TemporaryDirectory() as temporary, ThreadPoolExecutor() as pool:
         folder = Path(temporary)
-        screen = {source: markdown(book) for source, book in books.items()}
-        targets = _targets(books, screen)
-        parts = []
-        pages = {}
-        for source, book in books.items():
-            settings = _settings(books, source, targets, folder)
-            paper = markdown(book, on_paper=True)
-            parts.append(pool.submit(_pandoc, paper, "typst", settings))
-            pages[source] = pool.submit(_pandoc, screen[source], "html", settings)
-        pdf = _pdf([part.result() for part in parts], options, folder)
-        files = {f"{source.stem}.html": page.result() for source, page in pages.items()}
-        return files | {"report.pdf": pdf}
+        settings = [_settings(books, source, targets, folder) for source in books]
+        parts = pool.map(partial(_pandoc, "typst"), paper, settings)
+        pages = pool.map(partial(_pandoc, "html"), screen.values(), settings)
+        names = [f"{source.stem}.html" for source in books]
+        return dict(zip(names, pages)) | {"report.pdf": _pdf(parts, options, folder)}
 
 
 def markdown(book, on_paper: bool = False) -> str:
     """Return a notebook with its outputs and pictures as Markdown."""
-    environment = Environment(trim_blocks=True, lstrip_blocks=True)
-    environment.filters["strip_ansi"] = strip_ansi
-    template = environment.from_string((HERE / "notebook.md").read_text(encoding="utf-8"))
-    return template.render(book=book, on_paper=on_paper, alt=ALT, address=_address)
+    text = (HERE / "notebook.md").read_text(encoding="utf-8")
+    template = Template(text, trim_blocks=True, lstrip_blocks=True)
+    return template.render(book=book, on_paper=on_paper, address=address, strip_ansi=strip_ansi)
 
 
-def _address(kind, data):
+def address(kind: str, data: str) -> str:
     """Return the address of a picture of a kind such as "image/png", which holds its data."""
     if kind == "image/svg+xml":
         data = b64encode(data.encode()).decode()
@@ -103,7 +98,7 @@ def _settings(books, here, targets, folder):
             "targets": targets, "page": page}
 
 
-def _pandoc(text, kind, settings):
+def _pandoc(kind, text, settings):
     """Return what pandoc makes of Markdown (bytes): a page, or a part of a document for Typst."""
     command = [
         pypandoc.get_pandoc_path(), f"--from={DIALECT}", f"--to={kind}", "--mathml", "--toc",

@@ -2,11 +2,9 @@
 
 import asyncio
 import os
-import sys
 import time
 from collections.abc import Callable
 from copy import deepcopy
-from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -17,15 +15,12 @@ from nbclient.exceptions import CellExecutionError
 from nbconvert.filters import strip_ansi
 from nbconvert.preprocessors import CoalesceStreamsPreprocessor
 
-from slamlib.core.errors import require
 from slamlib.report.notebooks import LAB_ONLY, Books, NotebookError
 
-# The matrices are small: more threads cost time.
-ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-LAB_SETTINGS = Path(__file__).parent / "lab"       # overrides.json: no question when it opens
-# As root, as in containers: it listens to this machine alone.
-LAB_OPTIONS = (f"--LabApp.app_settings_dir={LAB_SETTINGS}", "--allow-root",
-               "--LabApp.check_for_updates_class=jupyterlab.NeverCheckForUpdate")
+JOBS = 2      # notebooks at a time
+# Pages are equal every time. The matrices are small: more threads cost time.
+DEFAULTS = {"SOURCE_DATE_EPOCH": "0", "PYTHONHASHSEED": "0", "OPENBLAS_NUM_THREADS": "1",
+            "OMP_NUM_THREADS": "1"}
 
 
 class _Loop(asyncio.SelectorEventLoop):
@@ -35,39 +30,29 @@ class _Loop(asyncio.SelectorEventLoop):
         raise RuntimeError("notebooks install no signal handlers")
 
 
-def kernel_environment(settings: Path, data: Path, datasets: list[str]) -> dict[str, str]:
-    """Return the kernels' environment variables without settings that change pages.
-
-    `settings` and `data` are the folders of the kernels' own settings and of the datasets,
-    `datasets` the selected names, or none for those that `notebook.start` selects.
-    """
-    defaults = {"SOURCE_DATE_EPOCH": "0", "PYTHONHASHSEED": "0"} | ONE_THREAD
-    return defaults | os.environ | {
-        "SLAMLIB_DATA": str(data),
-        "SLAMLIB_DATASETS": "\n".join(datasets),
-        "IPYTHONDIR": str(settings),
-        "MPLBACKEND": "module://matplotlib_inline.backend_inline"}
-
-
-def execute(books: Books, data: Path, datasets: list[str], results: dict[Path, Path], jobs: int,
+def execute(books: Books, data: Path, datasets: list[str], results: dict[Path, Path],
             finish: Callable):
-    """Execute notebooks, at most `jobs` at a time; the first failure stops the others.
+    """Execute those of some notebooks that have `results`; the first failure stops the others.
 
-    `data` and `datasets` as of `kernel_environment`. Each notebook writes its files to its own
-    folder, SLAMLIB_RESULTS, of `results`. When one has ended, finish(Path, the executed notebook,
-    seconds) is called. NotebookError if a cell failed.
+    `data` is the folder of the datasets, of which kernels select those that are named. Each
+    notebook writes its files to its own folder, SLAMLIB_RESULTS, of `results`. When one has ended,
+    finish(Path, the executed notebook, seconds) is called. NotebookError if a cell failed.
     """
-    with TemporaryDirectory(prefix="slamlib-", ignore_cleanup_errors=True) as temporary:
-        environment = kernel_environment(Path(temporary), data, datasets)
+    with TemporaryDirectory(ignore_cleanup_errors=True) as settings:
+        environment = DEFAULTS | os.environ | {
+            "SLAMLIB_DATA": str(data),
+            "SLAMLIB_DATASETS": "\n".join(datasets),
+            "IPYTHONDIR": settings,                              # without those of the user
+            "MPLBACKEND": "module://matplotlib_inline.backend_inline"}
         try:
             with asyncio.Runner(loop_factory=_Loop) as runner:
-                runner.run(_execute_all(books, environment, results, jobs, finish))
+                runner.run(_execute_all(books, environment, results, finish))
         except ExceptionGroup as group:
             raise group.exceptions[0] from None
 
 
-async def _execute_all(books, environment, results, jobs, finish):
-    slots = asyncio.Semaphore(jobs)
+async def _execute_all(books, environment, results, finish):
+    slots = asyncio.Semaphore(JOBS)
 
     async def run(source):
         executed = deepcopy(books[source])
@@ -78,7 +63,7 @@ async def _execute_all(books, environment, results, jobs, finish):
             finish(source, executed, time.monotonic() - start)
 
     async with asyncio.TaskGroup() as group:
-        for source in reversed(books):                           # later chapters take longer
+        for source in reversed(results):                         # later chapters take longer
             group.create_task(run(source))
 
 
@@ -102,11 +87,3 @@ async def _execute(source, book, environment):
         if manager.has_kernel:
             await manager.shutdown_kernel(now=True)
     CoalesceStreamsPreprocessor().preprocess(book, {})  # kernels divide them by time
-
-
-def start_lab(notebooks: Path, data: Path, arguments: list[str]):
-    """Replace this process by JupyterLab on the notebooks, with its `arguments`."""
-    require(find_spec("jupyterlab"), "lab", "JupyterLab, as by pip install jupyterlab", "none")
-    command = [sys.executable, "-m", "jupyterlab", *LAB_OPTIONS, *arguments, str(notebooks)]
-    environment = ONE_THREAD | os.environ | {"SLAMLIB_DATA": str(data.resolve())}
-    os.execve(sys.executable, command, environment)

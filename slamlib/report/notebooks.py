@@ -4,10 +4,9 @@ A title `# 2. Name` makes a chapter, `# A. Name` an appendix. The metadata of a 
 which measurements it needs, as `"slamlib": {"needs": "uwb"}`.
 """
 
+import fnmatch
 import re
-import sysconfig
 from dataclasses import dataclass, fields
-from fnmatch import fnmatchcase
 from pathlib import Path
 
 import nbformat
@@ -16,7 +15,6 @@ from nbformat import NotebookNode
 from slamlib.core.errors import require
 from slamlib.io.textfile import read_text, read_toml
 
-FOLDER = "notebooks"  # name of the notebooks' folder
 TITLE = re.compile(r"^#\s+(.+)", re.MULTILINE)
 LAB_ONLY = "lab-only"  # tag of cells that are not executed, and not shown on pages or in the PDF
 Books = dict[Path, NotebookNode]  # notebooks by their files, in the order of the report
@@ -47,28 +45,21 @@ def read_options(path: str | Path) -> Options:
         return Options()
     keys = [option.name for option in fields(Options)]
     entries = read_toml(path, 'author = "Ada Lovelace"', keys)
-    return Options(**{key: _checked(key, value, path) for key, value in entries.items()})
-
-
-def _checked(key, value, path):
-    """Return the value of a key of a file as Options have it."""
-    if key == "chapters":
-        is_list = isinstance(value, list) and all(isinstance(name, str) for name in value)
-        require(is_list, path,
-                'a list of notebooks in quotes, such as ["1_odometry", "A_studies"], for chapters',
-                value)
-        return tuple(value)
-    is_line = type(value) in (str, int) and re.fullmatch(r"[^\n\ufffd]*", str(value))
-    require(is_line, path, f"a line of UTF-8 text in quotes for {key}", value)
-    return str(value)
+    chapters = entries.pop("chapters", [])
+    is_list = isinstance(chapters, list) and all(isinstance(name, str) for name in chapters)
+    require(is_list, path, 'a list of notebooks in quotes, such as ["1_odometry", "A_studies"], '
+            'for chapters', chapters)
+    for key, value in entries.items():
+        is_line = type(value) in (str, int) and re.fullmatch(r"[^\n\ufffd]*", str(value))
+        require(is_line, path, f"a line of UTF-8 text in quotes for {key}", value)
+        entries[key] = str(value)
+    return Options(**entries, chapters=tuple(chapters))
 
 
 def notebooks_folder() -> Path:
-    """Return the folder `notebooks` if it is there, else that of the repository or installation."""
-    repository = Path(__file__).parents[2] / FOLDER
-    installed = Path(sysconfig.get_path("data"), "share", "slamlib", FOLDER)
-    folders = (Path(FOLDER), repository, installed)
-    return next(filter(Path.is_dir, folders), Path(FOLDER))
+    """Return the folder `notebooks` if it is there, else the one beside slamlib's sources."""
+    here = Path("notebooks")
+    return here if here.is_dir() else Path(__file__).parents[2] / here
 
 
 def read_books(folder: Path, chapters: tuple[str, ...] = ()) -> Books:
@@ -76,15 +67,15 @@ def read_books(folder: Path, chapters: tuple[str, ...] = ()) -> Books:
 
     DatasetError if there is none, or none of a name.
     """
-    sources = sorted(folder.glob("*.ipynb"))
-    require(sources, folder, "notebooks (*.ipynb), found no notebooks")
-    names = [source.stem for source in sources]
-    for pattern in chapters:
-        require(any(fnmatchcase(name, pattern) for name in names), "report.toml",
-                f"chapters among {', '.join(names)}", pattern)
-    chosen = chapters or ("*",)
-    return {source: read_notebook(source) for source in sources
-            if any(fnmatchcase(source.stem, pattern) for pattern in chosen)}
+    names = sorted(source.stem for source in folder.glob("*.ipynb"))
+    require(names, folder, "notebooks (*.ipynb), found no notebooks")
+    chosen = set()
+    for pattern in chapters or ("*",):
+        found = fnmatch.filter(names, pattern)
+        require(found, "report.toml", f"chapters among {', '.join(names)}", pattern)
+        chosen.update(found)
+    sources = [folder / f"{name}.ipynb" for name in sorted(chosen)]
+    return {source: read_notebook(source) for source in sources}
 
 
 def read_notebook(source: Path) -> NotebookNode:
@@ -110,11 +101,6 @@ def title_of(source: Path, book: NotebookNode) -> str:
     text = "\n\n".join(cell.source for cell in book.cells if cell.cell_type == "markdown")
     heading = TITLE.search(text)
     return re.sub("[*_`]", "", heading[1]).strip() if heading else source.stem
-
-
-def needs_of(book: NotebookNode) -> str | None:
-    """Return the sensor without which a notebook has nothing to say."""
-    return book.metadata.get("slamlib", {}).get("needs")
 
 
 def code_cells(book: NotebookNode) -> list[NotebookNode]:

@@ -21,32 +21,12 @@ from slamlib import (
 )
 from slamlib.core import odometry, se2
 from slamlib.core.evaluation import anees, ate, position_sigmas
-from slamlib.core.hint import Fusion
 from slamlib.core.increments import TYPICAL_SLIP
 from slamlib.core.records import Dataset, Truth
 from slamlib.core.sightings import sightings_by_frame
 from slamlib.robust.fit import refine
 from slamlib.robust.result import SlamResult, slam_result
-from slamlib.studies.simulation import distances, simulate
-
-PROBLEM2_METHODS = {
-    "odometry": lambda dataset: Fusion(
-        *odometry.equation2(dataset.ticks, dataset.vehicle), rejected=0),
-    "ArUco": lambda dataset: localize(dataset.aruco),
-    "naive": lambda dataset: localize(dataset.aruco, shared_errors=False),
-    "hint": fuse_increments,
-    "exact hint": lambda dataset: fuse_increments(dataset, odometry.first_order),
-    "fused": fuse}
-MEMORY_METHODS = ("markers", "problem 3", "problem 4", "independent")
-
-
-def drive(seed: int, poses: int | None = None, path: str = "short",
-          **options) -> tuple[Dataset, Truth]:
-    """The Dataset and Truth of a simulated drive, or of its first `poses`."""
-    dataset, truth = simulate(path, seed, **options)
-    if poses is None:
-        return dataset, truth
-    return dataset.first(poses), replace(truth, poses=truth.poses[:poses])
+from slamlib.studies.simulation import simulate
 
 
 def judged(name: str, poses: np.ndarray, covariances: np.ndarray, true: np.ndarray,
@@ -57,48 +37,54 @@ def judged(name: str, poses: np.ndarray, covariances: np.ndarray, true: np.ndarr
 
 
 def problem2_trial(seed: int, **options) -> dict:
-    """PROBLEM2_METHODS on one `drive`.
+    """Methods of problem 2 on one drive.
 
     Returns
     -------
     dict of numbers for each method: "nees", the mean over the measured poses, and "ate" in m.
     """
-    dataset, truth = drive(seed, **options)
-    frame = sightings_by_frame(dataset.aruco).frame
+    dataset, truth = simulate(seed=seed, **options)
+    aruco = dataset.aruco
+    methods = {
+        "odometry": fuse_increments(dataset.without("aruco")),
+        "ArUco": localize(aruco),
+        "naive": localize(aruco, shared_errors=False),
+        "hint": fuse_increments(dataset),
+        "exact hint": fuse_increments(dataset, odometry.first_order),
+        "fused": fuse(dataset)}
+    frame = sightings_by_frame(aruco).frame
     numbers = {}
-    for name, method in PROBLEM2_METHODS.items():
-        found = method(dataset)
+    for name, found in methods.items():
         rows = slice(None) if len(found.poses) == len(frame) else frame
         numbers |= judged(name, found.poses[rows], found.covariances[rows], truth.poses[frame])
     return numbers
 
 
+def problems_3_and_4(dataset: Dataset) -> tuple[SlamResult, SlamResult]:
+    """What `estimate` finds without and with the ranges of a Dataset."""
+    without = estimate(dataset.without("uwb"))
+    return without, estimate(dataset, previous=without)
+
+
 def ranges_added(seed: int, share: float = 1.0, **options) -> dict:
-    """Problems 3 and 4 on one `drive`, with markers over the first `share` of the drive only.
+    """Problems 3 and 4 on one drive, with markers over the first `share` of the drive only.
 
     Returns
     -------
-    dict of numbers, "without" and "with" ranges: "ate without" and "aligned without", the ATE in m;
-    "sigma without", the median over the poses of the larger sigma of x and y, in m; and so on. Also
-    "moved", the median distance between the positions of both, over this sigma of each pose.
+    dict of numbers, "without" and "with" ranges: "ate without" and "aligned without", the ATE in m.
     """
-    dataset, truth = drive(seed, **options)
+    dataset, truth = simulate(seed=seed, **options)
     marker_poses = round(share * len(dataset.ticks))
     dataset = replace(dataset, aruco=dataset.first(marker_poses).aruco)
-    without = estimate(dataset.without("uwb"))
-    added = estimate(dataset, previous=without)
     numbers = {}
-    for name, found in (("without", without), ("with", added)):
+    for name, found in zip(("without", "with"), problems_3_and_4(dataset)):
         numbers[f"ate {name}"] = ate(found.poses, truth.poses)
         numbers[f"aligned {name}"] = ate(found.poses, truth.poses, aligned=True)
-        numbers[f"sigma {name}"] = np.median(position_sigmas(found.covariances[1:]))
-    moved = distances(added.poses[1:], without.poses[1:])
-    numbers["moved"] = np.median(moved / position_sigmas(without.covariances[1:]))
     return numbers
 
 
 def plain_and_delivered(seed: int, **options) -> dict:
-    """The plain graph and `estimate`, problems 3 and 4, on one `drive`.
+    """The plain graph and `estimate`, problems 3 and 4, on one drive.
 
     Returns
     -------
@@ -106,12 +92,11 @@ def plain_and_delivered(seed: int, **options) -> dict:
     mean "nees", and the median "sigma" in m, the larger one of x and y; of the poses with a
     measurement.
     """
-    dataset, truth = drive(seed, **options)
-    without = dataset.without("uwb")
-    problem3 = estimate(without)
-    problem4 = estimate(dataset, previous=problem3)
+    dataset, truth = simulate(seed=seed, **options)
+    problem3, problem4 = problems_3_and_4(dataset)
     numbers = {}
-    for problem, given, result in ((3, without, problem3), (4, dataset, problem4)):
+    for problem, given, result in (
+            (3, dataset.without("uwb"), problem3), (4, dataset, problem4)):
         for name, at, poses, covariances in both_graphs(given, result):
             key = f"{name} {problem}"
             numbers |= judged(key, poses, covariances, truth.poses[at])
@@ -134,21 +119,21 @@ def both_graphs(dataset: Dataset, result: SlamResult) -> Iterator[tuple]:
 
 
 def correlated_errors(seed: int, correlation: float, **options) -> dict:
-    """Problems 2 to 4 on one `drive`; `correlation` is the `memory` of `simulate`.
+    """Problems 2 to 4 on one drive; `correlation` is the `memory` of `simulate`.
 
     Returns
     -------
-    dict of "nees" and aligned "ate" in m of MEMORY_METHODS, as "markers nees"; "independent" is
+    dict of "nees" and aligned "ate" in m of each method, as "markers nees"; "independent" is
     problem 3 with every sighting counted in full. Also of problem 3 the mean "share" of its
     information that a sighting keeps, and the "residuals", the correlation of those of neighbours.
     """
-    dataset, truth = drive(seed, memory=correlation, **options)
+    dataset, truth = simulate(seed=seed, memory=correlation, **options)
     markers = localize(dataset.aruco)
-    problem3 = estimate(dataset.without("uwb"))
-    problem4 = estimate(dataset, previous=problem3)
-    results = (markers, problem3, problem4, _counted_in_full(problem3.fit))
+    problem3, problem4 = problems_3_and_4(dataset)
+    methods = {"markers": markers, "problem 3": problem3, "problem 4": problem4,
+               "independent": _counted_in_full(problem3.fit)}
     numbers = {"share": problem3.share.mean(), "residuals": problem3.correlation[0]}
-    for name, found in zip(MEMORY_METHODS, results, strict=True):
+    for name, found in methods.items():
         true = truth.poses[markers.frame] if found is markers else truth.poses
         numbers |= judged(name, found.poses, found.covariances, true, aligned=True)
     return numbers

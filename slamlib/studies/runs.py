@@ -6,22 +6,23 @@ with SLAMLIB_STUDIES=write: `rows` then computes and writes them. With SLAMLIB_S
 test has it, `rows` computes the first two seeds of each again and compares.
 """
 
-import hashlib
 import os
 import platform
 from collections.abc import Callable, Iterable
 from importlib.metadata import version
 from pathlib import Path
 
+import joblib
 import pandas as pd
-from joblib import Parallel, delayed
 
 from slamlib.core.errors import require
+from slamlib.io.files import write_file
 
 FOLDER = Path("studies")                      # from a notebook's folder, in which its kernel runs
 SLAMLIB = Path(__file__).parents[1]
 TOLERANCE = 1e-3        # relative: tables print three digits
 SMALLEST = 1e-6         # m, or a share: smaller differences do not count
+COMPUTING = ("core", "robust", "studies")     # packages on which rows depend
 
 
 def run(trial: Callable, seeds: Iterable[int], **options) -> pd.DataFrame:
@@ -30,7 +31,7 @@ def run(trial: Callable, seeds: Iterable[int], **options) -> pd.DataFrame:
     The seeds are shared among all processors.
     """
     seeds = list(seeds)
-    found = Parallel(-1)(delayed(trial)(seed, **options) for seed in seeds)
+    found = joblib.Parallel(-1)(joblib.delayed(trial)(seed, **options) for seed in seeds)
     return pd.DataFrame(found, index=pd.Index(seeds, name="seed"))
 
 
@@ -46,14 +47,12 @@ def rows(name: str, trial: Callable, seeds: Iterable[int], **options) -> pd.Data
     mode = os.environ.get("SLAMLIB_STUDIES")
     if mode == "write":
         text = run(trial, seeds, **options).to_csv(float_format="%.7g", lineterminator="\n")
-        FOLDER.mkdir(exist_ok=True)
-        file.write_text(made_by() + call + text, encoding="utf-8", newline="\n")
-    require(file.is_file(), file, "rows that 'make studies' writes, beside the notebook")
-    header = file.read_text(encoding="utf-8").splitlines(keepends=True)[:2]
-    found = pd.read_csv(file, comment="#", index_col="seed")
-    as_written = header[1] == call and list(found.index) == seeds
-    require(as_written, file, f"rows of {trial.__name__} by the seeds and options of this call; "
-            "studies.run computes others")
+        write_file(file, f"{made_by()}{call}{text}".encode())
+    found = pd.DataFrame()
+    if file.exists() and call in file.read_text(encoding="utf-8"):
+        found = pd.read_csv(file, comment="#", index_col="seed")
+    require(list(found.index) == seeds, file, f"rows of {trial.__name__} by the seeds and options "
+            "of this call, as 'make studies' writes them; studies.run computes others")
     if mode == "check":
         again = run(trial, seeds[:2], **options)
         pd.testing.assert_frame_equal(found.loc[again.index], again, check_dtype=False,
@@ -63,10 +62,8 @@ def rows(name: str, trial: Callable, seeds: Iterable[int], **options) -> pd.Data
 
 def made_by() -> str:
     """A line (str) with the digest of the code that computes rows, and the versions it uses."""
-    code = hashlib.sha256()
-    for package in ("core", "robust", "studies"):
-        for file in sorted((SLAMLIB / package).glob("*.py")):
-            code.update(file.read_bytes())
+    files = sorted(file for file in SLAMLIB.rglob("*.py") if file.parent.name in COMPUTING)
+    code = joblib.hash([file.read_bytes() for file in files])
     versions = [f"{package} {version(package)}" for package in ("numpy", "scipy", "gtsam")]
-    return (f"# slamlib's code {code.hexdigest()[:12]}, Python {platform.python_version()}, "
+    return (f"# slamlib's code {code[:12]}, Python {platform.python_version()}, "
             f"{', '.join(versions)}\n")

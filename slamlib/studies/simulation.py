@@ -15,7 +15,6 @@ import numpy as np
 from scipy.integrate import cumulative_simpson
 
 from slamlib.core import se2
-from slamlib.core.errors import require
 from slamlib.core.odometry import dead_reckoning
 from slamlib.core.records import AntennaGuess, ArucoReadings, Dataset, Truth, UwbReadings
 from slamlib.core.vehicle import TABLE_2, Vehicle
@@ -27,27 +26,26 @@ from slamlib.io.formats import VEHICLE
 class Layout:
     """A closed path, a sum of rotating vectors, with its markers, antennas and rates."""
 
-    turns: tuple                 # of each vector in one round
+    turns: tuple                 # of each vector; twice as many drive the path twice
     radii: tuple                 # m, lengths of the vectors
     phases: tuple                # rad
-    poses: int                   # in one round
+    poses: int                   # of the encoders
     aruco_every: int             # poses from one camera frame to the next
     marker_spacing: float        # m
-    gap_place: float             # fraction of the path, centre of a disc without markers
-    gap_radius: float            # m, of this disc
     uwb_every: int               # poses from one set of ranges to the next
     antennas: int
+    gap_place: float = 0.0       # fraction of the path, centre of a disc without markers
+    gap_radius: float = 0.0      # m, of this disc
 
 
 PATHS = {
     "short": Layout(
         turns=(1, -1, 2, 3), radii=(2.9, 0.9, 0.7, 0.2), phases=(0.0, 0.3, 2.0, 1.0), poses=2000,
-        aruco_every=10, marker_spacing=1.5, gap_place=0.0, gap_radius=0.0, uwb_every=20,
-        antennas=4),
+        aruco_every=10, marker_spacing=1.5, uwb_every=20, antennas=4),
     "long": Layout(
         turns=(4, -3, 1), radii=(8.9, 3.9, 3.3), phases=(0.0, 0.5, 1.0), poses=23000,
-        aruco_every=12, marker_spacing=1.9, gap_place=0.42, gap_radius=3.5, uwb_every=25,
-        antennas=8),
+        aruco_every=12, marker_spacing=1.9, uwb_every=25, antennas=8,
+        gap_place=0.42, gap_radius=3.5),
 }
 CAMERA_REACH = 1.8      # m, largest distance in the plane at which a marker is in the image
 UWB_REACH = 15.0        # m, largest distance to an antenna that is measured
@@ -61,8 +59,9 @@ SPEED_PERIODS = 5       # of the speed, in the whole drive
 
 
 def simulate(path: str = "short", seed: int = 0, *, slip: float = 1e-3, late_ranges: float = 0.0,
-             mislabelled: float = 0.0, memory: float = 0.0, rounds: int = 1, noise: bool = True,
-             vehicle: Vehicle = TABLE_2) -> tuple[Dataset, Truth]:
+             mislabelled: float = 0.0, memory: float = 0.0, noise: bool = True,
+             vehicle: Vehicle = TABLE_2, markers: bool = True, poses: int | None = None
+             ) -> tuple[Dataset, Truth]:
     """A simulated dataset and its truth.
 
     Parameters
@@ -74,43 +73,41 @@ def simulate(path: str = "short", seed: int = 0, *, slip: float = 1e-3, late_ran
     late_ranges, mislabelled : fractions of the UWB ranges that are too long (no line of sight) and
         of the sightings that have another marker's id.
     memory : correlation of the errors of a marker's sightings from one camera frame to the next.
-    rounds : number of times that the closed path is driven.
     noise : False gives the nominal vehicle, fractional counts, and exact sightings, ranges and
         antenna guesses. The stated covariances do not change.
     vehicle : Vehicle, the nominal one.
+    markers : False for a vehicle without a camera.
+    poses : number of the first poses that are kept; None for all.
 
-    Returns Dataset and Truth. Raises DatasetError if there is no such path, or a number is beyond
-    its limits.
+    Returns Dataset and Truth.
 
     >>> dataset, truth = simulate("short", seed=1, late_ranges=0.1)
     >>> dataset.ticks.shape, truth.poses.shape
     ((2000, 2), (2000, 3))
     """
-    shares_hold = all(0 <= share <= 1 for share in (slip, late_ranges, mislabelled))
-    require(path in PATHS and seed >= 0 and rounds >= 1 and shares_hold, "simulate",
-            f"one of the paths {', '.join(PATHS)}, a seed from 0 on, rounds from 1 on, slip and "
-            "shares from 0 to 1")
     layout = PATHS[path]
     rng = np.random.default_rng(seed)
-    noise_scale = 1.0 if noise else 0.0
 
-    wheel_error = noise_scale * rng.normal(0, vehicle.sigma_wheel)
+    wheel_error = noise * rng.normal(0, vehicle.sigma_wheel)
     true_vehicle = vehicle.with_wheel(vehicle.wheel + wheel_error)
-    ds, dtheta = _driven_arcs(layout, rounds)
+    ds, dtheta = _driven_arcs(layout)
     counts = _counts(ds, dtheta, true_vehicle)
-    poses = dead_reckoning(counts, true_vehicle, model="arc")
+    true_poses = dead_reckoning(counts, true_vehicle, model="arc")
     whole_counts = _encoder(counts, true_vehicle, slip, rng)
 
-    marker, marker_in_world = _place_markers(layout, poses, rng)
-    antenna, antenna_in_world = _place_antennas(layout.antennas, poses, rng)
-    truth = Truth(poses, marker, marker_in_world, antenna, antenna_in_world, true_vehicle)
+    marker, marker_in_world = _place_markers(layout, true_poses, rng)
+    antenna, antenna_in_world = _place_antennas(layout.antennas, true_poses, rng)
+    truth = Truth(true_poses, marker, marker_in_world, antenna, antenna_in_world, true_vehicle)
 
-    aruco = _camera(truth, layout.aruco_every, mislabelled, memory, noise_scale, rng)
-    uwb = _uwb(truth, layout.uwb_every, late_ranges, noise_scale, rng)
+    aruco = _camera(truth, layout.aruco_every, mislabelled, memory, noise, rng)
+    uwb = _uwb(truth, layout.uwb_every, late_ranges, noise, rng)
     guess_error = SIMULATED_GUESS_SIGMA * rng.standard_normal(antenna_in_world.shape)
-    guess = AntennaGuess(antenna, antenna_in_world + noise_scale * guess_error)
-    ticks = whole_counts if noise else counts
-    return Dataset(path, vehicle, ticks, aruco, uwb, guess), truth
+    guess = AntennaGuess(antenna, antenna_in_world + noise * guess_error)
+    if not markers:
+        aruco = None
+    dataset = Dataset(path, vehicle, whole_counts if noise else counts, aruco, uwb, guess)
+    count = poses or len(true_poses)
+    return dataset.first(count), replace(truth, poses=true_poses[:count])
 
 
 def misguess(dataset: Dataset, position: np.ndarray, error: float, seed: int) -> Dataset:
@@ -134,9 +131,8 @@ def confuse_labels(dataset: Dataset, kind: str, seed: int) -> Dataset:
     aruco = dataset.aruco
     rng = np.random.default_rng(seed)
     label = aruco.marker.copy()
-    ids = np.unique(label)
+    ids, number = np.unique(label, return_inverse=True)
     if kind == "random":
-        number = np.searchsorted(ids, label)
         label = ids[_relabelled(number, len(ids), CONFUSED, rng)]
     elif kind == "in frame":
         for first in np.flatnonzero(rng.uniform(size=len(label)) < CONFUSED / 2):
@@ -166,12 +162,10 @@ def manoeuvre(legs: list[tuple[float, float]], vehicle: Vehicle = TABLE_2) -> np
 def write_dataset(folder: str | Path, dataset: Dataset, truth: Truth | None = None) -> None:
     """Write a Dataset, and its Truth if given, as the assignment's text files.
 
-    Raises DatasetError if the folder exists and is not empty.
+    Raises FileExistsError if the folder exists.
     """
     folder = Path(folder)
-    empty = folder.is_dir() and not any(folder.iterdir())
-    require(empty or not folder.exists(), folder, "a new or empty folder to write the dataset to")
-    folder.mkdir(parents=True, exist_ok=True)
+    folder.mkdir(parents=True)
     if dataset.vehicle != TABLE_2:
         write_vehicle(folder / VEHICLE, dataset.vehicle)
     number = np.arange(1, len(dataset.ticks) + 1)
@@ -192,19 +186,18 @@ def write_dataset(folder: str | Path, dataset: Dataset, truth: Truth | None = No
         folder = folder / "truth"
         folder.mkdir()
         write_vehicle(folder / VEHICLE, truth.vehicle)
-        pose = "%d %.6f %.6f %.6f"
-        _write_table(folder / "vehiclePose.txt", pose, number, truth.poses)
-        _write_table(folder / "ArucoMap.txt", pose, truth.marker, truth.marker_in_world)
+        _write_table(folder / "vehiclePose.txt", "%d %.6f %.6f %.6f", number, truth.poses)
+        _write_table(folder / "ArucoMap.txt", "%d %.6f %.6f %.6f",
+                     truth.marker, truth.marker_in_world)
         _write_table(folder / "UwbMap.txt", "%d %.6f %.6f", truth.antenna, truth.antenna_in_world)
 
 
 def _write_table(path, row_format, *columns):
-    """Write columns, arrays (n,) or (n, c), with line ends that are the same on all systems."""
-    with open(path, "wb") as file:
-        np.savetxt(file, np.column_stack(columns), fmt=row_format)
+    """Write columns, arrays (n,) or (n, c)."""
+    np.savetxt(path, np.column_stack(columns), fmt=row_format)
 
 
-def _driven_arcs(layout, rounds):
+def _driven_arcs(layout):
     """Lengths (n-1,) in m and turns (n-1,) in rad of the arcs of the path, at varying speed.
 
     With s the angle that parametrises a round, the path is the sum of r exp(i (t s + p)) over the
@@ -216,9 +209,9 @@ def _driven_arcs(layout, rounds):
     def velocity(s):
         return np.sum(amplitudes * np.exp(1j * (turns * s + phases)), axis=0)
 
-    fine = np.linspace(0, 2 * np.pi * rounds, 10 * layout.poses * rounds + 1)
+    fine = np.linspace(0, 2 * np.pi, 10 * layout.poses + 1)
     length = cumulative_simpson(np.abs(velocity(fine)), x=fine, initial=0.0)
-    time = np.linspace(0, 1, layout.poses * rounds)
+    time = np.linspace(0, 1, layout.poses)
     frequency = 2 * np.pi * SPEED_PERIODS
     travelled = length[-1] * (time - SPEED_SWING * np.sin(frequency * time) / frequency)
     s = np.interp(travelled, length, fine)
@@ -256,10 +249,10 @@ def _place_markers(layout, poses, rng):
     place = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     place += spacing * rng.uniform(-0.35, 0.35, place.shape)
 
-    visible = [distances(path[::10], each).min() < CAMERA_REACH for each in place]
+    closest = distances(path[::10], place[:, None]).min(axis=1)
     gap = path[int(layout.gap_place * len(path))]
     outside_gap = distances(place, gap) > layout.gap_radius
-    place = place[visible & outside_gap]
+    place = place[(closest < CAMERA_REACH) & outside_gap]
 
     count = len(place)
     ids = np.sort(rng.choice(np.arange(1, max(250, count + 1)), count, replace=False))
@@ -280,7 +273,7 @@ def _place_antennas(count, poses, rng):
     return ids, position[rng.permutation(count)]
 
 
-def _camera(truth, every, mislabelled, memory, noise_scale, rng):
+def _camera(truth, every, mislabelled, memory, noise, rng):
     """Sightings of all markers in the disc of CAMERA_REACH around every `every`-th pose."""
     frames = np.arange(0, len(truth.poses), every)
     in_vehicle = se2.between(truth.poses[frames, None], truth.marker_in_world)
@@ -290,7 +283,7 @@ def _camera(truth, every, mislabelled, memory, noise_scale, rng):
     covariance = _sighting_covariance(true_z, distance[frame, marker])
     unit_error = _correlated(rng.standard_normal(true_z.shape), frame, marker, memory)
     error = np.linalg.cholesky(covariance) @ unit_error[..., None]
-    z = true_z + noise_scale * error[..., 0]
+    z = true_z + noise * error[..., 0]
     z[:, 2] = se2.wrap(z[:, 2])
     read_as = _relabelled(marker, len(truth.marker), mislabelled, rng)
     return ArucoReadings(frames[frame], truth.marker[read_as], z, covariance)
@@ -325,7 +318,7 @@ def _relabelled(label, count, fraction, rng):
     return np.where(wrong, (label + shift) % count, label)
 
 
-def _uwb(truth, every, late_ranges, noise_scale, rng):
+def _uwb(truth, every, late_ranges, noise, rng):
     """Ranges to all antennas within UWB_REACH of every `every`-th pose, some of them late."""
     frames = np.arange(every // 2, len(truth.poses), every)
     distance = distances(truth.poses[frames, None], truth.antenna_in_world)
@@ -334,8 +327,8 @@ def _uwb(truth, every, late_ranges, noise_scale, rng):
     count = len(true_range)
     sigma = 0.05 + 0.004 * true_range
     late = rng.uniform(size=count) < late_ranges
-    excess = np.where(late, rng.exponential(LATE_RANGE_MEAN, count), 0.0)
-    error = noise_scale * sigma * rng.standard_normal(count)
+    excess = late * rng.exponential(LATE_RANGE_MEAN, count)
+    error = noise * sigma * rng.standard_normal(count)
     measured = np.maximum(true_range + error + excess, 1e-3)
     return UwbReadings(frames[frame], truth.antenna[antenna], measured, sigma)
 

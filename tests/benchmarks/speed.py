@@ -71,6 +71,13 @@ def pairs(count=PAIRS):
         f"{name} {seconds:.2f} s" for name, seconds in parts.items()))
 
 
+def layout(rounds, **changes):
+    """The long path, driven several times, with changes of the Layout."""
+    long = simulation.PATHS["long"]
+    turns = tuple(rounds * turn for turn in long.turns)
+    return replace(long, turns=turns, poses=rounds * long.poses, **changes)
+
+
 def growth(folder):
     """Print times and memory by the length of the drive."""
     print("\nThe long path driven several times: seconds of each problem, and of all")
@@ -78,8 +85,8 @@ def growth(folder):
           + f"{'solve':>9}{'ms/1000':>10}{'MB':>7}")
     for rounds in ROUNDS:
         drive = folder / f"{rounds} rounds"
-        subprocess.run([sys.executable, "-m", "slamlib", "simulate", drive, "--path", "long",
-                        "--seed", "3", "--rounds", str(rounds)], check=True)
+        simulation.PATHS["shape"] = layout(rounds)
+        simulation.write_dataset(drive, *simulation.simulate("shape", seed=3))
         seconds, parts, memory = solve(drive)
         rows = rounds * simulation.PATHS["long"].poses
         print(f"{rows:10,}" + "".join(f"{parts[name]:9.2f}" for name in PROBLEMS)
@@ -88,14 +95,14 @@ def growth(folder):
 
 def drive(shape, rows, spacing):
     """A simulated Dataset of a shape with this many rows, without ranges."""
-    simulation.PATHS["shape"] = replace(simulation.PATHS["long"], marker_spacing=spacing)
     rounds = math.ceil(rows / simulation.PATHS["long"].poses)
+    simulation.PATHS["shape"] = layout(rounds, marker_spacing=spacing)
     if SHAPES[shape]:
         once = simulation.manoeuvre(SHAPES[shape])[1:]
         counts = np.tile(once, (math.ceil(rows / len(once)), 1))
         right, left = 2 * np.pi * 0.1 / 8000 * counts.T
         simulation._driven_arcs = lambda *_: ((right + left) / 2, (right - left) / 0.4)
-    dataset, _ = simulation.simulate("shape", seed=3, slip=3e-3, rounds=rounds)
+    dataset, _ = simulation.simulate("shape", seed=3, slip=3e-3)
     return dataset.first(rows).without("uwb")
 
 
