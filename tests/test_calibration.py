@@ -249,14 +249,6 @@ def test_wrong_scatter_and_scale_are_named_alone(what):
     assert antenna_error(both, truth)[1].mean() < 8
 
 
-@pytest.mark.slow
-def test_slightly_wrong_wheels_are_named_alone():
-    spoilt = vehicle(right_radius=0.101, left_radius=0.101)(drive(61)[0])
-    markers, both = both_problems(spoilt)
-    assert named(both) == {"wheel-scale"} and not doubts_before_solving(spoilt)
-    assert named(markers) <= {"wheel-scale", "marker-size"}
-
-
 def counted(dataset, factor):
     """The Dataset with counts times a factor, a number or (n, 1)."""
     return replace(dataset, ticks=np.rint(dataset.ticks * factor).astype(int))

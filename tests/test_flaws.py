@@ -11,7 +11,6 @@ from numeric import aruco, assert_consistent, known_noise, short, sigmas, uwb, v
 from numpy.testing import assert_allclose, assert_array_equal
 
 from slamlib import estimate, solve
-from slamlib.core import se2
 from slamlib.core.records import Dataset
 from slamlib.core.vehicle import Vehicle
 from slamlib.io.dataset import read_dataset, read_truth
@@ -276,18 +275,3 @@ def test_a_marker_with_a_single_accepted_sighting_is_unconfirmed():
     assert not solution_doubts(found)
     row = solve.summarize(solve.problem_solution("problem3", dataset, found), None)
     assert row["unconfirmed"] == [marker]
-
-
-@pytest.mark.slow
-def test_a_marker_that_was_moved_halfway_is_named():
-    dataset, truth = short(5)
-    seen = dataset.aruco
-    late = seen.pose >= 1000
-    often = [np.bincount(seen.marker[half], minlength=500) for half in (late, ~late)]
-    marker = np.min(often, axis=0).argmax()
-    late &= seen.marker == marker
-    z = seen.marker_in_vehicle.copy()
-    z[late, :2] += se2.rotation(-truth.poses[seen.pose[late], 2]) @ [0.1, 0]
-    found = estimate(aruco(dataset, marker_in_vehicle=z).without("uwb"))
-    doubt, = solution_doubts(found)
-    assert doubt.what == "sightings-rejected" and f"of marker {marker} " in doubt.sentence

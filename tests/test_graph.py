@@ -426,9 +426,3 @@ def test_a_robust_factor_may_be_wrong_by_far(drive, solved):
     found, _ = with_fixes(drive, solved, {300: 5e8}, robust)     # its loss exceeds ten sigmas
     assert found.converged and not found.contradiction
     assert ate(found.poses, drive[1].poses[found.pose]) < 0.03
-
-
-def test_the_graph_can_be_written_as_a_g2o_file(solved, tmp_path):
-    gtsam.writeG2o(*solved.graph(), str(tmp_path / "graph.g2o"))
-    edges = (tmp_path / "graph.g2o").read_text().count("EDGE_SE2")
-    assert edges == np.count_nonzero(~solved.rejected)

@@ -151,13 +151,6 @@ def test_notes_and_doubts_are_said_and_in_the_summary(tmp_path, drive, capsys):
         assert f"drive: note: {note}\n" in told.err
 
 
-def test_without_guesses_problems_1_to_3_are_solved_and_it_is_said(folder, capsys):
-    (folder / "drive" / "UwbAntennaGuess.txt").unlink()
-    summary = solved(folder)
-    assert [*summary["problems"]] == [*solve.PROBLEMS][:-1]
-    assert "UwbAntennaGuess.txt is missing: problem 4 is left out." in capsys.readouterr().err
-
-
 def test_a_problem_that_fails_costs_the_others_nothing(tmp_path, capsys, drive):
     """Every marker is seen twice at a pose, at two places, and neither is confirmed."""
     write_dataset(tmp_path / "drive", replace(drive[0], aruco=contradicted(drive[0].aruco)))

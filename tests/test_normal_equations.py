@@ -120,29 +120,6 @@ def test_a_narrow_posterior_is_one_point(monkeypatch):
     assert_allclose(logs[0], CENTRE + 0.01 * np.diag(BROAD), rtol=1e-12)
 
 
-@pytest.mark.parametrize("free", [[0, 1, 2], [0, 2]], ids=str)
-@pytest.mark.parametrize("skew, steps", [(0.0, 0.1), (0.0, 1e-6), (0.0, 5.0), (0.5, 0.1)])
-def test_newton_finds_the_mode_of_a_log_density_and_its_covariance(free, skew, steps):
-    C = np.array([[0.04, 0.01, 0.005], [0.01, 0.01, 0], [0.005, 0, 0.0025]])
-    C = C[np.ix_(free, free)]
-    sigma = sigmas(C)
-
-    def log_density(x):
-        off = (x - CENTRE)[free]
-        u = off[0] / sigma[0]
-        return -off @ np.linalg.solve(C, off) / 2 + skew * (1 + u + u**2 / 2 - np.exp(u))
-
-    start = CENTRE.copy()
-    start[free] += 3 * sigma
-    x, value, covariance = noise._mode(
-        log_density, start, log_density(start), np.array(free), np.full(len(free), steps))
-    assert np.abs((x - CENTRE)[free] / sigma).max() < 0.1
-    assert value == log_density(x)
-    expected = np.zeros((3, 3))
-    expected[np.ix_(free, free)] = C
-    assert_allclose(covariance, expected, atol=1e-6 + 0.1 * skew * C.max())
-
-
 def test_gates_are_quantiles_of_chi_squared():
     """They are numbers in the code because scipy.special takes long to import."""
     assert np.allclose([sightings.GATE, sightings.POINT_GATE], chdtri([3, 2], 1e-3), rtol=1e-12)

@@ -2,14 +2,13 @@
 
 import numpy as np
 import pytest
-from numeric import central_differences, sigmas
+from numeric import central_differences
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.linalg import block_diag
 
 from slamlib.core import increments, odometry, se2
 from slamlib.core.increments import preintegrate
 from slamlib.core.records import Dataset
-from slamlib.core.se2 import correlations
 from slamlib.core.vehicle import Vehicle
 from slamlib.studies.simulation import manoeuvre, simulate
 
@@ -118,24 +117,6 @@ def test_first_order_is_the_propagation_by_numerical_derivatives(model):
 def test_unknown_model_is_refused():
     with pytest.raises(ValueError, match="euler.*arc.*'midpoint'"):
         odometry.dead_reckoning(curvy_ticks(), VEHICLE, model="midpoint")
-
-
-@pytest.mark.parametrize("legs, holds", [
-    ([(5, np.pi / 2)], True),                                             # a quarter turn
-    ([(3, 0), (4, 2.5), (3, -1.0)], True),                                # bends to both sides
-    ([(8, 0)], True),                                                     # straight on
-    ([(5, 0), (0.8, np.pi / 2), (-5, 0), (-0.8, np.pi / 2), (-5, 0)], False),       # backing up
-])
-def test_equation_2_is_right_in_its_sigmas_unless_the_vehicle_backs_up(legs, holds):
-    """And always in that of the heading; its correlations of heading and position are too small."""
-    ticks = manoeuvre(legs)
-    exact = odometry.first_order(ticks, VEHICLE)[1][-1]
-    equation2 = odometry.equation2(ticks, VEHICLE)[1][-1]
-    assert np.abs(correlations(exact)[:2, 2]).max() > 0.9
-    assert np.abs(correlations(equation2)[:2, 2]).max() < 0.2
-    assert_allclose(equation2[2, 2], exact[2, 2])
-    off = np.abs(sigmas(equation2) - sigmas(exact))[:2] / sigmas(exact)[:2].max()
-    assert off.max() < 0.05 if holds else off.max() > 0.5
 
 
 def test_a_single_pose_has_the_initial_covariance():

@@ -3,18 +3,14 @@
 import re
 from base64 import b64decode
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from test_document import text_of
 
 from slamlib.core import evaluation, se2
 from slamlib.notebook import Drive, plotting
 from slamlib.report import overview
-from slamlib.report.document import render
-from slamlib.report.notebooks import Options
 from slamlib.solve import Failure, Solution, solve_to_folder, summarize, title, truth_in_world
 from slamlib.studies.simulation import simulate
 
@@ -161,14 +157,3 @@ def test_at_returns_slam_is_compared_by_the_camera_that_it_estimated(tmp_path):
         "odometry", "SLAM: odometry + ArUco", "noise of the sightings alone"))
     assert slam < 1.5 * noise < odometry
     assert "those at returns" in text
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", NAMES)
-def test_the_opening_of_any_one_drive_fits_on_a_page(project, tmp_path, name):
-    drive, = (drive for drive in project.drives if drive.name == name)
-    files = render({Path("index"): overview.opening([drive])}, Options(title="T"))
-    text = text_of(files["report.pdf"], tmp_path)
-    _, page = text.rstrip("\f\n").split("\f")                     # after the cover
-    assert "Figure 1." in page and "The datasets" not in text
-    assert ("ATE" in text) == (name == "all") == ("Simulated" in text)

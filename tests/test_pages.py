@@ -161,42 +161,6 @@ slamlib.estimate ="""))
     assert 'class="stderr"' not in page
 
 
-def cells_of(page, name):
-    """The texts of the cells of all rows that begin with the name of a drive."""
-    cells = set()
-    for row in re.findall(r"<tr.*?</tr>", page, re.DOTALL):
-        first, *others = [text_of(cell).replace("\u00a0", " ").strip()
-                          for cell in re.findall(r"<t[dh].*?</t[dh]>", row, re.DOTALL)]
-        if first == name:
-            cells |= {*others}
-    return cells
-
-
-def test_chapters_say_which_noise_was_given(mixed):
-    """And not that it was learned, of the one drive whose vehicle.toml gives it."""
-    pages = [mixed[1].files[number].read_text(encoding="utf-8") for number in (1, 3)]
-    stated = {"0.00200", "1.25", "0.750"}
-    assert stated <= cells_of(pages[0], "told") and not stated & cells_of(pages[0], "good")
-    assert {"2.00 ± 0.00", "1.25 ± 0.00"} <= cells_of(pages[1], "told")
-    assert not any(cell.endswith("± 0.00") for cell in cells_of(pages[1], "good"))
-
-
-def test_figures_and_tables_are_numbered_without_a_gap_with_and_without_truth(built, mixed):
-    without_truth = {page.stem: page.read_text(encoding="utf-8")
-                     for page in mixed[1].files if page.suffix == ".html"}
-    for name, page in [*built[1].items(), *without_truth.items()]:
-        for kind in ("figure", "table"):
-            found = re.findall(rf'<figure id="{kind}-(\S+)">', page)
-            assert name == "index" or found == [
-                f"{name[0]}.{n}" for n in range(1, len(found) + 1)], name
-
-
-def test_without_truth_none_is_missed(mixed):
-    for page in mixed[1].files[:5]:
-        text = text_of(page.read_text(encoding="utf-8"))
-        assert not re.search("no truth (is|comes)|not known|is unknown", text, re.I), page.name
-
-
 # In the browser.
 
 
@@ -242,14 +206,6 @@ def test_figures_can_be_read_equations_have_numbers_tables_scroll_and_nothing_st
         assert outside == [], path.name
         assert page.evaluate(STICKING_OUT) == [], path.name
         assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth"), path.name
-
-
-def test_code_opens_by_its_summary(visited):
-    page = next(page for path, page in visited if path.stem == "1_odometry")
-    code = page.locator("details").first
-    assert not code.locator("pre").is_visible()
-    code.locator("summary").click()
-    assert code.locator("pre").is_visible()
 
 
 def test_a_dark_page_has_light_text(chromium, pages):

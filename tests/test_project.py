@@ -11,7 +11,6 @@ from importlib.metadata import packages_distributions, requires
 from pathlib import Path
 
 import nbformat
-import pytest
 import yaml
 from conftest import ROOT
 
@@ -150,12 +149,3 @@ def test_what_jupyterlab_saves_is_restored_to_the_byte_by_make_strip(tmp_path):
         save_as_lab(saved)
         subprocess.run([*command, saved], check=True, timeout=300)
         assert saved.read_bytes() == source.read_bytes()
-
-
-@pytest.mark.parametrize("version, code", [((3, 10), 1), ((3, 11), 0), ((3, 14), 0), ((3, 15), 1)])
-def test_the_makefile_asks_for_the_python_that_the_project_requires(version, code):
-    assert PROJECT["requires-python"] == ">=3.11,<3.15"
-    fits = re.search(r"^FITS := (.*)$", MAKEFILE, re.MULTILINE)[1]
-    with pytest.raises(SystemExit) as ended:
-        exec(fits.replace("sys.version_info[:2]", str(version)))  # noqa: S102
-    assert ended.value.code == code
