@@ -151,7 +151,8 @@ def test_what_stands_in_the_place_of_a_result_is_told_and_stays(tmp_path, drive,
 def test_a_build_removes_what_is_no_longer_made_and_no_file_of_the_user(tmp_path):
     make_data(tmp_path)
     write(tmp_path / "notebooks", "1_stays", "# Stays", (RESULT,))
-    write(tmp_path / "notebooks", "2_goes", "# Goes", (RESULT.replace("problem1", "problem2_hint"),))
+    other = RESULT.replace("problem1", "problem2_hint")
+    write(tmp_path / "notebooks", "2_goes", "# Goes", (other,))
     build(tmp_path, datasets=["short"])
     for name in ("report/notes.html", "results/short/notes.txt", "results/mine/vehiclePose.mat"):
         files.write_file(tmp_path / name, b"mine")

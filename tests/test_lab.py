@@ -2,12 +2,11 @@
 
 import json
 import os
-import subprocess
 import sys
-import time
 
 import pytest
 from conftest import ROOT, copied
+from test_concurrency import start, wait_for
 from test_report import make_data
 
 from slamlib.__main__ import main
@@ -19,38 +18,18 @@ SECONDS = 300
 NEWS = "Would you like to get notified about official Jupyter news?"
 
 
-@pytest.fixture(scope="module")
-def lab(tmp_path_factory):
+@pytest.fixture
+def lab(tmp_path, monkeypatch):
     """Address and token of a JupyterLab on a copy of a notebook and 300 poses of `short`."""
-    folder = tmp_path_factory.mktemp("lab")
-    copied(folder / "notebooks", "1_odometry.ipynb")
-    write_dataset(folder / "data" / "short", read_dataset(ROOT / "data" / "short").first(300))
-    environment = {name: value for name, value in os.environ.items()
-                   if not name.startswith(("SLAMLIB_", "JUPYTER"))}
-    for name in ("HOME", "IPYTHONDIR", "JUPYTER_CONFIG_DIR", "JUPYTER_DATA_DIR",
-                 "JUPYTER_RUNTIME_DIR", "JUPYTERLAB_SETTINGS_DIR", "JUPYTERLAB_WORKSPACES_DIR"):
-        environment[name] = str(folder / name.lower())
-    with open(folder / "log", "w") as log:
-        server = subprocess.Popen(
-            [sys.executable, "-m", "slamlib", "lab", "--no-browser", "--ip", "127.0.0.1",
-             "--port", "0"],
-            cwd=folder, env=environment, stdout=log, stderr=subprocess.STDOUT)
-    try:
-        yield _started(server, folder)
-    finally:
-        server.kill()
-        server.wait()
-
-
-def _started(server, folder):
-    """What the server writes into its runtime folder when it listens: `url` and `token`."""
-    deadline = time.monotonic() + SECONDS
-    while time.monotonic() < deadline and server.poll() is None:
-        for file in (folder / "jupyter_runtime_dir").glob("jpserver-*.json"):
-            if (text := file.read_text()).rstrip().endswith("}"):              # written to the end
-                return json.loads(text)
-        time.sleep(0.1)
-    pytest.fail("JupyterLab did not start:\n" + (folder / "log").read_text()[-2000:])
+    copied(tmp_path / "notebooks", "1_odometry.ipynb")
+    write_dataset(tmp_path / "data" / "short", read_dataset(ROOT / "data" / "short").first(300))
+    monkeypatch.setenv("HOME", str(tmp_path))                       # without settings of the user
+    server = start(tmp_path, "lab", "--no-browser", "--ip", "127.0.0.1", "--port", "0")
+    told = tmp_path / ".local" / "share" / "jupyter" / "runtime" / f"jpserver-{server.pid}.json"
+    wait_for(told.with_name(f"jpserver-{server.pid}-open.html"), server)      # written after it
+    yield json.loads(told.read_text())
+    server.kill()
+    server.communicate()
 
 
 def test_jupyterlab_replaces_the_command_and_kernels_see_the_data(tmp_path, monkeypatch):
@@ -93,12 +72,8 @@ def test_moving_a_slider_changes_the_picture(chromium, lab):
     picture = cell.locator("img")
     expect(picture).to_have_count(1)
     first = picture.get_attribute("src")
-    assert first.startswith("data:image/svg+xml")
-    slider = cell.get_by_role("slider").first
-    slider.press("ArrowLeft")
+    cell.get_by_role("slider").first.press("ArrowLeft")
     expect(picture).not_to_have_attribute("src", first)
-    slider.press("ArrowRight")                      # the same values give the same picture, alone
-    expect(picture).to_have_attribute("src", first)
     expect(picture).to_have_count(1)
     expect(page.locator("[data-mime-type*=stderr], [data-mime-type*=error]")).to_have_count(0)
     expect(page.get_by_text(NEWS)).to_have_count(0)

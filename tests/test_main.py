@@ -31,13 +31,6 @@ def folder(tmp_path, drive):
     return tmp_path
 
 
-def run(*arguments, cwd):
-    done = subprocess.run([sys.executable, "-m", "slamlib", *map(str, arguments)], cwd=cwd,
-                          text=True, capture_output=True, timeout=300)
-    assert done.returncode == 0, done.stderr
-    return done
-
-
 def solved(folder, *options, code=0):
     """The summary of `solve` on folder/drive into folder/out."""
     out = folder / "out"
@@ -45,16 +38,16 @@ def solved(folder, *options, code=0):
     return read_summary(out)
 
 
-@pytest.mark.slow
-def test_what_simulate_writes_is_what_solve_reads(tmp_path):
-    """In processes of their own; a path is driven twice."""
-    made = run("simulate", "drive", "--path", "short", "--seed", 21, "--nlos", 0.15, "--rounds", 2,
-               cwd=tmp_path)
-    assert (made.stdout, made.stderr) == ("", "")
-    done = run("solve", "drive", "--out", "out", "--problem", 1, cwd=tmp_path)
-    assert [line.split(":")[1] for line in done.stderr.splitlines()] == [
+def test_what_simulate_writes_is_what_solve_reads(tmp_path, monkeypatch, capsys):
+    """A path is driven twice."""
+    monkeypatch.chdir(tmp_path)
+    main("simulate drive --path short --seed 21 --nlos 0.15 --rounds 2".split())
+    assert capsys.readouterr() == ("", "")
+    main("solve drive --out out --problem 1".split())
+    table, told = capsys.readouterr()
+    assert [line.split(":")[1] for line in told.splitlines()] == [
         " encoders", " markers", " ranges", " truth", f" {tmp_path / 'out'}"]
-    header, row = done.stdout.splitlines()
+    header, row = table.splitlines()
     assert "ate_m" in header and row.split()[:3] == ["drive", "problem1", "4000"]
     expected, _ = simulate("short", 21, late_ranges=0.15, rounds=2)
     found = read_dataset(tmp_path / "drive")
@@ -76,7 +69,9 @@ def test_options_of_solve_are_heeded_and_said(folder, capsys):
 
 
 def test_verbose_prints_decisions(folder):
-    told = run("solve", "drive", "--out", "out", "--problem", 3, "-v", cwd=folder).stderr
+    """In a process of its own."""
+    command = [sys.executable, "-m", "slamlib", *"solve drive --out out --problem 3 -v".split()]
+    told = subprocess.run(command, cwd=folder, text=True, capture_output=True, timeout=300).stderr
     slip = read_summary(folder / "out")["problems"]["problem3"]["slip_sqrt_m"]
     assert f"round 1: slip {1e3 * slip:.3g} mm after 1 m, factors " in told
     assert re.search(r"\nGTSAM: \d+ factors, \d+ variables, \d+ steps from ", told)

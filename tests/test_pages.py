@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from urllib.parse import unquote, urlparse
 
-import nbformat
 import numpy as np
 import pytest
 from conftest import BROUGHT, ROOT, built_elsewhere, contradicted, copied
@@ -17,7 +16,6 @@ from conftest import BROUGHT, ROOT, built_elsewhere, contradicted, copied
 from slamlib.core.odometry import equation2
 from slamlib.io.dataset import read_dataset
 from slamlib.io.results import read_structs
-from slamlib.report import build_report
 from slamlib.solve import PROBLEMS
 from slamlib.studies.simulation import simulate, write_dataset
 
@@ -72,21 +70,6 @@ def test_chapters_name_the_datasets_that_have_what_they_need_and_show_no_warning
     for name, page in pages.items():                              # no defects of the notebooks
         assert 'class="stderr"' not in page, name
         assert not re.search(r"\bnan\b| at 0x[0-9a-f]{6}", text_of(page)), name
-
-
-def test_a_chapter_whose_sensor_no_dataset_has_is_left_out(tmp_path):
-    (tmp_path / "data" / "wheels").mkdir(parents=True)
-    (tmp_path / "data" / "wheels" / "encoderReading.txt").write_text("1 0 0\n2 100 90\n3 90 100\n")
-    (tmp_path / "notebooks").mkdir()
-    for name, metadata in (("1_all", {}), ("2_ranges", {"slamlib": {"needs": "uwb"}})):
-        book = nbformat.v4.new_notebook(metadata=metadata, cells=[
-            nbformat.v4.new_markdown_cell(f"# {name[0]}. {name[2:]}\n\nText.")])
-        nbformat.write(book, tmp_path / "notebooks" / f"{name}.ipynb")
-    pages = build_report(tmp_path / "notebooks", tmp_path / "data", tmp_path / "report",
-                         tmp_path / "results").files
-    assert [page.name for page in pages] == ["index.html", "1_all.html", "report.pdf"]
-    text = pages[0].read_text(encoding="utf-8")
-    assert "There are no markers in wheels" in text
 
 
 FAILING = """import numpy as np

@@ -278,8 +278,6 @@ def test_noise_that_is_known_is_not_learned_and_the_rest_is(known):
         values = np.array(each.noise)
         assert_allclose(values[is_known], [*known.values()], rtol=1e-12)
         assert (values != [1e-3, 1, 1]).all()
-        assert_allclose(values[1:][~is_known[1:]], 1, atol=0.2)
-    assert np.abs(found.poses[-1] - estimate(dataset).poses[-1]).max() > 1e-6
 
 
 @pytest.mark.parametrize("options, told", [
