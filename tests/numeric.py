@@ -121,20 +121,19 @@ def standing(dataset, truth, rows, count, at=0, every=1):
 
     It sees its markers there every few rows, while the counts creep by `count` a row.
     """
-    seen = dataset.aruco
-    here = np.flatnonzero(seen.pose == at)
-    row = np.repeat(np.arange(every, rows + 1, every), len(here))
-    again = np.tile(here, rows // every)
-    errors = errors_of(seen.covariance[again], np.random.default_rng(0))
-    z = se2.between(truth.poses[at], true_markers(truth, seen.marker[again])) + errors
-    pose = np.append(np.where(seen.pose > at, seen.pose + rows, seen.pose), at + row)
-    order = np.argsort(pose, kind="stable")
-    longer = replace(
-        seen.select(np.append(np.arange(len(seen.pose)), again)[order]), pose=pose[order],
-        marker_in_vehicle=np.append(seen.marker_in_vehicle, z, axis=0)[order])
+    seen = replace(dataset.aruco, pose=dataset.aruco.pose + rows * (dataset.aruco.pose > at))
+    frames = at + np.arange(every, rows + 1, every)
+    here = seen.select(seen.pose == at)
+    again = here.select(np.tile(np.arange(len(here.pose)), len(frames)))
+    z = se2.between(truth.poses[at], true_markers(truth, again.marker))
+    z += errors_of(again.covariance, np.random.default_rng(0))
+    again = replace(again, pose=np.repeat(frames, len(here.pose)), marker_in_vehicle=z)
+    joined = ArucoReadings(*(np.concatenate(each) for each in zip(
+        vars(seen).values(), vars(again).values())))
     ticks = np.insert(dataset.ticks, at + 1, np.full((rows, 2), count), axis=0)
     poses = np.insert(truth.poses, at + 1, np.tile(truth.poses[at], (rows, 1)), axis=0)
-    return replace(dataset, ticks=ticks, aruco=longer, uwb=None), poses
+    order = np.argsort(joined.pose, kind="stable")
+    return replace(dataset, ticks=ticks, aruco=joined.select(order), uwb=None), poses
 
 
 def known_noise(dataset, slip):

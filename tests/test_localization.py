@@ -27,6 +27,7 @@ from scipy.linalg import block_diag
 
 from slamlib import fuse, fuse_increments, localize, studies
 from slamlib.core import increments, odometry, se2
+from slamlib.core.errors import DatasetError
 from slamlib.core.evaluation import align, anees, ate, nees
 from slamlib.core.odometry import dead_reckoning
 from slamlib.io.dataset import read_dataset, read_truth
@@ -160,6 +161,13 @@ def test_markers_without_heading_localize():
     found = localize(without_headings(dataset.aruco))
     assert np.isfinite(found.poses).all()
     assert ate(found.poses, truth.poses[found.frame]) < 0.5
+
+
+@pytest.mark.parametrize("function", [fuse, fuse_increments, localize])
+def test_what_is_of_another_type_is_told(function):
+    """`estimate`'s arguments are in test_slam."""
+    with pytest.raises(DatasetError, match=f"{function.__name__}: expected a.*, found 'drive'"):
+        function("drive")
 
 
 # Fused with odometry.

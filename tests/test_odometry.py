@@ -7,10 +7,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.linalg import block_diag
 
 from slamlib.core import increments, odometry, se2
-from slamlib.core.increments import preintegrate
-from slamlib.core.records import Dataset
 from slamlib.core.vehicle import Vehicle
-from slamlib.studies.simulation import manoeuvre, simulate
+from slamlib.studies.simulation import simulate
 
 VEHICLE = Vehicle()
 BOTH = pytest.mark.parametrize("model", odometry.MODELS)
@@ -181,12 +179,3 @@ def test_noise_keeps_its_digits_far_from_the_origin():
 def test_from_a_pose_to_itself_there_is_no_noise(rows, pose):
     for part in increments.noise_in_drive(np.full((rows, 2), 127), VEHICLE, pose, pose):
         assert_array_equal(part, 0)
-
-
-def test_noise_of_wheels_moves_the_end_of_an_increment_across_its_own_direction():
-    """After a turn of 45 degrees and 5 m straight on."""
-    ticks = manoeuvre([(0.5, np.pi / 4), (5.0, 0.0)])
-    drive = Dataset("turn", VEHICLE, ticks, None, None, None)
-    found = preintegrate(drive, np.array([0, len(ticks) - 1]))
-    for Q in (found.rounding[0], found.slipping[0]):
-        assert Q[1, 1] > 3 * Q[0, 0]

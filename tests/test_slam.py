@@ -249,20 +249,6 @@ def test_parts_of_a_drive_grow_at_most_fourfold_from_where_the_heading_is_lost()
     assert part_lengths(replace(drive, vehicle=sure)) == [len(ticks)]
 
 
-def test_all_parts_of_a_drive_are_solved_one_after_the_other(monkeypatch):
-    """The last one is the whole drive, whose rounds follow."""
-    solved = []
-
-    def narrow_kernels(problem, state):
-        solved.append(len(problem.measurements.dataset.ticks))
-        return state
-
-    monkeypatch.setattr(initialization, "part_lengths", lambda _: [200, 400, 600])
-    monkeypatch.setattr(initialization, "narrow_kernels", narrow_kernels)
-    initialization.initial_state(measure(short(4, 600)[0]), "arc")
-    assert solved == [200, 400]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("known", [
     {"slip": 2e-3}, {"marker_noise_factor": 1.3}, {"range_noise_factor": 0.8}])
@@ -293,6 +279,18 @@ def test_noise_that_is_known_is_not_learned_and_the_rest_is(known):
 def test_an_option_with_a_wrong_name_or_value_is_told_with_what_there_is(options, told):
     with pytest.raises(DatasetError, match=told):
         estimate(**{"dataset": short(4, 50)[0]} | options)
+
+
+def test_kernel_and_gate_of_the_vehicle_are_those_of_the_options():
+    """Which decide where both are given."""
+    dataset = known_noise(short(4, 400, late_ranges=0.05)[0], 1e-3)
+    stated = vehicle(kernel="Huber", gate=False)(dataset)
+    found = estimate(stated)
+    default = estimate(dataset)
+    assert_array_equal(found.poses, estimate(dataset, kernel="Huber", gate=False).poses)
+    assert_array_equal(
+        default.poses, estimate(stated, kernel="asymmetric Tukey", gate=True).poses)
+    assert (found.range_weight > 0).all() and not (default.range_weight > 0).all()
 
 
 @pytest.mark.slow
@@ -377,4 +375,5 @@ def test_a_drive_of_one_pose_has_its_prior():
     sigma = np.array([1e-5, 1e-5, dataset.vehicle.sigma_heading])
     assert_allclose(found.covariances, [np.diag(sigma**2)], atol=1e-18)
     assert not found.poses.any() and len(found.marker) == len(dataset.aruco.pose) > 0
+    assert repr(found).startswith("SlamResult of 1 poses, mean sigma ")
     assert max(found.agreement) < 1e-6
