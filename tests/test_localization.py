@@ -20,7 +20,6 @@ from numeric import (
     true_markers,
     vehicle,
     wheel_nees,
-    without_headings,
 )
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.linalg import block_diag
@@ -154,13 +153,6 @@ def test_the_map_has_markers_that_are_confirmed_and_seen_from_known_poses():
     assert_allclose(found.marker_in_world[:, :2], [[1, -0.5], [2, -1]], atol=1e-12)
     assert_array_equal(readings.marker[found.unused], [5, 1, 2])
     assert not found.rejected.any()
-
-
-def test_markers_without_heading_localize():
-    dataset, truth = short(2)
-    found = localize(without_headings(dataset.aruco))
-    assert np.isfinite(found.poses).all()
-    assert ate(found.poses, truth.poses[found.frame]) < 0.5
 
 
 @pytest.mark.parametrize("function", [fuse, fuse_increments, localize])

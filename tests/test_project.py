@@ -24,8 +24,9 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 def imported(folder=""):
     """Names of the modules from which those in a folder of slamlib import, in functions too."""
-    text = "\n".join(file.read_text(encoding="utf-8") for file in (PACKAGE / folder).rglob("*.py"))
-    return {*re.findall(r"^ *(?:from (?=\S+ import)|import (?!\S+ [^a]))([\w.]+)", text, re.MULTILINE)}
+    statement = re.compile(r"^ *(?:from (?=\S+ import)|import (?!\S+ [^a]))([\w.]+)", re.MULTILINE)
+    return {name for file in (PACKAGE / folder).rglob("*.py")
+            for name in statement.findall(file.read_text(encoding="utf-8"))}
 
 
 def outside(folder=""):
