@@ -108,19 +108,15 @@ def test_changed_prose_is_shown_with_the_outputs_that_were_kept(project):
     assert order == sorted(order)
 
 
-@pytest.mark.parametrize("name, is_seen", [("core/a.py", True), ("notebook/a.mplstyle", True),
-                                           ("report/a.py", False)])
-def test_slamlib_s_code_counts_but_for_the_report(monkeypatch, tmp_path, name, is_seen):
+@pytest.mark.parametrize("change, is_seen", [
+    (lambda patch, folder: add(folder, "core/a.py"), True),
+    (lambda patch, folder: add(folder, "notebook/a.mplstyle"), True),
+    (lambda patch, folder: add(folder, "report/a.py"), False),
+    (lambda patch, folder: patch.setattr(cache, "version", lambda package: "99"), True)])
+def test_slamlib_s_code_but_for_the_report_and_the_packages_count(
+        monkeypatch, tmp_path, change, is_seen):
     books = {tmp_path / "notebooks" / "a.ipynb": nbformat.v4.new_notebook()}
-    add(tmp_path / "slamlib", "core/b.py")
     monkeypatch.setattr(cache, "SLAMLIB", tmp_path / "slamlib")
     before = cache.keys(books, [])
-    add(tmp_path / "slamlib", name)
+    change(monkeypatch, tmp_path / "slamlib")
     assert (cache.keys(books, []) != before) == is_seen
-
-
-def test_the_packages_count(monkeypatch, tmp_path):
-    books = {tmp_path / "a.ipynb": nbformat.v4.new_notebook()}
-    before = cache.keys(books, [])
-    monkeypatch.setattr(cache, "version", lambda package: "99")
-    assert cache.keys(books, []) != before

@@ -57,17 +57,6 @@ def test_code_is_short_and_what_pages_fold_is_collapsed_in_jupyterlab(source):
         assert collapsed == has(cell, "hide-input")
 
 
-@pytest.mark.parametrize("source", CHAPTERS[2:4], ids=lambda path: path.stem)
-def test_gtsam_solves_the_drives_within_the_first_600_words(source):
-    words = 0
-    for cell in nbformat.read(source, as_version=4).cells:
-        if "solve_graph(" in cell.source:
-            break
-        if cell.cell_type == "markdown":
-            words += len(cell.source.split())
-    assert words <= 600
-
-
 def names_of(source):
     """Global names that code binds and uses, in its functions too: two sets."""
     whole = symtable.symtable(source, "cell", "exec")

@@ -29,10 +29,9 @@ for drive in start():
 """
 
 
-def start(folder, *arguments, code=None):
+def start(folder, *arguments):
     """The command in a process of its own."""
-    program = ["-c", code] if code else ["-m", "slamlib"]
-    return subprocess.Popen([sys.executable, *program, *arguments], cwd=folder, text=True,
+    return subprocess.Popen([sys.executable, "-m", "slamlib", *arguments], cwd=folder, text=True,
                             stdout=subprocess.PIPE, stderr=subprocess.PIPE,
                             env=os.environ | {"PYTHONPATH": str(ROOT)})
 
@@ -180,21 +179,3 @@ time.sleep(1000)""",))
     assert told.splitlines()[-1] == "slamlib: ended by a signal" and "Traceback" not in told
     assert files.file_names(tmp_path / "results") == [] and hidden(tmp_path) == []
     assert not is_running(int(kernel.read_text()))
-
-
-def test_a_signal_ends_a_solve_in_order(tmp_path, drive):
-    write_dataset(tmp_path / "drive", drive)
-    process = start(tmp_path, "solve", "drive", "--out", "out", code="""import sys, time
-from pathlib import Path
-from slamlib import solve
-from slamlib.__main__ import main
-def find(*_):
-    Path("solves").touch()
-    time.sleep(1000)
-solve.find = find
-sys.exit(main())""")
-    wait_for(tmp_path / "solves", process)
-    process.send_signal(signal.SIGTERM)
-    out, told = process.communicate(timeout=300)
-    assert out == "" and told.splitlines()[-1] == "slamlib: ended by a signal"
-    assert process.returncode == 130 and [*(tmp_path / "out").iterdir()] == []

@@ -101,11 +101,3 @@ def test_confused_labels_are_as_many_as_stated_and_those_in_a_frame_are_exchange
     same = [np.array_equal(np.sort(label[right.pose == pose]), np.sort(
         right.marker[right.pose == pose])) for pose in np.unique(right.pose)]
     assert all(same) == (kind in ("none", "in frame"))
-
-
-def test_a_twin_is_one_certain_other_marker():
-    right = simulate("short", seed=1)[0].aruco.marker
-    label = confuse_labels(simulate("short", seed=1)[0], "twins", seed=3).aruco.marker
-    for marker in np.unique(right[label != right]):
-        read_as = label[right == marker]
-        assert len(np.unique(read_as)) == 2 and 0.3 < np.mean(read_as != marker) < 0.9

@@ -1,4 +1,4 @@
-"""A plain GTSAM script for problems 3 and 4, as the baseline of time.
+"""A plain GTSAM script for problem 4, as the baseline of time.
 
 A between factor for every encoder row, with the noise that table 2 gives a single step and a floor,
 since that noise is singular. A between factor for every sighting and a range factor for every
@@ -33,11 +33,10 @@ def plain(dataset):
     for k, pose in enumerate(poses):
         values.insert(X(k), gtsam.Pose2(*pose))
     huber = gtsam.noiseModel.mEstimator.Huber.Create(1.345)
-    for i, k, r, sigma in [] if uwb is None else zip(
-            uwb.pose.tolist(), uwb.antenna.tolist(), uwb.range, uwb.sigma):
+    for i, k, r, sigma in zip(uwb.pose.tolist(), uwb.antenna.tolist(), uwb.range, uwb.sigma):
         graph.add(gtsam.RangeFactor2D(X(i), A(k), r, gtsam.noiseModel.Robust.Create(
             huber, gtsam.noiseModel.Isotropic.Sigma(1, sigma))))
-    for k, place in [] if uwb is None else zip(guess.antenna.tolist(), guess.position):
+    for k, place in zip(guess.antenna.tolist(), guess.position):
         if k in uwb.antenna:
             values.insert(A(k), gtsam.Point2(*place))
     for i, j, z, C in zip(aruco.pose.tolist(), aruco.marker.tolist(), aruco.marker_in_vehicle,
