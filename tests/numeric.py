@@ -2,10 +2,8 @@
 
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
-import pytest
 from scipy.stats import t
 
 from slamlib import estimate
@@ -15,10 +13,7 @@ from slamlib.core.records import ArucoReadings
 from slamlib.studies import montecarlo
 from slamlib.studies.montecarlo import antenna_error
 
-REAL_LOGS = Path(__file__).parents[2] / "shared" / "real_logs"      # where they are present
 short = montecarlo.drive           # a simulated drive of the short path, or its first poses
-on_real_logs = pytest.mark.skipif(
-    not REAL_LOGS.is_dir(), reason="the public robot logs are not here")
 
 
 def central_differences(function, x, step=1e-6):

@@ -2,18 +2,17 @@
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from numeric import (
-    REAL_LOGS,
     aligned_ate,
     aruco,
     as_points,
     central_differences,
     mean_nees,
-    on_real_logs,
     seen_from,
     short,
     uwb,
@@ -357,19 +356,28 @@ def test_no_doubt_about_clean_drives(seed):
     assert not named(markers) and not named(both)
 
 
+LOGS = Path(__file__).parents[2] / "shared" / "real_logs"             # where they are present
+
+
 @pytest.mark.slow
-@on_real_logs
-@pytest.mark.parametrize("log, largest, what", [
-    ("starloc_b", 0.015, "marker-size"), ("mrclam_b", 0.100, "camera-offset")])
-def test_public_logs(log, largest, what):
-    """AprilTags with ranges, printed too large; barcodes by a camera that stands elsewhere."""
-    dataset = read_dataset(REAL_LOGS / log).first(6500)
-    truth = read_truth(REAL_LOGS / log).poses[:6500]
-    for found in both_problems(dataset) if dataset.uwb else [estimate(dataset)]:
+@pytest.mark.skipif(not LOGS.is_dir(), reason="the public robot logs are not here")
+@pytest.mark.parametrize("log, solve, largest, what", [
+    ("enmt", fuse, 1.34, None), ("starloc_b", fuse, 0.12, None), ("walker3", fuse, 0.052, None),
+    ("litw", fuse, 1.74, None), ("starloc_b", estimate, 0.015, "marker-size"),
+    ("mrclam_b", estimate, 0.1, "camera-offset")])
+def test_on_public_logs_errors_are_small_and_covered(log, solve, largest, what):
+    """AprilTags with ranges, printed too large; a vehicle that stands first; a camera elsewhere."""
+    count = 6500 if what else 13_000
+    dataset = read_dataset(LOGS / log).first(count)
+    truth = read_truth(LOGS / log).poses[:count]
+    found = solve(dataset)
+    assert ate(found.poses, truth, aligned=True) < largest
+    T = align(found.poses, truth)
+    later = slice(len(truth) // 10, None)
+    off = (se2.compose(T, found.poses) - truth)[later, :2]
+    C = se2.rotate_covariance(found.covariances, T[2])[later, :2, :2]
+    assert np.median(se2.squared_norms(off, C)) < 3
+    if what:
         assert what in found.released
-        assert ate(found.poses, truth, aligned=True) < largest
-        T = align(found.poses, truth)
-        later = slice(len(truth) // 10, None)
-        off = (se2.compose(T, found.poses) - truth)[later, :2]
-        C = se2.rotate_covariance(found.covariances, T[2])[later, :2, :2]
-        assert se2.squared_norms(off, C).mean() < 4
+    else:
+        assert found.rejected < 0.05 * len(dataset.aruco.pose)

@@ -5,14 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numeric import (
-    REAL_LOGS,
     aruco,
     assert_consistent,
     central_differences,
     decided,
     map_nees,
     mean_nees,
-    on_real_logs,
     seen_from,
     short,
     sightings,
@@ -27,9 +25,8 @@ from scipy.linalg import block_diag
 from slamlib import fuse, fuse_increments, localize, studies
 from slamlib.core import increments, odometry, se2
 from slamlib.core.errors import DatasetError
-from slamlib.core.evaluation import align, anees, ate, nees
+from slamlib.core.evaluation import anees, ate, nees
 from slamlib.core.odometry import dead_reckoning
-from slamlib.io.dataset import read_dataset, read_truth
 from slamlib.solve import problem_solution
 from slamlib.studies import montecarlo
 from slamlib.studies.simulation import TABLE_2
@@ -307,23 +304,6 @@ def test_standard_deviations_of_sightings_that_are_too_small_are_learned(times):
     assert fused.rejected == 0 and fused.slip == pytest.approx(5e-3, rel=0.3)
     assert ate(fused.poses, truth.poses) < 0.015
     assert mean_nees(fused, truth) < 5
-
-
-@pytest.mark.slow
-@on_real_logs
-@pytest.mark.parametrize("log, most", [
-    ("enmt", 1.0), ("starloc_b", 0.3), ("walker3", 0.3), ("litw", 1.3)])
-def test_on_public_logs_the_errors_are_below_those_of_odometry_and_covered(log, most):
-    """ATE over that of odometry; litw stands first, and its laser errs slowly and is turned."""
-    dataset, truth = read_dataset(REAL_LOGS / log), read_truth(REAL_LOGS / log).poses
-    fused = fuse(dataset)
-    by_odometry = dead_reckoning(dataset.ticks, dataset.vehicle)
-    assert ate(fused.poses, truth, aligned=True) < most * ate(by_odometry, truth, aligned=True)
-    aligned = se2.compose(align(fused.poses, truth), fused.poses)
-    squared = np.sum((aligned - truth)[:, :2]**2, axis=1)
-    variance = fused.covariances[:, 0, 0] + fused.covariances[:, 1, 1]
-    assert np.median(squared[1:] / variance[1:]) < 3
-    assert fused.rejected < 0.05 * len(dataset.aruco.pose)
 
 
 def test_a_learned_slip_that_no_wheel_has_is_doubted():
