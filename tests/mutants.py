@@ -27,7 +27,6 @@ FOLDERS = ("core", "robust", "io")
 OF_OTHER_CODE = ("docs", "document", "lab", "maps", "pages", "plotting", "project", "studies")
 FILES = [file for file in sorted(Path(__file__).parent.glob("test_*.py"))
          if file.stem.removeprefix("test_") not in OF_OTHER_CODE]
-MEMORY = 8 << 30                        # bytes
 LONGEST = 900                           # s, of the tests of one mutant
 SWAPS = {ast.Add: ast.Sub, ast.Mult: ast.Div, ast.BitAnd: ast.BitOr, ast.And: ast.Or,
          ast.Lt: ast.Gt, ast.LtE: ast.GtE, ast.Eq: ast.NotEq, ast.Is: ast.IsNot, ast.In: ast.NotIn}
@@ -113,7 +112,7 @@ def main():
     parser.add_argument("--seed", type=int, default=0, help="of the draw (default 0)")
     parser.add_argument("--only", default="", help="modules whose name begins so: core, robust/fit")
     given = parser.parse_args()
-    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+    resource.setrlimit(resource.RLIMIT_AS, (8 << 30, 8 << 30))             # bytes
     source = ROOT / "slamlib"
     files = {f"{folder}/{file.name}": file for folder in FOLDERS
              for file in sorted((source / folder).glob("*.py"))}
@@ -124,9 +123,8 @@ def main():
     drawn = [*mutants(trees, given.count, given.seed)]
     with ThreadPoolExecutor(os.cpu_count()) as threads:
         survived = [*threads.map(lambda mutant: survives(*mutant[:2]), drawn)]
-    for (_, _, difference), unnoticed in zip(drawn, survived):
-        if unnoticed:
-            print(difference)
+    print(*(difference for (*_, difference), unnoticed in zip(drawn, survived) if unnoticed),
+          sep="\n")
     print(f"{len(drawn) - sum(survived)} of {len(drawn)} are noticed")
 
 

@@ -167,7 +167,7 @@ def slam_trial(seed, ranges=True, markers=True, **options):
                "nees between": np.nanmean(np.delete(values, frame)),
                "last nees": values[-1], "wheel nees": wheel_nees(found, truth),
                "ate": ate(found.poses, truth.poses), "slip": found.slip,
-               "factor": found.noise.sightings, "arc": float(found.model == "arc")}
+               "factor": found.noise.sightings, "arc": found.model == "arc"}
     if markers:
         off = found.marker_in_world - true_markers(truth, found.marker)
         numbers |= {"map nees": map_nees(found, truth).mean(),

@@ -75,19 +75,18 @@ def test_factors_of_a_batch_are_linearised_at_once_and_anew_where_a_value_change
     """A variable that is not there yet is NaN."""
     calls = []
 
-    def linearised(points):
+    def squared(points):
         calls.append(points)
         return points**2, [2 * points[:, :, None] * np.eye(2)]
 
-    factors = Batch([[A(1), A(2)]], linearised)
-    first, second = (factors.factor(k, SIGMA(2, 1.0)) for k in range(2))
+    batch = Batch([[A(1), A(2)]], squared)
+    first, second = (batch.factor(k, SIGMA(2, 1.0)) for k in range(2))
     values = values_of({A(1): np.array([1.0, 0])})
-    assert first.error(values) == 0.5
+    assert first.error(values) == 0.5 and np.isnan(calls[0][1]).all()
     values.insert(A(2), np.array([2.0, 0]))
     J, b = second.linearize(values).jacobian()
     assert (J.tolist(), b.tolist()) == ([[4, 0], [0, 0]], [-4, 0])
-    assert second.error(values) == 8 and first.error(values) == 0.5
-    assert len(calls) == 2 and np.isnan(calls[0][1]).all()
+    assert (first.error(values), second.error(values), len(calls)) == (0.5, 8, 2)
     values.update(A(2), np.zeros(2))
     assert second.error(values) == 0
 

@@ -100,13 +100,10 @@ def save_as_lab(file):
     for cell in book.cells:
         cell.metadata |= {"editable": True, "slideshow": {"slide_type": ""}, "trusted": True}
         if cell.cell_type == "code":
-            cell.metadata |= {"execution": {"iopub.execute_input": "2026-01-01T00:00:00.0Z"},
-                              "collapsed": True, "scrolled": True}
+            cell.metadata |= {"execution": {}, "collapsed": True, "scrolled": True}
             cell.outputs = [nbformat.v4.new_output("stream", text="of JupyterLab: \u00e9")]
             cell.execution_count = 7
-    book.metadata |= {
-        "language_info": {"name": "python", "version": "3.99", "pygments_lexer": "ipython3"},
-        "widgets": {"application/vnd.jupyter.widget-state+json": {"state": {}}}}
+    book.metadata |= {"language_info": {"name": "python", "version": "3.99"}, "widgets": {}}
     nbformat.write(book, file)
 
 

@@ -174,7 +174,6 @@ def test_several_drives_have_a_table_and_one_that_fails_does_not_stop_them(
     assert [*table.index] == ["with truth", "nowhere", "without"]
     row = results.read_summary(out / "with truth")["problems"]["problem3"]
     assert table.ate_m["with truth"] == row["ate_m"] and np.isnan(table.ate_m["without"])
-    assert table.nees["with truth"] == row["nees"] and table.seconds["without"] > 0
     covariances = results.read_structs(out / "without" / "problem3", "vehiclePose")[2]
     assert table.last_sigma_m["without"] == evaluation.position_sigmas(covariances[-1:])
     assert table.failed.notna().tolist() == [False, True, False]

@@ -75,8 +75,8 @@ def learned_noise(seed, slip):
     learned = estimate(markers)
     known = estimate(known_noise(markers, slip), model="arc")
     both = estimate(dataset, previous=learned)
-    numbers = {"slip": learned.slip, "rejected": np.count_nonzero(learned.rejected),
-               "arc": float(learned.model == "arc")}
+    numbers = {"slip": learned.slip, "rejected": learned.rejected.sum(),
+               "arc": learned.model == "arc"}
     for name, found in (("learned", learned), ("known", known), ("both", both)):
         numbers |= montecarlo.judged(name, found.poses, found.covariances, truth.poses, True)
     return numbers
@@ -304,10 +304,8 @@ def test_every_kernel_solves_a_drive_with_wrong_labels_and_late_ranges(kernel):
     gated = estimate(dataset, kernel=kernel, model="arc")
     assert gated.rejected.any() and ate(gated.poses, truth.poses) < 0.02
     assert_allclose(gated.noise.sightings, 1, atol=0.05)
-    assert (gated.range_weight < 1).any()
     if kernel not in ONE_SIDED:                     # those leave the errors of sightings quadratic
         found = estimate(dataset, kernel=kernel, model="arc", gate=False)
-        assert not found.rejected.any()
         assert (ate(found.poses, truth.poses) < 0.03) == (kernel != "quadratic")
 
 
