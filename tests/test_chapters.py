@@ -2,18 +2,10 @@
 
 import re
 import symtable
-from dataclasses import replace
 
 import nbformat
-import numpy as np
 import pytest
 from conftest import ROOT
-from scipy.linalg import block_diag
-
-from slamlib import fuse
-from slamlib.core import increments, se2
-from slamlib.core.sightings import sightings_by_frame
-from slamlib.studies.simulation import simulate
 
 CHAPTERS = sorted((ROOT / "notebooks").glob("[0-9]*.ipynb"))
 
@@ -82,28 +74,3 @@ def test_what_is_shown_runs_without_what_is_hidden(source):
         elif not has(cell, "lab-only"):
             shown |= bound
             assert not (used - shown) & hidden
-
-
-def test_a_step_of_the_filter_of_chapter_2_is_that_of_fuse():
-    """Between the first two frames, linearised at the stated wheels."""
-    dataset, slip = simulate("short", seed=3)[0].first(11), 1e-3
-    seen = dataset.aruco
-    both = np.intersect1d(seen.marker[seen.pose == 0], seen.marker[seen.pose == 10])
-    dataset = replace(dataset, aruco=seen.select(np.isin(seen.marker, both)))
-    g = sightings_by_frame(dataset.aruco)
-    z_first, z_second = np.split(g.z, 2)
-    C_first, C_second = np.split(g.C, 2)
-    vehicle, known = dataset.vehicle, {"np": np, "se2": se2}
-    cell, = (each for each in cells_of(CHAPTERS[1]) if "def filter_step(" in each.source)
-    exec(cell.source, known)
-    delta, by_w = increments.between_poses(dataset.ticks, vehicle, [0], [10], "arc")
-    rounding, slipping = increments.noise_in_drive(dataset.ticks, vehicle, [0], [10])
-    P = block_diag(np.diag([0, 0, vehicle.sigma_heading, *vehicle.sigma_wheel])**2, *C_first)
-    X, w, _, P = known["filter_step"](
-        np.zeros(3), np.zeros(3), z_first, P, delta[0], by_w[0],
-        rounding[0] + slip**2 * slipping[0], z_second, C_second)
-    found = fuse(dataset, slip)
-    assert found.rejected == 0 and len(both) > 1
-    np.testing.assert_allclose(X, found.poses[-1], atol=1e-9)
-    np.testing.assert_allclose(P[:3, :3], found.covariances[-1], rtol=1e-6, atol=1e-14)
-    np.testing.assert_allclose(vehicle.wheel + w, found.wheel, atol=1e-12)

@@ -136,8 +136,6 @@ def test_notes_and_doubts_are_said_and_in_the_summary(tmp_path, drive, capsys):
     summary = solved(tmp_path)
     doubt, = summary["doubts"]
     assert doubt["what"] == "antenna"
-    assert doubt["sentence"].startswith(f"Antenna {first} is in doubt: only 2 of its 2 ranges")
-    assert doubt["advice"] == "Look at its rows in UwbReading.txt."
     told = capsys.readouterr()
     last = told.out.splitlines()[-1]
     assert last == f"drive: doubt (antenna): {doubt['sentence']} {doubt['advice']}"

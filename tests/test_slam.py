@@ -104,20 +104,6 @@ def test_a_slip_that_is_not_known_widens_the_covariance(slip):
         assert runs["arc"].mean() > 0.8
 
 
-def test_wrong_covariances_of_sightings_are_scaled():
-    """The estimate is nearly the one from the right covariances, and its factor is known."""
-    dataset = short(61)[0].without("uwb")
-    expected = estimate(dataset)
-    found = estimate(aruco(dataset, covariance=dataset.aruco.covariance / 16))
-    sigma = found.noise_sigma[1]
-    assert abs(np.log(found.noise.sightings / 4)) < 4 * sigma
-    assert 0.005 < sigma < 0.03                              # about 2700 errors: 1 / sqrt(2 * 2700)
-    off = (found.poses - expected.poses)[1:] / sigmas(expected.covariances)[1:]
-    assert np.abs(off).max() < 0.5
-    C = expected.covariances[-1]
-    assert_allclose(found.covariances[-1], C, rtol=0.2, atol=0.1 * C.max())
-
-
 @pytest.mark.parametrize("poses, slip", [(2000, 1e-3), (300, 0.0)])
 def test_the_learned_noise_has_the_greatest_posterior(poses, slip):
     """Many and few measurements: derivatives at the mode, by small steps, are nearly zero."""
