@@ -61,10 +61,11 @@ def ranges_in(factor, factor_of_sigmas, factor_of_guesses=1.0):
 
 SWAPPED, REVERSED, BACKWARDS = [[0, 1], [1, 0]], [[-1, 0], [0, -1]], [[0, -1], [-1, 0]]
 FLAWS = {                                           # how, kinds of doubts, and what is said
-    "columns of counts": (wheels(SWAPPED), "wheels-swapped", "the columns exchanged"),
-    "signs of counts": (wheels(REVERSED), "wheels-reversed", "both signs reversed"),
+    "columns of counts": (wheels(SWAPPED), "wheels-swapped", "the columns exchanged in encoder"
+                          "Reading.txt, or as well with sightings with [x, -y, -theta]"),
+    "signs of counts": (wheels(REVERSED), "wheels-reversed", "both signs reversed in encoder"
+                        "Reading.txt, or as well with sightings with [-x, y, -theta]"),
     "both": (wheels(BACKWARDS), "wheels-reversed", "signs reversed and the columns exchanged"),
-    "y and theta": (camera(1, -1, -1), "wheels-swapped", "with [x, -y, -theta]"),
     "y": (camera(1, -1, 1), "camera-mirrored", "with [x, -y, theta]"),
     "all": (camera(-1, -1, -1), "camera-mirrored", "with [-x, -y, -theta]"),
     "x and y": (camera(-1, -1, 1), "wheels-reversed", "with [-x, -y, theta]"),

@@ -93,21 +93,16 @@ def drive_with(truth=True):
     return result, Drive("a", None, SimpleNamespace(poses=poses) if truth else None)
 
 
-@pytest.mark.parametrize("truth", [True, False])
-def test_errors_are_in_mm_and_without_truth_the_bands_stand_alone(truth):
+@pytest.mark.parametrize("truth, rows", [(True, 2), (False, 2), (True, 1)])
+def test_errors_are_in_mm_and_without_truth_the_bands_stand_alone(truth, rows):
+    """Those of the position only where there is one of axes."""
     result, drive = drive_with(truth)
     (_, axes), = plotting.each_drive([drive], rows=2)
-    plotting.errors(axes, result, drive)
+    plotting.errors(axes[:rows], result, drive)
     assert axes[0].get_title("left") == drive.name
-    for ax, error, reach in ((axes[0], 10, 20 * REACH_95), (axes[1], 2, 200)):
+    for ax, error, reach in zip(axes[:rows], (10, 2), (20 * REACH_95, 200)):
         assert [line.get_ydata() for line in ax.lines] == ([pytest.approx(error)] if truth else [])
         assert ax.collections[0].get_paths()[0].vertices[:, 1].max() == pytest.approx(reach)
-
-
-def test_in_one_of_axes_the_errors_of_the_position_stand_alone():
-    (_, axes), = plotting.each_drive(["a"], rows=2)
-    plotting.errors(axes[:1], *drive_with())
-    assert axes[0].lines[0].get_ydata() == pytest.approx(10) and not axes[1].lines
 
 
 def test_errors_of_some_poses_are_in_the_frame_of_the_first_of_them():
