@@ -8,6 +8,7 @@ import sys
 import nbformat
 import pytest
 from conftest import ROOT
+from kills import contents
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 
 from slamlib.__main__ import main
@@ -101,13 +102,14 @@ def test_kernels_see_the_folders_and_what_is_printed_in_a_row_is_one_output(buil
         "one\ntwo", "three", "a picture", "and another", "four"]
 
 
-@pytest.mark.parametrize("good, bad, told", [
-    ("import time\ntime.sleep(60)", ["# Bad", ("x = 0",), ("y = 1\nz = y / x",)],
+@pytest.mark.parametrize("good, bad, results, told", [
+    ("import time\ntime.sleep(60)", ["# Bad", ("x = 0",), ("y = 1\nz = y / x",)], [],
      r"2_bad\.ipynb: (?s:.*)\nCell In\[2\], line 2\n(?s:.*)\n----> 2 z = y / x\n\n"
      "ZeroDivisionError: division by zero"),
-    ("1", ["# 2. Bad\n\n$$ \\nonsense $$", ("1",)],
+    ("1", ["# 2. Bad\n\n$$ \\nonsense $$", ("1",)], ["long/summary.json", "short/summary.json"],
      r"2_bad\.ipynb: pandoc cannot convert this formula:\n    \\nonsense")])
-def test_a_notebook_that_fails_is_named_and_leaves_the_old_report(tmp_path, good, bad, told):
+def test_a_notebook_that_fails_is_named_and_leaves_the_old_report(
+        tmp_path, good, bad, results, told):
     make_data(tmp_path)
     write(tmp_path / "notebooks", "1_good", "# Good", (good,))
     write(tmp_path / "notebooks", "2_bad", *bad)
@@ -115,8 +117,8 @@ def test_a_notebook_that_fails_is_named_and_leaves_the_old_report(tmp_path, good
     with pytest.raises(NotebookError) as caught:
         build(tmp_path)
     assert re.fullmatch(told, str(caught.value))
-    assert file_names(tmp_path / "report") == ["1_good.html"]
-    assert (tmp_path / "report" / "1_good.html").read_text() == "old"
+    assert contents(tmp_path / "report") == {"1_good.html": b"old"}
+    assert file_names(tmp_path / "results") == results
 
 
 def test_bad_data_is_told_before_a_kernel_starts(tmp_path):
