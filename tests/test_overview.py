@@ -14,8 +14,6 @@ from slamlib.report import overview
 from slamlib.solve import Failure, Solution, solve_to_folder, summarize, title, truth_in_world
 from slamlib.studies.simulation import simulate
 
-NAMES = ("all", "no_truth", "wheels_only")
-
 
 @pytest.fixture(scope="module")
 def project(tmp_path_factory):
