@@ -235,6 +235,20 @@ def test_parts_of_a_drive_grow_at_most_fourfold_from_where_the_heading_is_lost()
     assert part_lengths(replace(drive, vehicle=sure)) == [len(ticks)]
 
 
+def test_all_parts_of_a_drive_are_solved_one_after_the_other(monkeypatch):
+    """The last one is the whole drive, whose rounds follow."""
+    solved = []
+
+    def narrow_kernels(problem, state):
+        solved.append(len(problem.measurements.dataset.ticks))
+        return state
+
+    monkeypatch.setattr(initialization, "part_lengths", lambda _: [200, 400, 600])
+    monkeypatch.setattr(initialization, "narrow_kernels", narrow_kernels)
+    initialization.initial_state(measure(short(4, 600)[0]), "arc")
+    assert solved == [200, 400]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("known", [
     {"slip": 2e-3}, {"marker_noise_factor": 1.3}, {"range_noise_factor": 0.8}])
