@@ -21,9 +21,8 @@ settings.load_profile("short")           # another one by `pytest --hypothesis-p
 
 ROOT = Path(__file__).parents[1]
 # The longest come first, and those that mostly wait beside those that start further processes.
-FIRST = ("test_pages", "test_concurrency", "test_lab", "test_slam", "test_flaws", "test_memory",
-         "test_uwb", "test_localization", "test_jumps", "test_calibration", "test_docs",
-         "test_properties", "test_numbers", "test_report", "test_studies", "test_library")
+FIRST = ("test_pages", "test_concurrency", "test_slam", "test_flaws", "test_memory", "test_uwb",
+         "test_localization", "test_jumps", "test_calibration", "test_numbers", "test_studies")
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 

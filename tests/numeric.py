@@ -2,10 +2,8 @@
 
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
-import pytest
 from scipy.stats import t
 
 from slamlib import estimate
@@ -14,10 +12,6 @@ from slamlib.core.evaluation import anees, ate, nees, nees_band
 from slamlib.core.records import ArucoReadings
 from slamlib.studies.montecarlo import antenna_error
 from slamlib.studies.simulation import PATHS, simulate
-
-REAL_LOGS = Path(__file__).parents[2] / "shared" / "real_logs"      # where they are present
-on_real_logs = pytest.mark.skipif(
-    not REAL_LOGS.is_dir(), reason="the public robot logs are not here")
 
 
 def short(seed, poses=None, path="short", rounds=1, **options):
@@ -129,20 +123,19 @@ def standing(dataset, truth, rows, count, at=0, every=1):
 
     It sees its markers there every few rows, while the counts creep by `count` a row.
     """
-    seen = dataset.aruco
-    here = np.flatnonzero(seen.pose == at)
-    row = np.repeat(np.arange(every, rows + 1, every), len(here))
-    again = np.tile(here, rows // every)
-    errors = errors_of(seen.covariance[again], np.random.default_rng(0))
-    z = se2.between(truth.poses[at], true_markers(truth, seen.marker[again])) + errors
-    pose = np.append(np.where(seen.pose > at, seen.pose + rows, seen.pose), at + row)
-    order = np.argsort(pose, kind="stable")
-    longer = replace(
-        seen.select(np.append(np.arange(len(seen.pose)), again)[order]), pose=pose[order],
-        marker_in_vehicle=np.append(seen.marker_in_vehicle, z, axis=0)[order])
+    seen = replace(dataset.aruco, pose=dataset.aruco.pose + rows * (dataset.aruco.pose > at))
+    frames = at + np.arange(every, rows + 1, every)
+    here = seen.select(seen.pose == at)
+    again = here.select(np.tile(np.arange(len(here.pose)), len(frames)))
+    z = se2.between(truth.poses[at], true_markers(truth, again.marker))
+    z += errors_of(again.covariance, np.random.default_rng(0))
+    again = replace(again, pose=np.repeat(frames, len(here.pose)), marker_in_vehicle=z)
+    joined = ArucoReadings(*(np.concatenate(each) for each in zip(
+        vars(seen).values(), vars(again).values())))
     ticks = np.insert(dataset.ticks, at + 1, np.full((rows, 2), count), axis=0)
     poses = np.insert(truth.poses, at + 1, np.tile(truth.poses[at], (rows, 1)), axis=0)
-    return replace(dataset, ticks=ticks, aruco=longer, uwb=None), poses
+    order = np.argsort(joined.pose, kind="stable")
+    return replace(dataset, ticks=ticks, aruco=joined.select(order), uwb=None), poses
 
 
 def known_noise(dataset, slip):
@@ -181,7 +174,7 @@ def slam_trial(seed, ranges=True, markers=True, **options):
                "nees between": np.nanmean(np.delete(values, frame)),
                "last nees": values[-1], "wheel nees": wheel_nees(found, truth),
                "ate": ate(found.poses, truth.poses), "slip": found.slip,
-               "factor": found.noise.sightings, "arc": float(found.model == "arc")}
+               "factor": found.noise.sightings, "arc": found.model == "arc"}
     if markers:
         off = found.marker_in_world - true_markers(truth, found.marker)
         numbers |= {"map nees": map_nees(found, truth).mean(),

@@ -159,13 +159,6 @@ def test_the_first_poses_have_the_readings_until_then(folder):
     assert_same(data.first(np.int64(4)), data)
 
 
-def test_wheel_parameters_of_a_vehicle_have_one_order():
-    vehicle = Vehicle(sigma_left_radius=2e-4).with_wheel([0.11, 0.12, 0.5])
-    assert vehicle.wheel.tolist() == [0.11, 0.12, 0.5]
-    assert (vehicle.right_radius, vehicle.wheelbase) == (0.11, 0.5)
-    assert vehicle.sigma_wheel.tolist() == [1e-4, 2e-4, 1e-4]
-
-
 # Valid variants of the rows; test_dialects.py has those of the text.
 
 

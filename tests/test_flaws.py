@@ -7,15 +7,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from conftest import ROOT
-from numeric import aruco, assert_consistent, known_noise, short, sigmas, uwb, vehicle
-from numpy.testing import assert_allclose, assert_array_equal
+from numeric import aruco, assert_consistent, short, sigmas, uwb, vehicle
+from numpy.testing import assert_allclose
 
 from slamlib import estimate, solve
-from slamlib.core import se2
 from slamlib.core.records import Dataset
 from slamlib.core.vehicle import Vehicle
 from slamlib.io.dataset import read_dataset, read_truth
-from slamlib.robust.calibration import CAMERA, SIGHTING_LAG, SIGHTINGS
+from slamlib.robust.calibration import CAMERA, SIGHTING_LAG
 from slamlib.robust.file_doubts import doubts_before_solving
 from slamlib.robust.measurements import Noise
 from slamlib.robust.solution_doubts import GROUPS, _rejection_doubts, solution_doubts
@@ -60,17 +59,6 @@ LEGAL = {                                      # within the limits, and far from
     "sightings of a distance": sightings_of([1e8, 1e-18, 1e14]),
     "correlations of almost 1": sightings_of([1e-4, 1e-4, 1e-4], NEARLY_1),
     "correlations with heading of almost 1": sightings_of([1e-4, 1e-4, 1e-4], NEARLY_1, 1, 2)}
-
-
-def test_without_sightings_nothing_is_known_of_the_camera():
-    dataset = known_noise(short(61, 300)[0].without("aruco"), 1e-3)
-    stated = vehicle(camera_x=0.1, sigma_camera_x=0.02, marker_size=1.01, sighting_lag=2.0)
-    for drive in (dataset, stated(dataset)):
-        found = estimate(drive, model="arc")
-        assert_array_equal(found.c[SIGHTINGS], found.calibration.stated[SIGHTINGS])
-        assert_allclose(found.c_covariance[SIGHTINGS, SIGHTINGS],
-                                   np.diag(found.calibration.sigma[SIGHTINGS]**2), atol=1e-15)
-        assert not found.released & set(found.calibration.group[SIGHTINGS])
 
 
 @pytest.mark.slow
@@ -212,15 +200,6 @@ def test_slip_that_no_wheel_has_is_named_unless_it_was_given(found, slip, sigma,
     assert all("slips by 30 mm" in doubt.sentence for doubt in doubts)
 
 
-def said_of_rejected(count, wrong, repeated=0):
-    """Sentences if of `count` sightings of markers from 11 on so many are wrong."""
-    rejected = np.concatenate([np.arange(n) < k for n, k in zip(count, wrong)])
-    marker = np.repeat(11 + np.arange(len(count)), count)
-    result = SimpleNamespace(rejected=rejected, sightings=SimpleNamespace(
-        contradicting=repeated, marker=marker))
-    return [doubt.sentence for doubt in _rejection_doubts(result)]
-
-
 @pytest.mark.parametrize("wrong, repeated, said", [
     ([4, 0, 0], 0, None), ([0, 4, 1], 0, None), ([0, 0, 5], 0, None),
     ([5, 0, 0], 0, "5 of 54 sightings contradict the rest and are left out, of marker 11 5 of 10."),
@@ -229,7 +208,11 @@ def said_of_rejected(count, wrong, repeated=0):
     ([1, 0, 0], 6, "7 of 60 sightings contradict the rest and are left out, 6 by another one")])
 def test_many_rejected_sightings_are_named_of_all_and_of_single_markers(wrong, repeated, said):
     """Sightings of markers 11, 12 and 13: ten, four and forty."""
-    sentences = said_of_rejected([10, 4, 40], wrong, repeated)
+    count = [10, 4, 40]
+    rejected = np.concatenate([np.arange(n) < k for n, k in zip(count, wrong)])
+    seen = SimpleNamespace(marker=np.repeat([11, 12, 13], count), contradicting=repeated)
+    doubts = _rejection_doubts(SimpleNamespace(rejected=rejected, sightings=seen))
+    sentences = [doubt.sentence for doubt in doubts]
     assert len(sentences) == (said is not None)
     assert all(said in sentence for sentence in sentences)
 
@@ -276,18 +259,3 @@ def test_a_marker_with_a_single_accepted_sighting_is_unconfirmed():
     assert not solution_doubts(found)
     row = solve.summarize(solve.problem_solution("problem3", dataset, found), None)
     assert row["unconfirmed"] == [marker]
-
-
-@pytest.mark.slow
-def test_a_marker_that_was_moved_halfway_is_named():
-    dataset, truth = short(5)
-    seen = dataset.aruco
-    late = seen.pose >= 1000
-    often = [np.bincount(seen.marker[half], minlength=500) for half in (late, ~late)]
-    marker = np.min(often, axis=0).argmax()
-    late &= seen.marker == marker
-    z = seen.marker_in_vehicle.copy()
-    z[late, :2] += se2.rotation(-truth.poses[seen.pose[late], 2]) @ [0.1, 0]
-    found = estimate(aruco(dataset, marker_in_vehicle=z).without("uwb"))
-    doubt, = solution_doubts(found)
-    assert doubt.what == "sightings-rejected" and f"of marker {marker} " in doubt.sentence

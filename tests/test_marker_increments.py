@@ -15,7 +15,12 @@ from slamlib.core.marker_increments import (
     returns,
     robust_increments,
 )
-from slamlib.core.sightings import Sightings, consensus, merge_repeated, regularized
+from slamlib.core.sightings import (
+    consensus,
+    merge_repeated,
+    regularized,
+    sightings_by_frame,
+)
 
 DELTA = np.array([0.12, -0.03, 0.2])
 MARKERS = np.array([[1.2, 0.4, 0.3], [-0.7, 1.1, -2.9], [0.2, -1.3, 3.1], [-1.0, -0.8, 1.0]])
@@ -113,10 +118,9 @@ def test_an_implausible_speed_makes_an_increment_unusable(way, turn, start):
     row = np.append(k, k + 1)
     place = MARKERS[j] * [0.1, 0.1, 1]
     z = np.concatenate([place, se2.between(moved[k], place)])
-    order = np.lexsort((marker, row))
-    found = consecutive_increments(Sightings(
-        index=order, row=row[order], marker=marker[order], z=z[order],
-        C=np.tile(1e-6 * np.eye(3), (len(z), 1, 1)), frame=10 * np.arange(81)))
+    order = np.argsort(row, kind="stable")
+    seen = readings(10 * row[order], marker[order], z[order], 1e-6 * np.eye(3))
+    found = consecutive_increments(sightings_by_frame(seen))
     assert_array_equal(np.flatnonzero(~found.usable), [0, 40, 41, 79])
     assert_array_equal(found.accepted, found.usable[found.pair])
 

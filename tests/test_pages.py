@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from urllib.parse import unquote, urlparse
 
-import nbformat
 import numpy as np
 import pytest
 from conftest import BROUGHT, ROOT, built_elsewhere, contradicted, copied
@@ -17,7 +16,6 @@ from conftest import BROUGHT, ROOT, built_elsewhere, contradicted, copied
 from slamlib.core.odometry import equation2
 from slamlib.io.dataset import read_dataset
 from slamlib.io.results import read_structs
-from slamlib.report import build_report
 from slamlib.solve import PROBLEMS
 from slamlib.studies.simulation import simulate, write_dataset
 
@@ -72,21 +70,6 @@ def test_chapters_name_the_datasets_that_have_what_they_need_and_show_no_warning
     for name, page in pages.items():                              # no defects of the notebooks
         assert 'class="stderr"' not in page, name
         assert not re.search(r"\bnan\b| at 0x[0-9a-f]{6}", text_of(page)), name
-
-
-def test_a_chapter_whose_sensor_no_dataset_has_is_left_out(tmp_path):
-    (tmp_path / "data" / "wheels").mkdir(parents=True)
-    (tmp_path / "data" / "wheels" / "encoderReading.txt").write_text("1 0 0\n2 100 90\n3 90 100\n")
-    (tmp_path / "notebooks").mkdir()
-    for name, metadata in (("1_all", {}), ("2_ranges", {"slamlib": {"needs": "uwb"}})):
-        book = nbformat.v4.new_notebook(metadata=metadata, cells=[
-            nbformat.v4.new_markdown_cell(f"# {name[0]}. {name[2:]}\n\nText.")])
-        nbformat.write(book, tmp_path / "notebooks" / f"{name}.ipynb")
-    pages = build_report(tmp_path / "notebooks", tmp_path / "data", tmp_path / "report",
-                         tmp_path / "results", tmp_path / "kept").files
-    assert [page.name for page in pages] == ["index.html", "1_all.html", "report.pdf"]
-    text = pages[0].read_text(encoding="utf-8")
-    assert "There are no markers in wheels" in text
 
 
 FAILING = """import numpy as np
@@ -161,42 +144,6 @@ slamlib.estimate ="""))
     assert 'class="stderr"' not in page
 
 
-def cells_of(page, name):
-    """The texts of the cells of all rows that begin with the name of a drive."""
-    cells = set()
-    for row in re.findall(r"<tr.*?</tr>", page, re.DOTALL):
-        first, *others = [text_of(cell).replace("\u00a0", " ").strip()
-                          for cell in re.findall(r"<t[dh].*?</t[dh]>", row, re.DOTALL)]
-        if first == name:
-            cells |= {*others}
-    return cells
-
-
-def test_chapters_say_which_noise_was_given(mixed):
-    """And not that it was learned, of the one drive whose vehicle.toml gives it."""
-    pages = [mixed[1].files[number].read_text(encoding="utf-8") for number in (1, 3)]
-    stated = {"0.00200", "1.25", "0.750"}
-    assert stated <= cells_of(pages[0], "told") and not stated & cells_of(pages[0], "good")
-    assert {"2.00 ± 0.00", "1.25 ± 0.00"} <= cells_of(pages[1], "told")
-    assert not any(cell.endswith("± 0.00") for cell in cells_of(pages[1], "good"))
-
-
-def test_figures_and_tables_are_numbered_without_a_gap_with_and_without_truth(built, mixed):
-    without_truth = {page.stem: page.read_text(encoding="utf-8")
-                     for page in mixed[1].files if page.suffix == ".html"}
-    for name, page in [*built[1].items(), *without_truth.items()]:
-        for kind in ("figure", "table"):
-            found = re.findall(rf'<figure id="{kind}-(\S+)">', page)
-            assert name == "index" or found == [
-                f"{name[0]}.{n}" for n in range(1, len(found) + 1)], name
-
-
-def test_without_truth_none_is_missed(mixed):
-    for page in mixed[1].files[:5]:
-        text = text_of(page.read_text(encoding="utf-8"))
-        assert not re.search("no truth (is|comes)|not known|is unknown", text, re.I), page.name
-
-
 # In the browser.
 
 
@@ -242,14 +189,6 @@ def test_figures_can_be_read_equations_have_numbers_tables_scroll_and_nothing_st
         assert outside == [], path.name
         assert page.evaluate(STICKING_OUT) == [], path.name
         assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth"), path.name
-
-
-def test_code_opens_by_its_summary(visited):
-    page = next(page for path, page in visited if path.stem == "1_odometry")
-    code = page.locator("details").first
-    assert not code.locator("pre").is_visible()
-    code.locator("summary").click()
-    assert code.locator("pre").is_visible()
 
 
 def test_a_dark_page_has_light_text(chromium, pages):

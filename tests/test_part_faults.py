@@ -13,7 +13,6 @@ from slamlib.core.evaluation import ate
 from slamlib.core.vehicle import Vehicle
 from slamlib.robust.part_faults import camera_bump, slipping_rows
 from slamlib.robust.solution_doubts import solution_doubts
-from slamlib.studies.simulation import simulate
 
 BUMP = np.array([0.05, -0.03, 0.06])
 MOUNTED = Vehicle(camera_x=0.1, camera_y=0.05, camera_turn=0.4, marker_size=1.1)
@@ -73,7 +72,7 @@ def test_a_moved_camera_is_told_and_costs_problems_2_and_3_nothing():
 
 
 def test_markers_that_were_moved_are_not_taken_for_a_moved_camera():
-    dataset, truth = simulate("short", seed=8, rounds=2)
+    dataset, truth = short(8, rounds=2)
     dataset = dataset.first(1400).without("uwb")
     poses = truth.poses[dataset.aruco.pose]
     there = se2.compose(poses, dataset.aruco.marker_in_vehicle) + [0.25, 0.1, 0.1]

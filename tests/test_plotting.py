@@ -34,9 +34,10 @@ def boxes(fig):
 
 
 @pytest.mark.parametrize("count, rows, columns", [(1, 1, 2), (2, 3, 2), (3, 3, 3)])
-def test_panels_are_side_by_side_and_within_the_figure(count, rows, columns):
+def test_panels_are_side_by_side_under_their_titles_and_within_the_figure(count, rows, columns):
     fig = drawn(count, rows, columns)
-    assert len(fig.axes) == count * rows
+    titles = [title for name in "abc"[:count] for title in [name] + (rows - 1) * [""]]
+    assert [ax.get_title("left") for ax in fig.axes] == titles
     *wide, legend = boxes(fig)
     if count > 1:
         assert wide[rows].x0 > wide[0].x1
@@ -92,31 +93,16 @@ def drive_with(truth=True):
     return result, Drive("a", None, SimpleNamespace(poses=poses) if truth else None)
 
 
-def test_each_drive_has_its_panels_a_title_and_one_legend():
-    _, drive = drive_with()
-    for _, axes in plotting.each_drive([drive, "two"], rows=2):
-        assert len(axes) == 2
-        plotting.curve(axes[0], np.arange(3.0), "slam")
-    fig = plt.gcf()
-    assert [ax.get_title("left") for ax in fig.axes] == ["a", "", "two", ""]
-    assert len(fig.legends) == 1
-    assert list(plotting.each_drive([])) == []
-
-
-@pytest.mark.parametrize("truth", [True, False])
-def test_errors_are_in_mm_and_without_truth_the_bands_stand_alone(truth):
+@pytest.mark.parametrize("truth, rows", [(True, 2), (False, 2), (True, 1)])
+def test_errors_are_in_mm_and_without_truth_the_bands_stand_alone(truth, rows):
+    """Those of the position only where there is one of axes."""
     result, drive = drive_with(truth)
     (_, axes), = plotting.each_drive([drive], rows=2)
-    plotting.errors(axes, result, drive)
-    for ax, error, reach in ((axes[0], 10, 20 * REACH_95), (axes[1], 2, 200)):
+    plotting.errors(axes[:rows], result, drive)
+    assert axes[0].get_title("left") == drive.name
+    for ax, error, reach in zip(axes[:rows], (10, 2), (20 * REACH_95, 200)):
         assert [line.get_ydata() for line in ax.lines] == ([pytest.approx(error)] if truth else [])
         assert ax.collections[0].get_paths()[0].vertices[:, 1].max() == pytest.approx(reach)
-
-
-def test_in_one_of_axes_the_errors_of_the_position_stand_alone():
-    (_, axes), = plotting.each_drive(["a"], rows=2)
-    plotting.errors(axes[:1], *drive_with())
-    assert axes[0].lines[0].get_ydata() == pytest.approx(10) and not axes[1].lines
 
 
 def test_errors_of_some_poses_are_in_the_frame_of_the_first_of_them():

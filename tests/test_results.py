@@ -57,13 +57,12 @@ def test_structs_have_the_bytes_that_scipy_writes_and_octave_reads(
     for got, expected in zip(results.read_structs(tmp_path, name), (ids, poses, covariances)):
         np.testing.assert_array_equal(got, expected)
     if count == 107:
-        own_ids = f"[{name}.id]" if "id" in fields else f"(1:{count})"
-        run_octave(f"load('{name}.mat'); i = {own_ids}; p = vertcat({name}.{fields[0]});"
-                   f"c = {name}(2).{fields[1]}; save('-v7', 'again.mat', 'i', 'p', 'c');", tmp_path)
+        run_octave(f"load('{name}.mat'); p = vertcat({name}.{fields[0]});"
+                   f"c = {name}(2).{fields[1]}; save('-v7', 'again.mat', 'p', 'c');", tmp_path)
         again = loadmat(tmp_path / "again.mat")
-        np.testing.assert_array_equal(again["i"], [ids])
         np.testing.assert_array_equal(again["p"], poses)
         np.testing.assert_array_equal(again["c"], covariances[1])
+
 
 POSES = np.array([[1.0, 2.0, 0.1], [np.nan] * 3, [1 / 3, -1e-9, 7.0]])
 
@@ -175,7 +174,6 @@ def test_several_drives_have_a_table_and_one_that_fails_does_not_stop_them(
     assert [*table.index] == ["with truth", "nowhere", "without"]
     row = results.read_summary(out / "with truth")["problems"]["problem3"]
     assert table.ate_m["with truth"] == row["ate_m"] and np.isnan(table.ate_m["without"])
-    assert table.nees["with truth"] == row["nees"] and table.seconds["without"] > 0
     covariances = results.read_structs(out / "without" / "problem3", "vehiclePose")[2]
     assert table.last_sigma_m["without"] == evaluation.position_sigmas(covariances[-1:])
     assert table.failed.notna().tolist() == [False, True, False]

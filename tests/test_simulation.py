@@ -62,31 +62,6 @@ def test_noise_has_the_covariances_that_the_files_state():
     assert 0.2 < np.sqrt(np.mean(guess_error**2)) < 0.8
 
 
-def encoder_errors(dataset, truth):
-    """Errors (2, n-1) of the travelled distance of the true right and left wheel, and its steps."""
-    vehicle = truth.vehicle
-    count = 2 * np.pi * vehicle.wheel[:2] / vehicle.ticks_per_revolution
-    step = se2.between(truth.poses[:-1], truth.poses[1:])
-    ds = np.hypot(step[:, 0], step[:, 1]) / np.sinc(step[:, 2] / (2 * np.pi))
-    turn = vehicle.wheelbase / 2 * step[:, 2]
-    error = count * dataset.ticks[1:] - np.stack([ds + turn, ds - turn], axis=-1)
-    return np.cumsum(error, axis=0).T, ds
-
-
-def test_encoders_without_slip_err_by_at_most_a_count():
-    error, _ = encoder_errors(*simulate("long", seed=7, slip=0.0))
-    assert np.abs(error).max() < 1.01 * 2 * np.pi * 0.1 / 8000
-
-
-@pytest.mark.parametrize("slip", [1e-3, 5e-3])
-def test_encoder_error_is_a_random_walk_with_the_variance_of_slip(slip):
-    error, ds = encoder_errors(*simulate("long", seed=7, slip=slip))
-    per_metre = np.diff(error[:, ::100], axis=1)                  # about one metre each
-    metres = np.add.reduceat(ds, np.arange(0, len(ds) // 100 * 100, 100))
-    ratio = np.mean(per_metre**2) / (slip**2 * metres.mean())
-    assert abs(ratio - 1) < 4 * np.sqrt(2 / per_metre.size)
-
-
 def test_outliers_come_at_the_asked_rates_and_late_ranges_are_too_long():
     clean, truth = simulate("long", seed=8)
     dirty, _ = simulate("long", seed=8, late_ranges=0.15, mislabelled=0.03)
@@ -126,11 +101,3 @@ def test_confused_labels_are_as_many_as_stated_and_those_in_a_frame_are_exchange
     same = [np.array_equal(np.sort(label[right.pose == pose]), np.sort(
         right.marker[right.pose == pose])) for pose in np.unique(right.pose)]
     assert all(same) == (kind in ("none", "in frame"))
-
-
-def test_a_twin_is_one_certain_other_marker():
-    right = simulate("short", seed=1)[0].aruco.marker
-    label = confuse_labels(simulate("short", seed=1)[0], "twins", seed=3).aruco.marker
-    for marker in np.unique(right[label != right]):
-        read_as = label[right == marker]
-        assert len(np.unique(read_as)) == 2 and 0.3 < np.mean(read_as != marker) < 0.9

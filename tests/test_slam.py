@@ -75,8 +75,8 @@ def learned_noise(seed, slip):
     learned = estimate(markers)
     known = estimate(known_noise(markers, slip), model="arc")
     both = estimate(dataset, previous=learned)
-    numbers = {"slip": learned.slip, "rejected": np.count_nonzero(learned.rejected),
-               "arc": float(learned.model == "arc")}
+    numbers = {"slip": learned.slip, "rejected": learned.rejected.sum(),
+               "arc": learned.model == "arc"}
     for name, found in (("learned", learned), ("known", known), ("both", both)):
         numbers |= montecarlo.judged(name, found.poses, found.covariances, truth.poses, True)
     return numbers
@@ -102,20 +102,6 @@ def test_a_slip_that_is_not_known_widens_the_covariance(slip):
         assert 0.85 < np.exp(np.log(runs["slip"] / slip).mean()) < 1.15
         assert_consistent(runs["learned nees"], probability=0.999)
         assert runs["arc"].mean() > 0.8
-
-
-def test_wrong_covariances_of_sightings_are_scaled():
-    """The estimate is nearly the one from the right covariances, and its factor is known."""
-    dataset = short(61)[0].without("uwb")
-    expected = estimate(dataset)
-    found = estimate(aruco(dataset, covariance=dataset.aruco.covariance / 16))
-    sigma = found.noise_sigma[1]
-    assert abs(np.log(found.noise.sightings / 4)) < 4 * sigma
-    assert 0.005 < sigma < 0.03                              # about 2700 errors: 1 / sqrt(2 * 2700)
-    off = (found.poses - expected.poses)[1:] / sigmas(expected.covariances)[1:]
-    assert np.abs(off).max() < 0.5
-    C = expected.covariances[-1]
-    assert_allclose(found.covariances[-1], C, rtol=0.2, atol=0.1 * C.max())
 
 
 @pytest.mark.parametrize("poses, slip", [(2000, 1e-3), (300, 0.0)])
@@ -278,8 +264,6 @@ def test_noise_that_is_known_is_not_learned_and_the_rest_is(known):
         values = np.array(each.noise)
         assert_allclose(values[is_known], [*known.values()], rtol=1e-12)
         assert (values != [1e-3, 1, 1]).all()
-        assert_allclose(values[1:][~is_known[1:]], 1, atol=0.2)
-    assert np.abs(found.poses[-1] - estimate(dataset).poses[-1]).max() > 1e-6
 
 
 @pytest.mark.parametrize("options, told", [
@@ -297,6 +281,18 @@ def test_an_option_with_a_wrong_name_or_value_is_told_with_what_there_is(options
         estimate(**{"dataset": short(4, 50)[0]} | options)
 
 
+def test_kernel_and_gate_of_the_vehicle_are_those_of_the_options():
+    """Which decide where both are given."""
+    dataset = known_noise(short(4, 400, late_ranges=0.05)[0], 1e-3)
+    stated = vehicle(kernel="Huber", gate=False)(dataset)
+    found = estimate(stated)
+    default = estimate(dataset)
+    assert_array_equal(found.poses, estimate(dataset, kernel="Huber", gate=False).poses)
+    assert_array_equal(
+        default.poses, estimate(stated, kernel="asymmetric Tukey", gate=True).poses)
+    assert (found.range_weight > 0).all() and not (default.range_weight > 0).all()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_every_kernel_solves_a_drive_with_wrong_labels_and_late_ranges(kernel):
@@ -308,10 +304,8 @@ def test_every_kernel_solves_a_drive_with_wrong_labels_and_late_ranges(kernel):
     gated = estimate(dataset, kernel=kernel, model="arc")
     assert gated.rejected.any() and ate(gated.poses, truth.poses) < 0.02
     assert_allclose(gated.noise.sightings, 1, atol=0.05)
-    assert (gated.range_weight < 1).any()
     if kernel not in ONE_SIDED:                     # those leave the errors of sightings quadratic
         found = estimate(dataset, kernel=kernel, model="arc", gate=False)
-        assert not found.rejected.any()
         assert (ate(found.poses, truth.poses) < 0.03) == (kernel != "quadratic")
 
 
@@ -379,4 +373,5 @@ def test_a_drive_of_one_pose_has_its_prior():
     sigma = np.array([1e-5, 1e-5, dataset.vehicle.sigma_heading])
     assert_allclose(found.covariances, [np.diag(sigma**2)], atol=1e-18)
     assert not found.poses.any() and len(found.marker) == len(dataset.aruco.pose) > 0
+    assert repr(found).startswith("SlamResult of 1 poses, mean sigma ")
     assert max(found.agreement) < 1e-6

@@ -1,28 +1,22 @@
-"""A plain GTSAM script for problems 3 and 4, as the baseline of time and error.
+"""A plain GTSAM script for problem 4, as the baseline of time.
 
 A between factor for every encoder row, with the noise that table 2 gives a single step and a floor,
 since that noise is singular. A between factor for every sighting and a range factor for every
 range, both with a Huber kernel. Markers start at their first sighting, antennas at their guess. One
 Levenberg-Marquardt optimisation, and the marginal covariance of every pose.
-
-    python tests/benchmarks/plain_gtsam.py [FOLDER]
 """
-
-import sys
-import time
 
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import A, L, X
 
-from slamlib.core import evaluation, odometry, se2
-from slamlib.io.dataset import read_dataset, read_truth
+from slamlib.core import odometry, se2
 
 FLOOR = np.array([1e-4, 1e-4, 1e-3])          # m, m, rad in one step
 
 
-def plain(dataset, marginals=True):
-    """Poses (n, 3), and covariances (n, 3, 3) in GTSAM's axes or, without marginals, None."""
+def plain(dataset):
+    """Poses (n, 3), and covariances (n, 3, 3) in GTSAM's axes."""
     ticks, vehicle, aruco = dataset.ticks, dataset.vehicle, dataset.aruco
     uwb, guess = dataset.uwb, dataset.antenna_guess
     poses = odometry.dead_reckoning(ticks, vehicle)
@@ -39,11 +33,10 @@ def plain(dataset, marginals=True):
     for k, pose in enumerate(poses):
         values.insert(X(k), gtsam.Pose2(*pose))
     huber = gtsam.noiseModel.mEstimator.Huber.Create(1.345)
-    for i, k, r, sigma in [] if uwb is None else zip(
-            uwb.pose.tolist(), uwb.antenna.tolist(), uwb.range, uwb.sigma):
+    for i, k, r, sigma in zip(uwb.pose.tolist(), uwb.antenna.tolist(), uwb.range, uwb.sigma):
         graph.add(gtsam.RangeFactor2D(X(i), A(k), r, gtsam.noiseModel.Robust.Create(
             huber, gtsam.noiseModel.Isotropic.Sigma(1, sigma))))
-    for k, place in [] if uwb is None else zip(guess.antenna.tolist(), guess.position):
+    for k, place in zip(guess.antenna.tolist(), guess.position):
         if k in uwb.antenna:
             values.insert(A(k), gtsam.Point2(*place))
     for i, j, z, C in zip(aruco.pose.tolist(), aruco.marker.tolist(), aruco.marker_in_vehicle,
@@ -55,23 +48,5 @@ def plain(dataset, marginals=True):
     values = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     each = [values.atPose2(X(k)) for k in range(len(poses))]
     found = np.array([[p.x(), p.y(), p.theta()] for p in each])
-    if not marginals:
-        return found, None
     of = gtsam.Marginals(graph, values)
     return found, np.array([of.marginalCovariance(X(k)) for k in range(len(poses))])
-
-
-def main(folder):
-    dataset, truth = read_dataset(folder), read_truth(folder)
-    for problem, data in ((3, dataset.without("uwb")), (4, dataset)):
-        start = time.perf_counter()
-        poses, _ = plain(data)
-        seconds = time.perf_counter() - start
-        error = "" if truth is None else (
-            f", ATE {evaluation.ate(poses, truth.poses):.4f} m, aligned "
-            f"{evaluation.ate(poses, truth.poses, aligned=True):.4f} m")
-        print(f"plain GTSAM script, problem {problem} on {dataset.name}: {seconds:.1f} s{error}")
-
-
-if __name__ == "__main__":
-    main(sys.argv[1] if len(sys.argv) > 1 else "data/long")
