@@ -1,8 +1,8 @@
 """Increments between poses by odometry, their noise, and how they depend on the wheels.
 
 A wheel that travels s metres slips with variance slip^2 |s|, independently from step to step. Each
-encoder rounds its cumulative count. `rounding_and_slipping` is for single increments,
-`noise_in_drive` for increments of one drive that are used together. An increment is the pose `end`
+encoder rounds its cumulative count. `rounding_and_slipping` is the noise of increments by
+themselves, `noise_in_drive` that of increments of one drive that are used together. An increment is the pose `end`
 in the frame of the pose `start`; both are arrays (m,) of indices from 0. The `ticks` (n, 2),
 `vehicle` and `model` are those of module `odometry`.
 

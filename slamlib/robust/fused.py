@@ -15,7 +15,7 @@ with covariance C, measure these markers, M' = H state, and update
     state <- state + K (Z - M'),    P <- P' - K H P',    K = P' H^T S^-1,    S = H P' H^T + C.
 
 Sightings beyond GATE are rejected. Then the filter removes rejected markers and those out of view,
-and adds new ones with covariance C_j. Without markers the result is the first-order propagation of
+and adds new ones with covariance C. Without markers the result is the first-order propagation of
 odometry; with uninformative odometry and one marker it is `localize`.
 
 Errors of a marker in successive frames are alike, with the correlation `memory`. The last sighting
