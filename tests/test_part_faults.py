@@ -71,18 +71,6 @@ def test_a_moved_camera_is_told_and_costs_problems_2_and_3_nothing():
         assert error < 1.5 * ate(alone.poses, truth.poses, aligned=True) + 2e-3
 
 
-def test_markers_that_were_moved_are_not_taken_for_a_moved_camera():
-    dataset, truth = short(8, rounds=2)
-    dataset = dataset.first(1400).without("uwb")
-    poses = truth.poses[dataset.aruco.pose]
-    there = se2.compose(poses, dataset.aruco.marker_in_vehicle) + [0.25, 0.1, 0.1]
-    moved = (dataset.aruco.pose > 900) & (dataset.aruco.marker % 2 == 1)
-    z = np.where(moved[:, None], se2.between(poses, there), dataset.aruco.marker_in_vehicle)
-    found = estimate(aruco(dataset, marker_in_vehicle=z))
-    assert not found.released
-    assert ate(found.poses, truth.poses[:1400]) < 0.03
-
-
 def with_counts(dataset, begin, end, change):
     """The Dataset with the counts of some rows changed."""
     ticks = dataset.ticks.copy()

@@ -2,9 +2,9 @@
 
 A wheel that travels s metres slips with variance slip^2 |s|, independently from step to step. Each
 encoder rounds its cumulative count. `rounding_and_slipping` is the noise of increments by
-themselves, `noise_in_drive` that of increments of one drive that are used together. An increment is the pose `end`
-in the frame of the pose `start`; both are arrays (m,) of indices from 0. The `ticks` (n, 2),
-`vehicle` and `model` are those of module `odometry`.
+themselves, `noise_in_drive` that of increments of one drive that are used together. An increment
+is the pose `end` in the frame of the pose `start`; both are arrays (m,) of indices from 0. The
+`ticks` (n, 2), `vehicle` and `model` are those of module `odometry`.
 
 `OdometryIncrements` are those between the frames, the poses that are variables of the graph. An
 increment Delta accumulates all encoder steps from one frame to the next. It is linear in the wheel

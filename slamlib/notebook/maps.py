@@ -10,7 +10,7 @@ from slamlib.notebook import plotting
 
 HALF_WIDTH, WIDTH = 4.08, 7.4      # inches: half the width of the page, and all of it
 FLAT = 0.55                        # height of a map over its width, below which it needs all of it
-LABELS = 0.6, 1.3                  # inches beside and below the axes
+ABOVE_AND_BELOW = 0.8              # inches, for title, label and legend
 # Places of a name relative to its landmark, in font sizes, in the order in which they are tried.
 NAME_OFFSETS = (1, 0.9), (-1, 0.9), (1, -0.9), (-1, -0.9), (0, 1.4), (0, -1.4)
 HALO = withStroke(linewidth=1.5, foreground="white")       # so that a name on the path can be read
@@ -71,12 +71,12 @@ def whole_map(drive, result) -> Figure:
 
 def _size(result):
     """Width and height in inches of a map of a SlamResult that leaves little white beside it."""
-    points = np.concatenate([result.poses[:, :2], result.marker_in_world[:, :2],
+    places = np.concatenate([result.poses[:, :2], result.marker_in_world[:, :2],
                              result.antenna_in_world])
-    across, up = np.nanmax(points, axis=0) - np.nanmin(points, axis=0)
+    across, up = np.ptp(places, axis=0)
     shape = np.clip(up / max(across, 1e-9), 0.25, 1.0)
     width = WIDTH if shape < FLAT else HALF_WIDTH
-    return width, (width - LABELS[0]) * shape + LABELS[1]
+    return width, width * shape + ABOVE_AND_BELOW
 
 
 def _write_name(ax, place, name, size, taken):
