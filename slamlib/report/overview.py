@@ -126,13 +126,10 @@ def trajectories(drive: SolvedDrive) -> str:
         sigmas = evaluation.position_sigmas(solution.covariances)
         known = np.flatnonzero(sigmas > np.nanmax(sigmas) / 1000)  # on a logarithmic axis
         plotting.curve(right, sigmas[known], role, known, title)
-    if "ArucoMap" in last.maps:
-        _, places, _ = last.maps["ArucoMap"]
-        look = plotting.ROLES["marker"] | {"markersize": 1.5}
-        left.plot(*places.T[:2], label="markers", **look)
-    if "UwbMap" in last.maps:
-        _, places, covariances = last.maps["UwbMap"]
-        plotting.draw_antennas(left, places, covariances)
+    for name, role, size in (("ArucoMap", "marker", 1.5), ("UwbMap", "antenna", 5)):
+        if name in last.maps:
+            look = plotting.ROLES[role] | {"markersize": size}
+            left.plot(*last.maps[name][1].T[:2], label=f"{role}s", **look)
     if drive.truth is not None:
         plotting.trajectory(left, drive.truth.poses, "truth")
     right.set(xlabel="pose id", yscale="log", ylabel="σ of position (m)")
