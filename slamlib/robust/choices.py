@@ -401,7 +401,10 @@ def _lead_of_jumps(fit, other):
     """Log evidence of a Fit with more jumps over that of another, none if there is no solution."""
     if fit is None:
         return -np.inf
-    lead = _lead(fit, other)
+    try:
+        lead = _lead(fit, other)
+    except (DatasetError, np.linalg.LinAlgError):        # by what both accept
+        return -np.inf
     log.info("jumps: log evidence %+.1f", lead)
     return lead
 

@@ -51,6 +51,7 @@ MEMORIES = (0.0, 0.6, 0.9, 0.95)            # correlations of successive errors 
 FACTORS = (1.0, 3.0, 9.0)    # on the standard deviations of the sightings
 STRETCHES = 10               # of the drive, in which the first filters run
 STRETCH_FRAMES = 20          # at most, of each
+MAX_ENTRIES = 5e7            # of the covariances of all filters that run side by side
 PRICE = 6.0                  # log density by which errors have memory, and by which the camera errs
 MIN_JUMP_GAIN = 10.0         # log likelihood by each of many jumps; the loss by each of a few
 # Rows of covariances; those of the markers follow
@@ -190,8 +191,15 @@ def _learned_models(dataset, jumps, slip):
     slips = SLIPS if slip is None else [slip]
     factors = FACTORS if dataset.vehicle.marker_noise_factor is None else [1.0]
     models = _all_models(slips, MEMORIES, [False, True], factors)
-    last = _filter(_stretches(dataset), jumps, models)[-1]
-    best = last.likeliest
+    some = _stretches(dataset)
+    pose = np.array([]) if some.aruco is None else some.aruco.pose
+    most = np.unique(pose, return_counts=True)[1].max(initial=0)
+    at_once = max(1, int(MAX_ENTRIES / (9 + 6 * most)**2))
+    log_density = []
+    for k in range(0, len(models.slip), at_once):
+        part = _Models(*[field[k:k + at_once] for field in models])
+        log_density += _filter(some, jumps, part)[-1].log_density.tolist()
+    best = np.argmax(log_density)
     if slip is None:
         slips = np.minimum(models.slip[best] * FINE_STEPS, SLIP_BOUNDS[1])
     return _all_models(
