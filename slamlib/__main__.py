@@ -116,7 +116,8 @@ def _told(summaries):
                 print(f"{name}: {problem} could not be solved: {row['failed']}")
                 code = 3
         for doubt in summary["doubts"]:
-            print(f"{name}: doubt ({doubt['what']}): {doubt['sentence']} {doubt['advice']}")
+            told = f"{name}: doubt ({doubt['what']}): {doubt['sentence']} {doubt['advice']}"
+            print(told.rstrip())
     for summary in summaries:
         if "error" in summary:
             code = _ended(2, summary["error"])

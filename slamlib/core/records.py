@@ -75,13 +75,12 @@ class Dataset:
         if self.aruco is None:
             return None
         stated = self.vehicle
-        camera_in_vehicle = [stated.camera_x, stated.camera_y, stated.camera_turn]
         scale = np.array([stated.marker_size, stated.marker_size, 1])
         marker_in_camera = scale * self.aruco.marker_in_vehicle
         covariance = scale[:, None] * self.aruco.covariance * scale
         return replace(
             self.aruco,
-            marker_in_vehicle=se2.compose(camera_in_vehicle, marker_in_camera),
+            marker_in_vehicle=se2.compose(stated.camera, marker_in_camera),
             covariance=se2.rotate_covariance(covariance, stated.camera_turn))
 
     @property

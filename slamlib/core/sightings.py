@@ -15,6 +15,7 @@ from slamlib.core.records import NO_SIGHTINGS, ArucoReadings
 
 GATE = 16.26623619623813         # dimensionless, for residuals of [x, y, heading]
 POINT_GATE = 13.815510557964274  # dimensionless, for residuals of [x, y]
+MEDIAN_CHI2 = {3: 2.366, 2: 1.386, 1: 0.455}     # medians of chi-squared by degrees of freedom
 MIN_MEASUREMENT_SIGMA = 1e-6     # m or rad, of one coordinate given the others
 MIN_SIGMA_RATIO = 1e-6           # of the standard deviations of x and y
 MAX_HEADING_SIGMA = 0.5          # rad; with a larger standard deviation a heading is unknown

@@ -65,6 +65,11 @@ class Vehicle:
         """Standard deviations of the wheel parameters, (3,) in m."""
         return np.array([self.sigma_right_radius, self.sigma_left_radius, self.sigma_wheelbase])
 
+    @property
+    def camera(self) -> np.ndarray:
+        """Pose [x, y, turn] of the camera in the vehicle, (3,) in m and rad."""
+        return np.array([self.camera_x, self.camera_y, self.camera_turn])
+
     def with_wheel(self, wheel: np.ndarray) -> "Vehicle":
         """The Vehicle with the wheel parameters `wheel` (3,) in m and unchanged sigmas."""
         right, left, base = map(float, wheel)

@@ -16,7 +16,7 @@ import numpy as np
 from gtsam import noiseModel
 
 from slamlib.core.kernels import KERNELS, ONE_SIDED
-from slamlib.core.sightings import GATE, POINT_GATE
+from slamlib.core.sightings import GATE, MEDIAN_CHI2, POINT_GATE
 from slamlib.robust.calibration import WHEELS
 from slamlib.robust.error_memory import Memory, error_memory
 from slamlib.robust.factors import linearize_measurements, preintegrate_odometry
@@ -39,7 +39,6 @@ MAX_DIRECT = 3.3             # sigmas, of a range's residual; longer ones are ec
 CAUCHY_SCALES = (100.0, 30.0, 10.0, 3.0)     # sigmas, scale of the kernel in each round
 ROUGH = 1e-4                 # relative decrease of the error at which a round ends
 MIN_RESIDUALS = 20           # number of measurements from which their scatter gives a factor
-MEDIAN_CHI2 = {3: 2.366, 2: 1.386, 1: 0.455}         # medians by degrees of freedom
 
 MAX_ROUNDS = 6               # number of rounds of wheels, noise and accepted measurements
 NEGLIGIBLE_MOVE = 3e-3       # relative, of a wheel parameter since odometry was linearised

@@ -182,8 +182,22 @@ def _with_camera_mended(dataset, slip):
 
 def _log_density(dataset, jumps, slip):
     """Log density of all innovations of a filter with a slip, up to a constant."""
-    models = _all_models([slip], [0.0], [False], [1.0])
-    return _filter(dataset, jumps, models)[-1].log_density[0]
+    return _log_densities(dataset, jumps, _all_models([slip], [0.0], [False], [1.0]))[0]
+
+
+def _log_densities(dataset, jumps, models):
+    """Log densities (h,) of all innovations of filters with these _Models, up to a constant.
+
+    Where many markers are seen at once, fewer filters run side by side, or memory would not do.
+    """
+    most = np.bincount(_sightings(dataset).row, minlength=1).max()
+    rows = 9 + 6 * most                                  # of the largest covariance of a filter
+    at_once = max(1, int(MAX_ENTRIES / rows**2))
+    found = []
+    for k in range(0, len(models.slip), at_once):
+        part = _Models(*[field[k:k + at_once] for field in models])
+        found.append(_filter(dataset, jumps, part)[-1].log_density)
+    return np.concatenate(found)
 
 
 def _learned_models(dataset, jumps, slip):
@@ -191,15 +205,7 @@ def _learned_models(dataset, jumps, slip):
     slips = SLIPS if slip is None else [slip]
     factors = FACTORS if dataset.vehicle.marker_noise_factor is None else [1.0]
     models = _all_models(slips, MEMORIES, [False, True], factors)
-    some = _stretches(dataset)
-    pose = np.array([]) if some.aruco is None else some.aruco.pose
-    most = np.unique(pose, return_counts=True)[1].max(initial=0)
-    at_once = max(1, int(MAX_ENTRIES / (9 + 6 * most)**2))
-    log_density = []
-    for k in range(0, len(models.slip), at_once):
-        part = _Models(*[field[k:k + at_once] for field in models])
-        log_density += _filter(some, jumps, part)[-1].log_density.tolist()
-    best = np.argmax(log_density)
+    best = _log_densities(_stretches(dataset), jumps, models).argmax()
     if slip is None:
         slips = np.minimum(models.slip[best] * FINE_STEPS, SLIP_BOUNDS[1])
     return _all_models(

@@ -23,7 +23,7 @@ import numpy as np
 from slamlib.core import odometry, se2
 from slamlib.core.marker_increments import distance_and_turn, robust_increments
 from slamlib.core.records import Dataset
-from slamlib.core.sightings import GATE, sightings_by_frame
+from slamlib.core.sightings import GATE, MEDIAN_CHI2, sightings_by_frame
 from slamlib.robust.part_faults import CameraBump, slipping_rows
 
 log = logging.getLogger(__name__)
@@ -36,7 +36,6 @@ LAGS = range(-12, 13, 2)     # poses, by which all sightings may be late
 LEVER = 0.12                 # m, by which the camera may be elsewhere than stated
 # Decisions; gains are of twice the log likelihood
 SUSPECT = 7.8                # 95 % quantile of chi-squared with three degrees of freedom
-MEDIAN_SQUARED = 2.366       # its median
 MIN_GAIN = 12.0              # by a jump
 MIN_LAG_GAIN = 50.0          # by a lag
 MAX_LAG_COST = 0.8           # of that without it; with slip a wrong lag costs 0.95
@@ -197,9 +196,7 @@ def find_jumps(dataset: Dataset, bump: CameraBump | None = None) -> Jumps:
     slipping = slipping_rows(dataset)
     candidates = [_found(dataset.ticks, s, drives[each], slipping) for each in sorted({0, lag})]
     found = min(candidates, key=len)
-    jumps = replace(NO_JUMPS, lag=lag)
-    if bump is not None:
-        jumps = replace(jumps, bump=bump.pose)
+    jumps = replace(NO_JUMPS, lag=lag, bump=np.inf if bump is None else bump.pose)
     for jump in found:
         start = s.frame[jump.step]
         end = s.frame[jump.step + 1]
@@ -268,7 +265,7 @@ def _covariance_scale(s, drive):
     squared = pairs.squared[pairs.span == 1]
     if not len(squared):
         return 1.0
-    return max(1.0, np.median(squared) / MEDIAN_SQUARED)
+    return max(1.0, np.median(squared) / MEDIAN_CHI2[3])
 
 
 def _usual(drive):

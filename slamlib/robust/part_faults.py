@@ -33,7 +33,7 @@ from slamlib.core.marker_increments import (
     robust_increments,
 )
 from slamlib.core.records import Dataset
-from slamlib.core.sightings import GATE, sightings_by_frame
+from slamlib.core.sightings import GATE, MEDIAN_CHI2, sightings_by_frame
 
 log = logging.getLogger(__name__)
 
@@ -53,7 +53,6 @@ MAX_STRETCH = 0.5         # of the drive, in which wheels are exchanged; else th
 MIN_BUMP_GAIN = 35.0      # of squared residuals, by a camera that was moved
 MAX_BUMP = 0.3            # m and rad, of a motion of the camera
 BUMP_SIGMA = 0.2          # m and rad, of a camera about its stated place, before and after
-MEDIAN_SQUARED = {2: 1.386, 3: 2.366}    # of chi-squared, by degrees of freedom
 REWEIGHTED = 4            # times, by the residuals
 MIN_WHEELS_GAIN = 25.0    # of squared residuals, by other wheels in a stretch
 STRETCH_LENGTHS = 30      # number of lengths that are tried
@@ -222,17 +221,15 @@ class CameraBump(NamedTuple):
     def mended(self, dataset: Dataset) -> Dataset:
         """The Dataset with its later sightings as the camera would have them at its old place."""
         aruco = dataset.aruco
-        vehicle = dataset.vehicle
-        camera = np.array([vehicle.camera_x, vehicle.camera_y, vehicle.camera_turn])
-        scale = np.array([vehicle.marker_size, vehicle.marker_size, 1.0])
-        in_vehicle = se2.compose(self.motion, dataset.sightings.marker_in_vehicle)
-        in_camera = se2.between(camera, in_vehicle) / scale
-        covariance = se2.rotate_covariance(aruco.covariance, self.motion[2])
+        stated = dataset.vehicle
+        in_camera = se2.between(stated.camera, se2.compose(self.motion, stated.camera))
+        in_camera[:2] /= stated.marker_size              # in the unit of the sightings
         later = aruco.pose >= self.pose
+        motion = np.where(later[:, None], in_camera, 0.0)
         return replace(dataset, aruco=replace(
             aruco,
-            marker_in_vehicle=np.where(later[:, None], in_camera, aruco.marker_in_vehicle),
-            covariance=np.where(later[:, None, None], covariance, aruco.covariance)))
+            marker_in_vehicle=se2.compose(motion, aruco.marker_in_vehicle),
+            covariance=se2.rotate_covariance(aruco.covariance, motion[:, 2])))
 
 
 def camera_bump(dataset: Dataset) -> CameraBump | None:
@@ -274,27 +271,35 @@ def _moved_camera(markers, wheels, sigma):
     e = se2.difference(markers, wheels)[:, :2, None]
     turned = se2.rotation(wheels[:, 2]) - np.eye(2)
     across = np.stack([wheels[:, 1], -wheels[:, 0]], axis=1)
-    along = wheels[:, :2]
-    J = np.concatenate([turned, across[:, :, None], along[:, :, None]], axis=2)
+    by_camera = np.concatenate([turned, across[:, :, None]], axis=2)
+    by_factor = wheels[:, :2, None]
+    J = np.concatenate([by_camera, by_factor], axis=2)
     variance = sigma[:, 0]**2 / 2
     weight = 1 / variance
     for _ in range(REWEIGHTED):
         weighted = weight[:, None, None] * J.mT
         common, _ = _least_squares(np.sum(weighted @ J, axis=0), np.sum(weighted @ e, axis=0))
-        left = e - J[:, :, 3:] * common[3]
-        by_camera = J[:, :, :3]
-        weighted = weighted[:, :3]
-        information = np.cumsum(weighted @ by_camera, axis=0)
-        right = np.cumsum(weighted @ left, axis=0)
+        left = e - by_factor * common[3]
+        information = np.cumsum(weighted[:, :3] @ by_camera, axis=0)
+        right = np.cumsum(weighted[:, :3] @ left, axis=0)
         before, saved_before = _least_squares(information, right)
         after, saved_after = _least_squares(information[-1] - information, right[-1] - right)
         gain = saved_before + saved_after - saved_before[-1]
         k = MIN_COUNT + int(gain[MIN_COUNT:-MIN_COUNT].argmax())
         camera = np.where((np.arange(len(e)) <= k)[:, None, None], before[k], after[k])
         squared = np.sum((left - by_camera @ camera)**2, axis=(1, 2)) / variance
-        scale = max(1.0, np.median(squared) / MEDIAN_SQUARED[2])
-        weight = 1 / (scale + squared / GATE) / variance
+        weight = _robust_weights(squared, _scale(squared, 2)) / variance
     return k + 1, (after[k] - before[k])[:, 0], gain[k] / OVERLAP
+
+
+def _scale(squared, size):
+    """Factor, 1 or more, on variances of errors of `size` components, by their squares (n,)."""
+    return max(1.0, np.median(squared) / MEDIAN_CHI2[size])
+
+
+def _robust_weights(squared, scale):
+    """Weights (n,) of the Cauchy kernel over a `scale` of the variances, by squared errors (n,)."""
+    return 1 / (scale + squared / GATE)
 
 
 def _least_squares(information, right, sigma=BUMP_SIGMA):
@@ -315,32 +320,46 @@ def slipping_rows(dataset: Dataset) -> np.ndarray:
         return rows
     vehicle = dataset.vehicle
     _, by_wheel = increments.between_poses(dataset.ticks, vehicle, *poses.T, "arc")
-    J = by_wheel[:, :, :2] * vehicle.wheel[:2]
-    e = se2.difference(markers[0], wheels)[:, :, None]
+    by_radii = by_wheel[:, :, :2] * vehicle.wheel[:2]
     variance = sigma[:, [0, 0, 1]]**2 / [2, 2, 1]
+    stretch = _other_radii(se2.difference(markers[0], wheels), by_radii, variance)
+    if stretch is not None:
+        first, last = stretch
+        rows[poses[first, 0] + 1:poses[last, 1] + 1] = True
+        log.info("wheels: slip from pose %d to %d", poses[first, 0] + 1, poses[last, 1] + 1)
+    return rows
+
+
+def _other_radii(e, J, variance):
+    """First and last increment of the stretch with other radii, None if there is none.
+
+    By differences e (n, 3) of increments by markers and by wheels, their `variance` (n, 3), and
+    derivatives J (n, 3, 2) by relative changes of both radii, which may be off all the time.
+    """
+    e = e[:, :, None]
     weighted = (J / variance[:, :, None]).mT
-    kept = np.ones((len(e), 1, 1))
+    kept = np.ones(len(e))
     for _ in range(REWEIGHTED):
-        common, _ = _least_squares(np.sum(kept * weighted @ J, axis=0),
-                                   np.sum(kept * weighted @ e, axis=0), WHEELS_SIGMA)
+        robust = kept[:, None, None] * weighted
+        common, _ = _least_squares(
+            np.sum(robust @ J, axis=0), np.sum(robust @ e, axis=0), WHEELS_SIGMA)
         left = e - J @ common
         squared = np.sum(left[:, :, 0]**2 / variance, axis=1)
-        scale = max(1.0, np.median(squared) / MEDIAN_SQUARED[3])
-        kept[:, 0, 0] = 1 / (scale + squared / GATE)
+        scale = _scale(squared, 3)
+        kept = _robust_weights(squared, scale)
     if scale > MAX_SCALE:
-        return rows
-    information = odometry.cumulative(kept * weighted @ J)
-    right = odometry.cumulative(kept * weighted @ left)
-    best = 0.0
+        return None
+    robust = kept[:, None, None] * weighted
+    information = odometry.cumulative(robust @ J)
+    right = odometry.cumulative(robust @ left)
+    found = None
+    least = MIN_WHEELS_GAIN * OVERLAP
     longest = max(MIN_COUNT, int(MAX_WHEELS_STRETCH * len(e)))
     for length in np.unique(np.geomspace(MIN_COUNT, longest, STRETCH_LENGTHS).astype(int)):
         _, gain = _least_squares(information[length:] - information[:-length],
                                  right[length:] - right[:-length], WHEELS_SIGMA)
-        if gain.max() > best:
-            best = gain.max()
-            first = gain.argmax()
-            last = first + length - 1
-    if best > MIN_WHEELS_GAIN * OVERLAP:
-        rows[poses[first, 0] + 1:poses[last, 1] + 1] = True
-        log.info("wheels: slip from pose %d to %d", poses[first, 0] + 1, poses[last, 1] + 1)
-    return rows
+        first = gain.argmax()
+        if gain[first] > least:
+            least = gain[first]
+            found = first, first + length - 1
+    return found
