@@ -103,41 +103,27 @@ def _mean(z, C):
     return z[0] + mean, covariance, np.all(squared < GATE)
 
 
-def consensus(marker: np.ndarray, in_world: np.ndarray, covariance: np.ndarray,
-              maximum: int = 200) -> np.ndarray:
-    """Rows (k,) of one sighting of each marker, well supported and certain, in ascending id.
+def consensus(marker: np.ndarray, in_world: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Rows (k,) of one sighting of each marker, in ascending id.
 
-    The support of a sighting is the number of sightings of its marker within GATE of it. Among
-    those with at least half the maximum support, the one with the smallest determinant of its
-    covariance is taken. `marker` (s,) are ids, `in_world` (s, 3), m and rad, and `covariance`
-    (s, 3, 3) the poses of these markers in world axes by each sighting. Of a marker with more than
-    `maximum` sightings, so many evenly chosen ones are compared: the cost is quadratic.
+    It is the most certain one, by the determinant of its covariance, of those that agree with the
+    median, or the one nearest to it. The median counts as certain as the sighting of median
+    determinant. `marker` (s,) are ids, `in_world` (s, 3), m and rad, and `covariance` (s, 3, 3) the
+    poses of these markers in world axes by each sighting.
     """
     order = np.argsort(marker, kind="stable")
     begins = np.flatnonzero(np.diff(marker[order])) + 1
-    best = []
-    for same in np.split(order, begins):
-        if len(same):                                   # one empty group without sightings
-            chosen = _evenly(same, maximum)
-            k = _supported_and_certain(in_world[chosen], covariance[chosen])
-            best.append(chosen[k])
-    return np.array(best, int)
+    return np.array([same[_central(in_world[same], covariance[same])]
+                     for same in np.split(order, begins) if len(same)], int)
 
 
-def _evenly(rows, maximum):
-    """Of rows (n,), `maximum` evenly chosen ones if there are more."""
-    few = min(len(rows), maximum)
-    return rows[-(-np.arange(few) * len(rows) // few)]                # rounded up
-
-
-def _supported_and_certain(in_world, covariance):
-    """Number of the most certain pose of one marker, of those with half the maximum support."""
-    first, second = np.triu_indices(len(in_world), 1)
-    squared = se2.squared_distances(
-        in_world[first], in_world[second], covariance[first] + covariance[second])
-    close = squared < GATE
-    confirmed = np.append(first[close], second[close])
-    support = 1 + np.bincount(confirmed, minlength=len(in_world))        # with itself
-    log_determinant = np.linalg.slogdet(covariance)[1]
-    supported = support >= support.max() / 2
-    return np.where(supported, log_determinant, np.inf).argmin()
+def _central(in_world, covariance):
+    """Number of the most certain pose (n, 3) of one marker that agrees with the median."""
+    x, y, _ = np.median(in_world, axis=0)
+    heading = in_world[:, 2]
+    theta = np.arctan2(np.median(np.sin(heading)), np.median(np.cos(heading)))
+    log_determinant = np.linalg.slogdet(covariance).logabsdet
+    typical = covariance[np.argsort(log_determinant)[len(heading) // 2]]
+    squared = se2.squared_distances(in_world, np.array([x, y, theta]), covariance + typical)
+    agrees = squared <= max(GATE, squared.min())
+    return np.where(agrees, log_determinant, np.inf).argmin()

@@ -36,7 +36,7 @@ log = logging.getLogger(__name__)
 RANGE_GATE = 3.3             # sigmas; a range that is shorter than expected by more is rejected
 MAX_DIRECT = 3.3             # sigmas, of a range's residual; longer ones are echoes
 
-CAUCHY_SCALES = (100.0, 30.0, 10.0, 3.0)     # sigmas, scale of the kernel in each round
+CAUCHY_SCALES = (10.0, 3.0)   # sigmas, scale of the kernel in each round
 ROUGH = 1e-4                 # relative decrease of the error at which a round ends
 MIN_RESIDUALS = 20           # number of measurements from which their scatter gives a factor
 

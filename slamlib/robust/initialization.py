@@ -26,7 +26,6 @@ from slamlib.robust.optimize import cauchy_minimum
 MAX_ODOMETRY_SIGMA = 0.5     # rad, of odometry's heading at the end of a drive's first part
 MAX_FIRST_PART = 1.5         # length of the first part over that which odometry can predict
 GROWTH = 4                   # largest ratio of the numbers of poses of a part and the one before
-MAX_VOTES = 60               # number of sightings of a marker that enter its consensus
 
 MAX_RANGES = 150             # maximum number of ranges used per antenna, evenly chosen
 SAME_PLACE = 0.03            # of the median range: positions closer than this are one
@@ -110,7 +109,7 @@ def consensus_markers(measurements: Measurements, in_world: np.ndarray,
 
     `in_world` (s, 3) and `covariances` (s, 3, 3) are the marker poses by each sighting.
     """
-    return in_world[consensus(measurements.marker_row, in_world, covariances, MAX_VOTES)]
+    return in_world[consensus(measurements.marker_row, in_world, covariances)]
 
 
 def trilaterated_antennas(measurements: Measurements, poses: np.ndarray, covariances: np.ndarray,

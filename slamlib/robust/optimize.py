@@ -10,7 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from slamlib.core.graph_solution import CONVERGED, descended, undetermined
+from slamlib.core.graph_solution import (
+    CONVERGED,
+    MAX_HALVINGS,
+    ROUNDING,
+    descended,
+    undetermined,
+)
 from slamlib.robust.linear import NormalEquations, Problem, State, retract
 
 MAX_STEPS = 40               # number of steps of Gauss-Newton
@@ -35,6 +41,7 @@ def optimize(problem: Problem, state: State, max_steps: int = MAX_STEPS,
     """
     equations = NormalEquations(problem, state)
     steps = 0
+    halvings = 0
     ended = False
     while steps < max_steps and not ended:
         steps += 1
@@ -42,20 +49,23 @@ def optimize(problem: Problem, state: State, max_steps: int = MAX_STEPS,
         step = equations.step()
         if step is None:
             raise undetermined()
-        equations = after_step(equations, step)
-        ended = error - equations.error <= tolerance * (1 + error)
+        equations, halvings = after_step(equations, step, max(halvings - 1, 0))
+        ended = error - equations.error <= tolerance * (1 + error) and halvings == 0
     return Optimum(equations=equations, state=equations.state, steps=steps, converged=ended)
 
 
-def after_step(equations: NormalEquations, step: np.ndarray) -> NormalEquations:
-    """The NormalEquations after a step, halved until the error does not grow."""
+def after_step(equations: NormalEquations, step: np.ndarray,
+               halvings: int) -> tuple[NormalEquations, int]:
+    """The NormalEquations after a step, and how often it was halved until the error did not grow.
+
+    `halvings` come first: a step is often as long as the one before.
+    """
     problem = equations.problem
-
-    def moved(fraction):
-        there = NormalEquations(problem, retract(problem, equations.state, fraction * step))
-        return there, there.error
-
-    return descended(moved, equations, equations.error)[0]
+    for number in range(halvings, halvings + MAX_HALVINGS):
+        there = NormalEquations(problem, retract(problem, equations.state, 0.5**number * step))
+        if there.error <= (1 + ROUNDING) * equations.error:
+            return there, number
+    return equations, 0
 
 
 class Minimum(NamedTuple):
