@@ -345,16 +345,18 @@ def test_the_evidence_chooses_the_steps_that_the_vehicle_drives(true, other):
         assert_array_equal(ours.weight, theirs.weight)
 
 
-def test_a_marker_that_its_sightings_contradict_starts_where_these_agree():
-    """Seven of its sightings may hold it metres away; the others tell where it is."""
-    m = measure(short(7, 800)[0].without("uwb"))
-    fit = fit_from_odometry(m)
-    lost = fit.state.markers.copy()
-    lost[0] += [3.0, -2.0, 1.0]
-    found = initialization.with_consensus(fit.problem, replace(fit.state, markers=lost))
-    assert_allclose(found.markers[0], fit.state.markers[0], atol=0.05)
-    assert_array_equal(found.markers[1:], lost[1:])
-    assert initialization.with_consensus(fit.problem, fit.state) is fit.state
+def test_a_few_sightings_in_millimetres_are_rejected_and_cost_their_marker_nothing():
+    dataset, _ = short(7, 800)
+    a = dataset.aruco
+    z = a.marker_in_vehicle.copy()
+    wrong = np.flatnonzero(a.marker == a.marker[0])[:7]
+    z[wrong, :2] *= 1e-3
+    clean = fit_from_odometry(measure(dataset.without("uwb")))
+    found = fit_from_odometry(measure(aruco(dataset.without("uwb"), marker_in_vehicle=z)))
+    assert_allclose(found.state.markers, clean.state.markers, atol=0.01)
+    counts = clean.problem.accepted.sightings.weight.copy()
+    counts[wrong] = 0
+    assert_array_equal(found.problem.accepted.sightings.weight, counts)
 
 
 def test_headings_are_continuous_where_frames_are_rounds_apart():

@@ -6,7 +6,7 @@ part, and so on. Stage 7 uses trilateration again for the antennas in doubt.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from operator import attrgetter
 from typing import NamedTuple
 
@@ -15,11 +15,11 @@ import numpy as np
 from slamlib.core import odometry, se2
 from slamlib.core.graph import GUESS_PRIOR_SIGMA
 from slamlib.core.records import Dataset
-from slamlib.core.sightings import GATE, consensus
+from slamlib.core.sightings import consensus
 from slamlib.robust.calibration import ANTENNAS, HEIGHT, OFFSET, SCALE, SIGHTING_LAG, SIZE, WHEELS
 from slamlib.robust.factors import MIN_DISTANCE, sensor_poses
-from slamlib.robust.fit import narrow_kernels, noise_of_scatter, residuals
-from slamlib.robust.linear import Problem, State, build_problem, state_from_arrays
+from slamlib.robust.fit import narrow_kernels
+from slamlib.robust.linear import State, build_problem, state_from_arrays
 from slamlib.robust.measurements import Measurements, measure
 from slamlib.robust.optimize import cauchy_minimum
 
@@ -138,25 +138,6 @@ def state_from_poses(measurements: Measurements, poses: np.ndarray, covariances:
     return state_from_arrays(
         measurements, poses, markers(measurements, in_world, of_markers),
         antennas(measurements, poses, covariances, c), c)
-
-
-def with_consensus(problem: Problem, state: State) -> State:
-    """The State in which a marker that most of its sightings contradict is where these agree.
-
-    They agree from the poses of the State, which other markers have told, where from odometry's
-    they may not have. Kernels alone leave a marker where it is, far from its sightings.
-    """
-    m = problem.measurements
-    learned = replace(problem, noise=noise_of_scatter(problem, state))
-    residual, _ = residuals(learned, state)
-    contradicts = np.where(np.sum(residual**2, axis=1) > GATE, 1, -1)
-    is_lost = np.bincount(m.marker_row, contradicts, len(m.marker)) > 0
-    if not is_lost.any():
-        return state
-    certain = np.zeros((len(m.frame), 3, 3))
-    agreed = state_from_poses(
-        m, state.poses, certain, state.c, antennas=lambda *_: state.antennas).markers
-    return replace(state, markers=np.where(is_lost[:, None], agreed, state.markers))
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from slamlib.core.records import Dataset
 from slamlib.core.vehicle import changed
 from slamlib.robust.choices import better_model, calibrated, memory_or_slip, most_consistent
 from slamlib.robust.fit import CAUCHY_SCALES, Fit, narrow_kernels, refine, settled
-from slamlib.robust.initialization import initial_state, state_from_poses, with_consensus
+from slamlib.robust.initialization import initial_state, state_from_poses
 from slamlib.robust.jumps import NO_JUMPS
 from slamlib.robust.linear import build_problem
 from slamlib.robust.measurements import Measurements, Noise, measure
@@ -134,7 +134,6 @@ def fit_from_odometry(measurements: Measurements, model: str = "arc",
         model = like.problem.odometry.model
     problem = build_problem(measurements, model)                                      # 2
     state = narrow_kernels(problem, initial_state(measurements, model))               # 4, 5
-    state = with_consensus(problem, state)
     if like is None:
         return memory_or_slip(problem, state)                                         # 6
     decided = like.problem
