@@ -31,7 +31,11 @@ from slamlib.io.dataset import (
 )
 from slamlib.robust.file_doubts import Doubt, doubts_before_solving, merged
 from slamlib.robust.result import SlamResult
-from slamlib.robust.solution_doubts import fusion_doubts, solution_doubts
+from slamlib.robust.solution_doubts import (
+    contradiction_doubts,
+    fusion_doubts,
+    solution_doubts,
+)
 
 UNSOLVABLE = (DatasetError, np.linalg.LinAlgError)  # what `find` raises where there is no solution
 
@@ -190,6 +194,7 @@ def solutions(dataset: Dataset, problems: Collection[str] = PROBLEMS) -> list[So
     A problem that cannot be solved has a Failure. Facts include the seconds that it took.
     """
     previous = None
+    fused = None
     every = []
     for problem in PROBLEMS:
         if problem not in problems or not allows(dataset, problem):
@@ -204,8 +209,20 @@ def solutions(dataset: Dataset, problems: Collection[str] = PROBLEMS) -> list[So
         solution = solved(problem, dataset, found)
         if isinstance(solution, Solution):
             solution.facts["seconds"] = time.perf_counter() - start
+            if problem == "problem2_fused":
+                fused = solution.poses, solution.covariances
+            if problem == "problem3":
+                solution = _compared(solution, fused)
         every.append(solution)
     return every
+
+
+def _compared(solution, fused):
+    """Problem 3's Solution with a doubt if it contradicts poses and covariances of the fusion."""
+    if fused is None:
+        return solution
+    contradiction = contradiction_doubts(*fused, solution.poses)
+    return replace(solution, doubts=solution.doubts + contradiction)
 
 
 def write_results(out: Path | str, problem: str, found, dataset: Dataset,
@@ -244,6 +261,9 @@ def write_results(out: Path | str, problem: str, found, dataset: Dataset,
         with suppress(DatasetError):
             others = results.read_summary(out)["problems"]
         others.pop(problem, None)
+        if problem == "problem3" and "problem2_fused" in others and isinstance(solution, Solution):
+            _, *fused = results.read_structs(out / "problem2_fused", "vehiclePose")
+            solution = _compared(solution, fused)
         _write(out, dataset, truth, [solution], others, doubts)
     return solution
 

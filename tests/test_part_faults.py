@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numeric import aruco, short, without_headings
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
 from slamlib import estimate, fuse
 from slamlib.core import se2
-from slamlib.core.evaluation import ate
+from slamlib.core.evaluation import anees, ate
 from slamlib.core.vehicle import Vehicle
-from slamlib.robust.part_faults import camera_bump, slipping_rows
-from slamlib.robust.solution_doubts import solution_doubts
+from slamlib.robust.part_faults import camera_bump, frozen_rows, slipping_rows
+from slamlib.robust.solution_doubts import fusion_doubts, solution_doubts
 
 BUMP = np.array([0.05, -0.03, 0.06])
 MOUNTED = Vehicle(camera_x=0.1, camera_y=0.05, camera_turn=0.4, marker_size=1.1)
@@ -99,3 +99,21 @@ def test_wheels_that_slip_everywhere_alike_are_used(seed, slip, mislabelled):
     dataset, _ = short(seed, slip=slip, mislabelled=mislabelled)
     assert not slipping_rows(dataset).any()
     assert not slipping_rows(dataset.first(60)).any()
+
+
+@pytest.mark.parametrize("first, count", [(700, 100), (1500, 60)])
+def test_counts_that_freeze_are_told_and_cost_problems_2_and_3_little(first, count):
+    """The last row of the counts comes again and again; believed, it costs up to 0.3 m."""
+    dataset, truth = short(2)
+    ticks = dataset.ticks.copy()
+    ticks[first:first + count] = ticks[first]
+    frozen = replace(dataset, ticks=ticks)
+    assert_array_equal(np.flatnonzero(frozen_rows(ticks)), np.arange(first, first + count))
+    assert not frozen_rows(dataset.ticks).any()
+    found = estimate(frozen.without("uwb"))
+    assert ate(found.poses, truth.poses, aligned=True) < 3e-3
+    assert anees(found.poses, found.covariances, truth.poses) < 6
+    assert [doubt.what for doubt in solution_doubts(found)] == ["encoder"]
+    fusion = fuse(frozen)
+    assert ate(fusion.poses, truth.poses, aligned=True) < 2e-2
+    assert [doubt.what for doubt in fusion_doubts(fusion, frozen.vehicle)] == ["encoder"]

@@ -117,6 +117,23 @@ def test_problems_that_are_written_one_by_one_have_one_summary(tmp_path, drive):
         assert (tmp_path / name).read_bytes() == (together / name).read_bytes()
 
 
+def test_a_fusion_that_contradicts_problem_3_is_doubted_however_problems_are_written(tmp_path):
+    """Both wheels are stated 10 % too small, which problem 3 finds, and the fusion does not."""
+    dataset, _ = short(1, 800)
+    ticks = dataset.vehicle.ticks_per_revolution
+    for factor, expected in ((1.0, 0), (1.1, 1)):
+        stated = replace(dataset.vehicle, ticks_per_revolution=factor * ticks)
+        drive = replace(dataset, vehicle=stated)
+        problems = "problem2_fused", "problem3"
+        solve.solve_to_folder(drive, None, tmp_path / "at once", problems)
+        for problem in problems:
+            found = solve.find(problem, drive)
+            solve.write_results(tmp_path / "one by one", problem, found, drive)
+        for folder in ("at once", "one by one"):
+            doubts = results.read_summary(tmp_path / folder)["doubts"]
+            assert sum(doubt["what"] == "fusion" for doubt in doubts) == expected
+
+
 def test_what_a_killed_run_left_is_removed_by_the_next_problem_that_is_written(tmp_path, drive):
     solve.solve_to_folder(drive[0], None, tmp_path)
     (tmp_path / "summary.json").unlink()

@@ -34,6 +34,7 @@ class Fusion:
     wheel_covariance: np.ndarray | None = None  # (3, 3) m^2
     memory: float | None = None  # correlation of the errors of a marker in successive frames
     camera: np.ndarray | None = None            # (3,) m and rad, x, y, turn at the last frame
+    jumps: object | None = None  # robust.jumps.Jumps, without whose counts it does
 
 
 def fuse_increments(dataset: Dataset, propagation: Callable = odometry.equation2) -> Fusion:

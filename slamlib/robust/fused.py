@@ -153,7 +153,8 @@ def fuse(dataset: Dataset, slip: float | None = None) -> Fusion:
         wheel=dataset.vehicle.wheel + x[-1, 1],
         wheel_covariance=P[-1, WHEELS, WHEELS],
         memory=float(models.memory[best]),
-        camera=x[-1, 2])
+        camera=x[-1, 2],
+        jumps=jumps)
 
 
 def _believed_jumps(dataset, slip):

@@ -24,7 +24,7 @@ from slamlib.core import odometry, se2
 from slamlib.core.marker_increments import distance_and_turn, robust_increments
 from slamlib.core.records import Dataset
 from slamlib.core.sightings import GATE, MEDIAN_CHI2, sightings_by_frame
-from slamlib.robust.part_faults import CameraBump, slipping_rows
+from slamlib.robust.part_faults import CameraBump, frozen_rows, slipping_rows
 
 log = logging.getLogger(__name__)
 
@@ -193,7 +193,7 @@ def find_jumps(dataset: Dataset, bump: CameraBump | None = None) -> Jumps:
         poses = path[np.clip(taken, 0, len(path) - 1)]
         drives[lag] = _Drive.without_jumps(poses, vehicle.wheelbase)
     lag = _chosen_lag(s, drives)
-    slipping = slipping_rows(dataset)
+    slipping = slipping_rows(dataset) | frozen_rows(dataset.ticks)
     candidates = [_found(dataset.ticks, s, drives[each], slipping) for each in sorted({0, lag})]
     found = min(candidates, key=len)
     jumps = replace(NO_JUMPS, lag=lag, bump=np.inf if bump is None else bump.pose)

@@ -7,6 +7,7 @@ import numpy as np
 
 from slamlib.core import se2
 from slamlib.core.hint import Fusion
+from slamlib.core.sightings import GATE
 from slamlib.core.vehicle import Vehicle
 from slamlib.robust.file_doubts import Doubt
 from slamlib.robust.jumps import UNKNOWN_SIGMA
@@ -16,6 +17,7 @@ from slamlib.robust.result import SlamResult
 MAX_TURN_SIGMA = np.pi / 3   # rad, between two frames; half a turn is three sigmas
 MAX_GAP = 30                 # poses, between contradictions that are told as one
 MAX_SLIP = 0.02              # sqrt(m), of wheels on the ground
+MIN_CONTRADICTING = 0.05     # share of the poses where problem 2's fusion contradicts problem 3
 MAX_LATE_SHARE = 0.1         # share of the ranges that keep less than half of their weight
 MAX_NOISE_FACTOR = 1.5       # on a sigma, or its inverse; beyond it the factor is reported
 MIN_FACTOR_SIGMAS = 4.0      # sigmas of the logarithm of a factor that is reported
@@ -104,8 +106,11 @@ def _estimated_and_stated(row):
     return f"{estimated.rstrip()} (stated: {stated})"
 
 
-def _encoder_doubts(result):
-    """A Doubt if the markers contradict the counts, by stretches of the drive."""
+def _encoder_doubts(result, solution="Problem 2's fusion and problems 3 and 4 do"):
+    """A Doubt if the markers contradict the counts, by stretches of the drive.
+
+    `solution` begins the sentence on what is done without these counts.
+    """
     jumps = result.jumps
     if not len(jumps.start):
         return
@@ -117,8 +122,9 @@ def _encoder_doubts(result):
     if more > 0:
         told += f"; and {more} more times"
     yield Doubt("encoder", (
-        f"In encoderReading.txt, {told}. Problem 2's fusion and problems 3 and 4 do without these "
-        "counts."), "Look at the rows, and whether the vehicle was pushed or carried.")
+        f"In encoderReading.txt, {told}. {solution} without these counts."), (
+        "Look at the rows, whether the vehicle was pushed or carried, and at the marker ids before "
+        "and after."))
 
 
 def _stretch(jumps, rows):
@@ -246,10 +252,31 @@ def _rejection_doubts(result):
 
 
 def fusion_doubts(fusion: Fusion, vehicle: Vehicle) -> tuple[Doubt, ...]:
-    """Tuple of a Doubt if a Fusion learned a slip that no wheel has; a stated one is believed."""
-    if vehicle.slip is not None:
+    """Tuple of Doubt: jumps of a Fusion, a learned slip that no wheel has; a stated one counts."""
+    doubts = list(_encoder_doubts(fusion, "Problem 2's fusion does"))
+    if vehicle.slip is None:
+        doubts += _slip_doubt(fusion.slip)
+    return tuple(doubts)
+
+
+def contradiction_doubts(poses: np.ndarray, covariances: np.ndarray,
+                         by_slam: np.ndarray) -> tuple[Doubt, ...]:
+    """Tuple of a Doubt if problem 2's fusion is too far from problem 3's poses `by_slam` (n, 3).
+
+    That is where many of its poses (n, 3) are beyond GATE of its own covariances (n, 3, 3).
+    """
+    is_uncertain = np.linalg.det(covariances) > 0
+    squared = se2.squared_distances(
+        poses[is_uncertain], by_slam[is_uncertain], covariances[is_uncertain])
+    share = np.mean(squared > GATE) if len(squared) else 0.0
+    if share < MIN_CONTRADICTING:
         return ()
-    return tuple(_slip_doubt(fusion.slip))
+    off = se2.between(by_slam, poses)[:, :2]
+    farthest = np.linalg.norm(off, axis=1).max()
+    return (Doubt("fusion", (
+        f"Problem 2's fusion is up to {farthest:.2g} m from problem 3, and at {share:.0%} of the "
+        "poses outside the 99.9 % region of its own covariances: these are too small, or problem 3 "
+        "is wrong."), "Prefer problem 3 where nothing else is in doubt."),)
 
 
 def _slip_doubt(slip):
