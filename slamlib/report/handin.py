@@ -15,13 +15,13 @@ from slamlib.report.notebooks import Options
 from slamlib.solve import PROBLEMS, SENSORS
 
 README = Path(__file__).with_name("readme.txt")  # a template of Jinja
-CHAPTERS = ("[0-9]*",)  # notebooks whose names begin with a number, so no appendix
+CHAPTERS = ("[0-9]*", "A*")  # the problems, and the appendix on which they rely
 # The folders that are handed in, with problem 2 from markers alone, and fused as its improvement.
 HANDED = ("problem1", "problem2", "problem2_fused", "problem3", "problem4")
 
 
 def hand_in_options(options: Options) -> Options:
-    """Return Options of a hand-in: without appendices, unless report.toml names its chapters."""
+    """Return Options of a hand-in: CHAPTERS, unless report.toml names its own."""
     return replace(options, chapters=options.chapters or CHAPTERS)
 
 
