@@ -42,7 +42,7 @@ def handed(tmp_path_factory):
     write_dataset(folder / "data" / "mine", drive_of())
     write_dataset(folder / "data" / "stand_in", simulated.first(30),
                   replace(truth, poses=truth.poses[:30]))
-    write(folder / "notebooks", "A_more", "# A. More\n\nOnly if asked for.")
+    write(folder / "notebooks", "B_more", "# B. More\n\nOnly if asked for.")
     write(folder / "notebooks", "1_all", "# 1. All", (SOLVE,), "## 1.1 Middle\n\nRead this.")
     (folder / "report.toml").write_text('author = "Ada"\n')
     (folder / "report").mkdir()
