@@ -342,7 +342,7 @@ def _updated(state, sightings, row, memory, variance):
 
     `variance` (h, 1, 1) is over that of the sightings.
     """
-    seen = np.flatnonzero(sightings.row == row)
+    seen = np.arange(*np.searchsorted(sightings.row, [row, row + 1]))
     place, number = np.nonzero(sightings.marker[seen, None] == state.marker)
     known = seen[place]
     new = np.delete(seen, place)
