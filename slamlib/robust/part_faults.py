@@ -196,11 +196,7 @@ def other_axes(off: np.ndarray, poses: np.ndarray) -> OtherAxes | None:
     """
     agree = off < 1
     limited = _limited(off)
-    gained = limited[0, 0] - limited
-    total = np.insert(np.cumsum(gained, axis=2), 0, 0, axis=2)
-    rise = total - np.minimum.accumulate(total, axis=2)
-    k, is_reversed, end = np.unravel_index(rise.argmax(), rise.shape)
-    begin = total[k, is_reversed, :end + 1].argmin()
+    k, is_reversed, begin, end = _stretch_of_most_gain(limited[0, 0] - limited)
     if end == 0 or np.ptp(poses[begin:end]) <= MIN_SPANS * np.median(np.diff(poses)):
         return None
     stated = agree[0, 0, begin:end]
@@ -211,6 +207,19 @@ def other_axes(off: np.ndarray, poses: np.ndarray) -> OtherAxes | None:
         return None
     return OtherAxes(int(k), bool(is_reversed), poses[begin, 0], poses[end - 1, 1], stated,
                      agreeing)
+
+
+def _stretch_of_most_gain(gain):
+    """Indices of axes and of reversal, begin and end of the stretch with the greatest sum of gains.
+
+    The gain (8, k, n) is that of each increment. Of the stretches that end at an increment, the
+    best one begins where the sum from the first increment on is least.
+    """
+    total = np.insert(np.cumsum(gain, axis=2), 0, 0, axis=2)
+    of_best = total - np.minimum.accumulate(total, axis=2)
+    k, is_reversed, end = np.unravel_index(of_best.argmax(), of_best.shape)
+    begin = total[k, is_reversed, :end + 1].argmin()
+    return k, is_reversed, begin, end
 
 
 class CameraBump(NamedTuple):
