@@ -28,10 +28,11 @@ COMPUTING = ("core", "robust", "studies")     # packages on which rows depend
 def run(trial: Callable, seeds: Iterable[int], **options) -> pd.DataFrame:
     """DataFrame of what trial(seed, **options) returns, a dict, with one row for each seed.
 
-    The seeds are shared among all processors.
+    More than two seeds are shared among all processors.
     """
     seeds = list(seeds)
-    found = joblib.Parallel(-1)(joblib.delayed(trial)(seed, **options) for seed in seeds)
+    processes = -1 if len(seeds) > 2 else 1
+    found = joblib.Parallel(processes)(joblib.delayed(trial)(seed, **options) for seed in seeds)
     return pd.DataFrame(found, index=pd.Index(seeds, name="seed"))
 
 
