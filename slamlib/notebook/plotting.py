@@ -171,12 +171,13 @@ def own_axes(ax: Axes, covariance: np.ndarray, points: np.ndarray, **look) -> Ax
     """
     variances, directions = np.linalg.eigh(covariance[:2, :2])
     variances = variances[::-1]                                          # along, across
-    along, across = [_unit(REACH_95 * np.sqrt(max(variance, 0))) for variance in variances]
+    places = points[:, :2] @ directions[:, ::-1]
+    reach = np.vstack([np.abs(places), REACH_95 * np.sqrt(np.maximum(variances, 0))])
+    along, across = map(_unit, reach.max(axis=0))
     scale = np.array([PER_METRE[along], PER_METRE[across]])
     in_own_axes = np.diag(scale**2 * variances)
     ellipses(ax, np.zeros((1, 2)), in_own_axes[None], ROLES["odometry"]["color"])
-    x, y = scale[:, None] * (directions.T[::-1] @ points[:, :2].T)
-    ax.plot(x, y, **ROLES["true place"] | look)
+    ax.plot(*(scale * places).T, **ROLES["true place"] | look)
     ax.set(xlabel=f"along the ellipse ({along})", ylabel=f"across ({across})")
     return ax
 
