@@ -210,6 +210,14 @@ def test_code_is_folded_on_the_page_and_left_out_of_the_pdf(tmp_path):
     assert "told" in found and "told" in text
 
 
+def test_exercises_are_on_the_page_and_not_in_the_pdf(tmp_path):
+    exercises = new_markdown_cell("Answer this.", metadata={"tags": ["screen-only"]})
+    found, content = page("Read this.", exercises)
+    assert "Answer this." in found and "Read this." in found
+    text = text_of(content, tmp_path)
+    assert "Read this." in text and "Answer this." not in text
+
+
 @pytest.mark.parametrize("name", [
     '<svg onload="run()">', "<script>run()</script>", "[link](javascript:run())",
     "`<b>` | __b__ ![](x) &lt;b&gt; $x", "1. *a* #b @c ~d~ ^e^ \\f 'g' \"h\" -- ..."])

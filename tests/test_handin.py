@@ -79,7 +79,7 @@ def test_the_readme_is_true_of_the_files(handed):
     one_line = re.sub(r"\s+", " ", text)
     for part in ("Ada", "mine/problem2_fused: odometry + ArUco 40 of 40 poses have an estimate",
                  "mine/problem4: SLAM with UWB ranges 40 of 40", "fused with the odometry",
-                 "In mine/problem2 it is that at pose 11", "are NaN"):
+                 "In mine/problem2 this is pose 11", "are NaN"):
         assert part in one_line
     assert max(map(len, text.split("\n"))) <= 100 and text.endswith("\n")
 

@@ -79,6 +79,13 @@ def test_sensors_that_a_drive_lacks_are_named_and_their_problems_have_no_rows(pr
     assert "A dash stands" not in result_rows(overview.opening(known))[1]
 
 
+def test_conclusions_are_about_the_problems_that_a_drive_allows(project):
+    for drive, chapters in zip(project.drives, ("1234", "1234", "1")):
+        text = result_rows(overview.opening([drive]))[1]
+        conclusions = text.split("## Conclusions")[1].split("![")[0]
+        assert re.findall(r"\(chapter (\d)\)", conclusions) == list(chapters)
+
+
 def test_nothing_is_said_of_doubts_failures_and_notes_where_there_are_none(project):
     assert not re.search("Doubts|not be solved|Notes on", result_rows(project.summary)[1])
 
@@ -128,7 +135,9 @@ def test_the_pictures_are_the_same_every_time_and_need_no_display(project):
 
 def test_without_truth_there_are_no_errors(project):
     rows, text = result_rows(overview.opening(project.drives[1:]))
-    assert not re.search("[Ss]imulated|ATE|known|(?<!_)truth", text.split("Figure 1.")[0])
+    results, conclusions = text.split("![")[0].split("## Conclusions")
+    assert not re.search("[Ss]imulated|ATE|known|(?<!_)truth", results)
+    assert not re.search("ATE|known|(?<!_)truth", conclusions)
     assert all(len(row) == 3 for row in rows.values())
 
 

@@ -105,6 +105,24 @@ def test_errors_are_in_mm_and_without_truth_the_bands_stand_alone(truth, rows):
         assert ax.collections[0].get_paths()[0].vertices[:, 1].max() == pytest.approx(reach)
 
 
+def test_bands_beyond_a_metre_and_long_axes_of_ellipses_are_in_metres():
+    result, drive = drive_with()
+    result.covariances = 1e4 * result.covariances
+    (_, axes), = plotting.each_drive([drive], rows=2)
+    plotting.errors(axes, result, drive, label="SLAM:")
+    assert axes[0].get_ylabel() == "position (m)"
+    assert axes[0].lines[0].get_ydata() == pytest.approx(0.01)
+    assert axes[0].lines[0].get_label() == "SLAM: error"
+    vertices = axes[0].collections[0].get_paths()[0].vertices
+    assert vertices[:, 1].max() == pytest.approx(2 * REACH_95)
+
+    ax = plotting.own_axes(plt.figure().subplots(), np.diag([0.01, 1])**2, np.array([[0.02, 3]]))
+    assert ax.get_xlabel().endswith("(m)") and ax.get_ylabel().endswith("(mm)")
+    assert np.abs(ax.lines[0].get_xydata()) == pytest.approx(np.array([[3, 20]]))
+    assert ax.collections[0].get_paths()[0].vertices.max(axis=0) == pytest.approx(
+        [REACH_95, 10 * REACH_95])
+
+
 def test_errors_of_some_poses_are_in_the_frame_of_the_first_of_them():
     result, drive = drive_with()
     true = drive.truth.poses

@@ -54,6 +54,7 @@ ROLES = {
 STYLE = Path(__file__).with_name("slamlib.mplstyle")  # for matplotlib.style
 MAX_SEMI_AXIS = 0.08         # of enlarged 95 % ellipses, in the larger extent of the path
 MAX_BANDS = 800              # poses at which errors are drawn
+PER_METRE = {"m": 1.0, "mm": 1e3}
 MIN_POINT_VARIANCE = 1.0     # rad^2, variance of the heading of a marker without orientation
 
 
@@ -125,45 +126,59 @@ def with_ellipses(ax: Axes, poses: np.ndarray, covariances: np.ndarray, role: st
     return ax
 
 
-def errors(axes: Sequence[Axes], result, drive, role: str = "slam") -> Sequence[Axes]:
+def errors(axes: Sequence[Axes], result, drive, role: str = "slam", label: str = "",
+           unit: str | None = None) -> Sequence[Axes]:
     """Draw errors of a result along the path: of position, and in a second one of axes of heading.
 
     The bands are the longest semi-axis of the 95 % ellipse and ±2 sigma of the heading; without
-    truth they stand alone. `result` as of `estimates`.
+    truth they stand alone. `result` as of `estimates`. `label` goes before the texts in the legend.
+    `unit` of the position is "mm" or "m"; None takes the latter if the band reaches further than
+    1 m.
     """
     found = estimates(result, drive)
     some = slice(None, None, 1 + len(found.frame) // MAX_BANDS)
     frame = found.frame[some]
     C = found.covariances[some]
-    semi_axis = 1e3 * longest_semi_axes(C)                               # mm
+    semi_axis = longest_semi_axes(C)                                     # m
+    unit = unit or _unit(semi_axis.max())
+    scale = PER_METRE[unit]
     two_sigma = 2e3 * np.sqrt(C[:, 2, 2])                                # mrad
-    for ax, name, low, high in zip(axes, ("position (mm)", "δ (mrad)"),
-                                   (0, -two_sigma), (semi_axis, two_sigma)):
+    for ax, name, low, high in zip(axes, (f"position ({unit})", "δ (mrad)"),
+                                   (0, -two_sigma), (scale * semi_axis, two_sigma)):
         ax.fill_between(frame + 1, low, high, color=ROLES[role]["color"], alpha=0.18, linewidth=0,
-                        label="95 % by the covariance")
+                        label=f"{label} 95 % by the covariance".strip())
         ax.set(ylabel=name)
     if found.true is not None:
-        error = 1e3 * se2.difference(found.poses, found.true)[some]
-        distance = np.hypot(error[:, 0], error[:, 1])
-        for ax, values in zip(axes, (distance, error[:, 2])):
-            curve(ax, values, role, frame, "error", linewidth=1.0)
+        error = se2.difference(found.poses, found.true)[some]
+        distance = scale * np.hypot(error[:, 0], error[:, 1])
+        for ax, values in zip(axes, (distance, 1e3 * error[:, 2])):
+            curve(ax, values, role, frame, f"{label} error".strip(), linewidth=1.0)
     axes[0].set_ylim(0, None)
     axes[-1].set(xlabel="pose id")
     return axes
 
 
-def own_axes(ax: Axes, covariance: np.ndarray, points: np.ndarray, **look) -> Axes:
-    """Draw the 95 % ellipse of a covariance (>= 2, >= 2) by odometry along its own axes, in mm.
+def _unit(length):
+    """The unit, "m" or "mm", in which a length in m has a number of at most 1000."""
+    return "m" if length > 1.0 else "mm"
 
-    Each axis has its own scale, so that a needle becomes an ellipse. Crosses are `points` (m, >= 2)
-    relative to its centre, in m, in the axes of the covariance.
+
+def own_axes(ax: Axes, covariance: np.ndarray, points: np.ndarray, **look) -> Axes:
+    """Draw the 95 % ellipse of a covariance (>= 2, >= 2) by odometry along its own axes.
+
+    Each axis has its own scale and unit, so that a needle becomes an ellipse. Crosses are `points`
+    (m, >= 2) relative to its centre, in m, in the axes of the covariance.
     """
     variances, directions = np.linalg.eigh(covariance[:2, :2])
-    along_and_across = np.diag(1e6 * variances[::-1])                    # mm^2
-    ellipses(ax, np.zeros((1, 2)), along_and_across[None], ROLES["odometry"]["color"])
-    x, y = 1e3 * directions.T[::-1] @ points[:, :2].T
-    ax.plot(x, y, **ROLES["true place"] | look)
-    ax.set(xlabel="along the ellipse (mm)", ylabel="across (mm)")
+    variances = variances[::-1]                                          # along, across
+    places = points[:, :2] @ directions[:, ::-1]
+    reach = np.vstack([np.abs(places), REACH_95 * np.sqrt(np.maximum(variances, 0))])
+    along, across = map(_unit, reach.max(axis=0))
+    scale = np.array([PER_METRE[along], PER_METRE[across]])
+    in_own_axes = np.diag(scale**2 * variances)
+    ellipses(ax, np.zeros((1, 2)), in_own_axes[None], ROLES["odometry"]["color"])
+    ax.plot(*(scale * places).T, **ROLES["true place"] | look)
+    ax.set(xlabel=f"along the ellipse ({along})", ylabel=f"across ({across})")
     return ax
 
 

@@ -119,19 +119,22 @@ def trajectories(drive: SolvedDrive) -> str:
     fig = Figure(figsize=(7.2, 3.1))  # inches
     left, right = fig.subplots(1, 2, width_ratios=(2, 3))
     last = drive.solutions[-1]
-    for solution in drive.solutions:
-        title, _, role = PROBLEMS[solution.problem]
-        if solution.problem in DRAWN or solution is last:
-            plotting.trajectory(left, solution.poses, role, title, linewidth=1.2)
-        sigmas = evaluation.position_sigmas(solution.covariances)
-        known = np.flatnonzero(sigmas > np.nanmax(sigmas) / 1000)  # on a logarithmic axis
-        plotting.curve(right, sigmas[known], role, known, title)
-    for name, role, size in (("ArucoMap", "marker", 1.5), ("UwbMap", "antenna", 5)):
+    for name, role, size in (("ArucoMap", "marker", 1), ("UwbMap", "antenna", 5)):
         if name in last.maps:
             look = plotting.ROLES[role] | {"markersize": size}
             left.plot(*last.maps[name][1].T[:2], label=f"{role}s", **look)
+    for solution in drive.solutions:
+        title, _, role = PROBLEMS[solution.problem]
+        if solution.problem in DRAWN or solution is last:
+            # Curves that coincide are all seen, since later ones are thinner.
+            look = {"linewidth": 3.5, "linestyle": "-"} if solution is last else {"zorder": 3.1}
+            plotting.trajectory(left, solution.poses, role, "_", **look)
+        sigmas = evaluation.position_sigmas(solution.covariances)
+        known = np.flatnonzero(sigmas > np.nanmax(sigmas) / 1000)  # on a logarithmic axis
+        plotting.curve(right, sigmas[known], role, known, title)
     if drive.truth is not None:
-        plotting.trajectory(left, drive.truth.poses, "truth")
+        plotting.trajectory(left, drive.truth.poses, "truth", linewidth=0.6, linestyle="-",
+                            zorder=3.2)
     right.set(xlabel="pose id", yscale="log", ylabel="σ of position (m)")
     plotting.legend_below(fig)
     return print_figure(fig, "svg", metadata={"Date": None})
