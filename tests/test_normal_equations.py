@@ -17,7 +17,7 @@ from slamlib.robust.calibration import ENTRIES, WHEEL_SCALE
 from slamlib.robust.covariances import marginal_covariances
 from slamlib.robust.initialization import odometry_state
 from slamlib.robust.linear import NormalEquations, build_problem, laplace_approximation
-from slamlib.robust.measurements import WEAK_SIGMA, Noise, accept_all, measure
+from slamlib.robust.measurements import WEAK_SIGMA, Noise, _structure, accept_all, measure
 from slamlib.robust.optimize import optimize
 
 GROUPS = frozenset(entry.group for entry in ENTRIES) | {"antenna-offsets"}
@@ -40,6 +40,14 @@ def with_a_point(poses):
     dataset, _ = short(4, poses)
     points = dataset.aruco.marker == dataset.aruco.marker[0]
     return replace(dataset, aruco=as_points(dataset.aruco, points))
+
+
+def test_blocks_of_more_variables_than_a_32_bit_number_counts_pairs_of():
+    count = 50_000
+    chain = np.stack([np.arange(count - 1), np.arange(1, count)], axis=1)
+    structure = _structure(np.ones(count, bool), chain)
+    assert structure.places.nnz == 9 * (count + 2 * len(chain))
+    assert len(np.unique(structure.diagonal)) == 3 * count
 
 
 def test_markers_without_accepted_sightings_have_a_weak_prior_and_nothing_else():

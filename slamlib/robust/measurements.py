@@ -205,7 +205,7 @@ def _minimum_degree(pairs):
     factor = np.repeat(np.arange(len(pairs)), 2)
     J = sparse.csc_array((np.ones(pairs.size), (factor, pairs.ravel())))
     information = (J.T @ J).tocsc()                      # only where it is not 0 counts
-    return splu(information, permc_spec="MMD_AT_PLUS_A").perm_c
+    return splu(information, permc_spec="MMD_AT_PLUS_A").perm_c.astype(np.int64)
 
 
 def measure(dataset: Dataset, extra_poses: Sequence[int] = (),
