@@ -143,7 +143,7 @@ def learned_row(result, drive) -> dict:
     slip = 1e3 * result.slip
     factor = result.noise.sightings
     return {"dataset": drive.name, "slip (mm)": estimate(slip, slip * slip_sigma),
-            "of the graph": 1e3 * solved_noise(result.fit).slip,
+            "in GTSAM": 1e3 * solved_noise(result.fit).slip,
             "factor": estimate(factor, factor * factor_sigma), "step": result.model}
 
 
@@ -154,7 +154,8 @@ def gate_row(result, drive) -> dict:
     sighting, and how many that are not are missed.
     """
     s = result.sightings
-    row = {"dataset": drive.name, "sightings": len(s.marker), "rejected": result.rejected.sum()}
+    count = result.rejected.sum()
+    row = {"dataset": drive.name, "rejected": f"{count:,} of {len(s.marker):,}"}
     truth = drive.truth
     if truth is not None and np.isin(s.marker, truth.marker).all():
         places = places_by_id(truth.marker, truth.marker_in_world, s.marker)
