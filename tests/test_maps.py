@@ -13,7 +13,16 @@ from test_plotting import elongated, require_contours
 from slamlib import estimate, localize
 from slamlib.core import odometry, se2
 from slamlib.core.evaluation import REACH_95, ate
-from slamlib.notebook import Drive, accuracy, antenna_rows, calibration_rows, maps, table
+from slamlib.notebook import (
+    Drive,
+    accuracy,
+    antenna_rows,
+    calibration_rows,
+    gate_row,
+    map_accuracy,
+    maps,
+    table,
+)
 from slamlib.notebook.tabular import cell
 from slamlib.solve import problem_solution
 
@@ -84,12 +93,49 @@ def test_names_cover_neither_each_other_nor_what_is_around_axes_of_equal_scales(
     fig.draw_without_rendering()
     ax, = fig.axes
     names = {text.get_text() for text in ax.texts}
-    assert names == {str(each) for each in [*result.marker, *result.antenna]}
+    assert names == {str(each) for each in result.marker} | {f"A{k}" for k in result.antenna}
     boxes = [text.get_window_extent().padded(-0.18 * text.get_fontsize()) for text in ax.texts]
     assert not any(a.overlaps(b) for a, b in combinations(boxes, 2))
     assert all(ax.bbox.x0 <= box.x0 and box.x1 <= ax.bbox.x1 for box in boxes)
     across, up = ax.transData.transform([1, 1]) - ax.transData.transform([0, 0])
     assert across == pytest.approx(up, rel=1e-3)
+
+
+def test_of_many_markers_only_those_in_doubt_have_names(solved, monkeypatch):
+    drive, result = solved
+    monkeypatch.setattr(maps, "MOST_NAMES", len(result.marker) - 1)
+    ax, = maps.whole_map(drive, result).axes
+    assert {text.get_text() for text in ax.texts} == {f"A{k}" for k in result.antenna}
+
+
+def test_the_accuracy_of_a_map_is_that_of_its_places(solved):
+    drive, result = solved
+    at = 1e-3 * np.array([3.0, 4.0])
+    places = drive.truth.marker_in_world[np.isin(drive.truth.marker, result.marker)].copy()
+    places[:, :2] += at
+    C = np.tile(1e-6 * np.diag([4.0, 16.0, 1.0]), (len(places), 1, 1))
+    moved = replace(result, marker_in_world=places, marker_covariance=C)
+    row = map_accuracy(moved, drive, "marker")
+    assert row == pytest.approx({"markers": len(places), "their σ (mm)": 4.0, "error (mm)": 5.0,
+                                 "their NEES": 9 / 4 + 16 / 16})
+    without = map_accuracy(moved, replace(drive, truth=None), "marker")
+    assert list(without) == ["markers", "their σ (mm)"]
+    assert map_accuracy(replace(result, antenna=result.antenna[:0]), drive, "antenna") == {}
+
+
+def test_the_truth_tells_which_sightings_are_rejected_in_error_and_which_are_missed(solved):
+    drive, result = solved
+    s = result.sightings
+    wrong = np.arange(len(s.marker)) < 3
+    z = s.z + 1.0 * wrong[:, None]
+    fit = replace(result.fit, problem=replace(result.fit.problem, measurements=replace(
+        result.fit.problem.measurements, sightings=replace(s, z=z))))
+    rejected = np.arange(len(s.marker)) == 0
+    before = gate_row(replace(result, rejected=~(rejected | True)), drive)
+    row = gate_row(replace(result, fit=fit, rejected=rejected), drive)
+    assert row["rejected"] == f"1 of {len(s.marker)}" and row["right"] == 0
+    assert row["missed"] in range(before["missed"] - 1, before["missed"] + 3)
+    assert "missed" not in gate_row(result, replace(drive, truth=None))
 
 
 def test_rows_hold_every_antenna_and_its_errors(solved):
@@ -112,7 +158,7 @@ def test_an_antenna_in_doubt_is_called_so_and_has_no_ellipse(solved):
     ax, = maps.whole_map(drive, doubted).axes
     first_ellipse, other = ax.collections[-1].get_paths()[:2]
     assert np.ptp(first_ellipse.vertices, axis=0).max() == 0 < np.ptp(other.vertices)
-    assert f"{first}?" in {text.get_text() for text in ax.texts}
+    assert f"A{first}?" in {text.get_text() for text in ax.texts}
     assert next(antenna_rows(doubted, drive))["antenna"] == f"{first}?"
 
 

@@ -5,9 +5,11 @@ from slamlib.notebook.tabular import (
     accuracy,
     antenna_rows,
     calibration_rows,
+    gate_row,
     learned_row,
+    map_accuracy,
     table,
 )
 
-__all__ = ["Drive", "accuracy", "antenna_rows", "attempt", "calibration_rows", "learned_row",
-           "show_doubts", "start", "table", "write_results"]
+__all__ = ["Drive", "accuracy", "antenna_rows", "attempt", "calibration_rows", "gate_row",
+           "learned_row", "map_accuracy", "show_doubts", "start", "table", "write_results"]

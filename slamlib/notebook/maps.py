@@ -13,6 +13,7 @@ FLAT = 0.55                        # height of a map over its width, below which
 ABOVE_AND_BELOW = 0.8              # inches, for title, label and legend
 # Places of a name relative to its landmark, in font sizes, in the order in which they are tried.
 NAME_OFFSETS = (1, 0.9), (-1, 0.9), (1, -0.9), (-1, -0.9), (0, 1.4), (0, -1.4)
+MOST_NAMES = 60                    # number of markers, beyond which the map names antennas only
 HALO = withStroke(linewidth=1.5, foreground="white")       # so that a name on the path can be read
 
 
@@ -22,7 +23,8 @@ def whole_map(drive, result) -> Figure:
     `result` is a SlamResult. Ellipses hold 95 %; the title states how much they are enlarged, which
     is `plotting.enlargement` of the vehicle's. A question mark stands at the names of antennas in
     doubt, which have no ellipse because it may be as large as the map, and of markers that nothing
-    confirms. A marker's name without a free place is left out; pages tell it under the pointer.
+    confirms. Names of antennas begin with A. Names of more than MOST_NAMES markers, and those
+    without a free place, are left out; pages tell them under the pointer.
     """
     fig, ax = plt.subplots(figsize=_size(result))
     ax.set_title(drive.name)
@@ -51,17 +53,18 @@ def whole_map(drive, result) -> Figure:
     fig.draw_without_rendering()                                  # fixes the axes for the names
     seen = result.sightings.marker[~result.rejected]
     taken = []
-    for kind, size, doubtful, measured in (
-            ("antenna", 10.5, result.doubts, ranged),
-            ("marker", 7.0, result.unconfirmed, seen)):
+    for kind, letter, size, doubtful, measured in (
+            ("antenna", "A", 9.0, result.doubts, ranged),
+            ("marker", "", 7.0, result.unconfirmed, seen)):
         ids = getattr(result, kind)
         places = getattr(result, f"{kind}_in_world")[:, :2]
         sigmas = 1e3 * position_sigmas(getattr(result, f"{kind}_covariance"))
         for each, place, sigma in zip(ids, places, sigmas):
-            name = f"{each}"
+            name = f"{letter}{each}"
             if each in doubtful:
                 name += "?"
-            _write_name(ax, place, name, size, taken)
+            if letter or each in doubtful or len(ids) <= MOST_NAMES:
+                _write_name(ax, place, name, size, taken)
             # Pages tell the name of this invisible disc: report.lua makes a title of it.
             count = np.sum(measured == each)
             ax.plot(*place, "o", alpha=0, markersize=9, zorder=9,

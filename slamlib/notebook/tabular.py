@@ -8,8 +8,10 @@ import numpy as np
 from IPython.display import Markdown
 
 from slamlib.core import evaluation, se2
+from slamlib.core.sightings import GATE
 from slamlib.notebook.plotting import estimates, places_by_id
 from slamlib.robust.calibration import RANGES, WHEELS
+from slamlib.robust.solution import solved_noise
 
 DASH = "–"
 # What begins a cell of a column of numbers, or is an italic remark in it.
@@ -112,14 +114,56 @@ def accuracy(result, drive) -> dict:
     return row
 
 
+def map_accuracy(result, drive, kind: str) -> dict:
+    """Entries of a row of `table` on the landmarks of a `kind`, "marker" or "antenna".
+
+    Their number, the median of the larger sigma of x and y, and by a Drive's truth of all of them
+    the rms error of the position and the mean squared error in units of the covariance. `result`
+    is a SlamResult or GraphSolution.
+    """
+    ids = getattr(result, kind)
+    if not len(ids):
+        return {}
+    covariances = getattr(result, f"{kind}_covariance")
+    row = {f"{kind}s": len(ids),
+           "their σ (mm)": 1e3 * np.median(evaluation.position_sigmas(covariances))}
+    true_ids = getattr(drive.truth, kind, ())
+    if np.isin(ids, true_ids).all():
+        places = getattr(result, f"{kind}_in_world")
+        true = places_by_id(true_ids, getattr(drive.truth, f"{kind}_in_world"), ids)
+        off = se2.difference(places, true) if kind == "marker" else places - true
+        row["error (mm)"] = 1e3 * np.sqrt(np.mean(np.sum(off[:, :2]**2, axis=1)))
+        row["their NEES"] = np.nanmean(se2.squared_norms(off, covariances))
+    return row
+
+
 def learned_row(result, drive) -> dict:
-    """Row of `table` on what a SlamResult learned of a Drive's noise and rejected."""
+    """Row of `table` on what a SlamResult learned of a Drive's noise."""
     slip_sigma, factor_sigma, _ = result.noise_sigma
     slip = 1e3 * result.slip
     factor = result.noise.sightings
     return {"dataset": drive.name, "slip (mm)": estimate(slip, slip * slip_sigma),
-            "factor": estimate(factor, factor * factor_sigma), "step": result.model,
-            "sightings": len(result.rejected), "rejected": result.rejected.sum()}
+            "in GTSAM": 1e3 * solved_noise(result.fit).slip,
+            "factor": estimate(factor, factor * factor_sigma), "step": result.model}
+
+
+def gate_row(result, drive) -> dict:
+    """Row of `table` on the sightings that a SlamResult of a Drive rejects.
+
+    By the truth of their markers, how many of the rejected ones are right, within GATE of the true
+    sighting, and how many that are not are missed.
+    """
+    s = result.sightings
+    count = result.rejected.sum()
+    row = {"dataset": drive.name, "rejected": f"{count:,} of {len(s.marker):,}"}
+    truth = drive.truth
+    if truth is not None and np.isin(s.marker, truth.marker).all():
+        places = places_by_id(truth.marker, truth.marker_in_world, s.marker)
+        z = se2.between(truth.poses[s.frame[s.row]], places)
+        is_right = se2.squared_distances(s.z, z, s.C) < GATE
+        row["right"] = np.sum(result.rejected & is_right)
+        row["missed"] = np.sum(~result.rejected & ~is_right)
+    return row
 
 
 def calibration_rows(result, drive) -> Iterator[dict]:

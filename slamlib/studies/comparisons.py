@@ -126,13 +126,16 @@ LANDMARKS = {"first sighting": by_marker(first_sighting), "most certain": by_mar
              "median": by_marker(median), "mean by information": by_marker(mean_by_information),
              "consensus": consensus_markers, "problem 2's map": map_of_problem_2}
 CONFUSIONS = "none", "random", "in frame", "twins"        # of `simulation.confuse_labels`
+# Scales of the Cauchy kernels before the last one, by the name of the rounds.
+ROUNDS = {"last": (), "graduated": CAUCHY_SCALES[:-1], "wide": (100.0, 30.0, *CAUCHY_SCALES[:-1])}
 
 
 def confusions(seed: int, **options) -> dict:
     """LANDMARKS, starts of the markers, with each of CONFUSIONS, on one drive, its slip typical.
 
-    From each start the graph is solved with the "last" Cauchy kernel, and with the "graduated"
-    ones, all rounds. The right optimum is that reached from the true map and poses.
+    From each start the graph is solved with the "last" Cauchy kernel alone, with the "graduated"
+    ones, and from "wide" ones on (ROUNDS). The right optimum is that reached from the true map and
+    poses.
 
     Returns
     -------
@@ -155,8 +158,8 @@ def confusions(seed: int, **options) -> dict:
             state = odometry_state(m, "arc", markers=place)
             initial_error = distances(state.markers, right)
             numbers[f"{kind}, {name} initial error"] = np.sqrt(np.mean(initial_error**2))
-            narrowed = narrow_kernels(problem, state, CAUCHY_SCALES[:-1])
-            for kernel, start in (("last", state), ("graduated", narrowed)):
+            for kernel, scales in ROUNDS.items():
+                start = narrow_kernels(problem, state, scales)
                 error = distances(optimize(last, start).state.markers, right)
                 numbers[f"{kind}, {kernel}, {name} off"] = np.mean(error > MAX_MARKER_ERROR)
     return numbers
