@@ -292,25 +292,30 @@ def _write(out, dataset, truth, found, others, doubts):
     """Write Solutions to a folder; return its summary, with the rows of `others`, too."""
     rows = others | {each.problem: summarize(each, truth) for each in found}
     summary = summary_of(dataset, truth, rows, doubts)
-    clear_results(out, keep=others)
+    (out / results.SUMMARY).unlink(missing_ok=True)
+    written = []
     for each in found:
         if isinstance(each, Solution):
-            results.write_solution(out, each)
+            written += results.write_solution(out, each)
+    clear_results(out, others, written)
     _write_estimated_vehicle(out / VEHICLE_ESTIMATED, dataset.vehicle, summary["problems"])
     results.write_summary(out, summary)
     return summary
 
 
-def clear_results(out: Path, keep: Iterable[str] = ()):
-    """Remove the files of earlier runs from a results folder, but those of the problems `keep`.
+def clear_results(out: Path, keep: Iterable[str] = (), written: Collection[Path] = ()):
+    """Remove the files of earlier runs from a results folder, the summary first.
 
-    The summary is the first to go. No other file is touched, and folders stay.
+    Those of the problems `keep` and the files `written` stay, and so do all other files and
+    folders.
     """
     (out / results.SUMMARY).unlink(missing_ok=True)
     (out / VEHICLE_ESTIMATED).unlink(missing_ok=True)
     for problem in PROBLEMS.keys() - keep:
         for name in results.RESULT_FILES:
-            (out / problem / name).unlink(missing_ok=True)
+            file = out / problem / name
+            if file not in written:
+                file.unlink(missing_ok=True)
 
 
 def summary_of(dataset: Dataset, truth: Truth | None, rows: dict, doubts: list[Doubt]) -> dict:

@@ -83,7 +83,7 @@ FLAWS = {                                           # how, kinds of doubts, and 
     "wheelbase in mm": (vehicle(wheelbase=400.0), "units", "wheelbase in vehicle.toml"),
     "vehicle in mm": (vehicle(right_radius=100.0, left_radius=100.0, wheelbase=400.0),
                       "units units", "vehicle.toml"),
-    "no counts": (wheels([[0, 0], [0, 0]]), "odometry", "encoderReading.txt"),
+    "no counts": (wheels([[0, 0], [0, 0]]), "encoder-dead", "encoderReading.txt"),
     "another drive": (another_drive, "odometry", "of the same drive"),
 }
 
@@ -184,6 +184,17 @@ RIGHT = {
 def test_nothing_is_doubted(case, seed):
     dataset = RIGHT[case](*drive(seed), np.random.default_rng(seed))
     assert doubts_before_solving(dataset) == []
+
+
+@pytest.mark.parametrize("dead, name", [
+    ([0], "right"), ([1], "left"), ([0, 1], "right and the left")])
+def test_a_wheel_without_any_counts_is_the_only_cause(dead, name):
+    dataset, _ = drive(0)
+    ticks = dataset.ticks.copy()
+    ticks[:, dead] = 0
+    doubt, *others = files.merged(doubts_before_solving(replace(dataset, ticks=ticks)))
+    assert doubt.what == "encoder-dead" and f"counts of the {name} wheel" in doubt.sentence
+    assert [other.what for other in others] in ([], ["consequences"])
 
 
 @pytest.mark.parametrize("options", [

@@ -1,5 +1,6 @@
 """The files of results: as MATLAB, spreadsheets and evo read them."""
 
+import errno
 import os
 import re
 import shutil
@@ -141,6 +142,22 @@ def test_what_a_killed_run_left_is_removed_by_the_next_problem_that_is_written(t
         results.read_summary(tmp_path)
     solve.write_results(tmp_path, "problem1", solve.find("problem1", drive[0]), drive[0])
     assert [path.parent.name for path in tmp_path.rglob("*.mat")] == ["problem1"]
+
+
+def test_a_file_that_cannot_be_written_is_named_and_costs_no_earlier_file(
+        tmp_path, drive, monkeypatch):
+    """As on a full disk. Without summary.json the folder counts as unfinished."""
+    solve.solve_to_folder(drive[0], None, tmp_path)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*.mat")}
+
+    def on_a_full_disk(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Path, "write_bytes", on_a_full_disk)
+    with pytest.raises(DatasetError, match="problem1/vehiclePose.mat: expected .*No space left"):
+        solve.solve_to_folder(drive[0], None, tmp_path)
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*.mat")} == before
+    assert not [*tmp_path.rglob("*.part"), *tmp_path.rglob("summary.json")]
 
 
 def test_the_vehicle_as_estimated_can_be_taken_over(tmp_path):

@@ -27,12 +27,14 @@ SIZE_WORD = 33  # of 4 bytes: the size of the array of structs
 COUNT_WORD = 41  # its number of columns
 
 
-def write_solution(folder: Path | str, solution):
-    """Write the .mat files of a Solution into folder/<problem>/."""
+def write_solution(folder: Path | str, solution) -> list[Path]:
+    """Write the .mat files of a Solution into folder/<problem>/, and return their paths."""
     own = Path(folder) / solution.problem
-    write_structs(own, "vehiclePose", None, solution.poses, solution.covariances)
-    for name, values in solution.maps.items():
+    poses = None, solution.poses, solution.covariances
+    structs = {"vehiclePose": poses} | solution.maps
+    for name, values in structs.items():
         write_structs(own, name, *values)
+    return [own / f"{name}.mat" for name in structs]
 
 
 def write_summary(folder: Path | str, summary: dict):

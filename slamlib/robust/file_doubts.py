@@ -17,6 +17,7 @@ from slamlib.core.marker_increments import distance_and_turn
 from slamlib.core.records import Dataset
 from slamlib.robust.part_faults import (
     AXES,
+    MIN_AGREEING_SHARE,
     MIN_COUNT,
     MIN_MOTION_SIGMAS,
     MOTIONS,
@@ -35,8 +36,8 @@ MAX_SPREAD = 4.7
 SECOND_DIFFERENCE = 0.6745 * 6**0.5      # median size, of independent errors of sigma 1
 MIN_DIFFERENT_COUNTS = 8  # from which on a common divisor says that counts were cut off
 # Kinds of doubts from which most others follow
-DECISIVE = ("wheels-swapped", "wheels-reversed", "camera-mirrored", "camera-turned", "odometry",
-            "units")
+DECISIVE = ("encoder-dead", "wheels-swapped", "wheels-reversed", "camera-mirrored", "camera-turned",
+            "odometry", "units")
 # What [x, y] is with each of AXES, and by their number the kind of doubt and the change of the
 # counts with the same effect.
 AXES_NAMES = ("x, y", "x, -y", "-x, y", "-x, -y", "y, x", "-y, x", "y, -x", "-y, -x")
@@ -87,15 +88,27 @@ def merged(doubts: Iterable[Doubt]) -> list[Doubt]:
 
 
 def motion_doubts(dataset: Dataset) -> list[Doubt]:
-    """List of Doubts about axes, else about units or drives."""
+    """List of Doubts about dead wheels, else about axes, else about units or drives."""
     markers, wheels, sigma, poses = moving_increments(dataset)
     if len(wheels) < MIN_COUNT:
         return []
     off = contradictions(markers, wheels @ MOTIONS, sigma)
+    dead = ~dataset.ticks.any(axis=0)
+    if dead.any() and np.mean(off[0, 0] < 1) < MIN_AGREEING_SHARE:
+        return [_dead_doubt(dead)]
     stretch = other_axes(off, poses)
     if stretch is not None:
         return [_axes_doubt(stretch, stretch.is_mended(len(dataset.ticks)))]
     return list(wrong_sizes(markers[0], wheels, sigma, off[0, 0] < 1))
+
+
+def _dead_doubt(dead):
+    """The Doubt on wheels, right and left, that are `dead` (2,): all their counts are 0."""
+    wheels = " and the ".join(np.array(["right", "left"])[dead])
+    return Doubt("encoder-dead", (
+        f"All counts of the {wheels} wheel in encoderReading.txt are 0, and the markers say that "
+        "the vehicle moved otherwise. Only problem 2 from markers alone does without them."),
+        "Look at the encoder, and at the columns of the file.")
 
 
 def _axes_doubt(stretch, is_mended):
