@@ -61,6 +61,8 @@ def doubts_before_solving(dataset: Dataset) -> list[Doubt]:
     for check in (motion_doubts, range_units, sigma_units, cut_counts):
         with suppress(np.linalg.LinAlgError):              # where increments have no covariance
             doubts += list(check(dataset))
+        if any(doubt.what == "encoder-dead" for doubt in doubts):
+            break                                          # the others need the path by odometry
     return doubts
 
 
