@@ -11,7 +11,8 @@ from slamlib import estimate, fuse
 from slamlib.core import se2
 from slamlib.core.evaluation import anees, ate
 from slamlib.core.vehicle import Vehicle
-from slamlib.robust.part_faults import camera_bump, frozen_rows, slipping_rows
+from slamlib.robust.jumps import frozen_rows
+from slamlib.robust.part_faults import camera_bump, slipping_rows
 from slamlib.robust.solution_doubts import fusion_doubts, solution_doubts
 
 BUMP = np.array([0.05, -0.03, 0.06])

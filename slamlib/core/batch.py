@@ -67,7 +67,10 @@ class Batch:
         return gtsam.CustomFactor(noise, keys, error)
 
     def linearise(self, values: gtsam.Values, keys: list[int]) -> Linearization:
-        """All factors linearised at GTSAM's values, which have those of `keys`, of one factor."""
+        """All factors linearised at GTSAM's values.
+
+        `keys` are those of one factor, which tell the sizes of variables that are not there yet.
+        """
         place = {key: numbers(values, key)
                  for key in set().union(*self.keys) if values.exists(key)}
         columns = []

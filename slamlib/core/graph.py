@@ -11,8 +11,8 @@ what is stated. Poses are gtsam.Pose2, positions gtsam.Point2, all in the frame 
 
 Decisions are what enters the graph, and how much it counts. `count_everything` decides nothing: all
 measurements count as the files state them, which is the plain solver of chapters 3 and 4.
-`robust` decides more. GTSAM moves a pose by X exp(xi): errors and covariances of its poses are in
-the axes of the pose itself.
+`robust.solution` decides more, and builds the graph that is handed in. GTSAM moves a pose by
+X exp(xi): errors and covariances of its poses are in the axes of the pose itself.
 """
 
 from dataclasses import dataclass
@@ -143,17 +143,15 @@ def add_odometry(graph: gtsam.NonlinearFactorGraph, decisions: Decisions):
     """Add a factor between successive frames, which all depend on the same wheel parameters."""
     increments = decisions.odometry
     root = decisions.root_wheel
-    poses = [X(i) for i in increments.frame.tolist()]
-    first = poses[:-1]
-    second = poses[1:]
+    keys = [X(i) for i in increments.frame.tolist()]
 
-    def linearised(from_pose, to_pose, off):
-        there = np.concatenate([from_pose, to_pose[-1:]])
-        e, by_poses, by_wheel = odometry_error(
-            increments, there, increments.stated + root @ off[0])
+    def linearised(from_pose, to_pose, whitened):
+        poses = np.append(from_pose, to_pose[-1:], axis=0)       # of all frames in their order
+        wheel = increments.stated + root @ whitened[0]           # that of every increment
+        e, by_poses, by_wheel = odometry_error(increments, poses, wheel)
         return e, [by_poses[:, :, :3], by_poses[:, :, 3:], by_wheel @ root]
 
-    batch = Batch([first, second, len(first) * [W(0)]], linearised)
+    batch = Batch([keys[:-1], keys[1:], [W(0)] * len(keys[1:])], linearised)
     for k, covariance in enumerate(increments.covariance(decisions.slip)):
         graph.add(batch.factor(k, gtsam.noiseModel.Gaussian.Covariance(covariance)))
 

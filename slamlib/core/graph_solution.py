@@ -182,10 +182,9 @@ def gauss_newton(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values,
         tree, step = eliminated(linear)
         moved, new = after_step(graph, values, step, error)
         LOG.debug("Gauss-Newton step %d: error %.6g", steps, new)
-        negligible = CONVERGED * (1 + error)
-        promised = linear.error(values.zeroVectors()) - linear.error(step)
-        stuck = new >= error and promised > STUCK * (1 + error)
-        if error - new <= negligible:
+        if error - new <= CONVERGED * (1 + error):
+            promised = linear.error(values.zeroVectors()) - linear.error(step)
+            stuck = new >= error and promised > STUCK * (1 + error)
             return GaussNewton(gtsam.Values(moved), new, steps, not stuck, Marginals(tree))
         values = moved
         error = new

@@ -1,8 +1,8 @@
 """Increments between poses by odometry, their noise, and how they depend on the wheels.
 
 A wheel that travels s metres slips with variance slip^2 |s|, independently from step to step. Each
-encoder rounds its cumulative count. `rounding_and_slipping` is the noise of increments by
-themselves, `noise_in_drive` that of increments of one drive that are used together. An increment
+encoder rounds its cumulative count. `rounding_and_slipping` sums what the steps of an increment
+contribute to its noise, `noise_in_drive` is the noise of increments of one drive. An increment
 is the pose `end` in the frame of the pose `start`; both are arrays (m,) of indices from 0. The
 `ticks` (n, 2), `vehicle` and `model` are those of module `odometry`.
 

@@ -2,9 +2,9 @@
 
 from gtsam.noiseModel import mEstimator
 
-# Scales in sigmas; the first kernel is the default. Those of Huber, Cauchy and Tukey have 95 %
-# efficiency on Gaussian noise (Zhang, Image and Vision Computing 15(1), 1997).
-SCALES = {
+# Classes, and scales in sigmas; the first kernel is the default. The scales of Huber, Cauchy and
+# Tukey have 95 % efficiency on Gaussian noise (Zhang, Image and Vision Computing 15(1), 1997).
+SPECIFIED = {
     "asymmetric Tukey": (mEstimator.AsymmetricTukey, 4.685),
     "asymmetric Cauchy": (mEstimator.AsymmetricCauchy, 2.385),
     "quadratic": None,
@@ -29,12 +29,12 @@ def kernel_of(name: str, width: float = 1.0) -> mEstimator.Base | None:
 
     Asymmetric kernels need signed errors, which GTSAM passes to them with the scheme Scalar.
     """
-    if SCALES[name] is None:
+    if SPECIFIED[name] is None:
         return None
-    kind, scale = SCALES[name]
+    kind, scale = SPECIFIED[name]
     if name in ONE_SIDED:
         return kind.Create(scale * width, mEstimator.Base.ReweightScheme.Scalar)
     return kind.Create(scale * width)
 
 
-KERNELS = {name: kernel_of(name) for name in SCALES}
+KERNELS = {name: kernel_of(name) for name in SPECIFIED}

@@ -151,14 +151,14 @@ def robust_increments(z: np.ndarray, C: np.ndarray, pair: np.ndarray, first: np.
         for _ in range(iterations):
             linear = common.linearized(increment)
             weight = weight_of(linear.squared)
-            gain = linear.J_delta.mT @ linear.information * weight[:, None, None]
-            step, covariance = _solved(common, linear, gain)
+            J_t_W = linear.J_delta.mT @ linear.information * weight[:, None, None]
+            step, covariance = _solved(common, linear, J_t_W)
             increment = increment + step
             if np.nanmax(np.abs(step), initial=0) <= INCREMENT_STEP_TOLERANCE:
                 break
     increment[:, 2] = se2.wrap(increment[:, 2])
     usable = covariance[:, 2, 2] < MAX_HEADING_SIGMA**2
-    D = covariance[pair] @ gain
+    D = covariance[pair] @ J_t_W              # of the last linearisation
     return MarkerIncrements(
         pair=pair, first=first, second=second, accepted=(weight > 0) & usable[pair],
         J_first=D, J_second=-D @ linear.J_second, covariance=covariance, usable=usable,
@@ -175,19 +175,19 @@ def _gate_weight(squared):
     return squared < GATE
 
 
-def _solved(common, linear, gain):
+def _solved(common, linear, J_t_W):
     """The step (l, 3) C_Delta sum_j J_j^T W_j^-1 r_j, and C_Delta; NaN where undetermined.
 
-    `gain` (p, 3, 3) are the weighted J_j^T W_j^-1.
+    `J_t_W` (p, 3, 3) are the weighted J_j^T W_j^-1.
     """
-    terms = gain @ np.concatenate([linear.J_delta, linear.r[..., None]], axis=2)
-    total = np.zeros((common.count, 3, 4))
-    np.add.at(total, common.pair, terms)
-    information = total[..., :3]
+    information = np.zeros((common.count, 3, 3))
+    np.add.at(information, common.pair, J_t_W @ linear.J_delta)
+    vector = np.zeros((common.count, 3, 1))
+    np.add.at(vector, common.pair, J_t_W @ linear.r[..., None])
     determined = se2.are_regular(information)
     covariance = np.full_like(information, np.nan)
     covariance[determined] = np.linalg.inv(information[determined])
-    return (covariance @ total[..., 3:])[..., 0], covariance
+    return (covariance @ vector)[..., 0], covariance
 
 
 def _best_hypothesis(common):
@@ -199,12 +199,13 @@ def _best_hypothesis(common):
     """
     pair, hypothesis = _hypotheses(common)
     _, begin, which = np.unique(pair, return_index=True, return_inverse=True)
-    number = np.arange(len(pair)) - begin[which]        # those of a pair follow each other
+    rank = np.arange(len(pair)) - begin[which]          # in its pair, whose hypotheses are adjacent
     best = np.zeros((common.count, 3))
     least = common.cost(best)
-    for k in range(number.max(initial=-1) + 1):
+    for k in range(rank.max(initial=-1) + 1):
+        kth = rank == k
         tried = best.copy()
-        tried[pair[number == k]] = hypothesis[number == k]
+        tried[pair[kth]] = hypothesis[kth]
         cost = common.cost(tried)
         best = np.where((cost < least)[:, None], tried, best)
         least = np.minimum(cost, least)
@@ -254,7 +255,10 @@ def distance_and_turn(increment: np.ndarray) -> np.ndarray:
 
 
 def distance_and_turn_sigmas(covariance: np.ndarray) -> np.ndarray:
-    """Standard deviations (n, 2) of them, in m and rad, by covariances (n, 3, 3)."""
+    """Bounds (n, 2) of the standard deviations of distance in m and turn in rad.
+
+    By covariances (n, 3, 3) of the increments.
+    """
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     return np.sqrt(variance @ [[1, 0], [1, 0], [0, 1]])
 

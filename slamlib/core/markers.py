@@ -111,7 +111,8 @@ def _composed(sightings, increments, confirmed, shared_errors):
         by_parent = A @ covariances[parent] @ A.T
         covariances[f] = by_parent + B @ found.covariance[pair] @ B.T
         if shared_errors:
-            rows = slice(*np.searchsorted(found.pair, [pair, pair + 1]))
+            begin, end = np.searchsorted(found.pair, [pair, pair + 1])
+            rows = slice(begin, end)
             first = found.first[rows]
             second = found.second[rows]
             D = found.J_first[rows]
@@ -130,7 +131,7 @@ def _relocalize(sightings, confirmed, table, poses, frame):
     seen = table[:frame + 1] >= 0
     known = np.isfinite(poses[:frame, :1])
     common = seen[:frame] & seen[frame] & known
-    by_common_markers = np.lexsort((np.arange(frame), common.sum(axis=1)))
+    by_common_markers = np.argsort(common.sum(axis=1), kind="stable")
     for parent in by_common_markers[::-1][:MAX_CANDIDATES]:
         first = table[parent, common[parent]]
         second = table[frame, common[parent]]

@@ -46,12 +46,12 @@ class Steps(NamedTuple):
 def steps(ticks: np.ndarray, vehicle: Vehicle) -> Steps:
     """The Steps by equation 1: lengths, turns, and their derivatives by the wheel parameters."""
     counts = np.asarray(ticks, dtype=float)[1:]
-    ds_by_radius = np.pi / vehicle.ticks_per_revolution * counts
-    right = ds_by_radius[:, 0] * vehicle.right_radius
-    left = ds_by_radius[:, 1] * vehicle.left_radius
+    by_right, by_left = (np.pi / vehicle.ticks_per_revolution * counts).T
+    right = by_right * vehicle.right_radius
+    left = by_left * vehicle.left_radius
     dtheta = 2 * (right - left) / vehicle.wheelbase
-    ds_by_w = np.insert(ds_by_radius, 2, 0.0, axis=1)                       # b: zero
-    dtheta_by_w = np.column_stack([2 * ds_by_radius * [1, -1], -dtheta]) / vehicle.wheelbase
+    ds_by_w = np.column_stack([by_right, by_left, np.zeros(len(counts))])
+    dtheta_by_w = np.column_stack([2 * by_right, -2 * by_left, -dtheta]) / vehicle.wheelbase
     return Steps(right + left, dtheta, ds_by_w, dtheta_by_w)
 
 
@@ -80,10 +80,10 @@ def equation2(ticks: np.ndarray, vehicle: Vehicle, initial_pose: np.ndarray = OR
               initial_covariance: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Poses (n, 3) by equation 1 and covariances (n, 3, 3) by equation 2 and equation 3.
 
-    Equation 2 adds J C_w J^T + J S I^T + I S J^T = (I + J S)(I + J S)^T - I I^T at every step, and
-    I + J S is the next I, the (3, 4) sum of equation 3 and not the identity. The sum telescopes:
+    With I_k, the (3, 4) sum of J_j S_wj over the steps j < k of equation 3 (not the identity), what
+    equation 2 adds at step k is I_(k+1) I_(k+1)^T - I_k I_k^T. So the sum telescopes:
 
-        C_Xk = C_X1 + I_k I_k^T,      I_k = sum over the steps j < k of J_j S_wj.
+        C_Xk = C_X1 + I_k I_k^T.
 
     S_wj contains sigma_theta_j, the root of C_Xj[2, 2]. The heading row of J is zero in the heading
     column, so the first three columns of I_k determine every sigma_theta_j. Two cumulative sums

@@ -24,11 +24,12 @@ from slamlib.core import odometry, se2
 from slamlib.core.marker_increments import distance_and_turn, robust_increments
 from slamlib.core.records import Dataset
 from slamlib.core.sightings import GATE, MEDIAN_CHI2, sightings_by_frame
-from slamlib.robust.part_faults import CameraBump, frozen_rows, slipping_rows
+from slamlib.robust.part_faults import CameraBump, slipping_rows
 
 log = logging.getLogger(__name__)
 
 CRAWL = 0.1                  # of the typical speed, below which counts may creep
+MIN_FROZEN = 20              # ratio of the lengths of runs of equal counts, frozen and usual
 # Noise of odometry, generous
 SLIP = 0.03                  # sqrt(m), of a wheel after one metre
 FLOOR = 3e-3                 # m and rad, of an increment
@@ -165,6 +166,20 @@ def crawls(ticks: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
     travel = travelled[end] - travelled[start]
     speed = travel / np.maximum(end - start, 1)
     return speed * travel.sum() < CRAWL * (speed @ travel)
+
+
+def frozen_rows(ticks: np.ndarray) -> np.ndarray:
+    """Rows (n,), bool, in which counts (n, 2) repeat one row for far longer than is usual.
+
+    Counts that creep may be equal for long.
+    """
+    speed = np.abs(ticks).sum(axis=1)
+    creeps = speed * speed.sum() <= CRAWL * (speed @ speed)
+    is_new = np.append(True, (ticks[1:] != ticks[:-1]).any(axis=1))
+    run = np.cumsum(is_new) - 1
+    length = np.bincount(run)
+    frozen = length > MIN_FROZEN * np.quantile(length, 0.99)
+    return frozen[run] & ~creeps
 
 
 def creep_covariance(increment: np.ndarray, crawling: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ residuals are than with one c (generalised likelihood ratio: Basseville and Niki
 Detection of Abrupt Changes, 1993, section 2.4).
 
 Where wheels slip on a patch of the ground, both seem to have other radii there. The stretch is the
-one with the greatest likelihood ratio, and its counts are not used; nor are those that freeze.
+one with the greatest likelihood ratio, and its counts are not used.
 """
 
 import logging
@@ -58,7 +58,6 @@ MIN_WHEELS_GAIN = 25.0    # of squared residuals, by other wheels in a stretch
 STRETCH_LENGTHS = 30      # number of lengths that are tried
 MAX_WHEELS_STRETCH = 0.3  # of the increments, longest such stretch
 WHEELS_SIGMA = 0.05       # relative, of the distances by the wheels there
-MIN_FROZEN = 20           # ratio of the lengths of runs of equal counts, frozen and usual
 MAX_SCALE = 5.0           # of the squared residuals; beyond it wheels slip everywhere
 # The matrices A, and by their number the changes of the counts with the same effect.
 AXES = np.array([np.diag(signs) @ order for order in (np.eye(2), np.eye(2)[::-1])
@@ -338,16 +337,6 @@ def slipping_rows(dataset: Dataset) -> np.ndarray:
         rows[poses[first, 0] + 1:poses[last, 1] + 1] = True
         log.info("wheels: slip from pose %d to %d", poses[first, 0] + 1, poses[last, 1] + 1)
     return rows
-
-
-def frozen_rows(ticks: np.ndarray) -> np.ndarray:
-    """Rows (n,), bool, in which counts (n, 2) repeat one row for far longer than is usual."""
-    moves = ticks.any(axis=1)
-    is_new = np.append(True, (ticks[1:] != ticks[:-1]).any(axis=1))
-    run = np.cumsum(is_new) - 1
-    length = np.bincount(run)
-    frozen = length > MIN_FROZEN * np.quantile(length, 0.99)
-    return moves & frozen[run]
 
 
 def _other_radii(e, J, variance):
