@@ -194,7 +194,6 @@ def solutions(dataset: Dataset, problems: Collection[str] = PROBLEMS) -> list[So
     A problem that cannot be solved has a Failure. Facts include the seconds that it took.
     """
     previous = None
-    fused = None
     every = []
     for problem in PROBLEMS:
         if problem not in problems or not allows(dataset, problem):
@@ -209,20 +208,8 @@ def solutions(dataset: Dataset, problems: Collection[str] = PROBLEMS) -> list[So
         solution = solved(problem, dataset, found)
         if isinstance(solution, Solution):
             solution.facts["seconds"] = time.perf_counter() - start
-            if problem == "problem2_fused":
-                fused = solution.poses, solution.covariances
-            if problem == "problem3":
-                solution = _compared(solution, fused)
         every.append(solution)
     return every
-
-
-def _compared(solution, fused):
-    """Problem 3's Solution with a doubt if it contradicts poses and covariances of the fusion."""
-    if fused is None:
-        return solution
-    contradiction = contradiction_doubts(*fused, solution.poses)
-    return replace(solution, doubts=solution.doubts + contradiction)
 
 
 def write_results(out: Path | str, problem: str, found, dataset: Dataset,
@@ -261,9 +248,6 @@ def write_results(out: Path | str, problem: str, found, dataset: Dataset,
         with suppress(DatasetError):
             others = results.read_summary(out)["problems"]
         others.pop(problem, None)
-        if problem == "problem3" and "problem2_fused" in others and isinstance(solution, Solution):
-            _, *fused = results.read_structs(out / "problem2_fused", "vehiclePose")
-            solution = _compared(solution, fused)
         _write(out, dataset, truth, [solution], others, doubts)
     return solution
 
@@ -291,13 +275,13 @@ def solve_to_folder(dataset: Dataset, truth: Truth | None, out: Path,
 def _write(out, dataset, truth, found, others, doubts):
     """Write Solutions to a folder; return its summary, with the rows of `others`, too."""
     rows = others | {each.problem: summarize(each, truth) for each in found}
-    summary = summary_of(dataset, truth, rows, doubts)
     (out / results.SUMMARY).unlink(missing_ok=True)
     written = []
     for each in found:
         if isinstance(each, Solution):
             written += results.write_solution(out, each)
     clear_results(out, others, written)
+    summary = summary_of(dataset, truth, rows, [*doubts, *doubts_of_results(out)])
     _write_estimated_vehicle(out / VEHICLE_ESTIMATED, dataset.vehicle, summary["problems"])
     results.write_summary(out, summary)
     return summary
@@ -316,6 +300,15 @@ def clear_results(out: Path, keep: Iterable[str] = (), written: Collection[Path]
             file = out / problem / name
             if file not in written:
                 file.unlink(missing_ok=True)
+
+
+def doubts_of_results(out: Path) -> tuple[Doubt, ...]:
+    """A Doubt if problem 2's fusion contradicts problem 3 in a results folder that has both."""
+    with suppress(OSError):
+        _, poses, covariances = results.read_structs(out / "problem2_fused", "vehiclePose")
+        _, by_slam, _ = results.read_structs(out / "problem3", "vehiclePose")
+        return contradiction_doubts(poses, covariances, by_slam)
+    return ()
 
 
 def summary_of(dataset: Dataset, truth: Truth | None, rows: dict, doubts: list[Doubt]) -> dict:

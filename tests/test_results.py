@@ -22,6 +22,8 @@ from slamlib.__main__ import main
 from slamlib.core import evaluation
 from slamlib.core.errors import DatasetError
 from slamlib.io import results
+from slamlib.notebook import Drive
+from slamlib.report import build
 from slamlib.studies.simulation import simulate, write_dataset
 
 
@@ -127,10 +129,13 @@ def test_a_fusion_that_contradicts_problem_3_is_doubted_however_problems_are_wri
         drive = replace(dataset, vehicle=stated)
         problems = "problem2_fused", "problem3"
         solve.solve_to_folder(drive, None, tmp_path / "at once", problems)
-        for problem in problems:
+        for problem in problems:                     # as chapters of a report do, each by itself
             found = solve.find(problem, drive)
             solve.write_results(tmp_path / "one by one", problem, found, drive)
-        for folder in ("at once", "one by one"):
+            solve.write_results(tmp_path / problem / drive.name, problem, found, drive)
+        shown = Drive(drive.name, drive, None)
+        build._write_results(shown, [tmp_path / each for each in problems], tmp_path / "report")
+        for folder in ("at once", "one by one", "report"):
             doubts = results.read_summary(tmp_path / folder)["doubts"]
             assert sum(doubt["what"] == "fusion" for doubt in doubts) == expected
 

@@ -17,7 +17,7 @@ from slamlib.io.tables import datasets_in
 from slamlib.notebook.drives import read_drives, without_stand_ins
 from slamlib.report import cache
 from slamlib.report.notebooks import Options, read_books
-from slamlib.solve import SENSORS, clear_results, summary_of
+from slamlib.solve import SENSORS, clear_results, doubts_of_results, summary_of
 
 # Name of the file in a report that has a digest and lists its files; all others are the user's.
 PAGES = ".pages"
@@ -142,7 +142,8 @@ def _write_results(drive, stages, folder):
             for file in own.rglob("*"):
                 if file.is_file() and file.name != SUMMARY:
                     files.write_file(folder / file.relative_to(own), file.read_bytes())
-        summary = summary_of(drive.dataset, drive.truth, rows, drive.doubts)
+        doubts = [*drive.doubts, *doubts_of_results(folder)]
+        summary = summary_of(drive.dataset, drive.truth, rows, doubts)
         write_summary(folder, summary)
     return summary
 
