@@ -280,26 +280,25 @@ def _write(out, dataset, truth, found, others, doubts):
     for each in found:
         if isinstance(each, Solution):
             written += results.write_solution(out, each)
-    clear_results(out, others, written)
+    clear_results(out, written, keep=others)
     summary = summary_of(dataset, truth, rows, [*doubts, *doubts_of_results(out)])
     _write_estimated_vehicle(out / VEHICLE_ESTIMATED, dataset.vehicle, summary["problems"])
     results.write_summary(out, summary)
     return summary
 
 
-def clear_results(out: Path, keep: Iterable[str] = (), written: Collection[Path] = ()):
-    """Remove the files of earlier runs from a results folder, the summary first.
+def clear_results(out: Path, written: Collection[Path], keep: Iterable[str] = ()):
+    """Remove the files of earlier runs from a results folder whose summary is gone.
 
-    Those of the problems `keep` and the files `written` stay, and so do all other files and
+    The files `written` and those of the problems `keep` stay, and so do all other files and
     folders.
     """
-    (out / results.SUMMARY).unlink(missing_ok=True)
-    (out / VEHICLE_ESTIMATED).unlink(missing_ok=True)
+    files_of_runs = [out / VEHICLE_ESTIMATED]
     for problem in PROBLEMS.keys() - keep:
-        for name in results.RESULT_FILES:
-            file = out / problem / name
-            if file not in written:
-                file.unlink(missing_ok=True)
+        files_of_runs += [out / problem / name for name in results.RESULT_FILES]
+    for file in files_of_runs:
+        if file not in written:
+            file.unlink(missing_ok=True)
 
 
 def doubts_of_results(out: Path) -> tuple[Doubt, ...]:

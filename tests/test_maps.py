@@ -131,7 +131,7 @@ def test_the_truth_tells_which_sightings_are_rejected_in_error_and_which_are_mis
     fit = replace(result.fit, problem=replace(result.fit.problem, measurements=replace(
         result.fit.problem.measurements, sightings=replace(s, z=z))))
     rejected = np.arange(len(s.marker)) == 0
-    before = gate_row(replace(result, rejected=~(rejected | True)), drive)
+    before = gate_row(replace(result, rejected=np.zeros_like(rejected)), drive)
     row = gate_row(replace(result, fit=fit, rejected=rejected), drive)
     assert row["rejected"] == f"1 of {len(s.marker)}" and row["right"] == 0
     assert row["missed"] in range(before["missed"] - 1, before["missed"] + 3)

@@ -104,7 +104,7 @@ def test_wheels_that_slip_everywhere_alike_are_used(seed, slip, mislabelled):
 
 @pytest.mark.parametrize("first, count", [(700, 100), (1500, 60)])
 def test_counts_that_freeze_are_told_and_cost_problems_2_and_3_little(first, count):
-    """The last row of the counts comes again and again; believed, it costs up to 0.3 m."""
+    """The last row of the counts comes again and again."""
     dataset, truth = short(2)
     ticks = dataset.ticks.copy()
     ticks[first:first + count] = ticks[first]

@@ -134,14 +134,17 @@ def _write_results(drive, stages, folder):
     """Write the files of a Drive that notebooks wrote to `stages`; return the summary."""
     rows = {}
     with files.locked(folder):
-        clear_results(folder)
+        (folder / SUMMARY).unlink(missing_ok=True)
+        written = []
         for stage in stages:
             own = stage / drive.name
             with suppress(DatasetError):  # this notebook solves nothing
                 rows |= read_summary(own)["problems"]
             for file in own.rglob("*"):
                 if file.is_file() and file.name != SUMMARY:
-                    files.write_file(folder / file.relative_to(own), file.read_bytes())
+                    written.append(folder / file.relative_to(own))
+                    files.write_file(written[-1], file.read_bytes())
+        clear_results(folder, written)
         doubts = [*drive.doubts, *doubts_of_results(folder)]
         summary = summary_of(drive.dataset, drive.truth, rows, doubts)
         write_summary(folder, summary)
