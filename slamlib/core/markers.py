@@ -16,12 +16,17 @@ Estimating Uncertain Spatial Relationships in Robotics, 1990, without the states
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from slamlib.core import se2
 from slamlib.core.errors import DatasetError, require
-from slamlib.core.marker_increments import consecutive_increments, robust_increments
+from slamlib.core.marker_increments import (
+    MarkerIncrements,
+    consecutive_increments,
+    robust_increments,
+)
 from slamlib.core.records import ArucoReadings
 from slamlib.core.sightings import consensus, sightings_by_frame
 
@@ -42,6 +47,22 @@ class Localization:
     marker_covariance: np.ndarray   # (k, 3, 3) of [x, y, heading] in world axes
 
 
+class _Link(NamedTuple):
+    """How a frame is localized; the root has no parent."""
+
+    frame: int
+    parent: int | None = None
+    increments: MarkerIncrements | None = None
+    pair: int | None = None         # the increment from the parent, in `increments`
+
+    def sightings(self):
+        """Rows of the sightings from parent and frame, and derivatives of the increment by them."""
+        found = self.increments
+        begin, end = np.searchsorted(found.pair, [self.pair, self.pair + 1])
+        rows = slice(begin, end)
+        return found.first[rows], found.second[rows], found.J_first[rows], found.J_second[rows]
+
+
 @dataclass(frozen=True)
 class _Path:
     """Poses of f frames, NaN where unknown, and the errors that they share with s sightings."""
@@ -55,7 +76,7 @@ def localize(aruco: ArucoReadings, shared_errors: bool = True) -> Localization:
     """Localization for problem 2: incremental, from the ArucoReadings alone.
 
     A frame is localized against its parent: the previous frame if the increment from it is usable,
-    else an earlier frame (`_relocalize`). Without a parent its pose is unknown. The world frame is
+    else an earlier frame (`_relocalized`). Without a parent its pose is unknown. The world frame is
     that of the first frame with a usable increment to the next. Without `shared_errors` H_j = 0,
     as for independent increments; this is conservative. Raises DatasetError if no sighting agrees
     with the others of its marker at its pose.
@@ -76,7 +97,8 @@ def localize(aruco: ArucoReadings, shared_errors: bool = True) -> Localization:
     rows = np.arange(len(sightings.row))
     paired = np.isin(rows, common)
     confirmed = np.isin(rows, common[:, increments.accepted])
-    path = _composed(sightings, increments, confirmed, shared_errors)
+    links = _links(sightings, increments, confirmed)
+    path = _composed(sightings, links, shared_errors)
     known = np.isfinite(path.poses[sightings.row, 0])
     rejected = np.ones(len(aruco.pose), bool)
     rejected[sightings.index] = paired & ~confirmed
@@ -87,50 +109,36 @@ def localize(aruco: ArucoReadings, shared_errors: bool = True) -> Localization:
         sightings.frame, path.poses, path.covariances, rejected, unused, *mapped)
 
 
-def _composed(sightings, increments, confirmed, shared_errors):
-    """The _Path by MarkerIncrements from frame to frame; a lost frame is relocalized."""
-    count = len(sightings.frame)
-    table = sightings.table()
-    poses = np.full((count, 3), np.nan)
-    covariances = np.full((count, 3, 3), np.nan)
-    H = np.zeros((len(sightings.row), 3, 3))
-    root = int(np.argmax(increments.usable)) if len(increments.usable) else 0
-    poses[root] = 0.0
-    covariances[root] = 0.0
-    for f in range(root + 1, count):
-        found = increments
-        parent = f - 1
-        pair = f - 1
-        if not increments.usable[pair] or np.isnan(poses[parent, 0]):
-            parent, found = _relocalize(sightings, confirmed, table, poses, f)
-            pair = 0
-        if found is None:
-            continue
-        A, B = se2.compose_jacobians(poses[parent], found.increment[pair])
-        poses[f] = se2.compose(poses[parent], found.increment[pair])
-        by_parent = A @ covariances[parent] @ A.T
-        covariances[f] = by_parent + B @ found.covariance[pair] @ B.T
-        if shared_errors:
-            begin, end = np.searchsorted(found.pair, [pair, pair + 1])
-            rows = slice(begin, end)
-            first = found.first[rows]
-            second = found.second[rows]
-            D = found.J_first[rows]
-            S = A @ np.sum(H[first] @ (B @ D).mT, axis=0)
-            covariances[f] += S + S.T
-            H[second] = B @ found.J_second[rows] @ sightings.C[second]
-    return _Path(poses, covariances, H)
+def _links(sightings, increments, confirmed):
+    """The _Link to each frame that has one, in the order of the frames; the first one is the root.
 
-
-def _relocalize(sightings, confirmed, table, poses, frame):
-    """The parent of a frame and the MarkerIncrements from it to this frame, or None and None.
-
-    Candidates are the frames with known `poses` and the most common markers, the latest first. A
-    parent requires two accepted markers, or one whose two sightings adjacent frames confirm.
+    From the previous frame by MarkerIncrements, or relocalized. `confirmed` (s,) are the sightings
+    that adjacent frames confirm.
     """
-    seen = table[:frame + 1] >= 0
-    known = np.isfinite(poses[:frame, :1])
-    common = seen[:frame] & seen[frame] & known
+    table = sightings.table()
+    is_known = np.zeros(len(sightings.frame), bool)
+    root = int(np.argmax(increments.usable)) if len(increments.usable) else 0
+    is_known[root] = True
+    yield _Link(root)
+    for frame in range(root + 1, len(is_known)):
+        previous = frame - 1
+        if increments.usable[previous] and is_known[previous]:
+            link = _Link(frame, previous, increments, pair=previous)
+        else:
+            link = _relocalized(sightings, confirmed, table, is_known, frame)
+        if link is not None:
+            is_known[frame] = True
+            yield link
+
+
+def _relocalized(sightings, confirmed, table, is_known, frame):
+    """The _Link to a frame from an earlier one that `is_known` (f,), or None.
+
+    Candidates are those with the most markers in common, the latest first. A parent requires two
+    accepted markers, or one whose two sightings adjacent frames confirm.
+    """
+    seen = table >= 0
+    common = seen[:frame] & seen[frame] & is_known[:frame, None]
     by_common_markers = np.argsort(common.sum(axis=1), kind="stable")
     for parent in by_common_markers[::-1][:MAX_CANDIDATES]:
         first = table[parent, common[parent]]
@@ -139,8 +147,35 @@ def _relocalize(sightings, confirmed, table, poses, frame):
         found = robust_increments(sightings.z, sightings.C, one_pair, first, second, 1)
         sure = found.accepted & confirmed[first] & confirmed[second]
         if found.usable[0] and (np.sum(found.accepted) > 1 or sure.any()):
-            return parent, found
-    return None, None
+            return _Link(frame, parent, found, pair=0)
+    return None
+
+
+def _composed(sightings, links, shared_errors):
+    """The _Path by composition along the _Links, by equation 2.3."""
+    count = len(sightings.frame)
+    poses = np.full((count, 3), np.nan)
+    covariances = np.full((count, 3, 3), np.nan)
+    H = np.zeros((len(sightings.row), 3, 3))
+    for link in links:
+        f = link.frame
+        if link.increments is None:
+            poses[f] = 0.0
+            covariances[f] = 0.0
+            continue
+        X = poses[link.parent]
+        delta = link.increments.increment[link.pair]
+        poses[f] = se2.compose(X, delta)
+        A, B = se2.compose_jacobians(X, delta)
+        by_parent = A @ covariances[link.parent] @ A.T
+        by_increment = B @ link.increments.covariance[link.pair] @ B.T
+        covariances[f] = by_parent + by_increment
+        if shared_errors:
+            first, second, D, D_later = link.sightings()
+            S = A @ np.sum(H[first] @ (B @ D).mT, axis=0)
+            covariances[f] += S + S.T
+            H[second] = B @ D_later @ sightings.C[second]
+    return _Path(poses, covariances, H)
 
 
 def _map_markers(sightings, used, path):
