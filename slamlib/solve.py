@@ -94,7 +94,7 @@ def allows(dataset: Dataset, problem: str) -> bool:
 
 
 def find(problem: str, dataset: Dataset, previous: SlamResult | None = None):
-    """The result of a problem's solver: (poses, covariances), Localization, Fusion or SlamResult.
+    """A solver's result: (poses, covariances), Localization, Fusion or SlamResult.
 
     Problem 4 starts from `previous`, problem 3's. Raises UNSOLVABLE where the measurements
     determine no solution.

@@ -29,12 +29,6 @@ class Fusion:
     poses: np.ndarray            # (n, 3) in the world frame, m and rad
     covariances: np.ndarray      # (n, 3, 3) of [x, y, heading] in world axes
     rejected: int                # number of sightings not used; repeated ones are used once
-    slip: float | None = None    # sqrt(m), given or learned
-    wheel: np.ndarray | None = None             # (3,) m, R_R, R_L, b estimated at the last frame
-    wheel_covariance: np.ndarray | None = None  # (3, 3) m^2
-    memory: float | None = None  # correlation of the errors of a marker in successive frames
-    camera: np.ndarray | None = None            # (3,) m and rad, x, y, turn at the last frame
-    jumps: object | None = None  # robust.jumps.Jumps, without whose counts it does
 
 
 def fuse_increments(dataset: Dataset, propagation: Callable = odometry.equation2) -> Fusion:

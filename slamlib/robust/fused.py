@@ -42,7 +42,7 @@ from slamlib.core.increments import SLIP_BOUNDS, SLIP_FACTOR, TYPICAL_SLIP
 from slamlib.core.records import Dataset
 from slamlib.core.sightings import GATE, sightings_by_frame
 from slamlib.robust.calibration import stated_calibration
-from slamlib.robust.jumps import NO_JUMPS, crawls, creep_covariance, find_jumps
+from slamlib.robust.jumps import NO_JUMPS, Jumps, crawls, creep_covariance, find_jumps
 from slamlib.robust.part_faults import camera_bump, with_wheels_mended
 
 SLIPS = TYPICAL_SLIP * SLIP_FACTOR ** np.arange(-1.0, 4.0)     # sqrt(m), of the first filters
@@ -59,6 +59,18 @@ POSE = slice(0, 3)
 WHEELS = slice(3, 6)
 CAMERA = slice(6, 9)
 MARKERS = slice(9, None)
+
+
+@dataclass(frozen=True)
+class LearnedFusion(Fusion):
+    """A Fusion, with what the likeliest filter assumed, and what it estimated at the last frame."""
+
+    slip: float                      # sqrt(m), given or learned
+    wheel: np.ndarray                # (3,) m, R_R, R_L, b
+    wheel_covariance: np.ndarray     # (3, 3) m^2
+    memory: float                    # correlation of the errors of a marker in successive frames
+    camera: np.ndarray               # (3,) m and rad, x, y, turn
+    jumps: Jumps                     # without whose counts it does
 
 
 @dataclass(frozen=True)
@@ -115,8 +127,8 @@ class _State(NamedTuple):        # four are made at a frame: faster than frozen 
         return np.argmax(self.log_density)
 
 
-def fuse(dataset: Dataset, slip: float | None = None) -> Fusion:
-    """Fusion of a Dataset's odometry and markers for problem 2, with correct shared errors.
+def fuse(dataset: Dataset, slip: float | None = None) -> LearnedFusion:
+    """LearnedFusion of a Dataset's odometry and markers for problem 2, with correct shared errors.
 
     `slip` in sqrt(m) is the standard deviation of the slip of one wheel after 1 m; None takes that
     of the dataset's Vehicle or, if it has none, what the innovations say of it. A
@@ -145,7 +157,7 @@ def fuse(dataset: Dataset, slip: float | None = None) -> Fusion:
     sightings = _sightings(dataset)
     poses, covariances = _poses_from_frames(dataset, jumps, sightings.frame, slip, x, P)
     repeated = sighting_count(dataset) - len(sightings.row)
-    return Fusion(
+    return LearnedFusion(
         poses=poses,
         covariances=covariances,
         rejected=last.rejected + repeated,

@@ -6,10 +6,10 @@ from typing import NamedTuple
 import numpy as np
 
 from slamlib.core import se2
-from slamlib.core.hint import Fusion
 from slamlib.core.sightings import GATE
 from slamlib.core.vehicle import Vehicle
 from slamlib.robust.file_doubts import Doubt
+from slamlib.robust.fused import LearnedFusion
 from slamlib.robust.jumps import UNKNOWN_SIGMA
 from slamlib.robust.noise import BOUNDS
 from slamlib.robust.result import SlamResult
@@ -251,8 +251,8 @@ def _rejection_doubts(result):
         "twice, and for lost counts in encoderReading.txt."))
 
 
-def fusion_doubts(fusion: Fusion, vehicle: Vehicle) -> tuple[Doubt, ...]:
-    """Tuple of Doubt: jumps of a Fusion, a learned slip that no wheel has; a stated one counts."""
+def fusion_doubts(fusion: LearnedFusion, vehicle: Vehicle) -> tuple[Doubt, ...]:
+    """Tuple of Doubt: jumps of a LearnedFusion, and a slip that no wheel has, if it was learned."""
     doubts = list(_encoder_doubts(fusion, "Problem 2's fusion does"))
     if vehicle.slip is None:
         doubts += _slip_doubt(fusion.slip)
