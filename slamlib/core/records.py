@@ -93,7 +93,9 @@ class Dataset:
                        sigma=self.uwb.sigma / v.range_scale)
 
     def without(self, sensor: str) -> "Dataset":
-        """The Dataset without a sensor, "aruco" or "uwb"."""
+        """The Dataset without a sensor, "aruco" or "uwb"; the same one where it has none."""
+        if getattr(self, sensor) is None:
+            return self
         return replace(self, **{sensor: None})
 
     def first(self, count: int) -> "Dataset":

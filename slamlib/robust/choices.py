@@ -383,7 +383,10 @@ def _alternative(start, fit, jumps, places=None):
 
 def _with_jumps(dataset, start, decide, bump):
     """The Fit with those Jumps of a Dataset that are believed, and a CameraBump or None."""
-    jumps = find_jumps(dataset, bump)
+    if bump is None:
+        jumps = find_jumps(dataset)
+    else:
+        jumps = replace(find_jumps(bump.mended(dataset)), bump=bump.pose)
     found = len(jumps.start)
     no_jumps = jumps.none()
     fit = decide(start(jumps if jumps.are_few else no_jumps))

@@ -17,6 +17,7 @@ is from a frame to the next one, and has the number of the earlier one.
 
 import logging
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -24,7 +25,7 @@ from slamlib.core import odometry, se2
 from slamlib.core.marker_increments import distance_and_turn, robust_increments
 from slamlib.core.records import Dataset
 from slamlib.core.sightings import GATE, MEDIAN_CHI2, sightings_by_frame
-from slamlib.robust.part_faults import CameraBump, slipping_rows
+from slamlib.robust.part_faults import slipping_rows
 
 log = logging.getLogger(__name__)
 
@@ -188,13 +189,12 @@ def creep_covariance(increment: np.ndarray, crawling: np.ndarray) -> np.ndarray:
     return creep[:, :, None] * creep[:, None]
 
 
-def find_jumps(dataset: Dataset, bump: CameraBump | None = None) -> Jumps:
+@lru_cache(maxsize=2)
+def find_jumps(dataset: Dataset) -> Jumps:
     """The Jumps of a Dataset, by its sightings as the stated camera has them.
 
-    After a CameraBump, as the camera would have them at its old place.
+    Of the last Datasets it keeps what it found, which problems 2 and 3 share.
     """
-    if bump is not None:
-        dataset = bump.mended(dataset)
     s = sightings_by_frame(dataset.sightings)
     if len(s.frame) < 2:
         return NO_JUMPS
@@ -211,7 +211,7 @@ def find_jumps(dataset: Dataset, bump: CameraBump | None = None) -> Jumps:
     slipping = slipping_rows(dataset) | frozen_rows(dataset.ticks)
     candidates = [_found(dataset.ticks, s, drives[each], slipping) for each in sorted({0, lag})]
     found = min(candidates, key=len)
-    jumps = replace(NO_JUMPS, lag=lag, bump=np.inf if bump is None else bump.pose)
+    jumps = replace(NO_JUMPS, lag=lag)
     for jump in found:
         start = s.frame[jump.step]
         end = s.frame[jump.step + 1]

@@ -70,7 +70,7 @@ EXCHANGED = (1, 3)
 REVERSED = (2, 3)
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=2)
 def moving_increments(
         dataset: Dataset, signs: tuple[int, ...] = (1, -1)
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -77,7 +77,9 @@ def estimate(dataset: Dataset, slip: float | None = None, model: str | None = No
     require(model in (None, *MODELS), "estimate", f"{' or '.join(MODELS)} for model", model)
     options = {"slip": slip, "marker_noise_factor": marker_noise_factor,
                "range_noise_factor": range_noise_factor, "kernel": kernel, "gate": gate}
-    dataset = replace(dataset, vehicle=changed(dataset.vehicle, options, "estimate"))
+    vehicle = changed(dataset.vehicle, options, "estimate")
+    if vehicle != dataset.vehicle:                       # of the same Dataset jumps are known
+        dataset = replace(dataset, vehicle=vehicle)
     log.info("estimate of %s: %d poses", dataset.name, len(dataset.ticks))
 
     def start(jumps=NO_JUMPS, places=None, like=None):
