@@ -23,7 +23,7 @@ from numpy.testing import assert_allclose
 from slamlib import estimate, fuse, fuse_increments, localize
 from slamlib.core import se2
 from slamlib.core.evaluation import align, ate
-from slamlib.core.kernels import KERNELS, ONE_SIDED
+from slamlib.core.kernels import KERNELS, ONE_SIDED_BIAS
 from slamlib.core.odometry import dead_reckoning
 from slamlib.core.vehicle import Vehicle
 from slamlib.io.dataset import read_dataset, read_truth
@@ -151,7 +151,7 @@ def test_what_is_not_told_is_released_only_near_its_stated_value(monkeypatch, h,
 @pytest.mark.parametrize("name", ["asymmetric Tukey", "asymmetric Cauchy"])
 def test_ranges_without_late_ones_have_no_bias(name):
     """E[weight(r - b) (r - b)] of standard normal r is zero where the bias b is counted."""
-    r, kernel, b = np.linspace(-8, 8, 4001), KERNELS[name], ONE_SIDED[name]
+    r, kernel, b = np.linspace(-8, 8, 4001), KERNELS[name], ONE_SIDED_BIAS[name]
 
     def mean(shift):
         weight = np.exp(-r**2 / 2) * [kernel.weight(x) for x in r - shift]

@@ -24,7 +24,7 @@ from scipy.integrate import quad
 
 from slamlib import estimate, studies
 from slamlib.core.errors import DatasetError
-from slamlib.core.kernels import KERNELS, ONE_SIDED
+from slamlib.core.kernels import KERNELS, ONE_SIDED_BIAS
 from slamlib.core.odometry import dead_reckoning
 from slamlib.core.records import AntennaGuess, Dataset, UwbReadings
 from slamlib.core.se2 import compose
@@ -67,7 +67,7 @@ def located(dataset):
     Of noisy ranges it weighs late ones less, so the mean that it finds is less than theirs: the
     ranges that it takes as exact are shorter by 0.0758 sigmas.
     """
-    bias = ONE_SIDED["asymmetric Tukey"]
+    bias = ONE_SIDED_BIAS["asymmetric Tukey"]
     return uwb(dataset, range=dataset.uwb.range + bias * dataset.uwb.sigma)
 
 

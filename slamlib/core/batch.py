@@ -41,15 +41,15 @@ NOWHERE = Linearization(gtsam.Values(), {}, np.zeros((0, 0)), [])
 class Batch:
     """Custom factors of one kind, and where they were linearised last.
 
-    `keys` has a list of m keys for each variable of the m factors. The function `linearised` takes
+    `keys` has a list of m keys for each variable of the m factors. The function `errors_at` takes
     an array (m, d) of each variable's values, a pose as [x, y, heading], and returns the errors
     (m, e) and their derivatives (m, e, d), by the tangent vector of each variable. A variable that
     is not in the graph yet is NaN.
     """
 
-    def __init__(self, keys: list[list[int]], linearised: Callable):
+    def __init__(self, keys: list[list[int]], errors_at: Callable):
         self.keys = keys
-        self.linearised = linearised
+        self.errors_at = errors_at
         self.last = NOWHERE
 
     def factor(self, k: int, noise: gtsam.noiseModel.Base) -> gtsam.CustomFactor:
@@ -77,7 +77,7 @@ class Batch:
         for key, column in zip(keys, self.keys):
             absent = [np.nan] * len(place[key])
             columns.append(np.array([place.get(other, absent) for other in column]))
-        errors, derivatives = self.linearised(*columns)
+        errors, derivatives = self.errors_at(*columns)
         return Linearization(values, place, errors, derivatives)
 
 

@@ -25,7 +25,7 @@ from slamlib.core import odometry, se2
 from slamlib.core.batch import Batch
 from slamlib.core.errors import require
 from slamlib.core.increments import TYPICAL_SLIP, OdometryIncrements, odometry_error, preintegrate
-from slamlib.core.kernels import KERNELS, ONE_SIDED, kernel_of, symmetric
+from slamlib.core.kernels import KERNELS, ONE_SIDED_BIAS, kernel_of, symmetric
 from slamlib.core.records import (
     NO_RANGES,
     NO_SIGHTINGS,
@@ -145,13 +145,13 @@ def add_odometry(graph: gtsam.NonlinearFactorGraph, decisions: Decisions):
     root = decisions.root_wheel
     keys = [X(i) for i in increments.frame.tolist()]
 
-    def linearised(from_pose, to_pose, whitened):
+    def errors_at(from_pose, to_pose, whitened):
         poses = np.append(from_pose, to_pose[-1:], axis=0)       # of all frames in their order
         wheel = increments.stated + root @ whitened[0]           # that of every increment
         e, by_poses, by_wheel = odometry_error(increments, poses, wheel)
         return e, [by_poses[:, :, :3], by_poses[:, :, 3:], by_wheel @ root]
 
-    batch = Batch([keys[:-1], keys[1:], [W(0)] * len(keys[1:])], linearised)
+    batch = Batch([keys[:-1], keys[1:], [W(0)] * len(keys[1:])], errors_at)
     for k, covariance in enumerate(increments.covariance(decisions.slip)):
         graph.add(batch.factor(k, gtsam.noiseModel.Gaussian.Covariance(covariance)))
 
@@ -211,7 +211,7 @@ def add_ranges(graph: gtsam.NonlinearFactorGraph, decisions: Decisions):
     """Add a factor for each range, less the bias of a one-sided kernel."""
     ranges = decisions.ranges
     kernel = decisions.kernel
-    measured = ranges.range - ONE_SIDED.get(kernel, 0.0) * ranges.sigma
+    measured = ranges.range - ONE_SIDED_BIAS.get(kernel, 0.0) * ranges.sigma
     for k, sigma in enumerate(ranges.sigma):
         pose = X(ranges.pose[k])
         antenna = A(index_of(ranges.antenna[k]))

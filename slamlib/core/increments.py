@@ -75,7 +75,7 @@ def rounding_and_slipping(ticks: np.ndarray, vehicle: Vehicle, start: np.ndarray
         stop = np.clip(first + length, start, end)
         at_origin = total[stop] - total[begin]
         lever = poses[end] - poses[np.minimum(first, len(poses) - 1)]
-        to_end = se2.moved_by(lever[:, None])                        # I + [0, 0, S lever]
+        to_end = se2.by_left_perturbation(lever[:, None])             # I + [0, 0, S lever]
         return to_end @ at_origin @ to_end.mT
 
     first = start // length * length
@@ -204,7 +204,7 @@ def odometry_error(increments: OdometryIncrements, poses: np.ndarray,
     by_measured, by_expected = se2.between_jacobians(measured, expected)
     e = se2.log(difference)
     J = se2.log_jacobian(difference)
-    by_first = -J @ by_expected @ se2.moved_by(expected)
+    by_first = -J @ by_expected @ se2.by_left_perturbation(expected)
     by_second = J @ se2.compose_jacobians(difference, np.zeros(3))[1]
     by_poses = np.concatenate([by_first, by_second], axis=2)
     by_wheel = J @ by_measured @ increments.J_wheel

@@ -4,7 +4,7 @@ from gtsam.noiseModel import mEstimator
 
 # Classes, and scales in sigmas; the first kernel is the default. The scales of Huber, Cauchy and
 # Tukey have 95 % efficiency on Gaussian noise (Zhang, Image and Vision Computing 15(1), 1997).
-SPECIFIED = {
+CLASS_AND_SCALE = {
     "asymmetric Tukey": (mEstimator.AsymmetricTukey, 4.685),
     "asymmetric Cauchy": (mEstimator.AsymmetricCauchy, 2.385),
     "quadratic": None,
@@ -16,12 +16,12 @@ SPECIFIED = {
 # Location b, in sigmas, for which a one-sided kernel weighs standard normal residuals r, measured
 # minus expected, to E[weight(r - b) (r - b)] = 0. Only r > 0, a late range, loses weight, so the
 # weighted mean of r is below 0: b sigmas are subtracted from each range.
-ONE_SIDED = {"asymmetric Cauchy": -0.10555, "asymmetric Tukey": -0.07581}
+ONE_SIDED_BIAS = {"asymmetric Cauchy": -0.10555, "asymmetric Tukey": -0.07581}
 
 
 def symmetric(name: str) -> str:
     """The name of the kernel of sightings: this one, unless it is one-sided, for ranges only."""
-    return "quadratic" if name in ONE_SIDED else name
+    return "quadratic" if name in ONE_SIDED_BIAS else name
 
 
 def kernel_of(name: str, width: float = 1.0) -> mEstimator.Base | None:
@@ -29,12 +29,12 @@ def kernel_of(name: str, width: float = 1.0) -> mEstimator.Base | None:
 
     Asymmetric kernels need signed errors, which GTSAM passes to them with the scheme Scalar.
     """
-    if SPECIFIED[name] is None:
+    if CLASS_AND_SCALE[name] is None:
         return None
-    kind, scale = SPECIFIED[name]
-    if name in ONE_SIDED:
+    kind, scale = CLASS_AND_SCALE[name]
+    if name in ONE_SIDED_BIAS:
         return kind.Create(scale * width, mEstimator.Base.ReweightScheme.Scalar)
     return kind.Create(scale * width)
 
 
-KERNELS = {name: kernel_of(name) for name in SPECIFIED}
+KERNELS = {name: kernel_of(name) for name in CLASS_AND_SCALE}

@@ -151,14 +151,14 @@ def robust_increments(z: np.ndarray, C: np.ndarray, pair: np.ndarray, first: np.
         for _ in range(iterations):
             linear = common.linearized(increment)
             weight = weight_of(linear.squared)
-            J_t_W = linear.J_delta.mT @ linear.information * weight[:, None, None]
-            step, covariance = _solved(common, linear, J_t_W)
+            J_t_information = linear.J_delta.mT @ linear.information * weight[:, None, None]
+            step, covariance = _solved(common, linear, J_t_information)
             increment = increment + step
             if np.nanmax(np.abs(step), initial=0) <= INCREMENT_STEP_TOLERANCE:
                 break
     increment[:, 2] = se2.wrap(increment[:, 2])
     usable = covariance[:, 2, 2] < MAX_HEADING_SIGMA**2
-    D = covariance[pair] @ J_t_W              # of the last linearisation
+    D = covariance[pair] @ J_t_information              # of the last linearisation
     return MarkerIncrements(
         pair=pair, first=first, second=second, accepted=(weight > 0) & usable[pair],
         J_first=D, J_second=-D @ linear.J_second, covariance=covariance, usable=usable,
@@ -175,15 +175,15 @@ def _gate_weight(squared):
     return squared < GATE
 
 
-def _solved(common, linear, J_t_W):
+def _solved(common, linear, J_t_information):
     """The step (l, 3) C_Delta sum_j J_j^T W_j^-1 r_j, and C_Delta; NaN where undetermined.
 
-    `J_t_W` (p, 3, 3) are the weighted J_j^T W_j^-1.
+    `J_t_information` (p, 3, 3) are the weighted J_j^T W_j^-1.
     """
     information = np.zeros((common.count, 3, 3))
-    np.add.at(information, common.pair, J_t_W @ linear.J_delta)
+    np.add.at(information, common.pair, J_t_information @ linear.J_delta)
     vector = np.zeros((common.count, 3, 1))
-    np.add.at(vector, common.pair, J_t_W @ linear.r[..., None])
+    np.add.at(vector, common.pair, J_t_information @ linear.r[..., None])
     determined = se2.are_regular(information)
     covariance = np.full_like(information, np.nan)
     covariance[determined] = np.linalg.inv(information[determined])

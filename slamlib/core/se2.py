@@ -84,7 +84,7 @@ def compose_jacobians(T_ab: np.ndarray, T_bc: np.ndarray) -> tuple[np.ndarray, n
     return by_first, by_second
 
 
-def moved_by(T: np.ndarray) -> np.ndarray:
+def by_left_perturbation(T: np.ndarray) -> np.ndarray:
     """Derivatives (..., 3, 3) of exp(xi) T by a tangent vector xi at 0, of motions T (..., 3)."""
     return compose_jacobians(np.zeros(3), T)[0]
 

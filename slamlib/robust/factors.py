@@ -189,7 +189,7 @@ def sighting_error(
     by_marker = by_seen.copy()
     marker_in_camera = np.where(as_pose, seen[:, 2], -Y[:, 2])       # a point moves in the world
     by_marker[:, :, :2] @= se2.rotation(marker_in_camera)
-    by_Y = -by_seen @ se2.moved_by(seen)
+    by_Y = -by_seen @ se2.by_left_perturbation(seen)
     by_pose, by_camera, by_lag = _by_sensor(by_Y, mounted, camera, velocity)
     by_size = -by_seen[:, :, :2] @ h[:, :2, None]
     by_bump = after[:, None] * by_camera
@@ -241,7 +241,7 @@ def _by_sensor(by_Y, mounted, place, velocity):
 
 def inverse_adjoint(motion: np.ndarray) -> np.ndarray:
     """Derivatives (..., 3, 3) of xi' by xi where exp(xi) M = M exp(xi'), of motions M (..., 3)."""
-    return se2.between_jacobians(motion, motion)[1] @ se2.moved_by(motion)
+    return se2.between_jacobians(motion, motion)[1] @ se2.by_left_perturbation(motion)
 
 
 def sensor_poses(measurements: Measurements, poses: np.ndarray,

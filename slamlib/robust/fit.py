@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 from gtsam import noiseModel
 
-from slamlib.core.kernels import KERNELS, ONE_SIDED
+from slamlib.core.kernels import KERNELS, ONE_SIDED_BIAS
 from slamlib.core.sightings import GATE, MEDIAN_CHI2, POINT_GATE
 from slamlib.robust.calibration import WHEELS
 from slamlib.robust.error_memory import Memory, error_memory
@@ -65,11 +65,11 @@ def accepted_measurements(
     squared = np.sum(residual**2, axis=1)
     far = squared >= np.where(m.as_pose, GATE, POINT_GATE)
     wrong = late <= -RANGE_GATE
-    if range_kernel not in ONE_SIDED:
+    if range_kernel not in ONE_SIDED_BIAS:
         wrong |= late >= RANGE_GATE
     return AcceptedMeasurements(
-        _unless(gated & far, None if kernel in ONE_SIDED else KERNELS[kernel]),
-        _unless(ranges_gated & wrong, KERNELS[range_kernel], ONE_SIDED.get(range_kernel, 0.0)))
+        _unless(gated & far, None if kernel in ONE_SIDED_BIAS else KERNELS[kernel]),
+        _unless(ranges_gated & wrong, KERNELS[range_kernel], ONE_SIDED_BIAS.get(range_kernel, 0.0)))
 
 
 def _unless(rejected, kernel, bias=0.0):

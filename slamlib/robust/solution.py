@@ -37,7 +37,7 @@ from slamlib.core.graph_solution import (
     eliminated,
     gauss_newton,
 )
-from slamlib.core.kernels import ONE_SIDED, symmetric
+from slamlib.core.kernels import ONE_SIDED_BIAS, symmetric
 from slamlib.core.records import NO_RANGES, NO_SIGHTINGS, ArucoReadings, Dataset, UwbReadings
 from slamlib.robust.calibration import (
     HEIGHT,
@@ -179,7 +179,7 @@ def add_calibrated_ranges(graph: gtsam.NonlinearFactorGraph, problem: Problem, n
     kernel = m.dataset.vehicle.kernel
     sigma = noise.ranges * m.ranges.sigma[rows, None]
     measured = m.ranges.distance[rows]
-    bias = ONE_SIDED.get(kernel, 0.0) * sigma
+    bias = ONE_SIDED_BIAS.get(kernel, 0.0) * sigma
 
     def errors(poses, places, c):
         motion, velocity = delayed(m, frame, c[RANGE_LAG], is_known)
@@ -209,14 +209,14 @@ def add_calibrated(graph: gtsam.NonlinearFactorGraph, problem: Problem, errors: 
     if root.size:
         keys.append(len(landmarks) * [key])
 
-    def linearised(poses, places, *off):
+    def errors_at(poses, places, *off):
         c = problem.measurements.calibration.stated.copy()
         if off:
             c[columns] += root @ off[0][0]
         e, by_pose, by_landmark, by_c = errors(poses, places, c)
         return e, [by_pose, by_landmark, by_c @ root][:len(keys)]
 
-    batch = Batch(keys, linearised)
+    batch = Batch(keys, errors_at)
     for k, (covariance, share) in enumerate(zip(covariances, shares)):
         graph.add(batch.factor(k, noise_model(covariance, kernel, share)))
 

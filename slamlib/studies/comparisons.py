@@ -11,7 +11,7 @@ import pandas as pd
 from slamlib import localize
 from slamlib.core import se2
 from slamlib.core.increments import TYPICAL_SLIP
-from slamlib.core.kernels import ONE_SIDED
+from slamlib.core.kernels import ONE_SIDED_BIAS
 from slamlib.core.records import Dataset
 from slamlib.core.sightings import POINT_GATE
 from slamlib.robust.fit import CAUCHY_SCALES, Fit, accepted_measurements, narrow_kernels, refine
@@ -48,7 +48,7 @@ def solve_with(measurements: Measurements, ranges: str = "asymmetric Tukey",
     problem = build_problem(measurements, "arc")
     start = narrow_kernels(problem, odometry_state(measurements, "arc", antennas=antennas))
     accept = partial(accepted_measurements, sightings=("quadratic", True),
-                     ranges=(ranges, ranges in ONE_SIDED))
+                     ranges=(ranges, ranges in ONE_SIDED_BIAS))
     return refine(problem, start, accept)
 
 
