@@ -12,9 +12,9 @@ from slamlib.core.marker_increments import (
     consecutive_increments,
     distance_and_turn,
     distance_and_turn_sigmas,
-    returns,
     robust_increments,
 )
+from slamlib.core.returns import find_returns
 from slamlib.core.sightings import (
     consensus,
     merge_repeated,
@@ -162,7 +162,7 @@ def test_consensus_is_the_most_certain_sighting_that_agrees_with_the_median():
 def test_returns_measure_the_true_motion(wrong):
     """Without noise the markers give it exactly, also where some labels are wrong."""
     dataset, truth = short(3, noise=False, mislabelled=wrong)
-    found = returns(dataset)
+    found = find_returns(dataset)
     assert len(found.start) > 5 and (found.end - found.start > 450).all()          # poses, of 5 m
     assert np.diff(found.end).min() == 10                                  # every frame is asked
     assert_allclose(found.discrepancies(truth.poses), 0, atol=1e-8)
@@ -171,7 +171,7 @@ def test_returns_measure_the_true_motion(wrong):
 def test_a_drive_without_markers_or_that_goes_nowhere_again_has_no_returns():
     dataset, truth = short(3)
     for each in (dataset.without("aruco"), dataset.first(700), dataset.first(1)):
-        found = returns(each)
+        found = find_returns(each)
         assert found.discrepancies(truth.poses).shape == (0, 3)
         assert found.covariance.shape == (0, 3, 3)
 
@@ -181,7 +181,7 @@ def test_the_covariance_of_returns_is_consistent():
     values = []
     for seed in range(8):
         dataset, truth = short(seed, slip=3e-3)
-        found = returns(dataset)
+        found = find_returns(dataset)
         off = found.discrepancies(truth.poses)
         values.append(nees(off, found.covariance, 0 * off)[-1])
     assert_consistent(values)

@@ -11,9 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from slamlib.core import odometry, se2
-from slamlib.core.records import Dataset
-from slamlib.core.sightings import GATE, MAX_HEADING_SIGMA, Sightings, sightings_by_frame
+from slamlib.core import se2
+from slamlib.core.sightings import GATE, MAX_HEADING_SIGMA, Sightings
 
 CAUCHY_ITERATIONS = 8         # Gauss-Newton iterations with Cauchy weights, at most
 GATE_ITERATIONS = 6           # iterations after these, with the sightings within GATE, at most
@@ -21,9 +20,6 @@ INCREMENT_STEP_TOLERANCE = 1e-10  # m and rad; iterations end after a smaller st
 SPEED_RATIO = 3.0             # ratio of the largest plausible speed to the usual speed
 POINT_PAIRS = 60              # pairs of points, about, that give hypotheses, of each pair of frames
 MIN_TURN_RATE = 1e-3          # rad per encoder step; smaller differences of turn rates are ignored
-MIN_GAP = 5.0                 # m, driven between two sightings of the markers of a return
-MAX_RETURN_FRAMES = 400       # frames, evenly chosen, among which returns are sought
-MIN_COMMON_MARKERS = 2        # markers that both frames of a return see, and that agree
 
 
 @dataclass(frozen=True)
@@ -261,55 +257,3 @@ def distance_and_turn_sigmas(covariance: np.ndarray) -> np.ndarray:
     """
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     return np.sqrt(variance @ [[1, 0], [1, 0], [0, 1]])
-
-
-@dataclass(frozen=True)
-class Returns:
-    """Pairs of frames that see the same markers after a loop, and the motion between them."""
-
-    start: np.ndarray        # (m,) pose index from 0 of the earlier frame
-    end: np.ndarray          # (m,) pose index of the later frame, ascending
-    motion: np.ndarray       # (m, 3) later in earlier frame, by these markers, m and rad
-    covariance: np.ndarray   # (m, 3, 3) of the motion, by the covariances of the sightings
-
-    def discrepancies(self, poses: np.ndarray) -> np.ndarray:
-        """Motions (m, 3) by poses (n, 3) minus these, in the axes of the earlier frames."""
-        return se2.difference(se2.between(poses[self.start], poses[self.end]), self.motion)
-
-
-def returns(dataset: Dataset) -> Returns:
-    """The Returns of a Dataset after at least MIN_GAP of driving; none without markers.
-
-    They show the drift of methods that close no loops, and need no truth. Errors of returns are
-    correlated: they share sections of odometry, and sightings.
-    """
-    s = sightings_by_frame(dataset.sightings)
-    every = len(s.frame) // MAX_RETURN_FRAMES + 1
-    frame = s.frame[::every]
-    sighting = s.table()[::every]
-    seen = sighting >= 0
-    steps = odometry.steps(dataset.ticks, dataset.vehicle)
-    travelled = odometry.cumulative(np.abs(steps.ds))
-    earlier, later = _returning(seen, travelled[frame])
-    pair, marker = np.nonzero(seen[earlier] & seen[later])
-    found = robust_increments(s.z, s.C, pair, sighting[earlier[pair], marker],
-                              sighting[later[pair], marker], len(later))
-    agreeing = np.bincount(pair, found.accepted, len(later))
-    ok = found.usable & (agreeing >= MIN_COMMON_MARKERS)
-    return Returns(start=frame[earlier[ok]], end=frame[later[ok]], motion=found.increment[ok],
-                   covariance=found.covariance[ok])
-
-
-def _returning(seen, travelled):
-    """Earlier and later frames (l,) of returns, by the markers (f, k) that are `seen` at frames.
-
-    A frame returns to the earlier frame with which it has most markers in common, among those from
-    which the vehicle has `travelled` (f,) MIN_GAP since.
-    """
-    markers = seen.astype(int)
-    far = travelled[:, None] - travelled >= MIN_GAP
-    common = np.where(far, markers @ markers.T, 0)
-    later = np.flatnonzero((common >= MIN_COMMON_MARKERS).any(axis=1))
-    if not len(later):
-        return later, later
-    return common[later].argmax(axis=1), later

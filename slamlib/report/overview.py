@@ -16,7 +16,8 @@ from matplotlib.figure import Figure
 from nbformat import NotebookNode
 from nbformat.v4 import new_markdown_cell, new_notebook
 
-from slamlib.core import evaluation, marker_increments
+from slamlib.core import evaluation
+from slamlib.core.returns import find_returns
 from slamlib.core.vehicle import Vehicle
 from slamlib.io.dataset import read_vehicle
 from slamlib.io.results import FIELDS, read_structs, read_summary
@@ -99,7 +100,7 @@ def differences_at_returns(drive: SolvedDrive) -> dict[str, float]:
     By problem; "noise" is what the noise of the sightings alone gives. Sightings are those by the
     camera as it was estimated. None if the drive never returns.
     """
-    returns = marker_increments.returns(replace(drive.dataset, vehicle=drive.vehicle))
+    returns = find_returns(replace(drive.dataset, vehicle=drive.vehicle))
     if len(returns.start) == 0:
         return {}
     variances = np.trace(returns.covariance[:, :2, :2], axis1=1, axis2=2)

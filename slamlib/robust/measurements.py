@@ -265,7 +265,7 @@ class Accepted:
     weight: np.ndarray       # (m,) of its information, 0 if it is rejected
     share: np.ndarray        # (m,) of it that its neighbours leave each (`memory`)
     kernel: mEstimator.Base | None = None      # None: quadratic
-    bias: float = 0.0        # sigmas, of the kernel (`fit.ONE_SIDED_BIAS`)
+    bias: float = 0.0        # sigmas, of the kernel (`kernels.ONE_SIDED_BIAS`)
 
     def kept(self, residual: np.ndarray) -> np.ndarray:
         """(m,) weights, including the kernel's, by signed or absolute whitened residuals (m,)."""
