@@ -30,6 +30,7 @@ import numpy as np
 
 from slamlib.core import se2
 from slamlib.core.errors import DatasetError
+from slamlib.core.odometry import cumulative
 from slamlib.core.records import ArucoReadings, Dataset
 from slamlib.core.sightings import GATE
 from slamlib.robust.calibration import RADII, WHEEL_SCALE, WHEELS, Prior
@@ -44,7 +45,7 @@ from slamlib.robust.linear import (
     laplace_approximation,
     linear_solution,
 )
-from slamlib.robust.measurements import AcceptedMeasurements
+from slamlib.robust.measurements import AcceptedMeasurements, with_known
 from slamlib.robust.part_faults import camera_bump
 from slamlib.robust.result import slam_result
 
@@ -65,6 +66,11 @@ MAX_PROPOSALS = 5            # number of sets that are solved
 MIN_JUMP_LEAD = 10.0         # log evidence by which a jump found at the solution is believed
 
 PLAUSIBLE_FACTOR = 2.0       # on standard deviations, beyond which a sensor is not believed slow
+MIN_SHAKEN_SLIP = 0.01       # sqrt(m), of wheels that are not asked whether the camera shakes
+SHAKEN_SPAN = 40             # number of increments in a sum that tells slip from shaking
+MIN_SPANS = 3                # of these, on which it is judged
+MAX_VARIANCE_RATIO = 0.35    # of the sum, over that of independent increments
+HELD_SLIP = 3e-3             # sqrt(m), of wheels under a camera that shakes
 MAX_CONTRADICTING = 0.01     # share of the measurements, by which a small slip may contradict more
 
 VISIT_GAP = 30               # typical intervals between sightings of a marker, that end a visit
@@ -81,7 +87,18 @@ def memory_or_slip(problem: Problem, state: State) -> Fit:
     Slow errors of sensors bend the path as a large slip does. A small slip is more probable, so
     memory is sought first, unless measurements then contradict the path even if their standard
     deviations were PLAUSIBLE_FACTOR times those in the files, where with a larger slip they do not.
+    A camera that shakes bends it, too, but not for long: then the slip is HELD_SLIP.
     """
+    fit = _by_memory_or_slip(problem, state)
+    if not is_shaken(fit):
+        return fit
+    log.info("slip %.3g mm after 1 m does not accumulate: the camera shakes",
+             1e3 * fit.problem.noise.slip)
+    return refine(with_held_slip(problem), state)
+
+
+def _by_memory_or_slip(problem, state):
+    """The Fit by memory first, or by slip first."""
     fit = refine(problem, state)
     if not (fit.problem.accepted.share < 1).any():
         return fit
@@ -95,6 +112,42 @@ def memory_or_slip(problem: Problem, state: State) -> Fit:
              "%%: %s", 1e3 * fit.problem.noise.slip, 100 * by_memory,
              1e3 * other.problem.noise.slip, 100 * by_slip, "slip" if is_slip else "memory")
     return other if is_slip else fit
+
+
+def is_shaken(fit: Fit) -> bool:
+    """Whether the learned slip is large, and errors of odometry do not accumulate as slips do.
+
+    An error that all markers of an image share, as where the camera tilts, moves the path there and
+    back again. The variance of the sum of independent slips grows with the number of steps, that
+    of such errors does not (variance ratio: Lo and MacKinlay, Rev. Financial Studies 1(1), 1988).
+    Rounding of coarse counts does not accumulate, either, but is odometry's.
+    """
+    problem = fit.problem
+    slip = problem.noise.slip
+    if not problem.measurements.learned[0] or slip < MIN_SHAKEN_SLIP:
+        return False
+    error = odometry_error(problem.odometry, fit.state.poses, fit.state.c[WHEELS])[0]
+    sigma = np.sqrt(problem.odometry.covariance(slip)[:, 0, 0])
+    vehicle = problem.measurements.dataset.vehicle
+    count = 2 * np.pi * vehicle.right_radius / vehicle.ticks_per_revolution      # m
+    if np.median(sigma) < count:
+        return False
+    along = error[:, 0] / sigma
+    total = cumulative(along)
+    sums = total[SHAKEN_SPAN:] - total[:-SHAKEN_SPAN]
+    if len(sums) < MIN_SPANS * SHAKEN_SPAN:
+        return False
+    ratio = np.mean(sums**2) / (SHAKEN_SPAN * np.mean(along**2))
+    return bool(ratio < MAX_VARIANCE_RATIO)
+
+
+def with_held_slip(problem: Problem) -> Problem:
+    """The Problem of a drive with a camera that shakes, whose slip is known to be HELD_SLIP."""
+    m = problem.measurements
+    vehicle = replace(m.dataset.vehicle, slip=HELD_SLIP)
+    held = replace(m, dataset=replace(m.dataset, vehicle=vehicle))
+    return replace(problem, measurements=held, noise=with_known(problem.noise, vehicle),
+                   is_shaken=True)
 
 
 def _contradicting_share(fit):

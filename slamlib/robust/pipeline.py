@@ -16,11 +16,18 @@ from slamlib.core.graph import require_rows
 from slamlib.core.odometry import MODELS
 from slamlib.core.records import Dataset
 from slamlib.core.vehicle import changed
-from slamlib.robust.choices import better_model, calibrated, memory_or_slip, most_consistent
+from slamlib.robust.calibration import Prior
+from slamlib.robust.choices import (
+    better_model,
+    calibrated,
+    memory_or_slip,
+    most_consistent,
+    with_held_slip,
+)
 from slamlib.robust.fit import CAUCHY_SCALES, Fit, narrow_kernels, refine, settled
 from slamlib.robust.initialization import initial_state, state_from_poses
 from slamlib.robust.jumps import NO_JUMPS
-from slamlib.robust.linear import build_problem
+from slamlib.robust.linear import Problem, build_problem
 from slamlib.robust.measurements import Measurements, Noise, measure
 from slamlib.robust.part_faults import with_wheels_mended
 from slamlib.robust.result import SlamResult, slam_result
@@ -138,10 +145,16 @@ def fit_from_odometry(measurements: Measurements, model: str = "arc",
     state = narrow_kernels(problem, initial_state(measurements, model))               # 4, 5
     if like is None:
         return memory_or_slip(problem, state)                                         # 6
-    decided = like.problem
-    problem = replace(problem, prior=decided.prior, memory_first=decided.memory_first)
+    problem = decided_like(problem, like.problem, like.problem.prior)
     fit = refine(problem, replace(state, c=like.state.c))
     return replace(fit, explanations=like.explanations, lead=like.lead)
+
+
+def decided_like(problem: Problem, decided: Problem, prior: Prior) -> Problem:
+    """The Problem with a prior of the calibration, and what else another one has decided."""
+    if decided.is_shaken:
+        problem = with_held_slip(problem)
+    return replace(problem, prior=prior, memory_first=decided.memory_first)
 
 
 def fit_from_previous(measurements: Measurements, previous: SlamResult,
@@ -151,7 +164,7 @@ def fit_from_previous(measurements: Measurements, previous: SlamResult,
     problem = build_problem(m, model or previous.model, Noise(previous.slip), previous.wheel)
     decided = previous.fit.problem
     prior = m.calibration.prior(decided.prior.groups, decided.prior.width)
-    problem = replace(problem, prior=prior, memory_first=decided.memory_first)
+    problem = decided_like(problem, decided, prior)
     c = m.calibration.taken_from(previous.calibration, previous.c)
     state = state_from_poses(m, previous.poses[m.frame], previous.covariances[m.frame], c)
     state = narrow_kernels(problem, state, CAUCHY_SCALES[-1:])
