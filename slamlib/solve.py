@@ -8,7 +8,7 @@ datasets.
 import logging
 import sys
 import time
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -41,21 +41,28 @@ UNSOLVABLE = (DatasetError, np.linalg.LinAlgError)  # what `find` raises where t
 
 
 class Task(NamedTuple):
-    """What a problem is called, and what it needs."""
+    """What a problem is called, what it needs, and what solves it."""
 
     title: str
     sensor: str | None           # attribute of Dataset
     role: str                    # in figures (`notebook.plotting.ROLES`)
+    solve: Callable              # of a Dataset and problem 3's result or None
 
 
 # Every problem in the order of solution, by the name of its results folder.
 PROBLEMS = {
-    "problem1": Task("odometry", None, "odometry"),
-    "problem2": Task("ArUco", "aruco", "aruco"),
-    "problem2_hint": Task("odometry + ArUco, hint", "aruco", "hint"),
-    "problem2_fused": Task("odometry + ArUco", "aruco", "fused"),
-    "problem3": Task("SLAM: odometry + ArUco", "aruco", "slam"),
-    "problem4": Task("SLAM with UWB ranges", "uwb", "slam_uwb"),
+    "problem1": Task("odometry", None, "odometry",
+                     lambda dataset, _: odometry.equation2(dataset.ticks, dataset.vehicle)),
+    "problem2": Task("ArUco", "aruco", "aruco",
+                     lambda dataset, _: localize(dataset.sightings)),
+    "problem2_hint": Task("odometry + ArUco, hint", "aruco", "hint",
+                          lambda dataset, _: fuse_increments(dataset)),
+    "problem2_fused": Task("odometry + ArUco", "aruco", "fused",
+                           lambda dataset, _: fuse(dataset)),
+    "problem3": Task("SLAM: odometry + ArUco", "aruco", "slam",
+                     lambda dataset, _: estimate(dataset.without("uwb"))),
+    "problem4": Task("SLAM with UWB ranges", "uwb", "slam_uwb",
+                     lambda dataset, problem3: estimate(dataset, previous=problem3)),
 }
 SENSORS = {"aruco": "markers", "uwb": "UWB ranges"}
 VEHICLE_ESTIMATED = "vehicle.toml"                  # in the results: what the drive says of it
@@ -68,15 +75,22 @@ COLUMNS = ["dataset", "problem", "estimated_poses", "ate_m", "ate_aligned_m", "n
 
 @dataclass(frozen=True)
 class Solution:
-    """Poses, maps and facts of one problem; it has every pose of the encoder file."""
+    """Poses, maps and facts of one problem; it has every pose of the encoder file.
+
+    The world frame is that of the first pose with an estimate.
+    """
 
     problem: str                   # key of PROBLEMS
     poses: np.ndarray              # (n, 3) in the world frame; NaN where there is no estimate
     covariances: np.ndarray        # (n, 3, 3) of [x, y, heading] in world axes
-    world: int = 0                 # index from 0 of the pose whose frame is the world frame
     maps: dict = field(default_factory=dict)    # ids, places and covariances by name of the file
     facts: dict = field(default_factory=dict)       # plain numbers for the summary
     doubts: tuple[Doubt, ...] = ()
+
+    @property
+    def known(self) -> np.ndarray:
+        """Indices of the poses with an estimate."""
+        return np.flatnonzero(np.isfinite(self.poses[:, 0]))
 
 
 @dataclass(frozen=True)
@@ -99,14 +113,7 @@ def find(problem: str, dataset: Dataset, previous: SlamResult | None = None):
     Problem 4 starts from `previous`, problem 3's. Raises UNSOLVABLE where the measurements
     determine no solution.
     """
-    solvers = {
-        "problem1": lambda: odometry.equation2(dataset.ticks, dataset.vehicle),
-        "problem2": lambda: localize(dataset.sightings),
-        "problem2_hint": lambda: fuse_increments(dataset),
-        "problem2_fused": lambda: fuse(dataset),
-        "problem3": lambda: estimate(dataset.without("uwb")),
-        "problem4": lambda: estimate(dataset, previous=previous)}
-    return solvers[problem]()
+    return PROBLEMS[problem].solve(dataset, previous)
 
 
 def problem_solution(problem: str, dataset: Dataset, found) -> Solution:
@@ -121,9 +128,9 @@ def problem_solution(problem: str, dataset: Dataset, found) -> Solution:
     if problem == "problem1":
         found = Fusion(*found, rejected=0)
     maps = {}
-    if hasattr(found, "marker"):
+    if len(getattr(found, "marker", ())):
         maps["ArucoMap"] = found.marker, found.marker_in_world, found.marker_covariance
-    if hasattr(found, "antenna"):
+    if len(getattr(found, "antenna", ())):
         maps["UwbMap"] = found.antenna, found.antenna_in_world, found.antenna_covariance
     is_known = np.isfinite(found.poses[:, 0])
     covariances = [found.covariances[is_known]]
@@ -139,23 +146,22 @@ def problem_solution(problem: str, dataset: Dataset, found) -> Solution:
         doubts = fusion_doubts(found, dataset.vehicle)
     if isinstance(found, SlamResult):
         doubts = solution_doubts(found)
-    maps = {name: values for name, values in maps.items() if len(values[0])}
-    solution = Solution(problem, found.poses, found.covariances, maps=maps, facts=_facts(found),
-                        doubts=doubts)
+    poses = found.poses
+    covariances = found.covariances
     if problem == "problem2":
-        return _at_all_poses(solution, found.frame, len(dataset.ticks))
-    return solution
+        poses, covariances = _at_all_poses(found, len(dataset.ticks))
+    return Solution(problem, poses, covariances, maps, _facts(found), doubts)
 
 
-def _at_all_poses(solution, frame, count):
-    """The Solution at frames (f,) as one of all poses; the first localized pose is the world."""
+def _at_all_poses(found, count):
+    """Poses (count, 3) and covariances of a Localization, of which other poses are NaN."""
     poses = np.full((count, 3), np.nan)
     covariances = np.full((count, 3, 3), np.nan)
-    poses[frame] = solution.poses
-    covariances[frame] = solution.covariances
-    known = np.flatnonzero(np.isfinite(poses[:, 0]))
+    poses[found.frame] = found.poses
+    covariances[found.frame] = found.covariances
+    known = np.isfinite(poses[:, 0])
     poses[known, 2] = np.unwrap(poses[known, 2])
-    return replace(solution, poses=poses, covariances=covariances, world=int(known[0]))
+    return poses, covariances
 
 
 def _facts(found):
@@ -203,7 +209,7 @@ def solutions(dataset: Dataset, problems: Collection[str] = PROBLEMS) -> list[So
             found = find(problem, dataset, previous)
         except UNSOLVABLE as error:
             found = error
-        if problem == "problem3" and isinstance(found, SlamResult):
+        if isinstance(found, SlamResult):
             previous = found
         solution = solved(problem, dataset, found)
         if isinstance(solution, Solution):
@@ -326,16 +332,16 @@ def summarize(solved: Solution | Failure, truth: Truth | None) -> dict:
     title = PROBLEMS[solved.problem].title
     if isinstance(solved, Failure):
         return {"title": title, "doubts": [], "failed": solved.reason}
-    is_known = np.isfinite(solved.poses[:, 0])
-    sigmas = evaluation.sigmas(solved.covariances[is_known])
+    sigmas = evaluation.sigmas(solved.covariances[solved.known])
+    world = int(solved.known[0])
     position_sigmas = sigmas[:, :2].max(axis=1)
     row = {"title": title, "doubts": [asdict(doubt) for doubt in solved.doubts],
-           "estimated_poses": len(sigmas), "world_is_pose": solved.world + 1,
+           "estimated_poses": len(sigmas), "world_is_pose": world + 1,
            "last_sigma_m": position_sigmas[-1], "median_sigma_m": np.median(position_sigmas),
            "median_sigma_heading_rad": np.median(sigmas[:, 2])}
     row |= solved.facts
     if truth is not None:
-        true = se2.between(truth.poses[solved.world], truth.poses)
+        true = se2.between(truth.poses[world], truth.poses)
         row["ate_m"] = evaluation.ate(solved.poses, true)
         row["ate_aligned_m"] = evaluation.ate(solved.poses, true, aligned=True)
         nees = evaluation.anees(solved.poses, solved.covariances, true)
@@ -385,9 +391,9 @@ def solve_folder(folder: Path | str, out: Path | str, problems: Collection[str] 
     if verbose:
         logging.basicConfig(format="%(message)s")
         logging.getLogger("slamlib").setLevel(logging.INFO)
-    require(out.resolve() not in (folder.resolve(), folder.resolve() / "truth"), out,
-            "another folder for the results: this one is the dataset's")
     dataset = read_dataset(folder)
+    require(not out.resolve().is_relative_to(folder.resolve()), out,
+            "another folder for the results: this one is in the dataset's")
     truth = read_truth(folder)
     print("\n".join(inventory_lines(dataset, truth)), file=sys.stderr)
     for problem in problems:

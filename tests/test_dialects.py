@@ -151,7 +151,7 @@ wheelbase = 0 | 1 | a number from 0.001 to 20 m for wheelbase, found '0'
     "vehicle.toml": """
 # a¶wheel_base = 1 | 2 | entries such as 'wheelbase = 0.4', found 'wheel_base'
 [wheelbases]¶x = 1 | 1 | entries such as 'wheelbase = 0.4', found 'wheelbases'
-# left_radius = 1¶¶left_radius = 'wide' | 3 | a number from 0.001 to 2.5 m for left_radius, found 'wide'
+# left_radius¶left_radius = 'wide' | 2 | a number from 0.001 to 2.5 m for left_radius, found 'wide'
 gate = true¶ "left_radius" = [0.1] | 2 | a number from 0.001 to 2.5 m for left_radius, found '[0.1]'
 left_radius = true | 1 | a number from 0.001 to 2.5 m for left_radius, found 'True'
 left_radius = nan | 1 | a number from 0.001 to 2.5 m for left_radius, found 'nan'
@@ -294,8 +294,8 @@ def test_why_a_mat_file_is_not_read_is_said(folder, content):
     listed, reason = read_dataset(folder).notes
     assert listed == "Not read: 'UwbReading.mat'."
     assert reason.startswith(
-        "UwbReading.mat: expected a matrix named as UwbReading.txt of a file that 'save -v7' wrote, "
-        "found '")
+        "UwbReading.mat: expected a matrix named as UwbReading.txt of a file that 'save -v7' "
+        "wrote, found '")
 
 
 def test_a_mat_file_without_the_matrix_of_a_missing_file_is_told_with_what_it_has(folder):

@@ -80,6 +80,7 @@ def test_results_are_not_written_into_a_dataset(folder, monkeypatch, capsys):
     before = file_names(folder)
     for command in (["solve", "drive", "--out", "drive"],
                     ["solve", "drive", "--out", "drive/truth"],
+                    ["solve", "drive", "--out", "drive/new/results"],
                     ["solve", "drive", "nowhere", "--out", "."],
                     ["report", "--data", "results"]):
         assert main(command) == 2

@@ -47,8 +47,8 @@ def read_options(path: str | Path) -> Options:
     entries, places = read_toml(path, 'author = "Ada Lovelace"', keys)
     chapters = entries.pop("chapters", [])
     is_list = isinstance(chapters, list) and all(isinstance(name, str) for name in chapters)
-    require(is_list, places.get("chapters"), 'a list of notebooks in quotes, such as ["1_odometry", "A_studies"], '
-            'for chapters', chapters)
+    require(is_list, places.get("chapters"), 'a list of notebooks in quotes, such as '
+            '["1_odometry", "A_studies"], for chapters', chapters)
     for key, value in entries.items():
         is_line = type(value) in (str, int) and re.fullmatch(r"[^\n\ufffd]*", str(value))
         require(is_line, places[key], f"a line of UTF-8 text in quotes for {key}", value)

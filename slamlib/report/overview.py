@@ -50,8 +50,7 @@ def solved_drive(drive: Drive, results: Path) -> SolvedDrive:
             found = {name: read_structs(results / problem, name) for name in FIELDS
                      if (results / problem / f"{name}.mat").exists()}
             _, poses, covariances = found.pop("vehiclePose")
-            world = row["world_is_pose"] - 1
-            solutions.append(Solution(problem, poses, covariances, world, found))
+            solutions.append(Solution(problem, poses, covariances, found))
     estimated = results / VEHICLE_ESTIMATED
     vehicle = read_vehicle(estimated if estimated.exists() else None, drive.dataset.vehicle)
     return SolvedDrive(drive.name, drive.dataset, drive.truth, solutions, summary, vehicle)
