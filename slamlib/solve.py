@@ -180,18 +180,13 @@ def _facts(found):
     return facts
 
 
-def solved(problem: str, dataset: Dataset, found) -> Solution | Failure:
-    """The Solution from what `find` returned, or the Failure by what it raised, of UNSOLVABLE."""
-    try:
-        if isinstance(found, Exception):
-            raise found
-        return problem_solution(problem, dataset, found)
-    except UNSOLVABLE as error:
-        reason = str(error).removeprefix(f"{dataset.name}: ")
-        if isinstance(error, np.linalg.LinAlgError):
-            reason = ("expected lengths and standard deviations that float64 can hold together; "
-                      f"some are so far from the others that matrices lose their digits ({reason})")
-        return Failure(problem, reason)
+def failure(problem: str, dataset: Dataset, error: Exception) -> Failure:
+    """The Failure of a problem by an `error` of UNSOLVABLE."""
+    reason = str(error).removeprefix(f"{dataset.name}: ")
+    if isinstance(error, np.linalg.LinAlgError):
+        reason = ("expected lengths and standard deviations that float64 can hold together; "
+                  f"some are so far from the others that matrices lose their digits ({reason})")
+    return Failure(problem, reason)
 
 
 def solutions(dataset: Dataset, problems: Collection[str] = PROBLEMS) -> list[Solution | Failure]:
@@ -207,13 +202,12 @@ def solutions(dataset: Dataset, problems: Collection[str] = PROBLEMS) -> list[So
         start = time.perf_counter()
         try:
             found = find(problem, dataset, previous)
-        except UNSOLVABLE as error:
-            found = error
-        if isinstance(found, SlamResult):
-            previous = found
-        solution = solved(problem, dataset, found)
-        if isinstance(solution, Solution):
+            if isinstance(found, SlamResult):
+                previous = found
+            solution = problem_solution(problem, dataset, found)
             solution.facts["seconds"] = time.perf_counter() - start
+        except UNSOLVABLE as error:
+            solution = failure(problem, dataset, error)
         every.append(solution)
     return every
 
@@ -235,7 +229,8 @@ def write_results(out: Path | str, problem: str, found, dataset: Dataset,
 
     Returns
     -------
-    The Solution that is written, whose `doubts` say what contradicts the files, or a Failure.
+    The Solution that is written, whose `doubts` say what contradicts the files, or the Failure by
+    an exception. Raises UNSOLVABLE if a covariance is lost by rounding.
 
     >>> from slamlib.studies.simulation import simulate
     >>> dataset, truth = simulate("short", seed=1)
@@ -246,7 +241,10 @@ def write_results(out: Path | str, problem: str, found, dataset: Dataset,
     2000
     """
     out = Path(out)
-    solution = solved(problem, dataset, found)
+    if isinstance(found, Exception):
+        solution = failure(problem, dataset, found)
+    else:
+        solution = problem_solution(problem, dataset, found)
     if doubts is None:
         doubts = doubts_before_solving(dataset)
     with files.locked(out):

@@ -14,7 +14,7 @@ from slamlib.io import files
 from slamlib.io.dataset import inventory_lines
 from slamlib.io.results import SUMMARY, read_summary, write_summary
 from slamlib.io.tables import datasets_in
-from slamlib.notebook.drives import read_drives, without_stand_ins
+from slamlib.notebook.drives import read_drives
 from slamlib.report import cache
 from slamlib.report.notebooks import Options, read_books
 from slamlib.solve import SENSORS, clear_results, doubts_of_results, summary_of
@@ -73,14 +73,13 @@ def _read(data, selected):
     for name in names:
         require(DATASET_NAME.fullmatch(name), data / name, "letters from a to z, digits, spaces, "
                 "dots, dashes and underscores in its name: rename this folder")
-    found = read_drives(data, names)
-    drives = found if selected else without_stand_ins(found)
+    drives = read_drives(data, selected)
     lines = []
     for drive in drives:
         lines += inventory_lines(drive.dataset, drive.truth)
-    omitted = [drive.name for drive in found if drive not in drives]
-    if omitted:
-        lines.append(f"left out, because simulated: {', '.join(omitted)} (name all datasets to "
+        names.remove(drive.name)
+    if names:
+        lines.append(f"left out, because simulated: {', '.join(names)} (name all datasets to "
                      "have them)")
     _say("\n".join(lines + unread))
     return drives
