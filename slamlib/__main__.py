@@ -78,9 +78,10 @@ def _parser():
 
 def _build(options):
     """Build the report, and the zip to hand in where that is the command."""
-    from slamlib.report import NotebookError, build_report, handin
-    from slamlib.report.notebooks import notebooks_folder, read_options
-    shown = read_options("report.toml")
+    from slamlib.report import handin
+    from slamlib.report.build import build_report
+    from slamlib.report.notebooks import NotebookError, notebooks_folder, read_options
+    shown = read_options(Path("report.toml"))
     pages = Path("report")
     if options.command == "hand-in":
         shown = handin.hand_in_options(shown)

@@ -8,7 +8,7 @@ datasets.
 import logging
 import sys
 import time
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -41,28 +41,21 @@ UNSOLVABLE = (DatasetError, np.linalg.LinAlgError)  # what `find` raises where t
 
 
 class Task(NamedTuple):
-    """What a problem is called, what it needs, and what solves it."""
+    """What a problem is called, and what it needs."""
 
     title: str
     sensor: str | None           # attribute of Dataset
     role: str                    # in figures (`notebook.plotting.ROLES`)
-    solve: Callable              # of a Dataset and problem 3's result or None
 
 
 # Every problem in the order of solution, by the name of its results folder.
 PROBLEMS = {
-    "problem1": Task("odometry", None, "odometry",
-                     lambda dataset, _: odometry.equation2(dataset.ticks, dataset.vehicle)),
-    "problem2": Task("ArUco", "aruco", "aruco",
-                     lambda dataset, _: localize(dataset.sightings)),
-    "problem2_hint": Task("odometry + ArUco, hint", "aruco", "hint",
-                          lambda dataset, _: fuse_increments(dataset)),
-    "problem2_fused": Task("odometry + ArUco", "aruco", "fused",
-                           lambda dataset, _: fuse(dataset)),
-    "problem3": Task("SLAM: odometry + ArUco", "aruco", "slam",
-                     lambda dataset, _: estimate(dataset.without("uwb"))),
-    "problem4": Task("SLAM with UWB ranges", "uwb", "slam_uwb",
-                     lambda dataset, problem3: estimate(dataset, previous=problem3)),
+    "problem1": Task("odometry", None, "odometry"),
+    "problem2": Task("ArUco", "aruco", "aruco"),
+    "problem2_hint": Task("odometry + ArUco, hint", "aruco", "hint"),
+    "problem2_fused": Task("odometry + ArUco", "aruco", "fused"),
+    "problem3": Task("SLAM: odometry + ArUco", "aruco", "slam"),
+    "problem4": Task("SLAM with UWB ranges", "uwb", "slam_uwb"),
 }
 SENSORS = {"aruco": "markers", "uwb": "UWB ranges"}
 VEHICLE_ESTIMATED = "vehicle.toml"                  # in the results: what the drive says of it
@@ -113,7 +106,14 @@ def find(problem: str, dataset: Dataset, previous: SlamResult | None = None):
     Problem 4 starts from `previous`, problem 3's. Raises UNSOLVABLE where the measurements
     determine no solution.
     """
-    return PROBLEMS[problem].solve(dataset, previous)
+    solvers = {
+        "problem1": lambda: odometry.equation2(dataset.ticks, dataset.vehicle),
+        "problem2": lambda: localize(dataset.sightings),
+        "problem2_hint": lambda: fuse_increments(dataset),
+        "problem2_fused": lambda: fuse(dataset),
+        "problem3": lambda: estimate(dataset.without("uwb")),
+        "problem4": lambda: estimate(dataset, previous=previous)}
+    return solvers[problem]()
 
 
 def problem_solution(problem: str, dataset: Dataset, found) -> Solution:

@@ -14,8 +14,8 @@ from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook
 from slamlib.__main__ import main
 from slamlib.core.errors import DatasetError
 from slamlib.io.files import write_file
-from slamlib.report import NotebookError, build_report
-from slamlib.report.notebooks import Options, read_options
+from slamlib.report.build import build_report
+from slamlib.report.notebooks import NotebookError, Options, read_options
 
 ENVIRONMENT = """import os, sys
 print("stderr is shown", file=sys.stderr)

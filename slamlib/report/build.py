@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import joblib
+import nbformat
 
 from slamlib.core.errors import DatasetError, require
 from slamlib.io import files
@@ -111,7 +112,8 @@ def _execute(books, drives, data, kept):
 
     def finish(source, executed, seconds):
         folder = kept / source.stem
-        cache.keep(folder, keys[source], executed)
+        content = nbformat.writes(executed)
+        files.write_file(folder / f"{keys[source]}.ipynb", content.encode())
         cache.recall(folder, keys[source], books[source])
         say(source, f"executed in {seconds:.1f} s")
 

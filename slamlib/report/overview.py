@@ -11,7 +11,6 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 from IPython.core.pylabtools import print_figure
-from jinja2 import Template
 from matplotlib.figure import Figure
 from nbformat import NotebookNode
 from nbformat.v4 import new_markdown_cell, new_notebook
@@ -23,9 +22,9 @@ from slamlib.io.results import FIELDS, read_structs, read_summary
 from slamlib.notebook import Drive, plotting, table
 from slamlib.notebook.drives import plain, without_stand_ins
 from slamlib.report.document import address
+from slamlib.report.notebooks import rendered
 from slamlib.solve import PROBLEMS, SENSORS, VEHICLE_ESTIMATED, Solution
 
-TEXT = Path(__file__).with_name("overview.md")
 DRAWN = "problem1", "problem2_fused"  # whose trajectories figure 1 has, beside the last one
 # Columns of the table of results, in thousandths of these entries of a summary.
 COLUMNS = {"ATE (mm)": "ate_m", "aligned (mm)": "ate_aligned_m", "at returns (mm)": "at_returns_m",
@@ -61,11 +60,10 @@ def opening(drives: list[SolvedDrive]) -> NotebookNode:
     solved = [drive for drive in drives if drive.solutions]
     longest = without_stand_ins(solved)[-1] if solved else None
     drawn = trajectories(longest) if longest else ""
-    template = Template(TEXT.read_text(encoding="utf-8"), trim_blocks=True, lstrip_blocks=True)
-    text = template.render(
-        drives=drives, longest=longest, plain=plain, sensors=SENSORS,
-        picture=address("image/svg+xml", drawn),
-        results=table(row for drive in drives for row in result_rows(drive)).data)
+    rows = [row for drive in drives for row in result_rows(drive)]
+    text = rendered(
+        "overview.md", drives=drives, longest=longest, plain=plain, sensors=SENSORS,
+        picture=address("image/svg+xml", drawn), results=table(rows).data)
     return new_notebook(cells=[new_markdown_cell(text)])
 
 
@@ -118,10 +116,9 @@ def trajectories(drive: SolvedDrive) -> str:
     fig = Figure(figsize=(7.2, 3.1))  # inches
     left, right = fig.subplots(1, 2, width_ratios=(2, 3))
     last = drive.solutions[-1]
-    for name, role, size in (("ArucoMap", "marker", 1), ("UwbMap", "antenna", 5)):
+    for name, role in (("ArucoMap", "marker"), ("UwbMap", "antenna")):
         if name in last.maps:
-            look = plotting.ROLES[role] | {"markersize": size}
-            left.plot(*last.maps[name][1].T[:2], label=f"{role}s", **look)
+            plotting.landmarks(left, last.maps[name][1], role, f"{role}s", markersize=2)
     for solution in drive.solutions:
         title, _, role = PROBLEMS[solution.problem]
         if solution.problem in DRAWN or solution is last:
