@@ -1,6 +1,7 @@
 """The command line, `slamlib` or `python -m slamlib`: its options, commands and exit codes."""
 
 import argparse
+import logging
 import os
 import signal
 import sys
@@ -129,11 +130,12 @@ def _solve(options):
     """Solve the problems of one dataset or several, and print a table of each."""
     from slamlib.solve import solve_folder, solve_folders
     problems = [f"problem{each}" for each in options.problem]
-    how = {"problems": problems, "verbose": options.verbose}
+    if options.verbose:
+        logging.basicConfig(format="%(message)s", level=logging.INFO)
     if len(options.folders) > 1:
-        summaries = solve_folders(options.folders, options.out, options.jobs, **how)
+        summaries = solve_folders(options.folders, options.out, options.jobs, problems=problems)
     else:
-        summaries = [solve_folder(options.folders[0], options.out, **how)]
+        summaries = [solve_folder(options.folders[0], options.out, problems)]
     code = _told(summaries)
     print(f"results: {options.out.resolve()}", file=sys.stderr)
     return code

@@ -5,7 +5,6 @@ plain numbers. `solve_to_folder` does so for all problems of a dataset, `solve_f
 datasets.
 """
 
-import logging
 import sys
 import time
 from collections.abc import Collection, Iterable, Sequence
@@ -79,11 +78,6 @@ class Solution:
     maps: dict = field(default_factory=dict)    # ids, places and covariances by name of the file
     facts: dict = field(default_factory=dict)       # plain numbers for the summary
     doubts: tuple[Doubt, ...] = ()
-
-    @property
-    def known(self) -> np.ndarray:
-        """Indices of the poses with an estimate."""
-        return np.flatnonzero(np.isfinite(self.poses[:, 0]))
 
 
 @dataclass(frozen=True)
@@ -280,49 +274,44 @@ def _write(out, dataset, truth, found, others, doubts):
     """Write Solutions to a folder; return its summary, with the rows of `others`, too."""
     rows = others | {each.problem: summarize(each, truth) for each in found}
     (out / results.SUMMARY).unlink(missing_ok=True)
-    written = []
+    written = [file for problem in others for file in result_files(out, problem)]
     for each in found:
         if isinstance(each, Solution):
             written += results.write_solution(out, each)
-    clear_results(out, written, keep=others)
-    summary = summary_of(dataset, truth, rows, [*doubts, *doubts_of_results(out)])
-    _write_estimated_vehicle(out / VEHICLE_ESTIMATED, dataset.vehicle, summary["problems"])
-    results.write_summary(out, summary)
-    return summary
+    return finish_results(out, written, dataset, truth, rows, doubts)
 
 
-def clear_results(out: Path, written: Collection[Path], keep: Iterable[str] = ()):
-    """Remove the files of earlier runs from a results folder whose summary is gone.
+def result_files(out: Path, problem: str) -> list[Path]:
+    """Paths of all files that a problem may have in a results folder."""
+    return [out / problem / name for name in results.RESULT_FILES]
 
-    The files `written` and those of the problems `keep` stay, and so do all other files and
-    folders.
+
+def finish_results(out: Path, written: Collection[Path], dataset: Dataset, truth: Truth | None,
+                   rows: dict, doubts: Iterable[Doubt]) -> dict:
+    """Finish a results folder whose summary is gone; returns the new one.
+
+    Result files of earlier runs that are not among the `written` ones are removed; all other files
+    stay. The summary, by the rows (dict) of its problems and the doubts about the files, is written
+    last. With problem 2's fusion and problem 3, it doubts a fusion that contradicts problem 3.
     """
-    files_of_runs = [out / VEHICLE_ESTIMATED]
-    for problem in PROBLEMS.keys() - keep:
-        files_of_runs += [out / problem / name for name in results.RESULT_FILES]
-    for file in files_of_runs:
-        if file not in written:
-            file.unlink(missing_ok=True)
-
-
-def doubts_of_results(out: Path) -> tuple[Doubt, ...]:
-    """A Doubt if problem 2's fusion contradicts problem 3 in a results folder that has both."""
+    for problem in PROBLEMS:
+        for file in result_files(out, problem):
+            if file not in written:
+                file.unlink(missing_ok=True)
+    problems = {problem: rows[problem] for problem in PROBLEMS if problem in rows}
+    doubts = list(doubts)
     with suppress(OSError):
         _, poses, covariances = results.read_structs(out / "problem2_fused", "vehiclePose")
         _, by_slam, _ = results.read_structs(out / "problem3", "vehiclePose")
-        return contradiction_doubts(poses, covariances, by_slam)
-    return ()
-
-
-def summary_of(dataset: Dataset, truth: Truth | None, rows: dict, doubts: list[Doubt]) -> dict:
-    """The summary of a drive, by the rows (dict) of its problems and doubts about its files."""
-    doubts = list(doubts)
-    problems = {problem: rows[problem] for problem in PROBLEMS if problem in rows}
+        doubts += contradiction_doubts(poses, covariances, by_slam)
     for row in problems.values():
         doubts += [Doubt(**doubt) for doubt in row["doubts"]]
-    return {"dataset": dataset.name, "poses": len(dataset.ticks),
-            "doubts": [asdict(doubt) for doubt in merged(doubts)],
-            "notes": all_notes(dataset, truth), "problems": problems}
+    _write_estimated_vehicle(out / VEHICLE_ESTIMATED, dataset.vehicle, problems)
+    summary = {"dataset": dataset.name, "poses": len(dataset.ticks),
+               "doubts": [asdict(doubt) for doubt in merged(doubts)],
+               "notes": all_notes(dataset, truth), "problems": problems}
+    results.write_summary(out, summary)
+    return summary
 
 
 def summarize(solved: Solution | Failure, truth: Truth | None) -> dict:
@@ -330,8 +319,9 @@ def summarize(solved: Solution | Failure, truth: Truth | None) -> dict:
     title = PROBLEMS[solved.problem].title
     if isinstance(solved, Failure):
         return {"title": title, "doubts": [], "failed": solved.reason}
-    sigmas = evaluation.sigmas(solved.covariances[solved.known])
-    world = int(solved.known[0])
+    known = np.flatnonzero(np.isfinite(solved.poses[:, 0]))
+    world = int(known[0])
+    sigmas = evaluation.sigmas(solved.covariances[known])
     position_sigmas = sigmas[:, :2].max(axis=1)
     row = {"title": title, "doubts": [asdict(doubt) for doubt in solved.doubts],
            "estimated_poses": len(sigmas), "world_is_pose": world + 1,
@@ -367,28 +357,17 @@ def _write_estimated_vehicle(path, vehicle, rows):
     for name, fact in NOISE.items():
         if fact in learned and getattr(vehicle, name) is None:
             estimated[name] = learned[fact]
+    path.unlink(missing_ok=True)
     if estimated:
         write_vehicle(path, replace(vehicle, **estimated))
 
 
-def solve_folder(folder: Path | str, out: Path | str, problems: Collection[str] = (),
-                 verbose: bool = False) -> dict:
+def solve_folder(folder: Path, out: Path, problems: Collection[str] = ()) -> dict:
     """Read the dataset in a folder, solve it into the folder `out`; returns the summary.
 
-    What was read is printed to stderr.
-
-    Parameters
-    ----------
-    problems : keys of `PROBLEMS`, or none for all that the sensors allow.
-    verbose : True prints to stderr what is decided on the way.
-
-    Raises DatasetError if the dataset is malformed or does not allow a problem.
+    What was read is printed to stderr. `problems` are keys of `PROBLEMS`, or none for all that the
+    sensors allow. Raises DatasetError if the dataset is malformed or does not allow a problem.
     """
-    folder = Path(folder)
-    out = Path(out)
-    if verbose:
-        logging.basicConfig(format="%(message)s")
-        logging.getLogger("slamlib").setLevel(logging.INFO)
     dataset = read_dataset(folder)
     require(not out.resolve().is_relative_to(folder.resolve()), out,
             "another folder for the results: this one is in the dataset's")

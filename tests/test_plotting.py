@@ -22,7 +22,7 @@ def drawn(count, rows, columns=2, labels=LABELS):
     for _, axes in plotting.each_drive("abc"[:count], rows, 4.0, columns=columns):
         for ax in np.atleast_1d(axes):
             for label in labels:
-                plotting.curve(ax, np.arange(9.0), "slam", label=label)
+                plotting.curve(ax, np.arange(9.0), "slam", np.arange(9), label)
     return plt.gcf()
 
 

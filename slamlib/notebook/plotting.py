@@ -17,6 +17,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 from matplotlib_inline.backend_inline import set_matplotlib_formats
@@ -194,8 +195,9 @@ def ellipses(ax: Axes, positions: np.ndarray, covariances: np.ndarray, color: st
     angle = np.pi * np.arange(40) / 20
     circle = np.stack([np.cos(angle), np.sin(angle)])
     outlines = positions[:, :2, None] + directions * half_axes[:, None] @ circle
-    ax.add_collection(PolyCollection(outlines.mT, facecolors=(color, fill), edgecolors="#444444",
-                                     linewidths=0.7, zorder=3.5))
+    edge = 0.6 * np.array(to_rgb(color))                  # darker than the path below them
+    ax.add_collection(PolyCollection(outlines.mT, facecolors=(color, fill), edgecolors=edge,
+                                     linewidths=0.9, zorder=3.5))
     ax.autoscale_view()
     return ax
 
@@ -211,10 +213,10 @@ def draw_antennas(ax: Axes, positions: np.ndarray, covariances: np.ndarray,
     return landmarks(ax, positions, "antenna", "antennas: estimate")
 
 
-def landmarks(ax: Axes, places: np.ndarray, role: str, label: str, **look) -> Axes:
+def landmarks(ax: Axes, places: np.ndarray, role: str, label: str) -> Axes:
     """Draw the signs of landmarks at places (k, >= 2)."""
     if len(places):
-        ax.plot(places[:, 0], places[:, 1], label=label, **ROLES[role] | look)
+        ax.plot(places[:, 0], places[:, 1], label=label, **ROLES[role])
     return ax
 
 
@@ -253,10 +255,8 @@ def legend_below(fig: Figure) -> None:
     fig.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=columns)
 
 
-def curve(ax: Axes, values: np.ndarray, role: str, frame: np.ndarray | None = None,
-          label: str | None = None, **look) -> Axes:
+def curve(ax: Axes, values: np.ndarray, role: str, frame: np.ndarray, label: str | None = None,
+          **look) -> Axes:
     """Draw values (n,) over the pose id; `frame` (n,) are the indices from 0 of their poses."""
-    if frame is None:
-        frame = np.arange(len(values))
     ax.plot(frame + 1, values, label=label or role, **ROLES[role] | look)
     return ax

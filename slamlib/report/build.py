@@ -13,12 +13,12 @@ import nbformat
 from slamlib.core.errors import DatasetError, require
 from slamlib.io import files
 from slamlib.io.dataset import inventory_lines
-from slamlib.io.results import SUMMARY, read_summary, write_summary
+from slamlib.io.results import SUMMARY, read_summary
 from slamlib.io.tables import datasets_in
 from slamlib.notebook.drives import read_drives
 from slamlib.report import cache
 from slamlib.report.notebooks import Options, read_books
-from slamlib.solve import SENSORS, clear_results, doubts_of_results, summary_of
+from slamlib.solve import SENSORS, finish_results
 
 # Name of the file in a report that has a digest and lists its files; all others are the user's.
 PAGES = ".pages"
@@ -145,11 +145,7 @@ def _write_results(drive, stages, folder):
                 if file.is_file() and file.name != SUMMARY:
                     written.append(folder / file.relative_to(own))
                     files.write_file(written[-1], file.read_bytes())
-        clear_results(folder, written)
-        doubts = [*drive.doubts, *doubts_of_results(folder)]
-        summary = summary_of(drive.dataset, drive.truth, rows, doubts)
-        write_summary(folder, summary)
-    return summary
+        return finish_results(folder, written, drive.dataset, drive.truth, rows, drive.doubts)
 
 
 def _write_pages(books, keys, drives, summaries, options, results, report):

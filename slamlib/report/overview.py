@@ -116,9 +116,10 @@ def trajectories(drive: SolvedDrive) -> str:
     fig = Figure(figsize=(7.2, 3.1))  # inches
     left, right = fig.subplots(1, 2, width_ratios=(2, 3))
     last = drive.solutions[-1]
-    for name, role in (("ArucoMap", "marker"), ("UwbMap", "antenna")):
+    for name, role, size in (("ArucoMap", "marker", 1), ("UwbMap", "antenna", 5)):
         if name in last.maps:
-            plotting.landmarks(left, last.maps[name][1], role, f"{role}s", markersize=2)
+            look = plotting.ROLES[role] | {"markersize": size}
+            left.plot(*last.maps[name][1].T[:2], label=f"{role}s", **look)
     for solution in drive.solutions:
         title, _, role = PROBLEMS[solution.problem]
         if solution.problem in DRAWN or solution is last:

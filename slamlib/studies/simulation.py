@@ -184,7 +184,6 @@ def write_dataset(folder: str | Path, dataset: Dataset, truth: Truth | None = No
         _write_table(folder / "UwbAntennaGuess.txt", "%d %.3f %.3f", guess.antenna, guess.position)
     if truth is not None:
         folder = folder / "truth"
-        folder.mkdir()
         write_vehicle(folder / VEHICLE, truth.vehicle)
         _write_table(folder / "vehiclePose.txt", "%d %.6f %.6f %.6f", number, truth.poses)
         _write_table(folder / "ArucoMap.txt", "%d %.6f %.6f %.6f",
@@ -307,7 +306,8 @@ def _correlated(error, frame, marker, memory):
     for last, k in pairwise(order):
         if marker[k] == marker[last]:
             rho = memory**(frame[k] - frame[last])
-            found[k] = rho * found[last] + np.sqrt(1 - rho**2) * error[k]
+            new = np.sqrt(1 - rho**2) * error[k]
+            found[k] = rho * found[last] + new
     return found
 
 
