@@ -3,5 +3,6 @@
 `rows` are those of a study that a notebook shows; `run` runs a trial.
 """
 
-from slamlib.studies.runs import rows as rows
-from slamlib.studies.runs import run as run
+from slamlib.studies.runs import rows, run
+
+__all__ = ["rows", "run"]

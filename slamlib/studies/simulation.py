@@ -306,8 +306,7 @@ def _correlated(error, frame, marker, memory):
     for last, k in pairwise(order):
         if marker[k] == marker[last]:
             rho = memory**(frame[k] - frame[last])
-            new = np.sqrt(1 - rho**2) * error[k]
-            found[k] = rho * found[last] + new
+            found[k] = rho * found[last] + np.sqrt(1 - rho**2) * error[k]
     return found
 
 
