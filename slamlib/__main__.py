@@ -118,8 +118,7 @@ def _told(summaries):
                 print(f"{name}: {problem} could not be solved: {row['failed']}")
                 code = 3
         for doubt in summary["doubts"]:
-            told = f"{name}: doubt ({doubt['what']}): {doubt['sentence']} {doubt['advice']}"
-            print(told.rstrip())
+            print(f"{name}: doubt ({doubt['what']}): {doubt['sentence']} {doubt['advice']}")
     for summary in summaries:
         if "error" in summary:
             code = _ended(2, summary["error"])
@@ -133,7 +132,7 @@ def _solve(options):
     if options.verbose:
         logging.basicConfig(format="%(message)s", level=logging.INFO)
     if len(options.folders) > 1:
-        summaries = solve_folders(options.folders, options.out, options.jobs, problems=problems)
+        summaries = solve_folders(options.folders, options.out, options.jobs, problems)
     else:
         summaries = [solve_folder(options.folders[0], options.out, problems)]
     code = _told(summaries)

@@ -7,7 +7,7 @@ datasets.
 
 import sys
 import time
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -22,7 +22,6 @@ from slamlib.core.hint import Fusion
 from slamlib.core.records import Dataset, Truth
 from slamlib.io import files, results
 from slamlib.io.dataset import (
-    all_notes,
     inventory_lines,
     read_dataset,
     read_truth,
@@ -121,6 +120,8 @@ def problem_solution(problem: str, dataset: Dataset, found) -> Solution:
     """
     if problem == "problem1":
         found = Fusion(*found, rejected=0)
+    if problem == "problem2":
+        found = _at_all_poses(found, len(dataset.ticks))
     maps = {}
     if len(getattr(found, "marker", ())):
         maps["ArucoMap"] = found.marker, found.marker_in_world, found.marker_covariance
@@ -140,22 +141,18 @@ def problem_solution(problem: str, dataset: Dataset, found) -> Solution:
         doubts = fusion_doubts(found, dataset.vehicle)
     if isinstance(found, SlamResult):
         doubts = solution_doubts(found)
-    poses = found.poses
-    covariances = found.covariances
-    if problem == "problem2":
-        poses, covariances = _at_all_poses(found, len(dataset.ticks))
-    return Solution(problem, poses, covariances, maps, _facts(found), doubts)
+    return Solution(problem, found.poses, found.covariances, maps, _facts(found), doubts)
 
 
 def _at_all_poses(found, count):
-    """Poses (count, 3) and covariances of a Localization, of which other poses are NaN."""
+    """The Localization with `count` poses, NaN where it has no frame."""
     poses = np.full((count, 3), np.nan)
     covariances = np.full((count, 3, 3), np.nan)
     poses[found.frame] = found.poses
     covariances[found.frame] = found.covariances
     known = np.isfinite(poses[:, 0])
     poses[known, 2] = np.unwrap(poses[known, 2])
-    return poses, covariances
+    return replace(found, poses=poses, covariances=covariances)
 
 
 def _facts(found):
@@ -207,8 +204,7 @@ def solutions(dataset: Dataset, problems: Collection[str] = PROBLEMS) -> list[So
 
 
 def write_results(out: Path | str, problem: str, found, dataset: Dataset,
-                  truth: Truth | None = None, doubts: list[Doubt] | None = None
-                  ) -> Solution | Failure:
+                  truth: Truth | None = None) -> Solution | Failure:
     """Write what a solver found of one problem to the results folder `out` of a drive.
 
     The .mat files come first, summary.json last: a folder without it is unfinished. What it lists
@@ -219,7 +215,6 @@ def write_results(out: Path | str, problem: str, found, dataset: Dataset,
     problem : key of `PROBLEMS`.
     found : what `find` returns for the problem, or the exception, of UNSOLVABLE, that it raised.
     truth : Truth, to report errors, or None.
-    doubts : those about the files, or None to look for them.
 
     Returns
     -------
@@ -239,14 +234,12 @@ def write_results(out: Path | str, problem: str, found, dataset: Dataset,
         solution = failure(problem, dataset, found)
     else:
         solution = problem_solution(problem, dataset, found)
-    if doubts is None:
-        doubts = doubts_before_solving(dataset)
     with files.locked(out):
         others = {}
         with suppress(DatasetError):
             others = results.read_summary(out)["problems"]
         others.pop(problem, None)
-        _write(out, dataset, truth, [solution], others, doubts)
+        _write(out, dataset, truth, [solution], others)
     return solution
 
 
@@ -266,11 +259,10 @@ def solve_to_folder(dataset: Dataset, truth: Truth | None, out: Path,
     files were read.
     """
     with files.locked(out):
-        doubts = doubts_before_solving(dataset)
-        return _write(out, dataset, truth, solutions(dataset, problems), {}, doubts)
+        return _write(out, dataset, truth, solutions(dataset, problems), {})
 
 
-def _write(out, dataset, truth, found, others, doubts):
+def _write(out, dataset, truth, found, others):
     """Write Solutions to a folder; return its summary, with the rows of `others`, too."""
     rows = others | {each.problem: summarize(each, truth) for each in found}
     (out / results.SUMMARY).unlink(missing_ok=True)
@@ -278,7 +270,7 @@ def _write(out, dataset, truth, found, others, doubts):
     for each in found:
         if isinstance(each, Solution):
             written += results.write_solution(out, each)
-    return finish_results(out, written, dataset, truth, rows, doubts)
+    return finish_results(out, written, dataset, truth, rows)
 
 
 def result_files(out: Path, problem: str) -> list[Path]:
@@ -287,19 +279,19 @@ def result_files(out: Path, problem: str) -> list[Path]:
 
 
 def finish_results(out: Path, written: Collection[Path], dataset: Dataset, truth: Truth | None,
-                   rows: dict, doubts: Iterable[Doubt]) -> dict:
+                   rows: dict) -> dict:
     """Finish a results folder whose summary is gone; returns the new one.
 
     Result files of earlier runs that are not among the `written` ones are removed; all other files
     stay. The summary, by the rows (dict) of its problems and the doubts about the files, is written
-    last. With problem 2's fusion and problem 3, it doubts a fusion that contradicts problem 3.
+    last. It also doubts a fusion of problem 2 that contradicts problem 3 where both are there.
     """
     for problem in PROBLEMS:
         for file in result_files(out, problem):
             if file not in written:
                 file.unlink(missing_ok=True)
     problems = {problem: rows[problem] for problem in PROBLEMS if problem in rows}
-    doubts = list(doubts)
+    doubts = doubts_before_solving(dataset)
     with suppress(OSError):
         _, poses, covariances = results.read_structs(out / "problem2_fused", "vehiclePose")
         _, by_slam, _ = results.read_structs(out / "problem3", "vehiclePose")
@@ -309,7 +301,7 @@ def finish_results(out: Path, written: Collection[Path], dataset: Dataset, truth
     _write_estimated_vehicle(out / VEHICLE_ESTIMATED, dataset.vehicle, problems)
     summary = {"dataset": dataset.name, "poses": len(dataset.ticks),
                "doubts": [asdict(doubt) for doubt in merged(doubts)],
-               "notes": all_notes(dataset, truth), "problems": problems}
+               "notes": dataset.notes + getattr(truth, "notes", ()), "problems": problems}
     results.write_summary(out, summary)
     return summary
 
@@ -380,7 +372,7 @@ def solve_folder(folder: Path, out: Path, problems: Collection[str] = ()) -> dic
 
 
 def solve_folders(folders: Sequence[Path | str], out: Path | str, jobs: int | None = None,
-                  **options) -> list[dict]:
+                  problems: Collection[str] = ()) -> list[dict]:
     """Solve each of several datasets into out/<name>, and write the table out/drives.csv.
 
     One that cannot be read or written does not stop the others: its summary has the entry "error",
@@ -390,7 +382,7 @@ def solve_folders(folders: Sequence[Path | str], out: Path | str, jobs: int | No
     ----------
     jobs : datasets at a time, in as many processes; None for what joblib's `parallel_config` says,
         by default 1.
-    options : of `solve_folder`.
+    problems : as of `solve_folder`.
 
     Returns
     -------
@@ -403,20 +395,18 @@ def solve_folders(folders: Sequence[Path | str], out: Path | str, jobs: int | No
     by_name = {folder.absolute().name: folder for folder in folders}
     require(len(by_name) == len(folders), out,
             "datasets in folders of different names, as which their results are written")
-    solve = delayed(_summary_or_error)
+
+    def solve(name, folder):
+        try:
+            return solve_folder(folder, out / name, problems)
+        except (DatasetError, OSError) as error:
+            return {"dataset": name, "error": str(error), "doubts": [], "problems": {}}
+
     summaries = Parallel(n_jobs=jobs)(
-        solve(folder, out / name, **options) for name, folder in by_name.items())
+        delayed(solve)(name, folder) for name, folder in by_name.items())
     table = drive_table(summaries).to_csv(index=False)
     files.write_file(out / "drives.csv", table.encode())
     return summaries
-
-
-def _summary_or_error(folder, out, **options):
-    """What `solve_folder` returns, or a summary with an error."""
-    try:
-        return solve_folder(folder, out, **options)
-    except (DatasetError, OSError) as error:
-        return {"dataset": out.name, "error": str(error), "doubts": [], "problems": {}}
 
 
 def drive_table(summaries: Sequence[dict]):

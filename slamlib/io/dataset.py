@@ -220,11 +220,6 @@ def read_truth(folder: Path | str) -> Truth | None:
                  vehicle, notes)
 
 
-def all_notes(dataset: Dataset, truth: Truth | None) -> tuple[str, ...]:
-    """Notes on what was mended or left out of a Dataset and its Truth."""
-    return dataset.notes + getattr(truth, "notes", ())
-
-
 def inventory_lines(dataset: Dataset, truth: Truth | None) -> list[str]:
     """A line on what was read of a Dataset and its Truth, and one for each note."""
     sightings = (dataset.aruco or NO_SIGHTINGS).pose
@@ -232,5 +227,6 @@ def inventory_lines(dataset: Dataset, truth: Truth | None) -> list[str]:
     truth_is = "unknown" if truth is None else "known"
     lines = [f"{len(dataset.ticks)} poses, {len(sightings)} sightings, {len(ranges)} ranges, "
              f"truth {truth_is}"]
-    lines += [f"note: {note}" for note in all_notes(dataset, truth)]
+    notes = dataset.notes + getattr(truth, "notes", ())
+    lines += [f"note: {note}" for note in notes]
     return [f"{dataset.name}: {line}" for line in lines]

@@ -64,7 +64,8 @@ def read_structs(folder: Path | str, name: str) -> tuple[np.ndarray, np.ndarray,
     >>> ids.tolist(), poses.shape, covariances.shape
     ([1, 2], (2, 3), (2, 3, 3))
     """
-    structs = loadmat(Path(folder) / f"{name}.mat")[name].ravel()
+    file = Path(folder) / f"{name}.mat"
+    structs = loadmat(file)[name].ravel()
     place, covariance, *label = FIELDS[name]
     places = np.concatenate(structs[place])
     ids = np.arange(1, len(places) + 1)
@@ -99,12 +100,10 @@ def write_tum(path: Path | str, poses: np.ndarray):
     1 0 0 0 0 0 0 1
     3 2.5 0 0 0 0 0 1
     """
-    x, y, heading = poses.T
     ids = np.arange(1, len(poses) + 1)
-    zero = np.zeros(len(poses))
-    qz = np.sin(heading / 2)
-    qw = np.cos(heading / 2)
-    rows = np.column_stack([ids, x, y, zero, zero, zero, qz, qw])
+    no_z_qx_qy = np.zeros_like(poses)
+    half = poses[:, 2] / 2
+    rows = np.column_stack([ids, poses[:, :2], no_z_qx_qy, np.sin(half), np.cos(half)])
     text = BytesIO()
-    np.savetxt(text, rows[np.isfinite(x)], fmt="%.17g")
+    np.savetxt(text, rows[np.isfinite(half)], fmt="%.17g")
     write_file(Path(path), text.getvalue())

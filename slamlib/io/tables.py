@@ -187,7 +187,8 @@ def contents(folder: Path | str, expected: tuple[str, ...] = DATASET_FILES,
     notes = [f"{source.name} was read as {name}." for name, source in files.items()
              if source.name.lower() != name.lower()]
     used = [source.name.split(",")[0] for source in files.values()]
-    not_read = _not_read([path for path in paths if path.name not in used]) + reasons
+    others = [path for path in paths if path.name not in used]
+    not_read = _not_read(others) + reasons
     if required is not None:
         told = " ".join(["this file, found none.", *not_read])
         require(required in files, folder / required, told)

@@ -90,7 +90,7 @@ def write_results(drive: Drive, problem: str, found) -> None:
     """
     results = Path(os.environ.get("SLAMLIB_RESULTS") or _data_folder().parent / "results")
     solved = solve.write_results(
-        results / drive.name, problem, found, drive.dataset, drive.truth, drive.doubts)
+        results / drive.name, problem, found, drive.dataset, drive.truth)
     if isinstance(solved, solve.Failure):
         title = solve.PROBLEMS[problem].title
         _say(drive, f"The problem “{title}” could not be solved: {solved.reason}.")

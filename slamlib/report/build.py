@@ -145,7 +145,7 @@ def _write_results(drive, stages, folder):
                 if file.is_file() and file.name != SUMMARY:
                     written.append(folder / file.relative_to(own))
                     files.write_file(written[-1], file.read_bytes())
-        return finish_results(folder, written, drive.dataset, drive.truth, rows, drive.doubts)
+        return finish_results(folder, written, drive.dataset, drive.truth, rows)
 
 
 def _write_pages(books, keys, drives, summaries, options, results, report):
