@@ -42,13 +42,13 @@ class Task(NamedTuple):
     """What a problem is called, and what it needs."""
 
     title: str
-    sensor: str | None           # attribute of Dataset
+    sensor: str                  # attribute of Dataset
     role: str                    # in figures (`notebook.plotting.ROLES`)
 
 
 # Every problem in the order of solution, by the name of its results folder.
 PROBLEMS = {
-    "problem1": Task("odometry", None, "odometry"),
+    "problem1": Task("odometry", "ticks", "odometry"),
     "problem2": Task("ArUco", "aruco", "aruco"),
     "problem2_hint": Task("odometry + ArUco, hint", "aruco", "hint"),
     "problem2_fused": Task("odometry + ArUco", "aruco", "fused"),
@@ -89,8 +89,7 @@ class Failure:
 
 def allows(dataset: Dataset, problem: str) -> bool:
     """True if the dataset has the sensor that a problem needs."""
-    sensor = PROBLEMS[problem].sensor
-    return sensor is None or getattr(dataset, sensor) is not None
+    return getattr(dataset, PROBLEMS[problem].sensor) is not None
 
 
 def find(problem: str, dataset: Dataset, previous: SlamResult | None = None):
