@@ -18,7 +18,6 @@ import numpy as np
 from slamlib import estimate, fuse, fuse_increments, localize
 from slamlib.core import evaluation, odometry, se2
 from slamlib.core.errors import DatasetError, require
-from slamlib.core.hint import Fusion
 from slamlib.core.records import Dataset, Truth
 from slamlib.io import files, results
 from slamlib.io.dataset import (
@@ -118,7 +117,7 @@ def problem_solution(problem: str, dataset: Dataset, found) -> Solution:
     rounding.
     """
     if problem == "problem1":
-        found = Fusion(*found, rejected=0)
+        found = Solution(problem, *found)
     if problem == "problem2":
         found = _at_all_poses(found, len(dataset.ticks))
     maps = {}
