@@ -48,7 +48,7 @@ def _parser():
     """The parser of the command line; `run` of what it parses is the function of the command."""
     whole = argparse.ArgumentParser(
         prog="slamlib", description="Vehicle SLAM from wheel encoders, markers and UWB ranges.")
-    commands = whole.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    commands = whole.add_subparsers(dest="command", required=True)
 
     def add_command(name, run, help):
         command = commands.add_parser(name, help=help)
@@ -59,13 +59,12 @@ def _parser():
                        ("hand-in", "build the report, and zip it with the result files")):
         add = add_command(name, _build, help)
         add("--data", type=Path, default="data", help="folder of the datasets (default data)")
-        add("datasets", nargs="*", metavar="DATASET", help="names of folders in it (all of them "
-            "when none is named, but simulated ones where there are others)")
+        add("datasets", nargs="*", help="names of folders in it (all of them when none is named, "
+            "but simulated ones where there are others)")
 
     add = add_command("solve", _solve, "solve problems without notebooks")
-    add("folders", nargs="+", type=Path, metavar="FOLDER", help="a dataset's folder; each of "
-        "several has its results in the folder of its name in OUT, and drives.csv is the table "
-        "over all")
+    add("folders", nargs="+", type=Path, help="a dataset's folder; each of several has its results "
+        "in the folder of its name in OUT, and drives.csv is the table over all")
     add("--out", type=Path, required=True, help="folder for the results")
     add("-j", "--jobs", type=int, default=1, help="datasets solved at a time (default 1)")
     add("--problem", action="append", default=[],

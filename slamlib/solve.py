@@ -158,18 +158,17 @@ def _facts(found):
     facts = {}
     if getattr(found, "slip", None) is not None:
         facts["slip_sqrt_m"] = found.slip
-    if not isinstance(found, SlamResult):
-        return facts
-    facts["unconfirmed"] = found.unconfirmed.tolist()
-    facts["calibration"] = [row for row in found.calibration_table if row["sigma"]]
-    if len(found.rejected):
-        facts["marker_noise_factor"] = found.noise.sightings
-    if len(found.antenna):
-        facts["range_noise_factor"] = found.noise.ranges
+    if isinstance(found, SlamResult):
+        facts["unconfirmed"] = found.unconfirmed.tolist()
+        facts["calibration"] = [row for row in found.calibration_table if row["sigma"]]
+        if len(found.rejected):
+            facts["marker_noise_factor"] = found.noise.sightings
+        if len(found.antenna):
+            facts["range_noise_factor"] = found.noise.ranges
     return facts
 
 
-def failure(problem: str, dataset: Dataset, error: Exception) -> Failure:
+def _failure(problem, dataset, error):
     """The Failure of a problem by an `error` of UNSOLVABLE."""
     reason = str(error).removeprefix(f"{dataset.name}: ")
     if isinstance(error, np.linalg.LinAlgError):
@@ -196,7 +195,7 @@ def solutions(dataset: Dataset, problems: Collection[str] = PROBLEMS) -> list[So
             solution = problem_solution(problem, dataset, found)
             solution.facts["seconds"] = time.perf_counter() - start
         except UNSOLVABLE as error:
-            solution = failure(problem, dataset, error)
+            solution = _failure(problem, dataset, error)
         every.append(solution)
     return every
 
@@ -229,7 +228,7 @@ def write_results(out: Path | str, problem: str, found, dataset: Dataset,
     """
     out = Path(out)
     if isinstance(found, Exception):
-        solution = failure(problem, dataset, found)
+        solution = _failure(problem, dataset, found)
     else:
         solution = problem_solution(problem, dataset, found)
     with files.locked(out):
@@ -264,14 +263,14 @@ def _write(out, dataset, truth, found, others):
     """Write Solutions to a folder; return its summary, with the rows of `others`, too."""
     rows = others | {each.problem: summarize(each, truth) for each in found}
     (out / results.SUMMARY).unlink(missing_ok=True)
-    written = [file for problem in others for file in result_files(out, problem)]
+    written = [file for problem in others for file in _result_files(out, problem)]
     for each in found:
         if isinstance(each, Solution):
             written += results.write_solution(out, each)
     return finish_results(out, written, dataset, truth, rows)
 
 
-def result_files(out: Path, problem: str) -> list[Path]:
+def _result_files(out, problem):
     """Paths of all files that a problem may have in a results folder."""
     return [out / problem / name for name in results.RESULT_FILES]
 
@@ -285,7 +284,7 @@ def finish_results(out: Path, written: Collection[Path], dataset: Dataset, truth
     last. It also doubts a fusion of problem 2 that contradicts problem 3 where both are there.
     """
     for problem in PROBLEMS:
-        for file in result_files(out, problem):
+        for file in _result_files(out, problem):
             if file not in written:
                 file.unlink(missing_ok=True)
     problems = {problem: rows[problem] for problem in PROBLEMS if problem in rows}
@@ -369,7 +368,7 @@ def solve_folder(folder: Path, out: Path, problems: Collection[str] = ()) -> dic
     return solve_to_folder(dataset, truth, out, problems or PROBLEMS)
 
 
-def solve_folders(folders: Sequence[Path | str], out: Path | str, jobs: int | None = None,
+def solve_folders(folders: Sequence[Path], out: Path | str, jobs: int | None = None,
                   problems: Collection[str] = ()) -> list[dict]:
     """Solve each of several datasets into out/<name>, and write the table out/drives.csv.
 
@@ -389,7 +388,7 @@ def solve_folders(folders: Sequence[Path | str], out: Path | str, jobs: int | No
     from joblib import Parallel, delayed
 
     out = Path(out)
-    folders = [folder for folder in map(Path, folders) if not folder.is_file()]
+    folders = [folder for folder in folders if not folder.is_file()]
     by_name = {folder.absolute().name: folder for folder in folders}
     require(len(by_name) == len(folders), out,
             "datasets in folders of different names, as which their results are written")
