@@ -117,6 +117,11 @@ def summary_of(*problems, **others):
     return {"dataset": "d", "poses": 2, "doubts": [], "notes": [], "problems": rows} | others
 
 
+def test_the_readme_explains_no_map_that_is_not_there():
+    text = handin.readme([summary_of("problem1")], Options())
+    assert "Map" not in text and "except in problem2" not in text
+
+
 def test_doubts_notes_and_failures_are_in_the_readme_and_empty_headings_are_not():
     summary = summary_of("problem1", notes=["A header was left out."],
                          doubts=[{"what": "units", "sentence": "Lengths are in mm."}])
