@@ -78,10 +78,10 @@ def _read(data, selected):
     lines = []
     for drive in drives:
         lines += inventory_lines(drive.dataset, drive.truth)
-        names.remove(drive.name)
-    if names:
-        lines.append(f"left out, because simulated: {', '.join(names)} (name all datasets to "
-                     "have them)")
+    omitted = set(names) - {drive.name for drive in drives}
+    if omitted:
+        told = ", ".join(sorted(omitted))
+        lines.append(f"left out, because simulated: {told} (name all datasets to have them)")
     _say("\n".join(lines + unread))
     return drives
 
