@@ -80,8 +80,8 @@ def _read(data, selected):
         lines += inventory_lines(drive.dataset, drive.truth)
     omitted = set(names) - {drive.name for drive in drives}
     if omitted:
-        told = ", ".join(sorted(omitted))
-        lines.append(f"left out, because simulated: {told} (name all datasets to have them)")
+        lines.append(f"left out, because simulated: {', '.join(sorted(omitted))} (name all "
+                     "datasets to have them)")
     _say("\n".join(lines + unread))
     return drives
 
